@@ -1,0 +1,84 @@
+# Every target does its own set-up in ./.venv and touches nothing else on the machine.
+# Needed beforehand: make, a Python of at least 3.11 with its venv module, and a package index.
+
+VENV := .venv
+PY := $(VENV)/bin/python
+LOCK := requirements-dev.lock
+WORKERS ?= 2
+
+# The environment is made again only when what it depends on changes: the lock, the project file, the
+# interpreter asked for, or the place (an editable install remembers its folder).
+KEY := $(shell { pwd; echo "$(PYTHON)"; cat pyproject.toml $(LOCK); } | cksum | tr -d ' ')
+READY := $(VENV)/.ready-$(KEY)
+
+# No question to the network about newer releases of the type checker.
+export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint types thorough bench format docs lock clean
+
+help: ## this list
+	@sed -n 's/^\([a-z]*\):.*## /  make \1@/p' Makefile | awk -F@ '{ printf "%-17s %s\n", $$1, $$2 }'
+
+setup: $(READY) ## the development environment in ./.venv
+
+$(READY): pyproject.toml $(LOCK)
+	@set -e; python=''; \
+	for candidate in $(PYTHON) python3.11 python3.12 python3.13 python3.14 python3 python; do \
+	    if $$candidate -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
+	        python=$$candidate; break; \
+	    fi; \
+	done; \
+	if [ -z "$$python" ]; then \
+	    echo 'dvax needs Python 3.11 or newer and found none; say which with make PYTHON=/path/to/python3.11' >&2; \
+	    exit 1; \
+	fi; \
+	echo "Setting up $(VENV) with $$($$python --version) (once; a later run starts at once)"; \
+	rm -rf $(VENV); \
+	$$python -m venv $(VENV) || { \
+	    echo 'python -m venv failed; on Debian the module is in the package python3-venv' >&2; exit 1; }
+	@# Compiling every file of every package would double the time; Python compiles what is imported.
+	@$(PY) -m pip install --quiet --no-compile --requirement $(LOCK)
+	@$(PY) -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+demo: $(READY) ## solve the rough contact strip; results and report in ./demo-run
+	@$(VENV)/bin/dvax demo --out demo-run --force
+	@echo "The report: $(CURDIR)/demo-run/report.html"
+
+test: lint types ## lint, formatting, types and tests (under 10 minutes on two cores)
+	$(PY) -m pytest -n $(WORKERS) --durations=15
+	@echo 'make test: lint, formatting, types and every test not marked thorough have passed'
+
+lint: $(READY) ## ruff: rules and formatting
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+
+types: $(READY) ## pyright
+	$(PY) -m pyright --project pyproject.toml --pythonpath $(PY)
+
+thorough: $(READY) ## the long checks: many random cases, clean environments, full benchmarks
+	HYPOTHESIS_PROFILE=thorough $(PY) -m pytest -n $(WORKERS) -m thorough --durations=15
+	$(PY) -m benchmarks --full
+	@echo 'make thorough: every test marked thorough and the full benchmarks have passed'
+
+bench: $(READY) ## dvax against the peers found here: ratios, medians of repeated runs
+	$(PY) -m benchmarks
+
+format: $(READY) ## rewrite the sources in the common format
+	$(PY) -m ruff check --fix .
+	$(PY) -m ruff format .
+
+docs: $(READY) ## the documentation as a site in ./site
+	$(PY) -m pip install --quiet --editable '.[docs]'
+	$(PY) -m mkdocs build --strict
+
+lock: ## pin the newest releases that fit pyproject.toml (needs uv)
+	uv pip compile pyproject.toml --extra app --extra dev --universal --python-version 3.11 \
+	    --upgrade --no-emit-index-url --no-emit-find-links \
+	    --custom-compile-command 'make lock' --output-file $(LOCK)
+
+clean: ## everything the other targets have written
+	rm -rf $(VENV) .cache .hypothesis .pytest_cache .ruff_cache build dist site demo-run
+	find src tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
