@@ -1,0 +1,34 @@
+"""What every test runs under: double precision, checked shapes, repeatable random cases."""
+
+import os
+from pathlib import Path
+
+import hypothesis
+import jaxtyping
+
+ROOT = Path(__file__).parents[1]
+
+# Compiled programs outlive a test run. Through the environment, so that commands which tests start
+# as processes of their own find them too.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+# Every annotation below src/dvax, shapes included, is checked at each call. The hook must stand
+# before the first import of dvax, hence here and not in a fixture.
+jaxtyping.install_import_hook("dvax", "beartype.beartype")
+
+import jax  # noqa: E402  (its settings come from the lines above)
+
+# In this process alone: the command line has to ask for double precision by itself, and an
+# environment variable would hide it if it forgot.
+jax.config.update("jax_enable_x64", True)
+
+# Examples are drawn from the test's own text, so that a failure comes back on every machine.
+hypothesis.settings.register_profile(
+    "test", deadline=None, derandomize=True, database=None, print_blob=True
+)
+hypothesis.settings.register_profile(
+    "thorough", deadline=None, max_examples=100_000, print_blob=True
+)
+hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "test"))

@@ -1,0 +1,237 @@
+"""The habits of the house that no linter knows.
+
+A class is abstract or final and behaviour is not overridden (equinox's own `strict` flag checks
+nothing). A public name says what it is, and shows it in an example that runs. A file is one idea.
+"""
+
+import abc
+import doctest
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import equinox as eqx
+import pytest
+
+import dvax
+
+ROOT = Path(__file__).parents[1]
+
+# The names that examples, tests and other people's code are written against.
+CONTRACT = [
+    "Problem",
+    "solve",
+    "solve_vi",
+    "Solution",
+    "Constants",
+    "bound_error",
+    "ETD1",
+    "ETD2RK",
+    "generators.Scalar",
+    "generators.Diagonal",
+    "generators.Dense",
+    "generators.Product",
+    "operators.Scaling",
+    "operators.Diagonal",
+    "operators.Dense",
+    "operators.Product",
+    "sets.Box",
+    "sets.Ball",
+    "sets.WholeSpace",
+    "sets.Product",
+    "signals.Constant",
+    "signals.Table",
+    "spaces.Euclidean",
+    "spaces.L2",
+    "spaces.Product",
+    "vi.Extragradient",
+    "vi.Auto",
+    "models.Contact",
+]
+
+ROOMS = ["spaces", "generators", "operators", "sets", "signals", "vi", "evolution", "models"]
+
+# Files that may be longer than 400 lines, and the reason.
+LONG: dict[str, str] = {}
+
+# Methods that Python or equinox calls once for every class of a family, each adding to the others.
+COOPERATIVE = {"__init__", "__check_init__", "__init_subclass__"}
+# What `dataclass` writes.
+GENERATED = {"__repr__", "__eq__", "__hash__", "__setattr__", "__delattr__", "__replace__"}
+
+
+def all_modules() -> Iterator[str]:
+    for found in pkgutil.walk_packages(dvax.__path__, prefix="dvax."):
+        if not found.name.endswith("__main__"):
+            yield found.name
+
+
+def family(root: type = eqx.Module) -> list[type]:
+    """Every subclass of `root` that dvax defines, itself loaded whole."""
+    for name in all_modules():
+        importlib.import_module(name)
+    seen: dict[type, None] = {}
+    waiting = [root]
+    while waiting:
+        for cls in waiting.pop().__subclasses__():
+            if cls not in seen:
+                seen[cls] = None
+                waiting.append(cls)
+    ours = [cls for cls in seen if cls.__module__.split(".")[0] == "dvax"]
+    return sorted(ours, key=lambda cls: (cls.__module__, cls.__qualname__))
+
+
+def title(cls: type) -> str:
+    return f"{cls.__module__}.{cls.__qualname__}"
+
+
+def abstract_members(cls: type) -> set[str]:
+    return set().union(
+        getattr(cls, "__abstractmethods__", ()),
+        getattr(cls, "__abstractvars__", ()),
+        getattr(cls, "__abstractclassvars__", ()),
+    )
+
+
+def behaviour(cls: type) -> dict[str, object]:
+    """The methods and properties that `cls` itself writes down."""
+    kinds = (property, classmethod, staticmethod)
+    return {
+        name: member
+        for name, member in vars(cls).items()
+        if (callable(member) or isinstance(member, kinds))
+        and not isinstance(member, type)
+        and name not in COOPERATIVE | GENERATED
+    }
+
+
+def faults_of(classes: Iterable[type]) -> list[str]:
+    """What breaks 'abstract or final, and nothing concrete is overridden', as sentences."""
+    classes = list(classes)
+    faults = []
+    for cls in classes:
+        name, members = cls.__name__, abstract_members(cls)
+        promises = name.lstrip("_").startswith("Abstract")
+        if promises and not members:
+            faults.append(f"{title(cls)} is named Abstract and promises nothing")
+        if members and not promises:
+            faults.append(f"{title(cls)} leaves {sorted(members)} open and is not named Abstract")
+        for base in cls.__mro__[1:]:
+            if base not in classes:
+                continue
+            if not abstract_members(base):
+                faults.append(f"{title(cls)} extends {title(base)}, which is final")
+            for method in sorted(set(behaviour(cls)) & set(behaviour(base))):
+                if not getattr(behaviour(base)[method], "__isabstractmethod__", False):
+                    faults.append(f"{title(cls)}.{method} overrides that of {title(base)}")
+    return faults
+
+
+def public(room: str) -> dict[str, object]:
+    """The classes and functions of dvax that a room's __init__ offers."""
+    module = importlib.import_module(f"dvax.{room}")
+    return {
+        f"{room}.{name}": thing
+        for name, thing in vars(module).items()
+        if not name.startswith("_")
+        and (inspect.isclass(thing) or inspect.isfunction(thing))
+        and getattr(thing, "__module__", "").split(".")[0] == "dvax"
+    }
+
+
+def resolve(name: str) -> object:
+    thing: object = dvax
+    for part in name.split("."):
+        thing = getattr(thing, part)
+    return thing
+
+
+def test_every_class_is_abstract_or_final():
+    classes = family()
+    assert len(classes) > 10
+    faults = faults_of(classes)
+    assert not faults, "\n".join(faults)
+
+
+def test_planted_faults_are_seen():
+    class AbstractShape(eqx.Module):
+        @abc.abstractmethod
+        def area(self) -> float: ...
+
+        def twice(self) -> float:
+            return 2 * self.area()
+
+    class Disc(AbstractShape):
+        def area(self) -> float:
+            return 3.0
+
+    class Ring(Disc):
+        def area(self) -> float:
+            return 2.0
+
+    class Loud(AbstractShape):
+        def area(self) -> float:
+            return 1.0
+
+        def twice(self) -> float:
+            return 5.0
+
+    class AbstractNothing(eqx.Module):
+        pass
+
+    class Unfinished(AbstractShape):
+        pass
+
+    def short(*classes: type) -> list[str]:
+        prefix = f"{__name__}.{test_planted_faults_are_seen.__qualname__}.<locals>."
+        return [fault.replace(prefix, "") for fault in faults_of(classes)]
+
+    assert short(AbstractShape, Disc) == []
+    assert short(AbstractShape, Disc, Ring) == [
+        "Ring extends Disc, which is final",
+        "Ring.area overrides that of Disc",
+    ]
+    assert short(AbstractShape, Loud) == ["Loud.twice overrides that of AbstractShape"]
+    assert short(AbstractNothing) == ["AbstractNothing is named Abstract and promises nothing"]
+    assert short(AbstractShape, Unfinished) == [
+        "Unfinished leaves ['area'] open and is not named Abstract"
+    ]
+
+
+@pytest.mark.parametrize("name", CONTRACT)
+def test_a_contract_name_has_an_example_that_runs(name: str):
+    thing = resolve(name)
+    finder = doctest.DocTestFinder(recurse=False)
+    found = finder.find(thing, name, module=False, globs={})
+    examples = [example for test in found for example in test.examples]
+    assert any(example.want for example in examples), f"the docstring of {name} shows no result"
+    report: list[str] = []
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
+    for test in found:
+        runner.run(test, out=report.append)
+    assert runner.summarize(verbose=False).failed == 0, "".join(report)
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_every_public_name_is_documented(room: str):
+    names = public(room)
+    assert names
+    bare = [
+        name
+        for name, thing in names.items()
+        # A dataclass without a docstring is given its own signature as one.
+        if not (text := inspect.getdoc(thing)) or text.startswith(f"{name.rpartition('.')[2]}(")
+    ]
+    assert not bare, f"no docstring: {bare}"
+
+
+def lines(file: Path) -> int:
+    return len(file.read_text(encoding="utf-8").splitlines())
+
+
+def test_a_file_is_one_idea():
+    files = [f for top in ("src", "tests", "benchmarks") for f in (ROOT / top).rglob("*.py")]
+    long = {str(file.relative_to(ROOT)): lines(file) for file in files if lines(file) > 400}
+    assert set(long) == set(LONG), f"longer than 400 lines: {long}; with a reason: {set(LONG)}"

@@ -1,0 +1,150 @@
+"""What a user installs: a whole wheel, a core without extras, a command line that is quick."""
+
+import email
+import os
+import subprocess
+import sys
+import time
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+# Each of these takes longer to load than a person waits for --help.
+HEAVY = ["jax", "jaxlib", "numpy", "scipy", "equinox", "diffrax", "pydantic", "xarray", "zarr"]
+HEAVY += ["pandas", "plotly", "matplotlib", "pint"]
+
+
+def run(*command: str | Path, **settings) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        [str(part) for part in command], capture_output=True, text=True, timeout=600, **settings
+    )
+    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+    return done
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    run(sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder, cwd=ROOT)
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+def test_the_wheel_holds_every_file_of_the_package(wheel: Path):
+    inside = set(zipfile.ZipFile(wheel).namelist())
+    package = ROOT / "src" / "dvax"
+    files = {
+        str(file.relative_to(ROOT / "src"))
+        for file in package.rglob("*")
+        if file.is_file() and "__pycache__" not in file.parts
+    }
+    assert files - inside == set()
+    assert {name.split("/")[0] for name in inside - files} == {f"dvax-{version(wheel)}.dist-info"}
+
+
+def test_the_wheel_carries_the_demo(wheel: Path):
+    demo = {
+        name.rpartition("/")[2]: info.file_size
+        for info in zipfile.ZipFile(wheel).infolist()
+        if (name := info.filename).startswith("dvax/runs/demo/")
+    }
+    assert {"rough_strip.toml", "load.csv"} <= set(demo)
+    assert all(size > 0 for size in demo.values())
+
+
+def metadata(wheel: Path) -> email.message.Message:
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (n for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
+        return email.message_from_bytes(archive.read(name))
+
+
+def version(wheel: Path) -> str:
+    return metadata(wheel)["Version"]
+
+
+def test_the_metadata_says_what_is_needed(wheel: Path):
+    about = metadata(wheel)
+    assert about["Requires-Python"] == ">=3.11"
+    assert about["License-Expression"] == "Apache-2.0"
+    assert set(about.get_all("Provides-Extra", [])) == {"app", "dask", "dev", "docs", "fem"}
+    core = [need for need in about.get_all("Requires-Dist", []) if "extra ==" not in need]
+    assert {need.partition(">=")[0] for need in core} == {
+        *("jax", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping", "numpy"),
+    }
+    assert all(">=" in need for need in core)
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (n for n in archive.namelist() if n.endswith("entry_points.txt"))
+        assert "dvax = dvax.cli:main" in archive.read(name).decode()
+
+
+def test_the_lock_names_versions_and_nothing_else():
+    for line in (ROOT / "requirements-dev.lock").read_text().splitlines():
+        if not line.lstrip().startswith("#"):
+            assert "==" in line and "://" not in line and not line.startswith("-"), line
+
+
+def help_of(*arguments: str) -> str:
+    """The heavy modules that are loaded once `dvax ARGUMENTS --help` has been printed."""
+    code = f"""
+import sys
+from dvax.cli import main
+sys.argv = ["dvax", *{arguments!r}, "--help"]
+try:
+    main()
+except SystemExit as stop:
+    assert not stop.code, stop.code
+print("heavy:", *(name for name in {HEAVY!r} if name in sys.modules))
+"""
+    done = run(sys.executable, "-c", code, env={**os.environ, "PYTHONPATH": str(ROOT / "src")})
+    assert "Usage" in done.stdout
+    return done.stdout.rpartition("heavy:")[2].strip()
+
+
+@pytest.mark.parametrize("arguments", [(), ("run",), ("demo",)], ids=" ".join)
+def test_help_loads_nothing_heavy(arguments: tuple[str, ...]):
+    assert help_of(*arguments) == ""
+
+
+@pytest.mark.thorough
+def test_help_is_there_within_a_second():
+    code = "import sys; from dvax.cli import main; sys.argv = ['dvax', '--help']; main()"
+    took = []
+    for _ in range(5):
+        start = time.perf_counter()
+        run(sys.executable, "-c", code, env={**os.environ, "PYTHONPATH": str(ROOT / "src")})
+        took.append(time.perf_counter() - start)
+    print(f"dvax --help: best of five {min(took):.2f} s")
+    assert min(took) < 1.0
+
+
+@pytest.mark.thorough
+def test_the_library_works_from_its_wheel_without_extras(wheel: Path, tmp_path: Path):
+    place = tmp_path / "clean"
+    venv.create(place, with_pip=True)
+    python = place / "bin" / "python"
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    run(python, "-m", "pip", "install", "--quiet", wheel, cwd=tmp_path, env=environment)
+    code = """
+import jax
+jax.config.update("jax_enable_x64", True)
+import dvax
+problem = dvax.Problem(
+    A=dvax.generators.Scalar(-1.0),
+    P=dvax.operators.Scaling(1.0),
+    K=dvax.sets.Box(0.0, 0.5),
+    f=lambda t, x, u, args: 3.0 - 0.5 * x - u,
+    h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+)
+solution = dvax.solve(problem, -1.0, 0.0, 2.0, rtol=1e-10, atol=1e-10)
+print(dvax.__file__, float(solution.xs[-1]))
+"""
+    where, value = run(python, "-c", code, cwd=tmp_path, env=environment).stdout.split()
+    assert Path(where).is_relative_to(place)
+    # The closed form: saturated until t1 = ln(8/5)/(3/2), active for 2 ln(10/9), then unloaded.
+    assert abs(float(value) - 1.8360919559905713) < 1e-8
+    missing = "import dvax\ntry:\n    import rich\nexcept ModuleNotFoundError:\n    print('absent')"
+    assert run(python, "-c", missing, cwd=tmp_path, env=environment).stdout.strip() == "absent"
