@@ -5,10 +5,14 @@ nothing). A public name says what it is, and shows it in an example that runs. A
 """
 
 import abc
+import contextlib
 import doctest
 import importlib
 import inspect
+import io
 import pkgutil
+import re
+import runpy
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -212,6 +216,17 @@ def test_a_contract_name_has_an_example_that_runs(name: str):
     for test in found:
         runner.run(test, out=report.append)
     assert runner.summarize(verbose=False).failed == 0, "".join(report)
+
+
+def test_the_example_of_the_readme_prints_what_it_says(tmp_path: Path):
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    examples = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", text, flags=re.DOTALL)
+    assert len(examples) == text.count("```python") == 1
+    script = tmp_path / "example.py"
+    script.write_text(examples[0][0], encoding="utf-8")
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        runpy.run_path(str(script))
+    assert printed.getvalue() == examples[0][1]
 
 
 @pytest.mark.parametrize("room", ROOMS)
