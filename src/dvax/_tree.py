@@ -1,0 +1,112 @@
+"""Arithmetic on pytrees of arrays: a state or a control is one array, or a tuple of arrays."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .errors import InputError, InputProblem
+
+Tree = Any
+"""A pytree of arrays of one floating type."""
+
+
+def add(a: Tree, b: Tree) -> Tree:
+    return jtu.tree_map(jnp.add, a, b)
+
+
+def sub(a: Tree, b: Tree) -> Tree:
+    return jtu.tree_map(jnp.subtract, a, b)
+
+
+def scale(c: Any, a: Tree) -> Tree:
+    return jtu.tree_map(lambda leaf: c * leaf, a)
+
+
+def where(condition: Any, a: Tree, b: Tree) -> Tree:
+    return jtu.tree_map(lambda p, q: jnp.where(condition, p, q), a, b)
+
+
+def zeros_like(a: Tree) -> Tree:
+    return jtu.tree_map(jnp.zeros_like, a)
+
+
+def all_finite(a: Tree) -> jax.Array:
+    leaves = [jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(a)]
+    return jnp.all(jnp.stack(leaves)) if len(leaves) > 1 else leaves[0]
+
+
+def shapes(a: Tree) -> Tree:
+    """The tree with every array replaced by its shape: what two compatible trees share."""
+    return jtu.tree_map(jnp.shape, a)
+
+
+def same_shape(a: Tree, b: Tree) -> bool:
+    if jtu.tree_structure(a) != jtu.tree_structure(b):
+        return False
+    pairs = zip(jtu.tree_leaves(a), jtu.tree_leaves(b), strict=True)
+    return all(jnp.shape(p) == jnp.shape(q) for p, q in pairs)
+
+
+def is_concrete(*trees: Tree) -> bool:
+    """Whether every leaf has a value now, so that a check on values can be made at all."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jtu.tree_leaves(trees))
+
+
+def as_float(a: Tree, name: str) -> Tree:
+    """Arrays of a floating type from what the user gave; Python numbers take JAX's default type.
+
+    An integer or boolean *array* is refused rather than cast: its owner may have meant integer
+    arithmetic, and a silent cast would hide that.
+    """
+
+    def one(leaf: Any) -> jax.Array:
+        if isinstance(leaf, bool | complex):
+            raise _not_real(name, repr(leaf))
+        if isinstance(leaf, int | float):
+            return jnp.asarray(float(leaf))
+        if isinstance(leaf, list):
+            leaf = np.asarray(leaf, dtype=float)
+        if not hasattr(leaf, "dtype"):
+            raise _not_real(name, f"{type(leaf).__name__} {leaf!r}")
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
+                return jnp.asarray(leaf)
+            raise _not_real(name, f"an array of {leaf.dtype}")
+        return jnp.asarray(leaf)
+
+    return jtu.tree_map(one, a, is_leaf=lambda leaf: isinstance(leaf, list))
+
+
+def require(condition: Callable[[], Any], name: str, given: Any, rule: str, mend: str) -> None:
+    """Raise an `InputError` unless `condition()` is true on concrete values.
+
+    Values that are traced (inside `jax.jit`, `jax.grad`, ...) cannot be looked at, so they pass.
+    """
+    if is_concrete(given) and not bool(condition()):
+        raise InputError(InputProblem(name, short(given), rule, mend))
+
+
+def short(value: Any) -> str:
+    """A value as a message shows it: whole when small, summarised when large."""
+    leaves = jtu.tree_leaves(value)
+    if len(leaves) == 1 and hasattr(leaves[0], "shape") and np.size(leaves[0]) > 6:
+        array = np.asarray(leaves[0])
+        return f"an array of shape {array.shape} with range [{array.min():.6g}, {array.max():.6g}]"
+    if len(leaves) == 1:
+        return str(np.asarray(leaves[0]))
+    return str(value)
+
+
+def _not_real(name: str, given: str) -> InputError:
+    return InputError(
+        InputProblem(
+            name,
+            given,
+            "it must be a real number, a floating-point array, or a tuple of these",
+            f"Write {name} with a decimal point or convert it: jnp.asarray({name}, float)",
+        )
+    )

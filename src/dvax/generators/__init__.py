@@ -1,0 +1,9 @@
+"""Generators A of strongly continuous semigroups: e^{hA}, the φ-functions, the growth bound."""
+
+from .abstract import AbstractGenerator as AbstractGenerator
+from .abstract import AbstractPropagator as AbstractPropagator
+from .abstract import Growth as Growth
+from .dense import Dense as Dense
+from .diagonal import Diagonal as Diagonal
+from .product import Product as Product
+from .scalar import Scalar as Scalar

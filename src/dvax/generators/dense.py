@@ -1,0 +1,72 @@
+"""A given as a matrix."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from .. import _tree
+from .._tree import Tree
+from ..errors import InputError, InputProblem
+from ..spaces import AbstractSpace
+from .abstract import AbstractGenerator, AbstractPropagator, Growth
+from .phi import phi_matrix
+
+
+class Dense(AbstractGenerator):
+    """A v = matrix @ v for states that are vectors of n entries.
+
+    The growth bound is the logarithmic norm: M = 1 and ω = λ_max of the symmetric part of A in the
+    space's inner product, since d/dt ½‖e^{At}v‖² = ⟨A e^{At}v, e^{At}v⟩ ≤ ω‖e^{At}v‖².
+
+    **Arguments:** `matrix`: square, in 1/time.
+
+    **Raises:** `dvax.InputError` where the matrix is not square.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> A = dvax.generators.Dense(jnp.array([[-1.0, 2.0], [-2.0, -1.0]]))
+    >>> float(A.growth(dvax.spaces.Euclidean(2)).omega)
+    -1.0
+
+    ```
+    """
+
+    matrix: jax.Array
+
+    def __init__(self, matrix: Any):
+        self.matrix = _tree.as_float(matrix, "dvax.generators.Dense(matrix)")
+        shape = self.matrix.shape
+        if len(shape) != 2 or shape[0] != shape[1]:
+            raise InputError(
+                InputProblem(
+                    "dvax.generators.Dense(matrix)",
+                    f"shape {shape}",
+                    "a generator maps the state space to itself, so its matrix is square",
+                    "Use dvax.generators.Diagonal for a vector of diagonal entries",
+                )
+            )
+
+    def apply(self, v: Tree) -> Tree:
+        return self.matrix @ v
+
+    def propagator(self, h: Any, order: int) -> "MatrixPropagator":
+        return MatrixPropagator(phi_matrix(h * self.matrix, order))
+
+    def growth(self, space: AbstractSpace) -> Growth:
+        # ⟨Av, v⟩ = vᵀWAv: with q = W^{1/2}v it is qᵀ(W^{1/2}AW^{-1/2})q, so weights only rescale.
+        root = jnp.broadcast_to(jnp.sqrt(space.weights()), self.matrix.shape[:1])
+        similar = root[:, None] * self.matrix / root[None, :]
+        return Growth(jnp.ones(()), jnp.linalg.eigvalsh(0.5 * (similar + similar.T))[-1])
+
+
+class MatrixPropagator(AbstractPropagator):
+    """φₖ(hA) as matrices."""
+
+    matrices: tuple[jax.Array, ...]
+
+    def exp(self, v: Tree) -> Tree:
+        return self.matrices[0] @ v
+
+    def phi(self, k: int, v: Tree) -> Tree:
+        return self.matrices[k] @ v

@@ -1,0 +1,42 @@
+"""A = diag(a₁, …, aₙ)."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from .. import _tree
+from .._tree import Tree
+from ..spaces import AbstractSpace
+from .abstract import AbstractGenerator, Growth
+from .phi import phi_scalar
+from .scalar import ElementwisePropagator
+
+
+class Diagonal(AbstractGenerator):
+    """A v = a ⊙ v, elementwise: M = 1 and ω = max aᵢ in every norm with diagonal weights.
+
+    **Arguments:** `entries`: an array of the state's shape, in 1/time.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> A = dvax.generators.Diagonal(jnp.array([-1.0, -2.0]))
+    >>> float(A.growth(dvax.spaces.Euclidean(2)).omega)
+    -1.0
+
+    ```
+    """
+
+    entries: jax.Array
+
+    def __init__(self, entries: Any):
+        self.entries = _tree.as_float(entries, "dvax.generators.Diagonal(entries)")
+
+    def apply(self, v: Tree) -> Tree:
+        return self.entries * v
+
+    def propagator(self, h: Any, order: int) -> ElementwisePropagator:
+        return ElementwisePropagator(phi_scalar(h * self.entries, order))
+
+    def growth(self, space: AbstractSpace) -> Growth:
+        return Growth(jnp.ones(()), jnp.max(jnp.real(self.entries)))

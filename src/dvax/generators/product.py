@@ -1,0 +1,54 @@
+"""A = A₁ ⊕ A₂ ⊕ … on tuples."""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from .._tree import Tree
+from ..spaces import AbstractSpace
+from ..spaces import Product as ProductSpace
+from .abstract import AbstractGenerator, AbstractPropagator, Growth
+
+
+class Product(AbstractGenerator):
+    """A (x₁, x₂, …) = (A₁x₁, A₂x₂, …): the semigroup acts part by part.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> g = dvax.generators
+    >>> A = g.Product(g.Scalar(-1.0), g.Diagonal(jnp.array([-2.0, -3.0])))
+    >>> A.apply((jnp.array(1.0), jnp.array([1.0, 1.0])))[1].tolist()
+    [-2.0, -3.0]
+
+    ```
+    """
+
+    parts: tuple[AbstractGenerator, ...]
+
+    def __init__(self, *parts: AbstractGenerator):
+        self.parts = parts
+
+    def apply(self, v: Tree) -> Tree:
+        return tuple(a.apply(p) for a, p in zip(self.parts, v, strict=True))
+
+    def propagator(self, h: Any, order: int) -> "ProductPropagator":
+        return ProductPropagator(tuple(a.propagator(h, order) for a in self.parts))
+
+    def growth(self, space: AbstractSpace) -> Growth:
+        spaces = space.spaces if isinstance(space, ProductSpace) else (space,) * len(self.parts)
+        bounds = [a.growth(s) for a, s in zip(self.parts, spaces, strict=True)]
+        # max over parts of M e^{ωt} is at most (max M) e^{(max ω)t}.
+        worst = [jnp.max(jnp.stack([jnp.asarray(b[i]) for b in bounds])) for i in (0, 1)]
+        return Growth(*worst)
+
+
+class ProductPropagator(AbstractPropagator):
+    """Propagators of the parts, side by side."""
+
+    parts: tuple[AbstractPropagator, ...]
+
+    def exp(self, v: Tree) -> Tree:
+        return tuple(p.exp(q) for p, q in zip(self.parts, v, strict=True))
+
+    def phi(self, k: int, v: Tree) -> Tree:
+        return tuple(p.phi(k, q) for p, q in zip(self.parts, v, strict=True))

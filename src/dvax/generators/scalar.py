@@ -1,0 +1,53 @@
+"""A = a I."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .. import _tree
+from .._tree import Tree
+from ..spaces import AbstractSpace
+from .abstract import AbstractGenerator, AbstractPropagator, Growth
+from .phi import phi_scalar
+
+
+class Scalar(AbstractGenerator):
+    """A = a I on any space: e^{At} = e^{at} I, so M = 1 and ω = a.
+
+    **Arguments:** `a`: a real number, in 1/time.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> print(f"{float(dvax.generators.Scalar(-1.0).semigroup(1.0, jnp.array(1.0))):.6f}")
+    0.367879
+
+    ```
+    """
+
+    a: jax.Array
+
+    def __init__(self, a: Any):
+        self.a = _tree.as_float(a, "dvax.generators.Scalar(a)")
+
+    def apply(self, v: Tree) -> Tree:
+        return _tree.scale(self.a, v)
+
+    def propagator(self, h: Any, order: int) -> "ElementwisePropagator":
+        return ElementwisePropagator(phi_scalar(h * self.a, order))
+
+    def growth(self, space: AbstractSpace) -> Growth:
+        return Growth(jnp.ones(()), self.a)
+
+
+class ElementwisePropagator(AbstractPropagator):
+    """φₖ(hA) as factors that multiply elementwise: A is a number or a diagonal."""
+
+    factors: tuple[jax.Array, ...]
+
+    def exp(self, v: Tree) -> Tree:
+        return self.phi(0, v)
+
+    def phi(self, k: int, v: Tree) -> Tree:
+        return jtu.tree_map(lambda leaf: self.factors[k] * leaf, v)

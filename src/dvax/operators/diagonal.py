@@ -1,0 +1,50 @@
+"""P = diag(p₁, …, pₙ)."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from .. import _tree
+from .._tree import Tree
+from ..spaces import AbstractSpace
+from .abstract import AbstractOperator, Spectrum
+
+
+class Diagonal(AbstractOperator):
+    """P v = p ⊙ v, elementwise, with every pᵢ > 0.
+
+    **Raises:** `dvax.InputError` where an entry is not positive.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> P = dvax.operators.Diagonal(jnp.array([1.0, 2.0]))
+    >>> float(P.spectrum(dvax.spaces.Euclidean(2)).norm_P_inv)
+    1.0
+
+    ```
+    """
+
+    entries: jax.Array
+
+    def __init__(self, entries: Any):
+        self.entries = _tree.as_float(entries, "dvax.operators.Diagonal(entries)")
+        _tree.require(
+            lambda: jnp.all(self.entries > 0),
+            "dvax.operators.Diagonal(entries)",
+            self.entries,
+            "P must be coercive, so every entry is positive",
+            "Leave out or regularise the entries that are not",
+        )
+
+    def apply(self, v: Tree) -> Tree:
+        return self.entries * v
+
+    def inverse(self, v: Tree) -> Tree:
+        return v / self.entries
+
+    def check(self, space: AbstractSpace) -> None:
+        """Nothing to do: a positive diagonal is both for every diagonal weight."""
+
+    def spectrum(self, space: AbstractSpace) -> Spectrum:
+        return Spectrum(jnp.min(self.entries), jnp.max(self.entries))

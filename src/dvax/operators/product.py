@@ -1,0 +1,48 @@
+"""P = P₁ ⊕ P₂ ⊕ … on tuples."""
+
+import jax.numpy as jnp
+
+from .._tree import Tree
+from ..spaces import AbstractSpace
+from ..spaces import Product as ProductSpace
+from .abstract import AbstractOperator, Spectrum
+
+
+class Product(AbstractOperator):
+    """P (u₁, u₂, …) = (P₁u₁, P₂u₂, …).
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> P = dvax.operators.Product(dvax.operators.Scaling(2.0), dvax.operators.Scaling(3.0))
+    >>> [float(v) for v in P.apply((jnp.array(1.0), jnp.array(1.0)))]
+    [2.0, 3.0]
+
+    ```
+    """
+
+    parts: tuple[AbstractOperator, ...]
+
+    def __init__(self, *parts: AbstractOperator):
+        self.parts = parts
+
+    def apply(self, v: Tree) -> Tree:
+        return tuple(p.apply(q) for p, q in zip(self.parts, v, strict=True))
+
+    def inverse(self, v: Tree) -> Tree:
+        return tuple(p.inverse(q) for p, q in zip(self.parts, v, strict=True))
+
+    def check(self, space: AbstractSpace) -> None:
+        for part, own in zip(self.parts, _parts(space, len(self.parts)), strict=True):
+            part.check(own)
+
+    def spectrum(self, space: AbstractSpace) -> Spectrum:
+        pairs = zip(self.parts, _parts(space, len(self.parts)), strict=True)
+        ends = [part.spectrum(own) for part, own in pairs]
+        return Spectrum(
+            jnp.min(jnp.stack([jnp.asarray(e.m) for e in ends])),
+            jnp.max(jnp.stack([jnp.asarray(e.norm) for e in ends])),
+        )
+
+
+def _parts(space: AbstractSpace, count: int) -> tuple[AbstractSpace, ...]:
+    return space.spaces if isinstance(space, ProductSpace) else (space,) * count

@@ -1,0 +1,49 @@
+"""P = b I."""
+
+from typing import Any
+
+import jax
+
+from .. import _tree
+from .._tree import Tree
+from ..spaces import AbstractSpace
+from .abstract import AbstractOperator, Spectrum
+
+
+class Scaling(AbstractOperator):
+    """P v = b v with b > 0.
+
+    **Raises:** `dvax.InputError` where b ≤ 0: P would not be coercive.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> float(dvax.operators.Scaling(4.0).inverse(jnp.array(2.0)))
+    0.5
+
+    ```
+    """
+
+    b: jax.Array
+
+    def __init__(self, b: Any):
+        self.b = _tree.as_float(b, "dvax.operators.Scaling(b)")
+        _tree.require(
+            lambda: self.b > 0,
+            "dvax.operators.Scaling(b)",
+            self.b,
+            "P must be coercive, so b > 0",
+            "Give a positive scaling",
+        )
+
+    def apply(self, v: Tree) -> Tree:
+        return _tree.scale(self.b, v)
+
+    def inverse(self, v: Tree) -> Tree:
+        # A product with one reciprocal: a division for every entry would cost more than the law.
+        return _tree.scale(1.0 / self.b, v)
+
+    def check(self, space: AbstractSpace) -> None:
+        """Nothing to do: a positive multiple of I is both in every space."""
+
+    def spectrum(self, space: AbstractSpace) -> Spectrum:
+        return Spectrum(self.b, self.b)

@@ -1,0 +1,80 @@
+"""Balls of the space's norm."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from .. import _tree
+from .._tree import Tree
+from ..errors import InputError, InputProblem
+from ..spaces import AbstractSpace
+from .abstract import AbstractSet
+
+
+class Ball(AbstractSet):
+    """K = {y : ‖y − center‖ ≤ radius} in the norm of the space.
+
+    **Arguments:** `center`: an element, or a number that stands for a constant one; `radius` ≥ 0.
+
+    **Raises:** `dvax.InputError` where the radius is negative or not finite.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> K = dvax.sets.Ball(0.0, 1.0)
+    >>> K.project(jnp.array([3.0, 4.0]), dvax.spaces.Euclidean(2)).round(6).tolist()
+    [0.6, 0.8]
+
+    ```
+    """
+
+    center: Tree
+    radius: jax.Array
+
+    def __init__(self, center: Any, radius: Any):
+        self.center = _tree.as_float(center, "dvax.sets.Ball(center)")
+        self.radius = _tree.as_float(radius, "dvax.sets.Ball(radius)")
+        _tree.require(
+            lambda: (self.radius >= 0) & jnp.isfinite(self.radius),
+            "dvax.sets.Ball(radius)",
+            self.radius,
+            "a ball has a finite radius ≥ 0, or it is empty or the whole space",
+            "Use dvax.sets.WholeSpace() where there is no constraint",
+        )
+
+    def project(self, z: Tree, space: AbstractSpace) -> Tree:
+        offset = self._minus_center(z)
+        length = space.norm(offset)
+        outside = length >= self.radius
+        shrink = jnp.where(outside, self.radius / jnp.where(length > 0, length, 1.0), 1.0)
+        moved = _tree.scale(shrink, offset)
+        # Inside, z itself: center + (z − center) would lose digits for a far-away center.
+        pulled = (
+            _tree.add(self.center, moved)
+            if _tree.same_shape(self.center, z)
+            else jax.tree_util.tree_map(lambda leaf: self.center + leaf, moved)
+        )
+        return _tree.where(outside, pulled, z)
+
+    def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
+        return None
+
+    def check(self, like: Tree) -> None:
+        if jnp.ndim(self.radius) != 0 or not (
+            _tree.same_shape(self.center, like)
+            or (_tree.shapes(self.center) == () and not isinstance(self.center, tuple))
+        ):
+            raise InputError(
+                InputProblem(
+                    "dvax.sets.Ball(center, radius)",
+                    f"shapes {_tree.shapes(self.center)} and {jnp.shape(self.radius)}",
+                    f"the center is an element of shape {_tree.shapes(like)} or a number, "
+                    "the radius a number",
+                    "Use dvax.sets.Product for one ball a part",
+                )
+            )
+
+    def _minus_center(self, z: Tree) -> Tree:
+        if _tree.same_shape(self.center, z):
+            return _tree.sub(z, self.center)
+        return jax.tree_util.tree_map(lambda leaf: leaf - self.center, z)

@@ -1,0 +1,79 @@
+"""Boxes: pointwise intervals."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from .. import _tree
+from .._tree import Tree
+from ..errors import InputError, InputProblem
+from ..spaces import AbstractSpace
+from .abstract import AbstractSet
+
+
+class Box(AbstractSet):
+    """K = {y : lower ≤ y ≤ upper} pointwise; bounds may be infinite.
+
+    The projection clips pointwise. That is the projection of every space whose inner product is
+    diagonal (Euclidean, or with quadrature weights), which all spaces of dvax are; with a full mass
+    matrix it would not be.
+
+    **Arguments:** `lower`, `upper`: numbers or arrays, broadcast against y.
+
+    **Raises:** `dvax.InputError` where lower > upper, or a bound is NaN, or lower = +∞.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> K = dvax.sets.Box(0.0, jnp.inf)
+    >>> K.project(jnp.array([-1.0, 2.0]), dvax.spaces.Euclidean(2)).tolist()
+    [0.0, 2.0]
+
+    ```
+    """
+
+    lower: jax.Array
+    upper: jax.Array
+
+    def __init__(self, lower: Any, upper: Any):
+        self.lower = _tree.as_float(lower, "dvax.sets.Box(lower)")
+        self.upper = _tree.as_float(upper, "dvax.sets.Box(upper)")
+        _tree.require(
+            lambda: jnp.all(self.lower <= self.upper),
+            "dvax.sets.Box(lower, upper)",
+            (self.lower, self.upper),
+            "lower ≤ upper everywhere, or the set is empty and the law has no solution",
+            "Swap the bounds, or widen the interval",
+        )
+        _tree.require(
+            lambda: jnp.all(self.lower < jnp.inf) & jnp.all(self.upper > -jnp.inf),
+            "dvax.sets.Box(lower, upper)",
+            (self.lower, self.upper),
+            "lower < +∞ and upper > −∞, or the set is empty",
+            "Use −∞ and +∞ for the sides that are free",
+        )
+
+    def project(self, z: Tree, space: AbstractSpace) -> Tree:
+        # At a bound the bound's own derivative is taken: the convention of AbstractSet.
+        return jnp.where(z <= self.lower, self.lower, jnp.where(z >= self.upper, self.upper, z))
+
+    def intervals(self, like: Tree) -> tuple[Tree, Tree]:
+        shape = jnp.shape(like)
+        return jnp.broadcast_to(self.lower, shape), jnp.broadcast_to(self.upper, shape)
+
+    def check(self, like: Tree) -> None:
+        shape = jnp.shape(like)
+        for name, bound in (("lower", self.lower), ("upper", self.upper)):
+            try:
+                fits = jnp.broadcast_shapes(bound.shape, shape) == shape
+            except ValueError:
+                fits = False
+            if not fits:
+                raise InputError(
+                    InputProblem(
+                        f"dvax.sets.Box({name})",
+                        f"shape {bound.shape}",
+                        f"the bound must broadcast against y = P u, of shape {shape}",
+                        "Give the bound that shape, or set control_space= of dvax.Problem",
+                    )
+                )

@@ -1,0 +1,35 @@
+"""The same value at all times."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from .. import _tree
+from .abstract import AbstractSignal
+
+
+class Constant(AbstractSignal):
+    """s(t) = value.
+
+    ```python
+    >>> import dvax
+    >>> float(dvax.signals.Constant(3.0)(0.7))
+    3.0
+
+    ```
+    """
+
+    constant: jax.Array
+
+    def __init__(self, value: Any):
+        self.constant = _tree.as_float(value, "dvax.signals.Constant(value)")
+
+    def value(self, t: Any) -> jax.Array:
+        return self.constant
+
+    def knots(self) -> Any:
+        return np.zeros(0)
+
+    def span(self) -> tuple[Any, Any]:
+        return -np.inf, np.inf

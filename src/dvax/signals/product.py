@@ -1,0 +1,40 @@
+"""Products of signals: a profile over space times a record in time."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from .abstract import AbstractSignal
+from .constant import Constant
+
+
+class Product(AbstractSignal):
+    """s(t) = a(t) b(t), with broadcasting: `Constant(profile) * Table(...)` is a separable field.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> s = dvax.signals
+    >>> field = s.Constant(jnp.array([1.0, 2.0])) * s.Table([0.0, 1.0], [0.0, 10.0])
+    >>> field(0.5).tolist()
+    [5.0, 10.0]
+
+    ```
+    """
+
+    a: AbstractSignal
+    b: AbstractSignal
+
+    def __init__(self, a: AbstractSignal, b: Any):
+        self.a = a
+        self.b = b if isinstance(b, AbstractSignal) else Constant(b)
+
+    def value(self, t: Any) -> jax.Array:
+        return self.a(t) * self.b(t)
+
+    def knots(self) -> Any:
+        # The factors report their own knots when they are evaluated.
+        return np.zeros(0)
+
+    def span(self) -> tuple[Any, Any]:
+        return -np.inf, np.inf

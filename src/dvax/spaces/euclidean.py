@@ -1,0 +1,35 @@
+"""ℝⁿ, or any array shape, with the dot product."""
+
+import jax
+import jax.numpy as jnp
+
+from .._tree import Tree
+from .abstract import AbstractSpace
+
+
+class Euclidean(AbstractSpace):
+    """Arrays of one shape with ⟨a, b⟩ = Σ aᵢ bᵢ.
+
+    **Arguments:** `shape`: the arrays' shape; an integer n means `(n,)`, nothing means a scalar.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> float(dvax.spaces.Euclidean(2).norm(jnp.array([3.0, 4.0])))
+    5.0
+
+    ```
+    """
+
+    shape: tuple[int, ...]
+
+    def __init__(self, shape: int | tuple[int, ...] = ()):
+        self.shape = (shape,) if isinstance(shape, int) else tuple(shape)
+
+    def inner(self, a: Tree, b: Tree) -> jax.Array:
+        return jnp.sum(a * b)
+
+    def zeros(self) -> Tree:
+        return jnp.zeros(self.shape)
+
+    def weights(self) -> Tree:
+        return jnp.ones(())

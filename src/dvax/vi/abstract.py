@@ -1,0 +1,68 @@
+"""What a solver of the frozen variational inequality owes."""
+
+import abc
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+
+from .._tree import Tree
+from ..sets import AbstractSet
+from ..spaces import AbstractSpace
+
+Operator = Callable[[Tree], Tree]
+
+
+class RESULTS(eqx.Enumeration):
+    """How a solve ended, in a sentence."""
+
+    successful = "The tolerance was met."
+    max_steps = (
+        "The largest number of iterations was reached before the tolerance. The best iterate is "
+        "returned with its bound; raise max_steps, loosen tol, or choose another solver."
+    )
+    nonfinite = (
+        "The operator F or the projection returned NaN or infinity. Evaluate F at the returned y "
+        "to see where."
+    )
+    no_bracket = (
+        "No sign change of F was found on an unbounded interval, so F is not strongly "
+        "pseudomonotone there. Bound the interval, or check the sign of F."
+    )
+
+
+class Frozen(NamedTuple):
+    """VI(K, F) in a space: find y ∈ K with ⟨F(y), v − y⟩ ≥ 0 for all v ∈ K.
+
+    `gamma` and `L_F` are the moduli of F where they are known, None where not.
+    """
+
+    F: Operator
+    K: AbstractSet
+    space: AbstractSpace
+    gamma: Any = None
+    L_F: Any = None
+
+
+class Answer(NamedTuple):
+    """What a solver returns.
+
+    `y` lies in K. `z` is a point whose projection is y: the unconstrained value of the law, which
+    moves even while y sits on the boundary. `residual` is ‖w‖ for a w ∈ F(y) + N_K(y), so that
+    ‖y − y*‖ ≤ residual/γ; it is 0 where y is the solution in closed form (up to rounding).
+    """
+
+    y: Tree
+    z: Tree
+    residual: jax.Array
+    iterations: jax.Array
+    result: RESULTS
+
+
+class AbstractSolver(eqx.Module):
+    """A method for VI(K, F). Its answer is differentiable with respect to all that F and K hold."""
+
+    @abc.abstractmethod
+    def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
+        """Solve from the guess y0 until ‖w‖/γ ≤ tol, or ‖w‖ ≤ tol where γ is unknown."""

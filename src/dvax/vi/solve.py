@@ -1,0 +1,85 @@
+"""`dvax.solve_vi`: one frozen variational inequality, usable on its own."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .. import _tree
+from .._tree import Tree
+from ..sets import AbstractSet
+from ..spaces import AbstractSpace, Euclidean, Product
+from .abstract import RESULTS, AbstractSolver, Frozen
+from .auto import Auto
+from .certificate import certify
+
+
+class VISolution(eqx.Module):
+    """The solution of a variational inequality with its certificate.
+
+    `y` ∈ K; `residual` = ‖w‖ for a w ∈ F(y) + N_K(y); `error_bound` ≥ ‖y − y*‖ where γ was given,
+    else None; `iterations`; `result`, which is `dvax.vi.RESULTS.successful` or says what went wrong.
+    """
+
+    y: Tree
+    residual: jax.Array
+    error_bound: jax.Array | None
+    iterations: jax.Array
+    result: RESULTS
+
+
+def solve_vi(
+    F: Callable[[Tree, Any], Tree],
+    K: AbstractSet,
+    y0: Tree,
+    args: Any = None,
+    solver: AbstractSolver | None = None,
+    tol: float = 1e-10,
+    gamma: Any = None,
+    L_F: Any = None,
+    space: AbstractSpace | None = None,
+) -> VISolution:
+    """Find y ∈ K with ⟨F(y), v − y⟩ ≥ 0 for all v ∈ K (paper, eq:vi_canonical).
+
+    **Arguments:** `F(y, args)`, traceable; `K`, a set; `y0`, a guess, whose shape is y's; `args`, any
+    pytree; `solver`, `dvax.vi.Auto()` by default; `tol`, on the true error ‖y − y*‖ where `gamma` is
+    given, else on the residual ‖w‖; `gamma`, the modulus of strong pseudomonotonicity, declared by
+    the caller; `L_F`, a Lipschitz constant of F; `space`, Euclidean by default.
+
+    **Returns:** a `VISolution`. The answer is certified again after the solve, by one projection step
+    that shares nothing with the method.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> vi = dvax.solve_vi(lambda y, args: 2.0 * y - args, dvax.sets.Box(0.0, 1.0),
+    ...                    jnp.zeros(2), args=jnp.array([1.0, 5.0]), gamma=2.0)
+    >>> vi.y.tolist(), bool(vi.error_bound < 1e-10)
+    ([0.5, 1.0], True)
+
+    ```
+    """
+    y0 = _tree.as_float(y0, "y0")
+    space = default_space(y0) if space is None else space
+    K.check(y0)
+    frozen = Frozen(lambda y: F(y, args), K, space, gamma, L_F)
+    answer = (Auto() if solver is None else solver).solve(frozen, y0, tol)
+    tau = 1.0 if L_F is None else 1.0 / L_F
+    checked = certify(frozen.F, K, space, answer.y, tau)
+    # `checked.y` is a projection step from y. Its certificate covers y by the triangle inequality.
+    step = space.norm(_tree.sub(checked.y, answer.y))
+    if gamma is None:
+        return VISolution(answer.y, checked.norm, None, answer.iterations, answer.result)
+    bound = jnp.minimum(
+        checked.bound(gamma) + step,
+        jnp.where(answer.residual > 0, answer.residual / gamma, jnp.inf),
+    )
+    return VISolution(answer.y, checked.norm, bound, answer.iterations, answer.result)
+
+
+def default_space(like: Tree) -> AbstractSpace:
+    """The Euclidean space of elements shaped like `like`."""
+    if isinstance(like, tuple):
+        return Product(*(default_space(part) for part in like))
+    return Euclidean(jnp.shape(like))
