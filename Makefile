@@ -38,8 +38,9 @@ $(READY): pyproject.toml $(LOCK)
 	rm -rf $(VENV); \
 	$$python -m venv $(VENV) || { \
 	    echo 'python -m venv failed; on Debian the module is in the package python3-venv' >&2; exit 1; }
-	@# Compiling every file of every package would double the time; Python compiles what is imported.
-	@$(PY) -m pip install --quiet --no-compile --requirement $(LOCK)
+	@# The lock is complete, so nothing is resolved; Python compiles what it imports, so nothing is
+	@# compiled here. Either would double the time.
+	@$(PY) -m pip install --quiet --no-deps --no-compile --requirement $(LOCK)
 	@$(PY) -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 

@@ -14,9 +14,18 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
-# Every annotation below src/dvax, shapes included, is checked at each call. The hook must stand
-# before the first import of dvax, hence here and not in a fixture.
-jaxtyping.install_import_hook("dvax", "beartype.beartype")
+# Every annotation of the library, shapes included, is checked at each call. The hook must stand
+# before the first import of dvax, hence here and not in a fixture. The application is left out: it
+# promises an answer to input of any type, and a checker would answer first.
+APPLICATION = {"__init__", "__main__", "runs", "plots", "cli"}
+jaxtyping.install_import_hook(
+    [
+        f"dvax.{entry.stem}"
+        for entry in sorted((ROOT / "src" / "dvax").iterdir())
+        if entry.stem not in APPLICATION and (entry.is_dir() or entry.suffix == ".py")
+    ],
+    "beartype.beartype",
+)
 
 import jax  # noqa: E402  (its settings come from the lines above)
 

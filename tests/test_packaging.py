@@ -87,6 +87,11 @@ def test_the_lock_names_versions_and_nothing_else():
             assert "==" in line and "://" not in line and not line.startswith("-"), line
 
 
+def test_the_environment_is_consistent():
+    # `make` installs the lock without resolving it, so a package that the lock forgot shows here.
+    run(sys.executable, "-m", "pip", "check")
+
+
 def help_of(*arguments: str) -> str:
     """The heavy modules that are loaded once `dvax ARGUMENTS --help` has been printed."""
     code = f"""
