@@ -72,7 +72,7 @@ format: $(READY) ## rewrite the sources in the common format
 	$(PY) -m ruff format .
 
 docs: $(READY) ## the documentation as a site in ./site
-	$(PY) -m pip install --quiet --editable '.[docs]'
+	$(PY) -m pip install --quiet --no-build-isolation --editable '.[docs]'
 	$(PY) -m mkdocs build --strict
 
 lock: ## pin the newest releases that fit pyproject.toml (needs uv)
