@@ -57,7 +57,7 @@ class Import(NamedTuple):
     importer: str  # dotted module
     line: int
     imported: str  # dotted module, as deep as it is one
-    deferred: bool  # inside a function
+    deferred: bool  # not run when the module is loaded: inside a function, or for types alone
 
 
 def modules(package: Path) -> dict[str, Path]:
@@ -69,6 +69,10 @@ def modules(package: Path) -> dict[str, Path]:
     return found
 
 
+def for_types(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
+
+
 def imports(package: Path) -> list[Import]:
     """Every import statement of `package`, relative ones resolved."""
     known = modules(package)
@@ -78,7 +82,7 @@ def imports(package: Path) -> list[Import]:
         deferred = {
             id(inner)
             for node in ast.walk(tree)
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) or for_types(node)
             for inner in ast.walk(node)
         }
         home = name if file.name == "__init__.py" else name.rpartition(".")[0]
@@ -261,6 +265,7 @@ def test_a_planted_foreign_import_is_seen(tmp_path: Path):
         runs__store="import requests",
         cli__app="import jax",
         evolution__solution="def to_xarray():\n    import xarray",
+        evolution__stepper="if typing.TYPE_CHECKING:\n    import xarray",
     )
     assert sorted(line.split(":")[0] for line in foreign(house)) == [
         "dvax.cli.app",

@@ -81,6 +81,10 @@ def test_the_metadata_says_what_is_needed(wheel: Path):
         assert "dvax = dvax.cli:main" in archive.read(name).decode()
 
 
+def test_the_citation_is_of_this_version(wheel: Path):
+    assert f"\nversion: {version(wheel)}\n" in (ROOT / "CITATION.cff").read_text()
+
+
 def test_the_lock_names_versions_and_nothing_else():
     for line in (ROOT / "requirements-dev.lock").read_text().splitlines():
         if not line.lstrip().startswith("#"):
