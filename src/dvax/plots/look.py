@@ -1,0 +1,157 @@
+"""One look for every picture: colours safe for colour-blind readers, numbers and units as text."""
+
+import math
+import re
+from typing import Any
+
+import plotly.graph_objects as go
+from matplotlib.figure import Figure
+from plotly.subplots import make_subplots
+
+# Okabe and Ito (2008), in the order used here.
+BLUE, VERMILLION, GREEN, ORANGE, SKY, PURPLE = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#E69F00",
+    "#56B4E9",
+    "#CC79A7",
+)
+SERIES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
+INK, MUTED, RULE = "#1f2933", "#5f6b76", "#dde3e8"
+# Pale to strong: the order of the regimes survives a grey print and every kind of colour blindness.
+REGIME_COLOURS = ("#E9E6DC", SKY, VERMILLION)
+PRESSURE_MAP = "viridis"
+FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
+
+_SUPERSCRIPT = str.maketrans("-0123456789.", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹·")
+
+
+def number(value: Any, digits: int = 4) -> str:
+    """A number as a reader wants it: `digits` significant ones, powers of ten written out."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value)
+    if isinstance(value, int) or not math.isfinite(value):
+        return f"{value:,}".replace(",", "\u202f") if isinstance(value, int) else str(value)
+    if value == 0 or 1e-3 <= abs(value) < 1e6:
+        return f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.0f}"
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    return f"{float(mantissa):g} × 10{str(int(exponent)).translate(_SUPERSCRIPT)}"
+
+
+def unit_text(unit: str) -> str:
+    """A unit for the eye: um as µm, products with a dot, powers raised."""
+    if unit in ("", "1", "dimensionless"):
+        return ""
+    text = re.sub(r"\bum\b", "µm", unit)
+    text = re.sub(r"(?:\*\*|\^)\(?(-?[0-9.]+)\)?", lambda m: m[1].translate(_SUPERSCRIPT), text)
+    return re.sub(r"\s*\*\s*", " ", text)
+
+
+def counted(count: int, noun: str) -> str:
+    """A count with its noun: 1 frame, 2 frames."""
+    return f"{count} {noun}" + "s" * (count != 1)
+
+
+def quantity(value: Any, unit: str) -> str:
+    """A number with its unit; no trailing space where there is none."""
+    return f"{number(value)} {unit_text(unit)}".strip()
+
+
+def axis_title(words: str, unit: str) -> str:
+    """`words [unit]`, or the words alone for a pure number."""
+    return f"{words} [{unit_text(unit)}]" if unit_text(unit) else words
+
+
+def _axis() -> dict[str, Any]:
+    return dict(
+        showline=True,
+        linecolor=MUTED,
+        gridcolor=RULE,
+        zeroline=False,
+        ticks="outside",
+        tickcolor=MUTED,
+        automargin=True,
+        title=dict(standoff=8, font=dict(size=13)),
+    )
+
+
+def blank(height: int, row_heights: tuple[float, ...] = (1.0,)) -> go.Figure:
+    """An empty interactive figure in the house's look; its title stands in the page, above it.
+
+    Several `row_heights` make panels one above the other that share the horizontal axis.
+    """
+    figure = make_subplots(
+        rows=len(row_heights),
+        cols=1,
+        shared_xaxes=True,
+        row_heights=list(row_heights),
+        vertical_spacing=0.05,
+    )
+    axis = _axis()
+    figure.update_layout(
+        template=go.layout.Template(layout=dict(xaxis=axis, yaxis=axis)),
+        height=height,
+        font=dict(family=FONT, size=13, color=INK),
+        paper_bgcolor="white",
+        plot_bgcolor="white",
+        margin=dict(l=56, r=16, t=16, b=44),
+        hoverlabel=dict(font=dict(family=FONT)),
+        legend=dict(
+            traceorder="normal", orientation="h", x=0, y=1.01, xanchor="left", yanchor="bottom"
+        ),
+    )
+    return figure
+
+
+def pressure_bar(figure: go.Figure, words: str, height: int) -> dict[str, Any]:
+    """A flat colour bar for the top margin of `figure`, `height` pixels tall; widens that margin.
+
+    It is placed against the container: placed against the panel it moves the margin after the axis
+    title has been placed, and the title ends up on the tick labels (Plotly.js 4.1).
+    """
+    title = dict(text=words, font=dict(size=13), x=0, xref="paper", y=1, yref="container")
+    figure.update_layout(
+        margin=dict(t=78), title=dict(**title, yanchor="top", pad=dict(t=4), automargin=False)
+    )
+    return dict(
+        orientation="h",
+        yref="container",
+        y=1 - 24 / height,
+        yanchor="top",
+        thickness=12,
+        len=1.0,
+        ypad=4,
+    )
+
+
+# The same look for the still pictures.
+STILL_STYLE: dict[Any, Any] = {
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.titlelocation": "left",
+    "axes.edgecolor": MUTED,
+    "axes.labelcolor": INK,
+    "axes.grid": True,
+    "grid.color": RULE,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "text.color": INK,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "legend.frameon": False,
+    "figure.dpi": 150,
+    "savefig.dpi": 150,
+}
+
+
+def still_axes(
+    rows: int = 1, columns: int = 1, *, figsize: tuple[float, float], **options: Any
+) -> tuple[Figure, Any]:
+    """A still figure and its axes, as `matplotlib.pyplot.subplots` gives them.
+
+    Without pyplot: no global state to close, and no window system is looked for.
+    """
+    figure = Figure(figsize=figsize, layout="constrained")
+    return figure, figure.subplots(rows, columns, **options)

@@ -1,0 +1,67 @@
+"""From a run directory to its report: `report.html` and `figures/*.png`."""
+
+import os
+from pathlib import Path
+
+from dvax.plots.certificate import certificate_picture
+from dvax.plots.histories import histories_picture
+from dvax.plots.page import page
+from dvax.plots.picture import Picture
+from dvax.plots.pressure import pressure_picture
+from dvax.plots.record import RunRecord, read_run
+from dvax.plots.regimes import regime_picture
+from dvax.plots.scan import scan
+from dvax.plots.separation import separation_picture
+from dvax.plots.surface import surface_pictures
+
+
+def build_report(run_dir: Path | str, *, stills: bool = True) -> Path:
+    """Write `report.html`, and with `stills` a PNG a picture, into the run directory `run_dir`.
+
+    Works on a run that stopped early too, and says so at the top of the page. Returns the path of
+    the page. Raises InputError where `run_dir` is not a run directory or a file in it is damaged.
+    """
+    run = read_run(Path(run_dir))
+    pictures, missing = _pictures(run)
+    if stills:
+        _write_stills(run.directory / "figures", pictures)
+    return _write_whole(run.directory / "report.html", page(run, pictures, missing))
+
+
+def _pictures(run: RunRecord) -> tuple[list[Picture], list[str]]:
+    """The pictures that the run can give, and a sentence for each that it cannot."""
+    if run.trajectory is None:
+        return [], ["There is no picture, because the run wrote no frame."]
+    found = scan(run)
+    pictures: list[Picture] = []
+    if found.cells is not None:
+        pictures.append(pressure_picture(run, found))
+    else:
+        pictures.extend(surface_pictures(run, found))
+    pictures.append(regime_picture(run, found))
+    pictures.append(histories_picture(run, found))
+    missing: list[str] = []
+    certificate, separation = certificate_picture(run), separation_picture(run)
+    if certificate is None:
+        missing.append("Certified error: the trajectory holds no error bound.")
+    else:
+        pictures.append(certificate)
+    if separation is None:
+        missing.append("Certified decay: the run had no companion trajectory.")
+    else:
+        pictures.append(separation)
+    return pictures, missing
+
+
+def _write_stills(folder: Path, pictures: list[Picture]) -> None:
+    folder.mkdir(exist_ok=True)
+    for picture in pictures:
+        picture.still().savefig(folder / f"{picture.key}.png")
+
+
+def _write_whole(file: Path, text: str) -> Path:
+    """Write beside, then rename: a report is whole or the old one."""
+    beside = file.with_name(file.name + ".part")
+    beside.write_text(text, encoding="utf-8")
+    os.replace(beside, file)
+    return file

@@ -1,0 +1,114 @@
+"""The tables of the page: headline figures, constants with labels, facts of the manifest."""
+
+import html
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from dvax.plots.look import number, quantity
+from dvax.plots.record import RunRecord
+
+# manifest key: the words of the page. Whatever else the manifest holds follows, under its own name.
+FACTS = {
+    "status": "status",
+    "stop_reason": "why it stopped",
+    "started": "started",
+    "finished": "finished",
+    "steps": "steps",
+    "run_seconds": "run time [s]",
+    "compile_seconds": "compile time [s]",
+    "precision": "precision",
+    "device": "device",
+    "platform": "platform",
+    "python": "Python",
+    "git_commit": "git commit",
+}
+SHOWN_ELSEWHERE = ("constants",)
+
+
+def headline_cards(run: RunRecord) -> str:
+    """summary.json: one card a figure, its meaning beneath."""
+    cards = []
+    for name, entry in run.summary.items():
+        value = entry.get("value")
+        listed = value if isinstance(value, list) else [value]
+        text = ", ".join(number(item) for item in listed)
+        cards.append(
+            f'<div class="card"><div class="name">{_escape(_words(name))}</div>'
+            f'<div class="value">{_escape(quantity_text(text, str(entry.get("unit", ""))))}</div>'
+            f'<div class="meaning">{_escape(str(entry.get("meaning", "")))}</div></div>'
+        )
+    if not cards:
+        return '<p class="caption">summary.json holds no figures.</p>'
+    return f'<div class="cards">{"".join(cards)}</div>'
+
+
+def constants_table(run: RunRecord) -> str:
+    """Each constant with its value, its formula's label in the paper, its status and meaning."""
+    head = ("constant", "symbol", "value", "paper label", "status", "meaning")
+    rows = [
+        (
+            _escape(_words(row.name)),
+            _escape(row.symbol),
+            _escape(quantity(row.value, row.unit)),
+            f"<code>{_escape(row.label)}</code>" if row.label else "",
+            f'<span class="status {_escape(row.status)}">{_escape(row.status)}</span>',
+            _escape(row.meaning),
+        )
+        for row in run.constants
+    ]
+    if not rows:
+        return '<p class="caption">The run directory names no constants.</p>'
+    return _table(head, rows)
+
+
+def facts_table(run: RunRecord) -> str:
+    """The manifest, in reading order; nested values one a line."""
+    known = [(FACTS[key], run.manifest[key]) for key in FACTS if key in run.manifest]
+    others = [
+        (_words(key), value)
+        for key, value in run.manifest.items()
+        if key not in FACTS and key not in SHOWN_ELSEWHERE
+    ]
+    rows = [(_escape(name), _fact(value)) for name, value in [*known, *others]]
+    return _table(("fact", "value"), rows, kind="pairs")
+
+
+def quantity_text(text: str, unit: str) -> str:
+    """A value that is already text, with its unit for the eye."""
+    return f"{text} {quantity('', unit)}".strip()
+
+
+def _fact(value: Any) -> str:
+    if isinstance(value, Mapping):
+        lines = [f"{_escape(str(key))}: {_fact(item)}" for key, item in value.items()]
+        return "<br>".join(lines) if lines else "none"
+    if isinstance(value, list):
+        plain = [item if isinstance(item, str) else json.dumps(item) for item in value]
+        return "<br>".join(map(_escape, plain)) if plain else "none"
+    if value is None:
+        return "none"
+    return _escape(number(value))
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]], kind: str = "rows") -> str:
+    """An HTML table whose cells carry their column's name: a phone shows each row as a list."""
+    top = "".join(f"<th>{_escape(name)}</th>" for name in head)
+    body = "".join(
+        "<tr>"
+        + "".join(
+            f'<td data-name="{_escape(name)}">{cell}</td>'
+            for name, cell in zip(head, row, strict=True)
+        )
+        + "</tr>"
+        for row in rows
+    )
+    return f'<table class="{kind}"><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>'
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _escape(text: str) -> str:
+    return html.escape(text, quote=True)
