@@ -45,7 +45,7 @@ $(READY): pyproject.toml $(LOCK)
 	@touch $@
 
 demo: $(READY) ## solve the rough contact strip; results and report in ./demo-run
-	@$(VENV)/bin/dvax demo --out demo-run --force
+	@$(VENV)/bin/dvax demo -o demo-run --force
 	@echo "The report: $(CURDIR)/demo-run/report.html"
 
 test: lint types ## lint, formatting, types and tests (under 10 minutes on two cores)

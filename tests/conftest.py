@@ -32,6 +32,9 @@ import jax  # noqa: E402  (its settings come from the lines above)
 # In this process alone: the command line has to ask for double precision by itself, and an
 # environment variable would hide it if it forgot.
 jax.config.update("jax_enable_x64", True)
+# No array changes its precision or grows an axis unless the code says so.
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # Examples are drawn from the test's own text, so that a failure comes back on every machine.
 hypothesis.settings.register_profile(
