@@ -25,13 +25,14 @@ setup: $(READY) ## the development environment in ./.venv
 
 $(READY): pyproject.toml $(LOCK)
 	@set -e; python=''; \
-	for candidate in $(PYTHON) python3.11 python3.12 python3.13 python3.14 python3 python; do \
+	for candidate in $(or $(PYTHON),python3.11 python3.12 python3.13 python3.14 python3 python); do \
 	    if $$candidate -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
 	        python=$$candidate; break; \
 	    fi; \
 	done; \
 	if [ -z "$$python" ]; then \
-	    echo 'dvax needs Python 3.11 or newer and found none; say which with make PYTHON=/path/to/python3.11' >&2; \
+	    echo 'dvax needs Python 3.11 or newer, and $(or $(PYTHON),this PATH) has none;' \
+	        'say which with make PYTHON=/path/to/python3.11' >&2; \
 	    exit 1; \
 	fi; \
 	echo "Setting up $(VENV) with $$($$python --version) (once; a later run starts at once)"; \
