@@ -59,11 +59,12 @@ def parse_formula(text: str, names: tuple[str, ...], place: str) -> ast.expr:
             None, shown(flat), f"an expression nests at most {MAX_DEPTH} deep", "Write it flatter."
         ) from None
     except (SyntaxError, ValueError) as error:
-        offset = getattr(error, "offset", None)
+        # The parser says 0 where it missed something after the last character.
+        offset = getattr(error, "offset", None) or len(flat.strip()) + 1
         lead = len(flat) - len(flat.lstrip())
         reason = error.msg if isinstance(error, SyntaxError) and error.msg else str(error)
         raise refuse(
-            None if offset is None else offset + lead,
+            offset + lead,
             shown(flat),
             f"it is not a formula: {reason.splitlines()[0]}",
             f"Write one formula such as {example_of(names)}.",

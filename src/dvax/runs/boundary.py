@@ -1,0 +1,82 @@
+"""The contact boundary Gamma_C as points with quadrature weights."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dvax.errors import InputError, InputProblem
+from dvax.runs.csv_table import check_increasing, read_columns
+from dvax.runs.schema import BoundarySection
+from dvax.runs.units import UnitError, Units
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """n points: `coordinates` (one array (n,) a direction) and `weights` (n,), their measures.
+
+    `shape` is (n,) or, for a rectangle, (n1, n2) with the points in C order. The weights make the
+    sum of w(s) v(s)^2 the squared norm of L2(Gamma_C); for midpoints they are the measures of the
+    cells.
+    """
+
+    coordinates: tuple[np.ndarray, ...]
+    weights: np.ndarray
+    shape: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        return self.weights.size
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What formulas call the coordinates."""
+        return ("s",) if len(self.coordinates) == 1 else ("s1", "s2")
+
+    def nearest(self, place: tuple[float, ...]) -> int:
+        """The index of the point nearest to a place."""
+        pairs = zip(self.coordinates, place, strict=True)
+        return int(np.argmin(sum((c - p) ** 2 for c, p in pairs)))
+
+
+def build_boundary(section: BoundarySection, nodes: Path | None, units: Units) -> Boundary:
+    """Midpoints of equal cells (error O(h^2) of integrals), or the nodes of a file.
+
+    Raises `InputError` for every flaw of the file.
+    """
+    if nodes is not None:
+        return _from_file(nodes, units)
+    assert section.points is not None  # the consistency of the section has been checked
+    lengths = section.lengths or (section.length or 0.0,)
+    axes = [
+        length * (np.arange(n) + 0.5) / n for length, n in zip(lengths, section.points, strict=True)
+    ]
+    grid = np.meshgrid(*axes, indexing="ij")
+    size = int(np.prod(section.points))
+    weight = float(np.prod(lengths)) / size
+    return Boundary(tuple(c.ravel() for c in grid), np.full(size, weight), section.points)
+
+
+def _from_file(path: Path, units: Units) -> Boundary:
+    s, weight = read_columns(path, ["s", "weight"], "s")
+    check_increasing(path.name, s)
+    problems: list[InputProblem] = []
+    factors = []
+    for column in (s, weight):
+        try:
+            factors.append(units.factor(column.unit, "length"))
+        except UnitError as error:
+            place = f"{path.name}, column {column.name!r}"
+            problems.append(InputProblem(place, f"[{column.unit}]", error.rule, f"{error.mend}."))
+    problems += [
+        InputProblem(
+            f"{path.name}, line {weight.lines[i]}, column 'weight'",
+            f"{weight.values[i]:g}",
+            "a quadrature weight is the length that a node stands for and is greater than 0",
+            "Give a positive weight or remove the node.",
+        )
+        for i in np.flatnonzero(~(weight.values > 0))[:20]
+    ]
+    if problems:
+        raise InputError(*problems)
+    return Boundary((s.values * factors[0],), weight.values * factors[1], (s.values.size,))

@@ -1,0 +1,278 @@
+"""Configurations: a TOML file in, checked settings with every default filled in out.
+
+`load_config` reads and checks everything that can be checked without running: the syntax, the
+schema, the rules between values, the formulas, and every data file. All problems are reported
+together.
+"""
+
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, PrivateAttr, ValidationError
+
+from dvax.errors import InputError, InputProblem
+from dvax.runs.consistency import check_consistency
+from dvax.runs.contact_inputs import ContactInputs, read_inputs
+from dvax.runs.fields import Sources
+from dvax.runs.schema import (
+    OPTIONAL,
+    SECTIONS,
+    BoundarySection,
+    DemandSection,
+    InitialSection,
+    LoadSection,
+    ModelSection,
+    OutputSection,
+    Section,
+    SolverSection,
+    TimeSection,
+    UnitsSection,
+)
+from dvax.runs.schema_errors import shown, translate, unknown_key
+from dvax.runs.units import Units
+
+MAX_BYTES = 2**20
+_RTOL = 1e-6
+_ATOL_OF_SCALE = 1e-9  # of the model's own indentation scale
+
+
+class Config(Section):
+    """A checked configuration; every quantity is a number in the working units of `units`."""
+
+    units: UnitsSection
+    model: ModelSection
+    boundary: BoundarySection
+    demand: DemandSection
+    load: LoadSection
+    initial: InitialSection
+    time: TimeSection
+    solver: SolverSection
+    output: OutputSection
+
+    _source: Path = PrivateAttr(default=Path("configuration"))
+    _allow_outside: bool = PrivateAttr(default=False)
+
+    @property
+    def source(self) -> Path:
+        """The file that was read. Data files are named relative to its folder."""
+        return self._source
+
+    @property
+    def sources(self) -> Sources:
+        """Where the data files lie."""
+        return Sources(self._source.name, self._source.parent, self._allow_outside)
+
+    def data_files(self) -> dict[str, str]:
+        """Dotted key -> file name, for every data file that the configuration names."""
+        return dict(_files(self.model_dump(exclude_none=True)))
+
+    def to_toml(self, files: Mapping[str, str] | None = None) -> str:
+        """All settings as TOML; reading it again beside the same data gives the same configuration.
+
+        `files` gives other names to data files, by dotted key: for a copy elsewhere.
+        """
+        import tomli_w
+
+        tree = _plain(self.model_dump(exclude_none=True))
+        for key, name in (files or {}).items():
+            *path, last = key.split(".")
+            table = tree
+            for part in path:
+                table = table[part]
+            table[last] = name
+        return tomli_w.dumps(tree)
+
+
+def load_config(path: str | Path, *, allow_outside: bool = False) -> Config:
+    """Read, check and complete a configuration file.
+
+    Defaults are filled in, so the result says everything that a run will do. Data files lie in the
+    configuration's folder or below; `allow_outside` lifts that.
+
+    **Raises:** `InputError` with all problems found: syntax (line and column), unknown or missing
+    keys, types, units, ranges, contradictions, formulas (column) and data (file, line and column).
+    """
+    source = Path(path)
+    return _check(_parse(source), source, allow_outside)
+
+
+def build_contact(config: Config) -> ContactInputs:
+    """The data of a run as arrays and signals. Raises `InputError` if a file changed for the
+    worse."""
+    inputs, problems = read_inputs(config, config.sources, config.units)
+    if inputs is None or problems:
+        raise InputError(*problems)
+    return inputs
+
+
+def with_points(config: Config, points: int) -> Config:
+    """The same configuration on a one-dimensional boundary of other resolution."""
+    boundary = config.boundary.model_copy(update={"points": (points,)})
+    return config.model_copy(update={"boundary": boundary})
+
+
+def _parse(source: Path) -> dict[str, Any]:
+    def refuse(place: str, given: str, rule: str, mend: str) -> InputError:
+        return InputError(InputProblem(place, given, rule, mend))
+
+    name = source.name
+    try:
+        if not source.is_file():
+            given = "a folder" if source.is_dir() else "no such file"
+            raise refuse(str(source), given, "a configuration is a TOML file", "Check its name.")
+        size = source.stat().st_size
+        if size > MAX_BYTES:
+            raise refuse(
+                name,
+                f"{size} bytes",
+                f"a configuration has at most {MAX_BYTES} bytes",
+                "Put data into CSV or NPY files.",
+            )
+        text = source.read_bytes().decode("utf-8")
+        return tomllib.loads(text)
+    except OSError as error:
+        raise refuse(
+            str(source), error.strerror or str(error), "it must be readable", "Check it."
+        ) from None
+    except UnicodeDecodeError as error:
+        raise refuse(
+            f"{name}, byte {error.start + 1}",
+            "bytes that are not UTF-8",
+            "TOML is UTF-8",
+            "Save it so.",
+        ) from None
+    except tomllib.TOMLDecodeError as error:
+        message = str(error)
+        found = re.search(r"\(at line (\d+), column (\d+)\)", message)
+        place = f"{name}, line {found[1]}, column {found[2]}" if found else f"{name}, at its end"
+        reason = re.sub(r"\s*\(at .*\)$", "", message)
+        raise refuse(
+            place, reason, "the file is not TOML", 'Write key = value; texts in "quotes".'
+        ) from None
+    except (RecursionError, ValueError) as error:
+        # tomllib lets the errors of int() and of deep nesting through.
+        raise refuse(
+            name, shown(str(error)), "the file is not readable as TOML", "Write it simpler."
+        ) from None
+
+
+def _check(raw: dict[str, Any], source: Path, allow_outside: bool) -> Config:
+    file = source.name
+    problems = [
+        unknown_key(f"{file}: {key}", key, value, list(SECTIONS))
+        for key, value in raw.items()
+        if key not in SECTIONS
+    ]
+    # With broken units, dimensions are still checked, in the default ones.
+    units, broken = _section("units", raw.get("units", {}), file, Units())
+    problems += broken
+    working = units if isinstance(units, Units) else Units()
+    sections: dict[str, BaseModel] = {} if units is None else {"units": units}
+    for name in SECTIONS:
+        if name == "units":
+            continue
+        if name not in raw and name not in OPTIONAL:
+            mend = f"Add [{name}]."
+            problems.append(InputProblem(f"{file}: {name}", "nothing", "it is required", mend))
+            continue
+        section, broken = _section(name, raw.get(name, {}), file, working)
+        problems += broken
+        if section is not None:
+            sections[name] = section
+    between = check_consistency(raw, file)
+    problems += between
+    contradictory = {p.place.removeprefix(f"{file}: ").split(".")[0] for p in between}
+    usable = {name: s for name, s in sections.items() if name not in contradictory}
+    draft = Config.model_construct(**usable)  # pyright: ignore[reportArgumentType]
+    sources = Sources(file, source.parent, allow_outside)
+    quoted = frozenset(
+        name
+        for name in ("demand", "load", "initial")
+        if isinstance(raw.get(name), dict) and isinstance(raw[name].get("value"), str)
+    )
+    draft = _with_defaults(draft, usable)
+    edges = raw.get("boundary")
+    rectangle = isinstance(edges, dict) and "lengths" in edges
+    names = ("s1", "s2") if rectangle else ("s",)
+    inputs, found = read_inputs(draft, sources, working, quoted, names)
+    problems += found
+    if problems:
+        raise InputError(*problems)
+    assert inputs is not None
+    if draft.output.points_of_interest is None:
+        places = tuple(
+            tuple(float(c[i]) for c in inputs.boundary.coordinates) for i in inputs.point_indices
+        )
+        output = draft.output.model_copy(update={"points_of_interest": places})
+        draft = draft.model_copy(update={"output": output})
+    draft._source, draft._allow_outside = source, allow_outside
+    return draft
+
+
+def _section(
+    name: str, value: Any, file: str, units: Units
+) -> tuple[BaseModel | None, list[InputProblem]]:
+    model = SECTIONS[name]
+    try:
+        return model.model_validate(value, context={"units": units}), []
+    except ValidationError as error:
+        problems = translate(error, file, name, model)
+        refused = {e["loc"][0] for e in error.errors(include_url=False) if e["loc"]}
+    if name not in {"demand", "load", "initial"}:
+        return None, problems
+    # The factors that were not refused are still worth checking: everything is reported at once.
+    rest = {key: v for key, v in value.items() if key not in refused} if refused else {}
+    try:
+        return model.model_validate(rest, context={"units": units}), problems
+    except ValidationError:
+        return None, problems  # what is wrong has been said above
+
+
+def _with_defaults(draft: Config, usable: Mapping[str, BaseModel]) -> Config:
+    """Fill in what depends on the model: tolerances and the companion's perturbation."""
+    if "model" not in usable:
+        return draft
+    # The indentation that carries a point through the active regime (paper,
+    # eq:concrete_contact_states).
+    model = draft.model
+    scale = (1 + model.b_u) * model.kappa0 / (model.beta * model.b_x)
+    update: dict[str, BaseModel] = {}
+    if "solver" in usable and draft.solver.dt is None:
+        solver = draft.solver
+        tolerances = {"rtol": solver.rtol or _RTOL, "atol": solver.atol or _ATOL_OF_SCALE * scale}
+        update["solver"] = solver.model_copy(update=tolerances)
+    if "initial" in usable:
+        initial, change = draft.initial, {}
+        if initial.companion is None:
+            change["companion"] = scale
+        if initial.value is None and initial.expression is None and initial.profile is None:
+            change["value"] = 0.0
+        update["initial"] = initial.model_copy(update=change)
+    return draft.model_copy(update=update)
+
+
+def _files(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    found = []
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            found += _files(value, f"{prefix}{key}.")
+        elif key == "file":
+            found.append((f"{prefix}{key}", value))
+    return found
+
+
+def _plain(value: Any) -> Any:
+    """Tuples as TOML writes them: one entry stands for itself, more are an array."""
+    if isinstance(value, Mapping):
+        return {
+            key: [_plain(p) for p in inner]
+            if key in {"points_of_interest", "knots"}
+            else _plain(inner)
+            for key, inner in value.items()
+        }
+    if isinstance(value, tuple):
+        return value[0] if len(value) == 1 else list(value)
+    return value

@@ -1,0 +1,223 @@
+"""Everything that a run of the contact model starts from, as arrays and signals."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dvax.errors import InputError, InputProblem
+from dvax.runs.boundary import Boundary, build_boundary
+from dvax.runs.data_file import DataFile, fingerprint, locate
+from dvax.runs.fields import Field, Sources, perturbation, read_field, space_values, to_signal
+from dvax.runs.units import Units
+
+if TYPE_CHECKING:
+    from dvax.runs.config import Config
+
+_KINDS = {"demand": "indentation", "load": "indentation rate", "initial": "indentation"}
+
+
+@dataclass(frozen=True)
+class ContactInputs:
+    """The data of a run, in the working units of its configuration.
+
+    - `boundary`: n points with their weights, and the shape of their grid;
+    - `demand`, `load`: g(t) and ell(t) as factors, see `demand_signal` and `load_signal`;
+    - `x0`, `companion_x0`: the two initial states, (n,);
+    - `frame_times`: the times to save, from 0 to the end;
+    - `point_indices`: the points whose histories are shown;
+    - `data_files`: what was read, with fingerprints;
+    - `notices`: sentences for the log, about what is allowed but worth knowing.
+    """
+
+    boundary: Boundary
+    demand: Field
+    load: Field
+    x0: np.ndarray
+    companion_x0: np.ndarray
+    frame_times: np.ndarray
+    point_indices: tuple[int, ...]
+    data_files: tuple[DataFile, ...]
+    notices: tuple[str, ...]
+
+    @property
+    def demand_signal(self) -> Any:
+        """g as a `dvax.signals` signal, values (n,) or (); built anew in JAX's current
+        precision."""
+        return to_signal(self.demand, self.boundary)
+
+    @property
+    def load_signal(self) -> Any:
+        """ell as a `dvax.signals` signal, values (n,) or (); built anew in JAX's current
+        precision."""
+        return to_signal(self.load, self.boundary)
+
+
+def read_inputs(
+    config: "Config",
+    sources: Sources,
+    units: Units,
+    value_has_unit: frozenset[str] = frozenset(),
+    coordinate_names: tuple[str, ...] = ("s",),
+) -> tuple[ContactInputs | None, list[InputProblem]]:
+    """Read and check all data that a configuration names: (inputs, problems), with all problems.
+
+    The configuration may lack sections that were refused before; the rest is checked all the same,
+    and the inputs are None. `value_has_unit` names the fields whose value was written with a unit,
+    `coordinate_names` are those of a boundary that was refused.
+    """
+    problems: list[InputProblem] = []
+    sections = dict(config.__dict__)
+    time = sections.get("time")
+    end = time.end if time is not None else None
+    boundary, boundary_files = _boundary(sections.get("boundary"), sources, units, problems)
+    fields: dict[str, Field] = {}
+    for key, kind in _KINDS.items():
+        section = sections.get(key)
+        if section is None:
+            continue
+        try:
+            fields[key] = read_field(
+                section,
+                key,
+                kind,
+                sources,
+                units,
+                boundary or coordinate_names,
+                end,
+                value_has_unit=key in value_has_unit,
+            )
+        except InputError as error:
+            problems += error.problems
+    problems += _between_times(sections, sources.name)
+    shift = None
+    initial = sections.get("initial")
+    if boundary is not None and initial is not None and initial.companion is not None:
+        try:
+            place = f"{sources.name}: initial.companion"
+            shift = perturbation(initial.companion, boundary, place)
+        except InputError as error:
+            problems += error.problems
+    if boundary is None:
+        return None, problems
+    indices, notices = _points(sections.get("output"), boundary, sources.name, units, problems)
+    if problems or shift is None or time is None or len(fields) < len(_KINDS):
+        return None, problems
+    series = fields["demand"].series
+    if series is not None and series.kind == "constant":
+        notices.append(
+            "The demand jumps (series of kind 'constant'): the theory asks for g continuous in "
+            "time, and u jumps with it."
+        )
+    x0 = space_values(fields["initial"], boundary)
+    files = (*boundary_files, *(f for field in fields.values() for f in field.files))
+    inputs = ContactInputs(
+        boundary=boundary,
+        demand=fields["demand"],
+        load=fields["load"],
+        x0=x0,
+        companion_x0=x0 + shift,
+        frame_times=np.linspace(0.0, time.end, time.frames + 1),
+        point_indices=indices,
+        data_files=tuple(dict.fromkeys(files)),
+        notices=tuple(notices),
+    )
+    return inputs, problems
+
+
+def _boundary(
+    section: Any, sources: Sources, units: Units, problems: list[InputProblem]
+) -> tuple[Boundary | None, tuple[DataFile, ...]]:
+    """The boundary, None where it was refused."""
+    if section is None:
+        return None, ()
+    try:
+        nodes, files = None, ()
+        if section.file is not None:
+            place = f"{sources.name}: boundary.file"
+            nodes = locate(section.file, sources.folder, sources.allow_outside, place)
+            files = (fingerprint(section.file, nodes),)
+        return build_boundary(section, nodes, units), files
+    except InputError as error:
+        problems += error.problems
+        return None, ()
+
+
+def _between_times(sections: dict[str, Any], file: str) -> list[InputProblem]:
+    time, solver = sections.get("time"), sections.get("solver")
+    if time is None or solver is None or solver.dt is None or solver.dt <= time.end:
+        return []
+    return [
+        InputProblem(
+            f"{file}: solver.dt",
+            f"{solver.dt:.12g}",
+            f"a step is not longer than the run, which ends at {time.end:.12g}",
+            "Give a smaller step.",
+        )
+    ]
+
+
+def _points(
+    section: Any, boundary: Boundary, file: str, units: Units, problems: list[InputProblem]
+) -> tuple[tuple[int, ...], list[str]]:
+    """Indices of the points of interest, each snapped to the nearest point, and what to say of
+    it."""
+    if section is None:
+        return (), []
+    places = section.points_of_interest
+    if places is None:
+        return _quarters(boundary), []
+    indices: list[int] = []
+    notices: list[str] = []
+    for number, place in enumerate(places):
+        key = f"{file}: output.points_of_interest[{number}]"
+        if len(place) != len(boundary.coordinates):
+            problems.append(
+                InputProblem(
+                    key,
+                    str(list(place)),
+                    f"a point has {len(boundary.coordinates)} coordinate(s), {boundary.names}",
+                    "Write [2.5] on a line and [[2.5, 1.0]] on a rectangle.",
+                )
+            )
+            continue
+        outside = [
+            name
+            for name, p, c in zip(boundary.names, place, boundary.coordinates, strict=True)
+            if not c.min() - _margin(c) <= p <= c.max() + _margin(c)
+        ]
+        if outside:
+            problems.append(
+                InputProblem(
+                    key,
+                    str(list(place)),
+                    f"{' and '.join(outside)} lies off the boundary",
+                    f"Choose a place on the boundary, in {units.length}.",
+                )
+            )
+            continue
+        index = boundary.nearest(place)
+        at = tuple(float(c[index]) for c in boundary.coordinates)
+        if at != place:
+            notices.append(
+                f"Point of interest {list(place)} {units.length}: the nearest point is "
+                f"{[float(f'{a:.9g}') for a in at]} {units.length}."
+            )
+        indices.append(index)
+    return tuple(dict.fromkeys(indices)), notices
+
+
+def _margin(coordinate: np.ndarray) -> float:
+    """How far a boundary reaches beyond its outermost points: the widest gap between neighbours."""
+    distinct = np.unique(coordinate)
+    return float(np.max(np.diff(distinct))) if distinct.size > 1 else float("inf")
+
+
+def _quarters(boundary: Boundary) -> tuple[int, ...]:
+    """The points at a quarter, half and three quarters of the boundary, in every direction."""
+    parts = [sorted({min(n * k // 4, n - 1) for k in (1, 2, 3)}) for n in boundary.shape]
+    if len(parts) == 1:
+        return tuple(parts[0])
+    middle = [axis[len(axis) // 2] for axis in parts]
+    along = [(i, middle[1]) for i in parts[0]] + [(middle[0], j) for j in parts[1]]
+    return tuple(dict.fromkeys(i * boundary.shape[1] + j for i, j in along))
