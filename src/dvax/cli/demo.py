@@ -1,0 +1,42 @@
+"""`dvax demo`: the rough contact strip that dvax brings along."""
+
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dvax.cli.failure import reported
+from dvax.cli.options import Debug, Force, Quiet
+from dvax.cli.run import carry_out
+from dvax.cli.target import target_problems
+from dvax.errors import InputError
+
+CONFIG = "rough_strip.toml"
+
+
+def demo(
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="DIR", help="The folder for the results.")
+    ] = Path("demo-run"),
+    points: Annotated[
+        int | None,
+        typer.Option("--points", metavar="N", min=1, help="Sample the strip at N points."),
+    ] = None,
+    force: Force = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Solve a rough contact strip under an irregular load."""
+    with reported(debug):
+        problems = target_problems(out, force=force)
+        if problems:
+            raise InputError(*problems)
+        from dvax.runs.config import load_config, with_points
+
+        # The folder must outlive the run, which copies the data it names.
+        with as_file(files("dvax.runs") / "demo") as shipped:
+            config = load_config(shipped / CONFIG)
+            if points is not None:
+                config = with_points(config, points)
+            carry_out(config, out, force=force, quiet=quiet)

@@ -1,0 +1,102 @@
+"""What a run says while it runs: a bar with the time left on a terminal, lines in a pipe.
+
+The driver sends events, dicts with `event` one of compiled, progress, warning, stopped. Compile
+time is shown apart: it is paid once, and says nothing about how long the rest will take.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from dvax.cli.talk import remark, remarks
+
+Event = dict[str, Any]
+Listener = Callable[[Event], None]
+
+# In a pipe: one line for each tenth of the run, and a sign of life at least this often.
+LINES, SECONDS_BETWEEN = 10, 30.0
+
+
+@contextmanager
+def progress(unit: str, *, quiet: bool) -> Iterator[Listener]:
+    """A listener for the events of a run whose time is measured in `unit`."""
+    if quiet:
+        yield _warnings_alone
+    elif remarks().is_terminal:
+        with _bar(unit) as listener:
+            yield listener
+    else:
+        yield _Lines(unit)
+
+
+def _warnings_alone(event: Event) -> None:
+    if event["event"] == "warning":
+        remark(f"warning: {event['message']}")
+
+
+class _Lines:
+    """Plain lines: compiled, every tenth of the way, warnings."""
+
+    def __init__(self, unit: str):
+        self.unit = unit
+        self.tenth = 0
+        self.began = self.spoke = time.monotonic()
+
+    def __call__(self, event: Event) -> None:
+        _warnings_alone(event)
+        if event["event"] == "compiled":
+            remark(f"compiled in {event['compile_seconds']:.1f} s")
+            self.began = self.spoke = time.monotonic()
+        elif event["event"] == "progress":
+            self._advance(event)
+
+    def _advance(self, event: Event) -> None:
+        done = float(event["t"]) / float(event["t_end"])
+        now = time.monotonic()
+        if int(done * LINES) <= self.tenth and now - self.spoke < SECONDS_BETWEEN:
+            return
+        self.tenth, self.spoke = int(done * LINES), now
+        left = (now - self.began) * (1 - done) / done if done > 0 else float("nan")
+        remark(
+            f"t = {event['t']:.6g} of {event['t_end']:.6g} {self.unit} ({done:.0%}), "
+            f"{event['steps']} steps, {left:.0f} s left"
+        )
+
+
+@contextmanager
+def _bar(unit: str) -> Iterator[Listener]:
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    console = remarks()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TextColumn("{task.fields[where]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("compiling", total=None, where="")
+
+        def listen(event: Event) -> None:
+            kind = event["event"]
+            if kind == "warning":
+                bar.console.print(f"warning: {event['message']}", markup=False, style="yellow")
+            elif kind == "compiled":
+                seconds = event["compile_seconds"]
+                bar.console.print(f"compiled in {seconds:.1f} s", markup=False)
+                bar.reset(task, description="solving", where="")
+            elif kind == "progress":
+                where = f"t = {event['t']:.4g} {unit}, {event['steps']} steps"
+                bar.update(task, completed=event["t"], total=event["t_end"], where=where)
+
+        yield listen

@@ -1,0 +1,23 @@
+"""`dvax report DIR`: make the report of a run again."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dvax.cli.failure import reported
+from dvax.cli.options import Debug
+from dvax.cli.talk import say
+
+
+def report(
+    directory: Annotated[
+        Path, typer.Argument(metavar="DIR", help="The folder that `dvax run` wrote.")
+    ],
+    debug: Debug = False,
+) -> None:
+    """Write report.html and figures/*.png of a run, finished or not."""
+    with reported(debug):
+        from dvax.plots import build_report
+
+        say(str(build_report(directory)))

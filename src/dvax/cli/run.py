@@ -1,0 +1,82 @@
+"""`dvax run CONFIG.toml -o DIR`: from a configuration to a certified solution on disk."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from dvax.cli.failure import reported
+from dvax.cli.options import ConfigFile, Debug, Force, Quiet
+from dvax.cli.precision import enable_double
+from dvax.cli.progress import progress
+from dvax.cli.talk import remark, say, table
+from dvax.cli.target import target_problems
+from dvax.errors import InputError, InputProblem
+
+if TYPE_CHECKING:
+    from dvax.runs.config import Config
+
+
+def run(
+    config: ConfigFile,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="DIR", help="The folder for the results.")
+    ],
+    force: Force = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Solve the system that CONFIG.toml describes; results, manifest and report go into DIR."""
+    with reported(debug):
+        # Both are checked before anything is refused: one round is enough to mend all of it.
+        problems: list[InputProblem] = target_problems(out, force=force)
+        try:
+            loaded = _load(config)
+        except InputError as error:
+            raise InputError(*error.problems, *problems) from error
+        if problems:
+            raise InputError(*problems)
+        carry_out(loaded, out, force=force, quiet=quiet)
+
+
+def _load(file: Path) -> "Config":
+    from dvax.runs.config import load_config
+
+    return load_config(file)
+
+
+def carry_out(config: "Config", out: Path, *, force: bool, quiet: bool) -> None:
+    """Run a checked configuration, make its report, say the figures; exit with the run's code."""
+    enable_double()
+    from dvax.runs.driver import run as drive
+
+    with progress(config.units.time, quiet=quiet) as listener:
+        outcome = drive(config, out, overwrite=force, on_event=listener)
+    if not quiet:
+        _say_figures(outcome.summary)
+    if outcome.exit_code:
+        remark(f"{outcome.status}: {outcome.stop_reason}", "bold red")
+        remark(f"what was computed until then is in {outcome.directory}")
+    elif not quiet:
+        remark(f"{outcome.status}: {outcome.stop_reason}")
+    if config.output.report:
+        from dvax.plots import build_report
+
+        page = build_report(outcome.directory, stills=config.output.png)
+        if not quiet:
+            remark(f"report: {page}")
+    if outcome.exit_code:
+        raise typer.Exit(outcome.exit_code)
+
+
+def _say_figures(summary: dict[str, Any]) -> None:
+    """The model's headline figures: name, value, unit, meaning."""
+    rows = []
+    for name, entry in summary.items():
+        value = entry["value"]
+        parts = value if isinstance(value, list) else [value]
+        shown = ", ".join(f"{v:.6g}" if isinstance(v, float) else str(v) for v in parts)
+        rows.append((name, f"{shown} {entry.get('unit', '')}".strip(), entry.get("meaning", "")))
+    if rows:
+        table(("figure", "value", "meaning"), rows)
+        say("")
