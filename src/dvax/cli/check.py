@@ -1,18 +1,17 @@
 """`dvax check CONFIG.toml`: what a run would be, without running it or writing anything."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from dvax.cli.constants import constant_rows
 from dvax.cli.failure import OUT_OF_CLASS, reported
 from dvax.cli.options import ConfigFile, Debug
 from dvax.cli.precision import enable_double
 from dvax.cli.sizes import sizes
 from dvax.cli.talk import complain, remark, say, table
-
-if TYPE_CHECKING:
-    from dvax.runs.config import Config
+from dvax.cli.verdicts import outside_the_class, verdicts
 
 
 def check(
@@ -29,30 +28,25 @@ def check(
 
         loaded = load_config(config)
         inputs = build_contact(loaded)
+        enable_double()
         rows = constant_rows(loaded)
         say(f"{loaded.source}: no problem in the configuration and its data", "bold")
         say("")
         _say_constants(rows)
         say("")
+        table(("statement", "verdict", "because"), verdicts(rows))
+        say("")
         table(("size", "value", "remark"), sizes(loaded, inputs))
         for notice in inputs.notices:
             remark(f"note: {notice}")
-        refuted = [row for row in rows if row["status"] == "refuted"]
-        for row in refuted:
+        outside = outside_the_class(rows)
+        for row in outside:
             complain(
-                f"error: {row['symbol']} = {row['value']} ({row['label']}): {row['meaning']}. "
-                "The theory does not cover this system."
+                f"error: outside the class of the theory: {row['name']} = {row['value']:.6g}, "
+                f"{row['status']} ({row['label']}). Every statement and bound rests on it."
             )
-        if refuted and strict:
+        if outside and strict:
             raise typer.Exit(OUT_OF_CLASS)
-
-
-def constant_rows(config: "Config") -> Sequence[Mapping[str, Any]]:
-    """The constants of the theory with their labels, as a run writes them into its trajectory."""
-    enable_double()
-    from dvax.runs.constants import constant_rows as rows_of
-
-    return rows_of(config)
 
 
 def _say_constants(rows: Sequence[Mapping[str, Any]]) -> None:

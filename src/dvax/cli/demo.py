@@ -2,12 +2,14 @@
 
 from importlib.resources import as_file, files
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
 
 from dvax.cli.failure import reported
 from dvax.cli.options import Debug, Force, Quiet
+from dvax.cli.resample import resample
 from dvax.cli.run import carry_out
 from dvax.cli.target import target_problems
 from dvax.errors import InputError
@@ -32,11 +34,11 @@ def demo(
         problems = target_problems(out, force=force)
         if problems:
             raise InputError(*problems)
-        from dvax.runs.config import load_config, with_points
+        from dvax.runs.config import load_config
 
-        # The folder must outlive the run, which copies the data it names.
-        with as_file(files("dvax.runs") / "demo") as shipped:
-            config = load_config(shipped / CONFIG)
+        # The folders must outlive the run, which copies the data it names.
+        with as_file(files("dvax.runs") / "demo") as shipped, TemporaryDirectory() as sampled:
+            config = shipped / CONFIG
             if points is not None:
-                config = with_points(config, points)
-            carry_out(config, out, force=force, quiet=quiet)
+                config = resample(config, Path(sampled), points)
+            carry_out(load_config(config), out, force=force, quiet=quiet)

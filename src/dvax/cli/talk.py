@@ -62,14 +62,17 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
         drawn = Table(box=SIMPLE_HEAD, pad_edge=False)
         for name in head:
-            drawn.add_column(name)
+            drawn.add_column(name, overflow="fold")
         for row in rows:
             drawn.add_row(*map(Text, row))
         console.print(drawn)
         return
-    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    from rich.cells import cell_len, set_cell_size
+
+    # Widths on the screen: the tilde of L̃ takes no room of its own.
+    widths = [max(map(cell_len, column)) for column in zip(head, *rows, strict=True)]
     for row in (head, *rows):
-        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        cells = [set_cell_size(cell, width) for cell, width in zip(row, widths, strict=True)]
         say("  ".join(cells).rstrip())
 
 
