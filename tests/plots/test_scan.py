@@ -86,3 +86,17 @@ def test_a_regime_outside_the_three_is_named_with_its_place(tmp_path: Path) -> N
 def test_edges_lie_half_way_between_centres() -> None:
     np.testing.assert_allclose(edges(np.array([0.0, 1.0, 3.0])), [-0.5, 0.5, 2.0, 4.0])
     np.testing.assert_allclose(edges(np.array([2.0])), [1.0, 3.0])
+
+
+@pytest.mark.parametrize(("chunk", "sizes"), [(3, {3}), (4, {4}), (12, {1})])
+def test_blocks_are_whole_chunks_unless_these_are_huge(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk: int, sizes: set[int]
+) -> None:
+    run_dir = write_run(tmp_path / "run", Recipe(points=(31,), frames=12))
+    data = whole(run_dir).drop_encoding()
+    encoding = {name: {"chunks": (chunk, 31)} for name in ("pressure", "indentation", "regime")}
+    data.to_zarr(run_dir / "trajectory.zarr", mode="w", consolidated=False, encoding=encoding)
+    monkeypatch.setattr(scan_module, "BLOCK_BYTES", 8 * 31)
+    cut = list(scan_module.blocks(read_run(run_dir)))
+    assert {block.stop - block.start for block in cut} == sizes
+    assert (cut[0].start, cut[-1].stop) == (0, 12)

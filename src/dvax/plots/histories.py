@@ -180,7 +180,7 @@ def _nearest(run: RunRecord, place: np.ndarray) -> int:
 def _place(run: RunRecord, point: int) -> str:
     parts = []
     for name in _coordinates(run):
-        value = number(float(run.frames[name].values[point]))
+        value = number(float(run.frames[name].values[point]), 6)
         parts.append(f"{name} = {value} {unit_text(run.unit(name))}".strip())
     return ", ".join(parts)
 

@@ -70,11 +70,13 @@ def edges(centres: np.ndarray) -> np.ndarray:
 
 
 def blocks(run: RunRecord) -> Iterator[slice]:
-    """Slices of frames that fit the memory budget, aligned to the chunks of the store."""
+    """Slices of frames that fit the memory budget, made of whole chunks of the store where these
+    are not far larger: a part of a chunk costs as much to read as the whole."""
     pressure = run.frames["pressure"]
-    chunks = pressure.encoding.get("chunks") or (1,)
-    fitting = max(1, BLOCK_BYTES // (8 * pressure.sizes["point"]))
-    step = max(1, fitting // chunks[0]) * chunks[0]
+    chunk = (pressure.encoding.get("chunks") or (1,))[0]
+    frame_bytes = 8 * pressure.sizes["point"]
+    fitting = max(1, BLOCK_BYTES // frame_bytes)
+    step = fitting if chunk * frame_bytes > 4 * BLOCK_BYTES else -(-fitting // chunk) * chunk
     for start in range(0, pressure.sizes["time"], step):
         yield slice(start, min(start + step, pressure.sizes["time"]))
 
@@ -121,7 +123,8 @@ class _Gather:
     def __init__(self, run: RunRecord):
         place = np.asarray(run.frames["s"].values, dtype=float)
         # Nodes from a file need not be sorted along the curve; the map's axis must be.
-        self.order = np.argsort(place, kind="stable")
+        order = np.argsort(place, kind="stable")
+        self.order = slice(None) if (np.diff(place) > 0).all() else order
         frames, points = len(run.time), len(place)
         self.starts = _starts(points, SPACE_CELLS)
         time_starts = _starts(frames, TIME_CELLS)
@@ -129,7 +132,7 @@ class _Gather:
             np.arange(len(time_starts)), np.diff(np.append(time_starts, frames))
         )
         self.weight = run.weight[self.order]
-        self.space_edges = edges(place[self.order])[np.append(self.starts, points)]
+        self.space_edges = edges(place[order])[np.append(self.starts, points)]
         self.time_edges = edges(run.time)[np.append(time_starts, frames)]
         self.points_per_cell = -(-points // len(self.starts))
         self.frames_per_cell = -(-frames // len(time_starts))
@@ -140,7 +143,7 @@ class _Gather:
         self.lowest, self.highest = np.full(shape, 2, np.int8), np.zeros(shape, np.int8)
 
     def take(self, block: slice, pressure: np.ndarray, regime: np.ndarray) -> None:
-        pressure, regime = pressure[:, self.order], regime[:, self.order].astype(np.int8)
+        pressure, regime = pressure[:, self.order], regime[:, self.order]
         into, starts = self.cell_of_frame[block], self.starts
         np.add.at(self.sum, into, np.add.reduceat(pressure * self.weight, starts, axis=1))
         np.minimum.at(self.low, into, np.minimum.reduceat(pressure, starts, axis=1))

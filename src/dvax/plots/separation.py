@@ -4,6 +4,7 @@ Paper, cor:incremental_stability: ‖x₁(t) − x₂(t)‖ ≤ M e^{−(η − 
 for u. The sharp bound uses the one-sided rate, which knows the sign of −d_x x.
 """
 
+import numpy as np
 import plotly.graph_objects as go
 from matplotlib import rc_context
 from matplotlib.figure import Figure
@@ -23,6 +24,8 @@ from dvax.plots.look import (
 from dvax.plots.picture import Picture
 from dvax.plots.record import RunRecord
 
+# Differences of numbers of size one lose all digits here.
+ROUNDING = 1e-13
 OBSERVED, CERTIFIED, SHARP = "observed", "certified, e^(−(η−ML̃)t)", "sharper, one-sided rate"
 # panel: (quantity, ((variable, legend, colour, plotly dash, matplotlib style), ...))
 PANELS = (
@@ -114,6 +117,10 @@ def _still(run: RunRecord, panels: list) -> Figure:
     return drawn
 
 
+def _reaches_rounding(separation: np.ndarray) -> bool:
+    return bool((separation[1:] < ROUNDING * separation[0]).any())
+
+
 def _caption(run: RunRecord) -> str:
     parts = [
         "A second trajectory starts from a perturbed initial state. The certified decay is the "
@@ -129,6 +136,11 @@ def _caption(run: RunRecord) -> str:
                 "The largest ratio of the observed to the certified separation of x is "
                 f"{number(float(tight.max()), 3)}."
             )
+    if any(_reaches_rounding(run.series(name)) for name in names if name.endswith(("n_x", "n_u"))):
+        parts.append(
+            f"Where it has fallen below {number(ROUNDING)} of its first value, what is observed is "
+            "floating-point rounding, which no bound covers."
+        )
     if any((run.series(name) <= 0).any() for name in names):
         parts.append("A separation of exactly zero is left as a gap.")
     return " ".join(parts)

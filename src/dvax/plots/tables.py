@@ -48,7 +48,7 @@ def constants_table(run: RunRecord) -> str:
     head = ("constant", "symbol", "value", "paper label", "status", "meaning")
     rows = [
         (
-            _escape(_words(row.name)),
+            f"<code>{_escape(row.name)}</code>",
             _escape(row.symbol),
             _escape(quantity(row.value, row.unit)),
             f"<code>{_escape(row.label)}</code>" if row.label else "",
