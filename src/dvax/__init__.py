@@ -1,0 +1,58 @@
+"""dvax: coupled nonsmooth dynamical systems, solved with proofs.
+
+    x' = Ax + f(t, x, u) in the mild sense,      u ∈ h(t, x, u) − N_{K(t)}(P u)
+
+Names are loaded when they are first used, so that the command line starts without JAX.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from . import generators as generators
+    from . import models as models
+    from . import operators as operators
+    from . import sets as sets
+    from . import signals as signals
+    from . import spaces as spaces
+    from . import vi as vi
+    from .errors import DifferentiationError as DifferentiationError
+    from .errors import DvaxError as DvaxError
+    from .errors import InputError as InputError
+    from .errors import SolveError as SolveError
+    from .evolution import ETD1 as ETD1
+    from .evolution import ETD2RK as ETD2RK
+    from .evolution import RESULTS as RESULTS
+    from .evolution import Solution as Solution
+    from .evolution import solve as solve
+    from .problem import Problem as Problem
+    from .theory import Bound as Bound
+    from .theory import Constants as Constants
+    from .theory import bound_error as bound_error
+    from .vi import solve_vi as solve_vi
+
+__version__ = "0.1.0"
+
+_MODULES = ("generators", "models", "operators", "sets", "signals", "spaces", "vi")
+_HOMES = {
+    "errors": ("DifferentiationError", "DvaxError", "InputError", "SolveError"),
+    "evolution": ("ETD1", "ETD2RK", "RESULTS", "Solution", "solve"),
+    "problem": ("Problem",),
+    "theory": ("Bound", "Constants", "bound_error"),
+    "vi": ("solve_vi",),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = [*_MODULES, *_HOME_OF, "__version__"]  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return importlib.import_module(f".{name}", __name__)
+    if name in _HOME_OF:
+        return getattr(importlib.import_module(f".{_HOME_OF[name]}", __name__), name)
+    raise AttributeError(f"module 'dvax' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -17,18 +17,18 @@ class Growth(NamedTuple):
 
 
 class AbstractPropagator(eqx.Module):
-    """e^{hA} and φ₁(hA), …, φ_p(hA) for one h, with everything costly computed once.
+    """The exact flow of x' = Ax + p over one length h, with everything costly computed once.
 
-    φₖ(z) = ∫₀¹ e^{(1−s)z} s^{k−1}/(k−1)! ds, so φ₀ = exp and z φ_{k+1}(z) = φₖ(z) − 1/k!.
+    For the polynomial p(t₀ + θh) = c₀ + c₁θ + … + c_qθ^q,
+
+        x(t₀ + h) = e^{hA}x₀ + h Σⱼ j! φ_{j+1}(hA) cⱼ,
+
+    with φₖ(z) = ∫₀¹ e^{(1−s)z} s^{k−1}/(k−1)! ds, because ∫₀^h e^{(h−s)A} (s/h)^j ds = h j! φ_{j+1}(hA).
     """
 
     @abc.abstractmethod
-    def exp(self, v: Tree) -> Tree:
-        """e^{hA} v."""
-
-    @abc.abstractmethod
-    def phi(self, k: int, v: Tree) -> Tree:
-        """φₖ(hA) v, for 1 ≤ k ≤ p."""
+    def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
+        """x(t₀ + h), for at most as many coefficients as the propagator was made for."""
 
 
 class AbstractGenerator(eqx.Module):
@@ -39,8 +39,8 @@ class AbstractGenerator(eqx.Module):
         """A v."""
 
     @abc.abstractmethod
-    def propagator(self, h: Any, order: int) -> AbstractPropagator:
-        """e^{hA}, φ₁(hA), …, φ_order(hA) for the step h ≥ 0."""
+    def propagator(self, h: Any, terms: int) -> AbstractPropagator:
+        """The flow over h ≥ 0 for polynomials of up to `terms` coefficients."""
 
     @abc.abstractmethod
     def growth(self, space: AbstractSpace) -> Growth:
@@ -48,4 +48,4 @@ class AbstractGenerator(eqx.Module):
 
     def semigroup(self, h: Any, v: Tree) -> Tree:
         """e^{hA} v."""
-        return self.propagator(h, 0).exp(v)
+        return self.propagator(h, 0).step(v, ())

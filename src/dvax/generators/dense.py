@@ -10,7 +10,7 @@ from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
 from .abstract import AbstractGenerator, AbstractPropagator, Growth
-from .phi import phi_matrix
+from .phi import flow_factors, phi_matrix
 
 
 class Dense(AbstractGenerator):
@@ -50,8 +50,8 @@ class Dense(AbstractGenerator):
     def apply(self, v: Tree) -> Tree:
         return self.matrix @ v
 
-    def propagator(self, h: Any, order: int) -> "MatrixPropagator":
-        return MatrixPropagator(phi_matrix(h * self.matrix, order))
+    def propagator(self, h: Any, terms: int) -> "MatrixPropagator":
+        return MatrixPropagator(flow_factors(h, phi_matrix(h * self.matrix, terms)))
 
     def growth(self, space: AbstractSpace) -> Growth:
         # ⟨Av, v⟩ = vᵀWAv: with q = W^{1/2}v it is qᵀ(W^{1/2}AW^{-1/2})q, so weights only rescale.
@@ -61,12 +61,10 @@ class Dense(AbstractGenerator):
 
 
 class MatrixPropagator(AbstractPropagator):
-    """φₖ(hA) as matrices."""
+    """Factors that are matrices."""
 
-    matrices: tuple[jax.Array, ...]
+    factors: tuple[jax.Array, ...]
 
-    def exp(self, v: Tree) -> Tree:
-        return self.matrices[0] @ v
-
-    def phi(self, k: int, v: Tree) -> Tree:
-        return self.matrices[k] @ v
+    def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
+        products = [m @ v for m, v in zip(self.factors, (x0, *c), strict=False)]
+        return sum(products[1:], start=products[0])

@@ -9,7 +9,7 @@ from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace
 from .abstract import AbstractGenerator, Growth
-from .phi import phi_scalar
+from .phi import flow_factors, phi_scalar
 from .scalar import ElementwisePropagator
 
 
@@ -35,8 +35,8 @@ class Diagonal(AbstractGenerator):
     def apply(self, v: Tree) -> Tree:
         return self.entries * v
 
-    def propagator(self, h: Any, order: int) -> ElementwisePropagator:
-        return ElementwisePropagator(phi_scalar(h * self.entries, order))
+    def propagator(self, h: Any, terms: int) -> ElementwisePropagator:
+        return ElementwisePropagator(flow_factors(h, phi_scalar(h * self.entries, terms)))
 
     def growth(self, space: AbstractSpace) -> Growth:
         return Growth(jnp.ones(()), jnp.max(jnp.real(self.entries)))

@@ -50,3 +50,8 @@ def phi_matrix(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
     block = block.at[: order * n, n:].add(shift) if order else block
     first_row = jax.scipy.linalg.expm(block)[:n]
     return tuple(first_row[:, k * n : (k + 1) * n] for k in range(order + 1))
+
+
+def flow_factors(h: jax.Array, phis: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    """(e^{hA}, h 0! φ₁, h 1! φ₂, …): what a propagator multiplies x₀, c₀, c₁, … by."""
+    return phis[0], *(h * math.factorial(j) * phi for j, phi in enumerate(phis[1:]))

@@ -31,8 +31,8 @@ class Product(AbstractGenerator):
     def apply(self, v: Tree) -> Tree:
         return tuple(a.apply(p) for a, p in zip(self.parts, v, strict=True))
 
-    def propagator(self, h: Any, order: int) -> "ProductPropagator":
-        return ProductPropagator(tuple(a.propagator(h, order) for a in self.parts))
+    def propagator(self, h: Any, terms: int) -> "ProductPropagator":
+        return ProductPropagator(tuple(a.propagator(h, terms) for a in self.parts))
 
     def growth(self, space: AbstractSpace) -> Growth:
         spaces = space.spaces if isinstance(space, ProductSpace) else (space,) * len(self.parts)
@@ -47,8 +47,6 @@ class ProductPropagator(AbstractPropagator):
 
     parts: tuple[AbstractPropagator, ...]
 
-    def exp(self, v: Tree) -> Tree:
-        return tuple(p.exp(q) for p, q in zip(self.parts, v, strict=True))
-
-    def phi(self, k: int, v: Tree) -> Tree:
-        return tuple(p.phi(k, q) for p, q in zip(self.parts, v, strict=True))
+    def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
+        columns = zip(self.parts, x0, *c, strict=True)
+        return tuple(part.step(start, tuple(rest)) for part, start, *rest in columns)

@@ -10,7 +10,7 @@ from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace
 from .abstract import AbstractGenerator, AbstractPropagator, Growth
-from .phi import phi_scalar
+from .phi import flow_factors, phi_scalar
 
 
 class Scalar(AbstractGenerator):
@@ -34,20 +34,21 @@ class Scalar(AbstractGenerator):
     def apply(self, v: Tree) -> Tree:
         return _tree.scale(self.a, v)
 
-    def propagator(self, h: Any, order: int) -> "ElementwisePropagator":
-        return ElementwisePropagator(phi_scalar(h * self.a, order))
+    def propagator(self, h: Any, terms: int) -> "ElementwisePropagator":
+        return ElementwisePropagator(flow_factors(h, phi_scalar(h * self.a, terms)))
 
     def growth(self, space: AbstractSpace) -> Growth:
         return Growth(jnp.ones(()), self.a)
 
 
 class ElementwisePropagator(AbstractPropagator):
-    """φₖ(hA) as factors that multiply elementwise: A is a number or a diagonal."""
+    """Factors that multiply elementwise: A is a number or a diagonal."""
 
     factors: tuple[jax.Array, ...]
 
-    def exp(self, v: Tree) -> Tree:
-        return self.phi(0, v)
+    def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
+        def one(*leaves: jax.Array) -> jax.Array:
+            products = [f * leaf for f, leaf in zip(self.factors, leaves, strict=False)]
+            return sum(products[1:], start=products[0])
 
-    def phi(self, k: int, v: Tree) -> Tree:
-        return jtu.tree_map(lambda leaf: self.factors[k] * leaf, v)
+        return jtu.tree_map(one, x0, *c)

@@ -26,6 +26,7 @@ class Diagonal(AbstractOperator):
     """
 
     entries: jax.Array
+    inverse_entries: jax.Array
 
     def __init__(self, entries: Any):
         self.entries = _tree.as_float(entries, "dvax.operators.Diagonal(entries)")
@@ -36,12 +37,13 @@ class Diagonal(AbstractOperator):
             "P must be coercive, so every entry is positive",
             "Leave out or regularise the entries that are not",
         )
+        self.inverse_entries = 1.0 / self.entries
 
     def apply(self, v: Tree) -> Tree:
         return self.entries * v
 
     def inverse(self, v: Tree) -> Tree:
-        return v / self.entries
+        return self.inverse_entries * v
 
     def check(self, space: AbstractSpace) -> None:
         """Nothing to do: a positive diagonal is both for every diagonal weight."""

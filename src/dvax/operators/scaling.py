@@ -24,6 +24,7 @@ class Scaling(AbstractOperator):
     """
 
     b: jax.Array
+    inverse_b: jax.Array
 
     def __init__(self, b: Any):
         self.b = _tree.as_float(b, "dvax.operators.Scaling(b)")
@@ -34,13 +35,14 @@ class Scaling(AbstractOperator):
             "P must be coercive, so b > 0",
             "Give a positive scaling",
         )
+        # Kept: a division for every entry, at every evaluation, would cost more than the law.
+        self.inverse_b = 1.0 / self.b
 
     def apply(self, v: Tree) -> Tree:
         return _tree.scale(self.b, v)
 
     def inverse(self, v: Tree) -> Tree:
-        # A product with one reciprocal: a division for every entry would cost more than the law.
-        return _tree.scale(1.0 / self.b, v)
+        return _tree.scale(self.inverse_b, v)
 
     def check(self, space: AbstractSpace) -> None:
         """Nothing to do: a positive multiple of I is both in every space."""

@@ -22,8 +22,8 @@ class Ball(AbstractSet):
     ```python
     >>> import dvax, jax.numpy as jnp
     >>> K = dvax.sets.Ball(0.0, 1.0)
-    >>> K.project(jnp.array([3.0, 4.0]), dvax.spaces.Euclidean(2)).round(6).tolist()
-    [0.6, 0.8]
+    >>> K.project(jnp.array([0.0, 4.0]), dvax.spaces.Euclidean(2)).tolist()
+    [0.0, 1.0]
 
     ```
     """

@@ -14,6 +14,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import numpy as np
 
 _active = threading.local()
@@ -59,11 +60,6 @@ class AbstractSignal(eqx.Module):
     def __call__(self, t: Any) -> jax.Array:
         self.report(t)
         return self.value(t)
-
-    def __mul__(self, other: Any) -> "AbstractSignal":
-        from .product import Product
-
-        return Product(self, other)
 
     def report(self, t: Any) -> None:
         """Tell a listener, if there is one, about the knots and the span."""

@@ -10,12 +10,12 @@ from .constant import Constant
 
 
 class Product(AbstractSignal):
-    """s(t) = a(t) b(t), with broadcasting: `Constant(profile) * Table(...)` is a separable field.
+    """s(t) = a(t) b(t), with broadcasting: a profile times a record is a separable field.
 
     ```python
     >>> import dvax, jax.numpy as jnp
     >>> s = dvax.signals
-    >>> field = s.Constant(jnp.array([1.0, 2.0])) * s.Table([0.0, 1.0], [0.0, 10.0])
+    >>> field = s.Product(s.Constant(jnp.array([1.0, 2.0])), s.Table([0.0, 1.0], [0.0, 10.0]))
     >>> field(0.5).tolist()
     [5.0, 10.0]
 

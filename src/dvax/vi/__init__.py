@@ -16,3 +16,4 @@ from .solve import default_space as default_space
 from .solve import solve_vi as solve_vi
 from .structure import Structure as Structure
 from .structure import analyse as analyse
+from .structure import independent as independent

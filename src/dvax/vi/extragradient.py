@@ -51,24 +51,22 @@ class Extragradient(AbstractSolver):
         first = 1.0 if vi.L_F is None else self.step / vi.L_F
 
         def advance(state: tuple) -> tuple:
-            y, _, _, lam, _, count, _ = state
+            y, _, lam, _, count, _ = state
             Fy = frozen.F(y)
             z, Fz, lam = self._extrapolate(frozen, y, Fy, lam)
             w = _tree.add(_tree.sub(Fz, Fy), _tree.scale(1.0 / lam, _tree.sub(y, z)))
             residual = frozen.space.norm(w)
-            unconstrained = _tree.sub(y, _tree.scale(lam, Fy))
             after = frozen.K.project(_tree.sub(y, _tree.scale(lam, Fz)), frozen.space)
             # The certificate belongs to z, so z is what is returned.
             done = residual <= gamma * tol
-            return after, z, unconstrained, lam, residual, count + 1, done
+            return after, z, lam, residual, count + 1, done
 
         def unfinished(state: tuple) -> jax.Array:
-            residual, count, done = state[4], state[5], state[6]
+            residual, count, done = state[3], state[4], state[5]
             return ~done & (count < self.max_steps) & (residual < jnp.inf)
 
         dtype = jnp.result_type(*jax.tree_util.tree_leaves(start))
         state = (
-            lax.stop_gradient(start),
             lax.stop_gradient(start),
             lax.stop_gradient(start),
             jnp.asarray(lax.stop_gradient(first), dtype),
@@ -77,11 +75,14 @@ class Extragradient(AbstractSolver):
             jnp.asarray(False),
         )
         state = lax.while_loop(unfinished, advance, state)
-        _, found, unconstrained, lam, residual, count, done = state
+        _, found, lam, residual, count, done = state
         y = with_implicit_derivative(vi, found, lam, lambda guess: guess, pointwise=False)
         result = RESULTS.where(done, RESULTS.successful, RESULTS.max_steps)
         result = RESULTS.where(jnp.isfinite(residual), result, RESULTS.nonfinite)
-        return Answer(y, unconstrained, residual, count, result)
+        # One fixed step for every z, whatever λ the search ended with: z is compared between times.
+        tau = 1.0 if vi.L_F is None else 1.0 / vi.L_F
+        z = _tree.sub(found, _tree.scale(tau, frozen.F(found)))
+        return Answer(y, lax.stop_gradient(z), residual, count, result)
 
     def _extrapolate(self, vi: Frozen, y: Tree, Fy: Tree, lam: Any) -> tuple[Tree, Tree, Any]:
         def trial(lam: Any) -> tuple[Tree, Tree]:

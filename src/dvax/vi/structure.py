@@ -18,18 +18,26 @@ from .._tree import Tree
 
 
 class Structure(NamedTuple):
-    """`affine`: F(y) = Jy + c with J independent of y. `pointwise`: Fᵢ depends on yᵢ alone."""
+    """What is proved of F; False means "not shown", never "shown not to be".
+
+    `affine`: F(y) = Jy + c with J independent of y. `pointwise`: Fᵢ depends on yᵢ alone.
+    `isotropic`: affine and pointwise with one factor for all entries, F(y) = ay + c, so that
+    y* = proj_K(−c/a) for every K (each part of a tuple may have its own a).
+    """
 
     affine: bool
     pointwise: bool
+    isotropic: bool
 
 
 class _Mark(NamedTuple):
     """How one intermediate value depends on y: polynomial degree (2 means more than affine), and
-    the leaf of y that it depends on entry by entry (None: several leaves, or mixed entries)."""
+    the leaf of y that it depends on entry by entry (None: several leaves, or mixed entries), and
+    whether it is that leaf times one number (plus something independent of y)."""
 
     degree: int
     leaf: int | None
+    even: bool
 
 
 _LINEAR = {
@@ -49,6 +57,7 @@ _MIXING = {
     "reshape", "squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "slice",
     "dynamic_slice", "concatenate", "pad", "reduce_sum", "cumsum", "gather", "split",
 }  # fmt: skip
+_FLAT = _LINEAR | _SUM | _PRODUCT | _POINTWISE | {"div", "broadcast_in_dim"}
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "checkpoint", "custom_lin"}
 _CUSTOM = {"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
 
@@ -57,14 +66,23 @@ def analyse(F: Callable[[Tree], Tree], like: Tree) -> Structure:
     """The structure of F at arguments shaped like `like`, proved from its operations."""
     traced = jax.make_jaxpr(F)(like)
     leaves = jtu.tree_leaves(like)
-    shapes = [jnp.shape(leaf) for leaf in leaves]
-    inputs = [_Mark(1, i) for i in range(len(leaves))]
+    shapes = [tuple(jnp.shape(leaf)) for leaf in leaves]
+    inputs: list[_Mark | None] = [_Mark(1, i, True) for i in range(len(leaves))]
     outputs = _interpret(traced, inputs, shapes)
     affine = all(mark is None or mark.degree <= 1 for mark in outputs)
     pointwise = len(outputs) == len(leaves) and all(
         mark is None or mark.leaf == i for i, mark in enumerate(outputs)
     )
-    return Structure(affine, pointwise)
+    isotropic = affine and pointwise and all(mark is not None and mark.even for mark in outputs)
+    return Structure(affine, pointwise, isotropic)
+
+
+def independent(fn: Callable[..., Tree], *args: Tree) -> bool:
+    """Whether no output of fn(*args) depends on any of the args, as far as its code shows."""
+    traced = jax.make_jaxpr(fn)(*args)
+    count = len(traced.jaxpr.invars)
+    marks = _interpret(traced, [_Mark(1, None, False)] * count, [])
+    return all(mark is None for mark in marks)
 
 
 def _interpret(
@@ -73,6 +91,10 @@ def _interpret(
     """Marks of the outputs; None marks a value that does not depend on y."""
     jaxpr: Jaxpr = traced.jaxpr
     marks: dict[Any, _Mark | None] = dict(zip(jaxpr.invars, inputs, strict=True))
+    flat: set[Any] = set()  # values independent of y that are the same in every entry
+
+    def is_flat(atom: Any) -> bool:
+        return atom.aval.shape == () or (not isinstance(atom, Literal) and atom in flat)
 
     def read(atom: Any) -> _Mark | None:
         return None if isinstance(atom, Literal) else marks.get(atom)
@@ -81,6 +103,8 @@ def _interpret(
         given = [read(atom) for atom in eqn.invars]
         name = eqn.primitive.name
         if all(mark is None for mark in given):
+            if name in _FLAT and all(map(is_flat, eqn.invars)):
+                flat.update(eqn.outvars)
             continue
         if name in _CALLS or name in _CUSTOM:
             inner = _inner(eqn.params)
@@ -88,7 +112,7 @@ def _interpret(
                 results = _interpret(inner, given, shapes)
                 marks.update(zip(eqn.outvars, results, strict=True))
                 continue
-        mark = _rule(name, eqn, given, shapes)
+        mark = _rule(name, eqn, given, shapes, is_flat)
         marks.update((out, mark) for out in eqn.outvars)
     return [read(atom) for atom in jaxpr.outvars]
 
@@ -104,7 +128,11 @@ def _inner(params: dict[str, Any]) -> ClosedJaxpr | None:
 
 
 def _rule(
-    name: str, eqn: Any, given: list[_Mark | None], shapes: list[tuple[int, ...]]
+    name: str,
+    eqn: Any,
+    given: list[_Mark | None],
+    shapes: list[tuple[int, ...]],
+    is_flat: Callable[[Any], bool],
 ) -> _Mark:
     present = [mark for mark in given if mark is not None]
     degree = max(mark.degree for mark in present)
@@ -117,22 +145,28 @@ def _rule(
         for mark, atom in zip(given, eqn.invars, strict=True)
     )
     leaf = leaf if aligned and leaf is not None and shape == shapes[leaf] else None
+    even = leaf is not None and all(mark.even for mark in present)
+    others_flat = all(
+        mark is not None or is_flat(atom) for mark, atom in zip(given, eqn.invars, strict=True)
+    )
 
     if name in _LINEAR or name in _SUM:
-        return _Mark(degree, leaf)
+        return _Mark(degree, leaf, even)
     if name in _PRODUCT:
-        return _Mark(min(2, sum(mark.degree for mark in present)), leaf)
+        return _Mark(min(2, sum(mark.degree for mark in present)), leaf, even and others_flat)
     if name == "div":
-        return _Mark(degree if given[1] is None else 2, leaf)
+        return _Mark(degree if given[1] is None else 2, leaf, even and others_flat)
     if name == "select_n":
-        return _Mark(degree if given[0] is None else 2, leaf)
+        return _Mark(degree if given[0] is None else 2, leaf, False)
     if name in _POINTWISE:
-        return _Mark(2, leaf)
+        return _Mark(2, leaf, False)
     if name in _MIXING:
         # Indices and start positions that depend on y would not be linear in it.
         indices_fixed = all(mark is None for mark in given[1:]) or name in ("concatenate", "pad")
-        same = name in ("reshape", "squeeze", "broadcast_in_dim") and shape == eqn.invars[0].aval.shape
-        return _Mark(degree if indices_fixed else 2, present[0].leaf if same else None)
+        keeps = name in ("reshape", "squeeze", "broadcast_in_dim")
+        same = keeps and shape == eqn.invars[0].aval.shape
+        kept = present[0] if same else _Mark(degree, None, False)
+        return kept._replace(degree=degree if indices_fixed else 2)
     if name == "dot_general":
-        return _Mark(min(2, sum(mark.degree for mark in present)), None)
-    return _Mark(2, None)
+        return _Mark(min(2, sum(mark.degree for mark in present)), None, False)
+    return _Mark(2, None, False)

@@ -1,0 +1,8 @@
+"""The mild solution: exponential integrators, step control, `solve`, `Solution`."""
+
+from .method import ETD1 as ETD1
+from .method import ETD2RK as ETD2RK
+from .method import AbstractMethod as AbstractMethod
+from .solution import RESULTS as RESULTS
+from .solution import Solution as Solution
+from .solve import solve as solve

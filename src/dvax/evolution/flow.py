@@ -1,0 +1,116 @@
+"""The reduced map f̃ along a trajectory, with all that a step wants to know about the law."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .. import _tree
+from .._tree import Tree
+from ..generators import AbstractGenerator
+from ..operators import AbstractOperator
+from ..problem import Problem
+from ..spaces import AbstractSpace
+from ..vi import RESULTS, AbstractSolver, Frozen
+
+
+class Rate(NamedTuple):
+    """f̃(t, x) and the law behind it.
+
+    `value` = f(t, x, u); y = P u; `z`, whose projection onto K is y; `residual` = ‖w‖ of the frozen
+    solve; `solved`, whether it met its tolerance; `iterations`.
+    """
+
+    value: Tree
+    y: Tree
+    z: Tree
+    residual: jax.Array
+    solved: jax.Array
+    iterations: jax.Array
+
+
+class Flow(eqx.Module):
+    """x' = Ax + f̃(t, x) for one `args`, with the law's solver and tolerance settled.
+
+    `direct` says that the law was proved to be F(y) = ay − h(t, x, 0), pointwise on a set of pointwise
+    intervals, or with one number a on any set, so that its closed form y = proj_K(h(t, x, 0)/a) is
+    used and no guess is needed. `reciprocal` is 1/a
+    where a was proved not to depend on t and x, so that it is computed once.
+    """
+
+    problem: Problem
+    args: Any
+    generator: AbstractGenerator
+    operator: AbstractOperator
+    solver: AbstractSolver
+    direct: bool = eqx.field(static=True)
+    reciprocal: Tree | None
+    tol: Any
+    gamma: Any
+    L_F: Any
+
+    def rate(self, t: Any, x: Tree, guess: Tree | None) -> Rate:
+        """f̃(t, x), the law being solved from `guess`."""
+        if self.direct:
+            return self._closed_form(t, x)
+        problem, args = self.problem, self.args
+        start = problem.zero_control(x) if guess is None else guess
+        vi = Frozen(
+            problem.frozen(t, x, args),
+            problem.set_at(t, args),
+            problem.spaces(x)[1],
+            self.gamma,
+            self.L_F,
+        )
+        answer = self.solver.solve(vi, start, self.tol)
+        value = problem.f(t, x, self.operator.inverse(answer.y), args)
+        solved = answer.result == RESULTS.successful
+        return Rate(value, answer.y, answer.z, answer.residual, solved, answer.iterations)
+
+    def _closed_form(self, t: Any, x: Tree) -> Rate:
+        problem, args = self.problem, self.args
+        drive = problem.h(t, x, problem.zero_control(x), args)
+        if self.reciprocal is not None:
+            z = jtu.tree_map(jnp.multiply, drive, self.reciprocal)
+        else:
+            z = jtu.tree_map(jnp.divide, drive, slope(problem, self.operator, t, x, args))
+        y = problem.set_at(t, args).project(z, problem.spaces(x)[1])
+        value = problem.f(t, x, self.operator.inverse(y), args)
+        exact = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(x)))
+        return Rate(value, y, z, exact, jnp.asarray(True), jnp.asarray(1))
+
+    def hidden(self, t: Any, x: Tree, rate: Rate, error: Tree) -> Tree:
+        """How far f̃ may be off, entry by entry, because z may be off by ± `error`.
+
+        While u sits on the boundary of K, f̃ does not feel z at all, and an error estimate built from
+        f̃ alone goes blind. What z could do is read off the projection: the part of
+        proj(z ± e) − proj(z) that is not linear in e, which is zero deep inside K and deep outside it
+        and large just where z might have crossed the boundary unseen.
+        """
+        K = self.problem.set_at(t, self.args)
+        space = self.problem.spaces(x)[1]
+        P = self.operator
+        project = lambda z: K.project(z, space)  # noqa: E731
+        u = P.inverse(rate.y)
+
+        def moved(sign: float) -> Tree:
+            step = _tree.scale(sign, error)
+            base, linear = jax.jvp(project, (rate.z,), (step,))
+            curved = _tree.sub(project(_tree.add(rate.z, step)), _tree.add(base, linear))
+            shifted = self.problem.f(t, x, _tree.add(u, P.inverse(curved)), self.args)
+            return jtu.tree_map(lambda a, b: jnp.abs(a - b), shifted, rate.value)
+
+        return jtu.tree_map(jnp.maximum, moved(1.0), moved(-1.0))
+
+    def state_space(self, x: Tree) -> AbstractSpace:
+        return self.problem.spaces(x)[0]
+
+
+def slope(problem: Problem, operator: AbstractOperator, t: Any, x: Tree, args: Any) -> Tree:
+    """a with F(y) = ay + const, for a law that is pointwise affine: a = P⁻¹1 − ∂ᵤh P⁻¹1."""
+    zero = problem.zero_control(x)
+    ones = operator.inverse(jtu.tree_map(jnp.ones_like, zero))
+    _, change = jax.jvp(lambda u: problem.h(t, x, u, args), (zero,), (ones,))
+    return _tree.sub(ones, change)

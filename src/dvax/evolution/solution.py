@@ -1,0 +1,125 @@
+"""What a solve returns."""
+
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .. import _tree
+from .._tree import Tree
+from ..errors import InputError, InputProblem, SolveError
+from .flow import Flow
+from .stepper import Record, inside
+
+if TYPE_CHECKING:
+    import xarray
+
+
+class RESULTS(eqx.Enumeration):
+    """How a solve ended, in a sentence."""
+
+    successful = "The end time was reached."
+    max_steps = "The largest number of steps was reached before t1. Raise max_steps, or loosen rtol."
+    step_too_small = (
+        "The step became too small to move t while the defect stayed above the tolerance. The data "
+        "is discontinuous at that time (name it: dvax.signals knots), or rtol is below rounding."
+    )
+    nonfinite = "f, h or K returned NaN or infinity."
+    law_unsolved = (
+        "The frozen law was not solved to its tolerance. Check that it is strongly pseudomonotone "
+        "(dvax.solve_vi at that time and state), or give vi_solver= more iterations."
+    )
+
+
+class Solution(eqx.Module):
+    """A trajectory with its response, its errors and how it was computed.
+
+    - `ts`: the saved times; `xs`, `us`, `ys`: states, responses u and y = P u there, each with a
+      leading time axis;
+    - `law_error`: a certified bound on ‖u − u*‖ of the frozen law at each saved time (C0 of
+      `dvax.vi.certificate`), or None where γ was not given (`constants=`); `law_residual`: ‖w‖;
+    - `defect`: ∫ ‖p − f̃(·, x_h)‖ ds up to each saved time, where x_h is the computed trajectory: it is
+      the exact solution of the system with a disturbance p − f̃ of that size. `law_defect` is the same
+      integral of ‖w‖ over the frozen solves. Both None where not measured (fixed steps, unless
+      `measure=True`). `dvax.bound_error` turns them into error bounds;
+    - `stats`: steps, accepted and rejected, and the settings that fixed them;
+    - `result`: `dvax.RESULTS.successful`, or what went wrong.
+    """
+
+    ts: jax.Array
+    xs: Tree
+    us: Tree
+    ys: Tree
+    law_residual: jax.Array
+    law_error: jax.Array | None
+    defect: jax.Array | None
+    law_defect: jax.Array | None
+    stats: dict[str, Any]
+    result: RESULTS
+    flow: Flow
+    records: Record | None
+
+    def evaluate(self, t: Any) -> tuple[Tree, Tree]:
+        """(x(t), u(t)) at any time of a solve made with `dense=True`.
+
+        x is the step's own polynomial propagated exactly in A; u is solved from the law at (t, x).
+
+        **Raises:** `dvax.InputError` where the steps were not kept, or t lies outside them.
+        """
+        if self.records is None:
+            raise InputError(
+                InputProblem(
+                    "Solution.evaluate",
+                    f"t = {t}",
+                    "the steps were not kept, so nothing is known between the saved times",
+                    "Solve with dense=True, or name the times in ts=",
+                )
+            )
+        t = jnp.asarray(t, self.records.start.dtype)
+        starts = self.records.start
+        first, last = starts[0], jnp.max(jnp.where(jnp.isfinite(starts), starts, -jnp.inf))
+        i = jnp.clip(jnp.searchsorted(starts, t, side="right") - 1, 0)
+        step = jax.tree_util.tree_map(lambda leaf: leaf[i], self.records)
+        end = last + self.records.length[jnp.searchsorted(starts, last)]
+        if _tree.is_concrete(t, first, end) and not first <= t <= end:
+            raise InputError(
+                InputProblem(
+                    "Solution.evaluate",
+                    f"t = {float(t):g}",
+                    f"the solve covers [{float(first):g}, {float(end):g}]",
+                    "Solve further, or ask for a time inside",
+                )
+            )
+        theta = (t - step.start) / step.length
+        x = inside(self.flow.generator, step.length, theta, step.x0, step.coefficients)
+        rate = self.flow.rate(t, x, None)
+        return x, self.flow.operator.inverse(rate.y)
+
+    def raise_if_failed(self) -> "Solution":
+        """This solution, or a `dvax.SolveError` that carries it."""
+        if self.result != RESULTS.successful:
+            raise SolveError(RESULTS[self.result], self)
+        return self
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """The saved trajectory as an `xarray.Dataset` with dimension `time`.
+
+        Parts of a tuple state become `x0`, `x1`, …; axes of an array become `x_dim0`, ….
+
+        **Raises:** `ModuleNotFoundError` where xarray (the extra `dvax[app]`) is not installed.
+        """
+        import xarray
+
+        variables: dict[str, Any] = {}
+        for name, tree in (("x", self.xs), ("u", self.us), ("y", self.ys)):
+            leaves = jax.tree_util.tree_leaves(tree)
+            for k, leaf in enumerate(leaves):
+                label = name if len(leaves) == 1 else f"{name}{k}"
+                dims = ("time", *(f"{label}_dim{i}" for i in range(leaf.ndim - 1)))
+                variables[label] = (dims, np.asarray(leaf))
+        for name, series in (("law_error", self.law_error), ("defect", self.defect)):
+            if series is not None:
+                variables[name] = (("time",), np.asarray(series))
+        return xarray.Dataset(variables, coords={"time": np.asarray(self.ts)})

@@ -1,0 +1,289 @@
+"""One step of an exponential method, as Diffrax's time loop asks for it."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from .. import _tree
+from .._tree import Tree
+from ..generators import AbstractGenerator, AbstractPropagator
+from .flow import Flow, Rate
+from .method import AbstractMethod, polynomial, shortened
+
+_DOUBT = 4.0
+"""By how many times its interpolation error z is taken to be uncertain between the samples."""
+
+_SMALL = 64
+"""Up to this many entries a look at every one of them is free."""
+
+
+class Record(NamedTuple):
+    """What is needed to evaluate a step anywhere inside: x₀ and the stage polynomial."""
+
+    start: jax.Array
+    length: jax.Array
+    x0: Tree
+    coefficients: tuple[Tree, ...]
+
+
+class Carry(NamedTuple):
+    """What the time loop carries and saves.
+
+    `defect` = ∫ ‖p − f̃(·, x_h)‖ ds so far, so that x_h is the exact solution of the system with a
+    disturbance of that size; `law_defect` = ∫ ‖w‖ ds, the same for the frozen solves; NaN where not
+    measured. `record` is the last step, kept only for dense output.
+    """
+
+    x: Tree
+    defect: jax.Array
+    law_defect: jax.Array
+    record: Record | None
+
+
+class Memory(NamedTuple):
+    """What one step leaves to the next, each None where it is not needed: the rate at its end, a
+    guess for the law, and the propagators of its length."""
+
+    rate: Rate | None
+    guess: Tree | None
+    length: jax.Array | None
+    full: AbstractPropagator | None
+    half: AbstractPropagator | None
+    count: jax.Array | None
+
+
+class Sample(NamedTuple):
+    """The defect of one step: entry by entry for the step control, integrated for certificates."""
+
+    last: Rate
+    error: Tree
+    defect: jax.Array
+    law_defect: jax.Array
+
+
+class MildTerm(diffrax.AbstractTerm):
+    """The term Diffrax wants to be given. The mild form is not a vector field (A may be unbounded),
+    so the dynamics live in the stepper, and this only says that there is one term."""
+
+    def vf(self, t, y, args):
+        return y
+
+    def contr(self, t0, t1, **kwargs):
+        return t1 - t0
+
+    def prod(self, vf, control):
+        return _tree.scale(control, vf)
+
+
+class Interpolation(diffrax.AbstractPath):
+    """The step evaluated anywhere inside: exact in A (see `AbstractMethod`)."""
+
+    t0: Any
+    t1: Any
+    before: Carry
+    after: Carry
+    coefficients: tuple[Tree, ...]
+    generator: AbstractGenerator
+
+    def evaluate(self, t0, t1=None, left=True):
+        theta = (t0 - self.t0) / (self.t1 - self.t0)
+        x = inside(
+            self.generator, self.t1 - self.t0, theta, self.before.x, self.coefficients
+        )
+        # At the end of the step the end itself: evaluating there would differ by rounding.
+        x = _tree.where(theta >= 1.0, self.after.x, x)
+        started = theta > 0.0
+        return Carry(
+            x,
+            # Inside a step the bound of the whole step is charged: it can only be too large.
+            jnp.where(started, self.after.defect, self.before.defect),
+            jnp.where(started, self.after.law_defect, self.before.law_defect),
+            self.after.record,
+        )
+
+
+def inside(
+    generator: AbstractGenerator, length: Any, theta: Any, x0: Tree, c: tuple[Tree, ...]
+) -> Tree:
+    """x_h(t₀ + θh)."""
+    return generator.propagator(theta * length, len(c)).step(x0, shortened(c, theta))
+
+
+class Stepper(diffrax.AbstractAdaptiveSolver):
+    """A method bound to a flow.
+
+    - `measure`: sample the defect inside every step, which adaptive steps and certificates need;
+    - `careful`: on failure keep the last good state, at the price of a second pass over memory;
+    - `uniform`: the propagator, where all steps have one length that is known beforehand.
+    """
+
+    method: AbstractMethod
+    flow: Flow
+    measure: bool = eqx.field(static=True)
+    careful: bool = eqx.field(static=True)
+    uniform: AbstractPropagator | None = None
+
+    term_structure: ClassVar = MildTerm
+
+    @property
+    def interpolation_cls(self) -> Callable[..., Interpolation]:  # pyright: ignore
+        return functools.partial(Interpolation, generator=self.flow.generator)
+
+    def order(self, terms):
+        return self.method.order
+
+    def error_order(self, terms):
+        # The estimate is the defect itself, which is of the method's order.
+        return self.method.order
+
+    def func(self, terms, t0, y0, args):
+        return y0
+
+    def init(self, terms, t0, t1, y0, args) -> Memory:
+        h = t1 - t0
+        guess = None if self.flow.direct else self.flow.problem.zero_control(y0.x)
+        rate = self.flow.rate(t0, y0.x, guess) if self.measure else None
+        half = self._propagator(0.5 * h) if self.measure else None
+        sparse = not (self.measure or self.careful) and _size(y0.x) > _SMALL
+        count = jnp.asarray(0) if sparse else None
+        if self.uniform is not None:
+            return Memory(rate, guess, None, None, half, count)
+        return Memory(rate, guess, h, self._propagator(h), half, count)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        memory, h, x0 = solver_state, t1 - t0, y0.x
+        if self.uniform is None:
+            memory = self._fit(memory, t0, t1, h)
+        full = memory.full if self.uniform is None else self.uniform
+        first = self._first(t0, x0, memory, made_jump)
+        stages = [first]
+
+        def evaluate(theta: float, x: Tree) -> Tree:
+            stages.append(self.flow.rate(_within(t0, t1, theta), x, stages[-1].y))
+            return stages[-1].value
+
+        def to_end(c: tuple[Tree, ...]) -> Tree:
+            return full.step(x0, c)
+
+        c = self.method.coefficients(evaluate, to_end, first.value)
+        x1 = to_end(c)
+        if self.measure:
+            sample = self._measure(t0, t1, x0, x1, first, c, memory)
+            last, defect, law_defect = sample.last, sample.defect, sample.law_defect
+            stages.append(last)
+            # Further in, a bad value may come from a step that was too long: it is cut, not fatal.
+            finite = _tree.all_finite(first.value)
+        else:
+            last, defect, law_defect = stages[-1], 0.0, 0.0
+            finite = self._finite(x1, memory.count)
+
+        solved = jnp.all(jnp.stack([stage.solved for stage in stages]))
+        result = diffrax.RESULTS.where(
+            solved, diffrax.RESULTS.successful, diffrax.RESULTS.nonlinear_max_steps_reached
+        )
+        result = diffrax.RESULTS.where(finite, result, diffrax.RESULTS.nonfinite)
+        if self.careful:
+            x1 = _tree.where(finite & solved, x1, x0)
+        record = None if y0.record is None else Record(t0, h, x0, c)
+        y1 = Carry(x1, y0.defect + defect, y0.law_defect + law_defect, record)
+        estimate = None
+        if self.measure:
+            estimate = jax.tree_util.tree_map(jnp.zeros_like, y1)._replace(x=sample.error)
+        memory = memory._replace(
+            rate=last if self.measure else None,
+            guess=None if self.flow.direct else last.y,
+            count=None if memory.count is None else memory.count + 1,
+        )
+        info = {"before": y0, "after": y1, "coefficients": c}
+        return y1, estimate, info, memory, result
+
+    def _first(self, t0: Any, x0: Tree, memory: Memory, made_jump: Any) -> Rate:
+        if memory.rate is None:
+            return self.flow.rate(t0, x0, memory.guess)
+        kept = memory.rate
+        # The last sample of the previous step was taken here, unless data jumps here.
+        return lax.cond(
+            made_jump, lambda: self.flow.rate(t0, x0, memory.guess), lambda: kept
+        )
+
+    def _finite(self, x: Tree, count: Any) -> jax.Array:
+        """Whether x is finite; of a large x, looked at every 64th step only.
+
+        A look costs half a step, and a bad entry stays bad (x₁ contains e^{hA}x₀). `solve` looks at
+        the end once more, and on failure runs again, carefully, to name the step.
+        """
+        if count is None:
+            return _tree.all_finite(x)
+        return lax.cond(count % 64 == 63, _tree.all_finite, lambda _: jnp.asarray(True), x)
+
+    def _propagator(self, h: Any) -> AbstractPropagator:
+        return self.flow.generator.propagator(h, self.method.degree + 1)
+
+    def _fit(self, memory: Memory, t0: Any, t1: Any, h: Any) -> Memory:
+        """Propagators for this length; kept from the last step where the length is the same.
+
+        t₀ + h is rounded, so equal steps differ by an ulp of t: that is not a new length.
+        """
+        ulp = jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+        same = jnp.abs(h - memory.length) <= 2 * ulp
+        length, full, half = lax.cond(
+            same,
+            lambda: (memory.length, memory.full, memory.half),
+            lambda: (
+                h, self._propagator(h), self._propagator(0.5 * h) if self.measure else None
+            ),
+        )  # fmt: skip
+        return memory._replace(length=length, full=full, half=half)
+
+    def _measure(
+        self, t0: Any, t1: Any, x0: Tree, x1: Tree, first: Rate, c: Any, memory: Memory
+    ) -> Sample:
+        """The defect δ = p − f̃(·, x_h) at the middle and at the end of the step; δ(t₀) = 0.
+
+        Between the samples δ is taken to be a line plus a bump (a parabola, or the tent of a kink):
+        then ∫|δ| ≤ h(½|δ(1)| + |δ(½) − ½δ(1)|), whatever the place of the kink.
+        """
+        h = t1 - t0
+        flow = self.flow
+        assert memory.half is not None
+        xm = memory.half.step(x0, shortened(c, 0.5))
+        tm, te = _within(t0, t1, 0.5), _within(t0, t1, 1.0)
+        middle = flow.rate(tm, xm, first.y)
+        last = flow.rate(te, x1, middle.y)
+        at_end = _tree.sub(last.value, polynomial(c, 1.0))
+        line = _tree.scale(0.5, at_end)
+        bump = _tree.sub(_tree.sub(middle.value, polynomial(c, 0.5)), line)
+
+        # How well z, the unconstrained value of the law, is predicted in the middle.
+        doubt = jax.tree_util.tree_map(
+            lambda a, m, b: _DOUBT * (m - 0.5 * (a + b)), first.z, middle.z, last.z
+        )
+        unseen = jax.tree_util.tree_map(
+            jnp.maximum, flow.hidden(tm, xm, middle, doubt), flow.hidden(te, x1, last, doubt)
+        )
+        error = jax.tree_util.tree_map(
+            lambda a, b, s: jnp.abs(a) + jnp.abs(b) + s, line, bump, unseen
+        )
+        space = flow.state_space(x0)
+        defect = h * (space.norm(line) + space.norm(bump) + space.norm(unseen))
+        residuals = [first.residual, middle.residual, last.residual]
+        law_defect = h * jnp.max(jnp.stack(residuals))
+        return Sample(last, error, defect, law_defect)
+
+
+def _within(t0: Any, t1: Any, theta: float) -> Any:
+    """t₀ + θh, where the end of the step is approached from inside: data may jump at t₁."""
+    if theta < 1.0:
+        return t0 + theta * (t1 - t0)
+    end = lax.stop_gradient(t1)
+    return t1 + (jnp.nextafter(end, -jnp.inf) - end)
+
+
+def _size(x: Tree) -> int:
+    return sum(leaf.size for leaf in jax.tree_util.tree_leaves(x))

@@ -1,0 +1,6 @@
+"""The theory as software: constants, stability, the a-posteriori certificate."""
+
+from .certificate import Bound as Bound
+from .certificate import bound_error as bound_error
+from .constants import Constants as Constants
+from .constants import Row as Row

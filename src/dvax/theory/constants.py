@@ -1,0 +1,227 @@
+"""The constants of the theory and what follows from them, each found by its label in the paper."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .. import _tree
+from ..errors import InputError, InputProblem
+from .status import Status, weakest
+
+_PRIMARY = (
+    "gamma", "L_F", "alpha_h", "beta_h", "alpha_f", "beta_f", "M", "omega", "m_P", "norm_P_inv",
+)  # fmt: skip
+
+
+class Row(NamedTuple):
+    """One line of `Constants.table`: what a constant is, what it is worth, and how it is known."""
+
+    name: str
+    symbol: str
+    value: float
+    label: str
+    status: Status
+    meaning: str
+
+
+class Constants(eqx.Module):
+    """The moduli of a coupled system, declared by the caller or proved by a model.
+
+    **Arguments** (paper's symbol and label):
+
+    - `gamma` (γ) and `L_F`: strong pseudomonotonicity and Lipschitz modulus of the frozen operator
+      (ass:strong_pseudomono);
+    - `alpha_h` (ass:h_lipschitz_x), `beta_h` (ass:lipschitz_smallness): Lipschitz moduli of h in x, u;
+    - `alpha_f`, `beta_f`: those of f (ass:f_lipschitz);
+    - `M`, `omega`: ‖e^{At}‖ ≤ M e^{ωt} (lem:semigroup_bound_prelim);
+    - `m_P`, `norm_P_inv`: min σ(P⁻¹) and ‖P⁻¹‖ (ass:operators);
+    - `one_sided` (μ), optional: ⟨A(x−x') + f̃(x) − f̃(x'), x−x'⟩ ≤ μ‖x−x'‖². The paper's constants
+      use |·| where this sees signs, so it is never above ω + M L̃ when M = 1;
+    - `status`: "proved" or "declared" for all of them, or a mapping from name to status.
+
+    **Raises:** `dvax.InputError` where γ, L_F, m_P or ‖P⁻¹‖ is not positive, a Lipschitz modulus is
+    negative, M < 1, or γ > L_F.
+
+    ```python
+    >>> import dvax
+    >>> c = dvax.Constants(gamma=2.0, L_F=2.0, alpha_h=2.0, beta_h=1.0, alpha_f=0.5, beta_f=1.0,
+    ...                    M=1.0, omega=-1.0, m_P=1.0, norm_P_inv=1.0)
+    >>> float(c.L), float(c.L_tilde), round(float(c.hadamard(2.0)), 6)
+    (1.0, 1.5, 5.436564)
+
+    ```
+    """
+
+    gamma: Any
+    L_F: Any
+    alpha_h: Any
+    beta_h: Any
+    alpha_f: Any
+    beta_f: Any
+    M: Any
+    omega: Any
+    m_P: Any
+    norm_P_inv: Any
+    one_sided: Any
+    statuses: tuple[tuple[str, Status], ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        *,
+        gamma: Any,
+        L_F: Any,
+        alpha_h: Any,
+        beta_h: Any,
+        alpha_f: Any,
+        beta_f: Any,
+        M: Any,
+        omega: Any,
+        m_P: Any,
+        norm_P_inv: Any,
+        one_sided: Any = None,
+        status: Status | Mapping[str, Status] = "declared",
+    ):
+        given = (gamma, L_F, alpha_h, beta_h, alpha_f, beta_f, M, omega, m_P, norm_P_inv)
+        for name, value in zip(_PRIMARY, given, strict=True):
+            setattr(self, name, _tree.as_float(value, f"dvax.Constants({name})"))
+        self.one_sided = (
+            None if one_sided is None else _tree.as_float(one_sided, "dvax.Constants(one_sided)")
+        )
+        names = (*_PRIMARY, "one_sided")
+        each = {name: status if isinstance(status, str) else "declared" for name in names}
+        if not isinstance(status, str):
+            each.update(status)
+        self.statuses = tuple(sorted(each.items()))
+        self._check()
+
+    @property
+    def L(self) -> Any:
+        """Lipschitz constant of the state-to-control map: L = α_h ‖P⁻¹‖/γ (eq:LU_def)."""
+        return self.alpha_h * self.norm_P_inv / self.gamma
+
+    @property
+    def L_tilde(self) -> Any:
+        """Lipschitz constant of the reduced map: L̃ = α_f + β_f L (reduceLip)."""
+        return self.alpha_f + self.beta_f * self.L
+
+    @property
+    def growth_rate(self) -> Any:
+        """ω + M L̃, the exponent of every estimate of thm:continuous_dependence."""
+        return self.omega + self.M * self.L_tilde
+
+    @property
+    def decay_rate(self) -> Any:
+        """η − M L̃ with η = −ω: two trajectories approach at this rate where it is positive
+        (cor:incremental_stability)."""
+        return -self.growth_rate
+
+    @property
+    def sharp_decay_rate(self) -> Any:
+        """−μ of the one-sided constant, or None where that is not known: ‖x₁−x₂‖ ≤ e^{μt}‖Δx₀‖,
+        since d/dt ½‖x₁−x₂‖² ≤ μ‖x₁−x₂‖²."""
+        return None if self.one_sided is None else -self.one_sided
+
+    def hadamard(self, T: Any) -> Any:
+        """C_T = M e^{(ω+ML̃)₊T}(1 + L): ‖(x₁,u₁)−(x₂,u₂)‖ ≤ C_T‖Δx₀‖ (cor:hadamard_wellposed)."""
+        return self.M * jnp.exp(jnp.maximum(self.growth_rate, 0.0) * T) * (1.0 + self.L)
+
+    def contraction_factor(self, rho: Any) -> Any:
+        """q_ρ = ‖I − ρP⁻¹‖ + ρ β_h ‖P⁻¹‖ (eq:smalless), with ‖I − ρP⁻¹‖ from the spectrum."""
+        spread = jnp.maximum(
+            jnp.abs(1.0 - rho * self.m_P), jnp.abs(1.0 - rho * self.norm_P_inv)
+        )
+        return spread + rho * self.beta_h * self.norm_P_inv
+
+    @property
+    def best_rho(self) -> Any:
+        """ρ* = 2/(m_P + ‖P⁻¹‖), which minimises ‖I − ρP⁻¹‖ (remark after eq:smalless)."""
+        return 2.0 / (self.m_P + self.norm_P_inv)
+
+    def bielecki_factor(self, lam: Any) -> Any:
+        """M L̃/(λ − ω): the Picard map contracts by it in the λ-norm, λ > ω + M L̃ (eq:Sop)."""
+        return self.M * self.L_tilde / (lam - self.omega)
+
+    def status_of(self, *names: str) -> Status:
+        """The weakest status among the named constants."""
+        known = dict(self.statuses)
+        return weakest(*(known[name] for name in names))
+
+    def table(self, T: Any = None, rho: Any = None) -> list[Row]:
+        """Every constant with its label and status; C_T for the horizon T where it is given."""
+        rho = self.best_rho if rho is None else rho
+        law = ("alpha_h", "norm_P_inv", "gamma")
+        flow = (*law, "alpha_f", "beta_f")
+        rate = (*flow, "M", "omega")
+        rows = [
+            ("gamma", "γ", self.gamma, "ass:strong_pseudomono", ("gamma",),
+             "modulus of strong pseudomonotonicity of the frozen operator"),
+            ("L_F", "L_F", self.L_F, "ass:strong_pseudomono", ("L_F",),
+             "Lipschitz modulus of the frozen operator"),
+            ("alpha_h", "α_h", self.alpha_h, "ass:h_lipschitz_x", ("alpha_h",),
+             "Lipschitz modulus of the feedback h in the state"),
+            ("beta_h", "β_h", self.beta_h, "ass:lipschitz_smallness", ("beta_h",),
+             "Lipschitz modulus of the feedback h in the response"),
+            ("alpha_f", "α_f", self.alpha_f, "ass:f_lipschitz", ("alpha_f",),
+             "Lipschitz modulus of f in the state"),
+            ("beta_f", "β_f", self.beta_f, "ass:f_lipschitz", ("beta_f",),
+             "Lipschitz modulus of f in the response"),
+            ("M", "M", self.M, "lem:semigroup_bound_prelim", ("M",),
+             "overshoot of the semigroup"),
+            ("omega", "ω", self.omega, "lem:semigroup_bound_prelim", ("omega",),
+             "growth rate of the semigroup"),
+            ("m_P", "m_P", self.m_P, "remark:assstrong", ("m_P",), "min of the spectrum of P⁻¹"),
+            ("norm_P_inv", "‖P⁻¹‖", self.norm_P_inv, "ass:operators", ("norm_P_inv",),
+             "max of the spectrum of P⁻¹"),
+            ("L", "L", self.L, "eq:LU_def", law, "Lipschitz constant of the response u_x(t)"),
+            ("L_tilde", "L̃", self.L_tilde, "lem:lipschitz_reduced", flow,
+             "Lipschitz constant of the reduced map"),
+            ("growth_rate", "ω + M L̃", self.growth_rate, "thm:continuous_dependence", rate,
+             "largest rate at which two trajectories can separate"),
+            ("decay_rate", "η − M L̃", self.decay_rate, "cor:incremental_stability", rate,
+             "rate at which two trajectories certainly approach, where positive"),
+            ("q_rho", "q_ρ", self.contraction_factor(rho), "ass:lipschitz_smallness",
+             ("m_P", "norm_P_inv", "beta_h"),
+             f"factor of the projection route at ρ = {_number(rho)}; it works where below 1"),
+        ]  # fmt: skip
+        if T is not None:
+            rows.append(
+                ("hadamard", "C_T", self.hadamard(T), "cor:hadamard_wellposed", rate,
+                 f"Lipschitz constant of the solution map on [0, {_number(T)}]")
+            )  # fmt: skip
+        if self.one_sided is not None:
+            rows.append(
+                ("sharp_decay_rate", "−μ", self.sharp_decay_rate, "one-sided, sharper than the paper",
+                 ("one_sided",), "rate of approach that sees the sign of the feedback")
+            )  # fmt: skip
+        return [
+            Row(name, symbol, float(value), label, self.status_of(*made_of), meaning)
+            for name, symbol, value, label, made_of, meaning in rows
+        ]
+
+    def _check(self) -> None:
+        rules = [
+            *((n, getattr(self, n) > 0, "positive") for n in ("gamma", "L_F", "m_P", "norm_P_inv")),
+            *((n, getattr(self, n) >= 0, "≥ 0")
+              for n in ("alpha_h", "beta_h", "alpha_f", "beta_f")),
+            ("M", self.M >= 1, "≥ 1"),
+            ("gamma", self.gamma <= self.L_F * (1 + 1e-12), "at most L_F"),
+            ("m_P", self.m_P <= self.norm_P_inv * (1 + 1e-12), "at most norm_P_inv"),
+        ]  # fmt: skip
+        wrong = [
+            InputProblem(
+                f"dvax.Constants({name})",
+                _tree.short(getattr(self, name)),
+                f"it must be {rule}",
+                "Check its definition in the docstring of dvax.Constants",
+            )
+            for name, holds, rule in rules
+            if _tree.is_concrete(holds) and not bool(jnp.all(holds))
+        ]
+        if wrong:
+            raise InputError(*wrong)
+
+
+def _number(value: Any) -> str:
+    return f"{float(value):.6g}"
