@@ -133,6 +133,8 @@ def _parse(source: Path) -> dict[str, Any]:
             )
         text = source.read_bytes().decode("utf-8")
         return tomllib.loads(text)
+    except InputError:
+        raise  # it is a ValueError too
     except OSError as error:
         raise refuse(
             str(source), error.strerror or str(error), "it must be readable", "Check it."
@@ -195,7 +197,7 @@ def _check(raw: dict[str, Any], source: Path, allow_outside: bool) -> Config:
     )
     draft = _with_defaults(draft, usable)
     edges = raw.get("boundary")
-    rectangle = isinstance(edges, dict) and "lengths" in edges
+    rectangle = isinstance(edges, dict) and "lengths" in edges and "length" not in edges
     names = ("s1", "s2") if rectangle else ("s",)
     inputs, found = read_inputs(draft, sources, working, quoted, names)
     problems += found

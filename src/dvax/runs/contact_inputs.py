@@ -8,6 +8,7 @@ import numpy as np
 from dvax.errors import InputError, InputProblem
 from dvax.runs.boundary import Boundary, build_boundary
 from dvax.runs.data_file import DataFile, fingerprint, locate
+from dvax.runs.expressions import compile_expression
 from dvax.runs.fields import Field, Sources, perturbation, read_field, space_values, to_signal
 from dvax.runs.units import Units
 
@@ -92,10 +93,13 @@ def read_inputs(
     problems += _between_times(sections, sources.name)
     shift = None
     initial = sections.get("initial")
-    if boundary is not None and initial is not None and initial.companion is not None:
+    if initial is not None and initial.companion is not None:
+        place = f"{sources.name}: initial.companion"
         try:
-            place = f"{sources.name}: initial.companion"
-            shift = perturbation(initial.companion, boundary, place)
+            if boundary is not None:
+                shift = perturbation(initial.companion, boundary, place)
+            elif isinstance(initial.companion, str):
+                compile_expression(initial.companion, coordinate_names, place=place)
         except InputError as error:
             problems += error.problems
     if boundary is None:

@@ -109,7 +109,7 @@ def check_increasing(file: str, column: Column) -> None:
 
 def _rows(name: str, text: str) -> list[tuple[int, list[str]]]:
     """(line, cells) of every row that is neither blank nor a comment."""
-    reader = csv.reader(text.splitlines(), strict=True)
+    reader = csv.reader(text.splitlines(), strict=True, skipinitialspace=True)
     rows: list[tuple[int, list[str]]] = []
     try:
         for cells in reader:

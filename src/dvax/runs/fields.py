@@ -181,7 +181,7 @@ def to_signal(field: Field, boundary: Boundary) -> Any:
         factors.append(signals.Function(formula, knots=field.knots))
     product = factors[0]
     for factor in factors[1:]:
-        product = product * factor
+        product = signals.Product(product, factor)
     return product
 
 

@@ -2,6 +2,8 @@
 units."""
 
 import io
+import tokenize
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +17,21 @@ from dvax.runs.schema import ProfileSection, SeriesSection
 from dvax.runs.strong_motion import read_strong_motion
 from dvax.runs.units import UnitError, Units
 
+# What numpy raises for broken headers and data: its header parser lets the tokenizer's errors
+# through.
+_BROKEN_NPY = (
+    ValueError,
+    TypeError,
+    SyntaxError,
+    KeyError,
+    EOFError,
+    OSError,
+    MemoryError,
+    OverflowError,
+    RecursionError,
+    tokenize.TokenError,
+    Warning,
+)
 _CUBIC_LEAST = 4  # points that a not-a-knot spline needs
 
 
@@ -145,9 +162,12 @@ def _read_npy(section: ProfileSection, path: Path, boundary: Boundary, place: st
     for key, value in (("column", section.column), ("position_column", section.position_column)):
         if value not in (None, "s"):
             raise _error(f"{place}.{key}", repr(value), "an NPY file has no columns", "Remove it.")
+    content = read_bytes(path)
     try:
-        array = np.load(io.BytesIO(read_bytes(path)), allow_pickle=False)
-    except (ValueError, EOFError, OSError, MemoryError, SyntaxError, TypeError, OverflowError) as e:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # numpy repairs some headers with a mere warning
+            array = np.load(io.BytesIO(content), allow_pickle=False)
+    except _BROKEN_NPY as e:
         raise _error(
             path.name,
             str(e).splitlines()[0][:120] if str(e) else "an incomplete file",

@@ -6,8 +6,7 @@ Volokitin, Tosatti, J. Phys.: Condens. Matter 17 (2005) R1, section 2). Here H =
 wavelengths are 5 mm to 20 um on a strip of 20 mm, the root mean square height is 0.8 um about a
 mean of 0.8 um, and the phases are random:
 
-    height(s) = mean + sum_k a_k cos(2 pi k s / L + phase_k),    a_k ~ k^-(1/2 + H),  k = 4 ...
-    1000.
+    height(s) = mean + sum_k a_k cos(2 pi k s / L + phase_k),  a_k ~ k^-(1/2 + H),  4 <= k <= 1000.
 
 The amplitudes are not random, so mean and root mean square hold exactly, and as the surface is a
 formula it is the same surface at every resolution.
