@@ -1,5 +1,7 @@
 """A configuration says everything a run will do, in numbers whose units are known."""
 
+import time
+
 import jax
 import numpy as np
 import pytest
@@ -229,6 +231,24 @@ def test_what_is_wrong_is_said_with_its_place_and_rule(case, tmp_path):
     assert any(part in problem.place for part in place.split("|")), problem
     assert any(part in str(problem) for part in said.split("|")), problem
     assert problem.given and problem.mend
+
+
+def test_long_texts_cost_no_time(tmp_path):
+    blanks, digits = " " * 200_000, "1" * 200_000
+    start = time.perf_counter()
+    for changes in (
+        {"model.kappa0": "2 M" + blanks + "!"},
+        {"model.kappa0": digits + "!"},
+        {"model.kappa0": "2 " + "m*" * 50_000},
+        {"initial.companion": "2 s" + blanks + "!"},
+        {"load.expression": "(" * 100_000},
+    ):
+        with pytest.raises(InputError):
+            load_config(write(tmp_path, changes))
+    header = f"time [s],load{' ' * 100_000}!\n0,{digits[:100_000]}x\n3,1\n"
+    with pytest.raises(InputError):
+        load_config(write(tmp_path, load_csv=header))
+    assert time.perf_counter() - start < 3.0
 
 
 def test_all_problems_come_at_once(tmp_path):

@@ -131,7 +131,7 @@ def _read_header(
     names: list[str] = []
     units: list[str | None] = []
     for number, cell in enumerate(header, start=1):
-        match = _HEADER.fullmatch(cell)
+        match = _HEADER.fullmatch(cell) if len(cell) <= 200 else None
         title = match["name"] if match else cell.strip() or f"column {number}"
         place = f"{file}, line {line}, column {number}"
         if match is None or NUMBER.fullmatch(title):

@@ -37,11 +37,11 @@ _DIMENSIONS: Mapping[str, str] = {
     "pressure": "[mass] / [length] / [time] ** 2",
 }
 
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?")
+NUMBER = re.compile(r"[+-]?(\d+(?:\.\d*)?|\.\d+)([eE][+-]?\d{1,3})?")
 """A decimal number; what ``float`` also takes (``nan``, ``1_000``) is refused."""
 _QUANTITY = re.compile(rf"\s*({NUMBER.pattern})(\s*[A-Za-zµμ%°].*?|\s+(?:1\s*/|\().+?)\s*")
-# A unit is names with single-digit exponents between * / · or blanks, one level of parentheses deep:
-# no number within it can grow, and pint's own parser never sees anything else.
+# A unit is names with single-digit exponents between * / · or blanks, one level of parentheses
+# deep: no number within it can grow, and pint's own parser never sees anything else.
 _EXPONENT = r"(?:\s*(?:\*\*|\^)\s*-?\d)?"
 _NAME = rf"[A-Za-zµμ%][A-Za-zµμ_]*{_EXPONENT}"
 _BETWEEN = r"(?:\s*(?:\*(?!\*)|[/·])\s*|\s+)"
@@ -95,7 +95,7 @@ class Units(BaseModel):
 
     def convert(self, text: str, kind: str) -> float:
         """A text "number unit" in working units. Raises `UnitError`."""
-        match = _QUANTITY.fullmatch(text)
+        match = _match(text)
         if match is None:
             example = self.of(kind) if kind != "number" else ""
             raise UnitError(
@@ -107,7 +107,12 @@ class Units(BaseModel):
 
 def is_quantity(text: str) -> bool:
     """Whether a text has the form "number unit". No formula has it."""
-    return _QUANTITY.fullmatch(text) is not None
+    return _match(text) is not None
+
+
+def _match(text: str) -> re.Match[str] | None:
+    # The pattern takes quadratic time, which a long text could turn into minutes.
+    return _QUANTITY.fullmatch(text) if len(text) <= 100 else None
 
 
 def check_working_unit(name: str, unit: str) -> None:
