@@ -1,0 +1,258 @@
+"""`run`: from a checked configuration to a run directory, block by block of saved frames.
+
+The trajectory is never held as a whole: a block of frames is solved, certified, written, forgotten.
+Every block starts from the last state and step of the one before, so a run is the same whatever its
+blocks, and what is on disk is readable whenever and however the run ends.
+"""
+
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from dvax.errors import InputError, InputProblem, SolveError
+from dvax.evolution import ETD1, ETD2RK, Solution, solve
+from dvax.models import Contact
+from dvax.runs.compile_time import compile_seconds
+from dvax.runs.config import Config, build_contact
+from dvax.runs.contact_figures import Figures
+from dvax.runs.contact_frames import (
+    attributes,
+    block_values,
+    constant_rows,
+    coordinates,
+    variables,
+)
+from dvax.runs.contact_inputs import ContactInputs
+from dvax.runs.provenance import provenance
+from dvax.runs.resolved import write_resolved
+from dvax.runs.rundir import FrameStore, RunDirectory
+from dvax.spaces import AbstractSpace
+from dvax.theory import bound_error
+
+_BLOCKS = 40
+"""So many blocks at least where there are frames enough: the progress bar moves, and a kill loses
+no more than a fortieth."""
+_BLOCK_BYTES = 2**27
+
+Listener = Callable[[dict[str, Any]], None]
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """How a run ended. `exit_code`: 0 finished, 3 failed, 130 interrupted."""
+
+    status: str
+    exit_code: int
+    stop_reason: str
+    directory: Path
+    summary: dict[str, Any]
+
+
+def run(
+    config: Config, out: Path, *, overwrite: bool = False, on_event: Listener | None = None
+) -> RunOutcome:
+    """Solve what `config` describes and leave a run directory at `out`.
+
+    `on_event` is called with dicts whose "event" is compiled, progress, warning or stopped.
+
+    **Raises:** `dvax.InputError`, with nothing written, where `out` exists and is not empty and
+    `overwrite` is false, or where data files no longer fit. A failure of the solve is not raised: it
+    is the outcome, and what was computed before is on disk.
+    """
+    _refuse_existing(out, overwrite)
+    compile_seconds()
+    inputs = build_contact(config)
+    directory = RunDirectory(out, clear=True)
+    try:
+        return _Run(config, inputs, directory, on_event or (lambda event: None)).go()
+    finally:
+        directory.close()
+
+
+class _Run:
+    """One run under way: the model, what is on disk, and how far it is."""
+
+    def __init__(
+        self, config: Config, inputs: ContactInputs, directory: RunDirectory, tell: Listener
+    ):
+        self.config, self.inputs, self.directory, self.tell = config, inputs, directory, tell
+        m = config.model
+        self.model = Contact(
+            alpha=m.alpha, beta=m.beta, b_x=m.b_x, b_u=m.b_u, d_x=m.d_x, d_u=m.d_u,
+            kappa0=m.kappa0, g=inputs.demand_signal, ell=inputs.load_signal,
+            weights=inputs.boundary.weights,
+        )  # fmt: skip
+        self.problem, self.constants = self.model.problem, self.model.constants
+        self.space: AbstractSpace = self.problem.spaces(jnp.asarray(inputs.x0))[0]
+        self.rows = constant_rows(self.constants, config, config.time.end, m.beta)
+        self.started = datetime.now(UTC)
+        self.clock = time.monotonic()
+        self.steps = self.rejected = 0
+
+    def go(self) -> RunOutcome:
+        write_resolved(self.config, self.inputs, self.directory.path)
+        self._manifest("running", "The run is going on.")
+        for notice in self.inputs.notices:
+            self._event("warning", message=notice)
+        times = self.inputs.frame_times
+        block = _block_length(len(times), self.inputs.boundary.size)
+        store = FrameStore(
+            self.directory.path / "trajectory.zarr",
+            len(times),
+            block,
+            coordinates(self.inputs, self.config),
+            variables(self.config, "estimated"),
+            attributes(self.config, self.rows, self.inputs.boundary.shape),
+            {"long_name": "time", "units": self.config.units.time},
+        )
+        figures = Figures(self.inputs, self.config, self.constants)
+        status, code, reason = "finished", 0, "The end time was reached."
+        try:
+            with _terminable():
+                self._blocks(times, block, store, figures)
+        except KeyboardInterrupt:
+            status, code = "interrupted", 130
+            reason = "Interrupted; every frame written until then is kept."
+        except SolveError as error:
+            status, code, reason = "failed", 3, str(error)
+        store.finish()
+        summary = figures.summary(self.steps)
+        self.directory.write_json("summary.json", summary)
+        self._manifest(status, reason, frames=store.written)
+        self._event("stopped", message=reason, status=status)
+        return RunOutcome(status, code, reason, self.directory.path, summary)
+
+    def _blocks(self, times: np.ndarray, block: int, store: FrameStore, figures: Any) -> None:
+        main, other = _Piece(self.inputs.x0), _Piece(self.inputs.companion_x0)
+        apart = self.space.norm(jnp.asarray(self.inputs.x0 - self.inputs.companion_x0))
+        error, u_error = jnp.zeros(()), 0.0
+        defect = 0.0
+        for first in range(0, len(times), block):
+            wanted = times[first : first + block]
+            # Blocks are of one length, so that they share one compilation: the last repeats its end.
+            ts = np.concatenate([wanted, np.full(block - len(wanted), wanted[-1])])
+            start = times[max(first - 1, 0)]
+            failure = None
+            try:
+                a = self._solve(main, start, ts)
+            except SolveError as stopped:
+                a, failure = stopped.solution, stopped
+                assert isinstance(a, Solution)
+                if len(a.ts) == 0:
+                    raise
+                ts = np.asarray(a.ts)
+                wanted = wanted[: len(ts)]
+            b = self._solve(other, start, ts)
+            bound = bound_error(self.problem, a, self.constants, initial_error=error)
+            values = dict(block_values(self.model, self.space, a, b, bound, apart))
+            assert a.defect is not None
+            values["defect"] = defect + np.asarray(a.defect)
+            count = len(wanted)
+            kept = {name: value[:count] for name, value in values.items()}
+            store.write(wanted, kept)
+            figures.add(wanted, kept)
+            if failure is not None:
+                raise failure
+            error, defect = bound.x[-1] / self.constants.M, values["defect"][-1]
+            self.steps += int(a.stats["steps"])
+            self.rejected += int(a.stats["rejected"])
+            if first == 0:
+                self._event("compiled", compile_seconds=compile_seconds())
+            self._event("progress", t=float(wanted[-1]), t_end=float(times[-1]), steps=self.steps)
+
+    def _solve(self, piece: "_Piece", start: float, ts: np.ndarray) -> Solution:
+        s = self.config.solver
+        sol = solve(
+            self.problem, jnp.asarray(piece.x), start, float(ts[-1]), None, ts,
+            dt=s.dt, rtol=s.rtol or 1e-6, atol=s.atol or 1e-9,
+            method=ETD1() if s.method == "ETD1" else ETD2RK(),
+            constants=self.constants, measure=True,
+            dt0=piece.dt, horizon=self.config.time.end,
+        )  # fmt: skip
+        piece.x, piece.dt = sol.stats["x"], sol.stats["next_dt"] if s.dt is None else None
+        return sol
+
+    def _event(self, kind: str, **facts: Any) -> None:
+        event = {"event": kind, **facts}
+        self.directory.log(event)
+        self.tell(event)
+
+    def _manifest(self, status: str, reason: str, **more: Any) -> None:
+        seconds = time.monotonic() - self.clock
+        spent = compile_seconds()
+        files = {f.name: {"sha256": f.sha256, "bytes": f.bytes} for f in self.inputs.data_files}
+        content = {
+            **provenance(),
+            "status": status,
+            "stop_reason": reason,
+            "started": self.started.isoformat(timespec="seconds"),
+            "finished": None if status == "running" else _now(),
+            "compile_seconds": round(spent, 3),
+            "run_seconds": round(max(0.0, seconds - spent), 3),
+            "steps": self.steps,
+            "rejected_steps": self.rejected,
+            "points": self.inputs.boundary.size,
+            "data": files,
+            "constants": self.rows,
+            **more,
+        }
+        self.directory.write_json("manifest.json", content)
+
+
+class _Piece:
+    """Where a trajectory stands: its state and the step it would take next."""
+
+    def __init__(self, x: np.ndarray):
+        self.x: Any = x
+        self.dt: Any = None
+
+
+def _block_length(frames: int, points: int) -> int:
+    """Frames a block: a fortieth of all, fewer where they are large, and never the first alone,
+    which is no distance from the start."""
+    affordable = _BLOCK_BYTES // (8 * 3 * points)
+    longest = max(2, min(math.ceil(frames / _BLOCKS), affordable))
+    return math.ceil(frames / math.ceil(frames / longest))
+
+
+def _refuse_existing(out: Path, overwrite: bool) -> None:
+    if out.is_dir() and any(out.iterdir()) and not overwrite:
+        raise InputError(
+            InputProblem(
+                str(out),
+                "a folder that is not empty",
+                "results are never written over others unasked",
+                "Give another folder, or ask to overwrite this one",
+            )
+        )
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Let a request to terminate end the run as Ctrl-C does: with everything in order on disk."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
