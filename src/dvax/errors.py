@@ -11,8 +11,8 @@ class DvaxError(Exception):
 class InputProblem:
     """One thing wrong with what the user gave.
 
-    `place` says where (a file with line and column, a dotted key, an argument's name), `given` what was
-    found there, `rule` what is required and why, `mend` what to do about it.
+    `place` says where (a file with line and column, a dotted key, an argument's name), `given` what
+    was found there, `rule` what is required and why, `mend` what to do about it.
     """
 
     place: str

@@ -34,9 +34,10 @@ class Problem(eqx.Module):
     - `A`: a `dvax.generators` object, or a callable `args -> generator`;
     - `P`: a `dvax.operators` object, or a callable `args -> operator`;
     - `K`: a `dvax.sets` object, or a callable `(t, args) -> set`;
-    - `f(t, x, u, args)`, `h(t, x, u, args)`: traceable by JAX; x and u are arrays, or tuples of them;
-    - `state_space`, `control_space`: where they are not plain Euclidean, or where u does not have the
-      shape of x. The control space defaults to the state space.
+    - `f(t, x, u, args)`, `h(t, x, u, args)`: traceable by JAX; x and u are arrays, or tuples of
+      them;
+    - `state_space`, `control_space`: where they are not plain Euclidean, or where u does not have
+      the shape of x. The control space defaults to the state space.
 
     `args` is the paper's parameter η: any pytree, handed to all of them.
 
@@ -139,7 +140,7 @@ class Problem(eqx.Module):
     def response(
         self, t: Any, x: Tree, args: Any = None, *, solver: AbstractSolver | None = None
     ) -> Tree:
-        """The state-to-control map u_x(t) (paper, lem:unique_u), solved to 1e-10 in the residual."""
+        """The state-to-control map u_x(t) (paper, lem:unique_u), solved to 1e-10 in residual."""
         x = _tree.as_float(x, "x")
         self.check(t, x, args)
         return self.operator(args).inverse(self.law(t, x, args, solver=solver).y)
@@ -220,9 +221,7 @@ class Problem(eqx.Module):
         if self.control_space is None:
             return _tree.zeros_like(x)
         dtype = jnp.result_type(*jax.tree_util.tree_leaves(x))
-        return jax.tree_util.tree_map(
-            lambda leaf: leaf.astype(dtype), self.control_space.zeros()
-        )
+        return jax.tree_util.tree_map(lambda leaf: leaf.astype(dtype), self.control_space.zeros())
 
 
 def _check_spans(spans: list[tuple[Any, Any, str]], t0: Any, t1: Any) -> None:

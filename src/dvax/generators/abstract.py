@@ -23,7 +23,8 @@ class AbstractPropagator(eqx.Module):
 
         x(t₀ + h) = e^{hA}x₀ + h Σⱼ j! φ_{j+1}(hA) cⱼ,
 
-    with φₖ(z) = ∫₀¹ e^{(1−s)z} s^{k−1}/(k−1)! ds, because ∫₀^h e^{(h−s)A} (s/h)^j ds = h j! φ_{j+1}(hA).
+    with φₖ(z) = ∫₀¹ e^{(1−s)z} s^{k−1}/(k−1)! ds, because
+    ∫₀^h e^{(h−s)A} (s/h)^j ds = h j! φ_{j+1}(hA).
     """
 
     @abc.abstractmethod

@@ -32,15 +32,15 @@ class Contact(eqx.Module):
     demand; u the normalised reaction; p the pressure, compression positive; ℓ the rate at which a
     load drives the indentation.
 
-    **Units.** With indentation in [x] and pressure in [p] and time in [t]: α, d_x, d_u in 1/[t]; b_x,
-    b_u are pure numbers; β in [p]/[x]; κ₀ in [p]; g in [x]; ℓ in [x]/[t].
+    **Units.** With indentation in [x] and pressure in [p] and time in [t]: α, d_x, d_u in 1/[t];
+    b_x, b_u are pure numbers; β in [p]/[x]; κ₀ in [p]; g in [x]; ℓ in [x]/[t].
 
     **Arguments:**
 
     - `alpha`, `beta`, `b_x`, `d_x`, `d_u`, `kappa0` > 0 and `b_u` ≥ 0, real numbers;
     - `g`, `ell`: numbers, arrays over the points, `dvax.signals`, or callables of t;
-    - `weights`: quadrature weights of the points, whose sum is the measure of Γ_C; None for a single
-      point or for plain vectors.
+    - `weights`: quadrature weights of the points, whose sum is the measure of Γ_C; None for a
+      single point or for plain vectors.
 
     **Raises:** `dvax.InputError` for every parameter that breaks its rule.
 
@@ -100,7 +100,7 @@ class Contact(eqx.Module):
 
     @property
     def problem(self) -> Problem:
-        """The coupled system: A = −αI, P = βI, K = [0, κ₀], f and h of eq:concrete_f, eq:concrete_h."""
+        """The coupled system: A = −αI, P = βI, K = [0, κ₀], eq:concrete_f and eq:concrete_h."""
         return Problem(
             A=Scalar(-self.alpha),
             P=Scaling(self.beta),
@@ -140,10 +140,12 @@ class Contact(eqx.Module):
         return jnp.clip(self.beta / (1.0 + self.b_u) * self.drive(t, x), 0.0, self.kappa0)
 
     def regimes(self, t: Any, x: Any) -> jax.Array:
-        """0 unloaded (q ≤ 0), 1 active, 2 saturated (q ≥ (1+b_u)κ₀/β) (eq:concrete_contact_states)."""
+        """0 unloaded (q ≤ 0), 1 active, 2 saturated (q ≥ (1+b_u)κ₀/β)
+        (eq:concrete_contact_states)."""
         q = self.drive(t, x)
         full = (1.0 + self.b_u) / self.beta * self.kappa0
-        return jnp.where(q <= 0.0, UNLOADED, jnp.where(q >= full, SATURATED, ACTIVE)).astype(jnp.int8)
+        regime = jnp.where(q <= 0.0, UNLOADED, jnp.where(q >= full, SATURATED, ACTIVE))
+        return regime.astype(jnp.int8)
 
     def residual(self, tau: Any, t: Any, x: Any, y: Any) -> jax.Array:
         """R_τ(t, x, y) = y − proj_K(y − τF(y)), zero exactly at the pressure of the law (τ > 0)."""

@@ -25,7 +25,8 @@ class Table(AbstractSignal):
     **Arguments:** `times`: increasing, at least two (four for cubic); `values`: one a time along
     the first axis, of any trailing shape.
 
-    **Raises:** `dvax.InputError` where times do not increase, lengths differ, or data is not finite.
+    **Raises:** `dvax.InputError` where times do not increase, lengths differ, or data is not
+    finite.
 
     ```python
     >>> import dvax

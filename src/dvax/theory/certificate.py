@@ -36,8 +36,9 @@ class Bound(eqx.Module):
 
     - `ts`; `x` ≥ ‖x_h − x‖ and `u` ≥ ‖u_h − u‖ with the paper's constants;
     - `x_sharp`, `u_sharp`: the same with the one-sided constant, or None where it is not known;
-    - `status`: the weakest of what the bound rests on. The defect between its samples is an estimate
-      (`dvax.evolution`), so that a bound is at best "estimated" unless the model encloses it.
+    - `status`: the weakest of what the bound rests on. The defect between its samples is an
+      estimate (`dvax.evolution`), so that a bound is at best "estimated" unless the model encloses
+      it.
 
     Bounds hold up to floating-point rounding in the solve itself.
     """
@@ -58,8 +59,8 @@ def bound_error(
     **Arguments:** `problem` and `sol`, the solution of it; `constants`; `initial_error`, a bound on
     ‖x_h(t0) − x(t0)‖.
 
-    Where the solve did not measure its defect (fixed steps), it is run again with `measure=True`, and
-    the distance between the two runs, which is rounding, is added.
+    Where the solve did not measure its defect (fixed steps), it is run again with `measure=True`,
+    and the distance between the two runs, which is rounding, is added.
 
     **Raises:** `dvax.InputError` where `sol` is not a solution of `problem`.
 
@@ -93,7 +94,9 @@ def bound_error(
     c = constants
     law_gain = c.beta_f * c.norm_P_inv / c.gamma
     impulse = measured.defect + law_gain * measured.law_defect
-    law_error = c.norm_P_inv * sol.law_residual / c.gamma if sol.law_error is None else sol.law_error
+    law_error = sol.law_error
+    if law_error is None:
+        law_error = c.norm_P_inv * sol.law_residual / c.gamma
     t0 = jnp.asarray(sol.stats["setting"]["t0"], sol.ts.dtype)
 
     def propagated(rate: Any, M: Any) -> jax.Array:
@@ -119,7 +122,7 @@ def _gronwall(t0: Any, ts: Any, impulse: Any, rate: Any, M: Any, initial: Any) -
     """
 
     def advance(carry: tuple, now: tuple) -> tuple:
-        before, t, acted, = carry
+        before, t, acted = carry
         time, total = now
         span = time - t
         after = jnp.exp(rate * span) * before

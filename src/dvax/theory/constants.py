@@ -1,6 +1,6 @@
 """The constants of the theory and what follows from them, each found by its label in the paper."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from .. import _tree
 from ..errors import InputError, InputProblem
-from .status import Status, weakest
+from .status import ORDER, Status, weakest
 
 _PRIMARY = (
     "gamma", "L_F", "alpha_h", "beta_h", "alpha_f", "beta_f", "M", "omega", "m_P", "norm_P_inv",
@@ -33,7 +33,8 @@ class Constants(eqx.Module):
 
     - `gamma` (γ) and `L_F`: strong pseudomonotonicity and Lipschitz modulus of the frozen operator
       (ass:strong_pseudomono);
-    - `alpha_h` (ass:h_lipschitz_x), `beta_h` (ass:lipschitz_smallness): Lipschitz moduli of h in x, u;
+    - `alpha_h` (ass:h_lipschitz_x), `beta_h` (ass:lipschitz_smallness): Lipschitz moduli of h in
+      x and in u;
     - `alpha_f`, `beta_f`: those of f (ass:f_lipschitz);
     - `M`, `omega`: ‖e^{At}‖ ≤ M e^{ωt} (lem:semigroup_bound_prelim);
     - `m_P`, `norm_P_inv`: min σ(P⁻¹) and ‖P⁻¹‖ (ass:operators);
@@ -90,10 +91,10 @@ class Constants(eqx.Module):
             None if one_sided is None else _tree.as_float(one_sided, "dvax.Constants(one_sided)")
         )
         names = (*_PRIMARY, "one_sided")
-        each = {name: status if isinstance(status, str) else "declared" for name in names}
-        if not isinstance(status, str):
-            each.update(status)
-        self.statuses = tuple(sorted(each.items()))
+        each = dict.fromkeys(names, status) if isinstance(status, str) else dict(status)
+        _check_status(names, each)
+        pairs: list[tuple[str, Status]] = [(n, each.get(n, "declared")) for n in sorted(names)]
+        self.statuses = tuple(pairs)
         self._check()
 
     @property
@@ -129,9 +130,7 @@ class Constants(eqx.Module):
 
     def contraction_factor(self, rho: Any) -> Any:
         """q_ρ = ‖I − ρP⁻¹‖ + ρ β_h ‖P⁻¹‖ (eq:smalless), with ‖I − ρP⁻¹‖ from the spectrum."""
-        spread = jnp.maximum(
-            jnp.abs(1.0 - rho * self.m_P), jnp.abs(1.0 - rho * self.norm_P_inv)
-        )
+        spread = jnp.maximum(jnp.abs(1.0 - rho * self.m_P), jnp.abs(1.0 - rho * self.norm_P_inv))
         return spread + rho * self.beta_h * self.norm_P_inv
 
     @property
@@ -145,8 +144,8 @@ class Constants(eqx.Module):
 
     def status_of(self, *names: str) -> Status:
         """The weakest status among the named constants."""
-        known = dict(self.statuses)
-        return weakest(*(known[name] for name in names))
+        words: list[Status] = [word for name, word in self.statuses if name in names]
+        return weakest(*words)
 
     def table(self, T: Any = None, rho: Any = None) -> list[Row]:
         """Every constant with its label and status; C_T for the horizon T where it is given."""
@@ -192,8 +191,9 @@ class Constants(eqx.Module):
             )  # fmt: skip
         if self.one_sided is not None:
             rows.append(
-                ("sharp_decay_rate", "−μ", self.sharp_decay_rate, "one-sided, sharper than the paper",
-                 ("one_sided",), "rate of approach that sees the sign of the feedback")
+                ("sharp_decay_rate", "−μ", self.sharp_decay_rate,
+                 "one-sided, sharper than the paper", ("one_sided",),
+                 "rate of approach that sees the sign of the feedback")
             )  # fmt: skip
         return [
             Row(name, symbol, float(value), label, self.status_of(*made_of), meaning)
@@ -225,3 +225,19 @@ class Constants(eqx.Module):
 
 def _number(value: Any) -> str:
     return f"{float(value):.6g}"
+
+
+def _check_status(names: Collection[str], given: Mapping[str, Any]) -> None:
+    wrong = [
+        InputProblem(
+            "dvax.Constants(status)",
+            f"{name!r}: {value!r}",
+            f"it must map names among {', '.join(names)} to one of {', '.join(ORDER)}, or a bound "
+            "would claim to rest on something that nobody said",
+            "Mend the name or the word",
+        )
+        for name, value in given.items()
+        if name not in names or value not in ORDER
+    ]
+    if wrong:
+        raise InputError(*wrong)

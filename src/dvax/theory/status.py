@@ -11,4 +11,4 @@ from the wrong side. refuted: a counterexample is known."""
 
 def weakest(*statuses: Status) -> Status:
     """What can be said of a number made from others: no more than of the weakest of them."""
-    return max(statuses, key=ORDER.index, default="proved")
+    return ORDER[max(map(ORDER.index, statuses), default=0)]

@@ -20,9 +20,9 @@ class Bracketing(AbstractSolver):
 
     Strong pseudomonotonicity reads F(y)(y − y*) ≥ γ(y − y*)² at every point, so F has one sign on
     each side of y*: y* = lower where F(lower) ≥ 0, y* = upper where F(upper) ≤ 0, and elsewhere a
-    bracketed root, found by Chandrupatla's method (1997) at all points at once. Monotonicity of F is
-    not needed, and no starting point can fail. Where F is affine (proved from its code), y* is the
-    closed form proj_K(−F(0)/F′).
+    bracketed root, found by Chandrupatla's method (1997) at all points at once. Monotonicity of F
+    is not needed, and no starting point can fail. Where F is affine (proved from its code), y* is
+    the closed form proj_K(−F(0)/F′).
 
     **Arguments:** `max_steps`, the most iterations of the root finder.
 
@@ -96,7 +96,7 @@ def _away(slope: jax.Array) -> jax.Array:
 
 
 def _enclose(F: Any, guess: Tree, lower: Tree, upper: Tree) -> tuple[Any, Any, jax.Array]:
-    """Finite [a, b] inside [lower, upper] with F(a) ≥ 0 only if a = lower, F(b) ≤ 0 only if b = upper.
+    """Finite [a, b] inside K with F(a) ≥ 0 only if a = lower, and F(b) ≤ 0 only if b = upper.
 
     Infinite ends are replaced by points that walk outward from the guess, doubling their distance.
     """
@@ -120,11 +120,12 @@ def _enclose(F: Any, guess: Tree, lower: Tree, upper: Tree) -> tuple[Any, Any, j
         return width, a, F(a), b, F(b)
 
     def go_on(state: tuple) -> jax.Array:
-        width, a, fa, b, fb = state
+        width, (a, fa, b, fb) = state[0], state[1:]
         return missing(a, fa, b, fb) & (width < 1e100)
 
     a, b = ends(1.0)
-    width, a, fa, b, fb = lax.while_loop(go_on, widen, (jnp.asarray(1.0), a, F(a), b, F(b)))
+    start = (jnp.asarray(1.0), a, F(a), b, F(b))
+    _, a, fa, b, fb = lax.while_loop(go_on, widen, start)
     return (a, fa), (b, fb), ~missing(a, fa, b, fb)
 
 
@@ -171,7 +172,9 @@ def _chandrupatla(F: Any, a: Tree, fa: Tree, b: Tree, fb: Tree, max_steps: int) 
         return new, count + 1, jnp.any(jnp.stack(open_))
 
     half = [jnp.full_like(x, 0.5) for x in A]
-    start = [(x2, f2, x1, f1, x1, f1, t) for x1, f1, x2, f2, t in zip(A, FA, B, FB, half, strict=True)]
+    start = [
+        (x2, f2, x1, f1, x1, f1, t) for x1, f1, x2, f2, t in zip(A, FA, B, FB, half, strict=True)
+    ]
     points, count, _ = lax.while_loop(
         lambda s: s[2] & (s[1] < max_steps), body, (start, jnp.asarray(0), jnp.asarray(True))
     )
@@ -180,7 +183,8 @@ def _chandrupatla(F: Any, a: Tree, fa: Tree, b: Tree, fb: Tree, max_steps: int) 
 
 
 def _not_pointwise(set_is_to_blame: bool) -> InputError:
-    given = "a set that is not a pointwise interval" if set_is_to_blame else "an F that mixes points"
+    blame = "a set that is not a pointwise interval", "an F that mixes points"
+    given = blame[0] if set_is_to_blame else blame[1]
     return InputError(
         InputProblem(
             "dvax.vi.Bracketing",

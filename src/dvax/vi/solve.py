@@ -20,7 +20,8 @@ class VISolution(eqx.Module):
     """The solution of a variational inequality with its certificate.
 
     `y` ∈ K; `residual` = ‖w‖ for a w ∈ F(y) + N_K(y); `error_bound` ≥ ‖y − y*‖ where γ was given,
-    else None; `iterations`; `result`, which is `dvax.vi.RESULTS.successful` or says what went wrong.
+    else None; `iterations`; `result`, which is `dvax.vi.RESULTS.successful` or says what went
+    wrong.
     """
 
     y: Tree
@@ -43,13 +44,13 @@ def solve_vi(
 ) -> VISolution:
     """Find y ∈ K with ⟨F(y), v − y⟩ ≥ 0 for all v ∈ K (paper, eq:vi_canonical).
 
-    **Arguments:** `F(y, args)`, traceable; `K`, a set; `y0`, a guess, whose shape is y's; `args`, any
-    pytree; `solver`, `dvax.vi.Auto()` by default; `tol`, on the true error ‖y − y*‖ where `gamma` is
-    given, else on the residual ‖w‖; `gamma`, the modulus of strong pseudomonotonicity, declared by
-    the caller; `L_F`, a Lipschitz constant of F; `space`, Euclidean by default.
+    **Arguments:** `F(y, args)`, traceable; `K`, a set; `y0`, a guess, whose shape is y's; `args`,
+    any pytree; `solver`, `dvax.vi.Auto()` by default; `tol`, on the true error ‖y − y*‖ where
+    `gamma` is given, else on the residual ‖w‖; `gamma`, the modulus of strong pseudomonotonicity,
+    declared by the caller; `L_F`, a Lipschitz constant of F; `space`, Euclidean by default.
 
-    **Returns:** a `VISolution`. The answer is certified again after the solve, by one projection step
-    that shares nothing with the method.
+    **Returns:** a `VISolution`. The answer is certified again after the solve, by one projection
+    step that shares nothing with the method.
 
     ```python
     >>> import dvax, jax.numpy as jnp
