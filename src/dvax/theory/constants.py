@@ -90,8 +90,10 @@ class Constants(eqx.Module):
         self.one_sided = (
             None if one_sided is None else _tree.as_float(one_sided, "dvax.Constants(one_sided)")
         )
-        names = (*_PRIMARY, "one_sided")
-        each = dict.fromkeys(names, status) if isinstance(status, str) else dict(status)
+        names: tuple[str, ...] = (*_PRIMARY, "one_sided")
+        each: dict[str, Status] = {}
+        for name in names if isinstance(status, str) else status:
+            each[name] = status if isinstance(status, str) else status[name]
         _check_status(names, each)
         pairs: list[tuple[str, Status]] = [(n, each.get(n, "declared")) for n in sorted(names)]
         self.statuses = tuple(pairs)
