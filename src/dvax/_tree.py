@@ -52,6 +52,46 @@ def same_shape(a: Tree, b: Tree) -> bool:
     return all(jnp.shape(p) == jnp.shape(q) for p, q in pairs)
 
 
+def fits(name: str, given: Any, like: Tree, what: str) -> None:
+    """Raise an `InputError` unless the array `given` has the very shape of `like`."""
+    if isinstance(like, tuple) or jnp.shape(given) != jnp.shape(like):
+        raise InputError(
+            InputProblem(
+                name,
+                f"shape {jnp.shape(given)}",
+                f"it acts entry by entry on the {what}, whose elements have shape {shapes(like)}",
+                "Give it that shape, or name the space that you mean (state_space= or "
+                "control_space= of dvax.Problem)",
+            )
+        )
+
+
+def fits_matrix(name: str, matrix: Any, like: Tree, what: str) -> None:
+    """Raise an `InputError` unless `like` is a vector that the square `matrix` can act on."""
+    if isinstance(like, tuple) or jnp.shape(like) != jnp.shape(matrix)[:1]:
+        raise InputError(
+            InputProblem(
+                name,
+                f"shape {jnp.shape(matrix)}",
+                f"it acts on the {what}, whose elements have shape {shapes(like)}",
+                "A matrix acts on vectors: give it as many rows, or state and control as vectors",
+            )
+        )
+
+
+def fits_parts(name: str, count: int, like: Tree, what: str) -> None:
+    """Raise an `InputError` unless `like` is a tuple of `count` parts."""
+    if not isinstance(like, tuple) or len(like) != count:
+        raise InputError(
+            InputProblem(
+                name,
+                f"{count} parts",
+                f"it acts on the {what}, whose elements have shape {shapes(like)}",
+                "Give one part for each, and name the spaces with dvax.spaces.Product(...)",
+            )
+        )
+
+
 def is_concrete(*trees: Tree) -> bool:
     """Whether every leaf has a value now, so that a check on values can be made at all."""
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jtu.tree_leaves(trees))

@@ -89,14 +89,25 @@ class Contact(eqx.Module):
         }  # fmt: skip
         wrong: list[InputProblem] = []
         for name, value in given.items():
-            number = _tree.as_float(value, f"dvax.models.Contact({name})")
+            try:
+                number = _tree.as_float(value, f"dvax.models.Contact({name})")
+            except InputError as error:
+                wrong += error.problems
+                continue
             setattr(self, name, number)
             wrong += _breaks_rule(name, number)
+        self.space = None
+        for name, make in (
+            ("g", lambda: _signal(g, "g")),
+            ("ell", lambda: _signal(ell, "ell")),
+            ("space", lambda: None if weights is None else L2(weights)),
+        ):
+            try:
+                setattr(self, name, make())
+            except InputError as error:
+                wrong += error.problems
         if wrong:
             raise InputError(*wrong)
-        self.g = _signal(g, "g")
-        self.ell = _signal(ell, "ell")
-        self.space = None if weights is None else L2(weights)
 
     @property
     def problem(self) -> Problem:

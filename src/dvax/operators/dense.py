@@ -58,6 +58,7 @@ class Dense(AbstractOperator):
 
     def check(self, space: AbstractSpace) -> None:
         name = "dvax.operators.Dense(matrix)"
+        _tree.fits_matrix(name, self.matrix, space.zeros(), "control space")
         weighted = jnp.asarray(space.weights()).reshape(-1, 1) * self.matrix
         _tree.require(
             lambda: np.allclose(weighted, np.asarray(weighted).T, rtol=1e-13, atol=0.0),

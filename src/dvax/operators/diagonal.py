@@ -46,7 +46,9 @@ class Diagonal(AbstractOperator):
         return self.inverse_entries * v
 
     def check(self, space: AbstractSpace) -> None:
-        """Nothing to do: a positive diagonal is both for every diagonal weight."""
+        # A positive diagonal is self-adjoint and coercive for every diagonal weight.
+        name = "dvax.operators.Diagonal(entries)"
+        _tree.fits(name, self.entries, space.zeros(), "control space")
 
     def spectrum(self, space: AbstractSpace) -> Spectrum:
         return Spectrum(jnp.min(self.entries), jnp.max(self.entries))

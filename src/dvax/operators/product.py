@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 
+from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace
 from ..spaces import Product as ProductSpace
@@ -32,6 +33,7 @@ class Product(AbstractOperator):
         return tuple(p.inverse(q) for p, q in zip(self.parts, v, strict=True))
 
     def check(self, space: AbstractSpace) -> None:
+        _tree.fits_parts("dvax.operators.Product", len(self.parts), space.zeros(), "control space")
         for part, own in zip(self.parts, _parts(space, len(self.parts)), strict=True):
             part.check(own)
 

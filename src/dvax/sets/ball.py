@@ -41,12 +41,22 @@ class Ball(AbstractSet):
             "a ball has a finite radius ≥ 0, or it is empty or the whole space",
             "Use dvax.sets.WholeSpace() where there is no constraint",
         )
+        _tree.require(
+            lambda: _tree.all_finite(self.center),
+            "dvax.sets.Ball(center)",
+            self.center,
+            "a center is a point, with finite entries",
+            "Mend the entries that are not",
+        )
+        if not _tree.is_concrete(self.radius):
+            # Not known yet: a negative one is made NaN, so that an empty ball stops a solve.
+            self.radius = jnp.where(self.radius >= 0, self.radius, jnp.nan)
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         offset = self._minus_center(z)
         length = space.norm(offset)
-        outside = length >= self.radius
-        shrink = jnp.where(outside, self.radius / jnp.where(length > 0, length, 1.0), 1.0)
+        inside = length < self.radius  # NaN in z, center or radius is not inside: it comes out
+        shrink = jnp.where(inside, 1.0, self.radius / jnp.where(length > 0, length, 1.0))
         moved = _tree.scale(shrink, offset)
         # Inside, z itself: center + (z − center) would lose digits for a far-away center.
         pulled = (
@@ -54,7 +64,7 @@ class Ball(AbstractSet):
             if _tree.same_shape(self.center, z)
             else jax.tree_util.tree_map(lambda leaf: self.center + leaf, moved)
         )
-        return _tree.where(outside, pulled, z)
+        return _tree.where(inside, z, pulled)
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         return None

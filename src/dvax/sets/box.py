@@ -53,6 +53,11 @@ class Box(AbstractSet):
             "Use −∞ and +∞ for the sides that are free",
         )
 
+        if not _tree.is_concrete((self.lower, self.upper)):
+            # Bounds that move are not known yet. Where they cross (or are NaN) the projection is
+            # made infinite, so that an empty set stops a solve instead of passing for a point.
+            self.lower = jnp.where(self.lower <= self.upper, self.lower, jnp.inf)
+
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         # At a bound the bound's own derivative is taken: the convention of AbstractSet. Selections
         # are also what is fastest: minimum and maximum must look for NaN and signed zeros.
@@ -63,6 +68,15 @@ class Box(AbstractSet):
         return jnp.broadcast_to(self.lower, shape), jnp.broadcast_to(self.upper, shape)
 
     def check(self, like: Tree) -> None:
+        if isinstance(like, tuple):
+            raise InputError(
+                InputProblem(
+                    "dvax.sets.Box",
+                    "one box",
+                    f"y = P u is a tuple of {len(like)} parts",
+                    "Give one set a part: dvax.sets.Product(...)",
+                )
+            )
         shape = jnp.shape(like)
         for name, bound in (("lower", self.lower), ("upper", self.upper)):
             try:

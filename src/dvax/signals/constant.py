@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
@@ -18,12 +19,21 @@ class Constant(AbstractSignal):
     3.0
 
     ```
+
+    **Raises:** `dvax.InputError` where the value is not finite.
     """
 
     constant: jax.Array
 
     def __init__(self, value: Any):
         self.constant = _tree.as_float(value, "dvax.signals.Constant(value)")
+        _tree.require(
+            lambda: jnp.all(jnp.isfinite(self.constant)),
+            "dvax.signals.Constant(value)",
+            self.constant,
+            "data must be finite: a gap is not a value",
+            "Fill the gaps on purpose",
+        )
 
     def value(self, t: Any) -> jax.Array:
         return self.constant

@@ -69,7 +69,7 @@ class Table(AbstractSignal):
         # Counting is monotone in t and branch-free: on a short table faster than a bisection, and
         # on every table exact at the knots, where the new piece begins.
         count = times.shape[0]
-        method = "compare_all" if count <= 4096 else "scan_unrolled"
+        method = "compare_all" if count <= 2**16 else "scan_unrolled"
         i = jnp.clip(jnp.searchsorted(times, t, side="right", method=method) - 1, 0, count - 2)
         left, right = times[i], times[i + 1]
         v0, v1 = self.values[i], self.values[i + 1]
@@ -103,6 +103,16 @@ def _check(name: str, times: Any, values: jax.Array, least: int) -> None:
             )
         )
     if isinstance(times, np.ndarray):
+        gaps = np.flatnonzero(~np.isfinite(times))
+        if gaps.size:
+            raise InputError(
+                InputProblem(
+                    f"{name}(times)",
+                    f"times[{gaps[0]}] = {times[gaps[0]]}",
+                    "times must be finite, or a value has no place",
+                    "Drop the rows without a time",
+                )
+            )
         wrong = np.flatnonzero(~(np.diff(times) > 0))
         if wrong.size:
             i = int(wrong[0])

@@ -110,7 +110,10 @@ def bound_error(
         u=c.L * x + law_error,
         x_sharp=sharp,
         u_sharp=None if sharp is None else c.L * sharp + law_error,
-        status=weakest(c.status_of(*(name for name, _ in c.statuses)), "estimated"),
+        status=weakest(
+            c.status_of(*(name for name, _ in c.statuses)),
+            "proved" if measured.flow.enclosed else "estimated",
+        ),
     )
 
 

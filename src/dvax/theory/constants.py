@@ -204,6 +204,7 @@ class Constants(eqx.Module):
 
     def _check(self) -> None:
         rules = [
+            *((n, jnp.isfinite(getattr(self, n)), "finite") for n in _PRIMARY),
             *((n, getattr(self, n) > 0, "positive") for n in ("gamma", "L_F", "m_P", "norm_P_inv")),
             *((n, getattr(self, n) >= 0, "≥ 0")
               for n in ("alpha_h", "beta_h", "alpha_f", "beta_f")),

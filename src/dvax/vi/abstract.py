@@ -30,6 +30,15 @@ class RESULTS(eqx.Enumeration):
         "No sign change of F was found on an unbounded interval, so F is not strongly "
         "pseudomonotone there. Bound the interval, or check the sign of F."
     )
+    wrong_slope = (
+        "F is affine with a slope that is not positive somewhere, so it is not strongly "
+        "pseudomonotone and VI(K, F) may have no solution or several. Check the sign of F (of the "
+        "way in which h depends on u)."
+    )
+    not_lipschitz = (
+        "The step shrank to nothing: F jumps, or is steeper than floating-point numbers can "
+        "resolve. Smooth F, or choose another solver."
+    )
 
 
 class Frozen(NamedTuple):

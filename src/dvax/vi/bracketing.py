@@ -55,7 +55,7 @@ class Bracketing(AbstractSolver):
         lower, upper = lax.stop_gradient(intervals)
         guess = jtu.tree_map(jnp.clip, lax.stop_gradient(y0), lower, upper)
         (a, fa), (b, fb), found = _enclose(F, guess, lower, upper)
-        root, count = _chandrupatla(F, a, fa, b, fb, self.max_steps)
+        root, count, closed = _chandrupatla(F, a, fa, b, fb, self.max_steps)
 
         def choose(lo, up, flo, fup, inner):
             return jnp.where(flo >= 0, lo, jnp.where(fup <= 0, up, inner))
@@ -74,7 +74,8 @@ class Bracketing(AbstractSolver):
         z = jtu.tree_map(lambda yi, f, s, wi: yi - (f - wi) / _away(s), y, Fy, slope, w)
         differentiable = with_implicit_derivative(vi, y, 1.0, lambda found: found, pointwise=True)
         residual = vi.space.norm(w)
-        result = RESULTS.where(found, RESULTS.successful, RESULTS.no_bracket)
+        result = RESULTS.where(closed, RESULTS.successful, RESULTS.max_steps)
+        result = RESULTS.where(found, result, RESULTS.no_bracket)
         result = RESULTS.where(jnp.isfinite(residual), result, RESULTS.nonfinite)
         return Answer(differentiable, lax.stop_gradient(z), residual, count, result)
 
@@ -86,8 +87,11 @@ def affine_answer(vi: Frozen, like: Tree) -> Answer:
     c, a = jax.jvp(vi.F, (zero,), (ones,))
     z = jtu.tree_map(lambda p, q: -p / q, c, a)
     y = vi.K.project(z, vi.space)
-    dtype = jnp.result_type(*jtu.tree_leaves(y))
-    return Answer(y, z, jnp.zeros((), dtype), jnp.asarray(1), RESULTS.successful)
+    leaves = jtu.tree_leaves(y)
+    positive = jnp.all(jnp.stack([jnp.all(slope > 0) for slope in jtu.tree_leaves(a)]))
+    result = RESULTS.where(positive, RESULTS.successful, RESULTS.wrong_slope)
+    result = RESULTS.where(_tree.all_finite(y), result, RESULTS.nonfinite)
+    return Answer(y, z, jnp.zeros((), jnp.result_type(*leaves)), jnp.asarray(1), result)
 
 
 def _away(slope: jax.Array) -> jax.Array:
@@ -121,16 +125,21 @@ def _enclose(F: Any, guess: Tree, lower: Tree, upper: Tree) -> tuple[Any, Any, j
 
     def go_on(state: tuple) -> jax.Array:
         width, (a, fa, b, fb) = state[0], state[1:]
-        return missing(a, fa, b, fb) & (width < 1e100)
+        return missing(a, fa, b, fb) & (width < jnp.finfo(width.dtype).max ** 0.3)
 
-    a, b = ends(1.0)
-    start = (jnp.asarray(1.0), a, F(a), b, F(b))
+    one = jnp.ones((), jnp.result_type(*jtu.tree_leaves(guess)))
+    a, b = ends(one)
+    start = (one, a, F(a), b, F(b))
     _, a, fa, b, fb = lax.while_loop(go_on, widen, start)
     return (a, fa), (b, fb), ~missing(a, fa, b, fb)
 
 
-def _chandrupatla(F: Any, a: Tree, fa: Tree, b: Tree, fb: Tree, max_steps: int) -> tuple[Tree, Any]:
+def _chandrupatla(
+    F: Any, a: Tree, fa: Tree, b: Tree, fb: Tree, max_steps: int
+) -> tuple[Tree, Any, jax.Array]:
     """All roots at once: inverse quadratic interpolation where it is safe, else bisection.
+
+    Returns the roots, the number of iterations, and whether every bracket was closed.
 
     Chandrupatla 1997, Adv. Eng. Software 28, 145–149. Stops when every bracket is two spacings of
     floating-point numbers wide, or F vanishes.
@@ -175,11 +184,11 @@ def _chandrupatla(F: Any, a: Tree, fa: Tree, b: Tree, fb: Tree, max_steps: int) 
     start = [
         (x2, f2, x1, f1, x1, f1, t) for x1, f1, x2, f2, t in zip(A, FA, B, FB, half, strict=True)
     ]
-    points, count, _ = lax.while_loop(
+    points, count, unfinished = lax.while_loop(
         lambda s: s[2] & (s[1] < max_steps), body, (start, jnp.asarray(0), jnp.asarray(True))
     )
     best = [jnp.where(jnp.abs(f1) < jnp.abs(f2), x1, x2) for x1, f1, x2, f2, _, _, _ in points]
-    return unflatten(best), count
+    return unflatten(best), count, ~unfinished
 
 
 def _not_pointwise(set_is_to_blame: bool) -> InputError:

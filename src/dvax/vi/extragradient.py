@@ -78,6 +78,9 @@ class Extragradient(AbstractSolver):
         _, found, lam, residual, count, done = state
         y = with_implicit_derivative(vi, found, lam, lambda guess: guess, pointwise=False)
         result = RESULTS.where(done, RESULTS.successful, RESULTS.max_steps)
+        # Once y − λF(y) rounds to y, every point looks like a solution.
+        collapsed = lam < 1e3 * jnp.finfo(dtype).eps
+        result = RESULTS.where(collapsed, RESULTS.not_lipschitz, result)
         result = RESULTS.where(jnp.isfinite(residual), result, RESULTS.nonfinite)
         # One fixed step for every z, whatever λ the search ended with: z is compared between times.
         tau = 1.0 if vi.L_F is None else 1.0 / vi.L_F

@@ -41,8 +41,7 @@ class _Mark(NamedTuple):
 
 
 _LINEAR = {
-    "neg", "copy", "copy_p", "convert_element_type", "real", "imag", "reduce_precision",
-    "stop_gradient", "optimization_barrier",
+    "neg", "copy", "copy_p", "real", "imag", "reduce_precision", "optimization_barrier",
 }  # fmt: skip
 _SUM = {"add", "sub", "add_any"}
 _PRODUCT = {"mul"}
@@ -52,12 +51,15 @@ _POINTWISE = {
     "erf_inv", "sqrt", "rsqrt", "cbrt", "abs", "sign", "floor", "ceil", "round", "pow",
     "integer_pow", "square", "clamp", "rem", "nextafter", "is_finite", "eq", "ne", "lt", "le",
     "gt", "ge", "and", "or", "xor", "not", "lgamma", "digamma",
+    # Linear in value, but its derivative is 0, and the slope of a law is taken by differentiating.
+    "stop_gradient",
 }  # fmt: skip
 _MIXING = {
     "reshape", "squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "slice",
     "dynamic_slice", "concatenate", "pad", "reduce_sum", "cumsum", "gather", "split",
 }  # fmt: skip
-_FLAT = _LINEAR | _SUM | _PRODUCT | _POINTWISE | {"div", "broadcast_in_dim"}
+_ELEMENTWISE = {"div", "convert_element_type"}
+_FLAT = _LINEAR | _SUM | _PRODUCT | _POINTWISE | _ELEMENTWISE | {"broadcast_in_dim"}
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "checkpoint", "custom_lin"}
 _CUSTOM = {"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
 
@@ -110,6 +112,9 @@ def _interpret(
             inner = _inner(eqn.params)
             if inner is not None and len(inner.jaxpr.invars) == len(given):
                 results = _interpret(inner, given, shapes)
+                if name in _CUSTOM:
+                    # A derivative rule of its own need not be the slope of the values.
+                    results = [r and r._replace(degree=2) for r in results]
                 marks.update(zip(eqn.outvars, results, strict=True))
                 continue
         mark = _rule(name, eqn, given, shapes, is_flat)
@@ -154,6 +159,10 @@ def _rule(
         return _Mark(degree, leaf, even)
     if name in _PRODUCT:
         return _Mark(min(2, sum(mark.degree for mark in present)), leaf, even and others_flat)
+    if name == "convert_element_type":
+        # Between floating types it rounds; to integers and booleans it makes steps.
+        kept = jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.inexact)
+        return _Mark(degree if kept else 2, leaf, even)
     if name == "div":
         return _Mark(degree if given[1] is None else 2, leaf, even and others_flat)
     if name == "select_n":
@@ -164,6 +173,8 @@ def _rule(
         # Indices and start positions that depend on y would not be linear in it.
         indices_fixed = all(mark is None for mark in given[1:]) or name in ("concatenate", "pad")
         keeps = name in ("reshape", "squeeze", "broadcast_in_dim")
+        # A reshape may permute the axes first.
+        keeps = keeps and eqn.params.get("dimensions") in (None, ())
         same = keeps and shape == eqn.invars[0].aval.shape
         kept = present[0] if same else _Mark(degree, None, False)
         return kept._replace(degree=degree if indices_fixed else 2)
