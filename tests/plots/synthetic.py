@@ -54,13 +54,14 @@ def write_run(folder: Path, recipe: Recipe = Recipe()) -> Path:
     regime = np.where(drive <= 0, 0, np.where(drive >= KAPPA, 2, 1)).astype(np.int8)
     weight = np.full(drive.shape[1], 100.0 / drive.shape[1])
     decay = np.exp(-0.31 * time)
-    norm = "um mm^0.5"
+    norm = "um mm^(d/2)"
     series = {
         "demand_mean": (1.0 + 0 * time, "um", {}),
         "load_mean": (load, "um/s", {}),
         "law_error": (1e-12 * (1 + load), norm, {"status": "proved"}),
         "defect": (1e-5 * time, norm, {}),
         "error_bound_x": (2e-6 * (1 - decay), norm, {"status": "proved"}),
+        "error_bound_sharp_x": (1e-6 * (1 - decay), norm, {"status": "proved"}),
         "error_bound_u": (1.4e-6 * (1 - decay) + 1e-12, norm, {"status": "declared"}),
     }
     if recipe.companion:
@@ -109,8 +110,8 @@ def write_run(folder: Path, recipe: Recipe = Recipe()) -> Path:
     if written:
         dataset.isel(time=slice(0, written)).to_zarr(folder / "trajectory.zarr", consolidated=False)
     manifest = {
-        "dvax_version": "0.1.0",
-        "versions": {"jax": "0.10.2", "diffrax": "0.7.2"},
+        "dvax": "0.1.0",
+        "packages": {"jax": "0.10.2", "diffrax": "0.7.2"},
         "python": "3.11.9",
         "precision": "float64",
         "device": "cpu",

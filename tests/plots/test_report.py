@@ -155,9 +155,10 @@ def test_the_certificate_s_legend_carries_its_status(tmp_path: Path) -> None:
     picture = certificate_picture(read_run(write_run(tmp_path / "run", Recipe((40,)))))
     assert picture is not None
     names = [trace.name for trace in picture.interactive.data]
-    assert names[:3] == [
+    assert names[:4] == [
         "bound on the error of x (proved)",
         "bound on the error of u (declared)",
+        "the same for x, one-sided rate (proved)",
         "error of the frozen law, u (proved)",
     ]
     assert picture.interactive.layout.yaxis.type == "log"
@@ -210,7 +211,14 @@ def test_numbers_are_written_for_a_reader(value: float, text: str) -> None:
 
 @pytest.mark.parametrize(
     ("unit", "text"),
-    [("um", "µm"), ("um/s", "µm/s"), ("1", ""), ("um*mm**0.5", "µm mm⁰·⁵"), ("dimensionless", "")],
+    [
+        ("um", "µm"),
+        ("um/s", "µm/s"),
+        ("1", ""),
+        ("um*mm**0.5", "µm mm⁰·⁵"),
+        ("um mm^(1/2)", "µm mm⁰·⁵"),
+        ("dimensionless", ""),
+    ],
 )
 def test_units_are_written_for_a_reader(unit: str, text: str) -> None:
     assert unit_text(unit) == text

@@ -57,7 +57,7 @@ def _say_constants(rows: Sequence[Mapping[str, Any]]) -> None:
         shown.append(
             (
                 str(row["symbol"]),
-                f"{number} {row['unit']}".strip(),
+                number if row["unit"] in ("", "1") else f"{number} {row['unit']}",
                 str(row["status"]),
                 str(row["label"]),
                 str(row["meaning"]),

@@ -76,7 +76,8 @@ def _say_figures(summary: dict[str, Any]) -> None:
         value = entry["value"]
         parts = value if isinstance(value, list) else [value]
         shown = ", ".join(f"{v:.6g}" if isinstance(v, float) else str(v) for v in parts)
-        rows.append((name, f"{shown} {entry.get('unit', '')}".strip(), entry.get("meaning", "")))
+        unit = "" if entry["unit"] == "1" else entry["unit"]
+        rows.append((name, f"{shown} {unit}".strip(), entry["meaning"]))
     if rows:
         table(("figure", "value", "meaning"), rows)
         say("")

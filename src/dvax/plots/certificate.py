@@ -10,6 +10,7 @@ from dvax.plots.look import (
     BLUE,
     GREEN,
     MUTED,
+    SKY,
     STILL_STYLE,
     VERMILLION,
     axis_title,
@@ -24,6 +25,7 @@ from dvax.plots.record import RunRecord
 CURVES = {
     "error_bound_x": ("bound on the error of x", BLUE, "solid", "-"),
     "error_bound_u": ("bound on the error of u", VERMILLION, "dash", "--"),
+    "error_bound_sharp_x": ("the same for x, one-sided rate", SKY, "longdash", (0, (8, 3))),
     "law_error": ("error of the frozen law, u", GREEN, "dot", ":"),
     "defect": ("accumulated defect", MUTED, "dashdot", "-."),
 }
@@ -37,7 +39,7 @@ def certificate_picture(run: RunRecord) -> Picture | None:
     units = {name: run.unit(name) for name in held}
     shared = units[held[0]] if len(set(units.values())) == 1 else ""
     names = {name: _legend(run, name, with_unit=not shared) for name in held}
-    words = axis_title("certified bound", shared)
+    words = axis_title("error bound", shared)
     figure = blank(440)
     for name in held:
         values = positive(run.series(name))

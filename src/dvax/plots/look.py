@@ -43,7 +43,7 @@ def unit_text(unit: str) -> str:
     """A unit for the eye: um as µm, products with a dot, powers raised."""
     if unit in ("", "1", "dimensionless"):
         return ""
-    text = re.sub(r"\bum\b", "µm", unit)
+    text = re.sub(r"\bum\b", "µm", unit).replace("^(1/2)", "^0.5")
     text = re.sub(r"(?:\*\*|\^)\(?(-?[0-9.]+)\)?", lambda m: m[1].translate(_SUPERSCRIPT), text)
     return re.sub(r"\s*\*\s*", " ", text)
 

@@ -58,7 +58,7 @@ are any.</p>
 
 
 def _subtitle(run: RunRecord) -> str:
-    parts = [f"dvax {run.manifest['dvax_version']}" if "dvax_version" in run.manifest else "dvax"]
+    parts = [f"dvax {run.manifest.get('dvax') or ''}".strip()]
     if run.trajectory is not None:
         parts.append(f"model {run.trajectory.attrs.get('model', 'unnamed')}")
         points = " × ".join(str(n) for n in run.boundary_shape)
@@ -78,8 +78,9 @@ def _banner(run: RunRecord) -> str:
             f'<div class="banner partial" role="alert"><b>Partial results.</b> '
             f"{_escape(text)}</div>"
         )
-    for text in (*run.notes, *run.warnings):
-        lines.append(f'<div class="banner">{_escape(text)}</div>')
+    said = "".join(f"<li>{_escape(text)}</li>" for text in (*run.notes, *run.warnings))
+    if said:
+        lines.append(f'<div class="banner"><b>Notes of the run.</b><ul>{said}</ul></div>')
     return "\n".join(lines)
 
 

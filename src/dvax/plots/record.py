@@ -100,8 +100,12 @@ class RunRecord:
         return np.asarray(self.frames[name].values, dtype=float)
 
     def unit(self, name: str) -> str:
-        """The unit of a variable or coordinate, as the trajectory declares it."""
-        return str(self.frames[name].attrs.get("units", ""))
+        """The unit of a variable or coordinate, as the trajectory declares it.
+
+        Norms in L2 over a boundary of dimension d have the unit length^(d/2) in them.
+        """
+        declared = str(self.frames[name].attrs.get("units", ""))
+        return declared.replace("^(d/2)", "^0.5" if len(self.boundary_shape) == 1 else "")
 
 
 def read_run(directory: Path) -> RunRecord:
@@ -175,9 +179,10 @@ def _trajectory(store: Path) -> tuple[xr.Dataset | None, tuple[str, ...]]:
     whole = len(time) if rising.all() else int(np.argmin(rising))
     if whole == len(time):
         return dataset, ()
+    # A store has its full length from the start, and a frame gets its time when it is complete.
     note = (
-        f"{len(time) - whole} of {len(time)} frames have no valid time "
-        f"(written in part when the run stopped) and are left out."
+        f"{len(time) - whole} of {len(time)} frames have no valid time: "
+        "the run ended before they were complete. They are left out."
     )
     return (dataset.isel(time=slice(0, whole)) if whole else None), (note,)
 

@@ -20,6 +20,7 @@ FACTS = {
     "precision": "precision",
     "device": "device",
     "platform": "platform",
+    "dvax": "dvax",
     "python": "Python",
     "git_commit": "git commit",
 }
