@@ -14,18 +14,19 @@ from ..operators import AbstractOperator
 from ..problem import Problem
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, Frozen
+from .chords import Chord, NoEnclosure, enclose, is_chord, largest, smallest
 
 
 class Rate(NamedTuple):
     """f̃(t, x) and the law behind it.
 
-    `value` = f(t, x, u); y = P u; `z`, whose projection onto K is y; `residual` = ‖w‖ of the frozen
-    solve; `solved`, whether it met its tolerance; `iterations`.
+    `value` = f(t, x, u); y = P u; `z`, whose projection onto K is y (both None where not kept);
+    `residual` = ‖w‖ of the frozen solve; `solved`, whether it met its tolerance; `iterations`.
     """
 
     value: Tree
-    y: Tree
-    z: Tree
+    y: Tree | None
+    z: Tree | None
     residual: jax.Array
     solved: jax.Array
     iterations: jax.Array
@@ -37,7 +38,8 @@ class Flow(eqx.Module):
     `direct` says that the law was proved to be F(y) = ay − h(t, x, 0), pointwise on a set of pointwise
     intervals, or with one number a on any set, so that its closed form y = proj_K(h(t, x, 0)/a) is
     used and no guess is needed. `reciprocal` is 1/a
-    where a was proved not to depend on t and x, so that it is computed once.
+    where a was proved not to depend on t and x, so that it is computed once. `enclosed` says that f̃
+    can be enclosed over a whole step (`chords`), so that nothing about the defect is guessed.
     """
 
     problem: Problem
@@ -47,6 +49,7 @@ class Flow(eqx.Module):
     solver: AbstractSolver
     direct: bool = eqx.field(static=True)
     reciprocal: Tree | None
+    enclosed: bool = eqx.field(static=True)
     tol: Any
     gamma: Any
     L_F: Any
@@ -80,6 +83,25 @@ class Flow(eqx.Module):
         value = problem.f(t, x, self.operator.inverse(y), args)
         exact = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(x)))
         return Rate(value, y, z, exact, jnp.asarray(True), jnp.asarray(1))
+
+    def enclosure(self, t: Chord, x: Tree) -> Tree:
+        """f̃ along chords of t and x, as chords, for a direct law on pointwise intervals.
+
+        **Raises:** `NoEnclosure` where f, h or K uses an operation without a rule.
+        """
+        problem, args, P = self.problem, self.args, self.operator
+        start = jtu.tree_map(lambda chord: chord.a, x, is_leaf=is_chord)
+        zero = problem.zero_control(start)
+        drive = enclose(lambda t, x: problem.h(t, x, zero, args), t, x)
+        if self.reciprocal is None:
+            raise NoEnclosure("a slope of the law that moves")
+        z = enclose(lambda d: jtu.tree_map(jnp.multiply, d, self.reciprocal), drive)
+        ends = enclose(lambda t: problem.set_at(t, args).intervals(zero), t)
+        y = jtu.tree_map(
+            lambda q, low, up: smallest(largest(q, low), up), z, *ends, is_leaf=is_chord
+        )
+        u = enclose(P.inverse, y)
+        return enclose(lambda t, x, u: problem.f(t, x, u, args), t, x, u)
 
     def hidden(self, t: Any, x: Tree, rate: Rate, error: Tree) -> Tree:
         """How far f̃ may be off, entry by entry, because z may be off by ± `error`.

@@ -1,18 +1,19 @@
 """The time loop: one compiled function from a problem to its solution."""
 
+import dataclasses
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 
 from .. import _tree
 from .._tree import Tree
-from ..generators import AbstractGenerator
 from ..problem import Problem
-from ..spaces import AbstractSpace
 from ..vi import AbstractSolver, Auto, analyse, certify, independent
+from .chords import NoEnclosure, constant
 from .control import Adaptive, Fixed, root_mean_squares, step_count
 from .flow import Flow, slope
 from .method import AbstractMethod
@@ -41,7 +42,7 @@ def integrate(
     adjoint: str,
     progress: bool,
 ) -> Solution:
-    dtype = jnp.result_type(*jax.tree_util.tree_leaves(x0))
+    dtype = jnp.result_type(*jtu.tree_leaves(x0))
     s = {name: jnp.asarray(value, dtype) for name, value in setting.items()}
     t0, t1 = s["t0"], s["t1"]
     # Shapes and knots are looked at here, while tracing: a call that is compiled pays nothing.
@@ -51,7 +52,7 @@ def integrate(
         max_steps += knots.shape[0]
     state, control = problem.spaces(x0)
     generator = problem.generator(args)
-    flow = _flow(problem, x0, args, t0, generator, vi_solver, moduli, s, dtype)
+    flow = _flow(problem, x0, args, t0, generator, vi_solver, moduli, s, dtype, method)
 
     uniform = None
     if fixed:
@@ -100,10 +101,11 @@ def integrate(
         "steps": out.stats["num_accepted_steps"],
         "rejected": out.stats["num_rejected_steps"],
         "t": out.ts[1][0],
-        "x": jax.tree_util.tree_map(lambda leaf: leaf[0], out.ys[1][0]),
+        "x": jtu.tree_map(lambda leaf: leaf[0], out.ys[1][0]),
         "defect": out.ys[1][1][0],
         "next_dt": out.controller_state.length if not fixed else s["dt"],
         "setting": setting,
+        "enclosed": flow.enclosed,
         "x0": x0,
         "method": method,
     }
@@ -127,7 +129,7 @@ def integrate(
     )
 
 
-def _flow(problem, x0, args, t0, generator, vi_solver, moduli, s, dtype) -> Flow:
+def _flow(problem, x0, args, t0, generator, vi_solver, moduli, s, dtype, method) -> Flow:
     like = problem.zero_control(x0)
     K = problem.set_at(t0, args)
     frozen = problem.frozen(t0, x0, args)
@@ -145,13 +147,25 @@ def _flow(problem, x0, args, t0, generator, vi_solver, moduli, s, dtype) -> Flow
     operator = problem.operator(args)
     reciprocal = None
     if direct and independent(lambda t, x: slope(problem, operator, t, x, args), t0, x0):
-        reciprocal = jax.tree_util.tree_map(
-            jnp.reciprocal, slope(problem, operator, t0, x0, args)
-        )
-    return Flow(
-        problem, args, generator, operator, solver, direct, reciprocal, tol,
+        reciprocal = jtu.tree_map(jnp.reciprocal, slope(problem, operator, t0, x0, args))
+        if structure.isotropic:
+            # One number a part: read from memory once, not once an entry.
+            reciprocal = jtu.tree_map(lambda leaf: leaf.ravel()[0], reciprocal)
+    flow = Flow(
+        problem, args, generator, operator, solver, direct, reciprocal, False, tol,
         moduli.get("gamma"), moduli.get("L_F"),
     )  # fmt: skip
+    if direct and intervals and method.degree <= 1 and _can_enclose(flow, t0, x0):
+        return dataclasses.replace(flow, enclosed=True)
+    return flow
+
+
+def _can_enclose(flow: Flow, t0, x0) -> bool:
+    try:
+        jax.eval_shape(lambda t, x: flow.enclosure(constant(t), constant(x)), t0, x0)
+    except NoEnclosure:
+        return False
+    return True
 
 
 def _responses(flow: Flow, times, xs, control, moduli):
@@ -179,7 +193,7 @@ def _adjoint(name: str, max_steps: int, x0: Tree) -> diffrax.AbstractAdjoint:
         return diffrax.ForwardMode()
     # One checkpoint a step is the fast path (no step is computed twice more than once); larger
     # states get as many as fit the memory set aside, and recompute between them.
-    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree_util.tree_leaves(x0))
+    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jtu.tree_leaves(x0))
     affordable = max(64, _CHECKPOINT_BYTES // (8 * size + 512))
     return diffrax.RecursiveCheckpointAdjoint(checkpoints=min(max_steps, affordable))
 

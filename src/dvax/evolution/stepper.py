@@ -8,11 +8,13 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jax import lax
 
 from .. import _tree
 from .._tree import Tree
 from ..generators import AbstractGenerator, AbstractPropagator
+from .chords import ROOT_MEAN_SQUARE, Chord, is_chord
 from .flow import Flow, Rate
 from .method import AbstractMethod, polynomial, shortened
 
@@ -148,8 +150,8 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
     def init(self, terms, t0, t1, y0, args) -> Memory:
         h = t1 - t0
         guess = None if self.flow.direct else self.flow.problem.zero_control(y0.x)
-        rate = self.flow.rate(t0, y0.x, guess) if self.measure else None
-        half = self._propagator(0.5 * h) if self.measure else None
+        rate = self._kept(self.flow.rate(t0, y0.x, guess)) if self.measure else None
+        half = self._half(h)
         sparse = not (self.measure or self.careful) and _size(y0.x) > _SMALL
         count = jnp.asarray(0) if sparse else None
         if self.uniform is not None:
@@ -194,9 +196,9 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         y1 = Carry(x1, y0.defect + defect, y0.law_defect + law_defect, record)
         estimate = None
         if self.measure:
-            estimate = jax.tree_util.tree_map(jnp.zeros_like, y1)._replace(x=sample.error)
+            estimate = jtu.tree_map(jnp.zeros_like, y1)._replace(x=sample.error)
         memory = memory._replace(
-            rate=last if self.measure else None,
+            rate=self._kept(last) if self.measure else None,
             guess=None if self.flow.direct else last.y,
             count=None if memory.count is None else memory.count + 1,
         )
@@ -209,7 +211,7 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         kept = memory.rate
         # The last sample of the previous step was taken here, unless data jumps here.
         return lax.cond(
-            made_jump, lambda: self.flow.rate(t0, x0, memory.guess), lambda: kept
+            made_jump, lambda: self._kept(self.flow.rate(t0, x0, memory.guess)), lambda: kept
         )
 
     def _finite(self, x: Tree, count: Any) -> jax.Array:
@@ -225,6 +227,14 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
     def _propagator(self, h: Any) -> AbstractPropagator:
         return self.flow.generator.propagator(h, self.method.degree + 1)
 
+    def _kept(self, rate: Rate) -> Rate:
+        """What the next step needs of a rate: not the law behind it, where nothing samples it."""
+        return rate._replace(y=None, z=None) if self.flow.enclosed else rate
+
+    def _half(self, h: Any) -> AbstractPropagator | None:
+        sampled = self.measure and not self.flow.enclosed
+        return self._propagator(0.5 * h) if sampled else None
+
     def _fit(self, memory: Memory, t0: Any, t1: Any, h: Any) -> Memory:
         """Propagators for this length; kept from the last step where the length is the same.
 
@@ -235,14 +245,42 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         length, full, half = lax.cond(
             same,
             lambda: (memory.length, memory.full, memory.half),
-            lambda: (
-                h, self._propagator(h), self._propagator(0.5 * h) if self.measure else None
-            ),
-        )  # fmt: skip
+            lambda: (h, self._propagator(h), self._half(h)),
+        )
         return memory._replace(length=length, full=full, half=half)
 
     def _measure(
         self, t0: Any, t1: Any, x0: Tree, x1: Tree, first: Rate, c: Any, memory: Memory
+    ) -> Sample:
+        last = self.flow.rate(_within(t0, t1, 1.0), x1, first.y)
+        if self.flow.enclosed:
+            return self._enclosed(t0, t1, x0, x1, c, last)
+        return self._sampled(t0, t1, x0, x1, first, c, memory, last)
+
+    def _enclosed(self, t0: Any, t1: Any, x0: Tree, x1: Tree, c: Any, last: Rate) -> Sample:
+        """|δ(θ)| ≤ θ|δ(1)| + dev, with dev from chord arithmetic: p is a line, and p = f̃ at t₀."""
+        t0, t1, x0, x1, c = lax.stop_gradient((t0, t1, x0, x1, c))
+        h, space = t1 - t0, self.flow.state_space(x0)
+        bend = self.flow.generator.bend(h, x0, x1, c, space)
+        x = jtu.tree_map(Chord, x0, x1, bend)
+        t = Chord(t0, _within(t0, t1, 1.0), jnp.zeros_like(t0))
+        along = self.flow.enclosure(t, x)
+        end = polynomial(c, 1.0)
+        at_end = jtu.tree_map(lambda q, p: 0.5 * jnp.abs(q.b - p), along, end, is_leaf=is_chord)
+        dev = jtu.tree_map(lambda q: q.dev, along, is_leaf=is_chord)
+        defect = h * (space.norm(at_end) + ROOT_MEAN_SQUARE * space.norm(dev))
+        return Sample(last, _tree.add(at_end, dev), defect, jnp.zeros_like(defect))
+
+    def _sampled(
+        self,
+        t0: Any,
+        t1: Any,
+        x0: Tree,
+        x1: Tree,
+        first: Rate,
+        c: Any,
+        memory: Memory,
+        last: Rate,
     ) -> Sample:
         """The defect δ = p − f̃(·, x_h) at the middle and at the end of the step; δ(t₀) = 0.
 
@@ -255,21 +293,18 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         xm = memory.half.step(x0, shortened(c, 0.5))
         tm, te = _within(t0, t1, 0.5), _within(t0, t1, 1.0)
         middle = flow.rate(tm, xm, first.y)
-        last = flow.rate(te, x1, middle.y)
         at_end = _tree.sub(last.value, polynomial(c, 1.0))
         line = _tree.scale(0.5, at_end)
         bump = _tree.sub(_tree.sub(middle.value, polynomial(c, 0.5)), line)
 
         # How well z, the unconstrained value of the law, is predicted in the middle.
-        doubt = jax.tree_util.tree_map(
+        doubt = jtu.tree_map(
             lambda a, m, b: _DOUBT * (m - 0.5 * (a + b)), first.z, middle.z, last.z
         )
-        unseen = jax.tree_util.tree_map(
+        unseen = jtu.tree_map(
             jnp.maximum, flow.hidden(tm, xm, middle, doubt), flow.hidden(te, x1, last, doubt)
         )
-        error = jax.tree_util.tree_map(
-            lambda a, b, s: jnp.abs(a) + jnp.abs(b) + s, line, bump, unseen
-        )
+        error = jtu.tree_map(lambda a, b, s: jnp.abs(a) + jnp.abs(b) + s, line, bump, unseen)
         space = flow.state_space(x0)
         defect = h * (space.norm(line) + space.norm(bump) + space.norm(unseen))
         residuals = [first.residual, middle.residual, last.residual]
@@ -286,4 +321,4 @@ def _within(t0: Any, t1: Any, theta: float) -> Any:
 
 
 def _size(x: Tree) -> int:
-    return sum(leaf.size for leaf in jax.tree_util.tree_leaves(x))
+    return sum(leaf.size for leaf in jtu.tree_leaves(x))

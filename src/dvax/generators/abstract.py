@@ -47,6 +47,15 @@ class AbstractGenerator(eqx.Module):
     def growth(self, space: AbstractSpace) -> Growth:
         """M and ω with ‖e^{At}‖ ≤ M e^{ωt} in the norm of `space`, proved from A's structure."""
 
+    @abc.abstractmethod
+    def bend(self, h: Any, x0: Tree, x1: Tree, c: tuple[Tree, ...], space: AbstractSpace) -> Tree:
+        """A bound, entry by entry, on how far x(t₀ + θh) lies from the line between x₀ and x₁, for a
+        step from x₀ to x₁ with at most two coefficients c (see `AbstractPropagator`)."""
+
+    @abc.abstractmethod
+    def check(self, space: AbstractSpace) -> None:
+        """Raise an `InputError` where A does not act on the elements of `space`."""
+
     def semigroup(self, h: Any, v: Tree) -> Tree:
         """e^{hA} v."""
         return self.propagator(h, 0).step(v, ())

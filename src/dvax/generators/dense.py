@@ -53,11 +53,23 @@ class Dense(AbstractGenerator):
     def propagator(self, h: Any, terms: int) -> "MatrixPropagator":
         return MatrixPropagator(flow_factors(h, phi_matrix(h * self.matrix, terms)))
 
+    def check(self, space: AbstractSpace) -> None:
+        name = "dvax.generators.Dense(matrix)"
+        _tree.fits_matrix(name, self.matrix, space.zeros(), "state space")
+
     def growth(self, space: AbstractSpace) -> Growth:
         # ⟨Av, v⟩ = vᵀWAv: with q = W^{1/2}v it is qᵀ(W^{1/2}AW^{-1/2})q, so weights only rescale.
         root = jnp.broadcast_to(jnp.sqrt(space.weights()), self.matrix.shape[:1])
         similar = root[:, None] * self.matrix / root[None, :]
         return Growth(jnp.ones(()), jnp.linalg.eigvalsh(0.5 * (similar + similar.T))[-1])
+
+    def bend(self, h: Any, x0: Tree, x1: Tree, c: tuple[Tree, ...], space: AbstractSpace) -> Tree:
+        # x'' = e^{A(t−t₀)} x''(t₀), and one entry is at most the norm over the root of its weight.
+        slope = c[1] / h if len(c) > 1 else jnp.zeros_like(c[0])
+        curvature = self.matrix @ (self.matrix @ x0 + c[0]) + slope
+        M, omega = self.growth(space)
+        largest = M * jnp.exp(jnp.maximum(omega, 0.0) * h) * space.norm(curvature)
+        return jnp.broadcast_to(h**2 / 8 * largest / jnp.sqrt(space.weights()), x0.shape)
 
 
 class MatrixPropagator(AbstractPropagator):

@@ -10,7 +10,7 @@ from .._tree import Tree
 from ..spaces import AbstractSpace
 from .abstract import AbstractGenerator, Growth
 from .phi import flow_factors, phi_scalar
-from .scalar import ElementwisePropagator
+from .scalar import ElementwisePropagator, elementwise_bend
 
 
 class Diagonal(AbstractGenerator):
@@ -38,5 +38,12 @@ class Diagonal(AbstractGenerator):
     def propagator(self, h: Any, terms: int) -> ElementwisePropagator:
         return ElementwisePropagator(flow_factors(h, phi_scalar(h * self.entries, terms)))
 
+    def check(self, space: AbstractSpace) -> None:
+        name = "dvax.generators.Diagonal(entries)"
+        _tree.fits(name, self.entries, space.zeros(), "state space")
+
     def growth(self, space: AbstractSpace) -> Growth:
         return Growth(jnp.ones(()), jnp.max(jnp.real(self.entries)))
+
+    def bend(self, h: Any, x0: Tree, x1: Tree, c: tuple[Tree, ...], space: AbstractSpace) -> Tree:
+        return elementwise_bend(self.entries, h, x0, x1, *c)

@@ -4,6 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace
 from ..spaces import Product as ProductSpace
@@ -34,12 +35,25 @@ class Product(AbstractGenerator):
     def propagator(self, h: Any, terms: int) -> "ProductPropagator":
         return ProductPropagator(tuple(a.propagator(h, terms) for a in self.parts))
 
+    def check(self, space: AbstractSpace) -> None:
+        _tree.fits_parts("dvax.generators.Product", len(self.parts), space.zeros(), "state space")
+        for part, own in zip(self.parts, _parts(space, len(self.parts)), strict=True):
+            part.check(own)
+
     def growth(self, space: AbstractSpace) -> Growth:
-        spaces = space.spaces if isinstance(space, ProductSpace) else (space,) * len(self.parts)
-        bounds = [a.growth(s) for a, s in zip(self.parts, spaces, strict=True)]
+        pairs = zip(self.parts, _parts(space, len(self.parts)), strict=True)
+        bounds = [part.growth(own) for part, own in pairs]
         # max over parts of M e^{ωt} is at most (max M) e^{(max ω)t}.
         worst = [jnp.max(jnp.stack([jnp.asarray(b[i]) for b in bounds])) for i in (0, 1)]
         return Growth(*worst)
+
+    def bend(self, h: Any, x0: Tree, x1: Tree, c: tuple[Tree, ...], space: AbstractSpace) -> Tree:
+        columns = zip(self.parts, _parts(space, len(self.parts)), x0, x1, *c, strict=True)
+        return tuple(part.bend(h, a, b, tuple(rest), own) for part, own, a, b, *rest in columns)
+
+
+def _parts(space: AbstractSpace, count: int) -> tuple[AbstractSpace, ...]:
+    return space.spaces if isinstance(space, ProductSpace) else (space,) * count
 
 
 class ProductPropagator(AbstractPropagator):

@@ -37,8 +37,25 @@ class Scalar(AbstractGenerator):
     def propagator(self, h: Any, terms: int) -> "ElementwisePropagator":
         return ElementwisePropagator(flow_factors(h, phi_scalar(h * self.a, terms)))
 
+    def check(self, space: AbstractSpace) -> None:
+        if jnp.ndim(self.a) != 0:
+            _tree.fits("dvax.generators.Scalar(a)", self.a, (), "state space")
+
     def growth(self, space: AbstractSpace) -> Growth:
         return Growth(jnp.ones(()), self.a)
+
+    def bend(self, h: Any, x0: Tree, x1: Tree, c: tuple[Tree, ...], space: AbstractSpace) -> Tree:
+        return jtu.tree_map(lambda *leaves: elementwise_bend(self.a, h, *leaves), x0, x1, *c)
+
+
+def elementwise_bend(a: jax.Array, h: Any, x0: Any, x1: Any, c0: Any, c1: Any = None) -> jax.Array:
+    """For x' = ax + c₀ + c₁(t−t₀)/h with a real: x'' = x''(t₀)e^{a(t−t₀)} has one sign, so x' runs
+    monotonically between its ends and x is convex or concave. Then x leaves its chord by at most
+    h/4 |x'(t₁) − x'(t₀)|, and by at most h²/8 max|x''|."""
+    slope = jnp.zeros_like(c0) if c1 is None else c1
+    v0, v1 = a * x0 + c0, a * x1 + c0 + slope
+    w = jnp.maximum(jnp.abs(a * v0 + slope / h), jnp.abs(a * v1 + slope / h))
+    return jnp.minimum(h / 4 * jnp.abs(v1 - v0), h**2 / 8 * w)
 
 
 class ElementwisePropagator(AbstractPropagator):

@@ -144,7 +144,7 @@ class _Run:
             start = times[max(first - 1, 0)]
             failure = None
             try:
-                a = self._solve(main, start, ts)
+                a = self._solve(main, start, ts, measure=True)
             except SolveError as stopped:
                 a, failure = stopped.solution, stopped
                 assert isinstance(a, Solution)
@@ -152,7 +152,8 @@ class _Run:
                     raise
                 ts = np.asarray(a.ts)
                 wanted = wanted[: len(ts)]
-            b = self._solve(other, start, ts)
+            # The companion shows a distance; its own error is not asked for.
+            b = self._solve(other, start, ts, measure=False)
             bound = bound_error(self.problem, a, self.constants, initial_error=error)
             values = dict(block_values(self.model, self.space, a, b, bound, apart))
             assert a.defect is not None
@@ -170,13 +171,15 @@ class _Run:
                 self._event("compiled", compile_seconds=compile_seconds())
             self._event("progress", t=float(wanted[-1]), t_end=float(times[-1]), steps=self.steps)
 
-    def _solve(self, piece: "_Piece", start: float, ts: np.ndarray) -> Solution:
+    def _solve(
+        self, piece: "_Piece", start: float, ts: np.ndarray, *, measure: bool
+    ) -> Solution:
         s = self.config.solver
         sol = solve(
             self.problem, jnp.asarray(piece.x), start, float(ts[-1]), None, ts,
             dt=s.dt, rtol=s.rtol or 1e-6, atol=s.atol or 1e-9,
             method=ETD1() if s.method == "ETD1" else ETD2RK(),
-            constants=self.constants, measure=True,
+            constants=self.constants, measure=measure,
             dt0=piece.dt, horizon=self.config.time.end,
         )  # fmt: skip
         piece.x, piece.dt = sol.stats["x"], sol.stats["next_dt"] if s.dt is None else None

@@ -50,7 +50,7 @@ _POINTWISE = {
     "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "logistic", "erf", "erfc",
     "erf_inv", "sqrt", "rsqrt", "cbrt", "abs", "sign", "floor", "ceil", "round", "pow",
     "integer_pow", "square", "clamp", "rem", "nextafter", "is_finite", "eq", "ne", "lt", "le",
-    "gt", "ge", "and", "or", "xor", "not", "lgamma", "digamma",
+    "gt", "ge", "lt_to", "le_to", "eq_to", "and", "or", "xor", "not", "lgamma", "digamma",
     # Linear in value, but its derivative is 0, and the slope of a law is taken by differentiating.
     "stop_gradient",
 }  # fmt: skip
