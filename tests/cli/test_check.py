@@ -87,4 +87,4 @@ def test_memory_grows_with_the_points(tmp_path: Path) -> None:
         config = load_config(write_config(tmp_path / name, *changes))
         table = {what: value for what, value, _ in sizes(config, build_contact(config))}
         shown.append(table["memory"])
-    assert shown == ["about 450 MiB", "about 755 MiB"]
+    assert shown == ["about 550 MiB", "about 1.28 GiB"]

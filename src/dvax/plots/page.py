@@ -72,7 +72,9 @@ def _banner(run: RunRecord) -> str:
     lines: list[str] = []
     if run.status in UNFINISHED:
         reach = _reach(run)
-        reason = str(run.manifest.get("stop_reason") or "")
+        # A run that was killed could not say why: its manifest still says that it goes on.
+        gone = run.status == "running"
+        reason = "" if gone else str(run.manifest.get("stop_reason") or "")
         text = " ".join(part for part in (UNFINISHED[run.status], reach, reason) if part)
         lines.append(
             f'<div class="banner partial" role="alert"><b>Partial results.</b> '

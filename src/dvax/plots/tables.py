@@ -40,7 +40,7 @@ def headline_cards(run: RunRecord) -> str:
             f'<div class="meaning">{_escape(str(entry.get("meaning", "")))}</div></div>'
         )
     if not cards:
-        return '<p class="caption">summary.json holds no figures.</p>'
+        return '<p class="caption">The run wrote no figures: they are made when it ends.</p>'
     return f'<div class="cards">{"".join(cards)}</div>'
 
 
