@@ -10,8 +10,9 @@ Row = tuple[str, str, str]
 
 # A saved frame holds indentation and pressure in double precision and the regime in one byte.
 FRAME_BYTES = 8 + 8 + 1
-# Measured on runs of 24 and of 10⁶ points, report included: arrays of n numbers that live at once (states, stages and data of
-# the trajectory and its companion), and what JAX, Python and the report take without any point.
+# Measured on runs of 24 and of 10⁶ points, report included: arrays of n numbers that live at once
+# (states, stages and data of the trajectory and its companion), and what JAX, Python and the report
+# take without any point.
 ARRAYS, BASE_BYTES = 100, 550 * 2**20
 
 
