@@ -158,6 +158,7 @@ class Problem(eqx.Module):
         u = self.zero_control(x)
         problems: list[InputProblem] = []
         for attempt in (
+            lambda: self.generator(args).check(state),
             lambda: self.operator(args).check(control),
             lambda: self.set_at(t, args).check(u),
         ):

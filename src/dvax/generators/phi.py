@@ -1,6 +1,7 @@
 """The φ-functions of a number and of a matrix."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -52,6 +53,6 @@ def phi_matrix(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
     return tuple(first_row[:, k * n : (k + 1) * n] for k in range(order + 1))
 
 
-def flow_factors(h: jax.Array, phis: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+def flow_factors(h: Any, phis: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
     """(e^{hA}, h 0! φ₁, h 1! φ₂, …): what a propagator multiplies x₀, c₀, c₁, … by."""
     return phis[0], *(h * math.factorial(j) * phi for j, phi in enumerate(phis[1:]))

@@ -35,7 +35,7 @@ class Ball(AbstractSet):
         self.center = _tree.as_float(center, "dvax.sets.Ball(center)")
         self.radius = _tree.as_float(radius, "dvax.sets.Ball(radius)")
         _tree.require(
-            lambda: (self.radius >= 0) & jnp.isfinite(self.radius),
+            lambda: jnp.all((self.radius >= 0) & jnp.isfinite(self.radius)),
             "dvax.sets.Ball(radius)",
             self.radius,
             "a ball has a finite radius ≥ 0, or it is empty or the whole space",

@@ -29,8 +29,8 @@ class AbstractSpace(eqx.Module):
     def norm(self, a: Tree) -> jax.Array:
         """‖a‖ = √⟨a, a⟩. Its derivative at 0 is taken as 0, not NaN."""
         square = self.inner(a, a)
-        positive = square > 0
-        return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+        zero = square == 0  # not "positive": NaN is neither, and must come out as NaN
+        return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, square)))
 
     def size(self) -> jax.Array:
         """‖1‖² = Σ wᵢ: what turns a norm into a root mean square."""

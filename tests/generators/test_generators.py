@@ -1,0 +1,124 @@
+"""Generators: the semigroup, the flow of a polynomial forcing, and the growth bound."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from scipy.integrate import solve_ivp
+from tests.oracles import symmetric_extremes
+
+import dvax
+from dvax import generators, spaces
+
+MATRICES = {
+    "symmetric": np.array([[-2.0, 0.5, 0.0], [0.5, -1.0, 0.3], [0.0, 0.3, -0.2]]),
+    "skew": np.array([[0.0, 4.0, -1.0], [-4.0, 0.0, 2.0], [1.0, -2.0, 0.0]]),
+    "non-normal": np.array([[-1.0, 30.0, 0.0], [0.0, -1.2, 30.0], [0.0, 0.0, -0.9]]),
+}
+
+
+@jax.jit
+def _flow(matrix, h, x0, c0, c1, c2):
+    return generators.Dense(matrix).propagator(h, 3).step(x0, (c0, c1, c2))
+
+
+@pytest.mark.parametrize("name", MATRICES)
+@pytest.mark.parametrize("h", [1e-3, 0.7])
+def test_the_propagator_solves_the_equation_with_a_quadratic_forcing(name, h):
+    A = MATRICES[name]
+    x0, c = (
+        np.array([1.0, -2.0, 0.5]),
+        np.array([[0.3, 1.0, -1.0], [2.0, 0.0, 1.0], [1.0, 1.0, 3.0]]),
+    )
+    found = np.asarray(_flow(jnp.asarray(A), h, jnp.asarray(x0), *map(jnp.asarray, c)))
+    exact = solve_ivp(
+        lambda t, x: A @ x + c[0] + c[1] * (t / h) + c[2] * (t / h) ** 2,
+        (0, h), x0, method="DOP853", rtol=1e-13, atol=1e-13,
+    ).y[:, -1]  # fmt: skip
+    np.testing.assert_allclose(found, exact, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", MATRICES)
+def test_the_semigroup_is_the_matrix_exponential(name):
+    A, v = MATRICES[name], np.array([0.2, 1.0, -0.4])
+    found = np.asarray(generators.Dense(A).semigroup(0.9, jnp.asarray(v)))
+    np.testing.assert_allclose(found, scipy.linalg.expm(0.9 * A) @ v, rtol=1e-12, atol=1e-13)
+
+
+def test_the_semigroup_law_holds():
+    A, v = generators.Dense(MATRICES["non-normal"]), jnp.array([0.2, 1.0, -0.4])
+    twice = A.semigroup(0.3, A.semigroup(0.5, v))
+    np.testing.assert_allclose(np.asarray(A.semigroup(0.8, v)), np.asarray(twice), rtol=1e-13)
+
+
+def test_scalar_diagonal_dense_and_product_are_the_same_operator_in_other_clothes():
+    a, x0 = np.array([-0.5, -0.5]), np.array([1.0, -3.0])
+    c = (jnp.array([0.2, -1.0]), jnp.array([1.0, 2.0]))
+    h, x = 0.37, jnp.asarray(x0)
+    dense = generators.Dense(np.diag(a)).propagator(h, 2).step(x, c)
+    diagonal = generators.Diagonal(a).propagator(h, 2).step(x, c)
+    scalar = generators.Scalar(-0.5).propagator(h, 2).step(x, c)
+    parts = generators.Product(generators.Scalar(-0.5), generators.Diagonal(a[1:]))
+    split = lambda v: (v[0], v[1:])  # noqa: E731
+    pair = parts.propagator(h, 2).step(split(x), tuple(map(split, c)))
+    for other in (dense, scalar, jnp.concatenate([pair[0][None], pair[1]])):
+        np.testing.assert_allclose(np.asarray(other), np.asarray(diagonal), rtol=1e-14)
+    applied = [g.apply(x) for g in (generators.Dense(np.diag(a)), generators.Scalar(-0.5))]
+    for other in applied:
+        np.testing.assert_allclose(np.asarray(other), a * x0, rtol=1e-15)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_no_random_matrix_breaks_its_growth_bound_and_none_could_have_a_smaller_one(weighted):
+    rng = np.random.default_rng(20261121 + weighted)
+    for _ in range(25):
+        n = 4
+        A = rng.normal(size=(n, n)) * rng.choice([0.3, 3.0])
+        w = rng.uniform(0.05, 5.0, n) if weighted else np.ones(n)
+        space = spaces.L2(w) if weighted else spaces.Euclidean(n)
+        M, omega = map(float, generators.Dense(A).growth(space))
+        root = np.diag(np.sqrt(w))
+        for t in (1e-3, 0.1, 1.0, 3.0):
+            similar = root @ scipy.linalg.expm(t * A) @ np.linalg.inv(root)
+            assert np.linalg.norm(similar, 2) <= M * np.exp(omega * t) * (1 + 1e-10)
+        # The bound is attained to first order as t → 0: with M = 1 no smaller ω would do.
+        assert omega == pytest.approx(symmetric_extremes(A, w)[1], abs=1e-10)
+
+
+def test_growth_of_the_other_generators_is_read_off():
+    plane = spaces.Euclidean(2)
+    assert float(generators.Scalar(-0.7).growth(plane).omega) == -0.7
+    assert float(generators.Diagonal(jnp.array([-3.0, -0.2])).growth(plane).omega) == -0.2
+    both = generators.Product(generators.Scalar(-4.0), generators.Diagonal(jnp.array([-3.0, 0.5])))
+    bound = both.growth(spaces.Product(spaces.Euclidean(), plane))
+    assert (float(bound.M), float(bound.omega)) == (1.0, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("make", "word"),
+    [
+        (lambda: generators.Dense(jnp.ones((2, 3))), r"shape \(2, 3\)"),
+        (lambda: generators.Dense(jnp.ones(3)), r"shape \(3,\)"),
+        (lambda: generators.Scalar(True), "True"),
+        (lambda: generators.Scalar("fast"), "fast"),
+        (lambda: generators.Diagonal(np.array([1, 2])), "int64"),
+    ],
+)
+def test_what_is_no_generator_is_refused_with_what_was_given(make, word):
+    with pytest.raises(dvax.InputError, match=word):
+        make()
+
+
+@pytest.mark.parametrize(
+    "A",
+    [
+        generators.Diagonal(-jnp.ones(3)),
+        generators.Dense(-jnp.eye(3)),
+        generators.Scalar(-jnp.ones(2)),
+        generators.Product(generators.Scalar(-1.0), generators.Scalar(-1.0)),
+    ],
+)
+def test_a_generator_of_another_size_than_the_state_is_refused(A):
+    with pytest.raises(dvax.InputError, match=r"dvax\.generators"):
+        A.check(spaces.Euclidean(2))
