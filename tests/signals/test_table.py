@@ -1,0 +1,138 @@
+"""Measured data as functions of time."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.interpolate
+
+import dvax
+from dvax.signals import Constant, Function, Product, Table, listen
+
+TIMES = np.array([-1.0, -0.2, 0.1, 0.9, 2.0, 2.5])
+VALUES = np.array([[0.0, 1.0], [3.0, -1.0], [2.0, 2.0], [2.0, 0.0], [-4.0, 1.0], [0.5, 7.0]])
+KINDS = ("constant", "linear", "cubic")
+# Inside the pieces, on every knot, and next to the knots on either side.
+ASKED = np.sort(
+    np.concatenate(
+        [np.linspace(-1, 2.5, 61), TIMES, np.nextafter(TIMES[1:], -9), np.nextafter(TIMES[:-1], 9)]
+    )
+)
+
+
+def exact(kind, t):
+    if kind == "linear":
+        return scipy.interpolate.make_interp_spline(TIMES, VALUES, k=1)(t)
+    if kind == "cubic":
+        return scipy.interpolate.CubicSpline(TIMES, VALUES, bc_type="not-a-knot")(t)
+    return VALUES[[np.max(np.flatnonzero(TIMES <= s)) for s in t]]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_table_joins_its_values_as_scipy_does(kind):
+    table = Table(TIMES, VALUES, kind)
+    found = np.asarray(jax.jit(jax.vmap(table.value))(jnp.asarray(ASKED)))
+    np.testing.assert_allclose(found, exact(kind, ASKED), rtol=1e-12, atol=1e-12)
+
+
+def test_a_constant_table_takes_the_new_value_at_a_jump():
+    table = Table([0.0, 1.0, 2.0], [5.0, 7.0, 9.0], "constant")
+    before = float(np.nextafter(1.0, 0.0))
+    assert [float(table(t)) for t in (0.0, before, 1.0, 1.5, 2.0)] == [5.0, 5.0, 7.0, 7.0, 9.0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nothing_is_extrapolated(kind):
+    table = Table(TIMES, VALUES, kind)
+    outside = [np.nextafter(-1.0, -2), -5.0, np.nextafter(2.5, 3), 1e9]
+    found = np.asarray(jax.vmap(table.value)(jnp.asarray(outside)))
+    assert np.all(np.isnan(found))
+    assert np.all(np.isfinite(np.asarray(jax.vmap(table.value)(jnp.array([-1.0, 2.5])))))
+
+
+def test_a_cubic_table_of_four_points_is_the_cubic_through_them():
+    t = np.array([0.0, 0.4, 1.1, 3.0])
+    table = Table(t, t**3 - 2 * t**2 + 1, "cubic")
+    s = np.linspace(0, 3, 31)
+    found = np.asarray(jax.vmap(table.value)(jnp.asarray(s)))
+    np.testing.assert_allclose(found, s**3 - 2 * s**2 + 1, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [4096, 4097])
+def test_long_tables_find_their_piece_as_short_ones_do(count):
+    t = np.linspace(0, 1, count)
+    table = Table(t, np.sin(9 * t))
+    asked = np.random.default_rng(1).uniform(0, 1, 50)
+    found = np.asarray(jax.vmap(table.value)(jnp.asarray(asked)))
+    np.testing.assert_allclose(found, np.interp(asked, t, np.sin(9 * t)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_table_is_linear_in_its_values_and_its_gradient_says_how(kind):
+    t = 0.37
+    weights = jax.jacrev(lambda v: Table(TIMES, v, kind)(t))(jnp.asarray(VALUES[:, 0]))
+    np.testing.assert_allclose(
+        float(jnp.dot(weights, jnp.asarray(VALUES[:, 1]))), exact(kind, [t])[0, 1], atol=1e-12
+    )
+    # The unit values one by one give the same weights.
+    unit = np.eye(len(TIMES))
+    by_hand = {
+        "constant": lambda e: e[2],
+        "linear": lambda e: np.interp(t, TIMES, e),
+        "cubic": lambda e: scipy.interpolate.CubicSpline(TIMES, e)(t),
+    }[kind]
+    np.testing.assert_allclose(np.asarray(weights), [by_hand(e) for e in unit], atol=1e-12)
+
+
+def test_a_product_of_a_profile_and_a_record_is_a_separable_field():
+    profile, record = np.array([1.0, -2.0, 4.0]), Table(TIMES, VALUES[:, 0])
+    field = Product(Constant(profile), record)
+    expected = profile * np.interp(0.3, TIMES, VALUES[:, 0])
+    np.testing.assert_allclose(np.asarray(field(0.3)), expected)
+    np.testing.assert_allclose(np.asarray(Product(record, 2.0)(0.3)), 2 * expected[0])
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Table([0.0, 2.0, 1.0], [1.0, 2.0, 3.0]), ["times[1]", "increase"]),
+        (lambda: Table([0.0, 1.0, 1.0], [1.0, 2.0, 3.0]), ["times[1]", "increase"]),
+        (lambda: Table([0.0, np.nan], [1.0, 2.0]), ["times[1]", "finite"]),
+        (lambda: Table([0.0, np.inf], [1.0, 2.0]), ["times[1]", "finite"]),
+        (lambda: Table([0.0, 1.0], [1.0, np.nan]), ["values", "finite"]),
+        (lambda: Table([0.0, 1.0], [1.0, np.inf]), ["values", "finite"]),
+        (lambda: Table([0.0, 1.0], [1.0, 2.0, 3.0]), ["(2,)", "(3,)"]),
+        (lambda: Table([0.0], [1.0]), ["at least 2"]),
+        (lambda: Table([0.0, 1.0, 2.0], [1.0, 2.0, 3.0], "cubic"), ["at least 4"]),
+        (lambda: Table([[0.0, 1.0]], [[1.0, 2.0]]), ["vector"]),
+        (lambda: Constant(float("nan")), ["finite"]),
+    ],
+)
+def test_bad_data_is_refused_with_its_place(make, words):
+    with pytest.raises(dvax.InputError) as caught:
+        make()
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_a_listener_hears_every_table_at_its_own_time_and_no_other():
+    a, b = Table([0.0, 1.0], [0.0, 1.0]), Table([0.5, 3.0, 4.0], [0.0, 1.0, 2.0])
+    kinked = Function(lambda t: jnp.abs(t - 0.25), knots=[0.25])
+
+    def use(t):
+        with listen(t) as heard:
+            Product(a, b)(t)
+            kinked(t)
+            Constant(2.0)(t)
+            b(t - 1.0)
+        return heard
+
+    found = []
+    jax.eval_shape(lambda t: (found.append(use(t)), t)[1], jnp.zeros(()))
+    heard = found[0]
+    assert sorted(float(k) for knots in heard.knots for k in knots) == [0, 0.25, 0.5, 1, 3, 4]
+    assert [name for _, _, name in heard.spans if name == "Table"] == ["Table", "Table"]
+    assert len(heard.elsewhere) == 1 and "Table" in heard.elsewhere[0]
+    # Outside the block nobody listens.
+    a(0.5)
+    assert len(heard.knots) == 3
