@@ -1,0 +1,159 @@
+"""Solvers at the edges: degenerate slopes, bounds that coincide or are missing, and failures that
+must say so."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvax
+from dvax.sets import Ball, Box
+from dvax.vi import RESULTS, Auto, Bracketing, Extragradient
+
+INF = jnp.inf
+
+
+def solve(F, K, y0, **settings):
+    return dvax.solve_vi(lambda y, args: F(y), K, jnp.asarray(y0, float), **settings)
+
+
+# (F, lower, upper, solution), one entry a row
+EDGES = [
+    (lambda y: y**3, -INF, INF, 0.0),  # slope 0 at the solution
+    (lambda y: (y - 2.0) ** 3, -INF, INF, 2.0),
+    (lambda y: jnp.sign(y - 0.3) * jnp.abs(y - 0.3) ** 0.2, -1.0, 1.0, 0.3),  # slope ∞
+    (lambda y: jnp.exp(50 * y) - 1.0, -INF, 5.0, 0.0),  # steep and flat
+    (lambda y: jnp.arctan(1e8 * (y - 0.125)), 0.0, 1.0, 0.125),  # nearly a jump
+    (lambda y: y + jnp.tanh(y) - 9.0, -3.0, 3.0, 3.0),  # held above
+    (lambda y: y + jnp.tanh(y) + 9.0, -3.0, 3.0, -3.0),  # held below
+    (lambda y: y + jnp.tanh(y) - 9.0, 0.7, 0.7, 0.7),  # a single point
+    (lambda y: jnp.sinh(y - 1e4), -INF, INF, 1e4),  # far from the guess
+    (lambda y: jnp.expm1(y + 300.0), -INF, INF, -300.0),
+    (lambda y: y**3 - 8.0, -INF, 1.0, 1.0),
+    (lambda y: (y - 1.0) * (2 + jnp.sin(5 * y)), -50.0, 50.0, 1.0),
+    (lambda y: jnp.where(y < 1.0, y - 1.0, 3 * (y - 1.0)), 0.0, 2.0, 1.0),  # a kink at the root
+]
+
+
+@pytest.mark.parametrize("case", range(len(EDGES)))
+@pytest.mark.parametrize("guess", [0.0, -7.3, 1e3])
+def test_bracketing_needs_no_slope_no_guess_and_no_finite_interval(case, guess):
+    F, lower, upper, solution = EDGES[case]
+    vi = solve(F, Box(lower, upper), guess, solver=Bracketing())
+    assert vi.result == RESULTS.successful
+    # A root of multiplicity m is only known to eps^(1/m) · scale, as F itself vanishes there.
+    flat = case in (0, 1)
+    assert float(vi.y) == pytest.approx(solution, rel=1e-14, abs=1e-6 if flat else 1e-14)
+
+
+def test_bracketing_solves_all_points_of_a_field_at_once():
+    c = np.linspace(-3, 6, 1001)
+    F = lambda y: (2 + jnp.sin(y)) * (y - jnp.asarray(c))  # noqa: E731
+    upper = np.where(np.arange(1001) % 2, 2.0, np.inf)
+    vi = solve(F, Box(0.0, upper), np.zeros(1001), solver=Bracketing())
+    np.testing.assert_allclose(np.asarray(vi.y), np.clip(c, 0, upper), rtol=1e-14, atol=1e-14)
+    assert int(vi.iterations) < 60
+
+
+@pytest.mark.parametrize(
+    ("F", "K", "solver", "result"),
+    [
+        (lambda y: y * jnp.nan + y * y, Box(0.0, 1.0), Bracketing(), RESULTS.nonfinite),
+        (lambda y: jnp.sqrt(y - 5.0), Box(0.0, 1.0), Auto(), RESULTS.nonfinite),
+        (lambda y: jnp.sqrt(y - 5.0), Box(0.0, 1.0), Extragradient(), RESULTS.nonfinite),
+        (lambda y: y * jnp.nan, Ball(0.0, 1.0), Extragradient(), RESULTS.nonfinite),
+        (lambda y: y * jnp.nan, Box(0.0, 1.0), Auto(), RESULTS.nonfinite),
+        (lambda y: 0.0 * y, Box(0.0, 1.0), Auto(), RESULTS.nonfinite),
+        (lambda y: jnp.exp(y) - 2, Box(0.0, 1.0), Bracketing(max_steps=2), RESULTS.max_steps),
+        (lambda y: jnp.exp(y) - 2, Box(0.0, 1.0), Extragradient(max_steps=2), RESULTS.max_steps),
+        # Never zero: no solution on a half line, and none is invented.
+        (lambda y: -1.0 / (1.0 + y), Box(0.0, INF), Bracketing(), RESULTS.no_bracket),
+        (lambda y: -jnp.arctan(y), Box(-INF, INF), Bracketing(), RESULTS.no_bracket),
+        # −y + 2 on [0, 1] is solved by 0, not by proj(2) = 1: the closed form must not be trusted.
+        (lambda y: 2.0 - y, Box(0.0, 1.0), Auto(), RESULTS.wrong_slope),
+        (lambda y: jnp.array([1.0, -1.0]) * y, Box(0.0, 1.0), Auto(), RESULTS.wrong_slope),
+        # A jump: every step that sees it is shortened, until the step is gone.
+        (
+            lambda y: jnp.where(y > 0.5, 1.0, -1.0), Box(0.0, 1.0), Extragradient(),
+            RESULTS.not_lipschitz,
+        ),
+    ],
+)  # fmt: skip
+def test_a_failure_is_never_called_a_success(F, K, solver, result):
+    assert solve(F, K, np.full(2, 0.3), solver=solver).result == result
+
+
+def test_the_bound_of_an_unfinished_solve_still_holds():
+    for solver in (Extragradient(max_steps=3), Bracketing(max_steps=3)):
+        vi = solve(lambda y: jnp.exp(y) - 2.0, Box(0.0, 3.0), 3.0, solver=solver, gamma=1.0)
+        assert vi.result == RESULTS.max_steps
+        assert float(vi.error_bound) >= abs(float(vi.y) - np.log(2)) > 1e-8
+
+
+def test_bracketing_refuses_what_it_cannot_do_and_names_what_can():
+    for F, K, word in (
+        (lambda y: y[::-1] ** 3, Box(0.0, 1.0), "mixes points"),
+        (lambda y: y**3, Ball(0.0, 1.0), "not a pointwise interval"),
+    ):
+        with pytest.raises(dvax.InputError, match=word) as caught:
+            solve(F, K, np.zeros(2), solver=Bracketing())
+        assert "Extragradient" in str(caught.value)
+
+
+def test_auto_chooses_by_what_is_proved():
+    choose = lambda F, K: type(Auto().choose(F, K, jnp.zeros(2)))  # noqa: E731
+    assert choose(lambda y: y**3, Box(0.0, 1.0)) is Bracketing
+    assert choose(lambda y: y**3 + y[::-1], Box(0.0, 1.0)) is Extragradient
+    assert choose(lambda y: y**3, Ball(0.0, 1.0)) is Extragradient
+
+
+def test_an_isotropic_law_is_a_projection_for_every_set():
+    z = np.array([3.0, -4.0])
+    space = dvax.spaces.L2(np.array([1.0, 0.25]))
+    vi = solve(lambda y: 2.0 * (y - jnp.asarray(z)), Ball(0.0, 1.0), np.zeros(2), space=space)
+    length = np.sqrt(z[0] ** 2 + 0.25 * z[1] ** 2)
+    np.testing.assert_allclose(np.asarray(vi.y), z / length, rtol=1e-14)
+    assert int(vi.iterations) == 1
+
+
+def test_parts_of_a_tuple_are_solved_together():
+    # Coupled parts on different sets equal the stacked problem on one box.
+    M = np.array([[2.0, 0.3, 0.0], [-0.3, 1.0, 0.5], [0.1, -0.5, 3.0]])
+    q = np.array([-1.0, -4.0, 0.2])
+
+    def F(y):
+        out = jnp.asarray(M) @ jnp.concatenate([y[0][None], y[1]]) + jnp.asarray(q)
+        return out[0], out[1:]
+
+    K = dvax.sets.Product(Box(0.0, 1.0), Box(-1.0, 2.0))
+    pair = dvax.solve_vi(lambda y, _: F(y), K, (jnp.zeros(()), jnp.zeros(2)), tol=1e-12)
+    stacked = solve(
+        lambda y: jnp.asarray(M) @ y + jnp.asarray(q),
+        Box(np.array([0.0, -1.0, -1.0]), np.array([1.0, 2.0, 2.0])), np.zeros(3), tol=1e-12,
+    )  # fmt: skip
+    found = np.concatenate([np.asarray(pair.y[0])[None], np.asarray(pair.y[1])])
+    np.testing.assert_allclose(found, np.asarray(stacked.y), atol=1e-11)
+
+
+@pytest.mark.parametrize("solver", [Bracketing(), Extragradient(), Auto()])
+def test_vmap_equals_a_loop(solver):
+    cs = jnp.array([-1.0, 0.3, 2.0, 4.9])
+    K = Box(0.0, 4.0)
+
+    def one(c):
+        F = lambda y, c: (2 + jnp.sin(y)) * (y - c)  # noqa: E731
+        return dvax.solve_vi(F, K, jnp.ones(()), c, solver, tol=1e-11).y
+
+    together = np.asarray(jax.vmap(one)(cs))
+    np.testing.assert_allclose(together, [float(one(c)) for c in cs], rtol=0, atol=1e-12)
+
+
+def test_single_precision_stays_single_and_reaches_what_it_can():
+    y0 = jnp.zeros(2, jnp.float32)
+    target = jnp.array([0.3, 2.0], jnp.float32)
+    for solver in (Bracketing(), Extragradient()):
+        vi = dvax.solve_vi(
+            lambda y, c: (y - c) ** 3 + (y - c), Box(0.0, 1.0), y0, target, solver, tol=1e-5
+        )
+        assert vi.y.dtype == jnp.float32
+        np.testing.assert_allclose(np.asarray(vi.y), [0.3, 1.0], atol=1e-5)
