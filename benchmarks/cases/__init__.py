@@ -1,0 +1,29 @@
+"""One case a file, each a function `run(full) -> Section`; loaded when it is asked for."""
+
+import importlib
+from typing import Protocol, cast
+
+from ..section import Section
+
+CASES = (
+    "field",
+    "point",
+    "siconos",
+    "tools",
+    "certificate",
+    "derivatives",
+    "memory",
+    "processes",
+)
+"""The names that --only takes, in the order of a run."""
+
+
+class Case(Protocol):
+    def __call__(self, full: bool) -> Section:
+        """Measure; `full` repeats more and goes further."""
+        ...
+
+
+def load(name: str) -> Case:
+    """The case of that name."""
+    return cast(Case, importlib.import_module(f".{name}", __name__).run)

@@ -1,0 +1,33 @@
+"""`dvax.solve` in the two ways a program calls it: as it stands, and inside a function under jax.jit."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+import dvax
+
+
+def called(model: dvax.models.Contact, x0: Any, t1: float, **settings: Any) -> Any:
+    """x(t1) from a plain call, which checks its arguments and builds a whole `Solution`."""
+    return jax.block_until_ready(dvax.solve(model.problem, x0, 0.0, t1, **settings).xs)[-1]
+
+
+def fixed(t1: float, most: int) -> Callable[[Any, Any, Any], Any]:
+    """(model, x0, dt) -> x(t1) under jax.jit, with up to `most` steps; parameters are arguments."""
+
+    @jax.jit
+    def solve(model: dvax.models.Contact, x0: Any, dt: Any) -> Any:
+        return dvax.solve(model.problem, x0, 0.0, t1, dt=dt, max_steps=most).xs[-1]
+
+    return lambda model, x0, dt: jax.block_until_ready(solve(model, x0, dt))
+
+
+def adaptive(t1: float) -> Callable[[Any, Any, Any, Any], Any]:
+    """(model, x0, rtol, atol) -> x(t1) under jax.jit; parameters are arguments."""
+
+    @jax.jit
+    def solve(model: dvax.models.Contact, x0: Any, rtol: Any, atol: Any) -> Any:
+        return dvax.solve(model.problem, x0, 0.0, t1, rtol=rtol, atol=atol).xs[-1]
+
+    return lambda model, x0, rtol, atol: jax.block_until_ready(solve(model, x0, rtol, atol))
