@@ -1,0 +1,83 @@
+"""C1 to C4 of `tests.closed_forms`, solved to the accuracy that was asked for."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from tests.closed_forms import ALL, C1_KINKS, c1_derivatives, c1_solution
+
+import dvax
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_adaptive_steps_reach_nine_digits_at_the_end(name):
+    case = ALL[name]()
+    sol = dvax.solve(
+        case.problem, jnp.asarray(case.x0), 0.0, case.t1, args=case.args, rtol=1e-10, atol=1e-10
+    )
+    x, u = case.exact(case.t1)
+    assert sol.result == dvax.RESULTS.successful
+    assert np.max(np.abs(np.asarray(sol.xs[-1]) - x)) <= 1e-9
+    assert np.max(np.abs(np.asarray(sol.us[-1]) - u)) <= 1e-8
+    print(
+        f"{name}: error {np.max(np.abs(np.asarray(sol.xs[-1]) - x)):.1e}, {sol.stats['steps']} steps"
+    )
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_every_saved_time_is_right_and_every_saved_response_certified(name):
+    case = ALL[name]()
+    ts = np.linspace(0.0, case.t1, 33)
+    sol = dvax.solve(
+        case.problem, jnp.asarray(case.x0), 0.0, case.t1, args=case.args, ts=ts, rtol=1e-7,
+        atol=1e-7, constants=case.constants,
+    )  # fmt: skip
+    exact_x = np.array([case.exact(t)[0] for t in ts])
+    exact_u = np.array([case.exact(t)[1] for t in ts])
+    np.testing.assert_allclose(np.asarray(sol.xs), exact_x, atol=1e-6)
+    # The response moves with x by at most L: its own error is bounded by the law's certificate.
+    np.testing.assert_allclose(np.asarray(sol.us), exact_u, atol=3e-6)
+    assert np.all(np.asarray(sol.law_error) <= 1e-9)
+    P = case.problem.operator()
+    for u, y in zip(sol.us, sol.ys, strict=True):
+        np.testing.assert_allclose(np.asarray(P.apply(u)), np.asarray(y), atol=1e-13)
+
+
+def test_the_closed_forms_agree_with_a_general_solver():
+    # The oracles are checked too: DOP853 on the reduced equations, with the law written by hand.
+    clip = lambda v, a, b: min(max(v, a), b)  # noqa: E731
+    runs = {
+        "C1": lambda t, x: 3.0 - 1.5 * x - clip((1 - 2 * x[0]) / 2, 0.0, 0.5),
+        "C4": lambda t, x: -x + 0.5 - 0.2 * clip(x[0], 0.0, 1.5 * np.pi),
+    }
+    for name, rhs in runs.items():
+        case = ALL[name]()
+        out = solve_ivp(
+            rhs, (0, case.t1), [float(case.x0)], method="DOP853", rtol=1e-12, atol=1e-12,
+            max_step=1e-3,
+        )  # fmt: skip
+        assert out.y[0, -1] == pytest.approx(float(case.exact(case.t1)[0]), abs=1e-9)
+
+    def ball(t, x):
+        length, r = np.hypot(*x), 0.5 * np.exp(-t / 2)
+        u = x * min(1.0, r / length)
+        return np.array([-0.5 * x[0] - 3 * x[1], 3 * x[0] - 0.5 * x[1]]) - u
+
+    out = solve_ivp(
+        ball, (0, 4), [2.0, 0.0], method="DOP853", rtol=1e-12, atol=1e-12, max_step=0.01
+    )
+    np.testing.assert_allclose(out.y[:, -1], ALL["C3"]().exact(4.0)[0], atol=1e-9)
+
+    def corner(t, x):
+        u = np.linalg.solve([[2, 0.5], [0.5, 1]], [1 + 0.5 * np.sin(t), -1 + 0.25 * np.cos(2 * t)])
+        return np.array([[-1, 2], [-2, -1]]) @ x + [1, 0] - np.array([1, 0.5]) * u
+
+    out = solve_ivp(corner, (0, 4), [0.3, -0.2], method="DOP853", rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(out.y[:, -1], ALL["C2"]().exact(4.0)[0], atol=1e-10)
+
+
+def test_the_published_figures_of_c1():
+    assert C1_KINKS == pytest.approx((0.31333575283049, 0.52405678414614), abs=1e-13)
+    assert c1_solution(2.0)[0] == pytest.approx(1.8360919559905713, abs=1e-14)
+    assert c1_derivatives()[0] == pytest.approx(0.06146551650353571, abs=1e-14)
+    assert c1_derivatives()[1] == pytest.approx(0.6402592596, abs=1e-10)
