@@ -7,6 +7,8 @@ import jax
 
 import dvax
 
+from .contact_law import ContactLaw
+
 
 def called(model: dvax.models.Contact, x0: Any, t1: float, **settings: Any) -> Any:
     """x(t1) from a plain call, which checks its arguments and builds a whole `Solution`."""
@@ -31,3 +33,16 @@ def adaptive(t1: float) -> Callable[[Any, Any, Any, Any], Any]:
         return dvax.solve(model.problem, x0, 0.0, t1, rtol=rtol, atol=atol).xs[-1]
 
     return lambda model, x0, rtol, atol: jax.block_until_ready(solve(model, x0, rtol, atol))
+
+
+def known(law: ContactLaw, t1: float, dt: float) -> Callable[[Any, Any], Any]:
+    """(g, x0) -> x(t1) under jax.jit in fixed steps, every number known to the compiler."""
+    letters = ("alpha", "beta", "b_x", "b_u", "d_x", "d_u", "kappa0", "ell")
+    numbers = {name: getattr(law, name) for name in letters}
+
+    @jax.jit
+    def solve(g: Any, x0: Any) -> Any:
+        model = dvax.models.Contact(**numbers, g=g)
+        return dvax.solve(model.problem, x0, 0.0, t1, dt=dt).xs[-1]
+
+    return lambda g, x0: jax.block_until_ready(solve(g, x0))

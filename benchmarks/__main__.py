@@ -1,0 +1,86 @@
+"""`python -m benchmarks [--full] [--only NAME ...] [--save]`, from the root of the repository."""
+
+import argparse
+import dataclasses
+import datetime
+import json
+import platform
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from . import machine
+from .cases import CASES, load
+from .layout import as_text, verdicts
+from .section import Section, Target
+
+_RESULTS = Path(__file__).with_name("results")
+
+
+def main() -> None:
+    options = _options()
+    # Doubles throughout, on both sides of every comparison.
+    jax.config.update("jax_enable_x64", True)
+    facts = machine.facts() | {"load before": machine.load()}
+    print("\n".join(f"{name}: {value}" for name, value in facts.items()))
+    print("Times are medians of samples taken in turn, after compilation; ratios are formed round by")
+    print("round. benchmarks/README.md says how to read the tables.", flush=True)
+    begun = time.perf_counter()
+    sections: list[Section] = []
+    loads: list[str] = []
+    for name in CASES:
+        if options.only and name not in options.only:
+            continue
+        loads.append(machine.load())
+        sections.append(load(name)(options.full))
+        print(f"\n{as_text(sections[-1])}\n(load at its start: {loads[-1]})", flush=True)
+    facts["load after"] = machine.load()
+    facts["seconds"] = f"{time.perf_counter() - begun:.0f}"
+    print(f"\nTargets\n-------\n{verdicts(sections)}")
+    print(f"\n{facts['seconds']} s; load afterwards: {facts['load after']}")
+    if options.save:
+        print(f"Saved as {_save(facts, sections, loads)}")
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks", description="dvax against the peers that are found here."
+    )
+    parser.add_argument("--full", action="store_true", help="more rounds, longer runs, memory")
+    parser.add_argument("--only", action="append", choices=CASES, help="this case (repeatable)")
+    parser.add_argument("--save", action="store_true", help=f"write {_RESULTS.name}/*.json too")
+    return parser.parse_args()
+
+
+def _save(facts: dict[str, str], sections: list[Section], loads: list[str]) -> Path:
+    """All figures as JSON, beside the facts about the machine."""
+    now = datetime.datetime.now()
+    where = re.sub(r"\W+", "-", platform.node() or "machine").strip("-")
+    _RESULTS.mkdir(exist_ok=True)
+    file = _RESULTS / f"{now:%Y-%m-%dT%H%M}-{where}.json"
+    content = {
+        "date": now.isoformat(timespec="seconds"),
+        "machine": facts,
+        "sections": [
+            {"load": before, **_plain(section)} for before, section in zip(loads, sections)
+        ],
+    }
+    file.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    return file.relative_to(machine.ROOT)
+
+
+def _plain(thing: Any) -> Any:
+    """Dataclasses as dictionaries; a target also says whether it was met."""
+    if isinstance(thing, list | tuple):
+        return [_plain(entry) for entry in thing]
+    if not dataclasses.is_dataclass(thing):
+        return thing
+    fields = {f.name: _plain(getattr(thing, f.name)) for f in dataclasses.fields(thing)}
+    return fields | {"met": thing.met} if isinstance(thing, Target) else fields
+
+
+if __name__ == "__main__":
+    main()

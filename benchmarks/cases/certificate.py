@@ -1,0 +1,88 @@
+"""What the certificate costs on a field, and how far above the true error it is on C1."""
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+
+import dvax
+
+from .. import compiled
+from ..clock import in_turn, timed
+from ..contact_law import single, strip
+from ..section import Section, Table, compare
+
+_POINTS, _STEP, _STEPS = 10**5, 1e-3, 200
+_END, _TIMES = 2.0, 41
+_ROUNDING = 1e-13
+"""Errors below this are rounding, of which the certificate does not speak."""
+_RUNS: tuple[tuple[str, dvax.ETD1 | dvax.ETD2RK, tuple[float, ...]], ...] = (
+    ("ETD1", dvax.ETD1(), (1e-2, 1e-3, 1e-4)),
+    ("ETD2RK", dvax.ETD2RK(), (1e-2, 1e-4, 1e-6, 1e-8)),
+)
+
+
+def run(full: bool) -> Section:
+    section = Section(
+        title="certificate: what it costs, and how close it comes",
+        fair=(
+            f"Cost: dvax.solve as called, {_POINTS:.0e} points, {_STEPS} fixed steps, with "
+            "measure=True beside measure=False, which does not sample the defect and certifies "
+            "nothing. Closeness: bound / true error of C1 at t = 2, adaptive steps, "
+            f"{_TIMES} saved times, the true error from the closed form; 'sharp' uses the one-sided "
+            "constant. Errors there are of ETD1 and ETD2RK at the rtol named, atol = rtol/1000."
+        ),
+        tables=[Table("bound / true error on C1", _HEADER, _closeness())],
+    )
+    law = strip(_POINTS)
+    start, end = jnp.asarray(law.start), _STEP * _STEPS
+    sides = {
+        measure: functools.partial(
+            compiled.called, law.model, start, end, dt=_STEP, measure=measure
+        )
+        for measure in (True, False)
+    }
+    errors = {measure: law.error(side(), end) for measure, side in sides.items()}
+    taken = in_turn({str(m): timed(side) for m, side in sides.items()}, 25 if full else 11)
+    section.comparisons.append(
+        compare("measure=True, whole call", "measure=False", taken["True"], taken["False"],
+                error=errors[True], error_other=errors[False])
+    )  # fmt: skip
+    return section
+
+
+_HEADER = ("method", "rtol", "steps", "true error", "bound", "bound/error", "sharp/error",
+           "least ratio", "above at every time")  # fmt: skip
+
+
+def _closeness() -> list[tuple[str, ...]]:
+    law = single()
+    times = np.linspace(0.0, _END, _TIMES)
+    exact = np.array([law.exact(t)[0] for t in times])
+    problem, constants = law.model.problem, law.model.constants
+    rows = []
+    for name, method, tolerances in _RUNS:
+        for rtol in tolerances:
+            sol = dvax.solve(
+                problem, law.start, 0.0, _END, ts=times, rtol=rtol, atol=1e-3 * rtol, method=method
+            )
+            bound = dvax.bound_error(problem, sol, constants)
+            assert bound.x_sharp is not None
+            error = np.abs(np.asarray(sol.xs) - exact)
+            above, sharp = np.asarray(bound.x), np.asarray(bound.x_sharp)
+            told = error > _ROUNDING
+            least = np.min(np.minimum(above, sharp)[told] / error[told])
+            rows.append(
+                (
+                    name,
+                    f"{rtol:.0e}",
+                    str(int(sol.stats["steps"])),
+                    f"{error[-1]:.1e}",
+                    f"{above[-1]:.1e}",
+                    f"{above[-1] / error[-1]:.3g}",
+                    f"{sharp[-1] / error[-1]:.3g}",
+                    f"{least:.3g}",
+                    "yes" if least >= 1.0 else "NO",
+                )
+            )
+    return rows

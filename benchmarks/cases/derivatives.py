@@ -1,0 +1,97 @@
+"""What a derivative costs over the plain solve, by reverse and by forward mode."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import dvax
+
+from ..clock import in_turn, timed
+from ..contact_law import ContactLaw, strip
+from ..section import Section, compare
+
+_END = 2.0
+_LETTERS = ("alpha", "b_x", "b_u", "d_x", "d_u", "ell")
+_DIFFERENCE = 1e-5
+_MOST_STEPS = 2**12
+
+
+def run(full: bool) -> Section:
+    section = Section(
+        title="derivatives: of the sum of x(2) with respect to six parameters",
+        fair=(
+            "All under jax.jit. The other side is the plain solve of the same problem with the same "
+            "steps. Reverse is jax.grad of all six parameters at once; forward is jax.jvp in one "
+            "direction (ℓ). The first error is that of the derivative with respect to ℓ, relative, "
+            "against central differences of the closed form (their own error is about 1e-10); it is "
+            "the error of the steps, not of the differentiation. The second is that of x(2)."
+        ),
+    )
+    rounds = 25 if full else 11
+    for points, settings in (
+        (2, {"dt": _END / 1000}),
+        (2, {"rtol": 1e-6, "atol": 1e-9}),
+        (10**5, {"dt": _END / 100}),
+    ):
+        _measure(section, strip(points), settings, rounds)
+    return section
+
+
+def _measure(
+    section: Section, law: ContactLaw, settings: dict[str, float], rounds: int
+) -> None:
+    parameters = {name: jnp.asarray(getattr(law, name)) for name in _LETTERS}
+    along = {name: jnp.asarray(1.0 if name == "ell" else 0.0) for name in _LETTERS}
+    problem, start = _problem(law), jnp.asarray(law.start)
+
+    def end(p: dict[str, Any], adjoint: str) -> Any:
+        return dvax.solve(
+            problem, start, 0.0, _END, p, adjoint=adjoint, max_steps=_MOST_STEPS, **settings
+        ).xs[-1]
+
+    plain = jax.jit(lambda p: end(p, "reverse"))
+    reverse = jax.jit(jax.grad(lambda p: jnp.sum(end(p, "reverse"))))
+    forward = jax.jit(lambda p: jax.jvp(lambda q: jnp.sum(end(q, "forward")), (p,), (along,))[1])
+
+    exact = _sum_by_ell(law)
+    errors = {
+        "reverse": abs(float(reverse(parameters)["ell"]) / exact - 1.0),
+        "forward": abs(float(forward(parameters)) / exact - 1.0),
+    }
+    of_x = law.error(plain(parameters), _END)
+
+    def blocked(run: Callable[[Any], Any]) -> Callable[[], Any]:
+        return lambda: jax.block_until_ready(run(parameters))
+
+    sides = {"plain": plain, "reverse": reverse, "forward": forward}
+    taken = in_turn({name: timed(blocked(run)) for name, run in sides.items()}, rounds)
+    fixed = "dt" in settings
+    steps = f"{round(_END / settings['dt'])} steps" if fixed else f"rtol {settings['rtol']:g}"
+    for name in ("reverse", "forward"):
+        section.comparisons.append(
+            compare(f"n = {law.g.size}, {steps}, {name}", "plain solve", taken[name],
+                    taken["plain"], error=errors[name], error_other=of_x)
+        )  # fmt: skip
+
+
+def _problem(law: ContactLaw) -> dvax.Problem:
+    g = jnp.asarray(law.g)
+    return dvax.Problem(
+        A=lambda p: dvax.generators.Scalar(-p["alpha"]),
+        P=dvax.operators.Scaling(law.beta),
+        K=dvax.sets.Box(0.0, law.kappa0),
+        f=lambda t, x, u, p: p["ell"] - p["d_x"] * x - p["d_u"] * u,
+        h=lambda t, x, u, p: g - p["b_x"] * x - p["b_u"] * u,
+    )
+
+
+def _sum_by_ell(law: ContactLaw) -> float:
+    """∂/∂ℓ Σ x(2), by central differences of the closed form."""
+    from dataclasses import replace
+
+    up = replace(law, ell=law.ell + _DIFFERENCE).exact(_END)
+    down = replace(law, ell=law.ell - _DIFFERENCE).exact(_END)
+    return float(np.sum(up - down)) / (2 * _DIFFERENCE)
