@@ -18,6 +18,10 @@ from .layout import as_text, verdicts
 from .section import Section, Target
 
 _RESULTS = Path(__file__).with_name("results")
+_READING = (
+    "Times are medians of samples taken in turn, after compilation; ratios are formed round by\n"
+    "round. benchmarks/README.md says how to read the tables."
+)
 
 
 def main() -> None:
@@ -26,7 +30,9 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     facts = machine.facts() | {"load before": machine.load()}
     print("\n".join(f"{name}: {value}" for name, value in facts.items()))
-    print("Times are medians of samples taken in turn, after compilation; ratios are formed round by")
+    print(
+        "Times are medians of samples taken in turn, after compilation; ratios are formed round by"
+    )
     print("round. benchmarks/README.md says how to read the tables.", flush=True)
     begun = time.perf_counter()
     sections: list[Section] = []

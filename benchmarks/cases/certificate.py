@@ -28,8 +28,8 @@ def run(full: bool) -> Section:
         fair=(
             f"Cost: dvax.solve as called, {_POINTS:.0e} points, {_STEPS} fixed steps, with "
             "measure=True beside measure=False, which does not sample the defect and certifies "
-            "nothing. Closeness: bound / true error of C1 at t = 2, adaptive steps, "
-            f"{_TIMES} saved times, the true error from the closed form; 'sharp' uses the one-sided "
+            f"nothing. Closeness: bound / true error of C1 at t = 2, adaptive steps, {_TIMES} "
+            "saved times, the true error from the closed form; 'sharp' uses the one-sided "
             "constant. Errors there are of ETD1 and ETD2RK at the rtol named, atol = rtol/1000."
         ),
         tables=[Table("bound / true error on C1", _HEADER, _closeness())],

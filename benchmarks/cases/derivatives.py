@@ -1,6 +1,7 @@
 """What a derivative costs over the plain solve, by reverse and by forward mode."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -23,11 +24,12 @@ def run(full: bool) -> Section:
     section = Section(
         title="derivatives: of the sum of x(2) with respect to six parameters",
         fair=(
-            "All under jax.jit. The other side is the plain solve of the same problem with the same "
-            "steps. Reverse is jax.grad of all six parameters at once; forward is jax.jvp in one "
-            "direction (ℓ). The first error is that of the derivative with respect to ℓ, relative, "
-            "against central differences of the closed form (their own error is about 1e-10); it is "
-            "the error of the steps, not of the differentiation. The second is that of x(2)."
+            "All under jax.jit. The other side is the plain solve of the same problem with the "
+            "same steps. Reverse is jax.grad of all six parameters at once; forward is jax.jvp in "
+            "one direction (ℓ). The first error is that of the derivative with respect to ℓ, "
+            "relative, against central differences of the closed form (their own error is about "
+            "1e-10); it is the error of the steps, not of the differentiation. The second is that "
+            "of x(2)."
         ),
     )
     rounds = 25 if full else 11
@@ -40,9 +42,7 @@ def run(full: bool) -> Section:
     return section
 
 
-def _measure(
-    section: Section, law: ContactLaw, settings: dict[str, float], rounds: int
-) -> None:
+def _measure(section: Section, law: ContactLaw, settings: dict[str, Any], rounds: int) -> None:
     parameters = {name: jnp.asarray(getattr(law, name)) for name in _LETTERS}
     along = {name: jnp.asarray(1.0 if name == "ell" else 0.0) for name in _LETTERS}
     problem, start = _problem(law), jnp.asarray(law.start)
@@ -90,8 +90,6 @@ def _problem(law: ContactLaw) -> dvax.Problem:
 
 def _sum_by_ell(law: ContactLaw) -> float:
     """∂/∂ℓ Σ x(2), by central differences of the closed form."""
-    from dataclasses import replace
-
     up = replace(law, ell=law.ell + _DIFFERENCE).exact(_END)
     down = replace(law, ell=law.ell - _DIFFERENCE).exact(_END)
     return float(np.sum(up - down)) / (2 * _DIFFERENCE)

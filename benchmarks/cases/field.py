@@ -29,9 +29,7 @@ def run(full: bool) -> Section:
     def sides(count: int) -> dict[str, functools.partial]:
         known = compiled.known(law, count * _STEP, _STEP)
         return {
-            _CALLED: functools.partial(
-                compiled.called, law.model, start, count * _STEP, dt=_STEP
-            ),
+            _CALLED: functools.partial(compiled.called, law.model, start, count * _STEP, dt=_STEP),
             _CONSTANTS: functools.partial(known, g, start),
             _HAND: functools.partial(by_hand[0], start, count),
             _HAND_CONSTANTS: functools.partial(by_hand[1], start, count),
@@ -51,11 +49,11 @@ def run(full: bool) -> Section:
     section = Section(
         title=f"field: {_POINTS:.0e} contact points, {steps} fixed steps of ETD2RK",
         fair=(
-            "The other side is one lax.fori_loop with the same ETD2RK arithmetic and the clip in its "
-            "body: no saving, no statistics, no look for NaN. 'arguments': the parameters and the "
-            "φ-factors are run-time arguments of the compiled loop, as they are in dvax.solve as "
-            "called. 'constants': the compiler knows them and may fold them, on the dvax side too "
-            "where that row says so. All read the demand g, a number a point, from memory. "
+            "The other side is one lax.fori_loop with the same ETD2RK arithmetic and the clip in "
+            "its body: no saving, no statistics, no look for NaN. 'arguments': the parameters and "
+            "the φ-factors are run-time arguments of the compiled loop, as they are in dvax.solve "
+            "as called. 'constants': the compiler knows them and may fold them, on the dvax side "
+            "too where that row says so. All read the demand g, a number a point, from memory. "
             "dvax.solve as called returns a whole Solution; under jax.jit the unused parts of it "
             "are not computed. Errors: against the closed form at the last time."
         ),
@@ -84,9 +82,9 @@ def run(full: bool) -> Section:
         rest = spread([seconds - _FEW * each for seconds in taken[f"{name} {_FEW}"]]).middle
         section.notes.append(f"Start-up of {name}: {duration(max(rest, 0.0))} a run.")
     section.notes.append(
-        f"Start-up is what {_FEW} steps take beyond {_FEW} times the cost of a step; in a call it is "
-        "the checks, the response and its certificate at the saved time, and the copies that the "
-        "Solution holds. 'per point and step' is without it."
+        f"Start-up is what {_FEW} steps take beyond {_FEW} times the cost of a step; in a call it "
+        "is the checks, the response and its certificate at the saved time, and the copies that "
+        "the Solution holds. 'per point and step' is without it."
     )
     section.notes.append(f"JAX runs on {jax.devices()[0].device_kind}.")
     return section

@@ -30,9 +30,7 @@ def run(full: bool) -> Section:
         for _ in range(rounds):
             idle.append(start([sys.executable, "-c", "pass"], folder).seconds)
             helped.append(dvax(["--help"], folder).seconds)
-        section.comparisons.append(
-            _row("dvax --help", helped, _HELP_SECONDS, spread(idle).middle)
-        )
+        section.comparisons.append(_row("dvax --help", helped, _HELP_SECONDS, spread(idle).middle))
         out = folder / "demo"
         shown = _repeat(
             lambda: dvax(["demo", "-o", str(out), "--force", "--quiet"], folder).seconds,
