@@ -121,6 +121,8 @@ def as_float(a: Tree, name: str) -> Tree:
             raise _not_real(name, f"an array of {leaf.dtype}")
         return jnp.asarray(leaf)
 
+    if not jtu.tree_leaves(a):
+        raise _not_real(name, repr(a))
     return jtu.tree_map(one, a, is_leaf=lambda leaf: isinstance(leaf, list))
 
 

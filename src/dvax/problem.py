@@ -19,6 +19,10 @@ from .signals import listen
 from .spaces import AbstractSpace
 from .vi import AbstractSolver, Answer, Auto, Frozen, default_space
 
+KNOT_ULPS, END_ULPS = 4, 128
+"""Knots nearer than this to each other, or to the ends of a run, in roundings of t, are one: records
+round the same moment differently, and Diffrax rounds a step to the end within 100 of them."""
+
 
 class Problem(eqx.Module):
     """A coupled nonsmooth dynamical system (paper, Problem 1).
@@ -210,12 +214,18 @@ class Problem(eqx.Module):
         _check_spans(heard.spans, t0, t1)
         if not heard.knots:
             return np.zeros(0)
-        if _tree.is_concrete(heard.knots, t0, t1):
-            every = np.unique(np.concatenate([np.asarray(k, float) for k in heard.knots]))
-            return every[(every > float(t0)) & (every < float(t1))]
-        every = jnp.sort(jnp.concatenate([jnp.asarray(k) for k in heard.knots]))
-        # Traced knots cannot be dropped, so those outside become the end, where a step ends anyway.
-        return jnp.sort(jnp.where((every > t0) & (every < t1), every, t1))
+        concrete = _tree.is_concrete(heard.knots, t0, t1)
+        lib = np if concrete else jnp
+        arrays = [lib.asarray(knots, dtype=float) for knots in heard.knots]
+        every = lib.sort(lib.concatenate(arrays))
+        ulp = jnp.finfo(every.dtype).eps
+        margin = END_ULPS * ulp * lib.maximum(lib.abs(t0), lib.abs(t1))
+        apart = lib.diff(every, prepend=every[:1] - 1.0) > KNOT_ULPS * ulp * lib.abs(every)
+        kept = apart & (every > t0 + margin) & (every < t1 - margin)
+        if concrete:
+            return every[kept]
+        # Traced knots cannot be dropped, so the others become the end, where a step ends anyway.
+        return jnp.sort(jnp.where(kept, every, t1))
 
     def zero_control(self, x: Tree) -> Tree:
         """The zero of the control space, in the floating type of x."""

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
-from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..problem import Problem
 from .method import AbstractMethod
@@ -30,13 +29,14 @@ def check(problem, x0, t0, t1, ts, dt, rtol, atol, dt0, horizon, method, adjoint
     rule(isinstance(method, AbstractMethod), "method", method,
          "it must be a method such as dvax.ETD2RK()", "Leave it out for the default")  # fmt: skip
     rule(adjoint in ("reverse", "forward"), "adjoint", repr(adjoint),
-         "it must be 'reverse' or 'forward'", "'reverse' serves jax.grad, 'forward' jax.jvp")  # fmt: skip
+         "it must be 'reverse' or 'forward'",
+         "'reverse' serves jax.grad, 'forward' jax.jvp")  # fmt: skip
     if _tree.is_concrete(x0):
-        for leaf in jax.tree_util.tree_leaves(x0):
-            bad = np.argwhere(~np.isfinite(np.asarray(leaf)))
-            rule(bad.size == 0 and bad.shape[0] == 0, "x0",
-                 f"{np.asarray(leaf)[tuple(bad[0])]} at index {tuple(map(int, bad[0]))}" if len(bad) else "",
-                 "every entry must be finite", "Mend the initial state there")  # fmt: skip
+        for leaf in map(np.asarray, jax.tree_util.tree_leaves(x0)):
+            if not np.isfinite(leaf).all():
+                place = tuple(int(i) for i in np.argwhere(~np.isfinite(leaf))[0])
+                rule(False, "x0", f"{leaf[place]} at index {place}",
+                     "every entry must be finite", "Mend the initial state there")  # fmt: skip
     if _tree.is_concrete(t0, t1):
         rule(bool(math.isfinite(t0) and math.isfinite(t1) and t0 < t1), "t0, t1", f"{t0}, {t1}",
              "t0 < t1, both finite: a semigroup runs forward only", "Swap or mend them")  # fmt: skip
@@ -87,5 +87,5 @@ def bound_steps(max_steps: int | None, fixed: bool, t0, t1, dt) -> int:
             )
         )
     count = math.ceil((float(t1) - float(t0)) / float(dt)) + 1
-    # The next power of two: runs of similar length share one compilation.
-    return 2 ** max(4, math.ceil(math.log2(count + 1)))
+    # A power of two, and not a small one: runs of different length share one compilation.
+    return 2 ** max(12, math.ceil(math.log2(count + 1)))

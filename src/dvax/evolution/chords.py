@@ -205,7 +205,7 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
     if name in ("gather", "dynamic_slice"):
         return [_take(given, bind)]
     if name in _COMPARE:
-        return [_compare(*map(_lift, given), bind)]
+        return [_compare(_lift(given[0]), _lift(given[1]), bind)]
     if not all(jnp.issubdtype(atom.aval.dtype, jnp.floating) for atom in eqn.invars):
         return [_discrete(given, bind)]
     x = [_lift(value) for value in given]
@@ -234,7 +234,9 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
         return [Chord(*(bind(*(v[i] for v in x)) for i in range(3)))]
     if name == "dot_general" and not all(map(is_chord, given)):
         # A fixed matrix: deviations pass through its absolute values.
-        sides = [v if is_chord(g) else Chord(g, g, jnp.abs(g)) for v, g in zip(x, given, strict=True)]
+        sides = [
+            v if is_chord(g) else Chord(g, g, jnp.abs(g)) for v, g in zip(x, given, strict=True)
+        ]
         return [Chord(*(bind(sides[0][i], sides[1][i]) for i in range(3)))]
     raise NoEnclosure(name)
 
@@ -280,9 +282,7 @@ def _select(given: list[Any], bind: Callable) -> Chord:
     b = bind(which.b, *(case.b for case in cases))
     settled = bind(which.a, *(case.dev for case in cases))
     # Where the choice may change on the way, the value is one of the cases at every moment.
-    apart = [
-        jnp.maximum(jnp.abs(case.a - a), jnp.abs(case.b - b)) + case.dev for case in cases
-    ]
+    apart = [jnp.maximum(jnp.abs(case.a - a), jnp.abs(case.b - b)) + case.dev for case in cases]
     worst = apart[0]
     for more in apart[1:]:
         worst = jnp.maximum(worst, more)

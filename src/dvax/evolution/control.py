@@ -51,7 +51,9 @@ class Adaptive(diffrax.AbstractStepSizeController):
         self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
     ):
         state = controller_state
+        t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
         h = t1 - t0
+        assert y_error is not None  # the stepper always measures where steps adapt
         error = self.horizon * self._scaled(y_error.x, y0.x, y1_candidate.x)
         impulse = error * h / self.horizon
         relaxed = state.rejected & (impulse <= 0.1 * state.spare)
@@ -64,7 +66,9 @@ class Adaptive(diffrax.AbstractStepSizeController):
         wanted = jnp.where(steady, h, h * factor)
         # A step cut short by a knot says little about the length that was planned.
         cut = keep & (h < 0.99 * state.length)
-        wanted = jnp.where(cut, jnp.maximum(wanted, jnp.minimum(state.length, 3.0 * wanted)), wanted)
+        wanted = jnp.where(
+            cut, jnp.maximum(wanted, jnp.minimum(state.length, 3.0 * wanted)), wanted
+        )
 
         on_knot = keep & (t1 == self._stop(state.knot))
         knot = jnp.where(on_knot, state.knot + 1, state.knot)
@@ -74,7 +78,9 @@ class Adaptive(diffrax.AbstractStepSizeController):
         floor = 8 * jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
         stuck = ~keep & (h <= floor)
         blocked = diffrax.RESULTS.where(
-            jnp.isfinite(error), diffrax.RESULTS.dt_min_reached, diffrax.RESULTS.nonfinite
+            jnp.isfinite(error),
+            diffrax.RESULTS.dt_min_reached,
+            diffrax.RESULTS.nonfinite,  # pyright: ignore[reportArgumentType]
         )
         result = diffrax.RESULTS.where(stuck, blocked, diffrax.RESULTS.successful)
         new = self.State(wanted, knot, ~keep, spare)
@@ -150,5 +156,7 @@ def root_mean_squares(space: AbstractSpace) -> Callable[[Tree], list[Any]]:
     """The root mean square of each part of a state: its norm divided by that of the constant 1."""
     if isinstance(space, Product):
         spaces = space.spaces
-        return lambda tree: [s.norm(p) / jnp.sqrt(s.size()) for s, p in zip(spaces, tree, strict=True)]
+        return lambda tree: [
+            s.norm(p) / jnp.sqrt(s.size()) for s, p in zip(spaces, tree, strict=True)
+        ]
     return lambda tree: [space.norm(tree) / jnp.sqrt(space.size())]

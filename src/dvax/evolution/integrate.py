@@ -66,7 +66,7 @@ def integrate(
         sizes = root_mean_squares(state)
         controller = Adaptive(s["rtol"], s["atol"], sizes, s["horizon"], knots, t1)
         first = s["dt0"]
-    stepper = Stepper(method, flow, measure, careful, uniform)
+    stepper = Stepper(method, flow, measure, careful, (t0, t1), uniform)
 
     zero = jnp.zeros((), dtype)
     record = _blank_record(x0, method, dtype) if dense else None
@@ -91,7 +91,7 @@ def integrate(
         throw=False,
         progress_meter=diffrax.TextProgressMeter() if progress else diffrax.NoProgressMeter(),
     )
-    assert out.ts is not None and out.ys is not None
+    assert out.ts is not None and out.ys is not None and out.controller_state is not None
     times = out.ts[0]
     xs, defect, law_defect = out.ys[0]
     us, ys, residual, law_error = _responses(flow, times, xs, control, moduli)
@@ -103,7 +103,7 @@ def integrate(
         "t": out.ts[1][0],
         "x": jtu.tree_map(lambda leaf: leaf[0], out.ys[1][0]),
         "defect": out.ys[1][1][0],
-        "next_dt": out.controller_state.length if not fixed else s["dt"],
+        "next_dt": s["dt"] if fixed else out.controller_state.length,
         "setting": setting,
         "enclosed": flow.enclosed,
         "x0": x0,

@@ -21,7 +21,9 @@ class RESULTS(eqx.Enumeration):
     """How a solve ended, in a sentence."""
 
     successful = "The end time was reached."
-    max_steps = "The largest number of steps was reached before t1. Raise max_steps, or loosen rtol."
+    max_steps = (
+        "The largest number of steps was reached before t1. Raise max_steps, or loosen rtol."
+    )
     step_too_small = (
         "The step became too small to move t while the defect stayed above the tolerance. The data "
         "is discontinuous at that time (name it: dvax.signals knots), or rtol is below rounding."

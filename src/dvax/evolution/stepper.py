@@ -14,6 +14,7 @@ from jax import lax
 from .. import _tree
 from .._tree import Tree
 from ..generators import AbstractGenerator, AbstractPropagator
+from ..problem import END_ULPS, KNOT_ULPS
 from .chords import ROOT_MEAN_SQUARE, Chord, is_chord
 from .flow import Flow, Rate
 from .method import AbstractMethod, polynomial, shortened
@@ -95,9 +96,7 @@ class Interpolation(diffrax.AbstractPath):
 
     def evaluate(self, t0, t1=None, left=True):
         theta = (t0 - self.t0) / (self.t1 - self.t0)
-        x = inside(
-            self.generator, self.t1 - self.t0, theta, self.before.x, self.coefficients
-        )
+        x = inside(self.generator, self.t1 - self.t0, theta, self.before.x, self.coefficients)
         # At the end of the step the end itself: evaluating there would differ by rounding.
         x = _tree.where(theta >= 1.0, self.after.x, x)
         started = theta > 0.0
@@ -122,6 +121,7 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
 
     - `measure`: sample the defect inside every step, which adaptive steps and certificates need;
     - `careful`: on failure keep the last good state, at the price of a second pass over memory;
+    - `ends`: first and last time of the run;
     - `uniform`: the propagator, where all steps have one length that is known beforehand.
     """
 
@@ -129,12 +129,13 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
     flow: Flow
     measure: bool = eqx.field(static=True)
     careful: bool = eqx.field(static=True)
+    ends: tuple[Any, Any]
     uniform: AbstractPropagator | None = None
 
     term_structure: ClassVar = MildTerm
 
     @property
-    def interpolation_cls(self) -> Callable[..., Interpolation]:  # pyright: ignore
+    def interpolation_cls(self) -> Callable[..., Interpolation]:  # pyright: ignore[reportIncompatibleVariableOverride]
         return functools.partial(Interpolation, generator=self.flow.generator)
 
     def order(self, terms):
@@ -148,9 +149,11 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         return y0
 
     def init(self, terms, t0, t1, y0, args) -> Memory:
+        t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
         h = t1 - t0
         guess = None if self.flow.direct else self.flow.problem.zero_control(y0.x)
-        rate = self._kept(self.flow.rate(t0, y0.x, guess)) if self.measure else None
+        start = self._within(t0, t1, 0.0)
+        rate = self._kept(self.flow.rate(start, y0.x, guess)) if self.measure else None
         half = self._half(h)
         sparse = not (self.measure or self.careful) and _size(y0.x) > _SMALL
         count = jnp.asarray(0) if sparse else None
@@ -159,15 +162,17 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         return Memory(rate, guess, h, self._propagator(h), half, count)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
         memory, h, x0 = solver_state, t1 - t0, y0.x
         if self.uniform is None:
             memory = self._fit(memory, t0, t1, h)
         full = memory.full if self.uniform is None else self.uniform
-        first = self._first(t0, x0, memory, made_jump)
+        assert full is not None
+        first = self._first(self._within(t0, t1, 0.0), x0, memory, made_jump)
         stages = [first]
 
         def evaluate(theta: float, x: Tree) -> Tree:
-            stages.append(self.flow.rate(_within(t0, t1, theta), x, stages[-1].y))
+            stages.append(self.flow.rate(self._within(t0, t1, theta), x, stages[-1].y))
             return stages[-1].value
 
         def to_end(c: tuple[Tree, ...]) -> Tree:
@@ -186,10 +191,10 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
             finite = self._finite(x1, memory.count)
 
         solved = jnp.all(jnp.stack([stage.solved for stage in stages]))
-        result = diffrax.RESULTS.where(
-            solved, diffrax.RESULTS.successful, diffrax.RESULTS.nonlinear_max_steps_reached
-        )
-        result = diffrax.RESULTS.where(finite, result, diffrax.RESULTS.nonfinite)
+        unsolved: Any = diffrax.RESULTS.nonlinear_max_steps_reached
+        nonfinite: Any = diffrax.RESULTS.nonfinite
+        result = diffrax.RESULTS.where(solved, diffrax.RESULTS.successful, unsolved)
+        result = diffrax.RESULTS.where(finite, result, nonfinite)
         if self.careful:
             x1 = _tree.where(finite & solved, x1, x0)
         record = None if y0.record is None else Record(t0, h, x0, c)
@@ -205,13 +210,13 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         info = {"before": y0, "after": y1, "coefficients": c}
         return y1, estimate, info, memory, result
 
-    def _first(self, t0: Any, x0: Tree, memory: Memory, made_jump: Any) -> Rate:
+    def _first(self, start: Any, x0: Tree, memory: Memory, made_jump: Any) -> Rate:
         if memory.rate is None:
-            return self.flow.rate(t0, x0, memory.guess)
+            return self.flow.rate(start, x0, memory.guess)
         kept = memory.rate
         # The last sample of the previous step was taken here, unless data jumps here.
         return lax.cond(
-            made_jump, lambda: self._kept(self.flow.rate(t0, x0, memory.guess)), lambda: kept
+            made_jump, lambda: self._kept(self.flow.rate(start, x0, memory.guess)), lambda: kept
         )
 
     def _finite(self, x: Tree, count: Any) -> jax.Array:
@@ -223,6 +228,20 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         if count is None:
             return _tree.all_finite(x)
         return lax.cond(count % 64 == 63, _tree.all_finite, lambda _: jnp.asarray(True), x)
+
+    def _within(self, t0: Any, t1: Any, theta: float) -> Any:
+        """t₀ + θh, with the ends approached from inside: data may jump there.
+
+        A few roundings inside, since two records may round the same moment differently; at the ends
+        of the run as many as `Problem.knots` leaves out.
+        """
+        if 0.0 < theta < 1.0:
+            return t0 + theta * (t1 - t0)
+        begin, end = self.ends
+        at_end = (t0 == begin) if theta == 0.0 else (t1 == end)
+        ulps = jnp.where(at_end, END_ULPS, KNOT_ULPS)
+        inset = lax.stop_gradient(jnp.minimum(ulps * _ulp(t0, t1), 0.25 * (t1 - t0)))
+        return t0 + inset if theta == 0.0 else t1 - inset
 
     def _propagator(self, h: Any) -> AbstractPropagator:
         return self.flow.generator.propagator(h, self.method.degree + 1)
@@ -240,8 +259,7 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
 
         t₀ + h is rounded, so equal steps differ by an ulp of t: that is not a new length.
         """
-        ulp = jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-        same = jnp.abs(h - memory.length) <= 2 * ulp
+        same = jnp.abs(h - memory.length) <= 2 * _ulp(t0, t1)
         length, full, half = lax.cond(
             same,
             lambda: (memory.length, memory.full, memory.half),
@@ -252,7 +270,7 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
     def _measure(
         self, t0: Any, t1: Any, x0: Tree, x1: Tree, first: Rate, c: Any, memory: Memory
     ) -> Sample:
-        last = self.flow.rate(_within(t0, t1, 1.0), x1, first.y)
+        last = self.flow.rate(self._within(t0, t1, 1.0), x1, first.y)
         if self.flow.enclosed:
             return self._enclosed(t0, t1, x0, x1, c, last)
         return self._sampled(t0, t1, x0, x1, first, c, memory, last)
@@ -263,7 +281,7 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         h, space = t1 - t0, self.flow.state_space(x0)
         bend = self.flow.generator.bend(h, x0, x1, c, space)
         x = jtu.tree_map(Chord, x0, x1, bend)
-        t = Chord(t0, _within(t0, t1, 1.0), jnp.zeros_like(t0))
+        t = Chord(self._within(t0, t1, 0.0), self._within(t0, t1, 1.0), jnp.zeros_like(t0))
         along = self.flow.enclosure(t, x)
         end = polynomial(c, 1.0)
         at_end = jtu.tree_map(lambda q, p: 0.5 * jnp.abs(q.b - p), along, end, is_leaf=is_chord)
@@ -291,7 +309,7 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         flow = self.flow
         assert memory.half is not None
         xm = memory.half.step(x0, shortened(c, 0.5))
-        tm, te = _within(t0, t1, 0.5), _within(t0, t1, 1.0)
+        tm, te = self._within(t0, t1, 0.5), self._within(t0, t1, 1.0)
         middle = flow.rate(tm, xm, first.y)
         at_end = _tree.sub(last.value, polynomial(c, 1.0))
         line = _tree.scale(0.5, at_end)
@@ -312,12 +330,8 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         return Sample(last, error, defect, law_defect)
 
 
-def _within(t0: Any, t1: Any, theta: float) -> Any:
-    """t₀ + θh, where the end of the step is approached from inside: data may jump at t₁."""
-    if theta < 1.0:
-        return t0 + theta * (t1 - t0)
-    end = lax.stop_gradient(t1)
-    return t1 + (jnp.nextafter(end, -jnp.inf) - end)
+def _ulp(t0: Any, t1: Any) -> Any:
+    return jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
 
 
 def _size(x: Tree) -> int:

@@ -65,8 +65,9 @@ class Dense(AbstractGenerator):
 
     def bend(self, h: Any, x0: Tree, x1: Tree, c: tuple[Tree, ...], space: AbstractSpace) -> Tree:
         # x'' = e^{A(t−t₀)} x''(t₀), and one entry is at most the norm over the root of its weight.
-        slope = c[1] / h if len(c) > 1 else jnp.zeros_like(c[0])
-        curvature = self.matrix @ (self.matrix @ x0 + c[0]) + slope
+        first, *rest = c
+        slope = rest[0] / h if rest else jnp.zeros_like(first)
+        curvature = self.matrix @ (self.matrix @ x0 + first) + slope
         M, omega = self.growth(space)
         largest = M * jnp.exp(jnp.maximum(omega, 0.0) * h) * space.norm(curvature)
         return jnp.broadcast_to(h**2 / 8 * largest / jnp.sqrt(space.weights()), x0.shape)

@@ -16,7 +16,7 @@ def compile_seconds() -> float:
     return _spent
 
 
-def _add(event: str, duration: float, **_: object) -> None:
+def _add(event: str, duration_secs: float, **_: str | int) -> None:
     global _spent
     if event.startswith(_EVENTS):
-        _spent += duration
+        _spent += duration_secs

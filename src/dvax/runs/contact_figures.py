@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from dvax.runs.config import Config
+from dvax.runs.contact_frames import norm_unit
 from dvax.runs.contact_inputs import ContactInputs
+from dvax.runs.settings import Config
 from dvax.theory import Constants
 
 
@@ -15,6 +16,7 @@ class Figures:
 
     def __init__(self, inputs: ContactInputs, config: Config, constants: Constants):
         self._boundary, self._units, self._constants = inputs.boundary, config.units, constants
+        self._config = config
         self._weights = inputs.boundary.weights
         self._measure = float(self._weights.sum())
         self._end = config.time.end
@@ -29,8 +31,8 @@ class Figures:
         """Take a block of frames into account."""
         pressure, regime, weights = values["pressure"], values["regime"], self._weights
         force = pressure @ weights
-        self._peak = max(self._peak, _largest(times, pressure))
-        self._deepest = max(self._deepest, _largest(times, values["indentation"]))
+        self._peak = _larger(self._peak, _largest(times, pressure))
+        self._deepest = _larger(self._deepest, _largest(times, values["indentation"]))
         strongest = int(np.argmax(force))
         self._force = max(self._force, (float(force[strongest]), float(times[strongest])))
         fractions = [((regime == k) @ weights / self._measure) for k in (0, 2)]
@@ -60,7 +62,7 @@ class Figures:
         u, last, c = self._units, self._last, self._constants
         width = len(self._boundary.coordinates)
         force = f"{u.pressure} {u.length}" + ("^2" if width == 2 else "")
-        norm = f"{u.indentation} {u.length}" + ("^(1/2)" if width == 1 else "")
+        norm = norm_unit(self._config, width)
         rows: list[tuple[str, Any, str, str]] = [
             ("end_time", last["time"], u.time, "time of the last saved frame"),
             ("peak_pressure", self._peak[0], u.pressure, "largest pressure anywhere"),
@@ -100,5 +102,15 @@ class Figures:
 
 
 def _largest(times: np.ndarray, field: np.ndarray) -> tuple[float, float, int]:
-    frame, point = np.unravel_index(int(np.argmax(field)), field.shape)
+    # The first that reaches the largest value up to rounding: a plateau begins where it begins.
+    top = float(field.max())
+    reached = np.argmax(field >= top - 1e-12 * abs(top))
+    frame, point = np.unravel_index(int(reached), field.shape)
     return float(field[frame, point]), float(times[frame]), int(point)
+
+
+def _larger(
+    old: tuple[float, float, int], new: tuple[float, float, int]
+) -> tuple[float, float, int]:
+    """The one with the larger value; the earlier where rounding alone tells them apart."""
+    return new if new[0] > old[0] + 1e-12 * abs(old[0]) or old[0] == -np.inf else old

@@ -10,8 +10,8 @@ import numpy as np
 
 from dvax.evolution import Solution
 from dvax.models import Contact
-from dvax.runs.config import Config
 from dvax.runs.contact_inputs import ContactInputs
+from dvax.runs.settings import Config
 from dvax.spaces import AbstractSpace
 from dvax.theory import Bound, Constants, Row
 
@@ -31,11 +31,17 @@ def coordinates(inputs: ContactInputs, config: Config) -> dict[str, Any]:
     return out
 
 
-def variables(config: Config, status: str) -> dict[str, Any]:
+def norm_unit(config: Config, dimensions: int) -> str:
+    """The unit of an L2 norm of an indentation over a curve or a surface."""
+    length = config.units.length
+    return f"{config.units.indentation} {length}" + ("^(1/2)" if dimensions == 1 else "")
+
+
+def variables(config: Config, dimensions: int, status: str) -> dict[str, Any]:
     """Name -> (dimensions, type, attributes) of everything that is saved."""
     u = config.units
     x, p, t = u.indentation, u.pressure, u.time
-    norm = f"{x} {u.length}^(d/2)"
+    norm = norm_unit(config, dimensions)
     rate = f"{x}/{t}"
     bound = {"status": status}
     rows = {
@@ -140,7 +146,9 @@ def _values(
 ) -> dict[str, Any]:
     c = model.constants
     sharp = -c.sharp_decay_rate
-    certified = c.M * jnp.exp(c.growth_rate * main.ts) * apart
+    # Two computed states of this size cannot be told apart any nearer than this.
+    rounding = 64 * jnp.finfo(main.xs.dtype).eps * _norms(space, main.xs, 0 * main.xs)
+    certified = c.M * jnp.exp(c.growth_rate * main.ts) * apart + rounding
     return {
         **_of_frames(model, space, main.ts, main.xs),
         "indentation": main.xs,
@@ -149,5 +157,5 @@ def _values(
         "separation_u": _norms(space, main.us, other.us),
         "separation_bound_x": certified,
         "separation_bound_u": c.L * certified,
-        "separation_sharp_x": jnp.exp(sharp * main.ts) * apart,
+        "separation_sharp_x": jnp.exp(sharp * main.ts) * apart + rounding,
     }

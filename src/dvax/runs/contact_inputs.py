@@ -13,7 +13,7 @@ from dvax.runs.fields import Field, Sources, perturbation, read_field, space_val
 from dvax.runs.units import Units
 
 if TYPE_CHECKING:
-    from dvax.runs.config import Config
+    from dvax.runs.settings import Config
 
 _KINDS = {"demand": "indentation", "load": "indentation rate", "initial": "indentation"}
 

@@ -3,8 +3,8 @@
 import shutil
 from pathlib import Path
 
-from dvax.runs.config import Config
 from dvax.runs.contact_inputs import ContactInputs
+from dvax.runs.settings import Config
 
 NAME = "config.resolved.toml"
 DATA_FOLDER = "inputs"

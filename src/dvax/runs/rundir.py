@@ -38,7 +38,8 @@ class RunDirectory:
             for name in FILES:
                 (path / name).unlink(missing_ok=True)
             for name in FOLDERS:
-                shutil.rmtree(path / name, ignore_errors=False) if (path / name).exists() else None
+                if (path / name).exists():
+                    shutil.rmtree(path / name)
         self._log = (path / "log.jsonl").open("a", encoding="utf-8")
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
@@ -107,6 +108,12 @@ class FrameStore:
             self._array(name)[region] = values[name]
         self._array("time")[region] = times
         self.written += len(times)
+
+    def mark(self, names: tuple[str, ...], status: str) -> None:
+        """State how much is known of these variables (their attribute `status`)."""
+        for name in names:
+            if self._array(name).attrs.get("status") != status:
+                self._array(name).attrs["status"] = status
 
     def finish(self) -> None:
         """Cut off the frames that were never reached."""

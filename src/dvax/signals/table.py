@@ -66,11 +66,14 @@ class Table(AbstractSignal):
 
     def value(self, t: Any) -> jax.Array:
         times = jnp.asarray(self.times)
-        # Counting is monotone in t and branch-free: on a short table faster than a bisection, and
-        # on every table exact at the knots, where the new piece begins.
+        # Counting has no branches: on a short table it is faster than a bisection, and the place of
+        # t follows from comparisons alone, which an enclosure over a whole step can see through.
         count = times.shape[0]
-        method = "compare_all" if count <= 2**16 else "scan_unrolled"
-        i = jnp.clip(jnp.searchsorted(times, t, side="right", method=method) - 1, 0, count - 2)
+        if count <= 2**16:
+            passed = jnp.sum(times <= t)
+        else:
+            passed = jnp.searchsorted(times, t, side="right")
+        i = jnp.clip(passed - 1, 0, count - 2)
         left, right = times[i], times[i + 1]
         v0, v1 = self.values[i], self.values[i + 1]
         width = right - left

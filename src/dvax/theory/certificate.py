@@ -117,6 +117,7 @@ def bound_error(
     )
 
 
+@jax.jit
 def _gronwall(t0: Any, ts: Any, impulse: Any, rate: Any, M: Any, initial: Any) -> jax.Array:
     """M e^{ct} e₀ + M ∫ e^{c(t−s)} dI(s), from the impulse I known at the saved times only.
 
