@@ -1,0 +1,88 @@
+"""When something breaks: what, when, where, and what was computed before stays readable."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvax
+from dvax.evolution import RESULTS
+
+BREAKS = 0.7
+
+
+def system(broken):
+    """x' = −x − u of three entries, u = proj_{[0,1]}(x); from t = 0.7 on one of f, h, K is broken."""
+
+    def bad(t, name):
+        return jnp.where((t >= BREAKS) & (broken == name), jnp.nan, 0.0)
+
+    hit = jnp.array([0.0, 1.0, 0.0])
+    return dvax.Problem(
+        A=dvax.generators.Scalar(-1.0),
+        P=dvax.operators.Scaling(1.0),
+        K=lambda t, args: dvax.sets.Box(0.0, 1.0 + jnp.where(bad(t, "K") != 0, jnp.nan, 0.0)),
+        f=lambda t, x, u, args: jnp.where((hit > 0) & jnp.isnan(bad(t, "f")), jnp.nan, -u),
+        h=lambda t, x, u, args: jnp.where((hit > 0) & jnp.isnan(bad(t, "h")), jnp.nan, x),
+    )
+
+
+@pytest.mark.parametrize("dt", [None, 0.02], ids=["adaptive", "fixed"])
+@pytest.mark.parametrize("name", ["f", "h", "K"])
+def test_nan_stops_the_run_and_the_function_the_time_and_the_component_are_named(name, dt):
+    x0, ts = jnp.array([0.5, 2.0, -1.0]), np.linspace(0, 2, 21)
+    with pytest.raises(dvax.SolveError) as caught:
+        dvax.solve(system(name), x0, 0.0, 2.0, ts=ts, dt=dt, rtol=1e-5)
+    message, sol = str(caught.value), caught.value.solution
+    assert f"{name} is nan" in message or (name == "K" and "K is" in message)
+    assert f"t = {BREAKS}" in message
+    if name != "K":
+        assert "component (1,)" in message
+    # Within one step of the break, and what was saved before it is the solution.
+    reached = float(sol.stats["t"])
+    assert BREAKS - 0.03 <= reached <= BREAKS + 0.03
+    assert np.all(np.isfinite(np.asarray(sol.xs))) and float(sol.ts[-1]) <= BREAKS
+    assert len(sol.ts) == 8 if dt is None else len(sol.ts) >= 7
+    # −2x while 0 ≤ x ≤ 1, −x below 0; above 1 it is −x − 1.
+    np.testing.assert_allclose(np.asarray(sol.xs[:, 0]), 0.5 * np.exp(-2 * sol.ts), atol=1e-3)
+    np.testing.assert_allclose(np.asarray(sol.xs[:, 2]), -np.exp(-sol.ts), atol=1e-3)
+
+
+def test_without_throw_the_result_says_it():
+    sol = dvax.solve(system("f"), jnp.zeros(3), 0.0, 2.0, rtol=1e-3, throw=False)
+    assert sol.result == RESULTS.nonfinite
+    with pytest.raises(dvax.SolveError, match="NaN"):
+        sol.raise_if_failed()
+
+
+def test_too_few_steps_is_a_failure_with_a_partial_result():
+    with pytest.raises(dvax.SolveError, match="max_steps") as caught:
+        dvax.solve(system("none"), jnp.ones(3), 0.0, 50.0, ts=[0.0, 1e-6, 50.0], max_steps=16)
+    assert 0 < len(caught.value.solution.ts) < 3
+
+
+def test_a_law_that_has_no_solution_is_not_called_solved():
+    # F(y) = −y + …: not pseudomonotone, so the closed form proj(−c/a) means nothing.
+    for set_ in (dvax.sets.Box(0.0, 0.5), dvax.sets.Ball(0.0, 0.5)):
+        problem = dvax.Problem(
+            A=dvax.generators.Scalar(-1.0),
+            P=dvax.operators.Scaling(1.0),
+            K=set_,
+            f=lambda t, x, u, args: -u,
+            h=lambda t, x, u, args: 1.0 - 2.0 * x + 3.0 * u,
+        )
+        with pytest.raises(dvax.DvaxError):
+            dvax.solve(problem, jnp.zeros(2), 0.0, 1.0)
+
+
+def test_a_moving_set_that_becomes_empty_stops_the_run():
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0),
+        P=dvax.operators.Scaling(1.0),
+        K=lambda t, args: dvax.sets.Box(0.0, 0.5 - t),
+        f=lambda t, x, u, args: -u,
+        h=lambda t, x, u, args: 1.0 - u,
+    )
+    with pytest.raises(dvax.DvaxError, match=r"empty|K is") as caught:
+        dvax.solve(problem, 0.1, 0.0, 1.0, ts=[0.0, 0.25, 1.0])
+    solution = getattr(caught.value, "solution", None)
+    assert solution is not None and len(solution.ts) == 2

@@ -1,0 +1,145 @@
+"""Saved times, dense output, and states that are tuples."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.closed_forms import c1, c2, c3
+
+import dvax
+
+
+def test_dense_output_saved_times_and_the_exact_solution_agree():
+    case = c3()
+    ts = np.array([0.0, 0.013, 0.5, 1.7, 2.999, 3.0, 3.4, 4.0])
+    common = dict(args=case.args, rtol=1e-5, atol=1e-5)
+    x0 = jnp.asarray(case.x0)
+    saved = dvax.solve(case.problem, x0, 0.0, 4.0, ts=ts, **common)
+    dense = dvax.solve(case.problem, x0, 0.0, 4.0, dense=True, max_steps=4096, **common)
+    assert np.array_equal(np.asarray(saved.ts), ts)
+    for k, t in enumerate(ts):
+        x, u = dense.evaluate(t)
+        np.testing.assert_allclose(np.asarray(x), np.asarray(saved.xs[k]), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(np.asarray(u), np.asarray(saved.us[k]), rtol=0, atol=1e-11)
+        np.testing.assert_allclose(np.asarray(x), case.exact(t)[0], atol=1e-4)
+    assert float(dense.ts[-1]) == 4.0 and np.array_equal(dense.xs[-1], saved.xs[-1])
+
+
+def test_without_times_the_end_alone_is_saved():
+    sol = dvax.solve(c1().problem, -1.0, 0.0, 2.0, args=c1().args)
+    assert np.asarray(sol.ts).tolist() == [2.0]
+    assert sol.xs.shape == sol.us.shape == sol.ys.shape == (1,)
+
+
+def test_the_same_time_may_be_asked_for_twice_and_fixed_steps_save_between_steps():
+    ts = [0.0, 0.15, 0.15, 0.3, 1.0]
+    sol = dvax.solve(c1().problem, -1.0, 0.0, 1.0, args=c1().args, ts=ts, dt=0.01)
+    assert np.array_equal(np.asarray(sol.ts), ts)
+    assert float(sol.xs[1]) == float(sol.xs[2])
+    exact = [float(c1().exact(t)[0]) for t in ts]
+    np.testing.assert_allclose(np.asarray(sol.xs), exact, atol=1e-4)
+
+
+@pytest.mark.parametrize("t", [-0.1, 2.5])
+def test_nothing_is_evaluated_outside_the_solve(t):
+    sol = dvax.solve(
+        c1().problem, -1.0, 0.0, 2.0, args=c1().args, dense=True, rtol=1e-3, max_steps=4096
+    )
+    with pytest.raises(dvax.InputError, match=r"\[0, 2\]"):
+        sol.evaluate(t)
+
+
+def test_evaluate_without_dense_says_what_to_ask_for():
+    sol = dvax.solve(c1().problem, -1.0, 0.0, 2.0, args=c1().args)
+    with pytest.raises(dvax.InputError, match="dense=True"):
+        sol.evaluate(1.0)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (dict(ts=[0.5, 0.2]), ["ts"]),
+        (dict(ts=[0.0, 2.5]), ["ts"]),
+        (dict(ts=[]), ["ts"]),
+        (dict(dt=-0.1), ["dt"]),
+        (dict(rtol=float("nan")), ["rtol"]),
+        (dict(rtol=0.0, atol=0.0), ["rtol, atol"]),
+        (dict(rtol=-1.0, dt0=0.0, horizon=-2.0), ["rtol", "dt0", "horizon"]),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused_all_at_once(wrong, words):
+    with pytest.raises(dvax.InputError) as caught:
+        dvax.solve(c1().problem, -1.0, 0.0, 2.0, args=c1().args, **wrong)
+    for word in words:
+        assert f"dvax.solve({word})" in str(caught.value)
+
+
+@pytest.mark.parametrize(("t0", "t1"), [(1.0, 0.0), (0.0, 0.0), (0.0, np.inf), (np.nan, 1.0)])
+def test_time_runs_forward_and_is_finite(t0, t1):
+    with pytest.raises(dvax.InputError, match="t0, t1"):
+        dvax.solve(c1().problem, -1.0, t0, t1, args=c1().args)
+
+
+def test_a_state_with_a_bad_entry_is_refused_with_its_place():
+    with pytest.raises(dvax.InputError, match=r"nan at index \(1,\)"):
+        dvax.solve(c2().problem, jnp.array([0.0, np.nan]), 0.0, 1.0)
+
+
+def test_a_tuple_state_with_a_response_of_another_shape_equals_the_stacked_problem():
+    # x = (a, b) with a a number and b a pair; u = (v, w) with v a pair and w a number.
+    g, o, k, s = dvax.generators, dvax.operators, dvax.sets, dvax.spaces
+    B = np.array([[-1.0, 2.0], [-2.0, -1.0]])
+    A = np.zeros((3, 3))
+    A[0, 0], A[1:, 1:] = -0.5, B
+    F = np.array([[1.0, 0.3, 0.0], [0.0, -0.5, 1.0], [0.7, 0.0, -1.0]])
+    H = np.array([[-1.0, 0.5, 0.0], [0.3, 0.0, 2.0], [0.0, -1.0, 0.4]])
+    S = np.array([[0.2, 0.4, 0.0], [-0.4, 0.1, 0.3], [0.0, -0.3, 0.3]])
+    P = np.diag([2.0, 2.0, 0.5])
+    join = lambda z: jnp.concatenate([jnp.atleast_1d(p) for p in z])  # noqa: E731
+    drive = lambda t: jnp.stack([jnp.sin(t), jnp.cos(2 * t), jnp.ones_like(t)])  # noqa: E731
+    f = lambda t, x, u, args: drive(t) - jnp.asarray(F) @ u  # noqa: E731
+    h = lambda t, x, u, args: 2 * drive(t) + jnp.asarray(H) @ x - jnp.asarray(S) @ u  # noqa: E731
+
+    def split_f(t, x, u, args):
+        out = f(t, join(x), join(u), args)
+        return out[0], out[1:]
+
+    def split_h(t, x, u, args):
+        out = h(t, join(x), join(u), args)
+        return out[:2], out[2]
+
+    parts = dvax.Problem(
+        A=g.Product(g.Scalar(-0.5), g.Dense(B)),
+        P=o.Product(o.Scaling(2.0), o.Scaling(0.5)),
+        K=k.Product(k.Box(0.0, np.array([1.0, 0.5])), k.Box(-0.2, 0.6)),
+        f=split_f,
+        h=split_h,
+        state_space=s.Product(s.Euclidean(), s.Euclidean(2)),
+        control_space=s.Product(s.Euclidean(2), s.Euclidean()),
+    )
+    stacked = dvax.Problem(
+        A=g.Dense(A),
+        P=o.Dense(P),
+        K=k.Box(np.array([0.0, 0.0, -0.2]), np.array([1.0, 0.5, 0.6])),
+        f=f,
+        h=h,
+    )
+    x0, ts = np.array([0.3, -1.0, 0.8]), np.linspace(0, 2, 9)
+    settings = dict(ts=ts, dt=0.02)
+    a = dvax.solve(parts, (jnp.asarray(x0[0]), jnp.asarray(x0[1:])), 0.0, 2.0, **settings)
+    b = dvax.solve(stacked, jnp.asarray(x0), 0.0, 2.0, **settings)
+    stack = lambda z: np.concatenate([np.asarray(p).reshape(9, -1) for p in z], axis=1)  # noqa: E731
+    np.testing.assert_allclose(stack(a.xs), np.asarray(b.xs), atol=1e-9)
+    np.testing.assert_allclose(stack(a.us), np.asarray(b.us), atol=1e-9)
+    # Every regime occurs, or the comparison would say little.
+    assert a.us[0].shape == (9, 2) and a.us[1].shape == (9,)
+    y = stack(a.ys)
+    assert np.any(y[:, 0] == 1.0) and np.any(y[:, 2] == -0.2) | np.any(y[:, 2] == 0.6)
+
+
+def test_xarray_carries_the_trajectory():
+    pytest.importorskip("xarray", reason="the extra dvax[app] is not installed")
+    sol = dvax.solve(c2().problem, jnp.asarray(c2().x0), 0.0, 1.0, ts=[0.0, 0.5, 1.0])
+    data = sol.to_xarray()
+    assert data["x"].dims == ("time", "x_dim0")
+    np.testing.assert_array_equal(data["x"].values, np.asarray(sol.xs))
+    np.testing.assert_array_equal(data["time"].values, [0.0, 0.5, 1.0])
