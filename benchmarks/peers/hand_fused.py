@@ -3,7 +3,8 @@
     u(x) = clip(β (g − b_x x)/(1 + b_u), 0, κ₀)/β,      f̃(x) = ℓ − d_x x − d_u u(x)
     a = e^z x + hφ₁(z) f̃(x),      x ← a + hφ₂(z) (f̃(a) − f̃(x)),      z = −αh
 
-No saving, no statistics, no check for NaN, and a loop count that nobody has to find out.
+No saving, no statistics, no check for NaN, and a loop count that nobody has to find out. For the
+reverse mode it is a `lax.scan`, since a `fori_loop` of an unknown count has none.
 """
 
 import math
@@ -63,14 +64,35 @@ def as_constants(law: ContactLaw, h: float) -> Callable[[Any, int], Any]:
     return lambda x0, steps: jax.block_until_ready(loop(g, x0, steps))
 
 
+def gradient(law: ContactLaw, h: float, steps: int) -> Callable[[Any], dict[str, Any]]:
+    """x0 -> the derivatives of Σx with respect to b_x, d_x and ℓ, by jax.grad through a scan."""
+    letters = ("b_x", "d_x", "ell")
+    given = Numbers(*map(jnp.asarray, numbers(law, h)))
+    g = jnp.asarray(law.g.reshape(law.start.shape))
+
+    @jax.jit
+    @jax.grad
+    def slope(moving: dict[str, Any], fixed: Numbers, g: Any, x0: Any) -> Any:
+        step = _step(fixed._replace(**moving), g)
+        return jnp.sum(lax.scan(lambda x, _: (step(x), None), x0, length=steps)[0])
+
+    at = {name: getattr(given, name) for name in letters}
+    return lambda x0: jax.block_until_ready(slope(at, given, g, x0))
+
+
 def _loop(n: Numbers, g: jax.Array, x0: jax.Array, steps: Any) -> jax.Array:
+    step = _step(n, g)
+    return lax.fori_loop(0, steps, lambda _, x: step(x), x0)
+
+
+def _step(n: Numbers, g: jax.Array) -> Callable[[jax.Array], jax.Array]:
     def rate(x: jax.Array) -> jax.Array:
         pressure = jnp.clip(n.gain * (g - n.b_x * x), 0.0, n.kappa0)
         return n.ell - n.d_x * x - n.d_u_by_beta * pressure
 
-    def step(_: Any, x: jax.Array) -> jax.Array:
+    def step(x: jax.Array) -> jax.Array:
         before = rate(x)
         a = n.flow * x + n.first * before
         return a + n.second * (rate(a) - before)
 
-    return lax.fori_loop(0, steps, step, x0)
+    return step
