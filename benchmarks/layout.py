@@ -103,4 +103,4 @@ def _columns(text: str) -> int:
 
 
 def _wrap(text: str, indent: str = "") -> str:
-    return textwrap.fill(text, _WIDTH, subsequent_indent=indent)
+    return textwrap.fill(text, _WIDTH, subsequent_indent=indent, break_on_hyphens=False)

@@ -57,8 +57,8 @@ def run(full: bool) -> Section:
             "Every tool runs at the loosest of its settings (rtol in half decades from 1e-2 to "
             "1e-13, atol = rtol/1000; fixed steps in powers of two) whose achieved error, like "
             "that of every tighter setting tried, is at most the level. Diffrax is under jax.jit "
-            "with the end saved alone and parameters and tolerance as arguments; scipy's right- "
-            "hand side is plain Python arithmetic, faster than numpy on one entry. Their clip is "
+            "with the end saved alone and parameters and tolerance as arguments; scipy's "
+            "right-hand side is plain Python arithmetic, faster than numpy on one entry. Their clip is "
             "written by hand and they certify nothing; dvax adaptive measures its defect in every "
             "step. No target is set yet."
         ),
