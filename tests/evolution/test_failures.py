@@ -29,7 +29,7 @@ def system(broken):
 @pytest.mark.parametrize("dt", [None, 0.02], ids=["adaptive", "fixed"])
 @pytest.mark.parametrize("name", ["f", "h", "K"])
 def test_nan_stops_the_run_and_the_function_the_time_and_the_component_are_named(name, dt):
-    x0, ts = jnp.array([0.5, 2.0, -1.0]), np.linspace(0, 2, 21)
+    x0, ts = jnp.array([0.5, 2.0, -1.0]), np.linspace(0, 2, 20)  # none of them 0.7 itself
     with pytest.raises(dvax.SolveError) as caught:
         dvax.solve(system(name), x0, 0.0, 2.0, ts=ts, dt=dt, rtol=1e-5)
     message, sol = str(caught.value), caught.value.solution
@@ -40,8 +40,7 @@ def test_nan_stops_the_run_and_the_function_the_time_and_the_component_are_named
     # Within one step of the break, and what was saved before it is the solution.
     reached = float(sol.stats["t"])
     assert BREAKS - 0.03 <= reached <= BREAKS + 0.03
-    assert np.all(np.isfinite(np.asarray(sol.xs))) and float(sol.ts[-1]) <= BREAKS
-    assert len(sol.ts) == 8 if dt is None else len(sol.ts) >= 7
+    assert np.all(np.isfinite(np.asarray(sol.xs))) and len(sol.ts) == 7
     # −2x while 0 ≤ x ≤ 1, −x below 0; above 1 it is −x − 1.
     np.testing.assert_allclose(np.asarray(sol.xs[:, 0]), 0.5 * np.exp(-2 * sol.ts), atol=1e-3)
     np.testing.assert_allclose(np.asarray(sol.xs[:, 2]), -np.exp(-sol.ts), atol=1e-3)
