@@ -140,7 +140,9 @@ def test_intervals_are_given_where_the_set_is_one_a_point():
     assert sets.Ball(0.0, 1.0).intervals(like) is None
     pair = sets.Product(sets.Box(0.0, 1.0), sets.Ball(0.0, 1.0))
     assert pair.intervals((like, like)) is None
-    low, up = sets.Product(sets.Box(0.0, 1.0), sets.WholeSpace()).intervals((like, like))
+    both = sets.Product(sets.Box(0.0, 1.0), sets.WholeSpace()).intervals((like, like))
+    assert both is not None
+    low, up = both
     assert np.all(np.asarray(low[1]) == -np.inf) and np.all(np.asarray(up[0]) == 1.0)
 
 
