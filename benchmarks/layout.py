@@ -40,7 +40,9 @@ def verdicts(sections: Sequence[Section]) -> str:
     """Every target of a run, with what was reached."""
     rows = [
         (
-            f"{row.case}, against {row.versus}" if row.versus != "-" else row.case,
+            section.title.partition(":")[0],
+            row.case,
+            row.versus,
             str(row.target),
             f"{row.target.reached:.3g}{row.target.unit}",
             _met(row),
@@ -51,7 +53,7 @@ def verdicts(sections: Sequence[Section]) -> str:
     ]
     if not rows:
         return "No target belongs to these cases."
-    return _aligned(("target", "asked for", "reached", "met"), rows)
+    return _aligned(("", "case", "against", "target", "reached", "met"), rows)
 
 
 def _cells(row: Comparison) -> tuple[str, ...]:

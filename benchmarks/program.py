@@ -13,7 +13,9 @@ begun = time.perf_counter()
 with open(sys.argv[1], "w") as said:
     child = subprocess.Popen(sys.argv[2:], stdin=subprocess.DEVNULL, stdout=said, stderr=said)
     _, status, usage = os.wait4(child.pid, 0)
-print(json.dumps([time.perf_counter() - begun, usage.ru_maxrss, os.waitstatus_to_exitcode(status)]))
+ended = time.perf_counter() - begun
+worked = usage.ru_utime + usage.ru_stime
+print(json.dumps([ended, worked, usage.ru_maxrss, os.waitstatus_to_exitcode(status)]))
 """
 """A process of its own between this one and the program: Linux counts the memory of whoever starts
 a process as that process's own peak, and this one holds arrays of 10⁶ points."""
@@ -22,9 +24,11 @@ _MAIN = "from dvax.cli import main; main()"
 
 
 class Ended(NamedTuple):
-    """Wall seconds and peak resident bytes of a process that succeeded."""
+    """Wall seconds, processor seconds over all cores and peak resident bytes of a process that
+    succeeded."""
 
     seconds: float
+    worked: float
     peak: int
 
 
@@ -47,9 +51,9 @@ def run(command: Sequence[str], folder: Path) -> Ended:
     )  # fmt: skip
     if launched.returncode != 0:
         raise RuntimeError(f"{' '.join(command)} could not be started: {launched.stderr[-2000:]}")
-    seconds, peak, status = json.loads(launched.stdout)
+    seconds, worked, peak, status = json.loads(launched.stdout)
     if status != 0:
         text = said.read_text(encoding="utf-8", errors="replace")
         raise RuntimeError(f"{' '.join(command)} ended with status {status}: {text[-2000:]}")
     # Kilobytes everywhere but on macOS, which counts bytes.
-    return Ended(seconds, peak if sys.platform == "darwin" else 1024 * peak)
+    return Ended(seconds, worked, peak if sys.platform == "darwin" else 1024 * peak)

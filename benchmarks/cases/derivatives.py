@@ -34,7 +34,7 @@ def run(full: bool) -> Section:
             "fused ETD2RK step under jax.grad with respect to b_x, d_x and ℓ, all its states kept."
         ),
     )
-    rounds = 25 if full else 11
+    rounds = 15 if full else 7
     for points, settings in (
         (2, {"dt": _END / 1000}),
         (2, {"rtol": 1e-6, "atol": 1e-9}),

@@ -21,7 +21,7 @@ _HAND, _HAND_CONSTANTS = "hand-fused, arguments", "hand-fused, constants"
 
 
 def run(full: bool) -> Section:
-    steps, rounds = (1000, 15) if full else (200, 11)
+    steps, rounds = (500, 15) if full else (200, 9)
     law = strip(_POINTS)
     start, g = jnp.asarray(law.start), jnp.asarray(law.g)
     by_hand = hand_fused.as_arguments(law, _STEP), hand_fused.as_constants(law, _STEP)

@@ -42,14 +42,14 @@ def run(full: bool) -> Section:
         )
         return section
     with Siconos(interpreter) as siconos:
-        for points, end in ((1, 2.0), (1000, 2.0 if full else 0.5)):
+        for points, end in ((1, 2.0), (1000, 1.0 if full else 0.3)):
             for theta in (1.0, 0.5):
                 _compare(section, siconos, strip(points), end, theta, 21 if full else 9)
         printed = siconos.said()
     if printed:
         section.notes.append(f"Siconos printed: {printed.splitlines()[0]}")
     if not full:
-        section.notes.append("1000 points run to t = 0.5 here, and to t = 2 with --full.")
+        section.notes.append("1000 points run to t = 0.3 here, and to t = 1 with --full.")
     return section
 
 
