@@ -53,7 +53,7 @@ def check(problem, x0, t0, t1, ts, dt, rtol, atol, dt0, horizon, method, adjoint
     ):  # fmt: skip
         if value is not None and _tree.is_concrete(value):
             ok = math.isfinite(value) and (value >= 0 if zero_allowed else value > 0)
-            rule(ok, name, value, "it must be positive and finite", "Give a positive number")
+            rule(bool(ok), name, value, "it must be positive and finite", "Give a positive number")
     if _tree.is_concrete(rtol, atol):
         rule(rtol > 0 or atol > 0, "rtol, atol", "0, 0", "one of them must be positive",
              "No finite step has defect zero")  # fmt: skip

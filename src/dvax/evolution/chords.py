@@ -58,7 +58,7 @@ class Chord(NamedTuple):
 
 def straight(a: Tree, b: Tree) -> Tree:
     """A tree of chords without deviation: what is linear in time."""
-    return jtu.tree_map(lambda p, q: Chord(p, q, jnp.zeros_like(p)), a, b)
+    return jtu.tree_map(lambda p, q: Chord(p, q, _still(p)), a, b)
 
 
 def constant(a: Tree) -> Tree:
@@ -79,20 +79,33 @@ def enclose(fn: Callable[..., Tree], *args: Tree) -> Tree:
     return jtu.tree_structure(shape).unflatten(whole)
 
 
+def _still(value: Any) -> jax.Array:
+    """No deviation; a floating number for whatever type."""
+    dtype = jnp.result_type(value)
+    real = dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.result_type(float)
+    return jnp.zeros(jnp.shape(value), real)
+
+
 def is_chord(value: Any) -> bool:
     return isinstance(value, Chord)
 
 
 def largest(x: Chord, y: Chord) -> Chord:
-    """max(x, y): see the module's table."""
-    dev = jnp.maximum(x.dev, y.dev) + _crossing(x.a - y.a, x.b - y.b)
-    return Chord(jnp.maximum(x.a, y.a), jnp.maximum(x.b, y.b), dev)
+    """max(x, y): only the one that is larger all along matters, where there is such a one."""
+    return Chord(jnp.maximum(x.a, y.a), jnp.maximum(x.b, y.b), _either(x, y, x.a - y.a, x.b - y.b))
 
 
 def smallest(x: Chord, y: Chord) -> Chord:
     """min(x, y)."""
-    dev = jnp.maximum(x.dev, y.dev) + _crossing(x.a - y.a, x.b - y.b)
-    return Chord(jnp.minimum(x.a, y.a), jnp.minimum(x.b, y.b), dev)
+    return Chord(jnp.minimum(x.a, y.a), jnp.minimum(x.b, y.b), _either(x, y, y.a - x.a, y.b - x.b))
+
+
+def _either(x: Chord, y: Chord, d0: jax.Array, d1: jax.Array) -> jax.Array:
+    """The deviation of the larger of two, x being ahead by d0 at the start and by d1 at the end."""
+    doubt = x.dev + y.dev
+    mixed = jnp.maximum(x.dev, y.dev) + _crossing(d0, d1)
+    behind = jnp.where(jnp.maximum(d0, d1) <= -doubt, y.dev, mixed)
+    return jnp.where(jnp.minimum(d0, d1) >= doubt, x.dev, behind)
 
 
 def times(x: Chord, y: Chord) -> Chord:
@@ -252,12 +265,17 @@ def _zero_or_infinite(known: jax.Array) -> jax.Array:
 def _compare(x: Chord, y: Chord, bind: Callable) -> Chord:
     """A comparison, known where the difference keeps its sign all along."""
     a, b = bind(x.a, y.a), bind(x.b, y.b)
-    dev = jnp.asarray(x.dev, float) + jnp.asarray(y.dev, float)
-    margin = jnp.minimum(jnp.abs(1.0 * x.a - y.a), jnp.abs(1.0 * x.b - y.b))
+    dev = x.dev + y.dev
+    margin = jnp.minimum(_apart(x.a, y.a), _apart(x.b, y.b))
     # A line that gives the same answer at both ends gives it in between; with a deviation, only
     # where it stays clear of zero.
     known = (a == b) & ((dev == 0) | (margin > dev))
     return Chord(a, b, _zero_or_infinite(known))
+
+
+def _apart(p: jax.Array, q: jax.Array) -> jax.Array:
+    real = jnp.result_type(float)
+    return jnp.abs(p.astype(real) - q.astype(real))
 
 
 def _discrete(given: list[Any], bind: Callable) -> Chord:
@@ -276,6 +294,8 @@ def _discrete(given: list[Any], bind: Callable) -> Chord:
 
 def _select(given: list[Any], bind: Callable) -> Chord:
     which, cases = given[0], [_lift(case) for case in given[1:]]
+    if not all(jnp.issubdtype(case.a.dtype, jnp.floating) for case in cases):
+        return _discrete(given, bind)
     if not is_chord(which):
         return Chord(*(bind(which, *(case[i] for case in cases)) for i in range(3)))
     a = bind(which.a, *(case.a for case in cases))

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import diffrax
 import jax.numpy as jnp
+from jax import lax
 
 from .._tree import Tree
 from ..spaces import AbstractSpace, Product
@@ -54,16 +55,19 @@ class Adaptive(diffrax.AbstractStepSizeController):
         t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
         h = t1 - t0
         assert y_error is not None  # the stepper always measures where steps adapt
-        error = self.horizon * self._scaled(y_error.x, y0.x, y1_candidate.x)
+        # Where a step ends is a choice, not a function of the data: derivatives see the steps as given.
+        error = lax.stop_gradient(self.horizon * self._scaled(y_error.x, y0.x, y1_candidate.x))
         impulse = error * h / self.horizon
         relaxed = state.rejected & (impulse <= 0.1 * state.spare)
         keep = (error <= 1.0) | relaxed
         spare = jnp.where(keep & (error > 1.0), state.spare - impulse, state.spare)
 
-        factor = jnp.where(error > 0.0, (0.5 / error) ** (1.0 / error_order), jnp.inf)
+        positive = jnp.where(error > 0.0, error, 1.0)
+        factor = jnp.where(error > 0.0, (0.5 / positive) ** (1.0 / error_order), jnp.inf)
         factor = jnp.clip(factor, 0.1, 3.0)
         steady = keep & (factor > 0.8) & (factor < 1.25)
-        wanted = jnp.where(steady, h, h * factor)
+        length = lax.stop_gradient(h)
+        wanted = jnp.where(steady, length, length * factor)
         # A step cut short by a knot says little about the length that was planned.
         cut = keep & (h < 0.99 * state.length)
         wanted = jnp.where(
@@ -89,7 +93,9 @@ class Adaptive(diffrax.AbstractStepSizeController):
     def _scaled(self, error: Tree, before: Tree, after: Tree) -> Any:
         parts = zip(self.sizes(error), self.sizes(before), self.sizes(after), strict=True)
         ratios = [e / (self.atol + self.rtol * jnp.maximum(a, b)) for e, a, b in parts]
-        return jnp.max(jnp.stack(ratios)) if len(ratios) > 1 else ratios[0]
+        ratio = jnp.max(jnp.stack(ratios)) if len(ratios) > 1 else ratios[0]
+        # What is not a number is no reason to accept, nor to lengthen.
+        return jnp.where(jnp.isnan(ratio), jnp.inf, ratio)
 
     def _stop(self, knot: Any) -> Any:
         if self.knots.shape[0] == 0:

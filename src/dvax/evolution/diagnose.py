@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._tree import Tree
+from ..errors import InputError
 from .flow import Flow
 
 
@@ -28,7 +29,10 @@ def diagnose(flow: Flow, t: Any, x: Tree) -> str:
             "f at the law's solution": lambda s=later: flow.rate(s, x, None).value,
         }
         for name, evaluate in pieces.items():
-            found = _first_bad(evaluate(), allow_infinite=name == "K")
+            try:
+                found = _first_bad(evaluate(), allow_infinite=name == "K")
+            except InputError as refused:
+                return f"At t = {float(later):.9g}: {refused}"
             if found:
                 return f"{name} is {found} at t = {float(later):.9g}."
     return ""

@@ -77,12 +77,16 @@ class Flow(eqx.Module):
         drive = problem.h(t, x, problem.zero_control(x), args)
         if self.reciprocal is not None:
             z = jtu.tree_map(jnp.multiply, drive, self.reciprocal)
+            solved = _all_positive(self.reciprocal)
         else:
-            z = jtu.tree_map(jnp.divide, drive, slope(problem, self.operator, t, x, args))
+            a = slope(problem, self.operator, t, x, args)
+            z = jtu.tree_map(jnp.divide, drive, a)
+            solved = _all_positive(a)
         y = problem.set_at(t, args).project(z, problem.spaces(x)[1])
         value = problem.f(t, x, self.operator.inverse(y), args)
         exact = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(x)))
-        return Rate(value, y, z, exact, jnp.asarray(True), jnp.asarray(1))
+        # With a slope that is not positive the law is not monotone, and this is not its solution.
+        return Rate(value, y, z, exact, solved, jnp.asarray(1))
 
     def enclosure(self, t: Chord, x: Tree) -> Tree:
         """f̃ along chords of t and x, as chords, for a direct law on pointwise intervals.
@@ -136,3 +140,8 @@ def slope(problem: Problem, operator: AbstractOperator, t: Any, x: Tree, args: A
     ones = operator.inverse(jtu.tree_map(jnp.ones_like, zero))
     _, change = jax.jvp(lambda u: problem.h(t, x, u, args), (zero,), (ones,))
     return _tree.sub(ones, change)
+
+
+def _all_positive(tree: Tree) -> jax.Array:
+    smallest_entry = jnp.stack([jnp.min(leaf) for leaf in jtu.tree_leaves(tree)])
+    return jnp.all(smallest_entry > 0)

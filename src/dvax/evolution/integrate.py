@@ -13,14 +13,13 @@ from .. import _tree
 from .._tree import Tree
 from ..problem import Problem
 from ..vi import AbstractSolver, Auto, analyse, certify, independent
+from .adjoint import adjoint_for, forward_only
 from .chords import NoEnclosure, constant
 from .control import Adaptive, Fixed, root_mean_squares, step_count
 from .flow import Flow, slope
 from .method import AbstractMethod
 from .solution import RESULTS, Solution
 from .stepper import Carry, MildTerm, Record, Stepper
-
-_CHECKPOINT_BYTES = 2**30
 
 
 @eqx.filter_jit
@@ -86,7 +85,7 @@ def integrate(
         Carry(x0, zero, zero, record),
         saveat=diffrax.SaveAt(subs=(saved, last, steps), controller_state=True),
         stepsize_controller=controller,
-        adjoint=_adjoint(adjoint, max_steps, x0),
+        adjoint=adjoint_for(adjoint, max_steps, x0),
         max_steps=max_steps,
         throw=False,
         progress_meter=diffrax.TextProgressMeter() if progress else diffrax.NoProgressMeter(),
@@ -95,6 +94,8 @@ def integrate(
     times = out.ts[0]
     xs, defect, law_defect = out.ys[0]
     us, ys, residual, law_error = _responses(flow, times, xs, control, moduli)
+    if adjoint == "forward":
+        xs, us, ys = forward_only((xs, us, ys))
     records = out.ys[2] if dense else None
     result = _translate(out.result)
     stats = {
@@ -186,16 +187,6 @@ def _responses(flow: Flow, times, xs, control, moduli):
         return u, rate.y, checked.norm, error
 
     return jax.vmap(one)(times, xs)
-
-
-def _adjoint(name: str, max_steps: int, x0: Tree) -> diffrax.AbstractAdjoint:
-    if name == "forward":
-        return diffrax.ForwardMode()
-    # One checkpoint a step is the fast path (no step is computed twice more than once); larger
-    # states get as many as fit the memory set aside, and recompute between them.
-    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jtu.tree_leaves(x0))
-    affordable = max(64, _CHECKPOINT_BYTES // (8 * size + 512))
-    return diffrax.RecursiveCheckpointAdjoint(checkpoints=min(max_steps, affordable))
 
 
 def _blank_record(x0: Tree, method: AbstractMethod, dtype: Any) -> Record:

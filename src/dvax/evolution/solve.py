@@ -112,10 +112,12 @@ def solve(
         "adjoint": adjoint,
         "progress": progress,
     }
+    # Likewise for a number handed to f and h; integers and flags stay what they are.
+    args = jax.tree_util.tree_map(lambda v: jnp.asarray(v) if isinstance(v, float) else v, args)
     call = (problem, x0, args, None if ts is None else _times(ts), setting)
     rest = (method, Auto() if vi_solver is None else vi_solver, _moduli(constants))
     solution = _differentiably(call, rest, run)
-    if _tree.is_concrete(solution.result):
+    if _tree.is_concrete(solution.result, solution.ts, solution.xs):
         solution = _trim(solution)
         if solution.result != RESULTS.successful:
             # Data that ends too early is NaN from there on: then that is what is wrong.
@@ -133,17 +135,11 @@ def _differentiably(call: tuple, rest: tuple, run: dict[str, Any]) -> Solution:
         return integrate(*call, *rest, **run)
     except (TypeError, ValueError) as error:
         forward = "forward-mode autodiff" in str(error) or "custom_vjp" in str(error)
-        reverse = "Reverse-mode differentiation does not work" in str(error)
         if run["adjoint"] == "reverse" and forward:
             raise DifferentiationError(
                 'dvax.solve(adjoint="reverse") cannot be differentiated forward (jax.jvp, '
                 'jax.jacfwd). Pass adjoint="forward": the loop that stores steps for the reverse '
                 "pass is not the one that carries tangents along."
-            ) from error
-        if run["adjoint"] == "forward" and reverse:
-            raise DifferentiationError(
-                'dvax.solve(adjoint="forward") cannot be differentiated backward (jax.grad, '
-                'jax.vjp). Pass adjoint="reverse", the default.'
             ) from error
         raise
 

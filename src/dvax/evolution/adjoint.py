@@ -1,0 +1,49 @@
+"""Which derivatives a loop can serve: forward or backward, not both."""
+
+from typing import Any
+
+import diffrax
+import jax
+import jax.tree_util as jtu
+
+from .._tree import Tree
+from ..errors import DifferentiationError
+
+_CHECKPOINT_BYTES = 2**30
+
+
+def adjoint_for(name: str, max_steps: int, x0: Tree) -> diffrax.AbstractAdjoint:
+    """Diffrax's loop for "reverse" or "forward"."""
+    if name == "forward":
+        return diffrax.ForwardMode()
+    # One checkpoint a step is the fast path: nothing is computed more than twice. Larger states get
+    # as many as fit the memory set aside, and are recomputed between them.
+    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jtu.tree_leaves(x0))
+    affordable = max(64, _CHECKPOINT_BYTES // (8 * size + 512))
+    return diffrax.RecursiveCheckpointAdjoint(checkpoints=min(max_steps, affordable))
+
+
+def forward_only(tree: Tree) -> Tree:
+    """The same values; asking for their reverse derivative says what to do instead.
+
+    Without it the error would come from the loop, after `solve` has returned, and name neither.
+    """
+    return jtu.tree_map(_marked, tree)
+
+
+@jax.custom_jvp
+def _marked(x: jax.Array) -> jax.Array:
+    return x
+
+
+@_marked.defjvp
+def _marked_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, Any]:
+    (x,), (dx,) = primals, tangents
+    return _marked(x), jax.custom_derivatives.linear_call(lambda _, v: v, _refuse, (), dx)
+
+
+def _refuse(_: Any, cotangent: jax.Array) -> jax.Array:
+    raise DifferentiationError(
+        'dvax.solve(adjoint="forward") cannot be differentiated backward (jax.grad, jax.vjp). Pass '
+        'adjoint="reverse", the default: the loop that carries tangents along stores no steps.'
+    )
