@@ -3,8 +3,9 @@
 from typing import Any
 
 import diffrax
-import jax
 import jax.tree_util as jtu
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 
 from .._tree import Tree
 from ..errors import DifferentiationError
@@ -28,22 +29,20 @@ def forward_only(tree: Tree) -> Tree:
 
     Without it the error would come from the loop, after `solve` has returned, and name neither.
     """
-    return jtu.tree_map(_marked, tree)
+    return jtu.tree_map(_forward_only.bind, tree)
 
 
-@jax.custom_jvp
-def _marked(x: jax.Array) -> jax.Array:
-    return x
-
-
-@_marked.defjvp
-def _marked_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, Any]:
-    (x,), (dx,) = primals, tangents
-    return _marked(x), jax.custom_derivatives.linear_call(lambda _, v: v, _refuse, (), dx)
-
-
-def _refuse(_: Any, cotangent: jax.Array) -> jax.Array:
+def _refuse(cotangent: Any, x: Any) -> Any:
     raise DifferentiationError(
         'dvax.solve(adjoint="forward") cannot be differentiated backward (jax.grad, jax.vjp). Pass '
         'adjoint="reverse", the default: the loop that carries tangents along stores no steps.'
     )
+
+
+# The identity, linear forward and without a transpose.
+_forward_only = Primitive("forward_only")
+_forward_only.def_impl(lambda x: x)
+_forward_only.def_abstract_eval(lambda x: x)
+ad.deflinear2(_forward_only, _refuse)
+batching.defvectorized(_forward_only)
+mlir.register_lowering(_forward_only, lambda context, x: [x])

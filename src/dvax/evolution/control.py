@@ -21,7 +21,7 @@ class Adaptive(diffrax.AbstractStepSizeController):
     The defect integrated over the run is then at most the tolerance, so the computed trajectory is
     the exact one of a system disturbed by no more than was asked for. A kink or an unannounced jump
     inside a step has a defect that does not shrink with h; its impulse h·defect does, and a share of
-    the tolerance is set aside for such steps, each spending at most a tenth of what is left.
+    the tolerance is set aside for such steps, each spending at most a small part of what is left.
 
     A length is kept while it is within a fifth of the best one, since a new length costs new
     φ-functions; and the rest of the way to a knot is cut into equal parts, never into a sliver.
@@ -58,7 +58,10 @@ class Adaptive(diffrax.AbstractStepSizeController):
         # Where a step ends is a choice, not a function of the data: derivatives see the steps as given.
         error = lax.stop_gradient(self.horizon * self._scaled(y_error.x, y0.x, y1_candidate.x))
         impulse = error * h / self.horizon
-        relaxed = state.rejected & (impulse <= 0.1 * state.spare)
+        # A small share, because a derivative loses a kink's step; a large one where t has no room.
+        floor = 8 * jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+        share = jnp.where(h <= 1e4 * floor, 0.1, 1e-6)
+        relaxed = state.rejected & (impulse <= share * state.spare)
         keep = (error <= 1.0) | relaxed
         spare = jnp.where(keep & (error > 1.0), state.spare - impulse, state.spare)
 
@@ -79,7 +82,6 @@ class Adaptive(diffrax.AbstractStepSizeController):
         start = jnp.where(keep, t1, t0)
         next_t1 = _land(start, wanted, self._stop(knot))
         # Below this, t itself cannot tell the ends of a step apart.
-        floor = 8 * jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
         stuck = ~keep & (h <= floor)
         blocked = diffrax.RESULTS.where(
             jnp.isfinite(error),

@@ -32,7 +32,7 @@ def diagnose(flow: Flow, t: Any, x: Tree) -> str:
             try:
                 found = _first_bad(evaluate(), allow_infinite=name == "K")
             except InputError as refused:
-                return f"At t = {float(later):.9g}: {refused}"
+                return f"K is refused at t = {float(later):.9g}: {refused}"
             if found:
                 return f"{name} is {found} at t = {float(later):.9g}."
     return ""
