@@ -1,7 +1,6 @@
-"""The time loop: one compiled function from a problem to its solution."""
+"""The time loop: one compiled function from a setup to what was computed."""
 
-import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -11,27 +10,37 @@ import jax.tree_util as jtu
 
 from .. import _tree
 from .._tree import Tree
-from ..problem import Problem
-from ..vi import AbstractSolver, Auto, analyse, certify, independent
+from ..vi import certify
 from .adjoint import adjoint_for, forward_only
-from .chords import NoEnclosure, constant
 from .control import Adaptive, Fixed, root_mean_squares, step_count
-from .flow import Flow, slope
+from .flow import Flow
 from .method import AbstractMethod
-from .solution import RESULTS, Solution
+from .setup import Setup
+from .solution import RESULTS
 from .stepper import Carry, MildTerm, Record, Stepper
+
+
+class Computed(NamedTuple):
+    """What the time loop leaves; nothing of what it was given, which would be copied."""
+
+    ts: jax.Array
+    xs: Tree
+    us: Tree
+    ys: Tree
+    law_residual: jax.Array
+    law_error: jax.Array | None
+    defect: jax.Array | None
+    law_defect: jax.Array | None
+    stats: dict[str, Any]
+    result: RESULTS
+    records: Record | None
+    enclosed: bool
 
 
 @eqx.filter_jit
 def integrate(
-    problem: Problem,
-    x0: Tree,
-    args: Any,
+    setup: Setup,
     ts: Any,
-    setting: dict[str, Any],
-    method: AbstractMethod,
-    vi_solver: AbstractSolver,
-    moduli: dict[str, Any],
     *,
     fixed: bool,
     measure: bool,
@@ -40,31 +49,31 @@ def integrate(
     max_steps: int,
     adjoint: str,
     progress: bool,
-) -> Solution:
-    dtype = jnp.result_type(*jtu.tree_leaves(x0))
-    s = {name: jnp.asarray(value, dtype) for name, value in setting.items()}
-    t0, t1 = s["t0"], s["t1"]
+) -> Computed:
+    problem, x0, args, method = setup.problem, setup.x0, setup.args, setup.method
+    dtype, t0, t1 = setup.dtype, setup.number("t0"), setup.number("t1")
     # Shapes and knots are looked at here, while tracing: a call that is compiled pays nothing.
     problem.check(t0, x0, args)
     knots = jnp.asarray(problem.knots(t0, t1, x0, args), dtype)
     if fixed:
         max_steps += knots.shape[0]
     state, control = problem.spaces(x0)
-    generator = problem.generator(args)
-    flow = _flow(problem, x0, args, t0, generator, vi_solver, moduli, s, dtype, method)
+    flow = setup.flow()
 
     uniform = None
     if fixed:
         stops = jnp.concatenate([t0[None], knots, t1[None]])
-        controller = Fixed(s["dt"], stops)
+        controller = Fixed(setup.number("dt"), stops)
         first = None
         if knots.shape[0] == 0:
-            length = (t1 - t0) / step_count(t1 - t0, s["dt"])
-            uniform = generator.propagator(length, method.degree + 1)
+            length = (t1 - t0) / step_count(t1 - t0, setup.number("dt"))
+            uniform = flow.generator.propagator(length, method.degree + 1)
     else:
         sizes = root_mean_squares(state)
-        controller = Adaptive(s["rtol"], s["atol"], sizes, s["horizon"], knots, t1)
-        first = s["dt0"]
+        controller = Adaptive(
+            setup.number("rtol"), setup.number("atol"), sizes, setup.number("horizon"), knots, t1
+        )
+        first = setup.number("dt0")
     stepper = Stepper(method, flow, measure, careful, (t0, t1), uniform)
 
     zero = jnp.zeros((), dtype)
@@ -93,7 +102,7 @@ def integrate(
     assert out.ts is not None and out.ys is not None and out.controller_state is not None
     times = out.ts[0]
     xs, defect, law_defect = out.ys[0]
-    us, ys, residual, law_error = _responses(flow, times, xs, control, moduli)
+    us, ys, residual, law_error = _responses(flow, times, xs, control, setup.moduli)
     if adjoint == "forward":
         xs, us, ys = forward_only((xs, us, ys))
     records = out.ys[2] if dense else None
@@ -104,13 +113,9 @@ def integrate(
         "t": out.ts[1][0],
         "x": jtu.tree_map(lambda leaf: leaf[0], out.ys[1][0]),
         "defect": out.ys[1][1][0],
-        "next_dt": s["dt"] if fixed else out.controller_state.length,
-        "setting": setting,
-        "enclosed": flow.enclosed,
-        "x0": x0,
-        "method": method,
+        "next_dt": setup.number("dt") if fixed else out.controller_state.length,
     }
-    return Solution(
+    return Computed(
         ts=times,
         xs=xs,
         us=us,
@@ -125,48 +130,9 @@ def integrate(
             RESULTS.nonfinite,
             result,
         ),
-        flow=flow,
         records=records,
+        enclosed=flow.enclosed,
     )
-
-
-def _flow(problem, x0, args, t0, generator, vi_solver, moduli, s, dtype, method) -> Flow:
-    like = problem.zero_control(x0)
-    K = problem.set_at(t0, args)
-    frozen = problem.frozen(t0, x0, args)
-    structure = analyse(frozen, like)
-    intervals = structure.pointwise and structure.affine and K.intervals(like) is not None
-    closed = intervals or (structure.isotropic and not isinstance(like, tuple))
-    solver = vi_solver
-    if isinstance(vi_solver, Auto):
-        solver = vi_solver.choose(frozen, K, like)
-    direct = closed and isinstance(vi_solver, Auto)
-    # A thousandth of what the defect may be, and no less than rounding allows.
-    floor = 100 * jnp.finfo(dtype).eps
-    tol = jnp.maximum(1e-3 * (s["atol"] + s["rtol"]) / jnp.maximum(1.0, s["horizon"]), floor)
-    tol = jnp.where(jnp.isnan(s["dt"]), tol, jnp.maximum(1e-12, floor))
-    operator = problem.operator(args)
-    reciprocal = None
-    if direct and independent(lambda t, x: slope(problem, operator, t, x, args), t0, x0):
-        reciprocal = jtu.tree_map(jnp.reciprocal, slope(problem, operator, t0, x0, args))
-        if structure.isotropic:
-            # One number a part: read from memory once, not once an entry.
-            reciprocal = jtu.tree_map(lambda leaf: leaf.ravel()[0], reciprocal)
-    flow = Flow(
-        problem, args, generator, operator, solver, direct, reciprocal, False, tol,
-        moduli.get("gamma"), moduli.get("L_F"),
-    )  # fmt: skip
-    if direct and intervals and method.degree <= 1 and _can_enclose(flow, t0, x0):
-        return dataclasses.replace(flow, enclosed=True)
-    return flow
-
-
-def _can_enclose(flow: Flow, t0, x0) -> bool:
-    try:
-        jax.eval_shape(lambda t, x: flow.enclosure(constant(t), constant(x)), t0, x0)
-    except NoEnclosure:
-        return False
-    return True
 
 
 def _responses(flow: Flow, times, xs, control, moduli):

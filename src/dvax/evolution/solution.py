@@ -10,7 +10,7 @@ import numpy as np
 from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem, SolveError
-from .flow import Flow
+from .setup import Setup
 from .stepper import Record, inside
 
 if TYPE_CHECKING:
@@ -46,8 +46,25 @@ class Solution(eqx.Module):
       the exact solution of the system with a disturbance p − f̃ of that size. `law_defect` is the same
       integral of ‖w‖ over the frozen solves. Both None where not measured (fixed steps, unless
       `measure=True`). `dvax.bound_error` turns them into error bounds;
-    - `stats`: steps, accepted and rejected, and the settings that fixed them;
-    - `result`: `dvax.RESULTS.successful`, or what went wrong.
+    - `enclosed`: whether the defect is an enclosure over every step (`dvax.evolution.chords`) or an
+      estimate from samples;
+    - `stats`: steps accepted and rejected, and where the run stands: t, x and the next step;
+    - `result`: `dvax.RESULTS.successful`, or what went wrong;
+    - `setup`: what was asked; `records`: the steps, where `dense=True` kept them.
+
+    ```python
+    >>> import dvax
+    >>> model = dvax.models.Contact(alpha=1.0, beta=1.0, b_x=2.0, b_u=1.0, d_x=0.5, d_u=1.0,
+    ...                             kappa0=0.5, g=1.0, ell=3.0)
+    >>> sol = dvax.solve(model.problem, -1.0, 0.0, 2.0, ts=[0.0, 1.0, 2.0], dense=True,
+    ...                  max_steps=10_000)
+    >>> sol.xs.shape, sol.enclosed
+    ((3,), True)
+    >>> x, u = sol.evaluate(0.4)
+    >>> print(f"{float(u):.3f}")
+    0.288
+
+    ```
     """
 
     ts: jax.Array
@@ -60,8 +77,9 @@ class Solution(eqx.Module):
     law_defect: jax.Array | None
     stats: dict[str, Any]
     result: RESULTS
-    flow: Flow
     records: Record | None
+    enclosed: bool = eqx.field(static=True)
+    setup: Setup
 
     def evaluate(self, t: Any) -> tuple[Tree, Tree]:
         """(x(t), u(t)) at any time of a solve made with `dense=True`.
@@ -79,6 +97,7 @@ class Solution(eqx.Module):
                     "Solve with dense=True, or name the times in ts=",
                 )
             )
+        flow = self.setup.flow()
         t = jnp.asarray(t, self.records.start.dtype)
         starts = self.records.start
         first, last = starts[0], jnp.max(jnp.where(jnp.isfinite(starts), starts, -jnp.inf))
@@ -95,9 +114,9 @@ class Solution(eqx.Module):
                 )
             )
         theta = (t - step.start) / step.length
-        x = inside(self.flow.generator, step.length, theta, step.x0, step.coefficients)
-        rate = self.flow.rate(t, x, None)
-        return x, self.flow.operator.inverse(rate.y)
+        x = inside(flow.generator, step.length, theta, step.x0, step.coefficients)
+        rate = flow.rate(t, x, None)
+        return x, flow.operator.inverse(rate.y)
 
     def raise_if_failed(self) -> "Solution":
         """This solution, or a `dvax.SolveError` that carries it."""

@@ -15,8 +15,9 @@ from ..problem import Problem
 from ..vi import AbstractSolver, Auto
 from .arguments import bound_steps, check, warn_precision
 from .diagnose import diagnose
-from .integrate import integrate
+from .integrate import Computed, integrate
 from .method import ETD2RK, AbstractMethod
+from .setup import Setup
 from .solution import RESULTS, Solution
 
 
@@ -114,9 +115,10 @@ def solve(
     }
     # Likewise for a number handed to f and h; integers and flags stay what they are.
     args = jax.tree_util.tree_map(lambda v: jnp.asarray(v) if isinstance(v, float) else v, args)
-    call = (problem, x0, args, None if ts is None else _times(ts), setting)
-    rest = (method, Auto() if vi_solver is None else vi_solver, _moduli(constants))
-    solution = _differentiably(call, rest, run)
+    vi_solver = Auto() if vi_solver is None else vi_solver
+    setup = Setup(problem, x0, args, setting, method, vi_solver, _moduli(constants))
+    times = None if ts is None else _times(ts)
+    solution = _solution(setup, _differentiably(setup, times, run))
     if _tree.is_concrete(solution.result, solution.ts, solution.xs):
         solution = _trim(solution)
         if solution.result != RESULTS.successful:
@@ -124,15 +126,20 @@ def solve(
             problem.knots(t0, t1, x0, args)
             if fixed:
                 # Once more, keeping the last good state, to say where it went wrong.
-                solution = _trim(integrate(*call, *rest, **{**run, "careful": True}))
+                again = integrate(setup, times, **{**run, "careful": True})
+                solution = _trim(_solution(setup, again))
             if throw:
                 raise SolveError(_explain(solution), solution)
     return solution
 
 
-def _differentiably(call: tuple, rest: tuple, run: dict[str, Any]) -> Solution:
+def _solution(setup: Setup, computed: Computed) -> Solution:
+    return Solution(setup=setup, **computed._asdict())
+
+
+def _differentiably(setup: Setup, times: Any, run: dict[str, Any]) -> Computed:
     try:
-        return integrate(*call, *rest, **run)
+        return integrate(setup, times, **run)
     except (TypeError, ValueError) as error:
         forward = "forward-mode autodiff" in str(error) or "custom_vjp" in str(error)
         if run["adjoint"] == "reverse" and forward:
@@ -175,7 +182,7 @@ def _trim(solution: Solution) -> Solution:
 
 
 def _explain(solution: Solution) -> str:
-    where = diagnose(solution.flow, solution.stats["t"], solution.stats["x"])
+    where = diagnose(solution.setup.flow(), solution.stats["t"], solution.stats["x"])
     sentence = RESULTS[solution.result]
     reached = f"Stopped at t = {float(solution.stats['t']):.17g} after "
     reached += f"{int(solution.stats['steps'])} steps."

@@ -135,7 +135,7 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
     term_structure: ClassVar = MildTerm
 
     @property
-    def interpolation_cls(self) -> Callable[..., Interpolation]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def interpolation_cls(self) -> Callable[..., Interpolation]:
         return functools.partial(Interpolation, generator=self.flow.generator)
 
     def order(self, terms):

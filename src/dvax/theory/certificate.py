@@ -75,7 +75,7 @@ def bound_error(
 
     ```
     """
-    if sol.flow.problem is not problem and sol.flow.problem != problem:
+    if sol.setup.problem is not problem and sol.setup.problem != problem:
         raise InputError(
             InputProblem(
                 "dvax.bound_error(problem, sol)",
@@ -97,7 +97,7 @@ def bound_error(
     law_error = sol.law_error
     if law_error is None:
         law_error = c.norm_P_inv * sol.law_residual / c.gamma
-    t0 = jnp.asarray(sol.stats["setting"]["t0"], sol.ts.dtype)
+    t0 = jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
 
     def propagated(rate: Any, M: Any) -> jax.Array:
         return _gronwall(t0, sol.ts, impulse, rate, M, initial_error) + apart
@@ -112,7 +112,7 @@ def bound_error(
         u_sharp=None if sharp is None else c.L * sharp + law_error,
         status=weakest(
             c.status_of(*(name for name, _ in c.statuses)),
-            "proved" if measured.flow.enclosed else "estimated",
+            "proved" if measured.enclosed else "estimated",
         ),
     )
 
@@ -138,8 +138,8 @@ def _gronwall(t0: Any, ts: Any, impulse: Any, rate: Any, M: Any, initial: Any) -
 
 
 def _again(problem: Problem, sol: Solution) -> Solution:
-    s = sol.stats["setting"]
+    was = sol.setup
     return solve(
-        problem, sol.stats["x0"], s["t0"], s["t1"], sol.flow.args, sol.ts, s["dt"],
-        method=sol.stats["method"], vi_solver=sol.flow.solver, measure=True,
+        problem, was.x0, was.setting["t0"], was.setting["t1"], was.args, sol.ts, was.setting["dt"],
+        method=was.method, vi_solver=was.vi_solver, measure=True,
     )  # fmt: skip

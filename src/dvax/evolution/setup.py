@@ -1,0 +1,86 @@
+"""What was asked of a solve, and the flow that it settles."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .._tree import Tree
+from ..problem import Problem
+from ..vi import AbstractSolver, Auto, analyse, independent
+from .chords import NoEnclosure, constant
+from .flow import Flow, slope
+from .method import AbstractMethod
+
+
+class Setup(eqx.Module):
+    """The arguments of a solve that its solution is a function of.
+
+    `setting` holds the numbers: t0, t1, dt (NaN for adaptive steps), rtol, atol, dt0, horizon;
+    `moduli` those of γ, L_F and ‖P⁻¹‖ that are known.
+    """
+
+    problem: Problem
+    x0: Tree
+    args: Any
+    setting: dict[str, Any]
+    method: AbstractMethod
+    vi_solver: AbstractSolver
+    moduli: dict[str, Any]
+
+    @property
+    def dtype(self) -> Any:
+        """The floating type of the state, which time shares."""
+        return jnp.result_type(*jtu.tree_leaves(self.x0))
+
+    def number(self, name: str) -> jax.Array:
+        """An entry of `setting`, in the type of the state."""
+        return jnp.asarray(self.setting[name], self.dtype)
+
+    def flow(self) -> Flow:
+        """The reduced map, with what the code of f, h and K proves about the law put to use."""
+        problem, x0, args, vi_solver = self.problem, self.x0, self.args, self.vi_solver
+        t0 = self.number("t0")
+        like = problem.zero_control(x0)
+        K = problem.set_at(t0, args)
+        frozen = problem.frozen(t0, x0, args)
+        structure = analyse(frozen, like)
+        intervals = structure.pointwise and structure.affine and K.intervals(like) is not None
+        closed = intervals or (structure.isotropic and not isinstance(like, tuple))
+        solver = vi_solver
+        if isinstance(vi_solver, Auto):
+            solver = vi_solver.choose(frozen, K, like)
+        direct = closed and isinstance(vi_solver, Auto)
+        operator = problem.operator(args)
+        reciprocal = None
+        if direct and independent(lambda t, x: slope(problem, operator, t, x, args), t0, x0):
+            reciprocal = jtu.tree_map(jnp.reciprocal, slope(problem, operator, t0, x0, args))
+            if structure.isotropic:
+                # One number a part: read from memory once, not once an entry.
+                reciprocal = jtu.tree_map(lambda leaf: leaf.ravel()[0], reciprocal)
+        flow = Flow(
+            problem, args, problem.generator(args), operator, solver, direct, reciprocal, False,
+            self._tolerance(), self.moduli.get("gamma"), self.moduli.get("L_F"),
+        )  # fmt: skip
+        if direct and intervals and self.method.degree <= 1 and _can_enclose(flow, t0, x0):
+            return dataclasses.replace(flow, enclosed=True)
+        return flow
+
+    def _tolerance(self) -> jax.Array:
+        """Of the law: a thousandth of what the defect may be, and no less than rounding allows."""
+        floor = 100 * jnp.finfo(self.dtype).eps
+        defect = self.number("atol") + self.number("rtol")
+        adaptive = 1e-3 * defect / jnp.maximum(1.0, self.number("horizon"))
+        fixed = jnp.isnan(self.number("dt"))
+        return jnp.maximum(jnp.where(fixed, adaptive, 1e-12), floor)
+
+
+def _can_enclose(flow: Flow, t0: jax.Array, x0: Tree) -> bool:
+    try:
+        jax.eval_shape(lambda t, x: flow.enclosure(constant(t), constant(x)), t0, x0)
+    except NoEnclosure:
+        return False
+    return True
