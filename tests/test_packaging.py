@@ -115,7 +115,9 @@ print("heavy:", *(name for name in {HEAVY!r} if name in sys.modules))
 
 @pytest.mark.parametrize("arguments", [(), ("run",), ("demo",)], ids=" ".join)
 def test_help_loads_nothing_heavy(arguments: tuple[str, ...]):
-    assert help_of(*arguments) == ""
+    # Typer itself loads pydantic, where it is installed, to look at a command's parameters.
+    allowed = {"pydantic"} if arguments else set()
+    assert set(help_of(*arguments).split()) <= allowed
 
 
 @pytest.mark.thorough

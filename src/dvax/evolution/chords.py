@@ -173,7 +173,7 @@ _UNARY: dict[str, Callable[[Chord], Chord]] = {
 }
 _KEEPING = {
     "broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "slice", "rev",
-    "reduce_sum", "copy", "copy_p", "stop_gradient", "concatenate", "reduce_precision",
+    "reduce_sum", "copy", "copy_p", "stop_gradient", "concatenate", "stack", "reduce_precision",
 }  # fmt: skip
 _COMPARE = {"lt", "le", "gt", "ge", "eq", "ne", "lt_to", "le_to", "eq_to"}
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "checkpoint"}
@@ -221,6 +221,12 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
         return [_compare(_lift(given[0]), _lift(given[1]), bind)]
     if not all(jnp.issubdtype(atom.aval.dtype, jnp.floating) for atom in eqn.invars):
         return [_discrete(given, bind)]
+    if (
+        len(given) == 2
+        and not all(map(is_chord, given))
+        and name in ("add", "add_any", "sub", "mul")
+    ):
+        return [_with_constant(name, given, bind)]
     x = [_lift(value) for value in given]
     if name in _UNARY:
         return [_UNARY[name](x[0])]
@@ -252,6 +258,16 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
         ]
         return [Chord(*(bind(sides[0][i], sides[1][i]) for i in range(3)))]
     raise NoEnclosure(name)
+
+
+def _with_constant(name: str, given: list[Any], bind: Callable) -> Chord:
+    """A sum or product with what does not move: nothing bends, and laws are mostly made of these."""
+    first = is_chord(given[0])
+    chord, c = (given[0], given[1]) if first else (given[1], given[0])
+    a, b = (bind(chord.a, c), bind(chord.b, c)) if first else (bind(c, chord.a), bind(c, chord.b))
+    if name != "mul":
+        return Chord(a, b, jnp.broadcast_to(chord.dev, a.shape))
+    return Chord(a, b, _safe(jnp.abs(c), chord.dev))
 
 
 def _lift(value: Any) -> Chord:

@@ -83,7 +83,8 @@ def integrate(
         t1=ts is None,
         fn=lambda t, y, args: (y.x, y.defect, y.law_defect),
     )
-    last = diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: (y.x, y.defect, y.law_defect))
+    # Where the run ended, unless that is what is saved anyway.
+    last = None if ts is None else diffrax.SubSaveAt(t1=True, fn=saved.fn)
     steps = diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: y.record) if dense else None
     out = diffrax.diffeqsolve(
         MildTerm(),
@@ -107,12 +108,13 @@ def integrate(
         xs, us, ys = forward_only((xs, us, ys))
     records = out.ys[2] if dense else None
     result = _translate(out.result)
+    end = 0 if ts is None else 1
+    last_x = jtu.tree_map(lambda leaf: leaf[0], out.ys[end][0])
     stats = {
         "steps": out.stats["num_accepted_steps"],
         "rejected": out.stats["num_rejected_steps"],
-        "t": out.ts[1][0],
-        "x": jtu.tree_map(lambda leaf: leaf[0], out.ys[1][0]),
-        "defect": out.ys[1][1][0],
+        "t": out.ts[end][0],
+        "x": last_x,
         "next_dt": setup.number("dt") if fixed else out.controller_state.length,
     }
     return Computed(
@@ -126,7 +128,7 @@ def integrate(
         law_defect=law_defect if measure else None,
         stats=stats,
         result=RESULTS.where(
-            (result == RESULTS.successful) & ~_tree.all_finite(out.ys[1][0]),
+            (result == RESULTS.successful) & ~_tree.all_finite(last_x),
             RESULTS.nonfinite,
             result,
         ),

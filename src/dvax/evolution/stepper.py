@@ -58,7 +58,6 @@ class Memory(NamedTuple):
     length: jax.Array | None
     full: AbstractPropagator | None
     half: AbstractPropagator | None
-    count: jax.Array | None
 
 
 class Sample(NamedTuple):
@@ -155,11 +154,9 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         start = self._within(t0, t1, 0.0)
         rate = self._kept(self.flow.rate(start, y0.x, guess)) if self.measure else None
         half = self._half(h)
-        sparse = not (self.measure or self.careful) and _size(y0.x) > _SMALL
-        count = jnp.asarray(0) if sparse else None
         if self.uniform is not None:
-            return Memory(rate, guess, None, None, half, count)
-        return Memory(rate, guess, h, self._propagator(h), half, count)
+            return Memory(rate, guess, None, None, half)
+        return Memory(rate, guess, h, self._propagator(h), half)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
@@ -188,7 +185,10 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
             finite = _tree.all_finite(first.value)
         else:
             last, defect, law_defect = stages[-1], 0.0, 0.0
-            finite = self._finite(x1, memory.count)
+            # A look at a large state costs half a step, and a bad entry stays bad (x₁ contains
+            # e^{hA}x₀), so `solve` looks at the end and, where it must, runs again carefully.
+            look = self.careful or _size(x1) <= _SMALL
+            finite = _tree.all_finite(x1) if look else jnp.asarray(True)
 
         solved = jnp.all(jnp.stack([stage.solved for stage in stages]))
         unsolved: Any = diffrax.RESULTS.nonlinear_max_steps_reached
@@ -205,7 +205,6 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         memory = memory._replace(
             rate=self._kept(last) if self.measure else None,
             guess=None if self.flow.direct else last.y,
-            count=None if memory.count is None else memory.count + 1,
         )
         info = {"before": y0, "after": y1, "coefficients": c}
         return y1, estimate, info, memory, result
@@ -218,16 +217,6 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         return lax.cond(
             made_jump, lambda: self._kept(self.flow.rate(start, x0, memory.guess)), lambda: kept
         )
-
-    def _finite(self, x: Tree, count: Any) -> jax.Array:
-        """Whether x is finite; of a large x, looked at every 64th step only.
-
-        A look costs half a step, and a bad entry stays bad (x₁ contains e^{hA}x₀). `solve` looks at
-        the end once more, and on failure runs again, carefully, to name the step.
-        """
-        if count is None:
-            return _tree.all_finite(x)
-        return lax.cond(count % 64 == 63, _tree.all_finite, lambda _: jnp.asarray(True), x)
 
     def _within(self, t0: Any, t1: Any, theta: float) -> Any:
         """t₀ + θh, with the ends approached from inside: data may jump there.

@@ -56,7 +56,7 @@ _POINTWISE = {
 }  # fmt: skip
 _MIXING = {
     "reshape", "squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "slice",
-    "dynamic_slice", "concatenate", "pad", "reduce_sum", "cumsum", "gather", "split",
+    "dynamic_slice", "concatenate", "stack", "pad", "reduce_sum", "cumsum", "gather", "split",
 }  # fmt: skip
 _ELEMENTWISE = {"div", "convert_element_type"}
 _FLAT = _LINEAR | _SUM | _PRODUCT | _POINTWISE | _ELEMENTWISE | {"broadcast_in_dim"}
@@ -171,7 +171,11 @@ def _rule(
         return _Mark(2, leaf, False)
     if name in _MIXING:
         # Indices and start positions that depend on y would not be linear in it.
-        indices_fixed = all(mark is None for mark in given[1:]) or name in ("concatenate", "pad")
+        indices_fixed = all(mark is None for mark in given[1:]) or name in (
+            "concatenate",
+            "stack",
+            "pad",
+        )
         keeps = name in ("reshape", "squeeze", "broadcast_in_dim")
         # A reshape may permute the axes first.
         keeps = keeps and eqn.params.get("dimensions") in (None, ())

@@ -1,0 +1,126 @@
+"""Chord arithmetic: what it says a function may leave its chord by, the function never exceeds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import dvax
+from dvax.evolution.chords import Chord, NoEnclosure, constant, enclose, straight
+
+TABLE = dvax.signals.Table([0.0, 1.0, 2.5, 4.0], [0.0, 3.0, -1.0, 2.0])
+STAIRS = dvax.signals.Table([0.0, 1.0, 2.5, 4.0], [0.0, 3.0, -1.0, 2.0], kind="constant")
+SPLINE = dvax.signals.Table([0.0, 1.0, 2.5, 4.0], [0.0, 3.0, -1.0, 2.0], kind="cubic")
+PROFILE = jnp.array([0.5, -1.0, 2.0])
+
+FUNCTIONS = {
+    "affine": lambda t: 3.0 - 2.0 * t,
+    "square": lambda t: (t - 1.3) ** 2,
+    "cubic": lambda t: t**3 - 2.0 * t**2,
+    "reciprocal": lambda t: 1.0 / (0.5 + t),
+    "negative power": lambda t: (1.0 + t) ** -2,
+    "exponential": lambda t: jnp.exp(-t) * jnp.sin(3.0 * t),
+    "trigonometric": lambda t: jnp.cos(t * t),
+    "root": lambda t: jnp.sqrt(1.0 + t * t),
+    "logarithm": lambda t: jnp.log(1.0 + jnp.abs(jnp.sin(t))),
+    "clip": lambda t: jnp.clip(5.0 * jnp.sin(2.0 * t), -1.0, 1.0),
+    "maximum of two": lambda t: jnp.maximum(jnp.sin(t), 0.3 * t),
+    "where on time": lambda t: jnp.where(t > 1.7, 2.0 * t, 1.0),
+    "modulus": lambda t: jnp.abs(t - 2.0) * jnp.exp(0.3 * t),
+    "tanh of a product": lambda t: jnp.tanh(t * jnp.cos(t)),
+    "field": lambda t: PROFILE * jnp.exp(PROFILE * 0.3 * t) + jnp.minimum(t, PROFILE),
+    "matrix": lambda t: jnp.array([[1.0, -2.0], [0.5, 3.0]]) @ jnp.stack([jnp.sin(t), t * t]),
+    "sum": lambda t: jnp.sum(PROFILE * t * t),
+}
+
+
+def farthest(fn, t0, t1):
+    """How far fn leaves its chord on a fine grid, entry by entry."""
+    theta = jnp.linspace(0.0, 1.0, 801)
+    values = jax.vmap(lambda s: jnp.asarray(fn(t0 + s * (t1 - t0))))(theta)
+    weight = theta.reshape((-1,) + (1,) * (values.ndim - 1))
+    return np.abs(values - ((1 - weight) * values[:1] + weight * values[-1:])).max(axis=0)
+
+
+def enclosed(fn, t0, t1):
+    return enclose(fn, straight(jnp.asarray(t0), jnp.asarray(t1)))
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+@settings(max_examples=25)
+@given(t0=st.floats(0.0, 3.5), length=st.floats(1e-4, 0.5))
+def test_a_function_stays_within_its_bound(name, t0, length):
+    fn, t1 = FUNCTIONS[name], t0 + length
+    chord = enclosed(fn, t0, t1)
+    np.testing.assert_allclose(chord.a, fn(t0), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(chord.b, fn(t1), rtol=1e-12, atol=1e-12)
+    assert np.all(farthest(fn, t0, t1) <= np.asarray(chord.dev) + 1e-12)
+
+
+@pytest.mark.parametrize("name", ["square", "exponential", "root", "tanh of a product"])
+def test_where_things_are_smooth_the_bound_is_of_second_order_and_not_far_off(name):
+    bounds = [float(enclosed(FUNCTIONS[name], 0.9, 0.9 + h).dev) for h in (0.1, 0.05, 0.025)]
+    assert bounds[0] / bounds[1] == pytest.approx(4.0, rel=0.25)
+    assert bounds[1] / bounds[2] == pytest.approx(4.0, rel=0.15)
+    assert bounds[2] <= 30 * float(farthest(FUNCTIONS[name], 0.9, 0.925))
+
+
+def test_deep_inside_a_bound_nothing_is_left_of_what_is_clipped_away():
+    chord = enclosed(lambda t: jnp.clip(10.0 + jnp.sin(t), 0.0, 1.0), 0.0, 1.0)
+    assert float(chord.dev) == 0.0
+
+
+def test_a_single_kink_of_a_line_is_exact():
+    chord = enclosed(lambda t: jnp.maximum(t - 0.25, 0.0), 0.0, 1.0)
+    assert float(chord.dev) == pytest.approx(0.75 * 0.25)
+
+
+@pytest.mark.parametrize("signal", [TABLE, STAIRS, SPLINE], ids=["linear", "constant", "cubic"])
+@pytest.mark.parametrize(("t0", "t1"), [(0.0, 1.0), (0.2, 0.7), (1.0, 2.5), (3.9, 4.0)])
+def test_measured_data_between_two_knots(signal, t0, t1):
+    last = np.nextafter(t1, 0.0)  # a step ends just inside
+    chord = enclosed(signal.value, t0, last)
+    found = farthest(signal.value, t0, last)
+    assert np.isfinite(chord.dev) and found <= float(chord.dev) + 1e-12
+    if signal is not SPLINE:
+        assert float(chord.dev) <= 1e-12
+
+
+def test_data_across_a_knot_has_no_finite_bound_rather_than_a_wrong_one():
+    chord = enclosed(STAIRS.value, 0.9, 1.1)
+    assert not float(chord.dev) < 3.0
+
+
+def test_an_operation_without_a_rule_is_named():
+    with pytest.raises(NoEnclosure, match="erf"):
+        enclosed(jax.scipy.special.erf, 0.0, 1.0)
+
+
+def test_a_bend_of_the_trajectory_is_never_less_than_it_is():
+    space = dvax.spaces.Euclidean(2)
+    generators = {
+        "scalar": dvax.generators.Scalar(-3.0),
+        "diagonal": dvax.generators.Diagonal(jnp.array([-40.0, 0.7])),
+        "dense": dvax.generators.Dense(jnp.array([[-1.0, 6.0], [-6.0, -0.2]])),
+    }
+    rng = np.random.default_rng(1)
+    for A in generators.values():
+        for h in (0.3, 0.01):
+            x0, c0, c1 = (jnp.asarray(rng.normal(size=2)) for _ in range(3))
+
+            def at(theta, A=A, h=h, x0=x0, c0=c0, c1=c1):
+                return A.propagator(theta * h, 2).step(x0, (c0, theta * c1))
+
+            bend = A.bend(h, x0, at(1.0), (c0, c1), space)
+            assert np.all(farthest(at, 0.0, 1.0) <= np.asarray(bend) * (1 + 1e-12))
+
+
+def test_constants_do_not_move():
+    chord = enclose(
+        lambda a, t: a * a + t,
+        constant(jnp.asarray(3.0)),
+        Chord(*map(jnp.asarray, (0.0, 1.0, 0.5))),
+    )
+    assert (float(chord.a), float(chord.b), float(chord.dev)) == (9.0, 10.0, 0.5)
