@@ -202,7 +202,9 @@ def _points(
             continue
         index = boundary.nearest(place)
         at = tuple(float(c[index]) for c in boundary.coordinates)
-        if at != place:
+        extent = max(float(np.ptp(c)) for c in boundary.coordinates)
+        # Half a cell away is where the point is; a visible distance is worth a word.
+        if max(abs(a - p) for a, p in zip(at, place, strict=True)) > 0.01 * extent:
             notices.append(
                 f"Point of interest {list(place)} {units.length}: the nearest point is "
                 f"{[float(f'{a:.9g}') for a in at]} {units.length}."
