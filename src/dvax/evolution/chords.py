@@ -10,8 +10,7 @@ the user's f and h, read off its jaxpr, has a rule that keeps that true:
     smooth φ     sup|φ′| dev + sup|φ″| Δ²/8 over the range of the argument
 
 So a deviation is O(h²) where things are smooth, O(h) where a kink lies inside the step, and never
-too small: an enclosure, where samples would be a guess. Every rule's error has at most 3/4 of its
-bound as its root mean square over the step (a parabola has √(8/15), a tent √(1/3)).
+too small: an enclosure, where samples would be a guess.
 
 What has no rule raises `NoEnclosure`, and the defect is sampled instead, and called estimated.
 """
@@ -26,9 +25,6 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from .._tree import Tree
-
-ROOT_MEAN_SQUARE = 0.75
-"""√(∫dev(θ)²dθ) ≤ this times the bound: see above."""
 
 
 class NoEnclosure(Exception):
@@ -118,11 +114,11 @@ def times(x: Chord, y: Chord) -> Chord:
 
 def _crossing(d0: jax.Array, d1: jax.Array) -> jax.Array:
     """The bend of max(0, d) for d linear from d0 to d1."""
-    # An infinite difference (an infinite bound of a box) never crosses: both ends say so alike.
-    product = -d0 * d1
-    crosses = (product > 0) & jnp.isfinite(product)
-    total = jnp.abs(d0) + jnp.abs(d1)
-    return jnp.where(crosses, product / jnp.where(crosses, total, 1.0), 0.0)
+    crosses = ((d0 < 0) & (d1 > 0)) | ((d0 > 0) & (d1 < 0))
+    total = jnp.where(crosses, jnp.abs(d0) + jnp.abs(d1), 1.0)
+    bend = jnp.abs(d0) * (jnp.abs(d1) / total)
+    # From one infinity to the other there is no bound.
+    return jnp.where(crosses, jnp.where(jnp.isnan(bend), jnp.inf, bend), 0.0)
 
 
 def _safe(factor: jax.Array, dev: jax.Array) -> jax.Array:
@@ -176,6 +172,10 @@ _KEEPING = {
     "reduce_sum", "copy", "copy_p", "stop_gradient", "concatenate", "stack", "reduce_precision",
 }  # fmt: skip
 _COMPARE = {"lt", "le", "gt", "ge", "eq", "ne", "lt_to", "le_to", "eq_to"}
+_ENTRYWISE = {
+    "and", "or", "xor", "not", "add", "sub", "mul", "max", "min", "neg", "sign", "abs",
+    "convert_element_type", "select_n", "clamp", "eq", "ne", "lt", "le", "gt", "ge",
+}  # fmt: skip
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "checkpoint"}
 _CUSTOM = {"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
 
@@ -219,8 +219,11 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
         return [_take(given, bind)]
     if name in _COMPARE:
         return [_compare(_lift(given[0]), _lift(given[1]), bind)]
-    if not all(jnp.issubdtype(atom.aval.dtype, jnp.floating) for atom in eqn.invars):
-        return [_discrete(given, bind)]
+    atoms = (*eqn.invars, *eqn.outvars)
+    if not all(jnp.issubdtype(atom.aval.dtype, jnp.floating) for atom in atoms):
+        if eqn.primitive.multiple_results:
+            raise NoEnclosure(name)
+        return [_discrete(given, bind, entrywise=name in _ENTRYWISE)]
     if (
         len(given) == 2
         and not all(map(is_chord, given))
@@ -285,7 +288,8 @@ def _compare(x: Chord, y: Chord, bind: Callable) -> Chord:
     margin = jnp.minimum(_apart(x.a, y.a), _apart(x.b, y.b))
     # A line that gives the same answer at both ends gives it in between; with a deviation, only
     # where it stays clear of zero.
-    known = (a == b) & ((dev == 0) | (margin > dev))
+    same_side = ((x.a < y.a) == (x.b < y.b)) & ((x.a > y.a) == (x.b > y.b))
+    known = (a == b) & ((dev == 0) | ((margin > dev) & same_side))
     return Chord(a, b, _zero_or_infinite(known))
 
 
@@ -294,13 +298,13 @@ def _apart(p: jax.Array, q: jax.Array) -> jax.Array:
     return jnp.abs(p.astype(real) - q.astype(real))
 
 
-def _discrete(given: list[Any], bind: Callable) -> Chord:
+def _discrete(given: list[Any], bind: Callable, entrywise: bool) -> Chord:
     """Integers and truth values: known where everything that enters stays as it is."""
     x = [_lift(value) for value in given]
     a, b = bind(*(v.a for v in x)), bind(*(v.b for v in x))
     settled = [jnp.all(v.dev == 0) & jnp.all(v.a == v.b) for v in x]
     known = jnp.all(jnp.stack(settled))
-    if all(np.shape(v.a) in ((), np.shape(a)) for v in x):
+    if entrywise and all(np.shape(v.a) in ((), np.shape(a)) for v in x):
         each = [(v.dev == 0) & (v.a == v.b) for v in x]
         known = each[0]
         for more in each[1:]:
@@ -311,7 +315,7 @@ def _discrete(given: list[Any], bind: Callable) -> Chord:
 def _select(given: list[Any], bind: Callable) -> Chord:
     which, cases = given[0], [_lift(case) for case in given[1:]]
     if not all(jnp.issubdtype(case.a.dtype, jnp.floating) for case in cases):
-        return _discrete(given, bind)
+        return _discrete(given, bind, entrywise=True)
     if not is_chord(which):
         return Chord(*(bind(which, *(case[i] for case in cases)) for i in range(3)))
     a = bind(which.a, *(case.a for case in cases))
@@ -322,7 +326,8 @@ def _select(given: list[Any], bind: Callable) -> Chord:
     worst = apart[0]
     for more in apart[1:]:
         worst = jnp.maximum(worst, more)
-    return Chord(a, b, jnp.where(which.dev == 0, settled, worst))
+    known = (which.dev == 0) & (which.a == which.b)
+    return Chord(a, b, jnp.where(known, settled, worst))
 
 
 def _take(given: list[Any], bind: Callable) -> Chord:

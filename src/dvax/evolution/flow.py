@@ -144,4 +144,4 @@ def slope(problem: Problem, operator: AbstractOperator, t: Any, x: Tree, args: A
 
 def _all_positive(tree: Tree) -> jax.Array:
     smallest_entry = jnp.stack([jnp.min(leaf) for leaf in jtu.tree_leaves(tree)])
-    return jnp.all(smallest_entry > 0)
+    return jnp.all((smallest_entry > 0) & jnp.isfinite(smallest_entry))

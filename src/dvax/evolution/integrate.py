@@ -31,6 +31,7 @@ class Computed(NamedTuple):
     law_error: jax.Array | None
     defect: jax.Array | None
     law_defect: jax.Array | None
+    settled: tuple[jax.Array, jax.Array] | None
     stats: dict[str, Any]
     result: RESULTS
     records: Record | None
@@ -81,7 +82,7 @@ def integrate(
     saved = diffrax.SubSaveAt(
         ts=ts if ts is None else jnp.asarray(ts, dtype),
         t1=ts is None,
-        fn=lambda t, y, args: (y.x, y.defect, y.law_defect),
+        fn=lambda t, y, args: (y.x, y.defect, y.law_defect, y.before),
     )
     # Where the run ended, unless that is what is saved anyway.
     last = None if ts is None else diffrax.SubSaveAt(t1=True, fn=saved.fn)
@@ -92,7 +93,7 @@ def integrate(
         t0,
         t1,
         first,
-        Carry(x0, zero, zero, record),
+        Carry(x0, zero, zero, record, (zero, zero)),
         saveat=diffrax.SaveAt(subs=(saved, last, steps), controller_state=True),
         stepsize_controller=controller,
         adjoint=adjoint_for(adjoint, max_steps, x0),
@@ -102,7 +103,7 @@ def integrate(
     )
     assert out.ts is not None and out.ys is not None and out.controller_state is not None
     times = out.ts[0]
-    xs, defect, law_defect = out.ys[0]
+    xs, defect, law_defect, before = out.ys[0]
     us, ys, residual, law_error = _responses(flow, times, xs, control, setup.moduli)
     if adjoint == "forward":
         xs, us, ys = forward_only((xs, us, ys))
@@ -126,6 +127,7 @@ def integrate(
         law_error=law_error,
         defect=defect if measure else None,
         law_defect=law_defect if measure else None,
+        settled=before if measure else None,
         stats=stats,
         result=RESULTS.where(
             (result == RESULTS.successful) & ~_tree.all_finite(last_x),

@@ -46,6 +46,7 @@ class Solution(eqx.Module):
       the exact solution of the system with a disturbance p − f̃ of that size. `law_defect` is the same
       integral of ‖w‖ over the frozen solves. Both None where not measured (fixed steps, unless
       `measure=True`). `dvax.bound_error` turns them into error bounds;
+    - `settled`: (defect, law_defect) at the start of the step that each saved time lies in;
     - `enclosed`: whether the defect is an enclosure over every step (`dvax.evolution.chords`) or an
       estimate from samples;
     - `stats`: steps accepted and rejected, and where the run stands: t, x and the next step;
@@ -75,6 +76,7 @@ class Solution(eqx.Module):
     law_error: jax.Array | None
     defect: jax.Array | None
     law_defect: jax.Array | None
+    settled: tuple[jax.Array, jax.Array] | None
     stats: dict[str, Any]
     result: RESULTS
     records: Record | None

@@ -174,7 +174,17 @@ def _trim(solution: Solution) -> Solution:
     if reached.all() and solution.records is None:
         return solution
     cut = lambda leaf: leaf[: int(reached.sum())]  # noqa: E731
-    fields = ("ts", "xs", "us", "ys", "law_residual", "law_error", "defect", "law_defect")
+    fields = (
+        "ts",
+        "xs",
+        "us",
+        "ys",
+        "law_residual",
+        "law_error",
+        "defect",
+        "law_defect",
+        "settled",
+    )
     new = [jax.tree_util.tree_map(cut, getattr(solution, name)) for name in fields]
     return eqx.tree_at(
         lambda s: [getattr(s, name) for name in fields], solution, new, is_leaf=lambda x: x is None

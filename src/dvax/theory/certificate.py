@@ -94,13 +94,15 @@ def bound_error(
     c = constants
     law_gain = c.beta_f * c.norm_P_inv / c.gamma
     impulse = measured.defect + law_gain * measured.law_defect
+    assert measured.settled is not None
+    settled = measured.settled[0] + law_gain * measured.settled[1]
     law_error = sol.law_error
     if law_error is None:
         law_error = c.norm_P_inv * sol.law_residual / c.gamma
     t0 = jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
 
     def propagated(rate: Any, M: Any) -> jax.Array:
-        return _gronwall(t0, sol.ts, impulse, rate, M, initial_error) + apart
+        return _gronwall(t0, sol.ts, impulse, settled, rate, M, initial_error) + apart
 
     x = propagated(c.growth_rate, c.M)
     sharp = None if c.one_sided is None else propagated(c.one_sided, 1.0)
@@ -118,23 +120,26 @@ def bound_error(
 
 
 @jax.jit
-def _gronwall(t0: Any, ts: Any, impulse: Any, rate: Any, M: Any, initial: Any) -> jax.Array:
+def _gronwall(
+    t0: Any, ts: Any, impulse: Any, settled: Any, rate: Any, M: Any, initial: Any
+) -> jax.Array:
     """M e^{ct} e₀ + M ∫ e^{c(t−s)} dI(s), from the impulse I known at the saved times only.
 
     Between two saved times the impulse may have acted at any moment, so each one is charged
-    e^{c₊Δ}: saving more often makes the bound sharper where trajectories approach.
+    e^{c₊Δ}; and a step under way at a saved time is charged again after it, since nothing says how
+    much of it had acted. Saving more often makes the bound sharper where trajectories approach.
     """
 
     def advance(carry: tuple, now: tuple) -> tuple:
         before, t, acted = carry
-        time, total = now
+        time, total, surely = now
         span = time - t
         after = jnp.exp(rate * span) * before
         after = after + M * jnp.exp(jnp.maximum(rate, 0.0) * span) * (total - acted)
-        return (after, time, total), after
+        return (after, time, surely), after
 
     start = (jnp.asarray(M * initial, ts.dtype), t0, jnp.zeros((), ts.dtype))
-    return lax.scan(advance, start, (ts, impulse))[1]
+    return lax.scan(advance, start, (ts, impulse, settled))[1]
 
 
 def _again(problem: Problem, sol: Solution) -> Solution:
