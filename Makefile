@@ -63,7 +63,7 @@ types: $(READY) ## pyright
 thorough: $(READY) ## the long checks: many random cases, clean environments, full benchmarks
 	HYPOTHESIS_PROFILE=thorough $(PY) -m pytest -n $(WORKERS) -m thorough --durations=15
 	$(PY) -m benchmarks --full
-	@echo 'make thorough: every test marked thorough and the full benchmarks have passed'
+	@echo 'make thorough: every test marked thorough has passed, and the full benchmarks have run'
 
 bench: $(READY) ## dvax against the peers found here: ratios, medians of repeated runs
 	$(PY) -m benchmarks
