@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.hard_rates import RATES
 
 import dvax
 from dvax.evolution.chords import Chord, NoEnclosure, constant, enclose, straight
@@ -14,6 +15,9 @@ TABLE = dvax.signals.Table([0.0, 1.0, 2.5, 4.0], [0.0, 3.0, -1.0, 2.0])
 STAIRS = dvax.signals.Table([0.0, 1.0, 2.5, 4.0], [0.0, 3.0, -1.0, 2.0], kind="constant")
 SPLINE = dvax.signals.Table([0.0, 1.0, 2.5, 4.0], [0.0, 3.0, -1.0, 2.0], kind="cubic")
 PROFILE = jnp.array([0.5, -1.0, 2.0])
+UNRULED = {
+    "a remainder", "a choice among three", "a condition", "a loop", "the larger of sorted",
+}  # fmt: skip
 
 FUNCTIONS = {
     "affine": lambda t: 3.0 - 2.0 * t,
@@ -57,6 +61,34 @@ def test_a_function_stays_within_its_bound(name, t0, length):
     np.testing.assert_allclose(chord.a, fn(t0), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(chord.b, fn(t1), rtol=1e-12, atol=1e-12)
     assert np.all(farthest(fn, t0, t1) <= np.asarray(chord.dev) + 1e-12)
+
+
+@pytest.mark.parametrize("name", RATES)
+def test_what_is_made_to_deceive_is_enclosed_or_refused(name):
+    rate, breaks = RATES[name]
+    rng = np.random.default_rng(0)
+    spans = [(k / n, (k + 1) / n) for n in (1, 4, 7) for k in range(n)]
+    spans += [tuple(np.sort(rng.uniform(0.0, 1.0, 2))) for _ in range(20)]
+    spans += [(s, min(1.0, s + 0.1)) for s in breaks] + [(max(0.0, s - 0.1), s) for s in breaks]
+    if name in UNRULED:
+        with pytest.raises(NoEnclosure):
+            enclosed(rate, 0.0, 1.0)
+        return
+    for t0, t1 in spans:
+        chord = enclosed(rate, t0, t1)
+        assert np.all(farthest(rate, t0, t1) <= np.asarray(chord.dev) + 1e-9), (t0, t1)
+
+
+def test_single_precision_is_kept_where_double_is_the_default():
+    for name in ("where on time", "clip", "modulus", "square"):
+        chord = enclose(FUNCTIONS[name], straight(jnp.float32(0.9), jnp.float32(1.9)))
+        assert {part.dtype for part in chord} == {jnp.dtype("float32")}, name
+
+
+def test_a_crossing_too_large_for_single_precision_is_bounded():
+    steep = lambda t: jnp.maximum(0.0, 4e20 * (t - 0.5))  # noqa: E731
+    chord = enclose(steep, straight(jnp.float32(0.0), jnp.float32(1.0)))
+    assert float(chord.dev) == pytest.approx(1e20, rel=1e-6)
 
 
 @pytest.mark.parametrize("name", ["square", "exponential", "root", "tanh of a product"])

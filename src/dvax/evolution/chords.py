@@ -76,10 +76,14 @@ def enclose(fn: Callable[..., Tree], *args: Tree) -> Tree:
 
 
 def _still(value: Any) -> jax.Array:
-    """No deviation; a floating number for whatever type."""
+    """No deviation."""
+    return jnp.zeros(jnp.shape(value), _real(value))
+
+
+def _real(value: Any) -> Any:
+    """The type of a deviation: that of the value, or for integers and truth values the shortest."""
     dtype = jnp.result_type(value)
-    real = dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.result_type(float)
-    return jnp.zeros(jnp.shape(value), real)
+    return dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.float32
 
 
 def is_chord(value: Any) -> bool:
@@ -146,6 +150,11 @@ def _power(x: Chord, n: int) -> Chord:
     return _smooth(x, lambda v: v**n, jnp.asarray(slope), jnp.asarray(bend))
 
 
+def _stairs(phi: Callable) -> Callable[[Chord], Chord]:
+    """A monotone φ of finitely many values: over the step it stays between those at the extremes."""
+    return lambda x: Chord(phi(x.a), phi(x.b), phi(x.highest) - phi(x.lowest))
+
+
 _ONE = jnp.ones_like
 _UNARY: dict[str, Callable[[Chord], Chord]] = {
     "exp": lambda x: _smooth(x, jnp.exp, jnp.exp(x.highest), jnp.exp(x.highest)),
@@ -166,6 +175,10 @@ _UNARY: dict[str, Callable[[Chord], Chord]] = {
     "abs": lambda x: largest(x, Chord(-x.a, -x.b, x.dev)),
     "neg": lambda x: Chord(-x.a, -x.b, x.dev),
     "square": lambda x: _power(x, 2),
+    "sign": _stairs(jnp.sign),
+    "floor": _stairs(jnp.floor),
+    "ceil": _stairs(jnp.ceil),
+    "round": _stairs(jnp.round),
 }
 _KEEPING = {
     "broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "slice", "rev",
@@ -277,8 +290,10 @@ def _lift(value: Any) -> Chord:
     return value if is_chord(value) else constant(jnp.asarray(value))
 
 
-def _zero_or_infinite(known: jax.Array) -> jax.Array:
-    return jnp.where(known, 0.0, jnp.inf)
+def _known(a: jax.Array, b: jax.Array, known: jax.Array) -> Chord:
+    """A value that does not change where it is known, and may be anything where it is not."""
+    dev = jnp.where(known, 0.0, jnp.inf).astype(_real(a))
+    return Chord(a, b, jnp.broadcast_to(dev, jnp.shape(a)))
 
 
 def _compare(x: Chord, y: Chord, bind: Callable) -> Chord:
@@ -290,12 +305,11 @@ def _compare(x: Chord, y: Chord, bind: Callable) -> Chord:
     # where it stays clear of zero.
     same_side = ((x.a < y.a) == (x.b < y.b)) & ((x.a > y.a) == (x.b > y.b))
     known = (a == b) & ((dev == 0) | ((margin > dev) & same_side))
-    return Chord(a, b, _zero_or_infinite(known))
+    return _known(a, b, known)
 
 
 def _apart(p: jax.Array, q: jax.Array) -> jax.Array:
-    real = jnp.result_type(float)
-    return jnp.abs(p.astype(real) - q.astype(real))
+    return jnp.abs(p.astype(_real(p)) - q.astype(_real(q)))
 
 
 def _discrete(given: list[Any], bind: Callable, entrywise: bool) -> Chord:
@@ -309,7 +323,7 @@ def _discrete(given: list[Any], bind: Callable, entrywise: bool) -> Chord:
         known = each[0]
         for more in each[1:]:
             known = known & more
-    return Chord(a, b, jnp.broadcast_to(_zero_or_infinite(known), jnp.shape(a)))
+    return _known(a, b, known)
 
 
 def _select(given: list[Any], bind: Callable) -> Chord:
@@ -341,4 +355,4 @@ def _take(given: list[Any], bind: Callable) -> Chord:
     b = bind(given[0], *(p.b for p in places))
     settled = [jnp.all(p.dev == 0) & jnp.all(p.a == p.b) for p in places]
     known = jnp.all(jnp.stack(settled))
-    return Chord(a, b, jnp.broadcast_to(_zero_or_infinite(known), jnp.shape(a)))
+    return _known(a, b, known)

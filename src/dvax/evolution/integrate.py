@@ -28,6 +28,7 @@ class Computed(NamedTuple):
     us: Tree
     ys: Tree
     law_residual: jax.Array
+    law_step: jax.Array
     law_error: jax.Array | None
     defect: jax.Array | None
     law_defect: jax.Array | None
@@ -104,7 +105,7 @@ def integrate(
     assert out.ts is not None and out.ys is not None and out.controller_state is not None
     times = out.ts[0]
     xs, defect, law_defect, before = out.ys[0]
-    us, ys, residual, law_error = _responses(flow, times, xs, control, setup.moduli)
+    us, ys, residual, law_step, law_error = _responses(flow, times, xs, control, setup.moduli)
     if adjoint == "forward":
         xs, us, ys = forward_only((xs, us, ys))
     records = out.ys[2] if dense else None
@@ -124,6 +125,7 @@ def integrate(
         us=us,
         ys=ys,
         law_residual=residual,
+        law_step=law_step,
         law_error=law_error,
         defect=defect if measure else None,
         law_defect=law_defect if measure else None,
@@ -154,7 +156,7 @@ def _responses(flow: Flow, times, xs, control, moduli):
         error = None
         if gamma is not None and norm_P_inv is not None:
             error = norm_P_inv * (checked.bound(gamma) + step)
-        return u, rate.y, checked.norm, error
+        return u, rate.y, checked.norm, step, error
 
     return jax.vmap(one)(times, xs)
 

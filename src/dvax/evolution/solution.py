@@ -41,7 +41,8 @@ class Solution(eqx.Module):
     - `ts`: the saved times; `xs`, `us`, `ys`: states, responses u and y = P u there, each with a
       leading time axis;
     - `law_error`: a certified bound on ‖u − u*‖ of the frozen law at each saved time (C0 of
-      `dvax.vi.certificate`), or None where γ was not given (`constants=`); `law_residual`: ‖w‖;
+      `dvax.vi.certificate`), or None where γ was not given (`constants=`), ‖P⁻¹‖(‖w‖/γ + ‖ȳ − y‖)
+      with `law_residual` = ‖w‖ and `law_step` = ‖ȳ − y‖ of one projection step from y;
     - `defect`: ∫ ‖p − f̃(·, x_h)‖ ds up to each saved time, where x_h is the computed trajectory: it is
       the exact solution of the system with a disturbance p − f̃ of that size. `law_defect` is the same
       integral of ‖w‖ over the frozen solves. Both None where not measured (fixed steps, unless
@@ -73,6 +74,7 @@ class Solution(eqx.Module):
     us: Tree
     ys: Tree
     law_residual: jax.Array
+    law_step: jax.Array
     law_error: jax.Array | None
     defect: jax.Array | None
     law_defect: jax.Array | None

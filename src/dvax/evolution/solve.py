@@ -180,6 +180,7 @@ def _trim(solution: Solution) -> Solution:
         "us",
         "ys",
         "law_residual",
+        "law_step",
         "law_error",
         "defect",
         "law_defect",

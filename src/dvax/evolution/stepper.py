@@ -301,10 +301,11 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         memory: Memory,
         last: Rate,
     ) -> Sample:
-        """The defect δ = p − f̃(·, x_h) at the middle and at the end of the step; δ(t₀) = 0.
+        """The defect δ = p − f̃(·, x_h) at the start, the middle and the end of the step.
 
         Between the samples δ is taken to be a line plus a bump (a parabola, or the tent of a kink):
-        then ∫|δ| ≤ h(½|δ(1)| + |δ(½) − ½δ(1)|), whatever the place of the kink.
+        then ∫|δ| ≤ h(½|δ(0)| + ½|δ(1)| + |δ(½) − ½(δ(0) + δ(1))|), whatever the place of the kink.
+        δ(0) is zero for a method whose polynomial starts at f̃(t₀, x₀), as most do.
         """
         h = t1 - t0
         flow = self.flow
@@ -312,8 +313,9 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         xm = memory.half.step(x0, shortened(c, 0.5))
         tm, te = self._within(t0, t1, 0.5), self._within(t0, t1, 1.0)
         middle = flow.rate(tm, xm, first.y)
-        at_end = _tree.sub(last.value, polynomial(c, 1.0))
-        line = _tree.scale(0.5, at_end)
+        start = _tree.scale(0.5, _tree.sub(first.value, c[0]))
+        end = _tree.scale(0.5, _tree.sub(last.value, polynomial(c, 1.0)))
+        line = _tree.add(start, end)
         bump = _tree.sub(_tree.sub(middle.value, polynomial(c, 0.5)), line)
 
         # How well z, the unconstrained value of the law, is predicted in the middle.
@@ -323,9 +325,9 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         unseen = jtu.tree_map(
             jnp.maximum, flow.hidden(tm, xm, middle, doubt), flow.hidden(te, x1, last, doubt)
         )
-        error = jtu.tree_map(lambda a, b, s: jnp.abs(a) + jnp.abs(b) + s, line, bump, unseen)
+        error = jtu.tree_map(lambda *parts: sum(map(jnp.abs, parts)), start, end, bump, unseen)
         space = flow.state_space(x0)
-        defect = h * (space.norm(line) + space.norm(bump) + space.norm(unseen))
+        defect = h * sum(map(space.norm, (start, end, bump, unseen)))
         residuals = [first.residual, middle.residual, last.residual]
         law_defect = h * jnp.max(jnp.stack(residuals))
         return Sample(last, error, defect, law_defect)

@@ -135,7 +135,7 @@ class _Run:
     def _blocks(self, times: np.ndarray, block: int, store: FrameStore, figures: Any) -> None:
         main, other = _Piece(self.inputs.x0), _Piece(self.inputs.companion_x0)
         apart = self.space.norm(jnp.asarray(self.inputs.x0 - self.inputs.companion_x0))
-        error, defect = jnp.zeros(()), 0.0
+        error, defect = 0.0, 0.0
         for first in range(0, len(times), block):
             wanted = times[first : first + block]
             # Blocks are of one length, so that they share one compilation: the last repeats its end.
@@ -164,7 +164,7 @@ class _Run:
             figures.add(wanted, kept)
             if failure is not None:
                 raise failure
-            error, defect = bound.x[-1] / self.constants.M, values["defect"][-1]
+            error, defect = bound, values["defect"][-1]
             self.steps += int(a.stats["steps"])
             self.rejected += int(a.stats["rejected"])
             if first == 0:

@@ -1,0 +1,88 @@
+"""A bound that is called proved stands where a step's ends see nothing of what happens inside.
+
+x' = r(t), with a law that stays out of the way: the true solution is ∫ r, by quadrature between the
+places where r jumps or bends.
+"""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from tests.hard_rates import RATES
+
+import dvax
+
+TS = np.array([0.4, 0.75, 1.0])
+METHODS = {"ETD1": dvax.ETD1(), "ETD2RK": dvax.ETD2RK()}
+ENCLOSED = (
+    "a jump in the middle", "a pulse that ends see nothing of", "a dead zone by inequality",
+    "a number turned into an integer", "a running count", "a tooth",
+)  # fmt: skip
+SAMPLED = ("a remainder", "a condition", "a loop")
+
+
+def problem(f, h=lambda t, x, u, args: 0.0 * u):
+    return dvax.Problem(
+        A=dvax.generators.Scalar(0.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-1.0, 1.0),
+        f=f, h=h,
+    )  # fmt: skip
+
+
+CONSTANTS = dvax.Constants(
+    gamma=1.0, L_F=1.0, alpha_h=0.0, beta_h=0.0, alpha_f=0.0, beta_f=0.0, M=1.0, omega=0.0,
+    m_P=1.0, norm_P_inv=1.0, status="proved",
+)  # fmt: skip
+
+
+def integral(rate, breaks, t):
+    edges = [0.0, *(s for s in breaks if 0.0 < s < t), t]
+    one = lambda s: float(rate(jnp.asarray(s)))  # noqa: E731
+    return sum(quad(one, a, b, limit=200)[0] for a, b in itertools.pairwise(edges))
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", ENCLOSED)
+def test_a_bound_called_proved_is_above_the_error(name, method):
+    rate, breaks = RATES[name]
+    system = problem(lambda t, x, u, args: rate(t) + 0.0 * u)
+    truth = np.array([integral(jax.jit(rate), breaks, t) for t in TS])
+    for dt in (1.0, 0.25, 1 / 7):
+        sol = dvax.solve(
+            system, 0.0, 0.0, 1.0, ts=TS, dt=dt, method=METHODS[method], measure=True, max_steps=16
+        )
+        bound = dvax.bound_error(system, sol, CONSTANTS)
+        error = np.abs(np.asarray(sol.xs) - truth)
+        print(
+            f"{name}, {method}, dt = {dt:.3f}: error {error.max():.2g}, bound {bound.x.max():.2g}"
+        )
+        assert bound.status == "proved"
+        assert np.all(np.asarray(bound.x) >= error - 1e-12)
+
+
+@pytest.mark.parametrize("name", SAMPLED)
+def test_what_cannot_be_enclosed_is_called_an_estimate(name):
+    rate, _ = RATES[name]
+    system = problem(lambda t, x, u, args: rate(t) + 0.0 * u)
+    sol = dvax.solve(system, 0.0, 0.0, 1.0, dt=0.25, measure=True)
+    assert dvax.bound_error(system, sol, CONSTANTS).status == "estimated"
+
+
+def test_a_jump_that_nobody_announced_is_found_by_adaptive_steps():
+    rate, _ = RATES["a jump in the middle"]
+    system = problem(lambda t, x, u, args: rate(t) + 0.0 * u)
+    sol = dvax.solve(system, 0.0, 0.0, 1.0, ts=TS, rtol=1e-4, atol=1e-4, dt0=0.125)
+    bound = dvax.bound_error(system, sol, CONSTANTS)
+    error = np.abs(np.asarray(sol.xs) - np.array([0.0, 0.25, 0.5]))
+    assert bound.status == "proved" and np.all(np.asarray(bound.x) >= error - 1e-12)
+    assert bound.x[-1] < 1e-3
+
+
+def test_a_run_that_ends_before_its_first_saved_time_has_an_empty_bound():
+    rate, _ = RATES["a short pulse"]
+    system = problem(lambda t, x, u, args: rate(t) + 0.0 * u)
+    sol = dvax.solve(system, 0.0, 0.0, 1.0, ts=TS, rtol=1e-9, atol=1e-9, max_steps=2, throw=False)
+    assert sol.result == dvax.RESULTS.max_steps
+    assert dvax.bound_error(system, sol, CONSTANTS).x.shape == (0,)
