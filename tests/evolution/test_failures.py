@@ -59,15 +59,17 @@ def test_too_few_steps_is_a_failure_with_a_partial_result():
     assert 0 < len(caught.value.solution.ts) < 3
 
 
-def test_a_law_that_has_no_solution_is_not_called_solved():
-    # F(y) = −y + …: not pseudomonotone, so the closed form proj(−c/a) means nothing.
+@pytest.mark.parametrize("gain", [3.0, 1.0], ids=["falling", "flat"])
+def test_a_law_that_has_no_solution_is_not_called_solved(gain):
+    # F(y) = (1 − gain) y + …: not strongly pseudomonotone, so the closed form proj(−c/a) means
+    # nothing.
     for set_ in (dvax.sets.Box(0.0, 0.5), dvax.sets.Ball(0.0, 0.5)):
         problem = dvax.Problem(
             A=dvax.generators.Scalar(-1.0),
             P=dvax.operators.Scaling(1.0),
             K=set_,
             f=lambda t, x, u, args: -u,
-            h=lambda t, x, u, args: 1.0 - 2.0 * x + 3.0 * u,
+            h=lambda t, x, u, args: 1.0 - 2.0 * x + gain * u,
         )
         with pytest.raises(dvax.DvaxError):
             dvax.solve(problem, jnp.zeros(2), 0.0, 1.0)
