@@ -13,7 +13,7 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
-from ..generators import AbstractGenerator, AbstractPropagator
+from ..generators import AbstractGenerator, AbstractPropagator, Growth
 from ..problem import END_ULPS, KNOT_ULPS
 from .chords import Chord, is_chord
 from .flow import Flow, Rate
@@ -53,13 +53,14 @@ class Carry(NamedTuple):
 
 class Memory(NamedTuple):
     """What one step leaves to the next, each None where it is not needed: the rate at its end, a
-    guess for the law, and the propagators of its length."""
+    guess for the law, the propagators of its length, and the growth of the semigroup."""
 
     rate: Rate | None
     guess: Tree | None
     length: jax.Array | None
     full: AbstractPropagator | None
     half: AbstractPropagator | None
+    growth: Growth | None
 
 
 class Sample(NamedTuple):
@@ -160,10 +161,13 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
         guess = None if self.flow.direct else self.flow.problem.zero_control(y0.x)
         start = self._within(t0, t1, 0.0)
         rate = self._kept(self.flow.rate(start, y0.x, guess)) if self.measure else None
-        half = self._half(h)
+        half, growth = self._half(h), None
+        if self.measure and self.flow.enclosed:
+            # Once a run: for a matrix it takes an eigenvalue.
+            growth = self.flow.generator.growth(self.flow.state_space(y0.x))
         if self.uniform is not None:
-            return Memory(rate, guess, None, None, half)
-        return Memory(rate, guess, h, self._propagator(h), half)
+            return Memory(rate, guess, None, None, half, growth)
+        return Memory(rate, guess, h, self._propagator(h), half, growth)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
@@ -269,21 +273,22 @@ class Stepper(diffrax.AbstractAdaptiveSolver):
     ) -> Sample:
         last = self.flow.rate(self._within(t0, t1, 1.0), x1, first.y)
         if self.flow.enclosed:
-            return self._enclosed(t0, t1, x0, x1, c, last)
+            return self._enclosed(t0, t1, x0, x1, c, last, memory.growth)
         return self._sampled(t0, t1, x0, x1, first, c, memory, last)
 
-    def _enclosed(self, t0: Any, t1: Any, x0: Tree, x1: Tree, c: Any, last: Rate) -> Sample:
+    def _enclosed(
+        self, t0: Any, t1: Any, x0: Tree, x1: Tree, c: Any, last: Rate, growth: Any
+    ) -> Sample:
         """|δ(θ)| ≤ (1−θ)(|δ(0)| + dev) + θ(|δ(1)| + dev) entry by entry, with dev from chord
         arithmetic, since p is a line; so ∫‖δ‖ is at most the mean of the norms of the two brackets
         (the norm of their mean would be too little: ends may lie in different entries). δ(0) is
         rounding, unless data jumps where nobody said it would."""
-        t0, t1, x0, x1, c = lax.stop_gradient((t0, t1, x0, x1, c))
+        t0, t1, x0, x1, c, growth = lax.stop_gradient((t0, t1, x0, x1, c, growth))
         h, space = t1 - t0, self.flow.state_space(x0)
-        bend = self.flow.generator.bend(h, x0, x1, c, space)
+        bend = self.flow.generator.bend(h, x0, x1, c, space, growth)
         x = jtu.tree_map(Chord, x0, x1, bend)
         t = Chord(self._within(t0, t1, 0.0), self._within(t0, t1, 1.0), jnp.zeros_like(t0))
         along = self.flow.enclosure(t, x)
-        end = polynomial(c, 1.0)
         at_start = jtu.tree_map(
             lambda q, p: jnp.abs(q.a - p) + q.dev, along, c[0], is_leaf=is_chord
         )

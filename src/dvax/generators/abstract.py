@@ -48,9 +48,18 @@ class AbstractGenerator(eqx.Module):
         """M and ω with ‖e^{At}‖ ≤ M e^{ωt} in the norm of `space`, proved from A's structure."""
 
     @abc.abstractmethod
-    def bend(self, h: Any, x0: Tree, x1: Tree, c: tuple[Tree, ...], space: AbstractSpace) -> Tree:
+    def bend(
+        self,
+        h: Any,
+        x0: Tree,
+        x1: Tree,
+        c: tuple[Tree, ...],
+        space: AbstractSpace,
+        growth: Growth,
+    ) -> Tree:
         """A bound, entry by entry, on how far x(t₀ + θh) lies from the line between x₀ and x₁, for a
-        step from x₀ to x₁ with at most two coefficients c (see `AbstractPropagator`)."""
+        step from x₀ to x₁ with at most two coefficients c (see `AbstractPropagator`), given the
+        `growth` of this generator, or of a product that it is a part of, in the norm of `space`."""
 
     @abc.abstractmethod
     def check(self, space: AbstractSpace) -> None:

@@ -63,13 +63,21 @@ class Dense(AbstractGenerator):
         similar = root[:, None] * self.matrix / root[None, :]
         return Growth(jnp.ones(()), jnp.linalg.eigvalsh(0.5 * (similar + similar.T))[-1])
 
-    def bend(self, h: Any, x0: Tree, x1: Tree, c: tuple[Tree, ...], space: AbstractSpace) -> Tree:
+    def bend(
+        self,
+        h: Any,
+        x0: Tree,
+        x1: Tree,
+        c: tuple[Tree, ...],
+        space: AbstractSpace,
+        growth: Growth,
+    ) -> Tree:
         # x'' = e^{A(t−t₀)} x''(t₀), and one entry is at most the norm over the root of its weight.
         first, *rest = c
         slope = rest[0] / h if rest else jnp.zeros_like(first)
         curvature = self.matrix @ (self.matrix @ x0 + first) + slope
-        M, omega = self.growth(space)
-        largest = M * jnp.exp(jnp.maximum(omega, 0.0) * h) * space.norm(curvature)
+        rise = growth.M * jnp.exp(jnp.maximum(growth.omega, 0.0) * h)
+        largest = rise * space.norm(curvature)
         return jnp.broadcast_to(h**2 / 8 * largest / jnp.sqrt(space.weights()), x0.shape)
 
 

@@ -45,5 +45,13 @@ class Diagonal(AbstractGenerator):
     def growth(self, space: AbstractSpace) -> Growth:
         return Growth(jnp.ones(()), jnp.max(jnp.real(self.entries)))
 
-    def bend(self, h: Any, x0: Tree, x1: Tree, c: tuple[Tree, ...], space: AbstractSpace) -> Tree:
+    def bend(
+        self,
+        h: Any,
+        x0: Tree,
+        x1: Tree,
+        c: tuple[Tree, ...],
+        space: AbstractSpace,
+        growth: Growth,
+    ) -> Tree:
         return elementwise_bend(self.entries, h, x0, x1, *c)

@@ -47,9 +47,19 @@ class Product(AbstractGenerator):
         worst = [jnp.max(jnp.stack([jnp.asarray(b[i]) for b in bounds])) for i in (0, 1)]
         return Growth(*worst)
 
-    def bend(self, h: Any, x0: Tree, x1: Tree, c: tuple[Tree, ...], space: AbstractSpace) -> Tree:
+    def bend(
+        self,
+        h: Any,
+        x0: Tree,
+        x1: Tree,
+        c: tuple[Tree, ...],
+        space: AbstractSpace,
+        growth: Growth,
+    ) -> Tree:
         columns = zip(self.parts, _parts(space, len(self.parts)), x0, x1, *c, strict=True)
-        return tuple(part.bend(h, a, b, tuple(rest), own) for part, own, a, b, *rest in columns)
+        return tuple(
+            part.bend(h, a, b, tuple(rest), own, growth) for part, own, a, b, *rest in columns
+        )
 
 
 def _parts(space: AbstractSpace, count: int) -> tuple[AbstractSpace, ...]:

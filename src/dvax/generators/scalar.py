@@ -44,7 +44,15 @@ class Scalar(AbstractGenerator):
     def growth(self, space: AbstractSpace) -> Growth:
         return Growth(jnp.ones(()), self.a)
 
-    def bend(self, h: Any, x0: Tree, x1: Tree, c: tuple[Tree, ...], space: AbstractSpace) -> Tree:
+    def bend(
+        self,
+        h: Any,
+        x0: Tree,
+        x1: Tree,
+        c: tuple[Tree, ...],
+        space: AbstractSpace,
+        growth: Growth,
+    ) -> Tree:
         return jtu.tree_map(lambda *leaves: elementwise_bend(self.a, h, *leaves), x0, x1, *c)
 
 

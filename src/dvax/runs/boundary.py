@@ -1,5 +1,6 @@
 """The contact boundary Gamma_C as points with quadrature weights."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,13 +49,13 @@ def build_boundary(section: BoundarySection, nodes: Path | None, units: Units) -
         return _from_file(nodes, units)
     assert section.points is not None  # the consistency of the section has been checked
     lengths = section.lengths or (section.length or 0.0,)
-    axes = [
-        length * (np.arange(n) + 0.5) / n for length, n in zip(lengths, section.points, strict=True)
-    ]
-    grid = np.meshgrid(*axes, indexing="ij")
-    size = int(np.prod(section.points))
-    weight = float(np.prod(lengths)) / size
-    return Boundary(tuple(c.ravel() for c in grid), np.full(size, weight), section.points)
+    cells = [length / n for length, n in zip(lengths, section.points, strict=True)]
+    grid = np.meshgrid(
+        *(cell * (np.arange(n) + 0.5) for cell, n in zip(cells, section.points, strict=True)),
+        indexing="ij",
+    )
+    weights = np.full(math.prod(section.points), math.prod(cells))
+    return Boundary(tuple(c.ravel() for c in grid), weights, section.points)
 
 
 def _from_file(path: Path, units: Units) -> Boundary:
@@ -79,4 +80,23 @@ def _from_file(path: Path, units: Units) -> Boundary:
     ]
     if problems:
         raise InputError(*problems)
-    return Boundary((s.values * factors[0],), weight.values * factors[1], (s.values.size,))
+    with np.errstate(over="ignore"):  # an infinite coordinate is refused by check_size
+        places, weights = s.values * factors[0], weight.values * factors[1]
+    return Boundary((places,), weights, (places.size,))
+
+
+def check_size(boundary: Boundary, place: str) -> None:
+    """Raise `InputError` where distances and norms on the boundary would not be numbers."""
+    farthest = max(float(np.abs(c).max()) for c in boundary.coordinates)
+    least, most = float(boundary.weights.min()), float(boundary.weights.max())
+    if farthest <= 1e100 and least >= 1e-200 and most <= 1e200:
+        return
+    raise InputError(
+        InputProblem(
+            place,
+            f"coordinates up to {farthest:g} and weights from {least:g} to {most:g}",
+            "coordinates are at most 1e100 and weights between 1e-200 and 1e200, or squares of them "
+            "overflow",
+            "Choose a unit of length nearer to the size of the boundary.",
+        )
+    )

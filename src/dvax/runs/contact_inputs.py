@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dvax.errors import InputError, InputProblem
-from dvax.runs.boundary import Boundary, build_boundary
+from dvax.runs.boundary import Boundary, build_boundary, check_size
 from dvax.runs.data_file import DataFile, fingerprint, locate
 from dvax.runs.expressions import compile_expression
 from dvax.runs.fields import Field, Sources, perturbation, read_field, space_values, to_signal
@@ -137,11 +137,14 @@ def _boundary(
         return None, ()
     try:
         nodes, files = None, ()
+        place = f"{sources.name}: boundary"
         if section.file is not None:
-            place = f"{sources.name}: boundary.file"
+            place += ".file"
             nodes = locate(section.file, sources.folder, sources.allow_outside, place)
             files = (fingerprint(section.file, nodes),)
-        return build_boundary(section, nodes, units), files
+        boundary = build_boundary(section, nodes, units)
+        check_size(boundary, place)
+        return boundary, files
     except InputError as error:
         problems += error.problems
         return None, ()

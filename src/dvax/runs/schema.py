@@ -15,6 +15,7 @@ from pydantic_core import PydanticCustomError
 from dvax.runs.units import UnitError, Units, check_working_unit, is_quantity
 
 MAX_POINTS = 100_000_000
+MAX_FRAMES = 10**7
 
 
 def _broken(rule: str, mend: str) -> PydanticCustomError:
@@ -249,7 +250,9 @@ class TimeSection(Section):
     included."""
 
     end: Annotated[float, _quantity("time")] = Field(gt=0, description="time passes forward from 0")
-    frames: int = Field(200, ge=1, description="number of intervals between saved states")
+    frames: int = Field(
+        200, ge=1, le=MAX_FRAMES, description="number of intervals between saved states"
+    )
 
 
 class SolverSection(Section):

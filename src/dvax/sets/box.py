@@ -61,7 +61,8 @@ class Box(AbstractSet):
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         # At a bound the bound's own derivative is taken: the convention of AbstractSet. Selections
         # are also what is fastest: minimum and maximum must look for NaN and signed zeros.
-        return jnp.where(z <= self.lower, self.lower, jnp.where(z >= self.upper, self.upper, z))
+        lower, upper = self.intervals(z)
+        return jnp.where(z <= lower, lower, jnp.where(z >= upper, upper, z))
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree]:
         shape = jnp.shape(like)
