@@ -11,14 +11,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 
+from .. import _tree
 from .integrate import Loop, integrate
 from .setup import Setup
 from .solution import RESULTS, Solution
 
 
-def compiled(setup: Setup, ts: Any, loop: Loop) -> tuple[Solution, jax.Array]:
-    """The solution, and whether all of it was reached: one value to look at, not several."""
+def compiled(setup: Setup, ts: Any, loop: Loop) -> tuple[Solution, bool | None]:
+    """The solution, and whether all of it was reached; None where that is traced."""
     code, code_tree = jtu.tree_flatten((setup.problem, setup.method, setup.vi_solver))
     data, data_tree = jtu.tree_flatten((setup.x0, setup.args, setup.setting, setup.moduli, ts))
     # A Python number in the data is data: compiled in, every new tolerance would compile again. In
@@ -26,10 +28,17 @@ def compiled(setup: Setup, ts: Any, loop: Loop) -> tuple[Solution, jax.Array]:
     numbers = [leaf if eqx.is_array(leaf) else None for leaf in code]
     numbers += [leaf if isinstance(leaf, float) or eqx.is_array(leaf) else None for leaf in data]
     rest = tuple(
-        leaf if number is None else None
-        for leaf, number in zip(code + data, numbers, strict=True)
+        leaf if number is None else None for leaf, number in zip(code + data, numbers, strict=True)
     )
-    arrays, reached, shape = _run(numbers, _Kind(code_tree, data_tree, rest, loop))
+    try:
+        arrays, reached, shape = _run(numbers, _Kind(code_tree, data_tree, rest, loop))
+        # One look, through NumPy: through JAX it would be a program of its own.
+        reached = bool(np.asarray(reached)) if _tree.is_concrete(reached) else None
+    except jax.errors.JaxRuntimeError as error:
+        if "_EquinoxRuntimeError" in str(error):
+            # A check within f or h (`eqx.error_if`) is only quoted where Equinox compiles.
+            eqx.filter_jit(integrate)(setup, ts, loop)
+        raise
     return jtu.tree_unflatten(shape.tree, [*arrays, setup]), reached
 
 

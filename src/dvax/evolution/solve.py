@@ -118,10 +118,7 @@ def solve(
     setup = Setup(problem, x0, args, setting, method, vi_solver, _moduli(constants))
     times = None if ts is None else _times(ts)
     solution, reached = _differentiably(setup, times, loop)
-    if _tree.is_concrete(reached):
-        # One look, through NumPy: through JAX it would be a program of its own.
-        if np.asarray(reached) and not dense:
-            return solution
+    if reached is False or (reached and dense):
         solution = _trim(solution)
         if solution.result != RESULTS.successful:
             # Data that ends too early is NaN from there on: then that is what is wrong.
@@ -134,7 +131,7 @@ def solve(
     return solution
 
 
-def _differentiably(setup: Setup, times: Any, loop: Loop) -> tuple[Solution, jax.Array]:
+def _differentiably(setup: Setup, times: Any, loop: Loop) -> tuple[Solution, bool | None]:
     try:
         return compiled(setup, times, loop)
     except (TypeError, ValueError) as error:
@@ -163,7 +160,7 @@ def _times(ts: Any) -> Any:
 
 def _number(v: Any) -> Any:
     """What has a value as a Python number, the cheapest to hand over and at home in any precision."""
-    return v if isinstance(v, jax.core.Tracer) else float(v)
+    return float(v) if _tree.is_concrete(v) else v
 
 
 def _trim(solution: Solution) -> Solution:
