@@ -19,8 +19,8 @@ from .setup import Setup
 from .solution import RESULTS, Solution
 
 
-def compiled(setup: Setup, ts: Any, loop: Loop) -> tuple[Solution, bool | None]:
-    """The solution, and whether all of it was reached; None where that is traced."""
+def compiled(setup: Setup, ts: Any, loop: Loop) -> tuple[Solution, bool | jax.Array]:
+    """The solution, and whether all of it was reached."""
     code, code_tree = jtu.tree_flatten((setup.problem, setup.method, setup.vi_solver))
     data, data_tree = jtu.tree_flatten((setup.x0, setup.args, setup.setting, setup.moduli, ts))
     # A Python number in the data is data: compiled in, every new tolerance would compile again. In
@@ -33,7 +33,7 @@ def compiled(setup: Setup, ts: Any, loop: Loop) -> tuple[Solution, bool | None]:
     try:
         arrays, reached, shape = _run(numbers, _Kind(code_tree, data_tree, rest, loop))
         # One look, through NumPy: through JAX it would be a program of its own.
-        reached = bool(np.asarray(reached)) if _tree.is_concrete(reached) else None
+        reached = bool(np.asarray(reached)) if _tree.is_concrete(reached) else reached
     except jax.errors.JaxRuntimeError as error:
         if "_EquinoxRuntimeError" in str(error):
             # A check within f or h (`eqx.error_if`) is only quoted where Equinox compiles.

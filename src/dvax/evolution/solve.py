@@ -118,7 +118,9 @@ def solve(
     setup = Setup(problem, x0, args, setting, method, vi_solver, _moduli(constants))
     times = None if ts is None else _times(ts)
     solution, reached = _differentiably(setup, times, loop)
-    if reached is False or (reached and dense):
+    if reached is True and not dense:
+        return solution
+    if _tree.is_concrete(reached, solution.result, solution.ts, solution.xs):
         solution = _trim(solution)
         if solution.result != RESULTS.successful:
             # Data that ends too early is NaN from there on: then that is what is wrong.
@@ -131,7 +133,7 @@ def solve(
     return solution
 
 
-def _differentiably(setup: Setup, times: Any, loop: Loop) -> tuple[Solution, bool | None]:
+def _differentiably(setup: Setup, times: Any, loop: Loop) -> tuple[Solution, bool | jax.Array]:
     try:
         return compiled(setup, times, loop)
     except (TypeError, ValueError) as error:
