@@ -96,7 +96,10 @@ def fits_parts(name: str, count: int, like: Tree, what: str) -> None:
 
 def is_concrete(*trees: Tree) -> bool:
     """Whether every leaf has a value now, so that a check on values can be made at all."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jtu.tree_leaves(trees))
+    for leaf in jtu.tree_leaves(trees):
+        if isinstance(leaf, jax.core.Tracer):
+            return False
+    return True
 
 
 def as_float(a: Tree, name: str) -> Tree:
@@ -107,6 +110,9 @@ def as_float(a: Tree, name: str) -> Tree:
     """
 
     def one(leaf: Any) -> jax.Array:
+        # `dtypes.issubdtype` and `asarray` cost as much as a hundred steps of a small system.
+        if isinstance(leaf, jax.Array) and leaf.dtype.kind == "f":
+            return leaf
         if isinstance(leaf, bool | complex):
             raise _not_real(name, repr(leaf))
         if isinstance(leaf, int | float):

@@ -44,9 +44,10 @@ def check(problem, x0, t0, t1, ts, dt, rtol, atol, dt0, horizon, method, adjoint
             times = np.asarray(ts, float)
             good = times.ndim == 1 and times.size > 0 and bool(np.all(np.diff(times) >= 0))
             inside = good and float(t0) <= times[0] and times[-1] <= float(t1)
-            rule(bool(inside), "ts", _tree.short(times) if times.size else "nothing",
-                 f"a vector of increasing times in [{float(t0):g}, {float(t1):g}]",
-                 "Sort them, and drop those outside")  # fmt: skip
+            if not inside:
+                rule(False, "ts", _tree.short(times) if times.size else "nothing",
+                     f"a vector of increasing times in [{float(t0):g}, {float(t1):g}]",
+                     "Sort them, and drop those outside")  # fmt: skip
     for name, value, zero_allowed in (
         ("dt", dt, False), ("dt0", dt0, False), ("horizon", horizon, False),
         ("rtol", rtol, True), ("atol", atol, True),
@@ -61,9 +62,10 @@ def check(problem, x0, t0, t1, ts, dt, rtol, atol, dt0, horizon, method, adjoint
         raise InputError(*wrong)
 
 
-def warn_precision(dtype: Any, dt: Any, rtol: Any) -> None:
+def warn_precision(x0: Any, rtol: Any) -> None:
+    dtype = jnp.result_type(*jax.tree_util.tree_leaves(x0))
     eps = float(jnp.finfo(dtype).eps)
-    if dt is None and _tree.is_concrete(rtol) and float(rtol) < 100 * eps:
+    if _tree.is_concrete(rtol) and float(rtol) < 100 * eps:
         warnings.warn(
             f"rtol = {float(rtol):g} cannot be reached in {jnp.dtype(dtype).name}, whose rounding is "
             f"{eps:.1e} an operation. Set jax.config.update('jax_enable_x64', True) before anything "

@@ -1,12 +1,12 @@
-"""The time loop: one compiled function from a setup to what was computed."""
+"""The time loop: a function from a setup to its solution, to be compiled as a whole."""
 
 from typing import Any, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax import lax
 
 from .. import _tree
 from .._tree import Tree
@@ -16,42 +16,24 @@ from .control import Adaptive, Fixed, root_mean_squares, step_count
 from .flow import Flow
 from .method import AbstractMethod
 from .setup import Setup
-from .solution import RESULTS
+from .solution import RESULTS, Solution
 from .stepper import Carry, MildTerm, Record, Stepper
 
 
-class Computed(NamedTuple):
-    """What the time loop leaves; nothing of what it was given, which would be copied."""
+class Loop(NamedTuple):
+    """What a time loop is compiled for, apart from shapes; see `dvax.solve`."""
 
-    ts: jax.Array
-    xs: Tree
-    us: Tree
-    ys: Tree
-    law_residual: jax.Array
-    law_step: jax.Array
-    law_error: jax.Array | None
-    defect: jax.Array | None
-    law_defect: jax.Array | None
-    settled: tuple[jax.Array, jax.Array] | None
-    stats: dict[str, Any]
-    result: RESULTS
-    records: Record | None
-    enclosed: bool
+    fixed: bool
+    measure: bool
+    careful: bool
+    dense: bool
+    max_steps: int
+    adjoint: str
+    progress: bool
 
 
-@eqx.filter_jit
-def integrate(
-    setup: Setup,
-    ts: Any,
-    *,
-    fixed: bool,
-    measure: bool,
-    careful: bool,
-    dense: bool,
-    max_steps: int,
-    adjoint: str,
-    progress: bool,
-) -> Computed:
+def integrate(setup: Setup, ts: Any, loop: Loop) -> Solution:
+    fixed, measure, dense, max_steps = loop.fixed, loop.measure, loop.dense, loop.max_steps
     problem, x0, args, method = setup.problem, setup.x0, setup.args, setup.method
     dtype, t0, t1 = setup.dtype, setup.number("t0"), setup.number("t1")
     # Shapes and knots are looked at here, while tracing: a call that is compiled pays nothing.
@@ -76,7 +58,7 @@ def integrate(
             setup.number("rtol"), setup.number("atol"), sizes, setup.number("horizon"), knots, t1
         )
         first = setup.number("dt0")
-    stepper = Stepper(method, flow, measure, careful, (t0, t1), uniform)
+    stepper = Stepper(method, flow, measure, loop.careful, (t0, t1), uniform)
 
     zero = jnp.zeros((), dtype)
     record = _blank_record(x0, method, dtype) if dense else None
@@ -97,16 +79,16 @@ def integrate(
         Carry(x0, zero, zero, record, (zero, zero)),
         saveat=diffrax.SaveAt(subs=(saved, last, steps), controller_state=True),
         stepsize_controller=controller,
-        adjoint=adjoint_for(adjoint, max_steps, x0),
+        adjoint=adjoint_for(loop.adjoint, max_steps, x0),
         max_steps=max_steps,
         throw=False,
-        progress_meter=diffrax.TextProgressMeter() if progress else diffrax.NoProgressMeter(),
+        progress_meter=diffrax.TextProgressMeter() if loop.progress else diffrax.NoProgressMeter(),
     )
     assert out.ts is not None and out.ys is not None and out.controller_state is not None
     times = out.ts[0]
     xs, defect, law_defect, before = out.ys[0]
     us, ys, residual, law_step, law_error = _responses(flow, times, xs, control, setup.moduli)
-    if adjoint == "forward":
+    if loop.adjoint == "forward":
         xs, us, ys = forward_only((xs, us, ys))
     records = out.ys[2] if dense else None
     result = _translate(out.result)
@@ -119,7 +101,7 @@ def integrate(
         "x": last_x,
         "next_dt": setup.number("dt") if fixed else out.controller_state.length,
     }
-    return Computed(
+    return Solution(
         ts=times,
         xs=xs,
         us=us,
@@ -138,6 +120,7 @@ def integrate(
         ),
         records=records,
         enclosed=flow.enclosed,
+        setup=setup,
     )
 
 
@@ -151,14 +134,22 @@ def _responses(flow: Flow, times, xs, control, moduli):
         K = flow.problem.set_at(t, flow.args)
         frozen = flow.problem.frozen(t, x, flow.args)
         checked = certify(frozen, K, control, rate.y, tau)
-        step = control.norm(_tree.sub(checked.y, rate.y))
-        u = flow.operator.inverse(rate.y)
-        error = None
-        if gamma is not None and norm_P_inv is not None:
-            error = norm_P_inv * (checked.bound(gamma) + step)
-        return u, rate.y, checked.norm, step, error
+        return flow.operator.inverse(rate.y), rate.y, checked.w, _tree.sub(checked.y, rate.y)
 
-    return jax.vmap(one)(times, xs)
+    def every():
+        return jax.vmap(one)(times, xs)
+
+    def nothing():
+        return jtu.tree_map(lambda s: jnp.full(s.shape, jnp.nan, s.dtype), jax.eval_shape(every))
+
+    # Whether anything was saved is never in doubt, but the compiler does not know that: it would
+    # draw all of the above into the sums of the norms, at twenty times the cost for a large state.
+    us, ys, w, apart = lax.cond(times[0] < jnp.inf, every, nothing)
+    residual, step = jax.vmap(control.norm)(w), jax.vmap(control.norm)(apart)
+    error = None
+    if gamma is not None and norm_P_inv is not None:
+        error = norm_P_inv * (residual / gamma + step)
+    return us, ys, residual, step, error
 
 
 def _blank_record(x0: Tree, method: AbstractMethod, dtype: Any) -> Record:

@@ -1,9 +1,8 @@
 """What was asked of a solve, and the flow that it settles."""
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -16,11 +15,11 @@ from .flow import Flow, slope
 from .method import AbstractMethod
 
 
-class Setup(eqx.Module):
+class Setup(NamedTuple):
     """The arguments of a solve that its solution is a function of.
 
     `setting` holds the numbers: t0, t1, dt (NaN for adaptive steps), rtol, atol, dt0, horizon;
-    `moduli` those of γ, L_F and ‖P⁻¹‖ that are known.
+    `moduli` those of γ, L_F and ‖P⁻¹‖ that are known. A plain tuple: one is made at every call.
     """
 
     problem: Problem
@@ -42,7 +41,8 @@ class Setup(eqx.Module):
 
     def flow(self) -> Flow:
         """The reduced map, with what the code of f, h and K proves about the law put to use."""
-        problem, x0, args, vi_solver = self.problem, self.x0, self.args, self.vi_solver
+        problem, x0, vi_solver = self.problem, self.x0, self.vi_solver
+        args = as_arrays(self.args)
         t0 = self.number("t0")
         like = problem.zero_control(x0)
         K = problem.set_at(t0, args)
@@ -76,6 +76,12 @@ class Setup(eqx.Module):
         adaptive = 1e-3 * defect / jnp.maximum(1.0, self.number("horizon"))
         fixed = jnp.isnan(self.number("dt"))
         return jnp.maximum(jnp.where(fixed, adaptive, 1e-12), floor)
+
+
+def as_arrays(args: Any) -> Any:
+    """Every Python number with a point as the array that f and h are always handed; integers and
+    flags stay what they are."""
+    return jtu.tree_map(lambda v: jnp.asarray(v) if isinstance(v, float) else v, args)
 
 
 def _can_enclose(flow: Flow, t0: jax.Array, x0: Tree) -> bool:

@@ -5,7 +5,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
@@ -14,11 +13,15 @@ from ..errors import DifferentiationError, SolveError
 from ..problem import Problem
 from ..vi import AbstractSolver, Auto
 from .arguments import bound_steps, check, warn_precision
+from .compiled import compiled
 from .diagnose import diagnose
-from .integrate import Computed, integrate
+from .integrate import Loop
 from .method import ETD2RK, AbstractMethod
-from .setup import Setup
+from .setup import Setup, as_arrays
 from .solution import RESULTS, Solution
+
+_METHOD, _VI_SOLVER = ETD2RK(), Auto()
+"""The defaults, which nothing changes; making them would be felt in a short run."""
 
 
 def solve(
@@ -86,63 +89,56 @@ def solve(
     ```
     """
     x0 = _tree.as_float(x0, "x0")
-    method = ETD2RK() if method is None else method
+    method = _METHOD if method is None else method
     check(problem, x0, t0, t1, ts, dt, rtol, atol, dt0, horizon, method, adjoint)
-    dtype = jnp.result_type(*jax.tree_util.tree_leaves(x0))
-    warn_precision(dtype, dt, rtol)
-    span = _subtract(t1, t0)
+    fixed = dt is not None
+    if not fixed:
+        warn_precision(x0, rtol)
+    t0, t1 = _number(t0), _number(t1)
+    span = t1 - t0
     setting = {
         "t0": t0,
         "t1": t1,
-        "dt": math.nan if dt is None else dt,
-        "rtol": rtol,
-        "atol": atol,
-        "dt0": span * 1e-3 if dt0 is None else dt0,
-        "horizon": span if horizon is None else horizon,
+        "dt": math.nan if dt is None else _number(dt),
+        "rtol": _number(rtol),
+        "atol": _number(atol),
+        "dt0": span * 1e-3 if dt0 is None else _number(dt0),
+        "horizon": span if horizon is None else _number(horizon),
     }
-    # As arrays: a Python number would be compiled in, and every new tolerance compiled again.
-    setting = {k: np.asarray(v) if _tree.is_concrete(v) else v for k, v in setting.items()}
-    fixed = dt is not None
-    steps = bound_steps(max_steps, fixed, t0, t1, dt)
-    run = {
-        "fixed": fixed,
-        "measure": (not fixed) if measure is None else bool(measure) or not fixed,
-        "careful": not fixed,
-        "dense": dense,
-        "max_steps": steps,
-        "adjoint": adjoint,
-        "progress": progress,
-    }
-    # Likewise for a number handed to f and h; integers and flags stay what they are.
-    args = jax.tree_util.tree_map(lambda v: jnp.asarray(v) if isinstance(v, float) else v, args)
-    vi_solver = Auto() if vi_solver is None else vi_solver
+    loop = Loop(
+        fixed=fixed,
+        measure=(not fixed) if measure is None else bool(measure) or not fixed,
+        careful=not fixed,
+        dense=dense,
+        max_steps=bound_steps(max_steps, fixed, t0, t1, dt),
+        adjoint=adjoint,
+        progress=progress,
+    )
+    vi_solver = _VI_SOLVER if vi_solver is None else vi_solver
     setup = Setup(problem, x0, args, setting, method, vi_solver, _moduli(constants))
     times = None if ts is None else _times(ts)
-    solution = _solution(setup, _differentiably(setup, times, run))
-    if _tree.is_concrete(solution.result, solution.ts, solution.xs):
+    solution, reached = _differentiably(setup, times, loop)
+    if reached is True and not dense:
+        return solution
+    if _tree.is_concrete(reached, solution.result, solution.ts, solution.xs):
         solution = _trim(solution)
         if solution.result != RESULTS.successful:
             # Data that ends too early is NaN from there on: then that is what is wrong.
-            problem.knots(t0, t1, x0, args)
+            problem.knots(t0, t1, x0, as_arrays(args))
             if fixed:
                 # Once more, keeping the last good state, to say where it went wrong.
-                again = integrate(setup, times, **{**run, "careful": True})
-                solution = _trim(_solution(setup, again))
+                solution = _trim(compiled(setup, times, loop._replace(careful=True))[0])
             if throw:
                 raise SolveError(_explain(solution), solution)
     return solution
 
 
-def _solution(setup: Setup, computed: Computed) -> Solution:
-    return Solution(setup=setup, **computed._asdict())
-
-
-def _differentiably(setup: Setup, times: Any, run: dict[str, Any]) -> Computed:
+def _differentiably(setup: Setup, times: Any, loop: Loop) -> tuple[Solution, bool | jax.Array]:
     try:
-        return integrate(setup, times, **run)
+        return compiled(setup, times, loop)
     except (TypeError, ValueError) as error:
         forward = "forward-mode autodiff" in str(error) or "custom_vjp" in str(error)
-        if run["adjoint"] == "reverse" and forward:
+        if loop.adjoint == "reverse" and forward:
             raise DifferentiationError(
                 'dvax.solve(adjoint="reverse") cannot be differentiated forward (jax.jvp, '
                 'jax.jacfwd). Pass adjoint="forward": the loop that stores steps for the reverse '
@@ -157,15 +153,16 @@ def _moduli(constants: Any) -> dict[str, Any]:
         return {}
     names = ("gamma", "L_F", "norm_P_inv")
     known = {name: getattr(constants, name, None) for name in names}
-    return {name: jnp.asarray(v) for name, v in known.items() if v is not None}
+    return {name: _number(v) for name, v in known.items() if v is not None}
 
 
 def _times(ts: Any) -> Any:
     return np.asarray(ts, float) if _tree.is_concrete(ts) else ts
 
 
-def _subtract(t1: Any, t0: Any) -> Any:
-    return float(t1) - float(t0) if _tree.is_concrete(t0, t1) else t1 - t0
+def _number(v: Any) -> Any:
+    """What has a value as a Python number, the cheapest to hand over and at home in any precision."""
+    return float(v) if _tree.is_concrete(v) else v
 
 
 def _trim(solution: Solution) -> Solution:

@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import numpy as np
 
 from .. import _tree
 from .._tree import Tree
@@ -29,7 +30,7 @@ class Scaling(AbstractOperator):
     def __init__(self, b: Any):
         self.b = _tree.as_float(b, "dvax.operators.Scaling(b)")
         _tree.require(
-            lambda: self.b > 0,
+            lambda: np.asarray(self.b) > 0,
             "dvax.operators.Scaling(b)",
             self.b,
             "P must be coercive, so b > 0",

@@ -1,0 +1,77 @@
+"""One compiled time loop for all calls of one kind: the same code on the same shapes.
+
+What a call costs besides its steps is to find out that it is of that kind. `jax.jit` finds out in
+microseconds where it is handed a flat list of numbers and one hashable rest; so a setup is taken
+apart here, and its solution put together, around the setup itself: what was asked is not copied.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .. import _tree
+from .integrate import Loop, integrate
+from .setup import Setup
+from .solution import RESULTS, Solution
+
+
+def compiled(setup: Setup, ts: Any, loop: Loop) -> tuple[Solution, bool | jax.Array]:
+    """The solution, and whether all of it was reached."""
+    code, code_tree = jtu.tree_flatten((setup.problem, setup.method, setup.vi_solver))
+    data, data_tree = jtu.tree_flatten((setup.x0, setup.args, setup.setting, setup.moduli, ts))
+    # A Python number in the data is data: compiled in, every new tolerance would compile again. In
+    # the code (a setting of a solver) it may decide what is done.
+    numbers = [leaf if eqx.is_array(leaf) else None for leaf in code]
+    numbers += [leaf if isinstance(leaf, float) or eqx.is_array(leaf) else None for leaf in data]
+    rest = tuple(
+        leaf if number is None else None for leaf, number in zip(code + data, numbers, strict=True)
+    )
+    try:
+        arrays, reached, shape = _run(numbers, _Kind(code_tree, data_tree, rest, loop))
+        # One look, through NumPy: through JAX it would be a program of its own.
+        reached = bool(np.asarray(reached)) if _tree.is_concrete(reached) else reached
+    except jax.errors.JaxRuntimeError as error:
+        if "_EquinoxRuntimeError" in str(error):
+            # A check within f or h (`eqx.error_if`) is only quoted where Equinox compiles.
+            eqx.filter_jit(integrate)(setup, ts, loop)
+        raise
+    return jtu.tree_unflatten(shape.tree, [*arrays, setup]), reached
+
+
+class _Kind(NamedTuple):
+    """All of a call but its numbers."""
+
+    code: Any
+    data: Any
+    rest: tuple[Any, ...]
+    loop: Loop
+
+
+class _Shape:
+    """The structure of a solution that has the setup for its last leaf."""
+
+    def __init__(self, tree: Any):
+        self.tree = tree
+
+
+jtu.register_pytree_node(_Shape, lambda shape: ((), shape.tree), lambda tree, _: _Shape(tree))
+
+
+def _traced(numbers: list[Any], kind: _Kind) -> tuple[list[Any], jax.Array, _Shape]:
+    leaves = [r if n is None else n for n, r in zip(numbers, kind.rest, strict=True)]
+    split = kind.code.num_leaves
+    problem, method, vi_solver = jtu.tree_unflatten(kind.code, leaves[:split])
+    x0, args, setting, moduli, ts = jtu.tree_unflatten(kind.data, leaves[split:])
+    setup = Setup(problem, x0, args, setting, method, vi_solver, moduli)
+    solution = integrate(setup, ts, kind.loop)
+    reached = (solution.result == RESULTS.successful) & jnp.all(jnp.isfinite(solution.ts))
+    arrays, tree = jtu.tree_flatten(solution, is_leaf=lambda node: node is setup)
+    assert arrays.pop() is setup
+    return arrays, reached, _Shape(tree)
+
+
+_run = jax.jit(_traced, static_argnums=1)
