@@ -23,7 +23,7 @@ import numpy as np
 from dvax.errors import InputError, InputProblem, SolveError
 from dvax.evolution import ETD1, ETD2RK, Solution, solve
 from dvax.models import Contact
-from dvax.runs.compile_time import compile_seconds
+from dvax.runs.compile_time import announced, compile_seconds
 from dvax.runs.config import Config, build_contact
 from dvax.runs.contact_figures import Figures
 from dvax.runs.contact_frames import (
@@ -64,7 +64,8 @@ def run(
 ) -> RunOutcome:
     """Solve what `config` describes and leave a run directory at `out`.
 
-    `on_event` is called with dicts whose "event" is compiled, progress, warning or stopped.
+    `on_event` is called with dicts whose "event" is compiling, compiled, progress, warning or
+    stopped.
 
     **Raises:** `dvax.InputError`, with nothing written, where `out` exists and is not empty and
     `overwrite` is false, or where data files no longer fit. A failure of the solve is not raised: it
@@ -119,7 +120,11 @@ class _Run:
         figures = Figures(self.inputs, self.config, self.constants)
         status, code, reason = "finished", 0, "The end time was reached."
         try:
-            with _terminable(), ThreadPoolExecutor(1) as pool:
+            with (
+                _terminable(),
+                ThreadPoolExecutor(1) as pool,
+                announced(lambda: self._event("compiling")),
+            ):
                 self._blocks(times, block, store, figures, pool)
         except KeyboardInterrupt:
             status, code = "interrupted", 130
