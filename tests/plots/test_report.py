@@ -186,14 +186,18 @@ def test_histories_are_those_of_the_points_asked_for(tmp_path: Path) -> None:
     (run_dir / "config.resolved.toml").write_text(config)
     run = read_run(run_dir)
     picture = histories_picture(run, scan(run))
-    place = run.frames["s"].values
+    place = run.frames.line("s")
     for wanted in (10.1, 80.0):
         point = int(np.abs(place - wanted).argmin())
         name = f"s = {number(float(place[point]), 6)} mm"
         drawn = [trace for trace in picture.interactive.data if trace.name == name]
         assert len(drawn) == 2, "pressure and indentation"
-        np.testing.assert_array_equal(drawn[0].y, run.frames["pressure"].values[:, point])
-        np.testing.assert_array_equal(drawn[1].y, run.frames["indentation"].values[:, point])
+        np.testing.assert_array_equal(
+            drawn[0].y, run.frames.field("pressure", slice(None))[:, point]
+        )
+        np.testing.assert_array_equal(
+            drawn[1].y, run.frames.field("indentation", slice(None))[:, point]
+        )
 
 
 @pytest.mark.parametrize(

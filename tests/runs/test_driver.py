@@ -103,3 +103,29 @@ def test_the_recorded_earthquake_drives_the_strip(tmp_path: Path):
     assert manifest["steps"] >= 2 * 1550
     assert list(manifest["data"]) == ["elCentro.at2"]
     assert 0 < summary["error_bound_x"]["value"] < 1e-2
+
+
+def test_a_run_says_when_the_compiler_works_and_when_it_is_done(tmp_path: Path):
+    config = tmp_path / "strip.toml"
+    # A size of its own: what another test has compiled is not compiled again.
+    text = STRIP.format(load='value = "0.3 um/s"', end=1.0, solver='dt = "0.05 s"')
+    config.write_text(text.replace("points = 60", "points = 37"))
+    heard: list[str] = []
+    run(load_config(config), tmp_path / "out", on_event=lambda event: heard.append(event["event"]))
+    assert heard[:2] == ["compiling", "compiled"]
+    assert heard.count("compiling") == 1 and heard[-1] == "stopped"
+
+
+def test_a_main_trajectory_that_fails_shortens_its_companion(tmp_path: Path):
+    config = tmp_path / "strip.toml"
+    # No number about t = 1.27, which lies between the samples of the check on reading.
+    hole = "0.3 + 0*sqrt((t - 1.27)**2 - 1e-4)"
+    text = STRIP.format(load=f'expression = "{hole}"', end=2.0, solver='dt = "0.01 s"')
+    config.write_text(text)
+    out = tmp_path / "out"
+    outcome = run(load_config(config), out)
+    assert outcome.status == "failed" and outcome.exit_code == 3
+    frames = xr.open_zarr(out / "trajectory.zarr", consolidated=False, chunks=None)
+    assert 20 < frames.sizes["time"] < 30
+    assert np.isfinite(frames["separation_x"]).all()
+    assert np.all(frames["separation_x"] <= frames["separation_bound_x"])

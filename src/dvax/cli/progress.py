@@ -1,7 +1,7 @@
 """What a run says while it runs: a bar with the time left on a terminal, lines in a pipe.
 
-The driver sends events, dicts with `event` one of compiled, progress, warning, stopped. Compile
-time is shown apart: it is paid once, and says nothing about how long the rest will take.
+The driver sends events, dicts with `event` one of compiling, compiled, progress, warning, stopped.
+Compile time is shown apart: it is paid once, and says nothing about how long the rest will take.
 """
 
 import time

@@ -1,10 +1,12 @@
 """`dvax run CONFIG.toml -o DIR`: from a configuration to a certified solution on disk."""
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from dvax.cli.ahead import loaded_ahead
 from dvax.cli.failure import reported
 from dvax.cli.options import ConfigFile, Debug, Force, Quiet
 from dvax.cli.precision import enable_double
@@ -50,7 +52,9 @@ def carry_out(config: "Config", out: Path, *, force: bool, quiet: bool) -> None:
     enable_double()
     from dvax.runs.driver import run as drive
 
-    with progress(config.units.time, quiet=quiet) as listener:
+    with progress(config.units.time, quiet=quiet) as listener, ExitStack() as stack:
+        if config.output.report:
+            listener = stack.enter_context(loaded_ahead("dvax.plots", listener))
         outcome = drive(config, out, overwrite=force, on_event=listener)
     if not quiet:
         _say_figures(outcome.summary)

@@ -90,7 +90,7 @@ def certificate_picture(run: RunRecord) -> Picture | None:
 
 
 def _legend(run: RunRecord, name: str, *, with_unit: bool) -> str:
-    status = str(run.frames[name].attrs.get("status", ""))
+    status = str(run.frames.about(name).get("status", ""))
     status = f" ({status})" if status else ""
     unit = f" [{run.unit(name)}]" if with_unit and run.unit(name) else ""
     return CURVES[name][0] + status + unit

@@ -172,7 +172,7 @@ def _coordinates(run: RunRecord) -> list[str]:
 
 
 def _nearest(run: RunRecord, place: np.ndarray) -> int:
-    axes = [np.asarray(run.frames[name].values, float) for name in _coordinates(run)]
+    axes = [run.frames.line(name).astype(float) for name in _coordinates(run)]
     distance = sum((axis - value) ** 2 for axis, value in zip(axes, place, strict=True))
     return int(np.argmin(distance))
 
@@ -180,12 +180,12 @@ def _nearest(run: RunRecord, place: np.ndarray) -> int:
 def _place(run: RunRecord, point: int) -> str:
     parts = []
     for name in _coordinates(run):
-        value = number(float(run.frames[name].values[point]), 6)
+        value = number(float(run.frames.line(name)[point]), 6)
         parts.append(f"{name} = {value} {unit_text(run.unit(name))}".strip())
     return ", ".join(parts)
 
 
 def _columns(run: RunRecord, name: str, points: np.ndarray) -> np.ndarray:
     """The histories of a field at `points`, shape (frames, points), read block by block."""
-    parts = [np.asarray(run.frames[name][block].values)[:, points] for block in blocks(run)]
+    parts = [run.frames.field(name, block)[:, points] for block in blocks(run)]
     return np.concatenate(parts).astype(float)

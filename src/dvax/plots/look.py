@@ -76,21 +76,17 @@ def _axis() -> dict[str, Any]:
     )
 
 
+# Made once, when this file is imported: Plotly loads the parts of a layout when they are first used.
+_TEMPLATE = go.layout.Template(layout=dict(xaxis=_axis(), yaxis=_axis()))
+
+
 def blank(height: int, row_heights: tuple[float, ...] = (1.0,)) -> go.Figure:
     """An empty interactive figure in the house's look; its title stands in the page, above it.
 
     Several `row_heights` make panels one above the other that share the horizontal axis.
     """
-    figure = make_subplots(
-        rows=len(row_heights),
-        cols=1,
-        shared_xaxes=True,
-        row_heights=list(row_heights),
-        vertical_spacing=0.05,
-    )
-    axis = _axis()
-    figure.update_layout(
-        template=go.layout.Template(layout=dict(xaxis=axis, yaxis=axis)),
+    layout = go.Layout(
+        template=_TEMPLATE,
         height=height,
         font=dict(family=FONT, size=13, color=INK),
         paper_bgcolor="white",
@@ -101,7 +97,15 @@ def blank(height: int, row_heights: tuple[float, ...] = (1.0,)) -> go.Figure:
             traceorder="normal", orientation="h", x=0, y=1.01, xanchor="left", yanchor="bottom"
         ),
     )
-    return figure
+    return make_subplots(
+        rows=len(row_heights),
+        cols=1,
+        shared_xaxes=True,
+        row_heights=list(row_heights),
+        vertical_spacing=0.05,
+        # Begun with the template, so that Plotly does not read and check one of its own first.
+        figure=go.Figure(layout=layout),
+    )
 
 
 def pressure_bar(figure: go.Figure, words: str, height: int) -> dict[str, Any]:

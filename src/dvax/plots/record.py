@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from dvax.errors import InputError, InputProblem
+from dvax.plots.frames import Frames, open_frames
 
 # What manifest.json calls a run that did not reach its end, and what a reader should know of it.
 UNFINISHED = {
@@ -50,7 +50,7 @@ class RunRecord:
     config: Mapping[str, Any]
     constants: tuple[ConstantRow, ...]
     warnings: tuple[str, ...]
-    trajectory: xr.Dataset | None
+    trajectory: Frames | None
     notes: tuple[str, ...] = field(default=())
 
     @property
@@ -65,7 +65,7 @@ class RunRecord:
         return str(self.manifest.get("status", "unknown"))
 
     @property
-    def frames(self) -> xr.Dataset:
+    def frames(self) -> Frames:
         """The trajectory; asking for it where there is none is a mistake of the caller."""
         if self.trajectory is None:
             raise ValueError(
@@ -76,20 +76,20 @@ class RunRecord:
     @property
     def time(self) -> np.ndarray:
         """Saved times, shape (frames,), in the run's unit of time."""
-        return np.asarray(self.frames["time"].values, dtype=float)
+        return self.series("time")
 
     @property
     def boundary_shape(self) -> tuple[int, ...]:
         """(n,) on a curve, (n1, n2) on a surface whose points are flattened in C order."""
         given = self.frames.attrs.get("boundary_shape")
         if given is None or len(given) == 1:
-            return (self.frames.sizes["point"],)
+            return (self.frames.points,)
         return tuple(int(n) for n in given)
 
     @property
     def weight(self) -> np.ndarray:
         """Quadrature weights of the boundary's points, shape (point,)."""
-        return np.asarray(self.frames["weight"].values, dtype=float)
+        return self.frames.line("weight").astype(float)
 
     def has(self, name: str) -> bool:
         """Whether the trajectory holds the variable `name`."""
@@ -97,14 +97,14 @@ class RunRecord:
 
     def series(self, name: str) -> np.ndarray:
         """A variable over time alone, shape (frames,)."""
-        return np.asarray(self.frames[name].values, dtype=float)
+        return self.frames.line(name).astype(float)
 
     def unit(self, name: str) -> str:
         """The unit of a variable or coordinate, as the trajectory declares it.
 
         Norms in L2 over a boundary of dimension d have the unit length^(d/2) in them.
         """
-        declared = str(self.frames[name].attrs.get("units", ""))
+        declared = str(self.frames.about(name).get("units", ""))
         return declared.replace("^(d/2)", "^0.5" if len(self.boundary_shape) == 1 else "")
 
 
@@ -163,32 +163,26 @@ def _toml(file: Path) -> Mapping[str, Any]:
         raise _damaged(file, error) from error
 
 
-def _trajectory(store: Path) -> tuple[xr.Dataset | None, tuple[str, ...]]:
+def _trajectory(store: Path) -> tuple[Frames | None, tuple[str, ...]]:
     """The frames that are whole, and a note where some were left out."""
     if not store.exists():
         return None, ()
     try:
-        # The driver appends blocks; metadata consolidated before the last block would hide it.
-        dataset = xr.open_zarr(store, consolidated=False, chunks=None, decode_times=False)
+        frames, room = open_frames(store)
     except (OSError, ValueError, KeyError) as error:
         raise _damaged(store, error) from error
-    if "time" not in dataset or dataset.sizes["time"] == 0:
-        return None, ()
-    time = np.asarray(dataset["time"].values, dtype=float)
-    rising = np.isfinite(time) & np.concatenate([[True], np.diff(time) > 0])
-    whole = len(time) if rising.all() else int(np.argmin(rising))
-    if whole == len(time):
-        return dataset, ()
-    # A store has its full length from the start, and a frame gets its time when it is complete.
+    whole = 0 if frames is None else frames.count
+    if whole == room:
+        return frames, ()
     note = (
-        f"{len(time) - whole} of {len(time)} frames have no valid time: "
+        f"{room - whole} of {room} frames have no valid time: "
         "the run ended before they were complete. They are left out."
     )
-    return (dataset.isel(time=slice(0, whole)) if whole else None), (note,)
+    return frames, (note,)
 
 
 def _constants(
-    trajectory: xr.Dataset | None, manifest: Mapping[str, Any], directory: Path
+    trajectory: Frames | None, manifest: Mapping[str, Any], directory: Path
 ) -> tuple[ConstantRow, ...]:
     """The list in the trajectory's attributes; the manifest's where nothing was written."""
     rows: Any = None if trajectory is None else trajectory.attrs.get("constants")

@@ -72,26 +72,25 @@ def edges(centres: np.ndarray) -> np.ndarray:
 def blocks(run: RunRecord) -> Iterator[slice]:
     """Slices of frames that fit the memory budget, made of whole chunks of the store where these
     are not far larger: a part of a chunk costs as much to read as the whole."""
-    pressure = run.frames["pressure"]
-    chunk = (pressure.encoding.get("chunks") or (1,))[0]
-    frame_bytes = 8 * pressure.sizes["point"]
+    chunk, count = run.frames.frames_per_chunk, run.frames.count
+    frame_bytes = 8 * run.frames.points
     fitting = max(1, BLOCK_BYTES // frame_bytes)
     step = fitting if chunk * frame_bytes > 4 * BLOCK_BYTES else -(-fitting // chunk) * chunk
-    for start in range(0, pressure.sizes["time"], step):
-        yield slice(start, min(start + step, pressure.sizes["time"]))
+    for start in range(0, count, step):
+        yield slice(start, min(start + step, count))
 
 
 def scan(run: RunRecord) -> Scan:
     """Read pressure and regime once. InputError where a regime is not 0, 1 or 2."""
-    frames, points = run.frames.sizes["time"], run.frames.sizes["point"]
+    frames, points = run.frames.count, run.frames.points
     weight = run.weight / run.weight.sum()
     shares = np.empty((len(REGIMES), frames))
     time_mean = np.zeros(points)
     low, high = np.inf, -np.inf
     gather = _Gather(run) if len(run.boundary_shape) == 1 else None
     for block in blocks(run):
-        pressure = np.asarray(run.frames["pressure"][block].values, dtype=float)
-        regime = np.asarray(run.frames["regime"][block].values)
+        pressure = run.frames.field("pressure", block).astype(float, copy=False)
+        regime = run.frames.field("regime", block)
         _check_regime(run, regime, block)
         for kind in range(len(REGIMES)):
             shares[kind, block] = (regime == kind) @ weight
@@ -121,7 +120,7 @@ class _Gather:
     """Fold frames into cells: sums for the means, running extremes, regime measure per cell."""
 
     def __init__(self, run: RunRecord):
-        place = np.asarray(run.frames["s"].values, dtype=float)
+        place = run.frames.line("s").astype(float)
         # Nodes from a file need not be sorted along the curve; the map's axis must be.
         order = np.argsort(place, kind="stable")
         self.order = slice(None) if (np.diff(place) > 0).all() else order

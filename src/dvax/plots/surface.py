@@ -111,11 +111,11 @@ def _starts(count: int) -> np.ndarray:
 
 
 def _read(run: RunRecord, name: str, frame: int) -> np.ndarray:
-    return np.asarray(run.frames[name][frame].values).reshape(run.boundary_shape)
+    return run.frames.field(name, frame).reshape(run.boundary_shape)
 
 
 def _cell_edges(run: RunRecord, axis: int, starts: np.ndarray) -> np.ndarray:
-    grid = np.asarray(run.frames[("s1", "s2")[axis]].values, float).reshape(run.boundary_shape)
+    grid = run.frames.line(("s1", "s2")[axis]).astype(float).reshape(run.boundary_shape)
     line = grid[:, 0] if axis == 0 else grid[0, :]
     return edges(line)[np.append(starts, len(line))]
 

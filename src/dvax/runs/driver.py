@@ -10,6 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -22,7 +23,7 @@ import numpy as np
 from dvax.errors import InputError, InputProblem, SolveError
 from dvax.evolution import ETD1, ETD2RK, Solution, solve
 from dvax.models import Contact
-from dvax.runs.compile_time import compile_seconds
+from dvax.runs.compile_time import announced, compile_seconds
 from dvax.runs.config import Config, build_contact
 from dvax.runs.contact_figures import Figures
 from dvax.runs.contact_frames import (
@@ -63,7 +64,8 @@ def run(
 ) -> RunOutcome:
     """Solve what `config` describes and leave a run directory at `out`.
 
-    `on_event` is called with dicts whose "event" is compiled, progress, warning or stopped.
+    `on_event` is called with dicts whose "event" is compiling, compiled, progress, warning or
+    stopped.
 
     **Raises:** `dvax.InputError`, with nothing written, where `out` exists and is not empty and
     `overwrite` is false, or where data files no longer fit. A failure of the solve is not raised: it
@@ -118,8 +120,12 @@ class _Run:
         figures = Figures(self.inputs, self.config, self.constants)
         status, code, reason = "finished", 0, "The end time was reached."
         try:
-            with _terminable():
-                self._blocks(times, block, store, figures)
+            with (
+                _terminable(),
+                ThreadPoolExecutor(1) as pool,
+                announced(lambda: self._event("compiling")),
+            ):
+                self._blocks(times, block, store, figures, pool)
         except KeyboardInterrupt:
             status, code = "interrupted", 130
             reason = "Interrupted; every frame written until then is kept."
@@ -132,7 +138,14 @@ class _Run:
         self._event("stopped", message=reason, status=status)
         return RunOutcome(status, code, reason, self.directory.path, summary)
 
-    def _blocks(self, times: np.ndarray, block: int, store: FrameStore, figures: Any) -> None:
+    def _blocks(
+        self,
+        times: np.ndarray,
+        block: int,
+        store: FrameStore,
+        figures: Figures,
+        pool: ThreadPoolExecutor,
+    ) -> None:
         main, other = _Piece(self.inputs.x0), _Piece(self.inputs.companion_x0)
         apart = self.space.norm(jnp.asarray(self.inputs.x0 - self.inputs.companion_x0))
         error, defect = 0.0, 0.0
@@ -141,18 +154,20 @@ class _Run:
             # Blocks are of one length, so that they share one compilation: the last repeats its end.
             ts = np.concatenate([wanted, np.full(block - len(wanted), wanted[-1])])
             start = times[max(first - 1, 0)]
+            # Two trajectories keep two cores busy, once the first block has compiled for both.
+            beside = pool.submit(self._solve, other, start, ts) if first else None
             failure = None
             try:
                 a = self._solve(main, start, ts)
             except SolveError as stopped:
-                a, failure = stopped.solution, stopped
+                a, failure, beside = stopped.solution, stopped, None
                 assert isinstance(a, Solution)
                 if len(a.ts) == 0:
                     raise
                 ts = np.asarray(a.ts)
                 wanted = wanted[: len(ts)]
             # The same arithmetic for both, so that their distance is not made of its differences.
-            b = self._solve(other, start, ts)
+            b = self._solve(other, start, ts) if beside is None else beside.result()
             bound = bound_error(self.problem, a, self.constants, initial_error=error)
             values = dict(block_values(self.model, self.space, a, b, bound, apart))
             store.mark(("error_bound_x", "error_bound_u", "error_bound_sharp_x"), bound.status)
@@ -164,6 +179,7 @@ class _Run:
             figures.add(wanted, kept)
             if failure is not None:
                 raise failure
+            main, other = self._end(a), self._end(b)
             error, defect = bound, values["defect"][-1]
             self.steps += int(a.stats["steps"])
             self.rejected += int(a.stats["rejected"])
@@ -173,15 +189,17 @@ class _Run:
 
     def _solve(self, piece: "_Piece", start: float, ts: np.ndarray) -> Solution:
         s = self.config.solver
-        sol = solve(
+        return solve(
             self.problem, jnp.asarray(piece.x), start, float(ts[-1]), None, ts,
             dt=s.dt, rtol=s.rtol or 1e-6, atol=s.atol or 1e-9,
             method=ETD1() if s.method == "ETD1" else ETD2RK(),
             constants=self.constants, measure=True,
             dt0=piece.dt, horizon=self.config.time.end,
         )  # fmt: skip
-        piece.x, piece.dt = sol.stats["x"], sol.stats["next_dt"] if s.dt is None else None
-        return sol
+
+    def _end(self, solved: Solution) -> "_Piece":
+        fixed = self.config.solver.dt is not None
+        return _Piece(solved.stats["x"], None if fixed else solved.stats["next_dt"])
 
     def _event(self, kind: str, **facts: Any) -> None:
         event = {"event": kind, **facts}
@@ -210,12 +228,12 @@ class _Run:
         self.directory.write_json("manifest.json", content)
 
 
+@dataclass(frozen=True)
 class _Piece:
     """Where a trajectory stands: its state and the step it would take next."""
 
-    def __init__(self, x: np.ndarray):
-        self.x: Any = x
-        self.dt: Any = None
+    x: Any
+    dt: Any = None
 
 
 def _block_length(frames: int, points: int) -> int:

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 import zarr
 
 FILES = ("config.resolved.toml", "manifest.json", "summary.json", "log.jsonl", "report.html")
@@ -78,49 +77,52 @@ class FrameStore:
     ):
         self.path = path
         self.written = 0
-        self._names = tuple(variables)
         points = next(len(values) for dims, values, _ in coords.values() if dims == ("point",))
         sizes = {"time": frames, "point": points}
         chunk = {"time": block, "point": min(points, max(1, _CHUNK_BYTES // (8 * block)))}
-        fixed = xr.Dataset(
-            coords={name: (dims, values, meta) for name, (dims, values, meta) in coords.items()},
-            attrs=dict(attrs),
+        # Written by zarr alone: xarray takes longer to import than a block to solve. What it needs
+        # to see a Dataset is the names of the dimensions, and this attribute for its coordinates.
+        group = zarr.open_group(
+            path,
+            mode="w-",
+            zarr_format=3,
+            attributes={**attrs, "coordinates": " ".join(coords)},
         )
-        fixed.to_zarr(path, mode="w-", consolidated=False, zarr_format=3)
-        self._group = zarr.open_group(path, mode="r+")
-        everything = {"time": (("time",), np.float64, dict(time_attrs)), **variables}
-        for name, (dims, dtype, meta) in everything.items():
+
+        def create(name: str, dims: tuple[str, ...], dtype: Any, meta: Mapping[str, Any]) -> Any:
             integer = np.issubdtype(dtype, np.integer)
-            array = self._group.create_array(
+            return group.create_array(
                 name,
                 shape=tuple(sizes[d] for d in dims),
                 chunks=tuple(chunk[d] for d in dims),
                 dtype=dtype,
                 fill_value=-1 if integer else np.nan,
                 dimension_names=dims,
+                attributes=dict(meta),
             )
-            array.attrs.update(meta)
+
+        for name, (dims, values, meta) in coords.items():
+            create(name, dims, values.dtype, meta)[...] = values
+        self._time = create("time", ("time",), np.float64, time_attrs)
+        self._arrays = {name: create(name, *variable) for name, variable in variables.items()}
 
     def write(self, times: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
         """Append complete frames; their times go last and make them count."""
         region = slice(self.written, self.written + len(times))
-        for name in self._names:
-            self._array(name)[region] = values[name]
-        self._array("time")[region] = times
+        for name, array in self._arrays.items():
+            array[region] = values[name]
+        self._time[region] = times
         self.written += len(times)
 
     def mark(self, names: tuple[str, ...], status: str) -> None:
         """State how much is known of these variables (their attribute `status`)."""
         for name in names:
-            if self._array(name).attrs.get("status") != status:
-                self._array(name).attrs["status"] = status
+            attrs = self._arrays[name].attrs
+            if attrs.get("status") != status:
+                attrs["status"] = status
 
     def finish(self) -> None:
         """Cut off the frames that were never reached."""
-        for name in ("time", *self._names):
-            array = self._array(name)
+        for array in (self._time, *self._arrays.values()):
             if array.shape[0] != self.written:
                 array.resize((self.written, *array.shape[1:]))
-
-    def _array(self, name: str) -> Any:
-        return self._group[name]
