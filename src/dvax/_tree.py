@@ -102,6 +102,17 @@ def is_concrete(*trees: Tree) -> bool:
     return True
 
 
+def host(a: Tree) -> Tree:
+    """What has a value now as NumPy arrays, the rest as it is. On a few numbers JAX would compile
+    every operation as a program of its own."""
+    return jtu.tree_map(lambda leaf: np.asarray(leaf) if is_concrete(leaf) else leaf, a)
+
+
+def library(*values: Tree) -> Any:
+    """`numpy` where all of these have a value now, else `jax.numpy`."""
+    return np if is_concrete(values) else jnp
+
+
 def as_float(a: Tree, name: str) -> Tree:
     """Arrays of a floating type from what the user gave; Python numbers take JAX's default type.
 

@@ -1,5 +1,6 @@
 """Section 7 of the paper: saturated normal contact on a boundary Γ_C."""
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -113,7 +114,7 @@ class Contact(eqx.Module):
     def problem(self) -> Problem:
         """The coupled system: A = −αI, P = βI, K = [0, κ₀], eq:concrete_f and eq:concrete_h."""
         return Problem(
-            A=Scalar(-self.alpha),
+            A=Scalar(-_tree.host(self.alpha)),
             P=Scaling(self.beta),
             K=Box(0.0, self.kappa0),
             f=_Rate(self.ell, self.d_x, self.d_u),
@@ -126,19 +127,22 @@ class Contact(eqx.Module):
         """γ_c = L_F = (1+b_u)/β, α_h = b_x, β_h = b_u, α_f = d_x, β_f = d_u, M = 1, ω = −α, and the
         one-sided rate: at every point ∂f̃/∂x lies between −d_x and −d_x + d_u b_x/(1+b_u), so
         μ = −(α + d_x − d_u b_x/(1+b_u)), where the paper's |d_x| gives −(α − d_x − …)."""
-        modulus = (1.0 + self.b_u) / self.beta
+        alpha, beta, b_x, b_u, d_x, d_u = _tree.host(
+            (self.alpha, self.beta, self.b_x, self.b_u, self.d_x, self.d_u)
+        )
+        modulus = (1.0 + b_u) / beta
         return Constants(
             gamma=modulus,
             L_F=modulus,
-            alpha_h=self.b_x,
-            beta_h=self.b_u,
-            alpha_f=self.d_x,
-            beta_f=self.d_u,
+            alpha_h=b_x,
+            beta_h=b_u,
+            alpha_f=d_x,
+            beta_f=d_u,
             M=1.0,
-            omega=-self.alpha,
-            m_P=1.0 / self.beta,
-            norm_P_inv=1.0 / self.beta,
-            one_sided=-(self.alpha + self.d_x - self.d_u * self.b_x / (1.0 + self.b_u)),
+            omega=-alpha,
+            m_P=1.0 / beta,
+            norm_P_inv=1.0 / beta,
+            one_sided=-(alpha + d_x - d_u * b_x / (1.0 + b_u)),
             status="proved",
         )
 
@@ -196,7 +200,8 @@ def _breaks_rule(name: str, value: jax.Array) -> list[InputProblem]:
         return []
     else:
         given = f"{float(value):g}"
-        holds = bool(jnp.isfinite(value) & ((value >= 0) if zero_allowed else (value > 0)))
+        number = float(value)
+        holds = math.isfinite(number) and (number >= 0 if zero_allowed else number > 0)
     if holds:
         return []
     rule = "it must be a number ≥ 0" if zero_allowed else "it must be a positive number"

@@ -1,7 +1,6 @@
 """The contact law's frames: which variables a saved time has, and how a block of them is made."""
 
 import json
-from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -109,53 +108,53 @@ def attributes(config: Config, rows: list[dict], shape: tuple[int, ...]) -> dict
 
 
 def block_values(
-    model: Contact, space: AbstractSpace, main: Solution, other: Solution, bound: Bound, t_zero: Any
-) -> Mapping[str, np.ndarray]:
-    """All variables at the saved times of a block. `t_zero` holds ‖Δx₀‖ of the companion."""
-    values = _values(model, space, main, other, jnp.asarray(t_zero))
+    model: Contact,
+    space: AbstractSpace,
+    main: Solution,
+    other: Solution,
+    bound: Bound,
+    apart: float | None,
+) -> dict[str, np.ndarray]:
+    """All variables at the saved times of a block. `apart` holds ‖Δx₀‖ of the companion, None where
+    the block begins with it."""
     assert bound.x_sharp is not None and main.law_error is not None
-    values["law_error"] = main.law_error
-    values["error_bound_x"], values["error_bound_u"] = bound.x, bound.u
-    values["error_bound_sharp_x"] = bound.x_sharp
-    return {name: np.asarray(value) for name, value in values.items()}
+    frames = _of_frames(model, space, main.ts, (main.xs, main.us), (other.xs, other.us))
+    values = {name: np.asarray(value) for name, value in frames.items()}
+    c, ts = model.constants, np.asarray(main.ts)
+    # Two computed states of this size cannot be told apart any nearer than this.
+    rounding = 64 * np.finfo(main.xs.dtype).eps * values.pop("size")
+    initial = values["separation_x"][0] if apart is None else apart
+    certified = float(c.M) * np.exp(c.growth_rate * ts) * initial + rounding
+    return {
+        **values,
+        "indentation": np.asarray(main.xs),
+        "pressure": np.asarray(main.ys),
+        "law_error": np.asarray(main.law_error),
+        "error_bound_x": np.asarray(bound.x),
+        "error_bound_u": np.asarray(bound.u),
+        "error_bound_sharp_x": np.asarray(bound.x_sharp),
+        "separation_bound_x": certified,
+        "separation_bound_u": c.L * certified,
+        "separation_sharp_x": np.exp(-c.sharp_decay_rate * ts) * initial + rounding,
+    }
 
 
 @jax.jit
-def _norms(space: AbstractSpace, a: jax.Array, b: jax.Array) -> jax.Array:
-    return jax.lax.map(lambda pair: space.norm(pair[0] - pair[1]), (a, b))
-
-
-@jax.jit
-def _of_frames(model: Contact, space: AbstractSpace, ts: Any, xs: Any) -> dict[str, jax.Array]:
+def _of_frames(
+    model: Contact, space: AbstractSpace, ts: Any, main: Any, other: Any
+) -> dict[str, jax.Array]:
     measure = space.size()
 
-    def one(frame: tuple[Any, Any]) -> dict[str, jax.Array]:
-        t, x = frame
+    def one(frame: tuple[Any, Any, Any]) -> dict[str, jax.Array]:
+        t, (x, u), (companion_x, companion_u) = frame
         ones = jnp.ones_like(x)
         return {
             "regime": model.regimes(t, x),
             "demand_mean": space.inner(model.g(t) * ones, ones) / measure,
             "load_mean": space.inner(model.ell(t) * ones, ones) / measure,
+            "separation_x": space.norm(x - companion_x),
+            "separation_u": space.norm(u - companion_u),
+            "size": space.norm(x),
         }
 
-    return jax.lax.map(one, (ts, xs))
-
-
-def _values(
-    model: Contact, space: AbstractSpace, main: Solution, other: Solution, apart: jax.Array
-) -> dict[str, Any]:
-    c = model.constants
-    sharp = -c.sharp_decay_rate
-    # Two computed states of this size cannot be told apart any nearer than this.
-    rounding = 64 * jnp.finfo(main.xs.dtype).eps * _norms(space, main.xs, 0 * main.xs)
-    certified = c.M * jnp.exp(c.growth_rate * main.ts) * apart + rounding
-    return {
-        **_of_frames(model, space, main.ts, main.xs),
-        "indentation": main.xs,
-        "pressure": main.ys,
-        "separation_x": _norms(space, main.xs, other.xs),
-        "separation_u": _norms(space, main.us, other.us),
-        "separation_bound_x": certified,
-        "separation_bound_u": c.L * certified,
-        "separation_sharp_x": jnp.exp(sharp * main.ts) * apart + rounding,
-    }
+    return jax.lax.map(one, (ts, main, other))

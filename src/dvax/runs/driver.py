@@ -147,8 +147,7 @@ class _Run:
         pool: ThreadPoolExecutor,
     ) -> None:
         main, other = _Piece(self.inputs.x0), _Piece(self.inputs.companion_x0)
-        apart = self.space.norm(jnp.asarray(self.inputs.x0 - self.inputs.companion_x0))
-        error, defect = 0.0, 0.0
+        apart, error, defect = None, 0.0, 0.0
         for first in range(0, len(times), block):
             wanted = times[first : first + block]
             # Blocks are of one length, so that they share one compilation: the last repeats its end.
@@ -169,7 +168,8 @@ class _Run:
             # The same arithmetic for both, so that their distance is not made of its differences.
             b = self._solve(other, start, ts) if beside is None else beside.result()
             bound = bound_error(self.problem, a, self.constants, initial_error=error)
-            values = dict(block_values(self.model, self.space, a, b, bound, apart))
+            values = block_values(self.model, self.space, a, b, bound, apart)
+            apart = float(values["separation_x"][0]) if apart is None else apart
             store.mark(("error_bound_x", "error_bound_u", "error_bound_sharp_x"), bound.status)
             assert a.defect is not None
             values["defect"] = defect + np.asarray(a.defect)

@@ -3,7 +3,6 @@
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
@@ -28,7 +27,7 @@ class Constant(AbstractSignal):
     def __init__(self, value: Any):
         self.constant = _tree.as_float(value, "dvax.signals.Constant(value)")
         _tree.require(
-            lambda: jnp.all(jnp.isfinite(self.constant)),
+            lambda: np.all(np.isfinite(self.constant)),
             "dvax.signals.Constant(value)",
             self.constant,
             "data must be finite: a gap is not a value",

@@ -128,7 +128,7 @@ def _check(name: str, times: Any, values: jax.Array, least: int) -> None:
                 )
             )
     _tree.require(
-        lambda: jnp.all(jnp.isfinite(values)),
+        lambda: np.all(np.isfinite(values)),
         f"{name}(values)",
         values,
         "measured values must be finite: a gap is not a value",

@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .. import _tree
 from .._tree import Tree
@@ -31,7 +32,7 @@ class L2(AbstractSpace):
     def __init__(self, weights: Any):
         self.w = _tree.as_float(weights, "weights")
         _tree.require(
-            lambda: jnp.all((self.w > 0) & jnp.isfinite(self.w)),
+            lambda: np.all((np.asarray(self.w) > 0) & np.isfinite(self.w)),
             "dvax.spaces.L2(weights)",
             self.w,
             "quadrature weights must be positive and finite, or ⟨·,·⟩ is no inner product",

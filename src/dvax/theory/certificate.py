@@ -92,13 +92,13 @@ def bound_error(
     law = sol.law_residual, sol.law_step
     start = _starts(initial_error, sol.ts.dtype)
     t0 = jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
-    bounds = _bounds(constants, t0, sol.ts, impulse, apart, law, start)
+    x, u, x_sharp, u_sharp, onward = _bounds(constants, t0, sol.ts, impulse, apart, law, start)
     status = weakest(
         constants.status_of(*(name for name, _ in constants.statuses)),
         "proved" if measured.enclosed else "estimated",
         _status_of_structure(problem, sol, constants),
     )
-    return Bound(sol.ts, *bounds, status)
+    return Bound(sol.ts, x, u, x_sharp, u_sharp, onward, status)
 
 
 @jax.jit

@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
+import numpy as np
 
 from .. import _tree
 from ..errors import InputError, InputProblem
@@ -102,17 +102,20 @@ class Constants(eqx.Module):
     @property
     def L(self) -> Any:
         """Lipschitz constant of the state-to-control map: L = α_h ‖P⁻¹‖/γ (eq:LU_def)."""
-        return self.alpha_h * self.norm_P_inv / self.gamma
+        c = _tree.host(self)
+        return c.alpha_h * c.norm_P_inv / c.gamma
 
     @property
     def L_tilde(self) -> Any:
         """Lipschitz constant of the reduced map: L̃ = α_f + β_f L (reduceLip)."""
-        return self.alpha_f + self.beta_f * self.L
+        c = _tree.host(self)
+        return c.alpha_f + c.beta_f * self.L
 
     @property
     def growth_rate(self) -> Any:
         """ω + M L̃, the exponent of every estimate of thm:continuous_dependence."""
-        return self.omega + self.M * self.L_tilde
+        c = _tree.host(self)
+        return c.omega + c.M * self.L_tilde
 
     @property
     def decay_rate(self) -> Any:
@@ -124,25 +127,29 @@ class Constants(eqx.Module):
     def sharp_decay_rate(self) -> Any:
         """−μ of the one-sided constant, or None where that is not known: ‖x₁−x₂‖ ≤ e^{μt}‖Δx₀‖,
         since d/dt ½‖x₁−x₂‖² ≤ μ‖x₁−x₂‖²."""
-        return None if self.one_sided is None else -self.one_sided
+        return None if self.one_sided is None else -_tree.host(self.one_sided)
 
     def hadamard(self, T: Any) -> Any:
         """C_T = M e^{(ω+ML̃)₊T}(1 + L): ‖(x₁,u₁)−(x₂,u₂)‖ ≤ C_T‖Δx₀‖ (cor:hadamard_wellposed)."""
-        return self.M * jnp.exp(jnp.maximum(self.growth_rate, 0.0) * T) * (1.0 + self.L)
+        c, lib = _tree.host(self), _tree.library(self, T)
+        return c.M * lib.exp(lib.maximum(self.growth_rate, 0.0) * T) * (1.0 + self.L)
 
     def contraction_factor(self, rho: Any) -> Any:
         """q_ρ = ‖I − ρP⁻¹‖ + ρ β_h ‖P⁻¹‖ (eq:smalless), with ‖I − ρP⁻¹‖ from the spectrum."""
-        spread = jnp.maximum(jnp.abs(1.0 - rho * self.m_P), jnp.abs(1.0 - rho * self.norm_P_inv))
-        return spread + rho * self.beta_h * self.norm_P_inv
+        c, lib = _tree.host(self), _tree.library(self, rho)
+        spread = lib.maximum(abs(1.0 - rho * c.m_P), abs(1.0 - rho * c.norm_P_inv))
+        return spread + rho * c.beta_h * c.norm_P_inv
 
     @property
     def best_rho(self) -> Any:
         """ρ* = 2/(m_P + ‖P⁻¹‖), which minimises ‖I − ρP⁻¹‖ (remark after eq:smalless)."""
-        return 2.0 / (self.m_P + self.norm_P_inv)
+        c = _tree.host(self)
+        return 2.0 / (c.m_P + c.norm_P_inv)
 
     def bielecki_factor(self, lam: Any) -> Any:
         """M L̃/(λ − ω): the Picard map contracts by it in the λ-norm, λ > ω + M L̃ (eq:Sop)."""
-        return self.M * self.L_tilde / (lam - self.omega)
+        c = _tree.host(self)
+        return c.M * self.L_tilde / (lam - c.omega)
 
     def status_of(self, *names: str) -> Status:
         """The weakest status among the named constants."""
@@ -203,14 +210,14 @@ class Constants(eqx.Module):
         ]
 
     def _check(self) -> None:
+        c = _tree.host(self)
         rules = [
-            *((n, jnp.isfinite(getattr(self, n)), "finite") for n in _PRIMARY),
-            *((n, getattr(self, n) > 0, "positive") for n in ("gamma", "L_F", "m_P", "norm_P_inv")),
-            *((n, getattr(self, n) >= 0, "≥ 0")
-              for n in ("alpha_h", "beta_h", "alpha_f", "beta_f")),
-            ("M", self.M >= 1, "≥ 1"),
-            ("gamma", self.gamma <= self.L_F * (1 + 1e-12), "at most L_F"),
-            ("m_P", self.m_P <= self.norm_P_inv * (1 + 1e-12), "at most norm_P_inv"),
+            *((n, abs(getattr(c, n)) < np.inf, "finite") for n in _PRIMARY),
+            *((n, getattr(c, n) > 0, "positive") for n in ("gamma", "L_F", "m_P", "norm_P_inv")),
+            *((n, getattr(c, n) >= 0, "≥ 0") for n in ("alpha_h", "beta_h", "alpha_f", "beta_f")),
+            ("M", c.M >= 1, "≥ 1"),
+            ("gamma", c.gamma <= c.L_F * (1 + 1e-12), "at most L_F"),
+            ("m_P", c.m_P <= c.norm_P_inv * (1 + 1e-12), "at most norm_P_inv"),
         ]  # fmt: skip
         wrong = [
             InputProblem(
@@ -220,7 +227,7 @@ class Constants(eqx.Module):
                 "Check its definition in the docstring of dvax.Constants",
             )
             for name, holds, rule in rules
-            if _tree.is_concrete(holds) and not bool(jnp.all(holds))
+            if _tree.is_concrete(holds) and not bool(np.all(holds))
         ]
         if wrong:
             raise InputError(*wrong)
