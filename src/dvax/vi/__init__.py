@@ -11,6 +11,10 @@ from .certificate import certify as certify
 from .certificate import natural_residual as natural_residual
 from .certificate import residual_bound as residual_bound
 from .extragradient import Extragradient as Extragradient
+from .forward_backward_forward import ForwardBackwardForward as ForwardBackwardForward
+from .golden_ratio import GoldenRatio as GoldenRatio
+from .projection import Projection as Projection
+from .semismooth_newton import SemismoothNewton as SemismoothNewton
 from .solve import VISolution as VISolution
 from .solve import default_space as default_space
 from .solve import solve_vi as solve_vi

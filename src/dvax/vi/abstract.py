@@ -22,6 +22,22 @@ class RESULTS(eqx.Enumeration):
         "The largest number of iterations was reached before the tolerance. The best iterate is "
         "returned with its bound; raise max_steps, loosen tol, or choose another solver."
     )
+    stalled = (
+        "The iterate stopped moving before the tolerance was met: rounding allows no more. The best "
+        "iterate is returned with its bound; loosen tol, scale F, or use double precision."
+    )
+    cycling = (
+        "The iterates came back to where they had been before: the method goes round in a circle, "
+        "so F is not what it needs. Choose another solver; the bound of the best iterate holds."
+    )
+    diverging = (
+        "The iterates left for infinity: VI(K, F) may have no solution, F may not be "
+        "pseudomonotone, or a step was too long. Check F, or bound K."
+    )
+    singular = (
+        "The linear systems of the method were singular to rounding, and its safeguard ran out of "
+        "iterations. Choose a first-order solver, or raise max_steps."
+    )
     nonfinite = (
         "The operator F or the projection returned NaN or infinity. Evaluate F at the returned y "
         "to see where."
@@ -60,6 +76,7 @@ class Answer(NamedTuple):
     `y` lies in K. `z` is a point whose projection is y: the unconstrained value of the law, which
     moves even while y sits on the boundary. `residual` is ‖w‖ for a w ∈ F(y) + N_K(y), so that
     ‖y − y*‖ ≤ residual/γ; it is 0 where y is the solution in closed form (up to rounding).
+    `evaluations` counts calls of F, those for derivatives of F apart.
     """
 
     y: Tree
@@ -67,6 +84,7 @@ class Answer(NamedTuple):
     residual: jax.Array
     iterations: jax.Array
     result: RESULTS
+    evaluations: jax.Array
 
 
 class AbstractSolver(eqx.Module):
@@ -75,3 +93,8 @@ class AbstractSolver(eqx.Module):
     @abc.abstractmethod
     def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
         """Solve from the guess y0 until ‖w‖/γ ≤ tol, or ‖w‖ ≤ tol where γ is unknown."""
+
+    def chosen(self, vi: Frozen, like: Tree) -> "AbstractSolver":
+        """The solver that will do the work for unknowns shaped like `like`: this one, unless it
+        chooses among others."""
+        return self

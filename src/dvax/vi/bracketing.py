@@ -54,7 +54,7 @@ class Bracketing(AbstractSolver):
         F = lambda y: lax.stop_gradient(vi.F(y))  # noqa: E731
         lower, upper = lax.stop_gradient(intervals)
         guess = jtu.tree_map(jnp.clip, lax.stop_gradient(y0), lower, upper)
-        (a, fa), (b, fb), found = _enclose(F, guess, lower, upper)
+        (a, fa), (b, fb), found, widened = _enclose(F, guess, lower, upper)
         root, count, closed = _chandrupatla(F, a, fa, b, fb, self.max_steps)
 
         def choose(lo, up, flo, fup, inner):
@@ -77,7 +77,8 @@ class Bracketing(AbstractSolver):
         result = RESULTS.where(closed, RESULTS.successful, RESULTS.max_steps)
         result = RESULTS.where(found, result, RESULTS.no_bracket)
         result = RESULTS.where(jnp.isfinite(residual), result, RESULTS.nonfinite)
-        return Answer(differentiable, lax.stop_gradient(z), residual, count, result)
+        calls = 3 + 2 * widened + count
+        return Answer(differentiable, lax.stop_gradient(z), residual, count, result, calls)
 
 
 def affine_answer(vi: Frozen, like: Tree) -> Answer:
@@ -91,7 +92,8 @@ def affine_answer(vi: Frozen, like: Tree) -> Answer:
     positive = jnp.all(jnp.stack([jnp.all(slope > 0) for slope in jtu.tree_leaves(a)]))
     result = RESULTS.where(positive, RESULTS.successful, RESULTS.wrong_slope)
     result = RESULTS.where(_tree.all_finite(y), result, RESULTS.nonfinite)
-    return Answer(y, z, jnp.zeros((), jnp.result_type(*leaves)), jnp.asarray(1), result)
+    exact, one = jnp.zeros((), jnp.result_type(*leaves)), jnp.asarray(1)
+    return Answer(y, z, exact, one, result, one)
 
 
 def _away(slope: jax.Array) -> jax.Array:
@@ -99,10 +101,11 @@ def _away(slope: jax.Array) -> jax.Array:
     return jnp.maximum(jnp.abs(slope), 1e-6)
 
 
-def _enclose(F: Any, guess: Tree, lower: Tree, upper: Tree) -> tuple[Any, Any, jax.Array]:
+def _enclose(F: Any, guess: Tree, lower: Tree, upper: Tree) -> tuple[Any, Any, Any, Any]:
     """Finite [a, b] inside K with F(a) ≥ 0 only if a = lower, and F(b) ≤ 0 only if b = upper.
 
-    Infinite ends are replaced by points that walk outward from the guess, doubling their distance.
+    Infinite ends are replaced by points that walk outward from the guess, doubling their distance;
+    how often is returned last.
     """
     finite = lambda leaf: jnp.isfinite(leaf)  # noqa: E731
 
@@ -130,8 +133,9 @@ def _enclose(F: Any, guess: Tree, lower: Tree, upper: Tree) -> tuple[Any, Any, j
     one = jnp.ones((), jnp.result_type(*jtu.tree_leaves(guess)))
     a, b = ends(one)
     start = (one, a, F(a), b, F(b))
-    _, a, fa, b, fb = lax.while_loop(go_on, widen, start)
-    return (a, fa), (b, fb), ~missing(a, fa, b, fb)
+    width, a, fa, b, fb = lax.while_loop(go_on, widen, start)
+    widened = jnp.round(jnp.log2(width)).astype(int)
+    return (a, fa), (b, fb), ~missing(a, fa, b, fb), widened
 
 
 def _chandrupatla(

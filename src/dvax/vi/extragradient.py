@@ -8,8 +8,8 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
-from .abstract import RESULTS, AbstractSolver, Answer, Frozen
-from .implicit import with_implicit_derivative
+from .abstract import AbstractSolver, Answer, Frozen
+from .iteration import Trial, certificate, first_step, iterate
 
 
 class Extragradient(AbstractSolver):
@@ -45,72 +45,47 @@ class Extragradient(AbstractSolver):
         return jnp.sqrt(1.0 - a * b / (a + b))
 
     def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
-        gamma = 1.0 if vi.gamma is None else vi.gamma
-        frozen = _stopped(vi)
-        start = vi.K.project(y0, vi.space)
-        first = 1.0 if vi.L_F is None else self.step / vi.L_F
+        def begin(vi: Frozen, y: Tree) -> tuple:
+            return y, self.step * first_step(vi, y, vi.F(y))
 
-        def advance(state: tuple) -> tuple:
-            y, _, lam, _, count, _ = state
-            Fy = frozen.F(y)
-            z, Fz, lam = self._extrapolate(frozen, y, Fy, lam)
-            w = _tree.add(_tree.sub(Fz, Fy), _tree.scale(1.0 / lam, _tree.sub(y, z)))
-            residual = frozen.space.norm(w)
-            after = frozen.K.project(_tree.sub(y, _tree.scale(lam, Fz)), frozen.space)
-            # The certificate belongs to z, so z is what is returned.
-            done = residual <= gamma * tol
-            return after, z, lam, residual, count + 1, done
+        def advance(vi: Frozen, state: tuple) -> tuple[tuple, Trial]:
+            y, lam = state
+            after, trial = extragradient_step(vi, y, lam, self.step)
+            return (after, trial.step), trial._replace(at=[after])
 
-        def unfinished(state: tuple) -> jax.Array:
-            residual, count, done = state[3], state[4], state[5]
-            return ~done & (count < self.max_steps) & (residual < jnp.inf)
-
-        dtype = jnp.result_type(*jax.tree_util.tree_leaves(start))
-        state = (
-            lax.stop_gradient(start),
-            lax.stop_gradient(start),
-            jnp.asarray(lax.stop_gradient(first), dtype),
-            jnp.asarray(jnp.finfo(dtype).max, dtype),
-            jnp.asarray(0),
-            jnp.asarray(False),
-        )
-        state = lax.while_loop(unfinished, advance, state)
-        _, found, lam, residual, count, done = state
-        y = with_implicit_derivative(vi, found, lam, lambda guess: guess, pointwise=False)
-        result = RESULTS.where(done, RESULTS.successful, RESULTS.max_steps)
-        # Once y − λF(y) rounds to y, every point looks like a solution.
-        collapsed = lam < 1e3 * jnp.finfo(dtype).eps
-        result = RESULTS.where(collapsed, RESULTS.not_lipschitz, result)
-        result = RESULTS.where(jnp.isfinite(residual), result, RESULTS.nonfinite)
-        # One fixed step for every z, whatever λ the search ended with: z is compared between times.
-        tau = 1.0 if vi.L_F is None else 1.0 / vi.L_F
-        z = _tree.sub(found, _tree.scale(tau, frozen.F(found)))
-        return Answer(y, lax.stop_gradient(z), residual, count, result)
-
-    def _extrapolate(self, vi: Frozen, y: Tree, Fy: Tree, lam: Any) -> tuple[Tree, Tree, Any]:
-        def trial(lam: Any) -> tuple[Tree, Tree]:
-            z = vi.K.project(_tree.sub(y, _tree.scale(lam, Fy)), vi.space)
-            return z, vi.F(z)
-
-        if vi.L_F is not None:
-            return *trial(lam), lam
-
-        def too_long(carry: tuple) -> jax.Array:
-            z, Fz, lam = carry
-            change = lam * vi.space.norm(_tree.sub(Fz, Fy))
-            return change > self.step * vi.space.norm(_tree.sub(z, y))
-
-        def shorten(carry: tuple) -> tuple:
-            lam = 0.6 * carry[2]
-            return *trial(lam), lam
-
-        # Growing a little first lets λ recover where F is flatter than where it was set.
-        grown = 1.25 * lam
-        return lax.while_loop(too_long, shorten, (*trial(grown), grown))
+        return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=2)
 
 
-def _stopped(vi: Frozen) -> Frozen:
-    """The same problem with derivatives cut: the iteration itself is never differentiated."""
-    return vi._replace(
-        F=lambda y: lax.stop_gradient(vi.F(y)), K=jax.tree_util.tree_map(lax.stop_gradient, vi.K)
-    )
+def extragradient_step(vi: Frozen, y: Tree, lam: Any, step: float) -> tuple[Tree, Trial]:
+    """y⁺, and z with its certificate, from y with a first λ."""
+    Fy = vi.F(y)
+    z, Fz, lam, calls = extrapolate(vi, y, Fy, lam, step)
+    after = vi.K.project(_tree.sub(y, _tree.scale(lam, Fz)), vi.space)
+    # The certificate belongs to z, so z is what is returned.
+    return after, Trial(z, certificate(Fz, Fy, y, z, lam), lam, [z], calls + 1)
+
+
+def extrapolate(
+    vi: Frozen, y: Tree, Fy: Tree, lam: Any, step: float
+) -> tuple[Tree, Tree, Any, Any]:
+    """z, F(z), the λ that led there, and how often F was called."""
+
+    def trial(lam: Any) -> tuple[Tree, Tree]:
+        z = vi.K.project(_tree.sub(y, _tree.scale(lam, Fy)), vi.space)
+        return z, vi.F(z)
+
+    if vi.L_F is not None:
+        return *trial(lam), lam, 1
+
+    def too_long(carry: tuple) -> jax.Array:
+        z, Fz, lam, _ = carry
+        change = lam * vi.space.norm(_tree.sub(Fz, Fy))
+        return change > step * vi.space.norm(_tree.sub(z, y))
+
+    def shorten(carry: tuple) -> tuple:
+        lam = 0.6 * carry[2]
+        return *trial(lam), lam, carry[3] + 1
+
+    # Growing a little first lets λ recover where F is flatter than where it was set.
+    grown = 1.25 * lam
+    return lax.while_loop(too_long, shorten, (*trial(grown), grown, jnp.asarray(1)))

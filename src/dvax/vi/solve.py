@@ -20,15 +20,17 @@ class VISolution(eqx.Module):
     """The solution of a variational inequality with its certificate.
 
     `y` ∈ K; `residual` = ‖w‖ for a w ∈ F(y) + N_K(y); `error_bound` ≥ ‖y − y*‖ where γ was given,
-    else None; `iterations`; `result`, which is `dvax.vi.RESULTS.successful` or says what went
-    wrong.
+    else None; `iterations`, and `evaluations` of F (those for derivatives apart); `result`, which
+    is `dvax.vi.RESULTS.successful` or says what went wrong; `solver`, the one that was used.
     """
 
     y: Tree
     residual: jax.Array
     error_bound: jax.Array | None
     iterations: jax.Array
+    evaluations: jax.Array
     result: RESULTS
+    solver: str = eqx.field(static=True)
 
 
 def solve_vi(
@@ -65,18 +67,27 @@ def solve_vi(
     space = default_space(y0) if space is None else space
     K.check(y0)
     frozen = Frozen(lambda y: F(y, args), K, space, gamma, L_F)
-    answer = (Auto() if solver is None else solver).solve(frozen, y0, tol)
+    solver = (Auto() if solver is None else solver).chosen(frozen, y0)
+    answer = solver.solve(frozen, y0, tol)
     tau = 1.0 if L_F is None else 1.0 / L_F
     checked = certify(frozen.F, K, space, answer.y, tau)
     # `checked.y` is a projection step from y. Its certificate covers y by the triangle inequality.
     step = space.norm(_tree.sub(checked.y, answer.y))
-    if gamma is None:
-        return VISolution(answer.y, checked.norm, None, answer.iterations, answer.result)
-    bound = jnp.minimum(
-        checked.bound(gamma) + step,
-        jnp.where(answer.residual > 0, answer.residual / gamma, jnp.inf),
+    bound = None
+    if gamma is not None:
+        bound = jnp.minimum(
+            checked.bound(gamma) + step,
+            jnp.where(answer.residual > 0, answer.residual / gamma, jnp.inf),
+        )
+    return VISolution(
+        y=answer.y,
+        residual=checked.norm,
+        error_bound=bound,
+        iterations=answer.iterations,
+        evaluations=answer.evaluations,
+        result=answer.result,
+        solver=type(solver).__name__,
     )
-    return VISolution(answer.y, checked.norm, bound, answer.iterations, answer.result)
 
 
 def default_space(like: Tree) -> AbstractSpace:
