@@ -11,7 +11,14 @@ import pytest
 from tests.oracles import affine_box_vi
 
 import dvax
-from dvax.vi import Extragradient, certify, natural_residual, residual_bound
+from dvax.vi import (
+    Extragradient,
+    ForwardBackwardForward,
+    Projection,
+    certify,
+    natural_residual,
+    residual_bound,
+)
 
 ORTHONORMAL = dvax.spaces.Euclidean(4)
 
@@ -105,16 +112,40 @@ def test_random_boxes_are_solved_with_an_honest_bound(known):
         assert error <= 2e-8
 
 
-def test_every_step_of_extragradient_contracts_at_least_as_proved():
+# The methods as their docstrings state them, without a line of the library: y⁺ from y.
+def _extragradient(F, project, y, lam):
+    return project(y - lam * F(project(y - lam * F(y))))
+
+
+def _forward_backward_forward(F, project, y, lam):
+    z = project(y - lam * F(y))
+    return z - lam * (F(z) - F(y))
+
+
+def _projection(F, project, y, lam):
+    return project(y - lam * F(y))
+
+
+# solver, its step, λ of γ and L, and how near to the proven factor some step comes at least
+METHODS = {
+    "extragradient": (Extragradient(), _extragradient, lambda g, L: 0.7 / L, 0.8),
+    "forward-backward-forward": (
+        ForwardBackwardForward(), _forward_backward_forward, lambda g, L: 0.7 / L, 0.8,
+    ),
+    "projection": (Projection(), _projection, lambda g, L: g / L**2, 0.95),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_step_contracts_at_least_as_proved(name):
+    solver, step, length, attained = METHODS[name]
     rng = np.random.default_rng(13)
     worst = 0.0
     for _ in range(30):
         M, q, lower, upper, gamma, L = random_problem(rng)
         truth = affine_box_vi(M, q, lower, upper)
-        solver = Extragradient()
         proved = float(solver.contraction(gamma, L))
         assert 0 < proved < 1
-        lam = 0.7 / L
 
         def project(v, lower=lower, upper=upper):
             return np.clip(v, lower, upper)
@@ -124,27 +155,29 @@ def test_every_step_of_extragradient_contracts_at_least_as_proved():
             before = np.linalg.norm(y - truth)
             if before < 1e-6:
                 continue
-            # The method as its docstring states it, without a line of the library.
-            z = project(y - lam * (M @ y + q))
-            after = np.linalg.norm(project(y - lam * (M @ z + q)) - truth)
-            worst = max(worst, after / before / proved)
-            assert after <= proved * before * (1 + 1e-9) + 1e-9
-    print(f"worst measured / proved contraction: {worst:.4f}")
-    assert worst > 0.8  # the factor is nearly attained, so that a wrong sign in it would be seen
+            after = step(lambda v, M=M, q=q: M @ v + q, project, y, length(gamma, L))
+            distance = np.linalg.norm(after - truth)
+            worst = max(worst, distance / before / proved)
+            assert distance <= proved * before * (1 + 1e-9) + 1e-9
+    print(f"{name}: worst measured / proved contraction {worst:.4f}")
+    assert worst > attained  # nearly attained, so that a wrong sign in the factor would be seen
 
 
-def test_the_solver_takes_the_steps_that_the_contraction_speaks_of():
+@pytest.mark.parametrize("name", METHODS)
+def test_the_solver_takes_the_steps_that_the_contraction_speaks_of(name):
     # From iteration counts alone: to gain 10 more digits it needs no more than ln(1e10)/ln(1/q).
+    solver = METHODS[name][0]
     M, q = np.array([[1.0, 6.0], [-6.0, 1.0]]), np.array([-1.0, 2.0])
     L, gamma = float(np.linalg.norm(M, 2)), 1.0
     counts = [
         int(
             dvax.solve_vi(
                 lambda y, _: jnp.asarray(M) @ y + jnp.asarray(q), dvax.sets.Box(-9.0, 9.0),
-                jnp.full(2, 5.0), solver=Extragradient(), gamma=gamma, L_F=L, tol=tol,
+                jnp.full(2, 5.0), solver=solver, gamma=gamma, L_F=L, tol=tol,
             ).iterations
         )
         for tol in (1e-2, 1e-12)
     ]  # fmt: skip
-    allowed = np.log(1e10) / -np.log(float(Extragradient().contraction(gamma, L)))
+    allowed = np.log(1e10) / -np.log(float(solver.contraction(gamma, L)))
+    print(f"{name}: {counts[1] - counts[0]} iterations for ten digits, {allowed:.0f} allowed")
     assert 10 < counts[1] - counts[0] <= allowed + 1

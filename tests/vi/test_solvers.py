@@ -8,7 +8,17 @@ import pytest
 
 import dvax
 from dvax.sets import Ball, Box
-from dvax.vi import RESULTS, Auto, Bracketing, Extragradient
+from dvax.vi import (
+    RESULTS,
+    Auto,
+    Bracketing,
+    Closed,
+    Extragradient,
+    ForwardBackwardForward,
+    GoldenRatio,
+    Projection,
+    SemismoothNewton,
+)
 
 INF = jnp.inf
 
@@ -77,14 +87,34 @@ def test_bracketing_solves_all_points_of_a_field_at_once():
             lambda y: jnp.where(y > 0.5, 1.0, -1.0), Box(0.0, 1.0), Extragradient(),
             RESULTS.not_lipschitz,
         ),
+        (lambda y: y * jnp.nan, Ball(0.0, 1.0), SemismoothNewton(), RESULTS.nonfinite),
+        (lambda y: y * jnp.nan, Ball(0.0, 1.0), GoldenRatio(), RESULTS.nonfinite),
+        (lambda y: jnp.exp(y) - 2, Ball(0.0, 9.0), SemismoothNewton(max_steps=1), RESULTS.max_steps),
+        # −y is solved nowhere near: the iterates leave, or turn on the spot.
+        (lambda y: -y - 1.0, Box(0.0, INF), GoldenRatio(), RESULTS.diverging),
+        (lambda y: -y - 1.0, Box(0.0, INF), ForwardBackwardForward(), RESULTS.diverging),
+        (lambda y: -y - 1.0, Box(0.0, INF), SemismoothNewton(), RESULTS.diverging),
+        # A tolerance below rounding: nothing moves any more, and that is said.
+        (lambda y: 1e8 * (y**3 + y - 0.7), Box(0.0, 1.0), SemismoothNewton(), RESULTS.stalled),
     ],
 )  # fmt: skip
 def test_a_failure_is_never_called_a_success(F, K, solver, result):
     assert solve(F, K, np.full(2, 0.3), solver=solver).result == result
 
 
+def test_a_method_that_goes_round_in_a_circle_says_so():
+    # A rotation on a disk with a step that turns by a third: the projection method comes back.
+    F = lambda y: jnp.array([[0.0, -1.0], [1.0, 0.0]]) @ y  # noqa: E731
+    vi = solve(F, Ball(0.0, 1.0), [1.0, 0.0], solver=Projection(), gamma=3**-0.5, L_F=3**-0.25)
+    # λ = γ/L_F² = 1: y − F(y) has length √2 and direction −45°; eight projections close the circle.
+    assert vi.result == RESULTS.cycling
+
+
 def test_the_bound_of_an_unfinished_solve_still_holds():
-    for solver in (Extragradient(max_steps=3), Bracketing(max_steps=3)):
+    for solver in (
+        Extragradient(max_steps=3), Bracketing(max_steps=3), Projection(max_steps=3),
+        ForwardBackwardForward(max_steps=3), GoldenRatio(max_steps=3),
+    ):  # fmt: skip
         vi = solve(lambda y: jnp.exp(y) - 2.0, Box(0.0, 3.0), 3.0, solver=solver, gamma=1.0)
         assert vi.result == RESULTS.max_steps
         assert float(vi.error_bound) >= abs(float(vi.y) - np.log(2)) > 1e-8
@@ -103,8 +133,16 @@ def test_bracketing_refuses_what_it_cannot_do_and_names_what_can():
 def test_auto_chooses_by_what_is_proved():
     choose = lambda F, K: type(Auto().choose(F, K, jnp.zeros(2)))  # noqa: E731
     assert choose(lambda y: y**3, Box(0.0, 1.0)) is Bracketing
-    assert choose(lambda y: y**3 + y[::-1], Box(0.0, 1.0)) is Extragradient
-    assert choose(lambda y: y**3, Ball(0.0, 1.0)) is Extragradient
+    assert choose(lambda y: y**3 + y[::-1], Box(0.0, 1.0)) is SemismoothNewton
+    assert choose(lambda y: y**3, Ball(0.0, 1.0)) is SemismoothNewton
+    assert choose(lambda y: 3.0 * y - 1.0, Ball(0.0, 1.0)) is Closed
+    large = jnp.zeros(5000)
+    assert isinstance(Auto().choose(lambda y: y**3 + y[::-1], Box(0.0, 1.0), large), GoldenRatio)
+
+
+def test_the_closed_form_is_refused_where_it_does_not_hold():
+    with pytest.raises(dvax.InputError, match="one number a"):
+        solve(lambda y: y**3, Ball(0.0, 1.0), [0.0, 0.0], solver=Closed())
 
 
 def test_an_isotropic_law_is_a_projection_for_every_set():
@@ -135,7 +173,14 @@ def test_parts_of_a_tuple_are_solved_together():
     np.testing.assert_allclose(found, np.asarray(stacked.y), atol=1e-11)
 
 
-@pytest.mark.parametrize("solver", [Bracketing(), Extragradient(), Auto()])
+@pytest.mark.parametrize(
+    "solver",
+    [
+        Bracketing(), Extragradient(), Auto(), ForwardBackwardForward(), GoldenRatio(),
+        SemismoothNewton(),
+    ],
+    ids=lambda solver: type(solver).__name__,
+)  # fmt: skip
 def test_vmap_equals_a_loop(solver):
     cs = jnp.array([-1.0, 0.3, 2.0, 4.9])
     K = Box(0.0, 4.0)

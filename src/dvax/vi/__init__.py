@@ -5,6 +5,7 @@ from .abstract import AbstractSolver as AbstractSolver
 from .abstract import Answer as Answer
 from .abstract import Frozen as Frozen
 from .auto import Auto as Auto
+from .auto import Closed as Closed
 from .bracketing import Bracketing as Bracketing
 from .certificate import Certified as Certified
 from .certificate import certify as certify

@@ -77,7 +77,7 @@ def iterate(
         # Rounding is all that is left of a move: of the last one, or of all since the mark (which
         # is set anew at every power of two: Brent's way to find a cycle of any length).
         rest = length(_tree.sub(trial.at, s.at)) <= 4 * eps * size
-        back = length(_tree.sub(trial.at, s.mark)) <= 4 * eps * size
+        back = length(_tree.sub(trial.at, s.mark)) <= 32 * eps * size
         collapsed = jnp.asarray(trial.step < 1e3 * eps)
         gone = (size > far) & ~better
         reason = RESULTS.max_steps
