@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -88,7 +88,13 @@ class Answer(NamedTuple):
 
 
 class AbstractSolver(eqx.Module):
-    """A method for VI(K, F). Its answer is differentiable with respect to all that F and K hold."""
+    """A method for VI(K, F). Its answer is differentiable with respect to all that F and K hold.
+
+    `encloses` says that success means a y* enclosed to rounding, whatever F is there, and not a
+    small ‖w‖.
+    """
+
+    encloses: ClassVar[bool] = False
 
     @abc.abstractmethod
     def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:

@@ -1,6 +1,6 @@
 """Pointwise intervals: one scalar equation a point, solved for certain."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +38,8 @@ class Bracketing(AbstractSolver):
 
     ```
     """
+
+    encloses: ClassVar[bool] = True
 
     max_steps: int = 200
 
