@@ -44,8 +44,7 @@ class Ellipsoid(AbstractSet):
     center: jax.Array
     radii: jax.Array | None
     shape: jax.Array | None
-    axes: jax.Array | None
-    lengths: jax.Array | None
+    principal: tuple[jax.Array, jax.Array] | None
 
     def __init__(self, center: Any, radii: Any = None, *, shape: Any = None):
         name = "dvax.sets.Ellipsoid"
@@ -66,21 +65,22 @@ class Ellipsoid(AbstractSet):
                     "Give one of radii= and shape=",
                 )
             )
-        self.radii = self.shape = self.axes = self.lengths = None
+        self.radii = self.shape = self.principal = None
         if radii is not None:
             self.radii = _known_radii(f"{name}(radii)", radii)
             return
         self.shape = _known_matrix(f"{name}(shape)", shape)
         # Kept for spaces without weights, so that a solver's loop need not find them again.
-        self.axes, self.lengths = _principal(self.shape)
+        self.principal = _principal(self.shape)
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         offset = z - jnp.broadcast_to(self.center, z.shape)
         inverse_w = inverse_weights(space, z)
-        if self.shape is None:
-            inside, kept = self._straight(offset, inverse_w)
+        if self.radii is not None:
+            inside, kept = _straight(jnp.broadcast_to(self.radii, z.shape), offset, inverse_w)
         else:
-            inside, kept = self._turned(offset, inverse_w, even(space))
+            known = self.principal if even(space) else None
+            inside, kept = _turned(self.shape, known, offset, inverse_w)
         # Inside, z itself: c + (z − c) would lose digits for a far-away center.
         return jnp.where(inside, z, self.center + kept)
 
@@ -106,47 +106,49 @@ class Ellipsoid(AbstractSet):
                 )
             )
 
-    def _straight(self, offset: jax.Array, inverse_w: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """(inside, the projection minus c), S diagonal: in the coordinates as they are."""
-        radii = jnp.broadcast_to(self.radii, offset.shape)
-        inside = _norm(offset / radii) < 1.0
-        offset = jnp.where(inside, radii, offset)  # where no root is asked for, one that exists
-        square = radii * radii / inverse_w
 
-        def surface(lam: jax.Array) -> jax.Array:
-            return _norm(offset / radii * (square / (square + lam))) - 1.0
+def _straight(
+    radii: jax.Array, offset: jax.Array, inverse_w: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """(inside, the projection minus c), S diagonal: in the coordinates as they are."""
+    inside = _norm(offset / radii) < 1.0
+    offset = jnp.where(inside, radii, offset)  # where no root is asked for, one that exists
+    square = radii * radii / inverse_w
 
-        fixed = lax.stop_gradient((offset * jnp.sqrt(1.0 / inverse_w), jnp.sqrt(square)))
-        lam = implicit(surface, lambda: _multiplier(*fixed))
-        return inside, offset * (square / (square + lam))
+    def surface(lam: jax.Array) -> jax.Array:
+        return _norm(offset / radii * (square / (square + lam))) - 1.0
 
-    def _turned(
-        self, offset: jax.Array, inverse_w: jax.Array, plain: bool
-    ) -> tuple[jax.Array, jax.Array]:
-        """(inside, the projection minus c): the multiplier in the principal axes, whose derivatives
-        need not exist, and all that is differentiated in the coordinates as they are."""
-        matrix = self.shape
-        inside = offset @ jnp.linalg.solve(matrix, offset) < 1.0
-        # Where no root is asked for, one that exists: an axis' end is on or outside the surface.
-        corner = jnp.sqrt(jnp.sum(jnp.diagonal(matrix))) * jnp.ones_like(offset)
-        offset = jnp.where(inside, lax.stop_gradient(corner), offset)
+    fixed = lax.stop_gradient((offset * jnp.sqrt(1.0 / inverse_w), jnp.sqrt(square)))
+    lam = implicit(surface, lambda: _multiplier(*fixed))
+    return inside, offset * (square / (square + lam))
 
-        def at(lam: jax.Array) -> jax.Array:
-            return jnp.linalg.solve(matrix + lam * jnp.diag(inverse_w), offset)
 
-        def surface(lam: jax.Array) -> jax.Array:
-            dual = at(lam)
-            return jnp.sqrt(dual @ (matrix @ dual)) - 1.0
+def _turned(
+    matrix: Any,
+    known: tuple[jax.Array, jax.Array] | None,
+    offset: jax.Array,
+    inverse_w: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """(inside, the projection minus c): the multiplier in the principal axes, whose derivatives
+    need not exist, and all that is differentiated in the coordinates as they are."""
+    inside = offset @ jnp.linalg.solve(matrix, offset) < 1.0
+    # Where no root is asked for, one that exists: an axis' end is on or outside the surface.
+    corner = jnp.sqrt(jnp.sum(jnp.diagonal(matrix))) * jnp.ones_like(offset)
+    offset = jnp.where(inside, lax.stop_gradient(corner), offset)
 
-        def find() -> jax.Array:
-            root_w = 1.0 / jnp.sqrt(inverse_w)
-            if plain:
-                axes, lengths = self.axes, self.lengths
-            else:
-                axes, lengths = _principal(root_w[:, None] * matrix * root_w[None, :])
-            return _multiplier(axes.T @ (root_w * offset), lengths)
+    def at(lam: jax.Array) -> jax.Array:
+        return jnp.linalg.solve(matrix + lam * jnp.diag(inverse_w), offset)
 
-        return inside, matrix @ at(implicit(surface, find))
+    def surface(lam: jax.Array) -> jax.Array:
+        dual = at(lam)
+        return jnp.sqrt(dual @ (matrix @ dual)) - 1.0
+
+    def find() -> jax.Array:
+        root_w = 1.0 / jnp.sqrt(inverse_w)
+        axes, lengths = known or _principal(root_w[:, None] * matrix * root_w[None, :])
+        return _multiplier(axes.T @ (root_w * offset), lengths)
+
+    return inside, matrix @ at(implicit(surface, find))
 
 
 def _multiplier(zeta: jax.Array, lengths: jax.Array) -> jax.Array:

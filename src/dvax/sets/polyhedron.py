@@ -156,8 +156,9 @@ def _refuse_empty(name: str, G: np.ndarray, d: np.ndarray, E: np.ndarray, e: np.
     length = np.where(length > 0, length, 1.0)
     known = d < np.inf
     rows, bounds = (flat / length[:, None])[known], (d / length)[known]
-    size = max(np.max(np.abs(bounds), initial=0.0), np.max(np.abs(e), initial=0.0)) or 1.0
+    missing = np.inf
     if np.all(np.isfinite(bounds)):
+        size = max(np.max(np.abs(bounds), initial=0.0), np.max(np.abs(e), initial=0.0)) or 1.0
         answer = scipy.optimize.linprog(
             np.append(np.zeros(flat.shape[1]), 1.0),
             A_ub=np.hstack([rows, -np.ones((len(rows), 1))]) if len(rows) else None,
@@ -169,9 +170,8 @@ def _refuse_empty(name: str, G: np.ndarray, d: np.ndarray, E: np.ndarray, e: np.
         # Where the programme itself could not be solved nothing is known, and the projection, which
         # checks what it finds, has the last word.
         missing = answer.x[-1] * size if answer.status == 0 else 0.0
-    else:
-        missing = np.inf
-    if missing > 1e-6 * size:
+        missing = 0.0 if missing <= 1e-6 * size else missing
+    if missing > 0.0:
         raise InputError(
             InputProblem(
                 f"{name}(G, d, E, e)",

@@ -156,8 +156,8 @@ def _blocks(
         column = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
         place[np.repeat(start[number], size) + column] = offset + row * width + column
         offset += width * count
-        index = (jnp.asarray(a, np.int32) for a in (start[number], size, number))
-        blocks.append(_Block(*index, width))
+        first, long, which = (jnp.asarray(a, np.int32) for a in (start[number], size, number))
+        blocks.append(_Block(first, long, which, width))
         smallest = largest + 1
     return tuple(blocks), jnp.asarray(place), entries
 
