@@ -11,16 +11,18 @@ import jax.numpy as jnp
 from jax import lax
 
 
-def onto_total(z: jax.Array, total: jax.Array, inverse_w: jax.Array | None) -> jax.Array:
-    """argmin Σᵢ wᵢ(pᵢ − zᵢ)² over p ≥ 0 with Σᵢ pᵢ = total, along the last axis; weights 1 where
-    None. `total` has the shape of z without that axis; entries of −∞ take no part.
+def onto_total(
+    z: jax.Array, total: jax.Array, inverse_w: jax.Array | None, axis: int = -1
+) -> jax.Array:
+    """argmin Σᵢ wᵢ(pᵢ − zᵢ)² over p ≥ 0 with Σᵢ pᵢ = total, along `axis`; weights 1 where None.
 
+    `total` has the shape of z without it; entries of −∞ take no part.
     Only *which* entries are positive is found by iteration, with derivatives cut; on that face p is
     a formula, whose derivatives are those of p.
     """
 
     def spread(a: jax.Array) -> jax.Array:
-        return jnp.broadcast_to(a[..., None], z.shape)
+        return jnp.broadcast_to(jnp.expand_dims(a, axis), z.shape)
 
     def scaled(tau: jax.Array, inverse_w: jax.Array | None) -> jax.Array:
         return spread(tau) if inverse_w is None else inverse_w * spread(tau)
@@ -29,7 +31,7 @@ def onto_total(z: jax.Array, total: jax.Array, inverse_w: jax.Array | None) -> j
     # of z, and far-away points lose no digits; a shift changes neither p nor its derivatives.
     fixed_w = None if inverse_w is None else lax.stop_gradient(inverse_w)
     heights = lax.stop_gradient(z) if fixed_w is None else lax.stop_gradient(z) / fixed_w
-    shift = jnp.max(heights, axis=-1)
+    shift = jnp.max(heights, axis=axis)
     top = heights == spread(shift)  # always positive, and the one to grow from a total of 0
     s = z - scaled(shift, inverse_w)
     fixed_s, goal = lax.stop_gradient(s), lax.stop_gradient(total)
@@ -42,9 +44,9 @@ def onto_total(z: jax.Array, total: jax.Array, inverse_w: jax.Array | None) -> j
     def level_of(
         face: jax.Array, s: jax.Array, goal: jax.Array, inverse_w: jax.Array | None
     ) -> jax.Array:
-        reach = jnp.sum(jnp.where(face, s, 0.0), axis=-1) - goal
+        reach = jnp.sum(jnp.where(face, s, 0.0), axis=axis) - goal
         weights = jnp.ones((), z.dtype) if inverse_w is None else inverse_w
-        return reach / jnp.sum(jnp.where(face, weights, 0.0), axis=-1)
+        return reach / jnp.sum(jnp.where(face, weights, 0.0), axis=axis)
 
     def climb(state: tuple) -> tuple:
         level = state[1]
@@ -54,7 +56,7 @@ def onto_total(z: jax.Array, total: jax.Array, inverse_w: jax.Array | None) -> j
     # One entry alone would reach the total at wᵢ(zᵢ − total): a bound from the left.
     lowest = -goal
     if fixed_w is not None:
-        lowest = lowest / jnp.max(jnp.where(top, fixed_w, 0.0), axis=-1)
+        lowest = lowest / jnp.max(jnp.where(top, fixed_w, 0.0), axis=axis)
     _, level = lax.while_loop(
         lambda state: jnp.any(state[1] > state[0]), climb, climb((lowest, lowest))
     )

@@ -88,13 +88,13 @@ class Ellipsoid(AbstractSet):
         return None
 
     def check(self, like: Tree) -> None:
-        own = self.radii if self.shape is None else self.shape
-        shape, given = _tree.shapes(like), jnp.shape(own)
+        own = self.shape if self.radii is None else self.radii
+        shape, given = _tree.shapes(like), () if own is None else own.shape
         fits = not isinstance(like, tuple) and jnp.shape(self.center) in ((), shape)
         if self.shape is None:
             fits = fits and given in ((), shape)
         else:
-            fits = fits and (shape[0], shape[0]) == given if len(shape) == 1 else False
+            fits = fits and len(shape) == 1 and given == (shape[0], shape[0])
         if not fits:
             raise InputError(
                 InputProblem(

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from .. import _tree
 from .._tree import Tree
@@ -16,6 +17,8 @@ from ._threshold import onto_total
 from ._weights import even, inverse_weights
 from .abstract import AbstractSet
 
+_LOT = 16_000
+"""Entries that a processor works on at a time."""
 _WASTE = 1.5
 """Simplices are projected in blocks of similar size; the smallest is filled up by at most this."""
 
@@ -76,9 +79,7 @@ class Simplex(AbstractSet):
             one = jnp.ndim(self.total) == 0
             total = self.total if one else self.total[block.number]
             total = jnp.broadcast_to(total, block.number.shape)
-            rows = block.gather(z, -jnp.inf)
-            weights = None if inverse_w is None else block.gather(inverse_w, 1.0)
-            found.append(onto_total(rows, total, weights).reshape(-1))
+            found.append(block.project(z, inverse_w, total).reshape(-1))
         return jnp.concatenate(found).at[self.place].get(mode="promise_in_bounds")
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
@@ -104,19 +105,38 @@ class Simplex(AbstractSet):
 
 
 class _Block(eqx.Module):
-    """Simplices of similar size, as the rows of one array."""
+    """Simplices of similar size, in lots: arrays of shape (lots, simplices of a lot)."""
 
     start: jax.Array
     size: jax.Array
     number: jax.Array
     width: int = eqx.field(static=True)
 
-    def gather(self, flat: jax.Array, missing: float) -> jax.Array:
-        """The entries of each simplex in a row, `missing` behind them."""
-        column = jnp.arange(self.width, dtype=self.start.dtype)[None, :]
-        inside = column < self.size[:, None]
-        index = self.start[:, None] + jnp.where(inside, column, 0)
-        return jnp.where(inside, flat.at[index].get(mode="promise_in_bounds"), missing)
+    def project(self, z: jax.Array, inverse_w: jax.Array | None, total: jax.Array) -> jax.Array:
+        """Their projections, of shape (lots, simplices of a lot, width)."""
+
+        def one_lot(given: tuple) -> jax.Array:
+            start, size, total = given
+            weights = None if inverse_w is None else self._columns(inverse_w, 1.0, start, size)
+            return onto_total(self._columns(z, -jnp.inf, start, size), total, weights, axis=0).T
+
+        # A lot stays in the processor's cache until its own simplices have settled, which is three
+        # times as fast as all at once; an accelerator is fastest with all at once.
+        return lax.platform_dependent(
+            (self.start, self.size, total),
+            cpu=lambda lots: lax.map(one_lot, lots),
+            default=jax.vmap(one_lot),
+        )
+
+    def _columns(
+        self, flat: jax.Array, missing: float, start: jax.Array, size: jax.Array
+    ) -> jax.Array:
+        """The entries of each simplex down a column, `missing` below them."""
+        row = jnp.arange(self.width, dtype=start.dtype)[:, None]
+        inside = row < size[None, :]
+        index = start[None, :] + jnp.where(inside, row, 0)
+        columns = jnp.where(inside, flat.at[index].get(mode="promise_in_bounds"), missing)
+        return lax.optimization_barrier(columns)  # gathered once, not in every pass over them
 
 
 def _blocks(
@@ -152,11 +172,16 @@ def _blocks(
         number = np.flatnonzero((given >= smallest) & (given <= largest))
         size, count = given[number], len(number)
         width = int(size.max())
+        lots = -(-count * width // _LOT)
+        filled = -(-count // lots) * lots  # the last lot repeats a simplex, which nothing reads
         row = np.repeat(np.arange(count), size)
         column = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
         place[np.repeat(start[number], size) + column] = offset + row * width + column
-        offset += width * count
-        first, long, which = (jnp.asarray(a, np.int32) for a in (start[number], size, number))
+        offset += width * filled
+        number = np.pad(number, (0, filled - count), "edge").reshape(lots, -1)
+        first, long, which = (
+            jnp.asarray(a[number], np.int32) for a in (start, given, np.arange(len(given)))
+        )
         blocks.append(_Block(first, long, which, width))
         smallest = largest + 1
     return tuple(blocks), jnp.asarray(place), entries
