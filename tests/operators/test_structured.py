@@ -82,8 +82,11 @@ def test_bounds_of_a_large_low_rank_operator_say_that_they_are_bounds():
     U, d = RNG.normal(size=(n, 2)) / 20, RNG.uniform(0.5, 2.0, n)
     s = np.array([3.0, -0.2])
     P = operators.LowRank(d, U, s)
-    ends = check_all(P, spaces.Euclidean(n), np.diag(d) + U @ np.diag(s) @ U.T, (n,))
+    P.check(spaces.Euclidean(n))
+    ends = P.spectrum(spaces.Euclidean(n))
+    exact = np.linalg.eigvalsh(np.diag(d) + U @ np.diag(s) @ U.T)
     assert not ends.exact and not ends.declared
+    assert 0 < float(ends.m) <= exact[0] and float(ends.norm) >= exact[-1]
     full = operators.LowRank(2.0, np.eye(3), np.array([1.0, 1.0, 3.0]))  # 2 is not in its spectrum
     assert check_all(full, spaces.Euclidean(3), np.diag([3.0, 3.0, 5.0]), (3,)).exact
 
