@@ -11,14 +11,30 @@ import jax.numpy as jnp
 from jax import lax
 
 
-def onto_total(
-    z: jax.Array, total: jax.Array, inverse_w: jax.Array | None, axis: int = -1
-) -> jax.Array:
-    """argmin Σᵢ wᵢ(pᵢ − zᵢ)² over p ≥ 0 with Σᵢ pᵢ = total, along `axis`; weights 1 where None.
+def onto_total(z: jax.Array, total: jax.Array, inverse_w: jax.Array | None) -> jax.Array:
+    """argmin Σᵢ wᵢ(pᵢ − zᵢ)² over p ≥ 0 with Σᵢ pᵢ = total, along the last axis; weights 1 where
+    None. `total` has the shape of z without that axis."""
+    shift, level = levels(z, total, inverse_w, axis=-1)
+    return cut(z, *(jnp.broadcast_to(a[..., None], z.shape) for a in (shift, level)), inverse_w)
 
-    `total` has the shape of z without it; entries of −∞ take no part.
-    Only *which* entries are positive is found by iteration, with derivatives cut; on that face p is
-    a formula, whose derivatives are those of p.
+
+def cut(z: jax.Array, shift: jax.Array, level: jax.Array, inverse_w: jax.Array | None) -> jax.Array:
+    """(z − (shift + level)/w)₊, entry by entry. An entry of exactly zero is held, which is the
+    convention of AbstractSet, but for the largest: it grows from a total of 0."""
+    p = z - (shift if inverse_w is None else inverse_w * shift)
+    p = p - (level if inverse_w is None else inverse_w * level)
+    # "Below" is less than 0 for the largest, and at most 0 for the others; NaN is neither: it stays.
+    below = jnp.where(_heights(z, inverse_w) == shift, p < 0, p <= 0)
+    return jnp.where(below, 0.0, p)
+
+
+def levels(
+    z: jax.Array, total: jax.Array, inverse_w: jax.Array | None, axis: int
+) -> tuple[jax.Array, jax.Array]:
+    """(the largest wᵢzᵢ, τ less this) along `axis`; entries of −∞ take no part.
+
+    Only *which* entries are positive is found by iteration, with derivatives cut; on that face τ is
+    a formula, whose derivatives are those of τ.
     """
 
     def spread(a: jax.Array) -> jax.Array:
@@ -30,7 +46,7 @@ def onto_total(
     # τ is counted from the largest wᵢzᵢ. All that matters then has the size of the total, not that
     # of z, and far-away points lose no digits; a shift changes neither p nor its derivatives.
     fixed_w = None if inverse_w is None else lax.stop_gradient(inverse_w)
-    heights = lax.stop_gradient(z) if fixed_w is None else lax.stop_gradient(z) / fixed_w
+    heights = _heights(z, inverse_w)
     shift = jnp.max(heights, axis=axis)
     top = heights == spread(shift)  # always positive, and the one to grow from a total of 0
     s = z - scaled(shift, inverse_w)
@@ -60,7 +76,9 @@ def onto_total(
     _, level = lax.while_loop(
         lambda state: jnp.any(state[1] > state[0]), climb, climb((lowest, lowest))
     )
-    face = positive(level)
-    p = s - scaled(level_of(face, s, total, inverse_w), inverse_w)
-    # On the face p is positive but for rounding, which must not leave the set.
-    return jnp.where(face & ~(p < 0), p, 0.0)
+    return shift, level_of(positive(level), s, total, inverse_w)
+
+
+def _heights(z: jax.Array, inverse_w: jax.Array | None) -> jax.Array:
+    fixed = lax.stop_gradient(z)
+    return fixed if inverse_w is None else fixed / lax.stop_gradient(inverse_w)

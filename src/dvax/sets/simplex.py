@@ -13,7 +13,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
-from ._threshold import onto_total
+from ._threshold import cut, levels, onto_total
 from ._weights import even, inverse_weights
 from .abstract import AbstractSet
 
@@ -74,13 +74,17 @@ class Simplex(AbstractSet):
         if self.blocks is None or self.place is None:
             total = jnp.broadcast_to(self.total, z.shape[:-1])
             return onto_total(z, total, inverse_w)
-        found = []
+        shifts, taus = [], []
         for block in self.blocks:
             one = jnp.ndim(self.total) == 0
             total = self.total if one else self.total[block.number]
-            total = jnp.broadcast_to(total, block.number.shape)
-            found.append(block.project(z, inverse_w, total).reshape(-1))
-        return jnp.concatenate(found).at[self.place].get(mode="promise_in_bounds")
+            shift, tau = block.levels(z, inverse_w, jnp.broadcast_to(total, block.number.shape))
+            shifts.append(shift.reshape(-1))
+            taus.append(tau.reshape(-1))
+        shift, tau = (
+            jnp.concatenate(a).at[self.place].get(mode="promise_in_bounds") for a in (shifts, taus)
+        )
+        return cut(z, shift, tau, inverse_w)
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         return None
@@ -112,13 +116,15 @@ class _Block(eqx.Module):
     number: jax.Array
     width: int = eqx.field(static=True)
 
-    def project(self, z: jax.Array, inverse_w: jax.Array | None, total: jax.Array) -> jax.Array:
-        """Their projections, of shape (lots, simplices of a lot, width)."""
+    def levels(
+        self, z: jax.Array, inverse_w: jax.Array | None, total: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Of each simplex where its entries are cut off, in two parts: see `cut`."""
 
-        def one_lot(given: tuple) -> jax.Array:
+        def one_lot(given: tuple) -> tuple[jax.Array, jax.Array]:
             start, size, total = given
             weights = None if inverse_w is None else self._columns(inverse_w, 1.0, start, size)
-            return onto_total(self._columns(z, -jnp.inf, start, size), total, weights, axis=0).T
+            return levels(self._columns(z, -jnp.inf, start, size), total, weights, axis=0)
 
         # A lot stays in the processor's cache until its own simplices have settled, which is three
         # times as fast as all at once; an accelerator is fastest with all at once.
@@ -142,7 +148,7 @@ class _Block(eqx.Module):
 def _blocks(
     sizes: Sequence[int] | np.ndarray, totals: tuple[int, ...]
 ) -> tuple[tuple[_Block, ...], jax.Array, int]:
-    """(blocks, where each entry of y is found in the blocks laid end to end, Σ sizes)."""
+    """(blocks, the simplex of each entry of y in the blocks laid end to end, Σ sizes)."""
     given = np.asarray(sizes)
     if given.ndim != 1 or given.size == 0 or given.dtype.kind not in "iu" or np.any(given < 1):
         raise InputError(
@@ -174,10 +180,9 @@ def _blocks(
         width = int(size.max())
         lots = -(-count * width // _LOT)
         filled = -(-count // lots) * lots  # the last lot repeats a simplex, which nothing reads
-        row = np.repeat(np.arange(count), size)
-        column = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
-        place[np.repeat(start[number], size) + column] = offset + row * width + column
-        offset += width * filled
+        entry = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
+        place[np.repeat(start[number], size) + entry] = offset + np.repeat(np.arange(count), size)
+        offset += filled
         number = np.pad(number, (0, filled - count), "edge").reshape(lots, -1)
         first, long, which = (
             jnp.asarray(a[number], np.int32) for a in (start, given, np.arange(len(given)))
