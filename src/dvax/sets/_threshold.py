@@ -15,7 +15,8 @@ def onto_total(z: jax.Array, total: jax.Array, inverse_w: jax.Array | None) -> j
     """argmin Σᵢ wᵢ(pᵢ − zᵢ)² over p ≥ 0 with Σᵢ pᵢ = total, along the last axis; weights 1 where
     None. `total` has the shape of z without that axis."""
     shift, level = levels(z, total, inverse_w, axis=-1)
-    return cut(z, *(jnp.broadcast_to(a[..., None], z.shape) for a in (shift, level)), inverse_w)
+    spread = [jnp.broadcast_to(a[..., None], z.shape) for a in (shift, level)]
+    return cut(z, spread[0], spread[1], inverse_w)
 
 
 def cut(z: jax.Array, shift: jax.Array, level: jax.Array, inverse_w: jax.Array | None) -> jax.Array:

@@ -32,8 +32,9 @@ class AffineSubspace(AbstractSet):
     ```python
     >>> import dvax, jax.numpy as jnp
     >>> K = dvax.sets.AffineSubspace(jnp.array([[1.0, 1.0, 0.0]]), jnp.array([1.0]))
-    >>> K.project(jnp.array([2.0, 1.0, 7.0]), dvax.spaces.Euclidean(3)).tolist()
-    [1.0, 0.0, 7.0]
+    >>> y = K.project(jnp.array([4.0, 3.0, 7.0]), dvax.spaces.Euclidean(3))
+    >>> [round(float(v), 12) for v in y + 1.0]
+    [2.0, 1.0, 8.0]
 
     ```
     """
