@@ -43,7 +43,7 @@ NEIGHBOURS = {
     ("runs", "models"): "a run is a model that a file describes",
 }
 
-CORE = {"jax", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping", "numpy"}
+CORE = {"jax", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping", "numpy", "scipy"}
 APPLICATION = {
     *("matplotlib", "numcodecs", "pint", "plotly", "pydantic", "pydantic_core", "rich"),
     *("tomli_w", "typer", "xarray", "zarr"),

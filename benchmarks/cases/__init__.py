@@ -14,6 +14,7 @@ CASES = (
     "derivatives",
     "memory",
     "processes",
+    "simplices",
 )
 """The names that --only takes, in the order of a run."""
 

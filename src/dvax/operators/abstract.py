@@ -10,10 +10,16 @@ from ..spaces import AbstractSpace
 
 
 class Spectrum(NamedTuple):
-    """min and max of the spectrum of P: m‖v‖² ≤ ⟨Pv, v⟩ ≤ norm ‖v‖²."""
+    """Ends of the spectrum of P: m‖v‖² ≤ ⟨Pv, v⟩ ≤ norm ‖v‖².
+
+    `exact`: m and norm are the smallest and largest values of the spectrum; else they enclose it.
+    `declared`: they are what the caller says, and nothing here proves them.
+    """
 
     m: Any
     norm: Any
+    exact: bool = True
+    declared: bool = False
 
     @property
     def m_P(self) -> Any:
@@ -43,4 +49,4 @@ class AbstractOperator(eqx.Module):
 
     @abc.abstractmethod
     def spectrum(self, space: AbstractSpace) -> Spectrum:
-        """The exact ends of the spectrum in the inner product of `space`."""
+        """The ends of the spectrum in the inner product of `space`, saying what they rest on."""

@@ -43,6 +43,8 @@ class Product(AbstractOperator):
         return Spectrum(
             jnp.min(jnp.stack([jnp.asarray(e.m) for e in ends])),
             jnp.max(jnp.stack([jnp.asarray(e.norm) for e in ends])),
+            exact=all(e.exact for e in ends),
+            declared=any(e.declared for e in ends),
         )
 
 

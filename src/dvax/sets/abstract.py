@@ -17,6 +17,13 @@ class AbstractSet(eqx.Module):
     the boundary of K from outside or from inside. There `jax.grad` and `jax.jvp` return the
     derivative of the *constrained* side: a point exactly on a bound counts as held by it. This one
     choice, made here for every set, is what every derivative in dvax inherits.
+
+    **Derivatives** are with respect to the set's own data as well, since K may move. Where the
+    projection needs an iteration, it only finds which face or multiplier holds the point, with
+    derivatives cut; what is differentiated is the formula, or the equation, that holds there.
+
+    **Data that are traced** cannot be looked at when the set is made. Where they turn out to describe
+    no set, the projection is NaN or infinite: it never passes for a point.
     """
 
     @abc.abstractmethod

@@ -171,7 +171,7 @@ def _status_of_structure(problem: Problem, sol: Solution, c: Constants) -> Statu
         (c.norm_P_inv, spectrum.norm_P_inv),
         (spectrum.m_P, c.m_P),
     )
-    if not _tree.is_concrete(covered):
+    if spectrum.declared or not _tree.is_concrete(covered):
         return "declared"
     slack = 1e-9  # what rounding may do to an eigenvalue
     held = [float(a) >= float(b) - slack * abs(float(b)) for a, b in covered]

@@ -1,0 +1,73 @@
+"""s K: a set that has been stretched."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .. import _tree
+from .._tree import Tree
+from ..errors import InputError, InputProblem
+from ..spaces import AbstractSpace
+from .abstract import AbstractSet
+
+
+class Scaled(AbstractSet):
+    """K = {factor · y : y ∈ set}: proj_K(z) = factor · proj(z/factor).
+
+    **Arguments:** `set`: any set; `factor`: a number, not 0; a negative one reflects the set.
+
+    **Raises:** `dvax.InputError` where the factor is 0 or not finite.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> K = dvax.sets.Scaled(dvax.sets.Simplex(1.0), 2.0)
+    >>> K.project(jnp.array([5.0, 0.0]), dvax.spaces.Euclidean(2)).tolist()
+    [2.0, 0.0]
+
+    ```
+    """
+
+    set: AbstractSet
+    factor: jax.Array
+
+    def __init__(self, set: AbstractSet, factor: Any):
+        name = "dvax.sets.Scaled(factor)"
+        self.set = set
+        self.factor = _tree.as_float(factor, name)
+        if _tree.shapes(self.factor) != ():
+            raise InputError(
+                InputProblem(
+                    name,
+                    f"shape {_tree.shapes(self.factor)}",
+                    "one number stretches all entries alike: other maps do not keep what is nearest",
+                    "Scale the data of the set itself",
+                )
+            )
+        _tree.require(
+            lambda: jnp.isfinite(self.factor) & (self.factor != 0),
+            name,
+            self.factor,
+            "a set is stretched by a finite number that is not 0",
+            "Use dvax.sets.Ball(0.0, 0.0) for the set of the point 0",
+        )
+        if not _tree.is_concrete(self.factor):
+            # Not known yet: 0 is made NaN, so that it stops a solve.
+            self.factor = jnp.where(self.factor == 0, jnp.nan, self.factor)
+
+    def project(self, z: Tree, space: AbstractSpace) -> Tree:
+        shrunk = jtu.tree_map(lambda leaf: leaf / self.factor, z)
+        return _tree.scale(self.factor, self.set.project(shrunk, space))
+
+    def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
+        inner = self.set.intervals(like)
+        if inner is None:
+            return None
+        ends = _tree.scale(self.factor, inner[0]), _tree.scale(self.factor, inner[1])
+        return _tree.where(self.factor < 0, ends[1], ends[0]), _tree.where(
+            self.factor < 0, ends[0], ends[1]
+        )
+
+    def check(self, like: Tree) -> None:
+        self.set.check(like)

@@ -1,0 +1,75 @@
+"""K + a: a set that has been moved."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .. import _tree
+from .._tree import Tree
+from ..errors import InputError, InputProblem
+from ..spaces import AbstractSpace
+from .abstract import AbstractSet
+
+
+class Translated(AbstractSet):
+    """K = {y + offset : y ∈ set}: proj_K(z) = offset + proj(z − offset).
+
+    **Arguments:** `set`: any set; `offset`: an element, or a number that stands for a constant one.
+
+    **Raises:** `dvax.InputError` where the offset is not finite.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> K = dvax.sets.Translated(dvax.sets.Ball(0.0, 1.0), jnp.array([3.0, 0.0]))
+    >>> K.project(jnp.zeros(2), dvax.spaces.Euclidean(2)).tolist()
+    [2.0, 0.0]
+
+    ```
+    """
+
+    set: AbstractSet
+    offset: Tree
+
+    def __init__(self, set: AbstractSet, offset: Any):
+        self.set = set
+        self.offset = _tree.as_float(offset, "dvax.sets.Translated(offset)")
+        _tree.require(
+            lambda: _tree.all_finite(self.offset),
+            "dvax.sets.Translated(offset)",
+            self.offset,
+            "a set is moved by a point, with finite entries",
+            "Mend the entries that are not",
+        )
+
+    def project(self, z: Tree, space: AbstractSpace) -> Tree:
+        offset = self._spread(z)
+        return _tree.add(offset, self.set.project(_tree.sub(z, offset), space))
+
+    def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
+        inner = self.set.intervals(like)
+        if inner is None:
+            return None
+        offset = self._spread(like)
+        return _tree.add(inner[0], offset), _tree.add(inner[1], offset)
+
+    def check(self, like: Tree) -> None:
+        if not (_is_number(self.offset) or _tree.same_shape(self.offset, like)):
+            raise InputError(
+                InputProblem(
+                    "dvax.sets.Translated(offset)",
+                    f"shape {_tree.shapes(self.offset)}",
+                    f"the offset is an element, of shape {_tree.shapes(like)}, or a number",
+                    "Give it that shape",
+                )
+            )
+        self.set.check(like)
+
+    def _spread(self, like: Tree) -> Tree:
+        if _is_number(self.offset):
+            return jtu.tree_map(lambda leaf: jnp.broadcast_to(self.offset, leaf.shape), like)
+        return self.offset
+
+
+def _is_number(offset: Tree) -> bool:
+    return not isinstance(offset, tuple) and jnp.ndim(offset) == 0

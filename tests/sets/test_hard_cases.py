@@ -1,0 +1,254 @@
+"""Kinks, degenerate sets, far-away points, and sets that turn out to be none."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvax
+from dvax import sets, spaces
+
+PLANE = spaces.Euclidean(2)
+UNEVEN = spaces.L2(np.array([1.0, 4.0]))
+SQUARE = np.vstack([np.eye(2), -np.eye(2)])
+
+
+def slope(K, z, space=PLANE):
+    return np.asarray(jax.jacfwd(lambda v: K.project(v, space))(jnp.asarray(z)))
+
+
+def tangent(*normals):
+    """The projection onto what is left when the normals are held."""
+    rows = np.array(normals, float)
+    return np.eye(rows.shape[1]) - np.linalg.pinv(rows) @ rows
+
+
+ON_THE_EDGE = {
+    "half-space": (sets.HalfSpace(np.array([1.0, 1.0]), 1.0), [0.5, 0.5], [[1, 1]]),
+    "simplex": (sets.Simplex(1.0), [1.0, 0.0], [[1, 0], [0, 1]]),
+    "ℓ1 ball": (sets.L1Ball(0.0, 1.0), [0.25, 0.75], [[1, 1]]),
+    "cone": (sets.SecondOrderCone(), [1.0, 1.0], [[1, -1]]),
+    "apex": (sets.SecondOrderCone(), [0.0, 0.0], [[1, 0], [0, 1]]),
+    "polyhedron": (sets.Polyhedron(SQUARE, np.ones(4)), [1.0, 0.5], [[1, 0]]),
+    "corner": (sets.Polyhedron(SQUARE, np.ones(4)), [1.0, 1.0], [[1, 0], [0, 1]]),
+    "moved": (sets.Translated(sets.Polyhedron(SQUARE, np.ones(4)), 1.0), [2.0, 0.5], [[1, 0]]),
+    "intersection": (
+        sets.Intersection(sets.Box(0.0, 1.0), sets.HalfSpace(np.array([1.0, 1.0]), 9.0)),
+        [1.0, 0.5],
+        [[1, 0]],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ON_THE_EDGE)
+def test_a_point_exactly_on_the_boundary_is_held_by_it(name):
+    K, z, normals = ON_THE_EDGE[name]
+    np.testing.assert_allclose(np.asarray(K.project(jnp.asarray(z), PLANE)), z, atol=1e-15)
+    np.testing.assert_allclose(slope(K, z), tangent(*normals), atol=1e-12)
+
+
+def test_a_point_on_an_ellipsoid_moves_along_it():
+    K = sets.Ellipsoid(0.0, radii=jnp.array([2.0, 1.0]))
+    s = slope(K, [2.0, 0.0])
+    np.testing.assert_allclose(s[0], [0.0, 0.0], atol=1e-12)
+    turned = sets.Ellipsoid(0.0, shape=np.diag([4.0, 1.0]))
+    np.testing.assert_allclose(slope(turned, [2.0, 0.0]), s, atol=1e-12)
+
+
+def test_held_points_move_with_the_data():
+    z = jnp.array([2.0, 2.0])
+    edge = jax.grad(lambda b: sets.HalfSpace(jnp.ones(2), b).project(z, PLANE)[0])
+    assert float(edge(1.0)) == pytest.approx(0.5)
+    total = jax.grad(lambda t: sets.Simplex(t).project(jnp.array([3.0, 0.0]), PLANE)[0])
+    assert float(total(1.0)) == pytest.approx(1.0)
+    assert float(total(0.0)) == pytest.approx(1.0)  # to the right: on the largest
+    twice = np.array([[1.0, 0.0], [2.0, 0.0]])
+    shared = jax.grad(lambda d: sets.Polyhedron(twice, d).project(z, PLANE)[0])
+    np.testing.assert_allclose(shared(jnp.array([1.0, 2.0])), [0.5, 0.25])
+
+
+def test_second_derivatives_are_those_of_the_face():
+    K, z = sets.Ellipsoid(0.0, radii=jnp.array([2.0, 1.0])), jnp.array([3.0, 2.0])
+    one = lambda v: K.project(v, UNEVEN)[0]  # noqa: E731
+    exact = np.asarray(jax.hessian(one)(z))
+    step = 1e-5
+    gradient = jax.jit(jax.grad(one))
+    for i, e in enumerate(np.eye(2)):
+        central = (gradient(z + step * e) - gradient(z - step * e)) / (2 * step)
+        np.testing.assert_allclose(exact[i], central, rtol=1e-5, atol=1e-8)
+    flat = sets.Polyhedron(SQUARE, np.ones(4))
+    assert np.all(np.asarray(jax.hessian(lambda v: flat.project(v, UNEVEN)[0])(z)) == 0.0)
+
+
+DEGENERATE = {
+    "total 0": (sets.Simplex(0.0), [1.0, -2.0], [0.0, 0.0]),
+    "radius 0": (sets.L1Ball(jnp.array([1.0, 2.0]), 0.0), [5.0, 5.0], [1.0, 2.0]),
+    "one entry a simplex": (sets.Simplex(2.0, sizes=[1, 1]), [-3.0, 9.0], [2.0, 2.0]),
+    "equal entries": (sets.Simplex(1.0), [7.0, 7.0], [0.5, 0.5]),
+    "one point": (
+        sets.Polyhedron(SQUARE, np.array([0.3, 0.1, -0.3, -0.1])), [5.0, -7.0], [0.3, 0.1]),
+    "repeated rows": (
+        sets.Polyhedron(np.vstack([SQUARE, SQUARE, 3 * SQUARE]), np.r_[np.ones(8), 3 * np.ones(4)]),
+        [5.0, -7.0], [1.0, -1.0]),
+    "a row of nothing": (
+        sets.Polyhedron(np.array([[0.0, 0.0], [1.0, 0.0]]), np.ones(2)), [5.0, 4.0], [1.0, 4.0]),
+    "a free row": (
+        sets.Polyhedron(np.eye(2), np.array([np.inf, 1.0])), [5.0, 4.0], [5.0, 1.0]),
+    "more rows than a corner needs": (
+        sets.Polyhedron(np.array([[1.0, 0], [0, 1], [1, 1], [1, 2]]), np.array([1.0, 1, 2, 3])),
+        [3.0, 4.0], [1.0, 1.0]),
+    "repeated equations": (
+        sets.AffineSubspace(np.array([[1.0, 1.0], [2.0, 2.0]]), np.array([1.0, 2.0])),
+        [2.0, 1.0], [1.0, 0.0]),
+    "an inequality along an equation": (
+        sets.Polyhedron(np.array([[1.0, 1.0]]), np.array([1.0]), np.array([[1.0, 1.0]]),
+                        np.array([1.0])), [2.0, 1.0], [1.0, 0.0]),
+    "one common point": (
+        sets.Intersection(sets.Box(0.0, 1.0), sets.HalfSpace(-np.ones(2), -2.0)),
+        [0.0, 0.5], [1.0, 1.0]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_degenerate_sets_are_sets(name):
+    K, z, exact = DEGENERATE[name]
+    found = np.asarray(jax.jit(lambda z: K.project(z, PLANE))(jnp.asarray(z)))
+    np.testing.assert_allclose(found, exact, atol=1e-11)
+    assert np.all(np.isfinite(slope(K, z)))
+
+
+@pytest.mark.parametrize("unit", [1e-8, 1e8])
+def test_units_do_not_matter(unit):
+    z = np.array([3.0, 1.0])
+    S = np.array([[2.0, 0.3], [0.3, 0.5]])
+
+    def make(u):
+        return [
+            sets.HalfSpace(np.array([1.0, 2.0]), u),
+            sets.AffineSubspace(np.array([[1.0, 2.0]]) / u, np.ones(1)),
+            sets.Simplex(u),
+            sets.L1Ball(0.0, u),
+            sets.SecondOrderCone(0.5),
+            sets.Ellipsoid(0.0, radii=jnp.array([1.0, 0.3]) * u),
+            sets.Ellipsoid(0.0, shape=S * u * u),
+            sets.Polyhedron(SQUARE / u, np.ones(4)),
+            sets.Polyhedron(SQUARE, np.ones(4) * u, np.ones((1, 2)), np.array([u])),
+        ]
+
+    for K, scaled in zip(make(1.0), make(unit), strict=True):
+        expected = np.asarray(K.project(jnp.asarray(z), UNEVEN))
+        found = np.asarray(scaled.project(jnp.asarray(unit * z), UNEVEN)) / unit
+        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("space", [PLANE, UNEVEN], ids=["plain", "weighted"])
+def test_far_away_points_lose_no_digits_of_a_simplex_or_a_corner(space):
+    z = jnp.array([1e8, 1e8 + 1.0])
+    p = np.asarray(sets.Simplex(3.0).project(z, space))
+    assert p.sum() == pytest.approx(3.0, abs=1e-14)
+    corner = sets.Polyhedron(SQUARE, np.array([0.1, 0.2, 0.0, 0.0])).project(z, space)
+    np.testing.assert_allclose(np.asarray(corner), [0.1, 0.2], rtol=1e-14)
+    far = sets.Ellipsoid(0.0, radii=1.0).project(z, PLANE)
+    np.testing.assert_allclose(np.asarray(far), np.sqrt(0.5), rtol=1e-8)
+
+
+TURNS_OUT_EMPTY = {
+    "half-space": lambda a: sets.HalfSpace(0.0 * a * jnp.ones(2), 1.0),
+    "hyperplane": lambda a: sets.Hyperplane(0.0 * a * jnp.ones(2), 0.0),
+    "equations": lambda a: sets.AffineSubspace(jnp.ones((2, 2)), jnp.array([0.0, 1.0]) * a),
+    "simplex": lambda a: sets.Simplex(-a),
+    "simplices": lambda a: sets.Simplex(-a, sizes=(1, 1)),
+    "ℓ1 ball": lambda a: sets.L1Ball(0.0, -a),
+    "cone": lambda a: sets.SecondOrderCone(-a),
+    "radii": lambda a: sets.Ellipsoid(0.0, radii=-a),
+    "matrix": lambda a: sets.Ellipsoid(0.0, shape=jnp.diag(jnp.array([1.0, -1.0])) * a),
+    "polyhedron": lambda a: sets.Polyhedron(SQUARE, -a * jnp.ones(4)),
+    "polyhedron, equations": lambda a: sets.Polyhedron(
+        SQUARE, a * jnp.ones(4), jnp.ones((2, 2)), jnp.array([0.0, 1.0]) * a
+    ),
+    "polyhedron, both": lambda a: sets.Polyhedron(
+        SQUARE, a * jnp.ones(4), jnp.ones((1, 2)), 9.0 * a * jnp.ones(1)
+    ),
+    "scaled": lambda a: sets.Scaled(sets.Box(0.0, 1.0), 0.0 * a),
+    "intersection": lambda a: sets.Intersection(
+        sets.Box(0.0, a), sets.HalfSpace(-jnp.ones(2), -3.0 * a), max_cycles=200
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TURNS_OUT_EMPTY)
+def test_a_set_that_turns_out_to_be_none_projects_to_no_point(name):
+    found = jax.jit(lambda a, z: TURNS_OUT_EMPTY[name](a).project(z, PLANE))(
+        1.0, jnp.array([0.1, 0.2])
+    )
+    assert np.all(np.isnan(np.asarray(found)))
+
+
+def test_a_moving_set_works_in_a_problem():
+    def K(t, args):
+        return sets.Polyhedron(jnp.ones((1, 2)), args["cap"] + t)
+
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0),
+        P=dvax.operators.Scaling(1.0),
+        K=K,
+        f=lambda t, x, u, args: u,
+        h=lambda t, x, u, args: 2.0 + x - u,
+    )
+    cap = lambda c: problem.response(0.5, jnp.zeros(2), {"cap": c[None]})[0]  # noqa: E731
+    assert float(cap(jnp.asarray(0.5))) == pytest.approx(0.5)
+    assert float(jax.grad(cap)(jnp.asarray(0.5))) == pytest.approx(0.5)
+
+
+def test_intervals_of_moved_stretched_and_common_boxes():
+    like, box = jnp.zeros(2), sets.Box(0.0, 1.0)
+    ends = lambda K: [np.asarray(e).tolist() for e in K.intervals(like)]  # noqa: E731
+    assert ends(sets.Translated(box, 1.0)) == [[1.0, 1.0], [2.0, 2.0]]
+    assert ends(sets.Scaled(box, -2.0)) == [[-2.0, -2.0], [0.0, 0.0]]
+    assert ends(sets.Intersection(box, sets.Box(0.5, 3.0))) == [[0.5, 0.5], [1.0, 1.0]]
+    for K in (sets.Translated(sets.Simplex(1.0), 1.0), sets.Scaled(sets.Simplex(1.0), 1.0)):
+        assert K.intervals(like) is None
+    assert sets.Intersection(box, sets.Simplex(1.0)).intervals(like) is None
+
+
+def test_tuples_may_be_coupled_by_one_condition():
+    space = spaces.Product(PLANE, spaces.L2(np.array([4.0])))
+    K = sets.HalfSpace((np.array([1.0, 0.0]), np.array([2.0])), 0.0)
+    z = (jnp.array([2.0, 5.0]), jnp.array([1.0]))
+    K.check(z)
+    # Σ a²/w = 1 + 1, the excess 4: a step of 2 along a/w = (1, 0; ½).
+    p = K.project(z, space)
+    np.testing.assert_allclose(np.concatenate([np.asarray(q) for q in p]), [0.0, 5.0, 0.0])
+    both = sets.Intersection(K, sets.Product(sets.Box(0.5, 9.0), sets.WholeSpace()))
+    q = both.project(z, space)
+    assert float(K.distance(q, space)) < 1e-9 and float(q[0][0]) == pytest.approx(0.5)
+
+
+def test_cones_and_simplices_lie_along_the_last_axis():
+    z = np.random.default_rng(0).normal(size=(2, 3, 4))
+    whole, part = spaces.L2(np.ones((2, 3, 4)) * [1.0, 2, 3, 4]), spaces.L2(np.arange(1.0, 5))
+    for K, one in (
+        (sets.Simplex(jnp.ones((2, 1))), sets.Simplex(1.0)),
+        (sets.SecondOrderCone(jnp.full(3, 0.5)), sets.SecondOrderCone(0.5)),
+    ):
+        K.check(jnp.asarray(z))
+        found = np.asarray(K.project(jnp.asarray(z), whole))
+        alone = jax.jit(lambda v, K=one: K.project(v, part))
+        for row in np.ndindex(2, 3):
+            np.testing.assert_allclose(found[row], alone(jnp.asarray(z[row])), atol=1e-14)
+
+
+def test_many_simplices_of_unequal_size_are_as_each_alone():
+    rng = np.random.default_rng(4)
+    sizes, totals = rng.integers(1, 40, 60), rng.uniform(0, 3, 60)
+    z, w = rng.normal(size=sizes.sum()), rng.uniform(0.2, 3.0, sizes.sum())
+    K, space = sets.Simplex(totals, sizes=sizes), spaces.L2(w)
+    K.check(jnp.asarray(z))
+    found = np.asarray(jax.jit(lambda z: K.project(z, space))(jnp.asarray(z)))
+    ends = np.cumsum(sizes)[:-1]
+    for p, v, own, total in zip(*(np.split(a, ends) for a in (found, z, w)), totals):
+        # τ from the sorted breakpoints wᵢzᵢ.
+        order = np.argsort(-own * v)
+        levels = (np.cumsum(v[order]) - total) / np.cumsum(1 / own[order])
+        count = np.max(np.flatnonzero(own[order] * v[order] > levels), initial=0)
+        np.testing.assert_allclose(p, np.maximum(v - levels[count] / own, 0.0), atol=1e-13)

@@ -1,0 +1,67 @@
+"""Empty or inconsistent sets, and those that do not fit, are named before anything runs."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvax
+from dvax import sets
+
+SQUARE = np.vstack([np.eye(2), -np.eye(2)])
+
+
+@pytest.mark.parametrize(
+    ("make", "word"),
+    [
+        (lambda: sets.HalfSpace(np.zeros(2), 1.0), "not zero"),
+        (lambda: sets.HalfSpace(np.ones(2), np.inf), "finite"),
+        (lambda: sets.HalfSpace(np.ones(3), 1.0).check(jnp.zeros(2)), r"\(3,\)"),
+        (lambda: sets.Hyperplane(np.array([np.nan, 1.0]), 1.0), "normal"),
+        (lambda: sets.AffineSubspace(np.ones((2, 2)), np.array([0.0, 1.0])), "empty"),
+        (lambda: sets.AffineSubspace(np.zeros((1, 2)), np.ones(1)), "empty"),
+        (lambda: sets.AffineSubspace(np.ones((2, 2)), np.ones(3)), "a row a condition"),
+        (lambda: sets.AffineSubspace(np.ones((1, 3)), np.ones(1)).check(jnp.zeros(2)), "row"),
+        (lambda: sets.Simplex(-1.0), "total"),
+        (lambda: sets.Simplex(1.0, sizes=(2, 0)), "≥ 1"),
+        (lambda: sets.Simplex(1.0, sizes=()), "≥ 1"),
+        (lambda: sets.Simplex(np.ones(3), sizes=(2, 1)), "3"),
+        (lambda: sets.Simplex(1.0, sizes=(2, 1)).check(jnp.zeros(2)), "3 entries"),
+        (lambda: sets.Simplex(1.0).check(jnp.zeros(())), "last axis"),
+        (lambda: sets.Simplex(np.ones(3)).check(jnp.zeros((2, 2))), "totals"),
+        (lambda: sets.L1Ball(0.0, -1.0), "radius"),
+        (lambda: sets.L1Ball(np.zeros(3), 1.0).check(jnp.zeros(2)), r"\(3,\)"),
+        (lambda: sets.SecondOrderCone(0.0), "slope"),
+        (lambda: sets.SecondOrderCone().check(jnp.zeros(1)), "two entries"),
+        (lambda: sets.Ellipsoid(0.0), "neither"),
+        (lambda: sets.Ellipsoid(0.0, radii=np.array([1.0, 0.0])), "half-axes"),
+        (lambda: sets.Ellipsoid(0.0, shape=np.diag([1.0, -1.0])), "positive definite"),
+        (lambda: sets.Ellipsoid(0.0, shape=np.array([[1.0, 0.2], [0.0, 1.0]])), "symmetric"),
+        (lambda: sets.Ellipsoid(0.0, shape=np.eye(3)).check(jnp.zeros(2)), r"\(3, 3\)"),
+        (lambda: sets.Polyhedron(SQUARE, -np.ones(4)), "by 1"),
+        (lambda: sets.Polyhedron(np.zeros((1, 2)), -np.ones(1)), "no y satisfies"),
+        (lambda: sets.Polyhedron(SQUARE, np.array([1.0, 1, 1, -np.inf])), "no y satisfies"),
+        (lambda: sets.Polyhedron(SQUARE, np.array([1.0, 1, 1, np.nan])), "numbers"),
+        (lambda: sets.Polyhedron(SQUARE, np.ones(4), np.ones((1, 2))), "both"),
+        (
+            lambda: sets.Polyhedron(SQUARE, np.ones(4), np.ones((1, 2)), np.array([3.0])),
+            "no y satisfies",
+        ),
+        (
+            lambda: sets.Polyhedron(SQUARE, np.ones(4), np.ones((2, 2)), np.array([0.0, 1.0])),
+            "contradict",
+        ),
+        (lambda: sets.Polyhedron(SQUARE, np.ones(4)).check(jnp.zeros(3)), r"\(4, 2\)"),
+        (lambda: sets.Intersection(), "no sets"),
+        (
+            lambda: sets.Intersection(sets.Box(0.0, 1.0), sets.Box(2.0, 3.0)).check(jnp.zeros(2)),
+            "empty",
+        ),
+        (lambda: sets.Translated(sets.Box(0.0, 1.0), np.inf), "moved"),
+        (lambda: sets.Translated(sets.Simplex(1.0), np.ones(3)).check(jnp.zeros(2)), r"\(3,\)"),
+        (lambda: sets.Scaled(sets.Box(0.0, 1.0), 0.0), "not 0"),
+        (lambda: sets.Scaled(sets.Box(0.0, 1.0), np.ones(2)), "one number"),
+    ],
+)
+def test_what_is_empty_or_does_not_fit_is_named(make, word):
+    with pytest.raises(dvax.InputError, match=word):
+        make()
