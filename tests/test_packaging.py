@@ -73,7 +73,7 @@ def test_the_metadata_says_what_is_needed(wheel: Path):
     assert set(about.get_all("Provides-Extra", [])) == {"app", "dask", "dev", "docs", "fem"}
     core = [need for need in about.get_all("Requires-Dist", []) if "extra ==" not in need]
     assert {need.partition(">=")[0] for need in core} == {
-        *("jax", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping", "numpy"),
+        *("jax", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping", "numpy", "scipy"),
     }
     assert all(">=" in need for need in core)
     with zipfile.ZipFile(wheel) as archive:
