@@ -63,5 +63,6 @@ RATES = {
         lambda t: jnp.array([0.0, 4.0, -2.0, 1.0, 1.0])[jnp.floor(4.0 * t).astype(int)],
         [0.25, 0.5, 0.75],
     ),
+    "rounded to a short type": (lambda t: (2.0 * t).astype(jnp.float16).astype(float), []),
     "the larger of sorted": (lambda t: jnp.sort(jnp.array([0.0, 1.0]) * t - 0.3)[1], []),
 }  # fmt: skip

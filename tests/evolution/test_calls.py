@@ -69,3 +69,38 @@ def test_the_law_at_the_saved_states_is_certified_in_a_large_state_as_at_a_point
         point = dvax.solve(case.problem, x0[k], 0.0, 2.0, args=case.args, ts=[1.0, 2.0], dt=0.01)
         np.testing.assert_allclose(np.asarray(field.us[:, k]), np.asarray(point.us), atol=1e-14)
     assert np.all(np.asarray(field.law_residual) <= 1e-12)
+
+
+def test_a_flag_and_a_number_that_compare_equal_are_two_programs():
+    def f(t, x, u, args):
+        return (100.0 if args["on"] is True else 3.0) - 0.5 * x - u
+
+    system = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+        f=f, h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+    )  # fmt: skip
+    run = lambda on: float(dvax.solve(system, -1.0, 0.0, 2.0, {"on": on}, dt=0.5).xs[-1])  # noqa: E731
+    number, flag = run(1), run(True)
+    assert flag > 10.0 * number and run(1) == number
+
+
+def test_a_parameter_that_cannot_be_compiled_in_is_named():
+    system = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+        f=lambda t, x, u, args: -u, h=lambda t, x, u, args: x - u,
+    )  # fmt: skip
+    with pytest.raises(dvax.InputError, match=r"set \{1, 2\}.*hashable"):
+        dvax.solve(system, -1.0, 0.0, 2.0, {1, 2}, dt=0.5)
+
+
+@pytest.mark.parametrize("steps", [dict(rtol=1e-3, atol=1e-3), dict(dt=0.1, measure=True)])
+def test_single_precision_is_kept_from_end_to_end(steps):
+    one = jnp.float32
+    system = dvax.Problem(
+        A=dvax.generators.Scalar(one(-1.0)), P=dvax.operators.Scaling(one(1.0)),
+        K=dvax.sets.Box(one(0.0), one(0.5)), f=lambda t, x, u, args: 3.0 - 0.5 * x - u,
+        h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+    )  # fmt: skip
+    sol = dvax.solve(system, one(-1.0), 0.0, 2.0, **steps)
+    assert sol.xs.dtype == jnp.float32
+    assert float(sol.xs[-1]) == pytest.approx(1.8360919559905713, abs=5e-3)

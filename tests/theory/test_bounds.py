@@ -74,9 +74,9 @@ def test_an_initial_error_that_is_none_is_refused(wrong):
         dvax.bound_error(case.problem, sol, case.constants, initial_error=wrong)
 
 
-def test_a_run_in_pieces_has_the_bounds_of_the_whole():
+def _pieces(c):
+    """The bounds of C1 as a whole, and of the same steps in two pieces."""
     case = ALL["C1"]()
-    c = replaced(case.constants, M=2.0)
     run = lambda x, t0, ts: dvax.solve(  # noqa: E731
         case.problem, x, t0, ts[-1], args=case.args, ts=np.asarray(ts), dt=0.125, measure=True
     )
@@ -85,12 +85,36 @@ def test_a_run_in_pieces_has_the_bounds_of_the_whole():
     )
     first = run(-1.0, 0.0, [0.5, 1.0])
     before = dvax.bound_error(case.problem, first, c, initial_error=0.01)
-    after = dvax.bound_error(
-        case.problem, run(first.xs[-1], 1.0, [1.5, 2.0]), c, initial_error=before
+    second = run(first.xs[-1], 1.0, [1.5, 2.0])
+    after = dvax.bound_error(case.problem, second, c, initial_error=before)
+    names = ("x", "u", "x_sharp", "u_sharp")
+    joined = {n: np.concatenate([getattr(before, n), getattr(after, n)]) for n in names}
+    return {n: np.asarray(getattr(whole, n)) for n in names}, joined
+
+
+def test_a_run_in_pieces_has_the_bounds_of_the_whole():
+    whole, pieces = _pieces(ALL["C1"]().constants)
+    for name in whole:
+        np.testing.assert_allclose(pieces[name], whole[name], rtol=1e-10, err_msg=name)
+
+
+def test_an_overshoot_is_charged_again_at_every_piece():
+    # Nothing says that the pieces have one semigroup in common.
+    whole, pieces = _pieces(replaced(ALL["C1"]().constants, M=2.0))
+    assert np.all(pieces["x"] >= whole["x"] * (1 - 1e-12))
+    assert pieces["x"][-1] > 1.5 * whole["x"][-1]
+
+
+def test_a_bound_is_gone_on_with_only_from_where_it_stands():
+    case = ALL["C1"]()
+    run = lambda x, t0, t1, ts: dvax.solve(  # noqa: E731
+        case.problem, x, t0, t1, args=case.args, ts=ts, dt=0.125, measure=True
     )
-    for name in ("x", "u", "x_sharp", "u_sharp"):
-        pieces = np.concatenate([getattr(before, name), getattr(after, name)])
-        np.testing.assert_allclose(pieces, getattr(whole, name), rtol=1e-10, err_msg=name)
+    first = run(-1.0, 0.0, 1.0, [0.0, 0.5])
+    before = dvax.bound_error(case.problem, first, case.constants)
+    second = run(first.stats["x"], 1.0, 2.0, [2.0])
+    with pytest.raises(dvax.InputError, match=r"up to t = 0\.5 for a run from t0 = 1"):
+        dvax.bound_error(case.problem, second, case.constants, initial_error=before)
 
 
 def replaced(constants, **more):

@@ -22,7 +22,7 @@ ENCLOSED = (
     "a jump in the middle", "a pulse that ends see nothing of", "a dead zone by inequality",
     "a number turned into an integer", "a running count", "a tooth",
 )  # fmt: skip
-SAMPLED = ("a remainder", "a condition", "a loop")
+SAMPLED = ("a remainder", "a condition", "a loop", "rounded to a short type")
 
 
 def problem(f, h=lambda t, x, u, args: 0.0 * u):
@@ -110,3 +110,44 @@ def test_a_defect_that_turns_with_the_semigroup_is_not_averaged():
     error = np.linalg.norm(np.asarray(sol.xs[-1]) - truth)
     assert bound.status == "proved" and error > 0.8 * h
     assert float(bound.x[-1]) >= error
+
+
+def test_a_root_that_never_leaves_zero_costs_nothing():
+    # Its slope is infinite there, and nothing moves.
+    system = problem(lambda t, x, u, args: 1.0 - x + jnp.sqrt(jnp.maximum(t - 5.0, 0.0)) + 0.0 * u)
+    fixed = dvax.solve(system, 0.0, 0.0, 1.0, dt=0.1, measure=True)
+    bound = dvax.bound_error(system, fixed, CONSTANTS)
+    error = abs(float(fixed.xs[-1]) - (1.0 - np.exp(-1.0)))
+    assert bound.status == "proved" and error <= float(bound.x[-1]) < 0.1
+    adaptive = dvax.solve(system, 0.0, 0.0, 1.0, rtol=1e-6)
+    assert float(adaptive.xs[-1]) == pytest.approx(1.0 - np.exp(-1.0), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("upper", "response"),
+    [
+        (lambda t: 0.2 - 0.2 * jnp.cos(t), lambda t: 0.2 - 0.2 * np.cos(t)),
+        (lambda t: jnp.maximum(0.0, jnp.sin(4.0 * t)), lambda t: np.maximum(0.0, np.sin(4.0 * t))),
+    ],
+    ids=["opening", "opening and closing"],
+)
+def test_an_interval_that_shrinks_to_a_point_is_no_empty_one(upper, response):
+    # u is held at the upper end, so that x = ∫ u.
+    system = dvax.Problem(
+        A=dvax.generators.Scalar(0.0), P=dvax.operators.Scaling(1.0),
+        K=lambda t, args: dvax.sets.Box(0.0, upper(t)), f=lambda t, x, u, args: u + 0.0 * x,
+        h=lambda t, x, u, args: 9.0 - u + 0.0 * x,
+    )  # fmt: skip
+    truth = quad(response, 0.0, 2.0, points=[np.pi / 4, np.pi / 2], limit=200)[0]
+    for steps in (dict(dt=0.01, measure=True), dict(rtol=1e-5, atol=1e-7)):
+        sol = dvax.solve(system, 0.0, 0.0, 2.0, **steps)
+        bound = dvax.bound_error(system, sol, CONSTANTS)
+        error = abs(float(sol.xs[-1]) - truth)
+        assert bound.status == "proved" and error <= float(bound.x[-1]) < 0.1
+
+
+def test_a_function_with_its_own_derivative_may_depend_on_the_parameters_alone():
+    system = problem(lambda t, x, u, args: jax.nn.relu(args) - x + 0.0 * u)
+    sol = dvax.solve(system, 0.0, 0.0, 1.0, args=jnp.asarray(1.0), dt=0.01, measure=True)
+    assert sol.enclosed
+    assert float(sol.xs[-1]) == pytest.approx(1.0 - np.exp(-1.0), abs=1e-4)

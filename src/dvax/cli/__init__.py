@@ -4,7 +4,10 @@ Thin: it reads what the user typed, calls the rooms below, and says what came of
 is imported before a command needs it, so that `dvax --help` answers at once.
 """
 
+import os
 import sys
+
+_INTERRUPTED = 130
 
 
 def main() -> None:
@@ -18,4 +21,13 @@ def main() -> None:
             f"The command line needs the package {missing.name}, which is not installed. "
             "Install dvax with its application: pip install 'dvax[app]'."
         )
-    app()
+    try:
+        app()
+    except SystemExit as stop:
+        if stop.code != _INTERRUPTED:
+            raise
+        # All is on disk. The compiler cannot be interrupted: it may still be at work in threads of
+        # its own, and taking the interpreter down around them ends in a crash.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(_INTERRUPTED)

@@ -15,6 +15,7 @@ from .method import AbstractMethod
 
 ADAPTIVE_STEPS = 2**20
 """The most steps of an adaptive solve, unless max_steps says otherwise."""
+_MOST_STEPS = 2**30
 
 
 def check(problem, x0, t0, t1, ts, dt, rtol, atol, dt0, horizon, method, adjoint) -> None:
@@ -88,6 +89,16 @@ def bound_steps(max_steps: int | None, fixed: bool, t0, t1, dt) -> int:
                 "Give max_steps, a bound on it",
             )
         )
-    count = math.ceil((float(t1) - float(t0)) / float(dt)) + 1
+    span = float(t1) - float(t0)
+    if not span / float(dt) < _MOST_STEPS:
+        raise InputError(
+            InputProblem(
+                "dvax.solve(dt)",
+                f"{float(dt):g} for a span of {span:g}",
+                f"that is more than {_MOST_STEPS} steps, which cannot be counted",
+                "Give a longer step, or solve in pieces",
+            )
+        )
+    count = math.ceil(span / float(dt)) + 1
     # A power of two, and not a small one: runs of different length share one compilation.
     return 2 ** max(12, math.ceil(math.log2(count + 1)))

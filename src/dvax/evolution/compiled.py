@@ -5,6 +5,7 @@ microseconds where it is handed a flat list of numbers and one hashable rest; so
 apart here, and its solution put together, around the setup itself: what was asked is not copied.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +15,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from ..errors import InputError, InputProblem
 from .integrate import Loop, integrate
 from .setup import Setup
 from .solution import RESULTS, Solution
@@ -28,7 +30,8 @@ def compiled(setup: Setup, ts: Any, loop: Loop) -> tuple[Solution, bool | jax.Ar
     numbers = [leaf if eqx.is_array(leaf) else None for leaf in code]
     numbers += [leaf if isinstance(leaf, float) or eqx.is_array(leaf) else None for leaf in data]
     rest = tuple(
-        leaf if number is None else None for leaf, number in zip(code + data, numbers, strict=True)
+        _exactly(leaf) if number is None else None
+        for leaf, number in zip(code + data, numbers, strict=True)
     )
     try:
         arrays, reached, shape = _run(numbers, _Kind(code_tree, data_tree, rest, loop))
@@ -40,6 +43,22 @@ def compiled(setup: Setup, ts: Any, loop: Loop) -> tuple[Solution, bool | jax.Ar
             eqx.filter_jit(integrate)(setup, ts, loop)
         raise
     return jtu.tree_unflatten(shape.tree, [*arrays, setup]), reached
+
+
+def _exactly(leaf: Any) -> tuple[Any, ...]:
+    """A leaf as a key that tells 1 from True and 1.0, and 0.0 from −0.0, which `==` does not."""
+    try:
+        hash(leaf)
+    except TypeError as error:
+        raise InputError(
+            InputProblem(
+                "dvax.solve(problem, args)",
+                f"{type(leaf).__name__} {leaf!r}"[:200],
+                "what is not an array is compiled in, so it must be hashable",
+                "Register its class as a pytree (an equinox.Module is one), or make it hashable",
+            )
+        ) from error
+    return type(leaf), leaf, math.copysign(1.0, leaf) if isinstance(leaf, float) else None
 
 
 class _Kind(NamedTuple):
@@ -62,7 +81,7 @@ jtu.register_pytree_node(_Shape, lambda shape: ((), shape.tree), lambda tree, _:
 
 
 def _traced(numbers: list[Any], kind: _Kind) -> tuple[list[Any], jax.Array, _Shape]:
-    leaves = [r if n is None else n for n, r in zip(numbers, kind.rest, strict=True)]
+    leaves = [r[1] if n is None else n for n, r in zip(numbers, kind.rest, strict=True)]
     split = kind.code.num_leaves
     problem, method, vi_solver = jtu.tree_unflatten(kind.code, leaves[:split])
     x0, args, setting, moduli, ts = jtu.tree_unflatten(kind.data, leaves[split:])

@@ -164,7 +164,10 @@ def root_mean_squares(space: AbstractSpace) -> Callable[[Tree], list[Any]]:
     """The root mean square of each part of a state: its norm divided by that of the constant 1."""
     if isinstance(space, Product):
         spaces = space.spaces
-        return lambda tree: [
-            s.norm(p) / jnp.sqrt(s.size()) for s, p in zip(spaces, tree, strict=True)
-        ]
-    return lambda tree: [space.norm(tree) / jnp.sqrt(space.size())]
+        return lambda tree: [_mean(s, p) for s, p in zip(spaces, tree, strict=True)]
+    return lambda tree: [_mean(space, tree)]
+
+
+def _mean(space: AbstractSpace, part: Tree) -> Any:
+    norm = space.norm(part)
+    return norm / jnp.sqrt(space.size()).astype(norm.dtype)

@@ -22,6 +22,7 @@ import numpy as np
 
 from dvax.errors import InputError, InputProblem, SolveError
 from dvax.evolution import ETD1, ETD2RK, Solution, solve
+from dvax.evolution.arguments import bound_steps
 from dvax.models import Contact
 from dvax.runs.compile_time import announced, compile_seconds
 from dvax.runs.config import Config, build_contact
@@ -72,6 +73,8 @@ def run(
     is the outcome, and what was computed before is on disk.
     """
     _refuse_existing(out, overwrite)
+    if config.solver.dt is not None:
+        bound_steps(None, True, 0.0, config.time.end, config.solver.dt)
     compile_seconds()
     inputs = build_contact(config)
     directory = RunDirectory(out, clear=True)
@@ -161,7 +164,7 @@ class _Run:
             except SolveError as stopped:
                 a, failure, beside = stopped.solution, stopped, None
                 assert isinstance(a, Solution)
-                if len(a.ts) == 0:
+                if len(a.ts) == 0 or float(a.ts[-1]) <= start:
                     raise
                 ts = np.asarray(a.ts)
                 wanted = wanted[: len(ts)]

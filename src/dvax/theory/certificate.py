@@ -36,7 +36,6 @@ class Bound(eqx.Module):
 
     - `ts`; `x` ≥ ‖x_h − x‖ and `u` ≥ ‖u_h − u‖ with the paper's constants;
     - `x_sharp`, `u_sharp`: the same with the one-sided constant, or None where it is not known;
-    - `onward`: where the two bounds on x stand at the end, for a run that continues this one;
     - `status`: the weakest of what the bound rests on. "proved" says that the constants are proved,
       that M, ω and ‖P⁻¹‖ are no smaller than what the structure of A and P gives, and that the
       defect is enclosed over every step; the moduli of f and h are those that the constants state.
@@ -50,7 +49,6 @@ class Bound(eqx.Module):
     u: jax.Array
     x_sharp: jax.Array | None
     u_sharp: jax.Array | None
-    onward: tuple[jax.Array, jax.Array]
     status: Status = eqx.field(static=True)
 
 
@@ -60,7 +58,8 @@ def bound_error(
     """Bound the error of a computed trajectory at its saved times.
 
     **Arguments:** `problem` and `sol`, the solution of it; `constants`, its moduli; `initial_error`,
-    a bound on ‖x_h(t0) − x(t0)‖, or the `Bound` of the run that this one continues.
+    a bound on ‖x_h(t0) − x(t0)‖, or the `Bound` of the run that this one continues from its last
+    saved state. (With M > 1 every piece multiplies by M anew.)
 
     Where the solve did not measure its defect (fixed steps), it is run again with `measure=True`,
     and the distance between the two runs, which is rounding, is added.
@@ -92,35 +91,30 @@ def bound_error(
     law = sol.law_residual, sol.law_step
     start = _starts(initial_error, sol.ts.dtype)
     t0 = jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
-    x, u, x_sharp, u_sharp, onward = _bounds(constants, t0, sol.ts, impulse, apart, law, start)
+    x, u, x_sharp, u_sharp = _bounds(constants, t0, sol.ts, impulse, apart, law, start)
     status = weakest(
         constants.status_of(*(name for name, _ in constants.statuses)),
         "proved" if measured.enclosed else "estimated",
         _status_of_structure(problem, sol, constants),
     )
-    return Bound(sol.ts, x, u, x_sharp, u_sharp, onward, status)
+    return Bound(sol.ts, x, u, x_sharp, u_sharp, status)
 
 
 @jax.jit
 def _bounds(
     c: Constants, t0: Any, ts: Any, impulse: tuple, apart: Any, law: tuple, start: tuple
 ) -> tuple:
-    """x, u, x_sharp, u_sharp and onward of `Bound`."""
+    """x, u, x_sharp and u_sharp of `Bound`."""
     # A law solved to ‖w‖ disturbs f̃ by at most this much of it.
     gain = c.beta_f * c.norm_P_inv / c.gamma
     acted, settled = (defect + gain * law_defect for defect, law_defect in impulse)
     law_error = c.norm_P_inv * (law[0] / c.gamma + law[1])
-    last = lambda before, x: x[-1] if x.shape[0] else before  # noqa: E731
-
-    propagated = _gronwall(t0, ts, acted, settled, c.growth_rate, c.M, start[0])
-    x = propagated + apart
-    # One M covers a whole run, in however many pieces: what goes on is the bound before it.
-    onward = last(start[0], propagated / c.M + apart)
+    x = _gronwall(t0, ts, acted, settled, c.growth_rate, c.M, start[0]) + apart
     u = c.L * x + law_error
     if c.one_sided is None:
-        return x, u, None, None, (onward, last(c.M * start[0], x))
+        return x, u, None, None
     sharp = _gronwall(t0, ts, acted, settled, c.one_sided, 1.0, start[1]) + apart
-    return x, u, sharp, c.L * sharp + law_error, (onward, last(start[1], sharp))
+    return x, u, sharp, c.L * sharp + law_error
 
 
 def _check(problem: Problem, sol: Solution, initial_error: Any) -> None:
@@ -146,14 +140,36 @@ def _check(problem: Problem, sol: Solution, initial_error: Any) -> None:
                     "Pass 0 where the initial state is exact, or the Bound of the run before",
                 )
             )
+    if isinstance(initial_error, Bound):
+        wrong += _breaks_off(initial_error, sol.setup.setting["t0"])
     if wrong:
         raise InputError(*wrong)
+
+
+def _breaks_off(before: Bound, t0: Any) -> list[InputProblem]:
+    """What is wrong with going on from `before` at t0."""
+    if before.ts.shape[0] > 0:
+        end = before.ts[-1]
+        if not _tree.is_concrete(end, t0) or float(end) == float(np.asarray(t0, end.dtype)):
+            return []
+        given = f"a Bound up to t = {float(end):.17g} for a run from t0 = {float(t0):.17g}"
+    else:
+        given = "a Bound without a saved time"
+    return [
+        InputProblem(
+            "dvax.bound_error(initial_error)",
+            given,
+            "a bound is known at saved times only, so a run goes on from the last of them",
+            "Save t1 as well: let it be the last of ts=",
+        )
+    ]
 
 
 def _starts(initial_error: Any, dtype: Any) -> tuple[Any, Any]:
     """What the paper's and the sharp bound start with."""
     if isinstance(initial_error, Bound):
-        return initial_error.onward
+        sharp = initial_error.x if initial_error.x_sharp is None else initial_error.x_sharp
+        return initial_error.x[-1], sharp[-1]
     error = jnp.asarray(initial_error, dtype)
     return error, error
 
@@ -194,8 +210,8 @@ def _gronwall(
         span = time - t
         after = jnp.exp(rate * span) * before
         after = after + M * jnp.exp(jnp.maximum(rate, 0.0) * span) * (total - acted)
-        # An impulse without a bound stays one: ∞ − ∞ says nothing about what came after it.
-        after = jnp.where(jnp.isinf(total), jnp.inf, after)
+        # What has no bound keeps none: ∞ − ∞, and an impulse that is not a number, say nothing.
+        after = jnp.where(jnp.isfinite(total) & ~jnp.isnan(after), after, jnp.inf)
         return (after, time, surely), after
 
     start = (jnp.asarray(M * initial, ts.dtype), t0, jnp.zeros((), ts.dtype))
@@ -206,5 +222,5 @@ def _again(problem: Problem, sol: Solution) -> Solution:
     was = sol.setup
     return solve(
         problem, was.x0, was.setting["t0"], was.setting["t1"], was.args, sol.ts, was.setting["dt"],
-        method=was.method, vi_solver=was.vi_solver, measure=True,
+        method=was.method, vi_solver=was.vi_solver, measure=True, throw=False,
     )  # fmt: skip

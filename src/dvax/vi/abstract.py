@@ -99,8 +99,3 @@ class AbstractSolver(eqx.Module):
     @abc.abstractmethod
     def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
         """Solve from the guess y0 until ‖w‖/γ ≤ tol, or ‖w‖ ≤ tol where γ is unknown."""
-
-    def chosen(self, vi: Frozen, like: Tree) -> "AbstractSolver":
-        """The solver that will do the work for unknowns shaped like `like`: this one, unless it
-        chooses among others."""
-        return self

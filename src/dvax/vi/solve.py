@@ -68,7 +68,8 @@ def solve_vi(
     space = default_space(y0) if space is None else space
     K.check(y0)
     frozen = Frozen(lambda y: F(y, args), K, space, gamma, L_F)
-    solver = (Auto() if solver is None else solver).chosen(frozen, y0)
+    solver = Auto() if solver is None else solver
+    solver = solver.chosen(frozen, y0) if isinstance(solver, Auto) else solver
     answer = solver.solve(frozen, y0, tol)
     still = stopped(frozen)
     y = jax.lax.stop_gradient(answer.y)

@@ -41,7 +41,7 @@ class _Mark(NamedTuple):
 
 
 _LINEAR = {
-    "neg", "copy", "copy_p", "real", "imag", "reduce_precision", "optimization_barrier",
+    "neg", "copy", "copy_p", "real", "imag", "optimization_barrier",
 }  # fmt: skip
 _SUM = {"add", "sub", "add_any"}
 _PRODUCT = {"mul"}
@@ -52,7 +52,7 @@ _POINTWISE = {
     "integer_pow", "square", "clamp", "rem", "nextafter", "is_finite", "eq", "ne", "lt", "le",
     "gt", "ge", "lt_to", "le_to", "eq_to", "and", "or", "xor", "not", "lgamma", "digamma",
     # Linear in value, but its derivative is 0, and the slope of a law is taken by differentiating.
-    "stop_gradient",
+    "stop_gradient", "reduce_precision",
 }  # fmt: skip
 _MIXING = {
     "reshape", "squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "slice",
@@ -160,8 +160,11 @@ def _rule(
     if name in _PRODUCT:
         return _Mark(min(2, sum(mark.degree for mark in present)), leaf, even and others_flat)
     if name == "convert_element_type":
-        # Between floating types it rounds; to integers and booleans it makes steps.
-        kept = jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.inexact)
+        # To integers, booleans and shorter floating types it makes steps.
+        before, after = eqn.invars[0].aval.dtype, eqn.outvars[0].aval.dtype
+        kept = jnp.issubdtype(after, jnp.inexact) and (
+            not jnp.issubdtype(before, jnp.inexact) or jnp.finfo(after).eps <= jnp.finfo(before).eps
+        )
         return _Mark(degree if kept else 2, leaf, even)
     if name == "div":
         return _Mark(degree if given[1] is None else 2, leaf, even and others_flat)
