@@ -1,6 +1,7 @@
 """What a call hands to its compiled loop, and what it gives back of it."""
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from tests.closed_forms import c1

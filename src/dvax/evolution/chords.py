@@ -204,8 +204,7 @@ def _interpret(traced: ClosedJaxpr, inputs: list[Any]) -> list[Any]:
     for eqn in jaxpr.eqns:
         given = [read(atom) for atom in eqn.invars]
         if not any(map(is_chord, given)):
-            functions, params = eqn.primitive.get_bind_params(eqn.params)
-            out = eqn.primitive.bind(*functions, *given, **params)
+            out = eqn.primitive.bind(*given, **eqn.primitive.get_bind_params(eqn.params))
             results = out if eqn.primitive.multiple_results else [out]
         else:
             results = _apply(eqn, given)
