@@ -148,7 +148,16 @@ def nearest(y, solutions):
     return min(np.max(np.abs(np.asarray(y) - s)) for s in solutions)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize(
+    "solver",
+    [
+        pytest.param("extragradient", marks=pytest.mark.thorough),
+        pytest.param("forward-backward-forward", marks=pytest.mark.thorough),
+        "golden ratio",
+        "newton",
+        "auto",
+    ],
+)
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_published_problems_are_solved_from_every_start(name, solver):
     F, K, solutions, starts = PROBLEMS[name]
