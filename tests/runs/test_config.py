@@ -180,6 +180,7 @@ WRONG = {
     "frames": ({"time.frames": 0}, "time.frames", "at least 1"),
     "frames real": ({"time.frames": 2.5}, "time.frames", "whole number"),
     "dt": ({"solver.dt": -1.0}, "solver.dt", "greater than 0"),
+    "dt tiny": ({"solver.dt": "1e-300 s"}, "solver.dt", "cannot be counted"),
     "dt long": ({"solver.dt": 2.5}, "solver.dt", "not longer than the run"),
     "dt and rtol": ({"solver.dt": 0.1, "solver.rtol": 1e-6}, "solver", "not both"),
     "rtol": ({"solver.rtol": 1.0}, "solver.rtol", "less than 1"),

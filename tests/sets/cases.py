@@ -184,7 +184,7 @@ CASES: dict[str, Case] = {
         (G, D, np.ones((1, N)), np.zeros(1)),
     ),
     "translated": Case(
-        lambda v: sets.Translated(sets.Simplex(2.0), v),
+        lambda v: sets.Translated(sets.Simplex(jnp.asarray(2.0, v.dtype)), v),
         np.array([0.5, -1.0, 0.0, 2.0]),
         lambda y: _above(
             -(y - [0.5, -1.0, 0.0, 2.0]), abs((y - [0.5, -1.0, 0.0, 2.0]).sum() - 2.0)
@@ -192,14 +192,15 @@ CASES: dict[str, Case] = {
         lambda rng: _shares(rng) + [0.5, -1.0, 0.0, 2.0],
     ),
     "scaled": Case(
-        lambda v: sets.Scaled(sets.L1Ball(0.3, 1.2), v[0]),
+        lambda v: sets.Scaled(sets.L1Ball(*jnp.array([0.3, 1.2], v.dtype)), v[0]),
         np.array([-2.0]),
         lambda y: _above(np.abs(y / -2.0 - 0.3).sum() - 1.2),
         lambda rng: -2.0 * _diamond(rng),
     ),
     "intersection": Case(
         lambda v: sets.Intersection(
-            sets.HalfSpace(jnp.array([1.0, 0, 0, 0]), v[0]), sets.Ellipsoid(0.0, radii=v[1])
+            sets.HalfSpace(jnp.array([1.0, 0, 0, 0], v.dtype), v[0]),
+            sets.Ellipsoid(jnp.zeros((), v.dtype), radii=v[1]),
         ),
         np.array([0.3, 1.0]),
         lambda y: _above(y[0] - 0.3, np.linalg.norm(y) - 1.0),

@@ -164,8 +164,6 @@ def test_both_derivatives_are_the_slope_in_the_point_and_in_the_data(name, kind)
 
 @every_set
 def test_single_precision_stays_single(name):
-    if name in ("intersection", "translated", "scaled"):
-        pytest.skip("their parts are written with Python numbers, which are double here")
     data = jnp.asarray(CASES[name].data, jnp.float32)
     z = jnp.asarray(points(name)[5], jnp.float32)
     space = spaces.L2(jnp.asarray(WEIGHTS["weighted"], jnp.float32))

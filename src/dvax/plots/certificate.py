@@ -1,5 +1,7 @@
 """The certified error against time: of the trajectory (x and u), and of the frozen law."""
 
+import math
+
 import numpy as np
 import plotly.graph_objects as go
 from matplotlib import rc_context
@@ -74,7 +76,8 @@ def certificate_picture(run: RunRecord) -> Picture | None:
                     label=names[name],
                 )
             axes.set(yscale="log", xlabel=axis_title("time", run.unit("time")), ylabel=words)
-            axes.set_title("Certified error against time", pad=44)
+            # Above the legend, however many rows it has.
+            axes.set_title("Certified error against time", pad=8 + 16 * math.ceil(len(held) / 2))
             axes.legend(
                 ncols=2, loc="lower left", bbox_to_anchor=(0, 1.0), fontsize=9, borderpad=0.2
             )

@@ -23,6 +23,7 @@ from dvax.runs.settings import Config as Config
 from dvax.runs.units import Units
 
 MAX_BYTES = 2**20
+MOST_STEPS = 2**30
 _RTOL = 1e-6
 _ATOL_OF_SCALE = 1e-9  # of the model's own indentation scale
 
@@ -126,7 +127,7 @@ def _check(raw: dict[str, Any], source: Path, allow_outside: bool) -> Config:
         if section is not None:
             sections[name] = section
     between = check_consistency(raw, file)
-    problems += between
+    problems += between + _uncountable_steps(sections, file)
     contradictory = {p.place.removeprefix(f"{file}: ").split(".")[0] for p in between}
     usable = {name: s for name, s in sections.items() if name not in contradictory}
     draft = Config.model_construct(**usable)  # pyright: ignore[reportArgumentType]
@@ -153,6 +154,23 @@ def _check(raw: dict[str, Any], source: Path, allow_outside: bool) -> Config:
         draft = draft.model_copy(update={"output": output})
     draft._source, draft._allow_outside = source, allow_outside
     return draft
+
+
+def _uncountable_steps(sections: Mapping[str, Any], file: str) -> list[InputProblem]:
+    """A fixed step so short that the run has more steps than can be counted."""
+    if "time" not in sections or "solver" not in sections or sections["solver"].dt is None:
+        return []
+    end, dt = sections["time"].end, sections["solver"].dt
+    if end / dt < MOST_STEPS:
+        return []
+    return [
+        InputProblem(
+            f"{file}: solver.dt",
+            f"{dt:g} for a run of {end:g}",
+            f"a run has fewer than {MOST_STEPS} steps, or they cannot be counted",
+            "Give a longer step.",
+        )
+    ]
 
 
 def _section(

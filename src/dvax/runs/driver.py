@@ -22,7 +22,6 @@ import numpy as np
 
 from dvax.errors import InputError, InputProblem, SolveError
 from dvax.evolution import ETD1, ETD2RK, Solution, solve
-from dvax.evolution.arguments import bound_steps
 from dvax.models import Contact
 from dvax.runs.compile_time import announced, compile_seconds
 from dvax.runs.config import Config, build_contact
@@ -73,8 +72,6 @@ def run(
     is the outcome, and what was computed before is on disk.
     """
     _refuse_existing(out, overwrite)
-    if config.solver.dt is not None:
-        bound_steps(None, True, 0.0, config.time.end, config.solver.dt)
     compile_seconds()
     inputs = build_contact(config)
     directory = RunDirectory(out, clear=True)

@@ -32,25 +32,7 @@ class Ball(AbstractSet):
     radius: jax.Array
 
     def __init__(self, center: Any, radius: Any):
-        self.center = _tree.as_float(center, "dvax.sets.Ball(center)")
-        self.radius = _tree.as_float(radius, "dvax.sets.Ball(radius)")
-        _tree.require(
-            lambda: jnp.all((self.radius >= 0) & jnp.isfinite(self.radius)),
-            "dvax.sets.Ball(radius)",
-            self.radius,
-            "a ball has a finite radius ≥ 0, or it is empty or the whole space",
-            "Use dvax.sets.WholeSpace() where there is no constraint",
-        )
-        _tree.require(
-            lambda: _tree.all_finite(self.center),
-            "dvax.sets.Ball(center)",
-            self.center,
-            "a center is a point, with finite entries",
-            "Mend the entries that are not",
-        )
-        if not _tree.is_concrete(self.radius):
-            # Not known yet: a negative one is made NaN, so that an empty ball stops a solve.
-            self.radius = jnp.where(self.radius >= 0, self.radius, jnp.nan)
+        self.center, self.radius = center_and_radius("dvax.sets.Ball", center, radius)
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         offset = self._minus_center(z)
@@ -88,3 +70,27 @@ class Ball(AbstractSet):
         if _tree.same_shape(self.center, z):
             return _tree.sub(z, self.center)
         return jax.tree_util.tree_map(lambda leaf: leaf - self.center, z)
+
+
+def center_and_radius(name: str, center: Any, radius: Any) -> tuple[Tree, jax.Array]:
+    """Those of a ball of any norm, looked at as far as their values are known."""
+    center = _tree.as_float(center, f"{name}(center)")
+    radius = _tree.as_float(radius, f"{name}(radius)")
+    _tree.require(
+        lambda: jnp.all((radius >= 0) & jnp.isfinite(radius)),
+        f"{name}(radius)",
+        radius,
+        "a ball has a finite radius ≥ 0, or it is empty or the whole space",
+        "Use dvax.sets.WholeSpace() where there is no constraint",
+    )
+    _tree.require(
+        lambda: _tree.all_finite(center),
+        f"{name}(center)",
+        center,
+        "a center is a point, with finite entries",
+        "Mend the entries that are not",
+    )
+    if not _tree.is_concrete(radius):
+        # Not known yet: a negative one is made NaN, so that an empty ball stops a solve.
+        radius = jnp.where(radius >= 0, radius, jnp.nan)
+    return center, radius

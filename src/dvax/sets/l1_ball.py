@@ -12,6 +12,7 @@ from ..spaces import AbstractSpace
 from ._threshold import onto_total
 from ._weights import even, inverse_weights
 from .abstract import AbstractSet
+from .ball import center_and_radius
 
 
 class L1Ball(AbstractSet):
@@ -38,25 +39,7 @@ class L1Ball(AbstractSet):
     radius: jax.Array
 
     def __init__(self, center: Any, radius: Any):
-        self.center = _tree.as_float(center, "dvax.sets.L1Ball(center)")
-        self.radius = _tree.as_float(radius, "dvax.sets.L1Ball(radius)")
-        _tree.require(
-            lambda: jnp.all((self.radius >= 0) & jnp.isfinite(self.radius)),
-            "dvax.sets.L1Ball(radius)",
-            self.radius,
-            "a ball has a finite radius ≥ 0, or it is empty or the whole space",
-            "Use dvax.sets.WholeSpace() where there is no constraint",
-        )
-        _tree.require(
-            lambda: _tree.all_finite(self.center),
-            "dvax.sets.L1Ball(center)",
-            self.center,
-            "a center is a point, with finite entries",
-            "Mend the entries that are not",
-        )
-        if not _tree.is_concrete(self.radius):
-            # Not known yet: a negative one is made NaN, so that an empty ball stops a solve.
-            self.radius = jnp.where(self.radius >= 0, self.radius, jnp.nan)
+        self.center, self.radius = center_and_radius("dvax.sets.L1Ball", center, radius)
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         center = jnp.broadcast_to(self.center, jnp.shape(z))

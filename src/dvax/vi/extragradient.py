@@ -1,5 +1,6 @@
 """Korpelevich's extragradient method."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -41,12 +42,10 @@ class Extragradient(AbstractSolver):
 
     def contraction(self, gamma: Any, L_F: Any) -> Any:
         """The proven factor q with ‖y⁺ − y*‖ ≤ q‖y − y*‖ at the step λ = step/L_F."""
-        a, b = 1.0 - self.step**2, 2.0 * self.step * gamma / L_F
-        return jnp.sqrt(1.0 - a * b / (a + b))
+        return contraction(self.step, gamma, L_F)
 
     def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
-        def begin(vi: Frozen, y: Tree) -> tuple:
-            return y, self.step * first_step(vi, y, vi.F(y))
+        begin = partial(starting, self.step)
 
         def advance(vi: Frozen, state: tuple) -> tuple[tuple, Trial]:
             y, lam = state
@@ -54,6 +53,17 @@ class Extragradient(AbstractSolver):
             return (after, trial.step), trial._replace(at=[after])
 
         return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=2)
+
+
+def contraction(step: float, gamma: Any, L_F: Any) -> Any:
+    """q of the inequality that this method shares with Tseng's."""
+    a, b = 1.0 - step**2, 2.0 * step * gamma / L_F
+    return jnp.sqrt(1.0 - a * b / (a + b))
+
+
+def starting(step: float, vi: Frozen, y: Tree) -> tuple[Tree, Any]:
+    """The first iterate and the first λ."""
+    return y, step * first_step(vi, y, vi.F(y))
 
 
 def extragradient_step(vi: Frozen, y: Tree, lam: Any, step: float) -> tuple[Tree, Trial]:

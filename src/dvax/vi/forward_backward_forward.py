@@ -1,14 +1,13 @@
 """Tseng's forward-backward-forward method."""
 
+from functools import partial
 from typing import Any
-
-import jax.numpy as jnp
 
 from .. import _tree
 from .._tree import Tree
 from .abstract import AbstractSolver, Answer, Frozen
-from .extragradient import extrapolate
-from .iteration import Trial, certificate, first_step, iterate
+from .extragradient import contraction, extrapolate, starting
+from .iteration import Trial, certificate, iterate
 
 
 class ForwardBackwardForward(AbstractSolver):
@@ -42,12 +41,10 @@ class ForwardBackwardForward(AbstractSolver):
 
     def contraction(self, gamma: Any, L_F: Any) -> Any:
         """The proven factor q with ‖y⁺ − y*‖ ≤ q‖y − y*‖ at the step λ = step/L_F."""
-        a, b = 1.0 - self.step**2, 2.0 * self.step * gamma / L_F
-        return jnp.sqrt(1.0 - a * b / (a + b))
+        return contraction(self.step, gamma, L_F)
 
     def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
-        def begin(vi: Frozen, y: Tree) -> tuple:
-            return y, self.step * first_step(vi, y, vi.F(y))
+        begin = partial(starting, self.step)
 
         def advance(vi: Frozen, state: tuple) -> tuple[tuple, Trial]:
             y, lam = state

@@ -47,11 +47,10 @@ class GoldenRatio(AbstractSolver):
             lam = first_step(vi, y, Fy)
             # A first point apart from y, for the first difference quotient.
             after = vi.K.project(_tree.sub(y, _tree.scale(lam, Fy)), vi.space)
-            return after, y, Fy, y, lam, jnp.ones_like(lam)
+            return after, vi.F(after), y, Fy, y, lam, jnp.ones_like(lam)
 
         def advance(vi: Frozen, state: tuple) -> tuple[tuple, Trial]:
-            y, before, F_before, average, lam, theta = state
-            Fy = vi.F(y)
+            y, Fy, before, F_before, average, lam, theta = state
             moved = vi.space.norm(_tree.sub(y, before))
             turned = vi.space.norm(_tree.sub(Fy, F_before))
             flat = turned == 0
@@ -60,11 +59,9 @@ class GoldenRatio(AbstractSolver):
             new = jnp.minimum(jnp.minimum(growth * lam, limit), _LONGEST)
             average = _tree.scale(1 / phi, _tree.add(_tree.scale(phi - 1, y), average))
             after = vi.K.project(_tree.sub(average, _tree.scale(new, Fy)), vi.space)
-            state = after, y, Fy, average, new, phi * new / lam
-            return state, self._trial(vi, after, Fy, average, new)
+            F_after = vi.F(after)
+            w = certificate(F_after, Fy, average, after, new)
+            state = after, F_after, y, Fy, average, new, phi * new / lam
+            return state, Trial(after, w, new, [after, average], 1)
 
-        return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=2)
-
-    def _trial(self, vi: Frozen, y: Tree, F_old: Tree, base: Tree, lam: Any) -> Trial:
-        w = certificate(vi.F(y), F_old, base, y, lam)
-        return Trial(y, w, lam, [y, base], 1)
+        return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=3)

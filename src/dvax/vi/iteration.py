@@ -121,7 +121,7 @@ def iterate(
     tau = 1.0 if vi.L_F is None else 1.0 / vi.L_F
     z = _tree.sub(state.y, _tree.scale(tau, frozen.F(state.y)))
     z = lax.stop_gradient(z)
-    return Answer(y, z, state.residual, state.count, state.result, state.calls)
+    return Answer(y, z, state.residual, state.count, state.result, state.calls + 1)
 
 
 def stopped(vi: Frozen) -> Frozen:

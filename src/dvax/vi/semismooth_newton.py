@@ -40,10 +40,11 @@ class SemismoothNewton(AbstractSolver):
     the certificate w itself: [F′(y) D + (I − D)/τ] d = −Φ(z), z⁺ = z + d, D ∈ ∂proj_K(z).
 
     A Newton point is taken only if it halves the best ‖w‖; otherwise one extragradient step is made
-    from the best point so far. If infinitely many are taken, ‖w‖ → 0 by construction; if finitely
-    many, the tail is the extragradient method. So it converges wherever that does, and where
-    it converges to y* the last steps are Newton's: for polyhedral K, strict complementarity and F in
-    C¹, the matrix is regular with an inverse of norm at most about 1/γ, and the rate quadratic.
+    from where those steps stand: their own last iterate, or the last Newton point. If infinitely
+    many are taken, ‖w‖ → 0 by construction; if finitely many, the tail is the extragradient method.
+    So it converges wherever that does, and where it converges to y* the last steps are Newton's: for
+    polyhedral K, strict complementarity and F in C¹, the matrix is regular with an inverse of norm at
+    most about 1/γ, and the rate quadratic.
     Where a Newton point is refused, the next attempts are spaced out by 1, 2, 4, 8 iterations.
 
     Up to `dense` unknowns the matrix is formed and factorised; beyond, GMRES applies it, to
