@@ -24,8 +24,8 @@ class ActiveSet(AbstractSolver):
     others solve F′_II d_I = −F_I − F′_IA d_A. It is `SemismoothNewton` with the projection's
     derivative D = diag(0 or 1) eliminated by hand: the same iterates, the same safeguard, the same
     convergence, F symmetric or not; and a factorisation costs |I|³ instead of n³ (a compiled program
-    has arrays of fixed size, so the block is cut out in one of eight sizes). Where F is affine, which is
-    read off its code, its matrix is formed once.
+    has arrays of fixed size, so the block is cut out in one of eight sizes). Where F is affine,
+    which is read off its code, its matrix is formed once.
 
     Source: Hintermüller, Ito and Kunisch 2002, SIAM J. Optim. 13, 865–888 (the method, and that it
     is a semismooth Newton method); the safeguard is ours.

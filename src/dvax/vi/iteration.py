@@ -27,7 +27,8 @@ class Trial(NamedTuple):
 
     `y` ∈ K with `w` ∈ F(y) + N_K(y), and `value` = F(y); `step`, the λ that was used; `at`, the
     elements that the method iterates, which move as long as it does (y may rest in a corner meanwhile);
-    `calls` of F it took; `word`, what to say if no further iteration is allowed.
+    `calls` of F it took; `word`, what to say if no further iteration is allowed. An
+    iterate that is `tentative` may come back without the method going round in a circle.
     """
 
     y: Tree
@@ -37,6 +38,7 @@ class Trial(NamedTuple):
     at: list[Tree]
     calls: Any
     word: RESULTS = RESULTS.max_steps
+    tentative: Any = False
 
 
 class _State(NamedTuple):
@@ -81,7 +83,9 @@ def iterate(
         # Rounding is all that is left of a move: of the last one, or of all since the mark (which
         # is set anew at every power of two: Brent's way to find a cycle of any length).
         rest = length(_tree.sub(trial.at, s.at)) <= 4 * eps * size
+        rest &= ~jnp.asarray(trial.tentative)
         back = length(_tree.sub(trial.at, s.mark)) <= 32 * eps * size
+        back &= ~jnp.asarray(trial.tentative)
         collapsed = jnp.asarray(trial.step < 1e3 * eps)
         gone = (size > far) & ~better
         reason = trial.word
@@ -116,8 +120,8 @@ def iterate(
     shapes = jax.eval_shape(lambda m: advance(frozen, m)[1].at, method)
     nowhere = jtu.tree_map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), shapes)
     state = _State(
-        method, start, _tree.scale(jnp.nan, start), jnp.asarray(jnp.inf, dtype), nowhere, nowhere, jnp.asarray(1),
-        jnp.ones((), dtype), jnp.asarray(0), jnp.asarray(begun),
+        method, start, _tree.scale(jnp.nan, start), jnp.asarray(jnp.inf, dtype),
+        nowhere, nowhere, jnp.asarray(1), jnp.ones((), dtype), jnp.asarray(0), jnp.asarray(begun),
         RESULTS.max_steps, jnp.asarray(True),
     )  # fmt: skip
     state = lax.while_loop(lambda s: s.going & (s.count < max_steps), body, state)

@@ -11,6 +11,7 @@ from jax import lax
 from .. import _tree
 from .._tree import Tree
 from .abstract import RESULTS, Answer, Frozen
+from .batch import any_of_batch
 from .extragradient import extragradient_step
 from .iteration import Trial, first_step, iterate
 
@@ -34,17 +35,25 @@ Solve = Callable[[Linearised, Tree], Tree]
 """d with τF′(at) D d + (I − D) d = right. `shrunk` says how small ‖w‖ has become, against the first."""
 
 
+_RUN = 5
+"""Newton steps in a row that need not halve the best ‖w‖: an active set is found in a few guesses."""
+
+_WILD = 10.0
+"""A Newton point whose ‖w‖ is so many times the best is not gone on from."""
+
+
 class _State(NamedTuple):
-    """`z`, and F linearised at `at`, where it has the `value`; `base` and `lam`, where the safeguard
-    goes on; `best`, the least ‖w‖ so far; Newton is tried when `wait` is 0, tries being `pause`
-    apart; `singular`, whether the last linear system was."""
+    """`z`, and `ahead`, the linearisation at `at` of F where z projects to; `base` and `lam`, where the
+    safeguard goes on; `best`, the ‖w‖ to be halved; `left`, how many Newton steps may still fail to;
+    Newton rests for `wait` steps, next time for `pause`; `singular`, whether its last system was."""
 
     z: Tree
     at: Tree
-    value: Tree
+    ahead: Tree
     base: Tree
     lam: jax.Array
     best: jax.Array
+    left: jax.Array
     wait: jax.Array
     pause: jax.Array
     singular: jax.Array
@@ -56,8 +65,9 @@ def safeguarded_newton(
     """Newton's method for Φ(z) = F(y) + (z − y)/τ with y = proj_K(z), whose value is the certificate w.
 
     The first linearisation is made at y₀ itself with z = y₀ − τF(y₀), as for the natural map: one
-    evaluation of F, and from a good guess a second one ends the solve. A Newton point is taken only if
-    it halves the best ‖w‖; otherwise one extragradient step is made from where those stand.
+    evaluation of F, and from a good guess a second one ends the solve. A run of Newton steps is gone on
+    with while it halves the best ‖w‖ at least every sixth step; otherwise extragradient steps are made
+    from the last point that halved it, or from where they stopped last time.
     """
     # The iteration is never differentiated (`stopped`), but its F has a slope.
     slope_of = vi.F
@@ -66,21 +76,21 @@ def safeguarded_newton(
         return lambda d: lax.stop_gradient(jax.jvp(slope_of, (y,), (d,))[1])
 
     def begin(vi: Frozen, y: Tree) -> tuple:
-        Fy = vi.F(y)
-        tau = first_step(vi, y, Fy, slope_at(y))
+        Fy, slope = vi.F(y), slope_at(y)
+        tau = first_step(vi, y, Fy, slope)
         z = _tree.sub(y, _tree.scale(tau, Fy))
-        none, one = jnp.asarray(0), jnp.asarray(1)
-        far = jnp.full_like(tau, jnp.inf)
-        return _State(z, y, Fy, y, step * tau, far, none, one, jnp.asarray(False)), tau, far
+        ahead = _tree.add(Fy, slope(_tree.sub(vi.K.project(z, vi.space), y)))
+        none, one, far = jnp.asarray(0), jnp.asarray(1), jnp.full_like(tau, jnp.inf)
+        run = jnp.asarray(_RUN)
+        state = _State(z, y, ahead, y, step * tau, far, run, none, one, jnp.asarray(False))
+        return state, tau, far
 
     def newton(vi: Frozen, s: _State, tau: Any, first: Any) -> tuple[Tree, Tree, Tree, Tree]:
         project = lambda z: vi.K.project(z, vi.space)  # noqa: E731
-        y, slope = project(s.z), slope_at(s.at)
-        ahead = _tree.add(s.value, slope(_tree.sub(y, s.at)))
-        right = _tree.sub(_tree.scale(-tau, ahead), _tree.sub(s.z, y))
+        right = _tree.sub(_tree.scale(-tau, s.ahead), _tree.sub(s.z, project(s.z)))
         tangent = lambda d: jax.jvp(project, (s.z,), (d,))[1]  # noqa: E731
         shrunk = jnp.where(jnp.isfinite(first), s.best / first, 1.0)
-        d = solve(Linearised(vi, s.at, s.z, slope, tangent, tau, shrunk), right)
+        d = solve(Linearised(vi, s.at, s.z, slope_at(s.at), tangent, tau, shrunk), right)
         z = _tree.add(s.z, d)
         y = project(z)
         Fy = vi.F(y)
@@ -91,30 +101,43 @@ def safeguarded_newton(
         # w − F(y) ∈ N_K(y), so that y + τ(w − F(y)) projects onto y and has the same w.
         normal = _tree.sub(trial.w, trial.value)
         z = _tree.add(trial.y, _tree.scale(tau, normal))
-        return z, trial.y, trial.value, trial.w, base, trial.step, jnp.asarray(trial.calls)
+        return (z, trial.y, trial.value, trial.w), base, trial.step, jnp.asarray(trial.calls)
 
     def advance(vi: Frozen, carry: tuple) -> tuple[tuple, Trial]:
         s, tau, first = carry
         tries = s.wait == 0
-        found = lax.cond(
-            tries, lambda: newton(vi, s, tau, first), lambda: (s.z, s.at, s.value, s.value)
-        )
+        idle = s.z, s.at, s.ahead, s.ahead
+        found = lax.cond(any_of_batch(tries), lambda: newton(vi, s, tau, first), lambda: idle)
         norm = vi.space.norm(found[3])
-        taken = tries & (norm <= 0.5 * s.best) & jnp.isfinite(norm)
-        z, y, value, w, base, lam, calls = lax.cond(
-            taken,
-            lambda: (*found, found[1], s.lam, jnp.asarray(0)),
+        halved = tries & (norm <= 0.5 * s.best)
+        onward = tries & (s.left > 0) & (norm <= _WILD * s.best) & jnp.isfinite(norm)
+        taken = halved | onward
+        reached, base, lam, calls = lax.cond(
+            any_of_batch(~taken),
             lambda: safeguard(vi, s, tau),
+            lambda: (idle, s.base, s.lam, jnp.asarray(0)),
         )
-        norm_after = vi.space.norm(w)
-        singular = jnp.where(tries, ~_tree.all_finite(found[0]), s.singular)
-        pause = jnp.where(taken, 1, jnp.where(tries, jnp.minimum(2 * s.pause, 8), s.pause))
-        wait = jnp.where(taken, 0, jnp.where(tries, s.pause, s.wait - 1))
-        best = jnp.minimum(s.best, norm_after)
-        new = _State(z, y, value, base, lam, best, wait, pause, singular)
+        z, y, value, w = _tree.where(taken, found, reached)
+        base = _tree.where(halved, y, _tree.where(taken, s.base, base))
+        lam, calls = jnp.where(taken, s.lam, lam), jnp.where(taken, 0, calls)
+        norm = vi.space.norm(w)
+        failed = tries & ~taken
+        new = _State(
+            z=z,
+            at=y,
+            ahead=value,
+            base=base,
+            lam=lam,
+            best=jnp.where(halved | ~taken, jnp.minimum(s.best, norm), s.best),
+            left=jnp.where(halved | failed, _RUN, jnp.where(tries, s.left - 1, s.left)),
+            wait=jnp.where(taken, 0, jnp.where(failed, s.pause, s.wait - 1)),
+            pause=jnp.where(halved, 1, jnp.where(failed, jnp.minimum(2 * s.pause, 8), s.pause)),
+            singular=jnp.where(tries, ~_tree.all_finite(found[0]), s.singular),
+        )
+        first = jnp.where(jnp.isfinite(first), first, norm)
+        word = RESULTS.where(new.singular, RESULTS.singular, RESULTS.max_steps)
         calls = calls + jnp.where(tries, 1, 0)
-        word = RESULTS.where(singular, RESULTS.singular, RESULTS.max_steps)
-        first = jnp.where(jnp.isfinite(first), first, norm_after)
-        return (new, tau, first), Trial(y, w, value, tau, [z, base], calls, word)
+        trial = Trial(y, w, value, tau, [z, base], calls, word, tentative=taken & ~halved)
+        return (new, tau, first), trial
 
     return iterate(vi, y0, tol, begin, advance, max_steps, begun=1)
