@@ -22,3 +22,5 @@ from .solve import solve_vi as solve_vi
 from .structure import Structure as Structure
 from .structure import analyse as analyse
 from .structure import independent as independent
+from .weighted import Modulus as Modulus
+from .weighted import Weighted as Weighted
