@@ -84,10 +84,14 @@ def _random_case(key):
     n, count = 3, 6
     k = jax.random.split(key, 9)
     gamma = 10.0 ** jax.random.uniform(k[0], minval=-6.0, maxval=2.0)
-    skew = jax.random.normal(k[1], (n, n)) * 10.0 ** jax.random.uniform(k[2], minval=-3.0, maxval=2.0)
+    skew = jax.random.normal(k[1], (n, n)) * 10.0 ** jax.random.uniform(
+        k[2], minval=-3.0, maxval=2.0
+    )
     floor = jax.random.uniform(k[3], minval=0.05, maxval=1.0)
     weighted = jax.random.bernoulli(k[4])
-    middle = jax.random.normal(k[5], (n,)) * 10.0 ** jax.random.uniform(k[6], minval=-3.0, maxval=3.0)
+    middle = jax.random.normal(k[5], (n,)) * 10.0 ** jax.random.uniform(
+        k[6], minval=-3.0, maxval=3.0
+    )
     matrix = gamma * jnp.eye(n) + skew - skew.T
     c = matrix @ middle  # F(middle) = 0, by cancellation of terms that are not small
 
@@ -113,7 +117,9 @@ def _check_true_moduli(cases, seed):
         return jnp.stack(out)
 
     ratios = np.asarray(least(jax.random.split(jax.random.key(seed), cases)))
-    print(f"{cases} cases, three sets: least modulus left possible / true modulus {ratios.min():.6f}")
+    print(
+        f"{cases} cases, three sets: least modulus left possible / true modulus {ratios.min():.6f}"
+    )
     assert ratios.min() >= 1.0
 
 

@@ -50,7 +50,8 @@ def refute_gamma(
 
     - the definition: ⟨F(y), z − y⟩ ≥ 0 implies ⟨F(z), z − y⟩ ≥ γ‖z − y‖²;
     - the certificates: with w(y) ∈ F(y) + N_K(y) both lie within ‖w‖/γ of the one solution, so
-      γ‖y − z‖ ≤ ‖w(y)‖ + ‖w(z)‖ (F continuous). Two solutions, found from different guesses, refute every γ.
+      γ‖y − z‖ ≤ ‖w(y)‖ + ‖w(z)‖ (F continuous). Two solutions, found from different guesses,
+      refute every γ.
 
     Both are read with room for rounding, so that a true modulus is not refuted by it.
 
