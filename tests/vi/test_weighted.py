@@ -226,6 +226,17 @@ def test_lanes_of_a_batch_are_judged_apart():
     np.testing.assert_allclose(np.asarray(vi.y), [0.5, 1.2, 3.0])
 
 
+def test_single_precision_stays_single():
+    y0 = jnp.zeros(3, jnp.float32)
+    matrix, shift = jnp.asarray(WEIGHT, jnp.float32), jnp.asarray(SHIFT, jnp.float32)
+    for mu in (1.5, None):
+        law = Weighted(bump(0.2), lambda y, _: matrix @ y + shift, M=0.2, mu=mu)
+        vi = dvax.solve_vi(law, Box(-1.0, 1.0), y0, tol=1e-5)
+        assert vi.result == RESULTS.successful
+        assert vi.y.dtype == jnp.float32 and float(vi.error_bound) <= 1e-5
+        assert law(vi.y).dtype == jnp.float32
+
+
 def test_parts_share_one_weight():
     law = Weighted(
         lambda y, _: 2 + jnp.sin(y[0]), lambda y, _: (y[0] - 0.5, y[1] + y[0] - 2.0), M=1.0

@@ -25,6 +25,7 @@ class VISolution(eqx.Module):
     `y` ∈ K; `residual` = ‖w‖ for a w ∈ F(y) + N_K(y); `error_bound` ≥ ‖y − y*‖ where γ was given,
     else None; `iterations`, and `evaluations` of F (those for derivatives apart); `result`, which
     is `dvax.vi.RESULTS.successful` or says what went wrong; `solver`, the one that was used.
+    For a `dvax.vi.Weighted` operator aG these speak of G, which has the same solution.
     """
 
     y: Tree
