@@ -66,6 +66,8 @@ CONTRACT = [
     "spaces.Product",
     "vi.Extragradient",
     "vi.Auto",
+    "vi.Weighted",
+    "vi.refute_gamma",
     "models.Contact",
 ]
 

@@ -16,6 +16,8 @@ from .extragradient import Extragradient as Extragradient
 from .forward_backward_forward import ForwardBackwardForward as ForwardBackwardForward
 from .golden_ratio import GoldenRatio as GoldenRatio
 from .projection import Projection as Projection
+from .refute import Counterexample as Counterexample
+from .refute import refute_gamma as refute_gamma
 from .semismooth_newton import SemismoothNewton as SemismoothNewton
 from .solve import VISolution as VISolution
 from .solve import default_space as default_space
@@ -23,3 +25,5 @@ from .solve import solve_vi as solve_vi
 from .structure import Structure as Structure
 from .structure import analyse as analyse
 from .structure import independent as independent
+from .weighted import Modulus as Modulus
+from .weighted import Weighted as Weighted

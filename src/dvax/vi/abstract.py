@@ -52,6 +52,14 @@ class RESULTS(eqx.Enumeration):
         "pseudomonotone and VI(K, F) may have no solution or several. Check the sign of F (of the "
         "way in which h depends on u)."
     )
+    weight_not_positive = (
+        "The weight a of a Weighted operator is not positive at y. y solves VI(K, G), but then need "
+        "not solve VI(K, aG), and others may. Check a, or shrink K."
+    )
+    weight_below_bound = (
+        "The weight a of a Weighted operator is below M at y: M is refuted as its lower bound, and "
+        "with it γ = Mμ. y and its error bound, which rests on μ alone, hold. Lower M."
+    )
     not_lipschitz = (
         "The step shrank to nothing: F jumps, or is steeper than floating-point numbers can "
         "resolve. Smooth F, or choose another solver."

@@ -1,5 +1,6 @@
 """`dvax.solve_vi`: one frozen variational inequality, usable on its own."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +16,7 @@ from .abstract import RESULTS, AbstractSolver, Frozen
 from .auto import Auto
 from .certificate import certify
 from .iteration import first_step, stopped
+from .weighted import Weighted, moduli_belong_to_the_parts
 
 
 class VISolution(eqx.Module):
@@ -23,6 +25,7 @@ class VISolution(eqx.Module):
     `y` ∈ K; `residual` = ‖w‖ for a w ∈ F(y) + N_K(y); `error_bound` ≥ ‖y − y*‖ where γ was given,
     else None; `iterations`, and `evaluations` of F (those for derivatives apart); `result`, which
     is `dvax.vi.RESULTS.successful` or says what went wrong; `solver`, the one that was used.
+    For a `dvax.vi.Weighted` operator aG these speak of G, which has the same solution.
     """
 
     y: Tree
@@ -35,7 +38,7 @@ class VISolution(eqx.Module):
 
 
 def solve_vi(
-    F: Callable[[Tree, Any], Tree],
+    F: Callable[[Tree, Any], Tree] | Weighted,
     K: AbstractSet,
     y0: Tree,
     args: Any = None,
@@ -51,6 +54,7 @@ def solve_vi(
     any pytree; `solver`, `dvax.vi.Auto()` by default; `tol`, on the true error ‖y − y*‖ where
     `gamma` is given, else on the residual ‖w‖; `gamma`, the modulus of strong pseudomonotonicity,
     declared by the caller; `L_F`, a Lipschitz constant of F; `space`, Euclidean by default.
+    An F = aG that is a `dvax.vi.Weighted` is solved and certified as VI(K, G), by its own moduli.
 
     **Returns:** a `VISolution`. The answer is certified again after the solve, by one projection
     step that shares nothing with the method.
@@ -67,7 +71,29 @@ def solve_vi(
     y0 = _tree.as_float(y0, "y0")
     space = default_space(y0) if space is None else space
     K.check(y0)
-    frozen = Frozen(lambda y: F(y, args), K, space, gamma, L_F)
+    if isinstance(F, Weighted):
+        moduli_belong_to_the_parts(gamma, L_F)
+        return _divided(F, args, K, space, y0, solver, tol)
+    return _certified(Frozen(lambda y: F(y, args), K, space, gamma, L_F), y0, solver, tol, gamma)
+
+
+def _divided(
+    F: Weighted, args: Any, K: AbstractSet, space: AbstractSpace, y0: Tree, solver: Any, tol: Any
+) -> VISolution:
+    """Sol(K, aG) = Sol(K, G), so G is what is solved and certified; a is looked at afterwards."""
+    known = F.modulus(y0, args, space)
+    mu = None if known is None else known.value
+    # A modulus that is proved not to be positive says nothing, and may be so in some lanes only.
+    goal = tol if mu is None else tol * jnp.where(mu > 0, mu, 1.0)
+    found = _certified(Frozen(lambda y: F.G(y, args), K, space), y0, solver, goal, mu)
+    result, bound = F.judged(found.y, args, found.result, found.error_bound)
+    return dataclasses.replace(found, result=result, error_bound=bound)
+
+
+def _certified(
+    frozen: Frozen, y0: Tree, solver: AbstractSolver | None, tol: Any, gamma: Any
+) -> VISolution:
+    K, space = frozen.K, frozen.space
     solver = Auto() if solver is None else solver
     solver = solver.chosen(frozen, y0) if isinstance(solver, Auto) else solver
     answer = solver.solve(frozen, y0, tol)
@@ -80,13 +106,14 @@ def solve_vi(
     # The method's own residual belongs to y itself, unless it is the 0 of a closed form.
     own = jnp.where(answer.residual > 0, answer.residual, jnp.inf)
     residual = jnp.minimum(checked.norm, own)
-    target = tol if gamma is None else gamma * tol
+    target = tol if frozen.gamma is None else frozen.gamma * tol
     # What rounding let pass inside the method is looked at once more.
     unsure = (answer.result == RESULTS.successful) & ~(residual <= target) & (not solver.encloses)
     result = RESULTS.where(unsure, RESULTS.stalled, answer.result)
     bound = None
     if gamma is not None:
         bound = jnp.minimum(checked.bound(gamma) + step, own / gamma)
+        bound = jnp.where(gamma > 0, bound, jnp.inf)
     return VISolution(
         y=answer.y,
         residual=residual,

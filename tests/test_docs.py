@@ -1,0 +1,62 @@
+"""The pages of docs/: their examples run, and the page on the frozen law leaves nothing out."""
+
+import doctest
+import inspect
+import re
+from pathlib import Path
+
+import pytest
+
+import dvax
+
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = sorted(DOCS.glob("*.md"))
+
+
+def blocks(page: Path) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_examples_of_a_page_print_what_it_says(page: Path):
+    found = blocks(page)
+    assert len(found) == page.read_text(encoding="utf-8").count("```python")
+    assert all(">>>" in block for block in found), "an example that shows no result"
+    # One page is one session: later examples use what earlier ones made.
+    test = doctest.DocTestParser().get_doctest("\n".join(found), {}, page.name, str(page), 0)
+    report: list[str] = []
+    runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE)
+    runner.run(test, out=report.append)
+    assert runner.summarize(verbose=False).failed == 0, "".join(report)
+
+
+def test_some_page_has_examples():
+    assert sum(len(blocks(page)) for page in PAGES) >= 9
+
+
+def test_every_page_is_linked():
+    site = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8")
+    index = (DOCS / "index.md").read_text(encoding="utf-8")
+    for page in PAGES:
+        assert f"- {page.name}" in site
+        assert page.name == "index.md" or f"({page.name})" in index
+
+
+def public(module: object, base: type) -> list[str]:
+    return [
+        name
+        for name, thing in vars(module).items()
+        if isinstance(thing, type) and issubclass(thing, base) and not name.startswith("Abstract")
+    ]
+
+
+def test_every_set_solver_and_result_has_its_line():
+    text = (DOCS / "variational-inequalities.md").read_text(encoding="utf-8")
+    names = [
+        *public(dvax.sets, dvax.sets.AbstractSet),
+        *public(dvax.vi, dvax.vi.AbstractSolver),
+        *re.findall(r"^    (\w+) = ", inspect.getsource(dvax.vi.RESULTS), re.M),
+    ]
+    assert len(names) > 30
+    missing = [name for name in names if f"`{name}`" not in text]
+    assert not missing, f"not on the page: {missing}"
