@@ -99,11 +99,11 @@ class Answer(NamedTuple):
 class AbstractSolver(eqx.Module):
     """A method for VI(K, F). Its answer is differentiable with respect to all that F and K hold.
 
-    `encloses` says that success means a y* enclosed to rounding, whatever F is there, and not a
-    small ‖w‖.
+    `certifies` says that the residual is the norm of a w ∈ F(y) + N_K(y) that the method has found.
+    Where it is not, y is a closed form, or enclosed to rounding, and its w is still to be computed.
     """
 
-    encloses: ClassVar[bool] = False
+    certifies: ClassVar[bool] = True
 
     @abc.abstractmethod
     def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:

@@ -1,6 +1,6 @@
 """The default: the surest method that the structure of the problem allows."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.tree_util as jtu
 
@@ -65,6 +65,8 @@ class Closed(AbstractSolver):
 
     ```
     """
+
+    certifies: ClassVar[bool] = False
 
     def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
         if isinstance(y0, tuple) or not analyse(vi.F, y0).isotropic:

@@ -39,7 +39,7 @@ class Bracketing(AbstractSolver):
     ```
     """
 
-    encloses: ClassVar[bool] = True
+    certifies: ClassVar[bool] = False
 
     max_steps: int = 200
 
