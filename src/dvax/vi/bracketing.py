@@ -98,14 +98,19 @@ def _roots(
     values = zip(leaves, *F(guess), jtu.tree_leaves(lower), jtu.tree_leaves(upper), strict=True)
     start = [begin(*point) for point in values]
 
+    # The next trial travels with the brackets: computed where it is used, XLA would compute it anew
+    # for each of the seven arrays of a bracket (measured: 2.4 times the time of an iteration).
     def body(state: tuple) -> tuple:
-        points, count, _ = state
-        at = [trial(p, count) for p in points]
+        points, at, count, _ = state
         points = [narrow(p, *new) for p, *new in zip(points, at, *F(tree.unflatten(at)))]
-        return points, count + 1, _any(is_open, points)
+        at = [trial(p, count + 1) for p in points]
+        return points, at, count + 1, _any(is_open, points)
 
-    points, count, _ = lax.while_loop(
-        lambda s: s[2] & (s[1] < max_steps), body, (start, jnp.asarray(0), _any(is_open, start))
+    first = [trial(p, 0) for p in start]
+    points, _, count, _ = lax.while_loop(
+        lambda s: s[3] & (s[2] < max_steps),
+        body,
+        (start, first, jnp.asarray(0), _any(is_open, start)),
     )
     return points, count
 
