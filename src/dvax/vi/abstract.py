@@ -34,6 +34,11 @@ class RESULTS(eqx.Enumeration):
         "The iterates left for infinity: VI(K, F) may have no solution, F may not be "
         "pseudomonotone, or a step was too long. Check F, or bound K."
     )
+    singular = (
+        "The linear systems of the method were singular to rounding, and its safeguard ran out of "
+        "iterations. The best iterate is returned with its bound; choose a first-order solver, or "
+        "raise max_steps."
+    )
     nonfinite = (
         "The operator F or the projection returned NaN or infinity. Evaluate F at the returned y "
         "to see where."

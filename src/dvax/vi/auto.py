@@ -7,6 +7,7 @@ import jax.tree_util as jtu
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from .abstract import AbstractSolver, Answer, Frozen
+from .active_set import ActiveSet
 from .bracketing import Bracketing, affine_answer, is_pointwise
 from .golden_ratio import GoldenRatio
 from .semismooth_newton import SemismoothNewton
@@ -21,7 +22,7 @@ class Auto(AbstractSolver):
 
     - F(y) = ay + c with one number a: the closed form y* = proj_K(−c/a), for any K (`Closed`);
     - K a pointwise interval and F pointwise: `Bracketing` (closed form where F is affine);
-    - up to 1024 unknowns: `SemismoothNewton`;
+    - up to 1024 unknowns: `ActiveSet` on a box, `SemismoothNewton` on other sets;
     - beyond: `GoldenRatio`, which needs neither moduli nor memory.
 
     ```python
@@ -44,7 +45,9 @@ class Auto(AbstractSolver):
         if applies:
             return Bracketing()
         size = sum(leaf.size for leaf in jtu.tree_leaves(like))
-        return SemismoothNewton() if size <= _NEWTON else GoldenRatio()
+        if size > _NEWTON:
+            return GoldenRatio()
+        return SemismoothNewton() if vi.K.intervals(like) is None else ActiveSet()
 
     def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
         return self.chosen(vi, y0).solve(vi, y0, tol)

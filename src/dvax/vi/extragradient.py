@@ -52,7 +52,7 @@ class Extragradient(AbstractSolver):
             after, trial = extragradient_step(vi, y, lam, self.step)
             return (after, trial.step), trial._replace(at=[after])
 
-        return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=2)
+        return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=1 + (vi.L_F is None))
 
 
 def contraction(step: float, gamma: Any, L_F: Any) -> Any:
@@ -72,7 +72,7 @@ def extragradient_step(vi: Frozen, y: Tree, lam: Any, step: float) -> tuple[Tree
     z, Fz, lam, calls = extrapolate(vi, y, Fy, lam, step)
     after = vi.K.project(_tree.sub(y, _tree.scale(lam, Fz)), vi.space)
     # The certificate belongs to z, so z is what is returned.
-    return after, Trial(z, certificate(Fz, Fy, y, z, lam), lam, [z], calls + 1)
+    return after, Trial(z, certificate(Fz, Fy, y, z, lam), Fz, lam, [z], calls + 1)
 
 
 def extrapolate(

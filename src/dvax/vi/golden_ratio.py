@@ -62,6 +62,6 @@ class GoldenRatio(AbstractSolver):
             F_after = vi.F(after)
             w = certificate(F_after, Fy, average, after, new)
             state = after, F_after, y, Fy, average, new, phi * new / lam
-            return state, Trial(after, w, new, [after, average], 1)
+            return state, Trial(after, w, F_after, new, [after, average], 1)
 
-        return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=3)
+        return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=2 + (vi.L_F is None))

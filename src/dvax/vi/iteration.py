@@ -25,20 +25,24 @@ _DIVERGED = 1e8
 class Trial(NamedTuple):
     """What one iteration leaves.
 
-    `y` ∈ K with `w` ∈ F(y) + N_K(y); `step`, the λ that was used; `at`, the elements that the method
-    iterates, which move as long as it does (y may rest in a corner meanwhile); `calls` of F it took.
+    `y` ∈ K with `w` ∈ F(y) + N_K(y), and `value` = F(y); `step`, the λ that was used; `at`, the
+    elements that the method iterates, which move as long as it does (y may rest in a corner meanwhile);
+    `calls` of F it took; `word`, what to say if no further iteration is allowed.
     """
 
     y: Tree
     w: Tree
+    value: Tree
     step: Any
     at: list[Tree]
     calls: Any
+    word: RESULTS = RESULTS.max_steps
 
 
 class _State(NamedTuple):
     method: Any
     y: Tree
+    value: Tree
     residual: jax.Array
     at: list[Tree]
     mark: list[Tree]
@@ -61,7 +65,7 @@ def iterate(
     begun: int,
 ) -> Answer:
     """Advance from proj_K(y0) until ‖w‖/γ ≤ tol (‖w‖ ≤ tol where γ is unknown), or until nothing
-    more will come: see `RESULTS`. `begun` is how often `begin` calls F where L_F is not known."""
+    more will come: see `RESULTS`. `begun` is how often `begin` calls F."""
     frozen, target = stopped(vi), tol if vi.gamma is None else vi.gamma * tol
     start = lax.stop_gradient(vi.K.project(lax.stop_gradient(y0), vi.space))
     dtype = jnp.result_type(*jtu.tree_leaves(start))
@@ -80,7 +84,7 @@ def iterate(
         back = length(_tree.sub(trial.at, s.mark)) <= 32 * eps * size
         collapsed = jnp.asarray(trial.step < 1e3 * eps)
         gone = (size > far) & ~better
-        reason = RESULTS.max_steps
+        reason = trial.word
         for holds, word in (
             (back, RESULTS.cycling),
             (rest, RESULTS.stalled),
@@ -96,6 +100,7 @@ def iterate(
         return _State(
             method=method,
             y=_tree.where(better, trial.y, s.y),
+            value=_tree.where(better, trial.value, s.value),
             residual=jnp.where(better, residual, s.residual),
             at=trial.at,
             mark=_tree.where(mark, trial.at, s.mark),
@@ -111,17 +116,17 @@ def iterate(
     shapes = jax.eval_shape(lambda m: advance(frozen, m)[1].at, method)
     nowhere = jtu.tree_map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), shapes)
     state = _State(
-        method, start, jnp.asarray(jnp.inf, dtype), nowhere, nowhere, jnp.asarray(1),
-        jnp.ones((), dtype), jnp.asarray(0), jnp.asarray(begun - (vi.L_F is not None)),
+        method, start, _tree.scale(jnp.nan, start), jnp.asarray(jnp.inf, dtype), nowhere, nowhere, jnp.asarray(1),
+        jnp.ones((), dtype), jnp.asarray(0), jnp.asarray(begun),
         RESULTS.max_steps, jnp.asarray(True),
     )  # fmt: skip
     state = lax.while_loop(lambda s: s.going & (s.count < max_steps), body, state)
     y = with_implicit_derivative(vi, state.y, state.step, lambda found: found, pointwise=False)
     # One fixed step for every z, whatever λ the search ended with: z is compared between times.
     tau = 1.0 if vi.L_F is None else 1.0 / vi.L_F
-    z = _tree.sub(state.y, _tree.scale(tau, frozen.F(state.y)))
+    z = _tree.sub(state.y, _tree.scale(tau, state.value))
     z = lax.stop_gradient(z)
-    return Answer(y, z, state.residual, state.count, state.result, state.calls + 1)
+    return Answer(y, z, state.residual, state.count, state.result, state.calls)
 
 
 def stopped(vi: Frozen) -> Frozen:
@@ -131,8 +136,11 @@ def stopped(vi: Frozen) -> Frozen:
     )
 
 
-def first_step(vi: Frozen, y: Tree, Fy: Tree) -> jax.Array:
-    """1/L_F, or where that is unknown 1/L for the L that F shows along its own direction at y."""
+def first_step(
+    vi: Frozen, y: Tree, Fy: Tree, slope: Callable[[Tree], Tree] | None = None
+) -> jax.Array:
+    """1/L_F, or where that is unknown 1/L for the L that F shows along its own direction at y: by
+    one more evaluation, or by `slope`, d ↦ F′(y)d."""
     if vi.L_F is not None:
         return jnp.asarray(1.0 / vi.L_F, jnp.result_type(*jtu.tree_leaves(y)))
     norm = vi.space.norm
@@ -141,8 +149,9 @@ def first_step(vi: Frozen, y: Tree, Fy: Tree) -> jax.Array:
     reach = jnp.sqrt(eps) * (1.0 + norm(y))
     scale = reach / jnp.where(length > 0, length, 1.0)
     ahead = vi.K.project(_tree.sub(y, _tree.scale(scale, Fy)), vi.space)
-    moved = norm(_tree.sub(ahead, y))
-    change = norm(_tree.sub(vi.F(ahead), Fy))
+    move = _tree.sub(ahead, y)
+    moved = norm(move)
+    change = norm(_tree.sub(vi.F(ahead), Fy) if slope is None else slope(move))
     # Held at a corner, or F flat: any length will do, and the rules of the methods cut it.
     known = (moved > 0) & (change > 0) & jnp.isfinite(change)
     return jnp.where(known, moved / jnp.where(known, change, 1.0), 1.0)

@@ -63,6 +63,6 @@ class Projection(AbstractSolver):
                 fell = residual <= 0.999 * least
                 failures = jnp.where(fell, failures, failures + 1.0)
                 least = jnp.minimum(least, residual)
-            return (z, Fz, first, failures, least), Trial(z, w, lam, [z], 1)
+            return (z, Fz, first, failures, least), Trial(z, w, Fz, lam, [z], 1)
 
-        return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=2)
+        return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=1 + (vi.L_F is None))

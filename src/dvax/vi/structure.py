@@ -60,7 +60,7 @@ _MIXING = {
 }  # fmt: skip
 _ELEMENTWISE = {"div", "convert_element_type"}
 _FLAT = _LINEAR | _SUM | _PRODUCT | _POINTWISE | _ELEMENTWISE | {"broadcast_in_dim"}
-_CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"}
+CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"}
 _CUSTOM = {"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
 
 
@@ -108,8 +108,8 @@ def _interpret(
             if name in _FLAT and all(map(is_flat, eqn.invars)):
                 flat.update(eqn.outvars)
             continue
-        if name in _CALLS or name in _CUSTOM:
-            inner = _inner(eqn.params)
+        if name in CALLS or name in _CUSTOM:
+            inner = inner_jaxpr(eqn.params)
             if inner is not None and len(inner.jaxpr.invars) == len(given):
                 results = _interpret(inner, given, shapes)
                 if name in _CUSTOM:
@@ -122,7 +122,7 @@ def _interpret(
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def _inner(params: dict[str, Any]) -> ClosedJaxpr | None:
+def inner_jaxpr(params: dict[str, Any]) -> ClosedJaxpr | None:
     for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
         inner = params.get(key)
         if isinstance(inner, ClosedJaxpr):

@@ -1,0 +1,123 @@
+"""The matrix of a linear map, read off the map's own operations.
+
+A linear map traced to a jaxpr is a list of operations. Its matrix is carried through them, column
+after column, but as long as it is diagonal it stays a vector; and a product with a given matrix then
+*is* that matrix, with its columns scaled. So the matrix of d ↦ Md + φ′(y)d costs a pass over M, where
+applying the map to n unit vectors would cost the n³ operations of several factorisations.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+from jax import lax
+from jax.extend.core import ClosedJaxpr, Literal
+
+from .._tree import Tree
+from .structure import CALLS, inner_jaxpr
+
+
+class _Diagonal(NamedTuple):
+    """A value whose k-th entry (in the order of memory) is `factor`'s k-th times the k-th unknown."""
+
+    factor: jax.Array
+
+
+class _Columns(NamedTuple):
+    """A value that depends on the unknowns through `columns`: one more axis, the last."""
+
+    columns: jax.Array
+
+
+def matrix_of(linear: Callable[[Tree], Tree], like: Tree) -> jax.Array:
+    """The matrix of `linear` between elements shaped like `like`, as flat vectors."""
+    if isinstance(like, tuple):
+        flat, unravel = jax.flatten_util.ravel_pytree(like)
+        return matrix_of(lambda d: jax.flatten_util.ravel_pytree(linear(unravel(d)))[0], flat)
+    size = like.size
+    (out,) = _carry(jax.make_jaxpr(linear)(like), [_Diagonal(jnp.ones_like(like))])
+    if not _depends(out):
+        return jnp.zeros((size, size), like.dtype)
+    return _columns(out).reshape(size, size)
+
+
+def _columns(value: _Diagonal | _Columns) -> jax.Array:
+    if isinstance(value, _Columns):
+        return value.columns
+    factor = value.factor
+    return jnp.diag(factor.ravel()).reshape(*factor.shape, factor.size)
+
+
+def _depends(value: Any) -> bool:
+    return isinstance(value, _Diagonal | _Columns)
+
+
+def _carry(traced: ClosedJaxpr, inputs: list[Any]) -> list[Any]:
+    """The outputs for these inputs: what does not depend on the unknowns is computed as it is."""
+    jaxpr = traced.jaxpr
+    values: dict[Any, Any] = dict(zip(jaxpr.constvars, traced.consts, strict=True))
+    values.update(zip(jaxpr.invars, inputs, strict=True))
+
+    def read(atom: Any) -> Any:
+        return atom.val if isinstance(atom, Literal) else values[atom]
+
+    for eqn in jaxpr.eqns:
+        given = [read(atom) for atom in eqn.invars]
+        inner = inner_jaxpr(eqn.params) if eqn.primitive.name in CALLS else None
+        if not any(map(_depends, given)):
+            results = _bind(eqn, given)
+        elif inner is not None:
+            results = _carry(inner, given)
+        else:
+            results = _rule(eqn, given) or _column_by_column(eqn, given)
+        values.update(zip(eqn.outvars, results, strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def _bind(eqn: Any, given: list[Any]) -> list[Any]:
+    out = eqn.primitive.bind(*given, **eqn.primitive.get_bind_params(eqn.params))
+    return list(out) if eqn.primitive.multiple_results else [out]
+
+
+def _column_by_column(eqn: Any, given: list[Any]) -> list[Any]:
+    axes = [-1 if _depends(value) else None for value in given]
+    full = [_columns(value) if _depends(value) else value for value in given]
+    results = jax.vmap(lambda *g: _bind(eqn, list(g)), in_axes=axes, out_axes=-1)(*full)
+    return [_Columns(result) for result in results]
+
+
+def _rule(eqn: Any, given: list[Any]) -> list[Any] | None:
+    """What becomes of a diagonal; None where it becomes a full matrix by no shorter way."""
+    name, out = eqn.primitive.name, eqn.outvars[0].aval
+    bent = [value for value in given if _depends(value)]
+    if not all(isinstance(value, _Diagonal) for value in bent):
+        return None
+    if name in ("neg", "convert_element_type", "reshape", "squeeze", "copy"):
+        return [_Diagonal(_bind(eqn, [given[0].factor])[0])]
+    if name == "broadcast_in_dim" and out.size == given[0].factor.size:
+        return [_Diagonal(given[0].factor.reshape(out.shape))]
+    if name in ("add", "sub", "add_any") and len(bent) == 2:
+        return [_Diagonal(_bind(eqn, [value.factor for value in given])[0])]
+    if name in ("mul", "div") and len(bent) == 1:
+        factors = [value.factor if _depends(value) else value for value in given]
+        if bent[0].factor.shape == out.shape:
+            return [_Diagonal(jnp.broadcast_to(_bind(eqn, factors)[0], out.shape))]
+    if name == "select_n" and not _depends(given[0]) and len(bent) == len(given) - 1:
+        return [_Diagonal(_bind(eqn, [given[0], *(value.factor for value in bent)])[0])]
+    if name == "dot_general":
+        return _product(eqn, given)
+    return None
+
+
+def _product(eqn: Any, given: list[Any]) -> list[Any] | None:
+    """A given array times a vector of unknowns: the array, its summed axis moved to the end."""
+    (of_left, of_right), (batch, _) = eqn.params["dimension_numbers"]
+    left, right = given
+    array, vector, axes = (right, left, of_right) if _depends(left) else (left, right, of_left)
+    if _depends(array) or batch or len(axes) != 1 or vector.factor.ndim != 1:
+        return None
+    columns = jnp.moveaxis(array, axes[0], -1)
+    columns = columns * jnp.broadcast_to(vector.factor, columns.shape)
+    return [_Columns(lax.convert_element_type(columns, eqn.outvars[0].aval.dtype))]
