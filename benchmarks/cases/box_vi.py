@@ -61,9 +61,7 @@ def _solver() -> Callable[..., Any]:
     return solve
 
 
-def _one_size(
-    section: Section, n: int, interpreter: str | None, rounds: int, full: bool
-) -> None:
+def _one_size(section: Section, n: int, interpreter: str | None, rounds: int, full: bool) -> None:
     p = affine_boxes(n, seed=n)
     data = [jnp.asarray(part[0]) for part in p[:4]]
     solve = jax.jit(_solver())

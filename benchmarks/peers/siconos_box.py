@@ -63,7 +63,7 @@ def lemke(M: Any, q: Any, lower: Any, upper: Any, tol: float) -> Solve:
     return solve
 
 
-SOLVERS = {"BOX_QI": box_qi, "Lemke": lemke}
+SOLVERS: dict[str, Callable[..., Solve]] = {"BOX_QI": box_qi, "Lemke": lemke}
 
 
 def main() -> None:

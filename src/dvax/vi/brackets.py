@@ -101,9 +101,7 @@ def trial(p: Brackets, count: Any) -> jax.Array:
 def best(p: Brackets) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The end with the lesser |F|, of those that were evaluated, with F and F′ there."""
     lower_end = _lower_is_better(p)
-    return tuple(
-        jnp.where(lower_end, q, r) for q, r in ((p.a, p.b), (p.fa, p.fb), (p.sa, p.sb))
-    )  # pyright: ignore[reportReturnType]
+    return tuple(jnp.where(lower_end, q, r) for q, r in ((p.a, p.b), (p.fa, p.fb), (p.sa, p.sb)))  # pyright: ignore[reportReturnType]
 
 
 def is_open(p: Brackets) -> jax.Array:
