@@ -24,6 +24,9 @@ import siconos.numerics as numerics
 
 Solve = Callable[[], tuple[int, np.ndarray]]
 
+_KEPT: list[Any] = []
+"""Siconos keeps pointers to functions and arrays, not references: these must outlive the problems."""
+
 
 def box_qi(M: Any, q: Any, lower: Any, upper: Any, tol: float) -> Solve:
     def value(n: int, y: Any, F: Any) -> None:
@@ -38,6 +41,7 @@ def box_qi(M: Any, q: Any, lower: Any, upper: Any, tol: float) -> Solve:
     problem.set_compute_nabla_F(slope)
     options = numerics.SolverOptions(numerics.SICONOS_VI_BOX_QI)
     options.dparam[numerics.SICONOS_DPARAM_TOL] = tol
+    _KEPT.extend((value, slope, lower, upper))
 
     def solve() -> tuple[int, np.ndarray]:
         y, w = np.zeros(len(q)), np.zeros(len(q))
