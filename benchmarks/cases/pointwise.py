@@ -21,7 +21,7 @@ _OFF = (0.0, 1e-8, 1e-5, 1e-3)
 
 
 class Law(NamedTuple):
-    """F(y) = rule(y, c) on [lower, upper], c uniform in `drive`; `steep`: no Lipschitz constant, so no target."""
+    """F(y) = rule(y, c) on [lower, upper], c uniform in `drive`; no target where `steep` (no L_F)."""
 
     name: str
     rule: Callable[[Any, Any], Any]
