@@ -15,6 +15,8 @@ CASES = (
     "memory",
     "processes",
     "simplices",
+    "box_vi",
+    "pointwise",
 )
 """The names that --only takes, in the order of a run."""
 

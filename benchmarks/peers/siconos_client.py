@@ -6,13 +6,14 @@ import sys
 import tempfile
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from ..contact_law import ContactLaw
+from .affine_boxes import Affine
 
-_PROGRAM = Path(__file__).with_name("siconos_contact.py")
+_HERE = Path(__file__).parent
 _PYTHONS = (sys.executable, "/usr/bin/python3", "python3")
 _LETTERS = ("alpha", "beta", "b_x", "b_u", "d_x", "d_u", "kappa0", "ell", "x0")
 
@@ -32,21 +33,21 @@ def python() -> str | None:
     return None
 
 
-class Siconos:
+class _Running:
     """A running Siconos process, to be used in a `with` statement.
 
     Some of its solvers report success with NaN, and print a warning where they did not converge:
-    states are checked here, and `said` gives back what was printed.
+    answers are checked here, and `said` gives back what was printed.
     """
 
-    def __init__(self, interpreter: str):
+    def __init__(self, interpreter: str, program: str):
         self._print = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")
         self._process = subprocess.Popen(
-            [interpreter, str(_PROGRAM)],
+            [interpreter, str(_HERE / program)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._print, text=True,
         )  # fmt: skip
 
-    def __enter__(self) -> "Siconos":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
@@ -59,6 +60,27 @@ class Siconos:
         self._process.stdin.close()
         self._process.wait(timeout=60)
         self._print.close()
+
+    def said(self) -> str:
+        """What Siconos has printed so far."""
+        self._print.seek(0)
+        return self._print.read().strip()
+
+    def _ask(self, **order: Any) -> dict[str, Any]:
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.write(json.dumps(order) + "\n")
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        if not line:
+            raise RuntimeError(f"Siconos ended while asked to {order['do']}: {self.said()[-2000:]}")
+        return json.loads(line)
+
+
+class Siconos(_Running):
+    """The contact law (`siconos_contact.py`)."""
+
+    def __init__(self, interpreter: str):
+        super().__init__(interpreter, "siconos_contact.py")
 
     def build(self, law: ContactLaw, h: float, theta: float, t1: float) -> None:
         letters = {name: getattr(law, name) for name in _LETTERS}
@@ -82,16 +104,27 @@ class Siconos:
             )
         return x
 
-    def said(self) -> str:
-        """What Siconos has printed so far."""
-        self._print.seek(0)
-        return self._print.read().strip()
 
-    def _ask(self, **order: Any) -> dict[str, Any]:
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.write(json.dumps(order) + "\n")
-        self._process.stdin.flush()
-        line = self._process.stdout.readline()
-        if not line:
-            raise RuntimeError(f"Siconos ended while asked to {order['do']}: {self.said()[-2000:]}")
-        return json.loads(line)
+class SiconosBox(_Running):
+    """Affine inequalities on boxes (`siconos_box.py`)."""
+
+    def __init__(self, interpreter: str):
+        super().__init__(interpreter, "siconos_box.py")
+
+    def load(self, problems: Affine) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "problems.npz"
+            np.savez(file, **problems._asdict())
+            self._ask(do="load", file=str(file))
+
+    def seconds(self, solver: str, tol: float, first: int, count: int) -> float:
+        """For so many of the problems, one after the other."""
+        return self._ask(do="solve", solver=solver, tol=tol, first=first, count=count)["seconds"]
+
+    def solution(self, solver: str, tol: float, which: int) -> np.ndarray:
+        """**Raises:** `RuntimeError` where Siconos fails, or returns what is not finite."""
+        answer = self._ask(do="solve", solver=solver, tol=tol, first=which, count=1)
+        y = np.array(answer["y"])
+        if answer["info"] != 0 or not np.all(np.isfinite(y)):
+            raise RuntimeError(f"Siconos {solver} ended with info = {answer['info']}")
+        return y

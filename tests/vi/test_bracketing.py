@@ -1,0 +1,61 @@
+"""Pointwise intervals: how many evaluations of F they take, and that no guess changes the answer."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvax
+from dvax.sets import Box
+from dvax.vi import RESULTS, Bracketing
+
+INF = np.inf
+LAWS = {
+    "cubic": (lambda y, c: y + y**3 - c, -2.0, 2.0, (-12.0, 12.0)),
+    "pseudomonotone": (lambda y, c: (2 + jnp.sin(y)) * (y - c), 0.0, 4.7, (-2.0, 7.0)),
+    "exponential": (lambda y, c: jnp.exp(y) - c, -3.0, 3.0, (-2.0, 25.0)),
+    "logarithm": (lambda y, c: jnp.log(y) + y - c, 1e-6, 10.0, (-16.0, 16.0)),
+    "saturating": (lambda y, c: y + jnp.tanh(5 * y) - c, -2.0, 2.0, (-4.0, 4.0)),
+    "steep": (lambda y, c: jnp.arctan(1e3 * (y - c)), 0.0, 10.0, (-3.0, 13.0)),
+    "cubic on a line": (lambda y, c: y + y**3 - c, -INF, INF, (-1e3, 1e3)),
+    "exponential on a half line": (lambda y, c: jnp.expm1(y) - c, 0.0, INF, (-5.0, 1e3)),
+}
+POINTS = 10_000
+
+
+def solve(name, y0, count=POINTS):
+    law, lower, upper, drive = LAWS[name]
+    c = jnp.linspace(*drive, count)
+    vi = dvax.solve_vi(law, Box(lower, upper), y0, c, Bracketing())
+    assert vi.result == RESULTS.successful
+    return vi
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_fifteen_evaluations_solve_every_point_and_three_from_a_good_guess(name):
+    law, lower, upper, drive = LAWS[name]
+    vi = solve(name, jnp.zeros(POINTS))
+    assert int(vi.evaluations) <= 15
+    c = jnp.linspace(*drive, POINTS)
+    # Enclosed to eight spacings: F changes its sign, or a bound holds the point.
+    y = np.asarray(vi.y)
+    gap = 8 * np.finfo(float).eps * np.abs(y) + 1e-30
+    below, above = (np.asarray(law(jnp.clip(y + s * gap, lower, upper), c)) for s in (-1, 1))
+    assert np.all((below <= 0) | (y <= lower))
+    assert np.all((above >= 0) | (y >= upper))
+    assert int(solve(name, vi.y).evaluations) <= 3
+
+
+def test_the_answer_does_not_depend_on_the_guess():
+    found = [solve("pseudomonotone", jnp.full(101, guess), 101).y for guess in (-1e9, 0.3, 1e9)]
+    for y in found[1:]:
+        np.testing.assert_allclose(np.asarray(y), np.asarray(found[0]), rtol=1e-14, atol=1e-15)
+
+
+def test_a_root_without_a_slope_or_with_an_infinite_one_takes_a_bounded_number():
+    c = jnp.linspace(-0.3, 1.3, 1001)
+    for power, most in ((3.0, 240), (0.5, 60)):
+        law = lambda y, c, p=power: jnp.sign(y - c) * jnp.abs(y - c) ** p  # noqa: E731
+        vi = dvax.solve_vi(law, Box(0.0, 1.0), jnp.zeros(1001), c, Bracketing())
+        assert vi.result == RESULTS.successful
+        assert int(vi.evaluations) <= most
+        np.testing.assert_allclose(np.asarray(vi.y), np.clip(c, 0, 1), atol=1e-14)
