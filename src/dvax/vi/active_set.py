@@ -1,9 +1,11 @@
 """The primal-dual active-set method for boxes."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 
 from .. import _tree
@@ -27,10 +29,17 @@ class ActiveSet(AbstractSolver):
     has arrays of fixed size, so the block is cut out in one of eight sizes). Where F is affine,
     which is read off its code, its matrix is formed once.
 
+    Up to `dense` unknowns the matrix is formed; beyond, the block is only applied (by one derivative of
+    F a time), and conjugate gradients (`symmetric=True`: F′ is symmetric) or GMRES solve with it, to
+    min(0.1, ‖w‖/‖w₀‖) at first and tighter as ‖w‖ falls. They need a `preconditioner` where F′ is
+    ill-conditioned, as a differential operator is.
+
     Source: Hintermüller, Ito and Kunisch 2002, SIAM J. Optim. 13, 865–888 (the method, and that it
     is a semismooth Newton method); the safeguard is ours.
 
-    **Arguments:** `step` of the safeguard, in (0, 1); `max_steps`.
+    **Arguments:** `step` of the safeguard, in (0, 1); `max_steps`; `dense`; `symmetric`, declared by the
+    caller; `preconditioner(free, r)`, which returns an approximate solution d of F′_II d_I = r_I, given
+    where the unknowns are free (a tree of booleans) and an r that is 0 elsewhere, as d shall be.
 
     **Raises:** `dvax.InputError` where K is not a pointwise interval.
 
@@ -47,6 +56,9 @@ class ActiveSet(AbstractSolver):
 
     step: float = 0.7
     max_steps: int = 1000
+    dense: int = 1024
+    symmetric: bool = False
+    preconditioner: Callable[[Tree, Tree], Tree] | None = None
 
     def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
         if vi.K.intervals(y0) is None:
@@ -58,6 +70,11 @@ class ActiveSet(AbstractSolver):
                     "Use dvax.vi.SemismoothNewton()",
                 )
             )
+        size = sum(leaf.size for leaf in jtu.tree_leaves(y0))
+        linear = self._by_lu(vi, y0) if size <= self.dense else self._by_krylov
+        return safeguarded_newton(vi, y0, tol, linear, step=self.step, max_steps=self.max_steps)
+
+    def _by_lu(self, vi: Frozen, y0: Tree) -> Callable[[Linearised, Tree], Tree]:
         constant = None
         if analyse(vi.F, y0).affine:
             zero = _tree.zeros_like(y0)
@@ -67,11 +84,32 @@ class ActiveSet(AbstractSolver):
         def solve(at: Linearised, right: Tree) -> Tree:
             flat, unravel = ravel_pytree(right)
             matrix = matrix_of(at.slope, right) if constant is None else constant
-            ones = jax.tree_util.tree_map(jnp.ones_like, right)
-            free = ravel_pytree(at.tangent(ones))[0] > 0
+            free = ravel_pytree(_free(at, right))[0]
             # The held ones: d = right. The free ones: τF′_II d_I = right_I, d_A acting through z only.
             scaled = jnp.where(free, flat / at.tau, 0.0)
             d = jnp.where(free, solve_block(matrix, free, scaled), 0.0)
             return unravel(jnp.where(free, d, flat - at.tau * (matrix @ d)))
 
-        return safeguarded_newton(vi, y0, tol, solve, step=self.step, max_steps=self.max_steps)
+        return solve
+
+    def _by_krylov(self, at: Linearised, right: Tree) -> Tree:
+        free = _free(at, right)
+        inside = lambda d: jtu.tree_map(lambda f, v: jnp.where(f, v, 0.0), free, d)  # noqa: E731
+        apply = lambda d: inside(at.slope(d))  # noqa: E731  (d is 0 where held, and stays so)
+        given = self.preconditioner
+        M = None if given is None else lambda r: given(free, r)
+        aim = inside(_tree.scale(1.0 / at.tau, right))
+        rtol: Any = jnp.clip(at.shrunk, 1e-10, 0.1)
+        if self.symmetric:
+            d, _ = jax.scipy.sparse.linalg.cg(apply, aim, tol=rtol, maxiter=1000, M=M)
+        else:
+            d, _ = jax.scipy.sparse.linalg.gmres(
+                apply, aim, tol=rtol, atol=0.0, restart=40, maxiter=10, M=M
+            )
+        held = _tree.sub(right, _tree.scale(at.tau, at.slope(d)))
+        return jtu.tree_map(jnp.where, free, d, held)
+
+
+def _free(at: Linearised, like: Tree) -> Tree:
+    moved = at.tangent(jtu.tree_map(jnp.ones_like, like))
+    return jtu.tree_map(lambda leaf: leaf > 0, moved)

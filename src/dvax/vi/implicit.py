@@ -2,7 +2,9 @@
 
 y solves R(y; θ) = y − proj_K(y − τF(y; θ)) = 0, so dR/dy · dy = −dR/dθ · dθ. One linear solve gives
 every derivative, forward and reverse, of every order where it exists; no iteration is unrolled. At
-a kink the projection's convention (`dvax.sets.AbstractSet`) picks the element of dR/dy.
+a kink the projection's convention (`dvax.sets.AbstractSet`) picks the element of dR/dy. Where that is
+singular to rounding, y has no derivative (the solutions of VI(K, F) may not even be isolated), and
+what is returned is NaN and not some number.
 """
 
 from collections.abc import Callable
@@ -15,8 +17,9 @@ import jax.tree_util as jtu
 
 from .._tree import Tree
 from .certificate import natural_residual
+from .matrix import matrix_of
 
-_DENSE = 512  # up to this many unknowns the Jacobian is formed; beyond, GMRES applies it
+_DENSE = 1024  # up to this many unknowns the Jacobian is formed; beyond, GMRES applies it
 
 
 def with_implicit_derivative(
@@ -36,19 +39,18 @@ def with_implicit_derivative(
 
 def _diagonal_solve(g: Callable[[Tree], Tree], b: Tree) -> Tree:
     ones = jtu.tree_map(jnp.ones_like, b)
+    # Where the slope vanishes, so does the derivative's existence: b / 0 is not finite, 0 / 0 is NaN.
     return jtu.tree_map(lambda p, q: p / q, b, g(ones))
 
 
 def _general_solve(g: Callable[[Tree], Tree], b: Tree) -> Tree:
     flat, unflatten = jax.flatten_util.ravel_pytree(b)
-
-    def flat_g(v: jax.Array) -> jax.Array:
-        return jax.flatten_util.ravel_pytree(g(unflatten(v)))[0]
-
-    if flat.size <= _DENSE:
-        matrix = jax.jacfwd(flat_g)(jnp.zeros_like(flat))
-        return unflatten(jnp.linalg.solve(matrix, flat))
-    solution, _ = jax.scipy.sparse.linalg.gmres(
-        flat_g, flat, tol=1e-12, atol=0.0, restart=50, maxiter=20
-    )
-    return unflatten(solution)
+    if flat.size > _DENSE:
+        return jax.scipy.sparse.linalg.gmres(g, b, tol=1e-12, atol=0.0, restart=50, maxiter=20)[0]
+    matrix = matrix_of(g, b)
+    pivots = jnp.abs(jnp.diagonal(jax.lax.linalg.lu(jax.lax.stop_gradient(matrix))[0]))
+    eps = jnp.finfo(flat.dtype).eps
+    singular = ~(jnp.min(pivots) > flat.size * eps * jnp.max(pivots))
+    # A factor, so that the result stays linear in b.
+    exists = jnp.where(singular, jnp.nan, jnp.ones((), flat.dtype))
+    return unflatten(jnp.linalg.solve(matrix, flat) * exists)
