@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 
 from .. import _tree
 from .._tree import Tree
@@ -52,6 +53,10 @@ def solve_vi(
     `gamma` is given, else on the residual ‖w‖; `gamma`, the modulus of strong pseudomonotonicity,
     declared by the caller; `L_F`, a Lipschitz constant of F; `space`, Euclidean by default.
 
+    The solve is compiled at the first call and used again for the same function F, shapes and
+    solver, however `args`, `K`, `y0` and the moduli change. So what changes goes through `args`, as
+    for any function under `jax.jit`: a number that F reads from outside is seen once.
+
     **Returns:** a `VISolution`. The answer is certified again after the solve, by one projection
     step that shares nothing with the method.
 
@@ -65,10 +70,26 @@ def solve_vi(
     ```
     """
     y0 = _tree.as_float(y0, "y0")
-    space = default_space(y0) if space is None else space
     K.check(y0)
-    frozen = Frozen(lambda y: F(y, args), K, space, gamma, L_F)
+    space = default_space(y0) if space is None else space
     solver = Auto() if solver is None else solver
+    # Numbers as arrays: of a number written in the code the compiled program would be a program of
+    # its own.
+    dtype = jnp.result_type(*jtu.tree_leaves(y0))
+    tol, gamma, L_F = (
+        jnp.asarray(value, dtype) if isinstance(value, float | int) else value
+        for value in (tol, gamma, L_F)
+    )
+    return _solved(F, K, y0, args, solver, tol, gamma, L_F, space)
+
+
+@eqx.filter_jit
+def _solved(
+    F: Any, K: AbstractSet, y0: Tree, args: Any, solver: Any, tol: Any, gamma: Any, L_F: Any,
+    space: AbstractSpace,
+) -> VISolution:  # fmt: skip
+    """One program for all problems that differ in numbers alone, compiled at the first of them."""
+    frozen = Frozen(lambda y: F(y, args), K, space, gamma, L_F)
     solver = solver.chosen(frozen, y0) if isinstance(solver, Auto) else solver
     answer = solver.solve(frozen, y0, tol)
     still = stopped(frozen)
