@@ -41,7 +41,7 @@ def solve_vi(
     y0: Tree,
     args: Any = None,
     solver: AbstractSolver | None = None,
-    tol: float = 1e-10,
+    tol: Any = 1e-10,
     gamma: Any = None,
     L_F: Any = None,
     space: AbstractSpace | None = None,
