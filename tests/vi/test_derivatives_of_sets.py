@@ -144,8 +144,8 @@ def touching(solver, start):
     # From one side dy₁/dq₁ is −1/2, from the other 0; the convention of AbstractSet is 0.
     def solution(q, lower):
         vi = dvax.solve_vi(
-            lambda y, q: jnp.asarray(TOUCHING[0]) @ y + q, Box(lower, 1.0), jnp.asarray(start), q, solver,
-            tol=1e-12,
+            lambda y, q: jnp.asarray(TOUCHING[0]) @ y + q, Box(lower, 1.0), jnp.asarray(start), q,
+            solver, tol=1e-12,
         )  # fmt: skip
         return vi.y
 
