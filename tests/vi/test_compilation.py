@@ -62,6 +62,7 @@ def test_other_numbers_are_solved_without_a_trace_of_F(solver):
     assert first > 0 and len(counts) == first
 
 
+@pytest.mark.thorough  # three programs
 def test_another_shape_or_set_is_another_program():
     counts = []
     F = counted(counts)

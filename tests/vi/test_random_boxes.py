@@ -72,7 +72,13 @@ def check(name, seed):
     assert good[easy].mean() >= SOLVERS[name][2]
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+OFTEN = ("auto", "newton", "golden ratio")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=() if n in OFTEN else pytest.mark.thorough) for n in SOLVERS],
+)
 def test_a_box_is_solved_or_the_result_says_why_not(name):
     check(name, seed=1)
 
