@@ -32,10 +32,10 @@ SOLVERS = {
     "projection": Projection(max_steps=2000),
 }
 # Long programs, as every projection is an iteration of its own.
-LONG = {"mathiesen", "mathiesen as an intersection", "fukushima2"}
+LONG = {"mathiesen", "mathiesen as an intersection", "fukushima1", "fukushima2"}
 # In every run, beside Newton's method on the others and what is chosen where that is another.
 OFTEN = {
-    ("golden ratio", "kojshin"), ("golden ratio", "cournot5"), ("golden ratio", "kv_ball"),
+    ("golden ratio", "kojshin"), ("golden ratio", "cournot5"), ("golden ratio", "fukushima1"),
     ("extragradient", "mathiesen as an intersection"),
 }  # fmt: skip
 _compiled: dict[Any, Any] = {}

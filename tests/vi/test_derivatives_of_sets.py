@@ -84,6 +84,7 @@ def test_on_a_simplex_with_respect_to_its_total():
     np.testing.assert_allclose(back, exact, atol=1e-9)
 
 
+@pytest.mark.thorough  # beside `test_derivatives.py`, the center
 def test_on_a_ball_with_respect_to_center_and_radius():
     # The one row is (y − c)ᵀ, which turns with y: ν stands on the diagonal as well.
     center, radius = np.array([0.3, -0.2, 0.1, 0.0]), np.array(0.8)
