@@ -37,9 +37,9 @@ class ActiveSet(AbstractSolver):
     Source: Hintermüller, Ito and Kunisch 2002, SIAM J. Optim. 13, 865–888 (the method, and that it
     is a semismooth Newton method); the safeguard is ours.
 
-    **Arguments:** `step` of the safeguard, in (0, 1); `max_steps`; `dense`; `symmetric`, declared by the
-    caller; `preconditioner(free, r)`, which returns an approximate solution d of F′_II d_I = r_I, given
-    where the unknowns are free (a tree of booleans) and an r that is 0 elsewhere, as d shall be.
+    **Arguments:** `step` of the safeguard, in (0, 1); `max_steps`; `dense`; `symmetric`, declared by
+    the caller; `preconditioner(free, r)`, which returns an approximate solution of F′_II d_I = r_I,
+    given where the unknowns are free (a tree of booleans) and an r that is 0 elsewhere, as d shall be.
 
     **Raises:** `dvax.InputError` where K is not a pointwise interval.
 

@@ -54,6 +54,7 @@ class _State(NamedTuple):
     lam: jax.Array
     best: jax.Array
     left: jax.Array
+    run: jax.Array
     wait: jax.Array
     pause: jax.Array
     singular: jax.Array
@@ -81,8 +82,8 @@ def safeguarded_newton(
         z = _tree.sub(y, _tree.scale(tau, Fy))
         ahead = _tree.add(Fy, slope(_tree.sub(vi.K.project(z, vi.space), y)))
         none, one, far = jnp.asarray(0), jnp.asarray(1), jnp.full_like(tau, jnp.inf)
-        run = jnp.asarray(_RUN)
-        state = _State(z, y, ahead, y, step * tau, far, run, none, one, jnp.asarray(False))
+        run, no = jnp.asarray(_RUN), jnp.asarray(False)
+        state = _State(z, y, ahead, y, step * tau, far, run, run, none, one, no)
         return state, tau, far
 
     def newton(vi: Frozen, s: _State, tau: Any, first: Any) -> tuple[Tree, Tree, Tree, Tree]:
@@ -129,7 +130,10 @@ def safeguarded_newton(
             base=base,
             lam=lam,
             best=jnp.where(halved | ~taken, jnp.minimum(s.best, norm), s.best),
-            left=jnp.where(halved | failed, _RUN, jnp.where(tries, s.left - 1, s.left)),
+            left=jnp.where(
+                halved, s.run, jnp.where(failed, 2 * s.run, s.left - jnp.where(tries, 1, 0))
+            ),
+            run=jnp.where(failed, 2 * s.run, s.run),
             wait=jnp.where(taken, 0, jnp.where(failed, s.pause, s.wait - 1)),
             pause=jnp.where(halved, 1, jnp.where(failed, jnp.minimum(2 * s.pause, 8), s.pause)),
             singular=jnp.where(tries, ~_tree.all_finite(found[0]), s.singular),

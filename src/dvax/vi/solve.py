@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 
 from .. import _tree
 from .._tree import Tree
@@ -44,7 +45,7 @@ def solve_vi(
     y0: Tree,
     args: Any = None,
     solver: AbstractSolver | None = None,
-    tol: float = 1e-10,
+    tol: Any = 1e-10,
     gamma: Any = None,
     L_F: Any = None,
     space: AbstractSpace | None = None,
@@ -56,6 +57,10 @@ def solve_vi(
     `gamma` is given, else on the residual ‖w‖; `gamma`, the modulus of strong pseudomonotonicity,
     declared by the caller; `L_F`, a Lipschitz constant of F; `space`, Euclidean by default.
     An F = aG that is a `dvax.vi.Weighted` is solved and certified as VI(K, G), by its own moduli.
+
+    The solve is compiled at the first call and used again for the same function F, shapes and
+    solver, however `args`, `K`, `y0` and the moduli change. So what changes goes through `args`, as
+    for any function under `jax.jit`: a number that F reads from outside is seen once.
 
     **Returns:** a `VISolution`. Iterative methods stop by its `residual`; a closed form or a bracketed
     root is right to rounding whatever `tol`, and gets its `residual` by a projection step afterwards.
@@ -74,6 +79,24 @@ def solve_vi(
     K.check(y0)
     if isinstance(F, Weighted):
         moduli_belong_to_the_parts(gamma, L_F)
+    solver = Auto() if solver is None else solver
+    # Numbers as arrays: of a number written in the code the compiled program would be a program of
+    # its own.
+    dtype = jnp.result_type(*jtu.tree_leaves(y0))
+    tol, gamma, L_F = (
+        jnp.asarray(value, dtype) if isinstance(value, float | int) else value
+        for value in (tol, gamma, L_F)
+    )
+    return _solved(F, K, y0, args, solver, tol, gamma, L_F, space)
+
+
+@eqx.filter_jit
+def _solved(
+    F: Any, K: AbstractSet, y0: Tree, args: Any, solver: Any, tol: Any, gamma: Any, L_F: Any,
+    space: AbstractSpace,
+) -> VISolution:  # fmt: skip
+    """One program for all problems that differ in numbers alone, compiled at the first of them."""
+    if isinstance(F, Weighted):
         return _divided(F, args, K, space, y0, solver, tol)
     return _certified(Frozen(lambda y: F(y, args), K, space, gamma, L_F), y0, solver, tol, gamma)
 
@@ -92,10 +115,9 @@ def _divided(
 
 
 def _certified(
-    frozen: Frozen, y0: Tree, solver: AbstractSolver | None, tol: Any, gamma: Any
+    frozen: Frozen, y0: Tree, solver: AbstractSolver, tol: Any, gamma: Any
 ) -> VISolution:
     space = frozen.space
-    solver = Auto() if solver is None else solver
     solver = solver.chosen(frozen, y0) if isinstance(solver, Auto) else solver
     answer = solver.solve(frozen, y0, tol)
     residual, away = answer.residual, jnp.zeros_like(answer.residual)

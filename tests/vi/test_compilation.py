@@ -1,0 +1,97 @@
+"""Solves that differ in numbers alone share one compiled program, called plainly or under `jax.jit`."""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvax
+from dvax.sets import Ball, Box
+from dvax.vi import (
+    Bracketing,
+    Extragradient,
+    ForwardBackwardForward,
+    GoldenRatio,
+    Projection,
+    SemismoothNewton,
+)
+
+SOLVERS = [
+    None, SemismoothNewton(), Extragradient(), ForwardBackwardForward(), GoldenRatio(),
+    Projection(), Bracketing(),
+]  # fmt: skip
+
+
+def counted(counts):
+    def F(y, target):
+        counts.append(y.shape)  # runs when F is traced, never when it is evaluated
+        return y + y**3 - target
+
+    return F
+
+
+# One method in every run stands for all: what is counted lies outside of them.
+@pytest.mark.parametrize(
+    "solver",
+    [pytest.param(s, marks=() if s is None else pytest.mark.thorough) for s in SOLVERS],
+    ids=lambda solver: "auto" if solver is None else type(solver).__name__,
+)
+def test_other_numbers_are_solved_without_a_trace_of_F(solver):
+    counts = []
+    F, rng = counted(counts), np.random.default_rng(0)
+    took, first = [], 0
+    for number in range(5):
+        y0, target, upper = map(jnp.asarray, rng.normal(size=(3, 4)))
+        start = time.perf_counter()
+        vi = dvax.solve_vi(
+            F, Box(-2.0, jnp.abs(upper)), y0, target, solver=solver, tol=1e-9 / (1 + number),
+            gamma=1.0 - 0.1 * number, L_F=13.0 + number,
+        )  # fmt: skip
+        vi.y.block_until_ready()
+        took.append(time.perf_counter() - start)
+        first = first or len(counts)
+        # What is right is right at every call: nothing of the first is left in the program.
+        residual = vi.y - jnp.clip(vi.y - (vi.y + vi.y**3 - target), -2.0, jnp.abs(upper))
+        if not isinstance(solver, Projection):  # (which may still be on its way)
+            assert float(jnp.max(jnp.abs(residual))) < 1e-8
+    print(
+        f"first call {took[0]:.2f} s, later {1e3 * np.median(took[1:]):.2f} ms, {first} traces of F"
+    )
+    assert first > 0 and len(counts) == first
+
+
+@pytest.mark.thorough  # three programs
+def test_another_shape_or_set_is_another_program():
+    counts = []
+    F = counted(counts)
+    dvax.solve_vi(F, Box(0.0, 1.0), jnp.zeros(2), jnp.ones(2), GoldenRatio())
+    before = len(counts)
+    dvax.solve_vi(F, Box(0.0, 1.0), jnp.zeros(3), jnp.ones(3), GoldenRatio())
+    assert (3,) in counts[before:]
+    before = len(counts)
+    dvax.solve_vi(F, Ball(0.0, 1.0), jnp.zeros(3), jnp.ones(3), GoldenRatio())
+    assert len(counts) > before
+
+
+def test_under_the_callers_jit_there_is_one_trace_as_well():
+    counts = []
+    F = counted(counts)
+    solve = jax.jit(lambda y0, target, K: dvax.solve_vi(F, K, y0, target).y)
+    for number in range(4):
+        y = solve(jnp.full(2, 0.1 * number), jnp.array([0.5, 9.0 + number]), Box(0.0, 1.0 + number))
+        first = len(counts) if number == 0 else first
+        assert len(counts) == first
+    assert float(y[1] + y[1] ** 3) == pytest.approx(12.0, rel=1e-12)
+
+
+def test_what_F_closes_over_in_a_transformation_is_differentiated_and_mapped():
+    # A function made anew around a traced number is a new function, not the compiled old one.
+    def solution(c):
+        return dvax.solve_vi(lambda y, _: y + y**3 - c, Box(-9.0, 9.0), jnp.zeros(())).y
+
+    cs = jnp.array([0.0, 2.0, 10.0])
+    ys, slopes = jax.vmap(jax.value_and_grad(solution))(cs)
+    np.testing.assert_allclose(ys, [0.0, 1.0, 2.0], atol=1e-12)
+    np.testing.assert_allclose(slopes, [1.0, 1 / 4, 1 / 13], rtol=1e-10)
