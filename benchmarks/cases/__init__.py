@@ -17,6 +17,7 @@ CASES = (
     "simplices",
     "box_vi",
     "pointwise",
+    "obstacle",
 )
 """The names that --only takes, in the order of a run."""
 

@@ -66,11 +66,6 @@ def test_the_order_holds_to_four_hundred_points():
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("solver", [Auto(), SemismoothNewton()], ids=lambda s: type(s).__name__)
-@pytest.mark.xfail(
-    strict=True,
-    reason="the Newton points do not halve ‖w‖ while the contact set moves, and the safeguard takes as "
-    "many steps as the condition number asks for: max_steps",
-)
 def test_newton_finds_the_contact_of_a_hundred_points(solver):
     found = errors(solver, COUNTS[1:2], 100)
     np.testing.assert_allclose(found, [9.8e-5], rtol=0.05)

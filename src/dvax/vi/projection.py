@@ -63,6 +63,8 @@ class Projection(AbstractSolver):
                 fell = residual <= 0.999 * least
                 failures = jnp.where(fell, failures, failures + 1.0)
                 least = jnp.minimum(least, residual)
-            return (z, Fz, first, failures, least), Trial(z, w, Fz, lam, [z], 1)
+            # A λ that is known to be right may be as small as it likes.
+            step = lam if best is None else jnp.asarray(1.0 / vi.L_F, lam.dtype)
+            return (z, Fz, first, failures, least), Trial(z, w, Fz, step, [z], 1)
 
         return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=1 + (vi.L_F is None))
