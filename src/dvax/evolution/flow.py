@@ -58,19 +58,7 @@ class Flow(eqx.Module):
         """f̃(t, x), the law being solved from `guess`."""
         if self.direct:
             return self._closed_form(t, x)
-        problem, args = self.problem, self.args
-        start = problem.zero_control(x) if guess is None else guess
-        vi = Frozen(
-            problem.frozen(t, x, args),
-            problem.set_at(t, args),
-            problem.spaces(x)[1],
-            self.gamma,
-            self.L_F,
-        )
-        answer = self.solver.solve(vi, start, self.tol)
-        value = problem.f(t, x, self.operator.inverse(answer.y), args)
-        solved = answer.result == RESULTS.successful
-        return Rate(value, answer.y, answer.z, answer.residual, solved, answer.iterations)
+        return _solved(self, t, x, guess)
 
     def _closed_form(self, t: Any, x: Tree) -> Rate:
         problem, args = self.problem, self.args
@@ -132,6 +120,25 @@ class Flow(eqx.Module):
 
     def state_space(self, x: Tree) -> AbstractSpace:
         return self.problem.spaces(x)[0]
+
+
+@eqx.filter_jit
+def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
+    """The law solved by iteration. A function of its own, so that it is traced once a program, however
+    many places of a step ask for it (Diffrax traces a step three times)."""
+    problem, args = flow.problem, flow.args
+    start = problem.zero_control(x) if guess is None else guess
+    vi = Frozen(
+        problem.frozen(t, x, args),
+        problem.set_at(t, args),
+        problem.spaces(x)[1],
+        flow.gamma,
+        flow.L_F,
+    )
+    answer = flow.solver.solve(vi, start, flow.tol)
+    value = problem.f(t, x, flow.operator.inverse(answer.y), args)
+    solved = answer.result == RESULTS.successful
+    return Rate(value, answer.y, answer.z, answer.residual, solved, answer.iterations)
 
 
 def slope(problem: Problem, operator: AbstractOperator, t: Any, x: Tree, args: Any) -> Tree:

@@ -64,4 +64,6 @@ class GoldenRatio(AbstractSolver):
             state = after, F_after, y, Fy, average, new, phi * new / lam
             return state, Trial(after, w, F_after, new, [after, average], 1)
 
-        return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=2 + (vi.L_F is None))
+        return iterate(
+            vi, y0, tol, begin, advance, self.max_steps, begun=2 + (vi.L_F is None), moves=2
+        )

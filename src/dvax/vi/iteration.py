@@ -65,9 +65,11 @@ def iterate(
     max_steps: int,
     *,
     begun: int,
+    moves: int = 1,
 ) -> Answer:
     """Advance from proj_K(y0) until ‖w‖/γ ≤ tol (‖w‖ ≤ tol where γ is unknown), or until nothing
-    more will come: see `RESULTS`. `begun` is how often `begin` calls F."""
+    more will come: see `RESULTS`. `begun` is how often `begin` calls F, `moves`
+    how many elements an advance moves."""
     frozen, target = stopped(vi), tol if vi.gamma is None else vi.gamma * tol
     start = lax.stop_gradient(vi.K.project(lax.stop_gradient(y0), vi.space))
     dtype = jnp.result_type(*jtu.tree_leaves(start))
@@ -117,8 +119,7 @@ def iterate(
         )
 
     method = begin(frozen, start)
-    shapes = jax.eval_shape(lambda m: advance(frozen, m)[1].at, method)
-    nowhere = jtu.tree_map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), shapes)
+    nowhere = [_tree.scale(jnp.nan, start)] * moves
     state = _State(
         method, start, _tree.scale(jnp.nan, start), jnp.asarray(jnp.inf, dtype),
         nowhere, nowhere, jnp.asarray(1), jnp.ones((), dtype), jnp.asarray(0), jnp.asarray(begun),

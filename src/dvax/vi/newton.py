@@ -144,4 +144,4 @@ def safeguarded_newton(
         trial = Trial(y, w, value, tau, [z, base], calls, word, tentative=taken & ~halved)
         return (new, tau, first), trial
 
-    return iterate(vi, y0, tol, begin, advance, max_steps, begun=1)
+    return iterate(vi, y0, tol, begin, advance, max_steps, begun=1, moves=2)
