@@ -1,8 +1,11 @@
 """When something breaks: what, when, where, and what was computed before stays readable."""
 
+import itertools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax.evolution import RESULTS
@@ -26,8 +29,12 @@ def system(broken):
     )
 
 
-@pytest.mark.parametrize("dt", [None, 0.02], ids=["adaptive", "fixed"])
-@pytest.mark.parametrize("name", ["f", "h", "K"])
+@pytest.mark.parametrize(
+    ("name", "dt"),
+    mostly_thorough(
+        itertools.product("fhK", (None, 0.02)), [("f", 0.02), ("h", None), ("K", 0.02)]
+    ),
+)
 def test_nan_stops_the_run_and_the_function_the_time_and_the_component_are_named(name, dt):
     x0, ts = jnp.array([0.5, 2.0, -1.0]), np.linspace(0, 2, 20)  # none of them 0.7 itself
     with pytest.raises(dvax.SolveError) as caught:

@@ -136,6 +136,7 @@ def test_a_tuple_state_with_a_response_of_another_shape_equals_the_stacked_probl
     assert np.any(y[:, 0] == 1.0) and np.any(y[:, 2] == -0.2) | np.any(y[:, 2] == 0.6)
 
 
+@pytest.mark.thorough
 def test_xarray_carries_the_trajectory():
     pytest.importorskip("xarray", reason="the extra dvax[app] is not installed")
     sol = dvax.solve(c2().problem, jnp.asarray(c2().x0), 0.0, 1.0, ts=[0.0, 0.5, 1.0])

@@ -1,0 +1,21 @@
+"""Which of many cases run every time; the others run in `make thorough`."""
+
+from collections.abc import Collection, Iterable
+from typing import Any
+
+import pytest
+
+
+def mostly_thorough(cases: Iterable[Any], always: Collection[Any]) -> list[Any]:
+    """All cases for `pytest.mark.parametrize`, those not in `always` marked thorough."""
+    cases = list(cases)
+    unknown = [case for case in always if case not in cases]
+    assert not unknown, f"no such cases: {unknown}"
+    return [
+        case
+        if case in always
+        else pytest.param(
+            *(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.thorough
+        )
+        for case in cases
+    ]
