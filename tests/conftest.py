@@ -1,5 +1,6 @@
 """What every test runs under: double precision, checked shapes, repeatable random cases."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -7,6 +8,10 @@ import hypothesis
 import jaxtyping
 
 ROOT = Path(__file__).parents[1]
+
+# Tracing makes millions of objects that live as long as the run: to look through them all for garbage,
+# as often as Python does by default, would take a twentieth of the time.
+gc.set_threshold(100_000, 50, 50)
 
 # Compiled programs outlive a test run. Through the environment, so that commands which tests start
 # as processes of their own find them too.

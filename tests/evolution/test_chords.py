@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.hard_rates import RATES
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax.evolution.chords import Chord, NoEnclosure, constant, enclose, straight
@@ -64,7 +65,7 @@ def test_a_function_stays_within_its_bound(name, t0, length):
     assert np.all(farthest(fn, t0, t1) <= np.asarray(chord.dev) + 1e-12)
 
 
-@pytest.mark.parametrize("name", RATES)
+@pytest.mark.parametrize("name", mostly_thorough(RATES, list(RATES)[::2]))
 def test_what_is_made_to_deceive_is_enclosed_or_refused(name):
     rate, breaks = RATES[name]
     rng = np.random.default_rng(0)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+from tests.selection import mostly_thorough
 from tests.sets.cases import CASES, N
 
 from dvax import spaces
@@ -16,6 +17,7 @@ WEIGHTS = {"plain": np.ones(N), "weighted": np.array([0.3, 4.0, 1.0, 2.5])}
 SPACES = {"plain": spaces.Euclidean(N), "weighted": spaces.L2(WEIGHTS["weighted"])}
 LOT = 24
 every_set = pytest.mark.parametrize("name", CASES)
+every_other_set = pytest.mark.parametrize("name", mostly_thorough(CASES, list(CASES)[::2]))
 every_space = pytest.mark.parametrize(
     "kind", [pytest.param("plain", marks=pytest.mark.thorough), "weighted"]
 )
@@ -128,10 +130,11 @@ def test_a_round_set_agrees_with_a_general_minimiser(name, kind):
 OWN_WAY = ("affine subspace", "simplex", "second-order cone", "ellipsoid, matrix", "l1 ball")
 
 
+EACH = [(name, "plain" if name == "intersection" else "weighted") for name in CASES]
+
+
 @pytest.mark.parametrize(
-    ("name", "kind"),
-    [(name, "plain" if name == "intersection" else "weighted") for name in CASES]
-    + [(name, "plain") for name in OWN_WAY],
+    ("name", "kind"), mostly_thorough([*EACH, *((name, "plain") for name in OWN_WAY)], EACH[::2])
 )
 def test_both_derivatives_are_the_slope_in_the_point_and_in_the_data(name, kind):
     n = len(CASES[name].data)
@@ -162,7 +165,7 @@ def test_both_derivatives_are_the_slope_in_the_point_and_in_the_data(name, kind)
     np.testing.assert_allclose(forward, central, rtol=1e-6, atol=1e-6 * size)
 
 
-@every_set
+@every_other_set
 def test_single_precision_stays_single(name):
     data = jnp.asarray(CASES[name].data, jnp.float32)
     z = jnp.asarray(points(name)[5], jnp.float32)
@@ -173,7 +176,7 @@ def test_single_precision_stays_single(name):
     np.testing.assert_allclose(np.asarray(p), exact, atol=3e-5)
 
 
-@every_set
+@every_other_set
 def test_nothing_hides_a_value_that_is_not_a_number(name):
     z = np.full((1, N), 0.2)
     z[0, 1] = np.nan

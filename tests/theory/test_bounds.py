@@ -106,6 +106,7 @@ def test_a_run_in_pieces_has_the_bounds_of_the_whole():
         np.testing.assert_allclose(pieces[name], whole[name], rtol=1e-10, err_msg=name)
 
 
+@pytest.mark.thorough
 def test_an_overshoot_is_charged_again_at_every_piece():
     # Nothing says that the pieces have one semigroup in common.
     whole, pieces = _pieces(replaced(ALL["C1"]().constants, M=2.0))
@@ -184,7 +185,7 @@ def _reference(alpha, load, ts, breaks=()):
     return np.concatenate(out)
 
 
-@pytest.mark.parametrize("dt", [0.1, 0.05])
+@pytest.mark.parametrize("dt", mostly_thorough([0.1, 0.05], [0.1]))
 def test_saved_times_between_steps_of_a_stiff_contact_are_covered(dt):
     # Trajectories approach fast here, so a bound must not let an impulse decay before it acted.
     load = lambda t, np: 300.0 * np.sin(20.0 * t)  # noqa: E731

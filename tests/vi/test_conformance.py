@@ -35,7 +35,8 @@ SOLVERS = {
 LONG = {"mathiesen", "mathiesen as an intersection", "fukushima1", "fukushima2"}
 # In every run, beside Newton's method on the others and what is chosen where that is another.
 OFTEN = {
-    ("golden ratio", "kojshin"), ("golden ratio", "cournot5"), ("golden ratio", "fukushima1"),
+    ("auto", "kojshin"), ("auto", "expweight_box3"), ("golden ratio", "kojshin"),
+    ("golden ratio", "cournot5"), ("golden ratio", "fukushima1"),
     ("extragradient", "mathiesen as an intersection"),
 }  # fmt: skip
 _compiled: dict[Any, Any] = {}
@@ -61,7 +62,7 @@ def solved(name, solver):
 
 def cases():
     for solver, name in itertools.product(SOLVERS, PROBLEMS):
-        usual = solver in ("newton", "auto") and name not in LONG
+        usual = solver == "newton" and name not in LONG
         often = usual or (solver, name) in OFTEN
         yield pytest.param(name, solver, marks=() if often else pytest.mark.thorough)
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax.sets import Ball, Box
@@ -68,7 +69,10 @@ def test_on_a_ball_the_derivative_is_that_of_the_lagrange_conditions():
         np.testing.assert_allclose(np.asarray(found[1]), dr, atol=1e-10)
 
 
-@pytest.mark.parametrize("solver", [Bracketing(), Extragradient(), Auto()])
+SOLVERS = [Bracketing(), Extragradient(), Auto()]
+
+
+@pytest.mark.parametrize("solver", mostly_thorough(SOLVERS, SOLVERS[2:]))
 def test_first_and_second_derivatives_of_a_nonlinear_law(solver):
     # y³ + y = c on [−10, 10]: y' = 1/(3y² + 1), y'' = −6y/(3y² + 1)³.
     def solution(c):

@@ -123,6 +123,7 @@ def _check_true_moduli(cases, seed):
     assert ratios.min() >= 1.0
 
 
+@pytest.mark.thorough
 def test_a_true_modulus_is_never_refuted():
     _check_true_moduli(4_000, seed=1)
 

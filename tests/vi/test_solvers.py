@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax.sets import Ball, Box
@@ -47,7 +48,7 @@ EDGES = [
 
 
 @pytest.mark.parametrize("case", range(len(EDGES)))
-@pytest.mark.parametrize("guess", [0.0, -7.3, 1e3])
+@pytest.mark.parametrize("guess", mostly_thorough([0.0, -7.3, 1e3], [-7.3]))
 def test_bracketing_needs_no_slope_no_guess_and_no_finite_interval(case, guess):
     F, lower, upper, solution = EDGES[case]
     vi = solve(F, Box(lower, upper), guess, solver=Bracketing())

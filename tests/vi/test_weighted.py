@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from tests.oracles import affine_box_vi
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax.sets import Ball, Box, Simplex
@@ -54,7 +55,7 @@ FAMILIES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", mostly_thorough(FAMILIES, list(FAMILIES)[::2]))
 def test_the_published_families_are_solved_without_their_weight(name):
     a, G, M, mu, K, solution = FAMILIES[name]
     for law in (Weighted(a, G, M=M, mu=mu), Weighted(a, G, M=M), Weighted(a, G)):
@@ -75,8 +76,13 @@ def test_less_work_than_with_the_weight(name):
     print(f"{name}: {int(divided.evaluations)} evaluations of G, {int(whole.evaluations)} of aG")
 
 
+ROUND = (Ball(0.0, 0.8), Simplex(1.0))
+
+
 @pytest.mark.parametrize(
-    "K", [Box(-1.0, 1.0), Ball(0.0, 0.8), Simplex(1.0)], ids=lambda K: type(K).__name__
+    "K",
+    [Box(-1.0, 1.0), *(pytest.param(K, marks=pytest.mark.thorough) for K in ROUND)],
+    ids=lambda K: type(K).__name__,
 )
 def test_random_weights_do_not_move_the_solution(K):
     def both(matrix, b, mu, q):
