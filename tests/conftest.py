@@ -18,6 +18,10 @@ gc.set_threshold(100_000, 50, 50)
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("MPLBACKEND", "Agg")
+if os.environ.get("HYPOTHESIS_PROFILE") != "thorough":
+    # XLA's older way to emit code takes two thirds of the time to compile. `make thorough` tests what
+    # its newer way emits, which is what users run.
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 # Every annotation of the library, shapes included, is checked at each call. The hook must stand
 # before the first import of dvax, hence here and not in a fixture. The application is left out: it

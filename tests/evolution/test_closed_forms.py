@@ -10,7 +10,7 @@ from tests.selection import mostly_thorough
 import dvax
 
 
-@pytest.mark.parametrize("name", mostly_thorough(ALL, ["C1", "C3", "C4"]))
+@pytest.mark.parametrize("name", mostly_thorough(ALL, ["C1", "C4"]))
 def test_adaptive_steps_reach_nine_digits_at_the_end(name):
     case = ALL[name]()
     sol = dvax.solve(
@@ -24,7 +24,7 @@ def test_adaptive_steps_reach_nine_digits_at_the_end(name):
     assert np.max(np.abs(np.asarray(sol.us[-1]) - u)) <= 1e-8
 
 
-@pytest.mark.parametrize("name", mostly_thorough(ALL, ["C1", "C2"]))
+@pytest.mark.parametrize("name", mostly_thorough(ALL, ["C3"]))
 def test_every_saved_time_is_right_and_every_saved_response_certified(name):
     case = ALL[name]()
     ts = np.linspace(0.0, case.t1, 33)

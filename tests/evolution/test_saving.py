@@ -84,6 +84,7 @@ def test_a_state_with_a_bad_entry_is_refused_with_its_place():
         dvax.solve(c2().problem, jnp.array([0.0, np.nan]), 0.0, 1.0)
 
 
+@pytest.mark.thorough
 def test_a_tuple_state_with_a_response_of_another_shape_equals_the_stacked_problem():
     # x = (a, b) with a a number and b a pair; u = (v, w) with v a pair and w a number.
     g, o, k, s = dvax.generators, dvax.operators, dvax.sets, dvax.spaces

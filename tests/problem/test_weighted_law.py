@@ -35,6 +35,7 @@ def test_the_response_is_that_of_the_law_without_its_weight(x):
         assert float(problem.response(0.0, x)) == pytest.approx(exact, abs=1e-10)
 
 
+@pytest.mark.thorough
 def test_the_trajectory_is_that_of_the_law_without_its_weight():
     ts = jnp.linspace(0.0, 3.0, 13)
     whole, divided = (

@@ -65,6 +65,7 @@ def assert_what_every_run_promises(frames: xr.Dataset) -> None:
     assert set(np.unique(frames["regime"])) == {0, 1, 2}
 
 
+@pytest.mark.thorough
 def test_the_bound_of_a_coarse_run_covers_its_distance_to_a_fine_one(tmp_path: Path):
     load = 'expression = "2*sin(3*t)"'
     coarse, _, _ = solved(tmp_path / "coarse", load, 6.0, 'dt = "0.05 s"')
