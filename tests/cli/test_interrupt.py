@@ -10,11 +10,14 @@ from pathlib import Path
 import pytest
 import xarray as xr
 from tests.cli.contact import write_config
+from tests.selection import mostly_thorough
 
 import dvax
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", mostly_thorough([signal.SIGINT, signal.SIGTERM], [signal.SIGINT])
+)
 def test_a_signal_ends_a_run_in_good_order(tmp_path: Path, number: signal.Signals) -> None:
     # A million steps: nobody waits for its end.
     changes = (("dt = 0.05", "dt = 1e-6"), ("frames = 8", "frames = 200"))

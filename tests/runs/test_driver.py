@@ -117,6 +117,7 @@ def test_a_run_says_when_the_compiler_works_and_when_it_is_done(tmp_path: Path):
     assert heard.count("compiling") == 1 and heard[-1] == "stopped"
 
 
+@pytest.mark.thorough
 def test_a_main_trajectory_that_fails_shortens_its_companion(tmp_path: Path):
     config = tmp_path / "strip.toml"
     # No number about t = 1.27, which lies between the samples of the check on reading.

@@ -180,14 +180,15 @@ def test_parts_of_a_tuple_are_solved_together():
     np.testing.assert_allclose(found, np.asarray(stacked.y), atol=1e-11)
 
 
+ALL = [
+    Auto(), SemismoothNewton(), Bracketing(), Extragradient(), ForwardBackwardForward(),
+    GoldenRatio(),
+]  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    "solver",
-    [
-        Bracketing(), Extragradient(), Auto(), ForwardBackwardForward(), GoldenRatio(),
-        SemismoothNewton(),
-    ],
-    ids=lambda solver: type(solver).__name__,
-)  # fmt: skip
+    "solver", mostly_thorough(ALL, ALL[:2]), ids=lambda solver: type(solver).__name__
+)
 def test_vmap_equals_a_loop(solver):
     cs = jnp.array([-1.0, 0.3, 2.0, 4.9])
     K = Box(0.0, 4.0)

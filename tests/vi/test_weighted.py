@@ -135,6 +135,7 @@ def test_the_certificate_of_G_is_the_sharper_one():
         assert float(vi.error_bound) <= weighted_bound + 1e-14
 
 
+@pytest.mark.thorough
 def test_derivatives_are_those_of_the_whole_operator():
     def solution(args, divided):
         law = Weighted(
