@@ -4,7 +4,8 @@ y solves R(y; θ) = y − proj_K(y − τF(y; θ)) = 0, so dR/dy · dy = −dR/d
 every derivative, forward and reverse, of every order where it exists; no iteration is unrolled. At
 a kink the projection's convention (`dvax.sets.AbstractSet`) picks the element of dR/dy. Where that is
 singular to rounding, y has no derivative (the solutions of VI(K, F) may not even be isolated), and
-what is returned is NaN and not some number.
+what is returned is NaN and not some number (infinite or NaN for pointwise laws; not looked at beyond
+1024 unknowns).
 """
 
 from collections.abc import Callable

@@ -36,7 +36,7 @@ Solve = Callable[[Linearised, Tree], Tree]
 
 
 _RUN = 5
-"""Newton steps in a row that need not halve the best ‖w‖: an active set is found in a few guesses."""
+"""Newton steps in a row that need not halve the best ‖w‖, at first: a few guesses find most sets."""
 
 _WILD = 10.0
 """A Newton point whose ‖w‖ is so many times the best is not gone on from."""
@@ -44,8 +44,8 @@ _WILD = 10.0
 
 class _State(NamedTuple):
     """`z`, and `ahead`, the linearisation at `at` of F where z projects to; `base` and `lam`, where the
-    safeguard goes on; `best`, the ‖w‖ to be halved; `left`, how many Newton steps may still fail to;
-    Newton rests for `wait` steps, next time for `pause`; `singular`, whether its last system was."""
+    safeguard goes on; `best`, the ‖w‖ to be halved; `left`, how many Newton steps may still fail to,
+    of the `run` that they had; Newton rests for `wait` steps, next time for `pause`; `singular`, whether its last system was."""
 
     z: Tree
     at: Tree
@@ -67,7 +67,8 @@ def safeguarded_newton(
 
     The first linearisation is made at y₀ itself with z = y₀ − τF(y₀), as for the natural map: one
     evaluation of F, and from a good guess a second one ends the solve. A run of Newton steps is gone on
-    with while it halves the best ‖w‖ at least every sixth step; otherwise extragradient steps are made
+    with while it halves the best ‖w‖ at least every sixth step (each run that fails doubles what the
+    next may take: an obstacle's contact set moves node by node); otherwise extragradient steps are made
     from the last point that halved it, or from where they stopped last time.
     """
     # The iteration is never differentiated (`stopped`), but its F has a slope.

@@ -17,14 +17,15 @@ class SemismoothNewton(AbstractSolver):
     """Newton's method for the normal map Φ(z) = F(y) + (z − y)/τ with y = proj_K(z), whose value is
     the certificate w itself: [F′(y) D + (I − D)/τ] d = −Φ(z), z⁺ = z + d, D ∈ ∂proj_K(z).
 
-    The first step is that of the natural map y − proj_K(y − τF(y)) at the guess. A Newton point is
-    taken only if it halves the best ‖w‖; otherwise one extragradient step is made
-    from where those steps stand: their own last iterate, or the last Newton point. If infinitely
-    many are taken, ‖w‖ → 0 by construction; if finitely many, the tail is the extragradient method.
+    The first step is that of the natural map y − proj_K(y − τF(y)) at the guess. A run of Newton
+    steps is gone on with while it halves the best ‖w‖ at least every sixth step (after a run that
+    failed, every eleventh, and so on, doubling); otherwise extragradient steps are made from where
+    those stand: their own last iterate, or the last Newton point that halved it. If infinitely many
+    do, ‖w‖ → 0 by construction; if finitely many, the tail is the extragradient method.
     So it converges wherever that does, and where it converges to y* the last steps are Newton's: for
     polyhedral K, strict complementarity and F in C¹, the matrix is regular with an inverse of norm at
     most about 1/γ, and the rate quadratic.
-    Where a Newton point is refused, the next attempts are spaced out by 1, 2, 4, 8 iterations.
+    After a run that failed, the next one waits for 1, 2, 4, 8 extragradient steps.
 
     Up to `dense` unknowns the matrix is formed and factorised; beyond, GMRES applies it, to
     min(0.1, ‖w‖/‖w₀‖) at first and tighter as ‖w‖ falls. For boxes `ActiveSet` is the same method
