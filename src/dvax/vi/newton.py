@@ -45,7 +45,8 @@ _WILD = 10.0
 class _State(NamedTuple):
     """`z`, and `ahead`, the linearisation at `at` of F where z projects to; `base` and `lam`, where the
     safeguard goes on; `best`, the ‖w‖ to be halved; `left`, how many Newton steps may still fail to,
-    of the `run` that they had; Newton rests for `wait` steps, next time for `pause`; `singular`, whether its last system was."""
+    of the `run` that they had; Newton rests for `wait` steps, next time for `pause`; `singular`,
+    whether its last system was."""
 
     z: Tree
     at: Tree
