@@ -22,9 +22,10 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr
 
 from .._tree import Tree
+from ..vi.structure import CALLS, evaluate
 
 
 class NoEnclosure(Exception):
@@ -189,27 +190,11 @@ _ENTRYWISE = {
     "and", "or", "xor", "not", "add", "sub", "mul", "max", "min", "neg", "sign", "abs",
     "convert_element_type", "select_n", "clamp", "eq", "ne", "lt", "le", "gt", "ge",
 }  # fmt: skip
-_CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "checkpoint"}
 _CUSTOM = {"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
 
 
 def _interpret(traced: ClosedJaxpr, inputs: list[Any]) -> list[Any]:
-    jaxpr: Jaxpr = traced.jaxpr
-    values: dict[Any, Any] = dict(zip(jaxpr.constvars, traced.consts, strict=True))
-    values.update(zip(jaxpr.invars, inputs, strict=True))
-
-    def read(atom: Any) -> Any:
-        return atom.val if isinstance(atom, Literal) else values[atom]
-
-    for eqn in jaxpr.eqns:
-        given = [read(atom) for atom in eqn.invars]
-        if not any(map(is_chord, given)):
-            out = eqn.primitive.bind(*given, **eqn.primitive.get_bind_params(eqn.params))
-            results = out if eqn.primitive.multiple_results else [out]
-        else:
-            results = _apply(eqn, given)
-        values.update(zip(eqn.outvars, results, strict=True))
-    return [read(atom) for atom in jaxpr.outvars]
+    return evaluate(traced, inputs, is_chord, _apply)
 
 
 def _apply(eqn: Any, given: list[Any]) -> list[Any]:
@@ -218,7 +203,7 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
         # A box's lower bound: whether the box is empty is seen where the law is solved.
         shape = eqn.outvars[0].aval.shape
         return [Chord(*(jnp.broadcast_to(part, shape) for part in _lift(given[0])))]
-    if name in _CALLS or name in _CUSTOM:
+    if name in CALLS or name in _CUSTOM:
         for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
             inner = eqn.params.get(key)
             if isinstance(inner, Jaxpr):

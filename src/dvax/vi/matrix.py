@@ -13,10 +13,10 @@ import jax
 import jax.flatten_util
 import jax.numpy as jnp
 from jax import lax
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import ClosedJaxpr
 
 from .._tree import Tree
-from .structure import CALLS, inner_jaxpr
+from .structure import CALLS, bind, evaluate, inner_jaxpr
 
 
 class _Diagonal(NamedTuple):
@@ -56,35 +56,20 @@ def _depends(value: Any) -> bool:
 
 def _carry(traced: ClosedJaxpr, inputs: list[Any]) -> list[Any]:
     """The outputs for these inputs: what does not depend on the unknowns is computed as it is."""
-    jaxpr = traced.jaxpr
-    values: dict[Any, Any] = dict(zip(jaxpr.constvars, traced.consts, strict=True))
-    values.update(zip(jaxpr.invars, inputs, strict=True))
-
-    def read(atom: Any) -> Any:
-        return atom.val if isinstance(atom, Literal) else values[atom]
-
-    for eqn in jaxpr.eqns:
-        given = [read(atom) for atom in eqn.invars]
-        inner = inner_jaxpr(eqn.params) if eqn.primitive.name in CALLS else None
-        if not any(map(_depends, given)):
-            results = _bind(eqn, given)
-        elif inner is not None:
-            results = _carry(inner, given)
-        else:
-            results = _rule(eqn, given) or _column_by_column(eqn, given)
-        values.update(zip(eqn.outvars, results, strict=True))
-    return [read(atom) for atom in jaxpr.outvars]
+    return evaluate(traced, inputs, _depends, _apply)
 
 
-def _bind(eqn: Any, given: list[Any]) -> list[Any]:
-    out = eqn.primitive.bind(*given, **eqn.primitive.get_bind_params(eqn.params))
-    return list(out) if eqn.primitive.multiple_results else [out]
+def _apply(eqn: Any, given: list[Any]) -> list[Any]:
+    inner = inner_jaxpr(eqn.params) if eqn.primitive.name in CALLS else None
+    if inner is not None:
+        return _carry(inner, given)
+    return _rule(eqn, given) or _column_by_column(eqn, given)
 
 
 def _column_by_column(eqn: Any, given: list[Any]) -> list[Any]:
     axes = [-1 if _depends(value) else None for value in given]
     full = [_columns(value) if _depends(value) else value for value in given]
-    results = jax.vmap(lambda *g: _bind(eqn, list(g)), in_axes=axes, out_axes=-1)(*full)
+    results = jax.vmap(lambda *g: bind(eqn, list(g)), in_axes=axes, out_axes=-1)(*full)
     return [_Columns(result) for result in results]
 
 
@@ -95,17 +80,17 @@ def _rule(eqn: Any, given: list[Any]) -> list[Any] | None:
     if not all(isinstance(value, _Diagonal) for value in bent):
         return None
     if name in ("neg", "convert_element_type", "reshape", "squeeze", "copy"):
-        return [_Diagonal(_bind(eqn, [given[0].factor])[0])]
+        return [_Diagonal(bind(eqn, [given[0].factor])[0])]
     if name == "broadcast_in_dim" and out.size == given[0].factor.size:
         return [_Diagonal(given[0].factor.reshape(out.shape))]
     if name in ("add", "sub", "add_any") and len(bent) == 2:
-        return [_Diagonal(_bind(eqn, [value.factor for value in given])[0])]
+        return [_Diagonal(bind(eqn, [value.factor for value in given])[0])]
     if name in ("mul", "div") and len(bent) == 1:
         factors = [value.factor if _depends(value) else value for value in given]
         if bent[0].factor.shape == out.shape:
-            return [_Diagonal(jnp.broadcast_to(_bind(eqn, factors)[0], out.shape))]
+            return [_Diagonal(jnp.broadcast_to(bind(eqn, factors)[0], out.shape))]
     if name == "select_n" and not _depends(given[0]) and len(bent) == len(given) - 1:
-        return [_Diagonal(_bind(eqn, [given[0], *(value.factor for value in bent)])[0])]
+        return [_Diagonal(bind(eqn, [given[0], *(value.factor for value in bent)])[0])]
     if name == "dot_general":
         return _product(eqn, given)
     return None

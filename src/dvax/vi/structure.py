@@ -87,6 +87,34 @@ def independent(fn: Callable[..., Tree], *args: Tree) -> bool:
     return all(mark is None for mark in marks)
 
 
+def evaluate(
+    traced: ClosedJaxpr,
+    inputs: list[Any],
+    special: Callable[[Any], bool],
+    apply: Callable[[Any, list[Any]], list[Any]],
+) -> list[Any]:
+    """The outputs of a traced function, with values of another kind in the place of some arrays:
+    operations on `special` values are done by `apply(eqn, given)`, the others as they are."""
+    jaxpr: Jaxpr = traced.jaxpr
+    values: dict[Any, Any] = dict(zip(jaxpr.constvars, traced.consts, strict=True))
+    values.update(zip(jaxpr.invars, inputs, strict=True))
+
+    def read(atom: Any) -> Any:
+        return atom.val if isinstance(atom, Literal) else values[atom]
+
+    for eqn in jaxpr.eqns:
+        given = [read(atom) for atom in eqn.invars]
+        results = apply(eqn, given) if any(map(special, given)) else bind(eqn, given)
+        values.update(zip(eqn.outvars, results, strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def bind(eqn: Any, given: list[Any]) -> list[Any]:
+    """One operation of a traced function, on these arrays."""
+    out = eqn.primitive.bind(*given, **eqn.primitive.get_bind_params(eqn.params))
+    return list(out) if eqn.primitive.multiple_results else [out]
+
+
 def _interpret(
     traced: ClosedJaxpr, inputs: list[_Mark | None], shapes: list[tuple[int, ...]]
 ) -> list[_Mark | None]:
