@@ -50,7 +50,7 @@ def extragradient(p: Affine, tol: float) -> Solve:
         F = lambda y: M @ y + q  # noqa: E731
         onto = lambda z: jnp.clip(z, lower, upper)  # noqa: E731
 
-        def advance(state: tuple) -> tuple:
+        def advance(state: Any) -> Any:
             y, Fy, _ = state
             new = onto(y - step * F(onto(y - step * Fy)))
             Fnew = F(new)

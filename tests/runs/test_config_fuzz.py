@@ -68,7 +68,7 @@ def test_mutated_configurations(cases, tmp_path):
     assert 0.02 < sum(verdicts) / cases < 0.5, "the mutations reach both verdicts"
 
 
-@pytest.mark.parametrize("cases", [1500, pytest.param(20_000, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("cases", [500, pytest.param(20_000, marks=pytest.mark.thorough)])
 def test_mutated_data(cases, tmp_path):
     dice = random.Random(cases)
     changes = {"demand.profile": {"file": "strip.npy"}, "boundary": {"file": "nodes.csv"}}

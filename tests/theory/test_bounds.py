@@ -21,8 +21,7 @@ RUNS = {
 
 
 OFTEN = {
-    ("C1", "fixed ETD1"), ("C2", "adaptive ETD2RK"),
-    ("C4", "adaptive ETD2RK"),
+    ("C1", "fixed ETD1"), ("C4", "adaptive ETD2RK"),
 }  # fmt: skip
 
 
@@ -199,11 +198,13 @@ def test_saved_times_between_steps_of_a_stiff_contact_are_covered(dt):
     assert np.all(np.asarray(bound.x_sharp) >= error - 1e-8)
 
 
-@pytest.mark.parametrize("method", [dvax.ETD1(), dvax.ETD2RK()], ids=["ETD1", "ETD2RK"])
-def test_a_load_that_stops_on_a_step_nobody_announced_is_covered(method):
+@pytest.mark.parametrize("name", mostly_thorough(["ETD1", "ETD2RK"], ["ETD1"]))
+def test_a_load_that_stops_on_a_step_nobody_announced_is_covered(name):
     load = lambda t, np: np.where(t < 1.0, 3.0, 0.0)  # noqa: E731
     model, ts = _contact(1.0, load), np.linspace(0.0, 2.0, 41)[1:]
-    sol = dvax.solve(model.problem, -1.0, 0.0, 2.0, ts=ts, dt=0.125, method=method, measure=True)
+    sol = dvax.solve(
+        model.problem, -1.0, 0.0, 2.0, ts=ts, dt=0.125, method=getattr(dvax, name)(), measure=True
+    )
     bound = dvax.bound_error(model.problem, sol, model.constants)
     error = np.abs(np.asarray(sol.xs) - _reference(1.0, load, ts, breaks=[1.0]))
     assert bound.status == "proved" and error.max() > 0.05

@@ -48,7 +48,7 @@ def integral(rate, breaks, t):
 @pytest.mark.parametrize(
     ("name", "method"),
     mostly_thorough(
-        itertools.product(ENCLOSED, METHODS), list(zip(ENCLOSED, itertools.cycle(METHODS)))
+        itertools.product(ENCLOSED, METHODS), list(zip(ENCLOSED, itertools.cycle(METHODS)))[::2]
     ),
 )
 def test_a_bound_called_proved_is_above_the_error(name, method):

@@ -33,7 +33,7 @@ SOLVERS = {
 }
 # Long programs, as every projection is an iteration of its own.
 LONG = {"mathiesen", "mathiesen as an intersection", "fukushima1", "fukushima2"}
-EVERY_RUN = [name for name in PROBLEMS if name not in LONG][::2]
+EVERY_RUN = [name for name in PROBLEMS if name not in LONG][::4]
 # In every run, beside Newton's method on the others and what is chosen where that is another.
 OFTEN = {
     ("auto", "kojshin"), ("auto", "expweight_box3"), ("golden ratio", "kojshin"),

@@ -72,7 +72,7 @@ def check(name, seed):
     assert good[easy].mean() >= SOLVERS[name][2]
 
 
-OFTEN = ("auto", "newton", "golden ratio")
+OFTEN = ("auto", "golden ratio")
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ class Adaptive(diffrax.AbstractStepSizeController):
         blocked = diffrax.RESULTS.where(
             jnp.isfinite(error),
             diffrax.RESULTS.dt_min_reached,
-            diffrax.RESULTS.nonfinite,  # pyright: ignore[reportArgumentType]
+            diffrax.RESULTS.nonfinite,
         )
         result = diffrax.RESULTS.where(stuck, blocked, diffrax.RESULTS.successful)
         new = self.State(wanted, knot, ~keep, spare)
