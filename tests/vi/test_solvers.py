@@ -109,6 +109,19 @@ def test_a_failure_is_never_called_a_success(F, K, solver, result):
     assert solve(F, K, np.full(2, 0.3), solver=solver).result == result
 
 
+STEPPING = [Extragradient(), ForwardBackwardForward(), GoldenRatio(), SemismoothNewton()]
+
+
+@pytest.mark.parametrize("solver", STEPPING, ids=lambda solver: type(solver).__name__)
+def test_a_step_that_has_sunk_into_rounding_certifies_nothing(solver):
+    # A jump from −10 to 1 at the start itself: no step is short enough, until y − λF(y) is y, where
+    # (y − z)/λ + F(z) − F(y) is 0.
+    F = lambda y: jnp.where(y < 0.5, -10.0, 1.0) + 0.0 * y  # noqa: E731
+    vi = solve(F, Ball(0.0, 1.0), np.full(1, 0.5), solver=solver)
+    assert vi.result != RESULTS.successful
+    assert float(vi.residual) > 0.5
+
+
 def test_a_method_that_goes_round_in_a_circle_says_so():
     # A rotation on a disk with a step that turns by a third: the projection method comes back.
     F = lambda y: jnp.array([[0.0, -1.0], [1.0, 0.0]]) @ y  # noqa: E731

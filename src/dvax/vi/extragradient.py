@@ -12,6 +12,9 @@ from .._tree import Tree
 from .abstract import AbstractSolver, Answer, Frozen
 from .iteration import Trial, certificate, first_step, iterate
 
+_LEAST = 1e-24
+"""By how much a step is shortened at most."""
+
 
 class Extragradient(AbstractSolver):
     """z = proj_K(y − λF(y)), y⁺ = proj_K(y − λF(z)).
@@ -87,10 +90,14 @@ def extrapolate(
     if vi.L_F is not None:
         return *trial(lam), lam, 1
 
+    sound = jnp.isfinite(vi.space.norm(Fy))
+
     def too_long(carry: tuple) -> jax.Array:
         z, Fz, lam, _ = carry
         change = lam * vi.space.norm(_tree.sub(Fz, Fy))
-        return change > step * vi.space.norm(_tree.sub(z, y))
+        # A z where F has no value, or none at all, is too far as well; but there is an end to it.
+        short = change <= step * vi.space.norm(_tree.sub(z, y))
+        return ~short & sound & (lam > _LEAST * grown)
 
     def shorten(carry: tuple) -> tuple:
         lam = 0.6 * carry[2]

@@ -25,7 +25,8 @@ _DIVERGED = 1e8
 class Trial(NamedTuple):
     """What one iteration leaves.
 
-    `y` ∈ K with `w` ∈ F(y) + N_K(y), and `value` = F(y); `step`, the λ that was used; `at`, the
+    `y` ∈ K with `w` ∈ F(y) + N_K(y), and `value` = F(y); `step`, the λ of the method, and `length`,
+    where it is another, the one that w was divided by; `at`, the
     elements that the method iterates, which move as long as it does (y may rest in a corner meanwhile);
     `calls` of F it took; `word`, what to say if no further iteration is allowed. An
     iterate that is `tentative` may come back without the method going round in a circle.
@@ -39,6 +40,7 @@ class Trial(NamedTuple):
     calls: Any
     word: RESULTS = RESULTS.max_steps
     tentative: Any = False
+    length: Any = None
 
 
 class _State(NamedTuple):
@@ -50,6 +52,7 @@ class _State(NamedTuple):
     mark: list[Tree]
     marked: jax.Array
     step: jax.Array
+    first: jax.Array
     count: jax.Array
     calls: jax.Array
     result: RESULTS
@@ -80,6 +83,16 @@ def iterate(
     def body(s: _State) -> _State:
         method, trial = advance(frozen, s.method)
         residual, size = norm(trial.w), length(trial.at)
+        lam = trial.step if trial.length is None else trial.length
+        first = jnp.where(s.count == 0, trial.step, s.first)
+        # w contains (base − y)/λ, and with it the rounding of y divided by λ. Where that is as large as
+        # F itself, the step has sunk into rounding, y − λF(y) is y, and w = 0 says nothing; but for an
+        # F(y) that is none itself, since 0 is a normal.
+        blur, force, rounding = eps * norm(trial.y) / lam, norm(trial.value), eps * norm(trial.y)
+        sunk = (force > target + 4 * rounding / first) | (lam < 1e3 * eps) & (force > target)
+        blind = (blur > 0.1 * force) & sunk & (vi.L_F is None)
+        finite = jnp.isfinite(residual) & jnp.isfinite(size)
+        residual = jnp.where(blind, jnp.inf, residual)
         better = residual < s.residual
         done = residual <= target
         # Rounding is all that is left of a move: of the last one, or of all since the mark (which
@@ -89,19 +102,19 @@ def iterate(
         back = length(_tree.sub(trial.at, s.mark)) <= 32 * eps * size
         back &= ~jnp.asarray(trial.tentative)
         collapsed = jnp.asarray(trial.step < 1e3 * eps)
-        gone = (size > far) & ~better
+        gone = (norm(trial.y) > far) & ~better
         reason = trial.word
         for holds, word in (
             (back, RESULTS.cycling),
             (rest, RESULTS.stalled),
             (gone, RESULTS.diverging),
             (collapsed, RESULTS.not_lipschitz),
-            (~jnp.isfinite(residual) | ~jnp.isfinite(size), RESULTS.nonfinite),
+            (~finite, RESULTS.nonfinite),
             (done, RESULTS.successful),
         ):
             reason = RESULTS.where(holds, word, reason)
         count = s.count + 1
-        going = ~(done | rest | back | gone | collapsed) & jnp.isfinite(residual + size)
+        going = ~(done | rest | back | gone | collapsed) & finite
         mark = count >= 2 * s.marked
         return _State(
             method=method,
@@ -112,6 +125,7 @@ def iterate(
             mark=_tree.where(mark, trial.at, s.mark),
             marked=jnp.where(mark, count, s.marked),
             step=jnp.where(better, trial.step, s.step),
+            first=first,
             count=count,
             calls=s.calls + trial.calls,
             result=reason,
@@ -122,7 +136,8 @@ def iterate(
     nowhere = [_tree.scale(jnp.nan, start)] * moves
     state = _State(
         method, start, _tree.scale(jnp.nan, start), jnp.asarray(jnp.inf, dtype),
-        nowhere, nowhere, jnp.asarray(1), jnp.ones((), dtype), jnp.asarray(0), jnp.asarray(begun),
+        nowhere, nowhere, jnp.asarray(1), jnp.ones((), dtype), jnp.ones((), dtype),
+        jnp.asarray(0), jnp.asarray(begun),
         RESULTS.max_steps, jnp.asarray(True),
     )  # fmt: skip
     state = lax.while_loop(lambda s: s.going & (s.count < max_steps), body, state)

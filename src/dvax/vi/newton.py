@@ -82,11 +82,17 @@ def safeguarded_newton(
         Fy, slope = vi.F(y), slope_at(y)
         tau = first_step(vi, y, Fy, slope)
         z = _tree.sub(y, _tree.scale(tau, Fy))
-        ahead = _tree.add(Fy, slope(_tree.sub(vi.K.project(z, vi.space), y)))
-        none, one, far = jnp.asarray(0), jnp.asarray(1), jnp.full_like(tau, jnp.inf)
+        move = _tree.sub(vi.K.project(z, vi.space), y)
+        bent = slope(move)
+        ahead = _tree.add(Fy, bent)
+        # ‖w‖ where z projects to is at most about this: a first Newton point that is much worse has
+        # left the region where F is anything like its linearisation.
+        expected = vi.space.norm(bent) + vi.space.norm(move) / tau
+        best = jnp.maximum(expected, tol if vi.gamma is None else vi.gamma * tol)
+        none, one = jnp.asarray(0), jnp.asarray(1)
         run, no = jnp.asarray(_RUN), jnp.asarray(False)
-        state = _State(z, y, ahead, y, step * tau, far, run, run, none, one, no)
-        return state, tau, far
+        state = _State(z, y, ahead, y, step * tau, best, run, run, none, one, no)
+        return state, tau, jnp.full_like(tau, jnp.inf)
 
     def newton(vi: Frozen, s: _State, tau: Any, first: Any) -> tuple[Tree, Tree, Tree, Tree]:
         project = lambda z: vi.K.project(z, vi.space)  # noqa: E731
@@ -122,6 +128,7 @@ def safeguarded_newton(
         )
         z, y, value, w = _tree.where(taken, found, reached)
         base = _tree.where(halved, y, _tree.where(taken, s.base, base))
+        used = lam
         lam, calls = jnp.where(taken, s.lam, lam), jnp.where(taken, 0, calls)
         norm = vi.space.norm(w)
         failed = tries & ~taken
@@ -143,7 +150,10 @@ def safeguarded_newton(
         first = jnp.where(jnp.isfinite(first), first, norm)
         word = RESULTS.where(new.singular, RESULTS.singular, RESULTS.max_steps)
         calls = calls + jnp.where(tries, 1, 0)
-        trial = Trial(y, w, value, tau, [z, base], calls, word, tentative=taken & ~halved)
+        trial = Trial(
+            y, w, value, tau, [z, base], calls, word,
+            tentative=taken & ~halved, length=jnp.where(taken, tau, used),
+        )  # fmt: skip
         return (new, tau, first), trial
 
     return iterate(vi, y0, tol, begin, advance, max_steps, begun=1, moves=2)
