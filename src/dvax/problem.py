@@ -21,7 +21,7 @@ from .vi import AbstractSolver, Answer, Auto, Frozen, default_space
 
 KNOT_ULPS, END_ULPS = 4, 128
 """Knots nearer than this to each other, or to the ends of a run, in roundings of t, are one: records
-round the same moment differently, and Diffrax rounds a step to the end within 100 of them."""
+round the same moment differently."""
 
 
 class Problem(eqx.Module):

@@ -3,6 +3,6 @@
 from .method import ETD1 as ETD1
 from .method import ETD2RK as ETD2RK
 from .method import AbstractMethod as AbstractMethod
-from .solution import RESULTS as RESULTS
+from .results import RESULTS as RESULTS
 from .solution import Solution as Solution
 from .solve import solve as solve

@@ -16,12 +16,13 @@ import numpy as np
 
 from .. import _tree
 from ..errors import InputError, InputProblem
-from .integrate import Loop, integrate
+from .integrate import Options, integrate
+from .results import RESULTS
 from .setup import Setup
-from .solution import RESULTS, Solution
+from .solution import Solution
 
 
-def compiled(setup: Setup, ts: Any, loop: Loop) -> tuple[Solution, bool | jax.Array]:
+def compiled(setup: Setup, ts: Any, options: Options) -> tuple[Solution, bool | jax.Array]:
     """The solution, and whether all of it was reached."""
     code, code_tree = jtu.tree_flatten((setup.problem, setup.method, setup.vi_solver))
     data, data_tree = jtu.tree_flatten((setup.x0, setup.args, setup.setting, setup.moduli, ts))
@@ -34,13 +35,13 @@ def compiled(setup: Setup, ts: Any, loop: Loop) -> tuple[Solution, bool | jax.Ar
         for leaf, number in zip(code + data, numbers, strict=True)
     )
     try:
-        arrays, reached, shape = _run(numbers, _Kind(code_tree, data_tree, rest, loop))
+        arrays, reached, shape = _run(numbers, _Kind(code_tree, data_tree, rest, options))
         # One look, through NumPy: through JAX it would be a program of its own.
         reached = bool(np.asarray(reached)) if _tree.is_concrete(reached) else reached
     except jax.errors.JaxRuntimeError as error:
         if "_EquinoxRuntimeError" in str(error):
             # A check within f or h (`eqx.error_if`) is only quoted where Equinox compiles.
-            eqx.filter_jit(integrate)(setup, ts, loop)
+            eqx.filter_jit(integrate)(setup, ts, options)
         raise
     return jtu.tree_unflatten(shape.tree, [*arrays, setup]), reached
 
@@ -67,7 +68,7 @@ class _Kind(NamedTuple):
     code: Any
     data: Any
     rest: tuple[Any, ...]
-    loop: Loop
+    options: Options
 
 
 class _Shape:
@@ -86,7 +87,7 @@ def _traced(numbers: list[Any], kind: _Kind) -> tuple[list[Any], jax.Array, _Sha
     problem, method, vi_solver = jtu.tree_unflatten(kind.code, leaves[:split])
     x0, args, setting, moduli, ts = jtu.tree_unflatten(kind.data, leaves[split:])
     setup = Setup(problem, x0, args, setting, method, vi_solver, moduli)
-    solution = integrate(setup, ts, kind.loop)
+    solution = integrate(setup, ts, kind.options)
     reached = (solution.result == RESULTS.successful) & jnp.all(jnp.isfinite(solution.ts))
     arrays, tree = jtu.tree_flatten(solution, is_leaf=lambda node: node is setup)
     assert arrays.pop() is setup

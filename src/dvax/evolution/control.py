@@ -1,17 +1,65 @@
 """Where steps end: on the knots of data, and where the defect allows."""
 
+import abc
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
-import diffrax
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 
+from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace, Product
+from .results import RESULTS
+from .stepper import Step
 
 
-class Adaptive(diffrax.AbstractStepSizeController):
+class Verdict(NamedTuple):
+    """On one attempt: whether it is `kept`, the controller's state for the next one, whether data
+    `jumped` at its end, and how the run stands."""
+
+    kept: Any
+    state: Any
+    jumped: Any
+    result: RESULTS
+
+
+class AbstractController(eqx.Module):
+    """Chooses where each step ends.
+
+    `stops` = (t₀, knots…, t₁) are the times at which a step must end; `adapts` says that only a run
+    shows where the others do.
+    """
+
+    stops: eqx.AbstractVar[jax.Array]
+    adapts: eqx.AbstractClassVar[bool]
+
+    @abc.abstractmethod
+    def init(self) -> Any:
+        """The state before the first step."""
+
+    @abc.abstractmethod
+    def end(self, state: Any) -> Any:
+        """Where the next attempt ends."""
+
+    @abc.abstractmethod
+    def judge(self, t0: Any, t1: Any, x0: Tree, step: Step, state: Any) -> Verdict:
+        """What becomes of the step that was attempted from t0 to t1."""
+
+    @abc.abstractmethod
+    def next_length(self, state: Any) -> Any:
+        """The length that a run continued from here should begin with."""
+
+    @abc.abstractmethod
+    def boundary(self, index: Any, ends: Any) -> Any:
+        """The start of step number `index` as a function of the stops, given the recorded `ends` of
+        steps (None where nothing adapts). Elsewhere than on a stop, where a step ends is a
+        choice that derivatives do not see."""
+
+
+class Adaptive(AbstractController):
     """Steps as long as the defect stays below (atol + rtol‖x‖)/horizon.
 
     ‖·‖ is the root mean square in the state space, taken part by part where the state is a tuple, so
@@ -27,46 +75,52 @@ class Adaptive(diffrax.AbstractStepSizeController):
     φ-functions; and the rest of the way to a knot is cut into equal parts, never into a sliver.
     """
 
+    stops: jax.Array
     rtol: Any
     atol: Any
-    sizes: Callable[[Tree], list[Any]]
+    first: Any
     horizon: Any
-    knots: Any
-    end: Any
+    order: int = eqx.field(static=True)
+    sizes: Callable[[Tree], list[Any]]
+
+    adapts: ClassVar[bool] = True
 
     class State(NamedTuple):
+        end: Any
         length: Any
-        knot: Any
+        stop: Any
         rejected: Any
         spare: Any
 
-    def wrap(self, direction):
-        return self
+    def init(self):
+        first = lax.stop_gradient(self.first)
+        end = _land(self.stops[0], first, self.stops[1])
+        one = jnp.ones_like(first)
+        return self.State(end, first, jnp.asarray(1), jnp.asarray(False), one)
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        first = jnp.asarray(0)
-        state = self.State(dt0, first, jnp.asarray(False), jnp.ones_like(dt0))
-        return _land(t0, dt0, self._stop(first)), state
+    def end(self, state):
+        return state.end
 
-    def adapt_step_size(
-        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
-    ):
-        state = controller_state
-        t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
+    def next_length(self, state):
+        return state.length
+
+    def judge(self, t0, t1, x0, step, state):
         h = t1 - t0
-        assert y_error is not None  # the stepper always measures where steps adapt
         # Where a step ends is a choice, not a function of the data: derivatives see the steps as given.
-        error = lax.stop_gradient(self.horizon * self._scaled(y_error.x, y0.x, y1_candidate.x))
+        error = lax.stop_gradient(self.horizon * self._scaled(step.error, x0, step.x1))
+        # A law that is not solved further in may be that of a stage far out: the step was too long.
+        error = jnp.where(step.solved, error, jnp.inf)
         impulse = error * h / self.horizon
         # A small share, because a derivative loses a kink's step; a large one where t has no room.
         floor = 8 * jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
         share = jnp.where(h <= 1e4 * floor, 0.1, 1e-6)
         relaxed = state.rejected & (impulse <= share * state.spare)
-        keep = (error <= 1.0) | relaxed
+        sound = step.begun & step.finite
+        keep = sound & ((error <= 1.0) | relaxed)
         spare = jnp.where(keep & (error > 1.0), state.spare - impulse, state.spare)
 
         positive = jnp.where(error > 0.0, error, 1.0)
-        factor = jnp.where(error > 0.0, (0.5 / positive) ** (1.0 / error_order), jnp.inf)
+        factor = jnp.where(error > 0.0, (0.5 / positive) ** (1.0 / self.order), jnp.inf)
         factor = jnp.clip(factor, 0.1, 3.0)
         steady = keep & (factor > 0.8) & (factor < 1.25)
         length = lax.stop_gradient(h)
@@ -77,20 +131,30 @@ class Adaptive(diffrax.AbstractStepSizeController):
             cut, jnp.maximum(wanted, jnp.minimum(state.length, 3.0 * wanted)), wanted
         )
 
-        on_knot = keep & (t1 == self._stop(state.knot))
-        knot = jnp.where(on_knot, state.knot + 1, state.knot)
-        start = jnp.where(keep, t1, t0)
-        next_t1 = _land(start, wanted, self._stop(knot))
+        jumped = keep & (t1 == self.stops[state.stop])
+        last = self.stops.shape[0] - 1
+        stop = jnp.minimum(jnp.where(jumped, state.stop + 1, state.stop), last)
+        end = _land(jnp.where(keep, t1, t0), wanted, self.stops[stop])
         # Below this, t itself cannot tell the ends of a step apart.
         stuck = ~keep & (h <= floor)
-        blocked = diffrax.RESULTS.where(
-            jnp.isfinite(error),
-            diffrax.RESULTS.dt_min_reached,
-            diffrax.RESULTS.nonfinite,
+        result = RESULTS.where(
+            stuck,
+            RESULTS.where(
+                step.solved,
+                RESULTS.where(jnp.isfinite(error), RESULTS.step_too_small, RESULTS.nonfinite),
+                RESULTS.law_unsolved,
+            ),
+            RESULTS.successful,
         )
-        result = diffrax.RESULTS.where(stuck, blocked, diffrax.RESULTS.successful)
-        new = self.State(wanted, knot, ~keep, spare)
-        return keep, start, next_t1, on_knot, new, result
+        result = RESULTS.where(step.begun, result, RESULTS.law_unsolved)
+        result = RESULTS.where(step.finite, result, RESULTS.nonfinite)
+        return Verdict(keep, self.State(end, wanted, stop, ~keep, spare), jumped, result)
+
+    def boundary(self, index, ends):
+        before = jnp.where(index > 0, ends[jnp.maximum(index - 1, 0)], self.stops[0])
+        t = lax.stop_gradient(before)
+        nearest = self.stops[jnp.argmin(jnp.abs(self.stops - t))]
+        return jnp.where(nearest == t, nearest, t)
 
     def _scaled(self, error: Tree, before: Tree, after: Tree) -> Any:
         parts = zip(self.sizes(error), self.sizes(before), self.sizes(after), strict=True)
@@ -99,60 +163,65 @@ class Adaptive(diffrax.AbstractStepSizeController):
         # What is not a number is no reason to accept, nor to lengthen.
         return jnp.where(jnp.isnan(ratio), jnp.inf, ratio)
 
-    def _stop(self, knot: Any) -> Any:
-        if self.knots.shape[0] == 0:
-            return self.end
-        inner = self.knots[jnp.minimum(knot, self.knots.shape[0] - 1)]
-        return jnp.where(knot < self.knots.shape[0], inner, self.end)
-
 
 def _land(t: Any, length: Any, until: Any) -> Any:
     """The end of a step from t: `until` itself when in reach, half way when one step nearly is."""
     rest = until - t
     reaches = length >= rest * (1 - 1e-9)
-    return jnp.where(reaches, until, t + jnp.where(2 * length > rest, 0.5 * rest, length))
+    inner = t + jnp.where(2 * length > rest, 0.5 * rest, length)
+    return jnp.where(reaches, until, lax.stop_gradient(inner))
 
 
-class Fixed(diffrax.AbstractStepSizeController):
-    """Equal steps no longer than dt between one stop (knot or end) and the next."""
+class Fixed(AbstractController):
+    """Equal steps no longer than dt between one stop and the next."""
 
+    stops: jax.Array
     dt: Any
-    stops: Any
+
+    adapts: ClassVar[bool] = False
 
     class State(NamedTuple):
         segment: Any
         step: Any
 
-    def wrap(self, direction):
-        return self
+    def init(self):
+        return self.State(jnp.asarray(0), jnp.asarray(1))
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        state = self.State(jnp.asarray(0), jnp.asarray(1))
-        return self._time(state), state
+    def end(self, state):
+        return self._time(state.segment, state.step)
 
-    def adapt_step_size(
-        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
-    ):
-        state = controller_state
+    def next_length(self, state):
+        return self.dt
+
+    def judge(self, t0, t1, x0, step, state):
         if self.stops.shape[0] == 2:
-            new, jump = self.State(state.segment, state.step + 1), False
+            new, jumped = self.State(state.segment, state.step + 1), jnp.asarray(False)
         else:
             last = self.stops.shape[0] - 2
-            finished = state.step >= self._count(state.segment)
-            segment = jnp.minimum(state.segment + jnp.where(finished, 1, 0), last)
-            new = self.State(segment, jnp.where(finished, 1, state.step + 1))
-            jump = finished
-        return True, t1, self._time(new), jump, new, diffrax.RESULTS.successful
+            jumped = state.step >= self._counts()[state.segment]
+            segment = jnp.minimum(state.segment + jnp.where(jumped, 1, 0), last)
+            new = self.State(segment, jnp.where(jumped, 1, state.step + 1))
+        # Steps that are measured are only known to begin well.
+        finite = step.finite if step.error is None else step.finite & _tree.all_finite(step.x1)
+        result = RESULTS.where(step.solved, RESULTS.successful, RESULTS.law_unsolved)
+        result = RESULTS.where(finite, result, RESULTS.nonfinite)
+        return Verdict(step.solved & finite, new, jumped, result)
 
-    def _count(self, segment: Any) -> Any:
-        return step_count(self.stops[segment + 1] - self.stops[segment], self.dt)
+    def boundary(self, index, ends):
+        upto = jnp.cumsum(self._counts())
+        segment = jnp.searchsorted(upto, index, side="right")
+        segment = jnp.minimum(segment, self.stops.shape[0] - 2)
+        before = jnp.where(segment > 0, upto[segment - 1], 0)
+        return self._time(segment, index - before)
 
-    def _time(self, state: "Fixed.State") -> Any:
-        left, right = self.stops[state.segment], self.stops[state.segment + 1]
-        count = self._count(state.segment)
+    def _counts(self) -> Any:
+        return step_count(jnp.diff(self.stops), self.dt).astype(int)
+
+    def _time(self, segment: Any, step: Any) -> Any:
+        left, right = self.stops[segment], self.stops[segment + 1]
+        count, step = step_count(right - left, self.dt), jnp.asarray(step, left.dtype)
         # The last one is the stop itself, not a sum that rounds past it.
-        inner = left + state.step * ((right - left) / count)
-        return jnp.where(state.step >= count, right, inner)
+        return jnp.where(step >= count, right, left + step * ((right - left) / count))
 
 
 def step_count(span: Any, dt: Any) -> Any:

@@ -125,7 +125,7 @@ class Flow(eqx.Module):
 @eqx.filter_jit
 def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
     """The law solved by iteration. A function of its own, so that it is traced once a program, however
-    many places of a step ask for it (Diffrax traces a step three times)."""
+    many places of a step ask for it."""
     problem, args = flow.problem, flow.args
     start = problem.zero_control(x) if guess is None else guess
     vi = Frozen(

@@ -1,26 +1,28 @@
-"""The time loop: a function from a setup to its solution, to be compiled as a whole."""
+"""A function from a setup to its solution, to be compiled as a whole."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 
 from .. import _tree
-from .._tree import Tree
 from ..vi import certify
-from .adjoint import adjoint_for, forward_only
-from .control import Adaptive, Fixed, root_mean_squares, step_count
+from . import reverse
+from .closures import opened
+from .control import AbstractController, Adaptive, Fixed, root_mean_squares, step_count
 from .flow import Flow
-from .method import AbstractMethod
+from .forward import forward_only
+from .loop import Loop, Saved, State
+from .results import RESULTS
 from .setup import Setup
-from .solution import RESULTS, Solution
-from .stepper import Carry, MildTerm, Record, Stepper
+from .solution import Solution
+from .stepper import Stepper
 
 
-class Loop(NamedTuple):
+class Options(NamedTuple):
     """What a time loop is compiled for, apart from shapes; see `dvax.solve`."""
 
     fixed: bool
@@ -32,96 +34,107 @@ class Loop(NamedTuple):
     progress: bool
 
 
-def integrate(setup: Setup, ts: Any, loop: Loop) -> Solution:
-    fixed, measure, dense, max_steps = loop.fixed, loop.measure, loop.dense, loop.max_steps
-    problem, x0, args, method = setup.problem, setup.x0, setup.args, setup.method
-    dtype, t0, t1 = setup.dtype, setup.number("t0"), setup.number("t1")
+def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
+    problem, x0, args = setup.problem, setup.x0, setup.args
+    t0, t1 = setup.number("t0"), setup.number("t1")
     # Shapes and knots are looked at here, while tracing: a call that is compiled pays nothing.
     problem.check(t0, x0, args)
-    knots = jnp.asarray(problem.knots(t0, t1, x0, args), dtype)
-    if fixed:
-        max_steps += knots.shape[0]
-    state, control = problem.spaces(x0)
+    knots = jnp.asarray(problem.knots(t0, t1, x0, args), setup.dtype)
+    stops = jnp.concatenate([t0[None], knots, t1[None]])
     flow = setup.flow()
-
-    uniform = None
-    if fixed:
-        stops = jnp.concatenate([t0[None], knots, t1[None]])
-        controller = Fixed(setup.number("dt"), stops)
-        first = None
-        if knots.shape[0] == 0:
-            length = (t1 - t0) / step_count(t1 - t0, setup.number("dt"))
-            uniform = flow.generator.propagator(length, method.degree + 1)
+    if options.adjoint == "reverse":
+        open_ = opened(problem, t0, x0, flow.args)
+        flow = dataclasses.replace(flow, problem=open_)
+    controller = _controller(setup, stops, options)
+    loop = Loop(
+        _stepper(setup, flow, stops, options),
+        controller,
+        max_steps=options.max_steps + (knots.shape[0] if options.fixed else 0),
+        guarded=options.careful,
+        dense=options.dense,
+        progress=options.progress,
+    )
+    times = None if ts is None else jnp.asarray(ts, setup.dtype)
+    if options.adjoint == "forward":
+        saved, end = loop.run(x0, times)
+        saved, end = forward_only((saved, end))
     else:
-        sizes = root_mean_squares(state)
-        controller = Adaptive(
-            setup.number("rtol"), setup.number("atol"), sizes, setup.number("horizon"), knots, t1
-        )
-        first = setup.number("dt0")
-    stepper = Stepper(method, flow, measure, loop.careful, (t0, t1), uniform)
+        saved, end = reverse.run(loop, x0, times)
+    return _solution(setup, flow, controller, saved, end, options)
 
-    zero = jnp.zeros((), dtype)
-    record = _blank_record(x0, method, dtype) if dense else None
-    saved = diffrax.SubSaveAt(
-        ts=ts if ts is None else jnp.asarray(ts, dtype),
-        t1=ts is None,
-        fn=lambda t, y, args: (y.x, y.defect, y.law_defect, y.before),
+
+def _controller(setup: Setup, stops: jax.Array, options: Options) -> AbstractController:
+    if options.fixed:
+        return Fixed(stops, setup.number("dt"))
+    sizes = root_mean_squares(setup.problem.spaces(setup.x0)[0])
+    rtol, atol, first, horizon = map(setup.number, ("rtol", "atol", "dt0", "horizon"))
+    return Adaptive(stops, rtol, atol, first, horizon, setup.method.order, sizes)
+
+
+def _stepper(setup: Setup, flow: Flow, stops: jax.Array, options: Options) -> Stepper:
+    t0, t1, measure = stops[0], stops[-1], options.measure
+    growth = None
+    if measure and flow.enclosed:
+        # Once a run: for a matrix it takes an eigenvalue.
+        growth = flow.generator.growth(flow.state_space(setup.x0))
+    stepper = Stepper(setup.method, flow, measure, options.careful, (t0, t1), None, growth)
+    if options.fixed and stops.shape[0] == 2:
+        length = (t1 - t0) / step_count(t1 - t0, setup.number("dt"))
+        return dataclasses.replace(stepper, uniform=stepper.factors(length))
+    return stepper
+
+
+def _solution(
+    setup: Setup,
+    flow: Flow,
+    controller: AbstractController,
+    saved: Saved | None,
+    end: State,
+    options: Options,
+) -> Solution:
+    t1 = controller.stops[-1]
+    complete = end.t >= t1
+    result = RESULTS.where(
+        (end.result == RESULTS.successful) & ~complete, RESULTS.max_steps, end.result
     )
-    # Where the run ended, unless that is what is saved anyway.
-    last = None if ts is None else diffrax.SubSaveAt(t1=True, fn=saved.fn)
-    steps = diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: y.record) if dense else None
-    out = diffrax.diffeqsolve(
-        MildTerm(),
-        stepper,
-        t0,
-        t1,
-        first,
-        Carry(x0, zero, zero, record, (zero, zero)),
-        saveat=diffrax.SaveAt(subs=(saved, last, steps), controller_state=True),
-        stepsize_controller=controller,
-        adjoint=adjoint_for(loop.adjoint, max_steps, x0),
-        max_steps=max_steps,
-        throw=False,
-        progress_meter=diffrax.TextProgressMeter() if loop.progress else diffrax.NoProgressMeter(),
+    rows = _end_alone(end, complete, t1) if saved is None else saved
+    us, ys, residual, law_step, law_error = _responses(
+        flow, rows.t, rows.x, setup.problem.spaces(setup.x0)[1], setup.moduli
     )
-    assert out.ts is not None and out.ys is not None and out.controller_state is not None
-    times = out.ts[0]
-    xs, defect, law_defect, before = out.ys[0]
-    us, ys, residual, law_step, law_error = _responses(flow, times, xs, control, setup.moduli)
-    if loop.adjoint == "forward":
-        xs, us, ys = forward_only((xs, us, ys))
-    records = out.ys[2] if dense else None
-    result = _translate(out.result)
-    end = 0 if ts is None else 1
-    last_x = jtu.tree_map(lambda leaf: leaf[0], out.ys[end][0])
+    measured = options.measure
     stats = {
-        "steps": out.stats["num_accepted_steps"],
-        "rejected": out.stats["num_rejected_steps"],
-        "t": out.ts[end][0],
-        "x": last_x,
-        "next_dt": setup.number("dt") if fixed else out.controller_state.length,
+        "steps": end.steps,
+        "rejected": end.attempts - end.steps,
+        "t": end.t,
+        "x": end.x,
+        "next_dt": controller.next_length(end.control),
     }
     return Solution(
-        ts=times,
-        xs=xs,
+        ts=rows.t,
+        xs=rows.x,
         us=us,
         ys=ys,
         law_residual=residual,
         law_step=law_step,
         law_error=law_error,
-        defect=defect if measure else None,
-        law_defect=law_defect if measure else None,
-        settled=before if measure else None,
+        defect=rows.impulse[0] if measured else None,
+        law_defect=rows.impulse[1] if measured else None,
+        settled=rows.settled if measured else None,
         stats=stats,
         result=RESULTS.where(
-            (result == RESULTS.successful) & ~_tree.all_finite(last_x),
-            RESULTS.nonfinite,
-            result,
+            (result == RESULTS.successful) & ~_tree.all_finite(end.x), RESULTS.nonfinite, result
         ),
-        records=records,
+        records=end.records,
         enclosed=flow.enclosed,
         setup=setup,
     )
+
+
+def _end_alone(end: State, complete: Any, t1: Any) -> Saved:
+    """The end as the one saved time."""
+    x = jtu.tree_map(lambda leaf: jnp.where(complete, leaf, jnp.nan), end.x)
+    one = Saved(jnp.where(complete, t1, jnp.inf), x, end.impulse, end.impulse)
+    return jtu.tree_map(lambda leaf: leaf[None], one)
 
 
 def _responses(flow: Flow, times, xs, control, moduli):
@@ -150,21 +163,3 @@ def _responses(flow: Flow, times, xs, control, moduli):
     if gamma is not None and norm_P_inv is not None:
         error = norm_P_inv * (residual / gamma + step)
     return us, ys, residual, step, error
-
-
-def _blank_record(x0: Tree, method: AbstractMethod, dtype: Any) -> Record:
-    zero = jnp.zeros((), dtype)
-    return Record(zero, zero, x0, (_tree.zeros_like(x0),) * (method.degree + 1))
-
-
-def _translate(result: Any) -> RESULTS:
-    known = (
-        (diffrax.RESULTS.max_steps_reached, RESULTS.max_steps),
-        (diffrax.RESULTS.dt_min_reached, RESULTS.step_too_small),
-        (diffrax.RESULTS.nonfinite, RESULTS.nonfinite),
-        (diffrax.RESULTS.nonlinear_max_steps_reached, RESULTS.law_unsolved),
-    )
-    out = RESULTS.successful
-    for theirs, ours in known:
-        out = RESULTS.where(result == theirs, ours, out)
-    return out

@@ -15,10 +15,11 @@ from ..vi import AbstractSolver, Auto
 from .arguments import bound_steps, check, warn_precision
 from .compiled import compiled
 from .diagnose import diagnose
-from .integrate import Loop
+from .integrate import Options
 from .method import ETD2RK, AbstractMethod
+from .results import RESULTS
 from .setup import Setup, as_arrays
-from .solution import RESULTS, Solution
+from .solution import Solution
 
 _METHOD, _VI_SOLVER = ETD2RK(), Auto()
 """The defaults, which nothing changes; making them would be felt in a short run."""
@@ -105,7 +106,7 @@ def solve(
         "dt0": span * 1e-3 if dt0 is None else _number(dt0),
         "horizon": span if horizon is None else _number(horizon),
     }
-    loop = Loop(
+    options = Options(
         fixed=fixed,
         measure=(not fixed) if measure is None else bool(measure) or not fixed,
         careful=not fixed,
@@ -117,7 +118,7 @@ def solve(
     vi_solver = _VI_SOLVER if vi_solver is None else vi_solver
     setup = Setup(problem, x0, args, setting, method, vi_solver, _moduli(constants))
     times = None if ts is None else _times(ts)
-    solution, reached = _differentiably(setup, times, loop)
+    solution, reached = _differentiably(setup, times, options)
     if reached is True and not dense:
         return solution
     if _tree.is_concrete(reached, solution.result, solution.ts, solution.xs):
@@ -127,18 +128,20 @@ def solve(
             problem.knots(t0, t1, x0, as_arrays(args))
             if fixed:
                 # Once more, keeping the last good state, to say where it went wrong.
-                solution = _trim(compiled(setup, times, loop._replace(careful=True))[0])
+                solution = _trim(compiled(setup, times, options._replace(careful=True))[0])
             if throw:
                 raise SolveError(_explain(solution), solution)
     return solution
 
 
-def _differentiably(setup: Setup, times: Any, loop: Loop) -> tuple[Solution, bool | jax.Array]:
+def _differentiably(
+    setup: Setup, times: Any, options: Options
+) -> tuple[Solution, bool | jax.Array]:
     try:
-        return compiled(setup, times, loop)
+        return compiled(setup, times, options)
     except (TypeError, ValueError) as error:
         forward = "forward-mode autodiff" in str(error) or "custom_vjp" in str(error)
-        if loop.adjoint == "reverse" and forward:
+        if options.adjoint == "reverse" and forward:
             raise DifferentiationError(
                 'dvax.solve(adjoint="reverse") cannot be differentiated forward (jax.jvp, '
                 'jax.jacfwd). Pass adjoint="forward": the loop that stores steps for the reverse '
@@ -166,7 +169,7 @@ def _number(v: Any) -> Any:
 
 
 def _trim(solution: Solution) -> Solution:
-    """Only the times that were reached: Diffrax fills the rest with infinity."""
+    """Only the times that were reached: the others are infinite."""
     reached = np.isfinite(np.asarray(solution.ts))
     if reached.all() and solution.records is None:
         return solution

@@ -1,27 +1,13 @@
-"""Which derivatives a loop can serve: forward or backward, not both."""
+"""A loop that carries tangents along stores no steps, and says so where it is asked for others."""
 
 from typing import Any
 
-import diffrax
 import jax.tree_util as jtu
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from .._tree import Tree
 from ..errors import DifferentiationError
-
-_CHECKPOINT_BYTES = 2**30
-
-
-def adjoint_for(name: str, max_steps: int, x0: Tree) -> diffrax.AbstractAdjoint:
-    """Diffrax's loop for "reverse" or "forward"."""
-    if name == "forward":
-        return diffrax.ForwardMode()
-    # One checkpoint a step is the fast path: nothing is computed more than twice. Larger states get
-    # as many as fit the memory set aside, and are recomputed between them.
-    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jtu.tree_leaves(x0))
-    affordable = max(64, _CHECKPOINT_BYTES // (8 * size + 512))
-    return diffrax.RecursiveCheckpointAdjoint(checkpoints=min(max_steps, affordable))
 
 
 def forward_only(tree: Tree) -> Tree:

@@ -1,0 +1,240 @@
+"""The time loop: steps until every saved time and the end are reached.
+
+One loop over the saved times holds one loop over steps, so that a step is compiled once, saving costs
+nothing between saved times, and the lanes of a batch wait for each other no longer than they must.
+"""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+
+from .. import _tree
+from .._tree import Tree
+from .checkpoints import Checkpoints
+from .control import AbstractController
+from .results import RESULTS
+from .stepper import Factors, Memory, Stepper, inside
+
+
+class Record(NamedTuple):
+    """What is needed to evaluate a step anywhere inside: x₀ and the stage polynomial."""
+
+    start: jax.Array
+    length: jax.Array
+    x0: Tree
+    coefficients: tuple[Tree, ...]
+
+
+class Saved(NamedTuple):
+    """The state at a saved time, and what has disturbed it.
+
+    `impulse` = (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) up to the end of the step that the time lies in, so
+    that x_h is the exact solution of the system with a disturbance of that size; `settled` is what
+    both were at the start of that step: what has surely acted by then.
+    """
+
+    t: Any
+    x: Tree
+    impulse: tuple[Any, Any]
+    settled: tuple[Any, Any]
+
+
+class State(NamedTuple):
+    """Where the loop stands: after `steps` accepted ones of `attempts`.
+
+    `last` is the last step and what had disturbed the state before it, kept where saved times may lie
+    inside steps that are already taken; `records` all of them, for dense output; `ends` the times at
+    which they ended and `checkpoints` some of the states they began with, for the reverse pass.
+    """
+
+    t: Any
+    x: Tree
+    impulse: tuple[Any, Any]
+    memory: Memory
+    factors: Factors | None
+    control: Any
+    jumped: Any
+    last: tuple[Record, tuple[Any, Any]] | None
+    records: Record | None
+    ends: jax.Array | None
+    checkpoints: Checkpoints | None
+    result: RESULTS
+    steps: Any
+    attempts: Any
+    meter: Any
+
+
+class Loop(eqx.Module):
+    """A stepper and a controller from the first stop to the last.
+
+    - `guarded`: keep the last good state where a step fails, which costs a choice between the two;
+    - `dense`: keep every step; `progress`: say how far the run is.
+    """
+
+    stepper: Stepper
+    controller: AbstractController
+    max_steps: int = eqx.field(static=True)
+    guarded: bool = eqx.field(static=True)
+    dense: bool = eqx.field(static=True)
+    progress: bool = eqx.field(static=True)
+
+    def run(
+        self, x0: Tree, ts: jax.Array | None, checkpoints: Checkpoints | None = None
+    ) -> tuple[Saved | None, State]:
+        """The states at the times `ts`, and where the run ended."""
+        state = self._start(x0, ts is not None, checkpoints)
+        t1 = self.controller.stops[-1]
+        if ts is None:
+            return None, self._until(state, t1)
+        count = ts.shape[0]
+        blank = jax.eval_shape(lambda: self._read(state, ts[0]))
+        rows = jtu.tree_map(lambda s: jnp.zeros((count, *s.shape), s.dtype), blank)
+
+        def visit(k: Any, carry: tuple[State, Saved]) -> tuple[State, Saved]:
+            # One turn more than there are saved times, for the way from the last of them to the end:
+            # it writes the last row once more.
+            state, rows = carry
+            row = jnp.minimum(k, count - 1)
+            state = self._until(state, jnp.where(k < count, ts[row], t1))
+            found = _tree.where(
+                k < count, self._read(state, ts[row]), jtu.tree_map(lambda leaf: leaf[row], rows)
+            )
+            return state, jtu.tree_map(lambda leaf, new: leaf.at[row].set(new), rows, found)
+
+        state, rows = lax.fori_loop(0, count + 1, visit, (state, rows))
+        return rows, state
+
+    def _start(self, x0: Tree, saves: bool, checkpoints: Checkpoints | None) -> State:
+        controller, stepper = self.controller, self.stepper
+        t0, control = controller.stops[0], controller.init()
+        zero = jnp.zeros_like(t0)
+        measure = stepper.measure
+        record = Record(t0, zero, x0, (_tree.zeros_like(x0),) * (stepper.method.degree + 1))
+        many = lambda leaf: jnp.zeros((self.max_steps, *leaf.shape), leaf.dtype)  # noqa: E731
+        records = jtu.tree_map(many, record) if self.dense else None
+        if records is not None:
+            records = records._replace(start=jnp.full_like(records.start, jnp.inf))
+        uniform = stepper.uniform is not None
+        return State(
+            t=t0,
+            x=x0,
+            impulse=(zero, zero),
+            memory=stepper.begin(x0),
+            factors=None if uniform else stepper.factors(controller.end(control) - t0),
+            control=control,
+            jumped=jnp.asarray(True),
+            last=(record, (zero, zero)) if saves and measure else None,
+            records=records,
+            ends=jnp.zeros(self.max_steps, t0.dtype)
+            if checkpoints is not None and controller.adapts
+            else None,
+            checkpoints=checkpoints,
+            result=RESULTS.successful,
+            steps=jnp.asarray(0),
+            attempts=jnp.asarray(0),
+            meter=diffrax.TextProgressMeter().init() if self.progress else None,
+        )
+
+    def _until(self, state: State, time: Any) -> State:
+        """Steps until `time` has been reached, or lies in the next step where none is kept."""
+
+        def goes_on(state: State) -> Any:
+            before = state.t < time
+            if state.last is None:
+                # Saved times that coincide with the end of a step do so up to rounding.
+                end = self.controller.end(state.control)
+                before = before & (end <= time + 4 * jnp.finfo(time.dtype).eps * jnp.abs(time))
+            going = state.result == RESULTS.successful
+            return before & going & (state.attempts < self.max_steps)
+
+        return lax.while_loop(goes_on, lambda state: self._attempt(state), state)
+
+    def _attempt(self, state: State) -> State:
+        t0, t1 = state.t, self.controller.end(state.control)
+        factors = self.stepper.uniform
+        if factors is None:
+            assert state.factors is not None
+            factors = self.stepper.fitted(state.factors, t0, t1)
+        step = self.stepper.step(t0, t1, state.x, state.memory, factors, state.jumped)
+        verdict = self.controller.judge(t0, t1, state.x, step, state.control)
+        impulse = jtu.tree_map(jnp.add, state.impulse, step.impulse)
+        taken = Record(t0, t1 - t0, state.x, step.c)
+        # `last` and `records` of a step that is not kept are written over by the next one, or never
+        # looked at: nothing ends inside a step that was not kept.
+        ahead = (t1, step.x1, impulse, step.memory, verdict.jumped)
+        last = None if state.last is None else (taken, state.impulse)
+        if self.guarded:
+            behind = (t0, state.x, state.impulse, state.memory, state.jumped)
+            ahead, last = _tree.where(verdict.kept, (ahead, last), (behind, state.last))
+        write = lambda leaf, new: leaf.at[state.steps].set(new)  # noqa: E731
+        checkpoints = state.checkpoints
+        if checkpoints is not None:
+            checkpoints = checkpoints.put(state.steps, state.x)
+        meter = state.meter
+        if self.progress:
+            stops = self.controller.stops
+            meter = diffrax.TextProgressMeter().step(
+                meter, (ahead[0] - stops[0]) / (stops[-1] - stops[0])
+            )
+        t, x, impulse, memory, jumped = ahead
+        return State(
+            t=t,
+            x=x,
+            impulse=impulse,
+            memory=memory,
+            factors=None if self.stepper.uniform is not None else factors,
+            control=verdict.state,
+            jumped=jumped,
+            last=last,
+            records=None if state.records is None else jtu.tree_map(write, state.records, taken),
+            ends=None if state.ends is None else write(state.ends, t1),
+            checkpoints=checkpoints,
+            result=verdict.result,
+            steps=jnp.where(verdict.kept, state.steps + 1, state.steps),
+            attempts=state.attempts + 1,
+            meter=meter,
+        )
+
+    def _read(self, state: State, time: Any) -> Saved:
+        """The trajectory at a time that the loop has run up to; t = ∞ where it did not get there."""
+        generator = self.stepper.flow.generator
+        if state.last is None:
+            t0, t1 = state.t, self.controller.end(state.control)
+
+            def between() -> Tree:
+                c = self._polynomial(state, t0, t1)
+                return inside(generator, t1 - t0, (time - t0) / (t1 - t0), state.x, c)
+
+            met = time <= t0 + 4 * jnp.finfo(time.dtype).eps * jnp.abs(time)
+            reached = met | ((t1 > time) & (state.result == RESULTS.successful))
+            x = lax.cond(met, lambda: state.x, between)
+            impulse = settled = state.impulse
+        else:
+            record, before = state.last
+            theta = (time - record.start) / jnp.where(record.length > 0, record.length, 1)
+            reached = state.t >= time
+            x = lax.cond(
+                time >= state.t,
+                lambda: state.x,
+                lambda: inside(generator, record.length, theta, record.x0, record.coefficients),
+            )
+            # Inside a step the bound of the whole step is charged: it can only be too large.
+            impulse = _tree.where(theta > 0.0, state.impulse, before)
+            settled = _tree.where(time >= state.t, state.impulse, before)
+        x = jtu.tree_map(lambda leaf: jnp.where(reached, leaf, jnp.nan), x)
+        return Saved(jnp.where(reached, time, jnp.inf), x, impulse, settled)
+
+    def _polynomial(self, state: State, t0: Any, t1: Any) -> tuple[Tree, ...]:
+        """The stage polynomial of the step from t0 to t1, which the loop has not taken."""
+        stepper = self.stepper
+        factors = stepper.uniform
+        if factors is None:
+            assert state.factors is not None
+            factors = stepper.fitted(state.factors, t0, t1)
+        first = stepper.first(t0, t1, state.x, state.memory.guess)
+        return stepper.stages(t0, t1, state.x, factors.full, first)[0]

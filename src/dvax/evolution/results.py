@@ -1,0 +1,21 @@
+"""How a solve may end."""
+
+import equinox as eqx
+
+
+class RESULTS(eqx.Enumeration):
+    """How a solve ended, in a sentence."""
+
+    successful = "The end time was reached."
+    max_steps = (
+        "The largest number of steps was reached before t1. Raise max_steps, or loosen rtol."
+    )
+    step_too_small = (
+        "The step became too small to move t while the defect stayed above the tolerance. The data "
+        "is discontinuous at that time (name it: dvax.signals knots), or rtol is below rounding."
+    )
+    nonfinite = "f, h or K returned NaN or infinity."
+    law_unsolved = (
+        "The frozen law was not solved to its tolerance. Check that it is strongly pseudomonotone "
+        "(dvax.solve_vi at that time and state), or give vi_solver= more iterations."
+    )

@@ -1,0 +1,287 @@
+"""The reverse pass: the steps that were taken, seen from the end.
+
+The steps of a run are a choice; given them, x₀, x₁, … is a recursion xᵢ₊₁ = Φᵢ(xᵢ, p), and a saved
+state Ψ(xᵢ, p) belongs to the step that its time lies in. With λᵢ the derivative of what was asked for
+with respect to xᵢ,
+
+    λᵢ = (∂Φᵢ/∂x)ᵀ λᵢ₊₁ + Σ (∂Ψ/∂x)ᵀ ψ̄,      p̄ = Σᵢ (∂Φᵢ/∂p)ᵀ λᵢ₊₁ + Σ (∂Ψ/∂p)ᵀ ψ̄.
+
+States are kept at checkpoints and computed again between them, so that memory is bounded whatever the
+number of steps, and every step is computed at most twice more where the checkpoints suffice for one
+turn. Only what a derivative is asked for is differentiated.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax import lax
+
+from .. import _tree
+from .._tree import Tree
+from .checkpoints import Checkpoints, how_many
+from .loop import Loop, Saved, State
+from .stepper import inside
+
+
+class _Static:
+    """Anything, as a part of a tree that has no leaves."""
+
+    def __init__(self, value: Any):
+        self.value = value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Static) and self.value == other.value
+
+    def __hash__(self) -> int:
+        return hash(self.value)
+
+
+jtu.register_pytree_node(_Static, lambda s: ((), s), lambda s, _: s)
+
+
+def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State]:
+    """`loop.run(x0, ts)`, with a reverse derivative for the states: those saved, those of the dense
+    output, and the last. Of all the other things the derivative is zero."""
+    dynamic, static = eqx.partition((x0, loop, ts), eqx.is_array)
+    leaves, tree = jtu.tree_flatten(dynamic)
+
+    def whole(leaves: Any) -> tuple[Tree, Loop, jax.Array | None]:
+        return eqx.combine(jtu.tree_unflatten(tree, leaves), static)
+
+    @jax.custom_vjp
+    def solved(*leaves: jax.Array) -> Any:
+        x0, loop, ts = whole(leaves)
+        return _states(*loop.run(x0, ts))
+
+    def forward(*given: Any) -> Any:
+        leaves = [leaf.value for leaf in given]
+        x0, loop, ts = whole(leaves)
+        saved, state = loop.run(x0, ts, Checkpoints(x0, how_many(x0, loop.max_steps)[0]))
+        assert state.checkpoints is not None
+        moving = _Static(tuple(leaf.perturbed for leaf in given))
+        kept = leaves, moving, state.ends, state.checkpoints, state.steps
+        states, rest = _states(saved, state)
+        return (states, rest), kept
+
+    def backward(kept: Any, cotangents: Any) -> Any:
+        leaves, moving, *history = kept
+        return _Backward(whole, leaves, moving.value, *history).run(cotangents[0])
+
+    solved.defvjp(forward, backward, symbolic_zeros=True)
+    states, rest = solved(*leaves)
+    return _rejoin(states, rest)
+
+
+class _States(NamedTuple):
+    """What has a derivative."""
+
+    last: Tree
+    saved: Tree | None
+    records: tuple[Tree, tuple[Tree, ...]] | None
+
+
+def _states(saved: Saved | None, state: State) -> tuple[_States, Any]:
+    """The run's answer taken apart into what has a derivative and what has none."""
+    records = state.records
+    states = _States(
+        state.x,
+        None if saved is None else saved.x,
+        None if records is None else (records.x0, records.coefficients),
+    )
+    state = state._replace(
+        x=None, memory=None, factors=None, last=None, ends=None, checkpoints=None, meter=None,
+        records=None if records is None else records._replace(x0=None, coefficients=None),
+    )  # fmt: skip
+    return states, (None if saved is None else saved._replace(x=None), state)
+
+
+def _rejoin(states: _States, rest: Any) -> tuple[Saved | None, State]:
+    saved, state = rest
+    if saved is not None:
+        saved = saved._replace(x=states.saved)
+    records = state.records
+    if records is not None:
+        assert states.records is not None
+        x0, coefficients = states.records
+        records = records._replace(x0=x0, coefficients=coefficients)
+    return saved, state._replace(x=states.last, records=records)
+
+
+class _Backward:
+    """The pass itself, for one run and what is asked of it."""
+
+    def __init__(self, whole, leaves, moving, ends, checkpoints, steps):
+        self.whole, self.leaves = whole, leaves
+        real = [jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in leaves]
+        self.moving = [m and r for m, r in zip(moving, real, strict=True)]
+        self.ends, self.checkpoints, self.steps = ends, checkpoints, steps
+        self.x0, self.loop, self.ts = whole(leaves)
+        self.fixed = [leaf for leaf, m in zip(leaves, self.moving, strict=True) if not m]
+
+    def run(self, bar: _States) -> tuple[Any, ...]:
+        """The cotangents of the leaves."""
+        bar = _States(*map(_given, bar))
+        moving = tuple(leaf for leaf, m in zip(self.leaves, self.moving, strict=True) if m)
+        adjoint = bar.last if bar.last is not None else _tree.zeros_like(self.x0)
+        row = -1 if self.ts is None else self.ts.shape[0] - 1
+        carry = (adjoint, jtu.tree_map(jnp.zeros_like, moving), jnp.asarray(row), self._guess())
+        between = how_many(self.x0, self.loop.max_steps)[1]
+        blank = jtu.tree_map(lambda v: jnp.zeros((between, *v.shape), v.dtype), self.x0)
+
+        def segment(carry: Any) -> Any:
+            end, shelf, inner = carry
+            first, x = self.checkpoints.before(end - 1)
+            apart = (end - first - 1) // between + 1
+            shelf = self._refill(shelf, first, x, end, apart)
+
+            def one(carry: Any) -> Any:
+                i, inner = carry
+                place = (i - first) // apart
+                x = jtu.tree_map(lambda leaf: leaf[place], shelf)
+                x = self._replay(x, first + place * apart, i)
+                return i - 1, self._step_back(i, x, bar, *inner)
+
+            _, inner = lax.while_loop(lambda c: c[0] >= first, one, (end - 1, inner))
+            return first, shelf, inner
+
+        _, _, (adjoint, gathered, row, _) = lax.while_loop(
+            lambda c: c[0] > 0, segment, (self.steps, blank, carry)
+        )
+        gathered = iter(gathered)
+        out = [
+            next(gathered) if m else _no_tangent(leaf)
+            for leaf, m in zip(self.leaves, self.moving, strict=True)
+        ]
+        adjoint = self._rest(adjoint, row, bar)
+        return tuple(self._add_initial(out, adjoint))
+
+    def _rest(self, adjoint: Tree, row: Any, bar: _States) -> Tree:
+        """Saved times at which no step had been taken show x₀ itself."""
+        if bar.saved is None:
+            return adjoint
+        assert self.ts is not None
+        early = jnp.arange(self.ts.shape[0]) <= row
+        pick = lambda v: jnp.where(early.reshape(-1, *(1,) * (v.ndim - 1)), v, 0.0)  # noqa: E731
+        return jtu.tree_map(lambda a, v: a + jnp.sum(pick(v), axis=0), adjoint, bar.saved)
+
+    def _add_initial(self, out: list[Any], adjoint: Tree) -> list[Any]:
+        """The first leaves are those of x₀."""
+        for k, part in enumerate(jtu.tree_leaves(adjoint)):
+            if self.moving[k]:
+                out[k] = out[k] + part
+        return out
+
+    def _parts(self, moving: Any) -> Loop:
+        """The loop with these numbers in the place of those that are differentiated."""
+        ours, theirs = iter(moving), iter(self.fixed)
+        return self.whole([next(ours if m else theirs) for m in self.moving])[1]
+
+    def _guess(self) -> Tree | None:
+        flow = self.loop.stepper.flow
+        return None if flow.direct else flow.problem.zero_control(self.x0)
+
+    def _times(self, loop: Loop, i: Any) -> tuple[Any, Any]:
+        boundary = loop.controller.boundary
+        return boundary(i, self.ends), boundary(i + 1, self.ends)
+
+    def _advance(self, loop: Loop, i: Any, x: Tree, guess: Tree | None) -> tuple[Any, Any]:
+        """(xᵢ₊₁, c), and a guess for the law of another step."""
+        t0, t1 = self._times(loop, i)
+        stepper = loop.stepper
+        uniform = stepper.uniform
+        full = stepper.factors(t1 - t0).full if uniform is None else uniform.full
+        first = stepper.first(t0, t1, x, guess)
+        c, _ = stepper.stages(t0, t1, x, full, first)
+        return (full.step(x, c), c), None if guess is None else lax.stop_gradient(first.y)
+
+    def _replay(self, x: Tree, i: Any, until: Any) -> Tree:
+        """x_until from xᵢ."""
+
+        def one(carry: Any) -> Any:
+            i, x, guess = carry
+            (x, _), guess = self._advance(self.loop, i, x, guess)
+            return i + 1, x, guess
+
+        return lax.while_loop(lambda c: c[0] < until, one, (i, x, self._guess()))[1]
+
+    def _refill(self, shelf: Tree, first: Any, x: Tree, end: Any, apart: Any) -> Tree:
+        """Every `apart`-th state from `first` on, of those before `end`."""
+
+        def one(carry: Any) -> Any:
+            place, x, shelf = carry
+            shelf = jtu.tree_map(lambda leaf, v: leaf.at[place].set(v), shelf, x)
+            i = first + place * apart
+            return place + 1, self._replay(x, i, jnp.minimum(i + apart, end - 1)), shelf
+
+        return lax.while_loop(
+            lambda c: first + c[0] * apart < end, one, (jnp.asarray(0), x, shelf)
+        )[2]
+
+    def _step_back(
+        self, i: Any, x: Tree, bar: _States, adjoint: Tree, gathered: Any, row: Any, guess: Any
+    ) -> tuple[Any, ...]:
+        """λᵢ from λᵢ₊₁, with what this step adds to the rest."""
+        moving = tuple(leaf for leaf, m in zip(self.leaves, self.moving, strict=True) if m)
+        (_, c), pull, guess = jax.vjp(
+            lambda p, x: self._advance(self._parts(p), i, x, guess), moving, x, has_aux=True
+        )
+        bent = _tree.zeros_like(c)
+        behind = _tree.zeros_like(x)
+        if bar.records is not None:
+            behind, bent = jtu.tree_map(lambda leaf: leaf[i], bar.records)
+        if bar.saved is not None:
+            adjoint, behind, bent, gathered, row = self._saved_back(
+                i, x, c, moving, bar.saved, (adjoint, behind, bent, gathered, row)
+            )
+        p, x = pull((adjoint, bent))
+        return _tree.add(behind, x), jtu.tree_map(jnp.add, gathered, p), row, guess
+
+    def _saved_back(self, i: Any, x: Tree, c: Any, moving: Any, saved: Tree, carry: Any) -> Any:
+        """The times saved in this step, the last ones first."""
+        assert self.ts is not None
+        ts, (t0, t1) = self.ts, self._times(self.loop, i)
+        slack = 4 * jnp.finfo(ts.dtype).eps * jnp.abs(t0)
+
+        def at(p: Any, x: Tree, c: Any, time: Any) -> Tree:
+            loop = self._parts(p)
+            t0, t1 = self._times(loop, i)
+            theta = (time - t0) / (t1 - t0)
+            return inside(loop.stepper.flow.generator, t1 - t0, theta, x, c)
+
+        def one(carry: Any) -> Any:
+            adjoint, behind, bent, gathered, row = carry
+            psi = jtu.tree_map(lambda leaf: leaf[row], saved)
+
+            def within() -> Any:
+                _, pull = jax.vjp(lambda p, x, c: at(p, x, c, ts[row]), moving, x, c)
+                p, v, d = pull(psi)
+                return adjoint, _tree.add(behind, v), _tree.add(bent, d), _tree.add(gathered, p)
+
+            def at_end() -> Any:
+                return _tree.add(adjoint, psi), behind, bent, gathered
+
+            return *lax.cond(ts[row] >= t1 - slack, at_end, within), row - 1
+
+        return lax.while_loop(lambda c: (c[-1] >= 0) & (ts[c[-1]] > t0 + slack), one, carry)
+
+
+def _is_zero(leaf: Any) -> bool:
+    return isinstance(leaf, jax.custom_derivatives.SymbolicZero)
+
+
+def _given(cotangents: Any) -> Any:
+    """None where none of them is asked for."""
+    if all(map(_is_zero, jtu.tree_leaves(cotangents, is_leaf=_is_zero))):
+        return None
+    real = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype) if _is_zero(leaf) else leaf  # noqa: E731
+    return jtu.tree_map(real, cotangents, is_leaf=_is_zero)
+
+
+def _no_tangent(leaf: Any) -> Any:
+    if jnp.issubdtype(leaf.dtype, jnp.inexact):
+        return jnp.zeros_like(leaf)
+    return np.zeros(leaf.shape, jax.dtypes.float0)
