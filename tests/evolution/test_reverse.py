@@ -1,10 +1,13 @@
 """The reverse pass against the forward one, which shares none of its code, in every kind of run."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from tests.closed_forms import c1, c1_derivatives
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax.evolution import checkpoints
@@ -16,14 +19,15 @@ TS = np.array([0.0, 0.11, 0.11, 0.4, 1.0, 1.3])
 """The start, one step twice, a multiple of 0.1, and the end."""
 
 
-def system():
-    """A rotation whose matrix, set, law and field all depend on args; the law is not a closed form."""
+def system(cubic):
+    """A rotation whose matrix, set, law and field all depend on args; with a cubic term the law has no
+    closed form."""
     return dvax.Problem(
         A=lambda args: dvax.generators.Dense(args["A"]),
         P=dvax.operators.Scaling(1.0),
         K=lambda t, args: dvax.sets.Ball(0.0, args["r"] * jnp.exp(-t)),
         f=lambda t, x, u, args: jnp.sin(t) * args["w"] - u,
-        h=lambda t, x, u, args: 2 * x - u - 0.1 * u**3,
+        h=lambda t, x, u, args: 2 * x - u - (cubic * u**3 if cubic else 0.0),
     )
 
 
@@ -45,11 +49,14 @@ def forward(loss, given):
     return jax.jacfwd(lambda v: loss(back(v)))(flat)
 
 
-@pytest.mark.parametrize("places", [4096, 4], ids=["all kept", "four kept"])
-@pytest.mark.parametrize("kind", KINDS)
-def test_backward_is_forward_transposed(kind, places, monkeypatch):
+CASES = list(itertools.product(KINDS, (4096, 4), (0.0, 0.1)))
+OFTEN = [("fixed", 4, 0.0), ("measured", 4096, 0.0), ("adaptive", 4, 0.0)]
+
+
+@pytest.mark.parametrize(("kind", "places", "cubic"), mostly_thorough(CASES, OFTEN))
+def test_backward_is_forward_transposed(kind, places, cubic, monkeypatch):
     monkeypatch.setattr(checkpoints, "_MOST", places)
-    problem = system()
+    problem = system(cubic)
 
     def loss(given, adjoint):
         x0, args = given
