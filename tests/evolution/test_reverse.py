@@ -10,6 +10,7 @@ from tests.closed_forms import c1, c1_derivatives
 from tests.selection import mostly_thorough
 
 import dvax
+from dvax import generators
 from dvax.evolution import checkpoints
 from dvax.evolution.checkpoints import Checkpoints, how_many
 
@@ -20,10 +21,10 @@ TS = np.array([0.0, 0.11, 0.11, 0.4, 1.0, 1.3])
 
 
 def system(cubic):
-    """A rotation whose matrix, set, law and field all depend on args; with a cubic term the law has no
-    closed form."""
+    """A system whose generator, set and field all depend on args; with a cubic term the law has no
+    closed form, and the generator is a matrix."""
     return dvax.Problem(
-        A=lambda args: dvax.generators.Dense(args["A"]),
+        A=lambda args: generators.Dense(args["A"]) if cubic else generators.Diagonal(args["A"][0]),
         P=dvax.operators.Scaling(1.0),
         K=lambda t, args: dvax.sets.Ball(0.0, args["r"] * jnp.exp(-t)),
         f=lambda t, x, u, args: jnp.sin(t) * args["w"] - u,
@@ -50,7 +51,7 @@ def forward(loss, given):
 
 
 CASES = list(itertools.product(KINDS, (4096, 4), (0.0, 0.1)))
-OFTEN = [("fixed", 4, 0.0), ("measured", 4096, 0.0), ("adaptive", 4, 0.0)]
+OFTEN = [("fixed", 4096, 0.0), ("adaptive", 4, 0.0)]
 
 
 @pytest.mark.parametrize(("kind", "places", "cubic"), mostly_thorough(CASES, OFTEN))
