@@ -5,5 +5,6 @@ from .abstract import AbstractPropagator as AbstractPropagator
 from .abstract import Growth as Growth
 from .dense import Dense as Dense
 from .diagonal import Diagonal as Diagonal
+from .elliptic import Elliptic as Elliptic
 from .product import Product as Product
 from .scalar import Scalar as Scalar

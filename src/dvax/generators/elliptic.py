@@ -1,0 +1,237 @@
+"""Constant coefficients on a box: diffusion, advection, reaction."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .. import _tree
+from .._tree import Tree
+from ..errors import InputError, InputProblem
+from ..spaces import AbstractSpace
+from .abstract import AbstractGenerator, AbstractPropagator, Growth
+from .phi import flow_factors, phi_scalar
+from .scalar import elementwise_bend
+from .transforms import BOUNDARIES, Transform, along
+
+
+class Elliptic(AbstractGenerator):
+    """A v = Σᵢ dᵢ ∂ᵢ²v − Σᵢ cᵢ ∂ᵢv + r v on a box of one, two or three dimensions: the Laplacian for
+    d = 1, advection–diffusion with a velocity c, pure advection (skew) for d = 0.
+
+    Values sit at the midpoints (j + ½)h of equal cells, h = L/n. A is diagonal in the sines, cosines
+    and waves that its boundary conditions allow, so e^{tA} and the φ-functions are exact for what
+    the grid can show: wave number κ belongs to the eigenvalue −dκ² − icκ + r. In the norm of any
+    space that weighs all points alike the transform is orthogonal, so M = 1 and ω is the largest
+    real part.
+
+    **Arguments:**
+
+    - `shape`: cells along each axis, an integer or a tuple;
+    - `lengths`: of the box along each axis, one number or one an axis;
+    - `boundary`: "periodic", "dirichlet" (v = 0 on the faces) or "neumann" (∂v/∂n = 0), for all axes
+      or one an axis;
+    - `diffusion` ≥ 0, in length²/time, and `velocity`, in length/time: one number or one an axis; a
+      velocity other than 0 needs a periodic axis; `reaction`: a number, in 1/time;
+    - `scheme`: "spectral", or "differences" for the three-point formula of order two, whose
+      eigenvalues are −d (2/h)² sin²(κh/2) and −ic sin(κh)/h.
+
+    **Raises:** `dvax.InputError` where these do not fit together.
+
+    Source of the transforms: `dvax.generators.transforms`.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> A = dvax.generators.Elliptic(64, lengths=jnp.pi, boundary="dirichlet")
+    >>> s = (jnp.arange(64) + 0.5) * jnp.pi / 64
+    >>> decayed = A.semigroup(1.0, jnp.sin(3 * s))      # sin 3s has the eigenvalue −9
+    >>> bool(jnp.allclose(decayed, jnp.exp(-9.0) * jnp.sin(3 * s), atol=1e-6))
+    True
+
+    ```
+    """
+
+    symbol: jax.Array
+    transform: Transform
+
+    def __init__(
+        self,
+        shape: int | Sequence[int],
+        lengths: Any = 1.0,
+        boundary: str | Sequence[str] = "dirichlet",
+        diffusion: Any = 1.0,
+        velocity: Any = 0.0,
+        reaction: Any = 0.0,
+        scheme: str = "spectral",
+    ):
+        shape = (shape,) if isinstance(shape, int) else tuple(shape)
+        kinds = (boundary,) * len(shape) if isinstance(boundary, str) else tuple(boundary)
+        _check(shape, kinds, scheme)
+        per_axis = {"lengths": lengths, "diffusion": diffusion, "velocity": velocity}
+        L, d, c = (_by_axis(name, value, len(shape)) for name, value in per_axis.items())
+        r = _tree.as_float(reaction, "dvax.generators.Elliptic(reaction)")
+        _check_numbers(L, d, c, kinds)
+        self.transform = Transform(shape, kinds)
+        growing, turning = r, jnp.zeros_like(r)
+        for axis in range(len(shape)):
+            even, odd = _eigenvalues(self.transform, axis, L[axis], scheme)
+            growing = growing - along(d[axis] * even, axis, len(shape))
+            turning = turning - along(c[axis] * odd, axis, len(shape))
+        still = all(map(_is_zero, c))
+        self.symbol = growing if still else jax.lax.complex(growing, turning)
+
+    def apply(self, v: Tree) -> Tree:
+        return self.transform.backward(_times(self.symbol, self.transform.forward(v)))
+
+    def propagator(self, h: Any, terms: int) -> "SpectralPropagator":
+        h = jnp.asarray(h).astype(self.symbol.dtype)
+        factors = flow_factors(h, phi_scalar(h * self.symbol, terms))
+        return SpectralPropagator(self.transform, factors)
+
+    def check(self, space: AbstractSpace) -> None:
+        _tree.fits(
+            "dvax.generators.Elliptic(shape)",
+            jax.ShapeDtypeStruct(self.transform.shape, jnp.real(self.symbol).dtype),
+            space.zeros(),
+            "state space",
+        )
+
+    def growth(self, space: AbstractSpace) -> Growth:
+        # ‖v‖ lies between the roots of the least and the largest weight times the plain norm, in which
+        # the semigroup is that of a normal operator.
+        w = space.weights()
+        return Growth(jnp.sqrt(jnp.max(w) / jnp.min(w)), jnp.max(jnp.real(self.symbol)))
+
+    def bend(
+        self,
+        h: Any,
+        x0: Tree,
+        x1: Tree,
+        c: tuple[Tree, ...],
+        space: AbstractSpace,
+        growth: Growth,
+    ) -> Tree:
+        # Coefficient by coefficient; an eigenfunction is at most 1 anywhere.
+        forward = self.transform.forward
+        parts = [forward(v) for v in (x0, x1, *c)]
+        if jnp.iscomplexobj(self.symbol):
+            start, _, first, *rest = parts
+            slope = _times(1.0 / h, rest[0]) if rest else jnp.zeros_like(first)
+            curvature = jnp.abs(self.symbol * (self.symbol * start + first) + slope)
+            rise = jnp.exp(jnp.maximum(jnp.real(self.symbol), 0.0) * h)
+            leaves = h**2 / 8 * rise * curvature
+        else:
+            leaves = _both(lambda *p: elementwise_bend(self.symbol, h, *p), parts)
+        return jnp.broadcast_to(
+            jnp.sum(self.transform.shares().astype(leaves.dtype) * leaves), x0.shape
+        )
+
+
+class SpectralPropagator(AbstractPropagator):
+    """Factors that multiply the coefficients of a transform."""
+
+    transform: Transform
+    factors: tuple[jax.Array, ...]
+
+    def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
+        forward = self.transform.forward
+        products = [_times(f, forward(v)) for f, v in zip(self.factors, (x0, *c), strict=False)]
+        return self.transform.backward(sum(products[1:], start=products[0]))
+
+
+def _times(factor: Any, c: jax.Array) -> jax.Array:
+    """The product, of which either may be complex."""
+    if jnp.iscomplexobj(c) and not jnp.iscomplexobj(factor):
+        return jax.lax.complex(factor * jnp.real(c), factor * jnp.imag(c))
+    return factor * c
+
+
+def _both(bend: Any, parts: list[jax.Array]) -> jax.Array:
+    """A bound for complex coefficients from one for real ones."""
+    if not jnp.iscomplexobj(parts[0]):
+        return bend(*parts)
+    real, imaginary = (bend(*map(part, parts)) for part in (jnp.real, jnp.imag))
+    return jnp.sqrt(real**2 + imaginary**2)
+
+
+def _eigenvalues(
+    transform: Transform, axis: int, length: jax.Array, scheme: str
+) -> tuple[jax.Array, jax.Array]:
+    """κ² and κ, or what differences make of them."""
+    n, modes = transform.shape[axis], transform.modes(axis)
+    periodic = transform.boundary[axis] == "periodic"
+    # The wave of two cells is its own mirror image: an odd derivative of it is nowhere on the grid.
+    odd = np.where(periodic & (2 * np.abs(modes) == n), 0, modes)
+    angle = (2 * np.pi if periodic else np.pi) * np.asarray(modes, float)
+    angle_odd = (2 * np.pi if periodic else np.pi) * np.asarray(odd, float)
+    if scheme == "differences":
+        angle, angle_odd = 2 * n * np.sin(angle / (2 * n)), n * np.sin(angle_odd / n)
+    kappa, kappa_odd = (jnp.asarray(a, length.dtype) / length for a in (angle, angle_odd))
+    return kappa**2, kappa_odd
+
+
+def _by_axis(name: str, value: Any, count: int) -> list[jax.Array]:
+    full = f"dvax.generators.Elliptic({name})"
+    array = _tree.as_float(jnp.asarray(value) if isinstance(value, tuple | list) else value, full)
+    if array.shape not in ((), (count,)):
+        raise InputError(
+            InputProblem(
+                full,
+                f"shape {array.shape}",
+                f"one number, or one for each of the {count} axes",
+                f"Give {count} numbers",
+            )
+        )
+    return list(jnp.broadcast_to(array, (count,)))
+
+
+def _is_zero(v: jax.Array) -> bool:
+    return _tree.is_concrete(v) and float(v) == 0.0
+
+
+def _check(shape: tuple[int, ...], kinds: tuple[str, ...], scheme: str) -> None:
+    name = "dvax.generators.Elliptic"
+    wrong: list[InputProblem] = []
+    if not 1 <= len(shape) <= 3 or min(shape) < 1:
+        wrong.append(
+            InputProblem(f"{name}(shape)", str(shape), "one to three axes of at least one cell",
+                         "Give the number of cells along each axis")
+        )  # fmt: skip
+    if len(kinds) != len(shape) or any(kind not in BOUNDARIES for kind in kinds):
+        wrong.append(
+            InputProblem(f"{name}(boundary)", str(kinds),
+                         f"one of {', '.join(BOUNDARIES)}, for all axes or one for each",
+                         "Choose from these")
+        )  # fmt: skip
+    if scheme not in ("spectral", "differences"):
+        wrong.append(
+            InputProblem(f"{name}(scheme)", repr(scheme), "'spectral' or 'differences'",
+                         "Leave it out for the spectral one")
+        )  # fmt: skip
+    if wrong:
+        raise InputError(*wrong)
+
+
+def _check_numbers(L: list, d: list, c: list, kinds: tuple[str, ...]) -> None:
+    name = "dvax.generators.Elliptic"
+    _tree.require(
+        lambda: all(float(v) > 0 and np.isfinite(float(v)) for v in L), f"{name}(lengths)", L,
+        "lengths must be positive and finite", "Give the sides of the box",
+    )  # fmt: skip
+    _tree.require(
+        lambda: all(float(v) >= 0 and np.isfinite(float(v)) for v in d), f"{name}(diffusion)", d,
+        "a diffusion must be ≥ 0: backward in time nothing generates a semigroup",
+        "Mend its sign",
+    )  # fmt: skip
+    for axis, (v, kind) in enumerate(zip(c, kinds, strict=True)):
+        if kind != "periodic" and not _is_zero(v):
+            raise InputError(
+                InputProblem(
+                    f"{name}(velocity)",
+                    f"{_tree.short(v)} along axis {axis}, which is {kind}",
+                    "advection is diagonal in waves alone, so its axis must be periodic",
+                    "Put the advection into f, or give the operator as a sparse matrix",
+                )
+            )

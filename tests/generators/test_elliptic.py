@@ -1,0 +1,194 @@
+"""Constant coefficients on a box, against matrices that numpy writes down and scipy exponentiates."""
+
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.fft
+import scipy.linalg
+from tests.selection import mostly_thorough
+
+import dvax
+from dvax import generators, spaces
+from dvax.generators.transforms import BOUNDARIES, Transform
+
+SHAPES = [(1,), (2,), (5,), (8,), (4, 6), (5, 7), (3, 4, 5)]
+KINDS = [(s, b) for s in SHAPES for b in itertools.product(BOUNDARIES, repeat=len(s))]
+USUAL = [(s, b) for s, b in KINDS if len(s) < 2] + [
+    ((5, 7), ("neumann", "dirichlet")), ((4, 6), ("periodic", "neumann")),
+    ((4, 6), ("dirichlet", "periodic")), ((3, 4, 5), ("dirichlet", "periodic", "neumann")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(KINDS, USUAL))
+def test_a_transform_is_the_one_by_its_definition_and_comes_back(shape, boundary):
+    x = np.random.default_rng(0).normal(size=shape)
+    transform = Transform(shape, boundary)
+    c = transform.forward(jnp.asarray(x))
+    np.testing.assert_allclose(np.asarray(transform.backward(c)), x, atol=1e-13)
+    exact = x.astype(complex)
+    for axis, (n, kind) in enumerate(zip(shape, boundary, strict=True)):
+        k, j = transform.modes(axis)[:, None], np.arange(n)[None, :]
+        waves = {
+            "periodic": np.exp(-2j * np.pi * k * j / n),
+            "neumann": 2 * np.cos(np.pi * k * (j + 0.5) / n),
+            "dirichlet": 2 * np.sin(np.pi * k * (j + 0.5) / n),
+        }[kind]
+        exact = np.moveaxis(np.tensordot(waves, exact, (1, axis)), 0, axis)
+    np.testing.assert_allclose(np.asarray(c), exact, atol=1e-12)
+    # What one coefficient can be anywhere.
+    share = np.broadcast_to(np.asarray(transform.shares()), c.shape)
+    for index in np.ndindex(c.shape):
+        one = jnp.zeros_like(c).at[index].set(1.0)
+        assert np.max(np.abs(np.asarray(transform.backward(one)))) <= share[index] * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("n", [16, 17])
+def test_cosines_and_sines_are_scipys(n):
+    x = np.random.default_rng(1).normal(size=(n, n))
+    found = Transform((n, n), ("neumann", "dirichlet")).forward(jnp.asarray(x))
+    exact = scipy.fft.dst(scipy.fft.dct(x, axis=0), axis=1)[:, ::-1]
+    np.testing.assert_allclose(np.asarray(found), exact, atol=1e-12)
+
+
+def along(n, h, kind, d, c):
+    """Three-point second difference and central first difference, with what lies beyond the faces."""
+    ghost = {"periodic": 0.0, "dirichlet": -1.0, "neumann": 1.0}[kind]
+    second, first = -2.0 * np.eye(n), np.zeros((n, n))
+    for j in range(n):
+        for side in (-1, 1):
+            inside = 0 <= j + side < n
+            near = (j + side) % n if inside or kind == "periodic" else j
+            weight = 1.0 if inside or kind == "periodic" else ghost
+            second[j, near] += weight
+            first[j, near] += side * weight
+    return d * second / h**2 - c * first / (2 * h)
+
+
+def matrix_of(shape, lengths, boundary, diffusion, velocity, reaction):
+    total = reaction * np.eye(int(np.prod(shape)))
+    for axis, n in enumerate(shape):
+        eyes = [np.eye(m) for m in shape]
+        eyes[axis] = along(n, lengths[axis] / n, boundary[axis], diffusion[axis], velocity[axis])
+        total += functools.reduce(np.kron, eyes)
+    return total
+
+
+GRIDS = [
+    ((6,), ("dirichlet",)), ((5,), ("neumann",)), ((6,), ("periodic",)),
+    ((4, 5), ("neumann", "dirichlet")), ((4, 5), ("periodic", "neumann")),
+    ((3, 4), ("periodic", "periodic")), ((3, 2, 4), ("periodic", "dirichlet", "neumann")),
+]  # fmt: skip
+
+
+def operator(shape, boundary):
+    count = len(shape)
+    lengths, diffusion = np.array([1.3, 0.8, 2.0])[:count], np.array([0.1, 0.03, 0.2])[:count]
+    moving = np.array([kind == "periodic" for kind in boundary])
+    velocity = np.array([0.4, -0.7, 0.2])[:count] * moving
+    numbers = (lengths, diffusion, velocity, -0.3)
+    A = generators.Elliptic(
+        shape, lengths, boundary, diffusion, velocity, reaction=-0.3, scheme="differences"
+    )
+    return A, matrix_of(shape, lengths, boundary, diffusion, velocity, -0.3), numbers
+
+
+@pytest.mark.parametrize(("shape", "boundary"), GRIDS)
+def test_differences_are_their_matrix(shape, boundary):
+    A, matrix, _ = operator(shape, boundary)
+    rng, size = np.random.default_rng(2), int(np.prod(shape))
+    x0, c0, c1 = rng.normal(size=(3, size))
+    box = lambda v: jnp.asarray(v.reshape(shape))  # noqa: E731
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-11)
+    close(np.asarray(A.apply(box(x0))).ravel(), matrix @ x0)
+    close(np.asarray(A.semigroup(0.7, box(x0))).ravel(), scipy.linalg.expm(0.7 * matrix) @ x0)
+    flow = A.propagator(0.7, 2).step(box(x0), (box(c0), box(c1)))
+    dense = generators.Dense(matrix).propagator(0.7, 2)
+    exact = dense.step(jnp.asarray(x0), (jnp.asarray(c0), jnp.asarray(c1)))
+    close(np.asarray(flow).ravel(), np.asarray(exact))
+
+
+@pytest.mark.parametrize(("shape", "boundary"), GRIDS)
+def test_the_growth_bound_holds_and_is_reached(shape, boundary):
+    A, matrix, _ = operator(shape, boundary)
+    M, omega = map(float, A.growth(spaces.Euclidean(shape)))
+    assert M == 1.0
+    for t in (0.01, 0.3, 2.0):
+        norm = np.linalg.norm(scipy.linalg.expm(t * matrix), 2)
+        assert norm == pytest.approx(np.exp(omega * t), rel=1e-10)
+    w = np.random.default_rng(3).uniform(0.2, 3.0, shape)
+    M, omega = map(float, A.growth(spaces.L2(w)))
+    root = np.sqrt(w.ravel())
+    for t in (0.01, 0.3, 2.0):
+        moved = root[:, None] * scipy.linalg.expm(t * matrix) / root[None, :]
+        assert np.linalg.norm(moved, 2) <= M * np.exp(omega * t) * (1 + 1e-12)
+
+
+@pytest.mark.parametrize(("shape", "boundary"), GRIDS)
+def test_a_step_stays_within_its_bend(shape, boundary):
+    A, _, _ = operator(shape, boundary)
+    x0, c0, c1 = jnp.asarray(np.random.default_rng(4).normal(size=(3, *shape)))
+    space, h = spaces.Euclidean(shape), 0.2
+    step = lambda theta: A.propagator(theta * h, 2).step(x0, (c0, theta * c1))  # noqa: E731
+    thetas = jnp.linspace(0.0, 1.0, 41)
+    path = np.asarray(jax.vmap(step)(thetas))
+    line = np.asarray(jax.vmap(lambda s: (1 - s) * x0 + s * path[-1])(thetas))
+    bend = A.bend(h, x0, jnp.asarray(path[-1]), (c0, c1), space, A.growth(space))
+    assert np.all(np.abs(path - line) <= np.asarray(bend) + 1e-13)
+    assert np.max(np.abs(path - line)) >= 0.02 * float(np.max(np.asarray(bend)))
+
+
+@pytest.mark.parametrize("boundary", BOUNDARIES)
+def test_the_spectral_scheme_is_exact_for_what_the_grid_shows(boundary):
+    n, length, k = 24, 3.0, 4
+    s = (np.arange(n) + 0.5) * length / n
+    wave = {"periodic": 2 * np.pi, "dirichlet": np.pi, "neumann": np.pi}[boundary] * k / length
+    shape = np.sin if boundary == "dirichlet" else np.cos
+    v = 0.05 if boundary == "periodic" else 0.0
+    A = generators.Elliptic(n, length, boundary, diffusion=0.02, velocity=v, reaction=0.1)
+    found = A.semigroup(1.7, jnp.asarray(shape(wave * s)))
+    exact = np.exp((0.1 - 0.02 * wave**2) * 1.7) * shape(wave * (s - v * 1.7))
+    np.testing.assert_allclose(np.asarray(found), exact, atol=1e-13)
+
+
+def test_pure_advection_keeps_the_norm_of_what_it_moves():
+    A = generators.Elliptic((8, 9), 1.0, "periodic", diffusion=0.0, velocity=(0.3, -0.2))
+    x = jnp.asarray(np.random.default_rng(5).normal(size=(8, 9)))
+    far = A.semigroup(100.0, x)
+    # The wave of two cells is the one that an odd derivative does not see.
+    assert float(jnp.linalg.norm(far)) == pytest.approx(float(jnp.linalg.norm(x)), rel=1e-13)
+    assert float(A.growth(spaces.Euclidean((8, 9))).omega) == 0.0
+
+
+def test_single_precision_stays_single_and_parameters_have_derivatives():
+    one = np.float32
+    A = generators.Elliptic(8, one(1.0), "periodic", one(0.1), one(0.2), one(0.0))
+    assert A.semigroup(one(0.1), jnp.ones(8, one)).dtype == np.float32
+
+    def end(d):
+        s = (np.arange(16) + 0.5) * np.pi / 16
+        return generators.Elliptic(16, jnp.pi, diffusion=d).semigroup(
+            0.5, jnp.asarray(np.sin(2 * s))
+        )[3]
+
+    assert float(jax.grad(end)(0.3)) == pytest.approx(-2.0 * float(end(0.3)), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (dict(shape=(2, 2, 2, 2)), "one to three axes"),
+        (dict(shape=4, boundary="robin"), "periodic, dirichlet, neumann"),
+        (dict(shape=4, lengths=-1.0), "positive and finite"),
+        (dict(shape=4, diffusion=-1.0), "backward in time"),
+        (dict(shape=(4, 4), diffusion=(1.0, 1.0, 1.0)), "each of the 2 axes"),
+        (dict(shape=4, velocity=1.0), "must be periodic"),
+        (dict(shape=4, scheme="chebyshev"), "'spectral' or 'differences'"),
+    ],
+)
+def test_what_does_not_fit_is_refused(arguments, words):
+    with pytest.raises(dvax.InputError, match=words):
+        generators.Elliptic(**arguments)
