@@ -33,6 +33,7 @@ CONTRACT = [
     "bound_error",
     "ETD1",
     "ETD2RK",
+    "ETD4RK",
     "generators.Scalar",
     "generators.Diagonal",
     "generators.Dense",

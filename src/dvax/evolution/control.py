@@ -71,8 +71,9 @@ class Adaptive(AbstractController):
     inside a step has a defect that does not shrink with h; its impulse h·defect does, and a share of
     the tolerance is set aside for such steps, each spending at most a small part of what is left.
 
-    A length is kept while it is within a fifth of the best one, since a new length costs new
-    φ-functions; and the rest of the way to a knot is cut into equal parts, never into a sliver.
+    `order` is that of the defect. A length is kept while it is within a fifth of the best one, since
+    a new length costs new φ-functions; and the rest of the way to a knot is cut into equal parts,
+    never into a sliver.
     """
 
     stops: jax.Array

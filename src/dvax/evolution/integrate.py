@@ -68,7 +68,7 @@ def _controller(setup: Setup, stops: jax.Array, options: Options) -> AbstractCon
         return Fixed(stops, setup.number("dt"))
     sizes = root_mean_squares(setup.problem.spaces(setup.x0)[0])
     rtol, atol, first, horizon = map(setup.number, ("rtol", "atol", "dt0", "horizon"))
-    return Adaptive(stops, rtol, atol, first, horizon, setup.method.order, sizes)
+    return Adaptive(stops, rtol, atol, first, horizon, setup.method.degree + 1, sizes)
 
 
 def _stepper(setup: Setup, flow: Flow, stops: jax.Array, options: Options) -> Stepper:

@@ -237,4 +237,4 @@ class Loop(eqx.Module):
             assert state.factors is not None
             factors = stepper.fitted(state.factors, t0, t1)
         first = stepper.first(t0, t1, state.x, state.memory.guess)
-        return stepper.stages(t0, t1, state.x, factors.full, first)[0]
+        return stepper.stages(t0, t1, state.x, factors, first)[0]

@@ -192,11 +192,11 @@ class _Backward:
         """(xᵢ₊₁, c), and a guess for the law of another step."""
         t0, t1 = self._times(loop, i)
         stepper = loop.stepper
-        uniform = stepper.uniform
-        full = stepper.factors(t1 - t0).full if uniform is None else uniform.full
+        factors = stepper.factors(t1 - t0) if stepper.uniform is None else stepper.uniform
         first = stepper.first(t0, t1, x, guess)
-        c, _ = stepper.stages(t0, t1, x, full, first)
-        return (full.step(x, c), c), None if guess is None else lax.stop_gradient(first.y)
+        c, _ = stepper.stages(t0, t1, x, factors, first)
+        x1 = factors.full.step(x, c)
+        return (x1, c), None if guess is None else lax.stop_gradient(first.y)
 
     def _replay(self, x: Tree, i: Any, until: Any) -> Tree:
         """x_until from xᵢ."""

@@ -32,11 +32,13 @@ class Memory(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """The propagators of a step of this length, and of half of it where the defect is sampled."""
+    """The propagators of a step of this length, of half of it where the method's stages are there, and
+    up to the points inside where the defect is sampled."""
 
     length: jax.Array
     full: AbstractPropagator
     half: AbstractPropagator | None
+    inner: tuple[AbstractPropagator, ...]
 
 
 class Step(NamedTuple):
@@ -102,7 +104,10 @@ class Stepper(eqx.Module):
     def factors(self, h: Any) -> Factors:
         """Propagators over h."""
         sampled = self.measure and not self.flow.enclosed
-        return Factors(h, self._propagator(h), self._propagator(0.5 * h) if sampled else None)
+        over = lambda theta: self.flow.generator.propagator(theta * h, self.method.degree + 1)  # noqa: E731
+        half = over(0.5) if self.method.halves else None
+        inner = tuple(map(over, self.method.samples)) if sampled else ()
+        return Factors(h, over(1.0), half, inner)
 
     def fitted(self, factors: Factors, t0: Any, t1: Any) -> Factors:
         """Propagators for this step; those of the last one where the length is the same.
@@ -114,7 +119,7 @@ class Stepper(eqx.Module):
         return lax.cond(same, lambda: factors, lambda: self.factors(h))
 
     def stages(
-        self, t0: Any, t1: Any, x0: Tree, full: AbstractPropagator, first: Rate
+        self, t0: Any, t1: Any, x0: Tree, factors: Factors, first: Rate
     ) -> tuple[tuple[Tree, ...], list[Rate]]:
         """The stage polynomial, and the rates it was made from."""
         rates = [first]
@@ -123,8 +128,13 @@ class Stepper(eqx.Module):
             rates.append(self.flow.rate(self._within(t0, t1, theta), x, rates[-1].y))
             return rates[-1].value
 
-        c = self.method.coefficients(evaluate, lambda c: full.step(x0, c), first.value)
-        return c, rates
+        def propagate(theta: float, c: tuple[Tree, ...]) -> Tree:
+            if theta == 1.0:
+                return factors.full.step(x0, c)
+            assert factors.half is not None and theta == 0.5
+            return factors.half.step(x0, shortened(c, theta))
+
+        return self.method.coefficients(evaluate, propagate, first.value), rates
 
     def first(self, t0: Any, t1: Any, x0: Tree, guess: Tree | None) -> Rate:
         """f̃ where the step begins."""
@@ -142,7 +152,7 @@ class Stepper(eqx.Module):
             first = lax.cond(
                 jumped, lambda: self._kept(self.first(t0, t1, x0, memory.guess)), lambda: kept
             )
-        c, rates = self.stages(t0, t1, x0, factors.full, first)
+        c, rates = self.stages(t0, t1, x0, factors, first)
         x1 = factors.full.step(x0, c)
         error, impulse = None, (0.0, 0.0)
         if self.measure:
@@ -176,9 +186,6 @@ class Stepper(eqx.Module):
         ulps = jnp.where(at_end, END_ULPS, KNOT_ULPS)
         inset = lax.stop_gradient(jnp.minimum(ulps * _ulp(t0, t1), 0.25 * (t1 - t0)))
         return t0 + inset if theta == 0.0 else t1 - inset
-
-    def _propagator(self, h: Any) -> AbstractPropagator:
-        return self.flow.generator.propagator(h, self.method.degree + 1)
 
     def _kept(self, rate: Rate) -> Rate:
         """What the next step needs of a rate: not the law behind it, where nothing samples it."""
@@ -225,36 +232,56 @@ class Stepper(eqx.Module):
         factors: Factors,
         last: Rate,
     ) -> Sample:
-        """The defect δ = p − f̃(·, x_h) at the start, the middle and the end of the step.
+        """The defect δ = p − f̃(·, x_h) at the start, inside and at the end of the step.
 
         Between the samples δ is taken to be a line plus a bump (a parabola, or the tent of a kink):
-        then ∫|δ| ≤ h(½|δ(0)| + ½|δ(1)| + |δ(½) − ½(δ(0) + δ(1))|), whatever the place of the kink.
-        δ(0) is zero for a method whose polynomial starts at f̃(t₀, x₀), as most do.
+        then ∫|δ| ≤ h(½|δ(0)| + ½|δ(1)| + max |δ(θ) − (1 − θ)δ(0) − θδ(1)|), whatever the place of the
+        kink. δ(0) is zero for a method whose polynomial starts at f̃(t₀, x₀), as most do.
         """
-        h = t1 - t0
-        flow = self.flow
-        assert factors.half is not None
-        xm = factors.half.step(x0, shortened(c, 0.5))
-        tm, te = self._within(t0, t1, 0.5), self._within(t0, t1, 1.0)
-        middle = flow.rate(tm, xm, first.y)
-        start = _tree.scale(0.5, _tree.sub(first.value, c[0]))
-        end = _tree.scale(0.5, _tree.sub(last.value, polynomial(c, 1.0)))
-        line = _tree.add(start, end)
-        bump = _tree.sub(_tree.sub(middle.value, polynomial(c, 0.5)), line)
+        h, flow, thetas = t1 - t0, self.flow, self.method.samples
+        te = self._within(t0, t1, 1.0)
+        inner = []
+        for theta, propagator in zip(thetas, factors.inner, strict=True):
+            t, x = self._within(t0, t1, theta), propagator.step(x0, shortened(c, theta))
+            inner.append((t, x, flow.rate(t, x, inner[-1][2].y if inner else first.y)))
+        start = _tree.sub(first.value, c[0])
+        end = _tree.sub(last.value, polynomial(c, 1.0))
+        bumps = []
+        for theta, (_, _, rate) in zip(thetas, inner, strict=True):
+            line = _tree.add(_tree.scale(1.0 - theta, start), _tree.scale(theta, end))
+            bumps.append(_tree.sub(_tree.sub(rate.value, polynomial(c, theta)), line))
 
-        # How well z, the unconstrained value of the law, is predicted in the middle.
+        # How well z, the unconstrained value of the law, is predicted by its other samples.
+        zs = [first.z, *(rate.z for _, _, rate in inner), last.z]
+        weights = _extrapolation((0.0, *thetas, 1.0))
         doubt = jtu.tree_map(
-            lambda a, m, b: _DOUBT * (m - 0.5 * (a + b)), first.z, middle.z, last.z
+            lambda *z: _DOUBT * sum(w * v for w, v in zip(weights, z, strict=True)), *zs
         )
-        unseen = jtu.tree_map(
-            jnp.maximum, flow.hidden(tm, xm, middle, doubt), flow.hidden(te, x1, last, doubt)
-        )
-        error = jtu.tree_map(lambda *parts: sum(map(jnp.abs, parts)), start, end, bump, unseen)
+        unseen = flow.hidden(te, x1, last, doubt)
+        for t, x, rate in inner:
+            unseen = jtu.tree_map(jnp.maximum, unseen, flow.hidden(t, x, rate, doubt))
+        ends = _tree.scale(0.5, start), _tree.scale(0.5, end)
+        bump = jtu.tree_map(lambda *b: jnp.max(jnp.abs(jnp.stack(b)), axis=0), *bumps)
+        error = jtu.tree_map(lambda *parts: sum(map(jnp.abs, parts)), *ends, bump, unseen)
         space = flow.state_space(x0)
-        defect = h * sum(map(space.norm, (start, end, bump, unseen)))
-        residuals = [first.residual, middle.residual, last.residual]
+        defect = h * sum(map(space.norm, (*ends, bump, unseen)))
+        residuals = [first.residual, *(rate.residual for _, _, rate in inner), last.residual]
         law_defect = h * jnp.max(jnp.stack(residuals))
         return Sample(last, error, defect, law_defect)
+
+
+def _extrapolation(nodes: tuple[float, ...]) -> list[float]:
+    """Weights of values at the nodes that add up to how far the last inner one is from what the others
+    predict: the parabola's (or the line's) for as many nodes as there are."""
+    k = len(nodes) - 2
+    others = [j for j in range(len(nodes)) if j != k]
+    weights = [1.0] * len(nodes)
+    for j in others:
+        for i in others:
+            if i != j:
+                weights[j] *= (nodes[k] - nodes[i]) / (nodes[j] - nodes[i])
+        weights[j] *= -1.0
+    return weights
 
 
 def _ulp(t0: Any, t1: Any) -> Any:
