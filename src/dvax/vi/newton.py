@@ -42,11 +42,16 @@ _WILD = 10.0
 """A Newton point whose ‖w‖ is so many times the best is not gone on from."""
 
 
+_OTHER = 1e3
+"""Where F is so many times what it was, a first Newton point has left the region where F is anything
+like its linearisation."""
+
+
 class _State(NamedTuple):
     """`z`, and `ahead`, the linearisation at `at` of F where z projects to; `base` and `lam`, where the
     safeguard goes on; `best`, the ‖w‖ to be halved; `left`, how many Newton steps may still fail to,
     of the `run` that they had; Newton rests for `wait` steps, next time for `pause`; `singular`,
-    whether its last system was."""
+    whether its last system was; `limit`, how large F may be at the first Newton point."""
 
     z: Tree
     at: Tree
@@ -59,6 +64,7 @@ class _State(NamedTuple):
     wait: jax.Array
     pause: jax.Array
     singular: jax.Array
+    limit: jax.Array
 
 
 def safeguarded_newton(
@@ -82,17 +88,13 @@ def safeguarded_newton(
         Fy, slope = vi.F(y), slope_at(y)
         tau = first_step(vi, y, Fy, slope)
         z = _tree.sub(y, _tree.scale(tau, Fy))
-        move = _tree.sub(vi.K.project(z, vi.space), y)
-        bent = slope(move)
+        bent = slope(_tree.sub(vi.K.project(z, vi.space), y))
         ahead = _tree.add(Fy, bent)
-        # ‖w‖ where z projects to is at most about this: a first Newton point that is much worse has
-        # left the region where F is anything like its linearisation.
-        expected = vi.space.norm(bent) + vi.space.norm(move) / tau
-        best = jnp.maximum(expected, tol if vi.gamma is None else vi.gamma * tol)
-        none, one = jnp.asarray(0), jnp.asarray(1)
+        limit = _OTHER * (vi.space.norm(Fy) + vi.space.norm(bent))
+        none, one, far = jnp.asarray(0), jnp.asarray(1), jnp.full_like(tau, jnp.inf)
         run, no = jnp.asarray(_RUN), jnp.asarray(False)
-        state = _State(z, y, ahead, y, step * tau, best, run, run, none, one, no)
-        return state, tau, jnp.full_like(tau, jnp.inf)
+        state = _State(z, y, ahead, y, step * tau, far, run, run, none, one, no, limit)
+        return state, tau, far
 
     def newton(vi: Frozen, s: _State, tau: Any, first: Any) -> tuple[Tree, Tree, Tree, Tree]:
         project = lambda z: vi.K.project(z, vi.space)  # noqa: E731
@@ -118,8 +120,10 @@ def safeguarded_newton(
         idle = s.z, s.at, s.ahead, s.ahead
         found = lax.cond(any_of_batch(tries), lambda: newton(vi, s, tau, first), lambda: idle)
         norm = vi.space.norm(found[3])
-        halved = tries & (norm <= 0.5 * s.best)
-        onward = tries & (s.left > 0) & (norm <= _WILD * s.best) & jnp.isfinite(norm)
+        # Nothing is known yet that the first point could halve; but it must lie where F is alike.
+        alike = (vi.space.norm(found[2]) <= s.limit) | jnp.isfinite(s.best)
+        halved = tries & (norm <= 0.5 * s.best) & alike
+        onward = tries & alike & (s.left > 0) & (norm <= _WILD * s.best) & jnp.isfinite(norm)
         taken = halved | onward
         reached, base, lam, calls = lax.cond(
             any_of_batch(~taken),
@@ -146,6 +150,7 @@ def safeguarded_newton(
             wait=jnp.where(taken, 0, jnp.where(failed, s.pause, s.wait - 1)),
             pause=jnp.where(halved, 1, jnp.where(failed, jnp.minimum(2 * s.pause, 8), s.pause)),
             singular=jnp.where(tries, ~_tree.all_finite(found[0]), s.singular),
+            limit=s.limit,
         )
         first = jnp.where(jnp.isfinite(first), first, norm)
         word = RESULTS.where(new.singular, RESULTS.singular, RESULTS.max_steps)
