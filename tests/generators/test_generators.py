@@ -62,6 +62,9 @@ def test_scalar_diagonal_dense_and_product_are_the_same_operator_in_other_clothe
     parts = generators.Product(generators.Scalar(-0.5), generators.Diagonal(a[1:]))
     split = lambda v: (v[0], v[1:])  # noqa: E731
     pair = parts.propagator(h, 2).step(split(x), tuple(map(split, c)))
+    nothing = generators.Zero().propagator(h, 2).step(x, c)
+    nothing_at_all = generators.Scalar(0.0).propagator(h, 2).step(x, c)
+    np.testing.assert_allclose(np.asarray(nothing), np.asarray(nothing_at_all), rtol=1e-14)
     for other in (dense, scalar, jnp.concatenate([pair[0][None], pair[1]])):
         np.testing.assert_allclose(np.asarray(other), np.asarray(diagonal), rtol=1e-14)
     applied = [g.apply(x) for g in (generators.Dense(np.diag(a)), generators.Scalar(-0.5))]
@@ -86,10 +89,28 @@ def test_no_random_matrix_breaks_its_growth_bound_and_none_could_have_a_smaller_
         assert omega == pytest.approx(symmetric_extremes(A, w)[1], abs=1e-10)
 
 
+@pytest.mark.parametrize("weighted", [False, True])
+def test_a_matrix_far_from_normal_has_a_bound_that_decays_and_holds(weighted):
+    # ‖e^{At}‖ rises above 100 before it decays: the logarithmic norm is +149.
+    A = np.array([[-1.0, 300.0], [0.0, -1.2]])
+    w = np.array([0.3, 2.0]) if weighted else np.ones(2)
+    space = spaces.L2(w) if weighted else spaces.Euclidean(2)
+    M, omega = map(float, generators.Dense(A, omega=-0.8).growth(space))
+    root = np.diag(np.sqrt(w))
+    norms = [
+        np.linalg.norm(root @ scipy.linalg.expm(t * A) @ np.linalg.inv(root), 2) / np.exp(omega * t)
+        for t in np.geomspace(1e-3, 30.0, 200)
+    ]
+    assert omega == -0.8 and max(norms) > (100 if not weighted else 38)
+    assert max(norms) <= M <= 20 * max(norms)
+    assert float(generators.Dense(A).growth(space).omega) > 50
+
+
 def test_growth_of_the_other_generators_is_read_off():
     plane = spaces.Euclidean(2)
     assert float(generators.Scalar(-0.7).growth(plane).omega) == -0.7
     assert float(generators.Diagonal(jnp.array([-3.0, -0.2])).growth(plane).omega) == -0.2
+    assert tuple(map(float, generators.Zero().growth(plane))) == (1.0, 0.0)
     both = generators.Product(generators.Scalar(-4.0), generators.Diagonal(jnp.array([-3.0, 0.5])))
     bound = both.growth(spaces.Product(spaces.Euclidean(), plane))
     assert (float(bound.M), float(bound.omega)) == (1.0, 0.5)
@@ -100,6 +121,7 @@ def test_growth_of_the_other_generators_is_read_off():
     [
         (lambda: generators.Dense(jnp.ones((2, 3))), r"shape \(2, 3\)"),
         (lambda: generators.Dense(jnp.ones(3)), r"shape \(3,\)"),
+        (lambda: generators.Dense(jnp.eye(2), omega=1.0), "above the real part"),
         (lambda: generators.Scalar(True), "True"),
         (lambda: generators.Scalar("fast"), "fast"),
         (lambda: generators.Diagonal(np.array([1, 2])), "int64"),

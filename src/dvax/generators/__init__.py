@@ -8,3 +8,4 @@ from .diagonal import Diagonal as Diagonal
 from .elliptic import Elliptic as Elliptic
 from .product import Product as Product
 from .scalar import Scalar as Scalar
+from .zero import Zero as Zero

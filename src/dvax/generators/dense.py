@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .. import _tree
 from .._tree import Tree
@@ -17,11 +18,17 @@ class Dense(AbstractGenerator):
     """A v = matrix @ v for states that are vectors of n entries.
 
     The growth bound is the logarithmic norm: M = 1 and ω = λ_max of the symmetric part of A in the
-    space's inner product, since d/dt ½‖e^{At}v‖² = ⟨A e^{At}v, e^{At}v⟩ ≤ ω‖e^{At}v‖².
+    space's inner product, since d/dt ½‖e^{At}v‖² = ⟨A e^{At}v, e^{At}v⟩ ≤ ω‖e^{At}v‖². For a matrix
+    far from normal that ω is far above the real parts of the eigenvalues. With `omega` given, any
+    number above those, M is √cond(Q) for the Q > 0 with (A − ω)ᵀQ + Q(A − ω) = −I (Lyapunov): in the
+    norm of Q the semigroup grows no faster than e^{ωt}, and that norm is within √cond(Q) of the
+    space's. The bound is checked on the Q found, so it holds though Q is rounded.
 
-    **Arguments:** `matrix`: square, in 1/time.
+    **Arguments:** `matrix`: square, in 1/time; `omega`: the rate that the growth bound should have, in
+    1/time.
 
-    **Raises:** `dvax.InputError` where the matrix is not square.
+    **Raises:** `dvax.InputError` where the matrix is not square, or `omega` not above the real parts
+    of its eigenvalues.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -33,9 +40,12 @@ class Dense(AbstractGenerator):
     """
 
     matrix: jax.Array
+    omega: jax.Array | None
 
-    def __init__(self, matrix: Any):
+    def __init__(self, matrix: Any, omega: Any = None):
         self.matrix = _tree.as_float(matrix, "dvax.generators.Dense(matrix)")
+        name = "dvax.generators.Dense(omega)"
+        self.omega = None if omega is None else _tree.as_float(omega, name)
         shape = self.matrix.shape
         if len(shape) != 2 or shape[0] != shape[1]:
             raise InputError(
@@ -45,6 +55,15 @@ class Dense(AbstractGenerator):
                     "a generator maps the state space to itself, so its matrix is square",
                     "Use dvax.generators.Diagonal for a vector of diagonal entries",
                 )
+            )
+        if self.omega is not None:
+            rate = self.omega
+            _tree.require(
+                lambda: np.max(np.linalg.eigvals(np.asarray(self.matrix)).real) < float(rate),
+                name,
+                rate,
+                "no e^{ωt} bounds the semigroup unless ω is above the real part of every eigenvalue",
+                "Give a larger one, or leave it out for the logarithmic norm",
             )
 
     def apply(self, v: Tree) -> Tree:
@@ -61,6 +80,8 @@ class Dense(AbstractGenerator):
         # ⟨Av, v⟩ = vᵀWAv: with q = W^{1/2}v it is qᵀ(W^{1/2}AW^{-1/2})q, so weights only rescale.
         root = jnp.broadcast_to(jnp.sqrt(space.weights()), self.matrix.shape[:1])
         similar = root[:, None] * self.matrix / root[None, :]
+        if self.omega is not None:
+            return Growth(_overshoot(similar, self.omega), self.omega)
         return Growth(jnp.ones(()), jnp.linalg.eigvalsh(0.5 * (similar + similar.T))[-1])
 
     def bend(
@@ -79,6 +100,18 @@ class Dense(AbstractGenerator):
         rise = growth.M * jnp.exp(jnp.maximum(growth.omega, 0.0) * h)
         largest = rise * space.norm(curvature)
         return jnp.broadcast_to(h**2 / 8 * largest / jnp.sqrt(space.weights()), x0.shape)
+
+
+def _overshoot(matrix: jax.Array, omega: jax.Array) -> jax.Array:
+    """An M with ‖e^{At}‖ ≤ M e^{ωt}, by Lyapunov's equation; ∞ where it shows none."""
+    eye = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
+    shifted = matrix - omega * eye
+    Q = jax.scipy.linalg.solve_sylvester(shifted.T, shifted, -eye)
+    Q = 0.5 * (Q + Q.T)
+    sizes = jnp.linalg.eigvalsh(Q)
+    falls = jnp.linalg.eigvalsh(shifted.T @ Q + Q @ shifted)[-1] <= 0.0
+    holds = falls & (sizes[0] > 0.0)
+    return jnp.where(holds, jnp.sqrt(sizes[-1] / jnp.where(holds, sizes[0], 1.0)), jnp.inf)
 
 
 class MatrixPropagator(AbstractPropagator):
