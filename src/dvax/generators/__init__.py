@@ -7,5 +7,6 @@ from .dense import Dense as Dense
 from .diagonal import Diagonal as Diagonal
 from .elliptic import Elliptic as Elliptic
 from .product import Product as Product
+from .rotation import Rotation as Rotation
 from .scalar import Scalar as Scalar
 from .zero import Zero as Zero
