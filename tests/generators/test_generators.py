@@ -144,3 +144,51 @@ def test_what_is_no_generator_is_refused_with_what_was_given(make, word):
 def test_a_generator_of_another_size_than_the_state_is_refused(A):
     with pytest.raises(dvax.InputError, match=r"dvax\.generators"):
         A.check(spaces.Euclidean(2))
+
+
+def weighted(*shape, alike):
+    rng = np.random.default_rng(6)
+    return spaces.L2(np.full(shape, 0.3) if alike else rng.uniform(0.2, 2.0, shape))
+
+
+ADJOINTS = {
+    "Zero": (generators.Zero(), weighted(3, alike=False)),
+    "Scalar": (generators.Scalar(-2.0), weighted(3, alike=False)),
+    "Diagonal": (generators.Diagonal(np.array([-2.0, 0.1, 3.0])), weighted(3, alike=False)),
+    "Dense": (generators.Dense(MATRICES["non-normal"]), weighted(3, alike=False)),
+    "Elliptic": (
+        generators.Elliptic((3, 4), 1.0, ("neumann", "periodic"), velocity=(0.0, 2.0)),
+        weighted(3, 4, alike=True),
+    ),
+    "Rotation": (
+        generators.Rotation(np.array([-1.0, 0.2]), np.array([3.0, 1.0])),
+        spaces.Product(weighted(2, alike=True), weighted(2, alike=True)),
+    ),
+    "Product": (
+        generators.Product(generators.Dense(MATRICES["skew"]), generators.Scalar(2.0)),
+        spaces.Product(weighted(3, alike=False), weighted(2, alike=False)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ADJOINTS)
+def test_the_adjoint_and_its_semigroup_change_sides(name):
+    A, space = ADJOINTS[name]
+    rng = np.random.default_rng(7)
+    v, w = (
+        jax.tree_util.tree_map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), space.zeros())
+        for _ in range(2)
+    )
+    other = A.adjoint(space)
+    for left, right in (
+        (A.apply(v), other.apply(w)), (A.semigroup(0.4, v), other.semigroup(0.4, w)),
+    ):  # fmt: skip
+        assert float(space.inner(left, w)) == pytest.approx(float(space.inner(v, right)), rel=1e-11)
+
+
+def test_an_adjoint_of_another_kind_is_refused():
+    with pytest.raises(dvax.InputError, match="no constant coefficients"):
+        generators.Elliptic(4).adjoint(weighted(4, alike=False))
+    uneven = spaces.Product(spaces.L2(np.ones(2)), spaces.L2(np.full(2, 3.0)))
+    with pytest.raises(dvax.InputError, match="no Rotation"):
+        generators.Rotation(np.zeros(2), np.ones(2)).adjoint(uneven)

@@ -44,6 +44,10 @@ class AbstractGenerator(eqx.Module):
         """The flow over h ≥ 0 for polynomials of up to `terms` coefficients."""
 
     @abc.abstractmethod
+    def adjoint(self, space: AbstractSpace) -> "AbstractGenerator":
+        """A* with ⟨Av, w⟩ = ⟨v, A*w⟩ in `space`."""
+
+    @abc.abstractmethod
     def growth(self, space: AbstractSpace) -> Growth:
         """M and ω with ‖e^{At}‖ ≤ M e^{ωt} in the norm of `space`, proved from A's structure."""
 

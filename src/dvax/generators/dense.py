@@ -76,6 +76,11 @@ class Dense(AbstractGenerator):
         name = "dvax.generators.Dense(matrix)"
         _tree.fits_matrix(name, self.matrix, space.zeros(), "state space")
 
+    def adjoint(self, space: AbstractSpace) -> "Dense":
+        # ⟨Av, w⟩ = vᵀAᵀWw, so A* = W⁻¹AᵀW.
+        w = jnp.broadcast_to(space.weights(), self.matrix.shape[:1])
+        return Dense(self.matrix.T * w[None, :] / w[:, None], self.omega)
+
     def growth(self, space: AbstractSpace) -> Growth:
         # ⟨Av, v⟩ = vᵀWAv: with q = W^{1/2}v it is qᵀ(W^{1/2}AW^{-1/2})q, so weights only rescale.
         root = jnp.broadcast_to(jnp.sqrt(space.weights()), self.matrix.shape[:1])

@@ -42,6 +42,9 @@ class Diagonal(AbstractGenerator):
         name = "dvax.generators.Diagonal(entries)"
         _tree.fits(name, self.entries, space.zeros(), "state space")
 
+    def adjoint(self, space: AbstractSpace) -> "Diagonal":
+        return self
+
     def growth(self, space: AbstractSpace) -> Growth:
         return Growth(jnp.ones(()), jnp.max(jnp.real(self.entries)))
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -97,6 +98,15 @@ class Elliptic(AbstractGenerator):
             space.zeros(),
             "state space",
         )
+
+    def adjoint(self, space: AbstractSpace) -> "Elliptic":
+        alike = self.growth(space).M
+        _tree.require(
+            lambda: float(alike) <= 1.0 + 1e-12, "dvax.generators.Elliptic.adjoint(space)", alike,
+            "where points weigh differently A* has no constant coefficients",
+            "Use a space that weighs them alike",
+        )  # fmt: skip
+        return eqx.tree_at(lambda A: A.symbol, self, jnp.conj(self.symbol))
 
     def growth(self, space: AbstractSpace) -> Growth:
         # ‖v‖ lies between the roots of the least and the largest weight times the plain norm, in which

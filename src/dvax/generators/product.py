@@ -40,6 +40,10 @@ class Product(AbstractGenerator):
         for part, own in zip(self.parts, _parts(space, len(self.parts)), strict=True):
             part.check(own)
 
+    def adjoint(self, space: AbstractSpace) -> "Product":
+        pairs = zip(self.parts, _parts(space, len(self.parts)), strict=True)
+        return Product(*(part.adjoint(own) for part, own in pairs))
+
     def growth(self, space: AbstractSpace) -> Growth:
         pairs = zip(self.parts, _parts(space, len(self.parts)), strict=True)
         bounds = [part.growth(own) for part, own in pairs]

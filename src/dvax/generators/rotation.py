@@ -76,6 +76,15 @@ class Rotation(AbstractGenerator):
         for part in zeros:
             _tree.fits("dvax.generators.Rotation", like, part, "state space, part by part")
 
+    def adjoint(self, space: AbstractSpace) -> "Rotation":
+        alike = self.growth(space).M
+        _tree.require(
+            lambda: float(alike) <= 1.0 + 1e-12, "dvax.generators.Rotation.adjoint(space)", alike,
+            "where q and p, or points of the grid, weigh differently A* is no Rotation",
+            "Use a space that weighs them alike",
+        )  # fmt: skip
+        return Rotation(self.a, -self.b, self.transform)
+
     def growth(self, space: AbstractSpace) -> Growth:
         parts = space.spaces if isinstance(space, ProductSpace) else (space, space)
         first, second = (part.weights() for part in parts)

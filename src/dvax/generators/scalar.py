@@ -41,6 +41,9 @@ class Scalar(AbstractGenerator):
         if jnp.ndim(self.a) != 0:
             _tree.fits("dvax.generators.Scalar(a)", self.a, (), "state space")
 
+    def adjoint(self, space: AbstractSpace) -> "Scalar":
+        return self
+
     def growth(self, space: AbstractSpace) -> Growth:
         return Growth(jnp.ones(()), self.a)
 

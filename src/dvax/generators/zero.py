@@ -31,6 +31,9 @@ class Zero(AbstractGenerator):
     def check(self, space: AbstractSpace) -> None:
         """It acts on everything."""
 
+    def adjoint(self, space: AbstractSpace) -> "Zero":
+        return self
+
     def growth(self, space: AbstractSpace) -> Growth:
         return Growth(jnp.ones(()), jnp.zeros(()))
 
