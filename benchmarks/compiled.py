@@ -25,12 +25,12 @@ def fixed(t1: float, most: int) -> Callable[[Any, Any, Any], Any]:
     return lambda model, x0, dt: jax.block_until_ready(solve(model, x0, dt))
 
 
-def adaptive(t1: float) -> Callable[[Any, Any, Any, Any], Any]:
+def adaptive(t1: float, method: Any = None) -> Callable[[Any, Any, Any, Any], Any]:
     """(model, x0, rtol, atol) -> x(t1) under jax.jit; parameters are arguments."""
 
     @jax.jit
     def solve(model: dvax.models.Contact, x0: Any, rtol: Any, atol: Any) -> Any:
-        return dvax.solve(model.problem, x0, 0.0, t1, rtol=rtol, atol=atol).xs[-1]
+        return dvax.solve(model.problem, x0, 0.0, t1, rtol=rtol, atol=atol, method=method).xs[-1]
 
     return lambda model, x0, rtol, atol: jax.block_until_ready(solve(model, x0, rtol, atol))
 
