@@ -22,7 +22,12 @@ def test_a_signal_ends_a_run_in_good_order(tmp_path: Path, number: signal.Signal
     # A million steps: nobody waits for its end.
     changes = (("dt = 0.05", "dt = 1e-6"), ("frames = 8", "frames = 200"))
     config = write_config(tmp_path / "in", *changes)
-    program = "from dvax.cli import main; main()"
+    # As from a terminal: where the tests themselves run in the background, Ctrl-C is ignored, and what
+    # they start inherits that.
+    program = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from dvax.cli import main; main()"
+    )
     out = tmp_path / "out"
     source = str(Path(dvax.__file__).parents[1])
     run = subprocess.Popen(
