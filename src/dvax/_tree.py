@@ -15,6 +15,16 @@ Tree = Any
 """A pytree of arrays of one floating type."""
 
 
+class Static:
+    """Anything, as a part of a tree that has no leaves."""
+
+    def __init__(self, value: Any):
+        self.value = value
+
+
+jtu.register_pytree_node(Static, lambda s: ((), s.value), lambda value, _: Static(value))
+
+
 def add(a: Tree, b: Tree) -> Tree:
     return jtu.tree_map(jnp.add, a, b)
 

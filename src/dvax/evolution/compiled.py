@@ -43,7 +43,7 @@ def compiled(setup: Setup, ts: Any, options: Options) -> tuple[Solution, bool | 
             # A check within f or h (`eqx.error_if`) is only quoted where Equinox compiles.
             eqx.filter_jit(integrate)(setup, ts, options)
         raise
-    return jtu.tree_unflatten(shape.tree, [*arrays, setup]), reached
+    return jtu.tree_unflatten(shape.value, [*arrays, setup]), reached
 
 
 def _exactly(leaf: Any) -> tuple[Any, ...]:
@@ -71,17 +71,7 @@ class _Kind(NamedTuple):
     options: Options
 
 
-class _Shape:
-    """The structure of a solution that has the setup for its last leaf."""
-
-    def __init__(self, tree: Any):
-        self.tree = tree
-
-
-jtu.register_pytree_node(_Shape, lambda shape: ((), shape.tree), lambda tree, _: _Shape(tree))
-
-
-def _traced(numbers: list[Any], kind: _Kind) -> tuple[list[Any], jax.Array, _Shape]:
+def _traced(numbers: list[Any], kind: _Kind) -> tuple[list[Any], jax.Array, _tree.Static]:
     leaves = [r[1] if n is None else n for n, r in zip(numbers, kind.rest, strict=True)]
     split = kind.code.num_leaves
     problem, method, vi_solver = jtu.tree_unflatten(kind.code, leaves[:split])
@@ -91,7 +81,8 @@ def _traced(numbers: list[Any], kind: _Kind) -> tuple[list[Any], jax.Array, _Sha
     reached = (solution.result == RESULTS.successful) & jnp.all(jnp.isfinite(solution.ts))
     arrays, tree = jtu.tree_flatten(solution, is_leaf=lambda node: node is setup)
     assert arrays.pop() is setup
-    return arrays, reached, _Shape(tree)
+    # The structure of a solution that has the setup for its last leaf.
+    return arrays, reached, _tree.Static(tree)
 
 
 _run = jax.jit(_traced, static_argnums=1)

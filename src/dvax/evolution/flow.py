@@ -60,6 +60,10 @@ class Flow(eqx.Module):
             return self._closed_form(t, x)
         return _solved(self, t, x, guess)
 
+    def guess(self, x: Tree) -> Tree | None:
+        """Where the law's solver starts when nothing is known; None where it needs no start."""
+        return None if self.direct else self.problem.zero_control(x)
+
     def _closed_form(self, t: Any, x: Tree) -> Rate:
         problem, args = self.problem, self.args
         drive = problem.h(t, x, problem.zero_control(x), args)

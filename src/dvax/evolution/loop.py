@@ -146,9 +146,7 @@ class Loop(eqx.Module):
         def goes_on(state: State) -> Any:
             before = state.t < time
             if state.last is None:
-                # Saved times that coincide with the end of a step do so up to rounding.
-                end = self.controller.end(state.control)
-                before = before & (end <= time + 4 * jnp.finfo(time.dtype).eps * jnp.abs(time))
+                before = before & (self.controller.end(state.control) <= time + slack(time))
             going = state.result == RESULTS.successful
             return before & going & (state.attempts < self.max_steps)
 
@@ -210,7 +208,7 @@ class Loop(eqx.Module):
                 c = self._polynomial(state, t0, t1)
                 return inside(generator, t1 - t0, (time - t0) / (t1 - t0), state.x, c)
 
-            met = time <= t0 + 4 * jnp.finfo(time.dtype).eps * jnp.abs(time)
+            met = time <= t0 + slack(t0)
             reached = met | ((t1 > time) & (state.result == RESULTS.successful))
             x = lax.cond(met, lambda: state.x, between)
             impulse = settled = state.impulse
@@ -238,3 +236,8 @@ class Loop(eqx.Module):
             factors = stepper.fitted(state.factors, t0, t1)
         first = stepper.first(t0, t1, state.x, state.memory.guess)
         return stepper.stages(t0, t1, state.x, factors, first)[0]
+
+
+def slack(t: Any) -> Any:
+    """How far a saved time may lie from the end of a step and still be it: both are rounded."""
+    return 4 * jnp.finfo(t.dtype).eps * jnp.abs(t)

@@ -23,24 +23,8 @@ from jax import lax
 from .. import _tree
 from .._tree import Tree
 from .checkpoints import Checkpoints, how_many
-from .loop import Loop, Saved, State
+from .loop import Loop, Saved, State, slack
 from .stepper import inside
-
-
-class _Static:
-    """Anything, as a part of a tree that has no leaves."""
-
-    def __init__(self, value: Any):
-        self.value = value
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Static) and self.value == other.value
-
-    def __hash__(self) -> int:
-        return hash(self.value)
-
-
-jtu.register_pytree_node(_Static, lambda s: ((), s), lambda s, _: s)
 
 
 def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State]:
@@ -62,7 +46,7 @@ def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State
         x0, loop, ts = whole(leaves)
         saved, state = loop.run(x0, ts, Checkpoints(x0, how_many(x0, loop.max_steps)[0]))
         assert state.checkpoints is not None
-        moving = _Static(tuple(leaf.perturbed for leaf in given))
+        moving = _tree.Static(tuple(leaf.perturbed for leaf in given))
         kept = leaves, moving, state.ends, state.checkpoints, state.steps
         states, rest = _states(saved, state)
         return (states, rest), kept
@@ -128,7 +112,12 @@ class _Backward:
         moving = tuple(leaf for leaf, m in zip(self.leaves, self.moving, strict=True) if m)
         adjoint = bar.last if bar.last is not None else _tree.zeros_like(self.x0)
         row = -1 if self.ts is None else self.ts.shape[0] - 1
-        carry = (adjoint, jtu.tree_map(jnp.zeros_like, moving), jnp.asarray(row), self._guess())
+        carry = (
+            adjoint,
+            jtu.tree_map(jnp.zeros_like, moving),
+            jnp.asarray(row),
+            self.loop.stepper.flow.guess(self.x0),
+        )
         between = how_many(self.x0, self.loop.max_steps)[1]
         blank = jtu.tree_map(lambda v: jnp.zeros((between, *v.shape), v.dtype), self.x0)
 
@@ -180,10 +169,6 @@ class _Backward:
         ours, theirs = iter(moving), iter(self.fixed)
         return self.whole([next(ours if m else theirs) for m in self.moving])[1]
 
-    def _guess(self) -> Tree | None:
-        flow = self.loop.stepper.flow
-        return None if flow.direct else flow.problem.zero_control(self.x0)
-
     def _times(self, loop: Loop, i: Any) -> tuple[Any, Any]:
         boundary = loop.controller.boundary
         return boundary(i, self.ends), boundary(i + 1, self.ends)
@@ -206,7 +191,9 @@ class _Backward:
             (x, _), guess = self._advance(self.loop, i, x, guess)
             return i + 1, x, guess
 
-        return lax.while_loop(lambda c: c[0] < until, one, (i, x, self._guess()))[1]
+        return lax.while_loop(
+            lambda c: c[0] < until, one, (i, x, self.loop.stepper.flow.guess(self.x0))
+        )[1]
 
     def _refill(self, shelf: Tree, first: Any, x: Tree, end: Any, apart: Any) -> Tree:
         """Every `apart`-th state from `first` on, of those before `end`."""
@@ -244,7 +231,6 @@ class _Backward:
         """The times saved in this step, the last ones first."""
         assert self.ts is not None
         ts, (t0, t1) = self.ts, self._times(self.loop, i)
-        slack = 4 * jnp.finfo(ts.dtype).eps * jnp.abs(t0)
 
         def at(p: Any, x: Tree, c: Any, time: Any) -> Tree:
             loop = self._parts(p)
@@ -264,9 +250,9 @@ class _Backward:
             def at_end() -> Any:
                 return _tree.add(adjoint, psi), behind, bent, gathered
 
-            return *lax.cond(ts[row] >= t1 - slack, at_end, within), row - 1
+            return *lax.cond(ts[row] >= t1 - slack(t1), at_end, within), row - 1
 
-        return lax.while_loop(lambda c: (c[-1] >= 0) & (ts[c[-1]] > t0 + slack), one, carry)
+        return lax.while_loop(lambda c: (c[-1] >= 0) & (ts[c[-1]] > t0 + slack(t0)), one, carry)
 
 
 def _is_zero(leaf: Any) -> bool:

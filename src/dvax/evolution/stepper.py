@@ -95,7 +95,7 @@ class Stepper(eqx.Module):
 
     def begin(self, x0: Tree) -> Memory:
         """Before the first step nothing is known but where to look first."""
-        guess = None if self.flow.direct else self.flow.problem.zero_control(x0)
+        guess = self.flow.guess(x0)
         if not self.measure:
             return Memory(None, guess)
         blank = jax.eval_shape(lambda: self._kept(self.flow.rate(self.ends[0], x0, guess)))

@@ -15,7 +15,7 @@ from ..spaces import AbstractSpace
 from .abstract import AbstractGenerator, AbstractPropagator, Growth
 from .phi import flow_factors, phi_scalar
 from .scalar import elementwise_bend
-from .transforms import BOUNDARIES, Transform, along
+from .transforms import BOUNDARIES, Transform, along, times
 
 
 class Elliptic(AbstractGenerator):
@@ -84,7 +84,7 @@ class Elliptic(AbstractGenerator):
         self.symbol = growing if still else jax.lax.complex(growing, turning)
 
     def apply(self, v: Tree) -> Tree:
-        return self.transform.backward(_times(self.symbol, self.transform.forward(v)))
+        return self.transform.backward(times(self.symbol, self.transform.forward(v)))
 
     def propagator(self, h: Any, terms: int) -> "SpectralPropagator":
         h = jnp.asarray(h).astype(self.symbol.dtype)
@@ -128,7 +128,7 @@ class Elliptic(AbstractGenerator):
         parts = [forward(v) for v in (x0, x1, *c)]
         if jnp.iscomplexobj(self.symbol):
             start, _, first, *rest = parts
-            slope = _times(1.0 / h, rest[0]) if rest else jnp.zeros_like(first)
+            slope = times(1.0 / h, rest[0]) if rest else jnp.zeros_like(first)
             curvature = jnp.abs(self.symbol * (self.symbol * start + first) + slope)
             rise = jnp.exp(jnp.maximum(jnp.real(self.symbol), 0.0) * h)
             leaves = h**2 / 8 * rise * curvature
@@ -147,15 +147,8 @@ class SpectralPropagator(AbstractPropagator):
 
     def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
         forward = self.transform.forward
-        products = [_times(f, forward(v)) for f, v in zip(self.factors, (x0, *c), strict=False)]
+        products = [times(f, forward(v)) for f, v in zip(self.factors, (x0, *c), strict=False)]
         return self.transform.backward(sum(products[1:], start=products[0]))
-
-
-def _times(factor: Any, c: jax.Array) -> jax.Array:
-    """The product, of which either may be complex."""
-    if jnp.iscomplexobj(c) and not jnp.iscomplexobj(factor):
-        return jax.lax.complex(factor * jnp.real(c), factor * jnp.imag(c))
-    return factor * c
 
 
 def _both(bend: Any, parts: list[jax.Array]) -> jax.Array:

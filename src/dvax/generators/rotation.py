@@ -12,7 +12,7 @@ from ..spaces import AbstractSpace
 from ..spaces import Product as ProductSpace
 from .abstract import AbstractGenerator, AbstractPropagator, Growth
 from .phi import flow_factors, phi_scalar
-from .transforms import Transform
+from .transforms import Transform, times
 
 
 class Rotation(AbstractGenerator):
@@ -147,5 +147,4 @@ class RotationPropagator(AbstractPropagator):
 def _turned(a: jax.Array, b: jax.Array, v: Tree) -> Tree:
     """(a + ib)(q + ip) as a pair; q and p may be complex themselves, as coefficients of real fields."""
     q, p = v
-    times = lambda f, c: jax.lax.complex(f * c.real, f * c.imag) if jnp.iscomplexobj(c) else f * c  # noqa: E731
     return times(a, q) - times(b, p), times(b, q) + times(a, p)

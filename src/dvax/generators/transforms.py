@@ -123,6 +123,13 @@ class Transform(eqx.Module):
         return jnp.asarray(along(a, axis, len(self.shape)), dtype)
 
 
+def times(factor: Any, c: jax.Array) -> jax.Array:
+    """The product with coefficients, of which either may be complex."""
+    if jnp.iscomplexobj(c) and not jnp.iscomplexobj(factor):
+        return jax.lax.complex(factor * jnp.real(c), factor * jnp.imag(c))
+    return factor * c
+
+
 def along(v: Any, axis: int, count: int) -> Any:
     """A vector as an array of `count` axes that varies along one of them."""
     return v.reshape(*(1,) * axis, -1, *(1,) * (count - 1 - axis))
