@@ -1,6 +1,7 @@
 """What a call hands to its compiled loop, and what it gives back of it."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -105,3 +106,15 @@ def test_single_precision_is_kept_from_end_to_end(steps):
     sol = dvax.solve(system, one(-1.0), 0.0, 2.0, **steps)
     assert sol.xs.dtype == jnp.float32
     assert float(sol.xs[-1]) == pytest.approx(1.8360919559905713, abs=5e-3)
+
+
+@pytest.mark.parametrize("steps", [{"rtol": 1e-6}, {"dt": 0.01}], ids=["adaptive", "fixed"])
+def test_progress_is_shown_when_asked_and_changes_nothing(steps, capfd):
+    case = c1()
+    silent = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, **steps)
+    assert "%" not in "".join(capfd.readouterr())
+    shown = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, progress=True, **steps)
+    jax.block_until_ready(shown.xs)
+    jax.effects_barrier()
+    assert "100.00%" in "".join(capfd.readouterr())
+    assert float(shown.xs[0]) == float(silent.xs[0])

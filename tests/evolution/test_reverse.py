@@ -67,7 +67,9 @@ def test_backward_is_forward_transposed(kind, places, cubic, monkeypatch):
     given = X0, ARGS
     found, _ = jax.flatten_util.ravel_pytree(jax.grad(loss)(given, "reverse"))
     exact = forward(lambda g: loss(g, "forward"), given)
-    np.testing.assert_allclose(np.asarray(found), np.asarray(exact), rtol=1e-7, atol=1e-7)
+    # A law that is iterated is solved to its tolerance only.
+    close = 1e-7 if cubic else 1e-11
+    np.testing.assert_allclose(np.asarray(found), np.asarray(exact), rtol=close, atol=close)
 
 
 def test_checkpoints_hold_every_state_that_they_say_they_do():

@@ -104,6 +104,7 @@ class _Backward:
         self.moving = [m and r for m, r in zip(moving, real, strict=True)]
         self.ends, self.checkpoints, self.steps = ends, checkpoints, steps
         self.x0, self.loop, self.ts = whole(leaves)
+        self.guess = self.loop.stepper.flow.guess(self.x0)
         self.fixed = [leaf for leaf, m in zip(leaves, self.moving, strict=True) if not m]
 
     def run(self, bar: _States) -> tuple[Any, ...]:
@@ -116,7 +117,7 @@ class _Backward:
             adjoint,
             jtu.tree_map(jnp.zeros_like, moving),
             jnp.asarray(row),
-            self.loop.stepper.flow.guess(self.x0),
+            self.guess,
         )
         between = how_many(self.x0, self.loop.max_steps)[1]
         blank = jtu.tree_map(lambda v: jnp.zeros((between, *v.shape), v.dtype), self.x0)
@@ -191,9 +192,7 @@ class _Backward:
             (x, _), guess = self._advance(self.loop, i, x, guess)
             return i + 1, x, guess
 
-        return lax.while_loop(
-            lambda c: c[0] < until, one, (i, x, self.loop.stepper.flow.guess(self.x0))
-        )[1]
+        return lax.while_loop(lambda c: c[0] < until, one, (i, x, self.guess))[1]
 
     def _refill(self, shelf: Tree, first: Any, x: Tree, end: Any, apart: Any) -> Tree:
         """Every `apart`-th state from `first` on, of those before `end`."""

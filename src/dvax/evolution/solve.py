@@ -68,7 +68,8 @@ def solve(
     - `max_steps`: the most steps, 2²⁰ by default for adaptive ones; with fixed steps, counted;
     - `adjoint`: "reverse" serves `jax.grad` and `jax.vjp`, "forward" serves `jax.jvp` and
       `jax.jacfwd`: one loop cannot serve both;
-    - `throw`: raise where the solve fails; otherwise look at `result`.
+    - `throw`: raise where the solve fails; otherwise look at `result`. Under `jax.jit` nothing can
+      raise: times that were not reached are infinite there, and their states NaN.
 
     **Returns:** a `Solution`.
 

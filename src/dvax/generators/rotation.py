@@ -61,7 +61,7 @@ class Rotation(AbstractGenerator):
             )
 
     def apply(self, v: Tree) -> Tree:
-        return self._back(_turned(self.a, self.b, self._there(v)))
+        return self.back(_turned(self.a, self.b, self.there(v)))
 
     def propagator(self, h: Any, terms: int) -> "RotationPropagator":
         z = jax.lax.complex(h * self.a, h * self.b)
@@ -108,7 +108,7 @@ class Rotation(AbstractGenerator):
     ) -> Tree:
         # z'' = e^{λ(t−t₀)} z''(t₀) with λ = a + ib.
         turn = lambda v: _turned(self.a, self.b, v)  # noqa: E731
-        start, first, *rest = map(self._there, (x0, *c))
+        start, first, *rest = map(self.there, (x0, *c))
         curvature = turn(_tree.add(turn(start), first))
         if rest:
             curvature = _tree.add(curvature, _tree.scale(1.0 / h, rest[0]))
@@ -120,10 +120,12 @@ class Rotation(AbstractGenerator):
             largest = jnp.broadcast_to(jnp.sum(shares * largest), self.transform.shape)
         return largest, largest
 
-    def _there(self, v: Tree) -> Tree:
+    def there(self, v: Tree) -> Tree:
+        """The coefficients, part by part, that the generator turns."""
         return v if self.transform is None else tuple(map(self.transform.forward, v))
 
-    def _back(self, v: Tree) -> Tree:
+    def back(self, v: Tree) -> Tree:
+        """The pair with these coefficients."""
         return v if self.transform is None else tuple(map(self.transform.backward, v))
 
 
@@ -134,14 +136,14 @@ class RotationPropagator(AbstractPropagator):
     factors: tuple[jax.Array, ...]
 
     def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
-        pairs = [self.generator._there(v) for v in (x0, *c)]
+        pairs = [self.generator.there(v) for v in (x0, *c)]
         turned = [
             _turned(jnp.real(f), jnp.imag(f), v) for f, v in zip(self.factors, pairs, strict=False)
         ]
         total = turned[0]
         for other in turned[1:]:
             total = _tree.add(total, other)
-        return self.generator._back(total)
+        return self.generator.back(total)
 
 
 def _turned(a: jax.Array, b: jax.Array, v: Tree) -> Tree:
