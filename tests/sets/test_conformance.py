@@ -182,3 +182,38 @@ def test_nothing_hides_a_value_that_is_not_a_number(name):
     z[0, 1] = np.nan
     assert np.isnan(project(name, "plain", z)[0, 1])
     assert np.isnan(project(name, "weighted", z)[0, 1])
+
+
+@every_space
+@every_set
+def test_the_derivative_jumps_where_a_switch_changes_its_sign_and_nowhere_else(name, kind):
+    case, space = CASES[name], SPACES[kind]
+    rng = np.random.default_rng(8)
+    # From the inside (the middle of two members) and past it, out to somewhere.
+    middle = np.stack([0.5 * (case.members(rng) + case.members(rng)) for _ in range(6)])
+    away = 2.0 * rng.normal(size=(6, N))
+    ends = np.stack([middle - 0.3 * away, middle + away], axis=1)
+    grid = np.linspace(0.0, 1.0, 2001)
+    lines = ends[:, :1] + grid[:, None] * (ends[:, 1:] - ends[:, :1])
+    K = case.make(jnp.asarray(case.data))
+    if K.switches(jnp.asarray(lines[0, 0]), space) is None:
+        assert name.startswith("intersection")
+        return
+
+    @jax.jit
+    @jax.vmap
+    def look(z):
+        signs = [jnp.ravel(s) > 0 for s in K.switches(z, space)]
+        signs = jnp.concatenate([*signs, jnp.zeros(1, bool)])
+        return signs, jax.jacfwd(lambda z: K.project(z, space))(z)
+
+    changes = 0
+    for line in lines:
+        signs, slopes = map(np.asarray, look(line))
+        changed = np.any(np.diff(signs, axis=0), axis=1)
+        jump = np.max(np.abs(np.diff(slopes, axis=0)), axis=(1, 2))
+        changes += changed.sum()
+        # Beside a jump the derivative of a round set turns, the faster the shorter its axes are.
+        smooth = np.max(jump, where=~changed, initial=0.0)
+        assert smooth < 0.05 and np.all(jump[changed] > 3 * smooth), (smooth, jump[changed])
+    assert changes > 0 or name in ("whole space", "hyperplane", "affine subspace")

@@ -119,3 +119,42 @@ def test_the_guess_has_no_derivative():
     for solver in (Bracketing(), Extragradient()):
         slope = jax.grad(lambda y0, s=solver: dvax.solve_vi(F, Box(-5.0, 5.0), y0, solver=s).y)(0.4)
         assert float(slope) == 0.0
+
+
+def chain(pull, left_pull):
+    """A law on a chain of 1 200 unknowns, each drawn to its neighbours."""
+    n = 1200
+
+    def F(y, args):
+        left, right = jnp.roll(y, 1).at[0].set(0.0), jnp.roll(y, -1).at[-1].set(0.0)
+        return y + pull * (2 * y - left_pull * left - right) + 0.1 * y**3 - args
+
+    drive = 2.0 + 4.0 * np.sin(np.arange(n) / 7.0)
+    return F, jnp.asarray(drive), Box(0.0, 1.5)
+
+
+def test_beyond_the_dense_size_derivatives_come_by_gmres_both_ways():
+    F, drive, K = chain(0.4, 0.7)
+    weights = np.cos(np.arange(len(drive)))
+    solved = lambda q: dvax.solve_vi(F, K, jnp.zeros_like(q), q, dvax.vi.ActiveSet(dense=2000)).y  # noqa: E731
+    y = np.asarray(solved(drive))
+    free = (y > 0.0) & (y < 1.5)
+    matrix = np.asarray(jax.jacfwd(F)(jnp.asarray(y), drive))[np.ix_(free, free)]
+    exact = np.zeros(len(y))
+    exact[free] = np.linalg.solve(matrix.T, weights[free])
+    found = jax.grad(lambda q: jnp.sum(weights * solved(q)))(drive)
+    assert 100 < free.sum() < 1100
+    np.testing.assert_allclose(np.asarray(found), exact, atol=1e-9)
+    along = np.sin(3.0 * np.arange(len(y)))
+    _, change = jax.jvp(solved, (drive,), (jnp.asarray(along),))
+    np.testing.assert_allclose(weights @ np.asarray(change), exact @ along, rtol=1e-9)
+
+
+def test_a_derivative_that_gmres_does_not_reach_is_no_number():
+    # A chain so stiff that a thousand iterations without a preconditioner do not solve it.
+    F, drive, K = chain(1e9, 1.0)
+    K = Box(-1e12, 1e12)
+    solved = lambda q: dvax.solve_vi(F, K, jnp.zeros_like(q), q, dvax.vi.ActiveSet(dense=2000)).y  # noqa: E731
+    assert np.all(np.isfinite(np.asarray(solved(drive))))
+    found = jax.grad(lambda q: jnp.sum(solved(q)))(drive)
+    assert np.all(np.isnan(np.asarray(found)))

@@ -11,19 +11,27 @@ import jax.numpy as jnp
 from jax import lax
 
 
-def onto_total(z: jax.Array, total: jax.Array, inverse_w: jax.Array | None) -> jax.Array:
-    """argmin Σᵢ wᵢ(pᵢ − zᵢ)² over p ≥ 0 with Σᵢ pᵢ = total, along the last axis; weights 1 where
-    None. `total` has the shape of z without that axis."""
+def thresholds(
+    z: jax.Array, total: jax.Array, inverse_w: jax.Array | None
+) -> tuple[jax.Array, jax.Array]:
+    """`levels` along the last axis, once an entry: with them `cut` is argmin Σᵢ wᵢ(pᵢ − zᵢ)² over p ≥ 0
+    with Σᵢ pᵢ = total, weights 1 where None. `total` has the shape of z without that axis."""
     shift, level = levels(z, total, inverse_w, axis=-1)
-    spread = [jnp.broadcast_to(a[..., None], z.shape) for a in (shift, level)]
-    return cut(z, spread[0], spread[1], inverse_w)
+    return jnp.broadcast_to(shift[..., None], z.shape), jnp.broadcast_to(level[..., None], z.shape)
+
+
+def above(
+    z: jax.Array, shift: jax.Array, level: jax.Array, inverse_w: jax.Array | None
+) -> jax.Array:
+    """z − (shift + level)/w, entry by entry."""
+    p = z - (shift if inverse_w is None else inverse_w * shift)
+    return p - (level if inverse_w is None else inverse_w * level)
 
 
 def cut(z: jax.Array, shift: jax.Array, level: jax.Array, inverse_w: jax.Array | None) -> jax.Array:
     """(z − (shift + level)/w)₊, entry by entry. An entry of exactly zero is held, which is the
     convention of AbstractSet, but for the largest: it grows from a total of 0."""
-    p = z - (shift if inverse_w is None else inverse_w * shift)
-    p = p - (level if inverse_w is None else inverse_w * level)
+    p = above(z, shift, level, inverse_w)
     # "Below" is less than 0 for the largest, and at most 0 for the others; NaN is neither: it stays.
     below = jnp.where(_heights(z, inverse_w) == shift, p < 0, p <= 0)
     return jnp.where(below, 0.0, p)

@@ -31,6 +31,11 @@ class AbstractSet(eqx.Module):
         """proj_K(z), the nearest point of K in the norm of `space`."""
 
     @abc.abstractmethod
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array] | None:
+        """Continuous functions of z, proj_K being smooth in z wherever none of them is zero: a
+        trajectory's kinks are where one of them changes its sign. None where they are not known."""
+
+    @abc.abstractmethod
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         """(lower, upper) with K = {lower ≤ y ≤ upper} pointwise, shaped like `like`; else None."""
 

@@ -70,6 +70,9 @@ class AffineSubspace(AbstractSet):
             y = y - back @ (rows @ y - values)
         return jnp.where(_solved(rows, values, y), y, jnp.nan).reshape(jnp.shape(z))
 
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
+        return []
+
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         return None
 

@@ -48,6 +48,9 @@ class Ball(AbstractSet):
         )
         return _tree.where(inside, z, pulled)
 
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
+        return [self.radius - space.norm(self._minus_center(z))]
+
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         return None
 

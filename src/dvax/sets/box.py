@@ -68,6 +68,10 @@ class Box(AbstractSet):
         lower, upper = self.intervals(z)
         return jnp.where(z <= lower, lower, jnp.where(z >= upper, upper, z))
 
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
+        lower, upper = self.intervals(z)
+        return [z - lower, upper - z]
+
     def intervals(self, like: Tree) -> tuple[Tree, Tree]:
         shape = jnp.shape(like)
         return jnp.broadcast_to(self.lower, shape), jnp.broadcast_to(self.upper, shape)

@@ -84,6 +84,12 @@ class Ellipsoid(AbstractSet):
         # Inside, z itself: c + (z − c) would lose digits for a far-away center.
         return jnp.where(inside, z, self.center + kept)
 
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
+        offset = z - jnp.broadcast_to(self.center, z.shape)
+        if self.radii is not None:
+            return [1.0 - _norm(offset / self.radii)]
+        return [1.0 - offset @ jnp.linalg.solve(self.shape, offset)]
+
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         return None
 

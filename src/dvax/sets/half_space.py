@@ -41,6 +41,9 @@ class HalfSpace(AbstractSet):
         # Strictly below the plane nothing is held; on it, and where there is no number, all is.
         return along_normal(z, jnp.where(above < 0, 0.0, above), self.normal, space)
 
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
+        return [-excess(self.normal, self.offset, z)]
+
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         return None
 

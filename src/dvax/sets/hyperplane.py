@@ -42,6 +42,9 @@ class Hyperplane(AbstractSet):
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         return along_normal(z, excess(self.normal, self.offset, z), self.normal, space)
 
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
+        return []
+
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         return None
 

@@ -75,6 +75,10 @@ class Intersection(AbstractSet):
         x = _less(z, q)
         return _tree.where(good, x, jtu.tree_map(lambda leaf: jnp.full_like(leaf, jnp.nan), x))
 
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array] | None:
+        """Dykstra's method ends without saying which sets hold the point."""
+        return None
+
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         pairs = [K.intervals(like) for K in self.sets]
         known = [pair for pair in pairs if pair is not None]

@@ -9,7 +9,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
-from ._threshold import onto_total
+from ._threshold import above, cut, thresholds
 from ._weights import even, inverse_weights
 from .abstract import AbstractSet
 from .ball import center_and_radius
@@ -46,9 +46,18 @@ class L1Ball(AbstractSet):
         offset = z - center
         length = jnp.abs(offset)
         inside = jnp.sum(length) < self.radius  # NaN is not inside: it comes out
-        inverse_w = None if even(space) else inverse_weights(space, z).reshape(-1)
-        kept = onto_total(length.reshape(-1), self.radius, inverse_w).reshape(jnp.shape(z))
+        kept = cut(*self._cuts(length, space)).reshape(jnp.shape(z))
         return jnp.where(inside, z, center + jnp.sign(offset) * kept)
+
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
+        length = jnp.abs(z - jnp.broadcast_to(self.center, jnp.shape(z)))
+        return [self.radius - jnp.sum(length), above(*self._cuts(length, space))]
+
+    def _cuts(self, length: jax.Array, space: AbstractSpace) -> tuple:
+        """Where |z − c| is cut off, as `cut` takes it: nowhere inside, where it is all positive."""
+        flat = length.reshape(-1)
+        inverse_w = None if even(space) else inverse_weights(space, length).reshape(-1)
+        return flat, *thresholds(flat, self.radius, inverse_w), inverse_w
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         return None

@@ -73,10 +73,22 @@ class Polyhedron(AbstractSet):
             _refuse_empty(name, *(np.asarray(a) for a in (self.G, self.d, self.E, self.e)))
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
+        return _nearest(*self._flat(z, space))[0].reshape(z.shape)
+
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
+        """Slack less multiplier, row by row (of length one): one of them is zero."""
+        flat, root, G, d, E, e = self._flat(z, space)
+        y, held = _nearest(flat, root, G, d, E, e)
+        rows, bounds = _scaled(G, d, root)
+        equations = _scaled(E, e, root)[0] if len(e) else E
+        holding = jnp.concatenate([equations, held[:, None] * rows])
+        force = jnp.linalg.pinv(holding).T @ ((flat - y) / root)
+        return [bounds - rows @ (y / root) - held * force[len(e) :]]
+
+    def _flat(self, z: Tree, space: AbstractSpace) -> tuple:
         n = z.size
-        flat = (self.G.reshape(-1, n), self.d, self.E.reshape(-1, n), self.e)
         root = jnp.sqrt(inverse_weights(space, z)).reshape(-1)
-        return _nearest(z.reshape(-1), root, *flat)[0].reshape(z.shape)
+        return z.reshape(-1), root, self.G.reshape(-1, n), self.d, self.E.reshape(-1, n), self.e
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         return None

@@ -1,5 +1,7 @@
 """K = K₁ × K₂ × … on tuples."""
 
+import jax
+
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
@@ -27,8 +29,12 @@ class Product(AbstractSet):
         self.parts = parts
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
-        spaces = space.spaces if isinstance(space, ProductSpace) else (space,) * len(self.parts)
-        return tuple(k.project(p, s) for k, p, s in zip(self.parts, z, spaces, strict=True))
+        return tuple(k.project(p, s) for k, p, s in self._by_part(z, space))
+
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array] | None:
+        parts = [k.switches(p, s) for k, p, s in self._by_part(z, space)]
+        known = [part for part in parts if part is not None]
+        return [s for part in known for s in part] if len(known) == len(parts) else None
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         pairs = [k.intervals(p) for k, p in zip(self.parts, like, strict=True)]
@@ -49,3 +55,9 @@ class Product(AbstractSet):
             )
         for part, leaf in zip(self.parts, like, strict=True):
             part.check(leaf)
+
+    def _by_part(
+        self, z: Tree, space: AbstractSpace
+    ) -> list[tuple[AbstractSet, Tree, AbstractSpace]]:
+        spaces = space.spaces if isinstance(space, ProductSpace) else (space,) * len(self.parts)
+        return list(zip(self.parts, z, spaces, strict=True))

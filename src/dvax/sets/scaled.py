@@ -57,8 +57,10 @@ class Scaled(AbstractSet):
             self.factor = jnp.where(self.factor == 0, jnp.nan, self.factor)
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
-        shrunk = jtu.tree_map(lambda leaf: leaf / self.factor, z)
-        return _tree.scale(self.factor, self.set.project(shrunk, space))
+        return _tree.scale(self.factor, self.set.project(self._shrunk(z), space))
+
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array] | None:
+        return self.set.switches(self._shrunk(z), space)
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         inner = self.set.intervals(like)
@@ -71,3 +73,6 @@ class Scaled(AbstractSet):
 
     def check(self, like: Tree) -> None:
         self.set.check(like)
+
+    def _shrunk(self, z: Tree) -> Tree:
+        return jtu.tree_map(lambda leaf: leaf / self.factor, z)

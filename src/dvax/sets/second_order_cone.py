@@ -71,6 +71,12 @@ class SecondOrderCone(AbstractSet):
         # NaN is neither inside nor at the apex: it comes out of the surface.
         return jnp.where(inside[..., None], z, jnp.where(apex[..., None], 0.0, surface))
 
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
+        height, across = z[..., 0], z[..., 1:]
+        w = 1.0 / inverse_weights(space, z)
+        polar = _length(w[..., 1:] * across) + w[..., 0] * height / self.slope
+        return [self.slope * height - _length(across), polar]
+
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         return None
 

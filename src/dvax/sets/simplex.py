@@ -13,7 +13,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
-from ._threshold import cut, levels, onto_total
+from ._threshold import above, cut, levels, thresholds
 from ._weights import even, inverse_weights
 from .abstract import AbstractSet
 
@@ -71,9 +71,15 @@ class Simplex(AbstractSet):
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         inverse_w = None if even(space) else inverse_weights(space, z)
+        return cut(z, *self._thresholds(z, inverse_w), inverse_w)
+
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
+        inverse_w = None if even(space) else inverse_weights(space, z)
+        return [above(z, *self._thresholds(z, inverse_w), inverse_w)]
+
+    def _thresholds(self, z: jax.Array, inverse_w: jax.Array | None) -> tuple[jax.Array, jax.Array]:
         if self.blocks is None or self.place is None:
-            total = jnp.broadcast_to(self.total, z.shape[:-1])
-            return onto_total(z, total, inverse_w)
+            return thresholds(z, jnp.broadcast_to(self.total, z.shape[:-1]), inverse_w)
         shifts, taus = [], []
         for block in self.blocks:
             one = jnp.ndim(self.total) == 0
@@ -84,7 +90,7 @@ class Simplex(AbstractSet):
         shift, tau = (
             jnp.concatenate(a).at[self.place].get(mode="promise_in_bounds") for a in (shifts, taus)
         )
-        return cut(z, shift, tau, inverse_w)
+        return shift, tau
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         return None

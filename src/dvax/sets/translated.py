@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
@@ -45,6 +46,9 @@ class Translated(AbstractSet):
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         offset = self._spread(z)
         return _tree.add(offset, self.set.project(_tree.sub(z, offset), space))
+
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array] | None:
+        return self.set.switches(_tree.sub(z, self._spread(z)), space)
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         inner = self.set.intervals(like)

@@ -1,5 +1,6 @@
 """No constraint: the law is an equation."""
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
@@ -21,6 +22,9 @@ class WholeSpace(AbstractSet):
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         return z
+
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
+        return []
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree]:
         return (

@@ -4,8 +4,8 @@ y solves R(y; θ) = y − proj_K(y − τF(y; θ)) = 0, so dR/dy · dy = −dR/d
 every derivative, forward and reverse, of every order where it exists; no iteration is unrolled. At
 a kink the projection's convention (`dvax.sets.AbstractSet`) picks the element of dR/dy. Where that is
 singular to rounding, y has no derivative (the solutions of VI(K, F) may not even be isolated), and
-what is returned is NaN and not some number (infinite or NaN for pointwise laws; not looked at beyond
-1024 unknowns).
+what is returned is NaN and not some number (infinite or NaN for pointwise laws). Beyond 1024 unknowns
+it is NaN where GMRES did not converge, for that reason or another.
 """
 
 from collections.abc import Callable
@@ -21,6 +21,7 @@ from .certificate import natural_residual
 from .matrix import matrix_of
 
 _DENSE = 1024  # up to this many unknowns the Jacobian is formed; beyond, GMRES applies it
+_ASKED, _ENOUGH = 1e-12, 1e-8  # relative residuals of GMRES: what it aims at, and what is an answer
 
 
 def with_implicit_derivative(
@@ -47,7 +48,9 @@ def _diagonal_solve(g: Callable[[Tree], Tree], b: Tree) -> Tree:
 def _general_solve(g: Callable[[Tree], Tree], b: Tree) -> Tree:
     flat, unflatten = jax.flatten_util.ravel_pytree(b)
     if flat.size > _DENSE:
-        return jax.scipy.sparse.linalg.gmres(g, b, tol=1e-12, atol=0.0, restart=50, maxiter=20)[0]
+        return unflatten(
+            _krylov_solve(lambda d: jax.flatten_util.ravel_pytree(g(unflatten(d)))[0], flat)
+        )
     matrix = matrix_of(g, b)
     pivots = jnp.abs(jnp.diagonal(jax.lax.linalg.lu(jax.lax.stop_gradient(matrix))[0]))
     eps = jnp.finfo(flat.dtype).eps
@@ -55,3 +58,14 @@ def _general_solve(g: Callable[[Tree], Tree], b: Tree) -> Tree:
     # A factor, so that the result stays linear in b.
     exists = jnp.where(singular, jnp.nan, jnp.ones((), flat.dtype))
     return unflatten(jnp.linalg.solve(matrix, flat) * exists)
+
+
+def _krylov_solve(g: Callable[[jax.Array], jax.Array], b: jax.Array) -> jax.Array:
+    gmres = jax.scipy.sparse.linalg.gmres
+
+    def solve(apply: Callable[[jax.Array], jax.Array], right: jax.Array) -> jax.Array:
+        d, _ = gmres(apply, right, tol=_ASKED, atol=0.0, restart=50, maxiter=20)
+        left = jnp.linalg.norm(right - apply(d))
+        return jnp.where(left <= _ENOUGH * jnp.linalg.norm(right), d, jnp.nan)
+
+    return jax.lax.custom_linear_solve(g, b, solve, transpose_solve=solve)
