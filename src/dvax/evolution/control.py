@@ -12,6 +12,7 @@ from jax import lax
 from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace, Product
+from .kinks import Aim, aim, nothing_ahead, passed, until
 from .results import RESULTS
 from .stepper import Step
 
@@ -71,6 +72,8 @@ class Adaptive(AbstractController):
     inside a step has a defect that does not shrink with h; its impulse h·defect does, and a share of
     the tolerance is set aside for such steps, each spending at most a small part of what is left.
 
+    Where the stepper locates kinks of the response, steps are made to end there (`kinks`).
+
     `order` is that of the defect. A length is kept while it is within a fifth of the best one, since
     a new length costs new φ-functions; and the rest of the way to a knot is cut into equal parts,
     never into a sliver.
@@ -92,12 +95,13 @@ class Adaptive(AbstractController):
         stop: Any
         rejected: Any
         spare: Any
+        aim: Any
 
     def init(self):
         first = lax.stop_gradient(self.first)
         end = _land(self.stops[0], first, self.stops[1])
         one = jnp.ones_like(first)
-        return self.State(end, first, jnp.asarray(1), jnp.asarray(False), one)
+        return self.State(end, first, jnp.asarray(1), jnp.asarray(False), one, nothing_ahead(first))
 
     def end(self, state):
         return state.end
@@ -115,7 +119,11 @@ class Adaptive(AbstractController):
         # A small share, because a derivative loses a kink's step; a large one where t has no room.
         floor = 8 * jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
         share = jnp.where(h <= 1e4 * floor, 0.1, 1e-6)
-        relaxed = state.rejected & (impulse <= share * state.spare)
+        # A step may be taken all the same that is short after a refusal, or aimed to cross a kink.
+        known = Aim(*state.aim)
+        kink = jnp.full_like(h, jnp.inf) if step.kink is None else lax.stop_gradient(step.kink)
+        crossing = (kink < jnp.inf) & (h <= 4 * known.margin)
+        relaxed = (state.rejected | crossing) & (impulse <= share * state.spare)
         sound = step.begun & step.finite
         keep = sound & ((error <= 1.0) | relaxed)
         spare = jnp.where(keep & (error > 1.0), state.spare - impulse, state.spare)
@@ -133,10 +141,17 @@ class Adaptive(AbstractController):
             cut, jnp.maximum(wanted, jnp.minimum(state.length, 3.0 * wanted)), wanted
         )
 
+        # A kink explains why a step was refused: the length that was planned stays.
+        ahead, aimed = aim(state.aim, kink, length, floor, ~keep & sound & jnp.isfinite(error))
+        hindered = aimed | (keep & (known.kink < jnp.inf))
+        wanted = jnp.where(hindered, jnp.maximum(wanted, state.length), wanted)
+        ahead = passed(ahead, jnp.where(keep, t1, t0))
+
         jumped = keep & (t1 == self.stops[state.stop])
         last = self.stops.shape[0] - 1
         stop = jnp.minimum(jnp.where(jumped, state.stop + 1, state.stop), last)
-        end = _land(jnp.where(keep, t1, t0), wanted, self.stops[stop])
+        begin = jnp.where(keep, t1, t0)
+        end = _land(begin, wanted, jnp.minimum(self.stops[stop], until(ahead, begin)))
         # Below this, t itself cannot tell the ends of a step apart.
         stuck = ~keep & (h <= floor)
         result = RESULTS.where(
@@ -150,7 +165,9 @@ class Adaptive(AbstractController):
         )
         result = RESULTS.where(step.begun, result, RESULTS.law_unsolved)
         result = RESULTS.where(step.finite, result, RESULTS.nonfinite)
-        return Verdict(keep, self.State(end, wanted, stop, ~keep, spare), jumped, result)
+        return Verdict(
+            keep, self.State(end, wanted, stop, ~keep & ~aimed, spare, ahead), jumped, result
+        )
 
     def boundary(self, index, ends):
         before = jnp.where(index > 0, ends[jnp.maximum(index - 1, 0)], self.stops[0])

@@ -99,6 +99,13 @@ class Flow(eqx.Module):
         u = enclose(P.inverse, y)
         return enclose(lambda t, x, u: problem.f(t, x, u, args), t, x, u)
 
+    def switches(self, t: Any, x: Tree, z: Tree) -> jax.Array | None:
+        """What changes its sign where the response has a kink, as a vector; None where it has none, or
+        K does not say."""
+        K, space = self.problem.set_at(t, self.args), self.problem.spaces(x)[1]
+        found = K.switches(z, space)
+        return jnp.concatenate([jnp.ravel(v) for v in found]) if found else None
+
     def hidden(self, t: Any, x: Tree, rate: Rate, error: Tree) -> Tree:
         """How far f̃ may be off, entry by entry, because z may be off by ± `error`.
 

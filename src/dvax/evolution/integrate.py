@@ -77,11 +77,22 @@ def _stepper(setup: Setup, flow: Flow, stops: jax.Array, options: Options) -> St
     if measure and flow.enclosed:
         # Once a run: for a matrix it takes an eigenvalue.
         growth = flow.generator.growth(flow.state_space(setup.x0))
-    stepper = Stepper(setup.method, flow, measure, options.careful, (t0, t1), None, growth)
+    locate = not options.fixed and _can_locate(flow, t0, setup.x0)
+    stepper = Stepper(setup.method, flow, measure, locate, options.careful, (t0, t1), None, growth)
     if options.fixed and stops.shape[0] == 2:
         length = (t1 - t0) / step_count(t1 - t0, setup.number("dt"))
         return dataclasses.replace(stepper, uniform=stepper.factors(length))
     return stepper
+
+
+_FEW = 64
+"""Up to so many entries of the law kinks are located: those of a field are everywhere."""
+
+
+def _can_locate(flow: Flow, t0: jax.Array, x0: Any) -> bool:
+    like = flow.problem.zero_control(x0)
+    few = sum(leaf.size for leaf in jtu.tree_leaves(like)) <= _FEW
+    return few and flow.switches(t0, x0, like) is not None
 
 
 def _solution(

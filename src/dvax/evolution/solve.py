@@ -71,6 +71,10 @@ def solve(
     - `throw`: raise where the solve fails; otherwise look at `result`. Under `jax.jit` nothing can
       raise: times that were not reached are infinite there, and their states NaN.
 
+    **Kinks.** Where u enters or leaves the boundary of K its slope jumps, and with it that of f̃. With
+    at most 64 unknowns in the law, and a K that has `switches`, adaptive steps end there, and each
+    method has its order back. In a field some point has a kink at any time: expect order 2.
+
     **Returns:** a `Solution`.
 
     **Raises:** `dvax.InputError` for arguments that break a rule, all of them at once;

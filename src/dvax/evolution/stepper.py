@@ -14,6 +14,7 @@ from ..generators import AbstractGenerator, AbstractPropagator, Growth
 from ..problem import END_ULPS, KNOT_ULPS
 from .chords import Chord, is_chord
 from .flow import Flow, Rate
+from .kinks import first_change
 from .method import AbstractMethod, polynomial, shortened
 
 _DOUBT = 4.0
@@ -45,14 +46,16 @@ class Step(NamedTuple):
     """A step to x₁ with its stage polynomial c.
 
     `error` is the defect entry by entry (None where not measured), `impulse` = (∫ ‖p − f̃(·, x_h)‖ ds,
-    ∫ ‖w‖ ds) over the step. `begun` says that the law was solved at the start, `solved` that it was
-    everywhere; `finite`, that there are no bad values that a shorter step would not mend.
+    ∫ ‖w‖ ds) over the step. `kink` is the time of the first kink of the response inside, ∞ where there
+    is none (None where nobody looks). `begun` says that the law was solved at the start, `solved` that
+    it was everywhere; `finite`, that there are no bad values that a shorter step would not mend.
     """
 
     x1: Tree
     c: tuple[Tree, ...]
     error: Tree | None
     impulse: tuple[Any, Any]
+    kink: Any
     memory: Memory
     begun: Any
     solved: Any
@@ -60,9 +63,11 @@ class Step(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """The defect of one step: entry by entry for the step control, integrated for certificates."""
+    """The defect of one step: entry by entry for the step control, integrated for certificates; and the
+    rates along x_h that it was made from, the last one at the end."""
 
-    last: Rate
+    thetas: tuple[float, ...]
+    rates: list[Rate]
     error: Tree
     defect: jax.Array
     law_defect: jax.Array
@@ -79,6 +84,7 @@ class Stepper(eqx.Module):
     """A method bound to a flow.
 
     - `measure`: sample the defect inside every step, which adaptive steps and certificates need;
+    - `locate`: look for kinks of the response inside every step;
     - `careful`: look for bad values after every step, at the price of a second pass over memory;
     - `ends`: first and last time of the run;
     - `uniform`: the propagators, where all steps have one length that is known beforehand;
@@ -88,6 +94,7 @@ class Stepper(eqx.Module):
     method: AbstractMethod
     flow: Flow
     measure: bool = eqx.field(static=True)
+    locate: bool = eqx.field(static=True)
     careful: bool = eqx.field(static=True)
     ends: tuple[Any, Any]
     uniform: Factors | None
@@ -154,10 +161,12 @@ class Stepper(eqx.Module):
             )
         c, rates = self.stages(t0, t1, x0, factors, first)
         x1 = factors.full.step(x0, c)
-        error, impulse = None, (0.0, 0.0)
+        error, impulse, kink = None, (0.0, 0.0), None
         if self.measure:
             sample = self._measure(t0, t1, x0, x1, first, c, factors)
-            rates.append(sample.last)
+            rates.append(sample.rates[-1])
+            if self.locate:
+                kink = self._kink(t0, t1, x0, c, first, sample)
             error, impulse = sample.error, (sample.defect, sample.law_defect)
             # Further in, a bad value may come from a step that was too long: it is cut, not fatal.
             finite = _tree.all_finite(first.value)
@@ -171,7 +180,28 @@ class Stepper(eqx.Module):
             None if self.flow.direct else rates[-1].y,
         )
         solved = jnp.all(jnp.stack([rate.solved for rate in rates]))
-        return Step(x1, c, error, impulse, after, first.solved, solved, finite)
+        return Step(x1, c, error, impulse, kink, after, first.solved, solved, finite)
+
+    def _kink(self, t0: Any, t1: Any, x0: Tree, c: Any, first: Rate, sample: Sample) -> Any:
+        """The time of the first kink of the response along x_h."""
+        t0, t1, x0, c, rates = lax.stop_gradient((t0, t1, x0, c, [first, *sample.rates]))
+        flow, thetas = self.flow, (0.0, *sample.thetas, 1.0)
+
+        def switches(t: Any, rate: Rate) -> jax.Array:
+            found = flow.switches(t, x0, rate.z)
+            assert found is not None
+            return lax.stop_gradient(found)
+
+        def at(theta: Any) -> jax.Array:
+            t = t0 + theta * (t1 - t0)
+            x = inside(flow.generator, t1 - t0, theta, x0, c)
+            return switches(t, flow.rate(t, x, first.y))
+
+        values = [
+            switches(self._within(t0, t1, theta), rate)
+            for theta, rate in zip(thetas, rates, strict=True)
+        ]
+        return t0 + first_change(thetas, values, at) * (t1 - t0)
 
     def _within(self, t0: Any, t1: Any, theta: float) -> Any:
         """t₀ + θh, with the ends approached from inside: data may jump there.
@@ -189,7 +219,9 @@ class Stepper(eqx.Module):
 
     def _kept(self, rate: Rate) -> Rate:
         """What the next step needs of a rate: not the law behind it, where nothing samples it."""
-        return rate._replace(y=None, z=None) if self.flow.enclosed else rate
+        if not self.flow.enclosed:
+            return rate
+        return rate._replace(y=None, z=rate.z if self.locate else None)
 
     def _measure(
         self, t0: Any, t1: Any, x0: Tree, x1: Tree, first: Rate, c: Any, factors: Factors
@@ -219,7 +251,7 @@ class Stepper(eqx.Module):
         )
         error = _tree.scale(0.5, _tree.add(at_start, at_end))
         defect = 0.5 * h * (space.norm(at_start) + space.norm(at_end))
-        return Sample(last, error, defect, jnp.zeros_like(defect))
+        return Sample((), [last], error, defect, jnp.zeros_like(defect))
 
     def _sampled(
         self,
@@ -267,7 +299,8 @@ class Stepper(eqx.Module):
         defect = h * sum(map(space.norm, (*ends, bump, unseen)))
         residuals = [first.residual, *(rate.residual for _, _, rate in inner), last.residual]
         law_defect = h * jnp.max(jnp.stack(residuals))
-        return Sample(last, error, defect, law_defect)
+        rates = [*(rate for _, _, rate in inner), last]
+        return Sample(thetas, rates, error, defect, law_defect)
 
 
 def _extrapolation(nodes: tuple[float, ...]) -> list[float]:

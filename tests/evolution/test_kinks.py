@@ -1,0 +1,170 @@
+"""Kinks of the response are found, steps end there, and no way of meeting a bound stops a run."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.closed_forms import C1_KINKS, c1, c1_solution
+from tests.evolution.test_order import slope
+
+import dvax
+from dvax import sets
+from dvax.evolution.kinks import first_change
+
+
+def test_the_first_of_several_changes_of_sign_is_found():
+    def at(theta):
+        # Zeros at 0.8 and at 0.3 (steep), none in the third, and one that is infinite.
+        flat, steep = (theta - 0.8) * (0.1 + theta**2), jnp.tanh(40 * (0.3 - theta))
+        return jnp.stack([flat, steep, 1.0 + theta, jnp.full_like(theta, jnp.inf)])
+
+    thetas = (0.0, 0.5, 1.0)
+    values = [at(jnp.asarray(theta)) for theta in thetas]
+    assert float(first_change(thetas, values, at)) == pytest.approx(0.3, abs=1e-7)
+    late = lambda theta: at(theta).at[1].set(1.0)  # noqa: E731
+    values = [late(jnp.asarray(theta)) for theta in thetas]
+    assert float(first_change(thetas, values, late)) == pytest.approx(0.8, abs=1e-7)
+    assert float(first_change(thetas[:2], values[:2], late)) == np.inf
+
+
+def test_order_four_comes_back_over_kinks_that_nobody_announced():
+    case = c1()
+    steps, errors = [], []
+    for rtol in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7):
+        sol = dvax.solve(
+            case.problem, jnp.asarray(case.x0), 0.0, 2.0, args=case.args, rtol=rtol, atol=rtol,
+            ts=np.linspace(0.0, 2.0, 41), method=dvax.ETD4RK(),
+        )  # fmt: skip
+        errors.append(max(abs(float(x) - c1_solution(t)[0]) for t, x in zip(sol.ts, sol.xs)))
+        steps.append(int(sol.stats["steps"]))
+        # Three attempts that are refused, at most, for either kink; and the first step.
+        assert int(sol.stats["rejected"]) <= 3 * len(C1_KINKS) + 1
+        assert errors[-1] <= 10 * rtol
+    found = slope(np.array(steps), np.array(errors))
+    print(f"C1, adaptive: order {found:.2f}, steps {steps}, errors {errors}")
+    assert found > 3.8
+
+
+def driven(z, K=None):
+    """x' = −x + u with u = proj_K(z(t)); K = (−∞, 1]ᵐ by default."""
+    return dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),
+        K=sets.Box(-jnp.inf, 1.0) if K is None else K,
+        f=lambda t, x, u, args: u, h=lambda t, x, u, args: z(t) + 0.0 * x,
+    )  # fmt: skip
+
+
+TIMES = np.linspace(0.0, 2.0, 400_001)
+
+
+def exact(z, project):
+    """x(2) from 0, by the trapezoidal rule on steps of 5e-6: off by less than 1e-10 · slope of z."""
+    u = np.array(project(z(TIMES)))
+    weights = np.full(len(TIMES), TIMES[1]) * np.exp(TIMES - 2.0)
+    weights[[0, -1]] *= 0.5
+    return weights @ u
+
+
+def chatter(t):
+    # Crosses 1 infinitely often near t = 1, with a slope between −3 and 3.
+    s = t - 1.0
+    return 1.0 + 3.0 * s**2 * jnp.sin(1.0 / jnp.maximum(jnp.abs(s), 1e-12))
+
+
+CURVES = {
+    "touches the bound and turns back": lambda t: 1.0 - (t - 1.0) ** 2,
+    "is held and almost let go": lambda t: 1.0 + (t - 1.0) ** 2,
+    "slides along the bound": lambda t: 1.0 + jnp.where(t > 1, (t - 1) ** 3, 0.0) * jnp.cos(9 * t),
+    "held for an instant": lambda t: 1.0 + 1e-5 - (t - 1.0) ** 2,
+    "many kinks": lambda t: 1.0 + jnp.sin(40 * t),
+    "infinitely many kinks": chatter,
+}
+
+
+@pytest.mark.parametrize("method", [dvax.ETD2RK(), dvax.ETD4RK()], ids=["ETD2RK", "ETD4RK"])
+@pytest.mark.parametrize("name", CURVES)
+def test_grazing_and_chatter_end_with_the_accuracy_that_was_asked_for(name, method):
+    z = CURVES[name]
+    rtol = 1e-6
+    sol = dvax.solve(driven(z), 0.0, 0.0, 2.0, rtol=rtol, atol=rtol, method=method)
+    error = abs(float(sol.xs[0]) - exact(z, lambda v: np.minimum(v, 1.0)))
+    print(f"{name}: {sol.stats['steps']} steps, {sol.stats['rejected']} refused, error {error:.1e}")
+    assert error <= 10 * rtol
+    assert int(sol.stats["rejected"]) <= int(sol.stats["steps"]) + 10
+
+
+def test_a_law_too_rough_for_any_step_ends_with_a_sentence():
+    # Steeper and steeper towards t = 1: not Lipschitz in time, which the paper asks for.
+    def z(t):
+        s = jnp.maximum(jnp.abs(t - 1.0), 1e-12)
+        return 1.0 + s * jnp.sin(0.3 / s)
+
+    with pytest.raises(dvax.SolveError, match="largest number of steps"):
+        dvax.solve(driven(z), 0.0, 0.0, 2.0, method=dvax.ETD4RK(), max_steps=20_000)
+
+
+def test_kinks_at_the_same_instant_cost_no_more_than_one():
+    angles = jnp.linspace(0.5, 1.5, 5)
+    together = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=sets.Box(-jnp.inf, 1.0),
+        f=lambda t, x, u, args: u, h=lambda t, x, u, args: 1.0 + angles * jnp.sin(4 * t) + 0.0 * x,
+    )  # fmt: skip
+    alone = driven(lambda t: 1.0 + 1.5 * jnp.sin(4 * t))
+    options = dict(rtol=1e-7, atol=1e-7, method=dvax.ETD4RK())
+    many = dvax.solve(together, np.zeros(5), 0.0, 2.0, **options)
+    one = dvax.solve(alone, 0.0, 0.0, 2.0, **options)
+    assert int(many.stats["rejected"]) <= int(one.stats["rejected"]) + 2
+    z = lambda t: 1.0 + 0.5 * np.sin(4 * t)  # noqa: E731
+    assert abs(float(many.xs[0][0]) - exact(z, lambda v: np.minimum(v, 1.0))) <= 1e-6
+
+
+def test_a_batch_takes_each_of_its_lanes_over_its_own_kinks():
+    case = c1()
+    starts = jnp.array([-1.0, -0.3, 0.2, 0.9, 1.5])
+    run = lambda x0: dvax.solve(  # noqa: E731
+        case.problem, x0, 0.0, 2.0, args=case.args, rtol=1e-7, atol=1e-7, method=dvax.ETD4RK()
+    )
+    steps = lambda x0: (run(x0).xs, run(x0).stats["steps"], run(x0).stats["rejected"])  # noqa: E731
+    batch = jax.vmap(steps)(starts)
+    for lane, x0 in enumerate(starts):
+        for found, own in zip(batch, steps(x0), strict=True):
+            np.testing.assert_allclose(np.asarray(found[lane]), np.asarray(own), rtol=1e-12)
+
+
+SETS = {
+    "ball": (sets.Ball(0.0, 1.0), lambda t: jnp.stack([1.4 * jnp.sin(3 * t), jnp.cos(5 * t)])),
+    "simplex": (sets.Simplex(1.0), lambda t: jnp.stack([jnp.sin(3 * t), 0.3, jnp.cos(2 * t)])),
+    "ℓ1 ball": (sets.L1Ball(0.1, 0.8), lambda t: jnp.stack([jnp.sin(3 * t), jnp.cos(2 * t)])),
+    "second-order cone": (
+        sets.SecondOrderCone(0.7),
+        lambda t: jnp.stack([jnp.cos(3 * t), jnp.sin(2 * t), 0.5 * jnp.cos(t)]),
+    ),
+    "polyhedron": (
+        sets.Polyhedron(jnp.array([[1.0, 1.0], [-1.0, 0.3], [0.2, -1.0]]), jnp.array([0.6, 0.4, 0.5])),
+        lambda t: jnp.stack([1.5 * jnp.sin(4 * t), 1.5 * jnp.cos(3 * t)]),
+    ),
+    "intersection, whose kinks are not known": (
+        sets.Intersection(sets.Ball(0.0, 1.0), sets.Box(-0.5, 0.8)),
+        lambda t: jnp.stack([1.4 * jnp.sin(3 * t), jnp.cos(5 * t)]),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_kinks_of_every_kind_of_set(name):
+    K, z = SETS[name]
+    size = z(0.0).size
+    space = dvax.spaces.Euclidean(size)
+    sol = dvax.solve(
+        driven(z, K), np.zeros(size), 0.0, 2.0, rtol=1e-6, atol=1e-6, method=dvax.ETD4RK()
+    )
+    project = jax.jit(jax.vmap(lambda t: K.project(z(t), space)))
+    thinned = TIMES[::20]
+    u = np.asarray(project(jnp.asarray(thinned)))
+    weights = np.full(len(thinned), thinned[1]) * np.exp(thinned - 2.0)
+    weights[[0, -1]] *= 0.5
+    error = np.max(np.abs(np.asarray(sol.xs[0]) - weights @ u))
+    print(f"{name}: {sol.stats['steps']} steps, {sol.stats['rejected']} refused, error {error:.1e}")
+    assert error <= 1e-5
+    if "not known" not in name:
+        assert int(sol.stats["rejected"]) <= 0.35 * int(sol.stats["steps"])
