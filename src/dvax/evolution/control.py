@@ -131,7 +131,7 @@ class Adaptive(AbstractController):
         positive = jnp.where(error > 0.0, error, 1.0)
         factor = jnp.where(error > 0.0, (0.5 / positive) ** (1.0 / self.order), jnp.inf)
         # What was just refused is not tried again at once.
-        factor = jnp.clip(factor, 0.1, jnp.where(state.rejected, 1.0, 3.0))
+        factor = jnp.clip(factor, 0.1, jnp.where(state.rejected, 1.0, 5.0))
         steady = keep & (factor > 0.8) & (factor < 1.25)
         length = lax.stop_gradient(h)
         wanted = jnp.where(steady, length, length * factor)
