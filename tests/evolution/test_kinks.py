@@ -168,3 +168,34 @@ def test_kinks_of_every_kind_of_set(name):
     assert error <= 1e-5
     if "not known" not in name:
         assert int(sol.stats["rejected"]) <= 0.35 * int(sol.stats["steps"])
+
+
+def test_regimes_are_those_of_the_closed_form():
+    case = c1()
+    options = dict(args=case.args, dense=True, max_steps=4096)
+    adaptive = dvax.solve(
+        case.problem, jnp.asarray(case.x0), 0.0, 2.0, rtol=1e-9, method=dvax.ETD4RK(), **options
+    )
+    fixed = dvax.solve(case.problem, jnp.asarray(case.x0), 0.0, 2.0, dt=1e-3, **options)
+    for sol, close in ((adaptive, 1e-9), (fixed, 1e-6)):
+        times, positive = sol.regimes()
+        np.testing.assert_allclose(times, [0.0, *C1_KINKS, 2.0], atol=close)
+        # Held above, free, held at 0.
+        assert positive.tolist() == [[True, False], [True, True], [False, True]]
+
+
+def test_data_that_jumps_changes_the_regime_where_it_jumps():
+    problem = driven(lambda t: jnp.where(t < 0.7, 0.5, 1.5))
+    sol = dvax.solve(problem, 0.0, 0.0, 2.0, dense=True, max_steps=4096)
+    times, positive = sol.regimes()
+    np.testing.assert_allclose(times, [0.0, 0.7, 2.0], atol=1e-12)
+    assert positive.tolist() == [[True, True], [True, False]]
+
+
+def test_regimes_need_the_steps_and_a_set_that_has_switches():
+    with pytest.raises(dvax.InputError, match="dense=True"):
+        dvax.solve(driven(jnp.sin), 0.0, 0.0, 2.0).regimes()
+    K, z = SETS["intersection, whose kinks are not known"]
+    sol = dvax.solve(driven(z, K), np.zeros(2), 0.0, 0.1, dense=True, max_steps=1024)
+    with pytest.raises(dvax.InputError, match="Intersection"):
+        sol.regimes()

@@ -11,6 +11,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem, SolveError
 from .loop import Record
+from .regimes import Regimes, regimes
 from .results import RESULTS
 from .setup import Setup
 from .stepper import inside
@@ -105,6 +106,48 @@ class Solution(eqx.Module):
         x = inside(flow.generator, step.length, theta, step.x0, step.coefficients)
         rate = flow.rate(t, x, None)
         return x, flow.operator.inverse(rate.y)
+
+    def regimes(self) -> Regimes:
+        """The times at which the response enters or leaves the boundary of K, and on what side of which
+        bound it is between them, for a solve made with `dense=True`.
+
+        **Raises:** `dvax.InputError` where the steps were not kept, or K does not say where its
+        projection has kinks.
+
+        ```python
+        >>> import dvax
+        >>> model = dvax.models.Contact(alpha=1.0, beta=1.0, b_x=2.0, b_u=1.0, d_x=0.5, d_u=1.0,
+        ...                             kappa0=0.5, g=1.0, ell=3.0)
+        >>> sol = dvax.solve(model.problem, -1.0, 0.0, 2.0, rtol=1e-8, dense=True, max_steps=20_000)
+        >>> times, positive = sol.regimes()
+        >>> [f"{t:.6f}" for t in times]                        # held above, free, held at 0
+        ['0.000000', '0.313336', '0.524057', '2.000000']
+        >>> positive.tolist()
+        [[True, False], [True, True], [False, True]]
+
+        ```
+        """
+        if self.records is None:
+            raise InputError(
+                InputProblem(
+                    "Solution.regimes",
+                    "a solution without its steps",
+                    "changes between the saved times are found on the steps themselves",
+                    "Solve with dense=True",
+                )
+            )
+        flow = self.setup.flow()
+        x0, t0 = self.setup.x0, self.setup.number("t0")
+        if flow.switches(t0, x0, flow.problem.zero_control(x0)) is None:
+            raise InputError(
+                InputProblem(
+                    "Solution.regimes",
+                    f"a {type(flow.problem.set_at(t0, flow.args)).__name__}",
+                    "the set must say where its projection has kinks (dvax.sets.AbstractSet.switches)",
+                    "Give the set as one that does, a dvax.sets.Polyhedron, say",
+                )
+            )
+        return regimes(flow, self.records, int(self.stats["steps"]))
 
     def raise_if_failed(self) -> "Solution":
         """This solution, or a `dvax.SolveError` that carries it."""

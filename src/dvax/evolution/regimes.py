@@ -1,0 +1,56 @@
+"""The stretches of a trajectory on which the response obeys one formula."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .flow import Flow
+from .kinks import first_change
+from .loop import Record
+from .stepper import inside
+
+_LOOKS = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Where inside a step the signs are looked at."""
+
+
+class Regimes(NamedTuple):
+    """`times` = (t₀, the kinks…, t₁), and for every stretch between two of them the signs of the set's
+    `switches`: `positive` has a row a stretch and a column a switch. For a `dvax.sets.Box` of m entries
+    column i says that yᵢ is off its lower bound, column m + i that it is off the upper one. Of changes
+    within one step only the first has a time."""
+
+    times: np.ndarray
+    positive: np.ndarray
+
+
+def regimes(flow: Flow, records: Record, count: int) -> Regimes:
+    """Those of the first `count` steps of a flow whose set has switches."""
+    steps = jtu.tree_map(lambda leaf: leaf[:count], records)
+    kinks, before, after = map(np.asarray, jax.jit(jax.vmap(lambda s: _changes(flow, s)))(steps))
+    starts, lengths = np.asarray(steps.start), np.asarray(steps.length)
+    times, rows = [starts[0]], [before[0]]
+    for k in range(count):
+        # What data does when it jumps shows between two steps, a kink of the trajectory inside.
+        for time, row in ((starts[k], before[k]), (kinks[k], after[k])):
+            if np.any(row != rows[-1]):
+                times.append(time)
+                rows.append(row)
+    return Regimes(np.array([*times, starts[-1] + lengths[-1]]), np.array(rows))
+
+
+def _changes(flow: Flow, step: Record) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The time of the first change of sign in a step, and the signs at its ends."""
+
+    def at(theta: Any) -> jax.Array:
+        t = step.start + theta * step.length
+        x = inside(flow.generator, step.length, theta, step.x0, step.coefficients)
+        found = flow.switches(t, x, flow.rate(t, x, flow.guess(x)).z)
+        assert found is not None
+        return found
+
+    values = [at(jnp.asarray(theta, step.start.dtype)) for theta in _LOOKS]
+    kink = step.start + first_change(_LOOKS, values, at) * step.length
+    return kink, values[0] > 0, values[-1] > 0
