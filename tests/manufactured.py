@@ -35,7 +35,7 @@ def _wave(n: int) -> np.ndarray:
 
 FAR = np.array([[-1.0, 30.0, 0.0], [0.0, -1.3, 5.0], [0.0, 0.0, -2.0]])
 STIFF = jnp.array([1.0, 0.1, 2e-3])
-"""What A multiplies by much is small in x*, as in a smooth field: the theory of stiff orders asks for it."""
+"""What A multiplies by much is small in x*, as in a smooth field: stiff orders are for that."""
 FIELD = jnp.cos(_wave(16))
 GENERATORS = {
     "Zero": (generators.Zero(), 3),
@@ -62,7 +62,7 @@ SETS = {
     "SecondOrderCone": lambda t: sets.SecondOrderCone(0.7 + 0.1 * t),
     "L1Ball": lambda t: sets.L1Ball(0.1 * t, 0.9),
     "Ellipsoid": lambda t: sets.Ellipsoid(0.0, radii=jnp.arange(1.0, M + 1.0) / (3.0 + t)),
-    "Polyhedron": lambda t: sets.Polyhedron(jnp.asarray(ROOT), 0.4 + 0.1 * jnp.sin(t + jnp.arange(1.0 * M))),
+    "Polyhedron": lambda t: sets.Polyhedron(ROOT, 0.4 + 0.1 * jnp.sin(t + jnp.arange(1.0 * M))),
     "WholeSpace": lambda t: sets.WholeSpace(),
 }  # fmt: skip
 
@@ -81,7 +81,7 @@ def manufactured(generator: str, operator: str, kind: str) -> Manufactured:
         else:
             chosen = x_star
     else:
-        chosen = lambda t: jnp.exp(-t) * like + 0.3 * jnp.cos(2 * t)  # noqa: E731
+        chosen = lambda t: (jnp.exp(-t) + 0.3 * jnp.cos(2 * t)) * like  # noqa: E731
     x0, shape_back = ravel_pytree(chosen(0.0))
     n = len(x0)
     rng = np.random.default_rng(n)

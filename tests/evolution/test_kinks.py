@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from tests.closed_forms import C1_KINKS, c1, c1_solution
 from tests.evolution.test_order import slope
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax import sets
@@ -150,7 +151,7 @@ SETS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("name", mostly_thorough(SETS, ["ball", "simplex"]))
 def test_kinks_of_every_kind_of_set(name):
     K, z = SETS[name]
     size = z(0.0).size

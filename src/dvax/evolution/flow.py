@@ -120,10 +120,11 @@ class Flow(eqx.Module):
         project = lambda z: K.project(z, space)  # noqa: E731
         u = P.inverse(rate.y)
 
+        base, linear = jax.jvp(project, (rate.z,), (error,))
+
         def moved(sign: float) -> Tree:
-            step = _tree.scale(sign, error)
-            base, linear = jax.jvp(project, (rate.z,), (step,))
-            curved = _tree.sub(project(_tree.add(rate.z, step)), _tree.add(base, linear))
+            line = _tree.add(base, _tree.scale(sign, linear))
+            curved = _tree.sub(project(_tree.add(rate.z, _tree.scale(sign, error))), line)
             shifted = self.problem.f(t, x, _tree.add(u, P.inverse(curved)), self.args)
             return jtu.tree_map(lambda a, b: jnp.abs(a - b), shifted, rate.value)
 

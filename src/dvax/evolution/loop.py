@@ -234,8 +234,7 @@ class Loop(eqx.Module):
         if factors is None:
             assert state.factors is not None
             factors = stepper.fitted(state.factors, t0, t1)
-        first = stepper.first(t0, t1, state.x, state.memory.guess)
-        return stepper.stages(t0, t1, state.x, factors, first)[0]
+        return stepper.advance(t0, t1, state.x, factors, state.memory.guess)[1]
 
 
 def slack(t: Any) -> Any:

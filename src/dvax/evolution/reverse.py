@@ -179,10 +179,8 @@ class _Backward:
         t0, t1 = self._times(loop, i)
         stepper = loop.stepper
         factors = stepper.factors(t1 - t0) if stepper.uniform is None else stepper.uniform
-        first = stepper.first(t0, t1, x, guess)
-        c, _ = stepper.stages(t0, t1, x, factors, first)
-        x1 = factors.full.step(x, c)
-        return (x1, c), None if guess is None else lax.stop_gradient(first.y)
+        x1, c, y = stepper.advance(t0, t1, x, factors, guess)
+        return (x1, c), None if guess is None else lax.stop_gradient(y)
 
     def _replay(self, x: Tree, i: Any, until: Any) -> Tree:
         """x_until from xᵢ."""

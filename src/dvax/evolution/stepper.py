@@ -1,5 +1,6 @@
 """One step of an exponential method, and what it is known to miss."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -60,6 +61,18 @@ class Step(NamedTuple):
     begun: Any
     solved: Any
     finite: Any
+
+
+class Visit(NamedTuple):
+    """Where f̃ was evaluated, and what it was."""
+
+    t: Any
+    x: Tree
+    rate: Rate
+
+
+Plan = Callable[[Callable[[Any, Tree], Rate]], tuple[tuple[Tree, ...], Tree]]
+"""From evaluate(t, x) to (the stage polynomial, x₁)."""
 
 
 class Sample(NamedTuple):
@@ -125,49 +138,28 @@ class Stepper(eqx.Module):
         same = jnp.abs(h - factors.length) <= 2 * _ulp(t0, t1)
         return lax.cond(same, lambda: factors, lambda: self.factors(h))
 
-    def stages(
-        self, t0: Any, t1: Any, x0: Tree, factors: Factors, first: Rate
-    ) -> tuple[tuple[Tree, ...], list[Rate]]:
-        """The stage polynomial, and the rates it was made from."""
-        rates = [first]
-
-        def evaluate(theta: float, x: Tree) -> Tree:
-            rates.append(self.flow.rate(self._within(t0, t1, theta), x, rates[-1].y))
-            return rates[-1].value
-
-        def propagate(theta: float, c: tuple[Tree, ...]) -> Tree:
-            if theta == 1.0:
-                return factors.full.step(x0, c)
-            assert factors.half is not None and theta == 0.5
-            return factors.half.step(x0, shortened(c, theta))
-
-        return self.method.coefficients(evaluate, propagate, first.value), rates
-
-    def first(self, t0: Any, t1: Any, x0: Tree, guess: Tree | None) -> Rate:
-        """f̃ where the step begins."""
-        return self.flow.rate(self._within(t0, t1, 0.0), x0, guess)
+    def advance(
+        self, t0: Any, t1: Any, x0: Tree, factors: Factors, guess: Tree | None
+    ) -> tuple[Tree, tuple[Tree, ...], Tree | None]:
+        """(x₁, the stage polynomial, y where the step begins), and nothing else."""
+        plan = self._plan(t0, t1, x0, factors, False)
+        (c, x1), visits = self._evaluated(x0, plan, guess, None, True)
+        return x1, c, visits[0].rate.y
 
     def step(
         self, t0: Any, t1: Any, x0: Tree, memory: Memory, factors: Factors, jumped: Any
     ) -> Step:
         """One step from t0 to t1. `jumped` says that what memory holds is not the rate at t0."""
-        kept = memory.rate
-        if kept is None:
-            first = self.first(t0, t1, x0, memory.guess)
-        else:
-            # The last sample of the previous step was taken here, unless data jumps here.
-            first = lax.cond(
-                jumped, lambda: self._kept(self.first(t0, t1, x0, memory.guess)), lambda: kept
-            )
-        c, rates = self.stages(t0, t1, x0, factors, first)
-        x1 = factors.full.step(x0, c)
+        plan = self._plan(t0, t1, x0, factors, self.measure)
+        # The last evaluation of the previous step was made where this one begins.
+        (c, x1), visits = self._evaluated(x0, plan, memory.guess, memory.rate, jumped)
+        first, last = visits[0].rate, visits[-1].rate
         error, impulse, kink = None, (0.0, 0.0), None
         if self.measure:
-            sample = self._measure(t0, t1, x0, x1, first, c, factors)
-            rates.append(sample.rates[-1])
+            sample = self._measure(t0, t1, x0, x1, c, visits)
+            error, impulse = sample.error, (sample.defect, sample.law_defect)
             if self.locate:
                 kink = self._kink(t0, t1, x0, c, first, sample)
-            error, impulse = sample.error, (sample.defect, sample.law_defect)
             # Further in, a bad value may come from a step that was too long: it is cut, not fatal.
             finite = _tree.all_finite(first.value)
         else:
@@ -176,11 +168,97 @@ class Stepper(eqx.Module):
             look = self.careful or _size(x1) <= _SMALL
             finite = _tree.all_finite(x1) if look else jnp.asarray(True)
         after = Memory(
-            self._kept(rates[-1]) if self.measure else None,
-            None if self.flow.direct else rates[-1].y,
+            self._kept(last) if self.measure else None,
+            None if self.flow.direct else last.y,
         )
-        solved = jnp.all(jnp.stack([rate.solved for rate in rates]))
+        solved = jnp.all(jnp.stack([visit.rate.solved for visit in visits]))
         return Step(x1, c, error, impulse, kink, after, first.solved, solved, finite)
+
+    def _plan(self, t0: Any, t1: Any, x0: Tree, factors: Factors, measured: bool) -> Plan:
+        """The evaluations of a step: at its start, for its stages, inside, and at its end."""
+
+        def run(evaluate: Callable[[Any, Tree], Rate]) -> tuple[tuple[Tree, ...], Tree]:
+            def stage(theta: float, x: Tree) -> Tree:
+                return evaluate(self._within(t0, t1, theta), x).value
+
+            def propagate(theta: float, c: tuple[Tree, ...]) -> Tree:
+                if theta == 1.0:
+                    return factors.full.step(x0, c)
+                assert factors.half is not None and theta == 0.5
+                return factors.half.step(x0, shortened(c, theta))
+
+            c = self.method.coefficients(stage, propagate, stage(0.0, x0))
+            x1 = factors.full.step(x0, c)
+            if measured:
+                # No inner ones where the defect is enclosed.
+                for theta, to in zip(self.method.samples, factors.inner, strict=False):
+                    evaluate(self._within(t0, t1, theta), to.step(x0, shortened(c, theta)))
+                evaluate(self._within(t0, t1, 1.0), x1)
+            return c, x1
+
+        return run
+
+    def _evaluated(
+        self, x0: Tree, plan: Plan, guess: Tree | None, kept: Rate | None, jumped: Any
+    ) -> tuple[tuple[tuple[Tree, ...], Tree], list[Visit]]:
+        """What a plan comes to, and where it went; the first rate is `kept`, unless data `jumped`."""
+        if not self.flow.direct:
+            return self._in_turn(x0, plan, guess, kept, jumped)
+        visits: list[Visit] = []
+
+        def evaluate(t: Any, x: Tree) -> Rate:
+            look = lambda: self.flow.rate(t, x, None)  # noqa: E731
+            if not visits and kept is not None:
+                rate = lax.cond(jumped, lambda: self._kept(look()), lambda: kept)
+            else:
+                rate = look()
+            visits.append(Visit(t, x, rate))
+            return rate
+
+        return plan(evaluate), visits
+
+    def _in_turn(
+        self, x0: Tree, plan: Plan, guess: Tree | None, kept: Rate | None, jumped: Any
+    ) -> tuple[tuple[tuple[Tree, ...], Tree], list[Visit]]:
+        """The same by a loop that evaluates f̃ at one place of the program.
+
+        A law that is solved by iteration takes a compiler a second or ten, once for every place, and
+        next to its solution the few products of a step cost nothing: so the plan is run again for
+        every evaluation, with the rates known so far, to see what is asked for next.
+        """
+        flow = self.flow
+
+        def run(known: Callable[[int], Rate]) -> tuple[Any, list[Visit]]:
+            visits: list[Visit] = []
+
+            def answer(t: Any, x: Tree) -> Rate:
+                visits.append(Visit(t, x, known(len(visits))))
+                return visits[-1].rate
+
+            return plan(answer), visits
+
+        def row(table: Rate, k: Any) -> Rate:
+            return jtu.tree_map(lambda leaf: leaf[k], table)
+
+        def put(table: Rate, k: Any, rate: Rate) -> Rate:
+            return jtu.tree_map(lambda leaf, v: leaf.at[k].set(v), table, rate)
+
+        like = jax.eval_shape(lambda: flow.rate(self.ends[0], x0, guess))
+        blank = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), like)
+        count = len(run(lambda _: blank)[1])
+        table = jtu.tree_map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), blank)
+        start: Any = 0
+        if kept is not None:
+            table, start = put(table, 0, kept), jnp.where(jumped, 0, 1)
+
+        def one(k: Any, table: Rate) -> Rate:
+            _, visits = run(lambda i: row(table, i))
+            t, x = jtu.tree_map(lambda *v: jnp.stack(v)[k], *((v.t, v.x) for v in visits))
+            before = _tree.where(k > 0, row(table, jnp.maximum(k - 1, 0)).y, guess)
+            return put(table, k, flow.rate(t, x, before))
+
+        table = lax.fori_loop(start, count, one, table)
+        return run(lambda i: row(table, i))
 
     def _kink(self, t0: Any, t1: Any, x0: Tree, c: Any, first: Rate, sample: Sample) -> Any:
         """The time of the first kink of the response along x_h."""
@@ -223,13 +301,10 @@ class Stepper(eqx.Module):
             return rate
         return rate._replace(y=None, z=rate.z if self.locate else None)
 
-    def _measure(
-        self, t0: Any, t1: Any, x0: Tree, x1: Tree, first: Rate, c: Any, factors: Factors
-    ) -> Sample:
-        last = self.flow.rate(self._within(t0, t1, 1.0), x1, first.y)
+    def _measure(self, t0: Any, t1: Any, x0: Tree, x1: Tree, c: Any, visits: list[Visit]) -> Sample:
         if self.flow.enclosed:
-            return self._enclosed(t0, t1, x0, x1, c, last)
-        return self._sampled(t0, t1, x0, x1, first, c, factors, last)
+            return self._enclosed(t0, t1, x0, x1, c, visits[-1].rate)
+        return self._sampled(t0, t1, x0, c, visits)
 
     def _enclosed(self, t0: Any, t1: Any, x0: Tree, x1: Tree, c: Any, last: Rate) -> Sample:
         """|δ(θ)| ≤ (1−θ)(|δ(0)| + dev) + θ(|δ(1)| + dev) entry by entry, with dev from chord
@@ -253,54 +328,47 @@ class Stepper(eqx.Module):
         defect = 0.5 * h * (space.norm(at_start) + space.norm(at_end))
         return Sample((), [last], error, defect, jnp.zeros_like(defect))
 
-    def _sampled(
-        self,
-        t0: Any,
-        t1: Any,
-        x0: Tree,
-        x1: Tree,
-        first: Rate,
-        c: Any,
-        factors: Factors,
-        last: Rate,
-    ) -> Sample:
+    def _sampled(self, t0: Any, t1: Any, x0: Tree, c: Any, visits: list[Visit]) -> Sample:
         """The defect δ = p − f̃(·, x_h) at the start, inside and at the end of the step.
 
         Between the samples δ is taken to be a line plus a bump (a parabola, or the tent of a kink):
         then ∫|δ| ≤ h(½|δ(0)| + ½|δ(1)| + max |δ(θ) − (1 − θ)δ(0) − θδ(1)|), whatever the place of the
         kink. δ(0) is zero for a method whose polynomial starts at f̃(t₀, x₀), as most do.
         """
-        h, flow, thetas = t1 - t0, self.flow, self.method.samples
-        te = self._within(t0, t1, 1.0)
-        inner = []
-        for theta, propagator in zip(thetas, factors.inner, strict=True):
-            t, x = self._within(t0, t1, theta), propagator.step(x0, shortened(c, theta))
-            inner.append((t, x, flow.rate(t, x, inner[-1][2].y if inner else first.y)))
+        h, thetas = t1 - t0, self.method.samples
+        along = [visits[0], *visits[-1 - len(thetas) :]]
+        first, *inner, last = (visit.rate for visit in along)
         start = _tree.sub(first.value, c[0])
         end = _tree.sub(last.value, polynomial(c, 1.0))
         bumps = []
-        for theta, (_, _, rate) in zip(thetas, inner, strict=True):
+        for theta, rate in zip(thetas, inner, strict=True):
             line = _tree.add(_tree.scale(1.0 - theta, start), _tree.scale(theta, end))
             bumps.append(_tree.sub(_tree.sub(rate.value, polynomial(c, theta)), line))
 
         # How well z, the unconstrained value of the law, is predicted by its other samples.
-        zs = [first.z, *(rate.z for _, _, rate in inner), last.z]
+        zs = [visit.rate.z for visit in along]
         weights = _extrapolation((0.0, *thetas, 1.0))
         doubt = jtu.tree_map(
             lambda *z: _DOUBT * sum(w * v for w, v in zip(weights, z, strict=True)), *zs
         )
-        unseen = flow.hidden(te, x1, last, doubt)
-        for t, x, rate in inner:
-            unseen = jtu.tree_map(jnp.maximum, unseen, flow.hidden(t, x, rate, doubt))
+        unseen = self._unseen(along[1:], doubt)
         ends = _tree.scale(0.5, start), _tree.scale(0.5, end)
         bump = jtu.tree_map(lambda *b: jnp.max(jnp.abs(jnp.stack(b)), axis=0), *bumps)
         error = jtu.tree_map(lambda *parts: sum(map(jnp.abs, parts)), *ends, bump, unseen)
-        space = flow.state_space(x0)
+        space = self.flow.state_space(x0)
         defect = h * sum(map(space.norm, (*ends, bump, unseen)))
-        residuals = [first.residual, *(rate.residual for _, _, rate in inner), last.residual]
-        law_defect = h * jnp.max(jnp.stack(residuals))
-        rates = [*(rate for _, _, rate in inner), last]
-        return Sample(thetas, rates, error, defect, law_defect)
+        law_defect = h * jnp.max(jnp.stack([visit.rate.residual for visit in along]))
+        return Sample(thetas, [*inner, last], error, defect, law_defect)
+
+    def _unseen(self, visits: list[Visit], doubt: Tree) -> Tree:
+        """The most that is hidden at any of them; where projections are iterated, from one place of
+        the program, as in `_in_turn`."""
+        hidden = lambda v: self.flow.hidden(v.t, v.x, v.rate, doubt)  # noqa: E731
+        if self.flow.direct:
+            found = [hidden(visit) for visit in visits]
+            return jtu.tree_map(lambda *h: jnp.max(jnp.stack(h), axis=0), *found)
+        stacked = lax.map(hidden, jtu.tree_map(lambda *leaves: jnp.stack(leaves), *visits))
+        return jtu.tree_map(lambda leaf: jnp.max(leaf, axis=0), stacked)
 
 
 def _extrapolation(nodes: tuple[float, ...]) -> list[float]:
