@@ -21,11 +21,23 @@ def test_the_first_of_several_changes_of_sign_is_found():
 
     thetas = (0.0, 0.5, 1.0)
     values = [at(jnp.asarray(theta)) for theta in thetas]
-    assert float(first_change(thetas, values, at)) == pytest.approx(0.3, abs=1e-7)
+    assert float(first_change(thetas, values, at)) == pytest.approx(0.3, abs=1e-5)
     late = lambda theta: at(theta).at[1].set(1.0)  # noqa: E731
     values = [late(jnp.asarray(theta)) for theta in thetas]
-    assert float(first_change(thetas, values, late)) == pytest.approx(0.8, abs=1e-7)
+    assert float(first_change(thetas, values, late)) == pytest.approx(0.8, abs=1e-5)
     assert float(first_change(thetas[:2], values[:2], late)) == np.inf
+    assert float(first_change(thetas, values, late, asked=False)) == np.inf
+
+
+@pytest.mark.parametrize("place", [1e-4, 0.123, 0.5, 0.9, 0.9999])
+@pytest.mark.parametrize("hair", [0.0, 1e-12, 1e-6])
+def test_functions_that_rest_on_zero_or_nearly_so_are_found_to_leave_it(place, hair):
+    leaving = lambda theta: jnp.maximum(theta - place, 0.0)[None] - hair  # noqa: E731
+    arriving = lambda theta: jnp.maximum(place - theta, 0.0)[None] - hair  # noqa: E731
+    for at in (leaving, arriving):
+        thetas = (0.0, 1.0)
+        values = [at(jnp.asarray(theta)) for theta in thetas]
+        assert float(first_change(thetas, values, at)) == pytest.approx(place, abs=2e-5)
 
 
 def test_order_four_comes_back_over_kinks_that_nobody_announced():
@@ -77,6 +89,9 @@ CURVES = {
     "is held and almost let go": lambda t: 1.0 + (t - 1.0) ** 2,
     "slides along the bound": lambda t: 1.0 + jnp.where(t > 1, (t - 1) ** 3, 0.0) * jnp.cos(9 * t),
     "held for an instant": lambda t: 1.0 + 1e-5 - (t - 1.0) ** 2,
+    "leaves the bound from rest on it": lambda t: 1.0 - jnp.maximum(t - 1.0, 0.0),
+    "comes to rest on the bound": lambda t: 1.0 - jnp.maximum(1.0 - t, 0.0),
+    "leaves from a hair above": lambda t: 1.0 + 1e-7 - jnp.maximum(t - 1.0, 0.0),
     "many kinks": lambda t: 1.0 + jnp.sin(40 * t),
     "infinitely many kinks": chatter,
 }
@@ -191,6 +206,23 @@ def test_data_that_jumps_changes_the_regime_where_it_jumps():
     times, positive = sol.regimes()
     np.testing.assert_allclose(times, [0.0, 0.7, 2.0], atol=1e-12)
     assert positive.tolist() == [[True, True], [True, False]]
+    # Named by a table, also where it jumps at the very end; and a kink before it in the same step.
+    z = dvax.signals.Table([0.0, 0.7, 2.0], jnp.array([0.5, 1.5, 0.2]), kind="constant")
+    sol = dvax.solve(driven(z), 0.0, 0.0, 2.0, dense=True, max_steps=4096)
+    times, positive = sol.regimes()
+    np.testing.assert_allclose(times, [0.0, 0.7, 2.0], atol=1e-14)
+    assert positive.tolist() == [[True, True], [True, False]]
+    lift = lambda t: z(t) + jnp.where(t < 0.7, 2.0 * t, -1.0)  # noqa: E731
+    sol = dvax.solve(driven(lift), 0.0, 0.0, 2.0, dt=0.7, dense=True, max_steps=64)
+    times, positive = sol.regimes()
+    np.testing.assert_allclose(times, [0.0, 0.25, 0.7, 2.0], atol=1e-5)
+    assert positive.tolist() == [[True, True], [True, False], [True, True]]
+
+
+def test_a_set_without_kinks_has_one_regime():
+    sol = dvax.solve(driven(jnp.sin, sets.WholeSpace()), 0.0, 0.0, 2.0, rtol=1e-3, dense=True, max_steps=4096)
+    times, positive = sol.regimes()
+    assert times.tolist() == [0.0, 2.0] and positive.shape == (1, 0)
 
 
 def test_regimes_need_the_steps_and_a_set_that_has_switches():

@@ -11,7 +11,7 @@ import scipy.optimize
 from tests.selection import mostly_thorough
 from tests.sets.cases import CASES, N
 
-from dvax import spaces
+from dvax import sets, spaces
 
 WEIGHTS = {"plain": np.ones(N), "weighted": np.array([0.3, 4.0, 1.0, 2.5])}
 SPACES = {"plain": spaces.Euclidean(N), "weighted": spaces.L2(WEIGHTS["weighted"])}
@@ -218,3 +218,13 @@ def test_the_derivative_jumps_where_a_switch_changes_its_sign_and_nowhere_else(n
         smooth = np.max(jump, where=~changed, initial=0.0)
         assert smooth < 0.05 and np.all(jump[changed] > 3 * smooth), (smooth, jump[changed])
     assert changes > 0 or name in ("whole space", "hyperplane", "affine subspace")
+
+
+def test_a_row_that_says_what_others_say_does_not_switch_by_itself():
+    # (1, 1)·y ≤ 0 follows from y ≤ 0: the projection is 0 on the whole quadrant y ≥ 0.
+    rows = jnp.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    K, space = sets.Polyhedron(rows, jnp.zeros(3)), spaces.Euclidean(2)
+    rng = np.random.default_rng(2)
+    z = jnp.asarray(np.abs(rng.normal(size=(200, 2))))
+    (signs,) = jax.vmap(lambda z: K.switches(z, space))(z)
+    assert not np.any(np.asarray(signs) > 0)

@@ -150,6 +150,21 @@ def test_beyond_the_dense_size_derivatives_come_by_gmres_both_ways():
     np.testing.assert_allclose(weights @ np.asarray(change), exact @ along, rtol=1e-9)
 
 
+def test_beyond_the_dense_size_single_precision_has_derivatives_too():
+    F, drive, K = chain(0.4, 0.7)
+    drive = jnp.asarray(drive, jnp.float32)
+    K = Box(jnp.float32(0.0), jnp.float32(1.5))
+    solver = dvax.vi.ActiveSet(dense=2000)
+    solved = lambda q: dvax.solve_vi(F, K, jnp.zeros_like(q), q, solver, 1e-4).y  # noqa: E731
+    _, change = jax.jvp(solved, (drive,), (jnp.ones_like(drive),))
+    _, exact = jax.jvp(
+        lambda q: dvax.solve_vi(F, Box(0.0, 1.5), jnp.zeros_like(q), q, solver).y,
+        (jnp.asarray(drive, float),), (jnp.ones(len(drive)),),
+    )  # fmt: skip
+    # An entry that rounding puts on the other side of its bound moves otherwise.
+    assert np.mean(np.abs(np.asarray(change) - np.asarray(exact)) < 1e-3) > 0.99
+
+
 def test_a_derivative_that_gmres_does_not_reach_is_no_number():
     # A chain so stiff that a thousand iterations without a preconditioner do not solve it.
     F, drive, K = chain(1e9, 1.0)

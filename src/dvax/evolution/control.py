@@ -67,10 +67,10 @@ class Adaptive(AbstractController):
     that parts with different units are each held to their own size. Entry by entry it is not: where
     an entry passes through zero, nothing asks for a better rate there.
 
-    The defect integrated over the run is then at most the tolerance, so the computed trajectory is
-    the exact one of a system disturbed by no more than was asked for. A kink or an unannounced jump
-    inside a step has a defect that does not shrink with h; its impulse h·defect does, and a share of
-    the tolerance is set aside for such steps, each spending at most a small part of what is left.
+    The defect integrated over these steps is then at most the tolerance. A kink or an unannounced jump
+    inside a step has a defect that does not shrink with h; its impulse h·defect does, and such steps
+    have the tolerance once more among them, each spending at most a small part of what is left. So
+    the computed trajectory is the exact one of a system disturbed by no more than twice the tolerance.
 
     Where the stepper locates kinks of the response, steps are made to end there (`kinks`).
 
@@ -121,7 +121,10 @@ class Adaptive(AbstractController):
         share = jnp.where(h <= 1e4 * floor, 0.1, 1e-6)
         # A step may be taken all the same that is short after a refusal, or aimed to cross a kink.
         known = Aim(*state.aim)
-        kink = jnp.full_like(h, jnp.inf) if step.kink is None else lax.stop_gradient(step.kink)
+        # Where it is, matters where the defect is too large.
+        kink = jnp.full_like(h, jnp.inf)
+        if step.kink is not None:
+            kink = lax.stop_gradient(step.kink(error > 1.0))
         crossing = (kink < jnp.inf) & (h <= 4 * known.margin)
         relaxed = (state.rejected | crossing) & (impulse <= share * state.spare)
         sound = step.begun & step.finite
@@ -142,16 +145,17 @@ class Adaptive(AbstractController):
         )
 
         # A kink explains why a step was refused: the length that was planned stays.
-        ahead, aimed = aim(state.aim, kink, length, floor, ~keep & sound & jnp.isfinite(error))
+        refused = ~keep & sound & jnp.isfinite(error)
+        ahead, aimed = aim(state.aim, kink, length, state.length, floor, refused)
         hindered = aimed | (keep & (known.kink < jnp.inf))
         wanted = jnp.where(hindered, jnp.maximum(wanted, state.length), wanted)
-        ahead = passed(ahead, jnp.where(keep, t1, t0))
+        ahead = lax.stop_gradient(passed(ahead, jnp.where(keep, t1, t0)))
 
         jumped = keep & (t1 == self.stops[state.stop])
         last = self.stops.shape[0] - 1
         stop = jnp.minimum(jnp.where(jumped, state.stop + 1, state.stop), last)
         begin = jnp.where(keep, t1, t0)
-        end = _land(begin, wanted, jnp.minimum(self.stops[stop], until(ahead, begin)))
+        end = _land(begin, wanted, until(ahead, begin, self.stops[stop]))
         # Below this, t itself cannot tell the ends of a step apart.
         stuck = ~keep & (h <= floor)
         result = RESULTS.where(

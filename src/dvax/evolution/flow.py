@@ -100,11 +100,14 @@ class Flow(eqx.Module):
         return enclose(lambda t, x, u: problem.f(t, x, u, args), t, x, u)
 
     def switches(self, t: Any, x: Tree, z: Tree) -> jax.Array | None:
-        """What changes its sign where the response has a kink, as a vector; None where it has none, or
-        K does not say."""
+        """What changes its sign where the response has a kink, as a vector; None where K does not say."""
         K, space = self.problem.set_at(t, self.args), self.problem.spaces(x)[1]
         found = K.switches(z, space)
-        return jnp.concatenate([jnp.ravel(v) for v in found]) if found else None
+        if found is None:
+            return None
+        return jnp.concatenate(
+            [jnp.zeros(0, jnp.result_type(*jtu.tree_leaves(z))), *map(jnp.ravel, found)]
+        )
 
     def hidden(self, t: Any, x: Tree, rate: Rate, error: Tree) -> Tree:
         """How far f̃ may be off, entry by entry, because z may be off by ± `error`.

@@ -17,26 +17,35 @@ from jax import lax
 from ..vi.batch import any_of_batch
 
 _CLOSE = 1e-5
-"""Of a step: two guesses in a row so near each other settle where its kink is."""
+"""Of a step: so narrow a bracket settles where its kink is."""
 
-_MOST = 20
-"""Guesses for one kink within a step, and refused steps aimed at one kink."""
+_MOST = 60
+"""Guesses for one kink within a step."""
+
+_AIMS = 8
+"""Steps in a row that are aimed at kinks without getting on: then they are shortened as any others."""
 
 _FIRST = 0.02
 """How far before a kink a step is made to end that was guessed from one step alone, in its lengths."""
 
 
 def first_change(
-    thetas: tuple[float, ...], values: list[jax.Array], at: Callable[[Any], jax.Array]
+    thetas: tuple[float, ...],
+    values: list[jax.Array],
+    at: Callable[[Any], jax.Array],
+    asked: Any = True,
 ) -> jax.Array:
-    """The first θ at which one of the functions changes its sign, ∞ where none does.
+    """The first θ at which one of the functions changes its sign, ∞ where none does, or nobody `asked`.
 
     `values` are those at `thetas`, `at(θ)` gives them anywhere. By the method of false position for
     the function that changes first, as Illinois does it: an end that stays has its values halved.
+    Where a function rests on zero, or two guesses in a row have not halved the bracket, the middle is
+    the next one.
     """
     signs = [v > 0 for v in values]
     changed = [jnp.any(sign != signs[0]) for sign in signs[1:]]
     some = changed[-1] if len(changed) == 1 else jnp.any(jnp.stack(changed))
+    some = some & asked
 
     def search() -> jax.Array:
         j = jnp.argmax(jnp.stack(changed))
@@ -50,34 +59,42 @@ def first_change(
 def _false_position(
     a: Any, va: jax.Array, b: Any, vb: jax.Array, sign: jax.Array, at: Callable[[Any], jax.Array]
 ) -> jax.Array:
+    """The end of a bracket, no wider than `_CLOSE`, on the side where the sign has changed."""
+
     def narrow(s: tuple) -> tuple:
-        a, va, b, vb, _, last, before, count = s
+        a, va, b, vb, before, slow, count = s
         flips = (va > 0) != (vb > 0)
         shares = jnp.where(flips, va / jnp.where(flips, va - vb, 1.0), 1.0)
-        theta = a + (b - a) * jnp.min(shares)
+        guess = jnp.min(shares)
+        # A little past it, to either side in turn: two good guesses close the bracket.
+        inset = jnp.minimum(0.4 * _CLOSE / (b - a), 0.25)
+        share = jnp.clip(guess + jnp.where(before > 0, -inset, inset), inset, 1.0 - inset)
+        blind = (guess <= 0.0) | (guess >= 1.0) | (slow >= 2)
+        theta = a + (b - a) * jnp.where(blind, 0.5, share)
         v = at(theta)
         beyond = jnp.any((v > 0) != sign)
         side = jnp.where(beyond, 1, -1)
         again = jnp.where(side == before, 0.5, 1.0)
+        width = b - a
         a, va, b, vb = (
             jnp.where(beyond, p, q)
             for p, q in ((a, theta), (again * va, v), (theta, b), (v, again * vb))
         )
-        return a, va, b, vb, last, theta, side, count + 1
+        slow = jnp.where(b - a > 0.5 * width, slow + 1, 0)
+        return a, va, b, vb, side, slow, count + 1
 
     def unsettled(s: tuple) -> Any:
-        a, _, b, _, before, last, _, count = s
-        settled = (jnp.abs(last - before) <= _CLOSE) | (b - a <= _CLOSE)
-        return ~settled & (count < _MOST)
+        a, _, b, *_, count = s
+        return (b - a > _CLOSE) & (count < _MOST)
 
-    nowhere = jnp.full_like(b, -1.0)
-    start = a, va, b, vb, nowhere, b, jnp.asarray(0), jnp.asarray(0)
-    return lax.while_loop(unsettled, narrow, start)[5]
+    nothing = jnp.asarray(0)
+    return lax.while_loop(unsettled, narrow, (a, va, b, vb, nothing, nothing, nothing))[2]
 
 
 class Aim(NamedTuple):
     """The kink ahead (∞: none is known) and how well it is known: steps end `margin` before it and
-    behind it. `span` is the length of the step that showed it, `tries` how many were refused."""
+    behind it. `span` is the length of the step that showed it; `tries`, how many steps in a row were
+    aimed at kinks, refused or not, without one of a tenth of the first one's length being kept."""
 
     kink: Any
     margin: Any
@@ -90,25 +107,38 @@ def nothing_ahead(like: jax.Array) -> jax.Array:
     return jnp.stack([jnp.full_like(like, jnp.inf), *(jnp.zeros_like(like),) * 3])
 
 
-def aim(old: jax.Array, kink: Any, h: Any, floor: Any, refused: Any) -> tuple[jax.Array, Any]:
-    """What is known after a step of length h that had a `kink` inside and was or was not refused, and
-    whether the next one is aimed anew."""
+def aim(
+    old: jax.Array, kink: Any, h: Any, planned: Any, floor: Any, refused: Any
+) -> tuple[jax.Array, Any]:
+    """What is known after a step of length h, of those that were `planned`, that had a `kink` inside
+    and was or was not refused, and whether the next one is aimed anew."""
     was = Aim(*old)
-    anew = refused & (kink < jnp.inf) & (was.tries < _MOST)
-    # Off by as much as the last guess, times the ratio of lengths: the error is quadratic in them.
+    anew = refused & (kink < jnp.inf) & (was.tries < _AIMS)
+    # A guess is off by some h², so by (h/span)² of what the last one was off by; that is left to be
+    # one power less, and fourfold. The guess itself is no closer than its bracket.
     known = was.kink < jnp.inf
     off = 4.0 * jnp.abs(kink - jnp.where(known, was.kink, kink)) * h / jnp.maximum(was.span, h)
     margin = jnp.where(known, jnp.minimum(off, _FIRST * h), _FIRST * h)
-    new = Aim(kink, jnp.maximum(margin, 4.0 * floor), h, was.tries + 1)
-    return jnp.where(anew, jnp.stack(new), old), anew
+    margin = jnp.maximum(margin, jnp.maximum(2.0 * _CLOSE * h, 4.0 * floor))
+    new = Aim(kink, margin, h, was.tries + 1.0)
+    # Long steps, and aims that have come to nothing, begin the count anew.
+    fresh = ~refused & (h >= 0.1 * planned)
+    kept = old.at[3].set(jnp.where(fresh, 0.0, was.tries))
+    return jnp.where(anew, jnp.stack(new), kept), anew
 
 
 def passed(old: jax.Array, t: Any) -> jax.Array:
     """What is known at t."""
-    return jnp.where(t > Aim(*old).kink, nothing_ahead(Aim(*old).kink), old)
+    was = Aim(*old)
+    behind = jnp.stack(
+        [jnp.full_like(was.kink, jnp.inf), *(jnp.zeros_like(was.kink),) * 2, was.tries]
+    )
+    return jnp.where(t > was.kink, behind, old)
 
 
-def until(aim: jax.Array, t: Any) -> Any:
-    """Where a step from t ends at the latest: before the kink, or behind it from close by."""
+def until(aim: jax.Array, t: Any, stop: Any) -> Any:
+    """Where a step from t ends at the latest: before the kink, behind it from close by, or at the next
+    `stop`, where little would be left up to there."""
     kink, margin, *_ = aim
-    return jnp.where(t < kink - 2.0 * margin, kink - margin, kink + margin)
+    end = jnp.where(t < kink - 2.0 * margin, kink - margin, kink + margin)
+    return jnp.where(end < stop - margin, end, stop)

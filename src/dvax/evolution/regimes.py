@@ -10,7 +10,7 @@ import numpy as np
 from .flow import Flow
 from .kinks import first_change
 from .loop import Record
-from .stepper import inside
+from .stepper import inside, within
 
 _LOOKS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Where inside a step the signs are looked at."""
@@ -27,10 +27,12 @@ class Regimes(NamedTuple):
 
 
 def regimes(flow: Flow, records: Record, count: int) -> Regimes:
-    """Those of the first `count` steps of a flow whose set has switches."""
+    """Those of the first `count` steps, at least one, of a flow whose set says where its kinks are."""
     steps = jtu.tree_map(lambda leaf: leaf[:count], records)
-    kinks, before, after = map(np.asarray, jax.jit(jax.vmap(lambda s: _changes(flow, s)))(steps))
     starts, lengths = np.asarray(steps.start), np.asarray(steps.length)
+    run = steps.start[0], steps.start[-1] + steps.length[-1]
+    look = jax.jit(jax.vmap(lambda step: _changes(flow, step, run)))
+    kinks, before, after = map(np.asarray, look(steps))
     times, rows = [starts[0]], [before[0]]
     for k in range(count):
         # What data does when it jumps shows between two steps, a kink of the trajectory inside.
@@ -41,16 +43,23 @@ def regimes(flow: Flow, records: Record, count: int) -> Regimes:
     return Regimes(np.array([*times, starts[-1] + lengths[-1]]), np.array(rows))
 
 
-def _changes(flow: Flow, step: Record) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The time of the first change of sign in a step, and the signs at its ends."""
+def _changes(
+    flow: Flow, step: Record, run: tuple[Any, Any]
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The time of the first change of sign in a step, and the signs at its ends, seen from inside."""
 
-    def at(theta: Any) -> jax.Array:
-        t = step.start + theta * step.length
+    def at(theta: Any, t: Any = None) -> jax.Array:
+        t = step.start + theta * step.length if t is None else t
         x = inside(flow.generator, step.length, theta, step.x0, step.coefficients)
         found = flow.switches(t, x, flow.rate(t, x, flow.guess(x)).z)
         assert found is not None
         return found
 
-    values = [at(jnp.asarray(theta, step.start.dtype)) for theta in _LOOKS]
+    end = step.start + step.length
+    values = [
+        at(jnp.asarray(theta, end.dtype), within(step.start, end, theta, run)) for theta in _LOOKS
+    ]
+    if values[0].size == 0:
+        return jnp.full_like(end, jnp.inf), values[0] > 0, values[0] > 0
     kink = step.start + first_change(_LOOKS, values, at) * step.length
     return kink, values[0] > 0, values[-1] > 0

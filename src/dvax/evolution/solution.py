@@ -127,11 +127,11 @@ class Solution(eqx.Module):
 
         ```
         """
-        if self.records is None:
+        if self.records is None or int(self.stats["steps"]) == 0:
             raise InputError(
                 InputProblem(
                     "Solution.regimes",
-                    "a solution without its steps",
+                    "a solution without its steps" if self.records is None else "no step at all",
                     "changes between the saved times are found on the steps themselves",
                     "Solve with dense=True",
                 )

@@ -1,6 +1,7 @@
 """One step of an exponential method, and what it is known to miss."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from .. import _tree
 from .._tree import Tree
 from ..generators import AbstractGenerator, AbstractPropagator, Growth
 from ..problem import END_ULPS, KNOT_ULPS
+from ..vi.batch import any_of_batch
 from .chords import Chord, is_chord
 from .flow import Flow, Rate
 from .kinks import first_change
@@ -47,8 +49,8 @@ class Step(NamedTuple):
     """A step to x₁ with its stage polynomial c.
 
     `error` is the defect entry by entry (None where not measured), `impulse` = (∫ ‖p − f̃(·, x_h)‖ ds,
-    ∫ ‖w‖ ds) over the step. `kink` is the time of the first kink of the response inside, ∞ where there
-    is none (None where nobody looks). `begun` says that the law was solved at the start, `solved` that
+    ∫ ‖w‖ ds) over the step. `kink(asked)` is the time of the first kink of the response inside, ∞
+    where there is none or nobody `asked` (None where nobody looks). `begun` says that the law was solved at the start, `solved` that
     it was everywhere; `finite`, that there are no bad values that a shorter step would not mend.
     """
 
@@ -56,7 +58,7 @@ class Step(NamedTuple):
     c: tuple[Tree, ...]
     error: Tree | None
     impulse: tuple[Any, Any]
-    kink: Any
+    kink: Callable[[Any], Any] | None
     memory: Memory
     begun: Any
     solved: Any
@@ -91,6 +93,21 @@ def inside(
 ) -> Tree:
     """x_h(t₀ + θh)."""
     return generator.propagator(theta * length, len(c)).step(x0, shortened(c, theta))
+
+
+def within(t0: Any, t1: Any, theta: float, ends: tuple[Any, Any]) -> Any:
+    """t₀ + θh, with the ends approached from inside: data may jump there.
+
+    A few roundings inside, since two records may round the same moment differently; at the `ends` of
+    the run as many as `Problem.knots` leaves out.
+    """
+    if 0.0 < theta < 1.0:
+        return t0 + theta * (t1 - t0)
+    begin, end = ends
+    at_end = (t0 == begin) if theta == 0.0 else (t1 == end)
+    ulps = jnp.where(at_end, END_ULPS, KNOT_ULPS)
+    inset = lax.stop_gradient(jnp.minimum(ulps * _ulp(t0, t1), 0.25 * (t1 - t0)))
+    return t0 + inset if theta == 0.0 else t1 - inset
 
 
 class Stepper(eqx.Module):
@@ -159,7 +176,7 @@ class Stepper(eqx.Module):
             sample = self._measure(t0, t1, x0, x1, c, visits)
             error, impulse = sample.error, (sample.defect, sample.law_defect)
             if self.locate:
-                kink = self._kink(t0, t1, x0, c, first, sample)
+                kink = partial(self._kink, t0, t1, x0, c, first, sample)
             # Further in, a bad value may come from a step that was too long: it is cut, not fatal.
             finite = _tree.all_finite(first.value)
         else:
@@ -222,9 +239,9 @@ class Stepper(eqx.Module):
     ) -> tuple[tuple[tuple[Tree, ...], Tree], list[Visit]]:
         """The same by a loop that evaluates f̃ at one place of the program.
 
-        A law that is solved by iteration takes a compiler a second or ten, once for every place, and
-        next to its solution the few products of a step cost nothing: so the plan is run again for
-        every evaluation, with the rates known so far, to see what is asked for next.
+        A law that is solved by iteration takes a compiler a second or ten, once for every place. So
+        the plan is run again for every evaluation, with the rates known so far, to see where it goes
+        next; of all that it computes the compiler keeps what leads there.
         """
         flow = self.flow
 
@@ -236,6 +253,10 @@ class Stepper(eqx.Module):
                 return visits[-1].rate
 
             return plan(answer), visits
+
+        def visit(i: int, table: Rate) -> tuple[Any, Tree]:
+            at = run(lambda k: row(table, k))[1][i]
+            return at.t, at.x
 
         def row(table: Rate, k: Any) -> Rate:
             return jtu.tree_map(lambda leaf: leaf[k], table)
@@ -249,18 +270,19 @@ class Stepper(eqx.Module):
         table = jtu.tree_map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), blank)
         start: Any = 0
         if kept is not None:
-            table, start = put(table, 0, kept), jnp.where(jumped, 0, 1)
+            table, start = put(table, 0, kept), jnp.where(any_of_batch(jumped), 0, 1)
 
         def one(k: Any, table: Rate) -> Rate:
-            _, visits = run(lambda i: row(table, i))
-            t, x = jtu.tree_map(lambda *v: jnp.stack(v)[k], *((v.t, v.x) for v in visits))
+            t, x = lax.switch(k, [partial(visit, i) for i in range(count)], table)
             before = _tree.where(k > 0, row(table, jnp.maximum(k - 1, 0)).y, guess)
             return put(table, k, flow.rate(t, x, before))
 
         table = lax.fori_loop(start, count, one, table)
         return run(lambda i: row(table, i))
 
-    def _kink(self, t0: Any, t1: Any, x0: Tree, c: Any, first: Rate, sample: Sample) -> Any:
+    def _kink(
+        self, t0: Any, t1: Any, x0: Tree, c: Any, first: Rate, sample: Sample, asked: Any
+    ) -> Any:
         """The time of the first kink of the response along x_h."""
         t0, t1, x0, c, rates = lax.stop_gradient((t0, t1, x0, c, [first, *sample.rates]))
         flow, thetas = self.flow, (0.0, *sample.thetas, 1.0)
@@ -279,21 +301,10 @@ class Stepper(eqx.Module):
             switches(self._within(t0, t1, theta), rate)
             for theta, rate in zip(thetas, rates, strict=True)
         ]
-        return t0 + first_change(thetas, values, at) * (t1 - t0)
+        return t0 + first_change(thetas, values, at, asked) * (t1 - t0)
 
     def _within(self, t0: Any, t1: Any, theta: float) -> Any:
-        """t₀ + θh, with the ends approached from inside: data may jump there.
-
-        A few roundings inside, since two records may round the same moment differently; at the ends
-        of the run as many as `Problem.knots` leaves out.
-        """
-        if 0.0 < theta < 1.0:
-            return t0 + theta * (t1 - t0)
-        begin, end = self.ends
-        at_end = (t0 == begin) if theta == 0.0 else (t1 == end)
-        ulps = jnp.where(at_end, END_ULPS, KNOT_ULPS)
-        inset = lax.stop_gradient(jnp.minimum(ulps * _ulp(t0, t1), 0.25 * (t1 - t0)))
-        return t0 + inset if theta == 0.0 else t1 - inset
+        return within(t0, t1, theta, self.ends)
 
     def _kept(self, rate: Rate) -> Rate:
         """What the next step needs of a rate: not the law behind it, where nothing samples it."""

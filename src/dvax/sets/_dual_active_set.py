@@ -24,10 +24,11 @@ SLACK = 0.75
 
 
 class Found(NamedTuple):
-    """x; the rows that hold it, with force or without; whether it was reached and checked."""
+    """x; the rows that hold it, with force or without; their forces; whether x is right."""
 
     x: jax.Array
     held: jax.Array
+    force: jax.Array
     good: jax.Array
 
 
@@ -123,7 +124,8 @@ def nearest(rows: jax.Array, bounds: jax.Array, z: jax.Array, size: jax.Array) -
     inside = jnp.all(~(slack(end.x) > 2.0 * tolerance(end.x)))
     pushing = jnp.all(force >= -loose)
     good = inside & balanced & pushing & ~end.failed & jnp.isfinite(reach)
-    return Found(end.x, end.held | (jnp.abs(slack(end.x)) <= tolerance(end.x)), good)
+    held = end.held | (jnp.abs(slack(end.x)) <= tolerance(end.x))
+    return Found(end.x, held, jnp.where(end.held, end.force, 0.0), good)
 
 
 def _only(mask: jax.Array, rows: jax.Array) -> jax.Array:

@@ -76,14 +76,12 @@ class Polyhedron(AbstractSet):
         return _nearest(*self._flat(z, space))[0].reshape(z.shape)
 
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
-        """Slack less multiplier, row by row (of length one): one of them is zero."""
+        """Row by row the slack, or less the force of a row that holds. Of rows that repeat each other
+        some share the force that others might as well exert."""
         flat, root, G, d, E, e = self._flat(z, space)
-        y, held = _nearest(flat, root, G, d, E, e)
+        y, held, force = _nearest(flat, root, G, d, E, e)
         rows, bounds = _scaled(G, d, root)
-        equations = _scaled(E, e, root)[0] if len(e) else E
-        holding = jnp.concatenate([equations, held[:, None] * rows])
-        force = jnp.linalg.pinv(holding).T @ ((flat - y) / root)
-        return [bounds - rows @ (y / root) - held * force[len(e) :]]
+        return [jnp.where(held > 0, -force, bounds - rows @ (y / root))]
 
     def _flat(self, z: Tree, space: AbstractSpace) -> tuple:
         n = z.size
@@ -100,8 +98,8 @@ class Polyhedron(AbstractSet):
 @jax.custom_jvp
 def _nearest(
     z: jax.Array, root: jax.Array, G: jax.Array, d: jax.Array, E: jax.Array, e: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """(the projection, NaN where there is none; 1 for rows of G that hold it, else 0).
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """(the projection, NaN where there is none; 1 for rows of G that hold it, else 0; their forces).
 
     `root` is w^{−1/2}: in the coordinates y/root the norm of the space is the plain one.
     """
@@ -127,12 +125,12 @@ def _nearest(
     y = jnp.where(found.good & solvable, found.x + base, jnp.nan)
     # Nothing held: z itself, without the rounding of the way there and back.
     free = found.good & ~jnp.any(found.held) & (len(e) == 0)
-    return jnp.where(free, z, y * root), found.held.astype(z.dtype)
+    return jnp.where(free, z, y * root), found.held.astype(z.dtype), found.force
 
 
 @_nearest.defjvp
 def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
-    y, held = _nearest(*primals)
+    y, held, force = _nearest(*primals)
 
     def on_face(z, root, G, d, E, e) -> jax.Array:
         # Rows that do not hold take no part; d may be infinite there.
@@ -145,7 +143,7 @@ def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
         return root * (point - jnp.linalg.pinv(rows) @ (rows @ point - bounds))
 
     _, change = jax.jvp(on_face, primals, tangents)
-    return (y, held), (change, jnp.zeros_like(held))
+    return (y, held, force), (change, jnp.zeros_like(held), jnp.zeros_like(force))
 
 
 def _scaled(G: jax.Array, d: jax.Array, root: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -21,7 +21,6 @@ from .certificate import natural_residual
 from .matrix import matrix_of
 
 _DENSE = 1024  # up to this many unknowns the Jacobian is formed; beyond, GMRES applies it
-_ASKED, _ENOUGH = 1e-12, 1e-8  # relative residuals of GMRES: what it aims at, and what is an answer
 
 
 def with_implicit_derivative(
@@ -62,10 +61,13 @@ def _general_solve(g: Callable[[Tree], Tree], b: Tree) -> Tree:
 
 def _krylov_solve(g: Callable[[jax.Array], jax.Array], b: jax.Array) -> jax.Array:
     gmres = jax.scipy.sparse.linalg.gmres
+    eps = float(jnp.finfo(b.dtype).eps)
+    # Relative residuals: what is aimed at, and what is an answer.
+    asked, enough = max(1e-12, 10 * eps), eps**0.5
 
     def solve(apply: Callable[[jax.Array], jax.Array], right: jax.Array) -> jax.Array:
-        d, _ = gmres(apply, right, tol=_ASKED, atol=0.0, restart=50, maxiter=20)
+        d, _ = gmres(apply, right, tol=asked, atol=0.0, restart=50, maxiter=20)
         left = jnp.linalg.norm(right - apply(d))
-        return jnp.where(left <= _ENOUGH * jnp.linalg.norm(right), d, jnp.nan)
+        return jnp.where(left <= enough * jnp.linalg.norm(right), d, jnp.nan)
 
     return jax.lax.custom_linear_solve(g, b, solve, transpose_solve=solve)
