@@ -220,7 +220,8 @@ def test_data_that_jumps_changes_the_regime_where_it_jumps():
 
 
 def test_a_set_without_kinks_has_one_regime():
-    sol = dvax.solve(driven(jnp.sin, sets.WholeSpace()), 0.0, 0.0, 2.0, rtol=1e-3, dense=True, max_steps=4096)
+    problem = driven(jnp.sin, sets.WholeSpace())
+    sol = dvax.solve(problem, 0.0, 0.0, 2.0, rtol=1e-3, dense=True, max_steps=4096)
     times, positive = sol.regimes()
     assert times.tolist() == [0.0, 2.0] and positive.shape == (1, 0)
 

@@ -50,8 +50,9 @@ class Step(NamedTuple):
 
     `error` is the defect entry by entry (None where not measured), `impulse` = (∫ ‖p − f̃(·, x_h)‖ ds,
     ∫ ‖w‖ ds) over the step. `kink(asked)` is the time of the first kink of the response inside, ∞
-    where there is none or nobody `asked` (None where nobody looks). `begun` says that the law was solved at the start, `solved` that
-    it was everywhere; `finite`, that there are no bad values that a shorter step would not mend.
+    where there is none or nobody `asked` (None where nobody looks). `begun` says that the law was
+    solved at the start, `solved` that it was everywhere; `finite`, that there are no bad values that a
+    shorter step would not mend.
     """
 
     x1: Tree
