@@ -100,7 +100,7 @@ class Flow(eqx.Module):
         return enclose(lambda t, x, u: problem.f(t, x, u, args), t, x, u)
 
     def switches(self, t: Any, x: Tree, z: Tree) -> jax.Array | None:
-        """What changes its sign where the response has a kink, as a vector; None where K does not say."""
+        """What changes its sign where the response has a kink; None where K does not say."""
         K, space = self.problem.set_at(t, self.args), self.problem.spaces(x)[1]
         found = K.switches(z, space)
         if found is None:
