@@ -185,7 +185,7 @@ def test_nothing_hides_a_value_that_is_not_a_number(name):
 
 
 @every_space
-@every_set
+@every_other_set
 def test_the_derivative_jumps_where_a_switch_changes_its_sign_and_nowhere_else(name, kind):
     case, space = CASES[name], SPACES[kind]
     rng = np.random.default_rng(8)

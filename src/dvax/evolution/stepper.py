@@ -14,8 +14,8 @@ from .. import _tree
 from .._tree import Tree
 from ..generators import AbstractGenerator, AbstractPropagator, Growth
 from ..problem import END_ULPS, KNOT_ULPS
-from ..vi.batch import any_of_batch
 from .chords import Chord, is_chord
+from .evaluations import Plan, Visit, evaluated
 from .flow import Flow, Rate
 from .kinks import first_change
 from .method import AbstractMethod, polynomial, shortened
@@ -64,18 +64,6 @@ class Step(NamedTuple):
     begun: Any
     solved: Any
     finite: Any
-
-
-class Visit(NamedTuple):
-    """Where f̃ was evaluated, and what it was."""
-
-    t: Any
-    x: Tree
-    rate: Rate
-
-
-Plan = Callable[[Callable[[Any, Tree], Rate]], tuple[tuple[Tree, ...], Tree]]
-"""From evaluate(t, x) to (the stage polynomial, x₁)."""
 
 
 class Sample(NamedTuple):
@@ -161,7 +149,7 @@ class Stepper(eqx.Module):
     ) -> tuple[Tree, tuple[Tree, ...], Tree | None]:
         """(x₁, the stage polynomial, y where the step begins), and nothing else."""
         plan = self._plan(t0, t1, x0, factors, False)
-        (c, x1), visits = self._evaluated(x0, plan, guess, None, True)
+        (c, x1), visits = evaluated(self.flow, plan, self.ends[0], x0, guess, None, True)
         return x1, c, visits[0].rate.y
 
     def step(
@@ -170,7 +158,8 @@ class Stepper(eqx.Module):
         """One step from t0 to t1. `jumped` says that what memory holds is not the rate at t0."""
         plan = self._plan(t0, t1, x0, factors, self.measure)
         # The last evaluation of the previous step was made where this one begins.
-        (c, x1), visits = self._evaluated(x0, plan, memory.guess, memory.rate, jumped)
+        begin, kept = self.ends[0], memory.rate
+        (c, x1), visits = evaluated(self.flow, plan, begin, x0, memory.guess, kept, jumped)
         first, last = visits[0].rate, visits[-1].rate
         error, impulse, kink = None, (0.0, 0.0), None
         if self.measure:
@@ -215,71 +204,6 @@ class Stepper(eqx.Module):
             return c, x1
 
         return run
-
-    def _evaluated(
-        self, x0: Tree, plan: Plan, guess: Tree | None, kept: Rate | None, jumped: Any
-    ) -> tuple[tuple[tuple[Tree, ...], Tree], list[Visit]]:
-        """What a plan comes to, and where it went; the first rate is `kept`, unless data `jumped`."""
-        if not self.flow.direct:
-            return self._in_turn(x0, plan, guess, kept, jumped)
-        visits: list[Visit] = []
-
-        def evaluate(t: Any, x: Tree) -> Rate:
-            look = lambda: self.flow.rate(t, x, None)  # noqa: E731
-            if not visits and kept is not None:
-                rate = lax.cond(jumped, lambda: self._kept(look()), lambda: kept)
-            else:
-                rate = look()
-            visits.append(Visit(t, x, rate))
-            return rate
-
-        return plan(evaluate), visits
-
-    def _in_turn(
-        self, x0: Tree, plan: Plan, guess: Tree | None, kept: Rate | None, jumped: Any
-    ) -> tuple[tuple[tuple[Tree, ...], Tree], list[Visit]]:
-        """The same by a loop that evaluates f̃ at one place of the program.
-
-        A law that is solved by iteration takes a compiler a second or ten, once for every place. So
-        the plan is run again for every evaluation, with the rates known so far, to see where it goes
-        next; of all that it computes the compiler keeps what leads there.
-        """
-        flow = self.flow
-
-        def run(known: Callable[[int], Rate]) -> tuple[Any, list[Visit]]:
-            visits: list[Visit] = []
-
-            def answer(t: Any, x: Tree) -> Rate:
-                visits.append(Visit(t, x, known(len(visits))))
-                return visits[-1].rate
-
-            return plan(answer), visits
-
-        def visit(i: int, table: Rate) -> tuple[Any, Tree]:
-            at = run(lambda k: row(table, k))[1][i]
-            return at.t, at.x
-
-        def row(table: Rate, k: Any) -> Rate:
-            return jtu.tree_map(lambda leaf: leaf[k], table)
-
-        def put(table: Rate, k: Any, rate: Rate) -> Rate:
-            return jtu.tree_map(lambda leaf, v: leaf.at[k].set(v), table, rate)
-
-        like = jax.eval_shape(lambda: flow.rate(self.ends[0], x0, guess))
-        blank = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), like)
-        count = len(run(lambda _: blank)[1])
-        table = jtu.tree_map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), blank)
-        start: Any = 0
-        if kept is not None:
-            table, start = put(table, 0, kept), jnp.where(any_of_batch(jumped), 0, 1)
-
-        def one(k: Any, table: Rate) -> Rate:
-            t, x = lax.switch(k, [partial(visit, i) for i in range(count)], table)
-            before = _tree.where(k > 0, row(table, jnp.maximum(k - 1, 0)).y, guess)
-            return put(table, k, flow.rate(t, x, before))
-
-        table = lax.fori_loop(start, count, one, table)
-        return run(lambda i: row(table, i))
 
     def _kink(
         self, t0: Any, t1: Any, x0: Tree, c: Any, first: Rate, sample: Sample, asked: Any

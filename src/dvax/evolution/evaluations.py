@@ -1,0 +1,110 @@
+"""The evaluations of f̃ that a step asks for, one after the other."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+
+from .. import _tree
+from .._tree import Tree
+from ..vi.batch import any_of_batch
+from .flow import Flow, Rate
+
+
+class Visit(NamedTuple):
+    """Where f̃ was evaluated, and what it was."""
+
+    t: Any
+    x: Tree
+    rate: Rate
+
+
+Plan = Callable[[Callable[[Any, Tree], Rate]], tuple[tuple[Tree, ...], Tree]]
+"""From evaluate(t, x) to (the stage polynomial, x₁)."""
+
+Evaluated = tuple[tuple[tuple[Tree, ...], Tree], list[Visit]]
+"""What a plan comes to, and where it went."""
+
+
+def evaluated(
+    flow: Flow, plan: Plan, begin: Any, x0: Tree, guess: Tree | None, kept: Rate | None, jumped: Any
+) -> Evaluated:
+    """A plan carried out from x₀, its first rate being `kept` (None: unknown), unless data `jumped`.
+    `begin` is any time of the run."""
+    if flow.direct:
+        return _straight(flow, plan, kept, jumped)
+    return _in_turn(flow, plan, begin, x0, guess, kept, jumped)
+
+
+def _straight(flow: Flow, plan: Plan, kept: Rate | None, jumped: Any) -> Evaluated:
+    visits: list[Visit] = []
+
+    def evaluate(t: Any, x: Tree) -> Rate:
+        look = lambda: flow.rate(t, x, None)  # noqa: E731
+        rate = look() if visits or kept is None else _unless(jumped, kept, look)
+        visits.append(Visit(t, x, rate))
+        return rate
+
+    return plan(evaluate), visits
+
+
+def _unless(jumped: Any, kept: Rate, look: Callable[[], Rate]) -> Rate:
+    """The rate that is known, or of a new one as much as is kept of it."""
+
+    def again() -> Rate:
+        new = look()
+        return new._replace(
+            y=None if kept.y is None else new.y, z=None if kept.z is None else new.z
+        )
+
+    return lax.cond(jumped, again, lambda: kept)
+
+
+def _in_turn(
+    flow: Flow, plan: Plan, begin: Any, x0: Tree, guess: Tree | None, kept: Rate | None, jumped: Any
+) -> Evaluated:
+    """The same by a loop that evaluates f̃ at one place of the program.
+
+    A law that is solved by iteration takes a compiler a second or ten, once for every place. So the
+    plan is run again for every evaluation, with the rates known so far, to see where it goes next; of
+    all that it computes the compiler keeps what leads there.
+    """
+
+    def run(known: Callable[[int], Rate]) -> Evaluated:
+        visits: list[Visit] = []
+
+        def answer(t: Any, x: Tree) -> Rate:
+            visits.append(Visit(t, x, known(len(visits))))
+            return visits[-1].rate
+
+        return plan(answer), visits
+
+    def row(table: Rate, k: Any) -> Rate:
+        return jtu.tree_map(lambda leaf: leaf[k], table)
+
+    def put(table: Rate, k: Any, rate: Rate) -> Rate:
+        return jtu.tree_map(lambda leaf, v: leaf.at[k].set(v), table, rate)
+
+    def visit(i: int, table: Rate) -> tuple[Any, Tree]:
+        at = run(lambda k: row(table, k))[1][i]
+        return at.t, at.x
+
+    like = jax.eval_shape(lambda: flow.rate(begin, x0, guess))
+    blank = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), like)
+    count = len(run(lambda _: blank)[1])
+    table = jtu.tree_map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), blank)
+    start: Any = 0
+    if kept is not None:
+        table, start = put(table, 0, kept), jnp.where(any_of_batch(jumped), 0, 1)
+
+    def one(k: Any, table: Rate) -> Rate:
+        t, x = lax.switch(k, [partial(visit, i) for i in range(count)], table)
+        before = _tree.where(k > 0, row(table, jnp.maximum(k - 1, 0)).y, guess)
+        return put(table, k, flow.rate(t, x, before))
+
+    table = lax.fori_loop(start, count, one, table)
+    return run(lambda i: row(table, i))
