@@ -151,6 +151,7 @@ def test_beyond_the_dense_size_derivatives_come_by_gmres_both_ways(monkeypatch):
     np.testing.assert_allclose(weights @ np.asarray(change), exact @ along, rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_beyond_the_dense_size_single_precision_has_derivatives_too(monkeypatch):
     monkeypatch.setattr(implicit, "_DENSE", 32)
     F, drive, K = chain(150, 0.4, 0.7)
