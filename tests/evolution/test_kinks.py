@@ -112,7 +112,9 @@ def test_grazing_and_chatter_end_with_the_accuracy_that_was_asked_for(name, meth
     error = abs(float(sol.xs[0]) - exact(z, lambda v: np.minimum(v, 1.0)))
     print(f"{name}: {sol.stats['steps']} steps, {sol.stats['rejected']} refused, error {error:.1e}")
     assert error <= 10 * rtol
-    assert int(sol.stats["rejected"]) <= int(sol.stats["steps"]) + 10
+    # Only where kinks are without end is about every third attempt in vain.
+    share = 0.6 if name == "infinitely many kinks" else 0.5
+    assert int(sol.stats["rejected"]) <= share * int(sol.stats["steps"])
 
 
 def test_a_law_too_rough_for_any_step_ends_with_a_sentence():

@@ -121,7 +121,7 @@ class Adaptive(AbstractController):
         share = jnp.where(h <= 1e4 * floor, 0.1, 1e-6)
         # A step may be taken all the same that is short after a refusal, or aimed to cross a kink.
         known = Aim(*state.aim)
-        # Where it is, matters where the defect is too large.
+        # A kink is looked for only where the defect is too large.
         kink = jnp.full_like(h, jnp.inf)
         if step.kink is not None:
             kink = lax.stop_gradient(step.kink(error > 1.0))

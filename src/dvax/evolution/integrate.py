@@ -91,9 +91,10 @@ _FEW = 64
 
 def _can_locate(flow: Flow, t0: jax.Array, x0: Any) -> bool:
     like = flow.problem.zero_control(x0)
-    few = sum(leaf.size for leaf in jtu.tree_leaves(like)) <= _FEW
+    if sum(leaf.size for leaf in jtu.tree_leaves(like)) > _FEW:
+        return False
     known = flow.switches(t0, x0, like)
-    return few and known is not None and known.size > 0
+    return known is not None and known.size > 0
 
 
 def _solution(

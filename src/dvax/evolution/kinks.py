@@ -4,7 +4,7 @@ A kink of f̃ inside a step spoils a method's order, and nothing is gained by ma
 bit by bit. So a step that was refused is taken anew up to shortly before the kink, which is smooth; a
 short step crosses it; and the length that was planned goes on behind. How short, is found out: the
 first guess for the kink, from the step that was refused, is right to O(h²) or so, and where the
-crossing is refused too, it gives a far better one. Two or three rounds serve any tolerance.
+crossing is refused too, it gives a far better one, and so on.
 """
 
 from collections.abc import Callable
@@ -121,7 +121,7 @@ def aim(
     margin = jnp.where(known, jnp.minimum(off, _FIRST * h), _FIRST * h)
     margin = jnp.maximum(margin, jnp.maximum(2.0 * _CLOSE * h, 4.0 * floor))
     new = Aim(kink, margin, h, was.tries + 1.0)
-    # Long steps, and aims that have come to nothing, begin the count anew.
+    # A step that is kept and not short begins the count anew.
     fresh = ~refused & (h >= 0.1 * planned)
     kept = old.at[3].set(jnp.where(fresh, 0.0, was.tries))
     return jnp.where(anew, jnp.stack(new), kept), anew
@@ -130,10 +130,7 @@ def aim(
 def passed(old: jax.Array, t: Any) -> jax.Array:
     """What is known at t."""
     was = Aim(*old)
-    behind = jnp.stack(
-        [jnp.full_like(was.kink, jnp.inf), *(jnp.zeros_like(was.kink),) * 2, was.tries]
-    )
-    return jnp.where(t > was.kink, behind, old)
+    return jnp.where(t > was.kink, nothing_ahead(was.kink).at[3].set(was.tries), old)
 
 
 def until(aim: jax.Array, t: Any, stop: Any) -> Any:

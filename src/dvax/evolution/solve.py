@@ -56,8 +56,9 @@ def solve(
     - `dt`: fixed steps, no longer than this (the fewest equal ones between knots of the data);
       without it, steps adapt;
     - `rtol`, `atol`: the disturbance that the computed trajectory may amount to, integrated over the
-      run and relative to |x|: the defect is kept below (atol + rtol|x|)/horizon. For a system whose
-      trajectories do not separate, that is a bound on the error;
+      run and relative to |x|: the defect is kept below (atol + rtol|x|)/horizon, and steps over kinks
+      may add as much again. For a system whose trajectories do not separate, twice the tolerance is
+      a bound on the error;
     - `method`: `dvax.ETD2RK()` by default; `vi_solver`: `dvax.vi.Auto()` by default;
     - `constants`: `dvax.Constants` (or any object with `gamma`, `L_F`, `norm_P_inv`): lets the law be
       solved to a tolerance on its true error, and certifies every saved u;
