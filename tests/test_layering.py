@@ -16,6 +16,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "dvax"
 FLOORS = {
     "errors": -2,
     "_tree": -1,
+    "_batch": -1,
     "spaces": 0,
     "generators": 0,
     "operators": 0,

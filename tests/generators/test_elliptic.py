@@ -17,7 +17,7 @@ from dvax.generators.transforms import BOUNDARIES, Transform
 
 SHAPES = [(1,), (2,), (5,), (8,), (4, 6), (5, 7), (3, 4, 5)]
 KINDS = [(s, b) for s in SHAPES for b in itertools.product(BOUNDARIES, repeat=len(s))]
-USUAL = [(s, b) for s, b in KINDS if len(s) < 2] + [
+USUAL = [(s, b) for s, b in KINDS if s in ((1,), (5,))] + [
     ((5, 7), ("neumann", "dirichlet")), ((4, 6), ("periodic", "neumann")),
     ((4, 6), ("dirichlet", "periodic")), ((3, 4, 5), ("dirichlet", "periodic", "neumann")),
 ]  # fmt: skip
@@ -96,7 +96,7 @@ def operator(shape, boundary):
     return A, matrix_of(shape, lengths, boundary, diffusion, velocity, -0.3), numbers
 
 
-@pytest.mark.parametrize(("shape", "boundary"), GRIDS)
+@pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(GRIDS, GRIDS[2::2]))
 def test_differences_are_their_matrix(shape, boundary):
     A, matrix, _ = operator(shape, boundary)
     rng, size = np.random.default_rng(2), int(np.prod(shape))
@@ -111,7 +111,7 @@ def test_differences_are_their_matrix(shape, boundary):
     close(np.asarray(flow).ravel(), np.asarray(exact))
 
 
-@pytest.mark.parametrize(("shape", "boundary"), GRIDS)
+@pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(GRIDS, GRIDS[1::2]))
 def test_the_growth_bound_holds_and_is_reached(shape, boundary):
     A, matrix, _ = operator(shape, boundary)
     M, omega = map(float, A.growth(spaces.Euclidean(shape)))
@@ -127,7 +127,7 @@ def test_the_growth_bound_holds_and_is_reached(shape, boundary):
         assert np.linalg.norm(moved, 2) <= M * np.exp(omega * t) * (1 + 1e-12)
 
 
-@pytest.mark.parametrize(("shape", "boundary"), GRIDS)
+@pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(GRIDS, GRIDS[:5:2]))
 def test_a_step_stays_within_its_bend(shape, boundary):
     A, _, _ = operator(shape, boundary)
     x0, c0, c1 = jnp.asarray(np.random.default_rng(4).normal(size=(3, *shape)))
@@ -136,7 +136,9 @@ def test_a_step_stays_within_its_bend(shape, boundary):
     thetas = jnp.linspace(0.0, 1.0, 41)
     path = np.asarray(jax.vmap(step)(thetas))
     line = np.asarray(jax.vmap(lambda s: (1 - s) * x0 + s * path[-1])(thetas))
-    bend = A.bend(h, x0, jnp.asarray(path[-1]), (c0, c1), space, A.growth(space))
+    bend = A.bend(
+        dvax.generators.Arc(h, x0, jnp.asarray(path[-1]), (c0, c1)), space, A.growth(space)
+    )
     assert np.all(np.abs(path - line) <= np.asarray(bend) + 1e-13)
     assert np.max(np.abs(path - line)) >= 0.02 * float(np.max(np.asarray(bend)))
 

@@ -111,6 +111,7 @@ def test_every_figure_is_drawn_without_an_error(curve: Path, width: int) -> None
     assert report["moved"] == {key: [False, True, False] for key in ("pressure", "regimes")}
 
 
+@pytest.mark.thorough
 def test_a_slider_shows_the_other_frame(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((30, 20), frames=5))
     report = look_at(build_report(run_dir, stills=False), 1280)

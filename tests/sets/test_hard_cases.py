@@ -41,13 +41,14 @@ ON_THE_EDGE = {
 }
 
 
-@pytest.mark.parametrize("name", mostly_thorough(ON_THE_EDGE, list(ON_THE_EDGE)[::2]))
+@pytest.mark.parametrize("name", mostly_thorough(ON_THE_EDGE, ["half-space", "apex", "polyhedron"]))
 def test_a_point_exactly_on_the_boundary_is_held_by_it(name):
     K, z, normals = ON_THE_EDGE[name]
     np.testing.assert_allclose(np.asarray(K.project(jnp.asarray(z), PLANE)), z, atol=1e-15)
     np.testing.assert_allclose(slope(K, z), tangent(*normals), atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_a_point_on_an_ellipsoid_moves_along_it():
     K = sets.Ellipsoid(0.0, radii=jnp.array([2.0, 1.0]))
     s = slope(K, [2.0, 0.0])
@@ -68,6 +69,7 @@ def test_held_points_move_with_the_data():
     np.testing.assert_allclose(shared(jnp.array([1.0, 2.0])), [0.5, 0.25])
 
 
+@pytest.mark.thorough
 def test_second_derivatives_are_those_of_the_face():
     K, z = sets.Ellipsoid(0.0, radii=jnp.array([2.0, 1.0])), jnp.array([3.0, 2.0])
     one = lambda v: K.project(v, UNEVEN)[0]  # noqa: E731
@@ -110,7 +112,7 @@ DEGENERATE = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", mostly_thorough(DEGENERATE, list(DEGENERATE)[::3]))
+@pytest.mark.parametrize("name", mostly_thorough(DEGENERATE, list(DEGENERATE)[1::3]))
 def test_degenerate_sets_are_sets(name):
     K, z, exact = DEGENERATE[name]
     found = np.asarray(jax.jit(lambda z: K.project(z, PLANE))(jnp.asarray(z)))

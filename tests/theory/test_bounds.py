@@ -21,7 +21,7 @@ RUNS = {
 
 
 OFTEN = {
-    ("C1", "fixed ETD1"), ("C4", "adaptive ETD2RK"),
+    ("C1", "fixed ETD1"), ("C1", "adaptive ETD2RK"),
 }  # fmt: skip
 
 

@@ -38,7 +38,6 @@ EVERY_RUN = [name for name in PROBLEMS if name not in LONG][::4]
 OFTEN = {
     ("auto", "kojshin"), ("auto", "expweight_box3"), ("golden ratio", "kojshin"),
     ("golden ratio", "cournot5"), ("golden ratio", "fukushima1"),
-    ("extragradient", "mathiesen as an intersection"),
 }  # fmt: skip
 _compiled: dict[Any, Any] = {}
 

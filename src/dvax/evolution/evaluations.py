@@ -10,8 +10,8 @@ import jax.tree_util as jtu
 from jax import lax
 
 from .. import _tree
+from .._batch import any_of_batch
 from .._tree import Tree
-from ..vi.batch import any_of_batch
 from .flow import Flow, Rate
 
 

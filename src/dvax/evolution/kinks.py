@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ..vi.batch import any_of_batch
+from .._batch import any_of_batch
 
 _CLOSE = 1e-5
 """Of a step: so narrow a bracket settles where its kink is."""

@@ -12,7 +12,7 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
-from ..generators import AbstractGenerator, AbstractPropagator, Growth
+from ..generators import AbstractGenerator, AbstractPropagator, Arc, Growth
 from ..problem import END_ULPS, KNOT_ULPS
 from .chords import Chord, is_chord
 from .evaluations import Plan, Visit, evaluated
@@ -250,7 +250,7 @@ class Stepper(eqx.Module):
         assert self.growth is not None
         t0, t1, x0, x1, c, growth = lax.stop_gradient((t0, t1, x0, x1, c, self.growth))
         h, space = t1 - t0, self.flow.state_space(x0)
-        bend = self.flow.generator.bend(h, x0, x1, c, space, growth)
+        bend = self.flow.generator.bend(Arc(h, x0, x1, c), space, growth)
         x = jtu.tree_map(Chord, x0, x1, bend)
         t = Chord(self._within(t0, t1, 0.0), self._within(t0, t1, 1.0), jnp.zeros_like(t0))
         along = self.flow.enclosure(t, x)

@@ -2,11 +2,15 @@
 
 from .abstract import AbstractGenerator as AbstractGenerator
 from .abstract import AbstractPropagator as AbstractPropagator
+from .abstract import Arc as Arc
 from .abstract import Growth as Growth
 from .dense import Dense as Dense
 from .diagonal import Diagonal as Diagonal
 from .elliptic import Elliptic as Elliptic
+from .faber import Range as Range
+from .matrix_free import AbstractMatrixFree as AbstractMatrixFree
 from .product import Product as Product
 from .rotation import Rotation as Rotation
 from .scalar import Scalar as Scalar
+from .sparse import Sparse as Sparse
 from .zero import Zero as Zero

@@ -16,6 +16,16 @@ class Growth(NamedTuple):
     omega: Any
 
 
+class Arc(NamedTuple):
+    """One step of x' = Ax + p: of length h, from x₀ to x₁, under a polynomial with the coefficients c
+    (see `AbstractPropagator`)."""
+
+    h: Any
+    x0: Tree
+    x1: Tree
+    c: tuple[Tree, ...]
+
+
 class AbstractPropagator(eqx.Module):
     """The exact flow of x' = Ax + p over one length h, with everything costly computed once.
 
@@ -52,18 +62,10 @@ class AbstractGenerator(eqx.Module):
         """M and ω with ‖e^{At}‖ ≤ M e^{ωt} in the norm of `space`, proved from A's structure."""
 
     @abc.abstractmethod
-    def bend(
-        self,
-        h: Any,
-        x0: Tree,
-        x1: Tree,
-        c: tuple[Tree, ...],
-        space: AbstractSpace,
-        growth: Growth,
-    ) -> Tree:
-        """A bound, entry by entry, on how far x(t₀ + θh) lies from the line between x₀ and x₁, for a
-        step from x₀ to x₁ with at most two coefficients c (see `AbstractPropagator`), given the
-        `growth` of this generator, or of a product that it is a part of, in the norm of `space`."""
+    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
+        """A bound, entry by entry, on how far x(t₀ + θh) lies from its chord, the line between x₀ and
+        x₁, where p has at most two coefficients, given the `growth` of this generator, or of a product
+        that it is a part of, in the norm of `space`."""
 
     @abc.abstractmethod
     def check(self, space: AbstractSpace) -> None:

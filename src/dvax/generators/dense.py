@@ -10,7 +10,8 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
-from .abstract import AbstractGenerator, AbstractPropagator, Growth
+from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
+from .bend import normwise_bend
 from .phi import flow_factors, phi_matrix
 
 
@@ -89,22 +90,8 @@ class Dense(AbstractGenerator):
             return Growth(_overshoot(similar, self.omega), self.omega)
         return Growth(jnp.ones(()), jnp.linalg.eigvalsh(0.5 * (similar + similar.T))[-1])
 
-    def bend(
-        self,
-        h: Any,
-        x0: Tree,
-        x1: Tree,
-        c: tuple[Tree, ...],
-        space: AbstractSpace,
-        growth: Growth,
-    ) -> Tree:
-        # x'' = e^{A(t−t₀)} x''(t₀), and one entry is at most the norm over the root of its weight.
-        first, *rest = c
-        slope = rest[0] / h if rest else jnp.zeros_like(first)
-        curvature = self.matrix @ (self.matrix @ x0 + first) + slope
-        rise = growth.M * jnp.exp(jnp.maximum(growth.omega, 0.0) * h)
-        largest = rise * space.norm(curvature)
-        return jnp.broadcast_to(h**2 / 8 * largest / jnp.sqrt(space.weights()), x0.shape)
+    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
+        return normwise_bend(self, arc, space, growth)
 
 
 def _overshoot(matrix: jax.Array, omega: jax.Array) -> jax.Array:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace
-from .abstract import AbstractGenerator, Growth
+from .abstract import AbstractGenerator, Arc, Growth
 from .phi import flow_factors, phi_scalar
 from .scalar import ElementwisePropagator, elementwise_bend
 
@@ -48,13 +48,5 @@ class Diagonal(AbstractGenerator):
     def growth(self, space: AbstractSpace) -> Growth:
         return Growth(jnp.ones(()), jnp.max(jnp.real(self.entries)))
 
-    def bend(
-        self,
-        h: Any,
-        x0: Tree,
-        x1: Tree,
-        c: tuple[Tree, ...],
-        space: AbstractSpace,
-        growth: Growth,
-    ) -> Tree:
-        return elementwise_bend(self.entries, h, x0, x1, *c)
+    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
+        return elementwise_bend(self.entries, arc.h, arc.x0, arc.x1, *arc.c)

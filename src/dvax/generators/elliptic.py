@@ -12,7 +12,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
-from .abstract import AbstractGenerator, AbstractPropagator, Growth
+from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
 from .phi import flow_factors, phi_scalar
 from .scalar import elementwise_bend
 from .transforms import BOUNDARIES, Transform, along, times
@@ -114,16 +114,9 @@ class Elliptic(AbstractGenerator):
         w = space.weights()
         return Growth(jnp.sqrt(jnp.max(w) / jnp.min(w)), jnp.max(jnp.real(self.symbol)))
 
-    def bend(
-        self,
-        h: Any,
-        x0: Tree,
-        x1: Tree,
-        c: tuple[Tree, ...],
-        space: AbstractSpace,
-        growth: Growth,
-    ) -> Tree:
+    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
         # Coefficient by coefficient; an eigenfunction is at most 1 anywhere.
+        h, x0, x1, c = arc
         forward = self.transform.forward
         parts = [forward(v) for v in (x0, x1, *c)]
         if jnp.iscomplexobj(self.symbol):

@@ -8,7 +8,7 @@ from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace
 from ..spaces import Product as ProductSpace
-from .abstract import AbstractGenerator, AbstractPropagator, Growth
+from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
 
 
 class Product(AbstractGenerator):
@@ -51,18 +51,11 @@ class Product(AbstractGenerator):
         worst = [jnp.max(jnp.stack([jnp.asarray(b[i]) for b in bounds])) for i in (0, 1)]
         return Growth(*worst)
 
-    def bend(
-        self,
-        h: Any,
-        x0: Tree,
-        x1: Tree,
-        c: tuple[Tree, ...],
-        space: AbstractSpace,
-        growth: Growth,
-    ) -> Tree:
-        columns = zip(self.parts, _parts(space, len(self.parts)), x0, x1, *c, strict=True)
+    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
+        spaces = _parts(space, len(self.parts))
+        columns = zip(self.parts, spaces, arc.x0, arc.x1, *arc.c, strict=True)
         return tuple(
-            part.bend(h, a, b, tuple(rest), own, growth) for part, own, a, b, *rest in columns
+            part.bend(Arc(arc.h, a, b, tuple(c)), own, growth) for part, own, a, b, *c in columns
         )
 
 

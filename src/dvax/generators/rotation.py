@@ -10,7 +10,7 @@ from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
 from ..spaces import Product as ProductSpace
-from .abstract import AbstractGenerator, AbstractPropagator, Growth
+from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
 from .phi import flow_factors, phi_scalar
 from .transforms import Transform, times
 
@@ -97,16 +97,9 @@ class Rotation(AbstractGenerator):
             spread = jnp.maximum(jnp.max(first), jnp.max(second)) / low
         return Growth(jnp.sqrt(spread), jnp.max(self.a))
 
-    def bend(
-        self,
-        h: Any,
-        x0: Tree,
-        x1: Tree,
-        c: tuple[Tree, ...],
-        space: AbstractSpace,
-        growth: Growth,
-    ) -> Tree:
+    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
         # z'' = e^{λ(t−t₀)} z''(t₀) with λ = a + ib.
+        h, x0, _, c = arc
         turn = lambda v: _turned(self.a, self.b, v)  # noqa: E731
         start, first, *rest = map(self.there, (x0, *c))
         curvature = turn(_tree.add(turn(start), first))

@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace
-from .abstract import AbstractGenerator, AbstractPropagator, Growth
+from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
 from .phi import flow_factors, phi_scalar
 
 
@@ -47,16 +47,9 @@ class Scalar(AbstractGenerator):
     def growth(self, space: AbstractSpace) -> Growth:
         return Growth(jnp.ones(()), self.a)
 
-    def bend(
-        self,
-        h: Any,
-        x0: Tree,
-        x1: Tree,
-        c: tuple[Tree, ...],
-        space: AbstractSpace,
-        growth: Growth,
-    ) -> Tree:
-        return jtu.tree_map(lambda *leaves: elementwise_bend(self.a, h, *leaves), x0, x1, *c)
+    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
+        h, *ends, c = arc
+        return jtu.tree_map(lambda *leaves: elementwise_bend(self.a, h, *leaves), *ends, *c)
 
 
 def elementwise_bend(a: jax.Array, h: Any, x0: Any, x1: Any, c0: Any, c1: Any = None) -> jax.Array:

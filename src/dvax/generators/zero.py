@@ -7,7 +7,7 @@ import jax.tree_util as jtu
 
 from .._tree import Tree
 from ..spaces import AbstractSpace
-from .abstract import AbstractGenerator, AbstractPropagator, Growth
+from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
 from .scalar import elementwise_bend
 
 
@@ -37,17 +37,10 @@ class Zero(AbstractGenerator):
     def growth(self, space: AbstractSpace) -> Growth:
         return Growth(jnp.ones(()), jnp.zeros(()))
 
-    def bend(
-        self,
-        h: Any,
-        x0: Tree,
-        x1: Tree,
-        c: tuple[Tree, ...],
-        space: AbstractSpace,
-        growth: Growth,
-    ) -> Tree:
+    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
         zero = lambda leaf: jnp.zeros((), leaf.dtype)  # noqa: E731
-        return jtu.tree_map(lambda *v: elementwise_bend(zero(v[0]), h, *v), x0, x1, *c)
+        h, *ends, c = arc
+        return jtu.tree_map(lambda *v: elementwise_bend(zero(v[0]), h, *v), *ends, *c)
 
 
 class Sum(AbstractPropagator):

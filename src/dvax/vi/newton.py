@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from .. import _tree
+from .._batch import any_of_batch
 from .._tree import Tree
 from .abstract import RESULTS, Answer, Frozen
-from .batch import any_of_batch
 from .extragradient import extragradient_step
 from .iteration import Trial, first_step, iterate
 

@@ -1,0 +1,38 @@
+"""What a batch of problems may share."""
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
+
+
+def any_of_batch(condition: jax.Array) -> jax.Array:
+    """Whether the condition holds, and under `jax.vmap` whether it does for any problem of the batch.
+
+    A branch of `lax.cond` on this is left out where no problem needs it. (On a condition of each
+    problem's own, every branch would be computed for all.) What the branch returns must then be
+    chosen problem by problem.
+    """
+    return _any_p.bind(condition)
+
+
+def largest_of_batch(count: jax.Array) -> jax.Array:
+    """The integer, and under `jax.vmap` the largest one of the batch: a loop of so many turns is then
+    one loop for all."""
+    return _largest_p.bind(count)
+
+
+def _shared(name: str, join) -> Primitive:
+    primitive = Primitive(name)
+    primitive.def_impl(lambda value: value)
+    primitive.def_abstract_eval(lambda value: value)
+    mlir.register_lowering(primitive, lambda ctx, value: [value])
+    batching.primitive_batchers[primitive] = lambda given, axes: (
+        primitive.bind(join(given[0], axis=axes[0])),
+        None,
+    )
+    return primitive
+
+
+_any_p = _shared("any_of_batch", jnp.any)
+_largest_p = _shared("largest_of_batch", jnp.max)

@@ -1,0 +1,211 @@
+"""e^{hA} and its φ-functions by Faber series: A is only ever applied.
+
+Let E be an ellipse that contains the numerical range of A, with half-axes a and b around z₀. Its Faber
+polynomials are F₀ = 1 and Fₖ = 2τₖ, with
+
+    τ₀ = 1,   τ₁ = (z − z₀)/(a + b),   τₖ₊₁ = 2 (z − z₀)/(a + b) τₖ − (a − b)/(a + b) τₖ₋₁,
+
+Chebyshev's where E is an interval. On its boundary, z(w) = z₀ + ½(a + b)w + ½(a − b)/w for |w| = 1, an
+analytic g is Σ ĝₖ wᵏ over all k, and g = Σ_{k≥0} ĝₖ Fₖ inside, so the coefficients come from one fast
+Fourier transform. Since ‖Fₖ(A)‖ ≤ 2 wherever E is convex and contains the numerical range (Beckermann
+2005), what is left out of g(A) is at most twice the sum of the coefficients left out, for normal and
+non-normal A alike: here they are cut where they are no more than rounding. Nothing is orthogonalised or
+kept, the cost of h‖A‖ large is √(h‖A‖) products where A is self-adjoint and h‖A‖ where it is skew, and
+derivatives are those of a polynomial.
+
+Source: Beckermann and Reichel, Error estimates and evaluation of matrix functions via the Faber
+transform, SIAM J. Numer. Anal. 47 (2009); the bound: Beckermann, C. R. Acad. Sci. Paris 340 (2005).
+"""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+
+from .. import _tree
+from .._batch import largest_of_batch
+from .._tree import Tree
+from .abstract import AbstractGenerator, AbstractPropagator
+from .phi import flow_factors, phi_scalar
+
+_SIZES = (256, 2048, 16384)
+"""Of the Fourier transform that finds the coefficients."""
+_RISE = 4.0
+"""The largest exponent of e^{hz} on the ellipse, in one piece of a step."""
+_MOST_PIECES = 4096
+_RUN, _BRANCH = 8, 16
+"""A loop that is differentiated backward remembers where every run of turns began."""
+
+
+class Ellipse(NamedTuple):
+    """Centre, and half-axes along the real axis and along the imaginary one."""
+
+    centre: Any
+    real: Any
+    imaginary: Any
+
+
+class Range(NamedTuple):
+    """A rectangle that contains the numerical range {⟨Av, v⟩ : ‖v‖ = 1}, v complex: real parts from
+    `low` to `high`, imaginary parts up to ± `height`; an `ellipse` that contains it, where one is
+    known; in the inner product Σ `weights`ᵢ aᵢ bᵢ."""
+
+    low: Any
+    high: Any
+    height: Any = 0.0
+    weights: Tree = 1.0
+    ellipse: Ellipse | None = None
+
+
+def smaller(one: Ellipse, other: Ellipse) -> Ellipse:
+    """Which of the two is of less capacity, half the sum of the half-axes."""
+    return _tree.where(one.real + one.imaginary < other.real + other.imaginary, one, other)
+
+
+def around(found: Range, dtype: Any) -> Ellipse:
+    """The ellipse that is known, or that of least capacity around the rectangle, whichever has the
+    shorter axes; widened by more than rounding."""
+    low, high, height = (lax.stop_gradient(jnp.asarray(v, dtype)) for v in found[:3])
+    width = 0.5 * (high - low)
+    p, q = jnp.cbrt(width) ** 2, jnp.cbrt(height) ** 2
+    best = Ellipse(0.5 * (low + high), p * jnp.sqrt(p + q), q * jnp.sqrt(p + q))
+    if found.ellipse is not None:
+        known = Ellipse(*(lax.stop_gradient(jnp.asarray(v, dtype)) for v in found.ellipse))
+        best = smaller(known, best)
+    eps, tiny = jnp.finfo(dtype).eps, jnp.finfo(dtype).tiny
+    least = 1e-6 * (jnp.abs(low) + jnp.abs(high) + height) + jnp.sqrt(tiny)
+    wider = 1 + 1e3 * eps
+    return Ellipse(best.centre, wider * jnp.maximum(best.real, least), wider * best.imaginary)
+
+
+class FaberPropagator(AbstractPropagator):
+    """x(h) in `pieces` equal ones, each the sum of a series of `degree`: `coefficients[i, k]` belongs
+    to Fₖ and to x₀ (i = 0) or cᵢ₋₁."""
+
+    generator: AbstractGenerator
+    ellipse: Ellipse
+    coefficients: jax.Array
+    degree: jax.Array
+    pieces: jax.Array
+
+    def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
+        def piece(s: Any, x: Tree) -> Tree:
+            dtype = jnp.result_type(*jtu.tree_leaves(x))
+            count = self.pieces.astype(dtype)
+            return self._sum((x, *_from(s.astype(dtype) / count, 1.0 / count, c)))
+
+        return _loop(self.pieces, piece, x0, _MOST_PIECES, 1)
+
+    def _sum(self, v: tuple[Tree, ...]) -> Tree:
+        """Σₖ Fₖ(A) Σᵢ coefficients[i, k] vᵢ, by Clenshaw's recurrence."""
+        dtype = jnp.result_type(*jtu.tree_leaves(v))
+        z0, a, b = (number.astype(dtype) for number in self.ellipse)
+        rows = self.coefficients.astype(dtype)
+        forward, back = 2.0 / (a + b), (a - b) / (a + b)
+
+        def moved(u: Tree) -> Tree:
+            return jtu.tree_map(lambda Au, u: Au - z0 * u, self.generator.apply(u), u)
+
+        def mixed(k: Any, factor: float) -> Tree:
+            weights = factor * rows[:, k]
+            return jtu.tree_map(lambda *leaves: sum(map(jnp.multiply, weights, leaves)), *v)
+
+        def turn(j: Any, carry: tuple[Tree, Tree]) -> tuple[Tree, Tree]:
+            first, second = carry
+            k = last - j
+            new = jtu.tree_map(
+                lambda g, m, s: g + forward * m - back * s, mixed(k, 2.0), moved(first), second
+            )
+            return new, first
+
+        # Whole runs of turns: the coefficients beyond the degree are zero.
+        last = -(-self.degree // _RUN) * _RUN
+        zero = _tree.zeros_like(v[0])
+        longest = self.coefficients.shape[1]
+        first, second = _loop(self.degree, turn, (zero, zero), longest, _RUN)
+        return jtu.tree_map(
+            lambda g, m, s: g + 0.5 * forward * m - back * s, mixed(0, 1.0), moved(first), second
+        )
+
+
+def propagator(A: AbstractGenerator, found: Range, h: jax.Array, terms: int) -> FaberPropagator:
+    """The flow over h."""
+    ellipse, dtype = around(found, h.dtype), h.dtype
+    z0, a, b = ellipse
+    length = lax.stop_gradient(h)
+    # As large as e^{hz} is on the ellipse, so many digits of x₀ are lost where x(h) is no larger.
+    rise = jnp.maximum(z0 + a, 0.0)
+    largest = _SIZES[-1] / 2.2
+    count = jnp.maximum(length * rise / _RISE, _long(length, a, b) / largest)
+    # Four times as many pieces halve the square root.
+    count = jnp.where(_long(length, a, b) > largest, jnp.maximum(count, 4 * count), count)
+    pieces = largest_of_batch(jnp.maximum(jnp.ceil(count), 1.0).astype(int))
+    part = h / pieces.astype(h.dtype)
+    needed = 2.2 * _long(lax.stop_gradient(part), a, b)
+    size = jnp.searchsorted(jnp.asarray(_SIZES[:-1], needed.dtype), needed)
+
+    def series(n: int, part: jax.Array) -> jax.Array:
+        angle = jnp.arange(n // 2 + 1, dtype=dtype) * (2 * math.pi / n)
+        # Measured from the right end, where e^{hz} is not small: z0 + a cos would be off by ε‖A‖.
+        real = (z0 + a) - 2.0 * a * jnp.sin(0.5 * angle) ** 2
+        z = lax.complex(part * real, part * b * jnp.sin(angle))
+        values = flow_factors(part.astype(z.dtype), phi_scalar(z, terms))
+        rows = jnp.stack([jnp.fft.irfft(jnp.conj(value), n)[: n // 2] for value in values])
+        return jnp.pad(rows, ((0, 0), (0, _SIZES[-1] // 2 - n // 2)))
+
+    rows = lax.switch(largest_of_batch(size), [partial(series, n) for n in _SIZES], part)
+    scale = jnp.sum(jnp.abs(rows), axis=1, keepdims=True)
+    matters = lax.stop_gradient(jnp.abs(rows) > jnp.finfo(dtype).eps * scale)
+    order = jnp.arange(rows.shape[1])
+    degree = largest_of_batch(jnp.max(jnp.where(matters, order, 0)))
+    return FaberPropagator(A, ellipse, jnp.where(order <= degree, rows, 0.0), degree, pieces)
+
+
+def _long(h: Any, a: Any, b: Any) -> Any:
+    """More than the degree that e^{hz} needs: on the boundary it is a bump as wide as 1/√(ha), turned
+    hb times."""
+    return h * b + 9.0 * jnp.sqrt(h * a) + 30.0
+
+
+def _from(theta: Any, length: Any, c: tuple[Tree, ...]) -> tuple[Tree, ...]:
+    """The polynomial from θ on, over a piece of length l: Σⱼ lʲ Σᵢ (i over j) θ^{i−j} cᵢ sʲ."""
+    powers = [theta**k for k in range(len(c))]
+
+    def coefficient(j: int) -> Tree:
+        factors = [length**j * math.comb(i, j) * powers[i - j] for i in range(j, len(c))]
+        return jtu.tree_map(lambda *leaves: sum(map(jnp.multiply, factors, leaves)), *c[j:])
+
+    return tuple(map(coefficient, range(len(c))))
+
+
+def _loop(count: Any, turn: Callable[[Any, Any], Any], carry: Any, longest: int, run: int) -> Any:
+    """`turn(j, carry)` for j from 0 to `count`, rounded up to a multiple of `run`, at most `longest`.
+
+    A tree of loops of fixed length whose idle branches are skipped, so that derivatives go backward
+    through it; only what each run began with is kept for them.
+    """
+
+    def leaf(start: Any, carry: Any) -> Any:
+        return lax.fori_loop(0, run, lambda j, carry: turn(start + j, carry), carry)
+
+    def branch(inner: Callable, width: int) -> Callable:
+        def several(start: Any, carry: Any) -> Any:
+            def one(carry: Any, j: Any) -> tuple[Any, None]:
+                begin = start + j * width
+                return lax.cond(
+                    begin < count, lambda carry: inner(begin, carry), lambda carry: carry, carry
+                ), None
+
+            return lax.scan(one, carry, jnp.arange(_BRANCH))[0]
+
+        return several
+
+    whole, width = jax.checkpoint(leaf), run
+    while width < longest:
+        whole, width = branch(whole, width), width * _BRANCH
+    return whole(jnp.asarray(0), carry)

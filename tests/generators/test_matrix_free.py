@@ -1,0 +1,283 @@
+"""Sparse matrices and generators of one's own: Faber series against matrix exponentials, numerical
+ranges against eigenvalues."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.sparse
+from jax.experimental.sparse import BCOO
+
+import dvax
+from dvax import generators, spaces
+
+N = 40
+RNG = np.random.default_rng(4)
+WEIGHTS = RNG.uniform(0.2, 3.0, N)
+
+
+def bands(left, middle, right):
+    return scipy.sparse.diags_array([left, middle, right], offsets=[-1, 0, 1], shape=(N, N))
+
+
+def scattered(rng, n=N, density=0.1):
+    return scipy.sparse.random_array((n, n), density=density, rng=rng, data_sampler=rng.normal)
+
+
+MATRICES = {
+    "heat": 200.0 * bands(1.0, -2.0, 1.0),
+    "stiff heat": 1e5 * bands(1.0, -2.0, 1.0),
+    "advection": 40.0 * bands(1.0, 0.0, -1.0),
+    "advection and diffusion": bands(110.0, -100.0, -10.0),
+    "far from normal": bands(0.0, -1.5, 3.0),
+    "scattered": 3.0 * scattered(RNG),
+    "one long row": bands(1.0, -2.0, 1.0)
+    + scipy.sparse.coo_array((np.ones(N), (np.full(N, 7), np.arange(N))), shape=(N, N)),
+    "weighted heat": scipy.sparse.diags_array(1 / WEIGHTS) @ (100.0 * bands(1.0, -2.0, 1.0)),
+    "nothing": scipy.sparse.csr_array((N, N)),
+}
+
+
+def weights_of(name):
+    return WEIGHTS if name.startswith("weighted") else 1.0
+
+
+def exact(A, h, x0, c):
+    """x(h) of x' = Ax + Σ cⱼ(t/h)ʲ, from one exponential of a larger matrix."""
+    n, q = len(x0), len(c)
+    block = np.zeros((n + q, n + q))
+    block[:n, :n] = h * A
+    for j in range(q):
+        block[:n, n + j] = h * c[j]
+        if j:
+            block[n + j, n + j - 1] = j
+    return (scipy.linalg.expm(block) @ np.r_[x0, 1.0, np.zeros(q - 1)])[:n]
+
+
+@jax.jit
+def flow(A, h, x0, c):
+    return A.propagator(h, 3).step(x0, tuple(c))
+
+
+X0, C = RNG.normal(size=N), RNG.normal(size=(3, N))
+
+
+@pytest.mark.parametrize("name", MATRICES)
+def test_the_flow_is_that_of_the_matrix_exponential(name):
+    A = generators.Sparse(MATRICES[name], weights_of(name))
+    dense = MATRICES[name].toarray()
+    for h in (1e-3, 0.1, 2.0):
+        found = np.asarray(flow(A, jnp.asarray(h), jnp.asarray(X0), jnp.asarray(C)))
+        expected = exact(dense, h, X0, C)
+        # Rounding of A itself moves e^{hA} by as much as h‖A‖ roundings.
+        size = 1e-14 * max(10.0, h * np.abs(dense).sum(1).max())
+        assert np.abs(found - expected).max() <= size * np.abs(expected).max()
+
+
+def test_the_number_of_products_is_what_the_documentation_says():
+    heat = generators.Sparse(MATRICES["heat"]).propagator(jnp.asarray(2.0), 2)
+    wave = generators.Sparse(MATRICES["advection"]).propagator(jnp.asarray(2.0), 2)
+    assert int(heat.degree) <= 6 * np.sqrt(2.0 * 800) and int(heat.pieces) == 1
+    assert int(wave.degree) <= 1.5 * 2.0 * 80 and int(wave.pieces) == 1
+
+
+def supports(A, w):
+    """(θ, λ): the numerical range in the weighted inner product lies in Re(e^{−iθ}z) ≤ λ, exactly."""
+    root = np.sqrt(w)
+    similar = root[:, None] * A / root[None, :]
+    for theta in np.linspace(0.0, np.pi, 25):
+        turned = np.exp(-1j * theta) * similar
+        yield theta, np.linalg.eigvalsh((turned + turned.conj().T) / 2)[-1]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_numerical_range_lies_in_the_rectangle_and_in_the_ellipse(seed):
+    rng = np.random.default_rng(seed)
+    n = 12
+    A = scattered(rng, n, rng.uniform(0.05, 0.6)).toarray()
+    A[np.diag_indices(n)] += rng.normal(size=n) * rng.choice([0.0, 1.0, 10.0])
+    if seed % 3 == 0:
+        A = A - A.T
+    if seed % 4 == 0:
+        A[3] = 0.0
+        A[:, 3] = 0.0
+        A[3, 5] = 20.0
+    w = rng.uniform(0.1, 4.0, n) if seed % 2 else np.ones(n)
+    found = generators.Sparse(scipy.sparse.csr_array(A), w).numerical_range()
+    low, high, height = map(float, found[:3])
+    centre, a, b = map(float, found.ellipse)
+    for theta, support in supports(A, w):
+        cos, sin = np.cos(theta), np.sin(theta)
+        assert support <= max(cos * high, cos * low) + height * sin + 1e-10
+        assert support <= cos * centre + np.hypot(a * cos, b * sin) + 1e-10
+
+
+def test_constant_coefficients_have_the_ellipse_that_they_have():
+    found = generators.Sparse(MATRICES["advection and diffusion"]).numerical_range()
+    np.testing.assert_allclose(found.ellipse, (-100.0, 100.0, 120.0))
+    np.testing.assert_allclose(found[:3], (-200.0, 0.0, 120.0))
+
+
+@pytest.mark.parametrize("name", ["heat", "far from normal", "weighted heat", "scattered"])
+def test_the_growth_bound_holds_in_its_own_norm_and_in_another(name):
+    dense, w = MATRICES[name].toarray(), np.broadcast_to(weights_of(name), N)
+    A = generators.Sparse(MATRICES[name], weights_of(name))
+    other = RNG.uniform(0.5, 2.0, N)
+    for space_weights in (w, other):
+        M, omega = map(float, A.growth(spaces.L2(space_weights)))
+        root = np.sqrt(space_weights)
+        for t in (1e-3, 0.1, 1.0):
+            similar = root[:, None] * scipy.linalg.expm(t * dense) / root[None, :]
+            assert np.linalg.norm(similar, 2) <= M * np.exp(omega * t) * (1 + 1e-10)
+    assert float(A.growth(spaces.L2(w)).M) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_the_adjoint_is_the_adjoint_and_has_its_own_flow(own):
+    name = "weighted heat" if own else "advection and diffusion"
+    A = generators.Sparse(MATRICES[name], weights_of(name))
+    space = spaces.L2(RNG.uniform(0.5, 2.0, N))
+    adjoint = A.adjoint(space)
+    v, w = jnp.asarray(C[0]), jnp.asarray(C[1])
+    for apply, back in (
+        (A.apply, adjoint.apply),
+        (lambda v: A.semigroup(0.1, v), lambda v: adjoint.semigroup(0.1, v)),
+    ):
+        there = float(space.inner(apply(v), w))
+        assert there == pytest.approx(float(space.inner(v, back(w))), rel=1e-10)
+    M, omega = map(float, adjoint.growth(space))
+    assert float(space.norm(adjoint.semigroup(0.1, v))) <= M * np.exp(0.1 * omega) * float(
+        space.norm(v)
+    ) * (1 + 1e-10)
+
+
+def test_derivatives_in_all_that_enters_go_both_ways():
+    pattern = MATRICES["advection and diffusion"].tocoo()
+    places = jnp.asarray(np.stack([pattern.row, pattern.col], 1))
+
+    def end(values, h, x0, c):
+        A = generators.Sparse(BCOO((values, places), shape=(N, N)))
+        return A.propagator(h, 2).step(x0, tuple(c))
+
+    given = (jnp.asarray(pattern.data), jnp.asarray(0.05), jnp.asarray(X0), jnp.asarray(C[:2]))
+    along = tuple(jnp.asarray(RNG.normal(size=v.shape)) for v in given)
+    _, forward = jax.jit(lambda a, b: jax.jvp(end, a, b))(given, along)
+
+    def moved(s):
+        values, h, x0, c = (np.asarray(v + s * d) for v, d in zip(given, along, strict=True))
+        A = scipy.sparse.coo_array((values, (pattern.row, pattern.col)), shape=(N, N)).toarray()
+        return exact(A, h, x0, c)
+
+    step = 1e-4
+    central = (moved(step) - moved(-step)) / (2 * step)
+    np.testing.assert_allclose(np.asarray(forward), central, rtol=1e-6, atol=1e-6)
+    weight = jnp.asarray(C[2])
+    back = jax.jit(jax.grad(lambda a: weight @ end(*a)))(given)
+    total = sum(float(jnp.vdot(a, b)) for a, b in zip(back, along, strict=True))
+    assert total == pytest.approx(float(weight @ forward), rel=1e-10)
+    # Where a Krylov space has nothing to show, at zero, a polynomial has its derivative too.
+    still = (given[0], given[1], jnp.zeros(N), jnp.zeros((2, N)))
+    jacobian = jax.jit(jax.jacrev(lambda x0: end(*still[:2], x0, still[3])))(still[2])
+    np.testing.assert_allclose(
+        np.asarray(jacobian), scipy.linalg.expm(0.05 * pattern.toarray()), atol=1e-12
+    )
+
+
+def test_the_lanes_of_a_batch_are_what_they_are_alone():
+    A = generators.Sparse(MATRICES["heat"])
+    hs = jnp.asarray([1e-3, 0.05, 2.0])
+    x0 = jnp.asarray(X0)
+    together = jax.jit(jax.vmap(lambda h: A.semigroup(h, x0)))(hs)
+    for h, found in zip(hs, together, strict=True):
+        np.testing.assert_allclose(np.asarray(found), np.asarray(A.semigroup(h, x0)), atol=1e-13)
+
+
+class Waves(generators.AbstractMatrixFree):
+    """(q, p)' = (p, q'') on a ring, with q measured by its slope: a tuple, and skew."""
+
+    stiffness: float
+
+    def apply(self, v):
+        q, p = v
+        slope = lambda u: self.stiffness * (jnp.roll(u, -1) - u)  # noqa: E731
+        back = lambda u: self.stiffness * (u - jnp.roll(u, 1))  # noqa: E731
+        return slope(p), back(q)
+
+    def numerical_range(self):
+        return generators.Range(0.0, 0.0, 2.0 * self.stiffness)
+
+
+def test_a_generator_of_ones_own_is_two_methods():
+    A = Waves(30.0)
+    q, p = jnp.asarray(X0), jnp.asarray(C[0])
+    space = spaces.Product(spaces.Euclidean(N), spaces.Euclidean(N))
+    A.check(space)
+    assert tuple(map(float, A.growth(space))) == (1.0, 0.0)
+    there = A.semigroup(1.5, (q, p))
+    assert float(space.norm(there)) == pytest.approx(float(space.norm((q, p))), rel=1e-12)
+    matrix = np.zeros((2 * N, 2 * N))
+    for k in range(2 * N):
+        unit = np.eye(2 * N)[k]
+        matrix[:, k] = np.concatenate(
+            [np.asarray(part) for part in A.apply((jnp.asarray(unit[:N]), jnp.asarray(unit[N:])))]
+        )
+    expected = scipy.linalg.expm(1.5 * matrix) @ np.concatenate([X0, C[0]])
+    np.testing.assert_allclose(np.concatenate(list(map(np.asarray, there))), expected, atol=1e-11)
+    back = A.adjoint(space).semigroup(1.5, there)
+    np.testing.assert_allclose(np.asarray(back[0]), X0, atol=1e-11)
+
+
+def test_a_solve_is_that_of_the_same_operator_by_transforms():
+    n = 30
+    h = 1.0 / n
+    ends = np.r_[-3.0, np.full(n - 2, -2.0), -3.0]
+    laplacian = scipy.sparse.diags_array([np.ones(n - 1), ends, np.ones(n - 1)], offsets=[-1, 0, 1])
+    pair = (
+        generators.Sparse(laplacian / h**2),
+        generators.Elliptic(n, boundary="dirichlet", scheme="differences"),
+    )
+    s = jnp.asarray((np.arange(n) + 0.5) * h)
+
+    def end(A):
+        problem = dvax.Problem(
+            A=A, P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.3),
+            f=lambda t, x, u, args: 5.0 * jnp.sin(3.0 * t) * jnp.exp(-s) + u,
+            h=lambda t, x, u, args: 0.4 - 3.0 * x - u,
+        )  # fmt: skip
+        return dvax.solve(problem, jnp.sin(jnp.pi * s), 0.0, 0.5, rtol=1e-5)
+
+    ours, theirs = map(end, pair)
+    assert ours.enclosed
+    np.testing.assert_allclose(np.asarray(ours.xs), np.asarray(theirs.xs), atol=2e-5)
+    at_most = 2e-5 * float(jnp.linalg.norm(ours.xs)) + 1e-8
+    assert float(jnp.linalg.norm(ours.xs - theirs.xs)) <= at_most
+
+
+@pytest.mark.parametrize(
+    ("make", "word"),
+    [
+        (lambda: generators.Sparse(np.eye(3)), "must be a sparse matrix"),
+        (lambda: generators.Sparse(scipy.sparse.csr_array((2, 3))), r"shape \(2, 3\)"),
+        (lambda: generators.Sparse(scipy.sparse.csr_array(np.eye(3, dtype=int))), "int"),
+        (lambda: generators.Sparse(MATRICES["heat"] * np.nan), "finite"),
+        (lambda: generators.Sparse(MATRICES["heat"], np.ones(3)), r"shape \(3,\)"),
+        (lambda: generators.Sparse(MATRICES["heat"], np.zeros(N)), "positive weights"),
+        (lambda: generators.Sparse(MATRICES["heat"]).check(spaces.Euclidean(N + 1)), "maps the"),
+        (lambda: Waves(1.0).check(spaces.Euclidean(2)), "Waves.apply"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_what_was_given(make, word):
+    with pytest.raises(dvax.InputError, match=word):
+        make()
+
+
+def test_a_better_rectangle_can_be_declared():
+    known = generators.Range(-800.0, -1.0)
+    A = generators.Sparse(MATRICES["heat"], within=known)
+    assert float(A.growth(spaces.Euclidean(N)).omega) == -1.0
+    np.testing.assert_allclose(
+        np.asarray(A.semigroup(0.3, jnp.asarray(X0))),
+        scipy.linalg.expm(0.3 * MATRICES["heat"].toarray()) @ X0,
+        atol=1e-13,
+    )
