@@ -37,9 +37,11 @@ _SIZES = (256, 2048, 16384)
 """Of the Fourier transform that finds the coefficients."""
 _RISE = 4.0
 """The largest exponent of e^{hz} on the ellipse, in one piece of a step."""
-_MOST_PIECES = 4096
-_RUN, _BRANCH = 8, 16
-"""A loop that is differentiated backward remembers where every run of turns began."""
+_MOST_PIECES = 256
+"""Of a step, beyond which it is not computed but NaN: it would be millions of products."""
+_RUN, _BRANCH = 8, (32, 32)
+"""The turns of a series, three loops in each other: one that is differentiated backward remembers
+where every run began."""
 
 
 class Ellipse(NamedTuple):
@@ -99,7 +101,7 @@ class FaberPropagator(AbstractPropagator):
             count = self.pieces.astype(dtype)
             return self._sum((x, *_from(s.astype(dtype) / count, 1.0 / count, c)))
 
-        return _loop(self.pieces, piece, x0, _MOST_PIECES, 1)
+        return _loop(self.pieces, piece, x0, 1, (_MOST_PIECES,))
 
     def _sum(self, v: tuple[Tree, ...]) -> Tree:
         """Σₖ Fₖ(A) Σᵢ coefficients[i, k] vᵢ, by Clenshaw's recurrence."""
@@ -126,8 +128,7 @@ class FaberPropagator(AbstractPropagator):
         # Whole runs of turns: the coefficients beyond the degree are zero.
         last = -(-self.degree // _RUN) * _RUN
         zero = _tree.zeros_like(v[0])
-        longest = self.coefficients.shape[1]
-        first, second = _loop(self.degree, turn, (zero, zero), longest, _RUN)
+        first, second = _loop(self.degree, turn, (zero, zero), _RUN, _BRANCH)
         return jtu.tree_map(
             lambda g, m, s: g + 0.5 * forward * m - back * s, mixed(0, 1.0), moved(first), second
         )
@@ -140,12 +141,12 @@ def propagator(A: AbstractGenerator, found: Range, h: jax.Array, terms: int) -> 
     length = lax.stop_gradient(h)
     # As large as e^{hz} is on the ellipse, so many digits of x₀ are lost where x(h) is no larger.
     rise = jnp.maximum(z0 + a, 0.0)
-    largest = _SIZES[-1] / 2.2
+    largest = _SIZES[-1] / 2.2  # and less than the turns that there are
     count = jnp.maximum(length * rise / _RISE, _long(length, a, b) / largest)
     # Four times as many pieces halve the square root.
     count = jnp.where(_long(length, a, b) > largest, jnp.maximum(count, 4 * count), count)
     pieces = largest_of_batch(jnp.maximum(jnp.ceil(count), 1.0).astype(int))
-    part = h / pieces.astype(h.dtype)
+    part = jnp.where(pieces <= _MOST_PIECES, h, jnp.nan) / pieces.astype(h.dtype)
     needed = 2.2 * _long(lax.stop_gradient(part), a, b)
     size = jnp.searchsorted(jnp.asarray(_SIZES[:-1], needed.dtype), needed)
 
@@ -183,8 +184,10 @@ def _from(theta: Any, length: Any, c: tuple[Tree, ...]) -> tuple[Tree, ...]:
     return tuple(map(coefficient, range(len(c))))
 
 
-def _loop(count: Any, turn: Callable[[Any, Any], Any], carry: Any, longest: int, run: int) -> Any:
-    """`turn(j, carry)` for j from 0 to `count`, rounded up to a multiple of `run`, at most `longest`.
+def _loop(
+    count: Any, turn: Callable[[Any, Any], Any], carry: Any, run: int, branches: tuple[int, ...]
+) -> Any:
+    """`turn(j, carry)` for j from 0 to `count`, rounded up to a multiple of `run`.
 
     A tree of loops of fixed length whose idle branches are skipped, so that derivatives go backward
     through it; only what each run began with is kept for them.
@@ -193,7 +196,7 @@ def _loop(count: Any, turn: Callable[[Any, Any], Any], carry: Any, longest: int,
     def leaf(start: Any, carry: Any) -> Any:
         return lax.fori_loop(0, run, lambda j, carry: turn(start + j, carry), carry)
 
-    def branch(inner: Callable, width: int) -> Callable:
+    def branch(inner: Callable, many: int, width: int) -> Callable:
         def several(start: Any, carry: Any) -> Any:
             def one(carry: Any, j: Any) -> tuple[Any, None]:
                 begin = start + j * width
@@ -201,11 +204,11 @@ def _loop(count: Any, turn: Callable[[Any, Any], Any], carry: Any, longest: int,
                     begin < count, lambda carry: inner(begin, carry), lambda carry: carry, carry
                 ), None
 
-            return lax.scan(one, carry, jnp.arange(_BRANCH))[0]
+            return lax.scan(one, carry, jnp.arange(many))[0]
 
         return several
 
     whole, width = jax.checkpoint(leaf), run
-    while width < longest:
-        whole, width = branch(whole, width), width * _BRANCH
+    for many in branches:
+        whole, width = branch(whole, many, width), width * many
     return whole(jnp.asarray(0), carry)
