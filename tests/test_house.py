@@ -34,6 +34,7 @@ CONTRACT = [
     "ETD1",
     "ETD2RK",
     "ETD4RK",
+    "ExpRosenbrock",
     "generators.Scalar",
     "generators.Diagonal",
     "generators.Dense",

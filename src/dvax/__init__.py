@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .evolution import ETD2RK as ETD2RK
     from .evolution import ETD4RK as ETD4RK
     from .evolution import RESULTS as RESULTS
+    from .evolution import ExpRosenbrock as ExpRosenbrock
     from .evolution import Solution as Solution
     from .evolution import solve as solve
     from .problem import Problem as Problem
@@ -37,7 +38,7 @@ __version__ = "0.1.0"
 _MODULES = ("generators", "models", "operators", "sets", "signals", "spaces", "vi")
 _HOMES = {
     "errors": ("DifferentiationError", "DvaxError", "InputError", "SolveError"),
-    "evolution": ("ETD1", "ETD2RK", "ETD4RK", "RESULTS", "Solution", "solve"),
+    "evolution": ("ETD1", "ETD2RK", "ETD4RK", "ExpRosenbrock", "RESULTS", "Solution", "solve"),
     "problem": ("Problem",),
     "theory": ("Bound", "Constants", "bound_error"),
     "vi": ("solve_vi",),

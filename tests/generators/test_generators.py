@@ -192,3 +192,10 @@ def test_an_adjoint_of_another_kind_is_refused():
     uneven = spaces.Product(spaces.L2(np.ones(2)), spaces.L2(np.full(2, 3.0)))
     with pytest.raises(dvax.InputError, match="no Rotation"):
         generators.Rotation(np.zeros(2), np.ones(2)).adjoint(uneven)
+
+
+def test_a_matrix_of_any_norm_has_its_exponential():
+    # JAX's own gives NaN beyond a norm of 3·10⁵.
+    A = np.array([[-1e9, 3.0], [0.0, -0.5]])
+    found = np.asarray(generators.Dense(A).semigroup(2.0, jnp.array([1.0, 1.0])))
+    np.testing.assert_allclose(found, [3.0 * np.exp(-1.0) / 1e9, np.exp(-1.0)], rtol=1e-6)

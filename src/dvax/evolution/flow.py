@@ -1,5 +1,6 @@
 """The reduced map f̃ along a trajectory, with all that a step wants to know about the law."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,12 +10,13 @@ import jax.tree_util as jtu
 
 from .. import _tree
 from .._tree import Tree
-from ..generators import AbstractGenerator
+from ..generators import AbstractGenerator, AbstractPropagator
 from ..operators import AbstractOperator
 from ..problem import Problem
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, Frozen
 from .chords import Chord, NoEnclosure, enclose, is_chord, largest, smallest
+from .linearised import AbstractLinear, split
 
 
 class Rate(NamedTuple):
@@ -40,6 +42,7 @@ class Flow(eqx.Module):
     used and no guess is needed. `reciprocal` is 1/a
     where a was proved not to depend on t and x, so that it is computed once. `enclosed` says that f̃
     can be enclosed over a whole step (`chords`), so that nothing about the defect is guessed.
+    `linear` is A + J where some J is left to the propagator.
     """
 
     problem: Problem
@@ -53,6 +56,24 @@ class Flow(eqx.Module):
     tol: Any
     gamma: Any
     L_F: Any
+    linear: AbstractLinear | None = None
+
+    def propagator(self, h: Any, terms: int) -> AbstractPropagator:
+        """The exact flow over h of x' = Ax + p, or of x' = (A + J)x + p."""
+        linear = self.generator if self.linear is None else self.linear
+        return linear.propagator(h, terms)
+
+    def rest(self, x: Tree, value: Tree) -> Tree:
+        """f̃ without what is left to the propagator: `value` = f̃(t, x), or f̃(t, x) − Jx."""
+        return value if self.linear is None else _tree.sub(value, self.linear.apply(x))
+
+    def linearised(self, t: Any, x: Tree, guess: Tree | None) -> tuple["Flow", Tree]:
+        """The flow with J = Df̃(t, x) left to the propagator, and ∂ₜf̃(t, x)."""
+        value = lambda t, x: self.rate(t, x, guess).value  # noqa: E731
+        _, push = jax.linearize(value, t, x)
+        drift = push(jnp.ones_like(t), _tree.zeros_like(x))
+        linear = split(self.generator, lambda v: push(jnp.zeros_like(t), v), x)
+        return dataclasses.replace(self, linear=linear), drift
 
     def rate(self, t: Any, x: Tree, guess: Tree | None) -> Rate:
         """f̃(t, x), the law being solved from `guess`."""

@@ -79,7 +79,7 @@ def _stepper(setup: Setup, flow: Flow, stops: jax.Array, options: Options) -> St
         growth = flow.generator.growth(flow.state_space(setup.x0))
     locate = not options.fixed and _can_locate(flow, t0, setup.x0)
     stepper = Stepper(setup.method, flow, measure, locate, options.careful, (t0, t1), None, growth)
-    if options.fixed and stops.shape[0] == 2:
+    if options.fixed and stops.shape[0] == 2 and not setup.method.linearises:
         length = (t1 - t0) / step_count(t1 - t0, setup.number("dt"))
         return dataclasses.replace(stepper, uniform=stepper.factors(length))
     return stepper

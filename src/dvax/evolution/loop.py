@@ -18,7 +18,7 @@ from .._tree import Tree
 from .checkpoints import Checkpoints
 from .control import AbstractController
 from .results import RESULTS
-from .stepper import Factors, Memory, Stepper, inside
+from .stepper import Factors, Memory, Stepper, inside, local
 
 
 class Record(NamedTuple):
@@ -119,13 +119,13 @@ class Loop(eqx.Module):
         records = jtu.tree_map(many, record) if self.dense else None
         if records is not None:
             records = records._replace(start=jnp.full_like(records.start, jnp.inf))
-        uniform = stepper.uniform is not None
+        own = stepper.uniform is not None or stepper.method.linearises
         return State(
             t=t0,
             x=x0,
             impulse=(zero, zero),
             memory=stepper.begin(x0),
-            factors=None if uniform else stepper.factors(controller.end(control) - t0),
+            factors=None if own else stepper.factors(controller.end(control) - t0),
             control=control,
             jumped=jnp.asarray(True),
             last=(record, (zero, zero)) if saves and measure else None,
@@ -154,10 +154,7 @@ class Loop(eqx.Module):
 
     def _attempt(self, state: State) -> State:
         t0, t1 = state.t, self.controller.end(state.control)
-        factors = self.stepper.uniform
-        if factors is None:
-            assert state.factors is not None
-            factors = self.stepper.fitted(state.factors, t0, t1)
+        factors = self._factors(state, t0, t1)
         step = self.stepper.step(t0, t1, state.x, state.memory, factors, state.jumped)
         verdict = self.controller.judge(t0, t1, state.x, step, state.control)
         impulse = jtu.tree_map(jnp.add, state.impulse, step.impulse)
@@ -185,7 +182,7 @@ class Loop(eqx.Module):
             x=x,
             impulse=impulse,
             memory=memory,
-            factors=None if self.stepper.uniform is not None else factors,
+            factors=None if state.factors is None else factors,
             control=verdict.state,
             jumped=jumped,
             last=last,
@@ -200,13 +197,14 @@ class Loop(eqx.Module):
 
     def _read(self, state: State, time: Any) -> Saved:
         """The trajectory at a time that the loop has run up to; t = ∞ where it did not get there."""
-        generator = self.stepper.flow.generator
         if state.last is None:
             t0, t1 = state.t, self.controller.end(state.control)
 
             def between() -> Tree:
-                c = self._polynomial(state, t0, t1)
-                return inside(generator, t1 - t0, (time - t0) / (t1 - t0), state.x, c)
+                guess = state.memory.guess
+                c = self.stepper.advance(t0, t1, state.x, self._factors(state, t0, t1), guess)[1]
+                record = Record(t0, t1 - t0, state.x, c)
+                return self._inside(record, (time - t0) / (t1 - t0), guess)
 
             met = time <= t0 + slack(t0)
             reached = met | ((t1 > time) & (state.result == RESULTS.successful))
@@ -219,7 +217,7 @@ class Loop(eqx.Module):
             x = lax.cond(
                 time >= state.t,
                 lambda: state.x,
-                lambda: inside(generator, record.length, theta, record.x0, record.coefficients),
+                lambda: self._inside(record, theta, state.memory.guess),
             )
             # Inside a step the bound of the whole step is charged: it can only be too large.
             impulse = _tree.where(theta > 0.0, state.impulse, before)
@@ -227,14 +225,19 @@ class Loop(eqx.Module):
         x = jtu.tree_map(lambda leaf: jnp.where(reached, leaf, jnp.nan), x)
         return Saved(jnp.where(reached, time, jnp.inf), x, impulse, settled)
 
-    def _polynomial(self, state: State, t0: Any, t1: Any) -> tuple[Tree, ...]:
-        """The stage polynomial of the step from t0 to t1, which the loop has not taken."""
-        stepper = self.stepper
-        factors = stepper.uniform
-        if factors is None:
-            assert state.factors is not None
-            factors = stepper.fitted(state.factors, t0, t1)
-        return stepper.advance(t0, t1, state.x, factors, state.memory.guess)[1]
+    def _factors(self, state: State, t0: Any, t1: Any) -> Factors | None:
+        """The propagators of a step, None where it makes its own."""
+        uniform = self.stepper.uniform
+        if uniform is not None or state.factors is None:
+            return uniform
+        return self.stepper.fitted(state.factors, t0, t1)
+
+    def _inside(self, record: Record, theta: Any, guess: Tree | None) -> Tree:
+        """x_h inside a step."""
+        t0, stepper = record.start, self.stepper
+        end = t0 + record.length
+        flow, _ = local(stepper.method, stepper.flow, t0, end, record.x0, guess, stepper.ends)
+        return inside(flow, record.length, theta, record.x0, record.coefficients)
 
 
 def slack(t: Any) -> Any:

@@ -10,7 +10,8 @@ import numpy as np
 from .flow import Flow
 from .kinks import first_change
 from .loop import Record
-from .stepper import inside, within
+from .method import AbstractMethod
+from .stepper import inside, local, within
 
 _LOOKS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Where inside a step the signs are looked at."""
@@ -26,12 +27,12 @@ class Regimes(NamedTuple):
     positive: np.ndarray
 
 
-def regimes(flow: Flow, records: Record, count: int) -> Regimes:
+def regimes(flow: Flow, method: AbstractMethod, records: Record, count: int) -> Regimes:
     """Those of the first `count` steps, at least one, of a flow whose set says where its kinks are."""
     steps = jtu.tree_map(lambda leaf: leaf[:count], records)
     starts, lengths = np.asarray(steps.start), np.asarray(steps.length)
     run = steps.start[0], steps.start[-1] + steps.length[-1]
-    look = jax.jit(jax.vmap(lambda step: _changes(flow, step, run)))
+    look = jax.jit(jax.vmap(lambda step: _changes(flow, method, step, run)))
     kinks, before, after = map(np.asarray, look(steps))
     times, rows = [starts[0]], [before[0]]
     for k in range(count):
@@ -44,18 +45,20 @@ def regimes(flow: Flow, records: Record, count: int) -> Regimes:
 
 
 def _changes(
-    flow: Flow, step: Record, run: tuple[Any, Any]
+    flow: Flow, method: AbstractMethod, step: Record, run: tuple[Any, Any]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The time of the first change of sign in a step, and the signs at its ends, seen from inside."""
 
+    end, guess = step.start + step.length, flow.guess(step.x0)
+    own, _ = local(method, flow, step.start, end, step.x0, guess, run)
+
     def at(theta: Any, t: Any = None) -> jax.Array:
         t = step.start + theta * step.length if t is None else t
-        x = inside(flow.generator, step.length, theta, step.x0, step.coefficients)
+        x = inside(own, step.length, theta, step.x0, step.coefficients)
         found = flow.switches(t, x, flow.rate(t, x, flow.guess(x)).z)
         assert found is not None
         return found
 
-    end = step.start + step.length
     values = [
         at(jnp.asarray(theta, end.dtype), within(step.start, end, theta, run)) for theta in _LOOKS
     ]

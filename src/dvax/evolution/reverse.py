@@ -24,7 +24,7 @@ from .. import _tree
 from .._tree import Tree
 from .checkpoints import Checkpoints, how_many
 from .loop import Loop, Saved, State, slack
-from .stepper import inside
+from .stepper import inside, local
 
 
 def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State]:
@@ -178,7 +178,9 @@ class _Backward:
         """(xᵢ₊₁, c), and a guess for the law of another step."""
         t0, t1 = self._times(loop, i)
         stepper = loop.stepper
-        factors = stepper.factors(t1 - t0) if stepper.uniform is None else stepper.uniform
+        factors = stepper.uniform
+        if factors is None and not stepper.method.linearises:
+            factors = stepper.factors(t1 - t0)
         x1, c, y = stepper.advance(t0, t1, x, factors, guess)
         return (x1, c), None if guess is None else lax.stop_gradient(y)
 
@@ -233,7 +235,9 @@ class _Backward:
             loop = self._parts(p)
             t0, t1 = self._times(loop, i)
             theta = (time - t0) / (t1 - t0)
-            return inside(loop.stepper.flow.generator, t1 - t0, theta, x, c)
+            stepper = loop.stepper
+            flow, _ = local(stepper.method, stepper.flow, t0, t1, x, self.guess, stepper.ends)
+            return inside(flow, t1 - t0, theta, x, c)
 
         def one(carry: Any) -> Any:
             adjoint, behind, bent, gathered, row = carry

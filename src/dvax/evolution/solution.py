@@ -14,7 +14,7 @@ from .loop import Record
 from .regimes import Regimes, regimes
 from .results import RESULTS
 from .setup import Setup
-from .stepper import inside
+from .stepper import inside, local
 
 if TYPE_CHECKING:
     import xarray
@@ -103,7 +103,12 @@ class Solution(eqx.Module):
                 )
             )
         theta = (t - step.start) / step.length
-        x = inside(flow.generator, step.length, theta, step.x0, step.coefficients)
+        run = self.setup.number("t0"), self.setup.number("t1")
+        own, _ = local(
+            self.setup.method, flow, step.start, step.start + step.length, step.x0,
+            flow.guess(step.x0), run,
+        )  # fmt: skip
+        x = inside(own, step.length, theta, step.x0, step.coefficients)
         rate = flow.rate(t, x, None)
         return x, flow.operator.inverse(rate.y)
 
@@ -147,7 +152,7 @@ class Solution(eqx.Module):
                     "Give the set as one that does, a dvax.sets.Polyhedron, say",
                 )
             )
-        return regimes(flow, self.records, int(self.stats["steps"]))
+        return regimes(flow, self.setup.method, self.records, int(self.stats["steps"]))
 
     def raise_if_failed(self) -> "Solution":
         """This solution, or a `dvax.SolveError` that carries it."""

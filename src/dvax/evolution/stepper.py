@@ -1,5 +1,6 @@
 """One step of an exponential method, and what it is known to miss."""
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -12,7 +13,7 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
-from ..generators import AbstractGenerator, AbstractPropagator, Arc, Growth
+from ..generators import AbstractPropagator, Arc, Growth
 from ..problem import END_ULPS, KNOT_ULPS
 from .chords import Chord, is_chord
 from .evaluations import Plan, Visit, evaluated
@@ -77,11 +78,26 @@ class Sample(NamedTuple):
     law_defect: jax.Array
 
 
-def inside(
-    generator: AbstractGenerator, length: Any, theta: Any, x0: Tree, c: tuple[Tree, ...]
-) -> Tree:
+def inside(flow: Flow, length: Any, theta: Any, x0: Tree, c: tuple[Tree, ...]) -> Tree:
     """x_h(t₀ + θh)."""
-    return generator.propagator(theta * length, len(c)).step(x0, shortened(c, theta))
+    return flow.propagator(theta * length, len(c)).step(x0, shortened(c, theta))
+
+
+def local(
+    method: AbstractMethod,
+    flow: Flow,
+    t0: Any,
+    t1: Any,
+    x0: Tree,
+    guess: Tree | None,
+    ends: tuple[Any, Any],
+) -> tuple[Flow, Tree | None]:
+    """The flow of the step from t₀ to t₁ and its drift: where the method linearises, others than that
+    of the run. `guess` is for the law at x₀."""
+    if not method.linearises:
+        return flow, None
+    flow, drift = flow.linearised(within(t0, t1, 0.0, ends), x0, guess)
+    return flow, _tree.scale(t1 - t0, drift)
 
 
 def within(t0: Any, t1: Any, theta: float, ends: tuple[Any, Any]) -> Any:
@@ -130,7 +146,7 @@ class Stepper(eqx.Module):
     def factors(self, h: Any) -> Factors:
         """Propagators over h."""
         sampled = self.measure and not self.flow.enclosed
-        over = lambda theta: self.flow.generator.propagator(theta * h, self.method.degree + 1)  # noqa: E731
+        over = lambda theta: self.flow.propagator(theta * h, self.method.degree + 1)  # noqa: E731
         half = over(0.5) if self.method.halves else None
         inner = tuple(map(over, self.method.samples)) if sampled else ()
         return Factors(h, over(1.0), half, inner)
@@ -145,18 +161,20 @@ class Stepper(eqx.Module):
         return lax.cond(same, lambda: factors, lambda: self.factors(h))
 
     def advance(
-        self, t0: Any, t1: Any, x0: Tree, factors: Factors, guess: Tree | None
+        self, t0: Any, t1: Any, x0: Tree, factors: Factors | None, guess: Tree | None
     ) -> tuple[Tree, tuple[Tree, ...], Tree | None]:
         """(x₁, the stage polynomial, y where the step begins), and nothing else."""
-        plan = self._plan(t0, t1, x0, factors, False)
+        self, drift, factors = self._local(t0, t1, x0, factors, guess)
+        plan = self._plan(t0, t1, x0, factors, drift, False)
         (c, x1), visits = evaluated(self.flow, plan, self.ends[0], x0, guess, None, True)
         return x1, c, visits[0].rate.y
 
     def step(
-        self, t0: Any, t1: Any, x0: Tree, memory: Memory, factors: Factors, jumped: Any
+        self, t0: Any, t1: Any, x0: Tree, memory: Memory, factors: Factors | None, jumped: Any
     ) -> Step:
         """One step from t0 to t1. `jumped` says that what memory holds is not the rate at t0."""
-        plan = self._plan(t0, t1, x0, factors, self.measure)
+        self, drift, factors = self._local(t0, t1, x0, factors, memory.guess)
+        plan = self._plan(t0, t1, x0, factors, drift, self.measure)
         # The last evaluation of the previous step was made where this one begins.
         begin, kept = self.ends[0], memory.rate
         (c, x1), visits = evaluated(self.flow, plan, begin, x0, memory.guess, kept, jumped)
@@ -181,12 +199,26 @@ class Stepper(eqx.Module):
         solved = jnp.all(jnp.stack([visit.rate.solved for visit in visits]))
         return Step(x1, c, error, impulse, kink, after, first.solved, solved, finite)
 
-    def _plan(self, t0: Any, t1: Any, x0: Tree, factors: Factors, measured: bool) -> Plan:
+    def _local(
+        self, t0: Any, t1: Any, x0: Tree, factors: Factors | None, guess: Tree | None
+    ) -> tuple["Stepper", Tree | None, Factors]:
+        """The stepper with the flow of this step, the drift, and the propagators: those given, unless
+        the method linearises."""
+        if not self.method.linearises:
+            assert factors is not None
+            return self, None, factors
+        flow, drift = local(self.method, self.flow, t0, t1, x0, guess, self.ends)
+        stepper = dataclasses.replace(self, flow=flow)
+        return stepper, drift, stepper.factors(t1 - t0)
+
+    def _plan(
+        self, t0: Any, t1: Any, x0: Tree, factors: Factors, drift: Tree | None, measured: bool
+    ) -> Plan:
         """The evaluations of a step: at its start, for its stages, inside, and at its end."""
 
         def run(evaluate: Callable[[Any, Tree], Rate]) -> tuple[tuple[Tree, ...], Tree]:
             def stage(theta: float, x: Tree) -> Tree:
-                return evaluate(self._within(t0, t1, theta), x).value
+                return self.flow.rest(x, evaluate(self._within(t0, t1, theta), x).value)
 
             def propagate(theta: float, c: tuple[Tree, ...]) -> Tree:
                 if theta == 1.0:
@@ -194,7 +226,7 @@ class Stepper(eqx.Module):
                 assert factors.half is not None and theta == 0.5
                 return factors.half.step(x0, shortened(c, theta))
 
-            c = self.method.coefficients(stage, propagate, stage(0.0, x0))
+            c = self.method.coefficients(stage, propagate, stage(0.0, x0), drift)
             x1 = factors.full.step(x0, c)
             if measured:
                 # No inner ones where the defect is enclosed.
@@ -219,7 +251,7 @@ class Stepper(eqx.Module):
 
         def at(theta: Any) -> jax.Array:
             t = t0 + theta * (t1 - t0)
-            x = inside(flow.generator, t1 - t0, theta, x0, c)
+            x = inside(flow, t1 - t0, theta, x0, c)
             return switches(t, flow.rate(t, x, first.y))
 
         values = [
@@ -273,13 +305,15 @@ class Stepper(eqx.Module):
         """
         h, thetas = t1 - t0, self.method.samples
         along = [visits[0], *visits[-1 - len(thetas) :]]
-        first, *inner, last = (visit.rate for visit in along)
-        start = _tree.sub(first.value, c[0])
-        end = _tree.sub(last.value, polynomial(c, 1.0))
+        _, *inner, last = (visit.rate for visit in along)
+        start, *middle, end = (
+            _tree.sub(self.flow.rest(visit.x, visit.rate.value), polynomial(c, theta))
+            for theta, visit in zip((0.0, *thetas, 1.0), along, strict=True)
+        )
         bumps = []
-        for theta, rate in zip(thetas, inner, strict=True):
+        for theta, defect in zip(thetas, middle, strict=True):
             line = _tree.add(_tree.scale(1.0 - theta, start), _tree.scale(theta, end))
-            bumps.append(_tree.sub(_tree.sub(rate.value, polynomial(c, theta)), line))
+            bumps.append(_tree.sub(defect, line))
 
         # How well z, the unconstrained value of the law, is predicted by its other samples.
         zs = [visit.rate.z for visit in along]

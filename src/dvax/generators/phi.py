@@ -49,8 +49,13 @@ def phi_matrix(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
     block = jnp.zeros((size, size), z.dtype).at[:n, :n].set(z)
     shift = jnp.eye(order * n, dtype=z.dtype)
     block = block.at[: order * n, n:].add(shift) if order else block
-    first_row = jax.scipy.linalg.expm(block)[:n]
+    first_row = expm(block)[:n]
     return tuple(first_row[:, k * n : (k + 1) * n] for k in range(order + 1))
+
+
+def expm(matrix: jax.Array) -> jax.Array:
+    """The exponential of a matrix of any norm: JAX by itself gives NaN beyond 3·10⁵."""
+    return jax.scipy.linalg.expm(matrix, max_squarings=64)
 
 
 def flow_factors(h: Any, phis: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:

@@ -43,6 +43,15 @@ def matrix_of(linear: Callable[[Tree], Tree], like: Tree) -> jax.Array:
     return _columns(out).reshape(size, size)
 
 
+def diagonal_of(linear: Callable[[jax.Array], jax.Array], like: jax.Array) -> jax.Array | None:
+    """The diagonal of `linear` on arrays shaped like `like`, where its operations show that the matrix
+    has nothing else; None where they do not."""
+    (out,) = _carry(jax.make_jaxpr(linear)(like), [_Diagonal(jnp.ones_like(like))])
+    if not _depends(out):
+        return jnp.zeros_like(like)
+    return out.factor if isinstance(out, _Diagonal) and out.factor.shape == like.shape else None
+
+
 def _columns(value: _Diagonal | _Columns) -> jax.Array:
     if isinstance(value, _Columns):
         return value.columns
@@ -83,14 +92,16 @@ def _rule(eqn: Any, given: list[Any]) -> list[Any] | None:
         return [_Diagonal(bind(eqn, [given[0].factor])[0])]
     if name == "broadcast_in_dim" and out.size == given[0].factor.size:
         return [_Diagonal(given[0].factor.reshape(out.shape))]
-    if name in ("add", "sub", "add_any") and len(bent) == 2:
-        return [_Diagonal(bind(eqn, [value.factor for value in given])[0])]
+    factors = [value.factor if _depends(value) else value for value in given]
+    if name in ("add", "sub", "add_any"):
+        # What does not depend on the unknowns is zero here, or the map would not be linear.
+        if all(value.factor.shape == out.shape for value in bent):
+            return [_Diagonal(jnp.broadcast_to(bind(eqn, factors)[0], out.shape))]
     if name in ("mul", "div") and len(bent) == 1:
-        factors = [value.factor if _depends(value) else value for value in given]
         if bent[0].factor.shape == out.shape:
             return [_Diagonal(jnp.broadcast_to(bind(eqn, factors)[0], out.shape))]
-    if name == "select_n" and not _depends(given[0]) and len(bent) == len(given) - 1:
-        return [_Diagonal(bind(eqn, [given[0], *(value.factor for value in bent)])[0])]
+    if name == "select_n" and not _depends(given[0]):
+        return [_Diagonal(bind(eqn, factors)[0])]
     if name == "dot_general":
         return _product(eqn, given)
     return None
