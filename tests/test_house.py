@@ -35,6 +35,7 @@ CONTRACT = [
     "ETD2RK",
     "ETD4RK",
     "ExpRosenbrock",
+    "Implicit",
     "generators.Scalar",
     "generators.Diagonal",
     "generators.Dense",

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from .evolution import ETD4RK as ETD4RK
     from .evolution import RESULTS as RESULTS
     from .evolution import ExpRosenbrock as ExpRosenbrock
+    from .evolution import Implicit as Implicit
     from .evolution import Solution as Solution
     from .evolution import solve as solve
     from .problem import Problem as Problem
@@ -38,7 +39,16 @@ __version__ = "0.1.0"
 _MODULES = ("generators", "models", "operators", "sets", "signals", "spaces", "vi")
 _HOMES = {
     "errors": ("DifferentiationError", "DvaxError", "InputError", "SolveError"),
-    "evolution": ("ETD1", "ETD2RK", "ETD4RK", "ExpRosenbrock", "RESULTS", "Solution", "solve"),
+    "evolution": (
+        "ETD1",
+        "ETD2RK",
+        "ETD4RK",
+        "ExpRosenbrock",
+        "Implicit",
+        "RESULTS",
+        "Solution",
+        "solve",
+    ),
     "problem": ("Problem",),
     "theory": ("Bound", "Constants", "bound_error"),
     "vi": ("solve_vi",),

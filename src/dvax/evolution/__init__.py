@@ -1,5 +1,6 @@
 """The mild solution: exponential integrators, step control, `solve`, `Solution`."""
 
+from .implicit import Implicit as Implicit
 from .method import ETD1 as ETD1
 from .method import ETD2RK as ETD2RK
 from .method import ETD4RK as ETD4RK

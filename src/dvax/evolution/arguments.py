@@ -11,6 +11,7 @@ import numpy as np
 from .. import _tree
 from ..errors import InputError, InputProblem
 from ..problem import Problem
+from .implicit import Implicit
 from .method import AbstractMethod
 
 ADAPTIVE_STEPS = 2**20
@@ -18,7 +19,9 @@ ADAPTIVE_STEPS = 2**20
 _MOST_STEPS = 2**30
 
 
-def check(problem, x0, t0, t1, ts, dt, rtol, atol, dt0, horizon, method, adjoint) -> None:
+def check(
+    problem, x0, t0, t1, ts, dt, rtol, atol, dt0, horizon, method, adjoint, measure, dense
+) -> None:
     wrong: list[InputProblem] = []
 
     def rule(holds: bool, name: str, given: Any, text: str, mend: str) -> None:
@@ -27,11 +30,17 @@ def check(problem, x0, t0, t1, ts, dt, rtol, atol, dt0, horizon, method, adjoint
 
     rule(isinstance(problem, Problem), "problem", type(problem).__name__,
          "it must be a dvax.Problem", "Build one from A, P, K, f and h")  # fmt: skip
-    rule(isinstance(method, AbstractMethod), "method", method,
+    rule(isinstance(method, AbstractMethod | Implicit), "method", method,
          "it must be a method such as dvax.ETD2RK()", "Leave it out for the default")  # fmt: skip
     rule(adjoint in ("reverse", "forward"), "adjoint", repr(adjoint),
          "it must be 'reverse' or 'forward'",
          "'reverse' serves jax.grad, 'forward' jax.jvp")  # fmt: skip
+    if isinstance(method, Implicit):
+        for name, wanted in (("measure", measure), ("dense", dense)):
+            rule(not wanted, name, True, "an implicit method keeps no polynomials of its steps",
+                 "Leave it out and name the times in ts=, or use an exponential method")  # fmt: skip
+        rule(dt is None, "dt", dt, "how well an implicit method solves its equations follows from "
+             "rtol and atol, so its steps adapt", "Leave it out")  # fmt: skip
     if _tree.is_concrete(x0):
         for leaf in map(np.asarray, jax.tree_util.tree_leaves(x0)):
             if not np.isfinite(leaf).all():

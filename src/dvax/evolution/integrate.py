@@ -10,12 +10,14 @@ from jax import lax
 
 from .. import _tree
 from ..vi import certify
-from . import reverse
+from . import implicit, reverse
 from .closures import opened
 from .control import AbstractController, Adaptive, Fixed, root_mean_squares, step_count
 from .flow import Flow
 from .forward import forward_only
-from .loop import Loop, Saved, State
+from .implicit import Implicit
+from .loop import Loop, Record, Saved, State
+from .method import AbstractMethod
 from .results import RESULTS
 from .setup import Setup
 from .solution import Solution
@@ -45,16 +47,19 @@ def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
     if options.adjoint == "reverse":
         open_ = opened(problem, t0, x0, flow.args)
         flow = dataclasses.replace(flow, problem=open_)
-    controller = _controller(setup, stops, options)
+    times = None if ts is None else jnp.asarray(ts, setup.dtype)
+    if isinstance(setup.method, Implicit):
+        return _implicitly(setup, setup.method, flow, stops, times, options)
+    method = setup.method
+    controller = _controller(setup, method, stops, options)
     loop = Loop(
-        _stepper(setup, flow, stops, options),
+        _stepper(setup, method, flow, stops, options),
         controller,
         max_steps=options.max_steps + (knots.shape[0] if options.fixed else 0),
         guarded=options.careful,
         dense=options.dense,
         progress=options.progress,
     )
-    times = None if ts is None else jnp.asarray(ts, setup.dtype)
     if options.adjoint == "forward":
         saved, end = loop.run(x0, times)
         saved, end = forward_only((saved, end))
@@ -63,23 +68,54 @@ def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
     return _solution(setup, flow, controller, saved, end, options)
 
 
-def _controller(setup: Setup, stops: jax.Array, options: Options) -> AbstractController:
+def _implicitly(
+    setup: Setup,
+    method: Implicit,
+    flow: Flow,
+    stops: jax.Array,
+    ts: jax.Array | None,
+    options: Options,
+) -> Solution:
+    steps = implicit.controller(setup.number("rtol"), setup.number("atol"), stops)
+    first = setup.number("dt0")
+    end = implicit.run(
+        method, flow, setup.x0, stops, ts, steps, first, options.max_steps, options.adjoint,
+        options.progress,
+    )  # fmt: skip
+    nothing = jnp.zeros_like(end.ts)
+    rows = Saved(end.ts, end.xs, (nothing, nothing), (nothing, nothing))
+    # What is known of a run that failed is the last saved time that it reached.
+    count = jnp.sum(jnp.isfinite(end.ts))
+    row = jnp.maximum(count - 1, 0)
+    last = jtu.tree_map(lambda leaf, x: jnp.where(count > 0, leaf[row], x), end.xs, setup.x0)
+    t = jnp.where(count > 0, end.ts[row], stops[0])
+    stats = {
+        "steps": end.steps, "rejected": end.rejected, "t": t, "x": last, "next_dt": first,
+    }  # fmt: skip
+    return _assembled(setup, flow, rows, stats, end.result, None, False)
+
+
+def _controller(
+    setup: Setup, method: AbstractMethod, stops: jax.Array, options: Options
+) -> AbstractController:
     if options.fixed:
         return Fixed(stops, setup.number("dt"))
     sizes = root_mean_squares(setup.problem.spaces(setup.x0)[0])
     rtol, atol, first, horizon = map(setup.number, ("rtol", "atol", "dt0", "horizon"))
-    return Adaptive(stops, rtol, atol, first, horizon, setup.method.degree + 1, sizes)
+    return Adaptive(stops, rtol, atol, first, horizon, method.degree + 1, sizes)
 
 
-def _stepper(setup: Setup, flow: Flow, stops: jax.Array, options: Options) -> Stepper:
+def _stepper(
+    setup: Setup, method: AbstractMethod, flow: Flow, stops: jax.Array, options: Options
+) -> Stepper:
     t0, t1, measure = stops[0], stops[-1], options.measure
     growth = None
     if measure and flow.enclosed:
         # Once a run: for a matrix it takes an eigenvalue.
         growth = flow.generator.growth(flow.state_space(setup.x0))
     locate = not options.fixed and _can_locate(flow, t0, setup.x0)
-    stepper = Stepper(setup.method, flow, measure, locate, options.careful, (t0, t1), None, growth)
-    if options.fixed and stops.shape[0] == 2 and not setup.method.linearises:
+    stepper = Stepper(method, flow, measure, locate, options.careful, (t0, t1), None, growth)
+    if options.fixed and stops.shape[0] == 2 and not method.linearises:
         length = (t1 - t0) / step_count(t1 - t0, setup.number("dt"))
         return dataclasses.replace(stepper, uniform=stepper.factors(length))
     return stepper
@@ -110,11 +146,10 @@ def _solution(
     result = RESULTS.where(
         (end.result == RESULTS.successful) & ~complete, RESULTS.max_steps, end.result
     )
-    rows = _end_alone(end, complete, t1) if saved is None else saved
-    us, ys, residual, law_step, law_error = _responses(
-        flow, rows.t, rows.x, setup.problem.spaces(setup.x0)[1], setup.moduli
+    result = RESULTS.where(
+        (result == RESULTS.successful) & ~_tree.all_finite(end.x), RESULTS.nonfinite, result
     )
-    measured = options.measure
+    rows = _end_alone(end, complete, t1) if saved is None else saved
     stats = {
         "steps": end.steps,
         "rejected": end.attempts - end.steps,
@@ -122,6 +157,21 @@ def _solution(
         "x": end.x,
         "next_dt": controller.next_length(end.control),
     }
+    return _assembled(setup, flow, rows, stats, result, end.records, options.measure)
+
+
+def _assembled(
+    setup: Setup,
+    flow: Flow,
+    rows: Saved,
+    stats: dict[str, Any],
+    result: RESULTS,
+    records: Record | None,
+    measured: bool,
+) -> Solution:
+    us, ys, residual, law_step, law_error = _responses(
+        flow, rows.t, rows.x, setup.problem.spaces(setup.x0)[1], setup.moduli
+    )
     return Solution(
         ts=rows.t,
         xs=rows.x,
@@ -134,10 +184,8 @@ def _solution(
         law_defect=rows.impulse[1] if measured else None,
         settled=rows.settled if measured else None,
         stats=stats,
-        result=RESULTS.where(
-            (result == RESULTS.successful) & ~_tree.all_finite(end.x), RESULTS.nonfinite, result
-        ),
-        records=end.records,
+        result=result,
+        records=records,
         enclosed=flow.enclosed,
         setup=setup,
     )

@@ -12,6 +12,7 @@ from ..problem import Problem
 from ..vi import AbstractSolver, Auto, analyse, independent
 from .chords import NoEnclosure, constant
 from .flow import Flow, slope
+from .implicit import Implicit
 from .method import AbstractMethod
 
 
@@ -26,7 +27,7 @@ class Setup(NamedTuple):
     x0: Tree
     args: Any
     setting: dict[str, Any]
-    method: AbstractMethod
+    method: AbstractMethod | Implicit
     vi_solver: AbstractSolver
     moduli: dict[str, Any]
 
@@ -65,7 +66,8 @@ class Setup(NamedTuple):
             problem, args, problem.generator(args), operator, solver, direct, reciprocal, False,
             self._tolerance(), self.moduli.get("gamma"), self.moduli.get("L_F"),
         )  # fmt: skip
-        if direct and intervals and self.method.degree <= 1 and _can_enclose(flow, t0, x0):
+        line = isinstance(self.method, AbstractMethod) and self.method.degree <= 1
+        if direct and intervals and line and _can_enclose(flow, t0, x0):
             return dataclasses.replace(flow, enclosed=True)
         return flow
 

@@ -11,6 +11,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem, SolveError
 from .loop import Record
+from .method import AbstractMethod
 from .regimes import Regimes, regimes
 from .results import RESULTS
 from .setup import Setup
@@ -104,8 +105,10 @@ class Solution(eqx.Module):
             )
         theta = (t - step.start) / step.length
         run = self.setup.number("t0"), self.setup.number("t1")
+        method = self.setup.method
+        assert isinstance(method, AbstractMethod)
         own, _ = local(
-            self.setup.method, flow, step.start, step.start + step.length, step.x0,
+            method, flow, step.start, step.start + step.length, step.x0,
             flow.guess(step.x0), run,
         )  # fmt: skip
         x = inside(own, step.length, theta, step.x0, step.coefficients)
@@ -152,6 +155,7 @@ class Solution(eqx.Module):
                     "Give the set as one that does, a dvax.sets.Polyhedron, say",
                 )
             )
+        assert isinstance(self.setup.method, AbstractMethod)
         return regimes(flow, self.setup.method, self.records, int(self.stats["steps"]))
 
     def raise_if_failed(self) -> "Solution":

@@ -15,6 +15,7 @@ from ..vi import AbstractSolver, Auto
 from .arguments import bound_steps, check, warn_precision
 from .compiled import compiled
 from .diagnose import diagnose
+from .implicit import Implicit
 from .integrate import Options
 from .method import ETD2RK, AbstractMethod
 from .results import RESULTS
@@ -35,7 +36,7 @@ def solve(
     dt: Any = None,
     rtol: Any = 1e-6,
     atol: Any = 1e-9,
-    method: AbstractMethod | None = None,
+    method: AbstractMethod | Implicit | None = None,
     vi_solver: AbstractSolver | None = None,
     progress: bool = False,
     *,
@@ -97,7 +98,7 @@ def solve(
     """
     x0 = _tree.as_float(x0, "x0")
     method = _METHOD if method is None else method
-    check(problem, x0, t0, t1, ts, dt, rtol, atol, dt0, horizon, method, adjoint)
+    check(problem, x0, t0, t1, ts, dt, rtol, atol, dt0, horizon, method, adjoint, measure, dense)
     fixed = dt is not None
     if not fixed:
         warn_precision(x0, rtol)
@@ -114,7 +115,7 @@ def solve(
     }
     options = Options(
         fixed=fixed,
-        measure=(not fixed) if measure is None else bool(measure) or not fixed,
+        measure=not isinstance(method, Implicit) and (bool(measure) or not fixed),
         careful=not fixed,
         dense=dense,
         max_steps=bound_steps(max_steps, fixed, t0, t1, dt),

@@ -1,0 +1,148 @@
+"""The fallback: an implicit method of Diffrax on x' = Ax + f̃(t, x) as a whole."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .. import _tree
+from .._tree import Tree
+from ..errors import InputError, InputProblem
+from .flow import Flow
+from .results import RESULTS
+from .stepper import within
+
+_SPLIT = (diffrax.KenCarp3, diffrax.KenCarp4, diffrax.KenCarp5)
+
+
+class Implicit(eqx.Module):
+    """An implicit Runge–Kutta method of Diffrax, by default Kvaerno's of order 5, for what no
+    exponential method should solve: an f̃ that is stiff and couples more unknowns than
+    `ExpRosenbrock` takes, or an A whose exponential costs too much.
+
+    A is only applied. Each step solves equations as large as the state by Newton's method, which by
+    default forms their matrix: some thousand unknowns. `rtol` and `atol` then mean what Diffrax means
+    by them, the error of one step; nothing is certified (`Solution.defect` is None), kinks are not
+    looked for, and steps are not kept: name the times in `ts=`. Steps end on the knots of data.
+
+    **Arguments:** `solver`: any implicit solver of Diffrax, with root finder and linear solver of its
+    own if need be. To its KenCarp methods A is the implicit part and the law the explicit one.
+
+    **Raises:** `dvax.InputError` where the solver is not implicit, or where `dvax.solve` is asked for
+    `dt`, `dense=True` or `measure=True`.
+
+    Source: Kværnø, BIT 44 (2004); Diffrax, https://docs.kidger.site/diffrax.
+
+    ```python
+    >>> import dvax
+    >>> stiff = dvax.Problem(
+    ...     A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 9.0),
+    ...     f=lambda t, x, u, args: 1.0 - x + u, h=lambda t, x, u, args: -1e4 * (x - 2.0) - u,
+    ... )                              # a spring of 5000 holds x above 2, nearly
+    >>> sol = dvax.solve(stiff, 4.0, 0.0, 4.0, method=dvax.Implicit())
+    >>> print(f"{float(sol.xs[0]):.6f}")
+    1.999800
+
+    ```
+    """
+
+    solver: diffrax.AbstractSolver = eqx.field(default_factory=diffrax.Kvaerno5)
+
+    def __check_init__(self) -> None:
+        if not isinstance(self.solver, diffrax.AbstractImplicitSolver):
+            raise InputError(
+                InputProblem(
+                    "dvax.Implicit(solver)",
+                    f"{type(self.solver).__name__}",
+                    "it must be an implicit solver of Diffrax",
+                    "diffrax.Kvaerno5(), Kvaerno3() or KenCarp4(), say; leave it out for the first",
+                )
+            )
+
+
+class Outcome(NamedTuple):
+    """How a run went: the saved times and states, infinite and NaN where they were not reached."""
+
+    ts: jax.Array
+    xs: Tree
+    steps: jax.Array
+    rejected: jax.Array
+    result: RESULTS
+
+
+def run(
+    method: Implicit,
+    flow: Flow,
+    x0: Tree,
+    stops: jax.Array,
+    ts: jax.Array | None,
+    controller: diffrax.AbstractStepSizeController,
+    length: Any,
+    max_steps: int,
+    adjoint: str,
+    progress: bool,
+) -> Outcome:
+    """From the first of the `stops` to the last, the first step of this `length`."""
+
+    begin, end = stops[0], stops[-1]
+    first, last = (within(begin, end, theta, (begin, end)) for theta in (0.0, 1.0))
+
+    def law(t: Any, x: Tree, _: Any) -> Tree:
+        found = flow.rate(jnp.clip(t, first, last), x, flow.guess(x))
+        # A law that is not solved gives no rate: a shorter step is tried.
+        return jtu.tree_map(lambda v: jnp.where(found.solved, v, jnp.nan), found.value)
+
+    def linear(t: Any, x: Tree, _: Any) -> Tree:
+        return flow.generator.apply(x)
+
+    if isinstance(method.solver, _SPLIT):
+        terms = diffrax.MultiTerm(diffrax.ODETerm(law), diffrax.ODETerm(linear))
+    else:
+        terms = diffrax.ODETerm(lambda t, x, _: _tree.add(linear(t, x, _), law(t, x, _)))
+
+    found = diffrax.diffeqsolve(
+        terms,
+        method.solver,
+        begin,
+        end,
+        length,
+        x0,
+        saveat=diffrax.SaveAt(t1=True) if ts is None else diffrax.SaveAt(ts=ts),
+        stepsize_controller=controller,
+        adjoint=diffrax.ForwardMode()
+        if adjoint == "forward"
+        else diffrax.RecursiveCheckpointAdjoint(),
+        max_steps=max_steps,
+        throw=False,
+        progress_meter=diffrax.TextProgressMeter() if progress else diffrax.NoProgressMeter(),
+    )
+    assert found.ts is not None
+    fine = found.result == diffrax.RESULTS.successful
+    # Without ts the one time is that of the last good step.
+    reached = jnp.isfinite(found.ts) & (fine if ts is None else True)
+    xs = jtu.tree_map(
+        lambda leaf: jnp.where(reached.reshape(-1, *(1,) * (leaf.ndim - 1)), leaf, jnp.nan),
+        found.ys,
+    )
+    out_of_steps = found.result == diffrax.RESULTS.max_steps_reached
+    result = RESULTS.where(out_of_steps, RESULTS.max_steps, RESULTS.implicit_unsolved)
+    result = RESULTS.where(fine, RESULTS.successful, result)
+    return Outcome(
+        jnp.where(reached, found.ts, jnp.inf), xs, found.stats["num_accepted_steps"],
+        found.stats["num_rejected_steps"], result,
+    )  # fmt: skip
+
+
+def controller(rtol: Any, atol: Any, stops: jax.Array) -> diffrax.AbstractStepSizeController:
+    """Steps that adapt and end on the stops."""
+    # The error of a stiff step says little about the next one: Diffrax's advice.
+    shortest = 8 * jnp.finfo(stops.dtype).eps * jnp.max(jnp.abs(stops))
+    adaptive = diffrax.PIDController(
+        rtol, atol, pcoeff=0.3, icoeff=0.4, dtmin=shortest, force_dtmin=False
+    )
+    if stops.shape[0] == 2:
+        return adaptive
+    return diffrax.ClipStepSizeController(adaptive, jump_ts=stops[1:-1])

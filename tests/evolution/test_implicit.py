@@ -1,0 +1,118 @@
+"""The implicit fallback: Diffrax's accuracy on closed forms, and what it does not do, said at once."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.closed_forms import c1, c1_derivatives, c1_solution
+
+import dvax
+from dvax import generators, signals
+
+PLAIN = dvax.operators.Scaling(1.0)
+
+
+def test_the_contact_law_through_its_kinks():
+    case, ts = c1(), np.linspace(0.0, 2.0, 9)
+    sol = dvax.solve(
+        case.problem, case.x0, 0.0, 2.0, args=case.args, ts=ts, rtol=1e-8, method=dvax.Implicit(),
+        constants=case.constants,
+    )  # fmt: skip
+    for t, x, u in zip(ts, sol.xs, sol.us, strict=True):
+        np.testing.assert_allclose((float(x), float(u)), c1_solution(t), atol=1e-6)
+    assert sol.result == dvax.RESULTS.successful and sol.defect is None
+    assert float(np.max(sol.law_error)) < 1e-9
+
+
+def stiff(n):
+    """A chain with a fast reaction that couples neighbours, towards a known field."""
+    target = jnp.linspace(0.2, 0.8, n)
+    laplacian = 100.0 * (jnp.eye(n, k=1) + jnp.eye(n, k=-1) - 2.0 * jnp.eye(n))
+    return target, dvax.Problem(
+        A=generators.Dense(laplacian), P=PLAIN, K=dvax.sets.Box(0.0, 1.0),
+        f=lambda t, x, u, args: 1e6 * (u - x) - laplacian @ target,
+        h=lambda t, x, u, args: 2.0 * target - u,
+    )  # fmt: skip
+
+
+def test_a_stiff_system_of_some_size():
+    target, problem = stiff(300)
+    sol = dvax.solve(problem, jnp.zeros(300), 0.0, 1.0, method=dvax.Implicit(diffrax.Kvaerno3()))
+    np.testing.assert_allclose(np.asarray(sol.xs[0]), np.asarray(target), atol=1e-6)
+    assert int(sol.stats["steps"]) < 400
+
+
+def test_the_law_may_be_the_explicit_part():
+    case = c1()
+    sol = dvax.solve(
+        case.problem, case.x0, 0.0, 2.0, args=case.args, rtol=1e-7,
+        method=dvax.Implicit(diffrax.KenCarp4()),
+    )  # fmt: skip
+    assert float(sol.xs[0]) == pytest.approx(c1_solution(2.0)[0], abs=1e-5)
+
+
+def test_derivatives_go_both_ways():
+    case = c1()
+
+    def end(x0, ell, adjoint):
+        return dvax.solve(
+            case.problem, x0, 0.0, 2.0, args=(ell,), rtol=1e-9, method=dvax.Implicit(),
+            adjoint=adjoint, max_steps=4096,
+        ).xs[-1]  # fmt: skip
+
+    given = jnp.asarray(-1.0), jnp.asarray(3.0)
+    back = jax.grad(lambda v: end(*v, "reverse"))(given)
+    there = jax.jacfwd(lambda v: end(*v, "forward"))(given)
+    np.testing.assert_allclose([float(v) for v in back], c1_derivatives(), rtol=1e-4)
+    np.testing.assert_allclose([float(v) for v in there], [float(v) for v in back], rtol=1e-5)
+
+
+def pushed(times, values):
+    table = signals.Table(times, values, kind="constant")
+    return dvax.Problem(
+        A=generators.Zero(), P=PLAIN, K=dvax.sets.WholeSpace(), f=lambda t, x, u, args: table(t),
+        h=lambda t, x, u, args: -u,
+    )  # fmt: skip
+
+
+def test_steps_end_where_data_jumps():
+    problem = pushed([0.0, 0.37, 1.0], [1.0, -3.0, 0.0])
+    sol = dvax.solve(problem, 0.0, 0.0, 1.0, method=dvax.Implicit(diffrax.Kvaerno3()))
+    assert float(sol.xs[0]) == pytest.approx(0.37 - 3.0 * 0.63, abs=1e-12)
+    assert int(sol.stats["rejected"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        (dict(dense=True), "no polynomials of its steps"),
+        (dict(measure=True), "no polynomials of its steps"),
+        (dict(dt=0.1), "follows from rtol and atol"),
+    ],
+)
+def test_what_it_does_not_do_is_refused(asked, words):
+    case = c1()
+    with pytest.raises(dvax.InputError, match=words):
+        dvax.solve(case.problem, case.x0, 0.0, 2.0, args=case.args, method=dvax.Implicit(), **asked)
+    with pytest.raises(dvax.InputError, match="must be an implicit solver"):
+        dvax.Implicit(diffrax.Tsit5())
+
+
+def test_failures_have_their_sentences():
+    case = c1()
+    run = lambda **how: dvax.solve(  # noqa: E731
+        case.problem, case.x0, 0.0, 2.0, args=case.args, method=dvax.Implicit(), throw=False, **how
+    )
+    assert run(max_steps=3, rtol=1e-9).result == dvax.RESULTS.max_steps
+    broken = dvax.Problem(
+        A=generators.Zero(), P=PLAIN, K=dvax.sets.WholeSpace(),
+        f=lambda t, x, u, args: jnp.where(t > 0.5, jnp.nan, 1.0), h=lambda t, x, u, args: -u,
+    )  # fmt: skip
+    with pytest.raises(dvax.SolveError) as failure:
+        dvax.solve(broken, 0.0, 0.0, 1.0, ts=[0.25, 0.75], method=dvax.Implicit(), max_steps=2000)
+    assert "Stopped at t = 0.25" in str(failure.value) and "f is nan" in str(failure.value)
+    assert failure.value.solution.result == dvax.RESULTS.implicit_unsolved
+    partial = failure.value.solution
+    np.testing.assert_allclose(np.asarray(partial.ts), [0.25])
+    np.testing.assert_allclose(np.asarray(partial.xs), [0.25], atol=1e-9)
