@@ -26,7 +26,8 @@ class Implicit(eqx.Module):
     A is only applied. Each step solves equations as large as the state by Newton's method, which by
     default forms their matrix: some thousand unknowns. `rtol` and `atol` then mean what Diffrax means
     by them, the error of one step; nothing is certified (`Solution.defect` is None), kinks are not
-    looked for, and steps are not kept: name the times in `ts=`. Steps end on the knots of data.
+    looked for (derivatives of a run that crosses some are as good as the steps there are short), and
+    steps are not kept: name the times in `ts=`. Steps end on the knots of data.
 
     **Arguments:** `solver`: any implicit solver of Diffrax, with root finder and linear solver of its
     own if need be. To its KenCarp methods A is the implicit part and the law the explicit one.
