@@ -36,6 +36,7 @@ CONTRACT = [
     "ETD4RK",
     "ExpRosenbrock",
     "Implicit",
+    "Picard",
     "generators.Scalar",
     "generators.Diagonal",
     "generators.Dense",

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .evolution import RESULTS as RESULTS
     from .evolution import ExpRosenbrock as ExpRosenbrock
     from .evolution import Implicit as Implicit
+    from .evolution import Picard as Picard
     from .evolution import Solution as Solution
     from .evolution import solve as solve
     from .problem import Problem as Problem
@@ -45,6 +46,7 @@ _HOMES = {
         "ETD4RK",
         "ExpRosenbrock",
         "Implicit",
+        "Picard",
         "RESULTS",
         "Solution",
         "solve",

@@ -6,6 +6,7 @@ from .method import ETD2RK as ETD2RK
 from .method import ETD4RK as ETD4RK
 from .method import AbstractMethod as AbstractMethod
 from .method import ExpRosenbrock as ExpRosenbrock
+from .picard import Picard as Picard
 from .results import RESULTS as RESULTS
 from .solution import Solution as Solution
 from .solve import solve as solve

@@ -13,6 +13,7 @@ from ..errors import InputError, InputProblem
 from ..problem import Problem
 from .implicit import Implicit
 from .method import AbstractMethod
+from .picard import Picard
 
 ADAPTIVE_STEPS = 2**20
 """The most steps of an adaptive solve, unless max_steps says otherwise."""
@@ -30,7 +31,7 @@ def check(
 
     rule(isinstance(problem, Problem), "problem", type(problem).__name__,
          "it must be a dvax.Problem", "Build one from A, P, K, f and h")  # fmt: skip
-    rule(isinstance(method, AbstractMethod | Implicit), "method", method,
+    rule(isinstance(method, AbstractMethod | Implicit | Picard), "method", method,
          "it must be a method such as dvax.ETD2RK()", "Leave it out for the default")  # fmt: skip
     rule(adjoint in ("reverse", "forward"), "adjoint", repr(adjoint),
          "it must be 'reverse' or 'forward'",

@@ -99,7 +99,7 @@ class Adaptive(AbstractController):
 
     def init(self):
         first = lax.stop_gradient(self.first)
-        end = _land(self.stops[0], first, self.stops[1])
+        end = land(self.stops[0], first, self.stops[1])
         one = jnp.ones_like(first)
         return self.State(end, first, jnp.asarray(1), jnp.asarray(False), one, nothing_ahead(first))
 
@@ -155,7 +155,7 @@ class Adaptive(AbstractController):
         last = self.stops.shape[0] - 1
         stop = jnp.minimum(jnp.where(jumped, state.stop + 1, state.stop), last)
         begin = jnp.where(keep, t1, t0)
-        end = _land(begin, wanted, until(ahead, begin, self.stops[stop]))
+        end = land(begin, wanted, until(ahead, begin, self.stops[stop]))
         # Below this, t itself cannot tell the ends of a step apart.
         stuck = ~keep & (h <= floor)
         result = RESULTS.where(
@@ -187,7 +187,7 @@ class Adaptive(AbstractController):
         return jnp.where(jnp.isnan(ratio), jnp.inf, ratio)
 
 
-def _land(t: Any, length: Any, until: Any) -> Any:
+def land(t: Any, length: Any, until: Any) -> Any:
     """The end of a step from t: `until` itself when in reach, half way when one step nearly is."""
     rest = until - t
     reaches = length >= rest * (1 - 1e-9)

@@ -20,8 +20,9 @@ def forward_only(tree: Tree) -> Tree:
 
 def _refuse(cotangent: Any, x: Any) -> Any:
     raise DifferentiationError(
-        'dvax.solve(adjoint="forward") cannot be differentiated backward (jax.grad, jax.vjp). Pass '
-        'adjoint="reverse", the default: the loop that carries tangents along stores no steps.'
+        'dvax.solve(adjoint="forward") and dvax.Picard cannot be differentiated backward (jax.grad, '
+        'jax.vjp). Pass adjoint="reverse", the default, and another method: a loop that carries '
+        "tangents along stores no steps."
     )
 
 

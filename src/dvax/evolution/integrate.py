@@ -10,14 +10,15 @@ from jax import lax
 
 from .. import _tree
 from ..vi import certify
-from . import implicit, reverse
+from . import implicit, picard, reverse
 from .closures import opened
 from .control import AbstractController, Adaptive, Fixed, root_mean_squares, step_count
 from .flow import Flow
 from .forward import forward_only
 from .implicit import Implicit
 from .loop import Loop, Record, Saved, State
-from .method import AbstractMethod
+from .method import ETD2RK, AbstractMethod
+from .picard import Picard
 from .results import RESULTS
 from .setup import Setup
 from .solution import Solution
@@ -50,6 +51,8 @@ def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
     times = None if ts is None else jnp.asarray(ts, setup.dtype)
     if isinstance(setup.method, Implicit):
         return _implicitly(setup, setup.method, flow, stops, times, options)
+    if isinstance(setup.method, Picard):
+        return _by_windows(setup, setup.method, flow, stops, times, options)
     method = setup.method
     controller = _controller(setup, method, stops, options)
     loop = Loop(
@@ -93,6 +96,57 @@ def _implicitly(
         "steps": end.steps, "rejected": end.rejected, "t": t, "x": last, "next_dt": first,
     }  # fmt: skip
     return _assembled(setup, flow, rows, stats, end.result, None, False)
+
+
+def _by_windows(
+    setup: Setup,
+    method: Picard,
+    flow: Flow,
+    stops: jax.Array,
+    ts: jax.Array | None,
+    options: Options,
+) -> Solution:
+    x0 = setup.x0
+    growth = flow.generator.growth(flow.state_space(x0)) if flow.enclosed else None
+    ends = stops[0], stops[-1]
+    stepper = Stepper(ETD2RK(), flow, True, False, True, ends, None, growth)
+    rtol, atol, horizon = map(setup.number, ("rtol", "atol", "horizon"))
+    sizes = jax.vmap(
+        lambda *parts: jnp.stack(root_mean_squares(setup.problem.spaces(x0)[0])(*parts))
+    )
+
+    def size(error: Any, before: Any) -> Any:
+        """What the defect amounts to, in tolerances: the mean of the steps, since a kink is in one."""
+        scale = atol + rtol * sizes(before)
+        return horizon * jnp.max(jnp.mean(sizes(error) / scale, axis=0))
+
+    def matters(change: Any, X: Any, value: Any) -> Any:
+        """Whether f̃ still changes by more than rounding, and by a part of the tolerance that shows
+        beside the defect."""
+        worst = lambda v: jnp.max(sizes(v))  # noqa: E731
+        rounding = 20 * jnp.finfo(setup.dtype).eps * worst(value)
+        more = ~(worst(change) <= rounding)
+        return more if options.fixed else more & ~(size(change, X) <= 0.01)
+
+    first = setup.number("dt") if options.fixed else setup.number("dt0")
+    run = picard.Run(
+        method, stepper, stops, options.fixed, first, size, matters,
+        max(1, -(-options.max_steps // method.nodes)), options.dense,
+    )  # fmt: skip
+    saved, end = forward_only(run.solve(x0, ts))
+    complete = end.t >= stops[-1]
+    result = RESULTS.where(
+        (end.result == RESULTS.successful) & ~complete, RESULTS.max_steps, end.result
+    )
+    rows = saved
+    if rows is None:
+        rows = _end_alone(end, complete, stops[-1])
+    stats = {
+        "steps": end.steps, "rejected": end.refused, "t": end.t, "x": end.x,
+        "next_dt": end.length / method.nodes, "windows": end.windows, "sweeps": end.sweeps,
+        "contraction": end.contraction,
+    }  # fmt: skip
+    return _assembled(setup, flow, rows, stats, result, end.records, True)
 
 
 def _controller(
@@ -191,7 +245,7 @@ def _assembled(
     )
 
 
-def _end_alone(end: State, complete: Any, t1: Any) -> Saved:
+def _end_alone(end: State | picard.State, complete: Any, t1: Any) -> Saved:
     """The end as the one saved time."""
     x = jtu.tree_map(lambda leaf: jnp.where(complete, leaf, jnp.nan), end.x)
     one = Saved(jnp.where(complete, t1, jnp.inf), x, end.impulse, end.impulse)

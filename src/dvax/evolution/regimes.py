@@ -10,7 +10,6 @@ import numpy as np
 from .flow import Flow
 from .kinks import first_change
 from .loop import Record
-from .method import AbstractMethod
 from .stepper import inside, local, within
 
 _LOOKS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -27,7 +26,7 @@ class Regimes(NamedTuple):
     positive: np.ndarray
 
 
-def regimes(flow: Flow, method: AbstractMethod, records: Record, count: int) -> Regimes:
+def regimes(flow: Flow, method: Any, records: Record, count: int) -> Regimes:
     """Those of the first `count` steps, at least one, of a flow whose set says where its kinks are."""
     steps = jtu.tree_map(lambda leaf: leaf[:count], records)
     starts, lengths = np.asarray(steps.start), np.asarray(steps.length)
@@ -45,7 +44,7 @@ def regimes(flow: Flow, method: AbstractMethod, records: Record, count: int) -> 
 
 
 def _changes(
-    flow: Flow, method: AbstractMethod, step: Record, run: tuple[Any, Any]
+    flow: Flow, method: Any, step: Record, run: tuple[Any, Any]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The time of the first change of sign in a step, and the signs at its ends, seen from inside."""
 

@@ -14,6 +14,10 @@ class RESULTS(eqx.Enumeration):
         "The step became too small to move t while the defect stayed above the tolerance. The data "
         "is discontinuous at that time (name it: dvax.signals knots), or rtol is below rounding."
     )
+    picard_unsettled = (
+        "Picard's sweeps did not converge on a window, however short, or the law was not solved there. "
+        "Shorten dt, or take fewer nodes: dvax.Picard(nodes=16)."
+    )
     implicit_unsolved = (
         "The equations of an implicit step were not solved, however short the step. f, h or K may be "
         "NaN or infinite there, or jump; or give dvax.Implicit(solver) a root finder of its own."

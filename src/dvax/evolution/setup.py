@@ -14,6 +14,7 @@ from .chords import NoEnclosure, constant
 from .flow import Flow, slope
 from .implicit import Implicit
 from .method import AbstractMethod
+from .picard import Picard
 
 
 class Setup(NamedTuple):
@@ -27,7 +28,7 @@ class Setup(NamedTuple):
     x0: Tree
     args: Any
     setting: dict[str, Any]
-    method: AbstractMethod | Implicit
+    method: AbstractMethod | Implicit | Picard
     vi_solver: AbstractSolver
     moduli: dict[str, Any]
 
@@ -66,7 +67,7 @@ class Setup(NamedTuple):
             problem, args, problem.generator(args), operator, solver, direct, reciprocal, False,
             self._tolerance(), self.moduli.get("gamma"), self.moduli.get("L_F"),
         )  # fmt: skip
-        line = isinstance(self.method, AbstractMethod) and self.method.degree <= 1
+        line = not isinstance(self.method, Implicit) and self.method.degree <= 1
         if direct and intervals and line and _can_enclose(flow, t0, x0):
             return dataclasses.replace(flow, enclosed=True)
         return flow

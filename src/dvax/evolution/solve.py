@@ -18,6 +18,7 @@ from .diagnose import diagnose
 from .implicit import Implicit
 from .integrate import Options
 from .method import ETD2RK, AbstractMethod
+from .picard import Picard
 from .results import RESULTS
 from .setup import Setup, as_arrays
 from .solution import Solution
@@ -36,7 +37,7 @@ def solve(
     dt: Any = None,
     rtol: Any = 1e-6,
     atol: Any = 1e-9,
-    method: AbstractMethod | Implicit | None = None,
+    method: AbstractMethod | Implicit | Picard | None = None,
     vi_solver: AbstractSolver | None = None,
     progress: bool = False,
     *,

@@ -84,7 +84,7 @@ def inside(flow: Flow, length: Any, theta: Any, x0: Tree, c: tuple[Tree, ...]) -
 
 
 def local(
-    method: AbstractMethod,
+    method: Any,
     flow: Flow,
     t0: Any,
     t1: Any,
@@ -262,6 +262,24 @@ class Stepper(eqx.Module):
 
     def _within(self, t0: Any, t1: Any, theta: float) -> Any:
         return within(t0, t1, theta, self.ends)
+
+    def look(
+        self, t0: Any, t1: Any, x0: Tree, x1: Tree, c: tuple[Tree, ...], guess: Tree | None
+    ) -> tuple[Tree, tuple[Any, Any], Any]:
+        """The defect of a step that was made elsewhere, entry by entry and integrated, and whether the
+        law was solved where it was looked at."""
+
+        def run(evaluate: Callable[[Any, Tree], Rate]) -> tuple[tuple[Tree, ...], Tree]:
+            for theta, x in zip((0.0, *self.method.samples, 1.0), points, strict=True):
+                evaluate(self._within(t0, t1, theta), x)
+            return c, x1
+
+        between = [inside(self.flow, t1 - t0, theta, x0, c) for theta in self.method.samples]
+        points = [x0, *between, x1]
+        _, visits = evaluated(self.flow, run, self.ends[0], x0, guess, None, True)
+        sample = self._measure(t0, t1, x0, x1, c, visits)
+        solved = jnp.all(jnp.stack([visit.rate.solved for visit in visits]))
+        return sample.error, (sample.defect, sample.law_defect), solved
 
     def _kept(self, rate: Rate) -> Rate:
         """What the next step needs of a rate: not the law behind it, where nothing samples it."""
