@@ -16,6 +16,7 @@ from ..problem import Problem
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, Frozen
 from .chords import Chord, NoEnclosure, enclose, is_chord, largest, smallest
+from .faces import Faces
 from .linearised import AbstractLinear, split
 
 
@@ -37,12 +38,12 @@ class Rate(NamedTuple):
 class Flow(eqx.Module):
     """x' = Ax + f̃(t, x) for one `args`, with the law's solver and tolerance settled.
 
-    `direct` says that the law was proved to be F(y) = ay − h(t, x, 0), pointwise on a set of pointwise
-    intervals, or with one number a on any set, so that its closed form y = proj_K(h(t, x, 0)/a) is
-    used and no guess is needed. `reciprocal` is 1/a
-    where a was proved not to depend on t and x, so that it is computed once. `enclosed` says that f̃
-    can be enclosed over a whole step (`chords`), so that nothing about the defect is guessed.
-    `linear` is A + J where some J is left to the propagator.
+    `direct` says that the law has a closed form, so that no guess is needed: it was proved to be
+    F(y) = ay − h(t, x, 0), pointwise on a set of pointwise intervals, or with one number a on any set,
+    and y = proj_K(h(t, x, 0)/a); or affine on a box of few unknowns, and `faces` writes it out.
+    `reciprocal` is 1/a where a was proved not to depend on t and x, so that it is computed once.
+    `enclosed` says that f̃ can be enclosed over a whole step (`chords`), so that nothing about the
+    defect is guessed. `linear` is A + J where some J is left to the propagator.
     """
 
     problem: Problem
@@ -56,6 +57,7 @@ class Flow(eqx.Module):
     tol: Any
     gamma: Any
     L_F: Any
+    faces: Faces | None = None
     linear: AbstractLinear | None = None
 
     def propagator(self, h: Any, terms: int) -> AbstractPropagator:
@@ -87,6 +89,8 @@ class Flow(eqx.Module):
 
     def _closed_form(self, t: Any, x: Tree) -> Rate:
         problem, args = self.problem, self.args
+        if self.faces is not None:
+            return self._written_out(self.faces, t, x)
         drive = problem.h(t, x, problem.zero_control(x), args)
         if self.reciprocal is not None:
             z = jtu.tree_map(jnp.multiply, drive, self.reciprocal)
@@ -100,6 +104,20 @@ class Flow(eqx.Module):
         exact = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(x)))
         # With a slope that is not positive the law is not monotone, and this is not its solution.
         return Rate(value, y, z, exact, solved, jnp.asarray(1))
+
+    def _written_out(self, faces: Faces, t: Any, x: Tree) -> Rate:
+        problem, args = self.problem, self.args
+        zero = problem.zero_control(x)
+        bounds = problem.set_at(t, args).intervals(zero)
+        assert bounds is not None
+        q = problem.frozen(t, x, args)(zero)
+        found = faces.solve(q, *bounds)
+        value = problem.f(t, x, self.operator.inverse(found.y), args)
+        residual = problem.spaces(x)[1].norm(found.w)
+        # Where no face has a solution the law has none, or M is singular on all that might.
+        size = jnp.max(jnp.abs(q)) + jnp.max(jnp.abs(faces.M)) * jnp.max(jnp.abs(found.y))
+        solved = residual <= jnp.maximum(self.tol, 1e3 * jnp.finfo(residual.dtype).eps * size)
+        return Rate(value, found.y, found.z, residual, solved, jnp.asarray(1))
 
     def enclosure(self, t: Chord, x: Tree) -> Tree:
         """f̃ along chords of t and x, as chords, for a direct law on pointwise intervals.

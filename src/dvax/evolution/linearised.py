@@ -12,7 +12,8 @@ import jax.tree_util as jtu
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..generators import AbstractGenerator, AbstractPropagator, Diagonal, Scalar, Zero
-from ..generators.phi import expm, flow_factors, phi_scalar
+from ..generators.dense import MatrixPropagator
+from ..generators.phi import flow_factors, phi_matrix, phi_scalar
 from ..generators.scalar import ElementwisePropagator
 from ..vi.matrix import diagonal_of, matrix_of
 
@@ -51,32 +52,23 @@ class MatrixLinear(AbstractLinear):
     A: jax.Array
     J: jax.Array
 
-    def propagator(self, h: Any, terms: int) -> "ActionPropagator":
-        return ActionPropagator(h, self.A + self.J)
+    def propagator(self, h: Any, terms: int) -> "FlatPropagator":
+        factors = flow_factors(h, phi_matrix(h * (self.A + self.J), terms))
+        return FlatPropagator(MatrixPropagator(factors))
 
     def apply(self, v: Tree) -> Tree:
         flat, back = jax.flatten_util.ravel_pytree(v)
         return back(self.J @ flat)
 
 
-class ActionPropagator(AbstractPropagator):
-    """One exponential of a matrix that is larger by a row for each coefficient, since (t/h)ʲ solves
-    sⱼ' = (j/h) sⱼ₋₁: cheaper than the φ-functions of a matrix that is used once or twice."""
+class FlatPropagator(AbstractPropagator):
+    """A propagator of vectors, for states of any shape."""
 
-    h: Any
-    matrix: jax.Array
+    of: AbstractPropagator
 
     def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
         flat, back = jax.flatten_util.ravel_pytree(x0)
-        forcing = [self.h * jax.flatten_util.ravel_pytree(v)[0] for v in c]
-        n, q = flat.size, len(c)
-        block = jnp.zeros((n + q, n + q), flat.dtype).at[:n, :n].set(self.h * self.matrix)
-        if q:
-            block = block.at[:n, n:].set(jnp.stack(forcing, 1))
-            powers = jnp.arange(1, q).astype(flat.dtype)
-            block = block.at[n + 1 :, n : n + q - 1].add(jnp.diag(powers))
-        start = jnp.concatenate([flat, jnp.zeros(q, flat.dtype).at[:1].set(1.0)])
-        return back((expm(block) @ start)[:n])
+        return back(self.of.step(flat, tuple(jax.flatten_util.ravel_pytree(v)[0] for v in c)))
 
 
 def split(generator: AbstractGenerator, change: Any, x: Tree) -> AbstractLinear:

@@ -18,7 +18,6 @@ transform, SIAM J. Numer. Anal. 47 (2009); the bound: Beckermann, C. R. Acad. Sc
 """
 
 import math
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -32,6 +31,7 @@ from .._batch import largest_of_batch
 from .._tree import Tree
 from .abstract import AbstractGenerator, AbstractPropagator
 from .phi import flow_factors, phi_scalar
+from .turns import turns
 
 _SIZES = (256, 2048, 16384)
 """Of the Fourier transform that finds the coefficients."""
@@ -101,7 +101,7 @@ class FaberPropagator(AbstractPropagator):
             count = self.pieces.astype(dtype)
             return self._sum((x, *_from(s.astype(dtype) / count, 1.0 / count, c)))
 
-        return _loop(self.pieces, piece, x0, 1, (_MOST_PIECES,))
+        return turns(self.pieces, piece, x0, 1, (_MOST_PIECES,))
 
     def _sum(self, v: tuple[Tree, ...]) -> Tree:
         """Σₖ Fₖ(A) Σᵢ coefficients[i, k] vᵢ, by Clenshaw's recurrence."""
@@ -128,7 +128,7 @@ class FaberPropagator(AbstractPropagator):
         # Whole runs of turns: the coefficients beyond the degree are zero.
         last = -(-self.degree // _RUN) * _RUN
         zero = _tree.zeros_like(v[0])
-        first, second = _loop(self.degree, turn, (zero, zero), _RUN, _BRANCH)
+        first, second = turns(self.degree, turn, (zero, zero), _RUN, _BRANCH)
         return jtu.tree_map(
             lambda g, m, s: g + 0.5 * forward * m - back * s, mixed(0, 1.0), moved(first), second
         )
@@ -182,33 +182,3 @@ def _from(theta: Any, length: Any, c: tuple[Tree, ...]) -> tuple[Tree, ...]:
         return jtu.tree_map(lambda *leaves: sum(map(jnp.multiply, factors, leaves)), *c[j:])
 
     return tuple(map(coefficient, range(len(c))))
-
-
-def _loop(
-    count: Any, turn: Callable[[Any, Any], Any], carry: Any, run: int, branches: tuple[int, ...]
-) -> Any:
-    """`turn(j, carry)` for j from 0 to `count`, rounded up to a multiple of `run`.
-
-    A tree of loops of fixed length whose idle branches are skipped, so that derivatives go backward
-    through it; only what each run began with is kept for them.
-    """
-
-    def leaf(start: Any, carry: Any) -> Any:
-        return lax.fori_loop(0, run, lambda j, carry: turn(start + j, carry), carry)
-
-    def branch(inner: Callable, many: int, width: int) -> Callable:
-        def several(start: Any, carry: Any) -> Any:
-            def one(carry: Any, j: Any) -> tuple[Any, None]:
-                begin = start + j * width
-                return lax.cond(
-                    begin < count, lambda carry: inner(begin, carry), lambda carry: carry, carry
-                ), None
-
-            return lax.scan(one, carry, jnp.arange(many))[0]
-
-        return several
-
-    whole, width = jax.checkpoint(leaf), run
-    for many in branches:
-        whole, width = branch(whole, many, width), width * many
-    return whole(jnp.asarray(0), carry)

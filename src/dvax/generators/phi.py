@@ -5,8 +5,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
+
+from .._batch import largest_of_batch
+from .turns import turns
 
 _TERMS = 20  # of the Taylor series on |z| < 1: 1/20! is below double rounding
+_LEVELS = 3  # 4³ halvings at most: norms up to 10¹⁹
 
 
 def phi_scalar(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
@@ -39,23 +44,44 @@ def phi_scalar(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
 
 
 def phi_matrix(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
-    """(φ₀(Z), …, φ_order(Z)) of a square matrix, from one exponential.
+    """(φ₀(Z), …, φ_order(Z)) of a square matrix of any norm, to the rounding that Z itself has.
 
-    exp of the block matrix [[Z, I, 0, …], [0, 0, I, …], …, [0, …, 0]] has first block row
-    (φ₀(Z), φ₁(Z), …) (Al-Mohy and Higham 2011, Theorem 2.1).
+    On ‖Z‖ ≤ 1 as for a number: the highest one as a Taylor series, the others by the recurrence read
+    downward. A larger Z is halved s times, and then
+
+        φₖ(2Z) = 2⁻ᵏ (φ₀(Z)φₖ(Z) + Σⱼ φⱼ(Z)/(k − j)!),  j = 1, …, k
+
+    (Skaflestad and Wright 2009), with E = φ₀ − 1 in the place of φ₀, E(2Z) = E(Z)² + 2E(Z): what is
+    slow in a stiff Z keeps its digits, of which squaring φ₀ loses s binary ones.
     """
-    n = z.shape[0]
-    size = (order + 1) * n
-    block = jnp.zeros((size, size), z.dtype).at[:n, :n].set(z)
-    shift = jnp.eye(order * n, dtype=z.dtype)
-    block = block.at[: order * n, n:].add(shift) if order else block
-    first_row = expm(block)[:n]
-    return tuple(first_row[:, k * n : (k + 1) * n] for k in range(order + 1))
+    eye = jnp.eye(z.shape[0], dtype=z.dtype)
+    norm = lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(z), axis=0)))
+    halvings = jnp.ceil(jnp.log2(jnp.where(norm > 1.0, norm, 1.0)))
+    # What is not finite stays so; a norm near overflow is no generator's.
+    halvings = largest_of_batch(jnp.clip(halvings, 0, 4**_LEVELS - 1).astype(int))
+    small = z * jnp.exp2(-halvings.astype(norm.dtype)).astype(z.dtype)
 
+    top = max(order, 1)
+    taylor = jnp.zeros_like(z) + eye * (1.0 / math.factorial(top + _TERMS - 1))
+    for j in range(_TERMS - 2, -1, -1):
+        taylor = small @ taylor + eye * (1.0 / math.factorial(top + j))
+    down = [taylor]
+    for k in range(top - 1, 0, -1):
+        down.append(small @ down[-1] + eye * (1.0 / math.factorial(k)))
+    phis = tuple(reversed(down))
 
-def expm(matrix: jax.Array) -> jax.Array:
-    """The exponential of a matrix of any norm: JAX by itself gives NaN beyond 3·10⁵."""
-    return jax.scipy.linalg.expm(matrix, max_squarings=64)
+    def double(_: Any, carry: tuple[jax.Array, tuple[jax.Array, ...]]) -> Any:
+        E, phis = carry
+        new = []
+        for k, phi in enumerate(phis, start=1):
+            total = phi + E @ phi
+            for j in range(1, k + 1):
+                total = total + phis[j - 1] / math.factorial(k - j)
+            new.append(0.5**k * total)
+        return E @ E + 2.0 * E, tuple(new)
+
+    E, phis = turns(halvings, double, (small @ phis[0], phis), 1, (4,) * _LEVELS)
+    return (eye + E, *phis)[: order + 1]
 
 
 def flow_factors(h: Any, phis: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:

@@ -1,0 +1,99 @@
+"""The law written out face by face: it satisfies the law, and its derivative is that of its face."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvax
+from dvax.evolution.faces import faces, fits, sides
+
+INF = np.inf
+
+
+def definite(rng, n):
+    root = rng.normal(size=(n, n))
+    skew = rng.normal(size=(n, n))
+    return root @ root.T + 0.3 * np.eye(n) + 2.0 * (skew - skew.T)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_the_point_satisfies_the_law_whatever_the_bounds(n):
+    rng = np.random.default_rng(n)
+    M = definite(rng, n)
+    found = faces(lambda y: jnp.asarray(M) @ y, jnp.zeros(n))
+    solve = jax.jit(jax.vmap(lambda q, low, up: found.solve(q, low, up)))
+    count = 2000
+    q = rng.normal(size=(count, n)) * rng.choice([0.1, 1.0, 10.0], (count, 1))
+    low = np.where(rng.random((count, n)) < 0.3, -INF, -rng.random((count, n)))
+    up = np.where(rng.random((count, n)) < 0.3, INF, rng.random((count, n)))
+    # Some intervals are a point, and some solutions lie on a bound that does not push.
+    narrow = rng.random((count, n)) < 0.1
+    low, up = np.where(narrow, 0.2, low), np.where(narrow, 0.2, up)
+    touching = slice(0, 200)
+    q[touching] = -np.clip(rng.normal(size=(200, n)), low[touching], up[touching]) @ M.T
+    y, z, w = map(np.asarray, solve(q, low, up))
+    # M is definite, so that what satisfies the law is its one solution.
+    size = 1 + np.abs(q).max(axis=1, keepdims=True)
+    step = np.clip(y - (y @ M.T + q), low, up)
+    assert np.all(np.abs(y - step) <= 1e-12 * size)
+    assert np.all((low <= y) & (y <= up))
+    np.testing.assert_array_equal(np.clip(z, low, up), y)
+    assert np.all(np.abs(w) <= 1e-12 * size)
+
+
+def test_the_derivative_is_that_of_the_face_and_a_touching_entry_is_held():
+    M = np.array([[2.0, 0.7], [-0.3, 1.0]])
+    found = faces(lambda y: jnp.asarray(M) @ y, jnp.zeros(2))
+    low, up = jnp.full(2, -1.0), jnp.full(2, 1.0)
+
+    def slope(q):
+        return np.asarray(jax.jacfwd(lambda q: found.solve(q, low, up).y)(jnp.asarray(q)))
+
+    inside = -M @ np.array([0.2, -0.4])
+    np.testing.assert_allclose(slope(inside), -np.linalg.inv(M), rtol=1e-12)
+    np.testing.assert_allclose(slope(np.array([-9.0, 0.4])), [[0, 0], [0, -1.0]], atol=1e-12)
+    # Free and on its bound at once: y₁ = 1 with F₁ = 0.
+    touching = -M @ np.array([1.0, -0.5])
+    np.testing.assert_allclose(slope(touching), [[0, 0], [0, -1.0]], atol=1e-12)
+
+
+def test_what_is_written_out_is_what_is_iterated():
+    M = np.array([[2.0, 0.5], [0.1, 1.0]])
+    problem = dvax.Problem(
+        A=dvax.generators.Dense(jnp.array([[-0.3, 2.0], [-2.0, -0.1]])),
+        P=dvax.operators.Dense(jnp.array([[2.0, 0.5], [0.5, 1.0]])),
+        K=lambda t, args: dvax.sets.Box(-jnp.exp(-t) * jnp.ones(2), jnp.array([0.3, jnp.inf])),
+        f=lambda t, x, u, args: args * u,
+        h=lambda t, x, u, args: x - jnp.asarray(M - np.eye(2)) @ u,
+    )
+    x0 = jnp.array([2.0, -1.0])
+
+    def end(args, solver):
+        run = dict(rtol=1e-6, atol=1e-6, max_steps=4096, vi_solver=solver)
+        return dvax.solve(problem, x0, 0.0, 2.0, args=args, **run).xs[-1]
+
+    args = jnp.asarray(-1.5)
+    ours, theirs = (end(args, solver) for solver in (None, dvax.vi.ActiveSet()))
+    np.testing.assert_allclose(np.asarray(ours), np.asarray(theirs), atol=3e-6)
+    slope = jax.grad(lambda a: jnp.sum(end(a, None)))(args)
+    step = 1e-4
+    central = sum(s * float(jnp.sum(end(args + s * step, None))) for s in (1, -1)) / (2 * step)
+    assert float(slope) == pytest.approx(central, rel=1e-4)
+
+
+def test_a_law_without_a_solution_is_not_called_solved():
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),
+        K=dvax.sets.Box(jnp.array([0.0, 0.0]), jnp.array([jnp.inf, jnp.inf])),
+        f=lambda t, x, u, args: u,
+        h=lambda t, x, u, args: jnp.array([[2.0, -0.3], [0.3, 2.0]]) @ u + 1.0,
+    )  # fmt: skip
+    with pytest.raises(dvax.SolveError, match="not solved"):
+        dvax.solve(problem, jnp.ones(2), 0.0, 1.0)
+
+
+def test_only_a_few_unknowns_are_written_out():
+    assert [fits(jnp.zeros(n)) for n in (1, 2, 4, 5)] == [False, True, True, False]
+    assert not fits((jnp.zeros(2), jnp.zeros(1)))
+    assert sides(4).shape == (81, 4)
