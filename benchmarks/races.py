@@ -134,8 +134,8 @@ def shrinking_ball() -> Race:
 
 def heat(n: int) -> Race:
     """Heat in a rod with fixed ends and a saturated law at every point, whose free boundaries move;
-    second differences, so that all tools solve the same system. The reference is made by the
-    Rosenbrock method of SciPy's peers for n ≤ 512, and by a fine run of dvax beyond."""
+    second differences, so that all tools solve the same system. The reference is LSODA's at its
+    tightest for n ≤ 512, and dvax's own with 16 384 fixed steps beyond."""
     length = np.pi
     width = length / n
     s = (np.arange(n) + 0.5) * width

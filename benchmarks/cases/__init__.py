@@ -10,6 +10,7 @@ CASES = (
     "point",
     "siconos",
     "tools",
+    "work_precision",
     "certificate",
     "derivatives",
     "memory",

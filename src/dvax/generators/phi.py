@@ -62,9 +62,12 @@ def phi_matrix(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
     small = z * jnp.exp2(-halvings.astype(norm.dtype)).astype(z.dtype)
 
     top = max(order, 1)
-    taylor = jnp.zeros_like(z) + eye * (1.0 / math.factorial(top + _TERMS - 1))
-    for j in range(_TERMS - 2, -1, -1):
-        taylor = small @ taylor + eye * (1.0 / math.factorial(top + j))
+    series = [1.0 / math.factorial(top + j) for j in range(_TERMS - 1, -1, -1)]
+    weights = jnp.asarray(series, z.dtype)
+    # A loop and not its turns: a program holds several of these, and all are compiled.
+    taylor = lax.fori_loop(
+        1, _TERMS, lambda j, sum_: small @ sum_ + weights[j] * eye, weights[0] * eye
+    )
     down = [taylor]
     for k in range(top - 1, 0, -1):
         down.append(small @ down[-1] + eye * (1.0 / math.factorial(k)))
