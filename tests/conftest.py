@@ -6,6 +6,7 @@ from pathlib import Path
 
 import hypothesis
 import jaxtyping
+import pytest
 
 ROOT = Path(__file__).parents[1]
 
@@ -55,3 +56,14 @@ hypothesis.settings.register_profile(
     "thorough", deadline=None, max_examples=100_000, print_blob=True
 )
 hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "test"))
+
+
+@pytest.fixture
+def uncached():
+    """Programs that are compiled here are not kept: jaxlib 0.10.2 aborts the process where it writes one
+    whose loops lie some dozens deep in each other."""
+    name = "jax_persistent_cache_min_compile_time_secs"
+    before = getattr(jax.config, name)
+    jax.config.update(name, 1e9)
+    yield
+    jax.config.update(name, before)

@@ -110,7 +110,7 @@ def test_derivatives_go_both_ways():
 
 
 @pytest.mark.thorough
-def test_derivatives_of_a_coupled_law_that_is_iterated():
+def test_derivatives_of_a_coupled_law_that_is_iterated(uncached):
     def end(args, adjoint):
         problem = dvax.Problem(
             A=lambda args: generators.Dense(args["A"]), P=PLAIN,

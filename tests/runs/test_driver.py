@@ -79,6 +79,21 @@ def test_the_bound_of_a_coarse_run_covers_its_distance_to_a_fine_one(tmp_path: P
         print(f"{name}: at most {np.max(found[1:] / bound[1:]):.2f} of its bound")
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize("method", ["ETD4RK", "ExpRosenbrock"])
+def test_every_method_has_its_run_and_its_bound(tmp_path: Path, method: str):
+    load = 'expression = "2*sin(3*t)"'
+    runs = {
+        name: solved(tmp_path / name, load, 6.0, f'dt = "{dt} s"\nmethod = "{name}"')[0]
+        for name, dt in ((method, 0.05), ("ETD2RK", 0.005))
+    }
+    frames = runs[method]
+    assert frames["error_bound_x"].attrs["status"] == "estimated"
+    apart = distance(frames, frames["indentation"].values, runs["ETD2RK"]["indentation"].values)
+    bound = frames["error_bound_x"].values + runs["ETD2RK"]["error_bound_x"].values
+    assert np.all(apart <= bound)
+
+
 def test_summary_and_manifest_agree_with_the_frames(tmp_path: Path):
     frames, summary, manifest = solved(tmp_path / "run", 'value = "0.3 um/s"', 2.0, "rtol = 1e-6")
     force = frames["pressure"].values @ frames["weight"].values

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dvax.errors import InputError, InputProblem, SolveError
-from dvax.evolution import ETD1, ETD2RK, Solution, solve
+from dvax.evolution import ETD1, ETD2RK, ETD4RK, ExpRosenbrock, Solution, solve
 from dvax.models import Contact
 from dvax.runs.compile_time import announced, compile_seconds
 from dvax.runs.config import Config, build_contact
@@ -44,6 +44,7 @@ _BLOCKS = 40
 """So many blocks at least where there are frames enough: the progress bar moves, and a kill loses
 no more than a fortieth."""
 _BLOCK_BYTES = 2**27
+_METHODS = {kind.__name__: kind for kind in (ETD1, ETD2RK, ETD4RK, ExpRosenbrock)}
 
 Listener = Callable[[dict[str, Any]], None]
 
@@ -192,7 +193,7 @@ class _Run:
         return solve(
             self.problem, jnp.asarray(piece.x), start, float(ts[-1]), None, ts,
             dt=s.dt, rtol=s.rtol or 1e-6, atol=s.atol or 1e-9,
-            method=ETD1() if s.method == "ETD1" else ETD2RK(),
+            method=_METHODS[s.method](),
             constants=self.constants, measure=True,
             dt0=piece.dt, horizon=self.config.time.end,
         )  # fmt: skip
