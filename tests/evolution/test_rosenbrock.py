@@ -134,6 +134,7 @@ def test_derivatives_of_a_coupled_law_that_is_iterated(uncached):
     assert float(back["r"]) == pytest.approx((up - down) / (2 * step), rel=1e-6)
 
 
+@pytest.mark.thorough
 def test_a_batch_is_what_its_lanes_are_alone():
     run = lambda gain: dvax.solve(  # noqa: E731
         tracking(gain), jnp.array([0.9, 0.1]), 0.0, 0.4, rtol=1e-4, atol=1e-4, method=METHOD

@@ -21,7 +21,8 @@ MOST = 4
 
 
 class Point(NamedTuple):
-    """The solution y, z with proj(z) = y, and w in F(y) + N_K(y), which is zero up to rounding."""
+    """The solution y, z with proj(z) = y, both up to rounding, and w in F(z̄) + N_K(z̄) at z̄ = proj(z),
+    which is of the size of rounding."""
 
     y: jax.Array
     z: jax.Array
@@ -40,28 +41,33 @@ class Faces(eqx.Module):
         shape, M = q.shape, self.M
         q, low, up = q.ravel(), low.ravel(), up.ravel()
         side = jnp.asarray(sides(q.size))
-        right = jnp.where(side < 0, low, jnp.where(side > 0, up, -q))
+        right = jnp.where(side < 0, low[None], jnp.where(side > 0, up[None], -q[None]))
         there = jnp.all(jnp.isfinite(right), axis=1)
         # A bound at infinity has no face.
         right = jnp.where(jnp.isfinite(right), right, 0.0)
         points = jnp.einsum("fij,fj->fi", self.pieces, right)
 
         def stepped(y: jax.Array) -> jax.Array:
-            return jnp.clip(y - (y @ M.T + q), low, up)
+            return jnp.clip(y - (M @ y + q), low, up)
 
-        off = jnp.max(jnp.abs(points - stepped(points)), axis=1)
+        off = jax.vmap(lambda y: jnp.max(jnp.abs(y - stepped(y))))(points)
         off = lax.stop_gradient(jnp.where(there & ~jnp.isnan(off), off, jnp.inf))
         first = jnp.argmin(off)
-        z = points[first] - (M @ points[first] + q)
-        held = jnp.where(z <= low, -1, jnp.where(z >= up, 1, 0))
+        best = points[first]
+        size = jnp.max(jnp.abs(q)) + jnp.max(jnp.abs(M)) * jnp.max(jnp.abs(best))
+        slack = 64 * jnp.finfo(q.dtype).eps * size
+        z = best - (M @ best + q)
+        held = jnp.where(z <= low + slack, -1, jnp.where(z >= up - slack, 1, 0))
         index = jnp.sum((held + 1) * 3 ** jnp.arange(q.size)[::-1])
-        # Over that face, unless rounding makes it the worse one.
-        face = jnp.where(off[index] <= 2.0 * off[first], index, first)
-        y = points[face]
-        near = stepped(y)
+        # Over that face, where it has the solution as well.
+        face = jnp.where(off[index] <= off[first] + slack, index, first)
+        # An entry that is held is its bound, to the last digit.
+        y = jnp.clip(points[face], low, up)
+        z = y - (M @ y + q)
+        near = jnp.clip(z, low, up)
+        # z − near is in N_K(near), and F(near) + z − near is:
         w = (y - near) + M @ (near - y)
-        z = near - (M @ near + q) + w
-        return Point(near.reshape(shape), z.reshape(shape), w.reshape(shape))
+        return Point(y.reshape(shape), z.reshape(shape), w.reshape(shape))
 
 
 def sides(n: int) -> np.ndarray:
@@ -73,7 +79,7 @@ def faces(F: Callable[[jax.Array], jax.Array], like: jax.Array) -> Faces:
     """The pieces of an affine F at arguments shaped like `like`."""
     M = jax.jacfwd(lambda v: F(v.reshape(like.shape)).ravel())(jnp.zeros_like(like).ravel())
     side, eye = jnp.asarray(sides(like.size)), jnp.eye(like.size, dtype=like.dtype)
-    rows = jnp.where((side == 0)[:, :, None], M, eye)
+    rows = jnp.where((side == 0)[:, :, None], M[None], eye[None])
     return Faces(M, jnp.linalg.inv(rows))
 
 
