@@ -276,6 +276,104 @@ def test_what_does_not_fit_is_refused_with_what_was_given(make, word):
         make()
 
 
+def decays(rates, h):
+    """Whether a diagonal matrix, given as a sparse one, decays as it must."""
+    A = generators.Sparse(scipy.sparse.diags_array(rates).tocsr())
+    propagator = A.propagator(jnp.asarray(h), 0)
+    found = np.asarray(propagator.step(jnp.ones(len(rates)), ()))
+    np.testing.assert_allclose(
+        found, np.exp(h * rates), atol=1e-13 * h * np.abs(rates).max() ** 0.5
+    )
+    return int(propagator.pieces)
+
+
+@pytest.mark.thorough
+def test_a_step_too_stiff_for_one_series_is_taken_in_pieces_or_not_at_all():
+    rates = -np.array([0.0, 1e-6, 1e-6, 0.1, 1.0])
+    assert decays(1e6 * rates, 1.0) == 1
+    assert decays(1e8 * rates, 1.0) > 1
+    A = generators.Sparse(scipy.sparse.diags_array(1e11 * rates).tocsr())
+    assert np.isnan(np.asarray(A.semigroup(1.0, jnp.ones(5)))).all()
+
+
+def test_what_is_not_a_number_stays_so():
+    places = jnp.asarray([[0, 0], [1, 1]])
+    make = lambda values: generators.Sparse(BCOO((values, places), shape=(2, 2)))  # noqa: E731
+    end = jax.jit(lambda values, h: make(values).semigroup(h, jnp.ones(2)))
+    fine, bad = jnp.array([-1.0, -2.0]), jnp.array([-1.0, jnp.nan])
+    np.testing.assert_allclose(np.asarray(end(fine, 1.0)), np.exp([-1.0, -2.0]), rtol=1e-12)
+    assert np.isnan(np.asarray(end(bad, 1.0))).any()
+    assert np.isnan(np.asarray(end(fine, jnp.nan))).all()
+    # So many pieces that they are not computed; the other lane of a batch is none the worse.
+    lanes = np.asarray(jax.jit(jax.vmap(end, (None, 0)))(-fine, jnp.array([1.0, 1e4])))
+    np.testing.assert_allclose(lanes[0], np.exp([1.0, 2.0]), rtol=1e-11)
+    assert np.isnan(lanes[1]).all()
+
+
+def test_single_precision_stays_single_and_costs_as_little():
+    matrix = MATRICES["stiff heat"].astype(np.float32)
+    propagator = generators.Sparse(matrix).propagator(jnp.asarray(0.5, jnp.float32), 2)
+    assert int(propagator.pieces) == 1 and int(propagator.degree) < 6 * np.sqrt(0.5 * 4e5)
+    x0, c = jnp.asarray(X0, jnp.float32), jnp.asarray(C[:2], jnp.float32)
+    found = propagator.step(x0, tuple(c))
+    assert found.dtype == jnp.float32
+    expected = exact(MATRICES["stiff heat"].toarray(), 0.5, X0, C[:2])
+    assert np.max(np.abs(np.asarray(found) - expected)) < 3e-3 * np.max(np.abs(expected))
+
+
+def test_rows_that_only_turn_beside_rows_that_only_decay():
+    matrix = np.diag([0.0, 0.0, -9.0, 5.0]) + np.array(
+        [[0, 3, 0, 0], [-3, 0, 2, 0], [0, -2, 0, 0.5], [0, 0, -0.5, 0]]
+    )
+    for unit in (1.0, 1e6):
+        found = generators.Sparse(scipy.sparse.csr_array(unit * matrix)).numerical_range()
+        centre, a, b = (float(v) / unit for v in found.ellipse)
+        assert b < 20.0
+        for theta, support in supports(matrix, np.ones(4)):
+            reach = np.hypot(a * np.cos(theta), b * np.sin(theta))
+            assert support <= np.cos(theta) * centre + reach + 1e-10
+
+
+HEAT = MATRICES["heat"].tocoo()
+PLACES = jnp.asarray(np.stack([HEAT.row, HEAT.col], 1))
+
+
+def chain():
+    return dvax.Problem(
+        A=lambda args: generators.Sparse(BCOO((args, PLACES), shape=(N, N))),
+        P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.3),
+        f=lambda t, x, u, args: 1.0 + u, h=lambda t, x, u, args: 0.4 - 3.0 * x - u,
+    )  # fmt: skip
+
+
+@pytest.mark.thorough
+def test_a_solve_has_derivatives_in_the_entries_of_a_symmetric_matrix():
+    values = jnp.asarray(HEAT.data) / 50.0
+    x0 = jnp.asarray(np.abs(X0))
+    end = lambda v: jnp.sum(  # noqa: E731
+        dvax.solve(chain(), x0, 0.0, 0.3, args=v, dt=0.05).xs[-1] ** 2
+    )
+    slope = np.asarray(jax.jit(jax.grad(end))(values))
+    assert np.isfinite(slope).all()
+    along = np.random.default_rng(8).normal(size=values.shape)
+    step = 1e-5
+    central = (float(end(values + step * along)) - float(end(values - step * along))) / (2 * step)
+    assert float(slope @ along) == pytest.approx(central, rel=1e-5)
+
+
+@pytest.mark.thorough
+def test_the_lanes_of_an_adaptive_batch_are_what_they_are_alone():
+    values = jnp.asarray(HEAT.data)
+    x0 = jnp.asarray(np.abs(X0))
+    run = lambda s: dvax.solve(  # noqa: E731
+        chain(), x0, 0.0, 0.2, args=s * values, rtol=1e-3, atol=1e-3
+    ).xs[-1]
+    scales = jnp.array([0.01, 1.0])
+    together = jax.jit(jax.vmap(run))(scales)
+    for scale, found in zip(scales, together, strict=True):
+        np.testing.assert_allclose(np.asarray(found), np.asarray(run(scale)), atol=1e-11)
+
+
 def test_a_better_rectangle_can_be_declared():
     known = generators.Range(-800.0, -1.0)
     A = generators.Sparse(MATRICES["heat"], within=known)

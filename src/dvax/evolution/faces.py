@@ -45,7 +45,10 @@ class Faces(eqx.Module):
         there = jnp.all(jnp.isfinite(right), axis=1)
         # A bound at infinity has no face.
         right = jnp.where(jnp.isfinite(right), right, 0.0)
-        points = jnp.einsum("fij,fj->fi", self.pieces, right)
+        # Nor has one where its matrix is singular.
+        sound = jnp.all(jnp.isfinite(self.pieces), axis=(1, 2))
+        there, pieces = there & sound, jnp.where(sound[:, None, None], self.pieces, 0.0)
+        points = jnp.einsum("fij,fj->fi", pieces, right)
 
         def stepped(y: jax.Array) -> jax.Array:
             return jnp.clip(y - (M @ y + q), low, up)
@@ -54,13 +57,12 @@ class Faces(eqx.Module):
         off = lax.stop_gradient(jnp.where(there & ~jnp.isnan(off), off, jnp.inf))
         first = jnp.argmin(off)
         best = points[first]
-        size = jnp.max(jnp.abs(q)) + jnp.max(jnp.abs(M)) * jnp.max(jnp.abs(best))
-        slack = 64 * jnp.finfo(q.dtype).eps * size
+        slack = 8 * self.rounding(best, q)
         z = best - (M @ best + q)
         held = jnp.where(z <= low + slack, -1, jnp.where(z >= up - slack, 1, 0))
         index = jnp.sum((held + 1) * 3 ** jnp.arange(q.size)[::-1])
         # Over that face, where it has the solution as well.
-        face = jnp.where(off[index] <= off[first] + slack, index, first)
+        face = jnp.where(off[index] <= off[first] + jnp.min(slack), index, first)
         # An entry that is held is its bound, to the last digit.
         y = jnp.clip(points[face], low, up)
         z = y - (M @ y + q)
@@ -68,6 +70,11 @@ class Faces(eqx.Module):
         # z − near is in N_K(near), and F(near) + z − near is:
         w = (y - near) + M @ (near - y)
         return Point(y.reshape(shape), z.reshape(shape), w.reshape(shape))
+
+    def rounding(self, y: jax.Array, q: jax.Array) -> jax.Array:
+        """What My + q, entry by entry, cannot be told from zero by."""
+        y = jnp.abs(y.ravel())
+        return jnp.finfo(q.dtype).eps * (jnp.abs(q.ravel()) + jnp.abs(self.M) @ y + y)
 
 
 def sides(n: int) -> np.ndarray:

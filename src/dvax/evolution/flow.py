@@ -115,8 +115,9 @@ class Flow(eqx.Module):
         value = problem.f(t, x, self.operator.inverse(found.y), args)
         residual = problem.spaces(x)[1].norm(found.w)
         # Where no face has a solution the law has none, or M is singular on all that might.
-        size = jnp.max(jnp.abs(q)) + jnp.max(jnp.abs(faces.M)) * jnp.max(jnp.abs(found.y))
-        solved = residual <= jnp.maximum(self.tol, 1e3 * jnp.finfo(residual.dtype).eps * size)
+        most = jnp.maximum(self.tol, 1e3 * faces.rounding(found.y, q))
+        apart = jnp.abs(found.y - jnp.clip(found.z, *bounds)).ravel()
+        solved = jnp.all((jnp.abs(found.w).ravel() <= most) & (apart <= most))
         return Rate(value, found.y, found.z, residual, solved, jnp.asarray(1))
 
     def enclosure(self, t: Chord, x: Tree) -> Tree:

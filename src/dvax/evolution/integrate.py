@@ -115,10 +115,11 @@ def _by_windows(
         lambda *parts: jnp.stack(root_mean_squares(setup.problem.spaces(x0)[0])(*parts))
     )
 
-    def size(error: Any, before: Any) -> Any:
+    def size(error: Any, before: Any, after: Any) -> Any:
         """What the defect amounts to, in tolerances: the mean of the steps, since a kink is in one."""
-        scale = atol + rtol * sizes(before)
-        return horizon * jnp.max(jnp.mean(sizes(error) / scale, axis=0))
+        scale = atol + rtol * jnp.maximum(sizes(before), sizes(after))
+        ratio = horizon * jnp.max(jnp.mean(sizes(error) / scale, axis=0))
+        return jnp.where(jnp.isnan(ratio), jnp.inf, ratio)
 
     def matters(change: Any, X: Any, value: Any) -> Any:
         """Whether f̃ still changes by more than rounding, and by a part of the tolerance that shows
@@ -126,12 +127,16 @@ def _by_windows(
         worst = lambda v: jnp.max(sizes(v))  # noqa: E731
         rounding = 20 * jnp.finfo(setup.dtype).eps * worst(value)
         more = ~(worst(change) <= rounding)
-        return more if options.fixed else more & ~(size(change, X) <= 0.01)
+        return more if options.fixed else more & ~(size(change, X, X) <= 0.01)
 
     first = setup.number("dt") if options.fixed else setup.number("dt0")
+    windows = max(1, -(-options.max_steps // method.nodes))
+    if options.fixed:
+        # Each stretch between two knots rounds up to whole windows.
+        windows += stops.shape[0]
     run = picard.Run(
         method, stepper, stops, options.fixed, first, size, matters,
-        max(1, -(-options.max_steps // method.nodes)), options.dense,
+        windows, options.dense,
     )  # fmt: skip
     saved, end = forward_only(run.solve(x0, ts))
     complete = end.t >= stops[-1]

@@ -163,12 +163,12 @@ class ExpRosenbrock(AbstractMethod):
         x₁ = x_h(1) for p = g₀ + θhv + θ²(g₁ − g₀ − hv),  g₁ = g(t₀ + h, a).
 
     Order 3 with no condition on h‖Df̃‖, where the other methods need it to be of the size of 1; and a
-    system that is linear in pieces is solved exactly from kink to kink. The defect is of order 3. Where
-    h‖Df̃‖ is large and f̃ depends on t, the error falls as h² only, but is divided by ‖Df̃‖. Two
-    evaluations, and a derivative of the law through its
-    implicit function. Where A is a number or diagonal and f and the law act point by point, J is
-    diagonal; else the matrix of A + J is formed, up to 256 unknowns, and its exponential taken three
-    or four times a step. Steps that end at kinks have their order, as with the other methods.
+    system that is affine in pieces, in x and in t, is solved exactly from kink to kink. The defect is
+    of order 3. Where h‖Df̃‖ is large and f̃ depends on t, the error falls as h² only, but is divided
+    by ‖Df̃‖. Two evaluations, and a derivative of the law through its implicit function. Where A is a
+    number or diagonal and f and the law act point by point, J is
+    diagonal; else the matrix of A + J is formed, up to 256 unknowns, and its exponential taken
+    twice a step. Steps that end at kinks have their order, as with the other methods.
 
     ```python
     >>> import dvax

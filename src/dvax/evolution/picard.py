@@ -39,8 +39,9 @@ class Picard(eqx.Module):
     tolerance; one that does not converge is shortened.
 
     `Solution.stats` has besides the usual: `windows`, `sweeps` (of all of them) and `contraction`, the
-    largest ratio of two successive corrections: an observation, to be held against
-    `dvax.Constants.bielecki_factor`.
+    largest ratio of two successive corrections in the largest norm over a window: an observation.
+    `dvax.Constants.bielecki_factor` bounds it in the λ-norm. Every window has `nodes` equal steps, so
+    fixed steps are shorter than `dt` on a short stretch.
 
     Forward derivatives only (`jax.jvp`, `jax.jacfwd`).
 
@@ -84,10 +85,12 @@ class Picard(eqx.Module):
 
 
 class Window(NamedTuple):
-    """The steps of a window from a to b as one record, the state at b, the defect of each step, and how
-    the sweeps went; `settled` says that the law was solved everywhere and the sweeps converged."""
+    """The steps of a window from a to b as one record, the states `after` each, the state at b, the
+    defect of each step, and how the sweeps went; `settled` says that the law was solved everywhere and
+    the sweeps converged."""
 
     record: Record
+    after: Tree
     end: Tree
     error: Tree
     impulse: tuple[jax.Array, jax.Array]
@@ -125,7 +128,7 @@ class Run(eqx.Module):
     stops: jax.Array
     fixed: bool = eqx.field(static=True)
     first: Any
-    size: Callable[[Tree, Tree], Any]
+    size: Callable[[Tree, Tree, Tree], Any]
     matters: Callable[[Tree, Tree, Tree], Any]
     max_windows: int = eqx.field(static=True)
     dense: bool = eqx.field(static=True)
@@ -182,7 +185,7 @@ class Run(eqx.Module):
         else:
             b = land(a, state.length, stop)
         window = self._window(a, b, state.x)
-        ratio = self.size(window.error, window.record.x0)
+        ratio = self.size(window.error, window.record.x0, window.after)
         kept = window.settled & _tree.all_finite(window.end)
         length = state.length
         stuck = ~kept
@@ -260,7 +263,7 @@ class Run(eqx.Module):
             change = jnp.max(norm(_tree.sub(new, X)))
             ratio = change / jnp.where(moved > 0.0, moved, 1.0)
             # Corrections that are rounding have no ratio to speak of.
-            told = change > 1e-12 * (1.0 + jnp.max(norm(new)))
+            told = change > 1e4 * jnp.finfo(h.dtype).eps * (1.0 + jnp.max(norm(new)))
             contraction = jnp.where(told, jnp.maximum(contraction, ratio), contraction)
             off = _tree.sub(found.value, known.value)
             return k + 1, new, found, change, contraction, self.matters(off, new, found.value)
@@ -274,7 +277,7 @@ class Run(eqx.Module):
         error, impulse, looked = jax.vmap(stepper.look)(ends[:-1], ends[1:], start, end, c, ys)
         record = Record(ends[:-1], jnp.broadcast_to(h, (many,)), start, c)
         return Window(
-            record, _rows(X, -1), error, impulse, settled & jnp.all(looked), k, contraction
+            record, end, _rows(X, -1), error, impulse, settled & jnp.all(looked), k, contraction
         )
 
     def _read(self, state: State, time: Any) -> Saved:

@@ -79,10 +79,13 @@ def around(found: Range, dtype: Any) -> Ellipse:
     if found.ellipse is not None:
         known = Ellipse(*(lax.stop_gradient(jnp.asarray(v, dtype)) for v in found.ellipse))
         best = smaller(known, best)
+    # Wider by more than the rounding of its own sides, and no more: what lies right of 0 grows.
+    size = jnp.abs(low) + jnp.abs(high) + height
     eps, tiny = jnp.finfo(dtype).eps, jnp.finfo(dtype).tiny
-    least = 1e-6 * (jnp.abs(low) + jnp.abs(high) + height) + jnp.sqrt(tiny)
-    wider = 1 + 1e3 * eps
-    return Ellipse(best.centre, wider * jnp.maximum(best.real, least), wider * best.imaginary)
+    least = 1e-6 * size + jnp.sqrt(tiny)
+    return Ellipse(
+        best.centre, jnp.maximum(best.real, least) + 8 * eps * size, best.imaginary * (1 + 8 * eps)
+    )
 
 
 class FaberPropagator(AbstractPropagator):
@@ -99,9 +102,11 @@ class FaberPropagator(AbstractPropagator):
         def piece(s: Any, x: Tree) -> Tree:
             dtype = jnp.result_type(*jtu.tree_leaves(x))
             count = self.pieces.astype(dtype)
-            return self._sum((x, *_from(s.astype(dtype) / count, 1.0 / count, c)))
+            new = self._sum((x, *_from(s.astype(dtype) / count, 1.0 / count, c)))
+            return _tree.where(s < self.pieces, new, x)
 
-        return turns(self.pieces, piece, x0, 1, (_MOST_PIECES,))
+        # Lanes of a batch may have kept propagators of different steps.
+        return turns(largest_of_batch(self.pieces), piece, x0, 1, (_MOST_PIECES,))
 
     def _sum(self, v: tuple[Tree, ...]) -> Tree:
         """Σₖ Fₖ(A) Σᵢ coefficients[i, k] vᵢ, by Clenshaw's recurrence."""
@@ -126,9 +131,10 @@ class FaberPropagator(AbstractPropagator):
             return new, first
 
         # Whole runs of turns: the coefficients beyond the degree are zero.
-        last = -(-self.degree // _RUN) * _RUN
+        degree = largest_of_batch(self.degree)
+        last = -(-degree // _RUN) * _RUN
         zero = _tree.zeros_like(v[0])
-        first, second = turns(self.degree, turn, (zero, zero), _RUN, _BRANCH)
+        first, second = turns(degree, turn, (zero, zero), _RUN, _BRANCH)
         return jtu.tree_map(
             lambda g, m, s: g + 0.5 * forward * m - back * s, mixed(0, 1.0), moved(first), second
         )
@@ -141,12 +147,17 @@ def propagator(A: AbstractGenerator, found: Range, h: jax.Array, terms: int) -> 
     length = lax.stop_gradient(h)
     # As large as e^{hz} is on the ellipse, so many digits of x₀ are lost where x(h) is no larger.
     rise = jnp.maximum(z0 + a, 0.0)
-    largest = _SIZES[-1] / 2.2  # and less than the turns that there are
-    count = jnp.maximum(length * rise / _RISE, _long(length, a, b) / largest)
-    # Four times as many pieces halve the square root.
-    count = jnp.where(_long(length, a, b) > largest, jnp.maximum(count, 4 * count), count)
-    pieces = largest_of_batch(jnp.maximum(jnp.ceil(count), 1.0).astype(int))
-    part = jnp.where(pieces <= _MOST_PIECES, h, jnp.nan) / pieces.astype(h.dtype)
+    largest = _SIZES[-1] / 2.2
+    # Where one transform is too short, s pieces with hb/s + 9√(ha/s) = m, a quadratic in 1/√s.
+    room = 0.95 * largest - 260.0
+    bump, turned = 9.0 * jnp.sqrt(length * a), length * b
+    split = ((bump + jnp.sqrt(bump**2 + 4.0 * turned * room)) / (2.0 * room)) ** 2
+    split = jnp.where(_long(length, a, b) > largest, split, 1.0)
+    count = jnp.ceil(jnp.maximum(split, length * rise / _RISE))
+    # What is not a number is not computed either, and each lane of a batch answers for itself.
+    fits = count <= _MOST_PIECES
+    pieces = largest_of_batch(jnp.where(fits, count, 1.0).astype(int))
+    part = jnp.where(fits, h, jnp.nan) / pieces.astype(h.dtype)
     needed = 2.2 * _long(lax.stop_gradient(part), a, b)
     size = jnp.searchsorted(jnp.asarray(_SIZES[:-1], needed.dtype), needed)
 
@@ -169,8 +180,8 @@ def propagator(A: AbstractGenerator, found: Range, h: jax.Array, terms: int) -> 
 
 def _long(h: Any, a: Any, b: Any) -> Any:
     """More than the degree that e^{hz} needs: on the boundary it is a bump as wide as 1/√(ha), turned
-    hb times."""
-    return h * b + 9.0 * jnp.sqrt(h * a) + 30.0
+    hb times, with a tail of the third root of that."""
+    return h * b + 12.0 * jnp.cbrt(h * b) + 9.0 * jnp.sqrt(h * a) + 30.0
 
 
 def _from(theta: Any, length: Any, c: tuple[Tree, ...]) -> tuple[Tree, ...]:

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from .. import _tree
 from .._tree import Tree
@@ -91,6 +92,16 @@ def _triplets(matrix: Any) -> tuple[np.ndarray, np.ndarray, Any, int]:
         found = matrix.tocsr().tocoo()
         rows, cols, values = found.row, found.col, found.data
     elif hasattr(matrix, "indices") and hasattr(matrix, "data") and np.ndim(matrix.indices) == 2:
+        if not _tree.is_concrete(matrix.indices):
+            raise InputError(
+                InputProblem(
+                    name,
+                    "indices that are traced",
+                    "where the entries stand is looked at once, before anything runs; their values "
+                    "alone may depend on args",
+                    "Make the indices outside of A, once",
+                )
+            )
         rows, cols = np.asarray(matrix.indices).T
         values = matrix.data
     else:
@@ -141,7 +152,8 @@ def _circles(rows: np.ndarray, cols: np.ndarray, values: Any, w: Any) -> Range:
     n = w.shape[0]
     keys, place = np.unique(np.r_[rows * n + cols, cols * n + rows], return_inverse=True)
     i, j = keys // n, keys % n
-    values, w = _tree.host((values, w))
+    # Any enclosure gives the same series: its own derivative does not matter, and may not exist.
+    values, w = _tree.host(lax.stop_gradient((values, w)))
     there, back = np.split(place, 2)
     a = _sums(there, values, len(keys))
     adjoint = _sums(back, values * w[rows] / w[cols], len(keys))
@@ -184,7 +196,9 @@ def _hull(i: np.ndarray, centre: Any, even: Any, odd: Any) -> tuple[Any, Ellipse
     low, high = lib.min(centre - a), lib.max(centre + a)
     middle = (low + high) / 2
     apart = lib.abs(centre - middle)
-    tall = lib.max(lib.where(b > 0, b * lib.sqrt(1 + apart / positive(a)), 0.0))
+    tall = lib.max(
+        lib.where(b > 0, b * lib.sqrt(1 + lib.where(a > 0, apart / positive(a), 0.0)), 0.0)
+    )
     # A row without an even part has a = 0, and its ellipse is a segment: it fits into one with twice
     # the square of either axis.
     flat = lib.any((a == 0) & (b > 0) & (apart > 0))
