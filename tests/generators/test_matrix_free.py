@@ -327,6 +327,7 @@ def test_rows_that_only_turn_beside_rows_that_only_decay():
     )
     for unit in (1.0, 1e6):
         found = generators.Sparse(scipy.sparse.csr_array(unit * matrix)).numerical_range()
+        assert found.ellipse is not None
         centre, a, b = (float(v) / unit for v in found.ellipse)
         assert b < 20.0
         for theta, support in supports(matrix, np.ones(4)):
