@@ -11,6 +11,7 @@ from jax.experimental.sparse import BCOO
 
 import dvax
 from dvax import generators, spaces
+from dvax.theory.certificate import _is_declared
 
 N = 40
 RNG = np.random.default_rng(4)
@@ -384,3 +385,13 @@ def test_a_better_rectangle_can_be_declared():
         scipy.linalg.expm(0.3 * MATRICES["heat"].toarray()) @ X0,
         atol=1e-13,
     )
+
+
+def test_a_bound_that_rests_on_a_declared_range_is_declared():
+    known = generators.Range(-800.0, 0.0, proved=True)
+    ours = generators.Sparse(MATRICES["heat"])
+    theirs = generators.Sparse(MATRICES["heat"], within=known)
+    assert not _is_declared(ours) and _is_declared(theirs) and _is_declared(Waves(1.0))
+    assert _is_declared(theirs.adjoint(spaces.Euclidean(N)))
+    assert _is_declared(generators.Product(ours, theirs))
+    assert not _is_declared(generators.Product(ours, generators.Scalar(-1.0)))

@@ -55,13 +55,15 @@ class Ellipse(NamedTuple):
 class Range(NamedTuple):
     """A rectangle that contains the numerical range {⟨Av, v⟩ : ‖v‖ = 1}, v complex: real parts from
     `low` to `high`, imaginary parts up to ± `height`; an `ellipse` that contains it, where one is
-    known; in the inner product Σ `weights`ᵢ aᵢ bᵢ."""
+    known; in the inner product Σ `weights`ᵢ aᵢ bᵢ. Unless it is `proved` it is somebody's word, and so
+    are the bounds that rest on it."""
 
     low: Any
     high: Any
     height: Any = 0.0
     weights: Tree = 1.0
     ellipse: Ellipse | None = None
+    proved: bool = False
 
 
 def smaller(one: Ellipse, other: Ellipse) -> Ellipse:

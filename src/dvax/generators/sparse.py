@@ -65,7 +65,7 @@ class Sparse(AbstractMatrixFree):
         w = jnp.broadcast_to(weights, (self.size,)).astype(values.dtype)
         self.range = _circles(rows, cols, values, w)._replace(weights=weights)
         if within is not None:
-            self.range = within._replace(weights=weights)
+            self.range = within._replace(weights=weights, proved=False)
         self.gathered, self.scattered = _laid_out(rows, cols, values, self.size)
 
     def apply(self, v: Tree) -> Tree:
@@ -171,7 +171,7 @@ def _circles(rows: np.ndarray, cols: np.ndarray, values: Any, w: Any) -> Range:
     low, high, height = zip(*rectangles, strict=True)
     sides = lib.maximum(*low), lib.minimum(*high), lib.minimum(*height)
     best = Ellipse(*map(jnp.asarray, smaller(*ellipses)))
-    return Range(*map(jnp.asarray, sides), ellipse=best)
+    return Range(*map(jnp.asarray, sides), ellipse=best, proved=True)
 
 
 def _hull(i: np.ndarray, centre: Any, even: Any, odd: Any) -> tuple[Any, Ellipse]:
