@@ -8,6 +8,7 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax import lax
 
 from .errors import InputError, InputProblem
 
@@ -39,6 +40,13 @@ def scale(c: Any, a: Tree) -> Tree:
 
 def where(condition: Any, a: Tree, b: Tree) -> Tree:
     return jtu.tree_map(lambda p, q: jnp.where(condition, p, q), a, b)
+
+
+def put(table: Tree, index: Any, row: Tree) -> Tree:
+    """The table of rows with one of them written over, as one move: a scatter is more than that."""
+    return jtu.tree_map(
+        lambda leaf, new: lax.dynamic_update_index_in_dim(leaf, new, index, 0), table, row
+    )
 
 
 def zeros_like(a: Tree) -> Tree:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
+from .. import _tree
 from .._tree import Tree
 
 _BYTES = 2**30
@@ -41,7 +42,7 @@ class Checkpoints(eqx.Module):
         kept = index == ((index >> j) << j)
         # What is not kept goes to a place of its own, since not to write would be to copy.
         place = jnp.where(kept, self._place(index >> j, j), 2**self.bits)
-        places = jtu.tree_map(lambda leaf, v: leaf.at[place].set(v), self.places, x)
+        places = _tree.put(self.places, place, x)
         return eqx.tree_at(lambda c: (c.places, c.j), self, (places, j))
 
     def before(self, index: Any) -> tuple[Any, Tree]:

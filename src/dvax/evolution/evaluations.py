@@ -86,9 +86,6 @@ def _in_turn(
     def row(table: Rate, k: Any) -> Rate:
         return jtu.tree_map(lambda leaf: leaf[k], table)
 
-    def put(table: Rate, k: Any, rate: Rate) -> Rate:
-        return jtu.tree_map(lambda leaf, v: leaf.at[k].set(v), table, rate)
-
     def visit(i: int, table: Rate) -> tuple[Any, Tree]:
         at = run(lambda k: row(table, k))[1][i]
         return at.t, at.x
@@ -99,12 +96,12 @@ def _in_turn(
     table = jtu.tree_map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), blank)
     start: Any = 0
     if kept is not None:
-        table, start = put(table, 0, kept), jnp.where(any_of_batch(jumped), 0, 1)
+        table, start = _tree.put(table, 0, kept), jnp.where(any_of_batch(jumped), 0, 1)
 
     def one(k: Any, table: Rate) -> Rate:
         t, x = lax.switch(k, [partial(visit, i) for i in range(count)], table)
         before = _tree.where(k > 0, row(table, jnp.maximum(k - 1, 0)).y, guess)
-        return put(table, k, flow.rate(t, x, before))
+        return _tree.put(table, k, flow.rate(t, x, before))
 
     table = lax.fori_loop(start, count, one, table)
     return run(lambda i: row(table, i))

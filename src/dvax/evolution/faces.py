@@ -48,12 +48,10 @@ class Faces(eqx.Module):
         # Nor has one where its matrix is singular.
         sound = jnp.all(jnp.isfinite(self.pieces), axis=(1, 2))
         there, pieces = there & sound, jnp.where(sound[:, None, None], self.pieces, 0.0)
-        points = jnp.einsum("fij,fj->fi", pieces, right)
-
-        def stepped(y: jax.Array) -> jax.Array:
-            return jnp.clip(y - (M @ y + q), low, up)
-
-        off = jax.vmap(lambda y: jnp.max(jnp.abs(y - stepped(y))))(points)
+        # Sums of products, for what are so few numbers: a product of matrices is a call of a library.
+        points = jnp.sum(pieces * right[:, None, :], axis=2)
+        F = jnp.sum(M[None] * points[:, None, :], axis=2) + q[None]
+        off = jnp.max(jnp.abs(points - jnp.clip(points - F, low[None], up[None])), axis=1)
         off = lax.stop_gradient(jnp.where(there & ~jnp.isnan(off), off, jnp.inf))
         first = jnp.argmin(off)
         best = points[first]

@@ -9,6 +9,7 @@ import jax.tree_util as jtu
 from jax import lax
 
 from .. import _tree
+from .._one_function import in_one_function
 from ..vi import certify
 from . import implicit, picard, reverse
 from .closures import opened
@@ -64,7 +65,7 @@ def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
         progress=options.progress,
     )
     if options.adjoint == "forward":
-        saved, end = loop.run(x0, times)
+        saved, end = in_one_function(Loop.run, loop, x0, times)
         saved, end = forward_only((saved, end))
     else:
         saved, end = reverse.run(loop, x0, times)

@@ -123,14 +123,15 @@ def aim(
     new = Aim(kink, margin, h, was.tries + 1.0)
     # A step that is kept and not short begins the count anew.
     fresh = ~refused & (h >= 0.1 * planned)
-    kept = old.at[3].set(jnp.where(fresh, 0.0, was.tries))
-    return jnp.where(anew, jnp.stack(new), kept), anew
+    kept = was._replace(tries=jnp.where(fresh, 0.0, was.tries))
+    return jnp.where(anew, jnp.stack(new), jnp.stack(kept)), anew
 
 
 def passed(old: jax.Array, t: Any) -> jax.Array:
     """What is known at t."""
     was = Aim(*old)
-    return jnp.where(t > was.kink, nothing_ahead(was.kink).at[3].set(was.tries), old)
+    nothing = Aim(*nothing_ahead(was.kink))._replace(tries=was.tries)
+    return jnp.where(t > was.kink, jnp.stack(nothing), old)
 
 
 def until(aim: jax.Array, t: Any, stop: Any) -> Any:

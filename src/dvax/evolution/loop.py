@@ -104,7 +104,7 @@ class Loop(eqx.Module):
             found = _tree.where(
                 k < count, self._read(state, ts[row]), jtu.tree_map(lambda leaf: leaf[row], rows)
             )
-            return state, jtu.tree_map(lambda leaf, new: leaf.at[row].set(new), rows, found)
+            return state, _tree.put(rows, row, found)
 
         state, rows = lax.fori_loop(0, count + 1, visit, (state, rows))
         return rows, state
@@ -166,7 +166,6 @@ class Loop(eqx.Module):
         if self.guarded:
             behind = (t0, state.x, state.impulse, state.memory, state.jumped)
             ahead, last = _tree.where(verdict.kept, (ahead, last), (behind, state.last))
-        write = lambda leaf, new: leaf.at[state.steps].set(new)  # noqa: E731
         checkpoints = state.checkpoints
         if checkpoints is not None:
             checkpoints = checkpoints.put(state.steps, state.x)
@@ -186,8 +185,8 @@ class Loop(eqx.Module):
             control=verdict.state,
             jumped=jumped,
             last=last,
-            records=None if state.records is None else jtu.tree_map(write, state.records, taken),
-            ends=None if state.ends is None else write(state.ends, t1),
+            records=None if state.records is None else _tree.put(state.records, state.steps, taken),
+            ends=None if state.ends is None else _tree.put(state.ends, state.steps, t1),
             checkpoints=checkpoints,
             result=verdict.result,
             steps=jnp.where(verdict.kept, state.steps + 1, state.steps),

@@ -146,7 +146,7 @@ class Run(eqx.Module):
             state, rows = carry
             state = self._until(state, ts[k])
             found = self._read(state, ts[k])
-            return state, jtu.tree_map(lambda leaf, new: leaf.at[k].set(new), rows, found)
+            return state, _tree.put(rows, k, found)
 
         state, rows = lax.fori_loop(0, count, visit, (state, rows))
         return rows, self._until(state, self.stops[-1])
@@ -206,7 +206,7 @@ class Run(eqx.Module):
         if records is not None:
             place = state.steps + jnp.arange(many)
             taken = window.record._replace(start=jnp.where(kept, window.record.start, jnp.inf))
-            records = jtu.tree_map(lambda leaf, new: leaf.at[place].set(new), records, taken)
+            records = _tree.put(records, place, taken)
         last = self.stops.shape[0] - 1
         reached = jnp.where(kept & (b == stop), state.stop + 1, state.stop)
         new = (b, window.end, window.record, state.impulse, impulse)

@@ -21,6 +21,7 @@ import numpy as np
 from jax import lax
 
 from .. import _tree
+from .._one_function import in_one_function
 from .._tree import Tree
 from .checkpoints import Checkpoints, how_many
 from .loop import Loop, Saved, State, slack
@@ -39,12 +40,16 @@ def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State
     @jax.custom_vjp
     def solved(*leaves: jax.Array) -> Any:
         x0, loop, ts = whole(leaves)
-        return _states(*loop.run(x0, ts))
+        return _states(*in_one_function(Loop.run, loop, x0, ts))
 
     def forward(*given: Any) -> Any:
         leaves = [leaf.value for leaf in given]
         x0, loop, ts = whole(leaves)
-        saved, state = loop.run(x0, ts, Checkpoints(x0, how_many(x0, loop.max_steps)[0]))
+
+        def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State]:
+            return loop.run(x0, ts, Checkpoints(x0, how_many(x0, loop.max_steps)[0]))
+
+        saved, state = in_one_function(run, loop, x0, ts)
         assert state.checkpoints is not None
         moving = _tree.Static(tuple(leaf.perturbed for leaf in given))
         kept = leaves, moving, state.ends, state.checkpoints, state.steps
@@ -53,7 +58,12 @@ def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State
 
     def backward(kept: Any, cotangents: Any) -> Any:
         leaves, moving, *history = kept
-        return _Backward(whole, leaves, moving.value, *history).run(cotangents[0])
+
+        def run(leaves: Any, bar: _States, *history: Any) -> tuple[Any, ...]:
+            return _Backward(whole, leaves, moving.value, *history).run(bar)
+
+        bar = _States(*map(_given, cotangents[0]))
+        return in_one_function(run, leaves, bar, computed=tuple(history))
 
     solved.defvjp(forward, backward, symbolic_zeros=True)
     states, rest = solved(*leaves)
@@ -109,7 +119,6 @@ class _Backward:
 
     def run(self, bar: _States) -> tuple[Any, ...]:
         """The cotangents of the leaves."""
-        bar = _States(*map(_given, bar))
         moving = tuple(leaf for leaf, m in zip(self.leaves, self.moving, strict=True) if m)
         adjoint = bar.last if bar.last is not None else _tree.zeros_like(self.x0)
         row = -1 if self.ts is None else self.ts.shape[0] - 1
@@ -199,7 +208,7 @@ class _Backward:
 
         def one(carry: Any) -> Any:
             place, x, shelf = carry
-            shelf = jtu.tree_map(lambda leaf, v: leaf.at[place].set(v), shelf, x)
+            shelf = _tree.put(shelf, place, x)
             i = first + place * apart
             return place + 1, self._replay(x, i, jnp.minimum(i + apart, end - 1)), shelf
 

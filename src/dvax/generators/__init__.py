@@ -8,6 +8,8 @@ from .dense import Dense as Dense
 from .diagonal import Diagonal as Diagonal
 from .elliptic import Elliptic as Elliptic
 from .faber import Range as Range
+from .finite_elements import FiniteElements as FiniteElements
+from .kronecker import KroneckerSum as KroneckerSum
 from .matrix_free import AbstractMatrixFree as AbstractMatrixFree
 from .product import Product as Product
 from .rotation import Rotation as Rotation

@@ -55,8 +55,9 @@ class Ellipse(NamedTuple):
 class Range(NamedTuple):
     """A rectangle that contains the numerical range {⟨Av, v⟩ : ‖v‖ = 1}, v complex: real parts from
     `low` to `high`, imaginary parts up to ± `height`; an `ellipse` that contains it, where one is
-    known; in the inner product Σ `weights`ᵢ aᵢ bᵢ. Unless it is `proved` it is somebody's word, and so
-    are the bounds that rest on it."""
+    known; in the inner product Σ `weights`ᵢ aᵢ bᵢ, or in one whose squares lie between l and l `spread`
+    times Σ `weights`ᵢ aᵢ². Unless it is `proved` it is somebody's word, and so are the bounds that
+    rest on it."""
 
     low: Any
     high: Any
@@ -64,6 +65,7 @@ class Range(NamedTuple):
     weights: Tree = 1.0
     ellipse: Ellipse | None = None
     proved: bool = False
+    spread: Any = 1.0
 
 
 def smaller(one: Ellipse, other: Ellipse) -> Ellipse:

@@ -73,7 +73,8 @@ class AbstractMatrixFree(AbstractGenerator):
             lambda w, own: jnp.ravel(w / own), *_alike(space.weights(), found.weights)
         )
         ratio = jnp.concatenate(jtu.tree_leaves(ratios))
-        return Growth(jnp.sqrt(jnp.max(ratio) / jnp.min(ratio)), jnp.asarray(found.high))
+        apart = found.spread * jnp.max(ratio) / jnp.min(ratio)
+        return Growth(jnp.sqrt(apart), jnp.asarray(found.high))
 
     def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
         return normwise_bend(self, arc, space, growth)

@@ -11,6 +11,7 @@ from .._batch import largest_of_batch
 from .turns import turns
 
 _TERMS = 20  # of the Taylor series on |z| < 1: 1/20! is below double rounding
+_FEW = 8  # rows, up to which a call of a library costs more than a product
 _LEVELS = 3  # 4³ halvings at most: norms up to 10¹⁹
 
 
@@ -66,25 +67,30 @@ def phi_matrix(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
     weights = jnp.asarray(series, z.dtype)
     # A loop and not its turns: a program holds several of these, and all are compiled.
     taylor = lax.fori_loop(
-        1, _TERMS, lambda j, sum_: small @ sum_ + weights[j] * eye, weights[0] * eye
+        1, _TERMS, lambda j, sum_: _product(small, sum_) + weights[j] * eye, weights[0] * eye
     )
     down = [taylor]
     for k in range(top - 1, 0, -1):
-        down.append(small @ down[-1] + eye * (1.0 / math.factorial(k)))
+        down.append(_product(small, down[-1]) + eye * (1.0 / math.factorial(k)))
     phis = tuple(reversed(down))
 
     def double(_: Any, carry: tuple[jax.Array, tuple[jax.Array, ...]]) -> Any:
         E, phis = carry
         new = []
         for k, phi in enumerate(phis, start=1):
-            total = phi + E @ phi
+            total = phi + _product(E, phi)
             for j in range(1, k + 1):
                 total = total + phis[j - 1] / math.factorial(k - j)
             new.append(0.5**k * total)
-        return E @ E + 2.0 * E, tuple(new)
+        return _product(E, E) + 2.0 * E, tuple(new)
 
-    E, phis = turns(halvings, double, (small @ phis[0], phis), 1, (4,) * _LEVELS)
+    E, phis = turns(halvings, double, (_product(small, phis[0]), phis), 1, (4,) * _LEVELS)
     return (eye + E, *phis)[: order + 1]
+
+
+def _product(a: jax.Array, b: jax.Array) -> jax.Array:
+    """That of two square matrices; of few numbers term by term, without a call of a library."""
+    return jnp.sum(a[:, :, None] * b[None], axis=1) if len(a) <= _FEW else a @ b
 
 
 def flow_factors(h: Any, phis: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:

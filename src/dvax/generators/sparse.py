@@ -59,7 +59,7 @@ class Sparse(AbstractMatrixFree):
     size: int = eqx.field(static=True)
 
     def __init__(self, matrix: Any, weights: Any = 1.0, within: Range | None = None):
-        rows, cols, values, self.size = _triplets(matrix)
+        rows, cols, values, self.size = triplets(matrix, "dvax.generators.Sparse(matrix)")
         weights = _tree.as_float(weights, "dvax.generators.Sparse(weights)")
         _check_weights(weights, self.size)
         w = jnp.broadcast_to(weights, (self.size,)).astype(values.dtype)
@@ -84,9 +84,8 @@ class Sparse(AbstractMatrixFree):
         return self.range
 
 
-def _triplets(matrix: Any) -> tuple[np.ndarray, np.ndarray, Any, int]:
-    """Rows and columns, which are never traced, values, and the size."""
-    name = "dvax.generators.Sparse(matrix)"
+def triplets(matrix: Any, name: str) -> tuple[np.ndarray, np.ndarray, Any, int]:
+    """Rows and columns, which are never traced, values, and the size; `name` is what errors call it."""
     shape = tuple(np.shape(matrix))
     if hasattr(matrix, "tocsr"):
         found = matrix.tocsr().tocoo()

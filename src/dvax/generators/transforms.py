@@ -18,12 +18,16 @@ so one transform of n numbers does, and one pass before and after it. For real x
 the sines of n − k. As no sum is ever taken of neighbours, points that are equal stay so.
 """
 
+import functools
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+_SHORT = 128
+"""Points up to which a transform is a product with a matrix."""
 
 BOUNDARIES = ("periodic", "dirichlet", "neumann")
 
@@ -74,6 +78,8 @@ class Transform(eqx.Module):
 
     def forward(self, x: jax.Array) -> jax.Array:
         """The coefficients."""
+        if self._short():
+            return jnp.asarray(_matrices(self.shape[0], self.boundary[0])[0], x.dtype) @ x
         for axis in self._folded():
             x = _fold(x, axis, self.boundary[axis])
         F = jnp.fft.rfftn(x, axes=self._axes())
@@ -90,6 +96,8 @@ class Transform(eqx.Module):
 
     def backward(self, c: jax.Array) -> jax.Array:
         """The array with these coefficients."""
+        if self._short():
+            return jnp.asarray(_matrices(self.shape[0], self.boundary[0])[1], c.dtype) @ c
         if self.real:
             n, axis = self.shape[self.half], self.half
             low = jax.lax.slice_in_dim(c, 0, n // 2 + 1, axis=axis)
@@ -110,6 +118,10 @@ class Transform(eqx.Module):
             x = _unfold(x, axis, self.boundary[axis])
         return x
 
+    def _short(self) -> bool:
+        """Whether a product with a matrix takes less time than a fast transform."""
+        return len(self.shape) == 1 and self.real and self.shape[0] <= _SHORT
+
     def _axes(self) -> tuple[int, ...]:
         """All axes, that of the real transform last."""
         return *(k for k in range(len(self.shape)) if k != self.half), self.half
@@ -121,6 +133,17 @@ class Transform(eqx.Module):
         n = self.shape[axis]
         a = np.exp(-0.5j * np.pi * np.arange(n if count is None else count) / n)
         return jnp.asarray(along(a, axis, len(self.shape)), dtype)
+
+
+@functools.cache
+def _matrices(n: int, kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """The transform of n numbers and its inverse, written out."""
+    k = np.arange(n) if kind == "neumann" else n - np.arange(n)
+    # Angles in whole parts of π/2n, and less than a turn, so that they are exact.
+    parts = np.outer(k, 2 * np.arange(n) + 1) % (4 * n)
+    waves = (np.cos if kind == "neumann" else np.sin)(parts * (np.pi / (2 * n)))
+    shares = np.where((k == 0) | (k == n), 0.5, 1.0) / n
+    return 2.0 * waves, waves.T * shares
 
 
 def times(factor: Any, c: jax.Array) -> jax.Array:
