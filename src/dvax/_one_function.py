@@ -105,8 +105,8 @@ def _packed(leaves: list[Any]) -> jax.Array:
     return jnp.concatenate([_as_floating(leaf).ravel() for leaf in leaves])
 
 
-def _as_floating(leaf: jax.Array) -> jax.Array:
-    wide = jnp.result_type(float)
+def _as_floating(leaf: Any) -> jax.Array:
+    leaf, wide = jnp.asarray(leaf), jnp.result_type(float)
     if jnp.iscomplexobj(leaf):
         return jnp.stack([jnp.real(leaf), jnp.imag(leaf)]).astype(wide)
     if jnp.issubdtype(leaf.dtype, jnp.floating):

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import jax.test_util
 import numpy as np
 import pytest
 import scipy.linalg
@@ -51,7 +52,9 @@ def test_the_pair_commutes_and_the_growth_bound_holds():
     A = generators.KroneckerSum(field, B)
     v = jnp.asarray(RNG.normal(size=(3, *GRID)))
     across = scipy.linalg.expm(0.2 * B)
-    apart = jnp.tensordot(jnp.asarray(across), jax.vmap(lambda w: field.semigroup(0.2, w))(v), axes=1)
+    apart = jnp.tensordot(
+        jnp.asarray(across), jax.vmap(lambda w: field.semigroup(0.2, w))(v), axes=1
+    )
     np.testing.assert_allclose(A.semigroup(0.2, v), apart, atol=1e-13)
     bound = A.growth(spaces.Euclidean((3, *GRID)))
     dense = matrix_of(A, (3, *GRID))
@@ -82,10 +85,10 @@ def test_a_solve_is_that_of_the_same_matrix():
     x0 = RNG.uniform(size=(2, 6))
     dense = dvax.Problem(A=generators.Dense(matrix_of(A, (2, 6))), **laws)
     ends = [
-        np.asarray(dvax.solve(problem, start, 0.0, 2.0, rtol=1e-9, atol=1e-12).xs[-1]).ravel()
+        np.asarray(dvax.solve(problem, start, 0.0, 2.0, dt=0.05).xs[-1]).ravel()
         for problem, start in ((dvax.Problem(A=A, **laws), x0), (dense, x0.ravel()))
     ]
-    np.testing.assert_allclose(*ends, atol=1e-8)
+    np.testing.assert_allclose(*ends, atol=1e-12)
 
 
 def test_derivatives_in_the_matrix_and_the_field():
@@ -96,7 +99,7 @@ def test_derivatives_in_the_matrix_and_the_field():
         return jnp.sum(generators.KroneckerSum(field, coupling).semigroup(0.2, v) ** 3)
 
     at = jnp.asarray(B[:2, :2]), jnp.asarray(0.1)
-    jax.test_util.check_grads(end, at, order=1, modes=("fwd", "rev"), atol=1e-6, rtol=1e-6)
+    jax.test_util.check_grads(end, at, order=1, modes=("fwd", "rev"), atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("shape", [(2, *GRID), (*GRID, 3), ()])
