@@ -17,6 +17,7 @@ FLOORS = {
     "errors": -2,
     "_tree": -1,
     "_batch": -1,
+    "_one_function": -1,
     "spaces": 0,
     "generators": 0,
     "operators": 0,

@@ -52,7 +52,7 @@ _SUMS = frozenset(
     "argmax argmin reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum".split()
 )
 _CONTROL = frozenset(
-    "cond while scan jit pjit closed_call custom_jvp_call custom_vjp_call remat remat2 checkpoint".split()
+    "cond while scan jit pjit closed_call custom_jvp_call custom_vjp_call remat2".split()
 )
 
 
@@ -82,7 +82,8 @@ def in_one_function(run: Callable[..., Any], *args: Any, computed: Any = ()) -> 
 
 def _marked(value: jax.Array) -> jax.Array:
     """The value, with the attributes on the call that it comes from."""
-    return set_xla_metadata(value, **_ATTRIBUTES)
+    marked: Any = set_xla_metadata(value, **_ATTRIBUTES)
+    return marked
 
 
 _mark_p = Primitive("one_function")

@@ -122,9 +122,9 @@ def test_the_adjoint_is_the_adjoint():
 
 def test_derivatives_in_the_entries_of_both_matrices():
     _, M, S = rod(12)
-    place = np.stack(M.tocoo().coords, axis=1)
+    place = jnp.asarray(np.stack(M.tocoo().coords, axis=1))
     data, other = (jnp.asarray(v.tocoo().data) for v in (M, S))
-    assert (np.stack(S.tocoo().coords, axis=1) == place).all()
+    assert (np.stack(S.tocoo().coords, axis=1) == np.asarray(place)).all()
     v = jnp.asarray(np.sin(np.pi * np.arange(1, 13) / 13))
 
     def end(mass, stiffness):

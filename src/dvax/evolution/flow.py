@@ -65,6 +65,11 @@ class Flow(eqx.Module):
         linear = self.generator if self.linear is None else self.linear
         return linear.propagator(h, terms)
 
+    def propagators(self, lengths: tuple[Any, ...], terms: int) -> tuple[AbstractPropagator, ...]:
+        """Those over several lengths."""
+        linear = self.generator if self.linear is None else self.linear
+        return linear.propagators(lengths, terms)
+
     def rest(self, x: Tree, value: Tree) -> Tree:
         """f̃ without what is left to the propagator: `value` = f̃(t, x), or f̃(t, x) − Jx."""
         return value if self.linear is None else _tree.sub(value, self.linear.apply(x))

@@ -146,10 +146,11 @@ class Stepper(eqx.Module):
     def factors(self, h: Any) -> Factors:
         """Propagators over h."""
         sampled = self.measure and not self.flow.enclosed
-        over = lambda theta: self.flow.propagator(theta * h, self.method.degree + 1)  # noqa: E731
-        half = over(0.5) if self.method.halves else None
-        inner = tuple(map(over, self.method.samples)) if sampled else ()
-        return Factors(h, over(1.0), half, inner)
+        halves = (0.5,) if self.method.halves else ()
+        # Each length once: a sample may lie where a stage is.
+        thetas = (1.0, *halves, *(self.method.samples if sampled else ()))
+        found = self.flow.propagators(tuple(t * h for t in thetas), self.method.degree + 1)
+        return Factors(h, found[0], found[1] if halves else None, found[1 + len(halves) :])
 
     def fitted(self, factors: Factors, t0: Any, t1: Any) -> Factors:
         """Propagators for this step; those of the last one where the length is the same.

@@ -7,14 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.sparse import BCOO
 
 from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from .faber import Range
 from .matrix_free import AbstractMatrixFree
-from .sparse import Sparse, triplets
+from .sparse import Sparse, Triplets, triplets
 
 
 class FiniteElements(AbstractMatrixFree):
@@ -35,17 +34,17 @@ class FiniteElements(AbstractMatrixFree):
     - `mass_range`: (l, h). Gershgorin's circles by default, which suffice in one dimension. Where
       they do not, declare it: (1/2, 2) for linear triangles, (1/2, 5/2) for linear tetrahedra,
       (1/4, 9/4) for bilinear quadrilaterals, (1/8, 27/8) for trilinear bricks;
-    - `within`: a `dvax.generators.Range` that contains the numerical range of A in the inner product of
-      M, better than the circles do;
-    - `dissipative`: declares that vᵀSv ≥ 0 for all v, as for any stiffness matrix that was assembled from
-      elements. Circles see it on a rod, not where triangles are obtuse; the growth bound is then far
+    - `within`: a `dvax.generators.Range` that contains the numerical range of A in the inner product
+      of M, better than the circles do;
+    - `dissipative`: declares that vᵀSv ≥ 0 for all v, as for any stiffness matrix that was
+      assembled from elements. Circles see it on a rod, not where triangles are obtuse; the growth bound is then far
       too large and a long step too costly to be computed.
 
     **Raises:** `dvax.InputError` where the matrices do not fit each other, M is not symmetric, or its
     interval is not known to be positive.
 
-    Source: A. J. Wathen, Realistic eigenvalue bounds for the Galerkin mass matrix, IMA J. Numer. Anal. 7
-    (1987), Table 1; Chebyshev's iteration: Saad, Iterative Methods for Sparse Linear Systems (2003),
+    Source: A. J. Wathen, Realistic eigenvalue bounds for the Galerkin mass matrix, IMA J. Numer. Anal.
+    7 (1987), Table 1; Chebyshev's iteration: Saad, Iterative Methods for Sparse Linear Systems (2003),
     Algorithm 12.1.
 
     ```python
@@ -79,17 +78,17 @@ class FiniteElements(AbstractMatrixFree):
         dissipative: bool = False,
     ):
         name = "dvax.generators.FiniteElements"
-        rows, cols, values, n = triplets(mass, f"{name}(mass)")
-        others = triplets(stiffness, f"{name}(stiffness)")
-        _check(rows, cols, values, n, others[3])
+        M, S = triplets(mass, f"{name}(mass)"), triplets(stiffness, f"{name}(stiffness)")
+        _check(M, S)
+        rows, cols, values, n = M
         D = jnp.zeros(n, values.dtype).at[rows].add(jnp.where(rows == cols, values, 0.0))
         _tree.require(
             lambda: bool(np.all(np.asarray(D) > 0)), f"{name}(mass)", D,
             "a mass matrix has a positive diagonal", "Mend the assembly, or drop unused nodes",
         )  # fmt: skip
         # Both divided by D row by row: self-adjoint in L2(D), where M⁻¹S is (D⁻¹M)⁻¹ D⁻¹S.
-        self.mass = Sparse(_scaled(rows, cols, values, D), D)
-        self.stiffness = Sparse(_scaled(*others[:3], -D), D)
+        self.mass = Sparse(_scaled(M, D), D)
+        self.stiffness = Sparse(_scaled(S, -D), D)
         self.diagonal = D
         low, high = _interval(self.mass, mass_range)
         self.middle = jnp.asarray((low + high) / 2, values.dtype)
@@ -130,10 +129,9 @@ class FiniteElements(AbstractMatrixFree):
         return x + step
 
 
-def _scaled(rows: np.ndarray, cols: np.ndarray, values: Any, by: jax.Array) -> BCOO:
+def _scaled(matrix: Triplets, by: jax.Array) -> Triplets:
     """The matrix with row i divided by `by`ᵢ."""
-    n = by.shape[0]
-    return BCOO((jnp.asarray(values) / by[rows], np.stack([rows, cols], 1)), shape=(n, n))
+    return matrix._replace(values=jnp.asarray(matrix.values) / by[matrix.rows])
 
 
 def _interval(scaled: Sparse, declared: tuple[float, float] | None) -> tuple[float, float]:
@@ -192,12 +190,12 @@ def _divided(found: Range, low: float, high: float) -> Range:
     )
 
 
-def _check(rows: np.ndarray, cols: np.ndarray, values: Any, n: int, other: int) -> None:
+def _check(M: Triplets, S: Triplets) -> None:
     name = "dvax.generators.FiniteElements"
-    if n != other:
+    if M.size != S.size:
         raise InputError(
             InputProblem(
-                f"{name}(stiffness)", f"{other} rows, beside a mass matrix of {n}",
+                f"{name}(stiffness)", f"{S.size} rows, beside a mass matrix of {M.size}",
                 "both act on the same unknowns", "Assemble them over the same mesh and conditions",
             )
         )  # fmt: skip
@@ -205,11 +203,11 @@ def _check(rows: np.ndarray, cols: np.ndarray, values: Any, n: int, other: int) 
     def symmetric() -> bool:
         from scipy.sparse import coo_array
 
-        M = coo_array((np.asarray(values), (rows, cols)), shape=(n, n)).tocsr()
-        off = abs(M - M.T)
-        return bool(off.nnz == 0 or off.max() <= 1e-12 * abs(M).max())
+        whole = coo_array((np.asarray(M.values), (M.rows, M.cols)), shape=(M.size, M.size)).tocsr()
+        off = abs(whole - whole.T)
+        return bool(off.nnz == 0 or off.max() <= 1e-12 * abs(whole).max())
 
     _tree.require(
-        symmetric, f"{name}(mass)", values,
+        symmetric, f"{name}(mass)", M.values,
         "a mass matrix is that of an inner product: symmetric", "Mend its assembly",
     )  # fmt: skip

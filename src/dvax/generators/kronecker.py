@@ -4,7 +4,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from .. import _tree
 from .._tree import Tree
@@ -50,7 +49,7 @@ class KroneckerSum(AbstractGenerator):
     ```
     """
 
-    field: AbstractGenerator
+    field: Elliptic | Diagonal | Scalar
     matrix: jax.Array
 
     def __init__(self, field: Elliptic | Diagonal | Scalar, matrix: Any):
@@ -119,17 +118,16 @@ class ModalPropagator(AbstractPropagator):
         return total if self.transform is None else jax.vmap(self.transform.backward)(total)
 
 
-def _rates(field: AbstractGenerator) -> jax.Array:
+def _rates(field: Elliptic | Diagonal | Scalar) -> jax.Array:
     """The eigenvalues of F, one a mode."""
     if isinstance(field, Elliptic):
         return field.symbol
     if isinstance(field, Diagonal):
         return field.entries
-    assert isinstance(field, Scalar)
     return field.a
 
 
-def _transform(field: AbstractGenerator) -> Transform | None:
+def _transform(field: Elliptic | Diagonal | Scalar) -> Transform | None:
     return field.transform if isinstance(field, Elliptic) else None
 
 

@@ -1,6 +1,6 @@
 """A given as a sparse matrix."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -84,8 +84,19 @@ class Sparse(AbstractMatrixFree):
         return self.range
 
 
-def triplets(matrix: Any, name: str) -> tuple[np.ndarray, np.ndarray, Any, int]:
-    """Rows and columns, which are never traced, values, and the size; `name` is what errors call it."""
+class Triplets(NamedTuple):
+    """The entries of a square matrix: rows and columns, never traced, values, and the size."""
+
+    rows: np.ndarray
+    cols: np.ndarray
+    values: Any
+    size: int
+
+
+def triplets(matrix: Any, name: str) -> Triplets:
+    """The entries of a sparse matrix that errors call `name`."""
+    if isinstance(matrix, Triplets):
+        return matrix
     shape = tuple(np.shape(matrix))
     if hasattr(matrix, "tocsr"):
         found = matrix.tocsr().tocoo()
@@ -126,7 +137,7 @@ def triplets(matrix: Any, name: str) -> tuple[np.ndarray, np.ndarray, Any, int]:
         lambda: np.isfinite(np.asarray(values)).all(), name, values,
         "every entry must be finite", "Mend the assembly of the matrix",
     )  # fmt: skip
-    return np.asarray(rows, np.int64), np.asarray(cols, np.int64), values, shape[0]
+    return Triplets(np.asarray(rows, np.int64), np.asarray(cols, np.int64), values, shape[0])
 
 
 def _check_weights(weights: jax.Array, size: int) -> None:
