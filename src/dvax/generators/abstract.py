@@ -12,7 +12,6 @@ import jax.tree_util as jtu
 from .._tree import Tree
 from ..spaces import AbstractSpace
 
-
 _SMALL = 400
 """Entries of A."""
 

@@ -37,8 +37,8 @@ class FiniteElements(AbstractMatrixFree):
     - `within`: a `dvax.generators.Range` that contains the numerical range of A in the inner product
       of M, better than the circles do;
     - `dissipative`: declares that vᵀSv ≥ 0 for all v, as for any stiffness matrix that was
-      assembled from elements. Circles see it on a rod, not where triangles are obtuse; the growth bound is then far
-      too large and a long step too costly to be computed.
+      assembled from elements. Circles see it on a rod, not where triangles are obtuse; the growth
+      bound is then far too large, and a long step too costly to be computed.
 
     **Raises:** `dvax.InputError` where the matrices do not fit each other, M is not symmetric, or its
     interval is not known to be positive.
