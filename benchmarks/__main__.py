@@ -28,6 +28,9 @@ def main() -> None:
     options = _options()
     # Doubles throughout, on both sides of every comparison.
     jax.config.update("jax_enable_x64", True)
+    # Nor a hand-over to another thread: JAX makes it for all but the smallest programs, and on a busy
+    # machine it takes longer than a short solve.
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
     facts = machine.facts() | {"load before": machine.load()}
     print("\n".join(f"{name}: {value}" for name, value in facts.items()))
     print(

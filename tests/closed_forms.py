@@ -162,4 +162,32 @@ def c4() -> ClosedForm:
     return ClosedForm(problem, np.asarray(6.0), 3.0, c4_solution, constants)
 
 
+def c7_solution(n: int, t: float) -> tuple[Array, Array]:
+    s = (np.arange(n) + 0.5) * np.pi / n
+    x = np.exp(-t) * np.sin(s)
+    return x, np.clip((1.0 - 1.5 * x) / 1.5, 0.0, 0.4)
+
+
+def c7(n: int) -> ClosedForm:
+    """Heat in a rod with fixed ends and a saturated law at each of n points, x = e^{−t} sin s: u = 0.4
+    where s < arcsin(4eᵗ/15), nearer to an end than that, and u = 0 where s > arcsin(2eᵗ/3)."""
+    wave = jnp.asarray(np.sin((np.arange(n) + 0.5) * (np.pi / n)))
+
+    def load(t: Any) -> Any:
+        x = jnp.exp(-t) * wave
+        return 0.2 * x + jnp.clip((1.0 - 1.5 * x) / 1.5, 0.0, 0.4)
+
+    problem = dvax.Problem(
+        A=dvax.generators.Elliptic(n, jnp.pi), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.4),
+        f=lambda t, x, u, args: load(t) - 0.2 * x - u, h=lambda t, x, u, args: 1.0 - 1.5 * x - 0.5 * u,
+        state_space=dvax.spaces.L2(jnp.full(n, jnp.pi / n)),
+        control_space=dvax.spaces.L2(jnp.full(n, jnp.pi / n)),
+    )  # fmt: skip
+    constants = dvax.Constants(
+        gamma=1.5, L_F=1.5, alpha_h=1.5, beta_h=0.5, alpha_f=0.2, beta_f=1.0, M=1.0, omega=-1.0,
+        m_P=1.0, norm_P_inv=1.0,
+    )  # fmt: skip
+    return ClosedForm(problem, c7_solution(n, 0.0)[0], 1.0, lambda t: c7_solution(n, t), constants)
+
+
 ALL: dict[str, Callable[[], ClosedForm]] = {"C1": c1, "C2": c2, "C3": c3, "C4": c4}

@@ -11,6 +11,7 @@ CASES = (
     "siconos",
     "tools",
     "work_precision",
+    "transforms",
     "certificate",
     "derivatives",
     "memory",

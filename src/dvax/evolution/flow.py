@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 
 from .. import _tree
 from .._tree import Tree
-from ..generators import AbstractGenerator, AbstractPropagator
+from ..generators import AbstractGenerator, AbstractPropagator, Dense, Diagonal, Scalar
 from ..operators import AbstractOperator
 from ..problem import Problem
 from ..spaces import AbstractSpace
@@ -18,6 +18,9 @@ from ..vi import RESULTS, AbstractSolver, Frozen
 from .chords import Chord, NoEnclosure, enclose, is_chord, largest, smallest
 from .faces import Faces
 from .linearised import AbstractLinear, split
+
+_SMALL = 400
+"""Entries of A."""
 
 
 class Rate(NamedTuple):
@@ -68,7 +71,14 @@ class Flow(eqx.Module):
     def propagators(self, lengths: tuple[Any, ...], terms: int) -> tuple[AbstractPropagator, ...]:
         """Those over several lengths."""
         linear = self.generator if self.linear is None else self.linear
-        return linear.propagators(lengths, terms)
+        one = lambda h: linear.propagator(h, terms)  # noqa: E731
+        size = sum(leaf.size for leaf in jtu.tree_leaves(eqx.filter(linear, eqx.is_array)))
+        # The φ-functions of all of them in one go, where A is a number, diagonal or a matrix of so few
+        # entries that one more operation costs more than its arithmetic.
+        if size > _SMALL or not isinstance(linear, Scalar | Diagonal | Dense | AbstractLinear):
+            return tuple(map(one, lengths))
+        stacked = jax.vmap(one)(jnp.stack(lengths))
+        return tuple(jtu.tree_map(lambda leaf, k=k: leaf[k], stacked) for k in range(len(lengths)))
 
     def rest(self, x: Tree, value: Tree) -> Tree:
         """f̃ without what is left to the propagator: `value` = f̃(t, x), or f̃(t, x) − Jx."""

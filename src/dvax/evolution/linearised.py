@@ -12,7 +12,6 @@ import jax.tree_util as jtu
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..generators import AbstractGenerator, AbstractPropagator, Diagonal, Scalar, Zero
-from ..generators.abstract import together
 from ..generators.dense import MatrixPropagator
 from ..generators.phi import flow_factors, phi_matrix, phi_scalar
 from ..generators.scalar import ElementwisePropagator
@@ -32,11 +31,6 @@ class AbstractLinear(eqx.Module):
     @abc.abstractmethod
     def apply(self, v: Tree) -> Tree:
         """J v."""
-
-    def propagators(self, lengths: tuple[Any, ...], terms: int) -> tuple[AbstractPropagator, ...]:
-        """The flows over several lengths."""
-        size = sum(leaf.size for leaf in jtu.tree_leaves(self))
-        return together(lambda h: self.propagator(h, terms), lengths, size)
 
 
 class ElementwiseLinear(AbstractLinear):

@@ -1,19 +1,12 @@
 """What a generator owes, and the propagator that a step of length h caches."""
 
 import abc
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-import jax.tree_util as jtu
 
 from .._tree import Tree
 from ..spaces import AbstractSpace
-
-_SMALL = 400
-"""Entries of A."""
 
 
 class Growth(NamedTuple):
@@ -49,17 +42,6 @@ class AbstractPropagator(eqx.Module):
         """x(t₀ + h), for at most as many coefficients as the propagator was made for."""
 
 
-def together(
-    one: Callable[[Any], AbstractPropagator], lengths: tuple[Any, ...], size: int
-) -> tuple[AbstractPropagator, ...]:
-    """The flows over several lengths, the φ-functions of all of them in one go where A is of so small a
-    size that one more operation costs more than its arithmetic."""
-    if size > _SMALL or len(lengths) == 1:
-        return tuple(map(one, lengths))
-    stacked = jax.vmap(one)(jnp.stack(lengths))
-    return tuple(jtu.tree_map(lambda leaf, k=k: leaf[k], stacked) for k in range(len(lengths)))
-
-
 class AbstractGenerator(eqx.Module):
     """A linear operator A that generates a strongly continuous semigroup e^{At}."""
 
@@ -70,10 +52,6 @@ class AbstractGenerator(eqx.Module):
     @abc.abstractmethod
     def propagator(self, h: Any, terms: int) -> AbstractPropagator:
         """The flow over h ≥ 0 for polynomials of up to `terms` coefficients."""
-
-    def propagators(self, lengths: tuple[Any, ...], terms: int) -> tuple[AbstractPropagator, ...]:
-        """The flows over several lengths."""
-        return tuple(self.propagator(h, terms) for h in lengths)
 
     @abc.abstractmethod
     def adjoint(self, space: AbstractSpace) -> "AbstractGenerator":

@@ -10,7 +10,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
-from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth, together
+from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
 from .bend import normwise_bend
 from .phi import flow_factors, phi_matrix
 
@@ -72,9 +72,6 @@ class Dense(AbstractGenerator):
 
     def propagator(self, h: Any, terms: int) -> "MatrixPropagator":
         return MatrixPropagator(flow_factors(h, phi_matrix(h * self.matrix, terms)))
-
-    def propagators(self, lengths: tuple[Any, ...], terms: int) -> tuple[AbstractPropagator, ...]:
-        return together(lambda h: self.propagator(h, terms), lengths, self.matrix.size)
 
     def check(self, space: AbstractSpace) -> None:
         name = "dvax.generators.Dense(matrix)"

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace
-from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth, together
+from .abstract import AbstractGenerator, Arc, Growth
 from .phi import flow_factors, phi_scalar
 from .scalar import ElementwisePropagator, elementwise_bend
 
@@ -37,9 +37,6 @@ class Diagonal(AbstractGenerator):
 
     def propagator(self, h: Any, terms: int) -> ElementwisePropagator:
         return ElementwisePropagator(flow_factors(h, phi_scalar(h * self.entries, terms)))
-
-    def propagators(self, lengths: tuple[Any, ...], terms: int) -> tuple[AbstractPropagator, ...]:
-        return together(lambda h: self.propagator(h, terms), lengths, self.entries.size)
 
     def check(self, space: AbstractSpace) -> None:
         name = "dvax.generators.Diagonal(entries)"

@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace
-from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth, together
+from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
 from .phi import flow_factors, phi_scalar
 
 
@@ -36,9 +36,6 @@ class Scalar(AbstractGenerator):
 
     def propagator(self, h: Any, terms: int) -> "ElementwisePropagator":
         return ElementwisePropagator(flow_factors(h, phi_scalar(h * self.a, terms)))
-
-    def propagators(self, lengths: tuple[Any, ...], terms: int) -> tuple[AbstractPropagator, ...]:
-        return together(lambda h: self.propagator(h, terms), lengths, self.a.size)
 
     def check(self, space: AbstractSpace) -> None:
         if jnp.ndim(self.a) != 0:
