@@ -73,26 +73,44 @@ def in_one_function(run: Callable[..., Any], *args: Any, computed: Any = ()) -> 
         return out
 
     call, packed = jax.jit(flat), _packed(leaves)
-    small = _is_small(call.trace(packed, computed).jaxpr)
+    program = call.trace(packed, computed).jaxpr
+    small = _is_small(program)
     out = call(packed, computed)
     if small:
-        out = jtu.tree_map(_mark_p.bind, out)
+        plain = not _has_rules(program.jaxpr)
+        out = jtu.tree_map(lambda leaf: _mark_p.bind(leaf, plain=plain), out)
     return eqx.combine(out, rest[0])
 
 
-def _marked(value: jax.Array) -> jax.Array:
+def _marked(value: jax.Array, *, plain: bool) -> jax.Array:
     """The value, with the attributes on the call that it comes from."""
     marked: Any = set_xla_metadata(value, **_ATTRIBUTES)
     return marked
 
 
 _mark_p = Primitive("one_function")
-_mark_p.def_impl(lambda value: value)
-_mark_p.def_abstract_eval(lambda value: value)
+_mark_p.def_impl(lambda value, *, plain: value)
+_mark_p.def_abstract_eval(lambda value, *, plain: value)
 mlir.register_lowering(_mark_p, mlir.lower_fun(_marked, multiple_results=False), cacheable=False)
-# What a batch makes of a program, or a derivative, has not been looked through.
-batching.primitive_batchers[_mark_p] = lambda given, axes: (given[0], axes[0])
-ad.primitive_jvps[_mark_p] = lambda given, tangents: (given[0], tangents[0])
+# What a batch makes of a program has not been looked through.
+batching.primitive_batchers[_mark_p] = lambda given, axes, *, plain: (given[0], axes[0])
+
+
+def _differentiated(given: Any, tangents: Any, *, plain: bool) -> tuple[Any, Any]:
+    """A derivative takes more operations of the same kinds, unless somebody has made a rule for one."""
+    return (_mark_p.bind(*given, plain=True) if plain else given[0]), tangents[0]
+
+
+ad.primitive_jvps[_mark_p] = _differentiated
+
+
+def _has_rules(jaxpr: Jaxpr) -> bool:
+    """Whether derivatives somewhere are not those of the operations themselves."""
+    return any(
+        eqn.primitive.name in ("custom_jvp_call", "custom_vjp_call")
+        or any(_has_rules(inner.jaxpr) for inner in _inner(eqn.params))
+        for eqn in jaxpr.eqns
+    )
 
 
 def _can_pack(leaves: list[Any]) -> bool:
@@ -194,7 +212,7 @@ def _compiles() -> bool:
         return jnp.outer(v, v) @ v / jnp.sum(jnp.exp(v))
 
     def probe(v: jax.Array) -> jax.Array:
-        return _mark_p.bind(jax.jit(lambda v: jax.lax.fori_loop(0, 3, turn, v))(v))
+        return _mark_p.bind(jax.jit(lambda v: jax.lax.fori_loop(0, 3, turn, v))(v), plain=True)
 
     with jax.ensure_compile_time_eval():
         try:

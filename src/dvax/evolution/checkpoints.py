@@ -62,6 +62,8 @@ def how_many(x0: Tree, max_steps: int) -> tuple[int, int]:
     """Of checkpoints of the whole run, and of states between two of them, for steps from x0."""
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jtu.tree_leaves(x0))
     affordable = max(_FEWEST, _BYTES // (2 * max(size, 1)))
-    power = 2 ** (min(affordable, _MOST, max_steps).bit_length() - 1)
+    most = 2 ** (min(affordable, _MOST).bit_length() - 1)
+    # All of them where they fit.
+    power = min(most, 2 ** (max_steps - 1).bit_length())
     between = max(1, 2 ** ((2 * max_steps // power).bit_length()) if max_steps > power else 1)
     return power, min(between, 2 ** (affordable.bit_length() - 1))

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from .. import _tree
@@ -231,9 +232,12 @@ class Fixed(AbstractController):
         return Verdict(step.solved & finite, new, jumped, result)
 
     def boundary(self, index, ends):
-        upto = jnp.cumsum(self._counts())
-        segment = jnp.searchsorted(upto, index, side="right")
-        segment = jnp.minimum(segment, self.stops.shape[0] - 2)
+        if self.stops.shape[0] == 2:
+            return self._time(0, index)
+        counts = self._counts()
+        # How many steps end by the end of each segment: few numbers, added up as a sum of products.
+        upto = jnp.sum(np.tri(len(counts), dtype=int) * counts[None], axis=1)
+        segment = jnp.minimum(jnp.sum(upto <= index), len(counts) - 1)
         before = jnp.where(segment > 0, upto[segment - 1], 0)
         return self._time(segment, index - before)
 

@@ -129,6 +129,28 @@ class _Backward:
             self.guess,
         )
         between = how_many(self.x0, self.loop.max_steps)[1]
+        every = between == 1
+        carry = self._through_all(bar, carry) if every else self._by_segments(bar, carry, between)
+        adjoint, gathered, row, _ = carry
+        gathered = iter(gathered)
+        out = [
+            next(gathered) if m else _no_tangent(leaf)
+            for leaf, m in zip(self.leaves, self.moving, strict=True)
+        ]
+        adjoint = self._rest(adjoint, row, bar)
+        return tuple(self._add_initial(out, adjoint))
+
+    def _through_all(self, bar: _States, carry: Any) -> Any:
+        """Where every state was kept."""
+
+        def one(carry: Any) -> Any:
+            i, inner = carry
+            return i - 1, self._step_back(i, self.checkpoints.before(i)[1], bar, *inner)
+
+        return lax.while_loop(lambda c: c[0] >= 0, one, (self.steps - 1, carry))[1]
+
+    def _by_segments(self, bar: _States, carry: Any, between: int) -> Any:
+        """From one checkpoint back to the one before, with `between` states on a shelf."""
         blank = jtu.tree_map(lambda v: jnp.zeros((between, *v.shape), v.dtype), self.x0)
 
         def segment(carry: Any) -> Any:
@@ -147,16 +169,7 @@ class _Backward:
             _, inner = lax.while_loop(lambda c: c[0] >= first, one, (end - 1, inner))
             return first, shelf, inner
 
-        _, _, (adjoint, gathered, row, _) = lax.while_loop(
-            lambda c: c[0] > 0, segment, (self.steps, blank, carry)
-        )
-        gathered = iter(gathered)
-        out = [
-            next(gathered) if m else _no_tangent(leaf)
-            for leaf, m in zip(self.leaves, self.moving, strict=True)
-        ]
-        adjoint = self._rest(adjoint, row, bar)
-        return tuple(self._add_initial(out, adjoint))
+        return lax.while_loop(lambda c: c[0] > 0, segment, (self.steps, blank, carry))[2]
 
     def _rest(self, adjoint: Tree, row: Any, bar: _States) -> Tree:
         """Saved times at which no step had been taken show x₀ itself."""
