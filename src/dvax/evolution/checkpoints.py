@@ -1,5 +1,6 @@
 """Some of the states that steps began with, for a reverse pass that cannot keep them all."""
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -14,6 +15,10 @@ _BYTES = 2**30
 """What checkpoints may take, of all kinds together."""
 
 _FEWEST, _MOST = 16, 4096
+
+_CHEAP, _ENOUGH = 2**22, 128
+"""Bytes that cost nothing to keep; checkpoints that do for a run of large states, one turn of 16 384
+steps."""
 
 
 class Checkpoints(eqx.Module):
@@ -62,8 +67,16 @@ def how_many(x0: Tree, max_steps: int) -> tuple[int, int]:
     """Of checkpoints of the whole run, and of states between two of them, for steps from x0."""
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jtu.tree_leaves(x0))
     affordable = max(_FEWEST, _BYTES // (2 * max(size, 1)))
-    most = 2 ** (min(affordable, _MOST).bit_length() - 1)
-    # All of them where they fit.
-    power = min(most, 2 ** (max_steps - 1).bit_length())
-    between = max(1, 2 ** ((2 * max_steps // power).bit_length()) if max_steps > power else 1)
-    return power, min(between, 2 ** (affordable.bit_length() - 1))
+    # Large states are not kept because there is room: to touch new memory takes longer than to compute
+    # a step of many once more, and one turn does for as many states as there are checkpoints.
+    enough = max(_CHEAP // max(size, 1), min(_ENOUGH, math.isqrt(max_steps) + 1))
+    most = _power(min(affordable, _MOST, _power(2 * enough - 1)))
+    power = min(most, _power(2 * max_steps - 1))
+    if power >= max_steps:
+        return power, 1
+    return power, min(_power(4 * max_steps // power), most)
+
+
+def _power(count: int) -> int:
+    """The largest power of two up to it."""
+    return 2 ** (count.bit_length() - 1)
