@@ -19,7 +19,7 @@ def mean(v):
 
 @functools.cache
 def disturbed():
-    """The same system from another start, where f̃ is no longer smooth along the solution, and its end by
+    """The same system from another start, where f̃ is not smooth along the solution, and its end by
     a method of scipy on the matrix of A."""
     s = (np.arange(N) + 0.5) * np.pi / N
     k = np.arange(1, N + 1)

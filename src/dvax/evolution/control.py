@@ -18,6 +18,10 @@ from .results import RESULTS
 from .stepper import Step
 
 
+_TRUST, _CALM = 0.12, 9.0
+"""A step may grow by 1 + 0.12 k² after k that were kept; more than so many in a row say nothing more."""
+
+
 class Verdict(NamedTuple):
     """On one attempt: whether it is `kept`, the controller's state for the next one, whether data
     `jumped` at its end, and how the run stands."""
@@ -94,7 +98,7 @@ class Adaptive(AbstractController):
         end: Any
         length: Any
         stop: Any
-        rejected: Any
+        calm: Any
         spare: Any
         aim: Any
 
@@ -102,7 +106,7 @@ class Adaptive(AbstractController):
         first = lax.stop_gradient(self.first)
         end = land(self.stops[0], first, self.stops[1])
         one = jnp.ones_like(first)
-        return self.State(end, first, jnp.asarray(1), jnp.asarray(False), one, nothing_ahead(first))
+        return self.State(end, first, jnp.asarray(1), _CALM * one, one, nothing_ahead(first))
 
     def end(self, state):
         return state.end
@@ -127,15 +131,16 @@ class Adaptive(AbstractController):
         if step.kink is not None:
             kink = lax.stop_gradient(step.kink(error > 1.0))
         crossing = (kink < jnp.inf) & (h <= 4 * known.margin)
-        relaxed = (state.rejected | crossing) & (impulse <= share * state.spare)
+        relaxed = ((state.calm == 0) | crossing) & (impulse <= share * state.spare)
         sound = step.begun & step.finite
         keep = sound & ((error <= 1.0) | relaxed)
         spare = jnp.where(keep & (error > 1.0), state.spare - impulse, state.spare)
 
         positive = jnp.where(error > 0.0, error, 1.0)
         factor = jnp.where(error > 0.0, (0.5 / positive) ** (1.0 / self.order), jnp.inf)
-        # What was just refused is not tried again at once.
-        factor = jnp.clip(factor, 0.1, jnp.where(state.rejected, 1.0, 5.0))
+        # What was just refused is not tried again at once, nor soon: in a field, whose kinks a step
+        # meets or misses, one good step says little about the next.
+        factor = jnp.clip(factor, 0.1, jnp.minimum(1.0 + _TRUST * state.calm**2, 5.0))
         steady = keep & (factor > 0.8) & (factor < 1.25)
         length = lax.stop_gradient(h)
         wanted = jnp.where(steady, length, length * factor)
@@ -152,6 +157,9 @@ class Adaptive(AbstractController):
         wanted = jnp.where(hindered, jnp.maximum(wanted, state.length), wanted)
         ahead = lax.stop_gradient(passed(ahead, jnp.where(keep, t1, t0)))
 
+        # Steps that were kept since one was refused for anything but a kink.
+        still = jnp.where(aimed, jnp.maximum(state.calm, 1.0), 0.0)
+        calm = jnp.where(keep, jnp.minimum(state.calm + 1.0, _CALM), still)
         jumped = keep & (t1 == self.stops[state.stop])
         last = self.stops.shape[0] - 1
         stop = jnp.minimum(jnp.where(jumped, state.stop + 1, state.stop), last)
@@ -170,9 +178,7 @@ class Adaptive(AbstractController):
         )
         result = RESULTS.where(step.begun, result, RESULTS.law_unsolved)
         result = RESULTS.where(step.finite, result, RESULTS.nonfinite)
-        return Verdict(
-            keep, self.State(end, wanted, stop, ~keep & ~aimed, spare, ahead), jumped, result
-        )
+        return Verdict(keep, self.State(end, wanted, stop, calm, spare, ahead), jumped, result)
 
     def boundary(self, index, ends):
         before = jnp.where(index > 0, ends[jnp.maximum(index - 1, 0)], self.stops[0])
