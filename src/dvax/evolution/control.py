@@ -17,9 +17,8 @@ from .kinks import Aim, aim, nothing_ahead, passed, until
 from .results import RESULTS
 from .stepper import Step
 
-
 _TRUST, _CALM = 0.12, 9.0
-"""A step may grow by 1 + 0.12 k² after k that were kept; more than so many in a row say nothing more."""
+"""After k steps that were kept one may grow by 1 + 0.12 k²; more than nine say nothing more."""
 
 
 class Verdict(NamedTuple):
