@@ -36,6 +36,7 @@ def stiff(n):
     )  # fmt: skip
 
 
+@pytest.mark.thorough
 def test_a_stiff_system_of_some_size():
     target, problem = stiff(300)
     sol = dvax.solve(problem, jnp.zeros(300), 0.0, 1.0, method=dvax.Implicit(diffrax.Kvaerno3()))

@@ -233,6 +233,7 @@ def test_a_generator_of_ones_own_is_two_methods():
     np.testing.assert_allclose(np.asarray(back[0]), X0, atol=1e-11)
 
 
+@pytest.mark.thorough
 def test_a_solve_is_that_of_the_same_operator_by_transforms():
     n = 30
     h = 1.0 / n
