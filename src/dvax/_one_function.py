@@ -14,6 +14,7 @@ a larger one. So programs are looked through, and only what is known to work is 
 import functools
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -21,8 +22,9 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive
+from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun, new_jaxpr_eqn
 from jax.interpreters import ad, batching, mlir
+from jax.interpreters import partial_eval as pe
 
 _ATTRIBUTES = {"inlineable": "false", "xla_cpu_small_call": "true"}
 
@@ -57,60 +59,132 @@ _CONTROL = frozenset(
 
 
 def in_one_function(run: Callable[..., Any], *args: Any, computed: Any = ()) -> Any:
-    """run(*args, *computed), compiled as one function where it is small and this is a CPU. What is
-    `computed` by another such function, and surely used, may be as large as it likes."""
-    arrays, static = eqx.partition(args, eqx.is_array)
+    """run(*args, *computed), compiled as one function where it is small and this is a CPU. What another
+    such function has `computed` may be as large as it likes."""
+    arrays, static = eqx.partition((args, computed), eqx.is_array)
     leaves, tree = jtu.tree_flatten(arrays)
-    if not (_available() and _can_pack(leaves)):
+    large = [False] * len(jtu.tree_leaves(arrays[0])) + [True] * len(jtu.tree_leaves(arrays[1]))
+    if not (_available() and _can_pack(_small_ones(leaves, large))):
         return run(*args, *computed)
-    like = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
     rest: list[Any] = []
 
-    def flat(packed: jax.Array, computed: Any) -> Any:
-        arrays = jtu.tree_unflatten(tree, _unpacked(packed, like))
-        out, kept = eqx.partition(run(*eqx.combine(arrays, static), *computed), eqx.is_array)
-        rest.append(kept)
-        return out
+    def flat(*leaves: Any) -> list[Any]:
+        args, computed = eqx.combine(jtu.tree_unflatten(tree, leaves), static)
+        out, kept = eqx.partition(run(*args, *computed), eqx.is_array)
+        found, shape = jtu.tree_flatten(out)
+        rest[:] = [kept, shape]
+        return found
 
-    call, packed = jax.jit(flat), _packed(leaves)
-    program = call.trace(packed, computed).jaxpr
-    small = _is_small(program)
-    out = call(packed, computed)
-    if small:
-        plain = not _has_rules(program.jaxpr)
-        out = jtu.tree_map(lambda leaf: _mark_p.bind(leaf, plain=plain), out)
-    return eqx.combine(out, rest[0])
+    found = _called(flat, leaves, large)
+    return eqx.combine(jtu.tree_unflatten(rest[1], found), rest[0])
 
 
-def _marked(value: jax.Array, *, plain: bool) -> jax.Array:
-    """The value, with the attributes on the call that it comes from."""
-    marked: Any = set_xla_metadata(value, **_ATTRIBUTES)
-    return marked
-
-
-_mark_p = Primitive("one_function")
-_mark_p.def_impl(lambda value, *, plain: value)
-_mark_p.def_abstract_eval(lambda value, *, plain: value)
-mlir.register_lowering(_mark_p, mlir.lower_fun(_marked, multiple_results=False), cacheable=False)
-# What a batch makes of a program has not been looked through.
-batching.primitive_batchers[_mark_p] = lambda given, axes, *, plain: (given[0], axes[0])
-
-
-def _differentiated(given: Any, tangents: Any, *, plain: bool) -> tuple[Any, Any]:
-    """A derivative takes more operations of the same kinds, unless somebody has made a rule for one."""
-    return (_mark_p.bind(*given, plain=True) if plain else given[0]), tangents[0]
-
-
-ad.primitive_jvps[_mark_p] = _differentiated
-
-
-def _has_rules(jaxpr: Jaxpr) -> bool:
-    """Whether derivatives somewhere are not those of the operations themselves."""
-    return any(
-        eqn.primitive.name in ("custom_jvp_call", "custom_vjp_call")
-        or any(_has_rules(inner.jaxpr) for inner in _inner(eqn.params))
-        for eqn in jaxpr.eqns
+def _called(flat: Callable[..., list[Any]], leaves: list[Any], large: list[bool]) -> list[Any]:
+    """flat(*leaves), as one function where it is small."""
+    program = jax.make_jaxpr(flat)(*leaves)
+    # What it closes over is handed over like the rest.
+    leaves, large = [*program.consts, *leaves], [False] * len(program.consts) + large
+    jaxpr = program.jaxpr
+    names = jaxpr.debug_info.with_unknown_names()
+    opened = ClosedJaxpr(
+        jaxpr.replace(constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars], debug_info=names),
+        (),
     )
+    if not (_can_pack(_small_ones(leaves, large)) and _is_small(opened)):
+        return jaxpr_as_fun(opened)(*leaves)
+    return _one_p.bind(*leaves, program=opened, large=tuple(large))
+
+
+def _small_ones(leaves: list[Any], large: Any) -> list[Any]:
+    return [leaf for leaf, is_large in zip(leaves, large, strict=True) if not is_large]
+
+
+def _as_it_is(*leaves: Any, program: ClosedJaxpr, large: tuple[bool, ...]) -> list[Any]:
+    return jaxpr_as_fun(program)(*leaves)
+
+
+def _as_one(*leaves: Any, program: ClosedJaxpr, large: tuple[bool, ...]) -> list[Any]:
+    """The call with its attributes. The compiler stops at an argument that turns out to be of no use,
+    or at a long one that turns out to be constant: so the small ones are packed into one, and of the
+    large ones an entry is returned."""
+    few = _small_ones(list(leaves), large)
+    like = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in few]
+
+    def call(packed: jax.Array, many: list[Any]) -> tuple[list[Any], list[Any]]:
+        small, rest = iter(_unpacked(packed, like)), iter(many)
+        whole = [next(rest if is_large else small) for is_large in large]
+        return jaxpr_as_fun(program)(*whole), [leaf.ravel()[0] for leaf in many]
+
+    many = [leaf for leaf, is_large in zip(leaves, large, strict=True) if is_large]
+    marked: Any = set_xla_metadata(jax.jit(call)(_packed(few), many), **_ATTRIBUTES)
+    return marked[0]
+
+
+_one_p = Primitive("one_function")
+_one_p.multiple_results = True
+_one_p.def_impl(lambda *leaves, **params: jax.jit(partial(_as_it_is, **params))(*leaves))
+_one_p.def_abstract_eval(lambda *leaves, program, large: program.out_avals)
+mlir.register_lowering(_one_p, mlir.lower_fun(_as_it_is, multiple_results=True))
+mlir.register_lowering(
+    _one_p, mlir.lower_fun(_as_one, multiple_results=True), platform="cpu", cacheable=False
+)
+
+
+def _batched(leaves: Any, axes: Any, *, program: ClosedJaxpr, large: Any) -> tuple[Any, Any]:
+    """A batch is compiled as any program."""
+    found = jax.vmap(jaxpr_as_fun(program), in_axes=tuple(axes))(*leaves)
+    return found, [0] * len(found)
+
+
+def _pushed_forward(
+    leaves: Any, tangents: Any, *, program: ClosedJaxpr, large: Any
+) -> tuple[Any, Any]:
+    """A derivative is a program of its own, small or not; only in what moves."""
+    moves = [not isinstance(t, ad.Zero) and t.dtype != jax.dtypes.float0 for t in tangents]
+    count = len(leaves)
+
+    def both(*given: Any) -> list[Any]:
+        start = given[:count]
+
+        def of(*moving: Any) -> list[Any]:
+            own = iter(moving)
+            return jaxpr_as_fun(program)(
+                *(next(own) if m else leaf for leaf, m in zip(start, moves, strict=True))
+            )
+
+        moving = tuple(leaf for leaf, m in zip(start, moves, strict=True) if m)
+        found, pushed = jax.jvp(of, moving, given[count:])
+        return [*found, *(t for t in pushed if t.dtype != jax.dtypes.float0)]
+
+    pick = lambda values: [v for v, m in zip(values, moves, strict=True) if m]  # noqa: E731
+    found = _called(both, [*leaves, *pick(tangents)], [*large, *pick(large)])
+    out, own = found[: len(program.out_avals)], iter(found[len(program.out_avals) :])
+    real = [jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in out]
+    pushed = [
+        next(own) if is_real else ad.Zero.from_primal_value(leaf)
+        for leaf, is_real in zip(out, real, strict=True)
+    ]
+    return out, pushed
+
+
+def _of_use(used: list[bool], eqn: Any) -> tuple[list[bool], Any]:
+    """Without the outputs that nobody looks at, and what leads to them alone."""
+    if not any(used):
+        return [False] * len(eqn.invars), None
+    jaxpr, needed = pe.dce_jaxpr(eqn.params["program"].jaxpr, used)
+    large = [v for v, n in zip(eqn.params["large"], needed, strict=True) if n]
+    new = new_jaxpr_eqn(
+        [v for v, n in zip(eqn.invars, needed, strict=True) if n],
+        [v for v, u in zip(eqn.outvars, used, strict=True) if u],
+        eqn.primitive, dict(program=ClosedJaxpr(jaxpr, ()), large=tuple(large)), eqn.effects,
+        eqn.source_info, eqn.ctx,
+    )  # fmt: skip
+    return needed, new
+
+
+batching.primitive_batchers[_one_p] = _batched
+ad.primitive_jvps[_one_p] = _pushed_forward
+pe.dce_rules[_one_p] = _of_use
 
 
 def _can_pack(leaves: list[Any]) -> bool:
@@ -119,8 +193,7 @@ def _can_pack(leaves: list[Any]) -> bool:
 
 
 def _packed(leaves: list[Any]) -> jax.Array:
-    """All of them as one array of floating numbers, since the compiler stops at an argument that turns
-    out to be of no use, or at a large one that turns out to be constant."""
+    """All of them as one array of floating numbers."""
     return jnp.concatenate([_as_floating(leaf).ravel() for leaf in leaves])
 
 
@@ -212,7 +285,9 @@ def _compiles() -> bool:
         return jnp.outer(v, v) @ v / jnp.sum(jnp.exp(v))
 
     def probe(v: jax.Array) -> jax.Array:
-        return _mark_p.bind(jax.jit(lambda v: jax.lax.fori_loop(0, 3, turn, v))(v), plain=True)
+        return set_xla_metadata(
+            jax.jit(lambda v: jax.lax.fori_loop(0, 3, turn, v))(v), **_ATTRIBUTES
+        )
 
     with jax.ensure_compile_time_eval():
         try:

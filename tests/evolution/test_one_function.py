@@ -84,14 +84,54 @@ def test_arguments_of_every_kind_arrive_as_they_left():
     np.testing.assert_array_equal(turns, V + 7.0)
 
 
-@pytest.mark.parametrize("unused", [0, 1, 2])
-def test_arguments_that_turn_out_to_be_of_no_use_do_no_harm(unused):
-    def run(*args):
-        v, scale, index = (0.0 * a if k == unused else a for k, a in enumerate(args))
-        return looped(lambda k, v: v * scale + jnp.where(index > 0, 0.0, 1.0))(v)
+def test_arguments_that_turn_out_to_be_of_no_use_do_no_harm():
+    # Whole numbers, since the compiler sees that 0·n is 0.
+    def run(v, n, table):
+        return looped(lambda k, v: 0.5 * v + (0 * n).astype(v.dtype) + 0 * table[0])(v)
 
-    args = V, jnp.asarray(0.5), jnp.asarray(1.0)
-    np.testing.assert_allclose(compiled(run, *args)(*args), run(*args))
+    def whole(v, n, table):
+        return one.in_one_function(run, v, n, computed=(table,))
+
+    args = V, jnp.asarray(3), jnp.zeros(5000, int).astype(float)
+    program = jax.jit(lambda v, n, table: whole(v, n, 0.0 * table)).lower(*args).compile()
+    assert is_one(program)
+    np.testing.assert_allclose(program(*args), run(*args))
+
+
+def test_what_a_computed_argument_is_for_may_turn_out_to_be_nothing():
+    def run(v, table):
+        return looped(lambda k, v: 0.5 * v + jnp.where(table[k] == table[k], 0.0, 1.0))(v)
+
+    whole = jax.jit(lambda v, t: one.in_one_function(run, v, computed=(t + v[0],)))
+    np.testing.assert_allclose(whole(V, jnp.zeros(5000)), 0.5**7 * V)
+    # A linear system: what a step began with is of no use to the derivative of the step.
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.WholeSpace(),
+        f=lambda t, x, u, args: u, h=lambda t, x, u, args: 0.5 * x - u,
+    )  # fmt: skip
+    end = lambda x: dvax.solve(problem, x, 0.0, 1.0, dt=0.01).xs[-1]  # noqa: E731
+    assert float(jax.grad(end)(1.0)) == pytest.approx(np.exp(-0.75), rel=1e-4)
+
+
+def test_what_is_closed_over_is_handed_over():
+    @jax.jit
+    def outer(v, scale, long):
+        near = one.in_one_function(looped(lambda k, v: v * scale), v)
+        return near, one.in_one_function(looped(lambda k, v: v * long[k]), v)
+
+    near, far = outer(V, jnp.asarray(0.5), 0.5 * jnp.ones(5000))
+    np.testing.assert_allclose(near, 0.5**7 * V)
+    np.testing.assert_allclose(far, 0.5**7 * V)
+
+
+def test_numbers_that_take_the_type_of_what_they_meet_still_do():
+    def run(v, scale):
+        return jax.lax.fori_loop(0, 7, lambda k, v: v * scale, v)
+
+    whole = jax.jit(lambda v, scale: one.in_one_function(run, v, scale))
+    found = whole(V.astype(jnp.float32), 0.5)
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, 0.5**7 * V, rtol=1e-6)
 
 
 def test_constants_may_be_arguments_and_everything_may_be_constant():
@@ -110,10 +150,32 @@ def test_a_batch_and_a_derivative_are_compiled_as_any_program():
     batch = jax.jit(jax.vmap(whole)).lower(many).compile()
     assert not is_one(batch)
     np.testing.assert_allclose(batch(many), jax.vmap(run)(many), rtol=1e-13)
-    primal, tangent = jax.jit(lambda v: jax.jvp(whole, (v,), (v,)))(V)
-    exact = jax.jvp(run, (V,), (V,))
-    np.testing.assert_allclose(primal, exact[0], rtol=1e-13)
-    np.testing.assert_allclose(tangent, exact[1], rtol=1e-13)
+    derivative = jax.jit(lambda v: jax.jvp(whole, (v,), (v,))).lower(V).compile()
+    assert is_one(derivative)
+    for found, exact in zip(derivative(V), jax.jvp(run, (V,), (V,)), strict=True):
+        np.testing.assert_allclose(found, exact, rtol=1e-13)
+
+
+def test_all_directions_at_once_are_a_batch():
+    # A product of a matrix and a vector becomes one of matrices, which a library does.
+    M, v = jnp.asarray(np.random.default_rng(0).normal(size=(8, 8)) / 4), jnp.arange(8.0) / 8
+    run = lambda v: looped(lambda k, v: jnp.tanh(M @ v))(v)  # noqa: E731
+    whole = jax.jit(jax.jacfwd(lambda v: one.in_one_function(run, v)))
+    np.testing.assert_allclose(whole(v), jax.jacfwd(run)(v), atol=1e-14)
+
+
+def test_what_does_not_move_has_no_derivative_to_go_wrong():
+    run = lambda v, a: looped(lambda k, v: v * jnp.sqrt(a) + jnp.abs(v) ** a)(v)  # noqa: E731
+    push = lambda v: jax.jvp(lambda v: one.in_one_function(run, v, jnp.zeros(())), (v,), (v,))  # noqa: E731
+    assert np.isfinite(jax.jit(push)(V)[1]).all()
+
+
+def test_only_what_is_asked_for_is_computed():
+    def run(v):
+        return looped(lambda k, v: 0.5 * v)(v), looped(lambda k, v: jnp.sin(v))(v)
+
+    program = jax.jit(lambda v: one.in_one_function(run, v)[0]).lower(V).compile()
+    assert is_one(program) and "sine" not in program.as_text()
 
 
 @pytest.mark.parametrize("case", [c1, c2, c3], ids=["C1", "C2", "C3"])

@@ -139,6 +139,12 @@ def test_derivatives_in_the_entries_of_both_matrices():
     sizes = [float(jnp.sum(A.semigroup(0.05 * (1 + k * step), v) ** 2)) for k in (1, -1)]
     slope = (sizes[0] - sizes[1]) / (2 * step)
     assert float(jnp.sum(by_stiffness * other)) == pytest.approx(slope, rel=1e-7)
+    # And one pair of entries beside the diagonal, which M⁻¹ is a polynomial in.
+    i, j = np.asarray(place).T
+    pair = jnp.asarray(((i == 3) & (j == 4)) | ((i == 4) & (j == 3)), float)
+    ends = [float(end(data + k * 1e-7 * pair, other)) for k in (1, -1)]
+    slope_of_pair = (ends[0] - ends[1]) / 2e-7
+    assert float(jnp.sum(by_mass * pair)) == pytest.approx(slope_of_pair, rel=1e-5)
     assert float(jnp.sum(by_mass * data)) == pytest.approx(-slope, rel=1e-7)
 
 

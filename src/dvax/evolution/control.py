@@ -240,9 +240,15 @@ class Fixed(AbstractController):
         if self.stops.shape[0] == 2:
             return self._time(0, index)
         counts = self._counts()
-        # How many steps end by the end of each segment: few numbers, added up as a sum of products.
-        upto = jnp.sum(np.tri(len(counts), dtype=int) * counts[None], axis=1)
-        segment = jnp.minimum(jnp.sum(upto <= index), len(counts) - 1)
+        # How many steps end by the end of each segment; of few numbers as a sum of products, which stays
+        # within one function (`_one_function`).
+        if len(counts) <= 32:
+            upto = jnp.sum(np.tri(len(counts), dtype=int) * counts[None], axis=1)
+            segment = jnp.sum(upto <= index)
+        else:
+            upto = jnp.cumsum(counts)
+            segment = jnp.searchsorted(upto, index, side="right")
+        segment = jnp.minimum(segment, len(counts) - 1)
         before = jnp.where(segment > 0, upto[segment - 1], 0)
         return self._time(segment, index - before)
 

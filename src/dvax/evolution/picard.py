@@ -206,7 +206,7 @@ class Run(eqx.Module):
         if records is not None:
             place = state.steps + jnp.arange(many)
             taken = window.record._replace(start=jnp.where(kept, window.record.start, jnp.inf))
-            records = _tree.put(records, place, taken)
+            records = jtu.tree_map(lambda leaf, new: leaf.at[place].set(new), records, taken)
         last = self.stops.shape[0] - 1
         reached = jnp.where(kept & (b == stop), state.stop + 1, state.stop)
         new = (b, window.end, window.record, state.impulse, impulse)

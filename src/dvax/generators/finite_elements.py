@@ -19,8 +19,8 @@ from .sparse import Sparse, Triplets, triplets
 class FiniteElements(AbstractMatrixFree):
     """A = −M⁻¹S: M x' = −Sx + … for a mass matrix M and a stiffness matrix S, as they are assembled.
 
-    M is symmetric and nearly its own diagonal D: the eigenvalues of D⁻¹M lie in an interval [l, h] that
-    the element alone decides, whatever the mesh (Wathen 1987). So M⁻¹ is a Chebyshev polynomial of
+    M is symmetric and nearly its own diagonal D: the eigenvalues of D⁻¹M lie in the least interval [l, h]
+    that has those of every element (Wathen 1987), which for simplices is the same on any mesh. So M⁻¹ is a Chebyshev polynomial of
     fixed degree in D⁻¹M, exact to rounding: linear, differentiable, self-adjoint with M, and no
     factorisation. With S ≥ 0 symmetric the semigroup contracts in the norm of M, and in that of the
     space L2(D), where the sets of a response live, its bound is M = √(h/l).
@@ -33,7 +33,7 @@ class FiniteElements(AbstractMatrixFree):
     - `mass`, `stiffness`: of SciPy, or `jax.experimental.sparse.BCOO` whose `data` may be traced;
     - `mass_range`: (l, h). Gershgorin's circles by default, which suffice in one dimension. Where
       they do not, declare it: (1/2, 2) for linear triangles, (1/2, 5/2) for linear tetrahedra,
-      (1/4, 9/4) for bilinear quadrilaterals, (1/8, 27/8) for trilinear bricks;
+      (1/4, 9/4) for bilinear parallelograms, (1/8, 27/8) for trilinear parallelepipeds;
     - `within`: a `dvax.generators.Range` that contains the numerical range of A in the inner product
       of M, better than the circles do;
     - `dissipative`: declares that vᵀSv ≥ 0 for all v, as for any stiffness matrix that was
@@ -149,7 +149,9 @@ def _interval(scaled: Sparse, declared: tuple[float, float] | None) -> tuple[flo
                     "Declare the interval: (1/2, 2) for linear triangles, say",
                 )
             )  # fmt: skip
-        low, high = float(scaled.range.low), float(scaled.range.high)
+        slack = 64 * float(jnp.finfo(scaled.range.low.dtype).eps)
+        low = float(scaled.range.low) * (1 - slack)
+        high = float(scaled.range.high) * (1 + slack)
         given = f"none, and Gershgorin's circles give ({low:.3g}, {high:.3g})"
     if not 0.0 < low <= high < math.inf:
         raise InputError(
@@ -158,7 +160,7 @@ def _interval(scaled: Sparse, declared: tuple[float, float] | None) -> tuple[flo
                 "M is inverted by a polynomial that is small on an interval 0 < l ≤ h with the "
                 "eigenvalues of D⁻¹M",
                 "Declare what the element has: (1/2, 2) for linear triangles, (1/2, 5/2) for linear "
-                "tetrahedra, (1/4, 9/4) for bilinear quadrilaterals, (1/8, 27/8) for trilinear bricks",
+                "tetrahedra, (1/4, 9/4) for bilinear parallelograms, (1/8, 27/8) for trilinear boxes",
             )
         )  # fmt: skip
     return low, high
@@ -200,12 +202,14 @@ def _check(M: Triplets, S: Triplets) -> None:
             )
         )  # fmt: skip
 
+    eps = float(jnp.finfo(M.values.dtype).eps)
+
     def symmetric() -> bool:
         from scipy.sparse import coo_array
 
         whole = coo_array((np.asarray(M.values), (M.rows, M.cols)), shape=(M.size, M.size)).tocsr()
         off = abs(whole - whole.T)
-        return bool(off.nnz == 0 or off.max() <= 1e-12 * abs(whole).max())
+        return bool(off.nnz == 0 or off.max() <= 64 * eps * abs(whole).max())
 
     _tree.require(
         symmetric, f"{name}(mass)", M.values,

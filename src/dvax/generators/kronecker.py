@@ -18,6 +18,8 @@ from .phi import flow_factors, phi_matrix
 from .scalar import Scalar
 from .transforms import Transform
 
+_EXACT = jax.lax.Precision.HIGHEST
+
 
 class KroneckerSum(AbstractGenerator):
     """(A v)ᵢ = F vᵢ + Σⱼ Bᵢⱼ vⱼ for states of m components on one grid, of shape (m, *grid): two
@@ -57,7 +59,9 @@ class KroneckerSum(AbstractGenerator):
         self.field = field
 
     def apply(self, v: Tree) -> Tree:
-        return jax.vmap(self.field.apply)(v) + jnp.tensordot(self.matrix, v, axes=1)
+        return jax.vmap(self.field.apply)(v) + jnp.tensordot(
+            self.matrix, v, axes=1, precision=_EXACT
+        )
 
     def propagator(self, h: Any, terms: int) -> "ModalPropagator":
         rates = _rates(self.field)
@@ -111,7 +115,12 @@ class ModalPropagator(AbstractPropagator):
         forward = (lambda v: v) if self.transform is None else jax.vmap(self.transform.forward)
         given = [forward(v) for v in (x0, *c)]
         parts = [
-            jnp.einsum("...ij,j...->i...", factor.astype(coefficients.dtype), coefficients)
+            jnp.einsum(
+                "...ij,j...->i...",
+                factor.astype(coefficients.dtype),
+                coefficients,
+                precision=_EXACT,
+            )
             for factor, coefficients in zip(self.factors, given, strict=False)
         ]
         total = sum(parts[1:], start=parts[0])

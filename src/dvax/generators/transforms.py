@@ -79,7 +79,7 @@ class Transform(eqx.Module):
     def forward(self, x: jax.Array) -> jax.Array:
         """The coefficients."""
         if self._short():
-            return jnp.asarray(_matrices(self.shape[0], self.boundary[0])[0], x.dtype) @ x
+            return _product(_matrices(self.shape[0], self.boundary[0])[0], x)
         for axis in self._folded():
             x = _fold(x, axis, self.boundary[axis])
         F = jnp.fft.rfftn(x, axes=self._axes())
@@ -97,7 +97,7 @@ class Transform(eqx.Module):
     def backward(self, c: jax.Array) -> jax.Array:
         """The array with these coefficients."""
         if self._short():
-            return jnp.asarray(_matrices(self.shape[0], self.boundary[0])[1], c.dtype) @ c
+            return _product(_matrices(self.shape[0], self.boundary[0])[1], c)
         if self.real:
             n, axis = self.shape[self.half], self.half
             low = jax.lax.slice_in_dim(c, 0, n // 2 + 1, axis=axis)
@@ -144,6 +144,11 @@ def _matrices(n: int, kind: str) -> tuple[np.ndarray, np.ndarray]:
     waves = (np.cos if kind == "neumann" else np.sin)(parts * (np.pi / (2 * n)))
     shares = np.where((k == 0) | (k == n), 0.5, 1.0) / n
     return 2.0 * waves, waves.T * shares
+
+
+def _product(matrix: np.ndarray, v: jax.Array) -> jax.Array:
+    """To the precision of v, whatever the machine would make of it."""
+    return jnp.matmul(jnp.asarray(matrix, v.dtype), v, precision=jax.lax.Precision.HIGHEST)
 
 
 def times(factor: Any, c: jax.Array) -> jax.Array:
