@@ -99,11 +99,11 @@ def _small_ones(leaves: list[Any], large: Any) -> list[Any]:
     return [leaf for leaf, is_large in zip(leaves, large, strict=True) if not is_large]
 
 
-def _as_it_is(*leaves: Any, program: ClosedJaxpr, large: tuple[bool, ...]) -> list[Any]:
+def _as_it_is(*leaves: Any, program: ClosedJaxpr, large: Any) -> list[Any]:
     return jaxpr_as_fun(program)(*leaves)
 
 
-def _as_one(*leaves: Any, program: ClosedJaxpr, large: tuple[bool, ...]) -> list[Any]:
+def _as_one(*leaves: Any, program: ClosedJaxpr, large: Any) -> list[Any]:
     """The call with its attributes. The compiler stops at an argument that turns out to be of no use,
     or at a long one that turns out to be constant: so the small ones are packed into one, and of the
     large ones an entry is returned."""
@@ -139,11 +139,12 @@ def _batched(leaves: Any, axes: Any, *, program: ClosedJaxpr, large: Any) -> tup
 def _pushed_forward(
     leaves: Any, tangents: Any, *, program: ClosedJaxpr, large: Any
 ) -> tuple[Any, Any]:
-    """A derivative is a program of its own, small or not; only in what moves."""
+    """A derivative is a program of its own, small or not, in what moves alone; the values are not taken
+    from it, since they may be known, or the same for many directions, where it is not."""
     moves = [not isinstance(t, ad.Zero) and t.dtype != jax.dtypes.float0 for t in tangents]
     count = len(leaves)
 
-    def both(*given: Any) -> list[Any]:
+    def push(*given: Any) -> list[Any]:
         start = given[:count]
 
         def of(*moving: Any) -> list[Any]:
@@ -153,16 +154,18 @@ def _pushed_forward(
             )
 
         moving = tuple(leaf for leaf, m in zip(start, moves, strict=True) if m)
-        found, pushed = jax.jvp(of, moving, given[count:])
-        return [*found, *(t for t in pushed if t.dtype != jax.dtypes.float0)]
+        pushed = jax.jvp(of, moving, given[count:])[1]
+        return [t for t in pushed if t.dtype != jax.dtypes.float0]
 
     pick = lambda values: [v for v, m in zip(values, moves, strict=True) if m]  # noqa: E731
-    found = _called(both, [*leaves, *pick(tangents)], [*large, *pick(large)])
-    out, own = found[: len(program.out_avals)], iter(found[len(program.out_avals) :])
-    real = [jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in out]
+    out = _one_p.bind(*leaves, program=program, large=large)
+    found = iter(_called(push, [*leaves, *pick(tangents)], [*large, *pick(large)]))
+    zero: Any = ad.Zero
     pushed = [
-        next(own) if is_real else ad.Zero.from_primal_value(leaf)
-        for leaf, is_real in zip(out, real, strict=True)
+        next(found)
+        if jnp.issubdtype(leaf.dtype, jnp.inexact)
+        else zero(jax.typeof(leaf).to_tangent_aval())
+        for leaf in out
     ]
     return out, pushed
 
@@ -173,11 +176,11 @@ def _of_use(used: list[bool], eqn: Any) -> tuple[list[bool], Any]:
         return [False] * len(eqn.invars), None
     jaxpr, needed = pe.dce_jaxpr(eqn.params["program"].jaxpr, used)
     large = [v for v, n in zip(eqn.params["large"], needed, strict=True) if n]
+    params = {"program": ClosedJaxpr(jaxpr, ()), "large": tuple(large)}
     new = new_jaxpr_eqn(
         [v for v, n in zip(eqn.invars, needed, strict=True) if n],
         [v for v, u in zip(eqn.outvars, used, strict=True) if u],
-        eqn.primitive, dict(program=ClosedJaxpr(jaxpr, ()), large=tuple(large)), eqn.effects,
-        eqn.source_info, eqn.ctx,
+        eqn.primitive, params, eqn.effects, eqn.source_info, eqn.ctx,
     )  # fmt: skip
     return needed, new
 
@@ -284,7 +287,7 @@ def _compiles() -> bool:
         v = jax.lax.cond(v[0] > 1.0, lambda: 0.5 * v, lambda: jnp.flip(v) + v[k])
         return jnp.outer(v, v) @ v / jnp.sum(jnp.exp(v))
 
-    def probe(v: jax.Array) -> jax.Array:
+    def probe(v: jax.Array) -> Any:
         return set_xla_metadata(
             jax.jit(lambda v: jax.lax.fori_loop(0, 3, turn, v))(v), **_ATTRIBUTES
         )

@@ -240,8 +240,8 @@ class Fixed(AbstractController):
         if self.stops.shape[0] == 2:
             return self._time(0, index)
         counts = self._counts()
-        # How many steps end by the end of each segment; of few numbers as a sum of products, which stays
-        # within one function (`_one_function`).
+        # How many steps end by the end of each segment; of few numbers as a sum of products, which
+        # stays within one function (`_one_function`).
         if len(counts) <= 32:
             upto = jnp.sum(np.tri(len(counts), dtype=int) * counts[None], axis=1)
             segment = jnp.sum(upto <= index)

@@ -19,11 +19,11 @@ from .sparse import Sparse, Triplets, triplets
 class FiniteElements(AbstractMatrixFree):
     """A = −M⁻¹S: M x' = −Sx + … for a mass matrix M and a stiffness matrix S, as they are assembled.
 
-    M is symmetric and nearly its own diagonal D: the eigenvalues of D⁻¹M lie in the least interval [l, h]
-    that has those of every element (Wathen 1987), which for simplices is the same on any mesh. So M⁻¹ is a Chebyshev polynomial of
-    fixed degree in D⁻¹M, exact to rounding: linear, differentiable, self-adjoint with M, and no
-    factorisation. With S ≥ 0 symmetric the semigroup contracts in the norm of M, and in that of the
-    space L2(D), where the sets of a response live, its bound is M = √(h/l).
+    M is symmetric and nearly its own diagonal D: the eigenvalues of D⁻¹M lie in the least interval
+    [l, h] that has those of every element (Wathen 1987), for simplices the same on any mesh. So M⁻¹
+    is a Chebyshev polynomial of fixed degree in D⁻¹M, exact to rounding: linear, differentiable,
+    self-adjoint with M, and no factorisation. With S ≥ 0 symmetric the semigroup contracts in the norm
+    of M, and in that of the space L2(D), where the sets of a response live, its bound is M = √(h/l).
 
     A product costs one with S and about 18√(h/l) with M: where a lumped mass will do,
     `dvax.generators.Sparse` is that much cheaper.
