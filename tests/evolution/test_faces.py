@@ -58,6 +58,7 @@ def test_the_derivative_is_that_of_the_face_and_a_touching_entry_is_held():
     np.testing.assert_allclose(slope(touching), [[0, 0], [0, -1.0]], atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_what_is_written_out_is_what_is_iterated():
     M = np.array([[2.0, 0.5], [0.1, 1.0]])
     problem = dvax.Problem(

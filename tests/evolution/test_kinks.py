@@ -209,6 +209,7 @@ def test_regimes_are_those_of_the_closed_form():
         assert positive.tolist() == [[True, False], [True, True], [False, True]]
 
 
+@pytest.mark.thorough
 def test_data_that_jumps_changes_the_regime_where_it_jumps():
     problem = driven(lambda t: jnp.where(t < 0.7, 0.5, 1.5))
     sol = dvax.solve(problem, 0.0, 0.0, 2.0, dense=True, max_steps=4096)

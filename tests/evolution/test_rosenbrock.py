@@ -93,6 +93,7 @@ def test_what_is_linear_in_pieces_is_solved_to_rounding():
     np.testing.assert_allclose(times[1:-1], [0.31333575, 0.52405678], atol=1e-7)
 
 
+@pytest.mark.thorough
 def test_derivatives_go_both_ways():
     case = c1()
 

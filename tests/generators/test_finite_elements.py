@@ -120,6 +120,7 @@ def test_the_adjoint_is_the_adjoint():
     assert float(adjoint.growth(space).M) == pytest.approx(float(A.growth(space).M))
 
 
+@pytest.mark.thorough
 def test_derivatives_in_the_entries_of_both_matrices():
     _, M, S = rod(12)
     place = jnp.asarray(np.stack(M.tocoo().coords, axis=1))

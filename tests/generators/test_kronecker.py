@@ -91,6 +91,7 @@ def test_a_solve_is_that_of_the_same_matrix():
     np.testing.assert_allclose(*ends, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_derivatives_in_the_matrix_and_the_field():
     v = jnp.asarray(RNG.normal(size=(2, 5)))
 

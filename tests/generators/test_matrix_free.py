@@ -154,6 +154,7 @@ def test_the_adjoint_is_the_adjoint_and_has_its_own_flow(own):
     ) * (1 + 1e-10)
 
 
+@pytest.mark.thorough
 def test_derivatives_in_all_that_enters_go_both_ways():
     pattern = MATRICES["advection and diffusion"].tocoo()
     places = jnp.asarray(np.stack([pattern.row, pattern.col], 1))
