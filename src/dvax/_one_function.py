@@ -1,10 +1,9 @@
 """Small programs as one function of the processor.
 
-On a CPU, XLA runs a program as a list of kernels, and calling one costs fifty nanoseconds and more:
-longer than the arithmetic on a handful of numbers takes. It can compile a program as one function
-instead, and does so of its own accord for loops that touch less than a kilobyte. The two attributes
-below ask for the same where a program is known to be small: a step of a small system then takes a
-tenth of the time, and its loop half as long to compile.
+On a CPU, XLA runs a program as a list of kernels, and to call one takes longer than the arithmetic on
+a handful of numbers. It can compile a program as one function instead, and does so of its own accord
+for the tiniest of loops. The two attributes below ask for the same where a program is known to be
+small.
 
 Not every operation can be compiled so (library calls cannot, nor what XLA hands to its own libraries
 for matrices), and asking for one that cannot is an error that no program can catch once it is part of
@@ -33,9 +32,8 @@ _LARGEST = 1000
 the compiler; and several cores are then worth more than few kernels."""
 _SUMMED = 2048
 """Entries of an array that is reduced: of larger ones XLA makes calls of a library."""
-_VECTOR, _MATRIX = _LARGEST, 5
-"""Entries of a matrix that a vector is multiplied by; sides of one that a matrix is, larger ones being
-calls of a library as well."""
+_SIDE = 5
+"""Of a matrix that a matrix is multiplied by: larger ones are calls of a library as well."""
 
 _ENTRYWISE = frozenset(
     "abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp complex conj "
@@ -259,8 +257,8 @@ def _is_plain_product(eqn: Any) -> bool:
     if not jnp.issubdtype(first.dtype, jnp.floating) or max(first.ndim, second.ndim) > 2:
         return False
     if min(first.ndim, second.ndim) < 2:
-        return max(math.prod(first.shape), math.prod(second.shape)) <= _VECTOR
-    return max(*first.shape, *second.shape) <= _MATRIX
+        return _few([first, second])
+    return max(*first.shape, *second.shape) <= _SIDE
 
 
 def _inner(params: dict[str, Any]) -> list[ClosedJaxpr]:

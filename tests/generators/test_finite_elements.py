@@ -85,6 +85,22 @@ def test_the_element_decides_the_interval(seed):
     assert TRIANGLES[0] <= values[0] and values[-1] <= TRIANGLES[1] * (1 + 1e-12)
 
 
+CORNERS = {  # D⁻¹M of one element: of simplices, and of boxes as products of rods
+    (0.5, 2.0): (np.ones((3, 3)) + np.eye(3)) / 2,
+    (0.5, 2.5): (np.ones((4, 4)) + np.eye(4)) / 2,
+    (0.25, 2.25): np.kron([[1, 0.5], [0.5, 1]], [[1, 0.5], [0.5, 1]]),
+    (0.125, 3.375): np.kron(
+        np.kron([[1, 0.5], [0.5, 1]], [[1, 0.5], [0.5, 1]]), [[1, 0.5], [0.5, 1]]
+    ),
+}
+
+
+@pytest.mark.parametrize("interval", CORNERS)
+def test_the_intervals_that_are_named_are_those_of_the_elements(interval):
+    values = np.linalg.eigvalsh(CORNERS[interval])
+    np.testing.assert_allclose([values[0], values[-1]], interval)
+
+
 @pytest.mark.parametrize("name", MESHES)
 def test_the_numerical_range_lies_in_the_rectangle(name):
     M, S, interval = MESHES[name]

@@ -12,7 +12,6 @@ import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 from tests.plots.synthetic import Recipe, write_run
-from tests.selection import mostly_thorough
 
 from dvax.plots import build_report
 from dvax.plots.look import REGIME_COLOURS
@@ -98,7 +97,8 @@ def curve(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build_report(run_dir, stills=False)
 
 
-@pytest.mark.parametrize("width", mostly_thorough([1280, 500], []))
+@pytest.mark.thorough
+@pytest.mark.parametrize("width", [1280, 500])
 def test_every_figure_is_drawn_without_an_error(curve: Path, width: int) -> None:
     report = look_at(curve, width)
     assert report["wrong"] == []

@@ -20,7 +20,7 @@ from .faces import Faces
 from .linearised import AbstractLinear, split
 
 _SMALL = 400
-"""Entries of A."""
+"""Entries of A, up to which one more operation costs more than its arithmetic."""
 
 
 class Rate(NamedTuple):
@@ -73,8 +73,7 @@ class Flow(eqx.Module):
         linear = self.generator if self.linear is None else self.linear
         one = lambda h: linear.propagator(h, terms)  # noqa: E731
         size = sum(leaf.size for leaf in jtu.tree_leaves(eqx.filter(linear, eqx.is_array)))
-        # The φ-functions of all of them in one go, where A is a number, diagonal or a matrix of so few
-        # entries that one more operation costs more than its arithmetic.
+        # The φ-functions of all of them in one go, where all that a propagator holds are those.
         if size > _SMALL or not isinstance(linear, Scalar | Diagonal | Dense | AbstractLinear):
             return tuple(map(one, lengths))
         stacked = jax.vmap(one)(jnp.stack(lengths))

@@ -15,7 +15,7 @@ them, v = (x₀, x₂, …, x₃, x₁), and F the Fourier transform of v,
 
 so one transform of n numbers does, and one pass before and after it. For real x the right side is
 2 Re(aₖFₖ), and −2 Im(aₖFₖ) is the value at n − k. With every odd xⱼ negated the same formula yields
-the sines of n − k. As no sum is ever taken of neighbours, points that are equal stay so.
+the sines of n − k. One short axis by itself is transformed by a product with the matrix of this.
 """
 
 import functools
