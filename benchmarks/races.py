@@ -15,8 +15,10 @@ PLAIN = dvax.operators.Scaling(1.0)
 
 class Race(NamedTuple):
     """x(0) = x0 up to `end`, where x is `exact`. `field(t, x, lib)` is the right-hand side with the law
-    solved by hand; `banded` says that its Jacobian is tridiagonal."""
+    solved by hand; `banded` says that its Jacobian is tridiagonal; `key` is what peers that write
+    the law themselves call it."""
 
+    key: str
     name: str
     problem: dvax.Problem
     x0: np.ndarray
@@ -44,7 +46,7 @@ def contact() -> Race:
     first = np.log(1.6) / 1.5
     second = first + 2 * np.log(10 / 9)
     exact = np.array([2.0 - 1.5 * np.exp(-1.5 * (2.0 - second))])
-    return Race("C1, contact", problem, np.array([-1.0]), 2.0, exact, field)
+    return Race("contact", "C1, contact", problem, np.array([-1.0]), 2.0, exact, field)
 
 
 _P = np.array([[2.0, 0.5], [0.5, 1.0]])
@@ -87,7 +89,9 @@ def moving_box() -> Race:
         f=lambda t, x, u, args: jnp.array([1.0, 0.0]) - jnp.array([1.0, 0.5]) * u,
         h=lambda t, x, u, args: 0.2 * x - 0.5 * u + jnp.array([4.0, -4.0]),
     )  # fmt: skip
-    return Race("C2, moving box", problem, np.array([0.3, -0.2]), 4.0, _corner(4.0), field)
+    return Race(
+        "moving_box", "C2, moving box", problem, np.array([0.3, -0.2]), 4.0, _corner(4.0), field
+    )
 
 
 def _solved(M: np.ndarray, right: Any, k: int) -> Any:
@@ -129,7 +133,9 @@ def shrinking_ball() -> Race:
     )  # fmt: skip
     size = 0.5 * np.exp(-1.5) * np.exp(-1.5)
     exact = size * np.array([np.cos(12.0), np.sin(12.0)])
-    return Race("C3, shrinking ball", problem, np.array([2.0, 0.0]), 4.0, exact, field)
+    return Race(
+        "shrinking_ball", "C3, shrinking ball", problem, np.array([2.0, 0.0]), 4.0, exact, field
+    )
 
 
 def heat(n: int) -> Race:
@@ -168,4 +174,4 @@ def heat(n: int) -> Race:
         exact = np.asarray(
             dvax.solve(problem, x0, 0.0, 1.0, dt=1 / 16384, method=dvax.ETD4RK()).xs[-1]
         )
-    return Race(f"heat, n = {n}", problem, x0, 1.0, exact, field, banded=True)
+    return Race("heat", f"heat, n = {n}", problem, x0, 1.0, exact, field, banded=True)

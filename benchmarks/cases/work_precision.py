@@ -1,5 +1,6 @@
 """Time to a given error on three small systems and on the heat equation, beside general tools."""
 
+import contextlib
 import functools
 import time
 from collections.abc import Callable
@@ -13,25 +14,40 @@ from scipy.integrate import solve_ivp
 
 import dvax
 
-from ..clock import in_turn, spread, timed
+from ..clock import Sample, in_turn, spread, timed
 from ..layout import duration
+from ..peers import casadi_idas
+from ..peers.siconos_client import SiconosRaces, python
 from ..races import Race, contact, heat, moving_box, shrinking_ball
 from ..section import Section, Table, compare
 
 _LEVELS = (1e-4, 1e-6, 1e-8, 1e-10)
 _TOLERANCES = [10.0 ** (-k / 2) for k in range(2, 27)]
-_LONGEST = 20.0
-"""Seconds after which a tool is not asked for more digits."""
+_STEPS = [round(10.0 ** (k / 2)) for k in range(2, 13)]
+_LONGEST = {False: 2.0, True: 20.0}
+"""Seconds after which a tool is not asked for more digits, in a short and in a full run."""
 _MOST = 10**6
 _OURS = "dvax"
-_WANTED = {"scipy": 10.0, "Diffrax": 1.0}
+_WANTED = {"scipy": 10.0, "Diffrax": 1.0, "Siconos": 10.0, "CasADi": 10.0}
 """How many times faster dvax is to be than each tool on a small system; on the finest field 5."""
 
 
-class Tool(NamedTuple):
-    """rtol -> x(end); `first` is the time of the first call."""
+class Entrant(NamedTuple):
+    """setting -> x(end) at settings that grow tighter (rtol, or a number of steps), and how a solve is
+    timed: `timed` unless the tool runs in a process of its own."""
 
     solve: Callable[[float], Any]
+    settings: list[float] = _TOLERANCES
+    sample: Callable[[float], Sample] | None = None
+
+    def timed(self, setting: float) -> Sample:
+        return self.sample(setting) if self.sample else timed(lambda: self.solve(setting))
+
+
+class Tool(NamedTuple):
+    """An entrant, the seconds that its first call took, and its errors."""
+
+    entrant: Entrant
     first: float
     errors: list[tuple[float, float]]
 
@@ -44,29 +60,42 @@ def run(full: bool) -> Section:
             "achieved error, like that of every tighter rtol tried, is at most the level. Of the "
             "methods of dvax, as of those of a peer, the fastest counts in the comparison; the table "
             "shows all. dvax and Diffrax are under jax.jit, the end saved alone, with x(0) and rtol "
-            "as arguments; scipy calls NumPy. Peers have their law solved by hand."
+            "as arguments; scipy calls NumPy. scipy and Diffrax have their law solved by hand. "
+            "CasADi's IDAS is given the natural map of the law as an algebraic equation, its "
+            "integrators made beforehand. Siconos steps by θ = ½ with a relay of all unknowns, "
+            "projected Gauss-Seidel to 1e-13, data in time tabulated beforehand, and its stepping "
+            "alone is timed; its settings are half decades of steps from 10. A ball is no relay."
         ),
     )
     sizes = (64, 512, 4096) if full else (64,)
     makers = [contact, moving_box, shrinking_ball, *(functools.partial(heat, n) for n in sizes)]
-    for make in makers:
-        _race(section, make(), full)
+    with contextlib.ExitStack() as stack:
+        siconos = None
+        if (interpreter := python()) is not None:
+            siconos = stack.enter_context(SiconosRaces(interpreter))
+        else:
+            section.notes.append("No Python here imports siconos.kernel: Siconos is left out.")
+        if not casadi_idas.present():
+            section.notes.append("CasADi is not installed here (pip install casadi): left out.")
+        for make in makers:
+            race = make()
+            _race(section, race, _entrants(race) | _others(race, siconos), full)
     return section
 
 
-def _race(section: Section, race: Race, full: bool) -> None:
+def _race(section: Section, race: Race, entrants: dict[str, Entrant], full: bool) -> None:
     tools: dict[str, Tool] = {}
-    for name, solve in _entrants(race).items():
+    for name, entrant in entrants.items():
         begun = time.perf_counter()
-        solve(_TOLERANCES[0])
-        tools[name] = Tool(solve, time.perf_counter() - begun, _errors(race, solve))
+        entrant.solve(entrant.settings[0])
+        tools[name] = Tool(
+            entrant, time.perf_counter() - begun, _errors(race, entrant, _LONGEST[full])
+        )
     rows = []
     for level in _LEVELS:
         settings = {name: _loosest(tool.errors, level) for name, tool in tools.items()}
-        able = {name: rtol for name, rtol in settings.items() if rtol is not None}
-        samples = {
-            name: timed(functools.partial(tools[name].solve, rtol)) for name, rtol in able.items()
-        }
+        able = {name: setting for name, setting in settings.items() if setting is not None}
+        samples = {name: tools[name].entrant.timed(setting) for name, setting in able.items()}
         taken = in_turn(samples, 11 if full else 5)
         middle = {name: spread(series).middle for name, series in taken.items()}
         rows.append((f"{level:g}", *(duration(middle[n]) if n in middle else "-" for n in tools)))
@@ -90,7 +119,7 @@ def _race(section: Section, race: Race, full: bool) -> None:
     section.tables.append(Table(f"{race.name}: time to an error", ("error", *tools), rows))
 
 
-def _entrants(race: Race) -> dict[str, Callable[[float], Any]]:
+def _entrants(race: Race) -> dict[str, Entrant]:
     field = race.x0.size >= 64
     methods = [dvax.ETD2RK(), dvax.ETD4RK(), *([] if field else [dvax.ExpRosenbrock()])]
     out = {f"dvax {type(m).__name__}": _ours(race, m) for m in methods}
@@ -100,7 +129,23 @@ def _entrants(race: Race) -> dict[str, Callable[[float], Any]]:
         solvers = []
     out |= {f"Diffrax {type(s).__name__}": _diffrax(race, s) for s in solvers}
     names = ["LSODA", "Radau"] if race.x0.size > 64 else ["DOP853", "LSODA", "Radau"]
-    return out | {f"scipy {name}": _scipy(race, name) for name in names}
+    out |= {f"scipy {name}": _scipy(race, name) for name in names}
+    return {name: Entrant(solve) for name, solve in out.items()}
+
+
+def _others(race: Race, siconos: SiconosRaces | None) -> dict[str, Entrant]:
+    """The peers that write the law themselves."""
+    out: dict[str, Entrant] = {}
+    if casadi_idas.present():
+        out["CasADi IDAS"] = Entrant(casadi_idas.idas(casadi_idas.SYSTEMS[race.key](race.x0.size)))
+    # Siconos's linear algebra is dense.
+    if siconos is not None and race.key in SiconosRaces.names and race.x0.size <= 512:
+        run = functools.partial(siconos.run, race.key, race.x0.size)
+        out["Siconos"] = Entrant(
+            lambda steps: run(round(steps))[1], [float(n) for n in _STEPS],
+            lambda steps: lambda: run(round(steps))[0],
+        )  # fmt: skip
+    return out
 
 
 def _ours(race: Race, method: Any) -> Callable[[float], Any]:
@@ -150,22 +195,22 @@ def _scipy(race: Race, name: str) -> Callable[[float], Any]:
     return solve
 
 
-def _errors(race: Race, solve: Callable[[float], Any]) -> list[tuple[float, float]]:
-    """(rtol, error), tightest last, until the error has twice been below the last level."""
+def _errors(race: Race, entrant: Entrant, longest: float) -> list[tuple[float, float]]:
+    """(setting, error), tightest last, until the error has twice been below the last level."""
     found: list[tuple[float, float]] = []
-    for rtol in _TOLERANCES:
+    for setting in entrant.settings:
         begun = time.perf_counter()
-        found.append((rtol, race.error(solve(rtol))))
+        found.append((setting, race.error(entrant.solve(setting))))
         last = [error for _, error in found[-2:]]
-        if max(last) < 0.5 * _LEVELS[-1] or time.perf_counter() - begun > _LONGEST:
+        if max(last) < 0.5 * _LEVELS[-1] or time.perf_counter() - begun > longest:
             break
     return found
 
 
 def _loosest(found: list[tuple[float, float]], level: float) -> float | None:
     best = None
-    for rtol, error in reversed(found):
+    for setting, error in reversed(found):
         if error > level:
             break
-        best = rtol
+        best = setting
     return best

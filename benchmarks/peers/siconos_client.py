@@ -1,6 +1,7 @@
 """Siconos from here: a process of the Python that has it, spoken to line by line."""
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -15,6 +16,8 @@ from .affine_boxes import Affine
 
 _HERE = Path(__file__).parent
 _PYTHONS = (sys.executable, "/usr/bin/python3", "python3")
+_ENVIRONMENT = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+"""Its matrices are small: several threads would wait for one another, a hundred times as long."""
 _LETTERS = ("alpha", "beta", "b_x", "b_u", "d_x", "d_u", "kappa0", "ell", "x0")
 
 
@@ -45,6 +48,7 @@ class _Running:
         self._process = subprocess.Popen(
             [interpreter, str(_HERE / program)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._print, text=True,
+            env=_ENVIRONMENT,
         )  # fmt: skip
 
     def __enter__(self) -> Self:
@@ -128,3 +132,18 @@ class SiconosBox(_Running):
         if answer["info"] != 0 or not np.all(np.isfinite(y)):
             raise RuntimeError(f"Siconos {solver} ended with info = {answer['info']}")
         return y
+
+
+class SiconosRaces(_Running):
+    """The races that are linear systems with a relay (`siconos_races.py`)."""
+
+    names = ("contact", "moving_box", "heat")
+
+    def __init__(self, interpreter: str):
+        super().__init__(interpreter, "siconos_races.py")
+
+    def run(self, race: str, n: int, steps: int) -> tuple[float, np.ndarray]:
+        """Seconds for the steps, and x at the end, which may not be finite."""
+        self._ask(do="build", race=race, n=n, steps=steps)
+        answer = self._ask(do="run")
+        return answer["seconds"], np.array(answer["x"])
