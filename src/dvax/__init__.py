@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .evolution import ETD2RK as ETD2RK
     from .evolution import ETD4RK as ETD4RK
     from .evolution import RESULTS as RESULTS
+    from .evolution import DormandPrince as DormandPrince
     from .evolution import ExpRosenbrock as ExpRosenbrock
     from .evolution import Implicit as Implicit
     from .evolution import Picard as Picard
@@ -44,6 +45,7 @@ _HOMES = {
         "ETD1",
         "ETD2RK",
         "ETD4RK",
+        "DormandPrince",
         "ExpRosenbrock",
         "Implicit",
         "Picard",

@@ -80,7 +80,7 @@ def test_the_bound_of_a_coarse_run_covers_its_distance_to_a_fine_one(tmp_path: P
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("method", ["ETD4RK", "ExpRosenbrock"])
+@pytest.mark.parametrize("method", ["ETD4RK", "ExpRosenbrock", "DormandPrince"])
 def test_every_method_has_its_run_and_its_bound(tmp_path: Path, method: str):
     load = 'expression = "2*sin(3*t)"'
     runs = {

@@ -8,5 +8,6 @@ from .method import AbstractMethod as AbstractMethod
 from .method import ExpRosenbrock as ExpRosenbrock
 from .picard import Picard as Picard
 from .results import RESULTS as RESULTS
+from .runge_kutta import DormandPrince as DormandPrince
 from .solution import Solution as Solution
 from .solve import solve as solve

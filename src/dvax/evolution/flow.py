@@ -46,7 +46,7 @@ class Flow(eqx.Module):
     and y = proj_K(h(t, x, 0)/a); or affine on a box of few unknowns, and `faces` writes it out.
     `reciprocal` is 1/a where a was proved not to depend on t and x, so that it is computed once.
     `enclosed` says that f̃ can be enclosed over a whole step (`chords`), so that nothing about the
-    defect is guessed. `linear` is A + J where some J is left to the propagator.
+    defect is guessed. `linear` is A + J where some J joins A in what is left to the propagator.
     """
 
     problem: Problem

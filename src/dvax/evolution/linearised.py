@@ -61,6 +61,18 @@ class MatrixLinear(AbstractLinear):
         return back(self.J @ flat)
 
 
+class Nothing(AbstractLinear):
+    """J = −A: nothing is left to the propagator, and f̃ has Ax in it."""
+
+    A: AbstractGenerator
+
+    def propagator(self, h: Any, terms: int) -> AbstractPropagator:
+        return Zero().propagator(h, terms)
+
+    def apply(self, v: Tree) -> Tree:
+        return jtu.tree_map(jnp.negative, self.A.apply(v))
+
+
 class FlatPropagator(AbstractPropagator):
     """A propagator of vectors, for states of any shape."""
 

@@ -24,7 +24,8 @@ class AbstractMethod(eqx.Module):
 
     `samples` are the points inside a step where the defect is looked at, apart from those where p was
     made to agree with f̃; `halves` says that stages are reached by half a step. A method that
-    `linearises` has A + J in the place of A and f̃ − Jx in that of f̃, with J = Df̃(t₀, x₀).
+    `linearises` has A + J in the place of A and f̃ − Jx in that of f̃, with J = Df̃(t₀, x₀); one that
+    `joins` has 0 and f̃ + Ax there.
     """
 
     order: eqx.AbstractClassVar[int]
@@ -32,6 +33,7 @@ class AbstractMethod(eqx.Module):
     samples: eqx.AbstractClassVar[tuple[float, ...]]
     halves: eqx.AbstractClassVar[bool]
     linearises: eqx.AbstractClassVar[bool]
+    joins: eqx.AbstractClassVar[bool]
 
     @abc.abstractmethod
     def coefficients(
@@ -81,6 +83,7 @@ class ETD1(AbstractMethod):
     samples: ClassVar[tuple[float, ...]] = (0.5,)
     halves: ClassVar[bool] = False
     linearises: ClassVar[bool] = False
+    joins: ClassVar[bool] = False
 
     def coefficients(self, evaluate, propagate, first, drift):
         return (first,)
@@ -109,6 +112,7 @@ class ETD2RK(AbstractMethod):
     samples: ClassVar[tuple[float, ...]] = (0.5,)
     halves: ClassVar[bool] = False
     linearises: ClassVar[bool] = False
+    joins: ClassVar[bool] = False
 
     def coefficients(self, evaluate, propagate, first, drift):
         second = evaluate(1.0, propagate(1.0, (first,)))
@@ -142,14 +146,14 @@ class ETD4RK(AbstractMethod):
     samples: ClassVar[tuple[float, ...]] = (0.25, 0.75)
     halves: ClassVar[bool] = True
     linearises: ClassVar[bool] = False
+    joins: ClassVar[bool] = False
 
     def coefficients(self, evaluate, propagate, first, drift):
-        mix = lambda *terms: _combined(first, *terms)  # noqa: E731
         a = evaluate(0.5, propagate(0.5, (first,)))
-        b = evaluate(0.5, propagate(0.5, (first, mix((-4.0, first), (4.0, a)))))
-        d = evaluate(1.0, propagate(1.0, (first, mix((-2.0, first), (2.0, b)))))
-        slope = mix((-3.0, first), (2.0, a), (2.0, b), (-1.0, d))
-        bend = mix((2.0, first), (-2.0, a), (-2.0, b), (2.0, d))
+        b = evaluate(0.5, propagate(0.5, (first, combined((-4.0, first), (4.0, a)))))
+        d = evaluate(1.0, propagate(1.0, (first, combined((-2.0, first), (2.0, b)))))
+        slope = combined((-3.0, first), (2.0, a), (2.0, b), (-1.0, d))
+        bend = combined((2.0, first), (-2.0, a), (-2.0, b), (2.0, d))
         return first, slope, bend
 
 
@@ -188,17 +192,15 @@ class ExpRosenbrock(AbstractMethod):
     samples: ClassVar[tuple[float, ...]] = (0.5,)
     halves: ClassVar[bool] = False
     linearises: ClassVar[bool] = True
+    joins: ClassVar[bool] = False
 
     def coefficients(self, evaluate, propagate, first, drift):
         second = evaluate(1.0, propagate(1.0, (first, drift)))
-        return first, drift, _combined(first, (1.0, second), (-1.0, first), (-1.0, drift))
+        return first, drift, combined((1.0, second), (-1.0, first), (-1.0, drift))
 
 
-def _combined(like: Tree, *terms: tuple[float, Tree]) -> Tree:
+def combined(*terms: tuple[float, Tree]) -> Tree:
     """Σ cᵢ vᵢ."""
     weights, trees = zip(*terms, strict=True)
-    return jtu.tree_map(
-        lambda _, *leaves: sum(w * leaf for w, leaf in zip(weights, leaves, strict=True)),
-        like,
-        *trees,
-    )
+    one = lambda *leaves: sum(w * v for w, v in zip(weights, leaves, strict=True) if w)  # noqa: E731
+    return jtu.tree_map(one, *trees)

@@ -15,6 +15,7 @@ from . import faces
 from .chords import NoEnclosure, constant
 from .flow import Flow, slope
 from .implicit import Implicit
+from .linearised import Nothing
 from .method import AbstractMethod
 from .picard import Picard
 
@@ -73,6 +74,8 @@ class Setup(NamedTuple):
             reciprocal, False, self._tolerance(), self.moduli.get("gamma"), self.moduli.get("L_F"),
             written,
         )  # fmt: skip
+        if isinstance(self.method, AbstractMethod) and self.method.joins:
+            flow = dataclasses.replace(flow, linear=Nothing(flow.generator))
         line = not isinstance(self.method, Implicit) and self.method.degree <= 1
         if direct and intervals and line and _can_enclose(flow, t0, x0):
             return dataclasses.replace(flow, enclosed=True)

@@ -46,7 +46,7 @@ class Elliptic(AbstractGenerator):
     ```python
     >>> import dvax, jax.numpy as jnp
     >>> A = dvax.generators.Elliptic(64, lengths=jnp.pi, boundary="dirichlet")
-    >>> s = (jnp.arange(64) + 0.5) * jnp.pi / 64
+    >>> s = (jnp.arange(64.0) + 0.5) * jnp.pi / 64
     >>> decayed = A.semigroup(1.0, jnp.sin(3 * s))      # sin 3s has the eigenvalue −9
     >>> bool(jnp.allclose(decayed, jnp.exp(-9.0) * jnp.sin(3 * s), atol=1e-6))
     True

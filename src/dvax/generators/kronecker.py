@@ -43,7 +43,7 @@ class KroneckerSum(AbstractGenerator):
     >>> g = dvax.generators
     >>> exchange = jnp.array([[-1.0, 1.0], [1.0, -1.0]])            # what one loses the other gains
     >>> A = g.KroneckerSum(g.Elliptic(32, lengths=jnp.pi, boundary="neumann"), exchange)
-    >>> s = (jnp.arange(32) + 0.5) * jnp.pi / 32
+    >>> s = (jnp.arange(32.0) + 0.5) * jnp.pi / 32
     >>> v = A.semigroup(1.0, jnp.stack([jnp.cos(s), -jnp.cos(s)]))  # −1 along s, −2 across
     >>> print(f"{float(v[0, 0] / jnp.cos(s[0])):.6f}", f"{float(jnp.exp(-3.0)):.6f}")
     0.049787 0.049787

@@ -38,7 +38,7 @@ class AbstractMatrixFree(AbstractGenerator):
     ...         return padded[:-2] - 2.0 * v + padded[2:]
     ...     def numerical_range(self):
     ...         return dvax.generators.Range(-4.0, 0.0)
-    >>> v = jnp.sin(jnp.pi * jnp.arange(1, 10) / 10)    # an eigenvector
+    >>> v = jnp.sin(jnp.pi * jnp.arange(1.0, 10.0) / 10)    # an eigenvector
     >>> rate = -4.0 * jnp.sin(jnp.pi / 20) ** 2
     >>> bool(jnp.allclose(Chain().semigroup(3.0, v), jnp.exp(3.0 * rate) * v, atol=1e-5))
     True

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dvax.errors import InputError, InputProblem, SolveError
-from dvax.evolution import ETD1, ETD2RK, ETD4RK, ExpRosenbrock, Solution, solve
+from dvax.evolution import ETD1, ETD2RK, ETD4RK, DormandPrince, ExpRosenbrock, Solution, solve
 from dvax.models import Contact
 from dvax.runs.compile_time import announced, compile_seconds
 from dvax.runs.config import Config, build_contact
@@ -44,7 +44,7 @@ _BLOCKS = 40
 """So many blocks at least where there are frames enough: the progress bar moves, and a kill loses
 no more than a fortieth."""
 _BLOCK_BYTES = 2**27
-_METHODS = {kind.__name__: kind for kind in (ETD1, ETD2RK, ETD4RK, ExpRosenbrock)}
+_METHODS = {kind.__name__: kind for kind in (ETD1, ETD2RK, ETD4RK, ExpRosenbrock, DormandPrince)}
 
 Listener = Callable[[dict[str, Any]], None]
 

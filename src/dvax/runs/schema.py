@@ -258,8 +258,8 @@ class TimeSection(Section):
 class SolverSection(Section):
     """Fixed steps `dt`, or steps chosen for `rtol` and `atol`."""
 
-    method: Literal["ETD2RK", "ETD4RK", "ExpRosenbrock", "ETD1"] = Field(
-        "ETD2RK", description="exponential integrator"
+    method: Literal["ETD2RK", "ETD4RK", "ExpRosenbrock", "DormandPrince", "ETD1"] = Field(
+        "ETD2RK", description="of a step"
     )
     dt: Annotated[float | None, _quantity("time")] = Field(None, gt=0, description="a step")
     rtol: float | None = Field(None, gt=0, lt=1, description="relative tolerance of a step")
