@@ -1,6 +1,7 @@
 """What every test runs under: double precision, checked shapes, repeatable random cases."""
 
 import gc
+import itertools
 import os
 from pathlib import Path
 
@@ -56,6 +57,23 @@ hypothesis.settings.register_profile(
     "thorough", deadline=None, max_examples=100_000, print_blob=True
 )
 hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "test"))
+
+
+_MAPPED = Path("/proc/self/maps")
+_SO_MANY, _AT_MOST = 25, 20_000
+_TESTS = itertools.count(1)
+
+
+@pytest.fixture(autouse=True)
+def _few_programs():
+    """A compiled program takes a few of the 65 530 mappings that Linux allows a process; who asks for
+    more is ended by a segmentation fault within the compiler. A whole run comes close."""
+    yield
+    if next(_TESTS) % _SO_MANY == 0 and _MAPPED.exists():
+        with _MAPPED.open() as lines:
+            mappings = sum(1 for _ in lines)
+        if mappings > _AT_MOST:
+            jax.clear_caches()
 
 
 @pytest.fixture
