@@ -122,6 +122,8 @@ def _race(section: Section, race: Race, entrants: dict[str, Entrant], full: bool
 def _entrants(race: Race) -> dict[str, Entrant]:
     field = race.x0.size >= 64
     methods = [dvax.ETD2RK(), dvax.ETD4RK(), *([] if field else [dvax.ExpRosenbrock()])]
+    if race.x0.size <= 64:
+        methods.append(dvax.DormandPrince())
     out = {f"dvax {type(m).__name__}": _ours(race, m) for m in methods}
     solvers = [diffrax.Tsit5(), diffrax.Kvaerno5()]
     # An explicit method needs as many steps as the norm of A says, an implicit one a full matrix.
