@@ -1,4 +1,5 @@
-"""The law written out face by face: it satisfies the law, and its derivative is that of its face."""
+"""The law written out, by medians and face by face: it satisfies the law, and its derivative is that of
+its face."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +7,9 @@ import numpy as np
 import pytest
 
 import dvax
-from dvax.evolution.faces import faces, fits, sides
+from dvax.evolution.faces import faces, sides
+from dvax.evolution.medians import Medians
+from dvax.evolution.written import fits
 
 INF = np.inf
 
@@ -17,11 +20,15 @@ def definite(rng, n):
     return root @ root.T + 0.3 * np.eye(n) + 2.0 * (skew - skew.T)
 
 
-@pytest.mark.parametrize("n", [2, 3, 4])
-def test_the_point_satisfies_the_law_whatever_the_bounds(n):
+WAYS = [(Medians, 2), (faces, 2), (faces, 3), (faces, 4)]
+each_way = pytest.mark.parametrize(("way", "n"), WAYS, ids=["medians", "9", "27", "81 faces"])
+
+
+@each_way
+def test_the_point_satisfies_the_law_whatever_the_bounds(way, n):
     rng = np.random.default_rng(n)
     M = definite(rng, n)
-    found = faces(lambda y: jnp.asarray(M) @ y, jnp.zeros(n))
+    found = way(jnp.asarray(M))
     solve = jax.jit(jax.vmap(lambda q, low, up: found.solve(q, low, up)))
     count = 2000
     q = rng.normal(size=(count, n)) * rng.choice([0.1, 1.0, 10.0], (count, 1))
@@ -42,9 +49,47 @@ def test_the_point_satisfies_the_law_whatever_the_bounds(n):
     assert np.all(np.abs(w) <= 1e-12 * size)
 
 
-def test_the_derivative_is_that_of_the_face_and_a_touching_entry_is_held():
+MONOTONE = {
+    "skew": [[0.0, 2.0], [-2.0, 0.0]],
+    "a saddle": [[1.5, 1.0], [-1.0, 0.0]],
+    "a saddle, the other way round": [[0.0, 1.0], [-1.0, 1.5]],
+    "singular": [[1.0, -2.0], [-2.0, 4.0]],
+    "singular to rounding": [[0.1, 0.3], [0.3, 0.9]],
+    "alone": [[0.0, 0.0], [0.0, 2.0]],
+    "nothing": [[0.0, 0.0], [0.0, 0.0]],
+    "a P-matrix that is not monotone": [[1.0, 9.0], [0.0, 1.0]],
+}
+
+
+@pytest.mark.parametrize("kind", MONOTONE)
+def test_medians_solve_every_law_that_is_monotone_and_has_a_solution(kind):
+    rng = np.random.default_rng(7)
+    M = np.array(MONOTONE[kind])
+    count = 3000
+    low = -rng.random((count, 2))
+    up = rng.random((count, 2))
+    q = rng.normal(size=(count, 2))
+    q[:100] = rng.integers(-1, 2, (100, 2))
+    # A solution of a bounded box always exists; of an unbounded one where q was made from it.
+    half = count // 2
+    chosen = np.where(rng.random((half, 2)) < 0.5, low[half:], rng.normal(size=(half, 2)))
+    up[half:] = np.inf
+    chosen = np.maximum(chosen, low[half:])
+    push = np.where(chosen == low[half:], rng.random((half, 2)), 0.0)
+    q[half:] = push - chosen @ M.T
+    found = Medians(jnp.asarray(M))
+    y, _, w = map(np.asarray, jax.jit(jax.vmap(found.solve))(q, low, up))
+    step = np.clip(y - (y @ M.T + q), low, up)
+    size = 1 + np.abs(y).max(axis=1, keepdims=True)
+    assert np.all(np.abs(y - step) <= 1e-12 * size)
+    assert np.all((low <= y) & (y <= up))
+    assert np.all(np.abs(w) <= 1e-12 * size)
+
+
+@pytest.mark.parametrize("way", [Medians, faces])
+def test_the_derivative_is_that_of_the_face_and_a_touching_entry_is_held(way):
     M = np.array([[2.0, 0.7], [-0.3, 1.0]])
-    found = faces(lambda y: jnp.asarray(M) @ y, jnp.zeros(2))
+    found = way(jnp.asarray(M))
     low, up = jnp.full(2, -1.0), jnp.full(2, 1.0)
 
     def slope(q):
@@ -56,6 +101,15 @@ def test_the_derivative_is_that_of_the_face_and_a_touching_entry_is_held():
     # Free and on its bound at once: y₁ = 1 with F₁ = 0.
     touching = -M @ np.array([1.0, -0.5])
     np.testing.assert_allclose(slope(touching), [[0, 0], [0, -1.0]], atol=1e-12)
+    # In M and in the bounds, against differences.
+    q = jnp.array([-9.0, 0.4])
+    for free in (q, jnp.asarray(inside)):
+        of = lambda v: way(v[0]).solve(free, low - v[1], up + v[1]).y  # noqa: B023, E731
+        at, along = (jnp.asarray(M), jnp.zeros(2)), (jnp.ones((2, 2)), jnp.array([1.0, -2.0]))
+        _, pushed = jax.jvp(of, (at,), (along,))
+        there, back = (jax.tree.map(lambda a, b: a + s * b, at, along) for s in (1e-6, -1e-6))  # noqa: B023
+        central = (of(there) - of(back)) / 2e-6
+        np.testing.assert_allclose(np.asarray(pushed), np.asarray(central), atol=1e-8)
 
 
 @pytest.mark.thorough

@@ -16,8 +16,8 @@ from ..problem import Problem
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, Frozen
 from .chords import Chord, NoEnclosure, enclose, is_chord, largest, smallest
-from .faces import Faces
 from .linearised import AbstractLinear, split
+from .written import AbstractWritten
 
 _SMALL = 400
 """Entries of A, up to which one more operation costs more than its arithmetic."""
@@ -43,7 +43,7 @@ class Flow(eqx.Module):
 
     `direct` says that the law has a closed form, so that no guess is needed: it was proved to be
     F(y) = ay − h(t, x, 0), pointwise on a set of pointwise intervals, or with one number a on any set,
-    and y = proj_K(h(t, x, 0)/a); or affine on a box of few unknowns, and `faces` writes it out.
+    and y = proj_K(h(t, x, 0)/a); or affine on a box of few unknowns, and `written` out.
     `reciprocal` is 1/a where a was proved not to depend on t and x, so that it is computed once.
     `enclosed` says that f̃ can be enclosed over a whole step (`chords`), so that nothing about the
     defect is guessed. `linear` is A + J where some J joins A in what is left to the propagator.
@@ -60,7 +60,7 @@ class Flow(eqx.Module):
     tol: Any
     gamma: Any
     L_F: Any
-    faces: Faces | None = None
+    written: AbstractWritten | None = None
     linear: AbstractLinear | None = None
 
     def propagator(self, h: Any, terms: int) -> AbstractPropagator:
@@ -103,8 +103,8 @@ class Flow(eqx.Module):
 
     def _closed_form(self, t: Any, x: Tree) -> Rate:
         problem, args = self.problem, self.args
-        if self.faces is not None:
-            return self._written_out(self.faces, t, x)
+        if self.written is not None:
+            return self._written_out(self.written, t, x)
         drive = problem.h(t, x, problem.zero_control(x), args)
         if self.reciprocal is not None:
             z = jtu.tree_map(jnp.multiply, drive, self.reciprocal)
@@ -119,17 +119,17 @@ class Flow(eqx.Module):
         # With a slope that is not positive the law is not monotone, and this is not its solution.
         return Rate(value, y, z, exact, solved, jnp.asarray(1))
 
-    def _written_out(self, faces: Faces, t: Any, x: Tree) -> Rate:
+    def _written_out(self, written: AbstractWritten, t: Any, x: Tree) -> Rate:
         problem, args = self.problem, self.args
         zero = problem.zero_control(x)
         bounds = problem.set_at(t, args).intervals(zero)
         assert bounds is not None
         q = problem.frozen(t, x, args)(zero)
-        found = faces.solve(q, *bounds)
+        found = written.solve(q, *bounds)
         value = problem.f(t, x, self.operator.inverse(found.y), args)
         residual = problem.spaces(x)[1].norm(found.w)
-        # Where no face has a solution the law has none, or M is singular on all that might.
-        most = jnp.maximum(self.tol, 1e3 * faces.rounding(found.y, q))
+        # Where nothing is found the law has no solution, or is not monotone.
+        most = jnp.maximum(self.tol, 1e3 * written.rounding(found.y, q))
         apart = jnp.abs(found.y - jnp.clip(found.z, *bounds)).ravel()
         solved = jnp.all((jnp.abs(found.w).ravel() <= most) & (apart <= most))
         return Rate(value, found.y, found.z, residual, solved, jnp.asarray(1))

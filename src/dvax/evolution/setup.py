@@ -11,11 +11,13 @@ from .._tree import Tree
 from ..problem import Problem
 from ..sets import AbstractSet
 from ..vi import AbstractSolver, Auto, analyse, independent
-from . import faces
+from . import written
 from .chords import NoEnclosure, constant
+from .faces import faces
 from .flow import Flow, slope
 from .implicit import Implicit
 from .linearised import Nothing
+from .medians import Medians
 from .method import AbstractMethod
 from .picard import Picard
 
@@ -60,9 +62,9 @@ class Setup(NamedTuple):
             solver = vi_solver.choose(frozen, K, like)
         direct = closed and isinstance(vi_solver, Auto)
         operator = problem.operator(args)
-        written = None
-        if not closed and isinstance(vi_solver, Auto) and structure.affine and faces.fits(like):
-            written = self._written_out(frozen, K, like)
+        solved = None
+        if not closed and isinstance(vi_solver, Auto) and structure.affine and written.fits(like):
+            solved = self._written_out(frozen, K, like)
         reciprocal = None
         if direct and independent(lambda t, x: slope(problem, operator, t, x, args), t0, x0):
             reciprocal = jtu.tree_map(jnp.reciprocal, slope(problem, operator, t0, x0, args))
@@ -70,9 +72,9 @@ class Setup(NamedTuple):
                 # One number a part: read from memory once, not once an entry.
                 reciprocal = jtu.tree_map(lambda leaf: leaf.ravel()[0], reciprocal)
         flow = Flow(
-            problem, args, problem.generator(args), operator, solver, direct or written is not None,
+            problem, args, problem.generator(args), operator, solver, direct or solved is not None,
             reciprocal, False, self._tolerance(), self.moduli.get("gamma"), self.moduli.get("L_F"),
-            written,
+            solved,
         )  # fmt: skip
         if isinstance(self.method, AbstractMethod) and self.method.joins:
             flow = dataclasses.replace(flow, linear=Nothing(flow.generator))
@@ -81,13 +83,17 @@ class Setup(NamedTuple):
             return dataclasses.replace(flow, enclosed=True)
         return flow
 
-    def _written_out(self, frozen: Any, K: AbstractSet, like: Tree) -> faces.Faces | None:
-        """The law's faces, where its matrix does not depend on t and x."""
+    def _written_out(
+        self, frozen: Any, K: AbstractSet, like: Tree
+    ) -> written.AbstractWritten | None:
+        """The law written out, where its matrix does not depend on t and x."""
         problem, x0, args, t0 = self.problem, self.x0, as_arrays(self.args), self.number("t0")
         push = lambda t, x: jax.jacfwd(problem.frozen(t, x, args))(like)  # noqa: E731
         if K.intervals(like) is None or not independent(push, t0, x0):
             return None
-        return faces.faces(frozen, like)
+        flat = jnp.zeros_like(like).ravel()
+        M = jax.jacfwd(lambda v: frozen(v.reshape(like.shape)).ravel())(flat)
+        return Medians(M) if like.size == 2 else faces(M)
 
     def _tolerance(self) -> jax.Array:
         """Of the law: a thousandth of what the defect may be, and no less than rounding allows."""
