@@ -20,8 +20,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
+from jax.core import Tracer
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun, new_jaxpr_eqn
+from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, Var, jaxpr_as_fun, new_jaxpr_eqn
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
 
@@ -79,18 +81,37 @@ def in_one_function(run: Callable[..., Any], *args: Any, computed: Any = ()) -> 
 
 def _called(flat: Callable[..., list[Any]], leaves: list[Any], large: list[bool]) -> list[Any]:
     """flat(*leaves), as one function where it is small."""
-    program = jax.make_jaxpr(flat)(*leaves)
-    # What it closes over is handed over like the rest.
-    leaves, large = [*program.consts, *leaves], [False] * len(program.consts) + large
-    jaxpr = program.jaxpr
-    names = jaxpr.debug_info.with_unknown_names()
-    opened = ClosedJaxpr(
-        jaxpr.replace(constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars], debug_info=names),
-        (),
-    )
+    opened, consts = _opened(jax.make_jaxpr(flat)(*leaves))
+    leaves, large = [*consts, *leaves], [False] * len(consts) + large
     if not (_can_pack(_small_ones(leaves, large)) and _is_small(opened)):
         return jaxpr_as_fun(opened)(*leaves)
     return _one_p.bind(*leaves, program=opened, large=tuple(large))
+
+
+def _opened(program: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
+    """The program with what it closes over as its first arguments, equal arrays as one: those that are
+    written out in a user's function are new ones at every call of it."""
+    jaxpr = program.jaxpr
+    first: dict[Any, Any] = {}
+    same = {
+        var: first.setdefault(_value(const), (var, const))
+        for var, const in zip(jaxpr.constvars, program.consts, strict=True)
+    }
+    swap = lambda v: same[v][0] if isinstance(v, Var) and v in same else v  # noqa: E731
+    equations = [eqn.replace(invars=list(map(swap, eqn.invars))) for eqn in jaxpr.eqns]
+    opened = jaxpr.replace(
+        constvars=[], invars=[*(var for var, _ in first.values()), *jaxpr.invars], eqns=equations,
+        outvars=list(map(swap, jaxpr.outvars)), debug_info=jaxpr.debug_info.with_unknown_names(),
+    )  # fmt: skip
+    return ClosedJaxpr(opened, ()), [const for _, const in first.values()]
+
+
+def _value(const: Any) -> Any:
+    """What tells a constant from others: its entries, where they are known."""
+    if isinstance(const, Tracer) or math.prod(jnp.shape(const)) > _LARGEST:
+        return id(const)
+    array = np.asarray(const)
+    return array.dtype.name, array.shape, array.tobytes()
 
 
 def _small_ones(leaves: list[Any], large: Any) -> list[Any]:

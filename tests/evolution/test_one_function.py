@@ -124,6 +124,18 @@ def test_what_is_closed_over_is_handed_over():
     np.testing.assert_allclose(far, 0.5**7 * V)
 
 
+@pytest.mark.parametrize("equal", [True, False])
+def test_arrays_written_into_a_function_are_handed_over_once(equal):
+    # New ones at each of its five places: together they are more than is handed over.
+    def run(v):
+        weights = [np.full(300, 1.0 + (0 if equal else place)) for place in range(5)]
+        return looped(lambda k, v: v * sum(jnp.sin(w)[k] for w in weights) / 5.0)(v)
+
+    assert is_one(compiled(run, V)) == equal
+    rate = np.mean(np.sin(1.0 + (0 if equal else np.arange(5))))
+    np.testing.assert_allclose(compiled(run, V)(V), rate**7 * V, rtol=1e-13)
+
+
 def test_numbers_that_take_the_type_of_what_they_meet_still_do():
     def run(v, scale):
         return jax.lax.fori_loop(0, 7, lambda k, v: v * scale, v)

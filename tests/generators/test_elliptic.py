@@ -104,6 +104,11 @@ def test_differences_are_their_matrix(shape, boundary):
     box = lambda v: jnp.asarray(v.reshape(shape))  # noqa: E731
     close = functools.partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-11)
     close(np.asarray(A.apply(box(x0))).ravel(), matrix @ x0)
+    turned = A.adjoint(spaces.Euclidean(shape))
+    close(np.asarray(turned.apply(box(x0))).ravel(), matrix.T @ x0)
+    close(
+        np.asarray(turned.semigroup(0.7, box(x0))).ravel(), scipy.linalg.expm(0.7 * matrix.T) @ x0
+    )
     close(np.asarray(A.semigroup(0.7, box(x0))).ravel(), scipy.linalg.expm(0.7 * matrix) @ x0)
     flow = A.propagator(0.7, 2).step(box(x0), (box(c0), box(c1)))
     dense = generators.Dense(matrix).propagator(0.7, 2)

@@ -15,6 +15,7 @@ from ..spaces import AbstractSpace
 from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
 from .phi import flow_factors, phi_scalar
 from .scalar import elementwise_bend
+from .stencil import Stencil
 from .transforms import BOUNDARIES, Transform, along, times
 
 
@@ -56,6 +57,7 @@ class Elliptic(AbstractGenerator):
 
     symbol: jax.Array
     transform: Transform
+    stencil: Stencil | None
 
     def __init__(
         self,
@@ -82,8 +84,19 @@ class Elliptic(AbstractGenerator):
             turning = turning - along(c[axis] * odd, axis, len(shape))
         still = all(map(_is_zero, c))
         self.symbol = growing if still else jax.lax.complex(growing, turning)
+        self.stencil = None
+        if scheme == "differences":
+            cells = [side / n for side, n in zip(L, shape, strict=True)]
+            second = tuple(rate / cell**2 for rate, cell in zip(d, cells, strict=True))
+            first = tuple(
+                None if _is_zero(rate) else rate / (2.0 * cell)
+                for rate, cell in zip(c, cells, strict=True)
+            )
+            self.stencil = Stencil(kinds, second, first, r)
 
     def apply(self, v: Tree) -> Tree:
+        if self.stencil is not None:
+            return self.stencil.apply(v)
         return self.transform.backward(times(self.symbol, self.transform.forward(v)))
 
     def propagator(self, h: Any, terms: int) -> "SpectralPropagator":
@@ -106,7 +119,9 @@ class Elliptic(AbstractGenerator):
             "where points weigh differently A* has no constant coefficients",
             "Use a space that weighs them alike",
         )  # fmt: skip
-        return eqx.tree_at(lambda A: A.symbol, self, jnp.conj(self.symbol))
+        stencil = None if self.stencil is None else self.stencil.adjoint()
+        turned = eqx.tree_at(lambda A: A.symbol, self, jnp.conj(self.symbol))
+        return eqx.tree_at(lambda A: A.stencil, turned, stencil, is_leaf=lambda leaf: leaf is None)
 
     def growth(self, space: AbstractSpace) -> Growth:
         # ‖v‖ lies between the roots of the least and the largest weight times the plain norm, in which
