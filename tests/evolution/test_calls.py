@@ -118,3 +118,38 @@ def test_progress_is_shown_when_asked_and_changes_nothing(steps, capfd):
     jax.effects_barrier()
     assert "100.00%" in "".join(capfd.readouterr())
     assert float(shown.xs[0]) == float(silent.xs[0])
+
+
+@pytest.mark.parametrize(
+    ("method", "a_step"), [(dvax.ETD1(), 1), (dvax.ETD2RK(), 2), (dvax.DormandPrince(), 7)]
+)
+def test_evaluations_are_those_of_the_stages(method, a_step):
+    case = c1()
+    sol = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, dt=0.1, method=method)
+    assert int(sol.stats["evaluations"]) == 20 * a_step
+    # Measured, a step has its samples and its end as well, and the next one begins with that.
+    sol = dvax.solve(
+        case.problem, -1.0, 0.0, 2.0, args=case.args, dt=0.1, method=method, measure=True
+    )
+    samples = 0 if sol.enclosed else len(method.samples)
+    assert int(sol.stats["evaluations"]) == 20 * (a_step + samples) + 1
+
+
+def test_a_law_that_is_iterated_is_evaluated_more_often():
+    case = c1()
+    run = dict(args=case.args, dt=0.1)
+    iterated = dvax.solve(
+        case.problem, -1.0, 0.0, 2.0, **run, vi_solver=dvax.vi.ForwardBackwardForward()
+    )
+    assert int(iterated.stats["evaluations"]) > 2 * 40
+
+
+def test_time_to_compile_is_told_from_time_to_run():
+    f = lambda t, x, u, args: 2.5 - 0.5 * x - u  # noqa: E731
+    fresh = problem(f)
+    first, again = (dvax.solve(fresh, -1.0, 0.0, 2.0, rtol=1e-5).stats for _ in range(2))
+    assert first["compile_time"] > 10 * first["run_time"] > 0.0
+    assert again["compile_time"] == 0.0
+    assert 0.0 < again["run_time"] < first["compile_time"]
+    inside = jax.jit(lambda x: dvax.solve(fresh, x, 0.0, 2.0, rtol=1e-5).stats)(-1.0)
+    assert "run_time" not in inside

@@ -6,6 +6,8 @@ apart here, and its solution put together, around the setup itself: what was ask
 """
 
 import math
+import threading
+import time
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -34,6 +36,7 @@ def compiled(setup: Setup, ts: Any, options: Options) -> tuple[Solution, bool | 
         _exactly(leaf) if number is None else None
         for leaf, number in zip(code + data, numbers, strict=True)
     )
+    begun, _clock.compiling = time.perf_counter(), 0.0
     try:
         arrays, reached, shape = _run(numbers, _Kind(code_tree, data_tree, rest, options))
         # One look, through NumPy: through JAX it would be a program of its own.
@@ -43,7 +46,12 @@ def compiled(setup: Setup, ts: Any, options: Options) -> tuple[Solution, bool | 
             # A check within f or h (`eqx.error_if`) is only quoted where Equinox compiles.
             eqx.filter_jit(integrate)(setup, ts, options)
         raise
-    return jtu.tree_unflatten(shape.value, [*arrays, setup]), reached
+    solution = jtu.tree_unflatten(shape.value, [*arrays, setup])
+    if isinstance(reached, bool):
+        compiling = _clock.compiling
+        spent = time.perf_counter() - begun
+        solution.stats.update(compile_time=compiling, run_time=spent - compiling)
+    return solution, reached
 
 
 def _exactly(leaf: Any) -> tuple[Any, ...]:
@@ -71,7 +79,35 @@ class _Kind(NamedTuple):
     options: Options
 
 
+class _Clock(threading.local):
+    """Seconds that this thread has spent on the program of its call until it ran."""
+
+    compiling: float = 0.0
+
+
+_clock = _Clock()
+
+
+def _compiled_for(event: str, duration_secs: float, **_: Any) -> None:
+    if event in _COMPILING:
+        _clock.compiling += duration_secs
+
+
+_COMPILING = tuple(
+    f"/jax/core/compile/{part}_duration" for part in ("jaxpr_to_mlir_module", "backend_compile")
+)
+jax.monitoring.register_event_duration_secs_listener(_compiled_for)
+
+
 def _traced(numbers: list[Any], kind: _Kind) -> tuple[list[Any], jax.Array, _tree.Static]:
+    begun = time.perf_counter()
+    found = _integrated(numbers, kind)
+    # Programs that were compiled meanwhile are in this already.
+    _clock.compiling = time.perf_counter() - begun
+    return found
+
+
+def _integrated(numbers: list[Any], kind: _Kind) -> tuple[list[Any], jax.Array, _tree.Static]:
     leaves = [r[1] if n is None else n for n, r in zip(numbers, kind.rest, strict=True)]
     split = kind.code.num_leaves
     problem, method, vi_solver = jtu.tree_unflatten(kind.code, leaves[:split])

@@ -27,7 +27,7 @@ class Rate(NamedTuple):
     """f̃(t, x) and the law behind it.
 
     `value` = f(t, x, u); y = P u; `z`, whose projection onto K is y (both None where not kept);
-    `residual` = ‖w‖ of the frozen solve; `solved`, whether it met its tolerance; `iterations`.
+    `residual` = ‖w‖ of the frozen solve; `solved`, whether it met its tolerance; `evaluations` of F.
     """
 
     value: Tree
@@ -35,7 +35,7 @@ class Rate(NamedTuple):
     z: Tree | None
     residual: jax.Array
     solved: jax.Array
-    iterations: jax.Array
+    evaluations: jax.Array
 
 
 class Flow(eqx.Module):
@@ -207,7 +207,7 @@ def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
     answer = flow.solver.solve(vi, start, flow.tol)
     value = problem.f(t, x, flow.operator.inverse(answer.y), args)
     solved = answer.result == RESULTS.successful
-    return Rate(value, answer.y, answer.z, answer.residual, solved, answer.iterations)
+    return Rate(value, answer.y, answer.z, answer.residual, solved, answer.evaluations)
 
 
 def slope(problem: Problem, operator: AbstractOperator, t: Any, x: Tree, args: Any) -> Tree:

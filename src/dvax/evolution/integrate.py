@@ -213,6 +213,7 @@ def _solution(
     stats = {
         "steps": end.steps,
         "rejected": end.attempts - end.steps,
+        "evaluations": end.evaluations,
         "t": end.t,
         "x": end.x,
         "next_dt": controller.next_length(end.control),

@@ -66,6 +66,7 @@ class State(NamedTuple):
     result: RESULTS
     steps: Any
     attempts: Any
+    evaluations: Any
     meter: Any
 
 
@@ -137,6 +138,7 @@ class Loop(eqx.Module):
             result=RESULTS.successful,
             steps=jnp.asarray(0),
             attempts=jnp.asarray(0),
+            evaluations=jnp.asarray(0),
             meter=diffrax.TextProgressMeter().init() if self.progress else None,
         )
 
@@ -191,6 +193,7 @@ class Loop(eqx.Module):
             result=verdict.result,
             steps=jnp.where(verdict.kept, state.steps + 1, state.steps),
             attempts=state.attempts + 1,
+            evaluations=state.evaluations + step.evaluations,
             meter=meter,
         )
 

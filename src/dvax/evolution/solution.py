@@ -36,7 +36,9 @@ class Solution(eqx.Module):
     - `settled`: (defect, law_defect) at the start of the step that each saved time lies in;
     - `enclosed`: whether the defect is an enclosure over every step (`dvax.evolution.chords`) or an
       estimate from samples;
-    - `stats`: steps accepted and rejected, and where the run stands: t, x and the next step;
+    - `stats`: steps accepted and rejected, `evaluations` of F in them (without those that look for
+      kinks or read u at saved times), and where the run stands: t, x and the next step; with
+      `compile_time` and `run_time` in seconds, unless the solve is part of a larger compiled program;
     - `result`: `dvax.RESULTS.successful`, or what went wrong;
     - `setup`: what was asked; `records`: the steps, where `dense=True` kept them.
 

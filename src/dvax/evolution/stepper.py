@@ -53,7 +53,7 @@ class Step(NamedTuple):
     ∫ ‖w‖ ds) over the step. `kink(asked)` is the time of the first kink of the response inside, ∞
     where there is none or nobody `asked` (None where nobody looks). `begun` says that the law was
     solved at the start, `solved` that it was everywhere; `finite`, that there are no bad values that a
-    shorter step would not mend.
+    shorter step would not mend; `evaluations` counts those of F.
     """
 
     x1: Tree
@@ -65,6 +65,7 @@ class Step(NamedTuple):
     begun: Any
     solved: Any
     finite: Any
+    evaluations: Any
 
 
 class Sample(NamedTuple):
@@ -198,7 +199,12 @@ class Stepper(eqx.Module):
             None if self.flow.direct else last.y,
         )
         solved = jnp.all(jnp.stack([visit.rate.solved for visit in visits]))
-        return Step(x1, c, error, impulse, kink, after, first.solved, solved, finite)
+        # The first one was made by the step before, unless nothing is kept, or data jumped.
+        counts = [visit.rate.evaluations for visit in visits]
+        own = counts[0] if kept is None else jnp.where(jumped, counts[0], 0)
+        return Step(
+            x1, c, error, impulse, kink, after, first.solved, solved, finite, sum(counts[1:], own)
+        )
 
     def _local(
         self, t0: Any, t1: Any, x0: Tree, factors: Factors | None, guess: Tree | None
