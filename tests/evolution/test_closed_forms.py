@@ -24,6 +24,27 @@ def test_adaptive_steps_reach_nine_digits_at_the_end(name):
     assert np.max(np.abs(np.asarray(sol.us[-1]) - u)) <= 1e-8
 
 
+METHODS = {m.__name__: m() for m in (dvax.ETD4RK, dvax.DormandPrince, dvax.ExpRosenbrock)}
+PAIRS = [(name, method) for name in ALL for method in METHODS]
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    mostly_thorough(PAIRS, [("C1", "DormandPrince"), ("C2", "ETD4RK"), ("C3", "DormandPrince")]),
+)
+def test_no_error_is_ten_times_its_tolerance(name, method):
+    case, ts = ALL[name](), np.linspace(0.0, ALL[name]().t1, 9)
+    exact = np.array([case.exact(t)[0] for t in ts])
+    for rtol in (1e-4, 1e-7, 1e-10):
+        sol = dvax.solve(
+            case.problem, jnp.asarray(case.x0), 0.0, case.t1, args=case.args, ts=ts, rtol=rtol,
+            atol=1e-3 * rtol, method=METHODS[method],
+        )  # fmt: skip
+        error = np.abs(np.asarray(sol.xs) - exact) / np.maximum(np.abs(exact).max(), 1e-3)
+        print(f"{name}, {method}, {rtol:g}: error {error.max():.1e}, {sol.stats['steps']} steps")
+        assert error.max() <= 10 * rtol
+
+
 @pytest.mark.parametrize("name", mostly_thorough(ALL, ["C3"]))
 def test_every_saved_time_is_right_and_every_saved_response_certified(name):
     case = ALL[name]()

@@ -106,7 +106,7 @@ def test_order_five_comes_back_over_kinks_that_nobody_announced():
     assert found > 4.5
 
 
-def test_regimes_and_derivatives_are_those_of_the_closed_form():
+def test_regimes_are_those_of_the_closed_form():
     case = c1()
     sol = dvax.solve(
         case.problem, jnp.asarray(case.x0), 0.0, 2.0, args=case.args, rtol=1e-9, method=METHOD,
@@ -115,6 +115,11 @@ def test_regimes_and_derivatives_are_those_of_the_closed_form():
     times, positive = sol.regimes()
     np.testing.assert_allclose(times, [0.0, *C1_KINKS, 2.0], atol=1e-8)
     assert positive.tolist() == [[True, False], [True, True], [False, True]]
+
+
+@pytest.mark.thorough
+def test_derivatives_are_those_of_the_closed_form():
+    case = c1()
 
     def end(x0, args, adjoint):
         return dvax.solve(
@@ -140,6 +145,7 @@ def test_a_stiff_system_costs_steps_and_no_digits():
     assert 2.0 * 2e3 / 3.4 <= int(sol.stats["steps"]) <= 3.0 * 2.0 * 2e3 / 3.3
 
 
+@pytest.mark.thorough
 def test_a_law_that_is_iterated_and_a_state_of_two_parts():
     turn = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
     coupled = dvax.Problem(
