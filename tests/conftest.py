@@ -60,7 +60,7 @@ hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "test"))
 
 
 _MAPPED = Path("/proc/self/maps")
-_SO_MANY, _AT_MOST = 25, 20_000
+_SO_MANY, _AT_MOST = 25, 40_000
 _TESTS = itertools.count(1)
 
 
