@@ -2,9 +2,11 @@
 
     x' = A x + b(t) + B λ,   w = C x + D λ + e,   −w ∈ N_[lower(t), upper(t)](λ)
 
-by the θ-scheme with θ = ½. What depends on time is tabulated beforehand, b at the middle of each step
-and the bounds at its end, so that a step costs Siconos no call of Python but its own. It runs in the
-Python that has Siconos, needs numpy beside it, and nothing of dvax.
+by the θ-scheme with θ = ½. A relay has one pair of bounds for all its entries, so bounds that differ or
+move are brought to 0 and 1: λ = lower + width μ, in which the matrices move. What depends on time is
+tabulated beforehand, b at the middle of each step and the rest at its end, so that a step costs
+Siconos no call of Python but its own. It runs in the Python that has Siconos, needs numpy beside it,
+and nothing of dvax.
 
     {"do": "build", "race": "heat", "n": 64, "steps": 1000}  ->  {"steps": 1000}
     {"do": "run"}                    ->  {"seconds": ..., "x": [...]}     stepping alone is timed
@@ -94,18 +96,17 @@ class Run:
         # Siconos keeps pointers into these arrays, not references: they must outlive the run.
         self.kept: list[Any] = [a.copy(order="F") for a in data[:6]]
         A, B, C, D, e, x0 = self.kept
-        self.b = data.load(0.0).copy()
-        self.point = kernel.FirstOrderLinearDS(x0, A, self.b)
-        self.point.setbPtr(self.b)
-        relation = kernel.FirstOrderLinearTIR(C, B)
+        self.point = kernel.FirstOrderLinearDS(x0, A, data.load(0.0).copy())
+        if data.box is None:
+            relation = kernel.FirstOrderLinearTIR(C, B)
+            ends = float(data.lower[0]), float(data.upper[0])
+        else:
+            relation = kernel.FirstOrderLinearR(C, B)
+            ends = 0.0, 1.0
         relation.setDPtr(D)
         relation.setePtr(e)
-        self.lower, self.upper = data.lower.copy(), data.upper.copy()
-        size = data.lower.size
-        self.law = kernel.RelayNSL(size, float(data.lower[0]), float(data.upper[0]))
-        self.law.setLb(self.lower)
-        self.law.setUb(self.upper)
-        interaction = kernel.Interaction(self.law, relation)
+        law = kernel.RelayNSL(data.lower.size, *ends)
+        interaction = kernel.Interaction(law, relation)
         system = kernel.NonSmoothDynamicalSystem(0.0, data.end)
         system.insertDynamicalSystem(self.point)
         system.link(interaction, self.point)
@@ -116,27 +117,43 @@ class Run:
         options.dparam[numerics.SICONOS_DPARAM_TOL] = _TOLERANCE
         options.iparam[numerics.SICONOS_IPARAM_MAX_ITER] = 100_000
         self.loop = kernel.TimeStepping(system, grid, scheme, problem)
-        self.kept += [relation, interaction, system, scheme, grid, problem]
+        # These look into the memory that Siconos reads.
+        self.places = [self.point.b()]
+        if data.box is not None:
+            self.places += [relation.B(), relation.C(), relation.D(), relation.e()]
+            self._write(self._row(0))
+        self.kept += [law, relation, interaction, system, scheme, grid, problem]
 
     def run(self) -> float:
         """Seconds for all steps."""
-        step, shift, seconds, box = self.loop.computeOneStep, self.loop.nextStep, 0.0, self.data.box
-        b, law = self.b, self.law
+        step, shift, seconds = self.loop.computeOneStep, self.loop.nextStep, 0.0
         for first in range(0, self.steps, _CHUNK):
-            numbers = range(first, min(first + _CHUNK, self.steps))
-            loads = [self.data.load((k + 0.5) * self.h) for k in numbers]
-            boxes = [box((k + 1) * self.h) for k in numbers] if box else [None] * len(loads)
+            rows = [self._row(k) for k in range(first, min(first + _CHUNK, self.steps))]
             start = time.perf_counter()
-            for load, bounds in zip(loads, boxes, strict=True):
-                b[:] = load
-                if bounds is not None:
-                    self.lower[:], self.upper[:] = bounds
-                    law.setLb(self.lower)
-                    law.setUb(self.upper)
+            for row in rows:
+                self._write(row)
                 step()
                 shift()
             seconds += time.perf_counter() - start
         return seconds
+
+    def _row(self, k: int) -> list[np.ndarray]:
+        """What step number k is made with."""
+        data = self.data
+        load = data.load((k + 0.5) * self.h)
+        if data.box is None:
+            return [load]
+        lower, upper = data.box((k + 1) * self.h)
+        width = upper - lower
+        scaled = width[:, None] * data.D * width
+        return [
+            load + data.B @ lower, data.B * width, width[:, None] * data.C, scaled,
+            width * (data.e + data.D @ lower),
+        ]  # fmt: skip
+
+    def _write(self, row: list[np.ndarray]) -> None:
+        for place, value in zip(self.places, row, strict=True):
+            place[...] = value
 
 
 def main() -> None:
