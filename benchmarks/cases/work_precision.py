@@ -62,7 +62,7 @@ def run(full: bool) -> Section:
             "shows all. dvax and Diffrax are under jax.jit, the end saved alone, with x(0) and rtol "
             "as arguments; scipy calls NumPy. scipy and Diffrax have their law solved by hand. "
             "CasADi's IDAS is given the natural map of the law as an algebraic equation, its "
-            "integrators made beforehand. Siconos steps by θ = ½ with a relay of all unknowns, "
+            "integrators made beforehand. Siconos steps by θ = γ = ½ with a relay of all unknowns, "
             "projected Gauss-Seidel to 1e-13, data in time tabulated beforehand, and its stepping "
             "alone is timed; its settings are half decades of steps from 10. A ball is no relay."
         ),
