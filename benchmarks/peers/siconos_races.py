@@ -2,10 +2,10 @@
 
     x' = A x + b(t) + B λ,   w = C x + D λ + e,   −w ∈ N_[lower(t), upper(t)](λ)
 
-by the scheme with θ = γ = ½. A relay has one pair of bounds for all its entries, so bounds that differ or
-move are brought to 0 and 1: λ = lower + width μ, in which the matrices move. What depends on time is
-tabulated beforehand, at the middle of each step, so that a step costs Siconos no call of Python but its
-own. It runs in the Python that has Siconos, needs numpy beside it, and nothing of dvax.
+by the scheme with θ = γ = ½. A relay has one pair of bounds for all its entries, so bounds that
+differ or move are brought to 0 and 1: λ = lower + width μ, in which the matrices move. What depends on
+time is tabulated beforehand, at the middle of each step, so that a step costs Siconos no call of Python
+but its own. It runs in the Python that has Siconos, needs numpy beside it, and nothing of dvax.
 
     {"do": "build", "race": "heat", "n": 64, "steps": 1000}  ->  {"steps": 1000}
     {"do": "run"}                    ->  {"seconds": ..., "x": [...]}     stepping alone is timed
