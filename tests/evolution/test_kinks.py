@@ -143,6 +143,7 @@ def test_kinks_at_the_same_instant_cost_no_more_than_one():
     assert abs(float(many.xs[0][0]) - exact(z, lambda v: np.minimum(v, 1.0))) <= 1e-6
 
 
+@pytest.mark.thorough
 def test_a_batch_takes_each_of_its_lanes_over_its_own_kinks():
     case = c1()
     starts = jnp.array([-1.0, -0.3, 0.2, 0.9, 1.5])

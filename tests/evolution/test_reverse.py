@@ -92,6 +92,7 @@ def test_checkpoints_take_what_was_set_aside(size):
     assert top >= 16 and between >= 16
 
 
+@pytest.mark.thorough
 def test_the_end_time_and_a_knot_have_derivatives():
     case = c1()
 

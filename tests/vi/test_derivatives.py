@@ -31,6 +31,7 @@ def test_on_a_box_the_free_entries_move_by_the_inverse_of_their_block():
         np.testing.assert_allclose(jacobian(box_solution)(jnp.asarray(Q)), exact, atol=1e-11)
 
 
+@pytest.mark.thorough
 def test_held_entries_follow_their_bound():
     def solution(upper):
         F = lambda y, _: jnp.asarray(M) @ y + jnp.asarray(Q)  # noqa: E731
