@@ -150,7 +150,7 @@ def test_a_law_that_is_iterated_and_a_state_of_two_parts():
     turn = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
     coupled = dvax.Problem(
         A=generators.Product(generators.Scalar(-1.0), generators.Dense(turn)), P=PLAIN,
-         K=dvax.sets.Ball(0.0, 1.0),
+        K=dvax.sets.Ball(0.0, 1.0),
         f=lambda t, x, u, args: (u[0] + 0.1 * x[1][0], u - 0.2 * x[1]),
         h=lambda t, x, u, args: jnp.stack([jnp.cos(t), x[0]]) - jnp.tanh(u) - 0.3 * u[::-1],
         control_space=dvax.spaces.Euclidean(2),
