@@ -27,9 +27,10 @@ def run(full: bool) -> Section:
         fair=(
             "All under jax.jit. The other side is the plain solve of the same problem with the "
             "same steps. Reverse is jax.grad of all six parameters at once; forward is jax.jvp in "
-            "one direction (ℓ). The first error is that of the derivative with respect to ℓ, "
-            "relative, against central differences of the closed form (their own error is about "
-            "1e-10); with fixed steps it is the error of the steps. The second is that "
+            'one direction (ℓ); "x0 alone" is jax.grad of the initial state. The first error is that '
+            "of the derivative with respect to ℓ, or of the sum of that with respect to x0, relative, "
+            "against central differences of the closed form (their own error is about 1e-10); with "
+            "fixed steps it is the error of the steps. The second is that "
             "of x(2), and beside the hand-written scan that of its derivative. That scan is the "
             "fused ETD2RK step under jax.grad with respect to b_x, d_x and ℓ, all its states kept."
         ),
@@ -49,18 +50,21 @@ def _measure(section: Section, law: ContactLaw, settings: dict[str, Any], rounds
     along = {name: jnp.asarray(1.0 if name == "ell" else 0.0) for name in _LETTERS}
     problem, start = _problem(law), jnp.asarray(law.start)
 
-    def end(p: dict[str, Any], adjoint: str) -> Any:
+    def end(p: dict[str, Any], adjoint: str, start: Any = start) -> Any:
         return dvax.solve(
             problem, start, 0.0, _END, p, adjoint=adjoint, max_steps=_MOST_STEPS, **settings
         ).xs[-1]
 
     plain = jax.jit(lambda p: end(p, "reverse"))
     reverse = jax.jit(jax.grad(lambda p: jnp.sum(end(p, "reverse"))))
+    by_start = jax.jit(jax.grad(lambda x: jnp.sum(end(parameters, "reverse", x))))
     forward = jax.jit(lambda p: jax.jvp(lambda q: jnp.sum(end(q, "forward")), (p,), (along,))[1])
 
-    exact = _sum_by_ell(law)
+    exact = _sum_along(law, "ell")
+    exact_by_start = _sum_along(law, "x0")
     errors = {
         "reverse": abs(float(reverse(parameters)["ell"]) / exact - 1.0),
+        "reverse, x0 alone": abs(float(jnp.sum(by_start(start))) / exact_by_start - 1.0),
         "forward": abs(float(forward(parameters)) / exact - 1.0),
     }
     of_x = law.error(plain(parameters), _END)
@@ -72,6 +76,7 @@ def _measure(section: Section, law: ContactLaw, settings: dict[str, Any], rounds
         name: blocked(run)
         for name, run in (("plain", plain), ("reverse", reverse), ("forward", forward))
     }
+    sides["reverse, x0 alone"] = lambda: jax.block_until_ready(by_start(start))
     fixed = "dt" in settings
     if fixed:
         by_hand = hand_fused.gradient(law, settings["dt"], round(_END / settings["dt"]))
@@ -79,7 +84,7 @@ def _measure(section: Section, law: ContactLaw, settings: dict[str, Any], rounds
         error_by_hand = abs(float(by_hand(start)["ell"]) / exact - 1.0)
     taken = in_turn({name: timed(side) for name, side in sides.items()}, rounds)
     steps = f"{round(_END / settings['dt'])} steps" if fixed else f"rtol {settings['rtol']:g}"
-    for name in ("reverse", "forward"):
+    for name in ("reverse", "reverse, x0 alone", "forward"):
         section.comparisons.append(
             compare(f"n = {law.g.size}, {steps}, {name}", "plain solve", taken[name],
                     taken["plain"], error=errors[name], error_other=of_x)
@@ -103,8 +108,10 @@ def _problem(law: ContactLaw) -> dvax.Problem:
     )
 
 
-def _sum_by_ell(law: ContactLaw) -> float:
-    """∂/∂ℓ Σ x(2), by central differences of the closed form."""
-    up = replace(law, ell=law.ell + _DIFFERENCE).exact(_END)
-    down = replace(law, ell=law.ell - _DIFFERENCE).exact(_END)
+def _sum_along(law: ContactLaw, name: str) -> float:
+    """The derivative of Σ x(2) where `name` grows at every point alike, by central differences of the
+    closed form."""
+    at = getattr(law, name)
+    up = replace(law, **{name: at + _DIFFERENCE}).exact(_END)
+    down = replace(law, **{name: at - _DIFFERENCE}).exact(_END)
     return float(np.sum(up - down)) / (2 * _DIFFERENCE)
