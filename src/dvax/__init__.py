@@ -33,7 +33,9 @@ if TYPE_CHECKING:
     from .problem import Problem as Problem
     from .theory import Bound as Bound
     from .theory import Constants as Constants
+    from .theory import Verification as Verification
     from .theory import bound_error as bound_error
+    from .theory import verify as verify
     from .vi import solve_vi as solve_vi
 
 __version__ = "0.1.0"
@@ -54,7 +56,7 @@ _HOMES = {
         "solve",
     ),
     "problem": ("Problem",),
-    "theory": ("Bound", "Constants", "bound_error"),
+    "theory": ("Bound", "Constants", "Verification", "bound_error", "verify"),
     "vi": ("solve_vi",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

@@ -1,6 +1,9 @@
 """The theory as software: constants, stability, the a-posteriori certificate."""
 
+from .assumption import Assumption as Assumption
 from .certificate import Bound as Bound
 from .certificate import bound_error as bound_error
 from .constants import Constants as Constants
 from .constants import Row as Row
+from .verify import Verification as Verification
+from .verify import verify as verify

@@ -188,17 +188,17 @@ def _status_of_structure(problem: Problem, sol: Solution, c: Constants) -> Statu
         (c.norm_P_inv, spectrum.norm_P_inv),
         (spectrum.m_P, c.m_P),
     )
-    if _is_declared(problem.generator(args)) or spectrum.declared or not _tree.is_concrete(covered):
+    if is_declared(problem.generator(args)) or spectrum.declared or not _tree.is_concrete(covered):
         return "declared"
     slack = 1e-9  # what rounding may do to an eigenvalue
     held = [float(a) >= float(b) - slack * abs(float(b)) for a, b in covered]
     return "proved" if all(held) else "declared"
 
 
-def _is_declared(A: AbstractGenerator) -> bool:
+def is_declared(A: AbstractGenerator) -> bool:
     """Whether the growth bound rests on a numerical range that somebody gave."""
     if isinstance(A, Product):
-        return any(map(_is_declared, A.parts))
+        return any(map(is_declared, A.parts))
     return isinstance(A, AbstractMatrixFree) and not A.numerical_range().proved
 
 

@@ -61,7 +61,7 @@ _MIXING = {
 _ELEMENTWISE = {"div", "convert_element_type"}
 _FLAT = _LINEAR | _SUM | _PRODUCT | _POINTWISE | _ELEMENTWISE | {"broadcast_in_dim"}
 CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"}
-_CUSTOM = {"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
+CUSTOM = {"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
 
 
 def analyse(F: Callable[[Tree], Tree], like: Tree) -> Structure:
@@ -136,11 +136,11 @@ def _interpret(
             if name in _FLAT and all(map(is_flat, eqn.invars)):
                 flat.update(eqn.outvars)
             continue
-        if name in CALLS or name in _CUSTOM:
+        if name in CALLS or name in CUSTOM:
             inner = inner_jaxpr(eqn.params)
             if inner is not None and len(inner.jaxpr.invars) == len(given):
                 results = _interpret(inner, given, shapes)
-                if name in _CUSTOM:
+                if name in CUSTOM:
                     # A derivative rule of its own need not be the slope of the values.
                     results = [r and r._replace(degree=2) for r in results]
                 marks.update(zip(eqn.outvars, results, strict=True))

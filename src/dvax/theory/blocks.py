@@ -1,0 +1,191 @@
+"""Derivatives as matrices in the norms of their spaces, many small ones where a law is pointwise."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .._tree import Tree
+from ..spaces import AbstractSpace
+from .slope import MOST, Part, Slope, TooLarge, columns
+
+_DENSE = 2_000
+"""Up to so many rows or columns singular values are computed."""
+
+
+class Block(NamedTuple):
+    """W_q^{1/2} (∂q/∂v) W_v^{-1/2}, W the weights of the spaces, within `radius` of `center`: its
+    Euclidean norm is that from the one space to the other, and its transpose is the adjoint.
+
+    A stack of matrices, shape (points, rows, columns): one matrix, or where entries at different
+    points do not meet, one a point.
+    """
+
+    center: np.ndarray
+    radius: np.ndarray
+
+    @property
+    def T(self) -> "Block":
+        return Block(self.center.swapaxes(1, 2), self.radius.swapaxes(1, 2))
+
+    @property
+    def exact(self) -> bool:
+        return not self.radius.any()
+
+    def __matmul__(self, other: "Block") -> "Block":
+        a, b = alike(self, other)
+        radius = _dot(np.abs(a.center), b.radius) + _dot(a.radius, np.abs(b.center) + b.radius)
+        return Block(a.center @ b.center, radius)
+
+    def plus(self, other: "Block", sign: float = 1.0) -> "Block":
+        a, b = alike(self, other)
+        return Block(a.center + sign * b.center, a.radius + b.radius)
+
+    def times(self, factor: float) -> "Block":
+        return Block(factor * self.center, abs(factor) * self.radius)
+
+    def norm(self) -> float:
+        """sup ‖·‖ over all that lie within the radius: ‖Δ‖₂ ≤ ‖|Δ|‖₂ ≤ ‖radius‖₂."""
+        return float(np.max(_norms(self.center) + self.slack(), initial=0.0))
+
+    def slack(self) -> np.ndarray:
+        """‖radius‖ of every matrix."""
+        return _norms(self.radius)
+
+    def least(self) -> float:
+        """inf ⟨Jd, d⟩/‖d‖²: the least eigenvalue of the symmetric part."""
+        sym = 0.5 * (self.center + self.center.swapaxes(1, 2))
+        spread = Block(0.5 * (self.radius + self.radius.swapaxes(1, 2)), 0 * self.radius)
+        return float(np.min(eigenvalues(sym)[:, 0] - _norms(spread.center), initial=np.inf))
+
+    def greatest(self) -> float:
+        """sup ⟨Jd, d⟩/‖d‖²."""
+        return -self.times(-1.0).least()
+
+
+def identity(like: Block) -> Block:
+    """The identity among matrices like these."""
+    points, rows, _ = like.center.shape
+    eye = np.broadcast_to(np.eye(rows), (points, rows, rows))
+    return Block(eye, np.zeros_like(eye))
+
+
+def alike(a: Block, b: Block) -> tuple[Block, Block]:
+    """Two stacks as stacks of one length."""
+    if len(a.center) == len(b.center):
+        return a, b
+    if len(a.center) == 1 or len(b.center) == 1:
+        return spread_out(a), spread_out(b)
+    raise TooLarge
+
+
+def spread_out(a: Block) -> Block:
+    """One large matrix from a stack of small ones. Entry i of part k is row k·points + i."""
+    points, rows, cols = a.center.shape
+    if points == 1:
+        return a
+    if points * rows > _DENSE or points * cols > _DENSE:
+        raise TooLarge
+
+    def large(stack: np.ndarray) -> np.ndarray:
+        out = np.zeros((rows, points, cols, points))
+        index = np.arange(points)
+        out[:, index, :, index] = stack
+        return out.reshape(1, rows * points, cols * points)
+
+    return Block(large(a.center), large(a.radius))
+
+
+def block(
+    out: Tree,
+    first: int,
+    space_out: AbstractSpace,
+    like_out: Tree,
+    space_in: AbstractSpace,
+    like_in: Tree,
+) -> Block:
+    """∂q/∂v of a tree of slopes q by the parts from `first` on, those of an element v.
+
+    **Raises:** `TooLarge`.
+    """  # fmt: skip
+    slopes: list[Slope] = jtu.tree_leaves(out, is_leaf=lambda v: isinstance(v, Slope))
+    roots_out, roots_in = _roots(space_out, like_out), _roots(space_in, like_in)
+    rows = [[s.parts.get(first + j) for j in range(len(roots_in))] for s in slopes]
+    if _pointwise(rows, roots_out, roots_in):
+        return _stacked(rows, roots_out, roots_in)
+    sizes_out, sizes_in = [r.size for r in roots_out], [r.size for r in roots_in]
+    if max(sum(sizes_out), sum(sizes_in)) > _DENSE or sum(sizes_out) * sum(sizes_in) > MOST:
+        raise TooLarge
+
+    def large(pick: Callable[[Part], np.ndarray]) -> np.ndarray:
+        grid = []
+        for row, out in zip(rows, roots_out, strict=True):
+            line = []
+            for part, into in zip(row, roots_in, strict=True):
+                if part is None:
+                    line.append(np.zeros((out.size, into.size)))
+                    continue
+                full = pick(columns(part, into.size)).reshape(into.size, -1).T
+                line.append(_scaled(full, out[:, None], into[None, :]))
+            grid.append(line)
+        return np.block(grid)[None]
+
+    return Block(large(lambda part: part.center), large(lambda part: part.radius))
+
+
+def _pointwise(rows: list[list[Part | None]], *roots: list[np.ndarray]) -> bool:
+    sizes = {root.size for group in roots for root in group}
+    diagonal = all(part is None or not part.full for row in rows for part in row)
+    return diagonal and len(sizes) == 1
+
+
+def _stacked(
+    rows: list[list[Part | None]], roots_out: list[np.ndarray], roots_in: list[np.ndarray]
+) -> Block:
+    points = roots_out[0].size
+    center, radius = (np.zeros((points, len(rows), len(roots_in))) for _ in range(2))
+    for i, row in enumerate(rows):
+        for j, part in enumerate(row):
+            if part is not None:
+                for stack, values in ((center, part.center), (radius, part.radius)):
+                    stack[:, i, j] = _scaled(values.ravel(), roots_out[i], roots_in[j])
+    return Block(center, radius)
+
+
+def _scaled(values: np.ndarray, out: np.ndarray, into: np.ndarray) -> np.ndarray:
+    """values · out / into, without rounding where the weights are the same."""
+    return values * np.where(out == into, 1.0, out / into)
+
+
+def _roots(space: AbstractSpace, like: Tree) -> list[np.ndarray]:
+    """√wᵢ of every leaf, flat."""
+    weights = space.weights()
+    whole: Any = jtu.tree_map(lambda leaf, w: jnp.broadcast_to(w, leaf.shape), like, weights)
+    return [np.sqrt(np.asarray(w, float)).ravel() for w in jtu.tree_leaves(whole)]
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a @ b of nonnegative matrices with 0 · ∞ = 0."""
+    if np.isfinite(a).all() and np.isfinite(b).all():
+        return a @ b
+    loose = np.isinf(a) * 1.0 @ (b > 0) + (a > 0) * 1.0 @ np.isinf(b)
+    finite = np.where(np.isinf(a), 0.0, a) @ np.where(np.isinf(b), 0.0, b)
+    return np.where(loose > 0, np.inf, finite)
+
+
+def _norms(stack: np.ndarray) -> np.ndarray:
+    """‖·‖₂ of every matrix."""
+    if stack.shape[1:] == (1, 1):
+        return np.abs(stack[:, 0, 0])
+    infinite: np.ndarray = np.any(np.isinf(stack) | np.isnan(stack), axis=(1, 2))
+    if not stack.any():
+        return np.zeros(len(stack))
+    known = np.where(infinite[:, None, None], 0.0, stack)
+    return np.where(infinite, np.inf, np.linalg.norm(known, 2, axis=(1, 2)))
+
+
+def eigenvalues(symmetric: np.ndarray) -> np.ndarray:
+    """Those of every matrix, in order."""
+    return symmetric[:, 0, :1] if symmetric.shape[1:] == (1, 1) else np.linalg.eigvalsh(symmetric)

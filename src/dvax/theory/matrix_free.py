@@ -1,0 +1,114 @@
+"""Moduli of affine data too large to be written out as matrices: by their action, with Lanczos."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .._tree import Tree
+from ..spaces import AbstractSpace
+from ..vi import analyse, independent
+from .lanczos import greatest
+from .system import System
+
+Action = Callable[[np.ndarray], np.ndarray]
+
+
+class Linear:
+    """A linear map between two spaces in coordinates in which their norms are Euclidean."""
+
+    def __init__(
+        self, apply: Callable[[Tree], Tree], space_in: AbstractSpace, like_in: Tree,
+        space_out: AbstractSpace, like_out: Tree,
+    ):  # fmt: skip
+        flat_in, unravel = jax.flatten_util.ravel_pytree(like_in)
+        flat_out, _ = jax.flatten_util.ravel_pytree(like_out)
+        self.size_in, self.size_out = flat_in.size, flat_out.size
+        root_in, root_out = _roots(space_in, like_in), _roots(space_out, like_out)
+
+        def scaled(v: jax.Array) -> jax.Array:
+            out = apply(unravel((v / root_in).astype(flat_in.dtype)))
+            return root_out * jax.flatten_util.ravel_pytree(out)[0]
+
+        transposed = jax.linear_transpose(
+            scaled, jax.ShapeDtypeStruct(flat_in.shape, flat_in.dtype)
+        )
+        self.apply = jax.jit(scaled)
+        self.adjoint = jax.jit(lambda w: transposed(w)[0])
+
+    def norm(self) -> float:
+        """‖J‖, from above."""
+
+        @jax.jit
+        def gram(v: jax.Array) -> jax.Array:
+            return self.adjoint(self.apply(v))
+
+        square = greatest(lambda v: np.asarray(gram(jnp.asarray(v))), self.size_in, least=0.0)
+        return float(np.sqrt(max(square, 0.0)))
+
+    def least(self) -> float:
+        """inf ⟨Jd, d⟩/‖d‖², from below."""
+
+        @jax.jit
+        def minus(v: jax.Array) -> jax.Array:
+            return -0.5 * (self.apply(v) + self.adjoint(v))
+
+        return -greatest(lambda v: np.asarray(minus(jnp.asarray(v))), self.size_in)
+
+
+def _roots(space: AbstractSpace, like: Tree) -> jax.Array:
+    weights = space.weights()
+    whole: Any = jtu.tree_map(lambda leaf, w: jnp.broadcast_to(w, leaf.shape), like, weights)
+    return jnp.sqrt(jax.flatten_util.ravel_pytree(whole)[0])
+
+
+class Affine:
+    """f or h where its code shows that it is affine in x and u, its factors independent of t."""
+
+    def __init__(self, system: System, name: str, t0: float):
+        self.system = system
+        fn = getattr(system.problem, name)
+        self.out = (system.state, system.x0) if name == "f" else (system.control, system.u0)
+        self._at = lambda t, xu: fn(t, *xu, system.args)
+        self.t0 = jnp.asarray(t0, jnp.result_type(float))
+
+    def proved(self) -> bool:
+        """Whether it is."""
+        both = self.system.x0, self.system.u0
+        slope = lambda t: jax.jvp(lambda v: self._at(t, v), (both,), (both,))[1]  # noqa: E731
+        if not independent(slope, self.t0):
+            return False
+        return analyse(lambda flat: self._at(self.t0, flat), both).affine
+
+    def by_state(self) -> Linear:
+        """∂/∂x."""
+        system = self.system
+        zero = jtu.tree_map(jnp.zeros_like, system.u0)
+        return Linear(lambda d: self._push((d, zero)), system.state, system.x0, *self.out)
+
+    def by_response(self) -> Linear:
+        """∂/∂u."""
+        system = self.system
+        return Linear(self.push_response, system.control, system.u0, *self.out)
+
+    def push_response(self, d: Tree) -> Tree:
+        return self._push((jtu.tree_map(jnp.zeros_like, self.system.x0), d))
+
+    def _push(self, d: Tree) -> Tree:
+        both = self.system.x0, self.system.u0
+        return jax.jvp(lambda v: self._at(self.t0, v), (both,), (d,))[1]
+
+
+def frozen(system: System, h: Affine) -> Linear:
+    """∂F/∂y = (I − ∂h/∂u) P⁻¹."""
+    P = system.problem.operator(system.args)
+
+    def push(d: Tree) -> Tree:
+        v = P.inverse(d)
+        return jtu.tree_map(jnp.subtract, v, h.push_response(v))
+
+    return Linear(push, system.control, system.u0, system.control, system.u0)

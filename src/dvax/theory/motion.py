@@ -1,0 +1,219 @@
+"""How the data moves in time: K(t) with its hull and speed, and the values of f and h."""
+
+import itertools
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .._tree import Tree
+from ..errors import InputError
+from ..sets import AbstractSet, Ball, Simplex
+from ..spaces import AbstractSpace
+from .enclosure import Enclosure
+from .slope import Slope, TooLarge, interval, is_slope
+from .system import System
+
+_PIECES = 64
+MOST_KNOTS = 200
+
+
+class Motion(NamedTuple):
+    """K(t) for t0 ≤ t ≤ t1.
+
+    `speed`: ‖proj_{K(s)}z − proj_{K(t)}z‖ ≤ speed |s − t| for every z, between knots; ∞ where that is
+    not known. `low`, `high`: bounds of y ∈ K(t), entry by entry, infinite where there are none.
+    `standing`: that no K(t) is empty is proved. `empty_at`: a time at which it is, or None.
+    """
+
+    speed: float
+    low: Tree
+    high: Tree
+    standing: bool
+    empty_at: float | None
+
+
+def times(t0: float, t1: float, knots: np.ndarray, pieces: int = _PIECES) -> Iterator[Slope]:
+    """[t0, t1] in pieces without a knot inside; data may jump at their ends."""
+    inner = knots[(knots > t0) & (knots < t1)]
+    ends = np.concatenate([[t0], inner, [t1]])
+    each = max(1, pieces // (len(ends) - 1))
+    for a, b in itertools.pairwise(ends):
+        # A few roundings inside: at a knot itself a comparison is undecided.
+        inset = 8 * np.finfo(float).eps * max(abs(a), abs(b))
+        left = a + inset if a > t0 else a
+        right = b - inset if b < t1 else b
+        cuts = np.linspace(left, right, each + 1)
+        for begin, end in itertools.pairwise(cuts):
+            yield interval(begin, end)
+
+
+def motion(system: System, t0: float, t1: float, knots: np.ndarray) -> Motion:
+    """What is known of K(t) over [t0, t1]."""
+    problem, like, args = system.problem, system.u0, system.args
+    free = _free(like)
+    first = problem.set_at(jnp.asarray(t0), args)
+    still = isinstance(problem.K, AbstractSet)
+    empty = _empty_at(system, np.array([t0]) if still else _samples(t0, t1, knots))
+    if _describe(first, like, system.control) is None:
+        # Nothing is known of its shape; of one that stands still, that it was made as a set.
+        return Motion(0.0 if still else np.inf, *free, still and empty is None, empty)
+
+    def described(t: Any) -> Any:
+        found = _describe(problem.set_at(t, args), like, system.control)
+        assert found is not None
+        return found
+
+    if knots.size > MOST_KNOTS:
+        return Motion(np.inf, *free, False, empty)
+    low, high, speed, standing = free[1], free[0], 0.0, True
+    try:
+        enclosure = Enclosure(described, (jnp.zeros(()),), (0,))
+        for piece in times(t0, t1, knots, 1 if still else _PIECES):
+            (down, up, moves, gap), _ = enclosure(piece)
+            low, high = _least(low, down), _most(high, up)
+            speed = max(speed, _speed(moves, system.control, like))
+            standing &= all(bool((v.low >= 0).all()) for v in slopes(gap))
+    except TooLarge:
+        return Motion(np.inf, *free, False, empty)
+    return Motion(speed, low, high, standing and empty is None, empty)
+
+
+def _describe(
+    K: AbstractSet, like: Tree, space: AbstractSpace
+) -> tuple[Tree, Tree, Tree, Tree] | None:
+    """(low, high) of a box around K, what its projection moves by, and gaps that are ≥ 0 where K is not
+    empty; None for a set whose shape is not known here."""
+    bounds = K.intervals(like)
+    if bounds is not None:
+        low, high = bounds
+        return low, high, _Either(low, high), jtu.tree_map(jnp.subtract, high, low)
+    if isinstance(K, Ball) and not isinstance(like, tuple):
+        reach = K.radius / jnp.sqrt(jnp.broadcast_to(space.weights(), like.shape))
+        center = jnp.broadcast_to(K.center, like.shape)
+        return center - reach, center + reach, _Sum(center, (K.radius,)), K.radius
+    if isinstance(K, Simplex) and not isinstance(like, tuple) and K.blocks is None:
+        total = jnp.broadcast_to(K.total[..., None], like.shape)
+        heaviest = jnp.sqrt(jnp.max(space.weights()))
+        moves = _Sum(jnp.zeros_like(like), (heaviest * K.total,))
+        return jnp.zeros_like(like), total, moves, K.total
+    return None
+
+
+class _Either(NamedTuple):
+    """The projection moves no faster than the faster of the two, entry by entry."""
+
+    low: Tree
+    high: Tree
+
+
+class _Sum(NamedTuple):
+    """The projection moves no faster than the element and the numbers together."""
+
+    element: Tree
+    numbers: tuple[Any, ...]
+
+
+def _speed(moves: Any, space: AbstractSpace, like: Tree) -> float:
+    roots = [np.sqrt(np.asarray(w, float)) for w in jtu.tree_leaves(_whole(space, like))]
+
+    def fast(x: Slope) -> np.ndarray:
+        part = x.parts.get(0)
+        if part is None:
+            return np.zeros(x.low.shape)
+        return (np.abs(part.center) + part.radius).reshape(x.low.shape)
+
+    def norm(entries: list[np.ndarray]) -> float:
+        return float(
+            np.sqrt(sum(np.sum((r * e) ** 2) for r, e in zip(roots, entries, strict=True)))
+        )
+
+    if isinstance(moves, _Either):
+        pairs = zip(slopes(moves.low), slopes(moves.high), strict=True)
+        # A bound at infinity does not move.
+        return norm([np.maximum(_finite(a, fast(a)), _finite(b, fast(b))) for a, b in pairs])
+    return norm([fast(v) for v in slopes(moves.element)]) + sum(
+        float(np.sum(fast(v))) for v in slopes(moves.numbers)
+    )
+
+
+def _finite(x: Slope, speed: np.ndarray) -> np.ndarray:
+    never = (x.low == x.high) & np.isinf(x.low)
+    return np.where(never, 0.0, speed)
+
+
+def _empty_at(system: System, samples: np.ndarray) -> float | None:
+    """A time at which K says of itself that it is empty."""
+    for t in samples:
+        try:
+            system.problem.set_at(jnp.asarray(t), system.args).check(system.u0)
+        except InputError:
+            return float(t)
+    return None
+
+
+def _samples(t0: float, t1: float, knots: np.ndarray) -> np.ndarray:
+    return np.unique(np.concatenate([np.linspace(t0, t1, 17), knots[:MOST_KNOTS]]))
+
+
+def finite_and_steady(
+    fn: Callable[[Any], Tree], t0: float, t1: float, knots: np.ndarray
+) -> tuple[bool, float]:
+    """Whether fn's code shows that it is bounded on [t0, t1], and the largest speed of an entry."""
+    if knots.size > MOST_KNOTS:
+        return False, np.inf
+    try:
+        enclosure = Enclosure(fn, (jnp.zeros(()),), (0,))
+        bounded, speed = True, 0.0
+        for piece in times(t0, t1, knots):
+            for x in slopes(enclosure(piece).out):
+                bounded &= bool(np.isfinite(x.low).all() and np.isfinite(x.high).all())
+                part = x.parts.get(0)
+                if part is not None:
+                    speed = max(
+                        speed, float(np.max(np.abs(part.center) + part.radius, initial=0.0))
+                    )
+    except TooLarge:
+        return False, np.inf
+    return bounded, speed
+
+
+def jumps(fn: Callable[[Any], Tree], knots: np.ndarray) -> tuple[float, float] | None:
+    """The knot at which fn(t) jumps most, and by how much; None where it does not."""
+    worst = None
+    for knot in knots[:MOST_KNOTS]:
+        inset = 64 * np.finfo(float).eps * max(abs(knot), 1e-300)
+        before, after = (
+            np.concatenate(
+                [np.ravel(v) for v in jtu.tree_leaves(fn(jnp.asarray(knot + s * inset)))]
+            )
+            for s in (-1, 1)
+        )
+        gap = float(np.max(np.abs(after - before), initial=0.0))
+        scale = float(np.max(np.abs(after) + np.abs(before), initial=0.0))
+        if gap > 1e-9 * scale and (worst is None or gap > worst[1]):
+            worst = float(knot), gap
+    return worst
+
+
+def _free(like: Tree) -> tuple[Tree, Tree]:
+    end = lambda v: jtu.tree_map(lambda leaf: np.full(leaf.shape, v), like)  # noqa: E731
+    return end(-np.inf), end(np.inf)
+
+
+def _least(a: Tree, b: Tree) -> Tree:
+    return jtu.tree_map(lambda s, v: np.minimum(v, s.low), b, a, is_leaf=is_slope)
+
+
+def _most(a: Tree, b: Tree) -> Tree:
+    return jtu.tree_map(lambda s, v: np.maximum(v, s.high), b, a, is_leaf=is_slope)
+
+
+def slopes(tree: Tree) -> list[Slope]:
+    return jtu.tree_leaves(tree, is_leaf=is_slope)
+
+
+def _whole(space: AbstractSpace, like: Tree) -> Tree:
+    return jtu.tree_map(lambda leaf, w: jnp.broadcast_to(w, leaf.shape), like, space.weights())

@@ -1,0 +1,91 @@
+"""A problem's data as matrices: the derivatives of f and h over a region, P⁻¹ and A."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .._tree import Tree
+from ..problem import Problem
+from .blocks import Block, block, identity
+from .enclosure import Enclosure
+from .region import Region
+from .slope import TooLarge, interval
+
+
+class Jacobians(NamedTuple):
+    """∂f/∂x, ∂f/∂u, ∂h/∂x, ∂h/∂u over a region, in the norms of the spaces; None where too large to be
+    written out. `unknown`: the operations in f and in h that nothing is known about."""
+
+    f_x: Block | None
+    f_u: Block | None
+    h_x: Block | None
+    h_u: Block | None
+    unknown: dict[str, tuple[str, ...]]
+
+
+class System:
+    """The data of a problem at one parameter, as matrices in the norms of its spaces."""
+
+    def __init__(self, problem: Problem, x0: Tree, args: Any):
+        self.problem, self.args = problem, args
+        self.x0, self.u0 = x0, problem.zero_control(x0)
+        self.state, self.control = problem.spaces(x0)
+        time = jnp.zeros(())
+        self._f, self._h = (
+            Enclosure(lambda t, x, u, fn=fn: fn(t, x, u, args), (time, self.x0, self.u0), (1, 2))
+            for fn in (problem.f, problem.h)
+        )
+        P = problem.operator(args)
+        self.spectrum = P.spectrum(self.control)
+        self.growth = problem.generator(args).growth(self.state)
+        self.P = self._of_linear(P.apply, self.control, self.u0)
+        self.P_inv = self._of_linear(P.inverse, self.control, self.u0)
+        self.A = self._of_linear(problem.generator(args).apply, self.state, self.x0)
+
+    def at(self, region: Region) -> Jacobians:
+        """Over this region."""
+        parts = len(jtu.tree_leaves(self.x0))
+        blocks: list[Block | None] = []
+        unknown: dict[str, tuple[str, ...]] = {}
+        for name, enclosure, space, like in (
+            ("f", self._f, self.state, self.x0),
+            ("h", self._h, self.control, self.u0),
+        ):
+            try:
+                out, unknown[name] = enclosure(*region)
+            except TooLarge:
+                blocks += [None, None]
+                unknown[name] = ()
+                continue
+            blocks.append(_if_small(out, 0, space, like, self.state, self.x0))
+            blocks.append(_if_small(out, parts, space, like, self.control, self.u0))
+        f_x, f_u, h_x, h_u = blocks
+        return Jacobians(f_x, f_u, h_x, h_u, unknown)
+
+    def frozen(self, h_u: Block) -> Block:
+        """∂F/∂y = (I − ∂h/∂u) P⁻¹ (eq:F_def)."""
+        if self.P_inv is None:
+            raise TooLarge
+        return identity(h_u).plus(h_u, -1.0) @ self.P_inv
+
+    def _of_linear(self, apply: Callable[[Tree], Tree], space: Any, like: Tree) -> Block | None:
+        """The matrix of a linear map; None where its code does not show it or it is too large."""
+        anywhere = jtu.tree_map(
+            lambda leaf: interval(np.full(leaf.shape, -np.inf), np.full(leaf.shape, np.inf)), like
+        )
+        try:
+            out, unknown = Enclosure(apply, (like,), (0,))(anywhere)
+            found = block(out, 0, space, like, space, like)
+        except TooLarge:
+            return None
+        return found if not unknown and found.exact else None
+
+
+def _if_small(*given: Any) -> Block | None:
+    try:
+        return block(*given)
+    except TooLarge:
+        return None

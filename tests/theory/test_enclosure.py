@@ -1,0 +1,132 @@
+"""Slope arithmetic encloses values and difference quotients, on every operation that it has a rule for."""
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import pytest
+
+from dvax.theory.enclosure import Enclosure
+from dvax.theory.slope import TooLarge, interval
+
+M = jnp.asarray(np.random.default_rng(0).normal(size=(3, 3)))
+
+# (function of a vector of three, the box that its entries are drawn from)
+FUNCTIONS = {
+    "linear": (lambda v: M @ v - 2.0 * v + 1.0, (-3.0, 3.0)),
+    "products": (lambda v: v * v[::-1] * v - v**3, (-2.0, 2.0)),
+    "quotient": (lambda v: v / (2.0 + v[0] ** 2) + 1.0 / (3.0 + v), (-2.0, 2.0)),
+    "powers": (lambda v: v**2 + v**5 + (3.0 + v) ** -2 + (3.0 + v) ** 1.5, (-2.0, 2.0)),
+    "roots": (lambda v: jnp.sqrt(3.0 + v) + jax.lax.rsqrt(3.0 + v), (-2.0, 2.0)),
+    "exponentials": (lambda v: jnp.exp(v) + jnp.expm1(-v) + jnp.exp2(v), (-2.0, 1.0)),
+    "logarithms": (lambda v: jnp.log(3.0 + v) + jnp.log1p(2.5 + v), (-2.0, 2.0)),
+    "waves": (lambda v: jnp.sin(3.0 * v) * jnp.cos(v - 1.0), (-4.0, 4.0)),
+    "hyperbolic": (lambda v: jnp.sinh(v) - jnp.cosh(v) + jnp.tanh(v) + jnp.arcsinh(v), (-2.0, 2.0)),
+    "bounded": (lambda v: jax.nn.sigmoid(v) + jnp.arctan(v) + jax.scipy.special.erf(v), (-3.0, 3.0)),
+    "kinks": (lambda v: jnp.abs(v) + jnp.maximum(v, 0.5) - jnp.minimum(v, v[::-1]), (-2.0, 2.0)),
+    "clipped": (lambda v: jnp.clip(2.0 * v, -1.0, 1.0) + jax.nn.relu(v), (-2.0, 2.0)),
+    "softplus": (lambda v: jax.nn.softplus(v), (-2.0, 2.0)),
+    "steps that it does not meet": (lambda v: v * jnp.sign(v) + jnp.floor(0.1 * v), (0.5, 2.0)),
+    "a choice that is made": (lambda v: jnp.where((v > 0) & ~(v > 9.0), v**2, -v), (0.1, 2.0)),
+    "largest": (lambda v: v - jnp.max(v) + jnp.min(v * v), (-2.0, 2.0)),
+    "moved about": (
+        lambda v: jnp.concatenate([v[1:], v[:1]]) * jnp.stack([v[0], v[2], 1.0]) + jnp.cumsum(v),
+        (-2.0, 2.0),
+    ),
+    "sums": (lambda v: jnp.sum(v.reshape(3, 1) * M, axis=0) + jnp.linalg.norm(v + 9.0), (-2.0, 2.0)),
+    "two vectors": (lambda v: jnp.outer(v, jnp.sin(v)) @ v, (-2.0, 2.0)),
+    "picked": (lambda v: v[jnp.array([2, 0, 0])] + jnp.eye(3)[1] * v, (-2.0, 2.0)),
+    "called": (lambda v: jax.jit(lambda w: w * jnp.tanh(w))(v), (-2.0, 2.0)),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_values_and_difference_quotients_are_enclosed(name):
+    fn, (low, high) = FUNCTIONS[name]
+    enclosure = Enclosure(fn, (jnp.zeros(3),), (0,))
+    rng = np.random.default_rng(1)
+    both = jax.jit(jax.vmap(fn))
+    for _ in range(30):
+        a, b = np.sort(rng.uniform(low, high, (2, 3)), axis=0)
+        out, unknown = enclosure(interval(a, b))
+        assert unknown == ()
+        points = rng.uniform(a, b, (50, 3))
+        points[0], points[1] = a, b
+        values = np.asarray(both(points))
+        slack = 1e-12 * (1.0 + np.abs(values))
+        assert np.all(values >= out.low - slack) and np.all(values <= out.high + slack)
+        part = out.parts[0]
+        center, radius = part.center, part.radius
+        if not part.full:
+            center, radius = np.diag(center), np.diag(radius)
+        # From one point to another the change is J d for one J within the radius of the center.
+        d = points[1:] - points[:-1]
+        change = values[1:] - values[:-1]
+        reach = np.abs(d) @ radius.reshape(3, -1)
+        gap = np.abs(change.reshape(len(d), -1) - d @ center.reshape(3, -1))
+        assert np.all(gap <= reach + 1e-11 * (1.0 + np.abs(values).max()))
+
+
+@pytest.mark.parametrize(
+    "fn",
+    [
+        lambda v: jnp.where(v > 0, 1.0, 0.0),
+        lambda v: jnp.sign(v),
+        lambda v: jnp.floor(v),
+        lambda v: (v > 0.3).astype(float),
+        lambda v: jnp.where(v > -v, 1.0, 0.0),
+        lambda v: jnp.where(jnp.sum(v) > 0.1, v, 2.0 * v),
+        lambda v: jnp.sqrt(jnp.abs(v)),
+        lambda v: 1.0 / v,
+        lambda v: jnp.log(v),
+        lambda v: jnp.round(3.0 * v),
+        lambda v: jnp.sort(v),
+    ],
+)
+def test_what_may_jump_or_has_no_rule_is_not_bounded(fn):
+    out, _ = Enclosure(fn, (jnp.zeros(3),), (0,))(interval(-np.ones(3), np.ones(3)))
+    assert np.isinf(out.parts[0].radius).any()
+
+
+def test_an_operation_without_a_rule_is_named():
+    enclosed = Enclosure(jnp.sort, (jnp.zeros(3),), (0,))(interval(-np.ones(3), np.ones(3)))
+    assert enclosed.unknown == ("sort",)
+
+
+def test_what_is_not_differentiated_leaves_no_trace():
+    load = jnp.linspace(0.0, 1.0, 11)
+    fn = lambda t, v: v * 2.0 + jnp.interp(t, load, load**2)  # noqa: E731
+    out, unknown = Enclosure(fn, (jnp.zeros(()), jnp.zeros(3)), (1,))(
+        interval(0.0, 1.0), interval(-np.inf * np.ones(3), np.inf * np.ones(3))
+    )
+    assert unknown and out.parts[0].radius.max() == 0.0 and np.all(out.parts[0].center == 2.0)
+
+
+def test_affine_functions_of_everything_are_exact():
+    everywhere = interval(np.full(3, -np.inf), np.full(3, np.inf))
+    out, _ = Enclosure(lambda v: M @ v[::-1] + 1.0, (jnp.zeros(3),), (0,))(everywhere)
+    assert not out.parts[0].radius.any()
+    np.testing.assert_array_equal(out.parts[0].center.T, np.asarray(M)[:, ::-1])
+
+
+def test_a_pointwise_law_on_many_points_needs_no_matrix():
+    n = 100_000
+    everywhere = interval(np.full(n, -np.inf), np.full(n, np.inf))
+    g = jnp.linspace(0.0, 1.0, n)
+    fn = lambda v: jnp.tanh(g * v) - jnp.clip(v, 0.0, 1.0)  # noqa: E731
+    part = Enclosure(fn, (jnp.zeros(n),), (0,))(everywhere).out.parts[0]
+    assert not part.full
+    assert (part.center + part.radius).max() == pytest.approx(1.0)
+    assert (part.center - part.radius).min() == pytest.approx(-1.0)
+    with pytest.raises(TooLarge):
+        Enclosure(lambda v: v - jnp.sum(v), (jnp.zeros(n),), (0,))(everywhere)
+
+
+def test_pieces_of_a_region_sharpen_what_is_known_of_it():
+    fn = lambda v: v * (1.0 - v)  # noqa: E731
+    enclosure = Enclosure(fn, (jnp.zeros(()),), (0,))
+    whole = enclosure(interval(0.0, 1.0)).out
+    halves = [enclosure(interval(a, a + 0.5)).out for a in (0.0, 0.5)]
+    assert whole.high == pytest.approx(1.0)
+    assert max(float(h.high) for h in halves) == pytest.approx(0.5)
+    assert all(jtu.tree_leaves(h.parts[0].radius)[0] <= whole.parts[0].radius for h in halves)
