@@ -1,4 +1,4 @@
-"""Slope arithmetic encloses values and difference quotients, on every operation that it has a rule for."""
+"""Slope arithmetic encloses values and difference quotients, for every operation that it knows."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,10 @@ FUNCTIONS = {
     "logarithms": (lambda v: jnp.log(3.0 + v) + jnp.log1p(2.5 + v), (-2.0, 2.0)),
     "waves": (lambda v: jnp.sin(3.0 * v) * jnp.cos(v - 1.0), (-4.0, 4.0)),
     "hyperbolic": (lambda v: jnp.sinh(v) - jnp.cosh(v) + jnp.tanh(v) + jnp.arcsinh(v), (-2.0, 2.0)),
-    "bounded": (lambda v: jax.nn.sigmoid(v) + jnp.arctan(v) + jax.scipy.special.erf(v), (-3.0, 3.0)),
+    "bounded": (
+        lambda v: jax.nn.sigmoid(v) + jnp.arctan(v) + jax.scipy.special.erf(v),
+        (-3.0, 3.0),
+    ),
     "kinks": (lambda v: jnp.abs(v) + jnp.maximum(v, 0.5) - jnp.minimum(v, v[::-1]), (-2.0, 2.0)),
     "clipped": (lambda v: jnp.clip(2.0 * v, -1.0, 1.0) + jax.nn.relu(v), (-2.0, 2.0)),
     "softplus": (lambda v: jax.nn.softplus(v), (-2.0, 2.0)),
@@ -33,7 +36,10 @@ FUNCTIONS = {
         lambda v: jnp.concatenate([v[1:], v[:1]]) * jnp.stack([v[0], v[2], 1.0]) + jnp.cumsum(v),
         (-2.0, 2.0),
     ),
-    "sums": (lambda v: jnp.sum(v.reshape(3, 1) * M, axis=0) + jnp.linalg.norm(v + 9.0), (-2.0, 2.0)),
+    "sums": (
+        lambda v: jnp.sum(v.reshape(3, 1) * M, axis=0) + jnp.linalg.norm(v + 9.0),
+        (-2.0, 2.0),
+    ),
     "two vectors": (lambda v: jnp.outer(v, jnp.sin(v)) @ v, (-2.0, 2.0)),
     "picked": (lambda v: v[jnp.array([2, 0, 0])] + jnp.eye(3)[1] * v, (-2.0, 2.0)),
     "called": (lambda v: jax.jit(lambda w: w * jnp.tanh(w))(v), (-2.0, 2.0)),

@@ -9,7 +9,7 @@ import numpy as np
 
 from .._tree import Tree
 from ..spaces import AbstractSpace
-from .slope import MOST, Part, Slope, TooLarge, columns
+from .slope import MOST, Part, Slope, TooLarge, Values, columns, is_slope
 
 _DENSE = 2_000
 """Up to so many rows or columns singular values are computed."""
@@ -23,8 +23,8 @@ class Block(NamedTuple):
     points do not meet, one a point.
     """
 
-    center: np.ndarray
-    radius: np.ndarray
+    center: Values
+    radius: Values
 
     @property
     def T(self) -> "Block":
@@ -50,15 +50,15 @@ class Block(NamedTuple):
         """sup ‖·‖ over all that lie within the radius: ‖Δ‖₂ ≤ ‖|Δ|‖₂ ≤ ‖radius‖₂."""
         return float(np.max(_norms(self.center) + self.slack(), initial=0.0))
 
-    def slack(self) -> np.ndarray:
+    def slack(self) -> Values:
         """‖radius‖ of every matrix."""
         return _norms(self.radius)
 
     def least(self) -> float:
         """inf ⟨Jd, d⟩/‖d‖²: the least eigenvalue of the symmetric part."""
         sym = 0.5 * (self.center + self.center.swapaxes(1, 2))
-        spread = Block(0.5 * (self.radius + self.radius.swapaxes(1, 2)), 0 * self.radius)
-        return float(np.min(eigenvalues(sym)[:, 0] - _norms(spread.center), initial=np.inf))
+        spread = _norms(0.5 * (self.radius + self.radius.swapaxes(1, 2)))
+        return float(np.min(eigenvalues(sym)[:, 0] - spread, initial=np.inf))
 
     def greatest(self) -> float:
         """sup ⟨Jd, d⟩/‖d‖²."""
@@ -89,7 +89,7 @@ def spread_out(a: Block) -> Block:
     if points * rows > _DENSE or points * cols > _DENSE:
         raise TooLarge
 
-    def large(stack: np.ndarray) -> np.ndarray:
+    def large(stack: Values) -> Values:
         out = np.zeros((rows, points, cols, points))
         index = np.arange(points)
         out[:, index, :, index] = stack
@@ -98,20 +98,13 @@ def spread_out(a: Block) -> Block:
     return Block(large(a.center), large(a.radius))
 
 
-def block(
-    out: Tree,
-    first: int,
-    space_out: AbstractSpace,
-    like_out: Tree,
-    space_in: AbstractSpace,
-    like_in: Tree,
-) -> Block:
-    """∂q/∂v of a tree of slopes q by the parts from `first` on, those of an element v.
+def block(out: Tree, first: int, roots_out: list[Values], roots_in: list[Values]) -> Block:
+    """∂q/∂v of a tree of slopes q by the parts from `first` on, those of an element v, with the
+    `roots` of the weights of both.
 
     **Raises:** `TooLarge`.
-    """  # fmt: skip
-    slopes: list[Slope] = jtu.tree_leaves(out, is_leaf=lambda v: isinstance(v, Slope))
-    roots_out, roots_in = _roots(space_out, like_out), _roots(space_in, like_in)
+    """
+    slopes: list[Slope] = jtu.tree_leaves(out, is_leaf=is_slope)
     rows = [[s.parts.get(first + j) for j in range(len(roots_in))] for s in slopes]
     if _pointwise(rows, roots_out, roots_in):
         return _stacked(rows, roots_out, roots_in)
@@ -119,7 +112,7 @@ def block(
     if max(sum(sizes_out), sum(sizes_in)) > _DENSE or sum(sizes_out) * sum(sizes_in) > MOST:
         raise TooLarge
 
-    def large(pick: Callable[[Part], np.ndarray]) -> np.ndarray:
+    def large(pick: Callable[[Part], Values]) -> Values:
         grid = []
         for row, out in zip(rows, roots_out, strict=True):
             line = []
@@ -135,14 +128,14 @@ def block(
     return Block(large(lambda part: part.center), large(lambda part: part.radius))
 
 
-def _pointwise(rows: list[list[Part | None]], *roots: list[np.ndarray]) -> bool:
+def _pointwise(rows: list[list[Part | None]], *roots: list[Values]) -> bool:
     sizes = {root.size for group in roots for root in group}
     diagonal = all(part is None or not part.full for row in rows for part in row)
     return diagonal and len(sizes) == 1
 
 
 def _stacked(
-    rows: list[list[Part | None]], roots_out: list[np.ndarray], roots_in: list[np.ndarray]
+    rows: list[list[Part | None]], roots_out: list[Values], roots_in: list[Values]
 ) -> Block:
     points = roots_out[0].size
     center, radius = (np.zeros((points, len(rows), len(roots_in))) for _ in range(2))
@@ -154,19 +147,19 @@ def _stacked(
     return Block(center, radius)
 
 
-def _scaled(values: np.ndarray, out: np.ndarray, into: np.ndarray) -> np.ndarray:
+def _scaled(values: Values, out: Values, into: Values) -> Values:
     """values · out / into, without rounding where the weights are the same."""
     return values * np.where(out == into, 1.0, out / into)
 
 
-def _roots(space: AbstractSpace, like: Tree) -> list[np.ndarray]:
+def roots(space: AbstractSpace, like: Tree) -> list[Values]:
     """√wᵢ of every leaf, flat."""
     weights = space.weights()
     whole: Any = jtu.tree_map(lambda leaf, w: jnp.broadcast_to(w, leaf.shape), like, weights)
     return [np.sqrt(np.asarray(w, float)).ravel() for w in jtu.tree_leaves(whole)]
 
 
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _dot(a: Values, b: Values) -> Values:
     """a @ b of nonnegative matrices with 0 · ∞ = 0."""
     if np.isfinite(a).all() and np.isfinite(b).all():
         return a @ b
@@ -175,17 +168,17 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.where(loose > 0, np.inf, finite)
 
 
-def _norms(stack: np.ndarray) -> np.ndarray:
+def _norms(stack: Values) -> Values:
     """‖·‖₂ of every matrix."""
     if stack.shape[1:] == (1, 1):
         return np.abs(stack[:, 0, 0])
-    infinite: np.ndarray = np.any(np.isinf(stack) | np.isnan(stack), axis=(1, 2))
+    infinite: Values = np.any(np.isinf(stack) | np.isnan(stack), axis=(1, 2))
     if not stack.any():
         return np.zeros(len(stack))
     known = np.where(infinite[:, None, None], 0.0, stack)
     return np.where(infinite, np.inf, np.linalg.norm(known, 2, axis=(1, 2)))
 
 
-def eigenvalues(symmetric: np.ndarray) -> np.ndarray:
+def eigenvalues(symmetric: Values) -> Values:
     """Those of every matrix, in order."""
     return symmetric[:, 0, :1] if symmetric.shape[1:] == (1, 1) else np.linalg.eigvalsh(symmetric)

@@ -61,17 +61,24 @@ def knowledge(system: System, region: Region, box: Region, declared: dict[str, f
             known[name] = Known(value, "proved", how)
         else:
             least = steepest(system, box, of, by)
-            known[name] = _searched(least, declared.get(name), box, how)
+            known[name] = _searched(least, declared.get(name), box, _because(found, of, how))
     known["L_F"] = _of_frozen(system, found, known["beta_h"], declared)
     divided = _divided(system, region)
     gamma, how = found.gamma
     if divided is not None and divided.gamma > gamma:
         gamma, how = divided.gamma, divided.how
+    how = how if gamma > 0 else _because(found, "h", how)
     known["gamma"], pair = _gamma(system, gamma, how, box, declared)
     if known["gamma"].value > known["L_F"].value and known["L_F"].status == "estimated":
         known["L_F"] = known["L_F"]._replace(value=known["gamma"].value)
     exact = found.beta_h.how in ("entries", "singular values")
     return Knowledge(known, divided, pair, exact)
+
+
+def _because(found: Moduli, of: str, how: str) -> str:
+    """Why there is no proof."""
+    names = found.unknown[of]
+    return f"{of} uses {', '.join(names)}, without a rule" if names else how
 
 
 def _searched(least: float, given: float | None, box: Region, how: str) -> Known:

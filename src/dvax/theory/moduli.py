@@ -14,8 +14,11 @@ from .region import Region
 from .slope import TooLarge
 from .system import Jacobians, System
 
-PIECES = 48
+PIECES = 40
 """Into so many pieces a region is cut, where that makes an enclosure sharper."""
+
+_PATIENCE, _GAIN = 8, 1e-3
+"""After so many cuts the bound must be smaller by this share, or the region stays whole."""
 
 _SMALL = 16
 """Up to so many entries of t, x and u together a region is cut at all."""
@@ -104,8 +107,10 @@ class Pieces:
             return value
         order = itertools.count()
         waiting = [(-value, next(order), self.region)]
-        for _ in range(PIECES):
+        for cut in range(PIECES):
             worst, _, piece = waiting[0]
+            if cut == _PATIENCE and -worst > (1.0 - _GAIN) * value:
+                break
             halves = list(piece.halves(self.region))
             if not halves:
                 break

@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..sets import AbstractSet, Ball, Simplex
 from ..spaces import AbstractSpace
 from .enclosure import Enclosure
-from .slope import Slope, TooLarge, interval, is_slope
+from .slope import Slope, TooLarge, Values, interval, is_slope
 from .system import System
 
 _PIECES = 64
@@ -35,7 +35,7 @@ class Motion(NamedTuple):
     empty_at: float | None
 
 
-def times(t0: float, t1: float, knots: np.ndarray, pieces: int = _PIECES) -> Iterator[Slope]:
+def times(t0: float, t1: float, knots: Values, pieces: int = _PIECES) -> Iterator[Slope]:
     """[t0, t1] in pieces without a knot inside; data may jump at their ends."""
     inner = knots[(knots > t0) & (knots < t1)]
     ends = np.concatenate([[t0], inner, [t1]])
@@ -50,7 +50,7 @@ def times(t0: float, t1: float, knots: np.ndarray, pieces: int = _PIECES) -> Ite
             yield interval(begin, end)
 
 
-def motion(system: System, t0: float, t1: float, knots: np.ndarray) -> Motion:
+def motion(system: System, t0: float, t1: float, knots: Values) -> Motion:
     """What is known of K(t) over [t0, t1]."""
     problem, like, args = system.problem, system.u0, system.args
     free = _free(like)
@@ -119,13 +119,13 @@ class _Sum(NamedTuple):
 def _speed(moves: Any, space: AbstractSpace, like: Tree) -> float:
     roots = [np.sqrt(np.asarray(w, float)) for w in jtu.tree_leaves(_whole(space, like))]
 
-    def fast(x: Slope) -> np.ndarray:
+    def fast(x: Slope) -> Values:
         part = x.parts.get(0)
         if part is None:
             return np.zeros(x.low.shape)
         return (np.abs(part.center) + part.radius).reshape(x.low.shape)
 
-    def norm(entries: list[np.ndarray]) -> float:
+    def norm(entries: list[Values]) -> float:
         return float(
             np.sqrt(sum(np.sum((r * e) ** 2) for r, e in zip(roots, entries, strict=True)))
         )
@@ -139,12 +139,12 @@ def _speed(moves: Any, space: AbstractSpace, like: Tree) -> float:
     )
 
 
-def _finite(x: Slope, speed: np.ndarray) -> np.ndarray:
+def _finite(x: Slope, speed: Values) -> Values:
     never = (x.low == x.high) & np.isinf(x.low)
     return np.where(never, 0.0, speed)
 
 
-def _empty_at(system: System, samples: np.ndarray) -> float | None:
+def _empty_at(system: System, samples: Values) -> float | None:
     """A time at which K says of itself that it is empty."""
     for t in samples:
         try:
@@ -154,12 +154,12 @@ def _empty_at(system: System, samples: np.ndarray) -> float | None:
     return None
 
 
-def _samples(t0: float, t1: float, knots: np.ndarray) -> np.ndarray:
+def _samples(t0: float, t1: float, knots: Values) -> Values:
     return np.unique(np.concatenate([np.linspace(t0, t1, 17), knots[:MOST_KNOTS]]))
 
 
 def finite_and_steady(
-    fn: Callable[[Any], Tree], t0: float, t1: float, knots: np.ndarray
+    fn: Callable[[Any], Tree], t0: float, t1: float, knots: Values
 ) -> tuple[bool, float]:
     """Whether fn's code shows that it is bounded on [t0, t1], and the largest speed of an entry."""
     if knots.size > MOST_KNOTS:
@@ -180,7 +180,7 @@ def finite_and_steady(
     return bounded, speed
 
 
-def jumps(fn: Callable[[Any], Tree], knots: np.ndarray) -> tuple[float, float] | None:
+def jumps(fn: Callable[[Any], Tree], knots: Values) -> tuple[float, float] | None:
     """The knot at which fn(t) jumps most, and by how much; None where it does not."""
     worst = None
     for knot in knots[:MOST_KNOTS]:

@@ -25,7 +25,7 @@ from collections.abc import Callable
 import numpy as np
 
 from .blocks import Block, eigenvalues, spread_out
-from .slope import TooLarge
+from .slope import TooLarge, Values
 from .system import Jacobians, System
 
 _ROUNDS = 60
@@ -73,7 +73,7 @@ def _least(
     slack = [b.slack() for b in (f_x, f_u, h_x, h_u)]
     loose = any(s.any() for s in slack)
 
-    def mu(log_tau: np.ndarray) -> np.ndarray:
+    def mu(log_tau: Values) -> Values:
         """For every matrix, with its own τ or a common one."""
         tau = np.exp(log_tau)
         by = tau[:, None, None]
@@ -98,7 +98,7 @@ def _of_one_size(*blocks: Block) -> list[Block]:
     return [spread_out(b) for b in blocks]
 
 
-def _minimum(fn: Callable[[np.ndarray], np.ndarray], count: int) -> np.ndarray:
+def _minimum(fn: Callable[[Values], Values], count: int) -> Values:
     """The least values of functions that fall and then rise, by golden sections: every value of them
     is a bound, so that stopping early costs sharpness alone."""
     low, high = np.full(count, -30.0), np.full(count, 30.0)

@@ -12,7 +12,6 @@ from .assumption import Assumption
 from .certificate import is_declared
 from .enclosure import Enclosure
 from .known import Knowledge
-from .moduli import moduli
 from .motion import MOST_KNOTS, Motion, finite_and_steady, jumps, slopes, times
 from .region import Region
 from .slope import TooLarge, interval, is_slope
@@ -35,7 +34,7 @@ def rows(
         _generator(system),
         _operator(system),
         _sets(K),
-        _integrable(system, everywhere, span, knots),
+        _integrable(system, everywhere, span, knots, known),
         _law(known),
         _feedback(known),
         _moving_set(system, K, knots),
@@ -76,7 +75,11 @@ def _sets(K: Motion) -> Assumption:
 
 
 def _integrable(
-    system: System, everywhere: Region, span: tuple[float, float], knots: np.ndarray
+    system: System,
+    everywhere: Region,
+    span: tuple[float, float],
+    knots: np.ndarray,
+    known: Knowledge,
 ) -> Assumption:
     label, statement = "ass:operators (iv)", "f and h are Carathéodory, f(·, 0, 0) is integrable"
     zero = jtu.tree_map(jnp.zeros_like, system.x0)
@@ -87,7 +90,11 @@ def _integrable(
             why = f"f(t, 0, 0) = {_tree.short(value)} at t = {t:.17g}"
             return Assumption(label, statement, "refuted", why, evidence=float(t))
     bounded, _ = finite_and_steady(at_zero, *span, knots)
-    if bounded and all(modulus.value < np.inf for modulus in moduli(system, everywhere)[:4]):
+    blocks = system.at(everywhere)[:4]
+    smooth = all(b is not None and np.isfinite(b.radius).all() for b in blocks)
+    names = ("alpha_f", "beta_f", "alpha_h", "beta_h")
+    lipschitz = all(known.of[name].status == "proved" for name in names)
+    if bounded and (smooth or lipschitz):
         return Assumption(label, statement, "proved", "their code is bounded in t and continuous")
     why = f"f(t, 0, 0) is finite at {_SAMPLES} times; no proof from the code"
     return Assumption(label, statement, "estimated", why)

@@ -135,25 +135,21 @@ def _climb(value: Callable[[Any], jax.Array], starts: Any, low: Any, high: Any) 
     """Steps uphill, each of a shrinking share of the region's width, kept where they help."""
     width = jtu.tree_map(jnp.subtract, high, low)
 
-    @jax.jit
-    def climb(points: Any) -> Any:
-        def one(k: Any, carry: tuple) -> tuple:
-            points, best = carry
-            slope = jax.vmap(jax.grad(value))(points)
-            share = 0.3 * 0.9**k
-            direction = jtu.tree_map(lambda g: jnp.sign(jnp.nan_to_num(g)), slope)
-            new = jtu.tree_map(
-                lambda p, d, w, a, b: jnp.clip(p + share * w * d, a, b),
-                points, direction, width, low, high,
-            )  # fmt: skip
-            reached = jax.vmap(value)(new)
-            better = reached > best
-            keep = lambda a, b: jnp.where(better.reshape(-1, *(1,) * (a.ndim - 1)), b, a)  # noqa: E731
-            return jtu.tree_map(keep, points, new), jnp.where(better, reached, best)
+    def step(k: Any, carry: tuple) -> tuple:
+        point, best = carry
+        share = 0.3 * 0.9**k
+        new = jtu.tree_map(
+            lambda p, g, w, a, b: jnp.clip(p + share * w * jnp.sign(jnp.nan_to_num(g)), a, b),
+            point, jax.grad(value)(point), width, low, high,
+        )  # fmt: skip
+        reached = value(new)
+        better = reached > best
+        return _tree.where(better, new, point), jnp.where(better, reached, best)
 
-        return jax.lax.fori_loop(0, ROUNDS, one, (points, jax.vmap(value)(points)))[0]
+    def climb(point: Any) -> Any:
+        return jax.lax.fori_loop(0, ROUNDS, step, (point, value(point)))[0]
 
-    return climb(starts)
+    return jax.jit(jax.vmap(climb))(starts)
 
 
 def _quotient(
@@ -177,7 +173,7 @@ def _norm(
         roots = _roots(into, v)
         rows = jax.vmap(lambda e: push(unravel(e / roots)))(jnp.eye(size, dtype=flat.dtype))
         matrix = jax.vmap(lambda row: jax.flatten_util.ravel_pytree(row)[0])(rows)
-        matrix = matrix * _roots(out, value)
+        matrix = matrix * _roots(out, value)[None, :]
         square = matrix @ matrix.T
         return jnp.sqrt(jnp.linalg.norm(square, ord="fro") if size == 1 else _largest(square))
     pull = jax.linear_transpose(push, v)
@@ -220,6 +216,7 @@ def _points(low: Any, high: Any, count: int, seed: int) -> Any:
     def draw(a: jax.Array, b: jax.Array) -> jax.Array:
         share = rng.random((count, *a.shape))
         share[0], share[1], share[2] = 0.0, 1.0, 0.5
-        return (a + share * (b - a)).astype(a.dtype)
+        low, high = np.asarray(a), np.asarray(b)
+        return jnp.asarray(low + share * (high - low), a.dtype)
 
     return jtu.tree_map(draw, low, high)

@@ -9,7 +9,7 @@ import numpy as np
 
 from .._tree import Tree
 from ..problem import Problem
-from .blocks import Block, block, identity
+from .blocks import Block, block, identity, roots
 from .enclosure import Enclosure
 from .region import Region
 from .slope import TooLarge, interval
@@ -31,8 +31,10 @@ class System:
 
     def __init__(self, problem: Problem, x0: Tree, args: Any):
         self.problem, self.args = problem, args
+        self._seen: dict[bytes, Jacobians] = {}
         self.x0, self.u0 = x0, problem.zero_control(x0)
         self.state, self.control = problem.spaces(x0)
+        self._roots_x, self._roots_u = roots(self.state, x0), roots(self.control, self.u0)
         time = jnp.zeros(())
         self._f, self._h = (
             Enclosure(lambda t, x, u, fn=fn: fn(t, x, u, args), (time, self.x0, self.u0), (1, 2))
@@ -46,22 +48,26 @@ class System:
         self.A = self._of_linear(problem.generator(args).apply, self.state, self.x0)
 
     def at(self, region: Region) -> Jacobians:
-        """Over this region."""
+        """Over this region; kept, since every modulus looks at nearly the same pieces."""
+        key = b"".join(end.tobytes() for v in region.leaves for end in v[:2])
+        if key not in self._seen:
+            self._seen[key] = self._at(region)
+        return self._seen[key]
+
+    def _at(self, region: Region) -> Jacobians:
         parts = len(jtu.tree_leaves(self.x0))
         blocks: list[Block | None] = []
         unknown: dict[str, tuple[str, ...]] = {}
-        for name, enclosure, space, like in (
-            ("f", self._f, self.state, self.x0),
-            ("h", self._h, self.control, self.u0),
-        ):
+        for name, enclosure in (("f", self._f), ("h", self._h)):
             try:
                 out, unknown[name] = enclosure(*region)
             except TooLarge:
                 blocks += [None, None]
                 unknown[name] = ()
                 continue
-            blocks.append(_if_small(out, 0, space, like, self.state, self.x0))
-            blocks.append(_if_small(out, parts, space, like, self.control, self.u0))
+            roots_out = self._roots_x if name == "f" else self._roots_u
+            blocks.append(_if_small(out, 0, roots_out, self._roots_x))
+            blocks.append(_if_small(out, parts, roots_out, self._roots_u))
         f_x, f_u, h_x, h_u = blocks
         return Jacobians(f_x, f_u, h_x, h_u, unknown)
 
@@ -78,7 +84,7 @@ class System:
         )
         try:
             out, unknown = Enclosure(apply, (like,), (0,))(anywhere)
-            found = block(out, 0, space, like, space, like)
+            found = block(out, 0, roots(space, like), roots(space, like))
         except TooLarge:
             return None
         return found if not unknown and found.exact else None

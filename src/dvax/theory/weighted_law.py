@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.extend.core import ClosedJaxpr, Literal
 
 from ..problem import Problem
+from ..vi.structure import bind
 from .system import System
 
 
@@ -86,10 +86,16 @@ def _output(traced: ClosedJaxpr, atom: Any) -> Callable[..., jax.Array]:
     """The function that computes this value in the place of the output."""
     if isinstance(atom, Literal):
         return lambda *given: jnp.asarray(atom.val)
-    jaxpr = traced.jaxpr.replace(outvars=[atom], debug_info=None)
+    jaxpr = traced.jaxpr
 
     def fn(*given: Any) -> jax.Array:
-        leaves = jtu.tree_leaves(given)
-        return jax.core.eval_jaxpr(jaxpr, traced.consts, *leaves)[0]
+        values = dict(zip(jaxpr.constvars, traced.consts, strict=True))
+        values.update(zip(jaxpr.invars, jtu.tree_leaves(given), strict=True))
+        for eqn in jaxpr.eqns:
+            if atom in values:
+                break
+            read = [v.val if isinstance(v, Literal) else values[v] for v in eqn.invars]
+            values.update(zip(eqn.outvars, bind(eqn, read), strict=True))
+        return jnp.asarray(values[atom])
 
     return fn
