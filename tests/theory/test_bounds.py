@@ -185,6 +185,22 @@ def _reference(alpha, load, ts, breaks=()):
     return np.concatenate(out)
 
 
+def test_saving_often_does_not_loosen_a_bound():
+    """A step is charged once, however many saved times lie in it."""
+    case = ALL["C1"]()
+    end = {}
+    for count in (1, 2000):
+        ts = np.linspace(0.0, 2.0, count + 1)[1:]
+        sol = dvax.solve(
+            case.problem, -1.0, 0.0, 2.0, args=case.args, ts=ts, dt=1 / 16, measure=True
+        )
+        bound = dvax.bound_error(case.problem, sol, case.constants)
+        end[count] = np.array([float(bound.x[-1]), float(bound.x_sharp[-1])])
+    assert np.all(end[2000] <= end[1])
+    # In one piece everything is charged e^{c₊T}: with 2000 times the decay is seen as well.
+    assert end[2000][1] < 0.9 * end[1][1]
+
+
 @pytest.mark.parametrize("dt", mostly_thorough([0.1, 0.05], [0.1]))
 def test_saved_times_between_steps_of_a_stiff_contact_are_covered(dt):
     # Trajectories approach fast here, so a bound must not let an impulse decay before it acted.

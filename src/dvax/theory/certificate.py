@@ -207,22 +207,36 @@ def _gronwall(
 ) -> jax.Array:
     """M e^{ct} e₀ + M ∫ e^{c(t−s)} dI(s), from the impulse I known at the saved times only.
 
-    Between two saved times the impulse may have acted at any moment, so each one is charged
-    e^{c₊Δ}; and a step under way at a saved time is charged again after it, since nothing says how
-    much of it had acted. Saving more often makes the bound sharper where trajectories approach.
+    `settled` is what the steps that had ended by then brought, `impulse` has the one under way as well.
+    An ended step acted at any moment since the saved time before it began, so it is charged e^{c₊Δ}
+    over the time from there to its end; the step under way is charged in the same way, and for that
+    one saved time alone: nothing says how much of it had acted.
     """
 
     def advance(carry: tuple, now: tuple) -> tuple:
-        before, t, acted = carry
-        time, total, surely = now
-        span = time - t
-        after = jnp.exp(rate * span) * before
-        after = after + M * jnp.exp(jnp.maximum(rate, 0.0) * span) * (total - acted)
+        # `bound` holds at `base` for the steps ended by then; the others act after `early`.
+        early, base, ended, bound, last = carry
+        time, total, done = now
+        decayed = jnp.exp(rate * (time - base)) * bound
+        grown = M * jnp.exp(jnp.maximum(rate, 0.0) * (time - early))
+        after = decayed + grown * (total - ended)
         # What has no bound keeps none: ∞ − ∞, and an impulse that is not a number, say nothing.
-        after = jnp.where(jnp.isfinite(total) & ~jnp.isnan(after), after, jnp.inf)
-        return (after, time, surely), after
+        lost = ~jnp.isfinite(total) | jnp.isnan(after)
+        moved = (done > ended) | lost
+        new = jnp.where(lost, jnp.inf, decayed + grown * (done - ended))
+        carry = (
+            # A step under way began after the saved time before this one, whose own has ended.
+            jnp.where(moved, jnp.where(total > done, last, time), early),
+            jnp.where(moved, time, base),
+            jnp.where(moved, done, ended),
+            jnp.where(moved, new, bound),
+            time,
+        )
+        return carry, jnp.where(lost, jnp.inf, after)
 
-    start = (jnp.asarray(M * initial, ts.dtype), t0, jnp.zeros((), ts.dtype))
+    begin = jnp.asarray(t0, ts.dtype)
+    zero = jnp.zeros((), ts.dtype)
+    start = (begin, begin, zero, jnp.asarray(M * initial, ts.dtype), begin)
     return lax.scan(advance, start, (ts, impulse, settled))[1]
 
 
