@@ -33,8 +33,10 @@ if TYPE_CHECKING:
     from .problem import Problem as Problem
     from .theory import Bound as Bound
     from .theory import Constants as Constants
+    from .theory import ParameterBounds as ParameterBounds
     from .theory import Verification as Verification
     from .theory import bound_error as bound_error
+    from .theory import parameter_bounds as parameter_bounds
     from .theory import verify as verify
     from .vi import solve_vi as solve_vi
 
@@ -56,7 +58,15 @@ _HOMES = {
         "solve",
     ),
     "problem": ("Problem",),
-    "theory": ("Bound", "Constants", "Verification", "bound_error", "verify"),
+    "theory": (
+        "Bound",
+        "Constants",
+        "ParameterBounds",
+        "Verification",
+        "bound_error",
+        "parameter_bounds",
+        "verify",
+    ),
     "vi": ("solve_vi",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

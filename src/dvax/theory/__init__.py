@@ -1,9 +1,12 @@
 """The theory as software: constants, stability, the a-posteriori certificate."""
 
+from . import formulas as formulas
 from .assumption import Assumption as Assumption
 from .certificate import Bound as Bound
 from .certificate import bound_error as bound_error
 from .constants import Constants as Constants
 from .constants import Row as Row
+from .parameter_bounds import parameter_bounds as parameter_bounds
+from .parameters import ParameterBounds as ParameterBounds
 from .verify import Verification as Verification
 from .verify import verify as verify

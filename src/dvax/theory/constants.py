@@ -134,6 +134,33 @@ class Constants(eqx.Module):
         c, lib = _tree.host(self), _tree.library(self, T)
         return c.M * lib.exp(lib.maximum(self.growth_rate, 0.0) * T) * (1.0 + self.L)
 
+    def separation(self, t: Any) -> Any:
+        """M e^{(ω+ML̃)t}: ‖x₁(t)−x₂(t)‖ ≤ this · ‖Δx₀‖ (1stestistability)."""
+        c, lib = _tree.host(self), _tree.library(self, t)
+        return c.M * lib.exp(self.growth_rate * t)
+
+    def response_separation(self, t: Any) -> Any:
+        """L M e^{(ω+ML̃)t}: ‖u₁(t)−u₂(t)‖ ≤ this · ‖Δx₀‖ (2ndestistability)."""
+        return self.L * self.separation(t)
+
+    def largest_separation(self, T: Any) -> Any:
+        """M e^{(ω+ML̃)₊T}: max over [0, T] of ‖x₁−x₂‖ ≤ this · ‖Δx₀‖ (supesti1); times L for u
+        (supesti2)."""
+        c, lib = _tree.host(self), _tree.library(self, T)
+        return c.M * lib.exp(lib.maximum(self.growth_rate, 0.0) * T)
+
+    def sharp_separation(self, t: Any) -> Any:
+        """e^{μt}: the same with the one-sided constant, or None where that is not known."""
+        lib = _tree.library(self, t)
+        return None if self.one_sided is None else lib.exp(_tree.host(self.one_sided) * t)
+
+    @property
+    def smallness(self) -> tuple[Any, Any]:
+        """(m_P − β_h‖P⁻¹‖, ‖P⁻¹‖(1 + β_h)): γ and L_F where the first is positive
+        (remark:assstrong (i), eq:Liph)."""
+        c = _tree.host(self)
+        return c.m_P - c.beta_h * c.norm_P_inv, c.norm_P_inv * (1.0 + c.beta_h)
+
     def contraction_factor(self, rho: Any) -> Any:
         """q_ρ = ‖I − ρP⁻¹‖ + ρ β_h ‖P⁻¹‖ (eq:smalless), with ‖I − ρP⁻¹‖ from the spectrum."""
         c, lib = _tree.host(self), _tree.library(self, rho)
@@ -150,6 +177,16 @@ class Constants(eqx.Module):
         """M L̃/(λ − ω): the Picard map contracts by it in the λ-norm, λ > ω + M L̃ (eq:Sop)."""
         c = _tree.host(self)
         return c.M * self.L_tilde / (lam - c.omega)
+
+    def best_lambda(self, T: Any) -> Any:
+        """The λ of the Bielecki norm for which an error bound in the maximum norm is least.
+
+        ‖x − Sx‖_λ = r leaves ‖x − x*‖_C ≤ e^{λT} r/(1 − q) with q = ML̃/(λ − ω); with s = λ − ω and
+        a = ML̃ the factor e^{sT}s/(s − a) is least where T s(s − a) = a, s = (a + √(a² + 4a/T))/2.
+        """
+        c, lib = _tree.host(self), _tree.library(self, T)
+        a = c.M * self.L_tilde
+        return c.omega + 0.5 * (a + lib.sqrt(a * a + 4.0 * a / T))
 
     def status_of(self, *names: str) -> Status:
         """The weakest status among the named constants."""

@@ -122,6 +122,8 @@ def _gamma(
 
 def _divided(system: System, region: Region) -> Divided | None:
     """γ = Mμ where h is written as u − aG, and what is known of the law without the weight."""
+    if system.varied:
+        return None
     for weight, problem in splits(system):
         least = _least(weight, system, region)
         if not least > 0:
@@ -143,7 +145,7 @@ def _least(weight: Callable[..., Any], system: System, region: Region) -> float:
     pieces = [region]
     for _ in range(_ROUNDS):
         pieces = [half for piece in pieces for half in piece.halves(region)] or pieces
-    return min(float(np.min(enclosure(*piece).out.low)) for piece in pieces)
+    return min(float(np.min(enclosure(*piece[:3]).out.low)) for piece in pieces)
 
 
 def shown(box: Region) -> str:

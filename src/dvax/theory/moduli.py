@@ -137,6 +137,8 @@ class Pieces:
         return Proved(F.least(), _LANCZOS), Proved(F.norm(), _LANCZOS)
 
     def _proved_affine(self, of: str) -> Affine | None:
+        if self.system.varied:
+            return None  # its action is known at one parameter only
         if of not in self._affine:
             affine = Affine(self.system, of, float(self.region.t.low))
             self._affine[of] = affine if affine.proved() else None

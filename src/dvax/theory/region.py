@@ -14,7 +14,8 @@ from .slope import Slope, interval, is_slope
 
 
 class Region(NamedTuple):
-    """t0 ≤ t ≤ t1, and x and u between bounds, entry by entry: trees of intervals each.
+    """t0 ≤ t ≤ t1, and x, u and the parameter η between bounds, entry by entry: trees of intervals
+    each. η is () where it does not vary.
 
     A box is convex, so what bounds a derivative on it bounds a Lipschitz modulus.
     """
@@ -22,6 +23,7 @@ class Region(NamedTuple):
     t: Slope
     x: Tree
     u: Tree
+    eta: Tree = ()
 
     @property
     def leaves(self) -> list[Slope]:

@@ -27,19 +27,23 @@ class Jacobians(NamedTuple):
 
 
 class System:
-    """The data of a problem at one parameter, as matrices in the norms of its spaces."""
+    """The data of a problem as matrices in the norms of its spaces: at one parameter, or where it is
+    `varied` for f and h over a region of them; A, P and K are those of `args`."""
 
-    def __init__(self, problem: Problem, x0: Tree, args: Any):
+    def __init__(self, problem: Problem, x0: Tree, args: Any, varied: bool = False):
         self.problem, self.args = problem, args
         self._seen: dict[bytes, Jacobians] = {}
         self.x0, self.u0 = x0, problem.zero_control(x0)
         self.state, self.control = problem.spaces(x0)
         self._roots_x, self._roots_u = roots(self.state, x0), roots(self.control, self.u0)
         time = jnp.zeros(())
-        self._f, self._h = (
-            Enclosure(lambda t, x, u, fn=fn: fn(t, x, u, args), (time, self.x0, self.u0), (1, 2))
+        self.varied, self.eta = varied, args if varied else ()
+        self.f, self.h = (
+            lambda t, x, u, eta=(), fn=fn: fn(t, x, u, eta if varied else args)
             for fn in (problem.f, problem.h)
         )
+        self.likes = time, self.x0, self.u0, self.eta
+        self._f, self._h = (Enclosure(fn, self.likes, (1, 2)) for fn in (self.f, self.h))
         P = problem.operator(args)
         self.spectrum = P.spectrum(self.control)
         self.growth = problem.generator(args).growth(self.state)

@@ -113,20 +113,20 @@ def verify(
 
     ```
     """
-    x0 = _state(problem, x0)
-    t0, t1 = _span(t0, t1)
+    x0 = state_like(problem, x0, args, "dvax.verify(x0)")
+    t0, t1 = span(t0, t1, "dvax.verify(t0, t1)")
     problem.check(jnp.asarray(t0), x0, args)
     system = System(problem, x0, args)
     knots = np.asarray(problem.knots(t0, t1, x0, args), float)
     K = motion(system, t0, t1, knots)
     states = between(x, x0, "dvax.verify(x)")
-    responses = _met(between(u, system.u0, "dvax.verify(u)"), _around_responses(system, K))
+    responses = met(between(u, system.u0, "dvax.verify(u)"), around_responses(system, K))
     time = interval(t0, t1)
     region = Region(time, states, responses)
-    box = Region(time, _bounded(states, x0), _bounded(responses, system.u0))
+    box = Region(time, bounded(states, x0), bounded(responses, system.u0))
     known = knowledge(system, region, box, _declared(declared))
     assumptions = tuple(rows(system, region, K, knots, known))
-    return Verification(assumptions, _constants(system, region, known), _route(system, known))
+    return Verification(assumptions, constants_of(system, region, known), _route(system, known))
 
 
 def _route(system: System, known: Knowledge) -> str:
@@ -137,7 +137,7 @@ def _route(system: System, known: Knowledge) -> str:
     return "projection" if known.of["gamma"].value <= small else "variational inequality"
 
 
-def _constants(system: System, region: Region, known: Knowledge) -> Constants | None:
+def constants_of(system: System, region: Region, known: Knowledge) -> Constants | None:
     """The constants, where every modulus is a number and γ > 0."""
     values = {name: entry.value for name, entry in known.of.items()}
     if known.pair is not None or not values["gamma"] > 0:
@@ -179,7 +179,7 @@ def _pointwise(system: System, t: float) -> bool:
     return system.problem.set_at(jnp.asarray(t), system.args).intervals(system.u0) is not None
 
 
-def _around_responses(system: System, K: Motion) -> Tree:
+def around_responses(system: System, K: Motion) -> Tree:
     """A box around P⁻¹K(t)."""
     y = jtu.tree_map(interval, K.low, K.high)
     P = system.problem.operator(system.args)
@@ -189,7 +189,7 @@ def _around_responses(system: System, K: Motion) -> Tree:
         return between(None, system.u0, "dvax.verify(u)")
 
 
-def _met(asked: Tree, possible: Tree) -> Tree:
+def met(asked: Tree, possible: Tree) -> Tree:
     """Where the region that was asked for meets the one that responses lie in."""
 
     def met(a: Slope, b: Slope) -> Slope:
@@ -210,7 +210,7 @@ def _met(asked: Tree, possible: Tree) -> Tree:
     return jtu.tree_map(met, asked, possible, is_leaf=is_slope)
 
 
-def _bounded(tree: Tree, middle: Tree) -> Tree:
+def bounded(tree: Tree, middle: Tree) -> Tree:
     """The bounded box that a search stays in."""
 
     def one(v: Slope, m: Any) -> Slope:
@@ -223,30 +223,32 @@ def _bounded(tree: Tree, middle: Tree) -> Tree:
     return jtu.tree_map(one, tree, middle, is_leaf=is_slope)
 
 
-def _span(t0: Any, t1: Any) -> tuple[float, float]:
+def span(t0: Any, t1: Any, name: str) -> tuple[float, float]:
+    """Two times that make an interval."""
     begin, end = float(t0), float(t1)
     if not (np.isfinite([begin, end]).all() and begin < end):
         raise InputError(
             InputProblem(
-                "dvax.verify(t0, t1)", f"[{begin:.17g}, {end:.17g}]",
+                name, f"[{begin:.17g}, {end:.17g}]",
                 "it must be an interval of time with t0 < t1", "Give the times of the run",
             )
         )  # fmt: skip
     return begin, end
 
 
-def _state(problem: Problem, x0: Tree) -> Tree:
+def state_like(problem: Problem, x0: Tree, args: Any, name: str) -> Tree:
+    """A state of this problem: the one given, or zero where its shape is known."""
     if x0 is not None:
         return _tree.as_float(x0, "x0")
     if problem.state_space is not None:
         return problem.state_space.zeros()
     zero = jnp.zeros(())
     try:
-        problem.check(zero, zero)
+        problem.check(zero, zero, args)
     except InputError as error:
         raise InputError(
             InputProblem(
-                "dvax.verify(x0)",
+                name,
                 "None",
                 "the problem does not fit a scalar state, and names no state space, so that the shape "
                 "of its states is not known",
