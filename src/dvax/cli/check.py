@@ -25,6 +25,7 @@ def check(
     """Check CONFIG.toml and its data: constants, assumptions, sizes. Nothing is written."""
     with reported(debug):
         from dvax.runs.config import build_contact, load_config
+        from dvax.runs.contact_model import assumptions
 
         loaded = load_config(config)
         inputs = build_contact(loaded)
@@ -34,18 +35,27 @@ def check(
         say("")
         _say_constants(rows)
         say("")
+        known = assumptions(loaded, inputs)
+        table(
+            ("assumption", "status", "what it says", "how it is known"),
+            [(row.label, row.status, row.statement, row.why) for row in known],
+        )
+        say("")
         table(("statement", "verdict", "because"), verdicts(rows))
         say("")
         table(("size", "value", "remark"), sizes(loaded, inputs))
         for notice in inputs.notices:
             remark(f"note: {notice}")
+        broken = [row for row in known if row.needed and row.status == "refuted"]
+        for row in broken:
+            complain(f"error: {row.label} does not hold ({row.statement}): {row.why}")
         outside = outside_the_class(rows)
         for row in outside:
             complain(
                 f"error: outside the class of the theory: {row['name']} = {row['value']:.6g}, "
                 f"{row['status']} ({row['label']}). Every statement and bound rests on it."
             )
-        if outside and strict:
+        if (outside or broken) and strict:
             raise typer.Exit(OUT_OF_CLASS)
 
 

@@ -22,7 +22,6 @@ import numpy as np
 
 from dvax.errors import InputError, InputProblem, SolveError
 from dvax.evolution import ETD1, ETD2RK, ETD4RK, DormandPrince, ExpRosenbrock, Solution, solve
-from dvax.models import Contact
 from dvax.runs.compile_time import announced, compile_seconds
 from dvax.runs.config import Config, build_contact
 from dvax.runs.contact_figures import Figures
@@ -34,6 +33,7 @@ from dvax.runs.contact_frames import (
     variables,
 )
 from dvax.runs.contact_inputs import ContactInputs
+from dvax.runs.contact_model import contact_model
 from dvax.runs.provenance import provenance
 from dvax.runs.resolved import write_resolved
 from dvax.runs.rundir import FrameStore, RunDirectory
@@ -89,15 +89,10 @@ class _Run:
         self, config: Config, inputs: ContactInputs, directory: RunDirectory, tell: Listener
     ):
         self.config, self.inputs, self.directory, self.tell = config, inputs, directory, tell
-        m = config.model
-        self.model = Contact(
-            alpha=m.alpha, beta=m.beta, b_x=m.b_x, b_u=m.b_u, d_x=m.d_x, d_u=m.d_u,
-            kappa0=m.kappa0, g=inputs.demand_signal, ell=inputs.load_signal,
-            weights=inputs.boundary.weights,
-        )  # fmt: skip
+        self.model = contact_model(config, inputs)
         self.problem, self.constants = self.model.problem, self.model.constants
         self.space: AbstractSpace = self.problem.spaces(jnp.asarray(inputs.x0))[0]
-        self.rows = constant_rows(self.constants, config, config.time.end, m.beta)
+        self.rows = constant_rows(self.constants, config, config.time.end, config.model.beta)
         self.started = datetime.now(UTC)
         self.clock = time.monotonic()
         self.steps = self.rejected = 0

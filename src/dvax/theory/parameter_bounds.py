@@ -85,20 +85,25 @@ def parameter_bounds(
         raise _unknown("γ, L_F, α_h, β_h, α_f, β_f", known.of["gamma"].how)
 
     # Over the region, or where that leaves no bound over the ball of the a-priori estimate.
-    kappa = _kappa(system, t0, t1, knots)
-    sizes = {name: _size(system, name, region, knots) for name in ("f", "h")}
-    found = dict(T=t1 - t0, kappa_K=kappa, C_f0=sizes["f"], C_h0=sizes["h"])
-    moduli = {f"modulus_{name}": _by_parameter(system, name, region, knots) for name in ("f", "h")}
+    span_of: dict[str, Any] = dict(T=t1 - t0, kappa_K=_kappa(system, t0, t1, knots))
+    sizes: dict[str, Any] = dict(
+        C_f0=_size(system, "f", region, knots), C_h0=_size(system, "h", region, knots)
+    )
+    of = lambda region: {  # noqa: E731
+        f"modulus_{name}": _by_parameter(system, name, region, knots) for name in ("f", "h")
+    }
+    moduli = of(region)
     if not all(np.isfinite(v) for v in moduli.values()) and start_radius is not None:
-        R = ParameterBounds(constants, **found, modulus_f=0.0, modulus_h=0.0).radius(start_radius)
+        without = ParameterBounds(constants, **span_of, **sizes, modulus_f=0.0, modulus_h=0.0)
+        R = without.radius(start_radius)
         near = region._replace(
-            x=_ball(region.x, system.state, x0, R), u=_ball(region.u, system.control, system.u0, R)
+            x=_ball(region.x, system.state, R), u=_ball(region.u, system.control, R)
         )
-        moduli = {f"modulus_{n}": _by_parameter(system, n, near, knots) for n in ("f", "h")}
-    for name, value in {**found, **moduli}.items():
+        moduli = of(near)
+    for name, value in {**span_of, **sizes, **moduli}.items():
         if not np.isfinite(value):
             raise _unknown(name, "the code of f, h or K does not bound it over this region")
-    return ParameterBounds(constants, **found, **moduli, status="proved")
+    return ParameterBounds(constants, status="proved", **span_of, **sizes, **moduli)
 
 
 def _size(system: System, name: str, region: Region, knots: np.ndarray) -> float:
@@ -154,9 +159,9 @@ def _norm(out: Tree, space: AbstractSpace, like: Tree) -> float:
     return float(np.sqrt(total))
 
 
-def _ball(tree: Tree, space: AbstractSpace, like: Tree, R: Any) -> Tree:
+def _ball(tree: Tree, space: AbstractSpace, R: Any) -> Tree:
     """The intervals met with a box around 𝔹_R(0)."""
-    each = iter(roots(space, like))
+    each = iter(roots(space, space.zeros()))
 
     def met(v: Slope) -> Slope:
         reach = float(R) / next(each).reshape(v.low.shape)
