@@ -6,6 +6,7 @@ import jax.tree_util as jtu
 import numpy as np
 import pytest
 
+import dvax
 from dvax.theory.enclosure import Enclosure
 from dvax.theory.slope import TooLarge, interval
 
@@ -136,3 +137,34 @@ def test_pieces_of_a_region_sharpen_what_is_known_of_it():
     assert whole.high == pytest.approx(1.0)
     assert max(float(h.high) for h in halves) == pytest.approx(0.5)
     assert all(jtu.tree_leaves(h.parts[0].radius)[0] <= whole.parts[0].radius for h in halves)
+
+
+@pytest.mark.parametrize("kind", ["constant", "linear", "cubic"])
+@pytest.mark.parametrize("shape", [(), (2,)])
+def test_tables_are_enclosed_over_any_stretch_of_time(kind, shape):
+    rng = np.random.default_rng(4)
+    times = np.sort(rng.uniform(0.0, 3.0, 12))
+    table = dvax.signals.Table(times, rng.normal(size=(12, *shape)), kind=kind)
+    enclosure = Enclosure(table.value, (jnp.zeros(()),), (0,))
+    at = jax.jit(jax.vmap(table.value))
+    steady = 0
+    for _ in range(60):
+        a, b = np.sort(rng.uniform(times[0], times[-1], 2))
+        b = a + (b - a) * rng.choice([1.0, 0.1])
+        out, unknown = enclosure(interval(a, b))
+        assert unknown == ()
+        ts = np.concatenate([np.linspace(a, b, 200), times[(times >= a) & (times <= b)]])
+        ts.sort()
+        values = np.asarray(at(jnp.asarray(ts)))
+        assert np.all(values >= out.low - 1e-12) and np.all(values <= out.high + 1e-12)
+        part = out.parts[0]
+        radius, center = (np.asarray(v).reshape(shape) for v in (part.radius, part.center))
+        gaps = np.diff(ts).reshape(-1, *(1,) * len(shape))
+        change = np.diff(values, axis=0) - gaps * center
+        assert np.all(np.abs(change) <= gaps * radius + 1e-9 if kind != "constant" else True)
+        steady += bool(np.isfinite(radius).all())
+        if kind == "constant" and np.isfinite(radius).all():
+            assert np.ptp(values, axis=0).max() == 0.0
+    assert steady == 60 or (kind == "constant" and steady > 3)
+    beyond = enclosure(interval(times[0] - 1.0, times[-1])).out
+    assert np.isinf(beyond.high).all()

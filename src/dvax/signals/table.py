@@ -66,33 +66,66 @@ class Table(AbstractSignal):
 
     def value(self, t: Any) -> jax.Array:
         times = jnp.asarray(self.times)
-        # Counting has no branches: on a short table it is faster than a bisection, and the place of
-        # t follows from comparisons alone, which an enclosure over a whole step can see through.
-        count = times.shape[0]
-        if count <= 2**16:
-            passed = jnp.sum(times <= t)
-        else:
-            passed = jnp.searchsorted(times, t, side="right")
-        i = jnp.clip(passed - 1, 0, count - 2)
-        left, right = times[i], times[i + 1]
-        v0, v1 = self.values[i], self.values[i + 1]
-        width = right - left
-        s = (t - left) / width
         if self.kind == "constant":
-            out = jnp.where(t >= right, v1, v0)
-        elif self.slopes is None:
-            out = v0 + s * (v1 - v0)
-        else:
-            d0, d1 = self.slopes[i] * width, self.slopes[i + 1] * width
-            jump = v1 - v0
-            out = v0 + s * (d0 + s * ((3 * jump - 2 * d0 - d1) + s * (d0 + d1 - 2 * jump)))
-        return jnp.where((t >= times[0]) & (t <= times[-1]), out, jnp.nan)
+            return constant_table(times, self.values, t)
+        if self.slopes is None:
+            return linear_table(times, self.values, t)
+        return cubic_table(times, self.values, self.slopes, t)
 
     def knots(self) -> Any:
         return self.times
 
     def span(self) -> tuple[Any, Any]:
         return self.times[0], self.times[-1]
+
+
+# Functions of their own, by whose names an enclosure over time knows what they are.
+
+
+@jax.jit
+def constant_table(times: jax.Array, values: jax.Array, t: Any) -> jax.Array:
+    """vᵢ on [tᵢ, tᵢ₊₁)."""
+    i, _ = _place(times, t)
+    out = jnp.where(t >= times[i + 1], values[i + 1], values[i])
+    return _within(times, t, out)
+
+
+@jax.jit
+def linear_table(times: jax.Array, values: jax.Array, t: Any) -> jax.Array:
+    """Straight lines."""
+    i, s = _place(times, t)
+    v0, v1 = values[i], values[i + 1]
+    return _within(times, t, v0 + s * (v1 - v0))
+
+
+@jax.jit
+def cubic_table(times: jax.Array, values: jax.Array, slopes: jax.Array, t: Any) -> jax.Array:
+    """The cubics with these slopes at the times."""
+    i, s = _place(times, t)
+    width = times[i + 1] - times[i]
+    v0, v1 = values[i], values[i + 1]
+    d0, d1 = slopes[i] * width, slopes[i + 1] * width
+    jump = v1 - v0
+    out = v0 + s * (d0 + s * ((3 * jump - 2 * d0 - d1) + s * (d0 + d1 - 2 * jump)))
+    return _within(times, t, out)
+
+
+def _place(times: jax.Array, t: Any) -> tuple[jax.Array, jax.Array]:
+    """i with tᵢ ≤ t ≤ tᵢ₊₁, and how far between the two t is."""
+    # Counting has no branches: on a short table it is faster than a bisection, and the place of
+    # t follows from comparisons alone, which chord arithmetic can see through.
+    count = times.shape[0]
+    if count <= 2**16:
+        passed = jnp.sum(times <= t)
+    else:
+        passed = jnp.searchsorted(times, t, side="right")
+    i = jnp.clip(passed - 1, 0, count - 2)
+    left, right = times[i], times[i + 1]
+    return i, (t - left) / (right - left)
+
+
+def _within(times: jax.Array, t: Any, out: jax.Array) -> jax.Array:
+    return jnp.where((t >= times[0]) & (t <= times[-1]), out, jnp.nan)
 
 
 def _check(name: str, times: Any, values: jax.Array, least: int) -> None:

@@ -25,6 +25,7 @@ from ..vi.structure import CALLS, CUSTOM, evaluate, inner_jaxpr
 from .slope import Part, Slope, interval, is_slope, nothing
 from .slope_entrywise import ENTRYWISE
 from .slope_moves import MOVING
+from .slope_tables import TABLES
 
 _RULES = {**ENTRYWISE, **MOVING}
 
@@ -72,6 +73,10 @@ class Enclosure:
 def _interpret(traced: ClosedJaxpr, inputs: list[Any], unknown: list[str]) -> list[Any]:
     def apply(eqn: Any, given: list[Any]) -> list[Any]:
         name = eqn.primitive.name
+        table = TABLES.get(eqn.params.get("name", "")) if name in CALLS else None
+        result = None if table is None else table(eqn, given)
+        if result is not None:
+            return [_sane(result)]
         if name in CALLS or name in CUSTOM:
             inner = inner_jaxpr(eqn.params)
             if inner is not None and len(inner.jaxpr.invars) == len(given):

@@ -36,8 +36,9 @@ class Motion(NamedTuple):
 
 
 def times(t0: float, t1: float, knots: Values, pieces: int = _PIECES) -> Iterator[Slope]:
-    """[t0, t1] in pieces without a knot inside; data may jump at their ends."""
-    inner = knots[(knots > t0) & (knots < t1)]
+    """[t0, t1] in pieces without a knot inside, at whose ends data may jump; or where there are too
+    many knots in even ones."""
+    inner = knots[(knots > t0) & (knots < t1)] if knots.size <= MOST_KNOTS else np.zeros(0)
     ends = np.concatenate([[t0], inner, [t1]])
     each = max(1, pieces // (len(ends) - 1))
     for a, b in itertools.pairwise(ends):
@@ -66,12 +67,10 @@ def motion(system: System, t0: float, t1: float, knots: Values) -> Motion:
         assert found is not None
         return found
 
-    if knots.size > MOST_KNOTS:
-        return Motion(np.inf, *free, False, empty)
     low, high, speed, standing = free[1], free[0], 0.0, True
     try:
         enclosure = Enclosure(described, (jnp.zeros(()),), (0,))
-        for piece in times(t0, t1, knots, 1 if still else _PIECES):
+        for piece in [interval(t0, t1)] if still else times(t0, t1, knots):
             (down, up, moves, gap), _ = enclosure(piece)
             low, high = _least(low, down), _most(high, up)
             speed = max(speed, _speed(moves, system.control, like))
@@ -162,8 +161,6 @@ def finite_and_steady(
     fn: Callable[[Any], Tree], t0: float, t1: float, knots: Values
 ) -> tuple[bool, float]:
     """Whether fn's code shows that it is bounded on [t0, t1], and the largest speed of an entry."""
-    if knots.size > MOST_KNOTS:
-        return False, np.inf
     try:
         enclosure = Enclosure(fn, (jnp.zeros(()),), (0,))
         bounded, speed = True, 0.0

@@ -12,7 +12,7 @@ from .assumption import Assumption
 from .certificate import is_declared
 from .enclosure import Enclosure
 from .known import Knowledge
-from .motion import MOST_KNOTS, Motion, finite_and_steady, jumps, slopes, times
+from .motion import Motion, finite_and_steady, jumps, slopes, times
 from .region import Region
 from .slope import TooLarge, interval, is_slope
 from .status import Status, weakest
@@ -167,20 +167,19 @@ def _moving_feedback(
     if jump is not None:
         why = f"h jumps by {jump[1]:.6g} at t = {jump[0]:.17g}; {_ON_EACH_SIDE}"
         return Assumption(label, statement, "refuted", why, evidence=jump[0])
-    if knots.size <= MOST_KNOTS:
-        try:
-            enclosure = Enclosure(h, (jnp.zeros(()), system.x0, system.u0), (0,))
-            speed = 0.0
-            for piece in times(*span, knots):
-                for x in slopes(enclosure(piece, everywhere.x, everywhere.u).out):
-                    for part in x.parts.values():
-                        fastest = np.abs(part.center) + part.radius
-                        speed = max(speed, float(np.max(fastest, initial=0.0)))
-            if np.isfinite(speed):
-                shown = f", |∂h/∂t| ≤ {speed:.6g}" if speed < 1e50 else ""
-                return Assumption(label, statement, "proved", f"its code is Lipschitz in t{shown}")
-        except TooLarge:
-            pass
+    try:
+        enclosure = Enclosure(h, (jnp.zeros(()), system.x0, system.u0), (0,))
+        speed = 0.0
+        for piece in times(*span, knots):
+            for x in slopes(enclosure(piece, everywhere.x, everywhere.u).out):
+                for part in x.parts.values():
+                    fastest = np.abs(part.center) + part.radius
+                    speed = max(speed, float(np.max(fastest, initial=0.0)))
+        if np.isfinite(speed):
+            shown = f", |∂h/∂t| ≤ {speed:.6g}" if speed < 1e50 else ""
+            return Assumption(label, statement, "proved", f"its code is Lipschitz in t{shown}")
+    except TooLarge:
+        pass
     return Assumption(label, statement, "estimated", "no proof from the code of h")
 
 

@@ -203,7 +203,7 @@ def _roots(space: AbstractSpace, like: Tree) -> jax.Array:
 def _bounds(region: Region) -> tuple[Any, Any]:
     is_slope = lambda v: isinstance(v, Slope)  # noqa: E731
     ends = (
-        jtu.tree_map(lambda v, i=i: jnp.asarray(v[i]), tuple(region), is_leaf=is_slope)
+        jtu.tree_map(lambda v, i=i: jnp.asarray(v[i]), tuple(region)[:3], is_leaf=is_slope)
         for i in (0, 1)
     )
     return next(ends), next(ends)

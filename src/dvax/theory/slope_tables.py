@@ -1,0 +1,94 @@
+"""The rules of slope arithmetic for measured data: a table of values as one operation.
+
+Operation by operation a lookup is nothing that could be bounded, since the place in the table moves
+with t; as a whole it is: between two times it takes the values there and at the knots between.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from .slope import Slope, Values, is_slope, lift, mapped, scaled
+from .slope_entrywise import Rule
+
+
+def _linear(eqn: Any, given: list[Any]) -> Slope | None:
+    span = _span(eqn, given)
+    if span is None:
+        return None
+    times, values, t, pieces = span
+    first, last = pieces
+    slopes = (values[1:] - values[:-1]) / _widths(times, values)
+    ends = [_at(times, values, float(end)) for end in (t.low, t.high)]
+    reached = np.stack([*ends, *values[first + 1 : last + 1]])
+    return _slope(eqn, t, reached, slopes[first : last + 1])
+
+
+def _constant(eqn: Any, given: list[Any]) -> Slope | None:
+    span = _span(eqn, given)
+    if span is None:
+        return None
+    times, values, t, (first, last) = span
+    last = last + 1 if float(t.high) >= times[-1] else last
+    reached = values[first : last + 1]
+    jumps = np.where(reached.min(axis=0) == reached.max(axis=0), 0.0, np.inf)
+    return _slope(eqn, t, reached, np.stack([-jumps, jumps]))
+
+
+def _cubic(eqn: Any, given: list[Any]) -> Slope | None:
+    """A cubic lies within the hull of its Bernstein coefficients, and so does its derivative."""
+    if is_slope(given[2]):
+        return None
+    span = _span(eqn, [given[0], given[1], given[3]])
+    if span is None:
+        return None
+    times, values, t, (first, last) = span
+    slopes = np.asarray(given[2], float)
+    width = _widths(times, values)[first : last + 1]
+    v0, v1 = values[first : last + 1], values[first + 1 : last + 2]
+    d0, d1 = slopes[first : last + 1], slopes[first + 1 : last + 2]
+    b1, b2 = v0 + width * d0 / 3, v1 - width * d1 / 3
+    middle = 3 * (b2 - b1) / width
+    return _slope(eqn, t, np.concatenate([v0, b1, b2, v1]), np.concatenate([d0, middle, d1]))
+
+
+def _span(eqn: Any, given: list[Any]) -> tuple[Values, Values, Slope, tuple[int, int]] | None:
+    """The table, t, and the first and last piece that t may lie in; None where it may lie outside."""
+    times, values, t = given
+    if is_slope(times) or is_slope(values) or not is_slope(t) or t.low.shape != ():
+        return None
+    times, values = np.asarray(times, float), np.asarray(values, float)
+    if not (times[0] <= t.low and t.high <= times[-1]):
+        return None
+    last = len(times) - 2
+    first = min(int(np.searchsorted(times, float(t.low), side="right")) - 1, last)
+    return (
+        times,
+        values,
+        t,
+        (first, min(int(np.searchsorted(times, float(t.high), "right")) - 1, last)),
+    )
+
+
+def _slope(eqn: Any, t: Slope, reached: Values, slopes: Values) -> Slope:
+    low, high = reached.min(axis=0), reached.max(axis=0)
+    moving = lift(t, eqn.outvars[0].aval.shape)
+    down, up = slopes.min(axis=0), slopes.max(axis=0)
+    return Slope(low, high, mapped(moving.parts, lambda part: scaled(part, down, up)))
+
+
+def _at(times: Values, values: Values, t: float) -> Values:
+    i = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
+    share = (t - times[i]) / (times[i + 1] - times[i])
+    return values[i] + share * (values[i + 1] - values[i])
+
+
+def _widths(times: Values, values: Values) -> Values:
+    return np.diff(times).reshape(-1, *(1,) * (values.ndim - 1))
+
+
+TABLES: dict[str, Rule] = {
+    "constant_table": _constant,
+    "linear_table": _linear,
+    "cubic_table": _cubic,
+}
