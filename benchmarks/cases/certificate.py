@@ -69,7 +69,7 @@ def _closeness() -> list[tuple[str, ...]]:
             bound = dvax.bound_error(problem, sol, constants)
             assert bound.x_sharp is not None
             error = np.abs(np.asarray(sol.xs) - exact)
-            above, sharp = np.asarray(bound.x), np.asarray(bound.x_sharp)
+            above, sharp = np.asarray(bound.x_paper), np.asarray(bound.x_sharp)
             told = error > _ROUNDING
             least = np.min(np.minimum(above, sharp)[told] / error[told])
             rows.append(

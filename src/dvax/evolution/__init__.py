@@ -1,5 +1,7 @@
 """The mild solution: exponential integrators, step control, `solve`, `Solution`."""
 
+from .growth import disturbance as disturbance
+from .growth import gronwall as gronwall
 from .implicit import Implicit as Implicit
 from .method import ETD1 as ETD1
 from .method import ETD2RK as ETD2RK

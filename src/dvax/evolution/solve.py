@@ -9,10 +9,11 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import DifferentiationError, SolveError
+from ..errors import DifferentiationError, InputError, InputProblem, SolveError
 from ..problem import Problem
 from ..vi import AbstractSolver, Auto
 from .arguments import bound_steps, check, warn_precision
+from .certified import certified
 from .compiled import compiled
 from .diagnose import diagnose
 from .implicit import Implicit
@@ -42,6 +43,7 @@ def solve(
     progress: bool = False,
     *,
     constants: Any = None,
+    certified_tol: Any = None,
     measure: bool | None = None,
     dense: bool = False,
     dt0: Any = None,
@@ -64,6 +66,10 @@ def solve(
     - `method`: `dvax.ETD2RK()` by default; `vi_solver`: `dvax.vi.Auto()` by default;
     - `constants`: `dvax.Constants` (or any object with `gamma`, `L_F`, `norm_P_inv`): lets the law be
       solved to a tolerance on its true error, and certifies every saved u;
+    - `certified_tol`: the largest error of x in the norm of the state space that is allowed at any
+      saved time, for the exact x0: steps are chosen, in a few runs, until `dvax.bound_error` with
+      these `constants` says so (`rtol` and `atol` are then not used). The bound that was reached is
+      in `stats["certified_bound"]`;
     - `measure`: whether to sample the defect inside steps. Adaptive steps always do; fixed steps only
       when asked, since it doubles their cost;
     - `dense`: keep every step, for `Solution.evaluate`; memory grows with `max_steps`;
@@ -97,6 +103,17 @@ def solve(
 
     ```
     """
+    if certified_tol is not None:
+        x0 = _tree.as_float(x0, "x0")
+        _only_adaptive(dt, method)
+        again: dict[str, Any] = dict(
+            method=method, vi_solver=vi_solver, progress=progress, constants=constants, dense=dense,
+            dt0=dt0, max_steps=max_steps, adjoint=adjoint, throw=throw,
+        )  # fmt: skip
+        return certified(
+            lambda atol: solve(problem, x0, t0, t1, args, ts, rtol=0.0, atol=atol, **again),
+            problem, x0, args, float(t0), float(t1), constants, certified_tol,
+        )  # fmt: skip
     x0 = _tree.as_float(x0, "x0")
     method = _METHOD if method is None else method
     check(problem, x0, t0, t1, ts, dt, rtol, atol, dt0, horizon, method, adjoint, measure, dense)
@@ -140,6 +157,20 @@ def solve(
             if throw:
                 raise SolveError(_explain(solution), solution)
     return solution
+
+
+def _only_adaptive(dt: Any, method: Any) -> None:
+    for name, given, why in (
+        ("dt", dt, "fixed steps cannot be chosen"),
+        ("method", method if isinstance(method, Implicit) else None, "its steps have no defect"),
+    ):
+        if given is not None:
+            raise InputError(
+                InputProblem(
+                    f"dvax.solve({name})", str(given), f"with certified_tol {why}",
+                    "Leave it out, or use dvax.bound_error on the solution",
+                )
+            )  # fmt: skip
 
 
 def _differentiably(

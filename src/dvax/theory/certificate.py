@@ -21,11 +21,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from .. import _tree
 from ..errors import InputError, InputProblem
-from ..evolution import Solution, solve
+from ..evolution import Solution, disturbance, gronwall, solve
 from ..generators import AbstractGenerator, AbstractMatrixFree, Product
 from ..problem import Problem
 from .constants import Constants
@@ -35,8 +34,9 @@ from .status import Status, weakest
 class Bound(eqx.Module):
     """Bounds on the true error at the saved times of a solution.
 
-    - `ts`; `x` ≥ ‖x_h − x‖ and `u` ≥ ‖u_h − u‖ with the paper's constants;
-    - `x_sharp`, `u_sharp`: the same with the one-sided constant, or None where it is not known;
+    - `ts`; `x` ≥ ‖x_h − x‖ and `u` ≥ ‖u_h − u‖: the better one, at each time, of the next two;
+    - `x_paper`, `u_paper`: with the paper's rate ω + ML̃;
+    - `x_sharp`, `u_sharp`: with the one-sided constant μ, or None where it is not known;
     - `status`: the weakest of what the bound rests on. "proved" says that the constants are proved,
       that M, ω and ‖P⁻¹‖ are no smaller than what the structure of A and P gives, and that the
       defect is enclosed over every step; the moduli of f and h are those that the constants state.
@@ -48,6 +48,8 @@ class Bound(eqx.Module):
     ts: jax.Array
     x: jax.Array
     u: jax.Array
+    x_paper: jax.Array
+    u_paper: jax.Array
     x_sharp: jax.Array | None
     u_sharp: jax.Array | None
     status: Status = eqx.field(static=True)
@@ -93,12 +95,14 @@ def bound_error(
     start = _starts(initial_error, sol.ts.dtype)
     t0 = jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
     x, u, x_sharp, u_sharp = _bounds(constants, t0, sol.ts, impulse, apart, law, start)
+    best_x = x if x_sharp is None else jnp.minimum(x, x_sharp)
+    best_u = u if u_sharp is None else jnp.minimum(u, u_sharp)
     status = weakest(
         constants.status_of(*(name for name, _ in constants.statuses)),
         "proved" if measured.enclosed else "estimated",
         _status_of_structure(problem, sol, constants),
     )
-    return Bound(sol.ts, x, u, x_sharp, u_sharp, status)
+    return Bound(sol.ts, best_x, best_u, x, u, x_sharp, u_sharp, status)
 
 
 @jax.jit
@@ -106,15 +110,13 @@ def _bounds(
     c: Constants, t0: Any, ts: Any, impulse: tuple, apart: Any, law: tuple, start: tuple
 ) -> tuple:
     """x, u, x_sharp and u_sharp of `Bound`."""
-    # A law solved to ‖w‖ disturbs f̃ by at most this much of it.
-    gain = c.beta_f * c.norm_P_inv / c.gamma
-    acted, settled = (defect + gain * law_defect for defect, law_defect in impulse)
+    acted, settled = (disturbance(c, *parts) for parts in impulse)
     law_error = c.norm_P_inv * (law[0] / c.gamma + law[1])
-    x = _gronwall(t0, ts, acted, settled, c.growth_rate, c.M, start[0]) + apart
+    x = gronwall(t0, ts, acted, settled, c.growth_rate, c.M, start[0]) + apart
     u = c.L * x + law_error
     if c.one_sided is None:
         return x, u, None, None
-    sharp = _gronwall(t0, ts, acted, settled, c.one_sided, 1.0, start[1]) + apart
+    sharp = gronwall(t0, ts, acted, settled, c.one_sided, 1.0, start[1]) + apart
     return x, u, sharp, c.L * sharp + law_error
 
 
@@ -169,8 +171,8 @@ def _breaks_off(before: Bound, t0: Any) -> list[InputProblem]:
 def _starts(initial_error: Any, dtype: Any) -> tuple[Any, Any]:
     """What the paper's and the sharp bound start with."""
     if isinstance(initial_error, Bound):
-        sharp = initial_error.x if initial_error.x_sharp is None else initial_error.x_sharp
-        return initial_error.x[-1], sharp[-1]
+        paper, sharp = initial_error.x_paper, initial_error.x_sharp
+        return paper[-1], (paper if sharp is None else sharp)[-1]
     error = jnp.asarray(initial_error, dtype)
     return error, error
 
@@ -200,44 +202,6 @@ def is_declared(A: AbstractGenerator) -> bool:
     if isinstance(A, Product):
         return any(map(is_declared, A.parts))
     return isinstance(A, AbstractMatrixFree) and not A.numerical_range().proved
-
-
-def _gronwall(
-    t0: Any, ts: Any, impulse: Any, settled: Any, rate: Any, M: Any, initial: Any
-) -> jax.Array:
-    """M e^{ct} e₀ + M ∫ e^{c(t−s)} dI(s), from the impulse I known at the saved times only.
-
-    `settled` is what the steps that had ended by then brought, `impulse` has the one under way as well.
-    An ended step acted at any moment since the saved time before it began, so it is charged e^{c₊Δ}
-    over the time from there to its end; the step under way is charged in the same way, and for that
-    one saved time alone: nothing says how much of it had acted.
-    """
-
-    def advance(carry: tuple, now: tuple) -> tuple:
-        # `bound` holds at `base` for the steps ended by then; the others act after `early`.
-        early, base, ended, bound, last = carry
-        time, total, done = now
-        decayed = jnp.exp(rate * (time - base)) * bound
-        grown = M * jnp.exp(jnp.maximum(rate, 0.0) * (time - early))
-        after = decayed + grown * (total - ended)
-        # What has no bound keeps none: ∞ − ∞, and an impulse that is not a number, say nothing.
-        lost = ~jnp.isfinite(total) | jnp.isnan(after)
-        moved = (done > ended) | lost
-        new = jnp.where(lost, jnp.inf, decayed + grown * (done - ended))
-        carry = (
-            # A step under way began after the saved time before this one, whose own has ended.
-            jnp.where(moved, jnp.where(total > done, last, time), early),
-            jnp.where(moved, time, base),
-            jnp.where(moved, done, ended),
-            jnp.where(moved, new, bound),
-            time,
-        )
-        return carry, jnp.where(lost, jnp.inf, after)
-
-    begin = jnp.asarray(t0, ts.dtype)
-    zero = jnp.zeros((), ts.dtype)
-    start = (begin, begin, zero, jnp.asarray(M * initial, ts.dtype), begin)
-    return lax.scan(advance, start, (ts, impulse, settled))[1]
 
 
 def _again(problem: Problem, sol: Solution) -> Solution:

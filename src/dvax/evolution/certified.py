@@ -1,0 +1,150 @@
+"""Steps chosen for a bound on the error: `certified_tol` of `dvax.solve`.
+
+With a defect of the norm δ all along, ‖x_h − x‖(t) ≤ M Φ_c(t) δ, c = ω + ML̃. So the tolerance of the
+step control follows from the one that is asked for, up to a factor of a few that the run itself shows:
+a run in coarser steps is cheap and tells most of it, and the next one is made with what it told.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .. import _tree
+from .._tree import Tree
+from ..errors import InputError, InputProblem
+from ..problem import Problem
+from .growth import disturbance, gronwall
+from .solution import Solution
+
+_COARSE = 100.0
+"""How much coarser the first run is."""
+
+_AIM = 0.7
+"""The share of the tolerance that a run aims at, so that it need not be made again."""
+
+_RUNS = 8
+_ROUNDINGS = 256.0
+"""A rate f̃ is taken to be known to so many roundings of its size, and no defect to be smaller."""
+
+_NEEDED = ("M", "growth_rate", "beta_f", "norm_P_inv", "gamma")
+
+
+def certified(
+    run: Callable[[float], Solution],
+    problem: Problem,
+    x0: Tree,
+    args: Any,
+    t0: float,
+    t1: float,
+    constants: Any,
+    tol: float,
+) -> Solution:
+    """The solution whose bound is at most `tol` at every saved time;
+    `run(atol)` solves with this absolute tolerance and no relative one.
+
+    **Raises:** `dvax.InputError` where rounding alone leaves a bound above `tol`.
+    """
+    _check(constants, tol, x0)
+    space = problem.spaces(x0)[0]
+    size, span = float(np.sqrt(float(space.size()))), t1 - t0
+    grown = _grown(constants, span)
+    rate = problem.reduced(t0, x0, args)
+    largest = max(float(space.norm(rate)), float(space.norm(x0)))
+    eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(x0))).eps)
+    reachable = _ROUNDINGS * eps * largest * grown
+    if not tol >= reachable:
+        raise _hopeless(tol, reachable, constants, span)
+    # The step control holds the root mean square of the defect below atol/span.
+    best = atol = tol / grown * span / size
+    atol *= _COARSE if _COARSE * atol < 0.1 * (1.0 + largest / size) else 1.0
+    solution, bound = None, np.inf
+    for _ in range(_RUNS):
+        solution = run(atol)
+        bound = _bound(solution, constants, t0)
+        if bound <= tol:
+            return _with_bound(solution, bound)
+        atol = min(0.5 * atol, _AIM * atol * tol / bound) if np.isfinite(bound) else 0.1 * atol
+        if atol < 1e-3 * eps * best:
+            break
+    raise _hopeless(tol, bound, constants, span)
+
+
+def _bound(solution: Solution, constants: Any, t0: float) -> float:
+    """The largest bound at a saved time."""
+    assert solution.defect is not None and solution.settled is not None
+    acted = disturbance(constants, solution.defect, solution.law_defect)
+    settled = disturbance(constants, *solution.settled)
+    begin = jnp.asarray(t0, solution.ts.dtype)
+    each = [
+        gronwall(begin, solution.ts, acted, settled, rate, M, 0.0) for M, rate in _rates(constants)
+    ]
+    return float(jnp.max(jnp.min(jnp.stack(each), axis=0)))
+
+
+def _rates(constants: Any) -> list[tuple[float, float]]:
+    """(M, c) of the paper, and (1, μ) where the one-sided constant is known."""
+    one_sided = getattr(constants, "one_sided", None)
+    paper = float(constants.M), float(constants.growth_rate)
+    return [paper] if one_sided is None else [paper, (1.0, float(one_sided))]
+
+
+def _grown(constants: Any, span: float) -> float:
+    """M Φ_c(T): what a defect of 1 may grow to."""
+    return min(M * _convolved(rate, span) for M, rate in _rates(constants))
+
+
+def _with_bound(solution: Solution, bound: float) -> Solution:
+    solution.stats["certified_bound"] = bound
+    return solution
+
+
+def _convolved(a: float, T: float) -> float:
+    """Φ_a(T)."""
+    return T if a == 0.0 else float(np.expm1(min(a * T, 700.0)) / a)
+
+
+def _hopeless(tol: float, reachable: float, constants: Any, span: float) -> InputError:
+    M, rate = min(_rates(constants), key=lambda pair: pair[0] * _convolved(pair[1], span))
+    return InputError(
+        InputProblem(
+            "dvax.solve(certified_tol)",
+            f"{tol:g}",
+            f"errors may grow like M e^{{ct}} with M = {M:g} and c = {rate:g}, a defect by "
+            f"M Φ_c(T) = {M * _convolved(rate, span):.3g} over T = {span:g}, so that no bound below "
+            f"{reachable:.3g} can be reached here",
+            "Ask for more than that, solve for a shorter time, or find sharper constants: "
+            "dvax.verify gives a one-sided rate where it can",
+        )
+    )
+
+
+def _check(constants: Any, tol: Any, x0: Tree) -> None:
+    missing = [name for name in _NEEDED if getattr(constants, name, None) is None]
+    if constants is None or missing:
+        raise InputError(
+            InputProblem(
+                "dvax.solve(constants)",
+                "None" if constants is None else f"no {', '.join(missing)}",
+                "a bound on the error rests on the constants of the problem",
+                "Give dvax.Constants, or constants=dvax.verify(problem, x0).constants",
+            )
+        )
+    if not _tree.is_concrete(tol, x0, constants):
+        raise InputError(
+            InputProblem(
+                "dvax.solve(certified_tol)",
+                "a traced value",
+                "steps are chosen by what earlier runs showed, which a compiled program cannot do",
+                "Call it outside jax.jit, and pass the atol of the solution found to solve inside",
+            )
+        )
+    if not (np.ndim(tol) == 0 and np.isfinite(tol) and tol > 0):
+        raise InputError(
+            InputProblem(
+                "dvax.solve(certified_tol)", str(tol), "it must be a positive number",
+                "Give the largest error of x, in the norm of the state space, that is allowed",
+            )
+        )  # fmt: skip

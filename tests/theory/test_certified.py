@@ -1,0 +1,92 @@
+"""`certified_tol`: the true error is below what was asked; what cannot be had is said at once."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.closed_forms import ALL, c7
+from tests.selection import mostly_thorough
+
+import dvax
+
+METHODS = {"ETD1": dvax.ETD1(), "ETD2RK": dvax.ETD2RK(), "ETD4RK": dvax.ETD4RK()}
+TOLERANCES = {"ETD1": [1e-2, 1e-3], "ETD2RK": [1e-3, 1e-5, 1e-7], "ETD4RK": [1e-3, 1e-7]}
+CASES = [
+    (name, method, tol)
+    for name in [*ALL, "C7"]
+    for method, tols in TOLERANCES.items()
+    for tol in tols
+]  # fmt: skip
+OFTEN = {("C1", "ETD2RK", 1e-5), ("C2", "ETD2RK", 1e-3), ("C4", "ETD4RK", 1e-7)}
+
+
+def system(name):
+    case = c7(24) if name == "C7" else ALL[name]()
+    region = {"x": (0.0, 7.0)} if name == "C4" else {}
+    x0 = jnp.asarray(case.x0)
+    check = dvax.verify(case.problem, x0, 0.0, case.t1, case.args, **region)
+    return case, x0, check.constants
+
+
+def errors(case, x0, sol):
+    space, control = case.problem.spaces(x0)
+    exact = [case.exact(float(t)) for t in sol.ts]
+    of_x = [float(space.norm(x - e[0])) for x, e in zip(sol.xs, exact, strict=True)]
+    of_u = [float(control.norm(u - e[1])) for u, e in zip(sol.us, exact, strict=True)]
+    return np.array(of_x), np.array(of_u)
+
+
+@pytest.mark.parametrize(("name", "method", "tol"), mostly_thorough(CASES, OFTEN))
+def test_the_true_error_is_below_the_tolerance(name, method, tol):
+    case, x0, constants = system(name)
+    ts = np.linspace(0.0, case.t1, 21)[1:]
+    sol = dvax.solve(
+        case.problem, x0, 0.0, case.t1, case.args, ts, method=METHODS[method], constants=constants,
+        certified_tol=tol,
+    )  # fmt: skip
+    bound = dvax.bound_error(case.problem, sol, constants)
+    of_x, of_u = errors(case, x0, sol)
+    assert np.all(of_x <= np.asarray(bound.x) + 1e-12) and np.all(
+        of_u <= np.asarray(bound.u) + 1e-12
+    )
+    assert float(bound.x.max()) <= tol
+    assert sol.stats["certified_bound"] == pytest.approx(float(bound.x.max()), rel=1e-9)
+    if of_x.max() > 1e-11:
+        # Not far below either: the last run aims at seven tenths.
+        assert float(bound.x.max()) >= 0.05 * tol
+        print(f"{name} {method} {tol:g}: bound / error {float(bound.x.max()) / of_x.max():.1f}")
+
+
+def test_what_rounding_forbids_is_said_before_anything_runs():
+    case, x0, constants = system("C1")
+    with pytest.raises(dvax.InputError, match=r"c = -0\.5.*no bound below [\d.e-]+ can be reached"):
+        dvax.solve(case.problem, x0, 0.0, 2.0, case.args, constants=constants, certified_tol=1e-15)
+    with pytest.raises(dvax.InputError, match=r"M Φ_c\(T\) = [\d.]+e\+"):
+        # Paper's constants alone, over a long time: e^{c·200} of anything is hopeless.
+        paper = ALL["C1"]().constants
+        given = {n: getattr(paper, n) for n in ("gamma", "L_F", "alpha_h", "beta_h", "alpha_f",
+                 "beta_f", "M", "omega", "m_P", "norm_P_inv")}  # fmt: skip
+        alone = dvax.Constants(**given)
+        dvax.solve(case.problem, x0, 0.0, 200.0, case.args, constants=alone, certified_tol=1e-3)
+
+
+def test_arguments_that_do_not_go_together_are_refused():
+    case, x0, constants = system("C1")
+    run = lambda **more: dvax.solve(case.problem, x0, 0.0, 2.0, case.args, **more)  # noqa: E731
+    with pytest.raises(dvax.InputError, match=r"constants.*rests on the constants"):
+        run(certified_tol=1e-3)
+    for wrong in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(dvax.InputError, match="positive number"):
+            run(certified_tol=wrong, constants=constants)
+    with pytest.raises(dvax.InputError, match=r"dt.*cannot be chosen"):
+        run(certified_tol=1e-3, constants=constants, dt=0.1)
+    with pytest.raises(dvax.InputError, match="no defect"):
+        run(certified_tol=1e-3, constants=constants, method=dvax.Implicit())
+    with pytest.raises(dvax.InputError, match=r"traced.*outside jax\.jit"):
+        jax.jit(
+            lambda x: (
+                dvax.solve(
+                    case.problem, x, 0.0, 2.0, case.args, constants=constants, certified_tol=1e-3
+                ).xs
+            )
+        )(x0)
