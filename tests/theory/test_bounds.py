@@ -277,3 +277,35 @@ def test_no_pair_of_trajectories_of_a_contact_problem_breaks_the_estimates():
             assert dx[-1] < dx[0]
     print(f"{decaying} of 60 decay certainly; the one-sided bound is reached to {sharpest:.3f}")
     assert decaying > 3 and sharpest > 0.3
+
+
+def test_constants_of_a_region_are_good_while_the_trajectory_stays_in_it():
+    case = ALL["C1"]()
+    ts = np.linspace(0.0, 2.0, 21)[1:]
+    run = lambda t1, ts: dvax.solve(  # noqa: E731
+        case.problem, -1.0, 0.0, t1, args=case.args, ts=ts, rtol=1e-5, atol=1e-8
+    )
+    constants = lambda **more: dvax.verify(  # noqa: E731
+        case.problem, jnp.asarray(-1.0), 0.0, 2.0, case.args, **more
+    ).constants
+    sol = run(2.0, ts)
+    free = dvax.bound_error(case.problem, sol, constants())
+    assert free.status == "proved" and np.all(np.isfinite(free.x))
+    # x passes 1 at about t = 0.9 and stays above.
+    leaves = int(np.argmax(np.asarray(sol.xs) > 1.0 - 1e-4))
+    within = dvax.bound_error(case.problem, sol, constants(x=(-2.0, 1.0)))
+    assert within.status == "declared"
+    for v, w in ((within.x, free.x), (within.x_paper, free.x_paper), (within.u_sharp, free.u_sharp)):
+        np.testing.assert_allclose(np.asarray(v)[:leaves], np.asarray(w)[:leaves], rtol=1e-9)
+        assert np.all(np.isinf(np.asarray(v)[leaves:]))
+    longer = run(3.0, np.array([3.0]))
+    assert dvax.bound_error(case.problem, longer, constants()).status == "declared"
+
+
+def test_a_method_without_a_defect_is_refused():
+    case = ALL["C1"]()
+    sol = dvax.solve(
+        case.problem, -1.0, 0.0, 2.0, args=case.args, rtol=1e-3, method=dvax.Implicit()
+    )
+    with pytest.raises(dvax.InputError, match=r"dvax\.Implicit.*exponential method"):
+        dvax.bound_error(case.problem, sol, case.constants)

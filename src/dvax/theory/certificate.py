@@ -24,7 +24,7 @@ import numpy as np
 
 from .. import _tree
 from ..errors import InputError, InputProblem
-from ..evolution import Solution, disturbance, gronwall, solve
+from ..evolution import Implicit, Solution, disturbance, gronwall, solve
 from ..generators import AbstractGenerator, AbstractMatrixFree, Product
 from ..problem import Problem
 from .constants import Constants
@@ -67,6 +67,11 @@ def bound_error(
     Where the solve did not measure its defect (fixed steps), it is run again with `measure=True`,
     and the distance between the two runs, which is rounding, is added.
 
+    Constants that `dvax.verify` found for a region of x are good while the trajectory stays in it:
+    where a saved state, with its bound, is not inside, the bounds are infinite from there on. Between
+    saved times nobody looks, and for other times than those verified nobody proved them: then the
+    status is "declared".
+
     **Raises:** `dvax.InputError` where `sol` is not a solution of `problem`, or `initial_error` is
     not a number ≥ 0.
 
@@ -93,16 +98,27 @@ def bound_error(
     impulse = (measured.defect, measured.law_defect), measured.settled
     law = sol.law_residual, sol.law_step
     start = _starts(initial_error, sol.ts.dtype)
-    t0 = jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
+    begin = sol.setup.setting["t0"]
+    t0 = jnp.asarray(begin, sol.ts.dtype)
     x, u, x_sharp, u_sharp = _bounds(constants, t0, sol.ts, impulse, apart, law, start)
     best_x = x if x_sharp is None else jnp.minimum(x, x_sharp)
     best_u = u if u_sharp is None else jnp.minimum(u, u_sharp)
+    domain = constants.domain
+    where: Status = "proved"
+    inside = jnp.ones(sol.ts.shape, bool)
+    if domain is not None:
+        covered = domain.covers(begin, sol.setup.setting["t1"])
+        where = "proved" if covered and domain.free else "declared"
+        inside = inside if domain.free else domain.keeps(sol.xs, best_x, space)
     status = weakest(
         constants.status_of(*(name for name, _ in constants.statuses)),
         "proved" if measured.enclosed else "estimated",
         _status_of_structure(problem, sol, constants),
+        where,
     )
-    return Bound(sol.ts, best_x, best_u, x, u, x_sharp, u_sharp, status)
+    kept = lambda v: jnp.where(inside, v, jnp.inf)  # noqa: E731
+    sharp = [None if v is None else kept(v) for v in (x_sharp, u_sharp)]
+    return Bound(sol.ts, kept(best_x), kept(best_u), kept(x), kept(u), sharp[0], sharp[1], status)
 
 
 @jax.jit
@@ -129,6 +145,15 @@ def _check(problem: Problem, sol: Solution, initial_error: Any) -> None:
                 "a solution of another problem",
                 "the certificate evaluates the defect of this problem",
                 "Pass the problem that was solved",
+            )
+        )
+    if isinstance(sol.setup.method, Implicit):
+        wrong.append(
+            InputProblem(
+                "dvax.bound_error(sol)",
+                "a solution of dvax.Implicit",
+                "an implicit method keeps no polynomials of its steps, so that its defect is not known",
+                "Solve with an exponential method",
             )
         )
     if not isinstance(initial_error, Bound) and _tree.is_concrete(initial_error):

@@ -8,6 +8,7 @@ import numpy as np
 
 from .. import _tree
 from ..errors import InputError, InputProblem
+from .domain import Domain
 from .status import ORDER, Status, weakest
 
 _PRIMARY = (
@@ -40,7 +41,8 @@ class Constants(eqx.Module):
     - `m_P`, `norm_P_inv`: min σ(P⁻¹) and ‖P⁻¹‖ (ass:operators);
     - `one_sided` (μ), optional: ⟨A(x−x') + f̃(x) − f̃(x'), x−x'⟩ ≤ μ‖x−x'‖². The paper's constants
       use |·| where this sees signs, so it is never above ω + M L̃ when M = 1;
-    - `status`: "proved" or "declared" for all of them, or a mapping from name to status.
+    - `status`: "proved" or "declared" for all of them, or a mapping from name to status;
+    - `domain`: the times and states for which they hold, from `dvax.verify`; None for all.
 
     **Raises:** `dvax.InputError` where γ, L_F, m_P or ‖P⁻¹‖ is not positive, a Lipschitz modulus is
     negative, M < 1, or γ > L_F.
@@ -67,6 +69,7 @@ class Constants(eqx.Module):
     norm_P_inv: Any
     one_sided: Any
     statuses: tuple[tuple[str, Status], ...] = eqx.field(static=True)
+    domain: Domain | None
 
     def __init__(
         self,
@@ -83,7 +86,9 @@ class Constants(eqx.Module):
         norm_P_inv: Any,
         one_sided: Any = None,
         status: Status | Mapping[str, Status] = "declared",
+        domain: Domain | None = None,
     ):
+        self.domain = domain
         given = (gamma, L_F, alpha_h, beta_h, alpha_f, beta_f, M, omega, m_P, norm_P_inv)
         for name, value in zip(_PRIMARY, given, strict=True):
             setattr(self, name, _tree.as_float(value, f"dvax.Constants({name})"))

@@ -80,7 +80,7 @@ def parameter_bounds(
     region = Region(interval(t0, t1), states, responses, eta)
     box = Region(region.t, bounded(states, x0), bounded(responses, system.u0), eta)
     known = knowledge(system, region, box, {})
-    constants = constants_of(system, region, known)
+    constants = constants_of(system, region, known, x is None and u is None)
     if constants is None:
         raise _unknown("γ, L_F, α_h, β_h, α_f, β_f", known.of["gamma"].how)
 

@@ -14,6 +14,7 @@ from ..problem import Problem
 from .assumption import Assumption
 from .certificate import is_declared
 from .constants import Constants
+from .domain import Domain
 from .enclosure import Enclosure
 from .known import Knowledge, knowledge
 from .moduli import sharp_rate
@@ -126,7 +127,8 @@ def verify(
     box = Region(time, bounded(states, x0), bounded(responses, system.u0))
     known = knowledge(system, region, box, _declared(declared))
     assumptions = tuple(rows(system, region, K, knots, known))
-    return Verification(assumptions, constants_of(system, region, known), _route(system, known))
+    constants = constants_of(system, region, known, x is None and u is None)
+    return Verification(assumptions, constants, _route(system, known))
 
 
 def _route(system: System, known: Knowledge) -> str:
@@ -137,7 +139,7 @@ def _route(system: System, known: Knowledge) -> str:
     return "projection" if known.of["gamma"].value <= small else "variational inequality"
 
 
-def constants_of(system: System, region: Region, known: Knowledge) -> Constants | None:
+def constants_of(system: System, region: Region, known: Knowledge, free: bool) -> Constants | None:
     """The constants, where every modulus is a number and γ > 0."""
     values = {name: entry.value for name, entry in known.of.items()}
     if known.pair is not None or not values["gamma"] > 0:
@@ -155,7 +157,13 @@ def constants_of(system: System, region: Region, known: Knowledge) -> Constants 
     return Constants(
         **values, M=system.growth.M, omega=system.growth.omega, m_P=system.spectrum.m_P,
         norm_P_inv=system.spectrum.norm_P_inv, one_sided=mu, status=statuses,
+        domain=_domain(region, free),
     )  # fmt: skip
+
+
+def _domain(region: Region, free: bool) -> Domain:
+    end = lambda i: jtu.tree_map(lambda v: v[i], region.x, is_leaf=is_slope)  # noqa: E731
+    return Domain(float(region.t.low), float(region.t.high), end(0), end(1), free)
 
 
 def _sharp(system: System, region: Region, known: Knowledge) -> float | None:
