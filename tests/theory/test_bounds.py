@@ -285,21 +285,25 @@ def test_constants_of_a_region_are_good_while_the_trajectory_stays_in_it():
     run = lambda t1, ts: dvax.solve(  # noqa: E731
         case.problem, -1.0, 0.0, t1, args=case.args, ts=ts, rtol=1e-5, atol=1e-8
     )
-    constants = lambda **more: dvax.verify(  # noqa: E731
+    check = lambda **more: dvax.verify(  # noqa: E731
         case.problem, jnp.asarray(-1.0), 0.0, 2.0, case.args, **more
-    ).constants
+    )
     sol = run(2.0, ts)
-    free = dvax.bound_error(case.problem, sol, constants())
+    free = dvax.bound_error(case.problem, sol, check().constants)
     assert free.status == "proved" and np.all(np.isfinite(free.x))
     # x passes 1 at about t = 0.9 and stays above.
     leaves = int(np.argmax(np.asarray(sol.xs) > 1.0 - 1e-4))
-    within = dvax.bound_error(case.problem, sol, constants(x=(-2.0, 1.0)))
+    within = dvax.bound_error(case.problem, sol, check(x=(-2.0, 1.0)).constants)
     assert within.status == "declared"
-    for v, w in ((within.x, free.x), (within.x_paper, free.x_paper), (within.u_sharp, free.u_sharp)):
+    for v, w in (
+        (within.x, free.x),
+        (within.x_paper, free.x_paper),
+        (within.u_sharp, free.u_sharp),
+    ):
         np.testing.assert_allclose(np.asarray(v)[:leaves], np.asarray(w)[:leaves], rtol=1e-9)
         assert np.all(np.isinf(np.asarray(v)[leaves:]))
     longer = run(3.0, np.array([3.0]))
-    assert dvax.bound_error(case.problem, longer, constants()).status == "declared"
+    assert dvax.bound_error(case.problem, longer, check().constants).status == "declared"
 
 
 def test_a_method_without_a_defect_is_refused():
