@@ -50,6 +50,8 @@ APPLICATION = {
     *("matplotlib", "numcodecs", "pint", "plotly", "pydantic", "pydantic_core", "rich"),
     *("tomli_w", "typer", "xarray", "zarr"),
 }
+# Extras that a function asks for when it is called, and says so where they are missing.
+EXTRAS = {"clarabel"}
 # What the command line may load before it knows what is asked of it.
 LIGHT = {"typer", "rich"}
 APPLICATION_ROOMS = {"runs", "plots", "cli", "__main__"}
@@ -176,7 +178,7 @@ def foreign(package: Path) -> list[str]:
             # The package's __init__ is loaded by the command line too.
             allowed, why = LIGHT, "the command line loads it at its start"
         elif here in APPLICATION_ROOMS or deferred:
-            allowed, why = CORE | APPLICATION, "it is not a declared dependency"
+            allowed, why = CORE | APPLICATION | EXTRAS, "it is not a declared dependency"
         else:
             allowed, why = CORE, "the library below the application needs the JAX stack alone"
         if top not in allowed:

@@ -70,7 +70,14 @@ def test_the_metadata_says_what_is_needed(wheel: Path):
     about = metadata(wheel)
     assert about["Requires-Python"] == ">=3.11"
     assert about["License-Expression"] == "Apache-2.0"
-    assert set(about.get_all("Provides-Extra", [])) == {"app", "dask", "dev", "docs", "fem"}
+    assert set(about.get_all("Provides-Extra", [])) == {
+        "app",
+        "dask",
+        "dev",
+        "docs",
+        "energy",
+        "fem",
+    }
     core = [need for need in about.get_all("Requires-Dist", []) if "extra ==" not in need]
     assert {need.partition(">=")[0] for need in core} == {
         *("jax", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping", "numpy", "scipy"),

@@ -11,7 +11,7 @@ from scipy.spatial import Delaunay
 
 import dvax
 from dvax import generators, spaces
-from dvax.theory.certificate import _is_declared
+from dvax.theory.certificate import is_declared
 
 TRIANGLES = (0.5, 2.0)
 
@@ -186,9 +186,9 @@ def test_a_rod_cools_as_it_should_to_second_order_in_the_mesh():
 
 def test_a_declared_interval_makes_the_bound_declared():
     M, S, interval = MESHES["triangles"]
-    assert _is_declared(generators.FiniteElements(M, S, interval))
-    assert _is_declared(generators.FiniteElements(*rod(10)[1:], dissipative=True))
-    assert not _is_declared(generators.FiniteElements(*rod(10)[1:]))
+    assert is_declared(generators.FiniteElements(M, S, interval))
+    assert is_declared(generators.FiniteElements(*rod(10)[1:], dissipative=True))
+    assert not is_declared(generators.FiniteElements(*rod(10)[1:]))
 
 
 @pytest.mark.parametrize(

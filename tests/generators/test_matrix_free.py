@@ -11,7 +11,7 @@ from jax.experimental.sparse import BCOO
 
 import dvax
 from dvax import generators, spaces
-from dvax.theory.certificate import _is_declared
+from dvax.theory.certificate import is_declared
 
 N = 40
 RNG = np.random.default_rng(4)
@@ -393,7 +393,7 @@ def test_a_bound_that_rests_on_a_declared_range_is_declared():
     known = generators.Range(-800.0, 0.0, proved=True)
     ours = generators.Sparse(MATRICES["heat"])
     theirs = generators.Sparse(MATRICES["heat"], within=known)
-    assert not _is_declared(ours) and _is_declared(theirs) and _is_declared(Waves(1.0))
-    assert _is_declared(theirs.adjoint(spaces.Euclidean(N)))
-    assert _is_declared(generators.Product(ours, theirs))
-    assert not _is_declared(generators.Product(ours, generators.Scalar(-1.0)))
+    assert not is_declared(ours) and is_declared(theirs) and is_declared(Waves(1.0))
+    assert is_declared(theirs.adjoint(spaces.Euclidean(N)))
+    assert is_declared(generators.Product(ours, theirs))
+    assert not is_declared(generators.Product(ours, generators.Scalar(-1.0)))

@@ -85,10 +85,11 @@ def _bound(solution: Solution, constants: Any, t0: float) -> float:
 
 
 def _rates(constants: Any) -> list[tuple[float, float]]:
-    """(M, c) of the paper, and (1, μ) where the one-sided constant is known."""
-    one_sided = getattr(constants, "one_sided", None)
-    paper = float(constants.M), float(constants.growth_rate)
-    return [paper] if one_sided is None else [paper, (1.0, float(one_sided))]
+    """(M, c) of the paper, (1, μ) one-sided, and that of an energy norm, as far as they are known."""
+    one_sided, energy = (getattr(constants, name, None) for name in ("one_sided", "energy"))
+    rates = [(float(constants.M), float(constants.growth_rate))]
+    rates += [] if one_sided is None else [(1.0, float(one_sided))]
+    return rates + ([] if energy is None else [(float(energy[0]), float(energy[1]))])
 
 
 def _grown(constants: Any, span: float) -> float:

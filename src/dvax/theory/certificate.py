@@ -36,7 +36,8 @@ class Bound(eqx.Module):
 
     - `ts`; `x` ≥ ‖x_h − x‖ and `u` ≥ ‖u_h − u‖: the better one, at each time, of the next two;
     - `x_paper`, `u_paper`: with the paper's rate ω + ML̃;
-    - `x_sharp`, `u_sharp`: with the one-sided constant μ, or None where it is not known;
+    - `x_sharp`, `u_sharp`: with the one-sided constant μ, or the rate of an energy norm where that
+      gives less; None where neither is known;
     - `status`: the weakest of what the bound rests on. "proved" says that the constants are proved,
       that M, ω and ‖P⁻¹‖ are no smaller than what the structure of A and P gives, and that the
       defect is enclosed over every step; the moduli of f and h are those that the constants state.
@@ -130,9 +131,12 @@ def _bounds(
     law_error = c.norm_P_inv * (law[0] / c.gamma + law[1])
     x = gronwall(t0, ts, acted, settled, c.growth_rate, c.M, start[0]) + apart
     u = c.L * x + law_error
-    if c.one_sided is None:
+    rates = [] if c.one_sided is None else [(1.0, c.one_sided)]
+    rates += [] if c.energy is None else [c.energy]
+    if not rates:
         return x, u, None, None
-    sharp = gronwall(t0, ts, acted, settled, c.one_sided, 1.0, start[1]) + apart
+    each = [gronwall(t0, ts, acted, settled, rate, M, start[1]) for M, rate in rates]
+    sharp = jnp.min(jnp.stack(each), axis=0) + apart
     return x, u, sharp, c.L * sharp + law_error
 
 

@@ -41,6 +41,8 @@ class Constants(eqx.Module):
     - `m_P`, `norm_P_inv`: min σ(P⁻¹) and ‖P⁻¹‖ (ass:operators);
     - `one_sided` (μ), optional: ⟨A(x−x') + f̃(x) − f̃(x'), x−x'⟩ ≤ μ‖x−x'‖². The paper's constants
       use |·| where this sees signs, so it is never above ω + M L̃ when M = 1;
+    - `energy` (M, μ), optional: ‖x₁−x₂‖ ≤ M e^{μt}‖Δx₀‖ by contraction in another norm, of condition
+      M² (`dvax.verify(energy=True)` finds one);
     - `status`: "proved" or "declared" for all of them, or a mapping from name to status;
     - `domain`: the times and states for which they hold, from `dvax.verify`; None for all.
 
@@ -68,6 +70,7 @@ class Constants(eqx.Module):
     m_P: Any
     norm_P_inv: Any
     one_sided: Any
+    energy: tuple[Any, Any] | None
     statuses: tuple[tuple[str, Status], ...] = eqx.field(static=True)
     domain: Domain | None
 
@@ -85,17 +88,22 @@ class Constants(eqx.Module):
         m_P: Any,
         norm_P_inv: Any,
         one_sided: Any = None,
+        energy: tuple[Any, Any] | None = None,
         status: Status | Mapping[str, Status] = "declared",
         domain: Domain | None = None,
     ):
         self.domain = domain
+        self.energy = None
+        if energy is not None:
+            M_energy, rate = (_tree.as_float(v, "dvax.Constants(energy)") for v in energy)
+            self.energy = M_energy, rate
         given = (gamma, L_F, alpha_h, beta_h, alpha_f, beta_f, M, omega, m_P, norm_P_inv)
         for name, value in zip(_PRIMARY, given, strict=True):
             setattr(self, name, _tree.as_float(value, f"dvax.Constants({name})"))
         self.one_sided = (
             None if one_sided is None else _tree.as_float(one_sided, "dvax.Constants(one_sided)")
         )
-        names: tuple[str, ...] = (*_PRIMARY, "one_sided")
+        names: tuple[str, ...] = (*_PRIMARY, "one_sided", "energy")
         each: dict[str, Status] = {}
         for name in names if isinstance(status, str) else status:
             each[name] = status if isinstance(status, str) else status[name]
@@ -246,6 +254,13 @@ class Constants(eqx.Module):
                  "one-sided, sharper than the paper", ("one_sided",),
                  "rate of approach that sees the sign of the feedback")
             )  # fmt: skip
+        if self.energy is not None:
+            overshoot, rate_of_energy = self.energy
+            rows.append(
+                ("energy_rate", "−μ_Q", -_tree.host(rate_of_energy),
+                 "energy norm, sharper than the paper", ("energy",),
+                 f"rate of approach with an overshoot of {_number(overshoot)}")
+            )  # fmt: skip
         return [
             Row(name, symbol, float(value), label, self.status_of(*made_of), meaning)
             for name, symbol, value, label, made_of, meaning in rows
@@ -258,6 +273,7 @@ class Constants(eqx.Module):
             *((n, getattr(c, n) > 0, "positive") for n in ("gamma", "L_F", "m_P", "norm_P_inv")),
             *((n, getattr(c, n) >= 0, "≥ 0") for n in ("alpha_h", "beta_h", "alpha_f", "beta_f")),
             ("M", c.M >= 1, "≥ 1"),
+            ("energy", True if c.energy is None else c.energy[0] >= 1, "(M, μ) with M ≥ 1"),
             ("gamma", c.gamma <= c.L_F * (1 + 1e-12), "at most L_F"),
             ("m_P", c.m_P <= c.norm_P_inv * (1 + 1e-12), "at most norm_P_inv"),
         ]  # fmt: skip

@@ -16,6 +16,7 @@ from .certificate import is_declared
 from .constants import Constants
 from .domain import Domain
 from .enclosure import Enclosure
+from .energy import energy_norm
 from .known import Knowledge, knowledge
 from .moduli import sharp_rate
 from .motion import Motion, motion
@@ -76,6 +77,7 @@ def verify(
     x: Any = None,
     u: Any = None,
     declared: Mapping[str, float] | Constants | None = None,
+    energy: bool = False,
 ) -> Verification:
     """Check every assumption of the paper for a problem on [t0, t1], and compute its constants.
 
@@ -92,7 +94,9 @@ def verify(
     **Arguments:** `x0`: a state (its shape is what matters; 0 for a scalar problem); `x`, `u`: the
     region as (low, high), numbers or elements, where the statements are to hold: everywhere by
     default, with Pu in a box around K(t) where one is known. Constants that hold in a region only are
-    good for trajectories that stay in it. `declared`: moduli by name, or `dvax.Constants`.
+    good for trajectories that stay in it. `declared`: moduli by name, or `dvax.Constants`. `energy`:
+    look for a norm in which trajectories approach, for affine data of up to 40 unknowns (needs
+    `dvax[energy]`).
 
     Nothing is solved and nothing is refused: what is wrong is said in the answer.
 
@@ -127,7 +131,7 @@ def verify(
     box = Region(time, bounded(states, x0), bounded(responses, system.u0))
     known = knowledge(system, region, box, _declared(declared))
     assumptions = tuple(rows(system, region, K, knots, known))
-    constants = constants_of(system, region, known, x is None and u is None)
+    constants = constants_of(system, region, known, x is None and u is None, energy)
     return Verification(assumptions, constants, _route(system, known))
 
 
@@ -139,9 +143,11 @@ def _route(system: System, known: Knowledge) -> str:
     return "projection" if known.of["gamma"].value <= small else "variational inequality"
 
 
-def constants_of(system: System, region: Region, known: Knowledge, free: bool) -> Constants | None:
+def constants_of(
+    system: System, region: Region, known: Knowledge, free: bool, energy: bool = False
+) -> Constants | None:
     """The constants, where every modulus is a number and γ > 0."""
-    values = {name: entry.value for name, entry in known.of.items()}
+    values: dict[str, Any] = {name: entry.value for name, entry in known.of.items()}
     if known.pair is not None or not values["gamma"] > 0:
         return None
     if not all(np.isfinite(value) for value in values.values()):
@@ -154,11 +160,20 @@ def constants_of(system: System, region: Region, known: Knowledge, free: bool) -
     mu = _sharp(system, region, known)
     if mu is not None:
         statuses["one_sided"] = weakest(of_A, of_P)
+    contraction = _energy(system, region) if energy else None
+    if contraction is not None:
+        statuses["energy"] = "proved"
     return Constants(
         **values, M=system.growth.M, omega=system.growth.omega, m_P=system.spectrum.m_P,
         norm_P_inv=system.spectrum.norm_P_inv, one_sided=mu, status=statuses,
-        domain=_domain(region, free),
+        domain=_domain(region, free), energy=contraction,
     )  # fmt: skip
+
+
+def _energy(system: System, region: Region) -> tuple[float, float] | None:
+    t0, t1 = float(region.t.low), float(region.t.high)
+    found = energy_norm(system, system.at(region), _pointwise(system, t0), t1 - t0)
+    return None if found is None else (found.M, found.rate)
 
 
 def _domain(region: Region, free: bool) -> Domain:

@@ -1,0 +1,221 @@
+"""A norm in which trajectories approach: ‖d‖²_Q = ⟨Qd, d⟩, found by a semidefinite programme.
+
+For two solutions d = Δx, v = Δu let I ≤ Q ≤ κI. As in `one_sided`, with multipliers Λ ≥ 0 of the law
+(one number; for a box and a diagonal P one a component, since the law then holds for each by itself),
+
+    d/dt ‖d‖²_Q ≤ 2⟨Q(A + F_x)d + QF_u v, d⟩ + 2⟨Λ(H_x d − (I − H_u)v), Pv⟩ ≤ 2μ‖d‖²_Q
+
+wherever the matrix of the quadratic form in (d, v),
+
+    ⎡ QG + GᵀQ − 2μQ     QF_u + H_xᵀΛP ⎤
+    ⎣       ·                −N_Λ      ⎦ ⪯ 0,   G = A + F_x,  N_Λ = PΛ(I − H_u) + (I − H_u)ᵀΛP.
+
+Then ‖x₁ − x₂‖ ≤ √κ e^{μt}‖Δx₀‖, and a defect acts with the same M = √κ and rate. For a fixed μ the
+least κ is a semidefinite programme in (Q, Λ, κ). What the solver returns is only a proposal: κ and μ
+are then computed from Q and Λ by eigenvalues, so that the bound does not rest on the solver.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import InputError, InputProblem
+from .blocks import spread_out
+from .formulas import convolved
+from .slope import TooLarge
+from .system import Jacobians, System
+
+MOST = 40
+"""Unknowns of x and u together, up to which the programme is posed."""
+
+_BISECTIONS = 12
+_SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
+_LEAST_MULTIPLIER = 1e-8
+
+
+class EnergyNorm(NamedTuple):
+    """‖x₁ − x₂‖ ≤ M e^{rate·t}‖Δx₀‖, since ‖·‖_Q contracts at this rate: ⟨Qd, d⟩ in coordinates
+    in which the norm of the state space is Euclidean (entries times the roots of the weights)."""
+
+    Q: np.ndarray
+    M: float
+    rate: float
+
+
+def energy_norm(system: System, J: Jacobians, pointwise: bool, T: float) -> EnergyNorm | None:
+    """The Q for which √κ Φ_μ(T), what a defect may grow to, is least; None where the derivatives of f
+    and h are not constant, or nothing better than the norm of the space was found.
+
+    **Raises:** `dvax.InputError` where the solver is not installed.
+    """
+    data = _data(system, J, pointwise)
+    if data is None:
+        return None
+    # Where u does not move, no norm contracts faster than the linear part does.
+    low = float(np.linalg.eigvals(data.G).real.max())
+    start = high = _of_the_space(data)
+    if not np.isfinite(high):
+        return None
+    found = []
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        proposal = _solved(data, middle)
+        if proposal is None:
+            low = middle
+        else:
+            high = middle
+    for share in _SHARES:
+        mu = high + share * (start - high) + 1e-9 * (1.0 + abs(high))
+        proposal = _solved(data, mu)
+        if proposal is not None:
+            found.append(_proved(*proposal, data))
+    found = [norm for norm in found if norm is not None]
+    if not found:
+        return None
+    return min(found, key=lambda norm: norm.M * float(convolved(norm.rate, T)))
+
+
+class _Data(NamedTuple):
+    G: np.ndarray
+    F_u: np.ndarray
+    H_x: np.ndarray
+    slack: np.ndarray
+    P: np.ndarray
+    split: bool
+
+
+def _data(system: System, J: Jacobians, pointwise: bool) -> _Data | None:
+    blocks = [*J[:4], system.A, system.P]
+    if any(b is None or not b.exact for b in blocks):
+        return None
+    try:
+        f_x, f_u, h_x, h_u, A, P = (spread_out(b).center[0] for b in blocks if b is not None)
+    except TooLarge:
+        return None
+    if len(A) + len(P) > MOST:
+        return None
+    return _Data(A + f_x, f_u, h_x, np.eye(len(P)) - h_u, P, pointwise)
+
+
+def _form(Q: np.ndarray, multipliers: np.ndarray, data: _Data, mu: float) -> np.ndarray:
+    """The matrix of the quadratic form."""
+    L = np.diag(multipliers)
+    corner = Q @ data.G + data.G.T @ Q - 2.0 * mu * Q
+    side = Q @ data.F_u + data.H_x.T @ L @ data.P
+    push = data.P @ L @ data.slack
+    return np.block([[corner, side], [side.T, -(push + push.T)]])
+
+
+def _spread(numbers: np.ndarray, data: _Data) -> np.ndarray:
+    return numbers if data.split else np.full(len(data.P), numbers[0])
+
+
+def _proved(Q: np.ndarray, multipliers: np.ndarray, data: _Data) -> EnergyNorm | None:
+    ends = np.linalg.eigvalsh(Q)
+    rate = _rate_of(Q, multipliers, data) if ends[0] > 0 else np.inf
+    if not np.isfinite(rate):
+        return None
+    return EnergyNorm(Q, float(np.sqrt(ends[-1] / ends[0])), rate)
+
+
+def _rate_of(Q: np.ndarray, multipliers: np.ndarray, data: _Data) -> float:
+    """The least μ for this Q and these multipliers, by eigenvalues."""
+    n = len(Q)
+    form = _form(Q, multipliers, data, 0.0)
+    N = -form[n:, n:]
+    if not np.linalg.eigvalsh(N)[0] > 0:
+        return np.inf
+    S = form[:n, :n] + form[:n, n:] @ np.linalg.solve(N, form[n:, :n])
+    values, vectors = np.linalg.eigh(Q)
+    root = vectors / np.sqrt(values)
+    reduced = root.T @ S @ root
+    reduced = 0.5 * (reduced + reduced.T)
+    return 0.5 * float(np.linalg.eigvalsh(reduced)[-1]) + 1e-13 * float(np.abs(reduced).max())
+
+
+def _of_the_space(data: _Data) -> float:
+    """μ for Q = I and one multiplier."""
+    identity, ones = np.eye(len(data.G)), np.ones(len(data.P))
+    return min(_rate_of(identity, t * ones, data) for t in np.geomspace(1e-6, 1e6, 121))
+
+
+def _solved(data: _Data, mu: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Q and the multipliers with the least κ for this μ."""
+    n, m = len(data.G), len(data.P)
+    count = m if data.split else 1
+    pairs = [(i, j) for i in range(n) for j in range(i, n)]
+
+    def unpack(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        Q = np.zeros((n, n))
+        for value, (i, j) in zip(z, pairs):
+            Q[i, j] = Q[j, i] = value
+        return Q, z[len(pairs) : len(pairs) + count], float(z[-1])
+
+    def cones(z: np.ndarray) -> list[np.ndarray]:
+        Q, numbers, kappa = unpack(z)
+        form = _form(Q, _spread(numbers, data), data, mu)
+        return [-form, Q, kappa * np.eye(n) - Q]
+
+    z = _programme(cones, len(pairs) + count + 1, [np.zeros((n + m, n + m)), -np.eye(n), None],
+                   range(len(pairs), len(pairs) + count))  # fmt: skip
+    if z is None:
+        return None
+    Q, numbers, _ = unpack(z)
+    return Q, _spread(np.maximum(numbers, _LEAST_MULTIPLIER), data)
+
+
+def _programme(
+    cones: Callable[[np.ndarray], list[np.ndarray]], size: int, offsets: list, positive: range
+) -> np.ndarray | None:
+    """The z with the least last entry where cones(z) + offsets ⪰ 0, cones linear, and the entries at
+    `positive` are positive."""
+    clarabel = _solver()
+    units = [cones(e) for e in np.eye(size)]
+    rows, offset, kinds = [], [], []
+    for k, given in enumerate(offsets):
+        matrices = [unit[k] for unit in units]
+        rows.append(-np.stack([_packed(S) for S in matrices], axis=1))
+        offset.append(np.zeros(len(rows[-1])) if given is None else _packed(given))
+        kinds.append(clarabel.PSDTriangleConeT(len(matrices[0])))
+    for k in positive:
+        row = np.zeros((1, size))
+        row[0, k] = -1.0
+        rows.append(row)
+        offset.append(np.array([-_LEAST_MULTIPLIER]))
+        kinds.append(clarabel.NonnegativeConeT(1))
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    goal = np.zeros(size)
+    goal[-1] = 1.0
+    solver = clarabel.DefaultSolver(
+        sp.csc_matrix((size, size)), goal, sp.csc_matrix(np.concatenate(rows)),
+        np.concatenate(offset), kinds, settings,
+    )  # fmt: skip
+    answer = solver.solve()
+    solved = (clarabel.SolverStatus.Solved, clarabel.SolverStatus.AlmostSolved)
+    return np.array(answer.x) if answer.status in solved else None
+
+
+def _packed(S: np.ndarray) -> np.ndarray:
+    """The upper triangle column by column, with √2 off the diagonal: inner products stay."""
+    i, j = np.triu_indices(len(S))
+    order = np.lexsort((i, j))
+    i, j = i[order], j[order]
+    return S[i, j] * np.where(i == j, 1.0, np.sqrt(2.0))
+
+
+def _solver() -> Any:
+    try:
+        import clarabel
+    except ModuleNotFoundError as error:
+        raise InputError(
+            InputProblem(
+                "dvax.verify(energy=True)",
+                "no module named clarabel",
+                "the norm is found by a semidefinite programme, which Clarabel solves",
+                "pip install 'dvax[energy]', or leave energy out",
+            )
+        ) from error
+    return clarabel
