@@ -108,7 +108,9 @@ class Constants(eqx.Module):
         for name in names if isinstance(status, str) else status:
             each[name] = status if isinstance(status, str) else status[name]
         _check_status(names, each)
-        pairs: list[tuple[str, Status]] = [(n, each.get(n, "declared")) for n in sorted(names)]
+        # What is not there weakens nothing that is made from the rest.
+        there = [n for n in sorted(names) if getattr(self, n) is not None]
+        pairs: list[tuple[str, Status]] = [(n, each.get(n, "declared")) for n in there]
         self.statuses = tuple(pairs)
         self._check()
 
