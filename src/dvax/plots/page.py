@@ -12,6 +12,7 @@ from plotly.offline import get_plotlyjs
 from dvax.plots.look import counted
 from dvax.plots.picture import Picture, Views
 from dvax.plots.record import UNFINISHED, RunRecord
+from dvax.plots.stability import assumptions_table, losses_table
 from dvax.plots.tables import constants_table, facts_table, headline_cards
 
 _HINT = '<br><span class="hint">Drag in a figure to zoom, double-click to return.</span>'
@@ -44,6 +45,7 @@ def page(run: RunRecord, pictures: Sequence[Picture], missing: Sequence[str]) ->
 <section><h2>Headline figures</h2>{headline_cards(run)}</section>
 {shown}
 {f"<section><h2>Not drawn</h2><ul>{absent}</ul></section>" if absent else ""}
+{_stability(run)}
 <section><h2>Constants</h2>{constants_table(run)}
 <p class="caption">Labels are those of the formulas in the paper. The paper's constants use
 magnitudes and not signs: they are conservative, and sharper ones stand beside them where there
@@ -55,6 +57,18 @@ are any.</p>
 </body>
 </html>
 """
+
+
+def _stability(run: RunRecord) -> str:
+    """What the theory says of the system, where the run knows it."""
+    losses, known = losses_table(run), assumptions_table(run)
+    if not (losses or known):
+        return ""
+    caption = (
+        '<p class="caption">The distance of two trajectories grows at most at this rate. The paper\'s '
+        "adds magnitudes; the one with signs sees which feedbacks hold back.</p>"
+    )
+    return f"<section><h2>Stability</h2>{losses}{caption if losses else ''}{known}</section>"
 
 
 def _subtitle(run: RunRecord) -> str:

@@ -41,6 +41,16 @@ class ConstantRow:
 
 
 @dataclass(frozen=True)
+class AssumptionRow:
+    """One assumption of the theory: its label, what it says, its status, and how that is known."""
+
+    label: str
+    statement: str
+    status: str
+    why: str
+
+
+@dataclass(frozen=True)
 class RunRecord:
     """What a run directory holds. `trajectory` is None where no frame was written."""
 
@@ -51,6 +61,7 @@ class RunRecord:
     constants: tuple[ConstantRow, ...]
     warnings: tuple[str, ...]
     trajectory: Frames | None
+    assumptions: tuple[AssumptionRow, ...] = field(default=())
     notes: tuple[str, ...] = field(default=())
 
     @property
@@ -131,6 +142,7 @@ def read_run(directory: Path) -> RunRecord:
         constants=_constants(trajectory, manifest, directory),
         warnings=_warnings(directory / "log.jsonl"),
         trajectory=trajectory,
+        assumptions=_assumptions(trajectory, directory),
         notes=notes,
     )
 
@@ -185,18 +197,30 @@ def _constants(
     trajectory: Frames | None, manifest: Mapping[str, Any], directory: Path
 ) -> tuple[ConstantRow, ...]:
     """The list in the trajectory's attributes; the manifest's where nothing was written."""
-    rows: Any = None if trajectory is None else trajectory.attrs.get("constants")
-    if isinstance(rows, str):
-        try:
-            rows = json.loads(rows)
-        except json.JSONDecodeError as error:
-            raise _damaged(directory / "trajectory.zarr" / "constants", error) from error
+    rows = _listed(trajectory, "constants", directory)
     if rows is None:
         rows = manifest.get("constants")
     if not isinstance(rows, list):
         return ()
     names = tuple(ConstantRow.__dataclass_fields__)
     return tuple(ConstantRow(**{name: row.get(name, "") for name in names}) for row in rows)
+
+
+def _assumptions(trajectory: Frames | None, directory: Path) -> tuple[AssumptionRow, ...]:
+    rows = _listed(trajectory, "assumptions", directory)
+    names = tuple(AssumptionRow.__dataclass_fields__)
+    return tuple(AssumptionRow(**{n: str(row.get(n, "")) for n in names}) for row in rows or ())
+
+
+def _listed(trajectory: Frames | None, name: str, directory: Path) -> Any:
+    """A list among the trajectory's attributes, where it is written as JSON."""
+    rows: Any = None if trajectory is None else trajectory.attrs.get(name)
+    if isinstance(rows, str):
+        try:
+            rows = json.loads(rows)
+        except json.JSONDecodeError as error:
+            raise _damaged(directory / "trajectory.zarr" / name, error) from error
+    return rows
 
 
 def _warnings(log: Path) -> tuple[str, ...]:

@@ -35,9 +35,9 @@ def headline_cards(run: RunRecord) -> str:
         listed = value if isinstance(value, list) else [value]
         text = ", ".join(number(item) for item in listed)
         cards.append(
-            f'<div class="card"><div class="name">{_escape(_words(name))}</div>'
-            f'<div class="value">{_escape(quantity_text(text, str(entry.get("unit", ""))))}</div>'
-            f'<div class="meaning">{_escape(str(entry.get("meaning", "")))}</div></div>'
+            f'<div class="card"><div class="name">{escaped(_words(name))}</div>'
+            f'<div class="value">{escaped(quantity_text(text, str(entry.get("unit", ""))))}</div>'
+            f'<div class="meaning">{escaped(str(entry.get("meaning", "")))}</div></div>'
         )
     if not cards:
         return '<p class="caption">The run wrote no figures: they are made when it ends.</p>'
@@ -49,18 +49,18 @@ def constants_table(run: RunRecord) -> str:
     head = ("constant", "symbol", "value", "paper label", "status", "meaning")
     rows = [
         (
-            f"<code>{_escape(row.name)}</code>",
-            _escape(row.symbol),
-            _escape(quantity(row.value, row.unit)),
-            f"<code>{_escape(row.label)}</code>" if row.label else "",
-            f'<span class="status {_escape(row.status)}">{_escape(row.status)}</span>',
-            _escape(row.meaning),
+            f"<code>{escaped(row.name)}</code>",
+            escaped(row.symbol),
+            escaped(quantity(row.value, row.unit)),
+            f"<code>{escaped(row.label)}</code>" if row.label else "",
+            status_mark(row.status),
+            escaped(row.meaning),
         )
         for row in run.constants
     ]
     if not rows:
         return '<p class="caption">The run directory names no constants.</p>'
-    return _table(head, rows)
+    return table(head, rows)
 
 
 def facts_table(run: RunRecord) -> str:
@@ -71,8 +71,8 @@ def facts_table(run: RunRecord) -> str:
         for key, value in run.manifest.items()
         if key not in FACTS and key not in SHOWN_ELSEWHERE
     ]
-    rows = [(_escape(name), _fact(value)) for name, value in [*known, *others]]
-    return _table(("fact", "value"), rows, kind="pairs")
+    rows = [(escaped(name), _fact(value)) for name, value in [*known, *others]]
+    return table(("fact", "value"), rows, kind="pairs")
 
 
 def quantity_text(text: str, unit: str) -> str:
@@ -82,23 +82,23 @@ def quantity_text(text: str, unit: str) -> str:
 
 def _fact(value: Any) -> str:
     if isinstance(value, Mapping):
-        lines = [f"{_escape(str(key))}: {_fact(item)}" for key, item in value.items()]
+        lines = [f"{escaped(str(key))}: {_fact(item)}" for key, item in value.items()]
         return "<br>".join(lines) if lines else "none"
     if isinstance(value, list):
         plain = [item if isinstance(item, str) else json.dumps(item) for item in value]
-        return "<br>".join(map(_escape, plain)) if plain else "none"
+        return "<br>".join(map(escaped, plain)) if plain else "none"
     if value is None:
         return "none"
-    return _escape(number(value))
+    return escaped(number(value))
 
 
-def _table(head: tuple[str, ...], rows: list[tuple[str, ...]], kind: str = "rows") -> str:
+def table(head: tuple[str, ...], rows: list[tuple[str, ...]], kind: str = "rows") -> str:
     """An HTML table whose cells carry their column's name: a phone shows each row as a list."""
-    top = "".join(f"<th>{_escape(name)}</th>" for name in head)
+    top = "".join(f"<th>{escaped(name)}</th>" for name in head)
     body = "".join(
         "<tr>"
         + "".join(
-            f'<td data-name="{_escape(name)}">{cell}</td>'
+            f'<td data-name="{escaped(name)}">{cell}</td>'
             for name, cell in zip(head, row, strict=True)
         )
         + "</tr>"
@@ -111,5 +111,11 @@ def _words(name: str) -> str:
     return name.replace("_", " ")
 
 
-def _escape(text: str) -> str:
+def status_mark(status: str) -> str:
+    """A status word in its colour."""
+    return f'<span class="status {escaped(status)}">{escaped(status)}</span>'
+
+
+def escaped(text: str) -> str:
+    """Text as it stands in a page."""
     return html.escape(text, quote=True)

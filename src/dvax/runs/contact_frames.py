@@ -12,7 +12,7 @@ from dvax.models import Contact
 from dvax.runs.contact_inputs import ContactInputs
 from dvax.runs.settings import Config
 from dvax.spaces import AbstractSpace
-from dvax.theory import Bound, Constants, Row
+from dvax.theory import Assumption, Bound, Constants, Row
 
 _TIME_ONLY, _FIELD = ("time",), ("time", "point")
 
@@ -94,7 +94,9 @@ def constant_rows(constants: Constants, config: Config, T: float, rho: float) ->
     return [one(row) for row in constants.table(T, rho)]
 
 
-def attributes(config: Config, rows: list[dict], shape: tuple[int, ...]) -> dict[str, Any]:
+def attributes(
+    config: Config, rows: list[dict], shape: tuple[int, ...], known: tuple[Assumption, ...]
+) -> dict[str, Any]:
     """Attributes of the whole dataset."""
     return {
         "title": f"contact law, {config.source.stem}",
@@ -104,6 +106,13 @@ def attributes(config: Config, rows: list[dict], shape: tuple[int, ...]) -> dict
         "reaction": "the normalised reaction u is pressure / beta",
         "boundary_shape": list(shape),
         "constants": json.dumps(rows, ensure_ascii=False),
+        "assumptions": json.dumps(
+            [
+                {"label": a.label, "statement": a.statement, "status": a.status, "why": a.why}
+                for a in known
+            ],
+            ensure_ascii=False,
+        ),
     }
 
 

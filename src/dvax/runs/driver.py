@@ -33,7 +33,7 @@ from dvax.runs.contact_frames import (
     variables,
 )
 from dvax.runs.contact_inputs import ContactInputs
-from dvax.runs.contact_model import contact_model
+from dvax.runs.contact_model import assumptions, contact_model
 from dvax.runs.provenance import provenance
 from dvax.runs.resolved import write_resolved
 from dvax.runs.rundir import FrameStore, RunDirectory
@@ -110,7 +110,12 @@ class _Run:
             block,
             coordinates(self.inputs, self.config),
             variables(self.config, len(self.inputs.boundary.names), "estimated"),
-            attributes(self.config, self.rows, self.inputs.boundary.shape),
+            attributes(
+                self.config,
+                self.rows,
+                self.inputs.boundary.shape,
+                assumptions(self.config, self.inputs),
+            ),
             {"long_name": "time", "units": self.config.units.time},
         )
         figures = Figures(self.inputs, self.config, self.constants)
