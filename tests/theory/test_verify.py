@@ -4,6 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.sparse
+import scipy.sparse.linalg
+from jax.experimental.sparse import BCOO
 from tests.closed_forms import ALL, c7
 from tests.theory.generated import generate
 
@@ -182,3 +185,38 @@ def test_wrong_arguments_are_named():
         dvax.verify(problem, declared={"alpha": 1.0})
     with pytest.raises(KeyError):
         dvax.verify(problem)["ass:none"]
+
+
+@pytest.mark.parametrize("n", [5, 3000])
+@pytest.mark.parametrize("kind", ["scatter", "sparse", "transform"])
+def test_affine_data_that_no_matrix_is_made_of(kind, n):
+    """Where operations have no rule, or the matrix no room: Lanczos on what is proved to be affine."""
+    rng = np.random.default_rng(7)
+    if kind == "transform":
+        factors = jnp.asarray(rng.uniform(-0.5, 0.3, n // 2 + 1))
+        push = lambda v: jnp.fft.irfft((factors + 0j) * jnp.fft.rfft(v), n)  # noqa: E731
+        norm, least = np.abs(factors).max(), float(factors.min())
+    else:
+        M = scipy.sparse.random(n, n, density=min(1.0, 4 / n), random_state=3, format="coo")
+        M = 0.2 * M
+        if kind == "sparse":
+            B = BCOO.from_scipy_sparse(M)
+            push = lambda v: B @ v  # noqa: E731
+        else:
+            rows, cols, values = (jnp.asarray(v) for v in (M.row, M.col, M.data))
+            push = lambda v: jnp.zeros(n).at[rows].add(values * v[cols])  # noqa: E731
+        if n < 100:
+            norm, least = np.linalg.norm(M.toarray(), 2), None
+        else:
+            norm, least = scipy.sparse.linalg.svds(M, k=1, return_singular_vectors=False)[0], None
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1.0),
+        f=lambda t, x, u, args: push(u), h=lambda t, x, u, args: x - push(u),
+    )  # fmt: skip
+    check = dvax.verify(problem, jnp.zeros(n))
+    assert check.status == "proved", check.table()
+    c = check.constants
+    assert norm * (1 - 1e-9) <= float(c.beta_f) <= 1.02 * norm + 1e-9
+    assert norm * (1 - 1e-9) <= float(c.beta_h) <= 1.02 * norm + 1e-9
+    if least is not None:
+        assert 0.97 * (1 + least) <= float(c.gamma) <= (1 + least) * (1 + 1e-9)

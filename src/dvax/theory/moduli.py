@@ -83,6 +83,9 @@ class Pieces:
         if first is None:
             return self._without_matrix(name, of)
         value = self.worst(lambda J: _norm(getattr(J, name)), first.exact)
+        if np.isinf(value) and self._proved_affine(of) is not None:
+            # Linear operations without a rule of slope arithmetic: sparse products, transforms.
+            return self._without_matrix(name, of)
         return Proved(value, _how(first, self.region))
 
     def frozen(self) -> tuple[Proved, Proved]:
@@ -96,6 +99,8 @@ class Pieces:
             return self._frozen_without_matrix()
         gamma = -self.worst(lambda J: -_of(self.system, J, Block.least, -np.inf), h_u.exact)
         L_F = self.worst(lambda J: _of(self.system, J, Block.norm, np.inf), h_u.exact)
+        if np.isinf(L_F) and self._proved_affine("h") is not None:
+            return self._frozen_without_matrix()
         how = _how(h_u, self.region)
         return Proved(gamma, f"{how} of ∂F/∂y"), Proved(L_F, f"{how} of ∂F/∂y")
 

@@ -20,6 +20,9 @@ from .system import System
 POINTS, ROUNDS = 256, 60
 """Of a search: how many starts, and how many steps of ascent."""
 
+_ENTRIES = 2_000_000
+"""Of all points of a search together: in many dimensions there are fewer of them."""
+
 _ROUNDING = 1e4
 _DENSE = 64
 
@@ -212,6 +215,8 @@ def _bounds(region: Region) -> tuple[Any, Any]:
 def _points(low: Any, high: Any, count: int, seed: int) -> Any:
     """Evenly drawn points of a box, its middle and ends among them."""
     rng = np.random.default_rng(seed)
+    size = sum(leaf.size for leaf in jtu.tree_leaves(low))
+    count = max(4, min(count, _ENTRIES // size))
 
     def draw(a: jax.Array, b: jax.Array) -> jax.Array:
         share = rng.random((count, *a.shape))

@@ -213,6 +213,15 @@ def _rule(
         same = keeps and shape == eqn.invars[0].aval.shape
         kept = present[0] if same else _Mark(degree, None, False)
         return kept._replace(degree=degree if indices_fixed else 2)
-    if name == "dot_general":
-        return _Mark(min(2, sum(mark.degree for mark in present)), None, False)
+    if name in ("dot_general", "conv_general_dilated", "bcoo_dot_general"):
+        # Of a sparse product the second argument holds the places of the first.
+        product = sum(mark.degree for mark in present)
+        places_move = name == "bcoo_dot_general" and given[1] is not None
+        return _Mark(2 if places_move else min(2, product), None, False)
+    if name in ("scatter-add", "scatter_add"):
+        return _Mark(degree if given[1] is None else 2, None, False)
+    if name == "triangular_solve":
+        return _Mark(degree if given[0] is None else 2, None, False)
+    if name == "fft":
+        return _Mark(degree, None, False)
     return _Mark(2, None, False)
