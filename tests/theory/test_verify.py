@@ -194,7 +194,8 @@ def test_affine_data_that_no_matrix_is_made_of(kind, n):
     rng = np.random.default_rng(7)
     if kind == "transform":
         factors = jnp.asarray(rng.uniform(-0.5, 0.3, n // 2 + 1))
-        push = lambda v: jnp.fft.irfft((factors + 0j) * jnp.fft.rfft(v), n)  # noqa: E731
+        symbol = factors.astype(complex)
+        push = lambda v: jnp.fft.irfft(symbol * jnp.fft.rfft(v), n)  # noqa: E731
         norm, least = np.abs(factors).max(), float(factors.min())
     else:
         M = scipy.sparse.random(n, n, density=min(1.0, 4 / n), random_state=3, format="coo")
@@ -220,3 +221,29 @@ def test_affine_data_that_no_matrix_is_made_of(kind, n):
     assert norm * (1 - 1e-9) <= float(c.beta_h) <= 1.02 * norm + 1e-9
     if least is not None:
         assert 0.97 * (1 + least) <= float(c.gamma) <= (1 + least) * (1 + 1e-9)
+
+
+def test_data_that_jumps_is_seen_wherever_it_hides():
+    """Not at x = 0, not at y = 1: a jump is no continuity all the same."""
+    step = dvax.signals.Table([0.0, 0.5, 1.0], [2.0, 3.0, 3.0], kind="constant")
+    times_x = cubic(f=lambda t, x, u, args: -u, h=lambda t, x, u, args: -step(t) * x - u)
+    check = dvax.verify(times_x)
+    assert check["ass:time_regularity (ii)"].status != "proved"
+    far_away = cubic(
+        K=lambda t, args: dvax.sets.Box(-1.0, step(t)), f=lambda t, x, u, args: -u,
+        h=lambda t, x, u, args: -x - u,
+    )  # fmt: skip
+    check = dvax.verify(far_away)
+    assert check["ass:time_regularity (i)"].status != "proved"
+    assert check["ass:operators (iii)"].status == "proved"
+    bent = dvax.signals.Table([0.0, 0.5, 1.0], [2.0, 3.0, 1.0])
+    check = dvax.verify(cubic(h=lambda t, x, u, args: -bent(t) * x - u, f=far_away.f))
+    assert check["ass:time_regularity (ii)"].status == "proved"
+
+
+def test_a_sharp_declared_modulus_is_not_refuted_by_rounding():
+    large = cubic(
+        f=lambda t, x, u, args: 1e9 + jax.lax.sort(x[None])[0] - u, h=lambda t, x, u, args: -u
+    )
+    row = dvax.verify(large, declared={"alpha_f": 1.0})["ass:f_lipschitz"]
+    assert row.status == "declared", row.why

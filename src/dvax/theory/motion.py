@@ -35,19 +35,14 @@ class Motion(NamedTuple):
     empty_at: float | None
 
 
-def times(t0: float, t1: float, knots: Values, pieces: int = _PIECES) -> Iterator[Slope]:
-    """[t0, t1] in pieces without a knot inside, at whose ends data may jump; or where there are too
-    many knots in even ones."""
+def times(t0: float, t1: float, knots: np.ndarray, pieces: int = _PIECES) -> Iterator[Slope]:
+    """[t0, t1] in pieces that begin and end where data bends, as far as there are not too many. They
+    are closed, so that data which jumps at a knot has no speed in the pieces beside it."""
     inner = knots[(knots > t0) & (knots < t1)] if knots.size <= MOST_KNOTS else np.zeros(0)
     ends = np.concatenate([[t0], inner, [t1]])
     each = max(1, pieces // (len(ends) - 1))
     for a, b in itertools.pairwise(ends):
-        # A few roundings inside: at a knot itself a comparison is undecided.
-        inset = 8 * np.finfo(float).eps * max(abs(a), abs(b))
-        left = a + inset if a > t0 else a
-        right = b - inset if b < t1 else b
-        cuts = np.linspace(left, right, each + 1)
-        for begin, end in itertools.pairwise(cuts):
+        for begin, end in itertools.pairwise(np.linspace(a, b, each + 1)):
             yield interval(begin, end)
 
 
