@@ -63,8 +63,12 @@ def certified(
     solution, bound = None, np.inf
     for _ in range(_RUNS):
         solution = run(atol)
-        bound = _bound(solution, constants, t0)
+        bounds = _bounds(solution, constants, t0)
+        bound = float(jnp.max(bounds))
         if bound <= tol:
+            left = _leaves(solution, constants, bounds)
+            if left is not None:
+                raise _outside(left)
             return _with_bound(solution, bound)
         atol = min(0.5 * atol, _AIM * atol * tol / bound) if np.isfinite(bound) else 0.1 * atol
         if atol < 1e-3 * eps * best:
@@ -72,8 +76,8 @@ def certified(
     raise _hopeless(tol, bound, constants, span)
 
 
-def _bound(solution: Solution, constants: Any, t0: float) -> float:
-    """The largest bound at a saved time."""
+def _bounds(solution: Solution, constants: Any, t0: float) -> Any:
+    """The bound at every saved time."""
     assert solution.defect is not None and solution.settled is not None
     acted = disturbance(constants, solution.defect, solution.law_defect)
     settled = disturbance(constants, *solution.settled)
@@ -81,7 +85,19 @@ def _bound(solution: Solution, constants: Any, t0: float) -> float:
     each = [
         gronwall(begin, solution.ts, acted, settled, rate, M, 0.0) for M, rate in _rates(constants)
     ]
-    return float(jnp.max(jnp.min(jnp.stack(each), axis=0)))
+    return jnp.min(jnp.stack(each), axis=0)
+
+
+def _leaves(solution: Solution, constants: Any, bounds: Any) -> float | None:
+    """The first saved time at which x or u, with its bound, is not where the constants hold."""
+    domain = getattr(constants, "domain", None)
+    if domain is None or domain.free:
+        return None
+    law_error = solution.law_residual / constants.gamma + solution.law_step
+    of_u = constants.L * bounds + constants.norm_P_inv * law_error
+    spaces = solution.setup.problem.spaces(solution.setup.x0)
+    inside = np.asarray(domain.keeps(solution.xs, solution.us, bounds, of_u, spaces))
+    return None if inside.all() else float(solution.ts[int(np.argmin(inside))])
 
 
 def _rates(constants: Any) -> list[tuple[float, float]]:
@@ -95,6 +111,17 @@ def _rates(constants: Any) -> list[tuple[float, float]]:
 def _grown(constants: Any, span: float) -> float:
     """M Φ_c(T): what a defect of 1 may grow to."""
     return min(M * _convolved(rate, span) for M, rate in _rates(constants))
+
+
+def _outside(t: float) -> InputError:
+    return InputError(
+        InputProblem(
+            "dvax.solve(constants)",
+            f"constants of a region that the trajectory leaves by t = {t:.6g}",
+            "outside it nothing bounds the error",
+            "Verify the problem in a larger region: dvax.verify(problem, x0, x=(low, high))",
+        )
+    )
 
 
 def _with_bound(solution: Solution, bound: float) -> Solution:

@@ -46,6 +46,8 @@ def gronwall(
         )
         return carry, jnp.where(lost, jnp.inf, after)
 
+    rate, M = jnp.asarray(rate, ts.dtype), jnp.asarray(M, ts.dtype)
+    impulse, settled = (jnp.asarray(v, ts.dtype) for v in (impulse, settled))
     begin = jnp.asarray(t0, ts.dtype)
     zero = jnp.zeros((), ts.dtype)
     start = (begin, begin, zero, jnp.asarray(M * initial, ts.dtype), begin)

@@ -60,7 +60,7 @@ class Box(AbstractSet):
         if not _tree.is_concrete((self.lower, self.upper)):
             # Bounds that move are not known yet. Where they cross (or are NaN) the projection is
             # made infinite, so that an empty set stops a solve instead of passing for a point.
-            self.lower = standing(self.lower, self.upper)
+            self.lower = dvax_standing(self.lower, self.upper)
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         # At a bound the bound's own derivative is taken: the convention of AbstractSet. Selections
@@ -104,7 +104,7 @@ class Box(AbstractSet):
 
 
 @jax.jit
-def standing(lower: jax.Array, upper: jax.Array) -> jax.Array:
+def dvax_standing(lower: jax.Array, upper: jax.Array) -> jax.Array:
     """The lower bound, infinite where the interval is empty. A function of its own, by whose name an
     enclosure over time knows that it is the lower bound wherever there is a set at all."""
     return jnp.where(lower <= upper, lower, jnp.inf)

@@ -67,10 +67,10 @@ class Table(AbstractSignal):
     def value(self, t: Any) -> jax.Array:
         times = jnp.asarray(self.times)
         if self.kind == "constant":
-            return constant_table(times, self.values, t)
+            return dvax_constant_table(times, self.values, t)
         if self.slopes is None:
-            return linear_table(times, self.values, t)
-        return cubic_table(times, self.values, self.slopes, t)
+            return dvax_linear_table(times, self.values, t)
+        return dvax_cubic_table(times, self.values, self.slopes, t)
 
     def knots(self) -> Any:
         return self.times
@@ -83,7 +83,7 @@ class Table(AbstractSignal):
 
 
 @jax.jit
-def constant_table(times: jax.Array, values: jax.Array, t: Any) -> jax.Array:
+def dvax_constant_table(times: jax.Array, values: jax.Array, t: Any) -> jax.Array:
     """vᵢ on [tᵢ, tᵢ₊₁)."""
     i, _ = _place(times, t)
     out = jnp.where(t >= times[i + 1], values[i + 1], values[i])
@@ -91,7 +91,7 @@ def constant_table(times: jax.Array, values: jax.Array, t: Any) -> jax.Array:
 
 
 @jax.jit
-def linear_table(times: jax.Array, values: jax.Array, t: Any) -> jax.Array:
+def dvax_linear_table(times: jax.Array, values: jax.Array, t: Any) -> jax.Array:
     """Straight lines."""
     i, s = _place(times, t)
     v0, v1 = values[i], values[i + 1]
@@ -99,7 +99,7 @@ def linear_table(times: jax.Array, values: jax.Array, t: Any) -> jax.Array:
 
 
 @jax.jit
-def cubic_table(times: jax.Array, values: jax.Array, slopes: jax.Array, t: Any) -> jax.Array:
+def dvax_cubic_table(times: jax.Array, values: jax.Array, slopes: jax.Array, t: Any) -> jax.Array:
     """The cubics with these slopes at the times."""
     i, s = _place(times, t)
     width = times[i + 1] - times[i]

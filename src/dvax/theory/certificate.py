@@ -110,7 +110,9 @@ def bound_error(
     if domain is not None:
         covered = domain.covers(begin, sol.setup.setting["t1"])
         where = "proved" if covered and domain.free else "declared"
-        inside = inside if domain.free else domain.keeps(sol.xs, best_x, space)
+        if not domain.free:
+            spaces = problem.spaces(sol.setup.x0)
+            inside = domain.keeps(sol.xs, sol.us, best_x, best_u, spaces)
     status = weakest(
         constants.status_of(*(name for name, _ in constants.statuses)),
         "proved" if measured.enclosed else "estimated",

@@ -10,7 +10,7 @@ import numpy as np
 from .. import _tree
 from .._tree import Tree
 from .enclosure import Enclosure
-from .moduli import Moduli, moduli
+from .moduli import SMALLNESS, Moduli, moduli
 from .region import Region
 from .search import Pair, counterexample, least_modulus, steepest
 from .slope import is_slope
@@ -69,8 +69,13 @@ def knowledge(system: System, region: Region, box: Region, declared: dict[str, f
         gamma, how = divided.gamma, divided.how
     how = how if gamma > 0 else _because(found, "h", how)
     known["gamma"], pair = _gamma(system, gamma, how, box, declared)
-    if known["gamma"].value > known["L_F"].value and known["L_F"].status == "estimated":
+    if known["gamma"].value > known["L_F"].value:
+        # A modulus of pseudomonotonicity may be the larger one; more than L_F is a modulus as well.
         known["L_F"] = known["L_F"]._replace(value=known["gamma"].value)
+    if system.spectrum.declared:
+        for name in ("gamma", "L_F"):
+            if SMALLNESS in known[name].how and known[name].status == "proved":
+                known[name] = known[name]._replace(status="declared")
     exact = found.beta_h.how in ("entries", "singular values")
     return Knowledge(known, divided, pair, exact)
 

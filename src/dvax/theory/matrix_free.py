@@ -18,27 +18,50 @@ from .system import System
 Action = Callable[[np.ndarray], np.ndarray]
 
 
+def scaled(
+    apply: Callable[[Tree], Tree], space_in: AbstractSpace, like_in: Tree, space_out: AbstractSpace,
+    like_out: Tree,
+) -> Callable[[jax.Array], jax.Array]:  # fmt: skip
+    """A map between two spaces in coordinates in which their norms are Euclidean."""
+    flat_in, unravel = jax.flatten_util.ravel_pytree(like_in)
+    root_in, root_out = _roots(space_in, like_in), _roots(space_out, like_out)
+
+    def flat(v: jax.Array) -> jax.Array:
+        out = apply(unravel((v / root_in).astype(flat_in.dtype)))
+        return root_out * jax.flatten_util.ravel_pytree(out)[0]
+
+    return flat
+
+
 class Linear:
-    """A linear map between two spaces in coordinates in which their norms are Euclidean."""
+    """A linear map between two spaces by its action and that of its adjoint, in such coordinates."""
+
+    apply: Callable[[jax.Array], jax.Array]
+    adjoint: Callable[[jax.Array], jax.Array]
+    size_in: int
 
     def __init__(
         self, apply: Callable[[Tree], Tree], space_in: AbstractSpace, like_in: Tree,
         space_out: AbstractSpace, like_out: Tree,
     ):  # fmt: skip
-        flat_in, unravel = jax.flatten_util.ravel_pytree(like_in)
-        flat_out, _ = jax.flatten_util.ravel_pytree(like_out)
-        self.size_in, self.size_out = flat_in.size, flat_out.size
-        root_in, root_out = _roots(space_in, like_in), _roots(space_out, like_out)
-
-        def scaled(v: jax.Array) -> jax.Array:
-            out = apply(unravel((v / root_in).astype(flat_in.dtype)))
-            return root_out * jax.flatten_util.ravel_pytree(out)[0]
-
-        transposed = jax.linear_transpose(
-            scaled, jax.ShapeDtypeStruct(flat_in.shape, flat_in.dtype)
-        )
-        self.apply = jax.jit(scaled)
+        flat_in, _ = jax.flatten_util.ravel_pytree(like_in)
+        flat = scaled(apply, space_in, like_in, space_out, like_out)
+        transposed = jax.linear_transpose(flat, jax.ShapeDtypeStruct(flat_in.shape, flat_in.dtype))
+        self.size_in = flat_in.size
+        self.apply = jax.jit(flat)
         self.adjoint = jax.jit(lambda w: transposed(w)[0])
+
+    @classmethod
+    def of(
+        cls,
+        apply: Callable[[jax.Array], jax.Array],
+        adjoint: Callable[[jax.Array], jax.Array],
+        size: int,
+    ) -> "Linear":
+        """From both actions."""
+        linear = cls.__new__(cls)
+        linear.apply, linear.adjoint, linear.size_in = apply, adjoint, size
+        return linear
 
     def norm(self) -> float:
         """‖J‖, from above."""
@@ -105,10 +128,13 @@ class Affine:
 
 def frozen(system: System, h: Affine) -> Linear:
     """∂F/∂y = (I − ∂h/∂u) P⁻¹."""
+    space, like = system.control, system.u0
     P = system.problem.operator(system.args)
-
-    def push(d: Tree) -> Tree:
-        v = P.inverse(d)
-        return jtu.tree_map(jnp.subtract, v, h.push_response(v))
-
-    return Linear(push, system.control, system.u0, system.control, system.u0)
+    slack = Linear(
+        lambda v: jtu.tree_map(jnp.subtract, v, h.push_response(v)), space, like, space, like
+    )
+    # P⁻¹ is its own adjoint in the space, so that what it is computed by need not be transposed.
+    inverse = jax.jit(scaled(P.inverse, space, like, space, like))
+    return Linear.of(
+        lambda v: slack.apply(inverse(v)), lambda w: inverse(slack.adjoint(w)), slack.size_in
+    )

@@ -24,6 +24,10 @@ _SMALL = 16
 """Up to so many entries of t, x and u together a region is cut at all."""
 
 
+SMALLNESS = "(remark:assstrong (i))"
+"""The mark of a modulus that rests on the spectrum of P."""
+
+
 class Proved(NamedTuple):
     """An upper bound of a modulus (for γ: a lower one), infinite where there is none, and how it was
     found."""
@@ -52,9 +56,9 @@ def moduli(system: System, region: Region) -> Moduli:
     gamma, L_F = pieces.frozen()
     by_smallness = _smallness(system, beta_h.value)
     if by_smallness[0] > gamma.value:
-        gamma = Proved(by_smallness[0], "m_P − β_h‖P⁻¹‖ (remark:assstrong (i))")
+        gamma = Proved(by_smallness[0], f"m_P − β_h‖P⁻¹‖ {SMALLNESS}")
     if by_smallness[1] < L_F.value:
-        L_F = Proved(by_smallness[1], "‖P⁻¹‖(1 + β_h) (remark:assstrong (i))")
+        L_F = Proved(by_smallness[1], f"‖P⁻¹‖(1 + β_h) {SMALLNESS}")
     return Moduli(alpha_f, beta_f, alpha_h, beta_h, gamma, L_F, pieces.whole.unknown)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from .._tree import Tree
 from ..errors import InputError
-from ..sets import AbstractSet, Ball, Simplex
+from ..sets import AbstractSet, Ball, Intersection, Simplex
 from ..spaces import AbstractSpace
 from .enclosure import Enclosure
 from .slope import Slope, TooLarge, Values, interval, is_slope
@@ -55,7 +55,8 @@ def motion(system: System, t0: float, t1: float, knots: Values) -> Motion:
     empty = _empty_at(system, np.array([t0]) if still else _samples(t0, t1, knots))
     if _describe(first, like, system.control) is None:
         # Nothing is known of its shape; of one that stands still, that it was made as a set.
-        return Motion(0.0 if still else np.inf, *free, still and empty is None, empty)
+        sure = still and empty is None and _checked(first)
+        return Motion(0.0 if still else np.inf, *free, sure, empty)
 
     def described(t: Any) -> Any:
         found = _describe(problem.set_at(t, args), like, system.control)
@@ -73,6 +74,15 @@ def motion(system: System, t0: float, t1: float, knots: Values) -> Motion:
     except TooLarge:
         return Motion(np.inf, *free, False, empty)
     return Motion(speed, low, high, standing and empty is None, empty)
+
+
+def _checked(K: AbstractSet) -> bool:
+    """Whether a set of this kind refuses to be made where it is empty."""
+    held = [v for v in vars(K).values() if isinstance(v, AbstractSet)]
+    for group in vars(K).values():
+        held += [v for v in group if isinstance(v, AbstractSet)] if isinstance(group, tuple) else []
+    ours = type(K).__module__.startswith("dvax.sets.")
+    return ours and not isinstance(K, Intersection) and all(map(_checked, held))
 
 
 def _describe(
@@ -172,22 +182,30 @@ def finite_and_steady(
     return bounded, speed
 
 
-def jumps(fn: Callable[[Any], Tree], knots: Values) -> tuple[float, float] | None:
-    """The knot at which fn(t) jumps most, and by how much; None where it does not."""
+def jumps(
+    fn: Callable[[Any], Tree], knots: np.ndarray, span: tuple[float, float]
+) -> tuple[float, float] | None:
+    """The knot at which fn(t) jumps most, and by how much; None where it does not. What shrinks with
+    the distance to the knot is a slope."""
+    length = span[1] - span[0]
     worst = None
     for knot in knots[:MOST_KNOTS]:
-        inset = 64 * np.finfo(float).eps * max(abs(knot), 1e-300)
-        before, after = (
-            np.concatenate(
-                [np.ravel(v) for v in jtu.tree_leaves(fn(jnp.asarray(knot + s * inset)))]
-            )
-            for s in (-1, 1)
-        )
-        gap = float(np.max(np.abs(after - before), initial=0.0))
-        scale = float(np.max(np.abs(after) + np.abs(before), initial=0.0))
-        if gap > 1e-9 * scale and (worst is None or gap > worst[1]):
+        near = 64 * np.finfo(float).eps * max(abs(knot), length)
+        gap, scale = _gap(fn, knot, near)
+        further, _ = _gap(fn, knot, 16 * near)
+        if gap > 1e-9 * scale and gap > 0.5 * further and (worst is None or gap > worst[1]):
             worst = float(knot), gap
     return worst
+
+
+def _gap(fn: Callable[[Any], Tree], knot: float, inset: float) -> tuple[float, float]:
+    """How far fn is from one side of the knot to the other, and how large."""
+    before, after = (
+        np.concatenate([np.ravel(v) for v in jtu.tree_leaves(fn(jnp.asarray(knot + s * inset)))])
+        for s in (-1, 1)
+    )
+    largest = np.max(np.abs(after) + np.abs(before), initial=0.0)
+    return float(np.max(np.abs(after - before), initial=0.0)), float(largest)
 
 
 def _free(like: Tree) -> tuple[Tree, Tree]:

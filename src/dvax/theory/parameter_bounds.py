@@ -20,6 +20,7 @@ from .motion import motion, slopes, times
 from .parameters import ParameterBounds
 from .region import Region, between
 from .slope import Slope, TooLarge, interval, is_slope
+from .status import Status
 from .system import System
 from .verify import around_responses, bounded, constants_of, met, span, state_like
 
@@ -67,8 +68,8 @@ def parameter_bounds(
     low, high = _tree.as_float(low, "low"), _tree.as_float(high, "high")
     _check(problem, low, high)
     middle = jtu.tree_map(lambda a, b: 0.5 * (a + b), low, high)
-    x0 = state_like(problem, x0, middle, "dvax.parameter_bounds(x0)")
     t0, t1 = span(t0, t1, "dvax.parameter_bounds(t0, t1)")
+    x0 = state_like(problem, x0, t0, middle, "dvax.parameter_bounds(x0)")
     problem.check(jnp.asarray(t0), x0, middle)
     _fixed(problem, t0, middle)
     system = System(problem, x0, middle, varied=True)
@@ -80,7 +81,7 @@ def parameter_bounds(
     region = Region(interval(t0, t1), states, responses, eta)
     box = Region(region.t, bounded(states, x0), bounded(responses, system.u0), eta)
     known = knowledge(system, region, box, {})
-    constants = constants_of(system, region, known, x is None and u is None)
+    constants = constants_of(system, region, known, (x is not None, u is not None))
     if constants is None:
         raise _unknown("γ, L_F, α_h, β_h, α_f, β_f", known.of["gamma"].how)
 
@@ -103,7 +104,9 @@ def parameter_bounds(
     for name, value in {**span_of, **sizes, **moduli}.items():
         if not np.isfinite(value):
             raise _unknown(name, "the code of f, h or K does not bound it over this region")
-    return ParameterBounds(constants, status="proved", **span_of, **sizes, **moduli)
+    # In a region it is for the caller to say that trajectories stay in it.
+    status: Status = "proved" if x is None and u is None else "declared"
+    return ParameterBounds(constants, status=status, **span_of, **sizes, **moduli)
 
 
 def _size(system: System, name: str, region: Region, knots: np.ndarray) -> float:

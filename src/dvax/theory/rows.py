@@ -37,7 +37,7 @@ def rows(
         _integrable(system, everywhere, span, knots, known),
         _law(known),
         _feedback(known),
-        _moving_set(system, K, knots),
+        _moving_set(system, K, span, knots),
         _moving_feedback(system, everywhere, span, knots),
         _smallness(system, known),
         _rate(known),
@@ -129,17 +129,20 @@ def _smallness(system: System, known: Knowledge) -> Assumption:
     m_P, norm = float(system.spectrum.m_P), float(system.spectrum.norm_P_inv)
     q = (norm - m_P + 2.0 * beta.value * norm) / (norm + m_P)
     why = f"q_ρ ≤ {q:.6g} at ρ = {2.0 / (m_P + norm):.6g}, β_h = {beta.value:.6g} ({beta.how})"
-    status: Status = beta.status
+    status: Status = weakest(beta.status, "declared" if system.spectrum.declared else "proved")
     if not q < 1 and beta.status == "proved":
         # β_h is the modulus itself where ∂h/∂u does not change, and else only a bound of it.
-        status = "refuted" if known.exact_in_u else "estimated"
-        why += "; it fails for every ρ" if known.exact_in_u else "; it is not shown"
+        sharp = known.exact_in_u and system.spectrum.exact and not system.spectrum.declared
+        status = "refuted" if sharp else "estimated"
+        why += "; it fails for every ρ" if sharp else "; it is not shown"
         why += ", which does not matter where γ is known in another way"
     statement = "q_ρ < 1 for some ρ (the projection route)"
     return Assumption("ass:lipschitz_smallness", statement, status, why, needed=False)
 
 
-def _moving_set(system: System, K: Motion, knots: np.ndarray) -> Assumption:
+def _moving_set(
+    system: System, K: Motion, span: tuple[float, float], knots: np.ndarray
+) -> Assumption:
     label, statement = "ass:time_regularity (i)", "proj_{K(t)} moves continuously in t"
     if K.empty_at is not None:
         why = f"K(t) is empty at t = {K.empty_at:.17g}"
@@ -149,7 +152,7 @@ def _moving_set(system: System, K: Motion, knots: np.ndarray) -> Assumption:
     def project(t: Any) -> Tree:
         return system.problem.set_at(t, system.args).project(z, system.control)
 
-    jump = jumps(project, knots)
+    jump = jumps(project, knots, span)
     if jump is not None:
         why = f"proj_{{K(t)}}(1) jumps by {jump[1]:.6g} at t = {jump[0]:.17g}; {_ON_EACH_SIDE}"
         return Assumption(label, statement, "refuted", why, evidence=jump[0])
@@ -163,7 +166,7 @@ def _moving_feedback(
 ) -> Assumption:
     label, statement = "ass:time_regularity (ii)", "h moves continuously in t"
     h = lambda t, x, u: system.problem.h(t, x, u, system.args)  # noqa: E731
-    jump = jumps(lambda t: h(t, system.x0, system.u0), knots)
+    jump = jumps(lambda t: h(t, system.x0, system.u0), knots, span)
     if jump is not None:
         why = f"h jumps by {jump[1]:.6g} at t = {jump[0]:.17g}; {_ON_EACH_SIDE}"
         return Assumption(label, statement, "refuted", why, evidence=jump[0])

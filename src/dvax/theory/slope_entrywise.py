@@ -5,6 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from scipy.special import erf
 
 from .slope import (
@@ -64,7 +65,9 @@ def _reciprocal(y: Slope) -> Slope:
     return Slope(low, high, mapped(y.parts, lambda part: scaled(part, steepest, flattest)))
 
 
-def _div(eqn: Any, given: list[Any]) -> Slope:
+def _div(eqn: Any, given: list[Any]) -> Slope | None:
+    if not jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
+        return None  # integers are divided with a remainder
     x, y = _lifted(eqn, given)
     return _mul(eqn, [x, _reciprocal(y)])
 
@@ -236,6 +239,13 @@ def _stairs(phi: Callable) -> Rule:
     return rule
 
 
+def _round(eqn: Any, given: list[Any]) -> Slope | None:
+    """Halves go to the even side, or away from zero."""
+    to_even = eqn.params["rounding_method"] == lax.RoundingMethod.TO_NEAREST_EVEN
+    away = lambda v: np.sign(v) * np.floor(np.abs(v) + 0.5)  # noqa: E731
+    return _stairs(np.round if to_even else away)(eqn, given)
+
+
 def _marks(*slopes: Slope) -> dict[int, Part]:
     """What truth values depend on: no derivatives, 1 where there is a dependence."""
     marks: dict[int, Part] = {}
@@ -367,7 +377,7 @@ ENTRYWISE: dict[str, Rule] = {
     "sign": _stairs(np.sign),
     "floor": _stairs(np.floor),
     "ceil": _stairs(np.ceil),
-    "round": _stairs(np.round),
+    "round": _round,
     "lt": _compare(lambda x, y: (x.high < y.low, x.low < y.high)),
     "le": _compare(lambda x, y: (x.high <= y.low, x.low <= y.high)),
     "gt": _compare(lambda x, y: (x.low > y.high, x.high > y.low)),

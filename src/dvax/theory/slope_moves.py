@@ -30,7 +30,9 @@ def _moving(fn: Callable[[Any, Values, int], Values]) -> Rule:
     def rule(eqn: Any, given: list[Any]) -> Slope:
         x = given[0]
         aval = eqn.outvars[0].aval
-        same = aval.size == x.low.size
+        # A reshape may permute the axes first.
+        permuted = eqn.primitive.name == "reshape" and eqn.params.get("dimensions") is not None
+        same = aval.size == x.low.size and not permuted
         parts = {}
         for k, part in x.parts.items():
             keeps = same and not part.full and eqn.primitive.name in _IN_ORDER
@@ -52,6 +54,9 @@ _IN_ORDER = {"reshape", "squeeze", "expand_dims", "broadcast_in_dim", "copy", "c
 
 
 def _reshape(eqn: Any, v: Values, extra: int) -> Values:
+    order = eqn.params.get("dimensions") if eqn.primitive.name == "reshape" else None
+    if order is not None:
+        v = v.transpose(*range(extra), *(extra + axis for axis in order))
     return v.reshape((*v.shape[:extra], *eqn.outvars[0].aval.shape))
 
 
@@ -152,14 +157,20 @@ def _by_operation(eqn: Any, given: list[Any]) -> Slope | None:
     def move(v: Values) -> Values:
         return np.asarray(bind(eqn, [jnp.asarray(v), *rest])[0])
 
+    def moved_slopes(stack: Values) -> Values:
+        # What is filled in from outside does not move with anything.
+        params = dict(eqn.primitive.get_bind_params(eqn.params))
+        if "fill_value" in params:
+            params["fill_value"] = 0.0
+        each = [eqn.primitive.bind(jnp.asarray(v), *rest, **params) for v in stack]
+        return np.stack([np.asarray(v) for v in each])
+
     parts = {}
     for k, part in x.parts.items():
         if entries(part) * max(x.low.size, eqn.outvars[0].aval.size) > MOST:
             raise TooLarge
         full = columns(part, entries(part))
-        parts[k] = Part(
-            np.stack([move(v) for v in full.center]), np.stack([move(v) for v in full.radius]), True
-        )
+        parts[k] = Part(moved_slopes(full.center), moved_slopes(full.radius), True)
     return Slope(move(x.low), move(x.high), parts)
 
 

@@ -88,7 +88,7 @@ def _widths(times: Values, values: Values) -> Values:
 
 
 TABLES: dict[str, Rule] = {
-    "constant_table": _constant,
-    "linear_table": _linear,
-    "cubic_table": _cubic,
+    "dvax_constant_table": _constant,
+    "dvax_linear_table": _linear,
+    "dvax_cubic_table": _cubic,
 }

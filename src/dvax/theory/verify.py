@@ -118,8 +118,8 @@ def verify(
 
     ```
     """
-    x0 = state_like(problem, x0, args, "dvax.verify(x0)")
     t0, t1 = span(t0, t1, "dvax.verify(t0, t1)")
+    x0 = state_like(problem, x0, t0, args, "dvax.verify(x0)")
     problem.check(jnp.asarray(t0), x0, args)
     system = System(problem, x0, args)
     knots = np.asarray(problem.knots(t0, t1, x0, args), float)
@@ -131,7 +131,7 @@ def verify(
     box = Region(time, bounded(states, x0), bounded(responses, system.u0))
     known = knowledge(system, region, box, _declared(declared))
     assumptions = tuple(rows(system, region, K, knots, known))
-    constants = constants_of(system, region, known, x is None and u is None, energy)
+    constants = constants_of(system, region, known, (x is not None, u is not None), energy)
     return Verification(assumptions, constants, _route(system, known))
 
 
@@ -144,7 +144,7 @@ def _route(system: System, known: Knowledge) -> str:
 
 
 def constants_of(
-    system: System, region: Region, known: Knowledge, free: bool, energy: bool = False
+    system: System, region: Region, known: Knowledge, asked: tuple[bool, bool], energy: bool = False
 ) -> Constants | None:
     """The constants, where every modulus is a number and γ > 0."""
     values: dict[str, Any] = {name: entry.value for name, entry in known.of.items()}
@@ -166,7 +166,7 @@ def constants_of(
     return Constants(
         **values, M=system.growth.M, omega=system.growth.omega, m_P=system.spectrum.m_P,
         norm_P_inv=system.spectrum.norm_P_inv, one_sided=mu, status=statuses,
-        domain=_domain(region, free), energy=contraction,
+        domain=_domain(region, asked), energy=contraction,
     )  # fmt: skip
 
 
@@ -176,9 +176,14 @@ def _energy(system: System, region: Region) -> tuple[float, float] | None:
     return None if found is None else (found.M, found.rate)
 
 
-def _domain(region: Region, free: bool) -> Domain:
-    end = lambda i: jtu.tree_map(lambda v: v[i], region.x, is_leaf=is_slope)  # noqa: E731
-    return Domain(float(region.t.low), float(region.t.high), end(0), end(1), free)
+def _domain(region: Region, asked: tuple[bool, bool]) -> Domain:
+    """Where the constants hold: the bounds of x and u as far as they were asked for."""
+    end = lambda tree, i: jtu.tree_map(lambda v: v[i], tree, is_leaf=is_slope)  # noqa: E731
+    x, u = (
+        (end(tree, 0), end(tree, 1)) if given else None
+        for tree, given in zip((region.x, region.u), asked)
+    )
+    return Domain(float(region.t.low), float(region.t.high), x, u)
 
 
 def _sharp(system: System, region: Region, known: Knowledge) -> float | None:
@@ -259,7 +264,7 @@ def span(t0: Any, t1: Any, name: str) -> tuple[float, float]:
     return begin, end
 
 
-def state_like(problem: Problem, x0: Tree, args: Any, name: str) -> Tree:
+def state_like(problem: Problem, x0: Tree, t0: float, args: Any, name: str) -> Tree:
     """A state of this problem: the one given, or zero where its shape is known."""
     if x0 is not None:
         return _tree.as_float(x0, "x0")
@@ -267,7 +272,7 @@ def state_like(problem: Problem, x0: Tree, args: Any, name: str) -> Tree:
         return problem.state_space.zeros()
     zero = jnp.zeros(())
     try:
-        problem.check(zero, zero, args)
+        problem.check(jnp.asarray(t0), zero, args)
     except InputError as error:
         raise InputError(
             InputProblem(

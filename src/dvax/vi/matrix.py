@@ -88,6 +88,8 @@ def _rule(eqn: Any, given: list[Any]) -> list[Any] | None:
     bent = [value for value in given if _depends(value)]
     if not all(isinstance(value, _Diagonal) for value in bent):
         return None
+    if name == "reshape" and eqn.params.get("dimensions") is not None:
+        return None  # it permutes the axes first
     if name in ("neg", "convert_element_type", "reshape", "squeeze", "copy"):
         return [_Diagonal(bind(eqn, [given[0].factor])[0])]
     if name == "broadcast_in_dim" and out.size == given[0].factor.size:

@@ -1,0 +1,172 @@
+"""What a sceptical reader once got called proved, or refuted, and was not."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+import dvax
+
+GIVEN = dict(
+    A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1.0),
+    f=lambda t, x, u, args: -u, h=lambda t, x, u, args: 0.1 * x,
+)  # fmt: skip
+
+
+def problem(**other):
+    return dvax.Problem(**{**GIVEN, **other})
+
+
+def test_a_reshape_may_permute_the_axes_first():
+    left, right = jnp.array([[-100.0, 0.0], [0.0, 0.0]]), jnp.array([0.0, 100.0, 0.0, 0.0])
+    f = lambda t, x, u, a: left @ x + (jnp.ravel(x, order="F") * right).reshape(2, 2)  # noqa: E731
+    c = dvax.verify(problem(f=f), jnp.zeros((2, 2))).constants
+    J = np.asarray(jax.jacfwd(lambda x: f(0.0, x, 0.0, None))(jnp.zeros((2, 2)))).reshape(4, 4)
+    assert float(c.alpha_f) == pytest.approx(np.linalg.norm(J, 2))
+    assert float(c.one_sided) >= np.linalg.eigvalsh(0.5 * (J + J.T))[-1] - 1 - 1e-9
+
+
+def test_a_law_that_is_not_pointwise_bounds_its_response_as_a_whole():
+    first, second = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.001])
+    wave = lambda u: jnp.array([0.0, 1.0]) * jnp.sin(2 * jnp.pi * u) / (2 * jnp.pi)  # noqa: E731
+    system = problem(
+        A=dvax.generators.Scalar(0.0), K=dvax.sets.Ball(0.0, np.sqrt(2.0)),
+        h=lambda t, x, u, a: first * x + second,
+        f=lambda t, x, u, a: jnp.array([-1.0, -2.0]) * x + wave(u),
+    )  # fmt: skip
+    mu = float(dvax.verify(system, jnp.zeros(2)).constants.one_sided)
+    x, d = jnp.array([-1.00069, 1.20141]), jnp.array([7e-5, 7e-5])
+    rates = []
+    for angle in np.linspace(0.0, np.pi, 40):
+        d = 1e-4 * jnp.array([np.cos(angle), np.sin(angle)])
+        change = system.reduced(0.0, x + d) - system.reduced(0.0, x)
+        rates.append(float(change @ d / (d @ d)))
+    assert max(rates) > -0.95  # above what was once called proved
+    assert mu >= max(rates) - 1e-6
+
+
+@pytest.mark.parametrize(
+    ("K", "h"),
+    [
+        (dvax.sets.Box(0.0, 0.5), lambda t, x, u, a: -5 * lax.round(u)),
+        (
+            dvax.sets.Box(0.0, 4.0),
+            lambda t, x, u, a: (
+                jnp.where(jnp.clip(jnp.floor(u).astype(int), 1, 3) // 2 == 0, 5.0, 0.0) + 0 * u
+            ),
+        ),
+    ],
+)
+def test_what_jumps_within_the_set_is_not_proved(K, h):
+    check = dvax.verify(problem(K=K, h=h))
+    assert check["ass:strong_pseudomono"].status != "proved"
+    assert check["ass:lipschitz_smallness"].status != "proved"
+
+
+def test_a_filled_in_entry_does_not_move():
+    outside = jnp.array([7])
+    f = lambda t, x, u, a: (  # noqa: E731
+        x.at[outside].get(mode="fill", fill_value=-7.0) + 14 * jnp.maximum(x, 0.0)
+    )
+    c = dvax.verify(problem(A=dvax.generators.Scalar(0.0), f=f), jnp.zeros(1)).constants
+    assert float(c.alpha_f) == pytest.approx(14.0)
+
+
+def test_a_user_s_function_may_have_any_name():
+    @jax.jit
+    def linear_table(knots, weights, s):
+        return jnp.sum(weights * jnp.maximum(s - knots, 0.0))
+
+    knots = jnp.array([0.0, 1.0, 2.0])
+    f = lambda t, x, u, a: linear_table(knots, jnp.ones(3), x)  # noqa: E731
+    c = dvax.verify(problem(f=f), 0.0, x=(0.0, 2.0)).constants
+    assert float(c.alpha_f) >= 2.0
+
+
+def test_a_declared_spectrum_proves_nothing():
+    n = 3000
+    e = jnp.zeros(n).at[0].set(1.0)
+    P = dvax.operators.MatrixFree(lambda v: v + 3 * e * v, m=1.0, norm=4.0)
+    h = lambda t, x, u, a: 0.1 * x + 0.1 * jnp.tanh(u)  # noqa: E731
+    check = dvax.verify(problem(P=P, K=dvax.sets.Box(-1.0, 1.0), h=h), jnp.zeros(n))
+    assert check["ass:strong_pseudomono"].status == "declared"
+    # An affine law goes by its action, P⁻¹ by conjugate gradients.
+    affine = problem(
+        P=dvax.operators.MatrixFree(lambda v: 2 * v, m=0.5, norm=2.5),
+        h=lambda t, x, u, a: 0.1 * x + 0.1 * u,
+    )
+    found = dvax.verify(affine, jnp.zeros(4)).constants
+    assert float(found.gamma) == pytest.approx(0.45, rel=1e-6)
+
+
+def test_an_empty_set_that_stands_still_is_not_proved_to_stand():
+    balls = dvax.sets.Intersection(
+        dvax.sets.Ball(0.0, 1.0), dvax.sets.Ball(jnp.array([5.0, 0.0]), 1.0)
+    )
+    check = dvax.verify(problem(K=balls), jnp.zeros(2))
+    assert check["ass:operators (iii)"].status != "proved"
+
+
+@pytest.mark.parametrize("knot", [0.5, 0.0])
+def test_a_jump_is_none_the_less_one_where_nobody_looked(knot):
+    switch = dvax.signals.Function(
+        lambda t: jnp.where(t < knot, -5.0, -3.0), knots=jnp.array([knot])
+    )
+    moving = problem(K=lambda t, a: dvax.sets.Box(switch(t), 10.0))
+    assert dvax.verify(moving, t0=-1.0)["ass:time_regularity (i)"].status != "proved"
+    below = problem(K=lambda t, a: dvax.sets.Box(-6.0, switch(t)))
+    assert dvax.verify(below, t0=-1.0)["ass:time_regularity (i)"].status == "refuted"
+    scaled = problem(h=lambda t, x, u, a: switch(t) * x)
+    assert dvax.verify(scaled, t0=-1.0)["ass:time_regularity (ii)"].status != "proved"
+
+
+@pytest.mark.parametrize(("begin", "slope"), [(1e5, 1.0), (1.7e9, 1e-3)])
+def test_a_slope_at_a_late_time_is_no_jump(begin, slope):
+    times = begin + 3600.0 * np.arange(4)
+    load = dvax.signals.Table(times, np.array([1.0, 1.0, 1.0 + slope * 3600, 1.0]))
+    system = problem(
+        K=lambda t, a: dvax.sets.Box(-1.0, load(t) - 0.5), h=lambda t, x, u, a: 0.1 * x + load(t)
+    )
+    check = dvax.verify(system, None, times[0], times[-1])
+    assert check["ass:time_regularity (i)"].status == "proved"
+    assert check["ass:time_regularity (ii)"].status == "proved"
+
+
+def test_a_certified_run_does_not_leave_the_region_of_its_constants():
+    grows = problem(
+        A=dvax.generators.Scalar(0.0), K=dvax.sets.Box(-10.0, 10.0),
+        f=lambda t, x, u, a: 20 * jnp.maximum(x - 0.5, 0.0) + 1.0 + jnp.sin(20 * t) - 0.0 * u,
+    )  # fmt: skip
+    c = dvax.verify(grows, 0.0, 0.0, 1.0, x=(-1.0, 0.5)).constants
+    with pytest.raises(dvax.InputError, match="larger region"):
+        dvax.solve(grows, 0.0, 0.0, 0.8, constants=c, certified_tol=1e-2)
+    reacts = problem(
+        A=dvax.generators.Scalar(0.0), K=dvax.sets.Box(-10.0, 10.0), h=lambda t, x, u, a: x,
+        f=lambda t, x, u, a: 20 * jnp.maximum(u - 0.5, 0.0) + 1.0 + jnp.sin(20 * t),
+    )  # fmt: skip
+    c = dvax.verify(reacts, 0.0, 0.0, 1.0, u=(-1.0, 0.5)).constants
+    with pytest.raises(dvax.InputError, match="larger region"):
+        dvax.solve(reacts, 0.0, 0.0, 0.8, constants=c, certified_tol=1e-2)
+    sol = dvax.solve(reacts, 0.0, 0.0, 0.8, rtol=1e-4)
+    assert np.isinf(float(dvax.bound_error(reacts, sol, c).x[-1]))
+
+
+def test_bounds_of_parameters_in_a_region_are_the_caller_s_word():
+    f = lambda t, x, u, a: 20 * a["k"] * jnp.maximum(x - 0.5, 0.0) + a["c"] - u * 0.0  # noqa: E731
+    ends = {"k": 1.0, "c": 1.0}, {"k": 1.0, "c": 1.1}
+    bounds = dvax.parameter_bounds(problem(f=f), *ends, 0.0, x=(-1.0, 0.5))
+    assert bounds.status == "declared"
+
+
+def test_single_precision_runs_have_bounds_from_double_precision_constants():
+    short = problem(K=dvax.sets.Box(jnp.float32(0.0), jnp.float32(1.0)))
+    c = dvax.verify(short, jnp.zeros(2, jnp.float32)).constants
+    sol = dvax.solve(short, jnp.ones(2, jnp.float32), 0.0, 1.0, rtol=1e-3)
+    assert np.isfinite(float(dvax.bound_error(short, sol, c).x[-1]))
+
+
+def test_a_pseudomonotone_law_may_be_flatter_than_its_modulus():
+    flat = problem(K=dvax.sets.Box(1.0, 2.0), h=lambda t, x, u, a: u - (2 / u) * u)
+    check = dvax.verify(flat)
+    assert check.constants is not None and float(check.constants.gamma) == pytest.approx(1.0)
