@@ -1,7 +1,9 @@
 """What the certificate costs on a field, and how far above the true error it is on C1."""
 
 import functools
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -14,6 +16,7 @@ from ..section import Section, Table, compare
 
 _POINTS, _STEP, _STEPS = 10**5, 1e-3, 200
 _END, _TIMES = 2.0, 41
+_CERTIFIED = (1e-3, 1e-5, 1e-7)
 _ROUNDING = 1e-13
 """Errors below this are rounding, of which the certificate does not speak."""
 _RUNS: tuple[tuple[str, dvax.ETD1 | dvax.ETD2RK, tuple[float, ...]], ...] = (
@@ -30,7 +33,9 @@ def run(full: bool) -> Section:
             "measure=True beside measure=False, which does not sample the defect and certifies "
             f"nothing. Closeness: bound / true error of C1 at t = 2, adaptive steps, {_TIMES} "
             "saved times, the true error from the closed form; 'sharp' uses the one-sided "
-            "constant. Errors there are of ETD1 and ETD2RK at the rtol named, atol = rtol/1000."
+            "constant. Errors there are of ETD1 and ETD2RK at the rtol named, atol = rtol/1000. "
+            "certified_tol: all its runs together, beside the fewest fixed steps (of a ladder of "
+            "tenths) whose true error, which nobody knows beforehand, is just below it."
         ),
         tables=[Table("bound / true error on C1", _HEADER, _closeness())],
     )
@@ -48,7 +53,62 @@ def run(full: bool) -> Section:
         compare("measure=True, whole call", "measure=False", taken["True"], taken["False"],
                 error=errors[True], error_other=errors[False])
     )  # fmt: skip
+    _bound_after_a_run(section, law.model, start, full)
+    _certified(section, full)
     return section
+
+
+def _bound_after_a_run(
+    section: Section, model: dvax.models.Contact, start: Any, full: bool
+) -> None:
+    """What `bound_error` adds to an adaptive solve, which measures its defect anyway."""
+    times = np.linspace(0.0, 0.5, 6)[1:]
+    settings: dict[str, Any] = dict(ts=times, rtol=1e-4, atol=1e-7)
+
+    def solve() -> dvax.Solution:
+        return dvax.solve(model.problem, start, 0.0, 0.5, **settings)
+
+    def bounded() -> Any:
+        return jax.block_until_ready(dvax.bound_error(model.problem, solve(), model.constants).x)
+
+    sides = {"bounded": bounded, "solve": lambda: jax.block_until_ready(solve().xs)}
+    taken = in_turn({name: timed(side) for name, side in sides.items()}, 9 if full else 5)
+    section.comparisons.append(
+        compare("adaptive solve and bound_error", "adaptive solve", taken["bounded"],
+                taken["solve"], target=("≤", 1.6))
+    )  # fmt: skip
+
+
+def _certified(section: Section, full: bool) -> None:
+    """`certified_tol` against the fewest fixed steps whose true error is just below it."""
+    law, times = single(), np.linspace(0.0, _END, _TIMES)[1:]
+    problem, constants = law.model.problem, law.model.constants
+    exact = np.array([law.exact(t)[0] for t in times])
+
+    def error(sol: dvax.Solution) -> float:
+        return float(np.max(np.abs(np.asarray(sol.xs) - exact)))
+
+    def fixed(steps: int) -> dvax.Solution:
+        return dvax.solve(problem, law.start, 0.0, _END, ts=times, dt=_END / steps)
+
+    for tol in _CERTIFIED:
+        run = lambda tol=tol: dvax.solve(  # noqa: E731
+            problem, law.start, 0.0, _END, ts=times, constants=constants, certified_tol=tol
+        )
+        few = next(n for n in (round(8 * 1.1**k) for k in range(200)) if error(fixed(n)) <= tol)
+        sides = {
+            "certified": lambda run=run: jax.block_until_ready(run().xs),
+            "by hand": lambda few=few: jax.block_until_ready(fixed(few).xs),
+        }
+        taken = in_turn({name: timed(side) for name, side in sides.items()}, 9 if full else 5)
+        section.notes.append(
+            f"certified_tol = {tol:g}: {int(run().stats['steps'])} steps in its last run, {few} by hand"
+        )
+        section.comparisons.append(
+            compare(f"certified_tol = {tol:g}, as called", f"{few} fixed steps by hand",
+                    taken["certified"], taken["by hand"], error=error(run()),
+                    error_other=error(fixed(few)), target=("≤", 3.0))
+        )  # fmt: skip
 
 
 _HEADER = ("method", "rtol", "steps", "true error", "bound", "bound/error", "sharp/error",

@@ -6,8 +6,9 @@ a run in coarser steps is cheap and tells most of it, and the next one is made w
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -51,7 +52,8 @@ def certified(
     space = problem.spaces(x0)[0]
     size, span = float(np.sqrt(float(space.size()))), t1 - t0
     grown = _grown(constants, span)
-    rate = problem.reduced(t0, x0, args)
+    # How large rates are, roughly: the response is left out, since to solve for it takes a compilation.
+    rate = problem.f(jnp.asarray(t0), x0, problem.zero_control(x0), args)
     largest = max(float(space.norm(rate)), float(space.norm(x0)))
     eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(x0))).eps)
     reachable = _ROUNDINGS * eps * largest * grown
@@ -79,13 +81,22 @@ def certified(
 def _bounds(solution: Solution, constants: Any, t0: float) -> Any:
     """The bound at every saved time."""
     assert solution.defect is not None and solution.settled is not None
-    acted = disturbance(constants, solution.defect, solution.law_defect)
-    settled = disturbance(constants, *solution.settled)
-    begin = jnp.asarray(t0, solution.ts.dtype)
-    each = [
-        gronwall(begin, solution.ts, acted, settled, rate, M, 0.0) for M, rate in _rates(constants)
-    ]
+    moduli = tuple(float(getattr(constants, name)) for name in ("beta_f", "norm_P_inv", "gamma"))
+    impulse = (solution.defect, solution.law_defect), solution.settled
+    return _least(t0, solution.ts, impulse, moduli, _rates(constants))
+
+
+@jax.jit
+def _least(t0: Any, ts: Any, impulse: tuple, moduli: tuple, rates: list) -> jax.Array:
+    acted, settled = (disturbance(_Moduli(*moduli), *parts) for parts in impulse)
+    each = [gronwall(t0, ts, acted, settled, rate, M, 0.0) for M, rate in rates]
     return jnp.min(jnp.stack(each), axis=0)
+
+
+class _Moduli(NamedTuple):
+    beta_f: Any
+    norm_P_inv: Any
+    gamma: Any
 
 
 def _leaves(solution: Solution, constants: Any, bounds: Any) -> float | None:
