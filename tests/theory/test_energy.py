@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from tests.closed_forms import ALL
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax.theory import energy
@@ -30,7 +31,10 @@ def sheared(n, m, seed, pointwise):
     )
 
 
-@pytest.mark.parametrize(("n", "m", "pointwise"), [(2, 2, True), (3, 2, False), (5, 3, True)])
+SIZES = [(2, 2, True), (3, 2, False), (5, 3, True)]
+
+
+@pytest.mark.parametrize(("n", "m", "pointwise"), mostly_thorough(SIZES, {(3, 2, False)}))
 def test_no_pair_of_trajectories_is_faster_than_the_norm_says(n, m, pointwise):
     rng = np.random.default_rng(9)
     better = 0

@@ -74,13 +74,17 @@ def _hold(made, c):
         assert float(jnp.min(room)) >= -1e-9, name
 
 
-@pytest.mark.parametrize("seed", range(22))
+# Every way to break an assumption, and the three kinds that break none.
+OFTEN = [0, 2, 4, *range(1, 23, 2)]
+
+
+@pytest.mark.parametrize("seed", OFTEN)
 def test_a_generated_system(seed):
     _check(seed)
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("seed", range(22, 400, 2))
+@pytest.mark.parametrize("seed", [6, *range(8, 400, 2)])
 def test_two_hundred_generated_systems(seed):
     _check(seed)
     _check(seed + 1)
