@@ -1,14 +1,12 @@
 """Derivatives as matrices in the norms of their spaces, many small ones where a law is pointwise."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
 from .._tree import Tree
-from ..spaces import AbstractSpace
 from .slope import MOST, Part, Slope, TooLarge, Values, columns, is_slope
 
 _DENSE = 2_000
@@ -150,13 +148,6 @@ def _stacked(
 def _scaled(values: Values, out: Values, into: Values) -> Values:
     """values · out / into, without rounding where the weights are the same."""
     return values * np.where(out == into, 1.0, out / into)
-
-
-def roots(space: AbstractSpace, like: Tree) -> list[Values]:
-    """√wᵢ of every leaf, flat."""
-    weights = space.weights()
-    whole: Any = jtu.tree_map(lambda leaf, w: jnp.broadcast_to(w, leaf.shape), like, weights)
-    return [np.sqrt(np.asarray(w, float)).ravel() for w in jtu.tree_leaves(whole)]
 
 
 def _dot(a: Values, b: Values) -> Values:

@@ -1,7 +1,6 @@
 """Moduli of affine data too large to be written out as matrices: by their action, with Lanczos."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.flatten_util
@@ -14,6 +13,7 @@ from ..spaces import AbstractSpace
 from ..vi import analyse, independent
 from .lanczos import greatest
 from .system import System
+from .weights import flat_roots
 
 Action = Callable[[np.ndarray], np.ndarray]
 
@@ -24,7 +24,7 @@ def scaled(
 ) -> Callable[[jax.Array], jax.Array]:  # fmt: skip
     """A map between two spaces in coordinates in which their norms are Euclidean."""
     flat_in, unravel = jax.flatten_util.ravel_pytree(like_in)
-    root_in, root_out = _roots(space_in, like_in), _roots(space_out, like_out)
+    root_in, root_out = flat_roots(space_in, like_in), flat_roots(space_out, like_out)
 
     def flat(v: jax.Array) -> jax.Array:
         out = apply(unravel((v / root_in).astype(flat_in.dtype)))
@@ -81,12 +81,6 @@ class Linear:
             return -0.5 * (self.apply(v) + self.adjoint(v))
 
         return -greatest(lambda v: np.asarray(minus(jnp.asarray(v))), self.size_in)
-
-
-def _roots(space: AbstractSpace, like: Tree) -> jax.Array:
-    weights = space.weights()
-    whole: Any = jtu.tree_map(lambda leaf, w: jnp.broadcast_to(w, leaf.shape), like, weights)
-    return jnp.sqrt(jax.flatten_util.ravel_pytree(whole)[0])
 
 
 class Affine:

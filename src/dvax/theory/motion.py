@@ -15,6 +15,7 @@ from ..spaces import AbstractSpace
 from .enclosure import Enclosure
 from .slope import Slope, TooLarge, Values, interval, is_slope
 from .system import System
+from .weights import roots
 
 _PIECES = 64
 MOST_KNOTS = 200
@@ -121,7 +122,7 @@ class _Sum(NamedTuple):
 
 
 def _speed(moves: Any, space: AbstractSpace, like: Tree) -> float:
-    roots = [np.sqrt(np.asarray(w, float)) for w in jtu.tree_leaves(_whole(space, like))]
+    scales = [r.reshape(v.shape) for r, v in zip(roots(space, like), jtu.tree_leaves(like))]
 
     def fast(x: Slope) -> Values:
         part = x.parts.get(0)
@@ -131,7 +132,7 @@ def _speed(moves: Any, space: AbstractSpace, like: Tree) -> float:
 
     def norm(entries: list[Values]) -> float:
         return float(
-            np.sqrt(sum(np.sum((r * e) ** 2) for r, e in zip(roots, entries, strict=True)))
+            np.sqrt(sum(np.sum((r * e) ** 2) for r, e in zip(scales, entries, strict=True)))
         )
 
     if isinstance(moves, _Either):
@@ -223,7 +224,3 @@ def _most(a: Tree, b: Tree) -> Tree:
 
 def slopes(tree: Tree) -> list[Slope]:
     return jtu.tree_leaves(tree, is_leaf=is_slope)
-
-
-def _whole(space: AbstractSpace, like: Tree) -> Tree:
-    return jtu.tree_map(lambda leaf, w: jnp.broadcast_to(w, leaf.shape), like, space.weights())

@@ -13,7 +13,7 @@ from ..errors import InputError, InputProblem
 from ..problem import Problem
 from ..spaces import AbstractSpace
 from ..vi import independent
-from .blocks import block, roots
+from .blocks import block
 from .enclosure import Enclosure
 from .known import knowledge
 from .motion import motion, slopes, times
@@ -23,6 +23,7 @@ from .slope import Slope, TooLarge, interval, is_slope
 from .status import Status
 from .system import System
 from .verify import around_responses, bounded, constants_of, met, span, state_like
+from .weights import roots
 
 
 def parameter_bounds(

@@ -16,6 +16,7 @@ from ..spaces import AbstractSpace
 from .region import Region
 from .slope import Slope
 from .system import System
+from .weights import flat_roots, whole
 
 POINTS, ROUNDS = 256, 60
 """Of a search: how many starts, and how many steps of ascent."""
@@ -176,10 +177,10 @@ def _norm(
     value, push = jax.linearize(fn, v)
     if size <= _DENSE:
         flat, unravel = jax.flatten_util.ravel_pytree(v)
-        roots = _roots(into, v)
+        roots = flat_roots(into, v)
         rows = jax.vmap(lambda e: push(unravel(e / roots)))(jnp.eye(size, dtype=flat.dtype))
         matrix = jax.vmap(lambda row: jax.flatten_util.ravel_pytree(row)[0])(rows)
-        matrix = matrix * _roots(out, value)[None, :]
+        matrix = matrix * flat_roots(out, value)[None, :]
         square = matrix @ matrix.T
         return jnp.sqrt(jnp.linalg.norm(square, ord="fro") if size == 1 else _largest(square))
     pull = jax.linear_transpose(push, v)
@@ -189,21 +190,13 @@ def _norm(
         d = _tree.scale(1.0 / jnp.maximum(into.norm(d), 1e-300), d)
         image = push(d)
         gain = out.norm(image)
-        (d,) = pull(jtu.tree_map(jnp.multiply, image, _whole(out, image)))
-        d = jtu.tree_map(jnp.divide, d, _whole(into, d))
+        (d,) = pull(jtu.tree_map(jnp.multiply, image, whole(out, image)))
+        d = jtu.tree_map(jnp.divide, d, whole(into, d))
     return gain
 
 
 def _largest(square: jax.Array) -> jax.Array:
     return jnp.maximum(jnp.linalg.eigvalsh(square)[-1], 1e-300)
-
-
-def _whole(space: AbstractSpace, like: Tree) -> Tree:
-    return jtu.tree_map(lambda leaf, w: jnp.broadcast_to(w, leaf.shape), like, space.weights())
-
-
-def _roots(space: AbstractSpace, like: Tree) -> jax.Array:
-    return jnp.sqrt(jax.flatten_util.ravel_pytree(_whole(space, like))[0])
 
 
 def _bounds(region: Region) -> tuple[Any, Any]:

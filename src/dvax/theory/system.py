@@ -9,10 +9,11 @@ import numpy as np
 
 from .._tree import Tree
 from ..problem import Problem
-from .blocks import Block, block, identity, roots
+from .blocks import Block, block, identity
 from .enclosure import Enclosure
 from .region import Region
 from .slope import TooLarge, interval
+from .weights import roots
 
 
 class Jacobians(NamedTuple):
