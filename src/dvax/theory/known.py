@@ -137,8 +137,8 @@ def _divided(system: System, region: Region) -> Divided | None:
         found = moduli(without, region)
         if found.gamma.value > 0:
             how = (
-                f"F = aG with a ≥ {least:.6g} and G strongly monotone with {found.gamma.value:.6g} "
-                "(prop:weighted_strong_pseudomono)"
+                f"F = aG with a ≥ {least:.6g} and G strongly monotone with {found.gamma.value:.6g}, "
+                f"{found.gamma.how} (prop:weighted_strong_pseudomono)"
             )
             return Divided(least * found.gamma.value, how, without, found)
     return None
