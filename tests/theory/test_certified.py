@@ -59,7 +59,7 @@ def test_the_true_error_is_below_the_tolerance(name, method, tol):
 
 def test_what_rounding_forbids_is_said_before_anything_runs():
     case, x0, constants = system("C1")
-    with pytest.raises(dvax.InputError, match=r"c = -0\.5.*no bound below [\d.e-]+ can be reached"):
+    with pytest.raises(dvax.InputError, match=r"c = -0\.5.*in reach here is about [\d.e-]+"):
         dvax.solve(case.problem, x0, 0.0, 2.0, case.args, constants=constants, certified_tol=1e-15)
     with pytest.raises(dvax.InputError, match=r"M Φ_c\(T\) = [\d.]+e\+"):
         # Paper's constants alone, over a long time: e^{c·200} of anything is hopeless.
@@ -90,3 +90,12 @@ def test_arguments_that_do_not_go_together_are_refused():
                 ).xs
             )
         )(x0)
+
+
+def test_a_run_that_fails_is_returned_as_failed_and_not_as_certified():
+    case, x0, constants = system("C1")
+    sol = dvax.solve(
+        case.problem, x0, 0.0, 2.0, case.args, constants=constants, certified_tol=1e-5, max_steps=3,
+        throw=False,
+    )  # fmt: skip
+    assert sol.result != dvax.RESULTS.successful and "certified_bound" not in sol.stats

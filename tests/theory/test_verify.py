@@ -59,7 +59,6 @@ def _hold(made, c):
         norm = jnp.linalg.norm
         dx, du, dy = norm(xa - xb), norm(ua - ub), norm(ya - yb)
         f, h = problem.f, problem.h
-        push = (F(ya) - F(yb)) @ (ya - yb)
         forward, backward = F(ya) @ (yb - ya), F(yb) @ (yb - ya)
         return {
             "alpha_f": c.alpha_f * dx - norm(f(t, xa, ua, None) - f(t, xb, ua, None)),
@@ -67,7 +66,7 @@ def _hold(made, c):
             "alpha_h": c.alpha_h * dx - norm(h(t, xa, ua, None) - h(t, xb, ua, None)),
             "beta_h": c.beta_h * du - norm(h(t, xa, ua, None) - h(t, xa, ub, None)),
             "L_F": c.L_F * dy - norm(F(ya) - F(yb)),
-            "gamma": jnp.where(forward >= 0, backward - c.gamma * dy**2, 0.0) + 0.0 * push,
+            "gamma": jnp.where(forward >= 0, backward - c.gamma * dy**2, 0.0),
         }
 
     for name, room in jax.vmap(pair)(ts, points).items():

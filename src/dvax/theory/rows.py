@@ -12,7 +12,7 @@ from .assumption import Assumption
 from .certificate import is_declared
 from .enclosure import Enclosure
 from .known import Knowledge
-from .motion import Motion, finite_and_steady, jumps, slopes, times
+from .motion import Motion, bounded_in_time, jumps, slopes, times
 from .region import Region
 from .slope import TooLarge, interval, is_slope
 from .status import Status, weakest
@@ -71,7 +71,7 @@ def _sets(K: Motion) -> Assumption:
         return Assumption(label, statement, "refuted", why, evidence=K.empty_at)
     if K.standing:
         return Assumption(label, statement, "proved", "from the data of the set at every t")
-    return Assumption(label, statement, "estimated", f"looked at {_SAMPLES} times only")
+    return Assumption(label, statement, "estimated", "looked at some times only")
 
 
 def _integrable(
@@ -89,7 +89,7 @@ def _integrable(
         if not bool(_tree.all_finite(value)):
             why = f"f(t, 0, 0) = {_tree.short(value)} at t = {t:.17g}"
             return Assumption(label, statement, "refuted", why, evidence=float(t))
-    bounded, _ = finite_and_steady(at_zero, *span, knots)
+    bounded = bounded_in_time(at_zero, *span, knots)
     blocks = system.at(everywhere)[:4]
     smooth = all(b is not None and np.isfinite(b.radius).all() for b in blocks)
     names = ("alpha_f", "beta_f", "alpha_h", "beta_h")
