@@ -100,6 +100,31 @@ def test_a_declared_spectrum_proves_nothing():
     assert float(found.gamma) == pytest.approx(0.45, rel=1e-6)
 
 
+def test_a_weighted_law_over_a_declared_spectrum_is_declared():
+    h = lambda t, x, u, a: u - (2.0 + jnp.sin(x[0])) * (u - 0.1 * jnp.tanh(u))  # noqa: E731
+    for declared, P in enumerate(
+        (dvax.operators.Scaling(2.0), dvax.operators.MatrixFree(lambda v: 2.0 * v, m=2.0, norm=2.0))
+    ):
+        check = dvax.verify(problem(P=P, K=dvax.sets.Box(-1.0, 1.0), h=h), jnp.zeros(3))
+        row = check["ass:strong_pseudomono"]
+        assert row.status == ("declared" if declared else "proved")
+        assert "F = aG" in row.why
+
+
+def test_constants_of_one_parameter_prove_nothing_for_another():
+    f = lambda t, x, u, a: a["k"] * x - u  # noqa: E731
+    system = problem(f=f, K=dvax.sets.Box(-1.0, 1.0))
+    one, other = {"k": jnp.asarray(1.0)}, {"k": jnp.asarray(3.0)}
+    c = dvax.verify(system, 0.0, args=one).constants
+    for args, status in ((one, "proved"), ({"k": 1.0}, "proved"), (other, "declared")):
+        sol = dvax.solve(system, 0.1, 0.0, 1.0, args)
+        assert dvax.bound_error(system, sol, c).status == status
+    with pytest.raises(dvax.InputError, match="another args"):
+        dvax.solve(system, 0.1, 0.0, 1.0, other, constants=c, certified_tol=1e-3)
+    with pytest.raises(dvax.InputError, match="verified on"):
+        dvax.solve(system, 0.1, 0.0, 2.0, one, constants=c, certified_tol=1e-3)
+
+
 def test_an_empty_set_that_stands_still_is_not_proved_to_stand():
     balls = dvax.sets.Intersection(
         dvax.sets.Ball(0.0, 1.0), dvax.sets.Ball(jnp.array([5.0, 0.0]), 1.0)

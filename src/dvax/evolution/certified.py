@@ -50,6 +50,7 @@ def certified(
     **Raises:** `dvax.InputError` where rounding alone leaves a bound above `tol`.
     """
     _check(constants, tol, x0)
+    _check_domain(constants, args, t0, t1)
     space = problem.spaces(x0)[0]
     size, span = float(np.sqrt(float(space.size()))), t1 - t0
     grown = _grown(constants, span)
@@ -134,6 +135,32 @@ def _outside(t: float) -> InputError:
             "Verify the problem in a larger region: dvax.verify(problem, x0, x=(low, high))",
         )
     )
+
+
+def _check_domain(constants: Any, args: Any, t0: float, t1: float) -> None:
+    """A run is certified only by constants that hold for it."""
+    domain = getattr(constants, "domain", None)
+    wrong: list[InputProblem] = []
+    if domain is not None and not domain.covers(t0, t1):
+        wrong.append(
+            InputProblem(
+                "dvax.solve(constants)",
+                f"constants verified on [{domain.t0:.17g}, {domain.t1:.17g}]",
+                f"the run goes from {t0:.17g} to {t1:.17g}, and nobody proved them for other times",
+                f"Verify for these: dvax.verify(problem, x0, {t0:g}, {t1:g}, args)",
+            )
+        )
+    if domain is not None and not domain.is_of(args):
+        wrong.append(
+            InputProblem(
+                "dvax.solve(constants)",
+                "constants of another args",
+                "f and h may be steeper at these parameters than at those",
+                "Verify for these: dvax.verify(problem, x0, t0, t1, args)",
+            )
+        )
+    if wrong:
+        raise InputError(*wrong)
 
 
 def _with_bound(solution: Solution, bound: float) -> Solution:

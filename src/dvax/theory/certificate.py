@@ -70,8 +70,8 @@ def bound_error(
 
     Constants that `dvax.verify` found for a region of x are good while the trajectory stays in it:
     where a saved state, with its bound, is not inside, the bounds are infinite from there on. Between
-    saved times nobody looks, and for other times than those verified nobody proved them: then the
-    status is "declared".
+    saved times nobody looks, and for other times or `args` than those verified nobody proved them:
+    then the status is "declared".
 
     **Raises:** `dvax.InputError` where `sol` is not a solution of `problem`, or `initial_error` is
     not a number ≥ 0.
@@ -108,7 +108,7 @@ def bound_error(
     where: Status = "proved"
     inside = jnp.ones(sol.ts.shape, bool)
     if domain is not None:
-        covered = domain.covers(begin, sol.setup.setting["t1"])
+        covered = domain.covers(begin, sol.setup.setting["t1"]) and domain.is_of(sol.setup.args)
         where = "proved" if covered and domain.free else "declared"
         if not domain.free:
             spaces = problem.spaces(sol.setup.x0)

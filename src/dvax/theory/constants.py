@@ -44,7 +44,7 @@ class Constants(eqx.Module):
     - `energy` (M, μ), optional: ‖x₁−x₂‖ ≤ M e^{μt}‖Δx₀‖ by contraction in another norm, of condition
       M² (`dvax.verify(energy=True)` finds one);
     - `status`: "proved" or "declared" for all of them, or a mapping from name to status;
-    - `domain`: the times and states for which they hold, from `dvax.verify`; None for all.
+    - `domain`: the `args`, times and states for which they hold, from `dvax.verify`; None for all.
 
     **Raises:** `dvax.InputError` where γ, L_F, m_P or ‖P⁻¹‖ is not positive, a Lipschitz modulus is
     negative, M < 1, or γ > L_F.

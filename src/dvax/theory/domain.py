@@ -1,7 +1,8 @@
-"""Where constants hold: times and states."""
+"""Where constants hold: at what parameter, for what times and states."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -12,14 +13,27 @@ from .._tree import Tree
 from ..spaces import AbstractSpace
 
 
-class Domain(NamedTuple):
-    """t0 ≤ t ≤ t1, and x and u between bounds (low, high), entry by entry: None where x may be
-    anything, and u anything within P⁻¹K(t)."""
+class Domain(eqx.Module):
+    """t0 ≤ t ≤ t1, one `args`, and x and u between bounds (low, high), entry by entry: None where x
+    may be anything, and u anything within P⁻¹K(t)."""
 
     t0: float
     t1: float
     x: tuple[Tree, Tree] | None
     u: tuple[Tree, Tree] | None
+    values: tuple[Any, ...]
+    frame: tuple[Any, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        t0: float,
+        t1: float,
+        x: tuple[Tree, Tree] | None,
+        u: tuple[Tree, Tree] | None,
+        args: Any,
+    ):
+        self.t0, self.t1, self.x, self.u = t0, t1, x, u
+        self.values, self.frame = _taken_apart(args)
 
     @property
     def free(self) -> bool:
@@ -31,6 +45,13 @@ class Domain(NamedTuple):
             return False
         room = 1e-12 * max(abs(self.t0), abs(self.t1))
         return self.t0 - room <= float(t0) and float(t1) <= self.t1 + room
+
+    def is_of(self, args: Any) -> bool:
+        """Whether these are the `args` of the constants (traced ones are nobody's to see)."""
+        values, frame = _taken_apart(args)
+        if frame != self.frame or not _tree.is_concrete(values, self.values):
+            return False
+        return all(np.array_equal(a, b) for a, b in zip(values, self.values, strict=True))
 
     def keeps(
         self,
@@ -47,6 +68,14 @@ class Domain(NamedTuple):
             if ends is not None:
                 held = held & _inside(values, bound, ends, space)
         return jnp.cumsum(~held) == 0
+
+
+def _taken_apart(args: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """The numbers in args, and all the rest of it."""
+    leaves, structure = jtu.tree_flatten(args)
+    numbers = tuple(leaf for leaf in leaves if eqx.is_array_like(leaf))
+    others = tuple(None if eqx.is_array_like(leaf) else leaf for leaf in leaves)
+    return numbers, (structure, others)
 
 
 def _inside(

@@ -166,7 +166,7 @@ def constants_of(
     return Constants(
         **values, M=system.growth.M, omega=system.growth.omega, m_P=system.spectrum.m_P,
         norm_P_inv=system.spectrum.norm_P_inv, one_sided=mu, status=statuses,
-        domain=_domain(region, asked), energy=contraction,
+        domain=_domain(region, asked, system.args), energy=contraction,
     )  # fmt: skip
 
 
@@ -176,14 +176,14 @@ def _energy(system: System, region: Region) -> tuple[float, float] | None:
     return None if found is None else (found.M, found.rate)
 
 
-def _domain(region: Region, asked: tuple[bool, bool]) -> Domain:
+def _domain(region: Region, asked: tuple[bool, bool], args: Any) -> Domain:
     """Where the constants hold: the bounds of x and u as far as they were asked for."""
     end = lambda tree, i: jtu.tree_map(lambda v: v[i], tree, is_leaf=is_slope)  # noqa: E731
     x, u = (
         (end(tree, 0), end(tree, 1)) if given else None
         for tree, given in zip((region.x, region.u), asked)
     )
-    return Domain(float(region.t.low), float(region.t.high), x, u)
+    return Domain(float(region.t.low), float(region.t.high), x, u, args)
 
 
 def _sharp(system: System, region: Region, known: Knowledge) -> float | None:
