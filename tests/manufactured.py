@@ -27,6 +27,7 @@ class Manufactured(NamedTuple):
     problem: dvax.Problem
     x0: Any
     error: Any
+    exact: Any
 
 
 def _wave(n: int) -> np.ndarray:
@@ -126,7 +127,7 @@ def manufactured(generator: str, operator: str, kind: str) -> Manufactured:
         off_u = jax.vmap(lambda t, u: jnp.max(jnp.abs(u - law(t)[0])))(sol.ts, sol.us)
         return float(jnp.max(off_x)), float(jnp.max(off_u))
 
-    return Manufactured(problem, chosen(0.0), error)
+    return Manufactured(problem, chosen(0.0), error, chosen)
 
 
 def _space(x: Any) -> Any:

@@ -39,6 +39,7 @@ FUNCTIONS = {
     "field": lambda t: PROFILE * jnp.exp(PROFILE * 0.3 * t) + jnp.minimum(t, PROFILE),
     "matrix": lambda t: jnp.array([[1.0, -2.0], [0.5, 3.0]]) @ jnp.stack([jnp.sin(t), t * t]),
     "sum": lambda t: jnp.sum(PROFILE * t * t),
+    "taken apart": lambda t: jnp.split(jnp.sin(PROFILE * t), [1])[1],
 }
 
 

@@ -43,6 +43,10 @@ FUNCTIONS = {
     ),
     "two vectors": (lambda v: jnp.outer(v, jnp.sin(v)) @ v, (-2.0, 2.0)),
     "picked": (lambda v: v[jnp.array([2, 0, 0])] + jnp.eye(3)[1] * v, (-2.0, 2.0)),
+    "taken apart": (
+        lambda v: jnp.concatenate([p * v[0] for p in jnp.split(jnp.sin(v), [1])]),
+        (-2.0, 2.0),
+    ),
     "called": (lambda v: jax.jit(lambda w: w * jnp.tanh(w))(v), (-2.0, 2.0)),
 }
 

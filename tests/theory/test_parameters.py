@@ -152,7 +152,7 @@ def test_the_bounds_of_a_box_of_parameters_hold_for_pairs_of_trajectories():
         )
     )
     rng = np.random.default_rng(3)
-    n = 500
+    n = 1000
     etas = np.asarray(low) + rng.random((2, n, 4)) * np.asarray(high - low)
     near = rng.random(n) < 0.5
     etas[1] = np.where(near[:, None], etas[0] + 1e-2 * (etas[1] - etas[0]), etas[1])

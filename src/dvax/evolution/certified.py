@@ -8,6 +8,7 @@ a run in coarser steps is cheap and tells most of it, and the next one is made w
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -51,16 +52,13 @@ def certified(
     """
     _check(constants, tol, x0)
     _check_domain(constants, args, t0, t1)
-    space = problem.spaces(x0)[0]
-    size, span = float(np.sqrt(float(space.size()))), t1 - t0
-    grown = _grown(constants, span)
-    # How large rates are, roughly: the response is left out, since to solve for it takes a compilation.
-    rate = problem.f(jnp.asarray(t0), x0, problem.zero_control(x0), args)
-    largest = max(float(space.norm(rate)), float(space.norm(x0)))
+    known, span = _growth(constants), t1 - t0
+    grown = known.grown(span)
+    size, largest = (float(v) for v in _sizes(problem, jnp.asarray(t0), x0, args))
     eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(x0))).eps)
     reachable = _ROUNDINGS * eps * largest * grown
     if not tol >= reachable:
-        raise _hopeless(tol, reachable, constants, span)
+        raise _hopeless(tol, reachable, known, span)
     # The step control holds the root mean square of the defect below atol/span.
     atol = tol / grown * span / size
     atol *= _COARSE if _COARSE * atol < 0.1 * (1.0 + largest / size) else 1.0
@@ -69,36 +67,60 @@ def certified(
         solution = run(atol)
         if solution.result != RESULTS.successful:
             return solution  # throw=False: the result says what failed, and nothing is certified
-        bounds = _bounds(solution, constants, t0)
-        bound = float(jnp.max(bounds))
+        bounds = _bounds(solution, known, t0)
+        bound = float(np.max(np.asarray(bounds)))
         if bound <= tol:
             left = _leaves(solution, constants, bounds)
             if left is not None:
                 raise _outside(left)
             return _with_bound(solution, bound)
         atol = min(0.5 * atol, _AIM * atol * tol / bound) if np.isfinite(bound) else 0.1 * atol
-    raise _hopeless(tol, bound, constants, span)
+    raise _hopeless(tol, bound, known, span)
 
 
-def _bounds(solution: Solution, constants: Any, t0: float) -> Any:
+class _Growth(NamedTuple):
+    """What a disturbance grows by, as numbers: properties of `Constants` cost a run of C1 to read."""
+
+    rates: list[tuple[float, float]]
+    beta_f: float
+    norm_P_inv: float
+    gamma: float
+
+    def grown(self, span: float) -> float:
+        """M Φ_c(T): what a defect of 1 may grow to."""
+        return min(M * _convolved(rate, span) for M, rate in self.rates)
+
+
+def _growth(constants: Any) -> _Growth:
+    """(M, c) of the paper, (1, μ) one-sided, and that of an energy norm, as far as they are known."""
+    one_sided, energy = (getattr(constants, name, None) for name in ("one_sided", "energy"))
+    rates = [(float(constants.M), float(constants.growth_rate))]
+    rates += [] if one_sided is None else [(1.0, float(one_sided))]
+    rates += [] if energy is None else [(float(energy[0]), float(energy[1]))]
+    return _Growth(rates, *(float(getattr(constants, name)) for name in _Growth._fields[1:]))
+
+
+@eqx.filter_jit
+def _sizes(problem: Problem, t0: jax.Array, x0: Tree, args: Any) -> tuple[jax.Array, jax.Array]:
+    """‖1‖, and how large states and rates are, roughly: the response is left out, since to solve for
+    it takes much longer to compile."""
+    space = problem.spaces(x0)[0]
+    rate = problem.f(t0, x0, problem.zero_control(x0), args)
+    return jnp.sqrt(space.size()), jnp.maximum(space.norm(rate), space.norm(x0))
+
+
+def _bounds(solution: Solution, known: _Growth, t0: float) -> Any:
     """The bound at every saved time."""
     assert solution.defect is not None and solution.settled is not None
-    moduli = tuple(float(getattr(constants, name)) for name in ("beta_f", "norm_P_inv", "gamma"))
     impulse = (solution.defect, solution.law_defect), solution.settled
-    return _least(t0, solution.ts, impulse, moduli, _rates(constants))
+    return _least(t0, solution.ts, impulse, known)
 
 
 @jax.jit
-def _least(t0: Any, ts: Any, impulse: tuple, moduli: tuple, rates: list) -> jax.Array:
-    acted, settled = (disturbance(_Moduli(*moduli), *parts) for parts in impulse)
-    each = [gronwall(t0, ts, acted, settled, rate, M, 0.0) for M, rate in rates]
+def _least(t0: Any, ts: Any, impulse: tuple, known: _Growth) -> jax.Array:
+    acted, settled = (disturbance(known, *parts) for parts in impulse)
+    each = [gronwall(t0, ts, acted, settled, rate, M, 0.0) for M, rate in known.rates]
     return jnp.min(jnp.stack(each), axis=0)
-
-
-class _Moduli(NamedTuple):
-    beta_f: Any
-    norm_P_inv: Any
-    gamma: Any
 
 
 def _leaves(solution: Solution, constants: Any, bounds: Any) -> float | None:
@@ -111,19 +133,6 @@ def _leaves(solution: Solution, constants: Any, bounds: Any) -> float | None:
     spaces = solution.setup.problem.spaces(solution.setup.x0)
     inside = np.asarray(domain.keeps(solution.xs, solution.us, bounds, of_u, spaces))
     return None if inside.all() else float(solution.ts[int(np.argmin(inside))])
-
-
-def _rates(constants: Any) -> list[tuple[float, float]]:
-    """(M, c) of the paper, (1, μ) one-sided, and that of an energy norm, as far as they are known."""
-    one_sided, energy = (getattr(constants, name, None) for name in ("one_sided", "energy"))
-    rates = [(float(constants.M), float(constants.growth_rate))]
-    rates += [] if one_sided is None else [(1.0, float(one_sided))]
-    return rates + ([] if energy is None else [(float(energy[0]), float(energy[1]))])
-
-
-def _grown(constants: Any, span: float) -> float:
-    """M Φ_c(T): what a defect of 1 may grow to."""
-    return min(M * _convolved(rate, span) for M, rate in _rates(constants))
 
 
 def _outside(t: float) -> InputError:
@@ -173,8 +182,8 @@ def _convolved(a: float, T: float) -> float:
     return T if a == 0.0 else float(np.expm1(min(a * T, 700.0)) / a)
 
 
-def _hopeless(tol: float, reachable: float, constants: Any, span: float) -> InputError:
-    M, rate = min(_rates(constants), key=lambda pair: pair[0] * _convolved(pair[1], span))
+def _hopeless(tol: float, reachable: float, known: _Growth, span: float) -> InputError:
+    M, rate = min(known.rates, key=lambda pair: pair[0] * _convolved(pair[1], span))
     return InputError(
         InputProblem(
             "dvax.solve(certified_tol)",

@@ -235,6 +235,8 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
     if name == "convert_element_type" and _eps(eqn.outvars[0]) > _eps(eqn.invars[0]):
         raise NoEnclosure("rounding to a shorter type")
     x = [_lift(value) for value in given]
+    if name == "split":
+        return list(map(Chord, *(eqn.primitive.bind(part, **eqn.params) for part in x[0])))
     if name in _UNARY:
         return [_UNARY[name](x[0])]
     if name == "integer_pow":

@@ -24,7 +24,7 @@ from .._tree import Tree
 from ..vi.structure import CALLS, CUSTOM, evaluate, inner_jaxpr
 from .slope import Part, Slope, interval, is_slope, nothing
 from .slope_entrywise import ENTRYWISE
-from .slope_moves import MOVING
+from .slope_moves import MOVING, split
 from .slope_tables import TABLES
 
 _RULES = {**ENTRYWISE, **MOVING}
@@ -81,6 +81,8 @@ def _interpret(traced: ClosedJaxpr, inputs: list[Any], unknown: list[str]) -> li
             inner = inner_jaxpr(eqn.params)
             if inner is not None and len(inner.jaxpr.invars) == len(given):
                 return _interpret(inner, given, unknown)
+        if name == "split":
+            return [_settled(_sane(piece)) for piece in split(eqn, given)]
         rule = _RULES.get(name)
         result = None if rule is None else rule(eqn, given)
         if result is None:

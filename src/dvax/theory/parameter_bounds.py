@@ -11,10 +11,13 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..problem import Problem
+from ..sets import Ball
 from ..spaces import AbstractSpace
 from ..vi import independent
 from .blocks import block
+from .constants import Constants
 from .enclosure import Enclosure
+from .formulas import convolved
 from .known import knowledge
 from .motion import motion, slopes, times
 from .parameters import ParameterBounds
@@ -99,7 +102,12 @@ def parameter_bounds(
         without = ParameterBounds(constants, **span_of, **sizes, modulus_f=0.0, modulus_h=0.0)
         R = without.radius(start_radius)
         near = region._replace(
-            x=_ball(region.x, system.state, R), u=_ball(region.u, system.control, R)
+            x=_ball(
+                region.x,
+                system.state,
+                min(R, _reach(system, region, constants, knots, start_radius)),
+            ),
+            u=_ball(region.u, system.control, R),
         )
         moduli = of(near)
     for name, value in {**span_of, **sizes, **moduli}.items():
@@ -110,14 +118,24 @@ def parameter_bounds(
     return ParameterBounds(constants, status=status, **span_of, **sizes, **moduli)
 
 
-def _size(system: System, name: str, region: Region, knots: np.ndarray) -> float:
-    """sup ‖f(t, 0, 0, η)‖."""
-    zero = jtu.tree_map(
-        lambda leaf: interval(np.zeros(leaf.shape), np.zeros(leaf.shape)), system.x0
-    )
-    still = jtu.tree_map(
-        lambda leaf: interval(np.zeros(leaf.shape), np.zeros(leaf.shape)), system.u0
-    )
+def _reach(
+    system: System, region: Region, c: Constants, knots: np.ndarray, start_radius: float
+) -> float:
+    """A bound on ‖x(t)‖ from u ∈ P⁻¹K(t) alone, where K is bounded: with C = sup ‖f(t, 0, u, η)‖,
+    ‖x(t)‖ ≤ M e^{at}‖ζ‖ + M C Φ_a(t), a = ω + M α_f (Gronwall). The a-priori estimate of the paper
+    bounds u by x, and grows with L."""
+    C = _size(system, "f", region, knots, region.u)
+    M, a, T = float(c.M), float(c.omega + c.M * c.alpha_f), float(region.t.high - region.t.low)
+    return M * start_radius * float(np.exp(max(a, 0.0) * T)) + M * C * float(convolved(a, T))
+
+
+def _size(
+    system: System, name: str, region: Region, knots: np.ndarray, responses: Tree = None
+) -> float:
+    """sup ‖f(t, 0, 0, η)‖, or of f(t, 0, u, η)."""
+    nil = lambda leaf: interval(np.zeros(leaf.shape), np.zeros(leaf.shape))  # noqa: E731
+    zero, still = jtu.tree_map(nil, system.x0), jtu.tree_map(nil, system.u0)
+    still = still if responses is None else responses
     enclosure = Enclosure(getattr(system, name), system.likes, ())
     space, like = (system.state, system.x0) if name == "f" else (system.control, system.u0)
     worst = 0.0
@@ -144,14 +162,21 @@ def _by_parameter(system: System, name: str, region: Region, knots: np.ndarray) 
 
 def _kappa(system: System, t0: float, t1: float, knots: np.ndarray) -> float:
     """sup_t ‖proj_{K(t)} 0‖."""
+    like, space = system.u0, system.control
+    at = lambda t: system.problem.set_at(t, system.args)  # noqa: E731
+    time, pieces = (jnp.zeros(()),), times(t0, t1, knots)
+    if isinstance(at(jnp.asarray(t0)), Ball) and not isinstance(like, tuple):
+        # Its projection divides by a distance that may vanish, but how far off it is does not.
+        def off(t: Any) -> jax.Array:
+            ball = at(t)
+            assert isinstance(ball, Ball)
+            center = jnp.broadcast_to(ball.center, like.shape)
+            return jnp.maximum(space.norm(center) - ball.radius, 0.0)
 
-    def nearest(t: Any) -> Tree:
-        return system.problem.set_at(t, system.args).project(system.u0, system.control)
-
-    enclosure = Enclosure(nearest, (jnp.zeros(()),), ())
-    return max(
-        _norm(enclosure(piece).out, system.control, system.u0) for piece in times(t0, t1, knots)
-    )
+        enclosure = Enclosure(off, time, ())
+        return max(float(enclosure(piece).out.high) for piece in pieces)
+    enclosure = Enclosure(lambda t: at(t).project(like, space), time, ())
+    return max(_norm(enclosure(piece).out, space, like) for piece in pieces)
 
 
 def _norm(out: Tree, space: AbstractSpace, like: Tree) -> float:

@@ -80,6 +80,24 @@ def _slice(eqn: Any, v: Values, extra: int) -> Values:
     return v[(*(slice(None),) * extra, *cuts)]
 
 
+def split(eqn: Any, given: list[Any]) -> list[Slope]:
+    """The pieces along an axis, as `ravel_pytree` takes a vector apart."""
+    (x,), axis, sizes = given, eqn.params["axis"], eqn.params["sizes"]
+    if len(sizes) == 1:
+        return [x]
+    pieces, end = [], 0
+    for size in map(int, sizes):
+        piece = _moving(_cut(axis, end, end + size))(eqn, given)
+        assert piece is not None
+        pieces.append(piece)
+        end += size
+    return pieces
+
+
+def _cut(axis: int, start: int, end: int) -> Callable[[Any, Values, int], Values]:
+    return lambda eqn, v, extra: v[(*(slice(None),) * (extra + axis), slice(start, end))]
+
+
 def _rev(eqn: Any, v: Values, extra: int) -> Values:
     return np.flip(v, tuple(extra + axis for axis in eqn.params["dimensions"]))
 
