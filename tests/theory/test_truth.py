@@ -4,8 +4,6 @@ trajectories of C2 and of random affine systems beside every estimate of Section
 `pytest -m "" -s tests/theory/test_truth.py` prints the tables.
 """
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +11,6 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from tests.closed_forms import ALL, P2, c7
 from tests.manufactured import manufactured
-from tests.selection import mostly_thorough
 
 import dvax
 
@@ -44,56 +41,46 @@ def system(name):
     return case.problem, jnp.asarray(case.x0), case.args, case.t1, region, exact
 
 
-RATIOS: dict[tuple[str, str], list[tuple[float, float]]] = {}
-
-
-@pytest.mark.parametrize(
-    ("name", "method"), mostly_thorough(itertools.product(NAMES, METHODS), {("C3", "ETD4RK")})
-)
-def test_the_bound_is_above_the_truth(name, method):
+def ratios(name, method):
+    """(bound / error, with the paper's rate) at every tolerance, the largest of the run each; the
+    bounds are held against the truth at every saved time."""
     problem, x0, args, t1, region, exact = system(name)
-    constants = dvax.verify(
-        problem, x0, 0.0, t1, args, **region, energy=name == "Dense Box"
-    ).constants
+    # Of its generator alone, M e^{ωt} is hopeless: a norm in which it contracts is found.
+    energy = name == "Dense Box"
+    constants = dvax.verify(problem, x0, 0.0, t1, args, **region, energy=energy).constants
     assert constants is not None
-    space = problem.spaces(x0)[0]
+    norm = problem.spaces(x0)[0].norm
     ts = np.linspace(0.0, t1, 21)[1:]
     truth = exact(jnp.asarray(ts))
-    found = RATIOS[name, method] = []
+    found = []
     for tol in TOLERANCES[method]:
         sol = dvax.solve(
             problem, x0, 0.0, t1, args, ts, rtol=tol, atol=0.1 * tol, method=METHODS[method]
         )
         bound = dvax.bound_error(problem, sol, constants)
-        error = np.asarray(
-            jax.vmap(lambda a, b: space.norm(jax.tree_util.tree_map(jnp.subtract, a, b)))(
-                sol.xs, truth
-            )
-        )
+        error = np.asarray(jax.vmap(lambda a, b: norm(a - b))(sol.xs, truth))
         assert np.all(np.asarray(bound.x) >= error - 1e-12)
         assert np.all(np.asarray(bound.x_paper) >= error - 1e-12)
         if error.max() > ROUNDING:
-            both = (float(limit.max() / error.max()) for limit in (bound.x, bound.x_paper))
-            found.append(tuple(both))
-    print(
-        f"{name:<20}{method:<8}{bound.status:<11}"
-        + "".join(f"{r:8.1f}/{p:<8.1f}" for r, p in found)
-    )
+            found.append(tuple(float(b.max() / error.max()) for b in (bound.x, bound.x_paper)))
+    figures = "".join(f"{r:8.1f}/{p:<8.1f}" for r, p in found)
+    print(f"{name:<20}{method:<8}{bound.status:<11}{figures}")
+    return found
+
+
+def test_the_bound_is_above_the_truth():
+    assert len(ratios("C3", "ETD4RK")) == 3
 
 
 @pytest.mark.thorough
 def test_half_of_all_bounds_are_within_five_times_the_error():
-    if len(RATIOS) < len(NAMES) * len(METHODS):
-        pytest.skip(
-            "the ratios are those of the tests before this one, and not all of them ran here"
-        )
-    for method in METHODS:
-        rows = [pair for (_, m), pairs in RATIOS.items() if m == method for pair in pairs]
-        sharp, paper = np.median(np.array(rows), axis=0)
+    rows = {method: [row for name in NAMES for row in ratios(name, method)] for method in METHODS}
+    for method, found in rows.items():
+        sharp, paper = np.median(np.array(found), axis=0)
         print(f"{method}: median of bound / error {sharp:.1f}, with the paper's rate {paper:.1f}")
-    rows = np.array([pair for pairs in RATIOS.values() for pair in pairs])
-    print(f"all {len(rows)}: {np.median(rows, axis=0)}")
-    assert np.median(rows[:, 0]) <= 5.0
+    whole = np.concatenate(list(rows.values()))
+    print(f"all {len(whole)}: {np.median(whole, axis=0).round(1)}")
+    assert np.median(whole[:, 0]) <= 5.0
 
 
 def c2_of(eta):
