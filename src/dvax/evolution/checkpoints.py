@@ -1,12 +1,12 @@
 """Some of the states that steps began with, for a reverse pass that cannot keep them all."""
 
-import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 
 from .. import _tree
 from .._tree import Tree
@@ -16,9 +16,12 @@ _BYTES = 2**30
 
 _FEWEST, _MOST = 16, 4096
 
-_CHEAP, _ENOUGH = 2**22, 128
-"""Bytes that cost nothing to keep; checkpoints that do for a run of large states, one turn of 16 384
-steps."""
+_CHEAP, _ENOUGH = 2**22, 32
+"""Bytes that cost nothing to keep; checkpoints that do for a run of large states: to touch new memory
+takes longer than to compute a step several times more."""
+
+_TURNS = 12
+"""Up to this many times more is a step computed where that saves places."""
 
 
 class Checkpoints(eqx.Module):
@@ -56,6 +59,14 @@ class Checkpoints(eqx.Module):
         place = self._place(k, self.j)
         return k << self.j, jtu.tree_map(lambda leaf: leaf[place], self.places)
 
+    def stack(self, steps: Any) -> "Stack":
+        """What is kept of a run of so many steps."""
+        numbers = jnp.arange(2**self.bits)
+        # The place of what was not kept is free as well.
+        order = jnp.append(self._place(numbers, self.j), 2**self.bits)
+        height = ((steps - 1) >> self.j) + 1
+        return Stack(self.places, order, jnp.append(numbers << self.j, 0), height)
+
     def _place(self, k: Any, j: Any) -> Any:
         if self.bits == 0:
             return jnp.zeros_like(k)
@@ -63,18 +74,53 @@ class Checkpoints(eqx.Module):
         return ((k << r) | (k >> (self.bits - r))) & (2**self.bits - 1)
 
 
-def how_many(x0: Tree, max_steps: int) -> tuple[int, int]:
-    """Of checkpoints of the whole run, and of states between two of them, for steps from x0."""
-    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jtu.tree_leaves(x0))
-    affordable = max(_FEWEST, _BYTES // (2 * max(size, 1)))
-    # Large states are not kept because there is room: to touch new memory takes longer than to compute
-    # a step of many once more, and one turn does for as many states as there are checkpoints.
-    enough = max(_CHEAP // max(size, 1), min(_ENOUGH, math.isqrt(max_steps) + 1))
-    most = _power(min(affordable, _MOST, _power(2 * enough - 1)))
-    power = min(most, _power(2 * max_steps - 1))
-    if power >= max_steps:
-        return power, 1
-    return power, min(_power(4 * max_steps // power), most)
+class Stack(NamedTuple):
+    """Some of the states that steps began with, the last of them on top: the one at height k, that of
+    the step at[k], is in the place order[k]; places further up are free."""
+
+    places: Tree
+    order: jax.Array
+    at: jax.Array
+    height: jax.Array
+
+    @property
+    def step(self) -> Any:
+        """The step that begins with the state on top."""
+        return self.at[self.height - 1]
+
+    @property
+    def x(self) -> Tree:
+        place = self.order[self.height - 1]
+        return jtu.tree_map(lambda leaf: leaf[place], self.places)
+
+    def push(self, step: Any, x: Tree) -> "Stack":
+        places = _tree.put(self.places, self.order[self.height], x)
+        return Stack(places, self.order, self.at.at[self.height].set(step), self.height + 1)
+
+    def pop(self) -> "Stack":
+        return self._replace(height=self.height - 1)
+
+    def next(self, target: Any) -> Any:
+        """The next state to keep on the way from the top to that of step `target`.
+
+        With s free places and every step computed at most r times more, C(s + r − 1, r) states are
+        within reach (Griewank 1992); of d of them the best to keep first is number d r/(s + r),
+        nearly, with the least r that will do.
+        """
+        apart, free = target - self.step, len(self.order) - self.height
+        turns = np.arange(1, _TURNS + 1)
+        more = (free + (turns - 1)).astype(jnp.float32) / turns.astype(np.float32)
+        r = 1 + jnp.sum(jnp.cumprod(more) < apart.astype(jnp.float32))
+        ahead = -(-(apart * r) // (free + r))
+        return self.step + jnp.where(free > 1, jnp.clip(ahead, 1, apart), apart)
+
+
+def how_many(x0: Tree, max_steps: int) -> int:
+    """Of checkpoints of a run from x0."""
+    size = max(1, sum(leaf.size * leaf.dtype.itemsize for leaf in jtu.tree_leaves(x0)))
+    affordable = max(_FEWEST, _BYTES // size)
+    enough = max(_CHEAP // size, _ENOUGH)
+    return _power(min(affordable, _MOST, enough, _power(2 * max_steps - 1)))
 
 
 def _power(count: int) -> int:

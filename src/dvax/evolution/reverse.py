@@ -6,11 +6,12 @@ with respect to xᵢ,
 
     λᵢ = (∂Φᵢ/∂x)ᵀ λᵢ₊₁ + Σ (∂Ψ/∂x)ᵀ ψ̄,      p̄ = Σᵢ (∂Φᵢ/∂p)ᵀ λᵢ₊₁ + Σ (∂Ψ/∂p)ᵀ ψ̄.
 
-States are kept at checkpoints and computed again between them, so that memory is bounded whatever the
-number of steps, and every step is computed at most twice more where the checkpoints suffice for one
-turn. Only what a derivative is asked for is differentiated.
+States are kept at checkpoints and computed again between them, in the places that the way back has
+left free, so that memory is bounded whatever the number of steps. Only what a derivative is asked
+for is differentiated.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,7 +24,7 @@ from jax import lax
 from .. import _tree
 from .._one_function import in_one_function
 from .._tree import Tree
-from .checkpoints import Checkpoints, how_many
+from .checkpoints import Checkpoints, Stack, how_many
 from .loop import Loop, Saved, State, slack
 from .stepper import inside, local
 
@@ -47,7 +48,7 @@ def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State
         x0, loop, ts = whole(leaves)
 
         def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State]:
-            return loop.run(x0, ts, Checkpoints(x0, how_many(x0, loop.max_steps)[0]))
+            return loop.run(x0, ts, Checkpoints(x0, how_many(x0, loop.max_steps)))
 
         saved, state = in_one_function(run, loop, x0, ts)
         assert state.checkpoints is not None
@@ -128,9 +129,8 @@ class _Backward:
             jnp.asarray(row),
             self.guess,
         )
-        between = how_many(self.x0, self.loop.max_steps)[1]
-        every = between == 1
-        carry = self._through_all(bar, carry) if every else self._by_segments(bar, carry, between)
+        every = how_many(self.x0, self.loop.max_steps) >= self.loop.max_steps
+        carry = self._through_all(bar, carry) if every else self._from_checkpoints(bar, carry)
         adjoint, gathered, row, _ = carry
         gathered = iter(gathered)
         out = [
@@ -141,7 +141,7 @@ class _Backward:
         return tuple(self._add_initial(out, adjoint))
 
     def _through_all(self, bar: _States, carry: Any) -> Any:
-        """Where every state was kept."""
+        """Where every state was kept. (A loop inside would make a small step many times as long.)"""
 
         def one(carry: Any) -> Any:
             i, inner = carry
@@ -149,27 +149,21 @@ class _Backward:
 
         return lax.while_loop(lambda c: c[0] >= 0, one, (self.steps - 1, carry))[1]
 
-    def _by_segments(self, bar: _States, carry: Any, between: int) -> Any:
-        """From one checkpoint back to the one before, with `between` states on a shelf."""
-        blank = jtu.tree_map(lambda v: jnp.zeros((between, *v.shape), v.dtype), self.x0)
+    def _from_checkpoints(self, bar: _States, carry: Any) -> Any:
+        """Where states are computed again."""
 
-        def segment(carry: Any) -> Any:
-            end, shelf, inner = carry
-            first, x = self.checkpoints.before(end - 1)
-            apart = (end - first - 1) // between + 1
-            shelf = self._refill(shelf, first, x, end, apart)
+        def one(carry: Any) -> Any:
+            i, stack, inner = carry
+            stack = lax.while_loop(lambda s: s.step < i, partial(self._climb, i), stack)
+            return i - 1, stack.pop(), self._step_back(i, stack.x, bar, *inner)
 
-            def one(carry: Any) -> Any:
-                i, inner = carry
-                place = (i - first) // apart
-                x = jtu.tree_map(lambda leaf: leaf[place], shelf)
-                x = self._replay(x, first + place * apart, i)
-                return i - 1, self._step_back(i, x, bar, *inner)
+        start = self.steps - 1, self.checkpoints.stack(self.steps), carry
+        return lax.while_loop(lambda c: c[0] >= 0, one, start)[2]
 
-            _, inner = lax.while_loop(lambda c: c[0] >= first, one, (end - 1, inner))
-            return first, shelf, inner
-
-        return lax.while_loop(lambda c: c[0] > 0, segment, (self.steps, blank, carry))[2]
+    def _climb(self, i: Any, stack: Stack) -> Stack:
+        """One more state kept, towards the one that step i begins with."""
+        ahead = stack.next(i)
+        return stack.push(ahead, self._replay(stack.x, stack.step, ahead))
 
     def _rest(self, adjoint: Tree, row: Any, bar: _States) -> Tree:
         """Saved times at which no step had been taken show x₀ itself."""
@@ -215,19 +209,6 @@ class _Backward:
             return i + 1, x, guess
 
         return lax.while_loop(lambda c: c[0] < until, one, (i, x, self.guess))[1]
-
-    def _refill(self, shelf: Tree, first: Any, x: Tree, end: Any, apart: Any) -> Tree:
-        """Every `apart`-th state from `first` on, of those before `end`."""
-
-        def one(carry: Any) -> Any:
-            place, x, shelf = carry
-            shelf = _tree.put(shelf, place, x)
-            i = first + place * apart
-            return place + 1, self._replay(x, i, jnp.minimum(i + apart, end - 1)), shelf
-
-        return lax.while_loop(
-            lambda c: first + c[0] * apart < end, one, (jnp.asarray(0), x, shelf)
-        )[2]
 
     def _step_back(
         self, i: Any, x: Tree, bar: _States, adjoint: Tree, gathered: Any, row: Any, guess: Any
