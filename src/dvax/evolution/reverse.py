@@ -78,6 +78,11 @@ class _States(NamedTuple):
     saved: Tree | None
     records: tuple[Tree, tuple[Tree, ...]] | None
 
+    @property
+    def of_insides(self) -> bool:
+        """Whether anything within steps has one, not their ends alone."""
+        return self.saved is not None or self.records is not None
+
 
 def _states(saved: Saved | None, state: State) -> tuple[_States, Any]:
     """The run's answer taken apart into what has a derivative and what has none."""
@@ -215,9 +220,12 @@ class _Backward:
     ) -> tuple[Any, ...]:
         """λᵢ from λᵢ₊₁, with what this step adds to the rest."""
         moving = tuple(leaf for leaf, m in zip(self.leaves, self.moving, strict=True) if m)
-        (_, c), pull, guess = jax.vjp(
-            lambda p, x: self._advance(self._parts(p), i, x, guess), moving, x, has_aux=True
-        )
+
+        def step(p: Any, x: Tree) -> tuple[Any, Any]:
+            (x1, c), after = self._advance(self._parts(p), i, x, guess)
+            return ((x1, c) if bar.of_insides else (x1,)), (c, after)
+
+        _, pull, (c, guess) = jax.vjp(step, moving, x, has_aux=True)
         bent = _tree.zeros_like(c)
         behind = _tree.zeros_like(x)
         if bar.records is not None:
@@ -226,7 +234,7 @@ class _Backward:
             adjoint, behind, bent, gathered, row = self._saved_back(
                 i, x, c, moving, bar.saved, (adjoint, behind, bent, gathered, row)
             )
-        p, x = pull((adjoint, bent))
+        p, x = pull((adjoint, bent) if bar.of_insides else (adjoint,))
         return _tree.add(behind, x), jtu.tree_map(jnp.add, gathered, p), row, guess
 
     def _saved_back(self, i: Any, x: Tree, c: Any, moving: Any, saved: Tree, carry: Any) -> Any:
