@@ -43,6 +43,7 @@ NEIGHBOURS = {
     ("operators", "spaces"): "self-adjoint and coercive are meant in a space's inner product",
     ("sets", "spaces"): "a projection is nearest in a space's norm",
     ("runs", "models"): "a run is a model that a file describes",
+    ("sensitivity", "theory"): "what a derivative predicts is shown beside what is certified",
 }
 
 CORE = {"jax", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping", "numpy", "scipy"}

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from . import generators as generators
     from . import models as models
     from . import operators as operators
+    from . import sensitivity as sensitivity
     from . import sets as sets
     from . import signals as signals
     from . import spaces as spaces
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from .evolution import Solution as Solution
     from .evolution import solve as solve
     from .problem import Problem as Problem
+    from .sensitivity import Directional as Directional
+    from .sensitivity import directional_derivative as directional_derivative
     from .theory import Bound as Bound
     from .theory import Constants as Constants
     from .theory import ParameterBounds as ParameterBounds
@@ -42,7 +45,16 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_MODULES = ("generators", "models", "operators", "sets", "signals", "spaces", "vi")
+_MODULES = (
+    "generators",
+    "models",
+    "operators",
+    "sensitivity",
+    "sets",
+    "signals",
+    "spaces",
+    "vi",
+)
 _HOMES = {
     "errors": ("DifferentiationError", "DvaxError", "InputError", "SolveError"),
     "evolution": (
@@ -58,6 +70,7 @@ _HOMES = {
         "solve",
     ),
     "problem": ("Problem",),
+    "sensitivity": ("Directional", "directional_derivative"),
     "theory": (
         "Bound",
         "Constants",

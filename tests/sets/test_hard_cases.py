@@ -255,3 +255,15 @@ def test_many_simplices_of_unequal_size_are_as_each_alone():
         levels = (np.cumsum(v[order]) - total) / np.cumsum(1 / own[order])
         count = np.max(np.flatnonzero(own[order] * v[order] > levels), initial=0)
         np.testing.assert_allclose(p, np.maximum(v - levels[count] / own, 0.0), atol=1e-13)
+
+
+def test_what_is_nearest_to_the_apex_of_a_cone_is_found_at_any_distance():
+    """Points of the polar cone: the apex, with every row held, though nothing gives a length there."""
+    rng = np.random.default_rng(8)
+    for n in (2, 3, 5):
+        rows = rng.normal(size=(n, n))
+        K = dvax.sets.Polyhedron(jnp.asarray(rows), jnp.zeros(n))
+        space = dvax.spaces.Euclidean(n)
+        shares = rng.uniform(0.1, 1.0, (40, n)) * 10.0 ** rng.uniform(-14, 6, (40, 1))
+        found = np.asarray(jax.jit(jax.vmap(lambda z, K=K, s=space: K.project(z, s)))(shares @ rows))
+        assert np.all(np.abs(found) <= 1e-14 * np.linalg.norm(shares @ rows, axis=1)[:, None])

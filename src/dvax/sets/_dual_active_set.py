@@ -58,8 +58,11 @@ def nearest(rows: jax.Array, bounds: jax.Array, z: jax.Array, size: jax.Array) -
     def slack(x: jax.Array) -> jax.Array:
         return jnp.where(finite, rows @ x - jnp.where(finite, bounds, 0.0), -jnp.inf)
 
+    # At the apex of a cone x is 0, and what is left of z in it is rounding of rounding.
+    residue = eps ** (1.0 + SLACK) * jnp.linalg.norm(z)
+
     def tolerance(x: jax.Array) -> jax.Array:
-        return eps**SLACK * (size + jnp.linalg.norm(x))
+        return eps**SLACK * (size + jnp.linalg.norm(x)) + residue
 
     def violations(x: jax.Array, held: jax.Array) -> jax.Array:
         above = slack(x)

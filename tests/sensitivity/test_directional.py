@@ -1,0 +1,172 @@
+"""Directional derivatives at kinks against closed forms and one-sided differences, which share no code
+with the variational system; away from kinks against `jax.jvp`."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.closed_forms import c1, c1_derivatives
+from tests.selection import mostly_thorough
+
+import dvax
+
+ZERO, ONE = dvax.generators.Zero(), dvax.operators.Scaling(1.0)
+M = jnp.array([[1.0, 0.8], [-0.6, 0.7]])
+"""Couples two entries, and is not symmetric."""
+
+
+def quotient(problem, x0, t1, args, dx0, dargs):
+    """lim (x(ζ + εδζ, η + εδη) − x)/ε by extrapolation to ε = 0, to about 1e-6."""
+
+    def end(eps):
+        moved = jax.tree_util.tree_map(lambda a, d: a + eps * d, (x0, args), (dx0, dargs))
+        sol = dvax.solve(problem, moved[0], 0.0, t1, moved[1], dt=1e-3, method=dvax.ETD4RK())
+        return np.asarray(sol.xs[-1])
+
+    # Not from ε = 0 itself: on the kink the steps of a method lose their order.
+    return (-5 * end(1e-4) + 8 * end(2e-4) - 3 * end(3e-4)) / 2e-4
+
+
+def corner():
+    """At rest with both entries on their bounds, held by no force; nothing is linear."""
+    return dvax.Problem(
+        A=dvax.generators.Scalar(-0.3), P=dvax.operators.Dense(jnp.array([[1.2, 0.3], [0.3, 0.9]])),
+        K=lambda t, args: dvax.sets.Box(0.0 * args["low"], 4.0),
+        f=lambda t, x, u, args: M @ u - x + 0.2 * x**2,
+        h=lambda t, x, u, args: M @ x + jnp.sin(x) - 0.4 * u + 0.1 * u**2,
+    )  # fmt: skip
+
+
+def disc():
+    """Turns on the unit circle, to which z belongs all the time."""
+    spin = jnp.array([[0.0, 2.0], [-2.0, 0.0]])
+    return dvax.Problem(
+        A=ZERO, P=ONE, K=dvax.sets.Ball(0.0, 1.0), f=lambda t, x, u, args: spin @ x + (x - u),
+        h=lambda t, x, u, args: x,
+    )  # fmt: skip
+
+
+def rise():
+    """Waits at the upper bound η of u, held by no force."""
+    return dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=ONE, K=lambda t, args: dvax.sets.Box(-5.0, args["top"]),
+        f=lambda t, x, u, args: args["top"] * 0.0 + 1.5 - 0.5 * u, h=lambda t, x, u, args: x,
+    )  # fmt: skip
+
+
+def wedge():
+    """The corner of a wedge of two rows that are not at right angles."""
+    rows = jnp.array([[1.0, 0.4], [-0.3, 1.0]])
+    return dvax.Problem(
+        A=ZERO, P=ONE, K=dvax.sets.Polyhedron(rows, jnp.zeros(2)),
+        f=lambda t, x, u, args: -x + 0.6 * u + 0.1 * x * u, h=lambda t, x, u, args: M @ x - 0.2 * u,
+    )  # fmt: skip
+
+
+LOW = {"low": jnp.zeros(2)}
+CASES = {
+    "corner, up": (corner, jnp.zeros(2), LOW, jnp.array([1.0, 0.5]), None),
+    "corner, across": (corner, jnp.zeros(2), LOW, jnp.array([-1.0, 0.8]), None),
+    "corner, down": (corner, jnp.zeros(2), LOW, jnp.array([-0.4, -1.0]), None),
+    "disc, out": (disc, jnp.array([1.0, 0.0]), None, jnp.array([1.0, 0.4]), None),
+    "disc, in": (disc, jnp.array([1.0, 0.0]), None, jnp.array([-1.0, 0.4]), None),
+    "wedge": (wedge, jnp.zeros(2), None, jnp.array([1.0, 0.3]), None),
+    "wedge, other side": (wedge, jnp.zeros(2), None, jnp.array([-0.5, 1.0]), None),
+    "bound, up": (rise, jnp.array(1.0), {"top": jnp.array(1.0)}, jnp.array(0.0),
+                  {"top": jnp.array(1.0)}),
+    "bound, down": (rise, jnp.array(1.0), {"top": jnp.array(1.0)}, jnp.array(0.2),
+                    {"top": jnp.array(-1.0)}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", mostly_thorough(CASES, {"corner, across"}))
+def test_on_a_kink_the_derivative_is_the_limit_of_one_sided_differences(name):
+    make, x0, args, dx0, dargs = CASES[name]
+    problem = make()
+    found = dvax.directional_derivative(problem, x0, 0.0, 1.0, args, dx0=dx0, dargs=dargs)
+    assert any(kink.kind == "stays" for kink in found.kinks)
+    zero = jax.tree_util.tree_map(jnp.zeros_like, args)
+    exact = quotient(problem, x0, 1.0, args, dx0, zero if dargs is None else dargs)
+    np.testing.assert_allclose(np.asarray(found.dxs[-1]), exact, atol=1e-4, rtol=1e-4)
+    # Not linear in the direction, or it would have been no kink.
+    minus = jax.tree_util.tree_map(jnp.negative, (dx0, dargs))
+    back = dvax.directional_derivative(problem, x0, 0.0, 1.0, args, dx0=minus[0], dargs=minus[1])
+    assert np.max(np.abs(np.asarray(found.dxs[-1] + back.dxs[-1]))) > 1e-3
+
+
+def test_at_rest_on_a_kink_both_sides_have_their_own_exponential():
+    rest = dvax.Problem(
+        A=ZERO, P=ONE, K=dvax.sets.Box(0.0, 9.0), f=lambda t, x, u, args: u - 2.0 * x,
+        h=lambda t, x, u, args: x,
+    )  # fmt: skip
+    ts = np.array([0.5, 1.0])
+    for size, rate in ((3.0, 1.0), (-2.0, 2.0)):
+        found = dvax.directional_derivative(rest, 0.0, 0.0, 1.0, dx0=size, ts=ts)
+        np.testing.assert_allclose(np.asarray(found.dxs), size * np.exp(-rate * ts), rtol=1e-6)
+        np.testing.assert_allclose(
+            np.asarray(found.dus), np.maximum(size * np.exp(-rate * ts), 0.0), rtol=1e-6, atol=1e-12
+        )
+
+
+def test_where_kinks_are_crossed_it_is_the_ordinary_derivative():
+    case = c1()
+    by_start, _ = c1_derivatives()
+    found = dvax.directional_derivative(case.problem, -1.0, 0.0, 2.0, case.args, dx0=1.0)
+    assert [kink.kind for kink in found.kinks] == ["crosses", "crosses"]
+    assert float(found.dxs[-1]) == pytest.approx(by_start, rel=1e-6)
+
+
+@pytest.mark.thorough
+def test_every_kind_of_parameter_moves_as_with_jvp():
+    """A, P, K, f and h depend on η; off kinks."""
+    problem = dvax.Problem(
+        A=lambda p: dvax.generators.Dense(p["A"]), P=lambda p: dvax.operators.Diagonal(p["P"]),
+        K=lambda t, p: dvax.sets.Ball(p["c"] * jnp.sin(t), p["r"]),
+        f=lambda t, x, u, p: p["l"] - u + 0.1 * x**2, h=lambda t, x, u, p: p["b"] * x - 0.5 * u + 2.0,
+    )  # fmt: skip
+    args = {
+        "A": jnp.array([[-1.0, 1.0], [-1.0, -0.5]]), "P": jnp.array([1.0, 1.6]), "r": jnp.array(0.8),
+        "c": jnp.array([0.3, -0.2]), "l": jnp.array([1.0, 0.4]), "b": jnp.array(1.2),
+    }  # fmt: skip
+    rng = np.random.default_rng(5)
+    dargs = jax.tree_util.tree_map(lambda a: jnp.asarray(rng.normal(size=a.shape)), args)
+    x0, dx0 = jnp.array([0.5, -0.3]), jnp.array([0.2, 1.0])
+    ts = jnp.array([0.4, 1.0])
+
+    def run(x0, args):
+        sol = dvax.solve(
+            problem, x0, 0.0, 1.0, args, ts, method=dvax.ETD4RK(), rtol=1e-9, atol=1e-10,
+            adjoint="forward", max_steps=2**14,
+        )  # fmt: skip
+        return sol.xs, sol.us
+
+    dxs, dus = jax.jvp(run, (x0, args), (dx0, dargs))[1]
+    found = dvax.directional_derivative(problem, x0, 0.0, 1.0, args, dx0=dx0, dargs=dargs, ts=ts)
+    assert not found.kinks
+    np.testing.assert_allclose(np.asarray(found.dxs), np.asarray(dxs), rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(np.asarray(found.dus), np.asarray(dus), rtol=1e-6, atol=1e-7)
+
+
+def test_a_kink_crosses_touches_or_stays():
+    """z is what it is told to be: it crosses at 1, touches at 2 and stays from 3 on."""
+    z = lambda t: jnp.where(t < 1.5, 1.0 - t, jnp.where(t < 3.0, -2.0 * (t - 2.0) ** 2, 0.0))  # noqa: E731
+    smooth = lambda t: jnp.where((t > 2.5) & (t < 3.0), -2.0 * (3.0 - t) ** 2, z(t))  # noqa: E731
+    problem = dvax.Problem(
+        A=ZERO, P=ONE, K=dvax.sets.Box(0.0, 9.0), f=lambda t, x, u, args: u - x,
+        h=lambda t, x, u, args: smooth(t) + 0.0 * x,
+    )  # fmt: skip
+    sol = dvax.solve(problem, 0.0, 0.0, 4.0, dense=True, max_steps=2**14)
+    found = dvax.sensitivity.kinks(sol)
+    assert [kink.kind for kink in found] == ["crosses", "touches", "stays"]
+    assert found[0].start == pytest.approx(1.0, abs=1e-6)
+    assert found[1].start == pytest.approx(2.0, abs=1e-3)
+    assert found[2].start == pytest.approx(3.0, abs=2e-3) and found[2].end == 4.0
+
+
+def test_wrong_directions_are_refused():
+    case = c1()
+    with pytest.raises(dvax.InputError, match=r"dx0.*shape"):
+        dvax.directional_derivative(case.problem, -1.0, 0.0, 2.0, case.args, dx0=jnp.ones(2))
+    sol = dvax.solve(case.problem, -1.0, 0.0, 2.0, case.args)
+    with pytest.raises(dvax.InputError, match="dense=True"):
+        dvax.sensitivity.kinks(sol)
