@@ -166,7 +166,13 @@ def require(condition: Callable[[], Any], name: str, given: Any, rule: str, mend
 
     Values that are traced (inside `jax.jit`, `jax.grad`, ...) cannot be looked at, so they pass.
     """
-    if is_concrete(given) and not bool(condition()):
+    if not is_concrete(given):
+        return
+    with (
+        jax.ensure_compile_time_eval()
+    ):  # what has a value may be met while something else is traced
+        holds = bool(condition())
+    if not holds:
         raise InputError(InputProblem(name, short(given), rule, mend))
 
 

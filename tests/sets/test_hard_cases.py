@@ -265,5 +265,19 @@ def test_what_is_nearest_to_the_apex_of_a_cone_is_found_at_any_distance():
         K = dvax.sets.Polyhedron(jnp.asarray(rows), jnp.zeros(n))
         space = dvax.spaces.Euclidean(n)
         shares = rng.uniform(0.1, 1.0, (40, n)) * 10.0 ** rng.uniform(-14, 6, (40, 1))
-        found = np.asarray(jax.jit(jax.vmap(lambda z, K=K, s=space: K.project(z, s)))(shares @ rows))
+        found = np.asarray(
+            jax.jit(jax.vmap(lambda z, K=K, s=space: K.project(z, s)))(shares @ rows)
+        )
         assert np.all(np.abs(found) <= 1e-14 * np.linalg.norm(shares @ rows, axis=1)[:, None])
+
+
+def test_a_set_of_known_numbers_may_be_made_while_something_is_traced():
+    radius, rows = jnp.asarray(0.8), jnp.eye(2)
+    made = lambda t: (  # noqa: E731
+        sets.Ball(t * jnp.ones(2), radius).project(jnp.full(2, 3.0), PLANE)
+        + sets.Polyhedron(rows, jnp.ones(2)).project(t * jnp.ones(2), PLANE)
+    )
+    assert np.all(np.isfinite(np.asarray(jax.jit(made)(0.5))))
+    inside_out = -radius
+    with pytest.raises(dvax.InputError, match="finite radius"):
+        jax.jit(lambda t: sets.Ball(t, inside_out).project(jnp.ones(2), PLANE))(0.5)

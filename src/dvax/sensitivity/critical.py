@@ -11,6 +11,7 @@ Section 2E). K may move with η: then C is shifted by what its boundary moves.
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -49,19 +50,21 @@ def _entries(
 
 
 class Ahead(AbstractSet):
-    """What any set does just ahead of a point: project(v) is the derivative of the projection at
-    z + εv along v, for an ε so small that no kink but those within `tol` of z lies between."""
+    """What any set does just ahead of a point: project(v) is the derivative of the projection along v
+    at z or, within `tol` of a kink, at z + εv, for an ε so small that no other kink lies between."""
 
-    K: Callable[[Any], AbstractSet]
+    K: Callable[[Any], AbstractSet] = eqx.field(static=True)
     args: Any
     dargs: Any
     z: Tree
     tol: Any
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
-        size = space.norm(z)
-        # Past all that counts as the kink, so that the side is the one that v points to.
-        ahead = 10.0 * self.tol / jnp.where(size > 0, size, 1.0)
+        size, found = space.norm(z), self.K(self.args).switches(self.z, space)
+        near = [jnp.any(jnp.abs(s) <= self.tol) for s in found or ()]
+        # At a kink, past all that counts as one: then the side is the one that v points to.
+        at_kink = jnp.any(jnp.stack(near)) if near else jnp.asarray(False)
+        ahead = jnp.where(at_kink, 10.0 * self.tol / jnp.where(size > 0, size, 1.0), 0.0)
         shifted = jtu.tree_map(lambda p, v: p + ahead * v, self.z, z)
         args = jtu.tree_map(lambda p, v: p + ahead * v, self.args, self.dargs)
         at = lambda point, a: self.K(a).project(point, space)  # noqa: E731

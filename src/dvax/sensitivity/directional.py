@@ -27,6 +27,7 @@ from ..problem import Problem
 from ..signals import Table
 from .critical import critical
 from .degenerate import Kink, kinks
+from .newton import OneSided
 
 
 class Directional(NamedTuple):
@@ -133,7 +134,9 @@ def directional_derivative(
         return Directional(sol.ts, _tree.zeros_like(sol.xs), _tree.zeros_like(sol.us), sol, found)
     unit = lambda tree: jtu.tree_map(lambda v: v / scale, tree)  # noqa: E731
     base = eqx.tree_at(lambda b: b.direction, base, unit(direction), is_leaf=lambda v: v is None)
-    variation = solve(varied, unit(dx0), t0, t1, base, ts, **settings)
+    pointwise = problem.set_at(sol.setup.number("t0"), args).intervals(problem.zero_control(x0))
+    solver = OneSided() if pointwise is None else None
+    variation = solve(varied, unit(dx0), t0, t1, base, ts, vi_solver=solver, **settings)
     dus = jax.vmap(lambda t, v: _tree.add(v, _shift(base, t)))(variation.ts, variation.us)
     back = lambda tree: jtu.tree_map(lambda v: scale * v, tree)  # noqa: E731
     return Directional(variation.ts, back(variation.xs), back(dus), sol, found)
@@ -151,12 +154,8 @@ def _cone(t: Any, base: _Base) -> Any:
     base.marks(t)  # steps end where the response changes its regime
     x, _, y = base.at(t)
     w = jtu.tree_map(jnp.negative, base.problem.frozen(t, x, base.sol.setup.args)(y))
-    K = jtu.Partial(_set_at, base.problem, base.rest, t)
-    return critical(K, base.moving, base.direction, y, w, base.tol)
-
-
-def _set_at(problem: Problem, rest: Any, t: Any, moving: Any) -> Any:
-    return problem.set_at(t, eqx.combine(moving, rest))
+    at = lambda moving: base.problem.set_at(t, base.args(moving))  # noqa: E731
+    return critical(at, base.moving, base.direction, y, w, base.tol)
 
 
 def _shift(base: _Base, t: Any) -> Tree:
