@@ -25,7 +25,7 @@ from ..errors import InputError, InputProblem
 from ..evolution import ETD4RK, AbstractMethod, Solution, solve
 from ..problem import Problem
 from ..signals import Table
-from .critical import critical
+from .critical import code, critical
 from .degenerate import Kink, kinks
 from .newton import OneSided
 
@@ -52,7 +52,7 @@ class _Base(eqx.Module):
     rest: Any
     direction: Any
     tol: Any
-    marks: Table
+    codes: Any
 
     def args(self, moving: Any) -> Any:
         return eqx.combine(moving, self.rest)
@@ -122,8 +122,10 @@ def directional_derivative(
     begin, end = float(t0), float(t1)
     inner = sorted({t for kink in found for t in (kink.start, kink.end) if begin < t < end})
     times = np.array([begin, *inner, end])
-    marks = Table(times, np.zeros(len(times)), kind="constant")
-    base = _Base(problem, sol, moving, rest, direction, jnp.asarray(tol), marks)
+    base = _Base(problem, sol, moving, rest, direction, jnp.asarray(tol), None)
+    base = eqx.tree_at(
+        lambda b: b.codes, base, _codes(base, times, tol), is_leaf=lambda v: v is None
+    )
     varied = Problem(
         A=_generator, P=_operator, K=_cone, f=_rate, h=_law,
         state_space=problem.state_space, control_space=problem.control_space,
@@ -142,6 +144,18 @@ def directional_derivative(
     return Directional(variation.ts, back(variation.xs), back(dus), sol, found)
 
 
+def _codes(base: _Base, times: np.ndarray, tol: float) -> Any:
+    """What is constant between kinks, as signals that say where those are: steps end there."""
+
+    def at(t: Any) -> Tree:
+        _, _, y = base.at(t)
+        return code(_set(base, t)(base.moving), y, _force(base, t), _control(base), tol)
+
+    middles = jax.jit(jax.vmap(at))(jnp.asarray(0.5 * (times[:-1] + times[1:])))
+    whole = lambda leaf: np.concatenate([np.asarray(leaf), np.asarray(leaf)[-1:]])  # noqa: E731
+    return jtu.tree_map(lambda leaf: Table(times, whole(leaf), kind="constant"), middles)
+
+
 def _generator(base: _Base) -> Any:
     return base.problem.generator(base.sol.setup.args)
 
@@ -151,11 +165,24 @@ def _operator(base: _Base) -> Any:
 
 
 def _cone(t: Any, base: _Base) -> Any:
-    base.marks(t)  # steps end where the response changes its regime
+    _, _, y = base.at(t)
+    now = jtu.tree_map(lambda table: table(t), base.codes, is_leaf=lambda v: isinstance(v, Table))
+    return critical(_set(base, t), base.moving, base.direction, y, _force(base, t), now, base.tol)
+
+
+def _set(base: _Base, t: Any) -> Any:
+    """η ↦ K(t, η)."""
+    return lambda moving: base.problem.set_at(t, base.args(moving))
+
+
+def _control(base: _Base) -> Any:
+    return base.problem.spaces(base.sol.setup.x0)[1]
+
+
+def _force(base: _Base, t: Any) -> Tree:
+    """w = −F(y) ∈ N_K(y)."""
     x, _, y = base.at(t)
-    w = jtu.tree_map(jnp.negative, base.problem.frozen(t, x, base.sol.setup.args)(y))
-    at = lambda moving: base.problem.set_at(t, base.args(moving))  # noqa: E731
-    return critical(at, base.moving, base.direction, y, w, base.tol)
+    return jtu.tree_map(jnp.negative, base.problem.frozen(t, x, base.sol.setup.args)(y))
 
 
 def _shift(base: _Base, t: Any) -> Tree:
