@@ -199,3 +199,12 @@ def test_single_precision_stays_single_and_parameters_have_derivatives():
 def test_what_does_not_fit_is_refused(arguments, words):
     with pytest.raises(dvax.InputError, match=words):
         generators.Elliptic(**arguments)
+
+
+def test_numbers_that_are_known_stay_known_while_others_are_traced():
+    """No advection is no advection also where the diffusion is a parameter under jit."""
+    x = jnp.arange(1.0, 5.0)
+    made = lambda d: dvax.generators.Elliptic(4, 1.0, "neumann", diffusion=d)  # noqa: E731
+    found = jax.jit(lambda d: made(d).apply(x))(0.3)
+    np.testing.assert_allclose(np.asarray(found), np.asarray(made(0.3).apply(x)), rtol=1e-12)
+    assert not jnp.iscomplexobj(jax.jit(lambda d: made(d).symbol)(0.3))

@@ -184,6 +184,14 @@ def _eigenvalues(
 
 
 def _by_axis(name: str, value: Any, count: int) -> list[jax.Array]:
+    if _tree.is_concrete(value):
+        # A number that is known stays known while something else is traced.
+        with jax.ensure_compile_time_eval():
+            return _one_each(name, value, count)
+    return _one_each(name, value, count)
+
+
+def _one_each(name: str, value: Any, count: int) -> list[jax.Array]:
     full = f"dvax.generators.Elliptic({name})"
     array = _tree.as_float(jnp.asarray(value) if isinstance(value, tuple | list) else value, full)
     if array.shape not in ((), (count,)):
@@ -241,7 +249,8 @@ def _check_numbers(L: list, d: list, c: list, kinds: tuple[str, ...]) -> None:
             raise InputError(
                 InputProblem(
                     f"{name}(velocity)",
-                    f"{_tree.short(v)} along axis {axis}, which is {kind}",
+                    f"{_tree.short(v) if _tree.is_concrete(v) else 'a traced number'} along axis "
+                    f"{axis}, which is {kind}",
                     "advection is diagonal in waves alone, so its axis must be periodic",
                     "Put the advection into f, or give the operator as a sparse matrix",
                 )

@@ -94,8 +94,8 @@ def change(
     >>> seen = dvax.sensitivity.change(problem, -1.0, 0.0, 2.0, 3.0, bounds, dargs=0.1)
     >>> print(seen.table())
                         actual   predicted   certified       sharp
-    max ‖Δx‖            0.0645      0.0643      0.3437      0.1264
-    max ‖Δu‖           0.03083     0.03117      0.3437      0.1264
+    max ‖Δx‖             0.064     0.06403      0.3437      0.1264
+    max ‖Δu‖            0.0407     0.04059      0.3437      0.1264
 
     ```
     """
