@@ -46,7 +46,9 @@ def kinks(sol: Solution, *, tol: float = 1e-6) -> list[Kink]:
     >>> import dvax
     >>> model = dvax.models.Contact(alpha=1.0, beta=1.0, b_x=2.0, b_u=1.0, d_x=0.5, d_u=1.0,
     ...                             kappa0=0.5, g=1.0, ell=3.0)
-    >>> sol = dvax.solve(model.problem, -1.0, 0.0, 2.0, rtol=1e-8, dense=True, max_steps=20_000)
+    >>> sol = dvax.solve(
+    ...     model.problem, -1.0, 0.0, 2.0, rtol=1e-8, method=dvax.ETD4RK(), dense=True, max_steps=2**12
+    ... )
     >>> [(round(kink.start, 4), kink.kind) for kink in dvax.sensitivity.kinks(sol)]
     [(0.3133, 'crosses'), (0.5241, 'crosses')]
 
