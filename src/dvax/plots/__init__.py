@@ -2,10 +2,9 @@
 
 `build_report` reads a run directory and writes `report.html` (self-contained, no network) and
 `figures/*.png` into it. The library below the application never imports this room; it needs the
-extra `dvax[app]`. `change_figure` draws a `dvax.sensitivity.Change`.
+extra `dvax[app]`. `dvax.plots.change.change_figure` draws a `dvax.sensitivity.Change`.
 """
 
-from dvax.plots.change import change_figure
 from dvax.plots.report import build_report
 
-__all__ = ["build_report", "change_figure"]
+__all__ = ["build_report"]

@@ -1,0 +1,58 @@
+"""Gradients of many runs at once, and of a long one."""
+
+import subprocess
+import sys
+import textwrap
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.closed_forms import c1
+
+import dvax
+
+
+def test_a_batch_of_adaptive_runs_has_the_gradients_of_single_ones():
+    """Each has steps and kinks of its own, and one waits while others go on."""
+    case = c1()
+
+    def end(x0, load):
+        return dvax.solve(
+            case.problem, x0, 0.0, 2.0, (load,), rtol=1e-5, atol=1e-7, max_steps=2**12
+        ).xs[-1]
+
+    x0s, loads = jnp.array([-1.0, 0.2, 3.0, -2.5]), jnp.array([3.0, 1.0, 2.0, 5.0])
+    both = jax.grad(end, argnums=(0, 1))
+    together = jax.jit(jax.vmap(both))(x0s, loads)
+    alone = [jax.jit(both)(x0, load) for x0, load in zip(x0s, loads, strict=True)]
+    for k in range(2):
+        one = np.array([pair[k] for pair in alone])
+        np.testing.assert_allclose(np.asarray(together[k]), one, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.thorough
+def test_ten_thousand_steps_of_a_large_state_are_differentiated_in_four_gigabytes():
+    program = """
+        import resource
+        import jax, jax.numpy as jnp, dvax
+        jax.config.update("jax_enable_x64", True)
+        n = 10**5
+        g = 1.0 + jnp.sin(6.28 * jnp.arange(n) / n)
+        problem = dvax.Problem(
+            A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+            f=lambda t, x, u, p: p - 0.5 * x - u, h=lambda t, x, u, p: g - 2.0 * x - u,
+        )
+        total = lambda p: jnp.sum(
+            dvax.solve(problem, jnp.full(n, -1.0), 0.0, 10.0, p, dt=1e-3).xs[-1]
+        )
+        slope = jax.grad(total)(jnp.full(n, 3.0))
+        print(float(slope[0]), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
+    """
+    run = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, check=True
+    )
+    slope, gigabytes = map(float, run.stdout.split())
+    print(f"peak {gigabytes:.2f} GiB")
+    assert 0.0 < slope < 1.0
+    assert gigabytes < 4.0
