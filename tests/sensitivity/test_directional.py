@@ -1,6 +1,7 @@
 """Directional derivatives at kinks against closed forms and one-sided differences, which share no code
 with the variational system; away from kinks against `jax.jvp`."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -167,6 +168,36 @@ def test_wrong_directions_are_refused():
     case = c1()
     with pytest.raises(dvax.InputError, match=r"dx0.*shape"):
         dvax.directional_derivative(case.problem, -1.0, 0.0, 2.0, case.args, dx0=jnp.ones(2))
+    with pytest.raises(dvax.InputError, match=r"dargs.*structure"):
+        dvax.directional_derivative(case.problem, -1.0, 0.0, 2.0, case.args, dargs={"ell": 1.0})
+    with pytest.raises(dvax.InputError, match=r"outside jax\.jit"):
+        jax.jit(lambda x: dvax.directional_derivative(case.problem, x, 0.0, 2.0, case.args).dxs)(
+            0.1
+        )
     sol = dvax.solve(case.problem, -1.0, 0.0, 2.0, case.args)
     with pytest.raises(dvax.InputError, match="dense=True"):
         dvax.sensitivity.kinks(sol)
+
+
+@pytest.mark.thorough
+def test_a_measured_load_that_jumps_may_move_too():
+    """x' = −x + load(t) − u with u = max(0, x − 1): linear between jumps and kinks."""
+    times = [0.0, 0.5, 1.2, 2.0]
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=ONE, K=dvax.sets.Box(0.0, 9.0),
+        f=lambda t, x, u, load: load(t) - u, h=lambda t, x, u, load: x - 1.0,
+    )  # fmt: skip
+    table = lambda v: dvax.signals.Table(times, v, kind="constant")  # noqa: E731
+    load, along = table([3.0, 0.5, 2.0, 2.0]), table([1.0, -0.5, 0.3, 0.0])
+    dargs = jax.tree_util.tree_map(lambda leaf: None, load)
+    dargs = eqx.tree_at(lambda s: s.values, dargs, along.values, is_leaf=lambda v: v is None)
+    found = dvax.directional_derivative(problem, 0.2, 0.0, 2.0, load, dargs=dargs)
+
+    def end(values):
+        return dvax.solve(
+            problem, 0.2, 0.0, 2.0, table(values), method=dvax.ETD4RK(), rtol=1e-9,
+            adjoint="forward", max_steps=2**14,
+        ).xs[-1]  # fmt: skip
+
+    exact = jax.jvp(end, (load.values,), (along.values,))[1]
+    assert float(found.dxs[-1]) == pytest.approx(float(exact), rel=1e-6)

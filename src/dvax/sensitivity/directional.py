@@ -11,6 +11,7 @@ variation of a coupled system is a coupled system, and `dvax.solve` solves it. W
 direction; everywhere else this is what `jax.jvp` gives.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -24,7 +25,7 @@ from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..evolution import ETD4RK, AbstractMethod, Solution, solve
 from ..problem import Problem
-from ..signals import Table
+from ..signals import Table, listen
 from .critical import code, critical
 from .degenerate import Kink, kinks
 from .newton import OneSided
@@ -110,18 +111,26 @@ def directional_derivative(
 
     ```
     """
+    if not _tree.is_concrete(x0, t0, t1, args, dx0, dargs):
+        raise InputError(
+            InputProblem(
+                "dvax.directional_derivative", "a traced value",
+                "where kinks are is looked up between the two solves, which no compiled program can",
+                "Call it outside jax.jit; off kinks jax.jvp of dvax.solve is the same and compiles",
+            )
+        )  # fmt: skip
     x0 = _tree.as_float(x0, "x0")
-    moving, rest = eqx.partition(args, _varies)
     dx0 = _tree.zeros_like(x0) if dx0 is None else _tree.as_float(dx0, "dx0")
-    direction = _direction(moving, dargs)
+    moving, rest, direction = _apart(args, dargs)
     _check(x0, dx0, moving, direction)
     method = ETD4RK() if method is None else method
     settings: dict[str, Any] = dict(rtol=rtol, atol=atol, max_steps=max_steps, method=method)
     sol = solve(problem, x0, t0, t1, args, ts, dense=True, **settings)
     found = kinks(sol, tol=tol)
     begin, end = float(t0), float(t1)
-    inner = sorted({t for kink in found for t in (kink.start, kink.end) if begin < t < end})
-    times = np.array([begin, *inner, end])
+    inner = [t for kink in found for t in (kink.start, kink.end) if begin < t < end]
+    inner += [float(t) for t in problem.knots(begin, end, x0, args)]
+    times = np.array(sorted({begin, *inner, end}))
     base = _Base(problem, sol, moving, rest, direction, jnp.asarray(tol), None)
     base = eqx.tree_at(
         lambda b: b.codes, base, _codes(base, times, tol), is_leaf=lambda v: v is None
@@ -165,9 +174,12 @@ def _operator(base: _Base) -> Any:
 
 
 def _cone(t: Any, base: _Base) -> Any:
-    _, _, y = base.at(t)
     now = jtu.tree_map(lambda table: table(t), base.codes, is_leaf=lambda v: isinstance(v, Table))
-    return critical(_set(base, t), base.moving, base.direction, y, _force(base, t), now, base.tol)
+    with listen(None):  # the knots of the data are among the times of the codes
+        _, _, y = base.at(t)
+        return critical(
+            _set(base, t), base.moving, base.direction, y, _force(base, t), now, base.tol
+        )
 
 
 def _set(base: _Base, t: Any) -> Any:
@@ -194,43 +206,43 @@ def _shift(base: _Base, t: Any) -> Tree:
 
 def _rate(t: Any, dx: Tree, v: Tree, base: _Base) -> Tree:
     """f_x δx + f_u δu + f_η δη + (∂A)x."""
-    x, u, _ = base.at(t)
-    du = _tree.add(v, _shift(base, t))
     f = lambda x, u, moving: base.problem.f(t, x, u, base.args(moving))  # noqa: E731
-    rate = jax.jvp(f, (x, u, base.moving), (dx, du, base.direction))[1]
-    push = lambda moving: base.problem.generator(base.args(moving)).apply(x)  # noqa: E731
-    return _tree.add(rate, jax.jvp(push, (base.moving,), (base.direction,))[1])
+    push = lambda x, moving: base.problem.generator(base.args(moving)).apply(x)  # noqa: E731
+    with listen(None):
+        x, u, _ = base.at(t)
+        du = _tree.add(v, _shift(base, t))
+        rate = jax.jvp(f, (x, u, base.moving), (dx, du, base.direction))[1]
+        drift = jax.jvp(partial(push, x), (base.moving,), (base.direction,))[1]
+    return _tree.add(rate, drift)
 
 
 def _law(t: Any, dx: Tree, v: Tree, base: _Base) -> Tree:
     """v − (F_y δy + F_x δx + F_η δη) with δy = Pv: the h of which that is the frozen operator."""
-    x, _, y = base.at(t)
     F = lambda y, x, moving: base.problem.frozen(t, x, base.args(moving))(y)  # noqa: E731
-    dy = base.problem.operator(base.sol.setup.args).apply(v)
-    return _tree.sub(v, jax.jvp(F, (y, x, base.moving), (dy, dx, base.direction))[1])
+    with listen(None):
+        x, _, y = base.at(t)
+        dy = base.problem.operator(base.sol.setup.args).apply(v)
+        return _tree.sub(v, jax.jvp(F, (y, x, base.moving), (dy, dx, base.direction))[1])
 
 
-def _varies(leaf: Any) -> bool:
-    return isinstance(leaf, float) or eqx.is_inexact_array(leaf)
-
-
-def _direction(moving: Any, dargs: Any) -> Any:
-    """A direction with an entry for every number of args."""
+def _apart(args: Any, dargs: Any) -> tuple[Any, Any, Any]:
+    """(what moves, the rest, the direction), each shaped like args with None in the other places."""
+    leaves, structure = jtu.tree_flatten(args, is_leaf=lambda v: v is None)
+    given, shape = jtu.tree_flatten(dargs, is_leaf=lambda v: v is None)
     if dargs is None:
-        return jtu.tree_map(lambda leaf: jnp.zeros_like(jnp.asarray(leaf)), moving)
-    given = jtu.tree_leaves(dargs, is_leaf=lambda v: v is None)
-    leaves, structure = jtu.tree_flatten(moving, is_leaf=lambda v: v is None)
-    if len(given) != len(leaves):
-        raise _wrong("dargs", f"{len(given)} entries", f"args has {len(leaves)}")
-    filled = [
-        None
-        if a is None
-        else jnp.zeros_like(jnp.asarray(a))
-        if d is None
-        else jnp.asarray(d, float)
-        for a, d in zip(leaves, given, strict=True)
-    ]
-    return structure.unflatten(filled)
+        given, shape = [None] * len(leaves), structure
+    if shape != structure:
+        raise _wrong("dargs", f"the structure {shape}", f"that of args is {structure}")
+    for a, d in zip(leaves, given, strict=True):
+        if d is not None and not (isinstance(a, float) or eqx.is_inexact_array(a)):
+            rule = f"{a!r} in args is no real number with a point"
+            raise _wrong("dargs", f"{_tree.short(d)}", rule)
+    moving, rest = (
+        [a if (d is None) is still else None for a, d in zip(leaves, given, strict=True)]
+        for still in (False, True)
+    )
+    along = [None if d is None else jnp.asarray(d, float) for d in given]
+    return tuple(structure.unflatten(part) for part in (moving, rest, along))
 
 
 def _check(x0: Tree, dx0: Tree, moving: Any, direction: Any) -> None:
