@@ -201,3 +201,81 @@ def test_a_measured_load_that_jumps_may_move_too():
 
     exact = jax.jvp(end, (load.values,), (along.values,))[1]
     assert float(found.dxs[-1]) == pytest.approx(float(exact), rel=1e-6)
+
+
+@pytest.mark.thorough
+def test_a_set_that_moves_much_faster_than_its_response_is_looked_at_nearby():
+    """A half-plane that turns; z leaves its corner far slower than the plane does."""
+    e = jnp.array([0.0, 1.0])
+    problem = dvax.Problem(
+        A=ZERO, P=ONE, h=lambda t, x, u, a: e + 1e-4 * x,
+        K=lambda t, a: dvax.sets.HalfSpace(jnp.stack([jnp.cos(a), jnp.sin(a)]), 0.0),
+        f=lambda t, x, u, a: 0.5 * ((u - e) + 0.5 * (u - e)[::-1]),
+    )  # fmt: skip
+    dx0 = jnp.array([3.0, 3.0])
+    found = dvax.directional_derivative(
+        problem, jnp.zeros(2), 0.0, 1.0, jnp.array(0.0), dx0=dx0, dargs=jnp.array(1.0)
+    )
+    exact = quotient(problem, jnp.zeros(2), 1.0, jnp.array(0.0), dx0, jnp.array(1.0))
+    np.testing.assert_allclose(np.asarray(found.dxs[-1]), exact, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(np.asarray(found.dus[-1]), [-1.0, 2.8e-4], atol=1e-4)
+
+
+@pytest.mark.thorough
+def test_a_ball_that_shrinks_onto_a_response_at_rest_on_it():
+    spin = jnp.array([[0.0, 2.0], [-2.0, 0.0]])
+    problem = dvax.Problem(
+        A=ZERO, P=ONE, K=lambda t, r: dvax.sets.Ball(0.0, r), h=lambda t, x, u, r: x,
+        f=lambda t, x, u, r: spin @ x + (x - u),
+    )  # fmt: skip
+    for dx0 in (None, jnp.array([1e-7, 0.0])):
+        found = dvax.directional_derivative(
+            problem, jnp.array([1.0, 0.0]), 0.0, 1.0, jnp.array(1.0), dx0=dx0, dargs=jnp.array(-1.0)
+        )
+        np.testing.assert_allclose(np.asarray(found.dxs[-1]), [-0.7151, -1.5624], atol=1e-4)
+
+
+@pytest.mark.thorough
+def test_a_product_of_boxes_and_a_state_of_two_parts():
+    space = dvax.spaces.Product(dvax.spaces.Euclidean(2), dvax.spaces.Euclidean())
+    problem = dvax.Problem(
+        A=ZERO, P=ONE, K=dvax.sets.Product(dvax.sets.Box(0.0, 9.0), dvax.sets.Box(0.0, 9.0)),
+        f=lambda t, x, u, a: (u[0] - 2 * x[0], u[1] - 2 * x[1] + x[0][0]),
+        h=lambda t, x, u, a: (x[0], x[1]), state_space=space,
+    )  # fmt: skip
+    found = dvax.directional_derivative(
+        problem,
+        (jnp.zeros(2), jnp.array(0.0)),
+        0.0,
+        1.0,
+        dx0=(jnp.array([1.0, -1.0]), jnp.array(0.0)),
+    )
+    first, second = (np.asarray(part[-1]) for part in found.dxs)
+    np.testing.assert_allclose(first, [np.exp(-1.0), -np.exp(-2.0)], rtol=1e-6)
+    # δx₂' = −2δx₂ + max(δx₂, 0) + e^{−t}, from 0: t e^{−t}
+    assert float(second) == pytest.approx(np.exp(-1.0), rel=1e-6)
+
+
+@pytest.mark.thorough
+def test_single_precision_and_places_where_args_are_none():
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=ONE, K=dvax.sets.Box(0.0, 0.5),
+        f=lambda t, x, u, a: a[0] - 0.5 * x - u, h=lambda t, x, u, a: 1.0 - 2 * x - u,
+    )  # fmt: skip
+    with jax.numpy_dtype_promotion("standard"):  # times of tables are double
+        short = dvax.directional_derivative(
+            problem, jnp.float32(-1.0), 0.0, 2.0, (jnp.float32(3.0), None), dx0=1.0,
+            dargs=(1.0, None), rtol=1e-4, atol=1e-5, tol=1e-3,
+        )  # fmt: skip
+    by_start, by_load = c1_derivatives()
+    assert short.dxs.dtype == jnp.float32
+    assert float(short.dxs[-1]) == pytest.approx(by_start + by_load, rel=1e-2)
+    c = c1().constants
+    bounds = dvax.ParameterBounds(
+        c, T=2.0, kappa_K=0.0, C_h0=1.0, C_f0=3.0, modulus_f=1.0, modulus_h=0.0
+    )
+    seen = dvax.sensitivity.change(
+        problem, -1.0, 0.0, 2.0, (3.0, None), bounds, dargs=(0.1, None), ts=[0.0, 1.0, 2.0]
+    )
+    assert seen.x.actual[-1] == pytest.approx(0.064, abs=1e-3)
+    assert seen.x.certified[-1] == pytest.approx(0.3437, abs=1e-3)

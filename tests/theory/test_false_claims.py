@@ -195,3 +195,50 @@ def test_a_pseudomonotone_law_may_be_flatter_than_its_modulus():
     flat = problem(K=dvax.sets.Box(1.0, 2.0), h=lambda t, x, u, a: u - (2 / u) * u)
     check = dvax.verify(flat)
     assert check.constants is not None and float(check.constants.gamma) == pytest.approx(1.0)
+
+
+def test_a_certified_run_does_not_leave_the_region_between_its_saved_times():
+    """x = sin t, which is past 0.6 for a while: what holds up to there does not hold then."""
+    k = lambda x: 12 * jnp.tanh(5 * jnp.maximum(jnp.abs(x) - 0.6, 0.0))  # noqa: E731
+    system = problem(
+        A=dvax.generators.Zero(), K=dvax.sets.Box(0.0, 0.5), h=lambda t, x, u, a: 0.0 * x,
+        f=lambda t, x, u, a: jnp.cos(t) + k(x) * (x - jnp.sin(t)) - 0.0 * u,
+    )  # fmt: skip
+    c = dvax.verify(system, 0.0, 0.0, 3.0, x=(-0.6, 0.6)).constants
+    with pytest.raises(dvax.InputError, match="larger region"):
+        dvax.solve(system, 0.0, 0.0, 3.0, constants=c, certified_tol=1e-3)
+    inside = dvax.verify(system, 0.0, 0.0, 0.6, x=(-0.6, 0.6)).constants
+    sol = dvax.solve(
+        system, 0.0, 0.0, 0.6, ts=[0.2, 0.2, 0.6], constants=inside, certified_tol=1e-3
+    )
+    assert sol.ts.tolist() == [0.2, 0.2, 0.6] and sol.xs.shape == (3,)
+    assert (
+        np.max(np.abs(np.asarray(sol.xs) - np.sin(sol.ts))) <= sol.stats["certified_bound"] <= 1e-3
+    )
+
+
+def test_radii_are_counted_from_the_origin():
+    steep = lambda t, x, u, a: a * x + 10 * jnp.tanh(10 * x) + 0.0 * u  # noqa: E731
+    system = problem(f=steep, h=lambda t, x, u, a: -u)
+    with pytest.raises(dvax.InputError, match="region without 0"):
+        dvax.parameter_bounds(system, 0.0, 0.01, 1.0, start_radius=1.0, x=(1.0, np.inf))
+    for radius in (-1.0, np.nan, np.inf):
+        with pytest.raises(dvax.InputError, match="start_radius"):
+            dvax.parameter_bounds(system, 0.0, 0.01, 1.0, start_radius=radius)
+
+
+def test_bounds_of_a_box_of_parameters_say_nothing_outside_it():
+    system = problem(
+        K=dvax.sets.Box(0.0, 0.5), f=lambda t, x, u, a: a**3 - 0.5 * x - u,
+        h=lambda t, x, u, a: 1.0 - 2 * x - u,
+    )  # fmt: skip
+    bounds = dvax.parameter_bounds(system, 0.0, 0.1, t1=2.0)
+    change = dvax.sensitivity.change
+    with pytest.raises(dvax.InputError, match="outside it"):
+        change(system, -1.0, 0.0, 2.0, 0.05, bounds, dargs=1.0)
+    with pytest.raises(dvax.InputError, match=r"times \[0, 2\]"):
+        change(system, -1.0, 5.0, 7.0, 0.05, bounds, dargs=0.01)
+    grows = problem(f=lambda t, x, u, a: a * x - u, K=dvax.sets.Box(0.0, 0.5))
+    bounds = dvax.parameter_bounds(grows, 0.0, 0.1, t1=2.0, start_radius=1.0)
+    with pytest.raises(dvax.InputError, match=r"norm 3"):
+        change(grows, 3.0, 0.0, 2.0, 0.05, bounds, dargs=0.01)

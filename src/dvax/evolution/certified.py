@@ -29,6 +29,9 @@ _AIM = 0.7
 """The share of the tolerance that a run aims at, so that it need not be made again."""
 
 _RUNS = 8
+_LOOKS = 256
+"""Times at which it is looked whether a run stays in the region of its constants."""
+
 _ROUNDINGS = 256.0
 """A rate f̃ is taken to be known to so many roundings of its size, and no defect to be smaller."""
 
@@ -36,7 +39,8 @@ _NEEDED = ("M", "growth_rate", "beta_f", "norm_P_inv", "gamma")
 
 
 def certified(
-    run: Callable[[float], Solution],
+    run: Callable[[Any, float], Solution],
+    ts: Any,
     problem: Problem,
     x0: Tree,
     args: Any,
@@ -46,7 +50,7 @@ def certified(
     tol: float,
 ) -> Solution:
     """The solution whose bound is at most `tol` at every saved time;
-    `run(atol)` solves with this absolute tolerance and no relative one.
+    `run(ts, atol)` solves with this absolute tolerance and no relative one.
 
     **Raises:** `dvax.InputError` where rounding alone leaves a bound above `tol`.
     """
@@ -64,13 +68,17 @@ def certified(
     atol *= _COARSE if _COARSE * atol < 0.1 * (1.0 + largest / size) else 1.0
     bound = np.inf
     for _ in range(_RUNS):
-        solution = run(atol)
+        solution = run(ts, atol)
         if solution.result != RESULTS.successful:
             return solution  # throw=False: the result says what failed, and nothing is certified
         bounds = _bounds(solution, known, t0)
         bound = float(np.max(np.asarray(bounds)))
         if bound <= tol:
             left = _leaves(solution, constants, bounds)
+            if left is None and _of_region(constants):
+                # Between the saved times as well, as far as one can look.
+                looks = run(np.linspace(t0, t1, _LOOKS + 1)[1:], atol)
+                left = _leaves(looks, constants, _bounds(looks, known, t0))
             if left is not None:
                 raise _outside(left)
             return _with_bound(solution, bound)
@@ -123,11 +131,17 @@ def _least(t0: Any, ts: Any, impulse: tuple, known: _Growth) -> jax.Array:
     return jnp.min(jnp.stack(each), axis=0)
 
 
+def _of_region(constants: Any) -> bool:
+    """Whether x or u must stay somewhere for these to hold."""
+    domain = getattr(constants, "domain", None)
+    return domain is not None and not domain.free
+
+
 def _leaves(solution: Solution, constants: Any, bounds: Any) -> float | None:
     """The first saved time at which x or u, with its bound, is not where the constants hold."""
-    domain = getattr(constants, "domain", None)
-    if domain is None or domain.free:
+    if not _of_region(constants):
         return None
+    domain = constants.domain
     law_error = solution.law_residual / constants.gamma + solution.law_step
     of_u = constants.L * bounds + constants.norm_P_inv * law_error
     spaces = solution.setup.problem.spaces(solution.setup.x0)

@@ -69,7 +69,8 @@ def solve(
     - `certified_tol`: the largest error of x in the norm of the state space that is allowed at any
       saved time, for the exact x0: steps are chosen, in a few runs, until `dvax.bound_error` with
       these `constants` says so (`rtol` and `atol` are then not used). The bound that was reached is
-      in `stats["certified_bound"]`;
+      in `stats["certified_bound"]`. Constants of a region hold while x and u stay in it: that is
+      looked at 256 more times, and between them it is for you to know;
     - `measure`: whether to sample the defect inside steps. Adaptive steps always do; fixed steps only
       when asked, since it doubles their cost;
     - `dense`: keep every step, for `Solution.evaluate`; memory grows with `max_steps`;
@@ -110,10 +111,11 @@ def solve(
             method=method, vi_solver=vi_solver, progress=progress, constants=constants, dense=dense,
             dt0=dt0, max_steps=max_steps, adjoint=adjoint, throw=throw,
         )  # fmt: skip
-        return certified(
-            lambda atol: solve(problem, x0, t0, t1, args, ts, rtol=0.0, atol=atol, **again),
-            problem, x0, args, float(t0), float(t1), constants, certified_tol,
-        )  # fmt: skip
+        begin, end = float(t0), float(t1)
+        run = lambda times, atol: solve(  # noqa: E731
+            problem, x0, t0, t1, args, times, rtol=0.0, atol=atol, **again
+        )
+        return certified(run, ts, problem, x0, args, begin, end, constants, certified_tol)
     x0 = _tree.as_float(x0, "x0")
     method = _METHOD if method is None else method
     check(problem, x0, t0, t1, ts, dt, rtol, atol, dt0, horizon, method, adjoint, measure, dense)

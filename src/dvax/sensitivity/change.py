@@ -80,8 +80,8 @@ def change(
     **Arguments:** as in `dvax.directional_derivative`, with `dx0` and `dargs` the whole change, not a
     direction; `bounds`: from `dvax.parameter_bounds`; `ts`: 41 times between t0 and t1 by default.
 
-    **Raises:** `dvax.InputError` where T of the bounds is shorter than t1 − t0, or what
-    `dvax.directional_derivative` raises.
+    **Raises:** `dvax.InputError` where the bounds are not for these times, parameters or initial
+    states; what `dvax.directional_derivative` raises.
 
     ```python
     >>> import dvax
@@ -100,17 +100,17 @@ def change(
     ```
     """
     t0, t1 = float(t0), float(t1)
-    _covers(bounds, t1 - t0)
     times = np.linspace(t0, t1, 41) if ts is None else np.asarray(ts, float)
     method = ETD4RK() if method is None else method
     x0 = _tree.as_float(x0, "x0")
     tight: dict[str, Any] = dict(method=method, rtol=rtol, atol=atol, max_steps=max_steps)
+    state, control = problem.spaces(x0)
+    moved_x0, moved_args = _moved(x0, dx0), _moved(args, dargs)
+    _covers(bounds, t0, t1, (args, moved_args), [state.norm(x0), state.norm(moved_x0)])
     found = directional_derivative(
         problem, x0, t0, t1, args, dx0=dx0, dargs=dargs, ts=times, tol=tol, **tight
     )
-    moved_x0, moved_args = _moved(x0, dx0), _moved(args, dargs)
     other = solve(problem, moved_x0, t0, t1, moved_args, times, **tight)
-    state, control = problem.spaces(x0)
     norm_x, norm_u = (lambda v, s=s: np.asarray(jax.vmap(s.norm)(v)) for s in (state, control))
     gap = float(state.norm(_tree.sub(moved_x0, x0)))
     distance = _distance(args, moved_args)
@@ -132,11 +132,10 @@ def _moved(a: Any, d: Any) -> Any:
     """a + d, where None stands still."""
     if d is None:
         return a
-    leaves, structure = jtu.tree_flatten(a)
+    leaves, structure = jtu.tree_flatten(a, is_leaf=lambda v: v is None)
     steps = jtu.tree_leaves(d, is_leaf=lambda v: v is None)
-    if len(steps) != len(leaves):
-        return a  # `directional_derivative` says what is wrong
-    return structure.unflatten([p if s is None else p + s for p, s in zip(leaves, steps)])
+    moved = [p if s is None else p + s for p, s in zip(leaves, steps, strict=True)]
+    return structure.unflatten(moved)
 
 
 def _distance(a: Any, b: Any) -> float:
@@ -150,13 +149,29 @@ def _distance(a: Any, b: Any) -> float:
     return float(np.sqrt(total))
 
 
-def _covers(bounds: ParameterBounds, span: float) -> None:
-    if not float(bounds.T) >= span * (1 - 1e-12):
+def _covers(bounds: ParameterBounds, t0: float, t1: float, each: tuple, starts: list) -> None:
+    """Raise an `InputError` where these bounds say nothing about such a change."""
+    wrong: list[tuple[str, str]] = []
+    if not float(bounds.T) >= (t1 - t0) * (1 - 1e-12):
+        wrong.append((f"T = {float(bounds.T):g}", f"the run takes {t1 - t0:g}"))
+    made = bounds.domain
+    if made is not None:
+        room = 1e-12 * max(abs(made.t0), abs(made.t1), 1.0)
+        if t0 < made.t0 - room or t1 > made.t1 + room:
+            wrong.append((f"times [{made.t0:g}, {made.t1:g}]", f"the run is on [{t0:g}, {t1:g}]"))
+        if not all(made.holds(args) for args in each):
+            wrong.append(("a box of parameters", "one of the two parameters is outside it"))
+        if made.start_radius is not None and not max(map(float, starts)) <= made.start_radius:
+            norms = " and ".join(f"{float(v):.6g}" for v in starts)
+            wrong.append((f"‖ζ‖ ≤ {made.start_radius:g}", f"the initial states have norm {norms}"))
+    if wrong:
         raise InputError(
-            InputProblem(
-                "dvax.sensitivity.change(bounds)",
-                f"bounds over T = {float(bounds.T):g}",
-                f"the run takes {span:g}, and their radius is that of the shorter time",
-                "Make them for this time: dvax.parameter_bounds(problem, low, high, x0, t0, t1)",
+            *(
+                InputProblem(
+                    "dvax.sensitivity.change(bounds)", f"bounds made for {what}",
+                    f"{why}, of which they say nothing",
+                    "Make them for this: dvax.parameter_bounds(problem, low, high, x0, t0, t1)",
+                )
+                for what, why in wrong
             )
-        )
+        )  # fmt: skip

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._tree import Tree
-from ..sets import AbstractSet, Box
+from ..sets import AbstractSet, Box, Product
 from ..spaces import AbstractSpace
 
 
@@ -54,6 +54,8 @@ def critical(
     lows, highs, codes = (jtu.tree_leaves(tree) for tree in (*move, code))
     ends = [_entries(*parts) for parts in zip(lows, highs, codes, strict=True)]
     assert len(leaves) == len(ends)
+    if isinstance(y, tuple):
+        return Product(*(Box(*pair) for pair in ends))
     return Box(*(structure.unflatten(side) for side in zip(*ends, strict=True)))
 
 
@@ -80,8 +82,9 @@ class Ahead(AbstractSet):
     tol: Any
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
-        size = space.norm(z)
-        # At a kink, past all that counts as one: then the side is the one that v points to.
+        moves = sum(jnp.sum(jnp.square(leaf)) for leaf in jtu.tree_leaves(self.dargs))
+        size = jnp.sqrt(space.norm(z) ** 2 + moves)
+        # At a kink, past all that counts as one: then the side is the one that v and δη point to.
         ahead = 10.0 * self.tol / jnp.where(size > 0, size, 1.0)
         ahead = jnp.where(jnp.any(self.code == 0), ahead, 0.0)
         shifted = jtu.tree_map(lambda p, v: p + ahead * v, self._aside(space), z)

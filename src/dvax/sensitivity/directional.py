@@ -123,6 +123,7 @@ def directional_derivative(
     dx0 = _tree.zeros_like(x0) if dx0 is None else _tree.as_float(dx0, "dx0")
     moving, rest, direction = _apart(args, dargs)
     _check(x0, dx0, moving, direction)
+    dx0 = jtu.tree_map(lambda d, a: d.astype(a.dtype), dx0, x0)
     method = ETD4RK() if method is None else method
     settings: dict[str, Any] = dict(rtol=rtol, atol=atol, max_steps=max_steps, method=method)
     sol = solve(problem, x0, t0, t1, args, ts, dense=True, **settings)
@@ -237,11 +238,17 @@ def _apart(args: Any, dargs: Any) -> tuple[Any, Any, Any]:
         if d is not None and not (isinstance(a, float) or eqx.is_inexact_array(a)):
             rule = f"{a!r} in args is no real number with a point"
             raise _wrong("dargs", f"{_tree.short(d)}", rule)
+        if d is not None and (isinstance(d, bool) or not np.all(np.isfinite(np.asarray(d)))):
+            raise _wrong("dargs", f"{_tree.short(d)}", "it must be made of finite numbers")
     moving, rest = (
         [a if (d is None) is still else None for a, d in zip(leaves, given, strict=True)]
         for still in (False, True)
     )
-    along = [None if d is None else jnp.asarray(d, float) for d in given]
+    # Tangents have the type of what they are tangents of.
+    along = [
+        None if d is None else jnp.asarray(d, jnp.result_type(a))
+        for a, d in zip(leaves, given, strict=True)
+    ]
     return tuple(structure.unflatten(part) for part in (moving, rest, along))
 
 

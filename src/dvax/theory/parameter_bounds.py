@@ -20,7 +20,7 @@ from .enclosure import Enclosure
 from .formulas import convolved
 from .known import knowledge
 from .motion import motion, slopes, times
-from .parameters import ParameterBounds
+from .parameters import Domain, ParameterBounds
 from .region import Region, between
 from .slope import Slope, TooLarge, interval, is_slope
 from .status import Status
@@ -70,7 +70,7 @@ def parameter_bounds(
     ```
     """
     low, high = _tree.as_float(low, "low"), _tree.as_float(high, "high")
-    _check(problem, low, high)
+    _check(problem, low, high, start_radius)
     middle = jtu.tree_map(lambda a, b: 0.5 * (a + b), low, high)
     t0, t1 = span(t0, t1, "dvax.parameter_bounds(t0, t1)")
     x0 = state_like(problem, x0, t0, middle, "dvax.parameter_bounds(x0)")
@@ -81,6 +81,8 @@ def parameter_bounds(
     K = motion(system, t0, t1, knots)
     states = between(x, x0, "dvax.parameter_bounds(x)")
     responses = met(between(u, system.u0, "dvax.parameter_bounds(u)"), around_responses(system, K))
+    states = _from_the_origin("x", x, states)
+    responses = _from_the_origin("u", u, responses)
     eta = jtu.tree_map(lambda a, b: interval(np.asarray(a), np.asarray(b)), low, high)
     region = Region(interval(t0, t1), states, responses, eta)
     box = Region(region.t, bounded(states, x0), bounded(responses, system.u0), eta)
@@ -97,8 +99,9 @@ def parameter_bounds(
     of = lambda region: {  # noqa: E731
         f"modulus_{name}": _by_parameter(system, name, region, knots) for name in ("f", "h")
     }
-    moduli = of(region)
+    moduli, used = of(region), False
     if not all(np.isfinite(v) for v in moduli.values()) and start_radius is not None:
+        used = True
         without = ParameterBounds(constants, **span_of, **sizes, modulus_f=0.0, modulus_h=0.0)
         R = without.radius(start_radius)
         near = region._replace(
@@ -115,7 +118,27 @@ def parameter_bounds(
             raise _unknown(name, "the code of f, h or K does not bound it over this region")
     # In a region it is for the caller to say that trajectories stay in it.
     status: Status = "proved" if x is None and u is None else "declared"
-    return ParameterBounds(constants, status=status, **span_of, **sizes, **moduli)
+    domain = Domain(low, high, t0, t1, start_radius if used else None)
+    return ParameterBounds(constants, status=status, **span_of, **sizes, **moduli, domain=domain)
+
+
+def _from_the_origin(name: str, asked: Any, tree: Tree) -> Tree:
+    """The region with 0 in it: the estimates of Section 6 go out from f(t, 0, 0) and h(t, 0, 0), so
+    that moduli have to hold on the way from there."""
+
+    def one(v: Slope) -> Slope:
+        if asked is not None and not ((v.low <= 0) & (v.high >= 0)).all():
+            raise InputError(
+                InputProblem(
+                    f"dvax.parameter_bounds({name})", "a region without 0",
+                    "radii are counted from f(t, 0, 0) and h(t, 0, 0), on the way from where moduli "
+                    "of the region need not hold",
+                    "Widen it to one that contains 0",
+                )
+            )  # fmt: skip
+        return interval(np.minimum(v.low, 0.0), np.maximum(v.high, 0.0))
+
+    return jtu.tree_map(one, tree, is_leaf=is_slope)
 
 
 def _reach(
@@ -199,7 +222,14 @@ def _ball(tree: Tree, space: AbstractSpace, R: Any) -> Tree:
     return jtu.tree_map(met, tree, is_leaf=is_slope)
 
 
-def _check(problem: Problem, low: Tree, high: Tree) -> None:
+def _check(problem: Problem, low: Tree, high: Tree, start_radius: Any) -> None:
+    if start_radius is not None and not (np.ndim(start_radius) == 0 and 0 <= start_radius < np.inf):
+        raise InputError(
+            InputProblem(
+                "dvax.parameter_bounds(start_radius)", _tree.short(start_radius),
+                "it must be one number ≥ 0: a bound on ‖ζ‖", "Give the largest norm that is meant",
+            )
+        )  # fmt: skip
     same = _tree.same_shape(low, high)
     ordered = same and all(
         bool(np.all(np.asarray(a) <= np.asarray(b)))

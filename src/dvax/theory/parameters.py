@@ -3,13 +3,34 @@
 from typing import Any
 
 import equinox as eqx
+import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from .._tree import Tree
 from ..errors import InputError, InputProblem
 from .constants import Constants
 from .formulas import convolved
 from .status import Status, weakest
+
+
+class Domain(eqx.Module):
+    """low ≤ η ≤ high entry by entry, t0 ≤ t ≤ t1, and ‖ζ‖ ≤ start_radius where that was used."""
+
+    low: Tree
+    high: Tree
+    t0: float
+    t1: float
+    start_radius: float | None
+
+    def holds(self, args: Any) -> bool:
+        """Whether these parameters lie in the box."""
+        trees = (self.low, args, self.high)
+        low, at, high = (jtu.tree_leaves(tree) for tree in trees)
+        if not len(low) == len(at) == len(high):
+            return False
+        ends = zip(low, at, high, strict=True)
+        return all(bool(np.all((a <= v) & (v <= b))) for a, v, b in ends)
 
 
 class ParameterBounds(eqx.Module):
@@ -23,7 +44,9 @@ class ParameterBounds(eqx.Module):
     - `C_h0` ≥ ‖h(t, 0, 0, η)‖, `C_f0` ≥ ‖f(t, 0, 0, η)‖, (vi), (vii);
     - `modulus_f`, `modulus_h`: numbers ℓ with ‖f(t,x,u,η₁) − f(t,x,u,η₂)‖ ≤ ℓ_f ‖η₁ − η₂‖, and the same
       for h, (iii);
-    - `status`: of those five.
+    - `status`: of those five;
+    - `domain`: the box, the times and the initial states that they are for, from
+      `dvax.parameter_bounds`; None where nobody says.
 
     Distances d of parameters are in the norm that `modulus_f` and `modulus_h` are meant in.
 
@@ -48,6 +71,7 @@ class ParameterBounds(eqx.Module):
     C_f0: Any
     modulus_f: Any
     modulus_h: Any
+    domain: Domain | None
     given: Status = eqx.field(static=True)
 
     def __init__(
@@ -61,8 +85,9 @@ class ParameterBounds(eqx.Module):
         modulus_f: Any,
         modulus_h: Any,
         status: Status = "declared",
+        domain: Domain | None = None,
     ):
-        self.constants, self.given = constants, status
+        self.constants, self.given, self.domain = constants, status, domain
         wrong = []
         values = dict(
             T=T, kappa_K=kappa_K, C_h0=C_h0, C_f0=C_f0, modulus_f=modulus_f, modulus_h=modulus_h
