@@ -14,6 +14,7 @@ def test_the_curves_are_the_numbers_and_axes_have_units():
     bounds = dvax.parameter_bounds(problem, 2.9, 3.1, t1=2.0)
     seen = dvax.sensitivity.change(problem, -1.0, 0.0, 2.0, 3.0, bounds, dargs=0.1)
     for views in (seen.x, seen.u):
+        assert views.certified_sharp is not None
         assert np.all(views.actual <= views.certified_sharp + 1e-9)
         assert np.all(views.certified_sharp <= views.certified * (1 + 1e-12))
         assert np.max(np.abs(views.actual - views.predicted)) < 0.05
