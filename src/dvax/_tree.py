@@ -168,9 +168,8 @@ def require(condition: Callable[[], Any], name: str, given: Any, rule: str, mend
     """
     if not is_concrete(given):
         return
-    with (
-        jax.ensure_compile_time_eval()
-    ):  # what has a value may be met while something else is traced
+    # What has a value may be met while something else is traced.
+    with jax.ensure_compile_time_eval():
         holds = bool(condition())
     if not holds:
         raise InputError(InputProblem(name, short(given), rule, mend))

@@ -238,6 +238,8 @@ def test_bounds_of_a_box_of_parameters_say_nothing_outside_it():
         change(system, -1.0, 0.0, 2.0, 0.05, bounds, dargs=1.0)
     with pytest.raises(dvax.InputError, match=r"times \[0, 2\]"):
         change(system, -1.0, 5.0, 7.0, 0.05, bounds, dargs=0.01)
+    with pytest.raises(dvax.InputError, match=r"dargs.*structure"):
+        change(system, -1.0, 0.0, 2.0, 0.05, bounds, dargs=(0.01, 0.02))
     grows = problem(f=lambda t, x, u, a: a * x - u, K=dvax.sets.Box(0.0, 0.5))
     bounds = dvax.parameter_bounds(grows, 0.0, 0.1, t1=2.0, start_radius=1.0)
     with pytest.raises(dvax.InputError, match=r"norm 3"):

@@ -15,7 +15,7 @@ from ..evolution import ETD4RK, AbstractMethod, solve
 from ..problem import Problem
 from ..theory import ParameterBounds
 from ..theory.status import Status
-from .directional import Directional, directional_derivative
+from .directional import Directional, check_direction, directional_derivative
 
 
 class Views(NamedTuple):
@@ -105,6 +105,7 @@ def change(
     x0 = _tree.as_float(x0, "x0")
     tight: dict[str, Any] = dict(method=method, rtol=rtol, atol=atol, max_steps=max_steps)
     state, control = problem.spaces(x0)
+    check_direction(x0, args, dx0, dargs)
     moved_x0, moved_args = _moved(x0, dx0), _moved(args, dargs)
     _covers(bounds, t0, t1, (args, moved_args), [state.norm(x0), state.norm(moved_x0)])
     found = directional_derivative(

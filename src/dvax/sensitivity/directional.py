@@ -120,9 +120,7 @@ def directional_derivative(
             )
         )  # fmt: skip
     x0 = _tree.as_float(x0, "x0")
-    dx0 = _tree.zeros_like(x0) if dx0 is None else _tree.as_float(dx0, "dx0")
-    moving, rest, direction = _apart(args, dargs)
-    _check(x0, dx0, moving, direction)
+    dx0, moving, rest, direction = check_direction(x0, args, dx0, dargs)
     dx0 = jtu.tree_map(lambda d, a: d.astype(a.dtype), dx0, x0)
     method = ETD4RK() if method is None else method
     settings: dict[str, Any] = dict(rtol=rtol, atol=atol, max_steps=max_steps, method=method)
@@ -224,6 +222,14 @@ def _law(t: Any, dx: Tree, v: Tree, base: _Base) -> Tree:
         x, _, y = base.at(t)
         dy = base.problem.operator(base.sol.setup.args).apply(v)
         return _tree.sub(v, jax.jvp(F, (y, x, base.moving), (dy, dx, base.direction))[1])
+
+
+def check_direction(x0: Tree, args: Any, dx0: Tree, dargs: Any) -> tuple[Tree, Any, Any, Any]:
+    """(dx0, what moves of args, the rest, its direction); an `InputError` where they do not fit."""
+    dx0 = _tree.zeros_like(x0) if dx0 is None else _tree.as_float(dx0, "dx0")
+    moving, rest, direction = _apart(args, dargs)
+    _check(x0, dx0, moving, direction)
+    return dx0, moving, rest, direction
 
 
 def _apart(args: Any, dargs: Any) -> tuple[Any, Any, Any]:

@@ -20,7 +20,7 @@ from .enclosure import Enclosure
 from .formulas import convolved
 from .known import knowledge
 from .motion import motion, slopes, times
-from .parameters import Domain, ParameterBounds
+from .parameters import ParameterBounds, ParameterSet
 from .region import Region, between
 from .slope import Slope, TooLarge, interval, is_slope
 from .status import Status
@@ -118,7 +118,7 @@ def parameter_bounds(
             raise _unknown(name, "the code of f, h or K does not bound it over this region")
     # In a region it is for the caller to say that trajectories stay in it.
     status: Status = "proved" if x is None and u is None else "declared"
-    domain = Domain(low, high, t0, t1, start_radius if used else None)
+    domain = ParameterSet(low, high, t0, t1, start_radius if used else None)
     return ParameterBounds(constants, status=status, **span_of, **sizes, **moduli, domain=domain)
 
 

@@ -14,7 +14,7 @@ from .formulas import convolved
 from .status import Status, weakest
 
 
-class Domain(eqx.Module):
+class ParameterSet(eqx.Module):
     """low ≤ η ≤ high entry by entry, t0 ≤ t ≤ t1, and ‖ζ‖ ≤ start_radius where that was used."""
 
     low: Tree
@@ -71,7 +71,7 @@ class ParameterBounds(eqx.Module):
     C_f0: Any
     modulus_f: Any
     modulus_h: Any
-    domain: Domain | None
+    domain: ParameterSet | None
     given: Status = eqx.field(static=True)
 
     def __init__(
@@ -85,7 +85,7 @@ class ParameterBounds(eqx.Module):
         modulus_f: Any,
         modulus_h: Any,
         status: Status = "declared",
-        domain: Domain | None = None,
+        domain: ParameterSet | None = None,
     ):
         self.constants, self.given, self.domain = constants, status, domain
         wrong = []
