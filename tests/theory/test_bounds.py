@@ -294,7 +294,7 @@ def test_constants_of_a_region_are_good_while_the_trajectory_stays_in_it():
     # x passes 1 at about t = 0.9 and stays above.
     leaves = int(np.argmax(np.asarray(sol.xs) > 1.0 - 1e-4))
     within = dvax.bound_error(case.problem, sol, check(x=(-2.0, 1.0)).constants)
-    assert within.status == "declared"
+    assert within.status == "proved"
     for v, w in (
         (within.x, free.x),
         (within.x_paper, free.x_paper),
@@ -304,6 +304,62 @@ def test_constants_of_a_region_are_good_while_the_trajectory_stays_in_it():
         assert np.all(np.isinf(np.asarray(v)[leaves:]))
     longer = run(3.0, np.array([3.0]))
     assert dvax.bound_error(case.problem, longer, check().constants).status == "declared"
+
+
+def excursion() -> dvax.Problem:
+    """x is near 0 but for a pulse at t = ½, which lifts it to 1.5; u = x/2 up to 1."""
+    return dvax.Problem(
+        A=dvax.generators.Scalar(-4.0),
+        P=dvax.operators.Scaling(1.0),
+        K=dvax.sets.Box(0.0, 1.0),
+        f=lambda t, x, u, args: 0.1 * x**2 + 32.0 * jnp.exp(-(((t - 0.5) / 0.03) ** 2)) - 0.1 * u,
+        h=lambda t, x, u, args: x - u,
+    )
+
+
+@pytest.mark.parametrize("method", [dvax.ETD2RK(), dvax.Picard()], ids=["steps", "windows"])
+@pytest.mark.parametrize(
+    ("region", "good"),
+    [
+        ({"x": (-0.5, 2.0)}, True),
+        ({"x": (-0.5, 1.2)}, False),
+        ({"x": (-0.5, 2.0), "u": (-0.1, 1.1)}, True),
+        ({"x": (-0.5, 2.0), "u": (-0.1, 0.5)}, False),
+    ],
+)
+def test_what_happens_between_two_saved_times_is_seen(method, region, good):
+    """The saved states are within 0.1 of 0, whatever has been in between."""
+    problem = excursion()
+    check = dvax.verify(problem, 0.0, 0.0, 3.0, **region)
+    assert check.constants is not None and check.status == "proved"
+    ts = [0.2, 2.5, 3.0]
+    sol = dvax.solve(problem, 0.0, 0.0, 3.0, ts=ts, rtol=1e-5, atol=1e-8, method=method)
+    assert np.abs(np.asarray(sol.xs)).max() < 0.1
+    bound = dvax.bound_error(problem, sol, check.constants)
+    assert bound.status == "proved"
+    np.testing.assert_array_equal(np.isfinite(np.asarray(bound.x)), [True, good, good])
+    # Kept by the solve itself it is the same.
+    kept = dvax.solve(
+        problem, 0.0, 0.0, 3.0, ts=ts, rtol=1e-5, atol=1e-8, method=method,
+        constants=check.constants,
+    )  # fmt: skip
+    assert kept.extent is not None
+    again = dvax.bound_error(problem, kept, check.constants)
+    np.testing.assert_allclose(again.x, bound.x, rtol=1e-6)
+    low, high = kept.extent.x
+    assert 1.3 < float(high[1]) < 1.7 and float(low[1]) > -0.1 and float(high[0]) < 0.1
+
+
+@pytest.mark.parametrize("bound", [1.2, 2.0])
+def test_no_run_is_certified_by_constants_that_it_left_in_between(bound):
+    problem = excursion()
+    constants = dvax.verify(problem, 0.0, 0.0, 3.0, x=(-0.5, bound)).constants
+    run = lambda: dvax.solve(problem, 0.0, 0.0, 3.0, constants=constants, certified_tol=1e-3)  # noqa: E731
+    if bound < 1.5:
+        with pytest.raises(dvax.InputError, match=r"region that the trajectory leaves by t = 0\.5"):
+            run()
+    else:
+        assert float(run().stats["certified_bound"]) <= 1e-3
 
 
 def test_a_method_without_a_defect_is_refused():

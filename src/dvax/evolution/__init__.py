@@ -1,5 +1,7 @@
 """The mild solution: exponential integrators, step control, `solve`, `Solution`."""
 
+from .extent import Extent as Extent
+from .growth import between as between
 from .growth import disturbance as disturbance
 from .growth import gronwall as gronwall
 from .implicit import Implicit as Implicit

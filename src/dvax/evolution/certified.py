@@ -18,7 +18,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..problem import Problem
-from .growth import disturbance, gronwall
+from .growth import between, disturbance, gronwall
 from .results import RESULTS
 from .solution import Solution
 
@@ -30,7 +30,7 @@ _AIM = 0.7
 
 _RUNS = 8
 _LOOKS = 256
-"""Times at which it is looked whether a run stays in the region of its constants."""
+"""Times up to each of which it is looked whether a run stays in the region of its constants."""
 
 _ROUNDINGS = 256.0
 """A rate f̃ is taken to be known to so many roundings of its size, and no defect to be smaller."""
@@ -74,13 +74,12 @@ def certified(
         bounds = _bounds(solution, known, t0)
         bound = float(np.max(np.asarray(bounds)))
         if bound <= tol:
-            left = _leaves(solution, constants, bounds)
-            if left is None and _of_region(constants):
-                # Between the saved times as well, as far as one can look.
+            if of_region(constants):
+                # The same steps, saved more often: the bounds in between are the sharper for it.
                 looks = run(np.linspace(t0, t1, _LOOKS + 1)[1:], atol)
-                left = _leaves(looks, constants, _bounds(looks, known, t0))
-            if left is not None:
-                raise _outside(left)
+                left = _leaves(looks, constants, _all_along(looks, known, t0))
+                if left is not None:
+                    raise _outside(left)
             return _with_bound(solution, bound)
         atol = min(0.5 * atol, _AIM * atol * tol / bound) if np.isfinite(bound) else 0.1 * atol
     raise _hopeless(tol, bound, known, span)
@@ -121,31 +120,42 @@ def _bounds(solution: Solution, known: _Growth, t0: float) -> Any:
     """The bound at every saved time."""
     assert solution.defect is not None and solution.settled is not None
     impulse = (solution.defect, solution.law_defect), solution.settled
-    return _least(t0, solution.ts, impulse, known)
+    return _least(t0, solution.ts, impulse, known)[0]
+
+
+def _all_along(solution: Solution, known: _Growth, t0: float) -> Any:
+    """The bound at all times since the saved time before."""
+    assert solution.defect is not None and solution.settled is not None
+    impulse = (solution.defect, solution.law_defect), solution.settled
+    return _least(t0, solution.ts, impulse, known)[1]
 
 
 @jax.jit
-def _least(t0: Any, ts: Any, impulse: tuple, known: _Growth) -> jax.Array:
+def _least(t0: Any, ts: Any, impulse: tuple, known: _Growth) -> tuple[jax.Array, jax.Array]:
+    """At the saved times, and at all times before each of them since the last."""
     acted, settled = (disturbance(known, *parts) for parts in impulse)
-    each = [gronwall(t0, ts, acted, settled, rate, M, 0.0) for M, rate in known.rates]
-    return jnp.min(jnp.stack(each), axis=0)
+    at, on_the_way = [], []
+    for M, rate in known.rates:
+        at.append(gronwall(t0, ts, acted, settled, rate, M, 0.0))
+        on_the_way.append(between(t0, ts, acted, settled, rate, M, 0.0, at[-1]))
+    return jnp.min(jnp.stack(at), axis=0), jnp.min(jnp.stack(on_the_way), axis=0)
 
 
-def _of_region(constants: Any) -> bool:
+def of_region(constants: Any) -> bool:
     """Whether x or u must stay somewhere for these to hold."""
     domain = getattr(constants, "domain", None)
     return domain is not None and not domain.free
 
 
 def _leaves(solution: Solution, constants: Any, bounds: Any) -> float | None:
-    """The first saved time at which x or u, with its bound, is not where the constants hold."""
-    if not _of_region(constants):
-        return None
-    domain = constants.domain
+    """The first saved time by which x or u, with its bound, has been where the constants do not
+    hold."""
+    domain, extent = constants.domain, solution.extent
+    assert extent is not None
     law_error = solution.law_residual / constants.gamma + solution.law_step
     of_u = constants.L * bounds + constants.norm_P_inv * law_error
     spaces = solution.setup.problem.spaces(solution.setup.x0)
-    inside = np.asarray(domain.keeps(solution.xs, solution.us, bounds, of_u, spaces))
+    inside = np.asarray(domain.keeps(*extent, bounds, of_u, spaces))
     return None if inside.all() else float(solution.ts[int(np.argmin(inside))])
 
 

@@ -134,8 +134,8 @@ class Flow(eqx.Module):
         solved = jnp.all((jnp.abs(found.w).ravel() <= most) & (apart <= most))
         return Rate(value, found.y, found.z, residual, solved, jnp.asarray(1))
 
-    def enclosure(self, t: Chord, x: Tree) -> Tree:
-        """f̃ along chords of t and x, as chords, for a direct law on pointwise intervals.
+    def enclosure(self, t: Chord, x: Tree) -> tuple[Tree, Tree]:
+        """(f̃, u) along chords of t and x, as chords, for a direct law on pointwise intervals.
 
         **Raises:** `NoEnclosure` where f, h or K uses an operation without a rule.
         """
@@ -151,7 +151,7 @@ class Flow(eqx.Module):
             lambda q, low, up: smallest(largest(q, low), up), z, *ends, is_leaf=is_chord
         )
         u = enclose(P.inverse, y)
-        return enclose(lambda t, x, u: problem.f(t, x, u, args), t, x, u)
+        return enclose(lambda t, x, u: problem.f(t, x, u, args), t, x, u), u
 
     def switches(self, t: Any, x: Tree, z: Tree) -> jax.Array | None:
         """What changes its sign where the response has a kink; None where K does not say."""

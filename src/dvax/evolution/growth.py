@@ -52,3 +52,15 @@ def gronwall(
     zero = jnp.zeros((), ts.dtype)
     start = (begin, begin, zero, jnp.asarray(M * initial, ts.dtype), begin)
     return lax.scan(advance, start, (ts, impulse, settled))[1]
+
+
+def between(
+    t0: Any, ts: Any, impulse: Any, settled: Any, rate: Any, M: Any, initial: Any, bounds: Any
+) -> jax.Array:
+    """The most that `bounds`, which `gronwall` gave at the saved times, may be at any time between
+    the saved time before and this one: e^{c₊Δ} (the bound there + M ∫ dI over the time between)."""
+    first = lambda value, rest: jnp.concatenate([jnp.asarray(value, ts.dtype)[None], rest[:-1]])  # noqa: E731
+    grown = jnp.exp(jnp.maximum(rate, 0.0) * (ts - first(t0, ts)))
+    most = grown * (first(M * initial, bounds) + M * (impulse - first(0.0, settled)))
+    # The saved time itself belongs to it.
+    return jnp.where(jnp.isnan(most), jnp.inf, jnp.maximum(most, bounds))

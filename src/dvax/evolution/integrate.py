@@ -31,6 +31,7 @@ class Options(NamedTuple):
 
     fixed: bool
     measure: bool
+    ranged: bool
     careful: bool
     dense: bool
     max_steps: int
@@ -110,7 +111,7 @@ def _by_windows(
     x0 = setup.x0
     growth = flow.generator.growth(flow.state_space(x0)) if flow.enclosed else None
     ends = stops[0], stops[-1]
-    stepper = Stepper(ETD2RK(), flow, True, False, True, ends, None, growth)
+    stepper = Stepper(ETD2RK(), flow, True, False, options.ranged, True, ends, None, growth)
     rtol, atol, horizon = map(setup.number, ("rtol", "atol", "horizon"))
     sizes = jax.vmap(
         lambda *parts: jnp.stack(root_mean_squares(setup.problem.spaces(x0)[0])(*parts))
@@ -174,7 +175,9 @@ def _stepper(
         # Once a run: for a matrix it takes an eigenvalue.
         growth = flow.generator.growth(flow.state_space(setup.x0))
     locate = not options.fixed and _can_locate(flow, t0, setup.x0)
-    stepper = Stepper(method, flow, measure, locate, options.careful, (t0, t1), None, growth)
+    stepper = Stepper(
+        method, flow, measure, locate, options.ranged, options.careful, (t0, t1), None, growth
+    )
     if options.fixed and stops.shape[0] == 2 and not method.linearises:
         length = (t1 - t0) / step_count(t1 - t0, setup.number("dt"))
         return dataclasses.replace(stepper, uniform=stepper.factors(length))
@@ -244,6 +247,7 @@ def _assembled(
         defect=rows.impulse[0] if measured else None,
         law_defect=rows.impulse[1] if measured else None,
         settled=rows.settled if measured else None,
+        extent=rows.extent if measured else None,
         stats=stats,
         result=result,
         records=records,
@@ -255,7 +259,7 @@ def _assembled(
 def _end_alone(end: State | picard.State, complete: Any, t1: Any) -> Saved:
     """The end as the one saved time."""
     x = jtu.tree_map(lambda leaf: jnp.where(complete, leaf, jnp.nan), end.x)
-    one = Saved(jnp.where(complete, t1, jnp.inf), x, end.impulse, end.impulse)
+    one = Saved(jnp.where(complete, t1, jnp.inf), x, end.impulse, end.impulse, end.extent)
     return jtu.tree_map(lambda leaf: leaf[None], one)
 
 

@@ -17,6 +17,7 @@ from .. import _tree
 from .._tree import Tree
 from .checkpoints import Checkpoints
 from .control import AbstractController
+from .extent import Extent
 from .results import RESULTS
 from .stepper import Factors, Memory, Stepper, inside, local
 
@@ -35,13 +36,15 @@ class Saved(NamedTuple):
 
     `impulse` = (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) up to the end of the step that the time lies in, so
     that x_h is the exact solution of the system with a disturbance of that size; `settled` is what
-    both were at the start of that step: what has surely acted by then.
+    both were at the start of that step: what has surely acted by then. `extent` says where x_h and u_h
+    have been from the beginning to the end of that step, where it was asked for.
     """
 
     t: Any
     x: Tree
     impulse: tuple[Any, Any]
     settled: tuple[Any, Any]
+    extent: Extent | None = None
 
 
 class State(NamedTuple):
@@ -59,6 +62,7 @@ class State(NamedTuple):
     factors: Factors | None
     control: Any
     jumped: Any
+    extent: Extent | None
     last: tuple[Record, tuple[Any, Any]] | None
     records: Record | None
     ends: jax.Array | None
@@ -129,6 +133,7 @@ class Loop(eqx.Module):
             factors=None if own else stepper.factors(controller.end(control) - t0),
             control=control,
             jumped=jnp.asarray(True),
+            extent=stepper.extent(x0),
             last=(record, (zero, zero)) if saves and measure else None,
             records=records,
             ends=jnp.zeros(self.max_steps, t0.dtype)
@@ -163,10 +168,14 @@ class Loop(eqx.Module):
         taken = Record(t0, t1 - t0, state.x, step.c)
         # `last` and `records` of a step that is not kept are written over by the next one, or never
         # looked at: nothing ends inside a step that was not kept.
-        ahead = (t1, step.x1, impulse, step.memory, verdict.jumped)
+        extent = state.extent
+        if extent is not None:
+            assert step.extent is not None
+            extent = extent.joined(step.extent)
+        ahead = (t1, step.x1, impulse, step.memory, verdict.jumped, extent)
         last = None if state.last is None else (taken, state.impulse)
         if self.guarded:
-            behind = (t0, state.x, state.impulse, state.memory, state.jumped)
+            behind = (t0, state.x, state.impulse, state.memory, state.jumped, state.extent)
             ahead, last = _tree.where(verdict.kept, (ahead, last), (behind, state.last))
         checkpoints = state.checkpoints
         if checkpoints is not None:
@@ -177,7 +186,7 @@ class Loop(eqx.Module):
             meter = diffrax.TextProgressMeter().step(
                 meter, (ahead[0] - stops[0]) / (stops[-1] - stops[0])
             )
-        t, x, impulse, memory, jumped = ahead
+        t, x, impulse, memory, jumped, extent = ahead
         return State(
             t=t,
             x=x,
@@ -186,6 +195,7 @@ class Loop(eqx.Module):
             factors=None if state.factors is None else factors,
             control=verdict.state,
             jumped=jumped,
+            extent=extent,
             last=last,
             records=None if state.records is None else _tree.put(state.records, state.steps, taken),
             ends=None if state.ends is None else _tree.put(state.ends, state.steps, t1),
@@ -225,7 +235,7 @@ class Loop(eqx.Module):
             impulse = _tree.where(theta > 0.0, state.impulse, before)
             settled = _tree.where(time >= state.t, state.impulse, before)
         x = jtu.tree_map(lambda leaf: jnp.where(reached, leaf, jnp.nan), x)
-        return Saved(jnp.where(reached, time, jnp.inf), x, impulse, settled)
+        return Saved(jnp.where(reached, time, jnp.inf), x, impulse, settled, state.extent)
 
     def _factors(self, state: State, t0: Any, t1: Any) -> Factors | None:
         """The propagators of a step, None where it makes its own."""

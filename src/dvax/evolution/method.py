@@ -204,3 +204,17 @@ def combined(*terms: tuple[float, Tree]) -> Tree:
     weights, trees = zip(*terms, strict=True)
     one = lambda *leaves: sum(w * v for w, v in zip(weights, leaves, strict=True) if w)  # noqa: E731
     return jtu.tree_map(one, *trees)
+
+
+def extrapolation(nodes: tuple[float, ...]) -> list[float]:
+    """Weights of values at the nodes that add up to how far the last inner one is from what the others
+    predict: the parabola's (or the line's) for as many nodes as there are."""
+    k = len(nodes) - 2
+    others = [j for j in range(len(nodes)) if j != k]
+    weights = [1.0] * len(nodes)
+    for j in others:
+        for i in others:
+            if i != j:
+                weights[j] *= (nodes[k] - nodes[i]) / (nodes[j] - nodes[i])
+        weights[j] *= -1.0
+    return weights

@@ -21,6 +21,7 @@ from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..generators import AbstractGenerator, AbstractPropagator
 from .control import land
+from .extent import Extent
 from .loop import Record, Saved
 from .results import RESULTS
 from .stepper import Stepper, inside, within
@@ -86,14 +87,15 @@ class Picard(eqx.Module):
 
 class Window(NamedTuple):
     """The steps of a window from a to b as one record, the states `after` each, the state at b, the
-    defect of each step, and how the sweeps went; `settled` says that the law was solved everywhere and
-    the sweeps converged."""
+    defect of each step, the extent of all, and how the sweeps went; `settled` says that the law was
+    solved everywhere and the sweeps converged."""
 
     record: Record
     after: Tree
     end: Tree
     error: Tree
     impulse: tuple[jax.Array, jax.Array]
+    extent: Extent | None
     settled: jax.Array
     sweeps: jax.Array
     contraction: jax.Array
@@ -109,6 +111,7 @@ class State(NamedTuple):
     last: Record
     before: tuple[Any, Any]
     impulse: tuple[Any, Any]
+    extent: Extent | None
     records: Record | None
     steps: Any
     windows: Any
@@ -165,8 +168,8 @@ class Run(eqx.Module):
             records = records._replace(start=jnp.full_like(records.start, jnp.inf))
         nought = jnp.asarray(0)
         return State(
-            t0, x0, many * self.first, jnp.asarray(1), rows(many), (zero, zero), (zero, zero), records,
-            nought, nought, nought, nought, zero, RESULTS.successful,
+            t0, x0, many * self.first, jnp.asarray(1), rows(many), (zero, zero), (zero, zero),
+            self.stepper.extent(x0), records, nought, nought, nought, nought, zero, RESULTS.successful,
         )  # fmt: skip
 
     def _until(self, state: State, time: Any) -> State:
@@ -209,11 +212,15 @@ class Run(eqx.Module):
             records = jtu.tree_map(lambda leaf, new: leaf.at[place].set(new), records, taken)
         last = self.stops.shape[0] - 1
         reached = jnp.where(kept & (b == stop), state.stop + 1, state.stop)
-        new = (b, window.end, window.record, state.impulse, impulse)
-        old = (a, state.x, state.last, state.before, state.impulse)
-        t, x, record, before, impulse = _tree.where(kept, new, old)
+        extent = state.extent
+        if extent is not None:
+            assert window.extent is not None
+            extent = extent.joined(window.extent)
+        new = (b, window.end, window.record, state.impulse, impulse, extent)
+        old = (a, state.x, state.last, state.before, state.impulse, state.extent)
+        t, x, record, before, impulse, extent = _tree.where(kept, new, old)
         return State(
-            t, x, length, jnp.minimum(reached, last), record, before, impulse, records,
+            t, x, length, jnp.minimum(reached, last), record, before, impulse, extent, records,
             jnp.where(kept, state.steps + many, state.steps), state.windows + 1,
             jnp.where(kept, state.refused, state.refused + many), state.sweeps + window.sweeps,
             jnp.maximum(state.contraction, jnp.where(kept, window.contraction, 0.0)),
@@ -274,11 +281,14 @@ class Run(eqx.Module):
         c = _pieces(known.value)
         start, end = _rows(X, slice(-1)), _rows(X, slice(1, None))
         ys = None if guess is None else _rows(known.y, slice(-1))
-        error, impulse, looked = jax.vmap(stepper.look)(ends[:-1], ends[1:], start, end, c, ys)
+        sample, looked = jax.vmap(stepper.look)(ends[:-1], ends[1:], start, end, c, ys)
+        impulse = sample.defect, sample.law_defect
         record = Record(ends[:-1], jnp.broadcast_to(h, (many,)), start, c)
         return Window(
-            record, end, _rows(X, -1), error, impulse, settled & jnp.all(looked), k, contraction
-        )
+            record, end, _rows(X, -1), sample.error, impulse,
+            sample.extent.over_rows() if stepper.ranged else None,
+            settled & jnp.all(looked), k, contraction,
+        )  # fmt: skip
 
     def _read(self, state: State, time: Any) -> Saved:
         """The trajectory at a time in the last window; t = ∞ where the run did not get there."""
@@ -296,7 +306,7 @@ class Run(eqx.Module):
         started = time > record.start[0]
         impulse = _tree.where(started, state.impulse, state.before)
         settled = _tree.where(time >= state.t, state.impulse, state.before)
-        return Saved(jnp.where(reached, time, jnp.inf), x, impulse, settled)
+        return Saved(jnp.where(reached, time, jnp.inf), x, impulse, settled, state.extent)
 
 
 def _pieces(value: Tree) -> tuple[Tree, Tree]:

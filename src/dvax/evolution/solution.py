@@ -10,6 +10,7 @@ import numpy as np
 from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem, SolveError
+from .extent import Extent
 from .implicit import Implicit
 from .loop import Record
 from .regimes import Regimes, regimes
@@ -34,8 +35,10 @@ class Solution(eqx.Module):
       integral of ‖w‖ over the frozen solves. Both None where not measured (fixed steps, unless
       `measure=True`). `dvax.bound_error` turns them into error bounds;
     - `settled`: (defect, law_defect) at the start of the step that each saved time lies in;
-    - `enclosed`: whether the defect is an enclosure over every step (`dvax.evolution.chords`) or an
-      estimate from samples;
+    - `extent`: between what x_h and u_h stayed from t0 to the end of that step, where `constants=` of a
+      region were given;
+    - `enclosed`: whether the defect, and the extent, are enclosures over every step
+      (`dvax.evolution.chords`) or estimates from samples;
     - `stats`: steps accepted and rejected, `evaluations` of F in them (without those that look for
       kinks or read u at saved times), and where the run stands: t, x and the next step; with
       `compile_time` and `run_time` in seconds, unless the solve is part of a larger compiled program;
@@ -67,6 +70,7 @@ class Solution(eqx.Module):
     defect: jax.Array | None
     law_defect: jax.Array | None
     settled: tuple[jax.Array, jax.Array] | None
+    extent: Extent | None
     stats: dict[str, Any]
     result: RESULTS
     records: Record | None

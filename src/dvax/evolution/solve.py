@@ -13,7 +13,7 @@ from ..errors import DifferentiationError, InputError, InputProblem, SolveError
 from ..problem import Problem
 from ..vi import AbstractSolver, Auto
 from .arguments import bound_steps, check, warn_precision
-from .certified import certified
+from .certified import certified, of_region
 from .compiled import compiled
 from .diagnose import diagnose
 from .implicit import Implicit
@@ -133,9 +133,11 @@ def solve(
         "dt0": span * 1e-3 if dt0 is None else _number(dt0),
         "horizon": span if horizon is None else _number(horizon),
     }
+    measured = not isinstance(method, Implicit) and (bool(measure) or not fixed)
     options = Options(
         fixed=fixed,
-        measure=not isinstance(method, Implicit) and (bool(measure) or not fixed),
+        measure=measured,
+        ranged=measured and of_region(constants),
         careful=not fixed,
         dense=dense,
         max_steps=bound_steps(max_steps, fixed, t0, t1, dt),
@@ -226,6 +228,7 @@ def _trim(solution: Solution) -> Solution:
         "defect",
         "law_defect",
         "settled",
+        "extent",
     )
     new = [jax.tree_util.tree_map(cut, getattr(solution, name)) for name in fields]
     return eqx.tree_at(

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,9 +17,10 @@ from ..generators import AbstractPropagator, Arc, Growth
 from ..problem import END_ULPS, KNOT_ULPS
 from .chords import Chord, is_chord
 from .evaluations import Plan, Visit, evaluated
+from .extent import Extent
 from .flow import Flow, Rate
 from .kinks import first_change
-from .method import AbstractMethod, polynomial, shortened
+from .method import AbstractMethod, extrapolation, polynomial, shortened
 
 _DOUBT = 4.0
 """By how many times its interpolation error z is taken to be uncertain between the samples."""
@@ -51,9 +52,10 @@ class Step(NamedTuple):
 
     `error` is the defect entry by entry (None where not measured), `impulse` = (∫ ‖p − f̃(·, x_h)‖ ds,
     ∫ ‖w‖ ds) over the step. `kink(asked)` is the time of the first kink of the response inside, ∞
-    where there is none or nobody `asked` (None where nobody looks). `begun` says that the law was
-    solved at the start, `solved` that it was everywhere; `finite`, that there are no bad values that a
-    shorter step would not mend; `evaluations` counts those of F.
+    where there is none or nobody `asked` (None where nobody looks). `extent` is where x_h and u_h have
+    been (None where nobody asks). `begun` says that the law was solved at the start, `solved` that it
+    was everywhere; `finite`, that there are no bad values that a shorter step would not mend;
+    `evaluations` counts those of F.
     """
 
     x1: Tree
@@ -61,6 +63,7 @@ class Step(NamedTuple):
     error: Tree | None
     impulse: tuple[Any, Any]
     kink: Callable[[Any], Any] | None
+    extent: Extent | None
     memory: Memory
     begun: Any
     solved: Any
@@ -69,14 +72,15 @@ class Step(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """The defect of one step: entry by entry for the step control, integrated for certificates; and the
-    rates along x_h that it was made from, the last one at the end."""
+    """The defect of one step: entry by entry for the step control, integrated for certificates; the
+    rates along x_h that it was made from, the last one at the end; and where x_h and u_h have been."""
 
     thetas: tuple[float, ...]
     rates: list[Rate]
     error: Tree
     defect: jax.Array
     law_defect: jax.Array
+    extent: Extent
 
 
 def inside(flow: Flow, length: Any, theta: Any, x0: Tree, c: tuple[Tree, ...]) -> Tree:
@@ -121,6 +125,7 @@ class Stepper(eqx.Module):
 
     - `measure`: sample the defect inside every step, which adaptive steps and certificates need;
     - `locate`: look for kinks of the response inside every step;
+    - `ranged`: keep where x_h and u_h have been, which constants of a region need;
     - `careful`: look for bad values after every step, at the price of a second pass over memory;
     - `ends`: first and last time of the run;
     - `uniform`: the propagators, where all steps have one length that is known beforehand;
@@ -131,6 +136,7 @@ class Stepper(eqx.Module):
     flow: Flow
     measure: bool = eqx.field(static=True)
     locate: bool = eqx.field(static=True)
+    ranged: bool = eqx.field(static=True)
     careful: bool = eqx.field(static=True)
     ends: tuple[Any, Any]
     uniform: Factors | None
@@ -143,6 +149,12 @@ class Stepper(eqx.Module):
             return Memory(None, guess)
         blank = jax.eval_shape(lambda: self._kept(self.flow.rate(self.ends[0], x0, guess)))
         return Memory(jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), blank), guess)
+
+    def extent(self, x0: Tree) -> Extent | None:
+        """Before the first step x_h has been at x₀ alone, and u_h nowhere."""
+        if not self.ranged:
+            return None
+        return Extent.at_start(x0, self.flow.problem.zero_control(x0))
 
     def factors(self, h: Any) -> Factors:
         """Propagators over h."""
@@ -181,10 +193,11 @@ class Stepper(eqx.Module):
         begin, kept = self.ends[0], memory.rate
         (c, x1), visits = evaluated(self.flow, plan, begin, x0, memory.guess, kept, jumped)
         first, last = visits[0].rate, visits[-1].rate
-        error, impulse, kink = None, (0.0, 0.0), None
+        error, impulse, kink, extent = None, (0.0, 0.0), None, None
         if self.measure:
             sample = self._measure(t0, t1, x0, x1, c, visits)
             error, impulse = sample.error, (sample.defect, sample.law_defect)
+            extent = sample.extent if self.ranged else None
             if self.locate:
                 kink = partial(self._kink, t0, t1, x0, c, first, sample)
             # Further in, a bad value may come from a step that was too long: it is cut, not fatal.
@@ -203,8 +216,9 @@ class Stepper(eqx.Module):
         counts = [visit.rate.evaluations for visit in visits]
         own = counts[0] if kept is None else jnp.where(jumped, counts[0], 0)
         return Step(
-            x1, c, error, impulse, kink, after, first.solved, solved, finite, sum(counts[1:], own)
-        )
+            x1, c, error, impulse, kink, extent, after, first.solved, solved, finite,
+            sum(counts[1:], own),
+        )  # fmt: skip
 
     def _local(
         self, t0: Any, t1: Any, x0: Tree, factors: Factors | None, guess: Tree | None
@@ -272,9 +286,9 @@ class Stepper(eqx.Module):
 
     def look(
         self, t0: Any, t1: Any, x0: Tree, x1: Tree, c: tuple[Tree, ...], guess: Tree | None
-    ) -> tuple[Tree, tuple[Any, Any], Any]:
-        """The defect of a step that was made elsewhere, entry by entry and integrated, and whether the
-        law was solved where it was looked at."""
+    ) -> tuple[Sample, Any]:
+        """The defect of a step that was made elsewhere, and whether the law was solved where it was
+        looked at."""
 
         def run(evaluate: Callable[[Any, Tree], Rate]) -> tuple[tuple[Tree, ...], Tree]:
             for theta, x in zip((0.0, *self.method.samples, 1.0), points, strict=True):
@@ -286,7 +300,7 @@ class Stepper(eqx.Module):
         _, visits = evaluated(self.flow, run, self.ends[0], x0, guess, None, True)
         sample = self._measure(t0, t1, x0, x1, c, visits)
         solved = jnp.all(jnp.stack([visit.rate.solved for visit in visits]))
-        return sample.error, (sample.defect, sample.law_defect), solved
+        return sample._replace(rates=[]), solved
 
     def _kept(self, rate: Rate) -> Rate:
         """What the next step needs of a rate: not the law behind it, where nothing samples it."""
@@ -310,7 +324,7 @@ class Stepper(eqx.Module):
         bend = self.flow.generator.bend(Arc(h, x0, x1, c), space, growth)
         x = jtu.tree_map(Chord, x0, x1, bend)
         t = Chord(self._within(t0, t1, 0.0), self._within(t0, t1, 1.0), jnp.zeros_like(t0))
-        along = self.flow.enclosure(t, x)
+        along, u = self.flow.enclosure(t, x)
         at_start = jtu.tree_map(
             lambda q, p: jnp.abs(q.a - p) + q.dev, along, c[0], is_leaf=is_chord
         )
@@ -319,7 +333,7 @@ class Stepper(eqx.Module):
         )
         error = _tree.scale(0.5, _tree.add(at_start, at_end))
         defect = 0.5 * h * (space.norm(at_start) + space.norm(at_end))
-        return Sample((), [last], error, defect, jnp.zeros_like(defect))
+        return Sample((), [last], error, defect, jnp.zeros_like(defect), Extent.of_chords(x, u))
 
     def _sampled(self, t0: Any, t1: Any, x0: Tree, c: Any, visits: list[Visit]) -> Sample:
         """The defect δ = p − f̃(·, x_h) at the start, inside and at the end of the step.
@@ -342,7 +356,7 @@ class Stepper(eqx.Module):
 
         # How well z, the unconstrained value of the law, is predicted by its other samples.
         zs = [visit.rate.z for visit in along]
-        weights = _extrapolation((0.0, *thetas, 1.0))
+        weights = extrapolation((0.0, *thetas, 1.0))
         doubt = jtu.tree_map(
             lambda *z: _DOUBT * sum(w * v for w, v in zip(weights, z, strict=True)), *zs
         )
@@ -353,7 +367,12 @@ class Stepper(eqx.Module):
         space = self.flow.state_space(x0)
         defect = h * sum(map(space.norm, (*ends, bump, unseen)))
         law_defect = h * jnp.max(jnp.stack([visit.rate.residual for visit in along]))
-        return Sample(thetas, [*inner, last], error, defect, law_defect)
+        places = [
+            (visit.x, self.flow.operator.inverse(visit.rate.y))
+            for visit in lax.stop_gradient(along)
+        ]
+        extent = reduce(Extent.joined, [Extent((x, x), (u, u)) for x, u in places])
+        return Sample(thetas, [*inner, last], error, defect, law_defect, extent)
 
     def _unseen(self, visits: list[Visit], doubt: Tree) -> Tree:
         """The most that is hidden at any of them; where projections are iterated, from one place of
@@ -364,20 +383,6 @@ class Stepper(eqx.Module):
             return jtu.tree_map(lambda *h: jnp.max(jnp.stack(h), axis=0), *found)
         stacked = lax.map(hidden, jtu.tree_map(lambda *leaves: jnp.stack(leaves), *visits))
         return jtu.tree_map(lambda leaf: jnp.max(leaf, axis=0), stacked)
-
-
-def _extrapolation(nodes: tuple[float, ...]) -> list[float]:
-    """Weights of values at the nodes that add up to how far the last inner one is from what the others
-    predict: the parabola's (or the line's) for as many nodes as there are."""
-    k = len(nodes) - 2
-    others = [j for j in range(len(nodes)) if j != k]
-    weights = [1.0] * len(nodes)
-    for j in others:
-        for i in others:
-            if i != j:
-                weights[j] *= (nodes[k] - nodes[i]) / (nodes[j] - nodes[i])
-        weights[j] *= -1.0
-    return weights
 
 
 def _ulp(t0: Any, t1: Any) -> Any:

@@ -15,6 +15,7 @@ holds with M = 1 and c = μ: d/dt‖x_h − x‖ ≤ μ‖x_h − x‖ + δ. The
 ‖u_h − u‖ ≤ L‖x_h − x‖ + ‖u_h − u_{x_h}‖.
 """
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -24,7 +25,7 @@ import numpy as np
 
 from .. import _tree
 from ..errors import InputError, InputProblem
-from ..evolution import Implicit, Solution, disturbance, gronwall, solve
+from ..evolution import Implicit, Solution, between, disturbance, gronwall, solve
 from ..generators import AbstractGenerator, AbstractMatrixFree, Product
 from ..problem import Problem
 from .constants import Constants
@@ -65,13 +66,14 @@ def bound_error(
     a bound on ‖x_h(t0) − x(t0)‖, or the `Bound` of the run that this one continues from its last
     saved state. (With M > 1 every piece multiplies by M anew.)
 
-    Where the solve did not measure its defect (fixed steps), it is run again with `measure=True`,
-    and the distance between the two runs, which is rounding, is added.
+    Where the solve did not measure its defect (fixed steps), or where it went (constants of a region,
+    that the solve was not given), it is run again, and the distance of the two runs is added.
 
-    Constants that `dvax.verify` found for a region of x are good while the trajectory stays in it:
-    where a saved state, with its bound, is not inside, the bounds are infinite from there on. Between
-    saved times nobody looks, and for other times or `args` than those verified nobody proved them:
-    then the status is "declared".
+    Constants that `dvax.verify` found for a region of x or u are good while the trajectory stays in
+    it: where what encloses it over the steps up to a saved time, with its bound, is not inside, the
+    bounds are infinite from there on. (Between two saved times the bound is taken from the one before
+    and all that disturbs the equation on the way, so many saved times make it the sharper.) For other
+    times or `args` than those verified nobody proved them: then the status is "declared".
 
     **Raises:** `dvax.InputError` where `sol` is not a solution of `problem`, or `initial_error` is
     not a number ≥ 0.
@@ -90,8 +92,10 @@ def bound_error(
     _check(problem, sol, initial_error)
     space = problem.spaces(sol.setup.x0)[0]
     measured, apart = sol, jnp.zeros_like(sol.ts)
-    if sol.defect is None:
-        measured = _again(problem, sol)
+    domain = constants.domain
+    regional = domain is not None and not domain.free
+    if sol.defect is None or (regional and sol.extent is None):
+        measured = _again(problem, sol, constants)
         apart = jax.vmap(lambda a, b: space.norm(_tree.sub(a, b)))(measured.xs, sol.xs)
     assert measured.defect is not None and measured.law_defect is not None
     assert measured.settled is not None
@@ -104,15 +108,18 @@ def bound_error(
     x, u, x_sharp, u_sharp = _bounds(constants, t0, sol.ts, impulse, apart, law, start)
     best_x = x if x_sharp is None else jnp.minimum(x, x_sharp)
     best_u = u if u_sharp is None else jnp.minimum(u, u_sharp)
-    domain = constants.domain
     where: Status = "proved"
     inside = jnp.ones(sol.ts.shape, bool)
     if domain is not None:
         covered = domain.covers(begin, sol.setup.setting["t1"]) and domain.is_of(sol.setup.args)
-        where = "proved" if covered and domain.free else "declared"
-        if not domain.free:
+        where = "proved" if covered else "declared"
+        if regional:
+            assert measured.extent is not None
+            passed = _on_the_way(constants, t0, sol.ts, impulse, start)
+            law_error = constants.norm_P_inv * (law[0] / constants.gamma + law[1])
+            of_u = constants.L * passed + law_error
             spaces = problem.spaces(sol.setup.x0)
-            inside = domain.keeps(sol.xs, sol.us, best_x, best_u, spaces)
+            inside = domain.keeps(*measured.extent, passed, of_u, spaces)
     status = weakest(
         constants.status_of(*(name for name, _ in constants.statuses)),
         "proved" if measured.enclosed else "estimated",
@@ -131,15 +138,33 @@ def _bounds(
     """x, u, x_sharp and u_sharp of `Bound`."""
     acted, settled = (disturbance(c, *parts) for parts in impulse)
     law_error = c.norm_P_inv * (law[0] / c.gamma + law[1])
-    x = gronwall(t0, ts, acted, settled, c.growth_rate, c.M, start[0]) + apart
+    x, *each = (
+        gronwall(t0, ts, acted, settled, rate, M, initial) + apart
+        for M, rate, initial in _rates(c, start)
+    )
     u = c.L * x + law_error
-    rates = [] if c.one_sided is None else [(1.0, c.one_sided)]
-    rates += [] if c.energy is None else [c.energy]
-    if not rates:
+    if not each:
         return x, u, None, None
-    each = [gronwall(t0, ts, acted, settled, rate, M, start[1]) for M, rate in rates]
-    sharp = jnp.min(jnp.stack(each), axis=0) + apart
+    sharp = jnp.min(jnp.stack(each), axis=0)
     return x, u, sharp, c.L * sharp + law_error
+
+
+def _rates(c: Constants, start: tuple) -> list[tuple[Any, Any, Any]]:
+    """(M, c) in which errors grow, and what they start with: the paper's first, then the sharp ones."""
+    rates = [(c.M, c.growth_rate, start[0])]
+    rates += [] if c.one_sided is None else [(1.0, c.one_sided, start[1])]
+    return rates + ([] if c.energy is None else [(*c.energy, start[1])])
+
+
+@jax.jit
+def _on_the_way(c: Constants, t0: Any, ts: Any, impulse: tuple, start: tuple) -> jax.Array:
+    """The bound on x at all times since the saved time before."""
+    acted, settled = (disturbance(c, *parts) for parts in impulse)
+    each = []
+    for M, rate, initial in _rates(c, start):
+        at = gronwall(t0, ts, acted, settled, rate, M, initial)
+        each.append(between(t0, ts, acted, settled, rate, M, initial, at))
+    return jnp.min(jnp.stack(each), axis=0)
 
 
 def _check(problem: Problem, sol: Solution, initial_error: Any) -> None:
@@ -235,9 +260,23 @@ def is_declared(A: AbstractGenerator) -> bool:
     return isinstance(A, AbstractMatrixFree) and not A.numerical_range().proved
 
 
-def _again(problem: Problem, sol: Solution) -> Solution:
+def _again(problem: Problem, sol: Solution, constants: Constants) -> Solution:
+    """The same steps, with all that a certificate needs."""
     was = sol.setup
-    return solve(
-        problem, was.x0, was.setting["t0"], was.setting["t1"], was.args, sol.ts, was.setting["dt"],
-        method=was.method, vi_solver=was.vi_solver, measure=True, throw=False,
+    asked = was.setting
+    adaptive = isinstance(asked["dt"], float) and math.isnan(asked["dt"])
+    again = solve(
+        problem, was.x0, asked["t0"], asked["t1"], was.args, sol.ts, None if adaptive else asked["dt"],
+        rtol=asked["rtol"], atol=asked["atol"], dt0=asked["dt0"], horizon=asked["horizon"],
+        method=was.method, vi_solver=was.vi_solver, constants=constants, measure=True, throw=False,
     )  # fmt: skip
+    if again.ts.shape == sol.ts.shape:
+        return again
+    raise InputError(
+        InputProblem(
+            "dvax.bound_error(sol)",
+            f"{sol.ts.shape[0]} saved times, of which another run reaches {again.ts.shape[0]}",
+            "what the certificate needs was not kept, and so it solves once more",
+            "Solve with constants= and measure=True, so that it is kept",
+        )
+    )

@@ -55,18 +55,18 @@ class Domain(eqx.Module):
 
     def keeps(
         self,
-        xs: Tree,
-        us: Tree,
+        x: tuple[Tree, Tree],
+        u: tuple[Tree, Tree],
         of_x: jax.Array,
         of_u: jax.Array,
         spaces: tuple[AbstractSpace, ...],
     ) -> jax.Array:
-        """For each saved time whether all states and responses within these bounds of xs and us, in
-        norm, are inside; and whether they were at all the times before."""
+        """For each saved time whether all states and responses within these bounds of what lies between
+        x = (low, high), and u, in norm, are inside; and whether they were at all the times before."""
         held = jnp.ones(of_x.shape, bool)
-        for values, bound, ends, space in zip((xs, us), (of_x, of_u), (self.x, self.u), spaces):
+        for values, bound, ends, space in zip((x, u), (of_x, of_u), (self.x, self.u), spaces):
             if ends is not None:
-                held = held & _inside(values, bound, ends, space)
+                held = held & _inside(*values, bound, ends, space)
         return jnp.cumsum(~held) == 0
 
 
@@ -79,14 +79,15 @@ def _taken_apart(args: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
 
 
 def _inside(
-    values: Tree, bound: jax.Array, ends: tuple[Tree, Tree], space: AbstractSpace
+    lows: Tree, highs: Tree, bound: jax.Array, ends: tuple[Tree, Tree], space: AbstractSpace
 ) -> jax.Array:
     held = jnp.ones(bound.shape, bool)
     weights = jtu.tree_map(
-        lambda leaf, w: np.broadcast_to(w, leaf.shape[1:]), values, space.weights()
+        lambda leaf, w: np.broadcast_to(w, leaf.shape[1:]), lows, space.weights()
     )
-    for v, w, low, high in zip(*map(jtu.tree_leaves, (values, weights, *ends)), strict=True):
-        reach = bound.reshape(-1, *(1,) * (v.ndim - 1)) / jnp.sqrt(w)[None]
-        inside = (v - reach >= low[None]) & (v + reach <= high[None])
+    leaves = map(jtu.tree_leaves, (lows, highs, weights, *ends))
+    for least, most, w, low, high in zip(*leaves, strict=True):
+        reach = bound.reshape(-1, *(1,) * (least.ndim - 1)) / jnp.sqrt(w)[None]
+        inside = (least - reach >= low[None]) & (most + reach <= high[None])
         held = held & jnp.all(inside.reshape(len(bound), -1), axis=1)
     return held

@@ -25,7 +25,7 @@ from .region import Region, between
 from .slope import Slope, TooLarge, interval, is_slope
 from .status import Status
 from .system import System
-from .verify import around_responses, bounded, constants_of, met, span, state_like
+from .verify import around_responses, bounded, constants_of, domain_of, met, span, state_like
 from .weights import roots
 
 
@@ -80,14 +80,18 @@ def parameter_bounds(
     knots = np.asarray(problem.knots(t0, t1, x0, middle), float)
     K = motion(system, t0, t1, knots)
     states = between(x, x0, "dvax.parameter_bounds(x)")
-    responses = met(between(u, system.u0, "dvax.parameter_bounds(u)"), around_responses(system, K))
+    asked = between(u, system.u0, "dvax.parameter_bounds(u)")
+    responses = met(asked, around_responses(system, K))
     states = _from_the_origin("x", x, states)
     responses = _from_the_origin("u", u, responses)
     eta = jtu.tree_map(lambda a, b: interval(np.asarray(a), np.asarray(b)), low, high)
     region = Region(interval(t0, t1), states, responses, eta)
     box = Region(region.t, bounded(states, x0), bounded(responses, system.u0), eta)
     known = knowledge(system, region, box, {})
-    constants = constants_of(system, region, known, (x is not None, u is not None))
+    domain = domain_of(
+        region.t, None if x is None else states, None if u is None else asked, middle
+    )
+    constants = constants_of(system, region, known, domain)
     if constants is None:
         raise _unknown("γ, L_F, α_h, β_h, α_f, β_f", known.of["gamma"].how)
 
@@ -118,8 +122,8 @@ def parameter_bounds(
             raise _unknown(name, "the code of f, h or K does not bound it over this region")
     # In a region it is for the caller to say that trajectories stay in it.
     status: Status = "proved" if x is None and u is None else "declared"
-    domain = ParameterSet(low, high, t0, t1, start_radius if used else None)
-    return ParameterBounds(constants, status=status, **span_of, **sizes, **moduli, domain=domain)
+    meant = ParameterSet(low, high, t0, t1, start_radius if used else None)
+    return ParameterBounds(constants, status=status, **span_of, **sizes, **moduli, domain=meant)
 
 
 def _from_the_origin(name: str, asked: Any, tree: Tree) -> Tree:

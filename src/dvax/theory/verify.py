@@ -125,13 +125,16 @@ def verify(
     knots = np.asarray(problem.knots(t0, t1, x0, args), float)
     K = motion(system, t0, t1, knots)
     states = between(x, x0, "dvax.verify(x)")
-    responses = met(between(u, system.u0, "dvax.verify(u)"), around_responses(system, K))
+    asked = between(u, system.u0, "dvax.verify(u)")
+    responses = met(asked, around_responses(system, K))
     time = interval(t0, t1)
     region = Region(time, states, responses)
     box = Region(time, bounded(states, x0), bounded(responses, system.u0))
     known = knowledge(system, region, box, _declared(declared))
     assumptions = tuple(rows(system, region, K, knots, known))
-    constants = constants_of(system, region, known, (x is not None, u is not None), energy)
+    # u is around K(t) whatever it does: what it must be watched for is what was asked for.
+    domain = domain_of(time, None if x is None else states, None if u is None else asked, args)
+    constants = constants_of(system, region, known, domain, energy)
     return Verification(assumptions, constants, _route(system, known))
 
 
@@ -144,7 +147,7 @@ def _route(system: System, known: Knowledge) -> str:
 
 
 def constants_of(
-    system: System, region: Region, known: Knowledge, asked: tuple[bool, bool], energy: bool = False
+    system: System, region: Region, known: Knowledge, domain: Domain, energy: bool = False
 ) -> Constants | None:
     """The constants, where every modulus is a number and γ > 0."""
     values: dict[str, Any] = {name: entry.value for name, entry in known.of.items()}
@@ -166,7 +169,7 @@ def constants_of(
     return Constants(
         **values, M=system.growth.M, omega=system.growth.omega, m_P=system.spectrum.m_P,
         norm_P_inv=system.spectrum.norm_P_inv, one_sided=mu, status=statuses,
-        domain=_domain(region, asked, system.args), energy=contraction,
+        domain=domain, energy=contraction,
     )  # fmt: skip
 
 
@@ -176,14 +179,11 @@ def _energy(system: System, region: Region) -> tuple[float, float] | None:
     return None if found is None else (found.M, found.rate)
 
 
-def _domain(region: Region, asked: tuple[bool, bool], args: Any) -> Domain:
-    """Where the constants hold: the bounds of x and u as far as they were asked for."""
+def domain_of(time: Slope, x: Tree | None, u: Tree | None, args: Any) -> Domain:
+    """Where the constants hold: between the bounds of x and u that were asked for."""
     end = lambda tree, i: jtu.tree_map(lambda v: v[i], tree, is_leaf=is_slope)  # noqa: E731
-    x, u = (
-        (end(tree, 0), end(tree, 1)) if given else None
-        for tree, given in zip((region.x, region.u), asked)
-    )
-    return Domain(float(region.t.low), float(region.t.high), x, u, args)
+    both = lambda tree: None if tree is None else (end(tree, 0), end(tree, 1))  # noqa: E731
+    return Domain(float(time.low), float(time.high), both(x), both(u), args)
 
 
 def _sharp(system: System, region: Region, known: Knowledge) -> float | None:
