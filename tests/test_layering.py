@@ -52,7 +52,7 @@ APPLICATION = {
     *("tomli_w", "typer", "xarray", "zarr"),
 }
 # Extras that a function asks for when it is called, and says so where they are missing.
-EXTRAS = {"clarabel"}
+EXTRAS = {"clarabel", "meshio", "skfem"}
 # What the command line may load before it knows what is asked of it.
 LIGHT = {"typer", "rich"}
 APPLICATION_ROOMS = {"runs", "plots", "cli", "__main__"}

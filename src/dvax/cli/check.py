@@ -1,17 +1,21 @@
 """`dvax check CONFIG.toml`: what a run would be, without running it or writing anything."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dvax.cli.constants import constant_rows
 from dvax.cli.failure import OUT_OF_CLASS, reported
-from dvax.cli.options import ConfigFile, Debug
+from dvax.cli.options import AllowOutside, ConfigFile, Debug
 from dvax.cli.precision import enable_double
 from dvax.cli.sizes import sizes
 from dvax.cli.talk import complain, remark, say, table
 from dvax.cli.verdicts import outside_the_class, verdicts
+
+if TYPE_CHECKING:
+    from dvax.runs.applications.config import ModelConfig
+    from dvax.theory import Assumption
 
 
 def check(
@@ -20,35 +24,35 @@ def check(
         bool,
         typer.Option("--strict", help="Exit with 4 where the system is outside the class."),
     ] = False,
+    allow_outside: AllowOutside = False,
     debug: Debug = False,
 ) -> None:
     """Check CONFIG.toml and its data: constants, assumptions, sizes. Nothing is written."""
     with reported(debug):
-        from dvax.runs.config import build_contact, load_config
+        enable_double()
+        from dvax.runs.applications.config import ModelConfig, read_config
+        from dvax.runs.config import build_contact
         from dvax.runs.contact_model import assumptions
 
-        loaded = load_config(config)
+        loaded = read_config(config, allow_outside=allow_outside)
+        if isinstance(loaded, ModelConfig):
+            _check_model(loaded, strict)
+            return
         inputs = build_contact(loaded)
-        enable_double()
         rows = constant_rows(loaded)
         say(f"{loaded.source}: no problem in the configuration and its data", "bold")
         say("")
         _say_constants(rows)
         say("")
         known = assumptions(loaded, inputs)
-        table(
-            ("assumption", "status", "what it says", "how it is known"),
-            [(row.label, row.status, row.statement, row.why) for row in known],
-        )
+        _say_assumptions(known)
         say("")
         table(("statement", "verdict", "because"), verdicts(rows))
         say("")
         table(("size", "value", "remark"), sizes(loaded, inputs))
         for notice in inputs.notices:
             remark(f"note: {notice}")
-        broken = [row for row in known if row.needed and row.status == "refuted"]
-        for row in broken:
-            complain(f"error: {row.label} does not hold ({row.statement}): {row.why}")
+        broken = _complain_of_broken(known)
         outside = outside_the_class(rows)
         for row in outside:
             complain(
@@ -57,6 +61,42 @@ def check(
             )
         if (outside or broken) and strict:
             raise typer.Exit(OUT_OF_CLASS)
+
+
+def _check_model(config: "ModelConfig", strict: bool) -> None:
+    """The same for an application."""
+    from dvax.runs.applications.driver import constant_rows as rows_of
+
+    application = config.application
+    constants, known, sizes = application.known(config.model)
+    say(f"{config.source}: no problem in the configuration and its data", "bold")
+    say(f"class: {application.fit(config.model)}")
+    if constants is not None:
+        say("")
+        _say_constants(rows_of(constants))
+    if known:
+        say("")
+        _say_assumptions(known)
+    say("")
+    data = [("data", f.name, f"sha256 {f.sha256[:16]}…") for f in config.fingerprints()]
+    table(("size", "value", "remark"), [*sizes, *data])
+    if _complain_of_broken(known) and strict:
+        raise typer.Exit(OUT_OF_CLASS)
+
+
+def _say_assumptions(known: "Sequence[Assumption]") -> None:
+    table(
+        ("assumption", "status", "what it says", "how it is known"),
+        [(row.label, row.status, row.statement, row.why) for row in known],
+    )
+
+
+def _complain_of_broken(known: "Sequence[Assumption]") -> bool:
+    """Say which needed assumptions are refuted, and whether any is."""
+    broken = [row for row in known if row.needed and row.status == "refuted"]
+    for row in broken:
+        complain(f"error: {row.label} does not hold ({row.statement}): {row.why}")
+    return bool(broken)
 
 
 def _say_constants(rows: Sequence[Mapping[str, Any]]) -> None:

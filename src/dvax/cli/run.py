@@ -8,7 +8,7 @@ import typer
 
 from dvax.cli.ahead import loaded_ahead
 from dvax.cli.failure import reported
-from dvax.cli.options import ConfigFile, Debug, Force, Quiet
+from dvax.cli.options import AllowOutside, ConfigFile, Debug, Force, Quiet
 from dvax.cli.precision import enable_double
 from dvax.cli.progress import progress
 from dvax.cli.talk import remark, say, table
@@ -16,6 +16,7 @@ from dvax.cli.target import target_problems
 from dvax.errors import InputError, InputProblem
 
 if TYPE_CHECKING:
+    from dvax.runs.applications.config import ModelConfig
     from dvax.runs.config import Config
 
 
@@ -26,6 +27,7 @@ def run(
     ],
     force: Force = False,
     quiet: Quiet = False,
+    allow_outside: AllowOutside = False,
     debug: Debug = False,
 ) -> None:
     """Solve the system that CONFIG.toml describes; results, manifest and report go into DIR."""
@@ -33,7 +35,7 @@ def run(
         # Both are checked before anything is refused: one round is enough to mend all of it.
         problems: list[InputProblem] = target_problems(out, force=force)
         try:
-            loaded = _load(config)
+            loaded = _load(config, allow_outside)
         except InputError as error:
             raise InputError(*error.problems, *problems) from error
         if problems:
@@ -41,21 +43,28 @@ def run(
         carry_out(loaded, out, force=force, quiet=quiet)
 
 
-def _load(file: Path) -> "Config":
-    from dvax.runs.config import load_config
+def _load(file: Path, allow_outside: bool) -> "Config | ModelConfig":
+    enable_double()
+    from dvax.runs.applications.config import read_config
 
-    return load_config(file)
+    return read_config(file, allow_outside=allow_outside)
 
 
-def carry_out(config: "Config", out: Path, *, force: bool, quiet: bool) -> None:
+def carry_out(config: "Config | ModelConfig", out: Path, *, force: bool, quiet: bool) -> None:
     """Run a checked configuration, make its report, say the figures; exit with the run's code."""
     enable_double()
+    from dvax.runs.applications.config import ModelConfig
+    from dvax.runs.applications.driver import run_model
     from dvax.runs.driver import run as drive
 
-    with progress(config.units.time, quiet=quiet) as listener, ExitStack() as stack:
+    unit = "" if isinstance(config, ModelConfig) else config.units.time
+    with progress(unit, quiet=quiet) as listener, ExitStack() as stack:
         if config.output.report:
             listener = stack.enter_context(loaded_ahead("dvax.plots", listener))
-        outcome = drive(config, out, overwrite=force, on_event=listener)
+        if isinstance(config, ModelConfig):
+            outcome = run_model(config, out, overwrite=force, on_event=listener)
+        else:
+            outcome = drive(config, out, overwrite=force, on_event=listener)
     if not quiet:
         _say_figures(outcome.summary)
     if outcome.exit_code:
@@ -73,13 +82,23 @@ def carry_out(config: "Config", out: Path, *, force: bool, quiet: bool) -> None:
         raise typer.Exit(outcome.exit_code)
 
 
+_FEW = 4
+"""So many entries of a list are shown; all of them are in summary.json."""
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
+
+
 def _say_figures(summary: dict[str, Any]) -> None:
     """The model's headline figures: name, value, unit, meaning."""
     rows = []
     for name, entry in summary.items():
         value = entry["value"]
         parts = value if isinstance(value, list) else [value]
-        shown = ", ".join(f"{v:.6g}" if isinstance(v, float) else str(v) for v in parts)
+        shown = ", ".join(_shown(v) for v in parts[:_FEW])
+        if len(parts) > _FEW:
+            shown += f", … ({len(parts)} in all)"
         unit = "" if entry["unit"] == "1" else entry["unit"]
         rows.append((name, f"{shown} {unit}".strip(), entry["meaning"]))
     if rows:

@@ -77,6 +77,8 @@ def _subtitle(run: RunRecord) -> str:
         parts.append(f"model {run.trajectory.attrs.get('model', 'unnamed')}")
         points = " × ".join(str(n) for n in run.boundary_shape)
         parts.append(f"{points} points, {counted(len(run.time), 'frame')}")
+    elif run.data is not None:
+        parts.append(f"model {run.model}, {run.manifest.get('fit', '')}".rstrip(", "))
     parts.append(run.status)
     return " · ".join(parts)
 
@@ -102,7 +104,7 @@ def _banner(run: RunRecord) -> str:
 
 def _reach(run: RunRecord) -> str:
     if run.trajectory is None:
-        return "No frame was written."
+        return "Nothing was written." if run.data is not None else "No frame was written."
     unit = run.unit("time")
     end = run.config.get("time", {}).get("end")
     aim = f" of {end:g} {unit}" if isinstance(end, int | float) else ""

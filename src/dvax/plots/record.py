@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from dvax.errors import InputError, InputProblem
+from dvax.plots.applications.data import Data, read_data
 from dvax.plots.frames import Frames, open_frames
 
 # What manifest.json calls a run that did not reach its end, and what a reader should know of it.
@@ -52,7 +53,8 @@ class AssumptionRow:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """What a run directory holds. `trajectory` is None where no frame was written."""
+    """What a run directory holds. `trajectory` is None where no frame was written; an application has
+    `data` in its place."""
 
     directory: Path
     manifest: Mapping[str, Any]
@@ -63,6 +65,12 @@ class RunRecord:
     trajectory: Frames | None
     assumptions: tuple[AssumptionRow, ...] = field(default=())
     notes: tuple[str, ...] = field(default=())
+    data: Mapping[str, Data] | None = field(default=None)
+
+    @property
+    def model(self) -> str:
+        """The name of the model."""
+        return str(self.manifest.get("model", "contact"))
 
     @property
     def title(self) -> str:
@@ -133,7 +141,9 @@ def read_run(directory: Path) -> RunRecord:
     manifest = _json(directory / "manifest.json")
     summary_file = directory / "summary.json"
     config_file = directory / "config.resolved.toml"
-    trajectory, notes = _trajectory(directory / "trajectory.zarr")
+    application = str(manifest.get("model", "contact")) != "contact"
+    store = directory / "trajectory.zarr"
+    trajectory, notes = (None, ()) if application else _trajectory(store)
     return RunRecord(
         directory=directory,
         manifest=manifest,
@@ -142,8 +152,9 @@ def read_run(directory: Path) -> RunRecord:
         constants=_constants(trajectory, manifest, directory),
         warnings=_warnings(directory / "log.jsonl"),
         trajectory=trajectory,
-        assumptions=_assumptions(trajectory, directory),
+        assumptions=_assumptions(trajectory, manifest, directory),
         notes=notes,
+        data=_data(store) if application else None,
     )
 
 
@@ -206,8 +217,22 @@ def _constants(
     return tuple(ConstantRow(**{name: row.get(name, "") for name in names}) for row in rows)
 
 
-def _assumptions(trajectory: Frames | None, directory: Path) -> tuple[AssumptionRow, ...]:
+def _data(store: Path) -> Mapping[str, Data]:
+    """The results of an application; nothing where there are none yet."""
+    if not store.exists():
+        return {}
+    try:
+        return read_data(store)
+    except (OSError, ValueError, KeyError) as error:
+        raise _damaged(store, error) from error
+
+
+def _assumptions(
+    trajectory: Frames | None, manifest: Mapping[str, Any], directory: Path
+) -> tuple[AssumptionRow, ...]:
     rows = _listed(trajectory, "assumptions", directory)
+    if rows is None:
+        rows = manifest.get("assumptions")
     names = tuple(AssumptionRow.__dataclass_fields__)
     return tuple(AssumptionRow(**{n: str(row.get(n, "")) for n in names}) for row in rows or ())
 

@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+from dvax.plots.applications import application_pictures
 from dvax.plots.certificate import certificate_picture
 from dvax.plots.histories import histories_picture
 from dvax.plots.page import page
@@ -30,6 +31,8 @@ def build_report(run_dir: Path | str, *, stills: bool = True) -> Path:
 
 def _pictures(run: RunRecord) -> tuple[list[Picture], list[str]]:
     """The pictures that the run can give, and a sentence for each that it cannot."""
+    if run.data:
+        return application_pictures(run.model, run.data), []
     if run.trajectory is None:
         return [], ["There is no picture, because the run wrote no frame."]
     found = scan(run)

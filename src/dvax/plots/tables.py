@@ -24,7 +24,7 @@ FACTS = {
     "python": "Python",
     "git_commit": "git commit",
 }
-SHOWN_ELSEWHERE = ("constants",)
+SHOWN_ELSEWHERE = ("constants", "assumptions")
 
 
 def headline_cards(run: RunRecord) -> str:

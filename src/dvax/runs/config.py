@@ -38,7 +38,7 @@ def load_config(path: str | Path, *, allow_outside: bool = False) -> Config:
     keys, types, units, ranges, contradictions, formulas (column) and data (file, line and column).
     """
     source = Path(path)
-    return _check(_parse(source), source, allow_outside)
+    return check_contact(parse(source), source, allow_outside)
 
 
 def build_contact(config: Config) -> ContactInputs:
@@ -56,7 +56,9 @@ def with_points(config: Config, points: int) -> Config:
     return config.model_copy(update={"boundary": boundary})
 
 
-def _parse(source: Path) -> dict[str, Any]:
+def parse(source: Path) -> dict[str, Any]:
+    """A TOML file as a table. **Raises:** `InputError` with line and column."""
+
     def refuse(place: str, given: str, rule: str, mend: str) -> InputError:
         return InputError(InputProblem(place, given, rule, mend))
 
@@ -103,7 +105,8 @@ def _parse(source: Path) -> dict[str, Any]:
         ) from None
 
 
-def _check(raw: dict[str, Any], source: Path, allow_outside: bool) -> Config:
+def check_contact(raw: dict[str, Any], source: Path, allow_outside: bool) -> Config:
+    """The configuration of a contact law, checked and completed."""
     file = source.name
     problems = [
         unknown_key(f"{file}: {key}", key, value, list(SECTIONS))

@@ -1,6 +1,7 @@
 """Files of data: where they may lie, how large they may be, and their fingerprint."""
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,33 +26,57 @@ def locate(name: str, folder: Path, allow_outside: bool, place: str) -> Path:
     Raises `InputError` where it is missing, no regular file, too large, or outside the folder
     without `allow_outside`: a configuration from elsewhere must not read other people's files.
     """
+    resolved, size = _resolved(name, folder, allow_outside, place, Path.is_file)
+    if size is None:
+        raise _refuse(
+            place,
+            name,
+            "there is no such file",
+            f"Put it at {folder.name}/{name} or mend the name.",
+        )
+    if size > MAX_BYTES:
+        raise _refuse(
+            place, name, f"it has {size} bytes and a data file at most {MAX_BYTES}",
+            "Thin the data out.",
+        )  # fmt: skip
+    return resolved
 
-    def refuse(rule: str, mend: str) -> InputError:
-        return InputError(InputProblem(place, repr(name), rule, mend))
 
+def locate_folder(name: str, folder: Path, allow_outside: bool, place: str) -> Path:
+    """The folder of data that a configuration in `folder` calls `name`; see `locate`."""
+    resolved, size = _resolved(name, folder, allow_outside, place, Path.is_dir)
+    if size is None:
+        raise _refuse(place, name, "there is no such folder", "Mend the name.")
+    return resolved
+
+
+def _resolved(
+    name: str, folder: Path, allow_outside: bool, place: str, kind: Callable[[Path], bool]
+) -> tuple[Path, int | None]:
+    """The path, and its size where it is of the kind."""
     if not name or "\x00" in name:
-        raise refuse("this is no file name", "Name a file beside the configuration.")
+        raise _refuse(place, name, "this is no file name", "Name a file beside the configuration.")
     path = Path(name) if allow_outside and Path(name).is_absolute() else folder / name
     try:
         resolved = path.resolve()
         inside = resolved.is_relative_to(folder.resolve())
-        size = resolved.stat().st_size if resolved.is_file() else None
+        size = resolved.stat().st_size if kind(resolved) else None
     except (OSError, RuntimeError) as error:
-        raise refuse(
-            f"it cannot be opened: {error}", "Check the name and the permissions."
+        raise _refuse(
+            place, name, f"it cannot be opened: {error}", "Check the name and the permissions."
         ) from None
     if not inside and not allow_outside:
-        raise refuse(
+        raise _refuse(
+            place,
+            name,
             "data lies in the configuration's folder or below it",
-            "Copy the file there, or allow files outside.",
+            "Copy it there, or pass --allow-outside.",
         )
-    if size is None:
-        raise refuse("there is no such file", f"Put it at {folder.name}/{name} or mend the name.")
-    if size > MAX_BYTES:
-        raise refuse(
-            f"it has {size} bytes and a data file at most {MAX_BYTES}", "Thin the data out."
-        )
-    return resolved
+    return resolved, size
+
+
+def _refuse(place: str, name: str, rule: str, mend: str) -> InputError:
+    return InputError(InputProblem(place, repr(name), rule, mend))
 
 
 def read_bytes(path: Path) -> bytes:

@@ -72,7 +72,7 @@ def run(
     `overwrite` is false, or where data files no longer fit. A failure of the solve is not raised: it
     is the outcome, and what was computed before is on disk.
     """
-    _refuse_existing(out, overwrite)
+    refuse_existing(out, overwrite)
     compile_seconds()
     inputs = build_contact(config)
     directory = RunDirectory(out, clear=True)
@@ -122,7 +122,7 @@ class _Run:
         status, code, reason = "finished", 0, "The end time was reached."
         try:
             with (
-                _terminable(),
+                terminable(),
                 ThreadPoolExecutor(1) as pool,
                 announced(lambda: self._event("compiling")),
             ):
@@ -245,7 +245,8 @@ def _block_length(frames: int, points: int) -> int:
     return math.ceil(frames / math.ceil(frames / longest))
 
 
-def _refuse_existing(out: Path, overwrite: bool) -> None:
+def refuse_existing(out: Path, overwrite: bool) -> None:
+    """Results are never written over others unasked."""
     if out.is_dir() and any(out.iterdir()) and not overwrite:
         raise InputError(
             InputProblem(
@@ -258,7 +259,7 @@ def _refuse_existing(out: Path, overwrite: bool) -> None:
 
 
 @contextmanager
-def _terminable() -> Iterator[None]:
+def terminable() -> Iterator[None]:
     """Let a request to terminate end the run as Ctrl-C does: with everything in order on disk."""
     if threading.current_thread() is not threading.main_thread():
         yield

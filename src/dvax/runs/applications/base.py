@@ -1,0 +1,86 @@
+"""What an application hands to a run, and what a run asks of it."""
+
+import abc
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from dvax.runs.schema import Section
+from dvax.theory import Assumption, Constants
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A headline figure: a number, or a list of them."""
+
+    value: Any
+    unit: str
+    meaning: str
+
+
+@dataclass(frozen=True)
+class Variable:
+    """An array of the results with the names of its dimensions; one named like its dimension is a
+    coordinate."""
+
+    dims: tuple[str, ...]
+    values: np.ndarray
+    unit: str
+    words: str
+
+
+@dataclass(frozen=True)
+class Results:
+    """What a run leaves: figures for summary.json, variables for trajectory.zarr, constants and
+    assumptions for the report; `files` writes what else belongs into the run directory."""
+
+    figures: Mapping[str, Figure]
+    variables: Mapping[str, Variable]
+    constants: Constants | None
+    steps: int
+    assumptions: tuple[Assumption, ...] = ()
+    notices: tuple[str, ...] = ()
+    files: Callable[[Path], None] | None = None
+
+
+Model = TypeVar("Model")
+
+
+class AbstractApplication(abc.ABC, Generic[Model]):
+    """A model that the table `[model]` of a configuration describes alone.
+
+    - `section`: that table, for pydantic; the keys in `files` name data files, those in `folders`
+      folders, with the files that are read there;
+    - `read`: from the table to the model, everything checked, nothing solved;
+    - `fit`: "exact", or by what it is regularised, or why it is outside the class;
+    - `known`: constants and assumptions, before anything is solved, and sizes as (what, value, remark);
+    - `solve`: to the results.
+    """
+
+    section: type[Section]
+    files: tuple[str, ...] = ()
+    folders: Mapping[str, tuple[str, ...]] = {}
+
+    @abc.abstractmethod
+    def read(self, table: Any, paths: Mapping[str, Path]) -> Model:
+        """The model, from its table and where its data lies.
+
+        **Raises:** `dvax.InputError` with everything that is wrong.
+        """
+
+    @abc.abstractmethod
+    def fit(self, model: Model) -> str:
+        """Whether the model is in the class, exactly or regularised."""
+
+    @abc.abstractmethod
+    def known(
+        self, model: Model
+    ) -> tuple[Constants | None, tuple[Assumption, ...], list[tuple[str, str, str]]]:
+        """Constants, assumptions and sizes."""
+
+    @abc.abstractmethod
+    def solve(self, model: Model) -> Results:
+        """The results. **Raises:** `dvax.SolveError`."""

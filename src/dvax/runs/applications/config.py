@@ -1,0 +1,121 @@
+"""Configurations of applications: `[model]` says everything, `[output]` what is written beside."""
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from dvax.errors import InputError, InputProblem
+from dvax.runs.applications.base import AbstractApplication
+from dvax.runs.config import Config, check_contact, parse
+from dvax.runs.data_file import DataFile, fingerprint, locate, locate_folder
+from dvax.runs.schema import OutputSection, Section
+from dvax.runs.schema_errors import shown, translate, unknown_key
+from dvax.runs.units import Units
+
+MODULES = {
+    "traffic": "traffic",
+    "market": "market",
+    "frame": "frame",
+    "circuit": "circuit",
+    "fem-contact": "fem_contact",
+}
+"""The names of `[model]`, and where each is. They are imported when they are asked for."""
+
+NAMES = ("contact", *MODULES)
+_SECTIONS = ("model", "output")
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """A checked configuration of an application, and the model that it describes."""
+
+    name: str
+    table: Section
+    output: OutputSection
+    source: Path
+    application: AbstractApplication
+    model: Any
+    paths: Mapping[str, Path]
+
+    def data_files(self) -> list[tuple[str, Path]]:
+        """(key, file) of all the data: the files of a folder share its key."""
+        found = []
+        for key, path in self.paths.items():
+            inside = self.application.folders.get(key)
+            if inside is None:
+                found.append((key, path))
+            else:
+                found += [(key, path / name) for name in inside if (path / name).is_file()]
+        return found
+
+    def fingerprints(self) -> list[DataFile]:
+        """Size and SHA-256 of every data file."""
+        return [fingerprint(path.name, path) for _, path in self.data_files()]
+
+    def to_toml(self, paths: Mapping[str, str]) -> str:
+        """All settings as TOML, with these names in the place of those of the data."""
+        import tomli_w
+
+        table = {**self.table.model_dump(exclude_none=True), **paths}
+        output = self.output.model_dump(exclude_none=True)
+        return tomli_w.dumps({"model": table, "output": output})
+
+
+def read_config(path: str | Path, *, allow_outside: bool = False) -> Config | ModelConfig:
+    """Read, check and complete a configuration file of any model.
+
+    **Raises:** `dvax.InputError` with all problems found, those of the data files included.
+    """
+    source = Path(path)
+    raw = parse(source)
+    table = raw.get("model")
+    name = table.get("name", "contact") if isinstance(table, Mapping) else "contact"
+    if name == "contact" or not isinstance(name, str):
+        return check_contact(raw, source, allow_outside)
+    if name not in MODULES:
+        close = get_close_matches(name, NAMES, n=1)
+        mend = f"Did you mean {close[0]!r}?" if close else "Choose one of these."
+        raise InputError(
+            InputProblem(
+                f"{source.name}: model.name", shown(name), f"it is one of {', '.join(NAMES)}", mend
+            )
+        )
+    return _check(raw, name, source, allow_outside)
+
+
+def _check(raw: dict[str, Any], name: str, source: Path, allow_outside: bool) -> ModelConfig:
+    file = source.name
+    application = importlib.import_module(f"dvax.runs.applications.{MODULES[name]}").APPLICATION
+    problems = [
+        unknown_key(f"{file}: {key}", key, value, list(_SECTIONS))
+        for key, value in raw.items()
+        if key not in _SECTIONS
+    ]
+    sections: dict[str, Any] = {}
+    for key, kind in (("model", application.section), ("output", OutputSection)):
+        try:
+            sections[key] = kind.model_validate(raw.get(key, {}), context={"units": Units()})
+        except ValidationError as error:
+            problems += translate(error, file, key, kind)
+    if problems:
+        raise InputError(*problems)
+    table = sections["model"]
+    paths: dict[str, Path] = {}
+    for key in (*application.files, *application.folders):
+        given = getattr(table, key)
+        if given is None:
+            continue
+        find = locate if key in application.files else locate_folder
+        try:
+            paths[key] = find(given, source.parent, allow_outside, f"{file}: model.{key}")
+        except InputError as error:
+            problems += error.problems
+    if problems:
+        raise InputError(*problems)
+    model = application.read(table, paths)
+    return ModelConfig(name, table, sections["output"], source, application, model, paths)
