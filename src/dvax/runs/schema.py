@@ -33,7 +33,9 @@ def _in_units(value: Any, kind: str, info: ValidationInfo) -> Any:
         raise _broken(error.rule, error.mend) from None
 
 
-def _quantity(kind: str) -> BeforeValidator:
+def in_quantity(kind: str) -> BeforeValidator:
+    """A number in working units, or a text "number unit" of this kind."""
+
     def convert(value: Any, info: ValidationInfo) -> Any:
         return _in_units(value, kind, info)
 
@@ -128,25 +130,25 @@ class ModelSection(Section):
     """The contact law of the paper, section 7."""
 
     name: Literal["contact"] = Field("contact", description="the model")
-    alpha: Annotated[float, _quantity("rate")] = Field(
+    alpha: Annotated[float, in_quantity("rate")] = Field(
         gt=0, description="relaxation rate: A = -alpha I generates a decaying semigroup"
     )
-    beta: Annotated[float, _quantity("stiffness")] = Field(
+    beta: Annotated[float, in_quantity("stiffness")] = Field(
         gt=0, description="pressure per reaction: P = beta I must be coercive"
     )
-    b_x: Annotated[float, _quantity("number")] = Field(
+    b_x: Annotated[float, in_quantity("number")] = Field(
         gt=0, description="feedback of the state on the drive q = g - b_x x"
     )
-    b_u: Annotated[float, _quantity("number")] = Field(
+    b_u: Annotated[float, in_quantity("number")] = Field(
         ge=0, description="self-feedback of the reaction: below 0 the law may lose its solution"
     )
-    d_x: Annotated[float, _quantity("rate")] = Field(
+    d_x: Annotated[float, in_quantity("rate")] = Field(
         gt=0, description="state feedback in f = ell - d_x x - d_u u"
     )
-    d_u: Annotated[float, _quantity("rate")] = Field(
+    d_u: Annotated[float, in_quantity("rate")] = Field(
         gt=0, description="reaction of the pressure in f = ell - d_x x - d_u u"
     )
-    kappa0: Annotated[float, _quantity("pressure")] = Field(
+    kappa0: Annotated[float, in_quantity("pressure")] = Field(
         gt=0, description="pressure capacity: K = {0 <= y <= kappa0} needs an interior"
     )
 
@@ -154,7 +156,7 @@ class ModelSection(Section):
 class BoundarySection(Section):
     """Gamma_C: ``length`` and ``points``, or ``lengths`` and ``points``, or ``file``."""
 
-    length: Annotated[float, _quantity("length")] | None = Field(
+    length: Annotated[float, in_quantity("length")] | None = Field(
         None, gt=0, description="length of a one-dimensional boundary"
     )
     lengths: Annotated[tuple[float, ...] | None, PlainValidator(_pair_of_lengths)] = Field(
@@ -201,7 +203,7 @@ def _field_quantity(name: str) -> tuple[BeforeValidator, BeforeValidator, Before
             return {**value, "per_unit": factor}
         return value
 
-    return _quantity(name), BeforeValidator(table), BeforeValidator(table)
+    return in_quantity(name), BeforeValidator(table), BeforeValidator(table)
 
 
 _G = _field_quantity("indentation")
@@ -249,7 +251,9 @@ class TimeSection(Section):
     """The run ends at `end`; states are saved at `frames` + 1 equidistant times, 0 and end
     included."""
 
-    end: Annotated[float, _quantity("time")] = Field(gt=0, description="time passes forward from 0")
+    end: Annotated[float, in_quantity("time")] = Field(
+        gt=0, description="time passes forward from 0"
+    )
     frames: int = Field(
         200, ge=1, le=MAX_FRAMES, description="number of intervals between saved states"
     )
@@ -261,9 +265,9 @@ class SolverSection(Section):
     method: Literal["ETD2RK", "ETD4RK", "ExpRosenbrock", "DormandPrince", "ETD1"] = Field(
         "ETD2RK", description="of a step"
     )
-    dt: Annotated[float | None, _quantity("time")] = Field(None, gt=0, description="a step")
+    dt: Annotated[float | None, in_quantity("time")] = Field(None, gt=0, description="a step")
     rtol: float | None = Field(None, gt=0, lt=1, description="relative tolerance of a step")
-    atol: Annotated[float | None, _quantity("indentation")] = Field(
+    atol: Annotated[float | None, in_quantity("indentation")] = Field(
         None, gt=0, description="absolute tolerance of a step, an indentation"
     )
 

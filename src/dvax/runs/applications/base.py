@@ -4,7 +4,7 @@ import abc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
@@ -60,9 +60,9 @@ class AbstractApplication(abc.ABC, Generic[Model]):
     - `solve`: to the results.
     """
 
-    section: type[Section]
-    files: tuple[str, ...] = ()
-    folders: Mapping[str, tuple[str, ...]] = {}
+    section: ClassVar[type[Section]]
+    files: ClassVar[tuple[str, ...]] = ()
+    folders: ClassVar[Mapping[str, tuple[str, ...]]] = {}
 
     @abc.abstractmethod
     def read(self, table: Any, paths: Mapping[str, Path]) -> Model:

@@ -1,0 +1,37 @@
+"""The bound on the error of a run, with what rounding may add to it."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.tree_util as jtu
+import numpy as np
+
+from dvax.evolution import Solution
+from dvax.problem import Problem
+from dvax.theory import Constants, bound_error
+
+_A_STEP = 16.0
+"""Roundings that a step may add, of the size of the state."""
+
+
+class Certificate(NamedTuple):
+    """A bound on ‖x_h − x‖ at every saved time, and what it rests on."""
+
+    values: np.ndarray
+    status: str
+
+    @property
+    def largest(self) -> float:
+        """Over all saved times."""
+        return float(self.values.max())
+
+
+def certificate(problem: Problem, solution: Solution, constants: Constants) -> Certificate:
+    """`dvax.bound_error`, which holds up to rounding, and what every step may have rounded off: where a
+    solve is exact but for that, a bound of less would be an empty claim."""
+    bound = bound_error(problem, solution, constants)
+    space = problem.spaces(solution.setup.x0)[0]
+    size: Any = jax.vmap(space.norm)(solution.xs)
+    eps = np.finfo(jtu.tree_leaves(solution.xs)[0].dtype).eps
+    lost = _A_STEP * eps * (1.0 + float(solution.stats["steps"])) * float(size.max())
+    return Certificate(np.asarray(bound.x) + lost, bound.status)

@@ -1,0 +1,106 @@
+"""`[model] name = "circuit"`: a netlist from 0 to t_end."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jax
+import numpy as np
+from pydantic import Field
+
+from dvax.models.circuit import Circuit
+from dvax.runs.applications.base import AbstractApplication, Figure, Results, Variable
+from dvax.runs.applications.certificate import certificate
+from dvax.runs.schema import Section, in_quantity
+from dvax.theory import Assumption, Constants
+
+
+class CircuitSection(Section):
+    """The netlist and how long to run it."""
+
+    name: Literal["circuit"] = Field(description="the model")
+    netlist: str = Field(description="file with the elements of the circuit, a line each")
+    t_end: Annotated[float, in_quantity("time")] = Field(gt=0, description="end of the run [s]")
+    frames: int = Field(500, ge=1, le=10**6, description="number of intervals between saved states")
+    rtol: float = Field(1e-8, gt=0, lt=1, description="relative tolerance of a step")
+    r_on: float | None = Field(
+        None, gt=0, description="resistance in series with diodes that have none [ohm]"
+    )
+    g_leak: float | None = Field(
+        None, gt=0, description="conductance across diodes that have none [siemens]"
+    )
+
+
+class _Loaded:
+    def __init__(self, table: CircuitSection, file: Path):
+        self.table = table
+        self.circuit = Circuit.from_file(file, r_on=table.r_on, g_leak=table.g_leak)
+
+
+class CircuitApplication(AbstractApplication[_Loaded]):
+    """States, node voltages and diode currents over time."""
+
+    section = CircuitSection
+    files = ("netlist",)
+
+    def read(self, table: Any, paths: Mapping[str, Path]) -> _Loaded:
+        return _Loaded(table, paths["netlist"])
+
+    def fit(self, model: _Loaded) -> str:
+        return model.circuit.fit
+
+    def known(
+        self, model: _Loaded
+    ) -> tuple[Constants | None, tuple[Assumption, ...], list[tuple[str, str, str]]]:
+        c = model.circuit
+        sizes = [
+            ("states", str(len(c.states)), ", ".join(c.states)),
+            ("diodes", str(len(c.diodes)), ", ".join(c.diodes)),
+            ("time", f"0 to {model.table.t_end:g} s", f"{model.table.frames + 1} saved states"),
+        ]
+        return c.constants, (), sizes
+
+    def solve(self, model: _Loaded) -> Results:
+        c, table = model.circuit, model.table
+        times = np.linspace(0.0, table.t_end, table.frames + 1)
+        solution = c.solve(table.t_end, times, rtol=table.rtol, constants=c.constants)
+        bound = certificate(c.problem, solution, c.constants)
+        volts, amperes = (
+            np.asarray(jax.vmap(of)(solution.ts, solution.xs, solution.us))
+            for of in (c.voltages, c.currents)
+        )
+        time = ("time",)
+        variables = {"time": Variable(time, times, "s", "time")}
+        for k, name in enumerate(c.states):
+            unit = "V" if name.upper().startswith("C") else "A"
+            what = "voltage of" if unit == "V" else "current of"
+            values = np.asarray(solution.xs[:, k])
+            variables[f"state_{name}"] = Variable(time, values, unit, f"{what} {name}")
+        for k, name in enumerate(c.nodes):
+            variables[f"node_{name}"] = Variable(time, volts[:, k], "V", f"voltage of node {name}")
+        for k, name in enumerate(c.diodes):
+            words = f"current of diode {name}"
+            variables[f"diode_{name}"] = Variable(time, amperes[:, k], "A", words)
+        variables["error_bound"] = Variable(
+            time,
+            bound.values,
+            "J^(1/2)",
+            "bound on the error of the state, ‖x‖² = ΣCv² + ΣLi²",
+        )
+        figures = {
+            "final_state": Figure(
+                np.asarray(solution.xs[-1]), "V, A", f"{', '.join(c.states)} at t_end"
+            ),
+            "error_bound": Figure(
+                bound.largest, "J^(1/2)",
+                f"bound on the error of the state in the norm of the energy ({bound.status})",
+            ),
+            "decay_rate": Figure(
+                float(c.constants.sharp_decay_rate) + 0.0, "1/s",
+                "two runs certainly approach at this rate in the norm of the energy",
+            ),
+        }  # fmt: skip
+        return Results(figures, variables, c.constants, int(solution.stats["steps"]))
+
+
+APPLICATION = CircuitApplication()

@@ -1,0 +1,164 @@
+"""`[model] name = "fem-contact"`: a punch pressed into a Kelvin–Voigt body."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+from pydantic import Field
+
+from dvax.errors import InputError, InputProblem
+from dvax.evolution import Implicit, solve
+from dvax.models.fem_contact import ElasticBody, FemContact
+from dvax.runs.applications.base import AbstractApplication, Figure, Results, Variable
+from dvax.runs.applications.certificate import certificate
+from dvax.runs.schema import Section
+from dvax.theory import Assumption, Constants
+
+_SIZES = ("width", "height", "fine_half_width", "fine", "coarse", "layers", "growth")
+
+
+class FemContactSection(Section):
+    """The body, the punch and the compliance of the contact, in units of your choice."""
+
+    name: Literal["fem-contact"] = Field(description="the model")
+    mesh: str | None = Field(None, description="a mesh file; without it a block of the sizes below")
+    width: float | None = Field(None, gt=0, description="width of the block")
+    height: float | None = Field(None, gt=0, description="height of the block")
+    fine_half_width: float | None = Field(None, gt=0, description="half width of the fine zone")
+    fine: int | None = Field(None, ge=1, description="columns of elements a side in the fine zone")
+    coarse: int | None = Field(None, ge=1, description="columns a side outside of it")
+    layers: int | None = Field(None, ge=1, description="layers of elements")
+    growth: float | None = Field(None, gt=0, description="ratio of heights of successive layers")
+    contact: str = Field("contact", description="what the mesh file calls the contact boundary")
+    clamped: str = Field("clamped", description="what the mesh file calls the held boundary")
+    indentation: float = Field(0.01, gt=0, description="depth to which the punch is pressed")
+    stiffness: float = Field(100.0, gt=0, description="pressure per penetration, beta")
+    pressure_cap: float | None = Field(
+        None, gt=0, description="largest pressure, kappa0; without it there is none"
+    )
+    radius: float = Field(10.0, gt=0, description="radius of the punch")
+    youngs_modulus: float = Field(1.0, gt=0, description="of the body")
+    poisson_ratio: float = Field(0.3, gt=-1, lt=0.5, description="of the body")
+    relaxation_time: float = Field(1.0, gt=0, description="viscosity over elasticity")
+    ramp: float = Field(2.0, gt=0, description="time over which the punch is pressed in")
+    end: float = Field(12.0, gt=0, description="end of the run")
+    frames: int = Field(120, ge=1, le=10**6, description="number of intervals between saved states")
+
+
+class _Loaded:
+    def __init__(self, table: FemContactSection, file: Path | None):
+        self.table = table
+        sizes = {name: getattr(table, name) for name in _SIZES if getattr(table, name) is not None}
+        if file is not None and sizes:
+            raise InputError(
+                InputProblem(
+                    "model", f"mesh together with {', '.join(sizes)}",
+                    "a mesh comes from a file or is made from sizes, not both",
+                    "Keep mesh, or keep the sizes",
+                )
+            )  # fmt: skip
+        self.body = ElasticBody(
+            file if file is not None else sizes,
+            youngs_modulus=table.youngs_modulus, poisson_ratio=table.poisson_ratio,
+            contact=table.contact, clamped=table.clamped,
+        )  # fmt: skip
+        self.contact = FemContact(
+            self.body, indentation=table.indentation, stiffness=table.stiffness,
+            pressure_cap=np.inf if table.pressure_cap is None else table.pressure_cap,
+            radius=table.radius, relaxation_time=table.relaxation_time, ramp=table.ramp,
+        )  # fmt: skip
+
+
+class FemContactApplication(AbstractApplication[_Loaded]):
+    """The pressure over time, its limit at rest, and the fields at the end for ParaView."""
+
+    section = FemContactSection
+    files = ("mesh",)
+
+    def read(self, table: Any, paths: Mapping[str, Path]) -> _Loaded:
+        return _Loaded(table, paths.get("mesh"))
+
+    def fit(self, model: _Loaded) -> str:
+        return model.contact.fit
+
+    def known(
+        self, model: _Loaded
+    ) -> tuple[Constants | None, tuple[Assumption, ...], list[tuple[str, str, str]]]:
+        body = model.body
+        sizes = [
+            ("displacements", str(body.unknowns), "free ones, of quadratic elements"),
+            ("contact points", str(len(body.points)), "Gauss points of the contact boundary"),
+            ("states", str(body.trace.shape[1]), "displacements that the contact can see"),
+        ]
+        return model.contact.constants, (), sizes
+
+    def solve(self, model: _Loaded) -> Results:
+        m, table = model.contact, model.table
+        rest = m.equilibrium()
+        times = np.linspace(0.0, table.end, table.frames + 1)
+        solution = solve(
+            m.problem, m.untouched, 0.0, table.end, ts=times, method=m.method, rtol=1e-7, atol=1e-11,
+            constants=m.constants,
+        )  # fmt: skip
+        pressure = np.asarray(jax.vmap(m.pressure)(solution.ts, solution.xs))
+        still, last = m.figures(rest.pressure), m.figures(pressure[-1])
+        force = np.array([m.figures(p)["force"] for p in pressure])
+        s = m.body.points[:, 0]
+        order = np.argsort(s)
+        deformed = m.body.nodes + m.displacement(solution.xs[-1])
+        stress = m.stress(solution.ts[-1], solution.xs[-1])
+        variables = {
+            "time": Variable(("time",), times, "[t]", "time"),
+            "place": Variable(("place",), s[order], "[x]", "contact points"),
+            "force": Variable(("time",), force, "[p][x]", "force on the punch"),
+            "pressure": Variable(("time", "place"), pressure[:, order], "[p]", "contact pressure"),
+            "pressure_at_rest": Variable(
+                ("place",), np.asarray(rest.pressure)[order], "[p]", "contact pressure at rest"
+            ),
+            "nodes": Variable(("node", "axis"), m.body.nodes, "[x]", "nodes"),
+            "deformed": Variable(("node", "axis"), deformed, "[x]", "nodes at the end"),
+            "cells": Variable(("cell", "corner"), m.body.cells(), "1", "nodes of each element"),
+            "stress": Variable(("cell", "component"), stress, "[p]", "xx, yy, zz, xy at the end"),
+        }
+        certified = None if rest.vi.error_bound is None else float(rest.vi.error_bound)
+        figures = {
+            "force": Figure(still["force"], "[p][x]", "force on the punch at rest"),
+            "contact_half_width": Figure(
+                still["contact_half_width"], "[x]", "half of the width under pressure, at rest"
+            ),
+            "saturated_length": Figure(
+                still["saturated_length"], "[x]", "length at the cap, at rest"
+            ),
+            "peak_pressure": Figure(still["peak_pressure"], "[p]", "largest pressure at rest"),
+            "final_force": Figure(last["force"], "[p][x]", "force at the end of the run"),
+            "distance_from_rest": Figure(
+                float(np.abs(pressure[-1] - np.asarray(rest.pressure)).max()), "[p]",
+                "largest difference of the last pressure from that at rest",
+            ),
+            "rest_error_bound": Figure(
+                certified, "[p][x]^(1/2)", "bound on the error of the pressure at rest, in L2"
+            ),
+            "decay_rate": Figure(
+                float(m.constants.sharp_decay_rate), "1/[t]",
+                "two states certainly approach at this rate in the norm of the viscosity",
+            ),
+        }  # fmt: skip
+        if not isinstance(m.method, Implicit):
+            bound = certificate(m.problem, solution, m.constants)
+            figures["error_bound"] = Figure(
+                bound.largest, "([p][x]²)^(1/2)",
+                f"bound on the error of the state in the norm of the viscosity ({bound.status})",
+            )  # fmt: skip
+            variables["error_bound"] = Variable(
+                ("time",), bound.values, "([p][x]²)^(1/2)", "bound on the error of the state"
+            )
+
+        def files(directory: Path) -> None:
+            m.write(directory / "body.vtu", solution.ts[-1], solution.xs[-1])
+
+        return Results(figures, variables, m.constants, int(solution.stats["steps"]), files=files)
+
+
+APPLICATION = FemContactApplication()

@@ -1,0 +1,136 @@
+"""`[model] name = "market"`: a week of RTS-GMLC under a sticky price."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from pydantic import Field
+
+from dvax.models.market import RTS, Market, largest_gain, read_rts
+from dvax.runs.applications.base import AbstractApplication, Figure, Results, Variable
+from dvax.runs.applications.certificate import certificate
+from dvax.runs.schema import Section
+from dvax.theory import Assumption, Constants
+
+
+class MarketSection(Section):
+    """The data and the hours."""
+
+    name: Literal["market"] = Field(description="the model")
+    data: str = Field(description="folder with gen.csv and the DAY_AHEAD files of RTS-GMLC")
+    start_hour: int = Field(
+        ge=0, description="the first hour, counted from the first row of the data"
+    )
+    hours: int = Field(168, ge=1, description="how many hours")
+    speed: float = Field(6.0, gt=0, description="rate at which the price follows demand [1/h]")
+    reference_price: float = Field(
+        40.0, gt=0, description="price at which the load is wanted [$/MWh]"
+    )
+    elasticity: float = Field(0.3, gt=0, description="of the mean load at the reference price")
+
+
+class _Loaded:
+    def __init__(self, table: MarketSection, rts: RTS):
+        self.table = table
+        self.times = np.arange(table.start_hour, table.start_hour + table.hours, dtype=float)
+        options: dict[str, Any] = dict(
+            speed=table.speed, reference_price=table.reference_price, elasticity=table.elasticity
+        )
+        # An hour alone is a moment of the two that it lies between.
+        last = len(rts.load) - 1
+        first = min(table.start_hour, last - 1) if table.hours == 1 else table.start_hour
+        self.market = Market.from_rts(rts, first, max(2, table.hours), **options)
+
+
+class MarketApplication(AbstractApplication[_Loaded]):
+    """Prices at rest for every hour, and the sticky price between them."""
+
+    section = MarketSection
+    folders: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "data": (
+            "gen.csv", "DAY_AHEAD_regional_Load.csv", "DAY_AHEAD_wind.csv", "DAY_AHEAD_pv.csv",
+        ),
+    }  # fmt: skip
+
+    def read(self, table: Any, paths: Mapping[str, Path]) -> _Loaded:
+        return _Loaded(table, read_rts(paths["data"]))
+
+    def fit(self, model: _Loaded) -> str:
+        return model.market.fit
+
+    def known(
+        self, model: _Loaded
+    ) -> tuple[Constants | None, tuple[Assumption, ...], list[tuple[str, str, str]]]:
+        firms = model.market.firms
+        sizes = [
+            ("units", str(firms.shape[0]), f"of {firms.shape[1]} firms"),
+            ("hours", str(len(model.times)), f"from hour {model.table.start_hour} on"),
+        ]
+        return model.market.constants, (), sizes
+
+    def solve(self, model: _Loaded) -> Results:
+        market, times = model.market, model.times
+        prices, made = jax.vmap(market.equilibrium)(jnp.asarray(times))
+        capacity = np.asarray(jax.vmap(market.capacity.value)(jnp.asarray(times)))
+        gain = largest_gain(
+            np.asarray(prices), np.asarray(made), capacity, np.asarray(market.cost),
+            np.asarray(market.slope), np.asarray(market.firms), float(market.b),
+        )  # fmt: skip
+        by_firm = np.asarray(made @ market.firms)
+        hour = Variable(("hour",), times, "h", "hour of the data")
+        variables = {
+            "hour": hour,
+            "price": Variable(("hour",), np.asarray(prices), "$/MWh", "Cournot-Nash price"),
+            "made": Variable(("hour", "firm"), by_firm, "MW", "what each firm makes"),
+            "capacity": Variable(
+                ("hour", "firm"), capacity @ np.asarray(market.firms), "MW", "what it could make"
+            ),
+        }
+        figures = {
+            "price": Figure(prices, "$/MWh", "Cournot-Nash price of every hour"),
+            "max_deviation_profit": Figure(
+                gain, "$/h", "most that a firm could gain by making something else, at any hour"
+            ),
+            "mean_price": Figure(float(jnp.mean(prices)), "$/MWh", "their mean"),
+        }
+        steps = 0
+        if len(times) > 1:
+            solution = market.run(constants=market.constants)
+            steps = int(solution.stats["steps"])
+            bound = certificate(market.problem, solution, market.constants)
+            sticky = np.asarray(solution.xs)
+            variables |= {
+                "sticky_price": Variable(("hour",), sticky, "$/MWh", "price that follows demand"),
+                "error_bound": Variable(
+                    ("hour",),
+                    bound.values,
+                    "$/MWh",
+                    "bound on the error of the sticky price",
+                ),
+            }
+            figures |= {
+                "sticky_price": Figure(sticky, "$/MWh", "price of the dynamics at every hour"),
+                "largest_lag": Figure(
+                    float(np.abs(sticky - np.asarray(prices)).max()), "$/MWh",
+                    "most that the sticky price is away from the price at rest",
+                ),
+                "sticky_deviation_profit": Figure(
+                    market.figures(solution)["max_deviation_profit"], "$/h",
+                    "the same gain along the dynamics",
+                ),
+                "error_bound": Figure(
+                    bound.largest, "$/MWh",
+                    f"bound on the error of the sticky price ({bound.status})",
+                ),
+                "decay_rate": Figure(
+                    float(market.constants.sharp_decay_rate), "1/h",
+                    "two prices certainly approach at this rate",
+                ),
+            }  # fmt: skip
+        return Results(figures, variables, market.constants, steps)
+
+
+APPLICATION = MarketApplication()
