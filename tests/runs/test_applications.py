@@ -1,0 +1,114 @@
+"""Configurations of applications: what is refused and how, and what a run leaves behind."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import xarray
+
+import dvax
+from dvax.plots import build_report
+from dvax.runs.applications.config import ModelConfig, read_config
+from dvax.runs.applications.driver import run_model
+
+TANK = """* a tank that a diode damps in one half-wave
+C1 1 0 1u IC=10
+L1 1 0 10m
+D1 1 0 R=1k
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    where = tmp_path_factory.mktemp("circuit")
+    (where / "tank.cir").write_text(TANK)
+    (where / "tank.toml").write_text(
+        '[model]\nname = "circuit"\nnetlist = "tank.cir"\nt_end = "1 ms"\nframes = 20\n'
+    )
+    return where
+
+
+@pytest.fixture(scope="module")
+def outcome(folder):
+    return run_model(read_config(folder / "tank.toml"), folder / "run")
+
+
+def written(folder, text, name="bad.toml"):
+    file = folder / name
+    file.write_text(text)
+    return file
+
+
+def problems(file, **options):
+    with pytest.raises(dvax.InputError) as caught:
+        read_config(file, **options)
+    return [str(problem) for problem in caught.value.problems]
+
+
+def test_an_unknown_model_is_told_the_names(folder):
+    (told,) = problems(written(folder, '[model]\nname = "circit"\n'))
+    assert "model.name" in told and "fem-contact" in told and "Did you mean 'circuit'?" in told
+
+
+def test_everything_wrong_in_the_table_is_said_at_once(folder):
+    told = problems(
+        written(
+            folder,
+            '[model]\nname = "circuit"\nnetlists = "tank.cir"\nt_end = "5 V"\nr_on = -1.0\n[bnd]\n',
+        )
+    )
+    for word in ("bnd", "netlists", "Did you mean 'netlist'", "t_end", "r_on", "greater than 0"):
+        assert any(word in line for line in told), (word, told)
+
+
+def test_data_lies_beside_the_configuration_unless_allowed(folder, tmp_path):
+    shutil.copy(folder / "tank.cir", tmp_path / "tank.cir")
+    inner = tmp_path / "inner"
+    inner.mkdir()
+    text = '[model]\nname = "circuit"\nnetlist = "{}"\nt_end = 1e-3\n'
+    for name in ("../tank.cir", str(tmp_path / "tank.cir")):
+        file = written(inner, text.format(name))
+        (told,) = problems(file)
+        assert "model.netlist" in told
+        assert isinstance(read_config(file, allow_outside=True), ModelConfig)
+    (told,) = problems(written(inner, text.format("none.cir")))
+    assert "there is no such file" in told
+    (told,) = problems(written(inner, '[model]\nname = "market"\ndata = "no"\nstart_hour = 0\n'))
+    assert "there is no such folder" in told
+
+
+def test_what_is_wrong_in_the_data_comes_with_its_line(folder):
+    (folder / "open.cir").write_text("C1 1 0 1u\nL1 1 0 ten\n")
+    told = problems(
+        written(folder, '[model]\nname = "circuit"\nnetlist = "open.cir"\nt_end = 1.0\n')
+    )
+    assert any("open.cir, line 2" in line for line in told)
+
+
+def test_a_run_leaves_figures_data_and_a_report(folder, outcome):
+    assert outcome.exit_code == 0 and outcome.status == "finished"
+    summary = json.loads((outcome.directory / "summary.json").read_text())
+    assert set(summary["final_state"]) == {"value", "unit", "meaning"}
+    assert len(summary["final_state"]["value"]) == 2
+    assert 0 < summary["error_bound"]["value"] < 1e-8
+    manifest = json.loads((outcome.directory / "manifest.json").read_text())
+    assert manifest["model"] == "circuit" and manifest["fit"] == "exact"
+    assert list(manifest["data"]) == ["tank.cir"]
+    assert any(row["name"] == "gamma" and row["status"] == "proved" for row in manifest["constants"])
+    with xarray.open_zarr(outcome.directory / "trajectory.zarr", consolidated=False) as data:
+        assert data.sizes["time"] == 21 and "state_C1" in data
+        np.testing.assert_allclose(
+            [data.state_C1[-1], data.state_L1[-1]], summary["final_state"]["value"], rtol=1e-12
+        )
+        assert data.state_C1.attrs["units"] == "V"
+    page = build_report(outcome.directory).read_text()
+    assert "model circuit, exact" in page and "The circuit over time" in page
+    assert (outcome.directory / "figures" / "circuit.png").stat().st_size > 10_000
+
+
+def test_the_resolved_configuration_is_the_same_run(outcome, tmp_path):
+    moved = tmp_path / "moved"
+    shutil.copytree(outcome.directory, moved)
+    again = run_model(read_config(moved / "config.resolved.toml"), tmp_path / "again")
+    assert again.summary == outcome.summary
