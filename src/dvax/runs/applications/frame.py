@@ -1,0 +1,120 @@
+"""`[model] name = "frame"`: a one-storey frame under a measured earthquake."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from dvax.errors import InputError, InputProblem
+from dvax.models.frame import Accelerogram, Frame
+from dvax.runs.applications.base import AbstractApplication, Figure, Results, Variable
+from dvax.runs.applications.certificate import certificate
+from dvax.runs.schema import Section, in_quantity
+from dvax.runs.strong_motion import read_strong_motion
+from dvax.theory import Assumption, Constants
+
+
+class FrameSection(Section):
+    """The record and the frame."""
+
+    name: Literal["frame"] = Field(description="the model")
+    record: str = Field(description="an .at2 strong-motion record, in units of gravity")
+    period: Annotated[float, in_quantity("time")] = Field(gt=0, description="natural period [s]")
+    damping: float = Field(ge=0, description="of the critical damping")
+    yield_ratio: float | None = Field(
+        None, gt=0, description="yield force over the largest elastic force; without it: elastic"
+    )
+    viscosity_ratio: Annotated[float, in_quantity("time")] | None = Field(
+        None, gt=0, description="viscosity over stiffness, eta/k [s]; elastoplastic as it goes to 0"
+    )
+    rtol: float = Field(1e-8, gt=0, lt=1, description="relative tolerance of a step")
+
+
+class _Loaded:
+    def __init__(self, table: FrameSection, file: Path):
+        self.table = table
+        motion = read_strong_motion(file)
+        steps = np.diff(motion.times)
+        # Times are written with a few digits.
+        if np.ptp(steps) > 1e-6 * steps[0]:
+            k = int(np.argmax(np.abs(steps - steps[0])))
+            raise InputError(
+                InputProblem(
+                    file.name, f"a step of {steps[k]:g} s at {motion.times[k]:g} s",
+                    f"samples are equally far apart, here {steps[0]:g} s", "Sample it evenly",
+                )
+            )  # fmt: skip
+        self.frame = Frame(
+            record=Accelerogram(float(steps.mean()), motion.acceleration),
+            period=table.period, damping=table.damping, yield_ratio=table.yield_ratio,
+            viscosity_ratio=table.viscosity_ratio,
+        )  # fmt: skip
+
+
+class FrameApplication(AbstractApplication[_Loaded]):
+    """Displacements, the force of the spring, and the ground."""
+
+    section = FrameSection
+    files = ("record",)
+
+    def read(self, table: Any, paths: Mapping[str, Path]) -> _Loaded:
+        return _Loaded(table, paths["record"])
+
+    def fit(self, model: _Loaded) -> str:
+        return model.frame.fit
+
+    def known(
+        self, model: _Loaded
+    ) -> tuple[Constants | None, tuple[Assumption, ...], list[tuple[str, str, str]]]:
+        record = model.frame.record
+        count, long = record.samples.shape[0], record.duration
+        return model.frame.constants, (), [
+            ("record", f"{count} samples", f"{record.step:g} s apart, {long:g} s in all"),
+        ]  # fmt: skip
+
+    def solve(self, model: _Loaded) -> Results:
+        frame, table = model.frame, model.table
+        constants = frame.constants
+        solution = frame.solve(rtol=table.rtol, constants=constants)
+        bound = certificate(frame.problem, solution, constants)
+        every = slice(None, None, (len(solution.ts) - 1) // (frame.record.samples.shape[0] - 1))
+        d, v, plastic = np.asarray(solution.xs[every]).T
+        omega = float(frame.omega)
+        time = ("time",)
+        variables = {
+            "time": Variable(time, np.asarray(solution.ts[every]), "s", "time"),
+            "ground": Variable(
+                time, np.asarray(frame.record.samples), "in/s^2", "ground acceleration"
+            ),
+            "displacement": Variable(time, d, "in", "displacement against the ground"),
+            "velocity": Variable(time, v, "in/s", "velocity against the ground"),
+            "plastic": Variable(time, plastic, "in", "plastic displacement"),
+            "spring": Variable(
+                time, omega**2 * (d - plastic), "in/s^2", "force of the spring a mass"
+            ),
+            "error_bound": Variable(
+                time, bound.values[every] / omega, "in", "bound on the error of the displacement"
+            ),
+        }
+        peak = float(np.max(np.abs(d)))
+        figures = {
+            "peak_displacement": Figure(peak, "in", "largest displacement at the times of the record"),
+            "largest_displacement": Figure(
+                float(frame.largest_displacement(solution)), "in", "largest displacement at all times"
+            ),
+            "residual_displacement": Figure(float(plastic[-1]), "in", "plastic part of it at the end"),
+            "error_bound": Figure(
+                bound.largest / omega, "in",
+                f"bound on the error of the displacement ({bound.status})",
+            ),
+        }  # fmt: skip
+        limit = float(frame.yield_displacement)
+        if np.isfinite(limit):
+            figures["yield_displacement"] = Figure(limit, "in", "displacement at which it yields")
+            figures["ductility"] = Figure(peak / limit, "1", "peak over yield displacement")
+        return Results(figures, variables, constants, int(solution.stats["steps"]))
+
+
+APPLICATION = FrameApplication()
