@@ -79,15 +79,15 @@ class FrameApplication(AbstractApplication[_Loaded]):
         constants = frame.constants
         solution = frame.solve(rtol=table.rtol, constants=constants)
         bound = certificate(frame.problem, solution, constants)
-        every = slice(None, None, (len(solution.ts) - 1) // (frame.record.samples.shape[0] - 1))
-        d, v, plastic = np.asarray(solution.xs[every]).T
+        between = (len(solution.ts) - 1) // (frame.record.samples.shape[0] - 1)
+        d, v, plastic = np.asarray(solution.xs).T
+        ts = np.asarray(solution.ts)
         omega = float(frame.omega)
+        ground = np.interp(ts, np.asarray(frame.record.knots()), np.asarray(frame.record.samples))
         time = ("time",)
         variables = {
-            "time": Variable(time, np.asarray(solution.ts[every]), "s", "time"),
-            "ground": Variable(
-                time, np.asarray(frame.record.samples), "in/s^2", "ground acceleration"
-            ),
+            "time": Variable(time, ts, "s", "time"),
+            "ground": Variable(time, ground, "in/s^2", "ground acceleration"),
             "displacement": Variable(time, d, "in", "displacement against the ground"),
             "velocity": Variable(time, v, "in/s", "velocity against the ground"),
             "plastic": Variable(time, plastic, "in", "plastic displacement"),
@@ -95,10 +95,10 @@ class FrameApplication(AbstractApplication[_Loaded]):
                 time, omega**2 * (d - plastic), "in/s^2", "force of the spring a mass"
             ),
             "error_bound": Variable(
-                time, bound.values[every] / omega, "in", "bound on the error of the displacement"
+                time, bound.values / omega, "in", "bound on the error of the displacement"
             ),
         }
-        peak = float(np.max(np.abs(d)))
+        peak = float(np.max(np.abs(d[::between])))
         figures = {
             "peak_displacement": Figure(peak, "in", "largest displacement at the times of the record"),
             "largest_displacement": Figure(
