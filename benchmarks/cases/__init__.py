@@ -20,6 +20,7 @@ CASES = (
     "box_vi",
     "pointwise",
     "obstacle",
+    "applications",
 )
 """The names that --only takes, in the order of a run."""
 

@@ -147,3 +147,24 @@ class SiconosRaces(_Running):
         self._ask(do="build", race=race, n=n, steps=steps)
         answer = self._ask(do="run")
         return answer["seconds"], np.array(answer["x"])
+
+
+class SiconosCircuit(_Running):
+    """Linear circuits with ideal diodes (`siconos_circuit.py`)."""
+
+    def __init__(self, interpreter: str):
+        super().__init__(interpreter, "siconos_circuit.py")
+
+    def build(self, matrices: dict[str, Any], h: float, steps: int) -> None:
+        self._ask(do="build", **matrices, h=h, steps=steps)
+
+    def run(self) -> tuple[float, np.ndarray]:
+        """Seconds for the steps, and x at the end.
+
+        **Raises:** `RuntimeError` where an entry is not finite.
+        """
+        answer = self._ask(do="run")
+        x = np.array(answer["x"])
+        if not np.all(np.isfinite(x)):
+            raise RuntimeError("Siconos returned a state that is not finite")
+        return answer["seconds"], x
