@@ -111,15 +111,15 @@ class MarketApplication(AbstractApplication[_Loaded]):
                     "bound on the error of the sticky price",
                 ),
             }
+            figures["max_deviation_profit"] = Figure(
+                market.figures(solution)["max_deviation_profit"], "$/h",
+                "most that a firm could gain by making something else, at rest or under way",
+            )  # fmt: skip
             figures |= {
                 "sticky_price": Figure(sticky, "$/MWh", "price of the dynamics at every hour"),
                 "largest_lag": Figure(
                     float(np.abs(sticky - np.asarray(prices)).max()), "$/MWh",
                     "most that the sticky price is away from the price at rest",
-                ),
-                "sticky_deviation_profit": Figure(
-                    market.figures(solution)["max_deviation_profit"], "$/h",
-                    "the same gain along the dynamics",
                 ),
                 "error_bound": Figure(
                     bound.largest, "$/MWh",

@@ -1,0 +1,157 @@
+"""From a plant and its cost to the quadratic programme of a horizon."""
+
+import itertools
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from .. import _tree
+from ..errors import InputError, InputProblem
+
+
+class Condensed(NamedTuple):
+    """½UᵀHU + (Gx)ᵀU, half of the cost of the plan U from the state x; the `terminal` weight Π and the
+    gain of the `regulator`, which is the plan's first move where nothing limits it."""
+
+    H: np.ndarray
+    G: np.ndarray
+    terminal: np.ndarray
+    regulator: np.ndarray
+
+
+class Horizon(NamedTuple):
+    """A plant, the weights of a step, how many steps and how long."""
+
+    A: np.ndarray
+    B: np.ndarray
+    Q: np.ndarray
+    R: np.ndarray
+    horizon: int
+    step: float
+
+    @classmethod
+    def checked(cls, *, A: Any, B: Any, Q: Any, R: Any, horizon: Any, step: Any) -> "Horizon":
+        """These, or an `InputError` with all that is wrong."""
+        wrong: list[InputProblem] = []
+        a, b, q, r = (_matrix(name, v, wrong) for name, v in zip("ABQR", (A, B, Q, R)))
+        if not (isinstance(horizon, int) and not isinstance(horizon, bool) and horizon > 0):
+            wrong.append(
+                InputProblem("dvax.models.LinearMPC(horizon)", repr(horizon),
+                             "it must be a positive integer, the number of moves planned",
+                             "Give 10 or 20")
+            )  # fmt: skip
+        length = _positive(step, wrong)
+        if not wrong:
+            wrong = _misfits(a, b, q, r)
+        if wrong:
+            raise InputError(*wrong)
+        return cls(a, b, q, r, horizon, length)
+
+
+def condense(given: Horizon) -> Condensed:
+    """H = R̄ + ΓᵀQ̄Γ and G = ΓᵀQ̄Φ, where the predicted states are Φx + ΓU.
+
+    **Raises:** `dvax.InputError` where the Riccati equation has no stabilising solution.
+    """
+    A, B, Q, R, N, step = given
+    n, m = B.shape
+    held = scipy.linalg.expm(step * np.block([[A, B], [np.zeros((m, n + m))]]))
+    A_step, B_step = held[:n, :n], held[:n, n:]
+    terminal = _riccati(A_step, B_step, Q, R)
+    regulator = np.linalg.solve(R + B_step.T @ terminal @ B_step, B_step.T @ terminal @ A_step)
+    # Row block k: the state after k + 1 moves.
+    powers = [np.eye(n)]
+    for _ in range(N):
+        powers.append(A_step @ powers[-1])
+    Phi = np.concatenate(powers[1:])
+    zero = np.zeros((n, m))
+    Gamma = np.block(
+        [[powers[k - j] @ B_step if j <= k else zero for j in range(N)] for k in range(N)]
+    )
+    weights = scipy.linalg.block_diag(*[Q] * (N - 1), terminal)
+    H = scipy.linalg.block_diag(*[R] * N) + Gamma.T @ weights @ Gamma
+    return Condensed(0.5 * (H + H.T), Gamma.T @ weights @ Phi, terminal, regulator)
+
+
+def gain_by_regions(H: np.ndarray, G: np.ndarray, m: int) -> float:
+    """max over I of ‖E₁(H_II)⁻¹G_I‖, I running over the sets of moves that may be free."""
+    size, best = len(H), 0.0
+    for count in range(1, size + 1):
+        sets = np.array(list(itertools.combinations(range(size), count)))
+        # What is not free in the first block does not move.
+        sets = sets[sets[:, 0] < m]
+        if not len(sets):
+            continue
+        slopes = np.linalg.solve(H[sets[:, :, None], sets[:, None, :]], G[sets])
+        first = np.where((sets < m)[:, :, None], slopes, 0.0)[:, : min(m, count)]
+        best = max(best, float(np.max(np.linalg.norm(first, 2, axis=(1, 2)))))
+    return best
+
+
+def _riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
+    try:
+        return scipy.linalg.solve_discrete_are(A, B, Q, R)
+    except np.linalg.LinAlgError as error:
+        raise InputError(
+            InputProblem(
+                "dvax.models.LinearMPC(A, B, Q)",
+                f"a Riccati equation without a stabilising solution ({error})",
+                "the inputs must reach every mode that does not decay, and Q must see it",
+                "Add an actuator, or weigh the mode",
+            )
+        ) from error
+
+
+def _matrix(name: str, value: Any, wrong: list[InputProblem]) -> np.ndarray:
+    place = f"dvax.models.LinearMPC({name})"
+    try:
+        array = _tree.as_float(value, place)
+    except InputError as error:
+        wrong += error.problems
+        return np.zeros((0, 0))
+    known = _tree.is_concrete(array)
+    if not known or np.ndim(array) != 2 or not np.all(np.isfinite(array)):
+        wrong.append(
+            InputProblem(place, _tree.short(array) if known else "a traced array",
+                         "it must be a matrix of finite numbers that are known now",
+                         "Give rows of numbers")
+        )  # fmt: skip
+        return np.zeros((0, 0))
+    return np.asarray(array)
+
+
+def _positive(step: Any, wrong: list[InputProblem]) -> float:
+    try:
+        value = np.asarray(_tree.as_float(step, "dvax.models.LinearMPC(step)"))
+    except InputError as error:
+        wrong += error.problems
+        return 1.0
+    if value.shape == () and 0 < value < np.inf:
+        return float(value)
+    wrong.append(
+        InputProblem("dvax.models.LinearMPC(step)", _tree.short(value),
+                     "it must be a positive time, for which a planned move is held", "Mend it")
+    )  # fmt: skip
+    return 1.0
+
+
+def _misfits(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> list[InputProblem]:
+    n, m = len(A), B.shape[1]
+    rules = [
+        ("A", A, A.shape == (n, n) and n > 0, "it must be square"),
+        ("B", B, B.shape == (n, m) and m > 0, f"it has a row for each of the {n} states"),
+        ("Q", Q, _definite(Q, n, -1e-12), f"it must be symmetric and ⪰ 0, {n} by {n}"),
+        ("R", R, _definite(R, m, 0.0), f"it must be symmetric and ≻ 0, {m} by {m}: γ rests on it"),
+    ]
+    return [
+        InputProblem(f"dvax.models.LinearMPC({name})", _tree.short(value), rule, "Mend the matrix")
+        for name, value, holds, rule in rules
+        if not holds
+    ]
+
+
+def _definite(W: np.ndarray, size: int, least: float) -> bool:
+    if W.shape != (size, size) or not np.allclose(W, W.T, rtol=1e-12, atol=0.0):
+        return False
+    return bool(np.linalg.eigvalsh(W)[0] > least * np.abs(W).max())

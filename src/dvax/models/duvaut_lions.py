@@ -1,0 +1,267 @@
+"""Viscoplasticity of Duvaut and Lions at a material point."""
+
+import math
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .. import _tree
+from ..errors import InputError, InputProblem
+from ..generators import Scalar
+from ..operators import Scaling
+from ..problem import Problem
+from ..sets import AbstractSet, Ball, SecondOrderCone, Translated
+from ..signals import AbstractSignal, Constant, Function
+from ..spaces import L2
+from ..theory import Constants
+from ._stress import joined, split
+from ._stress import mandel as mandel
+from ._stress import tensor as tensor
+
+
+class VonMises(NamedTuple):
+    """√(3/2)‖dev σ‖ ≤ σ_y: `strength` σ_y > 0, a number, a `dvax.signals` or a callable of t."""
+
+    strength: Any
+
+
+class DruckerPrager(NamedTuple):
+    """√(3/2)‖dev σ‖ ≤ M (p + p_t) with the pressure p = −tr σ/3: a cone. `friction` M > 0, a number;
+    `tension` p_t ≥ 0, what the material bears of hydrostatic tension: a number, a `dvax.signals` or a
+    callable of t."""
+
+    friction: float
+    tension: Any
+
+
+class DuvautLions(eqx.Module):
+    """A material point that yields with a delay, driven by a strain history ε(t).
+
+        ε_p' = C⁻¹(σ − u)/τ,   σ = C(ε(t) − ε_p),   u = proj_K(σ) in the norm σ : C⁻¹ : σ
+
+    ε_p is the plastic strain, σ the stress, u the nearest stress that the material bears at rest. C is
+    isotropic, C e = K tr(e) 1 + 2G dev e. The nearest point in the energy norm is the closest-point
+    projection of computational plasticity: C⁻¹(σ − u) is normal to K at u, so the flow is associated,
+    and as τ → 0 the stress becomes that of rate-independent plasticity, at the order τ.
+
+    In `split` components of Mandel's vectors (the trace, five of the deviator: a rotation) C is the
+    diagonal c = (3K, 2G, …, 2G). The state is ε_p in the norm with weights c, the control u in the norm
+    with weights 1/c, both elastic energies, and as a problem of this library A = −1/τ, P = I,
+    h = c(ε − x), f = (ε − u/c)/τ. K is
+
+    - Drucker and Prager's cone, a `dvax.sets.SecondOrderCone` moved to its apex, projected in these
+      weights: six components;
+    - von Mises' cylinder. In σ : C⁻¹ : σ = (tr σ)²/(9K) + ‖dev σ‖²/(2G) the two terms of a distance are
+      least each by itself; nothing holds the trace, so it stays, and of the deviators with
+      √(3/2)‖s‖ ≤ σ_y the nearest one is on the radius, whatever the number 1/(2G). So the clip of the
+      deviator, the radial return, is exact; the pressure is elastic, and state and control are the
+      five components of the deviators, with a `dvax.sets.Ball` of radius σ_y √(2/3)/√(2G) in the energy
+      norm. The law is then ε_p' = (σ − u)/η with the viscosity η = 2Gτ.
+
+    **Units:** K, G, σ and strengths in one unit of stress; τ and t in one unit of time.
+
+    **Arguments:** `bulk` K > 0, `shear` G > 0, `relaxation` τ > 0: numbers; `strain`: ε(t) as a Mandel
+    vector (`mandel`), a `dvax.signals` or a callable of t; `yields`: `VonMises(…)` or
+    `DruckerPrager(…)`. Many points are a `jax.vmap`.
+
+    **Raises:** `dvax.InputError` for everything that breaks its rule.
+
+    Source: Duvaut and Lions 1972, chapter V; Simo and Hughes 1998, Computational Inelasticity, sections
+    2.7 and 3.6.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> from dvax.models.duvaut_lions import DuvautLions, VonMises, mandel
+    >>> shear = mandel(jnp.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    >>> steel = DuvautLions(bulk=160e3, shear=80e3, relaxation=0.1, yields=VonMises(250.0),
+    ...                     strain=lambda t: 1e-3 * t * shear)          # MPa and seconds
+    >>> sol = dvax.solve(steel.problem, steel.virgin, 0.0, 4.0, rtol=1e-8, atol=1e-12)
+    >>> stress = steel.stress(4.0, sol.xs[-1])
+    >>> round(float(stress[5] / 2**0.5), 3)              # 250/√3 + 2 · 80e3 · 1e-3 · 0.1
+    160.338
+
+    ```
+    """
+
+    moduli: jax.Array
+    relaxation: jax.Array
+    slope: jax.Array | None
+    limit: AbstractSignal
+    strain: AbstractSignal
+
+    def __init__(self, *, bulk: Any, shear: Any, relaxation: Any, strain: Any, yields: Any):
+        wrong: list[InputProblem] = []
+        K, G, self.relaxation = (
+            _positive(name, value, wrong)
+            for name, value in (("bulk", bulk), ("shear", shear), ("relaxation", relaxation))
+        )
+        self.moduli = jnp.concatenate([jnp.reshape(3.0 * K, (1,)), jnp.full(5, 2.0 * G)])
+        self.slope = None
+        if isinstance(yields, DruckerPrager):
+            # q = √(3/2)‖s‖ ≤ M(p + p_t) and y₀ = √3 p: ‖s‖ ≤ (√2/3) M (y₀ + √3 p_t).
+            self.slope = math.sqrt(2.0) / 3.0 * _positive("yields.friction", yields.friction, wrong)
+            self.limit = _limit("yields.tension", yields.tension, wrong, zero=True)
+        elif isinstance(yields, VonMises):
+            self.limit = _limit("yields.strength", yields.strength, wrong, zero=False)
+        else:
+            wrong.append(
+                InputProblem("dvax.models.DuvautLions(yields)", repr(yields),
+                             "it must be a VonMises(strength) or a DruckerPrager(friction, tension)",
+                             "Import them from dvax.models.duvaut_lions")
+            )  # fmt: skip
+        self.strain = _strain(strain, wrong)
+        if wrong:
+            raise InputError(*wrong)
+
+    @property
+    def fit(self) -> str:
+        """The model is in the class of the theory as it stands."""
+        return (
+            "exact (rate-independent plasticity is its limit as the relaxation time τ → 0, at O(τ))"
+        )
+
+    @property
+    def problem(self) -> Problem:
+        """The coupled system, in `split` components: those that yield."""
+        c = self._active
+        return Problem(
+            A=Scalar(-1.0 / _tree.host(self.relaxation)),
+            P=Scaling(1.0),
+            K=self._at_rest,
+            f=self._rate,
+            h=self._feedback,
+            state_space=L2(c),
+            control_space=L2(1.0 / c),
+        )
+
+    @property
+    def constants(self) -> Constants:
+        """In the energy norms γ = L_F = 1, α_h = ‖C‖ = 1, β_f = 1/τ, ω = −1/τ: ω + L̃ = 0. Two histories
+        of the same strain never separate, and inside the yield set they do not approach; the one-sided
+        rate is 0 as well, since ⟨Δσ, Δu⟩ ≤ ‖Δσ‖²."""
+        rate = 1.0 / _tree.host(self.relaxation)
+        return Constants(
+            gamma=1.0,
+            L_F=1.0,
+            alpha_h=1.0,
+            beta_h=0.0,
+            alpha_f=0.0,
+            beta_f=rate,
+            M=1.0,
+            omega=-rate,
+            m_P=1.0,
+            norm_P_inv=1.0,
+            one_sided=0.0,
+            status="proved",
+        )
+
+    @property
+    def virgin(self) -> jax.Array:
+        """The state without plastic strain: zeros, five of them (von Mises) or six."""
+        return jnp.zeros_like(self._active)
+
+    def stress(self, t: Any, x: Any) -> jax.Array:
+        """σ = C(ε(t) − ε_p), a Mandel vector, at the state x."""
+        return joined(self.moduli * (split(self.strain(t)) - self._whole(x)))
+
+    def plastic_strain(self, x: Any) -> jax.Array:
+        """ε_p as a Mandel vector."""
+        return joined(self._whole(x))
+
+    def von_mises(self, t: Any, x: Any) -> jax.Array:
+        """q = √(3/2)‖dev σ‖, in units of stress."""
+        return math.sqrt(1.5) * jnp.linalg.norm(self._trial(t, x)[-5:])
+
+    def figures(self, solution: Any) -> dict[str, Any]:
+        """Over the saved times, in units of stress: `peak_stress`, the largest q; `overstress`, the
+        largest ‖σ − u‖, which is what the delay lets the stress leave the yield set by. At the last
+        one: `final_stress`, a Mandel vector, and `plastic_strain`, √(2/3)‖ε_p‖."""
+        ts, xs = solution.ts, solution.xs
+        trial = jax.vmap(self._trial)(ts, xs)
+        return {
+            "peak_stress": float(jnp.max(jax.vmap(self.von_mises)(ts, xs))),
+            "overstress": float(jnp.max(jnp.linalg.norm(trial - solution.us, axis=-1))),
+            "plastic_strain": math.sqrt(2.0 / 3.0) * float(jnp.linalg.norm(xs[-1])),
+            "final_stress": [float(v) for v in self.stress(ts[-1], xs[-1])],
+        }
+
+    @property
+    def _active(self) -> jax.Array:
+        """c of the components that yield: of a von Mises material the five of the deviator."""
+        return self.moduli[1:] if self.slope is None else self.moduli
+
+    def _whole(self, x: Any) -> jax.Array:
+        """The six components of a state."""
+        return jnp.concatenate([jnp.zeros_like(x[:1]), x]) if self.slope is None else x
+
+    def _strained(self, t: Any) -> jax.Array:
+        """The components of ε(t) that yield."""
+        parts = split(self.strain(t))
+        return parts[1:] if self.slope is None else parts
+
+    def _trial(self, t: Any, x: Any) -> jax.Array:
+        return self._active * (self._strained(t) - x)
+
+    @property
+    def _at_rest(self) -> Any:
+        """K, or the callable that says what it is at t where it moves."""
+        return self._set(0.0, None) if isinstance(self.limit, Constant) else self._set
+
+    def _set(self, t: Any, args: Any) -> AbstractSet:
+        if self.slope is None:
+            return Ball(0.0, math.sqrt(2.0 / 3.0) * self.limit(t) / jnp.sqrt(self.moduli[1]))
+        apex = jnp.zeros(6).at[0].set(-math.sqrt(3.0) * self.limit(t))
+        return Translated(SecondOrderCone(self.slope), apex)
+
+    def _rate(self, t: Any, x: Any, u: Any, args: Any) -> jax.Array:
+        return (self._strained(t) - u / self._active) / self.relaxation
+
+    def _feedback(self, t: Any, x: Any, u: Any, args: Any) -> jax.Array:
+        return self._trial(t, x)
+
+
+def _positive(name: str, value: Any, wrong: list[InputProblem], zero: bool = False) -> jax.Array:
+    place = f"dvax.models.DuvautLions({name})"
+    try:
+        number = _tree.as_float(value, place)
+    except InputError as error:
+        wrong += error.problems
+        return jnp.ones(())
+    holds = jnp.ndim(number) == 0
+    if holds and _tree.is_concrete(number):
+        holds = bool(np.isfinite(number) and (number >= 0 if zero else number > 0))
+    if holds:
+        return number
+    rule = "it must be a number ≥ 0" if zero else "it must be a positive number"
+    wrong.append(InputProblem(place, _tree.short(number), rule, "Mend it"))
+    return jnp.ones(())
+
+
+def _limit(name: str, value: Any, wrong: list[InputProblem], zero: bool) -> AbstractSignal:
+    if isinstance(value, AbstractSignal):
+        return value
+    if callable(value):
+        return Function(value)
+    return Constant(_positive(name, value, wrong, zero))
+
+
+def _strain(value: Any, wrong: list[InputProblem]) -> AbstractSignal:
+    place = "dvax.models.DuvautLions(strain)"
+    signal = value if isinstance(value, AbstractSignal) else None
+    if signal is None:
+        try:
+            signal = Function(value) if callable(value) else Constant(_tree.as_float(value, place))
+        except InputError as error:
+            wrong += error.problems
+            return Constant(jnp.zeros(6))
+    shape = tuple(jax.eval_shape(signal.value, jnp.zeros(())).shape)
+    if shape != (6,):
+        wrong.append(
+            InputProblem(place, f"values of shape {shape}",
+                         "a strain is a Mandel vector of six components",
+                         "Use dvax.models.duvaut_lions.mandel on the tensor")
+        )  # fmt: skip
+    return signal

@@ -1,0 +1,7 @@
+"""Electricity markets: Cournot firms under a sticky price, and the RTS-GMLC data."""
+
+from .deviation import largest_gain as largest_gain
+from .market import Market as Market
+from .merit import MeritOrder as MeritOrder
+from .rts import RTS as RTS
+from .rts import read_rts as read_rts

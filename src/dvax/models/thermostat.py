@@ -1,0 +1,248 @@
+"""Heat in a plate whose heaters and coolers have a greatest power."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .. import _tree
+from ..errors import InputError, InputProblem
+from ..generators import Elliptic
+from ..operators import Scaling
+from ..problem import Problem
+from ..sets import Box
+from ..signals import AbstractSignal, Constant, Function
+from ..spaces import L2
+from ..theory import Constants
+
+COOLED, REGULATED, HEATED = -1, 0, 1
+"""At the least power, between, and at the greatest."""
+
+
+class Thermostat(eqx.Module):
+    """The heat equation on a rectangle Ω with a thermostat at every point.
+
+        x' = κΔx + u + ℓ(t)
+        u ∈ k(T_ref − x) − N_K(u),   K = {g₁ ≤ u ≤ g₂},   so that u = clip(k(T_ref − x), g₁, g₂)
+
+    in X = U = L²(Ω), with insulated walls (Neumann), walls held at 0 (Dirichlet), or a periodic
+    plate. u is the heating power, negative where it cools. Between the regions at g₁, at g₂ and in
+    between run free boundaries, where k(T_ref − x) meets a limit. (With −u for the flow through a
+    semipermeable membrane these are the laws of Duvaut and Lions, in the interior.)
+
+    As a problem of this library: A = κΔ, P = I, h = k(T_ref − x), f = u + ℓ; F(y) = y − h(x) has
+    γ = L_F = 1. On a grid L² has the area of a cell as weight, the projection is the clip, and Δ is
+    exact for what the grid can show.
+
+    **Units:** with temperature in [T], length in [s], time in [t]: κ in [s]²/[t]; k in 1/[t]; u, g₁, g₂
+    and ℓ in [T]/[t] (power over heat capacity); T_ref in [T].
+
+    **Arguments:** `shape`: cells along each axis; `lengths`; `boundary` and `scheme` as for
+    `dvax.generators.Elliptic`; `diffusion` κ > 0; `gain` k > 0; `reference` T_ref and `load` ℓ:
+    numbers, arrays over the cells, `dvax.signals` or callables of t; `lower` g₁ ≤ `upper` g₂: numbers
+    or arrays over the cells (equal where there is no heater).
+
+    **Raises:** `dvax.InputError` for everything that breaks its rule.
+
+    Source: Duvaut and Lions 1972, Les inéquations en mécanique et en physique, chapter I.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> from dvax.models.thermostat import Thermostat
+    >>> plate = Thermostat(shape=(32, 32), lengths=1.0, boundary="dirichlet", diffusion=0.1, gain=5.0,
+    ...                    reference=1.0, lower=0.0, upper=2.0, load=0.0)
+    >>> sol = dvax.solve(plate.problem, jnp.zeros((32, 32)), 0.0, 4.0, rtol=1e-4)
+    >>> figures = plate.figures(sol)
+    >>> round(figures["mean_temperature"], 3), round(figures["heated"], 3)
+    (0.496, 0.574)
+    >>> bool(plate.constants.sharp_decay_rate > 1.97), float(plate.constants.decay_rate) < 0
+    (True, True)
+
+    ```
+    """
+
+    diffusion: jax.Array
+    gain: jax.Array
+    reference: AbstractSignal
+    lower: jax.Array
+    upper: jax.Array
+    load: AbstractSignal
+    generator: Elliptic
+    space: L2
+    lengths: tuple[float, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        *,
+        shape: Any,
+        diffusion: Any,
+        gain: Any,
+        reference: Any,
+        lower: Any,
+        upper: Any,
+        load: Any = 0.0,
+        lengths: Any = 1.0,
+        boundary: Any = "neumann",
+        scheme: str = "spectral",
+    ):
+        wrong: list[InputProblem] = []
+        self.diffusion = _positive("diffusion", diffusion, wrong)
+        self.gain = _positive("gain", gain, wrong)
+        try:
+            self.generator = Elliptic(shape, lengths, boundary, self.diffusion, scheme=scheme)
+        except InputError as error:
+            # Without a grid the fields cannot be looked at.
+            raise InputError(*wrong, *error.problems) from error
+        cells = self.generator.transform.shape
+        for name, value in (("reference", reference), ("load", load)):
+            try:
+                setattr(self, name, _signal(name, value, cells))
+            except InputError as error:
+                wrong += error.problems
+        for name, value in (("lower", lower), ("upper", upper)):
+            setattr(self, name, _field(name, value, cells, wrong))
+        if not wrong and _tree.is_concrete(self.lower, self.upper):
+            if np.any(np.asarray(self.lower) > np.asarray(self.upper)):
+                wrong.append(
+                    InputProblem("dvax.models.Thermostat(lower, upper)", "lower > upper somewhere",
+                                 "the least power is at most the greatest", "Swap them there")
+                )  # fmt: skip
+        if wrong:
+            raise InputError(*wrong)
+        sides = np.broadcast_to(np.asarray(lengths, float), (len(cells),))
+        self.lengths = tuple(float(side) for side in sides)
+        self.space = L2(jnp.full(cells, math.prod(self.lengths) / math.prod(cells)))
+
+    @property
+    def fit(self) -> str:
+        """The model is in the class of the theory as it stands."""
+        return "exact"
+
+    @property
+    def problem(self) -> Problem:
+        """The coupled system, in L²(Ω) for x and u."""
+        return Problem(
+            A=self.generator,
+            P=Scaling(1.0),
+            K=Box(self.lower, self.upper),
+            f=self._rate,
+            h=self._feedback,
+            state_space=self.space,
+        )
+
+    @property
+    def constants(self) -> Constants:
+        """γ = L_F = 1, α_h = k, β_h = α_f = 0, β_f = 1, M = 1, ω = −κλ₁ with the least eigenvalue λ₁ of
+        −Δ: 0 for insulated walls. And the one-sided rate μ = ω: heating falls where the plate is
+        warmer, ⟨u(x₁) − u(x₂), x₁ − x₂⟩ ≤ 0, while the paper's ω + k counts it as if it rose."""
+        growth = self.generator.growth(self.space)
+        return Constants(
+            gamma=1.0,
+            L_F=1.0,
+            alpha_h=self.gain,
+            beta_h=0.0,
+            alpha_f=0.0,
+            beta_f=1.0,
+            M=growth.M,
+            omega=growth.omega,
+            m_P=1.0,
+            norm_P_inv=1.0,
+            one_sided=growth.omega,
+            status="proved",
+        )
+
+    @property
+    def points(self) -> tuple[np.ndarray, ...]:
+        """The coordinates of the cells' midpoints, one array of their shape an axis."""
+        cells = self.generator.transform.shape
+        axes = [(np.arange(n) + 0.5) * side / n for n, side in zip(cells, self.lengths)]
+        return tuple(np.meshgrid(*axes, indexing="ij"))
+
+    def power(self, t: Any, x: Any) -> jax.Array:
+        """u = clip(k(T_ref − x), g₁, g₂) at every cell."""
+        return jnp.clip(self.gain * (self.reference(t) - x), self.lower, self.upper)
+
+    def regimes(self, t: Any, x: Any) -> jax.Array:
+        """−1 where u = g₁, 1 where u = g₂, 0 between them; 1 where they are equal."""
+        z = self.gain * (self.reference(t) - x)
+        regime = jnp.where(z >= self.upper, HEATED, jnp.where(z <= self.lower, COOLED, REGULATED))
+        return regime.astype(jnp.int8)
+
+    def figures(self, solution: Any) -> dict[str, float]:
+        """At the last saved time: `mean_temperature`; `power`, the integral of u over Ω; `heated`,
+        `regulated` and `cooled`, the shares of Ω in each regime; and `decay_rate`, at which any two
+        states approach, proved."""
+        t, x, u = (jax.tree_util.tree_map(lambda v: v[-1], v) for v in
+                   (solution.ts, solution.xs, solution.us))  # fmt: skip
+        area, regime = self.space.w, np.asarray(self.regimes(t, x))
+        total = float(jnp.sum(area))
+        share = lambda name: float(np.mean(regime == name))  # noqa: E731  (cells are alike)
+        return {
+            "mean_temperature": float(jnp.sum(area * x)) / total,
+            "power": float(jnp.sum(area * u)),
+            "heated": share(HEATED),
+            "regulated": share(REGULATED),
+            "cooled": share(COOLED),
+            "decay_rate": float(-self.constants.one_sided),
+        }
+
+    def _rate(self, t: Any, x: Any, u: Any, args: Any) -> jax.Array:
+        return u + self.load(t)
+
+    def _feedback(self, t: Any, x: Any, u: Any, args: Any) -> jax.Array:
+        return self.gain * (self.reference(t) - x)
+
+
+def _positive(name: str, value: Any, wrong: list[InputProblem]) -> jax.Array:
+    place = f"dvax.models.Thermostat({name})"
+    try:
+        array = _tree.as_float(value, place)
+    except InputError as error:
+        wrong += error.problems
+        return jnp.ones(())
+    holds = jnp.ndim(array) == 0
+    if holds and _tree.is_concrete(array):
+        holds = bool(0 < float(array) < math.inf)
+    if holds:
+        return array
+    why = "backward in time heat does not flow" if name == "diffusion" else "it heats what is cold"
+    wrong.append(
+        InputProblem(place, _tree.short(array), f"it must be a positive number: {why}", "Mend it")
+    )
+    return jnp.ones(())
+
+
+def _field(name: str, value: Any, cells: tuple, wrong: list[InputProblem]) -> jax.Array:
+    """A number or an array over the cells."""
+    place = f"dvax.models.Thermostat({name})"
+    try:
+        array = _tree.as_float(value, place)
+    except InputError as error:
+        wrong += error.problems
+        return jnp.zeros(cells)
+    fits = jnp.shape(array) in ((), cells)
+    if not fits or (_tree.is_concrete(array) and np.any(np.isnan(np.asarray(array)))):
+        wrong.append(
+            InputProblem(place, _tree.short(array), f"a number, or an array over the cells {cells}",
+                         "Give one value a cell")
+        )  # fmt: skip
+        return jnp.zeros(cells)
+    return jnp.broadcast_to(array, cells)
+
+
+def _signal(name: str, value: Any, cells: tuple) -> AbstractSignal:
+    if isinstance(value, AbstractSignal):
+        return value
+    if callable(value):
+        return Function(value)
+    wrong: list[InputProblem] = []
+    field = _field(name, value, cells, wrong)
+    if wrong or (_tree.is_concrete(field) and not np.all(np.isfinite(np.asarray(field)))):
+        place = f"dvax.models.Thermostat({name})"
+        raise InputError(
+            *(wrong or [InputProblem(place, _tree.short(field), "it must be finite", "Mend it")])
+        )
+    return Constant(field)
