@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -95,7 +96,9 @@ def test_a_run_leaves_figures_data_and_a_report(folder, outcome):
     manifest = json.loads((outcome.directory / "manifest.json").read_text())
     assert manifest["model"] == "circuit" and manifest["fit"] == "exact"
     assert list(manifest["data"]) == ["tank.cir"]
-    assert any(row["name"] == "gamma" and row["status"] == "proved" for row in manifest["constants"])
+    assert any(
+        row["name"] == "gamma" and row["status"] == "proved" for row in manifest["constants"]
+    )
     with xarray.open_zarr(outcome.directory / "trajectory.zarr", consolidated=False) as data:
         assert data.sizes["time"] == 21 and "state_C1" in data
         np.testing.assert_allclose(
@@ -112,3 +115,46 @@ def test_the_resolved_configuration_is_the_same_run(outcome, tmp_path):
     shutil.copytree(outcome.directory, moved)
     again = run_model(read_config(moved / "config.resolved.toml"), tmp_path / "again")
     assert again.summary == outcome.summary
+
+
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+RUNS = {
+    "frame": (
+        'record = "elCentro.at2"\nperiod = 0.5\ndamping = 0.02\n',
+        ("peak_displacement", 2.676, 2e-3),
+    ),
+    "market": (
+        'data = "RTS-GMLC"\nstart_hour = 4380\nhours = 2\n', ("price", [82.34147234], 1e-9),
+    ),
+    "fem-contact": (
+        "fine = 10\ncoarse = 4\nlayers = 17\nindentation = 0.01\nstiffness = 100.0\n"
+        "pressure_cap = 0.01\n",
+        ("force", 4.67498819e-3, 1e-8),
+    ),
+    "traffic": (
+        'network = "SiouxFalls/SiouxFalls_net.tntp"\ntrips = "SiouxFalls/SiouxFalls_trips.tntp"\n',
+        ("objective", 4231335.287107, 1e-9),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", RUNS)
+def test_the_reference_figures_come_out_of_a_run(name, tmp_path):
+    lines, (figure, value, relative) = RUNS[name]
+    for line in lines.splitlines():
+        given = line.split(" = ")[1].strip('"')
+        if "/" in given or given in ("elCentro.at2", "RTS-GMLC"):
+            if not (SHARED / given).exists():
+                pytest.skip(f"needs {given} under ../shared/data")
+            (tmp_path / given).parent.mkdir(exist_ok=True)
+            copy = shutil.copytree if (SHARED / given).is_dir() else shutil.copy
+            copy(SHARED / given, tmp_path / given)
+    file = written(tmp_path, f'[model]\nname = "{name}"\n{lines}')
+    outcome = run_model(read_config(file), tmp_path / "run")
+    assert outcome.exit_code == 0
+    reached = np.atleast_1d(outcome.summary[figure]["value"])[: np.size(value)]
+    np.testing.assert_allclose(reached, np.atleast_1d(value), rtol=relative)
+    assert build_report(outcome.directory).stat().st_size > 10_000
+    again = read_config(outcome.directory / "config.resolved.toml")
+    assert isinstance(again, ModelConfig) and again.name == name

@@ -241,9 +241,9 @@ class Market(eqx.Module):
 
     def figures(self, solution: Solution) -> dict[str, Any]:
         """At every saved time, in $/MWh: `price`, the Cournot–Nash one (`equilibrium`), and
-        `sticky_price`, that of the solution, which follows it. `max_deviation_profit`: the most that any
-        firm could gain at any of these times, at rest or under way, in $/h, by making something else
-        within its capacities, while the others make what they make and the price moves along the
+        `sticky_price`, that of the solution, which follows it. `max_deviation_profit`: the most that
+        any firm could gain at any of these times, at rest or under way, in $/h, by making something
+        else within its capacities, while the others make what they make and the price moves along the
         demand; found by a search that shares nothing with the law (`dvax.models.market.largest_gain`).
         It is 0 up to rounding."""
         rest, at_rest = _rests(self, solution.ts)
