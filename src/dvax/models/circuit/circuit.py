@@ -1,0 +1,273 @@
+"""Circuits with diodes, from a netlist."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ... import _tree
+from ...errors import InputError, InputProblem
+from ...evolution import ExpRosenbrock, Solution, solve
+from ...generators import Dense
+from ...operators import Diagonal, Scaling
+from ...problem import Problem
+from ...sets import Box
+from ...signals import AbstractSignal
+from ...spaces import L2, Euclidean
+from ...theory import Constants
+from . import topology
+from .netlist import Netlist, read_netlist
+from .nodal import Equations, assemble
+
+_SINGULAR = 1e-14
+"""Of ‖D‖: an eigenvalue below this is zero up to rounding."""
+
+
+class Circuit(eqx.Module):
+    """Resistors, inductors, capacitors, sources and diodes.
+
+        x' = A x + B u + b s(t)                        Kirchhoff's laws
+        0 ∈ D u + C x + e s(t) + N_K(u),  K = {u ≥ 0}  ideal diodes: 0 ≤ current ⟂ blocked voltage ≥ 0
+
+    x holds the voltages of the capacitors (V) and then the currents of the inductors (A), in the order
+    of the netlist; u the currents of the diodes (A), or the voltages that they block (V, `blocking`)
+    for as many as it takes to join what only diodes join; s the sources. P = 1, or diagonal where units
+    mix, and h = u − P⁻¹(Du + Cx + e s). The norm of x is that of the energy, ‖x‖² = Σ C v² + Σ L i²: a
+    circuit is passive, so in it two trajectories never separate.
+
+    **Arguments:** `netlist`: its text, or what `read_netlist` made of it; `r_on` (ohm), `g_leak`
+    (siemens): for every diode whose line has no R=, and no G=, a resistance in series and a conductance
+    across its ideal part.
+
+    **What is exact.** Circuits whose diodes have a resistance on their way, so that γ = λ_min(D) > 0.
+    Where γ = 0 (bridges; diodes that only other diodes, inductors or current sources join to the rest)
+    the circuit is refused, and the diodes are named; with `r_on` and `g_leak` it is regularised, and
+    tends to the ideal one as both tend to 0. `fit` says which it is.
+
+    **Raises:** `dvax.InputError` with the lines of all that is wrong: what cannot be read, floating
+    nodes, loops of voltage sources and capacitors, cuts of inductors and current sources, γ = 0.
+
+    **Source:** Acary and Brogliato (2008), Chapter 1; the circuits are those of its Section 1.1.
+
+    ```python
+    >>> import dvax
+    >>> from dvax.models import Circuit
+    >>> tank = Circuit("C1 1 0 1u IC=10\\nL1 1 0 10m\\nD1 1 0 R=1k")
+    >>> tank.fit, tank.states, float(tank.constants.gamma)
+    ('exact', ('C1', 'L1'), 1000.0)
+    >>> [f"{v:.6f}" for v in tank.figures(5e-3)["final_state"]]
+    ['2.800403', '-0.008440']
+
+    ```
+    """
+
+    A: jax.Array
+    B: jax.Array
+    b: jax.Array
+    C: jax.Array
+    D: jax.Array
+    e: jax.Array
+    V: jax.Array
+    P: jax.Array
+    storage: jax.Array
+    x0: jax.Array
+    sources: tuple[AbstractSignal, ...]
+    states: tuple[str, ...] = eqx.field(static=True)
+    diodes: tuple[str, ...] = eqx.field(static=True)
+    blocking: tuple[bool, ...] = eqx.field(static=True)
+    nodes: tuple[str, ...] = eqx.field(static=True)
+    fit: str = eqx.field(static=True)
+
+    def __init__(
+        self, netlist: str | Netlist, *, r_on: float | None = None, g_leak: float | None = None
+    ):
+        netlist = read_netlist(netlist) if isinstance(netlist, str) else netlist
+        _check_options(r_on, g_leak)
+        diodes = netlist.of("D")
+        topology.check(netlist, leaks=g_leak is not None)
+        found = assemble(netlist, r_on or 0.0, g_leak or 0.0)
+        _check_modulus(netlist, found)
+        for name in ("A", "B", "b", "C", "D", "e", "V", "storage"):
+            setattr(self, name, jnp.asarray(getattr(found, name)))
+        self.P = jnp.asarray(_weights(found))
+        stores = [*netlist.of("C"), *netlist.of("L")]
+        self.x0 = jnp.asarray(np.array([element.initial for element in stores]))
+        feeds = [*netlist.of("V"), *netlist.of("I")]
+        self.sources = tuple(e.source for e in feeds if e.source is not None)
+        self.states = tuple(element.name for element in stores)
+        self.diodes = tuple(element.name for element in diodes)
+        self.blocking = tuple(map(bool, found.blocking))
+        self.nodes = found.nodes
+        added = {
+            f"r_on = {r_on} Ω": r_on is not None and any(e.series is None for e in diodes),
+            f"g_leak = {g_leak} S": g_leak is not None and any(e.leak is None for e in diodes),
+        }
+        by = " and ".join(name for name, used in added.items() if used)
+        self.fit = f"regularised by {by}: ideal diodes as they go to 0" if by else "exact"
+
+    @classmethod
+    def from_file(cls, path: str | Path, **options: Any) -> "Circuit":
+        """The circuit of a netlist in a file; messages say the name of the file.
+
+        **Raises:** `dvax.InputError` as the class does, and where the file is not text in UTF-8;
+        `OSError` where it cannot be read.
+        """
+        path = Path(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+        except UnicodeDecodeError as error:
+            raise InputError(
+                InputProblem(
+                    path.name, f"byte {error.start} that is not UTF-8", "a netlist is text",
+                    "Save it as UTF-8",
+                )
+            ) from error  # fmt: skip
+        return cls(read_netlist(text, path.name), **options)
+
+    @property
+    def problem(self) -> Problem:
+        """The coupled system, in the norm of the energy."""
+        return Problem(
+            A=Dense(self.A),
+            P=Diagonal(self.P) if any(self.blocking) else Scaling(1.0),
+            K=Box(0.0, np.inf),
+            f=_Rate(self.B, self.b, self.sources),
+            h=_Law(self.P, self.C, self.D, self.e, self.sources),
+            state_space=L2(self.storage),
+            control_space=Euclidean(len(self.diodes)),
+        )
+
+    @property
+    def constants(self) -> Constants:
+        """With D' = P⁻¹DP⁻¹, C' = P⁻¹C, B' = BP⁻¹, in the norm of the energy: γ = λ_min of the
+        symmetric part of D', L_F = ‖D'‖, α_h = ‖C'‖, β_h = ‖1 − D'P‖, α_f = 0, β_f = ‖B‖, M = 1,
+        ω = ½λ_max(A + A*), and the one-sided rate, the law being monotone,
+
+            μ = ½ λ_max(A + A* + (B' − C'*)(D' + D'*)⁻¹(B' − C'*)*) ≤ 0,
+
+        since the circuit is passive: ⟨Ad + B'v, d⟩ − ⟨D'v + C'd, v⟩ is −1 times what resistors burn."""
+        c: Circuit = _tree.host(self)
+        root = np.sqrt(c.storage)
+        A, B, C = root[:, None] * c.A / root, root[:, None] * c.B, c.C / root / c.P[:, None]
+        D = c.D / c.P / c.P[:, None]
+        twice = A + A.T
+        both = B / c.P - C.T
+        rate = twice + both @ np.linalg.solve(D + D.T, both.T)
+        return Constants(
+            gamma=0.5 * np.linalg.eigvalsh(D + D.T)[0],
+            L_F=np.linalg.norm(D, 2),
+            alpha_h=np.linalg.norm(C, 2),
+            beta_h=np.linalg.norm(np.eye(len(D)) - D * c.P, 2),
+            alpha_f=0.0,
+            beta_f=np.linalg.norm(B, 2),
+            M=1.0,
+            omega=0.5 * np.linalg.eigvalsh(twice)[-1],
+            m_P=np.min(1.0 / c.P),
+            norm_P_inv=np.max(1.0 / c.P),
+            # What rounding adds to a rate that passivity bounds by 0 is not part of it.
+            one_sided=min(0.5 * np.linalg.eigvalsh(rate)[-1], 0.0),
+            status="proved",
+        )
+
+    def solve(self, t_end: Any, ts: Any = None, **settings: Any) -> Solution:
+        """The run from the initial values of the netlist at t = 0 to `t_end` (s), saved at `ts`; by
+        `dvax.ExpRosenbrock`, which is exact from one switching to the next where sources are constant
+        or PWL; with rtol = 1e-8 and atol = 1e-12. `settings` go to `dvax.solve`."""
+        settings = {"method": ExpRosenbrock(), "rtol": 1e-8, "atol": 1e-12} | settings
+        return solve(self.problem, self.x0, 0.0, t_end, ts=ts, **settings)
+
+    def voltages(self, t: Any, x: Any, u: Any) -> jax.Array:
+        """The voltages of the `nodes` against ground (V)."""
+        return self.V @ jnp.concatenate([x, _values(self.sources, t), u])
+
+    def currents(self, t: Any, x: Any, u: Any) -> jax.Array:
+        """The currents through the ideal parts of the diodes (A)."""
+        other = self.D @ u + self.C @ x + self.e @ _values(self.sources, t)
+        return jnp.where(jnp.asarray(self.blocking), other, u)
+
+    def figures(self, t_end: Any, **settings: Any) -> dict[str, Any]:
+        """`final_state`: the state at `t_end`, in the order of `states`."""
+        return {"final_state": [float(v) for v in self.solve(t_end, **settings).xs[-1]]}
+
+
+class _Rate(eqx.Module):
+    """f = B u + b s(t)."""
+
+    B: jax.Array
+    b: jax.Array
+    sources: tuple[AbstractSignal, ...]
+
+    def __call__(self, t: Any, x: Any, u: Any, args: Any) -> jax.Array:
+        return self.B @ u + self.b @ _values(self.sources, t)
+
+
+class _Law(eqx.Module):
+    """h = u − P⁻¹(D u + C x + e s(t))."""
+
+    P: jax.Array
+    C: jax.Array
+    D: jax.Array
+    e: jax.Array
+    sources: tuple[AbstractSignal, ...]
+
+    def __call__(self, t: Any, x: Any, u: Any, args: Any) -> jax.Array:
+        return u - (self.D @ u + self.C @ x + self.e @ _values(self.sources, t)) / self.P
+
+
+def _values(sources: tuple[AbstractSignal, ...], t: Any) -> jax.Array:
+    return jnp.stack([source(t) for source in sources]) if sources else jnp.zeros(0)
+
+
+def _check_options(r_on: float | None, g_leak: float | None) -> None:
+    wrong = [
+        InputProblem(
+            f"dvax.models.Circuit({name})", str(value), f"it must be a positive {what}, or None for "
+            "diodes as the netlist has them", "Take r_on = 0.1 and g_leak = 1e-9, and then less",
+        )
+        for name, value, what in (("r_on", r_on, "resistance"), ("g_leak", g_leak, "conductance"))
+        if value is not None and not (math.isfinite(value) and value > 0)
+    ]  # fmt: skip
+    if wrong:
+        raise InputError(*wrong)
+
+
+def _check_modulus(netlist: Netlist, found: Equations) -> None:
+    """Refuse a law without γ > 0, and say which diodes it is for want of.
+
+    Those of known blocked voltage leak, so that their part of D is positive definite."""
+    conducting = np.flatnonzero(~found.blocking)
+    if conducting.size == 0:
+        return
+    sizes, vectors = np.linalg.eigh(found.D[np.ix_(conducting, conducting)])
+    null = vectors[:, sizes <= _SINGULAR * sizes[-1]]
+    involved = np.max(np.abs(null), axis=1, initial=0.0) > 1e-6
+    named = [netlist.of("D")[k] for k in conducting[involved]]
+    if named:
+        one = len(named) == 1
+        names = ", ".join(e.name for e in named)
+        why = "its current meets" if one else "their currents meet, in some proportion,"
+        raise InputError(
+            InputProblem(
+                netlist.place(*named), f"{names} without R=",
+                f"{why} no resistance, so γ = λ_min(D) = 0 and the law does not determine "
+                + ("it" if one else "them"),
+                "Write R=0.1 there, or regularise: Circuit(..., r_on=0.1, g_leak=1e-9)",
+            )
+        )  # fmt: skip
+
+
+def _weights(found: Equations) -> np.ndarray:
+    """The entries of P: the normalised unknowns y = P u have one unit, √watt, where some of u are
+    currents and some voltages. The impedance between the two is the one that makes γ largest."""
+    conducting, blocking = ~found.blocking, found.blocking
+    if not blocking.any() or not conducting.any():
+        return np.ones(len(blocking))
+    resistance, conductance = (
+        np.linalg.eigvalsh(found.D[np.ix_(own, own)])[0] for own in (conducting, blocking)
+    )
+    impedance = resistance / conductance
+    return np.where(conducting, impedance**0.25, impedance**-0.25)
