@@ -1,6 +1,8 @@
 """The law written out, by medians and face by face: it satisfies the law, and its derivative is that of
 its face."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -152,3 +154,33 @@ def test_only_a_few_unknowns_are_written_out():
     assert [fits(jnp.zeros(n)) for n in (1, 2, 4, 5)] == [False, True, True, False]
     assert not fits((jnp.zeros(2), jnp.zeros(1)))
     assert sides(4).shape == (81, 4)
+
+
+def test_a_law_of_large_gain_is_solved_to_what_rounding_leaves():
+    """A bridge of diodes with 1 µS and 1 mΩ: eigenvalues of M from 1e-3 to 1e6."""
+    leak, on, s = 1e6, 1e-3, 0.5 * np.array([-1.0, 1.0, 1.0, -1.0])
+    signs = np.array([1.0, 1.0, -1.0, -1.0])
+    M = jnp.asarray(0.25 * leak * np.outer(signs, signs) + on * np.eye(4))
+    problem = dvax.Problem(
+        A=dvax.generators.Dense(jnp.array([[-1.0, -1e3], [100.0, 0.0]])),
+        P=dvax.operators.Scaling(1.0),
+        K=dvax.sets.Box(0.0, jnp.inf),
+        f=lambda t, x, u, args: jnp.stack([1e3 * (jnp.asarray(s) @ u), 0.0 * x[0]]),
+        h=lambda t, x, u, args: u - M @ u - jnp.asarray(s) * x[0],
+        control_space=dvax.spaces.Euclidean(4),
+    )
+    sol = dvax.solve(
+        problem, jnp.array([10.0, 0.0]), 0.0, 0.02, rtol=1e-8, method=dvax.ExpRosenbrock(),
+        ts=np.linspace(0.0, 0.02, 9),
+    )  # fmt: skip
+    for x, u in zip(np.asarray(sol.xs), np.asarray(sol.us), strict=True):
+        # By every choice of conducting diodes: the one whose currents and voltages are ≥ 0.
+        q, found = s * x[0], []
+        for held in itertools.product([False, True], repeat=4):
+            free = ~np.array(held)
+            y = np.zeros(4)
+            y[free] = np.linalg.solve(np.asarray(M)[np.ix_(free, free)], -q[free])
+            off = 1e-9 * (1.0 + np.abs(q).max())
+            if (y >= -off).all() and (np.asarray(M) @ y + q >= -off).all():
+                found.append(y)
+        assert min(np.abs(u - y).max() for y in found) <= 1e-6 * (1.0 + np.abs(u).max())

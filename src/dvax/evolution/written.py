@@ -12,7 +12,7 @@ MOST = 4
 
 
 class Point(NamedTuple):
-    """The solution y, z with proj(z) = y, both up to rounding, and w in F(z̄) + N_K(z̄) at z̄ = proj(z),
+    """The solution y, z = y − τF(y) with proj(z) = y, both up to rounding, and w in F(z̄) + N_K(z̄) at z̄ = proj(z),
     which is of the size of rounding."""
 
     y: jax.Array
@@ -36,10 +36,12 @@ class AbstractWritten(eqx.Module):
         q, low, up = q.ravel(), low.ravel(), up.ravel()
         # An entry that is held is its bound, to the last digit.
         y = jnp.clip(self.find(q, low, up), low, up)
-        z = y - (M @ y + q)
+        # A step of at most 1/‖M‖, or what rounding leaves of F would be taken for z.
+        tau = 1.0 / jnp.maximum(1.0, jnp.max(jnp.sum(jnp.abs(M), axis=1)))
+        z = y - tau * (M @ y + q)
         near = jnp.clip(z, low, up)
-        # z − near is in N_K(near), and F(near) + z − near is:
-        w = (y - near) + M @ (near - y)
+        # (z − near)/τ is in N_K(near), and F(near) + (z − near)/τ is:
+        w = (y - near) / tau + M @ (near - y)
         return Point(y.reshape(shape), z.reshape(shape), w.reshape(shape))
 
     def held(self, y: jax.Array, q: jax.Array, low: jax.Array, up: jax.Array) -> jax.Array:
