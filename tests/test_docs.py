@@ -10,15 +10,22 @@ import pytest
 import dvax
 
 DOCS = Path(__file__).parents[1] / "docs"
-PAGES = sorted(DOCS.glob("*.md"))
+PAGES = sorted(DOCS.rglob("*.md"))
+
+
+def named(page: Path) -> str:
+    return page.relative_to(DOCS).as_posix()
 
 
 def blocks(page: Path) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_the_examples_of_a_page_print_what_it_says(page: Path):
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_the_examples_of_a_page_print_what_it_says(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)  # some write files
     found = blocks(page)
     assert len(found) == page.read_text(encoding="utf-8").count("```python")
     assert all(">>>" in block for block in found), "an example that shows no result"
@@ -38,8 +45,8 @@ def test_every_page_is_linked():
     site = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8")
     index = (DOCS / "index.md").read_text(encoding="utf-8")
     for page in PAGES:
-        assert f"- {page.name}" in site
-        assert page.name == "index.md" or f"({page.name})" in index
+        assert f"- {named(page)}" in site
+        assert named(page) == "index.md" or f"({named(page)})" in index
 
 
 def public(module: object, base: type) -> list[str]:
