@@ -12,8 +12,8 @@ MOST = 4
 
 
 class Point(NamedTuple):
-    """The solution y, z = y − τF(y) with proj(z) = y, both up to rounding, and w in F(z̄) + N_K(z̄) at z̄ = proj(z),
-    which is of the size of rounding."""
+    """The solution y, z = y − τF(y) with proj(z) = y, both up to rounding, and w in F(z̄) + N_K(z̄) at
+    z̄ = proj(z), which is of the size of rounding."""
 
     y: jax.Array
     z: jax.Array

@@ -255,8 +255,7 @@ def _check_modulus(netlist: Netlist, found: Equations) -> None:
                 netlist.place(*named), f"{names} without R=",
                 f"{why} no resistance, so γ = λ_min(D) = 0 and the law does not determine "
                 + ("it" if one else "them"),
-                "Write R=0.1 there, or regularise: Circuit(..., r_on=0.1, g_leak=1e-9), which are keys "
-                "of a configuration too",
+                "Write R=0.1 there, or regularise: Circuit(..., r_on=0.1, g_leak=1e-9)",
             )
         )  # fmt: skip
 
