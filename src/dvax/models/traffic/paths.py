@@ -1,0 +1,89 @@
+"""Sets of paths: which links each one takes, pair by pair."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """The paths of all pairs, those of one pair side by side.
+
+    `links` holds the links of all paths one after the other, `lengths` how many each has, `sizes` how
+    many paths each pair has; there are `count` links in the network.
+    """
+
+    links: np.ndarray
+    lengths: np.ndarray
+    sizes: np.ndarray
+    count: int
+
+    @property
+    def starts(self) -> np.ndarray:
+        """The first path of every pair."""
+        return np.cumsum(self.sizes) - self.sizes
+
+    @property
+    def pairs(self) -> np.ndarray:
+        """The pair of every path."""
+        return np.repeat(np.arange(len(self.sizes)), self.sizes)
+
+    def incidence(self) -> Any:
+        """Δᵀ as a sparse matrix: a row a path, with a one for each of its links."""
+        from scipy.sparse import csr_array
+
+        ends = np.concatenate([[0], np.cumsum(self.lengths)])
+        shape = len(self.lengths), self.count
+        return csr_array((np.ones(len(self.links)), self.links, ends), shape=shape)
+
+    def joined(self, links: np.ndarray, lengths: np.ndarray, pairs: np.ndarray) -> Any:
+        """(these paths and one more for each of the `pairs`, where each of the old ones is now)."""
+        owner = np.concatenate([self.pairs, pairs])
+        order = np.argsort(owner, kind="stable")
+        every = np.concatenate([self.lengths, lengths])
+        begin = np.cumsum(every) - every
+        new = every[order]
+        offset = np.arange(new.sum()) - np.repeat(np.cumsum(new) - new, new)
+        flat = np.concatenate([self.links, links])[np.repeat(begin[order], new) + offset]
+        sizes = np.bincount(owner, minlength=len(self.sizes))
+        moved = np.argsort(order, kind="stable")[: len(self.lengths)]
+        return Paths(flat, new, sizes, self.count), moved
+
+
+class Incidence(eqx.Module):
+    """Δ, the links of paths, as JAX applies it: v = Δx adds the flows of the paths over each link,
+    and Δᵀc the costs of the links along each path."""
+
+    links_by_path: jax.Array
+    path: jax.Array
+    link: jax.Array
+    count: int = eqx.field(static=True)
+
+    def __init__(self, paths: Paths):
+        number = len(paths.lengths)
+        row = np.repeat(np.arange(number), paths.lengths)
+        step = np.arange(len(row)) - np.repeat(
+            np.cumsum(paths.lengths) - paths.lengths, paths.lengths
+        )
+        table = np.full((int(paths.lengths.max()), number), paths.count)
+        table[step, row] = paths.links
+        order = np.argsort(paths.links, kind="stable")
+        self.links_by_path = jnp.asarray(table, jnp.int32)
+        self.path = jnp.asarray(row[order], jnp.int32)
+        self.link = jnp.asarray(paths.links[order], jnp.int32)
+        self.count = paths.count
+
+    def flows(self, x: jax.Array) -> jax.Array:
+        """v = Δx."""
+        taken = x.at[self.path].get(mode="promise_in_bounds")
+        return jax.ops.segment_sum(taken, self.link, self.count, indices_are_sorted=True)
+
+    def along(self, c: jax.Array) -> jax.Array:
+        """Δᵀc."""
+        # One more entry than links, for what a path shorter than the longest has behind its end.
+        padded = jnp.concatenate([c, jnp.zeros(1, c.dtype)])
+        return jnp.sum(padded.at[self.links_by_path].get(mode="promise_in_bounds"), axis=0)
