@@ -262,6 +262,7 @@ def test_the_constants_are_proved_and_no_circuit_separates_trajectories():
         )
 
 
+@pytest.mark.thorough
 def test_a_rectifier_on_the_mains_agrees_with_scipy():
     text = """
     V1 in 0 SIN(1 12 50 3m 20 30)    ; offset amplitude frequency delay damping phase

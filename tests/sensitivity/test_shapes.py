@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from tests.closed_forms import P2, c2, c3
+from tests.selection import mostly_thorough
 
 import dvax
 
 SETTINGS = dict(method=dvax.ETD4RK(), rtol=1e-8, atol=1e-10, max_steps=2**14)
 
 
+@pytest.mark.thorough
 def test_the_bounds_of_c2_push_as_a_linear_equation_says():
     """y rides a corner, so that z = x₁ + ix₂ has z' = (−1 − 2i)z − (P⁻¹ of what the bound moves by)."""
     case = c2()
@@ -47,7 +49,7 @@ def ball(center, radius, t1):
     return run.y[:, -1]
 
 
-@pytest.mark.parametrize("t1", [2.0, 4.0])
+@pytest.mark.parametrize("t1", mostly_thorough([2.0, 4.0], {4.0}))
 def test_radius_and_centre_of_c3(t1):
     """|x| = (2 − rt)e^{−t/2} until it meets the ball at 2/r − 1, and from there r e^{…}: at t = 4,
     d|x|/dr = (1/r − 2/r²)|x|, so that the kink moves as well."""

@@ -8,6 +8,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jax.experimental.sparse import BCOO
 from tests.closed_forms import ALL, c7
+from tests.selection import mostly_thorough
 from tests.theory.generated import generate
 
 import dvax
@@ -190,8 +191,10 @@ def test_wrong_arguments_are_named():
         dvax.verify(problem)["ass:none"]
 
 
-@pytest.mark.parametrize("n", [5, 3000])
-@pytest.mark.parametrize("kind", ["scatter", "sparse", "transform"])
+LARGE = [(kind, n) for n in (5, 3000) for kind in ("scatter", "sparse", "transform")]
+
+
+@pytest.mark.parametrize(("kind", "n"), mostly_thorough(LARGE, {*LARGE[:3], ("scatter", 3000)}))
 def test_affine_data_that_no_matrix_is_made_of(kind, n):
     """Where operations have no rule, or the matrix no room: Lanczos on what is proved to be affine."""
     rng = np.random.default_rng(7)

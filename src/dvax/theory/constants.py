@@ -264,7 +264,8 @@ class Constants(eqx.Module):
                  f"rate of approach with an overshoot of {_number(overshoot)}")
             )  # fmt: skip
         return [
-            Row(name, symbol, float(value), label, self.status_of(*made_of), meaning)
+            # −0 is 0.
+            Row(name, symbol, float(value) + 0.0, label, self.status_of(*made_of), meaning)
             for name, symbol, value, label, made_of, meaning in rows
         ]
 

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from dvax.evolution import solve
-from dvax.models.traffic import Incident, Network, Traffic, read_network, read_nodes, read_trips
+from dvax.models.traffic import Incident, Traffic, read_nodes
 from dvax.runs.applications.base import AbstractApplication, Figure, Results, Variable
 from dvax.runs.applications.certificate import certificate
 from dvax.runs.schema import Section
@@ -47,11 +47,9 @@ class TrafficSection(Section):
 class _Loaded:
     def __init__(self, table: TrafficSection, paths: Mapping[str, Path]):
         self.table = table
-        network = read_network(paths["network"])
-        self.places = read_nodes(paths["nodes"], network) if "nodes" in paths else None
-        self.network: Network = network
+        # By their names, so that what is wrong in both files is said at once.
         self.traffic = Traffic(
-            network, read_trips(paths["trips"]), toll_weight=table.toll_weight,
+            paths["network"], paths["trips"], toll_weight=table.toll_weight,
             distance_weight=table.distance_weight, rate=table.rate, rho=table.rho,
             incidents=[
                 Incident(
@@ -60,6 +58,8 @@ class _Loaded:
                 for i in table.incidents
             ],
         )  # fmt: skip
+        nodes = paths.get("nodes")
+        self.places = None if nodes is None else read_nodes(nodes, self.traffic.network)
 
 
 class TrafficApplication(AbstractApplication[_Loaded]):
