@@ -59,20 +59,22 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "test"))
 
 
-_MAPPED = Path("/proc/self/maps")
-_SO_MANY, _AT_MOST = 25, 40_000
+_MAPPED, _PAGES = Path("/proc/self/maps"), Path("/proc/self/statm")
+_SO_MANY, _AT_MOST, _MOST_PAGES = 25, 40_000, 5 * 2**30 // 4096
 _TESTS = itertools.count(1)
 
 
 @pytest.fixture(autouse=True)
 def _few_programs():
     """A compiled program takes a few of the 65 530 mappings that Linux allows a process; who asks for
-    more is ended by a segmentation fault within the compiler. A whole run comes close."""
+    more is ended by a segmentation fault within the compiler. A whole run comes close; the long checks
+    also to the memory of a machine."""
     yield
     if next(_TESTS) % _SO_MANY == 0 and _MAPPED.exists():
         with _MAPPED.open() as lines:
             mappings = sum(1 for _ in lines)
-        if mappings > _AT_MOST:
+        resident = int(_PAGES.read_text().split()[1])
+        if mappings > _AT_MOST or resident > _MOST_PAGES:
             jax.clear_caches()
 
 
