@@ -12,6 +12,8 @@ from dvax.plots.lines import thin
 from dvax.plots.look import MUTED, SERIES, STILL_STYLE, axis_title, blank, still_axes, unit_text
 from dvax.plots.picture import Picture
 
+# Powers of ten, where Plotly would write 1µ and 1f.
+_LOGARITHMIC = dict(type="log", exponentformat="power", showexponent="all")
 _DASHES = {"solid": "-", "dash": "--", "dot": ":"}
 
 
@@ -63,9 +65,11 @@ def panels_picture(
             named.add(curve.name)
         over = f"<br>[{unit_text(panel.unit)}]" if unit_text(panel.unit) else ""
         figure.update_yaxes(
-            title_text=panel.words + over, type="log" if panel.log else "linear", row=row, col=1
-        )
-    figure.update_xaxes(type="log" if log else "linear")
+            title_text=panel.words + over, row=row, col=1,
+            **(_LOGARITHMIC if panel.log else {}),
+        )  # fmt: skip
+    if log:
+        figure.update_xaxes(**_LOGARITHMIC)
     figure.update_xaxes(title_text=axis_title(words, unit), row=len(panels), col=1)
 
     def still() -> Figure:

@@ -58,6 +58,8 @@ def losses_table(run: RunRecord) -> str:
 
 
 def _word(rate: float) -> str:
+    if rate == 0:
+        return "trajectories do not separate"
     return "trajectories approach" if rate < 0 else "trajectories may separate"
 
 

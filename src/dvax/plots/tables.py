@@ -27,13 +27,19 @@ FACTS = {
 SHOWN_ELSEWHERE = ("constants", "assumptions")
 
 
+_FEW = 4
+"""So many entries of a list are shown; all of them are in summary.json."""
+
+
 def headline_cards(run: RunRecord) -> str:
     """summary.json: one card a figure, its meaning beneath."""
     cards = []
     for name, entry in run.summary.items():
         value = entry.get("value")
         listed = value if isinstance(value, list) else [value]
-        text = ", ".join(number(item) for item in listed)
+        text = ", ".join(number(item) for item in listed[:_FEW])
+        if len(listed) > _FEW:
+            text += f", … ({len(listed)} in all)"
         cards.append(
             f'<div class="card"><div class="name">{escaped(_words(name))}</div>'
             f'<div class="value">{escaped(quantity_text(text, str(entry.get("unit", ""))))}</div>'

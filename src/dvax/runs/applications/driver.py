@@ -50,6 +50,7 @@ class _Run:
         try:
             with terminable(), announced(lambda: self._event("compiling")):
                 results = self.config.application.solve(self.config.model)
+            self._event("compiled", compile_seconds=compile_seconds())
         except KeyboardInterrupt:
             status, code, reason = "interrupted", 130, "Interrupted; nothing was written yet."
         except SolveError as error:
