@@ -79,8 +79,10 @@ def panels_picture(
                 height_ratios=shares,
             )  # fmt: skip
             for place, panel in zip(axes[:, 0], panels, strict=True):
+                told: set[str] = set()
                 for c in panel.curves:
-                    style = dict(color=c.ink, label=c.name)
+                    style = dict(color=c.ink, label="_" if c.name in told else c.name)
+                    told.add(c.name)
                     if c.marks:
                         place.plot(c.x, c.y, "o", markersize=4, **style)
                     else:
