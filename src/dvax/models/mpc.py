@@ -131,6 +131,17 @@ class LinearMPC(eqx.Module):
         if wrong:
             raise InputError(*wrong)
         found = condense(parts)
+        ends = np.linalg.eigvalsh(found.H)
+        if ends[0] <= len(ends) * np.finfo(float).eps * ends[-1]:
+            raise InputError(
+                InputProblem(
+                    "dvax.models.LinearMPC(horizon, step)",
+                    f"predictions that grow until λ_max(H) = {ends[-1]:.1e}",
+                    "λ_min(H) ≥ λ_min(R) > 0 makes the law strongly monotone, and is below the "
+                    "rounding of that",
+                    "Shorten the horizon, or stabilise the plant first",
+                )
+            )
         self.A, self.B = jnp.asarray(parts.A), jnp.asarray(parts.B)
         self.H, self.G = jnp.asarray(found.H), jnp.asarray(found.G)
         self.terminal, self.regulator = jnp.asarray(found.terminal), jnp.asarray(found.regulator)

@@ -27,13 +27,11 @@ def locate(name: str, folder: Path, allow_outside: bool, place: str) -> Path:
     without `allow_outside`: a configuration from elsewhere must not read other people's files.
     """
     resolved, size = _resolved(name, folder, allow_outside, place, Path.is_file)
+    if size is None and resolved.is_dir():
+        raise _refuse(place, name, "it is a folder, and this is for a file", "Name a file in it.")
     if size is None:
-        raise _refuse(
-            place,
-            name,
-            "there is no such file",
-            f"Put it at {folder.name}/{name} or mend the name.",
-        )
+        where = Path(folder.resolve().name) / name
+        raise _refuse(place, name, "there is no such file", f"Put it at {where} or mend the name.")
     if size > MAX_BYTES:
         raise _refuse(
             place, name, f"it has {size} bytes and a data file at most {MAX_BYTES}",
@@ -46,7 +44,12 @@ def locate_folder(name: str, folder: Path, allow_outside: bool, place: str) -> P
     """The folder of data that a configuration in `folder` calls `name`; see `locate`."""
     resolved, size = _resolved(name, folder, allow_outside, place, Path.is_dir)
     if size is None:
-        raise _refuse(place, name, "there is no such folder", "Mend the name.")
+        what = (
+            "it is a file, and this is for a folder"
+            if resolved.is_file()
+            else "there is no such folder"
+        )
+        raise _refuse(place, name, what, "Mend the name.")
     return resolved
 
 

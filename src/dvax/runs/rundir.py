@@ -22,7 +22,10 @@ from typing import Any
 import numpy as np
 import zarr
 
-FILES = ("config.resolved.toml", "manifest.json", "summary.json", "log.jsonl", "report.html")
+FILES = (
+    "config.resolved.toml", "manifest.json", "summary.json", "log.jsonl", "report.html",
+    "body.vtu", "body-contact.vtu",
+)  # fmt: skip
 FOLDERS = ("trajectory.zarr", "figures", "inputs")
 _CHUNK_BYTES = 2**23
 

@@ -73,7 +73,9 @@ def bound_error(
     it: where what encloses it over the steps up to a saved time, with its bound, is not inside, the
     bounds are infinite from there on. (Between two saved times the bound is taken from the one before
     and all that disturbs the equation on the way, so many saved times make it the sharper.) For other
-    times or `args` than those verified nobody proved them: then the status is "declared".
+    times or `args` than those verified nobody proved them: then the status is "declared". With a region
+    of u the bounds are those of the one solution whose response stays in it; a law that is monotone
+    there alone may have others.
 
     **Raises:** `dvax.InputError` where `sol` is not a solution of `problem`, or `initial_error` is
     not a number ≥ 0.

@@ -94,7 +94,8 @@ def verify(
     **Arguments:** `x0`: a state (its shape is what matters; 0 for a scalar problem); `x`, `u`: the
     region as (low, high), numbers or elements, where the statements are to hold: everywhere by
     default, with Pu in a box around K(t) where one is known. Constants that hold in a region only are
-    good for trajectories that stay in it. `declared`: moduli by name, or `dvax.Constants`. `energy`:
+    good for trajectories that stay in it (and where that of u leaves out a part of P⁻¹K(t), the law may
+    have other solutions there). `declared`: moduli by name, or `dvax.Constants`. `energy`:
     look for a norm in which trajectories approach, for affine data of up to 40 unknowns (needs
     `dvax[energy]`).
 

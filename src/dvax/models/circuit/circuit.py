@@ -156,6 +156,8 @@ class Circuit(eqx.Module):
         D = c.D / c.P / c.P[:, None]
         twice = A + A.T
         both = B / c.P - C.T
+        # As the generator itself has them: of a circuit without losses ω is 0 and rounding.
+        growth = Dense(self.A).growth(L2(self.storage))
         rate = twice + both @ np.linalg.solve(D + D.T, both.T)
         return Constants(
             gamma=0.5 * np.linalg.eigvalsh(D + D.T)[0],
@@ -164,8 +166,8 @@ class Circuit(eqx.Module):
             beta_h=np.linalg.norm(np.eye(len(D)) - D * c.P, 2),
             alpha_f=0.0,
             beta_f=np.linalg.norm(B, 2),
-            M=1.0,
-            omega=0.5 * np.linalg.eigvalsh(twice)[-1],
+            M=growth.M,
+            omega=growth.omega,
             m_P=np.min(1.0 / c.P),
             norm_P_inv=np.max(1.0 / c.P),
             # What rounding adds to a rate that passivity bounds by 0 is not part of it.

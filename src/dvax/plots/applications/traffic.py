@@ -31,9 +31,15 @@ def pictures(data: Mapping[str, Data]) -> list[Picture]:
 def _days(data: Mapping[str, Data]) -> Picture:
     days, objective = data["day"].values, data["objective"].values
     least = float(data["equilibrium"].values)
-    excess = (objective - least) / least
-    # Below this, the difference of two objectives is rounding.
-    shown = np.where(excess > 1e-15, excess, np.nan)
+    if np.isfinite(least):
+        excess = (objective - least) / least
+        # Below this, the difference of two objectives is rounding.
+        shown = np.where(excess > 1e-15, excess, np.nan)
+        above = Panel([Curve(days, shown, "excess", 0)], "objective, excess", log=True)
+        words = "by what part Beckmann's objective is larger than at the equilibrium"
+    else:
+        above = Panel([Curve(days, objective, "objective", 0)], "objective")
+        words = "Beckmann's objective, whose least value changes with the capacities"
     load = data["flow"].values / data["capacity"].values
     busiest = np.argsort(load[-1])[::-1][:_BUSIEST]
     names = [f"{data['init_node'].values[k]} → {data['term_node'].values[k]}" for k in busiest]
@@ -44,10 +50,10 @@ def _days(data: Mapping[str, Data]) -> Picture:
     certificate = [Curve(days, np.where(bound > 0, bound, np.nan), "error bound", 0, "dash")]
     return panels_picture(
         "days", "The way to equilibrium",
-        "Above, by what part Beckmann's objective is larger than at the equilibrium. In the middle, "
-        "the links that are the fullest in the end. Below, the certified error of the path flows.",
+        f"Above, {words}. In the middle, the links that are the fullest in the end. Below, the bound "
+        "on the error of the path flows; its status stands with the figure.",
         [
-            Panel([Curve(days, shown, "excess", 0)], "objective, excess", log=True),
+            above,
             Panel(links, "flow / capacity"),
             Panel(certificate, "error bound", "trip", log=True, share=0.7),
         ],
@@ -58,7 +64,7 @@ def _days(data: Mapping[str, Data]) -> Picture:
 def _map(data: Mapping[str, Data]) -> Picture:
     place = data["place"].values.astype(float)
     first, last = (data[name].values.astype(int) - 1 for name in ("init_node", "term_node"))
-    load = data["flow"].values[-1] / data["capacity"].values
+    load = data["flow"].values[-1] / data["capacity"].values[-1]
     along = place[last] - place[first]
     length = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
     right = np.column_stack([along[:, 1], -along[:, 0]]) / length

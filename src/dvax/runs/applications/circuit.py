@@ -75,12 +75,14 @@ class CircuitApplication(AbstractApplication[_Loaded]):
             unit = "V" if name.upper().startswith("C") else "A"
             what = "voltage of" if unit == "V" else "current of"
             values = np.asarray(solution.xs[:, k])
-            variables[f"state_{name}"] = Variable(time, values, unit, f"{what} {name}")
+            variables[_key("state", name)] = Variable(time, values, unit, f"{what} {name}")
         for k, name in enumerate(c.nodes):
-            variables[f"node_{name}"] = Variable(time, volts[:, k], "V", f"voltage of node {name}")
+            variables[_key("node", name)] = Variable(
+                time, volts[:, k], "V", f"voltage of node {name}"
+            )
         for k, name in enumerate(c.diodes):
             words = f"current of diode {name}"
-            variables[f"diode_{name}"] = Variable(time, amperes[:, k], "A", words)
+            variables[_key("diode", name)] = Variable(time, amperes[:, k], "A", words)
         variables["error_bound"] = Variable(
             time,
             bound.values,
@@ -101,6 +103,11 @@ class CircuitApplication(AbstractApplication[_Loaded]):
             ),
         }  # fmt: skip
         return Results(figures, variables, c.constants, int(solution.stats["steps"]))
+
+
+def _key(kind: str, name: str) -> str:
+    """A name in a store, where a slash would begin a folder."""
+    return f"{kind}_{name}".replace("/", "∕")
 
 
 APPLICATION = CircuitApplication()

@@ -75,10 +75,10 @@ def read_config(path: str | Path, *, allow_outside: bool = False) -> Config | Mo
     raw = parse(source)
     table = raw.get("model")
     name = table.get("name", "contact") if isinstance(table, Mapping) else "contact"
-    if name == "contact" or not isinstance(name, str):
+    if name == "contact":
         return check_contact(raw, source, allow_outside)
-    if name not in MODULES:
-        close = get_close_matches(name, NAMES, n=1)
+    if not isinstance(name, str) or name not in MODULES:
+        close = get_close_matches(str(name), NAMES, n=1)
         mend = f"Did you mean {close[0]!r}?" if close else "Choose one of these."
         raise InputError(
             InputProblem(

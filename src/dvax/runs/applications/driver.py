@@ -55,6 +55,10 @@ class _Run:
             status, code, reason = "interrupted", 130, "Interrupted; nothing was written yet."
         except SolveError as error:
             status, code, reason = "failed", 3, str(error)
+        except BaseException as error:
+            # Whatever it was, the run is over, and its folder says so.
+            self._manifest("failed", f"{type(error).__name__}: {error}")
+            raise
         summary: dict[str, Any] = {}
         if results is not None:
             self._keep(results)

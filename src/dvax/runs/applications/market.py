@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from pydantic import Field
 
+from dvax.errors import InputError, InputProblem
 from dvax.models.market import RTS, Market, largest_gain, read_rts
 from dvax.runs.applications.base import AbstractApplication, Figure, Results, Variable
 from dvax.runs.applications.certificate import certificate
@@ -41,6 +42,13 @@ class _Loaded:
         )
         # An hour alone is a moment of the two that it lies between.
         last = len(rts.load) - 1
+        if not table.start_hour + table.hours <= last + 1:
+            raise InputError(
+                InputProblem(
+                    "model.start_hour, model.hours", f"{table.start_hour} and {table.hours}",
+                    f"the data have the hours 0 to {last}", "Name hours inside",
+                )
+            )  # fmt: skip
         first = min(table.start_hour, last - 1) if table.hours == 1 else table.start_hour
         self.market = Market.from_rts(rts, first, max(2, table.hours), **options)
 

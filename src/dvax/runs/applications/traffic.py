@@ -37,7 +37,7 @@ class TrafficSection(Section):
     distance_weight: float = Field(0.0, ge=0, description="cost of a unit of length")
     rate: float = Field(1.0, gt=0, description="how fast trips change their paths [1/day]")
     rho: float | None = Field(None, gt=0, description="trips that a unit of cost moves")
-    days: float = Field(40.0, gt=0, description="length of the run [day]")
+    days: float = Field(40.0, gt=0, le=1e5, description="length of the run [day]")
     dt: float = Field(0.25, gt=0, description="step [day]")
     incidents: list[IncidentSection] = Field(
         default_factory=list, description="links that lose capacity for a time"
@@ -99,17 +99,19 @@ class TrafficApplication(AbstractApplication[_Loaded]):
         spent = np.asarray(jax.vmap(t.total_travel_time)(solution.ts, solution.xs))
         flows = np.asarray(jax.vmap(t.link_flows)(solution.xs))
         gap = t.relative_gap(table.days, solution.xs[-1])
-        least = float(t.objective(table.days, t.equilibrium))
+        # Paths were generated for all capacities, the equilibrium is that of the network as it is.
+        cut = np.asarray(t.capacity(table.days)) != np.asarray(t.network.capacity)
+        least = np.nan if cut.any() else float(t.objective(table.days, t.equilibrium))
         found = t.figures(solution)
         day = ("day",)
-        capacity = np.asarray(t.capacity(table.days))
+        capacity = np.asarray(jax.vmap(t.capacity.value)(solution.ts))
         variables = {
             "day": Variable(day, days, "day", "time"),
             "objective": Variable(day, objectives, "trip cost", "Beckmann's objective"),
             "equilibrium": Variable((), np.asarray(least), "trip cost", "objective at equilibrium"),
             "travel_time": Variable(day, spent, "trip time", "time that all trips spend together"),
             "flow": Variable(("day", "link"), flows, "trip", "flow of each link"),
-            "capacity": Variable(("link",), capacity, "trip", "capacity of each link at the end"),
+            "capacity": Variable(("day", "link"), capacity, "trip", "capacity of each link"),
             "init_node": Variable(("link",), np.asarray(t.network.init_node), "1", "from"),
             "term_node": Variable(("link",), np.asarray(t.network.term_node), "1", "to"),
             "error_bound": Variable(day, bound.values, "trip", "bound on the error of path flows"),
@@ -128,15 +130,17 @@ class TrafficApplication(AbstractApplication[_Loaded]):
                 "largest relative error of the trips of any pair, on any day",
             ),
             "relative_gap": Figure(
-                gap, "1", "what would be saved if all took the least cost path of the whole network"
-            ),
-            "equilibrium_objective": Figure(
-                least, "trip cost", "the same at the equilibrium that paths were generated for"
+                gap, "1",
+                "share of all cost that would be saved if all took the least cost path of the network",
             ),
             "error_bound": Figure(
                 bound.largest, "trip", f"bound on the error of the path flows, in ℓ² ({bound.status})"
             ),
         }  # fmt: skip
+        if np.isfinite(least):
+            figures["equilibrium_objective"] = Figure(
+                least, "trip cost", "the same at the equilibrium that paths were generated for"
+            )
         return Results(figures, variables, t.constants, int(solution.stats["steps"]))
 
 
