@@ -290,3 +290,19 @@ def test_a_rectifier_on_the_mains_agrees_with_scipy():
     np.testing.assert_array_equal(circuit.problem.knots(0.0, 0.05, circuit.x0), [3e-3, 20e-3])
     figures = circuit.figures(0.05, ts=np.array(stops), rtol=1e-7)
     assert figures == {"final_state": [float(found.xs[-1, 0])]}
+
+
+@pytest.mark.parametrize("series", [1.0, 100.0])
+def test_a_stiff_diode_under_a_sine_does_not_stall_where_the_voltage_is_tiny(series):
+    circuit = Circuit(f"V1 a 0 SIN(0 10 1k)\nR1 a b 1k\nC1 b 0 1u\nD1 b 0 R={series}\n")
+    ts = np.linspace(0.0, 5e-3, 6)[1:]
+    sol = circuit.solve(5e-3, ts, rtol=1e-6, max_steps=50_000)
+
+    def rate(t, v):
+        drive = (10.0 * np.sin(2e3 * np.pi * t) - v) / 1e3
+        return (drive - np.maximum(v, 0.0) / series) / 1e-6
+
+    found = scipy.integrate.solve_ivp(
+        rate, (0.0, 5e-3), [0.0], "Radau", ts, rtol=1e-9, atol=1e-11, max_step=1e-5
+    )
+    np.testing.assert_allclose(sol.xs[:, 0], found.y[0], atol=2e-6)

@@ -178,8 +178,9 @@ class Circuit(eqx.Module):
     def solve(self, t_end: Any, ts: Any = None, **settings: Any) -> Solution:
         """The run from the initial values of the netlist at t = 0 to `t_end` (s), saved at `ts`; by
         `dvax.ExpRosenbrock`, which is exact from one switching to the next where sources are constant
-        or PWL; with rtol = 1e-8 and atol = 1e-12. `settings` go to `dvax.solve`."""
-        settings = {"method": ExpRosenbrock(), "rtol": 1e-8, "atol": 1e-12} | settings
+        or PWL; with rtol = 1e-8 and atol = 1e-9 (V and A, root mean square). `settings` go to
+        `dvax.solve`."""
+        settings = {"method": ExpRosenbrock(), "rtol": 1e-8, "atol": 1e-9} | settings
         return solve(self.problem, self.x0, 0.0, t_end, ts=ts, **settings)
 
     def voltages(self, t: Any, x: Any, u: Any) -> jax.Array:
