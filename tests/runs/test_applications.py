@@ -1,5 +1,6 @@
 """Configurations of applications: what is refused and how, and what a run leaves behind."""
 
+import importlib
 import json
 import shutil
 from pathlib import Path
@@ -10,7 +11,7 @@ import xarray
 
 import dvax
 from dvax.plots import build_report
-from dvax.runs.applications.config import ModelConfig, read_config
+from dvax.runs.applications.config import MODULES, ModelConfig, read_config
 from dvax.runs.applications.driver import run_model
 
 TANK = """* a tank that a diode damps in one half-wave
@@ -158,3 +159,15 @@ def test_the_reference_figures_come_out_of_a_run(name, tmp_path):
     assert build_report(outcome.directory).stat().st_size > 10_000
     again = read_config(outcome.directory / "config.resolved.toml")
     assert isinstance(again, ModelConfig) and again.name == name
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_every_key_of_a_model_is_on_the_page(name):
+    page = (Path(__file__).parents[2] / "docs" / "applications.md").read_text(encoding="utf-8")
+    table = page.split(f"### {name}\n")[1].split("\n### ")[0]
+    module = importlib.import_module(f"dvax.runs.applications.{MODULES[name]}")
+    for key, field in module.APPLICATION.section.model_fields.items():
+        if key != "name":
+            known = isinstance(field.default, int | float | str)
+            told = "required" if field.is_required() else str(field.default) if known else "–"
+            assert f"| `{key}` | {told} |" in table, key
