@@ -26,7 +26,7 @@ def test_the_parts_of_the_rate_add_up_and_the_largest_is_named() -> None:
     parts = {row[1]: row for row in cells}
     assert parts["M α_f"][2:] == ["0.6 1/s", "the largest term"]
     assert parts["M β_f L"][2:] == ["0.4 1/s", ""]
-    assert parts["ω + M L̃"][2:] == ["0 1/s", "trajectories may separate"]
+    assert parts["ω + M L̃"][2:] == ["0 1/s", "their distance stays bounded"]
     assert parts["μ"][2:] == ["-0.75 1/s", "trajectories approach"]
     assert parts["ω + M L̃ − μ"][2] == "0.75 1/s"
 

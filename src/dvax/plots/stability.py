@@ -59,7 +59,7 @@ def losses_table(run: RunRecord) -> str:
 
 def _word(rate: float) -> str:
     if rate == 0:
-        return "trajectories do not separate"
+        return "their distance stays bounded"
     return "trajectories approach" if rate < 0 else "trajectories may separate"
 
 
