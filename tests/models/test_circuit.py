@@ -186,6 +186,7 @@ def test_a_bridge_is_refused_by_the_lines_of_its_diodes():
         assert problem.place == f"netlist, lines {lines} and 7"
 
 
+@pytest.mark.thorough
 def test_the_regularised_bridge_tends_to_the_ideal_one():
     # Between ideal diodes the resistor always sees |v|, and current of the sign of v: it is linear.
     damped = np.array([[-1 / (R * C), -1 / C], [1 / L, 0.0]])

@@ -183,6 +183,7 @@ def test_a_strength_that_falls_under_a_strain_that_stays():
     assert np.linalg.norm(dev(stresses(model, sol)[0])) == pytest.approx(s, abs=2e-8)
 
 
+@pytest.mark.thorough
 def test_on_the_cone_the_flow_dilates_and_the_overstress_is_an_exponential():
     # On the smooth face f = q − M(p + p_t) obeys f' = n·Cε' − f/τ, n = ∂f/∂σ, with a fixed n.
     rate = 2e-3

@@ -163,6 +163,7 @@ def test_twice_the_earthquake_on_twice_the_strength_is_twice_the_displacement():
         assert twice[name] == pytest.approx(2 * value, rel=1e-10)
 
 
+@pytest.mark.thorough
 def test_a_spectrum_is_that_of_its_frames():
     T, z = np.array([0.5, 0.8, 1.7]), np.array([[0.02], [0.1]])
     ratio, tau = np.array([[[0.2]], [[0.6]]]), 0.01

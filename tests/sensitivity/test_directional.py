@@ -109,6 +109,7 @@ def test_at_rest_on_a_kink_both_sides_have_their_own_exponential():
         )
 
 
+@pytest.mark.thorough
 def test_where_kinks_are_crossed_it_is_the_ordinary_derivative():
     case = c1()
     by_start, _ = c1_derivatives()
