@@ -13,7 +13,7 @@ from ..generators import Scalar
 from ..operators import Scaling
 from ..problem import Problem
 from ..sets import Box
-from ..signals import AbstractSignal, Constant, Function
+from ..signals import AbstractSignal, as_signal
 from ..spaces import L2, AbstractSpace
 from ..theory import Constants
 from ..vi import natural_residual
@@ -216,8 +216,4 @@ def _breaks_rule(name: str, value: jax.Array) -> list[InputProblem]:
 
 
 def _signal(value: Any, name: str) -> AbstractSignal:
-    if isinstance(value, AbstractSignal):
-        return value
-    if callable(value):
-        return Function(value)
-    return Constant(_tree.as_float(value, f"dvax.models.Contact({name})"))
+    return as_signal(value, lambda v: _tree.as_float(v, f"dvax.models.Contact({name})"))

@@ -14,7 +14,7 @@ from ..generators import Scalar
 from ..operators import Scaling
 from ..problem import Problem
 from ..sets import AbstractSet, Ball, SecondOrderCone, Translated
-from ..signals import AbstractSignal, Constant, Function
+from ..signals import AbstractSignal, Constant, as_signal
 from ..spaces import L2
 from ..theory import Constants
 from ._stress import joined, split
@@ -241,22 +241,16 @@ def _positive(name: str, value: Any, wrong: list[InputProblem], zero: bool = Fal
 
 
 def _limit(name: str, value: Any, wrong: list[InputProblem], zero: bool) -> AbstractSignal:
-    if isinstance(value, AbstractSignal):
-        return value
-    if callable(value):
-        return Function(value)
-    return Constant(_positive(name, value, wrong, zero))
+    return as_signal(value, lambda v: _positive(name, v, wrong, zero))
 
 
 def _strain(value: Any, wrong: list[InputProblem]) -> AbstractSignal:
     place = "dvax.models.DuvautLions(strain)"
-    signal = value if isinstance(value, AbstractSignal) else None
-    if signal is None:
-        try:
-            signal = Function(value) if callable(value) else Constant(_tree.as_float(value, place))
-        except InputError as error:
-            wrong += error.problems
-            return Constant(jnp.zeros(6))
+    try:
+        signal = as_signal(value, lambda v: _tree.as_float(v, place))
+    except InputError as error:
+        wrong += error.problems
+        return Constant(jnp.zeros(6))
     shape = tuple(jax.eval_shape(signal.value, jnp.zeros(())).shape)
     if shape != (6,):
         wrong.append(

@@ -13,7 +13,7 @@ from ..generators import Dense
 from ..operators import Scaling
 from ..problem import Problem
 from ..sets import AbstractSet, Box, Polyhedron
-from ..signals import AbstractSignal, Constant, Function
+from ..signals import AbstractSignal, as_signal
 from ..spaces import Euclidean
 from ..theory import Constants
 from ._horizon import Horizon, condense, gain_by_regions
@@ -279,16 +279,13 @@ def _vector(name: str, value: Any, size: int, wrong: list[InputProblem]) -> np.n
 
 
 def _signal(value: Any, size: int, name: str) -> AbstractSignal:
-    if value is None:
-        return Constant(jnp.zeros(size))
-    if isinstance(value, AbstractSignal):
-        return value
-    if callable(value):
-        return Function(value)
-    given = _tree.as_float(value, name)
-    if jnp.shape(given) != (size,):
-        raise InputError(
-            InputProblem(name, f"shape {jnp.shape(given)}", f"it is a vector of {size} entries",
-                         "Give one number an entry")
-        )  # fmt: skip
-    return Constant(given)
+    def constant(value: Any) -> jax.Array:
+        given = jnp.zeros(size) if value is None else _tree.as_float(value, name)
+        if jnp.shape(given) != (size,):
+            raise InputError(
+                InputProblem(name, f"shape {jnp.shape(given)}", f"it is a vector of {size} entries",
+                             "Give one number an entry")
+            )  # fmt: skip
+        return given
+
+    return as_signal(value, constant)

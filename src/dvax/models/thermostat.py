@@ -14,7 +14,7 @@ from ..generators import Elliptic
 from ..operators import Scaling
 from ..problem import Problem
 from ..sets import Box
-from ..signals import AbstractSignal, Constant, Function
+from ..signals import AbstractSignal, as_signal
 from ..spaces import L2
 from ..theory import Constants
 
@@ -234,15 +234,17 @@ def _field(name: str, value: Any, cells: tuple, wrong: list[InputProblem]) -> ja
 
 
 def _signal(name: str, value: Any, cells: tuple) -> AbstractSignal:
-    if isinstance(value, AbstractSignal):
-        return value
-    if callable(value):
-        return Function(value)
-    wrong: list[InputProblem] = []
-    field = _field(name, value, cells, wrong)
-    if wrong or (_tree.is_concrete(field) and not np.all(np.isfinite(np.asarray(field)))):
-        place = f"dvax.models.Thermostat({name})"
-        raise InputError(
-            *(wrong or [InputProblem(place, _tree.short(field), "it must be finite", "Mend it")])
-        )
-    return Constant(field)
+    def constant(value: Any) -> jax.Array:
+        wrong: list[InputProblem] = []
+        field = _field(name, value, cells, wrong)
+        if wrong or (_tree.is_concrete(field) and not np.all(np.isfinite(np.asarray(field)))):
+            place = f"dvax.models.Thermostat({name})"
+            raise InputError(
+                *(
+                    wrong
+                    or [InputProblem(place, _tree.short(field), "it must be finite", "Mend it")]
+                )
+            )
+        return field
+
+    return as_signal(value, constant)

@@ -15,7 +15,7 @@ from ...generators import Scalar
 from ...operators import Scaling
 from ...problem import Problem
 from ...sets import Box
-from ...signals import AbstractSignal, Constant, Function, Table
+from ...signals import AbstractSignal, Table, as_signal
 from ...spaces import Euclidean
 from ...theory import Constants
 from .deviation import largest_gain
@@ -375,6 +375,4 @@ def _not_hours(start: Any, hours: Any, rows: int) -> list[InputProblem]:
 
 
 def _signal(value: Any, name: str) -> AbstractSignal:
-    if isinstance(value, AbstractSignal):
-        return value
-    return Function(value) if callable(value) else Constant(_tree.as_float(value, name))
+    return as_signal(value, lambda v: _tree.as_float(v, name))
