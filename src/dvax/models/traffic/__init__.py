@@ -1,6 +1,5 @@
 """Day-to-day traffic on networks in the TNTP format."""
 
-from .accelerated import Accelerated as Accelerated
 from .changes import Incident as Incident
 from .network import Network as Network
 from .network import Trips as Trips

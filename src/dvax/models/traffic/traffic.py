@@ -15,7 +15,7 @@ from ...operators import Scaling
 from ...problem import Problem
 from ...signals import AbstractSignal
 from ...theory import Constants
-from .accelerated import Accelerated
+from ...vi import Accelerated
 from .bounds import largest_flows, largest_slope
 from .changes import Incident, capacities, demand_factor, demand_set
 from .checks import agreement, loaded, numbers
