@@ -269,29 +269,6 @@ def test_costs_are_the_slope_of_their_integral_and_go_on_straight():
     np.testing.assert_allclose(below, -first, atol=1e-12)
 
 
-def test_a_gradient_is_followed_to_its_least_point():
-    # Made from its answer: y* with the multipliers of three simplices, κ = 10⁴.
-    rng = np.random.default_rng(6)
-    basis = np.linalg.qr(rng.normal(size=(60, 60)))[0]
-    matrix = basis * np.geomspace(1.0, 1e4, 60) @ basis.T
-    used = rng.uniform(size=60) < 0.5
-    y = np.where(used, rng.exponential(size=60), 0.0)
-    levels = np.repeat(rng.normal(size=3), 20)
-    drive = jnp.asarray(matrix @ y - levels - np.where(used, 0.0, rng.exponential(size=60)))
-    K = dvax.sets.Simplex(jnp.asarray(y.reshape(3, 20).sum(axis=1)), sizes=(20, 20, 20))
-    M = jnp.asarray(matrix)
-    for least in (0.0, 1e-2):
-        vi = dvax.solve_vi(
-            lambda y, args: M @ y - drive, K, jnp.zeros(60), tol=1e-7, gamma=1.0,
-            solver=traffic.Accelerated(least=least),
-        )  # fmt: skip
-        assert vi.result == dvax.vi.RESULTS.successful
-        assert float(np.linalg.norm(vi.y - y)) <= float(vi.error_bound) <= max(1e-7, least)
-        # √κ ln(1/ε) = 1600, where the method without momentum takes κ ln(1/ε) = 160 000.
-        assert 100 < int(vi.iterations) < 2000
-    assert float(vi.error_bound) > 1e-6
-
-
 # What is refused.
 
 
@@ -379,7 +356,7 @@ def test_a_network_of_the_size_of_anaheim():
 def test_the_examples_of_the_docstrings_print_what_they_say(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = [vars(traffic)[name] for name in ("Network", "Trips", "Incident")]
-    names += [traffic.read_network, traffic.read_trips, traffic.Accelerated]
+    names += [traffic.read_network, traffic.read_trips]
     found = [doctest.DocTestFinder(recurse=False).find(n, module=False, globs={}) for n in names]
     assert all(any(t.examples for t in tests) for tests in found)
     report: list[str] = []

@@ -4,6 +4,7 @@ from .abstract import RESULTS as RESULTS
 from .abstract import AbstractSolver as AbstractSolver
 from .abstract import Answer as Answer
 from .abstract import Frozen as Frozen
+from .accelerated import Accelerated as Accelerated
 from .active_set import ActiveSet as ActiveSet
 from .auto import Auto as Auto
 from .auto import Closed as Closed

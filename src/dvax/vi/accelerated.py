@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ... import _tree
-from ..._tree import Tree
-from ...vi import AbstractSolver, Answer, Frozen
-from ...vi.iteration import Trial, certificate, first_step, iterate
+from .. import _tree
+from .._tree import Tree
+from .abstract import AbstractSolver, Answer, Frozen
+from .iteration import Trial, certificate, first_step, iterate
 
 
 class Accelerated(AbstractSolver):
@@ -32,10 +32,9 @@ class Accelerated(AbstractSolver):
 
     ```python
     >>> import dvax, jax.numpy as jnp
-    >>> from dvax.models.traffic import Accelerated
     >>> stiff = jnp.array([1.0, 1e3, 1e4])
-    >>> K = dvax.sets.Simplex(1.0)
-    >>> vi = dvax.solve_vi(lambda y, args: stiff * y - 1.0, K, jnp.ones(3), solver=Accelerated())
+    >>> K, solver = dvax.sets.Simplex(1.0), dvax.vi.Accelerated()
+    >>> vi = dvax.solve_vi(lambda y, args: stiff * y - 1.0, K, jnp.ones(3), solver=solver)
     >>> [f"{float(v):.6f}" for v in vi.y], bool(vi.iterations < 400)
     (['0.998901', '0.000999', '0.000100'], True)
 
