@@ -47,6 +47,7 @@ def main(folder: Path = FOLDER) -> dict[str, float]:
         "decay_rate": -rate,
         "overshoot": overshoot,
         "room": float((certified / size).min()),
+        "largest_input": float(jnp.abs(sol.us[:, 0]).max()),
         "error_bound": float(bound.x.max()),
     }
 
