@@ -13,12 +13,15 @@ from jax import lax
 from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace, Product
+from .blur import Blur
 from .kinks import Aim, aim, nothing_ahead, passed, until
 from .results import RESULTS
 from .stepper import Step
 
-_TRUST, _CALM = 0.12, 9.0
-"""After k steps that were kept one may grow by 1 + 0.12 k²; more than nine say nothing more."""
+_TRUST, _CALM, _PATIENCE = 0.12, 9.0, 128.0
+"""After k steps that were kept one may grow by 1 + 0.12 k²; more than nine say nothing more. After
+128 of a length that was kept twice the length is tried: the error may be one of rounding, which no
+shorter step lowers."""
 
 
 class Verdict(NamedTuple):
@@ -75,6 +78,8 @@ class Adaptive(AbstractController):
     inside a step has a defect that does not shrink with h; its impulse h·defect does, and such steps
     have the tolerance once more among them, each spending at most a small part of what is left. So
     the computed trajectory is the exact one of a system disturbed by no more than twice the tolerance.
+    Neither does a defect that is rounding shrink with h: steps double while it stays as it is (`Blur`),
+    and spend of the same.
 
     Where the stepper locates kinks of the response, steps are made to end there (`kinks`).
 
@@ -100,12 +105,14 @@ class Adaptive(AbstractController):
         calm: Any
         spare: Any
         aim: Any
+        blur: Blur
 
     def init(self):
         first = lax.stop_gradient(self.first)
         end = land(self.stops[0], first, self.stops[1])
         one = jnp.ones_like(first)
-        return self.State(end, first, jnp.asarray(1), _CALM * one, one, nothing_ahead(first))
+        blur = Blur(0.0 * one, 0.0 * one, 0.0 * one)
+        return self.State(end, first, jnp.asarray(1), _CALM * one, one, nothing_ahead(first), blur)
 
     def end(self, state):
         return state.end
@@ -120,17 +127,19 @@ class Adaptive(AbstractController):
         # A law that is not solved further in may be that of a stage far out: the step was too long.
         error = jnp.where(step.solved, error, jnp.inf)
         impulse = error * h / self.horizon
-        # A small share, because a derivative loses a kink's step; a large one where t has no room.
+        # An error of rounding, until it grows with the length.
+        rounding = error <= 2.0 * state.blur.level
+        # A small share, because a derivative loses a kink's step; a large one where no step is better.
         floor = 8 * jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-        share = jnp.where(h <= 1e4 * floor, 0.1, 1e-6)
-        # A step may be taken all the same that is short after a refusal, or aimed to cross a kink.
+        share = jnp.where((h <= 1e4 * floor) | rounding, 0.1, 1e-6)
+        # A step may be taken all the same that is short after a refusal, aimed to cross a kink, or blurred.
         known = Aim(*state.aim)
         # A kink is looked for only where the defect is too large.
         kink = jnp.full_like(h, jnp.inf)
         if step.kink is not None:
             kink = lax.stop_gradient(step.kink(error > 1.0))
         crossing = (kink < jnp.inf) & (h <= 4 * known.margin)
-        relaxed = ((state.calm == 0) | crossing) & (impulse <= share * state.spare)
+        relaxed = ((state.calm == 0) | crossing | rounding) & (impulse <= share * state.spare)
         sound = step.begun & step.finite
         keep = sound & ((error <= 1.0) | relaxed)
         spare = jnp.where(keep & (error > 1.0), state.spare - impulse, state.spare)
@@ -142,7 +151,9 @@ class Adaptive(AbstractController):
         factor = jnp.clip(factor, 0.1, jnp.minimum(1.0 + _TRUST * state.calm**2, 5.0))
         steady = keep & (factor > 0.8) & (factor < 1.25)
         length = lax.stop_gradient(h)
+        blur = state.blur.after(length, error, keep, state.calm >= _PATIENCE, self.order)
         wanted = jnp.where(steady, length, length * factor)
+        wanted = jnp.where(keep & (blur.level > 0.0), jnp.maximum(wanted, 2.0 * length), wanted)
         # A step cut short by a knot says little about the length that was planned.
         cut = keep & (h < 0.99 * state.length)
         wanted = jnp.where(
@@ -158,14 +169,14 @@ class Adaptive(AbstractController):
 
         # Steps that were kept since one was refused for anything but a kink.
         still = jnp.where(aimed, jnp.maximum(state.calm, 1.0), 0.0)
-        calm = jnp.where(keep, jnp.minimum(state.calm + 1.0, _CALM), still)
+        calm = jnp.where(keep, jnp.minimum(state.calm + 1.0, _PATIENCE), still)
         jumped = keep & (t1 == self.stops[state.stop])
         last = self.stops.shape[0] - 1
         stop = jnp.minimum(jnp.where(jumped, state.stop + 1, state.stop), last)
         begin = jnp.where(keep, t1, t0)
         end = land(begin, wanted, until(ahead, begin, self.stops[stop]))
-        # Below this, t itself cannot tell the ends of a step apart.
-        stuck = ~keep & (h <= floor)
+        # Below this, t itself cannot tell the ends of a step apart; and rounding may spend no more.
+        stuck = ~keep & ((h <= floor) | (rounding & (state.spare < 1e-3)))
         result = RESULTS.where(
             stuck,
             RESULTS.where(
@@ -177,7 +188,9 @@ class Adaptive(AbstractController):
         )
         result = RESULTS.where(step.begun, result, RESULTS.law_unsolved)
         result = RESULTS.where(step.finite, result, RESULTS.nonfinite)
-        return Verdict(keep, self.State(end, wanted, stop, calm, spare, ahead), jumped, result)
+        return Verdict(
+            keep, self.State(end, wanted, stop, calm, spare, ahead, blur), jumped, result
+        )
 
     def boundary(self, index, ends):
         before = jnp.where(index > 0, ends[jnp.maximum(index - 1, 0)], self.stops[0])

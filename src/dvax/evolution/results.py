@@ -11,8 +11,9 @@ class RESULTS(eqx.Enumeration):
         "The largest number of steps was reached before t1. Raise max_steps, or loosen rtol."
     )
     step_too_small = (
-        "The step became too small to move t while the defect stayed above the tolerance. The data "
-        "is discontinuous at that time (name it: dvax.signals knots), or rtol is below rounding."
+        "The step became too small to move t, or to lower its error, while the defect stayed above "
+        "the tolerance. The data is discontinuous at that time (name it: dvax.signals knots), or "
+        "rtol and atol ask for less than the rounding of f, h and K."
     )
     picard_unsettled = (
         "Picard's sweeps did not converge on a window, however short, or the law was not solved there. "

@@ -1,0 +1,56 @@
+"""Right-hand sides whose rounding is as large as the tolerance."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+
+import dvax
+from dvax.evolution.results import RESULTS
+
+LARGE = jnp.asarray(1e9)
+
+
+def problem():
+    # Added to 10⁹ and taken away again, a rate keeps multiples of 1.2e-7. As an argument, since a
+    # compiler cancels constants.
+    return dvax.Problem(
+        A=dvax.generators.Zero(),
+        f=lambda t, x, u, large: (jnp.cos(5 * t) + u + large) - large,
+        h=lambda t, x, u, large: jnp.sin(3 * t) * jnp.ones_like(x),
+        K=dvax.sets.Box(0.0, 0.5),
+        P=dvax.operators.Scaling(1.0),
+    )
+
+
+def run(atol):
+    return dvax.solve(
+        problem(), jnp.zeros(1), 0.0, 3.0, LARGE, rtol=0.0, atol=atol, method=dvax.ETD4RK(),
+        max_steps=20_000, throw=False,
+    )  # fmt: skip
+
+
+def exact(t):
+    kinks = np.array([1, 5, 6, 12, 13, 17]) * np.pi / 18
+    share = scipy.integrate.quad(
+        lambda t: min(max(np.sin(3 * t), 0.0), 0.5), 0.0, t, points=kinks, epsabs=1e-13
+    )
+    return np.sin(5 * t) / 5 + share[0]
+
+
+@pytest.mark.parametrize("atol", [1e-6, 2.5e-7, 2e-7])
+def test_steps_are_not_cut_for_what_no_step_can_mend(atol):
+    found = run(atol)
+    assert found.result == RESULTS.successful
+    # The trajectory of a system disturbed by twice the tolerance; here the solution itself moves by
+    # no more than the disturbance.
+    assert abs(float(found.xs[-1, 0]) - exact(3.0)) <= 2 * atol
+    # A defect of order 4 without rounding takes about 900 of them at the smallest tolerance.
+    assert int(found.stats["steps"]) < 10_000
+
+
+def test_a_tolerance_below_rounding_is_refused_and_not_run_to_the_last_step():
+    found = run(2e-8)
+    assert found.result == RESULTS.step_too_small
+    assert "rounding" in RESULTS[found.result]
+    assert int(found.stats["steps"]) < 10_000
