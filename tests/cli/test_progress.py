@@ -30,6 +30,31 @@ def test_a_pipe_gets_a_line_for_each_tenth(capsys: pytest.CaptureFixture[str]) -
     assert lines[11] == "warning: the [bold] step shrank"
 
 
+def test_a_model_in_one_piece_says_its_stages(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = [
+        {"event": "stage", "stage": "solving at rest"},
+        {"event": "compiling"},
+        {"event": "stage", "stage": "bounding the error"},
+    ]
+    with progress("", quiet=False) as listener:
+        for event in told:
+            listener(event)
+    assert capsys.readouterr().err.splitlines() == ["solving at rest", "bounding the error"]
+    screen = io.StringIO()
+    terminal = Console(file=screen, force_terminal=True, width=100, color_system=None)
+    monkeypatch.setattr(progress_module, "remarks", lambda: terminal)
+    for end, shown in ((2, "solving at rest"), (3, "bounding the error")):
+        screen.truncate(0)
+        with progress("", quiet=False) as listener:
+            for event in told[:end]:
+                listener(event)
+        # What stands there last, when the bar is drawn for the last time.
+        assert shown in screen.getvalue().split("\r")[-1]
+        assert "compiling" not in screen.getvalue().split("\r")[-1]
+
+
 def test_quiet_still_warns(capsys: pytest.CaptureFixture[str]) -> None:
     with progress("s", quiet=True) as listener:
         for event in events(10):

@@ -248,6 +248,14 @@ def test_every_bad_argument_is_refused_by_name(name, value):
     assert len(caught.value.problems) == 1 and name in caught.value.problems[0].place
 
 
+def test_a_flow_of_a_frame_that_stays_elastic_is_refused():
+    with pytest.raises(dvax.InputError) as caught:
+        Frame(record=RECORD, period=0.5, damping=0.05, viscosity_ratio=0.01)
+    (problem,) = caught.value.problems
+    assert "viscosity_ratio" in problem.place and "stays elastic" in problem.rule
+    assert "yield_ratio" in problem.mend
+
+
 def test_records_without_sense_are_refused():
     for step, samples, said in (
         (0.0, [0.1, 0.2], "step"), (0.02, [0.1], "two samples"),

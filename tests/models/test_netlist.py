@@ -82,6 +82,7 @@ REFUSED = {
     "capacitors and a source": ("C2 1 2 1u\nV1 2 0 5", "line 5", "close a loop"),
     "cut of inductors": ("L2 1 2 1m\nL3 2 0 1m", "lines 4 and 5", "inductors and current sources"),
     "cut of a diode": ("L2 1 2 1m\nD2 2 0 R=1", "line 5", "no modulus γ > 0"),
+    "word twice": ("C2 1 2 1u IC=10 ic=5\nR1 2 0 1", "line 4", "a word stands once"),
     "no resistance": ("D2 1 0", "line 4", "its current meets no resistance"),
     "two in parallel": ("R1 1 2 5\nD2 2 0\nD3 2 0", "lines 5 and 6", "in some proportion"),
 }
@@ -104,12 +105,31 @@ def test_a_diode_without_resistance_is_named_and_the_regularised_circuit_offered
         Circuit(text)
     (problem,) = caught.value.problems
     assert "D1 without R=" in problem.given and "γ = λ_min(D) = 0" in problem.rule
-    assert "Circuit(..., r_on=0.1" in problem.mend
+    assert "r_on = 0.1" in problem.mend
     circuit = Circuit(text, r_on=0.1)
     assert circuit.fit == "regularised by r_on = 0.1 Ω: ideal diodes as they go to 0"
     assert float(circuit.constants.gamma) == pytest.approx(0.1)
     # What the line says is not written over.
     assert Circuit(TANK, r_on=0.1).fit == "exact"
+
+
+def test_words_that_stand_twice_are_shown_both():
+    with pytest.raises(dvax.InputError) as caught:
+        read_netlist("C1 1 0 1u IC=10 IC=5\nD1 1 0 R=1k R=2k", "x")
+    said = [(problem.place, problem.given) for problem in caught.value.problems]
+    assert said == [("x, line 1", "IC=10 and IC=5"), ("x, line 2", "R=1k and R=2k")]
+
+
+def test_a_source_that_ends_before_the_run_is_named_with_its_line():
+    circuit = Circuit(TANK + "R1 1 2 1k\nV1 2 0 PWL(0 0 1m 5)\nI1 0 1 PWL(0 0 9m 1)")
+    circuit.check_sources(1e-3)
+    for ask in (circuit.check_sources, circuit.solve):
+        with pytest.raises(dvax.InputError) as caught:
+            ask(5e-3)
+        (problem,) = caught.value.problems
+        assert problem.place == "netlist, line 5"
+        assert problem.given == "V1, a PWL from 0 to 0.001 s" and "t_end = 0.005 s" in problem.rule
+        assert "t_end = 0.001" in problem.mend
 
 
 def test_what_is_missing_from_the_whole_is_said_at_once():

@@ -284,9 +284,11 @@ BAD = {
     "peak": (dict(demand=lambda t: 1.0 + t), "cannot be read off"),
     "(peak)": (dict(demand=lambda t: 1.0 + t, peak=0.0), "positive"),
     "(demand) ": (dict(demand=TABLE([0.0, 1.0], [[1.0, 1.0], [2.0, 2.0]])), "each of the 1 pairs"),
-    "from 3 to 1": (dict(incidents=[traffic.Incident((3, 1), 0.5, 0.0, 1.0)]), "3 go to 2"),
-    "incidents": (dict(incidents=[traffic.Incident((3, 2), 0.0, 0.0, 1.0)]), "(0, 1]"),
-    "(incidents)": (dict(incidents=[traffic.Incident((3, 2), 0.5, 2.0, 1.0)]), "before it ends"),
+    "incidents[0].link": (dict(incidents=[traffic.Incident((3, 1), 0.5, 0.0, 1.0)]), "3 go to 2"),
+    "incidents[0].remaining": (dict(incidents=[traffic.Incident((3, 2), 0.0, 0.0, 1.0)]), "(0, 1]"),
+    "incidents[0].start": (
+        dict(incidents=[traffic.Incident((3, 2), 0.5, 2.0, 1.0)]), "before it ends",
+    ),
 }  # fmt: skip
 
 

@@ -1,6 +1,5 @@
 """Configurations of applications: what is refused and how, and what a run leaves behind."""
 
-import importlib
 import json
 import shutil
 from pathlib import Path
@@ -11,8 +10,9 @@ import xarray
 
 import dvax
 from dvax.plots import build_report
-from dvax.runs.applications.config import MODULES, ModelConfig, read_config
+from dvax.runs.applications.config import APPLICATIONS, ModelConfig, module_of, read_config
 from dvax.runs.applications.driver import run_model
+from dvax.runs.compile_time import compile_seconds
 
 TANK = """* a tank that a diode damps in one half-wave
 C1 1 0 1u IC=10
@@ -51,6 +51,15 @@ def problems(file, **options):
 def test_an_unknown_model_is_told_the_names(folder):
     (told,) = problems(written(folder, '[model]\nname = "circit"\n'))
     assert "model.name" in told and "fem-contact" in told and "Did you mean 'circuit'?" in told
+
+
+def test_a_name_that_is_missing_is_asked_for(folder):
+    (told,) = problems(written(folder, '[model]\nnetlist = "tank.cir"\nt_end = 1.0\n'))
+    assert "model.name: got nothing" in told and 'Add name = "circuit"' in told
+    assert all(name in told for name in ("contact", *APPLICATIONS))
+    # A contact law needs none.
+    told = problems(written(folder, "[model]\nalpha = 1.0\nperiod = 2.0\n"))
+    assert any("model.period" in line and "no key" in line for line in told)
 
 
 def test_everything_wrong_in_the_table_is_said_at_once(folder):
@@ -116,6 +125,29 @@ def test_the_resolved_configuration_is_the_same_run(outcome, tmp_path):
     shutil.copytree(outcome.directory, moved)
     again = run_model(read_config(moved / "config.resolved.toml"), tmp_path / "again")
     assert again.summary == outcome.summary
+    # Each run counts the compilations of its own, and not those of the process before it.
+    manifests = [json.loads((o.directory / "manifest.json").read_text()) for o in (outcome, again)]
+    first, second = (manifest["compile_seconds"] for manifest in manifests)
+    assert first > 0 and first + second <= compile_seconds() + 1e-2
+
+
+def test_a_run_says_what_it_does(outcome):
+    lines = (outcome.directory / "log.jsonl").read_text().splitlines()
+    stages = [event["stage"] for event in map(json.loads, lines) if event["event"] == "stage"]
+    assert stages == ["solving from 0 to 0.001 s", "bounding the error", "writing the results"]
+
+
+def test_a_run_directory_of_an_unknown_model_is_refused(outcome, tmp_path):
+    for name in ("circit", "data"):
+        moved = tmp_path / name
+        shutil.copytree(outcome.directory, moved)
+        manifest = json.loads((moved / "manifest.json").read_text())
+        (moved / "manifest.json").write_text(json.dumps(manifest | {"model": name}))
+        with pytest.raises(dvax.InputError) as caught:
+            build_report(moved)
+        (problem,) = caught.value.problems
+        assert "manifest.json" in problem.place and problem.given == repr(name)
+        assert all(known in problem.rule for known in APPLICATIONS)
 
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
@@ -161,12 +193,11 @@ def test_the_reference_figures_come_out_of_a_run(name, tmp_path):
     assert isinstance(again, ModelConfig) and again.name == name
 
 
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize("name", APPLICATIONS)
 def test_every_key_of_a_model_is_on_the_page(name):
     page = (Path(__file__).parents[2] / "docs" / "applications.md").read_text(encoding="utf-8")
     table = page.split(f"### {name}\n")[1].split("\n### ")[0]
-    module = importlib.import_module(f"dvax.runs.applications.{MODULES[name]}")
-    for key, field in module.APPLICATION.section.model_fields.items():
+    for key, field in module_of(name).APPLICATION.section.model_fields.items():
         if key != "name":
             known = isinstance(field.default, int | float | str)
             told = "required" if field.is_required() else str(field.default) if known else "–"

@@ -211,10 +211,10 @@ WRONG = {
     ),
     "companion": ({"initial.companion": "sin(t)"}, "initial.companion, column 5", "are s"),
     "companion zero": ({"initial.companion": 0.0}, "initial.companion", "both trajectories"),
-    "interest": ({"output.points_of_interest": [50]}, "points_of_interest[0]", "off the boundary"),
+    "interest": ({"output.points_of_interest": [50]}, "points_of_interest[1]", "off the boundary"),
     "interest 2-D": (
         {"output.points_of_interest": [[1, 2]]},
-        "points_of_interest[0]",
+        "points_of_interest[1]",
         "coordinate",
     ),
     "report": ({"output.report": 1}, "output.report", "true or false"),

@@ -19,9 +19,9 @@ app = typer.Typer(
     rich_markup_mode=None,
     help=(
         "Solve coupled nonsmooth dynamical systems, with a certificate of the error.\n\n"
-        "Exit codes: 0 done, 2 wrong input, 3 the solver failed (partial results are kept), "
-        "4 outside the class of problems (check --strict), 130 interrupted (partial results are "
-        "kept)."
+        "Exit codes: 0 done, 2 wrong input, 3 the solver failed, 4 outside the class of problems "
+        "(check --strict), 130 interrupted. After 3 and 130 the frames of a contact law that were "
+        "solved until then are kept; the other models are solved in one piece and leave none."
     ),
 )
 

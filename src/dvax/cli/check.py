@@ -68,7 +68,7 @@ def _check_model(config: "ModelConfig", strict: bool) -> None:
     from dvax.runs.applications.driver import constant_rows as rows_of
 
     application = config.application
-    constants, known, sizes = application.known(config.model)
+    constants, known, sizes, notes = application.known(config.model)
     say(f"{config.source}: no problem in the configuration and its data", "bold")
     say(f"class: {application.fit(config.model)}")
     if constants is not None:
@@ -80,6 +80,8 @@ def _check_model(config: "ModelConfig", strict: bool) -> None:
     say("")
     data = [("data", f.name, f"sha256 {f.sha256[:16]}…") for f in config.fingerprints()]
     table(("size", "value", "remark"), [*sizes, *data])
+    for note in notes:
+        remark(f"note: {note}")
     if _complain_of_broken(known) and strict:
         raise typer.Exit(OUT_OF_CLASS)
 

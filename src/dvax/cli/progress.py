@@ -1,6 +1,7 @@
 """What a run says while it runs: a bar with the time left on a terminal, lines in a pipe.
 
-The driver sends events, dicts with `event` one of compiling, compiled, progress, warning, stopped.
+The driver sends events, dicts with `event` one of compiling, compiled, progress, stage, warning,
+stopped. A model that is solved in one piece has stages in the place of progress.
 Compile time is shown apart: it is paid once, and says nothing about how long the rest will take.
 """
 
@@ -36,7 +37,7 @@ def _warnings_alone(event: Event) -> None:
 
 
 class _Lines:
-    """Plain lines: compiled, every tenth of the way, warnings."""
+    """Plain lines: compiled, every tenth of the way or every stage, warnings."""
 
     def __init__(self, unit: str):
         self.unit = unit
@@ -48,6 +49,8 @@ class _Lines:
         if event["event"] == "compiled":
             remark(f"compiled in {event['compile_seconds']:.1f} s")
             self.began = self.spoke = time.monotonic()
+        elif event["event"] == "stage":
+            remark(event["stage"])
         elif event["event"] == "progress":
             self._advance(event)
 
@@ -85,16 +88,24 @@ def _bar(unit: str) -> Iterator[Listener]:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console) as bar:
-        task = bar.add_task("compiling", total=None, where="")
+        task = bar.add_task("starting", total=None, where="")
+        staged = False
 
         def listen(event: Event) -> None:
+            nonlocal staged
             kind = event["event"]
             if kind == "warning":
                 bar.console.print(f"warning: {event['message']}", markup=False, style="yellow")
+            elif kind == "compiling" and not staged:
+                bar.update(task, description="compiling")
             elif kind == "compiled":
                 seconds = event["compile_seconds"]
                 bar.console.print(f"compiled in {seconds:.1f} s", markup=False)
                 bar.reset(task, description="solving", where="")
+            elif kind == "stage":
+                # Compiling is a part of the first stage, and says less than its name.
+                staged = True
+                bar.update(task, description=event["stage"])
             elif kind == "progress":
                 where = f"t = {event['t']:.4g} {unit}, {event['steps']} steps"
                 bar.update(task, completed=event["t"], total=event["t_end"], where=where)

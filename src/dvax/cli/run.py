@@ -69,7 +69,10 @@ def carry_out(config: "Config | ModelConfig", out: Path, *, force: bool, quiet: 
         _say_figures(outcome.summary)
     if outcome.exit_code:
         remark(f"{outcome.status}: {outcome.stop_reason}", "bold red")
-        remark(f"what was computed until then is in {outcome.directory}")
+        # An application is solved in one piece, so that there is nothing until then.
+        in_one_piece = isinstance(config, ModelConfig)
+        kept = "the settings and the log are" if in_one_piece else "what was computed until then is"
+        remark(f"{kept} in {outcome.directory}")
     elif not quiet:
         remark(f"{outcome.status}: {outcome.stop_reason}")
     if config.output.report:

@@ -132,7 +132,8 @@ class Adaptive(AbstractController):
         # A small share, because a derivative loses a kink's step; a large one where no step is better.
         floor = 8 * jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
         share = jnp.where((h <= 1e4 * floor) | rounding, 0.1, 1e-6)
-        # A step may be taken all the same that is short after a refusal, aimed to cross a kink, or blurred.
+        # A step may be taken all the same that is short after a refusal, aimed to cross a kink, or
+        # blurred by rounding.
         known = Aim(*state.aim)
         # A kink is looked for only where the defect is too large.
         kink = jnp.full_like(h, jnp.inf)

@@ -92,9 +92,9 @@ def _banner(run: RunRecord) -> str:
         gone = run.status == "running"
         reason = "" if gone else str(run.manifest.get("stop_reason") or "")
         text = " ".join(part for part in (UNFINISHED[run.status], reach, reason) if part)
+        head = "No results." if run.trajectory is None else "Partial results."
         lines.append(
-            f'<div class="banner partial" role="alert"><b>Partial results.</b> '
-            f"{_escape(text)}</div>"
+            f'<div class="banner partial" role="alert"><b>{head}</b> {_escape(text)}</div>'
         )
     said = "".join(f"<li>{_escape(text)}</li>" for text in (*run.notes, *run.warnings))
     if said:

@@ -23,6 +23,13 @@ def compile_seconds() -> float:
     return _spent
 
 
+def compile_clock() -> Callable[[], float]:
+    """What tells the seconds spent on compilation since now: those of one run, where a process has
+    several one after the other."""
+    before = compile_seconds()
+    return lambda: compile_seconds() - before
+
+
 @contextmanager
 def announced(announce: Callable[[], None]) -> Iterator[None]:
     """Call `announce` once, when the first large program is traced and goes to the compiler.

@@ -176,7 +176,7 @@ def _points(
         return _quarters(boundary), []
     indices: list[int] = []
     notices: list[str] = []
-    for number, place in enumerate(places):
+    for number, place in enumerate(places, start=1):
         key = f"{file}: output.points_of_interest[{number}]"
         if len(place) != len(boundary.coordinates):
             problems.append(

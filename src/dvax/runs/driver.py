@@ -22,7 +22,7 @@ import numpy as np
 
 from dvax.errors import InputError, InputProblem, SolveError
 from dvax.evolution import ETD1, ETD2RK, ETD4RK, DormandPrince, ExpRosenbrock, Solution, solve
-from dvax.runs.compile_time import announced, compile_seconds
+from dvax.runs.compile_time import announced, compile_clock
 from dvax.runs.config import Config, build_contact
 from dvax.runs.contact_figures import Figures
 from dvax.runs.contact_frames import (
@@ -51,7 +51,8 @@ Listener = Callable[[dict[str, Any]], None]
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """How a run ended. `exit_code`: 0 finished, 3 failed, 130 interrupted."""
+    """How a run ended. `exit_code`: 0 finished, 2 input that a solve refused, 3 failed, 130
+    interrupted."""
 
     status: str
     exit_code: int
@@ -66,14 +67,13 @@ def run(
     """Solve what `config` describes and leave a run directory at `out`.
 
     `on_event` is called with dicts whose "event" is compiling, compiled, progress, warning or
-    stopped.
+    stopped; of an application also stage.
 
     **Raises:** `dvax.InputError`, with nothing written, where `out` exists and is not empty and
     `overwrite` is false, or where data files no longer fit. A failure of the solve is not raised: it
     is the outcome, and what was computed before is on disk.
     """
     refuse_existing(out, overwrite)
-    compile_seconds()
     inputs = build_contact(config)
     directory = RunDirectory(out, clear=True)
     try:
@@ -89,6 +89,7 @@ class _Run:
         self, config: Config, inputs: ContactInputs, directory: RunDirectory, tell: Listener
     ):
         self.config, self.inputs, self.directory, self.tell = config, inputs, directory, tell
+        self.compiling = compile_clock()
         self.model = contact_model(config, inputs)
         self.problem, self.constants = self.model.problem, self.model.constants
         self.space: AbstractSpace = self.problem.spaces(jnp.asarray(inputs.x0))[0]
@@ -185,7 +186,7 @@ class _Run:
             self.steps += int(a.stats["steps"])
             self.rejected += int(a.stats["rejected"])
             if first == 0:
-                self._event("compiled", compile_seconds=compile_seconds())
+                self._event("compiled", compile_seconds=self.compiling())
             self._event("progress", t=float(wanted[-1]), t_end=float(times[-1]), steps=self.steps)
 
     def _solve(self, piece: "_Piece", start: float, ts: np.ndarray) -> Solution:
@@ -209,7 +210,7 @@ class _Run:
 
     def _manifest(self, status: str, reason: str, **more: Any) -> None:
         seconds = time.monotonic() - self.clock
-        spent = compile_seconds()
+        spent = self.compiling()
         files = {f.name: {"sha256": f.sha256, "bytes": f.bytes} for f in self.inputs.data_files}
         content = {
             **provenance(),

@@ -18,7 +18,8 @@ MAX_POINTS = 100_000_000
 MAX_FRAMES = 10**7
 
 
-def _broken(rule: str, mend: str) -> PydanticCustomError:
+def broken(rule: str, mend: str) -> PydanticCustomError:
+    """What a validator raises: the rule that a value breaks, and the mend."""
     return PydanticCustomError("rule", "{rule}", {"rule": rule, "mend": mend})
 
 
@@ -30,7 +31,7 @@ def _in_units(value: Any, kind: str, info: ValidationInfo) -> Any:
     try:
         return units.convert(value, kind)
     except UnitError as error:
-        raise _broken(error.rule, error.mend) from None
+        raise broken(error.rule, error.mend) from None
 
 
 def in_quantity(kind: str) -> BeforeValidator:
@@ -45,7 +46,7 @@ def in_quantity(kind: str) -> BeforeValidator:
 def _finite(value: Any, kind: str, info: ValidationInfo, what: str) -> float:
     number = _in_units(value, kind, info)
     if type(number) not in (int, float) or not math.isfinite(number):
-        raise _broken(
+        raise broken(
             f"{what} is a finite number", f'Write a number, or a text such as "2.5 <unit>" ({kind})'
         )
     return float(number)
@@ -53,21 +54,21 @@ def _finite(value: Any, kind: str, info: ValidationInfo, what: str) -> float:
 
 def _pair_of_lengths(value: Any, info: ValidationInfo) -> tuple[float, ...]:
     if not isinstance(value, list | tuple) or len(value) != 2:
-        raise _broken("a two-dimensional boundary has two lengths", "Write lengths = [a, b]")
+        raise broken("a two-dimensional boundary has two lengths", "Write lengths = [a, b]")
     pair = tuple(_finite(v, "length", info, "a length") for v in value)
     if not all(v > 0 for v in pair):
-        raise _broken("a length is greater than 0", "Give both sides of the boundary")
+        raise broken("a length is greater than 0", "Give both sides of the boundary")
     return pair
 
 
 def _counts(value: Any) -> tuple[int, ...]:
     counts = tuple(value) if isinstance(value, list | tuple) else (value,)
     if len(counts) not in (1, 2) or not all(type(n) is int for n in counts):
-        raise _broken(
+        raise broken(
             "points is a whole number, or two of them", "Write points = 1000 or points = [100, 50]"
         )
     if not all(n >= 1 for n in counts) or math.prod(counts) > MAX_POINTS:
-        raise _broken(
+        raise broken(
             f"a boundary has 1 to {MAX_POINTS} points in all", "Choose the resolution you need"
         )
     return counts
@@ -75,7 +76,7 @@ def _counts(value: Any) -> tuple[int, ...]:
 
 def _places(value: Any, info: ValidationInfo) -> tuple[tuple[float, ...], ...]:
     if not isinstance(value, list | tuple):
-        raise _broken("points_of_interest is a list", "Write points_of_interest = [2.5, 5.0]")
+        raise broken("points_of_interest is a list", "Write points_of_interest = [2.5, 5.0]")
     places = []
     for place in value:
         parts = place if isinstance(place, list | tuple) else (place,)
@@ -85,7 +86,7 @@ def _places(value: Any, info: ValidationInfo) -> tuple[tuple[float, ...], ...]:
 
 def _times(value: Any, info: ValidationInfo) -> tuple[float, ...]:
     if not isinstance(value, list | tuple):
-        raise _broken("knots is a list of times", "Write knots = [1.0, 2.0]")
+        raise broken("knots is a list of times", "Write knots = [1.0, 2.0]")
     return tuple(_finite(part, "time", info, "a time") for part in value)
 
 
@@ -101,7 +102,7 @@ def _working_unit(value: Any, info: ValidationInfo) -> Any:
         try:
             check_working_unit(str(info.field_name), value)
         except UnitError as error:
-            raise _broken(error.rule, error.mend) from None
+            raise broken(error.rule, error.mend) from None
     return value
 
 
@@ -272,14 +273,19 @@ class SolverSection(Section):
     )
 
 
-class OutputSection(Section):
-    """What is written beside the trajectory."""
+class ReportSection(Section):
+    """What is written beside the results of any model."""
+
+    report: bool = Field(True, description="write report.html")
+    png: bool = Field(True, description="write the figures as PNG")
+
+
+class OutputSection(ReportSection):
+    """What is written beside the trajectory of a contact law."""
 
     points_of_interest: Annotated[tuple[tuple[float, ...], ...] | None, PlainValidator(_places)] = (
         Field(None, description="places whose histories are shown; each snaps to the nearest point")
     )
-    report: bool = Field(True, description="write report.html")
-    png: bool = Field(True, description="write the figures as PNG")
 
 
 SECTIONS: dict[str, type[BaseModel]] = {

@@ -97,12 +97,27 @@ class Units(BaseModel):
         """A text "number unit" in working units. Raises `UnitError`."""
         match = _match(text)
         if match is None:
+            number = text.strip() if NUMBER.fullmatch(text.strip()) else "2.5"
             example = self.of(kind) if kind != "number" else ""
             raise UnitError(
                 "a quantity in quotes is a number and a unit",
-                f'Write "2.5 {example}"' if example else "Write the number without quotes",
+                f'Write "{number} {example}"' if example else "Write the number without quotes",
             )
         return float(match.group(1)) * self.factor(match.group(4).strip(), kind)
+
+
+def converted(text: str, unit: str) -> float | None:
+    """A text "number unit" in another unit; None where the text or the unit does not allow it."""
+    match = _match(text)
+    if match is None:
+        return None
+    try:
+        given, wanted = parse_unit(match.group(4)), parse_unit(unit)
+    except UnitError:
+        return None
+    if given.dimensionality != wanted.dimensionality:
+        return None
+    return float(match.group(1)) * float(_registry().Quantity(1.0, given).to(wanted).magnitude)
 
 
 def is_quantity(text: str) -> bool:

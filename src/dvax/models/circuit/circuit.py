@@ -76,6 +76,7 @@ class Circuit(eqx.Module):
     storage: jax.Array
     x0: jax.Array
     sources: tuple[AbstractSignal, ...]
+    feeds: tuple[tuple[str, str], ...] = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
     diodes: tuple[str, ...] = eqx.field(static=True)
     blocking: tuple[bool, ...] = eqx.field(static=True)
@@ -98,6 +99,7 @@ class Circuit(eqx.Module):
         self.x0 = jnp.asarray(np.array([element.initial for element in stores]))
         feeds = [*netlist.of("V"), *netlist.of("I")]
         self.sources = tuple(e.source for e in feeds if e.source is not None)
+        self.feeds = tuple((e.name, netlist.place(e)) for e in feeds)
         self.states = tuple(element.name for element in stores)
         self.diodes = tuple(element.name for element in diodes)
         self.blocking = tuple(map(bool, found.blocking))
@@ -179,9 +181,30 @@ class Circuit(eqx.Module):
         """The run from the initial values of the netlist at t = 0 to `t_end` (s), saved at `ts`; by
         `dvax.ExpRosenbrock`, which is exact from one switching to the next where sources are constant
         or PWL; with rtol = 1e-8 and atol = 1e-9 (V and A, root mean square). `settings` go to
-        `dvax.solve`."""
+        `dvax.solve`. Raises what `check_sources` does."""
+        self.check_sources(t_end)
         settings = {"method": ExpRosenbrock(), "rtol": 1e-8, "atol": 1e-9} | settings
         return solve(self.problem, self.x0, 0.0, t_end, ts=ts, **settings)
+
+    def check_sources(self, t_end: Any) -> None:
+        """See that every source lasts until `t_end` (s).
+
+        **Raises:** `dvax.InputError` with the lines of those that end before.
+        """
+        if not _tree.is_concrete(t_end, self.sources):
+            return
+        end = float(t_end)
+        short = [
+            InputProblem(
+                place, f"{name}, a PWL from 0 to {last:.12g} s",
+                f"the run is from 0 to t_end = {end:.12g} s, and a source is never extrapolated",
+                f"Add {end:.12g} and a value as its last point, or take t_end = {last:.12g}",
+            )
+            for (name, place), source in zip(self.feeds, self.sources, strict=True)
+            if (last := float(source.span()[1])) < end
+        ]  # fmt: skip
+        if short:
+            raise InputError(*short)
 
     def voltages(self, t: Any, x: Any, u: Any) -> jax.Array:
         """The voltages of the `nodes` against ground (V)."""
@@ -258,7 +281,7 @@ def _check_modulus(netlist: Netlist, found: Equations) -> None:
                 netlist.place(*named), f"{names} without R=",
                 f"{why} no resistance, so γ = λ_min(D) = 0 and the law does not determine "
                 + ("it" if one else "them"),
-                "Write R=0.1 there, or regularise: Circuit(..., r_on=0.1, g_leak=1e-9)",
+                "Write R=0.1 there, or regularise all: r_on = 0.1 and g_leak = 1e-9",
             )
         )  # fmt: skip
 

@@ -169,9 +169,19 @@ def _element(words: list[str], place: str, line: int) -> Element:
             found["value"] = _positive(rest[2], _QUANTITY[kind], place)
     except InputError as error:
         wrong += error.problems
+    said: dict[str, str] = {}
     for word in named:
         try:
             key, value = _named(kind, word, place)
+            first = said.setdefault(key, word)
+            if first is not word:
+                raise InputError(
+                    InputProblem(
+                        place, f"{first} and {word}",
+                        "a word stands once, or it is not known which of them counts",
+                        "Keep one of them",
+                    )
+                )  # fmt: skip
             found[key] = value
         except InputError as error:
             wrong += error.problems

@@ -52,9 +52,9 @@ def _missing(netlist: Netlist) -> list[InputProblem]:
         (GROUND in nodes, "no node 0", "voltages are against node 0, the ground",
          "Call one of the nodes 0"),
         (bool(netlist.of("C") or netlist.of("L")), "no capacitor and no inductor",
-         "without them nothing goes on in time", "Use dvax.solve_vi for a circuit at rest"),
+         "without them nothing goes on in time", "Add one, such as C1 a 0 1u"),
         (bool(netlist.of("D")), "no diode", "without one the system is linear and has no law",
-         "Use scipy.signal.lsim for it"),
+         "Add one, such as D1 a 0 R=1"),
     ]  # fmt: skip
     return [
         InputProblem(netlist.name, given, rule, mend)
@@ -162,8 +162,8 @@ def _cut(netlist: Netlist, part: str, cut: list[Element]) -> InputProblem:
         netlist.place(*diodes), which,
         f"nothing but {names} joins the part with node {part} to the rest: where no diode conducts, "
         "its voltage is anything, so the law has no modulus γ > 0",
-        f"Give {'each of ' if len(diodes) > 1 else ''}{which} a leak, G=1n, or regularise: "
-        "Circuit(..., r_on=0.1, g_leak=1e-9)",
+        f"Give {'each of ' if len(diodes) > 1 else ''}{which} a leak, G=1n, or regularise all: "
+        "r_on = 0.1 and g_leak = 1e-9",
     )  # fmt: skip
 
 

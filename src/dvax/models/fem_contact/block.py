@@ -8,6 +8,8 @@ import numpy as np
 from ...errors import InputError, InputProblem
 from .optional import needed
 
+_FLAT = 1e-9
+
 
 def block(
     width: Any = 8.0,
@@ -63,6 +65,7 @@ def block(
     heights = float(growth) ** np.arange(layers)
     depth = np.concatenate([[0.0], np.cumsum(heights)])
     y = -float(height) * (depth / depth[-1])[::-1]
+    _check_sides(np.diff(right), np.diff(y))
     mesh = skfem.MeshQuad.init_tensor(np.concatenate([-right[::-1], right[1:]]), y)
     middle = mesh.p[1, mesh.facets].mean(axis=0)
     # The ends of y are exact, and a facet in between is not near them.
@@ -71,5 +74,23 @@ def block(
     )
 
 
+def _check_sides(columns: np.ndarray, layers: np.ndarray) -> None:
+    """Refuse sizes that make elements so flat that they have no area to rounding."""
+    wrong = [
+        InputProblem(
+            f"dvax.models.ElasticBody({', '.join(f'mesh[{key!r}]' for key in keys)})",
+            f"elements {thin:.1e} by {long:.1e}", "no side is 10⁹ times the other: there is no area to "
+            "rounding", mend,
+        )
+        for keys, thin, long, mend in (
+            (("layers", "growth"), layers.min(), columns.max(), "Take fewer layers or a growth near 1"),
+            (("fine_half_width", "fine"), columns.min(), layers.max(), "Make the fine zone wider"),
+        )
+        if not thin > _FLAT * long
+    ]  # fmt: skip
+    if wrong:
+        raise InputError(*wrong)
+
+
 def _problem(name: str, value: Any, rule: str, mend: str) -> InputProblem:
-    return InputProblem(f"dvax.models.ElasticBody(mesh), size {name!r}", repr(value), rule, mend)
+    return InputProblem(f"dvax.models.ElasticBody(mesh[{name!r}])", repr(value), rule, mend)

@@ -250,7 +250,12 @@ def _checked(record: Any, given: dict[str, Any]) -> dict[str, jax.Array]:
         )
     if yields and given["viscosity_ratio"] is None:
         say("viscosity_ratio", "None", "how fast a frame that yields flows has no default",
-            "Give η/k in s, a hundredth of the period, say")  # fmt: skip
+            "Give η/k in s, a hundredth of the period, say: viscosity_ratio = 0.01")  # fmt: skip
+    if not yields and given["viscosity_ratio"] is not None:
+        flow = given["viscosity_ratio"]
+        say("viscosity_ratio", _tree.short(flow) if _tree.is_concrete(flow) else "a traced value",
+            "a frame without a yield force stays elastic and does not flow",
+            "Leave it out, or say when the frame yields: yield_ratio = 0.5")  # fmt: skip
     if wrong:
         raise InputError(*wrong)
     return values

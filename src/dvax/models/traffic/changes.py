@@ -1,6 +1,7 @@
 """What changes with time: capacities by incidents, demand by a factor."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -81,15 +82,18 @@ def capacities(
     problems: list[InputProblem] = []
     links = []
     for k, incident in enumerate(incidents):
-        place = f"dvax.models.Traffic(incidents)[{k}]"
+        one = f"incidents[{k}]"
         try:
             links.append(network.link(*incident.link))
         except InputError as error:
-            problems += error.problems
+            place = f"dvax.models.Traffic({one}.link)"
+            problems += [
+                replace(p, place=place, given=f"{p.place}: {p.given}") for p in error.problems
+            ]
         if not 0 < incident.remaining <= 1:
             problems.append(
                 InputProblem(
-                    place, f"remaining = {incident.remaining}",
+                    f"dvax.models.Traffic({one}.remaining)", f"remaining = {incident.remaining}",
                     "it is the share of the capacity that is left, in (0, 1]",
                     "Take a small share for a closed link, or remove the link",
                 )
@@ -97,7 +101,8 @@ def capacities(
         if not -np.inf < incident.start < incident.end < np.inf:
             problems.append(
                 InputProblem(
-                    place, f"start = {incident.start}, end = {incident.end}",
+                    f"dvax.models.Traffic({one}.start, {one}.end)",
+                    f"start = {incident.start}, end = {incident.end}",
                     "it begins before it ends", "Mend the times",
                 )
             )  # fmt: skip

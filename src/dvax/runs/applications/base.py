@@ -4,7 +4,7 @@ import abc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -46,6 +46,19 @@ class Results:
     files: Callable[[Path], None] | None = None
 
 
+class Known(NamedTuple):
+    """What is known of a model before anything is solved: its constants and assumptions, sizes as
+    (what, value, remark), and `notes`, sentences about what is allowed but worth knowing."""
+
+    constants: Constants | None
+    assumptions: tuple[Assumption, ...]
+    sizes: list[tuple[str, str, str]]
+    notes: tuple[str, ...] = ()
+
+
+Say = Callable[[str], None]
+"""To be told what a solve is about to do: "solving at rest", for a reader who waits."""
+
 Model = TypeVar("Model")
 
 
@@ -54,15 +67,17 @@ class AbstractApplication(abc.ABC, Generic[Model]):
 
     - `section`: that table, for pydantic; the keys in `files` name data files, those in `folders`
       folders, with the files that are read there;
+    - `keys`: the keys that make an argument of the model, where they are called otherwise than it;
     - `read`: from the table to the model, everything checked, nothing solved;
     - `fit`: "exact", or by what it is regularised, or why it is outside the class;
-    - `known`: constants and assumptions, before anything is solved, and sizes as (what, value, remark);
-    - `solve`: to the results.
+    - `known`: what can be told before anything is solved;
+    - `solve`: to the results, saying at each stage what it does.
     """
 
     section: ClassVar[type[Section]]
     files: ClassVar[tuple[str, ...]] = ()
     folders: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    keys: ClassVar[Mapping[str, tuple[str, ...]]] = {}
 
     @abc.abstractmethod
     def read(self, table: Any, paths: Mapping[str, Path]) -> Model:
@@ -76,11 +91,9 @@ class AbstractApplication(abc.ABC, Generic[Model]):
         """Whether the model is in the class, exactly or regularised."""
 
     @abc.abstractmethod
-    def known(
-        self, model: Model
-    ) -> tuple[Constants | None, tuple[Assumption, ...], list[tuple[str, str, str]]]:
-        """Constants, assumptions and sizes."""
+    def known(self, model: Model) -> Known:
+        """Constants, assumptions, sizes and notes."""
 
     @abc.abstractmethod
-    def solve(self, model: Model) -> Results:
+    def solve(self, model: Model, say: Say) -> Results:
         """The results. **Raises:** `dvax.SolveError`."""

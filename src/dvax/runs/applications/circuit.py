@@ -9,10 +9,16 @@ import numpy as np
 from pydantic import Field
 
 from dvax.models.circuit import Circuit
-from dvax.runs.applications.base import AbstractApplication, Figure, Results, Variable
+from dvax.runs.applications.base import (
+    AbstractApplication,
+    Figure,
+    Known,
+    Results,
+    Say,
+    Variable,
+)
 from dvax.runs.applications.certificate import certificate
 from dvax.runs.schema import Section, in_quantity
-from dvax.theory import Assumption, Constants
 
 
 class CircuitSection(Section):
@@ -35,6 +41,7 @@ class _Loaded:
     def __init__(self, table: CircuitSection, file: Path):
         self.table = table
         self.circuit = Circuit.from_file(file, r_on=table.r_on, g_leak=table.g_leak)
+        self.circuit.check_sources(table.t_end)
 
 
 class CircuitApplication(AbstractApplication[_Loaded]):
@@ -49,21 +56,21 @@ class CircuitApplication(AbstractApplication[_Loaded]):
     def fit(self, model: _Loaded) -> str:
         return model.circuit.fit
 
-    def known(
-        self, model: _Loaded
-    ) -> tuple[Constants | None, tuple[Assumption, ...], list[tuple[str, str, str]]]:
+    def known(self, model: _Loaded) -> Known:
         c = model.circuit
         sizes = [
             ("states", str(len(c.states)), ", ".join(c.states)),
             ("diodes", str(len(c.diodes)), ", ".join(c.diodes)),
             ("time", f"0 to {model.table.t_end:g} s", f"{model.table.frames + 1} saved states"),
         ]
-        return c.constants, (), sizes
+        return Known(c.constants, (), sizes)
 
-    def solve(self, model: _Loaded) -> Results:
+    def solve(self, model: _Loaded, say: Say) -> Results:
         c, table = model.circuit, model.table
         times = np.linspace(0.0, table.t_end, table.frames + 1)
+        say(f"solving from 0 to {table.t_end:g} s")
         solution = c.solve(table.t_end, times, rtol=table.rtol, constants=c.constants)
+        say("bounding the error")
         bound = certificate(c.problem, solution, c.constants)
         volts, amperes = (
             np.asarray(jax.vmap(of)(solution.ts, solution.xs, solution.us))

@@ -5,29 +5,30 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from dvax.errors import InputError, InputProblem
 from dvax.runs.applications.base import AbstractApplication
+from dvax.runs.applications.wording import in_keys
 from dvax.runs.config import Config, check_contact, parse
 from dvax.runs.data_file import DataFile, fingerprint, locate, locate_folder
-from dvax.runs.schema import OutputSection, Section
+from dvax.runs.schema import ModelSection, ReportSection, Section
 from dvax.runs.schema_errors import shown, translate, unknown_key
 from dvax.runs.units import Units
 
-MODULES = {
-    "traffic": "traffic",
-    "market": "market",
-    "frame": "frame",
-    "circuit": "circuit",
-    "fem-contact": "fem_contact",
-}
-"""The names of `[model]`, and where each is. They are imported when they are asked for."""
+APPLICATIONS = ("traffic", "market", "frame", "circuit", "fem-contact")
+"""The names of `[model]` that are applications."""
 
-NAMES = ("contact", *MODULES)
+NAMES = ("contact", *APPLICATIONS)
 _SECTIONS = ("model", "output")
+
+
+def module_of(name: str) -> ModuleType:
+    """The module of an application, imported when it is asked for."""
+    return importlib.import_module(f"dvax.runs.applications.{name.replace('-', '_')}")
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class ModelConfig:
 
     name: str
     table: Section
-    output: OutputSection
+    output: ReportSection
     source: Path
     application: AbstractApplication
     model: Any
@@ -74,10 +75,22 @@ def read_config(path: str | Path, *, allow_outside: bool = False) -> Config | Mo
     source = Path(path)
     raw = parse(source)
     table = raw.get("model")
-    name = table.get("name", "contact") if isinstance(table, Mapping) else "contact"
+    name = "contact"
+    if isinstance(table, Mapping):
+        # A contact law needs no name: it was the only model once.
+        name = table.get("name", "contact")
+        if "name" not in table and (meant := _meant(table)) is not None:
+            raise InputError(
+                InputProblem(
+                    f"{source.name}: model.name", "nothing",
+                    f"it says which model this is, one of {', '.join(NAMES)}; "
+                    f"these keys are of {meant!r}",
+                    f'Add name = "{meant}"',
+                )
+            )  # fmt: skip
     if name == "contact":
         return check_contact(raw, source, allow_outside)
-    if not isinstance(name, str) or name not in MODULES:
+    if not isinstance(name, str) or name not in APPLICATIONS:
         close = get_close_matches(str(name), NAMES, n=1)
         mend = f"Did you mean {close[0]!r}?" if close else "Choose one of these."
         raise InputError(
@@ -88,16 +101,30 @@ def read_config(path: str | Path, *, allow_outside: bool = False) -> Config | Mo
     return _check(raw, name, source, allow_outside)
 
 
+def _meant(table: Mapping[str, Any]) -> str | None:
+    """The application whose keys a table without a name has; None where it has those of a contact
+    law, or of no model."""
+
+    def shared(section: type[BaseModel]) -> int:
+        return len(set(table) & set(section.model_fields))
+
+    if shared(ModelSection):
+        return None
+    count = {name: shared(module_of(name).APPLICATION.section) for name in APPLICATIONS}
+    best = max(count, key=lambda name: count[name])
+    return best if count[best] else None
+
+
 def _check(raw: dict[str, Any], name: str, source: Path, allow_outside: bool) -> ModelConfig:
     file = source.name
-    application = importlib.import_module(f"dvax.runs.applications.{MODULES[name]}").APPLICATION
+    application = module_of(name).APPLICATION
     problems = [
         unknown_key(f"{file}: {key}", key, value, list(_SECTIONS))
         for key, value in raw.items()
         if key not in _SECTIONS
     ]
     sections: dict[str, Any] = {}
-    for key, kind in (("model", application.section), ("output", OutputSection)):
+    for key, kind in (("model", application.section), ("output", ReportSection)):
         try:
             sections[key] = kind.model_validate(raw.get(key, {}), context={"units": Units()})
         except ValidationError as error:
@@ -117,5 +144,6 @@ def _check(raw: dict[str, Any], name: str, source: Path, allow_outside: bool) ->
             problems += error.problems
     if problems:
         raise InputError(*problems)
-    model = application.read(table, paths)
+    with in_keys(file, application):
+        model = application.read(table, paths)
     return ModelConfig(name, table, sections["output"], source, application, model, paths)

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import zarr
 
-from dvax.errors import SolveError
+from dvax.errors import InputError, SolveError
 from dvax.runs.applications.base import Results, Variable
 from dvax.runs.applications.config import ModelConfig
-from dvax.runs.compile_time import announced, compile_seconds
+from dvax.runs.applications.wording import in_keys
+from dvax.runs.compile_time import announced, compile_clock
 from dvax.runs.driver import Listener, RunOutcome, refuse_existing, terminable
 from dvax.runs.provenance import provenance
 from dvax.runs.resolved import DATA_FOLDER, NAME
@@ -26,7 +27,6 @@ def run_model(
 ) -> RunOutcome:
     """Solve what `config` describes and leave a run directory at `out`; see `dvax.runs.driver.run`."""
     refuse_existing(out, overwrite)
-    compile_seconds()
     directory = RunDirectory(out, clear=True)
     try:
         return _Run(config, directory, on_event or (lambda event: None)).go()
@@ -38,21 +38,32 @@ class _Run:
     def __init__(self, config: ModelConfig, directory: RunDirectory, tell: Listener):
         self.config, self.directory, self.tell = config, directory, tell
         self.started, self.clock = datetime.now(UTC), time.monotonic()
-        constants, self.assumptions, _ = config.application.known(config.model)
-        self.rows = constant_rows(constants)
+        self.compiling = compile_clock()
+        known = config.application.known(config.model)
+        self.assumptions, self.notes = known.assumptions, known.notes
+        self.rows = constant_rows(known.constants)
         self.steps = 0
 
     def go(self) -> RunOutcome:
         _write_resolved(self.config, self.directory.path)
         self._manifest("running", "The run is going on.")
+        for note in self.notes:
+            self._event("warning", message=note)
         results: Results | None = None
         status, code, reason = "finished", 0, "The model was solved to its end."
         try:
-            with terminable(), announced(lambda: self._event("compiling")):
-                results = self.config.application.solve(self.config.model)
-            self._event("compiled", compile_seconds=compile_seconds())
+            application = self.config.application
+            with (
+                terminable(),
+                announced(lambda: self._event("compiling")),
+                in_keys(self.config.source.name, application),
+            ):
+                results = application.solve(self.config.model, self._stage)
+            self._event("compiled", compile_seconds=self.compiling())
         except KeyboardInterrupt:
-            status, code, reason = "interrupted", 130, "Interrupted; nothing was written yet."
+            status, code, reason = "interrupted", 130, "Interrupted before there were results."
+        except InputError as error:
+            status, code, reason = "failed", 2, str(error)
         except SolveError as error:
             status, code, reason = "failed", 3, str(error)
         except BaseException as error:
@@ -61,6 +72,7 @@ class _Run:
             raise
         summary: dict[str, Any] = {}
         if results is not None:
+            self._stage("writing the results")
             self._keep(results)
             summary = {
                 name: {"value": _plain(f.value), "unit": f.unit, "meaning": f.meaning}
@@ -87,13 +99,16 @@ class _Run:
         if results.files is not None:
             results.files(self.directory.path)
 
+    def _stage(self, words: str) -> None:
+        self._event("stage", stage=words)
+
     def _event(self, kind: str, **facts: Any) -> None:
         event = {"event": kind, **facts}
         self.directory.log(event)
         self.tell(event)
 
     def _manifest(self, status: str, reason: str) -> None:
-        seconds, spent = time.monotonic() - self.clock, compile_seconds()
+        seconds, spent = time.monotonic() - self.clock, self.compiling()
         now = datetime.now(UTC).isoformat(timespec="seconds")
         content = {
             **provenance(),

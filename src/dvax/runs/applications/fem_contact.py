@@ -11,10 +11,19 @@ from pydantic import Field
 from dvax.errors import InputError, InputProblem
 from dvax.evolution import Implicit, solve
 from dvax.models.fem_contact import ElasticBody, FemContact
-from dvax.runs.applications.base import AbstractApplication, Figure, Results, Variable
+from dvax.runs.applications.base import (
+    AbstractApplication,
+    Figure,
+    Known,
+    Results,
+    Say,
+    Variable,
+)
 from dvax.runs.applications.certificate import certificate
 from dvax.runs.schema import Section
-from dvax.theory import Assumption, Constants
+
+_SMALL = 0.1
+"""An indentation above this part of a size of the body or the punch is worth a note."""
 
 _SIZES = ("width", "height", "fine_half_width", "fine", "coarse", "layers", "growth")
 
@@ -31,8 +40,12 @@ class FemContactSection(Section):
     coarse: int | None = Field(None, ge=1, description="columns a side outside of it")
     layers: int | None = Field(None, ge=1, description="layers of elements")
     growth: float | None = Field(None, gt=0, description="ratio of heights of successive layers")
-    contact: str = Field("contact", description="what the mesh file calls the contact boundary")
-    clamped: str = Field("clamped", description="what the mesh file calls the held boundary")
+    contact: str | None = Field(
+        None, description='what the mesh file calls the contact boundary, "contact" if not given'
+    )
+    clamped: str | None = Field(
+        None, description='what the mesh file calls the held boundary, "clamped" if not given'
+    )
     indentation: float = Field(0.01, gt=0, description="depth to which the punch is pressed")
     stiffness: float = Field(100.0, gt=0, description="pressure per penetration, beta")
     pressure_cap: float | None = Field(
@@ -50,25 +63,65 @@ class FemContactSection(Section):
 class _Loaded:
     def __init__(self, table: FemContactSection, file: Path | None):
         self.table = table
-        sizes = {name: getattr(table, name) for name in _SIZES if getattr(table, name) is not None}
+        sizes = _given(table, _SIZES)
+        names = _given(table, ("contact", "clamped"))
         if file is not None and sizes:
-            raise InputError(
-                InputProblem(
-                    "model", f"mesh together with {', '.join(sizes)}",
-                    "a mesh comes from a file or is made from sizes, not both",
-                    "Keep mesh, or keep the sizes",
-                )
+            raise _refused(
+                ("mesh", *sizes), f"mesh together with {', '.join(sizes)}",
+                "a mesh comes from a file or is made from sizes, not both",
+                "Keep mesh, or keep the sizes",
+            )  # fmt: skip
+        if file is None and names:
+            raise _refused(
+                tuple(names), ", ".join(map(repr, names.values())),
+                "it is what a mesh file calls a boundary, and there is no mesh: the block is touched "
+                "at its top and held at its bottom",
+                'Leave it out, or add mesh = "..."',
             )  # fmt: skip
         self.body = ElasticBody(
             file if file is not None else sizes,
             youngs_modulus=table.youngs_modulus, poisson_ratio=table.poisson_ratio,
-            contact=table.contact, clamped=table.clamped,
+            **names,
         )  # fmt: skip
+        self.height = float(np.ptp(self.body.nodes[:, 1]))
+        if table.indentation >= self.height:
+            raise _refused(
+                ("indentation",), f"{table.indentation:g}",
+                f"the body is {self.height:g} high, and displacements are small against that",
+                f"Press the punch in by {0.01 * self.height:g}, say, or check the unit",
+            )  # fmt: skip
         self.contact = FemContact(
             self.body, indentation=table.indentation, stiffness=table.stiffness,
             pressure_cap=np.inf if table.pressure_cap is None else table.pressure_cap,
             radius=table.radius, relaxation_time=table.relaxation_time, ramp=table.ramp,
         )  # fmt: skip
+
+
+def _given(table: FemContactSection, names: tuple[str, ...]) -> dict[str, Any]:
+    """The values of those keys that the file has."""
+    return {name: getattr(table, name) for name in names if getattr(table, name) is not None}
+
+
+def _refused(keys: tuple[str, ...], given: str, rule: str, mend: str) -> InputError:
+    return InputError(InputProblem(", ".join(f"model.{k}" for k in keys), given, rule, mend))
+
+
+def _notes(model: _Loaded) -> tuple[str, ...]:
+    """What a run will do, and its equations are not meant for."""
+    table, notes = model.table, []
+    for name, size in (("height of the body", model.height), ("radius of the punch", table.radius)):
+        part = table.indentation / size
+        if part > _SMALL:
+            notes.append(
+                f"model.indentation is {part:.0%} of the {name}, {size:g}: the equations are those of "
+                "small displacements, a few per cent of it."
+            )
+    if table.end < table.ramp:
+        notes.append(
+            f"The run ends at {table.end:g} while the punch is still pressed in, until model.ramp = "
+            f"{table.ramp:g}: its last force is not that at the full depth."
+        )
+    return tuple(notes)
 
 
 class FemContactApplication(AbstractApplication[_Loaded]):
@@ -83,21 +136,21 @@ class FemContactApplication(AbstractApplication[_Loaded]):
     def fit(self, model: _Loaded) -> str:
         return model.contact.fit
 
-    def known(
-        self, model: _Loaded
-    ) -> tuple[Constants | None, tuple[Assumption, ...], list[tuple[str, str, str]]]:
+    def known(self, model: _Loaded) -> Known:
         body = model.body
         sizes = [
             ("displacements", str(body.unknowns), "free ones, of quadratic elements"),
             ("contact points", str(len(body.points)), "Gauss points of the contact boundary"),
             ("states", str(body.trace.shape[1]), "displacements that the contact can see"),
         ]
-        return model.contact.constants, (), sizes
+        return Known(model.contact.constants, (), sizes, _notes(model))
 
-    def solve(self, model: _Loaded) -> Results:
+    def solve(self, model: _Loaded, say: Say) -> Results:
         m, table = model.contact, model.table
+        say("solving at rest")
         rest = m.equilibrium()
         times = np.linspace(0.0, table.end, table.frames + 1)
+        say(f"solving from 0 to {table.end:g}")
         solution = solve(
             m.problem, m.untouched, 0.0, table.end, ts=times, method=m.method, rtol=1e-7, atol=1e-11,
             constants=m.constants,
@@ -146,6 +199,7 @@ class FemContactApplication(AbstractApplication[_Loaded]):
             ),
         }  # fmt: skip
         if not isinstance(m.method, Implicit):
+            say("bounding the error")
             bound = certificate(m.problem, solution, m.constants)
             figures["error_bound"] = Figure(
                 bound.largest, "([p][x]²)^(1/2)",

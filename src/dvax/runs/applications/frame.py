@@ -2,18 +2,24 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from dvax.errors import InputError, InputProblem
 from dvax.models.frame import Accelerogram, Frame
-from dvax.runs.applications.base import AbstractApplication, Figure, Results, Variable
+from dvax.runs.applications.base import (
+    AbstractApplication,
+    Figure,
+    Known,
+    Results,
+    Say,
+    Variable,
+)
 from dvax.runs.applications.certificate import certificate
 from dvax.runs.schema import Section, in_quantity
 from dvax.runs.strong_motion import read_strong_motion
-from dvax.theory import Assumption, Constants
 
 
 class FrameSection(Section):
@@ -27,7 +33,10 @@ class FrameSection(Section):
         None, gt=0, description="yield force over the largest elastic force; without it: elastic"
     )
     viscosity_ratio: Annotated[float, in_quantity("time")] | None = Field(
-        None, gt=0, description="viscosity over stiffness, eta/k [s]; elastoplastic as it goes to 0"
+        None,
+        gt=0,
+        description="viscosity over stiffness, eta/k [s], of a frame that yields; "
+        "elastoplastic as it goes to 0",
     )
     rtol: float = Field(1e-8, gt=0, lt=1, description="relative tolerance of a step")
 
@@ -58,6 +67,9 @@ class FrameApplication(AbstractApplication[_Loaded]):
 
     section = FrameSection
     files = ("record",)
+    keys: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "step": ("record",), "acceleration": ("record",),
+    }  # fmt: skip
 
     def read(self, table: Any, paths: Mapping[str, Path]) -> _Loaded:
         return _Loaded(table, paths["record"])
@@ -65,19 +77,25 @@ class FrameApplication(AbstractApplication[_Loaded]):
     def fit(self, model: _Loaded) -> str:
         return model.frame.fit
 
-    def known(
-        self, model: _Loaded
-    ) -> tuple[Constants | None, tuple[Assumption, ...], list[tuple[str, str, str]]]:
+    def known(self, model: _Loaded) -> Known:
         record = model.frame.record
         count, long = record.samples.shape[0], record.duration
-        return model.frame.constants, (), [
-            ("record", f"{count} samples", f"{record.step:g} s apart, {long:g} s in all"),
-        ]  # fmt: skip
+        sizes = [("record", f"{count} samples", f"{record.step:g} s apart, {long:g} s in all")]
+        period, notes = model.table.period, ()
+        # Two samples a period are the least that show an oscillation.
+        if period < 2.0 * record.step:
+            notes = (
+                f"model.period is {period:g} s and samples of the record are {record.step:g} s apart: "
+                "what would shake a frame at this period is not in the record.",
+            )
+        return Known(model.frame.constants, (), sizes, notes)
 
-    def solve(self, model: _Loaded) -> Results:
+    def solve(self, model: _Loaded, say: Say) -> Results:
         frame, table = model.frame, model.table
         constants = frame.constants
+        say("solving over the record")
         solution = frame.solve(rtol=table.rtol, constants=constants)
+        say("bounding the error")
         bound = certificate(frame.problem, solution, constants)
         between = (len(solution.ts) - 1) // (frame.record.samples.shape[0] - 1)
         d, v, plastic = np.asarray(solution.xs).T

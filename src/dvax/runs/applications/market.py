@@ -11,10 +11,16 @@ from pydantic import Field
 
 from dvax.errors import InputError, InputProblem
 from dvax.models.market import RTS, Market, largest_gain, read_rts
-from dvax.runs.applications.base import AbstractApplication, Figure, Results, Variable
+from dvax.runs.applications.base import (
+    AbstractApplication,
+    Figure,
+    Known,
+    Results,
+    Say,
+    Variable,
+)
 from dvax.runs.applications.certificate import certificate
 from dvax.runs.schema import Section
-from dvax.theory import Assumption, Constants
 
 
 class MarketSection(Section):
@@ -45,7 +51,8 @@ class _Loaded:
         if not table.start_hour + table.hours <= last + 1:
             raise InputError(
                 InputProblem(
-                    "model.start_hour, model.hours", f"{table.start_hour} and {table.hours}",
+                    "dvax.models.Market.from_rts(start_hour, hours)",
+                    f"{table.start_hour} and {table.hours}",
                     f"the data have the hours 0 to {last}", "Name hours inside",
                 )
             )  # fmt: skip
@@ -69,18 +76,17 @@ class MarketApplication(AbstractApplication[_Loaded]):
     def fit(self, model: _Loaded) -> str:
         return model.market.fit
 
-    def known(
-        self, model: _Loaded
-    ) -> tuple[Constants | None, tuple[Assumption, ...], list[tuple[str, str, str]]]:
+    def known(self, model: _Loaded) -> Known:
         firms = model.market.firms
         sizes = [
             ("units", str(firms.shape[0]), f"of {firms.shape[1]} firms"),
             ("hours", str(len(model.times)), f"from hour {model.table.start_hour} on"),
         ]
-        return model.market.constants, (), sizes
+        return Known(model.market.constants, (), sizes)
 
-    def solve(self, model: _Loaded) -> Results:
+    def solve(self, model: _Loaded, say: Say) -> Results:
         market, times = model.market, model.times
+        say("solving for the prices at rest")
         prices, made = jax.vmap(market.equilibrium)(jnp.asarray(times))
         capacity = np.asarray(jax.vmap(market.capacity.value)(jnp.asarray(times)))
         gain = largest_gain(
@@ -106,8 +112,10 @@ class MarketApplication(AbstractApplication[_Loaded]):
         }
         steps = 0
         if len(times) > 1:
+            say("solving for the sticky price")
             solution = market.run(constants=market.constants)
             steps = int(solution.stats["steps"])
+            say("bounding the error")
             bound = certificate(market.problem, solution, market.constants)
             sticky = np.asarray(solution.xs)
             variables |= {

@@ -2,28 +2,61 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import jax
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field, ValidationInfo
 
+from dvax.errors import InputError, InputProblem, SolveError
 from dvax.evolution import solve
 from dvax.models.traffic import Incident, Traffic, read_nodes
-from dvax.runs.applications.base import AbstractApplication, Figure, Results, Variable
+from dvax.runs.applications.base import (
+    AbstractApplication,
+    Figure,
+    Known,
+    Results,
+    Say,
+    Variable,
+)
 from dvax.runs.applications.certificate import certificate
-from dvax.runs.schema import Section
-from dvax.theory import Assumption, Constants
+from dvax.runs.config import MOST_STEPS
+from dvax.runs.schema import Section, broken
+
+_LEAST = 0.01
+_WHY = "of less, the link costs so much that rounding hides the costs of all others"
+_CLOSED = "Write 0.01 or more; for a closed road remove its link from the network file"
+
+
+def _enough(value: float) -> float:
+    if not _LEAST <= value <= 1:
+        raise broken(
+            f"it is the part of the capacity that is left, {_LEAST:g} to 1: {_WHY}", _CLOSED
+        )
+    return value
+
+
+def _countable(dt: float, info: ValidationInfo) -> float:
+    """A step that is no longer than the run, and not so short that steps cannot be counted."""
+    days = info.data.get("days", dt)
+    mend = "Write dt = 0.25, a quarter of a day, or less where the run is short"
+    if dt > days:
+        raise broken(f"a step is not longer than the run, which has {days:g} days", mend)
+    if not days / dt < MOST_STEPS:
+        raise broken(f"a run has fewer than {MOST_STEPS} steps, or they cannot be counted", mend)
+    return dt
 
 
 class IncidentSection(Section):
     """A link that loses capacity for a time."""
 
-    init_node: int = Field(ge=1, description="where the link begins")
-    term_node: int = Field(ge=1, description="where it ends")
-    remaining: float = Field(gt=0, description="the part of its capacity that is left")
-    start: float = Field(description="first day")
-    end: float = Field(description="last day")
+    init_node: int = Field(ge=1, description="node where the link begins", examples=[10])
+    term_node: int = Field(ge=1, description="node where it ends", examples=[16])
+    remaining: Annotated[float, AfterValidator(_enough)] = Field(
+        description="part of its capacity that is left", examples=[0.3]
+    )
+    start: float = Field(description="when it begins [day]", examples=[5.0])
+    end: float = Field(description="when it is over [day]", examples=[12.0])
 
 
 class TrafficSection(Section):
@@ -38,7 +71,7 @@ class TrafficSection(Section):
     rate: float = Field(1.0, gt=0, description="how fast trips change their paths [1/day]")
     rho: float | None = Field(None, gt=0, description="trips that a unit of cost moves")
     days: float = Field(40.0, gt=0, le=1e5, description="length of the run [day]")
-    dt: float = Field(0.25, gt=0, description="step [day]")
+    dt: Annotated[float, AfterValidator(_countable)] = Field(0.25, gt=0, description="step [day]")
     incidents: list[IncidentSection] = Field(
         default_factory=list, description="links that lose capacity for a time"
     )
@@ -47,19 +80,48 @@ class TrafficSection(Section):
 class _Loaded:
     def __init__(self, table: TrafficSection, paths: Mapping[str, Path]):
         self.table = table
-        # By their names, so that what is wrong in both files is said at once.
-        self.traffic = Traffic(
-            paths["network"], paths["trips"], toll_weight=table.toll_weight,
-            distance_weight=table.distance_weight, rate=table.rate, rho=table.rho,
-            incidents=[
-                Incident(
-                    link=(i.init_node, i.term_node), remaining=i.remaining, start=i.start, end=i.end
+        try:
+            # By their names, so that what is wrong in both files is said at once.
+            self.traffic = Traffic(
+                paths["network"], paths["trips"], toll_weight=table.toll_weight,
+                distance_weight=table.distance_weight, rate=table.rate, rho=table.rho,
+                incidents=[
+                    Incident(
+                        link=(i.init_node, i.term_node), remaining=i.remaining, start=i.start, end=i.end
+                    )
+                    for i in table.incidents
+                ],
+            )  # fmt: skip
+        except SolveError as error:
+            raise InputError(
+                InputProblem(
+                    f"{paths['network'].name} and {paths['trips'].name}",
+                    "numbers of which no equilibrium could be found",
+                    "capacities, times and trips are of sizes that rounding can compare",
+                    "Look in both files for very large and very small ones",
                 )
-                for i in table.incidents
-            ],
-        )  # fmt: skip
+            ) from error  # fmt: skip
+        left = float(np.min(self.traffic.worst / self.traffic.network.capacity))
+        if left < _LEAST:
+            raise InputError(
+                InputProblem(
+                    "model.incidents", f"{left:.2g} of a capacity left where several meet",
+                    f"incidents on one link multiply, and {_LEAST:g} or more is left of all: {_WHY}",
+                    _CLOSED,
+                )
+            )  # fmt: skip
         nodes = paths.get("nodes")
         self.places = None if nodes is None else read_nodes(nodes, self.traffic.network)
+
+
+def _notes(table: TrafficSection) -> tuple[str, ...]:
+    """Incidents that the run never meets."""
+    return tuple(
+        f"model.incidents[{number}] lasts from day {i.start:g} to day {i.end:g}, and the run, from day "
+        f"0 to day {table.days:g}, never meets it."
+        for number, i in enumerate(table.incidents, start=1)
+        if i.end <= 0 or i.start >= table.days
+    )
 
 
 class TrafficApplication(AbstractApplication[_Loaded]):
@@ -67,6 +129,7 @@ class TrafficApplication(AbstractApplication[_Loaded]):
 
     section = TrafficSection
     files = ("network", "trips", "nodes")
+    keys: ClassVar[Mapping[str, tuple[str, ...]]] = {"link": ("init_node", "term_node")}
 
     def read(self, table: Any, paths: Mapping[str, Path]) -> _Loaded:
         return _Loaded(table, paths)
@@ -74,9 +137,7 @@ class TrafficApplication(AbstractApplication[_Loaded]):
     def fit(self, model: _Loaded) -> str:
         return model.traffic.fit
 
-    def known(
-        self, model: _Loaded
-    ) -> tuple[Constants | None, tuple[Assumption, ...], list[tuple[str, str, str]]]:
+    def known(self, model: _Loaded) -> Known:
         t, table = model.traffic, model.table
         sizes = [
             ("links", str(len(t.network)), f"between {t.network.nodes} nodes"),
@@ -84,17 +145,20 @@ class TrafficApplication(AbstractApplication[_Loaded]):
             ("paths", str(len(t.paths.lengths)), "generated until none of the network costs less"),
             ("days", f"{table.days:g}", f"in steps of {table.dt:g}"),
         ]
-        return t.constants, (), sizes
+        return Known(t.constants, (), sizes, _notes(table))
 
-    def solve(self, model: _Loaded) -> Results:
+    def solve(self, model: _Loaded, say: Say) -> Results:
         t, table = model.traffic, model.table
         whole = np.arange(0.0, np.floor(table.days) + 0.5)
         days = whole if whole[-1] == table.days else np.append(whole, table.days)
+        say(f"solving {table.days:g} days")
         solution = solve(
             t.problem, t.all_or_nothing(), 0.0, table.days, ts=days, dt=table.dt,
             vi_solver=t.vi_solver, constants=t.constants, measure=True,
         )  # fmt: skip
+        say("bounding the error")
         bound = certificate(t.problem, solution, t.constants)
+        say("computing the figures")
         objectives = np.asarray(jax.vmap(t.objective)(solution.ts, solution.xs))
         spent = np.asarray(jax.vmap(t.total_travel_time)(solution.ts, solution.xs))
         flows = np.asarray(jax.vmap(t.link_flows)(solution.xs))
