@@ -127,6 +127,9 @@ def _as_one(*leaves: Any, program: ClosedJaxpr, large: Any) -> list[Any]:
     or at a long one that turns out to be constant: so the small ones are packed into one, and of the
     large ones an entry is returned."""
     few = _small_ones(list(leaves), large)
+    if not few:
+        # As a derivative in nothing that it was made of.
+        return jaxpr_as_fun(program)(*leaves)
     like = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in few]
 
     def call(packed: jax.Array, many: list[Any]) -> tuple[list[Any], list[Any]]:

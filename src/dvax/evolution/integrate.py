@@ -19,6 +19,7 @@ from .forward import forward_only
 from .implicit import Implicit
 from .loop import Loop, Record, Saved, State
 from .method import ETD2RK, AbstractMethod
+from .moving import moved, still, velocities
 from .picard import Picard
 from .results import RESULTS
 from .setup import Setup
@@ -47,9 +48,7 @@ def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
     knots = jnp.asarray(problem.knots(t0, t1, x0, args), setup.dtype)
     stops = jnp.concatenate([t0[None], knots, t1[None]])
     flow = setup.flow()
-    if options.adjoint == "reverse":
-        open_ = opened(problem, t0, x0, flow.args)
-        flow = dataclasses.replace(flow, problem=open_)
+    flow = dataclasses.replace(flow, problem=opened(problem, t0, x0, flow.args))
     times = None if ts is None else jnp.asarray(ts, setup.dtype)
     if isinstance(setup.method, Implicit):
         return _implicitly(setup, setup.method, flow, stops, times, options)
@@ -64,13 +63,14 @@ def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
         guarded=options.careful,
         dense=options.dense,
         progress=options.progress,
+        carries=options.adjoint == "forward",
     )
     if options.adjoint == "forward":
         saved, end = in_one_function(Loop.run, loop, x0, times)
         saved, end = forward_only((saved, end))
     else:
         saved, end = reverse.run(loop, x0, times)
-    return _solution(setup, flow, controller, saved, end, options)
+    return _solution(setup, flow, controller, saved, end, times, options)
 
 
 def _implicitly(
@@ -97,7 +97,7 @@ def _implicitly(
     stats = {
         "steps": end.steps, "rejected": end.rejected, "t": t, "x": last, "next_dt": first,
     }  # fmt: skip
-    return _assembled(setup, flow, rows, stats, end.result, None, False)
+    return _assembled(setup, flow, rows, None, stats, end.result, None, False)
 
 
 def _by_windows(
@@ -145,15 +145,13 @@ def _by_windows(
     result = RESULTS.where(
         (end.result == RESULTS.successful) & ~complete, RESULTS.max_steps, end.result
     )
-    rows = saved
-    if rows is None:
-        rows = _end_alone(end, complete, stops[-1])
+    rows = _end_alone(end, complete, stops[-1]) if saved is None else saved
     stats = {
         "steps": end.steps, "rejected": end.refused, "t": end.t, "x": end.x,
         "next_dt": end.length / method.nodes, "windows": end.windows, "sweeps": end.sweeps,
         "contraction": end.contraction,
     }  # fmt: skip
-    return _assembled(setup, flow, rows, stats, result, end.records, True)
+    return _assembled(setup, flow, rows, ts, stats, result, end.records, True)
 
 
 def _controller(
@@ -202,6 +200,7 @@ def _solution(
     controller: AbstractController,
     saved: Saved | None,
     end: State,
+    ts: jax.Array | None,
     options: Options,
 ) -> Solution:
     t1 = controller.stops[-1]
@@ -213,6 +212,9 @@ def _solution(
         (result == RESULTS.successful) & ~_tree.all_finite(end.x), RESULTS.nonfinite, result
     )
     rows = _end_alone(end, complete, t1) if saved is None else saved
+    if options.adjoint == "forward" and controller.adapts:
+        # States are those at times that stay where they are.
+        rows, ts = rows._replace(t=still(rows.t)), t1[None] if saved is None else ts
     stats = {
         "steps": end.steps,
         "rejected": end.attempts - end.steps,
@@ -221,18 +223,26 @@ def _solution(
         "x": end.x,
         "next_dt": controller.next_length(end.control),
     }
-    return _assembled(setup, flow, rows, stats, result, end.records, options.measure)
+    return _assembled(setup, flow, rows, ts, stats, result, end.records, options.measure)
 
 
 def _assembled(
     setup: Setup,
     flow: Flow,
     rows: Saved,
+    ts: jax.Array | None,
     stats: dict[str, Any],
     result: RESULTS,
     records: Record | None,
     measured: bool,
 ) -> Solution:
+    """The solution with `rows`, whose states belong to the times `ts`: the two move apart where one is
+    differentiated and the other is not. (None: they do not.)"""
+    if ts is not None:
+        t = jnp.where(rows.t < jnp.inf, rows.t, 0.0)
+        shift = (ts - still(ts)) - (t - still(t))
+        xs = moved(rows.x, shift, velocities, flow, still(rows.t), rows.x)
+        rows = rows._replace(t=rows.t + shift, x=xs)
     us, ys, residual, law_step, law_error = _responses(
         flow, rows.t, rows.x, setup.problem.spaces(setup.x0)[1], setup.moduli
     )

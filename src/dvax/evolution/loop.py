@@ -18,8 +18,10 @@ from .._tree import Tree
 from .checkpoints import Checkpoints
 from .control import AbstractController
 from .extent import Extent
+from .flow import Flow
+from .moving import moved, still, velocity
 from .results import RESULTS
-from .stepper import Factors, Memory, Stepper, inside, local
+from .stepper import Factors, Memory, Stepper, inside, local, within
 
 
 class Record(NamedTuple):
@@ -78,7 +80,12 @@ class Loop(eqx.Module):
     """A stepper and a controller from the first stop to the last.
 
     - `guarded`: keep the last good state where a step fails, which costs a choice between the two;
-    - `dense`: keep every step; `progress`: say how far the run is.
+    - `dense`: keep every step; `progress`: say how far the run is;
+    - `carries`: tangents go along with the steps.
+
+    Where steps adapt, tangents are those of the state at times that stand still: a stop that moves
+    carries the jump of x' over it, and what asks for the state at a moving time adds x' (`moving`).
+    Fixed steps move with the stops, and so do their states.
     """
 
     stepper: Stepper
@@ -87,6 +94,7 @@ class Loop(eqx.Module):
     guarded: bool = eqx.field(static=True)
     dense: bool = eqx.field(static=True)
     progress: bool = eqx.field(static=True)
+    carries: bool = eqx.field(static=True)
 
     def run(
         self, x0: Tree, ts: jax.Array | None, checkpoints: Checkpoints | None = None
@@ -96,8 +104,8 @@ class Loop(eqx.Module):
         t1 = self.controller.stops[-1]
         if ts is None:
             return None, self._until(state, t1)
-        count = ts.shape[0]
-        blank = jax.eval_shape(lambda: self._read(state, ts[0]))
+        times, count = still(ts), ts.shape[0]
+        blank = jax.eval_shape(lambda: self._read(state, times[0]))
         rows = jtu.tree_map(lambda s: jnp.zeros((count, *s.shape), s.dtype), blank)
 
         def visit(k: Any, carry: tuple[State, Saved]) -> tuple[State, Saved]:
@@ -105,9 +113,9 @@ class Loop(eqx.Module):
             # it writes the last row once more.
             state, rows = carry
             row = jnp.minimum(k, count - 1)
-            state = self._until(state, jnp.where(k < count, ts[row], t1))
+            state = self._until(state, jnp.where(k < count, times[row], t1))
             found = _tree.where(
-                k < count, self._read(state, ts[row]), jtu.tree_map(lambda leaf: leaf[row], rows)
+                k < count, self._read(state, times[row]), jtu.tree_map(lambda leaf: leaf[row], rows)
             )
             return state, _tree.put(rows, row, found)
 
@@ -130,7 +138,7 @@ class Loop(eqx.Module):
             x=x0,
             impulse=(zero, zero),
             memory=stepper.begin(x0),
-            factors=None if own else stepper.factors(controller.end(control) - t0),
+            factors=None if own else stepper.factors(self._end(control) - self._held(t0)),
             control=control,
             jumped=jnp.asarray(True),
             extent=stepper.extent(x0),
@@ -160,22 +168,23 @@ class Loop(eqx.Module):
         return lax.while_loop(goes_on, lambda state: self._attempt(state), state)
 
     def _attempt(self, state: State) -> State:
-        t0, t1 = state.t, self.controller.end(state.control)
+        begin, end = state.t, self.controller.end(state.control)
+        t0, t1, x0 = self._held(begin), self._held(end), self._begun(state, end)
         factors = self._factors(state, t0, t1)
-        step = self.stepper.step(t0, t1, state.x, state.memory, factors, state.jumped)
-        verdict = self.controller.judge(t0, t1, state.x, step, state.control)
+        step = self.stepper.step(t0, t1, x0, state.memory, factors, state.jumped)
+        verdict = self.controller.judge(begin, end, x0, step, state.control)
         impulse = jtu.tree_map(jnp.add, state.impulse, step.impulse)
-        taken = Record(t0, t1 - t0, state.x, step.c)
+        taken = Record(t0, t1 - t0, x0, step.c)
         # `last` and `records` of a step that is not kept are written over by the next one, or never
         # looked at: nothing ends inside a step that was not kept.
         extent = state.extent
         if extent is not None:
             assert step.extent is not None
             extent = extent.joined(step.extent)
-        ahead = (t1, step.x1, impulse, step.memory, verdict.jumped, extent)
+        ahead = (end, step.x1, impulse, step.memory, verdict.jumped, extent)
         last = None if state.last is None else (taken, state.impulse)
         if self.guarded:
-            behind = (t0, state.x, state.impulse, state.memory, state.jumped, state.extent)
+            behind = (begin, state.x, state.impulse, state.memory, state.jumped, state.extent)
             ahead, last = _tree.where(verdict.kept, (ahead, last), (behind, state.last))
         checkpoints = state.checkpoints
         if checkpoints is not None:
@@ -198,7 +207,7 @@ class Loop(eqx.Module):
             extent=extent,
             last=last,
             records=None if state.records is None else _tree.put(state.records, state.steps, taken),
-            ends=None if state.ends is None else _tree.put(state.ends, state.steps, t1),
+            ends=None if state.ends is None else _tree.put(state.ends, state.steps, end),
             checkpoints=checkpoints,
             result=verdict.result,
             steps=jnp.where(verdict.kept, state.steps + 1, state.steps),
@@ -209,8 +218,9 @@ class Loop(eqx.Module):
 
     def _read(self, state: State, time: Any) -> Saved:
         """The trajectory at a time that the loop has run up to; t = ∞ where it did not get there."""
+        now = self._held(state.t)
         if state.last is None:
-            t0, t1 = state.t, self.controller.end(state.control)
+            t0, t1 = now, self._end(state.control)
 
             def between() -> Tree:
                 guess = state.memory.guess
@@ -225,9 +235,9 @@ class Loop(eqx.Module):
         else:
             record, before = state.last
             theta = (time - record.start) / jnp.where(record.length > 0, record.length, 1)
-            reached = state.t >= time
+            reached, met = state.t >= time, time >= state.t
             x = lax.cond(
-                time >= state.t,
+                met,
                 lambda: state.x,
                 lambda: self._inside(record, theta, state.memory.guess),
             )
@@ -235,14 +245,35 @@ class Loop(eqx.Module):
             impulse = _tree.where(theta > 0.0, state.impulse, before)
             settled = _tree.where(time >= state.t, state.impulse, before)
         x = jtu.tree_map(lambda leaf: jnp.where(reached, leaf, jnp.nan), x)
+        # The state at the end of a step moves with it.
+        time = time + jnp.where(met, now - still(now), 0.0)
         return Saved(jnp.where(reached, time, jnp.inf), x, impulse, settled, state.extent)
+
+    def _held(self, t: Any) -> Any:
+        """t, which stands still for the tangents of steps that adapt."""
+        return still(t) if self.carries and self.controller.adapts else t
+
+    def _end(self, control: Any) -> Any:
+        return self._held(self.controller.end(control))
+
+    def _begun(self, state: State, end: Any) -> Tree:
+        """The state at a time that stands still, at the beginning of a step."""
+        if not (self.carries and self.controller.adapts):
+            return state.x
+        t0, stepper = still(state.t), self.stepper
+        ends = jtu.tree_map(still, stepper.ends)
+        return moved(
+            state.x, state.t - t0, jump, stepper.flow, t0, still(end), state.x, ends, state.jumped
+        )
 
     def _factors(self, state: State, t0: Any, t1: Any) -> Factors | None:
         """The propagators of a step, None where it makes its own."""
         uniform = self.stepper.uniform
         if uniform is not None or state.factors is None:
             return uniform
-        return self.stepper.fitted(state.factors, t0, t1)
+        # Lengths that are the same may move otherwise behind a stop that moves.
+        anew = state.jumped if self.carries and not self.controller.adapts else False
+        return self.stepper.fitted(state.factors, t0, t1, anew)
 
     def _inside(self, record: Record, theta: Any, guess: Tree | None) -> Tree:
         """x_h inside a step."""
@@ -250,6 +281,19 @@ class Loop(eqx.Module):
         end = t0 + record.length
         flow, _ = local(stepper.method, stepper.flow, t0, end, record.x0, guess, stepper.ends)
         return inside(flow, record.length, theta, record.x0, record.coefficients)
+
+
+def jump(flow: Flow, t: Any, t1: Any, x: Tree, ends: tuple[Any, Any], jumped: Any) -> Tree:
+    """What x at a fixed time right behind t, where a step to t1 begins, gains as t moves on: x' before
+    t takes the place of x' behind it. Before the run nothing moves."""
+
+    def gained() -> Tree:
+        late = within(t, t1, 0.0, ends)
+        behind = velocity(flow, late, x)
+        before = velocity(flow, t - (late - t), x)
+        return jtu.tree_map(lambda a, b: jnp.where(t == ends[0], 0.0, a) - b, before, behind)
+
+    return lax.cond(jumped, gained, lambda: _tree.zeros_like(x))
 
 
 def slack(t: Any) -> Any:

@@ -23,6 +23,7 @@ from ..generators import AbstractGenerator, AbstractPropagator
 from .control import land
 from .extent import Extent
 from .loop import Record, Saved
+from .moving import still
 from .results import RESULTS
 from .stepper import Stepper, inside, within
 
@@ -141,14 +142,14 @@ class Run(eqx.Module):
         state = self._start(x0)
         if ts is None:
             return None, self._until(state, self.stops[-1])
-        count = ts.shape[0]
-        blank = jax.eval_shape(lambda: self._read(state, ts[0]))
+        times, count = still(ts), ts.shape[0]
+        blank = jax.eval_shape(lambda: self._read(state, times[0]))
         rows = jtu.tree_map(lambda s: jnp.zeros((count, *s.shape), s.dtype), blank)
 
         def visit(k: Any, carry: tuple[State, Saved]) -> tuple[State, Saved]:
             state, rows = carry
-            state = self._until(state, ts[k])
-            found = self._read(state, ts[k])
+            state = self._until(state, times[k])
+            found = self._read(state, times[k])
             return state, _tree.put(rows, k, found)
 
         state, rows = lax.fori_loop(0, count, visit, (state, rows))
@@ -297,8 +298,9 @@ class Run(eqx.Module):
         step = jtu.tree_map(lambda leaf: leaf[jnp.maximum(i, 0)], record)
         theta = (time - step.start) / jnp.where(step.length > 0, step.length, 1)
         reached = state.t >= time
+        met = time >= state.t
         x = lax.cond(
-            time >= state.t,
+            met,
             lambda: state.x,
             lambda: inside(self.stepper.flow, step.length, theta, step.x0, step.coefficients),
         )
@@ -306,6 +308,8 @@ class Run(eqx.Module):
         started = time > record.start[0]
         impulse = _tree.where(started, state.impulse, state.before)
         settled = _tree.where(time >= state.t, state.impulse, state.before)
+        # The state at the end of a window moves with it.
+        time = time + jnp.where(met, state.t - still(state.t), 0.0)
         return Saved(jnp.where(reached, time, jnp.inf), x, impulse, settled, state.extent)
 
 

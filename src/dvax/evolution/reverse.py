@@ -26,6 +26,7 @@ from .._one_function import in_one_function
 from .._tree import Tree
 from .checkpoints import Checkpoints, Stack, how_many
 from .loop import Loop, Saved, State, slack
+from .moving import velocity
 from .stepper import inside, local
 
 
@@ -34,6 +35,9 @@ def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State
     output, and the last. Of all the other things the derivative is zero."""
     dynamic, static = eqx.partition((x0, loop, ts), eqx.is_array)
     leaves, tree = jtu.tree_flatten(dynamic)
+    # Which of them say where steps end.
+    _, numbered, _ = jtu.tree_unflatten(tree, range(len(leaves)))
+    timing = jtu.tree_leaves(numbered.controller)
 
     def whole(leaves: Any) -> tuple[Tree, Loop, jax.Array | None]:
         return eqx.combine(jtu.tree_unflatten(tree, leaves), static)
@@ -61,7 +65,7 @@ def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State
         leaves, moving, *history = kept
 
         def run(leaves: Any, bar: _States, *history: Any) -> tuple[Any, ...]:
-            return _Backward(whole, leaves, moving.value, *history).run(bar)
+            return _Backward(whole, leaves, moving.value, timing, *history).run(bar)
 
         bar = _States(*map(_given, cotangents[0]))
         return in_one_function(run, leaves, bar, computed=tuple(history))
@@ -114,13 +118,14 @@ def _rejoin(states: _States, rest: Any) -> tuple[Saved | None, State]:
 class _Backward:
     """The pass itself, for one run and what is asked of it."""
 
-    def __init__(self, whole, leaves, moving, ends, checkpoints, steps):
+    def __init__(self, whole, leaves, moving, timing, ends, checkpoints, steps):
         self.whole, self.leaves = whole, leaves
         real = [jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in leaves]
         self.moving = [m and r for m, r in zip(moving, real, strict=True)]
         self.ends, self.checkpoints, self.steps = ends, checkpoints, steps
         self.x0, self.loop, self.ts = whole(leaves)
         self.guess = self.loop.stepper.flow.guess(self.x0)
+        self.ends_move = any(self.moving[k] for k in timing)
         self.fixed = [leaf for leaf, m in zip(leaves, self.moving, strict=True) if not m]
 
     def run(self, bar: _States) -> tuple[Any, ...]:
@@ -137,12 +142,12 @@ class _Backward:
         every = how_many(self.x0, self.loop.max_steps) >= self.loop.max_steps
         carry = self._through_all(bar, carry) if every else self._from_checkpoints(bar, carry)
         adjoint, gathered, row, _ = carry
+        adjoint, gathered = self._rest(adjoint, gathered, row, bar)
         gathered = iter(gathered)
         out = [
             next(gathered) if m else _no_tangent(leaf)
             for leaf, m in zip(self.leaves, self.moving, strict=True)
         ]
-        adjoint = self._rest(adjoint, row, bar)
         return tuple(self._add_initial(out, adjoint))
 
     def _through_all(self, bar: _States, carry: Any) -> Any:
@@ -170,14 +175,28 @@ class _Backward:
         ahead = stack.next(i)
         return stack.push(ahead, self._replay(stack.x, stack.step, ahead))
 
-    def _rest(self, adjoint: Tree, row: Any, bar: _States) -> Tree:
+    def _rest(self, adjoint: Tree, gathered: Any, row: Any, bar: _States) -> tuple[Tree, Any]:
         """Saved times at which no step had been taken show x₀ itself."""
         if bar.saved is None:
-            return adjoint
+            return adjoint, gathered
         assert self.ts is not None
         early = jnp.arange(self.ts.shape[0]) <= row
         pick = lambda v: jnp.where(early.reshape(-1, *(1,) * (v.ndim - 1)), v, 0.0)  # noqa: E731
-        return jtu.tree_map(lambda a, v: a + jnp.sum(pick(v), axis=0), adjoint, bar.saved)
+        shown = jtu.tree_map(lambda v: jnp.sum(pick(v), axis=0), bar.saved)
+        gathered = self._stays(shown, self.x0, 0, gathered)
+        return _tree.add(adjoint, shown), gathered
+
+    def _stays(self, psi: Tree, x: Tree, i: Any, gathered: Any) -> Any:
+        """The state x that step i begins with moves along with that time, and one that was saved there
+        does not."""
+        if not self.ends_move:
+            return gathered
+        moving = tuple(leaf for leaf, m in zip(self.leaves, self.moving, strict=True) if m)
+        time = lambda p: self._parts(p).controller.boundary(i, self.ends)  # noqa: E731
+        t, pull = jax.vjp(time, moving)
+        rate = velocity(self.loop.stepper.flow, t, x)
+        by = jtu.tree_map(lambda v, r: jnp.sum(v * r), psi, rate)
+        return jtu.tree_map(jnp.add, gathered, pull(-sum(jtu.tree_leaves(by)))[0])
 
     def _add_initial(self, out: list[Any], adjoint: Tree) -> list[Any]:
         """The first leaves are those of x₀."""
@@ -225,20 +244,22 @@ class _Backward:
             (x1, c), after = self._advance(self._parts(p), i, x, guess)
             return ((x1, c) if bar.of_insides else (x1,)), (c, after)
 
-        _, pull, (c, guess) = jax.vjp(step, moving, x, has_aux=True)
+        reached, pull, (c, guess) = jax.vjp(step, moving, x, has_aux=True)
         bent = _tree.zeros_like(c)
         behind = _tree.zeros_like(x)
         if bar.records is not None:
             behind, bent = jtu.tree_map(lambda leaf: leaf[i], bar.records)
         if bar.saved is not None:
             adjoint, behind, bent, gathered, row = self._saved_back(
-                i, x, c, moving, bar.saved, (adjoint, behind, bent, gathered, row)
+                i, x, reached[0], c, moving, bar.saved, (adjoint, behind, bent, gathered, row)
             )
         p, x = pull((adjoint, bent) if bar.of_insides else (adjoint,))
         return _tree.add(behind, x), jtu.tree_map(jnp.add, gathered, p), row, guess
 
-    def _saved_back(self, i: Any, x: Tree, c: Any, moving: Any, saved: Tree, carry: Any) -> Any:
-        """The times saved in this step, the last ones first."""
+    def _saved_back(
+        self, i: Any, x: Tree, x1: Tree, c: Any, moving: Any, saved: Tree, carry: Any
+    ) -> Any:
+        """The times saved in this step from x to x1, the last ones first."""
         assert self.ts is not None
         ts, (t0, t1) = self.ts, self._times(self.loop, i)
 
@@ -260,7 +281,7 @@ class _Backward:
                 return adjoint, _tree.add(behind, v), _tree.add(bent, d), _tree.add(gathered, p)
 
             def at_end() -> Any:
-                return _tree.add(adjoint, psi), behind, bent, gathered
+                return _tree.add(adjoint, psi), behind, bent, self._stays(psi, x1, i + 1, gathered)
 
             return *lax.cond(ts[row] >= t1 - slack(t1), at_end, within), row - 1
 

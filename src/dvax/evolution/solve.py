@@ -56,7 +56,8 @@ def solve(
 
     **Arguments:**
 
-    - `ts`: times to save at, increasing, in [t0, t1]; None saves t1 alone;
+    - `ts`: times to save at, increasing, in [t0, t1]; None saves t1 alone. They are differentiated
+      as t0 and t1 are;
     - `dt`: fixed steps, no longer than this (the fewest equal ones between knots of the data);
       without it, steps adapt;
     - `rtol`, `atol`: the disturbance that the computed trajectory may amount to, integrated over the

@@ -165,13 +165,14 @@ class Stepper(eqx.Module):
         found = self.flow.propagators(tuple(t * h for t in thetas), self.method.degree + 1)
         return Factors(h, found[0], found[1] if halves else None, found[1 + len(halves) :])
 
-    def fitted(self, factors: Factors, t0: Any, t1: Any) -> Factors:
-        """Propagators for this step; those of the last one where the length is the same.
+    def fitted(self, factors: Factors, t0: Any, t1: Any, anew: Any) -> Factors:
+        """Propagators for this step; those of the last one where the length is the same, unless they
+        have to be made `anew`.
 
         t₀ + h is rounded, so equal steps differ by an ulp of t: that is not a new length.
         """
         h = t1 - t0
-        same = jnp.abs(h - factors.length) <= 2 * _ulp(t0, t1)
+        same = (jnp.abs(h - factors.length) <= 2 * _ulp(t0, t1)) & ~jnp.asarray(anew)
         return lax.cond(same, lambda: factors, lambda: self.factors(h))
 
     def advance(

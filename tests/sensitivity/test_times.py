@@ -1,0 +1,117 @@
+"""Derivatives in times: the first, the last, those saved at, and those at which data jump."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvax
+
+RATE, JUMP = 2.0, 3.0
+"""x' = −2x + u, u = t before η and t + 3 from there on: u = h/2, on no bound."""
+START, ETA, END, X0 = 0.1, 0.55, 1.4, 0.3
+AT = np.array([0.3, ETA + 0.25, END])
+
+
+def drive(eta):
+    times = jnp.stack([jnp.zeros_like(eta), eta, jnp.full_like(eta, 9.0)])
+    return dvax.signals.Table(times, jnp.array([0.0, JUMP, JUMP]), kind="constant")
+
+
+def problem():
+    return dvax.Problem(
+        A=dvax.generators.Scalar(-RATE), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-9.0, 9.0),
+        f=lambda t, x, u, jump: u, h=lambda t, x, u, jump: 2.0 * (t + jump(t)) - u + 0.0 * x,
+    )  # fmt: skip
+
+
+def exact(t0, eta, t):
+    """x(t) by variation of constants: s/2 − 1/4 + c/2 solves x' = −2x + s + c."""
+    line = lambda s, c: (s + c) / RATE - 1 / RATE**2  # noqa: E731
+    before = lambda s: line(s, 0.0) + jnp.exp(-RATE * (s - t0)) * (X0 - line(t0, 0.0))  # noqa: E731
+    behind = line(t, JUMP) + jnp.exp(-RATE * (t - eta)) * (before(eta) - line(eta, JUMP))
+    return jnp.where(t <= eta, before(t), behind)
+
+
+METHODS = {
+    "ETD2RK, adaptive": (dvax.ETD2RK(), dict(rtol=1e-9, atol=1e-9), 1e-6),
+    "ETD4RK, adaptive": (dvax.ETD4RK(), dict(rtol=1e-9, atol=1e-9), 1e-7),
+    "DormandPrince, adaptive": (dvax.DormandPrince(), dict(rtol=1e-9, atol=1e-9), 1e-7),
+    "ExpRosenbrock, adaptive": (dvax.ExpRosenbrock(), dict(rtol=1e-9, atol=1e-9), 1e-7),
+    # ETA and END are multiples of the step, and one of the saved times is: all of them move.
+    "ETD2RK, fixed": (dvax.ETD2RK(), dict(dt=1 / 320, max_steps=600), 2e-5),
+    "ETD4RK, fixed": (dvax.ETD4RK(), dict(dt=1 / 320, max_steps=600), 1e-7),
+    "ETD4RK, fixed and measured": (
+        dvax.ETD4RK(), dict(dt=1 / 320, max_steps=600, measure=True), 1e-7,
+    ),
+    "Picard": (dvax.Picard(), dict(dt=1 / 320, max_steps=600), 2e-5),
+    # What Diffrax makes of steps that move.
+    "Implicit": (dvax.Implicit(), dict(rtol=1e-10, atol=1e-10), 3e-4),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_derivatives_in_every_time_are_those_of_the_solution(name):
+    method, settings, tol = METHODS[name]
+
+    def saved(t0, eta, t1, ts, adjoint):
+        return dvax.solve(
+            problem(),
+            jnp.full(2, X0),
+            t0,
+            t1,
+            drive(eta),
+            ts,
+            method=method,
+            adjoint=adjoint,
+            **settings,
+        )
+
+    def by(adjoint):
+        def states(times):
+            t0, eta, t1, ts = times
+            found = saved(t0, eta, t1, ts, adjoint)
+            # The last saved time is the end, whether that moves or not; u is a function of time alone.
+            return jnp.concatenate([found.xs[:, 0], found.us[:2, 1]])
+
+        return states
+
+    given = tuple(map(jnp.asarray, (START, ETA, END))) + (jnp.asarray(AT),)
+
+    def truth(times):
+        t0, eta, _, ts = times
+        shown = jax.vmap(lambda t: exact(t0, eta, t))(ts)
+        return jnp.concatenate([shown, jnp.stack([ts[0], JUMP + ts[1]])])
+
+    want = jax.jacfwd(truth)(given)
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=tol, atol=tol)  # noqa: E731
+    forward = jax.jit(jax.jacfwd(by("forward")))(given)
+    jax.tree_util.tree_map(close, forward, want)
+    if name != "Picard":
+        backward = jax.jit(jax.jacrev(by("reverse")))(given)
+        jax.tree_util.tree_map(close, backward, want)
+
+
+@pytest.mark.parametrize("adjoint", ["forward", "reverse"])
+@pytest.mark.parametrize("name", ["ETD4RK, adaptive", "ETD4RK, fixed", "DormandPrince, adaptive"])
+def test_the_end_alone_moves_with_the_end(name, adjoint):
+    method, settings, tol = METHODS[name]
+
+    def last(times):
+        t0, eta, t1 = times
+        return dvax.solve(
+            problem(),
+            jnp.full(2, X0),
+            t0,
+            t1,
+            drive(eta),
+            method=method,
+            adjoint=adjoint,
+            **settings,
+        ).xs[-1, 0]
+
+    given = tuple(map(jnp.asarray, (START, ETA, END)))
+    derivative = jax.jacfwd if adjoint == "forward" else jax.jacrev
+    found = jax.jit(derivative(last))(given)
+    want = jax.jacfwd(lambda times: exact(*times))(given)
+    np.testing.assert_allclose(found, want, rtol=tol, atol=tol)
