@@ -115,3 +115,26 @@ def test_the_end_alone_moves_with_the_end(name, adjoint):
     found = jax.jit(derivative(last))(given)
     want = jax.jacfwd(lambda times: exact(*times))(given)
     np.testing.assert_allclose(found, want, rtol=tol, atol=tol)
+
+
+@pytest.mark.parametrize("adjoint", ["forward", "reverse"])
+@pytest.mark.parametrize("name", ["ETD4RK, adaptive", "ETD4RK, fixed"])
+def test_dense_output_stays_where_it_is_and_moves_with_its_own_time(name, adjoint):
+    method, settings, _ = METHODS[name]
+
+    def between(times):
+        t0, eta, t1, t = times
+        found = dvax.solve(
+            problem(), jnp.full(2, X0), t0, t1, drive(eta), method=method, adjoint=adjoint,
+            dense=True, **(settings | {"max_steps": 600}),
+        )  # fmt: skip
+        # In the last step, and the end itself.
+        return jnp.stack([found.evaluate(t)[0][0], found.evaluate(t1)[0][0]])
+
+    given = tuple(map(jnp.asarray, (START, ETA, END, END - 1e-3)))
+    derivative = jax.jacfwd if adjoint == "forward" else jax.jacrev
+    found = jax.jit(derivative(between))(given)
+    truth = lambda v: jnp.stack([exact(v[0], v[1], v[3]), exact(v[0], v[1], v[2])])  # noqa: E731
+    # Within a step x_h is of the order of the stage polynomial.
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)  # noqa: E731
+    jax.tree_util.tree_map(close, found, jax.jacfwd(truth)(given))

@@ -25,7 +25,7 @@ from .. import _tree
 from .._one_function import in_one_function
 from .._tree import Tree
 from .checkpoints import Checkpoints, Stack, how_many
-from .loop import Loop, Saved, State, slack
+from .loop import Loop, Record, Saved, State, slack
 from .moving import velocity
 from .stepper import inside, local
 
@@ -80,7 +80,7 @@ class _States(NamedTuple):
 
     last: Tree
     saved: Tree | None
-    records: tuple[Tree, tuple[Tree, ...]] | None
+    records: Record | None
 
     @property
     def of_insides(self) -> bool:
@@ -90,15 +90,10 @@ class _States(NamedTuple):
 
 def _states(saved: Saved | None, state: State) -> tuple[_States, Any]:
     """The run's answer taken apart into what has a derivative and what has none."""
-    records = state.records
-    states = _States(
-        state.x,
-        None if saved is None else saved.x,
-        None if records is None else (records.x0, records.coefficients),
-    )
+    states = _States(state.x, None if saved is None else saved.x, state.records)
     state = state._replace(
         x=None, memory=None, factors=None, last=None, ends=None, checkpoints=None, meter=None,
-        records=None if records is None else records._replace(x0=None, coefficients=None),
+        records=None,
     )  # fmt: skip
     return states, (None if saved is None else saved._replace(x=None), state)
 
@@ -107,12 +102,7 @@ def _rejoin(states: _States, rest: Any) -> tuple[Saved | None, State]:
     saved, state = rest
     if saved is not None:
         saved = saved._replace(x=states.saved)
-    records = state.records
-    if records is not None:
-        assert states.records is not None
-        x0, coefficients = states.records
-        records = records._replace(x0=x0, coefficients=coefficients)
-    return saved, state._replace(x=states.last, records=records)
+    return saved, state._replace(x=states.last, records=states.records)
 
 
 class _Backward:
@@ -248,13 +238,27 @@ class _Backward:
         bent = _tree.zeros_like(c)
         behind = _tree.zeros_like(x)
         if bar.records is not None:
-            behind, bent = jtu.tree_map(lambda leaf: leaf[i], bar.records)
+            kept = jtu.tree_map(lambda leaf: leaf[i], bar.records)
+            behind, bent = kept.x0, kept.coefficients
+            gathered = self._recorded(kept, i, moving, gathered)
         if bar.saved is not None:
             adjoint, behind, bent, gathered, row = self._saved_back(
                 i, x, reached[0], c, moving, bar.saved, (adjoint, behind, bent, gathered, row)
             )
         p, x = pull((adjoint, bent) if bar.of_insides else (adjoint,))
         return _tree.add(behind, x), jtu.tree_map(jnp.add, gathered, p), row, guess
+
+    def _recorded(self, kept: Record, i: Any, moving: Any, gathered: Any) -> Any:
+        """Where a kept step begins, and its length."""
+        if not self.ends_move:
+            return gathered
+
+        def step(p: Any) -> tuple[Any, Any]:
+            t0, t1 = self._times(self._parts(p), i)
+            return t0, t1 - t0
+
+        _, pull = jax.vjp(step, moving)
+        return jtu.tree_map(jnp.add, gathered, pull((kept.start, kept.length))[0])
 
     def _saved_back(
         self, i: Any, x: Tree, x1: Tree, c: Any, moving: Any, saved: Tree, carry: Any
