@@ -12,8 +12,8 @@ from tests.models.piecewise_linear import Regime, follow
 import dvax
 from dvax.models.frame import Accelerogram, Frame, response_spectrum
 from dvax.models.frame.accelerogram import GRAVITY
+from dvax.models.frame.at2 import read_at2
 from dvax.models.frame.peaks import largest
-from dvax.runs.strong_motion import read_strong_motion
 
 EL_CENTRO = Path(__file__).parents[3] / "shared" / "data" / "elCentro.at2"
 STEP = 0.02
@@ -38,7 +38,7 @@ RECORD = Accelerogram(STEP, GROUND)
 def el_centro():
     if not EL_CENTRO.exists():
         pytest.skip("needs elCentro.at2 of OpenSees's verification examples under ../shared/data")
-    return read_strong_motion(EL_CENTRO).acceleration
+    return read_at2(EL_CENTRO)[1]
 
 
 def viscoplastic(period, damping, limit, tau):
@@ -88,6 +88,22 @@ def peak_of(regimes, ground):
     near = np.abs(v) < np.abs(a) * STEP / 32
     tops = np.where(near, d - v * v / np.where(near, 2 * a, 1.0), d)
     return np.abs(tops).max()
+
+
+AT2 = "A record\nThe units are (g)\nNPTS=  5, DT= .50000 SEC\n 0.1 0.2 -0.3\n 4.0E-01 0.5\n"
+
+
+def test_a_record_is_read_from_its_file(tmp_path):
+    file = tmp_path / "r.at2"
+    file.write_text(AT2)
+    record = Accelerogram.from_at2(file)
+    np.testing.assert_allclose(record.knots(), [0.0, 0.5, 1.0, 1.5, 2.0], rtol=1e-15)
+    np.testing.assert_allclose(record(1.25), GRAVITY * (-0.3 + 0.4) / 2, rtol=1e-12)
+    file.write_text(AT2.replace("0.2", "0.2x"))
+    with pytest.raises(dvax.InputError, match="r.at2, line 4: got '0.2x' at column 6"):
+        Accelerogram.from_at2(file)
+    with pytest.raises(dvax.InputError, match="No such file"):
+        Accelerogram.from_at2(tmp_path / "other.at2")
 
 
 def test_elastic_peaks_are_those_of_the_published_table(el_centro):

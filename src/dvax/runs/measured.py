@@ -14,7 +14,6 @@ from dvax.runs.boundary import Boundary
 from dvax.runs.csv_table import check_increasing, read_columns
 from dvax.runs.data_file import read_bytes
 from dvax.runs.schema import ProfileSection, SeriesSection
-from dvax.runs.strong_motion import read_strong_motion
 from dvax.runs.units import UnitError, Units
 
 # What numpy raises for broken headers and data: its header parser lets the tokenizer's errors
@@ -65,7 +64,9 @@ def read_series(
     """
     factor = section.per_unit if isinstance(section.per_unit, float) else None
     if path.suffix.lower() == ".at2":
-        record = read_strong_motion(path)
+        from dvax.models.frame.at2 import read_at2  # which loads JAX: only where it is needed
+
+        step, raw = read_at2(path)
         problems = [
             InputProblem(
                 f"{place}.{key}", repr(value), "an .at2 record has no columns", "Remove it."
@@ -84,7 +85,7 @@ def read_series(
             )
         if problems:
             raise InputError(*problems)
-        times, raw, unit = record.times * units.factor("s", "time"), record.acceleration, "g"
+        times, unit = step * np.arange(raw.size) * units.factor("s", "time"), "g"
     else:
         time, column = read_columns(
             path, [section.time_column, section.column], section.time_column

@@ -1,5 +1,6 @@
 """The ground's acceleration as it was recorded: evenly spaced samples, and lines between them."""
 
+import os
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 from ... import _tree
 from ...errors import InputError, InputProblem
 from ...signals import AbstractSignal
+from .at2 import read_at2
 
 GRAVITY = 9.80665 / 0.0254
 """Standard gravity in in/s². Tables of the field often have 386.4 for it, which is 0.08 % more."""
@@ -66,6 +68,15 @@ class Accelerogram(AbstractSignal):
             raise InputError(*wrong)
         self.step = float(step)
         self.samples = jnp.asarray(GRAVITY * samples)
+
+    @classmethod
+    def from_at2(cls, path: str | os.PathLike[str]) -> "Accelerogram":
+        """The record of a file in the PEER strong-motion format: lines of description that say that
+        values are in g, a line such as `NPTS=  1559, DT= .02000 SEC`, and the values.
+
+        **Raises:** `dvax.InputError` with the line of every flaw.
+        """
+        return cls(*read_at2(path))
 
     def value(self, t: Any) -> jax.Array:
         return dvax_linear_table(jnp.asarray(self.knots()), self.samples, t)

@@ -7,7 +7,6 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from dvax.errors import InputError, InputProblem
 from dvax.models.frame import Accelerogram, Frame
 from dvax.runs.applications.base import (
     AbstractApplication,
@@ -19,7 +18,6 @@ from dvax.runs.applications.base import (
 )
 from dvax.runs.applications.certificate import certificate
 from dvax.runs.schema import Section, in_quantity
-from dvax.runs.strong_motion import read_strong_motion
 
 
 class FrameSection(Section):
@@ -44,21 +42,9 @@ class FrameSection(Section):
 class _Loaded:
     def __init__(self, table: FrameSection, file: Path):
         self.table = table
-        motion = read_strong_motion(file)
-        steps = np.diff(motion.times)
-        # Times are written with a few digits.
-        if np.ptp(steps) > 1e-6 * steps[0]:
-            k = int(np.argmax(np.abs(steps - steps[0])))
-            raise InputError(
-                InputProblem(
-                    file.name, f"a step of {steps[k]:g} s at {motion.times[k]:g} s",
-                    f"samples are equally far apart, here {steps[0]:g} s", "Sample it evenly",
-                )
-            )  # fmt: skip
         self.frame = Frame(
-            record=Accelerogram(float(steps.mean()), motion.acceleration),
-            period=table.period, damping=table.damping, yield_ratio=table.yield_ratio,
-            viscosity_ratio=table.viscosity_ratio,
+            record=Accelerogram.from_at2(file), period=table.period, damping=table.damping,
+            yield_ratio=table.yield_ratio, viscosity_ratio=table.viscosity_ratio,
         )  # fmt: skip
 
 

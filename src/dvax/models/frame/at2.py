@@ -4,17 +4,16 @@ A few lines of description that state the unit g (standard gravity), a line such
 ``NPTS=  1559, DT= .02000 SEC``, then the accelerations in rows. The first sample is at time 0.
 """
 
+import os
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from dvax.errors import InputError, InputProblem
-from dvax.runs.csv_table import MAX_PROBLEMS
-from dvax.runs.data_file import read_bytes
-from dvax.runs.units import NUMBER
+from ...errors import InputError, InputProblem
 
+MAX_PROBLEMS = 20
+_NUMBER = re.compile(r"[+-]?(\d+(?:\.\d*)?|\.\d+)([eE][+-]?\d{1,3})?")
 _SIZES = re.compile(
     r"NPTS\s*=\s*(?P<points>\d{1,9})\s*,\s*DT\s*=\s*(?P<step>\d*\.?\d+(?:[eE][+-]?\d+)?)"
     r"\s*,?\s*(?P<unit>[A-Za-z]*)",
@@ -23,18 +22,20 @@ _SIZES = re.compile(
 _GRAVITY = re.compile(r"units?\b[^\n]*?(\(\s*g\s*\)|\bg\b)", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
-class StrongMotion:
-    """`acceleration` in units of standard gravity, at `times` in seconds from 0."""
-
-    times: np.ndarray
-    acceleration: np.ndarray
-
-
-def read_strong_motion(path: Path) -> StrongMotion:
-    """Read an .at2 file. Raises `InputError` with the line of every problem."""
-    name = path.name
-    lines = read_bytes(path).decode("latin-1").splitlines()  # descriptions are of any encoding
+def read_at2(path: str | os.PathLike[str]) -> tuple[float, np.ndarray]:
+    """The step (s) and the accelerations (in units of standard gravity) of an .at2 file. Raises
+    `InputError` with the line of every problem."""
+    name = Path(path).name
+    try:
+        # Descriptions are of any encoding; what is read as data is ASCII or refused.
+        lines = Path(path).read_bytes().decode("latin-1").splitlines()
+    except OSError as error:
+        raise InputError(
+            InputProblem(
+                str(path), error.strerror or str(error), "an .at2 file must be there and readable",
+                "Check the name and the permissions",
+            )
+        ) from None  # fmt: skip
 
     def problem(line: int | None, given: str, rule: str, mend: str) -> InputProblem:
         return InputProblem(name if line is None else f"{name}, line {line}", given, rule, mend)
@@ -79,7 +80,7 @@ def read_strong_motion(path: Path) -> StrongMotion:
         if line.lstrip().startswith("***"):
             break
         for match in re.finditer(r"\S+", line):
-            if NUMBER.fullmatch(match[0]):
+            if _NUMBER.fullmatch(match[0]):
                 values.append(float(match[0]))
             elif len(problems) < MAX_PROBLEMS:
                 problems.append(
@@ -103,4 +104,4 @@ def read_strong_motion(path: Path) -> StrongMotion:
         problems.append(problem(None, "an infinite value", "values are finite", "Mend it."))
     if problems:
         raise InputError(*problems)
-    return StrongMotion(step * np.arange(points), np.array(values))
+    return step, np.array(values)
