@@ -21,6 +21,7 @@ CASES = (
     "pointwise",
     "obstacle",
     "applications",
+    "picard",
 )
 """The names that --only takes, in the order of a run."""
 
