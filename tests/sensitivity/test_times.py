@@ -1,9 +1,12 @@
 """Derivatives in times: the first, the last, those saved at, and those at which data jump."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tests.selection import mostly_thorough
 
 import dvax
 
@@ -50,7 +53,10 @@ METHODS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", METHODS)
+OFTEN = {"ETD4RK, adaptive", "ETD2RK, fixed"}
+
+
+@pytest.mark.parametrize("name", mostly_thorough(METHODS, OFTEN))
 def test_derivatives_in_every_time_are_those_of_the_solution(name):
     method, settings, tol = METHODS[name]
 
@@ -92,8 +98,14 @@ def test_derivatives_in_every_time_are_those_of_the_solution(name):
         jax.tree_util.tree_map(close, backward, want)
 
 
-@pytest.mark.parametrize("adjoint", ["forward", "reverse"])
-@pytest.mark.parametrize("name", ["ETD4RK, adaptive", "ETD4RK, fixed", "DormandPrince, adaptive"])
+ENDS = list(
+    itertools.product(
+        ["ETD4RK, adaptive", "ETD4RK, fixed", "DormandPrince, adaptive"], ["forward", "reverse"]
+    )
+)
+
+
+@pytest.mark.parametrize(("name", "adjoint"), mostly_thorough(ENDS, {ENDS[0]}))
 def test_the_end_alone_moves_with_the_end(name, adjoint):
     method, settings, tol = METHODS[name]
 
@@ -117,8 +129,7 @@ def test_the_end_alone_moves_with_the_end(name, adjoint):
     np.testing.assert_allclose(found, want, rtol=tol, atol=tol)
 
 
-@pytest.mark.parametrize("adjoint", ["forward", "reverse"])
-@pytest.mark.parametrize("name", ["ETD4RK, adaptive", "ETD4RK, fixed"])
+@pytest.mark.parametrize(("name", "adjoint"), mostly_thorough(ENDS[:4], {ENDS[1]}))
 def test_dense_output_stays_where_it_is_and_moves_with_its_own_time(name, adjoint):
     method, settings, _ = METHODS[name]
 
