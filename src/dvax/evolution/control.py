@@ -128,7 +128,7 @@ class Adaptive(AbstractController):
         error = jnp.where(step.solved, error, jnp.inf)
         impulse = error * h / self.horizon
         # An error of rounding, until it grows with the length.
-        rounding = error <= 2.0 * state.blur.level
+        rounding = error <= 2.0 ** min(1.0, 0.5 * self.order) * state.blur.level
         # A small share, because a derivative loses a kink's step; a large one where no step is better.
         floor = 8 * jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
         share = jnp.where((h <= 1e4 * floor) | rounding, 0.1, 1e-6)
