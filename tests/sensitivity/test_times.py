@@ -149,3 +149,114 @@ def test_dense_output_stays_where_it_is_and_moves_with_its_own_time(name, adjoin
     # Within a step x_h is of the order of the stage polynomial.
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)  # noqa: E731
     jax.tree_util.tree_map(close, found, jax.jacfwd(truth)(given))
+
+
+@pytest.mark.parametrize(("name", "adjoint"), mostly_thorough(ENDS[:4], {ENDS[0]}))
+def test_a_saved_time_that_meets_a_time_of_the_problem_moves_with_it_from_before(name, adjoint):
+    method, settings, tol = METHODS[name]
+
+    def saved(times):
+        t0, eta, t1 = times
+        # The first, one that is there twice, the jump, and the end of data, where it jumps again.
+        ts = jnp.stack([t0, 0.5 * (t0 + eta), 0.5 * (t0 + eta), eta, t1])
+        jumps = jnp.stack([jnp.zeros_like(eta), eta, t1])
+        data = dvax.signals.Table(jumps, jnp.array([0.0, JUMP, 7.0]), kind="constant")
+        return dvax.solve(
+            problem(), jnp.full(2, X0), t0, t1, data, ts, method=method, adjoint=adjoint, **settings
+        ).xs[:, 0]
+
+    def truth(times):
+        t0, eta, t1 = times
+        ts = jnp.stack([t0, 0.5 * (t0 + eta), 0.5 * (t0 + eta), eta, t1])
+        return jax.vmap(lambda t: exact(t0, eta, t))(ts)
+
+    given = tuple(map(jnp.asarray, (START, ETA, END)))
+    derivative = jax.jacfwd if adjoint == "forward" else jax.jacrev
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=tol, atol=tol)  # noqa: E731
+    jax.tree_util.tree_map(close, jax.jit(derivative(saved))(given), jax.jacfwd(truth)(given))
+
+
+SECOND = list(
+    itertools.product(["ETD4RK, adaptive", "ETD4RK, fixed"], ["forward", "reverse"], [False, True])
+)
+
+
+@pytest.mark.parametrize(("name", "adjoint", "within"), mostly_thorough(SECOND, {SECOND[2]}))
+def test_second_derivatives_in_every_time(name, adjoint, within):
+    method, settings, _ = METHODS[name]
+    weights = jnp.arange(1.0, 4.0) if within else jnp.ones(1)
+
+    def square(times):
+        t0, eta, t1, ts = times
+        found = dvax.solve(
+            problem(), jnp.full(2, X0), t0, t1, drive(eta), ts if within else None,
+            method=method, adjoint=adjoint, **settings,
+        )  # fmt: skip
+        return jnp.sum(weights * found.xs[:, 0] ** 2)
+
+    def truth(times):
+        t0, eta, t1, ts = times
+        x = jax.vmap(lambda t: exact(t0, eta, t))(ts if within else t1[None])
+        return jnp.sum(weights * x**2)
+
+    given = tuple(map(jnp.asarray, (START, ETA, END))) + (jnp.asarray(AT),)
+    inner = jax.jacfwd if adjoint == "forward" else jax.jacrev
+    found = jax.jit(jax.jacfwd(inner(square)))(given)
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)  # noqa: E731
+    jax.tree_util.tree_map(close, found, jax.jacfwd(jax.jacrev(truth))(given))
+
+
+def coupled():
+    """Two states, a box that jumps with a signal of its own, and rates that are not linear in x."""
+    return dvax.Problem(
+        A=dvax.generators.Dense(jnp.array([[-1.0, 0.5], [-0.5, -2.0]])),
+        P=dvax.operators.Scaling(1.0),
+        K=lambda t, a: dvax.sets.Box(-0.4 - 0.1 * a["s"](t), 0.5 + 0.0 * t),
+        f=lambda t, x, u, a: jnp.stack(
+            [a["p"] * jnp.sin(x[1]) + u[0] + a["s"](t), 0.3 * x[0] * x[1] - u[1] + a["q"](t)]
+        ),
+        h=lambda t, x, u, a: jnp.stack(
+            [x[0] + jnp.sin(t) + a["s"](t), a["p"] * x[1] - 0.2]
+        ) - 1.5 * u,
+    )  # fmt: skip
+
+
+COUPLED = list(
+    itertools.product(
+        ["ETD4RK, adaptive", "ETD4RK, fixed", "ExpRosenbrock, adaptive"], ["forward", "reverse"]
+    )
+)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(("name", "adjoint"), COUPLED)
+def test_derivatives_in_every_time_of_a_coupled_system(name, adjoint):
+    method, settings, _ = METHODS[name]
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=(7, 2)))
+
+    def asked(v, method=method, adjoint=adjoint, settings=settings):
+        t0, one, two, t1, p, x0 = v
+        jumps = lambda t, values: dvax.signals.Table(  # noqa: E731
+            jnp.stack([jnp.full_like(t, -1.0), t, jnp.full_like(t, 9.0)]),
+            jnp.array(values),
+            kind="constant",
+        )
+        data = {"s": jumps(one, [0.0, 1.0, 1.0]), "q": jumps(two, [1.0, -1.0, -1.0]), "p": p}
+        ts = jnp.stack([t0, t0 + 0.2, t0 + 0.2, one, two, 0.5 * (two + t1), t1])
+        found = dvax.solve(
+            coupled(), jnp.stack([x0, 0.2 + 0.0 * x0]), t0, t1, data, ts,
+            method=method, adjoint=adjoint, **settings,
+        )  # fmt: skip
+        # u jumps where the data do; it has a derivative elsewhere.
+        between = jnp.array([1, 5, 6])
+        return jnp.sum(weights * found.xs) + jnp.sum(weights[between] * found.us[between])
+
+    given = jnp.array([0.1, 0.55, 0.8, 1.4, 0.7, 0.3])
+    derivative = jax.jacfwd if adjoint == "forward" else jax.jacrev
+    # An oracle without derivatives, whose steps are far finer.
+    tight = dict(rtol=1e-12, atol=1e-12)
+    value = jax.jit(lambda v: asked(v, dvax.ETD4RK(), "reverse", tight))
+    e = 1e-4 * np.eye(6)
+    apart = lambda k, d: float(value(given + d * e[k]) - value(given - d * e[k]))  # noqa: E731
+    want = [(8 * apart(k, 1) - apart(k, 2)) / 12e-4 for k in range(6)]
+    np.testing.assert_allclose(jax.jit(derivative(asked))(given), want, rtol=1e-6, atol=1e-6)

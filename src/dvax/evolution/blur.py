@@ -4,6 +4,9 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+_PATIENCE = 128.0
+"""Steps of one length until twice of it is tried, for the first time."""
+
 
 class Blur(NamedTuple):
     """An error of order p falls by 4ᵖ where a step is cut to a quarter. One that falls by less than 2ᵖ
@@ -17,17 +20,27 @@ class Blur(NamedTuple):
     longest: Any
     error: Any
     level: Any
+    wait: Any
 
-    def after(self, length: Any, error: Any, keep: Any, patient: Any, order: int) -> "Blur":
-        """With one more attempt. `patient` says that one length has been kept for long: twice of it
-        is tried, since an error that is there at every length is not found by keeping one."""
+    @staticmethod
+    def at_start(like: Any) -> "Blur":
+        zero = jnp.zeros_like(like)
+        return Blur(zero, zero, zero, jnp.full_like(like, _PATIENCE))
+
+    def after(self, length: Any, error: Any, keep: Any, calm: Any, order: int) -> "Blur":
+        """With one more attempt. Where one length has been kept for as many steps as there is to
+        `wait`, twice of it is tried, since an error that is there at every length is not found by
+        keeping one. Each trial that finds nothing doubles the wait: it has cost propagators."""
         ratio = length / jnp.maximum(length, self.longest)
         short = ratio <= 0.25
         flat = short & (error > 0.1) & (error * error >= self.error * self.error * ratio**order)
         anew = short | (ratio == 1.0)
-        seen = keep & ((self.level > 0.0) | flat | patient)
+        tries = keep & (calm >= self.wait)
+        seen = keep & ((self.level > 0.0) | flat | tries)
+        found = keep & (self.level > 0.0)
         return Blur(
             jnp.where(anew, length, self.longest),
             jnp.where(anew, error, self.error),
             jnp.where(seen, jnp.maximum(self.level, error), 0.0),
+            jnp.where(found, _PATIENCE, jnp.where(tries, 2.0 * self.wait, self.wait)),
         )

@@ -18,10 +18,8 @@ from .kinks import Aim, aim, nothing_ahead, passed, until
 from .results import RESULTS
 from .stepper import Step
 
-_TRUST, _CALM, _PATIENCE = 0.12, 9.0, 128.0
-"""After k steps that were kept one may grow by 1 + 0.12 k²; more than nine say nothing more. After
-128 of a length that was kept twice the length is tried: the error may be one of rounding, which no
-shorter step lowers."""
+_TRUST, _CALM = 0.12, 9.0
+"""After k steps that were kept one may grow by 1 + 0.12 k²; more than nine say nothing more."""
 
 
 class Verdict(NamedTuple):
@@ -111,7 +109,7 @@ class Adaptive(AbstractController):
         first = lax.stop_gradient(self.first)
         end = land(self.stops[0], first, self.stops[1])
         one = jnp.ones_like(first)
-        blur = Blur(0.0 * one, 0.0 * one, 0.0 * one)
+        blur = Blur.at_start(first)
         return self.State(end, first, jnp.asarray(1), _CALM * one, one, nothing_ahead(first), blur)
 
     def end(self, state):
@@ -152,7 +150,7 @@ class Adaptive(AbstractController):
         factor = jnp.clip(factor, 0.1, jnp.minimum(1.0 + _TRUST * state.calm**2, 5.0))
         steady = keep & (factor > 0.8) & (factor < 1.25)
         length = lax.stop_gradient(h)
-        blur = state.blur.after(length, error, keep, state.calm >= _PATIENCE, self.order)
+        blur = state.blur.after(length, error, keep, state.calm, self.order)
         wanted = jnp.where(steady, length, length * factor)
         wanted = jnp.where(keep & (blur.level > 0.0), jnp.maximum(wanted, 2.0 * length), wanted)
         # A step cut short by a knot says little about the length that was planned.
@@ -170,7 +168,7 @@ class Adaptive(AbstractController):
 
         # Steps that were kept since one was refused for anything but a kink.
         still = jnp.where(aimed, jnp.maximum(state.calm, 1.0), 0.0)
-        calm = jnp.where(keep, jnp.minimum(state.calm + 1.0, _PATIENCE), still)
+        calm = jnp.where(keep, jnp.minimum(state.calm + 1.0, blur.wait), still)
         jumped = keep & (t1 == self.stops[state.stop])
         last = self.stops.shape[0] - 1
         stop = jnp.minimum(jnp.where(jumped, state.stop + 1, state.stop), last)

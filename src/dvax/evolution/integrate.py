@@ -19,7 +19,7 @@ from .forward import forward_only
 from .implicit import Implicit
 from .loop import Loop, Record, Saved, State
 from .method import ETD2RK, AbstractMethod
-from .moving import moved, still, velocities
+from .moving import arrivals, arriving, moved, still
 from .picard import Picard
 from .results import RESULTS
 from .setup import Setup
@@ -97,7 +97,7 @@ def _implicitly(
     stats = {
         "steps": end.steps, "rejected": end.rejected, "t": t, "x": last, "next_dt": first,
     }  # fmt: skip
-    return _assembled(setup, flow, rows, None, stats, end.result, None, False)
+    return _assembled(setup, flow, rows, stats, end.result, None, False)
 
 
 def _by_windows(
@@ -146,12 +146,14 @@ def _by_windows(
         (end.result == RESULTS.successful) & ~complete, RESULTS.max_steps, end.result
     )
     rows = _end_alone(end, complete, stops[-1]) if saved is None else saved
+    if ts is not None:
+        rows = _carried(rows, ts, x0, flow, still(stops[0]), False)
     stats = {
         "steps": end.steps, "rejected": end.refused, "t": end.t, "x": end.x,
         "next_dt": end.length / method.nodes, "windows": end.windows, "sweeps": end.sweeps,
         "contraction": end.contraction,
     }  # fmt: skip
-    return _assembled(setup, flow, rows, ts, stats, result, end.records, True)
+    return _assembled(setup, flow, rows, stats, result, end.records, True)
 
 
 def _controller(
@@ -212,9 +214,15 @@ def _solution(
         (result == RESULTS.successful) & ~_tree.all_finite(end.x), RESULTS.nonfinite, result
     )
     rows = _end_alone(end, complete, t1) if saved is None else saved
+    begin = still(controller.stops[0])
     if options.adjoint == "forward" and controller.adapts:
         # States are those at times that stay where they are.
-        rows, ts = rows._replace(t=still(rows.t)), t1[None] if saved is None else ts
+        if saved is None:
+            rows, ts = rows._replace(t=still(rows.t)), t1[None]
+        shift = jnp.where(end.steps > 0, end.t - still(end.t), 0.0)
+        end = end._replace(x=moved(end.x, shift, arriving, still(end.t), flow, begin))
+    if ts is not None:
+        rows = _carried(rows, ts, setup.x0, flow, begin, options.adjoint == "reverse")
     stats = {
         "steps": end.steps,
         "rejected": end.attempts - end.steps,
@@ -223,26 +231,32 @@ def _solution(
         "x": end.x,
         "next_dt": controller.next_length(end.control),
     }
-    return _assembled(setup, flow, rows, ts, stats, result, end.records, options.measure)
+    return _assembled(setup, flow, rows, stats, result, end.records, options.measure)
+
+
+def _carried(
+    rows: Saved, ts: jax.Array, x0: Any, flow: Flow, begin: Any, transposed: bool
+) -> Saved:
+    """`rows` with the states at the times `ts`: the two move apart where one is differentiated and the
+    other is not. Times that were not reached have no state that could move."""
+    reached = rows.t < jnp.inf
+    there = lambda x, y: jnp.where(reached.reshape(-1, *(1,) * (x.ndim - 1)), x, y)  # noqa: E731
+    t = jnp.where(reached, rows.t, begin)
+    shift = (ts - still(ts)) - (t - still(t))
+    x = jtu.tree_map(there, rows.x, x0)
+    x = moved(x, shift, arrivals, t, flow, begin, transposed=transposed)
+    return rows._replace(t=rows.t + shift, x=jtu.tree_map(there, x, rows.x))
 
 
 def _assembled(
     setup: Setup,
     flow: Flow,
     rows: Saved,
-    ts: jax.Array | None,
     stats: dict[str, Any],
     result: RESULTS,
     records: Record | None,
     measured: bool,
 ) -> Solution:
-    """The solution with `rows`, whose states belong to the times `ts`: the two move apart where one is
-    differentiated and the other is not. (None: they do not.)"""
-    if ts is not None:
-        t = jnp.where(rows.t < jnp.inf, rows.t, 0.0)
-        shift = (ts - still(ts)) - (t - still(t))
-        xs = moved(rows.x, shift, velocities, flow, still(rows.t), rows.x)
-        rows = rows._replace(t=rows.t + shift, x=xs)
     us, ys, residual, law_step, law_error = _responses(
         flow, rows.t, rows.x, setup.problem.spaces(setup.x0)[1], setup.moduli
     )

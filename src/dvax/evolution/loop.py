@@ -19,7 +19,7 @@ from .checkpoints import Checkpoints
 from .control import AbstractController
 from .extent import Extent
 from .flow import Flow
-from .moving import moved, still, velocity
+from .moving import arriving, moved, still, velocity
 from .results import RESULTS
 from .stepper import Factors, Memory, Stepper, inside, local, within
 
@@ -245,8 +245,9 @@ class Loop(eqx.Module):
             impulse = _tree.where(theta > 0.0, state.impulse, before)
             settled = _tree.where(time >= state.t, state.impulse, before)
         x = jtu.tree_map(lambda leaf: jnp.where(reached, leaf, jnp.nan), x)
-        # The state at the end of a step moves with it.
-        time = time + jnp.where(met, now - still(now), 0.0)
+        # The state at the end of a step moves with it; at the beginning of the run, always.
+        end = jnp.where(state.steps == 0, state.t, now)
+        time = time + jnp.where(met, end - still(end), 0.0)
         return Saved(jnp.where(reached, time, jnp.inf), x, impulse, settled, state.extent)
 
     def _held(self, t: Any) -> Any:
@@ -260,20 +261,17 @@ class Loop(eqx.Module):
         """The state at a time that stands still, at the beginning of a step."""
         if not (self.carries and self.controller.adapts):
             return state.x
-        t0, stepper = still(state.t), self.stepper
-        ends = jtu.tree_map(still, stepper.ends)
-        return moved(
-            state.x, state.t - t0, jump, stepper.flow, t0, still(end), state.x, ends, state.jumped
-        )
+        t0, flow = still(state.t), self.stepper.flow
+        ends, shift = jtu.tree_map(still, self.stepper.ends), state.t - t0
+        x = moved(state.x, shift, before, t0, flow, ends[0], state.jumped)
+        return moved(x, -shift, behind, t0 + shift, flow, still(end) - t0, ends, state.jumped)
 
     def _factors(self, state: State, t0: Any, t1: Any) -> Factors | None:
         """The propagators of a step, None where it makes its own."""
         uniform = self.stepper.uniform
         if uniform is not None or state.factors is None:
             return uniform
-        # Lengths that are the same may move otherwise behind a stop that moves.
-        anew = state.jumped if self.carries and not self.controller.adapts else False
-        return self.stepper.fitted(state.factors, t0, t1, anew)
+        return self.stepper.fitted(state.factors, t0, t1)
 
     def _inside(self, record: Record, theta: Any, guess: Tree | None) -> Tree:
         """x_h inside a step."""
@@ -283,17 +281,22 @@ class Loop(eqx.Module):
         return inside(flow, record.length, theta, record.x0, record.coefficients)
 
 
-def jump(flow: Flow, t: Any, t1: Any, x: Tree, ends: tuple[Any, Any], jumped: Any) -> Tree:
-    """What x at a fixed time right behind t, where a step to t1 begins, gains as t moves on: x' before
-    t takes the place of x' behind it. Before the run nothing moves."""
+def before(t: Any, x: Tree, flow: Flow, begin: Any, jumped: Any) -> Tree:
+    """x' before a stop; before the run nothing moves."""
+    return lax.cond(
+        jnp.asarray(jumped) & (t > begin),
+        lambda: arriving(t, x, flow, begin),
+        lambda: _tree.zeros_like(x),
+    )
 
-    def gained() -> Tree:
-        late = within(t, t1, 0.0, ends)
-        behind = velocity(flow, late, x)
-        before = velocity(flow, t - (late - t), x)
-        return jtu.tree_map(lambda a, b: jnp.where(t == ends[0], 0.0, a) - b, before, behind)
 
-    return lax.cond(jumped, gained, lambda: _tree.zeros_like(x))
+def behind(t: Any, x: Tree, flow: Flow, length: Any, ends: tuple[Any, Any], jumped: Any) -> Tree:
+    """x' behind a stop, where a step of this length begins."""
+    return lax.cond(
+        jumped,
+        lambda: velocity(flow, within(t, t + length, 0.0, ends), x),
+        lambda: _tree.zeros_like(x),
+    )
 
 
 def slack(t: Any) -> Any:

@@ -26,7 +26,7 @@ from .._one_function import in_one_function
 from .._tree import Tree
 from .checkpoints import Checkpoints, Stack, how_many
 from .loop import Loop, Record, Saved, State, slack
-from .moving import velocity
+from .moving import arriving, still
 from .stepper import inside, local
 
 
@@ -184,7 +184,7 @@ class _Backward:
         moving = tuple(leaf for leaf, m in zip(self.leaves, self.moving, strict=True) if m)
         time = lambda p: self._parts(p).controller.boundary(i, self.ends)  # noqa: E731
         t, pull = jax.vjp(time, moving)
-        rate = velocity(self.loop.stepper.flow, t, x)
+        rate = arriving(t, x, self.loop.stepper.flow, still(self.loop.controller.stops[0]))
         by = jtu.tree_map(lambda v, r: jnp.sum(v * r), psi, rate)
         return jtu.tree_map(jnp.add, gathered, pull(-sum(jtu.tree_leaves(by)))[0])
 
@@ -265,7 +265,7 @@ class _Backward:
     ) -> Any:
         """The times saved in this step from x to x1, the last ones first."""
         assert self.ts is not None
-        ts, (t0, t1) = self.ts, self._times(self.loop, i)
+        ts, (t0, t1) = still(self.ts), self._times(self.loop, i)
 
         def at(p: Any, x: Tree, c: Any, time: Any) -> Tree:
             loop = self._parts(p)

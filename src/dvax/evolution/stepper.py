@@ -21,6 +21,7 @@ from .extent import Extent
 from .flow import Flow, Rate
 from .kinks import first_change
 from .method import AbstractMethod, extrapolation, polynomial, shortened
+from .moving import if_moving
 
 _DOUBT = 4.0
 """By how many times its interpolation error z is taken to be uncertain between the samples."""
@@ -165,15 +166,19 @@ class Stepper(eqx.Module):
         found = self.flow.propagators(tuple(t * h for t in thetas), self.method.degree + 1)
         return Factors(h, found[0], found[1] if halves else None, found[1 + len(halves) :])
 
-    def fitted(self, factors: Factors, t0: Any, t1: Any, anew: Any) -> Factors:
-        """Propagators for this step; those of the last one where the length is the same, unless they
-        have to be made `anew`.
+    def fitted(self, factors: Factors, t0: Any, t1: Any) -> Factors:
+        """Propagators for this step; those of the last one where the length is the same.
 
-        t₀ + h is rounded, so equal steps differ by an ulp of t: that is not a new length.
+        t₀ + h is rounded, so equal steps differ by an ulp of t: that is not a new length. Equal
+        lengths may move apart: where they are differentiated, propagators are made anew.
         """
-        h = t1 - t0
-        same = (jnp.abs(h - factors.length) <= 2 * _ulp(t0, t1)) & ~jnp.asarray(anew)
-        return lax.cond(same, lambda: factors, lambda: self.factors(h))
+
+        def kept(h: Any, stepper: Stepper, factors: Factors, slack: Any) -> Factors:
+            same = jnp.abs(h - factors.length) <= slack
+            return lax.cond(same, lambda: factors, lambda: stepper.factors(h))
+
+        made = lambda h, stepper, *_: stepper.factors(h)  # noqa: E731
+        return if_moving(made, kept, t1 - t0, self, factors, 2 * _ulp(t0, t1))
 
     def advance(
         self, t0: Any, t1: Any, x0: Tree, factors: Factors | None, guess: Tree | None
