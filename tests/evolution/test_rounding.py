@@ -54,3 +54,21 @@ def test_a_tolerance_below_rounding_is_refused_and_not_run_to_the_last_step():
     assert found.result == RESULTS.step_too_small
     assert "rounding" in RESULTS[found.result]
     assert int(found.stats["steps"]) < 10_000
+
+
+def test_trials_of_longer_steps_become_rare_where_they_find_nothing():
+    # A forcing of one length throughout: every step is as long as the tolerance lets it be.
+    turning = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0),
+        f=lambda t, x, u, args: jnp.stack([jnp.cos(3 * t), jnp.sin(3 * t)]) + 0.0 * u,
+        h=lambda t, x, u, args: 0.0 * x - u,
+        K=dvax.sets.Box(-9.0, 9.0),
+        P=dvax.operators.Scaling(1.0),
+    )
+    stats = dvax.solve(
+        turning, jnp.zeros(2), 0.0, 20.0, rtol=0.0, atol=1e-4, max_steps=50_000
+    ).stats
+    # The k-th comes 128·2ᵏ steps after the one before it; a few more belong to the first steps.
+    trials = np.log2(1 + int(stats["steps"]) / 128)
+    assert int(stats["steps"]) > 10_000
+    assert int(stats["rejected"]) <= trials + 4
