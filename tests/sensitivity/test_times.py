@@ -260,3 +260,19 @@ def test_derivatives_in_every_time_of_a_coupled_system(name, adjoint):
     apart = lambda k, d: float(value(given + d * e[k]) - value(given - d * e[k]))  # noqa: E731
     want = [(8 * apart(k, 1) - apart(k, 2)) / 12e-4 for k in range(6)]
     np.testing.assert_allclose(jax.jit(derivative(asked))(given), want, rtol=1e-6, atol=1e-6)
+
+
+def test_where_no_time_is_differentiated_x_dot_at_saved_times_is_not():
+    # √x has no derivative at x(1) = 0, where no stage of ETD1 is.
+    emptying = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-9.0, 9.0),
+        f=lambda t, x, u, a: -a + 0.0 * u + (jnp.sqrt(x) - jnp.sqrt(x)),
+        h=lambda t, x, u, a: 0.0 * x - u,
+    )  # fmt: skip
+
+    def last(x0, a):
+        return dvax.solve(
+            emptying, x0, 0.0, 1.0, a, jnp.array([0.5, 1.0]), dt=0.25, method=dvax.ETD1()
+        ).xs[-1]
+
+    assert tuple(map(float, jax.grad(last, (0, 1))(1.0, 1.0))) == (1.0, -1.0)

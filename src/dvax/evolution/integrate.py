@@ -147,7 +147,7 @@ def _by_windows(
     )
     rows = _end_alone(end, complete, stops[-1]) if saved is None else saved
     if ts is not None:
-        rows = _carried(rows, ts, x0, flow, still(stops[0]), False)
+        rows = _carried(rows, ts, x0, flow, (still(stops[0]), still(stops[-1])), False)
     stats = {
         "steps": end.steps, "rejected": end.refused, "t": end.t, "x": end.x,
         "next_dt": end.length / method.nodes, "windows": end.windows, "sweeps": end.sweeps,
@@ -214,15 +214,15 @@ def _solution(
         (result == RESULTS.successful) & ~_tree.all_finite(end.x), RESULTS.nonfinite, result
     )
     rows = _end_alone(end, complete, t1) if saved is None else saved
-    begin = still(controller.stops[0])
+    ends = still(controller.stops[0]), still(t1)
     if options.adjoint == "forward" and controller.adapts:
         # States are those at times that stay where they are.
         if saved is None:
             rows, ts = rows._replace(t=still(rows.t)), t1[None]
         shift = jnp.where(end.steps > 0, end.t - still(end.t), 0.0)
-        end = end._replace(x=moved(end.x, shift, arriving, still(end.t), flow, begin))
+        end = end._replace(x=moved(end.x, shift, arriving, still(end.t), flow, ends))
     if ts is not None:
-        rows = _carried(rows, ts, setup.x0, flow, begin, options.adjoint == "reverse")
+        rows = _carried(rows, ts, setup.x0, flow, ends, options.adjoint == "reverse")
     stats = {
         "steps": end.steps,
         "rejected": end.attempts - end.steps,
@@ -235,16 +235,16 @@ def _solution(
 
 
 def _carried(
-    rows: Saved, ts: jax.Array, x0: Any, flow: Flow, begin: Any, transposed: bool
+    rows: Saved, ts: jax.Array, x0: Any, flow: Flow, ends: tuple[Any, Any], transposed: bool
 ) -> Saved:
     """`rows` with the states at the times `ts`: the two move apart where one is differentiated and the
     other is not. Times that were not reached have no state that could move."""
     reached = rows.t < jnp.inf
     there = lambda x, y: jnp.where(reached.reshape(-1, *(1,) * (x.ndim - 1)), x, y)  # noqa: E731
-    t = jnp.where(reached, rows.t, begin)
+    t = jnp.where(reached, rows.t, ends[0])
     shift = (ts - still(ts)) - (t - still(t))
     x = jtu.tree_map(there, rows.x, x0)
-    x = moved(x, shift, arrivals, t, flow, begin, transposed=transposed)
+    x = moved(x, shift, arrivals, t, flow, ends, transposed=transposed)
     return rows._replace(t=rows.t + shift, x=jtu.tree_map(there, x, rows.x))
 
 

@@ -263,7 +263,7 @@ class Loop(eqx.Module):
             return state.x
         t0, flow = still(state.t), self.stepper.flow
         ends, shift = jtu.tree_map(still, self.stepper.ends), state.t - t0
-        x = moved(state.x, shift, before, t0, flow, ends[0], state.jumped)
+        x = moved(state.x, shift, before, t0, flow, ends, state.jumped)
         return moved(x, -shift, behind, t0 + shift, flow, still(end) - t0, ends, state.jumped)
 
     def _factors(self, state: State, t0: Any, t1: Any) -> Factors | None:
@@ -271,7 +271,9 @@ class Loop(eqx.Module):
         uniform = self.stepper.uniform
         if uniform is not None or state.factors is None:
             return uniform
-        return self.stepper.fitted(state.factors, t0, t1)
+        # From one stop to the next, fixed steps move alike.
+        anew = jnp.asarray(True) if self.controller.adapts else state.jumped
+        return self.stepper.fitted(state.factors, t0, t1, anew)
 
     def _inside(self, record: Record, theta: Any, guess: Tree | None) -> Tree:
         """x_h inside a step."""
@@ -281,11 +283,11 @@ class Loop(eqx.Module):
         return inside(flow, record.length, theta, record.x0, record.coefficients)
 
 
-def before(t: Any, x: Tree, flow: Flow, begin: Any, jumped: Any) -> Tree:
+def before(t: Any, x: Tree, flow: Flow, ends: tuple[Any, Any], jumped: Any) -> Tree:
     """x' before a stop; before the run nothing moves."""
     return lax.cond(
-        jnp.asarray(jumped) & (t > begin),
-        lambda: arriving(t, x, flow, begin),
+        jumped & (t > ends[0]),
+        lambda: arriving(t, x, flow, ends),
         lambda: _tree.zeros_like(x),
     )
 

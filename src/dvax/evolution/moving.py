@@ -8,10 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..problem import KNOT_ULPS
+from ..problem import END_ULPS, KNOT_ULPS
 from .flow import Flow
 
 
@@ -51,8 +52,8 @@ def moved(
     whose derivatives are not: x itself, and nothing is computed, where nothing is differentiated.
     `speed` closes over no number.
 
-    Derivatives of every order are those of the flow by forward mode. Where the first is to be
-    `transposed`, no rule of its own survives that, and they are right up to the second.
+    Derivatives of every order are those of the flow by forward mode; where the first is to be
+    `transposed`, they are right up to the second, by forward over reverse.
     """
     real, rest = eqx.partition((t, given), eqx.is_inexact_array)
     other, static = eqx.partition(rest, eqx.is_array)
@@ -60,10 +61,10 @@ def moved(
     def rate(s: Any, x: Tree, real: Any, other: Any) -> Tree:
         return speed(s, x, *eqx.combine(real, other, static)[1])
 
-    return _moved(rate, transposed, x, shift, t, real, other)
+    return (_moved_back if transposed else _moved)(rate, x, shift, t, real, other)
 
 
-def _moved(rate: Callable[..., Tree], transposed: bool, *moving: Any) -> Tree:
+def _moved(rate: Callable[..., Tree], *moving: Any) -> Tree:
     @jax.custom_jvp
     def same(x: Tree, shift: Any, t: Any, real: Any, other: Any) -> Tree:
         return x
@@ -80,17 +81,62 @@ def _moved(rate: Callable[..., Tree], transposed: bool, *moving: Any) -> Tree:
             own = lambda s, x, real: rate(s, x, real, other)  # noqa: E731
             return jax.jvp(own, (s, pair[0], real), (later, pair[1], turn))
 
-        if transposed:
-            out = same(x, shift, t, real, other)
-            varied = both(t + shift, (out, along), (real, later, turn), other)[1]
-            along = _plus(along, shift, varied)
-        else:
-            out, along = _moved(both, False, (x, along), shift, t, (real, later, turn), other)
+        out, along = _moved(both, (x, along), shift, t, (real, later, turn), other)
         if _is_zero(by):
             return out, along
         return out, _plus(along, by, rate(t + shift, out, real, other))
 
     return same(*moving)
+
+
+def _moved_back(rate: Callable[..., Tree], *moving: Any) -> Tree:
+    """The same, to be transposed: x̄ goes back to x, ⟨x̄, x'⟩ to the shift, and what only a second
+    derivative sees is not computed for a first."""
+
+    @jax.custom_vjp
+    def same(x: Tree, shift: Any, t: Any, real: Any, other: Any) -> Tree:
+        return x
+
+    def forward(*given: Any) -> Any:
+        moves = _tree.Static(given[1].perturbed)
+        _, *where = given = jtu.tree_map(lambda v: v.value, given, is_leaf=_is_primal)
+        out = _moved(rate, *given)
+        return out, (moves, out, *where)
+
+    def backward(kept: Any, bar: Any) -> Any:
+        moves, x, shift, t, real, other = kept
+        bar = _filled(bar)
+        later, along, turn = _turned(rate, bar, shift, t, x, real, other)
+        by = jnp.zeros_like(shift)
+        if moves.value:
+            found = rate(t + shift, x, real, other)
+            rows = lambda b, r: jnp.sum((b * r).reshape(*shift.shape, -1), axis=-1)  # noqa: E731
+            by = sum(jtu.tree_leaves(jtu.tree_map(rows, bar, found)))
+        none = jtu.tree_map(lambda leaf: np.zeros(leaf.shape, jax.dtypes.float0), other)
+        return _tree.add(bar, along), by, later, turn, none
+
+    same.defvjp(forward, backward, symbolic_zeros=True)
+    return same(*moving)
+
+
+def _turned(rate: Callable[..., Tree], bar: Tree, shift: Any, *at: Any) -> Any:
+    """shift · (∂rate(t, x, real))ᵀ x̄: 0, but for its derivative in the shift."""
+
+    @jax.custom_jvp
+    def nothing(none: Any, bar: Tree, shift: Any, t: Any, x: Tree, real: Any, other: Any) -> Any:
+        return none
+
+    @nothing.defjvp
+    def rule(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
+        none, bar, _, t, x, real, other = primals
+        _, pull = jax.vjp(lambda t, x, real: rate(t, x, real, other), t, x, real)
+        return none, pull(_plus(_tree.zeros_like(bar), tangents[2], bar))
+
+    # Batched where x̄ is: a batched tangent is taken for a batched value alone.
+    zero = sum(jnp.sum(jnp.where(leaf == leaf, 0.0, 0.0)) for leaf in jtu.tree_leaves(bar))
+    t, x, real, _ = at
+    none = jtu.tree_map(lambda leaf: jnp.full_like(leaf, zero), (t, x, real))
+    return nothing(none, bar, shift, *at)
 
 
 def _plus(x: Tree, by: Any, rate: Tree) -> Tree:
@@ -104,16 +150,17 @@ def velocity(flow: Flow, t: Any, x: Tree) -> Tree:
     return _tree.add(flow.generator.apply(x), flow.rate(t, x, flow.guess(x)).value)
 
 
-def arriving(t: Any, x: Tree, flow: Flow, begin: Any) -> Tree:
+def arriving(t: Any, x: Tree, flow: Flow, ends: tuple[Any, Any]) -> Tree:
     """x' at t as the run comes there, or at its beginning as it goes: data may jump at t."""
-    ulp = jnp.finfo(t.dtype).eps * jnp.maximum(jnp.abs(t), jnp.abs(begin))
-    inset = still(jnp.where(t > begin, -KNOT_ULPS * ulp, KNOT_ULPS * ulp))
-    return velocity(flow, t + inset, x)
+    begin, end = ends
+    ulps = jnp.where((t <= begin) | (t >= end), END_ULPS, KNOT_ULPS)
+    inset = ulps * jnp.finfo(t.dtype).eps * jnp.maximum(jnp.abs(t), jnp.abs(begin))
+    return velocity(flow, t + still(jnp.where(t > begin, -inset, inset)), x)
 
 
-def arrivals(ts: Any, xs: Tree, flow: Flow, begin: Any) -> Tree:
+def arrivals(ts: Any, xs: Tree, flow: Flow, ends: tuple[Any, Any]) -> Tree:
     """Those at several times."""
-    return jax.vmap(lambda t, x: arriving(t, x, flow, begin))(ts, xs)
+    return jax.vmap(lambda t, x: arriving(t, x, flow, ends))(ts, xs)
 
 
 def _filled(tangents: Any) -> Any:
@@ -123,3 +170,7 @@ def _filled(tangents: Any) -> Any:
 
 def _is_zero(leaf: Any) -> bool:
     return isinstance(leaf, jax.custom_derivatives.SymbolicZero)
+
+
+def _is_primal(leaf: Any) -> bool:
+    return isinstance(leaf, jax.custom_derivatives.CustomVJPPrimal)

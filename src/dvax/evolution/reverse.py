@@ -184,7 +184,7 @@ class _Backward:
         moving = tuple(leaf for leaf, m in zip(self.leaves, self.moving, strict=True) if m)
         time = lambda p: self._parts(p).controller.boundary(i, self.ends)  # noqa: E731
         t, pull = jax.vjp(time, moving)
-        rate = arriving(t, x, self.loop.stepper.flow, still(self.loop.controller.stops[0]))
+        rate = arriving(t, x, self.loop.stepper.flow, jtu.tree_map(still, self.loop.stepper.ends))
         by = jtu.tree_map(lambda v, r: jnp.sum(v * r), psi, rate)
         return jtu.tree_map(jnp.add, gathered, pull(-sum(jtu.tree_leaves(by)))[0])
 

@@ -166,19 +166,19 @@ class Stepper(eqx.Module):
         found = self.flow.propagators(tuple(t * h for t in thetas), self.method.degree + 1)
         return Factors(h, found[0], found[1] if halves else None, found[1 + len(halves) :])
 
-    def fitted(self, factors: Factors, t0: Any, t1: Any) -> Factors:
+    def fitted(self, factors: Factors, t0: Any, t1: Any, anew: Any) -> Factors:
         """Propagators for this step; those of the last one where the length is the same.
 
         t₀ + h is rounded, so equal steps differ by an ulp of t: that is not a new length. Equal
-        lengths may move apart: where they are differentiated, propagators are made anew.
+        lengths may move apart, where `anew` says so: then, if they are differentiated, it is one.
         """
 
-        def kept(h: Any, stepper: Stepper, factors: Factors, slack: Any) -> Factors:
-            same = jnp.abs(h - factors.length) <= slack
+        def fit(h: Any, stepper: Stepper, factors: Factors, slack: Any, new: Any) -> Factors:
+            same = (jnp.abs(h - factors.length) <= slack) & jnp.logical_not(new)
             return lax.cond(same, lambda: factors, lambda: stepper.factors(h))
 
-        made = lambda h, stepper, *_: stepper.factors(h)  # noqa: E731
-        return if_moving(made, kept, t1 - t0, self, factors, 2 * _ulp(t0, t1))
+        still = lambda h, s, f, slack, _: fit(h, s, f, slack, False)  # noqa: E731
+        return if_moving(fit, still, t1 - t0, self, factors, 2 * _ulp(t0, t1), anew)
 
     def advance(
         self, t0: Any, t1: Any, x0: Tree, factors: Factors | None, guess: Tree | None
