@@ -80,8 +80,8 @@ def _few_programs():
 
 @pytest.fixture
 def uncached():
-    """Programs that are compiled here are not kept: jaxlib 0.10.2 aborts the process where it writes
-    one whose loops lie very deep in each other."""
+    """Programs that are compiled here are not kept: jaxlib 0.10.2 ends the process, now and then,
+    where it writes one whose loops lie very deep in each other."""
     name = "jax_persistent_cache_min_compile_time_secs"
     before = getattr(jax.config, name)
     jax.config.update(name, 1e9)
