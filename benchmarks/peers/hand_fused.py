@@ -4,7 +4,8 @@
     a = e^z x + hφ₁(z) f̃(x),      x ← a + hφ₂(z) (f̃(a) − f̃(x)),      z = −αh
 
 No saving, no statistics, no check for NaN, and a loop count that nobody has to find out. For the
-reverse mode it is a `lax.scan`, since a `fori_loop` of an unknown count has none.
+reverse mode it is a `lax.scan`, since a `fori_loop` of an unknown count has none; all its states are
+kept.
 """
 
 import math
@@ -78,6 +79,33 @@ def gradient(law: ContactLaw, h: float, steps: int) -> Callable[[Any], dict[str,
 
     at = {name: getattr(given, name) for name in letters}
     return lambda x0: jax.block_until_ready(slope(at, given, g, x0))
+
+
+def gradient_by_start(law: ContactLaw, h: float, steps: int) -> Callable[[Any], Any]:
+    """x0 -> the derivative of Σx with respect to x0, by jax.grad through a scan."""
+    given = Numbers(*map(jnp.asarray, numbers(law, h)))
+    g = jnp.asarray(law.g.reshape(law.start.shape))
+
+    @jax.jit
+    @jax.grad
+    def slope(x0: Any, given: Numbers, g: Any) -> Any:
+        step = _step(given, g)
+        return jnp.sum(lax.scan(lambda x, _: (step(x), None), x0, length=steps)[0])
+
+    return lambda x0: jax.block_until_ready(slope(x0, given, g))
+
+
+def tangent(law: ContactLaw, h: float, steps: int) -> Callable[[Any], Any]:
+    """x0 -> the derivative of Σx with respect to ℓ, by jax.jvp of the loop."""
+    given = Numbers(*map(jnp.asarray, numbers(law, h)))
+    g = jnp.asarray(law.g.reshape(law.start.shape))
+
+    @jax.jit
+    def along(given: Numbers, g: Any, x0: Any) -> Any:
+        end = lambda ell: jnp.sum(_loop(given._replace(ell=ell), g, x0, steps))  # noqa: E731
+        return jax.jvp(end, (given.ell,), (jnp.ones_like(given.ell),))[1]
+
+    return lambda x0: jax.block_until_ready(along(given, g, x0))
 
 
 def _loop(n: Numbers, g: jax.Array, x0: jax.Array, steps: Any) -> jax.Array:
