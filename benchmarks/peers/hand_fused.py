@@ -51,9 +51,8 @@ def numbers(law: ContactLaw, h: float) -> Numbers:
 
 def as_arguments(law: ContactLaw, h: float) -> Callable[[Any, int], Any]:
     """(x0, steps) -> x, where the numbers are arguments of the compiled loop, as in dvax."""
-    given = Numbers(*map(jnp.asarray, numbers(law, h)))
+    given, g = _arrays(law, h)
     loop = jax.jit(_loop)
-    g = jnp.asarray(law.g.reshape(law.start.shape))
     return lambda x0, steps: jax.block_until_ready(loop(given, g, x0, steps))
 
 
@@ -68,8 +67,7 @@ def as_constants(law: ContactLaw, h: float) -> Callable[[Any, int], Any]:
 def gradient(law: ContactLaw, h: float, steps: int) -> Callable[[Any], dict[str, Any]]:
     """x0 -> the derivatives of Σx with respect to b_x, d_x and ℓ, by jax.grad through a scan."""
     letters = ("b_x", "d_x", "ell")
-    given = Numbers(*map(jnp.asarray, numbers(law, h)))
-    g = jnp.asarray(law.g.reshape(law.start.shape))
+    given, g = _arrays(law, h)
 
     @jax.jit
     @jax.grad
@@ -83,8 +81,7 @@ def gradient(law: ContactLaw, h: float, steps: int) -> Callable[[Any], dict[str,
 
 def gradient_by_start(law: ContactLaw, h: float, steps: int) -> Callable[[Any], Any]:
     """x0 -> the derivative of Σx with respect to x0, by jax.grad through a scan."""
-    given = Numbers(*map(jnp.asarray, numbers(law, h)))
-    g = jnp.asarray(law.g.reshape(law.start.shape))
+    given, g = _arrays(law, h)
 
     @jax.jit
     @jax.grad
@@ -97,8 +94,7 @@ def gradient_by_start(law: ContactLaw, h: float, steps: int) -> Callable[[Any], 
 
 def tangent(law: ContactLaw, h: float, steps: int) -> Callable[[Any], Any]:
     """x0 -> the derivative of Σx with respect to ℓ, by jax.jvp of the loop."""
-    given = Numbers(*map(jnp.asarray, numbers(law, h)))
-    g = jnp.asarray(law.g.reshape(law.start.shape))
+    given, g = _arrays(law, h)
 
     @jax.jit
     def along(given: Numbers, g: Any, x0: Any) -> Any:
@@ -106,6 +102,11 @@ def tangent(law: ContactLaw, h: float, steps: int) -> Callable[[Any], Any]:
         return jax.jvp(end, (given.ell,), (jnp.ones_like(given.ell),))[1]
 
     return lambda x0: jax.block_until_ready(along(given, g, x0))
+
+
+def _arrays(law: ContactLaw, h: float) -> tuple[Numbers, jax.Array]:
+    g = jnp.asarray(law.g.reshape(law.start.shape))
+    return Numbers(*map(jnp.asarray, numbers(law, h))), g
 
 
 def _loop(n: Numbers, g: jax.Array, x0: jax.Array, steps: Any) -> jax.Array:

@@ -36,6 +36,11 @@ def exact(t0, eta, t):
     return jnp.where(t <= eta, before(t), behind)
 
 
+def assert_close(found, want, tol):
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=tol, atol=tol)  # noqa: E731
+    jax.tree_util.tree_map(close, found, want)
+
+
 METHODS = {
     "ETD2RK, adaptive": (dvax.ETD2RK(), dict(rtol=1e-9, atol=1e-9), 1e-6),
     "ETD4RK, adaptive": (dvax.ETD4RK(), dict(rtol=1e-9, atol=1e-9), 1e-7),
@@ -90,12 +95,11 @@ def test_derivatives_in_every_time_are_those_of_the_solution(name):
         return jnp.concatenate([shown, jnp.stack([ts[0], JUMP + ts[1]])])
 
     want = jax.jacfwd(truth)(given)
-    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=tol, atol=tol)  # noqa: E731
     forward = jax.jit(jax.jacfwd(by("forward")))(given)
-    jax.tree_util.tree_map(close, forward, want)
+    assert_close(forward, want, tol)
     if name != "Picard":
         backward = jax.jit(jax.jacrev(by("reverse")))(given)
-        jax.tree_util.tree_map(close, backward, want)
+        assert_close(backward, want, tol)
 
 
 ENDS = list(
@@ -147,8 +151,7 @@ def test_dense_output_stays_where_it_is_and_moves_with_its_own_time(name, adjoin
     found = jax.jit(derivative(between))(given)
     truth = lambda v: jnp.stack([exact(v[0], v[1], v[3]), exact(v[0], v[1], v[2])])  # noqa: E731
     # Within a step x_h is of the order of the stage polynomial.
-    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)  # noqa: E731
-    jax.tree_util.tree_map(close, found, jax.jacfwd(truth)(given))
+    assert_close(found, jax.jacfwd(truth)(given), 1e-5)
 
 
 @pytest.mark.parametrize(("name", "adjoint"), mostly_thorough(ENDS[:4], {ENDS[0]}))
@@ -172,8 +175,7 @@ def test_a_saved_time_that_meets_a_time_of_the_problem_moves_with_it_from_before
 
     given = tuple(map(jnp.asarray, (START, ETA, END)))
     derivative = jax.jacfwd if adjoint == "forward" else jax.jacrev
-    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=tol, atol=tol)  # noqa: E731
-    jax.tree_util.tree_map(close, jax.jit(derivative(saved))(given), jax.jacfwd(truth)(given))
+    assert_close(jax.jit(derivative(saved))(given), jax.jacfwd(truth)(given), tol)
 
 
 SECOND = list(
@@ -202,8 +204,22 @@ def test_second_derivatives_in_every_time(name, adjoint, within):
     given = tuple(map(jnp.asarray, (START, ETA, END))) + (jnp.asarray(AT),)
     inner = jax.jacfwd if adjoint == "forward" else jax.jacrev
     found = jax.jit(jax.jacfwd(inner(square)))(given)
-    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)  # noqa: E731
-    jax.tree_util.tree_map(close, found, jax.jacfwd(jax.jacrev(truth))(given))
+    assert_close(found, jax.jacfwd(jax.jacrev(truth))(given), 1e-6)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("place", [0, 1], ids=["the jump", "the end"])
+def test_third_derivatives_by_forward_mode(place):
+    method, settings, _ = METHODS["ETD4RK, adaptive"]
+
+    def last(eta, t1):
+        return dvax.solve(
+            problem(), jnp.full(2, X0), START, t1, drive(eta), method=method, adjoint="forward",
+            **settings,
+        ).xs[-1, 0]  # fmt: skip
+
+    third = lambda x: jax.jacfwd(jax.jacfwd(jax.jacfwd(x, place), place), place)(ETA, END)  # noqa: E731
+    assert_close(jax.jit(lambda: third(last))(), third(lambda eta, t: exact(START, eta, t)), 1e-6)
 
 
 def coupled():

@@ -39,8 +39,8 @@ def if_moving(made: Callable[..., Any], kept: Callable[..., Any], t: Any, *given
     @partial(found.defjvp, symbolic_zeros=True)
     def rule(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
         (real, other), (along, _) = primals, tangents
-        way = by(kept if _is_zero(along[0]) else made)
-        return jax.jvp(lambda real: way(real, other), (real,), (_filled(along),))
+        way = by(kept if is_zero(along[0]) else made)
+        return jax.jvp(lambda real: way(real, other), (real,), (filled(along),))
 
     return found(real, other)
 
@@ -73,7 +73,7 @@ def _moved(rate: Callable[..., Tree], *moving: Any) -> Tree:
     def rule(primals: tuple, tangents: tuple) -> tuple[Tree, Tree]:
         x, shift, t, real, other = primals
         along, by, later, turn, _ = tangents
-        along, later, turn = map(_filled, (along, later, turn))
+        along, later, turn = map(filled, (along, later, turn))
 
         def both(s: Any, pair: tuple, given: Any, other: Any) -> tuple:
             """The flow with its variation: a tangent goes along with it."""
@@ -82,7 +82,7 @@ def _moved(rate: Callable[..., Tree], *moving: Any) -> Tree:
             return jax.jvp(own, (s, pair[0], real), (later, pair[1], turn))
 
         out, along = _moved(both, (x, along), shift, t, (real, later, turn), other)
-        if _is_zero(by):
+        if is_zero(by):
             return out, along
         return out, _plus(along, by, rate(t + shift, out, real, other))
 
@@ -105,7 +105,7 @@ def _moved_back(rate: Callable[..., Tree], *moving: Any) -> Tree:
 
     def backward(kept: Any, bar: Any) -> Any:
         moves, x, shift, t, real, other = kept
-        bar = _filled(bar)
+        bar = filled(bar)
         later, along, turn = _turned(rate, bar, shift, t, x, real, other)
         by = jnp.zeros_like(shift)
         if moves.value:
@@ -163,12 +163,13 @@ def arrivals(ts: Any, xs: Tree, flow: Flow, ends: tuple[Any, Any]) -> Tree:
     return jax.vmap(lambda t, x: arriving(t, x, flow, ends))(ts, xs)
 
 
-def _filled(tangents: Any) -> Any:
-    real = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype) if _is_zero(leaf) else leaf  # noqa: E731
-    return jtu.tree_map(real, tangents, is_leaf=_is_zero)
+def filled(tangents: Any) -> Any:
+    """With zeros in the place of those that JAX says are none."""
+    real = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype) if is_zero(leaf) else leaf  # noqa: E731
+    return jtu.tree_map(real, tangents, is_leaf=is_zero)
 
 
-def _is_zero(leaf: Any) -> bool:
+def is_zero(leaf: Any) -> bool:
     return isinstance(leaf, jax.custom_derivatives.SymbolicZero)
 
 

@@ -26,7 +26,7 @@ from .._one_function import in_one_function
 from .._tree import Tree
 from .checkpoints import Checkpoints, Stack, how_many
 from .loop import Loop, Record, Saved, State, slack
-from .moving import arriving, still
+from .moving import arriving, filled, is_zero, still
 from .stepper import inside, local
 
 
@@ -292,16 +292,11 @@ class _Backward:
         return lax.while_loop(lambda c: (c[-1] >= 0) & (ts[c[-1]] > t0 + slack(t0)), one, carry)
 
 
-def _is_zero(leaf: Any) -> bool:
-    return isinstance(leaf, jax.custom_derivatives.SymbolicZero)
-
-
 def _given(cotangents: Any) -> Any:
     """None where none of them is asked for."""
-    if all(map(_is_zero, jtu.tree_leaves(cotangents, is_leaf=_is_zero))):
+    if all(map(is_zero, jtu.tree_leaves(cotangents, is_leaf=is_zero))):
         return None
-    real = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype) if _is_zero(leaf) else leaf  # noqa: E731
-    return jtu.tree_map(real, cotangents, is_leaf=_is_zero)
+    return filled(cotangents)
 
 
 def _no_tangent(leaf: Any) -> Any:
