@@ -8,6 +8,7 @@ from ..section import Section
 CASES = (
     "field",
     "point",
+    "saving",
     "siconos",
     "tools",
     "work_precision",
