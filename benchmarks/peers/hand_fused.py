@@ -64,6 +64,23 @@ def as_constants(law: ContactLaw, h: float) -> Callable[[Any, int], Any]:
     return lambda x0, steps: jax.block_until_ready(loop(g, x0, steps))
 
 
+def saved(law: ContactLaw, h: float, steps: int) -> Callable[[Any], Any]:
+    """x0 -> the states before and after every step, by a scan."""
+    given, g = _arrays(law, h)
+
+    @jax.jit
+    def states(given: Numbers, g: Any, x0: Any) -> Any:
+        step = _step(given, g)
+
+        def turn(x: Any, _: Any) -> tuple[Any, Any]:
+            return step(x), x
+
+        last, before = lax.scan(turn, x0, length=steps)
+        return jnp.concatenate([before, last[None]])
+
+    return lambda x0: jax.block_until_ready(states(given, g, x0))
+
+
 def gradient(law: ContactLaw, h: float, steps: int) -> Callable[[Any], dict[str, Any]]:
     """x0 -> the derivatives of Σx with respect to b_x, d_x and ℓ, by jax.grad through a scan."""
     letters = ("b_x", "d_x", "ell")

@@ -22,6 +22,16 @@ def largest_of_batch(count: jax.Array) -> jax.Array:
     return _largest_p.bind(count)
 
 
+def own_turn(condition: jax.Array) -> jax.Array:
+    """True, and under `jax.vmap` the condition: whether the turn of a loop that goes on while *any*
+    problem of a batch needs it (`any_of_batch`) is one of this problem's own.
+
+    A loop on a condition of each problem's own would, after every turn, choose between old and new for
+    all that it carries. Here what is written row by row need not be chosen as a whole.
+    """
+    return _own_p.bind(condition)
+
+
 def _shared(name: str, join) -> Primitive:
     primitive = Primitive(name)
     primitive.def_impl(lambda value: value)
@@ -36,3 +46,9 @@ def _shared(name: str, join) -> Primitive:
 
 _any_p = _shared("any_of_batch", jnp.any)
 _largest_p = _shared("largest_of_batch", jnp.max)
+
+_own_p = Primitive("own_turn")
+_own_p.def_impl(jnp.ones_like)
+_own_p.def_abstract_eval(lambda value: value)
+mlir.register_lowering(_own_p, mlir.lower_fun(jnp.ones_like, multiple_results=False))
+batching.primitive_batchers[_own_p] = lambda given, axes: (given[0], axes[0])

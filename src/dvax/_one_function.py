@@ -26,30 +26,39 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, Var, jaxpr_as_fun, new_jaxpr_eqn
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
+from jax.lax import GatherScatterMode
 
 _ATTRIBUTES = {"inlineable": "false", "xla_cpu_small_call": "true"}
 
-_LARGEST = 1000
-"""Entries of an array that is computed or handed over. A larger one that turns out to be constant stops
-the compiler; and several cores are then worth more than few kernels."""
+_LONGEST = 10**6
+"""Entries of all that is handed over: tables, of which a part at a time is read."""
+_LARGEST = 8192
+"""Entries of an array that is computed: for a larger one, cores are worth more than few kernels."""
+_COSTLY = 500
+"""The same, of a function that costs many times as much as a product."""
 _SUMMED = 2048
 """Entries of an array that is reduced: of larger ones XLA makes calls of a library."""
 _SIDE = 5
 """Of a matrix that a matrix is multiplied by: larger ones are calls of a library as well."""
 
 _ENTRYWISE = frozenset(
-    "abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp complex conj "
-    "convert_element_type copy cos cosh div eq erf exp exp2 expm1 floor ge gt imag integer_pow "
-    "is_finite le log log1p logistic lt max min mul ne neg nextafter not or pow real rem round rsqrt "
-    "select_n shift_left shift_right_arithmetic shift_right_logical sign sin sinh sqrt square "
-    "bitcast_convert_type stop_gradient sub tan tanh xor any_of_batch largest_of_batch".split()
+    "abs add add_any and ceil clamp complex conj convert_element_type copy div eq floor ge gt imag "
+    "integer_pow is_finite le lt max min mul ne neg nextafter not or real rem round rsqrt select_n "
+    "shift_left shift_right_arithmetic shift_right_logical sign sqrt square bitcast_convert_type sub "
+    "xor any_of_batch largest_of_batch own_turn".split()
+)
+_FUNCTIONS = frozenset(
+    "acos acosh asin asinh atan atan2 atanh cbrt cos cosh erf exp exp2 expm1 log log1p logistic pow "
+    "sin sinh tan tanh".split()
 )
 _MOVES = frozenset(
-    "broadcast_in_dim concatenate expand_dims iota pad reshape rev slice split squeeze stack "
-    "transpose".split()
+    "concatenate expand_dims iota pad reshape rev slice split squeeze stack transpose".split()
 )
-_PLACES = frozenset("dynamic_slice dynamic_update_slice gather".split())
-"""These touch a part of an array, which may be as large as it likes."""
+_PLACES = {"dynamic_slice": None, "gather": None, "dynamic_update_slice": 1, "scatter": 2}
+"""These touch a part of an array, which may be as large as it likes: the part is what comes out, or the
+argument of this number."""
+_MEMORY = frozenset("broadcast_in_dim stop_gradient".split())
+"""How arrays begin that are then filled part by part, and what does nothing."""
 _SUMS = frozenset(
     "argmax argmin reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum".split()
 )
@@ -58,34 +67,52 @@ _CONTROL = frozenset(
 )
 
 
-def in_one_function(run: Callable[..., Any], *args: Any, computed: Any = ()) -> Any:
+def in_one_function(
+    run: Callable[..., Any],
+    *args: Any,
+    computed: Any = (),
+    otherwise: Callable[..., Any] | None = None,
+) -> Any:
     """run(*args, *computed), compiled as one function where it is small and this is a CPU. What another
-    such function has `computed` may be as large as it likes."""
+    such function has `computed` may be as large as it likes.
+
+    A batch of it and its derivatives are such functions too; unless there is another way to the same
+    result, which is then taken `otherwise`, and can be transposed. It closes over no number."""
     arrays, static = eqx.partition((args, computed), eqx.is_array)
     leaves, tree = jtu.tree_flatten(arrays)
     large = [False] * len(jtu.tree_leaves(arrays[0])) + [True] * len(jtu.tree_leaves(arrays[1]))
     if not (_available() and _can_pack(_small_ones(leaves, large))):
-        return run(*args, *computed)
+        return (otherwise or run)(*args, *computed)
     rest: list[Any] = []
 
-    def flat(*leaves: Any) -> list[Any]:
-        args, computed = eqx.combine(jtu.tree_unflatten(tree, leaves), static)
-        out, kept = eqx.partition(run(*args, *computed), eqx.is_array)
-        found, shape = jtu.tree_flatten(out)
-        rest[:] = [kept, shape]
-        return found
+    def flattened(run: Callable[..., Any]) -> Callable[..., list[Any]]:
+        def flat(*leaves: Any) -> list[Any]:
+            args, computed = eqx.combine(jtu.tree_unflatten(tree, leaves), static)
+            out, kept = eqx.partition(run(*args, *computed), eqx.is_array)
+            found, shape = jtu.tree_flatten(out)
+            rest[:] = [kept, shape]
+            return found
 
-    found = _called(flat, leaves, large)
+        return flat
+
+    other = None if otherwise is None else flattened(otherwise)
+    found = _called(flattened(run), leaves, large, other)
     return eqx.combine(jtu.tree_unflatten(rest[1], found), rest[0])
 
 
-def _called(flat: Callable[..., list[Any]], leaves: list[Any], large: list[bool]) -> list[Any]:
+def _called(
+    flat: Callable[..., list[Any]],
+    leaves: list[Any],
+    large: list[bool],
+    otherwise: Callable[..., list[Any]] | None = None,
+) -> list[Any]:
     """flat(*leaves), as one function where it is small."""
     opened, consts = _opened(jax.make_jaxpr(flat)(*leaves))
-    leaves, large = [*consts, *leaves], [False] * len(consts) + large
-    if not (_can_pack(_small_ones(leaves, large)) and _is_small(opened)):
-        return jaxpr_as_fun(opened)(*leaves)
-    return _one_p.bind(*leaves, program=opened, large=tuple(large))
+    whole, large = [*consts, *leaves], [False] * len(consts) + large
+    if not (_can_pack(_small_ones(whole, large)) and _is_small(opened)):
+        return jaxpr_as_fun(opened)(*whole) if otherwise is None else otherwise(*leaves)
+    other = None if otherwise is None else lambda *given: otherwise(*given[len(consts) :])
+    return _one_p.bind(*whole, program=opened, large=tuple(large), otherwise=other)
 
 
 def _opened(program: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
@@ -118,11 +145,11 @@ def _small_ones(leaves: list[Any], large: Any) -> list[Any]:
     return [leaf for leaf, is_large in zip(leaves, large, strict=True) if not is_large]
 
 
-def _as_it_is(*leaves: Any, program: ClosedJaxpr, large: Any) -> list[Any]:
+def _as_it_is(*leaves: Any, program: ClosedJaxpr, **_: Any) -> list[Any]:
     return jaxpr_as_fun(program)(*leaves)
 
 
-def _as_one(*leaves: Any, program: ClosedJaxpr, large: Any) -> list[Any]:
+def _as_one(*leaves: Any, program: ClosedJaxpr, large: Any, **_: Any) -> list[Any]:
     """The call with its attributes. The compiler stops at an argument that turns out to be of no use,
     or at a long one that turns out to be constant: so the small ones are packed into one, and of the
     large ones an entry is returned."""
@@ -138,28 +165,32 @@ def _as_one(*leaves: Any, program: ClosedJaxpr, large: Any) -> list[Any]:
         return jaxpr_as_fun(program)(*whole), [leaf.ravel()[0] for leaf in many]
 
     many = [leaf for leaf, is_large in zip(leaves, large, strict=True) if is_large]
-    marked: Any = set_xla_metadata(jax.jit(call)(_packed(few), many), **_ATTRIBUTES)
+    # Something computed goes along with the small ones: all constant, they would be a long constant.
+    packed = _packed([*few, *(leaf.ravel()[:1] for leaf in many)])
+    marked: Any = set_xla_metadata(jax.jit(call)(packed, many), **_ATTRIBUTES)
     return marked[0]
 
 
 _one_p = Primitive("one_function")
 _one_p.multiple_results = True
 _one_p.def_impl(lambda *leaves, **params: jax.jit(partial(_as_it_is, **params))(*leaves))
-_one_p.def_abstract_eval(lambda *leaves, program, large: program.out_avals)
+_one_p.def_abstract_eval(lambda *leaves, program, **_: program.out_avals)
 mlir.register_lowering(_one_p, mlir.lower_fun(_as_it_is, multiple_results=True))
 mlir.register_lowering(
     _one_p, mlir.lower_fun(_as_one, multiple_results=True), platform="cpu", cacheable=False
 )
 
 
-def _batched(leaves: Any, axes: Any, *, program: ClosedJaxpr, large: Any) -> tuple[Any, Any]:
-    """A batch is compiled as any program."""
-    found = jax.vmap(jaxpr_as_fun(program), in_axes=tuple(axes))(*leaves)
+def _batched(
+    leaves: Any, axes: Any, *, program: ClosedJaxpr, large: Any, otherwise: Any
+) -> tuple[Any, Any]:
+    whole = jax.vmap(otherwise or jaxpr_as_fun(program), in_axes=tuple(axes))
+    found = whole(*leaves) if otherwise else _called(whole, list(leaves), list(large))
     return found, [0] * len(found)
 
 
 def _pushed_forward(
-    leaves: Any, tangents: Any, *, program: ClosedJaxpr, large: Any
+    leaves: Any, tangents: Any, *, program: ClosedJaxpr, large: Any, otherwise: Any
 ) -> tuple[Any, Any]:
     """A derivative is a program of its own, small or not, in what moves alone; the values are not taken
     from it, since they may be known, or the same for many directions, where it is not."""
@@ -171,7 +202,7 @@ def _pushed_forward(
 
         def of(*moving: Any) -> list[Any]:
             own = iter(moving)
-            return jaxpr_as_fun(program)(
+            return (otherwise or jaxpr_as_fun(program))(
                 *(next(own) if m else leaf for leaf, m in zip(start, moves, strict=True))
             )
 
@@ -179,9 +210,10 @@ def _pushed_forward(
         pushed = jax.jvp(of, moving, given[count:])[1]
         return [t for t in pushed if t.dtype != jax.dtypes.float0]
 
-    pick = lambda values: [v for v, m in zip(values, moves, strict=True) if m]  # noqa: E731
-    out = _one_p.bind(*leaves, program=program, large=large)
-    found = iter(_called(push, [*leaves, *pick(tangents)], [*large, *pick(large)]))
+    pick = lambda values: _those(values, moves)  # noqa: E731
+    out = _one_p.bind(*leaves, program=program, large=large, otherwise=otherwise)
+    given = [*leaves, *pick(tangents)]
+    found = iter(push(*given) if otherwise else _called(push, given, [*large, *pick(large)]))
     zero: Any = ad.Zero
     pushed = [
         next(found)
@@ -196,15 +228,22 @@ def _of_use(used: list[bool], eqn: Any) -> tuple[list[bool], Any]:
     """Without the outputs that nobody looks at, and what leads to them alone."""
     if not any(used):
         return [False] * len(eqn.invars), None
-    jaxpr, needed = pe.dce_jaxpr(eqn.params["program"].jaxpr, used)
-    large = [v for v, n in zip(eqn.params["large"], needed, strict=True) if n]
-    params = {"program": ClosedJaxpr(jaxpr, ()), "large": tuple(large)}
+    large, otherwise = eqn.params["large"], eqn.params["otherwise"]
+    other = otherwise and (lambda *given: _those(otherwise(*given), used))
+    # What is otherwise done may lead there from other inputs.
+    jaxpr, needed = pe.dce_jaxpr(eqn.params["program"].jaxpr, used, instantiate=bool(otherwise))
+    params = {
+        "program": ClosedJaxpr(jaxpr, ()), "large": tuple(_those(large, needed)), "otherwise": other
+    }  # fmt: skip
     new = new_jaxpr_eqn(
-        [v for v, n in zip(eqn.invars, needed, strict=True) if n],
-        [v for v, u in zip(eqn.outvars, used, strict=True) if u],
-        eqn.primitive, params, eqn.effects, eqn.source_info, eqn.ctx,
+        _those(eqn.invars, needed), _those(eqn.outvars, used), eqn.primitive, params, eqn.effects,
+        eqn.source_info, eqn.ctx,
     )  # fmt: skip
     return needed, new
+
+
+def _those(values: Any, wanted: list[bool]) -> list[Any]:
+    return [value for value, is_wanted in zip(values, wanted, strict=True) if is_wanted]
 
 
 batching.primitive_batchers[_one_p] = _batched
@@ -214,7 +253,7 @@ pe.dce_rules[_one_p] = _of_use
 
 def _can_pack(leaves: list[Any]) -> bool:
     known = all(leaf.dtype == bool or jnp.issubdtype(leaf.dtype, jnp.number) for leaf in leaves)
-    return known and 0 < sum(leaf.size for leaf in leaves) <= _LARGEST
+    return known and 0 < sum(leaf.size for leaf in leaves) <= _LONGEST
 
 
 def _packed(leaves: list[Any]) -> jax.Array:
@@ -247,8 +286,8 @@ def _unpacked(packed: jax.Array, like: list[Any]) -> list[jax.Array]:
     return leaves
 
 
-def _few(arrays: list[Any]) -> bool:
-    return all(math.prod(jnp.shape(array)) <= _LARGEST for array in arrays)
+def _few(arrays: list[Any], most: int = _LARGEST) -> bool:
+    return all(math.prod(jnp.shape(array)) <= most for array in arrays)
 
 
 def _is_small(program: ClosedJaxpr) -> bool:
@@ -259,18 +298,28 @@ def _is_known(eqn: Any) -> bool:
     name = eqn.primitive.name
     if name in _CONTROL:
         return all(map(_is_small, _inner(eqn.params)))
-    if name == "broadcast_in_dim" and not eqn.invars[0].aval.shape:
-        return True  # how arrays begin that are then filled part by part
+    if name in _MEMORY:
+        return True
     if name in _PLACES:
-        part = eqn.invars[1] if name == "dynamic_update_slice" else eqn.outvars[0]
-        return _few([part.aval])
+        place = _PLACES[name]
+        part = eqn.outvars[0] if place is None else eqn.invars[place]
+        return _few([part.aval]) and (name != "scatter" or _is_one_place(eqn))
     if not _few([v.aval for v in eqn.outvars]):
         return False
     if name == "dot_general":
         return _is_plain_product(eqn)
     if name in _SUMS:
         return math.prod(eqn.invars[0].aval.shape) <= _SUMMED
+    if name in _FUNCTIONS:
+        return _few([v.aval for v in eqn.outvars], _COSTLY)
     return name in _ENTRYWISE or name in _MOVES
+
+
+def _is_one_place(eqn: Any) -> bool:
+    """A row that is written into the same place for all of a batch: of scatters only this can be
+    compiled so, since XLA takes it for what it was."""
+    indices = eqn.invars[1].aval.shape
+    return math.prod(indices[:-1]) == 1 and eqn.params["mode"] == GatherScatterMode.CLIP
 
 
 def _is_plain_product(eqn: Any) -> bool:

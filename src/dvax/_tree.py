@@ -49,6 +49,12 @@ def put(table: Tree, index: Any, row: Tree) -> Tree:
     )
 
 
+def put_if(condition: Any, table: Tree, index: Any, row: Tree) -> Tree:
+    """The same, where the condition holds. (To choose between two tables would be to copy one.)"""
+    kept = jtu.tree_map(lambda leaf: lax.dynamic_index_in_dim(leaf, index, 0, False), table)
+    return put(table, index, where(condition, row, kept))
+
+
 def zeros_like(a: Tree) -> Tree:
     return jtu.tree_map(jnp.zeros_like, a)
 

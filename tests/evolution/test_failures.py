@@ -51,6 +51,15 @@ def test_nan_stops_the_run_and_the_function_the_time_and_the_component_are_named
     np.testing.assert_allclose(np.asarray(sol.xs[:, 2]), -np.exp(-sol.ts), atol=1e-3)
 
 
+@pytest.mark.parametrize("dt", [0.02, 0.1])
+def test_what_was_saved_at_the_end_of_steps_before_a_failure_is_kept(dt):
+    ts = np.linspace(0.0, 2.0, 21)
+    sol = dvax.solve(system("f"), jnp.array([0.5, 0.8, 0.9]), 0.0, 2.0, ts=ts, dt=dt, throw=False)
+    assert sol.result == RESULTS.nonfinite
+    np.testing.assert_array_equal(sol.ts, ts[:8])
+    np.testing.assert_allclose(sol.xs[:, 2], 0.9 * np.exp(-2 * ts[:8]), atol=1e-2)
+
+
 def test_without_throw_the_result_says_it():
     sol = dvax.solve(system("f"), jnp.zeros(3), 0.0, 2.0, rtol=1e-3, throw=False)
     assert sol.result == RESULTS.nonfinite

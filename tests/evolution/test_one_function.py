@@ -1,6 +1,8 @@
 """Small loops as one function of the processor: where they are, that nothing else changes, and that
 what the compiler cannot do is never asked of it."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,6 +37,13 @@ SMALL = {
     "a matrix product": lambda k, v: jnp.sum(0.1 * (jnp.outer(v, v) @ jnp.outer(v, v)), axis=0),
     "places": lambda k, v: jax.lax.dynamic_update_index_in_dim(v, v[k % N] + 1.0, N - 1, 0),
     "sorting by hand": lambda k, v: v[jnp.argmin(v)] + v / jnp.max(jnp.abs(v)),
+    "the same row for a batch": lambda k, v: jnp.sum(
+        jax.vmap(lambda w: jax.lax.dynamic_update_index_in_dim(w, 1.0, k % N, 0))(
+            0.1 * jnp.outer(v, v)
+        ),
+        axis=0,
+    ),
+    "much arithmetic": lambda k, v: v + jnp.outer(jnp.ones(1600), v)[k] / jnp.ones(8000)[k],
     "nothing of v": lambda k, v: jnp.ones(N) * 3.0,
 }
 LARGE = {
@@ -43,7 +52,15 @@ LARGE = {
     "a solve": lambda k, v: jnp.linalg.solve(jnp.eye(N) + jnp.outer(v, v), v),
     "sorting": lambda k, v: jnp.sort(v) + 1.0,
     "a scatter": lambda k, v: v.at[jnp.array([0, 0, k % N])].add(1.0),
-    "a long array": lambda k, v: v + jnp.sum(jnp.ones(4000) * v[0]) / 4000.0,
+    "a row for each of a batch": lambda k, v: jnp.sum(
+        jax.vmap(lambda w, k: jax.lax.dynamic_update_index_in_dim(w, 1.0, k, 0))(
+            jnp.outer(v, v), jnp.arange(N) + k % 2
+        ),
+        axis=0,
+    ),
+    "a long array": lambda k, v: v + jnp.max(jnp.ones(20000) * v[0]),
+    "a long sum": lambda k, v: v + jnp.sum(jnp.ones(4000) * v[0]) / 4000.0,
+    "many values of a function": lambda k, v: v + jnp.max(jnp.sin(jnp.ones(2000) * v[0])),
     "a call back": lambda k, v: jax.pure_callback(np.sin, v, v),
 }
 
@@ -126,14 +143,18 @@ def test_what_is_closed_over_is_handed_over():
 
 @pytest.mark.parametrize("equal", [True, False])
 def test_arrays_written_into_a_function_are_handed_over_once(equal):
-    # New ones at each of its five places: together they are more than is handed over.
+    # New ones at each of its five places.
     def run(v):
         weights = [np.full(300, 1.0 + (0 if equal else place)) for place in range(5)]
         return looped(lambda k, v: v * sum(jnp.sin(w)[k] for w in weights) / 5.0)(v)
 
-    assert is_one(compiled(run, V)) == equal
+    program = compiled(run, V)
+    assert is_one(program)
+    assert f"Arg_0.1: f64[{N + 300 * (1 if equal else 5)}]" in re.sub(
+        r"Arg_0\.\d+", "Arg_0.1", program.as_text()
+    )
     rate = np.mean(np.sin(1.0 + (0 if equal else np.arange(5))))
-    np.testing.assert_allclose(compiled(run, V)(V), rate**7 * V, rtol=1e-13)
+    np.testing.assert_allclose(program(V), rate**7 * V, rtol=1e-13)
 
 
 def test_numbers_that_take_the_type_of_what_they_meet_still_do():
@@ -148,20 +169,49 @@ def test_numbers_that_take_the_type_of_what_they_meet_still_do():
 
 def test_constants_may_be_arguments_and_everything_may_be_constant():
     run = looped(lambda k, v: 0.5 * v + 1.0)
-    for n in (5, 999):
-        v = np.linspace(0.0, 1.0, n)
+    for n in (5, 999, 8000):
+        v = np.random.default_rng(0).normal(size=n)
         np.testing.assert_allclose(
             jax.jit(lambda v=v: one.in_one_function(run, jnp.asarray(v)))(), run(v)
         )
 
 
-def test_a_batch_and_a_derivative_are_compiled_as_any_program():
+@pytest.mark.parametrize("n", [9, 3000, 50_000])
+def test_constants_as_long_as_they_like_go_along_with_what_was_computed(n):
+    # The compiler ends the process over a long constant beside another argument.
+    table = jnp.asarray(np.random.default_rng(0).normal(size=n))
+
+    def first(v, t):
+        def turn(k, carry):
+            v, rows = carry
+            return v * t[k], jax.lax.dynamic_update_index_in_dim(rows, v[0], k, 0)
+
+        return jax.lax.fori_loop(0, 7, turn, (v, jnp.zeros(n)))
+
+    def second(v, t, rows):
+        return looped(lambda k, v: v + t[k] * rows[k])(v)
+
+    def whole(v, t):
+        rows = one.in_one_function(first, v, t)[1]
+        return one.in_one_function(second, v, t, computed=(rows,))
+
+    exact = second(V, table, first(V, table)[1])
+    for found in (
+        jax.jit(lambda: whole(V, table))(),
+        jax.jit(lambda v: whole(v, table))(V),
+        jax.jit(whole)(V, table),
+    ):
+        np.testing.assert_allclose(found, exact)
+
+
+def test_a_batch_and_a_derivative_are_programs_of_their_own():
     run = looped(lambda k, v: jax.lax.dynamic_update_index_in_dim(jnp.sin(v), v[k % N], 1, 0))
     whole = lambda v: one.in_one_function(run, v)  # noqa: E731
-    many = jnp.stack([V * s for s in np.linspace(0.5, 2.0, 700)])
-    batch = jax.jit(jax.vmap(whole)).lower(many).compile()
-    assert not is_one(batch)
-    np.testing.assert_allclose(batch(many), jax.vmap(run)(many), rtol=1e-13)
+    for lanes in (20, 700):
+        many = jnp.stack([V * s for s in np.linspace(0.5, 2.0, lanes)])
+        batch = jax.jit(jax.vmap(whole)).lower(many).compile()
+        assert is_one(batch) == (lanes == 20)
+        np.testing.assert_allclose(batch(many), jax.vmap(run)(many), rtol=1e-13)
     derivative = jax.jit(lambda v: jax.jvp(whole, (v,), (v,))).lower(V).compile()
     assert is_one(derivative)
     for found, exact in zip(derivative(V), jax.jvp(run, (V,), (V,)), strict=True):
@@ -174,6 +224,31 @@ def test_all_directions_at_once_are_a_batch():
     run = lambda v: looped(lambda k, v: jnp.tanh(M @ v))(v)  # noqa: E731
     whole = jax.jit(jax.jacfwd(lambda v: one.in_one_function(run, v)))
     np.testing.assert_allclose(whole(v), jax.jacfwd(run)(v), atol=1e-14)
+
+
+def test_where_there_is_another_way_it_is_taken_for_a_batch_and_for_derivatives_of_both_modes():
+    in_turn = lambda a, v: jax.lax.map(lambda s: a * s**2, v)  # noqa: E731
+    asked = []
+
+    def at_once(a, v):
+        asked.append(v.shape)
+        return a * v**2
+
+    def whole(a, v):
+        return one.in_one_function(in_turn, a, computed=(v,), otherwise=at_once)
+
+    program = jax.jit(whole).lower(2.0, V).compile()
+    assert is_one(program) and not asked
+    np.testing.assert_allclose(program(2.0, V), 2.0 * V**2)
+    slope = jax.jit(jax.grad(lambda a, v: jnp.sum(whole(a, v)), argnums=(0, 1)))(2.0, V)
+    np.testing.assert_allclose(slope[0], jnp.sum(V**2))
+    np.testing.assert_allclose(slope[1], 4.0 * V)
+    pushed = jax.jvp(jax.jit(lambda v: whole(2.0, v)), (V,), (V,))[1]
+    np.testing.assert_allclose(pushed, 4.0 * V**2)
+    np.testing.assert_allclose(jax.vmap(whole, (0, None))(V, V), jnp.outer(V, V**2))
+    assert asked
+    monitored = jax.jit(lambda v: jax.jvp(lambda v: whole(2.0, v)[0], (v,), (v,))[1])
+    np.testing.assert_allclose(monitored(V), 4.0 * V[0] ** 2)
 
 
 def test_what_does_not_move_has_no_derivative_to_go_wrong():

@@ -1,11 +1,13 @@
 """Saved times, dense output, and states that are tuples."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.closed_forms import c1, c2, c3
+from tests.closed_forms import c1, c1_solution, c2, c3
 
 import dvax
+from dvax.evolution import RESULTS
 
 
 def test_dense_output_saved_times_and_the_exact_solution_agree():
@@ -37,6 +39,73 @@ def test_the_same_time_may_be_asked_for_twice_and_fixed_steps_save_between_steps
     assert float(sol.xs[1]) == float(sol.xs[2])
     exact = [float(c1().exact(t)[0]) for t in ts]
     np.testing.assert_allclose(np.asarray(sol.xs), exact, atol=1e-4)
+
+
+ENDS = np.linspace(0.0, 2.0, 201)
+"""Of the steps of a run with dt = 0.01."""
+TIMES = {
+    "every step": ENDS,
+    "every seventh": ENDS[3::7],
+    "between all of them": 0.5 * (ENDS[1:] + ENDS[:-1]),
+    "some of each": np.sort(np.concatenate([ENDS[::3], ENDS[50:60], [0.005, 0.0051, 1.9999, 2.0]])),
+    "rounded": np.nextafter(ENDS[1:-1], np.where(np.arange(199) % 2, 0.0, 3.0)),
+}
+
+
+@pytest.mark.parametrize("which", TIMES)
+def test_rows_are_written_as_steps_end_or_from_inside_them(which):
+    """Of the same steps, whichever are saved: against the dense output, and in a batch, where the
+    steps of each end elsewhere and one of the runs fails."""
+    problem, args, ts = c1().problem, c1().args, TIMES[which]
+    dense = dvax.solve(problem, -1.0, 0.0, 2.0, args, dt=0.01, dense=True)
+    found = dvax.solve(problem, -1.0, 0.0, 2.0, args, dt=0.01, ts=ts)
+    np.testing.assert_array_equal(found.ts, ts)
+    some = np.arange(0, len(ts), max(1, len(ts) // 16))
+    exact = [float(dense.evaluate(ts[k])[0]) for k in some]
+    np.testing.assert_allclose(np.asarray(found.xs)[some], exact, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(found.xs, [c1().exact(t)[0] for t in ts], atol=1e-4)
+    np.testing.assert_allclose(found.us, [c1().exact(t)[1] for t in ts], atol=1e-4)
+    assert found.stats["steps"] == 200
+
+    def run(x0, end):
+        part = dvax.solve(
+            problem, x0, 0.0, end, args, dt=end / 200, ts=0.5 * end * ts, max_steps=200, throw=False
+        )
+        return part.ts, part.xs, part.us, part.stats["steps"], part.result == RESULTS.successful
+
+    x0s, ends = jnp.array([-1.0, jnp.nan, 0.7]), jnp.array([2.0, 1.0, 0.3])
+    together = jax.jit(jax.vmap(run))(x0s, ends)
+    for k in (0, 2):
+        for a, b in zip(together, jax.jit(run)(x0s[k], ends[k]), strict=True):
+            np.testing.assert_allclose(a[k], b, rtol=1e-14, atol=1e-14)
+    assert together[4].tolist() == [True, False, True]
+    np.testing.assert_allclose(together[1][0], found.xs, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("which", ["every step", "some of each"])
+def test_saved_rows_have_the_same_derivatives_by_both_modes(which):
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=len(TIMES[which])))
+
+    def total(x0, ell, adjoint):
+        found = dvax.solve(
+            c1().problem, x0, 0.0, 2.0, (ell,), dt=0.01, ts=TIMES[which], adjoint=adjoint
+        )
+        return jnp.vdot(weights, found.xs) + jnp.vdot(weights, found.us)
+
+    back = jax.grad(total, argnums=(0, 1))(-1.0, 3.0, "reverse")
+    along = jax.jacfwd(total, argnums=(0, 1))(-1.0, 3.0, "forward")
+    np.testing.assert_allclose(back, along, rtol=1e-11)
+    # An oracle that shares nothing: the closed form, by differences.
+    exact = lambda x0, ell: sum(  # noqa: E731
+        w * (x + u)
+        for w, (x, u) in zip(weights, (c1_solution(t, x0, ell) for t in TIMES[which]), strict=True)
+    )
+    step = 1e-6
+    by_hand = [
+        (exact(-1.0 + step, 3.0) - exact(-1.0 - step, 3.0)) / (2 * step),
+        (exact(-1.0, 3.0 + step) - exact(-1.0, 3.0 - step)) / (2 * step),
+    ]
+    np.testing.assert_allclose(back, by_hand, atol=0.02 * float(jnp.sum(jnp.abs(weights))))
 
 
 @pytest.mark.parametrize("t", [-0.1, 2.5])

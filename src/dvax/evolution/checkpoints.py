@@ -43,11 +43,12 @@ class Checkpoints(eqx.Module):
         self.places = jtu.tree_map(lambda v: jnp.zeros((count + 1, *v.shape), v.dtype), like)
         self.j = jnp.asarray(0)
 
-    def put(self, index: Any, x: Tree) -> "Checkpoints":
-        """Step number `index` begins with x. Steps come in order; one may come again."""
-        full = (index >> self.j) >= 2**self.bits
+    def put(self, index: Any, x: Tree, counts: Any = True) -> "Checkpoints":
+        """Step number `index` begins with x, where that `counts`. Steps come in order; one may come
+        again."""
+        full = counts & ((index >> self.j) >= 2**self.bits)
         j = jnp.where(full, self.j + 1, self.j)
-        kept = index == ((index >> j) << j)
+        kept = counts & (index == ((index >> j) << j))
         # What is not kept goes to a place of its own, since not to write would be to copy.
         place = jnp.where(kept, self._place(index >> j, j), 2**self.bits)
         places = _tree.put(self.places, place, x)

@@ -1,6 +1,7 @@
 """A function from a setup to its solution, to be compiled as a whole."""
 
 import dataclasses
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,7 +20,7 @@ from .forward import forward_only
 from .implicit import Implicit
 from .loop import Loop, Record, Saved, State
 from .method import ETD2RK, AbstractMethod
-from .moving import arrivals, arriving, moved, still
+from .moving import arrivals, arriving, moved, shift, still
 from .picard import Picard
 from .results import RESULTS
 from .setup import Setup
@@ -87,8 +88,7 @@ def _implicitly(
         method, flow, setup.x0, stops, ts, steps, first, options.max_steps, options.adjoint,
         options.progress,
     )  # fmt: skip
-    nothing = jnp.zeros_like(end.ts)
-    rows = Saved(end.ts, end.xs, (nothing, nothing), (nothing, nothing))
+    rows = Saved(end.ts, end.xs)
     # What is known of a run that failed is the last saved time that it reached.
     count = jnp.sum(jnp.isfinite(end.ts))
     row = jnp.maximum(count - 1, 0)
@@ -97,7 +97,7 @@ def _implicitly(
     stats = {
         "steps": end.steps, "rejected": end.rejected, "t": t, "x": last, "next_dt": first,
     }  # fmt: skip
-    return _assembled(setup, flow, rows, stats, end.result, None, False)
+    return _assembled(setup, flow, rows, stats, end.result, None)
 
 
 def _by_windows(
@@ -145,7 +145,7 @@ def _by_windows(
     result = RESULTS.where(
         (end.result == RESULTS.successful) & ~complete, RESULTS.max_steps, end.result
     )
-    rows = _end_alone(end, complete, stops[-1]) if saved is None else saved
+    rows = _end_alone(end, complete, stops[-1], True) if saved is None else saved
     if ts is not None:
         rows = _carried(rows, ts, x0, flow, (still(stops[0]), still(stops[-1])), False)
     stats = {
@@ -153,7 +153,7 @@ def _by_windows(
         "next_dt": end.length / method.nodes, "windows": end.windows, "sweeps": end.sweeps,
         "contraction": end.contraction,
     }  # fmt: skip
-    return _assembled(setup, flow, rows, stats, result, end.records, True)
+    return _assembled(setup, flow, rows, stats, result, end.records)
 
 
 def _controller(
@@ -213,14 +213,14 @@ def _solution(
     result = RESULTS.where(
         (result == RESULTS.successful) & ~_tree.all_finite(end.x), RESULTS.nonfinite, result
     )
-    rows = _end_alone(end, complete, t1) if saved is None else saved
+    rows = _end_alone(end, complete, t1, options.measure) if saved is None else saved
     ends = still(controller.stops[0]), still(t1)
     if options.adjoint == "forward" and controller.adapts:
         # States are those at times that stay where they are.
         if saved is None:
             rows, ts = rows._replace(t=still(rows.t)), t1[None]
-        shift = jnp.where(end.steps > 0, end.t - still(end.t), 0.0)
-        end = end._replace(x=moved(end.x, shift, arriving, still(end.t), flow, ends))
+        by = shift(jnp.where(end.steps > 0, end.t, 0.0))
+        end = end._replace(x=moved(end.x, by, arriving, still(end.t), flow, ends))
     if ts is not None:
         rows = _carried(rows, ts, setup.x0, flow, ends, options.adjoint == "reverse")
     stats = {
@@ -231,7 +231,7 @@ def _solution(
         "x": end.x,
         "next_dt": controller.next_length(end.control),
     }
-    return _assembled(setup, flow, rows, stats, result, end.records, options.measure)
+    return _assembled(setup, flow, rows, stats, result, end.records)
 
 
 def _carried(
@@ -240,12 +240,18 @@ def _carried(
     """`rows` with the states at the times `ts`: the two move apart where one is differentiated and the
     other is not. Times that were not reached have no state that could move."""
     reached = rows.t < jnp.inf
-    there = lambda x, y: jnp.where(reached.reshape(-1, *(1,) * (x.ndim - 1)), x, y)  # noqa: E731
     t = jnp.where(reached, rows.t, ends[0])
-    shift = (ts - still(ts)) - (t - still(t))
-    x = jtu.tree_map(there, rows.x, x0)
-    x = moved(x, shift, arrivals, t, flow, ends, transposed=transposed)
-    return rows._replace(t=rows.t + shift, x=jtu.tree_map(there, x, rows.x))
+    apart = shift(jnp.where(reached, ts, ends[0])) - shift(t)
+    given = reached, still(x0), flow, ends
+    x = moved(rows.x, apart, _arrived, t, *given, transposed=transposed)
+    return rows._replace(t=rows.t + apart, x=x)
+
+
+def _arrived(ts: jax.Array, xs: Any, reached: Any, x0: Any, flow: Flow, ends: Any) -> Any:
+    """x' as the run came to those times that it reached; elsewhere 0, whatever there is."""
+    there = lambda x, y: jnp.where(reached.reshape(-1, *(1,) * (x.ndim - 1)), x, y)  # noqa: E731
+    found = arrivals(ts, jtu.tree_map(there, xs, x0), flow, ends)
+    return jtu.tree_map(lambda leaf: there(leaf, 0.0), found)
 
 
 def _assembled(
@@ -255,7 +261,6 @@ def _assembled(
     stats: dict[str, Any],
     result: RESULTS,
     records: Record | None,
-    measured: bool,
 ) -> Solution:
     us, ys, residual, law_step, law_error = _responses(
         flow, rows.t, rows.x, setup.problem.spaces(setup.x0)[1], setup.moduli
@@ -268,10 +273,10 @@ def _assembled(
         law_residual=residual,
         law_step=law_step,
         law_error=law_error,
-        defect=rows.impulse[0] if measured else None,
-        law_defect=rows.impulse[1] if measured else None,
-        settled=rows.settled if measured else None,
-        extent=rows.extent if measured else None,
+        defect=None if rows.impulse is None else rows.impulse[0],
+        law_defect=None if rows.impulse is None else rows.impulse[1],
+        settled=rows.settled,
+        extent=rows.extent,
         stats=stats,
         result=result,
         records=records,
@@ -280,11 +285,17 @@ def _assembled(
     )
 
 
-def _end_alone(end: State | picard.State, complete: Any, t1: Any) -> Saved:
+def _end_alone(end: State | picard.State, complete: Any, t1: Any, measured: bool) -> Saved:
     """The end as the one saved time."""
     x = jtu.tree_map(lambda leaf: jnp.where(complete, leaf, jnp.nan), end.x)
-    one = Saved(jnp.where(complete, t1, jnp.inf), x, end.impulse, end.impulse, end.extent)
+    impulse = end.impulse if measured else None
+    one = Saved(jnp.where(complete, t1, jnp.inf), x, impulse, impulse, end.extent)
     return jtu.tree_map(lambda leaf: leaf[None], one)
+
+
+_BRIEF = 4096
+"""Entries of states whose responses are computed one by one, in one function: for more arithmetic in
+one place than this JAX wakes another thread, which takes longer."""
 
 
 def _responses(flow: Flow, times, xs, control, moduli):
@@ -292,15 +303,24 @@ def _responses(flow: Flow, times, xs, control, moduli):
     gamma, norm_P_inv = moduli.get("gamma"), moduli.get("norm_P_inv")
     tau = 1.0 if moduli.get("L_F") is None else 1.0 / moduli["L_F"]
 
-    def one(t, x):
+    def one(flow, tau, t, x):
         rate = flow.rate(t, x, None)
         K = flow.problem.set_at(t, flow.args)
         frozen = flow.problem.frozen(t, x, flow.args)
         checked = certify(frozen, K, control, rate.y, tau)
         return flow.operator.inverse(rate.y), rate.y, checked.w, _tree.sub(checked.y, rate.y)
 
+    def in_turn(flow, tau, times, xs):
+        return lax.map(lambda row: one(flow, tau, *row), (times, xs))
+
+    def at_once(flow, tau, times, xs):
+        return jax.vmap(partial(one, flow, tau))(times, xs)
+
     def every():
-        return jax.vmap(one)(times, xs)
+        if sum(leaf.size for leaf in jtu.tree_leaves(xs)) > _BRIEF:
+            return at_once(flow, tau, times, xs)
+        rows = {"computed": (times, xs), "otherwise": at_once}
+        return in_one_function(in_turn, flow, tau, **rows)
 
     def nothing():
         return jtu.tree_map(lambda s: jnp.full(s.shape, jnp.nan, s.dtype), jax.eval_shape(every))

@@ -14,12 +14,13 @@ import jax.tree_util as jtu
 from jax import lax
 
 from .. import _tree
+from .._batch import any_of_batch, own_turn
 from .._tree import Tree
 from .checkpoints import Checkpoints
 from .control import AbstractController
 from .extent import Extent
 from .flow import Flow
-from .moving import arriving, moved, still, velocity
+from .moving import arriving, moved, shift, still, velocity
 from .results import RESULTS
 from .stepper import Factors, Memory, Stepper, inside, local, within
 
@@ -39,13 +40,14 @@ class Saved(NamedTuple):
     `impulse` = (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) up to the end of the step that the time lies in, so
     that x_h is the exact solution of the system with a disturbance of that size; `settled` is what
     both were at the start of that step: what has surely acted by then. `extent` says where x_h and u_h
-    have been from the beginning to the end of that step, where it was asked for.
+    have been from the beginning to the end of that step, where it was asked for. None where nothing
+    is measured.
     """
 
     t: Any
     x: Tree
-    impulse: tuple[Any, Any]
-    settled: tuple[Any, Any]
+    impulse: tuple[Any, Any] | None = None
+    settled: tuple[Any, Any] | None = None
     extent: Extent | None = None
 
 
@@ -108,18 +110,14 @@ class Loop(eqx.Module):
         blank = jax.eval_shape(lambda: self._read(state, times[0]))
         rows = jtu.tree_map(lambda s: jnp.zeros((count, *s.shape), s.dtype), blank)
 
-        def visit(k: Any, carry: tuple[State, Saved]) -> tuple[State, Saved]:
-            # One turn more than there are saved times, for the way from the last of them to the end:
-            # it writes the last row once more.
-            state, rows = carry
-            row = jnp.minimum(k, count - 1)
-            state = self._until(state, jnp.where(k < count, times[row], t1))
-            found = _tree.where(
-                k < count, self._read(state, times[row]), jtu.tree_map(lambda leaf: leaf[row], rows)
-            )
-            return state, _tree.put(rows, row, found)
+        def turn(carry: tuple[State, Saved, Any]) -> tuple[State, Saved, Any]:
+            # One turn more than there are saved times, for the way from the last of them to the end.
+            state, rows, row = self._through(*carry, times)
+            rows = _put(rows, row, self._read(state, _at(times, row)))
+            return state, rows, row + 1
 
-        state, rows = lax.fori_loop(0, count + 1, visit, (state, rows))
+        start = state, rows, jnp.asarray(0)
+        state, rows, _ = lax.while_loop(lambda carry: carry[2] <= count, turn, start)
         return rows, state
 
     def _start(self, x0: Tree, saves: bool, checkpoints: Checkpoints | None) -> State:
@@ -158,16 +156,47 @@ class Loop(eqx.Module):
     def _until(self, state: State, time: Any) -> State:
         """Steps until `time` has been reached, or lies in the next step where none is kept."""
 
-        def goes_on(state: State) -> Any:
-            before = state.t < time
-            if state.last is None:
-                before = before & (self.controller.end(state.control) <= time + slack(time))
-            going = state.result == RESULTS.successful
-            return before & going & (state.attempts < self.max_steps)
+        def turn(state: State) -> State:
+            return self._attempt(state, own_turn(self._goes_on(state, time)))
 
-        return lax.while_loop(goes_on, lambda state: self._attempt(state), state)
+        return lax.while_loop(lambda s: any_of_batch(self._goes_on(s, time)), turn, state)
 
-    def _attempt(self, state: State) -> State:
+    def _through(
+        self, state: State, rows: Saved, row: Any, times: jax.Array
+    ) -> tuple[State, Saved, Any]:
+        """Steps until the saved time at hand has been reached or lies in the next one; past those
+        that steps end at, whose rows are written here. Behind the last row, to the end."""
+        t1, count = self.controller.stops[-1], times.shape[0]
+        ahead = lambda row: jnp.where(row < count, _at(times, row), t1)  # noqa: E731
+        if state.last is not None:
+            return self._until(state, ahead(row)), rows, row
+
+        def goes_on(carry: tuple[State, Saved, Any]) -> Any:
+            return self._goes_on(carry[0], ahead(carry[2]))
+
+        def turn(carry: tuple[State, Saved, Any]) -> tuple[State, Saved, Any]:
+            state, rows, row = carry
+            state = self._attempt(state, own_turn(goes_on(carry)))
+            time = _at(times, row)
+            met = time <= state.t + slack(state.t)
+            # Problems of a batch wait for each other at every saved time.
+            over = (row < count) & ~any_of_batch(~met & (state.result == RESULTS.successful))
+            put = lambda: _put(rows, row, self._row(state, time, state.x, met, met))  # noqa: E731
+            rows = lax.cond(over, put, lambda: rows)
+            return state, rows, jnp.where(over, row + 1, row)
+
+        return lax.while_loop(lambda carry: any_of_batch(goes_on(carry)), turn, (state, rows, row))
+
+    def _goes_on(self, state: State, time: Any) -> Any:
+        """Whether a step is to be taken before `time`."""
+        before = state.t < time
+        if state.last is None:
+            before = before & (self.controller.end(state.control) <= time + slack(time))
+        going = state.result == RESULTS.successful
+        return before & going & (state.attempts < self.max_steps)
+
+    def _attempt(self, state: State, own: Any) -> State:
+        """The state after one more attempt, where that is its `own`."""
         begin, end = state.t, self.controller.end(state.control)
         t0, t1, x0 = self._held(begin), self._held(end), self._begun(state, end)
         factors = self._factors(state, t0, t1)
@@ -188,7 +217,7 @@ class Loop(eqx.Module):
             ahead, last = _tree.where(verdict.kept, (ahead, last), (behind, state.last))
         checkpoints = state.checkpoints
         if checkpoints is not None:
-            checkpoints = checkpoints.put(state.steps, state.x)
+            checkpoints = checkpoints.put(state.steps, state.x, own)
         meter = state.meter
         if self.progress:
             stops = self.controller.stops
@@ -196,7 +225,8 @@ class Loop(eqx.Module):
                 meter, (ahead[0] - stops[0]) / (stops[-1] - stops[0])
             )
         t, x, impulse, memory, jumped, extent = ahead
-        return State(
+        put = lambda table, row: _tree.put_if(own, table, state.steps, row)  # noqa: E731
+        after = State(
             t=t,
             x=x,
             impulse=impulse,
@@ -206,14 +236,21 @@ class Loop(eqx.Module):
             jumped=jumped,
             extent=extent,
             last=last,
-            records=None if state.records is None else _tree.put(state.records, state.steps, taken),
-            ends=None if state.ends is None else _tree.put(state.ends, state.steps, end),
-            checkpoints=checkpoints,
+            records=None,
+            ends=None,
+            checkpoints=None,
             result=verdict.result,
             steps=jnp.where(verdict.kept, state.steps + 1, state.steps),
             attempts=state.attempts + 1,
             evaluations=state.evaluations + step.evaluations,
             meter=meter,
+        )
+        tables = {"records": None, "ends": None, "checkpoints": None}
+        after = _tree.where(own, after, state._replace(**tables))
+        return after._replace(
+            records=None if state.records is None else put(state.records, taken),
+            ends=None if state.ends is None else put(state.ends, end),
+            checkpoints=checkpoints,
         )
 
     def _read(self, state: State, time: Any) -> Saved:
@@ -230,25 +267,29 @@ class Loop(eqx.Module):
 
             met = time <= t0 + slack(t0)
             reached = met | ((t1 > time) & (state.result == RESULTS.successful))
-            x = lax.cond(met, lambda: state.x, between)
-            impulse = settled = state.impulse
-        else:
-            record, before = state.last
-            theta = (time - record.start) / jnp.where(record.length > 0, record.length, 1)
-            reached, met = state.t >= time, time >= state.t
-            x = lax.cond(
-                met,
-                lambda: state.x,
-                lambda: self._inside(record, theta, state.memory.guess),
-            )
-            # Inside a step the bound of the whole step is charged: it can only be too large.
-            impulse = _tree.where(theta > 0.0, state.impulse, before)
-            settled = _tree.where(time >= state.t, state.impulse, before)
+            return self._row(state, time, lax.cond(met, lambda: state.x, between), reached, met)
+        record, before = state.last
+
+        theta = (time - record.start) / jnp.where(record.length > 0, record.length, 1)
+        reached, met = state.t >= time, time >= state.t
+        x = lax.cond(met, lambda: state.x, lambda: self._inside(record, theta, state.memory.guess))
+        row = self._row(state, time, x, reached, met)
+        # Inside a step the bound of the whole step is charged: it can only be too large.
+        return row._replace(
+            impulse=_tree.where(theta > 0.0, state.impulse, before),
+            settled=_tree.where(time >= state.t, state.impulse, before),
+        )
+
+    def _row(self, state: State, time: Any, x: Tree, reached: Any, met: Any) -> Saved:
+        """What is kept of the state x at a saved time, which may not have been `reached`; where it was
+        `met`, by the end of a step."""
         x = jtu.tree_map(lambda leaf: jnp.where(reached, leaf, jnp.nan), x)
         # The state at the end of a step moves with it; at the beginning of the run, always.
-        end = jnp.where(state.steps == 0, state.t, now)
-        time = time + jnp.where(met, end - still(end), 0.0)
-        return Saved(jnp.where(reached, time, jnp.inf), x, impulse, settled, state.extent)
+        end = jnp.where(state.steps == 0, state.t, self._held(state.t))
+        time = time + shift(jnp.where(met, end, 0.0))
+        t = jnp.where(reached, time, jnp.inf)
+        impulse = state.impulse if self.stepper.measure else None
+        return Saved(t, x, impulse, impulse, state.extent)
 
     def _held(self, t: Any) -> Any:
         """t, which stands still for the tangents of steps that adapt."""
@@ -262,9 +303,9 @@ class Loop(eqx.Module):
         if not (self.carries and self.controller.adapts):
             return state.x
         t0, flow = still(state.t), self.stepper.flow
-        ends, shift = jtu.tree_map(still, self.stepper.ends), state.t - t0
-        x = moved(state.x, shift, before, t0, flow, ends, state.jumped)
-        return moved(x, -shift, behind, t0 + shift, flow, still(end) - t0, ends, state.jumped)
+        ends, by = jtu.tree_map(still, self.stepper.ends), shift(state.t)
+        x = moved(state.x, by, before, t0, flow, ends, state.jumped)
+        return moved(x, -by, behind, t0 + by, flow, still(end) - t0, ends, state.jumped)
 
     def _factors(self, state: State, t0: Any, t1: Any) -> Factors | None:
         """The propagators of a step, None where it makes its own."""
@@ -299,6 +340,17 @@ def behind(t: Any, x: Tree, flow: Flow, length: Any, ends: tuple[Any, Any], jump
         lambda: velocity(flow, within(t, t + length, 0.0, ends), x),
         lambda: _tree.zeros_like(x),
     )
+
+
+def _at(times: jax.Array, row: Any) -> Any:
+    """The saved time at hand, or the last one."""
+    return times[jnp.minimum(row, times.shape[0] - 1)]
+
+
+def _put(rows: Saved, row: Any, found: Saved) -> Saved:
+    """The table with this row, if it has one."""
+    last = rows.t.shape[0] - 1
+    return _tree.put_if(row <= last, rows, jnp.minimum(row, last), found)
 
 
 def slack(t: Any) -> Any:

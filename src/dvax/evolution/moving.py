@@ -21,6 +21,17 @@ def still(t: Any) -> Any:
     return jax.lax.stop_gradient(t)
 
 
+@jax.custom_jvp
+def shift(t: Any) -> Any:
+    """0, which moves as t does."""
+    return jnp.zeros_like(t)
+
+
+@shift.defjvp
+def _(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
+    return shift(*primals), tangents[0]
+
+
 def if_moving(made: Callable[..., Any], kept: Callable[..., Any], t: Any, *given: Any) -> Any:
     """kept(t, *given), or made(t, *given), of the same value, where t is differentiated. Neither
     closes over a number."""

@@ -23,7 +23,7 @@ from ..generators import AbstractGenerator, AbstractPropagator
 from .control import land
 from .extent import Extent
 from .loop import Record, Saved
-from .moving import still
+from .moving import shift, still
 from .results import RESULTS
 from .stepper import Stepper, inside, within
 
@@ -309,7 +309,7 @@ class Run(eqx.Module):
         impulse = _tree.where(started, state.impulse, state.before)
         settled = _tree.where(time >= state.t, state.impulse, state.before)
         # The state at the end of a window moves with it.
-        time = time + jnp.where(met, state.t - still(state.t), 0.0)
+        time = time + shift(jnp.where(met, state.t, 0.0))
         return Saved(jnp.where(reached, time, jnp.inf), x, impulse, settled, state.extent)
 
 
