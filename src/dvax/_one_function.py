@@ -77,7 +77,7 @@ def in_one_function(
     such function has `computed` may be as large as it likes.
 
     A batch of it and its derivatives are such functions too; unless there is another way to the same
-    result, which is then taken `otherwise`, and can be transposed. It closes over no number."""
+    result, which is then taken `otherwise`, and can be transposed."""
     arrays, static = eqx.partition((args, computed), eqx.is_array)
     leaves, tree = jtu.tree_flatten(arrays)
     large = [False] * len(jtu.tree_leaves(arrays[0])) + [True] * len(jtu.tree_leaves(arrays[1]))
@@ -109,9 +109,16 @@ def _called(
     """flat(*leaves), as one function where it is small."""
     opened, consts = _opened(jax.make_jaxpr(flat)(*leaves))
     whole, large = [*consts, *leaves], [False] * len(consts) + large
-    if not (_can_pack(_small_ones(whole, large)) and _is_small(opened)):
-        return jaxpr_as_fun(opened)(*whole) if otherwise is None else otherwise(*leaves)
-    other = None if otherwise is None else lambda *given: otherwise(*given[len(consts) :])
+    is_one = _can_pack(_small_ones(whole, large)) and _is_small(opened)
+    if otherwise is None:
+        other = None
+        if not is_one:
+            return jaxpr_as_fun(opened)(*whole)
+    else:
+        # Run later, it would find that what it closes over is no more.
+        if not is_one or any(isinstance(const, Tracer) for const in consts):
+            return otherwise(*leaves)
+        other = lambda *given: otherwise(*given[len(consts) :])  # noqa: E731
     return _one_p.bind(*whole, program=opened, large=tuple(large), otherwise=other)
 
 

@@ -251,6 +251,17 @@ def test_where_there_is_another_way_it_is_taken_for_a_batch_and_for_derivatives_
     np.testing.assert_allclose(monitored(V), 4.0 * V[0] ** 2)
 
 
+def test_another_way_may_close_over_what_is_differentiated_or_batched():
+    def whole(a, v):
+        at_once = lambda v: a * v**2  # noqa: E731
+        in_turn = lambda v: jax.lax.map(at_once, v)  # noqa: E731
+        return jax.jit(lambda v: one.in_one_function(in_turn, v, otherwise=at_once))(v)
+
+    slope = jax.jit(jax.grad(lambda a: jnp.sum(whole(a, V))))(2.0)
+    np.testing.assert_allclose(slope, jnp.sum(V**2))
+    np.testing.assert_allclose(jax.jit(jax.vmap(whole, (0, None)))(V, V), jnp.outer(V, V**2))
+
+
 def test_what_does_not_move_has_no_derivative_to_go_wrong():
     run = lambda v, a: looped(lambda k, v: v * jnp.sqrt(a) + jnp.abs(v) ** a)(v)  # noqa: E731
     push = lambda v: jax.jvp(lambda v: one.in_one_function(run, v, jnp.zeros(())), (v,), (v,))  # noqa: E731

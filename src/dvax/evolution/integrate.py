@@ -298,29 +298,16 @@ _BRIEF = 4096
 one place than this JAX wakes another thread, which takes longer."""
 
 
-def _responses(flow: Flow, times, xs, control, moduli):
+def _responses(flow, times, xs, control, moduli):
     """u, y and the certificate C0 of the law at the saved states."""
     gamma, norm_P_inv = moduli.get("gamma"), moduli.get("norm_P_inv")
     tau = 1.0 if moduli.get("L_F") is None else 1.0 / moduli["L_F"]
 
-    def one(flow, tau, t, x):
-        rate = flow.rate(t, x, None)
-        K = flow.problem.set_at(t, flow.args)
-        frozen = flow.problem.frozen(t, x, flow.args)
-        checked = certify(frozen, K, control, rate.y, tau)
-        return flow.operator.inverse(rate.y), rate.y, checked.w, _tree.sub(checked.y, rate.y)
-
-    def in_turn(flow, tau, times, xs):
-        return lax.map(lambda row: one(flow, tau, *row), (times, xs))
-
-    def at_once(flow, tau, times, xs):
-        return jax.vmap(partial(one, flow, tau))(times, xs)
-
     def every():
         if sum(leaf.size for leaf in jtu.tree_leaves(xs)) > _BRIEF:
-            return at_once(flow, tau, times, xs)
-        rows = {"computed": (times, xs), "otherwise": at_once}
-        return in_one_function(in_turn, flow, tau, **rows)
+            return _at_once(flow, control, tau, times, xs)
+        rows = {"computed": (times, xs), "otherwise": _at_once}
+        return in_one_function(_in_turn, flow, control, tau, **rows)
 
     def nothing():
         return jtu.tree_map(lambda s: jnp.full(s.shape, jnp.nan, s.dtype), jax.eval_shape(every))
@@ -333,3 +320,20 @@ def _responses(flow: Flow, times, xs, control, moduli):
     if gamma is not None and norm_P_inv is not None:
         error = norm_P_inv * (residual / gamma + step)
     return us, ys, residual, step, error
+
+
+def _at_once(flow, control, tau, times, xs):
+    return jax.vmap(partial(_response, flow, control, tau))(times, xs)
+
+
+def _in_turn(flow, control, tau, times, xs):
+    return lax.map(lambda row: _response(flow, control, tau, *row), (times, xs))
+
+
+def _response(flow, control, tau, t, x):
+    """u, y, and what certifies it."""
+    rate = flow.rate(t, x, None)
+    K = flow.problem.set_at(t, flow.args)
+    frozen = flow.problem.frozen(t, x, flow.args)
+    checked = certify(frozen, K, control, rate.y, tau)
+    return flow.operator.inverse(rate.y), rate.y, checked.w, _tree.sub(checked.y, rate.y)
