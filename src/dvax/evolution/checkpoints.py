@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 
 from .. import _tree
 from .._tree import Tree
@@ -96,7 +95,7 @@ class Stack(NamedTuple):
 
     def push(self, step: Any, x: Tree) -> "Stack":
         places = _tree.put(self.places, self.order[self.height], x)
-        return Stack(places, self.order, self.at.at[self.height].set(step), self.height + 1)
+        return Stack(places, self.order, _tree.put(self.at, self.height, step), self.height + 1)
 
     def pop(self) -> "Stack":
         return self._replace(height=self.height - 1)
@@ -109,9 +108,10 @@ class Stack(NamedTuple):
         nearly, with the least r that will do.
         """
         apart, free = target - self.step, len(self.order) - self.height
-        turns = np.arange(1, _TURNS + 1)
-        more = (free + (turns - 1)).astype(jnp.float32) / turns.astype(np.float32)
-        r = 1 + jnp.sum(jnp.cumprod(more) < apart.astype(jnp.float32))
+        r, reach = 1, jnp.ones((), jnp.float32)
+        for turn in range(1, _TURNS + 1):
+            reach = reach * (free + (turn - 1)).astype(jnp.float32) / turn
+            r = r + jnp.where(reach < apart.astype(jnp.float32), 1, 0)
         ahead = -(-(apart * r) // (free + r))
         return self.step + jnp.where(free > 1, jnp.clip(ahead, 1, apart), apart)
 
