@@ -32,6 +32,12 @@ def own_turn(condition: jax.Array) -> jax.Array:
     return _own_p.bind(condition)
 
 
+def zeros_of_batch(t: jax.Array) -> jax.Array:
+    """Zeros, and under `jax.vmap` a batch of them where t is one: what has a batch of tangents is to be
+    one itself."""
+    return _zeros_p.bind(t)
+
+
 def _shared(name: str, join) -> Primitive:
     primitive = Primitive(name)
     primitive.def_impl(lambda value: value)
@@ -47,8 +53,15 @@ def _shared(name: str, join) -> Primitive:
 _any_p = _shared("any_of_batch", jnp.any)
 _largest_p = _shared("largest_of_batch", jnp.max)
 
-_own_p = Primitive("own_turn")
-_own_p.def_impl(jnp.ones_like)
-_own_p.def_abstract_eval(lambda value: value)
-mlir.register_lowering(_own_p, mlir.lower_fun(jnp.ones_like, multiple_results=False))
-batching.primitive_batchers[_own_p] = lambda given, axes: (given[0], axes[0])
+
+def _same_for_each(name: str, made, of_batch) -> Primitive:
+    primitive = Primitive(name)
+    primitive.def_impl(made)
+    primitive.def_abstract_eval(lambda value: value)
+    mlir.register_lowering(primitive, mlir.lower_fun(made, multiple_results=False))
+    batching.primitive_batchers[primitive] = lambda given, axes: (of_batch(given[0]), axes[0])
+    return primitive
+
+
+_own_p = _same_for_each("own_turn", jnp.ones_like, lambda value: value)
+_zeros_p = _same_for_each("zeros_of_batch", jnp.zeros_like, lambda value: _zeros_p.bind(value))

@@ -45,7 +45,7 @@ _ENTRYWISE = frozenset(
     "abs add add_any and ceil clamp complex conj convert_element_type copy div eq floor ge gt imag "
     "integer_pow is_finite le lt max min mul ne neg nextafter not or real rem round rsqrt select_n "
     "shift_left shift_right_arithmetic shift_right_logical sign sqrt square bitcast_convert_type sub "
-    "xor any_of_batch largest_of_batch own_turn".split()
+    "xor any_of_batch largest_of_batch own_turn zeros_of_batch".split()
 )
 _FUNCTIONS = frozenset(
     "acos acosh asin asinh atan atan2 atanh cbrt cos cosh erf exp exp2 expm1 log log1p logistic pow "
@@ -158,8 +158,8 @@ def _as_it_is(*leaves: Any, program: ClosedJaxpr, **_: Any) -> list[Any]:
 
 def _as_one(*leaves: Any, program: ClosedJaxpr, large: Any, **_: Any) -> list[Any]:
     """The call with its attributes. The compiler stops at an argument that turns out to be of no use,
-    or at a long one that turns out to be constant: so the small ones are packed into one, and of the
-    large ones an entry is returned."""
+    or at a long one that turns out to be constant: so the small ones are packed into one, and an entry
+    of it and of each of the large ones is returned."""
     few = _small_ones(list(leaves), large)
     if not few:
         # As a derivative in nothing that it was made of.
@@ -169,7 +169,7 @@ def _as_one(*leaves: Any, program: ClosedJaxpr, large: Any, **_: Any) -> list[An
     def call(packed: jax.Array, many: list[Any]) -> tuple[list[Any], list[Any]]:
         small, rest = iter(_unpacked(packed, like)), iter(many)
         whole = [next(rest if is_large else small) for is_large in large]
-        return jaxpr_as_fun(program)(*whole), [leaf.ravel()[0] for leaf in many]
+        return jaxpr_as_fun(program)(*whole), [leaf.ravel()[0] for leaf in (packed, *many)]
 
     many = [leaf for leaf, is_large in zip(leaves, large, strict=True) if is_large]
     # Something computed goes along with the small ones: all constant, they would be a long constant.

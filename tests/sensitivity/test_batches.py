@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.closed_forms import c1
+from tests.closed_forms import c1, c1_solution
 
 import dvax
 
@@ -57,3 +57,51 @@ def test_ten_thousand_steps_of_a_large_state_are_differentiated_in_four_gigabyte
     print(f"peak {gigabytes:.2f} GiB")
     assert 0.0 < slope < 1.0
     assert gigabytes < 4.0
+
+
+ROWS = np.array([0.0, 0.25, 0.5, 1.0, 1.93, 2.0])
+
+
+@pytest.mark.parametrize(
+    "steps", [dict(dt=0.05), dict(rtol=1e-4, max_steps=2**11)], ids=["dt", "rtol"]
+)
+@pytest.mark.parametrize("ts", [None, ROWS], ids=["the last", "rows"])
+def test_derivatives_of_a_batch_are_those_of_its_runs(ts, steps):
+    """Both ways round, by both modes, of x and u, in everything that differs or is shared."""
+    case = c1()
+
+    def total(x0, load, adjoint):
+        found = dvax.solve(case.problem, x0, 0.0, 2.0, (load,), ts=ts, adjoint=adjoint, **steps)
+        return jnp.sum(jnp.sin(found.xs)) + jnp.sum(found.us)
+
+    def of_all(x0s, load, adjoint):
+        return jnp.sum(jax.vmap(lambda x0: total(x0, load, adjoint))(x0s))
+
+    x0s = jnp.array([-1.0, 0.2, 3.0])
+    alone = [jax.jit(jax.grad(total, (0, 1)), static_argnums=2)(x0, 3.0, "reverse") for x0 in x0s]
+    exact = [pair[0] for pair in alone], sum(pair[1] for pair in alone)
+    for found in (
+        jax.jit(jax.grad(of_all, (0, 1)), static_argnums=2)(x0s, 3.0, "reverse"),
+        jax.jit(jax.jacfwd(of_all, (0, 1)), static_argnums=2)(x0s, 3.0, "forward"),
+    ):
+        np.testing.assert_allclose(found[0], exact[0], rtol=1e-8)
+        np.testing.assert_allclose(found[1], exact[1], rtol=1e-8)
+
+
+def test_a_batch_of_derivatives_may_be_nothing_but_zeros():
+    """XLA then leaves out the whole loop, and stops at a call whose arguments are of no use."""
+    case = c1()
+
+    def total(unused, x0, ts):
+        return jnp.sum(
+            dvax.solve(case.problem, x0, 0.0, 2.0, (jnp.asarray(3.0), unused), ts=ts, dt=0.1).xs
+        )
+
+    x0s, ts = jnp.array([-1.0, 0.0]), jnp.array([0.5, 1.0])
+    slopes = jax.vmap(jax.grad(total), (0, 0, None))(jnp.ones(2), x0s, ts)
+    np.testing.assert_array_equal(slopes, 0.0)
+    by_time = jax.vmap(jax.grad(total, 2), (None, 0, None))(1.0, x0s, ts)
+    velocity = lambda x, u: 3.0 - 1.5 * x - u  # noqa: E731
+    for x0, row in zip(x0s, by_time, strict=True):
+        pairs = (c1_solution(t, float(x0)) for t in ts)
+        np.testing.assert_allclose(row, [velocity(x, u) for x, u in pairs], atol=0.02)

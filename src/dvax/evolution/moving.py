@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from .._batch import zeros_of_batch
 from .._tree import Tree
 from ..problem import END_ULPS, KNOT_ULPS
 from .flow import Flow
@@ -24,7 +25,7 @@ def still(t: Any) -> Any:
 @jax.custom_jvp
 def shift(t: Any) -> Any:
     """0, which moves as t does."""
-    return jnp.zeros_like(t)
+    return zeros_of_batch(t)
 
 
 @shift.defjvp
