@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from tests.closed_forms import c1, c1_solution, c2, c3
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax.evolution import RESULTS
@@ -52,7 +53,7 @@ TIMES = {
 }
 
 
-@pytest.mark.parametrize("which", TIMES)
+@pytest.mark.parametrize("which", mostly_thorough(TIMES, ["every step", "some of each"]))
 def test_rows_are_written_as_steps_end_or_from_inside_them(which):
     """Of the same steps, whichever are saved: against the dense output, and in a batch, where the
     steps of each end elsewhere and one of the runs fails."""

@@ -65,7 +65,9 @@ ROWS = np.array([0.0, 0.25, 0.5, 1.0, 1.93, 2.0])
 @pytest.mark.parametrize(
     "steps", [dict(dt=0.05), dict(rtol=1e-4, max_steps=2**11)], ids=["dt", "rtol"]
 )
-@pytest.mark.parametrize("ts", [None, ROWS], ids=["the last", "rows"])
+@pytest.mark.parametrize(
+    "ts", [pytest.param(None, marks=pytest.mark.thorough), ROWS], ids=["the last", "rows"]
+)
 def test_derivatives_of_a_batch_are_those_of_its_runs(ts, steps):
     """Both ways round, by both modes, of x and u, in everything that differs or is shared."""
     case = c1()
