@@ -106,7 +106,7 @@ def test_saved_rows_have_the_same_derivatives_by_both_modes(which):
         (exact(-1.0 + step, 3.0) - exact(-1.0 - step, 3.0)) / (2 * step),
         (exact(-1.0, 3.0 + step) - exact(-1.0, 3.0 - step)) / (2 * step),
     ]
-    np.testing.assert_allclose(back, by_hand, atol=0.02 * float(jnp.sum(jnp.abs(weights))))
+    np.testing.assert_allclose(back, by_hand, rtol=3e-3)
 
 
 @pytest.mark.parametrize("t", [-0.1, 2.5])
