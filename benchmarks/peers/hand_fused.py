@@ -3,9 +3,9 @@
     u(x) = clip(β (g − b_x x)/(1 + b_u), 0, κ₀)/β,      f̃(x) = ℓ − d_x x − d_u u(x)
     a = e^z x + hφ₁(z) f̃(x),      x ← a + hφ₂(z) (f̃(a) − f̃(x)),      z = −αh
 
-No saving, no statistics, no check for NaN, and a loop count that nobody has to find out. For the
-reverse mode it is a `lax.scan`, since a `fori_loop` of an unknown count has none; all its states are
-kept.
+No saving but in `saved`, no statistics, no check for NaN, and a loop count that nobody has to find
+out. For the reverse mode it is a `lax.scan`, since a `fori_loop` of an unknown count has none; all its
+states are kept.
 """
 
 import math

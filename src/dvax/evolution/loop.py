@@ -245,8 +245,9 @@ class Loop(eqx.Module):
             evaluations=state.evaluations + step.evaluations,
             meter=meter,
         )
-        tables = {"records": None, "ends": None, "checkpoints": None}
-        after = _tree.where(own, after, state._replace(**tables))
+        # Tables are not chosen as a whole but written, or not.
+        bare = state._replace(records=None, ends=None, checkpoints=None)
+        after = _tree.where(own, after, bare)
         return after._replace(
             records=None if state.records is None else put(state.records, taken),
             ends=None if state.ends is None else put(state.ends, end),
@@ -269,7 +270,6 @@ class Loop(eqx.Module):
             reached = met | ((t1 > time) & (state.result == RESULTS.successful))
             return self._row(state, time, lax.cond(met, lambda: state.x, between), reached, met)
         record, before = state.last
-
         theta = (time - record.start) / jnp.where(record.length > 0, record.length, 1)
         reached, met = state.t >= time, time >= state.t
         x = lax.cond(met, lambda: state.x, lambda: self._inside(record, theta, state.memory.guess))
