@@ -11,6 +11,7 @@ from tests.closed_forms import c1, c2, c3
 
 import dvax
 from dvax import _one_function as one
+from dvax._one_function import marked
 
 N = 5
 V = jnp.linspace(0.5, 1.5, N)
@@ -43,6 +44,7 @@ SMALL = {
         ),
         axis=0,
     ),
+    "a long sum": lambda k, v: v + jnp.sum(jnp.ones(4000) * v[0]) / 4000.0,
     "much arithmetic": lambda k, v: v + jnp.outer(jnp.ones(1600), v)[k] / jnp.ones(8000)[k],
     "nothing of v": lambda k, v: jnp.ones(N) * 3.0,
 }
@@ -59,7 +61,7 @@ LARGE = {
         axis=0,
     ),
     "a long array": lambda k, v: v + jnp.max(jnp.ones(20000) * v[0]),
-    "a long sum": lambda k, v: v + jnp.sum(jnp.ones(4000) * v[0]) / 4000.0,
+    "many sums": lambda k, v: v + jnp.sum(jnp.outer(jnp.ones(1000), v), axis=0) / 1000.0,
     "many values of a function": lambda k, v: v + jnp.max(jnp.sin(jnp.ones(2000) * v[0])),
     "a call back": lambda k, v: jax.pure_callback(np.sin, v, v),
 }
@@ -288,5 +290,5 @@ def test_small_systems_are_solved_in_one_function(case):
 
 
 def test_where_the_compiler_cannot_do_it_nothing_is_asked(monkeypatch):
-    monkeypatch.setattr(one, "_compiles", lambda: False)
+    monkeypatch.setattr(marked, "_compiles", lambda: False)
     assert not is_one(compiled(looped(SMALL["arithmetic"]), V))

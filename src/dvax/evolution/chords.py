@@ -119,7 +119,8 @@ def times(x: Chord, y: Chord) -> Chord:
 
 def _crossing(d0: jax.Array, d1: jax.Array) -> jax.Array:
     """The bend of max(0, d) for d linear from d0 to d1."""
-    crosses = ((d0 < 0) & (d1 > 0)) | ((d0 > 0) & (d1 < 0))
+    # Where one of them is zero, so is the bend.
+    crosses = (d0 < 0) != (d1 < 0)
     total = jnp.where(crosses, jnp.abs(d0) + jnp.abs(d1), 1.0)
     bend = jnp.abs(d0) * (jnp.abs(d1) / total)
     # From one infinity to the other there is no bound.
@@ -280,7 +281,15 @@ def _with_constant(name: str, given: list[Any], bind: Callable) -> Chord:
     a, b = (bind(chord.a, c), bind(chord.b, c)) if first else (bind(c, chord.a), bind(c, chord.b))
     if name != "mul":
         return Chord(a, b, jnp.broadcast_to(chord.dev, a.shape))
+    if _is_plain(c):
+        return Chord(a, b, abs(float(c)) * jnp.broadcast_to(chord.dev, a.shape))
     return Chord(a, b, _safe(jnp.abs(c), chord.dev))
+
+
+def _is_plain(c: Any) -> bool:
+    """Whether it is one number that is known, and neither zero nor infinite."""
+    known = isinstance(c, (float, int, np.generic, np.ndarray)) and np.ndim(c) == 0
+    return known and bool(np.isfinite(c) & (c != 0))
 
 
 def _lift(value: Any) -> Chord:

@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 from .. import _tree
 from .._tree import Tree
 from ..generators import AbstractGenerator, AbstractPropagator, Dense, Diagonal, Scalar
+from ..generators.expanded import expanded
 from ..operators import AbstractOperator
 from ..problem import Problem
 from ..spaces import AbstractSpace
@@ -78,6 +79,10 @@ class Flow(eqx.Module):
             return tuple(map(one, lengths))
         stacked = jax.vmap(one)(jnp.stack(lengths))
         return tuple(jtu.tree_map(lambda leaf, k=k: leaf[k], stacked) for k in range(len(lengths)))
+
+    def expand(self, x: Tree, known: Tree = None) -> Tree:
+        """x as propagators take it with the least work."""
+        return expanded(self.generator, x, known) if self.linear is None else x
 
     def rest(self, x: Tree, value: Tree) -> Tree:
         """f̃ without what is left to the propagator: `value` = f̃(t, x), or f̃(t, x) − Jx."""

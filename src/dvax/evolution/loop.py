@@ -4,6 +4,7 @@ One loop over the saved times holds one loop over steps, so that a step is compi
 nothing between saved times, and the lanes of a batch wait for each other no longer than they must.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -156,10 +157,11 @@ class Loop(eqx.Module):
     def _until(self, state: State, time: Any) -> State:
         """Steps until `time` has been reached, or lies in the next step where none is kept."""
 
-        def turn(state: State) -> State:
-            return self._attempt(state, own_turn(self._goes_on(state, time)))
+        def turn(carry: tuple[State]) -> tuple[State]:
+            (state,) = carry
+            return (self._attempt(state, own_turn(self._goes_on(state, time))),)
 
-        return lax.while_loop(lambda s: any_of_batch(self._goes_on(s, time)), turn, state)
+        return self._repeat(lambda carry: self._goes_on(carry[0], time), turn, (state,))[0]
 
     def _through(
         self, state: State, rows: Saved, row: Any, times: jax.Array
@@ -185,7 +187,39 @@ class Loop(eqx.Module):
             rows = lax.cond(over, put, lambda: rows)
             return state, rows, jnp.where(over, row + 1, row)
 
-        return lax.while_loop(lambda carry: any_of_batch(goes_on(carry)), turn, (state, rows, row))
+        return self._repeat(goes_on, turn, (state, rows, row))
+
+    def _repeat(self, goes_on: Callable[[Any], Any], turn: Callable[[Any], Any], carry: Any) -> Any:
+        """One turn after the other, on a carry that begins with the state. Steps of one length are a
+        loop of their own, in which propagators stand still."""
+        ahead = lambda carry: any_of_batch(goes_on(carry))  # noqa: E731
+        if not self._refits(carry[0]):
+            return lax.while_loop(ahead, turn, carry)
+
+        def same(carry: Any) -> Any:
+            # Problems of a batch get new propagators together, as soon as one of them needs some.
+            return ~any_of_batch(goes_on(carry) & ~self.stepper.fits(*self._ahead(carry[0])))
+
+        def of_one_length(carry: Any) -> Any:
+            state, *rest = carry
+            factors = self.stepper.fitted(*self._ahead(state), jnp.asarray(True))
+            carry = (state._replace(factors=factors), *rest)
+            one = lambda c: (turn(c[0]), jnp.asarray(False))  # noqa: E731
+            # One in any case: what is not a number fits nothing.
+            more = lambda c: ahead(c[0]) & (c[1] | same(c[0]))  # noqa: E731
+            return lax.while_loop(more, one, (carry, jnp.asarray(True)))[0]
+
+        return lax.while_loop(ahead, of_one_length, carry)
+
+    def _refits(self, state: State) -> bool:
+        """Whether propagators are made between loops, not within them: where lengths are not known
+        beforehand and do not move."""
+        return state.factors is not None and not self.carries and self.stepper.uniform is None
+
+    def _ahead(self, state: State) -> tuple[Factors, Any, Any]:
+        """What fits the next step, if it does, and where that one begins and ends."""
+        assert state.factors is not None
+        return state.factors, self._held(state.t), self._end(state.control)
 
     def _goes_on(self, state: State, time: Any) -> Any:
         """Whether a step is to be taken before `time`."""
@@ -199,8 +233,11 @@ class Loop(eqx.Module):
         """The state after one more attempt, where that is its `own`."""
         begin, end = state.t, self.controller.end(state.control)
         t0, t1, x0 = self._held(begin), self._held(end), self._begun(state, end)
-        factors = self._factors(state, t0, t1)
-        step = self.stepper.step(t0, t1, x0, state.memory, factors, state.jumped)
+        factors = state.factors if self._refits(state) else self._factors(state, t0, t1)
+        memory = state.memory
+        if x0 is not state.x:
+            memory = memory._replace(coefficients=None)
+        step = self.stepper.step(t0, t1, x0, memory, factors, state.jumped)
         verdict = self.controller.judge(begin, end, x0, step, state.control)
         impulse = jtu.tree_map(jnp.add, state.impulse, step.impulse)
         taken = Record(t0, t1 - t0, x0, step.c)

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial, reduce
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,28 +14,27 @@ from jax import lax
 from .. import _tree
 from .._tree import Tree
 from ..generators import AbstractPropagator, Arc, Growth
+from ..generators.expanded import coefficients, values
 from ..problem import END_ULPS, KNOT_ULPS
-from .chords import Chord, is_chord
+from .defect import Sample, enclosed, sampled
 from .evaluations import Plan, Visit, evaluated
 from .extent import Extent
 from .flow import Flow, Rate
 from .kinks import first_change
-from .method import AbstractMethod, extrapolation, polynomial, shortened
+from .method import AbstractMethod, shortened
 from .moving import if_moving
-
-_DOUBT = 4.0
-"""By how many times its interpolation error z is taken to be uncertain between the samples."""
 
 _SMALL = 64
 """Up to this many entries a look at every one of them is free."""
 
 
 class Memory(NamedTuple):
-    """What an accepted step leaves to the next: the rate at its end and a guess for the law, each None
-    where it is not needed."""
+    """What an accepted step leaves to the next: the rate at its end, a guess for the law, and the
+    coefficients of its end in the eigenfunctions of A, each None where it is not needed."""
 
     rate: Rate | None
     guess: Tree | None
+    coefficients: Tree
 
 
 class Factors(NamedTuple):
@@ -70,18 +69,6 @@ class Step(NamedTuple):
     solved: Any
     finite: Any
     evaluations: Any
-
-
-class Sample(NamedTuple):
-    """The defect of one step: entry by entry for the step control, integrated for certificates; the
-    rates along x_h that it was made from, the last one at the end; and where x_h and u_h have been."""
-
-    thetas: tuple[float, ...]
-    rates: list[Rate]
-    error: Tree
-    defect: jax.Array
-    law_defect: jax.Array
-    extent: Extent
 
 
 def inside(flow: Flow, length: Any, theta: Any, x0: Tree, c: tuple[Tree, ...]) -> Tree:
@@ -146,10 +133,11 @@ class Stepper(eqx.Module):
     def begin(self, x0: Tree) -> Memory:
         """Before the first step nothing is known but where to look first."""
         guess = self.flow.guess(x0)
+        known = coefficients(self.flow.expand(x0))
         if not self.measure:
-            return Memory(None, guess)
+            return Memory(None, guess, known)
         blank = jax.eval_shape(lambda: self._kept(self.flow.rate(self.ends[0], x0, guess)))
-        return Memory(jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), blank), guess)
+        return Memory(jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), blank), guess, known)
 
     def extent(self, x0: Tree) -> Extent | None:
         """Before the first step x_h has been at x₀ alone, and u_h nowhere."""
@@ -174,19 +162,24 @@ class Stepper(eqx.Module):
         """
 
         def fit(h: Any, stepper: Stepper, factors: Factors, slack: Any, new: Any) -> Factors:
-            same = (jnp.abs(h - factors.length) <= slack) & jnp.logical_not(new)
+            same = _alike(h, factors.length, slack) & jnp.logical_not(new)
             return lax.cond(same, lambda: factors, lambda: stepper.factors(h))
 
         still = lambda h, s, f, slack, _: fit(h, s, f, slack, False)  # noqa: E731
         return if_moving(fit, still, t1 - t0, self, factors, 2 * _ulp(t0, t1), anew)
+
+    def fits(self, factors: Factors, t0: Any, t1: Any) -> Any:
+        """Whether these are the propagators for this step."""
+        return _alike(t1 - t0, factors.length, 2 * _ulp(t0, t1))
 
     def advance(
         self, t0: Any, t1: Any, x0: Tree, factors: Factors | None, guess: Tree | None
     ) -> tuple[Tree, tuple[Tree, ...], Tree | None]:
         """(x₁, the stage polynomial, y where the step begins), and nothing else."""
         self, drift, factors = self._local(t0, t1, x0, factors, guess)
-        plan = self._plan(t0, t1, x0, factors, drift, False)
-        (c, x1), visits = evaluated(self.flow, plan, self.ends[0], x0, guess, None, True)
+        plan = self._plan(t0, t1, self.flow.expand(x0), factors, drift, False)
+        found, visits = evaluated(self.flow, plan, self.ends[0], x0, guess, None, True)
+        c, x1 = values(found)
         return x1, c, visits[0].rate.y
 
     def step(
@@ -194,14 +187,17 @@ class Stepper(eqx.Module):
     ) -> Step:
         """One step from t0 to t1. `jumped` says that what memory holds is not the rate at t0."""
         self, drift, factors = self._local(t0, t1, x0, factors, memory.guess)
-        plan = self._plan(t0, t1, x0, factors, drift, self.measure)
+        start = self.flow.expand(x0, memory.coefficients)
+        plan = self._plan(t0, t1, start, factors, drift, self.measure)
         # The last evaluation of the previous step was made where this one begins.
         begin, kept = self.ends[0], memory.rate
         (c, x1), visits = evaluated(self.flow, plan, begin, x0, memory.guess, kept, jumped)
+        arc, known = Arc(t1 - t0, start, x1, c), coefficients(x1)
+        c, x1 = values((c, x1))
         first, last = visits[0].rate, visits[-1].rate
         error, impulse, kink, extent = None, (0.0, 0.0), None, None
         if self.measure:
-            sample = self._measure(t0, t1, x0, x1, c, visits)
+            sample = self._measure(t0, t1, arc, visits)
             error, impulse = sample.error, (sample.defect, sample.law_defect)
             extent = sample.extent if self.ranged else None
             if self.locate:
@@ -216,6 +212,7 @@ class Stepper(eqx.Module):
         after = Memory(
             self._kept(last) if self.measure else None,
             None if self.flow.direct else last.y,
+            known,
         )
         solved = jnp.all(jnp.stack([visit.rate.solved for visit in visits]))
         # The first one was made by the step before, unless nothing is kept, or data jumped.
@@ -239,27 +236,31 @@ class Stepper(eqx.Module):
         return stepper, drift, stepper.factors(t1 - t0)
 
     def _plan(
-        self, t0: Any, t1: Any, x0: Tree, factors: Factors, drift: Tree | None, measured: bool
+        self, t0: Any, t1: Any, start: Tree, factors: Factors, drift: Tree | None, measured: bool
     ) -> Plan:
-        """The evaluations of a step: at its start, for its stages, inside, and at its end."""
+        """The evaluations of a step: at its start, for its stages, inside, and at its end. States are
+        expanded (`AbstractGenerator.expand`), and so are c and x₁."""
 
         def run(evaluate: Callable[[Any, Tree], Rate]) -> tuple[tuple[Tree, ...], Tree]:
             def stage(theta: float, x: Tree) -> Tree:
-                return self.flow.rest(x, evaluate(self._within(t0, t1, theta), x).value)
+                x = values(x)
+                rate = evaluate(self._within(t0, t1, theta), x)
+                return self.flow.expand(self.flow.rest(x, rate.value))
 
             def propagate(theta: float, c: tuple[Tree, ...]) -> Tree:
                 if theta == 1.0:
-                    return factors.full.step(x0, c)
+                    return factors.full.step(start, c)
                 assert factors.half is not None and theta == 0.5
-                return factors.half.step(x0, shortened(c, theta))
+                return factors.half.step(start, shortened(c, theta))
 
-            c = self.method.coefficients(stage, propagate, stage(0.0, x0), drift)
-            x1 = factors.full.step(x0, c)
+            c = self.method.coefficients(stage, propagate, stage(0.0, start), drift)
+            x1 = factors.full.step(start, c)
             if measured:
                 # No inner ones where the defect is enclosed.
                 for theta, to in zip(self.method.samples, factors.inner, strict=False):
-                    evaluate(self._within(t0, t1, theta), to.step(x0, shortened(c, theta)))
-                evaluate(self._within(t0, t1, 1.0), x1)
+                    x = to.step(start, shortened(c, theta))
+                    evaluate(self._within(t0, t1, theta), values(x))
+                evaluate(self._within(t0, t1, 1.0), values(x1))
             return c, x1
 
         return run
@@ -304,7 +305,7 @@ class Stepper(eqx.Module):
         between = [inside(self.flow, t1 - t0, theta, x0, c) for theta in self.method.samples]
         points = [x0, *between, x1]
         _, visits = evaluated(self.flow, run, self.ends[0], x0, guess, None, True)
-        sample = self._measure(t0, t1, x0, x1, c, visits)
+        sample = self._measure(t0, t1, Arc(t1 - t0, x0, x1, c), visits)
         solved = jnp.all(jnp.stack([visit.rate.solved for visit in visits]))
         return sample._replace(rates=[]), solved
 
@@ -314,81 +315,17 @@ class Stepper(eqx.Module):
             return rate
         return rate._replace(y=None, z=rate.z if self.locate else None)
 
-    def _measure(self, t0: Any, t1: Any, x0: Tree, x1: Tree, c: Any, visits: list[Visit]) -> Sample:
-        if self.flow.enclosed:
-            return self._enclosed(t0, t1, x0, x1, c, visits[-1].rate)
-        return self._sampled(t0, t1, x0, c, visits)
-
-    def _enclosed(self, t0: Any, t1: Any, x0: Tree, x1: Tree, c: Any, last: Rate) -> Sample:
-        """|δ(θ)| ≤ (1−θ)(|δ(0)| + dev) + θ(|δ(1)| + dev) entry by entry, with dev from chord
-        arithmetic, since p is a line; so ∫‖δ‖ is at most the mean of the norms of the two brackets
-        (the norm of their mean would be too little: ends may lie in different entries). δ(0) is
-        rounding, unless data jumps where nobody said it would."""
+    def _measure(self, t0: Any, t1: Any, arc: Arc, visits: list[Visit]) -> Sample:
+        if not self.flow.enclosed:
+            x0, c = values((arc.x0, arc.c))
+            return sampled(self.flow, self.method.samples, arc.h, x0, c, visits)
         assert self.growth is not None
-        t0, t1, x0, x1, c, growth = lax.stop_gradient((t0, t1, x0, x1, c, self.growth))
-        h, space = t1 - t0, self.flow.state_space(x0)
-        bend = self.flow.generator.bend(Arc(h, x0, x1, c), space, growth)
-        x = jtu.tree_map(Chord, x0, x1, bend)
-        t = Chord(self._within(t0, t1, 0.0), self._within(t0, t1, 1.0), jnp.zeros_like(t0))
-        along, u = self.flow.enclosure(t, x)
-        at_start = jtu.tree_map(
-            lambda q, p: jnp.abs(q.a - p) + q.dev, along, c[0], is_leaf=is_chord
-        )
-        at_end = jtu.tree_map(
-            lambda q, p: jnp.abs(q.b - p) + q.dev, along, polynomial(c, 1.0), is_leaf=is_chord
-        )
-        error = _tree.scale(0.5, _tree.add(at_start, at_end))
-        defect = 0.5 * h * (space.norm(at_start) + space.norm(at_end))
-        return Sample((), [last], error, defect, jnp.zeros_like(defect), Extent.of_chords(x, u))
+        ends = self._within(t0, t1, 0.0), self._within(t0, t1, 1.0)
+        return enclosed(self.flow, self.growth, ends, arc, visits[-1].rate)
 
-    def _sampled(self, t0: Any, t1: Any, x0: Tree, c: Any, visits: list[Visit]) -> Sample:
-        """The defect δ = p − f̃(·, x_h) at the start, inside and at the end of the step.
 
-        Between the samples δ is taken to be a line plus a bump (a parabola, or the tent of a kink):
-        then ∫|δ| ≤ h(½|δ(0)| + ½|δ(1)| + max |δ(θ) − (1 − θ)δ(0) − θδ(1)|), whatever the place of the
-        kink. δ(0) is zero for a method whose polynomial starts at f̃(t₀, x₀), as most do.
-        """
-        h, thetas = t1 - t0, self.method.samples
-        along = [visits[0], *visits[-1 - len(thetas) :]]
-        _, *inner, last = (visit.rate for visit in along)
-        start, *middle, end = (
-            _tree.sub(self.flow.rest(visit.x, visit.rate.value), polynomial(c, theta))
-            for theta, visit in zip((0.0, *thetas, 1.0), along, strict=True)
-        )
-        bumps = []
-        for theta, defect in zip(thetas, middle, strict=True):
-            line = _tree.add(_tree.scale(1.0 - theta, start), _tree.scale(theta, end))
-            bumps.append(_tree.sub(defect, line))
-
-        # How well z, the unconstrained value of the law, is predicted by its other samples.
-        zs = [visit.rate.z for visit in along]
-        weights = extrapolation((0.0, *thetas, 1.0))
-        doubt = jtu.tree_map(
-            lambda *z: _DOUBT * sum(w * v for w, v in zip(weights, z, strict=True)), *zs
-        )
-        unseen = self._unseen(along[1:], doubt)
-        ends = _tree.scale(0.5, start), _tree.scale(0.5, end)
-        bump = jtu.tree_map(lambda *b: jnp.max(jnp.abs(jnp.stack(b)), axis=0), *bumps)
-        error = jtu.tree_map(lambda *parts: sum(map(jnp.abs, parts)), *ends, bump, unseen)
-        space = self.flow.state_space(x0)
-        defect = h * sum(map(space.norm, (*ends, bump, unseen)))
-        law_defect = h * jnp.max(jnp.stack([visit.rate.residual for visit in along]))
-        places = [
-            (visit.x, self.flow.operator.inverse(visit.rate.y))
-            for visit in lax.stop_gradient(along)
-        ]
-        extent = reduce(Extent.joined, [Extent((x, x), (u, u)) for x, u in places])
-        return Sample(thetas, [*inner, last], error, defect, law_defect, extent)
-
-    def _unseen(self, visits: list[Visit], doubt: Tree) -> Tree:
-        """The most that is hidden at any of them; where projections are iterated, from one place of
-        the program, as in `_in_turn`."""
-        hidden = lambda v: self.flow.hidden(v.t, v.x, v.rate, doubt)  # noqa: E731
-        if self.flow.direct:
-            found = [hidden(visit) for visit in visits]
-            return jtu.tree_map(lambda *h: jnp.max(jnp.stack(h), axis=0), *found)
-        stacked = lax.map(hidden, jtu.tree_map(lambda *leaves: jnp.stack(leaves), *visits))
-        return jtu.tree_map(lambda leaf: jnp.max(leaf, axis=0), stacked)
+def _alike(h: Any, length: Any, slack: Any) -> Any:
+    return jnp.abs(h - length) <= slack
 
 
 def _ulp(t0: Any, t1: Any) -> Any:

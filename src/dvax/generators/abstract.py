@@ -39,7 +39,8 @@ class AbstractPropagator(eqx.Module):
 
     @abc.abstractmethod
     def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
-        """x(t₀ + h), for at most as many coefficients as the propagator was made for."""
+        """x(t₀ + h), for at most as many coefficients as the propagator was made for; with its
+        coefficients, where x₀ and all cⱼ have theirs (`dvax.generators.expanded`)."""
 
 
 class AbstractGenerator(eqx.Module):

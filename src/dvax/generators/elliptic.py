@@ -12,14 +12,15 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
-from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
+from .abstract import AbstractPropagator, Arc, Growth
+from .expanded import AbstractModal, Expanded, as_given, coefficients_of, with_coefficients
 from .phi import flow_factors, phi_scalar
 from .scalar import elementwise_bend
 from .stencil import Stencil
 from .transforms import BOUNDARIES, Transform, along, times
 
 
-class Elliptic(AbstractGenerator):
+class Elliptic(AbstractModal):
     """A v = Σᵢ dᵢ ∂ᵢ²v − Σᵢ cᵢ ∂ᵢv + r v on a box of one, two or three dimensions: the Laplacian for
     d = 1, advection–diffusion with a velocity c, pure advection (skew) for d = 0.
 
@@ -99,6 +100,9 @@ class Elliptic(AbstractGenerator):
             return self.stencil.apply(v)
         return self.transform.backward(times(self.symbol, self.transform.forward(v)))
 
+    def expand(self, v: Tree, known: Tree = None) -> Expanded:
+        return with_coefficients(v, known, self.transform.forward)
+
     def propagator(self, h: Any, terms: int) -> "SpectralPropagator":
         h = jnp.asarray(h).astype(self.symbol.dtype)
         factors = flow_factors(h, phi_scalar(h * self.symbol, terms))
@@ -132,8 +136,7 @@ class Elliptic(AbstractGenerator):
     def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
         # Coefficient by coefficient; an eigenfunction is at most 1 anywhere.
         h, x0, x1, c = arc
-        forward = self.transform.forward
-        parts = [forward(v) for v in (x0, x1, *c)]
+        parts = [coefficients_of(v, self.transform.forward) for v in (x0, x1, *c)]
         if jnp.iscomplexobj(self.symbol):
             start, _, first, *rest = parts
             slope = times(1.0 / h, rest[0]) if rest else jnp.zeros_like(first)
@@ -143,7 +146,7 @@ class Elliptic(AbstractGenerator):
         else:
             leaves = _both(lambda *p: elementwise_bend(self.symbol, h, *p), parts)
         return jnp.broadcast_to(
-            jnp.sum(self.transform.shares().astype(leaves.dtype) * leaves), x0.shape
+            jnp.sum(self.transform.shares().astype(leaves.dtype) * leaves), self.transform.shape
         )
 
 
@@ -154,9 +157,10 @@ class SpectralPropagator(AbstractPropagator):
     factors: tuple[jax.Array, ...]
 
     def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
-        forward = self.transform.forward
-        products = [times(f, forward(v)) for f, v in zip(self.factors, (x0, *c), strict=False)]
-        return self.transform.backward(sum(products[1:], start=products[0]))
+        parts = [coefficients_of(v, self.transform.forward) for v in (x0, *c)]
+        products = [times(f, v) for f, v in zip(self.factors, parts, strict=False)]
+        total = sum(products[1:], start=products[0])
+        return as_given(x0, total, self.transform.backward)
 
 
 def _both(bend: Any, parts: list[jax.Array]) -> jax.Array:

@@ -9,11 +9,12 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace, Euclidean
-from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
+from .abstract import AbstractPropagator, Arc, Growth
 from .bend import normwise_bend
 from .dense import Dense
 from .diagonal import Diagonal
 from .elliptic import Elliptic
+from .expanded import AbstractModal, as_given, coefficients_of, values, with_coefficients
 from .phi import flow_factors, phi_matrix
 from .scalar import Scalar
 from .transforms import Transform
@@ -21,7 +22,7 @@ from .transforms import Transform
 _EXACT = jax.lax.Precision.HIGHEST
 
 
-class KroneckerSum(AbstractGenerator):
+class KroneckerSum(AbstractModal):
     """(A v)ᵢ = F vᵢ + Σⱼ Bᵢⱼ vⱼ for states of m components on one grid, of shape (m, *grid): two
     operators that commute, since F acts along the grid and B across the components. Species that
     diffuse and react linearly, layers that exchange heat, a wave with friction.
@@ -63,6 +64,10 @@ class KroneckerSum(AbstractGenerator):
             self.matrix, v, axes=1, precision=_EXACT
         )
 
+    def expand(self, v: Tree, known: Tree = None) -> Tree:
+        transform = _transform(self.field)
+        return v if transform is None else with_coefficients(v, known, jax.vmap(transform.forward))
+
     def propagator(self, h: Any, terms: int) -> "ModalPropagator":
         rates = _rates(self.field)
         h, B = (jnp.asarray(v).astype(rates.dtype) for v in (h, self.matrix))
@@ -102,7 +107,7 @@ class KroneckerSum(AbstractGenerator):
         return Growth(_spread(space), jnp.max(jnp.real(_rates(self.field))) + own)
 
     def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
-        return normwise_bend(self, arc, space, growth)
+        return normwise_bend(self, Arc(arc.h, *values((arc.x0, arc.x1, arc.c))), space, growth)
 
 
 class ModalPropagator(AbstractPropagator):
@@ -113,7 +118,7 @@ class ModalPropagator(AbstractPropagator):
 
     def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
         forward = (lambda v: v) if self.transform is None else jax.vmap(self.transform.forward)
-        given = [forward(v) for v in (x0, *c)]
+        given = [coefficients_of(v, forward) for v in (x0, *c)]
         parts = [
             jnp.einsum(
                 "...ij,j...->i...",
@@ -124,7 +129,9 @@ class ModalPropagator(AbstractPropagator):
             for factor, coefficients in zip(self.factors, given, strict=False)
         ]
         total = sum(parts[1:], start=parts[0])
-        return total if self.transform is None else jax.vmap(self.transform.backward)(total)
+        if self.transform is None:
+            return total
+        return as_given(x0, total, jax.vmap(self.transform.backward))
 
 
 def _rates(field: Elliptic | Diagonal | Scalar) -> jax.Array:

@@ -9,9 +9,10 @@ from .._tree import Tree
 from ..spaces import AbstractSpace
 from ..spaces import Product as ProductSpace
 from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
+from .expanded import AbstractModal, expanded
 
 
-class Product(AbstractGenerator):
+class Product(AbstractModal):
     """A (x₁, x₂, …) = (A₁x₁, A₂x₂, …): the semigroup acts part by part.
 
     ```python
@@ -31,6 +32,11 @@ class Product(AbstractGenerator):
 
     def apply(self, v: Tree) -> Tree:
         return tuple(a.apply(p) for a, p in zip(self.parts, v, strict=True))
+
+    def expand(self, v: Tree, known: Tree = None) -> Tree:
+        parts = (None,) * len(self.parts) if known is None else known
+        columns = zip(self.parts, v, parts, strict=True)
+        return tuple(expanded(part, own, of_it) for part, own, of_it in columns)
 
     def propagator(self, h: Any, terms: int) -> "ProductPropagator":
         return ProductPropagator(tuple(a.propagator(h, terms) for a in self.parts))

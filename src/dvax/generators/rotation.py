@@ -10,12 +10,13 @@ from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
 from ..spaces import Product as ProductSpace
-from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
+from .abstract import AbstractPropagator, Arc, Growth
+from .expanded import AbstractModal, as_given, coefficients_of, with_coefficients
 from .phi import flow_factors, phi_scalar
 from .transforms import Transform, times
 
 
-class Rotation(AbstractGenerator):
+class Rotation(AbstractModal):
     """A (q, p) = (a q − b p, b q + a p): z = q + ip turns at the rate b and grows at the rate a, entry
     by entry, or mode by mode of a transform. Its spectrum is a ± ib.
 
@@ -63,6 +64,9 @@ class Rotation(AbstractGenerator):
     def apply(self, v: Tree) -> Tree:
         return self.back(_turned(self.a, self.b, self.there(v)))
 
+    def expand(self, v: Tree, known: Tree = None) -> Tree:
+        return v if self.transform is None else with_coefficients(v, known, self.there)
+
     def propagator(self, h: Any, terms: int) -> "RotationPropagator":
         z = jax.lax.complex(h * self.a, h * self.b)
         factors = flow_factors(jnp.asarray(h).astype(z.dtype), phi_scalar(z, terms))
@@ -101,7 +105,7 @@ class Rotation(AbstractGenerator):
         # z'' = e^{λ(t−t₀)} z''(t₀) with λ = a + ib.
         h, x0, _, c = arc
         turn = lambda v: _turned(self.a, self.b, v)  # noqa: E731
-        start, first, *rest = map(self.there, (x0, *c))
+        start, first, *rest = (coefficients_of(v, self.there) for v in (x0, *c))
         curvature = turn(_tree.add(turn(start), first))
         if rest:
             curvature = _tree.add(curvature, _tree.scale(1.0 / h, rest[0]))
@@ -129,14 +133,14 @@ class RotationPropagator(AbstractPropagator):
     factors: tuple[jax.Array, ...]
 
     def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
-        pairs = [self.generator.there(v) for v in (x0, *c)]
+        pairs = [coefficients_of(v, self.generator.there) for v in (x0, *c)]
         turned = [
             _turned(jnp.real(f), jnp.imag(f), v) for f, v in zip(self.factors, pairs, strict=False)
         ]
         total = turned[0]
         for other in turned[1:]:
             total = _tree.add(total, other)
-        return self.generator.back(total)
+        return as_given(x0, total, self.generator.back)
 
 
 def _turned(a: jax.Array, b: jax.Array, v: Tree) -> Tree:

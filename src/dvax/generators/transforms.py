@@ -26,6 +26,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .line import cosines, of_cosines, of_waves, waves
+
 _SHORT = 128
 """Points up to which a transform is a product with a matrix."""
 
@@ -80,6 +82,8 @@ class Transform(eqx.Module):
         """The coefficients."""
         if self._short():
             return _product(_matrices(self.shape[0], self.boundary[0])[0], x)
+        if self._by_line():
+            return waves(x) if not self.real else cosines(x, self._sign())
         for axis in self._folded():
             x = _fold(x, axis, self.boundary[axis])
         F = jnp.fft.rfftn(x, axes=self._axes())
@@ -98,6 +102,8 @@ class Transform(eqx.Module):
         """The array with these coefficients."""
         if self._short():
             return _product(_matrices(self.shape[0], self.boundary[0])[1], c)
+        if self._by_line():
+            return of_waves(c) if not self.real else of_cosines(c, self._sign())
         if self.real:
             n, axis = self.shape[self.half], self.half
             low = jax.lax.slice_in_dim(c, 0, n // 2 + 1, axis=axis)
@@ -121,6 +127,12 @@ class Transform(eqx.Module):
     def _short(self) -> bool:
         """Whether a product with a matrix takes less time than a fast transform."""
         return len(self.shape) == 1 and self.real and self.shape[0] <= _SHORT
+
+    def _by_line(self) -> bool:
+        return len(self.shape) == 1 and self.shape[0] % 4 == 0
+
+    def _sign(self) -> float:
+        return -1.0 if self.boundary[0] == "dirichlet" else 1.0
 
     def _axes(self) -> tuple[int, ...]:
         """All axes, that of the real transform last."""

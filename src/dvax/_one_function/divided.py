@@ -1,0 +1,80 @@
+"""Loops that call libraries: what lies between those calls as few functions of the processor.
+
+A loop whose turns call a library (a Fourier transform) cannot be one function. XLA runs such a turn as
+a list of some hundred kernels and hands them from thread to thread, which takes longer than their
+arithmetic. Here a turn becomes
+
+    function, call, function, call, …, function,
+
+each of which computes all that follows from the calls before it (`turn`).
+"""
+
+from typing import Any
+
+from jax import lax
+from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+
+from .small import inner_programs, is_brief, is_known
+from .turn import Turn
+from .within import bound, retraced
+
+_CALLS = frozenset("jit pjit closed_call custom_jvp_call custom_vjp_call remat2".split())
+
+
+def can_divide(program: ClosedJaxpr) -> bool:
+    """Whether there is a loop to divide, of turns all of which is small: then to call their kernels is
+    what takes time."""
+    return not program.effects and any(map(_has_such, program.jaxpr.eqns))
+
+
+def _has_such(eqn: Any) -> bool:
+    name = eqn.primitive.name
+    if (name not in _CALLS and name != "while") or is_known(eqn):
+        return False
+    if name == "while" and is_brief(eqn.params["body_jaxpr"]):
+        return True
+    return any(any(map(_has_such, inner.jaxpr.eqns)) for inner in inner_programs(eqn.params))
+
+
+def divided(program: ClosedJaxpr) -> ClosedJaxpr:
+    """The program with its calls opened and its loops divided."""
+    return retraced(lambda *given: _opened(program, given), program.in_avals)
+
+
+def _opened(program: ClosedJaxpr, given: Any) -> list[Any]:
+    values = dict(zip(program.jaxpr.constvars, program.consts, strict=True))
+    values |= dict(zip(program.jaxpr.invars, given, strict=True))
+    read = lambda atom: atom.val if isinstance(atom, Literal) else values[atom]  # noqa: E731
+    for eqn in program.jaxpr.eqns:
+        values |= dict(zip(eqn.outvars, _taken(eqn, list(map(read, eqn.invars))), strict=True))
+    return list(map(read, program.jaxpr.outvars))
+
+
+def _taken(eqn: Any, given: list[Any]) -> list[Any]:
+    if eqn.primitive.name in _CALLS:
+        for inner in inner_programs(eqn.params):
+            if len(inner.jaxpr.invars) == len(given):
+                return _opened(inner, given)
+    if eqn.primitive.name == "while" and not is_known(eqn):
+        return _loop(eqn, given)
+    return bound(eqn, given)
+
+
+def _loop(eqn: Any, given: list[Any]) -> list[Any]:
+    goes_on, body = jaxpr_as_fun(eqn.params["cond_jaxpr"]), divided(eqn.params["body_jaxpr"])
+    first = eqn.params["cond_nconsts"]
+    second = first + eqn.params["body_nconsts"]
+    of_cond, of_body, init = given[:first], given[first:second], given[second:]
+    if not is_brief(eqn.params["body_jaxpr"]):
+        return lax.while_loop(
+            lambda carry: goes_on(*of_cond, *carry)[0],
+            lambda carry: jaxpr_as_fun(body)(*of_body, *carry),
+            init,
+        )
+    turn = Turn(body, of_body, init)
+    end = lax.while_loop(
+        lambda carry: goes_on(*of_cond, *turn.apart(*carry))[0],
+        lambda carry: turn(*carry),
+        turn.together(init),
+    )
+    return turn.apart(*end)

@@ -1,0 +1,107 @@
+"""How far a step's polynomial p is from f̃ along the trajectory x_h that it makes: δ = p − f̃(·, x_h)."""
+
+from functools import reduce
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+
+from .. import _tree
+from .._tree import Tree
+from ..generators import Arc, Growth
+from ..generators.expanded import values
+from .chords import Chord, is_chord
+from .evaluations import Visit
+from .extent import Extent
+from .flow import Flow, Rate
+from .method import extrapolation, polynomial
+
+_DOUBT = 4.0
+"""By how many times its interpolation error z is taken to be uncertain between the samples."""
+
+
+class Sample(NamedTuple):
+    """The defect of one step: entry by entry for the step control, integrated for certificates; the
+    rates along x_h that it was made from, the last one at the end; and where x_h and u_h have been."""
+
+    thetas: tuple[float, ...]
+    rates: list[Rate]
+    error: Tree
+    defect: jax.Array
+    law_defect: jax.Array
+    extent: Extent
+
+
+def enclosed(flow: Flow, growth: Growth, ends: tuple[Any, Any], arc: Arc, last: Rate) -> Sample:
+    """|δ(θ)| ≤ (1−θ)(|δ(0)| + dev) + θ(|δ(1)| + dev) entry by entry, with dev from chord
+    arithmetic, since p is a line; so ∫‖δ‖ is at most the mean of the norms of the two brackets
+    (the norm of their mean would be too little: ends may lie in different entries). δ(0) is
+    rounding, unless data jumps where nobody said it would. The step lies between the times `ends`."""
+    ends, arc, growth = lax.stop_gradient((ends, arc, growth))
+    h, x0, x1, c = values(tuple(arc))
+    space = flow.state_space(x0)
+    bend = flow.generator.bend(arc, space, growth)
+    x = jtu.tree_map(Chord, x0, x1, bend)
+    along, u = flow.enclosure(Chord(*ends, jnp.zeros_like(h)), x)
+    at_start = jtu.tree_map(lambda q, p: jnp.abs(q.a - p) + q.dev, along, c[0], is_leaf=is_chord)
+    at_end = jtu.tree_map(
+        lambda q, p: jnp.abs(q.b - p) + q.dev, along, polynomial(c, 1.0), is_leaf=is_chord
+    )
+    error = _tree.scale(0.5, _tree.add(at_start, at_end))
+    defect = 0.5 * h * (space.norm(at_start) + space.norm(at_end))
+    return Sample((), [last], error, defect, jnp.zeros_like(defect), Extent.of_chords(x, u))
+
+
+def sampled(
+    flow: Flow, thetas: tuple[float, ...], h: Any, x0: Tree, c: Any, visits: list[Visit]
+) -> Sample:
+    """δ at the start, at the points `thetas` inside and at the end of the step.
+
+    Between the samples δ is taken to be a line plus a bump (a parabola, or the tent of a kink):
+    then ∫|δ| ≤ h(½|δ(0)| + ½|δ(1)| + max |δ(θ) − (1 − θ)δ(0) − θδ(1)|), whatever the place of the
+    kink. δ(0) is zero for a method whose polynomial starts at f̃(t₀, x₀), as most do.
+    """
+    along = [visits[0], *visits[-1 - len(thetas) :]]
+    _, *inner, last = (visit.rate for visit in along)
+    start, *middle, end = (
+        _tree.sub(flow.rest(visit.x, visit.rate.value), polynomial(c, theta))
+        for theta, visit in zip((0.0, *thetas, 1.0), along, strict=True)
+    )
+    bumps = []
+    for theta, defect in zip(thetas, middle, strict=True):
+        line = _tree.add(_tree.scale(1.0 - theta, start), _tree.scale(theta, end))
+        bumps.append(jtu.tree_map(jnp.abs, _tree.sub(defect, line)))
+
+    # How well z, the unconstrained value of the law, is predicted by its other samples.
+    zs = [visit.rate.z for visit in along]
+    weights = extrapolation((0.0, *thetas, 1.0))
+    doubt = jtu.tree_map(
+        lambda *z: _DOUBT * sum(w * v for w, v in zip(weights, z, strict=True)), *zs
+    )
+    unseen = _unseen(flow, along[1:], doubt)
+    ends = _tree.scale(0.5, start), _tree.scale(0.5, end)
+    bump = _largest(bumps)
+    error = jtu.tree_map(lambda *parts: sum(map(jnp.abs, parts)), *ends, bump, unseen)
+    space = flow.state_space(x0)
+    defect = h * sum(map(space.norm, (*ends, bump, unseen)))
+    law_defect = h * jnp.max(jnp.stack([visit.rate.residual for visit in along]))
+    places = [(visit.x, flow.operator.inverse(visit.rate.y)) for visit in lax.stop_gradient(along)]
+    extent = reduce(Extent.joined, [Extent((x, x), (u, u)) for x, u in places])
+    return Sample(thetas, [*inner, last], error, defect, law_defect, extent)
+
+
+def _unseen(flow: Flow, visits: list[Visit], doubt: Tree) -> Tree:
+    """The most that is hidden at any of them; where projections are iterated, from one place of
+    the program, as in `evaluations`."""
+    hidden = lambda v: flow.hidden(v.t, v.x, v.rate, doubt)  # noqa: E731
+    if flow.direct:
+        return _largest([hidden(visit) for visit in visits])
+    stacked = lax.map(hidden, jtu.tree_map(lambda *leaves: jnp.stack(leaves), *visits))
+    return jtu.tree_map(lambda leaf: jnp.max(leaf, axis=0), stacked)
+
+
+def _largest(trees: list[Tree]) -> Tree:
+    """Entry by entry."""
+    return reduce(lambda a, b: jtu.tree_map(jnp.maximum, a, b), trees)
