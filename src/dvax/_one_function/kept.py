@@ -28,39 +28,40 @@ _COSTS = {
 
 
 def worth_keeping(eqns: list[Any], results: set[Any], brief: int) -> list[list[Any]]:
-    """Variables to be kept, those that others lead to after these."""
-    joined = _joined(eqns, results)
-    cost = _costs(eqns, set())
-    ends: dict[Any, set[Any]] = {v: {v} for v in results}
-    chosen: set[Any] = set()
-    for eqn in reversed(eqns):
-        (v, *_) = eqn.outvars
-        own = set().union(*(ends.get(w, set()) for w in eqn.outvars))
-        if not own:
-            continue
-        if _written(eqn):
-            own = {v}
-        elif math.prod(v.aval.shape) > brief and (
-            (len(own) > 1 and cost[v] >= _WORTH) or (v in joined and own != {v})
-        ):
-            chosen.add(v)
-            own = {v}
-        for w in _variables(eqn.invars):
-            ends[w] = ends.get(w, set()) | ({w} if is_sum(eqn) else own)
-    # With all that is chosen before it kept, one may cost little.
-    kept: set[Any] = set()
-    cost = _costs(eqns, kept, chosen, joined)
+    """Variables of more entries than `brief` to be kept, those that others lead to after these."""
+    kept = _kept(eqns, _chosen(eqns, results, brief), _joined(eqns, results))
     stage: dict[Any, int] = {}
     stages: list[list[Any]] = []
     for eqn in eqns:
         at = max([stage.get(w, 0) for w in _variables(eqn.invars)], default=0)
         stage |= dict.fromkeys(eqn.outvars, at)
-        for v in kept.intersection(eqn.outvars):
-            if at == len(stages):
-                stages.append([])
-            stages[at].append(v)
-            stage[v] = at + 1
+        for v in eqn.outvars:
+            if v in kept:
+                stages += [[]] if at == len(stages) else []
+                stages[at].append(v)
+                stage[v] = at + 1
     return stages
+
+
+def _chosen(eqns: list[Any], results: set[Any], brief: int) -> set[Any]:
+    """What leads to several things that are written down, and costs much if nothing before it is kept;
+    and what is put together of parts on the way to anything."""
+    joined, cost = _joined(eqns, results), _costs(eqns, set())
+    ends: dict[Any, set[Any]] = {v: {v} for v in results}
+    chosen: set[Any] = set()
+    for eqn in reversed(eqns):
+        v = eqn.outvars[0]
+        own = set().union(*(ends.get(w, set()) for w in eqn.outvars))
+        if own and _is_written(eqn):
+            own = {v}
+        elif own and math.prod(v.aval.shape) > brief:
+            often = len(own) > 1 and cost[v] >= _WORTH
+            if often or (v in joined and own != {v}):
+                chosen.add(v)
+                own = {v}
+        for w in _variables(eqn.invars):
+            ends[w] = ends.get(w, set()) | ({w} if own and is_sum(eqn) else own)
+    return chosen
 
 
 def _joined(eqns: list[Any], results: set[Any]) -> set[Any]:
@@ -78,23 +79,27 @@ def _joined(eqns: list[Any], results: set[Any]) -> set[Any]:
     return found - (into - others)
 
 
-def _costs(eqns: list[Any], kept: set[Any], chosen: Any = (), joined: Any = ()) -> dict[Any, float]:
-    """What it costs to compute an entry of each, from what is kept; of the `chosen`, those that cost
-    enough are kept."""
+def _kept(eqns: list[Any], chosen: set[Any], joined: set[Any]) -> set[Any]:
+    """Of the chosen, those that cost much even if the others before them are kept."""
+    kept: set[Any] = set()
+    for v in [v for eqn in eqns for v in eqn.outvars if v in chosen]:
+        if v in joined or _costs(eqns, kept)[v] >= _WORTH:
+            kept.add(v)
+    return kept
+
+
+def _costs(eqns: list[Any], kept: set[Any]) -> dict[Any, float]:
+    """What it costs to compute an entry of each, from what is kept."""
     cost: dict[Any, float] = {}
     for eqn in eqns:
-        own = _COSTS.get(eqn.primitive.name, 1.0) + sum(
-            cost.get(w, 0.0) for w in _variables(eqn.invars)
-        )
-        own = 0.0 if _written(eqn) else own
-        for v in eqn.outvars:
-            if v in chosen and (own >= _WORTH or v in joined):
-                kept.add(v)
-            cost[v] = 0.0 if v in kept else own
+        own = _COSTS.get(eqn.primitive.name, 1.0)
+        own += sum(cost.get(w, 0.0) for w in _variables(eqn.invars))
+        written = _is_written(eqn)
+        cost |= {v: 0.0 if written or v in kept else own for v in eqn.outvars}
     return cost
 
 
-def _written(eqn: Any) -> bool:
+def _is_written(eqn: Any) -> bool:
     return math.isinf(_COSTS.get(eqn.primitive.name, 1.0)) or is_sum(eqn)
 
 

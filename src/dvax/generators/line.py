@@ -10,6 +10,7 @@ Im Z and both backward with fixed factors. For these, n must be a multiple of fo
 """
 
 import functools
+import math
 from typing import Any
 
 import jax
@@ -49,7 +50,7 @@ def cosines(x: jax.Array, sign: float) -> jax.Array:
     low = ar * p - ai * q + br * r + bi * s
     high = br * s - bi * r - ai * p - ar * q
     begin, middle = parts[0][:1] + parts[1][:1], parts[0][:1] - parts[1][:1]
-    return jnp.concatenate([2.0 * begin, low, np.sqrt(2.0) * middle, jnp.flip(high)])
+    return jnp.concatenate([2.0 * begin, low, math.sqrt(2.0) * middle, jnp.flip(high)])
 
 
 def of_cosines(c: jax.Array, sign: float) -> jax.Array:
@@ -61,7 +62,7 @@ def of_cosines(c: jax.Array, sign: float) -> jax.Array:
     real = ar * up + ai * down + br * left - bi * right
     imag = ai * up - ar * down + bi * left + br * right
     # Z₀ has both the mean and what alternates.
-    begin, middle = 0.25 * c[:1], np.sqrt(0.125) * c[m : m + 1]
+    begin, middle = 0.25 * c[:1], math.sqrt(0.125) * c[m : m + 1]
     Z = jnp.concatenate(
         [jax.lax.complex(begin + middle, begin - middle), jax.lax.complex(real, imag)]
     )

@@ -1,0 +1,96 @@
+"""States with their coefficients: whatever is made of them is what is made of the states alone."""
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import pytest
+
+import dvax
+from dvax.generators import Arc
+from dvax.generators.expanded import coefficients, expanded, values
+
+g = dvax.generators
+WAVES = g.Elliptic(12, 2.0, "periodic", diffusion=0.0, velocity=1.5)
+HEAT = g.Elliptic(12, 2.0, "dirichlet")
+GENERATORS = {
+    "dirichlet": (HEAT, (12,)),
+    "dirichlet, long": (g.Elliptic(256, 2.0, "dirichlet"), (256,)),
+    "periodic": (WAVES, (12,)),
+    "neumann, odd": (g.Elliptic(131, 2.0, "neumann"), (131,)),
+    "a square": (g.Elliptic((6, 8), (1.0, 2.0), ("dirichlet", "periodic")), (6, 8)),
+    "rotation": (g.Rotation(0.0, WAVES.symbol.imag, WAVES.transform), ((12,), (12,))),
+    "components": (
+        g.KroneckerSum(HEAT, jnp.array([[-1.0, 0.3], [0.2, -2.0]])), (2, 12)
+    ),
+    "a product": (g.Product(HEAT, g.Scalar(-1.0)), ((12,), ())),
+    "a number": (g.Scalar(-0.5), (7,)),
+}  # fmt: skip
+
+
+def state(shape, seed):
+    rng = np.random.default_rng(seed)
+    if shape and isinstance(shape[0], tuple):
+        return tuple(jnp.asarray(rng.normal(size=part)) for part in shape)
+    return jnp.asarray(rng.normal(size=shape))
+
+
+def space_of(x):
+    return (
+        dvax.spaces.Product(*map(space_of, x))
+        if isinstance(x, tuple)
+        else dvax.spaces.L2(jnp.full(jnp.shape(x), 0.25))
+    )
+
+
+def close(a, b):
+    jtu.tree_map(lambda p, q: np.testing.assert_allclose(p, q, rtol=1e-11, atol=1e-11), a, b)
+
+
+@pytest.mark.parametrize("name", GENERATORS)
+def test_a_step_with_coefficients_is_the_step(name):
+    A, shape = GENERATORS[name]
+    x0, c0, c1 = (state(shape, seed) for seed in range(3))
+    step = A.propagator(jnp.asarray(0.3), 2).step
+    plain = step(x0, (c0, c1))
+    x1 = step(expanded(A, x0), (expanded(A, c0), expanded(A, c1)))
+    close(values(x1), plain)
+    # Those that come along are the state's own, and are taken for such.
+    close(coefficients(x1), coefficients(expanded(A, values(x1))))
+    again = expanded(A, values(x1), coefficients(x1))
+    close(values(step(again, ())), A.semigroup(0.3, plain))
+
+
+@pytest.mark.parametrize("name", GENERATORS)
+def test_what_is_linear_in_states_is_so_in_coefficients(name):
+    A, shape = GENERATORS[name]
+    a, b = (expanded(A, state(shape, seed)) for seed in (3, 4))
+    both = jtu.tree_map(lambda p, q: 2.0 * p - 0.5 * q, a, b)
+    close(both, expanded(A, values(both)))
+
+
+@pytest.mark.parametrize("name", GENERATORS)
+def test_the_bend_is_the_same(name):
+    A, shape = GENERATORS[name]
+    x0, c0, c1 = (state(shape, seed) for seed in range(3))
+    space = space_of(x0)
+    h = jnp.asarray(0.2)
+    x1 = A.propagator(h, 2).step(x0, (c0, c1))
+    growth = A.growth(space)
+    plain = A.bend(Arc(h, x0, x1, (c0, c1)), space, growth)
+    arc = Arc(h, *(jtu.tree_map(jnp.asarray, expanded(A, v)) for v in (x0, x1)),
+              tuple(expanded(A, v) for v in (c0, c1)))  # fmt: skip
+    close(A.bend(arc, space, growth), plain)
+
+
+def test_derivatives_of_a_step_see_no_difference():
+    A, shape = GENERATORS["dirichlet"]
+    x0, c0 = state(shape, 0), state(shape, 1)
+    w = state(shape, 2)
+
+    def end(x0, h, lift):
+        return jnp.sum(w * values(A.propagator(h, 1).step(lift(x0), (lift(c0),))))
+
+    for argnum in (0, 1):
+        slope = lambda lift, k=argnum: jax.grad(end, k)(x0, jnp.asarray(0.3), lift)  # noqa: E731
+        close(slope(lambda v: expanded(A, v)), slope(lambda v: v))
