@@ -144,6 +144,18 @@ def test_batches_and_derivatives_are_those_of_the_loop(by):
     np.testing.assert_allclose(divided(given), jax.jit(by(run))(given), rtol=1e-12, atol=1e-12)
 
 
+def test_each_of_a_batch_may_end_at_its_own_turn():
+    def run(turns, v):
+        turn = lambda c: (c[0] + 1, transformed(c[1]) + 1.0)  # noqa: E731
+        return jax.lax.while_loop(lambda c: c[0] < turns, turn, (jnp.asarray(0), v))
+
+    turns, given = jnp.array([1, 4, 0]), jnp.stack([V, 2.0 - V, V**2])
+    divided = jax.jit(jax.vmap(lambda n, v: in_one_function(run, n, v)))
+    count, v = divided(turns, given)
+    np.testing.assert_array_equal(count, turns)
+    np.testing.assert_allclose(v, jax.jit(jax.vmap(run))(turns, given)[1], rtol=1e-12)
+
+
 SIZES = mostly_thorough([1, 33, 64, 97, 512, 1000, 4097, 8191], [33, 1000, 4097])
 
 
@@ -221,6 +233,7 @@ def test_a_step_is_a_chain_of_few_functions(method, transforms, boundary):
             dict(rtol=1e-5, ts=np.linspace(0.1, 1.0, 7)),
             dict(rtol=1e-4, dense=True),
             dict(rtol=1e-5, adjoint="forward"),
+            dict(dt=0.02, method=dvax.ExpRosenbrock()),
             dict(dt=0.02, ts=np.linspace(0.1, 1.0, 7)),
         ],
         [dict(rtol=1e-5), dict(rtol=1e-5, method=dvax.ETD4RK())],

@@ -94,3 +94,17 @@ def test_derivatives_of_a_step_see_no_difference():
     for argnum in (0, 1):
         slope = lambda lift, k=argnum: jax.grad(end, k)(x0, jnp.asarray(0.3), lift)  # noqa: E731
         close(slope(lambda v: expanded(A, v)), slope(lambda v: v))
+
+
+@pytest.mark.parametrize("how", [dict(dt=0.1), dict(rtol=1e-3)], ids=["fixed", "adaptive"])
+def test_a_method_that_linearises_has_no_use_for_them(how):
+    # In every step A has another J beside it, and other eigenfunctions.
+    problem = dvax.Problem(
+        A=HEAT, P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.4),
+        f=lambda t, x, u, args: -0.2 * x - u, h=lambda t, x, u, args: 1.0 - 1.5 * x - 0.5 * u,
+    )  # fmt: skip
+    ends = [
+        dvax.solve(problem, jnp.ones(12), 0.0, 0.3, method=method, **how).xs[-1]
+        for method in (dvax.ExpRosenbrock(), dvax.ETD4RK())
+    ]
+    np.testing.assert_allclose(*ends, atol=1e-3)

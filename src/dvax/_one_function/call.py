@@ -28,8 +28,9 @@ def in_one_function(
     computed: Any = (),
     otherwise: Callable[..., Any] | None = None,
 ) -> Any:
-    """run(*args, *computed), compiled as one function where it is small and this is a CPU. What another
-    such function has `computed` may be as large as it likes.
+    """run(*args, *computed), compiled as one function where it is small and this is a CPU, or its loops
+    as few where they are small but for calls of a library. What another such function has `computed`
+    may be as large as it likes.
 
     A batch of it and its derivatives are such functions too; unless there is another way to the same
     result, which is then taken `otherwise`, and can be transposed."""

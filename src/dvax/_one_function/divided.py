@@ -9,8 +9,11 @@ arithmetic. Here a turn becomes
 each of which computes all that follows from the calls before it (`turn`).
 """
 
+from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
@@ -61,11 +64,16 @@ def _taken(eqn: Any, given: list[Any]) -> list[Any]:
 
 
 def _loop(eqn: Any, given: list[Any]) -> list[Any]:
-    goes_on, body = jaxpr_as_fun(eqn.params["cond_jaxpr"]), divided(eqn.params["body_jaxpr"])
     first = eqn.params["cond_nconsts"]
     second = first + eqn.params["body_nconsts"]
     of_cond, of_body, init = given[:first], given[first:second], given[second:]
-    if not is_brief(eqn.params["body_jaxpr"]):
+    goes_on, body = jaxpr_as_fun(eqn.params["cond_jaxpr"]), eqn.params["body_jaxpr"]
+    if eqn.params["cond_jaxpr"].out_avals[0].shape:
+        goes_on, body = _of_batch(goes_on, body, of_cond)
+        of_body = of_cond + of_body
+    brief = is_brief(body)
+    body = divided(body)
+    if not brief:
         return lax.while_loop(
             lambda carry: goes_on(*of_cond, *carry)[0],
             lambda carry: jaxpr_as_fun(body)(*of_body, *carry),
@@ -78,3 +86,25 @@ def _loop(eqn: Any, given: list[Any]) -> list[Any]:
         turn.together(init),
     )
     return turn.apart(*end)
+
+
+def _of_batch(
+    goes_on: Callable[..., Any], body: ClosedJaxpr, of_cond: list[Any]
+) -> tuple[Callable[..., Any], ClosedJaxpr]:
+    """The same loop where each problem of a batch has its own end: it goes on while any of them does,
+    and the others stay as they are."""
+    first, second = len(of_cond), len(body.in_avals) - len(body.out_avals)
+
+    def turn(*given: Any) -> list[Any]:
+        of_cond, of_body, carry = (
+            given[:first],
+            given[first : first + second],
+            given[first + second :],
+        )
+        own = goes_on(*of_cond, *carry)[0]
+        new = jaxpr_as_fun(body)(*of_body, *carry)
+        like = lambda v: own.reshape(*own.shape, *(1,) * (v.ndim - own.ndim))  # noqa: E731
+        return [jnp.where(like(v), w, v) for v, w in zip(carry, new, strict=True)]
+
+    avals = [jax.typeof(x) for x in of_cond] + body.in_avals
+    return lambda *given: [jnp.any(goes_on(*given)[0])], retraced(turn, avals)

@@ -202,7 +202,7 @@ class Loop(eqx.Module):
 
         def of_one_length(carry: Any) -> Any:
             state, *rest = carry
-            factors = self.stepper.fitted(*self._ahead(state), jnp.asarray(True))
+            factors = self.stepper.fitted(*self._ahead(state), jnp.asarray(False))
             carry = (state._replace(factors=factors), *rest)
             one = lambda c: (turn(c[0]), jnp.asarray(False))  # noqa: E731
             # One in any case: what is not a number fits nothing.

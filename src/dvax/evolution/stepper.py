@@ -133,7 +133,8 @@ class Stepper(eqx.Module):
     def begin(self, x0: Tree) -> Memory:
         """Before the first step nothing is known but where to look first."""
         guess = self.flow.guess(x0)
-        known = coefficients(self.flow.expand(x0))
+        # A method that linearises has another A in every step.
+        known = coefficients(x0 if self.method.linearises else self.flow.expand(x0))
         if not self.measure:
             return Memory(None, guess, known)
         blank = jax.eval_shape(lambda: self._kept(self.flow.rate(self.ends[0], x0, guess)))
