@@ -96,7 +96,7 @@ def test_derivatives_of_a_step_see_no_difference():
         close(slope(lambda v: expanded(A, v)), slope(lambda v: v))
 
 
-@pytest.mark.parametrize("how", [dict(dt=0.1), dict(rtol=1e-3)], ids=["fixed", "adaptive"])
+@pytest.mark.parametrize("how", [dict(dt=0.02), dict(rtol=1e-4)], ids=["fixed", "adaptive"])
 def test_a_method_that_linearises_has_no_use_for_them(how):
     # In every step A has another J beside it, and other eigenfunctions.
     problem = dvax.Problem(
@@ -107,4 +107,4 @@ def test_a_method_that_linearises_has_no_use_for_them(how):
         dvax.solve(problem, jnp.ones(12), 0.0, 0.3, method=method, **how).xs[-1]
         for method in (dvax.ExpRosenbrock(), dvax.ETD4RK())
     ]
-    np.testing.assert_allclose(*ends, atol=1e-3)
+    np.testing.assert_allclose(*ends, atol=3e-4)
