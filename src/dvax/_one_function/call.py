@@ -98,7 +98,8 @@ def _opened(program: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
 
 def _value(const: Any) -> Any:
     """What tells a constant from others: its entries, where they are known."""
-    if isinstance(const, Tracer) or math.prod(jnp.shape(const)) > LARGEST:
+    is_key = jax.dtypes.issubdtype(const.dtype, jax.dtypes.extended)
+    if isinstance(const, Tracer) or is_key or math.prod(jnp.shape(const)) > LARGEST:
         return id(const)
     array = np.asarray(const)
     return array.dtype.name, array.shape, array.tobytes()
