@@ -253,4 +253,3 @@ def test_a_field_is_solved_as_without(how, monkeypatch):
     jax.clear_caches()
     apart = np.max(np.abs(np.asarray(divided.xs) - np.asarray(plain.xs)))
     assert apart <= (2 * how["rtol"] if "rtol" in how else 1e-13)
-    assert re.search("success", str(divided.result)) or divided.stats["steps"] > 0
