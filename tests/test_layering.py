@@ -15,6 +15,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "dvax"
 
 FLOORS = {
     "errors": -2,
+    "_jaxpr": -2,
     "_tree": -1,
     "_batch": -1,
     "_one_function": -1,

@@ -26,7 +26,8 @@ def assembled(points, cells):
         slopes = np.linalg.inv(edges)
         slopes = np.column_stack([-slopes.sum(axis=1), slopes])
         i, j = np.meshgrid(cell, cell, indexing="ij")
-        rows.append(i.ravel()), cols.append(j.ravel())
+        rows.append(i.ravel())
+        cols.append(j.ravel())
         mass.append(
             (volume / (d + 1) / (d + 2) * (np.ones((d + 1, d + 1)) + np.eye(d + 1))).ravel()
         )

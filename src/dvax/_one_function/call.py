@@ -98,7 +98,7 @@ def _opened(program: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
 
 def _value(const: Any) -> Any:
     """What tells a constant from others: its entries, where they are known."""
-    is_key = jax.dtypes.issubdtype(const.dtype, jax.dtypes.extended)
+    is_key = jnp.issubdtype(const.dtype, jax.dtypes.extended)
     if isinstance(const, Tracer) or is_key or math.prod(jnp.shape(const)) > LARGEST:
         return id(const)
     array = np.asarray(const)

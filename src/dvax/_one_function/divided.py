@@ -15,11 +15,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
+from .._jaxpr import bound, walked
 from .small import inner_programs, is_brief, is_known
 from .turn import Turn
-from .within import bound, retraced
+from .within import retraced
 
 _CALLS = frozenset("jit pjit closed_call custom_jvp_call custom_vjp_call remat2".split())
 
@@ -41,23 +42,14 @@ def _has_such(eqn: Any) -> bool:
 
 def divided(program: ClosedJaxpr) -> ClosedJaxpr:
     """The program with its calls opened and its loops divided."""
-    return retraced(lambda *given: _opened(program, given), program.in_avals)
-
-
-def _opened(program: ClosedJaxpr, given: Any) -> list[Any]:
-    values = dict(zip(program.jaxpr.constvars, program.consts, strict=True))
-    values |= dict(zip(program.jaxpr.invars, given, strict=True))
-    read = lambda atom: atom.val if isinstance(atom, Literal) else values[atom]  # noqa: E731
-    for eqn in program.jaxpr.eqns:
-        values |= dict(zip(eqn.outvars, _taken(eqn, list(map(read, eqn.invars))), strict=True))
-    return list(map(read, program.jaxpr.outvars))
+    return retraced(lambda *given: walked(program, given, _taken), program.in_avals)
 
 
 def _taken(eqn: Any, given: list[Any]) -> list[Any]:
     if eqn.primitive.name in _CALLS:
         for inner in inner_programs(eqn.params):
             if len(inner.jaxpr.invars) == len(given):
-                return _opened(inner, given)
+                return walked(inner, given, _taken)
     if eqn.primitive.name == "while" and not is_known(eqn):
         return _loop(eqn, given)
     return bound(eqn, given)

@@ -8,8 +8,7 @@ branch is what it does not see through: what a branch returns is written down.
 import math
 from typing import Any
 
-from jax.extend.core import Literal, Var
-
+from .._jaxpr import variables
 from .joins import is_joined
 from .sums import is_sum
 
@@ -33,7 +32,7 @@ def worth_keeping(eqns: list[Any], results: set[Any], brief: int) -> list[list[A
     stage: dict[Any, int] = {}
     stages: list[list[Any]] = []
     for eqn in eqns:
-        at = max([stage.get(w, 0) for w in _variables(eqn.invars)], default=0)
+        at = max([stage.get(w, 0) for w in variables(eqn.invars)], default=0)
         stage |= dict.fromkeys(eqn.outvars, at)
         for v in eqn.outvars:
             if v in kept:
@@ -59,7 +58,7 @@ def _chosen(eqns: list[Any], results: set[Any], brief: int) -> set[Any]:
             if often or (v in joined and own != {v}):
                 chosen.add(v)
                 own = {v}
-        for w in _variables(eqn.invars):
+        for w in variables(eqn.invars):
             ends[w] = ends.get(w, set()) | ({w} if own and is_sum(eqn) else own)
     return chosen
 
@@ -70,11 +69,11 @@ def _joined(eqns: list[Any], results: set[Any]) -> set[Any]:
     for eqn in eqns:
         if is_joined(eqn):
             found.add(eqn.outvars[0])
-        elif eqn.primitive.name == "reshape" and found & _variables(eqn.invars):
+        elif eqn.primitive.name == "reshape" and found & variables(eqn.invars):
             found.add(eqn.outvars[0])
             into.add(eqn.invars[0])
     others = results | {
-        v for e in eqns if e.primitive.name != "reshape" for v in _variables(e.invars)
+        v for e in eqns if e.primitive.name != "reshape" for v in variables(e.invars)
     }
     return found - (into - others)
 
@@ -93,7 +92,7 @@ def _costs(eqns: list[Any], kept: set[Any]) -> dict[Any, float]:
     cost: dict[Any, float] = {}
     for eqn in eqns:
         own = _COSTS.get(eqn.primitive.name, 1.0)
-        own += sum(cost.get(w, 0.0) for w in _variables(eqn.invars))
+        own += sum(cost.get(w, 0.0) for w in variables(eqn.invars))
         written = _is_written(eqn)
         cost |= {v: 0.0 if written or v in kept else own for v in eqn.outvars}
     return cost
@@ -101,7 +100,3 @@ def _costs(eqns: list[Any], kept: set[Any]) -> dict[Any, float]:
 
 def _is_written(eqn: Any) -> bool:
     return math.isinf(_COSTS.get(eqn.primitive.name, 1.0)) or is_sum(eqn)
-
-
-def _variables(atoms: Any) -> set[Any]:
-    return {atom for atom in atoms if isinstance(atom, Var) and not isinstance(atom, Literal)}

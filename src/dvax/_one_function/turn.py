@@ -13,11 +13,12 @@ from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var
 from jax.interpreters import partial_eval as pe
 
+from .._jaxpr import bound, values, variables
 from .joins import joined
 from .marked import as_one
 from .packed import is_number, packed, places, unpacked
 from .small import is_known, writes
-from .within import BRIEF, bound, carried_out
+from .within import BRIEF, carried_out
 
 _LONG = 1024
 """Entries of an array up to which it is packed with others, if functions make it: to copy a longer one
@@ -60,7 +61,7 @@ class Turn:
             _is_few(v.aval) or (_is_few(v.aval, _LONG) and isinstance(w, Var) and w in made)
             for v, w in zip(self.carried, self.results, strict=True)
         ]
-        used = _used(moving) | _variables(self.results)
+        used = _used(moving) | variables(self.results)
         self._keep({v: value for v, value in known.items() if v in used})
 
     def _keep(self, still: dict[Any, Any]) -> None:
@@ -68,9 +69,9 @@ class Turn:
         few = {v: x for v, x in still.items() if _is_few(v.aval)}
         large = {v: x for v, x in still.items() if v not in few}
         # Constants that are handed to a function would stop the compiler.
-        values = lax.optimization_barrier([packed([jnp.ones(()), *few.values()]), *large.values()])
-        self.array: jax.Array = values[0]
-        self.known: dict[Any, Any] = dict(zip(large, values[1:], strict=True))
+        held = lax.optimization_barrier([packed([jnp.ones(()), *few.values()]), *large.values()])
+        self.array: jax.Array = held[0]
+        self.known: dict[Any, Any] = dict(zip(large, held[1:], strict=True))
         self.known |= _slots(0, few, 1)
 
     def _by_level(self, eqns: list[Any]) -> list[_Level]:
@@ -79,19 +80,19 @@ class Turn:
         made: dict[Any, int] = {}
         early = []
         for eqn in eqns:
-            early.append(max([made.get(v, 0) for v in _variables(eqn.invars)], default=0))
+            early.append(max([made.get(v, 0) for v in variables(eqn.invars)], default=0))
             made |= dict.fromkeys(eqn.outvars, early[-1] + 1 if _is_call(eqn) else early[-1])
         # Results are packed by a function, the last one.
-        last = max([made.get(v, 0) for v in _variables(self.results)], default=0)
+        last = max([made.get(v, 0) for v in variables(self.results)], default=0)
         last = max([last, *early])
         levels = [_Level([], []) for _ in range(last + 1)]
         due: dict[Any, int] = {}
         for eqn, level in zip(reversed(eqns), reversed(early), strict=True):
             # What was there before all calls is at hand for any function.
-            passed = {v for v in _variables(eqn.invars) if made.get(v, 0) > 0}
+            passed = {v for v in variables(eqn.invars) if made.get(v, 0) > 0}
             if not _is_call(eqn) and _size(passed) <= _size(eqn.outvars):
                 level = min([due.get(v, last) for v in eqn.outvars])
-            due |= {v: min(due.get(v, last), level) for v in _variables(eqn.invars)}
+            due |= {v: min(due.get(v, last), level) for v in variables(eqn.invars)}
             (levels[level].calls if _is_call(eqn) else levels[level].own).insert(0, eqn)
         return levels
 
@@ -117,9 +118,9 @@ class Turn:
         *before, last = range(len(self.levels))
         for k in before:
             later = [e for level in self.levels[k + 1 :] for e in (*level.own, *level.calls)]
-            run.function(self.levels[k], _used(later) | _variables(self.results), [])
+            run.function(self.levels[k], _used(later) | variables(self.results), [])
         small = _those(self.results, self.packs)
-        vector = run.function(self.levels[last], _variables(_those(self.results, others)), small)
+        vector = run.function(self.levels[last], variables(_those(self.results, others)), small)
         return vector, [run.value(v) for v in _those(self.results, others)]
 
 
@@ -158,16 +159,16 @@ class _Run:
         whole = [v for v in needed if v not in slots]
         few, large = [v for v in out if _is_few(v.aval)], [v for v in out if not _is_few(v.aval)]
 
-        def run(arrays: Any, values: Any) -> Any:
+        def run(arrays: Any, others: Any) -> Any:
             given = dict(zip(which, arrays, strict=True))
-            known = dict(zip(whole, values, strict=True))
+            known = dict(zip(whole, others, strict=True))
             known |= {v: _part(given, slot, v) for v, slot in slots.items()}
             one = arrays[0][0]
             eqns = [*self.turn.free, *own]
             found = iter(carried_out(eqns, known, [*large, *few, *results], one))
             rest, small, end = ([next(found) for _ in vs] for vs in (large, few, results))
             kept = packed(small) if small else None, _joined(end, one) if end else None
-            return rest, *kept, [leaf.ravel()[0] for leaf in (*arrays, *values)]
+            return rest, *kept, [leaf.ravel()[0] for leaf in (*arrays, *others)]
 
         handed = [self.arrays[k] for k in which], [self.known[v] for v in whole]
         rest, small, end, _ = as_one(run, *handed)
@@ -184,11 +185,10 @@ def _at_rest(jaxpr: Jaxpr, known: dict[Any, Any]) -> tuple[list[Any], list[Any]]
     free, moving = [], []
     none: dict[Any, Any] = {}
     for eqn in jaxpr.eqns:
-        needs = _variables(eqn.invars)
+        needs = variables(eqn.invars)
         if needs <= none.keys() | known.keys():
             both = none | known
-            given = [v.val if isinstance(v, Literal) else both[v] for v in eqn.invars]
-            found = dict(zip(eqn.outvars, bound(eqn, given), strict=True))
+            found = dict(zip(eqn.outvars, bound(eqn, values(both, eqn.invars)), strict=True))
             if needs <= none.keys() and is_known(eqn):
                 free.append(eqn)
                 none |= found
@@ -205,11 +205,11 @@ def _is_call(eqn: Any) -> bool:
     return not is_known(eqn) or writes(eqn, BRIEF)
 
 
-def _joined(values: list[Any], one: jax.Array) -> jax.Array:
+def _joined(leaves: list[Any], one: jax.Array) -> jax.Array:
     """All of them packed, the large ones by loops of their own."""
     parts: list[jax.Array] = []
     few: list[Any] = []
-    for value in values:
+    for value in leaves:
         if jnp.size(value) <= BRIEF:
             few.append(value)
             continue
@@ -233,8 +233,8 @@ def _slots(array: int, variables: Any, begin: int = 0) -> dict[Any, _Slot]:
     return found
 
 
-def _those(values: Any, wanted: list[bool]) -> list[Any]:
-    return [value for value, is_wanted in zip(values, wanted, strict=True) if is_wanted]
+def _those(those: Any, wanted: list[bool]) -> list[Any]:
+    return [value for value, is_wanted in zip(those, wanted, strict=True) if is_wanted]
 
 
 def _is_few(aval: Any, most: int = BRIEF) -> bool:
@@ -245,12 +245,8 @@ def _size(variables: Any) -> int:
     return sum(v.aval.size for v in variables)
 
 
-def _variables(atoms: Any) -> set[Any]:
-    return {atom for atom in atoms if isinstance(atom, Var)}
-
-
 def _used(eqns: list[Any]) -> set[Any]:
-    return {v for eqn in eqns for v in _variables(eqn.invars)}
+    return {v for eqn in eqns for v in variables(eqn.invars)}
 
 
 def _in_order(eqns: list[Any], results: list[Any]) -> list[Any]:

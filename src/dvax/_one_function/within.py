@@ -6,8 +6,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.extend.core import ClosedJaxpr, Literal, Var
+from jax.extend.core import ClosedJaxpr
 
+from .._jaxpr import bound, values, variables, walked
 from .joins import is_joined, part_by_part
 from .kept import worth_keeping
 from .small import inner_programs
@@ -15,13 +16,6 @@ from .sums import by_parts, is_sum
 
 BRIEF = 64
 """Entries of an array that is handed on with others, as one, and never worth a loop of its own."""
-
-
-def bound(eqn: Any, given: list[Any]) -> list[Any]:
-    """An operation on these arrays."""
-    with eqn.ctx.manager:
-        found = eqn.primitive.bind(*given, **eqn.primitive.get_bind_params(eqn.params))
-    return list(found) if eqn.primitive.multiple_results else [found]
 
 
 def retraced(run: Any, avals: Any) -> ClosedJaxpr:
@@ -33,14 +27,7 @@ def summed_by_parts(program: ClosedJaxpr) -> ClosedJaxpr:
     if not _has_sums(program):
         return program
 
-    def run(*given: Any) -> list[Any]:
-        known = dict(zip(program.jaxpr.constvars, program.consts, strict=True))
-        known |= dict(zip(program.jaxpr.invars, given, strict=True))
-        for eqn in program.jaxpr.eqns:
-            known |= dict(zip(eqn.outvars, _by_parts(eqn, _all(known, eqn.invars)), strict=True))
-        return _all(known, program.jaxpr.outvars)
-
-    return retraced(run, program.in_avals)
+    return retraced(lambda *given: walked(program, given, _by_parts), program.in_avals)
 
 
 def carried_out(
@@ -48,7 +35,7 @@ def carried_out(
 ) -> list[Any]:
     """The results of the equations as one function has them fastest, from the values of what is known
     and a 1 that the compiler does not know."""
-    for stage in worth_keeping(eqns, _variables(results), BRIEF):
+    for stage in worth_keeping(eqns, variables(results), BRIEF):
         compute = partial(_found, eqns, known, stage, one)
         blank = partial(_blank, stage)
         known = known | dict(zip(stage, lax.cond(one > 0.0, compute, blank), strict=True))
@@ -57,21 +44,21 @@ def carried_out(
 
 def _found(eqns: list[Any], known: dict[Any, Any], results: list[Any], one: Any) -> list[Any]:
     """The results, with no more computed than that takes."""
-    needed = _variables(results) - known.keys()
+    needed = variables(results) - known.keys()
     own = []
     for eqn in reversed(eqns):
         if needed.intersection(eqn.outvars):
             own.append(eqn)
-            needed |= _variables(eqn.invars) - known.keys()
-    values = dict(known)
+            needed |= variables(eqn.invars) - known.keys()
+    known = dict(known)
     for eqn in reversed(own):
-        given = _all(values, eqn.invars)
+        given = values(known, eqn.invars)
         if is_joined(eqn) and eqn.outvars[0].aval.size > BRIEF:
             found = [part_by_part(eqn, given, one)]
         else:
             found = _by_parts(eqn, given)
-        values = dict(zip(eqn.outvars, found, strict=True)) | values
-    return _all(values, results)
+        known = dict(zip(eqn.outvars, found, strict=True)) | known
+    return values(known, results)
 
 
 def _by_parts(eqn: Any, given: list[Any]) -> list[Any]:
@@ -92,14 +79,6 @@ def _inside(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return type(value)(map(_inside, value))
     return summed_by_parts(value) if isinstance(value, ClosedJaxpr) else value
-
-
-def _all(known: dict[Any, Any], atoms: Any) -> list[Any]:
-    return [atom.val if isinstance(atom, Literal) else known[atom] for atom in atoms]
-
-
-def _variables(atoms: Any) -> set[Any]:
-    return {atom for atom in atoms if isinstance(atom, Var)}
 
 
 def _blank(like: list[Any]) -> list[jax.Array]:

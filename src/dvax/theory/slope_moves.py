@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ..vi.structure import bind
+from .._jaxpr import bound
 from .slope import (
     MOST,
     Part,
@@ -173,7 +173,7 @@ def _by_operation(eqn: Any, given: list[Any]) -> Slope | None:
     x, rest = given[0], given[1:]
 
     def move(v: Values) -> Values:
-        return np.asarray(bind(eqn, [jnp.asarray(v), *rest])[0])
+        return np.asarray(bound(eqn, [jnp.asarray(v), *rest])[0])
 
     def moved_slopes(stack: Values) -> Values:
         # What is filled in from outside does not move with anything.

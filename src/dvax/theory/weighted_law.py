@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.extend.core import ClosedJaxpr, Literal
 
+from .._jaxpr import bound, values
 from ..problem import Problem
-from ..vi.structure import bind
 from .system import System
 
 
@@ -89,13 +89,12 @@ def _output(traced: ClosedJaxpr, atom: Any) -> Callable[..., jax.Array]:
     jaxpr = traced.jaxpr
 
     def fn(*given: Any) -> jax.Array:
-        values = dict(zip(jaxpr.constvars, traced.consts, strict=True))
-        values.update(zip(jaxpr.invars, jtu.tree_leaves(given), strict=True))
+        known = dict(zip(jaxpr.constvars, traced.consts, strict=True))
+        known.update(zip(jaxpr.invars, jtu.tree_leaves(given), strict=True))
         for eqn in jaxpr.eqns:
-            if atom in values:
+            if atom in known:
                 break
-            read = [v.val if isinstance(v, Literal) else values[v] for v in eqn.invars]
-            values.update(zip(eqn.outvars, bind(eqn, read), strict=True))
-        return jnp.asarray(values[atom])
+            known.update(zip(eqn.outvars, bound(eqn, values(known, eqn.invars)), strict=True))
+        return jnp.asarray(known[atom])
 
     return fn

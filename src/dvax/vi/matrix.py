@@ -15,8 +15,9 @@ import jax.numpy as jnp
 from jax import lax
 from jax.extend.core import ClosedJaxpr
 
+from .._jaxpr import bound
 from .._tree import Tree
-from .structure import CALLS, bind, evaluate, inner_jaxpr
+from .structure import CALLS, evaluate, inner_jaxpr
 
 
 class _Diagonal(NamedTuple):
@@ -78,7 +79,7 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
 def _column_by_column(eqn: Any, given: list[Any]) -> list[Any]:
     axes = [-1 if _depends(value) else None for value in given]
     full = [_columns(value) if _depends(value) else value for value in given]
-    results = jax.vmap(lambda *g: bind(eqn, list(g)), in_axes=axes, out_axes=-1)(*full)
+    results = jax.vmap(lambda *g: bound(eqn, list(g)), in_axes=axes, out_axes=-1)(*full)
     return [_Columns(result) for result in results]
 
 
@@ -91,19 +92,19 @@ def _rule(eqn: Any, given: list[Any]) -> list[Any] | None:
     if name == "reshape" and eqn.params.get("dimensions") is not None:
         return None  # it permutes the axes first
     if name in ("neg", "convert_element_type", "reshape", "squeeze", "copy"):
-        return [_Diagonal(bind(eqn, [given[0].factor])[0])]
+        return [_Diagonal(bound(eqn, [given[0].factor])[0])]
     if name == "broadcast_in_dim" and out.size == given[0].factor.size:
         return [_Diagonal(given[0].factor.reshape(out.shape))]
     factors = [value.factor if _depends(value) else value for value in given]
     if name in ("add", "sub", "add_any"):
         # What does not depend on the unknowns is zero here, or the map would not be linear.
         if all(value.factor.shape == out.shape for value in bent):
-            return [_Diagonal(jnp.broadcast_to(bind(eqn, factors)[0], out.shape))]
+            return [_Diagonal(jnp.broadcast_to(bound(eqn, factors)[0], out.shape))]
     if name in ("mul", "div") and len(bent) == 1:
         if bent[0].factor.shape == out.shape:
-            return [_Diagonal(jnp.broadcast_to(bind(eqn, factors)[0], out.shape))]
+            return [_Diagonal(jnp.broadcast_to(bound(eqn, factors)[0], out.shape))]
     if name == "select_n" and not _depends(given[0]):
-        return [_Diagonal(bind(eqn, factors)[0])]
+        return [_Diagonal(bound(eqn, factors)[0])]
     if name == "dot_general":
         return _product(eqn, given)
     return None

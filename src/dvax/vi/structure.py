@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from .._jaxpr import bound, walked
 from .._tree import Tree
 
 
@@ -95,24 +96,8 @@ def evaluate(
 ) -> list[Any]:
     """The outputs of a traced function, with values of another kind in the place of some arrays:
     operations on `special` values are done by `apply(eqn, given)`, the others as they are."""
-    jaxpr: Jaxpr = traced.jaxpr
-    values: dict[Any, Any] = dict(zip(jaxpr.constvars, traced.consts, strict=True))
-    values.update(zip(jaxpr.invars, inputs, strict=True))
-
-    def read(atom: Any) -> Any:
-        return atom.val if isinstance(atom, Literal) else values[atom]
-
-    for eqn in jaxpr.eqns:
-        given = [read(atom) for atom in eqn.invars]
-        results = apply(eqn, given) if any(map(special, given)) else bind(eqn, given)
-        values.update(zip(eqn.outvars, results, strict=True))
-    return [read(atom) for atom in jaxpr.outvars]
-
-
-def bind(eqn: Any, given: list[Any]) -> list[Any]:
-    """One operation of a traced function, on these arrays."""
-    out = eqn.primitive.bind(*given, **eqn.primitive.get_bind_params(eqn.params))
-    return list(out) if eqn.primitive.multiple_results else [out]
+    do = lambda eqn, given: (apply if any(map(special, given)) else bound)(eqn, given)  # noqa: E731
+    return walked(traced, inputs, do)
 
 
 def _interpret(
