@@ -94,6 +94,18 @@ def test_a_crossing_too_large_for_single_precision_is_bounded():
     assert float(chord.dev) == pytest.approx(1e20, rel=1e-6)
 
 
+def test_a_crossing_of_numbers_whose_sum_is_none_has_no_bound_rather_than_a_wrong_one():
+    ends = jnp.asarray(-1.5e308), jnp.asarray(1.5e308)
+    chord = enclose(lambda t: jnp.maximum(0.0, t), straight(*ends))
+    assert float(chord.dev) >= 0.75e308
+
+
+@pytest.mark.parametrize("factor", [0.0, 5e-324, 1e-310, 1e-300, 3.0])
+def test_a_factor_of_what_has_no_bound_leaves_a_number(factor):
+    chord = enclose(lambda t: factor * t, Chord(*map(jnp.asarray, (0.0, 1.0, jnp.inf))))
+    assert not np.isnan(chord.dev) and (factor < 1e-300 or np.isinf(chord.dev))
+
+
 @pytest.mark.parametrize("name", ["square", "exponential", "root", "tanh of a product"])
 def test_where_things_are_smooth_the_bound_is_of_second_order_and_not_far_off(name):
     bounds = [float(enclosed(FUNCTIONS[name], 0.9, 0.9 + h).dev) for h in (0.1, 0.05, 0.025)]
@@ -131,6 +143,8 @@ def test_data_across_a_knot_has_no_finite_bound_rather_than_a_wrong_one():
 def test_an_operation_without_a_rule_is_named():
     with pytest.raises(NoEnclosure, match="erf"):
         enclosed(jax.scipy.special.erf, 0.0, 1.0)
+    with pytest.raises(NoEnclosure, match="fft"):
+        enclosed(lambda t: jnp.fft.irfft(jnp.fft.rfft(PROFILE * t), 3), 0.0, 1.0)
 
 
 def test_a_bend_of_the_trajectory_is_never_less_than_it_is():

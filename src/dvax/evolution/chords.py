@@ -123,8 +123,8 @@ def _crossing(d0: jax.Array, d1: jax.Array) -> jax.Array:
     crosses = (d0 < 0) != (d1 < 0)
     total = jnp.where(crosses, jnp.abs(d0) + jnp.abs(d1), 1.0)
     bend = jnp.abs(d0) * (jnp.abs(d1) / total)
-    # From one infinity to the other there is no bound.
-    return jnp.where(crosses, jnp.where(jnp.isnan(bend), jnp.inf, bend), 0.0)
+    # From one infinity to the other, or from numbers whose sum is none, there is no bound.
+    return jnp.where(crosses, jnp.where(jnp.isfinite(total), bend, jnp.inf), 0.0)
 
 
 def _safe(factor: jax.Array, dev: jax.Array) -> jax.Array:
@@ -212,6 +212,9 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
             if isinstance(inner, ClosedJaxpr) and len(inner.jaxpr.invars) == len(given):
                 return _interpret(inner, given)
         raise NoEnclosure(name)
+    atoms = (*eqn.invars, *eqn.outvars)
+    if any(jnp.issubdtype(atom.aval.dtype, jnp.complexfloating) for atom in atoms):
+        raise NoEnclosure(name)
 
     def bind(*values: Any) -> jax.Array:
         return eqn.primitive.bind(*values, **eqn.params)
@@ -222,7 +225,6 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
         return [_take(given, bind)]
     if name in _COMPARE:
         return [_compare(_lift(given[0]), _lift(given[1]), bind)]
-    atoms = (*eqn.invars, *eqn.outvars)
     if not all(jnp.issubdtype(atom.aval.dtype, jnp.floating) for atom in atoms):
         if eqn.primitive.multiple_results:
             raise NoEnclosure(name)
@@ -281,15 +283,16 @@ def _with_constant(name: str, given: list[Any], bind: Callable) -> Chord:
     a, b = (bind(chord.a, c), bind(chord.b, c)) if first else (bind(c, chord.a), bind(c, chord.b))
     if name != "mul":
         return Chord(a, b, jnp.broadcast_to(chord.dev, a.shape))
-    if _is_plain(c):
+    if _is_plain(c, chord.dev.dtype):
         return Chord(a, b, abs(float(c)) * jnp.broadcast_to(chord.dev, a.shape))
     return Chord(a, b, _safe(jnp.abs(c), chord.dev))
 
 
-def _is_plain(c: Any) -> bool:
-    """Whether it is one number that is known, and neither zero nor infinite."""
+def _is_plain(c: Any, dtype: Any) -> bool:
+    """Whether it is one number that is known, and neither infinite nor one that a product may take
+    for zero."""
     known = isinstance(c, (float, int, np.generic, np.ndarray)) and np.ndim(c) == 0
-    return known and bool(np.isfinite(c) & (c != 0))
+    return known and bool(np.isfinite(c) & (np.abs(c) >= jnp.finfo(dtype).tiny))
 
 
 def _lift(value: Any) -> Chord:
