@@ -143,6 +143,12 @@ def test_what_is_closed_over_is_handed_over():
     np.testing.assert_allclose(far, 0.5**7 * V)
 
 
+def test_a_key_may_be_closed_over():
+    key = jax.random.key(3)
+    run = looped(lambda k, v: v * jax.random.uniform(jax.random.fold_in(key, k)))
+    np.testing.assert_array_equal(one.in_one_function(run, V), jax.jit(run)(V))
+
+
 @pytest.mark.parametrize("equal", [True, False])
 def test_arrays_written_into_a_function_are_handed_over_once(equal):
     # New ones at each of its five places.

@@ -16,7 +16,7 @@ from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
 
 from .divided import can_divide, divided
-from .marked import as_one, available
+from .marked import as_one, available, is_of_one_device
 from .packed import can_pack, packed, unpacked
 from .small import LARGEST, is_small
 from .within import summed_by_parts
@@ -113,6 +113,13 @@ def _as_it_is(*leaves: Any, program: ClosedJaxpr, **_: Any) -> list[Any]:
     return jaxpr_as_fun(program)(*leaves)
 
 
+def _lowered(ctx: Any, *leaves: Any, **params: Any) -> Any:
+    """As function where one device runs it: the compiler may put what several tell each other anywhere
+    into a program that is theirs, and a function cannot."""
+    run = _as_function if is_of_one_device(ctx.module_context.axis_context) else _as_it_is
+    return mlir.lower_fun(run, multiple_results=True)(ctx, *leaves, **params)
+
+
 def _as_function(*leaves: Any, program: ClosedJaxpr, large: Any, **_: Any) -> list[Any]:
     """As one function where it is small, as several where a loop can be divided."""
     if not is_small(program):
@@ -140,9 +147,7 @@ _one_p.multiple_results = True
 _one_p.def_impl(lambda *leaves, **params: jax.jit(partial(_as_it_is, **params))(*leaves))
 _one_p.def_abstract_eval(lambda *leaves, program, **_: program.out_avals)
 mlir.register_lowering(_one_p, mlir.lower_fun(_as_it_is, multiple_results=True))
-mlir.register_lowering(
-    _one_p, mlir.lower_fun(_as_function, multiple_results=True), platform="cpu", cacheable=False
-)
+mlir.register_lowering(_one_p, _lowered, platform="cpu", cacheable=False)
 
 
 def _batched(

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
+from jax.interpreters import mlir
 
 _ATTRIBUTES = {"inlineable": "false", "xla_cpu_small_call": "true"}
 
@@ -19,6 +20,13 @@ def as_one(call: Callable[..., Any], *args: Any) -> Any:
     """
     marked: Any = set_xla_metadata(jax.jit(call)(*args), **_ATTRIBUTES)
     return marked
+
+
+def is_of_one_device(context: Any) -> bool:
+    """Whether a program that is lowered in this context is that of one device, or of each alone."""
+    if isinstance(context, mlir.ShardingContext):
+        return context.num_devices == 1
+    return context.manual_axes == frozenset(context.mesh.axis_names)
 
 
 def available() -> bool:

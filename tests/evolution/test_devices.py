@@ -1,0 +1,62 @@
+"""Several devices share a field, or the runs of a batch, and nothing changes."""
+
+import subprocess
+import sys
+import textwrap
+
+import pytest
+from tests.selection import mostly_thorough
+
+PROGRAM = """
+    import os
+    os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+    from jax.sharding import AxisType, NamedSharding, PartitionSpec
+    jax.config.update("jax_enable_x64", True)
+    import dvax
+
+    mesh = jax.make_mesh((2,), ("devices",), axis_types=(AxisType.Auto,))
+    spec = PartitionSpec("devices")
+    shared = NamedSharding(mesh, spec)
+    s = (jnp.arange(64.0) + 0.5) * (jnp.pi / 64)
+    law = dict(P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.4))
+    field = dvax.Problem(
+        A=dvax.generators.Elliptic(64, jnp.pi, boundary="dirichlet"),
+        f=lambda t, x, u, args: jnp.exp(-t) * jnp.sin(s) - 0.2 * x - u,
+        h=lambda t, x, u, args: 1.0 - 1.5 * x - 0.5 * u, **law,
+    )
+    scalar = dvax.Problem(
+        A=dvax.generators.Scalar(-0.5), f=lambda t, x, u, args: jnp.sin(3.0 * t) - u,
+        h=lambda t, x, u, args: 1.0 - 1.5 * x - 0.5 * u, **law,
+    )
+
+    def end(problem):
+        return lambda x0: dvax.solve(problem, x0, 0.0, 1.0, rtol=1e-6).xs[-1]
+
+    def apart(run):
+        return jax.shard_map(run, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+
+    lanes, starts = jax.vmap(end(scalar)), jnp.linspace(-1.0, 1.0, 6)
+    run, alike, x0, is_one = {
+        "a field": (end(field), end(field), jnp.sin(s), False),
+        "its gradient": (*2 * (jax.grad(lambda x0: jnp.sum(end(field)(x0) ** 2)),), s, False),
+        "a batch": (lanes, lanes, starts, False),
+        "a batch on each": (apart(lanes), lanes, starts, True),
+    }[CASE]
+    program = jax.jit(run).lower(jax.device_put(x0, shared)).compile()
+    found = program(jax.device_put(x0, shared))
+    assert found.sharding.device_set == set(jax.devices())
+    assert ("xla_cpu_small_call" in program.as_text()) == is_one
+    np.testing.assert_allclose(found, jax.jit(alike)(x0), rtol=1e-9, atol=1e-12)
+"""
+
+
+CASES = ["a field", "its gradient", "a batch", "a batch on each"]
+
+
+@pytest.mark.parametrize("case", mostly_thorough(CASES, ["a field", "a batch on each"]))
+def test_what_devices_share_is_what_one_computes(case):
+    program = textwrap.dedent(PROGRAM).replace("CASE", repr(case))
+    subprocess.run([sys.executable, "-c", program], check=True)
