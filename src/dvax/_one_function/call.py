@@ -15,6 +15,7 @@ from jax.extend.core import ClosedJaxpr, Primitive, Var, jaxpr_as_fun, new_jaxpr
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
 
+from .begun import handed_over
 from .divided import can_divide, divided
 from .marked import as_one, available, is_of_one_device
 from .packed import can_pack, packed, unpacked
@@ -128,11 +129,13 @@ def _as_function(*leaves: Any, program: ClosedJaxpr, large: Any, **_: Any) -> li
     if not few:
         # As a derivative in nothing that it was made of.
         return jaxpr_as_fun(program)(*leaves)
+    program, numbers = handed_over(program)
+    few = [*few, numbers]
     like = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in few]
 
     def call(vector: jax.Array, many: list[Any]) -> tuple[list[Any], list[Any]]:
         small, rest = iter(unpacked(vector, like)), iter(many)
-        whole = [next(rest if is_large else small) for is_large in large]
+        whole = [next(rest if is_large else small) for is_large in (*large, False)]
         return jaxpr_as_fun(summed_by_parts(program))(*whole), [
             leaf.ravel()[0] for leaf in (vector, *many)
         ]

@@ -18,11 +18,9 @@ from jax import lax
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from .._jaxpr import bound, walked
-from .small import inner_programs, is_brief, is_known
+from .small import CALLS, called, inner_programs, is_brief, is_known
 from .turn import Turn
 from .within import retraced
-
-_CALLS = frozenset("jit pjit closed_call custom_jvp_call custom_vjp_call remat2".split())
 
 
 def can_divide(program: ClosedJaxpr) -> bool:
@@ -33,7 +31,7 @@ def can_divide(program: ClosedJaxpr) -> bool:
 
 def _has_such(eqn: Any) -> bool:
     name = eqn.primitive.name
-    if (name not in _CALLS and name != "while") or is_known(eqn):
+    if (name not in CALLS and name != "while") or is_known(eqn):
         return False
     if name == "while" and is_brief(eqn.params["body_jaxpr"]):
         return True
@@ -46,10 +44,8 @@ def divided(program: ClosedJaxpr) -> ClosedJaxpr:
 
 
 def _taken(eqn: Any, given: list[Any]) -> list[Any]:
-    if eqn.primitive.name in _CALLS:
-        for inner in inner_programs(eqn.params):
-            if len(inner.jaxpr.invars) == len(given):
-                return walked(inner, given, _taken)
+    if eqn.primitive.name in CALLS:
+        return walked(called(eqn), given, _taken)
     if eqn.primitive.name == "while" and not is_known(eqn):
         return _loop(eqn, given)
     return bound(eqn, given)

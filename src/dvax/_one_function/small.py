@@ -44,9 +44,8 @@ _MEMORY = frozenset("broadcast_in_dim stop_gradient".split())
 _SUMS = frozenset(
     "argmax argmin reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum".split()
 )
-_CONTROL = frozenset(
-    "cond while scan jit pjit closed_call custom_jvp_call custom_vjp_call remat2".split()
-)
+CALLS = frozenset("jit pjit closed_call custom_jvp_call custom_vjp_call remat2".split())
+_CONTROL = CALLS | frozenset("cond while scan".split())
 
 
 def are_few(arrays: list[Any], most: int = LARGEST) -> bool:
@@ -119,6 +118,11 @@ def _is_plain_product(eqn: Any) -> bool:
     if min(first.ndim, second.ndim) < 2:
         return are_few([first, second])
     return max(*first.shape, *second.shape) <= _SIDE
+
+
+def called(eqn: Any) -> ClosedJaxpr:
+    """The program that a call carries out."""
+    return next(p for p in inner_programs(eqn.params) if len(p.jaxpr.invars) == len(eqn.invars))
 
 
 def inner_programs(params: dict[str, Any]) -> list[ClosedJaxpr]:

@@ -3,6 +3,9 @@
 Within one function XLA adds the entries of an array one after the other, each addition waiting for the
 one before it. Here sixteen equal parts of the array are added, entry by entry, and again those of the
 sum: what a processor adds four or eight at a time, with less rounding besides.
+
+The few entries of a small array are added as they stand: what XLA adds them by is a function, with
+memory for each argument and the result that is taken and returned at every call (`begun`).
 """
 
 from functools import reduce
@@ -12,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 _PARTS = 16
+_FEW = 4
 
 _BY = {
     "reduce_sum": jnp.add,
@@ -24,11 +28,24 @@ _BY = {
 
 def is_sum(eqn: Any) -> bool:
     """Whether all entries of many become one."""
+    return _is_of_all(eqn) and eqn.invars[0].aval.size > 2 * _PARTS
+
+
+def is_short(eqn: Any) -> bool:
+    """Whether all entries of a few become one."""
+    return _is_of_all(eqn) and 1 < eqn.invars[0].aval.size <= _FEW
+
+
+def _is_of_all(eqn: Any) -> bool:
     if eqn.primitive.name not in _BY or eqn.outvars[0].aval.shape != ():
         return False
-    aval = eqn.invars[0].aval
-    boolean = aval.dtype == bool
-    return aval.size > 2 * _PARTS and boolean == (eqn.primitive.name in ("reduce_and", "reduce_or"))
+    boolean = eqn.invars[0].aval.dtype == bool
+    return boolean == (eqn.primitive.name in ("reduce_and", "reduce_or"))
+
+
+def one_by_one(eqn: Any, v: jax.Array) -> jax.Array:
+    """The sum (maximum, …) of few."""
+    return reduce(_BY[eqn.primitive.name], list(v.ravel()))
 
 
 def by_parts(eqn: Any, v: jax.Array) -> jax.Array:

@@ -7,6 +7,7 @@ first guess for the kink, from the step that was refused, is right to O(h²) or 
 crossing is refused too, it gives a far better one, and so on.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -44,13 +45,15 @@ def first_change(
     """
     signs = [v > 0 for v in values]
     changed = [jnp.any(sign != signs[0]) for sign in signs[1:]]
-    some = changed[-1] if len(changed) == 1 else jnp.any(jnp.stack(changed))
-    some = some & asked
+    some = functools.reduce(jnp.logical_or, changed) & asked
 
     def search() -> jax.Array:
-        j = jnp.argmax(jnp.stack(changed))
-        nodes, table = jnp.asarray(thetas, values[0].dtype), jnp.stack(values)
-        return _false_position(nodes[j], table[j], nodes[j + 1], table[j + 1], signs[0], at)
+        nodes = [jnp.asarray(theta, values[0].dtype) for theta in thetas]
+        *before, bracket = zip(nodes, values, nodes[1:], values[1:], strict=False)
+        for change, ends in zip(reversed(changed[:-1]), reversed(before), strict=True):
+            bracket = [jnp.where(change, p, q) for p, q in zip(ends, bracket, strict=True)]
+        a, va, b, vb = bracket
+        return _false_position(a, va, b, vb, signs[0], at)
 
     found = lax.cond(any_of_batch(some), search, lambda: jnp.full_like(values[0][0], jnp.inf))
     return jnp.where(some, found, jnp.inf)
