@@ -79,6 +79,20 @@ def test_none_is_left():
         np.testing.assert_array_equal(found, want)
 
 
+@pytest.mark.parametrize("axes", [(0,), (1,), (2,), (0, 2), (0, 1, 2)], ids=str)
+def test_rows_of_few_are_added_entry_by_entry(axes):
+    v = jnp.asarray(np.random.default_rng(5).normal(size=(2, 3, 2)))
+    over = [jnp.sum, jnp.max, jnp.min]
+
+    def run(v):
+        turn = lambda k, c: c + sum(f(v * jnp.cos(c), axes, keepdims=True) for f in over)  # noqa: E731
+        return jax.lax.fori_loop(0, jnp.where(v[0, 0, 0] > 9.0, 4, 3), turn, v)
+
+    program = jax.jit(lambda v: in_one_function(run, v)).lower(v).compile()
+    assert (" reduce(" in program.as_text()) == (np.prod([v.shape[a] for a in axes]) > 4)
+    np.testing.assert_allclose(program(v), jax.jit(run)(v), rtol=1e-13, atol=1e-14)
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5])
 def test_few_are_added_one_by_one(count):
     v = jnp.asarray(np.random.default_rng(count).normal(size=count))

@@ -8,6 +8,8 @@ The few entries of a small array are added as they stand: what XLA adds them by 
 memory for each argument and the result that is taken and returned at every call (`begun`).
 """
 
+import itertools
+import math
 from functools import reduce
 from typing import Any
 
@@ -28,24 +30,29 @@ _BY = {
 
 def is_sum(eqn: Any) -> bool:
     """Whether all entries of many become one."""
-    return _is_of_all(eqn) and eqn.invars[0].aval.size > 2 * _PARTS
+    return _can_join(eqn) and eqn.outvars[0].aval.shape == () and _count(eqn) > 2 * _PARTS
 
 
 def is_short(eqn: Any) -> bool:
-    """Whether all entries of a few become one."""
-    return _is_of_all(eqn) and 1 < eqn.invars[0].aval.size <= _FEW
+    """Whether a few entries become one, or each row of few."""
+    return _can_join(eqn) and 1 < _count(eqn) <= _FEW
 
 
-def _is_of_all(eqn: Any) -> bool:
-    if eqn.primitive.name not in _BY or eqn.outvars[0].aval.shape != ():
-        return False
-    boolean = eqn.invars[0].aval.dtype == bool
-    return boolean == (eqn.primitive.name in ("reduce_and", "reduce_or"))
+def _can_join(eqn: Any) -> bool:
+    boolean = eqn.primitive.name in ("reduce_and", "reduce_or")
+    return eqn.primitive.name in _BY and boolean == (eqn.invars[0].aval.dtype == bool)
+
+
+def _count(eqn: Any) -> int:
+    return math.prod(eqn.invars[0].aval.shape[axis] for axis in eqn.params["axes"])
 
 
 def one_by_one(eqn: Any, v: jax.Array) -> jax.Array:
-    """The sum (maximum, …) of few."""
-    return reduce(_BY[eqn.primitive.name], list(v.ravel()))
+    """The sum (maximum, …) of few, or of each row of few."""
+    places = itertools.product(
+        *(range(n) if k in eqn.params["axes"] else [slice(None)] for k, n in enumerate(v.shape))
+    )
+    return reduce(_BY[eqn.primitive.name], [v[place] for place in places])
 
 
 def by_parts(eqn: Any, v: jax.Array) -> jax.Array:
