@@ -79,13 +79,15 @@ def test_none_is_left():
         np.testing.assert_array_equal(found, want)
 
 
+@pytest.mark.parametrize("within", [lambda f: f, jax.checkpoint], ids=["plain", "checkpoint"])
 @pytest.mark.parametrize("axes", [(0,), (1,), (2,), (0, 2), (0, 1, 2)], ids=str)
-def test_rows_of_few_are_added_entry_by_entry(axes):
+def test_rows_of_few_are_added_entry_by_entry(axes, within):
     v = jnp.asarray(np.random.default_rng(5).normal(size=(2, 3, 2)))
     over = [jnp.sum, jnp.max, jnp.min]
 
     def run(v):
-        turn = lambda k, c: c + sum(f(v * jnp.cos(c), axes, keepdims=True) for f in over)  # noqa: E731
+        add = within(lambda c: c + sum(f(v * jnp.cos(c), axes, keepdims=True) for f in over))
+        turn = lambda k, c: add(c)  # noqa: E731
         return jax.lax.fori_loop(0, jnp.where(v[0, 0, 0] > 9.0, 4, 3), turn, v)
 
     program = jax.jit(lambda v: in_one_function(run, v)).lower(v).compile()

@@ -11,7 +11,7 @@ from jax.extend.core import ClosedJaxpr
 from .._jaxpr import bound, values, variables, walked
 from .joins import is_joined, part_by_part
 from .kept import worth_keeping
-from .small import inner_programs
+from .small import CALLS, called, inner_programs
 from .sums import by_parts, is_short, is_sum, one_by_one
 
 BRIEF = 64
@@ -67,6 +67,8 @@ def _by_parts(eqn: Any, given: list[Any]) -> list[Any]:
     if is_short(eqn):
         return [one_by_one(eqn, given[0])]
     if any(map(_has_sums, inner_programs(eqn.params))):
+        if eqn.primitive.name in CALLS:
+            return walked(called(eqn), given, _by_parts)
         eqn = eqn.replace(params={key: _inside(value) for key, value in eqn.params.items()})
     return bound(eqn, given)
 
