@@ -100,6 +100,24 @@ def test_a_crossing_of_numbers_whose_sum_is_none_has_no_bound_rather_than_a_wron
     assert float(chord.dev) >= 0.75e308
 
 
+@pytest.mark.parametrize(("a", "b"), [(-1e308, 1.0), (1.0, -1e308), (-1e30, 1e-300), (-3.0, 1.0)])
+def test_a_crossing_of_numbers_far_apart_is_not_lost(a, b):
+    chord = enclose(lambda t: jnp.maximum(0.0, t), straight(jnp.asarray(a), jnp.asarray(b)))
+    np.testing.assert_allclose(float(chord.dev), abs(a) * (abs(b) / (abs(a) + abs(b))) or max(b, a))
+
+
+@pytest.mark.parametrize("dev", [0.0, 1.0, np.inf])
+@pytest.mark.parametrize("c", [np.inf, 1e-310, 1e-300, 2.0, -3.0])
+def test_a_quotient_by_a_number_has_a_bound_that_is_one(c, dev):
+    for number in (c, jnp.asarray(c)):
+        chord = enclose(lambda t, by=number: t / by, Chord(*map(jnp.asarray, (1.0, 2.0, dev))))
+        assert not np.isnan(chord.dev)
+        if np.isfinite(dev / abs(c)) and abs(c) >= 1e-300:
+            assert float(chord.dev) == pytest.approx(dev / abs(c))
+        if dev > 0.0 and abs(c) < np.inf:
+            assert chord.dev > 0.0
+
+
 @pytest.mark.parametrize("factor", [0.0, 5e-324, 1e-310, 1e-300, 3.0])
 def test_a_factor_of_what_has_no_bound_leaves_a_number(factor):
     chord = enclose(lambda t: factor * t, Chord(*map(jnp.asarray, (0.0, 1.0, jnp.inf))))

@@ -15,7 +15,7 @@ from jax.extend.core import ClosedJaxpr, Primitive, Var, jaxpr_as_fun, new_jaxpr
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
 
-from .begun import handed_over
+from .begun import handed_over, in_a_row
 from .divided import can_divide, divided
 from .marked import as_one, available, is_of_one_device
 from .packed import can_pack, packed, unpacked
@@ -129,20 +129,21 @@ def _as_function(*leaves: Any, program: ClosedJaxpr, large: Any, **_: Any) -> li
     if not few:
         # As a derivative in nothing that it was made of.
         return jaxpr_as_fun(program)(*leaves)
-    program, numbers = handed_over(program)
-    few = [*few, numbers]
     like = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in few]
+    program, numbers = handed_over(program)
+    row = in_a_row(numbers)
 
     def call(vector: jax.Array, many: list[Any]) -> tuple[list[Any], list[Any]]:
-        small, rest = iter(unpacked(vector, like)), iter(many)
-        whole = [next(rest if is_large else small) for is_large in (*large, False)]
-        return jaxpr_as_fun(summed_by_parts(program))(*whole), [
+        *own, at_last = unpacked(vector, [*like, row])
+        small, rest = iter(own), iter(many)
+        whole = [next(rest if is_large else small) for is_large in large]
+        return jaxpr_as_fun(summed_by_parts(program))(*unpacked(at_last, numbers), *whole), [
             leaf.ravel()[0] for leaf in (vector, *many)
         ]
 
     many = [leaf for leaf, is_large in zip(leaves, large, strict=True) if is_large]
     # Something computed goes along with the small ones: all constant, they would be a long constant.
-    return as_one(call, packed([*few, *(leaf.ravel()[:1] for leaf in many)]), many)[0]
+    return as_one(call, packed([*few, row, *(leaf.ravel()[:1] for leaf in many)]), many)[0]
 
 
 _one_p = Primitive("one_function")

@@ -11,8 +11,8 @@ from jax.extend.core import ClosedJaxpr
 from .._jaxpr import bound, values, variables, walked
 from .joins import is_joined, part_by_part
 from .kept import worth_keeping
-from .small import CALLS, called, inner_programs
-from .sums import by_parts, is_short, is_sum, one_by_one
+from .small import inner_programs
+from .sums import by_parts, is_sum
 
 BRIEF = 64
 """Entries of an array that is handed on with others, as one, and never worth a loop of its own."""
@@ -64,19 +64,14 @@ def _found(eqns: list[Any], known: dict[Any, Any], results: list[Any], one: Any)
 def _by_parts(eqn: Any, given: list[Any]) -> list[Any]:
     if is_sum(eqn):
         return [by_parts(eqn, given[0])]
-    if is_short(eqn):
-        return [one_by_one(eqn, given[0])]
     if any(map(_has_sums, inner_programs(eqn.params))):
-        if eqn.primitive.name in CALLS:
-            return walked(called(eqn), given, _by_parts)
         eqn = eqn.replace(params={key: _inside(value) for key, value in eqn.params.items()})
     return bound(eqn, given)
 
 
 def _has_sums(program: ClosedJaxpr) -> bool:
     return any(
-        is_sum(eqn) or is_short(eqn) or any(map(_has_sums, inner_programs(eqn.params)))
-        for eqn in program.jaxpr.eqns
+        is_sum(eqn) or any(map(_has_sums, inner_programs(eqn.params))) for eqn in program.jaxpr.eqns
     )
 
 

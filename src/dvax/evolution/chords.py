@@ -122,7 +122,9 @@ def _crossing(d0: jax.Array, d1: jax.Array) -> jax.Array:
     # Where one of them is zero, so is the bend.
     crosses = (d0 < 0) != (d1 < 0)
     total = jnp.where(crosses, jnp.abs(d0) + jnp.abs(d1), 1.0)
-    bend = jnp.abs(d0) * (jnp.abs(d1) / total)
+    # The quotient is ½ at least: no bend is lost to one that is too small for a number.
+    d0, d1 = jnp.abs(d0), jnp.abs(d1)
+    bend = jnp.minimum(d0, d1) * (jnp.maximum(d0, d1) / total)
     # From one infinity to the other, or from numbers whose sum is none, there is no bound.
     return jnp.where(crosses, jnp.where(jnp.isfinite(total), bend, jnp.inf), 0.0)
 
@@ -252,8 +254,7 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
         return [times(x[0], x[1])]
     if name == "div":
         if not is_chord(given[1]):
-            c = given[1]
-            return [Chord(x[0].a / c, x[0].b / c, x[0].dev / jnp.abs(c))]
+            return [_by_constant(x[0], given[1])]
         return [times(x[0], _reciprocal(x[1]))]
     if name == "max":
         return [largest(x[0], x[1])]
@@ -286,6 +287,15 @@ def _with_constant(name: str, given: list[Any], bind: Callable) -> Chord:
     if _is_plain(c, chord.dev.dtype):
         return Chord(a, b, abs(float(c)) * jnp.broadcast_to(chord.dev, a.shape))
     return Chord(a, b, _safe(jnp.abs(c), chord.dev))
+
+
+def _by_constant(x: Chord, c: Any) -> Chord:
+    """x/c."""
+    dev = x.dev / jnp.abs(c)
+    if not _is_plain(c, x.dev.dtype):
+        # ∞/∞ may be anything, and so may 0/0, unless c is only small.
+        dev = jnp.where(jnp.isnan(dev), jnp.where((x.dev == 0) & (c != 0), 0.0, jnp.inf), dev)
+    return Chord(x.a / c, x.b / c, dev)
 
 
 def _is_plain(c: Any, dtype: Any) -> bool:

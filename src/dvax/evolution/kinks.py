@@ -26,6 +26,9 @@ _MOST = 60
 _AIMS = 8
 """Steps in a row that are aimed at kinks without getting on: then they are shortened as any others."""
 
+_FEW = 4
+"""Entries that are joined as they stand."""
+
 _FIRST = 0.02
 """How far before a kink a step is made to end that was guessed from one step alone, in its lengths."""
 
@@ -44,7 +47,7 @@ def first_change(
     the next one.
     """
     signs = [v > 0 for v in values]
-    changed = [jnp.any(sign != signs[0]) for sign in signs[1:]]
+    changed = [_of_all(jnp.logical_or, jnp.any, sign != signs[0]) for sign in signs[1:]]
     some = functools.reduce(jnp.logical_or, changed) & asked
 
     def search() -> jax.Array:
@@ -68,14 +71,14 @@ def _false_position(
         a, va, b, vb, before, slow, count = s
         flips = (va > 0) != (vb > 0)
         shares = jnp.where(flips, va / jnp.where(flips, va - vb, 1.0), 1.0)
-        guess = jnp.min(shares)
+        guess = _of_all(jnp.minimum, jnp.min, shares)
         # A little past it, to either side in turn: two good guesses close the bracket.
         inset = jnp.minimum(0.4 * _CLOSE / (b - a), 0.25)
         share = jnp.clip(guess + jnp.where(before > 0, -inset, inset), inset, 1.0 - inset)
         blind = (guess <= 0.0) | (guess >= 1.0) | (slow >= 2)
         theta = a + (b - a) * jnp.where(blind, 0.5, share)
         v = at(theta)
-        beyond = jnp.any((v > 0) != sign)
+        beyond = _of_all(jnp.logical_or, jnp.any, (v > 0) != sign)
         side = jnp.where(beyond, 1, -1)
         again = jnp.where(side == before, 0.5, 1.0)
         width = b - a
@@ -92,6 +95,13 @@ def _false_position(
 
     nothing = jnp.asarray(0)
     return lax.while_loop(unsettled, narrow, (a, va, b, vb, nothing, nothing, nothing))[2]
+
+
+def _of_all(join: Callable, joined: Callable, v: jax.Array) -> jax.Array:
+    """All entries joined. What XLA joins them by is a function, and memory for its arguments and result
+    is taken and returned at every call of a program, which costs as much as a small step: so few
+    entries are joined as they stand."""
+    return functools.reduce(join, list(v.ravel())) if 0 < v.size <= _FEW else joined(v)
 
 
 class Aim(NamedTuple):

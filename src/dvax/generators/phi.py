@@ -1,5 +1,6 @@
 """The φ-functions of a number and of a matrix."""
 
+import functools
 import math
 from typing import Any
 
@@ -12,6 +13,9 @@ from .turns import turns
 
 _TERMS = 20  # of the Taylor series on |z| < 1: 1/20! is below double rounding
 _FEW = 8  # rows, up to which a call of a library costs more than a product
+_VERY_FEW = (
+    3  # rows, up to which terms are added as they stand, and not by a function that XLA makes
+)
 _LEVELS = 3  # 4³ halvings at most: norms up to 10¹⁹
 
 
@@ -90,6 +94,8 @@ def phi_matrix(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
 
 def _product(a: jax.Array, b: jax.Array) -> jax.Array:
     """That of two square matrices; of few numbers term by term, without a call of a library."""
+    if len(a) <= _VERY_FEW:
+        return functools.reduce(jnp.add, [a[:, k, None] * b[None, k] for k in range(len(a))])
     return jnp.sum(a[:, :, None] * b[None], axis=1) if len(a) <= _FEW else a @ b
 
 
