@@ -63,6 +63,21 @@ def test_a_check_within_f_is_quoted():
         dvax.solve(problem(f), -1.0, 0.0, 2.0, dt=0.01)
 
 
+@pytest.mark.parametrize("steps", [dict(dt=0.1), dict(rtol=1e-6)], ids=["fixed", "adaptive"])
+def test_a_law_may_tell_what_it_is_asked(steps):
+    told = []
+
+    def h(t, x, u, args):
+        jax.debug.callback(lambda x, u: told.append((float(x), float(u))), x, u)
+        return 1.0 - 2.0 * x - u
+
+    quiet = problem(lambda t, x, u, args: 3.0 - 0.5 * x - u)
+    telling = eqx.tree_at(lambda p: p.h, quiet, h)
+    found, want = (dvax.solve(p, -1.0, 0.0, 2.0, **steps).xs[-1] for p in (telling, quiet))
+    jax.effects_barrier()
+    assert told and abs(float(found - want)) < 1e-5
+
+
 def test_the_law_at_the_saved_states_is_certified_in_a_large_state_as_at_a_point():
     case = c1()
     x0 = np.linspace(-1.0, 3.0, 5000)

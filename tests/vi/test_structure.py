@@ -167,6 +167,14 @@ def test_a_law_without_y_is_not_given_a_slope():
     assert constant.affine and constant.pointwise and not constant.isotropic
 
 
+def test_what_is_told_of_y_on_the_way_changes_nothing():
+    def F(y):
+        jax.debug.callback(lambda y: None, y)
+        return 2.0 * y - 1.0
+
+    assert analyse(F, jnp.ones(3)) == analyse(lambda y: 2.0 * y - 1.0, jnp.ones(3))
+
+
 def test_independence():
     x, t = jnp.ones(3), jnp.ones(())
     assert independent(lambda t, x: jnp.full(3, 2.0), t, x)

@@ -117,7 +117,7 @@ def _interpret(
     for eqn in jaxpr.eqns:
         given = [read(atom) for atom in eqn.invars]
         name = eqn.primitive.name
-        if all(mark is None for mark in given):
+        if not eqn.outvars or all(mark is None for mark in given):
             if name in _FLAT and all(map(is_flat, eqn.invars)):
                 flat.update(eqn.outvars)
             continue
