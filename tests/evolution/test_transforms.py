@@ -80,3 +80,19 @@ def test_a_run_in_two_halves_is_the_run():
     half = dvax.solve(case.problem, -1.0, 0.0, 1.0, args=case.args, dt=1 / 64)
     rest = dvax.solve(case.problem, half.xs[-1], 1.0, 2.0, args=case.args, dt=1 / 64)
     np.testing.assert_allclose(np.asarray(rest.xs), np.asarray(whole.xs), rtol=0, atol=1e-14)
+
+
+def test_f_may_pass_through_a_spectrum():
+    n = 32
+    s = jnp.arange(float(n)) * (2.0 * jnp.pi / n)
+    symbol = jnp.exp(-(jnp.arange(n // 2 + 1.0) ** 2) / 50.0).astype(complex)
+    problem = dvax.Problem(
+        A=dvax.generators.Elliptic(n, 2.0 * jnp.pi, boundary="periodic"),
+        P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.4),
+        f=lambda t, x, u, args: jnp.fft.irfft(jnp.fft.rfft(x) * symbol, n) - u,
+        h=lambda t, x, u, args: 1.0 - 1.5 * x - 0.5 * u,
+    )  # fmt: skip
+    found = dvax.solve(problem, jnp.sin(s), 0.0, 1.0, rtol=1e-5)
+    fine = dvax.solve(problem, jnp.sin(s), 0.0, 1.0, dt=1e-3)
+    assert int(found.stats["steps"]) < 1000
+    assert float(jnp.max(jnp.abs(found.xs[-1] - fine.xs[-1]))) < 1e-4
