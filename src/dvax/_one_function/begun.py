@@ -1,8 +1,8 @@
 """What the loops of a function begin with, and what its branches return.
 
 A number that a loop begins with is a constant to XLA, which gives it memory of its own, and takes and
-returns that memory at every call of the program: some 0.1 µs each, a third of what a step of a small
-system costs. So such numbers are handed to the function with its arguments.
+returns that memory at every call of the program. So such numbers are handed to the function with its
+arguments.
 """
 
 from functools import partial
@@ -22,11 +22,6 @@ def handed_over(program: ClosedJaxpr) -> tuple[ClosedJaxpr, list[np.ndarray]]:
     _look_through(program.jaxpr, found)
     values = list(map(_value, found.values()))
     return ClosedJaxpr(_with_arguments(program.jaxpr, found), program.consts), values
-
-
-def in_a_row(numbers: list[np.ndarray]) -> np.ndarray:
-    """All of them as one array, as `packed` has them, bit by bit; known to the compiler as one."""
-    return np.concatenate([np.zeros(0, jnp.result_type(float)), *map(_as_floating, numbers)])
 
 
 def _look_through(jaxpr: Jaxpr, found: dict[Any, Any]) -> None:
@@ -118,12 +113,3 @@ def _value(atom: Any) -> np.ndarray:
 
 def _key(atom: Any) -> Any:
     return atom.aval.weak_type, atom.aval.dtype.name, _value(atom).tobytes()
-
-
-def _as_floating(number: Any) -> np.ndarray:
-    wide = jnp.result_type(float)
-    if np.iscomplexobj(number):
-        return np.array([number.real, number.imag], wide)
-    if jnp.issubdtype(number.dtype, jnp.floating):
-        return number.astype(wide).reshape(1)
-    return number.astype(jnp.result_type(int)).reshape(1).view(wide)

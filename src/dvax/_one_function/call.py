@@ -15,10 +15,10 @@ from jax.extend.core import ClosedJaxpr, Primitive, Var, jaxpr_as_fun, new_jaxpr
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
 
-from .begun import handed_over, in_a_row
+from .begun import handed_over
 from .divided import can_divide, divided
 from .marked import as_one, available, is_of_one_device
-from .packed import can_pack, packed, unpacked
+from .packed import can_pack, in_a_row, packed, unpacked
 from .small import LARGEST, is_small
 from .within import summed_by_parts
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 _LONGEST = 10**6
 """Entries of all that is packed."""
@@ -21,6 +22,11 @@ def is_number(leaf: Any) -> bool:
 def packed(leaves: list[Any]) -> jax.Array:
     """All of them as one."""
     return jnp.concatenate([_as_floating(leaf).ravel() for leaf in leaves])
+
+
+def in_a_row(numbers: list[np.ndarray]) -> np.ndarray:
+    """The same of single numbers, by NumPy: the compiler has them as one constant."""
+    return np.concatenate([np.zeros(0, jnp.result_type(float)), *map(_one_as_floating, numbers)])
 
 
 def unpacked(vector: jax.Array, like: list[Any]) -> list[jax.Array]:
@@ -45,6 +51,15 @@ def _as_floating(leaf: Any) -> jax.Array:
     if jnp.issubdtype(leaf.dtype, jnp.floating):
         return leaf.astype(wide)
     return jax.lax.bitcast_convert_type(leaf.astype(jnp.result_type(int)), wide)
+
+
+def _one_as_floating(number: Any) -> np.ndarray:
+    wide = jnp.result_type(float)
+    if np.iscomplexobj(number):
+        return np.array([number.real, number.imag], wide)
+    if jnp.issubdtype(number.dtype, jnp.floating):
+        return number.astype(wide).reshape(1)
+    return number.astype(jnp.result_type(int)).reshape(1).view(wide)
 
 
 def _as_it_was(part: jax.Array, shape: tuple[int, ...], dtype: Any) -> jax.Array:

@@ -233,8 +233,8 @@ def _slots(array: int, variables: Any, begin: int = 0) -> dict[Any, _Slot]:
     return found
 
 
-def _those(those: Any, wanted: list[bool]) -> list[Any]:
-    return [value for value, is_wanted in zip(those, wanted, strict=True) if is_wanted]
+def _those(leaves: Any, wanted: list[bool]) -> list[Any]:
+    return [leaf for leaf, is_wanted in zip(leaves, wanted, strict=True) if is_wanted]
 
 
 def _is_few(aval: Any, most: int = BRIEF) -> bool:

@@ -13,9 +13,7 @@ from .turns import turns
 
 _TERMS = 20  # of the Taylor series on |z| < 1: 1/20! is below double rounding
 _FEW = 8  # rows, up to which a call of a library costs more than a product
-_VERY_FEW = (
-    3  # rows, up to which terms are added as they stand, and not by a function that XLA makes
-)
+_VERY_FEW = 3  # rows, up to which terms are added as they stand, not by a function of XLA's
 _LEVELS = 3  # 4³ halvings at most: norms up to 10¹⁹
 
 
