@@ -207,6 +207,45 @@ def test_second_derivatives_in_every_time(name, adjoint, within):
     assert_close(found, jax.jacfwd(jax.jacrev(truth))(given), 1e-6)
 
 
+def test_equal_steps_move_apart_in_the_derivative_of_a_gradient():
+    """Many are as long as the one before, and the last one alone moves with the end."""
+    rate = lambda t, x, pace: jnp.sin(pace * t) + 0.3 * jnp.sin(3 * x) * jnp.cos(pace * t)  # noqa: E731
+    curved = dvax.Problem(
+        A=dvax.generators.Scalar(-RATE), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-9.0, 9.0),
+        f=lambda t, x, u, pace: u + rate(t, x, pace) - jnp.sin(pace * t),
+        h=lambda t, x, u, pace: 2.0 * jnp.sin(pace * t) - u + 0.0 * x,
+    )  # fmt: skip
+
+    def square(given):
+        t0, pace, t1 = given
+        x = dvax.solve(curved, jnp.full(1, X0), t0, t1, pace, method=dvax.ETD4RK(), rtol=1e-6).xs
+        return x[-1, 0] ** 2, x[-1, 0]
+
+    def gradient(given):
+        by, x = jax.jacrev(square, has_aux=True)(given)
+        return by, jax.lax.stop_gradient(x)
+
+    given = tuple(map(jnp.asarray, (START, 1.3, END)))
+    found, x = jax.jit(jax.jacfwd(gradient, has_aux=True))(given)
+    assert_close(found, tuple(zip(*found, strict=True)), 1e-5)
+    # In the end itself, by x' and x''.
+    whole = lambda t, x: -RATE * x + rate(t, x, 1.3)  # noqa: E731
+    v, bent = jax.jvp(whole, (END, x), (1.0, whole(END, x)))
+    assert_close(found[2][2], 2.0 * (v**2 + x * bent), 1e-5)
+
+
+def test_fixed_steps_move_apart_at_a_jump_in_the_derivative_of_a_gradient():
+    def square(given):
+        t0, eta, t1 = given
+        return dvax.solve(
+            problem(), jnp.full(1, X0), t0, t1, drive(eta), dt=1 / 40, max_steps=60
+        ).xs[-1, 0] ** 2  # fmt: skip
+
+    given = tuple(map(jnp.asarray, (START, ETA, END)))
+    want = jax.jacfwd(jax.jacrev(lambda given: exact(*given) ** 2))(given)
+    assert_close(jax.jit(jax.jacfwd(jax.jacrev(square)))(given), want, 1e-6)
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("place", [0, 1], ids=["the jump", "the end"])
 def test_third_derivatives_by_forward_mode(place):

@@ -21,7 +21,7 @@ from .checkpoints import Checkpoints
 from .control import AbstractController
 from .extent import Extent
 from .flow import Flow
-from .moving import arriving, moved, shift, still, velocity
+from .moving import arriving, is_moving, moved, shift, still, velocity
 from .results import RESULTS
 from .stepper import Factors, Memory, Stepper, inside, local, within
 
@@ -195,14 +195,17 @@ class Loop(eqx.Module):
         ahead = lambda carry: any_of_batch(goes_on(carry))  # noqa: E731
         if not self._refits(carry[0]):
             return lax.while_loop(ahead, turn, carry)
+        # A reverse pass that is differentiated once more: equal lengths are others.
+        moves = is_moving(self.controller.stops)
 
         def same(carry: Any) -> Any:
+            fits = self.stepper.fits(*self._ahead(carry[0])) & ~(moves & self._anew(carry[0]))
             # Problems of a batch get new propagators together, as soon as one of them needs some.
-            return ~any_of_batch(goes_on(carry) & ~self.stepper.fits(*self._ahead(carry[0])))
+            return ~any_of_batch(goes_on(carry) & ~fits)
 
         def of_one_length(carry: Any) -> Any:
             state, *rest = carry
-            factors = self.stepper.fitted(*self._ahead(state), jnp.asarray(False))
+            factors = self.stepper.fitted(*self._ahead(state), self._anew(state))
             carry = (state._replace(factors=factors), *rest)
             one = lambda c: (turn(c[0]), jnp.asarray(False))  # noqa: E731
             # One in any case: what is not a number fits nothing.
@@ -349,9 +352,11 @@ class Loop(eqx.Module):
         uniform = self.stepper.uniform
         if uniform is not None or state.factors is None:
             return uniform
-        # From one stop to the next, fixed steps move alike.
-        anew = jnp.asarray(True) if self.controller.adapts else state.jumped
-        return self.stepper.fitted(state.factors, t0, t1, anew)
+        return self.stepper.fitted(state.factors, t0, t1, self._anew(state))
+
+    def _anew(self, state: State) -> Any:
+        """Whether the next length may move otherwise; from one stop to the next, fixed steps move alike."""
+        return jnp.asarray(True) if self.controller.adapts else state.jumped
 
     def _inside(self, record: Record, theta: Any, guess: Tree | None) -> Tree:
         """x_h inside a step."""

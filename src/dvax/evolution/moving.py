@@ -57,6 +57,17 @@ def if_moving(made: Callable[..., Any], kept: Callable[..., Any], t: Any, *given
     return found(real, other)
 
 
+@jax.custom_jvp
+def is_moving(t: Any) -> Any:
+    """Whether t is differentiated, for a program that has two ways to the same values."""
+    return jnp.asarray(False)
+
+
+@partial(is_moving.defjvp, symbolic_zeros=True)
+def _(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
+    return jnp.asarray(not is_zero(tangents[0])), np.zeros((), jax.dtypes.float0)
+
+
 def moved(
     x: Tree, shift: Any, speed: Callable[..., Tree], t: Any, *given: Any, transposed: bool = False
 ) -> Tree:
