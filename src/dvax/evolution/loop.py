@@ -355,7 +355,7 @@ class Loop(eqx.Module):
         return self.stepper.fitted(state.factors, t0, t1, self._anew(state))
 
     def _anew(self, state: State) -> Any:
-        """Whether the next length may move otherwise; from one stop to the next, fixed steps move alike."""
+        """Whether the next length may move otherwise; up to the next stop, fixed steps move alike."""
         return jnp.asarray(True) if self.controller.adapts else state.jumped
 
     def _inside(self, record: Record, theta: Any, guess: Tree | None) -> Tree:
