@@ -183,7 +183,8 @@ SECOND = list(
 )
 
 
-@pytest.mark.parametrize(("name", "adjoint", "within"), mostly_thorough(SECOND, {SECOND[2]}))
+@pytest.mark.thorough
+@pytest.mark.parametrize(("name", "adjoint", "within"), SECOND)
 def test_second_derivatives_in_every_time(name, adjoint, within):
     method, settings, _ = METHODS[name]
     weights = jnp.arange(1.0, 4.0) if within else jnp.ones(1)
