@@ -52,7 +52,7 @@ demo: $(READY) ## solve the rough contact strip; results and report in ./demo-ru
 	@echo "The report: $(CURDIR)/demo-run/report.html"
 
 test: lint types ## lint, formatting, types and tests (under 10 minutes on two cores)
-	$(PY) -m pytest -n $(WORKERS) --durations=15
+	$(PY) -m pytest -n $(WORKERS) --dist worksteal --durations=15
 	@echo 'make test: lint, formatting, types and every test not marked thorough have passed'
 
 lint: $(READY) ## ruff: rules and formatting
@@ -63,7 +63,7 @@ types: $(READY) ## pyright
 	$(PY) -m pyright --project pyproject.toml --pythonpath $(PY)
 
 thorough: $(READY) ## the long checks: many random cases, clean environments, full benchmarks
-	HYPOTHESIS_PROFILE=thorough $(PY) -m pytest -n $(WORKERS) -m thorough --durations=15
+	HYPOTHESIS_PROFILE=thorough $(PY) -m pytest -n $(WORKERS) --dist worksteal -m thorough --durations=15
 	$(PY) -m benchmarks --full
 	@echo 'make thorough: every test marked thorough has passed, and the full benchmarks have run'
 

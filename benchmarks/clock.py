@@ -4,6 +4,7 @@ One sample of each is taken a round, in an order that rotates, and ratios are fo
 their median is what is reported, with the smallest and the largest beside it.
 """
 
+import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -14,6 +15,8 @@ Sample = Callable[[], float]
 
 _SHORTEST = 5e-3
 """A sample spans at least this many seconds: timer and scheduler are then below a percent of it."""
+_FEWEST = 3
+"""Rounds that a median is taken of at the least."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +51,17 @@ def timed(run: Callable[[], object]) -> Sample:
     return lambda: _seconds(run, calls)
 
 
-def in_turn(samples: Mapping[str, Sample], rounds: int) -> dict[str, list[float]]:
-    """Seconds of every sample in every round."""
+def in_turn(
+    samples: Mapping[str, Sample], rounds: int, *, enough: float = math.inf
+) -> dict[str, list[float]]:
+    """Seconds of every sample in every round: `rounds` of them, or, where they are long, as many as
+    begin within `enough` seconds, but three at least."""
     names = list(samples)
     taken: dict[str, list[float]] = {name: [] for name in names}
+    begun = time.perf_counter()
     for number in range(rounds):
+        if number >= _FEWEST and time.perf_counter() - begun > enough:
+            break
         first = number % len(names)
         for name in names[first:] + names[:first]:
             taken[name].append(samples[name]())

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import sys
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -24,8 +25,10 @@ from ..section import Section, Table, compare
 _LEVELS = (1e-4, 1e-6, 1e-8, 1e-10)
 _TOLERANCES = [10.0 ** (-k / 2) for k in range(2, 27)]
 _STEPS = [round(10.0 ** (k / 2)) for k in range(2, 13)]
-_LONGEST = {False: 2.0, True: 20.0}
+_LONGEST = {False: 2.0, True: 10.0}
 """Seconds after which a tool is not asked for more digits, in a short and in a full run."""
+_ENOUGH = 20.0
+"""Seconds of rounds at one level, after which three rounds are enough."""
 _MOST = 10**6
 _OURS = "dvax"
 _WANTED = {"scipy": 10.0, "Diffrax": 1.0, "Siconos": 10.0, "CasADi": 10.0}
@@ -85,6 +88,7 @@ def run(full: bool) -> Section:
 
 def _race(section: Section, race: Race, entrants: dict[str, Entrant], full: bool) -> None:
     tools: dict[str, Tool] = {}
+    print(f"work and precision: {race.name}", file=sys.stderr, flush=True)
     for name, entrant in entrants.items():
         begun = time.perf_counter()
         entrant.solve(entrant.settings[0])
@@ -96,7 +100,7 @@ def _race(section: Section, race: Race, entrants: dict[str, Entrant], full: bool
         settings = {name: _loosest(tool.errors, level) for name, tool in tools.items()}
         able = {name: setting for name, setting in settings.items() if setting is not None}
         samples = {name: tools[name].entrant.timed(setting) for name, setting in able.items()}
-        taken = in_turn(samples, 11 if full else 5)
+        taken = in_turn(samples, 11 if full else 5, enough=_ENOUGH)
         middle = {name: spread(series).middle for name, series in taken.items()}
         rows.append((f"{level:g}", *(duration(middle[n]) if n in middle else "-" for n in tools)))
         ours = [name for name in middle if name.startswith(_OURS)]
