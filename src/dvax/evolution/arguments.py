@@ -21,7 +21,7 @@ _MOST_STEPS = 2**30
 
 
 def check(
-    problem, x0, t0, t1, ts, dt, rtol, atol, dt0, horizon, method, adjoint, measure, dense
+    problem, x0, t0, t1, ts, dt, rtol, atol, dt0, dt_max, horizon, method, adjoint, measure, dense
 ) -> None:
     wrong: list[InputProblem] = []
 
@@ -60,7 +60,8 @@ def check(
                      f"a vector of increasing times in [{float(t0):g}, {float(t1):g}]",
                      "Sort them, and drop those outside")  # fmt: skip
     for name, value, zero_allowed in (
-        ("dt", dt, False), ("dt0", dt0, False), ("horizon", horizon, False),
+        ("dt", dt, False), ("dt0", dt0, False), ("dt_max", dt_max, False),
+        ("horizon", horizon, False),
         ("rtol", rtol, True), ("atol", atol, True),
     ):  # fmt: skip
         if value is not None and _tree.is_concrete(value):

@@ -21,6 +21,15 @@ from .stepper import Step
 _TRUST, _CALM = 0.12, 9.0
 """After k steps that were kept one may grow by 1 + 0.12 k²; more than nine say nothing more."""
 
+GROWTH = 5.0
+"""Largest growth factor of the step size."""
+
+_CROSSINGS = 4
+"""Consecutive steps of the roundoff length that may exceed the tolerance and its reserve."""
+
+_WATCH = 1e-6
+"""Share of the run below which a step is short enough to ignore unseen excursions."""
+
 
 class Verdict(NamedTuple):
     """On one attempt: whether it is `kept`, the controller's state for the next one, whether data
@@ -90,6 +99,8 @@ class Adaptive(AbstractController):
     rtol: Any
     atol: Any
     first: Any
+    first_growth: Any
+    longest: Any
     horizon: Any
     order: int = eqx.field(static=True)
     sizes: Callable[[Tree], list[Any]]
@@ -104,13 +115,15 @@ class Adaptive(AbstractController):
         spare: Any
         aim: Any
         blur: Blur
+        crossings: Any
 
     def init(self):
-        first = lax.stop_gradient(self.first)
+        first = lax.stop_gradient(jnp.minimum(self.first, self.longest))
         end = land(self.stops[0], first, self.stops[1])
         one = jnp.ones_like(first)
         blur = Blur.at_start(first)
-        return self.State(end, first, jnp.asarray(1), _CALM * one, one, nothing_ahead(first), blur)
+        aim, none = nothing_ahead(first), jnp.asarray(0)
+        return self.State(end, first, jnp.asarray(1), _CALM * one, one, aim, blur, none)
 
     def end(self, state):
         return state.end
@@ -133,21 +146,38 @@ class Adaptive(AbstractController):
         # A step may be taken all the same that is short after a refusal, aimed to cross a kink, or
         # blurred by rounding.
         known = Aim(*state.aim)
-        # A kink is looked for only where the defect is too large.
+        excursion = jnp.zeros_like(h)
+        if step.excursion is not None:
+            watched = h > _WATCH * (self.stops[-1] - self.stops[0])
+            excursion = jnp.where(watched, step.excursion(self.rtol, self.atol), 0.0)
+            excursion = lax.stop_gradient(excursion)
+        # A kink is located only where the step is too long for it.
         kink = jnp.full_like(h, jnp.inf)
         if step.kink is not None:
-            kink = lax.stop_gradient(step.kink(error > 1.0))
-        crossing = (kink < jnp.inf) & (h <= 4 * known.margin)
-        relaxed = ((state.calm == 0) | crossing | rounding) & (impulse <= share * state.spare)
+            kink = lax.stop_gradient(step.kink((error > 1.0) | (excursion > 1.0)))
+        relaxed = impulse <= share * state.spare
+        # The time of a jump is uncertain by the roundoff of t: no shorter step resolves it.
+        at_floor = (h <= 4.0 * floor) & jnp.isfinite(error) & (state.crossings < _CROSSINGS)
         sound = step.begun & step.finite
-        keep = sound & ((error <= 1.0) | relaxed)
-        spare = jnp.where(keep & (error > 1.0), state.spare - impulse, state.spare)
+        keep = sound & ((error <= 1.0) | relaxed | at_floor) & (excursion <= 1.0)
+        spare = jnp.where(
+            keep & (error > 1.0), jnp.maximum(state.spare - impulse, 0.0), state.spare
+        )
+        crossed = jnp.where(keep & ~relaxed & (error > 1.0), state.crossings + 1, state.crossings)
+        crossings = jnp.where(keep & (error <= 1.0) & (h > 16.0 * floor), 0, crossed)
 
         positive = jnp.where(error > 0.0, error, 1.0)
         factor = jnp.where(error > 0.0, (0.5 / positive) ** (1.0 / self.order), jnp.inf)
         # What was just refused is not tried again at once, nor soon: in a field, whose kinks a step
         # meets or misses, one good step says little about the next.
-        factor = jnp.clip(factor, 0.1, jnp.minimum(1.0 + _TRUST * state.calm**2, 5.0))
+        first = (t0 == self.stops[0]) & (state.calm >= _CALM)
+        growth = jnp.minimum(1.0 + _TRUST * state.calm**2, GROWTH)
+        growth = jnp.where(first, self.first_growth, growth)
+        if step.excursion is not None:
+            # The width of an enclosure falls with h².
+            room = jnp.where(excursion > 0.0, excursion, 1.0) ** -0.5
+            growth = jnp.where(excursion > 0.0, jnp.minimum(growth, 0.9 * room), growth)
+        factor = jnp.clip(factor, 0.1, jnp.maximum(growth, 0.1))
         steady = keep & (factor > 0.8) & (factor < 1.25)
         length = lax.stop_gradient(h)
         blur = state.blur.after(length, error, keep, state.calm, self.order)
@@ -173,6 +203,7 @@ class Adaptive(AbstractController):
         last = self.stops.shape[0] - 1
         stop = jnp.minimum(jnp.where(jumped, state.stop + 1, state.stop), last)
         begin = jnp.where(keep, t1, t0)
+        wanted = jnp.minimum(wanted, self.longest)
         end = land(begin, wanted, until(ahead, begin, self.stops[stop]))
         # Below this, t itself cannot tell the ends of a step apart; and rounding may spend no more.
         stuck = ~keep & ((h <= floor) | (rounding & (state.spare < 1e-3)))
@@ -188,7 +219,7 @@ class Adaptive(AbstractController):
         result = RESULTS.where(step.begun, result, RESULTS.law_unsolved)
         result = RESULTS.where(step.finite, result, RESULTS.nonfinite)
         return Verdict(
-            keep, self.State(end, wanted, stop, calm, spare, ahead, blur), jumped, result
+            keep, self.State(end, wanted, stop, calm, spare, ahead, blur, crossings), jumped, result
         )
 
     def boundary(self, index, ends):

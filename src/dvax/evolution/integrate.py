@@ -12,7 +12,7 @@ from jax import lax
 from .. import _tree
 from .._one_function import in_one_function
 from ..vi import certify
-from . import implicit, picard, reverse
+from . import excursions, implicit, picard, reverse
 from .closures import opened
 from .control import AbstractController, Adaptive, Fixed, root_mean_squares, step_count
 from .flow import Flow
@@ -111,7 +111,7 @@ def _by_windows(
     x0 = setup.x0
     growth = flow.generator.growth(flow.state_space(x0)) if flow.enclosed else None
     ends = stops[0], stops[-1]
-    stepper = Stepper(ETD2RK(), flow, True, False, options.ranged, True, ends, None, growth)
+    stepper = Stepper(ETD2RK(), flow, True, False, None, options.ranged, True, ends, None, growth)
     rtol, atol, horizon = map(setup.number, ("rtol", "atol", "horizon"))
     sizes = jax.vmap(
         lambda *parts: jnp.stack(root_mean_squares(setup.problem.spaces(x0)[0])(*parts))
@@ -162,8 +162,8 @@ def _controller(
     if options.fixed:
         return Fixed(stops, setup.number("dt"))
     sizes = root_mean_squares(setup.problem.spaces(setup.x0)[0])
-    rtol, atol, first, horizon = map(setup.number, ("rtol", "atol", "dt0", "horizon"))
-    return Adaptive(stops, rtol, atol, first, horizon, method.degree + 1, sizes)
+    names = ("rtol", "atol", "dt0", "dt0_growth", "dt_max", "horizon")
+    return Adaptive(stops, *map(setup.number, names), method.degree + 1, sizes)
 
 
 def _stepper(
@@ -175,8 +175,10 @@ def _stepper(
         # Once a run: for a matrix it takes an eigenvalue.
         growth = flow.generator.growth(flow.state_space(setup.x0))
     locate = not options.fixed and _can_locate(flow, t0, setup.x0)
+    watch = not options.fixed and measure and not flow.enclosed
+    guard = excursions.guard(flow, t0, setup.x0) if watch else None
     stepper = Stepper(
-        method, flow, measure, locate, options.ranged, options.careful, (t0, t1), None, growth
+        method, flow, measure, locate, guard, options.ranged, options.careful, (t0, t1), None, growth
     )
     if options.fixed and stops.shape[0] == 2 and not method.linearises:
         length = (t1 - t0) / step_count(t1 - t0, setup.number("dt"))

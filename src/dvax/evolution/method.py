@@ -11,6 +11,12 @@ from .. import _tree
 from .._tree import Tree
 
 
+ONE_SAMPLE = (5**-0.5,)
+TWO_SAMPLES = (0.5 - 0.5 * 5**-0.5, 0.5 + 0.5 * 5**-0.5)
+"""Where a step is sampled: at irrational places near the middle and near the inner Lobatto points, so
+that no step is a multiple of a period of the data at all of its samples and stages."""
+
+
 class AbstractMethod(eqx.Module):
     """A method that replaces f̃(s, x(s)) on [t₀, t₀+h] by a polynomial p and solves the rest exactly.
 
@@ -80,7 +86,7 @@ class ETD1(AbstractMethod):
 
     order: ClassVar[int] = 1
     degree: ClassVar[int] = 0
-    samples: ClassVar[tuple[float, ...]] = (0.5,)
+    samples: ClassVar[tuple[float, ...]] = ONE_SAMPLE
     halves: ClassVar[bool] = False
     linearises: ClassVar[bool] = False
     joins: ClassVar[bool] = False
@@ -109,7 +115,7 @@ class ETD2RK(AbstractMethod):
 
     order: ClassVar[int] = 2
     degree: ClassVar[int] = 1
-    samples: ClassVar[tuple[float, ...]] = (0.5,)
+    samples: ClassVar[tuple[float, ...]] = ONE_SAMPLE
     halves: ClassVar[bool] = False
     linearises: ClassVar[bool] = False
     joins: ClassVar[bool] = False
@@ -143,7 +149,7 @@ class ETD4RK(AbstractMethod):
 
     order: ClassVar[int] = 4
     degree: ClassVar[int] = 2
-    samples: ClassVar[tuple[float, ...]] = (0.25, 0.75)
+    samples: ClassVar[tuple[float, ...]] = TWO_SAMPLES
     halves: ClassVar[bool] = True
     linearises: ClassVar[bool] = False
     joins: ClassVar[bool] = False
@@ -189,7 +195,7 @@ class ExpRosenbrock(AbstractMethod):
 
     order: ClassVar[int] = 3
     degree: ClassVar[int] = 2
-    samples: ClassVar[tuple[float, ...]] = (0.5,)
+    samples: ClassVar[tuple[float, ...]] = ONE_SAMPLE
     halves: ClassVar[bool] = False
     linearises: ClassVar[bool] = True
     joins: ClassVar[bool] = False

@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from .method import AbstractMethod, combined
+from .method import TWO_SAMPLES, AbstractMethod, combined
 
 _NODES = (1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0)
 _STAGES = (
@@ -55,7 +55,7 @@ class DormandPrince(AbstractMethod):
 
     order: ClassVar[int] = 5
     degree: ClassVar[int] = 3
-    samples: ClassVar[tuple[float, ...]] = (0.25, 0.75)
+    samples: ClassVar[tuple[float, ...]] = TWO_SAMPLES
     halves: ClassVar[bool] = False
     linearises: ClassVar[bool] = False
     joins: ClassVar[bool] = True

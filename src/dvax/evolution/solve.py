@@ -15,6 +15,7 @@ from ..vi import AbstractSolver, Auto
 from .arguments import bound_steps, check, warn_precision
 from .certified import certified, of_region
 from .compiled import compiled
+from .control import GROWTH
 from .diagnose import diagnose
 from .implicit import Implicit
 from .integrate import Options
@@ -26,6 +27,12 @@ from .solution import Solution
 
 _METHOD, _VI_SOLVER = ETD2RK(), Auto()
 """The defaults, which nothing changes; making them would be felt in a short run."""
+
+
+_FIRST, _FIRST_GROWTH = 1e-6, 1e3
+"""The first adaptive step as a share of the run, and the largest growth factor after it. Such a step
+costs one step and no compilation; its error estimate gives the scale of the problem, where the rule of
+Hairer, Nørsett and Wanner (1993, II.4) takes two evaluations and a norm of the second derivative."""
 
 
 def solve(
@@ -47,6 +54,7 @@ def solve(
     measure: bool | None = None,
     dense: bool = False,
     dt0: Any = None,
+    dt_max: Any = None,
     horizon: Any = None,
     max_steps: int | None = None,
     adjoint: str = "reverse",
@@ -75,7 +83,9 @@ def solve(
     - `measure`: whether to sample the defect inside steps. Adaptive steps always do; fixed steps only
       when asked, since it doubles their cost;
     - `dense`: keep every step, for `Solution.evaluate`; memory grows with `max_steps`;
-    - `dt0`, `horizon`: first step and length of the whole run, to continue a run in pieces;
+    - `dt0`, `horizon`: first step and length of the whole run, to continue a run in pieces. Without
+      `dt0` the first step is 10⁻⁶ of the run, and its error estimate chooses the second one;
+    - `dt_max`: the longest adaptive step, for data with features that no sample may miss;
     - `max_steps`: the most steps, 2²⁰ by default for adaptive ones; with fixed steps, counted;
     - `adjoint`: "reverse" serves `jax.grad` and `jax.vjp`, "forward" serves `jax.jvp` and
       `jax.jacfwd`: one loop cannot serve both;
@@ -110,7 +120,7 @@ def solve(
         _only_adaptive(dt, method)
         again: dict[str, Any] = dict(
             method=method, vi_solver=vi_solver, progress=progress, constants=constants, dense=dense,
-            dt0=dt0, max_steps=max_steps, adjoint=adjoint, throw=throw,
+            dt0=dt0, dt_max=dt_max, max_steps=max_steps, adjoint=adjoint, throw=throw,
         )  # fmt: skip
         begin, end = float(t0), float(t1)
         run = lambda times, atol: solve(  # noqa: E731
@@ -119,7 +129,7 @@ def solve(
         return certified(run, ts, problem, x0, args, begin, end, constants, certified_tol)
     x0 = _tree.as_float(x0, "x0")
     method = _METHOD if method is None else method
-    check(problem, x0, t0, t1, ts, dt, rtol, atol, dt0, horizon, method, adjoint, measure, dense)
+    check(problem, x0, t0, t1, ts, dt, rtol, atol, dt0, dt_max, horizon, method, adjoint, measure, dense)
     fixed = dt is not None
     if not fixed:
         warn_precision(x0, rtol)
@@ -131,7 +141,9 @@ def solve(
         "dt": math.nan if dt is None else _number(dt),
         "rtol": _number(rtol),
         "atol": _number(atol),
-        "dt0": span * 1e-3 if dt0 is None else _number(dt0),
+        "dt0": span * _FIRST if dt0 is None else _number(dt0),
+        "dt0_growth": _FIRST_GROWTH if dt0 is None else GROWTH,
+        "dt_max": math.inf if dt_max is None else _number(dt_max),
         "horizon": span if horizon is None else _number(horizon),
     }
     measured = not isinstance(method, Implicit) and (bool(measure) or not fixed)

@@ -18,6 +18,7 @@ from ..generators.expanded import coefficients, values
 from ..problem import END_ULPS, KNOT_ULPS
 from .defect import Sample, enclosed, sampled
 from .evaluations import Plan, Visit, evaluated
+from .excursions import ExcursionGuard
 from .extent import Extent
 from .flow import Flow, Rate
 from .kinks import first_change
@@ -52,7 +53,9 @@ class Step(NamedTuple):
 
     `error` is the defect entry by entry (None where not measured), `impulse` = (∫ ‖p − f̃(·, x_h)‖ ds,
     ∫ ‖w‖ ds) over the step. `kink(asked)` is the time of the first kink of the response inside, ∞
-    where there is none or nobody `asked` (None where nobody looks). `extent` is where x_h and u_h have
+    where there is none or nobody `asked` (None where nobody looks). `excursion(rtol, atol)` exceeds 1
+    where K or h may have made a switch function change its sign and back unseen (None where neither
+    depends on t by itself). `extent` is where x_h and u_h have
     been (None where nobody asks). `begun` says that the law was solved at the start, `solved` that it
     was everywhere; `finite`, that there are no bad values that a shorter step would not mend;
     `evaluations` counts those of F.
@@ -63,6 +66,7 @@ class Step(NamedTuple):
     error: Tree | None
     impulse: tuple[Any, Any]
     kink: Callable[[Any], Any] | None
+    excursion: Callable[[Any, Any], Any] | None
     extent: Extent | None
     memory: Memory
     begun: Any
@@ -113,6 +117,7 @@ class Stepper(eqx.Module):
 
     - `measure`: sample the defect inside every step, which adaptive steps and certificates need;
     - `locate`: look for kinks of the response inside every step;
+    - `guard`: bounds the excursions between the samples of a step, None where there can be none;
     - `ranged`: keep where x_h and u_h have been, which constants of a region need;
     - `careful`: look for bad values after every step, at the price of a second pass over memory;
     - `ends`: first and last time of the run;
@@ -124,6 +129,7 @@ class Stepper(eqx.Module):
     flow: Flow
     measure: bool = eqx.field(static=True)
     locate: bool = eqx.field(static=True)
+    guard: ExcursionGuard | None
     ranged: bool = eqx.field(static=True)
     careful: bool = eqx.field(static=True)
     ends: tuple[Any, Any]
@@ -196,13 +202,16 @@ class Stepper(eqx.Module):
         arc, known = Arc(t1 - t0, start, x1, c), coefficients(x1)
         c, x1 = values((c, x1))
         first, last = visits[0].rate, visits[-1].rate
-        error, impulse, kink, extent = None, (0.0, 0.0), None, None
+        error, impulse, kink, excursion, extent = None, (0.0, 0.0), None, None, None
         if self.measure:
             sample = self._measure(t0, t1, arc, visits)
             error, impulse = sample.error, (sample.defect, sample.law_defect)
             extent = sample.extent if self.ranged else None
             if self.locate:
                 kink = partial(self._kink, t0, t1, x0, c, first, sample)
+            if self.guard is not None:
+                along = [visits[0], *visits[-1 - len(sample.thetas) :]]
+                excursion = partial(self.guard.ratio, self.flow, along)
             # Further in, a bad value may come from a step that was too long: it is cut, not fatal.
             finite = _tree.all_finite(first.value)
         else:
@@ -220,7 +229,7 @@ class Stepper(eqx.Module):
         counts = [visit.rate.evaluations for visit in visits]
         own = counts[0] if kept is None else jnp.where(jumped, counts[0], 0)
         return Step(
-            x1, c, error, impulse, kink, extent, after, first.solved, solved, finite,
+            x1, c, error, impulse, kink, excursion, extent, after, first.solved, solved, finite,
             sum(counts[1:], own),
         )  # fmt: skip
 
