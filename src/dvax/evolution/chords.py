@@ -26,6 +26,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
+from .._jaxpr import bound
 from .._tree import Tree
 from ..vi.structure import CALLS, evaluate
 
@@ -224,6 +225,7 @@ _ENTRYWISE = {
     "and", "or", "xor", "not", "add", "sub", "mul", "max", "min", "neg", "sign", "abs",
     "convert_element_type", "select_n", "clamp", "eq", "ne", "lt", "le", "gt", "ge",
 }  # fmt: skip
+_TABLES = {"dvax_constant_table", "dvax_linear_table"}
 _CUSTOM = {"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
 
 
@@ -237,6 +239,8 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
         # A box's lower bound: whether the box is empty is seen where the law is solved.
         shape = eqn.outvars[0].aval.shape
         return [Chord(*(jnp.broadcast_to(part, shape) for part in _lift(given[0])))]
+    if eqn.params.get("name") in _TABLES:
+        return [_table(eqn, given)]
     if name in CALLS or name in _CUSTOM:
         for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
             inner = eqn.params.get(key)
@@ -344,6 +348,26 @@ def _known(a: jax.Array, b: jax.Array, known: jax.Array) -> Chord:
     """A value that does not change where it is known, and may be anything where it is not."""
     dev = jnp.where(known, 0.0, jnp.inf).astype(_real(a))
     return Chord(a, b, jnp.broadcast_to(dev, jnp.shape(a)))
+
+
+def _table(eqn: Any, given: list[Any]) -> Chord:
+    """Values of a table of constants or lines (`dvax.signals.Table`): affine in t between two of its
+    times, and without a bound across one."""
+    times, values, t = given
+    if is_chord(times) or is_chord(values):
+        raise NoEnclosure("a table that moves")
+    look = lambda t: bound(eqn, [times, values, t])[0]  # noqa: E731
+    a, b = look(t.a), look(t.b)
+    method = "scan_unrolled" if times.shape[0] <= 4096 else "scan"
+    passed = lambda t, side: jnp.searchsorted(times, t, side=side, method=method)  # noqa: E731
+    whole = passed(t.highest, "left") <= passed(t.lowest, "right")
+    if eqn.params["name"] == "dvax_constant_table":
+        slope = jnp.zeros(())
+    else:
+        i = jnp.clip(passed(t.lowest, "right") - 1, 0, times.shape[0] - 2)
+        slope = jnp.abs((values[i + 1] - values[i]) / (times[i + 1] - times[i]))
+    dev = jnp.where(whole, _safe(slope, t.dev), jnp.inf)
+    return Chord(a, b, jnp.broadcast_to(dev, a.shape).astype(a.dtype))
 
 
 def _compare(x: Chord, y: Chord, bind: Callable) -> Chord:

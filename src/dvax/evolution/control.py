@@ -27,6 +27,9 @@ GROWTH = 5.0
 _CROSSINGS = 4
 """Consecutive steps of the roundoff length that may exceed the tolerance and its reserve."""
 
+_SHORTER = 0.3
+"""Largest factor of the step size after a step that may hide an excursion."""
+
 _WATCH = 1e-6
 """Share of the run below which a step is short enough to ignore unseen excursions."""
 
@@ -174,9 +177,10 @@ class Adaptive(AbstractController):
         growth = jnp.minimum(1.0 + _TRUST * state.calm**2, GROWTH)
         growth = jnp.where(first, self.first_growth, growth)
         if step.excursion is not None:
-            # The width of an enclosure falls with h².
-            room = jnp.where(excursion > 0.0, excursion, 1.0) ** -0.5
-            growth = jnp.where(excursion > 0.0, jnp.minimum(growth, 0.9 * room), growth)
+            # The width of an enclosure falls with h², and the room beside it often too.
+            room = 0.9 * jnp.where(excursion > 0.0, excursion, 1.0) ** -0.5
+            room = jnp.where(excursion > 1.0, jnp.minimum(room, _SHORTER), room)
+            growth = jnp.where(excursion > 0.0, jnp.minimum(growth, room), growth)
         factor = jnp.clip(factor, 0.1, jnp.maximum(growth, 0.1))
         steady = keep & (factor > 0.8) & (factor < 1.25)
         length = lax.stop_gradient(h)

@@ -186,13 +186,16 @@ def _stepper(
     return stepper
 
 
-_FEW = 64
-"""Up to so many entries of the law kinks are located: those of a field are everywhere."""
+_FIELD, _LARGE_LAW = 64, 256
+"""Entries of the law beyond which a state of as many is taken for a field, whose kinks are everywhere;
+and entries of a law beyond which its kinks are never located. A market of 102 units and one price takes
+4 times fewer steps with its kinks located; a field of 128 points takes up to 2 times more."""
 
 
 def _can_locate(flow: Flow, t0: jax.Array, x0: Any) -> bool:
     like = flow.problem.zero_control(x0)
-    if sum(leaf.size for leaf in jtu.tree_leaves(like)) > _FEW:
+    law, state = (sum(leaf.size for leaf in jtu.tree_leaves(v)) for v in (like, x0))
+    if law > _LARGE_LAW or min(law, state) > _FIELD:
         return False
     known = flow.switches(t0, x0, like)
     return known is not None and known.size > 0

@@ -110,15 +110,17 @@ def dvax_cubic_table(times: jax.Array, values: jax.Array, slopes: jax.Array, t: 
     return _within(times, t, out)
 
 
+_UNROLLED = 4096
+"""Times up to which the bisection is unrolled."""
+
+
 def _place(times: jax.Array, t: Any) -> tuple[jax.Array, jax.Array]:
     """i with tᵢ ≤ t ≤ tᵢ₊₁, and how far between the two t is."""
-    # Counting has no branches: on a short table it is faster than a bisection, and the place of
-    # t follows from comparisons alone, which chord arithmetic can see through.
+    # Measured a lookup: counting 68 ns for 168 times and 3.9 µs for 8784; bisection 27 ns unrolled,
+    # 100 ns as a loop.
     count = times.shape[0]
-    if count <= 2**16:
-        passed = jnp.sum(times <= t)
-    else:
-        passed = jnp.searchsorted(times, t, side="right")
+    method = "scan_unrolled" if count <= _UNROLLED else "scan"
+    passed = jnp.searchsorted(times, t, side="right", method=method)
     i = jnp.clip(passed - 1, 0, count - 2)
     left, right = times[i], times[i + 1]
     return i, (t - left) / (right - left)
