@@ -181,7 +181,6 @@ def _power(x: Chord, n: int) -> Chord:
 def _stairs(phi: Callable) -> Callable[[Chord], Chord]:
     """A monotone φ of finitely many values: over the step it stays between those at the extremes."""
 
-
     def rule(x: Chord) -> Chord:
         rise = phi(x.highest) - phi(x.lowest)
         if _below_parabola.get():

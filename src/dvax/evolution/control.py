@@ -27,6 +27,10 @@ GROWTH = 5.0
 _CROSSINGS = 4
 """Consecutive steps of the roundoff length that may exceed the tolerance and its reserve."""
 
+_ROUNDINGS = 1e6
+"""Roundings of f̃ that a defect may amount to and count as roundoff: a law with a small modulus
+amplifies them by 1/γ."""
+
 _SHORTER = 0.3
 """Largest factor of the step size after a step that may hide an excursion."""
 
@@ -158,13 +162,19 @@ class Adaptive(AbstractController):
         kink = jnp.full_like(h, jnp.inf)
         if step.kink is not None:
             kink = lax.stop_gradient(step.kink((error > 1.0) | (excursion > 1.0)))
-        relaxed = impulse <= share * state.spare
+        # No step size reduces what the roundoff of f, h and K leaves: the reserve does not limit it.
+        size = self.horizon * self._scaled(step.c[0], x0, step.x1)
+        roundoff = rounding & (error <= _ROUNDINGS * jnp.finfo(h.dtype).eps * size)
+        roundoff = lax.stop_gradient(roundoff)
+        relaxed = (impulse <= share * state.spare) | roundoff
         # The time of a jump is uncertain by the roundoff of t: no shorter step resolves it.
         at_floor = (h <= 4.0 * floor) & jnp.isfinite(error) & (state.crossings < _CROSSINGS)
         sound = step.begun & step.finite
         keep = sound & ((error <= 1.0) | relaxed | at_floor) & (excursion <= 1.0)
         spare = jnp.where(
-            keep & (error > 1.0), jnp.maximum(state.spare - impulse, 0.0), state.spare
+            keep & (error > 1.0) & ~roundoff,
+            jnp.maximum(state.spare - impulse, 0.0),
+            state.spare,
         )
         crossed = jnp.where(keep & ~relaxed & (error > 1.0), state.crossings + 1, state.crossings)
         crossings = jnp.where(keep & (error <= 1.0) & (h > 16.0 * floor), 0, crossed)
@@ -210,7 +220,8 @@ class Adaptive(AbstractController):
         wanted = jnp.minimum(wanted, self.longest)
         end = land(begin, wanted, until(ahead, begin, self.stops[stop]))
         # Below this, t itself cannot tell the ends of a step apart; and rounding may spend no more.
-        stuck = ~keep & ((h <= floor) | (rounding & (state.spare < 1e-3)))
+        exhausted = rounding & ~roundoff & (state.spare < 1e-3)
+        stuck = ~keep & ((h <= floor) | exhausted)
         result = RESULTS.where(
             stuck,
             RESULTS.where(

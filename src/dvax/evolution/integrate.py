@@ -178,7 +178,16 @@ def _stepper(
     watch = not options.fixed and measure and not flow.enclosed
     guard = excursions.guard(flow, t0, setup.x0) if watch else None
     stepper = Stepper(
-        method, flow, measure, locate, guard, options.ranged, options.careful, (t0, t1), None, growth
+        method,
+        flow,
+        measure,
+        locate,
+        guard,
+        options.ranged,
+        options.careful,
+        (t0, t1),
+        None,
+        growth,
     )
     if options.fixed and stops.shape[0] == 2 and not method.linearises:
         length = (t1 - t0) / step_count(t1 - t0, setup.number("dt"))

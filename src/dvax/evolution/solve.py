@@ -129,7 +129,23 @@ def solve(
         return certified(run, ts, problem, x0, args, begin, end, constants, certified_tol)
     x0 = _tree.as_float(x0, "x0")
     method = _METHOD if method is None else method
-    check(problem, x0, t0, t1, ts, dt, rtol, atol, dt0, dt_max, horizon, method, adjoint, measure, dense)
+    check(
+        problem,
+        x0,
+        t0,
+        t1,
+        ts,
+        dt,
+        rtol,
+        atol,
+        dt0,
+        dt_max,
+        horizon,
+        method,
+        adjoint,
+        measure,
+        dense,
+    )
     fixed = dt is not None
     if not fixed:
         warn_precision(x0, rtol)
