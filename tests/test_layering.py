@@ -18,6 +18,7 @@ FLOORS = {
     "_jaxpr": -2,
     "_tree": -1,
     "_batch": -1,
+    "_failure": -1,
     "_one_function": -1,
     "spaces": 0,
     "generators": 0,
