@@ -95,8 +95,10 @@ def test_failed_lanes_have_nan_and_the_others_their_own_derivative(method, dt, a
         assert np.isfinite(values[0]), name
     # Alone, the lane that succeeded has the same derivative.
     alone, _ = derive(cost)({name: value[0] for name, value in batch.items()})
+    # An implicit step is solved to its tolerance, by other roundings in a batch.
+    rtol = 1e-7 if method == "Implicit" else 1e-9
     for name in WELL:
-        np.testing.assert_allclose(found[name][0], alone[name], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(found[name][0], alone[name], rtol=rtol, atol=1e-12)
     # Nor has one that is not part of a batch or a larger program.
     failed, _ = derive(cost)({name: value[1] for name, value in batch.items()})
     assert all(np.isnan(value) for value in failed.values())
