@@ -26,6 +26,7 @@ FLOORS = {
     "sets": 0,
     "signals": 0,
     "vi": 1,
+    "_switches": 1.5,
     "problem": 2,
     "evolution": 3,
     "theory": 4,
