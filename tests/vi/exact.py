@@ -41,12 +41,13 @@ def times(M, y):
 
 
 def box(M, q, lower, upper, guess):
-    """By Murty's least-index rule from the active set of the guess; it ends for every P-matrix."""
+    """From the active set of the guess: every violated condition is exchanged at once, and after 20
+    such turns, the first alone (Murty's least-index rule, which ends for every P-matrix)."""
     n = len(q)
     place = [
         -1 if y <= a else 1 if y >= b else 0 for y, a, b in zip(guess, lower, upper, strict=True)
     ]
-    for _ in range(50 * n):
+    for turn in range(5000):
         y = [(lower[i], None, upper[i])[place[i] + 1] for i in range(n)]
         free = [i for i in range(n) if place[i] == 0]
         held = [i for i in range(n) if place[i] != 0]
@@ -54,14 +55,15 @@ def box(M, q, lower, upper, guess):
         for i, v in zip(free, solve([[M[i][j] for j in free] for i in free], right), strict=True):
             y[i] = v
         F = [a + b for a, b in zip(times(M, y), q, strict=True)]
+        wrong = False
         for i in range(n):
             if place[i] == 0 and not lower[i] <= y[i] <= upper[i]:
-                place[i] = -1 if y[i] < lower[i] else 1
+                place[i], wrong = -1 if y[i] < lower[i] else 1, True
+            elif place[i] * F[i] > 0:
+                place[i], wrong = 0, True
+            if wrong and turn >= 20:
                 break
-            if place[i] * F[i] > 0:
-                place[i] = 0
-                break
-        else:
+        if not wrong:
             return y
     raise AssertionError("no active set")
 

@@ -45,6 +45,8 @@ class Options(NamedTuple):
 
 def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
     """The solution; where it failed, NaN is its derivative with respect to everything real."""
+    # Shapes and knots are looked at here, while tracing: a call that is compiled pays nothing.
+    setup.problem.check(setup.number("t0"), setup.x0, setup.args)
     flow = setup.flow()
     flow = dataclasses.replace(
         flow, problem=opened(setup.problem, setup.number("t0"), setup.x0, flow.args)
@@ -61,8 +63,6 @@ def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
 def _solved(setup: Setup, flow: Flow, ts: Any, options: Options) -> Solution:
     problem, x0, args = setup.problem, setup.x0, setup.args
     t0, t1 = setup.number("t0"), setup.number("t1")
-    # Shapes and knots are looked at here, while tracing: a call that is compiled pays nothing.
-    problem.check(t0, x0, args)
     knots = jnp.asarray(problem.knots(t0, t1, x0, args), setup.dtype)
     stops = jnp.concatenate([t0[None], knots, t1[None]])
     times = None if ts is None else jnp.asarray(ts, setup.dtype)
