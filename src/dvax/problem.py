@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import _tree
+from ._switches import switching_times
 from ._tree import Tree
 from .errors import InputError, InputProblem
 from .generators import AbstractGenerator
@@ -187,7 +188,8 @@ class Problem(eqx.Module):
             raise InputError(*problems)
 
     def knots(self, t0: Any, t1: Any, x: Tree, args: Any = None) -> Any:
-        """The times in (t0, t1) where the data in f, h or K is not smooth, sorted.
+        """The times in (t0, t1) where the data in f, h or K is not smooth, sorted: the knots of their
+        signals, and the times at which their code compares an affine function of t (`t < a`).
 
         **Raises:** `dvax.InputError` where some data does not cover [t0, t1].
         """
@@ -202,7 +204,7 @@ class Problem(eqx.Module):
 
         found: list[Any] = []
         time = jnp.asarray(t0, jnp.result_type(float))
-        jax.eval_shape(listener, time, x, u)
+        switches = switching_times(listener, time, x, u)
         heard = found[-1]
         for name in sorted(set(heard.elsewhere)):
             warnings.warn(
@@ -212,13 +214,16 @@ class Problem(eqx.Module):
                 stacklevel=4,
             )
         _check_spans(heard.spans, t0, t1)
-        if not heard.knots:
+        if not heard.knots and not switches:
             return np.zeros(0)
-        concrete = _tree.is_concrete(heard.knots, t0, t1)
+        listed = [*heard.knots, *switches]
+        concrete = _tree.is_concrete(listed, t0, t1)
         lib = np if concrete else jnp
         # Known ones are sorted here: the compiler takes a second for a thousand.
-        of_knots = np if _tree.is_concrete(heard.knots) else jnp
-        arrays = [of_knots.asarray(knots, dtype=float) for knots in heard.knots]
+        of_knots = np if _tree.is_concrete(listed) else jnp
+        arrays = [of_knots.asarray(knots, dtype=float) for knots in listed]
+        if of_knots is np:
+            arrays = [knots[np.isfinite(knots)] for knots in arrays]
         every = lib.asarray(of_knots.sort(of_knots.concatenate(arrays)))
         ulp = jnp.finfo(every.dtype).eps
         margin = END_ULPS * ulp * lib.maximum(lib.abs(t0), lib.abs(t1))

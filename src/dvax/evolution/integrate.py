@@ -4,12 +4,14 @@ import dataclasses
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 
 from .. import _tree
+from .._failure import nan_derivatives_where
 from .._one_function import in_one_function
 from ..vi import certify
 from . import excursions, implicit, picard, reverse
@@ -42,14 +44,27 @@ class Options(NamedTuple):
 
 
 def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
+    """The solution; where it failed, NaN is its derivative with respect to everything real."""
+    # Shapes and knots are looked at here, while tracing: a call that is compiled pays nothing.
+    setup.problem.check(setup.number("t0"), setup.x0, setup.args)
+    flow = setup.flow()
+    flow = dataclasses.replace(
+        flow, problem=opened(setup.problem, setup.number("t0"), setup.x0, flow.args)
+    )
+    solution = _solved(setup, flow, ts, options)
+    failed = (solution.result != RESULTS.successful) | ~jnp.all(solution.ts < jnp.inf)
+    # The setup is what was asked: it is no output.
+    arrays, tree = jtu.tree_flatten(solution, is_leaf=lambda node: node is setup)
+    assert arrays.pop() is setup
+    given = eqx.filter((flow, setup, ts), eqx.is_inexact_array)
+    return tree.unflatten([*nan_derivatives_where(failed, arrays, given), setup])
+
+
+def _solved(setup: Setup, flow: Flow, ts: Any, options: Options) -> Solution:
     problem, x0, args = setup.problem, setup.x0, setup.args
     t0, t1 = setup.number("t0"), setup.number("t1")
-    # Shapes and knots are looked at here, while tracing: a call that is compiled pays nothing.
-    problem.check(t0, x0, args)
     knots = jnp.asarray(problem.knots(t0, t1, x0, args), setup.dtype)
     stops = jnp.concatenate([t0[None], knots, t1[None]])
-    flow = setup.flow()
-    flow = dataclasses.replace(flow, problem=opened(problem, t0, x0, flow.args))
     times = None if ts is None else jnp.asarray(ts, setup.dtype)
     if isinstance(setup.method, Implicit):
         return _implicitly(setup, setup.method, flow, stops, times, options)

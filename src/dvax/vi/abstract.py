@@ -23,8 +23,9 @@ class RESULTS(eqx.Enumeration):
         "returned with its bound; raise max_steps, loosen tol, or choose another solver."
     )
     stalled = (
-        "The iterate stopped moving before the tolerance was met: rounding allows no more. The best "
-        "iterate is returned with its bound; loosen tol, scale F, or use double precision."
+        "The iterate stopped moving before the tolerance was met, or rounding in F keeps its error "
+        "bound above it: rounding allows no more. The best iterate is returned with its bound; "
+        "loosen tol, scale F, or use double precision."
     )
     cycling = (
         "The iterates came back to where they had been before: the method goes round in a circle, "
@@ -85,7 +86,8 @@ class Answer(NamedTuple):
     `y` lies in K. `z` is a point whose projection is y: the unconstrained value of the law, which
     moves even while y sits on the boundary. `residual` is ‖w‖ for a w ∈ F(y) + N_K(y), so that
     ‖y − y*‖ ≤ residual/γ; it is 0 where y is the solution in closed form (up to rounding).
-    `evaluations` counts calls of F, those for derivatives of F apart.
+    `evaluations` counts calls of F, those for derivatives of F apart. `length` is the λ that w was
+    divided by, with the roundings of y: w = F(y) − F(·) + (· − y)/λ; ∞ where it was not.
     """
 
     y: Tree
@@ -94,6 +96,7 @@ class Answer(NamedTuple):
     iterations: jax.Array
     result: RESULTS
     evaluations: jax.Array
+    length: Any = float("inf")
 
 
 class AbstractSolver(eqx.Module):

@@ -52,6 +52,7 @@ class _State(NamedTuple):
     mark: list[Tree]
     marked: jax.Array
     step: jax.Array
+    length: jax.Array
     first: jax.Array
     count: jax.Array
     calls: jax.Array
@@ -125,6 +126,7 @@ def iterate(
             mark=_tree.where(mark, trial.at, s.mark),
             marked=jnp.where(mark, count, s.marked),
             step=jnp.where(better, trial.step, s.step),
+            length=jnp.where(better, lam, s.length),
             first=first,
             count=count,
             calls=s.calls + trial.calls,
@@ -137,7 +139,7 @@ def iterate(
     state = _State(
         method, start, _tree.scale(jnp.nan, start), jnp.asarray(jnp.inf, dtype),
         nowhere, nowhere, jnp.asarray(1), jnp.ones((), dtype), jnp.ones((), dtype),
-        jnp.asarray(0), jnp.asarray(begun),
+        jnp.ones((), dtype), jnp.asarray(0), jnp.asarray(begun),
         RESULTS.max_steps, jnp.asarray(True),
     )  # fmt: skip
     state = lax.while_loop(lambda s: s.going & (s.count < max_steps), body, state)
@@ -146,7 +148,7 @@ def iterate(
     tau = 1.0 if vi.L_F is None else 1.0 / vi.L_F
     z = _tree.sub(state.y, _tree.scale(tau, state.value))
     z = lax.stop_gradient(z)
-    return Answer(y, z, state.residual, state.count, state.result, state.calls)
+    return Answer(y, z, state.residual, state.count, state.result, state.calls, state.length)
 
 
 def stopped(vi: Frozen) -> Frozen:

@@ -1,6 +1,7 @@
 """`dvax.solve_vi`: one frozen variational inequality, usable on its own."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .. import _tree
+from .._failure import nan_derivatives_where
 from .._tree import Tree
 from ..sets import AbstractSet
 from ..spaces import AbstractSpace, Euclidean, Product
@@ -17,26 +19,36 @@ from .abstract import RESULTS, AbstractSolver, Frozen
 from .auto import Auto
 from .certificate import certify
 from .iteration import first_step, stopped
+from .rounding import rounding_error
 from .weighted import Weighted, moduli_belong_to_the_parts
+
+_IN_VAIN = RESULTS.max_steps, RESULTS.stalled, RESULTS.cycling, RESULTS.singular
+"""Ends of an iteration that only missed its tolerance."""
 
 
 class VISolution(eqx.Module):
     """The solution of a variational inequality with its certificate.
 
-    `y` ∈ K; `residual` = ‖w‖ for a w ∈ F(y) + N_K(y); `error_bound` ≥ ‖y − y*‖ where γ was given,
-    else None; `iterations`, and `evaluations` of F (those for derivatives, and for the certificate of
-    a closed form, apart); `result`, which is `dvax.vi.RESULTS.successful` or says what went wrong;
-    `solver`, the one that was used.
+    `y` ∈ K; `residual` = ‖w‖ for a w ∈ F(y) + N_K(y), as computed; `rounding`, a bound on what the
+    rounding of F and of w adds to it; `error_bound` ≥ ‖y − y*‖ where γ was given, else None: that is
+    (residual + rounding)/γ, and the distance to the certified point where that is not y;
+    `rounding_status`, "proved" where K is a pointwise interval and every operation of F has a rule
+    (`dvax.vi.rounding`), else "estimated"; `iterations`, and `evaluations` of F (those for
+    derivatives, for rounding, and for the certificate of a closed form, apart); `result`, which is
+    `dvax.vi.RESULTS.successful` or says what went wrong; `solver`, the one that was used.
+    Derivatives of a solve that failed are NaN, unless it reached the level of rounding.
     For a `dvax.vi.Weighted` operator aG these speak of G, which has the same solution.
     """
 
     y: Tree
     residual: jax.Array
+    rounding: jax.Array
     error_bound: jax.Array | None
     iterations: jax.Array
     evaluations: jax.Array
     result: RESULTS
     solver: str = eqx.field(static=True)
+    rounding_status: str = eqx.field(static=True)
 
 
 def solve_vi(
@@ -97,8 +109,17 @@ def _solved(
 ) -> VISolution:  # fmt: skip
     """One program for all problems that differ in numbers alone, compiled at the first of them."""
     if isinstance(F, Weighted):
-        return _divided(F, args, K, space, y0, solver, tol)
-    return _certified(Frozen(lambda y: F(y, args), K, space, gamma, L_F), y0, solver, tol, gamma)
+        found = _divided(F, args, K, space, y0, solver, tol)
+    else:
+        frozen = Frozen(lambda y: F(y, args), K, space, gamma, L_F)
+        found = _certified(frozen, y0, solver, tol, gamma, tol)
+    # Where rounding allows no more than was reached, y is as good as its derivative.
+    at_floor = (found.result == RESULTS.stalled) & (found.residual <= 4 * found.rounding)
+    kept = (found.result == RESULTS.successful) | at_floor
+    kept |= found.result == RESULTS.weight_below_bound
+    hidden = jtu.tree_leaves(eqx.filter_closure_convert(F, y0, args))
+    inputs = [hidden, K, y0, args, solver, tol, gamma, L_F, space]
+    return nan_derivatives_where(~kept, found, eqx.filter(inputs, eqx.is_inexact_array))
 
 
 def _divided(
@@ -109,38 +130,75 @@ def _divided(
     mu = None if known is None else known.value
     # A modulus that is proved not to be positive says nothing, and may be so in some lanes only.
     goal = tol if mu is None else tol * jnp.where(mu > 0, mu, 1.0)
-    found = _certified(Frozen(lambda y: F.G(y, args), K, space), y0, solver, goal, mu)
+    found = _certified(Frozen(lambda y: F.G(y, args), K, space), y0, solver, goal, mu, tol)
     result, bound = F.judged(found.y, args, found.result, found.error_bound)
     return dataclasses.replace(found, result=result, error_bound=bound)
 
 
 def _certified(
-    frozen: Frozen, y0: Tree, solver: AbstractSolver, tol: Any, gamma: Any
+    frozen: Frozen, y0: Tree, solver: AbstractSolver, goal: Any, gamma: Any, tol: Any
 ) -> VISolution:
-    space = frozen.space
+    """Solve to the `goal` of the solver, and compare the error bound with `tol`."""
+    space, K = frozen.space, frozen.K
     solver = solver.chosen(frozen, y0) if isinstance(solver, Auto) else solver
-    answer = solver.solve(frozen, y0, tol)
+    # Where γ is known half of the tolerance is left to rounding.
+    answer = solver.solve(frozen, y0, goal if gamma is None else 0.5 * goal)
+    still, y = stopped(frozen), jax.lax.stop_gradient(answer.y)
     residual, away = answer.residual, jnp.zeros_like(answer.residual)
+    rounding, proved = _rounding(still, y, answer.length, residual)
     if not solver.certifies:
         # A projection step from y, whose certificate covers y by the triangle inequality.
-        still, y = stopped(frozen), jax.lax.stop_gradient(answer.y)
-        checked = certify(still.F, still.K, space, y, first_step(still, y, still.F(y)))
+        step = first_step(still, y, still.F(y))
+        checked = certify(still.F, still.K, space, y, step)
+        other, _ = _rounding(still, checked.y, step, checked.norm)
         residual = jnp.where(answer.residual > 0, answer.residual, jnp.inf)
-        nearer = checked.norm < residual
+        nearer = checked.norm + other < residual + rounding
         residual = jnp.where(nearer, checked.norm, residual)
+        rounding = jnp.where(nearer, other, rounding)
         away = jnp.where(nearer, space.norm(_tree.sub(checked.y, y)), away)
-    bound = None
+    bound, result = None, answer.result
     if gamma is not None:
-        bound = jnp.where(gamma > 0, residual / gamma + away, jnp.inf)
+        bound = jnp.where(gamma > 0, (residual + rounding) / gamma + away, jnp.inf)
+        good, within = result == RESULTS.successful, bound <= tol
+        # An iteration that went on in vain at the level of rounding is stalled; so is one that ended
+        # where rounding alone is what keeps the bound above the tolerance.
+        vain = functools.reduce(jnp.logical_or, [result == word for word in _IN_VAIN])
+        by_rounding = (residual <= gamma * tol) | (not solver.certifies)
+        limited = (good & by_rounding) | (vain & (residual <= 4 * rounding))
+        result = RESULTS.where((gamma > 0) & limited & ~within, RESULTS.stalled, result)
+        result = RESULTS.where((gamma > 0) & vain & within, RESULTS.successful, result)
+    status = "proved" if proved and K.intervals(y0) is not None else "estimated"
     return VISolution(
         y=answer.y,
         residual=residual,
+        rounding=rounding,
         error_bound=bound,
         iterations=answer.iterations,
         evaluations=answer.evaluations,
-        result=answer.result,
+        result=result,
         solver=type(solver).__name__,
+        rounding_status=status,
     )
+
+
+def _rounding(vi: Frozen, y: Tree, length: Any, residual: Any) -> tuple[jax.Array, bool]:
+    """A bound on ‖fl(w) − w‖ for some w ∈ F(y) + N_K(y), and whether that of F is proved.
+
+    With z = fl(base − λF(base)) and y = proj_K(z), n = (z − y)/λ is a normal whatever the error of
+    F(base). What is computed is F(y) + [(base − y)/λ − F(base)]: it differs from F(y) + n by the error
+    of F(y), by that of z divided by λ, and by roundings of the terms. The projection onto an interval
+    is exact; that onto another set is taken to be right to (8 + n)ε of the sizes in play.
+    """
+    norm, value = vi.space.norm, vi.F(y)
+    error, proved = rounding_error(vi.F, y)
+    eps = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y))).eps
+    size, force = norm(y), norm(value) + residual
+    exact = vi.K.intervals(y) is not None
+    places = 2 if exact else 2 * (8 + sum(leaf.size for leaf in jtu.tree_leaves(y)))
+    blur = eps * (places * size / length + (8 + (0 if exact else places)) * force)
+    # Of the norms themselves, and of this sum.
+    found = 1.01 * (norm(error) + blur)
+    return jnp.where(jnp.isfinite(residual), found, jnp.inf), proved
 
 
 def default_space(like: Tree) -> AbstractSpace:

@@ -1,0 +1,255 @@
+"""Times at which the code of f, h or K switches: comparisons of an affine function of t, read off it.
+
+    jnp.where(t < a, …)     t − a > 0     t >= 2 * a + b     jnp.sign(t − a)     jnp.maximum(t, a)
+
+compare st + c, with s and c independent of t, x and u, with 0. The switch is at −c/s, a function of the
+parameters that is differentiated as any other knot. Of the program traced with t, x and u as arguments
+every value is one of
+
+- *fixed*: independent of t, x and u;
+- a *line*: s t + c;
+- *of time*: another function of t, remembering comparisons that were not resolved;
+- *other*: a function of x or u. A comparison of those is an event, and nothing is said of it.
+
+A comparison of time that is not affine (sin(t) < a) has switches that are not found. Where it chooses
+between values that are fixed, and so jumps, a derivative in what it compares is refused.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.extend.core import ClosedJaxpr
+
+from . import _tree
+from ._jaxpr import bound, walked
+from .errors import DifferentiationError
+from .vi.structure import CALLS, CUSTOM, inner_jaxpr
+
+
+class _Lazy:
+    """A value that is computed when it is needed: few of them are."""
+
+    def __init__(self, make: Callable[[], Any]):
+        self.make, self.known = make, None
+
+    def get(self) -> Any:
+        if self.make is not None:
+            self.known, self.make = self.make(), None
+        return self.known
+
+
+class _Fixed(_Lazy):
+    """Independent of t, x and u."""
+
+
+class _Line:
+    """slope · t + offset."""
+
+    def __init__(self, slope: _Lazy, offset: _Lazy):
+        self.slope, self.offset = slope, offset
+
+
+class _OfTime:
+    """Another function of t, as it is at one time. `pending`: the operands of comparisons that decide
+    it and are not resolved, with their places."""
+
+    def __init__(self, value: _Lazy, pending: tuple = (), is_flag: bool = False):
+        self.value, self.pending, self.is_flag = value, pending, is_flag
+
+
+_OTHER = object()
+_COMPARE = {"lt", "le", "gt", "ge", "lt_to", "le_to"}
+_MOVING_PLACES = {
+    "broadcast_in_dim", "reshape", "squeeze", "expand_dims", "copy", "copy_p", "transpose", "rev",
+    "slice", "stop_gradient", "reduce_precision",
+}  # fmt: skip
+_LOGIC = {"and", "or", "not", "xor", "eq", "ne"} | _MOVING_PLACES
+
+
+def switching_times(fn: Callable[..., Any], t: Any, x: Any, u: Any) -> list[jax.Array]:
+    """The times, in vectors, at which fn(t, x, u) compares a line in t with 0; infinite where there is
+    none. `t` is a time of the run, at which functions of time alone are evaluated."""
+    traced = jax.make_jaxpr(fn)(t, x, u)
+    count = len(jtu.tree_leaves((x, u)))
+    one, zero = (_Fixed(partial(jnp.full, (), v, jnp.result_type(t))) for v in (1.0, 0.0))
+    found: list[jax.Array] = []
+    reader = _Reader(jax.lax.stop_gradient(t), found)
+    reader.read(traced, [_Line(one, zero), *[_OTHER] * count])
+    return found
+
+
+class _Reader:
+    def __init__(self, t: Any, found: list[Any]):
+        self.t, self.found = t, found
+
+    def read(self, traced: ClosedJaxpr, given: list[Any]) -> list[Any]:
+        return walked(traced, given, self._apply)
+
+    def _apply(self, eqn: Any, given: list[Any]) -> list[Any]:
+        name = eqn.primitive.name
+        given = [
+            v if isinstance(v, _Fixed | _Line | _OfTime) or v is _OTHER else _fixed(v)
+            for v in given
+        ]
+        if any(v is _OTHER for v in given):
+            # What it compares is an event; what else a select chooses by is not known to be one.
+            inner = self._inner(eqn, given)
+            return inner or [_OTHER] * len(eqn.outvars)
+        if all(isinstance(v, _Fixed) for v in given):
+            return self._lazily(eqn, given, _Fixed)
+        inner = self._inner(eqn, given)
+        if inner is not None:
+            return inner
+        line = self._line(name, eqn, given)
+        if line is not None:
+            return [line]
+        pending = tuple(p for v in given if isinstance(v, _OfTime) for p in v.pending)
+        if name in _COMPARE or name in ("max", "min", "sign", "abs", "clamp"):
+            pending += self._compared(name, eqn, given)
+        if pending and self._jumps(name, given):
+            self._refuse(pending)
+            pending = ()
+        is_flag = name in _COMPARE or name in _LOGIC
+        return self._lazily(eqn, given, lambda m: _OfTime(_Lazy(m), pending if is_flag else ()))
+
+    def _inner(self, eqn: Any, given: list[Any]) -> list[Any] | None:
+        name = eqn.primitive.name
+        if name not in CALLS and name not in CUSTOM:
+            return None
+        if str(eqn.params.get("name", "")).startswith("dvax_"):
+            return None  # tables announce their knots
+        inner = inner_jaxpr(eqn.params)
+        if inner is None or len(inner.jaxpr.invars) != len(given):
+            return None
+        return self.read(inner, given)
+
+    def _lazily(self, eqn: Any, given: list[Any], kind: Callable[..., Any]) -> list[Any]:
+        every = _Lazy(lambda: _done(eqn, [self._value(v) for v in given]))
+        return [kind(lambda k=k: every.get()[k]) for k in range(len(eqn.outvars))]
+
+    def _value(self, v: Any) -> Any:
+        if isinstance(v, _Line):
+            return v.slope.get() * self.t.astype(v.slope.get().dtype) + v.offset.get()
+        return v.value.get() if isinstance(v, _OfTime) else v.get()
+
+    def _line(self, name: str, eqn: Any, given: list[Any]) -> _Line | None:
+        """The outcome, where it is a line again."""
+        lines = [_as_line(v) for v in given]
+        if name in ("add", "sub", "add_any") and all(v is not None for v in lines):
+            return _both(lambda *v: _done(eqn, list(v))[0], *lines)
+        if name == "neg" or name in _MOVING_PLACES or name == "convert_element_type":
+            floating = jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating)
+            if floating and isinstance(given[0], _Line):
+                return _both(lambda v: _done(eqn, [v])[0], given[0])
+        if name == "mul" and isinstance(given[1], _Line) and isinstance(given[0], _Fixed):
+            return _both(lambda v: _done(eqn, [given[0].get(), v])[0], given[1])
+        if name in ("mul", "div") and isinstance(given[0], _Line) and isinstance(given[1], _Fixed):
+            return _both(lambda v: _done(eqn, [v, given[1].get()])[0], given[0])
+        return None
+
+    def _compared(self, name: str, eqn: Any, given: list[Any]) -> tuple:
+        """Keep where lines cross; return what is not resolved."""
+        if name in ("sign", "abs"):
+            pairs = [(given[0], _fixed(np.zeros((), eqn.invars[0].aval.dtype)))]
+        elif name == "clamp":
+            pairs = [(given[1], given[0]), (given[1], given[2])]
+        else:
+            pairs = [(given[0], given[1])]
+        pending: tuple = ()
+        for a, b in pairs:
+            p, q = _as_line(a), _as_line(b)
+            if not any(isinstance(v, _Line | _OfTime) for v in (a, b)):
+                continue
+            if p is None or q is None:
+                if name in _COMPARE or name == "sign":
+                    operands = [_Lazy(partial(self._value, v)) for v in (a, b)]
+                    pending += ((operands, _place(eqn)),)
+                continue
+            slope = p.slope.get() - q.slope.get()
+            offset = p.offset.get() - q.offset.get()
+            slope, offset = jnp.broadcast_arrays(slope, offset)
+            moves = slope != 0
+            times = -offset / jnp.where(moves, slope, jnp.ones_like(slope))
+            self.found.append(jnp.where(moves, times, jnp.inf).ravel())
+        return pending
+
+    def _jumps(self, name: str, given: list[Any]) -> bool:
+        """Whether what is decided so is surely not continuous."""
+        if name == "select_n":
+            cases = given[1:]
+            if not all(isinstance(v, _Fixed) for v in cases):
+                return False
+            values = [v.get() for v in cases]
+            if not _tree.is_concrete(values):
+                return True
+            return any(not np.array_equal(v, values[0]) for v in values[1:])
+        return name in ("convert_element_type", "sign")
+
+    def _refuse(self, pending: tuple) -> None:
+        for operands, place in pending:
+            values = [v.get() for v in operands]
+            real = [v for v in values if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
+            if not _tree.is_concrete(real):
+                self.found.append(_undifferentiated(place)(*real))
+
+
+def _undifferentiated(place: str) -> Callable[..., jax.Array]:
+    """A function that returns one infinite time; a derivative in its arguments raises."""
+
+    @jax.custom_jvp
+    def never(*values: Any) -> jax.Array:
+        return jnp.full(1, jnp.inf)
+
+    @partial(never.defjvp, symbolic_zeros=True)
+    def _(primals: tuple, tangents: tuple) -> Any:
+        if all(isinstance(v, jax.custom_derivatives.SymbolicZero) for v in tangents):
+            return never(*primals), jnp.zeros(1)
+        raise DifferentiationError(
+            f"f, h or K jumps at a time that depends on a parameter which is differentiated, by a "
+            f"comparison that is not affine in t{place}: the derivative of that time is not known. "
+            "Write the switch as a comparison of t itself with the time of the jump (t < a), or "
+            "name that time in the knots of a dvax.signals.Function or as a time of a "
+            "dvax.signals.Table."
+        )
+
+    return never
+
+
+def _fixed(value: Any) -> _Fixed:
+    return _Fixed(lambda: value)
+
+
+def _done(eqn: Any, given: list[Any]) -> list[Any]:
+    """One operation; on known numbers at once, also within a program that is being traced."""
+    if _tree.is_concrete(given):
+        with jax.ensure_compile_time_eval():
+            return bound(eqn, given)
+    return bound(eqn, given)
+
+
+def _as_line(v: Any) -> _Line | None:
+    if isinstance(v, _Line):
+        return v
+    if not isinstance(v, _Fixed):
+        return None
+    return _Line(_Fixed(lambda: jnp.zeros_like(jnp.asarray(v.get()))), v)
+
+
+def _both(do: Callable[..., Any], *lines: Any) -> _Line:
+    slope = _Fixed(lambda: do(*(line.slope.get() for line in lines)))
+    return _Line(slope, _Fixed(lambda: do(*(line.offset.get() for line in lines))))
+
+
+def _place(eqn: Any) -> str:
+    """Where in the caller's source an operation is written."""
+    traceback = getattr(getattr(eqn, "source_info", None), "traceback", None)
+    for frame in getattr(traceback, "frames", ()):
+        inside = ("site-packages", "/dvax/", "<frozen", "<string>")
+        if not any(part in frame.file_name for part in inside):
+            return f" ({frame.file_name}, line {frame.line_num})"
+    return ""
