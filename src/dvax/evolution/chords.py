@@ -30,7 +30,6 @@ from .._jaxpr import bound
 from .._tree import Tree
 from ..vi.structure import CALLS, evaluate
 
-
 _below_parabola = contextvars.ContextVar("below_parabola", default=False)
 
 

@@ -156,7 +156,10 @@ class Adaptive(AbstractController):
         excursion = jnp.zeros_like(h)
         if step.excursion is not None:
             watched = h > _WATCH * (self.stops[-1] - self.stops[0])
-            excursion = jnp.where(watched, step.excursion(self.rtol, self.atol), 0.0)
+            parts = zip(self.sizes(x0), self.sizes(step.x1), strict=True)
+            least = jnp.min(jnp.stack([self.atol + self.rtol * jnp.maximum(*p) for p in parts]))
+            ratio = step.excursion(self.rtol, self.atol, least / self.horizon)
+            excursion = jnp.where(watched, ratio, 0.0)
             excursion = lax.stop_gradient(excursion)
         # A kink is located only where the step is too long for it.
         kink = jnp.full_like(h, jnp.inf)

@@ -1,19 +1,28 @@
-"""Excursions: a set or a drive that moves in time may touch the response between two samples.
+"""Data that moves in time may do more between two samples of a step than the samples show.
 
-A switch function s of K (`AbstractSet.switches`) that has one sign at two neighbouring samples may
-still change it twice between them, where the data in h or K moves by itself: a bound that dips, a
-pulse. Let dev bound how far s is from the line between its values s₀ and s₁ at the samples, by chord
-arithmetic in t along the line between the states, in the shape 4θ(1−θ) dev (`below_parabola`). So s
-keeps its sign where
+Two things are bounded by chord arithmetic in t, in the shape 4θ(1−θ) dev (`below_parabola`):
+
+*Excursions.* A switch function s of K (`AbstractSet.switches`) with one sign at two neighbouring samples
+may change it twice between them: a bound that dips, a pulse in h. It keeps its sign where
 
     4 dev ≤ (√|s₀| + √|s₁|)²,
 
-the discriminant of the parabola; and it changes its sign once only where 4 dev ≤ |s₁ − s₀|, the
-slope of the parabola at its ends. The step control rejects a step where this fails by more than a part
-of the tolerance. What is smooth in x is left to the samples.
+the discriminant of the parabola; and it changes its sign once only where 4 dev ≤ |s₁ − s₀|, the slope
+of the parabola at its ends.
+
+*Pulses.* A function q of time (f and h at the state of the step, the parameters of K) may leave its
+samples and come back. The step is short enough where
+
+    dev ≤ max(variation between neighbouring samples in this run)/4.
+
+A wave that the steps resolve has shown its size and meets this by a wide margin; a pulse that lies
+between two samples does not.
+
+Both hold up to a part of the tolerance. What is smooth in x is left to the samples.
 """
 
-from typing import Any
+import dataclasses
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -32,33 +41,105 @@ _SHARE = 0.1
 _SAMPLED = 4.0
 """Safety factor of a deviation that is estimated from samples, where there is no enclosure."""
 
+_VARIATION = 0.25
+"""Of the largest variation seen, as a deviation that may lie between two samples."""
+
+
+class Look(NamedTuple):
+    """What one step shows: `excursion`(size) is the largest ratio of a deviation to the one that keeps a
+    sign, given the size that is ignored; `rates` and `laws` the deviations of the data of f, and of h
+    and K, beyond a quarter of the variation seen; `variation` the largest one seen so far."""
+
+    excursion: Any
+    law_size: Any
+    rates: Any
+    laws: Any
+    variation: Tree
+
+    def ratio(self, rtol: Any, atol: Any, rate_tolerance: Any) -> Any:
+        """Return by how much the step is too long: above 1 it may hide something."""
+        ignored = _SHARE * (atol + rtol * self.law_size)
+        worst = jnp.maximum(self.excursion(4.0 * ignored), self.laws / ignored)
+        worst = jnp.maximum(worst, self.rates / (_SHARE * rate_tolerance))
+        return jnp.where(jnp.isnan(worst), jnp.inf, worst)
+
 
 class ExcursionGuard(eqx.Module):
-    """Bounds the excursions of the switch functions within a step.
+    """Looks between the samples of a step at data that depends on t by itself, not through announced
+    tables alone.
 
-    - `drive_moves`: h depends on t by itself, not only through x and announced tables;
-    - `enclosed`: chord arithmetic knows the switch functions; otherwise it bounds the parameters of K,
-      or nothing, and the deviation is estimated from the samples.
+    - `switches`: K or h moves, and the switch functions of K are known;
+    - `rates`, `laws`: f, and h or K, depend on t by themselves and can be enclosed;
+    - `enclosed`: so can the switch functions; otherwise their deviation is estimated from the samples.
     """
 
-    drive_moves: bool = eqx.field(static=True)
+    switches: bool = eqx.field(static=True)
+    rates: bool = eqx.field(static=True)
+    laws: bool = eqx.field(static=True)
     enclosed: bool = eqx.field(static=True)
 
-    def ratio(self, flow: Flow, visits: list[Visit], rtol: Any, atol: Any) -> Any:
-        """Return the largest ratio of a deviation to the one that keeps the sign; above 1 a switch
-        function may have changed its sign unseen."""
-        visits = jax.lax.stop_gradient([Visit(v.t, v.x, v.rate) for v in visits])
-        places = [(v.t, v.x, v.rate.z) for v in visits]
-        rows = [_switches(flow, *place) for place in places]
-        size = jnp.max(jnp.stack([_largest(z) for _, _, z in places]))
-        ignored = 4.0 * _SHARE * (atol + rtol * size)
+    def start(self, flow: Flow, t0: Any, x0: Tree) -> Tree:
+        """Return the variation before the first step: none."""
+        data = jax.eval_shape(lambda t: self._data(flow, t, x0, flow.problem.zero_control(x0)), t0)
+        return jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), data)
+
+    def look(self, flow: Flow, visits: list[Visit], variation: Tree) -> Look:
+        """Return what the samples of a step leave open."""
+        places, variation = jax.lax.stop_gradient(
+            ([(v.t, v.x, v.rate.y, v.rate.z) for v in visits], variation)
+        )
         first = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *places[:-1])
         second = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *places[1:])
+        zero = jnp.zeros_like(visits[0].t)
+        rates, laws = zero, zero
+        if self.rates or self.laws:
+            with below_parabola():
+                moved, dev = jax.vmap(lambda p, q: self._pulses(flow, p, q))(first, second)
+            most = lambda tree: jtu.tree_map(lambda leaf: jnp.max(leaf, axis=0), tree)  # noqa: E731
+            variation = jtu.tree_map(jnp.maximum, variation, most(moved))
+            over = jtu.tree_map(
+                lambda d, v: jnp.max(d - _VARIATION * v, initial=0.0), most(dev), variation
+            )
+            rates, laws = (_largest(part) if part else zero for part in over)
+
+        def excursion(ignored: Any) -> Any:
+            return self._excursion(flow, places, first, second, ignored) if self.switches else zero
+
+        size = _largest([jnp.abs(leaf) for z in places for leaf in jtu.tree_leaves(z[3])])
+        return Look(excursion, size, rates, laws, variation)
+
+    def _data(self, flow: Flow, t: Any, x: Tree, u: Tree) -> tuple[list[Any], list[Any]]:
+        """The data of f, and that of h and K, as functions of t alone."""
+        problem, args = flow.problem, flow.args
+        rates = jtu.tree_leaves(problem.f(t, x, u, args)) if self.rates else []
+        if not self.laws:
+            return rates, []
+        parameters = eqx.filter(problem.set_at(t, args), eqx.is_inexact_array)
+        return rates, jtu.tree_leaves((problem.h(t, x, u, args), parameters))
+
+    def _pulses(self, flow: Flow, p: tuple, q: tuple) -> tuple[Tree, Tree]:
+        """Return how far the data moves from one sample to the next, and how far it may be from the
+        line between."""
+        t = Chord(p[0], q[0], jnp.zeros_like(p[0]))
+        u = flow.operator.inverse(p[2])
+        data = enclose(lambda t: self._data(flow, t, p[1], u), t)
+        # A bound at infinity does not move.
+        moved = jtu.tree_map(
+            lambda c: jnp.where(c.a == c.b, 0.0, jnp.abs(c.b - c.a)), data, is_leaf=is_chord
+        )
+        dev = jtu.tree_map(
+            lambda c: jnp.where((c.a == c.b) & jnp.isinf(c.a), 0.0, c.dev), data, is_leaf=is_chord
+        )
+        return moved, dev
+
+    def _excursion(self, flow: Flow, places: Any, first: Any, second: Any, ignored: Any) -> Any:
+        """Return the largest ratio of a deviation to the one that keeps the sign."""
+        rows = [_raveled(flow, t, x, z) for t, x, _, z in places]
         if self.enclosed:
             with below_parabola():
                 dev = jax.vmap(lambda p, q: self._deviation(flow, p, q))(first, second)
         else:
-            dev = _SAMPLED * _bends([v.t for v in visits], rows)
+            dev = _SAMPLED * _bends([place[0] for place in places], rows)
         s0, s1 = jnp.stack(rows[:-1]), jnp.stack(rows[1:])
         changes = (s0 > 0) != (s1 > 0)
         room = (jnp.sqrt(jnp.abs(s0)) + jnp.sqrt(jnp.abs(s1))) ** 2
@@ -66,45 +147,44 @@ class ExcursionGuard(eqx.Module):
         ratio = jnp.where(dev <= 0.0, 0.0, 4.0 * dev / (room + ignored))
         # An infinite slack cannot be used up.
         ratio = jnp.where(jnp.isinf(room), 0.0, ratio)
-        ratio = jnp.where(jnp.isnan(ratio), jnp.inf, ratio)
         return jnp.max(ratio, initial=0.0)
 
-    def _deviation(self, flow: Flow, p: tuple[Any, Tree, Tree], q: tuple[Any, Tree, Tree]) -> Any:
+    def _deviation(self, flow: Flow, p: tuple, q: tuple) -> Any:
         """Return how far the switch functions are from straight lines between two samples."""
         t = Chord(p[0], q[0], jnp.zeros_like(p[0]))
-        z = _line(p[2], q[2])
-        if self.drive_moves:
-            x = _line(p[1], q[1])
-            bend = _drive(flow, t, x)
-            z = jtu.tree_map(
-                lambda line, dev: Chord(line.a, line.b, dev), z, bend, is_leaf=is_chord
-            )
-        s = enclose(lambda t, z: _raveled(flow, t, p[1], z), t, z)
-        return s.dev
+        bend = _drive(flow, t, p[1])
+        z = jtu.tree_map(Chord, p[3], q[3], bend)
+        return enclose(lambda t, z: _raveled(flow, t, p[1], z), t, z).dev
 
 
 def guard(flow: Flow, t0: Any, x0: Tree) -> ExcursionGuard | None:
-    """Return the guard of a flow; None where neither K nor h depends on t by itself, or where the
-    switch functions of K are not known."""
+    """Return the guard of a flow; None where nothing depends on t by itself."""
     problem, args = flow.problem, flow.args
     z = problem.zero_control(x0)
-    if flow.switches(t0, x0, z) is None:
-        return None
-    set_moves = not _steady(lambda t: _raveled(flow, t, x0, z), t0)
-    drive_moves = not _steady(lambda t: problem.h(t, x0, z, args), t0)
-    if not (set_moves or drive_moves):
-        return None
-    try:
-        trial = ExcursionGuard(drive_moves, True)
-        jax.eval_shape(lambda t, x, z: trial._deviation(flow, (t, x, z), (t, x, z)), t0, x0, z)
-    except NoEnclosure:
-        return ExcursionGuard(drive_moves, False)
-    return trial
+    known = flow.switches(t0, x0, z)
+    trial = ExcursionGuard(known is not None and known.size > 0, True, True, True)
+    steady = lambda fn: independent(fn, t0)  # noqa: E731
+    rates = not steady(lambda t: problem.f(t, x0, z, args))
+    laws = not steady(lambda t: trial._data(flow, t, x0, z)[1])
+    trial = dataclasses.replace(trial, switches=trial.switches and laws, rates=rates, laws=laws)
 
+    def works(look: Any) -> bool:
+        try:
+            jax.eval_shape(look, t0, x0, z)
+        except NoEnclosure:
+            return False
+        return True
 
-def _steady(fn: Any, t0: Any) -> bool:
-    """Whether fn does not depend on t."""
-    return independent(fn, t0)
+    place = lambda t, x, z: (t, x, z, z)  # noqa: E731
+    for name in ("rates", "laws"):
+        alone = ExcursionGuard(False, name == "rates", name == "laws", True)
+        if getattr(trial, name) and not works(
+            lambda *p, alone=alone: alone._pulses(flow, place(*p), place(*p))
+        ):
+            trial = dataclasses.replace(trial, **{name: False})
+    if trial.switches and not works(lambda *p: trial._deviation(flow, place(*p), place(*p))):
+        trial = dataclasses.replace(trial, enclosed=False)
+    return trial if trial.switches or trial.rates or trial.laws else None
 
 
 def _raveled(flow: Flow, t: Any, x: Tree, z: Tree) -> jax.Array:
@@ -113,32 +193,22 @@ def _raveled(flow: Flow, t: Any, x: Tree, z: Tree) -> jax.Array:
     return found
 
 
-def _switches(flow: Flow, t: Any, x: Tree, z: Tree) -> jax.Array:
-    return _raveled(flow, t, x, z)
-
-
 def _drive(flow: Flow, t: Chord, x: Tree) -> Tree:
-    """Return how far z is from a line because h depends on t."""
+    """Return how far z may be from a line because h depends on t."""
     problem, args = flow.problem, flow.args
-    start = jtu.tree_map(lambda chord: chord.a, x, is_leaf=is_chord)
-    zero = problem.zero_control(start)
-    drive = enclose(lambda t, x: problem.h(t, x, zero, args), t, x)
+    zero = problem.zero_control(x)
+    drive = enclose(lambda t: problem.h(t, x, zero, args), t)
     dev = jtu.tree_map(lambda chord: chord.dev, drive, is_leaf=is_chord)
     if flow.reciprocal is not None:
         return jtu.tree_map(lambda d, r: jnp.abs(d * r), dev, flow.reciprocal)
     if flow.direct and flow.written is None:
-        a = slope(problem, flow.operator, t.a, start, args)
+        a = slope(problem, flow.operator, t.a, x, args)
         return jtu.tree_map(lambda d, s: jnp.abs(d / s), dev, a)
     return jtu.tree_map(jnp.abs, flow.operator.apply(dev))
 
 
-def _line(p: Tree, q: Tree) -> Tree:
-    return jtu.tree_map(lambda a, b: Chord(a, b, jnp.zeros_like(a)), p, q)
-
-
-def _largest(tree: Tree) -> Any:
-    leaves = [jnp.max(jnp.abs(leaf)) for leaf in jtu.tree_leaves(tree)]
-    return jnp.max(jnp.stack(leaves))
+def _largest(tree: Any) -> Any:
+    return jnp.max(jnp.stack([jnp.max(leaf, initial=0.0) for leaf in jtu.tree_leaves(tree)]))
 
 
 def _bends(times: list[Any], rows: list[jax.Array]) -> jax.Array:

@@ -10,7 +10,6 @@ import jax.tree_util as jtu
 from .. import _tree
 from .._tree import Tree
 
-
 ONE_SAMPLE = (5**-0.5,)
 TWO_SAMPLES = (0.5 - 0.5 * 5**-0.5, 0.5 + 0.5 * 5**-0.5)
 """Where a step is sampled: at irrational places near the middle and near the inner Lobatto points, so

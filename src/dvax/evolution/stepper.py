@@ -31,11 +31,13 @@ _SMALL = 64
 
 class Memory(NamedTuple):
     """What an accepted step leaves to the next: the rate at its end, a guess for the law, and the
-    coefficients of its end in the eigenfunctions of A, each None where it is not needed."""
+    coefficients of its end in the eigenfunctions of A, each None where it is not needed; and the largest
+    `variation` of the data between samples so far (`ExcursionGuard`)."""
 
     rate: Rate | None
     guess: Tree | None
     coefficients: Tree
+    variation: Tree
 
 
 class Factors(NamedTuple):
@@ -53,9 +55,9 @@ class Step(NamedTuple):
 
     `error` is the defect entry by entry (None where not measured), `impulse` = (∫ ‖p − f̃(·, x_h)‖ ds,
     ∫ ‖w‖ ds) over the step. `kink(asked)` is the time of the first kink of the response inside, ∞
-    where there is none or nobody `asked` (None where nobody looks). `excursion(rtol, atol)` exceeds 1
-    where K or h may have made a switch function change its sign and back unseen (None where neither
-    depends on t by itself). `extent` is where x_h and u_h have
+    where there is none or nobody `asked` (None where nobody looks). `excursion(rtol, atol, rate)` exceeds
+    1 where data that moves in time may hide something between the samples, given the tolerances of y and
+    of f (None where nothing moves by itself). `extent` is where x_h and u_h have
     been (None where nobody asks). `begun` says that the law was solved at the start, `solved` that it
     was everywhere; `finite`, that there are no bad values that a shorter step would not mend;
     `evaluations` counts those of F.
@@ -66,7 +68,7 @@ class Step(NamedTuple):
     error: Tree | None
     impulse: tuple[Any, Any]
     kink: Callable[[Any], Any] | None
-    excursion: Callable[[Any, Any], Any] | None
+    excursion: Callable[[Any, Any, Any], Any] | None
     extent: Extent | None
     memory: Memory
     begun: Any
@@ -142,9 +144,11 @@ class Stepper(eqx.Module):
         # A method that linearises has another A in every step.
         known = coefficients(x0 if self.method.linearises else self.flow.expand(x0))
         if not self.measure:
-            return Memory(None, guess, known)
+            return Memory(None, guess, known, None)
         blank = jax.eval_shape(lambda: self._kept(self.flow.rate(self.ends[0], x0, guess)))
-        return Memory(jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), blank), guess, known)
+        rate = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), blank)
+        none = None if self.guard is None else self.guard.start(self.flow, self.ends[0], x0)
+        return Memory(rate, guess, known, none)
 
     def extent(self, x0: Tree) -> Extent | None:
         """Before the first step x_h has been at x₀ alone, and u_h nowhere."""
@@ -203,6 +207,7 @@ class Stepper(eqx.Module):
         c, x1 = values((c, x1))
         first, last = visits[0].rate, visits[-1].rate
         error, impulse, kink, excursion, extent = None, (0.0, 0.0), None, None, None
+        variation = memory.variation
         if self.measure:
             sample = self._measure(t0, t1, arc, visits)
             error, impulse = sample.error, (sample.defect, sample.law_defect)
@@ -211,7 +216,8 @@ class Stepper(eqx.Module):
                 kink = partial(self._kink, t0, t1, x0, c, first, sample)
             if self.guard is not None:
                 along = [visits[0], *visits[-1 - len(sample.thetas) :]]
-                excursion = partial(self.guard.ratio, self.flow, along)
+                seen = self.guard.look(self.flow, along, variation)
+                excursion, variation = seen.ratio, seen.variation
             # Further in, a bad value may come from a step that was too long: it is cut, not fatal.
             finite = _tree.all_finite(first.value)
         else:
@@ -223,6 +229,7 @@ class Stepper(eqx.Module):
             self._kept(last) if self.measure else None,
             None if self.flow.direct else last.y,
             known,
+            variation,
         )
         solved = jnp.all(jnp.stack([visit.rate.solved for visit in visits]))
         # The first one was made by the step before, unless nothing is kept, or data jumped.
