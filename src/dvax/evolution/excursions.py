@@ -2,8 +2,8 @@
 
 Two things are bounded by chord arithmetic in t, in the shape 4θ(1−θ) dev (`below_parabola`):
 
-*Excursions.* A switch function s of K (`AbstractSet.switches`) with one sign at two neighbouring samples
-may change it twice between them: a bound that dips, a pulse in h. It keeps its sign where
+*Excursions.* A switch function s of K (`AbstractSet.switches`) with one sign at two neighbouring
+samples may change it twice between them: a bound that dips, a pulse in h. It keeps its sign where
 
     4 dev ≤ (√|s₀| + √|s₁|)²,
 
@@ -46,9 +46,9 @@ _VARIATION = 0.25
 
 
 class Look(NamedTuple):
-    """What one step shows: `excursion`(size) is the largest ratio of a deviation to the one that keeps a
-    sign, given the size that is ignored; `rates` and `laws` the deviations of the data of f, and of h
-    and K, beyond a quarter of the variation seen; `variation` the largest one seen so far."""
+    """What one step shows: `excursion`(size) is the largest ratio of a deviation to the one that keeps
+    a sign, given the size that is ignored; `rates` and `laws` the deviations of the data of f, and of
+    h and K, beyond a quarter of the variation seen; `variation` the largest one seen so far."""
 
     excursion: Any
     law_size: Any

@@ -30,9 +30,9 @@ _SMALL = 64
 
 
 class Memory(NamedTuple):
-    """What an accepted step leaves to the next: the rate at its end, a guess for the law, and the
-    coefficients of its end in the eigenfunctions of A, each None where it is not needed; and the largest
-    `variation` of the data between samples so far (`ExcursionGuard`)."""
+    """What an accepted step leaves to the next: the rate at its end, a guess for the law, the
+    coefficients of its end in the eigenfunctions of A, and the largest `variation` of the data between
+    samples so far (`ExcursionGuard`), each None where it is not needed."""
 
     rate: Rate | None
     guess: Tree | None
@@ -55,9 +55,9 @@ class Step(NamedTuple):
 
     `error` is the defect entry by entry (None where not measured), `impulse` = (∫ ‖p − f̃(·, x_h)‖ ds,
     ∫ ‖w‖ ds) over the step. `kink(asked)` is the time of the first kink of the response inside, ∞
-    where there is none or nobody `asked` (None where nobody looks). `excursion(rtol, atol, rate)` exceeds
-    1 where data that moves in time may hide something between the samples, given the tolerances of y and
-    of f (None where nothing moves by itself). `extent` is where x_h and u_h have
+    where there is none or nobody `asked` (None where nobody looks). `excursion(rtol, atol, rate)`
+    exceeds 1 where data that moves in time may hide something between the samples, given the
+    tolerances of y and of f (None where nothing moves by itself). `extent` is where x_h and u_h have
     been (None where nobody asks). `begun` says that the law was solved at the start, `solved` that it
     was everywhere; `finite`, that there are no bad values that a shorter step would not mend;
     `evaluations` counts those of F.
