@@ -13,7 +13,10 @@ import dvax
 from . import reference
 from .family import METHODS, Family, Sample
 
-MAX_STEPS = 2**18
+MAX_STEPS = 2**20
+SECOND_ORDER = 1e-7
+"""Below this rtol the default method, of order 2, takes 10⁶ steps or more."""
+
 LIMIT = 10.0
 """In tolerances: a run that says it succeeded has no larger error."""
 
@@ -54,6 +57,8 @@ def run(
             family.problem, sample.x0, sample.t0, sample.t1, sample.args
         ).constants
     for name in methods or family.methods:
+        if name == "default" and sample.rtol < SECOND_ORDER:
+            continue
         record = judge(family, seed, sample, name, truth, constants)
         if record.failure:
             # Before dvax is blamed: another method of SciPy, with four times the pieces.
@@ -86,7 +91,8 @@ def _size(x: Any) -> Any:
 def solve(family: Family, sample: Sample, method: str, **options: Any) -> dvax.Solution:
     return dvax.solve(
         family.problem, sample.x0, sample.t0, sample.t1, sample.args, sample.ts, rtol=sample.rtol,
-        atol=sample.atol, method=METHODS[method], throw=False, max_steps=MAX_STEPS, **options,
+        atol=sample.atol, method=METHODS[method], vi_solver=sample.law, throw=False,
+        max_steps=MAX_STEPS, **options,
     )  # fmt: skip
 
 
@@ -132,8 +138,8 @@ def certified(
     try:
         sol = dvax.solve(
             family.problem, sample.x0, sample.t0, sample.t1, sample.args, sample.ts,
-            method=METHODS[method], constants=constants, certified_tol=wanted, max_steps=MAX_STEPS,
-            throw=False,
+            method=METHODS[method], vi_solver=sample.law, constants=constants,
+            certified_tol=wanted, max_steps=MAX_STEPS, throw=False,
         )  # fmt: skip
     except dvax.InputError:
         sol = None

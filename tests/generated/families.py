@@ -1,8 +1,8 @@
 """All families, by name."""
 
 from .coupled import curved, full_matrix, oscillator, pair, scaled_control
-from .dispatch import balanced, sticky_price
-from .family import Family
+from .dispatch import balanced, firms, sticky_price
+from .family import ALL, Family
 from .projected import projected
 
 SOME = ("default", "ExpRosenbrock")
@@ -92,8 +92,11 @@ def _all() -> list[Family]:
         oscillator("three bumps", "jump"),
         pair("tent", "pulse"),
         # Markets.
-        sticky_price(24, 48, SOME, 40),
+        sticky_price(6, 24, ALL, 40),
+        sticky_price(24, 48, STIFF, 40),
         sticky_price(100, 168, STIFF, 6),
+        firms(30, 3, 24, STIFF, 60),
+        firms(102, 3, 48, STIFF, 12),
         balanced(20, 24, ("default",), 12),
     ]
 

@@ -24,6 +24,8 @@ class Sample(NamedTuple):
     rtol: float
     atol: float
     written: Written
+    law: Any = None
+    """`vi_solver=` of `dvax.solve`."""
 
 
 class Family(NamedTuple):
@@ -66,9 +68,11 @@ def span_and_start(rng: Any) -> tuple[float, float]:
     return t0, (t0 + span) - t0
 
 
-def tolerance(rng: Any, t0: float, t1: float, steep: float) -> tuple[float, float]:
-    """(rtol, atol), above what the rounding of t does to the data."""
-    rtol, atol = TOLERANCES[rng.integers(len(TOLERANCES))]
+def tolerance(
+    rng: Any, t0: float, t1: float, steep: float, tight: bool = True
+) -> tuple[float, float]:
+    """(rtol, atol), above what the rounding of t does to the data; 10⁻⁸ too where `tight`."""
+    rtol, atol = TOLERANCES[rng.integers(len(TOLERANCES) - (not tight))]
     blurred = 1e2 * np.finfo(float).eps * max(abs(t0), abs(t1)) * steep
     return (rtol, atol) if atol > blurred else (1e-6, 1e-9) if 1e-6 > blurred else (1e-3, 1e-6)
 

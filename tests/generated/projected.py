@@ -127,7 +127,7 @@ def projected(
         else:
             breaks += list(length * np.arange(1, 8) / 8.0)
         features = breaks if period is None else [period * k for k in range(1, 7)]
-        rtol, atol = tolerance(rng, t0, t1, 10.0)
+        rtol, atol = tolerance(rng, t0, t1, 10.0, tight=not stiff)
         if periodic:
             # The defect of a step is held below the tolerance over the whole span.
             rtol, atol = (
