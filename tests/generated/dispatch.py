@@ -56,7 +56,9 @@ def sticky_price(units: int, hours: int, methods: tuple[str, ...], samples: int)
         for i in wind:
             # Within a few MW of what it would make, above and below.
             free = price / (a[i] + b)
-            cap[:, i] = np.maximum(free + rng.normal(size=hours + 1) * rng.choice([0.1, 3.0, 100.0]), 0.0)
+            cap[:, i] = np.maximum(
+                free + rng.normal(size=hours + 1) * rng.choice([0.1, 3.0, 100.0]), 0.0
+            )
         price = _balance(alpha[0], b, a, c, cap[0])
 
         def rate(now: float, x: Array) -> Array:

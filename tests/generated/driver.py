@@ -56,18 +56,19 @@ def run(
         constants = dvax.verify(
             family.problem, sample.x0, sample.t0, sample.t1, sample.args
         ).constants
+    apart = None
     for name in methods or family.methods:
         if name == "default" and sample.rtol < SECOND_ORDER:
             continue
         record = judge(family, seed, sample, name, truth, constants)
-        if record.failure:
-            # Before dvax is blamed: another method of SciPy, with four times the pieces.
+        if record.failure and apart is None:
+            # Before dvax is blamed: another method of SciPy, with twice the pieces.
             other = "DOP853" if sample.written.stiff else "LSODA"
-            again = reference.solve(sample.written, ts, method=other, refine=4)
+            again = reference.solve(sample.written, ts, method=other, refine=2)
             apart = float(np.max(np.abs(again - truth)) / tolerance(sample, truth))
-            if apart > 0.5:
-                text = f"no reference: SciPy's methods are {apart:.1e} tolerances apart"
-                record = record._replace(failure=text)
+        if record.failure and apart is not None and apart > 0.5:
+            text = f"no reference: SciPy's methods are {apart:.1e} tolerances apart"
+            record = record._replace(failure=text)
         yield record
     if certify and constants is not None:
         yield certified(family, seed, sample, (methods or family.methods)[0], truth, constants)
