@@ -1,0 +1,172 @@
+"""Samples of a family through dvax and through SciPy, side by side."""
+
+import time
+import zlib
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+import dvax
+
+from . import reference
+from .family import METHODS, Family, Sample
+
+MAX_STEPS = 2**20
+SECOND_ORDER = 1e-7
+"""Below this rtol the default method, of order 2, takes 10⁶ steps or more."""
+
+LIMIT = 10.0
+"""In tolerances: a run that says it succeeded has no larger error."""
+
+
+class Record(NamedTuple):
+    """One run: `ratio` of its error to the tolerance; of the bounds on it that were computed the
+    status, and the largest ratio of error to bound (of those errors that stand out of the reference's
+    own); what failed, or ""."""
+
+    family: str
+    seed: int
+    method: str
+    rtol: float
+    result: str
+    ratio: float
+    steps: int
+    status: str
+    excess: float
+    seconds: float
+    failure: str
+
+
+def run(
+    family: Family,
+    seed: int,
+    methods: tuple[str, ...] | None = None,
+    bounds: bool = True,
+    certify: bool = False,
+) -> Iterator[Record]:
+    """The sample number `seed` by each method; with `bounds` on the error of each, and once more to
+    a certified tolerance."""
+    sample = sample_of(family, seed)
+    ts = sample.ts - sample.t0
+    truth = reference.solve(sample.written, ts)
+    constants = None
+    if bounds or certify:
+        constants = dvax.verify(
+            family.problem, sample.x0, sample.t0, sample.t1, sample.args
+        ).constants
+    apart = None
+    for name in methods or family.methods:
+        if name == "default" and sample.rtol < SECOND_ORDER:
+            continue
+        record = judge(family, seed, sample, name, truth, constants)
+        if record.failure and apart is None:
+            # Before dvax is blamed: another method of SciPy, with twice the pieces.
+            other = "DOP853" if sample.written.stiff else "LSODA"
+            again = reference.solve(sample.written, ts, method=other, refine=2)
+            apart = float(np.max(np.abs(again - truth)) / tolerance(sample, truth))
+        if record.failure and apart is not None and apart > 0.5:
+            text = f"no reference: SciPy's methods are {apart:.1e} tolerances apart"
+            record = record._replace(failure=text)
+        yield record
+    if certify and constants is not None:
+        yield certified(family, seed, sample, (methods or family.methods)[0], truth, constants)
+
+
+def sample_of(family: Family, seed: int) -> Sample:
+    """Number `seed` of a family, each family with random numbers of its own."""
+    return family.draw(np.random.default_rng([seed, zlib.crc32(family.name.encode())]))
+
+
+def tolerance(sample: Sample, truth: Any) -> float:
+    """atol + rtol max|x| of the run, |·| the root mean square."""
+    return float(sample.atol + sample.rtol * np.max(_size(truth)))
+
+
+def _size(x: Any) -> Any:
+    """The root mean square, as the step control has it."""
+    return np.sqrt(np.mean(np.square(x), axis=1))
+
+
+def solve(family: Family, sample: Sample, method: str, **options: Any) -> dvax.Solution:
+    return dvax.solve(
+        family.problem, sample.x0, sample.t0, sample.t1, sample.args, sample.ts, rtol=sample.rtol,
+        atol=sample.atol, method=METHODS[method], vi_solver=sample.law, throw=False,
+        max_steps=MAX_STEPS, **options,
+    )  # fmt: skip
+
+
+def judge(
+    family: Family, seed: int, sample: Sample, method: str, truth: Any, constants: Any
+) -> Record:
+    begun = time.perf_counter()
+    sol = solve(family, sample, method)
+    steps = int(sol.stats["steps"])
+    spent = time.perf_counter() - begun
+    good = bool(sol.result == dvax.RESULTS.successful)
+    ratio, status, excess, failure = np.nan, "", 0.0, ""
+    if good:
+        error = states(sol, truth) - truth
+        ratio = float(np.max(_size(error)) / tolerance(sample, truth))
+        if not ratio <= LIMIT:
+            failure = f"wrong by {ratio:.3g} tolerances, and successful"
+        if constants is not None:
+            bound = dvax.bound_error(family.problem, sol, constants)
+            status = bound.status
+            over = np.linalg.norm(error, axis=1) - floor(sample, truth)
+            excess = float(np.max(np.where(over > 0, over / np.maximum(bound.x, 1e-300), 0.0)))
+            if excess > 1.0 and not failure:
+                failure = f"the bound, {status}, is {excess:.3g} times too small"
+            elif excess > 1.0:
+                failure += f"; the bound, {status}, is {excess:.3g} times too small"
+    else:
+        word = str(dvax.RESULTS[sol.result]).split(".")[0]
+        failure = f"died at t0 + {float(sol.stats['t']) - sample.t0:.6g}: {word}"
+    return Record(
+        family.name, seed, method, sample.rtol, "successful" if good else "died", ratio, steps,
+        status, excess, spent, failure,
+    )  # fmt: skip
+
+
+def certified(
+    family: Family, seed: int, sample: Sample, method: str, truth: Any, constants: Any
+) -> Record:
+    """A run with `certified_tol`: refused, or within what it says. Refusing is no failure."""
+    begun = time.perf_counter()
+    wanted = 1e2 * tolerance(sample, truth)
+    steps, ratio, excess, result, failure = 0, np.nan, 0.0, "refused", ""
+    try:
+        sol = dvax.solve(
+            family.problem, sample.x0, sample.t0, sample.t1, sample.args, sample.ts,
+            method=METHODS[method], vi_solver=sample.law, constants=constants,
+            certified_tol=wanted, max_steps=MAX_STEPS, throw=False,
+        )  # fmt: skip
+    except dvax.InputError:
+        sol = None
+    if sol is not None and sol.result == dvax.RESULTS.successful:
+        result, steps = "successful", int(sol.stats["steps"])
+        error = np.linalg.norm(states(sol, truth) - truth, axis=1) - floor(sample, truth)
+        ratio = float(np.max(error) / wanted)
+        excess = float(np.max(error) / sol.stats["certified_bound"])
+        if excess > 1.0:
+            failure = f"the certified bound is {excess:.3g} times too small"
+    return Record(
+        family.name, seed, f"{method}, certified", 0.0, result, ratio, steps, "", excess,
+        time.perf_counter() - begun, failure,
+    )  # fmt: skip
+
+
+def states(sol: dvax.Solution, truth: Any) -> Any:
+    """The saved states as rows, parts of a tuple beside each other."""
+    parts = [np.asarray(leaf).reshape(len(truth), -1) for leaf in jax.tree_util.tree_leaves(sol.xs)]
+    return np.concatenate(parts, axis=1)
+
+
+def floor(sample: Sample, truth: Any) -> float:
+    """What is not counted against a bound: the error of the reference, and rounding, which bounds leave
+    out: of x a few thousand times, and that of t."""
+    eps = np.finfo(float).eps
+    size = 1.0 + float(np.max(np.linalg.norm(truth, axis=1)))
+    latest = max(abs(sample.t0), abs(sample.t1)) / (sample.t1 - sample.t0)
+    return size * (10 * sample.written.accuracy + 1e3 * eps + 10 * eps * latest)
