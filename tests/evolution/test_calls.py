@@ -132,7 +132,8 @@ def test_progress_is_shown_when_asked_and_changes_nothing(steps, capfd):
     jax.block_until_ready(shown.xs)
     jax.effects_barrier()
     assert "100.00%" in "".join(capfd.readouterr())
-    assert float(shown.xs[0]) == float(silent.xs[0])
+    # Another program, which is compiled otherwise: equal to rounding.
+    assert float(shown.xs[0]) == pytest.approx(float(silent.xs[0]), rel=1e-13)
 
 
 @pytest.mark.parametrize(

@@ -247,6 +247,28 @@ def test_fixed_steps_move_apart_at_a_jump_in_the_derivative_of_a_gradient():
     assert_close(jax.jit(jax.jacfwd(jax.jacrev(square)))(given), want, 1e-6)
 
 
+@pytest.mark.parametrize("name", mostly_thorough(OFTEN, ["ETD2RK, fixed"]))
+def test_linearize_gives_the_values_and_the_derivatives(name):
+    # As least squares do: the values must be known before the tangents are.
+    method, settings, tol = METHODS[name]
+
+    def saved(eta, t1, ts):
+        return dvax.solve(
+            problem(), jnp.full(2, X0), START, t1, drive(eta), ts, method=method,
+            adjoint="forward", **settings,
+        ).xs[:, 0]  # fmt: skip
+
+    given = jnp.asarray(ETA), jnp.asarray(END), jnp.asarray(AT)
+    along = jnp.asarray(0.7), jnp.asarray(-0.4), jnp.array([0.3, 1.1, -0.4])
+    # The last of the saved times is t1.
+    value, push = jax.linearize(saved, *given)
+    assert_close(
+        (value, push(*along)),
+        jax.jvp(lambda eta, t1, ts: exact(START, eta, ts), given, along),
+        tol,
+    )
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("place", [0, 1], ids=["the jump", "the end"])
 def test_third_derivatives_by_forward_mode(place):

@@ -197,8 +197,9 @@ def _pushed_forward(
     return out, pushed
 
 
-def _of_use(used: list[bool], eqn: Any) -> tuple[list[bool], Any]:
-    """Without the outputs that nobody looks at, and what leads to them alone."""
+def _of_use(used: list[bool], *given: Any) -> tuple[list[bool], Any]:
+    """Dead-code elimination rule; JAX passes (used, eqn), from 0.12 on (used, live inputs, eqn)."""
+    eqn = given[-1]
     if not any(used):
         return [False] * len(eqn.invars), None
     large, otherwise = eqn.params["large"], eqn.params["otherwise"]

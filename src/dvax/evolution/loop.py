@@ -7,7 +7,6 @@ nothing between saved times, and the lanes of a batch wait for each other no lon
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,6 +16,7 @@ from jax import lax
 from .. import _tree
 from .._batch import any_of_batch, own_turn
 from .._tree import Tree
+from . import meter
 from .checkpoints import Checkpoints
 from .control import AbstractController
 from .extent import Extent
@@ -106,7 +106,7 @@ class Loop(eqx.Module):
         state = self._start(x0, ts is not None, checkpoints)
         t1 = self.controller.stops[-1]
         if ts is None:
-            return None, self._until(state, t1)
+            return None, meter.keep(self._until(state, t1))
         times, count = still(ts), ts.shape[0]
         blank = jax.eval_shape(lambda: self._read(state, times[0]))
         rows = jtu.tree_map(lambda s: jnp.zeros((count, *s.shape), s.dtype), blank)
@@ -119,7 +119,7 @@ class Loop(eqx.Module):
 
         start = state, rows, jnp.asarray(0)
         state, rows, _ = lax.while_loop(lambda carry: carry[2] <= count, turn, start)
-        return rows, state
+        return rows, meter.keep(state)
 
     def _start(self, x0: Tree, saves: bool, checkpoints: Checkpoints | None) -> State:
         controller, stepper = self.controller, self.stepper
@@ -151,7 +151,7 @@ class Loop(eqx.Module):
             steps=jnp.asarray(0),
             attempts=jnp.asarray(0),
             evaluations=jnp.asarray(0),
-            meter=diffrax.TextProgressMeter().init() if self.progress else None,
+            meter=meter.begin() if self.progress else None,
         )
 
     def _until(self, state: State, time: Any) -> State:
@@ -258,12 +258,10 @@ class Loop(eqx.Module):
         checkpoints = state.checkpoints
         if checkpoints is not None:
             checkpoints = checkpoints.put(state.steps, state.x, own)
-        meter = state.meter
+        shown = state.meter
         if self.progress:
             stops = self.controller.stops
-            meter = diffrax.TextProgressMeter().step(
-                meter, (ahead[0] - stops[0]) / (stops[-1] - stops[0])
-            )
+            shown = meter.advance(shown, (ahead[0] - stops[0]) / (stops[-1] - stops[0]))
         t, x, impulse, memory, jumped, extent = ahead
         put = lambda table, row: _tree.put_if(own, table, state.steps, row)  # noqa: E731
         after = State(
@@ -283,7 +281,7 @@ class Loop(eqx.Module):
             steps=jnp.where(verdict.kept, state.steps + 1, state.steps),
             attempts=state.attempts + 1,
             evaluations=state.evaluations + step.evaluations,
-            meter=meter,
+            meter=shown,
         )
         # Tables are not chosen as a whole but written, or not.
         bare = state._replace(records=None, ends=None, checkpoints=None)

@@ -104,7 +104,9 @@ def _moved(rate: Callable[..., Tree], *moving: Any) -> Tree:
             own = lambda s, x, real: rate(s, x, real, other)  # noqa: E731
             return jax.jvp(own, (s, pair[0], real), (later, pair[1], turn))
 
-        out, along = _moved(both, (x, along), shift, t, (real, later, turn), other)
+        # The value by itself: JAX ≥ 0.12 has to know it without the tangents (`jax.linearize`).
+        out = _moved(rate, *primals)
+        _, along = _moved(both, (x, along), shift, t, (real, later, turn), other)
         if is_zero(by):
             return out, along
         return out, _plus(along, by, rate(t + shift, out, real, other))

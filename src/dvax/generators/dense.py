@@ -60,7 +60,7 @@ class Dense(AbstractGenerator):
         if self.omega is not None:
             rate = self.omega
             _tree.require(
-                lambda: np.max(np.linalg.eigvals(np.asarray(self.matrix)).real) < float(rate),
+                lambda: np.max(np.real(np.linalg.eigvals(np.asarray(self.matrix)))) < float(rate),
                 name,
                 rate,
                 "no e^{ωt} bounds the semigroup unless ω is above the real part of every eigenvalue",

@@ -70,19 +70,20 @@ def parse_formula(text: str, names: tuple[str, ...], place: str) -> ast.expr:
             f"Write one formula such as {example_of(names)}.",
         ) from None
     nodes, depth = _size(tree)
-    if nodes > MAX_NODES:
-        raise refuse(
-            None,
-            f"{nodes} terms and operations",
-            f"an expression has at most {MAX_NODES} nodes",
-            "Put long data into a CSV or NPY file (series, profile).",
-        )
+    # The depth first, as parsers that give up at it say: Python 3.13 gives up much later.
     if depth > MAX_DEPTH:
         raise refuse(
             None,
             f"nesting {depth} deep",
             f"an expression nests at most {MAX_DEPTH} deep",
             "Write it flatter: group the terms of a long sum in parentheses.",
+        )
+    if nodes > MAX_NODES:
+        raise refuse(
+            None,
+            f"{nodes} terms and operations",
+            f"an expression has at most {MAX_NODES} nodes",
+            "Put long data into a CSV or NPY file (series, profile).",
         )
     return tree
 

@@ -54,7 +54,7 @@ def energy_norm(system: System, J: Jacobians, pointwise: bool, T: float) -> Ener
     if data is None:
         return None
     # Where u does not move, no norm contracts faster than the linear part does.
-    low = float(np.linalg.eigvals(data.G).real.max())
+    low = float(np.max(np.real(np.linalg.eigvals(data.G))))
     start = high = _of_the_space(data)
     if not np.isfinite(high):
         return None

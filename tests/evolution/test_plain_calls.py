@@ -1,0 +1,96 @@
+"""Solves without outlined programs (`_one_function`): on a JAX that is faster by itself, and on one
+without the interfaces that they are built from, every answer and every derivative stays the same."""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvax
+from dvax import _one_function
+from dvax.evolution import integrate, reverse
+
+problem = dvax.Problem(
+    A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+    f=lambda t, x, u, args: args - 0.5 * x - u, h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+)  # fmt: skip
+
+
+def end(load, **how):
+    return dvax.solve(problem, -1.0, 0.0, 2.0, args=load, **how).xs[-1]
+
+
+FIXED = dict(dt=0.01, method=dvax.ETD4RK())
+TIGHT = dict(rtol=1e-9, atol=1e-9)
+WAYS = {
+    "fixed": (lambda load: end(load, **FIXED), 1e-13),
+    "adaptive": (lambda load: end(load, **TIGHT), 1e-8),
+    "grad": (jax.grad(lambda load: end(load, **TIGHT)), 1e-7),
+    "jvp": (
+        lambda load: jax.jvp(lambda a: end(a, adjoint="forward", **FIXED), (load,), (1.0,)), 1e-12,
+    ),
+    "linearize": (
+        lambda load: jax.linearize(lambda a: end(a, adjoint="forward", **FIXED), load)[1](1.0), 1e-12,
+    ),
+    "vmap": (lambda load: jax.vmap(lambda a: end(a, **FIXED))(load + jnp.arange(3.0)), 1e-13),
+}  # fmt: skip
+
+
+def by(monkeypatch, call):
+    """Have every solve call its programs by `call`."""
+    for module in (integrate, reverse):
+        monkeypatch.setattr(module, "in_one_function", call)
+    jax.clear_caches()
+
+
+@pytest.fixture(scope="module")
+def usual():
+    return {name: way(3.0) for name, (way, _) in WAYS.items()}
+
+
+def test_plain_programs_give_the_same_answers_and_derivatives(usual, monkeypatch):
+    by(monkeypatch, _one_function._plain)
+    for name, (way, apart) in WAYS.items():
+        jax.tree_util.tree_map(
+            lambda a, b, name=name, apart=apart: np.testing.assert_allclose(
+                a, b, rtol=apart, atol=apart, err_msg=name
+            ),
+            way(3.0),
+            usual[name],
+        )
+    jax.clear_caches()
+
+
+def test_the_answer_is_that_of_the_closed_form(usual):
+    # x is saturated up to ln(1.6)/1.5, in contact for 2 ln(10/9), and free from then on.
+    free = 2.0 - np.log(1.6) / 1.5 - 2.0 * np.log(10 / 9)
+    assert float(usual["adaptive"]) == pytest.approx(2.0 - 1.5 * np.exp(-1.5 * free), abs=1e-8)
+    assert float(usual["grad"]) == pytest.approx(0.6402593, abs=1e-6)
+
+
+def test_newer_releases_of_jax_get_plain_programs(monkeypatch):
+    # There the attributes make programs slower, and abort the compiler on some loops.
+    for version in [(0, 12, 0), (0, 13, 0), (1, 0, 0)]:
+        monkeypatch.setattr(jax, "__version_info__", version)
+        assert _one_function._chosen() is _one_function._plain
+
+
+@pytest.mark.skipif(not _one_function.OUTLINES, reason="on this JAX programs are plain anyway")
+@pytest.mark.parametrize("absent", ["jax.experimental.xla_metadata", "jax.interpreters.mlir"])
+def test_programs_are_plain_where_an_interface_is_absent(monkeypatch, absent):
+    for name in [name for name in sys.modules if name.startswith("dvax._one_function.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, absent, None)
+    parent, _, last = absent.rpartition(".")
+    monkeypatch.delattr(sys.modules[parent], last)
+    assert _one_function._chosen() is _one_function._plain
+
+
+@pytest.mark.parametrize("way", ["fixed", "vmap"])
+def test_the_attributes_are_set_where_outlines_says_so(way):
+    run = WAYS[way][0]
+    text = jax.jit(run).lower(3.0).compile().as_text()
+    outlined = 'inlineable="false",xla_cpu_small_call="true"' in text
+    assert outlined == _one_function.OUTLINES
