@@ -3,11 +3,12 @@
     jnp.where(t < a, …)     t − a > 0     t >= 2 * a + b     jnp.sign(t − a)     jnp.maximum(t, a)
 
 compare st + c, with s and c independent of t, x and u, with 0. The switch is at −c/s, a function of the
-parameters that is differentiated as any other knot. Of the program traced with t, x and u as arguments
-every value is one of
+parameters that is differentiated as any other knot. So are those of functions that are affine in pieces
+(|t − a| < w, a tent): where each of their lines meets, which includes all of their kinks. Of the program
+traced with t, x and u as arguments every value is one of
 
 - *fixed*: independent of t, x and u;
-- a *line*: s t + c;
+- *lines*: equal to one of s₁t + c₁, …, sₖt + cₖ at any time;
 - *of time*: another function of t, remembering comparisons that were not resolved;
 - *other*: a function of x or u. A comparison of those is an event, and nothing is said of it.
 
@@ -54,6 +55,18 @@ class _Line:
         self.slope, self.offset = slope, offset
 
 
+_MOST = 8
+"""Lines of one value; with more it counts as any function of time."""
+
+
+class _Lines(_Lazy):
+    """One of these `lines` at any time; as a value, that at one time."""
+
+    def __init__(self, lines: list[_Line], make: Callable[[], Any]):
+        super().__init__(make)
+        self.lines = lines
+
+
 class _OfTime:
     """Another function of t, as it is at one time. `pending`: the operands of comparisons that decide
     it and are not resolved, with their places."""
@@ -71,16 +84,17 @@ _MOVING_PLACES = {
 _LOGIC = {"and", "or", "not", "xor", "eq", "ne"} | _MOVING_PLACES
 
 
-def switching_times(fn: Callable[..., Any], t: Any, x: Any, u: Any) -> list[jax.Array]:
-    """The times, in vectors, at which fn(t, x, u) compares a line in t with 0; infinite where there is
-    none. `t` is a time of the run, at which functions of time alone are evaluated."""
+def switching_times(fn: Callable[..., list[Any]], t: Any, x: Any, u: Any) -> list[jax.Array]:
+    """Return the times, in vectors, at which the code of fn(t, x, u) switches; infinite where there is
+    none. With them those that fn returns: a list of vectors of times, computed from parameters alone.
+    `t` is a time of the run, at which functions of time alone are evaluated."""
     traced = jax.make_jaxpr(fn)(t, x, u)
     count = len(jtu.tree_leaves((x, u)))
     one, zero = (_Fixed(partial(jnp.full, (), v, jnp.result_type(t))) for v in (1.0, 0.0))
     found: list[jax.Array] = []
     reader = _Reader(jax.lax.stop_gradient(t), found)
-    reader.read(traced, [_Line(one, zero), *[_OTHER] * count])
-    return found
+    known = reader.read(traced, [_Lines([_Line(one, zero)], lambda: reader.t), *[_OTHER] * count])
+    return found + [jnp.ravel(v.get() if isinstance(v, _Fixed) else v) for v in known]
 
 
 class _Reader:
@@ -93,7 +107,7 @@ class _Reader:
     def _apply(self, eqn: Any, given: list[Any]) -> list[Any]:
         name = eqn.primitive.name
         given = [
-            v if isinstance(v, _Fixed | _Line | _OfTime) or v is _OTHER else _fixed(v)
+            v if isinstance(v, _Fixed | _Lines | _OfTime) or v is _OTHER else _fixed(v)
             for v in given
         ]
         if any(v is _OTHER for v in given):
@@ -105,15 +119,16 @@ class _Reader:
         inner = self._inner(eqn, given)
         if inner is not None:
             return inner
-        line = self._line(name, eqn, given)
-        if line is not None:
-            return [line]
         pending = tuple(p for v in given if isinstance(v, _OfTime) for p in v.pending)
         if name in _COMPARE or name in ("max", "min", "sign", "abs", "clamp"):
             pending += self._compared(name, eqn, given)
         if pending and self._jumps(name, given):
             self._refuse(pending)
             pending = ()
+        elif not (pending and name == "select_n"):
+            lines = self._lines(name, eqn, given)
+            if lines is not None and len(lines) <= _MOST:
+                return [_Lines(lines, lambda: _done(eqn, [self._value(v) for v in given])[0])]
         is_flag = name in _COMPARE or name in _LOGIC
         return self._lazily(eqn, given, lambda m: _OfTime(_Lazy(m), pending if is_flag else ()))
 
@@ -133,23 +148,29 @@ class _Reader:
         return [kind(lambda k=k: every.get()[k]) for k in range(len(eqn.outvars))]
 
     def _value(self, v: Any) -> Any:
-        if isinstance(v, _Line):
-            return v.slope.get() * self.t.astype(v.slope.get().dtype) + v.offset.get()
         return v.value.get() if isinstance(v, _OfTime) else v.get()
 
-    def _line(self, name: str, eqn: Any, given: list[Any]) -> _Line | None:
-        """The outcome, where it is a line again."""
-        lines = [_as_line(v) for v in given]
-        if name in ("add", "sub", "add_any") and all(v is not None for v in lines):
-            return _both(lambda *v: _done(eqn, list(v))[0], *lines)
+    def _lines(self, name: str, eqn: Any, given: list[Any]) -> list[_Line] | None:
+        """The lines of the outcome, where it consists of such."""
+        do = lambda *v: _done(eqn, list(v))[0]  # noqa: E731
+        each = [_as_lines(v) for v in given]
+        floating = jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating)
+        if name in ("add", "sub", "add_any") and None not in each:
+            return [_both(do, p, q) for p in each[0] for q in each[1]]
         if name == "neg" or name in _MOVING_PLACES or name == "convert_element_type":
-            floating = jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating)
-            if floating and isinstance(given[0], _Line):
-                return _both(lambda v: _done(eqn, [v])[0], given[0])
-        if name == "mul" and isinstance(given[1], _Line) and isinstance(given[0], _Fixed):
-            return _both(lambda v: _done(eqn, [given[0].get(), v])[0], given[1])
-        if name in ("mul", "div") and isinstance(given[0], _Line) and isinstance(given[1], _Fixed):
-            return _both(lambda v: _done(eqn, [v, given[1].get()])[0], given[0])
+            if floating and isinstance(given[0], _Lines):
+                return [_both(do, line) for line in given[0].lines]
+        if name == "mul" and isinstance(given[1], _Lines) and isinstance(given[0], _Fixed):
+            return [_both(lambda v: do(given[0].get(), v), line) for line in given[1].lines]
+        if name in ("mul", "div") and isinstance(given[0], _Lines) and isinstance(given[1], _Fixed):
+            return [_both(lambda v: do(v, given[1].get()), line) for line in given[0].lines]
+        if name == "abs" and isinstance(given[0], _Lines):
+            return [*given[0].lines, *(_both(jnp.negative, line) for line in given[0].lines)]
+        cases = {"max": each, "min": each, "clamp": each, "select_n": each[1:]}.get(name)
+        if cases is not None and floating and None not in cases:
+            shape = eqn.outvars[0].aval.shape
+            over = lambda v: jnp.broadcast_to(v, shape)  # noqa: E731
+            return [_both(over, line) for lines in cases for line in lines]
         return None
 
     def _compared(self, name: str, eqn: Any, given: list[Any]) -> tuple:
@@ -162,20 +183,15 @@ class _Reader:
             pairs = [(given[0], given[1])]
         pending: tuple = ()
         for a, b in pairs:
-            p, q = _as_line(a), _as_line(b)
-            if not any(isinstance(v, _Line | _OfTime) for v in (a, b)):
+            p, q = _as_lines(a), _as_lines(b)
+            if not any(isinstance(v, _Lines | _OfTime) for v in (a, b)):
                 continue
             if p is None or q is None:
                 if name in _COMPARE or name == "sign":
                     operands = [_Lazy(partial(self._value, v)) for v in (a, b)]
                     pending += ((operands, _place(eqn)),)
                 continue
-            slope = p.slope.get() - q.slope.get()
-            offset = p.offset.get() - q.offset.get()
-            slope, offset = jnp.broadcast_arrays(slope, offset)
-            moves = slope != 0
-            times = -offset / jnp.where(moves, slope, jnp.ones_like(slope))
-            self.found.append(jnp.where(moves, times, jnp.inf).ravel())
+            self.found += [_meeting(left, right) for left in p for right in q]
         return pending
 
     def _jumps(self, name: str, given: list[Any]) -> bool:
@@ -232,12 +248,21 @@ def _done(eqn: Any, given: list[Any]) -> list[Any]:
     return bound(eqn, given)
 
 
-def _as_line(v: Any) -> _Line | None:
-    if isinstance(v, _Line):
-        return v
+def _as_lines(v: Any) -> list[_Line] | None:
+    if isinstance(v, _Lines):
+        return v.lines
     if not isinstance(v, _Fixed):
         return None
-    return _Line(_Fixed(lambda: jnp.zeros_like(jnp.asarray(v.get()))), v)
+    return [_Line(_Fixed(lambda: jnp.zeros_like(jnp.asarray(v.get()))), v)]
+
+
+def _meeting(p: _Line, q: _Line) -> jax.Array:
+    """The times where two lines meet, infinite where they do not."""
+    slope, offset = p.slope.get() - q.slope.get(), p.offset.get() - q.offset.get()
+    slope, offset = jnp.broadcast_arrays(slope, offset)
+    moves = slope != 0
+    times = -offset / jnp.where(moves, slope, jnp.ones_like(slope))
+    return jnp.where(moves, times, jnp.inf).ravel()
 
 
 def _both(do: Callable[..., Any], *lines: Any) -> _Line:

@@ -195,12 +195,13 @@ class Problem(eqx.Module):
         """
         u = self.zero_control(x)
 
-        def listener(t: Any, x: Tree, u: Tree) -> Any:
+        def listener(t: Any, x: Tree, u: Tree) -> list[Any]:
             with listen(t) as heard:
                 self.set_at(t, args)
-                out = self.f(t, x, u, args), self.h(t, x, u, args)
+                self.f(t, x, u, args), self.h(t, x, u, args)
             found.append(heard)
-            return out
+            # Knots that are computed from args leave this trace as outputs.
+            return [knots for knots in heard.knots if not _tree.is_concrete(knots)]
 
         found: list[Any] = []
         time = jnp.asarray(t0, jnp.result_type(float))
@@ -214,9 +215,9 @@ class Problem(eqx.Module):
                 stacklevel=4,
             )
         _check_spans(heard.spans, t0, t1)
-        if not heard.knots and not switches:
+        listed = [*filter(_tree.is_concrete, heard.knots), *switches]
+        if not listed:
             return np.zeros(0)
-        listed = [*heard.knots, *switches]
         concrete = _tree.is_concrete(listed, t0, t1)
         lib = np if concrete else jnp
         # Known ones are sorted here: the compiler takes a second for a thousand.

@@ -29,7 +29,7 @@ class Function(AbstractSignal):
     def __init__(self, fn: Callable[[Any], Any], knots: Any = ()):
         self.fn = fn
         if not _tree.is_concrete(knots):
-            self.times = knots
+            self.times = jnp.sort(jnp.asarray(knots).ravel())
         else:
             self.times = np.sort(np.asarray(knots, dtype=float))
 
