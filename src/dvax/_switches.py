@@ -3,9 +3,9 @@
     jnp.where(t < a, …)     t − a > 0     t >= 2 * a + b     jnp.sign(t − a)     jnp.maximum(t, a)
 
 compare st + c, with s and c independent of t, x and u, with 0. The switch is at −c/s, a function of the
-parameters that is differentiated as any other knot. So are those of functions that are affine in pieces
-(|t − a| < w, a tent): where each of their lines meets, which includes all of their kinks. Of the program
-traced with t, x and u as arguments every value is one of
+parameters that is differentiated as any other knot. Functions that are affine in pieces (|t − a| < w, a
+tent) switch where any two of their lines meet, which includes all of their kinks. Of the program traced
+with t, x and u as arguments every value is one of
 
 - *fixed*: independent of t, x and u;
 - *lines*: equal to one of s₁t + c₁, …, sₖt + cₖ at any time;

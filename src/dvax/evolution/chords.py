@@ -354,9 +354,9 @@ def _table(eqn: Any, given: list[Any]) -> Chord:
     times, values, t = given
     if is_chord(times) or is_chord(values):
         raise NoEnclosure("a table that moves")
-    look = lambda t: bound(eqn, [times, values, t])[0]  # noqa: E731
-    a, b = look(t.a), look(t.b)
+    a, b = (bound(eqn, [times, values, end])[0] for end in (t.a, t.b))
     method = "scan_unrolled" if times.shape[0] <= 4096 else "scan"
+    times, values = jnp.asarray(times), jnp.asarray(values)
     passed = lambda t, side: jnp.searchsorted(times, t, side=side, method=method)  # noqa: E731
     whole = passed(t.highest, "left") <= passed(t.lowest, "right")
     if eqn.params["name"] == "dvax_constant_table":
