@@ -2,6 +2,7 @@
 
 import email
 import os
+import re
 import subprocess
 import sys
 import time
@@ -79,10 +80,12 @@ def test_the_metadata_says_what_is_needed(wheel: Path):
         "fem",
     }
     core = [need for need in about.get_all("Requires-Dist", []) if "extra ==" not in need]
-    assert {need.partition(">=")[0] for need in core} == {
+    assert {re.split("[<>]", need)[0] for need in core} == {
         *("jax", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping", "numpy", "scipy"),
     }
     assert all(">=" in need for need in core)
+    # Traced programs are read, so that a minor release of JAX can change what they look like.
+    assert [need for need in core if "<" in need] == ["jax<0.13,>=0.10"]
     with zipfile.ZipFile(wheel) as archive:
         (name,) = (n for n in archive.namelist() if n.endswith("entry_points.txt"))
         assert "dvax = dvax.cli:main" in archive.read(name).decode()
