@@ -20,6 +20,7 @@ FLOORS = {
     "_batch": -1,
     "_one_function": -1,
     "_user_code": 0,
+    "_figure_text": -2,
     "spaces": 0,
     "generators": 0,
     "operators": 0,

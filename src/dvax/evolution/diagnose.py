@@ -5,7 +5,7 @@ Each cause is tested at the last state (t, x) that was reached, on the functions
 - a value that is not finite, by evaluating K, P, A, h and f along x + s x' over the last step, with the
   earliest such time found by bisection;
 - a jump of K, h or f, by bisection of a few steps around t;
-- a finite-time escape, x' growing as a power p > 1 of x: then |x| is infinite after |x| / ((p − 1) |x'|);
+- a finite-time escape, x' growing as |x|^p with p > 1, infinite after |x| / ((p − 1) |x'|);
 - rounding: steps of the size of the spacing of floating-point numbers at t, or a tolerance below the
   rounding of f;
 - stiffness: a derivative of f̃ (or of Ax + f̃ for explicit methods) of which h times the largest
