@@ -310,8 +310,9 @@ def _fix_of_shape(name: str, out: Tree, element: Tree, space: str) -> str:
     if isinstance(out, list | tuple) and not isinstance(element, tuple):
         return f"Join the components: return jnp.stack([...]) from {name}"
     fix = f"Return that shape from {name}, or name the space: {space}_space= of dvax.Problem"
-    given = hasattr(out, "shape") and space == "control"
-    return fix + (f", such as control_space=dvax.spaces.Euclidean({out.shape})" if given else "")
+    shape = getattr(out, "shape", None)
+    given = shape is not None and space == "control"
+    return fix + (f", such as control_space=dvax.spaces.Euclidean({shape})" if given else "")
 
 
 def _check_spans(spans: list[tuple[Any, Any, str, str]], t0: Any, t1: Any) -> None:

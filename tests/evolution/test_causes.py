@@ -178,9 +178,11 @@ def test_u_takes_the_shape_that_P_or_K_fixes():
         )  # fmt: skip
         np.testing.assert_allclose(problem.response(0.0, jnp.zeros(2)), 0.25, atol=1e-9)
     pair = dvax.Problem(
-        A=generators.Zero(), P=operators.Product(operators.Dense(jnp.eye(3)), operators.Diagonal(jnp.ones(1))),
+        A=generators.Zero(),
+        P=operators.Product(operators.Dense(jnp.eye(3)), operators.Diagonal(jnp.ones(1))),
         K=sets.Product(sets.Box(0.0, 1.0), sets.Box(0.0, 1.0)),
-        f=lambda t, x, u, args: -x + u[0][:2] + u[1], h=lambda t, x, u, args: (jnp.full(3, 0.25), jnp.full(1, 2.0)),
+        f=lambda t, x, u, args: -x + u[0][:2] + u[1],
+        h=lambda t, x, u, args: (jnp.full(3, 0.25), jnp.full(1, 2.0)),
     )  # fmt: skip
     first, second = pair.response(0.0, jnp.zeros(2))
     np.testing.assert_allclose(first, 0.25, atol=1e-9)

@@ -18,6 +18,7 @@ from dvax.errors import Fix
 from dvax.plots import build_report
 from dvax.runs.applications.base import Plan
 from dvax.runs.applications.certificate import certificate
+from dvax.runs.applications.circuit import CircuitApplication
 from dvax.runs.applications.config import read_config
 from dvax.runs.applications.driver import run_model
 from dvax.runs.applications.segments import joined, segments
@@ -138,6 +139,7 @@ def test_pieces_join_to_a_solution_whose_bound_holds(count, settings):
     pieces = list(segments(plan))
     found = joined(pieces)
     np.testing.assert_array_equal(found.ts, plan.times)
+    assert found.defect is not None and found.settled is not None
     assert np.all(np.diff(found.defect) >= 0) and np.all(found.defect >= found.settled[0])
     bound = certificate(plan.problem, found, plan.constants)
     error = abs(float(found.xs[-1]) - 1.8360919559905713)
@@ -157,6 +159,22 @@ def test_pieces_join_to_a_solution_whose_bound_holds(count, settings):
     assert bound.status == other.status
 
 
+def test_states_alone_are_kept_where_there_is_no_time_for_more(tmp_path, whole, monkeypatch):
+    config = configured(tmp_path)
+
+    def hurried(*given):
+        raise KeyboardInterrupt  # a second signal
+
+    monkeypatch.setattr(CircuitApplication, "results", hurried)
+    outcome = run_model(config, tmp_path / "part", on_event=Stops(3, KeyboardInterrupt()))
+    assert outcome.exit_code == 130 and "states alone" in outcome.stop_reason
+    part, everything = frames_of(outcome.directory), frames_of(whole.directory)
+    kept = everything.isel(time=slice(part.sizes["time"]))
+    np.testing.assert_array_equal(part["state_part0"], np.stack([kept.state_C1, kept.state_L1], 1))
+    page = build_report(outcome.directory, stills=False).read_text(encoding="utf-8")
+    assert "Partial results." in page and "more than its states" in page
+
+
 def test_work_in_a_thread_returns_and_raises_as_it_would_here():
     assert interruptible(lambda: 7) == 7
     with pytest.raises(dvax.InputError, match="x0"):
@@ -171,7 +189,8 @@ from dvax.runs.applications.circuit import CircuitApplication
 
 def endless(self, *given):
     print("endless", file=sys.stderr, flush=True)
-    return jax.jit(lambda x: jax.lax.while_loop(lambda v: v < 2.0, lambda v: v * 1.0, x))(1.0).block_until_ready()
+    loop = jax.jit(lambda x: jax.lax.while_loop(lambda v: v < 2.0, lambda v: v * 1.0, x))
+    return loop(1.0).block_until_ready()
 
 setattr(CircuitApplication, sys.argv.pop(1), endless)
 from dvax.cli import main

@@ -60,8 +60,8 @@ def _full(error: OSError, out: Path | None) -> str:
     folder = next((p for p in (place, *place.parents) if p.is_dir()), Path.cwd())
     left = shutil.disk_usage(folder).free / 2**20
     return (
-        f"error: {place}: {error.strerror}; {left:.4g} MiB are free there. Free some space or raise the "
-        "limit, or give another folder with -o. What was complete before is kept."
+        f"error: {place}: {error.strerror}; {left:.4g} MiB are free there. Free some space or raise "
+        "the limit, or give another folder with -o. What was complete before is kept."
     )
 
 

@@ -25,10 +25,10 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import Fix, InputError, InputProblem, SolveError
-from ..problem import Problem
+from ..errors import Fix, InputError, SolveError
 from .flow import Flow
 from .method import AbstractMethod
+from .nonfinite import first_bad
 from .results import RESULTS
 from .runge_kutta import DormandPrince
 from .setup import Setup
@@ -84,20 +84,6 @@ class _Stop(NamedTuple):
         return float(self.flow.state_space(self.x).norm(x))
 
 
-def refuse_nonfinite_data(problem: Problem, args: Any, caller: str) -> None:
-    """Raise an `InputError` where A, P, K or args hold NaN (A and P also infinity)."""
-    wrong = []
-    for name, data in (("A", problem.A), ("P", problem.P), ("K", problem.K), ("args", args)):
-        found = _first_bad(data, allow_infinite=name in ("K", "args"))
-        if found:
-            place = f"{caller}(args)" if name == "args" else f"dvax.Problem({name})"
-            wrong.append(
-                InputProblem(place, found, "its numbers must be finite", "Correct the data there")
-            )
-    if wrong:
-        raise InputError(*wrong)
-
-
 def failure(setup: Setup, stats: dict[str, Any], result: RESULTS, solution: Any) -> SolveError:
     """The `SolveError` of a run that stopped: what happened, the cause, how far it came, what helps."""
     found = diagnose(setup, stats, result)
@@ -139,12 +125,12 @@ def _nonfinite(stop: _Stop) -> Diagnosis:
     flow, problem, args = stop.flow, stop.flow.problem, stop.flow.args
     like = problem.zero_control(stop.x)
     begin, velocity = stop.time(stop.t), None
-    if not _first_bad(stop.x):
+    if not first_bad(stop.x):
         try:
             velocity = stop.velocity(begin, stop.x)
         except InputError:
             pass  # K is refused at t itself: the search below says so
-    if velocity is None or _first_bad(velocity):
+    if velocity is None or first_bad(velocity):
         velocity = _tree.zeros_like(stop.x)
 
     def pieces(ahead: float) -> dict[str, Callable[[], Tree]]:
@@ -161,7 +147,7 @@ def _nonfinite(stop: _Stop) -> Diagnosis:
 
     def bad(name: str, ahead: float) -> str:
         try:
-            return _first_bad(pieces(ahead)[name](), allow_infinite=name == "K")
+            return first_bad(pieces(ahead)[name](), allow_infinite=name == "K")
         except InputError as refused:
             problem = refused.problems[0]
             return f"refused, {problem.place}: {problem.given}; {problem.rule}"
@@ -384,7 +370,7 @@ def _law(stop: _Stop) -> Diagnosis:
     at = f"at t = {stop.t:.12g}"
     y = stop.flow.rate(t, stop.x, None).y
     like = problem.zero_control(stop.x)
-    if y is None or _first_bad(y):
+    if y is None or first_bad(y):
         y = like
     flat, unravel = jax.flatten_util.ravel_pytree(y)
     fix = Fix("", "", "Check the sign of the way in which h depends on u")
@@ -407,21 +393,3 @@ def _law(stop: _Stop) -> Diagnosis:
             fix,
         ),
     )
-
-
-def _first_bad(tree: Tree, allow_infinite: bool = False) -> str:
-    """The first value in a tree that is NaN (or infinite), with its place; "" where there is none."""
-    leaves = [
-        leaf for leaf in jtu.tree_leaves(tree) if isinstance(leaf, float | np.ndarray | jax.Array)
-    ]
-    for k, leaf in enumerate(leaves):
-        if not _tree.is_concrete(leaf) or jnp.result_type(leaf).kind != "f":
-            continue
-        array = np.asarray(leaf)
-        bad = np.isnan(array) if allow_infinite else ~np.isfinite(array)
-        if bad.any():
-            index = tuple(int(i) for i in np.argwhere(bad)[0])
-            part = f" of part {k}" if len(leaves) > 1 else ""
-            place = f" in component {index}{part}" if index else part
-            return f"{array[index]}{place} ({int(bad.sum())} of {bad.size} entries)"
-    return ""

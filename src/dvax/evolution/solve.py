@@ -16,10 +16,11 @@ from ..vi import AbstractSolver, Auto
 from .arguments import bound_steps, check, check_memory, first_step, warn_precision
 from .certified import certified, of_region
 from .compiled import compiled
-from .diagnose import failure, refuse_nonfinite_data
+from .diagnose import failure
 from .implicit import Implicit
 from .integrate import Options
 from .method import ETD2RK, AbstractMethod
+from .nonfinite import refuse_nonfinite_data
 from .picard import Picard
 from .results import RESULTS
 from .setup import Setup, as_arrays

@@ -33,6 +33,8 @@ def build_report(run_dir: Path | str, *, stills: bool = True) -> Path:
 
 def _pictures(run: RunRecord) -> tuple[list[Picture], list[str]]:
     """The pictures that the run can give, and a sentence for each that it cannot."""
+    if run.data and "state_part0" in run.data:
+        return [], ["The run was stopped before more than its states could be written."]
     if run.data:
         return application_pictures(run.model, run.data), []
     if run.trajectory is None:

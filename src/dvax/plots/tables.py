@@ -36,11 +36,12 @@ def headline_cards(run: RunRecord) -> str:
             continue  # it stands at the top of the page, and among the facts of the run
         value = entry.get("value")
         text = figure_text(value, entry.get("error"))
+        shown = escaped(quantity_text(text, str(entry.get("unit", ""))))
         # All digits, for who points at it.
         whole = "" if isinstance(value, list) else f' title="{escaped(repr(value))}"'
         cards.append(
             f'<div class="card"><div class="name">{escaped(_words(name))}</div>'
-            f'<div class="value"{whole}>{escaped(quantity_text(text, str(entry.get("unit", ""))))}</div>'
+            f'<div class="value"{whole}>{shown}</div>'
             f'<div class="meaning">{escaped(str(entry.get("meaning", "")))}</div></div>'
         )
     if not cards:

@@ -20,10 +20,10 @@ from dvax.runs.fields import Sources
 from dvax.runs.schema import OPTIONAL, SECTIONS
 from dvax.runs.schema_errors import shown, translate, unknown_key
 from dvax.runs.settings import Config as Config
+from dvax.runs.solver_options import MOST_STEPS
 from dvax.runs.units import Units
 
 MAX_BYTES = 2**20
-MOST_STEPS = 2**30
 _RTOL = 1e-6
 _ATOL_OF_SCALE = 1e-9  # of the model's own indentation scale
 

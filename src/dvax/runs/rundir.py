@@ -200,8 +200,8 @@ class FrameStore:
         self._publish()
 
     def _publish(self) -> None:
-        """Replace the group's consolidated metadata, which readers such as xarray look at first: in it
-        every array ends with the last complete frame, so that what a killed run leaves opens as that."""
+        """Replace the group's consolidated metadata, which readers such as xarray take first: every
+        array in it ends with the last complete frame, and so the store of a killed run opens."""
         about = {
             folder.name: json.loads((folder / "zarr.json").read_text(encoding="utf-8"))
             for folder in sorted(self.path.iterdir())

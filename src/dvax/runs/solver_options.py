@@ -5,8 +5,11 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import AfterValidator, Field, ValidationInfo
 
 from dvax import evolution, vi
-from dvax.errors import Fix
+from dvax.errors import Fix, InputError, InputProblem
 from dvax.runs.schema import MOST_COUNTED, Section, ViSolver, broken
+
+MOST_STEPS = 2**30
+"""The most fixed steps of a run."""
 
 Method = Literal["ETD1", "ETD2RK", "ETD4RK", "ExpRosenbrock", "DormandPrince", "Implicit"]
 
@@ -39,6 +42,21 @@ class SolverKeys(Section):
     vi_solver: ViSolver | None = Field(
         None, description="of the frozen law; by default that of the model"
     )
+
+
+def check_steps(table: SolverKeys, span: float, words: str) -> None:
+    """Raise an `InputError` where a fixed step is longer than the run, which has the length `span` (in
+    `words`), or so short that steps cannot be counted."""
+    dt = table.dt
+    if dt is None or (dt <= span and span / dt < MOST_STEPS):
+        return
+    rule = (
+        f"a step is not longer than the run, which has {words}"
+        if dt > span
+        else f"a run has fewer than {MOST_STEPS} steps, or they cannot be counted"
+    )
+    fix = f"Write dt = {span / 100:.3g}, say, or leave it out"
+    raise InputError(InputProblem("model.dt", f"{dt:g}", rule, fix))
 
 
 def settings(table: SolverKeys, **defaults: Any) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
-from ..evolution.diagnose import refuse_nonfinite_data
+from ..evolution.nonfinite import refuse_nonfinite_data
 from ..problem import Problem
 from .assumption import Assumption
 from .certificate import is_declared

@@ -21,7 +21,7 @@ from dvax.runs.applications.base import (
 )
 from dvax.runs.applications.certificate import certificate
 from dvax.runs.schema import in_quantity
-from dvax.runs.solver_options import SolverKeys, settings
+from dvax.runs.solver_options import SolverKeys, check_steps, settings
 
 
 class CircuitSection(SolverKeys):
@@ -48,6 +48,7 @@ class _Loaded:
         self.table = table
         self.circuit = Circuit.from_file(file, r_on=table.r_on, g_leak=table.g_leak)
         self.circuit.check_sources(table.t_end)
+        check_steps(table, table.t_end, f"{table.t_end:g} s")
 
 
 class CircuitApplication(AbstractApplication[_Loaded]):

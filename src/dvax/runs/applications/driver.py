@@ -14,7 +14,7 @@ from dvax.errors import InputError, SolveError
 from dvax.evolution import Solution
 from dvax.runs.applications.base import Plan, Results, Variable
 from dvax.runs.applications.config import ModelConfig
-from dvax.runs.applications.segments import joined, segments
+from dvax.runs.applications.segments import joined, segments, states_alone
 from dvax.runs.applications.wording import in_keys
 from dvax.runs.compile_time import announced, compile_clock
 from dvax.runs.driver import Listener, RunOutcome, refuse_existing
@@ -25,9 +25,9 @@ from dvax.runs.rundir import RunDirectory, process
 from dvax.runs.solver_options import in_keys_of
 from dvax.theory import Assumption, Constants
 
-
-_PATIENCE = 5.0
-"""Seconds in which the results of a run that stopped are put together, or given up."""
+_PATIENCE = 30.0
+"""Seconds in which the results of a run that stopped are put together; after that, or at a second
+signal, its states alone are kept."""
 
 
 def run_model(
@@ -91,7 +91,8 @@ class _Run:
             try:
                 results = interruptible(lambda: self._results(plan, pieces), _PATIENCE)
             except (KeyboardInterrupt, TimeoutError):
-                reason += " The results up to there took too long to be put together."
+                results = states_alone(pieces)
+                reason += " Its states alone were kept: there was no time for figures."
         with undisturbed():
             if results is not None:
                 self._keep(results)

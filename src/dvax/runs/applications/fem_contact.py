@@ -21,7 +21,7 @@ from dvax.runs.applications.base import (
     Variable,
 )
 from dvax.runs.applications.certificate import certificate
-from dvax.runs.solver_options import SolverKeys, settings
+from dvax.runs.solver_options import SolverKeys, check_steps, settings
 
 _SMALL = 0.1
 """An indentation above this part of a size of the body or the punch is worth a note."""
@@ -64,6 +64,7 @@ class FemContactSection(SolverKeys):
 class _Loaded:
     def __init__(self, table: FemContactSection, file: Path | None):
         self.table = table
+        check_steps(table, table.end, f"the length {table.end:g}")
         sizes = _given(table, _SIZES)
         names = _given(table, ("contact", "clamped"))
         if file is not None and sizes:

@@ -22,7 +22,7 @@ from dvax.runs.applications.base import (
     Variable,
 )
 from dvax.runs.applications.certificate import certificate
-from dvax.runs.solver_options import SolverKeys, settings
+from dvax.runs.solver_options import SolverKeys, check_steps, settings
 
 
 class MarketSection(SolverKeys):
@@ -44,6 +44,7 @@ class MarketSection(SolverKeys):
 class _Loaded:
     def __init__(self, table: MarketSection, rts: RTS):
         self.table = table
+        check_steps(table, float(max(table.hours - 1, 1)), f"{table.hours} hours")
         self.times = np.arange(table.start_hour, table.start_hour + table.hours, dtype=float)
         options: dict[str, Any] = dict(
             speed=table.speed, reference_price=table.reference_price, elasticity=table.elasticity

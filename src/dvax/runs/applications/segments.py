@@ -14,7 +14,7 @@ import numpy as np
 
 from dvax.errors import SolveError
 from dvax.evolution import Implicit, Solution, solve
-from dvax.runs.applications.base import Plan
+from dvax.runs.applications.base import Plan, Results, Variable
 from dvax.runs.interrupt import interruptible
 
 _SEGMENTS = 20
@@ -87,13 +87,19 @@ def joined(pieces: list[Solution]) -> Solution:
     for name in ("ts", "xs", "us", "ys", "law_residual", "law_step", "law_error"):
         fields[name] = _joined([getattr(piece, name) for piece in pieces])
     if pieces[0].defect is not None:
-        ends = [np.array([p.defect[-1], p.law_defect[-1]]) for p in pieces]
+        defects: list[Any] = [(piece.defect, piece.law_defect) for piece in pieces]
+        starts: list[Any] = [piece.settled for piece in pieces]
+        # What had come together before each piece began.
+        ends = [np.array([one[-1], two[-1]]) for one, two in defects]
         before = np.cumsum([np.zeros(2), *ends[:-1]], axis=0)
-        for k, name in enumerate(("defect", "law_defect")):
-            fields[name] = _joined([getattr(p, name) + before[i, k] for i, p in enumerate(pieces)])
-        fields["settled"] = tuple(
-            _joined([p.settled[k] + before[i, k] for i, p in enumerate(pieces)]) for k in (0, 1)
-        )
+        sums = [
+            tuple(
+                _joined([part[k] + at[k] for part, at in zip(parts, before, strict=True)])
+                for k in (0, 1)
+            )
+            for parts in (defects, starts)
+        ]
+        (fields["defect"], fields["law_defect"]), fields["settled"] = sums
     last = pieces[-1].stats
     counts = {
         name: sum(int(p.stats[name]) for p in pieces)
@@ -102,6 +108,24 @@ def joined(pieces: list[Solution]) -> Solution:
     }
     fields["stats"] = {**last, **counts}
     return _with(pieces[0], fields)
+
+
+def states_alone(pieces: list[Solution]) -> Results:
+    """Times and states as they are, for which nothing needs to be compiled."""
+    parts = [jtu.tree_leaves(piece.xs) for piece in pieces]
+    leaves = [np.concatenate([np.asarray(v) for v in part]) for part in zip(*parts, strict=True)]
+    times = np.concatenate([np.asarray(piece.ts) for piece in pieces])
+    variables = {"time": Variable(("time",), times, "", "time")}
+    for k, leaf in enumerate(leaves):
+        rows = leaf.reshape(len(leaf), -1)
+        variables[f"{STATE}{k}"] = Variable(
+            ("time", f"entry{k}"), rows, "", f"part {k} of the state"
+        )
+    return Results({}, variables, None, sum(int(piece.stats["steps"]) for piece in pieces))
+
+
+STATE = "state_part"
+"""What the variables of a run are called that had no time for more than its states."""
 
 
 def _joined(parts: list[Any]) -> Any:

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import jax
 import numpy as np
-from pydantic import AfterValidator, Field, ValidationInfo
+from pydantic import AfterValidator, Field
 
 from dvax.errors import InputError, InputProblem, SolveError
 from dvax.evolution import Solution
@@ -21,9 +21,8 @@ from dvax.runs.applications.base import (
     Variable,
 )
 from dvax.runs.applications.certificate import certificate
-from dvax.runs.config import MOST_STEPS
 from dvax.runs.schema import Section, broken
-from dvax.runs.solver_options import SolverKeys, alone, settings
+from dvax.runs.solver_options import SolverKeys, check_steps, settings
 
 _STEP = 0.25
 """Days a step, where the file says nothing of steps."""
@@ -38,19 +37,6 @@ def _enough(value: float) -> float:
             f"it is the part of the capacity that is left, {_LEAST:g} to 1: {_WHY}", _CLOSED
         )
     return value
-
-
-def _countable(dt: float | None, info: ValidationInfo) -> float | None:
-    """A step that is no longer than the run, and not so short that steps cannot be counted."""
-    if dt is None:
-        return None
-    days = info.data.get("days", dt)
-    mend = "Write dt = 0.25, a quarter of a day, or less where the run is short"
-    if dt > days:
-        raise broken(f"a step is not longer than the run, which has {days:g} days", mend)
-    if not days / dt < MOST_STEPS:
-        raise broken(f"a run has fewer than {MOST_STEPS} steps, or they cannot be counted", mend)
-    return dt
 
 
 class IncidentSection(Section):
@@ -77,9 +63,6 @@ class TrafficSection(SolverKeys):
     rate: float = Field(1.0, gt=0, description="how fast trips change their paths [1/day]")
     rho: float | None = Field(None, gt=0, description="trips that a unit of cost moves")
     days: float = Field(40.0, gt=0, le=1e5, description="length of the run [day]")
-    dt: Annotated[float | None, AfterValidator(alone), AfterValidator(_countable)] = Field(
-        None, gt=0, description="step [day], 0.25 if no tolerance is given either"
-    )
     incidents: list[IncidentSection] = Field(
         default_factory=list, description="links that lose capacity for a time"
     )
@@ -88,6 +71,7 @@ class TrafficSection(SolverKeys):
 class _Loaded:
     def __init__(self, table: TrafficSection, paths: Mapping[str, Path]):
         self.table = table
+        check_steps(table, table.days, f"{table.days:g} days")
         try:
             # By their names, so that what is wrong in both files is said at once.
             self.traffic = Traffic(
