@@ -3,6 +3,7 @@
 import math
 import os
 import warnings
+from functools import cache
 from typing import Any
 
 import jax
@@ -32,21 +33,22 @@ def check(
     wrong: list[InputProblem] = []
 
     def rule(holds: bool, name: str, given: Any, text: str, fix: str) -> None:
-        if not holds:
-            line = _tree.short(given) if hasattr(given, "dtype") else str(given)
+        if not holds:  # what was given is formatted here, so that a call that is right does not pay
+            plain = isinstance(given, _tree.Text) or hasattr(given, "dtype")
+            line = _tree.short(given) if plain else repr(given)
             wrong.append(InputProblem(f"dvax.solve({name})", line[:200], text, fix))
 
-    rule(isinstance(problem, Problem), "problem", type(problem).__name__,
+    rule(isinstance(problem, Problem), "problem", _tree.Text(type(problem).__name__),
          "it must be a dvax.Problem", "Build one, or pass that of a model: model.problem")  # fmt: skip
-    rule(isinstance(method, AbstractMethod | Implicit | Picard), "method", repr(method),
+    rule(isinstance(method, AbstractMethod | Implicit | Picard), "method", method,
          "it must be a method such as dvax.ETD2RK()", "Leave it out for the default")  # fmt: skip
-    rule(isinstance(vi_solver, AbstractSolver | None), "vi_solver", repr(vi_solver),
+    rule(isinstance(vi_solver, AbstractSolver | None), "vi_solver", vi_solver,
          "it must be a solver such as dvax.vi.Auto()", "Leave it out for the default")  # fmt: skip
-    rule(adjoint in ("reverse", "forward"), "adjoint", repr(adjoint),
+    rule(adjoint in ("reverse", "forward"), "adjoint", adjoint,
          "it must be 'reverse' or 'forward'",
          "'reverse' serves jax.grad, 'forward' jax.jvp")  # fmt: skip
     for name, flag in (("measure", measure), ("dense", dense)):
-        rule(isinstance(flag, bool | np.bool_ | None), name, repr(flag), "it must be True or False",
+        rule(isinstance(flag, bool | np.bool_ | None), name, flag, "it must be True or False",
              "Leave it out for the default")  # fmt: skip
     if isinstance(method, Implicit):
         for name, wanted in (("measure", measure), ("dense", dense)):
@@ -56,7 +58,7 @@ def check(
              "rtol and atol, so its steps adapt", "Leave it out")  # fmt: skip
     if max_steps is not None:
         whole = isinstance(max_steps, int | np.integer) and not isinstance(max_steps, bool)
-        rule(bool(whole and 1 <= max_steps <= MOST_COUNTED), "max_steps", repr(max_steps),
+        rule(bool(whole and 1 <= max_steps <= MOST_COUNTED), "max_steps", max_steps,
              f"it must be a whole number from 1 to {MOST_COUNTED}",
              f"Leave it out for {ADAPTIVE_STEPS}")  # fmt: skip
     wrong += _not_finite(x0) + _wrong_moduli(constants)
@@ -71,24 +73,25 @@ def check(
     }
     unusable = set()
     for name, value in numbers.items():
-        optional = name in ("dt", "dt0", "horizon")
-        if (value is None and optional) or not _tree.is_concrete(value) or is_number(value):
+        if type(value) is float or (value is None and name in ("dt", "dt0", "horizon")):
+            continue
+        if not _tree.is_concrete(value) or is_number(value):
             continue
         unusable.add(name)
-        rule(False, name, value if hasattr(value, "dtype") else repr(value),
-             "it must be one real number", "Write a number such as 1.0")  # fmt: skip
+        rule(False, name, value, "it must be one real number",
+             "Write a number such as 1.0")  # fmt: skip
     if not unusable & {"t0", "t1"} and _tree.is_concrete(t0, t1):
-        finite = math.isfinite(t0) and math.isfinite(t1)
-        forward = finite and bool(t0 < t1)
-        rule(forward, "t0, t1", f"{t0}, {t1}",
-             "t0 < t1, both finite: a semigroup runs forward only", "Swap or correct them")  # fmt: skip
-        rule(not forward or math.isfinite(float(t1) - float(t0)), "t0, t1", f"{t0}, {t1}",
-             "t1 − t0 must be finite", "Take another unit of time")  # fmt: skip
-        dtype = jnp.result_type(*jax.tree_util.tree_leaves(x0))
-        least = 2.0**12 * float(jnp.finfo(dtype).tiny)
-        rule(not forward or float(t1) - float(t0) >= least, "t0, t1", f"{t0}, {t1}",
-             f"t1 − t0 must be at least {least:.3g}, or steps underflow to 0",
-             "Take another unit of time")  # fmt: skip
+        span = float(t1) - float(t0) if math.isfinite(t0) and math.isfinite(t1) else math.nan
+        least = 2.0**12 * _tiny(jnp.result_type(*jax.tree_util.tree_leaves(x0)))
+        if not least <= span < math.inf:
+            given = _tree.Text(f"{t0}, {t1}")
+            rule(span > 0, "t0, t1", given, "t0 < t1, both finite: a semigroup runs forward only",
+                 "Swap or correct them")  # fmt: skip
+            rule(span != math.inf, "t0, t1", given, "t1 − t0 must be finite",
+                 "Take another unit of time")  # fmt: skip
+            rule(not 0 < span < least, "t0, t1", given,
+                 f"t1 − t0 must be at least {least:.3g}, or steps underflow to 0",
+                 "Take another unit of time")  # fmt: skip
         if ts is not None and _tree.is_concrete(ts):
             _check_times(rule, ts, float(t0), float(t1))
     for name in ("dt", "dt0", "horizon", "rtol", "atol"):
@@ -98,10 +101,21 @@ def check(
             ok = math.isfinite(value) and (value >= 0 if zero else value > 0)
             rule(bool(ok), name, value, "it must be positive and finite", "Give a positive number")
     if not unusable & {"rtol", "atol"} and _tree.is_concrete(rtol, atol):
-        rule(bool(rtol != 0 or atol != 0), "rtol, atol", "0, 0", "one of them must be positive",
-             "No finite step has defect zero")  # fmt: skip
+        rule(bool(rtol != 0 or atol != 0), "rtol, atol", _tree.Text("0, 0"),
+             "one of them must be positive", "No finite step has defect zero")  # fmt: skip
     if wrong:
         raise InputError(*wrong)
+
+
+@cache
+def _tiny(dtype: Any) -> float:
+    """The smallest normal number of a type."""
+    return float(jnp.finfo(dtype).tiny)
+
+
+@cache
+def _eps(dtype: Any) -> float:
+    return float(jnp.finfo(dtype).eps)
 
 
 def is_number(value: Any) -> bool:
@@ -117,11 +131,11 @@ def _check_times(rule: Any, ts: Any, t0: float, t1: float) -> None:
     try:
         times = np.asarray(ts, float)
     except (TypeError, ValueError):
-        rule(False, "ts", " ".join(repr(ts).split()), text, "Write a list of numbers")
+        rule(False, "ts", ts, text, "Write a list of numbers")
         return
     good = times.ndim == 1 and times.size > 0 and bool(np.all(np.diff(times) >= 0))
     inside = bool(good and t0 <= times[0] and times[-1] <= t1)
-    rule(inside, "ts", _tree.short(times) if times.size else "nothing", text, fix)
+    rule(inside, "ts", times if times.size else _tree.Text("nothing"), text, fix)
 
 
 def _not_finite(x0: Any) -> list[InputProblem]:
@@ -134,7 +148,7 @@ def _not_finite(x0: Any) -> list[InputProblem]:
                 InputProblem(name, f"shape {np.shape(leaf)}", "a state has at least one entry",
                              "Leave out parts without entries")
             )  # fmt: skip
-        elif jnp.issubdtype(jnp.result_type(leaf), jnp.complexfloating):
+        elif leaf.dtype.kind == "c":
             wrong.append(
                 InputProblem(name, f"an array of {jnp.result_type(leaf)}", "states are real",
                              "Take real and imaginary part as two components")
@@ -172,7 +186,7 @@ def first_step(span: Any, t0: Any, t1: Any, dtype: Any) -> Any:
     step = span * 1e-3
     if not _tree.is_concrete(t0, t1):
         return step
-    ulp = float(jnp.finfo(dtype).eps) * max(abs(t0), abs(t1))
+    ulp = _eps(dtype) * max(abs(t0), abs(t1))
     return min(max(step, 4.0 * ulp), span)
 
 
