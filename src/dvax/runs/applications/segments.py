@@ -17,8 +17,8 @@ from dvax.evolution import Implicit, Solution, solve
 from dvax.runs.applications.base import Plan, Results, Variable
 from dvax.runs.interrupt import interruptible
 
-_SEGMENTS = 20
-"""So many, where there are times enough: an interruption loses no more than a twentieth."""
+_SEGMENTS = 100
+"""So many, where there are times enough: an interruption loses no more than a hundredth."""
 
 
 def segments(plan: Plan) -> Iterator[Solution]:
