@@ -154,7 +154,10 @@ def as_float(a: Tree, name: str) -> Tree:
         if isinstance(leaf, int | float):
             return jnp.asarray(float(leaf))
         if isinstance(leaf, list):
-            leaf = np.asarray(leaf, dtype=float)
+            try:
+                leaf = np.asarray(leaf, dtype=float)
+            except (TypeError, ValueError):
+                raise _not_real(name, " ".join(repr(leaf).split())[:120]) from None
         if not hasattr(leaf, "dtype"):
             raise _not_real(name, f"{type(leaf).__name__} {leaf!r}")
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
@@ -165,6 +168,8 @@ def as_float(a: Tree, name: str) -> Tree:
 
     if not jtu.tree_leaves(a):
         raise _not_real(name, repr(a))
+    if isinstance(a, str | dict | set):
+        raise _not_real(name, f"{type(a).__name__} {a!r}"[:120])
     return jtu.tree_map(one, a, is_leaf=lambda leaf: isinstance(leaf, list))
 
 
@@ -182,15 +187,31 @@ def require(condition: Callable[[], Any], name: str, given: Any, rule: str, mend
         raise InputError(InputProblem(name, short(given), rule, mend))
 
 
+class Text(str):
+    """A value that a message shows as it stands."""
+
+
 def short(value: Any) -> str:
-    """A value as a message shows it: whole when small, summarised when large."""
+    """A value as a message shows it, on one line: whole when small, summarised when large."""
+    if isinstance(value, Text):
+        return str(value)
     leaves = jtu.tree_leaves(value)
-    if len(leaves) == 1 and hasattr(leaves[0], "shape") and np.size(leaves[0]) > 6:
-        array = np.asarray(leaves[0])
-        return f"an array of shape {array.shape} with range [{array.min():.6g}, {array.max():.6g}]"
-    if len(leaves) == 1:
-        return str(np.asarray(leaves[0]))
-    return str(value)
+    if not leaves or not all(hasattr(leaf, "shape") for leaf in leaves) or len(leaves) > 4:
+        text = " ".join(str(value).split())
+        return text if len(text) <= 120 else text[:117] + "..."
+    return ", ".join(map(_short_array, leaves))
+
+
+def _short_array(leaf: Any) -> str:
+    if not is_concrete(leaf):
+        return f"a traced array of shape {jnp.shape(leaf)}"
+    array = np.asarray(leaf)
+    if array.size <= 6:
+        return " ".join(str(array).split())
+    known = array[~np.isnan(array)] if array.dtype.kind == "f" else array
+    unknown = array.size - known.size
+    range_ = f" with range [{known.min():.6g}, {known.max():.6g}]" if known.size else ""
+    return f"an array of shape {array.shape}{range_}" + (f" and {unknown} NaN" if unknown else "")
 
 
 def _not_real(name: str, given: str) -> InputError:

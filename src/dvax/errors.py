@@ -1,5 +1,6 @@
 """The one family of exceptions. Every message says what is wrong, the mend, and the reason."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 
@@ -34,12 +35,41 @@ class InputError(DvaxError, ValueError):
         super().__init__("\n".join(map(str, problems)))
 
 
-class SolveError(DvaxError, RuntimeError):
-    """A solve stopped before its end; the partial result is in `solution` where there is one."""
+@dataclass(frozen=True)
+class Fix:
+    """An option that a caller may change after a `SolveError`: its name, a value for it, and why.
 
-    def __init__(self, message: str, solution: object = None):
-        self.solution = solution
-        super().__init__(message)
+    Without an option, `why` is a sentence of its own.
+    """
+
+    option: str
+    value: str
+    why: str
+
+    def in_python(self) -> str:
+        """As an argument of `dvax.solve`."""
+        if not self.option:
+            return self.why
+        value = f"dvax.{self.value}()" if self.option == "method" else self.value
+        value = f"dvax.vi.{self.value}()" if self.option == "vi_solver" else value
+        return f"Pass {self.option}={value}, {self.why}"
+
+
+class SolveError(DvaxError, RuntimeError):
+    """A solve stopped before its end; the partial result is in `solution` where there is one.
+
+    `cause` says what happened and what the evidence is, `fixes` which options help, by name, so that a
+    caller with other names for them (the keys of a file) can say it in its own words.
+    """
+
+    def __init__(self, cause: str, solution: object = None, fixes: tuple[Fix, ...] = ()):
+        self.cause, self.solution, self.fixes = cause, solution, fixes
+        super().__init__(self.told(Fix.in_python))
+
+    def told(self, phrase: Callable[[Fix], str | None]) -> str:
+        """The message, with each fix in the words of the caller; None drops one."""
+        said = [text for fix in self.fixes if (text := phrase(fix))]
+        return " ".join([self.cause, *(f"{text}." for text in said)])
 
 
 class DifferentiationError(DvaxError, TypeError):

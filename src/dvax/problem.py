@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import _tree
+from . import _control_shape, _tree, _user_code
 from ._switches import switching_times
 from ._tree import Tree
 from .errors import InputError, InputProblem
@@ -41,8 +41,9 @@ class Problem(eqx.Module):
     - `K`: a `dvax.sets` object, or a callable `(t, args) -> set`;
     - `f(t, x, u, args)`, `h(t, x, u, args)`: traceable by JAX; x and u are arrays, or tuples of
       them;
-    - `state_space`, `control_space`: where they are not plain Euclidean, or where u does not have
-      the shape of x. The control space defaults to the state space.
+    - `state_space`, `control_space`: where they are not plain Euclidean. u has the shape that P and K
+      fix (a matrix, or bounds that are vectors), else that of x: name the control space where u has
+      another, `control_space=dvax.spaces.Euclidean(())` for a single number beside a vector x.
 
     `args` is the paper's parameter η: any pytree, handed to all of them.
 
@@ -73,7 +74,7 @@ class Problem(eqx.Module):
         wrong = [
             InputProblem(
                 f"dvax.Problem({name})",
-                f"{type(value).__name__} {value!r}",
+                " ".join(f"{type(value).__name__} {value!r}".split())[:200],
                 f"it must be {what}, or a callable of {arguments} that returns one",
                 f"See dvax.{module}",
             )
@@ -94,6 +95,19 @@ class Problem(eqx.Module):
             for name, fn in (("f", self.f), ("h", self.h))
             if not callable(fn)
         ]
+        wrong += [
+            InputProblem(
+                f"dvax.Problem({name})",
+                repr(space),
+                "it must be a space, or None",
+                f"Write {name}=dvax.spaces.Euclidean(3) for vectors of 3",
+            )
+            for name, space in (
+                ("state_space", self.state_space),
+                ("control_space", self.control_space),
+            )
+            if not isinstance(space, AbstractSpace | None)
+        ]
         if wrong:
             raise InputError(*wrong)
 
@@ -112,7 +126,10 @@ class Problem(eqx.Module):
     def spaces(self, x: Tree) -> tuple[AbstractSpace, AbstractSpace]:
         """The state and the control space, for states shaped like x."""
         state = default_space(x) if self.state_space is None else self.state_space
-        return state, state if self.control_space is None else self.control_space
+        if self.control_space is not None:
+            return state, self.control_space
+        fixed = _control_shape.fixed_by(self.P, self.K, x)
+        return state, state if fixed is None else default_space(fixed)
 
     def frozen(self, t: Any, x: Tree, args: Any = None) -> Callable[[Tree], Tree]:
         """The frozen operator F_{t,x}(y) = P⁻¹y − h(t, x, P⁻¹y) (paper, eq:F_def)."""
@@ -157,35 +174,82 @@ class Problem(eqx.Module):
         return self.f(t, x, self.response(t, x, args, solver=solver), args)
 
     def check(self, t: Any, x: Tree, args: Any = None) -> None:
-        """Raise an `InputError` with everything that does not fit: spaces, shapes, P, K."""
+        """Raise an `InputError` with everything that does not fit: parameters, spaces, shapes, P, K."""
         state, control = self.spaces(x)
         state.check(x, "x0")
         u = self.zero_control(x)
         problems: list[InputProblem] = []
         for attempt in (
-            lambda: self.generator(args).check(state),
-            lambda: self.operator(args).check(control),
-            lambda: self.set_at(t, args).check(u),
+            lambda: self._made("A", self.A, {"args": args}, AbstractGenerator, x).check(state),
+            lambda: self._made("P", self.P, {"args": args}, AbstractOperator, x).check(control),
+            lambda: self._check_set(t, x, u, args),
+            lambda: self._check_values("f", self.f, (t, x, u, args), x, "state"),
+            lambda: self._check_values("h", self.h, (t, x, u, args), u, "control"),
         ):
             try:
                 attempt()
             except InputError as error:
                 problems += error.problems
-        for name, fn, element, space in (("f", self.f, x, "state"), ("h", self.h, u, "control")):
-            out = jax.eval_shape(lambda t, x, u, fn=fn: fn(t, x, u, args), t, x, u)
-            if not _tree.same_shape(out, element):
-                problems.append(
-                    InputProblem(
-                        f"dvax.Problem({name})",
-                        f"a value of shape {_tree.shapes(out)}",
-                        f"{name}(t, x, u, args) must lie in the {space} space, whose elements have "
-                        f"shape {_tree.shapes(element)}",
-                        f"Return that shape from {name}, or name the spaces: state_space=, "
-                        "control_space= of dvax.Problem",
-                    )
-                )
         if problems:
             raise InputError(*problems)
+
+    def _made(self, name: str, made: Any, inputs: dict[str, Any], kind: type, x: Tree) -> Any:
+        """A, P or K, made from its arguments where it is a callable, and of the right kind."""
+        if not isinstance(made, kind):
+            made = _user_code.call(name, made, inputs)
+            if not isinstance(made, kind):
+                raise InputError(
+                    InputProblem(
+                        f"dvax.Problem({name})",
+                        f"a callable that returns {type(made).__name__} {made!r}"[:200],
+                        f"{name}({', '.join(inputs)}) must return an instance of dvax."
+                        f"{kind.__module__.split('.')[1]}.{kind.__name__}",
+                        f"See dvax.{kind.__module__.split('.')[1]}",
+                    )
+                )
+        _user_code.check_precision(name, made, x)
+        return made
+
+    def _check_set(self, t: Any, x: Tree, u: Tree, args: Any) -> None:
+        def traced(t: Any) -> None:
+            self._made("K", self.K, {"t": t, "args": args}, AbstractSet, x)
+
+        jax.eval_shape(traced, t)  # a run traces t, even if this check does not
+        self.set_at(t, args).check(u)
+
+    def _check_values(
+        self, name: str, fn: Callable[..., Any], inputs: tuple, element: Tree, space: str
+    ) -> None:
+        """Evaluate f or h abstractly, and compare the shape of its value with that of an element."""
+        source = self._source_of_shape(inputs[1])
+
+        def traced(t: Any, x: Tree, u: Tree) -> Any:
+            named = {"t": t, "x": x, "u": u, "args": inputs[3]}
+            out = _user_code.call(name, fn, named, source)
+            _user_code.check_values(name, fn, out, x)
+            return out
+
+        out = jax.eval_shape(traced, *inputs[:3])
+        if not _tree.same_shape(out, element):
+            raise InputError(
+                InputProblem(
+                    f"dvax.Problem({name})",
+                    f"a value of shape {_tree.shapes(out)}",
+                    f"{name}(t, x, u, args) must lie in the {space} space, whose elements have "
+                    f"shape {_tree.shapes(element)}; it was called with x of shape "
+                    f"{_tree.shapes(inputs[1])} and u of shape {_tree.shapes(inputs[2])}{source}",
+                    _fix_of_shape(name, out, element, space),
+                )
+            )
+
+    def _source_of_shape(self, x: Tree) -> str:
+        """Why u has the shape that it has, for messages."""
+        if self.control_space is not None:
+            return f" (of control_space={self.control_space!r})"
+        if _control_shape.fixed_by(self.P, self.K, x) is None:
+            return " (that of x, since P and K fix no other and control_space= is not given)"
+        parts = (f"{n}, {type(p).__name__}" for n, p in (("P", self.P), ("K", self.K)))
+        return f" (which {' and '.join(parts)}, fix)"
 
     def knots(self, t0: Any, t1: Any, x: Tree, args: Any = None) -> Any:
         """The times in (t0, t1) where the data in f, h or K is not smooth, sorted: the knots of their
@@ -195,27 +259,33 @@ class Problem(eqx.Module):
         """
         u = self.zero_control(x)
 
-        def listener(t: Any, x: Tree, u: Tree) -> list[Any]:
-            with listen(t) as heard:
-                self.set_at(t, args)
-                self.f(t, x, u, args), self.h(t, x, u, args)
-            found.append(heard)
-            # Knots that are computed from args leave this trace as outputs.
-            return [knots for knots in heard.knots if not _tree.is_concrete(knots)]
+        evaluations: dict[str, Callable[[Any, Tree, Tree], Any]] = {
+            "K": lambda t, x, u: self.set_at(t, args),
+            "f": lambda t, x, u: self.f(t, x, u, args),
+            "h": lambda t, x, u: self.h(t, x, u, args),
+        }
+        heard = {}
 
-        found: list[Any] = []
+        def listener(t: Any, x: Tree, u: Tree) -> list[Any]:
+            for name, evaluate in evaluations.items():
+                with listen(t) as heard[name]:
+                    evaluate(t, x, u)
+            # Knots that are computed from args leave this trace as outputs.
+            every = (knots for one in heard.values() for knots in one.knots)
+            return [knots for knots in every if not _tree.is_concrete(knots)]
+
         time = jnp.asarray(t0, jnp.result_type(float))
         switches = switching_times(listener, time, x, u)
-        heard = found[-1]
-        for name in sorted(set(heard.elsewhere)):
+        for name in sorted({text for one in heard.values() for text in one.elsewhere}):
             warnings.warn(
                 f"{name} is evaluated at a time other than t itself (shifted, scaled, or inside "
                 "another jit), so its knots in t are unknown and a step may jump over one. Shift "
                 "its times instead, or wrap it as dvax.signals.Function(fn, knots=...).",
                 stacklevel=4,
             )
-        _check_spans(heard.spans, t0, t1)
-        listed = [*filter(_tree.is_concrete, heard.knots), *switches]
+        _check_spans([(*span, name) for name in heard for span in heard[name].spans], t0, t1)
+        announced = (knots for one in heard.values() for knots in one.knots)
+        listed = [*filter(_tree.is_concrete, announced), *switches]
         if not listed:
             return np.zeros(0)
         concrete = _tree.is_concrete(listed, t0, t1)
@@ -238,22 +308,32 @@ class Problem(eqx.Module):
     def zero_control(self, x: Tree) -> Tree:
         """The zero of the control space, in the floating type of x."""
         if self.control_space is None:
-            return _tree.zeros_like(x)
+            fixed = _control_shape.fixed_by(self.P, self.K, x)
+            return _tree.zeros_like(x) if fixed is None else fixed
         dtype = jnp.result_type(*jax.tree_util.tree_leaves(x))
         return jax.tree_util.tree_map(lambda leaf: leaf.astype(dtype), self.control_space.zeros())
 
 
-def _check_spans(spans: list[tuple[Any, Any, str]], t0: Any, t1: Any) -> None:
+def _fix_of_shape(name: str, out: Tree, element: Tree, space: str) -> str:
+    if isinstance(out, list | tuple) and not isinstance(element, tuple):
+        return f"Join the components: return jnp.stack([...]) from {name}"
+    fix = f"Return that shape from {name}, or name the space: {space}_space= of dvax.Problem"
+    shape = getattr(out, "shape", None)
+    given = shape is not None and space == "control"
+    return fix + (f", such as control_space=dvax.spaces.Euclidean({shape})" if given else "")
+
+
+def _check_spans(spans: list[tuple[Any, Any, str, str]], t0: Any, t1: Any) -> None:
     if not _tree.is_concrete(spans, t0, t1):
         return
     short = [
         InputProblem(
-            f"a {name} in f, h or K",
+            f"a {name} in {where}",
             f"data from t = {float(first):g} to {float(last):g}",
             f"it must cover [t0, t1] = [{float(t0):g}, {float(t1):g}]: data is never extrapolated",
             "Shorten the time span, or extend the data",
         )
-        for first, last, name in spans
+        for first, last, name, where in spans
         if float(first) > float(t0) or float(last) < float(t1)
     ]
     if short:

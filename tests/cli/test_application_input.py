@@ -221,7 +221,7 @@ def test_a_run_that_stops_claims_no_partial_results(
     def solve(*_: Any) -> None:
         raise error
 
-    monkeypatch.setattr(CircuitApplication, "solve", solve)
+    monkeypatch.setattr(CircuitApplication, "plan", solve)
     config = write(tmp_path, CIRCUIT + "[output]\npng = false\n")
     out = tmp_path / "out"
     result = CliRunner().invoke(app, ["run", str(config), "-o", str(out)])

@@ -53,6 +53,9 @@ def _pieces(
 ) -> Array:
     """Piece by piece: no step reaches over a break, and none is longer than a third of a piece."""
     method = method or ("LSODA" if w.stiff else "DOP853")
+    # A step ends at every time that is asked for: dense output is less accurate than the steps.
+    apart = np.min(np.abs(stops[:, None] - ts[None]), axis=0) > 1e-12 * w.span
+    stops = np.union1d(stops, ts[apart & (ts > 0) & (ts < w.span)])
     rows: list[Array] = [x] * int(np.sum(ts <= begin))
     x = np.asarray(x, float)
     for a, b in itertools.pairwise(stops):

@@ -134,7 +134,7 @@ def test_the_resolved_configuration_is_the_same_run(outcome, tmp_path):
 def test_a_run_says_what_it_does(outcome):
     lines = (outcome.directory / "log.jsonl").read_text().splitlines()
     stages = [event["stage"] for event in map(json.loads, lines) if event["event"] == "stage"]
-    assert stages == ["solving from 0 to 0.001 s", "bounding the error", "writing the results"]
+    assert stages == ["solving from 0 to 0.001 s", "writing the results"]
 
 
 def test_a_run_directory_of_an_unknown_model_is_refused(outcome, tmp_path):

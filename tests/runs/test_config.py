@@ -311,3 +311,30 @@ def test_data_stays_in_the_folder_unless_allowed(tmp_path):
     (inner / "link.csv").symlink_to(tmp_path / "outside.csv")
     with pytest.raises(InputError, match="in the configuration's folder"):
         load_config(write(inner, {"load.series.file": "link.csv"}))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", ("an empty file", "[model]", "circuit")),
+        ("# nothing\n", ("an empty file",)),
+        ("[output]\npng = false\n", ("no [model], but output",)),
+        ("a 1", ("line 1", "'a 1'", "key = value")),
+        ("a = b", ("'a = b'", "no value of TOML", "quotes")),
+        ('[model]\nname = "x\n', ("line 2", "one line", "Close the quotes")),
+        ("[model]\na = 1\na = 2\n", ("line 3", "'a = 2'", "occurs once")),
+        ("[model]\n[model]\n", ("line 2", "[[table]]")),
+        ("a = 5 ms\n", ("'a = 5 ms'", '"5 ms"')),
+        ('a = "C:\\path"\n', ("backslash", "'single quotes'")),
+        ("a = [1, 2\n", ("at its end", "Close the bracket")),
+    ],
+)
+def test_a_file_that_cannot_be_read_is_told_in_words_of_a_file(tmp_path, text, words):
+    from dvax.runs.applications.config import read_config
+
+    file = tmp_path / "run.toml"
+    file.write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_config(file)
+    for word in words:
+        assert word in str(caught.value)

@@ -185,7 +185,7 @@ def test_wrong_arguments_are_named():
         dvax.verify(problem, x=(1.0, 0.0))
     with pytest.raises(dvax.InputError, match=r"responses lie in P⁻¹K"):
         dvax.verify(problem, u=(3.0, 4.0))
-    with pytest.raises(dvax.InputError, match=r"'alpha'.*Mend the name"):
+    with pytest.raises(dvax.InputError, match=r"'alpha'.*Correct the name"):
         dvax.verify(problem, declared={"alpha": 1.0})
     with pytest.raises(KeyError):
         dvax.verify(problem)["ass:none"]

@@ -7,7 +7,7 @@ is imported before a command needs it, so that `dvax --help` answers at once.
 import os
 import sys
 
-_INTERRUPTED = 130
+_STOPPED = (130, 143)
 
 
 def main() -> None:
@@ -24,10 +24,10 @@ def main() -> None:
     try:
         app()
     except SystemExit as stop:
-        if stop.code != _INTERRUPTED:
+        if stop.code not in _STOPPED:
             raise
         # All is on disk. The compiler cannot be interrupted: it may still be at work in threads of
         # its own, and taking the interpreter down around them ends in a crash.
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(_INTERRUPTED)
+        os._exit(int(stop.code or 1))

@@ -20,8 +20,8 @@ app = typer.Typer(
     help=(
         "Solve coupled nonsmooth dynamical systems, with a certificate of the error.\n\n"
         "Exit codes: 0 done, 2 wrong input, 3 the solver failed, 4 outside the class of problems "
-        "(check --strict), 130 interrupted. After 3 and 130 the frames of a contact law that were "
-        "solved until then are kept; the other models are solved in one piece and leave none."
+        "(check --strict), 5 no space left to write, 130 interrupted, 143 asked to terminate. Whatever "
+        "ends a run, the frames that were solved until then are kept."
     ),
 )
 

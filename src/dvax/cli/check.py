@@ -33,18 +33,19 @@ def check(
         from dvax.runs.applications.config import ModelConfig, read_config
         from dvax.runs.config import build_contact
         from dvax.runs.contact_model import assumptions
+        from dvax.runs.interrupt import interruptible
 
-        loaded = read_config(config, allow_outside=allow_outside)
+        loaded = interruptible(lambda: read_config(config, allow_outside=allow_outside))
         if isinstance(loaded, ModelConfig):
             _check_model(loaded, strict)
             return
-        inputs = build_contact(loaded)
-        rows = constant_rows(loaded)
+        inputs = interruptible(lambda: build_contact(loaded))
+        rows = interruptible(lambda: constant_rows(loaded))
         say(f"{loaded.source}: no problem in the configuration and its data", "bold")
         say("")
         _say_constants(rows)
         say("")
-        known = assumptions(loaded, inputs)
+        known = interruptible(lambda: assumptions(loaded, inputs))
         _say_assumptions(known)
         say("")
         table(("statement", "verdict", "because"), verdicts(rows))
@@ -66,9 +67,10 @@ def check(
 def _check_model(config: "ModelConfig", strict: bool) -> None:
     """The same for an application."""
     from dvax.runs.applications.driver import constant_rows as rows_of
+    from dvax.runs.interrupt import interruptible
 
     application = config.application
-    constants, known, sizes, notes = application.known(config.model)
+    constants, known, sizes, notes = interruptible(lambda: application.known(config.model))
     say(f"{config.source}: no problem in the configuration and its data", "bold")
     say(f"class: {application.fit(config.model)}")
     if constants is not None:

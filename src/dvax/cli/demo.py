@@ -30,15 +30,17 @@ def demo(
     debug: Debug = False,
 ) -> None:
     """Solve a rough contact strip under an irregular load."""
-    with reported(debug):
+    with reported(debug, out):
         problems = target_problems(out, force=force)
         if problems:
             raise InputError(*problems)
         from dvax.runs.config import load_config
+        from dvax.runs.interrupt import interruptible
 
         # The folders must outlive the run, which copies the data it names.
         with as_file(files("dvax.runs") / "demo") as shipped, TemporaryDirectory() as sampled:
             config = shipped / CONFIG
             if points is not None:
                 config = resample(config, Path(sampled), points)
-            carry_out(load_config(config), out, force=force, quiet=quiet)
+            loaded = interruptible(lambda: load_config(config))
+            carry_out(loaded, out, force=force, quiet=quiet)

@@ -56,12 +56,14 @@ def _numbers(wrong: list[str]) -> list[Row]:
     import jax
     import jax.numpy as jnp
 
+    from dvax.runs.interrupt import interruptible
+
     devices = ", ".join(f"{device.device_kind} ({device.platform})" for device in jax.devices())
     # 1 + 2⁻⁵² differs from 1 in double precision only; asked of the device, not of the setting.
     double = bool(jax.jit(lambda one: one + 2.0**-52 > one)(jnp.asarray(1.0)))
     if not double:
         wrong.append("the device computes in single precision. Choose another: JAX_PLATFORMS=cpu.")
-    test = self_test()
+    test = interruptible(self_test)
     if not test.passed:
         wrong.append(
             f"the self-test is off by {test.error:.2e}, more than {ALLOWED:.0e}. "

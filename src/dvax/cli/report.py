@@ -7,7 +7,7 @@ import typer
 
 from dvax.cli.failure import reported
 from dvax.cli.options import Debug
-from dvax.cli.talk import say
+from dvax.cli.talk import remark, say
 
 
 def report(
@@ -17,7 +17,11 @@ def report(
     debug: Debug = False,
 ) -> None:
     """Write report.html and figures/*.png of a run, finished or not."""
-    with reported(debug):
+    with reported(debug, directory):
         from dvax.plots import build_report
+        from dvax.runs.interrupt import interruptible
+        from dvax.runs.rundir import close_killed
 
-        say(str(build_report(directory)))
+        if close_killed(directory):
+            remark("the run was killed: its complete frames are kept")
+        say(str(interruptible(lambda: build_report(directory))))

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from dvax._figure_text import figure_text
 from dvax.cli.ahead import loaded_ahead
 from dvax.cli.failure import reported
 from dvax.cli.options import AllowOutside, ConfigFile, Debug, Force, Quiet
@@ -31,7 +32,7 @@ def run(
     debug: Debug = False,
 ) -> None:
     """Solve the system that CONFIG.toml describes; results, manifest and report go into DIR."""
-    with reported(debug):
+    with reported(debug, out):
         # Both are checked before anything is refused: one round is enough to mend all of it.
         problems: list[InputProblem] = target_problems(out, force=force)
         try:
@@ -46,8 +47,9 @@ def run(
 def _load(file: Path, allow_outside: bool) -> "Config | ModelConfig":
     enable_double()
     from dvax.runs.applications.config import read_config
+    from dvax.runs.interrupt import interruptible
 
-    return read_config(file, allow_outside=allow_outside)
+    return interruptible(lambda: read_config(file, allow_outside=allow_outside))
 
 
 def carry_out(config: "Config | ModelConfig", out: Path, *, force: bool, quiet: bool) -> None:
@@ -69,39 +71,31 @@ def carry_out(config: "Config | ModelConfig", out: Path, *, force: bool, quiet: 
         _say_figures(outcome.summary)
     if outcome.exit_code:
         remark(f"{outcome.status}: {outcome.stop_reason}", "bold red")
-        # An application is solved in one piece, so that there is nothing until then.
-        in_one_piece = isinstance(config, ModelConfig)
-        kept = "the settings and the log are" if in_one_piece else "what was computed until then is"
+        known = outcome.has_results
+        kept = "what was computed until then is" if known else "the settings and the log are"
         remark(f"{kept} in {outcome.directory}")
     elif not quiet:
         remark(f"{outcome.status}: {outcome.stop_reason}")
     if config.output.report:
         from dvax.plots import build_report
+        from dvax.runs.interrupt import interruptible
 
-        page = build_report(outcome.directory, stills=config.output.png)
+        # Who interrupts a run waits for its end: the stills would take the longest.
+        stills = config.output.png and outcome.status != "interrupted"
+        page = interruptible(lambda: build_report(outcome.directory, stills=stills))
         if not quiet:
             remark(f"report: {page}")
     if outcome.exit_code:
         raise typer.Exit(outcome.exit_code)
 
 
-_FEW = 4
-"""So many entries of a list are shown; all of them are in summary.json."""
-
-
-def _shown(value: Any) -> str:
-    return f"{value:.10g}" if isinstance(value, float) else str(value)
-
-
 def _say_figures(summary: dict[str, Any]) -> None:
     """The model's headline figures: name, value, unit, meaning."""
     rows = []
     for name, entry in summary.items():
-        value = entry["value"]
-        parts = value if isinstance(value, list) else [value]
-        shown = ", ".join(_shown(v) for v in parts[:_FEW])
-        if len(parts) > _FEW:
-            shown += f", … ({len(parts)} in all)"
+        if name == "status":
+            continue  # it is the last line, and in the exit code
+        shown = figure_text(entry["value"], entry.get("error"))
         unit = "" if entry["unit"] == "1" else entry["unit"]
         rows.append((name, f"{shown} {unit}".strip(), entry["meaning"]))
     if rows:

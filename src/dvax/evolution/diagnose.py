@@ -1,52 +1,395 @@
-"""Naming what went wrong: which function returned which bad value, when, and where."""
+"""Why a solve stopped: the cause that there is evidence for, and the options that help.
 
-from typing import Any
+Each cause is tested at the last state (t, x) that was reached, on the functions themselves:
+
+- a value that is not finite, by evaluating K, P, A, h and f along x + s x' over the last step, with the
+  earliest such time found by bisection;
+- a jump of K, h or f, by bisection of a few steps around t;
+- a finite-time escape, x' growing as |x|^p with p > 1, infinite after |x| / ((p − 1) |x'|);
+- rounding: steps of the size of the spacing of floating-point numbers at t, or a tolerance below the
+  rounding of f;
+- stiffness: a derivative of f̃ (or of Ax + f̃ for explicit methods) of which h times the largest
+  eigenvalue, found by power iteration, is of order one while x changes far more slowly;
+- a law that is not monotone, by the smallest eigenvalue of the symmetric part of ∂F/∂y.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 
+from .. import _tree
 from .._tree import Tree
-from ..errors import InputError
+from ..errors import Fix, InputError, SolveError
 from .flow import Flow
+from .method import AbstractMethod
+from .nonfinite import first_bad
+from .results import RESULTS
+from .runge_kutta import DormandPrince
+from .setup import Setup
+
+_LAST_STEPS = 64.0
+"""Steps ahead of the last state in which a cause is looked for."""
+_JUMP, _ROUNDINGS = 1e-7, 1e3
+"""A change of a function within two roundings of t is a jump above this part of its size, or so many
+of its own roundings."""
+_LOOSEST = 0.01
+"""The loosest rtol that is ever named as a fix."""
+_DENSE = 64
+"""Unknowns up to which a derivative of the law is formed as a matrix."""
+_LINEARISABLE = 400
+"""Unknowns up to which `ExpRosenbrock` is the method to name for a stiff problem."""
 
 
-def diagnose(flow: Flow, t: Any, x: Tree) -> str:
-    """A sentence naming the first of K, h, f that is not finite at (t, x) or shortly after.
+class Diagnosis(NamedTuple):
+    """The cause in a sentence or two ("" where there is no evidence), and what helps."""
 
-    x is the last good state, so what broke may only show a little later: the state is carried on by
-    the last good rate over growing fractions of a step, until something breaks.
-    """
-    problem, args = flow.problem, flow.args
-    like = problem.zero_control(x)
-    for ahead in (0.0, *np.geomspace(1e-12, 1.0, 25)):
-        later = jnp.asarray(t + ahead * max(1.0, abs(float(t))))
-        pieces = {
-            "K": lambda s=later: problem.set_at(s, args),
-            "h": lambda s=later: problem.h(s, x, like, args),
-            "f": lambda s=later: problem.f(s, x, like, args),
-            "the law (h at its solution)": lambda s=later: flow.rate(s, x, None).y,
-            "f at the law's solution": lambda s=later: flow.rate(s, x, None).value,
+    cause: str = ""
+    fixes: tuple[Fix, ...] = ()
+
+
+class _Stop(NamedTuple):
+    """Where a run stopped, with all that the tests of causes need."""
+
+    setup: Setup
+    flow: Flow
+    t: float
+    x: Tree
+    step: float
+    steps: int
+    attempts: int
+
+    @property
+    def span(self) -> tuple[float, float]:
+        return float(self.setup.setting["t0"]), float(self.setup.setting["t1"])
+
+    @property
+    def ulp(self) -> float:
+        """The spacing of floating-point numbers at t, in the precision of the state."""
+        return float(jnp.finfo(self.setup.dtype).eps) * abs(self.t)
+
+    def time(self, t: float) -> jax.Array:
+        return jnp.asarray(t, self.setup.dtype)
+
+    def velocity(self, t: Any, x: Tree) -> Tree:
+        """x' = Ax + f̃(t, x)."""
+        return _tree.add(self.flow.generator.apply(x), self.flow.rate(t, x, None).value)
+
+    def norm(self, x: Tree) -> float:
+        return float(self.flow.state_space(self.x).norm(x))
+
+
+def failure(setup: Setup, stats: dict[str, Any], result: RESULTS, solution: Any) -> SolveError:
+    """The `SolveError` of a run that stopped: what happened, the cause, how far it came, what helps."""
+    found = diagnose(setup, stats, result)
+    reached = f"Stopped at t = {float(stats['t']):.17g} after {int(stats['steps'])} steps."
+    parts = (RESULTS[result], found.cause, reached)
+    return SolveError(" ".join(part for part in parts if part), solution, found.fixes)
+
+
+def diagnose(setup: Setup, stats: dict[str, Any], result: RESULTS) -> Diagnosis:
+    """The cause of a failure that the functions themselves show; see the module."""
+    t, step = float(stats["t"]), float(stats["next_dt"])
+    t0, t1 = float(setup.setting["t0"]), float(setup.setting["t1"])
+    if not math.isfinite(step) or step <= 0:
+        step = setup.setting["dt"] if math.isfinite(setup.setting["dt"]) else (t1 - t0) * 1e-3
+    steps, rejected = int(stats["steps"]), int(stats["rejected"])
+    stop = _Stop(
+        setup, setup.flow(), t, stats["x"], min(float(step), max(t1 - t, 0.0)), steps,
+        steps + rejected,
+    )  # fmt: skip
+    causes: list[Callable[[_Stop], Diagnosis]] = []
+    if result != RESULTS.max_steps:
+        causes += [_nonfinite]
+    if result == RESULTS.law_unsolved:
+        causes += [_law]
+    causes += [_escape]
+    if result != RESULTS.law_unsolved and result != RESULTS.nonfinite:
+        causes += [_jump, _resolution, _tolerance, _stiff]
+    if result == RESULTS.max_steps:
+        causes += [_too_few]
+    for cause in causes:
+        found = cause(stop)
+        if found.cause:
+            return found
+    return Diagnosis()
+
+
+def _nonfinite(stop: _Stop) -> Diagnosis:
+    """The first of A, P, K, h, f that is not finite on the way to the next step."""
+    flow, problem, args = stop.flow, stop.flow.problem, stop.flow.args
+    like = problem.zero_control(stop.x)
+    begin, velocity = stop.time(stop.t), None
+    if not first_bad(stop.x):
+        try:
+            velocity = stop.velocity(begin, stop.x)
+        except InputError:
+            pass  # K is refused at t itself: the search below says so
+    if velocity is None or first_bad(velocity):
+        velocity = _tree.zeros_like(stop.x)
+
+    def pieces(ahead: float) -> dict[str, Callable[[], Tree]]:
+        s = stop.time(stop.t + ahead)
+        x = jtu.tree_map(lambda a, b: a + stop.time(ahead) * b, stop.x, velocity)
+        u = lambda: flow.operator.inverse(flow.rate(s, x, None).y)  # noqa: E731
+        return {
+            "A x": lambda: flow.generator.apply(x),
+            "K": lambda: problem.set_at(s, args),
+            "h": lambda: problem.h(s, x, like, args),
+            "the response u": u,
+            "f": lambda: problem.f(s, x, u(), args),
         }
-        for name, evaluate in pieces.items():
-            try:
-                found = _first_bad(evaluate(), allow_infinite=name == "K")
-            except InputError as refused:
-                return f"K is refused at t = {float(later):.9g}: {refused}"
-            if found:
-                return f"{name} is {found} at t = {float(later):.9g}."
-    return ""
+
+    def bad(name: str, ahead: float) -> str:
+        try:
+            return first_bad(pieces(ahead)[name](), allow_infinite=name == "K")
+        except InputError as refused:
+            problem = refused.problems[0]
+            return f"refused, {problem.place}: {problem.given}; {problem.rule}"
+
+    far = min(stop.span[1] - stop.t, _LAST_STEPS * max(stop.step, 4.0 * stop.ulp))
+    offsets = [0.0, *(far * np.geomspace(1e-12, 1.0, 13))] if far > 0 else [0.0]
+    good = 0.0
+    for ahead in offsets:
+        for name in pieces(ahead):
+            found = bad(name, ahead)
+            if not found:
+                continue
+            low, high = good, float(ahead)
+            while high - low > max(stop.ulp, 1e-9 * high) and high > 0:
+                middle = 0.5 * (low + high)
+                low, high = (low, middle) if bad(name, middle) else (middle, high)
+            at = stop.t + high
+            return Diagnosis(
+                f"{name} is {bad(name, high) or found} at t = {at:.12g}.",
+                (Fix("", "", f"Check {name.split()[0]} there"),),
+            )
+        good = float(ahead)
+    return Diagnosis()
 
 
-def _first_bad(tree: Tree, allow_infinite: bool) -> str:
-    leaves = jax.tree_util.tree_leaves(tree)
-    for k, leaf in enumerate(leaves):
-        array = np.asarray(leaf)
-        bad = np.isnan(array) if allow_infinite else ~np.isfinite(array)
-        if bad.any():
-            index = tuple(int(i) for i in np.argwhere(bad)[0])
-            value = array[index]
-            part = f" of part {k}" if len(leaves) > 1 else ""
-            place = f" in component {index}{part}" if index else part
-            return f"{value}{place} ({int(bad.sum())} of {bad.size} entries)"
-    return ""
+def _jump(stop: _Stop) -> Diagnosis:
+    """A jump of K, h or f in t, next to where the run stopped."""
+    flow, problem, args = stop.flow, stop.flow.problem, stop.flow.args
+    t0, t1 = stop.span
+    width = _LAST_STEPS * max(stop.step, 4.0 * stop.ulp)
+    low, high = max(t0, stop.t - width), min(t1, stop.t + width)
+    u = flow.operator.inverse(flow.rate(stop.time(stop.t), stop.x, None).y)
+    pieces: dict[str, Callable[[Any], Tree]] = {
+        "K": lambda s: problem.set_at(s, args),
+        "h": lambda s: problem.h(s, stop.x, u, args),
+        "f": lambda s: problem.f(s, stop.x, u, args),
+    }
+    eps = float(jnp.finfo(stop.setup.dtype).eps)
+    for name, evaluate in pieces.items():
+
+        def values(s: float, evaluate: Callable[[Any], Tree] = evaluate) -> np.ndarray:
+            leaves = [np.ravel(leaf) for leaf in jtu.tree_leaves(evaluate(stop.time(s)))]
+            return np.concatenate(
+                [leaf for leaf in leaves if leaf.dtype.kind == "f"] or [np.zeros(0)]
+            )
+
+        a, b = low, high
+        before, after = values(a), values(b)
+        while b - a > 2.0 * max(stop.ulp, 5e-324):
+            middle = 0.5 * (a + b)
+            if not a < middle < b:
+                break
+            between = values(middle)
+            if _change(before, between)[0] >= _change(between, after)[0]:
+                b, after = middle, between
+            else:
+                a, before = middle, between
+        change, k = _change(before, after)
+        size = float(np.max(np.abs(np.stack([before, after])), initial=0.0))
+        if change > max(_JUMP * size, _ROUNDINGS * eps * size) and b - a < 1e-9 * (t1 - t0):
+            where = f" in component {k}" if before.size > 1 else ""
+            return Diagnosis(
+                f"{name} jumps from {before[k]:.6g} to {after[k]:.6g}{where} at t = {b:.15g}, and no "
+                "step across a jump that is not announced meets the tolerance.",
+                (Fix("knots", f"[{b:.15g}]", "so that a step ends there: dvax.signals.Function"),),
+            )
+    return Diagnosis()
+
+
+def _change(a: np.ndarray, b: np.ndarray) -> tuple[float, int]:
+    """The largest change of a component, and which it is."""
+    if a.size == 0:
+        return 0.0, 0
+    with np.errstate(invalid="ignore"):  # bounds of K may be infinite
+        apart = np.where(a == b, 0.0, np.abs(b - a))
+    apart = np.where(np.isfinite(apart), apart, 0.0)
+    k = int(np.argmax(apart))
+    return float(apart[k]), k
+
+
+def _escape(stop: _Stop) -> Diagnosis:
+    """|x| grows as a power of itself above 1 (a finite-time escape), or exponentially without end."""
+    size, first = _largest(stop.x), _largest(stop.setup.x0)
+    if not size > 10.0 * (1.0 + first):
+        return Diagnosis()
+    t0, t1 = stop.span
+    grown = f"|x| has grown from {first:.6g} to {size:.6g} at t = {stop.t:.12g}"
+    v = stop.velocity(stop.time(stop.t), stop.x)
+    speed = _largest(v)
+    if math.isfinite(size) and math.isfinite(speed) and speed > 0:
+        scale = size / speed
+        ahead = 1e-4 * scale
+        later = jtu.tree_map(lambda a, b: a + stop.time(ahead) * b, stop.x, v)
+        faster = _largest(stop.velocity(stop.time(min(stop.t + ahead, t1)), later))
+        larger = _largest(later)
+        if larger > size and faster > 0:
+            power = math.log(faster / speed) / math.log(larger / size)
+            left = scale / max(power - 1.0, 1e-300)
+            if power > 1.05 and stop.t + left < t1 and left < 0.05 * (stop.t - t0):
+                at = stop.t + left
+                return Diagnosis(
+                    f"{grown}, and its rate grows like |x|^{power:.3g}: a finite-time escape. The "
+                    f"solution becomes infinite at t ≈ {at:.6g} and exists up to there only.",
+                    (
+                        Fix("t1", f"{t0 + 0.99 * (at - t0):.6g}", "to end before the escape"),
+                        Fix("", "", "Check the signs in f if x should stay bounded"),
+                    ),
+                )
+    if size > 1e15 * (1.0 + first):
+        rate = math.log(size / max(first, 1e-300)) / max(stop.t - t0, 1e-300)
+        return Diagnosis(
+            f"{grown}: exponential growth, at the mean rate {rate:.3g} per unit of time.",
+            (Fix("", "", "Check the signs in A and f if x should stay bounded"),),
+        )
+    return Diagnosis()
+
+
+def _largest(x: Tree) -> float:
+    """max |xᵢ|: a norm would overflow before the state does."""
+    return float(max(np.max(np.abs(np.asarray(leaf))) for leaf in jtu.tree_leaves(x)))
+
+
+def _resolution(stop: _Stop) -> Diagnosis:
+    """Steps of the size of the spacing of floating-point numbers at t."""
+    t0, t1 = stop.span
+    if not (stop.ulp > 0 and stop.step <= 64.0 * stop.ulp and stop.ulp > 1e-14 * (t1 - t0)):
+        return Diagnosis()
+    return Diagnosis(
+        f"The steps ({stop.step:.3g}) are as small as the rounding of t ({stop.ulp:.3g} at "
+        f"t = {stop.t:.12g}).",
+        (
+            Fix(
+                "",
+                "",
+                "Count time from the start of the run, so that |t| is not large against t1 − t0",
+            ),
+        ),
+    )
+
+
+def _tolerance(stop: _Stop) -> Diagnosis:
+    """A tolerance below the rounding of f̃."""
+    rtol, atol, horizon = (float(stop.setup.setting[n]) for n in ("rtol", "atol", "horizon"))
+    if math.isfinite(stop.setup.setting["dt"]):
+        return Diagnosis()
+    size = stop.norm(stop.x)
+    rate = stop.norm(stop.flow.rate(stop.time(stop.t), stop.x, None).value)
+    eps = float(jnp.finfo(stop.setup.dtype).eps)
+    asked, possible = (atol + rtol * size) / horizon, 16.0 * eps * max(rate, size / horizon)
+    if not asked < possible:
+        return Diagnosis()
+    reachable = 100.0 * possible * horizon / max(size, 1e-300)
+    fix = Fix("rtol", f"{reachable:.1g}", "which rounding allows")
+    if reachable > _LOOSEST:
+        fix = Fix("t1", f"{stop.span[0] + horizon * _LOOSEST / reachable:.3g}", "a shorter run")
+    return Diagnosis(
+        f"The tolerance asks for a defect below (atol + rtol |x|)/horizon = {asked:.3g}, and the "
+        f"rounding of f alone is {possible:.3g}.",
+        (fix,),
+    )
+
+
+def _stiff(stop: _Stop) -> Diagnosis:
+    """h λ of order one, for the eigenvalue λ of largest modulus, while x changes slowly."""
+    method = stop.setup.method
+    if not isinstance(method, AbstractMethod) or method.linearises:
+        return Diagnosis()
+    whole = isinstance(method, DormandPrince)
+    of = stop.velocity if whole else lambda t, x: stop.flow.rate(t, x, None).value
+    t = stop.time(stop.t)
+    push = jax.jit(lambda v: jax.jvp(lambda x: of(t, x), (stop.x,), (v,))[1])
+    space = stop.flow.state_space(stop.x)
+    # A fixed vector with a part in every direction.
+    v = jtu.tree_map(
+        lambda leaf: jnp.cos(1.0 + jnp.arange(leaf.size, dtype=leaf.dtype)).reshape(leaf.shape),
+        stop.x,
+    )
+    rate, sign = 0.0, 0.0
+    for _ in range(30):
+        v = _tree.scale(1.0 / space.norm(v), v)
+        w = push(v)
+        rate, sign = stop.norm(w), float(space.inner(v, w))
+        if not (math.isfinite(rate) and rate > 0):
+            return Diagnosis()
+        v = w
+    t0, t1 = stop.span
+    own = stop.norm(stop.velocity(t, stop.x)) / max(stop.norm(stop.x), 1e-300)
+    product = rate * max(stop.step, (stop.t - t0) / max(stop.steps, 1))
+    if not (sign < 0 and product > 0.3 and rate * (t1 - t0) > 1e3 and own < 0.1 * rate):
+        return Diagnosis()
+    many = sum(leaf.size for leaf in jtu.tree_leaves(stop.x)) > _LINEARISABLE
+    what = "Ax + f" if whole else "f"
+    return Diagnosis(
+        f"The problem is stiff for {type(method).__name__}: {what} has an eigenvalue of about "
+        f"{-rate:.3g}, times the step {product:.2g}, while x itself changes at the rate {own:.3g}: "
+        "stability limits the steps, not the tolerance.",
+        (Fix("method", "Implicit" if many else "ExpRosenbrock", "which is stable there"),),
+    )
+
+
+def _too_few(stop: _Stop) -> Diagnosis:
+    """The number of steps, and what the run would need at its last pace."""
+    t1 = stop.span[1]
+    left = (t1 - stop.t) / max(stop.step, 5e-324)
+    text = (
+        f"max_steps = {stop.attempts} attempts were used, with t1 = {t1:.12g} still {t1 - stop.t:.3g} "
+        f"away and a last step of {stop.step:.3g}."
+    )
+    enough = 2.0 * stop.attempts + 1.5 * left
+    if enough < 2**31:
+        return Diagnosis(text, (Fix("max_steps", f"{math.ceil(enough)}", "at this pace"),))
+    rtol = float(stop.setup.setting["rtol"])
+    more = (Fix("method", "ExpRosenbrock", "whose steps may be longer"),)
+    return Diagnosis(text, (*more, Fix("rtol", f"{min(1e-2, 100 * rtol):.1g}", "for longer steps")))
+
+
+def _law(stop: _Stop) -> Diagnosis:
+    """Whether F(y) = P⁻¹y − h(t, x, P⁻¹y) fails to be monotone at the last state."""
+    problem, args, t = stop.flow.problem, stop.flow.args, stop.time(stop.t)
+    at = f"at t = {stop.t:.12g}"
+    y = stop.flow.rate(t, stop.x, None).y
+    like = problem.zero_control(stop.x)
+    if y is None or first_bad(y):
+        y = like
+    flat, unravel = jax.flatten_util.ravel_pytree(y)
+    fix = Fix("", "", "Check the sign of the way in which h depends on u")
+    if flat.size <= _DENSE:
+        F = problem.frozen(t, stop.x, args)
+        M = np.asarray(jax.jacfwd(lambda v: jax.flatten_util.ravel_pytree(F(unravel(v)))[0])(flat))
+        if np.isfinite(M).all():
+            least = float(np.linalg.eigvalsh(0.5 * (M + M.T))[0])
+            if least <= 0:
+                return Diagnosis(
+                    f"F(y) = P⁻¹y − h(t, x, P⁻¹y) is not strongly monotone {at}: the symmetric part of "
+                    f"its derivative has the eigenvalue {least:.6g} ≤ 0, so that the law may have no "
+                    "solution or several.",
+                    (fix,),
+                )
+    return Diagnosis(
+        f"The law had not been solved to its tolerance {at}.",
+        (
+            Fix("vi_solver", "Extragradient", "or another solver of dvax.vi with more iterations"),
+            fix,
+        ),
+    )

@@ -294,6 +294,10 @@ def _assembled(
     us, ys, residual, law_step, law_error = _responses(
         flow, rows.t, rows.x, setup.problem.spaces(setup.x0)[1], setup.moduli
     )
+    # f may not feel a response that is not finite, and the solution would hold it all the same.
+    result = RESULTS.where(
+        (result == RESULTS.successful) & ~_tree.all_finite(us), RESULTS.nonfinite, result
+    )
     return Solution(
         ts=rows.t,
         xs=rows.x,

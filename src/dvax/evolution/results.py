@@ -7,13 +7,10 @@ class RESULTS(eqx.Enumeration):
     """How a solve ended, in a sentence."""
 
     successful = "The end time was reached."
-    max_steps = (
-        "The largest number of steps was reached before t1. Raise max_steps, or loosen rtol."
-    )
+    max_steps = "The largest number of steps was reached before t1."
     step_too_small = (
         "The step became too small to move t, or to lower its error, while the defect stayed above "
-        "the tolerance. The data is discontinuous at that time (name it: dvax.signals knots), or "
-        "rtol and atol ask for less than the rounding of f, h and K."
+        "the tolerance."
     )
     picard_unsettled = (
         "Picard's sweeps did not converge on a window, however short, or the law was not solved there. "
@@ -24,7 +21,4 @@ class RESULTS(eqx.Enumeration):
         "NaN or infinite there, or jump; or give dvax.Implicit(solver) a root finder of its own."
     )
     nonfinite = "f, h or K returned NaN or infinity."
-    law_unsolved = (
-        "The frozen law was not solved to its tolerance. Check that it is strongly pseudomonotone "
-        "(dvax.solve_vi at that time and state), or give vi_solver= more iterations."
-    )
+    law_unsolved = "The frozen law was not solved to its tolerance."

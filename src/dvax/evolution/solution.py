@@ -9,7 +9,8 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem, SolveError
+from ..errors import InputError, InputProblem
+from .diagnose import failure
 from .extent import Extent
 from .implicit import Implicit
 from .loop import Record
@@ -167,7 +168,7 @@ class Solution(eqx.Module):
     def raise_if_failed(self) -> "Solution":
         """This solution, or a `dvax.SolveError` that carries it."""
         if self.result != RESULTS.successful:
-            raise SolveError(RESULTS[self.result], self)
+            raise failure(self.setup, self.stats, self.result, self)
         return self
 
     def to_xarray(self) -> "xarray.Dataset":

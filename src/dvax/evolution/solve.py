@@ -5,21 +5,30 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from .. import _tree
+from .. import _tree, _user_code
 from .._tree import Tree
-from ..errors import DifferentiationError, InputError, InputProblem, SolveError
+from ..errors import DifferentiationError, InputError, InputProblem
 from ..problem import Problem
 from ..vi import AbstractSolver, Auto
-from .arguments import bound_steps, check, warn_precision
+from .arguments import (
+    FIRST_GROWTH,
+    bound_steps,
+    check,
+    check_memory,
+    first_step,
+    warn_precision,
+)
 from .certified import certified, of_region
 from .compiled import compiled
 from .control import GROWTH
-from .diagnose import diagnose
+from .diagnose import failure
 from .implicit import Implicit
 from .integrate import Options
 from .method import ETD2RK, AbstractMethod
+from .nonfinite import refuse_nonfinite_data
 from .picard import Picard
 from .results import RESULTS
 from .setup import Setup, as_arrays
@@ -27,12 +36,6 @@ from .solution import Solution
 
 _METHOD, _VI_SOLVER = ETD2RK(), Auto()
 """The defaults, which nothing changes; making them would be felt in a short run."""
-
-
-_FIRST, _FIRST_GROWTH = 1e-6, 1e3
-"""The first adaptive step as a share of the run, and the largest growth factor after it. Such a step
-costs one step and no compilation; its error estimate gives the scale of the problem, where the rule of
-Hairer, Nørsett and Wanner (1993, II.4) takes two evaluations and a norm of the second derivative."""
 
 
 def solve(
@@ -118,6 +121,11 @@ def solve(
     if certified_tol is not None:
         x0 = _tree.as_float(x0, "x0")
         _only_adaptive(dt, method)
+        check(
+            problem, x0, t0, t1, ts, dt, 0.0, 1.0, dt0, dt_max, horizon,
+            _METHOD if method is None else method, adjoint, measure, dense, vi_solver, max_steps,
+            constants,
+        )  # fmt: skip
         again: dict[str, Any] = dict(
             method=method, vi_solver=vi_solver, progress=progress, constants=constants, dense=dense,
             dt0=dt0, dt_max=dt_max, max_steps=max_steps, adjoint=adjoint, throw=throw,
@@ -130,35 +138,23 @@ def solve(
     x0 = _tree.as_float(x0, "x0")
     method = _METHOD if method is None else method
     check(
-        problem,
-        x0,
-        t0,
-        t1,
-        ts,
-        dt,
-        rtol,
-        atol,
-        dt0,
-        dt_max,
-        horizon,
-        method,
-        adjoint,
-        measure,
-        dense,
-    )
+        problem, x0, t0, t1, ts, dt, rtol, atol, dt0, dt_max, horizon, method, adjoint, measure, dense,
+        vi_solver, max_steps, constants,
+    )  # fmt: skip
     fixed = dt is not None
     if not fixed:
         warn_precision(x0, rtol)
     t0, t1 = _number(t0), _number(t1)
     span = t1 - t0
+    dtype = jnp.result_type(*jax.tree_util.tree_leaves(x0))
     setting = {
         "t0": t0,
         "t1": t1,
         "dt": math.nan if dt is None else _number(dt),
         "rtol": _number(rtol),
         "atol": _number(atol),
-        "dt0": span * _FIRST if dt0 is None else _number(dt0),
-        "dt0_growth": _FIRST_GROWTH if dt0 is None else GROWTH,
+        "dt0": first_step(span, t0, t1, dtype) if dt0 is None else _number(dt0),
+        "dt0_growth": FIRST_GROWTH if dt0 is None else GROWTH,
         "dt_max": math.inf if dt_max is None else _number(dt_max),
         "horizon": span if horizon is None else _number(horizon),
     }
@@ -173,6 +169,9 @@ def solve(
         adjoint=adjoint,
         progress=progress,
     )
+    if dense and isinstance(method, AbstractMethod):
+        entries = sum(leaf.size for leaf in jax.tree_util.tree_leaves(x0))
+        check_memory(entries, jnp.dtype(dtype).itemsize, options.max_steps, method.degree)
     vi_solver = _VI_SOLVER if vi_solver is None else vi_solver
     setup = Setup(problem, x0, args, setting, method, vi_solver, _moduli(constants))
     times = None if ts is None else _times(ts)
@@ -183,12 +182,13 @@ def solve(
         solution = _trim(solution)
         if solution.result != RESULTS.successful:
             # Data that ends too early is NaN from there on: then that is what is wrong.
+            refuse_nonfinite_data(problem, args, "dvax.solve")
             problem.knots(t0, t1, x0, as_arrays(args))
             if fixed:
                 # Once more, keeping the last good state, to say where it went wrong.
                 solution = _trim(compiled(setup, times, options._replace(careful=True))[0])
             if throw:
-                raise SolveError(_explain(solution), solution)
+                raise failure(solution.setup, solution.stats, solution.result, solution)
     return solution
 
 
@@ -211,6 +211,8 @@ def _differentiably(
 ) -> tuple[Solution, bool | jax.Array]:
     try:
         return compiled(setup, times, options)
+    except jax.errors.UnexpectedTracerError as error:
+        raise _user_code.leaked(error) from error
     except (TypeError, ValueError) as error:
         forward = "forward-mode autodiff" in str(error) or "custom_vjp" in str(error)
         if options.adjoint == "reverse" and forward:
@@ -263,11 +265,3 @@ def _trim(solution: Solution) -> Solution:
     return eqx.tree_at(
         lambda s: [getattr(s, name) for name in fields], solution, new, is_leaf=lambda x: x is None
     )
-
-
-def _explain(solution: Solution) -> str:
-    where = diagnose(solution.setup.flow(), solution.stats["t"], solution.stats["x"])
-    sentence = RESULTS[solution.result]
-    reached = f"Stopped at t = {float(solution.stats['t']):.17g} after "
-    reached += f"{int(solution.stats['steps'])} steps."
-    return " ".join(part for part in (sentence, where, reached) if part)

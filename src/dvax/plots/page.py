@@ -92,7 +92,7 @@ def _banner(run: RunRecord) -> str:
         gone = run.status == "running"
         reason = "" if gone else str(run.manifest.get("stop_reason") or "")
         text = " ".join(part for part in (UNFINISHED[run.status], reach, reason) if part)
-        head = "No results." if run.trajectory is None else "Partial results."
+        head = "No results." if run.trajectory is None and not run.data else "Partial results."
         lines.append(
             f'<div class="banner partial" role="alert"><b>{head}</b> {_escape(text)}</div>'
         )
@@ -103,6 +103,8 @@ def _banner(run: RunRecord) -> str:
 
 
 def _reach(run: RunRecord) -> str:
+    if run.data:
+        return ""  # the reason says how far it came
     if run.trajectory is None:
         return "Nothing was written." if run.data is not None else "No frame was written."
     unit = run.unit("time")

@@ -20,6 +20,7 @@ from dvax.plots.frames import Frames, open_frames
 # What manifest.json calls a run that did not reach its end, and what a reader should know of it.
 UNFINISHED = {
     "running": "The run had not ended when this report was made: it is going on, or was killed.",
+    "killed": "The run was killed before its end.",
     "interrupted": "The run was interrupted before its end.",
     "failed": "The run failed before its end.",
 }

@@ -1,7 +1,9 @@
 """From a run directory to its report: `report.html` and `figures/*.png`."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from dvax.plots.applications import application_pictures
 from dvax.plots.certificate import certificate_picture
@@ -31,6 +33,8 @@ def build_report(run_dir: Path | str, *, stills: bool = True) -> Path:
 
 def _pictures(run: RunRecord) -> tuple[list[Picture], list[str]]:
     """The pictures that the run can give, and a sentence for each that it cannot."""
+    if run.data and "state_part0" in run.data:
+        return [], ["The run was stopped before more than its states could be written."]
     if run.data:
         return application_pictures(run.model, run.data), []
     if run.trajectory is None:
@@ -59,12 +63,25 @@ def _pictures(run: RunRecord) -> tuple[list[Picture], list[str]]:
 def _write_stills(folder: Path, pictures: list[Picture]) -> None:
     folder.mkdir(exist_ok=True)
     for picture in pictures:
-        picture.still().savefig(folder / f"{picture.key}.png")
+        file, drawn = folder / f"{picture.key}.png", picture.still()
+        _written(file, lambda beside, drawn=drawn: drawn.savefig(beside, format="png"))
 
 
 def _write_whole(file: Path, text: str) -> Path:
-    """Write beside, then rename: a report is whole or the old one."""
-    beside = file.with_name(file.name + ".part")
-    beside.write_text(text, encoding="utf-8")
-    os.replace(beside, file)
+    _written(file, lambda beside: beside.write_text(text, encoding="utf-8"))
     return file
+
+
+def _written(file: Path, write: Callable[[Path], Any]) -> None:
+    """Write beside, then rename: a file is whole or the old one, and where the disk is full nothing is
+    left over.
+
+    **Raises:** `OSError` with the name of the file.
+    """
+    beside = file.with_name(file.name + ".part")
+    try:
+        write(beside)
+        os.replace(beside, file)
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise type(error)(error.errno, error.strerror, str(file)) from error

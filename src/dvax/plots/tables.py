@@ -5,6 +5,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from dvax._figure_text import figure_text
 from dvax.plots.look import number, quantity
 from dvax.plots.record import RunRecord
 
@@ -27,22 +28,20 @@ FACTS = {
 SHOWN_ELSEWHERE = ("constants", "assumptions")
 
 
-_FEW = 4
-"""So many entries of a list are shown; all of them are in summary.json."""
-
-
 def headline_cards(run: RunRecord) -> str:
     """summary.json: one card a figure, its meaning beneath."""
     cards = []
     for name, entry in run.summary.items():
+        if name == "status":
+            continue  # it stands at the top of the page, and among the facts of the run
         value = entry.get("value")
-        listed = value if isinstance(value, list) else [value]
-        text = ", ".join(number(item) for item in listed[:_FEW])
-        if len(listed) > _FEW:
-            text += f", … ({len(listed)} in all)"
+        text = figure_text(value, entry.get("error"))
+        shown = escaped(quantity_text(text, str(entry.get("unit", ""))))
+        # All digits, for who points at it.
+        whole = "" if isinstance(value, list) else f' title="{escaped(repr(value))}"'
         cards.append(
             f'<div class="card"><div class="name">{escaped(_words(name))}</div>'
-            f'<div class="value">{escaped(quantity_text(text, str(entry.get("unit", ""))))}</div>'
+            f'<div class="value"{whole}>{shown}</div>'
             f'<div class="meaning">{escaped(str(entry.get("meaning", "")))}</div></div>'
         )
     if not cards:

@@ -20,10 +20,10 @@ from dvax.runs.fields import Sources
 from dvax.runs.schema import OPTIONAL, SECTIONS
 from dvax.runs.schema_errors import shown, translate, unknown_key
 from dvax.runs.settings import Config as Config
+from dvax.runs.solver_options import MOST_STEPS
 from dvax.runs.units import Units
 
 MAX_BYTES = 2**20
-MOST_STEPS = 2**30
 _RTOL = 1e-6
 _ATOL_OF_SCALE = 1e-9  # of the model's own indentation scale
 
@@ -94,15 +94,46 @@ def parse(source: Path) -> dict[str, Any]:
         message = str(error)
         found = re.search(r"\(at line (\d+), column (\d+)\)", message)
         place = f"{name}, line {found[1]}, column {found[2]}" if found else f"{name}, at its end"
-        reason = re.sub(r"\s*\(at .*\)$", "", message)
-        raise refuse(
-            place, reason, "the file is not TOML", 'Write key = value; texts in "quotes".'
-        ) from None
+        lines = text.splitlines() or [""]
+        line = lines[min(int(found[1]), len(lines)) - 1] if found else lines[-1]
+        raise refuse(place, repr(line.strip()[:120]), *_broken_toml(message, line)) from None
     except (RecursionError, ValueError) as error:
         # tomllib lets the errors of int() and of deep nesting through.
         raise refuse(
             name, shown(str(error)), "the file is not readable as TOML", "Write it simpler."
         ) from None
+
+
+_TOML = (
+    ("Invalid value", "what stands after = is no value of TOML",
+     'Write a number with a point (0.5), true or false, a text in "quotes", or a list [1, 2].'),
+    ("Expected '=' after a key", "a line is key = value, or a heading [table]",
+     "Write = between the key and its value, and put keys with blanks in quotes."),
+    ("Invalid statement", "a line is key = value, or a heading [table]",
+     "Start comments with #, and keys with a letter."),
+    ("Cannot overwrite a value", "every key occurs once in its table",
+     "Remove one of the two lines with this key."),
+    ("Cannot declare", "every heading [table] occurs once, and [[table]] makes entries of a list",
+     "Join the two tables, or write [[table]] for each entry."),
+    ("Expected newline or end of document", "a value ends with its line",
+     'Write one key = value a line, numbers as 0.5 or 1e-3, and quantities in quotes: "5 ms".'),
+    ("Unterminated string", "a text ends with the quote it began with", "Close the quotes."),
+    ("Illegal character", "a text in quotes stands on one line", "Close the quotes on this line."),
+    ("Expected ']' at the end of a table", "a heading ends with ]", "Close the bracket."),
+    ('Expected "\'"', "a text ends with the quote it began with", "Close the quotes."),
+    ("Unclosed array", "a list ends with ]", "Close the bracket."),
+    ("Unescaped", "a backslash in a text in quotes begins an escape",
+     "Write paths with / or in 'single quotes'."),
+)  # fmt: skip
+
+
+def _broken_toml(message: str, line: str) -> tuple[str, str]:
+    """The rule that a line breaks, and the fix, from what the parser says."""
+    for start, rule, fix in _TOML:
+        if message.startswith(start):
+            return f"the file is not TOML: {rule}", fix
+    reason = re.sub(r"\s*\(at .*\)$", "", message)
+    return f"the file is not TOML ({reason})", 'Write key = value; texts in "quotes".'
 
 
 def check_contact(raw: dict[str, Any], source: Path, allow_outside: bool) -> Config:

@@ -6,12 +6,9 @@ blocks, and what is on disk is readable whenever and however the run ends.
 """
 
 import math
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +17,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from dvax import vi
 from dvax.errors import InputError, InputProblem, SolveError
 from dvax.evolution import ETD1, ETD2RK, ETD4RK, DormandPrince, ExpRosenbrock, Solution, solve
 from dvax.runs.compile_time import announced, compile_clock
@@ -34,9 +32,12 @@ from dvax.runs.contact_frames import (
 )
 from dvax.runs.contact_inputs import ContactInputs
 from dvax.runs.contact_model import assumptions, contact_model
+from dvax.runs.interrupt import exit_code, interruptible, terminable, undisturbed
 from dvax.runs.provenance import provenance
 from dvax.runs.resolved import write_resolved
-from dvax.runs.rundir import FrameStore, RunDirectory
+from dvax.runs.rundir import FrameStore, RunDirectory, process
+from dvax.runs.schema import SolverSection
+from dvax.runs.solver_options import in_keys_of
 from dvax.spaces import AbstractSpace
 from dvax.theory import bound_error
 
@@ -52,13 +53,14 @@ Listener = Callable[[dict[str, Any]], None]
 @dataclass(frozen=True)
 class RunOutcome:
     """How a run ended. `exit_code`: 0 finished, 2 input that a solve refused, 3 failed, 130
-    interrupted."""
+    interrupted, 143 asked to terminate. `has_results`: whether any frame was written."""
 
     status: str
     exit_code: int
     stop_reason: str
     directory: Path
     summary: dict[str, Any]
+    has_results: bool = True
 
 
 def run(
@@ -128,17 +130,22 @@ class _Run:
                 announced(lambda: self._event("compiling")),
             ):
                 self._blocks(times, block, store, figures, pool)
-        except KeyboardInterrupt:
-            status, code = "interrupted", 130
+        except KeyboardInterrupt as stop:
+            status, code = "interrupted", exit_code(stop)
             reason = "Interrupted; every frame written until then is kept."
         except SolveError as error:
-            status, code, reason = "failed", 3, str(error)
-        store.finish()
-        summary = figures.summary(self.steps)
-        self.directory.write_json("summary.json", summary)
-        self._manifest(status, reason, frames=store.written)
-        self._event("stopped", message=reason, status=status)
-        return RunOutcome(status, code, reason, self.directory.path, summary)
+            told = error.told(in_keys_of(SolverSection, "solver", "time.end"))
+            status, code, reason = "failed", 3, told
+        with undisturbed():
+            store.finish()
+            summary = {
+                "status": {"value": status, "unit": "1", "meaning": reason},
+                **figures.summary(self.steps),
+            }
+            self.directory.write_json("summary.json", summary)
+            self._manifest(status, reason, frames=store.written)
+            self._event("stopped", message=reason, status=status)
+        return RunOutcome(status, code, reason, self.directory.path, summary, store.written > 0)
 
     def _blocks(
         self,
@@ -191,12 +198,17 @@ class _Run:
 
     def _solve(self, piece: "_Piece", start: float, ts: np.ndarray) -> Solution:
         s = self.config.solver
-        return solve(
-            self.problem, jnp.asarray(piece.x), start, float(ts[-1]), None, ts,
-            dt=s.dt, rtol=s.rtol or 1e-6, atol=s.atol or 1e-9,
-            method=_METHODS[s.method](),
-            constants=self.constants, measure=True,
-            dt0=piece.dt, horizon=self.config.time.end,
+        options: dict[str, Any] = (
+            {} if s.vi_solver is None else {"vi_solver": getattr(vi, s.vi_solver)()}
+        )
+        return interruptible(
+            lambda: solve(
+                self.problem, jnp.asarray(piece.x), start, float(ts[-1]), None, ts,
+                dt=s.dt, rtol=s.rtol or 1e-6, atol=s.atol or 1e-9,
+                method=_METHODS[s.method](),
+                constants=self.constants, measure=True, max_steps=s.max_steps,
+                dt0=piece.dt, horizon=self.config.time.end, **options,
+            )
         )  # fmt: skip
 
     def _end(self, solved: Solution) -> "_Piece":
@@ -214,6 +226,7 @@ class _Run:
         files = {f.name: {"sha256": f.sha256, "bytes": f.bytes} for f in self.inputs.data_files}
         content = {
             **provenance(),
+            **process(),
             "status": status,
             "stop_reason": reason,
             "started": self.started.isoformat(timespec="seconds"),
@@ -257,23 +270,6 @@ def refuse_existing(out: Path, overwrite: bool) -> None:
                 "Give another folder, or ask to overwrite this one",
             )
         )
-
-
-@contextmanager
-def terminable() -> Iterator[None]:
-    """Let a request to terminate end the run as Ctrl-C does: with everything in order on disk."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _now() -> str:

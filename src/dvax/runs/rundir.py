@@ -13,6 +13,7 @@ frame with a time is a frame that is complete, whatever killed the run.
 
 import json
 import os
+import platform
 import shutil
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -46,13 +47,8 @@ class RunDirectory:
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Replace a small file as a whole: a reader sees the old one or the new one."""
-        beside = self.path / f".{name}.new"
-        with beside.open("w", encoding="utf-8") as file:
-            json.dump(content, file, indent=2, ensure_ascii=False, allow_nan=False)
-            file.write("\n")
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(self.path / name)
+        text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+        write_whole(self.path / name, text + "\n")
 
     def log(self, event: Mapping[str, Any]) -> None:
         """Append an event, with the moment it happened, and hand it to the system at once."""
@@ -63,6 +59,76 @@ class RunDirectory:
 
     def close(self) -> None:
         self._log.close()
+
+
+def write_whole(file: Path, text: str) -> None:
+    """Write beside `file`, then rename: a reader sees the old one or the new one, and where the disk is
+    full nothing is left over.
+
+    **Raises:** `OSError` with the name of the file.
+    """
+    beside = file.with_name(f".{file.name}.new")
+    try:
+        with beside.open("w", encoding="utf-8") as opened:
+            opened.write(text)
+            opened.flush()
+            os.fsync(opened.fileno())
+        beside.replace(file)
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise type(error)(error.errno, error.strerror, str(file)) from error
+
+
+def process() -> dict[str, Any]:
+    """Which process a run is, for the manifest: whether it is still going on can be told from that."""
+    return {"process": os.getpid(), "host": platform.node()}
+
+
+def close_killed(directory: Path) -> bool:
+    """Where the process of an unfinished run is gone, cut the frames off that it had not completed and
+    say so in the manifest. Returns whether that was so."""
+    file = directory / "manifest.json"
+    try:
+        manifest = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False  # who reads the directory next says what is wrong with it
+    ours = isinstance(manifest, dict) and manifest.get("status") == "running"
+    if not ours or manifest.get("host") != platform.node() or _alive(manifest.get("process")):
+        return False
+    reason = "The process was killed, or the machine stopped; it left no word."
+    write_whole(
+        file,
+        json.dumps(
+            {**manifest, "status": "killed", "stop_reason": reason}, indent=2, ensure_ascii=False
+        )
+        + "\n",
+    )
+    store = directory / "trajectory.zarr"
+    if store.is_dir():
+        cut_incomplete(store)
+    return True
+
+
+def _alive(number: Any) -> bool:
+    try:
+        os.kill(int(number), 0)
+    except (ProcessLookupError, TypeError, ValueError):
+        return False
+    except OSError:
+        return True  # it is another user's
+    return True
+
+
+def cut_incomplete(path: Path) -> None:
+    """Cut off the frames of a store without a time, which a killed run had not completed."""
+    group = zarr.open_group(path, mode="r+", use_consolidated=False)
+    if "time" not in group:
+        return
+    known = np.isfinite(np.asarray(group["time"][...]))  # pyright: ignore
+    whole = len(known) if known.all() else int(np.argmin(known))
+    for _, array in group.arrays():
+        if getattr(array.metadata, "dimension_names", (None,))[:1] == ("time",):
+            array.resize((whole, *array.shape[1:]))
 
 
 class FrameStore:
@@ -108,6 +174,7 @@ class FrameStore:
             create(name, dims, values.dtype, meta)[...] = values
         self._time = create("time", ("time",), np.float64, time_attrs)
         self._arrays = {name: create(name, *variable) for name, variable in variables.items()}
+        self._publish()
 
     def write(self, times: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
         """Append complete frames; their times go last and make them count."""
@@ -116,6 +183,7 @@ class FrameStore:
             array[region] = values[name]
         self._time[region] = times
         self.written += len(times)
+        self._publish()
 
     def mark(self, names: tuple[str, ...], status: str) -> None:
         """State how much is known of these variables (their attribute `status`)."""
@@ -129,3 +197,21 @@ class FrameStore:
         for array in (self._time, *self._arrays.values()):
             if array.shape[0] != self.written:
                 array.resize((self.written, *array.shape[1:]))
+        self._publish()
+
+    def _publish(self) -> None:
+        """Replace the group's consolidated metadata, which readers such as xarray take first: every
+        array in it ends with the last complete frame, and so the store of a killed run opens."""
+        about = {
+            folder.name: json.loads((folder / "zarr.json").read_text(encoding="utf-8"))
+            for folder in sorted(self.path.iterdir())
+            if (folder / "zarr.json").is_file()
+        }
+        for each in about.values():
+            if each.get("dimension_names", [None])[0] == "time":
+                each["shape"][0] = self.written
+        group = json.loads((self.path / "zarr.json").read_text(encoding="utf-8"))
+        group["consolidated_metadata"] = {
+            "kind": "inline", "must_understand": False, "metadata": about,
+        }  # fmt: skip
+        write_whole(self.path / "zarr.json", json.dumps(group))

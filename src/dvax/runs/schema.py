@@ -14,6 +14,13 @@ from pydantic_core import PydanticCustomError
 
 from dvax.runs.units import UnitError, Units, check_working_unit, is_quantity
 
+ViSolver = Literal[
+    "Auto", "Projection", "Extragradient", "ForwardBackwardForward", "GoldenRatio",
+    "SemismoothNewton", "ActiveSet", "Accelerated",
+]  # fmt: skip
+"""Solvers of the frozen law that need no argument, by their names in `dvax.vi`."""
+MOST_COUNTED = 2**31 - 1
+"""The largest max_steps of `dvax.solve`."""
 MAX_POINTS = 100_000_000
 MAX_FRAMES = 10**7
 
@@ -271,6 +278,10 @@ class SolverSection(Section):
     atol: Annotated[float | None, in_quantity("indentation")] = Field(
         None, gt=0, description="absolute tolerance of a step, an indentation"
     )
+    max_steps: int | None = Field(
+        None, ge=1, le=MOST_COUNTED, description="the most steps between two blocks of frames"
+    )
+    vi_solver: ViSolver | None = Field(None, description="of the frozen law, in the place of Auto")
 
 
 class ReportSection(Section):

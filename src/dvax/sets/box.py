@@ -43,7 +43,7 @@ class Box(AbstractSet):
         _tree.require(
             lambda: np.all(np.asarray(self.lower) <= np.asarray(self.upper)),
             "dvax.sets.Box(lower, upper)",
-            (self.lower, self.upper),
+            _crossing(self.lower, self.upper),
             "lower ≤ upper everywhere, or the set is empty and the law has no solution",
             "Swap the bounds, or widen the interval",
         )
@@ -73,8 +73,13 @@ class Box(AbstractSet):
         return [z - lower, upper - z]
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree]:
-        shape = jnp.shape(like)
-        return jnp.broadcast_to(self.lower, shape), jnp.broadcast_to(self.upper, shape)
+        def one(bound: jax.Array) -> jax.Array:
+            # Bounds that were Python numbers take the type of what they bound.
+            common = jnp.result_type(bound, like)
+            bound = bound if bound.dtype == common else bound.astype(common)
+            return jnp.broadcast_to(bound, jnp.shape(like))
+
+        return one(self.lower), one(self.upper)
 
     def check(self, like: Tree) -> None:
         if isinstance(like, tuple):
@@ -101,6 +106,19 @@ class Box(AbstractSet):
                         "Give the bound that shape, or set control_space= of dvax.Problem",
                     )
                 )
+
+
+def _crossing(lower: jax.Array, upper: jax.Array) -> Any:
+    """The bounds as a message shows them: those of the first entry where they cross or are NaN."""
+    if not _tree.is_concrete((lower, upper)):
+        return lower, upper
+    low, up = np.broadcast_arrays(np.asarray(lower), np.asarray(upper))
+    wrong = np.argwhere(~(low <= up))
+    if not len(wrong):
+        return lower, upper
+    index = tuple(map(int, wrong[0]))
+    where = f" in entry {index} ({len(wrong)} of {low.size} such entries)" if index else ""
+    return _tree.Text(f"lower = {low[index]:.9g}, upper = {up[index]:.9g}{where}")
 
 
 @jax.jit

@@ -10,6 +10,7 @@ import numpy as np
 from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
+from ..evolution.nonfinite import refuse_nonfinite_data
 from ..problem import Problem
 from .assumption import Assumption
 from .certificate import is_declared
@@ -121,6 +122,7 @@ def verify(
     """
     t0, t1 = span(t0, t1, "dvax.verify(t0, t1)")
     x0 = state_like(problem, x0, t0, args, "dvax.verify(x0)")
+    refuse_nonfinite_data(problem, args, "dvax.verify")
     problem.check(jnp.asarray(t0), x0, args)
     system = System(problem, x0, args)
     knots = np.asarray(problem.knots(t0, t1, x0, args), float)
@@ -254,7 +256,15 @@ def bounded(tree: Tree, middle: Tree) -> Tree:
 
 def span(t0: Any, t1: Any, name: str) -> tuple[float, float]:
     """Two times that make an interval."""
-    begin, end = float(t0), float(t1)
+    try:
+        begin, end = float(t0), float(t1)
+    except (TypeError, ValueError):
+        raise InputError(
+            InputProblem(
+                name, f"{t0!r}, {t1!r}"[:120], "they must be two real numbers with values",
+                "Give the times of the run",
+            )
+        ) from None  # fmt: skip
     if not (np.isfinite([begin, end]).all() and begin < end):
         raise InputError(
             InputProblem(
@@ -267,8 +277,20 @@ def span(t0: Any, t1: Any, name: str) -> tuple[float, float]:
 
 def state_like(problem: Problem, x0: Tree, t0: float, args: Any, name: str) -> Tree:
     """A state of this problem: the one given, or zero where its shape is known."""
+    if not isinstance(problem, Problem):
+        raise InputError(
+            InputProblem(
+                name.split("(")[0] + "(problem)", type(problem).__name__, "it must be a dvax.Problem",
+                "Build one from A, P, K, f and h, or pass model.problem",
+            )
+        )  # fmt: skip
     if x0 is not None:
-        return _tree.as_float(x0, "x0")
+        state = _tree.as_float(x0, "x0")
+        _tree.require(
+            lambda: all(np.isfinite(leaf).all() for leaf in jtu.tree_leaves(state)),
+            name, state, "every entry must be finite", "Correct the state there",
+        )  # fmt: skip
+        return state
     if problem.state_space is not None:
         return problem.state_space.zeros()
     zero = jnp.zeros(())
@@ -282,7 +304,8 @@ def state_like(problem: Problem, x0: Tree, t0: float, args: Any, name: str) -> T
                 "the problem does not fit a scalar state, and names no state space, so that the shape "
                 "of its states is not known",
                 "Give any state: dvax.verify(problem, x0)",
-            )
+            ),
+            *error.problems,
         ) from error
     return zero
 
@@ -294,13 +317,28 @@ def _declared(given: Mapping[str, float] | Constants | None) -> dict[str, float]
     if isinstance(given, Constants):
         return {name: float(getattr(given, name)) for name in names}
     wrong = [name for name in given if name not in names]
+    if not isinstance(given, Mapping):
+        wrong = [type(given).__name__]
     if wrong:
         raise InputError(
             InputProblem(
                 "dvax.verify(declared)",
                 f"{wrong[0]!r}",
                 f"it must map names among {', '.join(names)} to numbers",
-                "Mend the name; the others follow from A and P",
+                "Correct the name; the others follow from A and P",
             )
         )
-    return {name: float(value) for name, value in given.items()}
+    values: dict[str, float] = {}
+    for name, value in given.items():
+        try:
+            values[name] = float(value)
+        except (TypeError, ValueError):
+            values[name] = np.nan
+        if not np.isfinite(values[name]):
+            raise InputError(
+                InputProblem(
+                    f"dvax.verify(declared[{name!r}])", repr(value)[:120],
+                    "a modulus is a finite number", "Correct it, or leave it out",
+                )
+            )  # fmt: skip
+    return values

@@ -8,17 +8,20 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
+from dvax.problem import Problem
 from dvax.runs.schema import Section
 from dvax.theory import Assumption, Constants
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A headline figure: a number, or a list of them."""
+    """A headline figure: a number, or a list of them; `error`: a proved bound on its error, or on those
+    of its entries, where there is one."""
 
     value: Any
     unit: str
     meaning: str
+    error: Any = None
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,20 @@ class Known(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class Plan:
+    """What a run integrates: the problem from x0 at the first of `times` up to the last, saved at all
+    of them, with these `settings` for `dvax.solve`. `data` is the application's own."""
+
+    problem: Problem
+    x0: Any
+    times: np.ndarray
+    constants: Constants
+    settings: Mapping[str, Any]
+    data: Any = None
+    time_unit: str = ""
+
+
 Say = Callable[[str], None]
 """To be told what a solve is about to do: "solving at rest", for a reader who waits."""
 
@@ -71,13 +88,17 @@ class AbstractApplication(abc.ABC, Generic[Model]):
     - `read`: from the table to the model, everything checked, nothing solved;
     - `fit`: "exact", or by what it is regularised, or why it is outside the class;
     - `known`: what can be told before anything is solved;
-    - `solve`: to the results, saying at each stage what it does.
+    - `plan`: what is to be integrated, all else being computed, saying at each stage what it does;
+    - `results`: from the solution, which may end before the last time, to the results.
+
+    `end` is the key of the file for the last time of a run, where there is one.
     """
 
     section: ClassVar[type[Section]]
     files: ClassVar[tuple[str, ...]] = ()
     folders: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     keys: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    end: ClassVar[str | None] = None
 
     @abc.abstractmethod
     def read(self, table: Any, paths: Mapping[str, Path]) -> Model:
@@ -95,5 +116,10 @@ class AbstractApplication(abc.ABC, Generic[Model]):
         """Constants, assumptions, sizes and notes."""
 
     @abc.abstractmethod
-    def solve(self, model: Model, say: Say) -> Results:
-        """The results. **Raises:** `dvax.SolveError`."""
+    def plan(self, model: Model, say: Say) -> Plan:
+        """What to integrate. **Raises:** `dvax.SolveError`."""
+
+    @abc.abstractmethod
+    def results(self, model: Model, plan: Plan, solution: Any) -> Results:
+        """The results up to the last time of the `dvax.Solution`, whether or not it is the last of the
+        plan; None stands for it where the plan has one time alone."""

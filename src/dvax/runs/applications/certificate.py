@@ -6,7 +6,7 @@ import jax
 import jax.tree_util as jtu
 import numpy as np
 
-from dvax.evolution import Solution
+from dvax.evolution import Implicit, Solution
 from dvax.problem import Problem
 from dvax.theory import Constants, bound_error
 
@@ -21,17 +21,25 @@ class Certificate(NamedTuple):
     status: str
 
     @property
-    def largest(self) -> float:
-        """Over all saved times."""
-        return float(self.values.max())
+    def largest(self) -> float | None:
+        """Over all saved times; None where nothing is known."""
+        top = float(self.values.max())
+        return top if np.isfinite(top) else None
+
+    def proved(self, scale: float = 1.0) -> np.ndarray | None:
+        """scale · bound at every saved time, where it is proved: what figures are certified to."""
+        return scale * self.values if self.status == "proved" else None
 
 
 def certificate(problem: Problem, solution: Solution, constants: Constants) -> Certificate:
     """`dvax.bound_error`, which holds up to rounding, and what every step may have rounded off: where a
     solve is exact but for that, a bound of less would be an empty claim."""
+    if isinstance(solution.setup.method, Implicit):
+        # Implicit methods keep no polynomials of their steps, of which a defect could be measured.
+        return Certificate(np.full(len(solution.ts), np.nan), "not known")
     bound = bound_error(problem, solution, constants)
     space = problem.spaces(solution.setup.x0)[0]
-    size: Any = jax.vmap(space.norm)(solution.xs)
+    size: Any = jax.jit(jax.vmap(space.norm))(solution.xs)
     eps = np.finfo(jtu.tree_leaves(solution.xs)[0].dtype).eps
     lost = _A_STEP * eps * (1.0 + float(solution.stats["steps"])) * float(size.max())
     return Certificate(np.asarray(bound.x) + lost, bound.status)

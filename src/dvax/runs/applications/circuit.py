@@ -8,27 +8,29 @@ import jax
 import numpy as np
 from pydantic import Field
 
+from dvax.evolution import ExpRosenbrock, Solution
 from dvax.models.circuit import Circuit
 from dvax.runs.applications.base import (
     AbstractApplication,
     Figure,
     Known,
+    Plan,
     Results,
     Say,
     Variable,
 )
 from dvax.runs.applications.certificate import certificate
-from dvax.runs.schema import Section, in_quantity
+from dvax.runs.schema import in_quantity
+from dvax.runs.solver_options import SolverKeys, check_steps, settings
 
 
-class CircuitSection(Section):
+class CircuitSection(SolverKeys):
     """The netlist and how long to run it."""
 
     name: Literal["circuit"] = Field(description="the model")
     netlist: str = Field(description="file with the elements of the circuit, a line each")
     t_end: Annotated[float, in_quantity("time")] = Field(gt=0, description="end of the run [s]")
     frames: int = Field(500, ge=1, le=10**6, description="number of intervals between saved states")
-    rtol: float = Field(1e-8, gt=0, lt=1, description="relative tolerance of a step")
     r_on: float | None = Field(
         None, gt=0, description="resistance in series with diodes that have none [ohm]"
     )
@@ -37,11 +39,16 @@ class CircuitSection(Section):
     )
 
 
+_SETTINGS: dict[str, Any] = dict(method=ExpRosenbrock(), rtol=1e-8, atol=1e-9)
+"""As `dvax.models.Circuit.solve` has them."""
+
+
 class _Loaded:
     def __init__(self, table: CircuitSection, file: Path):
         self.table = table
         self.circuit = Circuit.from_file(file, r_on=table.r_on, g_leak=table.g_leak)
         self.circuit.check_sources(table.t_end)
+        check_steps(table, table.t_end, f"{table.t_end:g} s")
 
 
 class CircuitApplication(AbstractApplication[_Loaded]):
@@ -49,6 +56,7 @@ class CircuitApplication(AbstractApplication[_Loaded]):
 
     section = CircuitSection
     files = ("netlist",)
+    end = "model.t_end"
 
     def read(self, table: Any, paths: Mapping[str, Path]) -> _Loaded:
         return _Loaded(table, paths["netlist"])
@@ -65,15 +73,17 @@ class CircuitApplication(AbstractApplication[_Loaded]):
         ]
         return Known(c.constants, (), sizes)
 
-    def solve(self, model: _Loaded, say: Say) -> Results:
+    def plan(self, model: _Loaded, say: Say) -> Plan:
         c, table = model.circuit, model.table
-        times = np.linspace(0.0, table.t_end, table.frames + 1)
         say(f"solving from 0 to {table.t_end:g} s")
-        solution = c.solve(table.t_end, times, rtol=table.rtol, constants=c.constants)
-        say("bounding the error")
+        times = np.linspace(0.0, table.t_end, table.frames + 1)
+        return Plan(c.problem, c.x0, times, c.constants, settings(table, **_SETTINGS), None, "s")
+
+    def results(self, model: _Loaded, plan: Plan, solution: Solution) -> Results:
+        c, times = model.circuit, np.asarray(solution.ts)
         bound = certificate(c.problem, solution, c.constants)
         volts, amperes = (
-            np.asarray(jax.vmap(of)(solution.ts, solution.xs, solution.us))
+            np.asarray(jax.jit(jax.vmap(of))(solution.ts, solution.xs, solution.us))
             for of in (c.voltages, c.currents)
         )
         time = ("time",)
@@ -98,7 +108,7 @@ class CircuitApplication(AbstractApplication[_Loaded]):
         )
         figures = {
             "final_state": Figure(
-                np.asarray(solution.xs[-1]), "V, A", f"{', '.join(c.states)} at t_end"
+                np.asarray(solution.xs[-1]), "V, A", f"{', '.join(c.states)} at t = {times[-1]:g} s"
             ),
             "error_bound": Figure(
                 bound.largest, "J^(1/2)",

@@ -15,7 +15,7 @@ from dvax.runs.applications.base import AbstractApplication
 from dvax.runs.applications.wording import in_keys
 from dvax.runs.config import Config, check_contact, parse
 from dvax.runs.data_file import DataFile, fingerprint, locate, locate_folder
-from dvax.runs.schema import ModelSection, ReportSection, Section
+from dvax.runs.schema import SECTIONS, ModelSection, ReportSection, Section
 from dvax.runs.schema_errors import shown, translate, unknown_key
 from dvax.runs.units import Units
 
@@ -76,6 +76,15 @@ def read_config(path: str | Path, *, allow_outside: bool = False) -> Config | Mo
     raw = parse(source)
     table = raw.get("model")
     name = "contact"
+    if table is None and not set(raw) & (set(SECTIONS) - {"output"}):
+        given = "an empty file" if not raw else f"no [model], but {', '.join(raw)}"
+        raise InputError(
+            InputProblem(
+                f"{source.name}: model", given,
+                f"the table [model] says which model this is, one of {', '.join(NAMES)}",
+                'Write [model] and below it name = "circuit", say, with the keys of that model',
+            )
+        )  # fmt: skip
     if isinstance(table, Mapping):
         # A contact law needs no name: it was the only model once.
         name = table.get("name", "contact")

@@ -11,15 +11,23 @@ import numpy as np
 import zarr
 
 from dvax.errors import InputError, SolveError
-from dvax.runs.applications.base import Results, Variable
+from dvax.evolution import Solution
+from dvax.runs.applications.base import Plan, Results, Variable
 from dvax.runs.applications.config import ModelConfig
+from dvax.runs.applications.segments import joined, segments, states_alone
 from dvax.runs.applications.wording import in_keys
 from dvax.runs.compile_time import announced, compile_clock
-from dvax.runs.driver import Listener, RunOutcome, refuse_existing, terminable
+from dvax.runs.driver import Listener, RunOutcome, refuse_existing
+from dvax.runs.interrupt import exit_code, interruptible, terminable, undisturbed
 from dvax.runs.provenance import provenance
 from dvax.runs.resolved import DATA_FOLDER, NAME
-from dvax.runs.rundir import RunDirectory
+from dvax.runs.rundir import RunDirectory, process
+from dvax.runs.solver_options import in_keys_of
 from dvax.theory import Assumption, Constants
+
+_PATIENCE = 30.0
+"""Seconds in which the results of a run that stopped are put together; after that, or at a second
+signal, its states alone are kept."""
 
 
 def run_model(
@@ -49,39 +57,84 @@ class _Run:
         self._manifest("running", "The run is going on.")
         for note in self.notes:
             self._event("warning", message=note)
-        results: Results | None = None
         status, code, reason = "finished", 0, "The model was solved to its end."
-        try:
-            application = self.config.application
-            with (
-                terminable(),
-                announced(lambda: self._event("compiling")),
-                in_keys(self.config.source.name, application),
-            ):
-                results = application.solve(self.config.model, self._stage)
+        plan: Plan | None = None
+        pieces: list[Solution] = []
+        results: Results | None = None
+        with terminable():
+            try:
+                with (
+                    announced(lambda: self._event("compiling")),
+                    in_keys(self.config.source.name, self.config.application),
+                ):
+                    plan = interruptible(
+                        lambda: self.config.application.plan(self.config.model, self._stage)
+                    )
+                    for piece in segments(plan):
+                        pieces.append(piece)
+                        self._progress(plan, piece)
+                    results = interruptible(lambda: self._results(plan, pieces))
+            except KeyboardInterrupt as stop:
+                status, code = "interrupted", exit_code(stop)
+                reason = f"Interrupted {self._reached(plan, pieces)}."
+            except InputError as error:
+                status, code, reason = "failed", 2, str(error)
+            except SolveError as error:
+                section, end = self.config.application.section, self.config.application.end
+                status, code = "failed", 3
+                reason = error.told(in_keys_of(section, "model", end))
+            except BaseException as error:
+                # Whatever it was, the run is over, and its folder says so.
+                self._manifest("failed", f"{type(error).__name__}: {error}")
+                raise
+        if results is None and pieces:
+            try:
+                results = interruptible(lambda: self._results(plan, pieces), _PATIENCE)
+            except (KeyboardInterrupt, TimeoutError):
+                results = states_alone(pieces)
+                reason += " Its states alone were kept: there was no time for figures."
+        with undisturbed():
+            if results is not None:
+                self._keep(results)
+            summary = self._summary(status, reason, results)
+            self.directory.write_json("summary.json", summary)
+            self._manifest(status, reason)
+            self._event("stopped", message=reason, status=status)
+        return RunOutcome(status, code, reason, self.directory.path, summary, results is not None)
+
+    def _results(self, plan: Plan | None, pieces: list[Solution]) -> Results:
+        """What the pieces give."""
+        assert plan is not None
+        self._stage("writing the results")
+        solution = joined(pieces) if pieces else None
+        return self.config.application.results(self.config.model, plan, solution)
+
+    def _progress(self, plan: Plan, piece: Solution) -> None:
+        first = not self.steps
+        self.steps += int(piece.stats["steps"])
+        if first:
             self._event("compiled", compile_seconds=self.compiling())
-        except KeyboardInterrupt:
-            status, code, reason = "interrupted", 130, "Interrupted before there were results."
-        except InputError as error:
-            status, code, reason = "failed", 2, str(error)
-        except SolveError as error:
-            status, code, reason = "failed", 3, str(error)
-        except BaseException as error:
-            # Whatever it was, the run is over, and its folder says so.
-            self._manifest("failed", f"{type(error).__name__}: {error}")
-            raise
-        summary: dict[str, Any] = {}
-        if results is not None:
-            self._stage("writing the results")
-            self._keep(results)
-            summary = {
-                name: {"value": _plain(f.value), "unit": f.unit, "meaning": f.meaning}
-                for name, f in results.figures.items()
-            }
-        self.directory.write_json("summary.json", summary)
-        self._manifest(status, reason)
-        self._event("stopped", message=reason, status=status)
-        return RunOutcome(status, code, reason, self.directory.path, summary)
+        begin, t = float(plan.times[0]), float(piece.ts[-1])
+        self._event(
+            "progress", t=t - begin, t_end=float(plan.times[-1]) - begin, steps=self.steps
+        )  # fmt: skip
+
+    @staticmethod
+    def _reached(plan: Plan | None, pieces: list[Solution]) -> str:
+        if plan is None or not pieces:
+            return "before there were results"
+        unit, end = f" {plan.time_unit}".rstrip(), float(plan.times[-1])
+        return f"at t = {float(pieces[-1].ts[-1]):.10g} of {end:.10g}{unit}; what was saved is kept"
+
+    @staticmethod
+    def _summary(status: str, reason: str, results: Results | None) -> dict[str, Any]:
+        """The figures, and before them how the run ended."""
+        summary: dict[str, Any] = {"status": {"value": status, "unit": "1", "meaning": reason}}
+        for name, f in (results.figures if results is not None else {}).items():
+            summary[name] = {"value": _plain(f.value), "unit": f.unit, "meaning": f.meaning}
+            if f.error is not None:
+                summary[name]["error"] = _plain(f.error)
+        return summary
 
     def _keep(self, results: Results) -> None:
         """What was found, on disk."""
@@ -112,6 +165,7 @@ class _Run:
         now = datetime.now(UTC).isoformat(timespec="seconds")
         content = {
             **provenance(),
+            **process(),
             "model": self.config.name,
             "fit": self.config.application.fit(self.config.model),
             "status": status,

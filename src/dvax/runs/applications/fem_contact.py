@@ -9,18 +9,19 @@ import numpy as np
 from pydantic import Field
 
 from dvax.errors import InputError, InputProblem
-from dvax.evolution import Implicit, solve
+from dvax.evolution import Implicit, Solution
 from dvax.models.fem_contact import ElasticBody, FemContact
 from dvax.runs.applications.base import (
     AbstractApplication,
     Figure,
     Known,
+    Plan,
     Results,
     Say,
     Variable,
 )
 from dvax.runs.applications.certificate import certificate
-from dvax.runs.schema import Section
+from dvax.runs.solver_options import SolverKeys, check_steps, settings
 
 _SMALL = 0.1
 """An indentation above this part of a size of the body or the punch is worth a note."""
@@ -28,7 +29,7 @@ _SMALL = 0.1
 _SIZES = ("width", "height", "fine_half_width", "fine", "coarse", "layers", "growth")
 
 
-class FemContactSection(Section):
+class FemContactSection(SolverKeys):
     """The body, the punch and the compliance of the contact, in units of your choice."""
 
     name: Literal["fem-contact"] = Field(description="the model")
@@ -63,6 +64,7 @@ class FemContactSection(Section):
 class _Loaded:
     def __init__(self, table: FemContactSection, file: Path | None):
         self.table = table
+        check_steps(table, table.end, f"the length {table.end:g}")
         sizes = _given(table, _SIZES)
         names = _given(table, ("contact", "clamped"))
         if file is not None and sizes:
@@ -129,6 +131,7 @@ class FemContactApplication(AbstractApplication[_Loaded]):
 
     section = FemContactSection
     files = ("mesh",)
+    end = "model.end"
 
     def read(self, table: Any, paths: Mapping[str, Path]) -> _Loaded:
         return _Loaded(table, paths.get("mesh"))
@@ -145,17 +148,18 @@ class FemContactApplication(AbstractApplication[_Loaded]):
         ]
         return Known(model.contact.constants, (), sizes, _notes(model))
 
-    def solve(self, model: _Loaded, say: Say) -> Results:
+    def plan(self, model: _Loaded, say: Say) -> Plan:
         m, table = model.contact, model.table
         say("solving at rest")
         rest = m.equilibrium()
         times = np.linspace(0.0, table.end, table.frames + 1)
         say(f"solving from 0 to {table.end:g}")
-        solution = solve(
-            m.problem, m.untouched, 0.0, table.end, ts=times, method=m.method, rtol=1e-7, atol=1e-11,
-            constants=m.constants,
-        )  # fmt: skip
-        pressure = np.asarray(jax.vmap(m.pressure)(solution.ts, solution.xs))
+        options = settings(table, method=m.method, rtol=1e-7, atol=1e-11)
+        return Plan(m.problem, m.untouched, times, m.constants, options, rest)
+
+    def results(self, model: _Loaded, plan: Plan, solution: Solution) -> Results:
+        m, rest, times = model.contact, plan.data, np.asarray(solution.ts)
+        pressure = np.asarray(jax.jit(jax.vmap(m.pressure))(solution.ts, solution.xs))
         still, last = m.figures(rest.pressure), m.figures(pressure[-1])
         force = np.array([m.figures(p)["force"] for p in pressure])
         s = m.body.points[:, 0]
@@ -198,8 +202,7 @@ class FemContactApplication(AbstractApplication[_Loaded]):
                 "two states certainly approach at this rate in the norm of the viscosity",
             ),
         }  # fmt: skip
-        if not isinstance(m.method, Implicit):
-            say("bounding the error")
+        if not isinstance(solution.setup.method, Implicit):
             bound = certificate(m.problem, solution, m.constants)
             figures["error_bound"] = Figure(
                 bound.largest, "([p][x]²)^(1/2)",

@@ -4,23 +4,32 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from pydantic import Field
 
+from dvax.evolution import ExpRosenbrock, Solution
 from dvax.models.frame import Accelerogram, Frame
+from dvax.models.frame.peaks import largest as largest_between
 from dvax.runs.applications.base import (
     AbstractApplication,
     Figure,
     Known,
+    Plan,
     Results,
     Say,
     Variable,
 )
 from dvax.runs.applications.certificate import certificate
-from dvax.runs.schema import Section, in_quantity
+from dvax.runs.schema import in_quantity
+from dvax.runs.solver_options import SolverKeys, check_steps, settings
+
+_INCH = 0.0254
+"""Metres in an inch, exactly."""
 
 
-class FrameSection(Section):
+class FrameSection(SolverKeys):
     """The record and the frame."""
 
     name: Literal["frame"] = Field(description="the model")
@@ -36,7 +45,6 @@ class FrameSection(Section):
         description="viscosity over stiffness, eta/k [s], of a frame that yields; "
         "elastoplastic as it goes to 0",
     )
-    rtol: float = Field(1e-8, gt=0, lt=1, description="relative tolerance of a step")
 
 
 class _Loaded:
@@ -46,6 +54,8 @@ class _Loaded:
             record=Accelerogram.from_at2(file), period=table.period, damping=table.damping,
             yield_ratio=table.yield_ratio, viscosity_ratio=table.viscosity_ratio,
         )  # fmt: skip
+        long = float(self.frame.record.duration)
+        check_steps(table, long, f"{long:g} s")
 
 
 class FrameApplication(AbstractApplication[_Loaded]):
@@ -76,48 +86,69 @@ class FrameApplication(AbstractApplication[_Loaded]):
             )
         return Known(model.frame.constants, (), sizes, notes)
 
-    def solve(self, model: _Loaded, say: Say) -> Results:
-        frame, table = model.frame, model.table
-        constants = frame.constants
+    def plan(self, model: _Loaded, say: Say) -> Plan:
+        frame = model.frame
         say("solving over the record")
-        solution = frame.solve(rtol=table.rtol, constants=constants)
-        say("bounding the error")
+        options = settings(model.table, method=ExpRosenbrock(), rtol=1e-8)
+        return Plan(
+            frame.problem, jnp.zeros(3), frame.times, frame.constants, options, None, "s"
+        )  # fmt: skip
+
+    def results(self, model: _Loaded, plan: Plan, solution: Solution) -> Results:
+        frame, constants = model.frame, plan.constants
         bound = certificate(frame.problem, solution, constants)
-        between = (len(solution.ts) - 1) // (frame.record.samples.shape[0] - 1)
+        between = (len(plan.times) - 1) // (frame.record.samples.shape[0] - 1)
         d, v, plastic = np.asarray(solution.xs).T
         ts = np.asarray(solution.ts)
         omega = float(frame.omega)
         ground = np.interp(ts, np.asarray(frame.record.knots()), np.asarray(frame.record.samples))
-        time = ("time",)
-        variables = {
-            "time": Variable(time, ts, "s", "time"),
-            "ground": Variable(time, ground, "in/s^2", "ground acceleration"),
-            "displacement": Variable(time, d, "in", "displacement against the ground"),
-            "velocity": Variable(time, v, "in/s", "velocity against the ground"),
-            "plastic": Variable(time, plastic, "in", "plastic displacement"),
-            "spring": Variable(
-                time, omega**2 * (d - plastic), "in/s^2", "force of the spring a mass"
-            ),
-            "error_bound": Variable(
-                time, bound.values / omega, "in", "bound on the error of the displacement"
-            ),
-        }
+        time, error = ("time",), bound.values / omega
+        spring = omega**2 * (d - plastic)
+        variables = {"time": Variable(time, ts, "s", "time")}
+        for name, values, unit, words in (
+            ("ground", ground, "in/s^2", "ground acceleration"),
+            ("displacement", d, "in", "displacement against the ground"),
+            ("velocity", v, "in/s", "velocity against the ground"),
+            ("plastic", plastic, "in", "plastic displacement"),
+            ("spring", spring, "in/s^2", "force of the spring a mass"),
+            ("error_bound", error, "in", "bound on the error of the displacement"),
+        ):
+            variables[name] = Variable(time, values, unit, words)
+            si = Variable(time, _INCH * values, unit.replace("in", "m"), f"{words}, in SI units")
+            variables[f"{name}_si"] = si
         peak = float(np.max(np.abs(d[::between])))
-        figures = {
-            "peak_displacement": Figure(peak, "in", "largest displacement at the times of the record"),
-            "largest_displacement": Figure(
-                float(frame.largest_displacement(solution)), "in", "largest displacement at all times"
+        # One compiled program: a run that was interrupted has a length of its own to compile for.
+        a = -2.0 * float(frame.damping) * omega * v - spring - ground
+        apart = frame.record.step / between
+        top = float(jax.jit(largest_between)(*map(jnp.asarray, (d, v, a)), apart))
+        largest = bound.largest
+        # Every displacement is off by no more than the bound, so its peaks are as well.
+        proved = bound.proved(1.0 / omega)
+        within, last = (None, None) if proved is None else (float(proved.max()), float(proved[-1]))
+        lengths = {
+            "peak_displacement": (peak, within, "largest displacement at the times of the record"),
+            "largest_displacement": (
+                top, None, "largest displacement at all times"
             ),
-            "residual_displacement": Figure(float(plastic[-1]), "in", "plastic part of it at the end"),
-            "error_bound": Figure(
-                bound.largest / omega, "in",
+            "residual_displacement": (float(plastic[-1]), last, "plastic part of it at the end"),
+            "error_bound": (
+                None if largest is None else largest / omega, None,
                 f"bound on the error of the displacement ({bound.status})",
             ),
         }  # fmt: skip
         limit = float(frame.yield_displacement)
         if np.isfinite(limit):
-            figures["yield_displacement"] = Figure(limit, "in", "displacement at which it yields")
+            lengths["yield_displacement"] = (limit, None, "displacement at which it yields")
+        figures = {n: Figure(value, "in", words, e) for n, (value, e, words) in lengths.items()}
+        if np.isfinite(limit):
             figures["ductility"] = Figure(peak / limit, "1", "peak over yield displacement")
+        figures |= {
+            f"{name}_si": Figure(
+                None if value is None else _INCH * value, "m", f"{words}, in SI units",
+                None if error is None else _INCH * error,
+            )
+            for name, (value, error, words) in lengths.items()
+        }  # fmt: skip
         return Results(figures, variables, constants, int(solution.stats["steps"]))
 
 

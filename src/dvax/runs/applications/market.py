@@ -10,20 +10,22 @@ import numpy as np
 from pydantic import Field
 
 from dvax.errors import InputError, InputProblem
+from dvax.evolution import ExpRosenbrock, Solution
 from dvax.models.market import RTS, Market, largest_gain, read_rts
 from dvax.runs.applications.base import (
     AbstractApplication,
     Figure,
     Known,
+    Plan,
     Results,
     Say,
     Variable,
 )
 from dvax.runs.applications.certificate import certificate
-from dvax.runs.schema import Section
+from dvax.runs.solver_options import SolverKeys, check_steps, settings
 
 
-class MarketSection(Section):
+class MarketSection(SolverKeys):
     """The data and the hours."""
 
     name: Literal["market"] = Field(description="the model")
@@ -42,6 +44,7 @@ class MarketSection(Section):
 class _Loaded:
     def __init__(self, table: MarketSection, rts: RTS):
         self.table = table
+        check_steps(table, float(max(table.hours - 1, 1)), f"{table.hours} hours")
         self.times = np.arange(table.start_hour, table.start_hour + table.hours, dtype=float)
         options: dict[str, Any] = dict(
             speed=table.speed, reference_price=table.reference_price, elasticity=table.elasticity
@@ -84,57 +87,61 @@ class MarketApplication(AbstractApplication[_Loaded]):
         ]
         return Known(model.market.constants, (), sizes)
 
-    def solve(self, model: _Loaded, say: Say) -> Results:
+    def plan(self, model: _Loaded, say: Say) -> Plan:
         market, times = model.market, model.times
         say("solving for the prices at rest")
         prices, made = jax.vmap(market.equilibrium)(jnp.asarray(times))
-        capacity = np.asarray(jax.vmap(market.capacity.value)(jnp.asarray(times)))
-        gain = largest_gain(
-            np.asarray(prices), np.asarray(made), capacity, np.asarray(market.cost),
-            np.asarray(market.slope), np.asarray(market.firms), float(market.b),
-        )  # fmt: skip
-        by_firm = np.asarray(made @ market.firms)
-        hour = Variable(("hour",), times, "h", "hour of the data")
+        rest = np.asarray(prices), np.asarray(made)
+        if len(times) > 1:
+            say("solving for the sticky price")
+        options = settings(
+            model.table, method=ExpRosenbrock(), rtol=1e-8, atol=1e-8, vi_solver=market.law_solver
+        )
+        return Plan(market.problem, prices[0], times, market.constants, options, rest, "h")
+
+    def results(self, model: _Loaded, plan: Plan, solution: Solution | None) -> Results:
+        market = model.market
+        times = plan.times if solution is None else np.asarray(solution.ts)
+        prices, made = (values[: len(times)] for values in plan.data)
+        capacity = np.asarray(jax.jit(jax.vmap(market.capacity.value))(jnp.asarray(times)))
+        firms = np.asarray(market.firms)
+        numbers = np.asarray(market.cost), np.asarray(market.slope), firms, float(market.b)
+        gain = largest_gain(prices, made, capacity, *numbers)
         variables = {
-            "hour": hour,
-            "price": Variable(("hour",), np.asarray(prices), "$/MWh", "Cournot-Nash price"),
-            "made": Variable(("hour", "firm"), by_firm, "MW", "what each firm makes"),
-            "capacity": Variable(
-                ("hour", "firm"), capacity @ np.asarray(market.firms), "MW", "what it could make"
-            ),
+            "hour": Variable(("hour",), times, "h", "hour of the data"),
+            "price": Variable(("hour",), prices, "$/MWh", "Cournot-Nash price"),
+            "made": Variable(("hour", "firm"), made @ firms, "MW", "what each firm makes"),
+            "capacity": Variable(("hour", "firm"), capacity @ firms, "MW", "what it could make"),
         }
         figures = {
             "price": Figure(prices, "$/MWh", "Cournot-Nash price of every hour"),
             "max_deviation_profit": Figure(
                 gain, "$/h", "most that a firm could gain by making something else, at any hour"
             ),
-            "mean_price": Figure(float(jnp.mean(prices)), "$/MWh", "their mean"),
+            "mean_price": Figure(float(np.mean(prices)), "$/MWh", "their mean"),
         }
         steps = 0
-        if len(times) > 1:
-            say("solving for the sticky price")
-            solution = market.run(constants=market.constants)
+        if solution is not None:
             steps = int(solution.stats["steps"])
-            say("bounding the error")
             bound = certificate(market.problem, solution, market.constants)
             sticky = np.asarray(solution.xs)
             variables |= {
                 "sticky_price": Variable(("hour",), sticky, "$/MWh", "price that follows demand"),
                 "error_bound": Variable(
-                    ("hour",),
-                    bound.values,
-                    "$/MWh",
-                    "bound on the error of the sticky price",
+                    ("hour",), bound.values, "$/MWh", "bound on the error of the sticky price"
                 ),
             }
+            under_way = largest_gain(sticky, np.asarray(solution.us), capacity, *numbers)
             figures["max_deviation_profit"] = Figure(
-                market.figures(solution)["max_deviation_profit"], "$/h",
+                max(gain, under_way), "$/h",
                 "most that a firm could gain by making something else, at rest or under way",
             )  # fmt: skip
             figures |= {
-                "sticky_price": Figure(sticky, "$/MWh", "price of the dynamics at every hour"),
+                "sticky_price": Figure(
+                    sticky, "$/MWh", "price of the dynamics at every hour", bound.proved()
+                ),
                 "largest_lag": Figure(
-                    float(np.abs(sticky - np.asarray(prices)).max()), "$/MWh",
+                    float(np.abs(sticky - prices).max()), "$/MWh",
                     "most that the sticky price is away from the price at rest",
                 ),
                 "error_bound": Figure(

@@ -6,23 +6,26 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import jax
 import numpy as np
-from pydantic import AfterValidator, Field, ValidationInfo
+from pydantic import AfterValidator, Field
 
 from dvax.errors import InputError, InputProblem, SolveError
-from dvax.evolution import solve
+from dvax.evolution import Solution
 from dvax.models.traffic import Incident, Traffic, read_nodes
 from dvax.runs.applications.base import (
     AbstractApplication,
     Figure,
     Known,
+    Plan,
     Results,
     Say,
     Variable,
 )
 from dvax.runs.applications.certificate import certificate
-from dvax.runs.config import MOST_STEPS
 from dvax.runs.schema import Section, broken
+from dvax.runs.solver_options import SolverKeys, check_steps, settings
 
+_STEP = 0.25
+"""Days a step, where the file says nothing of steps."""
 _LEAST = 0.01
 _WHY = "of less, the link costs so much that rounding hides the costs of all others"
 _CLOSED = "Write 0.01 or more; for a closed road remove its link from the network file"
@@ -34,17 +37,6 @@ def _enough(value: float) -> float:
             f"it is the part of the capacity that is left, {_LEAST:g} to 1: {_WHY}", _CLOSED
         )
     return value
-
-
-def _countable(dt: float, info: ValidationInfo) -> float:
-    """A step that is no longer than the run, and not so short that steps cannot be counted."""
-    days = info.data.get("days", dt)
-    mend = "Write dt = 0.25, a quarter of a day, or less where the run is short"
-    if dt > days:
-        raise broken(f"a step is not longer than the run, which has {days:g} days", mend)
-    if not days / dt < MOST_STEPS:
-        raise broken(f"a run has fewer than {MOST_STEPS} steps, or they cannot be counted", mend)
-    return dt
 
 
 class IncidentSection(Section):
@@ -59,7 +51,7 @@ class IncidentSection(Section):
     end: float = Field(description="when it is over [day]", examples=[12.0])
 
 
-class TrafficSection(Section):
+class TrafficSection(SolverKeys):
     """The network, the trips, and how they adapt."""
 
     name: Literal["traffic"] = Field(description="the model")
@@ -71,7 +63,6 @@ class TrafficSection(Section):
     rate: float = Field(1.0, gt=0, description="how fast trips change their paths [1/day]")
     rho: float | None = Field(None, gt=0, description="trips that a unit of cost moves")
     days: float = Field(40.0, gt=0, le=1e5, description="length of the run [day]")
-    dt: Annotated[float, AfterValidator(_countable)] = Field(0.25, gt=0, description="step [day]")
     incidents: list[IncidentSection] = Field(
         default_factory=list, description="links that lose capacity for a time"
     )
@@ -80,6 +71,7 @@ class TrafficSection(Section):
 class _Loaded:
     def __init__(self, table: TrafficSection, paths: Mapping[str, Path]):
         self.table = table
+        check_steps(table, table.days, f"{table.days:g} days")
         try:
             # By their names, so that what is wrong in both files is said at once.
             self.traffic = Traffic(
@@ -124,11 +116,17 @@ def _notes(table: TrafficSection) -> tuple[str, ...]:
     )
 
 
+def _steps(table: TrafficSection) -> str:
+    adaptive = table.rtol is not None or table.atol is not None
+    return "in adaptive steps" if adaptive else f"in steps of {table.dt or _STEP:g}"
+
+
 class TrafficApplication(AbstractApplication[_Loaded]):
     """From the first day, on which all take the road that is fastest when empty, to the equilibrium."""
 
     section = TrafficSection
     files = ("network", "trips", "nodes")
+    end = "model.days"
     keys: ClassVar[Mapping[str, tuple[str, ...]]] = {"link": ("init_node", "term_node")}
 
     def read(self, table: Any, paths: Mapping[str, Path]) -> _Loaded:
@@ -143,32 +141,32 @@ class TrafficApplication(AbstractApplication[_Loaded]):
             ("links", str(len(t.network)), f"between {t.network.nodes} nodes"),
             ("pairs", str(len(t.trips)), f"with {float(np.sum(t.trips.flow)):g} trips"),
             ("paths", str(len(t.paths.lengths)), "generated until none of the network costs less"),
-            ("days", f"{table.days:g}", f"in steps of {table.dt:g}"),
+            ("days", f"{table.days:g}", _steps(table)),
         ]
         return Known(t.constants, (), sizes, _notes(table))
 
-    def solve(self, model: _Loaded, say: Say) -> Results:
+    def plan(self, model: _Loaded, say: Say) -> Plan:
         t, table = model.traffic, model.table
         whole = np.arange(0.0, np.floor(table.days) + 0.5)
         days = whole if whole[-1] == table.days else np.append(whole, table.days)
         say(f"solving {table.days:g} days")
-        solution = solve(
-            t.problem, t.all_or_nothing(), 0.0, table.days, ts=days, dt=table.dt,
-            vi_solver=t.vi_solver, constants=t.constants, measure=True,
-        )  # fmt: skip
-        say("bounding the error")
+        step = min(_STEP, table.days)
+        options = settings(table, dt=step, vi_solver=t.vi_solver)
+        return Plan(t.problem, t.all_or_nothing(), days, t.constants, options, None, "days")
+
+    def results(self, model: _Loaded, plan: Plan, solution: Solution) -> Results:
+        t, days = model.traffic, np.asarray(solution.ts)
         bound = certificate(t.problem, solution, t.constants)
-        say("computing the figures")
-        objectives = np.asarray(jax.vmap(t.objective)(solution.ts, solution.xs))
-        spent = np.asarray(jax.vmap(t.total_travel_time)(solution.ts, solution.xs))
-        flows = np.asarray(jax.vmap(t.link_flows)(solution.xs))
-        gap = t.relative_gap(table.days, solution.xs[-1])
+        objectives = np.asarray(jax.jit(jax.vmap(t.objective))(solution.ts, solution.xs))
+        spent = np.asarray(jax.jit(jax.vmap(t.total_travel_time))(solution.ts, solution.xs))
+        flows = np.asarray(jax.jit(jax.vmap(t.link_flows))(solution.xs))
+        gap = t.relative_gap(days[-1], solution.xs[-1])
         # Paths were generated for all capacities, the equilibrium is that of the network as it is.
-        cut = np.asarray(t.capacity(table.days)) != np.asarray(t.network.capacity)
-        least = np.nan if cut.any() else float(t.objective(table.days, t.equilibrium))
+        cut = np.asarray(t.capacity(days[-1])) != np.asarray(t.network.capacity)
+        least = np.nan if cut.any() else float(t.objective(days[-1], t.equilibrium))
         found = t.figures(solution)
         day = ("day",)
-        capacity = np.asarray(jax.vmap(t.capacity.value)(solution.ts))
+        capacity = np.asarray(jax.jit(jax.vmap(t.capacity.value))(solution.ts))
         variables = {
             "day": Variable(day, days, "day", "time"),
             "objective": Variable(day, objectives, "trip cost", "Beckmann's objective"),

@@ -1,0 +1,216 @@
+"""The user's own functions f, h, A, P and K, called for the first time.
+
+JAX traces them, and that is where most first programs stop: too few parameters, an `if` on a traced
+value, a NumPy function, shapes that do not fit. The exceptions of Python and JAX point into the
+libraries; here they become an `InputError` with the file and the line of the user's code.
+"""
+
+import inspect
+import re
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from . import _tree
+from .errors import DvaxError, InputError, InputProblem
+
+_LIBRARIES = {"dvax", "equinox", "jax", "jaxlib", "jaxtyping", "numpy", "scipy", "optimistix"}
+"""Packages whose frames are no code of the user."""
+
+
+def call(name: str, fn: Callable[..., Any], inputs: Mapping[str, Any], about: str = "") -> Any:
+    """Return fn(*inputs.values()) for the argument `name` of `dvax.Problem`.
+
+    `about` says where the shape of u comes from, for messages.
+
+    **Raises:** `dvax.InputError` where fn has other parameters, or raises an exception that a usual
+    mistake leads to. Any other exception keeps its type and gets a note.
+    """
+    _check_parameters(name, fn, inputs)
+    try:
+        return fn(*inputs.values())
+    except DvaxError:
+        raise
+    except (TypeError, ValueError, LookupError, AttributeError) as error:
+        raise InputError(_explained(name, fn, inputs, about, error)) from error
+    except Exception as error:
+        error.add_note(f"Raised in {name} of dvax.Problem, {_place(fn, error.__traceback__)}.")
+        raise
+
+
+def leaked(error: jax.errors.UnexpectedTracerError) -> InputError:
+    """The `InputError` for a traced array that f, h or K keeps, or hands on, beyond a call."""
+    found = re.search(r"created on line (\S+?):(\d+)", str(error))
+    place = f"{found[1]}, line {found[2]}" if found else "f, h, A, P or K of dvax.Problem"
+    return InputError(
+        InputProblem(
+            place,
+            "a traced array that is used after the call that made it",
+            "a dvax.signals.Table (or an array that is kept in a global) is made inside of f, h or K, "
+            "where it has no values yet, and steps must end at the times of tables",
+            "Make it once, outside of the function, or hand it over in args",
+        )
+    )
+
+
+def check_values(name: str, fn: Callable[..., Any], out: Any, x: Any) -> None:
+    """Raise an `InputError` unless `out` = fn(t, x, u, args) consists of real numbers no wider than
+    those of x."""
+    at, wide = f"dvax.Problem({name})", jnp.result_type(*jtu.tree_leaves(x))
+    for leaf in jtu.tree_leaves(out):
+        number = isinstance(leaf, bool | int | float | complex | np.generic)
+        if not number and not (hasattr(leaf, "dtype") and hasattr(leaf, "shape")):
+            raise InputError(
+                InputProblem(
+                    f"{at}, {_place(fn)}", f"{type(leaf).__name__} {_line(repr(leaf))}",
+                    f"{name}(t, x, u, args) returns an array, or a tuple of arrays",
+                    "Return numbers: jnp.stack([...]) joins several into one array",
+                )
+            )  # fmt: skip
+        common = jnp.promote_types(wide, _dtype(leaf, wide))
+        if jnp.issubdtype(common, jnp.complexfloating):
+            raise InputError(
+                InputProblem(
+                    f"{at}, {_place(fn)}", f"a value of {common}", "states and controls are real",
+                    "Return its real part, or take real and imaginary part as two components",
+                )
+            )  # fmt: skip
+        if common != wide:
+            raise _too_narrow(f"{at}, {_place(fn)}", f"a value of {common}", wide)
+
+
+def check_precision(name: str, data: Any, x: Any) -> None:
+    """Raise an `InputError` where an array in `data` is of a wider type than the state: arithmetic
+    would change the type of the state at the first step."""
+    wide = jnp.result_type(*jtu.tree_leaves(x))
+    for leaf in jtu.tree_leaves(data):
+        if isinstance(leaf, jax.Array) and leaf.dtype.kind == "f":
+            common = jnp.promote_types(wide, _dtype(leaf, wide))
+            if common != wide:
+                raise _too_narrow(f"dvax.Problem({name})", f"data of {common}", wide)
+
+
+def _too_narrow(place: str, given: str, wide: Any) -> InputError:
+    return InputError(
+        InputProblem(
+            place, given,
+            f"the state x0 is of {jnp.dtype(wide).name}, and nothing is converted unasked",
+            "Give x0 in that type, jnp.asarray(x0, float) in double precision, or the data in x0's",
+        )
+    )  # fmt: skip
+
+
+def _dtype(leaf: Any, wide: Any) -> Any:
+    """The type that a leaf has beside the state: Python's numbers and weak types take the state's."""
+    if isinstance(leaf, bool | int | float):
+        return wide
+    dtype = jnp.result_type(leaf)
+    if jnp.issubdtype(dtype, jnp.complexfloating):
+        return dtype
+    weak = getattr(leaf, "weak_type", False) or not jnp.issubdtype(dtype, jnp.floating)
+    return wide if weak else dtype
+
+
+def _check_parameters(name: str, fn: Callable[..., Any], inputs: Mapping[str, Any]) -> None:
+    try:
+        signature = inspect.signature(fn)
+    except (TypeError, ValueError):
+        return  # some functions written in C have none
+    try:
+        signature.bind(*inputs.values())
+    except TypeError:
+        names = ", ".join(inputs)
+        raise InputError(
+            InputProblem(
+                f"dvax.Problem({name}), {_place(fn)}", f"a function of {signature}",
+                f"it is called as {name}({names})",
+                f"Write {name}=lambda {names}: ..., also where not all of them are used",
+            )
+        ) from None  # fmt: skip
+
+
+def _explained(
+    name: str, fn: Callable[..., Any], inputs: Mapping[str, Any], about: str, error: Exception
+) -> InputProblem:
+    shapes = ", ".join(
+        f"{key} of shape {_tree.shapes(value)}" for key, value in inputs.items() if key in "xu"
+    )
+    given = f"{type(error).__name__}: {_line(str(error))}"
+    rule, fix = _reason(name, inputs, error)
+    if shapes:
+        rule += f". It was traced with {shapes}{about}"
+    return InputProblem(
+        f"dvax.Problem({name}), {_place(fn, error.__traceback__)}", given, rule, fix
+    )
+
+
+def _reason(name: str, inputs: Mapping[str, Any], error: Exception) -> tuple[str, str]:
+    """The rule that was broken, and the fix."""
+    traced = f"JAX traces {name}, so that its arguments have no values yet where"
+    if isinstance(error, jax.errors.TracerBoolConversionError):
+        return (
+            f"{traced} `if`, `while`, `and`, `or`, `not`, `min` and `max` need one",
+            "Write jnp.where(condition, a, b) for `if`, jnp.logical_and(a, b) for `and`, "
+            "jnp.maximum(a, b) for `max`",
+        )
+    if isinstance(error, jax.errors.NonConcreteBooleanIndexError):
+        return f"{traced} a mask selects entries", "Write jnp.where(mask, a, b) for a[mask]"
+    if isinstance(error, jax.errors.TracerArrayConversionError):
+        return (
+            f"{traced} a function of NumPy needs one",
+            "Use jax.numpy: `import jax.numpy as jnp`, and jnp.sin(x) for np.sin(x)",
+        )
+    if isinstance(error, jax.errors.TracerIntegerConversionError):
+        return (
+            f"{traced} an index or the bound of a loop needs one",
+            "Write jnp.take(a, i) for a list at i, jax.lax.fori_loop for a loop",
+        )
+    if isinstance(error, jax.errors.ConcretizationTypeError):
+        return (
+            f"{traced} float(), int() or a function of `math` needs one",
+            "Leave out float(); write jnp.sin(x) for math.sin(x)",
+        )
+    if isinstance(error, jax.errors.UnexpectedTracerError):
+        return (
+            f"{name} keeps an array of its own for another call, and traced arrays end with the call",
+            "Return all that is needed, and make data outside of the function",
+        )
+    if "immutable" in str(error) or "item assignment" in str(error):
+        return "arrays of JAX cannot be written into", "Write x = x.at[i].set(v) for x[i] = v"
+    if inputs.get("args", 0) is None and "NoneType" in str(error):
+        return f"{name} reads args, and no args were given", "Pass args=... to the call"
+    fix = "Fix that line"
+    if "u" in inputs:
+        fix += (
+            "; where u has another shape, name it: control_space=dvax.spaces.Euclidean(()) of "
+            "dvax.Problem for a single number, Euclidean(3) for a vector of 3"
+        )
+    return f"{name}({', '.join(inputs)}) must be evaluable by JAX", fix
+
+
+def _place(fn: Callable[..., Any], trace: TracebackType | None = None) -> str:
+    """File and line of the user's code: the innermost frame of `trace` in it, else where fn begins."""
+    place = None
+    while trace is not None:
+        frame = trace.tb_frame
+        if str(frame.f_globals.get("__name__", "")).split(".")[0] not in _LIBRARIES:
+            place = f"{frame.f_code.co_filename}, line {trace.tb_lineno}"
+        trace = trace.tb_next
+    if place is None:
+        inner = inspect.unwrap(getattr(fn, "func", fn))
+        # A callable object, such as an equinox.Module, has its code in its class.
+        code = getattr(inner, "__code__", None) or getattr(type(inner).__call__, "__code__", None)
+        known = code is not None
+        place = f"{code.co_filename}, line {code.co_firstlineno}" if known else f"{fn!r}"
+    return place
+
+
+def _line(text: str) -> str:
+    """The first line of a text, at most 160 characters of it."""
+    first = text.strip().split("\n", 1)[0]
+    return first if len(first) <= 160 else first[:157] + "..."

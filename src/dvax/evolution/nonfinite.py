@@ -1,0 +1,45 @@
+"""Numbers that are not finite: where the first one is, and data that holds one."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .. import _tree
+from .._tree import Tree
+from ..errors import InputError, InputProblem
+from ..problem import Problem
+
+
+def refuse_nonfinite_data(problem: Problem, args: Any, caller: str) -> None:
+    """Raise an `InputError` where A, P, K or args hold NaN (A and P also infinity)."""
+    wrong = []
+    for name, data in (("A", problem.A), ("P", problem.P), ("K", problem.K), ("args", args)):
+        found = first_bad(data, allow_infinite=name in ("K", "args"))
+        if found:
+            place = f"{caller}(args)" if name == "args" else f"dvax.Problem({name})"
+            wrong.append(
+                InputProblem(place, found, "its numbers must be finite", "Correct the data there")
+            )
+    if wrong:
+        raise InputError(*wrong)
+
+
+def first_bad(tree: Tree, allow_infinite: bool = False) -> str:
+    """The first value in a tree that is NaN (or infinite), with its place; "" where there is none."""
+    leaves = [
+        leaf for leaf in jtu.tree_leaves(tree) if isinstance(leaf, float | np.ndarray | jax.Array)
+    ]
+    for k, leaf in enumerate(leaves):
+        if not _tree.is_concrete(leaf) or jnp.result_type(leaf).kind != "f":
+            continue
+        array = np.asarray(leaf)
+        bad = np.isnan(array) if allow_infinite else ~np.isfinite(array)
+        if bad.any():
+            index = tuple(int(i) for i in np.argwhere(bad)[0])
+            part = f" of part {k}" if len(leaves) > 1 else ""
+            place = f" in component {index}{part}" if index else part
+            return f"{array[index]}{place} ({int(bad.sum())} of {bad.size} entries)"
+    return ""

@@ -1,0 +1,93 @@
+"""The options of the solver as keys of a configuration, for every model."""
+
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import AfterValidator, Field, ValidationInfo
+
+from dvax import evolution, vi
+from dvax.errors import Fix, InputError, InputProblem
+from dvax.runs.schema import MOST_COUNTED, Section, ViSolver, broken
+
+MOST_STEPS = 2**30
+"""The most fixed steps of a run."""
+
+Method = Literal["ETD1", "ETD2RK", "ETD4RK", "ExpRosenbrock", "DormandPrince", "Implicit"]
+
+
+def alone(dt: float | None, info: ValidationInfo) -> float | None:
+    """Fixed steps have no tolerance, and adapt to none."""
+    given = [name for name in ("rtol", "atol") if info.data.get(name) is not None]
+    if dt is not None and given:
+        raise broken(
+            f"steps are fixed by dt, or chosen for {' and '.join(given)}, not both",
+            f"Leave out dt, or {' and '.join(given)}",
+        )
+    if dt is not None and info.data.get("method") == "Implicit":
+        raise broken("the steps of an implicit method are chosen for rtol and atol", "Leave out dt")
+    return dt
+
+
+class SolverKeys(Section):
+    """Keys that go to `dvax.solve`; one that is left out has the default of the model."""
+
+    method: Method | None = Field(None, description="of a step; by default that of the model")
+    rtol: float | None = Field(None, gt=0, lt=1, description="relative tolerance of a run")
+    atol: float | None = Field(None, gt=0, description="absolute tolerance, in units of the state")
+    dt: Annotated[float | None, AfterValidator(alone)] = Field(
+        None, gt=0, description="fixed steps of this length, in the place of rtol and atol"
+    )
+    max_steps: int | None = Field(
+        None, ge=1, le=MOST_COUNTED, description="the most steps between two blocks of frames"
+    )
+    vi_solver: ViSolver | None = Field(
+        None, description="of the frozen law; by default that of the model"
+    )
+
+
+def check_steps(table: SolverKeys, span: float, words: str) -> None:
+    """Raise an `InputError` where a fixed step is longer than the run, which has the length `span` (in
+    `words`), or so short that steps cannot be counted."""
+    dt = table.dt
+    if dt is None or (dt <= span and span / dt < MOST_STEPS):
+        return
+    rule = (
+        f"a step is not longer than the run, which has {words}"
+        if dt > span
+        else f"a run has fewer than {MOST_STEPS} steps, or they cannot be counted"
+    )
+    fix = f"Write dt = {span / 100:.3g}, say, or leave it out"
+    raise InputError(InputProblem("model.dt", f"{dt:g}", rule, fix))
+
+
+def settings(table: SolverKeys, **defaults: Any) -> dict[str, Any]:
+    """The keywords for `dvax.solve`: the keys that are given, else the defaults of the model."""
+    given: dict[str, Any] = {
+        name: value
+        for name in ("rtol", "atol", "dt", "max_steps")
+        if (value := getattr(table, name)) is not None
+    }
+    if table.method is not None:
+        given["method"] = getattr(evolution, table.method)()
+    if table.vi_solver is not None:
+        given["vi_solver"] = getattr(vi, table.vi_solver)()
+    # Steps are fixed or adapt: what the file says of one kind drops the defaults of the other.
+    dropped = {"dt": ("rtol", "atol"), "rtol": ("dt",), "atol": ("dt",)}
+    out = [other for name in given for other in dropped.get(name, ())]
+    return {k: v for k, v in defaults.items() if k not in out} | given
+
+
+def in_keys_of(section: type[Section], table: str, end: str | None = None) -> Any:
+    """How a `Fix` reads in a configuration whose solver's keys stand in `[table]`; `end` is the key of
+    the last time. None for an option that the file does not have."""
+
+    def phrase(fix: Fix) -> str | None:
+        if not fix.option:
+            return fix.why
+        key = end if fix.option == "t1" else f"{table}.{fix.option}"
+        if key is None or (fix.option != "t1" and fix.option not in section.model_fields):
+            return None
+        known = get_args(Method) + get_args(ViSolver)
+        value = f'"{fix.value}"' if fix.value in known else fix.value
+        return f"Write {key} = {value}, {fix.why}"
+
+    return phrase

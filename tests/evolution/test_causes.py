@@ -1,0 +1,200 @@
+"""A `SolveError` names the cause that the functions show, and a fix that works."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.selection import mostly_thorough
+
+import dvax
+from dvax import generators, operators, sets
+
+
+def make(f, h=lambda t, x, u, args: 0.5 - u, K=None, A=None):
+    return dvax.Problem(
+        A=generators.Zero() if A is None else A,
+        P=operators.Scaling(1.0),
+        K=sets.Box(0.0, 1.0) if K is None else K,
+        f=f,
+        h=h,
+    )
+
+
+def failure(problem, x0=0.0, t1=2.0, t0=0.0, **options):
+    with pytest.raises(dvax.SolveError) as caught:
+        dvax.solve(problem, x0, t0, t1, **options)
+    error = caught.value
+    assert max(map(len, str(error).splitlines())) < 1000 and len(str(error).splitlines()) == 1
+    return error
+
+
+def fixes(error):
+    return {fix.option: fix.value for fix in error.fixes}
+
+
+ESCAPES = [
+    # x' = c(1 + x^p) from 0 escapes at π/(c p sin(π/p)).
+    (p, c, method)
+    for p in (2.0, 1.5, 3.0, 4.0)
+    for c in (1.0, 20.0)
+    for method in (dvax.DormandPrince(), dvax.ETD2RK(), dvax.ETD4RK(), dvax.ExpRosenbrock())
+]
+
+
+@pytest.mark.parametrize(
+    ("p", "c", "method"),
+    mostly_thorough(ESCAPES, [(2.0, 1.0, dvax.DormandPrince()), (3.0, 20.0, dvax.ETD2RK())]),
+)
+def test_a_finite_time_escape_is_told_with_its_time(p, c, method):
+    problem = make(lambda t, x, u, args: c * (1.0 + jnp.abs(x) ** p))
+    escape = math.pi / (c * p * math.sin(math.pi / p))
+    error = failure(problem, t1=3.0 * escape, method=method)
+    assert "finite-time escape" in error.cause
+    told = float(error.cause.split("t ≈ ")[1].split()[0])
+    assert told == pytest.approx(escape, rel=1e-2)
+    # The fix works: up to there the solution exists.
+    end = float(fixes(error)["t1"])
+    assert 0.9 * escape < end < escape
+    loose = dict(rtol=1e-3, atol=1e-3)
+    assert dvax.solve(problem, 0.0, 0.0, end, method=dvax.DormandPrince(), **loose).xs.shape == (1,)
+
+
+def test_growth_that_is_no_escape_is_not_called_one():
+    error = failure(make(lambda t, x, u, args: x), x0=1.0, t1=1e4, rtol=1e-3)
+    assert "escape" not in str(error) and "exponential growth" in error.cause
+    error = failure(make(lambda t, x, u, args: t - x), x0=1.0, t1=50.0, max_steps=9)
+    assert "grow" not in error.cause.split("max_steps")[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "k"),
+    mostly_thorough(
+        [(name, at, k) for name in "fhK" for at in (0.37, 1.0, 1.9) for k in (0, 2)],
+        [("f", 0.37, 2), ("K", 1.0, 0)],
+    ),
+)
+def test_the_function_the_time_and_the_component_of_a_bad_value_are_told(name, at, k):
+    def spoil(which, t):
+        bad = (jnp.arange(3) == k) & (t >= at) & (which == name)
+        return jnp.where(bad, jnp.nan, 0.0)
+
+    problem = make(
+        lambda t, x, u, args: -u + spoil("f", t),
+        h=lambda t, x, u, args: x - u + spoil("h", t),
+        K=lambda t, args: sets.Box(spoil("K", t), 1.0),
+        A=generators.Scalar(-1.0),
+    )
+    error = failure(problem, x0=jnp.ones(3), rtol=1e-4)
+    assert f"{name} is " in error.cause and f"t = {at:g}" in error.cause
+    assert name == "K" or f"({k},)" in error.cause  # the box is refused as a whole
+
+
+def test_a_response_that_is_not_finite_is_no_success_where_f_does_not_feel_it():
+    upper = jnp.array([1.0, jnp.nan])
+    problem = make(
+        lambda t, x, u, args: -x, K=lambda t, args: sets.Box(0.0, jnp.where(t < 1.5, 1.0, upper))
+    )
+    error = failure(problem, x0=jnp.ones(2), ts=[0.0, 1.0, 2.0], rtol=1e-3)
+    assert "K is " in error.cause
+
+
+def test_a_state_that_leaves_the_domain_of_f_is_told_where_it_does():
+    # x' = −1 from ½ under √x, with a part that is NaN below 0.
+    problem = make(lambda t, x, u, args: -1.0 + 0.0 * jnp.log(x))
+    error = failure(problem, x0=0.5, t1=2.0)
+    assert "f is nan" in error.cause
+    assert float(error.cause.split("t = ")[1].split()[0].rstrip(".")) == pytest.approx(
+        0.5, abs=1e-6
+    )
+
+
+def test_a_law_that_is_not_monotone_is_told_with_its_eigenvalue():
+    gain = jnp.array([1.0, 3.0, 0.5])
+    problem = make(lambda t, x, u, args: -u, h=lambda t, x, u, args: 1.0 - x + gain * u)
+    error = failure(problem, x0=jnp.zeros(3), t1=1.0)
+    assert "not strongly monotone" in error.cause and "eigenvalue -2 " in error.cause
+
+
+@pytest.mark.parametrize("rate", mostly_thorough([1e4, 1e5, 1e7, 1e9], [1e7]))
+def test_stiffness_is_told_and_the_method_that_is_named_helps(rate):
+    problem = make(lambda t, x, u, args: -rate * (x - jnp.cos(t)))
+    error = failure(problem, t1=1.0, method=dvax.DormandPrince(), max_steps=4000)
+    assert "stiff" in error.cause
+    assert float(error.cause.split("of about ")[1].split(",")[0]) == pytest.approx(-rate, rel=1e-3)
+    method = getattr(dvax, fixes(error)["method"])()
+    found = dvax.solve(problem, 0.0, 0.0, 1.0, method=method, max_steps=100_000)
+    assert float(found.xs[-1]) == pytest.approx(math.cos(1.0), abs=1e-3)
+
+
+def test_a_number_of_steps_that_is_told_is_enough():
+    problem = make(lambda t, x, u, args: jnp.cos(5.0 * t) - x)
+    error = failure(problem, t1=20.0, max_steps=300, rtol=1e-6)
+    enough = int(fixes(error)["max_steps"])
+    assert enough > 300
+    dvax.solve(problem, 0.0, 0.0, 20.0, max_steps=enough, rtol=1e-6)
+
+
+def test_a_tolerance_below_rounding_is_told_and_the_one_that_is_named_is_reached():
+    problem = make(lambda t, x, u, args: jnp.sin(t) - x)
+    with pytest.warns(UserWarning, match="cannot be reached"):
+        error = failure(problem, x0=1.0, t1=1.0, rtol=1e-20, atol=0.0, max_steps=10_000)
+    assert "rounding of f" in error.cause
+    rtol = float(fixes(error)["rtol"])
+    found = dvax.solve(
+        problem, 1.0, 0.0, 1.0, rtol=rtol, atol=0.0, method=dvax.ETD4RK(), max_steps=10**6
+    )
+    exact = 1.5 * math.exp(-1.0) + 0.5 * (math.sin(1.0) - math.cos(1.0))
+    assert float(found.xs[-1]) == pytest.approx(exact, abs=1e-8)
+
+
+@pytest.mark.parametrize("t0", [1e15, -1e15])
+def test_times_that_are_too_large_for_their_rounding_are_told(t0):
+    problem = make(lambda t, x, u, args: -x, h=lambda t, x, u, args: 1.0 - 2.0 * x - u)
+    error = failure(problem, x0=1.0, t0=t0, t1=t0 + 100.0)
+    assert "rounding of t" in error.cause and "Count time from" in str(error)
+
+
+@pytest.mark.parametrize("t0", [1.0, -1.0, 4036.4, 1e15])
+@pytest.mark.parametrize("ulps", mostly_thorough([1, 2, 3, 8, 64, 300, 512], [1, 64]))
+def test_spans_of_a_few_roundings_have_an_answer(t0, ulps):
+    problem = make(lambda t, x, u, args: -1e-20 * x)
+    t1 = t0 + ulps * float(np.spacing(abs(t0)))
+    assert float(dvax.solve(problem, 1.0, t0, t1).xs[-1]) == pytest.approx(1.0, abs=1e-14)
+
+
+def test_u_takes_the_shape_that_P_or_K_fixes():
+    # x ∈ ℝ², u ∈ ℝ³, given by K alone, by P alone, by both, and by the parts of a product.
+    options = [
+        (operators.Scaling(1.0), sets.Box(jnp.zeros(3), jnp.ones(3))),
+        (operators.Dense(jnp.eye(3)), sets.Box(0.0, 1.0)),
+        (operators.Diagonal(jnp.ones(3)), sets.Ball(jnp.zeros(3), 1.0)),
+        (operators.Scaling(1.0), sets.HalfSpace(jnp.ones(3), 1.0)),
+    ]
+    for P, K in options:
+        problem = dvax.Problem(
+            A=generators.Zero(), P=P, K=K,
+            f=lambda t, x, u, args: -x + u[:2], h=lambda t, x, u, args: jnp.full(3, 0.25),
+        )  # fmt: skip
+        np.testing.assert_allclose(problem.response(0.0, jnp.zeros(2)), 0.25, atol=1e-9)
+    pair = dvax.Problem(
+        A=generators.Zero(),
+        P=operators.Product(operators.Dense(jnp.eye(3)), operators.Diagonal(jnp.ones(1))),
+        K=sets.Product(sets.Box(0.0, 1.0), sets.Box(0.0, 1.0)),
+        f=lambda t, x, u, args: -x + u[0][:2] + u[1],
+        h=lambda t, x, u, args: (jnp.full(3, 0.25), jnp.full(1, 2.0)),
+    )  # fmt: skip
+    first, second = pair.response(0.0, jnp.zeros(2))
+    np.testing.assert_allclose(first, 0.25, atol=1e-9)
+    np.testing.assert_allclose(second, 1.0, atol=1e-9)
+
+
+def test_where_the_state_fits_u_has_its_shape():
+    # A matrix of the size of x, and bounds that are numbers, leave u what x is.
+    problem = make(lambda t, x, u, args: -u, h=lambda t, x, u, args: x)
+    assert problem.zero_control(jnp.zeros(4)).shape == (4,)
+    square = dvax.Problem(
+        A=generators.Zero(), P=operators.Dense(2.0 * jnp.eye(4)), K=sets.Box(0.0, 1.0),
+        f=lambda t, x, u, args: -u, h=lambda t, x, u, args: x,
+    )  # fmt: skip
+    assert square.zero_control(jnp.zeros(4)).shape == (4,)

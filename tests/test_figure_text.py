@@ -1,0 +1,59 @@
+"""A figure reads the same everywhere, with the digits that are known."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.plots.synthetic import Recipe, write_run
+
+from dvax._figure_text import figure_text
+from dvax.cli.run import _say_figures
+from dvax.plots import build_report
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64).filter(
+    lambda v: v == 0 or 1e-290 < abs(v) < 1e290
+)
+ERRORS = st.floats(min_value=1e-280, max_value=1e280)
+
+
+@given(FINITE)
+def test_ten_digits_where_no_error_is_known(value: float) -> None:
+    assert float(figure_text(value)) == pytest.approx(value, rel=5e-10, abs=0.0)
+
+
+@given(FINITE, ERRORS)
+def test_what_is_shown_contains_all_that_is_certified(value: float, error: float) -> None:
+    shown, told = figure_text(value, error).split(" ± ")
+    # The bound is rounded up, and the value off by no more than a unit of the bound's first digit.
+    assert error <= float(told) * (1 + 1e-12) <= 1.11 * error
+    assert abs(float(shown) - value) <= max(error, 1e-16 * abs(value)) * (1 + 1e-9)
+
+
+def test_particular_figures() -> None:
+    assert figure_text(1286032.12345) == "1286032.123"
+    assert figure_text(-0.0) == "0"
+    assert figure_text(3) == "3" and figure_text(None) == "not known"
+    assert figure_text([1.5, 2.5, 3.5, 4.5, 5.5]) == "1.5, 2.5, 3.5, 4.5, … (5 in all)"
+    assert figure_text([1.23456789, 2.0], [1e-4, 1e-2]) == "1.2346 ± 1e-04, 2 ± 1e-02"
+    assert figure_text(2.5, 0.0) == "2.5"
+
+
+def test_terminal_page_and_file_agree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run_dir = write_run(tmp_path / "run", Recipe((40,), frames=21))
+    summary = {
+        "objective": {"value": 4231335.287107123, "unit": "trip cost", "meaning": "no error"},
+        "peak": {"value": 2.676123456789, "unit": "in", "meaning": "certified", "error": 3.1e-5},
+        "tiny": {"value": -1.23456789012345e-13, "unit": "1", "meaning": "small"},
+    }
+    (run_dir / "summary.json").write_text(json.dumps(summary))
+    _say_figures(summary)
+    said = capsys.readouterr().out
+    page = build_report(run_dir, stills=False).read_text(encoding="utf-8")
+    cards = re.findall(r'<div class="value" title="([^"]*)">([^<]*)</div>', page)
+    assert len(cards) == 3
+    for (whole, shown), entry in zip(cards, summary.values(), strict=True):
+        text = figure_text(entry["value"], entry.get("error"))
+        assert text in said and shown.startswith(text) and float(whole) == entry["value"]
