@@ -67,7 +67,11 @@ def test_everything_may_depend_on_the_parameters_and_the_set_on_time():
         ({"f": lambda t, x, u, args: x[0]}, jnp.zeros(2), ["Problem(f)", "()", "(2,)"]),
         ({"h": lambda t, x, u, args: jnp.zeros(3)}, jnp.zeros(2), ["Problem(h)", "(3,)", "(2,)"]),
         ({"K": sets.Box(jnp.zeros(3), 1.0)}, jnp.zeros(2), ["Box(lower)", "(3,)", "(2,)"]),
-        ({"P": operators.Diagonal(jnp.ones(3))}, jnp.zeros(2), ["P, Diagonal,", "(3,)", "(2,)"]),
+        (
+            {"P": operators.Diagonal(jnp.ones(3))},
+            jnp.zeros(2),
+            ["P, Diagonal and K, Box", "(3,)", "(2,)"],
+        ),
         ({"A": generators.Diagonal(jnp.ones(3))}, jnp.zeros(2), ["generators.Diagonal", "(3,)"]),
         ({"state_space": spaces.Euclidean(2)}, jnp.zeros(3), ["x0", "(3,)", "(2,)"]),
     ],

@@ -171,7 +171,9 @@ class Adaptive(AbstractController):
         roundoff = lax.stop_gradient(roundoff)
         relaxed = (impulse <= share * state.spare) | roundoff
         # The time of a jump is uncertain by the roundoff of t: no shorter step resolves it.
-        at_floor = (h <= 4.0 * floor) & jnp.isfinite(error) & (state.crossings < _CROSSINGS)
+        fine = 4.0 * floor <= _WATCH * (self.stops[-1] - self.stops[0])
+        at_floor = fine & (h <= 4.0 * floor) & (state.crossings < _CROSSINGS)
+        at_floor = at_floor & jnp.isfinite(error)
         sound = step.begun & step.finite
         keep = sound & ((error <= 1.0) | relaxed | at_floor) & (excursion <= 1.0)
         spare = jnp.where(
