@@ -72,6 +72,12 @@ class TrafficSection(Section):
     rho: float | None = Field(None, gt=0, description="trips that a unit of cost moves")
     days: float = Field(40.0, gt=0, le=1e5, description="length of the run [day]")
     dt: Annotated[float, AfterValidator(_countable)] = Field(0.25, gt=0, description="step [day]")
+    gap: float = Field(
+        1e-12,
+        gt=0,
+        lt=1,
+        description="relative gap of the equilibrium that paths are generated for",
+    )
     incidents: list[IncidentSection] = Field(
         default_factory=list, description="links that lose capacity for a time"
     )
@@ -84,7 +90,8 @@ class _Loaded:
             # By their names, so that what is wrong in both files is said at once.
             self.traffic = Traffic(
                 paths["network"], paths["trips"], toll_weight=table.toll_weight,
-                distance_weight=table.distance_weight, rate=table.rate, rho=table.rho,
+                distance_weight=table.distance_weight, rate=table.rate, rho=table.rho, gap=table.gap,
+                progress=True,
                 incidents=[
                     Incident(
                         link=(i.init_node, i.term_node), remaining=i.remaining, start=i.start, end=i.end
