@@ -18,6 +18,7 @@ CASES = (
     "memory",
     "processes",
     "simplices",
+    "traffic",
     "box_vi",
     "pointwise",
     "obstacle",

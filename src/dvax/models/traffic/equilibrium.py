@@ -1,15 +1,15 @@
-"""User equilibria to rounding, with the paths that carry them, by the proximal point method.
+"""User equilibria to rounding, with the paths that carry them, by column generation.
 
 Flows x on paths are a user equilibrium where they minimise Beckmann's Φ(Δx) over K, the flows that
-add up to the demand of every pair (Beckmann, McGuire and Winsten 1956). The proximal point method
-
-    x ← argmin over y ∈ K of ½‖y − x‖² + ρ Φ(Δy)
-
-converges from anywhere, and joins the least cost path of every pair to the set before each of its
-steps. How far x is from the end is its gap: the share of Σ xc that would be saved if everybody took
-the least cost path of the whole network at these costs. It bounds the error of Φ.
+add up to the demand of every pair (Beckmann, McGuire and Winsten 1956). Each round finds the least
+cost path of every pair on the whole network, adds those that cost less than all that their pair has
+(Leventhal, Nemhauser and Trotter 1973), and reduces Φ over the paths there are (`RestrictedProblem`).
+How far x is from the end is its gap: the share of Σ xc that would be saved if everybody took the
+least cost path of the whole network at these costs. It bounds the error of Φ.
 """
 
+import time
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,13 +17,31 @@ import numpy as np
 from ...errors import SolveError
 from .costs import LinkCosts
 from .paths import Paths
-from .proximal import ProximalStep
+from .restricted import RestrictedProblem
 from .shortest import ShortestPaths
 
 _SAME = 1e-13
 """Costs that differ by so little, relatively, are the same: they are sums of a few dozen numbers."""
 
-_ROUNDS = 300
+_EQUAL = 1e-6
+"""Paths whose costs differ by so little at an equilibrium are all kept: trips may take any of them."""
+
+_ROUNDS, _PATIENCE = 500, 60
+"""The most rounds, and the most in a row that need reduce neither the gap nor Φ noticeably."""
+
+_SWEEPS = 4
+"""Sweeps between two searches for shortest paths, unless the gap over the given paths has fallen to
+`_WITHIN` of the whole one before."""
+_WITHIN = 0.05
+
+_FULL, _CUT, _MOST_BLOCKS = 0.5, 0.1, 1024
+"""Shares of a step that the line search leaves: above and below, blocks become larger and smaller."""
+
+_SILENCE = 2.0
+"""Seconds between two reports."""
+
+Report = Callable[[str], None]
+"""Receives a sentence about the progress."""
 
 
 class Equilibrium(NamedTuple):
@@ -34,17 +52,6 @@ class Equilibrium(NamedTuple):
     gap: float
 
 
-class _Look(NamedTuple):
-    """What is seen at path flows: the gap, Φ, the cost along each path, the least one of each pair on
-    any path, and the tree to read that path from."""
-
-    gap: float
-    value: float
-    along: np.ndarray
-    least: np.ndarray
-    tree: np.ndarray
-
-
 def equilibrate(
     costs: LinkCosts,
     capacity: np.ndarray,
@@ -52,55 +59,66 @@ def equilibrate(
     demand: np.ndarray,
     paths: Paths | None,
     gap: float,
+    report: Report | None = None,
 ) -> Equilibrium:
-    """A user equilibrium to this gap, on the `paths` given and those that had to be added.
+    """A user equilibrium to this gap, on the `paths` given (without them, those that are least on the
+    empty network) and those that had to be added and cost no more.
 
     **Raises:** `dvax.SolveError` where rounding, or the number of rounds, does not allow the gap.
     """
-
-    def look(x: np.ndarray, step: ProximalStep) -> _Look:
-        v = step.flows(x)
-        c = costs.costs(v, capacity)
-        least, tree = search.find(c)
-        along = step.incidence @ c
-        spent = float(x @ along)
-        # Differences first: they are small where their sums are not.
-        saved = float(x @ (along - np.repeat(least, step.sizes)))
-        value = float(costs.integrals(v, capacity).sum())
-        return _Look(saved / spent if spent > 0 else 0.0, value, along, least, tree)
-
     free = costs.costs(np.zeros(len(capacity)), capacity)
-    least, tree = search.find(free)
     if paths is None:
+        _, tree = search.find(free)
         every = np.arange(len(demand))
         paths = Paths(*search.trace(tree, every), np.ones(len(demand), int), len(capacity))
-    step = ProximalStep(costs, capacity, paths, demand)
     x = all_or_nothing(paths, free, demand)
-    seen = look(x, step)
-    # A difference of costs as large as a typical cost moves a typical flow.
-    rho = float(demand @ demand) / float(demand @ least) if np.any(least > 0) else 1.0
-    for _ in range(_ROUNDS):
-        if seen.gap <= gap:
-            return Equilibrium(paths, x, float(max(seen.gap, 0.0)))
-        own = np.minimum.reduceat(seen.along, paths.starts)
-        worse = np.flatnonzero(own > seen.least * (1 + _SAME))
+    kept = np.ones(len(x), bool)
+    blocks = None
+    best, lowest, since, spoke = np.inf, np.inf, 0, time.monotonic()
+    for number in range(_ROUNDS):
+        incidence = paths.incidence()
+        v = incidence.T @ x
+        c = costs.costs(v, capacity)
+        least, tree = search.find(c)
+        along = incidence @ c
+        spent = float(x @ along)
+        # Differences first: they are small where their sums are not.
+        saved = float(x @ (along - np.repeat(least, paths.sizes)))
+        now = max(saved / spent, 0.0) if spent > 0 else 0.0
+        if report is not None and time.monotonic() - spoke > _SILENCE:
+            spoke = time.monotonic()
+            report(f"round {number}: {len(x)} paths, relative gap {now:.1e}")
+        if now <= gap:
+            # Paths that were added, cost more in the end and carry nothing: the equilibrium needs none.
+            kept |= (x > 0) | (along <= np.repeat(least, paths.sizes) * (1 + _EQUAL))
+            return Equilibrium(paths.chosen(kept), x[kept], now)
+        value = float(costs.integrals(v, capacity).sum())
+        progress = now < 0.9 * best or value < 0.999 * lowest
+        best, lowest = min(now, best), min(value, lowest)
+        since = 0 if progress else since + 1
+        if since > _PATIENCE:
+            break
+        own = np.minimum.reduceat(along, paths.starts)
+        worse = np.flatnonzero(own > least * (1 + _SAME))
         if worse.size:
             # A path that costs less than all those of its pair is none of them.
-            paths, x = _joined(paths, x, *search.trace(seen.tree, worse), worse)
-            step = ProximalStep(costs, capacity, paths, demand)
-        # As exact as the gap is small, and not before: the paths are still to come.
-        y, tries = step.solve(x, rho, min(1e-6, max(1e-3 * seen.gap, 1e-13)))
-        new = look(y, step)
-        # Φ falls while paths come in, and the gap need not; in the end Φ rests, to rounding.
-        if new.gap < seen.gap or new.value < seen.value * (1 - _SAME):
-            x, seen = y, new
-            rho *= 4.0 if tries < 10 else 0.25 if tries > 20 else 1.0
-        else:
-            seen = look(x, step)
-            rho *= 0.25
+            paths, moved = paths.joined(*search.trace(tree, worse), worse)
+            x, kept = (_moved(values, moved, len(paths.lengths)) for values in (x, kept))
+        restricted = RestrictedProblem(costs, capacity, paths, demand, x, blocks)
+        for _ in range(_SWEEPS):
+            restricted.sweep()
+            if restricted.excess() <= _WITHIN * saved:
+                break
+        x = restricted.flows()
+        # Where full steps do, larger blocks converge faster: with one it is Newton's method. Where
+        # the pairs of a block hinder each other, smaller ones do, down to one pair at a time.
+        if restricted.shortest >= _FULL:
+            blocks = len(restricted.blocks) // 2
+        elif restricted.shortest < _CUT:
+            blocks = min(2 * len(restricted.blocks), _MOST_BLOCKS)
     raise SolveError(
-        f"The user equilibrium was not reached: after {_ROUNDS} rounds its relative gap is "
-        f"{seen.gap:.2e}, and {gap:.2e} was asked for. Ask for a larger gap: with numbers of very "
+        f"The user equilibrium was not reached: after {number + 1} rounds its relative gap is "
+        f"{best:.2e}, and {gap:.2e} was asked for. Ask for a larger gap: with numbers of very "
         "different sizes rounding allows no more."
     )
 
@@ -114,11 +132,8 @@ def all_or_nothing(paths: Paths, c: np.ndarray, demand: np.ndarray) -> np.ndarra
     return x
 
 
-def _joined(
-    paths: Paths, x: np.ndarray, links: np.ndarray, lengths: np.ndarray, pairs: np.ndarray
-) -> tuple[Paths, np.ndarray]:
-    """The set with one more path for each of the `pairs`, and x on it."""
-    more, moved = paths.joined(links, lengths, pairs)
-    flows = np.zeros(len(more.lengths))
-    flows[moved] = x
-    return more, flows
+def _moved(values: np.ndarray, places: np.ndarray, size: int) -> np.ndarray:
+    """The values at their new places, and zeros at the others."""
+    spread = np.zeros(size, values.dtype)
+    spread[places] = values
+    return spread

@@ -4,7 +4,7 @@ import numpy as np
 
 from ...errors import InputError, InputProblem
 from .costs import LinkCosts
-from .equilibrium import Equilibrium, equilibrate
+from .equilibrium import Equilibrium, Report, equilibrate
 from .network import Network, Trips
 from .shortest import ShortestPaths
 
@@ -16,7 +16,7 @@ is solved in half the time, and Sioux Falls is as fast at its equilibrium."""
 
 def generated(
     costs: LinkCosts, network: Network, trips: Trips, capacities: np.ndarray, peak: np.ndarray,
-    gap: float,
+    gap: float, report: Report | None = None,
 ) -> Equilibrium:  # fmt: skip
     """The equilibrium of the network and the trips as they are, on all paths that are needed for it,
     and for those of every row of `capacities`, with these trips and with those of the `peak`."""
@@ -34,7 +34,7 @@ def generated(
     # The plain one comes last, so that its flows are on all of the paths.
     for capacity, demand in changed + plain:
         bounded = costs.up_to(np.full(len(network), demand.sum()))
-        reached = equilibrate(bounded, capacity, search, demand, paths, gap)
+        reached = equilibrate(bounded, capacity, search, demand, paths, gap, report)
         paths = reached.paths
     return reached
 

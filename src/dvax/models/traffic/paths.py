@@ -40,7 +40,45 @@ class Paths:
         shape = len(self.lengths), self.count
         return csr_array((np.ones(len(self.links)), self.links, ends), shape=shape)
 
-    def joined(self, links: np.ndarray, lengths: np.ndarray, pairs: np.ndarray) -> Any:
+    def chosen(self, which: np.ndarray) -> "Paths":
+        """The paths where `which` is true; every pair must keep one."""
+        sizes = np.add.reduceat(which.astype(int), self.starts)
+        links = self.links[np.repeat(which, self.lengths)]
+        return Paths(links, self.lengths[which], sizes, self.count)
+
+    def differences(self, demand: np.ndarray) -> "Differences":
+        """What the choice between paths changes, for flows that add up to `demand`."""
+        several = self.sizes > 1
+        rows = np.flatnonzero(np.repeat(several, self.sizes))
+        sizes = self.sizes[several]
+        lengths = self.lengths[rows]
+        begin = np.cumsum(self.lengths) - self.lengths
+        offset = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+        links = self.links[np.repeat(begin[rows], lengths) + offset]
+        pair = np.repeat(np.arange(len(sizes)), sizes)
+        row = np.repeat(np.arange(len(rows)), lengths)
+        # A link is shared by all paths of its pair where (pair, link) occurs once for each of them.
+        key = pair[row] * self.count + links
+        order = np.argsort(key, kind="stable")
+        fresh = np.append(True, key[order][1:] != key[order][:-1])
+        group = np.cumsum(fresh) - 1
+        shared = np.empty(len(key), bool)
+        shared[order] = np.bincount(group)[group] == sizes[pair[row[order]]]
+        first = np.cumsum(sizes) - sizes
+        once = shared & (row == first[pair[row]])
+        pairs = np.flatnonzero(several)
+        fixed = np.bincount(links[once], demand[pairs][pair[row[once]]], self.count)
+        alone = np.repeat(~several, self.sizes)
+        only = np.repeat(np.repeat(demand, self.sizes), self.lengths)[
+            np.repeat(alone, self.lengths)
+        ]
+        fixed += np.bincount(self.links[np.repeat(alone, self.lengths)], only, self.count)
+        ends = np.append(0, np.cumsum(np.bincount(row[~shared], minlength=len(rows))))
+        return Differences(rows, pairs, sizes, links[~shared], ends, fixed, self.count)
+
+    def joined(
+        self, links: np.ndarray, lengths: np.ndarray, pairs: np.ndarray
+    ) -> tuple["Paths", np.ndarray]:
         """(these paths and one more for each of the `pairs`, where each of the old ones is now)."""
         owner = np.concatenate([self.pairs, pairs])
         order = np.argsort(owner, kind="stable")
@@ -52,6 +90,33 @@ class Paths:
         sizes = np.bincount(owner, minlength=len(self.sizes))
         moved = np.argsort(order, kind="stable")[: len(self.lengths)]
         return Paths(flat, new, sizes, self.count), moved
+
+
+@dataclass(frozen=True, eq=False)
+class Differences:
+    """The paths of the pairs that have several, without the links that all paths of a pair share.
+
+    `rows` are their numbers among all paths, `pairs` those of the pairs among all pairs, `sizes` how
+    many paths each pair has; `links` up to `ends` are those of each row, and `fixed` the link flows
+    that no choice changes: v = fixed + Δ′x.
+    """
+
+    rows: np.ndarray
+    pairs: np.ndarray
+    sizes: np.ndarray
+    links: np.ndarray
+    ends: np.ndarray
+    fixed: np.ndarray
+    count: int
+
+    def matrix(self, first: int, last: int) -> Any:
+        """The rows from `first` to before `last`, sparse, with a one for each link."""
+        from scipy.sparse import csr_array
+
+        ends = self.ends[first : last + 1]
+        links = self.links[ends[0] : ends[-1]]
+        shape = last - first, self.count
+        return csr_array((np.ones(len(links)), links, ends - ends[0]), shape=shape)
 
 
 class Incidence(eqx.Module):

@@ -1,5 +1,6 @@
 """Day-to-day traffic: how trips find their paths on a congested network."""
 
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -52,7 +53,8 @@ class Traffic(eqx.Module):
     - `demand`: the factor of all trips as a signal or callable of t, one number or one for each
       pair; `peak`, the most that it comes to, where it is neither constant nor a table;
     - `incidents`: `Incident`s, which cut capacities for a time;
-    - `gap`: how exact the equilibria are for which paths are generated.
+    - `gap` > 0: the relative gap of the equilibria for which paths are generated, 10⁻¹² by default;
+    - `progress`: print a line on standard error every two seconds while paths are generated.
 
     Paths are generated until no path of the network costs less at the equilibrium, for the trips
     as they are and at their peak, with all capacities that incidents bring about. `paths` are
@@ -104,6 +106,7 @@ class Traffic(eqx.Module):
         peak: Any = None,
         incidents: Sequence[Incident] = (),
         gap: Any = 1e-12,
+        progress: bool = False,
     ):
         wrong = numbers(
             toll_weight=toll_weight, distance_weight=distance_weight, rate=rate, rho=rho, gap=gap
@@ -132,7 +135,9 @@ class Traffic(eqx.Module):
         self.rate, self.worst = float(rate), each.min(axis=0)
         most = self.peak * self.trips.flow
         costs = found["costs"]
-        reached = generated(costs, self.network, self.trips, each, most, float(gap))
+        reached = generated(
+            costs, self.network, self.trips, each, most, float(gap), _say if progress else None
+        )
         self.paths, self.gap = reached.paths, reached.gap
         self.equilibrium = jnp.asarray(reached.flows)
         self.incidence = Incidence(self.paths)
@@ -244,6 +249,11 @@ class Traffic(eqx.Module):
             "total_travel_time": float(self.total_travel_time(t, x)),
             "max_conservation_error": worst,
         }
+
+
+def _say(words: str) -> None:
+    sys.stderr.write(f"generating paths, {words}\n")
+    sys.stderr.flush()
 
 
 class _Rate(eqx.Module):

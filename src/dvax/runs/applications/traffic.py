@@ -63,6 +63,12 @@ class TrafficSection(SolverKeys):
     rate: float = Field(1.0, gt=0, description="how fast trips change their paths [1/day]")
     rho: float | None = Field(None, gt=0, description="trips that a unit of cost moves")
     days: float = Field(40.0, gt=0, le=1e5, description="length of the run [day]")
+    gap: float = Field(
+        1e-12,
+        gt=0,
+        lt=1,
+        description="relative gap of the equilibrium that paths are generated for",
+    )
     incidents: list[IncidentSection] = Field(
         default_factory=list, description="links that lose capacity for a time"
     )
@@ -76,7 +82,8 @@ class _Loaded:
             # By their names, so that what is wrong in both files is said at once.
             self.traffic = Traffic(
                 paths["network"], paths["trips"], toll_weight=table.toll_weight,
-                distance_weight=table.distance_weight, rate=table.rate, rho=table.rho,
+                distance_weight=table.distance_weight, rate=table.rate, rho=table.rho, gap=table.gap,
+                progress=True,
                 incidents=[
                     Incident(
                         link=(i.init_node, i.term_node), remaining=i.remaining, start=i.start, end=i.end

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from .costs import LinkCosts
-from .paths import Paths
+from dvax.models.traffic.costs import LinkCosts
+from dvax.models.traffic.paths import Paths
 
 _MOST = 60
 """Newton steps; where they do not do, ρ was too large."""
