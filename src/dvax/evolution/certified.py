@@ -1,8 +1,10 @@
 """Steps chosen for a bound on the error: `certified_tol` of `dvax.solve`.
 
 With a defect of the norm δ all along, ‖x_h − x‖(t) ≤ M Φ_c(t) δ, c = ω + ML̃. So the tolerance of the
-step control follows from the one that is asked for, up to a factor of a few that the run itself shows:
-a run in coarser steps is cheap and tells most of it, and the next one is made with what it told.
+step control follows from the one that is asked for, up to a factor of a few that a run shows. The first
+run is cheap, whatever is asked for. Its bound and its number of steps predict those of the next one, so
+that a tolerance out of reach is refused after it. A bound is called certified where the defect is
+enclosed over every step, and estimated where it is sampled.
 """
 
 from collections.abc import Callable
@@ -25,6 +27,9 @@ from .solution import Solution
 
 _COARSE = 100.0
 """How much coarser the first run is."""
+
+_CHEAP = 1e-5
+"""Of the size of state and rate: the finest tolerance of the first run."""
 
 _AIM = 0.7
 """The share of the tolerance that a run aims at, so that it need not be made again."""
@@ -49,6 +54,7 @@ def certified(
     t1: float,
     constants: Any,
     tol: float,
+    max_steps: int,
 ) -> Solution:
     """The solution whose bound is at most `tol` at every saved time;
     `run(ts, atol)` solves with this absolute tolerance and no relative one.
@@ -63,17 +69,19 @@ def certified(
     eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(x0))).eps)
     reachable = _ROUNDINGS * eps * largest * grown
     if not tol >= reachable:
-        raise _hopeless(tol, reachable, known, span)
+        raise _hopeless(tol, reachable, known, span, "the roundoff of f alone grows to that")
     # The step control holds the root mean square of the defect below atol/span.
     atol = tol / grown * span / size
-    atol *= _COARSE if _COARSE * atol < 0.1 * (1.0 + largest / size) else 1.0
-    bound = np.inf
+    scale = 1.0 + largest / size
+    coarse = max(_COARSE * atol, _CHEAP * scale)
+    atol = coarse if coarse < 0.1 * scale else max(atol, min(coarse, 0.1 * scale))
+    before, bound = np.inf, np.inf
     for _ in range(_RUNS):
         solution = run(ts, atol)
         if solution.result != RESULTS.successful:
             return solution  # throw=False: the result says what failed, and nothing is certified
         bounds = _bounds(solution, known, t0)
-        bound = float(np.max(np.asarray(bounds)))
+        last, bound = bound, float(np.max(np.asarray(bounds)))
         if bound <= tol:
             if of_region(constants):
                 # The same steps, saved more often: the bounds in between are the sharper for it.
@@ -82,8 +90,36 @@ def certified(
                 if left is not None:
                     raise _outside(left)
             return _with_bound(solution, bound)
+        ratio = atol / before
+        if np.isfinite(last) and bound > last * ratio**0.5:
+            why = f"{1.0 / ratio:.3g} times finer steps gave {bound:.3g} after {last:.3g}: roundoff"
+            raise _hopeless(tol, min(bound, last), known, span, why)
+        before = atol
         atol = min(0.5 * atol, _AIM * atol * tol / bound) if np.isfinite(bound) else 0.1 * atol
-    raise _hopeless(tol, bound, known, span)
+        _predict(solution, before / atol, tol, bound, max_steps, known, span)
+    raise _hopeless(tol, bound, known, span, "every finer run fell short of its prediction")
+
+
+def _predict(
+    solution: Solution,
+    finer: float,
+    tol: float,
+    bound: float,
+    max_steps: int,
+    known: "_Growth",
+    span: float,
+) -> None:
+    """Refuse a run with a `finer` tolerance that would take more than `max_steps`: a defect of order p
+    takes finer^{1/p} times the steps."""
+    method = solution.setup.method
+    order = getattr(method, "degree", 1) + 1
+    steps = int(solution.stats["steps"]) + int(solution.stats["rejected"])
+    needed = steps * finer ** (1.0 / order)
+    if needed > max_steps:
+        least = bound * (steps / max_steps) ** order
+        name = type(method).__name__
+        why = f"it would take about {needed:.2g} steps of {name}, and max_steps is {max_steps}"
+        raise _hopeless(tol, least, known, span, why)
 
 
 class _Growth(NamedTuple):
@@ -198,7 +234,7 @@ def _check_domain(constants: Any, args: Any, t0: float, t1: float) -> None:
 
 
 def _with_bound(solution: Solution, bound: float) -> Solution:
-    solution.stats["certified_bound"] = bound
+    solution.stats["certified_bound" if solution.enclosed else "estimated_bound"] = bound
     return solution
 
 
@@ -207,7 +243,7 @@ def _convolved(a: float, T: float) -> float:
     return T if a == 0.0 else float(np.expm1(min(a * T, 700.0)) / a)
 
 
-def _hopeless(tol: float, reachable: float, known: _Growth, span: float) -> InputError:
+def _hopeless(tol: float, reachable: float, known: _Growth, span: float, why: str) -> InputError:
     M, rate = min(known.rates, key=lambda pair: pair[0] * _convolved(pair[1], span))
     return InputError(
         InputProblem(
@@ -215,7 +251,7 @@ def _hopeless(tol: float, reachable: float, known: _Growth, span: float) -> Inpu
             f"{tol:g}",
             f"errors may grow like M e^{{ct}} with M = {M:g} and c = {rate:g}, a defect by "
             f"M Φ_c(T) = {M * _convolved(rate, span):.3g} over T = {span:g}, and the least "
-            f"bound in reach here is about {reachable:.3g}",
+            f"bound in reach here is about {reachable:.3g} ({why})",
             "Ask for more than that, solve for a shorter time, or find sharper constants: "
             "dvax.verify gives a one-sided rate where it can",
         )

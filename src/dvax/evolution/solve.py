@@ -81,7 +81,8 @@ def solve(
     - `certified_tol`: the largest error of x in the norm of the state space that is allowed at any
       saved time, for the exact x0: steps are chosen, in a few runs, until `dvax.bound_error` with
       these `constants` says so (`rtol` and `atol` are then not used). The bound that was reached is
-      in `stats["certified_bound"]`. Constants of a region hold while x and u stay in it: that is
+      in `stats["certified_bound"]`, or in `stats["estimated_bound"]` where the defect was sampled and
+      not enclosed (`sol.enclosed`): methods of order above 2, and laws without closed form. Constants of a region hold while x and u stay in it: that is
       looked at 256 more times, and between them it is for you to know;
     - `measure`: whether to sample the defect inside steps. Adaptive steps always do; fixed steps only
       when asked, since it doubles their cost;
@@ -134,7 +135,8 @@ def solve(
         run = lambda times, atol: solve(  # noqa: E731
             problem, x0, t0, t1, args, times, rtol=0.0, atol=atol, **again
         )
-        return certified(run, ts, problem, x0, args, begin, end, constants, certified_tol)
+        most = bound_steps(max_steps, False, t0, t1, None)
+        return certified(run, ts, problem, x0, args, begin, end, constants, certified_tol, most)
     x0 = _tree.as_float(x0, "x0")
     method = _METHOD if method is None else method
     check(
