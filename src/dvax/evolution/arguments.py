@@ -14,6 +14,7 @@ from ..problem import Problem
 from .implicit import Implicit
 from .method import AbstractMethod
 from .picard import Picard
+from .piecewise.method import PiecewiseLinear
 
 ADAPTIVE_STEPS = 2**20
 """The most steps of an adaptive solve, unless max_steps says otherwise."""
@@ -31,7 +32,7 @@ def check(
 
     rule(isinstance(problem, Problem), "problem", type(problem).__name__,
          "it must be a dvax.Problem", "Build one from A, P, K, f and h")  # fmt: skip
-    rule(isinstance(method, AbstractMethod | Implicit | Picard), "method", method,
+    rule(isinstance(method, AbstractMethod | Implicit | Picard | PiecewiseLinear), "method", method,
          "it must be a method such as dvax.ETD2RK()", "Leave it out for the default")  # fmt: skip
     rule(adjoint in ("reverse", "forward"), "adjoint", repr(adjoint),
          "it must be 'reverse' or 'forward'",
@@ -42,6 +43,9 @@ def check(
                  "Leave it out and name the times in ts=, or use an exponential method")  # fmt: skip
         rule(dt is None, "dt", dt, "how well an implicit method solves its equations follows from "
              "rtol and atol, so its steps adapt", "Leave it out")  # fmt: skip
+    if isinstance(method, PiecewiseLinear):
+        rule(dt is None, "dt", dt, "dvax.PiecewiseLinear steps from one change of the constraints to the "
+             "next", "Leave it out, and name the times to save in ts=")  # fmt: skip
     if _tree.is_concrete(x0):
         for leaf in map(np.asarray, jax.tree_util.tree_leaves(x0)):
             if not np.isfinite(leaf).all():

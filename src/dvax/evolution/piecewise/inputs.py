@@ -1,0 +1,119 @@
+"""The inputs g(t) and q(t) of an affine system as polynomials in pieces.
+
+Between two knots of the data they are analytic. A stretch on which they are lines is one piece; others
+are halved until Chebyshev interpolation has converged, which its coefficients and further points show.
+The points are no fraction of a period apart from each other, so that a wave does not pass for a constant.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..._tree import Tree
+from ...problem import Problem
+from .radau import STAGES
+
+Array = np.ndarray
+
+_POINTS = np.cos(np.pi * (np.arange(STAGES + 1) + 0.5) / (STAGES + 1))
+_TO_COEFFICIENTS = np.linalg.inv(np.polynomial.chebyshev.chebvander(_POINTS, STAGES))
+_LINE = np.array([-0.93, -0.5441, 0.0713, 0.4129, 0.8537])
+_EXTRA = np.array([-0.9871, -0.4127, 0.0317, 0.3719, 0.8853])
+_NOISE = 64.0
+"""Roundings of t and of the value that a sample may be off by."""
+
+
+class Piece(NamedTuple):
+    """(g, q) on [start, start + length], by Chebyshev coefficients, a row each degree; `error` bounds
+    nothing: it is how far the polynomial was off at points that did not make it."""
+
+    start: float
+    length: float
+    coefficients: Array
+    error: Array
+
+    def at(self, places: Array) -> Array:
+        """(g, q), a row each place in [0, 1]."""
+        if len(self.coefficients) == 1:
+            return np.broadcast_to(self.coefficients[0], (len(places), self.error.size))
+        s = 2.0 * np.asarray(places) - 1.0
+        return np.polynomial.chebyshev.chebval(s, self.coefficients).T
+
+
+class Unresolved(Exception):
+    """No polynomial fits the inputs around a time, on however short a piece."""
+
+    def __init__(self, t: float, finite: bool):
+        super().__init__(t)
+        self.t, self.finite = t, finite
+
+
+@eqx.filter_jit
+def _samples(problem: Problem, args: Any, x: Tree, u: Tree, ts: Any) -> Any:
+    def one(t: Any) -> Any:
+        f, h = problem.f(t, x, u, args), problem.h(t, x, u, args)
+        return jnp.concatenate([f.ravel(), -h.ravel()])
+
+    return jax.vmap(one)(ts)
+
+
+def pieces(problem: Problem, stops: Array, x0: Any, args: Any, most: int) -> list[Piece]:
+    """Those of all stretches between `stops`.
+
+    **Raises:** `Unresolved` where a stretch of a few roundings of t, or `most` pieces, do not do.
+    """
+    dtype = jnp.result_type(x0)
+    x, u = jnp.zeros_like(x0), problem.zero_control(x0)
+    eps = float(jnp.finfo(dtype).eps)
+
+    def sampled(starts: Array, lengths: Array, places: Array) -> Array:
+        """Values at these places of every stretch: [stretch, place, entry]."""
+        ts = (starts[:, None] + lengths[:, None] * (0.5 + 0.5 * places)).ravel()
+        # In powers of two: the program is compiled for few counts.
+        padded = np.pad(ts, (0, (1 << (len(ts) - 1).bit_length()) - len(ts)), mode="edge")
+        values = np.asarray(_samples(problem, args, x, u, jnp.asarray(padded, dtype)), float)
+        values = values[: len(ts)].reshape(len(starts), len(places), -1)
+        bad = ~np.isfinite(values).all(axis=(1, 2))
+        if bad.any():
+            raise Unresolved(float(starts[bad][0]), finite=False)
+        return values
+
+    done: list[Piece] = []
+    starts, lengths = stops[:-1], np.diff(stops)
+    values = sampled(starts, lengths, _LINE)
+    slope = (values[:, -1] - values[:, 0]) / (_LINE[-1] - _LINE[0])
+    middle = values[:, 0] - _LINE[0] * slope
+    off = np.abs(values - middle[:, None] - _LINE[:, None] * slope[:, None]).max(axis=1)
+    ends = np.abs(starts) + lengths
+    noise = _NOISE * eps * (np.abs(values).max(axis=1) + np.abs(slope) * (ends / lengths)[:, None])
+    lines = (off <= noise).all(axis=1)
+    for k in np.flatnonzero(lines):
+        rows = np.stack([middle[k], slope[k]])
+        flat = np.all(np.abs(slope[k]) <= noise[k])
+        done.append(Piece(starts[k], lengths[k], rows[:1] if flat else rows, 0.0 * off[k]))
+    starts, lengths = starts[~lines], lengths[~lines]
+    places = np.concatenate([_POINTS, _EXTRA])
+    while len(starts):
+        values = sampled(starts, lengths, places)
+        nodes, extra = values[:, : STAGES + 1], values[:, STAGES + 1 :]
+        c = np.einsum("ij,kjl->kil", _TO_COEFFICIENTS, nodes)
+        basis = np.polynomial.chebyshev.chebvander(_EXTRA, STAGES)
+        off = np.abs(np.einsum("ij,kjl->kil", basis, c) - extra).max(axis=1)
+        steep = np.abs(c[:, 1:]).sum(axis=1)
+        near = ((np.abs(starts) + lengths) / lengths)[:, None]
+        noise = _NOISE * eps * (np.abs(c).sum(axis=1) + steep * near)
+        tail = np.abs(c[:, -3:]).max(axis=1)
+        good = ((off <= noise) & (tail <= noise)).all(axis=1)
+        done += [Piece(starts[k], lengths[k], c[k], off[k]) for k in np.flatnonzero(good)]
+        starts, lengths = starts[~good], lengths[~good]
+        short = lengths <= 1e3 * eps * (np.abs(starts) + lengths)
+        if short.any() or len(done) + len(starts) > most:
+            place = starts[short] if short.any() else starts
+            raise Unresolved(float(place[0]), finite=True)
+        half = 0.5 * lengths
+        starts = np.stack([starts, starts + half], axis=1).ravel()
+        lengths = np.repeat(half, 2)
+    return sorted(done, key=lambda piece: piece.start)

@@ -1,0 +1,161 @@
+"""Modes: which constraints of y are active, and what the equations prescribe in each.
+
+A mode has a number for each pair (yᵢ, wᵢ): −1 where yᵢ is at its lower bound, 1 at the upper one, and 0
+where it is free, so that wᵢ = 0. Of each pair a mode prescribes one member; what has a sign to keep is
+the other one.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from . import radau
+from .system import Affine
+
+Array = np.ndarray
+Mode = tuple[int, ...]
+
+ROUNDINGS = 64.0 * np.finfo(float).eps
+"""What rounding may do to a sum, relative to the sum of the sizes of its terms."""
+
+
+class Condition(NamedTuple):
+    """sign · (member − bound) ≥ 0 of pair i; where it fails the pair goes on in the state `to`."""
+
+    i: int
+    of_w: bool
+    sign: float
+    bound: float
+    to: int
+
+
+class Equations:
+    """The equations of one mode.
+
+    `prescribed_p` and `prescribed_d` hold the prescribed values (0 elsewhere), `unknown` says where p is
+    unknown; `rates` are the time scales of the mode, 1/|λ| in effect, from the shortest to the longest.
+    """
+
+    def __init__(self, system: Affine, mode: Mode):
+        self.system, self.mode = system, mode
+        state = np.array(mode)
+        free = state == 0
+        self.unknown = free != system.swapped
+        u = self.unknown
+        y = np.where(state < 0, system.low, np.where(state > 0, system.up, 0.0))
+        value = np.where(free, 0.0, y)
+        self.prescribed_p = np.where(u, 0.0, value)
+        self.prescribed_d = np.where(u, value, 0.0)
+        self.conditions = [c for i, s in enumerate(mode) for c in _conditions(system, i, s)]
+        M = system.M[np.ix_(u, u)]
+        self.inverse = _inverse(M)
+        eliminated = system.A - system.B[:, u] @ self.inverse @ system.C[u]
+        spectrum = np.linalg.eigvals(eliminated) if np.isfinite(eliminated).all() else np.zeros(1)
+        speeds = np.abs(spectrum.real) / 8.0 + np.abs(spectrum.imag) / 4.0
+        fastest = max(float(speeds.max()), 1e-300)
+        self.scales = np.unique(1.0 / speeds[speeds > 1e-20 * fastest])
+        self.shortest = 1e-2 / fastest
+        self._factors: dict[float, tuple[Array, tuple[Array, Array]]] = {}
+
+    def solve(self, h: float, x0: Array, inputs: Array) -> tuple[Array, Array]:
+        """(x at the nodes, p at the collocation points) of a step of length h from x0, for `inputs`
+        (g, q) at the collocation points."""
+        system, u, s = self.system, self.unknown, radau.STAGES
+        n, k = len(x0), int(self.unknown.sum())
+        scale, factors = self._factorised(h)
+        g, q = inputs[:, :n], inputs[:, n:]
+        right = np.zeros((s, n + k))
+        right[:, :n] = h * (g + system.B @ self.prescribed_p) - radau.D[1:, :1] * x0
+        right[:, n:] = (self.prescribed_d - q - system.M @ self.prescribed_p)[:, u]
+        found = scipy.linalg.lu_solve(factors, right.ravel() * scale, check_finite=False)
+        found = found.reshape(s, n + k)
+        p = np.tile(self.prescribed_p, (s, 1))
+        p[:, u] = found[:, n:]
+        return np.vstack([x0, found[:, :n]]), p
+
+    def dependent(self, x: Array, p: Array, q: Array) -> Array:
+        """d from x, p and q, rows of times."""
+        d = p @ self.system.M.T + x @ self.system.C.T + q
+        d[:, self.unknown] = self.prescribed_d[self.unknown]
+        return d
+
+    def noise(self, x: Array, p: Array, q: Array, off: Array) -> tuple[Array, Array]:
+        """What rounding leaves undetermined of p and of d, for values of these sizes, x being `off`."""
+        system, u = self.system, self.unknown
+        terms = np.abs(system.C) @ x + np.abs(system.M) @ p + q
+        of_d = ROUNDINGS * terms + np.abs(system.C) @ off
+        of_p = np.zeros(len(u))
+        of_p[u] = np.abs(self.inverse) @ of_d[u] + ROUNDINGS * p[u]
+        of_d = of_d + np.abs(system.M[:, u]) @ of_p[u]
+        return of_p, of_d
+
+    def members(self, p: Array, d: Array) -> tuple[Array, Array]:
+        """(y, w) from (p, d)."""
+        swapped = self.system.swapped
+        return np.where(swapped, d, p), np.where(swapped, p, d)
+
+    def at(self, x: Array, q: Array, off: Array) -> tuple[Array, Array, Array, Array]:
+        """(y, w) at one x and q, and their noise, x being `off`."""
+        p, u = self.prescribed_p.copy(), self.unknown
+        free = self.prescribed_d - q - self.system.C @ x - self.system.M @ p
+        p[u] = self.inverse @ free[u]
+        d = self.dependent(x[None], p[None], q[None])[0]
+        y, w = self.members(p, d)
+        return y, w, *self.members(*self.noise(np.abs(x), np.abs(p), np.abs(q), off))
+
+    def _factorised(self, h: float) -> tuple[Array, tuple[Array, Array]]:
+        """LU factors of the equations of a step, each row divided by its largest entry."""
+        if h in self._factors:
+            return self._factors[h]
+        system, u, s = self.system, self.unknown, radau.STAGES
+        n, k = len(system.A), int(self.unknown.sum())
+        K = np.zeros((s, n + k, s, n + k))
+        states = np.arange(n)
+        K[:, states, :, states] = radau.D[1:, 1:]
+        each = np.arange(s)
+        block = np.block(
+            [[-h * system.A, -h * system.B[:, u]], [system.C[u], system.M[np.ix_(u, u)]]]
+        )
+        K[each, :, each, :] += block
+        K = K.reshape(s * (n + k), -1)
+        scale = 1.0 / np.abs(K).max(axis=1)
+        if len(self._factors) >= _KEPT:
+            self._factors.clear()
+        found = scale, scipy.linalg.lu_factor(scale[:, None] * K, check_finite=False)
+        self._factors[h] = found
+        return found
+
+
+_KEPT = 64
+"""Factorisations that a mode keeps: steps between the knots of a record have few lengths."""
+
+
+def _inverse(M: Array) -> Array:
+    try:
+        return np.linalg.inv(M)
+    except np.linalg.LinAlgError:
+        # No mode of a law with γ > 0: the equations of a step will say so.
+        return np.full_like(M, np.nan)
+
+
+def _conditions(system: Affine, i: int, state: int) -> list[Condition]:
+    low, up = system.low[i], system.up[i]
+    if state:
+        # Between equal bounds w may have any sign.
+        return [] if low == up else [Condition(i, True, -float(state), 0.0, 0)]
+    found = [Condition(i, False, 1.0, low, -1), Condition(i, False, -1.0, up, 1)]
+    return [c for c in found if np.isfinite(c.bound)]
+
+
+def first_mode(system: Affine) -> Mode:
+    """Every yᵢ at a bound where it has one."""
+    return tuple(
+        -1 if np.isfinite(low) else 1 if np.isfinite(up) else 0
+        for low, up in zip(system.low, system.up, strict=True)
+    )
+
+
+def changed(mode: Mode, condition: Condition) -> Mode:
+    """The mode after a condition has failed."""
+    return (*mode[: condition.i], condition.to, *mode[condition.i + 1 :])
