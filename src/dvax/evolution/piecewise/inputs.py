@@ -27,12 +27,14 @@ _NOISE = 64.0
 
 
 class Piece(NamedTuple):
-    """(g, q) on [start, start + length], by Chebyshev coefficients, a row each degree; `error` bounds
-    nothing: it is how far the polynomial was off at points that did not make it."""
+    """(g, q) on [start, start + length], by Chebyshev coefficients, a row each degree; `noise` is what
+    rounding of t and of the values leaves undetermined. `error`, how far the polynomial was off at points
+    that did not make it, is an estimate and no bound."""
 
     start: float
     length: float
     coefficients: Array
+    noise: Array
     error: Array
 
     def at(self, places: Array) -> Array:
@@ -93,7 +95,7 @@ def pieces(problem: Problem, stops: Array, x0: Any, args: Any, most: int) -> lis
     for k in np.flatnonzero(lines):
         rows = np.stack([middle[k], slope[k]])
         flat = np.all(np.abs(slope[k]) <= noise[k])
-        done.append(Piece(starts[k], lengths[k], rows[:1] if flat else rows, 0.0 * off[k]))
+        done.append(Piece(starts[k], lengths[k], rows[:1] if flat else rows, noise[k], 0 * off[k]))
     starts, lengths = starts[~lines], lengths[~lines]
     places = np.concatenate([_POINTS, _EXTRA])
     while len(starts):
@@ -107,7 +109,10 @@ def pieces(problem: Problem, stops: Array, x0: Any, args: Any, most: int) -> lis
         noise = _NOISE * eps * (np.abs(c).sum(axis=1) + steep * near)
         tail = np.abs(c[:, -3:]).max(axis=1)
         good = ((off <= noise) & (tail <= noise)).all(axis=1)
-        done += [Piece(starts[k], lengths[k], c[k], off[k]) for k in np.flatnonzero(good)]
+        error = np.maximum(off - noise, 0.0)
+        done += [
+            Piece(starts[k], lengths[k], c[k], noise[k], error[k]) for k in np.flatnonzero(good)
+        ]
         starts, lengths = starts[~good], lengths[~good]
         short = lengths <= 1e3 * eps * (np.abs(starts) + lengths)
         if short.any() or len(done) + len(starts) > most:
@@ -116,4 +121,25 @@ def pieces(problem: Problem, stops: Array, x0: Any, args: Any, most: int) -> lis
         half = 0.5 * lengths
         starts = np.stack([starts, starts + half], axis=1).ravel()
         lengths = np.repeat(half, 2)
-    return sorted(done, key=lambda piece: piece.start)
+    return _joined(sorted(done, key=lambda piece: piece.start))
+
+
+def _joined(pieces: list[Piece]) -> list[Piece]:
+    """The same pieces, continuous where they meet within their noise: the value of the one with less of
+    it is taken, and a line is added to the other. A steep edge far from t = 0 is not known better."""
+    changes = np.zeros((len(pieces), 2, len(pieces[0].noise)))
+    for k in range(len(pieces) - 1):
+        left, right = pieces[k], pieces[k + 1]
+        apart = right.at(np.zeros(1))[0] - left.at(np.ones(1))[0]
+        same = np.abs(apart) <= left.noise + right.noise
+        changes[k, 1] = np.where(same & (left.noise > right.noise), apart, 0.0)
+        changes[k + 1, 0] = np.where(same & (left.noise <= right.noise), -apart, 0.0)
+    found = []
+    for piece, (first, last) in zip(pieces, changes, strict=True):
+        c = piece.coefficients
+        if first.any() or last.any():
+            c = np.concatenate([c, np.zeros((max(0, 2 - len(c)), c.shape[1]))])
+            c[0] += 0.5 * (first + last)
+            c[1] += 0.5 * (last - first)
+        found.append(piece._replace(coefficients=c))
+    return found

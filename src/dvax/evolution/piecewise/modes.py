@@ -16,7 +16,7 @@ from .system import Affine
 Array = np.ndarray
 Mode = tuple[int, ...]
 
-ROUNDINGS = 64.0 * np.finfo(float).eps
+ROUNDINGS = 512.0 * np.finfo(float).eps
 """What rounding may do to a sum, relative to the sum of the sizes of its terms."""
 
 

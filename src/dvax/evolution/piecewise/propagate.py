@@ -57,7 +57,7 @@ def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
     try:
         found = pieces(problem, stops, x0, args, limits.max_steps)
     except Unresolved as error:
-        run = Run(given, given, [Piece(t0, t1 - t0, np.zeros((1, 1)), np.zeros(1))],
+        run = Run(given, given, [Piece(t0, t1 - t0, np.zeros((1, 1)), np.zeros(1), np.zeros(1))],
                   np.asarray(x0, float).ravel(), weights, tol, *limits_of(limits, times))  # fmt: skip
         run.t, run.result = error.t, "step_too_small" if error.finite else "nonfinite"
         prepared = time.perf_counter()

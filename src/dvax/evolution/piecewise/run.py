@@ -114,7 +114,7 @@ class Run:
     def _converted(self, piece: Piece) -> Piece:
         """The piece in the system's own variables."""
         c = piece.coefficients @ self.system.inputs.T
-        return piece._replace(coefficients=c, error=np.abs(self.system.inputs) @ piece.error)
+        return piece._replace(coefficients=c, noise=np.abs(self.system.inputs) @ piece.noise)
 
     def of(self, mode: Mode) -> Equations:
         if mode not in self.equations:
@@ -307,7 +307,7 @@ def _continuous(before: Piece, after: Piece) -> bool:
     """Whether the inputs go on from one piece to the next without a jump."""
     end, start = before.at(np.ones(1))[0], after.at(np.zeros(1))[0]
     size = np.abs(before.coefficients).sum(axis=0) + np.abs(after.coefficients).sum(axis=0)
-    return bool(np.all(np.abs(end - start) <= 1e-9 * size))
+    return bool(np.all(np.abs(end - start) <= ROUNDINGS * size))
 
 
 def _widened(extent: Array, *values: Array) -> Array:
