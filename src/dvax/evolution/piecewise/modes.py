@@ -11,6 +11,7 @@ import numpy as np
 import scipy.linalg
 
 from . import radau
+from .rings import Ring, rings
 from .system import Affine
 
 Array = np.ndarray
@@ -56,6 +57,10 @@ class Equations:
         fastest = max(float(speeds.max()), 1e-300)
         self.scales = np.unique(1.0 / speeds[speeds > 1e-20 * fastest])
         self.shortest = 1e-2 / fastest
+        whole = np.block([[system.A, system.B[:, u]], [system.C[u], M]])
+        # Others are damped within a period or two, and not worth the trouble.
+        light = spectrum[(spectrum.imag > 4.0 * np.abs(spectrum.real)) & (spectrum.imag > 0)]
+        self.rings = rings(whole, len(system.A), light)
         self._factors: dict[float, tuple[Array, tuple[Array, Array]]] = {}
 
     def solve(self, h: float, x0: Array, inputs: Array) -> tuple[Array, Array]:
@@ -73,6 +78,23 @@ class Equations:
         p = np.tile(self.prescribed_p, (s, 1))
         p[:, u] = found[:, n:]
         return np.vstack([x0, found[:, :n]]), p
+
+    def responses(self, ring: Ring) -> tuple[Array, Array]:
+        """(y, w) of an oscillation of amplitude 1."""
+        p = np.zeros(len(self.unknown), complex)
+        p[self.unknown] = ring.p
+        d = self.system.C @ ring.x + self.system.M @ p
+        d[self.unknown] = 0.0
+        return self.members(p, d)
+
+    def forcing(self, coefficients: Array) -> Array:
+        """The Chebyshev coefficients of (g, r) from those of (g, q)."""
+        n = len(self.system.A)
+        q = coefficients[:, n:][:, self.unknown]
+        found = np.hstack([coefficients[:, :n], q])
+        found[0, :n] += self.system.B @ self.prescribed_p
+        found[0, n:] += (self.system.M @ self.prescribed_p - self.prescribed_d)[self.unknown]
+        return found
 
     def dependent(self, x: Array, p: Array, q: Array) -> Array:
         """d from x, p and q, rows of times."""
@@ -95,14 +117,14 @@ class Equations:
         swapped = self.system.swapped
         return np.where(swapped, d, p), np.where(swapped, p, d)
 
-    def at(self, x: Array, q: Array, off: Array) -> tuple[Array, Array, Array, Array]:
-        """(y, w) at one x and q, and their noise, x being `off`."""
+    def at(self, x: Array, q: Array, sizes: Array, off: Array) -> tuple[Array, ...]:
+        """(y, w) at one x and q, and their noise, where q is a sum of terms of these `sizes`."""
         p, u = self.prescribed_p.copy(), self.unknown
         free = self.prescribed_d - q - self.system.C @ x - self.system.M @ p
         p[u] = self.inverse @ free[u]
         d = self.dependent(x[None], p[None], q[None])[0]
         y, w = self.members(p, d)
-        return y, w, *self.members(*self.noise(np.abs(x), np.abs(p), np.abs(q), off))
+        return y, w, *self.members(*self.noise(np.abs(x), np.abs(p), sizes, off))
 
     def _factorised(self, h: float) -> tuple[Array, tuple[Array, Array]]:
         """LU factors of the equations of a step, each row divided by its largest entry."""

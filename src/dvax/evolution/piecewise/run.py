@@ -15,6 +15,7 @@ import numpy as np
 from . import radau
 from .inputs import Piece
 from .modes import ROUNDINGS, Condition, Equations, Mode, changed, first_mode
+from .rings import derivatives
 from .system import Affine
 
 Array = np.ndarray
@@ -22,21 +23,25 @@ Array = np.ndarray
 
 class Step(NamedTuple):
     """x at the nodes and y at the collocation points of a step that begins at `start` in a piece, of
-    which the part up to θ = `used` is the trajectory."""
+    which the part up to θ = `used` is the trajectory, and the oscillations 2 Re ae^{λt}(x, y) beside
+    them."""
 
     start: float
     length: float
     used: float
     x: Array
     y: Array
-    mode: Mode
+    rings: tuple[tuple[complex, Array, Array], ...]
 
     def at(self, theta: float) -> tuple[Array, Array]:
         """(x, y) there."""
         place = np.array([theta])
-        x = radau.interpolation(radau.NODES, place) @ self.x
-        y = radau.interpolation(radau.POINTS, place) @ self.y
-        return x[0], y[0]
+        x = (radau.interpolation(radau.NODES, place) @ self.x)[0]
+        y = (radau.interpolation(radau.POINTS, place) @ self.y)[0]
+        for rate, of_x, of_y in self.rings:
+            factor = 2.0 * np.exp(rate * theta * self.length)
+            x, y = x + (factor * of_x).real, y + (factor * of_y).real
+        return x, y
 
 
 class Row(NamedTuple):
@@ -54,15 +59,19 @@ class Row(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """A step that was computed: x at the nodes, y at the points, y and w on the grid with what they may
-    be off by, the size of the unresolved part in units of what is allowed, and the `residuals` of the
-    state's and of the law's equations at θ = 0."""
+    """A step that was computed: x at the nodes, y at the points, y and w on the grid with the `slack` that
+    they may be off by; the `rings` beside these polynomials, and by how much they move y and w at most;
+    the `size` of the whole state; `excess`, what the polynomials lack in units of what is allowed; and
+    the `residuals` of the state's and of the law's equations at θ = 0."""
 
     x: Array
     ys: Array
     y: Array
     w: Array
     slack: tuple[Array, Array]
+    rings: tuple[tuple[complex, Array, Array], ...]
+    swing: tuple[Array, Array]
+    size: Array
     excess: float
     residuals: tuple[Array, Array]
 
@@ -103,7 +112,7 @@ class Run:
             self.piece = piece
             inputs = self._converted(piece)
             if last is None or not _continuous(last, piece):
-                self.result = self._solve_law(inputs.at(np.zeros(1))[0])
+                self.result = self._solve_law(inputs)
                 self.events.append((piece.start, self.mode))
             if self.result == "successful":
                 self.result = self._through(inputs, k == len(self.pieces) - 1)
@@ -121,13 +130,14 @@ class Run:
             self.equations[mode] = Equations(self.system, mode)
         return self.equations[mode]
 
-    def _solve_law(self, inputs: Array) -> str:
-        """The mode of the law at x: of the violated conditions the first is changed (Murty's rule,
+    def _solve_law(self, piece: Piece) -> str:
+        """The mode of the law at x and at the start of a piece: of the violated conditions the first is changed (Murty's rule,
         which ends for matrices whose principal minors are positive)."""
-        q = inputs[len(self.x) :]
+        q = piece.at(np.zeros(1))[0, len(self.x) :]
+        sizes = np.abs(piece.coefficients[:, len(self.x) :]).sum(axis=0)
         for _ in range(_MOST_CHANGES):
             own = self.of(self.mode)
-            y, w, slack_y, slack_w = own.at(self.x, q, self.off)
+            y, w, slack_y, slack_w = own.at(self.x, q, sizes, self.off)
             for c in own.conditions:
                 value, slack = (w, slack_w) if c.of_w else (y, slack_y)
                 if c.sign * (value[c.i] - c.bound) < -slack[c.i]:
@@ -144,31 +154,34 @@ class Run:
             own = self.of(self.mode)
             remaining = (piece.length - begin) - low
             h = min(proposal, remaining)
-            found = None
+            found, before = None, np.inf
             while found is None:
                 if self.accepted + self.rejected >= self.max_steps:
                     return "max_steps"
                 attempt = self._attempt(own, piece, begin + low, h)
                 if attempt is None:
                     return "nonfinite"
-                if attempt.excess <= 1.0 or h <= own.shortest:
-                    found = attempt
-                else:
+                if attempt.excess > 1.0 and h > own.shortest:
                     self.rejected += 1
-                    shorter = own.scales[own.scales < 0.6 * h]
-                    h = float(shorter[-1]) if len(shorter) else h / 8.0
+                    h, before = _shorter(own, h, attempt.excess, before), attempt.excess
+                elif attempt.rings and self._undecided(own, attempt):
+                    self.rejected += 1
+                    fastest = max(rate.imag for rate, *_ in attempt.rings)
+                    h = max(0.25 * h, 0.999 * _FOLLOWED / fastest)
+                else:
+                    found = attempt
             theta, condition = self._first_change(own, found)
             whole = condition is None and h == remaining
-            step = Step(piece.start + begin, h, theta, found.x, found.ys, self.mode)
+            step = Step(piece.start + begin, h, theta, found.x, found.ys, found.rings)
             end = piece.length if whole else begin + (low + theta * h)
             self._keep(step, found, piece, begin + low, end, last and whole)
             if whole:
                 return "successful"
             x, _ = step.at(theta)
-            self.x = found.x[-1] if theta == 1.0 else x
+            self.x = x
             begin, low = _two_sum(begin, low + theta * h)
             if condition is None:
-                proposal = _longer(own, h, found.excess)
+                proposal = 4.0 * h if own.rings else _longer(own, h, found.excess)
                 continue
             proposal = np.inf
             self.mode = changed(self.mode, condition)
@@ -183,15 +196,18 @@ class Run:
         n = len(self.x)
         at = lambda theta: piece.at((begin + h * theta) / piece.length)  # noqa: E731
         given = at(radau.POINTS)
-        x, p = own.solve(h, self.x, given)
+        rings, x0 = self._rings(own, piece, begin, h)
+        x, p = own.solve(h, x0, given)
         if not (np.isfinite(x).all() and np.isfinite(p).all()):
             return None
-        sizes = np.abs(x).max(axis=0), np.abs(p).max(axis=0), np.abs(given[:, n:]).max(axis=0)
-        off = np.maximum(self.off, ROUNDINGS * sizes[0])
-        noise_p, noise_d = own.noise(*sizes, off)
-        self.scale = np.maximum(self.scale, sizes[0])
+        # Rounding in the inputs is that of the terms they are summed from.
+        q = np.abs(piece.coefficients[:, n:]).sum(axis=0)
+        beside = sum((2.0 * np.abs(ring[1]) for ring in rings), np.zeros(n))
+        sizes = np.abs(x).max(axis=0) + beside, np.abs(p).max(axis=0), q
+        noise_p, noise_d = own.noise(*sizes, np.maximum(self.off, ROUNDINGS * sizes[0]))
         energy = np.sqrt(np.sum((self.weights * sizes[0]) ** 2))
-        allowed = np.maximum(self.tol * self.scale, 1e-2 * self.tol * energy / self.weights)
+        allowed = self.tol * np.maximum(self.scale, sizes[0])
+        allowed = np.maximum(allowed, 1e-2 * self.tol * energy / self.weights)
         tail_x = np.abs(radau.TAIL_OF_STATE @ x).max(axis=0)
         tail_p = np.abs(radau.TAIL_OF_MULTIPLIER @ p).max(axis=0)
         allowed_p = np.maximum(self.tol * sizes[1], noise_p)
@@ -205,7 +221,37 @@ class Run:
         tail_d = np.abs(own.system.C) @ tail_x + np.abs(own.system.M) @ tail_p
         slack = own.members(noise_p + 4.0 * tail_p, noise_d + 4.0 * tail_d)
         ys, _ = own.members(p, own.dependent(x[1:], p, given[:, n:]))
-        return Attempt(x, ys, y, w, slack, excess, self._residuals(own, x, p, G[0], h))
+        swing = tuple(
+            sum((2.0 * np.abs(ring[k]) for ring in rings), np.zeros(len(p[0]))) for k in (2, 3)
+        )
+        return Attempt(
+            x, ys, y, w, slack, tuple(ring[:3] for ring in rings), swing, sizes[0], excess,
+            self._residuals(own, x, p, G[0], h),
+        )  # fmt: skip
+
+    def _rings(
+        self, own: Equations, piece: Piece, begin: float, h: float
+    ) -> tuple[list[tuple[complex, Array, Array, Array]], Array]:
+        """(λ, x, y, w) of the oscillations that a step is too long to follow, and what is left of x."""
+        active = [ring for ring in own.rings if ring.rate.imag * h > _FOLLOWED]
+        found, x0 = [], self.x
+        if active:
+            forcing = derivatives(own.forcing(piece.coefficients), begin / piece.length, piece.length)
+        for ring in active:
+            a = ring.amplitude(self.x, forcing)
+            y, w = own.responses(ring)
+            found.append((ring.rate, a * ring.x, a * y, a * w))
+            x0 = x0 - 2.0 * found[-1][1].real
+        return found, x0
+
+    def _undecided(self, own: Equations, found: Attempt) -> bool:
+        """Whether the oscillations may break a condition."""
+        for c in own.conditions:
+            k = int(c.of_w)
+            values = c.sign * ((found.y, found.w)[k][:, c.i] - c.bound)
+            if radau.lowest(values) - found.swing[k][c.i] < -found.slack[k][c.i]:
+                return True
+        return False
 
     def _residuals(
         self, own: Equations, x: Array, p: Array, given: Array, h: float
@@ -232,6 +278,8 @@ class Run:
     def _first_change(self, own: Equations, found: Attempt) -> tuple[float, Condition | None]:
         """(θ, condition) of the first condition that fails; (1, None) where all hold."""
         theta, first = 1.0, None
+        if found.rings:
+            return theta, first
         for c in own.conditions:
             grid, slack = (found.w, found.slack[1]) if c.of_w else (found.y, found.slack[0])
             values, allowed = c.sign * (grid[:, c.i] - c.bound), float(slack[c.i])
@@ -255,10 +303,10 @@ class Run:
         self.law_defect += part * float(mean * np.linalg.norm(of_law) + np.linalg.norm(error[n:]))
         self.accepted += 1
         # The state that a step ends in is as good as the largest one that it was made of.
-        self.off = ROUNDINGS * np.abs(found.x).max(axis=0)
+        self.off, self.scale = ROUNDINGS * found.size, np.maximum(self.scale, found.size)
         self.t = piece.start + end
         if self.extent is not None:
-            self.extent = _widened(self.extent, radau.FROM_NODES @ found.x, found.y)
+            self.extent = _widened(self.extent, found)
         while len(self.rows) < len(self.times):
             time = float(self.times[len(self.rows)])
             offset = time - piece.start
@@ -279,6 +327,9 @@ class Run:
         return float(np.sqrt(np.sum((self.weights * v) ** 2)))
 
 
+_FOLLOWED = 4.0
+"""Radians of an oscillation in a step, up to which its polynomials follow it."""
+
 _MOST_CHANGES, _MOST_STUCK = 4096, 12
 _ROUNDING = 256.0 * np.finfo(float).eps
 
@@ -286,6 +337,15 @@ _ROUNDING = 256.0 * np.finfo(float).eps
 def _mean(used: float) -> float:
     """A bound on the mean of |ρ| up to θ = `used`, relative to |ρ(0)|."""
     return min(1.0, radau.MEAN_RESIDUAL / used) if used > 0.0 else 1.0
+
+
+def _shorter(own: Equations, h: float, excess: float, before: float) -> float:
+    """The step to try next: half of it, as long as that pays (by 2²⁰ where the solution is resolved, but
+    for little); else the next time scale of the mode, since a transient is there that is not."""
+    if excess < 1e6 and excess < 0.1 * before:
+        return 0.5 * h
+    shorter = own.scales[own.scales < 0.6 * h]
+    return float(shorter[-1]) if len(shorter) else h / 8.0
 
 
 def _longer(own: Equations, h: float, excess: float) -> float:
@@ -310,8 +370,10 @@ def _continuous(before: Piece, after: Piece) -> bool:
     return bool(np.all(np.abs(end - start) <= ROUNDINGS * size))
 
 
-def _widened(extent: Array, *values: Array) -> Array:
-    """(low, high) that hold those as well, with the margin of polynomials between samples."""
-    low = np.concatenate([radau.lowest(v) for v in values])
-    high = -np.concatenate([radau.lowest(-v) for v in values])
+def _widened(extent: Array, found: Attempt) -> Array:
+    """(low, high) that hold a step as well, with the margin of polynomials between samples."""
+    x = radau.FROM_NODES @ found.x
+    beside = np.concatenate([found.size - np.abs(found.x).max(axis=0), found.swing[0]])
+    low = np.concatenate([radau.lowest(v) for v in (x, found.y)]) - beside
+    high = -np.concatenate([radau.lowest(-v) for v in (x, found.y)]) + beside
     return np.stack([np.minimum(extent[0], low), np.maximum(extent[1], high)])
