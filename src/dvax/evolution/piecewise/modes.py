@@ -79,6 +79,14 @@ class Equations:
         p[:, u] = found[:, n:]
         return np.vstack([x0, found[:, :n]]), p
 
+    def hidden(self, x: Array, p: Array, q: Array) -> Array:
+        """The changes of each entry of x that rounding in the law hides; 0 of those not in it."""
+        C = np.abs(self.system.C)
+        terms = ROUNDINGS / 8.0 * (C @ x + np.abs(self.system.M) @ p + q)
+        each = np.where(C > 0.0, terms[:, None] / np.where(C > 0.0, C, 1.0), np.inf)
+        least = each.min(axis=0, initial=np.inf)
+        return np.where(np.isfinite(least), least, 0.0)
+
     def responses(self, ring: Ring) -> tuple[Array, Array]:
         """(y, w) of an oscillation of amplitude 1."""
         p = np.zeros(len(self.unknown), complex)
@@ -103,10 +111,11 @@ class Equations:
         return d
 
     def noise(self, x: Array, p: Array, q: Array, off: Array) -> tuple[Array, Array]:
-        """What rounding leaves undetermined of p and of d, for values of these sizes, x being `off`."""
+        """What rounding leaves undetermined of p and of d, for values of these sizes; d as
+        it follows from x is `off` already."""
         system, u = self.system, self.unknown
         terms = np.abs(system.C) @ x + np.abs(system.M) @ p + q
-        of_d = ROUNDINGS * terms + np.abs(system.C) @ off
+        of_d = ROUNDINGS * terms + off
         of_p = np.zeros(len(u))
         of_p[u] = np.abs(self.inverse) @ of_d[u] + ROUNDINGS * p[u]
         of_d = of_d + np.abs(system.M[:, u]) @ of_p[u]

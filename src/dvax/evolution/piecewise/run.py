@@ -61,8 +61,8 @@ class Row(NamedTuple):
 class Attempt(NamedTuple):
     """A step that was computed: x at the nodes, y at the points, y and w on the grid with the `slack` that
     they may be off by; the `rings` beside these polynomials, and by how much they move y and w at most;
-    the `size` of the whole state; `excess`, what the polynomials lack in units of what is allowed; and
-    the `residuals` of the state's and of the law's equations at θ = 0."""
+    the `size` of the whole state; what the polynomials are `lacking` in d, and `excess`, the same in units
+    of what is allowed; and the `residuals` of the state's and of the law's equations at θ = 0."""
 
     x: Array
     ys: Array
@@ -72,6 +72,7 @@ class Attempt(NamedTuple):
     rings: tuple[tuple[complex, Array, Array], ...]
     swing: tuple[Array, Array]
     size: Array
+    lacking: Array
     excess: float
     residuals: tuple[Array, Array]
 
@@ -93,7 +94,7 @@ class Run:
         self.times, self.dense = times, dense
         self.equations: dict[Mode, Equations] = {}
         self.mode = first_mode(given)
-        self.scale, self.off = np.abs(x0), 0.0 * x0
+        self.scale, self.off, self.law_off = np.abs(x0), 0.0 * x0, np.zeros(len(given.low))
         self.rows: list[Row] = []
         self.steps: list[Step] = []
         self.events: list[tuple[float, Mode]] = []
@@ -137,7 +138,7 @@ class Run:
         sizes = np.abs(piece.coefficients[:, len(self.x) :]).sum(axis=0)
         for _ in range(_MOST_CHANGES):
             own = self.of(self.mode)
-            y, w, slack_y, slack_w = own.at(self.x, q, sizes, self.off)
+            y, w, slack_y, slack_w = own.at(self.x, q, sizes, np.abs(self.system.C) @ self.off)
             for c in own.conditions:
                 value, slack = (w, slack_w) if c.of_w else (y, slack_y)
                 if c.sign * (value[c.i] - c.bound) < -slack[c.i]:
@@ -204,9 +205,11 @@ class Run:
         q = np.abs(piece.coefficients[:, n:]).sum(axis=0)
         beside = sum((2.0 * np.abs(ring[1]) for ring in rings), np.zeros(n))
         sizes = np.abs(x).max(axis=0) + beside, np.abs(p).max(axis=0), q
-        noise_p, noise_d = own.noise(*sizes, np.maximum(self.off, ROUNDINGS * sizes[0]))
+        off = np.abs(own.system.C) @ np.maximum(self.off, ROUNDINGS * sizes[0]) + self.law_off
+        noise_p, noise_d = own.noise(*sizes, off)
         energy = np.sqrt(np.sum((self.weights * sizes[0]) ** 2))
-        allowed = self.tol * np.maximum(self.scale, sizes[0])
+        hidden = own.hidden(*sizes)
+        allowed = np.maximum(self.tol * np.maximum(self.scale, sizes[0]), hidden)
         allowed = np.maximum(allowed, 1e-2 * self.tol * energy / self.weights)
         tail_x = np.abs(radau.TAIL_OF_STATE @ x).max(axis=0)
         tail_p = np.abs(radau.TAIL_OF_MULTIPLIER @ p).max(axis=0)
@@ -220,12 +223,13 @@ class Run:
         y, w = own.members(P, d)
         tail_d = np.abs(own.system.C) @ tail_x + np.abs(own.system.M) @ tail_p
         slack = own.members(noise_p + 4.0 * tail_p, noise_d + 4.0 * tail_d)
+        lacking = _EXTRAPOLATED * tail_d
         ys, _ = own.members(p, own.dependent(x[1:], p, given[:, n:]))
         swing = tuple(
             sum((2.0 * np.abs(ring[k]) for ring in rings), np.zeros(len(p[0]))) for k in (2, 3)
         )
         return Attempt(
-            x, ys, y, w, slack, tuple(ring[:3] for ring in rings), swing, sizes[0], excess,
+            x, ys, y, w, slack, tuple(ring[:3] for ring in rings), swing, sizes[0], lacking, excess,
             self._residuals(own, x, p, G[0], h),
         )  # fmt: skip
 
@@ -303,6 +307,7 @@ class Run:
         self.law_defect += part * float(mean * np.linalg.norm(of_law) + np.linalg.norm(error[n:]))
         self.accepted += 1
         # The state that a step ends in is as good as the largest one that it was made of.
+        self.law_off = found.lacking
         self.off, self.scale = ROUNDINGS * found.size, np.maximum(self.scale, found.size)
         self.t = piece.start + end
         if self.extent is not None:
@@ -326,6 +331,9 @@ class Run:
         """An upper bound of the norm of the state space, exact where its unit vectors are orthogonal."""
         return float(np.sqrt(np.sum((self.weights * v) ** 2)))
 
+
+_EXTRAPOLATED = 16.0
+"""What a polynomial may lack at θ = 0, in units of its last coefficients."""
 
 _FOLLOWED = 4.0
 """Radians of an oscillation in a step, up to which its polynomials follow it."""
