@@ -176,10 +176,9 @@ class Run:
             step = Step(piece.start + begin, h, theta, found.x, found.ys, found.rings)
             end = piece.length if whole else begin + (low + theta * h)
             self._keep(step, found, piece, begin + low, end, last and whole)
+            self.x, _ = step.at(theta)
             if whole:
                 return "successful"
-            x, _ = step.at(theta)
-            self.x = x
             begin, low = _two_sum(begin, low + theta * h)
             if condition is None:
                 proposal = 4.0 * h if own.rings else _longer(own, h, found.excess)
