@@ -45,6 +45,33 @@ class Piece(NamedTuple):
         return np.polynomial.chebyshev.chebval(s, self.coefficients).T
 
 
+    def local(self, begin: float, length: float) -> Array:
+        """The coefficients of the polynomial on a part of the piece, those left out that are rounding:
+        on a part that is short the samples would differ by nothing else."""
+        c = self.coefficients
+        s, share = 2.0 * (begin + 0.5 * length) / self.length - 1.0, length / self.length
+        if len(c) <= 2:
+            return np.stack([c[0] + s * c[1], share * c[1]]) if len(c) == 2 else c
+        values = np.polynomial.chebyshev.chebval(s + share * _POINTS, c).T
+        found = _TO_COEFFICIENTS @ values
+        seen = np.abs(found) > _CHOPPED * np.abs(c).sum(axis=0)
+        degree = int(np.flatnonzero(seen.any(axis=1)).max(initial=1))
+        return np.where(np.arange(degree + 1)[:, None] < 2, 1.0, seen[: degree + 1]) * found[: degree + 1]
+
+
+def values(coefficients: Array, basis: Array) -> Array:
+    """The polynomials at the points of a basis (a row each, a column each degree)."""
+    return basis[:, : len(coefficients)] @ coefficients
+
+
+def basis(places: Array) -> Array:
+    """Chebyshev polynomials at places in [0, 1]."""
+    return np.polynomial.chebyshev.chebvander(2.0 * places - 1.0, STAGES)
+
+
+_CHOPPED = 16.0 * np.finfo(float).eps
+
+
 class Unresolved(Exception):
     """No polynomial fits the inputs around a time, on however short a piece."""
 

@@ -15,6 +15,7 @@ from ..results import RESULTS
 from ..setup import Setup, as_arrays
 from ..solution import Solution
 from .inputs import Piece, Unresolved, pieces
+from .radau import STAGES
 from .run import Row, Run
 from .system import Affine, affine, pivoted
 from .trajectory import Trajectory
@@ -53,7 +54,7 @@ def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
     state, control = problem.spaces(x0)
     weights = np.asarray(jax.vmap(lambda v: state.norm(v.reshape(x0.shape)))(jnp.eye(x0.size)))
     times = np.array([t1]) if ts is None else np.asarray(ts, float)
-    tol = float(np.clip(1e-4 * rtol, 1e-12, 1e-6))
+    tol = float(np.clip(1e-5 * rtol, 1e-13, 1e-6))
     try:
         found = pieces(problem, stops, x0, args, limits.max_steps)
     except Unresolved as error:
@@ -143,11 +144,18 @@ def _extent(rows: list[Row], n: int, x0: Any, u0: Any, P: Any) -> Extent:
 
 
 def _trajectory(run: Run) -> Trajectory:
-    s, x, u = run.steps, run.given.A.shape[0], run.given.M.shape[0]
+    steps, (n, m) = run.steps, run.given.B.shape
+    count, most = len(steps), max((len(step.rings) for step in steps), default=0)
     stack = lambda name, *shape: np.reshape(  # noqa: E731
-        [getattr(step, name) for step in s], (len(s), *shape)
+        [getattr(step, name) for step in steps], (count, *shape)
     )
+    rates = np.zeros((count, most), complex)
+    ring_x, ring_y = np.zeros((count, most, n), complex), np.zeros((count, most, m), complex)
+    for k, step in enumerate(steps):
+        for i, (rate, x, y) in enumerate(step.rings):
+            rates[k, i], ring_x[k, i], ring_y[k, i] = rate, x, y
     return Trajectory(
-        stack("start"), stack("length"), stack("used"), stack("x", -1, x), stack("y", -1, u),
-        np.array([t for t, _ in run.events]), np.reshape([m for _, m in run.events], (-1, u)),
+        stack("start"), stack("length"), stack("used"), stack("x", STAGES + 1, n),
+        stack("y", STAGES, m), rates, ring_x, ring_y,
+        np.array([t for t, _ in run.events]), np.reshape([mode for _, mode in run.events], (-1, m)),
     )  # fmt: skip

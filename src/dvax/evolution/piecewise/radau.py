@@ -30,12 +30,18 @@ def _weights(nodes: Array) -> Array:
 
 def interpolation(nodes: Array, at: Array) -> Array:
     """The matrix from values at the nodes to values of their polynomial `at` other points."""
-    apart = np.asarray(at)[:, None] - nodes[None, :]
+    return _barycentric(nodes, _weights(nodes), np.asarray(at))
+
+
+def _barycentric(nodes: Array, weights: Array, at: Array) -> Array:
+    apart = at[:, None] - nodes
     exact = apart == 0.0
-    terms = _weights(nodes) / np.where(exact, 1.0, apart)
+    if not exact.any():
+        terms = weights / apart
+        return terms / terms.sum(axis=1, keepdims=True)
+    terms = weights / np.where(exact, 1.0, apart)
     rows = terms / terms.sum(axis=1, keepdims=True)
-    hit = exact.any(axis=1)
-    return np.where(hit[:, None], exact.astype(float), rows)
+    return np.where(exact.any(axis=1)[:, None], exact.astype(float), rows)
 
 
 def _differentiation(nodes: Array) -> Array:
@@ -65,6 +71,19 @@ D = _differentiation(NODES)
 """dx/dθ at the nodes from x at the nodes."""
 
 _DENSITY = 8
+_OF_NODES, _OF_POINTS = _weights(NODES), _weights(POINTS)
+
+
+def state_at(x: Array, thetas: Array) -> Array:
+    """States at these θ, a row each, from those at the nodes."""
+    return _barycentric(NODES, _OF_NODES, thetas) @ x
+
+
+def multiplier_at(y: Array, thetas: Array) -> Array:
+    """Multipliers at these θ, a row each, from those at the collocation points."""
+    return _barycentric(POINTS, _OF_POINTS, thetas) @ y
+
+
 GRID = _lobatto(_DENSITY * STAGES)
 """Where polynomials are sampled for their signs."""
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from . import radau
-from .inputs import Piece
+from .inputs import Piece, basis, values
 from .modes import ROUNDINGS, Condition, Equations, Mode, changed, first_mode
 from .rings import derivatives
 from .system import Affine
@@ -33,13 +33,11 @@ class Step(NamedTuple):
     y: Array
     rings: tuple[tuple[complex, Array, Array], ...]
 
-    def at(self, theta: float) -> tuple[Array, Array]:
-        """(x, y) there."""
-        place = np.array([theta])
-        x = (radau.interpolation(radau.NODES, place) @ self.x)[0]
-        y = (radau.interpolation(radau.POINTS, place) @ self.y)[0]
+    def at(self, thetas: Array) -> tuple[Array, Array]:
+        """(x, y) there, a row each."""
+        x, y = radau.state_at(self.x, thetas), radau.multiplier_at(self.y, thetas)
         for rate, of_x, of_y in self.rings:
-            factor = 2.0 * np.exp(rate * theta * self.length)
+            factor = 2.0 * np.exp(rate * self.length * thetas)[:, None]
             x, y = x + (factor * of_x).real, y + (factor * of_y).real
         return x, y
 
@@ -176,7 +174,7 @@ class Run:
             step = Step(piece.start + begin, h, theta, found.x, found.ys, found.rings)
             end = piece.length if whole else begin + (low + theta * h)
             self._keep(step, found, piece, begin + low, end, last and whole)
-            self.x, _ = step.at(theta)
+            self.x = step.at(np.array([theta]))[0][0]
             if whole:
                 return "successful"
             begin, low = _two_sum(begin, low + theta * h)
@@ -194,8 +192,8 @@ class Run:
 
     def _attempt(self, own: Equations, piece: Piece, begin: float, h: float) -> Attempt | None:
         n = len(self.x)
-        at = lambda theta: piece.at((begin + h * theta) / piece.length)  # noqa: E731
-        given = at(radau.POINTS)
+        local = piece.local(begin, h)
+        given = values(local, _AT_POINTS)
         rings, x0 = self._rings(own, piece, begin, h)
         x, p = own.solve(h, x0, given)
         if not (np.isfinite(x).all() and np.isfinite(p).all()):
@@ -217,7 +215,7 @@ class Run:
         excess = max(
             float(np.max(tail_x / (allowed + tiny))), float(np.max(tail_p / (allowed_p + tiny)))
         )
-        X, P, G = radau.FROM_NODES @ x, radau.FROM_POINTS @ p, at(radau.GRID)
+        X, P, G = radau.FROM_NODES @ x, radau.FROM_POINTS @ p, values(local, _ON_GRID)
         d = own.dependent(X, P, G[:, n:])
         y, w = own.members(P, d)
         tail_d = np.abs(own.system.C) @ tail_x + np.abs(own.system.M) @ tail_p
@@ -251,8 +249,8 @@ class Run:
         """Whether the oscillations may break a condition."""
         for c in own.conditions:
             k = int(c.of_w)
-            values = c.sign * ((found.y, found.w)[k][:, c.i] - c.bound)
-            if radau.lowest(values) - found.swing[k][c.i] < -found.slack[k][c.i]:
+            signed = c.sign * ((found.y, found.w)[k][:, c.i] - c.bound)
+            if radau.lowest(signed) - found.swing[k][c.i] < -found.slack[k][c.i]:
                 return True
         return False
 
@@ -285,10 +283,10 @@ class Run:
             return theta, first
         for c in own.conditions:
             grid, slack = (found.w, found.slack[1]) if c.of_w else (found.y, found.slack[0])
-            values, allowed = c.sign * (grid[:, c.i] - c.bound), float(slack[c.i])
-            if theta == 0.0 or radau.lowest(values) >= -allowed:
+            signed, allowed = c.sign * (grid[:, c.i] - c.bound), float(slack[c.i])
+            if theta == 0.0 or radau.lowest(signed) >= -allowed:
                 continue
-            when = radau.first_negative(values, allowed, theta)
+            when = radau.first_negative(signed, allowed, theta)
             if when is not None and (first is None or when < theta):
                 theta, first = when, c
         return theta, first
@@ -311,18 +309,19 @@ class Run:
         self.t = piece.start + end
         if self.extent is not None:
             self.extent = _widened(self.extent, found)
-        while len(self.rows) < len(self.times):
-            time = float(self.times[len(self.rows)])
-            offset = time - piece.start
-            # The last step has what rounding may put behind it.
-            if not (offset < end or last):
-                break
-            theta = float(np.clip((offset - begin) / step.length, 0.0, step.used))
-            x, y = step.at(theta)
-            q = self.piece.at(np.array([(begin + theta * step.length) / piece.length]))[0, n:]
-            w = self.given.M @ y + self.given.C @ x + q
-            done = self.defect, self.law_defect
-            self.rows.append(Row(time, x, y, w, done, settled, self.extent))
+        done, first = (self.defect, self.law_defect), len(self.rows)
+        offsets = self.times[first:] - piece.start
+        # The last step has what rounding may put behind it.
+        offsets = offsets if last else offsets[: np.searchsorted(offsets, end)]
+        if len(offsets):
+            thetas = np.clip((offsets - begin) / step.length, 0.0, step.used)
+            x, y = step.at(thetas)
+            q = self.piece.at((begin + thetas * step.length) / piece.length)[:, n:]
+            w = y @ self.given.M.T + x @ self.given.C.T + q
+            self.rows += [
+                Row(float(self.times[first + k]), x[k], y[k], w[k], done, settled, self.extent)
+                for k in range(len(offsets))
+            ]
         if self.dense:
             self.steps.append(step)
 
@@ -330,6 +329,8 @@ class Run:
         """An upper bound of the norm of the state space, exact where its unit vectors are orthogonal."""
         return float(np.sqrt(np.sum((self.weights * v) ** 2)))
 
+
+_AT_POINTS, _ON_GRID = basis(radau.POINTS), basis(radau.GRID)
 
 _EXTRAPOLATED = 16.0
 """What a polynomial may lack at θ = 0, in units of its last coefficients."""

@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import radau
+from .run import Step
 
 
 class Trajectory(eqx.Module):
     """The steps of a run: `start` and `length`, of which the part up to θ = `used` belongs to the
-    trajectory; `x` at the nodes and `y` at the collocation points of each; `changes` = when the mode
+    trajectory; `x` at the nodes and `y` at the collocation points of each, and beside them the oscillations
+    of `rates` λ and amplitudes `ring_x` and `ring_y`, as many zeros as it takes among them; `changes` = when the mode
     changed, and `modes`, a row for each change and a column for each entry of y (−1 at the lower bound,
     1 at the upper one, 0 between them)."""
 
@@ -21,6 +22,9 @@ class Trajectory(eqx.Module):
     used: np.ndarray
     x: np.ndarray
     y: np.ndarray
+    rates: np.ndarray
+    ring_x: np.ndarray
+    ring_y: np.ndarray
     changes: np.ndarray
     modes: np.ndarray
 
@@ -33,9 +37,11 @@ class Trajectory(eqx.Module):
         """(x, y) at t, flat."""
         k = int(np.clip(np.searchsorted(self.start, float(t), side="right") - 1, 0, None))
         theta = np.clip((float(t) - self.start[k]) / self.length[k], 0.0, self.used[k])
-        place = np.array([theta])
-        x = radau.interpolation(radau.NODES, place) @ self.x[k]
-        y = radau.interpolation(radau.POINTS, place) @ self.y[k]
+        step = Step(
+            self.start[k], self.length[k], self.used[k], self.x[k], self.y[k],
+            tuple(zip(self.rates[k], self.ring_x[k], self.ring_y[k], strict=True)),
+        )  # fmt: skip
+        x, y = step.at(np.array([theta]))
         return jnp.asarray(x[0]), jnp.asarray(y[0])
 
 
