@@ -38,8 +38,8 @@ class Equations:
     unknown; `rates` are the time scales of the mode, 1/|λ| in effect, from the shortest to the longest.
     """
 
-    def __init__(self, system: Affine, mode: Mode):
-        self.system, self.mode = system, mode
+    def __init__(self, system: Affine, mode: Mode, weights: Array):
+        self.system, self.mode, self.weights = system, mode, weights
         state = np.array(mode)
         free = state == 0
         self.unknown = free != system.swapped
@@ -61,20 +61,20 @@ class Equations:
         # Others are damped within a period or two, and not worth the trouble.
         light = spectrum[(spectrum.imag > 4.0 * np.abs(spectrum.real)) & (spectrum.imag > 0)]
         self.rings = rings(whole, len(system.A), light)
-        self._factors: dict[float, tuple[Array, tuple[Array, Array]]] = {}
+        self._factors: dict[float, tuple[Array, Array, tuple[Array, Array]]] = {}
 
     def solve(self, h: float, x0: Array, inputs: Array) -> tuple[Array, Array]:
         """(x at the nodes, p at the collocation points) of a step of length h from x0, for `inputs`
         (g, q) at the collocation points."""
         system, u, s = self.system, self.unknown, radau.STAGES
         n, k = len(x0), int(self.unknown.sum())
-        scale, factors = self._factorised(h)
+        rows, columns, factors = self._factorised(h)
         g, q = inputs[:, :n], inputs[:, n:]
         right = np.zeros((s, n + k))
         right[:, :n] = h * (g + system.B @ self.prescribed_p) - radau.D[1:, :1] * x0
         right[:, n:] = (self.prescribed_d - q - system.M @ self.prescribed_p)[:, u]
-        found = scipy.linalg.lu_solve(factors, right.ravel() * scale, check_finite=False)
-        found = found.reshape(s, n + k)
+        found = scipy.linalg.lu_solve(factors, (right * rows).ravel(), check_finite=False)
+        found = found.reshape(s, n + k) * columns
         p = np.tile(self.prescribed_p, (s, 1))
         p[:, u] = found[:, n:]
         return np.vstack([x0, found[:, :n]]), p
@@ -135,25 +135,37 @@ class Equations:
         y, w = self.members(p, d)
         return y, w, *self.members(*self.noise(np.abs(x), np.abs(p), sizes, off))
 
-    def _factorised(self, h: float) -> tuple[Array, tuple[Array, Array]]:
-        """LU factors of the equations of a step, each row divided by its largest entry."""
+    def _factorised(self, h: float) -> tuple[Array, Array, tuple[Array, Array]]:
+        """Scales of rows and columns, and LU factors of the scaled equations of a step.
+
+        States are measured by their energy, since pivots that compare volts with amperes would spoil
+        the smaller ones, and each p and its row by their largest entries."""
         if h in self._factors:
             return self._factors[h]
         system, u, s = self.system, self.unknown, radau.STAGES
         n, k = len(system.A), int(self.unknown.sum())
-        K = np.zeros((s, n + k, s, n + k))
-        states = np.arange(n)
-        K[:, states, :, states] = radau.D[1:, 1:]
-        each = np.arange(s)
         block = np.block(
             [[-h * system.A, -h * system.B[:, u]], [system.C[u], system.M[np.ix_(u, u)]]]
         )
+        rows = np.concatenate([self.weights, np.ones(k)])
+        columns = np.concatenate([1.0 / self.weights, np.ones(k)])
+        for _ in range(2 if k else 0):
+            scaled = np.abs(rows[:, None] * block * columns)
+            columns[n:] /= np.maximum(scaled.max(axis=0)[n:], 1e-300)
+            scaled = np.abs(rows[:, None] * block * columns)
+            rows[n:] /= np.maximum(scaled.max(axis=1)[n:], 1e-300)
+        block = rows[:, None] * block * columns
+        K = np.zeros((s, n + k, s, n + k))
+        states, each = np.arange(n), np.arange(s)
+        K[:, states, :, states] = radau.D[1:, 1:]
         K[each, :, each, :] += block
         K = K.reshape(s * (n + k), -1)
-        scale = 1.0 / np.abs(K).max(axis=1)
+        # Rows that are stiff have large entries, and are not to be the pivots for that.
+        large = 1.0 / np.abs(K).max(axis=1)
         if len(self._factors) >= _KEPT:
             self._factors.clear()
-        found = scale, scipy.linalg.lu_factor(scale[:, None] * K, check_finite=False)
+        factors = scipy.linalg.lu_factor(large[:, None] * K, check_finite=False)
+        found = rows * large.reshape(s, n + k), columns, factors
         self._factors[h] = found
         return found
 

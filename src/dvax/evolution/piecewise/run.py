@@ -126,7 +126,7 @@ class Run:
 
     def of(self, mode: Mode) -> Equations:
         if mode not in self.equations:
-            self.equations[mode] = Equations(self.system, mode)
+            self.equations[mode] = Equations(self.system, mode, self.weights)
         return self.equations[mode]
 
     def _solve_law(self, piece: Piece) -> str:
