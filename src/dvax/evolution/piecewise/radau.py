@@ -10,6 +10,7 @@ multiple of ρ(θ) = Π(θ − cᵢ), and |ρ| is largest at θ = 0: one evaluat
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import scipy.special
@@ -112,7 +113,7 @@ MEAN_RESIDUAL = float(_RHO.mean() / _RHO[0])
 """∫ |ρ| dθ / |ρ(0)|."""
 
 
-def lowest(values: Array) -> Array:
+def lowest(values: Array) -> Any:
     """A lower bound of polynomials on [0, 1], a column each, from their values on the grid."""
     low, high = values.min(axis=0), values.max(axis=0)
     return low - 0.5 * _MARGIN * (high - low)

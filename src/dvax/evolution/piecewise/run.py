@@ -170,7 +170,7 @@ class Run:
                 else:
                     found = attempt
             theta, condition = self._first_change(own, found)
-            whole = condition is None and h == remaining
+            whole = condition is None and bool(h == remaining)
             step = Step(piece.start + begin, h, theta, found.x, found.ys, found.rings)
             end = piece.length if whole else begin + (low + theta * h)
             self._keep(step, found, piece, begin + low, end, last and whole)

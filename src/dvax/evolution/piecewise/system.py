@@ -132,12 +132,12 @@ def _matrices(problem: Problem, args: Any, x0: Any, u0: Any, t: Any) -> tuple[An
 
 
 def pivoted(system: Affine) -> Affine:
-    """The system with members of pairs exchanged one by one, where that halves the size of A."""
+    """The system with members of pairs exchanged one by one, where that makes A smaller."""
     size = np.abs(system.A).sum()
     for i in range(len(system.low)):
         if system.M[i, i] > 0.0:
             other = system.modified(i)
             smaller = np.abs(other.A).sum()
-            if smaller < 0.5 * size:
+            if smaller < size:
                 system, size = other, smaller
     return system

@@ -10,7 +10,7 @@ import numpy as np
 
 from ... import _tree
 from ...errors import InputError, InputProblem
-from ...evolution import ExpRosenbrock, Solution, solve
+from ...evolution import ExpRosenbrock, PiecewiseLinear, Solution, solve
 from ...generators import Dense
 from ...operators import Scaling
 from ...problem import Problem
@@ -160,8 +160,14 @@ class Frame(eqx.Module):
 
     def solve(self, **settings: Any) -> Solution:
         """The whole record from rest, saved at its times and seven between two of them; by
-        `dvax.ExpRosenbrock`, which is exact from kink to kink. `settings` go to `dvax.solve`."""
-        settings = {"method": ExpRosenbrock(), "ts": self.times, "rtol": 1e-8} | settings
+        `dvax.PiecewiseLinear`, at a cost that does not depend on η/k; where values are traced
+        (`jax.jit`, `jax.grad`), or `dt` is given, by `dvax.ExpRosenbrock`. `settings` go to
+        `dvax.solve`."""
+        settings = {"ts": self.times, "rtol": 1e-8} | settings
+        if settings.get("method") is None:
+            traced = not _tree.is_concrete(self, *settings.values())
+            follow = traced or settings.get("dt") is not None
+            settings["method"] = ExpRosenbrock() if follow else PiecewiseLinear()
         end = self.record.duration
         return solve(self.problem, jnp.zeros(3), 0.0, end, **settings)
 
