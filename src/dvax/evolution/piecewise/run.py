@@ -202,8 +202,8 @@ class Run:
         q = np.abs(piece.coefficients[:, n:]).sum(axis=0)
         beside = sum((2.0 * np.abs(ring[1]) for ring in rings), np.zeros(n))
         sizes = np.abs(x).max(axis=0) + beside, np.abs(p).max(axis=0), q
-        off = np.abs(own.system.C) @ np.maximum(self.off, ROUNDINGS * sizes[0]) + self.law_off
-        noise_p, noise_d = own.noise(*sizes, off)
+        off = np.abs(own.system.C) @ np.maximum(self.off, ROUNDINGS * sizes[0])
+        noise_p, _ = own.noise(*sizes, off)
         energy = np.sqrt(np.sum((self.weights * sizes[0]) ** 2))
         hidden = own.hidden(*sizes)
         allowed = np.maximum(self.tol * np.maximum(self.scale, sizes[0]), hidden)
@@ -219,7 +219,9 @@ class Run:
         d = own.dependent(X, P, G[:, n:])
         y, w = own.members(P, d)
         tail_d = np.abs(own.system.C) @ tail_x + np.abs(own.system.M) @ tail_p
-        slack = own.members(noise_p + 4.0 * tail_p, noise_d + 4.0 * tail_d)
+        # What the step before was lacking decides on signs, and not on what this one may lack.
+        slack_p, slack_d = own.noise(*sizes, off + self.law_off)
+        slack = own.members(slack_p + 4.0 * tail_p, slack_d + 4.0 * tail_d)
         lacking = _EXTRAPOLATED * tail_d
         ys, _ = own.members(p, own.dependent(x[1:], p, given[:, n:]))
         swing = tuple(

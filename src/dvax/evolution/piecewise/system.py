@@ -132,12 +132,14 @@ def _matrices(problem: Problem, args: Any, x0: Any, u0: Any, t: Any) -> tuple[An
 
 
 def pivoted(system: Affine) -> Affine:
-    """The system with members of pairs exchanged one by one, where that makes A smaller."""
+    """The system with members of pairs exchanged one by one, where that halves A, or makes it smaller
+    and M not much larger: the noise of a dependent member is in proportion to its coefficients."""
     size = np.abs(system.A).sum()
     for i in range(len(system.low)):
         if system.M[i, i] > 0.0:
             other = system.modified(i)
             smaller = np.abs(other.A).sum()
-            if smaller < size:
+            tame = np.abs(other.M).max() <= 10.0 * np.abs(system.M).max()
+            if smaller < (size if tame else 0.5 * size):
                 system, size = other, smaller
     return system

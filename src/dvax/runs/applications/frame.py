@@ -117,6 +117,10 @@ class FrameApplication(AbstractApplication[_Loaded]):
         limit = float(frame.yield_displacement)
         if np.isfinite(limit):
             figures["yield_displacement"] = Figure(limit, "in", "displacement at which it yields")
+            figures["elastoplastic_distance"] = Figure(
+                float(np.max(np.asarray(frame.elastoplastic_distance(solution)))), "in",
+                "bound on how far the displacement is from that of the elastoplastic frame, eta/k = 0",
+            )  # fmt: skip
             figures["ductility"] = Figure(peak / limit, "1", "peak over yield displacement")
         return Results(figures, variables, constants, int(solution.stats["steps"]))
 
