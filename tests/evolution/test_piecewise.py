@@ -155,9 +155,7 @@ def test_jumps_are_met_announced_or_not_and_data_that_ends_is_told():
     sol = dvax.solve(hidden, 0.0, 0.0, 1.0, method=dvax.PiecewiseLinear())
     assert float(sol.xs[0]) == pytest.approx(0.5 * (1 - np.exp(-1.4)), rel=1e-12)
     jump = dvax.signals.Table([0.0, 0.3, 1.0], [0.0, 1.0, 1.0], kind="constant")
-    sol = dvax.solve(
-        driven(jump), 0.0, 0.0, 1.0, ts=[0.3, 1.0], method=dvax.PiecewiseLinear()
-    )
+    sol = dvax.solve(driven(jump), 0.0, 0.0, 1.0, ts=[0.3, 1.0], method=dvax.PiecewiseLinear())
     # Then x' = −x + (1 − x).
     assert float(sol.xs[1]) == pytest.approx(0.5 * (1 - np.exp(-1.4)), rel=1e-13)
     assert float(sol.us[0]) == pytest.approx(1.0)

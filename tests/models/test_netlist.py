@@ -128,7 +128,10 @@ def test_a_source_that_ends_before_the_run_is_named_with_its_line():
             ask(5e-3)
         (problem,) = caught.value.problems
         assert problem.place == "netlist, line 5"
-        assert problem.given == "V1, which is known from 0 to 0.001 s" and "t_end = 0.005 s" in problem.rule
+        assert (
+            problem.given == "V1, which is known from 0 to 0.001 s"
+            and "t_end = 0.005 s" in problem.rule
+        )
         assert "t_end = 0.001" in problem.mend
 
 

@@ -53,7 +53,9 @@ def agrees_at_any_resistance(case):
     ts = np.linspace(0.0, end, 41)
     sol = circuit.solve(end, ts)
     assert work(sol) <= 60 * (int(sol.stats["switchings"]) + events + len(ts)), sol.stats
-    current = np.asarray([circuit.currents(*row) for row in zip(sol.ts, sol.xs, sol.us, strict=True)])
+    current = np.asarray(
+        [circuit.currents(*row) for row in zip(sol.ts, sol.xs, sol.us, strict=True)]
+    )
     assert current.min() > -1e-6 and np.abs(np.asarray(sol.law_residual)).max() < 1e-7
     return sol
 
@@ -109,7 +111,14 @@ def test_a_stiff_rectifier_agrees_with_radau(case):
         return [(through(source_v - b) - i - b / 1e3) / other, (i - c / 10) / C, (b - c) / L]
 
     found = scipy.integrate.solve_ivp(
-        rate, (0.0, ts[-1]), np.zeros(mine.shape[1]), "Radau", ts, rtol=1e-9, atol=1e-11, max_step=2e-5
+        rate,
+        (0.0, ts[-1]),
+        np.zeros(mine.shape[1]),
+        "Radau",
+        ts,
+        rtol=1e-9,
+        atol=1e-11,
+        max_step=2e-5,
     )
     order = ["C9", "C1", "L1"] if other else ["C1", "L1"]
     columns = [order.index(name) for name in circuit.states]
@@ -175,7 +184,9 @@ def test_random_circuits_of_stiff_diodes_agree_with_the_second_analysis(seed):
     found = scipy.integrate.solve_ivp(
         rate, (0.0, 2.0), np.zeros(len(plain.A)), "LSODA", ts, rtol=1e-9, atol=1e-11, max_step=0.02
     )
-    np.testing.assert_allclose(np.asarray(sol.xs), found.y.T, atol=2e-6 * (1 + np.abs(found.y).max()))
+    np.testing.assert_allclose(
+        np.asarray(sol.xs), found.y.T, atol=2e-6 * (1 + np.abs(found.y).max())
+    )
 
 
 def test_a_pulse_is_that_of_spice():
@@ -183,7 +194,9 @@ def test_a_pulse_is_that_of_spice():
     times = 1e-6 * np.array([0, 10, 11, 12, 20, 32, 34, 36, 60, 110, 111, 1e3 + 11, 1e3 + 33])
     values = [1, 1, 3, 5, 5, 5, 3, 1, 1, 1, 3, 3, 4]
     np.testing.assert_allclose([float(pulse(t)) for t in times], values, rtol=1e-9)
-    np.testing.assert_allclose(pulse.knots()[:5], 1e-6 * np.array([10, 12, 32, 36, 110]), rtol=1e-12)
+    np.testing.assert_allclose(
+        pulse.knots()[:5], 1e-6 * np.array([10, 12, 32, 36, 110]), rtol=1e-12
+    )
     step = read_waveform(["PULSE(0 2 1m)"], "current", "here")
     assert [float(step(t)) for t in (0.9e-3, 1e-3, 5.0)] == [0.0, 2.0, 2.0]
     assert step.knots().tolist() == [1e-3] and step.span()[1] == np.inf

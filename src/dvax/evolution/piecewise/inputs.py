@@ -44,7 +44,6 @@ class Piece(NamedTuple):
         s = 2.0 * np.asarray(places) - 1.0
         return np.polynomial.chebyshev.chebval(s, self.coefficients).T
 
-
     def local(self, begin: float, length: float) -> Array:
         """The coefficients of the polynomial on a part of the piece, those left out that are rounding:
         on a part that is short the samples would differ by nothing else."""
@@ -56,7 +55,10 @@ class Piece(NamedTuple):
         found = _TO_COEFFICIENTS @ values
         seen = np.abs(found) > _CHOPPED * np.abs(c).sum(axis=0)
         degree = int(np.flatnonzero(seen.any(axis=1)).max(initial=1))
-        return np.where(np.arange(degree + 1)[:, None] < 2, 1.0, seen[: degree + 1]) * found[: degree + 1]
+        return (
+            np.where(np.arange(degree + 1)[:, None] < 2, 1.0, seen[: degree + 1])
+            * found[: degree + 1]
+        )
 
 
 def values(coefficients: Array, basis: Array) -> Array:

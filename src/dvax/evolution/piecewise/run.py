@@ -8,7 +8,7 @@ that are excited and not from how far they are apart. Times within a piece are k
 start, in two parts: a transient of 10⁻¹⁸ s is resolved at any t.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -224,9 +224,10 @@ class Run:
         slack = own.members(slack_p + 4.0 * tail_p, slack_d + 4.0 * tail_d)
         lacking = _EXTRAPOLATED * tail_d
         ys, _ = own.members(p, own.dependent(x[1:], p, given[:, n:]))
-        swing = tuple(
+        of_y, of_w = (
             sum((2.0 * np.abs(ring[k]) for ring in rings), np.zeros(len(p[0]))) for k in (2, 3)
         )
+        swing = of_y, of_w
         return Attempt(
             x, ys, y, w, slack, tuple(ring[:3] for ring in rings), swing, sizes[0], lacking, excess,
             self._residuals(own, x, p, G[0], h),
@@ -239,7 +240,9 @@ class Run:
         active = [ring for ring in own.rings if ring.rate.imag * h > _FOLLOWED]
         found, x0 = [], self.x
         if active:
-            forcing = derivatives(own.forcing(piece.coefficients), begin / piece.length, piece.length)
+            forcing = derivatives(
+                own.forcing(piece.coefficients), begin / piece.length, piece.length
+            )
         for ring in active:
             a = ring.amplitude(self.x, forcing)
             y, w = own.responses(ring)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 
 from ..._tree import Tree
@@ -77,12 +78,14 @@ def affine(problem: Problem, t0: Any, x0: Tree, args: Any) -> Affine:
 
 def _check(problem: Problem, t0: Any, x0: Tree, u0: Tree, args: Any) -> None:
     place = "dvax.solve(method=dvax.PiecewiseLinear())"
-    arrays = not isinstance(x0, tuple) and not isinstance(u0, tuple)
-    if not arrays or x0.size > _LARGEST or u0.size > _LARGEST:
+    several = isinstance(x0, tuple) or isinstance(u0, tuple)
+    sizes = [leaf.size for leaf in jtu.tree_leaves((x0, u0))]
+    if several or max(sizes) > _LARGEST:
+        given = "several parts" if several else f"{sizes[0]} and {sizes[1]} entries"
         raise InputError(
             InputProblem(
-                place, "a state or response of " + (f"{x0.size} and {u0.size} entries" if arrays
-                else "several parts"), f"it is for one array of at most {_LARGEST} entries each",
+                place, f"a state or response of {given}",
+                f"it is for one array of at most {_LARGEST} entries each",
                 "Leave method out, or name another",
             )
         )  # fmt: skip

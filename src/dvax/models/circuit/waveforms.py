@@ -149,7 +149,9 @@ def _pulse(fields: list[str], quantity: str, place: str) -> AbstractSignal:
         if values[2 + k] < 0
     ]
     if not wrong and not period > 0:
-        wrong = [InputProblem(place, fields[6], "the period is positive", "Leave it out for one pulse")]
+        wrong = [
+            InputProblem(place, fields[6], "the period is positive", "Leave it out for one pulse")
+        ]
     if not wrong and rise + width + fall > period:
         wrong = [
             InputProblem(
