@@ -127,8 +127,8 @@ def test_the_method_says_what_it_is_not_for():
         dvax.solve(curved, 1.0, 0.0, 1.0, method=method)
     assert len(caught.value.problems) == 2  # f is not affine, and the slope of h moves
     ball = dvax.Problem(
-        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=lambda t, args: dvax.sets.Box(0.0, t),
-        f=lambda t, x, u, args: -x + u, h=lambda t, x, u, args: x - u,
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=lambda t, args:
+        dvax.sets.Box(0.0, t), f=lambda t, x, u, args: -x + u, h=lambda t, x, u, args: x - u,
     )  # fmt: skip
     with pytest.raises(dvax.InputError, match="a box that does not move"):
         dvax.solve(ball, 1.0, 0.5, 1.0, method=method)

@@ -44,7 +44,8 @@ def check(
         rule(dt is None, "dt", dt, "how well an implicit method solves its equations follows from "
              "rtol and atol, so its steps adapt", "Leave it out")  # fmt: skip
     if isinstance(method, PiecewiseLinear):
-        rule(dt is None, "dt", dt, "dvax.PiecewiseLinear steps from one change of the constraints to the "
+        rule(dt is None, "dt", dt, "dvax.PiecewiseLinear steps from one change of the constraints "
+        "to the "
              "next", "Leave it out, and name the times to save in ts=")  # fmt: skip
     if _tree.is_concrete(x0):
         for leaf in map(np.asarray, jax.tree_util.tree_leaves(x0)):

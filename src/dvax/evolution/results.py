@@ -24,7 +24,8 @@ class RESULTS(eqx.Enumeration):
         "NaN or infinite there, or jump; or give dvax.Implicit(solver) a root finder of its own."
     )
     switching_unresolved = (
-        "The constraints changed again and again at one time, so that no mode goes on from there. Check "
+        "The constraints changed again and again at one time, so that no mode goes on from there. "
+        "Check "
         "that the law is strongly pseudomonotone (dvax.verify), or use dvax.ExpRosenbrock()."
     )
     nonfinite = "f, h or K returned NaN or infinity."

@@ -2,7 +2,8 @@
 
 Between two knots of the data they are analytic. A stretch on which they are lines is one piece; others
 are halved until Chebyshev interpolation has converged, which its coefficients and further points show.
-The points are no fraction of a period apart from each other, so that a wave does not pass for a constant.
+The points are no fraction of a period apart from each other, so that a wave does not pass for a
+constant.
 """
 
 from typing import Any, NamedTuple
@@ -28,8 +29,8 @@ _NOISE = 64.0
 
 class Piece(NamedTuple):
     """(g, q) on [start, start + length], by Chebyshev coefficients, a row each degree; `noise` is what
-    rounding of t and of the values leaves undetermined. `error`, how far the polynomial was off at points
-    that did not make it, is an estimate and no bound."""
+    rounding of t and of the values leaves undetermined. `error`, how far the polynomial was off at
+    points that did not make it, is an estimate and no bound."""
 
     start: float
     length: float

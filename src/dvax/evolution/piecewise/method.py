@@ -19,9 +19,11 @@ class PiecewiseLinear(eqx.Module):
     So the cost follows from the number of changes, of knots and of periods of the inputs, and not from
     stiffness: after a change each time scale that is excited takes a few steps.
 
-    `rtol` is what the polynomials may lack, divided by 10⁴ and never below 10⁻¹²; the defect is evaluated,
+    `rtol` is what the polynomials may lack, divided by 10⁵ and never below 10⁻¹³; the defect is
+    evaluated,
     and is zero up to rounding on most runs. In `Solution.stats`, `switchings` counts the changes, and
-    `evaluations` the solves. It runs on the host in NumPy, outside of `jax.jit` and without derivatives:
+    `evaluations` the solves. It runs on the host in NumPy, outside of `jax.jit` and without
+    derivatives:
     `dvax.ExpRosenbrock` solves the same systems there.
 
     **Raises:** `dvax.InputError` where the code of f, h or K does not show the structure, for more than

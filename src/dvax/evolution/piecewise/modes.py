@@ -34,7 +34,8 @@ class Condition(NamedTuple):
 class Equations:
     """The equations of one mode.
 
-    `prescribed_p` and `prescribed_d` hold the prescribed values (0 elsewhere), `unknown` says where p is
+    `prescribed_p` and `prescribed_d` hold the prescribed values (0 elsewhere), `unknown` says
+    where p is
     unknown; `rates` are the time scales of the mode, 1/|λ| in effect, from the shortest to the longest.
     """
 

@@ -2,7 +2,8 @@
 
 A step solves the equations of its mode by collocation and samples what has a sign to keep in that mode.
 Where bounds on these polynomials cannot exclude a change of sign, the change is located, and the step
-ends there. Steps end at the ends of the input's pieces as well. After a change the longest step is tried
+ends there. Steps end at the ends of the input's pieces as well. After a change the longest step is
+tried
 first, then the time scales of the mode, so that the number of steps follows from the number of scales
 that are excited and not from how far they are apart. Times within a piece are kept relative to its
 start, in two parts: a transient of 10⁻¹⁸ s is resolved at any t.
@@ -57,9 +58,11 @@ class Row(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """A step that was computed: x at the nodes, y at the points, y and w on the grid with the `slack` that
+    """A step that was computed: x at the nodes, y at the points, y and w on the grid with the
+    `slack` that
     they may be off by; the `rings` beside these polynomials, and by how much they move y and w at most;
-    the `size` of the whole state; what the polynomials are `lacking` in d, and `excess`, the same in units
+    the `size` of the whole state; what the polynomials are `lacking` in d, and `excess`, the same
+    in units
     of what is allowed; and the `residuals` of the state's and of the law's equations at θ = 0."""
 
     x: Array
@@ -130,7 +133,8 @@ class Run:
         return self.equations[mode]
 
     def _solve_law(self, piece: Piece) -> str:
-        """The mode of the law at x and at the start of a piece: of the violated conditions the first is changed (Murty's rule,
+        """The mode of the law at x and at the start of a piece: of the violated conditions the
+        first is changed (Murty's rule,
         which ends for matrices whose principal minors are positive)."""
         q = piece.at(np.zeros(1))[0, len(self.x) :]
         sizes = np.abs(piece.coefficients[:, len(self.x) :]).sum(axis=0)
@@ -331,7 +335,8 @@ class Run:
             self.steps.append(step)
 
     def _norm(self, v: Array) -> float:
-        """An upper bound of the norm of the state space, exact where its unit vectors are orthogonal."""
+        """An upper bound of the norm of the state space, exact where its unit vectors are
+        orthogonal."""
         return float(np.sqrt(np.sum((self.weights * v) ** 2)))
 
 
@@ -353,7 +358,8 @@ def _mean(used: float) -> float:
 
 
 def _shorter(own: Equations, h: float, excess: float, before: float) -> float:
-    """The step to try next: half of it, as long as that pays (by 2²⁰ where the solution is resolved, but
+    """The step to try next: half of it, as long as that pays (by 2²⁰ where the solution is
+    resolved, but
     for little); else the next time scale of the mode, since a transient is there that is not."""
     if excess < 1e6 and excess < 0.1 * before:
         return 0.5 * h

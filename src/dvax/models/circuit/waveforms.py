@@ -89,7 +89,8 @@ def read_waveform(fields: list[str], quantity: str, place: str) -> AbstractSigna
         if len(numbers) != 1 or "(" in whole:
             raise InputError(
                 InputProblem(
-                    place, repr(whole), "a source is a number, DC number, SIN(...), PWL(...) or PULSE(...)",
+                    place, repr(whole), "a source is a number, DC number, SIN(...), PWL(...) or "
+                    "PULSE(...)",
                     "Write one of them after the two nodes",
                 )
             )  # fmt: skip
@@ -136,7 +137,8 @@ def _pulse(fields: list[str], quantity: str, place: str) -> AbstractSignal:
         raise InputError(
             InputProblem(
                 place, f"PULSE with {len(fields)} numbers",
-                "it has a low and a high value, and may have a delay, a rise time, a fall time, a width "
+                "it has a low and a high value, and may have a delay, a rise time, a fall time, a "
+                "width "
                 "and a period", "Write PULSE(0 5 0 1n 1n 5u 10u)",
             )
         )  # fmt: skip
@@ -155,7 +157,8 @@ def _pulse(fields: list[str], quantity: str, place: str) -> AbstractSignal:
     if not wrong and rise + width + fall > period:
         wrong = [
             InputProblem(
-                place, f"a period of {fields[6]}", "a pulse is over when the next one begins: rise, width "
+                place, f"a period of {fields[6]}", "a pulse is over when the next one begins: rise, "
+                "width "
                 f"and fall are {rise + width + fall:.12g} s", "Lengthen the period, or leave it out",
             )
         ]  # fmt: skip
