@@ -44,6 +44,7 @@ CONTRACT = [
     "ExpRosenbrock",
     "Implicit",
     "Picard",
+    "PiecewiseLinear",
     "generators.Scalar",
     "generators.Diagonal",
     "generators.Dense",

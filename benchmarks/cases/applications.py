@@ -48,7 +48,7 @@ def run(full: bool) -> Section:
         ),
     )
     rounds = 7 if full else 3
-    for race in (_circuit, _oscillators, _market, _predictive, _bodies):
+    for race in (_circuit, _stiff, _oscillators, _market, _predictive, _bodies):
         race(section, rounds, full)
     return section
 
@@ -86,6 +86,30 @@ def _circuit(section: Section, rounds: int, full: bool) -> None:
             lambda: siconos.run()[0], rounds,
             abs(float(run()[-1][0]) - exact[0]), abs(reached[0] - exact[0]),
         )  # fmt: skip
+
+
+def _stiff(section: Section, rounds: int, full: bool) -> None:
+    """What stiffness costs: the same run with a diode of 1 µΩ and 1 Ω, with η/k = 1e-8 s and 1e-2 s."""
+
+    def rectifier(r: float) -> Callable[[], Any]:
+        text = f"V1 a 0 SIN(0 10 1k)\nD1 a b R={r} G=1u\nL1 b c 10u\nR1 c 0 10\nC1 c 0 1u"
+        circuit = Circuit(text)
+        return lambda: circuit.solve(3e-3).xs
+
+    def frame(tau: float) -> Callable[[], Any]:
+        made = Frame(record=_record(), period=0.5, damping=0.05, yield_displacement=0.4,
+                     viscosity_ratio=tau)  # fmt: skip
+        return lambda: made.solve().xs
+
+    for case, versus, stiff, mild in (
+        ("rectifier, diode of 1 µΩ", "1 Ω", rectifier(1e-6), rectifier(1.0)),
+        ("frame, η/k = 1e-8 s", "1e-2 s", frame(1e-8), frame(1e-2)),
+    ):
+        stiff(), mild()
+        taken = in_turn({"stiff": timed(stiff), "mild": timed(mild)}, rounds)
+        section.comparisons.append(
+            compare(case, versus, taken["stiff"], taken["mild"], direction="dvax/other")
+        )
 
 
 def _record() -> Accelerogram:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .evolution import ExpRosenbrock as ExpRosenbrock
     from .evolution import Implicit as Implicit
     from .evolution import Picard as Picard
+    from .evolution import PiecewiseLinear as PiecewiseLinear
     from .evolution import Solution as Solution
     from .evolution import solve as solve
     from .problem import Problem as Problem
@@ -65,6 +66,7 @@ _HOMES = {
         "ExpRosenbrock",
         "Implicit",
         "Picard",
+        "PiecewiseLinear",
         "RESULTS",
         "Solution",
         "solve",

@@ -69,7 +69,7 @@ REFUSED = {
     "word of a diode": ("D2 1 0 N=2", "line 4", "the words of an element D are R= and G="),
     "model of a diode": ("D2 1 0 1N4148", "line 4", "no models of diodes are known"),
     "two values": ("L2 1 0 5m 6m", "line 4", "two nodes and one value"),
-    "waveform": ("V1 1 0 PULSE(0 1 2)", "line 4", "a waveform is one of SIN, PWL"),
+    "waveform": ("V1 1 0 EXP(0 1 2)", "line 4", "a waveform is one of SIN, PWL, PULSE"),
     "open bracket": ("V1 1 0 SIN(0 1 2", "line 4", "a source is a number"),
     "short sine": ("V1 1 0 SIN(0 1)", "line 4", "an offset, an amplitude and a frequency"),
     "sine before its time": ("V1 1 0 SIN(0 1 50 -1)", "line 4", "the delay is not negative"),
@@ -128,7 +128,10 @@ def test_a_source_that_ends_before_the_run_is_named_with_its_line():
             ask(5e-3)
         (problem,) = caught.value.problems
         assert problem.place == "netlist, line 5"
-        assert problem.given == "V1, a PWL from 0 to 0.001 s" and "t_end = 0.005 s" in problem.rule
+        assert (
+            problem.given == "V1, which is known from 0 to 0.001 s"
+            and "t_end = 0.005 s" in problem.rule
+        )
         assert "t_end = 0.001" in problem.mend
 
 

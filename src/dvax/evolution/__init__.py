@@ -11,6 +11,7 @@ from .method import ETD4RK as ETD4RK
 from .method import AbstractMethod as AbstractMethod
 from .method import ExpRosenbrock as ExpRosenbrock
 from .picard import Picard as Picard
+from .piecewise.method import PiecewiseLinear as PiecewiseLinear
 from .results import RESULTS as RESULTS
 from .runge_kutta import DormandPrince as DormandPrince
 from .solution import Solution as Solution

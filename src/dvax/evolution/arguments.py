@@ -17,6 +17,7 @@ from ..vi import AbstractSolver
 from .implicit import Implicit
 from .method import AbstractMethod
 from .picard import Picard
+from .piecewise.method import PiecewiseLinear
 
 ADAPTIVE_STEPS = 2**20
 """The most steps of an adaptive solve, unless max_steps says otherwise."""
@@ -40,7 +41,7 @@ def check(
 
     rule(isinstance(problem, Problem), "problem", _tree.Text(type(problem).__name__),
          "it must be a dvax.Problem", "Build one, or pass that of a model: model.problem")  # fmt: skip
-    rule(isinstance(method, AbstractMethod | Implicit | Picard), "method", method,
+    rule(isinstance(method, AbstractMethod | Implicit | Picard | PiecewiseLinear), "method", method,
          "it must be a method such as dvax.ETD2RK()", "Leave it out for the default")  # fmt: skip
     rule(isinstance(vi_solver, AbstractSolver | None), "vi_solver", vi_solver,
          "it must be a solver such as dvax.vi.Auto()", "Leave it out for the default")  # fmt: skip
@@ -56,6 +57,9 @@ def check(
                  "Leave it out and name the times in ts=, or use an exponential method")  # fmt: skip
         rule(dt is None, "dt", dt, "how well an implicit method solves its equations follows from "
              "rtol and atol, so its steps adapt", "Leave it out")  # fmt: skip
+    if isinstance(method, PiecewiseLinear):
+        rule(dt is None, "dt", dt, "dvax.PiecewiseLinear steps from one change of the constraints to "
+             "the next", "Leave it out, and name the times to save in ts=")  # fmt: skip
     if max_steps is not None:
         whole = isinstance(max_steps, int | np.integer) and not isinstance(max_steps, bool)
         rule(bool(whole and 1 <= max_steps <= MOST_COUNTED), "max_steps", max_steps,

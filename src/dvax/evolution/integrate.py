@@ -71,6 +71,7 @@ def _solved(setup: Setup, flow: Flow, ts: Any, options: Options) -> Solution:
     if isinstance(setup.method, Picard):
         return _by_windows(setup, setup.method, flow, stops, times, options)
     method = setup.method
+    assert isinstance(method, AbstractMethod)  # PiecewiseLinear runs on the host
     controller = _controller(setup, method, stops, options)
     loop = Loop(
         _stepper(setup, method, flow, stops, options),

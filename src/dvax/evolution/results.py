@@ -20,5 +20,10 @@ class RESULTS(eqx.Enumeration):
         "The equations of an implicit step were not solved, however short the step. f, h or K may be "
         "NaN or infinite there, or jump; or give dvax.Implicit(solver) a root finder of its own."
     )
+    switching_unresolved = (
+        "The constraints changed again and again at one time, so that no mode goes on from there. "
+        "Check "
+        "that the law is strongly pseudomonotone (dvax.verify), or use dvax.ExpRosenbrock()."
+    )
     nonfinite = "f, h or K returned NaN or infinity."
     law_unsolved = "The frozen law was not solved to its tolerance."

@@ -20,6 +20,7 @@ from .linearised import Nothing
 from .medians import Medians
 from .method import AbstractMethod
 from .picard import Picard
+from .piecewise.method import PiecewiseLinear
 
 
 class Setup(NamedTuple):
@@ -33,7 +34,7 @@ class Setup(NamedTuple):
     x0: Tree
     args: Any
     setting: dict[str, Any]
-    method: AbstractMethod | Implicit | Picard
+    method: AbstractMethod | Implicit | Picard | PiecewiseLinear
     vi_solver: AbstractSolver
     moduli: dict[str, Any]
 

@@ -14,6 +14,8 @@ from .diagnose import failure
 from .extent import Extent
 from .implicit import Implicit
 from .loop import Record
+from .piecewise.method import PiecewiseLinear
+from .piecewise.trajectory import Trajectory, signs
 from .regimes import Regimes, regimes
 from .results import RESULTS
 from .setup import Setup
@@ -74,7 +76,7 @@ class Solution(eqx.Module):
     extent: Extent | None
     stats: dict[str, Any]
     result: RESULTS
-    records: Record | None
+    records: Record | Trajectory | None
     enclosed: bool = eqx.field(static=True)
     setup: Setup
 
@@ -94,6 +96,13 @@ class Solution(eqx.Module):
                     "Solve with dense=True, or name the times in ts=",
                 )
             )
+        if isinstance(self.records, Trajectory):
+            records = self.records
+            self._check_inside(t, records.start[0], records.end)
+            x, y = records.at(t)
+            x0, u0 = self.setup.x0, self.us[0]
+            u = self.setup.flow().operator.inverse(y.reshape(u0.shape).astype(u0.dtype))
+            return x.reshape(jnp.shape(x0)).astype(self.xs.dtype), u
         flow = self.setup.flow()
         t = jnp.asarray(t, self.records.start.dtype)
         starts = self.records.start
@@ -101,6 +110,20 @@ class Solution(eqx.Module):
         i = jnp.clip(jnp.searchsorted(starts, t, side="right") - 1, 0)
         step = jax.tree_util.tree_map(lambda leaf: leaf[i], self.records)
         end = last + self.records.length[jnp.searchsorted(starts, last)]
+        self._check_inside(t, first, end)
+        theta = (t - step.start) / step.length
+        run = self.setup.number("t0"), self.setup.number("t1")
+        method = self.setup.method
+        assert not isinstance(method, Implicit | PiecewiseLinear)
+        own, _ = local(
+            method, flow, step.start, step.start + step.length, step.x0,
+            flow.guess(step.x0), run,
+        )  # fmt: skip
+        x = inside(own, step.length, theta, step.x0, step.coefficients)
+        rate = flow.rate(t, x, None)
+        return x, flow.operator.inverse(rate.y)
+
+    def _check_inside(self, t: Any, first: Any, end: Any) -> None:
         if _tree.is_concrete(t, first, end) and not first <= t <= end:
             raise InputError(
                 InputProblem(
@@ -110,17 +133,6 @@ class Solution(eqx.Module):
                     "Solve further, or ask for a time inside",
                 )
             )
-        theta = (t - step.start) / step.length
-        run = self.setup.number("t0"), self.setup.number("t1")
-        method = self.setup.method
-        assert not isinstance(method, Implicit)
-        own, _ = local(
-            method, flow, step.start, step.start + step.length, step.x0,
-            flow.guess(step.x0), run,
-        )  # fmt: skip
-        x = inside(own, step.length, theta, step.x0, step.coefficients)
-        rate = flow.rate(t, x, None)
-        return x, flow.operator.inverse(rate.y)
 
     def regimes(self) -> Regimes:
         """The times at which the response enters or leaves the boundary of K, and on what side of which
@@ -151,6 +163,8 @@ class Solution(eqx.Module):
                     "Solve with dense=True",
                 )
             )
+        if isinstance(self.records, Trajectory):
+            return Regimes(*signs(self.records))
         flow = self.setup.flow()
         x0, t0 = self.setup.x0, self.setup.number("t0")
         if flow.switches(t0, x0, flow.problem.zero_control(x0)) is None:
@@ -162,7 +176,7 @@ class Solution(eqx.Module):
                     "Give the set as one that does, a dvax.sets.Polyhedron, say",
                 )
             )
-        assert not isinstance(self.setup.method, Implicit)
+        assert not isinstance(self.setup.method, Implicit | PiecewiseLinear)
         return regimes(flow, self.setup.method, self.records, int(self.stats["steps"]))
 
     def raise_if_failed(self) -> "Solution":

@@ -30,6 +30,8 @@ from .integrate import Options
 from .method import ETD2RK, AbstractMethod
 from .nonfinite import refuse_nonfinite_data
 from .picard import Picard
+from .piecewise.method import PiecewiseLinear
+from .piecewise.propagate import Limits, propagate
 from .results import RESULTS
 from .setup import Setup, as_arrays
 from .solution import Solution
@@ -48,7 +50,7 @@ def solve(
     dt: Any = None,
     rtol: Any = 1e-6,
     atol: Any = 1e-9,
-    method: AbstractMethod | Implicit | Picard | None = None,
+    method: AbstractMethod | Implicit | Picard | PiecewiseLinear | None = None,
     vi_solver: AbstractSolver | None = None,
     progress: bool = False,
     *,
@@ -177,6 +179,11 @@ def solve(
     vi_solver = _VI_SOLVER if vi_solver is None else vi_solver
     setup = Setup(problem, x0, args, setting, method, vi_solver, _moduli(constants))
     times = None if ts is None else _times(ts)
+    if isinstance(method, PiecewiseLinear):
+        solution = propagate(setup, times, Limits(options.max_steps, dense, options.ranged))
+        if throw and solution.result != RESULTS.successful:
+            raise SolveError(_explain(solution), solution)
+        return solution
     solution, reached = _differentiably(setup, times, options)
     if reached is True and not dense:
         return solution

@@ -11,7 +11,7 @@ import numpy as np
 
 from ... import _tree
 from ...errors import InputError, InputProblem
-from ...evolution import ExpRosenbrock, Solution, solve
+from ...evolution import ExpRosenbrock, PiecewiseLinear, Solution, solve
 from ...generators import Dense
 from ...operators import Diagonal, Scaling
 from ...problem import Problem
@@ -179,11 +179,16 @@ class Circuit(eqx.Module):
 
     def solve(self, t_end: Any, ts: Any = None, **settings: Any) -> Solution:
         """The run from the initial values of the netlist at t = 0 to `t_end` (s), saved at `ts`; by
-        `dvax.ExpRosenbrock`, which is exact from one switching to the next where sources are constant
-        or PWL; with rtol = 1e-8 and atol = 1e-9 (V and A, root mean square). `settings` go to
-        `dvax.solve`. Raises what `check_sources` does."""
+        `dvax.PiecewiseLinear`, which goes from one switching to the next, whatever the stiffness; where
+        values are traced (`jax.jit`, `jax.grad`), or `dt` is given, by `dvax.ExpRosenbrock`. With
+        rtol = 1e-8 and atol = 1e-9 (V and A, root mean square). `settings` go to `dvax.solve`. Raises
+        what `check_sources` does."""
         self.check_sources(t_end)
-        settings = {"method": ExpRosenbrock(), "rtol": 1e-8, "atol": 1e-9} | settings
+        settings = {"rtol": 1e-8, "atol": 1e-9} | settings
+        if settings.get("method") is None:
+            traced = not _tree.is_concrete(self, t_end, ts, *settings.values())
+            follow = traced or settings.get("dt") is not None
+            settings["method"] = ExpRosenbrock() if follow else PiecewiseLinear()
         return solve(self.problem, self.x0, 0.0, t_end, ts=ts, **settings)
 
     def check_sources(self, t_end: Any) -> None:
@@ -196,9 +201,9 @@ class Circuit(eqx.Module):
         end = float(t_end)
         short = [
             InputProblem(
-                place, f"{name}, a PWL from 0 to {last:.12g} s",
+                place, f"{name}, which is known from 0 to {last:.12g} s",
                 f"the run is from 0 to t_end = {end:.12g} s, and a source is never extrapolated",
-                f"Add {end:.12g} and a value as its last point, or take t_end = {last:.12g}",
+                f"Add {end:.12g} and a value as the last point of a PWL, or take t_end = {last:.12g}",
             )
             for (name, place), source in zip(self.feeds, self.sources, strict=True)
             if (last := float(source.span()[1])) < end

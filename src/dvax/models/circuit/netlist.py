@@ -3,7 +3,7 @@
     R1 a b 1k               resistor
     L1 a b 10m IC=0.1       inductor, with the current from a to b at t = 0
     C1 a b 1u  IC=10        capacitor, with the voltage of a over b at t = 0
-    V1 a b SIN(0 10 1k)     voltage of a over b: a number, DC number, SIN(...) or PWL(...)
+    V1 a b SIN(0 10 1k)     voltage of a over b: a number, DC number, SIN, PWL or PULSE(...)
     I1 a b 1m               current that flows from a through the source to b
     D1 a b R=1 G=1n         ideal diode from anode a to cathode b, in series with a resistance R,
                             its ideal part beside a conductance G (both may be left out)

@@ -30,9 +30,55 @@ class Sine(eqx.Module):
         return self.offset + self.amplitude * jnp.exp(-self.damping * s) * jnp.sin(angle)
 
 
+class Pulse(AbstractSignal):
+    """The PULSE of SPICE: `low` up to `delay`, then in every `period` a rise to `high`, which lasts for
+    `width`, and a fall. Rise and fall take `edges` = (rise, fall), 0 for a jump. Without an end of the
+    pulse `width` is infinite, and without repetition `period`.
+
+    Its knots are those of the first 10⁵ periods, and there its span ends.
+    """
+
+    low: float
+    high: float
+    delay: float
+    edges: tuple[float, float]
+    width: float
+    period: float
+
+    def value(self, t: Any) -> jax.Array:
+        s = jnp.asarray(t - self.delay, jnp.result_type(float))
+        if np.isfinite(self.period):
+            s = s - self.period * jnp.floor(s / self.period)
+        rise, fall = self.edges
+        end = rise + self.width
+        up = s / rise if rise > 0 else jnp.ones_like(s)
+        level = jnp.clip(up, 0.0, 1.0)
+        if np.isfinite(end):
+            down = (s - end) / fall if fall > 0 else jnp.where(s >= end, 1.0, 0.0)
+            level = level * (1.0 - jnp.clip(down, 0.0, 1.0))
+        level = jnp.where(t >= self.delay, level, 0.0)
+        return jnp.where(t <= self.span()[1], self.low + (self.high - self.low) * level, jnp.nan)
+
+    def knots(self) -> Any:
+        rise, fall = self.edges
+        end = rise + self.width
+        one = np.array([0.0, rise, end, end + fall])
+        one = self.delay + one[np.isfinite(one)]
+        if np.isfinite(self.period):
+            one = (one + self.period * np.arange(_PERIODS)[:, None]).ravel()
+        return np.unique(one[one > 0.0])
+
+    def span(self) -> tuple[Any, Any]:
+        return -np.inf, self.delay + _PERIODS * self.period
+
+
+_PERIODS = 100_000
+
+
 def read_waveform(fields: list[str], quantity: str, place: str) -> AbstractSignal:
     """The signal that the end of a source's line describes: ``5``, ``DC 5``,
-    ``SIN(offset amplitude frequency [delay damping phase])`` or ``PWL(t v t v ...)``.
+    ``SIN(offset amplitude frequency [delay damping phase])``, ``PWL(t v t v ...)`` or
+    ``PULSE(low high [delay rise fall width period])``.
 
     **Raises:** `dvax.InputError` at `place`, with everything that is wrong.
     """
@@ -43,12 +89,13 @@ def read_waveform(fields: list[str], quantity: str, place: str) -> AbstractSigna
         if len(numbers) != 1 or "(" in whole:
             raise InputError(
                 InputProblem(
-                    place, repr(whole), "a source is a number, DC number, SIN(...) or PWL(...)",
+                    place, repr(whole), "a source is a number, DC number, SIN(...), PWL(...) or "
+                    "PULSE(...)",
                     "Write one of them after the two nodes",
                 )
             )  # fmt: skip
         return Constant(read_value(numbers[0], quantity, place))
-    shapes = {"SIN": _sine, "PWL": _lines}
+    shapes = {"SIN": _sine, "PWL": _lines, "PULSE": _pulse}
     shape = shapes.get(call["name"].upper())
     if shape is None:
         raise InputError(
@@ -82,6 +129,45 @@ def _sine(fields: list[str], quantity: str, place: str) -> AbstractSignal:
     values[5] = np.deg2rad(values[5])
     delay = values[3]
     return Function(Sine(*map(jnp.asarray, values)), knots=[delay] if delay > 0 else [])
+
+
+def _pulse(fields: list[str], quantity: str, place: str) -> AbstractSignal:
+    kinds = (quantity, quantity, "time", "time", "time", "time", "time")
+    if not 2 <= len(fields) <= len(kinds):
+        raise InputError(
+            InputProblem(
+                place, f"PULSE with {len(fields)} numbers",
+                "it has a low and a high value, and may have a delay, a rise time, a fall time, a "
+                "width "
+                "and a period", "Write PULSE(0 5 0 1n 1n 5u 10u)",
+            )
+        )  # fmt: skip
+    values = _all(fields, kinds[: len(fields)], place)
+    low, high, delay, rise, fall, width, period = values + _PULSE_DEFAULTS[len(values) :]
+    names = ("the delay", "the rise time", "the fall time", "the width", "the period")
+    wrong = [
+        InputProblem(place, fields[2 + k], f"{what} is not negative", "Mend the sign")
+        for k, what in enumerate(names[: len(fields) - 2])
+        if values[2 + k] < 0
+    ]
+    if not wrong and not period > 0:
+        wrong = [
+            InputProblem(place, fields[6], "the period is positive", "Leave it out for one pulse")
+        ]
+    if not wrong and rise + width + fall > period:
+        wrong = [
+            InputProblem(
+                place, f"a period of {fields[6]}", "a pulse is over when the next one begins: rise, "
+                "width "
+                f"and fall are {rise + width + fall:.12g} s", "Lengthen the period, or leave it out",
+            )
+        ]  # fmt: skip
+    if wrong:
+        raise InputError(*wrong)
+    return Pulse(low, high, delay, (rise, fall), width, period)
+
+
+_PULSE_DEFAULTS = [0.0, 0.0, 0.0, 0.0, 0.0, np.inf, np.inf]
 
 
 def _lines(fields: list[str], quantity: str, place: str) -> AbstractSignal:

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from pydantic import Field
 
-from dvax.evolution import ExpRosenbrock, Solution
+from dvax.evolution import ExpRosenbrock, PiecewiseLinear, Solution
 from dvax.models.circuit import Circuit
 from dvax.runs.applications.base import (
     AbstractApplication,
@@ -37,10 +37,6 @@ class CircuitSection(SolverKeys):
     g_leak: float | None = Field(
         None, gt=0, description="conductance across diodes that have none [siemens]"
     )
-
-
-_SETTINGS: dict[str, Any] = dict(method=ExpRosenbrock(), rtol=1e-8, atol=1e-9)
-"""As `dvax.models.Circuit.solve` has them."""
 
 
 class _Loaded:
@@ -77,7 +73,10 @@ class CircuitApplication(AbstractApplication[_Loaded]):
         c, table = model.circuit, model.table
         say(f"solving from 0 to {table.t_end:g} s")
         times = np.linspace(0.0, table.t_end, table.frames + 1)
-        return Plan(c.problem, c.x0, times, c.constants, settings(table, **_SETTINGS), None, "s")
+        # As `dvax.models.Circuit.solve` has them.
+        method = PiecewiseLinear() if table.dt is None else ExpRosenbrock()
+        options = settings(table, method=method, rtol=1e-8, atol=1e-9)
+        return Plan(c.problem, c.x0, times, c.constants, options, None, "s")
 
     def results(self, model: _Loaded, plan: Plan, solution: Solution) -> Results:
         c, times = model.circuit, np.asarray(solution.ts)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from pydantic import Field
 
-from dvax.evolution import ExpRosenbrock, Solution
+from dvax.evolution import ExpRosenbrock, PiecewiseLinear, Solution
 from dvax.models.frame import Accelerogram, Frame
 from dvax.models.frame.peaks import largest as largest_between
 from dvax.runs.applications.base import (
@@ -89,7 +89,8 @@ class FrameApplication(AbstractApplication[_Loaded]):
     def plan(self, model: _Loaded, say: Say) -> Plan:
         frame = model.frame
         say("solving over the record")
-        options = settings(model.table, method=ExpRosenbrock(), rtol=1e-8)
+        method = PiecewiseLinear() if model.table.dt is None else ExpRosenbrock()
+        options = settings(model.table, method=method, rtol=1e-8)
         return Plan(
             frame.problem, jnp.zeros(3), frame.times, frame.constants, options, None, "s"
         )  # fmt: skip
@@ -139,6 +140,10 @@ class FrameApplication(AbstractApplication[_Loaded]):
         limit = float(frame.yield_displacement)
         if np.isfinite(limit):
             lengths["yield_displacement"] = (limit, None, "displacement at which it yields")
+            lengths["elastoplastic_distance"] = (
+                float(np.max(np.asarray(frame.elastoplastic_distance(solution)))), None,
+                "bound on how far the displacement is from that of the elastoplastic frame, eta/k = 0",
+            )  # fmt: skip
         figures = {n: Figure(value, "in", words, e) for n, (value, e, words) in lengths.items()}
         if np.isfinite(limit):
             figures["ductility"] = Figure(peak / limit, "1", "peak over yield displacement")

@@ -1,0 +1,50 @@
+"""The method by its name."""
+
+from typing import ClassVar
+
+import equinox as eqx
+
+
+class PiecewiseLinear(eqx.Module):
+    """From one switching to the next, for systems that are affine while no constraint changes.
+
+    Where f and h are affine in (x, u) with constant coefficients and K is a box, the system is linear,
+    with inputs that depend on t, as long as the same entries of y = P u are at their bounds:
+
+        x' = Ax + By + g(t),    w = My + Cx + q(t),    0 = w on the free entries, y given on the others.
+
+    Each step solves these equations as they stand, by Radau collocation of order 39: no matter how
+    stiff, since the free y stay unknowns and no small M is divided by. Polynomials of degree 20 are the
+    result, and bounds on them decide where a constraint changes; the step ends there, within rounding.
+    So the cost follows from the number of changes, of knots and of periods of the inputs, and not from
+    stiffness: after a change each time scale that is excited takes a few steps.
+
+    `rtol` is what the polynomials may lack, divided by 10⁵ and never below 10⁻¹³; the defect is
+    evaluated,
+    and is zero up to rounding on most runs. In `Solution.stats`, `switchings` counts the changes, and
+    `evaluations` the solves. It runs on the host in NumPy, outside of `jax.jit` and without
+    derivatives:
+    `dvax.ExpRosenbrock` solves the same systems there.
+
+    **Raises:** `dvax.InputError` where the code of f, h or K does not show the structure, for more than
+    64 states or responses, or where `dt` is given; `dvax.DifferentiationError` where values are traced.
+
+    Source: Hairer and Wanner (1996), Sections IV.5 and VI.1 (Radau IIA; the direct approach); Murty,
+    *Linear Complementarity* (1988), Section 4.1 (changes of the active set).
+
+    ```python
+    >>> import dvax
+    >>> stiff = dvax.Problem(
+    ...     A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1e12),
+    ...     f=lambda t, x, u, args: 1.0 - x + u, h=lambda t, x, u, args: -1e12 * (x - 2.0) - u,
+    ... )                              # a spring of 5·10¹¹ holds x above 2, nearly
+    >>> sol = dvax.solve(stiff, 4.0, 0.0, 4.0, method=dvax.PiecewiseLinear())
+    >>> print(f"{float(sol.xs[0]):.12f}", int(sol.stats["switchings"]))
+    1.999999999998 1
+
+    ```
+    """
+
+    order: ClassVar[int] = 39
+    degree: ClassVar[int] = 20
+    linearises: ClassVar[bool] = False

@@ -1,0 +1,205 @@
+"""Modes: which constraints of y are active, and what the equations prescribe in each.
+
+A mode has a number for each pair (yᵢ, wᵢ): −1 where yᵢ is at its lower bound, 1 at the upper one, and 0
+where it is free, so that wᵢ = 0. Of each pair a mode prescribes one member; what has a sign to keep is
+the other one.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from . import radau
+from .rings import Ring, rings
+from .system import Affine
+
+Array = np.ndarray
+Mode = tuple[int, ...]
+
+ROUNDINGS = 512.0 * np.finfo(float).eps
+"""What rounding may do to a sum, relative to the sum of the sizes of its terms."""
+
+
+class Condition(NamedTuple):
+    """sign · (member − bound) ≥ 0 of pair i; where it fails the pair goes on in the state `to`."""
+
+    i: int
+    of_w: bool
+    sign: float
+    bound: float
+    to: int
+
+
+class Equations:
+    """The equations of one mode.
+
+    `prescribed_p` and `prescribed_d` hold the prescribed values (0 elsewhere), `unknown` says
+    where p is
+    unknown; `rates` are the time scales of the mode, 1/|λ| in effect, from the shortest to the longest.
+    """
+
+    def __init__(self, system: Affine, mode: Mode, weights: Array):
+        self.system, self.mode, self.weights = system, mode, weights
+        state = np.array(mode)
+        free = state == 0
+        self.unknown = free != system.swapped
+        u = self.unknown
+        y = np.where(state < 0, system.low, np.where(state > 0, system.up, 0.0))
+        value = np.where(free, 0.0, y)
+        self.prescribed_p = np.where(u, 0.0, value)
+        self.prescribed_d = np.where(u, value, 0.0)
+        self.conditions = [c for i, s in enumerate(mode) for c in _conditions(system, i, s)]
+        M = system.M[np.ix_(u, u)]
+        self.inverse = _inverse(M)
+        eliminated = system.A - system.B[:, u] @ self.inverse @ system.C[u]
+        spectrum = np.linalg.eigvals(eliminated) if np.isfinite(eliminated).all() else np.zeros(1)
+        speeds = np.abs(spectrum.real) / 8.0 + np.abs(spectrum.imag) / 4.0
+        fastest = max(float(speeds.max()), 1e-300)
+        self.scales = np.unique(1.0 / speeds[speeds > 1e-20 * fastest])
+        self.shortest = 1e-2 / fastest
+        whole = np.block([[system.A, system.B[:, u]], [system.C[u], M]])
+        # Others are damped within a period or two, and not worth the trouble.
+        light = spectrum[(spectrum.imag > 4.0 * np.abs(spectrum.real)) & (spectrum.imag > 0)]
+        self.rings = rings(whole, len(system.A), light)
+        self._factors: dict[float, tuple[Array, Array, tuple[Array, Array]]] = {}
+
+    def solve(self, h: float, x0: Array, inputs: Array) -> tuple[Array, Array]:
+        """(x at the nodes, p at the collocation points) of a step of length h from x0, for `inputs`
+        (g, q) at the collocation points."""
+        system, u, s = self.system, self.unknown, radau.STAGES
+        n, k = len(x0), int(self.unknown.sum())
+        rows, columns, factors = self._factorised(h)
+        g, q = inputs[:, :n], inputs[:, n:]
+        right = np.zeros((s, n + k))
+        right[:, :n] = h * (g + system.B @ self.prescribed_p) - radau.D[1:, :1] * x0
+        right[:, n:] = (self.prescribed_d - q - system.M @ self.prescribed_p)[:, u]
+        found = scipy.linalg.lu_solve(factors, (right * rows).ravel(), check_finite=False)
+        found = found.reshape(s, n + k) * columns
+        p = np.tile(self.prescribed_p, (s, 1))
+        p[:, u] = found[:, n:]
+        return np.vstack([x0, found[:, :n]]), p
+
+    def hidden(self, x: Array, p: Array, q: Array) -> Array:
+        """The changes of each entry of x that rounding in the law hides; 0 of those not in it."""
+        C = np.abs(self.system.C)
+        terms = ROUNDINGS / 8.0 * (C @ x + np.abs(self.system.M) @ p + q)
+        each = np.where(C > 0.0, terms[:, None] / np.where(C > 0.0, C, 1.0), np.inf)
+        least = each.min(axis=0, initial=np.inf)
+        return np.where(np.isfinite(least), least, 0.0)
+
+    def responses(self, ring: Ring) -> tuple[Array, Array]:
+        """(y, w) of an oscillation of amplitude 1."""
+        p = np.zeros(len(self.unknown), complex)
+        p[self.unknown] = ring.p
+        d = self.system.C @ ring.x + self.system.M @ p
+        d[self.unknown] = 0.0
+        return self.members(p, d)
+
+    def forcing(self, coefficients: Array) -> Array:
+        """The Chebyshev coefficients of (g, r) from those of (g, q)."""
+        n = len(self.system.A)
+        q = coefficients[:, n:][:, self.unknown]
+        found = np.hstack([coefficients[:, :n], q])
+        found[0, :n] += self.system.B @ self.prescribed_p
+        found[0, n:] += (self.system.M @ self.prescribed_p - self.prescribed_d)[self.unknown]
+        return found
+
+    def dependent(self, x: Array, p: Array, q: Array) -> Array:
+        """d from x, p and q, rows of times."""
+        d = p @ self.system.M.T + x @ self.system.C.T + q
+        d[:, self.unknown] = self.prescribed_d[self.unknown]
+        return d
+
+    def noise(self, x: Array, p: Array, q: Array, off: Array) -> tuple[Array, Array]:
+        """What rounding leaves undetermined of p and of d, for values of these sizes; d as
+        it follows from x is `off` already."""
+        system, u = self.system, self.unknown
+        terms = np.abs(system.C) @ x + np.abs(system.M) @ p + q
+        of_d = ROUNDINGS * terms + off
+        of_p = np.zeros(len(u))
+        of_p[u] = np.abs(self.inverse) @ of_d[u] + ROUNDINGS * p[u]
+        of_d = of_d + np.abs(system.M[:, u]) @ of_p[u]
+        return of_p, of_d
+
+    def members(self, p: Array, d: Array) -> tuple[Array, Array]:
+        """(y, w) from (p, d)."""
+        swapped = self.system.swapped
+        return np.where(swapped, d, p), np.where(swapped, p, d)
+
+    def at(self, x: Array, q: Array, sizes: Array, off: Array) -> tuple[Array, ...]:
+        """(y, w) at one x and q, and their noise, where q is a sum of terms of these `sizes`."""
+        p, u = self.prescribed_p.copy(), self.unknown
+        free = self.prescribed_d - q - self.system.C @ x - self.system.M @ p
+        p[u] = self.inverse @ free[u]
+        d = self.dependent(x[None], p[None], q[None])[0]
+        y, w = self.members(p, d)
+        return y, w, *self.members(*self.noise(np.abs(x), np.abs(p), sizes, off))
+
+    def _factorised(self, h: float) -> tuple[Array, Array, tuple[Array, Array]]:
+        """Scales of rows and columns, and LU factors of the scaled equations of a step.
+
+        States are measured by their energy, since pivots that compare volts with amperes would spoil
+        the smaller ones, and each p and its row by their largest entries."""
+        if h in self._factors:
+            return self._factors[h]
+        system, u, s = self.system, self.unknown, radau.STAGES
+        n, k = len(system.A), int(self.unknown.sum())
+        block = np.block(
+            [[-h * system.A, -h * system.B[:, u]], [system.C[u], system.M[np.ix_(u, u)]]]
+        )
+        rows = np.concatenate([self.weights, np.ones(k)])
+        columns = np.concatenate([1.0 / self.weights, np.ones(k)])
+        for _ in range(2 if k else 0):
+            scaled = np.abs(rows[:, None] * block * columns)
+            columns[n:] /= np.maximum(scaled.max(axis=0)[n:], 1e-300)
+            scaled = np.abs(rows[:, None] * block * columns)
+            rows[n:] /= np.maximum(scaled.max(axis=1)[n:], 1e-300)
+        block = rows[:, None] * block * columns
+        K = np.zeros((s, n + k, s, n + k))
+        states, each = np.arange(n), np.arange(s)
+        K[:, states, :, states] = radau.D[1:, 1:]
+        K[each, :, each, :] += block
+        K = K.reshape(s * (n + k), -1)
+        # Rows that are stiff have large entries, and are not to be the pivots for that.
+        large = 1.0 / np.abs(K).max(axis=1)
+        if len(self._factors) >= _KEPT:
+            self._factors.clear()
+        factors = scipy.linalg.lu_factor(large[:, None] * K, check_finite=False)
+        found = rows * large.reshape(s, n + k), columns, factors
+        self._factors[h] = found
+        return found
+
+
+_KEPT = 64
+"""Factorisations that a mode keeps: steps between the knots of a record have few lengths."""
+
+
+def _inverse(M: Array) -> Array:
+    try:
+        return np.linalg.inv(M)
+    except np.linalg.LinAlgError:
+        # No mode of a law with γ > 0: the equations of a step will say so.
+        return np.full_like(M, np.nan)
+
+
+def _conditions(system: Affine, i: int, state: int) -> list[Condition]:
+    low, up = system.low[i], system.up[i]
+    if state:
+        # Between equal bounds w may have any sign.
+        return [] if low == up else [Condition(i, True, -float(state), 0.0, 0)]
+    found = [Condition(i, False, 1.0, low, -1), Condition(i, False, -1.0, up, 1)]
+    return [c for c in found if np.isfinite(c.bound)]
+
+
+def first_mode(system: Affine) -> Mode:
+    """Every yᵢ at a bound where it has one."""
+    return tuple(
+        -1 if np.isfinite(low) else 1 if np.isfinite(up) else 0
+        for low, up in zip(system.low, system.up, strict=True)
+    )
+
+
+def changed(mode: Mode, condition: Condition) -> Mode:
+    """The mode after a condition has failed."""
+    return (*mode[: condition.i], condition.to, *mode[condition.i + 1 :])

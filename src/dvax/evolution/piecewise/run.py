@@ -1,0 +1,398 @@
+"""From switching to switching: steps in one mode, and the mode that follows.
+
+A step solves the equations of its mode by collocation and samples what has a sign to keep in that mode.
+Where bounds on these polynomials cannot exclude a change of sign, the change is located, and the step
+ends there. Steps end at the ends of the input's pieces as well. After a change the longest step is
+tried
+first, then the time scales of the mode, so that the number of steps follows from the number of scales
+that are excited and not from how far they are apart. Times within a piece are kept relative to its
+start, in two parts: a transient of 10⁻¹⁸ s is resolved at any t.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from . import radau
+from .inputs import Piece, basis, values
+from .modes import ROUNDINGS, Condition, Equations, Mode, changed, first_mode
+from .rings import derivatives
+from .system import Affine
+
+Array = np.ndarray
+
+
+class Step(NamedTuple):
+    """x at the nodes and y at the collocation points of a step that begins at `start` in a piece, of
+    which the part up to θ = `used` is the trajectory, and the oscillations 2 Re ae^{λt}(x, y) beside
+    them."""
+
+    start: float
+    length: float
+    used: float
+    x: Array
+    y: Array
+    rings: tuple[tuple[complex, Array, Array], ...]
+
+    def at(self, thetas: Array) -> tuple[Array, Array]:
+        """(x, y) there, a row each."""
+        x, y = radau.state_at(self.x, thetas), radau.multiplier_at(self.y, thetas)
+        for rate, of_x, of_y in self.rings:
+            factor = 2.0 * np.exp(rate * self.length * thetas)[:, None]
+            x, y = x + (factor * of_x).real, y + (factor * of_y).real
+        return x, y
+
+
+class Row(NamedTuple):
+    """What is saved at one time: x, y and F(y) = w of the frozen law; the `defect` of both equations up
+    to the end of the step that the time lies in, and `settled`, what it was at its start; `extent`, the
+    bounds (low, high) of x and y so far, where they are asked for."""
+
+    t: float
+    x: Array
+    y: Array
+    w: Array
+    defect: tuple[float, float]
+    settled: tuple[float, float]
+    extent: Array | None
+
+
+class Attempt(NamedTuple):
+    """A step that was computed: x at the nodes, y at the points, y and w on the grid with the
+    `slack` that
+    they may be off by; the `rings` beside these polynomials, and by how much they move y and w at most;
+    the `size` of the whole state; what the polynomials are `lacking` in d, and `excess`, the same
+    in units
+    of what is allowed; and the `residuals` of the state's and of the law's equations at θ = 0."""
+
+    x: Array
+    ys: Array
+    y: Array
+    w: Array
+    slack: tuple[Array, Array]
+    rings: tuple[tuple[complex, Array, Array], ...]
+    swing: tuple[Array, Array]
+    size: Array
+    lacking: Array
+    excess: float
+    residuals: tuple[Array, Array]
+
+
+class Run:
+    """The trajectory of a system from x0 over its pieces, which are those of the `given` system; it is
+    computed in the variables of the `pivoted` one.
+
+    `weights` are the norms of the unit vectors of the state space; `tol` what a polynomial may lack,
+    relative to the size of what it stands for.
+    """
+
+    def __init__(
+        self, given: Affine, pivoted: Affine, pieces: list[Piece], x0: Array, weights: Array,
+        tol: float, max_steps: int, times: Array, dense: bool, ranged: bool,
+    ):  # fmt: skip
+        self.given, self.system, self.pieces, self.x = given, pivoted, pieces, x0
+        self.weights, self.tol, self.max_steps = weights, tol, max_steps
+        self.times, self.dense = times, dense
+        self.equations: dict[Mode, Equations] = {}
+        self.mode = first_mode(given)
+        self.scale, self.off, self.law_off = np.abs(x0), 0.0 * x0, np.zeros(len(given.low))
+        self.rows: list[Row] = []
+        self.steps: list[Step] = []
+        self.events: list[tuple[float, Mode]] = []
+        self.accepted = self.rejected = self.switchings = self.stuck = 0
+        self.defect = self.law_defect = 0.0
+        self.piece = pieces[0]
+        self.t, self.result = pieces[0].start, "successful"
+        m = len(given.low)
+        none = np.stack([np.full(m, np.inf), np.full(m, -np.inf)])
+        self.extent = np.hstack([np.stack([x0, x0]), none]) if ranged else None
+
+    def go(self) -> None:
+        """Run to the end, or to where `result` says why not."""
+        last = None
+        for k, piece in enumerate(self.pieces):
+            self.piece = piece
+            inputs = self._converted(piece)
+            if last is None or not _continuous(last, piece):
+                self.result = self._solve_law(inputs)
+                self.events.append((piece.start, self.mode))
+            if self.result == "successful":
+                self.result = self._through(inputs, k == len(self.pieces) - 1)
+            if self.result != "successful":
+                return
+            last = piece
+
+    def _converted(self, piece: Piece) -> Piece:
+        """The piece in the system's own variables."""
+        c = piece.coefficients @ self.system.inputs.T
+        return piece._replace(coefficients=c, noise=np.abs(self.system.inputs) @ piece.noise)
+
+    def of(self, mode: Mode) -> Equations:
+        if mode not in self.equations:
+            self.equations[mode] = Equations(self.system, mode, self.weights)
+        return self.equations[mode]
+
+    def _solve_law(self, piece: Piece) -> str:
+        """The mode of the law at x and at the start of a piece: of the violated conditions the
+        first is changed (Murty's rule,
+        which ends for matrices whose principal minors are positive)."""
+        q = piece.at(np.zeros(1))[0, len(self.x) :]
+        sizes = np.abs(piece.coefficients[:, len(self.x) :]).sum(axis=0)
+        for _ in range(_MOST_CHANGES):
+            own = self.of(self.mode)
+            y, w, slack_y, slack_w = own.at(self.x, q, sizes, np.abs(self.system.C) @ self.off)
+            for c in own.conditions:
+                value, slack = (w, slack_w) if c.of_w else (y, slack_y)
+                if c.sign * (value[c.i] - c.bound) < -slack[c.i]:
+                    self.mode = changed(self.mode, c)
+                    break
+            else:
+                return "successful"
+        return "law_unsolved"
+
+    def _through(self, piece: Piece, last: bool) -> str:
+        """All steps of a piece."""
+        begin, low, proposal = 0.0, 0.0, np.inf
+        while begin < piece.length:
+            own = self.of(self.mode)
+            remaining = (piece.length - begin) - low
+            h = min(proposal, remaining)
+            found, before = None, np.inf
+            while found is None:
+                if self.accepted + self.rejected >= self.max_steps:
+                    return "max_steps"
+                attempt = self._attempt(own, piece, begin + low, h)
+                if attempt is None:
+                    return "nonfinite"
+                if attempt.excess > 1.0 and h > own.shortest:
+                    self.rejected += 1
+                    h, before = _shorter(own, h, attempt.excess, before), attempt.excess
+                elif attempt.rings and self._undecided(own, attempt):
+                    self.rejected += 1
+                    fastest = max(rate.imag for rate, *_ in attempt.rings)
+                    h = max(0.25 * h, 0.999 * _FOLLOWED / fastest)
+                else:
+                    found = attempt
+            theta, condition = self._first_change(own, found)
+            whole = condition is None and bool(h == remaining)
+            step = Step(piece.start + begin, h, theta, found.x, found.ys, found.rings)
+            end = piece.length if whole else begin + (low + theta * h)
+            self._keep(step, found, piece, begin + low, end, last and whole)
+            self.x = step.at(np.array([theta]))[0][0]
+            if whole:
+                return "successful"
+            begin, low = _two_sum(begin, low + theta * h)
+            if condition is None:
+                proposal = 4.0 * h if own.rings else _longer(own, h, found.excess)
+                continue
+            proposal = np.inf
+            self.mode = changed(self.mode, condition)
+            self.switchings += 1
+            self.events.append((self.t, self.mode))
+            self.stuck = self.stuck + 1 if theta * h <= 1e-9 * own.shortest else 0
+            if self.stuck > _MOST_STUCK * (1 + len(self.mode)):
+                return "switching_unresolved"
+        return "successful"
+
+    def _attempt(self, own: Equations, piece: Piece, begin: float, h: float) -> Attempt | None:
+        n = len(self.x)
+        local = piece.local(begin, h)
+        given = values(local, _AT_POINTS)
+        rings, x0 = self._rings(own, piece, begin, h)
+        x, p = own.solve(h, x0, given)
+        if not (np.isfinite(x).all() and np.isfinite(p).all()):
+            return None
+        # Rounding in the inputs is that of the terms they are summed from.
+        q = np.abs(piece.coefficients[:, n:]).sum(axis=0)
+        beside = sum((2.0 * np.abs(ring[1]) for ring in rings), np.zeros(n))
+        sizes = np.abs(x).max(axis=0) + beside, np.abs(p).max(axis=0), q
+        off = np.abs(own.system.C) @ np.maximum(self.off, ROUNDINGS * sizes[0])
+        noise_p, _ = own.noise(*sizes, off)
+        energy = np.sqrt(np.sum((self.weights * sizes[0]) ** 2))
+        hidden = own.hidden(*sizes)
+        allowed = np.maximum(self.tol * np.maximum(self.scale, sizes[0]), hidden)
+        allowed = np.maximum(allowed, 1e-2 * self.tol * energy / self.weights)
+        tail_x = np.abs(radau.TAIL_OF_STATE @ x).max(axis=0)
+        tail_p = np.abs(radau.TAIL_OF_MULTIPLIER @ p).max(axis=0)
+        allowed_p = np.maximum(self.tol * sizes[1], noise_p)
+        tiny = np.finfo(float).tiny
+        excess = max(
+            float(np.max(tail_x / (allowed + tiny))), float(np.max(tail_p / (allowed_p + tiny)))
+        )
+        X, P, G = radau.FROM_NODES @ x, radau.FROM_POINTS @ p, values(local, _ON_GRID)
+        d = own.dependent(X, P, G[:, n:])
+        y, w = own.members(P, d)
+        tail_d = np.abs(own.system.C) @ tail_x + np.abs(own.system.M) @ tail_p
+        # What the step before was lacking decides on signs, and not on what this one may lack.
+        slack_p, slack_d = own.noise(*sizes, off + self.law_off)
+        slack = own.members(slack_p + 4.0 * tail_p, slack_d + 4.0 * tail_d)
+        lacking = _EXTRAPOLATED * tail_d
+        ys, _ = own.members(p, own.dependent(x[1:], p, given[:, n:]))
+        of_y, of_w = (
+            sum((2.0 * np.abs(ring[k]) for ring in rings), np.zeros(len(p[0]))) for k in (2, 3)
+        )
+        swing = of_y, of_w
+        return Attempt(
+            x, ys, y, w, slack, tuple(ring[:3] for ring in rings), swing, sizes[0], lacking, excess,
+            self._residuals(own, x, p, G[0], h),
+        )  # fmt: skip
+
+    def _rings(
+        self, own: Equations, piece: Piece, begin: float, h: float
+    ) -> tuple[list[tuple[complex, Array, Array, Array]], Array]:
+        """(λ, x, y, w) of the oscillations that a step is too long to follow, and what is left of x."""
+        active = [ring for ring in own.rings if ring.rate.imag * h > _FOLLOWED]
+        found, x0 = [], self.x
+        if active:
+            forcing = derivatives(
+                own.forcing(piece.coefficients), begin / piece.length, piece.length
+            )
+        for ring in active:
+            a = ring.amplitude(self.x, forcing)
+            y, w = own.responses(ring)
+            found.append((ring.rate, a * ring.x, a * y, a * w))
+            x0 = x0 - 2.0 * found[-1][1].real
+        return found, x0
+
+    def _undecided(self, own: Equations, found: Attempt) -> bool:
+        """Whether the oscillations may break a condition."""
+        for c in own.conditions:
+            k = int(c.of_w)
+            signed = c.sign * ((found.y, found.w)[k][:, c.i] - c.bound)
+            if radau.lowest(signed) - found.swing[k][c.i] < -found.slack[k][c.i]:
+                return True
+        return False
+
+    def _residuals(
+        self, own: Equations, x: Array, p: Array, given: Array, h: float
+    ) -> tuple[Array, Array]:
+        """Of the equations of x' and of those that prescribe d, at θ = 0, less what is rounding."""
+        system, n = self.system, x.shape[1]
+        p0 = radau.START @ p
+        rate = radau.D[0] @ x / h
+        terms = np.abs(system.A) @ np.abs(x[0]) + np.abs(system.B) @ np.abs(p0) + np.abs(given[:n])
+        slope = np.abs(radau.D[0]) @ np.abs(x) / h
+        off = np.abs(rate - system.A @ x[0] - system.B @ p0 - given[:n])
+        rounding = _ROUNDING * (terms + slope)
+        law = np.abs(system.M @ p0 + system.C @ x[0] + given[n:] - own.prescribed_d)
+        sizes = np.abs(p).max(axis=0)
+        noise = _ROUNDING * (
+            np.abs(system.M) @ sizes + np.abs(system.C) @ np.abs(x).max(axis=0) + np.abs(given[n:])
+        )
+        law = np.where(own.unknown, np.maximum(law - noise, 0.0), 0.0)
+        # Where y is prescribed it is taken to be so exactly, and the state's equation is off instead.
+        of_y = np.where(system.swapped, law, 0.0)
+        state = np.maximum(off - rounding, 0.0) + np.abs(self.given.B) @ of_y
+        return state, law - of_y
+
+    def _first_change(self, own: Equations, found: Attempt) -> tuple[float, Condition | None]:
+        """(θ, condition) of the first condition that fails; (1, None) where all hold."""
+        theta, first = 1.0, None
+        if found.rings:
+            return theta, first
+        for c in own.conditions:
+            grid, slack = (found.w, found.slack[1]) if c.of_w else (found.y, found.slack[0])
+            signed, allowed = c.sign * (grid[:, c.i] - c.bound), float(slack[c.i])
+            if theta == 0.0 or radau.lowest(signed) >= -allowed:
+                continue
+            when = radau.first_negative(signed, allowed, theta)
+            if when is not None and (first is None or when < theta):
+                theta, first = when, c
+        return theta, first
+
+    def _keep(
+        self, step: Step, found: Attempt, piece: Piece, begin: float, end: float, last: bool
+    ) -> None:
+        """Account for an accepted step, and save what lies in it."""
+        settled = self.defect, self.law_defect
+        of_state, of_law = found.residuals
+        n, part = len(self.x), step.length * step.used
+        mean = _mean(step.used)
+        error = self.piece.error
+        self.defect += part * (mean * self._norm(of_state) + self._norm(error[:n]))
+        self.law_defect += part * float(mean * np.linalg.norm(of_law) + np.linalg.norm(error[n:]))
+        self.accepted += 1
+        # The state that a step ends in is as good as the largest one that it was made of.
+        self.law_off = found.lacking
+        self.off, self.scale = ROUNDINGS * found.size, np.maximum(self.scale, found.size)
+        self.t = piece.start + end
+        if self.extent is not None:
+            self.extent = _widened(self.extent, found)
+        done, first = (self.defect, self.law_defect), len(self.rows)
+        offsets = self.times[first:] - piece.start
+        # The last step has what rounding may put behind it.
+        offsets = offsets if last else offsets[: np.searchsorted(offsets, end)]
+        if len(offsets):
+            thetas = np.clip((offsets - begin) / step.length, 0.0, step.used)
+            x, y = step.at(thetas)
+            q = self.piece.at((begin + thetas * step.length) / piece.length)[:, n:]
+            w = y @ self.given.M.T + x @ self.given.C.T + q
+            self.rows += [
+                Row(float(self.times[first + k]), x[k], y[k], w[k], done, settled, self.extent)
+                for k in range(len(offsets))
+            ]
+        if self.dense:
+            self.steps.append(step)
+
+    def _norm(self, v: Array) -> float:
+        """An upper bound of the norm of the state space, exact where its unit vectors are
+        orthogonal."""
+        return float(np.sqrt(np.sum((self.weights * v) ** 2)))
+
+
+_AT_POINTS, _ON_GRID = basis(radau.POINTS), basis(radau.GRID)
+
+_EXTRAPOLATED = 16.0
+"""What a polynomial may lack at θ = 0, in units of its last coefficients."""
+
+_FOLLOWED = 4.0
+"""Radians of an oscillation in a step, up to which its polynomials follow it."""
+
+_MOST_CHANGES, _MOST_STUCK = 4096, 12
+_ROUNDING = 256.0 * np.finfo(float).eps
+
+
+def _mean(used: float) -> float:
+    """A bound on the mean of |ρ| up to θ = `used`, relative to |ρ(0)|."""
+    return min(1.0, radau.MEAN_RESIDUAL / used) if used > 0.0 else 1.0
+
+
+def _shorter(own: Equations, h: float, excess: float, before: float) -> float:
+    """The step to try next: half of it, as long as that pays (by 2²⁰ where the solution is
+    resolved, but
+    for little); else the next time scale of the mode, since a transient is there that is not."""
+    if excess < 1e6 and excess < 0.1 * before:
+        return 0.5 * h
+    shorter = own.scales[own.scales < 0.6 * h]
+    return float(shorter[-1]) if len(shorter) else h / 8.0
+
+
+def _longer(own: Equations, h: float, excess: float) -> float:
+    """The step to try next: while a transient lasts, much the same; else the next time scale."""
+    if excess > 1e-2:
+        return h if excess > 0.1 else 1.5 * h
+    longer = own.scales[own.scales > 1.5 * h]
+    return float(longer[0]) if len(longer) else np.inf
+
+
+def _two_sum(a: float, b: float) -> tuple[float, float]:
+    """a + b and what rounding takes from it."""
+    total = a + b
+    other = total - a
+    return total, (a - (total - other)) + (b - other)
+
+
+def _continuous(before: Piece, after: Piece) -> bool:
+    """Whether the inputs go on from one piece to the next without a jump."""
+    end, start = before.at(np.ones(1))[0], after.at(np.zeros(1))[0]
+    size = np.abs(before.coefficients).sum(axis=0) + np.abs(after.coefficients).sum(axis=0)
+    return bool(np.all(np.abs(end - start) <= ROUNDINGS * size))
+
+
+def _widened(extent: Array, found: Attempt) -> Array:
+    """(low, high) that hold a step as well, with the margin of polynomials between samples."""
+    x = radau.FROM_NODES @ found.x
+    beside = np.concatenate([found.size - np.abs(found.x).max(axis=0), found.swing[0]])
+    low = np.concatenate([radau.lowest(v) for v in (x, found.y)]) - beside
+    high = -np.concatenate([radau.lowest(-v) for v in (x, found.y)]) + beside
+    return np.stack([np.minimum(extent[0], low), np.maximum(extent[1], high)])

@@ -1,0 +1,193 @@
+"""Systems that are affine between switchings, against closed forms and against matrix exponentials."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import dvax
+from dvax.evolution.piecewise import inputs, radau
+
+
+def held(stiffness, **kwargs):
+    """x' = 1 − x + u, held above 2 by a spring of this stiffness, nearly."""
+    return dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, np.inf),
+        f=lambda t, x, u, args: 1.0 - x + u, h=lambda t, x, u, args: -stiffness * (x - 2.0), **kwargs,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("stiffness", [1.0, 1e3, 1e8, 1e15])
+def test_a_spring_of_any_stiffness_is_met_where_it_begins(stiffness):
+    ts = np.array([0.5, np.log(3.0), 1.2, 4.0])
+    sol = dvax.solve(
+        held(stiffness), 4.0, 0.0, 4.0, ts=ts, rtol=1e-8, method=dvax.PiecewiseLinear(), dense=True
+    )
+    # x = 1 + 3e^{−t} down to 2 at t = ln 3; then x' = 1 − x + s(2 − x).
+    rate, level = 1.0 + stiffness, (1.0 + 2.0 * stiffness) / (1.0 + stiffness)
+    after = level + (2.0 - level) * np.exp(-rate * (ts - np.log(3.0)).clip(0))
+    exact = np.where(ts <= np.log(3.0), 1.0 + 3.0 * np.exp(-ts), after)
+    np.testing.assert_allclose(np.asarray(sol.xs), exact, rtol=1e-13)
+    times, positive = sol.regimes()
+    assert len(times) == 3 and abs(times[1] - np.log(3.0)) < 1e-14
+    assert positive[:, 0].tolist() == [False, True]
+    assert int(sol.stats["steps"]) + int(sol.stats["rejected"]) < 40
+    x, u = sol.evaluate(3.0)
+    left = np.exp(-rate * (3.0 - np.log(3.0)))
+    spring = stiffness / (1.0 + stiffness) * (1.0 - left)
+    assert float(u) == pytest.approx(spring, rel=1e-12)
+    assert float(x) == pytest.approx(level + (2.0 - level) * left, rel=1e-13)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_random_systems_agree_with_matrix_exponentials(seed):
+    rng = np.random.default_rng(seed)
+    n, m = 3, 2
+    R, S = rng.normal(size=(n, n)), rng.normal(size=(m, m))
+    A, M = R - R.T - 0.3 * np.eye(n), S @ S.T + 0.5 * np.eye(m)
+    C = rng.normal(size=(m, n))
+    B, q, low = -C.T, rng.normal(size=m), -rng.uniform(0.1, 1.0, m)
+    problem = dvax.Problem(
+        A=dvax.generators.Dense(jnp.asarray(A)), P=dvax.operators.Scaling(1.0),
+        K=dvax.sets.Box(low, -low), f=lambda t, x, u, args: B @ u + jnp.sin(3.0 * t),
+        h=lambda t, x, u, args: u - M @ u - C @ x - q, state_space=dvax.spaces.Euclidean(n),
+        control_space=dvax.spaces.Euclidean(m),
+    )  # fmt: skip
+    x0 = rng.normal(size=n)
+    ts = np.linspace(0.0, 8.0, 17)
+    one = dvax.solve(problem, x0, 0.0, 8.0, ts=ts, method=dvax.PiecewiseLinear(), rtol=1e-8)
+    other = dvax.solve(
+        problem, x0, 0.0, 8.0, ts=ts, method=dvax.DormandPrince(), rtol=1e-11, atol=1e-12
+    )
+    np.testing.assert_allclose(np.asarray(one.xs), np.asarray(other.xs), atol=2e-9)
+    np.testing.assert_allclose(np.asarray(one.us), np.asarray(other.us), atol=2e-9)
+    assert int(one.stats["switchings"]) >= 3
+    assert float(jnp.max(one.law_residual)) < 1e-12
+
+
+def test_the_defect_bounds_the_error_and_a_region_is_seen():
+    problem = held(50.0)
+    constants = dvax.verify(problem, 4.0, 0.0, 4.0).constants
+    sol = dvax.solve(
+        problem, 4.0, 0.0, 4.0, ts=[1.0, 4.0], method=dvax.PiecewiseLinear(), constants=constants
+    )
+    bound = dvax.bound_error(problem, sol, constants)
+    level = 101.0 / 51.0
+    error = abs(float(sol.xs[1]) - level - (2 - level) * np.exp(-51.0 * (4 - np.log(3.0))))
+    assert error <= float(bound.x[-1]) + 1e-14 and float(bound.x[-1]) < 1e-10
+    assert bound.status == "estimated" and not sol.enclosed
+
+
+def test_an_oscillation_beside_a_constraint_takes_no_step_a_period():
+    # x'' = −ω²x with ω = 10⁶ for a second, and a law that it does not reach: exact by one cosine.
+    w = 1e6
+    problem = dvax.Problem(
+        A=dvax.generators.Dense(jnp.array([[0.0, w, 0.0], [-w, -2.0, 0.0], [0.0, 0.0, -1.0]])),
+        P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-5.0, 5.0),
+        f=lambda t, x, u, args: jnp.stack([0.0, 0.0, 1.0]) * u[0],
+        h=lambda t, x, u, args: x[:1] + x[2:], control_space=dvax.spaces.Euclidean(1),
+    )  # fmt: skip
+    x0 = np.array([1.0, 0.0, 0.5])
+    sol = dvax.solve(problem, x0, 0.0, 1.0, ts=[1e-4, 1.0], method=dvax.PiecewiseLinear())
+    M = np.asarray(problem.generator().matrix) + np.outer([0, 0, 1.0], [1.0, 0, 1.0])
+    for t, x in zip(np.asarray(sol.ts), np.asarray(sol.xs), strict=True):
+        rates, vectors = np.linalg.eig(M)
+        exact = (vectors * np.exp(rates * t)) @ np.linalg.solve(vectors, x0)
+        np.testing.assert_allclose(x, exact.real, atol=1e-9)
+    assert int(sol.stats["steps"]) < 60
+
+
+def test_first_crossings_are_found_and_touching_is_none():
+    theta = radau.GRID
+    assert radau.first_negative((theta - 0.3) ** 2, 1e-14) is None
+    found = radau.first_negative((theta - 0.3) ** 2 - 1e-10, 1e-14)
+    assert found == pytest.approx(0.3 - 1e-5, abs=1e-9)
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        c = rng.normal(size=12) / np.arange(1, 13)
+        values = np.polynomial.chebyshev.chebval(2 * theta - 1, c)
+        fine = np.linspace(0, 1, 200_001)
+        there = np.polynomial.chebyshev.chebval(2 * fine - 1, c)
+        found = radau.first_negative(values, 1e-13)
+        below = np.flatnonzero(there < -1e-13)
+        if not len(below):
+            assert found is None
+        else:
+            assert found is not None and abs(found - fine[below[0]]) <= 5e-6
+
+
+def test_the_method_says_what_it_is_not_for():
+    method = dvax.PiecewiseLinear()
+    curved = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1.0),
+        f=lambda t, x, u, args: -(x**2) + u, h=lambda t, x, u, args: t * x - u,
+    )  # fmt: skip
+    with pytest.raises(dvax.InputError) as caught:
+        dvax.solve(curved, 1.0, 0.0, 1.0, method=method)
+    assert len(caught.value.problems) == 2  # f is not affine, and the slope of h moves
+    ball = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=lambda t, args:
+        dvax.sets.Box(0.0, t), f=lambda t, x, u, args: -x + u, h=lambda t, x, u, args: x - u,
+    )  # fmt: skip
+    with pytest.raises(dvax.InputError, match="a box that does not move"):
+        dvax.solve(ball, 1.0, 0.5, 1.0, method=method)
+    with pytest.raises(dvax.InputError, match="dt"):
+        dvax.solve(held(1.0), 4.0, 0.0, 1.0, dt=0.1, method=method)
+    run = lambda x0: dvax.solve(held(1.0), x0, 0.0, 1.0, method=method).xs[-1]  # noqa: E731
+    for traced in (jax.jit(run), jax.grad(run)):
+        with pytest.raises(dvax.DifferentiationError, match="ExpRosenbrock"):
+            traced(4.0)
+
+
+def test_jumps_are_met_announced_or_not_and_data_that_ends_is_told():
+    def driven(s):
+        return dvax.Problem(
+            A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1.0),
+            f=lambda t, x, u, args: u, h=lambda t, x, u, args: s(t) - x,
+        )  # fmt: skip
+
+    ending = driven(lambda t: jnp.where(t < 0.3, 0.0, jnp.nan))
+    with pytest.raises(dvax.SolveError, match="NaN") as caught:
+        dvax.solve(ending, 0.5, 0.0, 1.0, ts=[0.1, 1.0], method=dvax.PiecewiseLinear())
+    assert float(caught.value.solution.stats["t"]) <= 0.3
+    hidden = driven(lambda t: jnp.where(t < 0.3, 0.0, 1.0))
+    sol = dvax.solve(hidden, 0.0, 0.0, 1.0, method=dvax.PiecewiseLinear())
+    assert float(sol.xs[0]) == pytest.approx(0.5 * (1 - np.exp(-1.4)), rel=1e-12)
+    jump = dvax.signals.Table([0.0, 0.3, 1.0], [0.0, 1.0, 1.0], kind="constant")
+    sol = dvax.solve(driven(jump), 0.0, 0.0, 1.0, ts=[0.3, 1.0], method=dvax.PiecewiseLinear())
+    # Then x' = −x + (1 − x).
+    assert float(sol.xs[1]) == pytest.approx(0.5 * (1 - np.exp(-1.4)), rel=1e-13)
+    assert float(sol.us[0]) == pytest.approx(1.0)
+
+
+def test_a_wave_of_a_thousand_periods_is_no_constant():
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-9.0, 9.0),
+        f=lambda t, x, u, args: jnp.sin(2000 * jnp.pi * t) ** 2, h=lambda t, x, u, args: x,
+    )  # fmt: skip
+    stops = np.array([0.0, 1.0])
+    found = inputs.pieces(problem, stops, jnp.asarray(0.0), None, 100_000)
+    w = 4000 * np.pi
+    sol = dvax.solve(problem, 0.0, 0.0, 1.0, method=dvax.PiecewiseLinear())
+    e = np.exp(-1.0)
+    exact = 0.5 * (1 - e) - 0.5 * (np.cos(w) + w * np.sin(w) - e) / (1 + w * w)
+    assert len(found) > 500 and float(sol.xs[-1]) == pytest.approx(exact, rel=1e-11)
+
+
+def test_matrix_exponentials_are_those_of_scipy_between_knots():
+    # A line that turns at knots, through one mode: exact by an augmented exponential.
+    table = dvax.signals.Table([0.0, 0.4, 1.0], [0.0, 2.0, -1.0])
+    A = np.array([[-3.0, 50.0], [-50.0, -1.0]])
+    problem = dvax.Problem(
+        A=dvax.generators.Dense(jnp.asarray(A)), P=dvax.operators.Scaling(1.0),
+        K=dvax.sets.Box(-1e3, 1e3), f=lambda t, x, u, args: jnp.stack([table(t), -table(t)]),
+        h=lambda t, x, u, args: x,
+    )  # fmt: skip
+    x, slopes = np.array([1.0, -1.0]), ((0.4, 0.0, 5.0), (0.6, 2.0, -5.0))
+    for h, value, slope in slopes:
+        G = np.zeros((4, 4))
+        G[:2, :2], G[:2, 2], G[2, 3] = A, [1.0, -1.0], 1.0
+        x = (scipy.linalg.expm(h * G) @ np.array([*x, value, slope]))[:2]
+    sol = dvax.solve(problem, np.array([1.0, -1.0]), 0.0, 1.0, method=dvax.PiecewiseLinear())
+    np.testing.assert_allclose(np.asarray(sol.xs[-1]), x, atol=1e-13)

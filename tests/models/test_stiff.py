@@ -1,0 +1,264 @@
+"""Circuits with diodes of almost no resistance, and frames of almost no viscosity."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.integrate
+from tests.models.tableau import random_netlist, tableau
+from tests.models.test_frame import GROUND, RECORD, STEP, elastoplastic, exactly
+from tests.oracles import affine_box_vi
+
+import dvax
+from dvax.models.circuit import Circuit
+from dvax.models.circuit.waveforms import read_waveform
+from dvax.models.frame import Accelerogram, Frame
+
+EL_CENTRO = Path(__file__).parents[3] / "shared" / "data" / "elCentro.at2"
+RESISTANCES = (1.0, 1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+SOURCES = {
+    "SIN": ("SIN(0 10 1k)", 3e-3, 3),
+    "PULSE": ("PULSE(-5 10 10u 1n 1n 200u 500u)", 2e-3, 17),
+    "PWL": ("PWL(0 0 1n 10 50u 10 50.001u -5 900u -5 900.001u 8 2m 0)", 2e-3, 7),
+}
+
+
+def rectifier(r, source, capacity="", stray="", inductance="10u"):
+    """Half a wave through a diode and an inductor, with strays beside and in front of them; 1 kΩ
+    across the node between, as a snubber has it, so that strays do not ring for ever."""
+    diode = f"D1 a d R={r:g} G=1u\nL9 d b 1n\nR8 b 0 1k" if stray else f"D1 a b R={r:g} G=1u"
+    beside = f"C9 b 0 {capacity}\nR9 b 0 1k" if capacity else ""
+    return f"V1 a 0 {source}\n{diode}\n{beside}\nL1 b c {inductance}\nR1 c 0 10\nC1 c 0 1u\n"
+
+
+def work(sol):
+    return int(sol.stats["steps"]) + int(sol.stats["rejected"])
+
+
+CASES = list(
+    itertools.product(RESISTANCES, ("", "1n", "1p"), ("", "1n"), ("10u", "1m"), sorted(SOURCES))
+)
+FEW = [
+    (1e-1, "", "", "10u", "SIN"), (1e-6, "", "", "10u", "SIN"), (1e-6, "1n", "", "10u", "PULSE"),
+    (1e-3, "1p", "", "1m", "PWL"), (1e-6, "1p", "1n", "10u", "SIN"),
+]  # fmt: skip
+
+
+def agrees_at_any_resistance(case):
+    """It ends, the law holds, and the work follows from what happens and not from r."""
+    r, capacity, stray, inductance, kind = case
+    source, end, events = SOURCES[kind]
+    circuit = Circuit(rectifier(r, source, capacity, stray, inductance))
+    ts = np.linspace(0.0, end, 41)
+    sol = circuit.solve(end, ts)
+    assert work(sol) <= 60 * (int(sol.stats["switchings"]) + events + len(ts)), sol.stats
+    current = np.asarray(
+        [circuit.currents(*row) for row in zip(sol.ts, sol.xs, sol.us, strict=True)]
+    )
+    assert current.min() > -1e-6 and np.abs(np.asarray(sol.law_residual)).max() < 1e-7
+    return sol
+
+
+@pytest.mark.parametrize("case", FEW)
+def test_diodes_of_almost_no_resistance_run_at_the_defaults(case):
+    agrees_at_any_resistance(case)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("case", CASES)
+def test_every_resistance_stray_and_source_runs_at_the_defaults(case):
+    agrees_at_any_resistance(case)
+
+
+def test_the_ideal_diode_is_the_limit_and_is_met_in_proportion_to_r():
+    ends = [
+        np.asarray(Circuit(rectifier(r, "SIN(0 10 1k)")).solve(0.4e-3).xs[-1])
+        for r in (1e-2, 1e-3, 1e-4, 1e-5)
+    ]
+    steps = np.abs(np.diff(ends, axis=0))
+    np.testing.assert_allclose(np.log10(steps[:-1] / steps[1:]), 1.0, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        (1e-1, "SIN(0 10 1k)", ""),
+        pytest.param((1e-3, "SIN(0 10 1k)", ""), marks=pytest.mark.thorough),
+        pytest.param((1e-6, "SIN(0 10 1k)", "1n"), marks=pytest.mark.thorough),
+    ],
+)
+def test_a_stiff_rectifier_agrees_with_radau(case):
+    r, source, capacity = case
+    text = rectifier(r, source, capacity)
+    circuit, ts = Circuit(text), np.linspace(0.0, 1.2e-3, 25)
+    mine = np.asarray(circuit.solve(ts[-1], ts).xs)
+    L, C, g = 1e-5, 1e-6, 1e-6
+    other = float(capacity.replace("n", "e-9").replace("p", "e-12")) if capacity else None
+
+    def through(v):
+        """The current of the diode at a voltage across it and its resistance."""
+        return v / r if v > 0 else v / (r + 1 / g)
+
+    def rate(t, x):
+        source_v = 10 * np.sin(2e3 * np.pi * t)
+        if other is None:
+            c, i = x
+            # The node before the inductor: its current is that of the diode.
+            b = source_v - (i * r if i > 0 else i * (r + 1 / g))
+            return [(i - c / 10) / C, (b - c) / L]
+        b, c, i = x
+        return [(through(source_v - b) - i - b / 1e3) / other, (i - c / 10) / C, (b - c) / L]
+
+    found = scipy.integrate.solve_ivp(
+        rate,
+        (0.0, ts[-1]),
+        np.zeros(mine.shape[1]),
+        "Radau",
+        ts,
+        rtol=1e-9,
+        atol=1e-11,
+        max_step=2e-5,
+    )
+    order = ["C9", "C1", "L1"] if other else ["C1", "L1"]
+    columns = [order.index(name) for name in circuit.states]
+    np.testing.assert_allclose(mine, found.y.T[:, columns], atol=2e-6)
+
+
+def test_a_bridge_and_a_clipper_of_almost_ideal_diodes():
+    bridge = """
+    V1 a 0 SIN(0 10 1k)
+    D1 a p
+    D2 0 p
+    D3 n a
+    D4 n 0
+    C1 p n 1u
+    R1 p n 100
+    """
+    ends = {}
+    for r in (1e-2, 1e-6):
+        circuit = Circuit(bridge, r_on=r, g_leak=1e-9)
+        ts = np.linspace(0.0, 2e-3, 81)
+        sol = circuit.solve(ts[-1], ts)
+        ends[r] = np.asarray(sol.xs)[:, 0]
+        assert work(sol) <= 60 * (int(sol.stats["switchings"]) + 2 + len(ts))
+    # The load follows |v| up, and falls with RC until the next half wave meets it.
+    v, w = np.abs(10 * np.sin(2e3 * np.pi * ts)), 2e3 * np.pi
+    top = (np.pi - np.arctan(w * 1e-4)) / w  # there the current ends
+    falls = 10 * np.sin(w * top) * np.exp(-(ts - top) / 1e-4)
+    ideal = np.where(ts <= top, v, np.maximum(v, falls))
+    first = ts < 0.75e-3
+    np.testing.assert_allclose(ends[1e-6][first], ideal[first], atol=1e-4)
+    assert np.abs(ends[1e-2] - ends[1e-6]).max() < 0.05
+
+    clipper = "V1 a 0 SIN(0 10 1k)\nR1 a b 1k\nC1 b 0 1p\nD1 b 0 R=1u G=1n\nD2 0 b R=1u G=1n\n"
+    sol = Circuit(clipper).solve(2e-3, ts)
+    drive = 1e-2 * np.sin(2e3 * np.pi * ts)
+    np.testing.assert_allclose(np.asarray(sol.xs)[1:, 0], 1e-6 * drive[1:], atol=1e-9)
+    assert work(sol) <= 60 * (int(sol.stats["switchings"]) + 2)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("seed", range(60))
+def test_random_circuits_of_stiff_diodes_agree_with_the_second_analysis(seed):
+    rng = np.random.default_rng(seed)
+    text = random_netlist(rng, island=False)
+    words = [
+        word if not word.startswith("R=") else f"R={10 ** rng.uniform(-2, 0):.6f}"
+        for word in text.split(" ")
+    ]
+    text = " ".join(words).replace("\n", "\n")
+    sources = [line for line in text.splitlines() if line[0] in "VI"]
+    plain = tableau(text)
+    circuit = Circuit(text)
+    ts = np.linspace(0.0, 2.0, 9)
+    sol = circuit.solve(ts[-1], ts)
+    s = np.array([float(line.split()[3]) for line in sorted(sources, key=lambda v: v[0] != "V")])
+    m = len(plain.D)
+
+    def rate(t, x):
+        q = plain.C @ x + plain.e @ s
+        y = affine_box_vi(plain.D, q, np.zeros(m), np.full(m, np.inf))
+        return plain.A @ x + plain.B @ y + plain.b @ s
+
+    found = scipy.integrate.solve_ivp(
+        rate, (0.0, 2.0), np.zeros(len(plain.A)), "LSODA", ts, rtol=1e-9, atol=1e-11, max_step=0.02
+    )
+    np.testing.assert_allclose(
+        np.asarray(sol.xs), found.y.T, atol=2e-6 * (1 + np.abs(found.y).max())
+    )
+
+
+def test_a_pulse_is_that_of_spice():
+    pulse = read_waveform(["PULSE(1 5 10u 2u 4u 20u 100u)"], "voltage", "here")
+    times = 1e-6 * np.array([0, 10, 11, 12, 20, 32, 34, 36, 60, 110, 111, 1e3 + 11, 1e3 + 33])
+    values = [1, 1, 3, 5, 5, 5, 3, 1, 1, 1, 3, 3, 4]
+    np.testing.assert_allclose([float(pulse(t)) for t in times], values, rtol=1e-9)
+    np.testing.assert_allclose(
+        pulse.knots()[:5], 1e-6 * np.array([10, 12, 32, 36, 110]), rtol=1e-12
+    )
+    step = read_waveform(["PULSE(0 2 1m)"], "current", "here")
+    assert [float(step(t)) for t in (0.9e-3, 1e-3, 5.0)] == [0.0, 2.0, 2.0]
+    assert step.knots().tolist() == [1e-3] and step.span()[1] == np.inf
+    assert np.isnan(float(pulse(pulse.span()[1] * 1.01)))
+    for text, said in (
+        ("PULSE(0)", "a low and a high value"), ("PULSE(0 1 -1)", "the delay is not negative"),
+        ("PULSE(0 1 0 1u 1u 5u 6u)", "over when the next one begins"),
+        ("PULSE(0 1 0 0 0 0 0)", "the period is positive"), ("PULSE(0 1 5V)", "unit of voltage"),
+    ):  # fmt: skip
+        with pytest.raises(dvax.InputError, match=said):
+            read_waveform([text], "voltage", "here")
+
+
+def records():
+    rng = np.random.default_rng(1)
+    white = np.cumsum(rng.normal(size=300))
+    white -= np.linspace(white[0], white[-1], 300)
+    yield "waves", RECORD
+    yield "pulse", Accelerogram(0.01, 0.5 * np.sin(np.pi * np.minimum(np.arange(300) / 40, 2)))
+    yield "walk", Accelerogram(0.02, 0.3 * white / np.abs(white).max())
+
+
+@pytest.mark.parametrize("name", ["waves", "pulse", "walk"])
+def test_the_work_of_a_frame_does_not_grow_as_its_viscosity_goes(name):
+    record = dict(records())[name]
+    knots = record.samples.shape[0]
+    peaks, counts = [], []
+    for ratio in (1e-2, 1e-8) if name != "waves" else (1e-2, 1e-4, 1e-8):
+        frame = Frame(record=record, period=0.6, damping=0.03, yield_displacement=0.4,
+                      viscosity_ratio=ratio)  # fmt: skip
+        sol = frame.solve(ts=record.knots())
+        assert work(sol) <= knots + 40 * (int(sol.stats["switchings"]) + 1), sol.stats
+        peaks.append(float(np.abs(np.asarray(sol.xs)[:, 0]).max()))
+        counts.append(work(sol))
+    assert counts[-1] < 2 * counts[0] and int(sol.stats["switchings"]) >= 2
+
+
+@pytest.mark.parametrize("ratio", [1e-4, 1e-8])
+def test_the_distance_to_the_elastoplastic_frame_is_bounded(ratio):
+    T, z, limit = 0.5, 0.05, 0.5
+    run, _ = exactly(elastoplastic(T, z, limit), GROUND[:151], step=1.25e-3)
+    frame = Frame(record=Accelerogram(STEP, GROUND[:151]), period=T, damping=z,
+                  yield_displacement=limit, viscosity_ratio=ratio)  # fmt: skip
+    sol = frame.solve()
+    bound = np.asarray(frame.elastoplastic_distance(sol))[::8]
+    apart = np.abs(np.asarray(sol.xs)[::8, 0] - run.states[:, 0])
+    assert len(run.switchings) >= 2 and np.all(apart <= bound + 1e-9)
+    # Proportional to η/k; and the frame is no nearer than that.
+    assert 1e-3 * ratio < apart.max() and bound.max() < 1e6 * ratio
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("ratio", [1e-2, 1e-5, 1e-7, 1e-8])
+@pytest.mark.parametrize("strength", [0.125, 0.5])
+def test_el_centro_at_any_viscosity(ratio, strength):
+    if not EL_CENTRO.exists():
+        pytest.skip("needs elCentro.at2 of OpenSees's verification examples under ../shared/data")
+    record = Accelerogram.from_at2(EL_CENTRO)
+    for period in (0.2, 0.5, 2.0):
+        frame = Frame(record=record, period=period, damping=0.05, yield_ratio=strength,
+                      viscosity_ratio=ratio * period)  # fmt: skip
+        sol = frame.solve()
+        assert work(sol) <= 2 * record.samples.shape[0] + 60 * int(sol.stats["switchings"])
+        bound = dvax.bound_error(frame.problem, sol, frame.constants)
+        assert float(np.max(np.asarray(bound.x))) < 1e-3
