@@ -26,6 +26,7 @@ import numpy as np
 from .. import _tree
 from ..errors import InputError, InputProblem
 from ..evolution import Implicit, Solution, between, disturbance, gronwall, solve
+from ..evolution.control import GROWTH
 from ..generators import AbstractGenerator, AbstractMatrixFree, Product
 from ..problem import Problem
 from .constants import Constants
@@ -267,9 +268,13 @@ def _again(problem: Problem, sol: Solution, constants: Constants) -> Solution:
     was = sol.setup
     asked = was.setting
     adaptive = isinstance(asked["dt"], float) and math.isnan(asked["dt"])
+    # A first step that nobody gave is chosen again, with the growth that it allows.
+    given = asked["dt0_growth"] <= GROWTH
+    longest = None if asked["dt_max"] == math.inf else asked["dt_max"]
     again = solve(
         problem, was.x0, asked["t0"], asked["t1"], was.args, sol.ts, None if adaptive else asked["dt"],
-        rtol=asked["rtol"], atol=asked["atol"], dt0=asked["dt0"], horizon=asked["horizon"],
+        rtol=asked["rtol"], atol=asked["atol"], dt0=asked["dt0"] if given else None,
+        dt_max=longest, horizon=asked["horizon"],
         method=was.method, vi_solver=was.vi_solver, constants=constants, measure=True, throw=False,
     )  # fmt: skip
     if again.ts.shape == sol.ts.shape:
