@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 
 from . import _tree, operators, sets
 from ._tree import Tree
@@ -20,10 +21,15 @@ def fixed_by(P: Any, K: Any, x: Tree) -> Tree | None:
     number, or several shapes fit. Callables (a set that moves) are not evaluated.
     """
     parts = [part for part in (P, K) if isinstance(part, AbstractOperator | AbstractSet)]
-    if not any(jnp.ndim(leaf) for leaf in jtu.tree_leaves(parts)) or _accept(parts, x):
+    if not any(map(np.ndim, _arrays(parts))) or _accept(parts, x):
         return None
     found = _fixed(parts, jnp.result_type(*jtu.tree_leaves(x)))
     return found if found is not None and _accept(parts, found) else None
+
+
+def _arrays(parts: list[Any]) -> list[Any]:
+    """The arrays in operators and sets, which may hold functions as well."""
+    return [leaf for leaf in jtu.tree_leaves(parts) if hasattr(leaf, "shape")]
 
 
 def _fixed(parts: list[Any], dtype: Any) -> Tree | None:
@@ -35,7 +41,7 @@ def _fixed(parts: list[Any], dtype: Any) -> Tree | None:
             _fixed(list(each), dtype) for each in zip(*(p.parts for p in products), strict=True)
         )
         return None if any(part is None for part in found) else found
-    shapes = {jnp.shape(leaf) for leaf in jtu.tree_leaves(parts)}
+    shapes = {np.shape(leaf) for leaf in _arrays(parts)}
     tried = {cut for s in shapes for cut in (s, s[:1], s[-1:], s[1:])} - {()}
     fitting = [zero for s in sorted(tried) if _accept(parts, zero := jnp.zeros(s, dtype))]
     # A matrix can be applied to matrices as well, and is meant for vectors.

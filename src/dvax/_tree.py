@@ -168,7 +168,8 @@ def as_float(a: Tree, name: str) -> Tree:
 
     if not jtu.tree_leaves(a):
         raise _not_real(name, repr(a))
-    if isinstance(a, str | dict | set):
+    # States are arrays and tuples of them; parameters may be any tree.
+    if isinstance(a, str | set) or (isinstance(a, dict) and name in ("x0", "x")):
         raise _not_real(name, f"{type(a).__name__} {a!r}"[:120])
     return jtu.tree_map(one, a, is_leaf=lambda leaf: isinstance(leaf, list))
 
