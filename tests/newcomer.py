@@ -146,12 +146,6 @@ FUNCTIONS = {
         ),
         "control_space=dvax.spaces.Euclidean(())",
     ),
-    "table inside": (
-        lambda: of_f(
-            lambda t, x, u, a: signals.Table(jnp.array([0.0, 2.0]), jnp.array([1.0, 2.0]))(t) - u
-        ),
-        "newcomer.py, line; outside of the function",
-    ),
     "short table": (
         lambda: of_f(lambda t, x, u, a: SHORT(t) - u),
         "a Table in f; from t = 0 to 0.5; [0, 1]",

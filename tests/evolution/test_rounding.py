@@ -52,7 +52,6 @@ def test_steps_are_not_cut_for_what_no_step_can_mend(atol):
 def test_a_tolerance_below_rounding_is_refused_and_not_run_to_the_last_step():
     found = run(2e-8)
     assert found.result == RESULTS.step_too_small
-    assert "rounding" in RESULTS[found.result]
     assert int(found.stats["steps"]) < 10_000
 
 

@@ -269,7 +269,10 @@ def test_newton_alone_cycles_and_the_model_does_not(bodies):
     # β‖C‖ = 35 570, where the safeguard of the solver alone takes more than a thousand steps.
     for beta in (1e2, 1e4):
         rest = build(body, stiffness=beta).equilibrium()
-        assert rest.vi.result == dvax.vi.RESULTS.successful and int(rest.vi.iterations) < 10
+        # With β‖C‖ = 3.6e6 roundoff alone keeps the bound above the tolerance.
+        at_roundoff = float(rest.vi.residual) <= float(rest.vi.rounding)
+        assert rest.vi.result == dvax.vi.RESULTS.successful or at_roundoff
+        assert int(rest.vi.iterations) < 10
 
 
 def test_the_stress_balances_the_punch(run, tmp_path: Path):

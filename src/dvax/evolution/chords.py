@@ -223,7 +223,7 @@ _ENTRYWISE = {
     "and", "or", "xor", "not", "add", "sub", "mul", "max", "min", "neg", "sign", "abs",
     "convert_element_type", "select_n", "clamp", "eq", "ne", "lt", "le", "gt", "ge",
 }  # fmt: skip
-_TABLES = {"dvax_constant_table", "dvax_linear_table"}
+_TABLES = {"dvax_constant_table", "dvax_linear_table", "dvax_cubic_table"}
 _CUSTOM = {"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
 
 
@@ -349,22 +349,32 @@ def _known(a: jax.Array, b: jax.Array, known: jax.Array) -> Chord:
 
 
 def _table(eqn: Any, given: list[Any]) -> Chord:
-    """Values of a table of constants or lines (`dvax.signals.Table`): affine in t between two of its
-    times, and without a bound across one."""
-    times, values, t = given
-    if is_chord(times) or is_chord(values):
+    """Values of a `dvax.signals.Table`: a constant, a line or a cubic between two of its times, and
+    without a bound across one."""
+    times, values, *slopes, t = given
+    if any(map(is_chord, (times, values, *slopes))):
         raise NoEnclosure("a table that moves")
-    a, b = (bound(eqn, [times, values, end])[0] for end in (t.a, t.b))
-    method = "scan_unrolled" if times.shape[0] <= 4096 else "scan"
+    a, b = (bound(eqn, [*given[:-1], end])[0] for end in (t.a, t.b))
     times, values = jnp.asarray(times), jnp.asarray(values)
+    method = "scan_unrolled" if times.shape[0] <= 4096 else "scan"
     passed = lambda t, side: jnp.searchsorted(times, t, side=side, method=method)  # noqa: E731
     whole = passed(t.highest, "left") <= passed(t.lowest, "right")
-    if eqn.params["name"] == "dvax_constant_table":
-        slope = jnp.zeros(())
-    else:
-        i = jnp.clip(passed(t.lowest, "right") - 1, 0, times.shape[0] - 2)
-        slope = jnp.abs((values[i + 1] - values[i]) / (times[i + 1] - times[i]))
-    dev = jnp.where(whole, _safe(slope, t.dev), jnp.inf)
+    i = jnp.clip(passed(t.lowest, "right") - 1, 0, times.shape[0] - 2)
+    width = times[i + 1] - times[i]
+    rise, slope, bend = values[i + 1] - values[i], jnp.zeros(()), jnp.zeros(())
+    if eqn.params["name"] == "dvax_linear_table":
+        slope = jnp.abs(rise / width)
+    if slopes:
+        d0, d1 = slopes[0][i] * width, slopes[0][i + 1] * width
+        # v'' is a line in the share of the way between the two times.
+        shares = (t.lowest - times[i]) / width, (t.highest - times[i]) / width
+        first, turn = 6.0 * rise - 4.0 * d0 - 2.0 * d1, 6.0 * (d0 + d1 - 2.0 * rise)
+        bend = jnp.maximum(*(jnp.abs(first + turn * s) for s in shares)) / width**2
+        slope = jnp.maximum(
+            *(jnp.abs(d0 + s * (first + 0.5 * turn * s)) / width for s in shares)
+        ) + bend * (t.highest - t.lowest)
+    dev = _safe(slope, t.dev) + _safe(bend, (t.b - t.a) ** 2 / 8)
+    dev = jnp.where(whole, dev, jnp.inf)
     return Chord(a, b, jnp.broadcast_to(dev, a.shape).astype(a.dtype))
 
 

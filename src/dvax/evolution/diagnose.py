@@ -27,6 +27,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import Fix, InputError, SolveError
 from .flow import Flow
+from .implicit import Implicit
 from .method import AbstractMethod
 from .nonfinite import first_bad
 from .results import RESULTS
@@ -98,6 +99,8 @@ def diagnose(setup: Setup, stats: dict[str, Any], result: RESULTS) -> Diagnosis:
     t0, t1 = float(setup.setting["t0"]), float(setup.setting["t1"])
     if not math.isfinite(step) or step <= 0:
         step = setup.setting["dt"] if math.isfinite(setup.setting["dt"]) else (t1 - t0) * 1e-3
+    if isinstance(setup.method, Implicit):
+        step = t1 - t  # such a run is known up to the last saved time that it reached
     steps, rejected = int(stats["steps"]), int(stats["rejected"])
     stop = _Stop(
         setup, setup.flow(), t, stats["x"], min(float(step), max(t1 - t, 0.0)), steps,
