@@ -105,7 +105,7 @@ def _stiff(section: Section, rounds: int, full: bool) -> None:
         ("rectifier, diode of 1 µΩ", "1 Ω", rectifier(1e-6), rectifier(1.0)),
         ("frame, η/k = 1e-8 s", "1e-2 s", frame(1e-8), frame(1e-2)),
     ):
-        stiff(), mild()
+        _ = stiff(), mild()
         taken = in_turn({"stiff": timed(stiff), "mild": timed(mild)}, rounds)
         section.comparisons.append(
             compare(case, versus, taken["stiff"], taken["mild"], direction="dvax/other")

@@ -153,9 +153,10 @@ class _Reader:
     def _lines(self, name: str, eqn: Any, given: list[Any]) -> list[_Line] | None:
         """The lines of the outcome, where it consists of such."""
         do = lambda *v: _done(eqn, list(v))[0]  # noqa: E731
-        each = [_as_lines(v) for v in given]
+        each = [lines for v in given if (lines := _as_lines(v)) is not None]
+        known = len(each) == len(given)
         floating = jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating)
-        if name in ("add", "sub", "add_any") and None not in each:
+        if name in ("add", "sub", "add_any") and known:
             return [_both(do, p, q) for p in each[0] for q in each[1]]
         if name == "neg" or name in _MOVING_PLACES or name == "convert_element_type":
             if floating and isinstance(given[0], _Lines):
@@ -166,11 +167,13 @@ class _Reader:
             return [_both(lambda v: do(v, given[1].get()), line) for line in given[0].lines]
         if name == "abs" and isinstance(given[0], _Lines):
             return [*given[0].lines, *(_both(jnp.negative, line) for line in given[0].lines)]
-        cases = {"max": each, "min": each, "clamp": each, "select_n": each[1:]}.get(name)
-        if cases is not None and floating and None not in cases:
+        if name == "select_n":
+            each = [lines for v in given[1:] if (lines := _as_lines(v)) is not None]
+            known = len(each) == len(given) - 1
+        if name in ("max", "min", "clamp", "select_n") and floating and known:
             shape = eqn.outvars[0].aval.shape
             over = lambda v: jnp.broadcast_to(v, shape)  # noqa: E731
-            return [_both(over, line) for lines in cases for line in lines]
+            return [_both(over, line) for lines in each for line in lines]
         return None
 
     def _compared(self, name: str, eqn: Any, given: list[Any]) -> tuple:

@@ -33,7 +33,7 @@ class Profile(NamedTuple):
     def of(self, p: Numbers) -> Callable[[Any], Any]:
         """The profile inside a problem: a function of a traced t."""
         if self.table is not None:
-            return dvax.signals.Table(p["a"], p["d"], kind=self.table)  # pyright: ignore[reportArgumentType]
+            return dvax.signals.Table(p["a"], p["d"], kind=self.table)
         formula = lambda t: self.value(jnp, t, p)  # noqa: E731
         if self.knots is None:
             return formula

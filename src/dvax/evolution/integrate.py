@@ -178,8 +178,17 @@ def _controller(
     if options.fixed:
         return Fixed(stops, setup.number("dt"))
     sizes = root_mean_squares(setup.problem.spaces(setup.x0)[0])
-    names = ("rtol", "atol", "dt0", "dt0_growth", "dt_max", "horizon")
-    return Adaptive(stops, *map(setup.number, names), method.degree + 1, sizes)
+    return Adaptive(
+        stops,
+        rtol=setup.number("rtol"),
+        atol=setup.number("atol"),
+        first=setup.number("dt0"),
+        first_growth=setup.number("dt0_growth"),
+        longest=setup.number("dt_max"),
+        horizon=setup.number("horizon"),
+        order=method.degree + 1,
+        sizes=sizes,
+    )
 
 
 def _stepper(

@@ -184,7 +184,7 @@ def solve(
     if isinstance(method, PiecewiseLinear):
         solution = propagate(setup, times, Limits(options.max_steps, dense, options.ranged))
         if throw and solution.result != RESULTS.successful:
-            raise SolveError(_explain(solution), solution)
+            raise failure(solution.setup, solution.stats, solution.result, solution)
         return solution
     solution, reached = _differentiably(setup, times, options)
     if reached is True and not dense:
