@@ -54,13 +54,14 @@ class Equations:
         self.inverse = _inverse(M)
         eliminated = system.A - system.B[:, u] @ self.inverse @ system.C[u]
         spectrum = np.linalg.eigvals(eliminated) if np.isfinite(eliminated).all() else np.zeros(1)
-        speeds = np.abs(spectrum.real) / 8.0 + np.abs(spectrum.imag) / 4.0
+        real, imag = np.real(spectrum), np.imag(spectrum)
+        speeds = np.abs(real) / 8.0 + np.abs(imag) / 4.0
         fastest = max(float(speeds.max()), 1e-300)
         self.scales = np.unique(1.0 / speeds[speeds > 1e-20 * fastest])
         self.shortest = 1e-2 / fastest
         whole = np.block([[system.A, system.B[:, u]], [system.C[u], M]])
         # Others are damped within a period or two, and not worth the trouble.
-        light = spectrum[(spectrum.imag > 4.0 * np.abs(spectrum.real)) & (spectrum.imag > 0)]
+        light = spectrum[(imag > 4.0 * np.abs(real)) & (imag > 0)]
         self.rings = rings(whole, len(system.A), light)
         self._factors: dict[float, tuple[Array, Array, tuple[Array, Array]]] = {}
 
