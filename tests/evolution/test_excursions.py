@@ -1,0 +1,99 @@
+"""What moves between two samples of a step is seen: dips of a bound, pulses, periods, jumps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.selection import mostly_thorough
+
+import dvax
+
+METHODS = {
+    "DormandPrince": dvax.DormandPrince(), "ETD4RK": dvax.ETD4RK(),
+    "ExpRosenbrock": dvax.ExpRosenbrock(),
+}  # fmt: skip
+DIPS = {
+    "vee": lambda t, a, np: np.abs(t - a),
+    "waves": lambda t, a, np: np.abs(np.sin(12.0 * (t - a))) / 5.0,
+    "bell": lambda t, a, np: 0.1 - 0.1 * np.exp(-(((t - a) / 0.01) ** 2)),
+}
+RTOL = 1e-6
+
+
+def end_of(problem, t1, method):
+    """x(t1) from 0 as a function of args, compiled once."""
+    return jax.jit(
+        lambda a: dvax.solve(
+            problem, jnp.zeros(()), 0.0, t1, a, rtol=RTOL, atol=1e-9, method=method, throw=False
+        ).xs[-1]
+    )
+
+
+ALL = [(dip, method) for dip in DIPS for method in METHODS]
+
+
+@pytest.mark.parametrize(
+    ("dip", "method"), mostly_thorough(ALL, [("vee", "DormandPrince"), ("bell", "ExpRosenbrock")])
+)
+def test_a_bound_that_dips_within_a_step_is_met(dip, method):
+    """x' = u − 0.1x, u = min(0.05, k(t)): by quadrature of e^{−0.1(2 − s)} min(0.05, k(s))."""
+    k = DIPS[dip]
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0),
+        K=lambda t, a: dvax.sets.Box(-1.0, k(t, a, jnp)),
+        f=lambda t, x, u, a: u - 0.1 * x, h=lambda t, x, u, a: 0.05 + 0.0 * x,
+    )  # fmt: skip
+    run = end_of(problem, 2.0, METHODS[method])
+    s = np.linspace(0.0, 2.0, 1_000_001)
+    for a in np.random.default_rng(0).uniform(0.0, 2.0, 12):
+        exact = np.trapezoid(np.exp(-0.1 * (2.0 - s)) * np.minimum(0.05, k(s, a, np)), s)
+        assert abs(float(run(a)) - exact) <= 10 * (RTOL * abs(exact) + 1e-9) + 1e-10
+
+
+@pytest.mark.parametrize("kind", ["where", "floor"])
+@pytest.mark.parametrize("method", mostly_thorough(METHODS, ["DormandPrince"]))
+def test_no_jump_ends_a_run_wherever_it_lies(kind, method):
+    """x' = −x ± 1 with the sign changing at a; `floor` hides the time of the jump from the code."""
+    before = {
+        "where": lambda t, a: jnp.where(t < a, 1.0, -1.0),
+        "floor": lambda t, a: 1.0 - 2.0 * jnp.clip(jnp.floor(t / a), 0.0, 1.0),
+    }[kind]
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-1.0, 1.0),
+        f=lambda t, x, u, a: before(t, a) + 0.0 * u, h=lambda t, x, u, a: -u,
+    )  # fmt: skip
+    run = end_of(problem, 3.0, METHODS[method])
+    for a in np.random.default_rng(1).uniform(1.6, 3.0, 40):
+        exact = -1.0 + (2.0 - np.exp(-a)) * np.exp(-(3.0 - a))
+        assert abs(float(run(a)) - exact) <= 10 * RTOL
+
+
+@pytest.mark.parametrize(
+    ("span", "method"),
+    mostly_thorough(
+        [(t, m) for t in (97.0, 200.0, 500.0) for m in ("DormandPrince", "ETD4RK")],
+        [(200.0, "DormandPrince")],
+    ),
+)
+def test_data_of_many_whole_periods_are_not_taken_for_constant(span, method):
+    """x' = −x + u, u = sin²(2πt) within a ball; the span is a whole number of periods."""
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Ball(0.0, 5.0),
+        f=lambda t, x, u, a: u, h=lambda t, x, u, a: jnp.sin(2 * jnp.pi * t) ** 2 + 0.0 * x,
+    )  # fmt: skip
+    w = 4 * np.pi
+    exact = 0.5 - 0.5 * (np.cos(w * span) + w * np.sin(w * span)) / (1 + w * w)
+    sol = dvax.solve(problem, jnp.zeros(1), 0.0, span, rtol=RTOL, method=METHODS[method])
+    assert abs(float(sol.xs[-1, 0]) - exact) <= 10 * RTOL
+
+
+def test_dt_max_limits_adaptive_steps():
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-1.0, 1.0),
+        f=lambda t, x, u, a: u, h=lambda t, x, u, a: -u,
+    )  # fmt: skip
+    free = dvax.solve(problem, 1.0, 0.0, 1.0)
+    limited = dvax.solve(problem, 1.0, 0.0, 1.0, dt_max=0.01)
+    assert int(free.stats["steps"]) < 50 and int(limited.stats["steps"]) >= 100
+    with pytest.raises(dvax.InputError, match="dt_max"):
+        dvax.solve(problem, 1.0, 0.0, 1.0, dt_max=-1.0)

@@ -1,0 +1,51 @@
+"""Every week of the RTS-GMLC year ends at the default tolerances, wherever hours are counted from."""
+
+from pathlib import Path
+
+import equinox as eqx
+import numpy as np
+import pytest
+from tests.selection import mostly_thorough
+
+import dvax
+from dvax.models.market import Market, read_rts
+
+FOLDER = Path(__file__).parents[3] / "shared" / "data" / "RTS-GMLC"
+pytestmark = pytest.mark.skipif(
+    not FOLDER.is_dir(), reason=f"RTS-GMLC is not in {FOLDER}, and its licence forbids copying it"
+)
+WEEKS = [4000, 8616, *range(0, 8736, 168)]
+
+
+@pytest.fixture(scope="module")
+def data():
+    return read_rts(FOLDER)
+
+
+@pytest.mark.parametrize("start", mostly_thorough(WEEKS, [4000, 8616, 4032, 7896]))
+def test_a_week_ends_at_the_default_tolerances(data, start):
+    market = Market.from_rts(data, start, min(168, len(data.load) - start))
+    sol = market.run()
+    assert float(sol.ts[-1]) == float(market.intercept.span()[1])
+    bound = dvax.bound_error(market.problem, sol, market.constants)
+    assert float(bound.x.max()) < 1e-4
+
+
+@pytest.mark.thorough
+def test_the_whole_year_ends_in_one_run(data):
+    sol = Market.from_rts(data, 0, len(data.load)).run()
+    assert np.isfinite(np.asarray(sol.xs)).all() and sol.ts.shape == (len(data.load),)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("start", [0, 4000, 8500])
+def test_wind_of_every_five_minutes(data, start):
+    market = Market.from_rts(data, start, 168)
+    rng, times = np.random.default_rng(start), start + np.arange(167 * 12 + 1) / 12.0
+    hourly = np.asarray(market.capacity.values)
+    finer = np.stack([np.interp(times, market.capacity.times, row) for row in hourly.T], axis=1)
+    moves = np.ptp(finer, axis=0) > 0
+    noise = 1.0 + 0.05 * rng.standard_normal((len(times), int(moves.sum())))
+    finer[:, moves] = np.maximum(0.0, finer[:, moves] * noise)
+    windy = eqx.tree_at(lambda m: m.capacity, market, dvax.signals.Table(times, finer))
+    assert float(windy.run().ts[-1]) == start + 167.0
