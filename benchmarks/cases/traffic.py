@@ -27,7 +27,7 @@ def run(full: bool) -> Section:
         title="traffic: seconds until a relative gap of a user equilibrium",
         fair=(
             "Biconjugate Frank–Wolfe in NumPy with an exact line search, on link flows alone; "
-            "shortest paths are SciPy's on both sides. dvax starts anew for every gap, the other side "
+            "shortest paths are SciPy's on both sides. dvax restarts for every gap, the other side "
             "runs once. Errors: of dvax the gap that was reached, of the other side how far the two "
             "link flows are from each other, relative to the largest. Generated regions; real networks "
             f"where {_FOLDER} names a folder with the TNTP files of {', '.join(_REAL)}."

@@ -1,1 +1,1 @@
-"""Event-driven propagation of systems that are affine between switchings, whatever their stiffness."""
+"""Event-driven propagation of systems that are affine between switchings."""

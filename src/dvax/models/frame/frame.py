@@ -42,7 +42,7 @@ class Frame(eqx.Module):
 
     **What is exact.** The viscoplastic frame is in the class, with γ = L_F = 1. As a frame that is
     elastoplastic it is regularised: its displacement is off by O(η/k), which `elastoplastic_distance`
-    bounds. A small η/k costs nothing.
+    bounds. The cost does not grow as η/k → 0.
 
     **Raises:** `dvax.InputError` for every argument that breaks its rule.
 
