@@ -23,10 +23,10 @@ def problem():
     )
 
 
-def run(atol):
+def run(atol, throw=False):
     return dvax.solve(
         problem(), jnp.zeros(1), 0.0, 3.0, LARGE, rtol=0.0, atol=atol, method=dvax.ETD4RK(),
-        max_steps=20_000, throw=False,
+        max_steps=20_000, throw=throw,
     )  # fmt: skip
 
 
@@ -53,6 +53,12 @@ def test_a_tolerance_below_rounding_is_refused_and_not_run_to_the_last_step():
     found = run(2e-8)
     assert found.result == RESULTS.step_too_small
     assert int(found.stats["steps"]) < 10_000
+    with pytest.raises(dvax.SolveError, match="rounding of terms that cancel") as told:
+        run(2e-8, throw=True)
+    # What is named as a fix helps.
+    (named,) = [fix.value for fix in told.value.fixes if fix.option == "atol"]
+    assert 2e-8 < float(named) < 1e-5
+    assert run(float(named)).result == RESULTS.successful
 
 
 def test_trials_of_longer_steps_become_rare_where_they_find_nothing():

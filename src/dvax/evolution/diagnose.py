@@ -4,7 +4,8 @@ Each cause is tested at the last state (t, x) that was reached, on the functions
 
 - a value that is not finite, by evaluating K, P, A, h and f along x + s x' over the last step, with the
   earliest such time found by bisection;
-- a jump of K, h or f, by bisection of a few steps around t;
+- a jump of K, h or f, by bisection of a few steps around t; many jumps of one height are
+  rounding;
 - a finite-time escape, x' growing as |x|^p with p > 1, infinite after |x| / ((p − 1) |x'|);
 - rounding: steps of the size of the spacing of floating-point numbers at t, or a tolerance below the
   rounding of f;
@@ -197,27 +198,54 @@ def _jump(stop: _Stop) -> Diagnosis:
                 [leaf for leaf in leaves if leaf.dtype.kind == "f"] or [np.zeros(0)]
             )
 
-        a, b = low, high
-        before, after = values(a), values(b)
-        while b - a > 2.0 * max(stop.ulp, 5e-324):
-            middle = 0.5 * (a + b)
-            if not a < middle < b:
-                break
-            between = values(middle)
-            if _change(before, between)[0] >= _change(between, after)[0]:
-                b, after = middle, between
-            else:
-                a, before = middle, between
+        a, b, before, after = _narrow(values, low, high, stop.ulp)
         change, k = _change(before, after)
         size = float(np.max(np.abs(np.stack([before, after])), initial=0.0))
-        if change > max(_JUMP * size, _ROUNDINGS * eps * size) and b - a < 1e-9 * (t1 - t0):
-            where = f" in component {k}" if before.size > 1 else ""
-            return Diagnosis(
-                f"{name} jumps from {before[k]:.6g} to {after[k]:.6g}{where} at t = {b:.15g}, and no "
-                "step across a jump that is not announced meets the tolerance.",
-                (Fix("knots", f"[{b:.15g}]", "so that a step ends there: dvax.signals.Function"),),
-            )
+        if not (change > max(_JUMP, _ROUNDINGS * eps) * size and b - a < 1e-9 * (t1 - t0)):
+            continue
+        # Both halves of what is longer, the part before the jump or the part after it.
+        left, right = max((low, a), (b, high), key=lambda part: part[1] - part[0])
+        middle = 0.5 * (left + right)
+        beside = [_narrow(values, *part, stop.ulp) for part in ((left, middle), (middle, right))]
+        if all(_change(*found[2:])[0] > 0.25 * change for found in beside):
+            return _stairs(stop, name, change, b)
+        where = f" in component {k}" if before.size > 1 else ""
+        return Diagnosis(
+            f"{name} jumps from {before[k]:.6g} to {after[k]:.6g}{where} at t = {b:.15g}, and no "
+            "step across a jump that is not announced meets the tolerance.",
+            (Fix("knots", f"[{b:.15g}]", "so that a step ends there: dvax.signals.Function"),),
+        )
     return Diagnosis()
+
+
+def _narrow(
+    values: Callable[[float], np.ndarray], a: float, b: float, ulp: float
+) -> tuple[float, float, np.ndarray, np.ndarray]:
+    """The part of [a, b] of about two roundings in which the values change most, by bisection."""
+    before, after = values(a), values(b)
+    while b - a > 2.0 * max(ulp, 5e-324):
+        middle = 0.5 * (a + b)
+        if not a < middle < b:
+            break
+        between = values(middle)
+        if _change(before, between)[0] >= _change(between, after)[0]:
+            b, after = middle, between
+        else:
+            a, before = middle, between
+    return a, b, before, after
+
+
+def _stairs(stop: _Stop, name: str, height: float, t: float) -> Diagnosis:
+    """Jumps of about one height beside each other: rounding of terms far larger than their sum."""
+    horizon = float(stop.setup.setting["horizon"])
+    return Diagnosis(
+        f"{name} changes in jumps of about {height:.3g} near t = {t:.12g}, as the rounding of terms "
+        "that cancel does, and the tolerance asks for less.",
+        (
+            Fix("atol", f"{2.0 * height * horizon:.1g}", "which rounding allows"),
+            Fix("", "", f"Write {name} so that large terms do not cancel"),
+        ),
+    )
 
 
 def _change(a: np.ndarray, b: np.ndarray) -> tuple[float, int]:
