@@ -23,10 +23,10 @@ _BEND = (
     69997945 / 29380423,
 )
 """Of k₁, …, k₇ in the bend r of the dense output."""
-_SAMPLES = (26**-0.5, 0.4**0.5)
-"""Irrational places of either sign of the defect, which is close to a multiple of θ(1−θ)(1 − 5(2θ−1)²):
-there the larger of the two is 1.05 times the mean of its modulus. At the zeros, 0.276 and 0.724, it
-would be seen as none."""
+_SAMPLES = (50**-0.5, 0.77**0.5)
+"""Irrational places far from the zeros of the defect, which is close to a multiple of
+θ(1−θ)(1 − 5(2θ−1)²): at 0.276 and 0.724 it would be seen as none. The larger value of the two is 1.4
+times the mean of its modulus."""
 
 
 class DormandPrince(AbstractMethod):

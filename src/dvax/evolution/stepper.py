@@ -335,7 +335,7 @@ class Stepper(eqx.Module):
     def _measure(self, t0: Any, t1: Any, arc: Arc, visits: list[Visit], jumped: Any) -> Sample:
         if not self.flow.enclosed:
             x0, c = values((arc.x0, arc.c))
-            return sampled(self.flow, self.method.samples, arc.h, x0, c, visits)
+            return sampled(self.flow, self.method, arc.h, x0, c, visits)
         assert self.growth is not None
         # A rate that the step before made was made where that one ended: a few roundings of t earlier,
         # which a steep f tells apart.
