@@ -1,8 +1,11 @@
 """Programs that JAX has traced, operation by operation."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Literal, Var
 
 
@@ -32,3 +35,24 @@ def values(known: dict[Any, Any], atoms: Any) -> list[Any]:
 def variables(atoms: Any) -> set[Any]:
     """Those that are not literals."""
     return {atom for atom in atoms if isinstance(atom, Var)}
+
+
+def is_search(eqn: Any) -> bool:
+    """Whether a call is that of `jnp.searchsorted` for one number, as in `jnp.interp` and in a table
+    with steps: by the name and by the program, which is that of JAX for these shapes."""
+    inner = eqn.params.get("jaxpr")
+    if eqn.params.get("name") != "searchsorted" or inner is None or len(eqn.invars) != 2:
+        return False
+    row, value = (
+        jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype, weak_type=v.aval.weak_type)
+        for v in eqn.invars
+    )
+    if len(row.shape) != 1:
+        return False
+    for side in ("left", "right"):
+        for method in ("scan", "scan_unrolled", "compare_all"):
+            search = partial(jnp.searchsorted, side=side, method=method)
+            own = jax.make_jaxpr(search)(row, value).jaxpr.eqns
+            if len(own) == 1 and str(own[0].params.get("jaxpr")) == str(inner):
+                return True
+    return False

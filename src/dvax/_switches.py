@@ -1,6 +1,7 @@
 """Times at which the code of f, h or K switches: comparisons of an affine function of t, read off it.
 
     jnp.where(t < a, …)     t − a > 0     t >= 2 * a + b     jnp.sign(t − a)     jnp.maximum(t, a)
+    jnp.interp(t, times, values)     values[jnp.searchsorted(times, t)]
 
 compare st + c, with s and c independent of t, x and u, with 0. The switch is at −c/s, a function of the
 parameters that is differentiated as any other knot. Functions that are affine in pieces (|t − a| < w, a
@@ -27,7 +28,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from . import _tree
-from ._jaxpr import bound, walked
+from ._jaxpr import bound, is_search, walked
 from .errors import DifferentiationError
 from .vi.structure import CALLS, CUSTOM, inner_jaxpr
 
@@ -116,6 +117,11 @@ class _Reader:
             return inner or [_OTHER] * len(eqn.outvars)
         if all(isinstance(v, _Fixed) for v in given):
             return self._lazily(eqn, given, _Fixed)
+        if is_search(eqn):
+            row, lines = map(_as_lines, given)
+            if row is not None and lines is not None and len(row) == 1:
+                self.found += [_meeting(line, row[0]) for line in lines]
+                return self._lazily(eqn, given, lambda m: _OfTime(_Lazy(m)))
         inner = self._inner(eqn, given)
         if inner is not None:
             return inner

@@ -49,6 +49,8 @@ FUNCTIONS = {
     "roots": lambda t: jnp.cbrt(1.0 + t) + jax.lax.rsqrt(0.2 + t) + jnp.log1p(t),
     "powers": lambda t: (0.1 + t) ** 1.7 + (0.3 + t) ** -0.4 + t**2.5 + 1.9**t + jnp.exp2(-t),
     "tangent": lambda t: jnp.tan(0.3 * t) - jnp.tan(0.3 * t - 1.2),
+    "interpolation": lambda t: jnp.interp(t, jnp.arange(5.0), PROFILE[jnp.array([0, 1, 2, 1, 0])]),
+    "steps of an array": lambda t: PROFILE[jnp.searchsorted(jnp.array([1.0, 2.2]), t)] * t,
     "cumulative": lambda t: jnp.cumsum(PROFILE * jnp.sin(t)),
     "taken apart": lambda t: jnp.split(jnp.sin(PROFILE * t), [1])[1],
 }

@@ -1,5 +1,7 @@
 """Jumps that the code of f, h and K shows are knots: steps end there and derivatives include them."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -131,3 +133,34 @@ def test_a_jump_that_cannot_be_read_refuses_the_derivative_of_its_time():
         jax.grad(end)(0.5, 1.0)
     # What has nothing to do with the time of the jump is differentiated as ever.
     assert np.isfinite(jax.grad(end, 1)(0.5, 1.0))
+
+
+@pytest.mark.parametrize("kind", ["interp", "steps"])
+@pytest.mark.parametrize("method", [None, dvax.DormandPrince()], ids=["default", "DormandPrince"])
+def test_a_spike_in_an_array_is_met_and_its_times_are_differentiated(kind, method):
+    """x' = −x + q(t), q read from arrays by JAX's own functions; exact between two of its times."""
+    times, n = np.linspace(0.0, 10.0, 1001), 1000
+    values = np.where(np.arange(n + 1) == 377, 50.0, 0.1)
+
+    def data(t, times):
+        if kind == "interp":
+            return jnp.interp(t, times, values)
+        return jnp.asarray(values)[jnp.searchsorted(times, t, side="right") - 1]
+
+    read = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-99.0, 99.0),
+        f=lambda t, x, u, times: u, h=lambda t, x, u, times: data(t, times) + 0.0 * x,
+    )  # fmt: skip
+
+    def end(times):
+        return dvax.solve(read, 0.0, 0.0, 10.0, times, rtol=1e-7, atol=1e-9, method=method).xs[-1]
+
+    h, x = 10.0 / n, 0.0
+    for a, b in itertools.pairwise(values):
+        b = a if kind == "steps" else b
+        x = x * np.exp(-h) - a * np.expm1(-h) + (b - a) / h * (h + np.expm1(-h))
+    assert abs(float(end(times)) - x) <= 1e-7
+    if kind == "steps" and method is not None:
+        slope = jax.grad(end)(jnp.asarray(times))
+        jump = (values[1] - 50.0) * np.exp(times[377] - 10.0)
+        np.testing.assert_allclose(slope[377:379], [jump, -jump * np.exp(h)], rtol=1e-6)

@@ -26,7 +26,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
-from .._jaxpr import bound
+from .._jaxpr import bound, is_search
 from .._tree import Tree
 from ..vi.structure import CALLS, evaluate
 from .smooth_bounds import BOUNDS, exponential, power
@@ -247,6 +247,8 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
         return [Chord(*(jnp.broadcast_to(part, shape) for part in _lift(given[0])))]
     if eqn.params.get("name") in _TABLES:
         return [_table(eqn, given)]
+    if is_search(eqn) and not is_chord(given[0]):
+        return [_search(eqn, *given)]
     if name in CALLS or name in _CUSTOM:
         for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
             inner = eqn.params.get(key)
@@ -388,6 +390,13 @@ def _table(eqn: Any, given: list[Any]) -> Chord:
     dev = _safe(slope, t.dev) + _safe(bend, (t.b - t.a) ** 2 / 8)
     dev = jnp.where(whole, dev, jnp.inf)
     return Chord(a, b, jnp.broadcast_to(dev, a.shape).astype(a.dtype))
+
+
+def _search(eqn: Any, row: Any, x: Chord) -> Chord:
+    """The place of x in a sorted row: known where both of its bounds have the same."""
+    place = lambda v: bound(eqn, [row, v])[0]  # noqa: E731
+    sorted_row = jnp.all(jnp.diff(row) >= 0)
+    return _known(place(x.a), place(x.b), (place(x.lowest) == place(x.highest)) & sorted_row)
 
 
 def _compare(x: Chord, y: Chord, bind: Callable) -> Chord:
