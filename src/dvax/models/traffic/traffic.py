@@ -140,7 +140,7 @@ class Traffic(eqx.Module):
         )
         self.paths, self.gap = reached.paths, reached.gap
         self.equilibrium = jnp.asarray(reached.flows)
-        self.incidence = Incidence(self.paths)
+        self.incidence = Incidence(self.paths.lengths, self.paths.links, self.paths.count)
         self.link_costs = costs.up_to(largest_flows(self.paths, most))
         self.rho = typical_rho(costs, self.network, self.trips) if rho is None else float(rho)
 
