@@ -139,11 +139,17 @@ class Incidence(eqx.Module):
 
     def flows(self, x: jax.Array) -> jax.Array:
         """v = Δx."""
-        taken = x.at[self.path].get(mode="promise_in_bounds")
+        taken = _computed(x).at[self.path].get(mode="promise_in_bounds")
         nothing = jnp.zeros(self.count, x.dtype)
         return nothing.at[self.link].add(taken, mode="promise_in_bounds")
 
     def along(self, c: jax.Array) -> jax.Array:
         """Δᵀc."""
-        passed = c.at[self.link].get(mode="promise_in_bounds")
+        passed = _computed(c).at[self.link].get(mode="promise_in_bounds")
         return jax.ops.segment_sum(passed, self.path, self.number, indices_are_sorted=True)
+
+
+def _computed(a: jax.Array) -> jax.Array:
+    """The same array, written to memory by a scatter. XLA fuses what precedes a gather into it, barrier
+    or not, and would compute the power of a link's cost once for every path over it."""
+    return jnp.zeros_like(a).at[jnp.arange(len(a))].set(a, mode="promise_in_bounds")
