@@ -199,7 +199,7 @@ def test_two_trajectories_never_separate(city, days):
 
 
 def test_responses_are_within_their_certificate(city, days):
-    # By Newton's method in the link flows, which shares nothing with the solver but the formulas.
+    # By a Newton method with dense matrices, which shares no code with the solver but link costs.
     costs = jax.tree_util.tree_map(np.asarray, city.link_costs)
     step = ProximalStep(costs, city.network.capacity, city.paths, city.trips.flow)
     for sol in days:

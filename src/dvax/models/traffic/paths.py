@@ -67,7 +67,7 @@ class Paths:
         first = np.cumsum(sizes) - sizes
         once = shared & (row == first[pair[row]])
         pairs = np.flatnonzero(several)
-        fixed = np.bincount(links[once], demand[pairs][pair[row[once]]], self.count)
+        fixed = np.bincount(links[once], demand[pairs][pair[row[once]]], self.count).astype(float)
         alone = np.repeat(~several, self.sizes)
         only = np.repeat(np.repeat(demand, self.sizes), self.lengths)[
             np.repeat(alone, self.lengths)
