@@ -183,7 +183,7 @@ def test_days_lead_to_the_equilibrium_and_trips_are_conserved(city, days):
     for sol in days:
         objective = np.array([float(city.objective(0.0, x)) for x in sol.xs])
         assert np.all(np.diff(objective) < 1e-13 * least)  # Φ' ≤ −(κ/ρ)‖u − x‖²
-        assert objective[0] > 1.2 * least and abs(objective[-1] / least - 1) <= 1e-9
+        assert objective[0] > 1.5 * least and abs(objective[-1] / least - 1) <= 1e-9
         figures = city.figures(sol)
         assert figures["objective"] == objective[-1]
         assert figures["max_conservation_error"] <= 1e-12
@@ -331,7 +331,8 @@ def test_sioux_falls():
     sol = run(model, model.all_or_nothing(), 40.0, ts, method=dvax.ETD1())
     figures = model.figures(sol)
     assert figures["objective"] == pytest.approx(4_231_335.287107, rel=1e-9)
-    # Of first order in the distance to the equilibrium, which falls as the root of the objective's.
+    # Of first order in the distance to the equilibrium, which falls by e^(−t/2) (`above` is of second
+    # order and falls by e^(−t)): e⁻²⁰ = 2·10⁻⁹ after 40 days, as found, so 10⁻⁹ would be too much.
     assert figures["total_travel_time"] == pytest.approx(7_480_225.344921, rel=1e-8)
     spent = float(model.total_travel_time(0.0, model.equilibrium))
     assert spent == pytest.approx(7_480_225.344921, rel=1e-9)
