@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -23,6 +24,21 @@ from .vi import AbstractSolver, Answer, Auto, Frozen, default_space
 KNOT_ULPS, END_ULPS = 4, 128
 """Knots nearer than this to each other, or to the ends of a run, in roundings of t, are one: records
 round the same moment differently."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrozenOperator:
+    """F(y) = P⁻¹y − h(t, x, P⁻¹y), whose parts a solver of one law may read."""
+
+    P: AbstractOperator
+    h: Callable[[Any, Tree, Tree, Any], Tree]
+    t: Any
+    x: Tree
+    args: Any
+
+    def __call__(self, y: Tree) -> Tree:
+        u = self.P.inverse(y)
+        return _tree.sub(u, self.h(self.t, self.x, u, self.args))
 
 
 class Problem(eqx.Module):
@@ -131,15 +147,9 @@ class Problem(eqx.Module):
         fixed = _control_shape.fixed_by(self.P, self.K, x)
         return state, state if fixed is None else default_space(fixed)
 
-    def frozen(self, t: Any, x: Tree, args: Any = None) -> Callable[[Tree], Tree]:
+    def frozen(self, t: Any, x: Tree, args: Any = None) -> "FrozenOperator":
         """The frozen operator F_{t,x}(y) = P⁻¹y − h(t, x, P⁻¹y) (paper, eq:F_def)."""
-        P = self.operator(args)
-
-        def F(y: Tree) -> Tree:
-            u = P.inverse(y)
-            return _tree.sub(u, self.h(t, x, u, args))
-
-        return F
+        return FrozenOperator(self.operator(args), self.h, t, x, args)
 
     def law(
         self,

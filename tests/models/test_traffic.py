@@ -183,7 +183,7 @@ def test_days_lead_to_the_equilibrium_and_trips_are_conserved(city, days):
     for sol in days:
         objective = np.array([float(city.objective(0.0, x)) for x in sol.xs])
         assert np.all(np.diff(objective) < 1e-13 * least)  # Φ' ≤ −(κ/ρ)‖u − x‖²
-        assert objective[0] > 1.2 * least and abs(objective[-1] / least - 1) <= 1e-9
+        assert objective[0] > 1.5 * least and abs(objective[-1] / least - 1) <= 1e-9
         figures = city.figures(sol)
         assert figures["objective"] == objective[-1]
         assert figures["max_conservation_error"] <= 1e-12
@@ -199,7 +199,7 @@ def test_two_trajectories_never_separate(city, days):
 
 
 def test_responses_are_within_their_certificate(city, days):
-    # By Newton's method in the link flows, which shares nothing with the solver but the formulas.
+    # By a Newton method with dense matrices, which shares no code with the solver but link costs.
     costs = jax.tree_util.tree_map(np.asarray, city.link_costs)
     step = ProximalStep(costs, city.network.capacity, city.paths, city.trips.flow)
     for sol in days:
@@ -331,7 +331,8 @@ def test_sioux_falls():
     sol = run(model, model.all_or_nothing(), 40.0, ts, method=dvax.ETD1())
     figures = model.figures(sol)
     assert figures["objective"] == pytest.approx(4_231_335.287107, rel=1e-9)
-    # Of first order in the distance to the equilibrium, which falls as the root of the objective's.
+    # Of first order in the distance to the equilibrium, which falls by e^(−t/2) (`above` is of second
+    # order and falls by e^(−t)): e⁻²⁰ = 2·10⁻⁹ after 40 days, as found, so 10⁻⁹ would be too much.
     assert figures["total_travel_time"] == pytest.approx(7_480_225.344921, rel=1e-8)
     spent = float(model.total_travel_time(0.0, model.equilibrium))
     assert spent == pytest.approx(7_480_225.344921, rel=1e-9)

@@ -36,7 +36,7 @@ def run(
         # Both are checked before anything is refused: one round is enough to mend all of it.
         problems: list[InputProblem] = target_problems(out, force=force)
         try:
-            loaded = _load(config, allow_outside)
+            loaded = _load(config, allow_outside, quiet)
         except InputError as error:
             raise InputError(*error.problems, *problems) from error
         if problems:
@@ -44,12 +44,12 @@ def run(
         carry_out(loaded, out, force=force, quiet=quiet)
 
 
-def _load(file: Path, allow_outside: bool) -> "Config | ModelConfig":
+def _load(file: Path, allow_outside: bool, quiet: bool) -> "Config | ModelConfig":
     enable_double()
     from dvax.runs.applications.config import read_config
     from dvax.runs.interrupt import interruptible
 
-    return interruptible(lambda: read_config(file, allow_outside=allow_outside))
+    return interruptible(lambda: read_config(file, allow_outside=allow_outside, quiet=quiet))
 
 
 def carry_out(config: "Config | ModelConfig", out: Path, *, force: bool, quiet: bool) -> None:

@@ -1,6 +1,7 @@
 """Day-to-day traffic on networks in the TNTP format."""
 
 from .changes import Incident as Incident
+from .law import LinkNewton as LinkNewton
 from .network import Network as Network
 from .network import Trips as Trips
 from .tntp import Flows as Flows

@@ -16,13 +16,13 @@ from ...operators import Scaling
 from ...problem import Problem
 from ...signals import AbstractSignal
 from ...theory import Constants
-from ...vi import Accelerated
 from .bounds import largest_flows, largest_slope
 from .changes import Incident, capacities, demand_factor, demand_set
 from .checks import agreement, loaded, numbers
 from .costs import LinkCosts, link_costs
 from .equilibrium import all_or_nothing
 from .generation import generated, typical_rho
+from .law import Choices, LinkNewton, Proposal
 from .network import Network, Trips
 from .paths import Incidence, Paths
 from .shortest import ShortestPaths
@@ -140,7 +140,7 @@ class Traffic(eqx.Module):
         )
         self.paths, self.gap = reached.paths, reached.gap
         self.equilibrium = jnp.asarray(reached.flows)
-        self.incidence = Incidence(self.paths)
+        self.incidence = Incidence(self.paths.lengths, self.paths.links, self.paths.count)
         self.link_costs = costs.up_to(largest_flows(self.paths, most))
         self.rho = typical_rho(costs, self.network, self.trips) if rho is None else float(rho)
 
@@ -153,7 +153,7 @@ class Traffic(eqx.Module):
             P=Scaling(1.0),
             K=demand_set(self.trips.flow, self.paths.sizes, self.factor, self.peak),
             f=_Rate(jnp.asarray(self.rate)),
-            h=_Proposal(self.incidence, costs, self.capacity, jnp.asarray(self.rho)),
+            h=Proposal(self.incidence, costs, self.capacity, jnp.asarray(self.rho)),
         )
 
     @property
@@ -183,14 +183,18 @@ class Traffic(eqx.Module):
         )
 
     @property
-    def vi_solver(self) -> Accelerated:
-        """The solver for the law, whose F is a gradient: to 10⁻¹⁰ of all trips, or to what the rounding
-        of flows alone makes of F, ε L_F ‖d‖, where that is more."""
+    def vi_solver(self) -> LinkNewton:
+        """The solver for the law, Newton's method on link flows: to 10⁻¹⁰ of all trips, or to what
+        rounding makes of F, where that is more: that of flows, ε L_F ‖d‖, or that of the costs c of
+        paths, which makes an error of ε ρ c in the flows that follow from them."""
         rounding = np.finfo(self.equilibrium.dtype).eps * float(self.constants.L_F)
         flows = self.peak * self.trips.flow
-        return Accelerated(
-            least=float(max(1e-10 * flows.sum(), 4.0 * rounding * np.linalg.norm(flows)))
-        )
+        c = float(jnp.max(self.incidence.along(self.costs(0.0, self.equilibrium))))
+        blur = rounding * max(4.0 * np.linalg.norm(flows), 0.25 * self.rho * c)
+        least = float(max(1e-10 * flows.sum(), blur))
+        v = np.asarray(self.link_flows(self.equilibrium))
+        stiffness = self.rho * self.link_costs.slopes(v, self.worst)
+        return LinkNewton(Choices(self.paths, stiffness), jnp.asarray(v), least)
 
     def all_or_nothing(self) -> jax.Array:
         """All trips on the paths that cost least on the empty network, for a `demand` of 1."""
@@ -263,16 +267,3 @@ class _Rate(eqx.Module):
 
     def __call__(self, t: Any, x: Any, u: Any, args: Any) -> jax.Array:
         return self.rate * u
-
-
-class _Proposal(eqx.Module):
-    """h = x − ρ Δᵀc(Δu)."""
-
-    incidence: Incidence
-    costs: LinkCosts
-    capacity: AbstractSignal
-    rho: jax.Array
-
-    def __call__(self, t: Any, x: Any, u: Any, args: Any) -> jax.Array:
-        c = self.costs.costs(self.incidence.flows(u), self.capacity(t))
-        return x - self.rho * self.incidence.along(c)

@@ -101,8 +101,8 @@ class AbstractApplication(abc.ABC, Generic[Model]):
     end: ClassVar[str | None] = None
 
     @abc.abstractmethod
-    def read(self, table: Any, paths: Mapping[str, Path]) -> Model:
-        """The model, from its table and where its data lies.
+    def read(self, table: Any, paths: Mapping[str, Path], quiet: bool) -> Model:
+        """The model, from its table and where its data lies; `quiet`: without lines of progress.
 
         **Raises:** `dvax.InputError` with everything that is wrong.
         """

@@ -54,7 +54,7 @@ class CircuitApplication(AbstractApplication[_Loaded]):
     files = ("netlist",)
     end = "model.t_end"
 
-    def read(self, table: Any, paths: Mapping[str, Path]) -> _Loaded:
+    def read(self, table: Any, paths: Mapping[str, Path], quiet: bool) -> _Loaded:
         return _Loaded(table, paths["netlist"])
 
     def fit(self, model: _Loaded) -> str:

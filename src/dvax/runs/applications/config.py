@@ -67,8 +67,10 @@ class ModelConfig:
         return tomli_w.dumps({"model": table, "output": output})
 
 
-def read_config(path: str | Path, *, allow_outside: bool = False) -> Config | ModelConfig:
-    """Read, check and complete a configuration file of any model.
+def read_config(
+    path: str | Path, *, allow_outside: bool = False, quiet: bool = False
+) -> Config | ModelConfig:
+    """Read, check and complete a configuration file of any model; `quiet`: without lines of progress.
 
     **Raises:** `dvax.InputError` with all problems found, those of the data files included.
     """
@@ -107,7 +109,7 @@ def read_config(path: str | Path, *, allow_outside: bool = False) -> Config | Mo
                 f"{source.name}: model.name", shown(name), f"it is one of {', '.join(NAMES)}", mend
             )
         )
-    return _check(raw, name, source, allow_outside)
+    return _check(raw, name, source, allow_outside, quiet)
 
 
 def _meant(table: Mapping[str, Any]) -> str | None:
@@ -124,7 +126,9 @@ def _meant(table: Mapping[str, Any]) -> str | None:
     return best if count[best] else None
 
 
-def _check(raw: dict[str, Any], name: str, source: Path, allow_outside: bool) -> ModelConfig:
+def _check(
+    raw: dict[str, Any], name: str, source: Path, allow_outside: bool, quiet: bool
+) -> ModelConfig:
     file = source.name
     application = module_of(name).APPLICATION
     problems = [
@@ -154,5 +158,5 @@ def _check(raw: dict[str, Any], name: str, source: Path, allow_outside: bool) ->
     if problems:
         raise InputError(*problems)
     with in_keys(file, application):
-        model = application.read(table, paths)
+        model = application.read(table, paths, quiet)
     return ModelConfig(name, table, sections["output"], source, application, model, paths)

@@ -133,7 +133,7 @@ class FemContactApplication(AbstractApplication[_Loaded]):
     files = ("mesh",)
     end = "model.end"
 
-    def read(self, table: Any, paths: Mapping[str, Path]) -> _Loaded:
+    def read(self, table: Any, paths: Mapping[str, Path], quiet: bool) -> _Loaded:
         return _Loaded(table, paths.get("mesh"))
 
     def fit(self, model: _Loaded) -> str:

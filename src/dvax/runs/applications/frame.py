@@ -67,7 +67,7 @@ class FrameApplication(AbstractApplication[_Loaded]):
         "step": ("record",), "acceleration": ("record",),
     }  # fmt: skip
 
-    def read(self, table: Any, paths: Mapping[str, Path]) -> _Loaded:
+    def read(self, table: Any, paths: Mapping[str, Path], quiet: bool) -> _Loaded:
         return _Loaded(table, paths["record"])
 
     def fit(self, model: _Loaded) -> str:

@@ -73,7 +73,7 @@ class MarketApplication(AbstractApplication[_Loaded]):
         ),
     }  # fmt: skip
 
-    def read(self, table: Any, paths: Mapping[str, Path]) -> _Loaded:
+    def read(self, table: Any, paths: Mapping[str, Path], quiet: bool) -> _Loaded:
         return _Loaded(table, read_rts(paths["data"]))
 
     def fit(self, model: _Loaded) -> str:

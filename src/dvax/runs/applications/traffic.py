@@ -75,7 +75,7 @@ class TrafficSection(SolverKeys):
 
 
 class _Loaded:
-    def __init__(self, table: TrafficSection, paths: Mapping[str, Path]):
+    def __init__(self, table: TrafficSection, paths: Mapping[str, Path], quiet: bool):
         self.table = table
         check_steps(table, table.days, f"{table.days:g} days")
         try:
@@ -83,7 +83,7 @@ class _Loaded:
             self.traffic = Traffic(
                 paths["network"], paths["trips"], toll_weight=table.toll_weight,
                 distance_weight=table.distance_weight, rate=table.rate, rho=table.rho, gap=table.gap,
-                progress=True,
+                progress=not quiet,
                 incidents=[
                     Incident(
                         link=(i.init_node, i.term_node), remaining=i.remaining, start=i.start, end=i.end
@@ -136,8 +136,8 @@ class TrafficApplication(AbstractApplication[_Loaded]):
     end = "model.days"
     keys: ClassVar[Mapping[str, tuple[str, ...]]] = {"link": ("init_node", "term_node")}
 
-    def read(self, table: Any, paths: Mapping[str, Path]) -> _Loaded:
-        return _Loaded(table, paths)
+    def read(self, table: Any, paths: Mapping[str, Path], quiet: bool) -> _Loaded:
+        return _Loaded(table, paths, quiet)
 
     def fit(self, model: _Loaded) -> str:
         return model.traffic.fit

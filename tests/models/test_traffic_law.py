@@ -1,0 +1,68 @@
+"""The law of day-to-day traffic on link flows: against a first-order method that shares no code."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.models import traffic_networks as networks
+from tests.selection import mostly_thorough
+
+import dvax
+from dvax.models import traffic
+from dvax.vi import RESULTS, Accelerated, Frozen
+
+SHAPES = {
+    "square": dict(rows=5, columns=5, zones=8, pairs=30, load=3e4, seed=1),
+    "long": dict(rows=3, columns=12, zones=10, pairs=40, load=2e4, seed=2),
+    "one way": dict(rows=6, columns=6, zones=9, pairs=50, load=6e4, seed=3, one_way=True),
+    "empty roads": dict(rows=4, columns=5, zones=6, pairs=15, load=1e2, seed=4),
+    "jammed": dict(rows=4, columns=4, zones=6, pairs=20, load=2e5, seed=5),
+}
+EVERY = [(s, d, r) for s in SHAPES for d in (0.5, 1.0, 2.0) for r in (1e-3, 1e-1, 1.0, 10.0)]
+
+
+@pytest.mark.parametrize(
+    ("shape", "factor", "share"),
+    mostly_thorough(EVERY, [("square", 1.0, 1.0), ("one way", 2.0, 0.1)]),
+)
+def test_the_law_agrees_with_accelerated_gradients(shape, factor, share):
+    network, trips = networks.grid(**SHAPES[shape])
+    trips = traffic.Trips(trips.zones, trips.origin, trips.destination, factor * trips.flow)
+    usual = traffic.Traffic(network, trips)
+    model = traffic.Traffic(network, trips, rho=share * usual.rho)
+    problem, newton = model.problem, model.vi_solver
+    first_order = Accelerated(least=newton.least, max_steps=200_000)
+
+    def solved(x, solver):
+        space = problem.spaces(x)[1]
+        vi = Frozen(problem.frozen(0.0, x), problem.set_at(0.0), space, 1.0, model.constants.L_F)
+        return solver.solve(vi, x, 0.0)
+
+    ours = jax.jit(lambda x: solved(x, newton))
+    theirs = jax.jit(lambda x: solved(x, first_order))
+    x = model.all_or_nothing()
+    for _ in range(3):
+        one, other = ours(x), theirs(x)
+        assert one.result == RESULTS.successful and float(one.residual) <= newton.least
+        # Both lie within their ‖w‖ of the solution, as γ = 1.
+        apart = float(jnp.linalg.norm(one.y - other.y))
+        assert apart <= float(one.residual + other.residual) * (1 + 1e-9)
+        assert int(one.iterations) <= 60
+        x = x + 0.5 * (one.y - x)
+
+
+def test_another_law_is_refused():
+    solver = traffic.Traffic(*networks.two_roads(), rho=10.0).vi_solver
+    with pytest.raises(dvax.InputError, match="Traffic alone"):
+        dvax.solve_vi(lambda y, args: y, dvax.sets.Simplex(1.0), jnp.ones(2), solver=solver)
+
+
+def test_pairs_without_a_choice_have_a_law_too():
+    network = traffic.Network(
+        zones=2, nodes=2, first_thru_node=1, init_node=[1, 2], term_node=[2, 1],
+        capacity=[10.0, 10.0], length=[1.0, 1.0], free_flow_time=[5.0, 5.0], b=[0.15, 0.15],
+        power=[4.0, 4.0],
+    )  # fmt: skip
+    model = traffic.Traffic(network, traffic.Trips(2, [1], [2], [10.0]))
+    u = model.problem.response(0.0, jnp.array([3.0]), solver=model.vi_solver)
+    np.testing.assert_allclose(u, [10.0], rtol=1e-15)
