@@ -29,6 +29,9 @@ _INCH = 0.0254
 """Metres in an inch, exactly."""
 
 
+_largest_between = jax.jit(largest_between)
+
+
 class FrameSection(SolverKeys):
     """The record and the frame."""
 
@@ -95,12 +98,12 @@ class FrameApplication(AbstractApplication[_Loaded]):
             frame.problem, jnp.zeros(3), frame.times, frame.constants, options, None, "s"
         )  # fmt: skip
 
-    def results(self, model: _Loaded, plan: Plan, solution: Solution) -> Results:
+    def results(self, model: _Loaded, plan: Plan, solution: Solution, count: int) -> Results:
         frame, constants = model.frame, plan.constants
-        bound = certificate(frame.problem, solution, constants)
+        bound = certificate(frame.problem, solution, constants, count)
         between = (len(plan.times) - 1) // (frame.record.samples.shape[0] - 1)
-        d, v, plastic = np.asarray(solution.xs).T
-        ts = np.asarray(solution.ts)
+        d, v, plastic = np.asarray(solution.xs)[:count].T
+        ts = np.asarray(solution.ts)[:count]
         omega = float(frame.omega)
         ground = np.interp(ts, np.asarray(frame.record.knots()), np.asarray(frame.record.samples))
         time, error = ("time",), bound.values / omega
@@ -118,10 +121,12 @@ class FrameApplication(AbstractApplication[_Loaded]):
             si = Variable(time, _INCH * values, unit.replace("in", "m"), f"{words}, in SI units")
             variables[f"{name}_si"] = si
         peak = float(np.max(np.abs(d[::between])))
-        # One compiled program: a run that was interrupted has a length of its own to compile for.
         a = -2.0 * float(frame.damping) * omega * v - spring - ground
         apart = frame.record.step / between
-        top = float(jax.jit(largest_between)(*map(jnp.asarray, (d, v, a)), apart))
+        # Behind its last row a frame stands still.
+        behind = len(plan.times) - count
+        moves = np.pad(d, (0, behind), "edge"), np.pad(v, (0, behind)), np.pad(a, (0, behind))
+        top = float(_largest_between(*map(jnp.asarray, moves), apart))
         largest = bound.largest
         # Every displacement is off by no more than the bound, so its peaks are as well.
         proved = bound.proved(1.0 / omega)
