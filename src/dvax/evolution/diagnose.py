@@ -31,6 +31,7 @@ from .flow import Flow
 from .implicit import Implicit
 from .method import AbstractMethod
 from .nonfinite import first_bad
+from .piecewise.method import PiecewiseLinear
 from .results import RESULTS
 from .runge_kutta import DormandPrince
 from .setup import Setup
@@ -48,11 +49,20 @@ _LINEARISABLE = 400
 """Unknowns up to which `ExpRosenbrock` is the method to name for a stiff problem."""
 
 
+_REFUSED = "refused: "
+_CHECKED = {name: f"Check {name} there" for name in ("K", "h", "f")} | {
+    "A x": "Check A, and how large x becomes",
+    "the response u": "Check how h depends on u: the law has no solution where nothing bounds it",
+}
+
+
 class Diagnosis(NamedTuple):
     """The cause in a sentence or two ("" where there is no evidence), and what helps."""
 
     cause: str = ""
     fixes: tuple[Fix, ...] = ()
+    whole: bool = False
+    """Whether the cause says what happened, too."""
 
 
 class _Stop(NamedTuple):
@@ -90,7 +100,7 @@ def failure(setup: Setup, stats: dict[str, Any], result: RESULTS, solution: Any)
     """The `SolveError` of a run that stopped: what happened, the cause, how far it came, what helps."""
     found = diagnose(setup, stats, result)
     reached = f"Stopped at t = {float(stats['t']):.17g} after {int(stats['steps'])} steps."
-    parts = (RESULTS[result], found.cause, reached)
+    parts = ("" if found.whole else RESULTS[result], found.cause, reached)
     return SolveError(" ".join(part for part in parts if part), solution, found.fixes)
 
 
@@ -103,6 +113,8 @@ def diagnose(setup: Setup, stats: dict[str, Any], result: RESULTS) -> Diagnosis:
     if isinstance(setup.method, Implicit):
         step = t1 - t  # such a run is known up to the last saved time that it reached
     steps, rejected = int(stats["steps"]), int(stats["rejected"])
+    if isinstance(setup.method, PiecewiseLinear):
+        step = (t - t0) / max(steps, 1) or t1 - t0  # its steps are as long as its events are apart
     stop = _Stop(
         setup, setup.flow(), t, stats["x"], min(float(step), max(t1 - t, 0.0)), steps,
         steps + rejected,
@@ -154,7 +166,7 @@ def _nonfinite(stop: _Stop) -> Diagnosis:
             return first_bad(pieces(ahead)[name](), allow_infinite=name == "K")
         except InputError as refused:
             problem = refused.problems[0]
-            return f"refused, {problem.place}: {problem.given}; {problem.rule}"
+            return f"{_REFUSED}{problem.place}: got {problem.given}; {problem.rule}"
 
     far = min(stop.span[1] - stop.t, _LAST_STEPS * max(stop.step, 4.0 * stop.ulp))
     offsets = [0.0, *(far * np.geomspace(1e-12, 1.0, 13))] if far > 0 else [0.0]
@@ -168,11 +180,11 @@ def _nonfinite(stop: _Stop) -> Diagnosis:
             while high - low > max(stop.ulp, 1e-9 * high) and high > 0:
                 middle = 0.5 * (low + high)
                 low, high = (low, middle) if bad(name, middle) else (middle, high)
-            at = stop.t + high
-            return Diagnosis(
-                f"{name} is {bad(name, high) or found} at t = {at:.12g}.",
-                (Fix("", "", f"Check {name.split()[0]} there"),),
-            )
+            at, what = f"at t = {stop.t + high:.12g}", bad(name, high) or found
+            fixes = (Fix("", "", _CHECKED[name]),)
+            if what.startswith(_REFUSED):
+                return Diagnosis(f"{name} is refused {at}: {what[len(_REFUSED) :]}.", fixes, True)
+            return Diagnosis(f"{name} is {what} {at}.", fixes)
         good = float(ahead)
     return Diagnosis()
 
@@ -331,6 +343,12 @@ def _tolerance(stop: _Stop) -> Diagnosis:
     if not asked < possible:
         return Diagnosis()
     reachable = 100.0 * possible * horizon / max(size, 1e-300)
+    speed, (t0, t1) = stop.norm(stop.velocity(stop.time(stop.t), stop.x)), stop.span
+    if speed * (t1 - t0) > 1e9 * (1.0 + size) and stop.t - t0 < 1e-9 * (t1 - t0):
+        return Diagnosis(
+            f"x' is {speed:.3g} next to t = {t0:.12g} while x is {size:.3g}.",
+            (Fix("", "", "Check whether f or h is infinite at the start of the run"),),
+        )
     fix = Fix("rtol", f"{reachable:.1g}", "which rounding allows")
     if reachable > _LOOSEST:
         fix = Fix("t1", f"{stop.span[0] + horizon * _LOOSEST / reachable:.3g}", "a shorter run")

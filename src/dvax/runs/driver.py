@@ -215,7 +215,7 @@ class _Run:
         return interruptible(
             lambda: solve(
                 self.problem, jnp.asarray(piece.x), start, float(ts[-1]), None, ts,
-                dt=s.dt, rtol=s.rtol or 1e-6, atol=s.atol or 1e-9,
+                dt=s.dt, dt_max=s.dt_max, rtol=s.rtol or 1e-6, atol=s.atol or 1e-9,
                 method=_METHODS[s.method](),
                 constants=self.constants, measure=True, max_steps=s.max_steps,
                 dt0=piece.dt, horizon=self.config.time.end, **options,

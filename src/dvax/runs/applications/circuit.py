@@ -21,7 +21,7 @@ from dvax.runs.applications.base import (
 )
 from dvax.runs.applications.certificate import certificate
 from dvax.runs.schema import in_quantity
-from dvax.runs.solver_options import SolverKeys, check_steps, settings
+from dvax.runs.solver_options import SolverKeys, check_steps, event_driven, settings
 
 
 class CircuitSection(SolverKeys):
@@ -74,7 +74,7 @@ class CircuitApplication(AbstractApplication[_Loaded]):
         say(f"solving from 0 to {table.t_end:g} s")
         times = np.linspace(0.0, table.t_end, table.frames + 1)
         # As `dvax.models.Circuit.solve` has them.
-        method = PiecewiseLinear() if table.dt is None else ExpRosenbrock()
+        method = PiecewiseLinear() if event_driven(table) else ExpRosenbrock()
         options = settings(table, method=method, rtol=1e-8, atol=1e-9)
         return Plan(c.problem, c.x0, times, c.constants, options, None, "s")
 

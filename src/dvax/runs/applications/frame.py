@@ -23,7 +23,7 @@ from dvax.runs.applications.base import (
 )
 from dvax.runs.applications.certificate import certificate
 from dvax.runs.schema import in_quantity
-from dvax.runs.solver_options import SolverKeys, check_steps, settings
+from dvax.runs.solver_options import SolverKeys, check_steps, event_driven, settings
 
 _INCH = 0.0254
 """Metres in an inch, exactly."""
@@ -92,7 +92,7 @@ class FrameApplication(AbstractApplication[_Loaded]):
     def plan(self, model: _Loaded, say: Say) -> Plan:
         frame = model.frame
         say("solving over the record")
-        method = PiecewiseLinear() if model.table.dt is None else ExpRosenbrock()
+        method = PiecewiseLinear() if event_driven(model.table) else ExpRosenbrock()
         options = settings(model.table, method=method, rtol=1e-8)
         return Plan(
             frame.problem, jnp.zeros(3), frame.times, frame.constants, options, None, "s"
