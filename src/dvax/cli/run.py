@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dvax._figure_text import figure_text
+from dvax._figure_text import entry_text
 from dvax.cli.ahead import loaded_ahead
 from dvax.cli.failure import reported
 from dvax.cli.load import load
@@ -108,7 +108,7 @@ def _say_figures(summary: dict[str, Any]) -> None:
     for name, entry in summary.items():
         if name == "status":
             continue  # it is the last line, and in the exit code
-        shown = figure_text(entry["value"], entry.get("error"))
+        shown = entry_text(entry)
         unit = "" if entry["unit"] == "1" else entry["unit"]
         rows.append((name, f"{shown} {unit}".strip(), entry["meaning"]))
     if rows:

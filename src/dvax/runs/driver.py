@@ -178,13 +178,13 @@ class _Run:
             b = self._solve(other, start, ts) if beside is None else beside.result()
             bound, values = interruptible(self._values(a, b, error, apart))
             apart = float(values["separation_x"][0]) if apart is None else apart
-            store.mark(("error_bound_x", "error_bound_u", "error_bound_sharp_x"), bound.status)
             assert a.defect is not None
             values["defect"] = defect + np.asarray(a.defect)
             count = len(wanted)
             kept = {name: value[:count] for name, value in values.items()}
+            figures.add(wanted, kept, bound.status)
+            store.mark(("error_bound_x", "error_bound_u", "error_bound_sharp_x"), figures.status)
             store.write(wanted, kept)
-            figures.add(wanted, kept)
             if failure is not None:
                 raise failure
             main, other = self._end(a), self._end(b)

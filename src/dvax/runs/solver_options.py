@@ -78,9 +78,7 @@ def check_steps(table: SolverKeys, span: float, words: str) -> None:
 def event_driven(table: SolverKeys) -> bool:
     """Whether a model that `dvax.PiecewiseLinear` can solve is solved by it: where the file names no
     method, and no option of those that take steps."""
-    return all(
-        value is None for value in (table.method, table.dt, table.dt_max, table.vi_solver)
-    )
+    return all(value is None for value in (table.method, table.dt, table.dt_max, table.vi_solver))
 
 
 def settings(table: SolverKeys, **defaults: Any) -> dict[str, Any]:

@@ -26,7 +26,10 @@ class Euclidean(AbstractSpace):
 
     def __init__(self, shape: int | tuple[int, ...] = ()):
         self.shape = (shape,) if isinstance(shape, int) else tuple(shape)
-        if not all(isinstance(n, int | np.integer) and not isinstance(n, bool) and n > 0 for n in self.shape):
+        if not all(
+            isinstance(n, int | np.integer) and not isinstance(n, bool) and n > 0
+            for n in self.shape
+        ):
             raise InputError(
                 InputProblem(
                     "dvax.spaces.Euclidean(shape)", repr(shape),

@@ -17,23 +17,26 @@ from dvax.theory import Assumption, Constants
 @dataclass(frozen=True)
 class Figure:
     """A headline figure: a number, or a list of them; `error`: a proved bound on its error, or on those
-    of its entries, where there is one."""
+    of its entries, where there is one. A figure that is a bound itself says in `bound` how much is
+    known of it: "proved", "declared" or "estimated"."""
 
     value: Any
     unit: str
     meaning: str
     error: Any = None
+    bound: str | None = None
 
 
 @dataclass(frozen=True)
 class Variable:
     """An array of the results with the names of its dimensions; one named like its dimension is a
-    coordinate."""
+    coordinate. `status`: of a bound, how much is known of it."""
 
     dims: tuple[str, ...]
     values: np.ndarray
     unit: str
     words: str
+    status: str = ""
 
 
 @dataclass(frozen=True)

@@ -104,6 +104,7 @@ class CircuitApplication(AbstractApplication[_Loaded]):
             bound.values,
             "J^(1/2)",
             "bound on the error of the state, ‖x‖² = ΣCv² + ΣLi²",
+            bound.status,
         )
         figures = {
             "final_state": Figure(
@@ -112,6 +113,7 @@ class CircuitApplication(AbstractApplication[_Loaded]):
             "error_bound": Figure(
                 bound.largest, "J^(1/2)",
                 f"bound on the error of the state in the norm of the energy ({bound.status})",
+                bound=bound.status,
             ),
             "decay_rate": Figure(
                 float(c.constants.sharp_decay_rate) + 0.0, "1/s",

@@ -148,6 +148,8 @@ class _Run:
             summary[name] = {"value": _plain(f.value), "unit": f.unit, "meaning": f.meaning}
             if f.error is not None:
                 summary[name]["error"] = _plain(f.error)
+            if f.bound is not None:
+                summary[name]["bound"] = f.bound
         return summary
 
     def _keep(self, results: Results) -> None:
@@ -181,6 +183,7 @@ class _Run:
             **provenance(),
             **process(),
             "model": self.config.name,
+            "title": f"{self.config.name}, {self.config.source.stem}",
             "fit": self.config.application.fit(self.config.model),
             "status": status,
             "stop_reason": reason,
@@ -226,7 +229,8 @@ def write_dataset(path: Path, variables: Mapping[str, Variable], attrs: Mapping[
         values = np.asarray(v.values)
         group.create_array(
             name, data=values, dimension_names=v.dims,
-            attributes={"long_name": v.words, "units": v.unit},
+            attributes={"long_name": v.words, "units": v.unit}
+            | ({"status": v.status} if v.status else {}),
         )  # fmt: skip
 
 

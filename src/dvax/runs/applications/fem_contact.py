@@ -179,6 +179,7 @@ class FemContactApplication(AbstractApplication[_Loaded]):
             "cells": Variable(("cell", "corner"), m.body.cells(), "1", "nodes of each element"),
             "stress": Variable(("cell", "component"), stress, "[p]", "xx, yy, zz, xy at the end"),
         }
+        known = m.constants.status_of("gamma")
         certified = None if rest.vi.error_bound is None else float(rest.vi.error_bound)
         figures = {
             "force": Figure(still["force"], "[p][x]", "force on the punch at rest"),
@@ -195,7 +196,8 @@ class FemContactApplication(AbstractApplication[_Loaded]):
                 "largest difference of the last pressure from that at rest",
             ),
             "rest_error_bound": Figure(
-                certified, "[p][x]^(1/2)", "bound on the error of the pressure at rest, in L2"
+                certified, "[p][x]^(1/2)",
+                f"bound on the error of the pressure at rest, in L2 ({known})", bound=known,
             ),
             "decay_rate": Figure(
                 float(m.constants.sharp_decay_rate), "1/[t]",
@@ -207,9 +209,14 @@ class FemContactApplication(AbstractApplication[_Loaded]):
             figures["error_bound"] = Figure(
                 bound.largest, "([p][x]²)^(1/2)",
                 f"bound on the error of the state in the norm of the viscosity ({bound.status})",
+                bound=bound.status,
             )  # fmt: skip
             variables["error_bound"] = Variable(
-                ("time",), bound.values, "([p][x]²)^(1/2)", "bound on the error of the state"
+                ("time",),
+                bound.values,
+                "([p][x]²)^(1/2)",
+                "bound on the error of the state",
+                bound.status,
             )
 
         def files(directory: Path) -> None:

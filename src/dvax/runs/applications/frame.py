@@ -37,7 +37,9 @@ class FrameSection(SolverKeys):
 
     name: Literal["frame"] = Field(description="the model")
     record: str = Field(description="an .at2 strong-motion record, in units of gravity")
-    period: Annotated[float, in_quantity("time")] = Field(gt=0, description="natural period [s]")
+    period: Annotated[float, in_quantity("time")] = Field(
+        gt=0, le=1e6, description="natural period [s]"
+    )
     damping: float = Field(ge=0, description="of the critical damping")
     yield_ratio: float | None = Field(
         None, gt=0, description="yield force over the largest elastic force; without it: elastic"
@@ -117,8 +119,10 @@ class FrameApplication(AbstractApplication[_Loaded]):
             ("spring", spring, "in/s^2", "force of the spring a mass"),
             ("error_bound", error, "in", "bound on the error of the displacement"),
         ):
-            variables[name] = Variable(time, values, unit, words)
-            si = Variable(time, _INCH * values, unit.replace("in", "m"), f"{words}, in SI units")
+            status = bound.status if name == "error_bound" else ""
+            variables[name] = Variable(time, values, unit, words, status)
+            metres = unit.replace("in", "m")
+            si = Variable(time, _INCH * values, metres, f"{words}, in SI units", status)
             variables[f"{name}_si"] = si
         peak = float(np.max(np.abs(d[::between])))
         a = -2.0 * float(frame.damping) * omega * v - spring - ground
@@ -147,15 +151,20 @@ class FrameApplication(AbstractApplication[_Loaded]):
             lengths["yield_displacement"] = (limit, None, "displacement at which it yields")
             lengths["elastoplastic_distance"] = (
                 float(np.max(np.asarray(frame.elastoplastic_distance(solution)))), None,
-                "bound on how far the displacement is from that of the elastoplastic frame, eta/k = 0",
+                "bound on how far the displacement is from that of the elastoplastic frame, eta/k = 0 "
+                "(estimated, from the velocities that were computed)",
             )  # fmt: skip
-        figures = {n: Figure(value, "in", words, e) for n, (value, e, words) in lengths.items()}
+        bounds = {"error_bound": bound.status, "elastoplastic_distance": "estimated"}
+        figures = {
+            n: Figure(value, "in", words, e, bounds.get(n))
+            for n, (value, e, words) in lengths.items()
+        }
         if np.isfinite(limit):
             figures["ductility"] = Figure(peak / limit, "1", "peak over yield displacement")
         figures |= {
             f"{name}_si": Figure(
                 None if value is None else _INCH * value, "m", f"{words}, in SI units",
-                None if error is None else _INCH * error,
+                None if error is None else _INCH * error, bounds.get(name),
             )
             for name, (value, error, words) in lengths.items()
         }  # fmt: skip

@@ -129,7 +129,11 @@ class MarketApplication(AbstractApplication[_Loaded]):
             variables |= {
                 "sticky_price": Variable(("hour",), sticky, "$/MWh", "price that follows demand"),
                 "error_bound": Variable(
-                    ("hour",), bound.values, "$/MWh", "bound on the error of the sticky price"
+                    ("hour",),
+                    bound.values,
+                    "$/MWh",
+                    "bound on the error of the sticky price",
+                    bound.status,
                 ),
             }
             under_way = largest_gain(sticky, np.asarray(solution.us)[:count], capacity, *numbers)
@@ -148,6 +152,7 @@ class MarketApplication(AbstractApplication[_Loaded]):
                 "error_bound": Figure(
                     bound.largest, "$/MWh",
                     f"bound on the error of the sticky price ({bound.status})",
+                    bound=bound.status,
                 ),
                 "decay_rate": Figure(
                     float(market.constants.sharp_decay_rate), "1/h",

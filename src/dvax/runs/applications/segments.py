@@ -118,7 +118,7 @@ def joined(pieces: list[Solution], count: int | None = None) -> Solution:
             else jtu.tree_map(lambda rows: _padded(rows, count), value)
             for name, value in fields.items()
         }
-    return _with(pieces[0], fields)
+    return _with(pieces[0], fields | {"enclosed": all(piece.enclosed for piece in pieces)})
 
 
 def _padded(rows: Any, count: int) -> jax.Array:

@@ -184,7 +184,9 @@ class TrafficApplication(AbstractApplication[_Loaded]):
             "capacity": Variable(("day", "link"), capacity, "trip", "capacity of each link"),
             "init_node": Variable(("link",), np.asarray(t.network.init_node), "1", "from"),
             "term_node": Variable(("link",), np.asarray(t.network.term_node), "1", "to"),
-            "error_bound": Variable(day, bound.values, "trip", "bound on the error of path flows"),
+            "error_bound": Variable(
+                day, bound.values, "trip", "bound on the error of path flows", bound.status
+            ),
         }
         if model.places is not None:
             variables["place"] = Variable(("node", "axis"), model.places, "1", "places of nodes")
@@ -204,7 +206,8 @@ class TrafficApplication(AbstractApplication[_Loaded]):
                 "share of all cost that would be saved if all took the least cost path of the network",
             ),
             "error_bound": Figure(
-                bound.largest, "trip", f"bound on the error of the path flows, in ℓ² ({bound.status})"
+                bound.largest, "trip", f"bound on the error of the path flows, in ℓ² ({bound.status})",
+                bound=bound.status,
             ),
         }  # fmt: skip
         if np.isfinite(least):
