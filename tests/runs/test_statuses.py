@@ -1,4 +1,4 @@
-"""A bound made from samples is called estimated wherever it is printed, and certified is what is proved."""
+"""A bound made from samples is called estimated everywhere, and only what is proved certified."""
 
 import json
 import re
