@@ -68,6 +68,28 @@ def test_no_jump_ends_a_run_wherever_it_lies(kind, method):
         assert abs(float(run(a)) - exact) <= 10 * RTOL
 
 
+@pytest.mark.parametrize("method", mostly_thorough(METHODS, ["DormandPrince"]))
+@pytest.mark.parametrize("start", [0.0, pytest.param(-3e5, marks=pytest.mark.thorough)])
+def test_hundreds_of_jumps_end_no_run_at_a_tight_tolerance(method, start):
+    """x' = −x ± 1, the sign changing with `floor` every 1/151; x in closed form at the last change."""
+    every = 1.0 / 151.0
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-1.0, 1.0),
+        f=lambda t, x, u, a: 1.0 - 2.0 * jnp.mod(jnp.floor((t - start) / every), 2.0) + 0.0 * u,
+        h=lambda t, x, u, a: -u,
+    )  # fmt: skip
+    # The errors of jumps add up: each is uncertain by the rounding of t.
+    rtol = 1e-10 if start == 0.0 else 1e-6
+    x = dvax.solve(
+        problem, 0.0, start, start + 1.0, 0.0, rtol=rtol, atol=1e-3 * rtol, method=METHODS[method],
+        max_steps=200_000,
+    ).xs[-1]  # fmt: skip
+    exact = 0.0
+    for k in range(151):
+        exact = (-1.0) ** k + (exact - (-1.0) ** k) * np.exp(-every)
+    assert abs(float(x) - exact) <= 10 * rtol
+
+
 @pytest.mark.parametrize(
     ("span", "method"),
     mostly_thorough(

@@ -77,3 +77,21 @@ def test_trials_of_longer_steps_become_rare_where_they_find_nothing():
     trials = np.log2(1 + int(stats["steps"]) / 128)
     assert int(stats["steps"]) > 10_000
     assert int(stats["rejected"]) <= trials + 4
+
+
+def test_a_start_far_from_zero_costs_nothing_where_f_is_steep():
+    # Between neighbours of t at 4·10⁵ this drive moves by 10⁻⁷, more than the tolerance on f.
+    steep = dvax.Problem(
+        A=dvax.generators.Scalar(-90.0),
+        f=lambda t, x, u, start: 2.0 * u,
+        h=lambda t, x, u, start: 150.0 * jnp.sin(13.0 * (t - start)) - 500.0 * x,
+        K=dvax.sets.Box(-0.5, 0.5),
+        P=dvax.operators.Scaling(1.0),
+    )
+    runs = [
+        dvax.solve(steep, jnp.zeros(1), t0, t0 + 0.125, t0, rtol=1e-6, atol=1e-9)
+        for t0 in (0.0, -(2.0**19))
+    ]
+    near, far = (int(run.stats["steps"]) for run in runs)
+    assert far <= 1.05 * near
+    assert abs(float(runs[0].xs[-1, 0] - runs[1].xs[-1, 0])) <= 1e-9

@@ -41,6 +41,7 @@ def main() -> int:
     worst = 0
     print(f"{'problems':>8} {'runs':>5} {'wrong':>5} {'died':>5} {'bound':>5} {'CPU s':>6}  family")
     for family in chosen:
+        jax.clear_caches()  # each family has programs of its own, and memory maps are limited
         begun, runs, failed = time.process_time(), [], []
         for seed in range(asked.first, asked.first + asked.samples):
             bounds = asked.bounds > 0 and seed % asked.bounds == 0

@@ -8,7 +8,7 @@ import numpy as np
 
 import dvax
 
-from .reference import Written
+from .reference import FINEST, Written
 
 Array = np.ndarray[Any, Any]
 
@@ -79,7 +79,7 @@ def tolerance(
 
 def accuracy_for(rtol: float) -> float:
     """Of a reference that a run at this tolerance is held against."""
-    return max(1e-5 * rtol, 3e-12)
+    return max(1e-5 * rtol, FINEST)
 
 
 def unit(rng: Any, n: int) -> Array:

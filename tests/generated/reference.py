@@ -9,6 +9,8 @@ import scipy.integrate
 
 Array = np.ndarray[Any, Any]
 Rate = Callable[[float, Array], Array]
+FINEST = 3e-12
+"""The smallest relative accuracy that SciPy is asked for."""
 
 
 class Written(NamedTuple):
@@ -22,7 +24,7 @@ class Written(NamedTuple):
     breaks: list[float]
     period: float | None = None
     stiff: bool = False
-    accuracy: float = 3e-12
+    accuracy: float = FINEST
 
 
 class NoReference(Exception):

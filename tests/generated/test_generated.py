@@ -4,6 +4,7 @@ tolerance, no bound below the error, and no run that dies.
 `python -m tests.generated` prints a table of all that fails, and runs one problem alone.
 """
 
+import jax
 import numpy as np
 import pytest
 
@@ -40,6 +41,7 @@ def test_few(name):
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", FAMILIES)
 def test_many(name):
+    jax.clear_caches()  # each family has programs of its own, and memory maps are limited
     family = FAMILIES[name]
     check(
         [

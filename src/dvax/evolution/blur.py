@@ -8,6 +8,10 @@ _PATIENCE = 128.0
 """Steps of one length until twice of it is tried, for the first time."""
 
 
+_MOST = 1e4
+"""In tolerances: more is no rounding."""
+
+
 class Blur(NamedTuple):
     """An error of order p falls by 4ᵖ where a step is cut to a quarter. One that falls by less than 2ᵖ
     is rounding (or of a kink that was left behind), and steps may double while they are kept.
@@ -33,7 +37,9 @@ class Blur(NamedTuple):
         keeping one. Each trial that finds nothing doubles the wait: it has cost propagators."""
         ratio = length / jnp.maximum(length, self.longest)
         short = ratio <= 0.25
-        flat = short & (error > 0.1) & (error * error >= self.error * self.error * ratio**order)
+        # An error far above the tolerance that no shorter step lowers is that of a jump.
+        noise = (error > 0.1) & (error < _MOST)
+        flat = short & noise & (error * error >= self.error * self.error * ratio**order)
         anew = short | (ratio == 1.0)
         tries = keep & (calm >= self.wait)
         seen = keep & ((self.level > 0.0) | flat | tries)

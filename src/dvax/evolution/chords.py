@@ -29,6 +29,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr
 from .._jaxpr import bound
 from .._tree import Tree
 from ..vi.structure import CALLS, evaluate
+from .smooth_bounds import BOUNDS, exponential, power
 
 _below_parabola = contextvars.ContextVar("below_parabola", default=False)
 
@@ -177,6 +178,29 @@ def _power(x: Chord, n: int) -> Chord:
     return _smooth(x, lambda v: v**n, jnp.asarray(slope), jnp.asarray(bend))
 
 
+def _power_of(given: list[Any], bind: Callable) -> Chord:
+    """x^c or c^x with a fixed c."""
+    x, c = given
+    if is_chord(x):
+        return _smooth(x, lambda v: bind(v, c), *power(x.lowest, x.highest, c))
+    return _smooth(c, lambda v: bind(x, v), *exponential(c.lowest, c.highest, x))
+
+
+def _remainder(given: list[Any], bind: Callable) -> Chord:
+    """x − c trunc(x/c) with a fixed c: a line with the slope of x while the quotient stays."""
+    x, c = given
+    if not is_chord(x):
+        raise NoEnclosure("rem by what moves")
+    whole = lambda v: jnp.trunc(v / c)  # noqa: E731
+    # Bounds on x that are sums are rounded, and a quotient at a whole number may be either.
+    slack = jnp.where(x.dev == 0.0, 0.0, 2 * jnp.finfo(x.a.dtype).eps * x.largest)
+    stays = whole(x.lowest - slack) == whole(x.highest + slack)
+    stays = stays | ((x.a == x.b) & (x.dev == 0.0))
+    jumps = jnp.inf if _below_parabola.get() else 2.0 * jnp.abs(c)
+    dev = jnp.where(stays, x.dev, x.dev + jumps)
+    return Chord(bind(x.a, c), bind(x.b, c), dev)
+
+
 def _stairs(phi: Callable) -> Callable[[Chord], Chord]:
     """A monotone φ of finitely many values: over the step it stays between those at the extremes."""
 
@@ -189,23 +213,7 @@ def _stairs(phi: Callable) -> Callable[[Chord], Chord]:
     return rule
 
 
-_ONE = jnp.ones_like
 _UNARY: dict[str, Callable[[Chord], Chord]] = {
-    "exp": lambda x: _smooth(x, jnp.exp, jnp.exp(x.highest), jnp.exp(x.highest)),
-    "expm1": lambda x: _smooth(x, jnp.expm1, jnp.exp(x.highest), jnp.exp(x.highest)),
-    "sin": lambda x: _smooth(x, jnp.sin, _ONE(x.a), _ONE(x.a)),
-    "cos": lambda x: _smooth(x, jnp.cos, _ONE(x.a), _ONE(x.a)),
-    # sup|tanh″| = 4/(3√3) < 0.77
-    "tanh": lambda x: _smooth(x, jnp.tanh, _ONE(x.a), 0.77 * _ONE(x.a)),
-    "log": lambda x: _smooth(
-        x, jnp.log, 1 / jnp.maximum(x.lowest, 0.0), 1 / jnp.maximum(x.lowest, 0.0) ** 2
-    ),
-    "sqrt": lambda x: _smooth(
-        x,
-        jnp.sqrt,
-        0.5 / jnp.sqrt(jnp.maximum(x.lowest, 0.0)),
-        0.25 / jnp.maximum(x.lowest, 0.0) ** 1.5,
-    ),
     "abs": lambda x: largest(x, Chord(-x.a, -x.b, x.dev)),
     "neg": lambda x: Chord(-x.a, -x.b, x.dev),
     "square": lambda x: _power(x, 2),
@@ -216,7 +224,7 @@ _UNARY: dict[str, Callable[[Chord], Chord]] = {
 }
 _KEEPING = {
     "broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "slice", "rev",
-    "reduce_sum", "copy", "copy_p", "stop_gradient", "concatenate", "stack",
+    "reduce_sum", "cumsum", "copy", "copy_p", "stop_gradient", "concatenate", "stack",
 }  # fmt: skip
 _COMPARE = {"lt", "le", "gt", "ge", "eq", "ne", "lt_to", "le_to", "eq_to"}
 _ENTRYWISE = {
@@ -277,6 +285,10 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
         return list(map(Chord, *(eqn.primitive.bind(part, **eqn.params) for part in x[0])))
     if name in _UNARY:
         return [_UNARY[name](x[0])]
+    if name in BOUNDS:
+        return [_smooth(x[0], bind, *BOUNDS[name](x[0].lowest, x[0].highest))]
+    if name in ("pow", "rem") and not all(map(is_chord, given)):
+        return [_power_of(given, bind) if name == "pow" else _remainder(given, bind)]
     if name == "integer_pow":
         return [_power(x[0], eqn.params["y"])]
     if name in ("add", "add_any"):

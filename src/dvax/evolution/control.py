@@ -222,7 +222,8 @@ class Adaptive(AbstractController):
         last = self.stops.shape[0] - 1
         stop = jnp.minimum(jnp.where(jumped, state.stop + 1, state.stop), last)
         begin = jnp.where(keep, t1, t0)
-        wanted = jnp.minimum(wanted, self.longest)
+        # A shorter step would not move t.
+        wanted = jnp.minimum(jnp.maximum(wanted, floor), self.longest)
         end = land(begin, wanted, until(ahead, begin, self.stops[stop]))
         # Below this, t itself cannot tell the ends of a step apart; and rounding may spend no more.
         exhausted = rounding & ~roundoff & (state.spare < 1e-3)

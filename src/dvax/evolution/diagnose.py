@@ -41,6 +41,8 @@ _LAST_STEPS = 64.0
 _JUMP, _ROUNDINGS = 1e-7, 1e3
 """A change of a function within two roundings of t is a jump above this part of its size, or so many
 of its own roundings."""
+_STAIR = 1e-3
+"""Part of the size of a function below which many jumps of it are taken for rounding."""
 _LOOSEST = 0.01
 """The loosest rtol that is ever named as a fix."""
 _DENSE = 64
@@ -219,7 +221,8 @@ def _jump(stop: _Stop) -> Diagnosis:
         left, right = max((low, a), (b, high), key=lambda part: part[1] - part[0])
         middle = 0.5 * (left + right)
         beside = [_narrow(values, *part, stop.ulp) for part in ((left, middle), (middle, right))]
-        if all(_change(*found[2:])[0] > 0.25 * change for found in beside):
+        many = all(_change(*found[2:])[0] > 0.25 * change for found in beside)
+        if many and change < _STAIR * size:
             return _stairs(stop, name, change, b)
         where = f" in component {k}" if before.size > 1 else ""
         return Diagnosis(

@@ -209,7 +209,7 @@ class Stepper(eqx.Module):
         error, impulse, kink, excursion, extent = None, (0.0, 0.0), None, None, None
         variation = memory.variation
         if self.measure:
-            sample = self._measure(t0, t1, arc, visits)
+            sample = self._measure(t0, t1, arc, visits, jumped)
             error, impulse = sample.error, (sample.defect, sample.law_defect)
             extent = sample.extent if self.ranged else None
             if self.locate:
@@ -322,7 +322,7 @@ class Stepper(eqx.Module):
         between = [inside(self.flow, t1 - t0, theta, x0, c) for theta in self.method.samples]
         points = [x0, *between, x1]
         _, visits = evaluated(self.flow, run, self.ends[0], x0, guess, None, True)
-        sample = self._measure(t0, t1, Arc(t1 - t0, x0, x1, c), visits)
+        sample = self._measure(t0, t1, Arc(t1 - t0, x0, x1, c), visits, True)
         solved = jnp.all(jnp.stack([visit.rate.solved for visit in visits]))
         return sample._replace(rates=[]), solved
 
@@ -332,12 +332,16 @@ class Stepper(eqx.Module):
             return rate
         return rate._replace(y=None, z=rate.z if self.locate else None)
 
-    def _measure(self, t0: Any, t1: Any, arc: Arc, visits: list[Visit]) -> Sample:
+    def _measure(self, t0: Any, t1: Any, arc: Arc, visits: list[Visit], jumped: Any) -> Sample:
         if not self.flow.enclosed:
             x0, c = values((arc.x0, arc.c))
-            return sampled(self.flow, self.method.samples, arc.h, x0, c, visits)
+            return sampled(self.flow, self.method, arc.h, x0, c, visits)
         assert self.growth is not None
-        ends = self._within(t0, t1, 0.0), self._within(t0, t1, 1.0)
+        # A rate that the step before made was made where that one ended: a few roundings of t earlier,
+        # which a steep f tells apart.
+        begin = self._within(t0, t1, 0.0)
+        begin = jnp.where(jumped, begin, 2.0 * t0 - begin)
+        ends = begin, self._within(t0, t1, 1.0)
         return enclosed(self.flow, self.growth, ends, arc, visits[-1].rate)
 
 

@@ -1,0 +1,113 @@
+"""sup|φ′| and sup|φ″| of the smooth functions of one variable over an interval [low, high].
+
+They are what chord arithmetic needs of a smooth φ (`chords`). Where φ is not smooth or not defined in
+the interval the bounds are infinite.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+Bounds = Callable[[jax.Array, jax.Array], tuple[Any, Any]]
+
+
+def _everywhere(slope: float, bend: float) -> Bounds:
+    return lambda low, high: (jnp.full_like(low, slope), jnp.full_like(low, bend))
+
+
+def _size(low: jax.Array, high: jax.Array) -> jax.Array:
+    return jnp.maximum(jnp.abs(low), jnp.abs(high))
+
+
+def _nearest(low: jax.Array, high: jax.Array) -> jax.Array:
+    """The distance of the interval from zero."""
+    return jnp.where(low > 0, low, jnp.where(high < 0, -high, 0.0))
+
+
+def _above(least: float, slope: Callable, bend: Callable) -> Bounds:
+    """For φ on (least, ∞) with |φ′| and |φ″| falling in x − least."""
+
+    def bounds(low: jax.Array, high: jax.Array) -> tuple[Any, Any]:
+        apart = jnp.maximum(low - least, 0.0)
+        return slope(apart), bend(apart)
+
+    return bounds
+
+
+def _within_one(slope: Callable, bend: Callable) -> Bounds:
+    """For φ on (−1, 1) with |φ′| and |φ″| growing in |x|, as functions of that and of 1 − x²."""
+
+    def bounds(low: jax.Array, high: jax.Array) -> tuple[Any, Any]:
+        m = jnp.minimum(_size(low, high), 1.0)
+        left = (1.0 - m) * (1.0 + m)
+        return slope(m, left), jnp.where(left > 0.0, bend(m, left), jnp.inf)
+
+    return bounds
+
+
+def _tan(low: jax.Array, high: jax.Array) -> tuple[Any, Any]:
+    branch = lambda v: jnp.floor(v / math.pi + 0.5)  # noqa: E731
+    # A pole that rounding may have moved into the interval counts as in it.
+    slack = 1e-6 * (1.0 + _size(low, high))
+    one = branch(low - slack) == branch(high + slack)
+    largest = _size(jnp.tan(low), jnp.tan(high))
+    slope = 1.0 + largest**2
+    return jnp.where(one, slope, jnp.inf), jnp.where(one, 2.0 * largest * slope, jnp.inf)
+
+
+def power(low: jax.Array, high: jax.Array, c: Any) -> tuple[Any, Any]:
+    """Of x^c with any fixed c, for x ≥ 0."""
+    low = jnp.maximum(low, jnp.where(low < 0.0, jnp.nan, 0.0))
+
+    def most(p: Any, factor: Any) -> jax.Array:
+        worst = jnp.abs(factor) * jnp.maximum(low**p, high**p)
+        return jnp.where(factor == 0.0, 0.0, jnp.where(jnp.isnan(worst), jnp.inf, worst))
+
+    return most(c - 1.0, c), most(c - 2.0, c * (c - 1.0))
+
+
+def exponential(low: jax.Array, high: jax.Array, base: Any) -> tuple[Any, Any]:
+    """Of base^x with any fixed base."""
+    rate = jnp.log(base)
+    most = jnp.maximum(base**low, base**high)
+    slope, bend = jnp.abs(rate) * most, rate**2 * most
+    good = jnp.isfinite(rate)
+    return jnp.where(good, slope, jnp.inf), jnp.where(good, bend, jnp.inf)
+
+
+_E = lambda low, high: (jnp.exp(high), jnp.exp(high))  # noqa: E731
+_HYPERBOLIC = (lambda m: jnp.cosh(m), lambda m: jnp.sinh(m))
+
+BOUNDS: dict[str, Bounds] = {
+    "exp": _E,
+    "expm1": _E,
+    "exp2": lambda low, high: (math.log(2) * 2.0**high, math.log(2) ** 2 * 2.0**high),
+    "log": _above(0.0, lambda d: 1.0 / d, lambda d: 1.0 / d**2),
+    "log1p": _above(-1.0, lambda d: 1.0 / d, lambda d: 1.0 / d**2),
+    "sqrt": _above(0.0, lambda d: 0.5 / jnp.sqrt(d), lambda d: 0.25 / d**1.5),
+    "rsqrt": _above(0.0, lambda d: 0.5 / d**1.5, lambda d: 0.75 / d**2.5),
+    "cbrt": lambda low, high: (
+        _nearest(low, high) ** (-2 / 3) / 3, 2 / 9 * _nearest(low, high) ** (-5 / 3),
+    ),
+    "sin": _everywhere(1.0, 1.0),
+    "cos": _everywhere(1.0, 1.0),
+    "tan": _tan,
+    "asin": _within_one(lambda m, left: left**-0.5, lambda m, left: m * left**-1.5),
+    "acos": _within_one(lambda m, left: left**-0.5, lambda m, left: m * left**-1.5),
+    "atan": _everywhere(1.0, 0.65),  # 3√3/8
+    "sinh": lambda low, high: tuple(f(_size(low, high)) for f in _HYPERBOLIC),
+    "cosh": lambda low, high: tuple(f(_size(low, high)) for f in _HYPERBOLIC[::-1]),
+    "tanh": _everywhere(1.0, 0.77),  # 4/(3√3)
+    "asinh": _everywhere(1.0, 0.385),  # 2/(3√3)
+    "acosh": _above(
+        1.0, lambda d: (d * (2.0 + d)) ** -0.5, lambda d: (1.0 + d) * (d * (2.0 + d)) ** -1.5
+    ),
+    "atanh": _within_one(lambda m, left: 1.0 / left, lambda m, left: 2.0 * m / left**2),
+    "logistic": _everywhere(0.25, 0.0963),  # 1/(6√3)
+    "erf": _everywhere(1.1284, 0.968),  # 2/√π, and 2√2/√(πe)
+    "erfc": _everywhere(1.1284, 0.968),
+}  # fmt: skip
+"""By the names of JAX's primitives."""
