@@ -130,7 +130,8 @@ class _Run:
         self.steps += int(piece.stats["steps"])
         begin, t = float(plan.times[0]), float(piece.ts[-1])
         self._event(
-            "progress", t=t - begin, t_end=float(plan.times[-1]) - begin, steps=self.steps
+            "progress", t=t - begin, t_end=float(plan.times[-1]) - begin, steps=self.steps,
+            unit=plan.time_unit,
         )  # fmt: skip
 
     @staticmethod
