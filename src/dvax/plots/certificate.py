@@ -7,6 +7,7 @@ import plotly.graph_objects as go
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from dvax._figure_text import entry_text
 from dvax.plots.lines import positive, thin
 from dvax.plots.look import (
     BLUE,
@@ -17,8 +18,8 @@ from dvax.plots.look import (
     VERMILLION,
     axis_title,
     blank,
-    quantity,
     still_axes,
+    unit_text,
 )
 from dvax.plots.picture import Picture
 from dvax.plots.record import RunRecord
@@ -125,7 +126,8 @@ def _caption(run: RunRecord, held: list[str]) -> str:
         if name in held:
             value = float(run.series(name)[-1])
             what = "x" if name.endswith("x") else "u"
-            parts.append(f"At the last frame, for {what}: {quantity(value, run.unit(name))}.")
+            shown = entry_text({"value": value, "bound": True})
+            parts.append(f"At the last frame, for {what}: {shown} {unit_text(run.unit(name))}.")
     if any((run.series(name) <= 0).any() for name in held):
         parts.append(
             "Zero (exact at a frame, such as the given initial state) has no place on a "

@@ -97,10 +97,10 @@ class Figures:
              "‖x1 − x2‖ of the two trajectories at the end"),
             ("steps", steps, "1", "accepted time steps"),
         ]  # fmt: skip
-        bounds = dict.fromkeys(
+        bounds: dict[str, str] = {"law_error": of_law}
+        bounds |= dict.fromkeys(
             ("error_bound_x", "error_bound_sharp_x", "error_bound_u"), self.status
         )
-        bounds["law_error"] = of_law
         return {
             name: {"value": value, "unit": unit, "meaning": meaning}
             | ({"bound": bounds[name]} if name in bounds else {})

@@ -230,8 +230,9 @@ def write_dataset(path: Path, variables: Mapping[str, Variable], attrs: Mapping[
         values = np.asarray(v.values)
         group.create_array(
             name, data=values, dimension_names=v.dims,
-            attributes={"long_name": v.words, "units": v.unit}
-            | ({"status": v.status} if v.status else {}),
+            attributes={
+                "long_name": v.words, "units": v.unit, **({"status": v.status} if v.status else {}),
+            },
         )  # fmt: skip
 
 

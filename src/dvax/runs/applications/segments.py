@@ -112,12 +112,13 @@ def joined(pieces: list[Solution], count: int | None = None) -> Solution:
     }
     fields["stats"] = {**last, **counts}
     if count is not None:
-        fields = {
-            name: value
-            if name == "stats"
-            else jtu.tree_map(lambda rows: _padded(rows, count), value)
-            for name, value in fields.items()
-        }
+        length = count
+
+        def whole(rows: Any) -> jax.Array:
+            return _padded(rows, length)
+
+        stats = fields.pop("stats")
+        fields = {**jtu.tree_map(whole, fields), "stats": stats}
     return _with(pieces[0], fields | {"enclosed": all(piece.enclosed for piece in pieces)})
 
 
