@@ -20,7 +20,7 @@ print(json.dumps([ended, worked, usage.ru_maxrss, os.waitstatus_to_exitcode(stat
 """A process of its own between this one and the program: Linux counts the memory of whoever starts
 a process as that process's own peak, and this one holds arrays of 10⁶ points."""
 
-_MAIN = "from dvax.cli import main; main()"
+MAIN = "from dvax.cli import main; main()"
 
 
 class Ended(NamedTuple):
@@ -38,7 +38,7 @@ def dvax(arguments: Sequence[str], folder: Path) -> Ended:
     **Raises:** `RuntimeError`, with what it printed, where it fails.
     """
     script = Path(sys.executable).with_name("dvax")
-    program = [str(script)] if script.is_file() else [sys.executable, "-c", _MAIN]
+    program = [str(script)] if script.is_file() else [sys.executable, "-c", MAIN]
     return run([*program, *arguments], folder)
 
 

@@ -146,6 +146,25 @@ FUNCTIONS = {
         ),
         "control_space=dvax.spaces.Euclidean(())",
     ),
+    "a flag": (lambda: of_f(lambda t, x, u, args: x > 0), "newcomer.py, line; jnp.where(condition"),
+    "single precision": (
+        lambda: of_f(lambda t, x, u, args: jnp.float32(2.0) * u.astype(jnp.float32)),
+        "Problem(f), ; a value of float32; of float64; jnp.float64",
+    ),
+    "single precision in args": (
+        lambda: of_f(lambda t, x, u, args: args * u, args=jnp.float32(1.0)),
+        "Problem(f), ; a value of float32; of float64",
+    ),
+    "a class for A": (lambda: problem(A=generators.Scalar), "Problem(A); a generator"),
+    "a class for K": (lambda: problem(K=sets.Box), "Problem(K); a set"),
+    "a table without order, made inside": (
+        lambda: of_f(lambda t, x, u, a: signals.Table(jnp.array([1.0, 0.0]), jnp.ones(2))(t) - u),
+        "Table(times); times[0] = 1, times[1] = 0; increase strictly",
+    ),
+    "a short table, made inside": (
+        lambda: of_f(lambda t, x, u, a: signals.Table(jnp.array([0.0, 0.5]), jnp.ones(2))(t) - u),
+        "a Table in f; from t = 0 to 0.5; [0, 1]",
+    ),
     "short table": (
         lambda: of_f(lambda t, x, u, a: SHORT(t) - u),
         "a Table in f; from t = 0 to 0.5; [0, 1]",
@@ -274,6 +293,32 @@ ARGUMENTS = {
         ),
         "Contact; model.problem",
     ),
+    "K single, x0 double": (
+        lambda: solve(problem(K=sets.Box(jnp.float32(0.0), jnp.float32(0.5)))),
+        "Problem(K); data of float32; of float64; jnp.float64",
+    ),
+    "P single, x0 double": (
+        lambda: solve(problem(P=operators.Scaling(jnp.float32(2.0)))),
+        "Problem(P); data of float32; of float64",
+    ),
+    "bounds of two shapes": (lambda: sets.Box(jnp.zeros(2), jnp.ones(3)), "shapes (2,) and (3,)"),
+    "P infinite": (lambda: operators.Scaling(inf), "Scaling(b); inf; bounded"),
+    "dt and dt_max": (lambda: solve(dt=0.1, dt_max=0.2), "(dt_max); with dt all steps; Leave out"),
+    "dt and dt0": (lambda: solve(dt=0.1, dt0=0.2), "(dt0); with dt all steps; Leave out"),
+    "dt_max tiny": (lambda: solve(dt_max=1e-12), "(dt_max); max_steps = 1048576; 9.5e-07 or more"),
+    "dt_max of events": (
+        lambda: solve(method=dvax.PiecewiseLinear(), dt_max=0.1),
+        "(dt_max); from one change of the constraints",
+    ),
+    "vi_solver of events": (
+        lambda: solve(method=dvax.PiecewiseLinear(), vi_solver=dvax.vi.Auto()),
+        "(vi_solver); closed form",
+    ),
+    "progress text": (lambda: solve(progress="yes"), "(progress); 'yes'"),
+    "table of text": (lambda: signals.Table("a", "b"), "Table(times); 'a'; numbers"),
+    "space of a negative number": (lambda: dvax.spaces.Euclidean(-1), "Euclidean(shape); -1"),
+    "space of text in a tuple": (lambda: dvax.spaces.Euclidean(("a",)), "Euclidean(shape); ('a',)"),
+    "response at text": (lambda: PLAIN.response("a", 0.1), "t; str 'a'"),
     "P of another size": (
         lambda: solve(
             problem(
@@ -306,6 +351,14 @@ VERIFY = {
     "moduli in a list": (lambda: verify(declared=[1]), "verify(declared); 'list'"),
     "A NaN": (lambda: verify(problem(A=generators.Scalar(nan))), "Problem(A); nan"),
     "args NaN": (lambda: verify(problem(f=lambda t, x, u, a: a * u), args=nan), "(args); nan"),
+    "bound of nothing": (
+        lambda: dvax.bound_error(PLAIN, None, verify().constants),
+        "bound_error(sol); NoneType; what dvax.solve returned",
+    ),
+    "bound without constants": (
+        lambda: dvax.bound_error(PLAIN, solve(), None),
+        "bound_error(constants); NoneType; dvax.verify(problem, x0).constants",
+    ),
     "parameters, t0 text": (lambda: dvax.parameter_bounds(PLAIN, 0.0, 1.0, t0="a"), "'a'"),
 }
 CASES = {"functions": FUNCTIONS, "arguments": ARGUMENTS, "verify": VERIFY}

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.plots.synthetic import Recipe, write_run
 
-from dvax._figure_text import figure_text
+from dvax._figure_text import entry_text, figure_text
 from dvax.cli.run import _say_figures
 from dvax.plots import build_report
 
@@ -41,19 +41,47 @@ def test_particular_figures() -> None:
     assert figure_text(2.5, 0.0) == "2.5"
 
 
+@given(st.floats(min_value=1e-280, max_value=1e280))
+def test_two_digits_of_a_bound_rounded_up(value: float) -> None:
+    shown = entry_text({"value": value, "bound": "estimated"})
+    assert shown.startswith("≤ ")
+    told = float(shown.removeprefix("≤ "))
+    assert value <= told * (1 + 1e-12) <= 1.11 * value
+    digits = shown.removeprefix("≤ ").split("e")[0].replace(".", "").strip("0")
+    assert len(digits) <= 2
+
+
+def test_particular_bounds() -> None:
+    texts = [
+        entry_text({"value": value, "bound": "proved"})
+        for value in (1065.322453, 0.3101843489, 2.3316511e-11, 0.0, 99.1)
+    ]
+    assert texts == ["≤ 1100", "≤ 0.32", "≤ 2.4e-11", "0", "≤ 100"]
+    assert entry_text({"value": None, "bound": "estimated"}) == "not known"
+
+
 def test_terminal_page_and_file_agree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), frames=21))
     summary = {
         "objective": {"value": 4231335.287107123, "unit": "trip cost", "meaning": "no error"},
         "peak": {"value": 2.676123456789, "unit": "in", "meaning": "certified", "error": 3.1e-5},
+        "bound": {
+            "value": 3.1415e-7,
+            "unit": "MPa mm",
+            "meaning": "(estimated)",
+            "bound": "estimated",
+        },
         "tiny": {"value": -1.23456789012345e-13, "unit": "1", "meaning": "small"},
     }
     (run_dir / "summary.json").write_text(json.dumps(summary))
     _say_figures(summary)
     said = capsys.readouterr().out
     page = build_report(run_dir, stills=False).read_text(encoding="utf-8")
-    cards = re.findall(r'<div class="value" title="([^"]*)">([^<]*)</div>', page)
-    assert len(cards) == 3
+    cards = re.findall(r'<div class="value" title="([^"]*)">(.*?)</div>', page)
+    assert len(cards) == 4
+    # A unit never breaks.
+    assert re.search(r"3\.2e-07 <span class=\"unit\">MPa mm</span>", page)
+    assert re.search(r"\.unit \{[^}]*white-space: nowrap", page)
     for (whole, shown), entry in zip(cards, summary.values(), strict=True):
-        text = figure_text(entry["value"], entry.get("error"))
+        text = entry_text(entry)
         assert text in said and shown.startswith(text) and float(whole) == entry["value"]

@@ -17,6 +17,7 @@ CASES = (
     "derivatives",
     "memory",
     "processes",
+    "signals",
     "simplices",
     "traffic",
     "box_vi",

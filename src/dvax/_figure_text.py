@@ -1,12 +1,25 @@
 """How a headline figure reads: the same text on the terminal and on the page of the report."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 DIGITS = 10
 """Digits of a figure of which no error is known."""
 _FEW = 4
 """So many entries of a list are shown; all of them are in summary.json."""
+
+
+def entry_text(entry: Mapping[str, Any]) -> str:
+    """The value of an entry of summary.json: with `bound`, two digits of it, rounded up."""
+    value = entry.get("value")
+    if entry.get("bound") is None or not isinstance(value, float) or not math.isfinite(value):
+        return figure_text(value, entry.get("error"))
+    if not value > 0:
+        return figure_text(value)
+    above = _above(value)
+    decimals = max(0, 1 - math.floor(math.log10(above)))
+    return f"≤ {above:.{decimals}f}" if 1e-3 <= above < 1e6 else f"≤ {_short(above)}"
 
 
 def figure_text(value: Any, error: Any = None) -> str:
@@ -36,7 +49,11 @@ def figure_text(value: Any, error: Any = None) -> str:
     place = math.floor(math.log10(error))  # of the first digit of the error
     leading = math.floor(math.log10(abs(value))) if value else place
     digits = min(17, max(1, leading - place + 1))
-    return f"{value:.{digits}g} ± {_above(error):.1e}".replace(".0e", "e")
+    return f"{value:.{digits}g} ± {_short(_above(error))}"
+
+
+def _short(error: float) -> str:
+    return f"{error:.1e}".replace(".0e", "e")
 
 
 def _above(error: float) -> float:

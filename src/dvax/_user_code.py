@@ -80,29 +80,39 @@ def check_values(name: str, fn: Callable[..., Any], out: Any, x: Any) -> None:
                     "Return its real part, or take real and imaginary part as two components",
                 )
             )  # fmt: skip
-        if common != wide:
-            raise _too_narrow(f"{at}, {_place(fn)}", f"a value of {common}", wide)
+        if _is_flag(leaf):
+            raise InputError(
+                InputProblem(
+                    f"{at}, {_place(fn)}", "a value of bool", f"{name}(t, x, u, args) is a number",
+                    "Say which: jnp.where(condition, 1.0, 0.0)",
+                )
+            )  # fmt: skip
+        if (own := _dtype(leaf, wide)) != wide:
+            raise _other_precision(f"{at}, {_place(fn)}", f"a value of {jnp.dtype(own)}", own, wide)
 
 
 def check_precision(name: str, data: Any, x: Any) -> None:
-    """Raise an `InputError` where an array in `data` is of a wider type than the state: arithmetic
-    would change the type of the state at the first step."""
+    """Raise an `InputError` where an array in `data` is of another type than the state: arithmetic
+    would change the type of the state at the first step, or lose half of its digits."""
     wide = jnp.result_type(*jtu.tree_leaves(x))
     for leaf in jtu.tree_leaves(data):
         if isinstance(leaf, jax.Array) and leaf.dtype.kind == "f":
-            common = jnp.promote_types(wide, _dtype(leaf, wide))
-            if common != wide:
-                raise _too_narrow(f"dvax.Problem({name})", f"data of {common}", wide)
+            own = _dtype(leaf, wide)
+            if own != wide:
+                place = f"dvax.Problem({name})"
+                raise _other_precision(place, f"data of {jnp.dtype(own)}", own, wide)
 
 
-def _too_narrow(place: str, given: str, wide: Any) -> InputError:
-    return InputError(
-        InputProblem(
-            place, given,
-            f"the state x0 is of {jnp.dtype(wide).name}, and nothing is converted unasked",
-            "Give x0 in that type, jnp.asarray(x0, float) in double precision, or the data in x0's",
-        )
-    )  # fmt: skip
+def _other_precision(place: str, given: str, own: Any, wide: Any) -> InputError:
+    fix = "Give x0 in that type, jnp.asarray(x0, float) in double precision, or the data in x0's"
+    if jnp.promote_types(own, wide) == wide:
+        fix = f"Give the data in that type: jnp.asarray(..., jnp.{jnp.dtype(wide).name})"
+    rule = f"the state x0 is of {jnp.dtype(wide).name}, and nothing is converted unasked"
+    return InputError(InputProblem(place, given, rule, fix))
+
+
+def _is_flag(leaf: Any) -> bool:
+    return isinstance(leaf, bool) or getattr(leaf, "dtype", None) == np.dtype(bool)
 
 
 def _dtype(leaf: Any, wide: Any) -> Any:

@@ -99,7 +99,8 @@ class Problem(eqx.Module):
                 ("P", self.P, AbstractOperator, "an operator", "args", "operators"),
                 ("K", self.K, AbstractSet, "a set", "(t, args)", "sets"),
             )
-            if not isinstance(value, kind) and not callable(value)
+            if not isinstance(value, kind)
+            and (not callable(value) or (isinstance(value, type) and issubclass(value, kind)))
         ]
         wrong += [
             InputProblem(
@@ -174,6 +175,7 @@ class Problem(eqx.Module):
     ) -> Tree:
         """The state-to-control map u_x(t) (paper, lem:unique_u), solved to 1e-10 in residual."""
         x = _tree.as_float(x, "x")
+        t = _tree.as_float(t, "t")
         self.check(t, x, args)
         return self.operator(args).inverse(self.law(t, x, args, solver=solver).y)
 
@@ -267,14 +269,7 @@ class Problem(eqx.Module):
 
         **Raises:** `dvax.InputError` where some data does not cover [t0, t1].
         """
-        u = self.zero_control(x)
-
-        evaluations: dict[str, Callable[[Any, Tree, Tree], Any]] = {
-            "K": lambda t, x, u: self.set_at(t, args),
-            "f": lambda t, x, u: self.f(t, x, u, args),
-            "h": lambda t, x, u: self.h(t, x, u, args),
-        }
-        heard = {}
+        u, evaluations, heard = self.zero_control(x), self._evaluations(args), {}
 
         def listener(t: Any, x: Tree, u: Tree) -> list[Any]:
             for name, evaluate in evaluations.items():
@@ -314,6 +309,27 @@ class Problem(eqx.Module):
             return every[kept]
         # Traced knots cannot be dropped, so the others become the end, where a step ends anyway.
         return jnp.sort(jnp.where(kept, every, t1))
+
+    def check_data(self, t0: Any, t1: Any, x: Tree, args: Any = None) -> None:
+        """Evaluate K, f and h at (t0, x) untraced, where data that they make themselves has values.
+
+        **Raises:** `dvax.InputError` where such data is refused, or does not cover [t0, t1].
+        """
+        if not _tree.is_concrete(t0, t1, x, args):
+            return
+        t, u, heard = jnp.asarray(t0, jnp.result_type(float)), self.zero_control(x), {}
+        for name, evaluate in self._evaluations(args).items():
+            with listen(t) as heard[name]:
+                evaluate(t, x, u)
+        _check_spans([(*span, name) for name in heard for span in heard[name].spans], t0, t1)
+
+    def _evaluations(self, args: Any) -> dict[str, Callable[[Any, Tree, Tree], Any]]:
+        """K, f and h as functions of (t, x, u)."""
+        return {
+            "K": lambda t, x, u: self.set_at(t, args),
+            "f": lambda t, x, u: self.f(t, x, u, args),
+            "h": lambda t, x, u: self.h(t, x, u, args),
+        }
 
     def zero_control(self, x: Tree) -> Tree:
         """The zero of the control space, in the floating type of x."""

@@ -73,3 +73,10 @@ def test_a_terminal_gets_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "compiled in 1.2 s" in shown
     assert "100 %" in shown and "t = 2 s, 100 steps" in shown
     assert "warning: the [bold] step shrank" in shown
+
+
+def test_a_model_names_its_own_unit_or_none(capsys: pytest.CaptureFixture[str]) -> None:
+    for unit, shown in (("days", "t = 1 of 2 days (50%)"), ("", "t = 1 of 2 (50%)")):
+        with progress("", quiet=False) as listener:
+            listener({"event": "progress", "t": 1.0, "t_end": 2.0, "steps": 3, "unit": unit})
+        assert capsys.readouterr().err.startswith(shown)

@@ -64,7 +64,7 @@ def refused(config: Path, out: Path, *named: str) -> str:
         assert result.exit_code == 2, result.output
         assert result.stdout == ""
         assert "Traceback" not in result.output
-        for text in (*named, "given:", "rule:", "mend:"):
+        for text in (*named, "given:", "rule:", "fix:"):
             assert text in result.stderr
     assert sorted(out.parent.rglob("*")) == before
     return result.stderr
@@ -113,5 +113,5 @@ def test_a_plain_pipe_gets_one_line_a_fact(tmp_path: Path) -> None:
     text = refused(config, tmp_path / "out", "model.kappa0")
     lines = [line for line in text.splitlines() if line]
     assert lines[0] == "error: 1 problem in the input; nothing was written"
-    assert [line.split(":")[0].strip() for line in lines[2:]] == ["given", "rule", "mend"]
+    assert [line.split(":")[0].strip() for line in lines[2:]] == ["given", "rule", "fix"]
     assert "\x1b" not in text

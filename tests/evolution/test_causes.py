@@ -198,3 +198,36 @@ def test_where_the_state_fits_u_has_its_shape():
         f=lambda t, x, u, args: -u, h=lambda t, x, u, args: x,
     )  # fmt: skip
     assert square.zero_control(jnp.zeros(4)).shape == (4,)
+
+
+EMPTIED = [
+    lambda t, a: sets.Box(0.0, 0.5 - t),
+    lambda t, a: sets.Box(t - 0.5, 0.0),
+    lambda t, a: sets.Box(0.0, jnp.abs(t - 0.5001) - 1e-4),
+    lambda t, a: sets.Box(0.0, jnp.where((t > 0.5) & (t < 0.5001), -1.0, 1.0)),
+    lambda t, a: sets.Ball(0.0, 0.5 - t),
+]
+
+
+@pytest.mark.parametrize(
+    ("K", "method"),
+    mostly_thorough(
+        [
+            (K, method)
+            for K in EMPTIED
+            for method in (dvax.ETD2RK(), dvax.DormandPrince(), dvax.ETD4RK())
+        ],
+        [(EMPTIED[0], dvax.ETD2RK())],
+    ),
+)
+def test_a_set_that_becomes_empty_is_told_with_its_time(K, method):
+    error = failure(make(lambda t, x, u, args: u - x, K=K), x0=0.1, t1=1.0, method=method)
+    # Of no value that is not finite: the set is refused, by its own words.
+    assert str(error).startswith("K is refused at t = 0.5")
+    assert "empty" in error.cause and "Check K there." in str(error)
+
+
+def test_what_is_infinite_at_the_start_is_said_so():
+    error = failure(make(lambda t, x, u, args: 1.0 / t), x0=0.1, t1=1.0)
+    assert "next to t = 0 " in error.cause or "f is inf" in error.cause
+    assert "t1" not in fixes(error)

@@ -189,7 +189,7 @@ from dvax.runs.applications.circuit import CircuitApplication
 
 def endless(self, *given):
     print("endless", file=sys.stderr, flush=True)
-    loop = jax.jit(lambda x: jax.lax.while_loop(lambda v: v < 2.0, lambda v: v * 1.0, x))
+    loop = jax.jit(lambda x: jax.lax.while_loop(lambda v: v < 2.0, lambda v: 1.5 - v, x))
     return loop(1.0).block_until_ready()
 
 setattr(CircuitApplication, sys.argv.pop(1), endless)

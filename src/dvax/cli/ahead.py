@@ -4,25 +4,28 @@ Plotly and Matplotlib take a second or two to import. Compiling the time loop ta
 no Python, so that both go on side by side.
 """
 
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import suppress
 from importlib import import_module
+from threading import Thread
 
 from dvax.cli.progress import Event, Listener
 
 
-@contextmanager
-def loaded_ahead(module: str, listener: Listener) -> Iterator[Listener]:
+def loaded_ahead(module: str, listener: Listener) -> Listener:
     """A listener in the place of `listener` that imports `module` once the run compiles.
 
     What goes wrong there goes wrong again, and is said, where the module is used.
     """
-    with ThreadPoolExecutor(1) as pool:
 
-        def listen(event: Event) -> None:
-            if event["event"] == "compiling":
-                pool.submit(import_module, module)
-            listener(event)
+    def listen(event: Event) -> None:
+        if event["event"] == "compiling":
+            # Nobody waits for it: who needs the module imports it, and waits for this import then.
+            Thread(target=_load, args=(module,), name="dvax load", daemon=True).start()
+        listener(event)
 
-        yield listen
+    return listen
+
+
+def _load(module: str) -> None:
+    with suppress(Exception):
+        import_module(module)

@@ -7,8 +7,8 @@ import typer
 
 from dvax.cli.constants import constant_rows
 from dvax.cli.failure import OUT_OF_CLASS, reported
+from dvax.cli.load import load
 from dvax.cli.options import AllowOutside, ConfigFile, Debug
-from dvax.cli.precision import enable_double
 from dvax.cli.sizes import sizes
 from dvax.cli.talk import complain, remark, say, table
 from dvax.cli.verdicts import outside_the_class, verdicts
@@ -29,13 +29,13 @@ def check(
 ) -> None:
     """Check CONFIG.toml and its data: constants, assumptions, sizes. Nothing is written."""
     with reported(debug):
-        enable_double()
-        from dvax.runs.applications.config import ModelConfig, read_config
-        from dvax.runs.config import build_contact
-        from dvax.runs.contact_model import assumptions
         from dvax.runs.interrupt import interruptible
 
-        loaded = interruptible(lambda: read_config(config, allow_outside=allow_outside))
+        loaded = interruptible(lambda: load(config, allow_outside))
+        from dvax.runs.applications.config import ModelConfig
+        from dvax.runs.config import build_contact
+        from dvax.runs.contact_model import assumptions
+
         if isinstance(loaded, ModelConfig):
             _check_model(loaded, strict)
             return
@@ -50,7 +50,7 @@ def check(
         say("")
         table(("statement", "verdict", "because"), verdicts(rows))
         say("")
-        table(("size", "value", "remark"), sizes(loaded, inputs))
+        table(("size", "value", "remark"), interruptible(lambda: sizes(loaded, inputs)))
         for notice in inputs.notices:
             remark(f"note: {notice}")
         broken = _complain_of_broken(known)
@@ -71,6 +71,7 @@ def _check_model(config: "ModelConfig", strict: bool) -> None:
 
     application = config.application
     constants, known, sizes, notes = interruptible(lambda: application.known(config.model))
+    data = interruptible(config.fingerprints)
     say(f"{config.source}: no problem in the configuration and its data", "bold")
     say(f"class: {application.fit(config.model)}")
     if constants is not None:
@@ -80,8 +81,8 @@ def _check_model(config: "ModelConfig", strict: bool) -> None:
         say("")
         _say_assumptions(known)
     say("")
-    data = [("data", f.name, f"sha256 {f.sha256[:16]}…") for f in config.fingerprints()]
-    table(("size", "value", "remark"), [*sizes, *data])
+    files = [("data", f.name, f"sha256 {f.sha256[:16]}…") for f in data]
+    table(("size", "value", "remark"), [*sizes, *files])
     for note in notes:
         remark(f"note: {note}")
     if _complain_of_broken(known) and strict:

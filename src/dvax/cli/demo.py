@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from dvax.cli.failure import reported
+from dvax.cli.load import load
 from dvax.cli.options import Debug, Force, Quiet
 from dvax.cli.resample import resample
 from dvax.cli.run import carry_out
@@ -34,13 +35,13 @@ def demo(
         problems = target_problems(out, force=force)
         if problems:
             raise InputError(*problems)
-        from dvax.runs.config import load_config
         from dvax.runs.interrupt import interruptible
 
         # The folders must outlive the run, which copies the data it names.
         with as_file(files("dvax.runs") / "demo") as shipped, TemporaryDirectory() as sampled:
             config = shipped / CONFIG
             if points is not None:
-                config = resample(config, Path(sampled), points)
-            loaded = interruptible(lambda: load_config(config))
+                sample = Path(sampled)
+                config = interruptible(lambda: resample(shipped / CONFIG, sample, points))
+            loaded = interruptible(lambda: load(config, False))
             carry_out(loaded, out, force=force, quiet=quiet)

@@ -18,7 +18,9 @@ def doctor(debug: Debug = False) -> None:
     """Show versions, devices and precision, and solve a problem whose solution is known."""
     with reported(debug):
         wrong: list[str] = []
-        rows = [*_installation(wrong), *_machine(), *_numbers(wrong)]
+        from dvax.runs.interrupt import interruptible
+
+        rows = interruptible(lambda: [*_installation(wrong), *_machine(), *_numbers(wrong)])
         table(("what", "found", "remark"), rows)
         for text in wrong:
             complain(f"error: {text}")
@@ -56,14 +58,12 @@ def _numbers(wrong: list[str]) -> list[Row]:
     import jax
     import jax.numpy as jnp
 
-    from dvax.runs.interrupt import interruptible
-
     devices = ", ".join(f"{device.device_kind} ({device.platform})" for device in jax.devices())
     # 1 + 2⁻⁵² differs from 1 in double precision only; asked of the device, not of the setting.
     double = bool(jax.jit(lambda one: one + 2.0**-52 > one)(jnp.asarray(1.0)))
     if not double:
         wrong.append("the device computes in single precision. Choose another: JAX_PLATFORMS=cpu.")
-    test = interruptible(self_test)
+    test = self_test()
     if not test.passed:
         wrong.append(
             f"the self-test is off by {test.error:.2e}, more than {ALLOWED:.0e}. "

@@ -62,9 +62,14 @@ class _Lines:
         self.tenth, self.spoke = int(done * LINES), now
         left = (now - self.began) * (1 - done) / done if done > 0 else float("nan")
         remark(
-            f"t = {event['t']:.6g} of {event['t_end']:.6g} {self.unit} ({done:.0%}), "
+            f"t = {event['t']:.6g} of {event['t_end']:.6g}{_unit(event, self.unit)} ({done:.0%}), "
             f"{event['steps']} steps, {left:.0f} s left"
         )
+
+
+def _unit(event: Event, unit: str) -> str:
+    """The unit of time with a space before it: that of the event, where it names one."""
+    return f" {event.get('unit', unit)}".rstrip()
 
 
 @contextmanager
@@ -107,7 +112,7 @@ def _bar(unit: str) -> Iterator[Listener]:
                 staged = True
                 bar.update(task, description=event["stage"])
             elif kind == "progress":
-                where = f"t = {event['t']:.4g} {unit}, {event['steps']} steps"
+                where = f"t = {event['t']:.4g}{_unit(event, unit)}, {event['steps']} steps"
                 bar.update(task, completed=event["t"], total=event["t_end"], where=where)
 
         yield listen

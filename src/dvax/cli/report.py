@@ -18,10 +18,17 @@ def report(
 ) -> None:
     """Write report.html and figures/*.png of a run, finished or not."""
     with reported(debug, directory):
-        from dvax.plots import build_report
         from dvax.runs.interrupt import interruptible
+
+        interruptible(_import)
+        from dvax.plots import build_report
         from dvax.runs.rundir import close_killed
 
         if close_killed(directory):
             remark("the run was killed: its complete frames are kept")
         say(str(interruptible(lambda: build_report(directory))))
+
+
+def _import() -> None:
+    import dvax.plots
+    import dvax.runs.rundir  # noqa: F401

@@ -1,22 +1,23 @@
 """`dvax run CONFIG.toml -o DIR`: from a configuration to a certified solution on disk."""
 
-from contextlib import ExitStack
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dvax._figure_text import figure_text
+from dvax._figure_text import entry_text
 from dvax.cli.ahead import loaded_ahead
 from dvax.cli.failure import reported
+from dvax.cli.load import load
 from dvax.cli.options import AllowOutside, ConfigFile, Debug, Force, Quiet
-from dvax.cli.precision import enable_double
 from dvax.cli.progress import progress
 from dvax.cli.talk import remark, say, table
 from dvax.cli.target import target_problems
 from dvax.errors import InputError, InputProblem
 
 if TYPE_CHECKING:
+    from dvax.plots.report import Report
     from dvax.runs.applications.config import ModelConfig
     from dvax.runs.config import Config
 
@@ -33,10 +34,12 @@ def run(
 ) -> None:
     """Solve the system that CONFIG.toml describes; results, manifest and report go into DIR."""
     with reported(debug, out):
+        from dvax.runs.interrupt import interruptible
+
         # Both are checked before anything is refused: one round is enough to mend all of it.
         problems: list[InputProblem] = target_problems(out, force=force)
         try:
-            loaded = _load(config, allow_outside, quiet)
+            loaded = interruptible(lambda: load(config, allow_outside, quiet))
         except InputError as error:
             raise InputError(*error.problems, *problems) from error
         if problems:
@@ -44,25 +47,19 @@ def run(
         carry_out(loaded, out, force=force, quiet=quiet)
 
 
-def _load(file: Path, allow_outside: bool, quiet: bool) -> "Config | ModelConfig":
-    enable_double()
-    from dvax.runs.applications.config import read_config
-    from dvax.runs.interrupt import interruptible
-
-    return interruptible(lambda: read_config(file, allow_outside=allow_outside, quiet=quiet))
-
-
 def carry_out(config: "Config | ModelConfig", out: Path, *, force: bool, quiet: bool) -> None:
     """Run a checked configuration, make its report, say the figures; exit with the run's code."""
-    enable_double()
+    from dvax.runs.interrupt import interruptible, patience
+
+    interruptible(_import)
     from dvax.runs.applications.config import ModelConfig
     from dvax.runs.applications.driver import run_model
     from dvax.runs.driver import run as drive
 
     unit = "" if isinstance(config, ModelConfig) else config.units.time
-    with progress(unit, quiet=quiet) as listener, ExitStack() as stack:
+    with progress(unit, quiet=quiet) as listener:
         if config.output.report:
-            listener = stack.enter_context(loaded_ahead("dvax.plots", listener))
+            listener = loaded_ahead("dvax.plots", listener)
         if isinstance(config, ModelConfig):
             outcome = run_model(config, out, overwrite=force, on_event=listener)
         else:
@@ -77,16 +74,32 @@ def carry_out(config: "Config | ModelConfig", out: Path, *, force: bool, quiet: 
     elif not quiet:
         remark(f"{outcome.status}: {outcome.stop_reason}")
     if config.output.report:
-        from dvax.plots import build_report
-        from dvax.runs.interrupt import interruptible
-
+        stopped = outcome.status == "interrupted"
         # Who interrupts a run waits for its end: the stills would take the longest.
-        stills = config.output.png and outcome.status != "interrupted"
-        page = interruptible(lambda: build_report(outcome.directory, stills=stills))
-        if not quiet:
-            remark(f"report: {page}")
+        stills = config.output.png and not stopped
+        try:
+            drawn = interruptible(
+                lambda: _draw(outcome.directory, stills), patience() if stopped else math.inf
+            )
+            page = drawn.write()
+            if not quiet:
+                remark(f"report: {page}")
+        except (KeyboardInterrupt, TimeoutError):
+            if not stopped:
+                raise
+            remark(f"for its report: dvax report {outcome.directory}")
     if outcome.exit_code:
         raise typer.Exit(outcome.exit_code)
+
+
+def _import() -> None:
+    import dvax.runs.applications.driver  # noqa: F401
+
+
+def _draw(directory: Path, stills: bool) -> "Report":
+    from dvax.plots.report import draw_report
+
+    return draw_report(directory, stills=stills)
 
 
 def _say_figures(summary: dict[str, Any]) -> None:
@@ -95,7 +108,7 @@ def _say_figures(summary: dict[str, Any]) -> None:
     for name, entry in summary.items():
         if name == "status":
             continue  # it is the last line, and in the exit code
-        shown = figure_text(entry["value"], entry.get("error"))
+        shown = entry_text(entry)
         unit = "" if entry["unit"] == "1" else entry["unit"]
         rows.append((name, f"{shown} {unit}".strip(), entry["meaning"]))
     if rows:

@@ -49,7 +49,7 @@ def complain_of(error: InputError) -> None:
         remark(f"{number}. {problem.place}", "bold")
         remark(f"   given: {problem.given}")
         remark(f"   rule:  {problem.rule}")
-        remark(f"   mend:  {problem.mend}")
+        remark(f"   fix:   {problem.mend}")
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -28,7 +28,7 @@ MOST_COUNTED = 2**31 - 1
 
 def check(
     problem, x0, t0, t1, ts, dt, rtol, atol, dt0, dt_max, horizon, method, adjoint, measure, dense,
-    vi_solver=None, max_steps=None, constants=None,
+    vi_solver=None, max_steps=None, constants=None, progress=False,
 ) -> None:  # fmt: skip
     """Raise one `InputError` with everything that is wrong with the arguments of `dvax.solve`."""
     wrong: list[InputProblem] = []
@@ -48,7 +48,7 @@ def check(
     rule(adjoint in ("reverse", "forward"), "adjoint", adjoint,
          "it must be 'reverse' or 'forward'",
          "'reverse' serves jax.grad, 'forward' jax.jvp")  # fmt: skip
-    for name, flag in (("measure", measure), ("dense", dense)):
+    for name, flag in (("measure", measure), ("dense", dense), ("progress", progress)):
         rule(isinstance(flag, bool | np.bool_ | None), name, flag, "it must be True or False",
              "Leave it out for the default")  # fmt: skip
     if isinstance(method, Implicit):
@@ -57,7 +57,15 @@ def check(
                  "Leave it out and name the times in ts=, or use an exponential method")  # fmt: skip
         rule(dt is None, "dt", dt, "how well an implicit method solves its equations follows from "
              "rtol and atol, so its steps adapt", "Leave it out")  # fmt: skip
+    if dt is not None:
+        for name, length in (("dt0", dt0), ("dt_max", dt_max)):
+            rule(length is None, name, length, "with dt all steps have that length",
+                 f"Leave out {name}, or dt for steps that adapt")  # fmt: skip
     if isinstance(method, PiecewiseLinear):
+        rule(vi_solver is None, "vi_solver", vi_solver, "dvax.PiecewiseLinear knows its law in closed "
+             "form in each mode", "Leave it out, or name another method")  # fmt: skip
+        rule(dt_max is None, "dt_max", dt_max, "dvax.PiecewiseLinear steps from one change of the "
+             "constraints to the next", "Leave it out, or name another method")  # fmt: skip
         rule(dt is None, "dt", dt, "dvax.PiecewiseLinear steps from one change of the constraints to "
              "the next", "Leave it out, and name the times to save in ts=")  # fmt: skip
     if max_steps is not None:
@@ -105,6 +113,11 @@ def check(
             zero = name in ("rtol", "atol")
             ok = math.isfinite(value) and (value >= 0 if zero else value > 0)
             rule(bool(ok), name, value, "it must be positive and finite", "Give a positive number")
+    if dt is None and not wrong and dt_max is not None and _tree.is_concrete(t0, t1, dt_max):
+        most, span = ADAPTIVE_STEPS if max_steps is None else max_steps, float(t1) - float(t0)
+        rule(span <= most * float(dt_max), "dt_max", dt_max,
+             f"steps no longer than that are more than max_steps = {most} over {span:g}",
+             f"Write {span / most:.1e} or more, or raise max_steps")  # fmt: skip
     if not unusable & {"rtol", "atol"} and _tree.is_concrete(rtol, atol):
         rule(bool(rtol != 0 or atol != 0), "rtol, atol", _tree.Text("0, 0"),
              "one of them must be positive", "No finite step has defect zero")  # fmt: skip

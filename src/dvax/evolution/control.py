@@ -227,7 +227,8 @@ class Adaptive(AbstractController):
         end = land(begin, wanted, until(ahead, begin, self.stops[stop]))
         # Below this, t itself cannot tell the ends of a step apart; and rounding may spend no more.
         exhausted = rounding & ~roundoff & (state.spare < 1e-3)
-        stuck = ~keep & ((h <= floor) | exhausted)
+        # (A length is rounded with the times between which it lies.)
+        stuck = ~keep & ((h <= 1.25 * floor) | exhausted)
         result = RESULTS.where(
             stuck,
             RESULTS.where(

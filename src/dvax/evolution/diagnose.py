@@ -16,7 +16,7 @@ Each cause is tested at the last state (t, x) that was reached, on the functions
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.flatten_util
@@ -27,21 +27,16 @@ import numpy as np
 from .. import _tree
 from .._tree import Tree
 from ..errors import Fix, InputError, SolveError
-from .flow import Flow
 from .implicit import Implicit
+from .jumps import find_jump
 from .method import AbstractMethod
 from .nonfinite import first_bad
+from .piecewise.method import PiecewiseLinear
 from .results import RESULTS
 from .runge_kutta import DormandPrince
 from .setup import Setup
+from .stopped import LAST_STEPS, Diagnosis, Stop
 
-_LAST_STEPS = 64.0
-"""Steps ahead of the last state in which a cause is looked for."""
-_JUMP, _ROUNDINGS = 1e-7, 1e3
-"""A change of a function within two roundings of t is a jump above this part of its size, or so many
-of its own roundings."""
-_STAIR = 1e-3
-"""Part of the size of a function below which many jumps of it are taken for rounding."""
 _LOOSEST = 0.01
 """The loosest rtol that is ever named as a fix."""
 _DENSE = 64
@@ -50,49 +45,18 @@ _LINEARISABLE = 400
 """Unknowns up to which `ExpRosenbrock` is the method to name for a stiff problem."""
 
 
-class Diagnosis(NamedTuple):
-    """The cause in a sentence or two ("" where there is no evidence), and what helps."""
-
-    cause: str = ""
-    fixes: tuple[Fix, ...] = ()
-
-
-class _Stop(NamedTuple):
-    """Where a run stopped, with all that the tests of causes need."""
-
-    setup: Setup
-    flow: Flow
-    t: float
-    x: Tree
-    step: float
-    steps: int
-    attempts: int
-
-    @property
-    def span(self) -> tuple[float, float]:
-        return float(self.setup.setting["t0"]), float(self.setup.setting["t1"])
-
-    @property
-    def ulp(self) -> float:
-        """The spacing of floating-point numbers at t, in the precision of the state."""
-        return float(jnp.finfo(self.setup.dtype).eps) * abs(self.t)
-
-    def time(self, t: float) -> jax.Array:
-        return jnp.asarray(t, self.setup.dtype)
-
-    def velocity(self, t: Any, x: Tree) -> Tree:
-        """x' = Ax + f̃(t, x)."""
-        return _tree.add(self.flow.generator.apply(x), self.flow.rate(t, x, None).value)
-
-    def norm(self, x: Tree) -> float:
-        return float(self.flow.state_space(self.x).norm(x))
+_REFUSED = "refused: "
+_CHECKED = {name: f"Check {name} there" for name in ("K", "h", "f")} | {
+    "A x": "Check A, and how large x becomes",
+    "the response u": "Check how h depends on u: the law has no solution where nothing bounds it",
+}
 
 
 def failure(setup: Setup, stats: dict[str, Any], result: RESULTS, solution: Any) -> SolveError:
     """The `SolveError` of a run that stopped: what happened, the cause, how far it came, what helps."""
     found = diagnose(setup, stats, result)
     reached = f"Stopped at t = {float(stats['t']):.17g} after {int(stats['steps'])} steps."
-    parts = (RESULTS[result], found.cause, reached)
+    parts = ("" if found.whole else RESULTS[result], found.cause, reached)
     return SolveError(" ".join(part for part in parts if part), solution, found.fixes)
 
 
@@ -105,18 +69,21 @@ def diagnose(setup: Setup, stats: dict[str, Any], result: RESULTS) -> Diagnosis:
     if isinstance(setup.method, Implicit):
         step = t1 - t  # such a run is known up to the last saved time that it reached
     steps, rejected = int(stats["steps"]), int(stats["rejected"])
-    stop = _Stop(
+    if isinstance(setup.method, PiecewiseLinear):
+        step = (t - t0) / max(steps, 1) or t1 - t0  # its steps are as long as its events are apart
+    stop = Stop(
         setup, setup.flow(), t, stats["x"], min(float(step), max(t1 - t, 0.0)), steps,
         steps + rejected,
     )  # fmt: skip
-    causes: list[Callable[[_Stop], Diagnosis]] = []
-    if result != RESULTS.max_steps:
+    causes: list[Callable[[Stop], Diagnosis]] = []
+    at_floor = stop.step <= 64.0 * max(stop.ulp, 5e-324)
+    if result != RESULTS.max_steps or at_floor:
         causes += [_nonfinite]
     if result == RESULTS.law_unsolved:
         causes += [_law]
     causes += [_escape]
     if result != RESULTS.law_unsolved and result != RESULTS.nonfinite:
-        causes += [_jump, _resolution, _tolerance, _stiff]
+        causes += [find_jump, _resolution, _tolerance, _stiff]
     if result == RESULTS.max_steps:
         causes += [_too_few]
     for cause in causes:
@@ -126,7 +93,7 @@ def diagnose(setup: Setup, stats: dict[str, Any], result: RESULTS) -> Diagnosis:
     return Diagnosis()
 
 
-def _nonfinite(stop: _Stop) -> Diagnosis:
+def _nonfinite(stop: Stop) -> Diagnosis:
     """The first of A, P, K, h, f that is not finite on the way to the next step."""
     flow, problem, args = stop.flow, stop.flow.problem, stop.flow.args
     like = problem.zero_control(stop.x)
@@ -156,9 +123,9 @@ def _nonfinite(stop: _Stop) -> Diagnosis:
             return first_bad(pieces(ahead)[name](), allow_infinite=name == "K")
         except InputError as refused:
             problem = refused.problems[0]
-            return f"refused, {problem.place}: {problem.given}; {problem.rule}"
+            return f"{_REFUSED}{problem.place}: got {problem.given}; {problem.rule}"
 
-    far = min(stop.span[1] - stop.t, _LAST_STEPS * max(stop.step, 4.0 * stop.ulp))
+    far = min(stop.span[1] - stop.t, LAST_STEPS * max(stop.step, 4.0 * stop.ulp))
     offsets = [0.0, *(far * np.geomspace(1e-12, 1.0, 13))] if far > 0 else [0.0]
     good = 0.0
     for ahead in offsets:
@@ -170,99 +137,16 @@ def _nonfinite(stop: _Stop) -> Diagnosis:
             while high - low > max(stop.ulp, 1e-9 * high) and high > 0:
                 middle = 0.5 * (low + high)
                 low, high = (low, middle) if bad(name, middle) else (middle, high)
-            at = stop.t + high
-            return Diagnosis(
-                f"{name} is {bad(name, high) or found} at t = {at:.12g}.",
-                (Fix("", "", f"Check {name.split()[0]} there"),),
-            )
+            at, what = f"at t = {stop.t + high:.12g}", bad(name, high) or found
+            fixes = (Fix("", "", _CHECKED[name]),)
+            if what.startswith(_REFUSED):
+                return Diagnosis(f"{name} is refused {at}: {what[len(_REFUSED) :]}.", fixes, True)
+            return Diagnosis(f"{name} is {what} {at}.", fixes)
         good = float(ahead)
     return Diagnosis()
 
 
-def _jump(stop: _Stop) -> Diagnosis:
-    """A jump of K, h or f in t, next to where the run stopped."""
-    flow, problem, args = stop.flow, stop.flow.problem, stop.flow.args
-    t0, t1 = stop.span
-    width = _LAST_STEPS * max(stop.step, 4.0 * stop.ulp)
-    low, high = max(t0, stop.t - width), min(t1, stop.t + width)
-    u = flow.operator.inverse(flow.rate(stop.time(stop.t), stop.x, None).y)
-    pieces: dict[str, Callable[[Any], Tree]] = {
-        "K": lambda s: problem.set_at(s, args),
-        "h": lambda s: problem.h(s, stop.x, u, args),
-        "f": lambda s: problem.f(s, stop.x, u, args),
-    }
-    eps = float(jnp.finfo(stop.setup.dtype).eps)
-    for name, evaluate in pieces.items():
-
-        def values(s: float, evaluate: Callable[[Any], Tree] = evaluate) -> np.ndarray:
-            leaves = [np.ravel(leaf) for leaf in jtu.tree_leaves(evaluate(stop.time(s)))]
-            return np.concatenate(
-                [leaf for leaf in leaves if leaf.dtype.kind == "f"] or [np.zeros(0)]
-            )
-
-        a, b, before, after = _narrow(values, low, high, stop.ulp)
-        change, k = _change(before, after)
-        size = float(np.max(np.abs(np.stack([before, after])), initial=0.0))
-        if not (change > max(_JUMP, _ROUNDINGS * eps) * size and b - a < 1e-9 * (t1 - t0)):
-            continue
-        # Both halves of what is longer, the part before the jump or the part after it.
-        left, right = max((low, a), (b, high), key=lambda part: part[1] - part[0])
-        middle = 0.5 * (left + right)
-        beside = [_narrow(values, *part, stop.ulp) for part in ((left, middle), (middle, right))]
-        many = all(_change(*found[2:])[0] > 0.25 * change for found in beside)
-        if many and change < _STAIR * size:
-            return _stairs(stop, name, change, b)
-        where = f" in component {k}" if before.size > 1 else ""
-        return Diagnosis(
-            f"{name} jumps from {before[k]:.6g} to {after[k]:.6g}{where} at t = {b:.15g}, and no "
-            "step across a jump that is not announced meets the tolerance.",
-            (Fix("knots", f"[{b:.15g}]", "so that a step ends there: dvax.signals.Function"),),
-        )
-    return Diagnosis()
-
-
-def _narrow(
-    values: Callable[[float], np.ndarray], a: float, b: float, ulp: float
-) -> tuple[float, float, np.ndarray, np.ndarray]:
-    """The part of [a, b] of about two roundings in which the values change most, by bisection."""
-    before, after = values(a), values(b)
-    while b - a > 2.0 * max(ulp, 5e-324):
-        middle = 0.5 * (a + b)
-        if not a < middle < b:
-            break
-        between = values(middle)
-        if _change(before, between)[0] >= _change(between, after)[0]:
-            b, after = middle, between
-        else:
-            a, before = middle, between
-    return a, b, before, after
-
-
-def _stairs(stop: _Stop, name: str, height: float, t: float) -> Diagnosis:
-    """Jumps of about one height beside each other: rounding of terms far larger than their sum."""
-    horizon = float(stop.setup.setting["horizon"])
-    return Diagnosis(
-        f"{name} changes in jumps of about {height:.3g} near t = {t:.12g}, as the rounding of terms "
-        "that cancel does, and the tolerance asks for less.",
-        (
-            Fix("atol", f"{2.0 * height * horizon:.1g}", "which rounding allows"),
-            Fix("", "", f"Write {name} so that large terms do not cancel"),
-        ),
-    )
-
-
-def _change(a: np.ndarray, b: np.ndarray) -> tuple[float, int]:
-    """The largest change of a component, and which it is."""
-    if a.size == 0:
-        return 0.0, 0
-    with np.errstate(invalid="ignore"):  # bounds of K may be infinite
-        apart = np.where(a == b, 0.0, np.abs(b - a))
-    apart = np.where(np.isfinite(apart), apart, 0.0)
-    k = int(np.argmax(apart))
-    return float(apart[k]), k
-
-
-def _escape(stop: _Stop) -> Diagnosis:
+def _escape(stop: Stop) -> Diagnosis:
     """|x| grows as a power of itself above 1 (a finite-time escape), or exponentially without end."""
     size, first = _largest(stop.x), _largest(stop.setup.x0)
     if not size > 10.0 * (1.0 + first):
@@ -304,7 +188,7 @@ def _largest(x: Tree) -> float:
     return float(max(np.max(np.abs(np.asarray(leaf))) for leaf in jtu.tree_leaves(x)))
 
 
-def _resolution(stop: _Stop) -> Diagnosis:
+def _resolution(stop: Stop) -> Diagnosis:
     """Steps of the size of the spacing of floating-point numbers at t."""
     t0, t1 = stop.span
     if not (stop.ulp > 0 and stop.step <= 64.0 * stop.ulp and stop.ulp > 1e-14 * (t1 - t0)):
@@ -322,7 +206,7 @@ def _resolution(stop: _Stop) -> Diagnosis:
     )
 
 
-def _tolerance(stop: _Stop) -> Diagnosis:
+def _tolerance(stop: Stop) -> Diagnosis:
     """A tolerance below the rounding of f̃."""
     rtol, atol, horizon = (float(stop.setup.setting[n]) for n in ("rtol", "atol", "horizon"))
     if math.isfinite(stop.setup.setting["dt"]):
@@ -334,6 +218,12 @@ def _tolerance(stop: _Stop) -> Diagnosis:
     if not asked < possible:
         return Diagnosis()
     reachable = 100.0 * possible * horizon / max(size, 1e-300)
+    speed, (t0, t1) = stop.norm(stop.velocity(stop.time(stop.t), stop.x)), stop.span
+    if speed * (t1 - t0) > 1e9 * (1.0 + size) and stop.t - t0 < 1e-9 * (t1 - t0):
+        return Diagnosis(
+            f"x' is {speed:.3g} next to t = {t0:.12g} while x is {size:.3g}.",
+            (Fix("", "", "Check whether f or h is infinite at the start of the run"),),
+        )
     fix = Fix("rtol", f"{reachable:.1g}", "which rounding allows")
     if reachable > _LOOSEST:
         fix = Fix("t1", f"{stop.span[0] + horizon * _LOOSEST / reachable:.3g}", "a shorter run")
@@ -344,7 +234,7 @@ def _tolerance(stop: _Stop) -> Diagnosis:
     )
 
 
-def _stiff(stop: _Stop) -> Diagnosis:
+def _stiff(stop: Stop) -> Diagnosis:
     """h λ of order one, for the eigenvalue λ of largest modulus, while x changes slowly."""
     method = stop.setup.method
     if not isinstance(method, AbstractMethod) or method.linearises:
@@ -382,7 +272,7 @@ def _stiff(stop: _Stop) -> Diagnosis:
     )
 
 
-def _too_few(stop: _Stop) -> Diagnosis:
+def _too_few(stop: Stop) -> Diagnosis:
     """The number of steps, and what the run would need at its last pace."""
     t1 = stop.span[1]
     left = (t1 - stop.t) / max(stop.step, 5e-324)
@@ -398,7 +288,7 @@ def _too_few(stop: _Stop) -> Diagnosis:
     return Diagnosis(text, (*more, Fix("rtol", f"{min(1e-2, 100 * rtol):.1g}", "for longer steps")))
 
 
-def _law(stop: _Stop) -> Diagnosis:
+def _law(stop: Stop) -> Diagnosis:
     """Whether F(y) = P⁻¹y − h(t, x, P⁻¹y) fails to be monotone at the last state."""
     problem, args, t = stop.flow.problem, stop.flow.args, stop.time(stop.t)
     at = f"at t = {stop.t:.12g}"

@@ -60,6 +60,7 @@ class DormandPrince(AbstractMethod):
     order: ClassVar[int] = 5
     degree: ClassVar[int] = 3
     samples: ClassVar[tuple[float, ...]] = _SAMPLES
+    hidden: ClassVar[float] = 0.0
     halves: ClassVar[bool] = False
     linearises: ClassVar[bool] = False
     joins: ClassVar[bool] = True

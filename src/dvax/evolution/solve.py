@@ -129,7 +129,7 @@ def solve(
         check(
             problem, x0, t0, t1, ts, dt, 0.0, 1.0, dt0, dt_max, horizon,
             _METHOD if method is None else method, adjoint, measure, dense, vi_solver, max_steps,
-            constants,
+            constants, progress,
         )  # fmt: skip
         again: dict[str, Any] = dict(
             method=method, vi_solver=vi_solver, progress=progress, constants=constants, dense=dense,
@@ -145,7 +145,7 @@ def solve(
     method = _METHOD if method is None else method
     check(
         problem, x0, t0, t1, ts, dt, rtol, atol, dt0, dt_max, horizon, method, adjoint, measure, dense,
-        vi_solver, max_steps, constants,
+        vi_solver, max_steps, constants, progress,
     )  # fmt: skip
     fixed = dt is not None
     if not fixed:
@@ -195,6 +195,7 @@ def solve(
             # Data that ends too early is NaN from there on: then that is what is wrong.
             refuse_nonfinite_data(problem, args, "dvax.solve")
             problem.knots(t0, t1, x0, as_arrays(args))
+            problem.check_data(t0, t1, x0, args)
             if fixed:
                 # Once more, keeping the last good state, to say where it went wrong.
                 solution = _trim(compiled(setup, times, options._replace(careful=True))[0])

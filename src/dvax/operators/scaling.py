@@ -14,7 +14,7 @@ from .abstract import AbstractOperator, Spectrum
 class Scaling(AbstractOperator):
     """P v = b v with b > 0.
 
-    **Raises:** `dvax.InputError` where b ≤ 0: P would not be coercive.
+    **Raises:** `dvax.InputError` where b ≤ 0, as P would not be coercive, or b is not finite.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -30,10 +30,10 @@ class Scaling(AbstractOperator):
     def __init__(self, b: Any):
         self.b = _tree.as_float(b, "dvax.operators.Scaling(b)")
         _tree.require(
-            lambda: np.asarray(self.b) > 0,
+            lambda: np.asarray(self.b) > 0 and np.isfinite(np.asarray(self.b)),
             "dvax.operators.Scaling(b)",
             self.b,
-            "P must be coercive, so b > 0",
+            "P must be coercive and bounded, so b > 0 and finite",
             "Give a positive scaling",
         )
         # Kept: a division for every entry, at every evaluation, would cost more than the law.

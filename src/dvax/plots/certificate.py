@@ -7,6 +7,7 @@ import plotly.graph_objects as go
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from dvax._figure_text import entry_text
 from dvax.plots.lines import positive, thin
 from dvax.plots.look import (
     BLUE,
@@ -17,8 +18,8 @@ from dvax.plots.look import (
     VERMILLION,
     axis_title,
     blank,
-    quantity,
     still_axes,
+    unit_text,
 )
 from dvax.plots.picture import Picture
 from dvax.plots.record import RunRecord
@@ -77,7 +78,7 @@ def certificate_picture(run: RunRecord) -> Picture | None:
                 )
             axes.set(yscale="log", xlabel=axis_title("time", run.unit("time")), ylabel=words)
             # Above the legend, however many rows it has.
-            axes.set_title("Certified error against time", pad=8 + 16 * math.ceil(len(held) / 2))
+            axes.set_title(_title(run, held), pad=8 + 16 * math.ceil(len(held) / 2))
             axes.legend(
                 ncols=2, loc="lower left", bbox_to_anchor=(0, 1.0), fontsize=9, borderpad=0.2
             )
@@ -85,11 +86,17 @@ def certificate_picture(run: RunRecord) -> Picture | None:
 
     return Picture(
         key="certificate",
-        title="Certified error against time",
+        title=_title(run, held),
         caption=_caption(run, held),
         interactive=figure,
         still=still,
     )
+
+
+def _title(run: RunRecord, held: list[str]) -> str:
+    """Nothing is called certified but what is proved."""
+    known = {str(run.frames.about(name).get("status", "")) for name in held} - {"", "proved"}
+    return f"Error bound against time, {known.pop()}" if known else "Certified error against time"
 
 
 def _legend(run: RunRecord, name: str, *, with_unit: bool) -> str:
@@ -119,7 +126,8 @@ def _caption(run: RunRecord, held: list[str]) -> str:
         if name in held:
             value = float(run.series(name)[-1])
             what = "x" if name.endswith("x") else "u"
-            parts.append(f"At the last frame, for {what}: {quantity(value, run.unit(name))}.")
+            shown = entry_text({"value": value, "bound": True})
+            parts.append(f"At the last frame, for {what}: {shown} {unit_text(run.unit(name))}.")
     if any((run.series(name) <= 0).any() for name in held):
         parts.append(
             "Zero (exact at a frame, such as the given initial state) has no place on a "

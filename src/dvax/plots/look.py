@@ -33,6 +33,7 @@ def number(value: Any, digits: int = 4) -> str:
         return str(value)
     if isinstance(value, int) or not math.isfinite(value):
         return f"{value:,}".replace(",", "\u202f") if isinstance(value, int) else str(value)
+    value += 0.0  # no negative zero
     if value == 0 or 1e-3 <= abs(value) < 1e6:
         return f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.0f}"
     mantissa, exponent = f"{value:.{digits - 1}e}".split("e")

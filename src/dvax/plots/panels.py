@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from dvax.plots.applications.data import Data
 from dvax.plots.lines import thin
 from dvax.plots.look import MUTED, SERIES, STILL_STYLE, axis_title, blank, still_axes, unit_text
 from dvax.plots.picture import Picture
@@ -43,6 +45,19 @@ class Panel:
     unit: str = ""
     log: bool = False
     share: float = field(default=1.0)
+
+
+def bound_panel(x: np.ndarray, bound: Data, unit: str, colour: int = 1, **more: Any) -> Panel:
+    """An error bound on a logarithmic axis, with the word for how much is known of it."""
+    shown = np.where(bound.values > 0, bound.values, np.nan)
+    known = f" ({bound.status})" if bound.status else ""
+    words = f"error bound{known.replace(' ', '<br>')}"
+    return Panel([Curve(x, shown, f"error bound{known}", colour)], words, unit, log=True, **more)
+
+
+def bound_title(bound: Data) -> str:
+    """What a picture of a bound is called: nothing is certified but what is proved."""
+    return "Certified error" if bound.status == "proved" else f"Error bound, {bound.status}"
 
 
 def panels_picture(
@@ -87,7 +102,7 @@ def panels_picture(
                         place.plot(c.x, c.y, "o", markersize=4, **style)
                     else:
                         place.plot(c.x, c.y, _DASHES[c.dash], linewidth=1.3, **style)
-                place.set_ylabel(axis_title(panel.words + "\n", panel.unit))
+                place.set_ylabel(axis_title(panel.words.replace("<br>", "\n") + "\n", panel.unit))
                 place.set_yscale("log" if panel.log else "linear")
                 if len(panel.curves) > 1:
                     place.legend(

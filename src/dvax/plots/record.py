@@ -77,7 +77,7 @@ class RunRecord:
     def title(self) -> str:
         """The run's name: the dataset's, else the directory's."""
         named = "" if self.trajectory is None else str(self.trajectory.attrs.get("title", ""))
-        return named or self.directory.resolve().name
+        return named or str(self.manifest.get("title") or self.directory.resolve().name)
 
     @property
     def status(self) -> str:

@@ -1,7 +1,9 @@
 """From a run directory to its report: `report.html` and `figures/*.png`."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +26,34 @@ def build_report(run_dir: Path | str, *, stills: bool = True) -> Path:
     Works on a run that stopped early too, and says so at the top of the page. Returns the path of
     the page. Raises InputError where `run_dir` is not a run directory or a file in it is damaged.
     """
-    run = read_run(Path(run_dir))
+    return draw_report(Path(run_dir), stills=stills).write()
+
+
+@dataclass(frozen=True)
+class Report:
+    """A report that is made and not yet written: the text of its page, and a PNG a picture."""
+
+    directory: Path
+    text: str
+    stills: Mapping[str, bytes]
+
+    def write(self) -> Path:
+        """Write all of it, and return the path of the page."""
+        for name, drawn in self.stills.items():
+            file = self.directory / "figures" / name
+            file.parent.mkdir(exist_ok=True)
+            _written(file, lambda beside, drawn=drawn: beside.write_bytes(drawn))
+        file = self.directory / "report.html"
+        _written(file, lambda beside: beside.write_text(self.text, encoding="utf-8"))
+        return file
+
+
+def draw_report(run_dir: Path, *, stills: bool) -> Report:
+    """Make the report of `build_report`, and write nothing."""
+    run = read_run(run_dir)
     pictures, missing = _pictures(run)
-    if stills:
-        _write_stills(run.directory / "figures", pictures)
-    return _write_whole(run.directory / "report.html", page(run, pictures, missing))
+    drawn = {f"{picture.key}.png": _png(picture) for picture in pictures} if stills else {}
+    return Report(run.directory, page(run, pictures, missing), drawn)
 
 
 def _pictures(run: RunRecord) -> tuple[list[Picture], list[str]]:
@@ -60,16 +85,10 @@ def _pictures(run: RunRecord) -> tuple[list[Picture], list[str]]:
     return pictures, missing
 
 
-def _write_stills(folder: Path, pictures: list[Picture]) -> None:
-    folder.mkdir(exist_ok=True)
-    for picture in pictures:
-        file, drawn = folder / f"{picture.key}.png", picture.still()
-        _written(file, lambda beside, drawn=drawn: drawn.savefig(beside, format="png"))
-
-
-def _write_whole(file: Path, text: str) -> Path:
-    _written(file, lambda beside: beside.write_text(text, encoding="utf-8"))
-    return file
+def _png(picture: Picture) -> bytes:
+    drawn = BytesIO()
+    picture.still().savefig(drawn, format="png")
+    return drawn.getvalue()
 
 
 def _written(file: Path, write: Callable[[Path], Any]) -> None:

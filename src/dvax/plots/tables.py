@@ -5,7 +5,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from dvax._figure_text import figure_text
+from dvax._figure_text import entry_text
 from dvax.plots.look import number, quantity
 from dvax.plots.record import RunRecord
 
@@ -25,7 +25,7 @@ FACTS = {
     "python": "Python",
     "git_commit": "git commit",
 }
-SHOWN_ELSEWHERE = ("constants", "assumptions")
+SHOWN_ELSEWHERE = ("constants", "assumptions", "title")
 
 
 def headline_cards(run: RunRecord) -> str:
@@ -35,8 +35,11 @@ def headline_cards(run: RunRecord) -> str:
         if name == "status":
             continue  # it stands at the top of the page, and among the facts of the run
         value = entry.get("value")
-        text = figure_text(value, entry.get("error"))
-        shown = escaped(quantity_text(text, str(entry.get("unit", ""))))
+        unit = escaped(quantity("", str(entry.get("unit", ""))))
+        # A unit stays on one line, and with the last digits where there is room.
+        shown = f'{escaped(entry_text(entry))} <span class="unit">{unit}</span>'.removesuffix(
+            ' <span class="unit"></span>'
+        )
         # All digits, for who points at it.
         whole = "" if isinstance(value, list) else f' title="{escaped(repr(value))}"'
         cards.append(
@@ -80,11 +83,6 @@ def facts_table(run: RunRecord) -> str:
     return table(("fact", "value"), rows, kind="pairs")
 
 
-def quantity_text(text: str, unit: str) -> str:
-    """A value that is already text, with its unit for the eye."""
-    return f"{text} {quantity('', unit)}".strip()
-
-
 def _fact(value: Any) -> str:
     if isinstance(value, Mapping):
         lines = [f"{escaped(str(key))}: {_fact(item)}" for key, item in value.items()]
@@ -113,7 +111,8 @@ def table(head: tuple[str, ...], rows: list[tuple[str, ...]], kind: str = "rows"
 
 
 def _words(name: str) -> str:
-    return name.replace("_", " ")
+    words = name.replace("_", " ")
+    return f"{words.removesuffix(' si')} (SI)" if words.endswith(" si") else words
 
 
 def status_mark(status: str) -> str:

@@ -26,13 +26,14 @@ def check_consistency(raw: Mapping[str, Any], file: str) -> list[InputProblem]:
         if section is not None:
             problems += _field(section, name, file)
     solver = table("solver")
-    if solver is not None and "dt" in solver and {"rtol", "atol"} & set(solver):
+    others = [key for key in ("rtol", "atol", "dt_max") if key in (solver or ())]
+    if solver is not None and "dt" in solver and others:
         problems.append(
             InputProblem(
                 f"{file}: solver",
-                f"dt together with {' and '.join(k for k in ('rtol', 'atol') if k in solver)}",
+                f"dt together with {' and '.join(others)}",
                 "steps are fixed by dt or chosen for tolerances, not both",
-                "Keep dt, or keep rtol and atol.",
+                "Keep dt, or keep the others.",
             )
         )
     return problems

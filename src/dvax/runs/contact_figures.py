@@ -8,7 +8,7 @@ import numpy as np
 from dvax.runs.contact_frames import norm_unit
 from dvax.runs.contact_inputs import ContactInputs
 from dvax.runs.settings import Config
-from dvax.theory import Constants
+from dvax.theory import Constants, Status, weakest
 
 
 class Figures:
@@ -26,9 +26,12 @@ class Figures:
         self._force = (-np.inf, 0.0)
         self._saturated = self._unloaded = 0.0
         self._last: dict[str, float] = {}
+        self.status: Status = "proved"
+        """Of the bounds so far."""
 
-    def add(self, times: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
-        """Take a block of frames into account."""
+    def add(self, times: np.ndarray, values: Mapping[str, np.ndarray], status: Status) -> None:
+        """Take a block of frames into account; `status` says how much is known of its bounds."""
+        self.status = weakest(self.status, status)
         pressure, regime, weights = values["pressure"], values["regime"], self._weights
         force = pressure @ weights
         self._peak = _larger(self._peak, _largest(times, pressure))
@@ -63,6 +66,7 @@ class Figures:
         width = len(self._boundary.coordinates)
         force = f"{u.pressure} {u.length}" + ("^2" if width == 2 else "")
         norm = norm_unit(self._config, width)
+        of_law = c.status_of("gamma", "norm_P_inv")
         rows: list[tuple[str, Any, str, str]] = [
             ("end_time", last["time"], u.time, "time of the last saved frame"),
             ("peak_pressure", self._peak[0], u.pressure, "largest pressure anywhere"),
@@ -78,11 +82,13 @@ class Figures:
             ("final_saturated_fraction", last["saturated"], "1", "part at capacity at the end"),
             ("final_unloaded_fraction", last["unloaded"], "1", "part unloaded at the end"),
             ("error_bound_x", last["error_bound_x"], norm,
-             "bound on ‖x_h − x‖ in L2 at the end, paper's constants"),
+             f"bound on ‖x_h − x‖ in L2 at the end, paper's constants ({self.status})"),
             ("error_bound_sharp_x", last["error_bound_sharp_x"], norm,
-             "the same with the one-sided rate"),
-            ("error_bound_u", last["error_bound_u"], norm, "bound on ‖u_h − u‖ in L2 at the end"),
-            ("law_error", last["law_error"], norm, "largest certified error of a frozen solve"),
+             f"the same with the one-sided rate ({self.status})"),
+            ("error_bound_u", last["error_bound_u"], norm,
+             f"bound on ‖u_h − u‖ in L2 at the end ({self.status})"),
+            ("law_error", last["law_error"], norm,
+             f"bound on the error of a frozen solve ({of_law})"),
             ("decay_rate", float(c.decay_rate), f"1/{u.time}",
              "two trajectories certainly approach at this rate, where positive"),
             ("sharp_decay_rate", float(c.sharp_decay_rate), f"1/{u.time}",
@@ -91,8 +97,13 @@ class Figures:
              "‖x1 − x2‖ of the two trajectories at the end"),
             ("steps", steps, "1", "accepted time steps"),
         ]  # fmt: skip
+        bounds: dict[str, str] = {"law_error": of_law}
+        bounds |= dict.fromkeys(
+            ("error_bound_x", "error_bound_sharp_x", "error_bound_u"), self.status
+        )
         return {
             name: {"value": value, "unit": unit, "meaning": meaning}
+            | ({"bound": bounds[name]} if name in bounds else {})
             for name, value, unit, meaning in rows
         }
 

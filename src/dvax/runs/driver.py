@@ -8,7 +8,6 @@ blocks, and what is on disk is readable whenever and however the run ends.
 import math
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -32,14 +31,14 @@ from dvax.runs.contact_frames import (
 )
 from dvax.runs.contact_inputs import ContactInputs
 from dvax.runs.contact_model import assumptions, contact_model
-from dvax.runs.interrupt import exit_code, interruptible, terminable, undisturbed
+from dvax.runs.interrupt import Work, exit_code, interruptible, terminable, writing
 from dvax.runs.provenance import provenance
 from dvax.runs.resolved import write_resolved
 from dvax.runs.rundir import FrameStore, RunDirectory, process
 from dvax.runs.schema import SolverSection
 from dvax.runs.solver_options import in_keys_of
 from dvax.spaces import AbstractSpace
-from dvax.theory import bound_error
+from dvax.theory import Bound, bound_error
 
 _BLOCKS = 40
 """So many blocks at least where there are frames enough: the progress bar moves, and a kill loses
@@ -76,21 +75,25 @@ def run(
     is the outcome, and what was computed before is on disk.
     """
     refuse_existing(out, overwrite)
-    inputs = build_contact(config)
-    directory = RunDirectory(out, clear=True)
-    try:
-        return _Run(config, inputs, directory, on_event or (lambda event: None)).go()
-    finally:
-        directory.close()
+    with terminable():
+        inputs = interruptible(lambda: build_contact(config))
+        tell = on_event or (lambda event: None)
+        # Nothing lies in the folder before a manifest can say what it is.
+        begun = interruptible(lambda: _Run(config, inputs, tell))
+        directory = RunDirectory(out, clear=True)
+        try:
+            return begun.go(directory)
+        finally:
+            directory.close()
 
 
 class _Run:
     """One run under way: the model, what is on disk, and how far it is."""
 
-    def __init__(
-        self, config: Config, inputs: ContactInputs, directory: RunDirectory, tell: Listener
-    ):
-        self.config, self.inputs, self.directory, self.tell = config, inputs, directory, tell
+    directory: RunDirectory
+
+    def __init__(self, config: Config, inputs: ContactInputs, tell: Listener):
+        self.config, self.inputs, self.tell = config, inputs, tell
         self.compiling = compile_clock()
         self.model = contact_model(config, inputs)
         self.problem, self.constants = self.model.problem, self.model.constants
@@ -99,8 +102,10 @@ class _Run:
         self.started = datetime.now(UTC)
         self.clock = time.monotonic()
         self.steps = self.rejected = 0
+        self.assumptions = assumptions(config, inputs)
 
-    def go(self) -> RunOutcome:
+    def go(self, directory: RunDirectory) -> RunOutcome:
+        self.directory = directory
         write_resolved(self.config, self.inputs, self.directory.path)
         self._manifest("running", "The run is going on.")
         for notice in self.inputs.notices:
@@ -117,26 +122,22 @@ class _Run:
                 self.config,
                 self.rows,
                 self.inputs.boundary.shape,
-                assumptions(self.config, self.inputs),
+                self.assumptions,
             ),
             {"long_name": "time", "units": self.config.units.time},
         )
         figures = Figures(self.inputs, self.config, self.constants)
         status, code, reason = "finished", 0, "The end time was reached."
         try:
-            with (
-                terminable(),
-                ThreadPoolExecutor(1) as pool,
-                announced(lambda: self._event("compiling")),
-            ):
-                self._blocks(times, block, store, figures, pool)
+            with announced(lambda: self._event("compiling")):
+                self._blocks(times, block, store, figures)
         except KeyboardInterrupt as stop:
             status, code = "interrupted", exit_code(stop)
             reason = "Interrupted; every frame written until then is kept."
         except SolveError as error:
             told = error.told(in_keys_of(SolverSection, "solver", "time.end"))
             status, code, reason = "failed", 3, told
-        with undisturbed():
+        with writing():
             store.finish()
             summary = {
                 "status": {"value": status, "unit": "1", "meaning": reason},
@@ -153,7 +154,6 @@ class _Run:
         block: int,
         store: FrameStore,
         figures: Figures,
-        pool: ThreadPoolExecutor,
     ) -> None:
         main, other = _Piece(self.inputs.x0), _Piece(self.inputs.companion_x0)
         apart, error, defect = None, 0.0, 0.0
@@ -163,7 +163,7 @@ class _Run:
             ts = np.concatenate([wanted, np.full(block - len(wanted), wanted[-1])])
             start = times[max(first - 1, 0)]
             # Two trajectories keep two cores busy, once the first block has compiled for both.
-            beside = pool.submit(self._solve, other, start, ts) if first else None
+            beside = self._beside(other, start, ts) if first else None
             failure = None
             try:
                 a = self._solve(main, start, ts)
@@ -176,16 +176,15 @@ class _Run:
                 wanted = wanted[: len(ts)]
             # The same arithmetic for both, so that their distance is not made of its differences.
             b = self._solve(other, start, ts) if beside is None else beside.result()
-            bound = bound_error(self.problem, a, self.constants, initial_error=error)
-            values = block_values(self.model, self.space, a, b, bound, apart)
+            bound, values = interruptible(self._values(a, b, error, apart))
             apart = float(values["separation_x"][0]) if apart is None else apart
-            store.mark(("error_bound_x", "error_bound_u", "error_bound_sharp_x"), bound.status)
             assert a.defect is not None
             values["defect"] = defect + np.asarray(a.defect)
             count = len(wanted)
             kept = {name: value[:count] for name, value in values.items()}
+            figures.add(wanted, kept, bound.status)
+            store.mark(("error_bound_x", "error_bound_u", "error_bound_sharp_x"), figures.status)
             store.write(wanted, kept)
-            figures.add(wanted, kept)
             if failure is not None:
                 raise failure
             main, other = self._end(a), self._end(b)
@@ -196,6 +195,18 @@ class _Run:
                 self._event("compiled", compile_seconds=self.compiling())
             self._event("progress", t=float(wanted[-1]), t_end=float(times[-1]), steps=self.steps)
 
+    def _beside(self, piece: "_Piece", start: float, ts: np.ndarray) -> Work[Solution]:
+        return Work(lambda: self._solve(piece, start, ts))
+
+    def _values(
+        self, a: Solution, b: Solution, error: Any, apart: Any
+    ) -> Callable[[], tuple[Bound, dict[str, np.ndarray]]]:
+        def compute() -> tuple[Bound, dict[str, np.ndarray]]:
+            bound = bound_error(self.problem, a, self.constants, initial_error=error)
+            return bound, block_values(self.model, self.space, a, b, bound, apart)
+
+        return compute
+
     def _solve(self, piece: "_Piece", start: float, ts: np.ndarray) -> Solution:
         s = self.config.solver
         options: dict[str, Any] = (
@@ -204,7 +215,7 @@ class _Run:
         return interruptible(
             lambda: solve(
                 self.problem, jnp.asarray(piece.x), start, float(ts[-1]), None, ts,
-                dt=s.dt, rtol=s.rtol or 1e-6, atol=s.atol or 1e-9,
+                dt=s.dt, dt_max=s.dt_max, rtol=s.rtol or 1e-6, atol=s.atol or 1e-9,
                 method=_METHODS[s.method](),
                 constants=self.constants, measure=True, max_steps=s.max_steps,
                 dt0=piece.dt, horizon=self.config.time.end, **options,

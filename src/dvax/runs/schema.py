@@ -278,6 +278,9 @@ class SolverSection(Section):
     atol: Annotated[float | None, in_quantity("indentation")] = Field(
         None, gt=0, description="absolute tolerance of a step, an indentation"
     )
+    dt_max: Annotated[float | None, in_quantity("time")] = Field(
+        None, gt=0, description="the longest step that adapts"
+    )
     max_steps: int | None = Field(
         None, ge=1, le=MOST_COUNTED, description="the most steps between two blocks of frames"
     )

@@ -3,7 +3,7 @@
 import json
 import re
 from difflib import get_close_matches
-from typing import Any, get_args
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -139,4 +139,11 @@ def _model_within(annotation: Any) -> type[BaseModel] | None:
 
 
 def _literals(info: FieldInfo | None) -> tuple[Any, ...]:
-    return () if info is None else get_args(info.annotation)
+    """The values that a key may have, those of an optional key included."""
+    return () if info is None else tuple(_values(info.annotation))
+
+
+def _values(annotation: Any) -> list[Any]:
+    if get_origin(annotation) is Literal:
+        return list(get_args(annotation))
+    return [value for part in get_args(annotation) for value in _values(part)]

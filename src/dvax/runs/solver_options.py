@@ -11,12 +11,14 @@ from dvax.runs.schema import MOST_COUNTED, Section, ViSolver, broken
 MOST_STEPS = 2**30
 """The most fixed steps of a run."""
 
-Method = Literal["ETD1", "ETD2RK", "ETD4RK", "ExpRosenbrock", "DormandPrince", "Implicit"]
+Method = Literal[
+    "ETD1", "ETD2RK", "ETD4RK", "ExpRosenbrock", "DormandPrince", "Implicit", "PiecewiseLinear"
+]  # fmt: skip
 
 
 def alone(dt: float | None, info: ValidationInfo) -> float | None:
     """Fixed steps have no tolerance, and adapt to none."""
-    given = [name for name in ("rtol", "atol") if info.data.get(name) is not None]
+    given = [name for name in ("rtol", "atol", "dt_max") if info.data.get(name) is not None]
     if dt is not None and given:
         raise broken(
             f"steps are fixed by dt, or chosen for {' and '.join(given)}, not both",
@@ -27,19 +29,33 @@ def alone(dt: float | None, info: ValidationInfo) -> float | None:
     return dt
 
 
+def _apart(value: Any, info: ValidationInfo) -> Any:
+    """`PiecewiseLinear` steps from event to event, and knows its law in closed form."""
+    if value is not None and info.data.get("method") == "PiecewiseLinear":
+        raise broken(
+            "PiecewiseLinear steps from one change of the constraints to the next, and solves its law "
+            "in closed form",
+            f"Leave out {info.field_name}, or name another method",
+        )
+    return value
+
+
 class SolverKeys(Section):
     """Keys that go to `dvax.solve`; one that is left out has the default of the model."""
 
     method: Method | None = Field(None, description="of a step; by default that of the model")
     rtol: float | None = Field(None, gt=0, lt=1, description="relative tolerance of a run")
     atol: float | None = Field(None, gt=0, description="absolute tolerance, in units of the state")
-    dt: Annotated[float | None, AfterValidator(alone)] = Field(
+    dt_max: Annotated[float | None, AfterValidator(_apart)] = Field(
+        None, gt=0, description="the longest step that adapts, in units of time"
+    )
+    dt: Annotated[float | None, AfterValidator(_apart), AfterValidator(alone)] = Field(
         None, gt=0, description="fixed steps of this length, in the place of rtol and atol"
     )
     max_steps: int | None = Field(
         None, ge=1, le=MOST_COUNTED, description="the most steps between two blocks of frames"
     )
-    vi_solver: ViSolver | None = Field(
+    vi_solver: Annotated[ViSolver | None, AfterValidator(_apart)] = Field(
         None, description="of the frozen law; by default that of the model"
     )
 
@@ -47,23 +63,29 @@ class SolverKeys(Section):
 def check_steps(table: SolverKeys, span: float, words: str) -> None:
     """Raise an `InputError` where a fixed step is longer than the run, which has the length `span` (in
     `words`), or so short that steps cannot be counted."""
-    dt = table.dt
-    if dt is None or (dt <= span and span / dt < MOST_STEPS):
-        return
-    rule = (
-        f"a step is not longer than the run, which has {words}"
-        if dt > span
-        else f"a run has fewer than {MOST_STEPS} steps, or they cannot be counted"
-    )
-    fix = f"Write dt = {span / 100:.3g}, say, or leave it out"
-    raise InputError(InputProblem("model.dt", f"{dt:g}", rule, fix))
+    for key, step in (("dt", table.dt), ("dt_max", table.dt_max)):
+        if step is None or (step <= span and span / step < MOST_STEPS):
+            continue
+        rule = (
+            f"a step is not longer than the run, which has {words}"
+            if step > span
+            else f"a run has fewer than {MOST_STEPS} steps, or they cannot be counted"
+        )
+        fix = f"Write {key} = {span / 100:.3g}, say, or leave it out"
+        raise InputError(InputProblem(f"model.{key}", f"{step:g}", rule, fix))
+
+
+def event_driven(table: SolverKeys) -> bool:
+    """Whether a model that `dvax.PiecewiseLinear` can solve is solved by it: where the file names no
+    method, and no option of those that take steps."""
+    return all(value is None for value in (table.method, table.dt, table.dt_max, table.vi_solver))
 
 
 def settings(table: SolverKeys, **defaults: Any) -> dict[str, Any]:
     """The keywords for `dvax.solve`: the keys that are given, else the defaults of the model."""
     given: dict[str, Any] = {
         name: value
-        for name in ("rtol", "atol", "dt", "max_steps")
+        for name in ("rtol", "atol", "dt", "dt_max", "max_steps")
         if (value := getattr(table, name)) is not None
     }
     if table.method is not None:
@@ -71,7 +93,8 @@ def settings(table: SolverKeys, **defaults: Any) -> dict[str, Any]:
     if table.vi_solver is not None:
         given["vi_solver"] = getattr(vi, table.vi_solver)()
     # Steps are fixed or adapt: what the file says of one kind drops the defaults of the other.
-    dropped = {"dt": ("rtol", "atol"), "rtol": ("dt",), "atol": ("dt",)}
+    adaptive = ("rtol", "atol", "dt_max")
+    dropped = {"dt": adaptive, **dict.fromkeys(adaptive, ("dt",))}
     out = [other for name in given for other in dropped.get(name, ())]
     return {k: v for k, v in defaults.items() if k not in out} | given
 

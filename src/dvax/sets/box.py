@@ -39,6 +39,9 @@ class Box(AbstractSet):
     def __init__(self, lower: Any, upper: Any):
         self.lower = _tree.as_float(lower, "dvax.sets.Box(lower)")
         self.upper = _tree.as_float(upper, "dvax.sets.Box(upper)")
+        shapes = jnp.shape(self.lower), jnp.shape(self.upper)
+        if shapes[0] != shapes[1]:
+            _check_shapes(*shapes)
         # In NumPy: in JAX each check is a program of its own, slower than a hundred small steps.
         _tree.require(
             lambda: np.all(np.asarray(self.lower) <= np.asarray(self.upper)),
@@ -106,6 +109,18 @@ class Box(AbstractSet):
                         "Give the bound that shape, or set control_space= of dvax.Problem",
                     )
                 )
+
+
+def _check_shapes(lower: tuple[int, ...], upper: tuple[int, ...]) -> None:
+    try:
+        np.broadcast_shapes(lower, upper)
+    except ValueError:
+        raise InputError(
+            InputProblem(
+                "dvax.sets.Box(lower, upper)", f"shapes {lower} and {upper}",
+                "both bound the same entries", "Give both one shape, or a number for all entries",
+            )
+        ) from None  # fmt: skip
 
 
 def _crossing(lower: jax.Array, upper: jax.Array) -> Any:

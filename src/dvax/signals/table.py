@@ -56,9 +56,10 @@ class Table(AbstractSignal):
                 )
             )
         # Times stay NumPy where they can: knots are then known without running anything.
-        self.times = np.asarray(times, dtype=float) if _tree.is_concrete(times) else times
+        self.times = _numbers(times, f"{name}(times)") if _tree.is_concrete(times) else times
         self.values = _tree.as_float(
-            values if hasattr(values, "dtype") else np.asarray(values, float), f"{name}(values)"
+            values if hasattr(values, "dtype") else _numbers(values, f"{name}(values)"),
+            f"{name}(values)",
         )
         self.kind = kind
         _check(name, self.times, self.values, least=4 if kind == "cubic" else 2)
@@ -77,6 +78,18 @@ class Table(AbstractSignal):
 
     def span(self) -> tuple[Any, Any]:
         return self.times[0], self.times[-1]
+
+
+def _numbers(values: Any, name: str) -> np.ndarray:
+    try:
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(
+            InputProblem(
+                name, " ".join(repr(values).split())[:120], "it is a list or array of numbers",
+                "Write numbers, and rows of one length",
+            )
+        ) from None  # fmt: skip
 
 
 # Functions of their own, by whose names an enclosure over time knows what they are.
@@ -157,7 +170,7 @@ def _check(name: str, times: Any, values: jax.Array, least: int) -> None:
             raise InputError(
                 InputProblem(
                     f"{name}(times)",
-                    f"times[{i}] = {times[i]!r}, times[{i + 1}] = {times[i + 1]!r}",
+                    f"times[{i}] = {times[i]:.17g}, times[{i + 1}] = {times[i + 1]:.17g}",
                     "times must increase strictly, or the signal has two values at one time",
                     "Sort the data and drop repeated times",
                 )

@@ -8,5 +8,7 @@ from .constants import Constants as Constants
 from .constants import Row as Row
 from .parameter_bounds import parameter_bounds as parameter_bounds
 from .parameters import ParameterBounds as ParameterBounds
+from .status import Status as Status
+from .status import weakest as weakest
 from .verify import Verification as Verification
 from .verify import verify as verify

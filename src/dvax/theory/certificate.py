@@ -92,7 +92,7 @@ def bound_error(
 
     ```
     """
-    _check(problem, sol, initial_error)
+    _check(problem, sol, constants, initial_error)
     space = problem.spaces(sol.setup.x0)[0]
     measured, apart = sol, jnp.zeros_like(sol.ts)
     domain = constants.domain
@@ -170,8 +170,20 @@ def _on_the_way(c: Constants, t0: Any, ts: Any, impulse: tuple, start: tuple) ->
     return jnp.min(jnp.stack(each), axis=0)
 
 
-def _check(problem: Problem, sol: Solution, initial_error: Any) -> None:
-    wrong: list[InputProblem] = []
+def _check(problem: Problem, sol: Any, constants: Any, initial_error: Any) -> None:
+    wrong: list[InputProblem] = [
+        InputProblem(
+            f"dvax.bound_error({name})", type(given).__name__, f"it is a {kind}", f"Take {source}"
+        )
+        for name, given, known, kind, source in (
+            ("sol", sol, isinstance(sol, Solution), "dvax.Solution", "what dvax.solve returned"),
+            ("constants", constants, isinstance(constants, Constants), "dvax.Constants",
+             "dvax.verify(problem, x0).constants"),
+        )
+        if not known
+    ]  # fmt: skip
+    if wrong:
+        raise InputError(*wrong)
     if sol.setup.problem is not problem and sol.setup.problem != problem:
         wrong.append(
             InputProblem(

@@ -2,10 +2,8 @@
 
 from collections.abc import Mapping
 
-import numpy as np
-
 from dvax.plots.applications.data import Data
-from dvax.plots.panels import Curve, Panel, panels_picture
+from dvax.plots.panels import Curve, Panel, bound_panel, bound_title, panels_picture
 from dvax.plots.picture import Picture
 
 _PREFIXES = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
@@ -23,15 +21,15 @@ def pictures(data: Mapping[str, Data]) -> list[Picture]:
         ("voltage", "state_", "V"), ("current", "state_", "A"), ("diode current", "diode_", "A"),
     ):  # fmt: skip
         found = [n for n, v in data.items() if n.startswith(prefix) and v.unit == of]
+        drawn = sum(len(panel.curves) for panel in panels)
         curves = [
             Curve(t, data[name].values, name.removeprefix(prefix), k, ("solid", "dash")[k // 6 % 2])
-            for k, name in enumerate(found)
+            for k, name in enumerate(found, start=drawn)
         ]
         if curves:
             panels.append(Panel(curves, what, of))
     bound = data["error_bound"]
-    shown = np.where(bound.values > 0, bound.values, np.nan)
-    certificate = Panel([Curve(t, shown, "bound", 1)], "error bound", bound.unit, log=True)
+    certificate = bound_panel(t, bound, bound.unit)
     return [
         panels_picture(
             "circuit", "The circuit over time",
@@ -39,7 +37,7 @@ def pictures(data: Mapping[str, Data]) -> list[Picture]:
             panels, "time", unit,
         ),
         panels_picture(
-            "certificate", "Certified error",
+            "certificate", bound_title(bound),
             "A bound on the distance of the computed state from the true one, in the norm of the "
             "stored energy, ‖x‖² = ΣCv² + ΣLi².",
             [certificate], "time", unit,

@@ -15,6 +15,8 @@ class Data:
     dims: tuple[str, ...]
     unit: str
     words: str
+    status: str = ""
+    """Of a bound, how much is known of it: proved, declared or estimated."""
 
 
 def read_data(store: Path) -> dict[str, Data]:
@@ -32,5 +34,6 @@ def read_data(store: Path) -> dict[str, Data]:
             dims,
             str(attrs.get("units", "")),
             str(attrs.get("long_name", "")),
+            str(attrs.get("status", "")),
         )
     return found

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from dvax.plots.applications.data import Data
 from dvax.plots.look import STILL_STYLE, blank, still_axes
-from dvax.plots.panels import Curve, Panel, panels_picture
+from dvax.plots.panels import Curve, Panel, bound_panel, panels_picture
 from dvax.plots.picture import Picture
 
 _MOMENTS = 5
@@ -48,13 +48,7 @@ def _force(data: Mapping[str, Data]) -> Picture:
     times = data["time"].values
     panels = [Panel([Curve(times, data["force"].values, "force", 0)], "force", "p·x")]
     if "error_bound" in data:
-        bound = data["error_bound"].values
-        shown = np.where(bound > 0, bound, np.nan)
-        panels.append(
-            Panel(
-                [Curve(times, shown, "bound", 1)], "error bound", "(p·x²)^0.5", log=True, share=0.7
-            )
-        )
+        panels.append(bound_panel(times, data["error_bound"], "(p·x²)^0.5", share=0.7))
     return panels_picture(
         "force", "Force on the punch",
         "Units are those of the configuration: [x] of length, [p] of pressure, [t] of time.",

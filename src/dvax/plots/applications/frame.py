@@ -2,10 +2,8 @@
 
 from collections.abc import Mapping
 
-import numpy as np
-
 from dvax.plots.applications.data import Data
-from dvax.plots.panels import Curve, Panel, panels_picture
+from dvax.plots.panels import Curve, Panel, bound_panel, bound_title, panels_picture
 from dvax.plots.picture import Picture
 
 
@@ -20,10 +18,8 @@ def pictures(data: Mapping[str, Data]) -> list[Picture]:
             "in",
         ),
     ]
-    bound = data["error_bound"].values
-    certificate = [
-        Panel([Curve(t, np.where(bound > 0, bound, np.nan), "bound", 1)], "bound", "in", log=True)
-    ]
+    bound = data["error_bound"]
+    certificate = [bound_panel(t, bound, "in")]
     return [
         panels_picture(
             "histories", "Displacement under the earthquake",
@@ -38,7 +34,7 @@ def pictures(data: Mapping[str, Data]) -> list[Picture]:
             "displacement", "in",
         ),
         panels_picture(
-            "certificate", "Certified error",
+            "certificate", bound_title(bound),
             "A bound on the distance of the computed displacement from the true one.",
             certificate, "time", "s",
         ),

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from dvax.plots.applications.data import Data
 from dvax.plots.look import INK, STILL_STYLE, blank, still_axes
-from dvax.plots.panels import Curve, Panel, panels_picture
+from dvax.plots.panels import Curve, Panel, bound_panel, panels_picture
 from dvax.plots.picture import Picture
 
 _BUSIEST = 5
@@ -46,16 +46,14 @@ def _days(data: Mapping[str, Data]) -> Picture:
     links = [
         Curve(days, load[:, k], name, i + 1) for i, (k, name) in enumerate(zip(busiest, names))
     ]
-    bound = data["error_bound"].values
-    certificate = [Curve(days, np.where(bound > 0, bound, np.nan), "error bound", 0, "dash")]
     return panels_picture(
         "days", "The way to equilibrium",
         f"Above, {words}. In the middle, the links that are the fullest in the end. Below, the bound "
-        "on the error of the path flows; its status stands with the figure.",
+        "on the error of the path flows.",
         [
             above,
             Panel(links, "flow / capacity"),
-            Panel(certificate, "error bound", "trip", log=True, share=0.7),
+            bound_panel(days, data["error_bound"], "trip", _BUSIEST + 1, share=0.7),
         ],
         "time", "day",
     )  # fmt: skip

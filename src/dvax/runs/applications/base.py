@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
+import jax
 import numpy as np
 
 from dvax.problem import Problem
@@ -16,23 +17,26 @@ from dvax.theory import Assumption, Constants
 @dataclass(frozen=True)
 class Figure:
     """A headline figure: a number, or a list of them; `error`: a proved bound on its error, or on those
-    of its entries, where there is one."""
+    of its entries, where there is one. A figure that is a bound itself says in `bound` how much is
+    known of it: "proved", "declared" or "estimated"."""
 
     value: Any
     unit: str
     meaning: str
     error: Any = None
+    bound: str | None = None
 
 
 @dataclass(frozen=True)
 class Variable:
     """An array of the results with the names of its dimensions; one named like its dimension is a
-    coordinate."""
+    coordinate. `status`: of a bound, how much is known of it."""
 
     dims: tuple[str, ...]
     values: np.ndarray
     unit: str
     words: str
+    status: str = ""
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,19 @@ class Plan:
     time_unit: str = ""
 
 
+class PerRow:
+    """Functions of one row of a solution over all of its rows, each compiled once for a model."""
+
+    def __init__(self) -> None:
+        self._made: dict[str, Callable[..., Any]] = {}
+
+    def __call__(self, name: str, function: Callable[..., Any], *rows: Any) -> np.ndarray:
+        """function(*row) at every row of `rows`; by the same `name` it is the same function."""
+        if name not in self._made:
+            self._made[name] = jax.jit(jax.vmap(function))
+        return np.asarray(self._made[name](*rows))
+
+
 Say = Callable[[str], None]
 """To be told what a solve is about to do: "solving at rest", for a reader who waits."""
 
@@ -89,7 +106,7 @@ class AbstractApplication(abc.ABC, Generic[Model]):
     - `fit`: "exact", or by what it is regularised, or why it is outside the class;
     - `known`: what can be told before anything is solved;
     - `plan`: what is to be integrated, all else being computed, saying at each stage what it does;
-    - `results`: from the solution, which may end before the last time, to the results.
+    - `results`: from the solution, of which the first `count` rows are meant, to the results.
 
     `end` is the key of the file for the last time of a run, where there is one.
     """
@@ -120,6 +137,8 @@ class AbstractApplication(abc.ABC, Generic[Model]):
         """What to integrate. **Raises:** `dvax.SolveError`."""
 
     @abc.abstractmethod
-    def results(self, model: Model, plan: Plan, solution: Any) -> Results:
-        """The results up to the last time of the `dvax.Solution`, whether or not it is the last of the
-        plan; None stands for it where the plan has one time alone."""
+    def results(self, model: Model, plan: Plan, solution: Any, count: int) -> Results:
+        """The results up to the time number `count` of the plan. The `dvax.Solution` has all rows of
+        the plan, and the last of those `count` once more in each that was not reached: what is compiled
+        for the first results serves all later ones. None stands for it where the plan has one time
+        alone."""

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import jax
 import numpy as np
 from pydantic import Field
 
@@ -14,6 +13,7 @@ from dvax.runs.applications.base import (
     AbstractApplication,
     Figure,
     Known,
+    PerRow,
     Plan,
     Results,
     Say,
@@ -21,7 +21,7 @@ from dvax.runs.applications.base import (
 )
 from dvax.runs.applications.certificate import certificate
 from dvax.runs.schema import in_quantity
-from dvax.runs.solver_options import SolverKeys, check_steps, settings
+from dvax.runs.solver_options import SolverKeys, check_steps, event_driven, settings
 
 
 class CircuitSection(SolverKeys):
@@ -41,7 +41,7 @@ class CircuitSection(SolverKeys):
 
 class _Loaded:
     def __init__(self, table: CircuitSection, file: Path):
-        self.table = table
+        self.table, self.per_row = table, PerRow()
         self.circuit = Circuit.from_file(file, r_on=table.r_on, g_leak=table.g_leak)
         self.circuit.check_sources(table.t_end)
         check_steps(table, table.t_end, f"{table.t_end:g} s")
@@ -74,15 +74,15 @@ class CircuitApplication(AbstractApplication[_Loaded]):
         say(f"solving from 0 to {table.t_end:g} s")
         times = np.linspace(0.0, table.t_end, table.frames + 1)
         # As `dvax.models.Circuit.solve` has them.
-        method = PiecewiseLinear() if table.dt is None else ExpRosenbrock()
+        method = PiecewiseLinear() if event_driven(table) else ExpRosenbrock()
         options = settings(table, method=method, rtol=1e-8, atol=1e-9)
         return Plan(c.problem, c.x0, times, c.constants, options, None, "s")
 
-    def results(self, model: _Loaded, plan: Plan, solution: Solution) -> Results:
-        c, times = model.circuit, np.asarray(solution.ts)
-        bound = certificate(c.problem, solution, c.constants)
+    def results(self, model: _Loaded, plan: Plan, solution: Solution, count: int) -> Results:
+        c, times = model.circuit, np.asarray(solution.ts)[:count]
+        bound = certificate(c.problem, solution, c.constants, count)
         volts, amperes = (
-            np.asarray(jax.jit(jax.vmap(of))(solution.ts, solution.xs, solution.us))
+            model.per_row(of.__name__, of, solution.ts, solution.xs, solution.us)[:count]
             for of in (c.voltages, c.currents)
         )
         time = ("time",)
@@ -90,7 +90,7 @@ class CircuitApplication(AbstractApplication[_Loaded]):
         for k, name in enumerate(c.states):
             unit = "V" if name.upper().startswith("C") else "A"
             what = "voltage of" if unit == "V" else "current of"
-            values = np.asarray(solution.xs[:, k])
+            values = np.asarray(solution.xs)[:count, k]
             variables[_key("state", name)] = Variable(time, values, unit, f"{what} {name}")
         for k, name in enumerate(c.nodes):
             variables[_key("node", name)] = Variable(
@@ -104,14 +104,16 @@ class CircuitApplication(AbstractApplication[_Loaded]):
             bound.values,
             "J^(1/2)",
             "bound on the error of the state, ‖x‖² = ΣCv² + ΣLi²",
+            bound.status,
         )
         figures = {
             "final_state": Figure(
-                np.asarray(solution.xs[-1]), "V, A", f"{', '.join(c.states)} at t = {times[-1]:g} s"
+                np.asarray(solution.xs)[-1], "V, A", f"{', '.join(c.states)} at t = {times[-1]:g} s"
             ),
             "error_bound": Figure(
                 bound.largest, "J^(1/2)",
                 f"bound on the error of the state in the norm of the energy ({bound.status})",
+                bound=bound.status,
             ),
             "decay_rate": Figure(
                 float(c.constants.sharp_decay_rate) + 0.0, "1/s",

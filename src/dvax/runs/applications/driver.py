@@ -2,7 +2,7 @@
 
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -18,16 +18,12 @@ from dvax.runs.applications.segments import joined, segments, states_alone
 from dvax.runs.applications.wording import in_keys
 from dvax.runs.compile_time import announced, compile_clock
 from dvax.runs.driver import Listener, RunOutcome, refuse_existing
-from dvax.runs.interrupt import exit_code, interruptible, terminable, undisturbed
+from dvax.runs.interrupt import Work, exit_code, interruptible, patience, terminable, writing
 from dvax.runs.provenance import provenance
 from dvax.runs.resolved import DATA_FOLDER, NAME
 from dvax.runs.rundir import RunDirectory, process
 from dvax.runs.solver_options import in_keys_of
 from dvax.theory import Assumption, Constants
-
-_PATIENCE = 30.0
-"""Seconds in which the results of a run that stopped are put together; after that, or at a second
-signal, its states alone are kept."""
 
 
 def run_model(
@@ -35,16 +31,22 @@ def run_model(
 ) -> RunOutcome:
     """Solve what `config` describes and leave a run directory at `out`; see `dvax.runs.driver.run`."""
     refuse_existing(out, overwrite)
-    directory = RunDirectory(out, clear=True)
-    try:
-        return _Run(config, directory, on_event or (lambda event: None)).go()
-    finally:
-        directory.close()
+    with terminable():
+        tell = on_event or (lambda event: None)
+        # Nothing lies in the folder before a manifest can say what it is.
+        begun = interruptible(lambda: _Run(config, tell))
+        directory = RunDirectory(out, clear=True)
+        try:
+            return begun.go(directory)
+        finally:
+            directory.close()
 
 
 class _Run:
-    def __init__(self, config: ModelConfig, directory: RunDirectory, tell: Listener):
-        self.config, self.directory, self.tell = config, directory, tell
+    directory: RunDirectory
+
+    def __init__(self, config: ModelConfig, tell: Listener):
+        self.config, self.tell = config, tell
         self.started, self.clock = datetime.now(UTC), time.monotonic()
         self.compiling = compile_clock()
         known = config.application.known(config.model)
@@ -52,7 +54,8 @@ class _Run:
         self.rows = constant_rows(known.constants)
         self.steps = 0
 
-    def go(self) -> RunOutcome:
+    def go(self, directory: RunDirectory) -> RunOutcome:
+        self.directory = directory
         _write_resolved(self.config, self.directory.path)
         self._manifest("running", "The run is going on.")
         for note in self.notes:
@@ -61,39 +64,48 @@ class _Run:
         plan: Plan | None = None
         pieces: list[Solution] = []
         results: Results | None = None
-        with terminable():
+        last: Work[Results] | None = None
+        try:
+            with (
+                announced(lambda: self._event("compiling")),
+                in_keys(self.config.source.name, self.config.application),
+            ):
+                plan = interruptible(
+                    lambda: self.config.application.plan(self.config.model, self._stage)
+                )
+                for piece in segments(plan):
+                    pieces.append(piece)
+                    if len(pieces) == 1:
+                        # All that the figures need is compiled now, so that whoever ends the run
+                        # later on has them at once.
+                        last = Work(self._results(plan, pieces))
+                        last.result()
+                        last = None
+                        self._event("compiled", compile_seconds=self.compiling())
+                    self._progress(plan, piece)
+                self._stage("writing the results")
+                last = Work(self._results(plan, pieces))
+                results = last.result()
+        except KeyboardInterrupt as stop:
+            status, code = "interrupted", exit_code(stop)
+            reason = f"Interrupted {self._reached(plan, pieces)}."
+        except InputError as error:
+            status, code, reason = "failed", 2, str(error)
+        except SolveError as error:
+            section, end = self.config.application.section, self.config.application.end
+            status, code = "failed", 3
+            reason = error.told(in_keys_of(section, "model", end))
+        except BaseException as error:
+            # Whatever it was, the run is over, and its folder says so.
+            self._manifest("failed", f"{type(error).__name__}: {error}")
+            raise
+        if results is None and plan is not None and pieces:
             try:
-                with (
-                    announced(lambda: self._event("compiling")),
-                    in_keys(self.config.source.name, self.config.application),
-                ):
-                    plan = interruptible(
-                        lambda: self.config.application.plan(self.config.model, self._stage)
-                    )
-                    for piece in segments(plan):
-                        pieces.append(piece)
-                        self._progress(plan, piece)
-                    results = interruptible(lambda: self._results(plan, pieces))
-            except KeyboardInterrupt as stop:
-                status, code = "interrupted", exit_code(stop)
-                reason = f"Interrupted {self._reached(plan, pieces)}."
-            except InputError as error:
-                status, code, reason = "failed", 2, str(error)
-            except SolveError as error:
-                section, end = self.config.application.section, self.config.application.end
-                status, code = "failed", 3
-                reason = error.told(in_keys_of(section, "model", end))
-            except BaseException as error:
-                # Whatever it was, the run is over, and its folder says so.
-                self._manifest("failed", f"{type(error).__name__}: {error}")
-                raise
-        if results is None and pieces:
-            try:
-                results = interruptible(lambda: self._results(plan, pieces), _PATIENCE)
+                results = (last or Work(self._results(plan, pieces))).result(patience())
             except (KeyboardInterrupt, TimeoutError):
                 results = states_alone(pieces)
                 reason += " Its states alone were kept: there was no time for figures."
-        with undisturbed():
+        with writing():
             if results is not None:
                 self._keep(results)
             summary = self._summary(status, reason, results)
@@ -102,21 +114,24 @@ class _Run:
             self._event("stopped", message=reason, status=status)
         return RunOutcome(status, code, reason, self.directory.path, summary, results is not None)
 
-    def _results(self, plan: Plan | None, pieces: list[Solution]) -> Results:
-        """What the pieces give."""
-        assert plan is not None
-        self._stage("writing the results")
-        solution = joined(pieces) if pieces else None
-        return self.config.application.results(self.config.model, plan, solution)
+    def _results(self, plan: Plan, pieces: list[Solution]) -> Callable[[], Results]:
+        """Work that returns what the pieces give."""
+        config, given = self.config, list(pieces)
+
+        def compute() -> Results:
+            every = len(plan.times)
+            count = sum(len(piece.ts) for piece in given) if given else every
+            solution = joined(given, every) if given else None
+            return config.application.results(config.model, plan, solution, count)
+
+        return compute
 
     def _progress(self, plan: Plan, piece: Solution) -> None:
-        first = not self.steps
         self.steps += int(piece.stats["steps"])
-        if first:
-            self._event("compiled", compile_seconds=self.compiling())
         begin, t = float(plan.times[0]), float(piece.ts[-1])
         self._event(
-            "progress", t=t - begin, t_end=float(plan.times[-1]) - begin, steps=self.steps
+            "progress", t=t - begin, t_end=float(plan.times[-1]) - begin, steps=self.steps,
+            unit=plan.time_unit,
         )  # fmt: skip
 
     @staticmethod
@@ -134,6 +149,8 @@ class _Run:
             summary[name] = {"value": _plain(f.value), "unit": f.unit, "meaning": f.meaning}
             if f.error is not None:
                 summary[name]["error"] = _plain(f.error)
+            if f.bound is not None:
+                summary[name]["bound"] = f.bound
         return summary
 
     def _keep(self, results: Results) -> None:
@@ -167,6 +184,7 @@ class _Run:
             **provenance(),
             **process(),
             "model": self.config.name,
+            "title": f"{self.config.name}, {self.config.source.stem}",
             "fit": self.config.application.fit(self.config.model),
             "status": status,
             "stop_reason": reason,
@@ -212,7 +230,9 @@ def write_dataset(path: Path, variables: Mapping[str, Variable], attrs: Mapping[
         values = np.asarray(v.values)
         group.create_array(
             name, data=values, dimension_names=v.dims,
-            attributes={"long_name": v.words, "units": v.unit},
+            attributes={
+                "long_name": v.words, "units": v.unit, **({"status": v.status} if v.status else {}),
+            },
         )  # fmt: skip
 
 

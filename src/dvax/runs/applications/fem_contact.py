@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
 import numpy as np
 from pydantic import Field
 
@@ -15,6 +14,7 @@ from dvax.runs.applications.base import (
     AbstractApplication,
     Figure,
     Known,
+    PerRow,
     Plan,
     Results,
     Say,
@@ -63,7 +63,7 @@ class FemContactSection(SolverKeys):
 
 class _Loaded:
     def __init__(self, table: FemContactSection, file: Path | None):
-        self.table = table
+        self.table, self.per_row = table, PerRow()
         check_steps(table, table.end, f"the length {table.end:g}")
         sizes = _given(table, _SIZES)
         names = _given(table, ("contact", "clamped"))
@@ -157,9 +157,9 @@ class FemContactApplication(AbstractApplication[_Loaded]):
         options = settings(table, method=m.method, rtol=1e-7, atol=1e-11)
         return Plan(m.problem, m.untouched, times, m.constants, options, rest)
 
-    def results(self, model: _Loaded, plan: Plan, solution: Solution) -> Results:
-        m, rest, times = model.contact, plan.data, np.asarray(solution.ts)
-        pressure = np.asarray(jax.jit(jax.vmap(m.pressure))(solution.ts, solution.xs))
+    def results(self, model: _Loaded, plan: Plan, solution: Solution, count: int) -> Results:
+        m, rest, times = model.contact, plan.data, np.asarray(solution.ts)[:count]
+        pressure = model.per_row("pressure", m.pressure, solution.ts, solution.xs)[:count]
         still, last = m.figures(rest.pressure), m.figures(pressure[-1])
         force = np.array([m.figures(p)["force"] for p in pressure])
         s = m.body.points[:, 0]
@@ -179,6 +179,7 @@ class FemContactApplication(AbstractApplication[_Loaded]):
             "cells": Variable(("cell", "corner"), m.body.cells(), "1", "nodes of each element"),
             "stress": Variable(("cell", "component"), stress, "[p]", "xx, yy, zz, xy at the end"),
         }
+        known = m.constants.status_of("gamma")
         certified = None if rest.vi.error_bound is None else float(rest.vi.error_bound)
         figures = {
             "force": Figure(still["force"], "[p][x]", "force on the punch at rest"),
@@ -195,7 +196,8 @@ class FemContactApplication(AbstractApplication[_Loaded]):
                 "largest difference of the last pressure from that at rest",
             ),
             "rest_error_bound": Figure(
-                certified, "[p][x]^(1/2)", "bound on the error of the pressure at rest, in L2"
+                certified, "[p][x]^(1/2)",
+                f"bound on the error of the pressure at rest, in L2 ({known})", bound=known,
             ),
             "decay_rate": Figure(
                 float(m.constants.sharp_decay_rate), "1/[t]",
@@ -203,13 +205,18 @@ class FemContactApplication(AbstractApplication[_Loaded]):
             ),
         }  # fmt: skip
         if not isinstance(solution.setup.method, Implicit):
-            bound = certificate(m.problem, solution, m.constants)
+            bound = certificate(m.problem, solution, m.constants, count)
             figures["error_bound"] = Figure(
                 bound.largest, "([p][x]²)^(1/2)",
                 f"bound on the error of the state in the norm of the viscosity ({bound.status})",
+                bound=bound.status,
             )  # fmt: skip
             variables["error_bound"] = Variable(
-                ("time",), bound.values, "([p][x]²)^(1/2)", "bound on the error of the state"
+                ("time",),
+                bound.values,
+                "([p][x]²)^(1/2)",
+                "bound on the error of the state",
+                bound.status,
             )
 
         def files(directory: Path) -> None:

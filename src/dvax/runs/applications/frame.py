@@ -23,10 +23,13 @@ from dvax.runs.applications.base import (
 )
 from dvax.runs.applications.certificate import certificate
 from dvax.runs.schema import in_quantity
-from dvax.runs.solver_options import SolverKeys, check_steps, settings
+from dvax.runs.solver_options import SolverKeys, check_steps, event_driven, settings
 
 _INCH = 0.0254
 """Metres in an inch, exactly."""
+
+
+_largest_between = jax.jit(largest_between)
 
 
 class FrameSection(SolverKeys):
@@ -34,7 +37,9 @@ class FrameSection(SolverKeys):
 
     name: Literal["frame"] = Field(description="the model")
     record: str = Field(description="an .at2 strong-motion record, in units of gravity")
-    period: Annotated[float, in_quantity("time")] = Field(gt=0, description="natural period [s]")
+    period: Annotated[float, in_quantity("time")] = Field(
+        gt=0, le=1e6, description="natural period [s]"
+    )
     damping: float = Field(ge=0, description="of the critical damping")
     yield_ratio: float | None = Field(
         None, gt=0, description="yield force over the largest elastic force; without it: elastic"
@@ -89,18 +94,18 @@ class FrameApplication(AbstractApplication[_Loaded]):
     def plan(self, model: _Loaded, say: Say) -> Plan:
         frame = model.frame
         say("solving over the record")
-        method = PiecewiseLinear() if model.table.dt is None else ExpRosenbrock()
+        method = PiecewiseLinear() if event_driven(model.table) else ExpRosenbrock()
         options = settings(model.table, method=method, rtol=1e-8)
         return Plan(
             frame.problem, jnp.zeros(3), frame.times, frame.constants, options, None, "s"
         )  # fmt: skip
 
-    def results(self, model: _Loaded, plan: Plan, solution: Solution) -> Results:
+    def results(self, model: _Loaded, plan: Plan, solution: Solution, count: int) -> Results:
         frame, constants = model.frame, plan.constants
-        bound = certificate(frame.problem, solution, constants)
+        bound = certificate(frame.problem, solution, constants, count)
         between = (len(plan.times) - 1) // (frame.record.samples.shape[0] - 1)
-        d, v, plastic = np.asarray(solution.xs).T
-        ts = np.asarray(solution.ts)
+        d, v, plastic = np.asarray(solution.xs)[:count].T
+        ts = np.asarray(solution.ts)[:count]
         omega = float(frame.omega)
         ground = np.interp(ts, np.asarray(frame.record.knots()), np.asarray(frame.record.samples))
         time, error = ("time",), bound.values / omega
@@ -114,14 +119,18 @@ class FrameApplication(AbstractApplication[_Loaded]):
             ("spring", spring, "in/s^2", "force of the spring a mass"),
             ("error_bound", error, "in", "bound on the error of the displacement"),
         ):
-            variables[name] = Variable(time, values, unit, words)
-            si = Variable(time, _INCH * values, unit.replace("in", "m"), f"{words}, in SI units")
+            status = bound.status if name == "error_bound" else ""
+            variables[name] = Variable(time, values, unit, words, status)
+            metres = unit.replace("in", "m")
+            si = Variable(time, _INCH * values, metres, f"{words}, in SI units", status)
             variables[f"{name}_si"] = si
         peak = float(np.max(np.abs(d[::between])))
-        # One compiled program: a run that was interrupted has a length of its own to compile for.
         a = -2.0 * float(frame.damping) * omega * v - spring - ground
         apart = frame.record.step / between
-        top = float(jax.jit(largest_between)(*map(jnp.asarray, (d, v, a)), apart))
+        # Behind its last row a frame stands still.
+        behind = len(plan.times) - count
+        moves = np.pad(d, (0, behind), "edge"), np.pad(v, (0, behind)), np.pad(a, (0, behind))
+        top = float(_largest_between(*map(jnp.asarray, moves), apart))
         largest = bound.largest
         # Every displacement is off by no more than the bound, so its peaks are as well.
         proved = bound.proved(1.0 / omega)
@@ -142,15 +151,20 @@ class FrameApplication(AbstractApplication[_Loaded]):
             lengths["yield_displacement"] = (limit, None, "displacement at which it yields")
             lengths["elastoplastic_distance"] = (
                 float(np.max(np.asarray(frame.elastoplastic_distance(solution)))), None,
-                "bound on how far the displacement is from that of the elastoplastic frame, eta/k = 0",
+                "bound on how far the displacement is from that of the elastoplastic frame, eta/k = 0 "
+                "(estimated, from the velocities that were computed)",
             )  # fmt: skip
-        figures = {n: Figure(value, "in", words, e) for n, (value, e, words) in lengths.items()}
+        bounds = {"error_bound": bound.status, "elastoplastic_distance": "estimated"}
+        figures = {
+            n: Figure(value, "in", words, e, bounds.get(n))
+            for n, (value, e, words) in lengths.items()
+        }
         if np.isfinite(limit):
             figures["ductility"] = Figure(peak / limit, "1", "peak over yield displacement")
         figures |= {
             f"{name}_si": Figure(
                 None if value is None else _INCH * value, "m", f"{words}, in SI units",
-                None if error is None else _INCH * error,
+                None if error is None else _INCH * error, bounds.get(name),
             )
             for name, (value, error, words) in lengths.items()
         }  # fmt: skip

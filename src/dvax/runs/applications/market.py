@@ -16,6 +16,7 @@ from dvax.runs.applications.base import (
     AbstractApplication,
     Figure,
     Known,
+    PerRow,
     Plan,
     Results,
     Say,
@@ -43,7 +44,7 @@ class MarketSection(SolverKeys):
 
 class _Loaded:
     def __init__(self, table: MarketSection, rts: RTS):
-        self.table = table
+        self.table, self.per_row = table, PerRow()
         check_steps(table, float(max(table.hours - 1, 1)), f"{table.hours} hours")
         self.times = np.arange(table.start_hour, table.start_hour + table.hours, dtype=float)
         options: dict[str, Any] = dict(
@@ -99,11 +100,11 @@ class MarketApplication(AbstractApplication[_Loaded]):
         )
         return Plan(market.problem, prices[0], times, market.constants, options, rest, "h")
 
-    def results(self, model: _Loaded, plan: Plan, solution: Solution | None) -> Results:
-        market = model.market
-        times = plan.times if solution is None else np.asarray(solution.ts)
-        prices, made = (values[: len(times)] for values in plan.data)
-        capacity = np.asarray(jax.jit(jax.vmap(market.capacity.value))(jnp.asarray(times)))
+    def results(self, model: _Loaded, plan: Plan, solution: Solution | None, count: int) -> Results:
+        market, times = model.market, np.asarray(plan.times)[:count]
+        prices, made = (values[:count] for values in plan.data)
+        every = model.per_row("capacity", market.capacity.value, jnp.asarray(plan.times))
+        capacity = every[:count]
         firms = np.asarray(market.firms)
         numbers = np.asarray(market.cost), np.asarray(market.slope), firms, float(market.b)
         gain = largest_gain(prices, made, capacity, *numbers)
@@ -123,15 +124,19 @@ class MarketApplication(AbstractApplication[_Loaded]):
         steps = 0
         if solution is not None:
             steps = int(solution.stats["steps"])
-            bound = certificate(market.problem, solution, market.constants)
-            sticky = np.asarray(solution.xs)
+            bound = certificate(market.problem, solution, market.constants, count)
+            sticky = np.asarray(solution.xs)[:count]
             variables |= {
                 "sticky_price": Variable(("hour",), sticky, "$/MWh", "price that follows demand"),
                 "error_bound": Variable(
-                    ("hour",), bound.values, "$/MWh", "bound on the error of the sticky price"
+                    ("hour",),
+                    bound.values,
+                    "$/MWh",
+                    "bound on the error of the sticky price",
+                    bound.status,
                 ),
             }
-            under_way = largest_gain(sticky, np.asarray(solution.us), capacity, *numbers)
+            under_way = largest_gain(sticky, np.asarray(solution.us)[:count], capacity, *numbers)
             figures["max_deviation_profit"] = Figure(
                 max(gain, under_way), "$/h",
                 "most that a firm could gain by making something else, at rest or under way",
@@ -147,6 +152,7 @@ class MarketApplication(AbstractApplication[_Loaded]):
                 "error_bound": Figure(
                     bound.largest, "$/MWh",
                     f"bound on the error of the sticky price ({bound.status})",
+                    bound=bound.status,
                 ),
                 "decay_rate": Figure(
                     float(market.constants.sharp_decay_rate), "1/h",

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -80,9 +81,10 @@ def _with(solution: Solution, fields: dict[str, Any]) -> Solution:
     return Solution(**(given | fields))
 
 
-def joined(pieces: list[Solution]) -> Solution:
+def joined(pieces: list[Solution], count: int | None = None) -> Solution:
     """One solution of consecutive pieces: integrals of defects go on from piece to piece, and steps
-    are counted together. Its `setup` is that of the first piece."""
+    are counted together. Its `setup` is that of the first piece. With `count` the last row is repeated
+    up to so many, so that programs of its length serve it however far the run came."""
     fields: dict[str, Any] = {}
     for name in ("ts", "xs", "us", "ys", "law_residual", "law_step", "law_error"):
         fields[name] = _joined([getattr(piece, name) for piece in pieces])
@@ -90,11 +92,13 @@ def joined(pieces: list[Solution]) -> Solution:
         defects: list[Any] = [(piece.defect, piece.law_defect) for piece in pieces]
         starts: list[Any] = [piece.settled for piece in pieces]
         # What had come together before each piece began.
-        ends = [np.array([one[-1], two[-1]]) for one, two in defects]
+        ends = [np.array([float(one[-1]), float(two[-1])]) for one, two in defects]
         before = np.cumsum([np.zeros(2), *ends[:-1]], axis=0)
         sums = [
             tuple(
-                _joined([part[k] + at[k] for part, at in zip(parts, before, strict=True)])
+                _joined(
+                    [np.asarray(part[k]) + at[k] for part, at in zip(parts, before, strict=True)]
+                )
                 for k in (0, 1)
             )
             for parts in (defects, starts)
@@ -107,7 +111,20 @@ def joined(pieces: list[Solution]) -> Solution:
         if name in last
     }
     fields["stats"] = {**last, **counts}
-    return _with(pieces[0], fields)
+    if count is not None:
+        length = count
+
+        def whole(rows: Any) -> jax.Array:
+            return _padded(rows, length)
+
+        stats = fields.pop("stats")
+        fields = {**jtu.tree_map(whole, fields), "stats": stats}
+    return _with(pieces[0], fields | {"enclosed": all(piece.enclosed for piece in pieces)})
+
+
+def _padded(rows: Any, count: int) -> jax.Array:
+    rows = np.asarray(rows)
+    return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], count - len(rows), axis=0)]))
 
 
 def states_alone(pieces: list[Solution]) -> Results:
@@ -131,4 +148,5 @@ STATE = "state_part"
 def _joined(parts: list[Any]) -> Any:
     if any(part is None for part in parts):
         return None
-    return jtu.tree_map(lambda *leaves: jnp.concatenate([jnp.asarray(v) for v in leaves]), *parts)
+    # By NumPy: JAX would compile a program for every number of pieces.
+    return jtu.tree_map(lambda *leaves: jnp.asarray(np.concatenate(leaves)), *parts)

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-import jax
 import numpy as np
 from pydantic import AfterValidator, Field
 
@@ -15,6 +14,7 @@ from dvax.runs.applications.base import (
     AbstractApplication,
     Figure,
     Known,
+    PerRow,
     Plan,
     Results,
     Say,
@@ -76,7 +76,7 @@ class TrafficSection(SolverKeys):
 
 class _Loaded:
     def __init__(self, table: TrafficSection, paths: Mapping[str, Path], quiet: bool):
-        self.table = table
+        self.table, self.per_row = table, PerRow()
         check_steps(table, table.days, f"{table.days:g} days")
         try:
             # By their names, so that what is wrong in both files is said at once.
@@ -161,19 +161,20 @@ class TrafficApplication(AbstractApplication[_Loaded]):
         options = settings(table, dt=step, vi_solver=t.vi_solver)
         return Plan(t.problem, t.all_or_nothing(), days, t.constants, options, None, "days")
 
-    def results(self, model: _Loaded, plan: Plan, solution: Solution) -> Results:
-        t, days = model.traffic, np.asarray(solution.ts)
-        bound = certificate(t.problem, solution, t.constants)
-        objectives = np.asarray(jax.jit(jax.vmap(t.objective))(solution.ts, solution.xs))
-        spent = np.asarray(jax.jit(jax.vmap(t.total_travel_time))(solution.ts, solution.xs))
-        flows = np.asarray(jax.jit(jax.vmap(t.link_flows))(solution.xs))
+    def results(self, model: _Loaded, plan: Plan, solution: Solution, count: int) -> Results:
+        t, days = model.traffic, np.asarray(solution.ts)[:count]
+        bound = certificate(t.problem, solution, t.constants, count)
+        each = model.per_row
+        objectives = each("objective", t.objective, solution.ts, solution.xs)[:count]
+        spent = each("travel_time", t.total_travel_time, solution.ts, solution.xs)[:count]
+        flows = each("flow", t.link_flows, solution.xs)[:count]
         gap = t.relative_gap(days[-1], solution.xs[-1])
         # Paths were generated for all capacities, the equilibrium is that of the network as it is.
         cut = np.asarray(t.capacity(days[-1])) != np.asarray(t.network.capacity)
         least = np.nan if cut.any() else float(t.objective(days[-1], t.equilibrium))
         found = t.figures(solution)
         day = ("day",)
-        capacity = np.asarray(jax.jit(jax.vmap(t.capacity.value))(solution.ts))
+        capacity = each("capacity", t.capacity.value, solution.ts)[:count]
         variables = {
             "day": Variable(day, days, "day", "time"),
             "objective": Variable(day, objectives, "trip cost", "Beckmann's objective"),
@@ -183,7 +184,9 @@ class TrafficApplication(AbstractApplication[_Loaded]):
             "capacity": Variable(("day", "link"), capacity, "trip", "capacity of each link"),
             "init_node": Variable(("link",), np.asarray(t.network.init_node), "1", "from"),
             "term_node": Variable(("link",), np.asarray(t.network.term_node), "1", "to"),
-            "error_bound": Variable(day, bound.values, "trip", "bound on the error of path flows"),
+            "error_bound": Variable(
+                day, bound.values, "trip", "bound on the error of path flows", bound.status
+            ),
         }
         if model.places is not None:
             variables["place"] = Variable(("node", "axis"), model.places, "1", "places of nodes")
@@ -203,7 +206,8 @@ class TrafficApplication(AbstractApplication[_Loaded]):
                 "share of all cost that would be saved if all took the least cost path of the network",
             ),
             "error_bound": Figure(
-                bound.largest, "trip", f"bound on the error of the path flows, in ℓ² ({bound.status})"
+                bound.largest, "trip", f"bound on the error of the path flows, in ℓ² ({bound.status})",
+                bound=bound.status,
             ),
         }  # fmt: skip
         if np.isfinite(least):

@@ -1,0 +1,51 @@
+"""Tables that f makes itself: their kinks are steps' ends like those of tables made outside."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.selection import mostly_thorough
+
+import dvax
+from dvax import generators, operators, sets, signals
+
+TIMES, VALUES = np.array([0.0, 0.3, 0.31, 0.7, 1.0]), np.array([0.0, 1.0, -2.0, 3.0, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("kind", "method", "shift"),
+    mostly_thorough(
+        [
+            (kind, method, shift)
+            for kind in ("linear", "constant")
+            for method in (dvax.ETD2RK(), dvax.DormandPrince(), dvax.ETD4RK())
+            for shift in (0.0, 0.0123, -0.11)
+        ],
+        [("linear", dvax.ETD2RK(), 0.0)],
+    ),
+)
+def test_the_integral_of_a_table_is_exact(kind, method, shift):
+    times = TIMES.copy()
+    times[1:-1] += shift * TIMES[1:-1] * (1.0 - TIMES[1:-1])
+
+    def inside(t, x, u, args):
+        return signals.Table(jnp.array(times), jnp.array(VALUES), kind=kind)(t) + 0.0 * u
+
+    problem = dvax.Problem(
+        A=generators.Zero(),
+        P=operators.Scaling(1.0),
+        K=sets.Box(-1.0, 1.0),
+        f=inside,
+        h=lambda t, x, u, args: x,
+    )
+    ts = np.array([0.2, 0.305, 0.5, 1.0])
+    sol = dvax.solve(problem, 0.0, 0.0, 1.0, ts=ts, rtol=1e-8, atol=1e-10, method=method)
+    fine = np.union1d(np.union1d(ts, times), np.linspace(0.0, 1.0, 11))
+    if kind == "linear":
+        pieces = np.interp(fine, times, VALUES)
+        grown = np.cumsum(0.5 * (pieces[1:] + pieces[:-1]) * np.diff(fine))
+    else:
+        level = VALUES[np.searchsorted(times, 0.5 * (fine[1:] + fine[:-1])) - 1]
+        grown = np.cumsum(level * np.diff(fine))
+    exact = np.interp(ts, fine, np.append(0.0, grown))
+    np.testing.assert_allclose(sol.xs, exact, atol=1e-9)
+    assert int(sol.stats["rejected"]) == 0
