@@ -46,7 +46,7 @@ def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
         )
     begun = time.perf_counter()
     problem, x0, args = setup.problem, jnp.asarray(setup.x0), as_arrays(setup.args)
-    t0, t1, rtol = (float(setup.setting[name]) for name in ("t0", "t1", "rtol"))
+    t0, t1, rtol, atol = (float(setup.setting[name]) for name in ("t0", "t1", "rtol", "atol"))
     problem.check(t0, x0, args)
     knots = np.asarray(problem.knots(t0, t1, x0, args), float)
     stops = np.concatenate([[t0], knots, [t1]])
@@ -54,7 +54,7 @@ def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
     state, control = problem.spaces(x0)
     weights = np.asarray(jax.vmap(lambda v: state.norm(v.reshape(x0.shape)))(jnp.eye(x0.size)))
     times = np.array([t1]) if ts is None else np.asarray(ts, float)
-    tol = float(np.clip(1e-5 * rtol, 1e-13, 1e-6))
+    tol = float(np.clip(1e-5 * rtol, 1e-13, 1e-6)), 1e-5 * atol
     try:
         found = pieces(problem, stops, x0, args, limits.max_steps)
     except Unresolved as error:

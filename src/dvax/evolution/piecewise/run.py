@@ -70,7 +70,7 @@ class Attempt(NamedTuple):
     y: Array
     w: Array
     slack: tuple[Array, Array]
-    rings: tuple[tuple[complex, Array, Array], ...]
+    rings: list[tuple[complex, Array, Array, Array]]
     swing: tuple[Array, Array]
     size: Array
     lacking: Array
@@ -88,10 +88,13 @@ class Run:
 
     def __init__(
         self, given: Affine, pivoted: Affine, pieces: list[Piece], x0: Array, weights: Array,
-        tol: float, max_steps: int, times: Array, dense: bool, ranged: bool,
+        tol: tuple[float, float], max_steps: int, times: Array, dense: bool, ranged: bool,
     ):  # fmt: skip
         self.given, self.system, self.pieces, self.x = given, pivoted, pieces, x0
-        self.weights, self.tol, self.max_steps = weights, tol, max_steps
+        self.weights, self.max_steps = weights, max_steps
+        self.tol, self.least = tol
+        # Of the members w in proportion to their law.
+        self.least_p = self.least * np.where(pivoted.swapped, np.diag(given.M), 1.0)
         self.times, self.dense = times, dense
         self.equations: dict[Mode, Equations] = {}
         self.mode = first_mode(given)
@@ -167,15 +170,12 @@ class Run:
                 if attempt.excess > 1.0 and h > own.shortest:
                     self.rejected += 1
                     h, before = _shorter(own, h, attempt.excess, before), attempt.excess
-                elif attempt.rings and self._undecided(own, attempt):
-                    self.rejected += 1
-                    fastest = max(rate.imag for rate, *_ in attempt.rings)
-                    h = max(0.25 * h, 0.999 * _FOLLOWED / fastest)
                 else:
                     found = attempt
-            theta, condition = self._first_change(own, found)
-            whole = condition is None and bool(h == remaining)
-            step = Step(piece.start + begin, h, theta, found.x, found.ys, found.rings)
+            theta, condition = self._first_change(own, found, h)
+            whole = condition is None and theta == 1.0 and bool(h == remaining)
+            rings = tuple(ring[:3] for ring in found.rings)
+            step = Step(piece.start + begin, h, theta, found.x, found.ys, rings)
             end = piece.length if whole else begin + (low + theta * h)
             self._keep(step, found, piece, begin + low, end, last and whole)
             self.x = step.at(np.array([theta]))[0][0]
@@ -212,9 +212,10 @@ class Run:
         hidden = own.hidden(*sizes)
         allowed = np.maximum(self.tol * np.maximum(self.scale, sizes[0]), hidden)
         allowed = np.maximum(allowed, 1e-2 * self.tol * energy / self.weights)
+        allowed = np.maximum(allowed, self.least)
         tail_x = np.abs(radau.TAIL_OF_STATE @ x).max(axis=0)
         tail_p = np.abs(radau.TAIL_OF_MULTIPLIER @ p).max(axis=0)
-        allowed_p = np.maximum(self.tol * sizes[1], noise_p)
+        allowed_p = np.maximum(np.maximum(self.tol * sizes[1], noise_p), self.least_p)
         tiny = np.finfo(float).tiny
         excess = max(
             float(np.max(tail_x / (allowed + tiny))), float(np.max(tail_p / (allowed_p + tiny)))
@@ -228,12 +229,11 @@ class Run:
         slack = own.members(slack_p + 4.0 * tail_p, slack_d + 4.0 * tail_d)
         lacking = _EXTRAPOLATED * tail_d
         ys, _ = own.members(p, own.dependent(x[1:], p, given[:, n:]))
-        of_y, of_w = (
+        swing = tuple(
             sum((2.0 * np.abs(ring[k]) for ring in rings), np.zeros(len(p[0]))) for k in (2, 3)
         )
-        swing = of_y, of_w
         return Attempt(
-            x, ys, y, w, slack, tuple(ring[:3] for ring in rings), swing, sizes[0], lacking, excess,
+            x, ys, y, w, slack, rings, swing, sizes[0], lacking, excess,
             self._residuals(own, x, p, G[0], h),
         )  # fmt: skip
 
@@ -253,15 +253,6 @@ class Run:
             found.append((ring.rate, a * ring.x, a * y, a * w))
             x0 = x0 - 2.0 * found[-1][1].real
         return found, x0
-
-    def _undecided(self, own: Equations, found: Attempt) -> bool:
-        """Whether the oscillations may break a condition."""
-        for c in own.conditions:
-            k = int(c.of_w)
-            signed = c.sign * ((found.y, found.w)[k][:, c.i] - c.bound)
-            if radau.lowest(signed) - found.swing[k][c.i] < -found.slack[k][c.i]:
-                return True
-        return False
 
     def _residuals(
         self, own: Equations, x: Array, p: Array, given: Array, h: float
@@ -285,19 +276,25 @@ class Run:
         state = np.maximum(off - rounding, 0.0) + np.abs(self.given.B) @ of_y
         return state, law - of_y
 
-    def _first_change(self, own: Equations, found: Attempt) -> tuple[float, Condition | None]:
-        """(θ, condition) of the first condition that fails; (1, None) where all hold."""
+    def _first_change(
+        self, own: Equations, found: Attempt, h: float
+    ) -> tuple[float, Condition | None]:
+        """(θ, condition) of the first condition that fails; (θ, None) where all hold up to θ."""
         theta, first = 1.0, None
-        if found.rings:
-            return theta, first
         for c in own.conditions:
-            grid, slack = (found.w, found.slack[1]) if c.of_w else (found.y, found.slack[0])
+            k = int(c.of_w)
+            grid, slack, swing = (v[k] for v in ((found.y, found.w), found.slack, found.swing))
             signed, allowed = c.sign * (grid[:, c.i] - c.bound), float(slack[c.i])
-            if theta == 0.0 or radau.lowest(signed) >= -allowed:
+            if theta == 0.0 or radau.lowest(signed) - swing[c.i] >= -allowed:
                 continue
-            when = radau.first_negative(signed, allowed, theta)
-            if when is not None and (first is None or when < theta):
-                theta, first = when, c
+            waves = [
+                radau.Wave(ring[0] * h, c.sign * ring[2 + k][c.i])
+                for ring in found.rings
+                if ring[2 + k][c.i] != 0.0
+            ]
+            when, fails = radau.first_negative(signed, allowed, theta, waves)
+            if fails or when < theta:
+                theta, first = when, c if fails else None
         return theta, first
 
     def _keep(
