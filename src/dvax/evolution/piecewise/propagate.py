@@ -54,7 +54,7 @@ def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
     state, control = problem.spaces(x0)
     weights = np.asarray(jax.vmap(lambda v: state.norm(v.reshape(x0.shape)))(jnp.eye(x0.size)))
     times = np.array([t1]) if ts is None else np.asarray(ts, float)
-    tol = float(np.clip(1e-5 * rtol, 1e-13, 1e-6)), 1e-5 * atol
+    tol = float(np.clip(1e-4 * rtol, 1e-12, 1e-6)), 1e-4 * atol
     try:
         found = pieces(problem, stops, x0, args, limits.max_steps)
     except Unresolved as error:
