@@ -128,11 +128,16 @@ class Equations:
         swapped = self.system.swapped
         return np.where(swapped, d, p), np.where(swapped, p, d)
 
-    def at(self, x: Array, q: Array, sizes: Array, off: Array) -> tuple[Array, ...]:
-        """(y, w) at one x and q, and their noise, where q is a sum of terms of these `sizes`."""
+    def multiplier(self, x: Array, q: Array) -> Array:
+        """p from x and q, by the law alone."""
         p, u = self.prescribed_p.copy(), self.unknown
         free = self.prescribed_d - q - self.system.C @ x - self.system.M @ p
         p[u] = self.inverse @ free[u]
+        return p
+
+    def at(self, x: Array, q: Array, sizes: Array, off: Array) -> tuple[Array, ...]:
+        """(y, w) at one x and q, and their noise, where q is a sum of terms of these `sizes`."""
+        p = self.multiplier(x, q)
         d = self.dependent(x[None], p[None], q[None])[0]
         y, w = self.members(p, d)
         return y, w, *self.members(*self.noise(np.abs(x), np.abs(p), sizes, off))

@@ -217,8 +217,11 @@ class Run:
         tail_p = np.abs(radau.TAIL_OF_MULTIPLIER @ p).max(axis=0)
         allowed_p = np.maximum(np.maximum(self.tol * sizes[1], noise_p), self.least_p)
         tiny = np.finfo(float).tiny
+        # A boundary layer shows in p at the start, which is no collocation point.
+        layer = np.abs(radau.START @ p - own.multiplier(x0, values(local, _START)[0, n:]))
         excess = max(
-            float(np.max(tail_x / (allowed + tiny))), float(np.max(tail_p / (allowed_p + tiny)))
+            float(np.max(tail_x / (allowed + tiny))),
+            float(np.max((tail_p + layer / _EXTRAPOLATED) / (allowed_p + tiny))),
         )
         X, P, G = radau.FROM_NODES @ x, radau.FROM_POINTS @ p, values(local, _ON_GRID)
         d = own.dependent(X, P, G[:, n:])
@@ -226,7 +229,7 @@ class Run:
         tail_d = np.abs(own.system.C) @ tail_x + np.abs(own.system.M) @ tail_p
         # What the step before was lacking decides on signs, and not on what this one may lack.
         slack_p, slack_d = own.noise(*sizes, off + self.law_off)
-        slack = own.members(slack_p + 4.0 * tail_p, slack_d + 4.0 * tail_d)
+        slack = own.members(slack_p + layer + _EXTRAPOLATED * tail_p, slack_d + _EXTRAPOLATED * tail_d)
         lacking = _EXTRAPOLATED * tail_d
         ys, _ = own.members(p, own.dependent(x[1:], p, given[:, n:]))
         swing = tuple(
@@ -337,7 +340,7 @@ class Run:
         return float(np.sqrt(np.sum((self.weights * v) ** 2)))
 
 
-_AT_POINTS, _ON_GRID = basis(radau.POINTS), basis(radau.GRID)
+_AT_POINTS, _ON_GRID, _START = (basis(v) for v in (radau.POINTS, radau.GRID, np.zeros(1)))
 
 _EXTRAPOLATED = 16.0
 """What a polynomial may lack at θ = 0, in units of its last coefficients."""
