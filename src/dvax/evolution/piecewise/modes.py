@@ -75,8 +75,15 @@ class Equations:
         right = np.zeros((s, n + k))
         right[:, :n] = h * (g + system.B @ self.prescribed_p) - radau.D[1:, :1] * x0
         right[:, n:] = (self.prescribed_d - q - system.M @ self.prescribed_p)[:, u]
-        found = scipy.linalg.lu_solve(factors, (right * rows).ravel(), check_finite=False)
-        found = found.reshape(s, n + k) * columns
+        A, B, C, M = system.A, system.B[:, u], system.C[u], system.M[np.ix_(u, u)]
+        found = np.zeros((s, n + k))
+        # One step of refinement: the errors of each equation are then those of its own terms.
+        for _ in range(2):
+            X, Q = found[:, :n], found[:, n:]
+            of_x = right[:, :n] - radau.D[1:, 1:] @ X + h * (X @ A.T + Q @ B.T)
+            off = np.hstack([of_x, right[:, n:] - X @ C.T - Q @ M.T])
+            change = scipy.linalg.lu_solve(factors, (off * rows).ravel(), check_finite=False)
+            found = found + change.reshape(s, n + k) * columns
         p = np.tile(self.prescribed_p, (s, 1))
         p[:, u] = found[:, n:]
         return np.vstack([x0, found[:, :n]]), p
