@@ -77,13 +77,20 @@ class Equations:
         right[:, n:] = (self.prescribed_d - q - system.M @ self.prescribed_p)[:, u]
         A, B, C, M = system.A, system.B[:, u], system.C[u], system.M[np.ix_(u, u)]
         found = np.zeros((s, n + k))
-        # One step of refinement: the errors of each equation are then those of its own terms.
-        for _ in range(2):
+        # Refined until the errors of each equation are the rounding of its own terms.
+        last = np.inf
+        for _ in range(_REFINED):
             X, Q = found[:, :n], found[:, n:]
             of_x = right[:, :n] - radau.D[1:, 1:] @ X + h * (X @ A.T + Q @ B.T)
             off = np.hstack([of_x, right[:, n:] - X @ C.T - Q @ M.T])
             change = scipy.linalg.lu_solve(factors, (off * rows).ravel(), check_finite=False)
-            found = found + change.reshape(s, n + k) * columns
+            change = change.reshape(s, n + k) * columns
+            found = found + change
+            size = np.abs(found).max(axis=0)
+            now = float(np.max(np.abs(change).max(axis=0) / np.where(size > 0.0, size, 1.0)))
+            if not (_ACCURATE < now < 0.5 * last):
+                break
+            last = now
         p = np.tile(self.prescribed_p, (s, 1))
         p[:, u] = found[:, n:]
         return np.vstack([x0, found[:, :n]]), p
@@ -184,6 +191,7 @@ class Equations:
         return found
 
 
+_REFINED, _ACCURATE = 6, 1e-14
 _KEPT = 64
 """Factorisations that a mode keeps: steps between the knots of a record have few lengths."""
 

@@ -156,6 +156,7 @@ class Run:
     def _through(self, piece: Piece, last: bool) -> str:
         """All steps of a piece."""
         begin, low, proposal = 0.0, 0.0, np.inf
+        even, reached = 0, 0.0
         while begin < piece.length:
             own = self.of(self.mode)
             remaining = (piece.length - begin) - low
@@ -183,9 +184,14 @@ class Run:
                 return "successful"
             begin, low = _two_sum(begin, low + theta * h)
             if condition is None:
+                even = even + 1 if h <= reached else 0
+                reached = h
                 proposal = 4.0 * h if own.rings else _longer(own, h, found.excess)
+                if even >= _EVEN:
+                    # What is left of the excess may be rounding, which no step changes.
+                    proposal, even = max(4.0 * h, proposal), 0
                 continue
-            proposal = np.inf
+            proposal, even, reached = np.inf, 0, 0.0
             self.mode = changed(self.mode, condition)
             self.switchings += 1
             self.events.append((self.t, self.mode))
@@ -203,16 +209,22 @@ class Run:
         if not (np.isfinite(x).all() and np.isfinite(p).all()):
             return None
         # Rounding in the inputs is that of the terms they are summed from.
-        q = np.abs(piece.coefficients[:, n:]).sum(axis=0)
+        terms = np.abs(piece.coefficients).sum(axis=0)
+        g, q = terms[:n], terms[n:]
         beside = sum((2.0 * np.abs(ring[1]) for ring in rings), np.zeros(n))
         sizes = np.abs(x).max(axis=0) + beside, np.abs(p).max(axis=0), q
-        off = np.abs(own.system.C) @ np.maximum(self.off, ROUNDINGS * sizes[0])
+        follows = h / (1.0 + h * np.abs(np.diag(own.system.A)))
+        off = np.maximum(self.off, ROUNDINGS * np.maximum(sizes[0], follows * g))
+        off = np.abs(own.system.C) @ off
         noise_p, _ = own.noise(*sizes, off)
         energy = np.sqrt(np.sum((self.weights * sizes[0]) ** 2))
         hidden = own.hidden(*sizes)
         allowed = np.maximum(self.tol * np.maximum(self.scale, sizes[0]), hidden)
         allowed = np.maximum(allowed, 1e-2 * self.tol * energy / self.weights)
         allowed = np.maximum(allowed, self.least)
+        # Rounding of large rows reaches the slow components as well; a tenth of the tolerance at most.
+        rounding = np.abs(own.system.A) @ sizes[0] + np.abs(own.system.B) @ sizes[1] + g
+        allowed = np.maximum(allowed, np.minimum(1e3 * allowed, 1e-2 * _ROUNDING * h * rounding))
         tail_x = np.abs(radau.TAIL_OF_STATE @ x).max(axis=0)
         tail_p = np.abs(radau.TAIL_OF_MULTIPLIER @ p).max(axis=0)
         allowed_p = np.maximum(np.maximum(self.tol * sizes[1], noise_p), self.least_p)
@@ -347,6 +359,9 @@ _EXTRAPOLATED = 16.0
 
 _FOLLOWED = 4.0
 """Radians of an oscillation in a step, up to which its polynomials follow it."""
+
+_EVEN = 3
+"""Steps of one length after which a longer one is tried."""
 
 _MOST_CHANGES, _MOST_STUCK = 4096, 12
 _ROUNDING = 256.0 * np.finfo(float).eps
