@@ -52,7 +52,7 @@ class Equations:
         self.conditions = [c for i, s in enumerate(mode) for c in _conditions(system, i, s)]
         M = system.M[np.ix_(u, u)]
         self.inverse = _inverse(M)
-        eliminated = system.A - system.B[:, u] @ self.inverse @ system.C[u]
+        self.eliminated = eliminated = system.A - system.B[:, u] @ self.inverse @ system.C[u]
         spectrum = np.linalg.eigvals(eliminated) if np.isfinite(eliminated).all() else np.zeros(1)
         real, imag = np.real(spectrum), np.imag(spectrum)
         speeds = np.abs(real) / 8.0 + np.abs(imag) / 4.0
@@ -63,6 +63,7 @@ class Equations:
         # Others are damped within a period or two, and not worth the trouble.
         light = spectrum[(imag > 4.0 * np.abs(real)) & (imag > 0)]
         self.rings = rings(whole, len(system.A), light)
+        self._reach: dict[float, Array] = {}
         self._factors: dict[float, tuple[Array, Array, tuple[Array, Array]]] = {}
 
     def solve(self, h: float, x0: Array, inputs: Array) -> tuple[Array, Array]:
@@ -102,6 +103,15 @@ class Equations:
         each = np.where(C > 0.0, terms[:, None] / np.where(C > 0.0, C, 1.0), np.inf)
         least = each.min(axis=0, initial=np.inf)
         return np.where(np.isfinite(least), least, 0.0)
+
+    def reach(self, h: float) -> Array:
+        """Sizes of the entries of (1/h − A)⁻¹, A that of the states alone: what a disturbance of x'
+        does to x within h."""
+        if h not in self._reach:
+            if len(self._reach) >= _KEPT:
+                self._reach.clear()
+            self._reach[h] = np.abs(_inverse(np.eye(len(self.eliminated)) / h - self.eliminated))
+        return self._reach[h]
 
     def responses(self, ring: Ring) -> tuple[Array, Array]:
         """(y, w) of an oscillation of amplitude 1."""

@@ -213,8 +213,7 @@ class Run:
         g, q = terms[:n], terms[n:]
         beside = sum((2.0 * np.abs(ring[1]) for ring in rings), np.zeros(n))
         sizes = np.abs(x).max(axis=0) + beside, np.abs(p).max(axis=0), q
-        follows = h / (1.0 + h * np.abs(np.diag(own.system.A)))
-        off = np.maximum(self.off, ROUNDINGS * np.maximum(sizes[0], follows * g))
+        off = np.maximum(self.off, ROUNDINGS * np.maximum(sizes[0], own.reach(h) @ g))
         off = np.abs(own.system.C) @ off
         noise_p, _ = own.noise(*sizes, off)
         energy = np.sqrt(np.sum((self.weights * sizes[0]) ** 2))
