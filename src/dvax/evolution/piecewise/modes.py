@@ -142,10 +142,16 @@ class Equations:
         system, u = self.system, self.unknown
         terms = np.abs(system.C) @ x + np.abs(system.M) @ p + q
         of_d = ROUNDINGS * terms + off
-        of_p = np.zeros(len(u))
-        of_p[u] = np.abs(self.inverse) @ of_d[u] + ROUNDINGS * p[u]
+        of_p = self.of_law(of_d)
+        of_p[u] += ROUNDINGS * p[u]
         of_d = of_d + np.abs(system.M[:, u]) @ of_p[u]
         return of_p, of_d
+
+    def of_law(self, off: Array) -> Array:
+        """By how much p changes where d is off by this."""
+        of_p = np.zeros(len(off))
+        of_p[self.unknown] = np.abs(self.inverse) @ off[self.unknown]
+        return of_p
 
     def members(self, p: Array, d: Array) -> tuple[Array, Array]:
         """(y, w) from (p, d)."""

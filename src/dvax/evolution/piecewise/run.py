@@ -217,16 +217,19 @@ class Run:
         off = np.abs(own.system.C) @ off
         noise_p, _ = own.noise(*sizes, off)
         energy = np.sqrt(np.sum((self.weights * sizes[0]) ** 2))
-        hidden = own.hidden(*sizes)
-        allowed = np.maximum(self.tol * np.maximum(self.scale, sizes[0]), hidden)
+        allowed = np.maximum(self.tol * np.maximum(self.scale, sizes[0]), self.least)
         allowed = np.maximum(allowed, 1e-2 * self.tol * energy / self.weights)
-        allowed = np.maximum(allowed, self.least)
-        # Rounding of large rows reaches the slow components as well; a tenth of the tolerance at most.
-        rounding = np.abs(own.system.A) @ sizes[0] + np.abs(own.system.B) @ sizes[1] + g
-        allowed = np.maximum(allowed, np.minimum(1e3 * allowed, 1e-2 * _ROUNDING * h * rounding))
+        allowed_p = np.maximum(self.tol * sizes[1], self.least_p)
+        # Rounding that shorter steps do not change: in the law, in large rows, which reaches the slow
+        # components too, and in p, which comes back through x.
+        rows = np.abs(own.system.A) @ sizes[0] + np.abs(own.system.B) @ sizes[1] + g
+        rounding = np.maximum(own.hidden(*sizes), 1e-2 * _ROUNDING * h * rows)
+        fed = np.abs(own.system.C) @ (own.reach(h) @ (np.abs(own.system.B) @ noise_p))
+        allowed = np.maximum(allowed, np.minimum(_MOST_ROUNDING * allowed, rounding))
+        fed_p = np.minimum(_MOST_ROUNDING * allowed_p, own.of_law(fed))
+        allowed_p = np.maximum(np.maximum(allowed_p, noise_p), fed_p)
         tail_x = np.abs(radau.TAIL_OF_STATE @ x).max(axis=0)
         tail_p = np.abs(radau.TAIL_OF_MULTIPLIER @ p).max(axis=0)
-        allowed_p = np.maximum(np.maximum(self.tol * sizes[1], noise_p), self.least_p)
         tiny = np.finfo(float).tiny
         # A boundary layer shows in p at the start, which is no collocation point.
         layer = np.abs(radau.START @ p - own.multiplier(x0, values(local, _START)[0, n:]))
@@ -358,6 +361,9 @@ _EXTRAPOLATED = 16.0
 
 _FOLLOWED = 4.0
 """Radians of an oscillation in a step, up to which its polynomials follow it."""
+
+_MOST_ROUNDING = 1e3
+"""How much more than `tol` a polynomial may lack where rounding is larger: a tenth of the tolerance."""
 
 _EVEN = 3
 """Steps of one length after which a longer one is tried."""
