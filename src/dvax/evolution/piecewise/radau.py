@@ -161,12 +161,12 @@ class _Sum:
 def first_negative(
     values: Array, slack: float, until: float = 1.0, waves: Sequence[Wave] = ()
 ) -> tuple[float, bool]:
-    """(θ, True) of the first θ in [0, until] where a polynomial with `waves` beside it passes from above
-    to below zero and goes on below −`slack`; (θ, False) where it stays above −`slack` up to θ, which is
-    `until` unless that takes more than `_MOST_INTERVALS`. `values` are those of the polynomial on the
-    grid.
+    """Return (θ, True), the first θ in [0, until] where a polynomial with `waves` beside it passes from
+    above to below zero and goes on below −`slack`; (θ, False) where it stays above −`slack` up to θ.
 
-    An interval is left where bounds on the function decide it, and halved otherwise.
+    That θ is `until` unless the search takes more than `_MOST_INTERVALS`. `values` are those of the
+    polynomial on the grid. An interval is left where bounds on the function decide it, and halved
+    otherwise.
     """
     function = _Sum(values, waves)
     if function(0.0) < -slack:

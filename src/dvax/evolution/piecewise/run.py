@@ -92,8 +92,10 @@ class Run:
     ):  # fmt: skip
         self.given, self.system, self.pieces, self.x = given, pivoted, pieces, x0
         self.weights, self.max_steps = weights, max_steps
-        self.tol, self.least = tol
-        # Of the members w in proportion to their law.
+        rtol, atol = tol
+        self.tol, self.least = float(np.clip(1e-4 * rtol, 1e-12, 1e-6)), 1e-4 * atol
+        self.rtol, self.atol, self.veiled = rtol, atol, 0.0 * x0
+        # The members w are in proportion to their law.
         self.least_p = self.least * np.where(pivoted.swapped, np.diag(given.M), 1.0)
         self.times, self.dense = times, dense
         self.equations: dict[Mode, Equations] = {}
@@ -174,6 +176,8 @@ class Run:
                 else:
                     found = attempt
             theta, condition = self._first_change(own, found, h)
+            if theta > 0.0 and not self._account(own, found, theta, h):
+                return "switching_hidden"
             whole = condition is None and theta == 1.0 and bool(h == remaining)
             rings = tuple(ring[:3] for ring in found.rings)
             step = Step(piece.start + begin, h, theta, found.x, found.ys, rings)
@@ -243,7 +247,9 @@ class Run:
         tail_d = np.abs(own.system.C) @ tail_x + np.abs(own.system.M) @ tail_p
         # What the step before was lacking decides on signs, and not on what this one may lack.
         slack_p, slack_d = own.noise(*sizes, off + self.law_off)
-        slack = own.members(slack_p + layer + _EXTRAPOLATED * tail_p, slack_d + _EXTRAPOLATED * tail_d)
+        slack = own.members(
+            slack_p + layer + _EXTRAPOLATED * tail_p, slack_d + _EXTRAPOLATED * tail_d
+        )
         lacking = _EXTRAPOLATED * tail_d
         ys, _ = own.members(p, own.dependent(x[1:], p, given[:, n:]))
         swing = tuple(
@@ -313,6 +319,29 @@ class Run:
             if fails or when < theta:
                 theta, first = when, c if fails else None
         return theta, first
+
+    def _account(self, own: Equations, found: Attempt, theta: float, h: float) -> bool:
+        """Add what y and w are beyond their bounds within the slack up to θ, in the mean, to the
+        defects; whether the state would differ by less than the tolerance had the constraints changed.
+        """
+        passed, before = np.zeros((2, len(self.mode))), radau.GRID <= theta
+        thetas, size = radau.GRID[before], np.abs(self.given.B)
+        for c in own.conditions:
+            k = int(c.of_w)
+            value = (found.y, found.w)[k][before, c.i] - c.bound
+            for ring in found.rings:
+                value = value + 2.0 * (ring[2 + k][c.i] * np.exp(ring[0] * h * thetas)).real
+            mean = float(np.clip(-c.sign * value, 0.0, found.slack[k][c.i]).mean())
+            passed[k, c.i] = mean
+            if mean > 0.0:
+                # A residual below zero is a response in the mode that would follow.
+                mode = self.of(changed(self.mode, c)) if c.of_w else own
+                response = mean / self.given.M[c.i, c.i] if c.of_w else mean
+                self.veiled += mode.reach(theta * h) @ size[:, c.i] * response
+        self.defect += theta * h * self._norm(size @ passed[0])
+        self.law_defect += theta * h * float(np.linalg.norm(passed[1]))
+        allowed = self.rtol * np.maximum(self.scale, found.size) + self.atol
+        return bool(np.all(self.veiled <= allowed))
 
     def _keep(
         self, step: Step, found: Attempt, piece: Piece, begin: float, end: float, last: bool
