@@ -141,6 +141,41 @@ def test_first_crossings_beside_waves_are_those_of_dense_samples(seed):
         assert not crosses or at < level + 2e-5  # below between two samples
 
 
+def test_progress_is_printed_as_other_methods_do_and_changes_nothing(capfd):
+    run = lambda **kwargs: dvax.solve(  # noqa: E731
+        held(50.0), 4.0, 0.0, 4.0, ts=[1.0, 4.0], method=dvax.PiecewiseLinear(), **kwargs
+    )
+    quiet = run()
+    assert capfd.readouterr().out == ""
+    np.testing.assert_array_equal(run(progress=True).xs, quiet.xs)
+    lines = capfd.readouterr().out.split()
+    shares = [float(line.removesuffix("%")) for line in lines]
+    assert len(lines) >= 3 and shares[0] == 0.0 and shares[-1] == 100.0
+    assert shares == sorted(set(shares))
+
+
+@pytest.mark.parametrize(("level", "hidden"), [(1e4, True), (1e-6, False)])
+def test_rounding_that_may_hide_a_switching_is_refused(level, hidden):
+    # x follows s(t) up through a response u = (s − x)/M ≥ 0, and z counts it. Beside s = 10⁴ the
+    # rounding of s − x is more than all of s', and says nothing about the sign of u.
+    M = 1e-10
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, np.inf),
+        f=lambda t, x, u, args: jnp.stack([u[0], u[0]]),
+        h=lambda t, x, u, args: u - (M * u + x[:1] - level - 1e-5 * jnp.sin(2.0 * t)),
+        state_space=dvax.spaces.Euclidean(2), control_space=dvax.spaces.Euclidean(1),
+    )  # fmt: skip
+    run = lambda: dvax.solve(  # noqa: E731
+        problem, np.array([level, 0.0]), 0.0, 4.0, method=dvax.PiecewiseLinear()
+    )
+    if hidden:
+        with pytest.raises(dvax.SolveError, match="hides whether a constraint changes"):
+            run()
+    else:
+        # Up with s to its maximum and no further.
+        np.testing.assert_allclose(np.asarray(run().xs[-1]), [level + 1e-5, 1e-5], atol=1e-12)
+
+
 def test_the_method_says_what_it_is_not_for():
     method = dvax.PiecewiseLinear()
     curved = dvax.Problem(

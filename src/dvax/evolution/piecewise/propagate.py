@@ -24,11 +24,13 @@ Array = np.ndarray
 
 
 class Limits(NamedTuple):
-    """The most steps, rejected ones included; whether to keep all of them; whether to bound x and u."""
+    """The most steps, rejected ones included; whether to keep all of them, to bound x and u, and to print
+    the percentage of the run that is done."""
 
     max_steps: int
     dense: bool
     ranged: bool
+    progress: bool
 
 
 def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
@@ -75,9 +77,9 @@ def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
     return _solution(setup, x0, run, given, (state, control), limits, timing)
 
 
-def limits_of(limits: Limits, times: Array) -> tuple[int, Array, bool, bool]:
+def limits_of(limits: Limits, times: Array) -> tuple[int, Array, bool, bool, bool]:
     """The last arguments of a `Run`."""
-    return limits.max_steps, times, limits.dense, limits.ranged
+    return limits.max_steps, times, limits.dense, limits.ranged, limits.progress
 
 
 def _solution(

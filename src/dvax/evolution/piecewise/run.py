@@ -89,6 +89,7 @@ class Run:
     def __init__(
         self, given: Affine, pivoted: Affine, pieces: list[Piece], x0: Array, weights: Array,
         tol: tuple[float, float], max_steps: int, times: Array, dense: bool, ranged: bool,
+        progress: bool,
     ):  # fmt: skip
         self.given, self.system, self.pieces, self.x = given, pivoted, pieces, x0
         self.weights, self.max_steps = weights, max_steps
@@ -108,6 +109,8 @@ class Run:
         self.defect = self.law_defect = 0.0
         self.piece = pieces[0]
         self.t, self.result = pieces[0].start, "successful"
+        self.progress, self.shown = progress, 0.0
+        self.span = pieces[-1].start + pieces[-1].length - self.t
         m = len(given.low)
         none = np.stack([np.full(m, np.inf), np.full(m, -np.inf)])
         self.extent = np.hstack([np.stack([x0, x0]), none]) if ranged else None
@@ -115,6 +118,7 @@ class Run:
     def go(self) -> None:
         """Run to the end, or to where `result` says why not."""
         last = None
+        self._show(0.0)
         for k, piece in enumerate(self.pieces):
             self.piece = piece
             inputs = self._converted(piece)
@@ -126,6 +130,14 @@ class Run:
             if self.result != "successful":
                 return
             last = piece
+        if self.shown < 1.0:
+            self._show(1.0)
+
+    def _show(self, share: float) -> None:
+        """Print the share of the run that is done, where that is asked for."""
+        self.shown = share
+        if self.progress:
+            print(f"{100 * share:.2f}%", flush=True)
 
     def _converted(self, piece: Piece) -> Piece:
         """The piece in the system's own variables."""
@@ -359,6 +371,9 @@ class Run:
         self.law_off = found.lacking
         self.off, self.scale = ROUNDINGS * found.size, np.maximum(self.scale, found.size)
         self.t = piece.start + end
+        share = (self.t - self.pieces[0].start) / self.span
+        if self.shown + _SHOWN < share < 1.0:
+            self._show(share)
         if self.extent is not None:
             self.extent = _widened(self.extent, found)
         done, first = (self.defect, self.law_defect), len(self.rows)
@@ -396,6 +411,9 @@ _MOST_ROUNDING = 1e3
 
 _EVEN = 3
 """Steps of one length after which a longer one is tried."""
+
+_SHOWN = 0.02
+"""The share of a run between two lines that `progress` prints."""
 
 _MOST_CHANGES, _MOST_STUCK = 4096, 12
 _ROUNDING = 256.0 * np.finfo(float).eps
