@@ -34,9 +34,9 @@ class Condition(NamedTuple):
 class Equations:
     """The equations of one mode.
 
-    `prescribed_p` and `prescribed_d` hold the prescribed values (0 elsewhere), `unknown` says
-    where p is
-    unknown; `rates` are the time scales of the mode, 1/|λ| in effect, from the shortest to the longest.
+    `prescribed_p` and `prescribed_d` hold the prescribed values (0 elsewhere), `unknown` says where p
+    is unknown; `scales` are the time scales of the mode, 1/|λ| in effect, from the shortest to the
+    longest.
     """
 
     def __init__(self, system: Affine, mode: Mode, weights: Array):
@@ -137,8 +137,8 @@ class Equations:
         return d
 
     def noise(self, x: Array, p: Array, q: Array, off: Array) -> tuple[Array, Array]:
-        """What rounding leaves undetermined of p and of d, for values of these sizes; d as
-        it follows from x is `off` already."""
+        """What rounding leaves undetermined of p and of d, for values of these sizes; d as it follows
+        from x is `off` already."""
         system, u = self.system, self.unknown
         terms = np.abs(system.C) @ x + np.abs(system.M) @ p + q
         of_d = ROUNDINGS * terms + off

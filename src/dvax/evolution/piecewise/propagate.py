@@ -24,8 +24,8 @@ Array = np.ndarray
 
 
 class Limits(NamedTuple):
-    """The most steps, rejected ones included; whether to keep all of them, to bound x and u, and to print
-    the percentage of the run that is done."""
+    """The most steps, rejected ones included; whether to keep all of them, to bound x and u, and to
+    print the percentage of the run that is done."""
 
     max_steps: int
     dense: bool

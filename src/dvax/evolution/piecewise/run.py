@@ -3,16 +3,17 @@
 A step solves the equations of its mode by collocation and samples what has a sign to keep in that mode.
 Where bounds on these polynomials cannot exclude a change of sign, the change is located, and the step
 ends there. Steps end at the ends of the input's pieces as well. After a change the longest step is
-tried
-first, then the time scales of the mode, so that the number of steps follows from the number of scales
-that are excited and not from how far they are apart. Times within a piece are kept relative to its
-start, in two parts: a transient of 10⁻¹⁸ s is resolved at any t.
+tried first, then the time scales of the mode, so that the number of steps follows from the number of
+scales that are excited and not from how far they are apart. Times within a piece are kept relative to
+its start, in two parts: a transient of 10⁻¹⁸ s is resolved at any t.
 """
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
+from .. import meter
 from . import radau
 from .inputs import Piece, basis, values
 from .modes import ROUNDINGS, Condition, Equations, Mode, changed, first_mode
@@ -58,12 +59,11 @@ class Row(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """A step that was computed: x at the nodes, y at the points, y and w on the grid with the
-    `slack` that
-    they may be off by; the `rings` beside these polynomials, and by how much they move y and w at most;
-    the `size` of the whole state; what the polynomials are `lacking` in d, and `excess`, the same
-    in units
-    of what is allowed; and the `residuals` of the state's and of the law's equations at θ = 0."""
+    """A step that was computed: x at the nodes, y at the points, y and w on the grid with the `slack`
+    that they may be off by; the `rings` beside these polynomials, (λ, x, y, w), and by how much they
+    `swing` y and w at most; the `size` of the whole state; what the polynomials are `lacking` in d, and
+    `excess`, the same in units of what is allowed; and the `residuals` of the state's and of the law's
+    equations at θ = 0."""
 
     x: Array
     ys: Array
@@ -82,8 +82,8 @@ class Run:
     """The trajectory of a system from x0 over its pieces, which are those of the `given` system; it is
     computed in the variables of the `pivoted` one.
 
-    `weights` are the norms of the unit vectors of the state space; `tol` what a polynomial may lack,
-    relative to the size of what it stands for.
+    `weights` are the norms of the unit vectors of the state space; `tol` = (rtol, atol), of which a
+    polynomial may lack 10⁻⁴.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Run:
         self.defect = self.law_defect = 0.0
         self.piece = pieces[0]
         self.t, self.result = pieces[0].start, "successful"
-        self.progress, self.shown = progress, 0.0
+        self.meter, self.shown = meter.begin() if progress else None, 0.0
         self.span = pieces[-1].start + pieces[-1].length - self.t
         m = len(given.low)
         none = np.stack([np.full(m, np.inf), np.full(m, -np.inf)])
@@ -118,7 +118,6 @@ class Run:
     def go(self) -> None:
         """Run to the end, or to where `result` says why not."""
         last = None
-        self._show(0.0)
         for k, piece in enumerate(self.pieces):
             self.piece = piece
             inputs = self._converted(piece)
@@ -136,8 +135,8 @@ class Run:
     def _show(self, share: float) -> None:
         """Print the share of the run that is done, where that is asked for."""
         self.shown = share
-        if self.progress:
-            print(f"{100 * share:.2f}%", flush=True)
+        if self.meter is not None:
+            self.meter = meter.advance(self.meter, jnp.asarray(share))
 
     def _converted(self, piece: Piece) -> Piece:
         """The piece in the system's own variables."""
@@ -150,9 +149,8 @@ class Run:
         return self.equations[mode]
 
     def _solve_law(self, piece: Piece) -> str:
-        """The mode of the law at x and at the start of a piece: of the violated conditions the
-        first is changed (Murty's rule,
-        which ends for matrices whose principal minors are positive)."""
+        """The mode of the law at x and at the start of a piece: of the violated conditions the first is
+        changed (Murty's rule, which ends for matrices whose principal minors are positive)."""
         q = piece.at(np.zeros(1))[0, len(self.x) :]
         sizes = np.abs(piece.coefficients[:, len(self.x) :]).sum(axis=0)
         for _ in range(_MOST_CHANGES):
@@ -425,9 +423,8 @@ def _mean(used: float) -> float:
 
 
 def _shorter(own: Equations, h: float, excess: float, before: float) -> float:
-    """The step to try next: half of it, as long as that pays (by 2²⁰ where the solution is
-    resolved, but
-    for little); else the next time scale of the mode, since a transient is there that is not."""
+    """The step to try next: half of it, as long as that pays (by 2²⁰ where the solution is resolved,
+    but for little); else the next time scale of the mode, since a transient is there that is not."""
     if excess < 1e6 and excess < 0.1 * before:
         return 0.5 * h
     shorter = own.scales[own.scales < 0.6 * h]
