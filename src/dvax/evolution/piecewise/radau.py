@@ -148,7 +148,7 @@ class _Sum:
         the middle and bounds of the second derivatives, and for waves by their amplitudes as well."""
         middle, half = 0.5 * (a + b), 0.5 * (b - a)
         waves = self.amplitudes * np.exp(self.rates * middle)
-        size = np.abs(self.amplitudes) * np.exp(self.rates.real * a)
+        size = np.abs(self.amplitudes) * np.exp(np.real(self.rates) * a)
         value = np.polynomial.chebyshev.chebval(2.0 * middle - 1.0, self.value)
         slope = np.polynomial.chebyshev.chebval(2.0 * middle - 1.0, self.slope)
         both = slope + (self.rates * waves).real.sum(axis=0)
@@ -178,9 +178,9 @@ def first_negative(
         below = np.flatnonzero(at_b < -slack)
         if len(below):
             # What comes after the first value below −slack does not matter.
-            a, b, low, monotone, at_a, at_b = (
-                v[: below[0] + 1] for v in (a, b, low, monotone, at_a, at_b)
-            )
+            last = below[0] + 1
+            a, b, low, monotone = a[:last], b[:last], low[:last], monotone[:last]
+            at_a, at_b = at_a[:last], at_b[:last]
             until, negative = float(b[-1]), True
         open_ = (low < -slack) & ~(monotone & (at_a >= -slack) & (at_b >= -slack))
         a, b, monotone = a[open_], b[open_], monotone[open_]

@@ -77,6 +77,10 @@ class Attempt(NamedTuple):
     excess: float
     residuals: tuple[Array, Array]
 
+    def waves(self, k: int, i: int) -> list[tuple[complex, complex]]:
+        """(λ, amplitude) of the oscillations in entry i of y (k = 0) or of w (k = 1)."""
+        return [(rate, (y, w)[k][i]) for rate, _, y, w in self.rings]
+
 
 class Run:
     """The trajectory of a system from x0 over its pieces, which are those of the `given` system; it is
@@ -262,8 +266,10 @@ class Run:
         )
         lacking = _EXTRAPOLATED * tail_d
         ys, _ = own.members(p, own.dependent(x[1:], p, given[:, n:]))
-        swing = tuple(
-            sum((2.0 * np.abs(ring[k]) for ring in rings), np.zeros(len(p[0]))) for k in (2, 3)
+        none = np.zeros(len(p[0]))
+        swing = (
+            sum((2.0 * np.abs(ring[2]) for ring in rings), none),
+            sum((2.0 * np.abs(ring[3]) for ring in rings), none),
         )
         return Attempt(
             x, ys, y, w, slack, rings, swing, sizes[0], lacking, excess,
@@ -321,9 +327,9 @@ class Run:
             if theta == 0.0 or radau.lowest(signed) - swing[c.i] >= -allowed:
                 continue
             waves = [
-                radau.Wave(ring[0] * h, c.sign * ring[2 + k][c.i])
-                for ring in found.rings
-                if ring[2 + k][c.i] != 0.0
+                radau.Wave(rate * h, c.sign * amplitude)
+                for rate, amplitude in found.waves(k, c.i)
+                if amplitude != 0.0
             ]
             when, fails = radau.first_negative(signed, allowed, theta, waves)
             if fails or when < theta:
@@ -339,8 +345,8 @@ class Run:
         for c in own.conditions:
             k = int(c.of_w)
             value = (found.y, found.w)[k][before, c.i] - c.bound
-            for ring in found.rings:
-                value = value + 2.0 * (ring[2 + k][c.i] * np.exp(ring[0] * h * thetas)).real
+            for rate, amplitude in found.waves(k, c.i):
+                value = value + 2.0 * np.real(amplitude * np.exp(rate * h * thetas))
             mean = float(np.clip(-c.sign * value, 0.0, found.slack[k][c.i]).mean())
             passed[k, c.i] = mean
             if mean > 0.0:
