@@ -271,6 +271,14 @@ class Run:
             sum((2.0 * np.abs(ring[2]) for ring in rings), none),
             sum((2.0 * np.abs(ring[3]) for ring in rings), none),
         )
+        # Bounds on rounding may be far above it; a violation of so much is a switching.
+        of_w = np.diag(self.given.M)
+        slack = (
+            np.minimum(slack[0], _MOST_SLACK * (self.rtol * np.abs(y).max(axis=0) + self.atol)),
+            np.minimum(
+                slack[1], _MOST_SLACK * (self.rtol * np.abs(w).max(axis=0) + self.atol * of_w)
+            ),
+        )
         return Attempt(
             x, ys, y, w, slack, rings, swing, sizes[0], lacking, excess,
             self._residuals(own, x, p, G[0], h),
@@ -415,6 +423,9 @@ _MOST_ROUNDING = 1e3
 
 _EVEN = 3
 """Steps of one length after which a longer one is tried."""
+
+_MOST_SLACK = 1e3
+"""The most that y and w may be beyond a bound, in units of the tolerance."""
 
 _SHOWN = 0.02
 """The share of a run between two lines that `progress` prints."""
