@@ -100,6 +100,7 @@ class Run:
         rtol, atol = tol
         self.tol, self.least = float(np.clip(1e-4 * rtol, 1e-12, 1e-6)), 1e-4 * atol
         self.rtol, self.atol, self.veiled = rtol, atol, 0.0 * x0
+        self.largest = np.zeros((2, len(given.low)))
         # The members w are in proportion to their law.
         self.least_p = self.least * np.where(pivoted.swapped, np.diag(given.M), 1.0)
         self.times, self.dense = times, dense
@@ -273,11 +274,10 @@ class Run:
         )
         # Bounds on rounding may be far above it; a violation of so much is a switching.
         of_w = np.diag(self.given.M)
+        largest = np.maximum(self.largest, [np.abs(y).max(axis=0), np.abs(w).max(axis=0)])
         slack = (
-            np.minimum(slack[0], _MOST_SLACK * (self.rtol * np.abs(y).max(axis=0) + self.atol)),
-            np.minimum(
-                slack[1], _MOST_SLACK * (self.rtol * np.abs(w).max(axis=0) + self.atol * of_w)
-            ),
+            np.minimum(slack[0], _MOST_SLACK * (self.rtol * largest[0] + self.atol)),
+            np.minimum(slack[1], _MOST_SLACK * (self.rtol * largest[1] + self.atol * of_w)),
         )
         return Attempt(
             x, ys, y, w, slack, rings, swing, sizes[0], lacking, excess,
@@ -379,6 +379,8 @@ class Run:
         self.defect += part * (mean * self._norm(of_state) + self._norm(error[:n]))
         self.law_defect += part * float(mean * np.linalg.norm(of_law) + np.linalg.norm(error[n:]))
         self.accepted += 1
+        now = [np.abs(v).max(axis=0) for v in (found.y, found.w)]
+        self.largest = np.maximum(self.largest, now)
         # The state that a step ends in is as good as the largest one that it was made of.
         self.law_off = found.lacking
         self.off, self.scale = ROUNDINGS * found.size, np.maximum(self.scale, found.size)
