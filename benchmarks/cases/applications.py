@@ -91,8 +91,10 @@ def _circuit(section: Section, rounds: int, full: bool) -> None:
 def _stiff(section: Section, rounds: int, full: bool) -> None:
     """What stiffness costs: the same run with a diode of 1 µΩ and 1 Ω, with η/k = 1e-8 s and 1e-2 s."""
 
-    def rectifier(r: float) -> Callable[[], Any]:
-        text = f"V1 a 0 SIN(0 10 1k)\nD1 a b R={r} G=1u\nL1 b c 10u\nR1 c 0 10\nC1 c 0 1u"
+    def rectifier(r: float, strays: str = "") -> Callable[[], Any]:
+        anode = "d" if strays else "b"
+        text = f"V1 a 0 SIN(0 10 1k)\nD1 a {anode} R={r} G=1u\nL1 b c 10u\nR1 c 0 10\nC1 c 0 1u\n"
+        text += strays
         circuit = Circuit(text)
         return lambda: circuit.solve(3e-3).xs
 
@@ -101,8 +103,15 @@ def _stiff(section: Section, rounds: int, full: bool) -> None:
                      viscosity_ratio=tau)  # fmt: skip
         return lambda: made.solve().xs
 
+    strays = "L9 d b 1n\nC9 b 0 1p"
     for case, versus, stiff, mild in (
         ("rectifier, diode of 1 µΩ", "1 Ω", rectifier(1e-6), rectifier(1.0)),
+        (
+            "rectifier of 1 µΩ with undamped strays of 1 pF, 1 nH",
+            "without",
+            rectifier(1e-6, strays),
+            rectifier(1e-6),
+        ),
         ("frame, η/k = 1e-8 s", "1e-2 s", frame(1e-8), frame(1e-2)),
     ):
         _ = stiff(), mild()

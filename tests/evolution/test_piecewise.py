@@ -28,7 +28,8 @@ def test_a_spring_of_any_stiffness_is_met_where_it_begins(stiffness):
     rate, level = 1.0 + stiffness, (1.0 + 2.0 * stiffness) / (1.0 + stiffness)
     after = level + (2.0 - level) * np.exp(-rate * (ts - np.log(3.0)).clip(0))
     exact = np.where(ts <= np.log(3.0), 1.0 + 3.0 * np.exp(-ts), after)
-    np.testing.assert_allclose(np.asarray(sol.xs), exact, rtol=1e-13)
+    # The polynomials may lack 10⁻⁴ rtol.
+    np.testing.assert_allclose(np.asarray(sol.xs), exact, rtol=1e-12)
     times, positive = sol.regimes()
     assert len(times) == 3 and abs(times[1] - np.log(3.0)) < 1e-14
     assert positive[:, 0].tolist() == [False, True]
@@ -36,7 +37,7 @@ def test_a_spring_of_any_stiffness_is_met_where_it_begins(stiffness):
     x, u = sol.evaluate(3.0)
     left = np.exp(-rate * (3.0 - np.log(3.0)))
     spring = stiffness / (1.0 + stiffness) * (1.0 - left)
-    assert float(u) == pytest.approx(spring, rel=1e-12)
+    assert float(u) == pytest.approx(spring, rel=1e-11)
     assert float(x) == pytest.approx(level + (2.0 - level) * left, rel=1e-13)
 
 
@@ -100,21 +101,79 @@ def test_an_oscillation_beside_a_constraint_takes_no_step_a_period():
 
 def test_first_crossings_are_found_and_touching_is_none():
     theta = radau.GRID
-    assert radau.first_negative((theta - 0.3) ** 2, 1e-14) is None
-    found = radau.first_negative((theta - 0.3) ** 2 - 1e-10, 1e-14)
-    assert found == pytest.approx(0.3 - 1e-5, abs=1e-9)
+    assert radau.first_negative((theta - 0.3) ** 2, 1e-14) == (1.0, False)
+    found, crosses = radau.first_negative((theta - 0.3) ** 2 - 1e-10, 1e-14)
+    assert crosses and found == pytest.approx(0.3 - 1e-5, abs=1e-9)
     rng = np.random.default_rng(0)
     for _ in range(50):
         c = rng.normal(size=12) / np.arange(1, 13)
         values = np.polynomial.chebyshev.chebval(2 * theta - 1, c)
         fine = np.linspace(0, 1, 200_001)
         there = np.polynomial.chebyshev.chebval(2 * fine - 1, c)
-        found = radau.first_negative(values, 1e-13)
+        found, crosses = radau.first_negative(values, 1e-13)
         below = np.flatnonzero(there < -1e-13)
         if not len(below):
-            assert found is None
+            assert not crosses and found == 1.0
         else:
-            assert found is not None and abs(found - fine[below[0]]) <= 5e-6
+            assert crosses and abs(found - fine[below[0]]) <= 5e-6
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_first_crossings_beside_waves_are_those_of_dense_samples(seed):
+    rng = np.random.default_rng(seed)
+    c = rng.normal(size=6) / np.arange(1, 7) ** 2
+    values = np.polynomial.chebyshev.chebval(2 * radau.GRID - 1, c)
+    waves = [
+        radau.Wave(complex(-rng.uniform(0, 5), 10 ** rng.uniform(1, 3.5)), 0.3 * rng.normal() + 0j)
+        for _ in range(int(rng.integers(1, 3)))
+    ]
+    fine = np.linspace(0, 1, 400_001)
+    there = np.polynomial.chebyshev.chebval(2 * fine - 1, c)
+    there = there + sum(2 * (w.amplitude * np.exp(w.rate * fine)).real for w in waves)
+    # From a level that makes the first crossing one near a trough, or none.
+    level = np.quantile(there, rng.choice([0.0, 0.001, 0.05])) - 1e-9 * rng.integers(2)
+    found, crosses = radau.first_negative(values - level, 1e-13, 1.0, waves)
+    below = np.flatnonzero(there < level - 1e-13)
+    if len(below):
+        assert crosses and fine[below[0]] - 2.6e-6 <= found <= fine[below[0]]
+    else:
+        at = there[0] if found == 0.0 else np.interp(found, fine, there)
+        assert not crosses or at < level + 2e-5  # below between two samples
+
+
+def test_progress_is_printed_as_other_methods_do_and_changes_nothing(capfd):
+    run = lambda **kwargs: dvax.solve(  # noqa: E731
+        held(50.0), 4.0, 0.0, 4.0, ts=[1.0, 4.0], method=dvax.PiecewiseLinear(), **kwargs
+    )
+    quiet = run()
+    assert capfd.readouterr().out == ""
+    np.testing.assert_array_equal(run(progress=True).xs, quiet.xs)
+    lines = capfd.readouterr().out.split()
+    shares = [float(line.removesuffix("%")) for line in lines]
+    assert len(lines) >= 3 and shares[0] == 0.0 and shares[-1] == 100.0
+    assert shares == sorted(set(shares))
+
+
+@pytest.mark.parametrize(("level", "hidden"), [(1e4, True), (1e-6, False)])
+def test_rounding_that_may_hide_a_switching_is_refused(level, hidden):
+    # x follows s(t) up through a response u = (s − x)/M ≥ 0, and z counts it. Beside s = 10⁴ the
+    # rounding of s − x is more than all of s', and says nothing about the sign of u.
+    M = 1e-10
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, np.inf),
+        f=lambda t, x, u, args: jnp.stack([u[0], u[0]]),
+        h=lambda t, x, u, args: u - (M * u + x[:1] - level - 1e-5 * jnp.sin(2.0 * t)),
+        state_space=dvax.spaces.Euclidean(2), control_space=dvax.spaces.Euclidean(1),
+    )  # fmt: skip
+    run = lambda: dvax.solve(  # noqa: E731
+        problem, np.array([level, 0.0]), 0.0, 4.0, method=dvax.PiecewiseLinear()
+    )
+    if hidden:
+        with pytest.raises(dvax.SolveError, match="hides whether a constraint changes"):
+            run()
+    else:
+        # Up with s to its maximum and no further.
+        np.testing.assert_allclose(np.asarray(run().xs[-1]), [level + 1e-5, 1e-5], atol=1e-12)
 
 
 def test_the_method_says_what_it_is_not_for():

@@ -189,6 +189,113 @@ def test_random_circuits_of_stiff_diodes_agree_with_the_second_analysis(seed):
     )
 
 
+def drawn(rng, mild=False):
+    """A circuit of one of five kinds, with strays and snubbers or without: its netlist, source and end,
+    and the knots of the source. `mild` ones are within reach of a general method."""
+    ten = lambda low, high: 10 ** rng.uniform(np.log10(low), np.log10(high))  # noqa: E731
+    kind = rng.choice(["half wave", "bridge", "clamp", "doubler", "clipper"])
+    frequency, volts = ten(100, 1e5) if mild else ten(10, 1e6), ten(0.1, 1e3)
+    T = 1 / frequency
+    if rng.random() < 0.5:
+        offset = rng.choice([0.0, 0.3 * volts])
+        source, events = f"SIN({offset:g} {volts:g} {frequency:g})", 3
+    else:
+        low = -volts * rng.random()
+        edge = 0.02 * T if mild else 1e-9
+        source = f"PULSE({low:g} {volts:g} {0.1 * T:g} {edge:g} {edge:g} {0.4 * T:g} {T:g})"
+        events = 12
+    r, leak = (ten(1e-3, 1), ten(1e-5, 1e-3)) if mild else (ten(1e-6, 1), ten(1e-9, 1e-3))
+    L, R = ten(1e-6, 1e-2), ten(1, 1e3 if mild else 1e5)
+    C = ten(1e-8 if mild else 1e-11, 1e-5)
+    stray, snubbed = (0, True) if mild else (int(rng.integers(4)), rng.random() < 0.5)
+
+    def diode(k, a, b):
+        line = f"D{k} {a} {{}} R={r:g} G={leak:g}\n"
+        if stray & 2 and k == 1:
+            return line.format("d") + f"L{k}9 d {b} {ten(1e-9, 1e-7):g}\n"
+        return line.format(b)
+
+    beside = f"C9 {{0}} 0 {ten(1e-12, 1e-9):g}\n" if stray & 1 else ""
+    beside += "R9 {0} 0 1000\n" if snubbed else "R9 {0} 0 100000\n"
+    text = f"V1 a 0 {source}\n"
+    if kind == "half wave":
+        text += (
+            diode(1, "a", "b") + beside.format("b") + f"L1 b c {L:g}\nR1 c 0 {R:g}\nC1 c 0 {C:g}\n"
+        )
+    elif kind == "bridge":
+        text = (
+            f"V1 s 0 {source}\nR0 s a {ten(1e-3, 10):g}\n" + diode(1, "a", "p") + diode(2, "0", "p")
+        )
+        text += diode(3, "n", "a") + diode(4, "n", "0") + beside.format("a")
+        text += f"C1 p n {C:g}\nR1 p n {R:g}\n"
+    elif kind == "clamp":
+        text += f"C1 a b {C:g}\n" + diode(1, "0", "b") + f"R1 b 0 {R:g}\n"
+    elif kind == "doubler":
+        text += f"R0 a e {ten(1e-2, 10):g}\nC1 e b {C:g}\n" + diode(1, "0", "b")
+        text += diode(2, "b", "c") + f"C2 c 0 {C:g}\nR1 c 0 {R:g}\n"
+    else:
+        text += f"R1 a b {R:g}\n" + diode(1, "b", "0") + diode(2, "0", "b") + beside.format("b")
+        text += f"L1 b c {L:g}\nR2 c 0 {R:g}\n"
+    return text, source, 3 * T, events
+
+
+@pytest.mark.parametrize(
+    "seed", [0, 3, 5, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(6, 300))]
+)
+def test_circuits_of_any_kind_and_scale_run_at_the_defaults(seed):
+    text, _, end, events = drawn(np.random.default_rng(seed))
+    circuit, ts = Circuit(text), np.linspace(0.0, end, 21)
+    sol = circuit.solve(end, ts)
+    assert work(sol) <= 60 * (int(sol.stats["switchings"]) + events + len(ts)), sol.stats
+    # The law holds within what voltages of this size leave of a current through so little.
+    size = 1e-8 * (1 + np.abs(np.asarray(sol.xs)).max() + np.abs(np.asarray(sol.us)).max())
+    assert np.abs(np.asarray(sol.law_step)).max() <= size
+
+
+@pytest.mark.parametrize(
+    "seed", [1, 2, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(3, 60))]
+)
+def test_circuits_of_any_kind_agree_with_radau_on_the_second_analysis(seed):
+    text, source, end, _ = drawn(np.random.default_rng(1000 + seed), mild=True)
+    circuit, ts = Circuit(text), np.linspace(0.0, end, 13)
+    mine = np.asarray(circuit.solve(end, ts).xs)
+    plain = tableau(text.replace(source, "1"))
+    name, *numbers = source.replace("(", " ").replace(")", " ").split()
+    numbers = [float(v) for v in numbers]
+    if name == "SIN":
+        drive = lambda t: numbers[0] + numbers[1] * np.sin(2 * np.pi * numbers[2] * t)  # noqa: E731
+        knots = [0.0, end]
+    else:
+        low, high, delay, rise, fall, width, period = numbers
+        corners = np.array([0.0, rise, rise + width, rise + width + fall])
+        times = np.concatenate([delay + k * period + corners for k in range(4)])
+        levels = np.tile([low, high, high, low], 4)
+        drive = lambda t: np.interp(t, times, levels)  # noqa: E731
+        knots = [0.0, *times[times < end], end]
+    D, m = plain.D, len(plain.D)
+
+    def law(t, x):
+        q = plain.C @ x + plain.e[:, 0] * drive(t)
+        return affine_box_vi(D, q, np.zeros(m), np.full(m, np.inf))
+
+    def rate(t, x):
+        return plain.A @ x + plain.B @ law(t, x) + plain.b[:, 0] * drive(t)
+
+    def jacobian(t, x):
+        on = law(t, x) > 0
+        return plain.A - plain.B[:, on] @ np.linalg.solve(D[np.ix_(on, on)], plain.C[on])
+
+    x, found = np.zeros(len(plain.A)), np.zeros((len(ts), len(plain.A)))
+    for a, b in itertools.pairwise(knots):
+        inside = (ts > a) & (ts <= b)
+        at = np.unique(np.append(ts[inside], b))
+        part = scipy.integrate.solve_ivp(
+            rate, (a, b), x, "Radau", at, rtol=1e-7, atol=1e-9, jac=jacobian, max_step=(b - a) / 20
+        )
+        found[inside], x = part.y.T[: int(inside.sum())], part.y[:, -1]
+    np.testing.assert_allclose(mine, found, atol=3e-5 * np.abs(found).max(axis=0).max())
+
+
 def test_a_pulse_is_that_of_spice():
     pulse = read_waveform(["PULSE(1 5 10u 2u 4u 20u 100u)"], "voltage", "here")
     times = 1e-6 * np.array([0, 10, 11, 12, 20, 32, 34, 36, 60, 110, 111, 1e3 + 11, 1e3 + 33])

@@ -34,9 +34,9 @@ class Condition(NamedTuple):
 class Equations:
     """The equations of one mode.
 
-    `prescribed_p` and `prescribed_d` hold the prescribed values (0 elsewhere), `unknown` says
-    where p is
-    unknown; `rates` are the time scales of the mode, 1/|λ| in effect, from the shortest to the longest.
+    `prescribed_p` and `prescribed_d` hold the prescribed values (0 elsewhere), `unknown` says where p
+    is unknown; `scales` are the time scales of the mode, 1/|λ| in effect, from the shortest to the
+    longest.
     """
 
     def __init__(self, system: Affine, mode: Mode, weights: Array):
@@ -52,7 +52,7 @@ class Equations:
         self.conditions = [c for i, s in enumerate(mode) for c in _conditions(system, i, s)]
         M = system.M[np.ix_(u, u)]
         self.inverse = _inverse(M)
-        eliminated = system.A - system.B[:, u] @ self.inverse @ system.C[u]
+        self.eliminated = eliminated = system.A - system.B[:, u] @ self.inverse @ system.C[u]
         spectrum = np.linalg.eigvals(eliminated) if np.isfinite(eliminated).all() else np.zeros(1)
         real, imag = np.real(spectrum), np.imag(spectrum)
         speeds = np.abs(real) / 8.0 + np.abs(imag) / 4.0
@@ -63,6 +63,7 @@ class Equations:
         # Others are damped within a period or two, and not worth the trouble.
         light = spectrum[(imag > 4.0 * np.abs(real)) & (imag > 0)]
         self.rings = rings(whole, len(system.A), light)
+        self._reach: dict[float, Array] = {}
         self._factors: dict[float, tuple[Array, Array, tuple[Array, Array]]] = {}
 
     def solve(self, h: float, x0: Array, inputs: Array) -> tuple[Array, Array]:
@@ -75,8 +76,22 @@ class Equations:
         right = np.zeros((s, n + k))
         right[:, :n] = h * (g + system.B @ self.prescribed_p) - radau.D[1:, :1] * x0
         right[:, n:] = (self.prescribed_d - q - system.M @ self.prescribed_p)[:, u]
-        found = scipy.linalg.lu_solve(factors, (right * rows).ravel(), check_finite=False)
-        found = found.reshape(s, n + k) * columns
+        A, B, C, M = system.A, system.B[:, u], system.C[u], system.M[np.ix_(u, u)]
+        found = np.zeros((s, n + k))
+        # Refined until the errors of each equation are the rounding of its own terms.
+        last = np.inf
+        for _ in range(_REFINED):
+            X, Q = found[:, :n], found[:, n:]
+            of_x = right[:, :n] - radau.D[1:, 1:] @ X + h * (X @ A.T + Q @ B.T)
+            off = np.hstack([of_x, right[:, n:] - X @ C.T - Q @ M.T])
+            change = scipy.linalg.lu_solve(factors, (off * rows).ravel(), check_finite=False)
+            change = change.reshape(s, n + k) * columns
+            found = found + change
+            size = np.abs(found).max(axis=0)
+            now = float(np.max(np.abs(change).max(axis=0) / np.where(size > 0.0, size, 1.0)))
+            if not (_ACCURATE < now < 0.5 * last):
+                break
+            last = now
         p = np.tile(self.prescribed_p, (s, 1))
         p[:, u] = found[:, n:]
         return np.vstack([x0, found[:, :n]]), p
@@ -88,6 +103,15 @@ class Equations:
         each = np.where(C > 0.0, terms[:, None] / np.where(C > 0.0, C, 1.0), np.inf)
         least = each.min(axis=0, initial=np.inf)
         return np.where(np.isfinite(least), least, 0.0)
+
+    def reach(self, h: float) -> Array:
+        """Sizes of the entries of (1/h − A)⁻¹, A that of the states alone: what a disturbance of x'
+        does to x within h."""
+        if h not in self._reach:
+            if len(self._reach) >= _KEPT:
+                self._reach.clear()
+            self._reach[h] = np.abs(_inverse(np.eye(len(self.eliminated)) / h - self.eliminated))
+        return self._reach[h]
 
     def responses(self, ring: Ring) -> tuple[Array, Array]:
         """(y, w) of an oscillation of amplitude 1."""
@@ -113,26 +137,37 @@ class Equations:
         return d
 
     def noise(self, x: Array, p: Array, q: Array, off: Array) -> tuple[Array, Array]:
-        """What rounding leaves undetermined of p and of d, for values of these sizes; d as
-        it follows from x is `off` already."""
+        """What rounding leaves undetermined of p and of d, for values of these sizes; d as it follows
+        from x is `off` already."""
         system, u = self.system, self.unknown
         terms = np.abs(system.C) @ x + np.abs(system.M) @ p + q
         of_d = ROUNDINGS * terms + off
-        of_p = np.zeros(len(u))
-        of_p[u] = np.abs(self.inverse) @ of_d[u] + ROUNDINGS * p[u]
+        of_p = self.of_law(of_d)
+        of_p[u] += ROUNDINGS * p[u]
         of_d = of_d + np.abs(system.M[:, u]) @ of_p[u]
         return of_p, of_d
+
+    def of_law(self, off: Array) -> Array:
+        """By how much p changes where d is off by this."""
+        of_p = np.zeros(len(off))
+        of_p[self.unknown] = np.abs(self.inverse) @ off[self.unknown]
+        return of_p
 
     def members(self, p: Array, d: Array) -> tuple[Array, Array]:
         """(y, w) from (p, d)."""
         swapped = self.system.swapped
         return np.where(swapped, d, p), np.where(swapped, p, d)
 
-    def at(self, x: Array, q: Array, sizes: Array, off: Array) -> tuple[Array, ...]:
-        """(y, w) at one x and q, and their noise, where q is a sum of terms of these `sizes`."""
+    def multiplier(self, x: Array, q: Array) -> Array:
+        """p from x and q, by the law alone."""
         p, u = self.prescribed_p.copy(), self.unknown
         free = self.prescribed_d - q - self.system.C @ x - self.system.M @ p
         p[u] = self.inverse @ free[u]
+        return p
+
+    def at(self, x: Array, q: Array, sizes: Array, off: Array) -> tuple[Array, ...]:
+        """(y, w) at one x and q, and their noise, where q is a sum of terms of these `sizes`."""
+        p = self.multiplier(x, q)
         d = self.dependent(x[None], p[None], q[None])[0]
         y, w = self.members(p, d)
         return y, w, *self.members(*self.noise(np.abs(x), np.abs(p), sizes, off))
@@ -172,6 +207,7 @@ class Equations:
         return found
 
 
+_REFINED, _ACCURATE = 6, 1e-14
 _KEPT = 64
 """Factorisations that a mode keeps: steps between the knots of a record have few lengths."""
 

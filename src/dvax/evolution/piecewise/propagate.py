@@ -24,11 +24,13 @@ Array = np.ndarray
 
 
 class Limits(NamedTuple):
-    """The most steps, rejected ones included; whether to keep all of them; whether to bound x and u."""
+    """The most steps, rejected ones included; whether to keep all of them, to bound x and u, and to
+    print the percentage of the run that is done."""
 
     max_steps: int
     dense: bool
     ranged: bool
+    progress: bool
 
 
 def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
@@ -46,7 +48,7 @@ def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
         )
     begun = time.perf_counter()
     problem, x0, args = setup.problem, jnp.asarray(setup.x0), as_arrays(setup.args)
-    t0, t1, rtol = (float(setup.setting[name]) for name in ("t0", "t1", "rtol"))
+    t0, t1, rtol, atol = (float(setup.setting[name]) for name in ("t0", "t1", "rtol", "atol"))
     problem.check(t0, x0, args)
     knots = np.asarray(problem.knots(t0, t1, x0, args), float)
     stops = np.concatenate([[t0], knots, [t1]])
@@ -54,17 +56,19 @@ def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
     state, control = problem.spaces(x0)
     weights = np.asarray(jax.vmap(lambda v: state.norm(v.reshape(x0.shape)))(jnp.eye(x0.size)))
     times = np.array([t1]) if ts is None else np.asarray(ts, float)
-    tol = float(np.clip(1e-5 * rtol, 1e-13, 1e-6))
     try:
         found = pieces(problem, stops, x0, args, limits.max_steps)
     except Unresolved as error:
-        run = Run(given, given, [Piece(t0, t1 - t0, np.zeros((1, 1)), np.zeros(1), np.zeros(1))],
-                  np.asarray(x0, float).ravel(), weights, tol, *limits_of(limits, times))  # fmt: skip
+        nothing = [Piece(t0, t1 - t0, np.zeros((1, 1)), np.zeros(1), np.zeros(1))]
+        run = Run(
+            given, given, nothing, np.asarray(x0, float).ravel(), weights, (rtol, atol),
+            *limits_of(limits, times),
+        )  # fmt: skip
         run.t, run.result = error.t, "step_too_small" if error.finite else "nonfinite"
         prepared = time.perf_counter()
     else:
         run = Run(
-            given, pivoted(given), found, np.asarray(x0, float).ravel(), weights, tol,
+            given, pivoted(given), found, np.asarray(x0, float).ravel(), weights, (rtol, atol),
             *limits_of(limits, times),
         )  # fmt: skip
         prepared = time.perf_counter()
@@ -73,9 +77,9 @@ def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
     return _solution(setup, x0, run, given, (state, control), limits, timing)
 
 
-def limits_of(limits: Limits, times: Array) -> tuple[int, Array, bool, bool]:
+def limits_of(limits: Limits, times: Array) -> tuple[int, Array, bool, bool, bool]:
     """The last arguments of a `Run`."""
-    return limits.max_steps, times, limits.dense, limits.ranged
+    return limits.max_steps, times, limits.dense, limits.ranged, limits.progress
 
 
 def _solution(
@@ -90,7 +94,7 @@ def _solution(
         np.reshape(np.array(values, float), (len(rows), *shape)), dtype
     )
     ys, w = (np.reshape(np.array([r[k] for r in rows]), (len(rows), m)) for k in (2, 3))
-    tau = 1.0 if setup.moduli.get("L_F") is None else 1.0 / float(setup.moduli["L_F"])
+    tau = 1.0 / max(float(np.linalg.norm(given.M, 2)), np.finfo(float).tiny)
     # One projection step, as in `dvax.vi.certificate`; F is affine.
     moved = ys - np.clip(ys - tau * w, given.low, given.up)
     size = lambda v: jax.vmap(spaces[1].norm)(array(v, u0.shape))  # noqa: E731

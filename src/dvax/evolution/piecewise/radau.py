@@ -9,8 +9,8 @@ The residual of a linear equation in polynomials of degree s that vanishes at th
 multiple of ρ(θ) = Π(θ − cᵢ), and |ρ| is largest at θ = 0: one evaluation there bounds it on the step.
 """
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.special
@@ -119,38 +119,88 @@ def lowest(values: Array) -> Any:
     return low - 0.5 * _MARGIN * (high - low)
 
 
-def first_negative(values: Array, slack: float, until: float = 1.0) -> float | None:
-    """The first θ in [0, until] where a polynomial passes from above to below zero and goes on below
-    −`slack`; None where it stays above −2 `slack`. `values` are those on the grid.
+class Wave(NamedTuple):
+    """θ ↦ 2 Re ce^{μθ}, with Re μ ≤ 0: `rate` is μ, `amplitude` c."""
 
-    An interval is left when bounds on the polynomial or on its slope decide it, and halved otherwise.
+    rate: complex
+    amplitude: complex
+
+
+class _Sum:
+    """A polynomial, by its values on the grid, and waves."""
+
+    def __init__(self, values: Array, waves: Sequence[Wave]):
+        self.value = COEFFICIENTS @ values[::_DENSITY]
+        self.slope = 2.0 * np.polynomial.chebyshev.chebder(self.value)
+        bend = 2.0 * np.polynomial.chebyshev.chebder(self.slope)
+        on_grid = np.polynomial.chebyshev.chebval(2.0 * GRID - 1.0, bend)
+        self.bend = (1.0 + _MARGIN) * float(np.abs(on_grid).max())
+        self.rates = np.array([wave.rate for wave in waves])[:, None]
+        self.amplitudes = 2.0 * np.array([wave.amplitude for wave in waves])[:, None]
+
+    def __call__(self, theta: Any) -> Any:
+        waves = self.amplitudes * np.exp(self.rates * theta)
+        found = np.polynomial.chebyshev.chebval(2.0 * theta - 1.0, self.value)
+        return found + waves.real.sum(axis=0)
+
+    def bounds(self, a: Array, b: Array) -> tuple[Array, Array]:
+        """Lower bounds on the intervals [a, b], and whether the sum is monotone there: by the slopes in
+        the middle and bounds of the second derivatives, and for waves by their amplitudes as well."""
+        middle, half = 0.5 * (a + b), 0.5 * (b - a)
+        waves = self.amplitudes * np.exp(self.rates * middle)
+        size = np.abs(self.amplitudes) * np.exp(np.real(self.rates) * a)
+        value = np.polynomial.chebyshev.chebval(2.0 * middle - 1.0, self.value)
+        slope = np.polynomial.chebyshev.chebval(2.0 * middle - 1.0, self.slope)
+        both = slope + (self.rates * waves).real.sum(axis=0)
+        bend = self.bend + (np.abs(self.rates) ** 2 * size).sum(axis=0)
+        centred = value + waves.real.sum(axis=0) - (np.abs(both) + 0.5 * bend * half) * half
+        apart = value - (np.abs(slope) + 0.5 * self.bend * half) * half - size.sum(axis=0)
+        return np.maximum(centred, apart), np.abs(both) >= bend * half
+
+
+def first_negative(
+    values: Array, slack: float, until: float = 1.0, waves: Sequence[Wave] = ()
+) -> tuple[float, bool]:
+    """Return (θ, True), the first θ in [0, until] where a polynomial with `waves` beside it passes from
+    above to below zero and goes on below −`slack`; (θ, False) where it stays above −`slack` up to θ.
+
+    That θ is `until` unless the search takes more than `_MOST_INTERVALS`. `values` are those of the
+    polynomial on the grid. An interval is left where bounds on the function decide it, and halved
+    otherwise.
     """
-    coefficients = COEFFICIENTS @ values[::_DENSITY]
-    slopes = 2.0 * np.polynomial.chebyshev.chebder(coefficients)
+    function = _Sum(values, waves)
+    if function(0.0) < -slack:
+        return 0.0, True
+    a, b, negative = np.zeros(1), np.full(1, until), False
+    while len(a):
+        low, monotone = function.bounds(a, b)
+        at_a, at_b = function(a), function(b)
+        below = np.flatnonzero(at_b < -slack)
+        if len(below):
+            # What comes after the first value below −slack does not matter.
+            last = below[0] + 1
+            a, b, low, monotone = a[:last], b[:last], low[:last], monotone[:last]
+            at_a, at_b = at_a[:last], at_b[:last]
+            until, negative = float(b[-1]), True
+        open_ = (low < -slack) & ~(monotone & (at_a >= -slack) & (at_b >= -slack))
+        a, b, monotone = a[open_], b[open_], monotone[open_]
+        if not len(a):
+            break
+        shortest = b[0] - a[0] <= 4.0 * np.finfo(float).eps
+        if negative and len(a) == 1 and b[0] == until and (shortest or monotone[0]):
+            return _bisected(function, float(a[0]), until), True
+        wide = b - a > 4.0 * np.finfo(float).eps
+        wide |= negative & (b == until)
+        a, b = a[wide], b[wide]
+        middle = 0.5 * (a + b)
+        a, b = np.stack([a, middle], axis=1).ravel(), np.stack([middle, b], axis=1).ravel()
+        if len(a) > _MOST_INTERVALS:
+            until, negative = float(a[_MOST_INTERVALS // 2]), False
+            a, b = a[: _MOST_INTERVALS // 2], b[: _MOST_INTERVALS // 2]
+    return until, negative
 
-    def value(theta: float) -> float:
-        return float(np.polynomial.chebyshev.chebval(2.0 * theta - 1.0, coefficients))
 
-    if value(0.0) < -slack:
-        return 0.0
-    waiting = [(0.0, until)]
-    while waiting:
-        a, b = waiting.pop()
-        points = 2.0 * (a + (b - a) * GRID) - 1.0
-        inside = np.polynomial.chebyshev.chebval(points, coefficients)
-        if lowest(inside) >= -slack:
-            continue
-        slope = np.polynomial.chebyshev.chebval(points, slopes)
-        fall = slack / (b - a)
-        if inside[0] >= -slack and inside[-1] >= -slack and lowest(slope) >= -fall:
-            continue
-        shortest = b - a <= 4.0 * np.finfo(float).eps
-        if inside[-1] < -slack and (shortest or lowest(-slope) >= -fall):
-            return _bisected(value, a, b)
-        if not shortest:
-            middle = 0.5 * (a + b)
-            waiting += [(middle, b), (a, middle)]
-    return None
+_MOST_INTERVALS = 1 << 17
 
 
 def _bisected(value: Callable[[float], float], a: float, b: float) -> float:

@@ -3,16 +3,17 @@
 A step solves the equations of its mode by collocation and samples what has a sign to keep in that mode.
 Where bounds on these polynomials cannot exclude a change of sign, the change is located, and the step
 ends there. Steps end at the ends of the input's pieces as well. After a change the longest step is
-tried
-first, then the time scales of the mode, so that the number of steps follows from the number of scales
-that are excited and not from how far they are apart. Times within a piece are kept relative to its
-start, in two parts: a transient of 10⁻¹⁸ s is resolved at any t.
+tried first, then the time scales of the mode, so that the number of steps follows from the number of
+scales that are excited and not from how far they are apart. Times within a piece are kept relative to
+its start, in two parts: a transient of 10⁻¹⁸ s is resolved at any t.
 """
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
+from .. import meter
 from . import radau
 from .inputs import Piece, basis, values
 from .modes import ROUNDINGS, Condition, Equations, Mode, changed, first_mode
@@ -58,40 +59,50 @@ class Row(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """A step that was computed: x at the nodes, y at the points, y and w on the grid with the
-    `slack` that
-    they may be off by; the `rings` beside these polynomials, and by how much they move y and w at most;
-    the `size` of the whole state; what the polynomials are `lacking` in d, and `excess`, the same
-    in units
-    of what is allowed; and the `residuals` of the state's and of the law's equations at θ = 0."""
+    """A step that was computed: x at the nodes, y at the points, y and w on the grid with the `slack`
+    that they may be off by; the `rings` beside these polynomials, (λ, x, y, w), and by how much they
+    `swing` y and w at most; the `size` of the whole state; what the polynomials are `lacking` in d, and
+    `excess`, the same in units of what is allowed; and the `residuals` of the state's and of the law's
+    equations at θ = 0."""
 
     x: Array
     ys: Array
     y: Array
     w: Array
     slack: tuple[Array, Array]
-    rings: tuple[tuple[complex, Array, Array], ...]
+    rings: list[tuple[complex, Array, Array, Array]]
     swing: tuple[Array, Array]
     size: Array
     lacking: Array
     excess: float
     residuals: tuple[Array, Array]
 
+    def waves(self, k: int, i: int) -> list[tuple[complex, complex]]:
+        """(λ, amplitude) of the oscillations in entry i of y (k = 0) or of w (k = 1)."""
+        return [(rate, (y, w)[k][i]) for rate, _, y, w in self.rings]
+
 
 class Run:
     """The trajectory of a system from x0 over its pieces, which are those of the `given` system; it is
     computed in the variables of the `pivoted` one.
 
-    `weights` are the norms of the unit vectors of the state space; `tol` what a polynomial may lack,
-    relative to the size of what it stands for.
+    `weights` are the norms of the unit vectors of the state space; `tol` = (rtol, atol), of which a
+    polynomial may lack 10⁻⁴.
     """
 
     def __init__(
         self, given: Affine, pivoted: Affine, pieces: list[Piece], x0: Array, weights: Array,
-        tol: float, max_steps: int, times: Array, dense: bool, ranged: bool,
+        tol: tuple[float, float], max_steps: int, times: Array, dense: bool, ranged: bool,
+        progress: bool,
     ):  # fmt: skip
         self.given, self.system, self.pieces, self.x = given, pivoted, pieces, x0
-        self.weights, self.tol, self.max_steps = weights, tol, max_steps
+        self.weights, self.max_steps = weights, max_steps
+        rtol, atol = tol
+        self.tol, self.least = float(np.clip(1e-4 * rtol, 1e-12, 1e-6)), 1e-4 * atol
+        self.rtol, self.atol, self.veiled = rtol, atol, 0.0 * x0
+        self.largest = np.zeros((2, len(given.low)))
+        # The members w are in proportion to their law.
+        self.least_p = self.least * np.where(pivoted.swapped, np.diag(given.M), 1.0)
         self.times, self.dense = times, dense
         self.equations: dict[Mode, Equations] = {}
         self.mode = first_mode(given)
@@ -103,6 +114,8 @@ class Run:
         self.defect = self.law_defect = 0.0
         self.piece = pieces[0]
         self.t, self.result = pieces[0].start, "successful"
+        self.meter, self.shown = meter.begin() if progress else None, 0.0
+        self.span = pieces[-1].start + pieces[-1].length - self.t
         m = len(given.low)
         none = np.stack([np.full(m, np.inf), np.full(m, -np.inf)])
         self.extent = np.hstack([np.stack([x0, x0]), none]) if ranged else None
@@ -121,6 +134,14 @@ class Run:
             if self.result != "successful":
                 return
             last = piece
+        if self.shown < 1.0:
+            self._show(1.0)
+
+    def _show(self, share: float) -> None:
+        """Print the share of the run that is done, where that is asked for."""
+        self.shown = share
+        if self.meter is not None:
+            self.meter = meter.advance(self.meter, jnp.asarray(share))
 
     def _converted(self, piece: Piece) -> Piece:
         """The piece in the system's own variables."""
@@ -133,9 +154,8 @@ class Run:
         return self.equations[mode]
 
     def _solve_law(self, piece: Piece) -> str:
-        """The mode of the law at x and at the start of a piece: of the violated conditions the
-        first is changed (Murty's rule,
-        which ends for matrices whose principal minors are positive)."""
+        """The mode of the law at x and at the start of a piece: of the violated conditions the first is
+        changed (Murty's rule, which ends for matrices whose principal minors are positive)."""
         q = piece.at(np.zeros(1))[0, len(self.x) :]
         sizes = np.abs(piece.coefficients[:, len(self.x) :]).sum(axis=0)
         for _ in range(_MOST_CHANGES):
@@ -153,6 +173,7 @@ class Run:
     def _through(self, piece: Piece, last: bool) -> str:
         """All steps of a piece."""
         begin, low, proposal = 0.0, 0.0, np.inf
+        even, reached = 0, 0.0
         while begin < piece.length:
             own = self.of(self.mode)
             remaining = (piece.length - begin) - low
@@ -167,15 +188,14 @@ class Run:
                 if attempt.excess > 1.0 and h > own.shortest:
                     self.rejected += 1
                     h, before = _shorter(own, h, attempt.excess, before), attempt.excess
-                elif attempt.rings and self._undecided(own, attempt):
-                    self.rejected += 1
-                    fastest = max(rate.imag for rate, *_ in attempt.rings)
-                    h = max(0.25 * h, 0.999 * _FOLLOWED / fastest)
                 else:
                     found = attempt
-            theta, condition = self._first_change(own, found)
-            whole = condition is None and bool(h == remaining)
-            step = Step(piece.start + begin, h, theta, found.x, found.ys, found.rings)
+            theta, condition = self._first_change(own, found, h)
+            if theta > 0.0 and not self._account(own, found, theta, h):
+                return "switching_hidden"
+            whole = condition is None and theta == 1.0 and bool(h == remaining)
+            rings = tuple(ring[:3] for ring in found.rings)
+            step = Step(piece.start + begin, h, theta, found.x, found.ys, rings)
             end = piece.length if whole else begin + (low + theta * h)
             self._keep(step, found, piece, begin + low, end, last and whole)
             self.x = step.at(np.array([theta]))[0][0]
@@ -183,9 +203,14 @@ class Run:
                 return "successful"
             begin, low = _two_sum(begin, low + theta * h)
             if condition is None:
+                even = even + 1 if h <= reached else 0
+                reached = h
                 proposal = 4.0 * h if own.rings else _longer(own, h, found.excess)
+                if even >= _EVEN:
+                    # What is left of the excess may be rounding, which no step changes.
+                    proposal, even = max(4.0 * h, proposal), 0
                 continue
-            proposal = np.inf
+            proposal, even, reached = np.inf, 0, 0.0
             self.mode = changed(self.mode, condition)
             self.switchings += 1
             self.events.append((self.t, self.mode))
@@ -203,21 +228,33 @@ class Run:
         if not (np.isfinite(x).all() and np.isfinite(p).all()):
             return None
         # Rounding in the inputs is that of the terms they are summed from.
-        q = np.abs(piece.coefficients[:, n:]).sum(axis=0)
+        terms = np.abs(piece.coefficients).sum(axis=0)
+        g, q = terms[:n], terms[n:]
         beside = sum((2.0 * np.abs(ring[1]) for ring in rings), np.zeros(n))
         sizes = np.abs(x).max(axis=0) + beside, np.abs(p).max(axis=0), q
-        off = np.abs(own.system.C) @ np.maximum(self.off, ROUNDINGS * sizes[0])
+        off = np.maximum(self.off, ROUNDINGS * np.maximum(sizes[0], own.reach(h) @ g))
+        off = np.abs(own.system.C) @ off
         noise_p, _ = own.noise(*sizes, off)
         energy = np.sqrt(np.sum((self.weights * sizes[0]) ** 2))
-        hidden = own.hidden(*sizes)
-        allowed = np.maximum(self.tol * np.maximum(self.scale, sizes[0]), hidden)
+        allowed = np.maximum(self.tol * np.maximum(self.scale, sizes[0]), self.least)
         allowed = np.maximum(allowed, 1e-2 * self.tol * energy / self.weights)
+        allowed_p = np.maximum(self.tol * sizes[1], self.least_p)
+        # Rounding that shorter steps do not change: in the law, in large rows, which reaches the slow
+        # components too, and in p, which comes back through x.
+        rows = np.abs(own.system.A) @ sizes[0] + np.abs(own.system.B) @ sizes[1] + g
+        rounding = np.maximum(own.hidden(*sizes), 1e-2 * _ROUNDING * h * rows)
+        fed = np.abs(own.system.C) @ (own.reach(h) @ (np.abs(own.system.B) @ noise_p))
+        allowed = np.maximum(allowed, np.minimum(_MOST_ROUNDING * allowed, rounding))
+        fed_p = np.minimum(_MOST_ROUNDING * allowed_p, own.of_law(fed))
+        allowed_p = np.maximum(np.maximum(allowed_p, noise_p), fed_p)
         tail_x = np.abs(radau.TAIL_OF_STATE @ x).max(axis=0)
         tail_p = np.abs(radau.TAIL_OF_MULTIPLIER @ p).max(axis=0)
-        allowed_p = np.maximum(self.tol * sizes[1], noise_p)
         tiny = np.finfo(float).tiny
+        # A boundary layer shows in p at the start, which is no collocation point.
+        layer = np.abs(radau.START @ p - own.multiplier(x0, values(local, _START)[0, n:]))
         excess = max(
-            float(np.max(tail_x / (allowed + tiny))), float(np.max(tail_p / (allowed_p + tiny)))
+            float(np.max(tail_x / (allowed + tiny))),
+            float(np.max((tail_p + layer / _EXTRAPOLATED) / (allowed_p + tiny))),
         )
         X, P, G = radau.FROM_NODES @ x, radau.FROM_POINTS @ p, values(local, _ON_GRID)
         d = own.dependent(X, P, G[:, n:])
@@ -225,15 +262,25 @@ class Run:
         tail_d = np.abs(own.system.C) @ tail_x + np.abs(own.system.M) @ tail_p
         # What the step before was lacking decides on signs, and not on what this one may lack.
         slack_p, slack_d = own.noise(*sizes, off + self.law_off)
-        slack = own.members(slack_p + 4.0 * tail_p, slack_d + 4.0 * tail_d)
+        slack = own.members(
+            slack_p + layer + _EXTRAPOLATED * tail_p, slack_d + _EXTRAPOLATED * tail_d
+        )
         lacking = _EXTRAPOLATED * tail_d
         ys, _ = own.members(p, own.dependent(x[1:], p, given[:, n:]))
-        of_y, of_w = (
-            sum((2.0 * np.abs(ring[k]) for ring in rings), np.zeros(len(p[0]))) for k in (2, 3)
+        none = np.zeros(len(p[0]))
+        swing = (
+            sum((2.0 * np.abs(ring[2]) for ring in rings), none),
+            sum((2.0 * np.abs(ring[3]) for ring in rings), none),
         )
-        swing = of_y, of_w
+        # Bounds on rounding may be far above it; a violation of so much is a switching.
+        of_w = np.diag(self.given.M)
+        largest = np.maximum(self.largest, [np.abs(y).max(axis=0), np.abs(w).max(axis=0)])
+        slack = (
+            np.minimum(slack[0], _MOST_SLACK * (self.rtol * largest[0] + self.atol)),
+            np.minimum(slack[1], _MOST_SLACK * (self.rtol * largest[1] + self.atol * of_w)),
+        )
         return Attempt(
-            x, ys, y, w, slack, tuple(ring[:3] for ring in rings), swing, sizes[0], lacking, excess,
+            x, ys, y, w, slack, rings, swing, sizes[0], lacking, excess,
             self._residuals(own, x, p, G[0], h),
         )  # fmt: skip
 
@@ -253,15 +300,6 @@ class Run:
             found.append((ring.rate, a * ring.x, a * y, a * w))
             x0 = x0 - 2.0 * found[-1][1].real
         return found, x0
-
-    def _undecided(self, own: Equations, found: Attempt) -> bool:
-        """Whether the oscillations may break a condition."""
-        for c in own.conditions:
-            k = int(c.of_w)
-            signed = c.sign * ((found.y, found.w)[k][:, c.i] - c.bound)
-            if radau.lowest(signed) - found.swing[k][c.i] < -found.slack[k][c.i]:
-                return True
-        return False
 
     def _residuals(
         self, own: Equations, x: Array, p: Array, given: Array, h: float
@@ -285,20 +323,49 @@ class Run:
         state = np.maximum(off - rounding, 0.0) + np.abs(self.given.B) @ of_y
         return state, law - of_y
 
-    def _first_change(self, own: Equations, found: Attempt) -> tuple[float, Condition | None]:
-        """(θ, condition) of the first condition that fails; (1, None) where all hold."""
+    def _first_change(
+        self, own: Equations, found: Attempt, h: float
+    ) -> tuple[float, Condition | None]:
+        """(θ, condition) of the first condition that fails; (θ, None) where all hold up to θ."""
         theta, first = 1.0, None
-        if found.rings:
-            return theta, first
         for c in own.conditions:
-            grid, slack = (found.w, found.slack[1]) if c.of_w else (found.y, found.slack[0])
+            k = int(c.of_w)
+            grid, slack, swing = (v[k] for v in ((found.y, found.w), found.slack, found.swing))
             signed, allowed = c.sign * (grid[:, c.i] - c.bound), float(slack[c.i])
-            if theta == 0.0 or radau.lowest(signed) >= -allowed:
+            if theta == 0.0 or radau.lowest(signed) - swing[c.i] >= -allowed:
                 continue
-            when = radau.first_negative(signed, allowed, theta)
-            if when is not None and (first is None or when < theta):
-                theta, first = when, c
+            waves = [
+                radau.Wave(rate * h, c.sign * amplitude)
+                for rate, amplitude in found.waves(k, c.i)
+                if amplitude != 0.0
+            ]
+            when, fails = radau.first_negative(signed, allowed, theta, waves)
+            if fails or when < theta:
+                theta, first = when, c if fails else None
         return theta, first
+
+    def _account(self, own: Equations, found: Attempt, theta: float, h: float) -> bool:
+        """Add what y and w are beyond their bounds within the slack up to θ, in the mean, to the
+        defects; whether the state would differ by less than the tolerance had the constraints changed.
+        """
+        passed, before = np.zeros((2, len(self.mode))), radau.GRID <= theta
+        thetas, size = radau.GRID[before], np.abs(self.given.B)
+        for c in own.conditions:
+            k = int(c.of_w)
+            value = (found.y, found.w)[k][before, c.i] - c.bound
+            for rate, amplitude in found.waves(k, c.i):
+                value = value + 2.0 * np.real(amplitude * np.exp(rate * h * thetas))
+            mean = float(np.clip(-c.sign * value, 0.0, found.slack[k][c.i]).mean())
+            passed[k, c.i] = mean
+            if mean > 0.0:
+                # A residual below zero is a response in the mode that would follow.
+                mode = self.of(changed(self.mode, c)) if c.of_w else own
+                response = mean / self.given.M[c.i, c.i] if c.of_w else mean
+                self.veiled += mode.reach(theta * h) @ size[:, c.i] * response
+        self.defect += theta * h * self._norm(size @ passed[0])
+        self.law_defect += theta * h * float(np.linalg.norm(passed[1]))
+        allowed = self.rtol * np.maximum(self.scale, found.size) + self.atol
+        return bool(np.all(self.veiled <= allowed))
 
     def _keep(
         self, step: Step, found: Attempt, piece: Piece, begin: float, end: float, last: bool
@@ -312,10 +379,15 @@ class Run:
         self.defect += part * (mean * self._norm(of_state) + self._norm(error[:n]))
         self.law_defect += part * float(mean * np.linalg.norm(of_law) + np.linalg.norm(error[n:]))
         self.accepted += 1
+        now = [np.abs(v).max(axis=0) for v in (found.y, found.w)]
+        self.largest = np.maximum(self.largest, now)
         # The state that a step ends in is as good as the largest one that it was made of.
         self.law_off = found.lacking
         self.off, self.scale = ROUNDINGS * found.size, np.maximum(self.scale, found.size)
         self.t = piece.start + end
+        share = (self.t - self.pieces[0].start) / self.span
+        if self.shown + _SHOWN < share < 1.0:
+            self._show(share)
         if self.extent is not None:
             self.extent = _widened(self.extent, found)
         done, first = (self.defect, self.law_defect), len(self.rows)
@@ -340,13 +412,25 @@ class Run:
         return float(np.sqrt(np.sum((self.weights * v) ** 2)))
 
 
-_AT_POINTS, _ON_GRID = basis(radau.POINTS), basis(radau.GRID)
+_AT_POINTS, _ON_GRID, _START = (basis(v) for v in (radau.POINTS, radau.GRID, np.zeros(1)))
 
 _EXTRAPOLATED = 16.0
 """What a polynomial may lack at θ = 0, in units of its last coefficients."""
 
 _FOLLOWED = 4.0
 """Radians of an oscillation in a step, up to which its polynomials follow it."""
+
+_MOST_ROUNDING = 1e3
+"""How much more than `tol` a polynomial may lack where rounding is larger: a tenth of the tolerance."""
+
+_EVEN = 3
+"""Steps of one length after which a longer one is tried."""
+
+_MOST_SLACK = 1e3
+"""The most that y and w may be beyond a bound, in units of the tolerance."""
+
+_SHOWN = 0.02
+"""The share of a run between two lines that `progress` prints."""
 
 _MOST_CHANGES, _MOST_STUCK = 4096, 12
 _ROUNDING = 256.0 * np.finfo(float).eps
@@ -358,9 +442,8 @@ def _mean(used: float) -> float:
 
 
 def _shorter(own: Equations, h: float, excess: float, before: float) -> float:
-    """The step to try next: half of it, as long as that pays (by 2²⁰ where the solution is
-    resolved, but
-    for little); else the next time scale of the mode, since a transient is there that is not."""
+    """The step to try next: half of it, as long as that pays (by 2²⁰ where the solution is resolved,
+    but for little); else the next time scale of the mode, since a transient is there that is not."""
     if excess < 1e6 and excess < 0.1 * before:
         return 0.5 * h
     shorter = own.scales[own.scales < 0.6 * h]

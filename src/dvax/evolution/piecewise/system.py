@@ -6,9 +6,8 @@
 Each pair (yᵢ, wᵢ) has an independent member pᵢ and a dependent one dᵢ, so that the equations read
 x' = Ax + Bp + g, d = Mp + Cx + q. Which member is independent is decided once a run, by principal
 pivots: a member that the other one determines through a large coefficient makes large entries of A that
-cancel when the constraint is active. Nothing is eliminated after that: where d is prescribed, p
-stays an
-unknown beside x. So a small M (the resistance of a diode) never becomes a large entry of a matrix.
+cancel when the constraint is active. Nothing is eliminated after that: where d is prescribed, p stays
+an unknown beside x. So a small M (the resistance of a diode) never becomes a large entry of a matrix.
 """
 
 from typing import Any, NamedTuple
@@ -100,8 +99,8 @@ def _check(problem: Problem, t0: Any, x0: Tree, u0: Tree, args: Any) -> None:
             wrong.append(
                 InputProblem(
                     f"{place}: {name}", "code that does not show it", f"{name} must be affine in "
-                    f"(x, u) "
-                    "with coefficients that do not depend on t", "Leave method out, or name another",
+                    "(x, u) with coefficients that do not depend on t",
+                    "Leave method out, or name another",
                 )
             )  # fmt: skip
     bounds = lambda t: problem.set_at(t, args).intervals(u0)  # noqa: E731

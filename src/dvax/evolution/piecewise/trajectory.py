@@ -13,11 +13,9 @@ from .run import Step
 class Trajectory(eqx.Module):
     """The steps of a run: `start` and `length`, of which the part up to θ = `used` belongs to the
     trajectory; `x` at the nodes and `y` at the collocation points of each, and beside them the
-    oscillations
-    of `rates` λ and amplitudes `ring_x` and `ring_y`, as many zeros as it takes among them;
-    `changes` = when the mode
-    changed, and `modes`, a row for each change and a column for each entry of y (−1 at the lower bound,
-    1 at the upper one, 0 between them)."""
+    oscillations of `rates` λ and amplitudes `ring_x` and `ring_y`, as many zeros as it takes among
+    them; `changes` = when the mode changed, and `modes`, a row for each change and a column for each
+    entry of y (−1 at the lower bound, 1 at the upper one, 0 between them)."""
 
     start: np.ndarray
     length: np.ndarray

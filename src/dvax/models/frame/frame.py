@@ -190,10 +190,10 @@ class Frame(eqx.Module):
         """A bound on |d − d⁰| at the saved times of a `solve`, in in: d⁰ is the displacement of the
         elastoplastic frame, the limit as τ = η/k → 0, of the same yield displacement.
 
-        The elongation beyond yield is o ≤ δ = τ max |d'|. p = d_p is what the elastoplastic law
-        makes of
-        d − o, and the play operator has the constant 1, so that the elastoplastic law makes of d itself
-        what differs from p by δ at most. In the equation of d⁰ this is a force of ω²δ a mass, and
+        The elongation beyond yield is o ≤ δ = τ max |d'|. p = d_p is what the elastoplastic law makes
+        of d − o, and the play operator has the constant 1, so that the elastoplastic law makes of d
+        itself what differs from p by δ at most. In the equation of d⁰ this is a force of ω²δ a mass,
+        and
 
             |d − d⁰| ≤ ½ω²δt²,    |d' − d⁰'| ≤ ω²δt,
 
