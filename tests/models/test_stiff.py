@@ -56,7 +56,11 @@ def agrees_at_any_resistance(case):
     current = np.asarray(
         [circuit.currents(*row) for row in zip(sol.ts, sol.xs, sol.us, strict=True)]
     )
-    assert current.min() > -1e-6 and np.abs(np.asarray(sol.law_residual)).max() < 1e-7
+    assert current.min() > -1e-6
+    # Of one diode a projection step solves the law: its length holds all that is known.
+    assert (
+        np.abs(np.asarray(sol.law_residual)).max() + np.abs(np.asarray(sol.law_step)).max() < 1e-7
+    )
     return sol
 
 

@@ -92,20 +92,6 @@ def sampled(
     if kinked is not None:
         share = jnp.where(kinked, method.hidden, 0.0)
         bump = jtu.tree_map(lambda b, bend: b + share * jnp.abs(bend), bump, c[-1])
-
-    # How well z, the unconstrained value of the law, is predicted by its other samples.
-    zs = [visit.rate.z for visit in along]
-    weights = extrapolation((0.0, *thetas, 1.0))
-    doubt = jtu.tree_map(
-        lambda *z: _DOUBT * sum(w * v for w, v in zip(weights, z, strict=True)), *zs
-    )
-    unseen = _unseen(flow, along[1:], doubt)
-    ends = _tree.scale(0.5, start), _tree.scale(0.5, end)
-    bump = _largest(bumps)
-    kinked = _kinked(flow, along)
-    if kinked is not None:
-        more = method.with_kink(bump, c)
-        bump = jtu.tree_map(lambda a, b: jnp.where(kinked, a, b), more, bump)
     error = jtu.tree_map(lambda *parts: sum(map(jnp.abs, parts)), *ends, bump, unseen)
     space = flow.state_space(x0)
     defect = _SAFETY * h * sum(map(space.norm, (*ends, bump, unseen)))

@@ -11,6 +11,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..problem import Problem
+from .setup import Setup
 
 
 def refuse_nonfinite_data(problem: Problem, args: Any, caller: str) -> None:
@@ -29,9 +30,9 @@ def refuse_nonfinite_data(problem: Problem, args: Any, caller: str) -> None:
 
 def first_bad(tree: Tree, allow_infinite: bool = False) -> str:
     """The first value in a tree that is NaN (or infinite), with its place; "" where there is none."""
-    leaves = [
-        leaf for leaf in jtu.tree_leaves(tree) if isinstance(leaf, float | np.ndarray | jax.Array)
-    ]
+    # A solution among the args has settings that are no data of the problem.
+    whole = jtu.tree_leaves(tree, is_leaf=lambda v: isinstance(v, Setup))
+    leaves = [leaf for leaf in whole if isinstance(leaf, float | np.ndarray | jax.Array)]
     for k, leaf in enumerate(leaves):
         if not _tree.is_concrete(leaf) or jnp.result_type(leaf).kind != "f":
             continue

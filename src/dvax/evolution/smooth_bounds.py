@@ -79,7 +79,12 @@ def exponential(low: jax.Array, high: jax.Array, base: Any) -> tuple[Any, Any]:
 
 
 _E = lambda low, high: (jnp.exp(high), jnp.exp(high))  # noqa: E731
-_HYPERBOLIC = (lambda m: jnp.cosh(m), lambda m: jnp.sinh(m))
+
+
+def _sinh(low: jax.Array, high: jax.Array) -> tuple[Any, Any]:
+    m = _size(low, high)
+    return jnp.cosh(m), jnp.sinh(m)
+
 
 BOUNDS: dict[str, Bounds] = {
     "exp": _E,
@@ -98,8 +103,8 @@ BOUNDS: dict[str, Bounds] = {
     "asin": _within_one(lambda m, left: left**-0.5, lambda m, left: m * left**-1.5),
     "acos": _within_one(lambda m, left: left**-0.5, lambda m, left: m * left**-1.5),
     "atan": _everywhere(1.0, 0.65),  # 3√3/8
-    "sinh": lambda low, high: tuple(f(_size(low, high)) for f in _HYPERBOLIC),
-    "cosh": lambda low, high: tuple(f(_size(low, high)) for f in _HYPERBOLIC[::-1]),
+    "sinh": _sinh,
+    "cosh": lambda low, high: _sinh(low, high)[::-1],
     "tanh": _everywhere(1.0, 0.77),  # 4/(3√3)
     "asinh": _everywhere(1.0, 0.385),  # 2/(3√3)
     "acosh": _above(

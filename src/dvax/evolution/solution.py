@@ -103,13 +103,25 @@ class Solution(eqx.Module):
             x0, u0 = self.setup.x0, self.us[0]
             u = self.setup.flow().operator.inverse(y.reshape(u0.shape).astype(u0.dtype))
             return x.reshape(jnp.shape(x0)).astype(self.xs.dtype), u
-        flow = self.setup.flow()
-        t = jnp.asarray(t, self.records.start.dtype)
-        starts = self.records.start
+        if _tree.is_concrete(t):
+            return self._within_step(t)
+
+        # A call by name: a step in data that is the trajectory of another run needs no enclosure.
+        def dvax_evaluate(t: Any) -> tuple[Tree, Tree]:
+            return self._within_step(t)
+
+        return jax.jit(dvax_evaluate)(t)
+
+    def _within_step(self, t: Any) -> tuple[Tree, Tree]:
+        """x and u at t, from the record of the step that t lies in."""
+        flow, records = self.setup.flow(), self.records
+        assert isinstance(records, Record)
+        t = jnp.asarray(t, records.start.dtype)
+        starts = records.start
         first, last = starts[0], jnp.max(jnp.where(jnp.isfinite(starts), starts, -jnp.inf))
         i = jnp.clip(jnp.searchsorted(starts, t, side="right") - 1, 0)
-        step = jax.tree_util.tree_map(lambda leaf: leaf[i], self.records)
-        end = last + self.records.length[jnp.searchsorted(starts, last)]
+        step = jax.tree_util.tree_map(lambda leaf: leaf[i], records)
+        end = last + records.length[jnp.searchsorted(starts, last)]
         self._check_inside(t, first, end)
         theta = (t - step.start) / step.length
         run = self.setup.number("t0"), self.setup.number("t1")

@@ -182,7 +182,9 @@ def solve(
     setup = Setup(problem, x0, args, setting, method, vi_solver, _moduli(constants))
     times = None if ts is None else _times(ts)
     if isinstance(method, PiecewiseLinear):
-        solution = propagate(setup, times, Limits(options.max_steps, dense, options.ranged, progress))
+        solution = propagate(
+            setup, times, Limits(options.max_steps, dense, options.ranged, progress)
+        )
         if throw and solution.result != RESULTS.successful:
             raise failure(solution.setup, solution.stats, solution.result, solution)
         return solution

@@ -16,7 +16,8 @@ from ..setup import Setup, as_arrays
 from ..solution import Solution
 from .inputs import Piece, Unresolved, pieces
 from .radau import STAGES
-from .run import Row, Run
+from .records import Row
+from .run import Run
 from .system import Affine, affine, pivoted
 from .trajectory import Trajectory
 

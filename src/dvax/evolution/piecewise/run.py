@@ -8,78 +8,19 @@ scales that are excited and not from how far they are apart. Times within a piec
 its start, in two parts: a transient of 10⁻¹⁸ s is resolved at any t.
 """
 
-from typing import NamedTuple
-
 import jax.numpy as jnp
 import numpy as np
 
 from .. import meter
 from . import radau
 from .inputs import Piece, basis, values
+from .lengths import longer, shorter
 from .modes import ROUNDINGS, Condition, Equations, Mode, changed, first_mode
+from .records import Attempt, Row, Step
 from .rings import derivatives
 from .system import Affine
 
 Array = np.ndarray
-
-
-class Step(NamedTuple):
-    """x at the nodes and y at the collocation points of a step that begins at `start` in a piece, of
-    which the part up to θ = `used` is the trajectory, and the oscillations 2 Re ae^{λt}(x, y) beside
-    them."""
-
-    start: float
-    length: float
-    used: float
-    x: Array
-    y: Array
-    rings: tuple[tuple[complex, Array, Array], ...]
-
-    def at(self, thetas: Array) -> tuple[Array, Array]:
-        """(x, y) there, a row each."""
-        x, y = radau.state_at(self.x, thetas), radau.multiplier_at(self.y, thetas)
-        for rate, of_x, of_y in self.rings:
-            factor = 2.0 * np.exp(rate * self.length * thetas)[:, None]
-            x, y = x + (factor * of_x).real, y + (factor * of_y).real
-        return x, y
-
-
-class Row(NamedTuple):
-    """What is saved at one time: x, y and F(y) = w of the frozen law; the `defect` of both equations up
-    to the end of the step that the time lies in, and `settled`, what it was at its start; `extent`, the
-    bounds (low, high) of x and y so far, where they are asked for."""
-
-    t: float
-    x: Array
-    y: Array
-    w: Array
-    defect: tuple[float, float]
-    settled: tuple[float, float]
-    extent: Array | None
-
-
-class Attempt(NamedTuple):
-    """A step that was computed: x at the nodes, y at the points, y and w on the grid with the `slack`
-    that they may be off by; the `rings` beside these polynomials, (λ, x, y, w), and by how much they
-    `swing` y and w at most; the `size` of the whole state; what the polynomials are `lacking` in d, and
-    `excess`, the same in units of what is allowed; and the `residuals` of the state's and of the law's
-    equations at θ = 0."""
-
-    x: Array
-    ys: Array
-    y: Array
-    w: Array
-    slack: tuple[Array, Array]
-    rings: list[tuple[complex, Array, Array, Array]]
-    swing: tuple[Array, Array]
-    size: Array
-    lacking: Array
-    excess: float
-    residuals: tuple[Array, Array]
-
-    def waves(self, k: int, i: int) -> list[tuple[complex, complex]]:
-        """(λ, amplitude) of the oscillations in entry i of y (k = 0) or of w (k = 1)."""
-        return [(rate, (y, w)[k][i]) for rate, _, y, w in self.rings]
 
 
 class Run:
@@ -187,7 +128,7 @@ class Run:
                     return "nonfinite"
                 if attempt.excess > 1.0 and h > own.shortest:
                     self.rejected += 1
-                    h, before = _shorter(own, h, attempt.excess, before), attempt.excess
+                    h, before = shorter(own, h, attempt.excess, before), attempt.excess
                 else:
                     found = attempt
             theta, condition = self._first_change(own, found, h)
@@ -205,7 +146,7 @@ class Run:
             if condition is None:
                 even = even + 1 if h <= reached else 0
                 reached = h
-                proposal = 4.0 * h if own.rings else _longer(own, h, found.excess)
+                proposal = 4.0 * h if own.rings else longer(own, h, found.excess)
                 if even >= _EVEN:
                     # What is left of the excess may be rounding, which no step changes.
                     proposal, even = max(4.0 * h, proposal), 0
@@ -389,7 +330,7 @@ class Run:
         if self.shown + _SHOWN < share < 1.0:
             self._show(share)
         if self.extent is not None:
-            self.extent = _widened(self.extent, found)
+            self.extent = found.widened(self.extent)
         done, first = (self.defect, self.law_defect), len(self.rows)
         offsets = self.times[first:] - piece.start
         # The last step has what rounding may put behind it.
@@ -441,23 +382,6 @@ def _mean(used: float) -> float:
     return min(1.0, radau.MEAN_RESIDUAL / used) if used > 0.0 else 1.0
 
 
-def _shorter(own: Equations, h: float, excess: float, before: float) -> float:
-    """The step to try next: half of it, as long as that pays (by 2²⁰ where the solution is resolved,
-    but for little); else the next time scale of the mode, since a transient is there that is not."""
-    if excess < 1e6 and excess < 0.1 * before:
-        return 0.5 * h
-    shorter = own.scales[own.scales < 0.6 * h]
-    return float(shorter[-1]) if len(shorter) else h / 8.0
-
-
-def _longer(own: Equations, h: float, excess: float) -> float:
-    """The step to try next: while a transient lasts, much the same; else the next time scale."""
-    if excess > 1e-2:
-        return h if excess > 0.1 else 1.5 * h
-    longer = own.scales[own.scales > 1.5 * h]
-    return float(longer[0]) if len(longer) else np.inf
-
-
 def _two_sum(a: float, b: float) -> tuple[float, float]:
     """a + b and what rounding takes from it."""
     total = a + b
@@ -470,12 +394,3 @@ def _continuous(before: Piece, after: Piece) -> bool:
     end, start = before.at(np.ones(1))[0], after.at(np.zeros(1))[0]
     size = np.abs(before.coefficients).sum(axis=0) + np.abs(after.coefficients).sum(axis=0)
     return bool(np.all(np.abs(end - start) <= ROUNDINGS * size))
-
-
-def _widened(extent: Array, found: Attempt) -> Array:
-    """(low, high) that hold a step as well, with the margin of polynomials between samples."""
-    x = radau.FROM_NODES @ found.x
-    beside = np.concatenate([found.size - np.abs(found.x).max(axis=0), found.swing[0]])
-    low = np.concatenate([radau.lowest(v) for v in (x, found.y)]) - beside
-    high = -np.concatenate([radau.lowest(-v) for v in (x, found.y)]) + beside
-    return np.stack([np.minimum(extent[0], low), np.maximum(extent[1], high)])

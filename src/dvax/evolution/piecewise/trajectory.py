@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .run import Step
+from .records import Step
 
 
 class Trajectory(eqx.Module):

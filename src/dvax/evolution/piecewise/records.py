@@ -1,0 +1,76 @@
+"""What a run keeps of its steps: the attempt, the step that was kept, the saved row."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from . import radau
+
+Array = np.ndarray
+
+
+class Step(NamedTuple):
+    """x at the nodes and y at the collocation points of a step that begins at `start` in a piece, of
+    which the part up to θ = `used` is the trajectory, and the oscillations 2 Re ae^{λt}(x, y) beside
+    them."""
+
+    start: float
+    length: float
+    used: float
+    x: Array
+    y: Array
+    rings: tuple[tuple[complex, Array, Array], ...]
+
+    def at(self, thetas: Array) -> tuple[Array, Array]:
+        """(x, y) there, a row each."""
+        x, y = radau.state_at(self.x, thetas), radau.multiplier_at(self.y, thetas)
+        for rate, of_x, of_y in self.rings:
+            factor = 2.0 * np.exp(rate * self.length * thetas)[:, None]
+            x, y = x + (factor * of_x).real, y + (factor * of_y).real
+        return x, y
+
+
+class Row(NamedTuple):
+    """What is saved at one time: x, y and F(y) = w of the frozen law; the `defect` of both equations up
+    to the end of the step that the time lies in, and `settled`, what it was at its start; `extent`, the
+    bounds (low, high) of x and y so far, where they are asked for."""
+
+    t: float
+    x: Array
+    y: Array
+    w: Array
+    defect: tuple[float, float]
+    settled: tuple[float, float]
+    extent: Array | None
+
+
+class Attempt(NamedTuple):
+    """A step that was computed: x at the nodes, y at the points, y and w on the grid with the `slack`
+    that they may be off by; the `rings` beside these polynomials, (λ, x, y, w), and by how much they
+    `swing` y and w at most; the `size` of the whole state; what the polynomials are `lacking` in d, and
+    `excess`, the same in units of what is allowed; and the `residuals` of the state's and of the law's
+    equations at θ = 0."""
+
+    x: Array
+    ys: Array
+    y: Array
+    w: Array
+    slack: tuple[Array, Array]
+    rings: list[tuple[complex, Array, Array, Array]]
+    swing: tuple[Array, Array]
+    size: Array
+    lacking: Array
+    excess: float
+    residuals: tuple[Array, Array]
+
+    def waves(self, k: int, i: int) -> list[tuple[complex, complex]]:
+        """(λ, amplitude) of the oscillations in entry i of y (k = 0) or of w (k = 1)."""
+        return [(rate, (y, w)[k][i]) for rate, _, y, w in self.rings]
+
+    def widened(self, extent: Array) -> Array:
+        """(low, high) that hold a step as well, with the margin of polynomials between samples."""
+        x = radau.FROM_NODES @ self.x
+        beside = np.concatenate([self.size - np.abs(self.x).max(axis=0), self.swing[0]])
+        low = np.concatenate([radau.lowest(v) for v in (x, self.y)]) - beside
+        high = -np.concatenate([radau.lowest(-v) for v in (x, self.y)]) + beside
+        return np.stack([np.minimum(extent[0], low), np.maximum(extent[1], high)])
