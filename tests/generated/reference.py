@@ -44,7 +44,8 @@ def solve(written: Written, ts: Array, *, method: str | None = None, refine: int
 
 def _cut(breaks: list[float], span: float, refine: int) -> Array:
     stops = np.unique(np.concatenate([[0.0, span], [t for t in breaks if 0 < t < span]]))
-    stops = stops[np.append(True, np.diff(stops) > 4e-15 * span)]
+    # Pieces shorter than this are below the least step of SciPy.
+    stops = stops[np.append(True, np.diff(stops) > 1e-12 * span)]
     stops[-1] = span
     fine = [np.linspace(a, b, refine + 1)[1:] for a, b in itertools.pairwise(stops)]
     return np.concatenate([[0.0], *fine])
