@@ -289,14 +289,15 @@ def test_circuits_of_any_kind_agree_with_radau_on_the_second_analysis(seed):
         on = law(t, x) > 0
         return plain.A - plain.B[:, on] @ np.linalg.solve(D[np.ix_(on, on)], plain.C[on])
 
-    x, found = np.zeros(len(plain.A)), np.zeros((len(ts), len(plain.A)))
-    for a, b in itertools.pairwise(knots):
-        inside = (ts > a) & (ts <= b)
-        at = np.unique(np.append(ts[inside], b))
+    # Pieces end at every saved time, too: where a transient lies within a step, the dense output of
+    # Radau is off by a percent.
+    x, rows = np.zeros(len(plain.A)), {0.0: np.zeros(len(plain.A))}
+    for a, b in itertools.pairwise(np.union1d(knots, ts)):
         part = scipy.integrate.solve_ivp(
-            rate, (a, b), x, "Radau", at, rtol=1e-7, atol=1e-9, jac=jacobian, max_step=(b - a) / 20
+            rate, (a, b), x, "Radau", [b], rtol=1e-7, atol=1e-9, jac=jacobian, max_step=(b - a) / 8
         )
-        found[inside], x = part.y.T[: int(inside.sum())], part.y[:, -1]
+        rows[b] = x = part.y[:, -1]
+    found = np.array([rows[t] for t in ts])
     np.testing.assert_allclose(mine, found, atol=3e-5 * np.abs(found).max(axis=0).max())
 
 
