@@ -84,7 +84,7 @@ def _periodic(w: Written, ts: Array, stops: Array, method: str | None) -> Array:
     """Period after period, until one changes nothing any more: all later ones are like the last."""
     period = w.period
     assert period is not None
-    inner = stops[(stops > 0) & (stops < period)]
+    inner = stops[(stops > 0) & (stops < (1.0 - 1e-9) * period)]
     one = np.concatenate([[0.0], inner[np.diff(inner, prepend=0.0) > 1e-9 * period], [period]])
     shifted = w._replace(span=period)
     rows, x = [], np.asarray(w.x0, float)
