@@ -81,6 +81,6 @@ def _delay(words: tuple[str, ...], at: float, number: signal.Signals) -> float |
             return None
         except subprocess.TimeoutExpired:
             command.send_signal(number)
-            begun = time.perf_counter()
+            start = time.perf_counter()
             command.wait()
-            return time.perf_counter() - begun
+            return time.perf_counter() - start

@@ -90,10 +90,12 @@ def certified(
                 if left is not None:
                     raise _outside(left)
             return _with_bound(solution, bound)
-        ratio, taken = atol / before, int(solution.stats["steps"])
-        # Where other rules than the tolerance chose the steps, an equal bound says nothing.
-        if np.isfinite(last) and bound > last * ratio**0.5 and taken > 1.2 * steps:
-            why = f"{1.0 / ratio:.3g} times finer steps gave {bound:.3g} after {last:.3g}: roundoff"
+        taken = int(solution.stats["steps"])
+        # Where other rules than the tolerance chose the steps, an equal bound says nothing. Elsewhere
+        # it falls like a power of their number, by half the order at the very least.
+        expected = last * (steps / taken) ** (0.5 * _order(solution))
+        if np.isfinite(last) and bound > expected and taken > 1.5 * steps:
+            why = f"{taken} steps gave {bound:.3g}, and {steps} gave {last:.3g}: roundoff"
             raise _hopeless(tol, min(bound, last), known, span, why)
         before, steps = atol, taken
         atol = min(0.5 * atol, _AIM * atol * tol / bound) if np.isfinite(bound) else 0.1 * atol
@@ -112,15 +114,19 @@ def _predict(
 ) -> None:
     """Refuse a run with a `finer` tolerance that would take more than `max_steps`: a defect of order p
     takes finer^{1/p} times the steps."""
-    method = solution.setup.method
-    order = getattr(method, "degree", 1) + 1
+    order = _order(solution)
     steps = int(solution.stats["steps"]) + int(solution.stats["rejected"])
     needed = steps * finer ** (1.0 / order)
     if needed > max_steps:
         least = bound * (steps / max_steps) ** order
-        name = type(method).__name__
+        name = type(solution.setup.method).__name__
         why = f"it would take about {needed:.2g} steps of {name}, and max_steps is {max_steps}"
         raise _hopeless(tol, least, known, span, why)
+
+
+def _order(solution: Solution) -> int:
+    """p, where the defect is O(h^p)."""
+    return getattr(solution.setup.method, "degree", 1) + 1
 
 
 class _Growth(NamedTuple):

@@ -79,10 +79,10 @@ def run(
         inputs = interruptible(lambda: build_contact(config))
         tell = on_event or (lambda event: None)
         # Nothing lies in the folder before a manifest can say what it is.
-        begun = interruptible(lambda: _Run(config, inputs, tell))
+        task = interruptible(lambda: _Run(config, inputs, tell))
         directory = RunDirectory(out, clear=True)
         try:
-            return begun.go(directory)
+            return task.go(directory)
         finally:
             directory.close()
 

@@ -34,10 +34,10 @@ def run_model(
     with terminable():
         tell = on_event or (lambda event: None)
         # Nothing lies in the folder before a manifest can say what it is.
-        begun = interruptible(lambda: _Run(config, tell))
+        task = interruptible(lambda: _Run(config, tell))
         directory = RunDirectory(out, clear=True)
         try:
-            return begun.go(directory)
+            return task.go(directory)
         finally:
             directory.close()
 
