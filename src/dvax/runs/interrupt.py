@@ -1,4 +1,4 @@
-"""Signals: Ctrl-C and a request to terminate end a command within two seconds, whatever it does.
+"""Signals: Ctrl-C and a request to terminate end a command within about two seconds, whatever it does.
 
 Python runs signal handlers in the main thread alone, between two of its own instructions: a compiled
 loop, a long compilation or an import of C code holds them up for as long as it takes, and an exception
