@@ -21,27 +21,28 @@ gc.set_threshold(100_000, 50, 50)
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("MPLBACKEND", "Agg")
+# `make thorough` tests what users run, and more of it in its time, so that both of these are left out.
 if os.environ.get("HYPOTHESIS_PROFILE") != "thorough":
     # XLA's older emitters compile in two thirds of the time, and LLVM without optimisation in a fifth
-    # less. `make thorough` tests what users run; XLA_FLAGS= make test does so here.
+    # less. XLA_FLAGS= make test does without.
     flags = ["--xla_backend_optimization_level=0"]
     if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 12):
         # Later releases have no other emitters, and XLA ends a process on a flag that it does not know.
         flags.append("--xla_cpu_use_fusion_emitters=false")
     os.environ.setdefault("XLA_FLAGS", " ".join(flags))
 
-# Every annotation of the library, shapes included, is checked at each call. The hook must stand
-# before the first import of dvax, hence here and not in a fixture. The application is left out: it
-# promises an answer to input of any type, and a checker would answer first.
-APPLICATION = {"__init__", "__main__", "runs", "plots", "cli"}
-jaxtyping.install_import_hook(
-    [
-        f"dvax.{entry.stem}"
-        for entry in sorted((ROOT / "src" / "dvax").iterdir())
-        if entry.stem not in APPLICATION and (entry.is_dir() or entry.suffix == ".py")
-    ],
-    "beartype.beartype",
-)
+    # Every annotation of the library, shapes included, is checked at each call. The hook must stand
+    # before the first import of dvax, hence here and not in a fixture. The application is left out: it
+    # promises an answer to input of any type, and a checker would answer first.
+    application = {"__init__", "__main__", "runs", "plots", "cli"}
+    jaxtyping.install_import_hook(
+        [
+            f"dvax.{entry.stem}"
+            for entry in sorted((ROOT / "src" / "dvax").iterdir())
+            if entry.stem not in application and (entry.is_dir() or entry.suffix == ".py")
+        ],
+        "beartype.beartype",
+    )
 
 import jax  # noqa: E402  (its settings come from the lines above)
 

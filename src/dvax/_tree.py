@@ -144,34 +144,36 @@ def as_float(a: Tree, name: str) -> Tree:
     An integer or boolean *array* is refused rather than cast: its owner may have meant integer
     arithmetic, and a silent cast would hide that.
     """
-
-    def one(leaf: Any) -> jax.Array:
-        # `dtypes.issubdtype` and `asarray` cost as much as a hundred steps of a small system.
-        if isinstance(leaf, jax.Array) and leaf.dtype.kind == "f":
-            return leaf
-        if isinstance(leaf, bool | complex):
-            raise _not_real(name, repr(leaf))
-        if isinstance(leaf, int | float):
-            return jnp.asarray(float(leaf))
-        if isinstance(leaf, list):
-            try:
-                leaf = np.asarray(leaf, dtype=float)
-            except (TypeError, ValueError):
-                raise _not_real(name, " ".join(repr(leaf).split())[:120]) from None
-        if not hasattr(leaf, "dtype"):
-            raise _not_real(name, f"{type(leaf).__name__} {leaf!r}")
-        if not jnp.issubdtype(leaf.dtype, jnp.floating):
-            if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
-                return jnp.asarray(leaf)
-            raise _not_real(name, f"an array of {leaf.dtype}")
-        return jnp.asarray(leaf)
-
     if not jtu.tree_leaves(a):
         raise _not_real(name, repr(a))
     # States are arrays and tuples of them; parameters may be any tree.
     if isinstance(a, str | set) or (isinstance(a, dict) and name in ("x0", "x")):
         raise _not_real(name, f"{type(a).__name__} {a!r}"[:120])
-    return jtu.tree_map(one, a, is_leaf=lambda leaf: isinstance(leaf, list))
+    return jtu.tree_map(
+        lambda leaf: _float_array(leaf, name), a, is_leaf=lambda leaf: isinstance(leaf, list)
+    )
+
+
+def _float_array(leaf: Any, name: str) -> jax.Array:
+    # `dtypes.issubdtype` and `asarray` cost as much as a hundred steps of a small system.
+    if isinstance(leaf, jax.Array) and leaf.dtype.kind == "f":
+        return leaf
+    if isinstance(leaf, bool | complex):
+        raise _not_real(name, repr(leaf))
+    if isinstance(leaf, int | float):
+        return jnp.asarray(float(leaf))
+    if isinstance(leaf, list):
+        try:
+            leaf = np.asarray(leaf, dtype=float)
+        except (TypeError, ValueError):
+            raise _not_real(name, " ".join(repr(leaf).split())[:120]) from None
+    if not hasattr(leaf, "dtype"):
+        raise _not_real(name, f"{type(leaf).__name__} {leaf!r}")
+    if not jnp.issubdtype(leaf.dtype, jnp.floating):
+        if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
+            return jnp.asarray(leaf)
+        raise _not_real(name, f"an array of {leaf.dtype}")
+    return jnp.asarray(leaf)
 
 
 def require(condition: Callable[[], Any], name: str, given: Any, rule: str, mend: str) -> None:

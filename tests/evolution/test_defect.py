@@ -47,3 +47,41 @@ def test_a_smooth_defect_is_seen_in_its_size(name):
         sizes = np.asarray(jax.jit(jax.vmap(size))(jnp.asarray(inner.ravel())))
         integral = float(np.sum(0.5 * h * WEIGHTS * sizes.reshape(steps, -1)))
         assert 0.8 * integral <= float(sol.defect[-1]) <= 7.0 * integral
+
+
+def bent(t, x, u, p):
+    """x₁ is the time, and f kinks or jumps in it: no step ends there by itself."""
+    past = x[0] - p["at"]
+    kink = p["bend"] * jnp.maximum(past, 0) + p["jump"] * jnp.heaviside(past, 0.0)
+    return jnp.stack([jnp.ones_like(past), kink])
+
+
+CLOCK = dvax.Problem(
+    A=dvax.generators.Scalar(0.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.WholeSpace(), f=bent,
+    h=lambda t, x, u, p: 0.0 * x,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_kink_or_a_jump_within_a_step_hides_nothing(name):
+    """One step over it, beside the integral of its defect."""
+    places = (jnp.arange(2000.0) + 0.5) / 2000
+
+    @jax.jit
+    def step(p):
+        sol = dvax.solve(
+            CLOCK, jnp.zeros(2), 0.0, 1.0, p, dt=1.0, method=METHODS[name], dense=True, measure=True,
+            max_steps=2,
+        )  # fmt: skip
+
+        def size(t):
+            _, x_dot = jax.jvp(lambda s: sol.evaluate(s)[0], (t,), (jnp.ones_like(t),))
+            return jnp.abs(x_dot - CLOCK.f(t, jnp.stack([t, t]), None, p))[1]
+
+        # Exact up to the panel with the kink.
+        return sol.defect[-1], jnp.mean(jax.vmap(size)(places))
+
+    for at in np.random.default_rng(2).uniform(0.0, 1.0, 60):
+        for bend, jump in ((1.0, 0.0), (0.0, 1.0)):
+            defect, integral = step({"at": at, "bend": bend, "jump": jump})
+            assert integral > 0.0 and float(integral) <= float(defect) + 1e-3

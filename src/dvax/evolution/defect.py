@@ -12,6 +12,7 @@ from .. import _tree
 from .._tree import Tree
 from ..generators import Arc, Growth
 from ..generators.expanded import values
+from .branches import branches
 from .chords import Chord, is_chord
 from .evaluations import Visit
 from .extent import Extent
@@ -20,10 +21,6 @@ from .method import AbstractMethod, extrapolation, polynomial
 
 _DOUBT = 4.0
 """By how many times its interpolation error z is taken to be uncertain between the samples."""
-
-_SAFETY = 2.05
-"""Of a sampled defect in certificates: its integral over a step with a kink of f̃ inside is at most 1.66
-times what the samples show, with a jump 2.05 times (DormandPrince; the other methods less)."""
 
 
 class Sample(NamedTuple):
@@ -65,7 +62,8 @@ def sampled(
 
     Between the samples δ is taken to be a line plus a bump (a parabola, or the tent of a kink):
     then ∫|δ| ≤ h(½|δ(0)| + ½|δ(1)| + max |δ(θ) − (1 − θ)δ(0) − θδ(1)|), whatever the place of the
-    kink, up to `_SAFETY`. δ(0) is zero for a method whose polynomial starts at f̃(t₀, x₀), as most do.
+    kink, up to the `safety` of the method. δ(0) is zero for a method whose polynomial starts at
+    f̃(t₀, x₀), as most do.
     """
     thetas = method.samples
     along = [visits[0], *visits[-1 - len(thetas) :]]
@@ -88,13 +86,12 @@ def sampled(
     unseen = _unseen(flow, along[1:], doubt)
     ends = _tree.scale(0.5, start), _tree.scale(0.5, end)
     bump = _largest(bumps)
-    kinked = _kinked(flow, along) if method.hidden > 0.0 else None
-    if kinked is not None:
-        share = jnp.where(kinked, method.hidden, 0.0)
+    if method.hidden > 0.0:
+        share = jnp.where(_kinked(flow, lax.stop_gradient(along)), method.hidden, 0.0)
         bump = jtu.tree_map(lambda b, bend: b + share * jnp.abs(bend), bump, c[-1])
     error = jtu.tree_map(lambda *parts: sum(map(jnp.abs, parts)), *ends, bump, unseen)
     space = flow.state_space(x0)
-    defect = _SAFETY * h * sum(map(space.norm, (*ends, bump, unseen)))
+    defect = method.safety * h * sum(map(space.norm, (*ends, bump, unseen)))
     law_defect = h * jnp.max(jnp.stack([visit.rate.residual for visit in along]))
     places = [(visit.x, flow.operator.inverse(visit.rate.y)) for visit in lax.stop_gradient(along)]
     extent = reduce(Extent.joined, [Extent((x, x), (u, u)) for x, u in places])
@@ -102,14 +99,19 @@ def sampled(
 
 
 def _kinked(flow: Flow, visits: list[Visit]) -> Any:
-    """Whether the regime changes from one of them to the next; None where K does not say."""
-    signs = []
-    for visit in visits:
-        found = flow.switches(visit.t, visit.x, visit.rate.z)
-        if found is None or found.size == 0:
-            return None
-        signs.append(found > 0)
-    return jnp.any(jnp.stack(signs[1:]) != jnp.stack(signs[:-1]))
+    """Whether the regime changes from one of them to the next, as far as K, f and h say."""
+    problem, args = flow.problem, flow.args
+
+    def signs(visit: Visit) -> jax.Array:
+        known = flow.switches(visit.t, visit.x, visit.rate.z)
+        u = flow.operator.inverse(visit.rate.y)
+        found = [] if known is None else [known]
+        for fn in (problem.f, problem.h):
+            found += branches(lambda t, x, u, fn=fn: fn(t, x, u, args), visit.t, visit.x, u)
+        return jnp.concatenate([jnp.ravel(s) > 0 for s in found] or [jnp.zeros(0, bool)])
+
+    rows = jnp.stack([signs(visit) for visit in visits])
+    return jnp.any(rows[1:] != rows[:-1])
 
 
 def _unseen(flow: Flow, visits: list[Visit], doubt: Tree) -> Tree:

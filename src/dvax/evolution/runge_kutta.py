@@ -61,6 +61,7 @@ class DormandPrince(AbstractMethod):
     degree: ClassVar[int] = 3
     samples: ClassVar[tuple[float, ...]] = _SAMPLES
     hidden: ClassVar[float] = 0.0
+    safety: ClassVar[float] = 2.05
     halves: ClassVar[bool] = False
     linearises: ClassVar[bool] = False
     joins: ClassVar[bool] = True

@@ -12,6 +12,7 @@ jump, the derivative is enclosed by (−∞, ∞): nothing is known, and nothing
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -71,26 +72,27 @@ class Enclosure:
 
 
 def _interpret(traced: ClosedJaxpr, inputs: list[Any], unknown: list[str]) -> list[Any]:
-    def apply(eqn: Any, given: list[Any]) -> list[Any]:
-        name = eqn.primitive.name
-        table = TABLES.get(eqn.params.get("name", "")) if name in CALLS else None
-        result = None if table is None else table(eqn, given)
-        if result is not None:
-            return [_sane(result)]
-        if name in CALLS or name in CUSTOM:
-            inner = inner_jaxpr(eqn.params)
-            if inner is not None and len(inner.jaxpr.invars) == len(given):
-                return _interpret(inner, given, unknown)
-        if name == "split":
-            return [_settled(_sane(piece)) for piece in split(eqn, given)]
-        rule = _RULES.get(name)
-        result = None if rule is None else rule(eqn, given)
-        if result is None:
-            unknown.append(name)
-            return [nothing(given, out.aval) for out in eqn.outvars]
-        return [_settled(_sane(result))]
+    return evaluate(traced, inputs, is_slope, partial(_apply, unknown))
 
-    return evaluate(traced, inputs, is_slope, apply)
+
+def _apply(unknown: list[str], eqn: Any, given: list[Any]) -> list[Any]:
+    name = eqn.primitive.name
+    table = TABLES.get(eqn.params.get("name", "")) if name in CALLS else None
+    result = None if table is None else table(eqn, given)
+    if result is not None:
+        return [_sane(result)]
+    if name in CALLS or name in CUSTOM:
+        inner = inner_jaxpr(eqn.params)
+        if inner is not None and len(inner.jaxpr.invars) == len(given):
+            return _interpret(inner, given, unknown)
+    if name == "split":
+        return [_settled(_sane(piece)) for piece in split(eqn, given)]
+    rule = _RULES.get(name)
+    result = None if rule is None else rule(eqn, given)
+    if result is None:
+        unknown.append(name)
+        return [nothing(given, out.aval) for out in eqn.outvars]
+    return [_settled(_sane(result))]
 
 
 def _settled(x: Slope) -> Any:

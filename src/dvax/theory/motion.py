@@ -122,31 +122,24 @@ class _Sum(NamedTuple):
 
 
 def _speed(moves: Any, space: AbstractSpace, like: Tree) -> float:
-    scales = [r.reshape(v.shape) for r, v in zip(roots(space, like), jtu.tree_leaves(like))]
-
-    def fast(x: Slope) -> Values:
-        part = x.parts.get(0)
-        if part is None:
-            return np.zeros(x.low.shape)
-        return (np.abs(part.center) + part.radius).reshape(x.low.shape)
-
-    def norm(entries: list[Values]) -> float:
-        return float(
-            np.sqrt(sum(np.sum((r * e) ** 2) for r, e in zip(scales, entries, strict=True)))
-        )
-
     if isinstance(moves, _Either):
         pairs = zip(slopes(moves.low), slopes(moves.high), strict=True)
-        # A bound at infinity does not move.
-        return norm([np.maximum(_finite(a, fast(a)), _finite(b, fast(b))) for a, b in pairs])
-    return norm([fast(v) for v in slopes(moves.element)]) + sum(
-        float(np.sum(fast(v))) for v in slopes(moves.numbers)
-    )
+        entries, further = [np.maximum(_fastest(a), _fastest(b)) for a, b in pairs], 0.0
+    else:
+        entries = [_fastest(v) for v in slopes(moves.element)]
+        further = sum(float(np.sum(_fastest(v))) for v in slopes(moves.numbers))
+    scales = [r.reshape(v.shape) for r, v in zip(roots(space, like), jtu.tree_leaves(like))]
+    squares = (np.sum((r * e) ** 2) for r, e in zip(scales, entries, strict=True))
+    return float(np.sqrt(sum(squares))) + further
 
 
-def _finite(x: Slope, speed: Values) -> Values:
-    never = (x.low == x.high) & np.isinf(x.low)
-    return np.where(never, 0.0, speed)
+def _fastest(x: Slope) -> Values:
+    """How fast it moves at most, entry by entry; a bound at infinity does not move."""
+    part = x.parts.get(0)
+    if part is None:
+        return np.zeros(x.low.shape)
+    speed = (np.abs(part.center) + part.radius).reshape(x.low.shape)
+    return np.where((x.low == x.high) & np.isinf(x.low), 0.0, speed)
 
 
 def _empty_at(system: System, samples: Values) -> float | None:

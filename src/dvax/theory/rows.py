@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -84,11 +85,12 @@ def _integrable(
     label, statement = "ass:operators (iv)", "f and h are Carathéodory, f(·, 0, 0) is integrable"
     zero = jtu.tree_map(jnp.zeros_like, system.x0)
     at_zero = lambda t: system.problem.f(t, zero, system.u0, system.args)  # noqa: E731
-    for t in np.linspace(*span, _SAMPLES):
-        value = at_zero(jnp.asarray(t))
-        if not bool(_tree.all_finite(value)):
-            why = f"f(t, 0, 0) = {_tree.short(value)} at t = {t:.17g}"
-            return Assumption(label, statement, "refuted", why, evidence=float(t))
+    samples = np.linspace(*span, _SAMPLES)
+    finite = jax.vmap(lambda t: _tree.all_finite(at_zero(t)))(jnp.asarray(samples))
+    if not finite.all():
+        t = samples[np.argmin(finite)]
+        why = f"f(t, 0, 0) = {_tree.short(at_zero(jnp.asarray(t)))} at t = {t:.17g}"
+        return Assumption(label, statement, "refuted", why, evidence=float(t))
     bounded = bounded_in_time(at_zero, *span, knots)
     blocks = system.at(everywhere)[:4]
     smooth = all(b is not None and np.isfinite(b.radius).all() for b in blocks)

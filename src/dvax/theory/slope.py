@@ -141,17 +141,16 @@ def lift(value: Any, shape: tuple[int, ...]) -> Slope:
         return value
     # Axes of length one are repeated; a scalar has all of them.
     padding = (1,) * (len(shape) - value.low.ndim)
-
-    def whole(v: Values) -> Values:
-        count, *old = v.shape
-        return np.broadcast_to(v.reshape((count, *padding, *old)), (count, *shape))
-
     parts = {}
     for k, part in value.parts.items():
         if entries(part) * math.prod(shape) > MOST:
             raise TooLarge
         full = columns(part, entries(part))
-        parts[k] = Part(whole(full.center), whole(full.radius), True)
+        center, radius = (
+            np.broadcast_to(v.reshape((len(v), *padding, *v.shape[1:])), (len(v), *shape))
+            for v in (full.center, full.radius)
+        )
+        parts[k] = Part(center, radius, True)
     return Slope(np.broadcast_to(value.low, shape), np.broadcast_to(value.high, shape), parts)
 
 

@@ -173,21 +173,14 @@ def _wave(shift: float) -> Callable[..., Ends]:
     return values
 
 
-def _powers(n: int) -> Callable[..., Ends]:
+def _powers(low: Values, high: Values, n: int) -> Ends:
     """The range of vⁿ, n ≥ 0."""
-
-    def values(low: Values, high: Values) -> Ends:
-        if n == 0:
-            return np.ones_like(low), np.ones_like(high)
-        if n % 2:
-            return low**n, high**n
-        across = (low <= 0) & (high >= 0)
-        return (
-            np.where(across, 0.0, np.minimum(low**n, high**n)),
-            np.maximum(low**n, high**n),
-        )
-
-    return values
+    if n == 0:
+        return np.ones_like(low), np.ones_like(high)
+    if n % 2:
+        return low**n, high**n
+    across = (low <= 0) & (high >= 0)
+    return np.where(across, 0.0, np.minimum(low**n, high**n)), np.maximum(low**n, high**n)
 
 
 def _integer_pow(eqn: Any, given: list[Any]) -> Slope:
@@ -198,8 +191,8 @@ def _integer_pow(eqn: Any, given: list[Any]) -> Slope:
 
 
 def _power(x: Slope, n: int) -> Slope:
-    low, high = _powers(n)(x.low, x.high)
-    down, up = _powers(n - 1)(x.low, x.high) if n > 0 else (np.zeros(()), np.zeros(()))
+    low, high = _powers(x.low, x.high, n)
+    down, up = _powers(x.low, x.high, n - 1) if n > 0 else (np.zeros(()), np.zeros(()))
     parts = mapped(x.parts, lambda part: scaled(part, n * down, n * up))
     return Slope(low, high, parts)
 
