@@ -103,6 +103,24 @@ def check_precision(name: str, data: Any, x: Any) -> None:
                 raise _other_precision(place, f"data of {jnp.dtype(own)}", own, wide)
 
 
+def check_args(args: Any, caller: str) -> None:
+    """Raise an `InputError` where JAX cannot take `args`: keys that have no order, arrays of text or of
+    Python objects."""
+    place = f"{caller}(args)"
+    try:
+        leaves = jtu.tree_leaves(args)
+    except ValueError:
+        rule = "JAX sorts the keys of a dict, and these have no order"
+        raise InputError(
+            InputProblem(place, "keys of several types", rule, "Use strings")
+        ) from None
+    for leaf in leaves:
+        if isinstance(leaf, np.ndarray) and leaf.dtype.kind not in "biufc":
+            given = f"an array of {leaf.dtype}, {_tree.short(leaf)}"
+            fix = "Convert it, np.asarray(..., float), and keep texts beside it, as str"
+            raise InputError(InputProblem(place, given, "the arrays in args hold numbers", fix))
+
+
 def _other_precision(place: str, given: str, own: Any, wide: Any) -> InputError:
     fix = "Give x0 in that type, jnp.asarray(x0, float) in double precision, or the data in x0's"
     if jnp.promote_types(own, wide) == wide:

@@ -134,3 +134,24 @@ def test_things_of_the_wrong_kind_are_named_all_at_once():
 def test_a_state_that_is_not_of_real_numbers_is_refused(x0):
     with pytest.raises(dvax.InputError, match="x0"):
         dvax.solve(make(), x0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("args", "given"),
+    [
+        (np.array([1.0, "a"], dtype=object), "an array of object"),
+        ({"names": np.array(["a", "b"])}, "an array of <U1"),
+        ({0: 2.0, "n": 3.0}, "keys of several types"),
+    ],
+)
+def test_parameters_that_jax_cannot_take_are_refused(args, given):
+    for name, call in {"solve": dvax.solve, "verify": dvax.verify}.items():
+        with pytest.raises(dvax.InputError) as caught:
+            call(make(), jnp.zeros(2), 0.0, 1.0, args)
+        assert caught.value.problems[0].place == f"dvax.{name}(args)"
+        assert given in caught.value.problems[0].given
+
+
+def test_texts_among_the_parameters_are_left_alone():
+    sol = dvax.solve(make(), jnp.zeros(2), 0.0, 1.0, {"load": 2.0, "name": "of a run"})
+    assert sol.result == dvax.RESULTS.successful

@@ -48,7 +48,7 @@ _LINEARISABLE = 400
 _REFUSED = "refused: "
 _CHECKED = {name: f"Check {name} there" for name in ("K", "h", "f")} | {
     "A x": "Check A, and how large x becomes",
-    "the response u": "Check how h depends on u: the law has no solution where nothing bounds it",
+    "u": "Check how h depends on u: the law has no solution where nothing bounds it",
 }
 
 
@@ -114,7 +114,7 @@ def _nonfinite(stop: Stop) -> Diagnosis:
             "A x": lambda: flow.generator.apply(x),
             "K": lambda: problem.set_at(s, args),
             "h": lambda: problem.h(s, x, like, args),
-            "the response u": u,
+            "u": u,
             "f": lambda: problem.f(s, x, u(), args),
         }
 

@@ -147,6 +147,7 @@ def solve(
         problem, x0, t0, t1, ts, dt, rtol, atol, dt0, dt_max, horizon, method, adjoint, measure, dense,
         vi_solver, max_steps, constants, progress,
     )  # fmt: skip
+    _user_code.check_args(args, "dvax.solve")
     fixed = dt is not None
     if not fixed:
         warn_precision(x0, rtol)

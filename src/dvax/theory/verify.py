@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from .. import _tree
+from .. import _tree, _user_code
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..evolution.nonfinite import refuse_nonfinite_data
@@ -121,6 +121,7 @@ def verify(
     ```
     """
     t0, t1 = span(t0, t1, "dvax.verify(t0, t1)")
+    _user_code.check_args(args, "dvax.verify")
     x0 = state_like(problem, x0, t0, args, "dvax.verify(x0)")
     refuse_nonfinite_data(problem, args, "dvax.verify")
     problem.check(jnp.asarray(t0), x0, args)
