@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -168,25 +169,23 @@ def jumps(
 ) -> tuple[float, float] | None:
     """The knot at which fn(t) jumps most, and by how much; None where it does not. What shrinks with
     the distance to the knot is a slope."""
-    length = span[1] - span[0]
-    worst = None
-    for knot in knots[:MOST_KNOTS]:
-        near = 64 * np.finfo(float).eps * max(abs(knot), length)
-        gap, scale = _gap(fn, knot, near)
-        further, _ = _gap(fn, knot, 16 * near)
-        if gap > 1e-9 * scale and gap > 0.5 * further and (worst is None or gap > worst[1]):
-            worst = float(knot), gap
-    return worst
+    knots = knots[:MOST_KNOTS]
+    if knots.size == 0:
+        return None
+    near = 64 * np.finfo(float).eps * np.maximum(np.abs(knots), span[1] - span[0])
+    beside = knots[:, None] + near[:, None] * np.array([-16.0, -1.0, 1.0, 16.0])
+    leaves = jtu.tree_leaves(jax.vmap(fn)(jnp.asarray(beside.ravel())))
+    rows = [np.asarray(leaf).reshape(knots.size, 4, -1) for leaf in leaves]
+    outer, before, after, further = np.moveaxis(np.concatenate(rows, axis=2), 1, 0)
+    gap, wide = (_largest(p - q) for p, q in ((after, before), (further, outer)))
+    scale = _largest(np.abs(after) + np.abs(before))
+    height = np.where((gap > 1e-9 * scale) & (gap > 0.5 * wide), gap, 0.0)
+    worst = int(np.argmax(height))
+    return (float(knots[worst]), float(gap[worst])) if height[worst] > 0.0 else None
 
 
-def _gap(fn: Callable[[Any], Tree], knot: float, inset: float) -> tuple[float, float]:
-    """How far fn is from one side of the knot to the other, and how large."""
-    before, after = (
-        np.concatenate([np.ravel(v) for v in jtu.tree_leaves(fn(jnp.asarray(knot + s * inset)))])
-        for s in (-1, 1)
-    )
-    largest = np.max(np.abs(after) + np.abs(before), initial=0.0)
-    return float(np.max(np.abs(after - before), initial=0.0)), float(largest)
+def _largest(rows: Values) -> Values:
+    return np.max(np.abs(rows), axis=1, initial=0.0)
 
 
 def _free(like: Tree) -> tuple[Tree, Tree]:
