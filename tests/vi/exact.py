@@ -57,6 +57,8 @@ def box(M, q, lower, upper, guess):
         F = [a + b for a, b in zip(times(M, y), q, strict=True)]
         wrong = False
         for i in range(n):
+            if lower[i] == upper[i]:
+                continue  # a number that is given, whatever its sign of F
             if place[i] == 0 and not lower[i] <= y[i] <= upper[i]:
                 place[i], wrong = -1 if y[i] < lower[i] else 1, True
             elif place[i] * F[i] > 0:
