@@ -194,7 +194,8 @@ class Traffic(eqx.Module):
         least = float(max(1e-10 * flows.sum(), blur))
         v = np.asarray(self.link_flows(self.equilibrium))
         stiffness = self.rho * self.link_costs.slopes(v, self.worst)
-        return LinkNewton(Choices(self.paths, stiffness), jnp.asarray(v), least)
+        choices = Choices(self.paths, stiffness, np.asarray(self.equilibrium))
+        return LinkNewton(choices, jnp.asarray(v), least)
 
     def all_or_nothing(self) -> jax.Array:
         """All trips on the paths that cost least on the empty network, for a `demand` of 1."""
