@@ -1,5 +1,7 @@
 """The law of day-to-day traffic on link flows: against a first-order method that shares no code."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,19 +33,22 @@ def test_the_law_agrees_with_accelerated_gradients(shape, factor, share):
     usual = traffic.Traffic(network, trips)
     model = traffic.Traffic(network, trips, rho=share * usual.rho)
     problem, newton = model.problem, model.vi_solver
-    first_order = Accelerated(least=newton.least, max_steps=200_000)
+    # To what rounding allows: `least` is no help.
+    newton = dataclasses.replace(newton, least=0.0)
+    first_order = Accelerated(max_steps=200_000)
 
-    def solved(x, solver):
+    def solved(x, solver, tol):
         space = problem.spaces(x)[1]
         vi = Frozen(problem.frozen(0.0, x), problem.set_at(0.0), space, 1.0, model.constants.L_F)
-        return solver.solve(vi, x, 0.0)
+        return solver.solve(vi, x, tol)
 
-    ours = jax.jit(lambda x: solved(x, newton))
-    theirs = jax.jit(lambda x: solved(x, first_order))
+    ours = jax.jit(lambda x: solved(x, newton, 0.0))
+    theirs = jax.jit(lambda x, tol: solved(x, first_order, tol))
     x = model.all_or_nothing()
     for _ in range(3):
-        one, other = ours(x), theirs(x)
-        assert one.result == RESULTS.successful and float(one.residual) <= newton.least
+        one = ours(x)
+        assert one.result == RESULTS.successful
+        other = theirs(x, jnp.maximum(one.residual, 1e-10 * jnp.sum(trips.flow)))
         # Both lie within their ‖w‖ of the solution, as γ = 1.
         apart = float(jnp.linalg.norm(one.y - other.y))
         assert apart <= float(one.residual + other.residual) * (1 + 1e-9)

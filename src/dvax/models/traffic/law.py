@@ -196,7 +196,8 @@ class LinkNewton(AbstractSolver):
     function. ‖w‖ is that of w = ρ Δᵀ(c(Δy) − c(v)), less its mean over the paths of every pair, which
     is a normal to K: an element of F(y) + N_K(y).
 
-    **Arguments:** `least`, the smallest ‖w‖ that is asked for, whatever the tolerance; `max_steps`.
+    **Arguments:** `least`, the smallest ‖w‖ that is asked for, whatever the tolerance, where rounding
+    allows it (see `rounding`); `max_steps`.
 
     **Raises:** `dvax.InputError` for any other law.
     """
@@ -208,14 +209,15 @@ class LinkNewton(AbstractSolver):
 
     def solve(self, vi: Frozen, y0: jax.Array, tol: Any) -> Answer:
         law = _Law(self.choices, vi)
+        start = law.K.project(lax.stop_gradient(y0), vi.space)
+        own = law.respond(law.link_flows(start))
+        other = law.respond(self.equilibrium)
+        better = other.dual > own.dual
+        at = jax.tree_util.tree_map(lambda a, b: jnp.where(better, a, b), other, own)
 
-        def begin(_: Frozen, y: jax.Array) -> _Method:
-            own = law.respond(law.link_flows(y))
-            other = law.respond(self.equilibrium)
-            better = other.dual > own.dual
-            at = jax.tree_util.tree_map(lambda a, b: jnp.where(better, a, b), other, own)
+        def begin(*_: Any) -> _Method:
             size = len(self.choices.block)
-            return _Method(at, jnp.zeros((size, size), y.dtype), jnp.asarray(_PRODUCTS))
+            return _Method(at, jnp.zeros((size, size), start.dtype), jnp.asarray(_PRODUCTS))
 
         def advance(_: Frozen, method: _Method) -> tuple[_Method, Trial]:
             new, calls = law.ascend(method)
@@ -223,8 +225,8 @@ class LinkNewton(AbstractSolver):
             one = jnp.ones((), w.dtype)
             return new, Trial(new.at.y, w, value, one, [new.at.y], calls)
 
-        tol = jnp.maximum(tol, self.least)
-        return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=2)
+        tol = jnp.maximum(jnp.maximum(tol, self.least), law.rounding(at))
+        return iterate(vi, at.y, tol, begin, advance, self.max_steps, begun=2)
 
 
 class _Law:
@@ -296,6 +298,19 @@ class _Law:
         rows, nothing = self.choices.rows, jnp.zeros_like(at.y)
         w = nothing.at[rows].set(self.rho * (after - at.along))
         return w, (at.y - self.x).at[rows].add(self.rho * after)
+
+    def rounding(self, at: _State) -> jax.Array:
+        """What rounding makes of ‖w‖, roughly, whatever the iteration: an estimate.
+
+        y(v) is the projection of x − ρΔᵀc, each number of which is off by a rounding of its terms; Δ
+        sums these up, v is rounded, and w = ρΔᵀ(c(Δy) − c(v)) makes ρ c′ of what they are apart and
+        has the roundings of c itself. Their squares add up, as for independent numbers.
+        """
+        choices, eps = self.choices, jnp.finfo(at.v.dtype).eps
+        c, D = (f(at.v, self.capacity) for f in (self.costs.costs, self.costs.slopes))
+        z = jnp.abs(self._rows(self.x)) + self.rho * choices.incidence.along(c)
+        flows = choices.incidence.flows(z * z) + at.v**2
+        return 4 * eps * self.rho * jnp.sqrt(jnp.sum(choices.many * (D**2 * flows + c**2)))
 
     def _newton(
         self, r: jax.Array, D: jax.Array, y: jax.Array, method: _Method
