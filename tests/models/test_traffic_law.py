@@ -11,6 +11,7 @@ from tests.selection import mostly_thorough
 
 import dvax
 from dvax.models import traffic
+from dvax.models.traffic import law
 from dvax.vi import RESULTS, Accelerated, Frozen
 
 SHAPES = {
@@ -54,6 +55,26 @@ def test_the_law_agrees_with_accelerated_gradients(shape, factor, share):
         assert apart <= float(one.residual + other.residual) * (1 + 1e-9)
         assert int(one.iterations) <= 60
         x = x + 0.5 * (one.y - x)
+
+
+def test_the_block_is_that_of_the_dense_matrix():
+    # S = Δ P Δᵀ, P = diag(used) − mean over the used paths of a pair, of dense matrices.
+    model = traffic.Traffic(*networks.grid(**SHAPES["one way"]))
+    choices, rng = model.vi_solver.choices, np.random.default_rng(6)
+    rows, pair = len(choices.rows), np.asarray(choices.pair)
+    along = np.zeros((rows, model.paths.count))
+    along[np.asarray(choices.incidence.path), np.asarray(choices.incidence.link)] = 1.0
+    used = (rng.uniform(size=rows) < 0.6).astype(float)
+    count = np.maximum(np.bincount(pair, used), 1.0)
+    P = np.diag(used) - np.where(pair[:, None] == pair, np.outer(used, used), 0.0) / count[pair]
+    S = along.T @ P @ along
+    block = np.asarray(choices.block)
+    assert len(block) > 20 and used.sum() > 15
+    found = choices.matrix(jnp.asarray(used), jnp.asarray(count))
+    np.testing.assert_allclose(np.tril(found), np.tril(S[np.ix_(block, block)]), atol=1e-13)
+    link, path = np.asarray(choices.incidence.link), np.asarray(choices.incidence.path)
+    diagonal = law._diagonal(pair, path, link, used, model.paths.count)
+    np.testing.assert_allclose(diagonal, np.diag(S), atol=1e-13)
 
 
 def test_another_law_is_refused():

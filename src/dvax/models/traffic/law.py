@@ -19,8 +19,8 @@ factorised, and the block preconditions conjugate gradients for the whole system
 flow change from one iteration to the next, which the block need not follow: it is formed once a law,
 and again where conjugate gradients become slow with it.
 
-They need not be solved exactly: sg is an ascent for any iterate g of conjugate gradients, whose
-⟨g, −sr⟩ is positive.
+They need not be solved exactly: along g/s the slope is ρ⟨g, −sr⟩, which is positive for every iterate g
+of conjugate gradients. So dv = g/s where costs react, and −r − ρSsg elsewhere, where s may be 0.
 """
 
 from collections.abc import Callable
