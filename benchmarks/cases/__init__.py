@@ -20,6 +20,7 @@ CASES = (
     "signals",
     "simplices",
     "traffic",
+    "traffic_days",
     "box_vi",
     "pointwise",
     "obstacle",

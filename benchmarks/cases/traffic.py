@@ -34,7 +34,7 @@ def run(full: bool) -> Section:
         ),
     )
     longest = 300.0 if full else 60.0
-    for name, (network, trips, weights) in _networks(section).items():
+    for name, (network, trips, weights) in networks(section).items():
         charge = weights[1] * network.length
         if network.toll is not None:
             charge = charge + weights[0] * network.toll
@@ -77,7 +77,8 @@ def run(full: bool) -> Section:
     return section
 
 
-def _networks(section: Section) -> dict[str, tuple[Network, Trips, tuple[float, float]]]:
+def networks(section: Section) -> dict[str, tuple[Network, Trips, tuple[float, float]]]:
+    """The networks by their names, and the weights of tolls and lengths; notes say which are absent."""
     found = {
         "region of Anaheim's size": (*region(18, 21, 38, 1_406, 1.5), (0.0, 0.04)),
         "region of Winnipeg's size": (*region(25, 36, 147, 4_344, 2.0), (0.0, 0.04)),

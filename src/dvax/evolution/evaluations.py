@@ -72,6 +72,9 @@ def _in_turn(
     A law that is solved by iteration takes a compiler a second or ten, once for every place. So the
     plan is run again for every evaluation, with the rates known so far, to see where it goes next; of
     all that it computes the compiler keeps what leads there.
+
+    The law is solved from what is known of y at that time, and not from where the plan went last: it
+    may go to the end of the step for a stage, then inside, and to the end again.
     """
 
     def run(known: Callable[[int], Rate]) -> Evaluated:
@@ -92,7 +95,8 @@ def _in_turn(
 
     like = jax.eval_shape(lambda: flow.rate(begin, x0, guess))
     blank = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), like)
-    count = len(run(lambda _: blank)[1])
+    times = [visit.t for visit in run(lambda _: blank)[1]]
+    count, times = len(times), lax.stop_gradient(jnp.stack(times))
     table = jtu.tree_map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), blank)
     start: Any = 0
     if kept is not None:
@@ -100,8 +104,24 @@ def _in_turn(
 
     def one(k: Any, table: Rate) -> Rate:
         t, x = lax.switch(k, [partial(visit, i) for i in range(count)], table)
-        before = _tree.where(k > 0, row(table, jnp.maximum(k - 1, 0)).y, guess)
-        return _tree.put(table, k, flow.rate(t, x, before))
+        near = _tree.where(k > 0, _along_line(times, table.y, k), guess)
+        return _tree.put(table, k, flow.rate(t, x, near))
 
     table = lax.fori_loop(start, count, one, table)
     return run(lambda i: row(table, i))
+
+
+def _along_line(times: jax.Array, rows: Tree, k: Any) -> Tree:
+    """The rows before `k` at the time `times[k]`: on the line between the two around it, or the nearest
+    one; the latest of those that have one time."""
+    t, last = times[k], len(times) - 1
+    known = jnp.arange(len(times)) < k
+    early = jnp.where(known & (times <= t), times, -jnp.inf)
+    late = jnp.where(known & (times >= t), times, jnp.inf)
+    before, after = last - jnp.argmax(early[::-1]), last - jnp.argmin(late[::-1])
+    before = jnp.where(early[before] > -jnp.inf, before, after)
+    after = jnp.where(late[after] < jnp.inf, after, before)
+    length = times[after] - times[before]
+    share = jnp.where(length > 0, (t - times[before]) / jnp.where(length > 0, length, 1.0), 0.0)
+    between = lambda leaf: (1.0 - share) * leaf[before] + share * leaf[after]  # noqa: E731
+    return lax.stop_gradient(jtu.tree_map(between, rows))

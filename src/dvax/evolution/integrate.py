@@ -302,7 +302,7 @@ def _assembled(
     records: Record | None,
 ) -> Solution:
     us, ys, residual, law_step, law_error = _responses(
-        flow, rows.t, rows.x, setup.problem.spaces(setup.x0)[1], setup.moduli
+        flow, (rows.t, rows.x, rows.guess), setup.problem.spaces(setup.x0)[1], setup.moduli
     )
     # f may not feel a response that is not finite, and the solution would hold it all the same.
     result = RESULTS.where(
@@ -341,16 +341,23 @@ _BRIEF = 4096
 one place than this JAX wakes another thread, which takes longer."""
 
 
-def _responses(flow, times, xs, control, moduli):
-    """u, y and the certificate C0 of the law at the saved states."""
+def _responses(flow, rows, control, moduli):
+    """u, y and the certificate C0 of the law at the saved states, `rows` being times, states and where
+    the solver of the law begins."""
     gamma, norm_P_inv = moduli.get("gamma"), moduli.get("norm_P_inv")
     tau = 1.0 if moduli.get("L_F") is None else 1.0 / moduli["L_F"]
 
+    times, xs, _ = rows
+    entries = sum(leaf.size for leaf in jtu.tree_leaves(xs))
+
     def every():
-        if sum(leaf.size for leaf in jtu.tree_leaves(xs)) > _BRIEF:
-            return _at_once(flow, control, tau, times, xs)
-        rows = {"computed": (times, xs), "otherwise": _at_once}
-        return in_one_function(_in_turn, flow, control, tau, **rows)
+        if not flow.direct and entries > _BRIEF * len(times):
+            # What iterates waits for nobody, and has the memory of one row.
+            return _in_turn(flow, control, tau, *rows)
+        if entries > _BRIEF:
+            return _at_once(flow, control, tau, *rows)
+        given = {"computed": rows, "otherwise": _at_once}
+        return in_one_function(_in_turn, flow, control, tau, **given)
 
     def nothing():
         return jtu.tree_map(lambda s: jnp.full(s.shape, jnp.nan, s.dtype), jax.eval_shape(every))
@@ -365,17 +372,17 @@ def _responses(flow, times, xs, control, moduli):
     return us, ys, residual, step, error
 
 
-def _at_once(flow, control, tau, times, xs):
-    return jax.vmap(partial(_response, flow, control, tau))(times, xs)
+def _at_once(flow, control, tau, times, xs, guesses):
+    return jax.vmap(partial(_response, flow, control, tau))(times, xs, guesses)
 
 
-def _in_turn(flow, control, tau, times, xs):
-    return lax.map(lambda row: _response(flow, control, tau, *row), (times, xs))
+def _in_turn(flow, control, tau, times, xs, guesses):
+    return lax.map(lambda row: _response(flow, control, tau, *row), (times, xs, guesses))
 
 
-def _response(flow, control, tau, t, x):
+def _response(flow, control, tau, t, x, guess):
     """u, y, and what certifies it."""
-    rate = flow.rate(t, x, None)
+    rate = flow.rate(t, x, guess)
     K = flow.problem.set_at(t, flow.args)
     frozen = flow.problem.frozen(t, x, flow.args)
     checked = certify(frozen, K, control, rate.y, tau)

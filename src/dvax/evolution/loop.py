@@ -42,7 +42,7 @@ class Saved(NamedTuple):
     that x_h is the exact solution of the system with a disturbance of that size; `settled` is what
     both were at the start of that step: what has surely acted by then. `extent` says where x_h and u_h
     have been from the beginning to the end of that step, where it was asked for. None where nothing
-    is measured.
+    is measured. `guess` is where the solver of the law may begin.
     """
 
     t: Any
@@ -50,6 +50,7 @@ class Saved(NamedTuple):
     impulse: tuple[Any, Any] | None = None
     settled: tuple[Any, Any] | None = None
     extent: Extent | None = None
+    guess: Tree | None = None
 
 
 class State(NamedTuple):
@@ -327,7 +328,7 @@ class Loop(eqx.Module):
         time = time + shift(jnp.where(met, end, 0.0))
         t = jnp.where(reached, time, jnp.inf)
         impulse = state.impulse if self.stepper.measure else None
-        return Saved(t, x, impulse, impulse, state.extent)
+        return Saved(t, x, impulse, impulse, state.extent, state.memory.guess)
 
     def _held(self, t: Any) -> Any:
         """t, which stands still for the tangents of steps that adapt."""

@@ -15,11 +15,15 @@ slope along dv is −ρ⟨r, D dv⟩ ≥ 0; a line search on it makes the method
 
 Only pairs with two paths or more have a choice, and only links that not all paths of a pair share
 matter to it (`Paths.differences`). Few links have ρ Dᵢ Sᵢᵢ ≫ 0: on these the matrix is formed and
-factorised, and conjugate gradients preconditioned by that block solve the whole system in some ten
-iterations. Without it they need hundreds, and first-order methods a thousand on Chicago's sketch
-network.
+factorised, and the block preconditions conjugate gradients for the whole system. The paths that carry
+flow change from one iteration to the next, which the block need not follow: it is formed once a law,
+and again where conjugate gradients become slow with it.
+
+They need not be solved exactly: along g/s the slope is ρ⟨g, −sr⟩, which is positive for every iterate g
+of conjugate gradients. So dv = g/s where costs react, and −r − ρSsg elsewhere, where s may be 0.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -36,15 +40,16 @@ from ...vi.iteration import Trial, iterate
 from .costs import LinkCosts
 from .paths import Incidence, Paths
 
-_BLOCK = 1024
-"""The most links that the factorised block holds: it takes 10 ms."""
+_BLOCK = 768
+"""The most links that the factorised block holds."""
 _STIFF = 0.1
 """Links below this ρ Dᵢ Sᵢᵢ are left to the conjugate gradients."""
 
-_LINEAR = 1e-5
+_LINEAR = 1e-2
 _PRODUCTS = 500
-"""Relative residual of the linear systems, and the most products. dv has the error of g times ρ s: with
-10⁻³ the steps on Chicago's sketch network do not ascend, with 10⁻⁵ they are as good as exact."""
+"""Relative residual of the linear systems, and the most products."""
+_SLOW = 16
+"""Products after which the block is formed anew: they cost as much as that."""
 
 _ASCENT = 1e-4
 _SHORTEST = 1e-9
@@ -68,7 +73,8 @@ class Choices(eqx.Module):
     """The paths of pairs that have several, as far as they differ (`Paths.differences`).
 
     `rows` are their numbers among all paths, `pair` numbers their pairs, `incidence` holds the links
-    of each. `block` are the links of the factorised block; the entries of S there are the sums, over
+    of each, `many` how many of them a link is on. `block` are the links of the factorised block; the
+    entries of S there are the sums, over
     `cells`, of one number a path (`of_row`: whether it carries flow) and of one a pair of links
     (`first`, `second`: rows of `key_pair`, a pair and a link of the block each, whose flow-carrying
     paths `key_row` → `key` count).
@@ -77,6 +83,7 @@ class Choices(eqx.Module):
     rows: jax.Array
     pair: jax.Array
     incidence: Incidence
+    many: jax.Array
     block: jax.Array
     cells: jax.Array
     of_row: jax.Array
@@ -87,13 +94,15 @@ class Choices(eqx.Module):
     key_pair: jax.Array
     pairs: int = eqx.field(static=True)
 
-    def __init__(self, paths: Paths, stiffness: np.ndarray):
-        """`stiffness` is ρ c′ of every link: where it is large, times its paths, is the block."""
+    def __init__(self, paths: Paths, stiffness: np.ndarray, flows: np.ndarray):
+        """The block is where `stiffness`, ρ c′ of a link, times Sᵢᵢ at these path flows is large."""
         found = paths.differences(np.zeros(len(paths.sizes)))
         lengths = np.diff(found.ends)
         row = np.repeat(np.arange(len(lengths)), lengths)
         pair = np.repeat(np.arange(len(found.sizes)), found.sizes)
-        carried = stiffness * np.bincount(found.links, minlength=paths.count)
+        many = np.bincount(found.links, minlength=paths.count)
+        used = (flows[found.rows] > 0).astype(float)
+        carried = stiffness * _diagonal(pair, row, found.links, used, paths.count)
         block = np.sort(np.argsort(-carried, kind="stable")[:_BLOCK])
         block = block[carried[block] > _STIFF]
         place = np.full(paths.count, -1)
@@ -113,6 +122,7 @@ class Choices(eqx.Module):
         whole = lambda a: jnp.asarray(a, jnp.int32)  # noqa: E731
         self.rows, self.pair, self.block = whole(found.rows), whole(pair), whole(block)
         self.incidence = Incidence(lengths, found.links, paths.count)
+        self.many = jnp.asarray(many, float)
         self.cells, self.of_row = whole(np.concatenate([cells, more])), whole(of_row)
         self.first, self.second = whole(first), whole(second)
         self.key, self.key_row, self.key_pair = whole(inverse), whole(row), whole(key_pair)
@@ -141,6 +151,16 @@ class Choices(eqx.Module):
         return flat.at[self.cells].add(values, mode="promise_in_bounds").reshape(size, size)
 
 
+def _diagonal(
+    pair: np.ndarray, row: np.ndarray, links: np.ndarray, used: np.ndarray, count: int
+) -> np.ndarray:
+    """Sᵢᵢ of every link, where `row` and `links` say which paths are on which link."""
+    key, inverse = np.unique(pair[row] * count + links, return_inverse=True)
+    n = np.bincount(inverse, used[row])
+    share = n / np.maximum(np.bincount(pair, used), 1.0)[key // count]
+    return np.bincount(key % count, n * (1.0 - share), minlength=count)
+
+
 def _combinations(group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """All (i, j) with j ≤ i in the same group, for groups that lie side by side."""
     begin = np.searchsorted(group, group)
@@ -151,12 +171,22 @@ def _combinations(group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _State(NamedTuple):
-    """v, and y, w = Δy and the dual function there."""
+    """v, and there Δᵀc(v) as `_Law._along` has it, y, w = Δy and the dual function."""
 
     v: jax.Array
+    along: jax.Array
     y: jax.Array
     w: jax.Array
     dual: jax.Array
+
+
+class _Method(NamedTuple):
+    """Where Newton's method stands: `inverse` is that of a Cholesky factor of the block, `products`
+    are those that the last linear system took with it."""
+
+    at: _State
+    inverse: jax.Array
+    products: jax.Array
 
 
 class LinkNewton(AbstractSolver):
@@ -166,7 +196,8 @@ class LinkNewton(AbstractSolver):
     function. ‖w‖ is that of w = ρ Δᵀ(c(Δy) − c(v)), less its mean over the paths of every pair, which
     is a normal to K: an element of F(y) + N_K(y).
 
-    **Arguments:** `least`, the smallest ‖w‖ that is asked for, whatever the tolerance; `max_steps`.
+    **Arguments:** `least`, the smallest ‖w‖ that is asked for, whatever the tolerance, where rounding
+    allows it (see `rounding`); `max_steps`.
 
     **Raises:** `dvax.InputError` for any other law.
     """
@@ -178,21 +209,24 @@ class LinkNewton(AbstractSolver):
 
     def solve(self, vi: Frozen, y0: jax.Array, tol: Any) -> Answer:
         law = _Law(self.choices, vi)
+        start = law.K.project(lax.stop_gradient(y0), vi.space)
+        own = law.respond(law.link_flows(start))
+        other = law.respond(self.equilibrium)
+        better = other.dual > own.dual
+        at = jax.tree_util.tree_map(lambda a, b: jnp.where(better, a, b), other, own)
 
-        def begin(_: Frozen, y: jax.Array) -> _State:
-            own = law.respond(law.link_flows(y))
-            other = law.respond(self.equilibrium)
-            better = other.dual > own.dual
-            return jax.tree_util.tree_map(lambda a, b: jnp.where(better, a, b), other, own)
+        def begin(*_: Any) -> _Method:
+            size = len(self.choices.block)
+            return _Method(at, jnp.zeros((size, size), start.dtype), jnp.asarray(_PRODUCTS))
 
-        def advance(_: Frozen, at: _State) -> tuple[_State, Trial]:
-            new, calls = law.ascend(at)
-            w, value = law.certificate(new)
-            one = jnp.ones((), new.v.dtype)
-            return new, Trial(new.y, w, value, one, [new.y], calls)
+        def advance(_: Frozen, method: _Method) -> tuple[_Method, Trial]:
+            new, calls = law.ascend(method)
+            w, value = law.certificate(new.at)
+            one = jnp.ones((), w.dtype)
+            return new, Trial(new.at.y, w, value, one, [new.at.y], calls)
 
-        tol = jnp.maximum(tol, self.least)
-        return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=2)
+        tol = jnp.maximum(jnp.maximum(tol, self.least), law.rounding(at))
+        return iterate(vi, at.y, tol, begin, advance, self.max_steps, begun=2)
 
 
 class _Law:
@@ -224,19 +258,21 @@ class _Law:
     def respond(self, v: jax.Array) -> _State:
         """y(v) and what belongs to it."""
         c = self.costs.costs(v, self.capacity)
-        z = self.x.at[self.choices.rows].add(-self.rho * self._along(c))
+        along = self._along(c)
+        z = self.x.at[self.choices.rows].add(-self.rho * along)
         y = self.K.project(z, self.space)
         w = self.fixed + self.choices.incidence.flows(self._rows(y))
         away = y - self.x
         terms = c * (w - v) + self.costs.integrals(v, self.capacity)
-        return _State(v, y, w, 0.5 * jnp.sum(away * away) + self.rho * jnp.sum(terms))
+        return _State(v, along, y, w, 0.5 * jnp.sum(away * away) + self.rho * jnp.sum(terms))
 
-    def ascend(self, at: _State) -> tuple[_State, jax.Array]:
-        """(the state after a step of Newton's method, how many points it tried)."""
+    def ascend(self, method: _Method) -> tuple[_Method, jax.Array]:
+        """(where a step of Newton's method leads, how many points it tried)."""
+        at = method.at
         r = at.v - at.w
         D = self.costs.slopes(at.v, self.capacity)
-        dv = self._newton(r, D, self._rows(at.y))
-        slope = -self.rho * jnp.sum(r * D * dv)
+        dv, inverse, products = self._newton(r, D, self._rows(at.y), method)
+        slope = jnp.maximum(-self.rho * jnp.sum(r * D * dv), 0.0)
         # Below the rounding of the dual function nothing is a descent.
         blur = 8 * jnp.finfo(r.dtype).eps * jnp.abs(at.dual)
 
@@ -254,18 +290,33 @@ class _Law:
 
         one = jnp.ones((), r.dtype)
         _, new, _, tried = lax.while_loop(goes_on, shorter, (one, *attempt(one), jnp.asarray(1)))
-        return new, tried
+        return _Method(new, inverse, products), tried
 
     def certificate(self, at: _State) -> tuple[jax.Array, jax.Array]:
         """(w ∈ F(y) + N_K(y), F(y) less a normal), both on all paths."""
-        after, before = (self._along(self.costs.costs(v, self.capacity)) for v in (at.w, at.v))
+        after = self._along(self.costs.costs(at.w, self.capacity))
         rows, nothing = self.choices.rows, jnp.zeros_like(at.y)
-        w = nothing.at[rows].set(self.rho * (after - before))
+        w = nothing.at[rows].set(self.rho * (after - at.along))
         return w, (at.y - self.x).at[rows].add(self.rho * after)
 
-    def _newton(self, r: jax.Array, D: jax.Array, y: jax.Array) -> jax.Array:
-        """dv for the residual r."""
-        choices, s = self.choices, jnp.sqrt(D)
+    def rounding(self, at: _State) -> jax.Array:
+        """What rounding makes of ‖w‖, roughly, whatever the iteration: an estimate.
+
+        y(v) is the projection of x − ρΔᵀc, each number of which is off by a rounding of its terms; Δ
+        sums these up, v is rounded, and w = ρΔᵀ(c(Δy) − c(v)) makes ρ c′ of what they are apart and
+        has the roundings of c itself. Their squares add up, as for independent numbers.
+        """
+        choices, eps = self.choices, jnp.finfo(at.v.dtype).eps
+        c, D = (f(at.v, self.capacity) for f in (self.costs.costs, self.costs.slopes))
+        z = jnp.abs(self._rows(self.x)) + self.rho * choices.incidence.along(c)
+        flows = choices.incidence.flows(z * z) + at.v**2
+        return 4 * eps * self.rho * jnp.sqrt(jnp.sum(choices.many * (D**2 * flows + c**2)))
+
+    def _newton(
+        self, r: jax.Array, D: jax.Array, y: jax.Array, method: _Method
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """(dv for the residual r, the inverse that it was found with, the products that it took)."""
+        choices, rho, s = self.choices, self.rho, jnp.sqrt(D)
         used = jnp.where(y > 0, 1.0, 0.0)
         count = jnp.maximum(choices.sums(used), 1.0)
 
@@ -273,21 +324,25 @@ class _Law:
             a = used * choices.incidence.along(q)
             return choices.incidence.flows(a - used * choices.each(choices.sums(a) / count))
 
-        def whole(g: jax.Array) -> jax.Array:
-            return g + self.rho * s * apply(s * g)
-
         block = choices.block
-        inner = s[block]
-        matrix = self.rho * inner[:, None] * inner[None, :] * choices.matrix(used, count)
-        unit = jnp.eye(len(block), dtype=s.dtype)
-        factor = jnp.linalg.cholesky(matrix + unit, symmetrize_input=False)
+
+        def formed() -> jax.Array:
+            inner, unit = s[block], jnp.eye(len(block), dtype=s.dtype)
+            matrix = rho * inner[:, None] * inner[None, :] * choices.matrix(used, count)
+            factor = jnp.linalg.cholesky(matrix + unit, symmetrize_input=False)
+            return jax.scipy.linalg.solve_triangular(factor, unit, lower=True)
+
+        inverse = lax.cond(method.products > _SLOW, formed, lambda: method.inverse)
 
         def nearly(g: jax.Array) -> jax.Array:
-            part = jax.scipy.linalg.cho_solve((factor, True), g[block])
-            return g.at[block].set(part)
+            return g.at[block].set((inverse @ g[block]) @ inverse)
 
-        g, _ = jax.scipy.sparse.linalg.cg(whole, -s * r, tol=_LINEAR, maxiter=_PRODUCTS, M=nearly)
-        return -r - self.rho * apply(s * g)
+        g, Ssg, products = _conjugate_gradients(apply, nearly, s, rho, -s * r)
+        # Of an inexact g the first has the smaller error in s dv where costs react, and the second
+        # has one that does not grow as s → 0.
+        stiff = rho * D * choices.many > _STIFF
+        dv = jnp.where(stiff, g / jnp.where(stiff, s, 1.0), -r - rho * Ssg)
+        return dv, inverse, products
 
     def _rows(self, y: jax.Array) -> jax.Array:
         return y.at[self.choices.rows].get(mode="promise_in_bounds")
@@ -298,3 +353,34 @@ class _Law:
         a = self.choices.incidence.along(c)
         number = jnp.maximum(self.choices.sums(jnp.ones_like(a)), 1.0)
         return a - self.choices.each(self.choices.sums(a) / number)
+
+
+def _conjugate_gradients(
+    apply: Callable[[jax.Array], jax.Array],
+    precondition: Callable[[jax.Array], jax.Array],
+    s: jax.Array,
+    rho: jax.Array,
+    b: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """(g, S s g, products) with (I + ρ s S s) g = b nearly, S being what `apply` applies."""
+
+    def goes_on(carry: tuple) -> jax.Array:
+        _, _, r, _, _, products = carry
+        return (jnp.sum(r * r) > goal) & (products < _PRODUCTS)
+
+    def step(carry: tuple) -> tuple:
+        g, Ssg, r, p, size, products = carry
+        Ssp = apply(s * p)
+        Ap = p + rho * s * Ssp
+        length = size / jnp.sum(p * Ap)
+        r = r - length * Ap
+        z = precondition(r)
+        new = jnp.sum(r * z)
+        p_new = z + (new / size) * p
+        return g + length * p, Ssg + length * Ssp, r, p_new, new, products + 1
+
+    goal = _LINEAR**2 * jnp.sum(b * b)
+    p, nothing = precondition(b), jnp.zeros_like(b)
+    start = nothing, nothing, b, p, jnp.sum(b * p), jnp.asarray(0)
+    g, Ssg, *_, products = lax.while_loop(goes_on, step, start)
+    return g, Ssg, products

@@ -124,7 +124,7 @@ class Incidence(eqx.Module):
     and Δᵀc the costs of the links along each path.
 
     Both go through the links of all paths one after the other: tables with a row for each step of a
-    path, filled up to the longest, take XLA 50 times as long on Chicago's sketch network.
+    path, filled up to the longest, take XLA much longer where few paths are long.
     """
 
     path: jax.Array

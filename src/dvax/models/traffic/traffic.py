@@ -185,16 +185,12 @@ class Traffic(eqx.Module):
     @property
     def vi_solver(self) -> LinkNewton:
         """The solver for the law, Newton's method on link flows: to 10⁻¹⁰ of all trips, or to what
-        rounding makes of F, where that is more: that of flows, ε L_F ‖d‖, or that of the costs c of
-        paths, which makes an error of ε ρ c in the flows that follow from them."""
-        rounding = np.finfo(self.equilibrium.dtype).eps * float(self.constants.L_F)
-        flows = self.peak * self.trips.flow
-        c = float(jnp.max(self.incidence.along(self.costs(0.0, self.equilibrium))))
-        blur = rounding * max(4.0 * np.linalg.norm(flows), 0.25 * self.rho * c)
-        least = float(max(1e-10 * flows.sum(), blur))
+        rounding allows."""
+        least = float(1e-10 * np.sum(self.peak * self.trips.flow))
         v = np.asarray(self.link_flows(self.equilibrium))
         stiffness = self.rho * self.link_costs.slopes(v, self.worst)
-        return LinkNewton(Choices(self.paths, stiffness), jnp.asarray(v), least)
+        choices = Choices(self.paths, stiffness, np.asarray(self.equilibrium))
+        return LinkNewton(choices, jnp.asarray(v), least)
 
     def all_or_nothing(self) -> jax.Array:
         """All trips on the paths that cost least on the empty network, for a `demand` of 1."""

@@ -78,7 +78,8 @@ class Plan:
 
 
 class PerRow:
-    """Functions of one row of a solution over all of its rows, each compiled once for a model."""
+    """Functions of one row of a solution over all of its rows, each compiled once for a model. One row
+    after the other: of a large state all at once would need more memory than the solve."""
 
     def __init__(self) -> None:
         self._made: dict[str, Callable[..., Any]] = {}
@@ -86,7 +87,7 @@ class PerRow:
     def __call__(self, name: str, function: Callable[..., Any], *rows: Any) -> np.ndarray:
         """function(*row) at every row of `rows`; by the same `name` it is the same function."""
         if name not in self._made:
-            self._made[name] = jax.jit(jax.vmap(function))
+            self._made[name] = jax.jit(lambda *rows: jax.lax.map(lambda row: function(*row), rows))
         return np.asarray(self._made[name](*rows))
 
 
