@@ -176,11 +176,11 @@ def _solve_exactly(text: str, source: str, ts: list[Decimal]) -> Exact:
         offset, size, frequency = numbers
         w = 2 * PI * frequency
         # σ = (s, cosine part, offset)
-        drive = np.array([[0, w, 0], [-w, 0, w], [0, 0, 0]], object) * Decimal(1)
+        drive, wave = np.array([[0, w, 0], [-w, 0, w], [0, 0, 0]], object) * Decimal(1), 0.5 / float(w)
         starts = [(Decimal(0), np.array([offset, size, offset], object))]
     else:
         low, high, delay, rise, fall, width, period = numbers
-        drive = np.array([[0, 1], [0, 0]], object) * Decimal(1)
+        drive, wave = np.array([[0, 1], [0, 0]], object) * Decimal(1), float(period)
         starts = [(Decimal(0), np.array([low, Decimal(0)], object))]
         for k in itertools.count():
             at = delay + k * period
@@ -227,7 +227,7 @@ def _solve_exactly(text: str, source: str, ts: list[Decimal]) -> Exact:
                 h, E = mode.power(level)
                 if reached and count >= _A_OCTAVE:
                     longest = [top for top, lasts in mode.rings if float(reached) < lasts]
-                    if 2 * h <= min(longest, default=float(end)):
+                    if 2 * h <= min([*longest, wave]):
                         level, count = level + 1, count // 2
                         continue
                 samples += 1

@@ -31,13 +31,27 @@ class Condition(NamedTuple):
     to: int
 
 
+class Factors(NamedTuple):
+    """Scales of rows and columns, LU factors and inverse of the scaled equations of a step, and the
+    sizes of what their solution has of x at the start."""
+
+    rows: Array
+    columns: Array
+    factors: tuple[Array, Array]
+    inverse: Array
+    from_start: Array
+
+
 class Solved(NamedTuple):
-    """x at the nodes and p at the collocation points, and by how much rounding may change them."""
+    """x at the nodes and p at the collocation points, by how much rounding may change them, and by how
+    much what x may be off by at the start."""
 
     x: Array
     p: Array
     noise_x: Array
     noise_p: Array
+    carried_x: Array
+    carried_p: Array
 
 
 class Equations:
@@ -73,14 +87,14 @@ class Equations:
         light = spectrum[(imag > 4.0 * np.abs(real)) & (imag > 0)]
         self.rings = rings(whole, len(system.A), light)
         self._reach: dict[float, Array] = {}
-        self._factors: dict[float, tuple[Array, Array, tuple[Array, Array], Array]] = {}
+        self._factors: dict[float, Factors] = {}
 
-    def solve(self, h: float, x0: Array, inputs: Array, sizes: Array) -> Solved:
-        """A step of length h from x0, for `inputs` (g, q) at the collocation points, which are sums of
-        terms of these `sizes`."""
+    def solve(self, h: float, x0: Array, inputs: Array, sizes: Array, off: Array) -> Solved:
+        """A step of length h from x0, which is `off` by so much, for `inputs` (g, q) at the collocation
+        points, which are sums of terms of these `sizes`."""
         system, u, s = self.system, self.unknown, radau.STAGES
         n, k = len(x0), int(self.unknown.sum())
-        rows, columns, factors, inverse = self._factorised(h)
+        rows, columns, factors, inverse, from_start = self._factorised(h)
         g, q = inputs[:, :n], inputs[:, n:]
         A, B, C, M = system.A, system.B[:, u], system.C[u], system.M[np.ix_(u, u)]
         # For x − x0, so that the rounding of a short step is that of a small change.
@@ -93,8 +107,8 @@ class Equations:
         for _ in range(_REFINED):
             X, Q = found[:, :n], found[:, n:]
             of_x = right[:, :n] - radau.D[1:, 1:] @ X + h * (X @ A.T + Q @ B.T)
-            off = np.hstack([of_x, right[:, n:] - X @ C.T - Q @ M.T])
-            change = scipy.linalg.lu_solve(factors, (off * rows).ravel(), check_finite=False)
+            residual = np.hstack([of_x, right[:, n:] - X @ C.T - Q @ M.T])
+            change = scipy.linalg.lu_solve(factors, (residual * rows).ravel(), check_finite=False)
             change = change.reshape(s, n + k) * columns
             found = found + change
             size = np.abs(found).max(axis=0)
@@ -113,12 +127,16 @@ class Equations:
         terms[:, :n] += h * (X @ np.abs(system.A.T) + P @ np.abs(system.B.T) + sizes[:n])
         of_law = X @ np.abs(system.C.T) + P @ np.abs(system.M.T) + sizes[n:]
         terms[:, n:] = (of_law + np.abs(self.prescribed_d))[:, u]
-        off = _ROW * np.linalg.norm(inverse * (terms * rows).ravel(), axis=1)
-        off = off.reshape(s, n + k) * columns
-        off[:, :n] += _ROW * X
-        noise_p = np.zeros((s, len(u)))
-        noise_p[:, u] = off[:, n:]
-        return Solved(x, p, np.vstack([0.0 * x0, off[:, :n]]), noise_p)
+        noise = _ROW * np.linalg.norm(inverse * (terms * rows).ravel(), axis=1)
+        carried = (from_start @ off).reshape(s, n + k) * columns
+        both = []
+        for v in (noise.reshape(s, n + k) * columns, carried):
+            of_p = np.zeros((s, len(u)))
+            of_p[:, u] = v[:, n:]
+            both.append((v[:, :n], of_p))
+        (noise_x, noise_p), (carried_x, carried_p) = both
+        noise_x = np.vstack([0.0 * x0, noise_x + _ROW * X])
+        return Solved(x, p, noise_x, noise_p, np.vstack([off, carried_x]), carried_p)
 
     def reach(self, h: float) -> Array:
         """Sizes of the entries of (1/h − A)⁻¹, A that of the states alone: what a disturbance of x'
@@ -190,9 +208,8 @@ class Equations:
         y, w = self.members(p, d)
         return y, w, *self.members(*self.noise(np.abs(x), np.abs(p), sizes, off))
 
-    def _factorised(self, h: float) -> tuple[Array, Array, tuple[Array, Array], Array]:
-        """Scales of rows and columns, LU factors of the scaled equations of a step, and the sizes of
-        the entries of their inverse.
+    def _factorised(self, h: float) -> Factors:
+        """Those of a step of this length.
 
         States are measured by their energy, since pivots that compare volts with amperes would spoil
         the smaller ones, and each p and its row by their largest entries."""
@@ -221,8 +238,11 @@ class Equations:
         if len(self._factors) >= _KEPT:
             self._factors.clear()
         factors = scipy.linalg.lu_factor(large[:, None] * K, check_finite=False)
-        inverse = np.abs(scipy.linalg.lu_solve(factors, np.eye(len(K)), check_finite=False))
-        found = rows * large.reshape(s, n + k), columns, factors, inverse
+        rows = rows * large.reshape(s, n + k)
+        inverse = scipy.linalg.lu_solve(factors, np.eye(len(K)), check_finite=False)
+        scaled = inverse.reshape(-1, s, n + k)[:, :, :n] * rows[:, :n]
+        from_start = np.abs(np.einsum("kji,j->ki", scaled, radau.D[1:, 0]))
+        found = Factors(rows, columns, factors, inverse, from_start)
         self._factors[h] = found
         return found
 

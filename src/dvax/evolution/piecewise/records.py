@@ -51,7 +51,7 @@ class Row(NamedTuple):
 class Attempt(NamedTuple):
     """A step that was computed: x at the nodes, y at the points, y and w on the grid with the `slack`
     that they may be off by; the `rings` beside these polynomials, (λ, x, y, w), and by how much they
-    `swing` y and w at most; the `size` of the whole state; what the polynomials are `lacking` in d, and
+    `swing` y and w at most; the `size` of the whole state; what the polynomials are `lacking` in x, and
     `excess`, the same in units of what is allowed; and the `residuals` of the state's and of the law's
     equations at θ = 0."""
 

@@ -47,7 +47,7 @@ class Run:
         self.times, self.dense = times, dense
         self.equations: dict[Mode, Equations] = {}
         self.mode = first_mode(given)
-        self.scale, self.off, self.law_off = np.abs(x0), 0.0 * x0, np.zeros(len(given.low))
+        self.scale, self.off, self.lacking = np.abs(x0), 0.0 * x0, 0.0 * x0
         self.rows: list[Row] = []
         self.steps: list[Step] = []
         self.events: list[tuple[float, Mode]] = []
@@ -172,7 +172,8 @@ class Run:
         rings, x0 = self._rings(own, piece, begin, h)
         # Rounding in the inputs is that of the terms they are summed from.
         terms = np.abs(piece.coefficients).sum(axis=0)
-        x, p, noise_x, noise_p = own.solve(h, x0, given, terms)
+        solved = own.solve(h, x0, given, terms, self.off + self.lacking)
+        x, p, noise_x, noise_p = solved[:4]
         if not (np.isfinite(x).all() and np.isfinite(p).all()):
             return None
         beside = sum((2.0 * np.abs(ring[1]) for ring in rings), np.zeros(n))
@@ -202,15 +203,14 @@ class Run:
         y, w = own.members(P, d)
         tail_d = np.abs(own.system.C) @ tail_x + np.abs(own.system.M) @ tail_p
         # What the step before was lacking decides on signs, and not on what this one may lack.
-        grid_x = (np.abs(radau.FROM_NODES) @ noise_x).max(axis=0)
-        slack_p = (np.abs(radau.FROM_POINTS) @ noise_p).max(axis=0) + own.of_law(self.law_off)
-        _, slack_d = own.noise(
-            *sizes, np.abs(own.system.C) @ grid_x + np.abs(own.system.M) @ slack_p + self.law_off
-        )
+        of_x = (np.abs(radau.FROM_NODES) @ (noise_x + solved.carried_x)).max(axis=0)
+        slack_p = (np.abs(radau.FROM_POINTS) @ (noise_p + solved.carried_p)).max(axis=0)
+        of_d = np.abs(own.system.C) @ of_x + np.abs(own.system.M) @ slack_p
+        _, slack_d = own.noise(*sizes, of_d)
         slack = own.members(
             slack_p + layer + _EXTRAPOLATED * tail_p, slack_d + _EXTRAPOLATED * tail_d
         )
-        lacking = _EXTRAPOLATED * tail_d
+        lacking = _EXTRAPOLATED * tail_x
         ys, _ = own.members(p, own.dependent(x[1:], p, given[:, n:]))
         none = np.zeros(len(p[0]))
         swing = (
@@ -303,8 +303,9 @@ class Run:
             mean = float(np.clip(-c.sign * value, 0.0, found.slack[k][c.i]).mean())
             passed[k, c.i] = mean
             if mean > 0.0:
-                # A residual below zero is a response in the mode that would follow.
-                mode = self.of(changed(self.mode, c)) if c.of_w else own
+                # A residual below zero is a response in the mode that would follow, and what follows
+                # from a response that would be at its bound there is known from that mode as well.
+                mode = self.of(changed(self.mode, c))
                 response = mean / self.given.M[c.i, c.i] if c.of_w else mean
                 self.veiled += mode.reach(theta * h) @ size[:, c.i] * response
         self.defect += theta * h * self._norm(size @ passed[0])
@@ -327,7 +328,7 @@ class Run:
         if step.used > 0.0:
             size, of_y, of_w = found.sizes(step.used)
             self.largest = np.maximum(self.largest, [of_y, of_w])
-            self.law_off = found.lacking
+            self.lacking = found.lacking
             self.off, self.scale = found.noise, np.maximum(self.scale, size)
         self.t = piece.start + end
         share = (self.t - self.pieces[0].start) / self.span
