@@ -12,7 +12,7 @@ import scipy.linalg
 
 from . import radau
 from .rings import Ring, rings
-from .system import Affine
+from .system import LARGEST, Affine
 
 Array = np.ndarray
 Mode = tuple[int, ...]
@@ -32,13 +32,12 @@ class Condition(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """Scales of rows and columns, LU factors and inverse of the scaled equations of a step, and the
-    sizes of what their solution has of x at the start."""
+    """Scales of rows and columns, LU factors of the scaled equations of a step, and the sizes of what
+    their solution has of x at the start."""
 
     rows: Array
     columns: Array
     factors: tuple[Array, Array]
-    inverse: Array
     from_start: Array
 
 
@@ -94,7 +93,7 @@ class Equations:
         points, which are sums of terms of these `sizes`."""
         system, u, s = self.system, self.unknown, radau.STAGES
         n, k = len(x0), int(self.unknown.sum())
-        rows, columns, factors, inverse, from_start = self._factorised(h)
+        rows, columns, factors, from_start = self._factorised(h)
         g, q = inputs[:, :n], inputs[:, n:]
         A, B, C, M = system.A, system.B[:, u], system.C[u], system.M[np.ix_(u, u)]
         # For x − x0, so that the rounding of a short step is that of a small change.
@@ -120,14 +119,16 @@ class Equations:
         p = np.tile(self.prescribed_p, (s, 1))
         p[:, u] = found[:, n:]
         x = np.vstack([x0, x0 + found[:, :n]])
-        # By K⁻¹ times the rounding of the residual, which is independent at different points.
+        # The rounding of the residual, with a few patterns of signs, as it is at different points.
         X, P = np.abs(x[1:]), np.abs(p)
         terms = np.empty((s, n + k))
         terms[:, :n] = np.abs(radau.D[1:, 1:]) @ np.abs(found[:, :n])
         terms[:, :n] += h * (X @ np.abs(system.A.T) + P @ np.abs(system.B.T) + sizes[:n])
         of_law = X @ np.abs(system.C.T) + P @ np.abs(system.M.T) + sizes[n:]
         terms[:, n:] = (of_law + np.abs(self.prescribed_d))[:, u]
-        noise = _ROW * np.linalg.norm(inverse * (terms * rows).ravel(), axis=1)
+        patterns = _SIGNS[: terms.size] * (_ROW * terms * rows).ravel()[:, None]
+        noise = scipy.linalg.lu_solve(factors, patterns, check_finite=False)
+        noise = np.abs(noise).max(axis=1)
         carried = (from_start @ off).reshape(s, n + k) * columns
         both = []
         for v in (noise.reshape(s, n + k) * columns, carried):
@@ -239,16 +240,18 @@ class Equations:
             self._factors.clear()
         factors = scipy.linalg.lu_factor(large[:, None] * K, check_finite=False)
         rows = rows * large.reshape(s, n + k)
-        inverse = scipy.linalg.lu_solve(factors, np.eye(len(K)), check_finite=False)
-        scaled = inverse.reshape(-1, s, n + k)[:, :, :n] * rows[:, :n]
-        from_start = np.abs(np.einsum("kji,j->ki", scaled, radau.D[1:, 0]))
-        found = Factors(rows, columns, factors, inverse, from_start)
+        start = np.zeros((s, n + k, n))
+        start[:, states, states] = radau.D[1:, :1] * rows[:, :n]
+        start = scipy.linalg.lu_solve(factors, start.reshape(len(K), n), check_finite=False)
+        found = Factors(rows, columns, factors, np.abs(start))
         self._factors[h] = found
         return found
 
 
 _ROW = 4.0 * np.finfo(float).eps
 """Rounding of a row of a refined solution, relative to the sum of the sizes of its terms."""
+
+_SIGNS = np.random.default_rng(0).choice([-1.0, 1.0], (2 * LARGEST * radau.STAGES, 4))
 
 _REFINED, _ACCURATE = 6, 1e-14
 _KEPT = 64
