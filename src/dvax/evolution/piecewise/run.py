@@ -114,7 +114,7 @@ class Run:
     def _through(self, piece: Piece, last: bool) -> str:
         """All steps of a piece."""
         begin, low, proposal = 0.0, 0.0, np.inf
-        even, reached = 0, 0.0
+        even, reached, doubts = 0, 0.0, 0
         while begin < piece.length:
             own = self.of(self.mode)
             remaining = (piece.length - begin) - low
@@ -132,8 +132,9 @@ class Run:
                     continue
                 theta, condition = self._first_change(own, attempt, h)
                 nearer = until(own, h, theta) if condition is not None else h
-                if nearer < 0.8 * h and attempt.is_coarse(theta):
+                if doubts < _MOST_DOUBTS and nearer < 0.8 * h and attempt.is_coarse(theta):
                     self.rejected += 1
+                    doubts += 1
                     h, before = nearer, np.inf
                 else:
                     found = attempt
@@ -156,7 +157,7 @@ class Run:
                     # What is left of the excess may be rounding, which no step changes.
                     proposal, even = max(4.0 * h, proposal), 0
                 continue
-            proposal, even, reached = np.inf, 0, 0.0
+            proposal, even, reached, doubts = np.inf, 0, 0.0, 0
             self.mode = changed(self.mode, condition)
             self.switchings += 1
             self.events.append((self.t, self.mode))
@@ -382,6 +383,9 @@ _SHOWN = 0.02
 """The share of a run between two lines that `progress` prints."""
 
 _MOST_CHANGES, _MOST_STUCK = 4096, 12
+_MOST_DOUBTS = 4
+"""How often a switching is located again in a shorter step, until there is one."""
+
 _ROUNDING = 256.0 * np.finfo(float).eps
 
 
