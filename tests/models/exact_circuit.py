@@ -1,6 +1,6 @@
 """Circuits with one source, solved from switching to switching in 100 decimal digits.
 
-With ζ = (x, s, …) the source is a linear system as well, so that in each mode ζ' = Zζ with a constant Z,
+With ζ = (x, s, …) the source is a linear system as well, so in each mode ζ' = Zζ with a constant Z,
 and ζ(τ) = exp(Zτ)ζ(0) by Taylor's series and squaring. A switching is where one of the currents and
 blocked voltages, linear functions of ζ, changes its sign; it is bisected to the last digit. Nothing in
 here is stiff, small or large in a way that 100 digits would notice. What is sampled is only whether
@@ -129,7 +129,6 @@ class _Mode:
         # Each has a sign to keep.
         self.conditions = np.where(on[:, None], self.currents, self.blocked)
         self.on = on
-        # Balanced by the size of the rows first: volts and amperes differ by many powers of ten.
         spectrum = np.linalg.eigvals(self.Z[:n, :n].astype(float))
         ringing = spectrum[np.abs(spectrum.imag) > np.abs(spectrum.real) / 8]
         # (longest step, how long) of each oscillation
@@ -176,7 +175,10 @@ def _solve_exactly(text: str, source: str, ts: list[Decimal]) -> Exact:
         offset, size, frequency = numbers
         w = 2 * PI * frequency
         # σ = (s, cosine part, offset)
-        drive, wave = np.array([[0, w, 0], [-w, 0, w], [0, 0, 0]], object) * Decimal(1), 0.5 / float(w)
+        drive, wave = (
+            np.array([[0, w, 0], [-w, 0, w], [0, 0, 0]], object) * Decimal(1),
+            0.5 / float(w),
+        )
         starts = [(Decimal(0), np.array([offset, size, offset], object))]
     else:
         low, high, delay, rise, fall, width, period = numbers
@@ -232,7 +234,7 @@ def _solve_exactly(text: str, source: str, ts: list[Decimal]) -> Exact:
                         continue
                 samples += 1
                 if samples > _MOST_SAMPLES:
-                    raise TooManySamples
+                    raise TooManySamples(f"{_MOST_SAMPLES} samples do not show every period")
                 count += 1
                 if t + reached + h >= end:
                     h = end - t - reached

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.integrate
+from tests.models.exact_circuit import TooManySamples, solve_exactly
 from tests.models.tableau import random_netlist, tableau
 from tests.models.test_frame import GROUND, RECORD, STEP, elastoplastic, exactly
 from tests.oracles import affine_box_vi
@@ -254,6 +255,26 @@ def test_circuits_of_any_kind_and_scale_run_at_the_defaults(seed):
     # The law holds within what voltages of this size leave of a current through so little.
     size = 1e-8 * (1 + np.abs(np.asarray(sol.xs)).max() + np.abs(np.asarray(sol.us)).max())
     assert np.abs(np.asarray(sol.law_step)).max() <= size
+
+
+@pytest.mark.parametrize(
+    "seed", [2, 25, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(26, 200))]
+)
+def test_circuits_of_any_kind_and_scale_agree_with_a_hundred_digits(seed):
+    text, source, end, _ = drawn(np.random.default_rng(seed))
+    ts = np.linspace(0.0, end, 21)
+    try:
+        exact = solve_exactly(text, source, ts)
+    except TooManySamples as found:
+        pytest.skip(str(found))
+    circuit = Circuit(text)
+    sol = circuit.solve(end, ts)
+    xs, us = np.asarray(sol.xs), np.asarray(sol.us)
+    # The default tolerances, of each state.
+    assert np.all(np.abs(xs - exact.xs) <= 1e-8 * np.abs(exact.xs).max(axis=0) + 1e-9)
+    ys = np.where(circuit.blocking, exact.blocked, exact.currents)
+    size = 1.0 + np.abs(exact.xs).max() + np.abs(ys).max()
+    np.testing.assert_allclose(us, ys, rtol=0, atol=1e-8 * size)
 
 
 @pytest.mark.parametrize(

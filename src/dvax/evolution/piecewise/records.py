@@ -10,7 +10,7 @@ Array = np.ndarray
 
 
 _USED, _LARGER = 0.05, 4.0
-"""The least part of a step that is used before a switching, and by how much its values may grow after."""
+"""The least part of a step that is used before a switching, and how much values may grow after it."""
 
 
 class Step(NamedTuple):
