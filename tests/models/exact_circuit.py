@@ -4,7 +4,8 @@ With ζ = (x, s, …) the source is a linear system as well, so in each mode ζ'
 and ζ(τ) = exp(Zτ)ζ(0) by Taylor's series and squaring. A switching is where one of the currents and
 blocked voltages, linear functions of ζ, changes its sign; it is bisected to the last digit. Nothing in
 here is stiff, small or large in a way that 100 digits would notice. What is sampled is only whether
-there is a change of sign: sixteen times an octave after every switching, and a dozen times a period.
+there is a change of sign: sixteen times an octave after every switching, and a dozen times a
+period, with the slopes at both ends of each interval.
 """
 
 import decimal
@@ -144,6 +145,27 @@ class _Mode:
             self._powers.append(self._powers[-1].dot(self._powers[-1]))
         return self.first * 2**k, self._powers[k]
 
+    def dip(self, before: Array, after: Array, h: Decimal, noise: Array) -> Decimal | None:
+        """A time within h at which a condition that holds at both ends does not; by its slopes."""
+        slopes = self.conditions.dot(self.Z)
+        for k in range(len(slopes)):
+            falls, rises = slopes[k].dot(before), slopes[k].dot(after)
+            if not falls < 0 < rises:
+                continue
+            start, end = self.conditions[k].dot(before), self.conditions[k].dot(after)
+            # Where both tangents meet.
+            meet = (end - start - rises * h) / (falls - rises)
+            if start + falls * meet >= 0:
+                continue
+            low, high = Decimal(0), h
+            for _ in range(60):
+                middle = (low + high) / 2
+                at = self.after(before, middle)
+                if self.conditions[k].dot(at) < -noise[k]:
+                    return middle
+                low, high = (middle, high) if slopes[k].dot(at) < 0 else (low, middle)
+        return None
+
     def after(self, zeta: Array, time: Decimal) -> Array:
         """ζ after any time: the binary digits of it, and what is left by Taylor's series."""
         count, left = divmod(time, self.first)
@@ -243,6 +265,10 @@ def _solve_exactly(text: str, source: str, ts: list[Decimal]) -> Exact:
                     after = E.dot(before)
                 # Against the rounding of 100 digits alone.
                 noise = Decimal(10) ** (30 - DIGITS) * np.abs(mode.conditions).dot(np.abs(after))
+                if all(mode.conditions.dot(after) >= -noise):
+                    dip = mode.dip(before, after, h, noise)
+                    if dip is not None:
+                        h, after = dip, mode.after(before, dip)
                 if any(mode.conditions.dot(after) < -noise):
                     low, high = Decimal(0), h
                     for _ in range(160):

@@ -163,16 +163,20 @@ def test_a_bridge_and_a_clipper_of_almost_ideal_diodes():
     assert work(sol) <= 60 * (int(sol.stats["switchings"]) + 2)
 
 
+def stiffened(seed):
+    """A random circuit, with diodes of 10 mΩ to 1 Ω."""
+    rng = np.random.default_rng(seed)
+    words = [
+        word if not word.startswith("R=") else f"R={10 ** rng.uniform(-2, 0):.6f}"
+        for word in random_netlist(rng, island=False).split(" ")
+    ]
+    return " ".join(words)
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(60))
 def test_random_circuits_of_stiff_diodes_agree_with_the_second_analysis(seed):
-    rng = np.random.default_rng(seed)
-    text = random_netlist(rng, island=False)
-    words = [
-        word if not word.startswith("R=") else f"R={10 ** rng.uniform(-2, 0):.6f}"
-        for word in text.split(" ")
-    ]
-    text = " ".join(words).replace("\n", "\n")
+    text = stiffened(seed)
     sources = [line for line in text.splitlines() if line[0] in "VI"]
     plain = tableau(text)
     circuit = Circuit(text)
@@ -192,6 +196,13 @@ def test_random_circuits_of_stiff_diodes_agree_with_the_second_analysis(seed):
     np.testing.assert_allclose(
         np.asarray(sol.xs), found.y.T, atol=2e-6 * (1 + np.abs(found.y).max())
     )
+
+
+@pytest.mark.parametrize("seed", [27, 40])
+def test_the_last_time_is_saved_where_the_last_step_ends_within_rounding_of_it(seed):
+    ts = np.linspace(0.0, 2.0, 9)
+    sol = Circuit(stiffened(seed)).solve(ts[-1], ts)
+    np.testing.assert_array_equal(sol.ts, ts)
 
 
 def drawn(rng, mild=False):

@@ -144,7 +144,7 @@ class Run:
             rings = tuple(ring[:3] for ring in found.rings)
             step = Step(piece.start + begin, h, theta, found.x, found.ys, rings)
             end = piece.length if whole else begin + (low + theta * h)
-            self._keep(step, found, piece, begin + low, end, last and whole)
+            self._keep(step, found, piece, begin + low, end, bool(last and end >= piece.length))
             self.x = step.at(np.array([theta]))[0][0]
             if whole:
                 return "successful"
