@@ -225,9 +225,13 @@ class Run:
             np.minimum(slack[0], _MOST_SLACK * (self.rtol * largest[0] + self.atol)),
             np.minimum(slack[1], _MOST_SLACK * (self.rtol * largest[1] + self.atol * of_w)),
         )
+        residuals = self._residuals(own, x, p, G[0], h)
+        # What a layer leaves in the defect, of which bounds are made.
+        most = _OF_DEFECT * (self.rtol * energy + self._norm(np.full(n, self.atol)))
+        excess = max(excess, h * _mean(1.0) * self._norm(residuals[0]) / (most + tiny))
         return Attempt(
             x, ys, y, w, slack, rings, swing, sizes[0], noise_x.max(axis=0), lacking, excess,
-            self._residuals(own, x, p, G[0], h),
+            residuals,
         )  # fmt: skip
 
     def _rings(
@@ -363,6 +367,9 @@ _AT_POINTS, _ON_GRID, _START = (basis(v) for v in (radau.POINTS, radau.GRID, np.
 
 _EXTRAPOLATED = 16.0
 """What a polynomial may lack at θ = 0, in units of its last coefficients."""
+
+_OF_DEFECT = 1e-2
+"""The most that a step may add to the defect, in units of the tolerance."""
 
 _ONE_VALUE = 16.0 * np.finfo(float).eps
 """What rounding may do to the law at one x, relative to the sum of the sizes of its terms."""
