@@ -194,6 +194,20 @@ def test_a_spectrum_is_that_of_its_frames():
         assert found.elastic[k] == pytest.approx(frame.figures()["largest_displacement"], rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    "taus", [[1.2e-4, 1e-8], pytest.param([1e-5, 1e-6, 1e-7], marks=pytest.mark.thorough)]
+)
+def test_a_spectrum_of_any_viscosity_is_that_of_its_frames(taus):
+    # On both sides of the η/k from which on frames are solved one by one, and far beyond it.
+    T, z, ratio = np.array([[0.4], [1.1]]), 0.05, 0.4
+    record = Accelerogram(STEP, GROUND[:81])
+    found = response_spectrum(record, T, z, ratio, taus, chunk=2)
+    for k in np.ndindex(2, len(taus)):
+        limit = found.yield_displacement[k]
+        exact = peak_of(viscoplastic(T[k[0], 0], z, limit, taus[k[1]]), GROUND[:81])
+        assert found.peak[k] == pytest.approx(exact, rel=1e-6)
+
+
 def test_the_constants_are_proved():
     frame = Frame(
         record=RECORD, period=0.5, damping=0.05, yield_displacement=0.5, viscosity_ratio=0.02

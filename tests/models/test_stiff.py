@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.integrate
+from tests.models.exact_circuit import TooManySamples, solve_exactly
 from tests.models.tableau import random_netlist, tableau
 from tests.models.test_frame import GROUND, RECORD, STEP, elastoplastic, exactly
 from tests.oracles import affine_box_vi
@@ -162,16 +163,20 @@ def test_a_bridge_and_a_clipper_of_almost_ideal_diodes():
     assert work(sol) <= 60 * (int(sol.stats["switchings"]) + 2)
 
 
+def stiffened(seed):
+    """A random circuit, with diodes of 10 mΩ to 1 Ω."""
+    rng = np.random.default_rng(seed)
+    words = [
+        word if not word.startswith("R=") else f"R={10 ** rng.uniform(-2, 0):.6f}"
+        for word in random_netlist(rng, island=False).split(" ")
+    ]
+    return " ".join(words)
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(60))
 def test_random_circuits_of_stiff_diodes_agree_with_the_second_analysis(seed):
-    rng = np.random.default_rng(seed)
-    text = random_netlist(rng, island=False)
-    words = [
-        word if not word.startswith("R=") else f"R={10 ** rng.uniform(-2, 0):.6f}"
-        for word in text.split(" ")
-    ]
-    text = " ".join(words).replace("\n", "\n")
+    text = stiffened(seed)
     sources = [line for line in text.splitlines() if line[0] in "VI"]
     plain = tableau(text)
     circuit = Circuit(text)
@@ -191,6 +196,13 @@ def test_random_circuits_of_stiff_diodes_agree_with_the_second_analysis(seed):
     np.testing.assert_allclose(
         np.asarray(sol.xs), found.y.T, atol=2e-6 * (1 + np.abs(found.y).max())
     )
+
+
+@pytest.mark.parametrize("seed", [27, 40])
+def test_the_last_time_is_saved_where_the_last_step_ends_within_rounding_of_it(seed):
+    ts = np.linspace(0.0, 2.0, 9)
+    sol = Circuit(stiffened(seed)).solve(ts[-1], ts)
+    np.testing.assert_array_equal(sol.ts, ts)
 
 
 def drawn(rng, mild=False):
@@ -254,6 +266,26 @@ def test_circuits_of_any_kind_and_scale_run_at_the_defaults(seed):
     # The law holds within what voltages of this size leave of a current through so little.
     size = 1e-8 * (1 + np.abs(np.asarray(sol.xs)).max() + np.abs(np.asarray(sol.us)).max())
     assert np.abs(np.asarray(sol.law_step)).max() <= size
+
+
+@pytest.mark.parametrize(
+    "seed", [2, 25, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(26, 200))]
+)
+def test_circuits_of_any_kind_and_scale_agree_with_a_hundred_digits(seed):
+    text, source, end, _ = drawn(np.random.default_rng(seed))
+    ts = np.linspace(0.0, end, 21)
+    try:
+        exact = solve_exactly(text, source, ts)
+    except TooManySamples as found:
+        pytest.skip(str(found))
+    circuit = Circuit(text)
+    sol = circuit.solve(end, ts)
+    xs, us = np.asarray(sol.xs), np.asarray(sol.us)
+    # The default tolerances, of each state.
+    assert np.all(np.abs(xs - exact.xs) <= 1e-8 * np.abs(exact.xs).max(axis=0) + 1e-9)
+    ys = np.where(circuit.blocking, exact.blocked, exact.currents)
+    size = 1.0 + np.abs(exact.xs).max() + np.abs(ys).max()
+    np.testing.assert_allclose(us, ys, rtol=0, atol=1e-8 * size)
 
 
 @pytest.mark.parametrize(

@@ -20,3 +20,8 @@ def longer(own: Equations, h: float, excess: float) -> float:
         return h if excess > 0.1 else 1.5 * h
     longer = own.scales[own.scales > 1.5 * h]
     return float(longer[0]) if len(longer) else np.inf
+
+
+def until(own: Equations, h: float, theta: float) -> float:
+    """The step that ends soon after θ, no shorter than the shortest time scale of the mode."""
+    return max(1.25 * theta * h, float(own.scales[0]) if len(own.scales) else h)

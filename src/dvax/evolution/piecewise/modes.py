@@ -12,7 +12,7 @@ import scipy.linalg
 
 from . import radau
 from .rings import Ring, rings
-from .system import Affine
+from .system import LARGEST, Affine
 
 Array = np.ndarray
 Mode = tuple[int, ...]
@@ -29,6 +29,28 @@ class Condition(NamedTuple):
     sign: float
     bound: float
     to: int
+
+
+class Factors(NamedTuple):
+    """Scales of rows and columns, LU factors of the scaled equations of a step, and the sizes of what
+    their solution has of x at the start."""
+
+    rows: Array
+    columns: Array
+    factors: tuple[Array, Array]
+    from_start: Array
+
+
+class Solved(NamedTuple):
+    """x at the nodes and p at the collocation points, by how much rounding may change them, and by how
+    much what x may be off by at the start."""
+
+    x: Array
+    p: Array
+    noise_x: Array
+    noise_p: Array
+    carried_x: Array
+    carried_p: Array
 
 
 class Equations:
@@ -64,45 +86,58 @@ class Equations:
         light = spectrum[(imag > 4.0 * np.abs(real)) & (imag > 0)]
         self.rings = rings(whole, len(system.A), light)
         self._reach: dict[float, Array] = {}
-        self._factors: dict[float, tuple[Array, Array, tuple[Array, Array]]] = {}
+        self._factors: dict[float, Factors] = {}
 
-    def solve(self, h: float, x0: Array, inputs: Array) -> tuple[Array, Array]:
-        """(x at the nodes, p at the collocation points) of a step of length h from x0, for `inputs`
-        (g, q) at the collocation points."""
+    def solve(self, h: float, x0: Array, inputs: Array, sizes: Array, off: Array) -> Solved:
+        """A step of length h from x0, which is `off` by so much, for `inputs` (g, q) at the collocation
+        points, which are sums of terms of these `sizes`."""
         system, u, s = self.system, self.unknown, radau.STAGES
         n, k = len(x0), int(self.unknown.sum())
-        rows, columns, factors = self._factorised(h)
+        rows, columns, factors, from_start = self._factorised(h)
         g, q = inputs[:, :n], inputs[:, n:]
-        right = np.zeros((s, n + k))
-        right[:, :n] = h * (g + system.B @ self.prescribed_p) - radau.D[1:, :1] * x0
-        right[:, n:] = (self.prescribed_d - q - system.M @ self.prescribed_p)[:, u]
         A, B, C, M = system.A, system.B[:, u], system.C[u], system.M[np.ix_(u, u)]
+        # For x − x0, so that the rounding of a short step is that of a small change.
+        right = np.zeros((s, n + k))
+        right[:, :n] = h * (g + system.B @ self.prescribed_p + A @ x0)
+        right[:, n:] = (self.prescribed_d - q - system.M @ self.prescribed_p)[:, u] - C @ x0
         found = np.zeros((s, n + k))
         # Refined until the errors of each equation are the rounding of its own terms.
         last = np.inf
         for _ in range(_REFINED):
             X, Q = found[:, :n], found[:, n:]
             of_x = right[:, :n] - radau.D[1:, 1:] @ X + h * (X @ A.T + Q @ B.T)
-            off = np.hstack([of_x, right[:, n:] - X @ C.T - Q @ M.T])
-            change = scipy.linalg.lu_solve(factors, (off * rows).ravel(), check_finite=False)
+            residual = np.hstack([of_x, right[:, n:] - X @ C.T - Q @ M.T])
+            change = scipy.linalg.lu_solve(factors, (residual * rows).ravel(), check_finite=False)
             change = change.reshape(s, n + k) * columns
             found = found + change
             size = np.abs(found).max(axis=0)
+            size[:n] += np.abs(x0)
             now = float(np.max(np.abs(change).max(axis=0) / np.where(size > 0.0, size, 1.0)))
             if not (_ACCURATE < now < 0.5 * last):
                 break
             last = now
         p = np.tile(self.prescribed_p, (s, 1))
         p[:, u] = found[:, n:]
-        return np.vstack([x0, found[:, :n]]), p
-
-    def hidden(self, x: Array, p: Array, q: Array) -> Array:
-        """The changes of each entry of x that rounding in the law hides; 0 of those not in it."""
-        C = np.abs(self.system.C)
-        terms = ROUNDINGS / 8.0 * (C @ x + np.abs(self.system.M) @ p + q)
-        each = np.where(C > 0.0, terms[:, None] / np.where(C > 0.0, C, 1.0), np.inf)
-        least = each.min(axis=0, initial=np.inf)
-        return np.where(np.isfinite(least), least, 0.0)
+        x = np.vstack([x0, x0 + found[:, :n]])
+        # The rounding of the residual, with a few patterns of signs, as it is at different points.
+        X, P = np.abs(x[1:]), np.abs(p)
+        terms = np.empty((s, n + k))
+        terms[:, :n] = np.abs(radau.D[1:, 1:]) @ np.abs(found[:, :n])
+        terms[:, :n] += h * (X @ np.abs(system.A.T) + P @ np.abs(system.B.T) + sizes[:n])
+        of_law = X @ np.abs(system.C.T) + P @ np.abs(system.M.T) + sizes[n:]
+        terms[:, n:] = (of_law + np.abs(self.prescribed_d))[:, u]
+        patterns = _SIGNS[: terms.size] * (_ROW * terms * rows).ravel()[:, None]
+        noise = scipy.linalg.lu_solve(factors, patterns, check_finite=False)
+        noise = np.abs(noise).max(axis=1)
+        carried = (from_start @ off).reshape(s, n + k) * columns
+        both = []
+        for v in (noise.reshape(s, n + k) * columns, carried):
+            of_p = np.zeros((s, len(u)))
+            of_p[:, u] = v[:, n:]
+            both.append((v[:, :n], of_p))
+        (noise_x, noise_p), (carried_x, carried_p) = both
+        noise_x = np.vstack([0.0 * x0, noise_x + _ROW * X])
+        return Solved(x, p, noise_x, noise_p, np.vstack([off, carried_x]), carried_p)
 
     def reach(self, h: float) -> Array:
         """Sizes of the entries of (1/h − A)⁻¹, A that of the states alone: what a disturbance of x'
@@ -136,14 +171,16 @@ class Equations:
         d[:, self.unknown] = self.prescribed_d[self.unknown]
         return d
 
-    def noise(self, x: Array, p: Array, q: Array, off: Array) -> tuple[Array, Array]:
+    def noise(
+        self, x: Array, p: Array, q: Array, off: Array, rounding: float = ROUNDINGS
+    ) -> tuple[Array, Array]:
         """What rounding leaves undetermined of p and of d, for values of these sizes; d as it follows
         from x is `off` already."""
         system, u = self.system, self.unknown
         terms = np.abs(system.C) @ x + np.abs(system.M) @ p + q
-        of_d = ROUNDINGS * terms + off
+        of_d = rounding * terms + off
         of_p = self.of_law(of_d)
-        of_p[u] += ROUNDINGS * p[u]
+        of_p[u] += rounding * p[u]
         of_d = of_d + np.abs(system.M[:, u]) @ of_p[u]
         return of_p, of_d
 
@@ -172,8 +209,8 @@ class Equations:
         y, w = self.members(p, d)
         return y, w, *self.members(*self.noise(np.abs(x), np.abs(p), sizes, off))
 
-    def _factorised(self, h: float) -> tuple[Array, Array, tuple[Array, Array]]:
-        """Scales of rows and columns, and LU factors of the scaled equations of a step.
+    def _factorised(self, h: float) -> Factors:
+        """Those of a step of this length.
 
         States are measured by their energy, since pivots that compare volts with amperes would spoil
         the smaller ones, and each p and its row by their largest entries."""
@@ -202,10 +239,19 @@ class Equations:
         if len(self._factors) >= _KEPT:
             self._factors.clear()
         factors = scipy.linalg.lu_factor(large[:, None] * K, check_finite=False)
-        found = rows * large.reshape(s, n + k), columns, factors
+        rows = rows * large.reshape(s, n + k)
+        start = np.zeros((s, n + k, n))
+        start[:, states, states] = radau.D[1:, :1] * rows[:, :n]
+        start = scipy.linalg.lu_solve(factors, start.reshape(len(K), n), check_finite=False)
+        found = Factors(rows, columns, factors, np.abs(start))
         self._factors[h] = found
         return found
 
+
+_ROW = 4.0 * np.finfo(float).eps
+"""Rounding of a row of a refined solution, relative to the sum of the sizes of its terms."""
+
+_SIGNS = np.random.default_rng(0).choice([-1.0, 1.0], (2 * LARGEST * radau.STAGES, 4))
 
 _REFINED, _ACCURATE = 6, 1e-14
 _KEPT = 64

@@ -188,7 +188,13 @@ def first_negative(
             break
         shortest = b[0] - a[0] <= 4.0 * np.finfo(float).eps
         if negative and len(a) == 1 and b[0] == until and (shortest or monotone[0]):
-            return _bisected(function, float(a[0]), until), True
+            start = float(a[0])
+            if function(start) <= 0.0:
+                # Within the slack it has been negative for longer.
+                before = GRID[start > GRID]
+                above = np.flatnonzero(function(before) > 0.0)
+                start = float(before[above[-1]]) if len(above) else 0.0
+            return _bisected(function, start, until), True
         wide = b - a > 4.0 * np.finfo(float).eps
         wide |= negative & (b == until)
         a, b = a[wide], b[wide]

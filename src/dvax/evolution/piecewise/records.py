@@ -9,6 +9,10 @@ from . import radau
 Array = np.ndarray
 
 
+_USED, _LARGER = 0.05, 4.0
+"""The least part of a step that is used before a switching, and how much values may grow after it."""
+
+
 class Step(NamedTuple):
     """x at the nodes and y at the collocation points of a step that begins at `start` in a piece, of
     which the part up to θ = `used` is the trajectory, and the oscillations 2 Re ae^{λt}(x, y) beside
@@ -47,7 +51,7 @@ class Row(NamedTuple):
 class Attempt(NamedTuple):
     """A step that was computed: x at the nodes, y at the points, y and w on the grid with the `slack`
     that they may be off by; the `rings` beside these polynomials, (λ, x, y, w), and by how much they
-    `swing` y and w at most; the `size` of the whole state; what the polynomials are `lacking` in d, and
+    `swing` y and w at most; the `size` of the whole state; what the polynomials are `lacking` in x, and
     `excess`, the same in units of what is allowed; and the `residuals` of the state's and of the law's
     equations at θ = 0."""
 
@@ -59,6 +63,7 @@ class Attempt(NamedTuple):
     rings: list[tuple[complex, Array, Array, Array]]
     swing: tuple[Array, Array]
     size: Array
+    noise: Array
     lacking: Array
     excess: float
     residuals: tuple[Array, Array]
@@ -66,6 +71,22 @@ class Attempt(NamedTuple):
     def waves(self, k: int, i: int) -> list[tuple[complex, complex]]:
         """(λ, amplitude) of the oscillations in entry i of y (k = 0) or of w (k = 1)."""
         return [(rate, (y, w)[k][i]) for rate, _, y, w in self.rings]
+
+    def sizes(self, theta: float) -> tuple[Array, Array, Array]:
+        """Of x, y and w up to θ."""
+        part = theta >= radau.GRID
+        x = np.abs(radau.FROM_NODES[part] @ self.x).max(axis=0)
+        beside = self.size - np.abs(self.x).max(axis=0)
+        y, w = (np.abs(v[part]).max(axis=0) for v in (self.y, self.w))
+        return x + beside, y, w
+
+    def is_coarse(self, theta: float) -> bool:
+        """Whether so little of a step is used, or what follows is so much larger, that its accuracy is
+        not that of the part up to θ."""
+        x, y, w = self.sizes(theta)
+        whole = self.sizes(1.0)
+        grows = (np.any(b > _LARGER * a) for a, b in zip((x, y, w), whole, strict=True))
+        return theta < _USED or any(grows)
 
     def widened(self, extent: Array) -> Array:
         """(low, high) that hold a step as well, with the margin of polynomials between samples."""

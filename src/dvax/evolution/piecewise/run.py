@@ -14,7 +14,7 @@ import numpy as np
 from .. import meter
 from . import radau
 from .inputs import Piece, basis, values
-from .lengths import longer, shorter
+from .lengths import longer, shorter, until
 from .modes import ROUNDINGS, Condition, Equations, Mode, changed, first_mode
 from .records import Attempt, Row, Step
 from .rings import derivatives
@@ -47,7 +47,7 @@ class Run:
         self.times, self.dense = times, dense
         self.equations: dict[Mode, Equations] = {}
         self.mode = first_mode(given)
-        self.scale, self.off, self.law_off = np.abs(x0), 0.0 * x0, np.zeros(len(given.low))
+        self.scale, self.off, self.lacking = np.abs(x0), 0.0 * x0, 0.0 * x0
         self.rows: list[Row] = []
         self.steps: list[Step] = []
         self.events: list[tuple[float, Mode]] = []
@@ -114,7 +114,7 @@ class Run:
     def _through(self, piece: Piece, last: bool) -> str:
         """All steps of a piece."""
         begin, low, proposal = 0.0, 0.0, np.inf
-        even, reached = 0, 0.0
+        even, reached, doubts = 0, 0.0, 0
         while begin < piece.length:
             own = self.of(self.mode)
             remaining = (piece.length - begin) - low
@@ -129,16 +129,22 @@ class Run:
                 if attempt.excess > 1.0 and h > own.shortest:
                     self.rejected += 1
                     h, before = shorter(own, h, attempt.excess, before), attempt.excess
+                    continue
+                theta, condition = self._first_change(own, attempt, h)
+                nearer = until(own, h, theta) if condition is not None else h
+                if doubts < _MOST_DOUBTS and nearer < 0.8 * h and attempt.is_coarse(theta):
+                    self.rejected += 1
+                    doubts += 1
+                    h, before = nearer, np.inf
                 else:
                     found = attempt
-            theta, condition = self._first_change(own, found, h)
             if theta > 0.0 and not self._account(own, found, theta, h):
                 return "switching_hidden"
             whole = condition is None and theta == 1.0 and bool(h == remaining)
             rings = tuple(ring[:3] for ring in found.rings)
             step = Step(piece.start + begin, h, theta, found.x, found.ys, rings)
             end = piece.length if whole else begin + (low + theta * h)
-            self._keep(step, found, piece, begin + low, end, last and whole)
+            self._keep(step, found, piece, begin + low, end, bool(last and end >= piece.length))
             self.x = step.at(np.array([theta]))[0][0]
             if whole:
                 return "successful"
@@ -151,7 +157,7 @@ class Run:
                     # What is left of the excess may be rounding, which no step changes.
                     proposal, even = max(4.0 * h, proposal), 0
                 continue
-            proposal, even, reached = np.inf, 0, 0.0
+            proposal, even, reached, doubts = np.inf, 0, 0.0, 0
             self.mode = changed(self.mode, condition)
             self.switchings += 1
             self.events.append((self.t, self.mode))
@@ -165,34 +171,30 @@ class Run:
         local = piece.local(begin, h)
         given = values(local, _AT_POINTS)
         rings, x0 = self._rings(own, piece, begin, h)
-        x, p = own.solve(h, x0, given)
-        if not (np.isfinite(x).all() and np.isfinite(p).all()):
-            return None
         # Rounding in the inputs is that of the terms they are summed from.
         terms = np.abs(piece.coefficients).sum(axis=0)
-        g, q = terms[:n], terms[n:]
+        solved = own.solve(h, x0, given, terms, self.off + self.lacking)
+        x, p, noise_x, noise_p = solved[:4]
+        if not (np.isfinite(x).all() and np.isfinite(p).all()):
+            return None
         beside = sum((2.0 * np.abs(ring[1]) for ring in rings), np.zeros(n))
-        sizes = np.abs(x).max(axis=0) + beside, np.abs(p).max(axis=0), q
-        off = np.maximum(self.off, ROUNDINGS * np.maximum(sizes[0], own.reach(h) @ g))
-        off = np.abs(own.system.C) @ off
-        noise_p, _ = own.noise(*sizes, off)
+        sizes = np.abs(x).max(axis=0) + beside, np.abs(p).max(axis=0), terms[n:]
         energy = np.sqrt(np.sum((self.weights * sizes[0]) ** 2))
         allowed = np.maximum(self.tol * np.maximum(self.scale, sizes[0]), self.least)
         allowed = np.maximum(allowed, 1e-2 * self.tol * energy / self.weights)
         allowed_p = np.maximum(self.tol * sizes[1], self.least_p)
-        # Rounding that shorter steps do not change: in the law, in large rows, which reaches the slow
-        # components too, and in p, which comes back through x.
-        rows = np.abs(own.system.A) @ sizes[0] + np.abs(own.system.B) @ sizes[1] + g
-        rounding = np.maximum(own.hidden(*sizes), 1e-2 * _ROUNDING * h * rows)
-        fed = np.abs(own.system.C) @ (own.reach(h) @ (np.abs(own.system.B) @ noise_p))
+        # What rounding leaves undetermined no shorter step resolves.
+        rounding = (np.abs(radau.TAIL_OF_STATE) @ noise_x).max(axis=0)
         allowed = np.maximum(allowed, np.minimum(_MOST_ROUNDING * allowed, rounding))
-        fed_p = np.minimum(_MOST_ROUNDING * allowed_p, own.of_law(fed))
-        allowed_p = np.maximum(np.maximum(allowed_p, noise_p), fed_p)
+        allowed_p = np.maximum(allowed_p, (np.abs(radau.TAIL_OF_MULTIPLIER) @ noise_p).max(axis=0))
         tail_x = np.abs(radau.TAIL_OF_STATE @ x).max(axis=0)
         tail_p = np.abs(radau.TAIL_OF_MULTIPLIER @ p).max(axis=0)
         tiny = np.finfo(float).tiny
         # A boundary layer shows in p at the start, which is no collocation point.
+        off = np.abs(own.system.C) @ self.off
+        at_start, _ = own.noise(np.abs(x0), np.abs(p[0]), terms[n:], off, _ONE_VALUE)
         layer = np.abs(radau.START @ p - own.multiplier(x0, values(local, _START)[0, n:]))
+        layer = np.maximum(layer - at_start, 0.0)
         excess = max(
             float(np.max(tail_x / (allowed + tiny))),
             float(np.max((tail_p + layer / _EXTRAPOLATED) / (allowed_p + tiny))),
@@ -202,11 +204,14 @@ class Run:
         y, w = own.members(P, d)
         tail_d = np.abs(own.system.C) @ tail_x + np.abs(own.system.M) @ tail_p
         # What the step before was lacking decides on signs, and not on what this one may lack.
-        slack_p, slack_d = own.noise(*sizes, off + self.law_off)
+        of_x = (np.abs(radau.FROM_NODES) @ (noise_x + solved.carried_x)).max(axis=0)
+        slack_p = (np.abs(radau.FROM_POINTS) @ (noise_p + solved.carried_p)).max(axis=0)
+        of_d = np.abs(own.system.C) @ of_x + np.abs(own.system.M) @ slack_p
+        _, slack_d = own.noise(*sizes, of_d)
         slack = own.members(
             slack_p + layer + _EXTRAPOLATED * tail_p, slack_d + _EXTRAPOLATED * tail_d
         )
-        lacking = _EXTRAPOLATED * tail_d
+        lacking = _EXTRAPOLATED * tail_x
         ys, _ = own.members(p, own.dependent(x[1:], p, given[:, n:]))
         none = np.zeros(len(p[0]))
         swing = (
@@ -220,9 +225,13 @@ class Run:
             np.minimum(slack[0], _MOST_SLACK * (self.rtol * largest[0] + self.atol)),
             np.minimum(slack[1], _MOST_SLACK * (self.rtol * largest[1] + self.atol * of_w)),
         )
+        residuals = self._residuals(own, x, p, G[0], h)
+        # What a layer leaves in the defect, of which bounds are made.
+        most = _OF_DEFECT * (self.rtol * energy + self._norm(np.full(n, self.atol)))
+        excess = max(excess, h * _mean(1.0) * self._norm(residuals[0]) / (most + tiny))
         return Attempt(
-            x, ys, y, w, slack, rings, swing, sizes[0], lacking, excess,
-            self._residuals(own, x, p, G[0], h),
+            x, ys, y, w, slack, rings, swing, sizes[0], noise_x.max(axis=0), lacking, excess,
+            residuals,
         )  # fmt: skip
 
     def _rings(
@@ -299,8 +308,9 @@ class Run:
             mean = float(np.clip(-c.sign * value, 0.0, found.slack[k][c.i]).mean())
             passed[k, c.i] = mean
             if mean > 0.0:
-                # A residual below zero is a response in the mode that would follow.
-                mode = self.of(changed(self.mode, c)) if c.of_w else own
+                # A residual below zero is a response in the mode that would follow, and what follows
+                # from a response that would be at its bound there is known from that mode as well.
+                mode = self.of(changed(self.mode, c))
                 response = mean / self.given.M[c.i, c.i] if c.of_w else mean
                 self.veiled += mode.reach(theta * h) @ size[:, c.i] * response
         self.defect += theta * h * self._norm(size @ passed[0])
@@ -320,11 +330,11 @@ class Run:
         self.defect += part * (mean * self._norm(of_state) + self._norm(error[:n]))
         self.law_defect += part * float(mean * np.linalg.norm(of_law) + np.linalg.norm(error[n:]))
         self.accepted += 1
-        now = [np.abs(v).max(axis=0) for v in (found.y, found.w)]
-        self.largest = np.maximum(self.largest, now)
-        # The state that a step ends in is as good as the largest one that it was made of.
-        self.law_off = found.lacking
-        self.off, self.scale = ROUNDINGS * found.size, np.maximum(self.scale, found.size)
+        if step.used > 0.0:
+            size, of_y, of_w = found.sizes(step.used)
+            self.largest = np.maximum(self.largest, [of_y, of_w])
+            self.lacking = found.lacking
+            self.off, self.scale = found.noise, np.maximum(self.scale, size)
         self.t = piece.start + end
         share = (self.t - self.pieces[0].start) / self.span
         if self.shown + _SHOWN < share < 1.0:
@@ -358,6 +368,12 @@ _AT_POINTS, _ON_GRID, _START = (basis(v) for v in (radau.POINTS, radau.GRID, np.
 _EXTRAPOLATED = 16.0
 """What a polynomial may lack at θ = 0, in units of its last coefficients."""
 
+_OF_DEFECT = 1e-2
+"""The most that a step may add to the defect, in units of the tolerance."""
+
+_ONE_VALUE = 16.0 * np.finfo(float).eps
+"""What rounding may do to the law at one x, relative to the sum of the sizes of its terms."""
+
 _FOLLOWED = 4.0
 """Radians of an oscillation in a step, up to which its polynomials follow it."""
 
@@ -374,6 +390,9 @@ _SHOWN = 0.02
 """The share of a run between two lines that `progress` prints."""
 
 _MOST_CHANGES, _MOST_STUCK = 4096, 12
+_MOST_DOUBTS = 4
+"""How often a switching is located again in a shorter step, until there is one."""
+
 _ROUNDING = 256.0 * np.finfo(float).eps
 
 

@@ -25,7 +25,7 @@ from ...vi import analyse, independent
 
 Array = np.ndarray
 
-_LARGEST = 64
+LARGEST = 64
 """The most states and the most responses: a step solves dense equations in all of them."""
 
 
@@ -81,12 +81,12 @@ def _check(problem: Problem, t0: Any, x0: Tree, u0: Tree, args: Any) -> None:
     place = "dvax.solve(method=dvax.PiecewiseLinear())"
     several = isinstance(x0, tuple) or isinstance(u0, tuple)
     sizes = [leaf.size for leaf in jtu.tree_leaves((x0, u0))]
-    if several or max(sizes) > _LARGEST:
+    if several or max(sizes) > LARGEST:
         given = "several parts" if several else f"{sizes[0]} and {sizes[1]} entries"
         raise InputError(
             InputProblem(
                 place, f"a state or response of {given}",
-                f"it is for one array of at most {_LARGEST} entries each",
+                f"it is for one array of at most {LARGEST} entries each",
                 "Leave method out, or name another",
             )
         )  # fmt: skip
