@@ -41,13 +41,28 @@ def times(M, y):
 
 
 def box(M, q, lower, upper, guess):
-    """From the active set of the guess: every violated condition is exchanged at once, and after 20
-    such turns, the first alone (Murty's least-index rule, which ends for every P-matrix)."""
+    """From the active set of the guess; where that leads nowhere, from those of (M + s)y + q for
+    s = 2⁸, 2⁶, …, 2⁻³², 0: for large s they are found at once, and each is a guess for the next."""
+    y = _exchanged(M, q, lower, upper, guess)
+    if y is not None:
+        return y
+    for s in (*(Fraction(2) ** k for k in range(8, -33, -2)), 0):
+        more = [[v + s * (i == j) for j, v in enumerate(row)] for i, row in enumerate(M)]
+        y = _exchanged(more, q, lower, upper, guess)
+        guess = guess if y is None else y
+    if y is None:
+        raise AssertionError("no active set")
+    return y
+
+
+def _exchanged(M, q, lower, upper, guess):
+    """Every violated condition is exchanged at once, and after 20 such turns, the first alone (Murty's
+    least-index rule, which ends for every P-matrix, but may take long: None after 200)."""
     n = len(q)
     place = [
         -1 if y <= a else 1 if y >= b else 0 for y, a, b in zip(guess, lower, upper, strict=True)
     ]
-    for turn in range(5000):
+    for turn in range(200):
         y = [(lower[i], None, upper[i])[place[i] + 1] for i in range(n)]
         free = [i for i in range(n) if place[i] == 0]
         held = [i for i in range(n) if place[i] != 0]
@@ -67,7 +82,7 @@ def box(M, q, lower, upper, guess):
                 break
         if not wrong:
             return y
-    raise AssertionError("no active set")
+    return None
 
 
 def polyhedron(M, q, G, d, E, e, guess):

@@ -136,6 +136,15 @@ def test_the_rounding_of_an_affine_map_is_the_textbook_one(n):
         assert np.all(bound <= 1.01 * textbook)
 
 
+@pytest.mark.parametrize("F", [lambda M, y: M @ y + 1.0, lambda M, y: y @ M + 1.0])
+def test_nothing_is_multiplied_by_the_errors_of_what_is_exact(F):
+    """One product for the value, and one for the error: |M||y|."""
+    M = jnp.asarray(np.random.default_rng(0).normal(size=(5, 5)))
+    traced = jax.make_jaxpr(lambda y: rounding_error(lambda y: F(M, y), y)[0])(jnp.ones(5))
+    names = [eqn.primitive.name for eqn in traced.jaxpr.eqns]
+    assert names.count("dot_general") == 2
+
+
 def test_laws_that_are_not_affine_have_a_bound_and_unknown_operations_only_an_estimate():
     y = jnp.linspace(-2.0, 3.0, 40)
     smooth = lambda y: y**3 + jnp.tanh(5.0 * y) / (2.0 + jnp.cos(y)) - jnp.exp(y) + jnp.sum(y**2)  # noqa: E731

@@ -173,3 +173,10 @@ def _joined(pieces: list[Piece]) -> list[Piece]:
             c[1] += 0.5 * (last - first)
         found.append(piece._replace(coefficients=c))
     return found
+
+
+def continuous(before: Piece, after: Piece) -> bool:
+    """Whether the inputs go on from one piece to the next without a jump."""
+    end, start = before.at(np.ones(1))[0], after.at(np.zeros(1))[0]
+    size = np.abs(before.coefficients).sum(axis=0) + np.abs(after.coefficients).sum(axis=0)
+    return bool(np.all(np.abs(end - start) <= 8.0 * _NOISE * np.finfo(float).eps * size))

@@ -25,3 +25,10 @@ def longer(own: Equations, h: float, excess: float) -> float:
 def until(own: Equations, h: float, theta: float) -> float:
     """The step that ends soon after θ, no shorter than the shortest time scale of the mode."""
     return max(1.25 * theta * h, float(own.scales[0]) if len(own.scales) else h)
+
+
+def two_sum(a: float, b: float) -> tuple[float, float]:
+    """a + b and what rounding takes from it."""
+    total = a + b
+    other = total - a
+    return total, (a - (total - other)) + (b - other)

@@ -218,3 +218,8 @@ def _bisected(value: Callable[[float], float], a: float, b: float) -> float:
         if middle in (a, b):
             return a
         a, b = (middle, b) if value(middle) > 0.0 else (a, middle)
+
+
+def mean_residual(used: float) -> float:
+    """A bound on the mean of |ρ| up to θ = `used`, relative to |ρ(0)|."""
+    return min(1.0, MEAN_RESIDUAL / used) if used > 0.0 else 1.0

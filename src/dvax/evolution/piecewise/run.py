@@ -13,9 +13,9 @@ import numpy as np
 
 from .. import meter
 from . import radau
-from .inputs import Piece, basis, values
-from .lengths import longer, shorter, until
-from .modes import ROUNDINGS, Condition, Equations, Mode, changed, first_mode
+from .inputs import Piece, basis, continuous, values
+from .lengths import longer, shorter, two_sum, until
+from .modes import Condition, Equations, Mode, changed, first_mode
 from .records import Attempt, Row, Step
 from .rings import derivatives
 from .system import Affine
@@ -67,7 +67,7 @@ class Run:
         for k, piece in enumerate(self.pieces):
             self.piece = piece
             inputs = self._converted(piece)
-            if last is None or not _continuous(last, piece):
+            if last is None or not continuous(last, piece):
                 self.result = self._solve_law(inputs)
                 self.events.append((piece.start, self.mode))
             if self.result == "successful":
@@ -148,7 +148,7 @@ class Run:
             self.x = step.at(np.array([theta]))[0][0]
             if whole:
                 return "successful"
-            begin, low = _two_sum(begin, low + theta * h)
+            begin, low = two_sum(begin, low + theta * h)
             if condition is None:
                 even = even + 1 if h <= reached else 0
                 reached = h
@@ -211,6 +211,9 @@ class Run:
         slack = own.members(
             slack_p + layer + _EXTRAPOLATED * tail_p, slack_d + _EXTRAPOLATED * tail_d
         )
+        # More changes at one time than there are constraints: rounding is larger than was estimated.
+        doubt = 2.0 ** max(0, self.stuck - len(self.mode))
+        slack = doubt * slack[0], doubt * slack[1]
         lacking = _EXTRAPOLATED * tail_x
         ys, _ = own.members(p, own.dependent(x[1:], p, given[:, n:]))
         none = np.zeros(len(p[0]))
@@ -228,7 +231,9 @@ class Run:
         residuals = self._residuals(own, x, p, G[0], h)
         # What a layer leaves in the defect, of which bounds are made.
         most = _OF_DEFECT * (self.rtol * energy + self._norm(np.full(n, self.atol)))
-        excess = max(excess, h * _mean(1.0) * self._norm(residuals[0]) / (most + tiny))
+        excess = max(
+            excess, h * radau.mean_residual(1.0) * self._norm(residuals[0]) / (most + tiny)
+        )
         return Attempt(
             x, ys, y, w, slack, rings, swing, sizes[0], noise_x.max(axis=0), lacking, excess,
             residuals,
@@ -325,7 +330,7 @@ class Run:
         settled = self.defect, self.law_defect
         of_state, of_law = found.residuals
         n, part = len(self.x), step.length * step.used
-        mean = _mean(step.used)
+        mean = radau.mean_residual(step.used)
         error = self.piece.error
         self.defect += part * (mean * self._norm(of_state) + self._norm(error[:n]))
         self.law_defect += part * float(mean * np.linalg.norm(of_law) + np.linalg.norm(error[n:]))
@@ -394,22 +399,3 @@ _MOST_DOUBTS = 4
 """How often a switching is located again in a shorter step, until there is one."""
 
 _ROUNDING = 256.0 * np.finfo(float).eps
-
-
-def _mean(used: float) -> float:
-    """A bound on the mean of |ρ| up to θ = `used`, relative to |ρ(0)|."""
-    return min(1.0, radau.MEAN_RESIDUAL / used) if used > 0.0 else 1.0
-
-
-def _two_sum(a: float, b: float) -> tuple[float, float]:
-    """a + b and what rounding takes from it."""
-    total = a + b
-    other = total - a
-    return total, (a - (total - other)) + (b - other)
-
-
-def _continuous(before: Piece, after: Piece) -> bool:
-    """Whether the inputs go on from one piece to the next without a jump."""
-    end, start = before.at(np.ones(1))[0], after.at(np.zeros(1))[0]
-    size = np.abs(before.coefficients).sum(axis=0) + np.abs(after.coefficients).sum(axis=0)
-    return bool(np.all(np.abs(end - start) <= ROUNDINGS * size))
