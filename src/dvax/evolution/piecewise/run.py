@@ -231,8 +231,12 @@ class Run:
         residuals = self._residuals(own, x, p, G[0], h)
         # What a layer leaves in the defect, of which bounds are made.
         most = _OF_DEFECT * (self.rtol * energy + self._norm(np.full(n, self.atol)))
+        # Of that, no shorter step lowers what the rounding of x and p at the start makes of it.
+        of_start = np.abs(radau.START) @ (noise_p + solved.carried_p)
+        rounded = np.abs(own.system.A) @ self.off + np.abs(own.system.B) @ of_start
+        layer_defect = np.maximum(residuals[0] - rounded, 0.0)
         excess = max(
-            excess, h * radau.mean_residual(1.0) * self._norm(residuals[0]) / (most + tiny)
+            excess, h * radau.mean_residual(1.0) * self._norm(layer_defect) / (most + tiny)
         )
         return Attempt(
             x, ys, y, w, slack, rings, swing, sizes[0], noise_x.max(axis=0), lacking, excess,
