@@ -11,13 +11,14 @@ import dvax
 from dvax import generators, operators, sets
 
 
-def make(f, h=lambda t, x, u, args: 0.5 - u, K=None, A=None):
+def make(f, h=lambda t, x, u, args: 0.5 - u, K=None, A=None, **spaces):
     return dvax.Problem(
         A=generators.Zero() if A is None else A,
         P=operators.Scaling(1.0),
         K=sets.Box(0.0, 1.0) if K is None else K,
         f=f,
         h=h,
+        **spaces,
     )
 
 
@@ -231,3 +232,43 @@ def test_what_is_infinite_at_the_start_is_said_so():
     error = failure(make(lambda t, x, u, args: 1.0 / t), x0=0.1, t1=1.0)
     assert "next to t = 0 " in error.cause or "f is inf" in error.cause
     assert "t1" not in fixes(error)
+
+
+RELAYS = {
+    # x' as a function of s = sign(g(x)), g, x0, the time at which x first meets g = 0.
+    "one": (lambda x, s: -s, lambda x: x, 1.0, 1.0),
+    "friction": (lambda x, s: jnp.stack([x[1], -x[0] - 0.5 * s]), lambda x: x[1], [3.0, 0.0], None),
+    "surface": (
+        lambda x, s: jnp.stack([x[1], -2.0 * s]), lambda x: x[0] + x[1], [1.0, 0.3], None
+    ),
+}  # fmt: skip
+METHODS = {
+    "ETD2RK": None, "DormandPrince": dvax.DormandPrince(), "ExpRosenbrock": dvax.ExpRosenbrock(),
+    "ETD4RK": dvax.ETD4RK(),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    mostly_thorough(
+        [(n, m) for n in RELAYS for m in METHODS], [("one", "ETD2RK"), ("friction", "ETD4RK")]
+    ),
+)
+def test_a_switch_of_x_is_told_and_can_be_written_as_a_law(name, method):
+    rate, g, x0, when = RELAYS[name]
+    problem = make(lambda t, x, u, args: rate(x, jnp.sign(g(x))))
+    error = failure(problem, x0=jnp.asarray(x0), t1=20.0, method=METHODS[method])
+    assert "x' jumps as a function of x" in error.cause and "slide along it" in error.cause
+    told = float(error.solution.stats["t"])
+    assert when is None or told == pytest.approx(when, abs=1e-6)
+    # The fix, to the letter: a layer of width ε, in which the solution stays.
+    width = 1e-3
+    one = dvax.spaces.Euclidean(())
+    smooth = make(
+        lambda t, x, u, args: rate(x, u), lambda t, x, u, args: g(x) / width, sets.Box(-1.0, 1.0),
+        control_space=one,
+    )  # fmt: skip
+    sol = dvax.solve(
+        smooth, jnp.asarray(x0), 0.0, told + 1e-2, method=dvax.ExpRosenbrock(), rtol=1e-4, atol=1e-6
+    )
+    assert abs(float(g(sol.xs[-1]))) <= 1.01 * width

@@ -4,8 +4,9 @@ Each cause is tested at the last state (t, x) that was reached, on the functions
 
 - a value that is not finite, by evaluating K, P, A, h and f along x + s x' over the last step, with the
   earliest such time found by bisection;
-- a jump of K, h or f, by bisection of a few steps around t; many jumps of one height are
+- a jump of K, h or f in t, by bisection of a few steps around t; many jumps of one height are
   rounding;
+- a jump of x' as a function of x, by bisection on the line along x';
 - a finite-time escape, x' growing as |x|^p with p > 1, infinite after |x| / ((p − 1) |x'|);
 - rounding: steps of the size of the spacing of floating-point numbers at t, or a tolerance below the
   rounding of f;
@@ -28,7 +29,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import Fix, InputError, SolveError
 from .implicit import Implicit
-from .jumps import find_jump
+from .jumps import find_discontinuity, find_jump
 from .method import AbstractMethod
 from .nonfinite import first_bad
 from .piecewise.method import PiecewiseLinear
@@ -83,7 +84,7 @@ def diagnose(setup: Setup, stats: dict[str, Any], result: RESULTS) -> Diagnosis:
         causes += [_law]
     causes += [_escape]
     if result != RESULTS.law_unsolved and result != RESULTS.nonfinite:
-        causes += [find_jump, _resolution, _tolerance, _stiff]
+        causes += [find_jump, find_discontinuity, _resolution, _tolerance, _stiff]
     if result == RESULTS.max_steps:
         causes += [_too_few]
     for cause in causes:

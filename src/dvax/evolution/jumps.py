@@ -1,4 +1,4 @@
-"""A jump of K, h or f in t, or the steps that rounding makes of it, where a run stopped."""
+"""A jump of K, h or f in t or in x, or the steps that rounding makes of it, where a run stopped."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,6 +14,8 @@ from .stopped import LAST_STEPS, Diagnosis, Stop
 _JUMP, _ROUNDINGS = 1e-7, 1e3
 """A change of a function within two roundings of t is a jump above this part of its size, or so many
 of its own roundings."""
+_IN_X = 1e-3
+"""A change of x' between two states that rounding tells apart is a jump above this part of its size."""
 _STAIR = 1e-3
 """Part of the size of a function below which many jumps of it are taken for rounding."""
 
@@ -61,6 +63,49 @@ def find_jump(stop: Stop) -> Diagnosis:
             (Fix("knots", f"[{b:.15g}]", "so that a step ends there: dvax.signals.Function"),),
         )
     return Diagnosis()
+
+
+def find_discontinuity(stop: Stop) -> Diagnosis:
+    """A jump of f̃ in x, at fixed t, on the line along x' through where the run stopped."""
+    t = stop.time(stop.t)
+    along = stop.velocity(t, stop.x)
+    speed = stop.norm(along)
+    if not (np.isfinite(speed) and speed > 0.0):
+        return Diagnosis()
+
+    def velocity(s: float) -> Tree:
+        return stop.velocity(t, jtu.tree_map(lambda x, v: x + stop.time(s) * v, stop.x, along))
+
+    def values(s: float) -> np.ndarray:
+        return np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(velocity(s))])
+
+    eps = float(jnp.finfo(stop.setup.dtype).eps)
+    ulp = eps * stop.norm(stop.x) / speed
+    far = LAST_STEPS * max(stop.step, 4.0 * stop.ulp, 4.0 * ulp)
+    within = max(ulp, 1e-12 * far)
+    a, b, *_ = _narrow(values, -far, far, within)
+    # Next to the jump and not at it, where sign(0) = 0 lies between both sides.
+    before, after = values(a - 4.0 * within), values(b + 4.0 * within)
+    change, k = _change(before, after)
+    size = float(np.max(np.abs(np.stack([before, after])), initial=0.0))
+    if not change > _IN_X * size:
+        return Diagnosis()
+    where = f" in component {k}" if before.size > 1 else ""
+    # The jump itself is a direction in which both sides differ.
+    jump = after - before
+    enters = float(before @ jump) * float(after @ jump) < 0.0
+    slides = " It points to the jump from both sides: the solution would slide along it."
+    return Diagnosis(
+        f"x' jumps as a function of x, from {before[k]:.6g} to {after[k]:.6g}{where}, at t = "
+        f"{stop.t:.12g}.{slides if enters else ''} A solution needs f to be continuous in x.",
+        (
+            Fix(
+                "", "",
+                "Write the switch as a law: with K = Box(-1, 1) and h = g(x)/ε the response u = "
+                "clip(g(x)/ε, -1, 1) is the sign of g(x) outside a layer of width ε",
+            ),
+        ),
+    )  # fmt: skip
 
 
 def _narrow(
