@@ -95,3 +95,30 @@ def test_a_start_far_from_zero_costs_nothing_where_f_is_steep():
     near, far = (int(run.stats["steps"]) for run in runs)
     assert far <= 1.05 * near
     assert abs(float(runs[0].xs[-1, 0] - runs[1].xs[-1, 0])) <= 1e-9
+
+
+@pytest.mark.parametrize("steep", [1e2, 1e3, 1e4])
+@pytest.mark.parametrize("method", [dvax.ExpRosenbrock(), dvax.DormandPrince()])
+def test_a_start_far_from_zero_ends_no_run_where_its_rounding_is_a_tolerance(method, steep):
+    """f moves by about `steep` ulp(t₀) where t is rounded: up to some ten tolerances."""
+    scalar = dvax.generators.Scalar(-2.4)
+    problem = dvax.Problem(
+        A=scalar, P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-0.7, 0.4),
+        f=lambda t, x, u, args: 0.5 * u,
+        h=lambda t, x, u, args: args["q"] * jnp.sin(2.8 * (t - args["t0"])) - args["g"] * x - 3.0,
+    )  # fmt: skip
+
+    def end(t0, **options):
+        args = {"q": jnp.asarray(steep), "g": jnp.asarray(10.0 * steep), "t0": jnp.asarray(t0)}
+        ts = np.array([t0 + 0.5, t0 + 1.0])
+        return dvax.solve(problem, 0.0, t0, t0 + 1.0, args, ts, method=method, **options).xs
+
+    truth = np.asarray(end(0.0, rtol=1e-9, atol=1e-12))
+    for t0 in (2.0**13, -(2.0**17), 2.0**20):
+        try:
+            found = np.asarray(end(t0))
+        except dvax.SolveError as error:
+            # Beyond a thousand tolerances it may be refused, with what to do.
+            assert steep * np.spacing(abs(t0)) > 1e-6 and "Count time from the start" in str(error)
+            continue
+        assert np.abs(found - truth).max() <= 10 * (1e-9 + 1e-6 * np.abs(truth).max()), t0

@@ -31,6 +31,9 @@ _ROUNDINGS = 1e6
 """Roundings of f̃ that a defect may amount to and count as roundoff: a law with a small modulus
 amplifies them by 1/γ."""
 
+_MOST_ROUNDOFF = 1e-4
+"""Part of f̃ above which no defect counts as roundoff, wherever t is."""
+
 _SHORTER = 0.3
 """Largest factor of the step size after a step that may hide an excursion."""
 
@@ -167,7 +170,10 @@ class Adaptive(AbstractController):
             kink = lax.stop_gradient(step.kink((error > 1.0) | (excursion > 1.0)))
         # No step size reduces what the roundoff of f, h and K leaves: the reserve does not limit it.
         size = self.horizon * self._scaled(step.c[0], x0, step.x1)
-        roundoff = rounding & (error <= _ROUNDINGS * jnp.finfo(h.dtype).eps * size)
+        span = self.stops[-1] - self.stops[0]
+        # Data that moves within the run has the rounding of t besides, relative to the run.
+        relative = jnp.finfo(h.dtype).eps * (1.0 + jnp.maximum(jnp.abs(t0), jnp.abs(t1)) / span)
+        roundoff = rounding & (error <= jnp.minimum(_ROUNDINGS * relative, _MOST_ROUNDOFF) * size)
         roundoff = lax.stop_gradient(roundoff)
         relaxed = (impulse <= share * state.spare) | roundoff
         # The time of a jump is uncertain by the roundoff of t: no shorter step resolves it.

@@ -16,6 +16,8 @@ _JUMP, _ROUNDINGS = 1e-7, 1e3
 of its own roundings."""
 _IN_X = 1e-3
 """A change of x' between two states that rounding tells apart is a jump above this part of its size."""
+_FAR = 1e3
+"""|t| in lengths of the run, from which on t itself is a term that cancels."""
 _STAIR = 1e-3
 """Part of the size of a function below which many jumps of it are taken for rounding."""
 
@@ -128,13 +130,14 @@ def _narrow(
 def _stairs(stop: Stop, name: str, height: float, t: float) -> Diagnosis:
     """Jumps of about one height beside each other: rounding of terms far larger than their sum."""
     horizon = float(stop.setup.setting["horizon"])
+    t0, t1 = stop.span
+    cure = f"Write {name} so that large terms do not cancel"
+    if max(abs(t0), abs(t1)) > _FAR * (t1 - t0):
+        cure = "Count time from the start of the run, so that |t| is not large against t1 − t0"
     return Diagnosis(
         f"{name} changes in jumps of about {height:.3g} near t = {t:.12g}, as the rounding of terms "
         "that cancel does, and the tolerance asks for less.",
-        (
-            Fix("atol", f"{2.0 * height * horizon:.1g}", "which rounding allows"),
-            Fix("", "", f"Write {name} so that large terms do not cancel"),
-        ),
+        (Fix("atol", f"{2.0 * height * horizon:.1g}", "which rounding allows"), Fix("", "", cure)),
     )
 
 
