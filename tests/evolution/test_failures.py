@@ -2,6 +2,7 @@
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -101,3 +102,46 @@ def test_a_moving_set_that_becomes_empty_stops_the_run():
         dvax.solve(problem, 0.1, 0.0, 1.0, ts=[0.0, 0.25, 1.0])
     solution = getattr(caught.value, "solution", None)
     assert solution is not None and len(solution.ts) == 2
+
+
+def refused_when_traced(method):
+    """What each traced number that breaks a rule is given to."""
+    run = lambda t1=1.0, **options: dvax.solve(  # noqa: E731
+        system(""), jnp.array([0.5, 2.0, -1.0]), 0.0, t1, method=method, **options
+    )
+    cases = {
+        "t1 before t0": (lambda v: run(v), -1.0),
+        "t1 at t0": (lambda v: run(v), 0.0),
+        "rtol": (lambda v: run(rtol=v), -1e-3),
+        "atol": (lambda v: run(atol=v), -1e-3),
+        "both tolerances": (lambda v: run(rtol=v, atol=v), 0.0),
+        "ts": (lambda v: run(ts=jnp.stack([v, 0.5 - v])), -0.1),
+    }
+    if not isinstance(method, dvax.Implicit):
+        cases |= {
+            "dt": (lambda v: run(dt=v, max_steps=100), -0.1),
+            "ts of a run that is not forward": (lambda v: run(v, ts=jnp.stack([0.5 * v, v])), -1.0),
+        }
+    return cases
+
+
+TRACED = [
+    (name, method)
+    for method in ("ETD2RK", "DormandPrince", "ExpRosenbrock", "Picard", "Implicit")
+    for name in refused_when_traced(getattr(dvax, method)())
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "method"), mostly_thorough(TRACED, [("t1 before t0", "ETD2RK"), ("dt", "ETD2RK")])
+)
+def test_traced_numbers_that_break_a_rule_give_no_answer(name, method):
+    call, value = refused_when_traced(getattr(dvax, method)())[name]
+
+    def found(v):
+        sol = call(v)
+        return sol.ts, sol.xs, sol.us, sol.result
+
+    ts, xs, us, result = jax.jit(found)(value)
+    assert result == RESULTS.invalid_number
+    assert np.all(np.isinf(ts)) and np.all(np.isnan(xs)) and np.all(np.isnan(us))

@@ -121,7 +121,8 @@ def run(
         progress_meter=diffrax.TextProgressMeter() if progress else diffrax.NoProgressMeter(),
     )
     assert found.ts is not None
-    fine = found.result == diffrax.RESULTS.successful
+    # An end that is no number has no steps before it.
+    fine = (found.result == diffrax.RESULTS.successful) & (end > begin)
     # Without ts the one time is that of the last good step.
     reached = jnp.isfinite(found.ts) & (fine if ts is None else True)
     xs = jtu.tree_map(

@@ -51,7 +51,10 @@ def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
     flow = dataclasses.replace(
         flow, problem=opened(setup.problem, setup.number("t0"), setup.x0, flow.args)
     )
-    solution = _solved(setup, flow, ts, options)
+    valid = _are_valid(setup, ts)
+    solution = _solved(setup, flow, ts, valid, options)
+    result = RESULTS.where(valid, solution.result, RESULTS.invalid_number)
+    solution = dataclasses.replace(solution, result=result)
     failed = (solution.result != RESULTS.successful) | ~jnp.all(solution.ts < jnp.inf)
     # The setup is what was asked: it is no output.
     arrays, tree = jtu.tree_flatten(solution, is_leaf=lambda node: node is setup)
@@ -60,12 +63,14 @@ def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
     return tree.unflatten([*nan_derivatives_where(failed, arrays, given), setup])
 
 
-def _solved(setup: Setup, flow: Flow, ts: Any, options: Options) -> Solution:
+def _solved(setup: Setup, flow: Flow, ts: Any, valid: jax.Array, options: Options) -> Solution:
     problem, x0, args = setup.problem, setup.x0, setup.args
     t0, t1 = setup.number("t0"), setup.number("t1")
+    # No step is made and no time is saved where the numbers are not valid.
+    t1 = jnp.where(valid, t1, jnp.nan)
     knots = jnp.asarray(problem.knots(t0, t1, x0, args), setup.dtype)
     stops = jnp.concatenate([t0[None], knots, t1[None]])
-    times = None if ts is None else jnp.asarray(ts, setup.dtype)
+    times = None if ts is None else jnp.where(valid, jnp.asarray(ts, setup.dtype), jnp.nan)
     if isinstance(setup.method, Implicit):
         return _implicitly(setup, setup.method, flow, stops, times, options)
     if isinstance(setup.method, Picard):
@@ -88,6 +93,20 @@ def _solved(setup: Setup, flow: Flow, ts: Any, options: Options) -> Solution:
     else:
         saved, end = reverse.run(loop, x0, times)
     return _solution(setup, flow, controller, saved, end, times, options)
+
+
+def _are_valid(setup: Setup, ts: Any) -> jax.Array:
+    """Whether the numbers obey the rules of `arguments.check`, which cannot look at traced ones."""
+    number = setup.number
+    lengths = jnp.stack([number(name) for name in ("dt0", "dt_max", "horizon")])
+    # dt is NaN where steps adapt.
+    positive = jnp.all(lengths > 0) & ~(number("dt") <= 0)
+    rtol, atol = number("rtol"), number("atol")
+    tolerances = (rtol >= 0) & (atol >= 0) & (rtol + atol > 0)
+    forward = number("t1") > number("t0")
+    if ts is not None:
+        forward &= jnp.min(jnp.asarray(ts, setup.dtype)) >= number("t0")
+    return forward & positive & tolerances
 
 
 def _implicitly(

@@ -44,9 +44,22 @@ def find_jump(stop: Stop) -> Diagnosis:
             )
 
         try:
+            again = _change(values(stop.t), values(stop.t))[0]
             a, b, before, after = _narrow(values, low, high, stop.ulp)
         except InputError:
             continue  # refused within the window: that is another cause
+        if again > 0.0:
+            return Diagnosis(
+                f"{name} has two values at one time, {again:.3g} apart at t = {stop.t:.12g}: it is no "
+                "function of its arguments.",
+                (
+                    Fix(
+                        "", "",
+                        f"Make {name} depend on t, x, u and args alone: no random numbers of NumPy, no "
+                        "counters, no lists that grow",
+                    ),
+                ),
+            )  # fmt: skip
         change, k = _change(before, after)
         size = float(np.max(np.abs(np.stack([before, after])), initial=0.0))
         if not (change > max(_JUMP, _ROUNDINGS * eps) * size and b - a < 1e-9 * (t1 - t0)):
@@ -62,8 +75,15 @@ def find_jump(stop: Stop) -> Diagnosis:
         return Diagnosis(
             f"{name} jumps from {before[k]:.6g} to {after[k]:.6g}{where} at t = {b:.15g}, and no "
             "step across a jump that is not announced meets the tolerance.",
-            (Fix("knots", f"[{b:.15g}]", "so that a step ends there: dvax.signals.Function"),),
-        )
+            (
+                Fix(
+                    "", "",
+                    f"Name the time, so that a step ends there: write what jumps in {name} as "
+                    f"dvax.signals.Function(fn, knots=[{b:.15g}]) and evaluate that, or compare t with "
+                    "the time itself (jnp.where(t < a, …))",
+                ),
+            ),
+        )  # fmt: skip
     return Diagnosis()
 
 

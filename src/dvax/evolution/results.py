@@ -32,3 +32,7 @@ class RESULTS(eqx.Enumeration):
     )
     nonfinite = "f, h or K returned NaN or infinity."
     law_unsolved = "The frozen law was not solved to its tolerance."
+    invalid_number = (
+        "A traced number breaks a rule: t0 < t1, no saved time before t0; dt, dt0, dt_max and horizon "
+        "positive; rtol and atol not negative, and one of them positive."
+    )
