@@ -260,6 +260,8 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
             if isinstance(inner, ClosedJaxpr) and len(inner.jaxpr.invars) == len(given):
                 return _interpret(inner, given)
         raise NoEnclosure(name)
+    if name == "scan":
+        return _unrolled(eqn, given)
     atoms = (*eqn.invars, *eqn.outvars)
     if any(jnp.issubdtype(atom.aval.dtype, jnp.complexfloating) for atom in atoms):
         raise NoEnclosure(name)
@@ -273,8 +275,15 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
         return [_take(given, bind)]
     if name in _COMPARE:
         return [_compare(_lift(given[0]), _lift(given[1]), bind)]
+    if name in ("scatter", "scatter-add") and not is_chord(given[1]):
+        # Linear in the array and in what is written into it.
+        whole, new = _lift(given[0]), _lift(given[2])
+        return [Chord(*(bind(p, given[1], q) for p, q in zip(whole, new, strict=True)))]
     if not all(jnp.issubdtype(atom.aval.dtype, jnp.floating) for atom in atoms):
-        if eqn.primitive.multiple_results:
+        of_floats = any(jnp.issubdtype(atom.aval.dtype, jnp.floating) for atom in eqn.invars)
+        if name == "convert_element_type" and of_floats:
+            return [_whole(_lift(given[0]), bind)]
+        if eqn.primitive.multiple_results or (of_floats and name not in _ENTRYWISE):
             raise NoEnclosure(name)
         return [_discrete(given, bind, entrywise=name in _ENTRYWISE)]
     if (
@@ -314,6 +323,19 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
         return [smallest(largest(x[1], x[0]), x[2])]
     if name == "convert_element_type" or name in _KEEPING:
         return [Chord(*(bind(*(v[i] for v in x)) for i in range(3)))]
+    if name == "pad":
+        edge, inner = x[1], jnp.zeros_like(x[0].dev)
+        dev = jnp.maximum(bind(x[0].dev, jnp.zeros_like(edge.dev)), bind(inner, edge.dev))
+        return [Chord(bind(x[0].a, edge.a), bind(x[0].b, edge.b), dev)]
+    if name in _FOLDS:
+        return [_folded(_FOLDS[name], x[0], eqn.params["axes"])]
+    if name == "pow":
+        # x^y = exp(y log x), for x > 0.
+        power_of = times(x[1], _smooth(x[0], jnp.log, *BOUNDS["log"](x[0].lowest, x[0].highest)))
+        found = _smooth(power_of, jnp.exp, *BOUNDS["exp"](power_of.lowest, power_of.highest))
+        return [Chord(bind(x[0].a, x[1].a), bind(x[0].b, x[1].b), found.dev)]
+    if name == "dot_general" and all(map(is_chord, given)):
+        return [_product(x[0], x[1], bind)]
     if name == "dot_general" and not all(map(is_chord, given)):
         # A fixed matrix: deviations pass through its absolute values.
         sides = [
@@ -321,6 +343,65 @@ def _apply(eqn: Any, given: list[Any]) -> list[Any]:
         ]
         return [Chord(*(bind(sides[0][i], sides[1][i]) for i in range(3)))]
     raise NoEnclosure(name)
+
+
+_FOLDS: dict[str, Callable[[Chord, Chord], Chord]] = {
+    "reduce_max": largest, "reduce_min": smallest, "reduce_prod": times,
+}  # fmt: skip
+
+
+def _folded(join: Callable[[Chord, Chord], Chord], x: Chord, axes: tuple[int, ...]) -> Chord:
+    """The join of all entries along the axes, two halves at a time."""
+    for axis in sorted(axes, reverse=True):
+        rows = [jnp.moveaxis(part, axis, 0) for part in x]
+        while (count := rows[0].shape[0]) > 1:
+            half = count // 2
+            both = join(
+                Chord(*(r[:half] for r in rows)), Chord(*(r[half : 2 * half] for r in rows))
+            )
+            # An odd one waits for the next turn.
+            rows = [
+                jnp.concatenate([part, r[2 * half :]]) for part, r in zip(both, rows, strict=True)
+            ]
+        if count == 0:
+            raise NoEnclosure("a reduction of nothing")
+        x = Chord(*(r[0] for r in rows))
+    return x
+
+
+def _product(x: Chord, y: Chord, bind: Callable) -> Chord:
+    """A product of two arrays that move: the rule of `times`, summed."""
+    ends = lambda q: jnp.maximum(jnp.abs(q.a), jnp.abs(q.b))  # noqa: E731
+    dev = bind(ends(x), y.dev) + bind(x.dev, ends(y)) + bind(x.dev, y.dev)
+    dev = dev + 0.25 * bind(jnp.abs(x.b - x.a), jnp.abs(y.b - y.a))
+    # 0 · ∞ may stand for anything.
+    return Chord(bind(x.a, y.a), bind(x.b, y.b), jnp.where(jnp.isnan(dev), jnp.inf, dev))
+
+
+def _unrolled(eqn: Any, given: list[Any]) -> list[Any]:
+    """A loop of few turns (`lax.scan`, `fori_loop` between fixed numbers), turn by turn."""
+    params = eqn.params
+    length = params["length"]
+    if length > _TURNS or length == 0:
+        raise NoEnclosure("a loop of many turns")
+    first = params["num_consts"]
+    second = first + params["num_carry"]
+    fixed, carry, rows = given[:first], given[first:second], given[second:]
+    order = range(length - 1, -1, -1) if params["reverse"] else range(length)
+    found: dict[int, list[Any]] = {}
+    for k in order:
+        row = [Chord(*(part[k] for part in v)) if is_chord(v) else v[k] for v in rows]
+        out = _interpret(params["jaxpr"], [*fixed, *carry, *row])
+        carry, found[k] = out[: len(carry)], out[len(carry) :]
+    stacked = []
+    for leaves in zip(*(found[k] for k in range(length)), strict=True):
+        chords = [_lift(leaf) for leaf in leaves]
+        stacked.append(Chord(*(jnp.stack([c[i] for c in chords]) for i in range(3))))
+    return [*carry, *stacked]
+
+
+_TURNS = 32
+"""The most turns of a loop that is read."""
 
 
 def _eps(atom: Any) -> float:
@@ -418,6 +499,16 @@ def _apart(p: jax.Array, q: jax.Array) -> jax.Array:
     return jnp.abs(p.astype(_real(p)) - q.astype(_real(q)))
 
 
+def _whole(x: Chord, bind: Callable) -> Chord:
+    """The whole part of x, or whether x is not zero: known where both bounds have the same one."""
+    same = bind(x.lowest) == bind(x.highest)
+    # Truth changes at zero alone, and both bounds may differ from it on different sides.
+    if bind(x.a).dtype == bool:
+        same = same & ((x.lowest > 0) | (x.highest < 0) | ((x.a == x.b) & (x.dev == 0)))
+    # Infinite bounds have no whole part.
+    return _known(bind(x.a), bind(x.b), same & jnp.isfinite(x.dev))
+
+
 def _discrete(given: list[Any], bind: Callable, entrywise: bool) -> Chord:
     """Integers and truth values: known where everything that enters stays as it is."""
     x = [_lift(value) for value in given]
@@ -463,4 +554,8 @@ def _take(given: list[Any], bind: Callable) -> Chord:
     b = bind(given[0], *(p.b for p in places))
     settled = [jnp.all(p.dev == 0) & jnp.all(p.a == p.b) for p in places]
     known = jnp.all(jnp.stack(settled))
-    return _known(a, b, known)
+    if _below_parabola.get() or not jnp.issubdtype(a.dtype, jnp.floating):
+        return _known(a, b, known)
+    # Wherever they lead, the value is one of the array.
+    apart = jnp.max(given[0]) - jnp.min(given[0])
+    return Chord(a, b, jnp.broadcast_to(jnp.where(known, 0.0, apart), jnp.shape(a)))

@@ -14,6 +14,7 @@ from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace, Product
 from .blur import Blur
+from .excursions import WATCH
 from .kinks import Aim, aim, nothing_ahead, passed, until
 from .results import RESULTS
 from .stepper import Step
@@ -36,9 +37,6 @@ _MOST_ROUNDOFF = 1e-4
 
 _SHORTER = 0.3
 """Largest factor of the step size after a step that may hide an excursion."""
-
-_WATCH = 1e-6
-"""Share of the run below which a step is short enough to ignore unseen excursions."""
 
 
 class Verdict(NamedTuple):
@@ -158,7 +156,7 @@ class Adaptive(AbstractController):
         known = Aim(*state.aim)
         excursion = jnp.zeros_like(h)
         if step.excursion is not None:
-            watched = h > _WATCH * (self.stops[-1] - self.stops[0])
+            watched = h > WATCH * (self.stops[-1] - self.stops[0])
             parts = zip(self.sizes(x0), self.sizes(step.x1), strict=True)
             least = jnp.min(jnp.stack([self.atol + self.rtol * jnp.maximum(*p) for p in parts]))
             ratio = step.excursion(self.rtol, self.atol, least / self.horizon)
@@ -177,7 +175,7 @@ class Adaptive(AbstractController):
         roundoff = lax.stop_gradient(roundoff)
         relaxed = (impulse <= share * state.spare) | roundoff
         # The time of a jump is uncertain by the roundoff of t: no shorter step resolves it.
-        fine = 4.0 * floor <= _WATCH * (self.stops[-1] - self.stops[0])
+        fine = 4.0 * floor <= WATCH * (self.stops[-1] - self.stops[0])
         at_floor = fine & (h <= 4.0 * floor) & (state.crossings < _CROSSINGS)
         at_floor = at_floor & jnp.isfinite(error)
         sound = step.begun & step.finite

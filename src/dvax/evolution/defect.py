@@ -35,11 +35,16 @@ class Sample(NamedTuple):
     extent: Extent
 
 
-def enclosed(flow: Flow, growth: Growth, ends: tuple[Any, Any], arc: Arc, last: Rate) -> Sample:
+def enclosed(
+    flow: Flow, growth: Growth, ends: tuple[Any, Any], arc: Arc, last: Rate, short: Any
+) -> Sample:
     """|δ(θ)| ≤ (1−θ)(|δ(0)| + dev) + θ(|δ(1)| + dev) entry by entry, with dev from chord
     arithmetic, since p is a line; so ∫‖δ‖ is at most the mean of the norms of the two brackets
     (the norm of their mean would be too little: ends may lie in different entries). δ(0) is
-    rounding, unless data jumps where nobody said it would. The step lies between the times `ends`."""
+    rounding, unless data jumps where nobody said it would. The step lies between the times `ends`.
+
+    Where an entry has no bound, as next to the zero of |s|^1.5, the defect is infinite, and so is what
+    it certifies; the step control goes by the samples at both ends in a step that is `short`."""
     ends, arc, growth = lax.stop_gradient((ends, arc, growth))
     h, x0, x1, c = values(tuple(arc))
     space = flow.state_space(x0)
@@ -51,6 +56,11 @@ def enclosed(flow: Flow, growth: Growth, ends: tuple[Any, Any], arc: Arc, last: 
         lambda q, p: jnp.abs(q.b - p) + q.dev, along, polynomial(c, 1.0), is_leaf=is_chord
     )
     error = _tree.scale(0.5, _tree.add(at_start, at_end))
+    at_ends = jtu.tree_map(
+        lambda q, p, r: 0.5 * (jnp.abs(q.a - p) + jnp.abs(q.b - r)),
+        along, c[0], polynomial(c, 1.0), is_leaf=is_chord,
+    )  # fmt: skip
+    error = jtu.tree_map(lambda e, s: jnp.where(short & (e == jnp.inf), s, e), error, at_ends)
     defect = 0.5 * h * (space.norm(at_start) + space.norm(at_end))
     return Sample((), [last], error, defect, jnp.zeros_like(defect), Extent.of_chords(x, u))
 

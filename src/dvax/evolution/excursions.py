@@ -13,10 +13,11 @@ of the parabola at its ends.
 *Pulses.* A function q of time (f and h at the state of the step, the parameters of K) may leave its
 samples and come back. The step is short enough where
 
-    dev ≤ max(variation between neighbouring samples in this run)/4.
+    dev ≤ V/4,    V = the largest variation between neighbouring samples so far, halved every 64th of
+                  the run.
 
 A wave that the steps resolve has shown its size and meets this by a wide margin; a pulse that lies
-between two samples does not.
+between two samples does not. A jump is no such size, nor what the data did at the start of the run.
 
 Both hold up to a part of the tolerance. What is smooth in x is left to the samples.
 """
@@ -35,6 +36,9 @@ from .chords import Chord, NoEnclosure, below_parabola, enclose, is_chord
 from .evaluations import Visit
 from .flow import Flow, slope
 
+WATCH = 1e-6
+"""Share of the run below which a step is short enough to go by its samples alone."""
+
 _SHARE = 0.1
 """Of the tolerance, as a depth of an excursion that is ignored."""
 
@@ -43,6 +47,10 @@ _SAMPLED = 4.0
 
 _VARIATION = 0.25
 """Of the largest variation seen, as a deviation that may lie between two samples."""
+
+_HALVINGS = 64.0
+"""How often the largest variation is halved in a run. At the crest of a wave as long as the run, V is
+still a tenth of the variation beside it."""
 
 
 class Look(NamedTuple):
@@ -83,8 +91,8 @@ class ExcursionGuard(eqx.Module):
         data = jax.eval_shape(lambda t: self._data(flow, t, x0, flow.problem.zero_control(x0)), t0)
         return jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), data)
 
-    def look(self, flow: Flow, visits: list[Visit], variation: Tree) -> Look:
-        """Return what the samples of a step leave open."""
+    def look(self, flow: Flow, visits: list[Visit], variation: Tree, share: Any) -> Look:
+        """Return what the samples of a step leave open, which is this `share` of the run."""
         places, variation = jax.lax.stop_gradient(
             ([(v.t, v.x, v.rate.y, v.rate.z) for v in visits], variation)
         )
@@ -96,7 +104,8 @@ class ExcursionGuard(eqx.Module):
             with below_parabola():
                 moved, dev = jax.vmap(lambda p, q: self._pulses(flow, p, q))(first, second)
             most = lambda tree: jtu.tree_map(lambda leaf: jnp.max(leaf, axis=0), tree)  # noqa: E731
-            variation = jtu.tree_map(jnp.maximum, variation, most(moved))
+            fades = 0.5 ** (_HALVINGS * share)
+            variation = jtu.tree_map(lambda v, m: jnp.maximum(fades * v, m), variation, most(moved))
             over = jtu.tree_map(
                 lambda d, v: jnp.max(d - _VARIATION * v, initial=0.0), most(dev), variation
             )
@@ -105,7 +114,8 @@ class ExcursionGuard(eqx.Module):
         def excursion(ignored: Any) -> Any:
             return self._excursion(flow, places, first, second, ignored) if self.switches else zero
 
-        size = _largest([jnp.abs(leaf) for z in places for leaf in jtu.tree_leaves(z[3])])
+        # Of y and not of z: an entry far outside K is where it is at the bound.
+        size = _largest([jnp.abs(leaf) for p in places for leaf in jtu.tree_leaves(p[2])])
         return Look(excursion, size, rates, laws, variation)
 
     def _data(self, flow: Flow, t: Any, x: Tree, u: Tree) -> tuple[list[Any], list[Any]]:
@@ -121,12 +131,15 @@ class ExcursionGuard(eqx.Module):
         """Return how far the data moves from one sample to the next, and how far it may be from the
         line between."""
         t = Chord(p[0], q[0], jnp.zeros_like(p[0]))
-        u = flow.operator.inverse(p[2])
-        data = enclose(lambda t: self._data(flow, t, p[1], u), t)
-        # A bound at infinity does not move.
+        # Half way: a factor that is zero at one of the samples hides what it multiplies.
+        x, y = jtu.tree_map(lambda a, b: 0.5 * (a + b), (p[1], p[2]), (q[1], q[2]))
+        u = flow.operator.inverse(y)
+        data = enclose(lambda t: self._data(flow, t, x, u), t)
+        # A bound at infinity does not move, and a jump is no measure of what moves smoothly.
         moved = jtu.tree_map(
-            lambda c: jnp.where(c.a == c.b, 0.0, jnp.abs(c.b - c.a)), data, is_leaf=is_chord
-        )
+            lambda c: jnp.where((c.a == c.b) | jnp.isinf(c.dev), 0.0, jnp.abs(c.b - c.a)), data,
+            is_leaf=is_chord,
+        )  # fmt: skip
         dev = jtu.tree_map(
             lambda c: jnp.where((c.a == c.b) & jnp.isinf(c.a), 0.0, c.dev), data, is_leaf=is_chord
         )

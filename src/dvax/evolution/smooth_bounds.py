@@ -27,6 +27,16 @@ def _nearest(low: jax.Array, high: jax.Array) -> jax.Array:
     return jnp.where(low > 0, low, jnp.where(high < 0, -high, 0.0))
 
 
+def _saturating(slope: Callable, bend: Callable, peak: float) -> Bounds:
+    """For φ whose |φ′| falls with |x|, and whose |φ″| rises up to |x| = `peak` and falls from there."""
+
+    def bounds(low: jax.Array, high: jax.Array) -> tuple[Any, Any]:
+        near = _nearest(low, high)
+        return slope(near), bend(jnp.clip(peak, near, _size(low, high)))
+
+    return bounds
+
+
 def _above(least: float, slope: Callable, bend: Callable) -> Bounds:
     """For φ on (least, ∞) with |φ′| and |φ″| falling in x − least."""
 
@@ -59,8 +69,9 @@ def _tan(low: jax.Array, high: jax.Array) -> tuple[Any, Any]:
 
 
 def power(low: jax.Array, high: jax.Array, c: Any) -> tuple[Any, Any]:
-    """Of x^c with any fixed c, for x ≥ 0."""
-    low = jnp.maximum(low, jnp.where(low < 0.0, jnp.nan, 0.0))
+    """Of x^c with any fixed c, where it is a number: for x ≥ 0, or for whole c."""
+    # A bound below zero is loose, or c is whole and the size of x counts.
+    low, high = jnp.maximum(low, 0.0), _size(low, high)
 
     def most(p: Any, factor: Any) -> jax.Array:
         worst = jnp.abs(factor) * jnp.maximum(low**p, high**p)
@@ -86,6 +97,16 @@ def _sinh(low: jax.Array, high: jax.Array) -> tuple[Any, Any]:
     return jnp.cosh(m), jnp.sinh(m)
 
 
+def _sech2(m: jax.Array) -> jax.Array:
+    return 1.0 / jnp.cosh(jnp.minimum(m, 350.0)) ** 2
+
+
+_ERF = _saturating(
+    lambda m: 2.0 / math.sqrt(math.pi) * jnp.exp(-(m**2)),
+    lambda m: 4.0 / math.sqrt(math.pi) * m * jnp.exp(-(m**2)),
+    2**-0.5,
+)
+
 BOUNDS: dict[str, Bounds] = {
     "exp": _E,
     "expm1": _E,
@@ -102,17 +123,24 @@ BOUNDS: dict[str, Bounds] = {
     "tan": _tan,
     "asin": _within_one(lambda m, left: left**-0.5, lambda m, left: m * left**-1.5),
     "acos": _within_one(lambda m, left: left**-0.5, lambda m, left: m * left**-1.5),
-    "atan": _everywhere(1.0, 0.65),  # 3√3/8
+    "atan": _saturating(
+        lambda m: 1.0 / (1.0 + m**2), lambda m: 2.0 * m / (1.0 + m**2) ** 2, 3**-0.5
+    ),
     "sinh": _sinh,
     "cosh": lambda low, high: _sinh(low, high)[::-1],
-    "tanh": _everywhere(1.0, 0.77),  # 4/(3√3)
-    "asinh": _everywhere(1.0, 0.385),  # 2/(3√3)
+    "tanh": _saturating(_sech2, lambda m: 2.0 * jnp.tanh(m) * _sech2(m), math.atanh(3**-0.5)),
+    "asinh": _saturating(
+        lambda m: (1.0 + m**2) ** -0.5, lambda m: m * (1.0 + m**2) ** -1.5, 2**-0.5
+    ),
     "acosh": _above(
         1.0, lambda d: (d * (2.0 + d)) ** -0.5, lambda d: (1.0 + d) * (d * (2.0 + d)) ** -1.5
     ),
     "atanh": _within_one(lambda m, left: 1.0 / left, lambda m, left: 2.0 * m / left**2),
-    "logistic": _everywhere(0.25, 0.0963),  # 1/(6√3)
-    "erf": _everywhere(1.1284, 0.968),  # 2/√π, and 2√2/√(πe)
-    "erfc": _everywhere(1.1284, 0.968),
+    "logistic": _saturating(
+        lambda m: 0.25 * _sech2(0.5 * m), lambda m: 0.25 * jnp.tanh(0.5 * m) * _sech2(0.5 * m),
+        2.0 * math.atanh(3**-0.5),
+    ),
+    "erf": _ERF,
+    "erfc": _ERF,
 }  # fmt: skip
 """By the names of JAX's primitives."""

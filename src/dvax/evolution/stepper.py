@@ -18,7 +18,7 @@ from ..generators.expanded import coefficients, values
 from ..problem import END_ULPS, KNOT_ULPS
 from .defect import Sample, enclosed, sampled
 from .evaluations import Plan, Visit, evaluated
-from .excursions import ExcursionGuard
+from .excursions import WATCH, ExcursionGuard
 from .extent import Extent
 from .flow import Flow, Rate
 from .kinks import first_change
@@ -216,7 +216,8 @@ class Stepper(eqx.Module):
                 kink = partial(self._kink, t0, t1, x0, c, first, sample)
             if self.guard is not None:
                 along = [visits[0], *visits[-1 - len(sample.thetas) :]]
-                seen = self.guard.look(self.flow, along, variation)
+                share = (t1 - t0) / (self.ends[1] - self.ends[0])
+                seen = self.guard.look(self.flow, along, variation, share)
                 excursion, variation = seen.ratio, seen.variation
             # Further in, a bad value may come from a step that was too long: it is cut, not fatal.
             finite = _tree.all_finite(first.value)
@@ -342,7 +343,8 @@ class Stepper(eqx.Module):
         begin = self._within(t0, t1, 0.0)
         begin = jnp.where(jumped, begin, 2.0 * t0 - begin)
         ends = begin, self._within(t0, t1, 1.0)
-        return enclosed(self.flow, self.growth, ends, arc, visits[-1].rate)
+        short = t1 - t0 <= WATCH * (self.ends[1] - self.ends[0])
+        return enclosed(self.flow, self.growth, ends, arc, visits[-1].rate, short)
 
 
 def _alike(h: Any, length: Any, slack: Any) -> Any:
