@@ -525,10 +525,10 @@ def _discrete(given: list[Any], bind: Callable, entrywise: bool) -> Chord:
 
 def _select(given: list[Any], bind: Callable) -> Chord:
     which, cases = given[0], [_lift(case) for case in given[1:]]
-    if not all(jnp.issubdtype(case.a.dtype, jnp.floating) for case in cases):
-        return _discrete(given, bind, entrywise=True)
     if not is_chord(which):
         return Chord(*(bind(which, *(case[i] for case in cases)) for i in range(3)))
+    if not all(jnp.issubdtype(case.a.dtype, jnp.floating) for case in cases):
+        return _discrete(given, bind, entrywise=True)
     a = bind(which.a, *(case.a for case in cases))
     b = bind(which.b, *(case.b for case in cases))
     settled = bind(which.a, *(case.dev for case in cases))
