@@ -81,7 +81,11 @@ def certified(
         if solution.result != RESULTS.successful:
             return solution  # throw=False: the result says what failed, and nothing is certified
         bounds = _bounds(solution, known, t0)
-        last, bound = bound, float(np.max(np.asarray(bounds)))
+        rounding = _rounding(solution, known, max(size, largest), t0, t1)
+        if rounding > 0.5 * tol:
+            many = f"roundoff of x in {int(solution.stats['steps'])} steps, and of t"
+            raise _hopeless(tol, max(2.0 * rounding, reachable), known, span, many)
+        last, bound = bound, float(np.max(np.asarray(bounds))) + rounding
         if bound <= tol:
             if of_region(constants):
                 # The same steps, saved more often: the bounds in between are the sharper for it.
@@ -165,6 +169,18 @@ def _bounds(solution: Solution, known: _Growth, t0: float) -> Any:
     assert solution.defect is not None and solution.settled is not None
     impulse = (solution.defect, solution.law_defect), solution.settled
     return _least(t0, solution.ts, impulse, known)[0]
+
+
+def _rounding(solution: Solution, known: _Growth, rate: float, t0: float, t1: float) -> float:
+    """What rounding may add to the error: of x, twice a step; of t, at which data is evaluated and x is
+    known, x' being of the size `rate`."""
+    space = solution.setup.problem.spaces(solution.setup.x0)[0]
+    sizes = jax.vmap(space.norm)(solution.xs)
+    size = float(np.maximum(np.max(np.asarray(sizes)), space.norm(solution.setup.x0)))
+    eps = float(jnp.finfo(solution.setup.dtype).eps)
+    steps = int(solution.stats["steps"])
+    grows = min(M * np.exp(min(max(c, 0.0) * (t1 - t0), 700.0)) for M, c in known.rates)
+    return float(grows) * eps * (2.0 * steps * size + 4.0 * max(abs(t0), abs(t1)) * rate)
 
 
 def _all_along(solution: Solution, known: _Growth, t0: float) -> Any:

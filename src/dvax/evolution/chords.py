@@ -27,9 +27,9 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
 from .._jaxpr import bound, is_search
+from .._smooth_bounds import BOUNDS, exponential, power
 from .._tree import Tree
 from ..vi.structure import CALLS, evaluate
-from .smooth_bounds import BOUNDS, exponential, power
 
 _below_parabola = contextvars.ContextVar("below_parabola", default=False)
 

@@ -145,6 +145,11 @@ def _hill(phi: Callable) -> Callable[..., Ends]:
     return values
 
 
+def _sech(v: Values) -> Values:
+    # 1 − tanh² would cancel to 0 where the slope is small and not 0.
+    return 1.0 / np.cosh(np.minimum(np.abs(v), 350.0))
+
+
 def _valley(phi: Callable) -> Callable[..., Ends]:
     """The range of an even φ that rises away from 0."""
     hill = _hill(lambda v: -phi(v))
@@ -358,9 +363,9 @@ ENTRYWISE: dict[str, Rule] = {
     "ne": _unequal,
     "sinh": _rising(np.sinh, _valley(np.cosh)),
     "cosh": _smooth(_valley(np.cosh), lambda a, b: (np.sinh(a), np.sinh(b))),
-    "tanh": _rising(np.tanh, _hill(lambda v: 1 - np.tanh(v) ** 2)),
+    "tanh": _rising(np.tanh, _hill(lambda v: _sech(v) ** 2)),
     "logistic": _rising(
-        lambda v: 0.5 * (1 + np.tanh(0.5 * v)), _hill(lambda v: 0.25 * (1 - np.tanh(0.5 * v) ** 2))
+        lambda v: np.exp(-np.logaddexp(0.0, -v)), _hill(lambda v: 0.25 * _sech(0.5 * v) ** 2)
     ),
     "atan": _rising(np.arctan, _hill(lambda v: 1 / (1 + v**2))),
     "asinh": _rising(np.arcsinh, _hill(lambda v: 1 / np.sqrt(1 + v**2))),

@@ -80,7 +80,7 @@ class Accelerated(AbstractSolver):
             # momentum.
             still = space.norm(_tree.sub(new, y)) <= 2 * eps * space.norm(new)
             at_rest = short & (age == 1.0) & still
-            return state, Trial(new, w, F_new, lam, [new, y], 2, tentative=~at_rest)
+            return state, Trial(new, w, F_new, lam, [new, y], 2, tentative=~at_rest, base=(z, lam))
 
         tol = jnp.maximum(tol, self.least)
         return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=1, moves=2)

@@ -75,7 +75,8 @@ def extragradient_step(vi: Frozen, y: Tree, lam: Any, step: float) -> tuple[Tree
     z, Fz, lam, calls = extrapolate(vi, y, Fy, lam, step)
     after = vi.K.project(_tree.sub(y, _tree.scale(lam, Fz)), vi.space)
     # The certificate belongs to z, so z is what is returned.
-    return after, Trial(z, certificate(Fz, Fy, y, z, lam), Fz, lam, [z], calls + 1)
+    w = certificate(Fz, Fy, y, z, lam)
+    return after, Trial(z, w, Fz, lam, [z], calls + 1, base=(y, lam))
 
 
 def extrapolate(

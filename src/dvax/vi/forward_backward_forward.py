@@ -52,6 +52,6 @@ class ForwardBackwardForward(AbstractSolver):
             z, Fz, lam, calls = extrapolate(vi, y, Fy, lam, self.step)
             after = _tree.sub(z, _tree.scale(lam, _tree.sub(Fz, Fy)))
             w = certificate(Fz, Fy, y, z, lam)
-            return (after, lam), Trial(z, w, Fz, lam, [after], calls + 1)
+            return (after, lam), Trial(z, w, Fz, lam, [after], calls + 1, base=(y, lam))
 
         return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=1 + (vi.L_F is None))

@@ -62,7 +62,7 @@ class GoldenRatio(AbstractSolver):
             F_after = vi.F(after)
             w = certificate(F_after, Fy, average, after, new)
             state = after, F_after, y, Fy, average, new, phi * new / lam
-            return state, Trial(after, w, F_after, new, [after, average], 1)
+            return state, Trial(after, w, F_after, new, [after, average], 1, base=(average, new))
 
         return iterate(
             vi, y0, tol, begin, advance, self.max_steps, begun=2 + (vi.L_F is None), moves=2

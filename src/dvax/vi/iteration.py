@@ -29,7 +29,8 @@ class Trial(NamedTuple):
     where it is another, the one that w was divided by; `at`, the
     elements that the method iterates, which move as long as it does (y may rest in a corner meanwhile);
     `calls` of F it took; `word`, what to say if no further iteration is allowed. An
-    iterate that is `tentative` may come back without the method going round in a circle.
+    iterate that is `tentative` may come back without the method going round in a circle. `base` is
+    (b, λ) where w contains (b − y)/λ.
     """
 
     y: Tree
@@ -41,6 +42,7 @@ class Trial(NamedTuple):
     word: RESULTS = RESULTS.max_steps
     tentative: Any = False
     length: Any = None
+    base: tuple[Tree, Any] | None = None
 
 
 class _State(NamedTuple):
@@ -84,6 +86,10 @@ def iterate(
     def body(s: _State) -> _State:
         method, trial = advance(frozen, s.method)
         residual, size = norm(trial.w), length(trial.at)
+        if trial.base is not None:
+            # From far away w is a difference of large terms, of which rounding is left.
+            base, divisor = trial.base
+            residual = residual + 8 * eps * norm(_tree.sub(base, trial.y)) / divisor
         lam = trial.step if trial.length is None else trial.length
         first = jnp.where(s.count == 0, trial.step, s.first)
         # w contains (base − y)/λ, and with it the rounding of y divided by λ. Where that is as large as

@@ -65,6 +65,7 @@ class Projection(AbstractSolver):
                 least = jnp.minimum(least, residual)
             # A λ that is known to be right may be as small as it likes.
             step = lam if best is None else jnp.asarray(1.0 / vi.L_F, lam.dtype)
-            return (z, Fz, first, failures, least), Trial(z, w, Fz, step, [z], 1)
+            trial = Trial(z, w, Fz, step, [z], 1, base=(y, lam))
+            return (z, Fz, first, failures, least), trial
 
         return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=1 + (vi.L_F is None))

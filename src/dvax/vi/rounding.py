@@ -8,12 +8,15 @@ of Numerical Algorithms, Section 3.3). With the unit roundoff below ε:
     product    e = |a|e_b + |b|e_a + e_a e_b + ε|v|
     quotient   e = (e_a + |v|e_b)/(|b| − e_b) + ε|v|
     Σ, k terms e = Σ e_i + kε Σ|a_i|, in any order of summation; matrix products likewise
-    φ(a)       e = 2|φ′(a)|e_a + 8ε|v|, elementary functions being right to a few ulps
+    φ(a)       e = sup|φ′|e_a + 8ε|v| over [a − e_a, a + e_a], φ being right to a few ulps
+    a < b      in doubt where |a − b| ≤ e_a + e_b: what it chooses is then off by how far the cases are
+               apart; steps (sign, floor) likewise
 
 For F(y) = My − q it is (n + 3)ε(|M||y| + |q|), as it should be. An operation without a rule gets an
 estimate from the relative errors of its arguments, and then the result is not proved.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -23,6 +26,7 @@ import jax.tree_util as jtu
 from jax.extend.core import ClosedJaxpr
 
 from .._jaxpr import bound, walked
+from .._smooth_bounds import BOUNDS
 from .._tree import Tree
 from .structure import CALLS, CUSTOM, inner_jaxpr
 
@@ -84,7 +88,8 @@ def _apply(eqn: Any, given: list[Any], unknown: set[str]) -> list[Any]:
         return _carry(inner, given, unknown)
     out = bound(eqn, [_value(v) for v in given])
     if not any(jnp.issubdtype(v.dtype, jnp.floating) for v in out):
-        return out  # integers and truth values are taken as computed
+        # Integers are taken as computed, and so are truth values of which rounding leaves no doubt.
+        return [_doubted(name, eqn, given, v) if v.dtype == bool else v for v in out]
     error = _rule(name, eqn, given, out)
     if error is None:
         if any(isinstance(v, _Value) for v in given) or name not in ("iota",):
@@ -100,7 +105,13 @@ def _rule(name: str, eqn: Any, given: list[Any], out: list[Any]) -> list[jax.Arr
     if name in _INDEXED:
         return bound(eqn, [_lift(given[0]).error, *map(_value, given[1:])])
     if name == "select_n":
-        return bound(eqn, [_value(given[0]), *(_lift(v).error for v in given[1:])])
+        chosen = bound(eqn, [_value(given[0]), *(_lift(v).error for v in given[1:])])[0]
+        if not isinstance(given[0], _Value):
+            return [chosen]
+        # Where the condition is in doubt the value may be that of any case.
+        cases = [_lift(v) for v in given[1:]]
+        apart = [jnp.abs(case.value - out[0]) + case.error for case in cases]
+        return [jnp.where(given[0].error > 0, functools.reduce(jnp.maximum, apart), chosen)]
     x = [_lift(v) for v in given]
     v = out[0]
     eps = _eps(v)
@@ -112,8 +123,9 @@ def _rule(name: str, eqn: Any, given: list[Any], out: list[Any]) -> list[jax.Arr
         return [jnp.abs(e) for e in bound(eqn, [one.error for one in x])]
     if name == "abs":
         return [x[0].error]
-    if name == "sign":
-        return [jnp.zeros_like(v)]
+    if name in ("sign", "floor", "ceil", "round"):
+        # A value that its error may carry over a step is off by the height of the steps between.
+        return [jnp.where(x[0].error > 0, _rise(eqn, x[0], v), 0.0)]
     if name == "clamp":
         return [jnp.maximum(x[1].error, jnp.maximum(x[0].error, x[2].error))]
     if name == "convert_element_type":
@@ -125,7 +137,7 @@ def _rule(name: str, eqn: Any, given: list[Any], out: list[Any]) -> list[jax.Arr
         return [x[0].error + x[1].error + eps * jnp.abs(v)]
     if name == "mul":
         (a, p, _), (b, q, _) = x
-        return [jnp.abs(a) * q + jnp.abs(b) * p + p * q + eps * jnp.abs(v)]
+        return [_times(jnp.abs(a), q) + _times(jnp.abs(b) + q, p) + eps * jnp.abs(v)]
     if name == "div":
         (_, p, _), (b, q, _) = x
         room = jnp.abs(b) - q
@@ -151,17 +163,53 @@ def _rule(name: str, eqn: Any, given: list[Any], out: list[Any]) -> list[jax.Arr
         # now and then, that it fuses with a sum (jaxlib 0.10.2).
         return [error if exact else error + times(p, b + q)]
     if name in _SMOOTH:
-        slope = jax.jvp(lambda a: bound(eqn, [a])[0], (x[0].value,), (jnp.ones_like(x[0].value),))[
-            1
-        ]
-        # A factor of 2 for the second order of errors that are themselves of the order ε; where the
-        # argument is exact the slope, which may be infinite, does not matter.
-        through = jnp.where(x[0].error > 0, 2 * jnp.abs(slope) * x[0].error, 0.0)
-        power = abs(eqn.params["y"]) if name == "integer_pow" else 0
+        # Of the largest slope within the error: where the argument is exact, a slope that may be
+        # infinite does not matter.
+        low, high = x[0].value - x[0].error, x[0].value + x[0].error
+        power = {"integer_pow": eqn.params.get("y", 0), "square": 2}.get(name)
+        slope = BOUNDS[name](low, high)[0] if power is None else _power_slope(low, high, power)
+        through = jnp.where(x[0].error > 0, 1.01 * slope * x[0].error, 0.0)
+        power = abs(power) if power is not None and name == "integer_pow" else 0
         return [through + (8 + 2 * power) * eps * jnp.abs(v)]
-    if name in ("iota", "floor", "ceil", "round"):
+    if name == "iota":
         return [jnp.zeros_like(v)]
     return None
+
+
+def _times(factor: jax.Array, error: jax.Array) -> jax.Array:
+    """factor · error with 0 · ∞ = 0: a factor that is zero leaves nothing of an error."""
+    return jnp.where((error > 0) & (factor > 0), factor * error, 0.0)
+
+
+def _power_slope(low: jax.Array, high: jax.Array, n: int) -> jax.Array:
+    """sup |n x^(n−1)| over [low, high]."""
+    size = jnp.maximum(jnp.abs(low), jnp.abs(high))
+    nearest = jnp.where(low > 0, low, jnp.where(high < 0, -high, 0.0))
+    return abs(n) * (size ** (n - 1) if n >= 1 else nearest ** (n - 1))
+
+
+def _rise(eqn: Any, x: _Value, v: jax.Array) -> jax.Array:
+    """How far a step function of x may be from its computed value v."""
+    ends = [bound(eqn, [end])[0] for end in (x.value - x.error, x.value + x.error)]
+    return functools.reduce(jnp.maximum, [jnp.abs(end - v) for end in ends])
+
+
+_COMPARED = {"lt", "le", "gt", "ge", "eq", "ne", "lt_to", "le_to", "eq_to"}
+
+
+def _doubted(name: str, eqn: Any, given: list[Any], v: jax.Array) -> Any:
+    """A truth value with error 1 where rounding may have decided it, else as it is."""
+    if not any(isinstance(one, _Value) for one in given):
+        return v
+    x = [_lift(one) for one in given]
+    if name in _COMPARED and all(jnp.issubdtype(one.value.dtype, jnp.floating) for one in x):
+        room = x[0].error + x[1].error
+        doubt = (room > 0) & (jnp.abs(x[0].value - x[1].value) <= room)
+    else:
+        doubt = functools.reduce(jnp.logical_or, [jnp.any(one.error > 0) for one in x])
+        if all(one.value.shape in ((), v.shape) for one in x):
+            doubt = functools.reduce(jnp.logical_or, [one.error > 0 for one in x])
+    return _Value(v, jnp.broadcast_to(doubt, v.shape).astype(jnp.float32))
 
 
 def _estimate(out: jax.Array, given: list[Any]) -> jax.Array:

@@ -19,6 +19,7 @@ from .abstract import RESULTS, AbstractSolver, Frozen
 from .auto import Auto
 from .certificate import certify
 from .iteration import first_step, stopped
+from .projection_error import projection_error
 from .rounding import rounding_error
 from .weighted import Weighted, moduli_belong_to_the_parts
 
@@ -99,6 +100,7 @@ def solve_vi(
         jnp.asarray(value, dtype) if isinstance(value, float | int) else value
         for value in (tol, gamma, L_F)
     )
+    args = jtu.tree_map(lambda v: jnp.asarray(v, dtype) if isinstance(v, float) else v, args)
     return _solved(F, K, y0, args, solver, tol, gamma, L_F, space)
 
 
@@ -187,17 +189,22 @@ def _rounding(vi: Frozen, y: Tree, length: Any, residual: Any) -> tuple[jax.Arra
     With z = fl(base − λF(base)) and y = proj_K(z), n = (z − y)/λ is a normal whatever the error of
     F(base). What is computed is F(y) + [(base − y)/λ − F(base)]: it differs from F(y) + n by the error
     of F(y), by that of z divided by λ, and by roundings of the terms. The projection onto an interval
-    is exact; that onto another set is taken to be right to (8 + n)ε of the sizes in play.
+    is exact; that onto another set is taken to be right to (8 + n)ε of the sizes in play
+    (`projection_error`). A norm that underflows is less than that of n numbers of √tiny.
     """
     norm, value = vi.space.norm, vi.F(y)
     error, proved = rounding_error(vi.F, y)
-    eps = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y))).eps
+    kind = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y)))
+    eps, entries = kind.eps, sum(leaf.size for leaf in jtu.tree_leaves(y))
     size, force = norm(y), norm(value) + residual
-    exact = vi.K.intervals(y) is not None
-    places = 2 if exact else 2 * (8 + sum(leaf.size for leaf in jtu.tree_leaves(y)))
-    blur = eps * (places * size / length + (8 + (0 if exact else places)) * force)
+    if vi.K.intervals(y) is not None:
+        blur = eps * (2 * size / length + 8 * force)
+    else:
+        of_K, places = projection_error(vi.K), 2 * (8 + entries)
+        off = places * of_K.condition * eps * (size + of_K.data) + of_K.absolute * (1.0 + size)
+        blur = off / length + (8 + places) * eps * force
     # Of the norms themselves, and of this sum.
-    found = 1.01 * (norm(error) + blur)
+    found = 1.01 * (norm(error) + blur) + jnp.sqrt(entries * jnp.asarray(kind.tiny, size.dtype))
     return jnp.where(jnp.isfinite(residual), found, jnp.inf), proved
 
 
