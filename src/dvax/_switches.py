@@ -13,8 +13,9 @@ with t, x and u as arguments every value is one of
 - *of time*: another function of t, remembering comparisons that were not resolved;
 - *other*: a function of x or u. A comparison of those is an event, and nothing is said of it.
 
-A comparison of time that is not affine (sin(t) < a) has switches that are not found. Where it chooses
-between values that are fixed, and so jumps, a derivative in what it compares is refused.
+The switches of a comparison of time that is not affine (sin(t) < a), of a loop that compares time, and
+of a step function of it (floor(t/a), t % a) are not found. Where such a comparison chooses, a
+derivative in what it compares is refused.
 """
 
 from collections.abc import Callable
@@ -25,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.extend.core import ClosedJaxpr
+from jax.extend.core import ClosedJaxpr, Literal
 
 from . import _tree
 from ._jaxpr import bound, is_search, walked
@@ -111,6 +112,13 @@ class _Reader:
             v if isinstance(v, _Fixed | _Lines | _OfTime) or v is _OTHER else _fixed(v)
             for v in given
         ]
+        if name == "select_n" and isinstance(given[0], _OfTime):
+            self._refuse(given[0].pending)
+        if name in _STEPS or (name == "convert_element_type" and _becomes_whole(eqn)):
+            if isinstance(given[0], _Lines | _OfTime):
+                self._refuse(((self._operands(given), _place(eqn)),))
+        if name in ("scan", "while") and _compares_time(eqn, given):
+            self._refuse(((self._operands(given), _place(eqn)),))
         if any(v is _OTHER for v in given):
             # What it compares is an event; what else a select chooses by is not known to be one.
             inner = self._inner(eqn, given)
@@ -215,12 +223,69 @@ class _Reader:
             return any(not np.array_equal(v, values[0]) for v in values[1:])
         return name in ("convert_element_type", "sign")
 
+    def _operands(self, given: list[Any]) -> list[Any]:
+        return [_Lazy(partial(self._value, v)) for v in given if v is not _OTHER]
+
     def _refuse(self, pending: tuple) -> None:
         for operands, place in pending:
             values = [v.get() for v in operands]
             real = [v for v in values if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
             if not _tree.is_concrete(real):
                 self.found.append(_undifferentiated(place)(*real))
+
+
+_STEPS = {"floor", "ceil", "round", "rem"}
+
+
+def _becomes_whole(eqn: Any) -> bool:
+    kinds = [jnp.issubdtype(v.aval.dtype, jnp.floating) for v in (eqn.invars[0], eqn.outvars[0])]
+    return kinds == [True, False]
+
+
+def _compares_time(eqn: Any, given: list[Any]) -> bool:
+    """Whether the body of a loop compares what depends on time, and not on x or u."""
+    if eqn.primitive.name == "scan":
+        bodies, first = [eqn.params["jaxpr"]], 0
+        back = {eqn.params["num_consts"] + k: k for k in range(eqn.params["num_carry"])}
+        inputs = [given]
+    else:
+        first, second = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
+        bodies = [eqn.params["cond_jaxpr"], eqn.params["body_jaxpr"]]
+        carried = given[first + second :]
+        inputs = [[*given[:first], *carried], [*given[first : first + second], *carried]]
+        back = {second + k: k for k in range(len(carried))}
+    kinds = [[_dependence(v) for v in row] for row in inputs]
+    # What a turn carries on may depend on more than what it began with.
+    for _ in range(len(given) + 1):
+        out = _tainted(bodies[-1], kinds[-1])[1]
+        for place, k in back.items():
+            kinds[-1][place] = kinds[-1][place] | out[k]
+    if eqn.primitive.name == "while":
+        for k in range(len(back)):
+            kinds[0][first + k] = kinds[-1][eqn.params["body_nconsts"] + k]
+    return any(_tainted(body, row)[0] for body, row in zip(bodies, kinds, strict=True))
+
+
+def _dependence(v: Any) -> set[str]:
+    if v is _OTHER:
+        return {"x"}
+    return {"t"} if isinstance(v, _Lines | _OfTime) else set()
+
+
+def _tainted(program: ClosedJaxpr, given: list[set[str]]) -> tuple[bool, list[set[str]]]:
+    """(whether a comparison of time alone is in it, what the outputs depend on)."""
+    known: dict[Any, set[str]] = dict(zip(program.jaxpr.invars, given, strict=True))
+    of = lambda v: set() if isinstance(v, Literal) else known.get(v, set())  # noqa: E731
+    found = False
+    for eqn in program.jaxpr.eqns:
+        depends = set().union(*map(of, eqn.invars))
+        name = eqn.primitive.name
+        found |= name in _COMPARE | _STEPS and depends == {"t"}
+        inner = inner_jaxpr(eqn.params) if name in CALLS or name in CUSTOM else None
+        if inner is not None and len(inner.jaxpr.invars) == len(eqn.invars):
+            found |= _tainted(inner, list(map(of, eqn.invars)))[0]
+        known |= dict.fromkeys(eqn.outvars, depends)
+    return found, list(map(of, program.jaxpr.outvars))
 
 
 def _undifferentiated(place: str) -> Callable[..., jax.Array]:
@@ -235,8 +300,9 @@ def _undifferentiated(place: str) -> Callable[..., jax.Array]:
         if all(isinstance(v, jax.custom_derivatives.SymbolicZero) for v in tangents):
             return never(*primals), jnp.zeros(1)
         raise DifferentiationError(
-            f"f, h or K jumps at a time that depends on a parameter which is differentiated, by a "
-            f"comparison that is not affine in t{place}: the derivative of that time is not known. "
+            f"f, h or K may jump at a time that depends on a parameter which is differentiated, by a "
+            "comparison that is not affine in t, a step function (floor, round, %) or a loop"
+            f"{place}: the derivative of that time is not known. "
             "Write the switch as a comparison of t itself with the time of the jump (t < a), or "
             "name that time in the knots of a dvax.signals.Function or as a time of a "
             "dvax.signals.Table."
