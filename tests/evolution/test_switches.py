@@ -164,3 +164,56 @@ def test_a_spike_in_an_array_is_met_and_its_times_are_differentiated(kind, metho
         slope = jax.grad(end)(jnp.asarray(times))
         jump = (values[1] - 50.0) * np.exp(times[377] - 10.0)
         np.testing.assert_allclose(slope[377:379], [jump, -jump * np.exp(h)], rtol=1e-6)
+
+
+def _where(flag):
+    return jnp.where(flag, 1.0, 0.0)
+
+
+HIDDEN = {
+    "a loop": lambda t, x, a: jax.lax.fori_loop(
+        0, 3, lambda i, s: s + _where(t < a + 0.5 * i), 0.0
+    ),
+    "a map": lambda t, x, a: jnp.sum(jax.lax.map(lambda b: _where(t < b), jnp.stack([a, a + 0.5]))),
+    "a while loop": lambda t, x, a: jax.lax.while_loop(
+        lambda s: (s + 1) * a < t, lambda s: s + 1.0, 0.0
+    ),
+    "a remainder": lambda t, x, a: t % a,
+    "a floor": lambda t, x, a: jnp.floor(t / a),
+    "the parity of a floor": lambda t, x, a: _where(jnp.floor(t / a) % 2 == 0),
+    "a rounding": lambda t, x, a: jnp.round(t - a),
+    "a whole part": lambda t, x, a: jnp.arange(9.0)[(t / a).astype(int)],
+    "cases of t": lambda t, x, a: jnp.where(t**2 < a, jnp.sin(t) + 1, 0.0),
+    "cases of x": lambda t, x, a: jnp.where(jnp.sin(2 * t) < a, x, 1.0),
+}
+READ = {
+    "a fixed period": lambda t, x, a: a * _where(t % 0.8 < 0.3),
+    "a loop without comparisons": lambda t, x, a: jax.lax.fori_loop(
+        0, 3, lambda i, s: 0.1 * s * t + a, 0.0
+    ),
+    "a loop that compares x": lambda t, x, a: jax.lax.fori_loop(
+        0, 3, lambda i, s: s + jnp.maximum(x - a * i, 0.0), 0.0
+    ),
+    "a table": lambda t, x, a: jnp.interp(t, jnp.array([0.0, 1.0, 3.0]), jnp.stack([a, 1.0, a])),
+}
+
+
+def _end_with(drive):
+    case = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-1.0, 1.0),
+        f=lambda t, x, u, a: u + drive(t, x, a), h=lambda t, x, u, a: 2.0 * jnp.cos(t) - x,
+    )  # fmt: skip
+    return lambda a: dvax.solve(case, 0.3, 0.0, 1.9, a, dt=0.05, max_steps=64).xs[-1]
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_a_derivative_in_a_time_that_the_code_hides_is_refused(name):
+    with pytest.raises(dvax.DifferentiationError, match="may jump at a time"):
+        jax.grad(_end_with(HIDDEN[name]))(0.7)
+
+
+@pytest.mark.parametrize("name", READ)
+def test_a_derivative_that_moves_no_jump_is_not_refused(name):
+    end, a = _end_with(READ[name]), 0.7
+    difference = (end(a + 1e-5) - end(a - 1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.grad(end)(a), difference, rtol=1e-4, atol=1e-5)
