@@ -123,6 +123,7 @@ def solve(
 
     ```
     """
+    _problem_first(problem)
     if certified_tol is not None:
         x0 = _tree.as_float(x0, "x0")
         _only_adaptive(dt, method)
@@ -205,6 +206,15 @@ def solve(
             if throw:
                 raise failure(solution.setup, solution.stats, solution.result, solution)
     return solution
+
+
+def _problem_first(problem: Any) -> None:
+    """Raise an `InputError` where the first argument is no problem, before the others are read."""
+    _tree.check_kind(
+        problem, Problem, "dvax.solve(problem)",
+        "it must be a dvax.Problem, which comes first: dvax.solve(problem, x0, t0, t1)",
+        "Build one, or pass that of a model: model.problem",
+    )  # fmt: skip
 
 
 def _only_adaptive(dt: Any, method: Any) -> None:
