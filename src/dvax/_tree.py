@@ -239,9 +239,8 @@ def _float_array(leaf: Any, name: str, rule: str = _TREE) -> jax.Array:
             raise _not_real(name, leaf, rule) from None
     if isinstance(leaf, list):
         leaf = _from_list(leaf, name)
-    if not isinstance(leaf, np.generic) and not (hasattr(leaf, "dtype") and hasattr(leaf, "shape")):
-        raise _not_real(name, leaf, rule)
-    if isinstance(leaf, np.ma.MaskedArray) or leaf.dtype not in _FLOATS:
+    dtype = getattr(leaf, "dtype", None)
+    if isinstance(leaf, np.ma.MaskedArray | type) or dtype not in _FLOATS:
         raise _not_real(name, leaf, rule)
     try:
         return jnp.asarray(leaf)
@@ -254,7 +253,7 @@ _FLOATS = {np.dtype(np.float32), np.dtype(np.float64)}
 
 def _from_list(numbers: list[Any], name: str) -> Any:
     try:
-        array = np.asarray(numbers) if is_concrete(numbers) else jnp.asarray(numbers)
+        array: Any = np.asarray(numbers) if is_concrete(numbers) else jnp.asarray(numbers)
         if array.dtype.kind == "O" and _are_numbers(tuple(array.flat)):
             array = array.astype(float)  # integers beyond 64 bits
     except (TypeError, ValueError, OverflowError):

@@ -1,7 +1,7 @@
 """Constant coefficients on a box: diffusion, advection, reaction."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, SupportsIndex
 
 import equinox as eqx
 import jax
@@ -62,7 +62,7 @@ class Elliptic(AbstractModal):
 
     def __init__(
         self,
-        shape: int | Sequence[int],
+        shape: SupportsIndex | Sequence[SupportsIndex],
         lengths: Any = 1.0,
         boundary: str | Sequence[str] = "dirichlet",
         diffusion: Any = 1.0,

@@ -1,6 +1,7 @@
 """P as a periodic convolution: translation-invariant, diagonal in Fourier space."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, SupportsIndex
 
 import equinox as eqx
 import jax
@@ -41,7 +42,7 @@ class Convolution(AbstractOperator):
     symbol: jax.Array
     shape: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, symbol: Any, shape: int | tuple[int, ...]):
+    def __init__(self, symbol: Any, shape: SupportsIndex | Sequence[SupportsIndex]):
         name = "dvax.operators.Convolution(symbol)"
         self.symbol = _tree.as_array(symbol, name)
         self.shape = _tree.as_shape(

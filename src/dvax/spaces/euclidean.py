@@ -1,5 +1,8 @@
 """ℝⁿ, or any array shape, with the dot product."""
 
+from collections.abc import Sequence
+from typing import SupportsIndex
+
 import jax
 import jax.numpy as jnp
 
@@ -23,7 +26,7 @@ class Euclidean(AbstractSpace):
 
     shape: tuple[int, ...]
 
-    def __init__(self, shape: int | tuple[int, ...] = ()):
+    def __init__(self, shape: SupportsIndex | Sequence[SupportsIndex] = ()):
         self.shape = _tree.as_shape(
             shape, "dvax.spaces.Euclidean(shape)",
             "Write dvax.spaces.Euclidean(3) for vectors of 3, Euclidean() for a number",
