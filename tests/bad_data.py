@@ -80,7 +80,7 @@ ARRAYS = {
     "no entries": (lambda: o.Diagonal([]), "Diagonal(entries); shape (0,); at least one entry"),
     "infinite entry": (lambda: o.Diagonal([1.0, inf]), "Diagonal(entries); [ 1. inf]; finite"),
     "text of a number": (lambda: s.Box(0.0, "1.0"), "Box(upper); '1.0'; Write 1.0, without quot"),
-    "text": (lambda: s.Box(0.0, "a"), "Box(upper); got 'a'; not text"),
+    "text": (lambda: s.Box(0.0, "a"), "Box(upper); str 'a'; not text"),
     "nothing": (lambda: s.Box(0.0, None), "Box(upper); got None; such as 1.0"),
     "function": (
         lambda: s.Box(0.0, lambda t: t),

@@ -328,12 +328,14 @@ def _described(value: Any) -> str:
     if dtype is not None and hasattr(value, "shape"):
         masked = "a masked array" if isinstance(value, np.ma.MaskedArray) else "an array"
         return f"{masked} of {dtype} of shape {value.shape}"
-    return line(value) if isinstance(value, str | tuple | list) else f"{kind} {line(value)}"
+    return line(value) if isinstance(value, tuple | list) else f"{kind} {line(value)}"
 
 
 def _not_real(name: str, given: Any, rule: str = _TREE) -> InputError:
     if isinstance(given, list):
         rule = "a list must have real numbers, and rows of one length"
+    if getattr(getattr(given, "dtype", None), "kind", "") == "c":
+        rule = "data and states are real"
     argument = name.rpartition("(")[2].rstrip(")")
     argument = argument if argument.isidentifier() else "value"
     return InputError(InputProblem(name, _described(given), rule, _conversion(given, argument)))
