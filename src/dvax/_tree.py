@@ -1,5 +1,6 @@
 """Arithmetic on pytrees of arrays: a state or a control is one array, or a tuple of arrays."""
 
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -138,46 +139,134 @@ def library(*values: Tree) -> Any:
     return np if is_concrete(values) else jnp
 
 
+_TREE = "it must be a real number, a floating-point array, or a tuple of these"
+
+
 def as_float(a: Tree, name: str) -> Tree:
     """Arrays of a floating type from what the user gave; Python numbers take JAX's default type.
 
-    An integer or boolean *array* is refused rather than cast: its owner may have meant integer
-    arithmetic, and a silent cast would hide that.
+    States and controls are arrays and tuples of them. An integer or boolean *array* is refused rather
+    than cast: its owner may have meant integer arithmetic, and a silent cast would hide that.
     """
+    if isinstance(a, tuple) and a:
+        parts = [as_float(part, name) for part in a]
+        return type(a)(*parts) if hasattr(a, "_fields") else tuple(parts)
+    return _float_array(a, name)
+
+
+def as_floats(a: Tree, name: str) -> Tree:
+    """The same for the parameters of a problem, which may be any tree."""
     if not jtu.tree_leaves(a):
-        raise _not_real(name, repr(a))
-    # States are arrays and tuples of them; parameters may be any tree.
-    if isinstance(a, str | set) or (isinstance(a, dict) and name in ("x0", "x")):
-        raise _not_real(name, f"{type(a).__name__} {a!r}"[:120])
+        raise _not_real(name, a)
     return jtu.tree_map(
         lambda leaf: _float_array(leaf, name), a, is_leaf=lambda leaf: isinstance(leaf, list)
     )
 
 
-def _float_array(leaf: Any, name: str) -> jax.Array:
+def as_array(a: Any, name: str, least: int = 1) -> jax.Array:
+    """One array of at least `least` entries, where no tuple of arrays will do."""
+    if isinstance(a, tuple):
+        fix = f"Write jnp.array({[*a]!r})" if _are_numbers(a) else "Join them into one array"
+        rule = "it must be one array: a tuple is an element of a direct sum, one array a part"
+        raise InputError(InputProblem(name, line(a), rule, fix))
+    array = _float_array(a, name, "it must be a real number or a floating-point array")
+    if array.size < least:
+        given, rule = f"an array of shape {array.shape}", "it must have at least one entry"
+        raise InputError(InputProblem(name, given, rule, "Give a number or a vector with entries"))
+    return array
+
+
+def as_number(a: Any, name: str, fix: str) -> jax.Array:
+    """One number; `fix` says what to do about an array of several."""
+    if isinstance(a, tuple):
+        raise InputError(InputProblem(name, line(a), "it must be one number", fix))
+    number = _float_array(a, name, "it must be one real number")
+    if number.shape != ():
+        raise InputError(InputProblem(name, _short_array(number), "it must be one number", fix))
+    return number
+
+
+def as_shape(shape: Any, name: str, fix: str) -> tuple[int, ...]:
+    """The shape of an array: (n,) for a whole number n > 0, or a tuple of such numbers."""
+    try:
+        sizes = tuple(shape) if np.ndim(shape) else (shape,)
+        whole = tuple(operator.index(n) for n in sizes)
+    except (TypeError, ValueError):
+        sizes, whole = (), (0,)
+    if any(isinstance(n, bool) for n in sizes) or min(whole, default=1) < 1:
+        rule = "it is a whole number > 0, or a tuple of these"
+        raise InputError(InputProblem(name, line(shape), rule, fix))
+    return whole
+
+
+def check_kind(given: Any, kind: Any, name: str, rule: str, fix: str) -> None:
+    """Raise an `InputError` unless `given` is an instance of `kind`."""
+    if not isinstance(given, kind):
+        raise InputError(InputProblem(name, _described(given), rule, fix))
+
+
+def check_parts(parts: tuple[Any, ...], kind: type, name: str, example: str) -> None:
+    """Raise an `InputError` unless there are parts and each is an instance of `kind`."""
+    noun = kind.__name__.removeprefix("Abstract").lower()
+    fix = f"Give one argument a part, such as dvax.{noun}s.{example}"
+    rule = f"every part is one of dvax.{noun}s"
+    for number, part in enumerate(parts, start=1):
+        check_kind(part, kind, f"{name}, part {number}", rule, fix)
+    if not parts:
+        raise InputError(InputProblem(name, "no parts", f"it needs one {noun} or more", fix))
+
+
+def check_tolerance(tol: Any, name: str) -> None:
+    """Raise an `InputError` unless `tol` is a finite number ≥ 0 with a value."""
+    number = isinstance(tol, int | float | np.floating) and not isinstance(tol, bool)
+    if not (number and 0 <= tol < np.inf):
+        rule = "it must be a finite number ≥ 0 that is not traced"
+        raise InputError(InputProblem(name, _described(tol), rule, "Leave it out for the default"))
+
+
+def _are_numbers(a: tuple[Any, ...]) -> bool:
+    return all(isinstance(v, int | float) and not isinstance(v, bool) for v in a)
+
+
+def _float_array(leaf: Any, name: str, rule: str = _TREE) -> jax.Array:
     # `dtypes.issubdtype` and `asarray` cost as much as a hundred steps of a small system.
-    if isinstance(leaf, jax.Array) and leaf.dtype.kind == "f":
+    if isinstance(leaf, jax.Array) and leaf.dtype in _FLOATS:
         return leaf
-    if isinstance(leaf, bool | complex):
-        raise _not_real(name, repr(leaf))
-    if isinstance(leaf, int | float):
-        return jnp.asarray(float(leaf))
-    if isinstance(leaf, list):
+    if isinstance(leaf, int | float) and not isinstance(leaf, bool):
         try:
-            leaf = np.asarray(leaf, dtype=float)
-        except (TypeError, ValueError):
-            raise _not_real(name, " ".join(repr(leaf).split())[:120]) from None
-    if not hasattr(leaf, "dtype"):
-        raise _not_real(name, f"{type(leaf).__name__} {leaf!r}")
-    if not jnp.issubdtype(leaf.dtype, jnp.floating):
-        if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
-            return jnp.asarray(leaf)
-        raise _not_real(name, f"an array of {leaf.dtype}")
-    return jnp.asarray(leaf)
+            return jnp.asarray(float(leaf))
+        except OverflowError:
+            raise _not_real(name, leaf, rule) from None
+    if isinstance(leaf, list):
+        leaf = _from_list(leaf, name)
+    dtype = getattr(leaf, "dtype", None)
+    if isinstance(leaf, np.ma.MaskedArray | type) or dtype not in _FLOATS:
+        raise _not_real(name, leaf, rule)
+    try:
+        return jnp.asarray(leaf)
+    except (TypeError, ValueError):  # pandas tables, ShapeDtypeStruct and others
+        raise _not_real(name, leaf, rule) from None
+
+
+_FLOATS = {np.dtype(np.float32), np.dtype(np.float64)}
+
+
+def _from_list(numbers: list[Any], name: str) -> Any:
+    try:
+        array: Any = np.asarray(numbers) if is_concrete(numbers) else jnp.asarray(numbers)
+        if array.dtype.kind == "O" and _are_numbers(tuple(array.flat)):
+            array = array.astype(float)  # integers beyond 64 bits
+    except (TypeError, ValueError, OverflowError):
+        raise _not_real(name, numbers) from None
+    if array.dtype.kind not in "iuf":
+        raise _not_real(name, numbers)
+    return (
+        array.astype(float) if isinstance(array, np.ndarray) or array.dtype.kind != "f" else array
+    )
 
 
 def require(condition: Callable[[], Any], name: str, given: Any, rule: str, mend: str) -> None:
-    """Raise an `InputError` unless `condition()` is true on concrete values.
+    """Raise an `InputError` unless `condition()` is true, in all entries, on concrete values.
 
     Values that are traced (inside `jax.jit`, `jax.grad`, ...) cannot be looked at, so they pass.
     """
@@ -185,7 +274,8 @@ def require(condition: Callable[[], Any], name: str, given: Any, rule: str, mend
         return
     # What has a value may be met while something else is traced.
     with jax.ensure_compile_time_eval():
-        holds = bool(condition())
+        found = condition()
+        holds = bool(np.all(found)) if np.ndim(found) else bool(found)
     if not holds:
         raise InputError(InputProblem(name, short(given), rule, mend))
 
@@ -211,18 +301,75 @@ def _short_array(leaf: Any) -> str:
     array = np.asarray(leaf)
     if array.size <= 6:
         return " ".join(str(array).split())
+    if array.dtype.kind not in "iuf":
+        return f"an array of {array.dtype} of shape {array.shape}"
     known = array[~np.isnan(array)] if array.dtype.kind == "f" else array
     unknown = array.size - known.size
     range_ = f" with range [{known.min():.6g}, {known.max():.6g}]" if known.size else ""
     return f"an array of shape {array.shape}{range_}" + (f" and {unknown} NaN" if unknown else "")
 
 
-def _not_real(name: str, given: str) -> InputError:
-    return InputError(
-        InputProblem(
-            name,
-            given,
-            "it must be a real number, a floating-point array, or a tuple of these",
-            f"Write {name} with a decimal point or convert it: jnp.asarray({name}, float)",
-        )
-    )
+def line(value: Any, most: int = 120) -> str:
+    """repr(value) on one line of at most `most` characters."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def _described(value: Any) -> str:
+    """The type of a value, and the value where that says more."""
+    kind = type(value).__name__
+    if value is None:
+        return "None"
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    dtype = getattr(value, "dtype", None)
+    if isinstance(value, np.generic):
+        return f"{dtype} {value}"
+    if dtype is not None and hasattr(value, "shape"):
+        masked = "a masked array" if isinstance(value, np.ma.MaskedArray) else "an array"
+        return f"{masked} of {dtype} of shape {value.shape}"
+    return line(value) if isinstance(value, tuple | list) else f"{kind} {line(value)}"
+
+
+def _not_real(name: str, given: Any, rule: str = _TREE) -> InputError:
+    if isinstance(given, list):
+        rule = "a list must have real numbers, and rows of one length"
+    if getattr(getattr(given, "dtype", None), "kind", "") == "c":
+        rule = "data and states are real"
+    argument = name.rpartition("(")[2].rstrip(")")
+    argument = argument if argument.isidentifier() else "value"
+    return InputError(InputProblem(name, _described(given), rule, _conversion(given, argument)))
+
+
+def _conversion(given: Any, argument: str) -> str:
+    """How to make real numbers of `given`, the value of `argument`."""
+    if isinstance(given, str):
+        try:
+            return f"Write {float(given)!r}, without quotation marks"
+        except ValueError:
+            return "Give a number or an array, not text"
+    if isinstance(given, bool | np.bool_):
+        return f"Write {float(given)!r} for {bool(given)}"
+    if isinstance(given, dict):
+        return "Give its values: a number, an array, or a tuple of arrays"
+    if isinstance(given, set | frozenset):
+        return "A set has no order: give a list"
+    if isinstance(given, int):
+        return "Give a number within the range of float64"
+    if isinstance(given, list):
+        return "Correct its entries, or join arrays of several shapes in a tuple"
+    if isinstance(given, np.ma.MaskedArray):
+        return f"Say what stands in for masked entries: {argument}.filled(0.0)"
+    dtype = getattr(given, "dtype", None)
+    kind = getattr(dtype, "kind", "")
+    if isinstance(given, complex) or kind == "c":
+        return f"Take its real part, jnp.real({argument}), or give both parts as two components"
+    if kind in ("i", "u", "b"):
+        return f"Convert it: jnp.asarray({argument}, float)"
+    if kind == "f" or (dtype is not None and "float" in str(dtype).lower()):
+        return f"Convert it to float32 or float64: np.asarray({argument}, np.float64)"
+    if callable(given) and not isinstance(given, type):
+        return "Give a number or an array, such as the value that it returns"
+    if hasattr(given, "__array__") and not isinstance(given, type):
+        return f"Convert it: np.asarray({argument}, float)"
+    return "Give a number, such as 1.0, or an array, such as jnp.array([1.0, 2.0])"

@@ -5,6 +5,7 @@ value, a NumPy function, shapes that do not fit. The exceptions of Python and JA
 libraries; here they become an `InputError` with the file and the line of the user's code.
 """
 
+import dis
 import inspect
 import re
 from collections.abc import Callable, Mapping
@@ -169,7 +170,7 @@ def _explained(
         f"{key} of shape {_tree.shapes(value)}" for key, value in inputs.items() if key in "xu"
     )
     given = f"{type(error).__name__}: {_line(str(error))}"
-    rule, fix = _reason(name, inputs, error)
+    rule, fix = _reason(name, fn, inputs, error)
     if shapes:
         rule += f". It was traced with {shapes}{about}"
     return InputProblem(
@@ -177,7 +178,9 @@ def _explained(
     )
 
 
-def _reason(name: str, inputs: Mapping[str, Any], error: Exception) -> tuple[str, str]:
+def _reason(
+    name: str, fn: Callable[..., Any], inputs: Mapping[str, Any], error: Exception
+) -> tuple[str, str]:
     """The rule that was broken, and the fix."""
     traced = f"JAX traces {name}, so that its arguments have no values yet where"
     if isinstance(error, jax.errors.TracerBoolConversionError):
@@ -210,7 +213,7 @@ def _reason(name: str, inputs: Mapping[str, Any], error: Exception) -> tuple[str
         )
     if "immutable" in str(error) or "item assignment" in str(error):
         return "arrays of JAX cannot be written into", "Write x = x.at[i].set(v) for x[i] = v"
-    if inputs.get("args", 0) is None and "NoneType" in str(error):
+    if inputs.get("args", 0) is None and _reads_args(fn, error):
         return f"{name} reads args, and no args were given", "Pass args=... to the call"
     fix = "Fix that line"
     if "u" in inputs:
@@ -221,13 +224,50 @@ def _reason(name: str, inputs: Mapping[str, Any], error: Exception) -> tuple[str
     return f"{name}({', '.join(inputs)}) must be evaluable by JAX", fix
 
 
+def _reads_args(fn: Callable[..., Any], error: Exception) -> bool:
+    """Whether the error is about None, and the statement of the user's code that raised it reads a
+    parameter that is None: args, or what args was handed on to."""
+    if "NoneType" not in str(error):
+        return False
+    frame, instruction, trace = None, 0, error.__traceback__
+    while trace is not None:
+        if not _in_library(trace):
+            frame, instruction = trace.tb_frame, trace.tb_lasti
+        trace = trace.tb_next
+    if frame is None:
+        return False
+    code, names = frame.f_code, frame.f_locals
+    own = {*code.co_varnames[: code.co_argcount + code.co_kwonlyargcount], *_last_parameter(fn)}
+    first, last = [*code.co_positions()][instruction // 2][:2]
+    for step in dis.get_instructions(code):
+        at = step.positions.lineno if step.positions else None
+        if first is None or last is None or at is None or not first <= at <= last:
+            continue
+        read = step.argval if isinstance(step.argval, tuple) else (step.argval,)
+        if any(isinstance(n, str) and n in own and names.get(n, 0) is None for n in read):
+            return True
+    return False
+
+
+def _last_parameter(fn: Callable[..., Any]) -> list[str]:
+    """The name that fn gives to args."""
+    try:
+        return [*inspect.signature(fn).parameters][-1:]
+    except (TypeError, ValueError):
+        return []
+
+
+def _in_library(trace: TracebackType) -> bool:
+    module = str(trace.tb_frame.f_globals.get("__name__", ""))
+    return module.split(".")[0] in _LIBRARIES
+
+
 def _place(fn: Callable[..., Any], trace: TracebackType | None = None) -> str:
     """File and line of the user's code: the innermost frame of `trace` in it, else where fn begins."""
     place = None
     while trace is not None:
-        frame = trace.tb_frame
-        if str(frame.f_globals.get("__name__", "")).split(".")[0] not in _LIBRARIES:
-            place = f"{frame.f_code.co_filename}, line {trace.tb_lineno}"
+        if not _in_library(trace):
+            place = f"{trace.tb_frame.f_code.co_filename}, line {trace.tb_lineno}"
         trace = trace.tb_next
     if place is None:
         inner = inspect.unwrap(getattr(fn, "func", fn))

@@ -62,7 +62,7 @@ def _exactly(leaf: Any) -> tuple[Any, ...]:
         raise InputError(
             InputProblem(
                 "dvax.solve(problem, args)",
-                f"{type(leaf).__name__} {leaf!r}"[:200],
+                f"{type(leaf).__name__} {_tree.line(leaf)}",
                 "what is not an array is compiled in, so it must be hashable",
                 "Register its class as a pytree (an equinox.Module is one), or make it hashable",
             )

@@ -124,7 +124,7 @@ def solve(
     ```
     """
     if certified_tol is not None:
-        x0 = _tree.as_float(x0, "x0")
+        x0 = _state(problem, x0)
         _only_adaptive(dt, method)
         check(
             problem, x0, t0, t1, ts, dt, 0.0, 1.0, dt0, dt_max, horizon,
@@ -141,7 +141,7 @@ def solve(
         )
         most = bound_steps(max_steps, False, t0, t1, None)
         return certified(run, ts, problem, x0, args, begin, end, constants, certified_tol, most)
-    x0 = _tree.as_float(x0, "x0")
+    x0 = _state(problem, x0)
     method = _METHOD if method is None else method
     check(
         problem, x0, t0, t1, ts, dt, rtol, atol, dt0, dt_max, horizon, method, adjoint, measure, dense,
@@ -205,6 +205,19 @@ def solve(
             if throw:
                 raise failure(solution.setup, solution.stats, solution.result, solution)
     return solution
+
+
+def _state(problem: Any, x0: Any) -> Tree:
+    """x0 as arrays. Where neither it nor the problem is one, the order of the two may be wrong."""
+    try:
+        return _tree.as_float(x0, "x0")
+    except InputError:
+        _tree.check_kind(
+            problem, Problem, "dvax.solve(problem)",
+            "it must be a dvax.Problem, which comes first: dvax.solve(problem, x0, t0, t1)",
+            "Build one, or pass that of a model: model.problem",
+        )  # fmt: skip
+        raise
 
 
 def _only_adaptive(dt: Any, method: Any) -> None:

@@ -44,9 +44,7 @@ class Dense(AbstractGenerator):
     omega: jax.Array | None
 
     def __init__(self, matrix: Any, omega: Any = None):
-        self.matrix = _tree.as_float(matrix, "dvax.generators.Dense(matrix)")
-        name = "dvax.generators.Dense(omega)"
-        self.omega = None if omega is None else _tree.as_float(omega, name)
+        self.matrix = _tree.as_array(matrix, "dvax.generators.Dense(matrix)")
         shape = self.matrix.shape
         if len(shape) != 2 or shape[0] != shape[1]:
             raise InputError(
@@ -57,8 +55,18 @@ class Dense(AbstractGenerator):
                     "Use dvax.generators.Diagonal for a vector of diagonal entries",
                 )
             )
-        if self.omega is not None:
-            rate = self.omega
+        self.omega = None
+        if omega is not None:
+            name = "dvax.generators.Dense(omega)"
+            rate = self.omega = _tree.as_number(omega, name, "Give the rate of the growth bound")
+            _tree.require(
+                lambda: np.isfinite(rate), name, rate,
+                "the rate of a growth bound is a finite number", "Leave it out, or give a finite one",
+            )  # fmt: skip
+            _tree.require(
+                lambda: np.isfinite(self.matrix), "dvax.generators.Dense(matrix)", self.matrix,
+                "every entry must be finite", "Correct the matrix there",
+            )  # fmt: skip
             _tree.require(
                 lambda: np.max(np.real(np.linalg.eigvals(np.asarray(self.matrix)))) < float(rate),
                 name,

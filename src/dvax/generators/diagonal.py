@@ -30,7 +30,7 @@ class Diagonal(AbstractGenerator):
     entries: jax.Array
 
     def __init__(self, entries: Any):
-        self.entries = _tree.as_float(entries, "dvax.generators.Diagonal(entries)")
+        self.entries = _tree.as_array(entries, "dvax.generators.Diagonal(entries)")
 
     def apply(self, v: Tree) -> Tree:
         return self.entries * v

@@ -1,7 +1,7 @@
 """Constant coefficients on a box: diffusion, advection, reaction."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, SupportsIndex
 
 import equinox as eqx
 import jax
@@ -62,7 +62,7 @@ class Elliptic(AbstractModal):
 
     def __init__(
         self,
-        shape: int | Sequence[int],
+        shape: SupportsIndex | Sequence[SupportsIndex],
         lengths: Any = 1.0,
         boundary: str | Sequence[str] = "dirichlet",
         diffusion: Any = 1.0,
@@ -70,12 +70,15 @@ class Elliptic(AbstractModal):
         reaction: Any = 0.0,
         scheme: str = "spectral",
     ):
-        shape = (shape,) if isinstance(shape, int) else tuple(shape)
-        kinds = (boundary,) * len(shape) if isinstance(boundary, str) else tuple(boundary)
+        shape = _tree.as_shape(
+            shape, "dvax.generators.Elliptic(shape)", "Give the number of cells along each axis"
+        )
+        kinds = _kinds(boundary, len(shape))
         _check(shape, kinds, scheme)
         per_axis = {"lengths": lengths, "diffusion": diffusion, "velocity": velocity}
         L, d, c = (_by_axis(name, value, len(shape)) for name, value in per_axis.items())
-        r = _tree.as_float(reaction, "dvax.generators.Elliptic(reaction)")
+        name = "dvax.generators.Elliptic(reaction)"
+        r = _tree.as_number(reaction, name, "Put a rate that varies in space into f")
         _check_numbers(L, d, c, kinds)
         self.transform = Transform(shape, kinds)
         growing, turning = r, jnp.zeros_like(r)
@@ -197,7 +200,7 @@ def _by_axis(name: str, value: Any, count: int) -> list[jax.Array]:
 
 def _one_each(name: str, value: Any, count: int) -> list[jax.Array]:
     full = f"dvax.generators.Elliptic({name})"
-    array = _tree.as_float(jnp.asarray(value) if isinstance(value, tuple | list) else value, full)
+    array = _tree.as_array([*value] if isinstance(value, tuple) else value, full)
     if array.shape not in ((), (count,)):
         raise InputError(
             InputProblem(
@@ -214,23 +217,30 @@ def _is_zero(v: jax.Array) -> bool:
     return _tree.is_concrete(v) and float(v) == 0.0
 
 
+def _kinds(boundary: Any, axes: int) -> tuple[Any, ...]:
+    """The boundary condition of every axis."""
+    if isinstance(boundary, str):
+        return (boundary,) * axes
+    return tuple(boundary) if isinstance(boundary, tuple | list | np.ndarray) else (boundary,)
+
+
 def _check(shape: tuple[int, ...], kinds: tuple[str, ...], scheme: str) -> None:
     name = "dvax.generators.Elliptic"
     wrong: list[InputProblem] = []
-    if not 1 <= len(shape) <= 3 or min(shape) < 1:
+    if not 1 <= len(shape) <= 3:
         wrong.append(
             InputProblem(f"{name}(shape)", str(shape), "one to three axes of at least one cell",
                          "Give the number of cells along each axis")
         )  # fmt: skip
-    if len(kinds) != len(shape) or any(kind not in BOUNDARIES for kind in kinds):
+    if len(kinds) != len(shape) or any(str(kind) not in BOUNDARIES for kind in kinds):
         wrong.append(
-            InputProblem(f"{name}(boundary)", str(kinds),
+            InputProblem(f"{name}(boundary)", _tree.line(kinds),
                          f"one of {', '.join(BOUNDARIES)}, for all axes or one for each",
                          "Choose from these")
         )  # fmt: skip
-    if scheme not in ("spectral", "differences"):
+    if not isinstance(scheme, str) or scheme not in ("spectral", "differences"):
         wrong.append(
-            InputProblem(f"{name}(scheme)", repr(scheme), "'spectral' or 'differences'",
+            InputProblem(f"{name}(scheme)", _tree.line(scheme), "'spectral' or 'differences'",
                          "Leave it out for the spectral one")
         )  # fmt: skip
     if wrong:

@@ -56,6 +56,11 @@ class KroneckerSum(AbstractModal):
     matrix: jax.Array
 
     def __init__(self, field: Elliptic | Diagonal | Scalar, matrix: Any):
+        _tree.check_kind(
+            field, Elliptic | Diagonal | Scalar, "dvax.generators.KroneckerSum(field)",
+            "it is the generator on the grid: Elliptic, Diagonal or Scalar",
+            "Give that first, such as dvax.generators.Elliptic(32), and then the matrix",
+        )  # fmt: skip
         self.matrix = Dense(matrix).matrix
         self.field = field
 

@@ -28,6 +28,8 @@ class Product(AbstractModal):
     parts: tuple[AbstractGenerator, ...]
 
     def __init__(self, *parts: AbstractGenerator):
+        example = "Product(dvax.generators.Scalar(-1.0), dvax.generators.Zero())"
+        _tree.check_parts(parts, AbstractGenerator, "dvax.generators.Product", example)
         self.parts = parts
 
     def apply(self, v: Tree) -> Tree:

@@ -46,8 +46,8 @@ class Rotation(AbstractModal):
     transform: Transform | None
 
     def __init__(self, growth: Any, turn: Any, transform: Transform | None = None):
-        self.a = _tree.as_float(growth, "dvax.generators.Rotation(growth)")
-        self.b = _tree.as_float(turn, "dvax.generators.Rotation(turn)")
+        self.a = _tree.as_array(growth, "dvax.generators.Rotation(growth)")
+        self.b = _tree.as_array(turn, "dvax.generators.Rotation(turn)")
         self.transform = transform
         if self.a.ndim == 0 and self.b.ndim > 0:
             self.a = jnp.broadcast_to(self.a, self.b.shape)

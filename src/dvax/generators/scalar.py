@@ -29,7 +29,7 @@ class Scalar(AbstractGenerator):
     a: jax.Array
 
     def __init__(self, a: Any):
-        self.a = _tree.as_float(a, "dvax.generators.Scalar(a)")
+        self.a = _tree.as_array(a, "dvax.generators.Scalar(a)")
 
     def apply(self, v: Tree) -> Tree:
         return _tree.scale(self.a, v)

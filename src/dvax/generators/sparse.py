@@ -60,7 +60,7 @@ class Sparse(AbstractMatrixFree):
 
     def __init__(self, matrix: Any, weights: Any = 1.0, within: Range | None = None):
         rows, cols, values, self.size = triplets(matrix, "dvax.generators.Sparse(matrix)")
-        weights = _tree.as_float(weights, "dvax.generators.Sparse(weights)")
+        weights = _tree.as_array(weights, "dvax.generators.Sparse(weights)")
         _check_weights(weights, self.size)
         w = jnp.broadcast_to(weights, (self.size,)).astype(values.dtype)
         self.range = _circles(rows, cols, values, w)._replace(weights=weights)

@@ -1,6 +1,7 @@
 """P as a periodic convolution: translation-invariant, diagonal in Fourier space."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, SupportsIndex
 
 import equinox as eqx
 import jax
@@ -41,10 +42,12 @@ class Convolution(AbstractOperator):
     symbol: jax.Array
     shape: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, symbol: Any, shape: int | tuple[int, ...]):
+    def __init__(self, symbol: Any, shape: SupportsIndex | Sequence[SupportsIndex]):
         name = "dvax.operators.Convolution(symbol)"
-        self.symbol = _tree.as_float(symbol, name)
-        self.shape = (shape,) if isinstance(shape, int) else tuple(shape)
+        self.symbol = _tree.as_array(symbol, name)
+        self.shape = _tree.as_shape(
+            shape, "dvax.operators.Convolution(shape)", "Give the shape of v, such as (64, 64)"
+        )
         stored = (*self.shape[:-1], self.shape[-1] // 2 + 1) if self.shape else ()
         if len(self.shape) not in (1, 2) or jnp.shape(self.symbol) != stored:
             raise InputError(

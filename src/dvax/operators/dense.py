@@ -35,7 +35,7 @@ class Dense(AbstractOperator):
 
     def __init__(self, matrix: Any):
         name = "dvax.operators.Dense(matrix)"
-        self.matrix = _tree.as_float(matrix, name)
+        self.matrix = _tree.as_array(matrix, name)
         shape = self.matrix.shape
         if len(shape) != 2 or shape[0] != shape[1]:
             raise InputError(
@@ -46,6 +46,8 @@ class Dense(AbstractOperator):
                     "Use dvax.operators.Diagonal for a vector of diagonal entries",
                 )
             )
+        if _tree.is_concrete(self.matrix):
+            _check_positive(name, np.asarray(self.matrix))
         # The law applies P⁻¹ at every evaluation: a stored inverse is one product that fuses with
         # what surrounds it, a triangular solve is not; P is well conditioned or nothing else works.
         self.inverse_matrix = jnp.linalg.inv(self.matrix)
@@ -81,3 +83,33 @@ class Dense(AbstractOperator):
         similar = root[:, None] * self.matrix / root[None, :]
         eigenvalues = jnp.linalg.eigvalsh(0.5 * (similar + similar.T))
         return Spectrum(eigenvalues[0], eigenvalues[-1])
+
+
+def _check_positive(name: str, matrix: np.ndarray) -> None:
+    """Raise an `InputError` where no inner product with diagonal weights makes P coercive."""
+    given = ""
+    if not np.isfinite(matrix).all():
+        given = f"{_tree.short(matrix)}, which has entries that are not finite"
+    elif np.allclose(matrix, matrix.T, rtol=1e-13, atol=0.0):
+        given = _not_definite(matrix)
+    elif (sign := np.linalg.slogdet(matrix)[0]) <= 0:  # the product of the eigenvalues
+        kind = "a singular matrix" if sign == 0 else "a matrix with a negative determinant"
+        given = f"{kind} (rank {np.linalg.matrix_rank(matrix)}, size {len(matrix)})"
+    if given:
+        rule = "P must be bounded and coercive, so its matrix is finite and positive definite"
+        fix = "Correct the matrix, or add a multiple of the identity"
+        raise InputError(InputProblem(name, given, rule, fix))
+
+
+def _not_definite(matrix: np.ndarray) -> str:
+    """What is wrong with a symmetric matrix that is not positive definite, else nothing."""
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        smallest, rank = np.linalg.eigvalsh(matrix)[0], np.linalg.matrix_rank(matrix)
+        kind = (
+            "a singular matrix" if rank < len(matrix) else "a matrix that is not positive definite"
+        )
+        about = f"smallest eigenvalue {smallest:.3g}, rank {rank}, size {len(matrix)}"
+        return f"{kind} ({about})"
+    return ""

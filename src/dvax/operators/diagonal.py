@@ -14,7 +14,7 @@ from .abstract import AbstractOperator, Spectrum
 class Diagonal(AbstractOperator):
     """P v = p ⊙ v, elementwise, with every pᵢ > 0.
 
-    **Raises:** `dvax.InputError` where an entry is not positive.
+    **Raises:** `dvax.InputError` where an entry is not positive and finite.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -29,12 +29,12 @@ class Diagonal(AbstractOperator):
     inverse_entries: jax.Array
 
     def __init__(self, entries: Any):
-        self.entries = _tree.as_float(entries, "dvax.operators.Diagonal(entries)")
+        self.entries = _tree.as_array(entries, "dvax.operators.Diagonal(entries)")
         _tree.require(
-            lambda: jnp.all(self.entries > 0),
+            lambda: jnp.all((self.entries > 0) & jnp.isfinite(self.entries)),
             "dvax.operators.Diagonal(entries)",
             self.entries,
-            "P must be coercive, so every entry is positive",
+            "P must be coercive and bounded, so every entry is positive and finite",
             "Leave out or regularise the entries that are not",
         )
         self.inverse_entries = 1.0 / self.entries

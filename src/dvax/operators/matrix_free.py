@@ -56,9 +56,15 @@ class MatrixFree(AbstractOperator):
         tol: float = 1e-12,
     ):
         name = "dvax.operators.MatrixFree(m, norm)"
+        _tree.check_kind(
+            fn, Callable, "dvax.operators.MatrixFree(fn)", "it must be a function of v, linear in v",
+            "Write lambda v: ..., or use dvax.operators.Dense for a matrix",
+        )  # fmt: skip
+        _tree.check_tolerance(tol, "dvax.operators.MatrixFree(tol)")
         self.fn, self.tol = fn, tol
-        self.m = _tree.as_float(m, name)
-        self.norm = _tree.as_float(norm, name)
+        bound = "Give one bound of the spectrum of P"
+        self.m = _tree.as_number(m, "dvax.operators.MatrixFree(m)", bound)
+        self.norm = _tree.as_number(norm, "dvax.operators.MatrixFree(norm)", bound)
         self.weights = _tree.as_float(weights, "dvax.operators.MatrixFree(weights)")
         _tree.require(
             lambda: (self.m > 0) & (self.m <= self.norm) & jnp.isfinite(self.norm),

@@ -24,6 +24,8 @@ class Product(AbstractOperator):
     parts: tuple[AbstractOperator, ...]
 
     def __init__(self, *parts: AbstractOperator):
+        example = "Product(dvax.operators.Scaling(1.0), dvax.operators.Scaling(2.0))"
+        _tree.check_parts(parts, AbstractOperator, "dvax.operators.Product", example)
         self.parts = parts
 
     def apply(self, v: Tree) -> Tree:

@@ -28,7 +28,9 @@ class Scaling(AbstractOperator):
     inverse_b: jax.Array
 
     def __init__(self, b: Any):
-        self.b = _tree.as_float(b, "dvax.operators.Scaling(b)")
+        self.b = _tree.as_number(
+            b, "dvax.operators.Scaling(b)", "Use dvax.operators.Diagonal for one factor an entry"
+        )
         _tree.require(
             lambda: np.asarray(self.b) > 0 and np.isfinite(np.asarray(self.b)),
             "dvax.operators.Scaling(b)",

@@ -82,8 +82,8 @@ class AffineSubspace(AbstractSet):
 
 def linear_rows(name: str, E: Any, e: Any, left: str, right: str) -> tuple[jax.Array, jax.Array]:
     """(E, e) of conditions on E y, looked at as far as their shapes and values are known."""
-    E = _tree.as_float(E, f"{name}({left})")
-    e = _tree.as_float(e, f"{name}({right})")
+    E = _tree.as_array(E, f"{name}({left})")
+    e = _tree.as_array(e, f"{name}({right})")
     if jnp.ndim(E) < 1 or jnp.shape(e) != jnp.shape(E)[:1] or jnp.shape(E)[0] == 0:
         raise InputError(
             InputProblem(

@@ -78,7 +78,7 @@ class Ball(AbstractSet):
 def center_and_radius(name: str, center: Any, radius: Any) -> tuple[Tree, jax.Array]:
     """Those of a ball of any norm, looked at as far as their values are known."""
     center = _tree.as_float(center, f"{name}(center)")
-    radius = _tree.as_float(radius, f"{name}(radius)")
+    radius = _tree.as_array(radius, f"{name}(radius)")
     _tree.require(
         lambda: jnp.all((radius >= 0) & jnp.isfinite(radius)),
         f"{name}(radius)",

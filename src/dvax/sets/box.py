@@ -37,8 +37,8 @@ class Box(AbstractSet):
     upper: jax.Array
 
     def __init__(self, lower: Any, upper: Any):
-        self.lower = _tree.as_float(lower, "dvax.sets.Box(lower)")
-        self.upper = _tree.as_float(upper, "dvax.sets.Box(upper)")
+        self.lower = _tree.as_array(lower, "dvax.sets.Box(lower)")
+        self.upper = _tree.as_array(upper, "dvax.sets.Box(upper)")
         shapes = jnp.shape(self.lower), jnp.shape(self.upper)
         if shapes[0] != shapes[1]:
             _check_shapes(*shapes)

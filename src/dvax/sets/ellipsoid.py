@@ -48,7 +48,7 @@ class Ellipsoid(AbstractSet):
 
     def __init__(self, center: Any, radii: Any = None, *, shape: Any = None):
         name = "dvax.sets.Ellipsoid"
-        self.center = _tree.as_float(center, f"{name}(center)")
+        self.center = _tree.as_array(center, f"{name}(center)")
         _tree.require(
             lambda: _tree.all_finite(self.center),
             f"{name}(center)",
@@ -182,7 +182,7 @@ def _multiplier(zeta: jax.Array, lengths: jax.Array) -> jax.Array:
 
 
 def _known_radii(name: str, given: Any) -> jax.Array:
-    radii = _tree.as_float(given, name)
+    radii = _tree.as_array(given, name)
     _tree.require(
         lambda: jnp.all((radii > 0) & jnp.isfinite(radii)),
         name,
@@ -194,7 +194,7 @@ def _known_radii(name: str, given: Any) -> jax.Array:
 
 
 def _known_matrix(name: str, given: Any) -> jax.Array:
-    matrix = _tree.as_float(given, name)
+    matrix = _tree.as_array(given, name)
     if jnp.ndim(matrix) != 2 or matrix.shape[0] != matrix.shape[1]:
         raise InputError(
             InputProblem(

@@ -55,7 +55,8 @@ class Hyperplane(AbstractSet):
 def one_row(name: str, normal: Any, offset: Any) -> tuple[Tree, jax.Array]:
     """(a, b) of a linear condition, looked at as far as their values are known."""
     normal = _tree.as_float(normal, f"{name}(normal)")
-    offset = _tree.as_float(offset, f"{name}(offset)")
+    several = "Use dvax.sets.Polyhedron or dvax.sets.AffineSubspace for several conditions"
+    offset = _tree.as_number(offset, f"{name}(offset)", several)
     _tree.require(
         lambda: (
             _tree.all_finite(normal) & any(bool(jnp.any(a != 0)) for a in jtu.tree_leaves(normal))

@@ -7,6 +7,7 @@ import jax
 import jax.flatten_util
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
 
 from .. import _tree
@@ -48,6 +49,12 @@ class Intersection(AbstractSet):
     max_cycles: int = eqx.field(static=True)
 
     def __init__(self, *sets: AbstractSet, tol: float = 1e-11, max_cycles: int = 10_000):
+        name = "dvax.sets.Intersection"
+        _tree.check_tolerance(tol, f"{name}(tol)")
+        if not isinstance(max_cycles, int | np.integer) or max_cycles < 1:
+            rule, fix = "it must be a whole number > 0", "Leave it out for the default"
+            given = _tree.line(max_cycles)
+            raise InputError(InputProblem(f"{name}(max_cycles)", given, rule, fix))
         self.sets, self.tol, self.max_cycles = sets, tol, max_cycles
         if not sets:
             raise InputError(
@@ -58,6 +65,8 @@ class Intersection(AbstractSet):
                     "Use dvax.sets.WholeSpace() where there is no constraint",
                 )
             )
+        example = "Intersection(dvax.sets.Box(0.0, 1.0), dvax.sets.Ball(0.0, 1.0))"
+        _tree.check_parts(sets, AbstractSet, name, example)
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         fixed = jtu.tree_map(lax.stop_gradient, (self.sets, z, space))

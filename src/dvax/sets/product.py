@@ -2,6 +2,7 @@
 
 import jax
 
+from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
@@ -26,6 +27,8 @@ class Product(AbstractSet):
     parts: tuple[AbstractSet, ...]
 
     def __init__(self, *parts: AbstractSet):
+        example = "Product(dvax.sets.Box(0.0, 1.0), dvax.sets.WholeSpace())"
+        _tree.check_parts(parts, AbstractSet, "dvax.sets.Product", example)
         self.parts = parts
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:

@@ -8,7 +8,6 @@ import jax.tree_util as jtu
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
 from .abstract import AbstractSet
 
@@ -34,17 +33,12 @@ class Scaled(AbstractSet):
 
     def __init__(self, set: AbstractSet, factor: Any):
         name = "dvax.sets.Scaled(factor)"
+        _tree.check_kind(
+            set, AbstractSet, "dvax.sets.Scaled(set)", "it must be a set of dvax.sets",
+            "The set comes first, then the factor",
+        )  # fmt: skip
         self.set = set
-        self.factor = _tree.as_float(factor, name)
-        if _tree.shapes(self.factor) != ():
-            raise InputError(
-                InputProblem(
-                    name,
-                    f"shape {_tree.shapes(self.factor)}",
-                    "one number stretches all entries alike: other maps do not keep what is nearest",
-                    "Scale the data of the set itself",
-                )
-            )
+        self.factor = _tree.as_number(factor, name, "Scale the data of the set itself")
         _tree.require(
             lambda: jnp.isfinite(self.factor) & (self.factor != 0),
             name,

@@ -41,7 +41,7 @@ class SecondOrderCone(AbstractSet):
 
     def __init__(self, slope: Any = 1.0):
         name = "dvax.sets.SecondOrderCone(slope)"
-        self.slope = _tree.as_float(slope, name)
+        self.slope = _tree.as_array(slope, name)
         _tree.require(
             lambda: jnp.all((self.slope > 0) & jnp.isfinite(self.slope)),
             name,

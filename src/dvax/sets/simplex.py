@@ -54,7 +54,7 @@ class Simplex(AbstractSet):
 
     def __init__(self, total: Any, sizes: Sequence[int] | np.ndarray | None = None):
         name = "dvax.sets.Simplex(total)"
-        self.total = _tree.as_float(total, name)
+        self.total = _tree.as_array(total, name)
         _tree.require(
             lambda: jnp.all((self.total >= 0) & jnp.isfinite(self.total)),
             name,

@@ -33,6 +33,10 @@ class Translated(AbstractSet):
     offset: Tree
 
     def __init__(self, set: AbstractSet, offset: Any):
+        _tree.check_kind(
+            set, AbstractSet, "dvax.sets.Translated(set)", "it must be a set of dvax.sets",
+            "The set comes first, then the offset",
+        )  # fmt: skip
         self.set = set
         self.offset = _tree.as_float(offset, "dvax.sets.Translated(offset)")
         _tree.require(

@@ -25,7 +25,7 @@ class Constant(AbstractSignal):
     constant: jax.Array
 
     def __init__(self, value: Any):
-        self.constant = _tree.as_float(value, "dvax.signals.Constant(value)")
+        self.constant = _tree.as_array(value, "dvax.signals.Constant(value)")
         _tree.require(
             lambda: np.all(np.isfinite(self.constant)),
             "dvax.signals.Constant(value)",

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
+from ..errors import InputError, InputProblem
 from .abstract import AbstractSignal
 
 
@@ -27,11 +28,15 @@ class Function(AbstractSignal):
     times: jax.Array | np.ndarray
 
     def __init__(self, fn: Callable[[Any], Any], knots: Any = ()):
+        _tree.check_kind(
+            fn, Callable, "dvax.signals.Function(fn)", "it must be a function of t",
+            "Write lambda t: ..., or dvax.signals.Constant(...) for one value",
+        )  # fmt: skip
         self.fn = fn
         if not _tree.is_concrete(knots):
             self.times = jnp.sort(jnp.asarray(knots).ravel())
         else:
-            self.times = np.sort(np.asarray(knots, dtype=float))
+            self.times = np.sort(_times(knots))
 
     def value(self, t: Any) -> jax.Array:
         return jnp.asarray(self.fn(t))
@@ -41,3 +46,21 @@ class Function(AbstractSignal):
 
     def span(self) -> tuple[Any, Any]:
         return -np.inf, np.inf
+
+
+def _times(knots: Any) -> np.ndarray:
+    """One time, or a vector of times."""
+    try:
+        times = np.atleast_1d(np.asarray(knots))
+    except ValueError:  # rows of several lengths
+        times = np.empty((0, 0))
+    numbers = times.dtype.kind in "iuf" or times.size == 0
+    if times.ndim != 1 or not numbers or np.any(np.isnan(times.astype(float))):
+        raise InputError(
+            InputProblem(
+                "dvax.signals.Function(knots)", _tree.line(knots),
+                "it is a time, or a list of times where fn is not smooth: real numbers",
+                "Write knots=[0.5, 1.0]",
+            )
+        )  # fmt: skip
+    return times.astype(float)

@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from .. import _tree
 from .abstract import AbstractSignal
 from .constant import Constant
 
@@ -26,6 +27,10 @@ class Product(AbstractSignal):
     b: AbstractSignal
 
     def __init__(self, a: AbstractSignal, b: Any):
+        _tree.check_kind(
+            a, AbstractSignal, "dvax.signals.Product(a)", "it must be a signal of dvax.signals",
+            "The signal comes first; write dvax.signals.Constant(a) for one value",
+        )  # fmt: skip
         self.a = a
         self.b = b if isinstance(b, AbstractSignal) else Constant(b)
 

@@ -1,11 +1,13 @@
 """ℝⁿ, or any array shape, with the dot product."""
 
+from collections.abc import Sequence
+from typing import SupportsIndex
+
 import jax
 import jax.numpy as jnp
-import numpy as np
 
+from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
 from .abstract import AbstractSpace
 
 
@@ -24,19 +26,11 @@ class Euclidean(AbstractSpace):
 
     shape: tuple[int, ...]
 
-    def __init__(self, shape: int | tuple[int, ...] = ()):
-        self.shape = (shape,) if isinstance(shape, int) else tuple(shape)
-        if not all(
-            isinstance(n, int | np.integer) and not isinstance(n, bool) and n > 0
-            for n in self.shape
-        ):
-            raise InputError(
-                InputProblem(
-                    "dvax.spaces.Euclidean(shape)", repr(shape),
-                    "it is a whole number > 0, or a tuple of these",
-                    "Write dvax.spaces.Euclidean(3) for vectors of 3, Euclidean() for a number",
-                )
-            )  # fmt: skip
+    def __init__(self, shape: SupportsIndex | Sequence[SupportsIndex] = ()):
+        self.shape = _tree.as_shape(
+            shape, "dvax.spaces.Euclidean(shape)",
+            "Write dvax.spaces.Euclidean(3) for vectors of 3, Euclidean() for a number",
+        )  # fmt: skip
 
     def inner(self, a: Tree, b: Tree) -> jax.Array:
         return jnp.sum(a * b)

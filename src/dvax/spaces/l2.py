@@ -30,7 +30,7 @@ class L2(AbstractSpace):
     w: jax.Array
 
     def __init__(self, weights: Any):
-        self.w = _tree.as_float(weights, "weights")
+        self.w = _tree.as_array(weights, "dvax.spaces.L2(weights)")
         _tree.require(
             lambda: np.all((np.asarray(self.w) > 0) & np.isfinite(self.w)),
             "dvax.spaces.L2(weights)",

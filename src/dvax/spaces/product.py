@@ -2,6 +2,7 @@
 
 import jax
 
+from .. import _tree
 from .._tree import Tree
 from .abstract import AbstractSpace
 
@@ -21,6 +22,8 @@ class Product(AbstractSpace):
     spaces: tuple[AbstractSpace, ...]
 
     def __init__(self, *spaces: AbstractSpace):
+        example = "Product(dvax.spaces.Euclidean(2), dvax.spaces.Euclidean())"
+        _tree.check_parts(spaces, AbstractSpace, "dvax.spaces.Product", example)
         self.spaces = spaces
 
     def inner(self, a: Tree, b: Tree) -> jax.Array:

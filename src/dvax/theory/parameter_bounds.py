@@ -69,7 +69,7 @@ def parameter_bounds(
 
     ```
     """
-    low, high = _tree.as_float(low, "low"), _tree.as_float(high, "high")
+    low, high = _tree.as_floats(low, "low"), _tree.as_floats(high, "high")
     _check(problem, low, high, start_radius)
     middle = jtu.tree_map(lambda a, b: 0.5 * (a + b), low, high)
     t0, t1 = span(t0, t1, "dvax.parameter_bounds(t0, t1)")

@@ -96,8 +96,12 @@ def between(bounds: Any, like: Tree, name: str) -> Tree:
     out = jtu.tree_map(lambda a, b: interval(np.asarray(a), np.asarray(b)), *ends)
     if any(not (v.low <= v.high).all() for v in _slopes((out,))):
         raise _wrong(name, _tree.short(bounds), "low ≤ high in every entry, or the region is empty")
+    if any(np.isposinf(v.low).any() or np.isneginf(v.high).any() for v in _slopes((out,))):
+        raise _wrong(name, _tree.short(bounds), "low < ∞ and high > −∞, or the region has no point")
     return out
 
 
 def _wrong(name: str, given: Any, rule: str) -> InputError:
-    return InputError(InputProblem(name, str(given), rule, "Give the bounds as (low, high)"))
+    return InputError(
+        InputProblem(name, _tree.short(given), rule, "Give the bounds as (low, high)")
+    )

@@ -1,0 +1,93 @@
+"""Data that is no number, array, shape or part is refused where it is given; the rest is taken."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests import bad_data
+
+import dvax
+from dvax import generators, operators, sets, signals, spaces
+
+NAMES = [
+    (f"{group}: {name}", words)
+    for group, cases in bad_data.CASES.items()
+    for name, (_, words) in cases.items()
+]
+
+
+@pytest.fixture(scope="module")
+def answers():
+    root = Path(bad_data.__file__).parents[1]
+    paths = os.pathsep.join([str(Path(dvax.__file__).parents[1]), str(root)])
+    done = subprocess.run(
+        [sys.executable, bad_data.__file__], capture_output=True, text=True, timeout=600,
+        env=os.environ | {"PYTHONPATH": paths},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize(("name", "words"), NAMES, ids=[name for name, _ in NAMES])
+def test_bad_data_is_an_input_error_on_one_line_with_place_and_fix(answers, name, words):
+    kind, message = answers[name]
+    assert kind == "InputError", message
+    for word in words.split("; "):
+        assert word in message, message
+    place, _, rest = message.partition(": got ")
+    assert place and "; " in rest, "place: got what; the rule. The fix"
+    assert "\n" not in message and len(message) < 700, message
+    assert "asarray(dvax" not in message, "the fix is code of the caller"
+
+
+def test_none_that_is_not_args_is_not_said_to_be(answers):
+    assert "args=" not in answers["solve: None from elsewhere"][1]
+
+
+@pytest.mark.parametrize("size", [np.int64(4), np.int32(4), (np.int64(4),), [4]])
+def test_integers_of_numpy_are_sizes(size):
+    assert spaces.Euclidean(size).zeros().shape == (4,)
+    assert generators.Elliptic(size).transform.shape == (4,)
+    assert operators.Convolution(jnp.ones(3), size).shape == (4,)
+
+
+@pytest.mark.parametrize(
+    ("knots", "times"),
+    [
+        (0.5, [0.5]),
+        (1, [1.0]),
+        ([2, 1], [1.0, 2.0]),
+        ((), []),
+        ([], []),
+        (np.arange(2), [0.0, 1.0]),
+    ],
+)
+def test_knots_are_a_time_or_a_list_of_times(knots, times):
+    assert signals.Function(jnp.sin, knots).knots().tolist() == times
+
+
+@pytest.mark.parametrize(
+    ("make", "value"),
+    [
+        (lambda: sets.Box([0, 1], 2).lower, [0.0, 1.0]),
+        (lambda: sets.Box(-np.inf, np.inf).upper, np.inf),
+        (lambda: sets.Box([0.0, 2**70], 2.0**80).lower, [0.0, 2.0**70]),
+        (lambda: sets.Ball((jnp.zeros(2), 1.0), 1.0).center[1], 1.0),
+        (lambda: sets.HalfSpace((jnp.ones(2), 1.0), 1.0).normal[1], 1.0),
+        (lambda: operators.Dense([[2, 0], [0, 1]]).matrix, [[2.0, 0.0], [0.0, 1.0]]),
+        (lambda: operators.Dense([[1.0, 2.0], [1.0, 3.0]]).matrix[1], [1.0, 3.0]),  # for weights
+        (lambda: generators.Dense(-np.eye(2), omega=1).omega, 1.0),
+        (lambda: generators.Elliptic((2, 2), lengths=(1, 2)).symbol.shape, (2, 2)),
+        (lambda: jax.jit(lambda a: sets.Box([a, 0.0], [1.0, a + 1.0]).lower)(0.5), [0.5, 0.0]),
+        (lambda: jax.vmap(lambda b: operators.Scaling(b).inverse_b)(jnp.array([1.0, 2.0])), [1, 0.5]),
+        (lambda: jax.grad(lambda p: operators.Dense([[p]]).inverse(jnp.ones(1))[0])(2.0), -0.25),
+    ],
+)  # fmt: skip
+def test_data_that_is_right_is_taken(make, value):
+    np.testing.assert_allclose(make(), value)
