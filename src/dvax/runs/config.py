@@ -183,10 +183,12 @@ def check_contact(raw: dict[str, Any], source: Path, allow_outside: bool) -> Con
     if problems:
         raise InputError(*problems)
     assert inputs is not None
-    solver, span = draft.solver, longest_block(inputs.frame_times, inputs.boundary.size)
-    short = short_dt_max(solver.dt_max, solver.max_steps, span, f"{file}: solver")
-    if short is not None:
-        raise InputError(short)
+    solver = draft.solver
+    if solver.dt_max is not None:
+        span = longest_block(inputs.frame_times, inputs.boundary.size)
+        short = short_dt_max(solver.dt_max, solver.max_steps, span, f"{file}: solver")
+        if short is not None:
+            raise InputError(short)
     if draft.output.points_of_interest is None:
         places = tuple(
             tuple(float(c[i]) for c in inputs.boundary.coordinates) for i in inputs.point_indices

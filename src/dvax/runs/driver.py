@@ -7,6 +7,7 @@ blocks, and what is on disk is readable whenever and however the run ends.
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -141,8 +142,9 @@ class _Run:
             status, code, reason = "failed", 3, told
         except BaseException as error:
             # Whatever it was, the run is over, and its folder says so.
-            store.finish()
-            self._manifest("failed", f"{type(error).__name__}: {error}", frames=store.written)
+            with suppress(OSError):  # of a full disk, which is the error itself
+                store.finish()
+                self._manifest("failed", f"{type(error).__name__}: {error}", frames=store.written)
             raise
         with writing():
             store.finish()
@@ -176,8 +178,7 @@ class _Run:
                 a = self._solve(main, start, ts)
             except SolveError as stopped:
                 a, failure, beside = stopped.solution, stopped, None
-                assert isinstance(a, Solution)
-                if len(a.ts) == 0 or float(a.ts[-1]) <= start:
+                if not isinstance(a, Solution) or len(a.ts) == 0 or float(a.ts[-1]) <= start:
                     raise
                 ts = np.asarray(a.ts)
                 wanted = wanted[: len(ts)]
