@@ -6,15 +6,17 @@ from typing import Any
 
 DIGITS = 10
 """Digits of a figure of which no error is known."""
+NOT_FINITE = {"inf": "∞", "-inf": "−∞", "nan": "NaN"}
+"""How the JSON files of a run spell numbers that are not finite, and how they are shown."""
 _FEW = 4
 """So many entries of a list are shown; all of them are in summary.json."""
 
 
 def entry_text(entry: Mapping[str, Any]) -> str:
     """The value of an entry of summary.json: with `bound`, two digits of it, rounded up."""
-    value = entry.get("value")
+    value, error = _decoded(entry.get("value")), _decoded(entry.get("error"))
     if entry.get("bound") is None or not isinstance(value, float) or not math.isfinite(value):
-        return figure_text(value, entry.get("error"))
+        return figure_text(value, error)
     if not value > 0:
         return figure_text(value)
     above = _above(value)
@@ -41,8 +43,10 @@ def figure_text(value: Any, error: Any = None) -> str:
         return "not known" if value is None else str(value)
     if isinstance(value, int):
         return str(value)
+    if not math.isfinite(value):
+        return NOT_FINITE[str(float(value))]
     value += 0.0  # no negative zero
-    if error is None or not math.isfinite(error) or error < 0 or not math.isfinite(value):
+    if error is None or not math.isfinite(error) or error < 0:
         return f"{value:.{DIGITS}g}"
     if error == 0:
         return f"{value:.17g}"
@@ -50,6 +54,13 @@ def figure_text(value: Any, error: Any = None) -> str:
     leading = math.floor(math.log10(abs(value))) if value else place
     digits = min(17, max(1, leading - place + 1))
     return f"{value:.{digits}g} ± {_short(_above(error))}"
+
+
+def _decoded(value: Any) -> Any:
+    """A number, or a list of them, as it was before it was written to JSON."""
+    if isinstance(value, list):
+        return [_decoded(entry) for entry in value]
+    return float(value) if isinstance(value, str) and value in NOT_FINITE else value
 
 
 def _short(error: float) -> str:

@@ -42,6 +42,13 @@ SPOILED: dict[str, tuple[tuple[tuple[str, str], ...], tuple[str, ...]]] = {
     "unknown name": (((EXPRESSION, 'expression = "sinn(s)"'),), ("demand.expression", "sin")),
     "bomb": (((EXPRESSION, 'expression = "9**9**9**9"'),), ("demand.expression",)),
     "not finite": (((EXPRESSION, 'expression = "1/(s-s)"'),), ("demand", "1/(s-s)")),
+    "steps beyond max_steps": ((("dt = 0.05", "dt_max = 1e-12"),), ("solver.dt_max", "max_steps")),
+    "no such precision": ((("dt = 0.05", "rtol = 1e-300"),), ("solver.rtol", "2.3e-14")),
+    "start that overflows": (((KAPPA, "kappa0 = 1e308"),), ("initial.companion", "inf")),
+    "profile beside a fine boundary": (
+        (("points = 24", "points = 100000000"),),
+        ("initial.profile", "24", "100000000"),
+    ),
     "syntax of TOML": ((("[model]", "[model"),), ("strip.toml", "line")),
 }
 
@@ -115,3 +122,9 @@ def test_a_plain_pipe_gets_one_line_a_fact(tmp_path: Path) -> None:
     assert lines[0] == "error: 1 problem in the input; nothing was written"
     assert [line.split(":")[0].strip() for line in lines[2:]] == ["given", "rule", "fix"]
     assert "\x1b" not in text
+
+
+def test_a_file_in_the_place_of_a_run_directory_is_called_a_file(tmp_path: Path) -> None:
+    config = write_config(tmp_path / "in")
+    result = CliRunner().invoke(app, ["report", str(config)])
+    assert result.exit_code == 2 and "a file, not a folder" in result.stderr

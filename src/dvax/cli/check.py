@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from dvax._figure_text import NOT_FINITE
 from dvax.cli.constants import constant_rows
 from dvax.cli.failure import OUT_OF_CLASS, reported
 from dvax.cli.load import load
@@ -108,7 +109,7 @@ def _say_constants(rows: Sequence[Mapping[str, Any]]) -> None:
     shown = []
     for row in rows:
         value = row["value"]
-        number = f"{value:.6g}" if isinstance(value, int | float) else str(value)
+        number = NOT_FINITE.get(f"{value:g}", f"{value:.6g}")
         shown.append(
             (
                 str(row["symbol"]),

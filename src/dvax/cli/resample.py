@@ -17,7 +17,7 @@ def resample(config: Path, folder: Path, points: int) -> Path:
     import numpy as np
     import tomli_w
 
-    content: dict[str, Any] = tomllib.loads(config.read_text(encoding="utf-8"))
+    content: dict[str, Any] = tomllib.loads(config.read_text(encoding="utf-8-sig"))
     old = int(content["boundary"]["points"])
     content["boundary"]["points"] = points
     at = (np.arange(points) + 0.5) / points

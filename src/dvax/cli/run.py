@@ -8,11 +8,11 @@ import typer
 
 from dvax._figure_text import entry_text
 from dvax.cli.ahead import loaded_ahead
-from dvax.cli.failure import reported
+from dvax.cli.failure import BAD_INPUT, reported
 from dvax.cli.load import load
 from dvax.cli.options import AllowOutside, ConfigFile, Debug, Force, Quiet
 from dvax.cli.progress import progress
-from dvax.cli.talk import remark, say, table
+from dvax.cli.talk import complain_of, remark, say, table
 from dvax.cli.target import target_problems
 from dvax.errors import InputError, InputProblem
 
@@ -84,6 +84,10 @@ def carry_out(config: "Config | ModelConfig", out: Path, *, force: bool, quiet: 
             page = drawn.write()
             if not quiet:
                 remark(f"report: {page}")
+        except InputError as error:
+            # The run itself is complete, and its folder says how it ended.
+            complain_of(error, f"the run is in {outcome.directory}, without a report")
+            raise typer.Exit(outcome.exit_code or BAD_INPUT) from error
         except (KeyboardInterrupt, TimeoutError):
             if not stopped:
                 raise

@@ -41,10 +41,11 @@ def complain(text: str) -> None:
     remark(text, "bold red" if text.startswith("error") else "")
 
 
-def complain_of(error: InputError) -> None:
-    """Every problem of an InputError: where, what was given, the rule, the mend."""
+def complain_of(error: InputError, kept: str = "nothing was written") -> None:
+    """Every problem of an InputError: where, what was given, the rule, the mend; before them, what of
+    the results is on disk."""
     count = len(error.problems)
-    complain(f"error: {count} problem{'s' * (count != 1)} in the input; nothing was written")
+    complain(f"error: {count} problem{'s' * (count != 1)} in the input; {kept}")
     for number, problem in enumerate(error.problems, start=1):
         remark(f"{number}. {problem.place}", "bold")
         remark(f"   given: {problem.given}")

@@ -241,10 +241,14 @@ def warn_precision(x0: Any, rtol: Any) -> None:
     if _tree.is_concrete(rtol) and float(rtol) == 0.0:
         return  # what is asked for is absolute, and how large x becomes is not known
     if _tree.is_concrete(rtol) and float(rtol) < 100 * eps:
+        wider = "Set jax.config.update('jax_enable_x64', True) before anything else, or pass"
+        if jax.config.read("jax_enable_x64"):
+            wider = "Give x0 as float64, or pass"
+        if jnp.dtype(dtype) == np.float64:
+            wider = "Pass"
         warnings.warn(
             f"rtol = {float(rtol):g} cannot be reached in {jnp.dtype(dtype).name}, whose rounding is "
-            f"{eps:.1e} an operation. Set jax.config.update('jax_enable_x64', True) before anything "
-            "else, or ask for less.",
+            f"{eps:.1e} an operation. {wider} rtol = {105 * eps:.1e} or more.",
             stacklevel=3,
         )
 

@@ -46,6 +46,8 @@ _LINEARISABLE = 400
 """Unknowns up to which `ExpRosenbrock` is the method to name for a stiff problem."""
 
 
+_MANY_STEPS = 100
+"""Attempts from which the pace of the rest of a run can be told."""
 _REFUSED = "refused: "
 _CHECKED = {name: f"Check {name} there" for name in ("K", "h", "f")} | {
     "A x": "Check A, and how large x becomes",
@@ -275,13 +277,21 @@ def _stiff(stop: Stop) -> Diagnosis:
 
 def _too_few(stop: Stop) -> Diagnosis:
     """The number of steps, and what the run would need at its last pace."""
-    t1 = stop.span[1]
-    left = (t1 - stop.t) / max(stop.step, 5e-324)
-    text = (
-        f"max_steps = {stop.attempts} attempts were used, with t1 = {t1:.12g} still {t1 - stop.t:.3g} "
-        f"away and a last step of {stop.step:.3g}."
+    t0, t1 = stop.span
+    horizon = float(stop.setup.setting["horizon"])
+    # A piece of a longer run: its end is no time that the caller of the run has named, and the
+    # pieces that follow have the same max_steps.
+    is_piece = horizon > 1.000001 * (t1 - t0)
+    far = horizon if is_piece else t1 - stop.t
+    left = far / max(stop.step, 5e-324)
+    text = f"max_steps = {stop.attempts} attempts were used" + (
+        f" from t = {t0:.6g} to t = {stop.t:.6g} of a run of the length {horizon:.6g}, with a last "
+        if is_piece
+        else f", with t1 = {t1:.12g} still {t1 - stop.t:.3g} away and a last "
     )
-    enough = 2.0 * stop.attempts + 1.5 * left
+    text += f"step of {stop.step:.3g}."
+    # The first few steps say little about the pace of the later ones.
+    enough = 2.0 * stop.attempts + (1.5 if stop.attempts >= _MANY_STEPS else 10.0) * left
     if enough < 2**31:
         return Diagnosis(text, (Fix("max_steps", f"{math.ceil(enough)}", "at this pace"),))
     rtol = float(stop.setup.setting["rtol"])

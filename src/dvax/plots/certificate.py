@@ -8,7 +8,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from dvax._figure_text import entry_text
-from dvax.plots.lines import positive, thin
+from dvax.plots.lines import LARGEST, positive, thin
 from dvax.plots.look import (
     BLUE,
     GREEN,
@@ -18,6 +18,7 @@ from dvax.plots.look import (
     VERMILLION,
     axis_title,
     blank,
+    number,
     still_axes,
     unit_text,
 )
@@ -133,8 +134,9 @@ def _caption(run: RunRecord, held: list[str]) -> str:
             "Zero (exact at a frame, such as the given initial state) has no place on a "
             "logarithmic axis and is left as a gap."
         )
-    if any(not np.isfinite(run.series(name)).all() for name in held):
+    if any(not (run.series(name) <= LARGEST).all() for name in held):
         parts.append(
-            "Where a bound is not finite the certificate says nothing, and the curve has a gap."
+            f"Where a bound is not finite, or above {number(LARGEST)}, the certificate says nothing, "
+            "and the curve has a gap."
         )
     return " ".join(parts)

@@ -3,6 +3,7 @@
 import numpy as np
 
 MOST_POINTS = 4000
+LARGEST = 1e200
 
 
 def thin(time: np.ndarray, values: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
@@ -27,5 +28,6 @@ def thin(time: np.ndarray, values: np.ndarray, most: int = MOST_POINTS) -> np.nd
 
 
 def positive(values: np.ndarray) -> np.ndarray:
-    """The values a logarithmic axis can show; zero, negative and infinite ones become gaps."""
-    return np.where(np.isfinite(values) & (values > 0), values, np.nan)
+    """The values a logarithmic axis can show; the others become gaps: zero, negative and infinite ones,
+    and those above `LARGEST`, next to which the margins of the axis would overflow."""
+    return np.where((values > 0) & (values <= LARGEST), values, np.nan)

@@ -8,6 +8,8 @@ import plotly.graph_objects as go
 from matplotlib.figure import Figure
 from plotly.subplots import make_subplots
 
+from dvax._figure_text import NOT_FINITE
+
 # Okabe and Ito (2008), in the order used here.
 BLUE, VERMILLION, GREEN, ORANGE, SKY, PURPLE = (
     "#0072B2",
@@ -30,9 +32,11 @@ _SUPERSCRIPT = str.maketrans("-0123456789.", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹·")
 def number(value: Any, digits: int = 4) -> str:
     """A number as a reader wants it: `digits` significant ones, powers of ten written out."""
     if isinstance(value, bool) or not isinstance(value, int | float):
-        return str(value)
-    if isinstance(value, int) or not math.isfinite(value):
-        return f"{value:,}".replace(",", "\u202f") if isinstance(value, int) else str(value)
+        return NOT_FINITE.get(str(value), str(value))
+    if isinstance(value, int):
+        return f"{value:,}".replace(",", "\u202f")
+    if not math.isfinite(value):
+        return NOT_FINITE[str(float(value))]
     value += 0.0  # no negative zero
     if value == 0 or 1e-3 <= abs(value) < 1e6:
         return f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.0f}"

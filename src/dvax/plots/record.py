@@ -134,7 +134,7 @@ def read_run(directory: Path) -> RunRecord:
         raise InputError(
             InputProblem(
                 str(directory),
-                "a folder without manifest.json" if directory.is_dir() else "no such folder",
+                _other_than_a_run(directory),
                 "a run directory holds manifest.json and trajectory.zarr",
                 "Give the folder that `dvax run ... -o FOLDER` wrote.",
             )
@@ -157,6 +157,13 @@ def read_run(directory: Path) -> RunRecord:
         notes=notes,
         data=_data(store) if application else None,
     )
+
+
+def _other_than_a_run(path: Path) -> str:
+    """What `path` is, where it is no run directory."""
+    if path.is_dir():
+        return "a folder without manifest.json"
+    return "a file, not a folder" if path.exists() else "no such folder"
 
 
 def _damaged(file: Path, error: Exception) -> InputError:

@@ -7,6 +7,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dvax.plots.applications import application_pictures
 from dvax.plots.certificate import certificate_picture
 from dvax.plots.histories import histories_picture
@@ -48,6 +50,7 @@ class Report:
         return file
 
 
+@np.errstate(over="ignore", invalid="ignore")  # infinite values become gaps
 def draw_report(run_dir: Path, *, stills: bool) -> Report:
     """Make the report of `build_report`, and write nothing."""
     run = read_run(run_dir)

@@ -130,7 +130,8 @@ def _caption(run: RunRecord) -> str:
     names = [name for _, curves in PANELS for name, *_ in curves if run.has(name)]
     if run.has("separation_bound_x"):
         observed, bound = run.series("separation_x"), run.series("separation_bound_x")
-        tight = (observed / bound)[bound > 0]
+        tells = (bound > 0) & np.isfinite(bound)
+        tight = observed[tells] / bound[tells]
         if tight.size:
             parts.append(
                 "The largest ratio of the observed to the certified separation of x is "

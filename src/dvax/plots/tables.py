@@ -41,7 +41,7 @@ def headline_cards(run: RunRecord) -> str:
             ' <span class="unit"></span>'
         )
         # All digits, for who points at it.
-        whole = "" if isinstance(value, list) else f' title="{escaped(repr(value))}"'
+        whole = "" if isinstance(value, list) else f' title="{escaped(str(value))}"'
         cards.append(
             f'<div class="card"><div class="name">{escaped(_words(name))}</div>'
             f'<div class="value"{whole}>{shown}</div>'

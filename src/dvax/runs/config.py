@@ -14,13 +14,14 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from dvax.errors import InputError, InputProblem
+from dvax.runs.blocks import longest_block
 from dvax.runs.consistency import check_consistency
 from dvax.runs.contact_inputs import ContactInputs, read_inputs
 from dvax.runs.fields import Sources
 from dvax.runs.schema import OPTIONAL, SECTIONS
 from dvax.runs.schema_errors import shown, translate, unknown_key
 from dvax.runs.settings import Config as Config
-from dvax.runs.solver_options import MOST_STEPS
+from dvax.runs.solver_options import MOST_STEPS, short_dt_max
 from dvax.runs.units import Units
 
 MAX_BYTES = 2**20
@@ -75,7 +76,9 @@ def parse(source: Path) -> dict[str, Any]:
                 f"a configuration has at most {MAX_BYTES} bytes",
                 "Put data into CSV or NPY files.",
             )
-        text = source.read_bytes().decode("utf-8")
+        text = source.read_bytes().decode(
+            "utf-8-sig"
+        )  # Notepad begins a file with a byte-order mark
         return tomllib.loads(text)
     except InputError:
         raise  # it is a ValueError too
@@ -180,6 +183,12 @@ def check_contact(raw: dict[str, Any], source: Path, allow_outside: bool) -> Con
     if problems:
         raise InputError(*problems)
     assert inputs is not None
+    solver = draft.solver
+    if solver.dt_max is not None:
+        span = longest_block(inputs.frame_times, inputs.boundary.size)
+        short = short_dt_max(solver.dt_max, solver.max_steps, span, f"{file}: solver")
+        if short is not None:
+            raise InputError(short)
     if draft.output.points_of_interest is None:
         places = tuple(
             tuple(float(c[i]) for c in inputs.boundary.coordinates) for i in inputs.point_indices

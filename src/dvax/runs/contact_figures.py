@@ -7,6 +7,7 @@ import numpy as np
 
 from dvax.runs.contact_frames import norm_unit
 from dvax.runs.contact_inputs import ContactInputs
+from dvax.runs.json_numbers import bound_meaning
 from dvax.runs.settings import Config
 from dvax.theory import Constants, Status, weakest
 
@@ -58,6 +59,7 @@ class Figures:
             "law_error": float(values["law_error"].max()),
         }
 
+    @np.errstate(over="ignore", invalid="ignore")  # a rate that overflows is infinite
     def summary(self, steps: int) -> dict[str, Any]:
         """Name -> value, unit and meaning, as summary.json holds them."""
         if not self._last:
@@ -103,7 +105,13 @@ class Figures:
         )
         return {
             name: {"value": value, "unit": unit, "meaning": meaning}
-            | ({"bound": bounds[name]} if name in bounds else {})
+            if name not in bounds
+            else {
+                "value": value,
+                "unit": unit,
+                "meaning": bound_meaning(meaning, value),
+                "bound": bounds[name],
+            }
             for name, value, unit, meaning in rows
         }
 

@@ -10,6 +10,7 @@ import numpy as np
 from dvax.evolution import Solution
 from dvax.models import Contact
 from dvax.runs.contact_inputs import ContactInputs
+from dvax.runs.json_numbers import json_ready
 from dvax.runs.settings import Config
 from dvax.spaces import AbstractSpace
 from dvax.theory import Assumption, Bound, Constants, Row
@@ -105,7 +106,7 @@ def attributes(
         "kappa0": config.model.kappa0,
         "reaction": "the normalised reaction u is pressure / beta",
         "boundary_shape": list(shape),
-        "constants": json.dumps(rows, ensure_ascii=False),
+        "constants": json.dumps(json_ready(rows), ensure_ascii=False),
         "assumptions": json.dumps(
             [
                 {"label": a.label, "statement": a.statement, "status": a.status, "why": a.why}

@@ -1,5 +1,6 @@
 """Everything that a run of the contact model starts from, as arrays and signals."""
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,11 +11,13 @@ from dvax.runs.boundary import Boundary, build_boundary, check_size
 from dvax.runs.data_file import DataFile, fingerprint, locate
 from dvax.runs.expressions import compile_expression
 from dvax.runs.fields import Field, Sources, perturbation, read_field, space_values, to_signal
+from dvax.runs.measured import check_length
 from dvax.runs.units import Units
 
 if TYPE_CHECKING:
     from dvax.runs.settings import Config
 
+_FINE = 10**6
 _KINDS = {"demand": "indentation", "load": "indentation rate", "initial": "indentation"}
 
 
@@ -71,7 +74,10 @@ def read_inputs(
     sections = dict(config.__dict__)
     time = sections.get("time")
     end = time.end if time is not None else None
-    boundary, boundary_files = _boundary(sections.get("boundary"), sources, units, problems)
+    mismatched = _mismatched_profiles(sections, sources)
+    problems += mismatched
+    described = None if mismatched else sections.get("boundary")
+    boundary, boundary_files = _boundary(described, sources, units, problems)
     fields: dict[str, Field] = {}
     for key, kind in _KINDS.items():
         section = sections.get(key)
@@ -113,20 +119,73 @@ def read_inputs(
             "The demand jumps (series of kind 'constant'): the theory asks for g continuous in "
             "time, and u jumps with it."
         )
-    x0 = space_values(fields["initial"], boundary)
+    x0, companion_x0 = _initial_states(fields["initial"], boundary, shift, sources.name, problems)
+    if problems:
+        return None, problems
     files = (*boundary_files, *(f for field in fields.values() for f in field.files))
     inputs = ContactInputs(
         boundary=boundary,
         demand=fields["demand"],
         load=fields["load"],
         x0=x0,
-        companion_x0=x0 + shift,
+        companion_x0=companion_x0,
         frame_times=np.linspace(0.0, time.end, time.frames + 1),
         point_indices=indices,
         data_files=tuple(dict.fromkeys(files)),
         notices=tuple(notices),
     )
     return inputs, problems
+
+
+def _mismatched_profiles(sections: dict[str, Any], sources: Sources) -> list[InputProblem]:
+    """Profiles of another length than a boundary so fine that building it would take seconds."""
+    points = getattr(sections.get("boundary"), "points", None)
+    problems: list[InputProblem] = []
+    if points is None or math.prod(points) < _FINE:
+        return problems
+    for key in _KINDS:
+        profile = getattr(sections.get(key), "profile", None)
+        if profile is None:
+            continue
+        place = f"{sources.name}: {key}.profile"
+        try:
+            path = locate(profile.file, sources.folder, sources.allow_outside, f"{place}.file")
+        except InputError:
+            continue  # read_field reports it
+        try:
+            check_length(profile, path, points, place)
+        except InputError as error:
+            problems += error.problems
+    return problems
+
+
+def _initial_states(
+    field: Field, boundary: Boundary, shift: np.ndarray, file: str, problems: list[InputProblem]
+) -> tuple[np.ndarray, np.ndarray]:
+    """x(0) and where the companion starts; a problem where one of them overflows."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        x0 = space_values(field, boundary)
+        companion = x0 + shift
+    for key, state in (("initial", x0), ("initial.companion", companion)):
+        bad = np.flatnonzero(~np.isfinite(state))
+        if not bad.size:
+            continue
+        what = "x(0, s)"
+        if key == "initial.companion":
+            what = (
+                "where the companion starts, which is x(0, s) plus companion, by default "
+                "(1 + b_u) kappa0 / (beta b_x),"
+            )
+        problems.append(
+            InputProblem(
+                f"{file}: {key}",
+                f"{state[bad[0]]} at point {bad[0] + 1}",
+                f"{what} is finite at every point",
+                "Check the sizes of the factors, and the units that they are in.",
+            )
+        )
+        break
+    return x0, companion
 
 
 def _boundary(

@@ -5,9 +5,9 @@ Every block starts from the last state and step of the one before, so a run is t
 blocks, and what is on disk is readable whenever and however the run ends.
 """
 
-import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +19,7 @@ import numpy as np
 from dvax import vi
 from dvax.errors import InputError, InputProblem, SolveError
 from dvax.evolution import ETD1, ETD2RK, ETD4RK, DormandPrince, ExpRosenbrock, Solution, solve
+from dvax.runs.blocks import block_length
 from dvax.runs.compile_time import announced, compile_clock
 from dvax.runs.config import Config, build_contact
 from dvax.runs.contact_figures import Figures
@@ -36,14 +37,11 @@ from dvax.runs.provenance import provenance
 from dvax.runs.resolved import write_resolved
 from dvax.runs.rundir import FrameStore, RunDirectory, process
 from dvax.runs.schema import SolverSection
-from dvax.runs.solver_options import in_keys_of
+from dvax.runs.solutions import all_finite
+from dvax.runs.solver_options import in_keys_of, in_solver_keys
 from dvax.spaces import AbstractSpace
 from dvax.theory import Bound, bound_error
 
-_BLOCKS = 40
-"""So many blocks at least where there are frames enough: the progress bar moves, and a kill loses
-no more than a fortieth."""
-_BLOCK_BYTES = 2**27
 _METHODS = {kind.__name__: kind for kind in (ETD1, ETD2RK, ETD4RK, ExpRosenbrock, DormandPrince)}
 
 Listener = Callable[[dict[str, Any]], None]
@@ -111,7 +109,7 @@ class _Run:
         for notice in self.inputs.notices:
             self._event("warning", message=notice)
         times = self.inputs.frame_times
-        block = _block_length(len(times), self.inputs.boundary.size)
+        block = block_length(len(times), self.inputs.boundary.size)
         store = FrameStore(
             self.directory.path / "trajectory.zarr",
             len(times),
@@ -129,14 +127,25 @@ class _Run:
         figures = Figures(self.inputs, self.config, self.constants)
         status, code, reason = "finished", 0, "The end time was reached."
         try:
-            with announced(lambda: self._event("compiling")):
+            with (
+                announced(lambda: self._event("compiling")),
+                in_solver_keys(self.config.source.name),
+            ):
                 self._blocks(times, block, store, figures)
         except KeyboardInterrupt as stop:
             status, code = "interrupted", exit_code(stop)
             reason = "Interrupted; every frame written until then is kept."
+        except InputError as error:
+            status, code, reason = "failed", 2, str(error)
         except SolveError as error:
             told = error.told(in_keys_of(SolverSection, "solver", "time.end"))
             status, code, reason = "failed", 3, told
+        except BaseException as error:
+            # Whatever it was, the run is over, and its folder says so.
+            with suppress(OSError):  # of a full disk, which is the error itself
+                store.finish()
+                self._manifest("failed", f"{type(error).__name__}: {error}", frames=store.written)
+            raise
         with writing():
             store.finish()
             summary = {
@@ -169,8 +178,7 @@ class _Run:
                 a = self._solve(main, start, ts)
             except SolveError as stopped:
                 a, failure, beside = stopped.solution, stopped, None
-                assert isinstance(a, Solution)
-                if len(a.ts) == 0 or float(a.ts[-1]) <= start:
+                if not isinstance(a, Solution) or len(a.ts) == 0 or float(a.ts[-1]) <= start:
                     raise
                 ts = np.asarray(a.ts)
                 wanted = wanted[: len(ts)]
@@ -201,6 +209,7 @@ class _Run:
     def _values(
         self, a: Solution, b: Solution, error: Any, apart: Any
     ) -> Callable[[], tuple[Bound, dict[str, np.ndarray]]]:
+        @np.errstate(over="ignore", invalid="ignore")  # a bound that overflows is infinite
         def compute() -> tuple[Bound, dict[str, np.ndarray]]:
             bound = bound_error(self.problem, a, self.constants, initial_error=error)
             return bound, block_values(self.model, self.space, a, b, bound, apart)
@@ -212,7 +221,7 @@ class _Run:
         options: dict[str, Any] = (
             {} if s.vi_solver is None else {"vi_solver": getattr(vi, s.vi_solver)()}
         )
-        return interruptible(
+        solution = interruptible(
             lambda: solve(
                 self.problem, jnp.asarray(piece.x), start, float(ts[-1]), None, ts,
                 dt=s.dt, dt_max=s.dt_max, rtol=s.rtol or 1e-6, atol=s.atol or 1e-9,
@@ -221,6 +230,7 @@ class _Run:
                 dt0=piece.dt, horizon=self.config.time.end, **options,
             )
         )  # fmt: skip
+        return all_finite(solution, start)
 
     def _end(self, solved: Solution) -> "_Piece":
         fixed = self.config.solver.dt is not None
@@ -260,14 +270,6 @@ class _Piece:
 
     x: Any
     dt: Any = None
-
-
-def _block_length(frames: int, points: int) -> int:
-    """Frames a block: a fortieth of all, fewer where they are large, and never the first alone,
-    which is no distance from the start."""
-    affordable = _BLOCK_BYTES // (8 * 3 * points)
-    longest = max(2, min(math.ceil(frames / _BLOCKS), affordable))
-    return math.ceil(frames / math.ceil(frames / longest))
 
 
 def refuse_existing(out: Path, overwrite: bool) -> None:

@@ -2,6 +2,7 @@
 units."""
 
 import io
+import math
 import tokenize
 import warnings
 from dataclasses import dataclass
@@ -159,7 +160,41 @@ def read_profile(
     return Profile(values, factor is not None)
 
 
+def check_length(section: ProfileSection, path: Path, shape: tuple[int, ...], place: str) -> None:
+    """Raise `InputError` where an NPY profile does not fit a boundary of this shape, which need not
+    have been built. A CSV profile is interpolated, and fits."""
+    if path.suffix.lower() == ".npy":
+        _of_shape(_load_npy(section, path, place), shape, path, place)
+
+
 def _read_npy(section: ProfileSection, path: Path, boundary: Boundary, place: str) -> np.ndarray:
+    array = _load_npy(section, path, place)
+    _of_shape(array, boundary.shape, path, place)
+    values = array.astype(np.float64).ravel()
+    bad = np.flatnonzero(~np.isfinite(values))
+    if bad.size:
+        first = int(bad[0])
+        raise _error(
+            f"{path.name}, value {first + 1}",
+            f"{values[first]} ({bad.size} such values)",
+            "every value of a profile is finite: a gap is not a value",
+            "Fill the gaps on purpose.",
+        )
+    return values
+
+
+def _of_shape(array: np.ndarray, shape: tuple[int, ...], path: Path, place: str) -> None:
+    size = math.prod(shape)
+    if array.shape not in {(size,), shape}:
+        raise _error(
+            f"{place}.file",
+            f"{path.name} with {array.size} values (shape {array.shape})",
+            f"the boundary has {size} points (shape {shape}), a value for each",
+            "Set boundary.points to the profile's length, or sample the profile anew.",
+        )
+
+
+def _load_npy(section: ProfileSection, path: Path, place: str) -> np.ndarray:
     for key, value in (("column", section.column), ("position_column", section.position_column)):
         if value not in (None, "s"):
             raise _error(f"{place}.{key}", repr(value), "an NPY file has no columns", "Remove it.")
@@ -180,24 +215,7 @@ def _read_npy(section: ProfileSection, path: Path, boundary: Boundary, place: st
         raise _error(
             path.name, given, "a profile is one array of real numbers", "Save it as float."
         )
-    if array.shape not in {(boundary.size,), boundary.shape}:
-        raise _error(
-            f"{place}.file",
-            f"{path.name} with {array.size} values (shape {array.shape})",
-            f"the boundary has {boundary.size} points (shape {boundary.shape}), a value for each",
-            "Set boundary.points to the profile's length, or sample the profile anew.",
-        )
-    values = array.astype(np.float64).ravel()
-    bad = np.flatnonzero(~np.isfinite(values))
-    if bad.size:
-        first = int(bad[0])
-        raise _error(
-            f"{path.name}, value {first + 1}",
-            f"{values[first]} ({bad.size} such values)",
-            "every value of a profile is finite: a gap is not a value",
-            "Fill the gaps on purpose.",
-        )
-    return values
+    return array
 
 
 def _factor(units: Units, unit: str, kind: str, file: str, column: str) -> float:

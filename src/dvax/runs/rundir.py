@@ -6,6 +6,7 @@
     log.jsonl              one JSON object an event
     trajectory.zarr        frames, as an xarray Dataset
 
+Numbers that are not finite are the strings "inf", "-inf" and "nan" in JSON, which `float` reads.
 Small files are replaced whole (written beside, then renamed). Frames are written into a store that
 has its full length from the start; the time of a frame is written last and is NaN until then, so a
 frame with a time is a frame that is complete, whatever killed the run.
@@ -22,6 +23,8 @@ from typing import Any
 
 import numpy as np
 import zarr
+
+from dvax.runs.json_numbers import json_ready
 
 FILES = (
     "config.resolved.toml", "manifest.json", "summary.json", "log.jsonl", "report.html",
@@ -47,13 +50,13 @@ class RunDirectory:
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Replace a small file as a whole: a reader sees the old one or the new one."""
-        text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+        text = json.dumps(json_ready(content), indent=2, ensure_ascii=False, allow_nan=False)
         write_whole(self.path / name, text + "\n")
 
     def log(self, event: Mapping[str, Any]) -> None:
         """Append an event, with the moment it happened, and hand it to the system at once."""
         moment = datetime.now(UTC).isoformat(timespec="milliseconds")
-        json.dump({"at": moment, **event}, self._log, ensure_ascii=False)
+        json.dump({"at": moment, **json_ready(event)}, self._log, ensure_ascii=False)
         self._log.write("\n")
         self._log.flush()
 

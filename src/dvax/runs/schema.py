@@ -9,7 +9,15 @@ values stand in `dvax.runs.consistency`.
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainValidator, ValidationInfo
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    ValidationInfo,
+)
 from pydantic_core import PydanticCustomError
 
 from dvax.runs.units import UnitError, Units, check_working_unit, is_quantity
@@ -28,6 +36,21 @@ MAX_FRAMES = 10**7
 def broken(rule: str, mend: str) -> PydanticCustomError:
     """What a validator raises: the rule that a value breaks, and the mend."""
     return PydanticCustomError("rule", "{rule}", {"rule": rule, "mend": mend})
+
+
+LEAST_RTOL = 2.3e-14
+"""A hundred roundings of double precision: the smallest rtol that steps can reach."""
+
+
+def within_precision(rtol: float | None) -> float | None:
+    """A relative tolerance that double precision can reach."""
+    if rtol is not None and rtol < LEAST_RTOL:
+        raise broken(
+            f"a relative tolerance below {LEAST_RTOL:g} cannot be reached in double precision, whose "
+            "rounding is 2.2e-16 an operation",
+            f"Write rtol = {LEAST_RTOL:g} or more; atol is for states near 0",
+        )
+    return rtol
 
 
 def _in_units(value: Any, kind: str, info: ValidationInfo) -> Any:
@@ -274,7 +297,9 @@ class SolverSection(Section):
         "ETD2RK", description="of a step"
     )
     dt: Annotated[float | None, in_quantity("time")] = Field(None, gt=0, description="a step")
-    rtol: float | None = Field(None, gt=0, lt=1, description="relative tolerance of a step")
+    rtol: Annotated[float | None, AfterValidator(within_precision)] = Field(
+        None, gt=0, lt=1, description="relative tolerance of a step"
+    )
     atol: Annotated[float | None, in_quantity("indentation")] = Field(
         None, gt=0, description="absolute tolerance of a step, an indentation"
     )

@@ -1,15 +1,29 @@
 """The options of the solver as keys of a configuration, for every model."""
 
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, Field, ValidationInfo
 
 from dvax import evolution, vi
 from dvax.errors import Fix, InputError, InputProblem
-from dvax.runs.schema import MOST_COUNTED, Section, ViSolver, broken
+from dvax.evolution.arguments import ADAPTIVE_STEPS
+from dvax.runs.schema import (
+    MOST_COUNTED,
+    Section,
+    SolverSection,
+    ViSolver,
+    broken,
+    within_precision,
+)
 
 MOST_STEPS = 2**30
 """The most fixed steps of a run."""
+SEGMENTS = 100
+"""Solves that the run of an application consists of, where it has times enough."""
 
 Method = Literal[
     "ETD1", "ETD2RK", "ETD4RK", "ExpRosenbrock", "DormandPrince", "Implicit", "PiecewiseLinear"
@@ -44,7 +58,9 @@ class SolverKeys(Section):
     """Keys that go to `dvax.solve`; one that is left out has the default of the model."""
 
     method: Method | None = Field(None, description="of a step; by default that of the model")
-    rtol: float | None = Field(None, gt=0, lt=1, description="relative tolerance of a run")
+    rtol: Annotated[float | None, AfterValidator(within_precision)] = Field(
+        None, gt=0, lt=1, description="relative tolerance of a run"
+    )
     atol: float | None = Field(None, gt=0, description="absolute tolerance, in units of the state")
     dt_max: Annotated[float | None, AfterValidator(_apart)] = Field(
         None, gt=0, description="the longest step that adapts, in units of time"
@@ -73,6 +89,33 @@ def check_steps(table: SolverKeys, span: float, words: str) -> None:
         )
         fix = f"Write {key} = {span / 100:.3g}, say, or leave it out"
         raise InputError(InputProblem(f"model.{key}", f"{step:g}", rule, fix))
+    # Of at most a hundred segments, one is at least this long.
+    problem = short_dt_max(table.dt_max, table.max_steps, span / SEGMENTS, "model")
+    if problem is not None:
+        raise InputError(problem)
+
+
+def short_dt_max(
+    dt_max: float | None, max_steps: int | None, span: float, table: str
+) -> InputProblem | None:
+    """What is wrong with a `dt_max` so short that one solve, over a time of `span`, takes more than
+    `max_steps` steps."""
+    most = ADAPTIVE_STEPS if max_steps is None else max_steps
+    if dt_max is None or span <= most * dt_max:
+        return None
+    return InputProblem(
+        f"{table}.dt_max",
+        f"{dt_max:g}",
+        f"between two blocks of frames, {span:.3g} apart, steps no longer than that are more than "
+        f"max_steps = {most}",
+        f"Write dt_max = {_rounded_up(span / most)} or more, or a larger max_steps",
+    )
+
+
+def _rounded_up(number: float) -> str:
+    """The number with two digits, rounded up."""
+    shown = f"{number:.1e}"
+    return shown if float(shown) >= number else f"{1.05 * number:.1e}"
 
 
 def event_driven(table: SolverKeys) -> bool:
@@ -114,3 +157,31 @@ def in_keys_of(section: type[Section], table: str, end: str | None = None) -> An
         return f"Write {key} = {value}, {fix.why}"
 
     return phrase
+
+
+_OF_SOLVE = re.compile(r"dvax\.solve\(([^()]*)\)")
+_ELSEWHERE = {
+    "t0": "time",
+    "t1": "time.end",
+    "t0, t1": "time.end",
+    "ts": "time.frames",
+    "x0": "initial",
+}
+
+
+@contextmanager
+def in_solver_keys(file: str) -> Iterator[None]:
+    """Problems that `dvax.solve` finds in its arguments name the keys of the contact law's `file`."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(*(_with_keys(problem, file) for problem in error.problems)) from error
+
+
+def _with_keys(problem: InputProblem, file: str) -> InputProblem:
+    found = _OF_SOLVE.fullmatch(problem.place)
+    if found is None:
+        return problem
+    names = [name for name in found[1].split(", ") if name in SolverSection.model_fields]
+    keys = ", ".join(f"solver.{name}" for name in names)
+    return replace(problem, place=f"{file}: {keys or _ELSEWHERE.get(found[1], found[1])}")

@@ -146,13 +146,12 @@ class Constants(eqx.Module):
 
     def hadamard(self, T: Any) -> Any:
         """C_T = M e^{(ω+ML̃)₊T}(1 + L): ‖(x₁,u₁)−(x₂,u₂)‖ ≤ C_T‖Δx₀‖ (cor:hadamard_wellposed)."""
-        c, lib = _tree.host(self), _tree.library(self, T)
-        return c.M * lib.exp(lib.maximum(self.growth_rate, 0.0) * T) * (1.0 + self.L)
+        return self.largest_separation(T) * (1.0 + self.L)
 
     def separation(self, t: Any) -> Any:
         """M e^{(ω+ML̃)t}: ‖x₁(t)−x₂(t)‖ ≤ this · ‖Δx₀‖ (1stestistability)."""
         c, lib = _tree.host(self), _tree.library(self, t)
-        return c.M * lib.exp(self.growth_rate * t)
+        return c.M * _exp(lib, self.growth_rate * t)
 
     def response_separation(self, t: Any) -> Any:
         """L M e^{(ω+ML̃)t}: ‖u₁(t)−u₂(t)‖ ≤ this · ‖Δx₀‖ (2ndestistability)."""
@@ -162,12 +161,12 @@ class Constants(eqx.Module):
         """M e^{(ω+ML̃)₊T}: max over [0, T] of ‖x₁−x₂‖ ≤ this · ‖Δx₀‖ (supesti1); times L for u
         (supesti2)."""
         c, lib = _tree.host(self), _tree.library(self, T)
-        return c.M * lib.exp(lib.maximum(self.growth_rate, 0.0) * T)
+        return c.M * _exp(lib, lib.maximum(self.growth_rate, 0.0) * T)
 
     def sharp_separation(self, t: Any) -> Any:
         """e^{μt}: the same with the one-sided constant, or None where that is not known."""
         lib = _tree.library(self, t)
-        return None if self.one_sided is None else lib.exp(_tree.host(self.one_sided) * t)
+        return None if self.one_sided is None else _exp(lib, _tree.host(self.one_sided) * t)
 
     @property
     def smallness(self) -> tuple[Any, Any]:
@@ -208,6 +207,7 @@ class Constants(eqx.Module):
         words: list[Status] = [word for name, word in self.statuses if name in names]
         return weakest(*words)
 
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows is ∞ in the table
     def table(self, T: Any = None, rho: Any = None) -> list[Row]:
         """Every constant with its label and status; C_T for the horizon T where it is given."""
         rho = self.best_rho if rho is None else rho
@@ -265,9 +265,10 @@ class Constants(eqx.Module):
             )  # fmt: skip
         return [
             # −0 is 0.
-            Row(name, symbol, float(value) + 0.0, label, self.status_of(*made_of), meaning)
+            Row(name, symbol, float(value) + 0.0, label, self.status_of(*made_of),
+                _meaning(meaning, float(value)))
             for name, symbol, value, label, made_of, meaning in rows
-        ]
+        ]  # fmt: skip
 
     def _check(self) -> None:
         c = _tree.host(self)
@@ -292,6 +293,16 @@ class Constants(eqx.Module):
         ]
         if wrong:
             raise InputError(*wrong)
+
+
+def _exp(lib: Any, exponent: Any) -> Any:
+    """e^exponent, which is ∞ without a warning where it overflows."""
+    with np.errstate(over="ignore"):
+        return lib.exp(exponent)
+
+
+def _meaning(meaning: str, value: float) -> str:
+    return meaning if np.isfinite(value) else f"{meaning}; it is not finite, so it says nothing"
 
 
 def _number(value: Any) -> str:

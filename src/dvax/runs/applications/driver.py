@@ -19,6 +19,7 @@ from dvax.runs.applications.wording import in_keys
 from dvax.runs.compile_time import announced, compile_clock
 from dvax.runs.driver import Listener, RunOutcome, refuse_existing
 from dvax.runs.interrupt import Work, exit_code, interruptible, patience, terminable, writing
+from dvax.runs.json_numbers import bound_meaning
 from dvax.runs.provenance import provenance
 from dvax.runs.resolved import DATA_FOLDER, NAME
 from dvax.runs.rundir import RunDirectory, process
@@ -151,6 +152,7 @@ class _Run:
                 summary[name]["error"] = _plain(f.error)
             if f.bound is not None:
                 summary[name]["bound"] = f.bound
+                summary[name]["meaning"] = bound_meaning(f.meaning, summary[name]["value"])
         return summary
 
     def _keep(self, results: Results) -> None:
@@ -206,9 +208,7 @@ def constant_rows(constants: Constants | None) -> list[dict[str, Any]]:
     """The table of constants; an application's units are those of its own description."""
     if constants is None:
         return []
-    rows = [{**row._asdict(), "unit": ""} for row in constants.table()]
-    # JSON has no infinity, and a constant that is not finite says nothing.
-    return [row for row in rows if np.isfinite(row["value"])]
+    return [{**row._asdict(), "unit": ""} for row in constants.table()]
 
 
 def assumption_rows(known: tuple[Assumption, ...]) -> list[dict[str, str]]:

@@ -5,7 +5,7 @@ solution like any other.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -17,9 +17,8 @@ from dvax.errors import SolveError
 from dvax.evolution import Implicit, Solution, solve
 from dvax.runs.applications.base import Plan, Results, Variable
 from dvax.runs.interrupt import interruptible
-
-_SEGMENTS = 100
-"""So many, where there are times enough: an interruption loses no more than a hundredth."""
+from dvax.runs.solutions import all_finite, cut, with_fields
+from dvax.runs.solver_options import SEGMENTS
 
 
 def segments(plan: Plan) -> Iterator[Solution]:
@@ -34,7 +33,7 @@ def segments(plan: Plan) -> Iterator[Solution]:
         return
     fixed = plan.settings.get("dt") is not None
     measure = {} if isinstance(plan.settings.get("method"), Implicit) else {"measure": True}
-    length = max(2, math.ceil(len(times) / _SEGMENTS))
+    length = max(2, math.ceil(len(times) / SEGMENTS))
     x, step = plan.x0, None
     for begin in range(0, len(times), length):
         wanted = times[begin : begin + length]
@@ -53,32 +52,13 @@ def segments(plan: Plan) -> Iterator[Solution]:
             )  # fmt: skip
 
         try:
-            solution = interruptible(piece)
+            solution = all_finite(interruptible(piece), start)
         except SolveError as error:
             if isinstance(error.solution, Solution) and len(error.solution.ts):
                 yield error.solution
             raise
-        yield _cut(solution, len(wanted))
+        yield cut(solution, len(wanted))
         x, step = solution.stats["x"], None if fixed else float(solution.stats["next_dt"])
-
-
-_ROWS = ("ts", "xs", "us", "ys", "law_residual", "law_step", "law_error", "defect", "law_defect")
-
-
-def _cut(solution: Solution, count: int) -> Solution:
-    """The first `count` saved times."""
-    return _replaced(solution, lambda leaf: leaf[:count])
-
-
-def _replaced(solution: Solution, change: Callable[[Any], Any]) -> Solution:
-    names = (*_ROWS, "settled")
-    fields = {n: jtu.tree_map(change, getattr(solution, n)) for n in names}
-    return _with(solution, fields)
-
-
-def _with(solution: Solution, fields: dict[str, Any]) -> Solution:
-    given = {name: getattr(solution, name) for name in solution.__dataclass_fields__}
-    return Solution(**(given | fields))
 
 
 def joined(pieces: list[Solution], count: int | None = None) -> Solution:
@@ -119,7 +99,7 @@ def joined(pieces: list[Solution], count: int | None = None) -> Solution:
 
         stats = fields.pop("stats")
         fields = {**jtu.tree_map(whole, fields), "stats": stats}
-    return _with(pieces[0], fields | {"enclosed": all(piece.enclosed for piece in pieces)})
+    return with_fields(pieces[0], fields | {"enclosed": all(piece.enclosed for piece in pieces)})
 
 
 def _padded(rows: Any, count: int) -> jax.Array:
