@@ -148,6 +148,10 @@ class Equations:
             self._reach[h] = np.abs(_inverse(np.eye(len(self.eliminated)) / h - self.eliminated))
         return self._reach[h]
 
+    def start_residual(self, of_x: Array, of_p: Array) -> Array:
+        """What errors of x and p make of the equations of x'."""
+        return np.abs(self.system.A) @ of_x + np.abs(self.system.B) @ of_p
+
     def responses(self, ring: Ring) -> tuple[Array, Array]:
         """(y, w) of an oscillation of amplitude 1."""
         p = np.zeros(len(self.unknown), complex)

@@ -217,10 +217,8 @@ class Run:
         lacking = _EXTRAPOLATED * tail_x
         ys, _ = own.members(p, own.dependent(x[1:], p, given[:, n:]))
         none = np.zeros(len(p[0]))
-        swing = (
-            sum((2.0 * np.abs(ring[2]) for ring in rings), none),
-            sum((2.0 * np.abs(ring[3]) for ring in rings), none),
-        )
+        swings = [sum((2.0 * np.abs(ring[k]) for ring in rings), none) for k in (2, 3)]
+        swing = swings[0], swings[1]
         # Bounds on rounding may be far above it; a violation of so much is a switching.
         of_w = np.diag(self.given.M)
         largest = np.maximum(self.largest, [np.abs(y).max(axis=0), np.abs(w).max(axis=0)])
@@ -232,12 +230,9 @@ class Run:
         # What a layer leaves in the defect, of which bounds are made.
         most = _OF_DEFECT * (self.rtol * energy + self._norm(np.full(n, self.atol)))
         # Of that, no shorter step lowers what the rounding of x and p at the start makes of it.
-        of_start = np.abs(radau.START) @ (noise_p + solved.carried_p)
-        rounded = np.abs(own.system.A) @ self.off + np.abs(own.system.B) @ of_start
-        layer_defect = np.maximum(residuals[0] - rounded, 0.0)
-        excess = max(
-            excess, h * radau.mean_residual(1.0) * self._norm(layer_defect) / (most + tiny)
-        )
+        rounded = own.start_residual(self.off, np.abs(radau.START) @ (noise_p + solved.carried_p))
+        layer = h * radau.mean_residual(1.0) * self._norm(np.maximum(residuals[0] - rounded, 0.0))
+        excess = max(excess, layer / (most + tiny))
         return Attempt(
             x, ys, y, w, slack, rings, swing, sizes[0], noise_x.max(axis=0), lacking, excess,
             residuals,
