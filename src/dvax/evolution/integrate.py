@@ -51,7 +51,7 @@ def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
     flow = dataclasses.replace(
         flow, problem=opened(setup.problem, setup.number("t0"), setup.x0, flow.args)
     )
-    valid = _are_valid(setup, ts)
+    valid = setup.is_valid(ts)
     solution = _solved(setup, flow, ts, valid, options)
     result = RESULTS.where(valid, solution.result, RESULTS.invalid_number)
     solution = dataclasses.replace(solution, result=result)
@@ -93,20 +93,6 @@ def _solved(setup: Setup, flow: Flow, ts: Any, valid: jax.Array, options: Option
     else:
         saved, end = reverse.run(loop, x0, times)
     return _solution(setup, flow, controller, saved, end, times, options)
-
-
-def _are_valid(setup: Setup, ts: Any) -> jax.Array:
-    """Whether the numbers obey the rules of `arguments.check`, which cannot look at traced ones."""
-    number = setup.number
-    lengths = jnp.stack([number(name) for name in ("dt0", "dt_max", "horizon")])
-    # dt is NaN where steps adapt.
-    positive = jnp.all(lengths > 0) & ~(number("dt") <= 0)
-    rtol, atol = number("rtol"), number("atol")
-    tolerances = (rtol >= 0) & (atol >= 0) & (rtol + atol > 0)
-    forward = number("t1") > number("t0")
-    if ts is not None:
-        forward &= jnp.min(jnp.asarray(ts, setup.dtype)) >= number("t0")
-    return forward & positive & tolerances
 
 
 def _implicitly(

@@ -47,6 +47,19 @@ class Setup(NamedTuple):
         """An entry of `setting`, in the type of the state."""
         return jnp.asarray(self.setting[name], self.dtype)
 
+    def is_valid(self, ts: Any) -> jax.Array:
+        """Whether the numbers obey the rules of `arguments.check`, which cannot look at traced ones."""
+        number = self.number
+        lengths = jnp.stack([number(name) for name in ("dt0", "dt_max", "horizon")])
+        # dt is NaN where steps adapt.
+        positive = jnp.all(lengths > 0) & ~(number("dt") <= 0)
+        rtol, atol = number("rtol"), number("atol")
+        tolerances = (rtol >= 0) & (atol >= 0) & (rtol + atol > 0)
+        forward = number("t1") > number("t0")
+        if ts is not None:
+            forward &= jnp.min(jnp.asarray(ts, self.dtype)) >= number("t0")
+        return forward & positive & tolerances
+
     def flow(self) -> Flow:
         """The reduced map, with what the code of f, h and K proves about the law put to use."""
         problem, x0, vi_solver = self.problem, self.x0, self.vi_solver
