@@ -127,6 +127,14 @@ def is_concrete(*trees: Tree) -> bool:
     return True
 
 
+def is_number(value: Any) -> bool:
+    """Whether this is one real number, traced or not: no flag, text or array of several."""
+    if isinstance(value, int | float):
+        return not isinstance(value, bool)
+    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    return kind in ("f", "i", "u") and getattr(value, "shape", None) == ()
+
+
 def host(a: Tree) -> Tree:
     """What has a value now as NumPy arrays, the rest as it is. On a few numbers JAX would compile
     every operation as a program of its own."""
@@ -147,7 +155,7 @@ def as_float(a: Tree, name: str) -> Tree:
     if not jtu.tree_leaves(a):
         raise _not_real(name, repr(a))
     # States are arrays and tuples of them; parameters may be any tree.
-    if isinstance(a, str | set) or (isinstance(a, dict) and name in ("x0", "x")):
+    if isinstance(a, str | set) or (isinstance(a, dict) and name in ("x0", "x", "y0")):
         raise _not_real(name, f"{type(a).__name__} {a!r}"[:120])
     return jtu.tree_map(
         lambda leaf: _float_array(leaf, name), a, is_leaf=lambda leaf: isinstance(leaf, list)
@@ -188,6 +196,15 @@ def require(condition: Callable[[], Any], name: str, given: Any, rule: str, mend
         holds = bool(condition())
     if not holds:
         raise InputError(InputProblem(name, short(given), rule, mend))
+
+
+def refuse_nan(name: str, a: Tree) -> None:
+    """Raise an `InputError` where an entry of a concrete array is NaN."""
+    for leaf in jtu.tree_leaves(a):
+        if is_concrete(leaf) and np.isnan(np.asarray(leaf)).any():
+            raise InputError(
+                InputProblem(name, short(leaf), "it must be a number", "Correct the NaN entries")
+            )
 
 
 class Text(str):
