@@ -136,11 +136,12 @@ def check_functions(F: Any, y0: Tree, args: Any, space: AbstractSpace) -> None:
 
     It traces F, so it belongs into what is compiled once.
     """
-    if not _tree.same_shape(y0, space.zeros()):
+    zero = jax.eval_shape(space.zeros)  # its type is no part of the program
+    if not _tree.same_shape(y0, zero):
         raise InputError(
             InputProblem(
                 f"{_CALLER}(y0)", f"shape {_tree.shapes(y0)}",
-                f"it must be an element of space={space!r}, of shape {_tree.shapes(space.zeros())}",
+                f"it must be an element of space={space!r}, of shape {_tree.shapes(zero)}",
                 "Give y0 that shape, or name the space of y in space=",
             )
         )  # fmt: skip
