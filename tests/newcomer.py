@@ -129,7 +129,7 @@ FUNCTIONS = {
     "list": (lambda: of_f(lambda t, x, u, args: [x[0], x[1]], x0=jnp.zeros(2)), "jnp.stack([...])"),
     "complex": (
         lambda: of_f(lambda t, x, u, args: x * 1j),
-        "complex128; states and controls are real",
+        "complex128; is real, as the state x0 is",
     ),
     "shape": (lambda: of_f(lambda t, x, u, args: jnp.zeros(3), x0=jnp.zeros(2)), "(3,); (2,)"),
     "scalar u": (

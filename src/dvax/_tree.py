@@ -128,6 +128,14 @@ def is_concrete(*trees: Tree) -> bool:
     return True
 
 
+def is_number(value: Any) -> bool:
+    """Whether this is one real number, traced or not: no flag, text or array of several."""
+    if isinstance(value, int | float):
+        return not isinstance(value, bool)
+    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    return kind in ("f", "i", "u") and getattr(value, "shape", None) == ()
+
+
 def host(a: Tree) -> Tree:
     """What has a value now as NumPy arrays, the rest as it is. On a few numbers JAX would compile
     every operation as a program of its own."""
@@ -278,6 +286,15 @@ def require(condition: Callable[[], Any], name: str, given: Any, rule: str, mend
         holds = bool(np.all(found)) if np.ndim(found) else bool(found)
     if not holds:
         raise InputError(InputProblem(name, short(given), rule, mend))
+
+
+def refuse_nan(name: str, a: Tree) -> None:
+    """Raise an `InputError` where an entry of a concrete array is NaN."""
+    for leaf in jtu.tree_leaves(a):
+        if is_concrete(leaf) and np.isnan(np.asarray(leaf)).any():
+            raise InputError(
+                InputProblem(name, short(leaf), "it must be a number", "Correct the NaN entries")
+            )
 
 
 class Text(str):

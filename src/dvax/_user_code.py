@@ -1,4 +1,5 @@
-"""The user's own functions f, h, A, P and K, called for the first time.
+"""The user's own functions (f, h, A, P and K of a problem, F of `dvax.solve_vi`), called for the first
+time.
 
 JAX traces them, and that is where most first programs stop: too few parameters, an `if` on a traced
 value, a NumPy function, shapes that do not fit. The exceptions of Python and JAX point into the
@@ -24,23 +25,30 @@ _LIBRARIES = {"dvax", "equinox", "jax", "jaxlib", "jaxtyping", "numpy", "scipy",
 """Packages whose frames are no code of the user."""
 
 
-def call(name: str, fn: Callable[..., Any], inputs: Mapping[str, Any], about: str = "") -> Any:
-    """Return fn(*inputs.values()) for the argument `name` of `dvax.Problem`.
+def call(
+    name: str,
+    fn: Callable[..., Any],
+    inputs: Mapping[str, Any],
+    about: str = "",
+    caller: str = "dvax.Problem",
+) -> Any:
+    """Return fn(*inputs.values()) for the argument `name` of `caller`.
 
     `about` says where the shape of u comes from, for messages.
 
     **Raises:** `dvax.InputError` where fn has other parameters, or raises an exception that a usual
     mistake leads to. Any other exception keeps its type and gets a note.
     """
-    _check_parameters(name, fn, inputs)
+    at = f"{caller}({name})"
+    _check_parameters(at, name, fn, inputs)
     try:
         return fn(*inputs.values())
     except DvaxError:
         raise
     except (TypeError, ValueError, LookupError, AttributeError) as error:
-        raise InputError(_explained(name, fn, inputs, about, error)) from error
+        raise InputError(_explained(at, name, fn, inputs, about, error)) from error
     except Exception as error:
-        error.add_note(f"Raised in {name} of dvax.Problem, {_place(fn, error.__traceback__)}.")
+        error.add_note(f"Raised in {name} of {caller}, {_place(fn, error.__traceback__)}.")
         raise
 
 
@@ -59,37 +67,43 @@ def leaked(error: jax.errors.UnexpectedTracerError) -> InputError:
     )
 
 
-def check_values(name: str, fn: Callable[..., Any], out: Any, x: Any) -> None:
-    """Raise an `InputError` unless `out` = fn(t, x, u, args) consists of real numbers no wider than
-    those of x."""
-    at, wide = f"dvax.Problem({name})", jnp.result_type(*jtu.tree_leaves(x))
+def check_values(
+    name: str,
+    fn: Callable[..., Any],
+    out: Any,
+    x: Any,
+    inputs: str = "t, x, u, args",
+    caller: str = "dvax.Problem",
+    element: str = "the state x0",
+) -> None:
+    """Raise an `InputError` unless `out` = fn(`inputs`) consists of real numbers of the type of x, an
+    `element` of which messages speak."""
+    wide = jnp.result_type(*jtu.tree_leaves(x))
+
+    def refuse(given: str, rule: str, fix: str) -> None:
+        raise InputError(InputProblem(f"{caller}({name}), {_place(fn)}", given, rule, fix))
+
     for leaf in jtu.tree_leaves(out):
-        number = isinstance(leaf, bool | int | float | complex | np.generic)
-        if not number and not (hasattr(leaf, "dtype") and hasattr(leaf, "shape")):
-            raise InputError(
-                InputProblem(
-                    f"{at}, {_place(fn)}", f"{type(leaf).__name__} {_line(repr(leaf))}",
-                    f"{name}(t, x, u, args) returns an array, or a tuple of arrays",
-                    "Return numbers: jnp.stack([...]) joins several into one array",
-                )
-            )  # fmt: skip
-        common = jnp.promote_types(wide, _dtype(leaf, wide))
+        if not _is_numeric(leaf):
+            refuse(
+                f"{type(leaf).__name__} {_line(repr(leaf))}",
+                f"{name}({inputs}) returns an array, or a tuple of arrays",
+                "Return numbers: jnp.stack([...]) joins several into one array",
+            )
+        own = _dtype(leaf, wide)
+        common = jnp.promote_types(wide, own)
         if jnp.issubdtype(common, jnp.complexfloating):
-            raise InputError(
-                InputProblem(
-                    f"{at}, {_place(fn)}", f"a value of {common}", "states and controls are real",
-                    "Return its real part, or take real and imaginary part as two components",
-                )
+            refuse(
+                f"a value of {common}", f"{name}({inputs}) is real, as {element} is",
+                "Return its real part, or take real and imaginary part as two components",
             )  # fmt: skip
         if _is_flag(leaf):
-            raise InputError(
-                InputProblem(
-                    f"{at}, {_place(fn)}", "a value of bool", f"{name}(t, x, u, args) is a number",
-                    "Say which: jnp.where(condition, 1.0, 0.0)",
-                )
+            refuse(
+                "a value of bool", f"{name}({inputs}) is a number",
+                "Say which: jnp.where(condition, 1.0, 0.0)",
             )  # fmt: skip
-        if (own := _dtype(leaf, wide)) != wide:
-            raise _other_precision(f"{at}, {_place(fn)}", f"a value of {jnp.dtype(own)}", own, wide)
+        if own != wide:
+            refuse(f"a value of {jnp.dtype(own)}", *_other_precision(own, wide, element))
 
 
 def check_precision(name: str, data: Any, x: Any) -> None:
@@ -100,8 +114,9 @@ def check_precision(name: str, data: Any, x: Any) -> None:
         if isinstance(leaf, jax.Array) and leaf.dtype.kind == "f":
             own = _dtype(leaf, wide)
             if own != wide:
-                place = f"dvax.Problem({name})"
-                raise _other_precision(place, f"data of {jnp.dtype(own)}", own, wide)
+                given = f"data of {jnp.dtype(own)}"
+                words = _other_precision(own, wide, "the state x0")
+                raise InputError(InputProblem(f"dvax.Problem({name})", given, *words))
 
 
 def check_args(args: Any, caller: str) -> None:
@@ -122,12 +137,24 @@ def check_args(args: Any, caller: str) -> None:
             raise InputError(InputProblem(place, given, "the arrays in args hold numbers", fix))
 
 
-def _other_precision(place: str, given: str, own: Any, wide: Any) -> InputError:
-    fix = "Give x0 in that type, jnp.asarray(x0, float) in double precision, or the data in x0's"
+def _other_precision(own: Any, wide: Any, element: str) -> tuple[str, str]:
+    """The rule that numbers of the type `own` break beside an `element` of the type `wide`, and the
+    fix."""
+    x = element.split()[-1]
+    fix = (
+        f"Give {x} in that type, jnp.asarray({x}, float) in double precision, or the data in {x}'s"
+    )
     if jnp.promote_types(own, wide) == wide:
         fix = f"Give the data in that type: jnp.asarray(..., jnp.{jnp.dtype(wide).name})"
-    rule = f"the state x0 is of {jnp.dtype(wide).name}, and nothing is converted unasked"
-    return InputError(InputProblem(place, given, rule, fix))
+    return f"{element} is of {jnp.dtype(wide).name}, and nothing is converted unasked", fix
+
+
+def _is_numeric(leaf: Any) -> bool:
+    """Whether a leaf is a number or an array of them (flags and complex numbers included)."""
+    if isinstance(leaf, np.ndarray | np.generic):
+        return leaf.dtype.kind not in "OSUMm"
+    number = isinstance(leaf, bool | int | float | complex)
+    return number or (hasattr(leaf, "dtype") and hasattr(leaf, "shape"))
 
 
 def _is_flag(leaf: Any) -> bool:
@@ -145,7 +172,9 @@ def _dtype(leaf: Any, wide: Any) -> Any:
     return wide if weak else dtype
 
 
-def _check_parameters(name: str, fn: Callable[..., Any], inputs: Mapping[str, Any]) -> None:
+def _check_parameters(
+    at: str, name: str, fn: Callable[..., Any], inputs: Mapping[str, Any]
+) -> None:
     try:
         signature = inspect.signature(fn)
     except (TypeError, ValueError):
@@ -156,7 +185,7 @@ def _check_parameters(name: str, fn: Callable[..., Any], inputs: Mapping[str, An
         names = ", ".join(inputs)
         raise InputError(
             InputProblem(
-                f"dvax.Problem({name}), {_place(fn)}", f"a function of {signature}",
+                f"{at}, {_place(fn)}", f"a function of {signature}",
                 f"it is called as {name}({names})",
                 f"Write {name}=lambda {names}: ..., also where not all of them are used",
             )
@@ -164,18 +193,17 @@ def _check_parameters(name: str, fn: Callable[..., Any], inputs: Mapping[str, An
 
 
 def _explained(
-    name: str, fn: Callable[..., Any], inputs: Mapping[str, Any], about: str, error: Exception
-) -> InputProblem:
+    at: str, name: str, fn: Callable[..., Any], inputs: Mapping[str, Any], about: str,
+    error: Exception,
+) -> InputProblem:  # fmt: skip
     shapes = ", ".join(
-        f"{key} of shape {_tree.shapes(value)}" for key, value in inputs.items() if key in "xu"
+        f"{key} of shape {_tree.shapes(value)}" for key, value in inputs.items() if key in "xuy"
     )
     given = f"{type(error).__name__}: {_line(str(error))}"
     rule, fix = _reason(name, fn, inputs, error)
     if shapes:
         rule += f". It was traced with {shapes}{about}"
-    return InputProblem(
-        f"dvax.Problem({name}), {_place(fn, error.__traceback__)}", given, rule, fix
-    )
+    return InputProblem(f"{at}, {_place(fn, error.__traceback__)}", given, rule, fix)
 
 
 def _reason(
@@ -260,6 +288,11 @@ def _last_parameter(fn: Callable[..., Any]) -> list[str]:
 def _in_library(trace: TracebackType) -> bool:
     module = str(trace.tb_frame.f_globals.get("__name__", ""))
     return module.split(".")[0] in _LIBRARIES
+
+
+def place(at: str, fn: Callable[..., Any]) -> str:
+    """The place of an argument `at`, with the file and the line where the function begins."""
+    return f"{at}, {_place(fn)}"
 
 
 def _place(fn: Callable[..., Any], trace: TracebackType | None = None) -> str:

@@ -20,6 +20,8 @@ from .sets import AbstractSet
 from .signals import listen
 from .spaces import AbstractSpace
 from .vi import AbstractSolver, Answer, Auto, Frozen, default_space
+from .vi.arguments import wrong_solver
+from .vi.outcome import unless_failed
 
 KNOT_ULPS, END_ULPS = 4, 128
 """Knots nearer than this to each other, or to the ends of a run, in roundings of t, are one: records
@@ -165,25 +167,48 @@ class Problem(eqx.Module):
         L_F: Any = None,
     ) -> Answer:
         """Solve the frozen law for y = P u_x(t), from the guess y0 (zero by default)."""
+        return self._law(t, x, args, solver, y0, tol, gamma, L_F)[1]
+
+    def _law(
+        self, t: Any, x: Tree, args: Any, solver: Any, y0: Any = None, tol: Any = 1e-10,
+        gamma: Any = None, L_F: Any = None,
+    ) -> tuple[Frozen, Answer]:  # fmt: skip
+        if wrong := wrong_solver("solver", solver):
+            raise InputError(*wrong)
         space = self.spaces(x)[1]
         guess = self.zero_control(x) if y0 is None else y0
         vi = Frozen(self.frozen(t, x, args), self.set_at(t, args), space, gamma, L_F)
-        return (Auto() if solver is None else solver).solve(vi, guess, tol)
+        return vi, (Auto() if solver is None else solver).solve(vi, guess, tol)
 
     def response(
         self, t: Any, x: Tree, args: Any = None, *, solver: AbstractSolver | None = None
     ) -> Tree:
-        """The state-to-control map u_x(t) (paper, lem:unique_u), solved to 1e-10 in residual."""
-        x = _tree.as_float(x, "x")
-        t = _tree.as_float(t, "t")
-        self.check(t, x, args)
-        return self.operator(args).inverse(self.law(t, x, args, solver=solver).y)
+        """The state-to-control map u_x(t) (paper, lem:unique_u), solved to 1e-10 in residual or to
+        rounding.
+
+        **Raises:** `dvax.SolveError` where the law is not solved; where that is traced (`jax.jit`,
+        `jax.vmap`), values and derivatives are NaN instead.
+        """
+        return self._of_response(t, x, args, solver, lambda t, x, u: u)
 
     def reduced(
         self, t: Any, x: Tree, args: Any = None, *, solver: AbstractSolver | None = None
     ) -> Tree:
-        """The reduced map f̃(t, x) = f(t, x, u_x(t)) (paper, eq. reduced)."""
-        return self.f(t, x, self.response(t, x, args, solver=solver), args)
+        """The reduced map f̃(t, x) = f(t, x, u_x(t)) (paper, eq. reduced). Raises as `response` does."""
+        return self._of_response(t, x, args, solver, lambda t, x, u: self.f(t, x, u, args))
+
+    def _of_response(
+        self, t: Any, x: Tree, args: Any, solver: Any, read: Callable[[Any, Tree, Tree], Tree]
+    ) -> Tree:
+        """read(t, x, u_x(t)), from a law that is solved."""
+        x, t = _tree.as_float(x, "x"), _tree.as_float(t, "t")
+        for name, value in (("t", t), ("x", x)):
+            _tree.refuse_nan(name, value)
+        _user_code.check_args(args, "dvax.Problem.response")
+        self.check(t, x, args)
+        vi, answer = self._law(t, x, args, solver)
+        P = self.operator(args)
+        return unless_failed(vi, answer, lambda y: read(t, x, P.inverse(y)), solver)
 
     def check(self, t: Any, x: Tree, args: Any = None) -> None:
         """Raise an `InputError` with everything that does not fit: parameters, spaces, shapes, P, K."""

@@ -88,7 +88,7 @@ def check(
     for name, value in numbers.items():
         if type(value) is float or (value is None and name in ("dt", "dt0", "dt_max", "horizon")):
             continue
-        if not _tree.is_concrete(value) or is_number(value):
+        if not _tree.is_concrete(value) or _tree.is_number(value):
             continue
         unusable.add(name)
         rule(False, name, value, "it must be one real number",
@@ -134,13 +134,6 @@ def _tiny(dtype: Any) -> float:
 @cache
 def _eps(dtype: Any) -> float:
     return float(jnp.finfo(dtype).eps)
-
-
-def is_number(value: Any) -> bool:
-    """A real number with a value: no flag, text, complex number or array of several."""
-    if isinstance(value, bool | np.bool_ | complex | str | bytes) or np.ndim(value) != 0:
-        return False
-    return isinstance(value, int | float) or getattr(value, "dtype", np.dtype(bool)).kind in "fiu"
 
 
 def _check_times(rule: Any, ts: Any, t0: float, t1: float) -> None:
@@ -195,7 +188,7 @@ def _wrong_moduli(constants: Any) -> list[InputProblem]:
         for name, value in given.items()
         if value is not None
         and _tree.is_concrete(value)
-        and not (is_number(value) and 0 < float(value) < math.inf)
+        and not (_tree.is_number(value) and 0 < float(value) < math.inf)
     ]
 
 

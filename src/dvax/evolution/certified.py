@@ -20,7 +20,6 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..problem import Problem
-from .arguments import is_number
 from .growth import between, disturbance, gronwall
 from .results import RESULTS
 from .solution import Solution
@@ -301,7 +300,7 @@ def _check(constants: Any, tol: Any, x0: Tree) -> None:
                 "Call it outside jax.jit, and pass the atol of the solution found to solve inside",
             )
         )
-    if not (is_number(tol) and np.isfinite(tol) and tol > 0):
+    if not (_tree.is_number(tol) and np.isfinite(tol) and tol > 0):
         raise InputError(
             InputProblem(
                 "dvax.solve(certified_tol)", str(tol), "it must be a positive number",

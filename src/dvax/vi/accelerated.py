@@ -10,6 +10,7 @@ from .. import _tree
 from .._tree import Tree
 from .abstract import AbstractSolver, Answer, Frozen
 from .iteration import Trial, certificate, first_step, iterate
+from .parameters import LEAST, STEPS, check_parameters
 
 
 class Accelerated(AbstractSolver):
@@ -43,6 +44,9 @@ class Accelerated(AbstractSolver):
 
     least: float = 0.0
     max_steps: int = 20_000
+
+    def __check_init__(self) -> None:
+        check_parameters(self, least=LEAST, max_steps=STEPS)
 
     def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
         # A proved L_F is that of the worst point; here the slope at hand is what matters. It is taken

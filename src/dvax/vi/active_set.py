@@ -15,6 +15,7 @@ from .abstract import AbstractSolver, Answer, Frozen
 from .block import solve_block
 from .matrix import matrix_of
 from .newton import Linearised, safeguarded_newton
+from .parameters import SAFETY, STEPS, UNKNOWNS, check_parameters, shown
 from .structure import analyse
 
 
@@ -59,6 +60,21 @@ class ActiveSet(AbstractSolver):
     dense: int = 1024
     symmetric: bool = False
     preconditioner: Callable[[Tree, Tree], Tree] | None = None
+
+    def __check_init__(self) -> None:
+        check_parameters(self, step=SAFETY, max_steps=STEPS, dense=UNKNOWNS)
+        for name, right, words in (
+            ("symmetric", isinstance(self.symmetric, bool), "it must be True or False"),
+            (
+                "preconditioner",
+                self.preconditioner is None or callable(self.preconditioner),
+                "it must be callable as (free, r), or None",
+            ),
+        ):
+            if not right:
+                given = shown(getattr(self, name))
+                place = f"dvax.vi.ActiveSet({name})"
+                raise InputError(InputProblem(place, given, words, "Leave it out"))
 
     def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
         if vi.K.intervals(y0) is None:

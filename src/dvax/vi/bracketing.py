@@ -14,6 +14,7 @@ from ..errors import InputError, InputProblem
 from .abstract import RESULTS, AbstractSolver, Answer, Frozen
 from .brackets import Brackets, begin, best, is_lost, is_open, narrow, trial
 from .implicit import with_implicit_derivative
+from .parameters import STEPS, check_parameters
 from .structure import Structure, analyse
 
 
@@ -51,6 +52,9 @@ class Bracketing(AbstractSolver):
     certifies: ClassVar[bool] = False
 
     max_steps: int = 400
+
+    def __check_init__(self) -> None:
+        check_parameters(self, max_steps=STEPS)
 
     def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
         structure = analyse(vi.F, y0)

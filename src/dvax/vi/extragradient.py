@@ -11,6 +11,7 @@ from .. import _tree
 from .._tree import Tree
 from .abstract import AbstractSolver, Answer, Frozen
 from .iteration import Trial, certificate, first_step, iterate
+from .parameters import SAFETY, STEPS, check_parameters
 
 _LEAST = 1e-24
 """By how much a step is shortened at most."""
@@ -42,6 +43,9 @@ class Extragradient(AbstractSolver):
 
     step: float = 0.7
     max_steps: int = 10_000
+
+    def __check_init__(self) -> None:
+        check_parameters(self, step=SAFETY, max_steps=STEPS)
 
     def contraction(self, gamma: Any, L_F: Any) -> Any:
         """The proven factor q with ‖y⁺ − y*‖ ≤ q‖y − y*‖ at the step λ = step/L_F."""

@@ -8,6 +8,7 @@ from .._tree import Tree
 from .abstract import AbstractSolver, Answer, Frozen
 from .extragradient import contraction, extrapolate, starting
 from .iteration import Trial, certificate, iterate
+from .parameters import SAFETY, STEPS, check_parameters
 
 
 class ForwardBackwardForward(AbstractSolver):
@@ -38,6 +39,9 @@ class ForwardBackwardForward(AbstractSolver):
 
     step: float = 0.7
     max_steps: int = 10_000
+
+    def __check_init__(self) -> None:
+        check_parameters(self, step=SAFETY, max_steps=STEPS)
 
     def contraction(self, gamma: Any, L_F: Any) -> Any:
         """The proven factor q with ‖y⁺ − y*‖ ≤ q‖y − y*‖ at the step λ = step/L_F."""

@@ -8,6 +8,7 @@ from .. import _tree
 from .._tree import Tree
 from .abstract import AbstractSolver, Answer, Frozen
 from .iteration import Trial, certificate, first_step, iterate
+from .parameters import GOLDEN, STEPS, check_parameters
 
 _LONGEST = 1e10
 
@@ -37,6 +38,9 @@ class GoldenRatio(AbstractSolver):
 
     phi: float = 1.5
     max_steps: int = 20_000
+
+    def __check_init__(self) -> None:
+        check_parameters(self, phi=GOLDEN, max_steps=STEPS)
 
     def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
         phi = self.phi

@@ -8,6 +8,7 @@ from .. import _tree
 from .._tree import Tree
 from .abstract import AbstractSolver, Answer, Frozen
 from .iteration import Trial, certificate, first_step, iterate
+from .parameters import STEPS, check_parameters
 
 
 class Projection(AbstractSolver):
@@ -38,6 +39,9 @@ class Projection(AbstractSolver):
     """
 
     max_steps: int = 100_000
+
+    def __check_init__(self) -> None:
+        check_parameters(self, max_steps=STEPS)
 
     def contraction(self, gamma: Any, L_F: Any) -> Any:
         """The proven factor q = (1 + (γ/L_F)²)^{−1/2} with ‖y⁺ − y*‖ ≤ q‖y − y*‖ at λ = γ/L_F²."""

@@ -11,6 +11,7 @@ from .._tree import Tree
 from .abstract import AbstractSolver, Answer, Frozen
 from .matrix import matrix_of
 from .newton import Linearised, safeguarded_newton
+from .parameters import SAFETY, STEPS, UNKNOWNS, check_parameters
 
 
 class SemismoothNewton(AbstractSolver):
@@ -46,6 +47,9 @@ class SemismoothNewton(AbstractSolver):
     step: float = 0.7
     max_steps: int = 1000
     dense: int = 1024
+
+    def __check_init__(self) -> None:
+        check_parameters(self, step=SAFETY, max_steps=STEPS, dense=UNKNOWNS)
 
     def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
         size = sum(leaf.size for leaf in jax.tree_util.tree_leaves(y0))

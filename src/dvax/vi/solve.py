@@ -16,14 +16,16 @@ from .._tree import Tree
 from ..sets import AbstractSet
 from ..spaces import AbstractSpace, Euclidean, Product
 from .abstract import RESULTS, AbstractSolver, Frozen
+from .arguments import check, check_functions, checked_guess, checked_number
 from .auto import Auto
 from .certificate import certify
 from .iteration import first_step, stopped
+from .parameters import MODULUS, TOLERANCE
 from .projection_error import projection_error
 from .rounding import rounding_error
 from .weighted import Weighted, moduli_belong_to_the_parts
 
-_IN_VAIN = RESULTS.max_steps, RESULTS.stalled, RESULTS.cycling, RESULTS.singular
+IN_VAIN = RESULTS.max_steps, RESULTS.stalled, RESULTS.cycling, RESULTS.singular
 """Ends of an iteration that only missed its tolerance."""
 
 
@@ -75,6 +77,9 @@ def solve_vi(
     solver, however `args`, `K`, `y0` and the moduli change. So what changes goes through `args`, as
     for any function under `jax.jit`: a number that F reads from outside is seen once.
 
+    **Raises:** `dvax.InputError` where an argument breaks a rule or F cannot be traced, before anything
+    is solved. The values of traced numbers (`gamma`, `L_F`, `tol`) are not checked.
+
     **Returns:** a `VISolution`. Iterative methods stop by its `residual`; a closed form or a bracketed
     root is right to rounding whatever `tol`, and gets its `residual` by a projection step afterwards.
 
@@ -87,19 +92,17 @@ def solve_vi(
 
     ```
     """
-    y0 = _tree.as_float(y0, "y0")
+    y0 = checked_guess(y0)
+    check(F, K, args, solver, space)
     space = default_space(y0) if space is None else space
     K.check(y0)
     if isinstance(F, Weighted):
         moduli_belong_to_the_parts(gamma, L_F)
     solver = Auto() if solver is None else solver
-    # Numbers as arrays: of a number written in the code the compiled program would be a program of
-    # its own.
     dtype = jnp.result_type(*jtu.tree_leaves(y0))
-    tol, gamma, L_F = (
-        jnp.asarray(value, dtype) if isinstance(value, float | int) else value
-        for value in (tol, gamma, L_F)
-    )
+    tol = checked_number("tol", tol, TOLERANCE, dtype)
+    gamma = None if gamma is None else checked_number("gamma", gamma, MODULUS, dtype)
+    L_F = None if L_F is None else checked_number("L_F", L_F, MODULUS, dtype)
     args = jtu.tree_map(lambda v: jnp.asarray(v, dtype) if isinstance(v, float) else v, args)
     return _solved(F, K, y0, args, solver, tol, gamma, L_F, space)
 
@@ -110,6 +113,7 @@ def _solved(
     space: AbstractSpace,
 ) -> VISolution:  # fmt: skip
     """One program for all problems that differ in numbers alone, compiled at the first of them."""
+    check_functions(F, y0, args, space)
     if isinstance(F, Weighted):
         found = _divided(F, args, K, space, y0, solver, tol)
     else:
@@ -147,12 +151,12 @@ def _certified(
     answer = solver.solve(frozen, y0, goal if gamma is None else 0.5 * goal)
     still, y = stopped(frozen), jax.lax.stop_gradient(answer.y)
     residual, away = answer.residual, jnp.zeros_like(answer.residual)
-    rounding, proved = _rounding(still, y, answer.length, residual)
+    rounding, proved = rounding_of(still, y, answer.length, residual)
     if not solver.certifies:
         # A projection step from y, whose certificate covers y by the triangle inequality.
         step = first_step(still, y, still.F(y))
         checked = certify(still.F, still.K, space, y, step)
-        other, _ = _rounding(still, checked.y, step, checked.norm)
+        other, _ = rounding_of(still, checked.y, step, checked.norm)
         residual = jnp.where(answer.residual > 0, answer.residual, jnp.inf)
         nearer = checked.norm + other < residual + rounding
         residual = jnp.where(nearer, checked.norm, residual)
@@ -160,11 +164,14 @@ def _certified(
         away = jnp.where(nearer, space.norm(_tree.sub(checked.y, y)), away)
     bound, result = None, answer.result
     if gamma is not None:
-        bound = jnp.where(gamma > 0, (residual + rounding) / gamma + away, jnp.inf)
+        total = residual + rounding
+        # Where the quotient underflows the bound is the smallest normal number: 0 says "exact".
+        least = jnp.where(total > 0, jnp.finfo(total.dtype).tiny, 0.0)
+        bound = jnp.where(gamma > 0, jnp.maximum(total / gamma, least) + away, jnp.inf)
         good, within = result == RESULTS.successful, bound <= tol
         # An iteration that went on in vain at the level of rounding is stalled; so is one that ended
         # where rounding alone is what keeps the bound above the tolerance.
-        vain = functools.reduce(jnp.logical_or, [result == word for word in _IN_VAIN])
+        vain = functools.reduce(jnp.logical_or, [result == word for word in IN_VAIN])
         by_rounding = (residual <= gamma * tol) | (not solver.certifies)
         limited = (good & by_rounding) | (vain & (residual <= 4 * rounding))
         result = RESULTS.where((gamma > 0) & limited & ~within, RESULTS.stalled, result)
@@ -183,7 +190,7 @@ def _certified(
     )
 
 
-def _rounding(vi: Frozen, y: Tree, length: Any, residual: Any) -> tuple[jax.Array, bool]:
+def rounding_of(vi: Frozen, y: Tree, length: Any, residual: Any) -> tuple[jax.Array, bool]:
     """A bound on ‖fl(w) − w‖ for some w ∈ F(y) + N_K(y), and whether that of F is proved.
 
     With z = fl(base − λF(base)) and y = proj_K(z), n = (z − y)/λ is a normal whatever the error of

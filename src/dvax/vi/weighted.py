@@ -14,6 +14,7 @@ from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
 from .abstract import RESULTS
+from .parameters import shown
 from .structure import analyse
 
 _PROVED = 256
@@ -85,6 +86,14 @@ class Weighted(eqx.Module):
         mu: Any = None,
     ):
         self.a, self.G = a, G
+        for name, fn in (("a", a), ("G", G)):
+            if not callable(fn):
+                raise InputError(
+                    InputProblem(
+                        f"dvax.vi.Weighted({name})", shown(fn), "it must be callable as (y, args)",
+                        f"Write {name}=lambda y, args: ...",
+                    )
+                )  # fmt: skip
         self.M = _positive("M", M, "a must be bounded away from 0, or Mμ is no modulus")
         self.mu = _positive("mu", mu, "G must be strongly monotone, or uniqueness is not known")
 

@@ -1,0 +1,203 @@
+"""What `dvax.solve_vi` asks of its arguments."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .. import _tree, _user_code
+from .._tree import Tree
+from ..errors import InputError, InputProblem
+from ..sets import AbstractSet
+from ..spaces import AbstractSpace
+from .abstract import AbstractSolver
+from .parameters import MODULUS, Rule, obeys, shown
+from .weighted import Weighted
+
+_CALLER = "dvax.solve_vi"
+
+
+def checked_guess(y0: Any) -> Tree:
+    """y0 as arrays of a real floating type, or as plain tuples of these.
+
+    **Raises:** `dvax.InputError` for anything else.
+    """
+    y0 = _tree.as_float(y0, "y0")
+    if isinstance(y0, jax.Array) and y0.dtype.kind == "f":
+        return y0
+    return _plain(y0)
+
+
+def _plain(y: Any) -> Tree:
+    if isinstance(y, tuple):
+        return tuple(map(_plain, y))
+    if not hasattr(y, "dtype"):
+        raise InputError(
+            InputProblem(
+                f"{_CALLER}(y0)", f"a {type(y).__name__} in a tuple",
+                "y is an array, or a tuple of arrays", "Take the arrays out of it",
+            )
+        )  # fmt: skip
+    if jnp.issubdtype(y.dtype, jnp.complexfloating):
+        raise InputError(
+            InputProblem(
+                f"{_CALLER}(y0)", f"an array of {y.dtype}", "y is real",
+                "Take real and imaginary part as two components",
+            )
+        )  # fmt: skip
+    return y
+
+
+def check(F: Any, K: Any, args: Any, solver: Any, space: Any) -> None:
+    """Raise one `InputError` with everything that is not of the right kind."""
+    wrong = []
+    if not callable(F):
+        wrong.append(
+            InputProblem(
+                f"{_CALLER}(F)", shown(F), "it must be callable as (y, args)",
+                "Write F=lambda y, args: ...",
+            )
+        )  # fmt: skip
+    if not isinstance(K, AbstractSet):
+        moving = callable(K) and not isinstance(K, type)
+        fix = (
+            "Call it: K=K(t, args), the set at one time"
+            if moving
+            else "Write dvax.sets.Box(0.0, 1.0)"
+        )
+        wrong.append(InputProblem(f"{_CALLER}(K)", shown(K), "it must be a set of dvax.sets", fix))
+    wrong += wrong_solver(f"{_CALLER}(solver)", solver)
+    if not isinstance(space, AbstractSpace | None):
+        wrong.append(
+            InputProblem(
+                f"{_CALLER}(space)", shown(space), "it must be a space of dvax.spaces, or None",
+                "Leave it out for the Euclidean inner product",
+            )
+        )  # fmt: skip
+    if wrong:
+        raise InputError(*wrong)
+    _user_code.check_args(args, _CALLER)
+    for name, given in (("F", F), ("args", args)):
+        for leaf in jtu.tree_leaves(given):
+            _check_hashable(name, leaf)
+
+
+def wrong_solver(place: str, solver: Any) -> list[InputProblem]:
+    """What is wrong with the `solver` of a law, which None leaves to the default."""
+    if isinstance(solver, AbstractSolver | None):
+        return []
+    rule = "it must be a solver such as dvax.vi.Auto(), made by a call"
+    return [InputProblem(place, shown(solver), rule, "Leave it out for the default")]
+
+
+def _check_hashable(name: str, leaf: Any) -> None:
+    if isinstance(leaf, jax.Array | np.ndarray | float | int):
+        return
+    try:
+        hash(leaf)
+    except TypeError:
+        raise InputError(
+            InputProblem(
+                f"{_CALLER}({name})", shown(leaf),
+                "what is not an array is compiled in, so it must be hashable",
+                "Register its class as a pytree (an equinox.Module is one), or make it hashable",
+            )
+        ) from None  # fmt: skip
+
+
+def checked_number(name: str, value: Any, rule: Rule, dtype: Any) -> Any:
+    """The argument `name` of `solve_vi`, a number of Python as an array of the type of y.
+
+    Numbers become arrays since of a number written in the code the compiled program would be a
+    program of its own.
+    """
+    number = value
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        try:
+            with np.errstate(over="ignore"):
+                number = np.asarray(float(value), dtype)
+        except OverflowError:
+            number = np.asarray(math.inf, dtype)
+    if obeys(rule, number):
+        return number
+    given = shown(value)
+    if number is not value and obeys(rule, float(min(value, 1e308))):
+        given += f", which is {number} in {jnp.dtype(dtype).name}"
+    fix = "Leave it out where it is not known" if rule is MODULUS else "Leave it out for 1e-10"
+    raise InputError(InputProblem(f"{_CALLER}({name})", given, rule.words, fix))
+
+
+def check_functions(F: Any, y0: Tree, args: Any, space: AbstractSpace) -> None:
+    """Evaluate F abstractly, and raise an `InputError` unless its value is an element shaped like y0.
+
+    It traces F, so it belongs into what is compiled once.
+    """
+    zero = jax.eval_shape(space.zeros)  # its type is no part of the program
+    if not _tree.same_shape(y0, zero):
+        raise InputError(
+            InputProblem(
+                f"{_CALLER}(y0)", f"shape {_tree.shapes(y0)}",
+                f"it must be an element of space={space!r}, of shape {_tree.shapes(zero)}",
+                "Give y0 that shape, or name the space of y in space=",
+            )
+        )  # fmt: skip
+    if not isinstance(F, Weighted):
+        _check_function("F", F, y0, args, _CALLER)
+        return
+    _check_function("G", F.G, y0, args, "dvax.vi.Weighted")
+
+    def weight(y: Tree) -> None:
+        out = _user_code.call("a", F.a, {"y": y, "args": args}, caller="dvax.vi.Weighted")
+        if not _tree.is_number(out) and jnp.shape(out) == ():
+            raise InputError(
+                InputProblem(
+                    "dvax.vi.Weighted(a)", shown(out), "a(y, args) must be one real number",
+                    "Return a scalar",
+                )
+            )  # fmt: skip
+
+    jax.eval_shape(weight, y0)
+
+
+def _check_function(name: str, fn: Callable[..., Any], y0: Tree, args: Any, caller: str) -> None:
+    def traced(y: Tree) -> None:
+        out = _user_code.call(name, fn, {"y": y, "args": args}, caller=caller)
+        alike = jtu.tree_structure(out) == jtu.tree_structure(y)
+        # Parts of a tuple may be of several types.
+        parts = zip(jtu.tree_leaves(out), jtu.tree_leaves(y), strict=True) if alike else [(out, y)]
+        for value, like in parts:
+            _user_code.check_values(
+                name, fn, value, like, inputs="y, args", caller=caller, element="the guess y0"
+            )
+        problem = _wrong_shape(name, out, y) or _wrong_kind(name, out, y)
+        if problem is not None:
+            place = _user_code.place(f"{caller}({name})", fn)
+            raise InputError(InputProblem(place, *problem))
+
+    jax.eval_shape(traced, y0)
+
+
+def _wrong_shape(name: str, out: Any, y: Tree) -> tuple[str, str, str] | None:
+    if _tree.same_shape(out, y):
+        return None
+    fix = f"Return that shape from {name}, or give y0 the shape that y has"
+    if isinstance(out, list | tuple) and not isinstance(y, tuple):
+        fix = f"Join the components: return jnp.stack([...]) from {name}"
+    if out is None:
+        fix = f"End {name} with `return`"
+    given = "None" if out is None else f"a value of shape {_tree.shapes(out)}"
+    rule = f"{name}(y, args) must have the shape of y, which is {_tree.shapes(y)} as y0 is"
+    return given, rule, fix
+
+
+def _wrong_kind(name: str, out: Any, y: Tree) -> tuple[str, str, str] | None:
+    for leaf, like in zip(jtu.tree_leaves(out), jtu.tree_leaves(y), strict=True):
+        if isinstance(leaf, int) or getattr(leaf, "dtype", like.dtype).kind in "iu":
+            given = f"a value of {jnp.result_type(leaf)}"
+            fix = f"Write numbers with a decimal point, or jnp.asarray(..., {like.dtype})"
+            return given, f"{name}(y, args) is of the floating type of y, {like.dtype}", fix
+    return None
