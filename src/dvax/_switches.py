@@ -112,7 +112,7 @@ class _Reader:
             v if isinstance(v, _Fixed | _Lines | _OfTime) or v is _OTHER else _fixed(v)
             for v in given
         ]
-        if name == "select_n" and isinstance(given[0], _OfTime):
+        if name == "select_n" and isinstance(given[0], _OfTime) and not _is_check(given[1:]):
             self._refuse(given[0].pending)
         if name in _STEPS or (name == "convert_element_type" and _becomes_whole(eqn)):
             if isinstance(given[0], _Lines | _OfTime):
@@ -232,6 +232,12 @@ class _Reader:
             real = [v for v in values if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
             if not _tree.is_concrete(real):
                 self.found.append(_undifferentiated(place)(*real))
+
+
+def _is_check(cases: list[Any]) -> bool:
+    """Whether one of the cases stands for what is not valid: infinity, or NaN."""
+    values = [v.get() for v in cases if isinstance(v, _Fixed)]
+    return any(_tree.is_concrete(v) and not np.all(np.isfinite(np.asarray(v))) for v in values)
 
 
 _STEPS = {"floor", "ceil", "round", "rem"}

@@ -15,12 +15,17 @@ from ..generators.expanded import values
 from .branches import branches
 from .chords import Chord, is_chord
 from .evaluations import Visit
+from .excursions import WATCH
 from .extent import Extent
 from .flow import Flow, Rate
 from .method import AbstractMethod, extrapolation, polynomial
 
 _DOUBT = 4.0
 """By how many times its interpolation error z is taken to be uncertain between the samples."""
+
+
+_SETTLES = 1e-3
+"""Part of x by which a change of f̃ within a short step may change x over the run."""
 
 
 class Sample(NamedTuple):
@@ -36,7 +41,7 @@ class Sample(NamedTuple):
 
 
 def enclosed(
-    flow: Flow, growth: Growth, ends: tuple[Any, Any], arc: Arc, last: Rate, short: Any
+    flow: Flow, growth: Growth, ends: tuple[Any, Any], arc: Arc, last: Rate, span: Any
 ) -> Sample:
     """|δ(θ)| ≤ (1−θ)(|δ(0)| + dev) + θ(|δ(1)| + dev) entry by entry, with dev from chord
     arithmetic, since p is a line; so ∫‖δ‖ is at most the mean of the norms of the two brackets
@@ -44,9 +49,11 @@ def enclosed(
     rounding, unless data jumps where nobody said it would. The step lies between the times `ends`.
 
     Where an entry has no bound, as next to the zero of |s|^1.5, the defect is infinite, and so is what
-    it certifies; the step control goes by the samples at both ends in a step that is `short`."""
-    ends, arc, growth = lax.stop_gradient((ends, arc, growth))
+    it certifies; in a step that is short in a run of this `span` the step control goes by how far f̃
+    moves from one end to the other."""
+    ends, arc, growth, span = lax.stop_gradient((ends, arc, growth, span))
     h, x0, x1, c = values(tuple(arc))
+    short = h <= WATCH * span
     space = flow.state_space(x0)
     bend = flow.generator.bend(arc, space, growth)
     x = jtu.tree_map(Chord, x0, x1, bend)
@@ -56,11 +63,11 @@ def enclosed(
         lambda q, p: jnp.abs(q.b - p) + q.dev, along, polynomial(c, 1.0), is_leaf=is_chord
     )
     error = _tree.scale(0.5, _tree.add(at_start, at_end))
-    at_ends = jtu.tree_map(
-        lambda q, p, r: 0.5 * (jnp.abs(q.a - p) + jnp.abs(q.b - r)),
-        along, c[0], polynomial(c, 1.0), is_leaf=is_chord,
-    )  # fmt: skip
-    error = jtu.tree_map(lambda e, s: jnp.where(short & (e == jnp.inf), s, e), error, at_ends)
+    varies = jtu.tree_map(lambda q: jnp.abs(q.b - q.a), along, is_leaf=is_chord)
+    # Not where f̃ grows without bound, as 1/t does.
+    most = lambda tree: jnp.max(jnp.stack([jnp.max(jnp.abs(v)) for v in jtu.tree_leaves(tree)]))  # noqa: E731
+    settles = short & (most(varies) * span <= _SETTLES * most((x0, x1)))
+    error = jtu.tree_map(lambda e, v: jnp.where(settles & (e == jnp.inf), v, e), error, varies)
     defect = 0.5 * h * (space.norm(at_start) + space.norm(at_end))
     return Sample((), [last], error, defect, jnp.zeros_like(defect), Extent.of_chords(x, u))
 

@@ -18,7 +18,7 @@ from ..generators.expanded import coefficients, values
 from ..problem import END_ULPS, KNOT_ULPS
 from .defect import Sample, enclosed, sampled
 from .evaluations import Plan, Visit, evaluated
-from .excursions import WATCH, ExcursionGuard
+from .excursions import ExcursionGuard
 from .extent import Extent
 from .flow import Flow, Rate
 from .kinks import first_change
@@ -343,8 +343,8 @@ class Stepper(eqx.Module):
         begin = self._within(t0, t1, 0.0)
         begin = jnp.where(jumped, begin, 2.0 * t0 - begin)
         ends = begin, self._within(t0, t1, 1.0)
-        short = t1 - t0 <= WATCH * (self.ends[1] - self.ends[0])
-        return enclosed(self.flow, self.growth, ends, arc, visits[-1].rate, short)
+        span = self.ends[1] - self.ends[0]
+        return enclosed(self.flow, self.growth, ends, arc, visits[-1].rate, span)
 
 
 def _alike(h: Any, length: Any, slack: Any) -> Any:
