@@ -149,7 +149,7 @@ ELEMENTS = {
     "y0 text": (lambda: solve(y0="a"), "y0; 'a'"),
     "y0 None": (lambda: solve(y0=None), "y0; None"),
     "y0 ints": (lambda: solve(y0=np.array([1, 2])), "y0; int64"),
-    "y0 complex": (lambda: solve(y0=np.array([1j, 2.0])), "solve_vi(y0); complex128; real"),
+    "y0 complex": (lambda: solve(y0=np.array([1j, 2.0])), "y0; complex128; real"),
 }
 RESPONSE = {
     "solver": (lambda: PLAIN.response(0.0, 0.1, solver="a"), "solver; 'a'; dvax.vi.Auto()"),
