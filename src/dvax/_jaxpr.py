@@ -32,6 +32,19 @@ def values(known: dict[Any, Any], atoms: Any) -> list[Any]:
     return [atom.val if isinstance(atom, Literal) else known[atom] for atom in atoms]
 
 
+def scan_counts(params: dict[str, Any]) -> tuple[int, int] | None:
+    """How many arguments of a `lax.scan` do not change, and how many it carries on; None where this JAX
+    says it in another way."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    try:
+        fixed, carried, *_ = params["ft_in"].elts  # from JAX 0.12 on
+        counts = [len(list(part.vals)) for part in (fixed, carried)]
+    except (AttributeError, KeyError, TypeError, ValueError):
+        return None
+    return counts[0], counts[1]
+
+
 def variables(atoms: Any) -> set[Any]:
     """Those that are not literals."""
     return {atom for atom in atoms if isinstance(atom, Var)}

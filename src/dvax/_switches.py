@@ -29,7 +29,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
 from . import _tree
-from ._jaxpr import bound, is_search, walked
+from ._jaxpr import bound, is_search, scan_counts, walked
 from .errors import DifferentiationError
 from .vi.structure import CALLS, CUSTOM, inner_jaxpr
 
@@ -252,7 +252,8 @@ def _compares_time(eqn: Any, given: list[Any]) -> bool:
     """Whether the body of a loop compares what depends on time, and not on x or u."""
     if eqn.primitive.name == "scan":
         bodies, first = [eqn.params["jaxpr"]], 0
-        back = {eqn.params["num_consts"] + k: k for k in range(eqn.params["num_carry"])}
+        fixed, carries = scan_counts(eqn.params) or (0, 0)
+        back = {fixed + k: k for k in range(carries)}
         inputs = [given]
     else:
         first, second = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]

@@ -26,7 +26,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
-from .._jaxpr import bound, is_search
+from .._jaxpr import bound, is_search, scan_counts
 from .._smooth_bounds import BOUNDS, exponential, power
 from .._tree import Tree
 from ..vi.structure import CALLS, evaluate
@@ -381,11 +381,11 @@ def _product(x: Chord, y: Chord, bind: Callable) -> Chord:
 def _unrolled(eqn: Any, given: list[Any]) -> list[Any]:
     """A loop of few turns (`lax.scan`, `fori_loop` between fixed numbers), turn by turn."""
     params = eqn.params
-    length = params["length"]
-    if length > _TURNS or length == 0:
+    length, counts = params["length"], scan_counts(params)
+    if length > _TURNS or length == 0 or counts is None:
         raise NoEnclosure("a loop of many turns")
-    first = params["num_consts"]
-    second = first + params["num_carry"]
+    first = counts[0]
+    second = first + counts[1]
     fixed, carry, rows = given[:first], given[first:second], given[second:]
     order = range(length - 1, -1, -1) if params["reverse"] else range(length)
     found: dict[int, list[Any]] = {}
