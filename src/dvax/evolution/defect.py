@@ -66,7 +66,8 @@ def enclosed(
     varies = jtu.tree_map(lambda q: jnp.abs(q.b - q.a), along, is_leaf=is_chord)
     # Not where f̃ grows without bound, as 1/t does.
     most = lambda tree: jnp.max(jnp.stack([jnp.max(jnp.abs(v)) for v in jtu.tree_leaves(tree)]))  # noqa: E731
-    settles = short & (most(varies) * span <= _SETTLES * most((x0, x1)))
+    size = most((x0, x1))
+    settles = short & jnp.isfinite(size) & (most(varies) * span <= _SETTLES * size)
     error = jtu.tree_map(lambda e, v: jnp.where(settles & (e == jnp.inf), v, e), error, varies)
     defect = 0.5 * h * (space.norm(at_start) + space.norm(at_end))
     return Sample((), [last], error, defect, jnp.zeros_like(defect), Extent.of_chords(x, u))
