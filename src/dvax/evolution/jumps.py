@@ -110,7 +110,9 @@ def find_discontinuity(stop: Stop) -> Diagnosis:
     before, after = values(a - 4.0 * within), values(b + 4.0 * within)
     change, k = _change(before, after)
     size = float(np.max(np.abs(np.stack([before, after])), initial=0.0))
-    if not change > _IN_X * size:
+    # What is only steep changes more over a wider part.
+    wider, _ = _change(values(a - 32.0 * within), values(b + 32.0 * within))
+    if not (change > _IN_X * size and change > 0.5 * wider):
         return Diagnosis()
     where = f" in component {k}" if before.size > 1 else ""
     # The jump itself is a direction in which both sides differ.
