@@ -42,7 +42,7 @@ def complain(text: str) -> None:
 
 
 def complain_of(error: InputError, kept: str = "nothing was written") -> None:
-    """Every problem of an InputError: where, what was given, the rule, the mend; before them, what of
+    """Every problem of an InputError: where, what was given, the rule, the fix; before them, what of
     the results is on disk."""
     count = len(error.problems)
     complain(f"error: {count} problem{'s' * (count != 1)} in the input; {kept}")

@@ -190,7 +190,7 @@ def _of_shape(array: np.ndarray, shape: tuple[int, ...], path: Path, place: str)
             f"{place}.file",
             f"{path.name} with {array.size} values (shape {array.shape})",
             f"the boundary has {size} points (shape {shape}), a value for each",
-            "Set boundary.points to the profile's length, or sample the profile anew.",
+            "Set boundary.points to the profile's length, or resample the profile.",
         )
 
 
