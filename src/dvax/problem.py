@@ -318,22 +318,24 @@ class Problem(eqx.Module):
         listed = [*filter(_tree.is_concrete, announced), *switches]
         if not listed:
             return np.zeros(0)
-        concrete = _tree.is_concrete(listed, t0, t1)
-        lib = np if concrete else jnp
-        # Known ones are sorted here: the compiler takes a second for a thousand.
-        of_knots = np if _tree.is_concrete(listed) else jnp
-        arrays = [of_knots.asarray(knots, dtype=float) for knots in listed]
-        if of_knots is np:
-            arrays = [knots[np.isfinite(knots)] for knots in arrays]
-        every = lib.asarray(of_knots.sort(of_knots.concatenate(arrays)))
-        ulp = jnp.finfo(every.dtype).eps
-        margin = END_ULPS * ulp * lib.maximum(lib.abs(t0), lib.abs(t1))
-        apart = lib.diff(every, prepend=every[:1] - 1.0) > KNOT_ULPS * ulp * lib.abs(every)
-        kept = apart & (every > t0 + margin) & (every < t1 - margin)
-        if concrete:
-            return every[kept]
-        # Traced knots cannot be dropped, so the others become the end, where a step ends anyway.
-        return jnp.sort(jnp.where(kept, every, t1))
+        known = [np.asarray(knots, float) for knots in listed if _tree.is_concrete(knots)]
+        known = np.sort(np.concatenate([np.zeros(0), *known]))
+        known = known[np.isfinite(known)]
+        known = known[_apart(known)]
+        if _tree.is_concrete(listed, t0, t1):
+            return known[_within(known, t0, t1)]
+        # The compiler takes minutes to sort many constants: those within (t0, t1) come first, in their
+        # order. None can be dropped: the others become the end, where a step ends anyway.
+        inside = _within(known, t0, t1)
+        first = jnp.argmax(inside) if len(known) else 0
+        every = jnp.roll(jnp.where(inside, known, t1), -first)
+        computed = [jnp.ravel(knots) for knots in listed if not _tree.is_concrete(knots)]
+        if not computed:
+            return every
+        computed = jnp.concatenate(computed)
+        computed = jnp.where(_within(computed, t0, t1), computed, t1)
+        every = jnp.sort(jnp.concatenate([every, computed]))
+        return jnp.sort(jnp.where(_apart(every), every, t1))
 
     def check_data(self, t0: Any, t1: Any, x: Tree, args: Any = None) -> None:
         """Evaluate K, f and h at (t0, x) untraced, where data that they make themselves has values.
@@ -372,6 +374,20 @@ def _fix_of_shape(name: str, out: Tree, element: Tree, space: str) -> str:
     shape = getattr(out, "shape", None)
     given = shape is not None and space == "control"
     return fix + (f", such as control_space=dvax.spaces.Euclidean({shape})" if given else "")
+
+
+def _apart(knots: Any) -> Any:
+    """Which sorted times rounding can tell from the one before."""
+    lib = np if _tree.is_concrete(knots) else jnp
+    gap = lib.diff(knots, prepend=knots[:1] - 1.0)
+    return gap > KNOT_ULPS * jnp.finfo(knots.dtype).eps * lib.abs(knots)
+
+
+def _within(knots: Any, t0: Any, t1: Any) -> Any:
+    """Which times are between t0 and t1, and not these."""
+    lib = np if _tree.is_concrete(knots, t0, t1) else jnp
+    margin = END_ULPS * jnp.finfo(knots.dtype).eps * lib.maximum(lib.abs(t0), lib.abs(t1))
+    return (knots > t0 + margin) & (knots < t1 - margin)
 
 
 def _check_spans(spans: list[tuple[Any, Any, str, str]], t0: Any, t1: Any) -> None:

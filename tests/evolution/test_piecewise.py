@@ -154,26 +154,22 @@ def test_progress_is_printed_as_other_methods_do_and_changes_nothing(capfd):
     assert shares == sorted(set(shares))
 
 
-@pytest.mark.parametrize(("level", "hidden"), [(1e4, True), (1e-6, False)])
-def test_rounding_that_may_hide_a_switching_is_refused(level, hidden):
+@pytest.mark.parametrize("level", [1e4, 1e2, 1.0, 1e-6])
+@pytest.mark.parametrize("M", [1e-8, 1e-10, 1e-13])
+def test_rounding_hides_no_switching(level, M):
     # x follows s(t) up through a response u = (s − x)/M ≥ 0, and z counts it. Beside s = 10⁴ the
-    # rounding of s − x is more than all of s', and says nothing about the sign of u.
-    M = 1e-10
+    # rounding of s − x is more than all of s', and the law alone does not show the sign of u.
     problem = dvax.Problem(
         A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, np.inf),
         f=lambda t, x, u, args: jnp.stack([u[0], u[0]]),
         h=lambda t, x, u, args: u - (M * u + x[:1] - level - 1e-5 * jnp.sin(2.0 * t)),
         state_space=dvax.spaces.Euclidean(2), control_space=dvax.spaces.Euclidean(1),
     )  # fmt: skip
-    run = lambda: dvax.solve(  # noqa: E731
-        problem, np.array([level, 0.0]), 0.0, 4.0, method=dvax.PiecewiseLinear()
-    )
-    if hidden:
-        with pytest.raises(dvax.SolveError, match="hides whether a constraint changes"):
-            run()
-    else:
-        # Up with s to its maximum and no further.
-        np.testing.assert_allclose(np.asarray(run().xs[-1]), [level + 1e-5, 1e-5], atol=1e-12)
+    sol = dvax.solve(problem, np.array([level, 0.0]), 0.0, 4.0, method=dvax.PiecewiseLinear())
+    # Up with s to its maximum and no further.
+    rounding = 8 * np.spacing(level) + 1e-12
+    np.testing.assert_allclose(sol.xs[-1], [level + 1e-5, 1e-5], rtol=0.0, atol=rounding)
+    assert int(sol.stats["switchings"]) == 2
 
 
 def test_the_method_says_what_it_is_not_for():

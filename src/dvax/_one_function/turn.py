@@ -168,7 +168,7 @@ class _Run:
             found = iter(carried_out(eqns, known, [*large, *few, *results], one))
             rest, small, end = ([next(found) for _ in vs] for vs in (large, few, results))
             kept = packed(small) if small else None, _joined(end, one) if end else None
-            return rest, *kept, [leaf.ravel()[0] for leaf in (*arrays, *others)]
+            return rest, *kept, [leaf.ravel()[0] for leaf in (*arrays, *others) if leaf.size]
 
         handed = [self.arrays[k] for k in which], [self.known[v] for v in whole]
         rest, small, end, _ = as_one(run, *handed)

@@ -8,8 +8,8 @@ _PATIENCE = 128.0
 """Steps of one length until twice of it is tried, for the first time."""
 
 
-_MOST = 1e4
-"""In tolerances: more is no rounding."""
+LEAST, _MOST = 0.1, 1e4
+"""In tolerances: less does not matter, and more is no rounding."""
 
 
 class Blur(NamedTuple):
@@ -18,18 +18,20 @@ class Blur(NamedTuple):
 
     `longest` and `error` are those of the attempt that shorter ones are compared with: from a length
     to its quarter, since rounding fluctuates and neighbouring lengths tell little. `level` is the
-    largest error of rounding that was seen, 0 when none is.
+    largest error of rounding that was seen, 0 when none is; `last` is the error of the last step that was
+    kept: of rounding it is seldom small, while steps between two jumps have little.
     """
 
     longest: Any
     error: Any
     level: Any
     wait: Any
+    last: Any
 
     @staticmethod
     def at_start(like: Any) -> "Blur":
         zero = jnp.zeros_like(like)
-        return Blur(zero, zero, zero, jnp.full_like(like, _PATIENCE))
+        return Blur(zero, zero, zero, jnp.full_like(like, _PATIENCE), zero)
 
     def after(self, length: Any, error: Any, keep: Any, calm: Any, order: int) -> "Blur":
         """With one more attempt. Where one length has been kept for as many steps as there is to
@@ -38,7 +40,7 @@ class Blur(NamedTuple):
         ratio = length / jnp.maximum(length, self.longest)
         short = ratio <= 0.25
         # An error far above the tolerance that no shorter step lowers is that of a jump.
-        noise = (error > 0.1) & (error < _MOST)
+        noise = (error > LEAST) & (error < _MOST)
         flat = short & noise & (error * error >= self.error * self.error * ratio**order)
         anew = short | (ratio == 1.0)
         tries = keep & (calm >= self.wait)
@@ -49,4 +51,5 @@ class Blur(NamedTuple):
             jnp.where(anew, error, self.error),
             jnp.where(seen, jnp.maximum(self.level, error), 0.0),
             jnp.where(found, _PATIENCE, jnp.where(tries, 2.0 * self.wait, self.wait)),
+            jnp.where(keep, error, self.last),
         )

@@ -13,7 +13,7 @@ from jax import lax
 from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace, Product
-from .blur import Blur
+from .blur import LEAST, Blur
 from .excursions import WATCH
 from .kinks import Aim, aim, nothing_ahead, passed, until
 from .results import RESULTS
@@ -230,7 +230,7 @@ class Adaptive(AbstractController):
         wanted = jnp.minimum(jnp.maximum(wanted, floor), self.longest)
         end = land(begin, wanted, until(ahead, begin, self.stops[stop]))
         # Below this, t itself cannot tell the ends of a step apart; and rounding may spend no more.
-        exhausted = rounding & ~roundoff & (state.spare < 1e-3)
+        exhausted = rounding & ~roundoff & (state.spare < 1e-3) & (state.blur.last > LEAST)
         # (A length is rounded with the times between which it lies.)
         stuck = ~keep & ((h <= 1.25 * floor) | exhausted)
         result = RESULTS.where(

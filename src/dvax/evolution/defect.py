@@ -23,6 +23,9 @@ from .method import AbstractMethod, extrapolation, polynomial
 _DOUBT = 4.0
 """By how many times its interpolation error z is taken to be uncertain between the samples."""
 
+_MARGIN = 1.25
+"""What two kinks in one step, as an excursion has, may hide of the defect beyond the `safety`: measured
+on generated problems, of which one in ten thousand has more than 1.01."""
 
 _SETTLES = 1e-3
 """Part of x by which a change of f̃ within a short step may change x over the run."""
@@ -80,7 +83,7 @@ def sampled(
 
     Between the samples δ is taken to be a line plus a bump (a parabola, or the tent of a kink):
     then ∫|δ| ≤ h(½|δ(0)| + ½|δ(1)| + max |δ(θ) − (1 − θ)δ(0) − θδ(1)|), whatever the place of the
-    kink, up to the `safety` of the method. δ(0) is zero for a method whose polynomial starts at
+    kink, up to the `safety` of the method and a margin for steps with two. δ(0) is zero for a method whose polynomial starts at
     f̃(t₀, x₀), as most do.
     """
     thetas = method.samples
@@ -109,7 +112,7 @@ def sampled(
         bump = jtu.tree_map(lambda b, bend: b + share * jnp.abs(bend), bump, c[-1])
     error = jtu.tree_map(lambda *parts: sum(map(jnp.abs, parts)), *ends, bump, unseen)
     space = flow.state_space(x0)
-    defect = method.safety * h * sum(map(space.norm, (*ends, bump, unseen)))
+    defect = _MARGIN * method.safety * h * sum(map(space.norm, (*ends, bump, unseen)))
     law_defect = h * jnp.max(jnp.stack([visit.rate.residual for visit in along]))
     places = [(visit.x, flow.operator.inverse(visit.rate.y)) for visit in lax.stop_gradient(along)]
     extent = reduce(Extent.joined, [Extent((x, x), (u, u)) for x, u in places])

@@ -25,11 +25,6 @@ class RESULTS(eqx.Enumeration):
         "Check "
         "that the law is strongly pseudomonotone (dvax.verify), or use dvax.ExpRosenbrock()."
     )
-    switching_hidden = (
-        "The rounding of the law hides whether a constraint changes: a response, or its residual, may "
-        "have passed its bound by more than rtol and atol allow. Raise rtol or atol, or bring the "
-        "largest and the smallest coefficients of the law nearer to each other."
-    )
     nonfinite = "f, h or K returned NaN or infinity."
     law_unsolved = "The frozen law was not solved to its tolerance."
     invalid_number = (

@@ -17,7 +17,7 @@ from .system import LARGEST, Affine
 Array = np.ndarray
 Mode = tuple[int, ...]
 
-ROUNDINGS = 512.0 * np.finfo(float).eps
+ROUNDINGS = 32.0 * np.finfo(float).eps
 """What rounding may do to a sum, relative to the sum of the sizes of its terms."""
 
 
@@ -33,24 +33,26 @@ class Condition(NamedTuple):
 
 class Factors(NamedTuple):
     """Scales of rows and columns, LU factors of the scaled equations of a step, and the sizes of what
-    their solution has of x at the start."""
+    x, p and d at the collocation points have of x at the start."""
 
     rows: Array
     columns: Array
     factors: tuple[Array, Array]
-    from_start: Array
+    from_start: tuple[Array, Array, Array]
 
 
 class Solved(NamedTuple):
-    """x at the nodes and p at the collocation points, by how much rounding may change them, and by how
-    much what x may be off by at the start."""
+    """x at the nodes and p at the collocation points; by how much rounding may change them and d; and
+    by how much what x may be off by at the start."""
 
     x: Array
     p: Array
     noise_x: Array
     noise_p: Array
+    noise_d: Array
     carried_x: Array
     carried_p: Array
+    carried_d: Array
 
 
 class Equations:
@@ -74,7 +76,12 @@ class Equations:
         self.conditions = [c for i, s in enumerate(mode) for c in _conditions(system, i, s)]
         M = system.M[np.ix_(u, u)]
         self.inverse = _inverse(M)
-        self.eliminated = eliminated = system.A - system.B[:, u] @ self.inverse @ system.C[u]
+        of_x = self.inverse @ system.C[u]
+        self.eliminated = eliminated = system.A - system.B[:, u] @ of_x
+        # Products before sizes: a large change of p may leave d as it is.
+        self._p_of_x, self._d_of_x = np.abs(of_x), np.abs(system.C - system.M[:, u] @ of_x)
+        self._p_of_law = np.abs(self.inverse)
+        self._d_of_law = np.abs(system.M[:, u] @ self.inverse)
         spectrum = np.linalg.eigvals(eliminated) if np.isfinite(eliminated).all() else np.zeros(1)
         real, imag = np.real(spectrum), np.imag(spectrum)
         speeds = np.abs(real) / 8.0 + np.abs(imag) / 4.0
@@ -128,24 +135,32 @@ class Equations:
         terms[:, n:] = (of_law + np.abs(self.prescribed_d))[:, u]
         patterns = _SIGNS[: terms.size] * (_ROW * terms * rows).ravel()[:, None]
         noise = scipy.linalg.lu_solve(factors, patterns, check_finite=False)
-        noise = np.abs(noise).max(axis=1)
-        carried = (from_start @ off).reshape(s, n + k) * columns
-        both = []
-        for v in (noise.reshape(s, n + k) * columns, carried):
-            of_p = np.zeros((s, len(u)))
-            of_p[:, u] = v[:, n:]
-            both.append((v[:, :n], of_p))
-        (noise_x, noise_p), (carried_x, carried_p) = both
-        noise_x = np.vstack([0.0 * x0, noise_x + _ROW * X])
-        return Solved(x, p, noise_x, noise_p, np.vstack([off, carried_x]), carried_p)
+        noise = noise.reshape(s, n + k, -1) * columns[:, None]
+        noise_x, noise_p, noise_d = (v.max(axis=-1) for v in self._sizes(noise))
+        carried_x, carried_p, carried_d = (v @ off for v in from_start)
+        return Solved(
+            x, p, np.vstack([0.0 * x0, noise_x + _ROW * X]), noise_p, noise_d,
+            np.vstack([off, carried_x]), carried_p, carried_d,
+        )  # fmt: skip
 
-    def reach(self, h: float) -> Array:
-        """Sizes of the entries of (1/h − A)⁻¹, A that of the states alone: what a disturbance of x'
-        does to x within h."""
+    def _sizes(self, found: Array) -> tuple[Array, Array, Array]:
+        """|x|, |p| and |d| at the collocation points from solutions of the equations of a step, stacked
+        along the last axis."""
+        system, u = self.system, self.unknown
+        x, free = found[:, : len(system.A)], found[:, len(system.A) :]
+        p = np.zeros((len(x), len(u), x.shape[-1]))
+        p[:, u] = free
+        d = system.C @ x + system.M[:, u] @ free
+        d[:, u] = 0.0
+        return np.abs(x), np.abs(p), np.abs(d)
+
+    def reach(self, h: float, B: Array) -> Array:
+        """Sizes of the entries of (1/h − A)⁻¹B, A that of the states alone: what disturbances of x' by
+        the columns of B do to x within h."""
         if h not in self._reach:
             if len(self._reach) >= _KEPT:
                 self._reach.clear()
-            self._reach[h] = np.abs(_inverse(np.eye(len(self.eliminated)) / h - self.eliminated))
+            self._reach[h] = np.abs(np.linalg.solve(np.eye(len(self.eliminated)) / h - self.eliminated, B))
         return self._reach[h]
 
     def start_residual(self, of_x: Array, of_p: Array) -> Array:
@@ -178,21 +193,13 @@ class Equations:
     def noise(
         self, x: Array, p: Array, q: Array, off: Array, rounding: float = ROUNDINGS
     ) -> tuple[Array, Array]:
-        """What rounding leaves undetermined of p and of d, for values of these sizes; d as it follows
-        from x is `off` already."""
+        """What is undetermined of p and of d at one t, for values of these sizes, by rounding and by
+        what x is `off` by."""
         system, u = self.system, self.unknown
-        terms = np.abs(system.C) @ x + np.abs(system.M) @ p + q
-        of_d = rounding * terms + off
-        of_p = self.of_law(of_d)
-        of_p[u] += rounding * p[u]
-        of_d = of_d + np.abs(system.M[:, u]) @ of_p[u]
-        return of_p, of_d
-
-    def of_law(self, off: Array) -> Array:
-        """By how much p changes where d is off by this."""
-        of_p = np.zeros(len(off))
-        of_p[self.unknown] = np.abs(self.inverse) @ off[self.unknown]
-        return of_p
+        terms = rounding * (np.abs(system.C) @ x + np.abs(system.M) @ p + q)
+        of_p = np.zeros(len(u))
+        of_p[u] = rounding * p[u] + self._p_of_law @ terms[u] + self._p_of_x @ off
+        return of_p, terms + self._d_of_law @ terms[u] + self._d_of_x @ off
 
     def members(self, p: Array, d: Array) -> tuple[Array, Array]:
         """(y, w) from (p, d)."""
@@ -247,7 +254,8 @@ class Equations:
         start = np.zeros((s, n + k, n))
         start[:, states, states] = radau.D[1:, :1] * rows[:, :n]
         start = scipy.linalg.lu_solve(factors, start.reshape(len(K), n), check_finite=False)
-        found = Factors(rows, columns, factors, np.abs(start))
+        start = start.reshape(s, n + k, n) * columns[:, None]
+        found = Factors(rows, columns, factors, self._sizes(start))
         self._factors[h] = found
         return found
 

@@ -48,6 +48,21 @@ class Row(NamedTuple):
     extent: Array | None
 
 
+class Crossing(NamedTuple):
+    """Where in a piece the last crossing of several modes' bounds ended, and its length."""
+
+    end: float
+    length: float
+
+
+class Hidden(NamedTuple):
+    """By how much y and w are `beyond` their bounds within the slack of a step, in the mean, and how much
+    of that the `state` would show."""
+
+    beyond: Array
+    state: Array
+
+
 class Attempt(NamedTuple):
     """A step that was computed: x at the nodes, y at the points, y and w on the grid with the `slack`
     that they may be off by; the `rings` beside these polynomials, (λ, x, y, w), and by how much they

@@ -66,6 +66,8 @@ def rings(F: Array, n: int, guesses: Array) -> list[Ring]:
             if abs(product) < 1e-6 * np.abs(left[:n]) @ np.abs(right[:n]):
                 break  # nearly defective: the oscillation is followed step by step
             rate = complex(left @ F @ right / product)
+            if not rate.imag > 0.0:
+                break  # none of these
         else:
             left = left / (left[:n] @ right[:n])
             known = any(abs(rate - other.rate) < 1e-6 * abs(rate) for other in found)

@@ -8,6 +8,8 @@ scales that are excited and not from how far they are apart. Times within a piec
 its start, in two parts: a transient of 10⁻¹⁸ s is resolved at any t.
 """
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -16,7 +18,7 @@ from . import radau
 from .inputs import Piece, basis, continuous, values
 from .lengths import longer, shorter, two_sum, until
 from .modes import Condition, Equations, Mode, changed, first_mode
-from .records import Attempt, Row, Step
+from .records import Attempt, Crossing, Hidden, Row, Step
 from .rings import derivatives
 from .system import Affine
 
@@ -68,8 +70,12 @@ class Run:
             self.piece = piece
             inputs = self._converted(piece)
             if last is None or not continuous(last, piece):
-                self.result = self._solve_law(inputs)
-                self.events.append((piece.start, self.mode))
+                mode = self._solve_law(inputs)
+                if mode is None:
+                    self.result = "law_unsolved"
+                    return
+                self.mode, self.stuck = mode, 0
+                self.events.append((piece.start, mode))
             if self.result == "successful":
                 self.result = self._through(inputs, k == len(self.pieces) - 1)
             if self.result != "successful":
@@ -94,28 +100,51 @@ class Run:
             self.equations[mode] = Equations(self.system, mode, self.weights)
         return self.equations[mode]
 
-    def _solve_law(self, piece: Piece) -> str:
-        """The mode of the law at x and at the start of a piece: of the violated conditions the first is
-        changed (Murty's rule, which ends for matrices whose principal minors are positive)."""
-        q = piece.at(np.zeros(1))[0, len(self.x) :]
-        sizes = np.abs(piece.coefficients[:, len(self.x) :]).sum(axis=0)
+    def _solve_law(self, piece: Piece) -> Mode | None:
+        """The mode of the law at x and at the start of a piece."""
+        given = piece.at(np.zeros(1))[0]
+        return self._solve(self.of, self.x, given[len(self.x) :], piece)
+
+    def _solve_implicitly(self, piece: Piece, begin: float, h: float) -> Mode | None:
+        """The mode of the law at the end of a step of the implicit Euler method."""
+        system, n = self.system, len(self.x)
+        after = system.C @ np.linalg.inv(np.eye(n) - h * system.A)
+        implicit = system._replace(C=after, M=system.M + h * after @ system.B)
+        given = piece.at(np.array([(begin + h) / piece.length]))[0]
+        of = lambda mode: Equations(implicit, mode, self.weights)  # noqa: E731
+        return self._solve(of, self.x + h * given[:n], given[n:], piece)
+
+    def _solve(
+        self, of: Callable[[Mode], Equations], x: Array, q: Array, piece: Piece
+    ) -> Mode | None:
+        """The mode of the law at x: of the violated conditions the first is changed (Murty's rule,
+        which ends for matrices whose principal minors are positive)."""
+        sizes = np.abs(piece.coefficients[:, len(x) :]).sum(axis=0)
+        mode = self.mode
         for _ in range(_MOST_CHANGES):
-            own = self.of(self.mode)
-            y, w, slack_y, slack_w = own.at(self.x, q, sizes, np.abs(self.system.C) @ self.off)
+            own = of(mode)
+            y, w, slack_y, slack_w = own.at(x, q, sizes, self.off)
             for c in own.conditions:
                 value, slack = (w, slack_w) if c.of_w else (y, slack_y)
                 if c.sign * (value[c.i] - c.bound) < -slack[c.i]:
-                    self.mode = changed(self.mode, c)
+                    mode = changed(mode, c)
                     break
             else:
-                return "successful"
-        return "law_unsolved"
+                return mode
+        return None
 
     def _through(self, piece: Piece, last: bool) -> str:
         """All steps of a piece."""
         begin, low, proposal = 0.0, 0.0, np.inf
-        even, reached, doubts = 0, 0.0, 0
+        even, reached, doubts, self.crossing = 0, 0.0, 0, Crossing(-np.inf, 0.0)
         while begin < piece.length:
+            # More changes at one time than there are constraints: the law alone does not say which mode
+            # goes on.
+            if self.stuck > len(self.mode):
+                crossed = self._cross(piece, begin, low)
+                if isinstance(crossed, str):
+                    return crossed
+                begin, low = crossed
             own = self.of(self.mode)
             remaining = (piece.length - begin) - low
             h = min(proposal, remaining)
@@ -130,7 +159,7 @@ class Run:
                     self.rejected += 1
                     h, before = shorter(own, h, attempt.excess, before), attempt.excess
                     continue
-                theta, condition = self._first_change(own, attempt, h)
+                attempt, theta, condition, hidden = self._decided(own, attempt, h)
                 nearer = until(own, h, theta) if condition is not None else h
                 if doubts < _MOST_DOUBTS and nearer < 0.8 * h and attempt.is_coarse(theta):
                     self.rejected += 1
@@ -138,14 +167,10 @@ class Run:
                     h, before = nearer, np.inf
                 else:
                     found = attempt
-            if theta > 0.0 and not self._account(own, found, theta, h):
-                return "switching_hidden"
+            self._account(hidden, theta * h)
             whole = condition is None and theta == 1.0 and bool(h == remaining)
-            rings = tuple(ring[:3] for ring in found.rings)
-            step = Step(piece.start + begin, h, theta, found.x, found.ys, rings)
             end = piece.length if whole else begin + (low + theta * h)
-            self._keep(step, found, piece, begin + low, end, bool(last and end >= piece.length))
-            self.x = step.at(np.array([theta]))[0][0]
+            self._keep(found, h, theta, piece, begin, low, end, bool(last and end >= piece.length))
             if whole:
                 return "successful"
             begin, low = two_sum(begin, low + theta * h)
@@ -158,13 +183,50 @@ class Run:
                     proposal, even = max(4.0 * h, proposal), 0
                 continue
             proposal, even, reached, doubts = np.inf, 0, 0.0, 0
-            self.mode = changed(self.mode, condition)
-            self.switchings += 1
-            self.events.append((self.t, self.mode))
+            self._switch(changed(self.mode, condition))
             self.stuck = self.stuck + 1 if theta * h <= 1e-9 * own.shortest else 0
-            if self.stuck > _MOST_STUCK * (1 + len(self.mode)):
-                return "switching_unresolved"
         return "successful"
+
+    def _cross(self, piece: Piece, begin: float, low: float) -> tuple[float, float] | str:
+        """A short step in the mode that the implicit Euler method ends in, whatever signs are before its
+        end, as long as the state does not show it; (begin, low) after it.
+
+        Rounding hides which mode goes on where x lies on the bounds of several modes, or where the
+        multipliers have boundary layers that steps do not resolve. Crossings that follow one another
+        become longer.
+        """
+        now, after = begin + low, self.crossing
+        near = now - after.end <= _NEAR * after.length
+        h = 4.0 * (after.length if near else self.of(self.mode).shortest)
+        h = min(h, 0.5 * ((piece.length - begin) - low))
+        for _ in range(_MOST_CROSSINGS):
+            if self.accepted + self.rejected >= self.max_steps:
+                return "max_steps"
+            mode = self._solve_implicitly(piece, now, h)
+            if mode is None:
+                return "law_unsolved"
+            own = self.of(mode)
+            attempt = self._attempt(own, piece, now, h)
+            if attempt is None:
+                return "nonfinite"
+            any_of = np.full(len(mode), np.inf)
+            found = attempt._replace(slack=(any_of, any_of))
+            hidden = self._hidden(own, found, 1.0, h)
+            if attempt.excess <= 1.0 and self._is_little(hidden, found):
+                self._switch(mode)
+                self._account(hidden, h)
+                self._keep(found, h, 1.0, piece, begin, low, begin + (low + h), False)
+                begin, low = two_sum(begin, low + h)
+                self.crossing, self.stuck = Crossing(begin + low, h), 0
+                return begin, low
+            self.rejected += 1
+            h *= 0.25
+        return "switching_unresolved"
+
+    def _switch(self, mode: Mode) -> None:
+        self.mode = mode
+        self.switchings += 1
+        self.events.append((self.t, mode))
 
     def _attempt(self, own: Equations, piece: Piece, begin: float, h: float) -> Attempt | None:
         n = len(self.x)
@@ -174,7 +236,7 @@ class Run:
         # Rounding in the inputs is that of the terms they are summed from.
         terms = np.abs(piece.coefficients).sum(axis=0)
         solved = own.solve(h, x0, given, terms, self.off + self.lacking)
-        x, p, noise_x, noise_p = solved[:4]
+        x, p, noise_x, noise_p, noise_d = solved[:5]
         if not (np.isfinite(x).all() and np.isfinite(p).all()):
             return None
         beside = sum((2.0 * np.abs(ring[1]) for ring in rings), np.zeros(n))
@@ -191,8 +253,7 @@ class Run:
         tail_p = np.abs(radau.TAIL_OF_MULTIPLIER @ p).max(axis=0)
         tiny = np.finfo(float).tiny
         # A boundary layer shows in p at the start, which is no collocation point.
-        off = np.abs(own.system.C) @ self.off
-        at_start, _ = own.noise(np.abs(x0), np.abs(p[0]), terms[n:], off, _ONE_VALUE)
+        at_start, _ = own.noise(np.abs(x0), np.abs(p[0]), terms[n:], self.off, _ONE_VALUE)
         layer = np.abs(radau.START @ p - own.multiplier(x0, values(local, _START)[0, n:]))
         layer = np.maximum(layer - at_start, 0.0)
         excess = max(
@@ -202,20 +263,17 @@ class Run:
         X, P, G = radau.FROM_NODES @ x, radau.FROM_POINTS @ p, values(local, _ON_GRID)
         d = own.dependent(X, P, G[:, n:])
         y, w = own.members(P, d)
-        tail_d = np.abs(own.system.C) @ tail_x + np.abs(own.system.M) @ tail_p
+        tail_d = np.abs(radau.TAIL_OF_MULTIPLIER @ (d_at := own.dependent(x[1:], p, given[:, n:])))
         # What the step before was lacking decides on signs, and not on what this one may lack.
-        of_x = (np.abs(radau.FROM_NODES) @ (noise_x + solved.carried_x)).max(axis=0)
-        slack_p = (np.abs(radau.FROM_POINTS) @ (noise_p + solved.carried_p)).max(axis=0)
-        of_d = np.abs(own.system.C) @ of_x + np.abs(own.system.M) @ slack_p
-        _, slack_d = own.noise(*sizes, of_d)
+        from_points = np.abs(radau.FROM_POINTS)
+        slack_p = (from_points @ (noise_p + solved.carried_p)).max(axis=0)
+        slack_d = (from_points @ (noise_d + solved.carried_d)).max(axis=0)
+        slack_d += own.noise(*sizes, 0.0 * self.off)[1]
         slack = own.members(
-            slack_p + layer + _EXTRAPOLATED * tail_p, slack_d + _EXTRAPOLATED * tail_d
+            slack_p + layer + _EXTRAPOLATED * tail_p, slack_d + _EXTRAPOLATED * tail_d.max(axis=0)
         )
-        # More changes at one time than there are constraints: rounding is larger than was estimated.
-        doubt = 2.0 ** max(0, self.stuck - len(self.mode))
-        slack = doubt * slack[0], doubt * slack[1]
         lacking = _EXTRAPOLATED * tail_x
-        ys, _ = own.members(p, own.dependent(x[1:], p, given[:, n:]))
+        ys, _ = own.members(p, d_at)
         none = np.zeros(len(p[0]))
         swings = [sum((2.0 * np.abs(ring[k]) for ring in rings), none) for k in (2, 3)]
         swing = swings[0], swings[1]
@@ -298,34 +356,65 @@ class Run:
                 theta, first = when, c if fails else None
         return theta, first
 
-    def _account(self, own: Equations, found: Attempt, theta: float, h: float) -> bool:
-        """Add what y and w are beyond their bounds within the slack up to θ, in the mean, to the
-        defects; whether the state would differ by less than the tolerance had the constraints changed.
+    def _decided(
+        self, own: Equations, attempt: Attempt, h: float
+    ) -> tuple[Attempt, float, Condition | None, Hidden]:
+        """An attempt, its first change, and what its slack hides up to there.
+
+        Slack keeps a switching from being undone by rounding. Where it would hide what matters to the
+        state, there is less of it, and none at last: the signs are then those of the polynomials.
         """
-        passed, before = np.zeros((2, len(self.mode))), radau.GRID <= theta
-        thetas, size = radau.GRID[before], np.abs(self.given.B)
-        for c in own.conditions:
+        for share in _SLACKS:
+            tried = attempt._replace(slack=(share * attempt.slack[0], share * attempt.slack[1]))
+            theta, condition = self._first_change(own, tried, h)
+            hidden = self._hidden(own, tried, theta, h)
+            if self._is_little(hidden, tried):
+                break
+        return tried, theta, condition, hidden
+
+    def _is_little(self, hidden: Hidden, found: Attempt) -> bool:
+        """Whether it is a small part of what the tolerance leaves."""
+        allowed = self.rtol * np.maximum(self.scale, found.size) + self.atol
+        return bool(np.all(hidden.state <= _OF_VEIL * np.maximum(allowed - self.veiled, 0.0)))
+
+    def _hidden(self, own: Equations, found: Attempt, theta: float, h: float) -> Hidden:
+        """What y and w are beyond their bounds within the slack up to θ, in the mean, and by how much
+        the state would differ had the constraints changed."""
+        beyond, state = np.zeros((2, len(self.mode))), 0.0 * self.x
+        before = radau.GRID <= theta
+        thetas = radau.GRID[before]
+        # The trapezoidal rule, since samples are dense at the ends.
+        part = np.gradient(thetas) if len(thetas) > 1 else np.ones(1)
+        for c in own.conditions if theta > 0.0 else ():
             k = int(c.of_w)
             value = (found.y, found.w)[k][before, c.i] - c.bound
             for rate, amplitude in found.waves(k, c.i):
                 value = value + 2.0 * np.real(amplitude * np.exp(rate * h * thetas))
-            mean = float(np.clip(-c.sign * value, 0.0, found.slack[k][c.i]).mean())
-            passed[k, c.i] = mean
+            mean = np.average(np.clip(-c.sign * value, 0.0, found.slack[k][c.i]), weights=part)
+            beyond[k, c.i] = mean
             if mean > 0.0:
                 # A residual below zero is a response in the mode that would follow, and what follows
                 # from a response that would be at its bound there is known from that mode as well.
                 mode = self.of(changed(self.mode, c))
                 response = mean / self.given.M[c.i, c.i] if c.of_w else mean
-                self.veiled += mode.reach(theta * h) @ size[:, c.i] * response
-        self.defect += theta * h * self._norm(size @ passed[0])
-        self.law_defect += theta * h * float(np.linalg.norm(passed[1]))
-        allowed = self.rtol * np.maximum(self.scale, found.size) + self.atol
-        return bool(np.all(self.veiled <= allowed))
+                state += mode.reach(theta * h, self.given.B)[:, c.i] * response
+        return Hidden(beyond, state)
+
+    def _account(self, hidden: Hidden, length: float) -> None:
+        """Add to the defects what is beyond the bounds, in a step of this length."""
+        of_y, of_w = hidden.beyond
+        self.defect += length * self._norm(np.abs(self.given.B) @ of_y)
+        self.law_defect += length * float(np.linalg.norm(of_w))
+        self.veiled = self.veiled + hidden.state
 
     def _keep(
-        self, step: Step, found: Attempt, piece: Piece, begin: float, end: float, last: bool
+        self, found: Attempt, h: float, theta: float, piece: Piece, begin: float, low: float,
+        end: float, last: bool,
     ) -> None:
-        """Account for an accepted step, and save what lies in it."""
+        """Account for an accepted step of which the part up to θ is used, save what lies in it, and move
+        to its end."""
+        rings = tuple(ring[:3] for ring in found.rings)
+        step, begin = Step(piece.start + begin, h, theta, found.x, found.ys, rings), begin + low
         settled = self.defect, self.law_defect
         of_state, of_law = found.residuals
         n, part = len(self.x), step.length * step.used
@@ -337,7 +426,8 @@ class Run:
         if step.used > 0.0:
             size, of_y, of_w = found.sizes(step.used)
             self.largest = np.maximum(self.largest, [of_y, of_w])
-            self.lacking = found.lacking
+            # The polynomial is exact at the start of the step: Markov's bound of what it lacks later.
+            self.lacking = min(1.0, _MARKOV * step.used) * found.lacking
             self.off, self.scale = found.noise, np.maximum(self.scale, size)
         self.t = piece.start + end
         share = (self.t - self.pieces[0].start) / self.span
@@ -360,6 +450,7 @@ class Run:
             ]
         if self.dense:
             self.steps.append(step)
+        self.x = step.at(np.array([theta]))[0][0]
 
     def _norm(self, v: Array) -> float:
         """An upper bound of the norm of the state space, exact where its unit vectors are
@@ -371,6 +462,9 @@ _AT_POINTS, _ON_GRID, _START = (basis(v) for v in (radau.POINTS, radau.GRID, np.
 
 _EXTRAPOLATED = 16.0
 """What a polynomial may lack at θ = 0, in units of its last coefficients."""
+
+_MARKOV = 2.0 * radau.STAGES**2
+"""The largest slope of a polynomial of a step on [0, 1] where its values are at most 1."""
 
 _OF_DEFECT = 1e-2
 """The most that a step may add to the defect, in units of the tolerance."""
@@ -387,13 +481,22 @@ _MOST_ROUNDING = 1e3
 _EVEN = 3
 """Steps of one length after which a longer one is tried."""
 
+_SLACKS = (1.0, 1e-2, 1e-4, 0.0)
+"""The shares of the slack that are tried."""
+
+_OF_VEIL = 0.1
+"""The most that a step may hide, in units of what is left of the tolerance."""
+
 _MOST_SLACK = 1e3
 """The most that y and w may be beyond a bound, in units of the tolerance."""
 
 _SHOWN = 0.02
 """The share of a run between two lines that `progress` prints."""
 
-_MOST_CHANGES, _MOST_STUCK = 4096, 12
+_MOST_CHANGES, _MOST_CROSSINGS = 4096, 40
+_NEAR = 64.0
+"""Crossings follow one another within so many of their lengths."""
+
 _MOST_DOUBTS = 4
 """How often a switching is located again in a shorter step, until there is one."""
 
