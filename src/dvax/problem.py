@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import _control_shape, _tree, _user_code
+from . import _control_shape, _knots, _tree, _user_code
 from ._switches import switching_times
 from ._tree import Tree
 from .errors import InputError, InputProblem
@@ -22,10 +22,6 @@ from .spaces import AbstractSpace
 from .vi import AbstractSolver, Answer, Auto, Frozen, default_space
 from .vi.arguments import wrong_solver
 from .vi.outcome import unless_failed
-
-KNOT_ULPS, END_ULPS = 4, 128
-"""Knots nearer than this to each other, or to the ends of a run, in roundings of t, are one: records
-round the same moment differently."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,24 +314,7 @@ class Problem(eqx.Module):
         listed = [*filter(_tree.is_concrete, announced), *switches]
         if not listed:
             return np.zeros(0)
-        known = [np.asarray(knots, float) for knots in listed if _tree.is_concrete(knots)]
-        known = np.sort(np.concatenate([np.zeros(0), *known]))
-        known = known[np.isfinite(known)]
-        known = known[_apart(known)]
-        if _tree.is_concrete(listed, t0, t1):
-            return known[_within(known, t0, t1)]
-        # The compiler takes minutes to sort many constants: those within (t0, t1) come first, in their
-        # order. None can be dropped: the others become the end, where a step ends anyway.
-        inside = _within(known, t0, t1)
-        first = jnp.argmax(inside) if len(known) else 0
-        every = jnp.roll(jnp.where(inside, known, t1), -first)
-        computed = [jnp.ravel(knots) for knots in listed if not _tree.is_concrete(knots)]
-        if not computed:
-            return every
-        computed = jnp.concatenate(computed)
-        computed = jnp.where(_within(computed, t0, t1), computed, t1)
-        every = jnp.sort(jnp.concatenate([every, computed]))
-        return jnp.sort(jnp.where(_apart(every), every, t1))
+        return _knots.within(listed, t0, t1)
 
     def check_data(self, t0: Any, t1: Any, x: Tree, args: Any = None) -> None:
         """Evaluate K, f and h at (t0, x) untraced, where data that they make themselves has values.
@@ -374,20 +353,6 @@ def _fix_of_shape(name: str, out: Tree, element: Tree, space: str) -> str:
     shape = getattr(out, "shape", None)
     given = shape is not None and space == "control"
     return fix + (f", such as control_space=dvax.spaces.Euclidean({shape})" if given else "")
-
-
-def _apart(knots: Any) -> Any:
-    """Which sorted times rounding can tell from the one before."""
-    lib = np if _tree.is_concrete(knots) else jnp
-    gap = lib.diff(knots, prepend=knots[:1] - 1.0)
-    return gap > KNOT_ULPS * jnp.finfo(knots.dtype).eps * lib.abs(knots)
-
-
-def _within(knots: Any, t0: Any, t1: Any) -> Any:
-    """Which times are between t0 and t1, and not these."""
-    lib = np if _tree.is_concrete(knots, t0, t1) else jnp
-    margin = END_ULPS * jnp.finfo(knots.dtype).eps * lib.maximum(lib.abs(t0), lib.abs(t1))
-    return (knots > t0 + margin) & (knots < t1 - margin)
 
 
 def _check_spans(spans: list[tuple[Any, Any, str, str]], t0: Any, t1: Any) -> None:

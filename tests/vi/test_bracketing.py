@@ -59,3 +59,16 @@ def test_a_root_without_a_slope_or_with_an_infinite_one_takes_a_bounded_number()
         assert vi.result == RESULTS.successful
         assert int(vi.evaluations) <= most
         np.testing.assert_allclose(np.asarray(vi.y), np.clip(c, 0, 1), atol=1e-14)
+
+
+@pytest.mark.parametrize("bound", [0.9332785790714507, -1e-3, 1e12])
+def test_a_bound_that_is_met_from_next_to_it_is_the_answer(bound):
+    # The guess is a few spacings from the bound: nothing is left to narrow, and no sign has changed.
+    for side in (-1.0, 1.0):
+        law = lambda y, c, side=side: (y - c) + jnp.tanh(y - c) + 0 * side  # noqa: E731
+        far = bound - side * abs(bound)
+        K = Box(min(far, bound), max(far, bound))
+        spacings = np.arange(9) * np.spacing(abs(bound))
+        for guess in bound - side * spacings:
+            vi = dvax.solve_vi(law, K, jnp.array([guess]), bound + side, Bracketing())
+            assert float(vi.y[0]) == bound and float(vi.residual) == 0.0

@@ -18,8 +18,8 @@ class Blur(NamedTuple):
 
     `longest` and `error` are those of the attempt that shorter ones are compared with: from a length
     to its quarter, since rounding fluctuates and neighbouring lengths tell little. `level` is the
-    largest error of rounding that was seen, 0 when none is; `last` is the error of the last step that was
-    kept: of rounding it is seldom small, while steps between two jumps have little.
+    largest error of rounding that was seen, 0 when none is; `last` is the error of the last step that
+    was kept: of rounding it is seldom small, while steps between two jumps have little.
     """
 
     longest: Any

@@ -83,8 +83,8 @@ def sampled(
 
     Between the samples δ is taken to be a line plus a bump (a parabola, or the tent of a kink):
     then ∫|δ| ≤ h(½|δ(0)| + ½|δ(1)| + max |δ(θ) − (1 − θ)δ(0) − θδ(1)|), whatever the place of the
-    kink, up to the `safety` of the method and a margin for steps with two. δ(0) is zero for a method whose polynomial starts at
-    f̃(t₀, x₀), as most do.
+    kink, up to the `safety` of the method and a margin for steps with two. δ(0) is zero for a method
+    whose polynomial starts at f̃(t₀, x₀), as most do.
     """
     thetas = method.samples
     along = [visits[0], *visits[-1 - len(thetas) :]]

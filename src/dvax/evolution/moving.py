@@ -12,8 +12,8 @@ import numpy as np
 
 from .. import _tree
 from .._batch import zeros_of_batch
+from .._knots import END_ULPS, KNOT_ULPS
 from .._tree import Tree
-from ..problem import END_ULPS, KNOT_ULPS
 from .flow import Flow
 
 

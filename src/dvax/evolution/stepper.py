@@ -12,10 +12,10 @@ import jax.tree_util as jtu
 from jax import lax
 
 from .. import _tree
+from .._knots import END_ULPS, KNOT_ULPS
 from .._tree import Tree
 from ..generators import AbstractPropagator, Arc, Growth
 from ..generators.expanded import coefficients, values
-from ..problem import END_ULPS, KNOT_ULPS
 from .defect import Sample, enclosed, sampled
 from .evaluations import Plan, Visit, evaluated
 from .excursions import ExcursionGuard

@@ -12,7 +12,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from .abstract import RESULTS, AbstractSolver, Answer, Frozen
-from .brackets import Brackets, begin, best, is_lost, is_open, narrow, trial
+from .brackets import Brackets, answer, begin, is_lost, is_open, narrow, trial
 from .implicit import with_implicit_derivative
 from .parameters import STEPS, check_parameters
 from .structure import Structure, analyse
@@ -70,7 +70,7 @@ class Bracketing(AbstractSolver):
         guess = jtu.tree_map(jnp.clip, lax.stop_gradient(y0), lower, upper)
         points, count = _roots(_values_and_slopes(vi.F), lower, guess, upper, self.max_steps)
 
-        found = [best(p) for p in points]
+        found = [answer(p) for p in points]
         y, Fy, slope = (jtu.tree_structure(guess).unflatten(part) for part in zip(*found))
         # Points not held by a bound must have a root; w there is F itself, and N_K covers the rest.
         held = jtu.tree_map(

@@ -104,9 +104,22 @@ def best(p: Brackets) -> tuple[jax.Array, jax.Array, jax.Array]:
     return tuple(jnp.where(lower_end, q, r) for q, r in ((p.a, p.b), (p.fa, p.fb), (p.sa, p.sb)))  # pyright: ignore[reportReturnType]
 
 
+def answer(p: Brackets) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`best`, and where a bracket closed at a bound without a change of sign, that bound."""
+    x, f, s = best(p)
+    closed = _is_closed(p)
+    x = jnp.where(closed & jnp.isnan(p.fb) & (f < 0), p.b, x)
+    x = jnp.where(closed & jnp.isnan(p.fa) & (f > 0), p.a, x)
+    return x, f, s
+
+
 def is_open(p: Brackets) -> jax.Array:
     """Whether there is something left to do at each point."""
-    return ~(p.b - p.a <= _CLOSED * _spacing(best(p)[0])) & ~is_lost(p)
+    return ~_is_closed(p) & ~is_lost(p)
+
+
+def _is_closed(p: Brackets) -> jax.Array:
+    return p.b - p.a <= _CLOSED * _spacing(best(p)[0])
 
 
 def is_lost(p: Brackets) -> jax.Array:

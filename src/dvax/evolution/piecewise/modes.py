@@ -11,7 +11,8 @@ import numpy as np
 import scipy.linalg
 
 from . import radau
-from .rings import Ring, rings
+from .inputs import Piece
+from .rings import Ring, derivatives, rings
 from .system import LARGEST, Affine
 
 Array = np.ndarray
@@ -160,8 +161,49 @@ class Equations:
         if h not in self._reach:
             if len(self._reach) >= _KEPT:
                 self._reach.clear()
-            self._reach[h] = np.abs(np.linalg.solve(np.eye(len(self.eliminated)) / h - self.eliminated, B))
+            self._reach[h] = np.abs(
+                np.linalg.solve(np.eye(len(self.eliminated)) / h - self.eliminated, B)
+            )
         return self._reach[h]
+
+    def ringing(
+        self, x: Array, piece: Piece, begin: float, h: float
+    ) -> tuple[list[tuple[complex, Array, Array, Array]], Array]:
+        """(λ, x, y, w) of the oscillations that a step is too long to follow, and what is left of x."""
+        active = [ring for ring in self.rings if ring.rate.imag * h > _FOLLOWED]
+        found, x0 = [], x
+        if active:
+            forcing = derivatives(
+                self.forcing(piece.coefficients), begin / piece.length, piece.length
+            )
+        for ring in active:
+            a = ring.amplitude(x, forcing)
+            y, w = self.responses(ring)
+            found.append((ring.rate, a * ring.x, a * y, a * w))
+            x0 = x0 - 2.0 * found[-1][1].real
+        return found, x0
+
+    def residuals(
+        self, x: Array, p: Array, given: Array, h: float, B: Array
+    ) -> tuple[Array, Array]:
+        """Of the equations of x' and of those that prescribe d, at θ = 0, less what is rounding."""
+        system, n = self.system, x.shape[1]
+        p0 = radau.START @ p
+        rate = radau.D[0] @ x / h
+        terms = np.abs(system.A) @ np.abs(x[0]) + np.abs(system.B) @ np.abs(p0) + np.abs(given[:n])
+        slope = np.abs(radau.D[0]) @ np.abs(x) / h
+        off = np.abs(rate - system.A @ x[0] - system.B @ p0 - given[:n])
+        rounding = _ROUNDING * (terms + slope)
+        law = np.abs(system.M @ p0 + system.C @ x[0] + given[n:] - self.prescribed_d)
+        sizes = np.abs(p).max(axis=0)
+        noise = _ROUNDING * (
+            np.abs(system.M) @ sizes + np.abs(system.C) @ np.abs(x).max(axis=0) + np.abs(given[n:])
+        )
+        law = np.where(self.unknown, np.maximum(law - noise, 0.0), 0.0)
+        # Where y is prescribed it is taken to be so exactly, and the state's equation is off instead.
+        of_y = np.where(system.swapped, law, 0.0)
+        state = np.maximum(off - rounding, 0.0) + np.abs(B) @ of_y
+        return state, law - of_y
 
     def start_residual(self, of_x: Array, of_p: Array) -> Array:
         """What errors of x and p make of the equations of x'."""
@@ -264,6 +306,10 @@ _ROW = 4.0 * np.finfo(float).eps
 """Rounding of a row of a refined solution, relative to the sum of the sizes of its terms."""
 
 _SIGNS = np.random.default_rng(0).choice([-1.0, 1.0], (2 * LARGEST * radau.STAGES, 4))
+
+_ROUNDING = 256.0 * np.finfo(float).eps
+_FOLLOWED = 4.0
+"""Radians of an oscillation in a step, up to which its polynomials follow it."""
 
 _REFINED, _ACCURATE = 6, 1e-14
 _KEPT = 64

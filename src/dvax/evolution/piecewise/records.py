@@ -56,8 +56,8 @@ class Crossing(NamedTuple):
 
 
 class Hidden(NamedTuple):
-    """By how much y and w are `beyond` their bounds within the slack of a step, in the mean, and how much
-    of that the `state` would show."""
+    """By how much y and w are `beyond` their bounds within the slack of a step, in the mean, and how
+    much of that the `state` would show."""
 
     beyond: Array
     state: Array

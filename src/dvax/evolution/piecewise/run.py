@@ -8,8 +8,6 @@ scales that are excited and not from how far they are apart. Times within a piec
 its start, in two parts: a transient of 10⁻¹⁸ s is resolved at any t.
 """
 
-from collections.abc import Callable
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -18,8 +16,9 @@ from . import radau
 from .inputs import Piece, basis, continuous, values
 from .lengths import longer, shorter, two_sum, until
 from .modes import Condition, Equations, Mode, changed, first_mode
+from .murty import implicit_mode, law_mode
 from .records import Attempt, Crossing, Hidden, Row, Step
-from .rings import derivatives
+from .signs import first_change, what_slack_hides
 from .system import Affine
 
 Array = np.ndarray
@@ -70,7 +69,7 @@ class Run:
             self.piece = piece
             inputs = self._converted(piece)
             if last is None or not continuous(last, piece):
-                mode = self._solve_law(inputs)
+                mode = law_mode(self.of, self.mode, self.x, inputs, self.off)
                 if mode is None:
                     self.result = "law_unsolved"
                     return
@@ -99,39 +98,6 @@ class Run:
         if mode not in self.equations:
             self.equations[mode] = Equations(self.system, mode, self.weights)
         return self.equations[mode]
-
-    def _solve_law(self, piece: Piece) -> Mode | None:
-        """The mode of the law at x and at the start of a piece."""
-        given = piece.at(np.zeros(1))[0]
-        return self._solve(self.of, self.x, given[len(self.x) :], piece)
-
-    def _solve_implicitly(self, piece: Piece, begin: float, h: float) -> Mode | None:
-        """The mode of the law at the end of a step of the implicit Euler method."""
-        system, n = self.system, len(self.x)
-        after = system.C @ np.linalg.inv(np.eye(n) - h * system.A)
-        implicit = system._replace(C=after, M=system.M + h * after @ system.B)
-        given = piece.at(np.array([(begin + h) / piece.length]))[0]
-        of = lambda mode: Equations(implicit, mode, self.weights)  # noqa: E731
-        return self._solve(of, self.x + h * given[:n], given[n:], piece)
-
-    def _solve(
-        self, of: Callable[[Mode], Equations], x: Array, q: Array, piece: Piece
-    ) -> Mode | None:
-        """The mode of the law at x: of the violated conditions the first is changed (Murty's rule,
-        which ends for matrices whose principal minors are positive)."""
-        sizes = np.abs(piece.coefficients[:, len(x) :]).sum(axis=0)
-        mode = self.mode
-        for _ in range(_MOST_CHANGES):
-            own = of(mode)
-            y, w, slack_y, slack_w = own.at(x, q, sizes, self.off)
-            for c in own.conditions:
-                value, slack = (w, slack_w) if c.of_w else (y, slack_y)
-                if c.sign * (value[c.i] - c.bound) < -slack[c.i]:
-                    mode = changed(mode, c)
-                    break
-            else:
-                return mode
-        return None
 
     def _through(self, piece: Piece, last: bool) -> str:
         """All steps of a piece."""
@@ -188,8 +154,8 @@ class Run:
         return "successful"
 
     def _cross(self, piece: Piece, begin: float, low: float) -> tuple[float, float] | str:
-        """A short step in the mode that the implicit Euler method ends in, whatever signs are before its
-        end, as long as the state does not show it; (begin, low) after it.
+        """A short step in the mode that the implicit Euler method ends in, whatever signs are before
+        its end, as long as the state does not show it; (begin, low) after it.
 
         Rounding hides which mode goes on where x lies on the bounds of several modes, or where the
         multipliers have boundary layers that steps do not resolve. Crossings that follow one another
@@ -202,7 +168,9 @@ class Run:
         for _ in range(_MOST_CROSSINGS):
             if self.accepted + self.rejected >= self.max_steps:
                 return "max_steps"
-            mode = self._solve_implicitly(piece, now, h)
+            mode = implicit_mode(
+                self.system, self.weights, self.mode, self.x, piece, now, h, self.off
+            )
             if mode is None:
                 return "law_unsolved"
             own = self.of(mode)
@@ -211,7 +179,7 @@ class Run:
                 return "nonfinite"
             any_of = np.full(len(mode), np.inf)
             found = attempt._replace(slack=(any_of, any_of))
-            hidden = self._hidden(own, found, 1.0, h)
+            hidden = what_slack_hides(self.of, self.given, own, found, 1.0, h)
             if attempt.excess <= 1.0 and self._is_little(hidden, found):
                 self._switch(mode)
                 self._account(hidden, h)
@@ -232,7 +200,7 @@ class Run:
         n = len(self.x)
         local = piece.local(begin, h)
         given = values(local, _AT_POINTS)
-        rings, x0 = self._rings(own, piece, begin, h)
+        rings, x0 = own.ringing(self.x, piece, begin, h)
         # Rounding in the inputs is that of the terms they are summed from.
         terms = np.abs(piece.coefficients).sum(axis=0)
         solved = own.solve(h, x0, given, terms, self.off + self.lacking)
@@ -284,7 +252,7 @@ class Run:
             np.minimum(slack[0], _MOST_SLACK * (self.rtol * largest[0] + self.atol)),
             np.minimum(slack[1], _MOST_SLACK * (self.rtol * largest[1] + self.atol * of_w)),
         )
-        residuals = self._residuals(own, x, p, G[0], h)
+        residuals = own.residuals(x, p, G[0], h, self.given.B)
         # What a layer leaves in the defect, of which bounds are made.
         most = _OF_DEFECT * (self.rtol * energy + self._norm(np.full(n, self.atol)))
         # Of that, no shorter step lowers what the rounding of x and p at the start makes of it.
@@ -296,66 +264,6 @@ class Run:
             residuals,
         )  # fmt: skip
 
-    def _rings(
-        self, own: Equations, piece: Piece, begin: float, h: float
-    ) -> tuple[list[tuple[complex, Array, Array, Array]], Array]:
-        """(λ, x, y, w) of the oscillations that a step is too long to follow, and what is left of x."""
-        active = [ring for ring in own.rings if ring.rate.imag * h > _FOLLOWED]
-        found, x0 = [], self.x
-        if active:
-            forcing = derivatives(
-                own.forcing(piece.coefficients), begin / piece.length, piece.length
-            )
-        for ring in active:
-            a = ring.amplitude(self.x, forcing)
-            y, w = own.responses(ring)
-            found.append((ring.rate, a * ring.x, a * y, a * w))
-            x0 = x0 - 2.0 * found[-1][1].real
-        return found, x0
-
-    def _residuals(
-        self, own: Equations, x: Array, p: Array, given: Array, h: float
-    ) -> tuple[Array, Array]:
-        """Of the equations of x' and of those that prescribe d, at θ = 0, less what is rounding."""
-        system, n = self.system, x.shape[1]
-        p0 = radau.START @ p
-        rate = radau.D[0] @ x / h
-        terms = np.abs(system.A) @ np.abs(x[0]) + np.abs(system.B) @ np.abs(p0) + np.abs(given[:n])
-        slope = np.abs(radau.D[0]) @ np.abs(x) / h
-        off = np.abs(rate - system.A @ x[0] - system.B @ p0 - given[:n])
-        rounding = _ROUNDING * (terms + slope)
-        law = np.abs(system.M @ p0 + system.C @ x[0] + given[n:] - own.prescribed_d)
-        sizes = np.abs(p).max(axis=0)
-        noise = _ROUNDING * (
-            np.abs(system.M) @ sizes + np.abs(system.C) @ np.abs(x).max(axis=0) + np.abs(given[n:])
-        )
-        law = np.where(own.unknown, np.maximum(law - noise, 0.0), 0.0)
-        # Where y is prescribed it is taken to be so exactly, and the state's equation is off instead.
-        of_y = np.where(system.swapped, law, 0.0)
-        state = np.maximum(off - rounding, 0.0) + np.abs(self.given.B) @ of_y
-        return state, law - of_y
-
-    def _first_change(
-        self, own: Equations, found: Attempt, h: float
-    ) -> tuple[float, Condition | None]:
-        """(θ, condition) of the first condition that fails; (θ, None) where all hold up to θ."""
-        theta, first = 1.0, None
-        for c in own.conditions:
-            k = int(c.of_w)
-            grid, slack, swing = (v[k] for v in ((found.y, found.w), found.slack, found.swing))
-            signed, allowed = c.sign * (grid[:, c.i] - c.bound), float(slack[c.i])
-            if theta == 0.0 or radau.lowest(signed) - swing[c.i] >= -allowed:
-                continue
-            waves = [
-                radau.Wave(rate * h, c.sign * amplitude)
-                for rate, amplitude in found.waves(k, c.i)
-                if amplitude != 0.0
-            ]
-            when, fails = radau.first_negative(signed, allowed, theta, waves)
-            if fails or when < theta:
-                theta, first = when, c if fails else None
-        return theta, first
-
     def _decided(
         self, own: Equations, attempt: Attempt, h: float
     ) -> tuple[Attempt, float, Condition | None, Hidden]:
@@ -366,8 +274,8 @@ class Run:
         """
         for share in _SLACKS:
             tried = attempt._replace(slack=(share * attempt.slack[0], share * attempt.slack[1]))
-            theta, condition = self._first_change(own, tried, h)
-            hidden = self._hidden(own, tried, theta, h)
+            theta, condition = first_change(own, tried, h)
+            hidden = what_slack_hides(self.of, self.given, own, tried, theta, h)
             if self._is_little(hidden, tried):
                 break
         return tried, theta, condition, hidden
@@ -377,29 +285,6 @@ class Run:
         allowed = self.rtol * np.maximum(self.scale, found.size) + self.atol
         return bool(np.all(hidden.state <= _OF_VEIL * np.maximum(allowed - self.veiled, 0.0)))
 
-    def _hidden(self, own: Equations, found: Attempt, theta: float, h: float) -> Hidden:
-        """What y and w are beyond their bounds within the slack up to θ, in the mean, and by how much
-        the state would differ had the constraints changed."""
-        beyond, state = np.zeros((2, len(self.mode))), 0.0 * self.x
-        before = radau.GRID <= theta
-        thetas = radau.GRID[before]
-        # The trapezoidal rule, since samples are dense at the ends.
-        part = np.gradient(thetas) if len(thetas) > 1 else np.ones(1)
-        for c in own.conditions if theta > 0.0 else ():
-            k = int(c.of_w)
-            value = (found.y, found.w)[k][before, c.i] - c.bound
-            for rate, amplitude in found.waves(k, c.i):
-                value = value + 2.0 * np.real(amplitude * np.exp(rate * h * thetas))
-            mean = np.average(np.clip(-c.sign * value, 0.0, found.slack[k][c.i]), weights=part)
-            beyond[k, c.i] = mean
-            if mean > 0.0:
-                # A residual below zero is a response in the mode that would follow, and what follows
-                # from a response that would be at its bound there is known from that mode as well.
-                mode = self.of(changed(self.mode, c))
-                response = mean / self.given.M[c.i, c.i] if c.of_w else mean
-                state += mode.reach(theta * h, self.given.B)[:, c.i] * response
-        return Hidden(beyond, state)
-
     def _account(self, hidden: Hidden, length: float) -> None:
         """Add to the defects what is beyond the bounds, in a step of this length."""
         of_y, of_w = hidden.beyond
@@ -408,11 +293,18 @@ class Run:
         self.veiled = self.veiled + hidden.state
 
     def _keep(
-        self, found: Attempt, h: float, theta: float, piece: Piece, begin: float, low: float,
-        end: float, last: bool,
+        self,
+        found: Attempt,
+        h: float,
+        theta: float,
+        piece: Piece,
+        begin: float,
+        low: float,
+        end: float,
+        last: bool,
     ) -> None:
-        """Account for an accepted step of which the part up to θ is used, save what lies in it, and move
-        to its end."""
+        """Account for an accepted step of which the part up to θ is used, save what lies in it, and
+        move to its end."""
         rings = tuple(ring[:3] for ring in found.rings)
         step, begin = Step(piece.start + begin, h, theta, found.x, found.ys, rings), begin + low
         settled = self.defect, self.law_defect
@@ -472,9 +364,6 @@ _OF_DEFECT = 1e-2
 _ONE_VALUE = 16.0 * np.finfo(float).eps
 """What rounding may do to the law at one x, relative to the sum of the sizes of its terms."""
 
-_FOLLOWED = 4.0
-"""Radians of an oscillation in a step, up to which its polynomials follow it."""
-
 _MOST_ROUNDING = 1e3
 """How much more than `tol` a polynomial may lack where rounding is larger: a tenth of the tolerance."""
 
@@ -493,11 +382,9 @@ _MOST_SLACK = 1e3
 _SHOWN = 0.02
 """The share of a run between two lines that `progress` prints."""
 
-_MOST_CHANGES, _MOST_CROSSINGS = 4096, 40
+_MOST_CROSSINGS = 40
 _NEAR = 64.0
 """Crossings follow one another within so many of their lengths."""
 
 _MOST_DOUBTS = 4
 """How often a switching is located again in a shorter step, until there is one."""
-
-_ROUNDING = 256.0 * np.finfo(float).eps

@@ -1,0 +1,88 @@
+"""Multipliers of voltage and bridges of three phases: many diodes switch at one time, and capacitors
+hang on each other by nothing but diodes of almost no resistance."""
+
+import numpy as np
+import pytest
+from tests.models.exact_circuit import TooManySamples, solve_exactly
+
+from dvax.models.circuit import Circuit
+
+
+def multiplier(stages, r, capacity, frequency, volts, load, leak=None, source=None):
+    """Cockcroft and Walton's, a column of capacitors beside another; `source` is its resistance."""
+    beside = f" G={leak:g}" if leak else ""
+    lines = [f"V1 s 0 SIN(0 {volts:g} {frequency:g})"]
+    lines += [f"R0 s a0 {source:g}"] if source else []
+    nodes = ["a0" if source else "s", "0"]
+    for k in range(1, stages + 1):
+        lines += [
+            f"C{2 * k - 1} {nodes[0]} a{k} {capacity:g}", f"C{2 * k} {nodes[1]} b{k} {capacity:g}",
+            f"D{2 * k - 1} {nodes[1]} a{k} R={r:g}{beside}", f"D{2 * k} a{k} b{k} R={r:g}{beside}",
+        ]  # fmt: skip
+        nodes = [f"a{k}", f"b{k}"]
+    return "\n".join([*lines, f"R9 b{stages} 0 {load:g}"]) + "\n"
+
+
+def three_phases(r, frequency, line, stray, inductance, load):
+    """Six diodes behind inductive lines, `stray` capacities at their ends, and a filter."""
+    lines = []
+    for k, phase in enumerate("abc", 1):
+        lines += [
+            f"V{k} s{phase} 0 SIN(0 325 {frequency:g} 0 0 {-120 * (k - 1)})",
+            f"L{k} s{phase} {phase} {line:g}", f"R{k} s{phase} {phase} 1k",
+            f"D{2 * k - 1} {phase} p R={r:g} G=1u", f"D{2 * k} n {phase} R={r:g} G=1u",
+        ]  # fmt: skip
+        lines += [f"C{k} {phase} 0 {stray:g}"] if stray else []
+    return "\n".join([*lines, f"L9 p q {inductance:g}", f"R9 q n {load:g}", "C9 q n 100u"]) + "\n"
+
+
+def drawn(seed, most_stages=4):
+    """A circuit of one of the two kinds, of any scale: its netlist, and its end."""
+    rng = np.random.default_rng([7, seed])
+    ten = lambda low, high: 10 ** rng.uniform(np.log10(low), np.log10(high))  # noqa: E731
+    if seed % 2:
+        frequency = rng.choice([50.0, 60.0, 400.0, 1e4])
+        text = three_phases(
+            ten(1e-6, 1), frequency, ten(1e-7, 1e-3), rng.choice([0.0, ten(1e-12, 1e-8)]),
+            ten(1e-5, 1e-1), ten(0.1, 1e3),
+        )  # fmt: skip
+        return text, "", rng.uniform(0.5, 3.0) / frequency
+    frequency, volts = ten(50, 1e5), rng.choice([1.0, 10.0, 325.0, 1e4])
+    leaks = [None if most_stages > 2 else 1e-9, ten(1e-9, 1e-5)]
+    text = multiplier(
+        int(rng.integers(1, most_stages + 1)), ten(1e-6, 1), ten(1e-9, 1e-6), frequency, volts,
+        ten(1e4, 1e8), rng.choice(leaks), rng.choice([None, ten(1e-3, 1e2)]),
+    )  # fmt: skip
+    source = text[: text.index("\n")].split(" ", 3)[3]
+    return text, source, rng.uniform(1.0, 12.0) / frequency
+
+
+@pytest.mark.parametrize(
+    "seed", [0, 1, 2, 3, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(4, 240))]
+)
+def test_rectifiers_of_any_scale_run_at_the_defaults(seed):
+    text, _, end = drawn(seed)
+    circuit, ts = Circuit(text), np.linspace(0.0, end, 31)
+    sol = circuit.solve(end, ts)
+    # Strays ring after a switching, and some of them are followed period by period.
+    work = int(sol.stats["steps"]) + int(sol.stats["rejected"])
+    assert work <= 200 * (int(sol.stats["switchings"]) + len(ts)), sol.stats
+    xs = np.asarray(sol.xs)
+    fine = np.asarray(circuit.solve(end, ts, rtol=1e-10, atol=1e-13).xs)
+    assert np.all(np.abs(xs - fine) <= 1e-7 * np.abs(fine).max(axis=0) + 1e-9)
+    size = 1e-8 * (1.0 + np.abs(xs).max() + np.abs(np.asarray(sol.us)).max())
+    assert np.abs(np.asarray(sol.law_step)).max() <= size
+
+
+@pytest.mark.parametrize(
+    "seed", [0, 4, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(6, 60, 2))]
+)
+def test_multipliers_agree_with_a_hundred_digits(seed):
+    text, source, end = drawn(seed, most_stages=2)
+    ts = np.linspace(0.0, 0.25 * end, 13)
+    try:
+        exact = solve_exactly(text, source, ts)
+    except TooManySamples as found:
+        pytest.skip(str(found))
+    xs = np.asarray(Circuit(text).solve(ts[-1], ts).xs)
+    assert np.all(np.abs(xs - exact.xs) <= 1e-7 * np.abs(exact.xs).max(axis=0) + 1e-9)
