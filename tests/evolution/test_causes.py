@@ -66,6 +66,13 @@ def test_growth_that_is_no_escape_is_not_called_one():
     assert "escape" not in str(error) and "exponential growth" in error.cause
     error = failure(make(lambda t, x, u, args: t - x), x0=1.0, t1=50.0, max_steps=9)
     assert "grow" not in error.cause.split("max_steps")[0]
+    # A drive that grows faster than any exponential, and a state that only follows it.
+    for steps in (60, 90, 120):
+        error = failure(
+            make(lambda t, x, u, args: jnp.exp(t**2) - x), t1=6.0, max_steps=steps, rtol=1e-8,
+            method=dvax.DormandPrince(),
+        )  # fmt: skip
+        assert "escape" not in str(error)
 
 
 @pytest.mark.parametrize(

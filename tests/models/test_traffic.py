@@ -121,6 +121,22 @@ def test_a_rush_and_an_incident_are_followed():
     assert float(model.constants.L_F) == pytest.approx(1 + 50.0 * 0.5, rel=1e-6)
 
 
+@pytest.mark.parametrize("case", ["one path", "no congestion", "constant costs"])
+def test_a_network_without_a_choice_or_without_congestion_runs(case):
+    # Two roads of equal cost for the last case; no link is stiff, or no pair has two paths.
+    congested = case == "one path"
+    columns = dict(
+        init_node=[1, 3, 1, 4], term_node=[3, 2, 4, 2], length=[1.0] * 4, power=[4.0] * 4,
+        capacity=[10.0 if congested else 1e6] * 4, b=[0.0 if case == "constant costs" else 0.15] * 4,
+        free_flow_time=[5.0, 1.0, 500.0 if congested else 5.0, 1.0],
+    )  # fmt: skip
+    network = traffic.Network(zones=2, nodes=4, first_thru_node=3, **columns)
+    model = traffic.Traffic(network, traffic.Trips(2, [1], [2], [10.0]))
+    sol = run(model, model.equilibrium, 3.0, [3.0])
+    np.testing.assert_allclose(sol.xs[-1].sum(), 10.0, rtol=1e-12)
+    np.testing.assert_allclose(sol.xs[-1], model.equilibrium, rtol=1e-9)
+
+
 def test_incidents_on_one_link_multiply():
     holes = [traffic.Incident((1, 3), 0.5, 1.0, 4.0), traffic.Incident((1, 3), 0.4, 3.0, 5.0)]
     model = traffic.Traffic(*networks.two_roads(), rho=50.0, incidents=holes)

@@ -160,14 +160,19 @@ def _escape(stop: Stop) -> Diagnosis:
     speed = _largest(v)
     if math.isfinite(size) and math.isfinite(speed) and speed > 0:
         scale = size / speed
-        ahead = 1e-4 * scale
-        later = jtu.tree_map(lambda a, b: a + stop.time(ahead) * b, stop.x, v)
-        faster = _largest(stop.velocity(stop.time(min(stop.t + ahead, t1)), later))
-        larger = _largest(later)
-        if larger > size and faster > 0:
-            power = math.log(faster / speed) / math.log(larger / size)
+
+        def power_of(share: float) -> float:
+            """Of |x| in |x'|, from a state that is larger by this share of itself, at the same t: what
+            a drive makes of x' is no escape."""
+            later = jtu.tree_map(lambda a, b: a + stop.time(share * scale) * b, stop.x, v)
+            larger, faster = _largest(later), _largest(stop.velocity(stop.time(stop.t), later))
+            grows = larger > size and faster > 0
+            return math.log(faster / speed) / math.log(larger / size) if grows else 0.0
+
+        power = power_of(1e-4)
+        if power > 1.05 and abs(power_of(0.3) - power) < 0.1 * power:
             left = scale / max(power - 1.0, 1e-300)
-            if power > 1.05 and stop.t + left < t1 and left < 0.05 * (stop.t - t0):
+            if stop.t + left < t1 and left < 0.05 * (stop.t - t0):
                 at = stop.t + left
                 return Diagnosis(
                     f"{grown}, and its rate grows like |x|^{power:.3g}: a finite-time escape. The "
