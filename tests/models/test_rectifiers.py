@@ -58,17 +58,18 @@ def drawn(seed, most_stages=4):
 
 
 @pytest.mark.parametrize(
-    "seed", [0, 1, 2, 3, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(4, 240))]
+    "seed",
+    # 45: three equal lines and strays, whose ringing is that of a triple eigenvalue but for rounding.
+    [0, 1, 2, 45, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(3, 240) if s != 45)],
 )
 def test_rectifiers_of_any_scale_run_at_the_defaults(seed):
     text, _, end = drawn(seed)
     circuit, ts = Circuit(text), np.linspace(0.0, end, 31)
     sol = circuit.solve(end, ts)
-    # Strays ring after a switching, and some of them are followed period by period.
     work = int(sol.stats["steps"]) + int(sol.stats["rejected"])
-    assert work <= 200 * (int(sol.stats["switchings"]) + len(ts)), sol.stats
+    assert work <= 60 * (int(sol.stats["switchings"]) + len(ts)), sol.stats
     xs = np.asarray(sol.xs)
-    fine = np.asarray(circuit.solve(end, ts, rtol=1e-10, atol=1e-13).xs)
+    fine = np.asarray(circuit.solve(end, ts, rtol=1e-8, atol=1e-11).xs)
     assert np.all(np.abs(xs - fine) <= 1e-7 * np.abs(fine).max(axis=0) + 1e-9)
     size = 1e-8 * (1.0 + np.abs(xs).max() + np.abs(np.asarray(sol.us)).max())
     assert np.abs(np.asarray(sol.law_step)).max() <= size

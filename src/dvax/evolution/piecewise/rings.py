@@ -10,7 +10,7 @@ the law have on the right. Where λ is large its solution is
 so that x − 2 Re(ae^{λt}v) is smooth, and |2av| bounds what the oscillation does to every unknown.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,11 @@ Array = np.ndarray
 
 _ROUNDS = 4
 _TERMS = 12
+_CLOSE = 1e-2
+"""Rates this close to each other, relative to their size, are found together."""
+
+_DEFECTIVE = 1e6
+"""Condition numbers above which a cluster has no eigenvectors of its own."""
 
 
 class Ring(NamedTuple):
@@ -43,38 +48,65 @@ class Ring(NamedTuple):
 
 def rings(F: Array, n: int, guesses: Array) -> list[Ring]:
     """Those of the pencil (F, E) whose eigenvalues are near the `guesses` with positive imaginary part;
-    by inverse iteration on the pencil itself, which no small entry of M makes inaccurate."""
-    E = np.zeros(len(F))
-    E[:n] = 1.0
-    found: list[Ring] = []
-    for guess in guesses:
-        rate = complex(guess)
-        right = left = np.ones(len(F), complex)
-        for _ in range(_ROUNDS):
-            shifted = F - np.diag(rate * (1.0 + 1e-10) * E)
-            scale = 1.0 / np.abs(shifted).max(axis=1)
-            try:
-                right = np.linalg.solve(scale[:, None] * shifted, scale * (E * right))
-                left = scale * np.linalg.solve((scale[:, None] * shifted).T, E * left)
-            except np.linalg.LinAlgError:
-                break
-            size = np.abs(right[:n]).max(), np.abs(left[:n]).max()
-            if not (np.isfinite(size).all() and min(size) > 0):
-                break
-            right, left = right / size[0], left / size[1]
-            product = left[:n] @ right[:n]
-            if abs(product) < 1e-6 * np.abs(left[:n]) @ np.abs(right[:n]):
-                break  # nearly defective: the oscillation is followed step by step
-            rate = complex(left @ F @ right / product)
-            if not rate.imag > 0.0:
-                break  # none of these
+    by inverse iteration on the pencil itself, which no small entry of M makes inaccurate. Guesses that
+    are close to each other, as symmetric circuits have them, are iterated as one block."""
+    return [ring for near in _clusters(guesses) for ring in _of_cluster(F, n, near)]
+
+
+def _clusters(guesses: Array) -> list[Array]:
+    """Chains of guesses, each close to the next."""
+    found: list[list[complex]] = []
+    for guess in sorted(map(complex, guesses), key=abs):
+        near = (c for c in found if any(abs(guess - other) < _CLOSE * abs(guess) for other in c))
+        cluster = next(near, None)
+        if cluster is None:
+            found.append([guess])
         else:
-            left = left / (left[:n] @ right[:n])
-            known = any(abs(rate - other.rate) < 1e-6 * abs(rate) for other in found)
-            near = abs(rate - guess) < 0.1 * abs(guess) and rate.imag > 0 >= rate.real
-            if near and not known:
-                found.append(Ring(rate, right[:n], right[n:], left[:n], left[n:]))
-    return found
+            cluster.append(guess)
+    return [np.array(cluster) for cluster in found]
+
+
+def _of_cluster(F: Array, n: int, guesses: Array) -> list[Ring]:
+    """All of a cluster, or none: then these oscillations are followed step by step."""
+    count, middle = len(guesses), complex(np.mean(guesses))
+    E = np.zeros((len(F), 1))
+    E[:n] = 1.0
+    # Columns that no symmetry of the circuit makes alike.
+    right = np.cos(np.outer(1.0 + np.arange(len(F)), np.arange(count))) + 0j
+    left, product, shift = right, right, middle
+    rates: Any = np.zeros(count)
+    mixed: Any = right
+    for _ in range(_ROUNDS):
+        shifted = F - np.diag(shift * (1.0 + 1e-10) * E[:, 0])
+        scale = 1.0 / np.abs(shifted).max(axis=1, keepdims=True)
+        try:
+            right = _based(np.linalg.solve(scale * shifted, scale * (E * right)), n)
+            left = _based(scale * np.linalg.solve((scale * shifted).T, E * left), n)
+            product = left[:n].T @ right[:n]
+            if np.linalg.cond(product) > _DEFECTIVE:
+                return []
+            rates, mixed = np.linalg.eig(np.linalg.solve(product, left.T @ F @ right))
+        except np.linalg.LinAlgError:
+            return []
+        shift = complex(rates.mean())
+        if not shift.imag > 0.0:
+            return []
+    near = np.abs(rates - middle) < 0.1 * abs(middle)
+    lasting = (rates.imag > 0.0) & (rates.real <= 0.0)
+    if not (near & lasting).all() or np.linalg.cond(mixed) > _DEFECTIVE:
+        return []
+    right, left = right @ mixed, np.linalg.solve(product @ mixed, left.T)
+    return [
+        Ring(complex(rate), x[:n], x[n:], y[:n], y[n:])
+        for rate, x, y in zip(rates, right.T, left, strict=True)
+    ]
+
+
+def _based(block: Array, n: int) -> Array:
+    """The same space, with columns that differ in their states."""
+    size = np.abs(block[:n]).max(axis=1, keepdims=True)
+    _, r = np.linalg.qr(block[:n] / np.where(size > 0.0, size, 1.0))
+    return np.linalg.solve(r.T, block.T).T
 
 
 def derivatives(coefficients: Array, place: float, length: float) -> Array:
