@@ -25,6 +25,7 @@ CASES = (
     "pointwise",
     "obstacle",
     "applications",
+    "stiffness",
     "picard",
 )
 """The names that --only takes, in the order of a run."""
