@@ -30,6 +30,7 @@ FLOORS = {
     "signals": 0,
     "_control_shape": 1,
     "vi": 1,
+    "_knots": 1.5,
     "_switches": 1.5,
     "problem": 2,
     "evolution": 3,
