@@ -28,7 +28,7 @@ def run(full: bool) -> Section:
     )
     events = Table("events", ("case", "switchings", "steps", "refused"), [])
     rounds = 7 if full else 3
-    for name, small, mild in [*_circuits(), *_frames(), *_weeks(section)]:
+    for name, small, mild in [*_circuits(), *_frames(), *(_weeks(section) if full else [])]:
         found = {"small": small(), "mild": mild()}
         taken = in_turn(
             {key: timed(call) for key, call in (("small", small), ("mild", mild))}, rounds
@@ -78,10 +78,10 @@ def _circuits() -> list[Pair]:
         return lambda: circuit.solve(end, np.linspace(0.0, end, 41))
 
     kinds: list[tuple[str, Callable[[float], str], float]] = [
-        ("half wave", lambda r: half_wave(r, False), 3e-3),
-        ("half wave, strays of 1 pF and 1 nH", lambda r: half_wave(r, True), 3e-3),
-        ("multiplier of four stages", multiplier, 2e-3),
-        ("three phases, strays of 1 nF and 1 µH", bridge, 0.06),
+        ("half wave", lambda r: half_wave(r, False), 2e-3),
+        ("half wave, strays of 1 pF and 1 nH", lambda r: half_wave(r, True), 2e-3),
+        ("multiplier of four stages", multiplier, 5e-4),
+        ("three phases, strays of 1 nF and 1 µH", bridge, 5e-3),
     ]
     return [
         (f"{name}: 1 µΩ beside 0.1 Ω", call(text(1e-6), end), call(text(0.1), end))
