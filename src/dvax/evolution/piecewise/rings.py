@@ -69,37 +69,55 @@ def _clusters(guesses: Array) -> list[Array]:
 def _of_cluster(F: Array, n: int, guesses: Array) -> list[Ring]:
     """All of a cluster, or none: then these oscillations are followed step by step."""
     count, middle = len(guesses), complex(np.mean(guesses))
-    E = np.zeros((len(F), 1))
-    E[:n] = 1.0
     # Columns that no symmetry of the circuit makes alike.
     right = np.cos(np.outer(1.0 + np.arange(len(F)), np.arange(count))) + 0j
-    left, product, shift = right, right, middle
-    rates: Any = np.zeros(count)
-    mixed: Any = right
-    for _ in range(_ROUNDS):
-        shifted = F - np.diag(shift * (1.0 + 1e-10) * E[:, 0])
-        scale = 1.0 / np.abs(shifted).max(axis=1, keepdims=True)
-        try:
-            right = _based(np.linalg.solve(scale * shifted, scale * (E * right)), n)
-            left = _based(scale * np.linalg.solve((scale * shifted).T, E * left), n)
+    left = right
+    rates: Any = np.full(count, middle)
+    try:
+        for _ in range(_ROUNDS):
+            right, left = _iterated(F, n, complex(rates.mean()), right, left)
+            rates, right, left = _separated(F, n, _based(right, n), _based(left, n))
+        # The small problem knows vectors of rates that are near each other to few digits.
+        for _ in range(_ROUNDS if count > 1 else 0):
+            pairs = [
+                _iterated(F, n, complex(rate), right[:, k : k + 1], left[:, k : k + 1])
+                for k, rate in enumerate(rates)
+            ]
+            right, left = (np.hstack(side) for side in zip(*pairs, strict=True))
+            right, left = right / np.abs(right[:n]).max(axis=0), left / np.abs(left[:n]).max(axis=0)
             product = left[:n].T @ right[:n]
-            if np.linalg.cond(product) > _DEFECTIVE:
-                return []
-            rates, mixed = np.linalg.eig(np.linalg.solve(product, left.T @ F @ right))
-        except np.linalg.LinAlgError:
-            return []
-        shift = complex(rates.mean())
-        if not shift.imag > 0.0:
-            return []
-    near = np.abs(rates - middle) < 0.1 * abs(middle)
-    lasting = (rates.imag > 0.0) & (rates.real <= 0.0)
-    if not (near & lasting).all() or np.linalg.cond(mixed) > _DEFECTIVE:
+            left = np.linalg.solve(product, left.T).T
+            rates = np.einsum("ik,ij,jk->k", left, F, right)
+    except np.linalg.LinAlgError:
         return []
-    right, left = right @ mixed, np.linalg.solve(product @ mixed, left.T)
+    near = np.abs(rates - middle) < 0.1 * abs(middle)
+    if not (near & (rates.imag > 0.0) & (rates.real <= 0.0)).all():
+        return []
     return [
         Ring(complex(rate), x[:n], x[n:], y[:n], y[n:])
-        for rate, x, y in zip(rates, right.T, left, strict=True)
+        for rate, x, y in zip(rates, right.T, left.T, strict=True)
     ]
+
+
+def _iterated(F: Array, n: int, rate: complex, right: Array, left: Array) -> tuple[Array, Array]:
+    """One step of inverse iteration from both sides, near a rate."""
+    if not rate.imag > 0.0:
+        raise np.linalg.LinAlgError
+    E = np.zeros((len(F), 1))
+    E[:n] = 1.0
+    shifted = F - np.diag(rate * (1.0 + 1e-10) * E[:, 0])
+    scale = 1.0 / np.abs(shifted).max(axis=1, keepdims=True)
+    right = np.linalg.solve(scale * shifted, scale * (E * right))
+    return right, scale * np.linalg.solve((scale * shifted).T, E * left)
+
+
+def _separated(F: Array, n: int, right: Array, left: Array) -> tuple[Array, Array, Array]:
+    """Rates, and right and left vectors for each in the spaces of these, with left · right = 1."""
+    product = left[:n].T @ right[:n]
+    rates, mixed = np.linalg.eig(np.linalg.solve(product, left.T @ F @ right))
+    if max(np.linalg.cond(product), np.linalg.cond(mixed)) > _DEFECTIVE:
+        raise np.linalg.LinAlgError
+    return rates, right @ mixed, np.linalg.solve(product @ mixed, left.T).T
 
 
 def _based(block: Array, n: int) -> Array:
