@@ -14,6 +14,7 @@ from dvax.models.frame import Accelerogram, Frame
 from dvax.models.market import Market, read_rts
 
 from ..clock import in_turn, timed
+from ..netlists import multiplier, three_phases
 from ..section import Section, Table, compare
 
 
@@ -53,25 +54,8 @@ def _circuits() -> list[Pair]:
         )  # fmt: skip
         return f"V1 a 0 SIN(0 10 1k)\n{near.format(r=r)}\nL1 b c 10u\nR1 c 0 10\nC1 c 0 1u\n"
 
-    def multiplier(r: float, stages: int = 4) -> str:
-        lines, nodes = ["V1 s 0 SIN(0 325 10k)", "R0 s a0 10"], ["a0", "0"]
-        for k in range(1, stages + 1):
-            lines += [
-                f"C{2 * k - 1} {nodes[0]} a{k} 100n", f"C{2 * k} {nodes[1]} b{k} 100n",
-                f"D{2 * k - 1} {nodes[1]} a{k} R={r} G=1u", f"D{2 * k} a{k} b{k} R={r} G=1u",
-            ]  # fmt: skip
-            nodes = [f"a{k}", f"b{k}"]
-        return "\n".join([*lines, f"R9 b{stages} 0 1meg"]) + "\n"
-
-    def bridge(r: float) -> str:
-        lines = ["L9 p q 1m", "R9 q n 10", "C9 q n 100u"]
-        for k, phase in enumerate("abc", 1):
-            lines += [
-                f"V{k} s{phase} 0 SIN(0 325 50 0 0 {-120 * (k - 1)})",
-                f"L{k} s{phase} {phase} 1u", f"R{k} s{phase} {phase} 1k", f"C{k} {phase} 0 1n",
-                f"D{2 * k - 1} {phase} p R={r} G=1u", f"D{2 * k} n {phase} R={r} G=1u",
-            ]  # fmt: skip
-        return "\n".join(lines) + "\n"
+    ladder = lambda r: multiplier(4, r, 1e-7, 1e4, 325.0, 1e6, 1e-6, 10.0)  # noqa: E731
+    bridge = lambda r: three_phases(r, 50.0, 1e-6, 1e-9, 1e-3, 10.0)  # noqa: E731
 
     def call(text: str, end: float) -> Callable[[], dvax.Solution]:
         circuit = Circuit(text)
@@ -80,8 +64,8 @@ def _circuits() -> list[Pair]:
     kinds: list[tuple[str, Callable[[float], str], float]] = [
         ("half wave", lambda r: half_wave(r, False), 2e-3),
         ("half wave, strays of 1 pF and 1 nH", lambda r: half_wave(r, True), 2e-3),
-        ("multiplier of four stages", multiplier, 5e-4),
-        ("three phases, strays of 1 nF and 1 µH", bridge, 5e-3),
+        ("multiplier of four stages", ladder, 5e-4),
+        ("three phases, strays of 1 nF and 1 µH", bridge, 0.06),
     ]
     return [
         (f"{name}: 1 µΩ beside 0.1 Ω", call(text(1e-6), end), call(text(0.1), end))
