@@ -24,8 +24,8 @@ _DOUBT = 4.0
 """By how many times its interpolation error z is taken to be uncertain between the samples."""
 
 _MARGIN = 1.25
-"""What two kinks in one step, as an excursion has, may hide of the defect beyond the `safety`: measured
-on generated problems, of which one in ten thousand has more than 1.01."""
+"""Factor of a defect that is estimated from samples, since a step with two kinks, as an excursion has,
+may have more than `safety` allows for; of the generated problems one bound was too small without it."""
 
 _SETTLES = 1e-3
 """Part of x by which a change of f̃ within a short step may change x over the run."""

@@ -76,7 +76,7 @@ class Equations:
         self.prescribed_d = np.where(u, value, 0.0)
         self.conditions = [c for i, s in enumerate(mode) for c in _conditions(system, i, s)]
         M = system.M[np.ix_(u, u)]
-        self.inverse = _inverse(M)
+        self.inverse = inverse(M)
         of_x = self.inverse @ system.C[u]
         self.eliminated = eliminated = system.A - system.B[:, u] @ of_x
         # Products before sizes: a large change of p may leave d as it is.
@@ -161,9 +161,8 @@ class Equations:
         if h not in self._reach:
             if len(self._reach) >= _KEPT:
                 self._reach.clear()
-            self._reach[h] = np.abs(
-                np.linalg.solve(np.eye(len(self.eliminated)) / h - self.eliminated, B)
-            )
+            unit = np.eye(len(self.eliminated))
+            self._reach[h] = np.abs(inverse(unit / h - self.eliminated) @ B)
         return self._reach[h]
 
     def ringing(
@@ -316,7 +315,7 @@ _KEPT = 64
 """Factorisations that a mode keeps: steps between the knots of a record have few lengths."""
 
 
-def _inverse(M: Array) -> Array:
+def inverse(M: Array) -> Array:
     try:
         return np.linalg.inv(M)
     except np.linalg.LinAlgError:

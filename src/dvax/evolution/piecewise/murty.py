@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from .inputs import Piece
-from .modes import Equations, Mode, changed
+from .modes import Equations, Mode, changed, inverse
 from .system import Affine
 
 Array = np.ndarray
@@ -32,7 +32,9 @@ def implicit_mode(
 ) -> Mode | None:  # fmt: skip
     """That of the law at the end of a step of the implicit Euler method of length h from `begin`."""
     n = len(x)
-    after = system.C @ np.linalg.inv(np.eye(n) - h * system.A)
+    after = system.C @ inverse(np.eye(n) - h * system.A)
+    if not np.isfinite(after).all():
+        return None
     implicit = system._replace(C=after, M=system.M + h * after @ system.B)
     given = piece.at(np.array([(begin + h) / piece.length]))[0]
     of = lambda mode: Equations(implicit, mode, weights)  # noqa: E731

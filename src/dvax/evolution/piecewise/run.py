@@ -165,7 +165,7 @@ class Run:
         near = now - after.end <= _NEAR * after.length
         h = 4.0 * (after.length if near else self.of(self.mode).shortest)
         h = min(h, 0.5 * ((piece.length - begin) - low))
-        for _ in range(_MOST_CROSSINGS):
+        for _ in range(_MOST_SHORTER):
             if self.accepted + self.rejected >= self.max_steps:
                 return "max_steps"
             mode = implicit_mode(
@@ -192,9 +192,10 @@ class Run:
         return "switching_unresolved"
 
     def _switch(self, mode: Mode) -> None:
-        self.mode = mode
-        self.switchings += 1
-        self.events.append((self.t, mode))
+        if mode != self.mode:
+            self.mode = mode
+            self.switchings += 1
+            self.events.append((self.t, mode))
 
     def _attempt(self, own: Equations, piece: Piece, begin: float, h: float) -> Attempt | None:
         n = len(self.x)
@@ -231,14 +232,15 @@ class Run:
         X, P, G = radau.FROM_NODES @ x, radau.FROM_POINTS @ p, values(local, _ON_GRID)
         d = own.dependent(X, P, G[:, n:])
         y, w = own.members(P, d)
-        tail_d = np.abs(radau.TAIL_OF_MULTIPLIER @ (d_at := own.dependent(x[1:], p, given[:, n:])))
+        d_at = own.dependent(x[1:], p, given[:, n:])
+        tail_d = np.abs(radau.TAIL_OF_MULTIPLIER @ d_at).max(axis=0)
         # What the step before was lacking decides on signs, and not on what this one may lack.
         from_points = np.abs(radau.FROM_POINTS)
         slack_p = (from_points @ (noise_p + solved.carried_p)).max(axis=0)
         slack_d = (from_points @ (noise_d + solved.carried_d)).max(axis=0)
         slack_d += own.noise(*sizes, 0.0 * self.off)[1]
         slack = own.members(
-            slack_p + layer + _EXTRAPOLATED * tail_p, slack_d + _EXTRAPOLATED * tail_d.max(axis=0)
+            slack_p + layer + _EXTRAPOLATED * tail_p, slack_d + _EXTRAPOLATED * tail_d
         )
         lacking = _EXTRAPOLATED * tail_x
         ys, _ = own.members(p, d_at)
@@ -293,16 +295,9 @@ class Run:
         self.veiled = self.veiled + hidden.state
 
     def _keep(
-        self,
-        found: Attempt,
-        h: float,
-        theta: float,
-        piece: Piece,
-        begin: float,
-        low: float,
-        end: float,
-        last: bool,
-    ) -> None:
+        self, found: Attempt, h: float, theta: float, piece: Piece, begin: float, low: float,
+        end: float, last: bool,
+    ) -> None:  # fmt: skip
         """Account for an accepted step of which the part up to θ is used, save what lies in it, and
         move to its end."""
         rings = tuple(ring[:3] for ring in found.rings)
@@ -382,7 +377,9 @@ _MOST_SLACK = 1e3
 _SHOWN = 0.02
 """The share of a run between two lines that `progress` prints."""
 
-_MOST_CROSSINGS = 40
+_MOST_SHORTER = 40
+"""How often a crossing is tried in a shorter step."""
+
 _NEAR = 64.0
 """Crossings follow one another within so many of their lengths."""
 
