@@ -4,14 +4,12 @@ A process of its own, since the tests check annotations and promotion, which use
 `max_steps="9"` would be refused by the checker, and never reach dvax.
 """
 
-import json
 import math
-import sys
-import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from tests.refusals import print_all
 
 jax.config.update("jax_enable_x64", True)  # before the data of the cases is made
 
@@ -363,23 +361,5 @@ VERIFY = {
 }
 CASES = {"functions": FUNCTIONS, "arguments": ARGUMENTS, "verify": VERIFY}
 
-
-def said(attempt) -> tuple[str, str]:
-    """The kind of exception and its message."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            return "answer", repr(attempt())[:200]
-        except dvax.DvaxError as error:
-            return type(error).__name__, str(error)
-        except Exception as error:  # noqa: BLE001 (which kind it is, is the answer)
-            return f"raw {type(error).__name__}", str(error)
-
-
 if __name__ == "__main__":
-    tried = {
-        f"{group}: {name}": said(attempt)
-        for group, cases in CASES.items()
-        for name, (attempt, _) in cases.items()
-    }
-    json.dump(tried, sys.stdout)
+    print_all(CASES)

@@ -1,47 +1,26 @@
 """Data that is no number, array, shape or part is refused where it is given; the rest is taken."""
 
-import json
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from tests import bad_data
+from tests.refusals import answers_of, is_a_good_refusal, names_and_words
 
-import dvax
 from dvax import generators, operators, sets, signals, spaces
 
-NAMES = [
-    (f"{group}: {name}", words)
-    for group, cases in bad_data.CASES.items()
-    for name, (_, words) in cases.items()
-]
+NAMES = names_and_words(bad_data)
 
 
 @pytest.fixture(scope="module")
 def answers():
-    root = Path(bad_data.__file__).parents[1]
-    paths = os.pathsep.join([str(Path(dvax.__file__).parents[1]), str(root)])
-    done = subprocess.run(
-        [sys.executable, bad_data.__file__], capture_output=True, text=True, timeout=600,
-        env=os.environ | {"PYTHONPATH": paths},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return answers_of(bad_data)
 
 
 @pytest.mark.parametrize(("name", "words"), NAMES, ids=[name for name, _ in NAMES])
 def test_bad_data_is_an_input_error_on_one_line_with_place_and_fix(answers, name, words):
-    kind, message = answers[name]
-    assert kind == "InputError", message
-    for word in words.split("; "):
-        assert word in message, message
-    place, _, rest = message.partition(": got ")
-    assert place and "; " in rest, "place: got what; the rule. The fix"
+    is_a_good_refusal(answers[name], words)
+    message = answers[name][1]
     assert "\n" not in message and len(message) < 700, message
     assert "asarray(dvax" not in message, "the fix is code of the caller"
 
