@@ -5,10 +5,12 @@ import math
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from benchmarks.netlists import multiplier
 from tests.selection import mostly_thorough
 
 import dvax
 from dvax import generators, operators, sets
+from dvax.models import Circuit
 
 
 def make(f, h=lambda t, x, u, args: 0.5 - u, K=None, A=None, **spaces):
@@ -73,6 +75,18 @@ def test_growth_that_is_no_escape_is_not_called_one():
             method=dvax.DormandPrince(),
         )  # fmt: skip
         assert "escape" not in str(error)
+
+
+@pytest.mark.parametrize("most", [1, 20, 60, 100])
+def test_a_circuit_that_needs_more_steps_is_told_that_and_nothing_else(most):
+    # A multiplier with 20 periods of its source: with 20 steps not even these have a piece each.
+    circuit = Circuit(multiplier(4, 1e-6, 1e-7, 1e4, 325.0, 1e6, 1e-6, 10.0))
+    with pytest.raises(dvax.SolveError) as caught:
+        circuit.solve(2e-3, max_steps=most)
+    error = caught.value
+    assert f"max_steps = {most} attempts were used" in error.cause
+    assert [fix.option for fix in error.fixes] == ["max_steps"]
+    assert most < int(error.fixes[0].value) <= 100 * most
 
 
 @pytest.mark.parametrize(

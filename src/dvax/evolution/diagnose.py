@@ -86,7 +86,10 @@ def diagnose(setup: Setup, stats: dict[str, Any], result: RESULTS) -> Diagnosis:
         causes += [_law]
     causes += [_escape]
     if result != RESULTS.law_unsolved and result != RESULTS.nonfinite:
-        causes += [find_jump, find_discontinuity, _resolution, _tolerance, _stiff]
+        # What runs from event to event has data and laws without such causes: its code was proved.
+        by_steps = not isinstance(setup.method, PiecewiseLinear)
+        causes += [find_jump, find_discontinuity] if by_steps else []
+        causes += [_resolution, *([_tolerance, _stiff] if by_steps else [])]
     if result == RESULTS.max_steps:
         causes += [_too_few]
     for cause in causes:
@@ -297,6 +300,9 @@ def _too_few(stop: Stop) -> Diagnosis:
     text += f"step of {stop.step:.3g}."
     # The first few steps say little about the pace of the later ones.
     enough = 2.0 * stop.attempts + (1.5 if stop.attempts >= _MANY_STEPS else 10.0) * left
+    if isinstance(stop.setup.method, PiecewiseLinear):
+        # Its events may all lie at the start, where a circuit is switched on.
+        enough = min(enough, 100.0 * stop.attempts)
     if enough < 2**31:
         return Diagnosis(text, (Fix("max_steps", f"{math.ceil(enough)}", "at this pace"),))
     rtol = float(stop.setup.setting["rtol"])

@@ -76,11 +76,12 @@ _CHOPPED = 16.0 * np.finfo(float).eps
 
 
 class Unresolved(Exception):
-    """No polynomial fits the inputs around a time, on however short a piece."""
+    """No polynomial fits the inputs around a time, on however short a piece; or they are not finite
+    there, or need more pieces than there may be. `result` is the name of that in `dvax.RESULTS`."""
 
-    def __init__(self, t: float, finite: bool):
+    def __init__(self, t: float, result: str):
         super().__init__(t)
-        self.t, self.finite = t, finite
+        self.t, self.result = t, result
 
 
 @eqx.filter_jit
@@ -110,7 +111,7 @@ def pieces(problem: Problem, stops: Array, x0: Any, args: Any, most: int) -> lis
         values = values[: len(ts)].reshape(len(starts), len(places), -1)
         bad = ~np.isfinite(values).all(axis=(1, 2))
         if bad.any():
-            raise Unresolved(float(starts[bad][0]), finite=False)
+            raise Unresolved(float(starts[bad][0]), "nonfinite")
         return values
 
     done: list[Piece] = []
@@ -145,9 +146,10 @@ def pieces(problem: Problem, stops: Array, x0: Any, args: Any, most: int) -> lis
         ]
         starts, lengths = starts[~good], lengths[~good]
         short = lengths <= 1e3 * eps * (np.abs(starts) + lengths)
-        if short.any() or len(done) + len(starts) > most:
-            place = starts[short] if short.any() else starts
-            raise Unresolved(float(place[0]), finite=True)
+        if short.any():
+            raise Unresolved(float(starts[short][0]), "step_too_small")
+        if len(done) + len(starts) > most:
+            raise Unresolved(float(stops[0]), "max_steps")
         half = 0.5 * lengths
         starts = np.stack([starts, starts + half], axis=1).ravel()
         lengths = np.repeat(half, 2)

@@ -65,7 +65,9 @@ def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
             given, given, nothing, np.asarray(x0, float).ravel(), weights, (rtol, atol),
             *limits_of(limits, times),
         )  # fmt: skip
-        run.t, run.result = error.t, "step_too_small" if error.finite else "nonfinite"
+        run.t, run.result = error.t, error.result
+        if run.result == "max_steps":
+            run.rejected = limits.max_steps  # a step for each piece is too many
         prepared = time.perf_counter()
     else:
         run = Run(
