@@ -12,7 +12,7 @@ KNOT_ULPS, END_ULPS = 4, 128
 round the same moment differently."""
 
 
-def within(listed: list[Any], t0: Any, t1: Any) -> Any:
+def between(listed: list[Any], t0: Any, t1: Any) -> Any:
     """The times in (t0, t1), sorted, of vectors of them. Where something is traced none can be dropped:
     the others become t1, where a step ends anyway."""
     known = [np.asarray(knots, float) for knots in listed if _tree.is_concrete(knots)]

@@ -314,7 +314,7 @@ class Problem(eqx.Module):
         listed = [*filter(_tree.is_concrete, announced), *switches]
         if not listed:
             return np.zeros(0)
-        return _knots.within(listed, t0, t1)
+        return _knots.between(listed, t0, t1)
 
     def check_data(self, t0: Any, t1: Any, x: Tree, args: Any = None) -> None:
         """Evaluate K, f and h at (t0, x) untraced, where data that they make themselves has values.

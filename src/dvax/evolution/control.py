@@ -13,10 +13,10 @@ from jax import lax
 from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace, Product
-from .blur import LEAST, Blur
 from .excursions import WATCH
 from .kinks import Aim, aim, nothing_ahead, passed, until
 from .results import RESULTS
+from .roundoff_guard import SMALLEST_NOISE, RoundoffGuard
 from .stepper import Step
 
 _TRUST, _CALM = 0.12, 9.0
@@ -93,8 +93,8 @@ class Adaptive(AbstractController):
     inside a step has a defect that does not shrink with h; its impulse h·defect does, and such steps
     have the tolerance once more among them, each spending at most a small part of what is left. So
     the computed trajectory is the exact one of a system disturbed by no more than twice the tolerance.
-    Neither does a defect that is rounding shrink with h: steps double while it stays as it is (`Blur`),
-    and spend of the same.
+    Neither does a defect that is rounding shrink with h: steps double while it stays as it is
+    (`RoundoffGuard`), and spend of the same.
 
     Where the stepper locates kinks of the response, steps are made to end there (`kinks`).
 
@@ -122,16 +122,16 @@ class Adaptive(AbstractController):
         calm: Any
         spare: Any
         aim: Any
-        blur: Blur
+        guard: RoundoffGuard
         crossings: Any
 
     def init(self):
         first = lax.stop_gradient(jnp.minimum(self.first, self.longest))
         end = land(self.stops[0], first, self.stops[1])
         one = jnp.ones_like(first)
-        blur = Blur.at_start(first)
+        guard = RoundoffGuard.at_start(first)
         aim, none = nothing_ahead(first), jnp.asarray(0)
-        return self.State(end, first, jnp.asarray(1), _CALM * one, one, aim, blur, none)
+        return self.State(end, first, jnp.asarray(1), _CALM * one, one, aim, guard, none)
 
     def end(self, state):
         return state.end
@@ -147,12 +147,12 @@ class Adaptive(AbstractController):
         error = jnp.where(step.solved, error, jnp.inf)
         impulse = error * h / self.horizon
         # An error of rounding, until it grows with the length.
-        rounding = error <= 2.0 ** min(1.0, 0.5 * self.order) * state.blur.level
+        rounding = error <= 2.0 ** min(1.0, 0.5 * self.order) * state.guard.noise_floor
         # A small share, because a derivative loses a kink's step; a large one where no step is better.
         floor = 8 * jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
         share = jnp.where((h <= 1e4 * floor) | rounding, 0.1, 1e-6)
         # A step may be taken all the same that is short after a refusal, aimed to cross a kink, or
-        # blurred by rounding.
+        # kept for rounding.
         known = Aim(*state.aim)
         excursion = jnp.zeros_like(h)
         if step.excursion is not None:
@@ -203,9 +203,11 @@ class Adaptive(AbstractController):
         factor = jnp.clip(factor, 0.1, jnp.maximum(growth, 0.1))
         steady = keep & (factor > 0.8) & (factor < 1.25)
         length = lax.stop_gradient(h)
-        blur = state.blur.after(length, error, keep, state.calm, self.order)
+        guard = state.guard.after(length, error, keep, state.calm, self.order)
         wanted = jnp.where(steady, length, length * factor)
-        wanted = jnp.where(keep & (blur.level > 0.0), jnp.maximum(wanted, 2.0 * length), wanted)
+        wanted = jnp.where(
+            keep & (guard.noise_floor > 0.0), jnp.maximum(wanted, 2.0 * length), wanted
+        )
         # A step cut short by a knot says little about the length that was planned.
         cut = keep & (h < 0.99 * state.length)
         wanted = jnp.where(
@@ -221,7 +223,7 @@ class Adaptive(AbstractController):
 
         # Steps that were kept since one was refused for anything but a kink.
         still = jnp.where(aimed, jnp.maximum(state.calm, 1.0), 0.0)
-        calm = jnp.where(keep, jnp.minimum(state.calm + 1.0, blur.wait), still)
+        calm = jnp.where(keep, jnp.minimum(state.calm + 1.0, guard.wait), still)
         jumped = keep & (t1 == self.stops[state.stop])
         last = self.stops.shape[0] - 1
         stop = jnp.minimum(jnp.where(jumped, state.stop + 1, state.stop), last)
@@ -230,7 +232,9 @@ class Adaptive(AbstractController):
         wanted = jnp.minimum(jnp.maximum(wanted, floor), self.longest)
         end = land(begin, wanted, until(ahead, begin, self.stops[stop]))
         # Below this, t itself cannot tell the ends of a step apart; and rounding may spend no more.
-        exhausted = rounding & ~roundoff & (state.spare < 1e-3) & (state.blur.last > LEAST)
+        exhausted = (
+            rounding & ~roundoff & (state.spare < 1e-3) & (state.guard.last_error > SMALLEST_NOISE)
+        )
         # (A length is rounded with the times between which it lies.)
         stuck = ~keep & ((h <= 1.25 * floor) | exhausted)
         result = RESULTS.where(
@@ -245,7 +249,10 @@ class Adaptive(AbstractController):
         result = RESULTS.where(step.begun, result, RESULTS.law_unsolved)
         result = RESULTS.where(step.finite, result, RESULTS.nonfinite)
         return Verdict(
-            keep, self.State(end, wanted, stop, calm, spare, ahead, blur, crossings), jumped, result
+            keep,
+            self.State(end, wanted, stop, calm, spare, ahead, guard, crossings),
+            jumped,
+            result,
         )
 
     def boundary(self, index, ends):

@@ -55,12 +55,12 @@ class Crossing(NamedTuple):
     length: float
 
 
-class Hidden(NamedTuple):
-    """By how much y and w are `beyond` their bounds within the slack of a step, in the mean, and how
-    much of that the `state` would show."""
+class MaskedViolation(NamedTuple):
+    """By how much y and w are beyond their bounds within the slack of a step, in the mean (a row each),
+    and `state_error`, by how much the state would differ had the constraints changed."""
 
-    beyond: Array
-    state: Array
+    violation: Array
+    state_error: Array
 
 
 class Attempt(NamedTuple):

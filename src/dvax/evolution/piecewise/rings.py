@@ -50,7 +50,7 @@ def rings(F: Array, n: int, guesses: Array) -> list[Ring]:
     """Those of the pencil (F, E) whose eigenvalues are near the `guesses` with positive imaginary part;
     by inverse iteration on the pencil itself, which no small entry of M makes inaccurate. Guesses that
     are close to each other, as symmetric circuits have them, are iterated as one block."""
-    return [ring for near in _clusters(guesses) for ring in _of_cluster(F, n, near)]
+    return [ring for near in _clusters(guesses) for ring in _cluster_rings(F, n, near)]
 
 
 def _clusters(guesses: Array) -> list[Array]:
@@ -66,7 +66,7 @@ def _clusters(guesses: Array) -> list[Array]:
     return [np.array(cluster) for cluster in found]
 
 
-def _of_cluster(F: Array, n: int, guesses: Array) -> list[Ring]:
+def _cluster_rings(F: Array, n: int, guesses: Array) -> list[Ring]:
     """All of a cluster, or none: then these oscillations are followed step by step."""
     count, middle = len(guesses), complex(np.mean(guesses))
     # Columns that no symmetry of the circuit makes alike.
@@ -75,12 +75,12 @@ def _of_cluster(F: Array, n: int, guesses: Array) -> list[Ring]:
     rates: Any = np.full(count, middle)
     try:
         for _ in range(_ROUNDS):
-            right, left = _iterated(F, n, complex(rates.mean()), right, left)
-            rates, right, left = _separated(F, n, _based(right, n), _based(left, n))
+            right, left = _inverse_iteration(F, n, complex(rates.mean()), right, left)
+            rates, right, left = _eigenvectors(F, n, _basis(right, n), _basis(left, n))
         # The small problem knows vectors of rates that are near each other to few digits.
         for _ in range(_ROUNDS if count > 1 else 0):
             pairs = [
-                _iterated(F, n, complex(rate), right[:, k : k + 1], left[:, k : k + 1])
+                _inverse_iteration(F, n, complex(rate), right[:, k : k + 1], left[:, k : k + 1])
                 for k, rate in enumerate(rates)
             ]
             right, left = (np.hstack(side) for side in zip(*pairs, strict=True))
@@ -99,7 +99,9 @@ def _of_cluster(F: Array, n: int, guesses: Array) -> list[Ring]:
     ]
 
 
-def _iterated(F: Array, n: int, rate: complex, right: Array, left: Array) -> tuple[Array, Array]:
+def _inverse_iteration(
+    F: Array, n: int, rate: complex, right: Array, left: Array
+) -> tuple[Array, Array]:
     """One step of inverse iteration from both sides, near a rate."""
     if not rate.imag > 0.0:
         raise np.linalg.LinAlgError
@@ -111,7 +113,7 @@ def _iterated(F: Array, n: int, rate: complex, right: Array, left: Array) -> tup
     return right, scale * np.linalg.solve((scale * shifted).T, E * left)
 
 
-def _separated(F: Array, n: int, right: Array, left: Array) -> tuple[Array, Array, Array]:
+def _eigenvectors(F: Array, n: int, right: Array, left: Array) -> tuple[Array, Array, Array]:
     """Rates, and right and left vectors for each in the spaces of these, with left · right = 1."""
     product = left[:n].T @ right[:n]
     rates, mixed = np.linalg.eig(np.linalg.solve(product, left.T @ F @ right))
@@ -120,7 +122,7 @@ def _separated(F: Array, n: int, right: Array, left: Array) -> tuple[Array, Arra
     return rates, right @ mixed, np.linalg.solve(product @ mixed, left.T).T
 
 
-def _based(block: Array, n: int) -> Array:
+def _basis(block: Array, n: int) -> Array:
     """The same space, with columns that differ in their states."""
     size = np.abs(block[:n]).max(axis=1, keepdims=True)
     _, r = np.linalg.qr(block[:n] / np.where(size > 0.0, size, 1.0))

@@ -17,8 +17,8 @@ from .inputs import Piece, basis, continuous, values
 from .lengths import longer, shorter, two_sum, until
 from .modes import Condition, Equations, Mode, changed, first_mode
 from .murty import implicit_mode, law_mode
-from .records import Attempt, Crossing, Hidden, Row, Step
-from .signs import first_change, what_slack_hides
+from .records import Attempt, Crossing, MaskedViolation, Row, Step
+from .signs import locate_event, masked_violation
 from .system import Affine
 
 Array = np.ndarray
@@ -41,7 +41,7 @@ class Run:
         self.weights, self.max_steps = weights, max_steps
         rtol, atol = tol
         self.tol, self.least = float(np.clip(1e-4 * rtol, 1e-12, 1e-6)), 1e-4 * atol
-        self.rtol, self.atol, self.veiled = rtol, atol, 0.0 * x0
+        self.rtol, self.atol, self.masked_error = rtol, atol, 0.0 * x0
         self.largest = np.zeros((2, len(given.low)))
         # The members w are in proportion to their law.
         self.least_p = self.least * np.where(pivoted.swapped, np.diag(given.M), 1.0)
@@ -125,7 +125,7 @@ class Run:
                     self.rejected += 1
                     h, before = shorter(own, h, attempt.excess, before), attempt.excess
                     continue
-                attempt, theta, condition, hidden = self._decided(own, attempt, h)
+                attempt, theta, condition, masked = self._locate_event(own, attempt, h)
                 nearer = until(own, h, theta) if condition is not None else h
                 if doubts < _MOST_DOUBTS and nearer < 0.8 * h and attempt.is_coarse(theta):
                     self.rejected += 1
@@ -133,7 +133,7 @@ class Run:
                     h, before = nearer, np.inf
                 else:
                     found = attempt
-            self._account(hidden, theta * h)
+            self._account(masked, theta * h)
             whole = condition is None and theta == 1.0 and bool(h == remaining)
             end = piece.length if whole else begin + (low + theta * h)
             self._keep(found, h, theta, piece, begin, low, end, bool(last and end >= piece.length))
@@ -179,10 +179,10 @@ class Run:
                 return "nonfinite"
             any_of = np.full(len(mode), np.inf)
             found = attempt._replace(slack=(any_of, any_of))
-            hidden = what_slack_hides(self.of, self.given, own, found, 1.0, h)
-            if attempt.excess <= 1.0 and self._is_little(hidden, found):
+            masked = masked_violation(self.of, self.given, own, found, 1.0, h)
+            if attempt.excess <= 1.0 and self._is_negligible(masked, found):
                 self._switch(mode)
-                self._account(hidden, h)
+                self._account(masked, h)
                 self._keep(found, h, 1.0, piece, begin, low, begin + (low + h), False)
                 begin, low = two_sum(begin, low + h)
                 self.crossing, self.stuck = Crossing(begin + low, h), 0
@@ -266,33 +266,34 @@ class Run:
             residuals,
         )  # fmt: skip
 
-    def _decided(
+    def _locate_event(
         self, own: Equations, attempt: Attempt, h: float
-    ) -> tuple[Attempt, float, Condition | None, Hidden]:
-        """An attempt, its first change, and what its slack hides up to there.
+    ) -> tuple[Attempt, float, Condition | None, MaskedViolation]:
+        """An attempt, the first change of a constraint, and the violations that slack masks up to it.
 
         Slack keeps a switching from being undone by rounding. Where it would hide what matters to the
         state, there is less of it, and none at last: the signs are then those of the polynomials.
         """
         for share in _SLACKS:
             tried = attempt._replace(slack=(share * attempt.slack[0], share * attempt.slack[1]))
-            theta, condition = first_change(own, tried, h)
-            hidden = what_slack_hides(self.of, self.given, own, tried, theta, h)
-            if self._is_little(hidden, tried):
+            theta, condition = locate_event(own, tried, h)
+            masked = masked_violation(self.of, self.given, own, tried, theta, h)
+            if self._is_negligible(masked, tried):
                 break
-        return tried, theta, condition, hidden
+        return tried, theta, condition, masked
 
-    def _is_little(self, hidden: Hidden, found: Attempt) -> bool:
+    def _is_negligible(self, masked: MaskedViolation, found: Attempt) -> bool:
         """Whether it is a small part of what the tolerance leaves."""
         allowed = self.rtol * np.maximum(self.scale, found.size) + self.atol
-        return bool(np.all(hidden.state <= _OF_VEIL * np.maximum(allowed - self.veiled, 0.0)))
+        left = np.maximum(allowed - self.masked_error, 0.0)
+        return bool(np.all(masked.state_error <= _MASKED_SHARE * left))
 
-    def _account(self, hidden: Hidden, length: float) -> None:
+    def _account(self, masked: MaskedViolation, length: float) -> None:
         """Add to the defects what is beyond the bounds, in a step of this length."""
-        of_y, of_w = hidden.beyond
+        of_y, of_w = masked.violation
         self.defect += length * self._norm(np.abs(self.given.B) @ of_y)
         self.law_defect += length * float(np.linalg.norm(of_w))
-        self.veiled = self.veiled + hidden.state
+        self.masked_error = self.masked_error + masked.state_error
 
     def _keep(
         self, found: Attempt, h: float, theta: float, piece: Piece, begin: float, low: float,
@@ -368,8 +369,8 @@ _EVEN = 3
 _SLACKS = (1.0, 1e-2, 1e-4, 0.0)
 """The shares of the slack that are tried."""
 
-_OF_VEIL = 0.1
-"""The most that a step may hide, in units of what is left of the tolerance."""
+_MASKED_SHARE = 0.1
+"""The most that a step may mask, in units of what is left of the tolerance."""
 
 _MOST_SLACK = 1e3
 """The most that y and w may be beyond a bound, in units of the tolerance."""

@@ -1,4 +1,4 @@
-"""Signs of what a step computed: the first constraint that changes, and what slack hides."""
+"""Signs of what a step computed: the first constraint that changes, and violations that slack masks."""
 
 from collections.abc import Callable
 
@@ -6,11 +6,11 @@ import numpy as np
 
 from . import radau
 from .modes import Condition, Equations, Mode, changed
-from .records import Attempt, Hidden
+from .records import Attempt, MaskedViolation
 from .system import Affine
 
 
-def first_change(own: Equations, found: Attempt, h: float) -> tuple[float, Condition | None]:
+def locate_event(own: Equations, found: Attempt, h: float) -> tuple[float, Condition | None]:
     """(θ, condition) of the first condition that fails; (θ, None) where all hold up to θ."""
     theta, first = 1.0, None
     for c in own.conditions:
@@ -30,17 +30,17 @@ def first_change(own: Equations, found: Attempt, h: float) -> tuple[float, Condi
     return theta, first
 
 
-def what_slack_hides(
+def masked_violation(
     of: Callable[[Mode], Equations],
     given: Affine,
     own: Equations,
     found: Attempt,
     theta: float,
     h: float,
-) -> Hidden:
+) -> MaskedViolation:
     """What y and w are beyond their bounds within the slack up to θ, in the mean, and by how much the
     state would differ had the constraints changed."""
-    beyond, state = np.zeros((2, len(own.mode))), np.zeros(found.x.shape[1])
+    violation, state_error = np.zeros((2, len(own.mode))), np.zeros(found.x.shape[1])
     before = radau.GRID <= theta
     thetas = radau.GRID[before]
     # The trapezoidal rule, since samples are dense at the ends.
@@ -51,10 +51,10 @@ def what_slack_hides(
         for rate, amplitude in found.waves(k, c.i):
             value = value + 2.0 * np.real(amplitude * np.exp(rate * h * thetas))
         mean = np.average(np.clip(-c.sign * value, 0.0, found.slack[k][c.i]), weights=part)
-        beyond[k, c.i] = mean
+        violation[k, c.i] = mean
         if mean > 0.0:
             # A residual below zero is a response in the mode that would follow, and what follows from
             # a response that would be at its bound there is known from that mode as well.
             response = mean / given.M[c.i, c.i] if c.of_w else mean
-            state += of(changed(own.mode, c)).reach(theta * h, given.B)[:, c.i] * response
-    return Hidden(beyond, state)
+            state_error += of(changed(own.mode, c)).reach(theta * h, given.B)[:, c.i] * response
+    return MaskedViolation(violation, state_error)
