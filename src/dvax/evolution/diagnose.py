@@ -42,6 +42,8 @@ _LOOSEST = 0.01
 """The loosest rtol that is ever named as a fix."""
 _DENSE = 64
 """Unknowns up to which a derivative of the law is formed as a matrix."""
+_STABLE = 3.0
+"""The largest stable step times the modulus of a negative eigenvalue: from 2 to 3.3 by the method."""
 _LINEARISABLE = 400
 """Unknowns up to which `ExpRosenbrock` is the method to name for a stiff problem."""
 
@@ -270,15 +272,19 @@ def _stiff(stop: Stop) -> Diagnosis:
         v = w
     t0, t1 = stop.span
     own = stop.norm(stop.velocity(t, stop.x)) / max(stop.norm(stop.x), 1e-300)
-    product = rate * max(stop.step, (stop.t - t0) / max(stop.steps, 1))
-    if not (sign < 0 and product > 0.3 and rate * (t1 - t0) > 1e3 and own < 0.1 * rate):
+    # At the limit already, or with more steps at the limit to come than there were in all.
+    at_limit = rate * max(stop.step, (stop.t - t0) / max(stop.steps, 1)) > 0.3
+    left = rate * (t1 - stop.t) / _STABLE
+    if not (sign < 0 and rate * (t1 - t0) > 1e3 and own < 0.1 * rate):
+        return Diagnosis()
+    if not (at_limit or left > stop.attempts):
         return Diagnosis()
     many = sum(leaf.size for leaf in jtu.tree_leaves(stop.x)) > _LINEARISABLE
     what = "Ax + f" if whole else "f"
     return Diagnosis(
         f"The problem is stiff for {type(method).__name__}: {what} has an eigenvalue of about "
-        f"{-rate:.3g}, times the step {product:.2g}, while x itself changes at the rate {own:.3g}: "
-        "stability limits the steps, not the tolerance.",
+        f"{-rate:.3g}, so that a stable step is at most about {_STABLE / rate:.2g}, while x itself "
+        f"changes at the rate {own:.3g}. From here to t1 that is {left:.2g} steps at least.",
         (Fix("method", "Implicit" if many else "ExpRosenbrock", "which is stable there"),),
     )
 
