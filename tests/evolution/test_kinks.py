@@ -12,7 +12,7 @@ from tests.selection import mostly_thorough
 
 import dvax
 from dvax import sets
-from dvax.evolution.kinks import first_change
+from dvax.evolution.locate_event import locate_event
 
 
 def test_the_first_of_several_changes_of_sign_is_found():
@@ -23,12 +23,12 @@ def test_the_first_of_several_changes_of_sign_is_found():
 
     thetas = (0.0, 0.5, 1.0)
     values = [at(jnp.asarray(theta)) for theta in thetas]
-    assert float(first_change(thetas, values, at)) == pytest.approx(0.3, abs=1e-5)
+    assert float(locate_event(thetas, values, at)) == pytest.approx(0.3, abs=1e-5)
     late = lambda theta: at(theta).at[1].set(1.0)  # noqa: E731
     values = [late(jnp.asarray(theta)) for theta in thetas]
-    assert float(first_change(thetas, values, late)) == pytest.approx(0.8, abs=1e-5)
-    assert float(first_change(thetas[:2], values[:2], late)) == np.inf
-    assert float(first_change(thetas, values, late, asked=False)) == np.inf
+    assert float(locate_event(thetas, values, late)) == pytest.approx(0.8, abs=1e-5)
+    assert float(locate_event(thetas[:2], values[:2], late)) == np.inf
+    assert float(locate_event(thetas, values, late, wanted=False)) == np.inf
 
 
 @pytest.mark.parametrize("place", [1e-4, 0.123, 0.5, 0.9, 0.9999])
@@ -39,7 +39,7 @@ def test_functions_that_rest_on_zero_or_nearly_so_are_found_to_leave_it(place, h
     for at in (leaving, arriving):
         thetas = (0.0, 1.0)
         values = [at(jnp.asarray(theta)) for theta in thetas]
-        assert float(first_change(thetas, values, at)) == pytest.approx(place, abs=2e-5)
+        assert float(locate_event(thetas, values, at)) == pytest.approx(place, abs=2e-5)
 
 
 def test_order_four_comes_back_over_kinks_that_nobody_announced():

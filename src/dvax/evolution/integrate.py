@@ -16,7 +16,14 @@ from .._one_function import in_one_function
 from ..vi import certify
 from . import excursions, implicit, picard, reverse
 from .closures import opened
-from .control import AbstractController, Adaptive, Fixed, root_mean_squares, step_count
+from .control import (
+    AbstractController,
+    Adaptive,
+    ErrorTest,
+    Fixed,
+    root_mean_squares,
+    step_count,
+)
 from .flow import Flow
 from .forward import forward_only
 from .implicit import Implicit
@@ -183,16 +190,14 @@ def _controller(
     if options.fixed:
         return Fixed(stops, setup.number("dt"))
     sizes = root_mean_squares(setup.problem.spaces(setup.x0)[0])
+    rtol, atol, horizon = map(setup.number, ("rtol", "atol", "horizon"))
     return Adaptive(
         stops,
-        rtol=setup.number("rtol"),
-        atol=setup.number("atol"),
+        ErrorTest(rtol, atol, horizon, sizes),
         first=setup.number("dt0"),
         first_growth=setup.number("dt0_growth"),
         longest=setup.number("dt_max"),
-        horizon=setup.number("horizon"),
         order=method.degree + 1,
-        sizes=sizes,
     )
 
 
@@ -273,7 +278,7 @@ def _solution(
         "evaluations": end.evaluations,
         "t": end.t,
         "x": end.x,
-        "next_dt": controller.next_length(end.control),
+        "next_dt": controller.next_size(end.control),
     }
     return _assembled(setup, flow, rows, stats, result, end.records)
 

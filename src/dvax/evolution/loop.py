@@ -242,7 +242,7 @@ class Loop(eqx.Module):
         if x0 is not state.x:
             memory = memory._replace(coefficients=None)
         step = self.stepper.step(t0, t1, x0, memory, factors, state.jumped)
-        verdict = self.controller.judge(begin, end, x0, step, state.control)
+        decision = self.controller.decide(begin, end, x0, step, state.control)
         impulse = jtu.tree_map(jnp.add, state.impulse, step.impulse)
         taken = Record(t0, t1 - t0, x0, step.c)
         # `last` and `records` of a step that is not kept are written over by the next one, or never
@@ -251,11 +251,11 @@ class Loop(eqx.Module):
         if extent is not None:
             assert step.extent is not None
             extent = extent.joined(step.extent)
-        ahead = (end, step.x1, impulse, step.memory, verdict.jumped, extent)
+        ahead = (end, step.x1, impulse, step.memory, decision.jumped, extent)
         last = None if state.last is None else (taken, state.impulse)
         if self.guarded:
             behind = (begin, state.x, state.impulse, state.memory, state.jumped, state.extent)
-            ahead, last = _tree.where(verdict.kept, (ahead, last), (behind, state.last))
+            ahead, last = _tree.where(decision.accepted, (ahead, last), (behind, state.last))
         checkpoints = state.checkpoints
         if checkpoints is not None:
             checkpoints = checkpoints.put(state.steps, state.x, own)
@@ -271,15 +271,15 @@ class Loop(eqx.Module):
             impulse=impulse,
             memory=memory,
             factors=None if state.factors is None else factors,
-            control=verdict.state,
+            control=decision.state,
             jumped=jumped,
             extent=extent,
             last=last,
             records=None,
             ends=None,
             checkpoints=None,
-            result=verdict.result,
-            steps=jnp.where(verdict.kept, state.steps + 1, state.steps),
+            result=decision.result,
+            steps=jnp.where(decision.accepted, state.steps + 1, state.steps),
             attempts=state.attempts + 1,
             evaluations=state.evaluations + step.evaluations,
             meter=shown,

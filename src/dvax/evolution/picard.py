@@ -20,7 +20,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..generators import AbstractGenerator, AbstractPropagator
-from .control import land
+from .control import clip_to_stop
 from .extent import Extent
 from .loop import Record, Saved
 from .moving import shift, still
@@ -187,7 +187,7 @@ class Run(eqx.Module):
             count = jnp.maximum(jnp.ceil((stop - a) / state.length * (1 - 1e-12)), 1.0)
             b = jnp.where(count > 1, a + (stop - a) / count, stop)
         else:
-            b = land(a, state.length, stop)
+            b = clip_to_stop(a, state.length, stop)
         window = self._window(a, b, state.x)
         ratio = self.size(window.error, window.record.x0, window.after)
         kept = window.settled & _tree.all_finite(window.end)

@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .flow import Flow
-from .kinks import first_change
+from .locate_event import locate_event
 from .loop import Record
 from .stepper import inside, local, within
 
@@ -63,5 +63,5 @@ def _changes(
     ]
     if values[0].size == 0:
         return jnp.full_like(end, jnp.inf), values[0] > 0, values[0] > 0
-    kink = step.start + first_change(_LOOKS, values, at) * step.length
+    kink = step.start + locate_event(_LOOKS, values, at) * step.length
     return kink, values[0] > 0, values[-1] > 0

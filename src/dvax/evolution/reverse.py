@@ -182,7 +182,7 @@ class _Backward:
         if not self.ends_move:
             return gathered
         moving = tuple(leaf for leaf, m in zip(self.leaves, self.moving, strict=True) if m)
-        time = lambda p: self._parts(p).controller.boundary(i, self.ends)  # noqa: E731
+        time = lambda p: self._parts(p).controller.step_start(i, self.ends)  # noqa: E731
         t, pull = jax.vjp(time, moving)
         rate = arriving(t, x, self.loop.stepper.flow, jtu.tree_map(still, self.loop.stepper.ends))
         by = jtu.tree_map(lambda v, r: jnp.sum(v * r), psi, rate)
@@ -201,8 +201,8 @@ class _Backward:
         return self.whole([next(ours if m else theirs) for m in self.moving])[1]
 
     def _times(self, loop: Loop, i: Any) -> tuple[Any, Any]:
-        boundary = loop.controller.boundary
-        return boundary(i, self.ends), boundary(i + 1, self.ends)
+        step_start = loop.controller.step_start
+        return step_start(i, self.ends), step_start(i + 1, self.ends)
 
     def _advance(self, loop: Loop, i: Any, x: Tree, guess: Tree | None) -> tuple[Any, Any]:
         """(xᵢ₊₁, c), and a guess for the law of another step."""

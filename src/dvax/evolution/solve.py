@@ -23,7 +23,7 @@ from .arguments import (
 )
 from .certified import certified, of_region
 from .compiled import compiled
-from .control import GROWTH
+from .control import MAX_GROWTH
 from .diagnose import failure
 from .implicit import Implicit
 from .integrate import Options
@@ -161,7 +161,7 @@ def solve(
         "rtol": _number(rtol),
         "atol": _number(atol),
         "dt0": first_step(span, t0, t1, dtype) if dt0 is None else _number(dt0),
-        "dt0_growth": FIRST_GROWTH if dt0 is None else GROWTH,
+        "dt0_growth": FIRST_GROWTH if dt0 is None else MAX_GROWTH,
         "dt_max": math.inf if dt_max is None else _number(dt_max),
         "horizon": span if horizon is None else _number(horizon),
     }

@@ -21,7 +21,7 @@ from .evaluations import Plan, Visit, evaluated
 from .excursions import ExcursionGuard
 from .extent import Extent
 from .flow import Flow, Rate
-from .kinks import first_change
+from .locate_event import locate_event
 from .method import AbstractMethod, shortened
 from .moving import if_moving
 
@@ -53,21 +53,23 @@ class Factors(NamedTuple):
 class Step(NamedTuple):
     """A step to x₁ with its stage polynomial c.
 
-    `error` is the defect entry by entry (None where not measured), `impulse` = (∫ ‖p − f̃(·, x_h)‖ ds,
-    ∫ ‖w‖ ds) over the step. `kink(asked)` is the time of the first kink of the response inside, ∞
-    where there is none or nobody `asked` (None where nobody looks). `excursion(rtol, atol, rate)`
-    exceeds 1 where data that moves in time may hide something between the samples, given the
-    tolerances of y and of f (None where nothing moves by itself). `extent` is where x_h and u_h have
-    been (None where nobody asks). `begun` says that the law was solved at the start, `solved` that it
-    was everywhere; `finite`, that there are no bad values that a shorter step would not mend;
-    `evaluations` counts those of F.
+    - `error`: the defect entry by entry, None where it is not measured;
+    - `impulse` = (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) over the step;
+    - `event(wanted)`: the time of the first kink of the response inside, ∞ where there is none or the
+      time is not `wanted`; None where events are not located;
+    - `excursion(rtol, atol, rate)`: exceeds 1 where data that moves in time may hide something between
+      the samples, given the tolerances of y and of f; None where nothing moves by itself;
+    - `extent`: the bounds of x_h and u_h over the step, None where they are not tracked;
+    - `begun`, `solved`: the law was solved at the start, and everywhere;
+    - `finite`: there is no non-finite value that a smaller step would leave;
+    - `evaluations`: of F.
     """
 
     x1: Tree
     c: tuple[Tree, ...]
     error: Tree | None
     impulse: tuple[Any, Any]
-    kink: Callable[[Any], Any] | None
+    event: Callable[[Any], Any] | None
     excursion: Callable[[Any, Any, Any], Any] | None
     extent: Extent | None
     memory: Memory
@@ -206,14 +208,14 @@ class Stepper(eqx.Module):
         arc, known = Arc(t1 - t0, start, x1, c), coefficients(x1)
         c, x1 = values((c, x1))
         first, last = visits[0].rate, visits[-1].rate
-        error, impulse, kink, excursion, extent = None, (0.0, 0.0), None, None, None
+        error, impulse, event, excursion, extent = None, (0.0, 0.0), None, None, None
         variation = memory.variation
         if self.measure:
             sample = self._measure(t0, t1, arc, visits, jumped)
             error, impulse = sample.error, (sample.defect, sample.law_defect)
             extent = sample.extent if self.ranged else None
             if self.locate:
-                kink = partial(self._kink, t0, t1, x0, c, first, sample)
+                event = partial(self._event, t0, t1, x0, c, first, sample)
             if self.guard is not None:
                 along = [visits[0], *visits[-1 - len(sample.thetas) :]]
                 share = (t1 - t0) / (self.ends[1] - self.ends[0])
@@ -237,7 +239,7 @@ class Stepper(eqx.Module):
         counts = [visit.rate.evaluations for visit in visits]
         own = counts[0] if kept is None else jnp.where(jumped, counts[0], 0)
         return Step(
-            x1, c, error, impulse, kink, excursion, extent, after, first.solved, solved, finite,
+            x1, c, error, impulse, event, excursion, extent, after, first.solved, solved, finite,
             sum(counts[1:], own),
         )  # fmt: skip
 
@@ -283,10 +285,10 @@ class Stepper(eqx.Module):
 
         return run
 
-    def _kink(
-        self, t0: Any, t1: Any, x0: Tree, c: Any, first: Rate, sample: Sample, asked: Any
+    def _event(
+        self, t0: Any, t1: Any, x0: Tree, c: Any, first: Rate, sample: Sample, wanted: Any
     ) -> Any:
-        """The time of the first kink of the response along x_h."""
+        """Return the time of the first kink of the response along x_h."""
         t0, t1, x0, c, rates = lax.stop_gradient((t0, t1, x0, c, [first, *sample.rates]))
         flow, thetas = self.flow, (0.0, *sample.thetas, 1.0)
 
@@ -304,7 +306,7 @@ class Stepper(eqx.Module):
             switches(self._within(t0, t1, theta), rate)
             for theta, rate in zip(thetas, rates, strict=True)
         ]
-        return t0 + first_change(thetas, values, at, asked) * (t1 - t0)
+        return t0 + locate_event(thetas, values, at, wanted) * (t1 - t0)
 
     def _within(self, t0: Any, t1: Any, theta: float) -> Any:
         return within(t0, t1, theta, self.ends)

@@ -26,7 +26,7 @@ import numpy as np
 from .. import _tree
 from ..errors import InputError, InputProblem
 from ..evolution import Implicit, Solution, between, disturbance, gronwall, solve
-from ..evolution.control import GROWTH
+from ..evolution.control import MAX_GROWTH
 from ..generators import AbstractGenerator, AbstractMatrixFree, Product
 from ..problem import Problem
 from .constants import Constants
@@ -281,7 +281,7 @@ def _again(problem: Problem, sol: Solution, constants: Constants) -> Solution:
     asked = was.setting
     adaptive = isinstance(asked["dt"], float) and math.isnan(asked["dt"])
     # A first step that nobody gave is chosen again, with the growth that it allows.
-    given = asked["dt0_growth"] <= GROWTH
+    given = asked["dt0_growth"] <= MAX_GROWTH
     longest = None if asked["dt_max"] == math.inf else asked["dt_max"]
     again = solve(
         problem, was.x0, asked["t0"], asked["t1"], was.args, sol.ts, None if adaptive else asked["dt"],

@@ -1,0 +1,164 @@
+"""Adaptive steps."""
+
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from ..._tree import Tree
+from ..excursions import WATCH
+from ..results import RESULTS
+from ..stepper import Step
+from .controller import AbstractController, StepDecision, clip_to_stop
+from .error_budget import ErrorBudget
+from .error_test import Attempt, ErrorTest
+from .event_bracket import EventBracket
+from .growth_limiter import GrowthLimiter, limit_by_excursion, next_size, resume_planned
+from .roundoff_guard import RoundoffGuard
+
+
+class Adaptive(AbstractController):
+    """Steps whose defect is at most (atol + rtol‖x‖)/horizon.
+
+    The defect integrated over these steps is then at most the tolerance. Steps over kinks and jumps may
+    amount to the tolerance once more (`ErrorBudget`), so that the computed trajectory is the exact one
+    of a system with a disturbance of at most twice the tolerance.
+
+    `decide` composes the parts in this order; each is a file of this folder:
+
+    1. `ErrorTest` measures the step, and `ErrorBudget` says which steps above the tolerance are
+       accepted;
+    2. the `GrowthLimiter` chooses the next step size;
+    3. the `RoundoffGuard` lets steps grow where the error is roundoff;
+    4. the `EventBracket` ends steps at events that the stepper located.
+
+    `order` is that of the defect; `first` and `longest` are the first and the largest step size, and
+    `first_growth` limits the growth after the first step.
+    """
+
+    stops: jax.Array
+    test: ErrorTest
+    first: Any
+    first_growth: Any
+    longest: Any
+    order: int = eqx.field(static=True)
+
+    adapts: ClassVar[bool] = True
+
+    class State(NamedTuple):
+        """The `end` of the next attempt, the step `size` that is planned, the number of the next
+        `stop`, and the states of the parts."""
+
+        end: Any
+        size: Any
+        stop: Any
+        budget: ErrorBudget
+        growth: GrowthLimiter
+        guard: RoundoffGuard
+        event: jax.Array
+
+    def init(self):
+        first = lax.stop_gradient(jnp.minimum(self.first, self.longest))
+        return self.State(
+            end=clip_to_stop(self.stops[0], first, self.stops[1]),
+            size=first,
+            stop=jnp.asarray(1),
+            budget=ErrorBudget.at_start(first),
+            growth=GrowthLimiter.at_start(first),
+            guard=RoundoffGuard.at_start(first),
+            event=EventBracket.no_event(first).pack(),
+        )
+
+    def end(self, state):
+        return state.end
+
+    def next_size(self, state):
+        return state.size
+
+    def decide(self, t0, t1, x0, step, state):
+        span = self.stops[-1] - self.stops[0]
+        attempt = self.test.attempt(t0, t1, x0, step, span)
+
+        # 1. Accept or reject.
+        is_noise = state.guard.is_noise(attempt.error, self.order)
+        is_roundoff = lax.stop_gradient(is_noise & (attempt.error <= attempt.roundoff))
+        covered = state.budget.covers(attempt, is_noise) | is_roundoff
+        is_resolved = 4.0 * attempt.smallest <= WATCH * span
+        crossing = state.budget.may_cross(attempt, is_resolved)
+        excursion = self._excursion(x0, step, attempt, span)
+        passes = (attempt.error <= 1.0) | covered | crossing
+        accepted = attempt.usable & passes & (excursion <= 1.0)
+        budget = state.budget.after(attempt, accepted, covered, is_roundoff)
+
+        # 2. Limit the growth of the step size.
+        factor, limit = state.growth.factor(
+            attempt, self.order, t0 == self.stops[0], self.first_growth
+        )
+        if step.excursion is not None:
+            limit = limit_by_excursion(limit, excursion)
+        attempt = attempt._replace(size=lax.stop_gradient(attempt.size))
+        size = next_size(attempt, accepted, factor, limit)
+
+        # 3. Let steps grow where errors are roundoff.
+        guard = state.guard.after(
+            attempt.size, attempt.error, accepted, state.growth.accepted_in_a_row, self.order
+        )
+        size = guard.lengthen(size, attempt.size, accepted)
+        size = resume_planned(size, attempt, accepted, state.size)
+
+        # 4. End steps at events. An event explains a rejection: the planned step size stays.
+        known = EventBracket.unpack(state.event)
+        found = self._event(step, attempt, excursion)
+        rejected = ~accepted & attempt.usable & jnp.isfinite(attempt.error)
+        event, directed = known.after(attempt, found, state.size, rejected)
+        at_event = directed | (accepted & known.is_known())
+        size = jnp.where(at_event, jnp.maximum(size, state.size), size)
+        begin = jnp.where(accepted, t1, t0)
+        event = EventBracket(*map(lax.stop_gradient, event.discard_passed(begin)))
+
+        jumped = accepted & (t1 == self.stops[state.stop])
+        last = self.stops.shape[0] - 1
+        stop = jnp.minimum(jnp.where(jumped, state.stop + 1, state.stop), last)
+        size = jnp.minimum(jnp.maximum(size, attempt.smallest), self.longest)
+        exhausted = is_noise & ~is_roundoff & state.budget.is_exhausted() & state.guard.had_noise()
+        new = self.State(
+            end=clip_to_stop(begin, size, event.limit(begin, self.stops[stop])),
+            size=size,
+            stop=stop,
+            budget=budget,
+            growth=state.growth.after(accepted, directed, guard.wait),
+            guard=guard,
+            event=event.pack(),
+        )
+        return StepDecision(accepted, new, jumped, self._result(step, attempt, accepted, exhausted))
+
+    def step_start(self, index, ends):
+        before = jnp.where(index > 0, ends[jnp.maximum(index - 1, 0)], self.stops[0])
+        t = lax.stop_gradient(before)
+        nearest = self.stops[jnp.argmin(jnp.abs(self.stops - t))]
+        return jnp.where(nearest == t, nearest, t)
+
+    def _excursion(self, x0: Tree, step: Step, attempt: Attempt, span: Any) -> Any:
+        """Return by how much data may have moved unseen between the samples, 1 being the limit."""
+        if step.excursion is None:
+            return jnp.zeros_like(attempt.size)
+        watched = attempt.size > WATCH * span
+        return lax.stop_gradient(jnp.where(watched, self.test.excursion(x0, step), 0.0))
+
+    def _event(self, step: Step, attempt: Attempt, excursion: Any) -> Any:
+        """Return the time of the first event inside a step that is too long for it, ∞ for none."""
+        if step.event is None:
+            return jnp.full_like(attempt.size, jnp.inf)
+        return lax.stop_gradient(step.event((attempt.error > 1.0) | (excursion > 1.0)))
+
+    def _result(self, step: Step, attempt: Attempt, accepted: Any, exhausted: Any) -> RESULTS:
+        # A step size is rounded with the two times that it lies between.
+        stuck = ~accepted & ((attempt.size <= 1.25 * attempt.smallest) | exhausted)
+        finite = jnp.isfinite(attempt.error)
+        reason = RESULTS.where(finite, RESULTS.step_too_small, RESULTS.nonfinite)
+        reason = RESULTS.where(step.solved, reason, RESULTS.law_unsolved)
+        result = RESULTS.where(stuck, reason, RESULTS.successful)
+        result = RESULTS.where(step.begun, result, RESULTS.law_unsolved)
+        return RESULTS.where(step.finite, result, RESULTS.nonfinite)

@@ -1,0 +1,70 @@
+"""The interface of a step-size controller."""
+
+import abc
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from ..._tree import Tree
+from ..results import RESULTS
+from ..stepper import Step
+
+
+class StepDecision(NamedTuple):
+    """What becomes of one attempted step.
+
+    - `accepted`: whether the step is accepted;
+    - `state`: the state of the controller for the next attempt;
+    - `jumped`: whether the step was accepted and ends at a stop, where the data may jump;
+    - `result`: `RESULTS.successful`, or the reason for which the run ends here.
+    """
+
+    accepted: Any
+    state: Any
+    jumped: Any
+    result: RESULTS
+
+
+class AbstractController(eqx.Module):
+    """Choose where each step ends.
+
+    `stops` = (t₀, knots…, t₁) are the times at which a step must end; `adapts` says whether the ends
+    of the other steps depend on the solution.
+    """
+
+    stops: eqx.AbstractVar[jax.Array]
+    adapts: eqx.AbstractClassVar[bool]
+
+    @abc.abstractmethod
+    def init(self) -> Any:
+        """Return the state before the first step."""
+
+    @abc.abstractmethod
+    def end(self, state: Any) -> Any:
+        """Return the end of the next attempt."""
+
+    @abc.abstractmethod
+    def decide(self, t0: Any, t1: Any, x0: Tree, step: Step, state: Any) -> StepDecision:
+        """Accept or reject the step that was attempted from (t0, x0) to t1."""
+
+    @abc.abstractmethod
+    def next_size(self, state: Any) -> Any:
+        """Return the first step size for a run that is continued from here."""
+
+    @abc.abstractmethod
+    def step_start(self, index: Any, ends: Any) -> Any:
+        """Return the start of step number `index` as a function of the stops, given the recorded
+        `ends` of all steps (None for fixed steps). Other ends than stops are constants under
+        differentiation."""
+
+
+def clip_to_stop(t: Any, size: Any, stop: Any) -> Any:
+    """Return the end of a step from t: `stop` where the step reaches it, half of the way where two
+    such steps would pass it, so that no sliver is left, else t + size."""
+    rest = stop - t
+    reaches = size >= rest * (1 - 1e-9)
+    inner = t + jnp.where(2 * size > rest, 0.5 * rest, size)
+    return jnp.where(reaches, stop, lax.stop_gradient(inner))

@@ -1,0 +1,107 @@
+"""The error test: the defect of a step in units of the tolerance."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+
+from ..._tree import Tree
+from ...spaces import AbstractSpace, Product
+from ..stepper import Step
+
+_ROUNDINGS = 1e6
+"""Roundings of f̃ up to which a defect counts as roundoff: a law with a small modulus γ amplifies
+rounding by 1/γ."""
+
+_LARGEST_ROUNDOFF = 1e-4
+"""Share of f̃ above which no defect counts as roundoff, whatever t is."""
+
+
+class Attempt(NamedTuple):
+    """An attempted step, as the parts of the controller use it.
+
+    - `begin`, `end`, `size`: its times, and end − begin;
+    - `smallest`: the smallest step size, eight roundings of t;
+    - `error`: the largest defect divided by the tolerance (1 is the limit);
+    - `integrated`: the defect integrated over the step, in units of the tolerance of the whole run;
+    - `roundoff`: the largest `error` that rounding of f̃ and of t can explain;
+    - `usable`: the law was solved at `begin`, and no value is non-finite that a smaller step would
+      leave so.
+    """
+
+    begin: Any
+    end: Any
+    size: Any
+    smallest: Any
+    error: Any
+    integrated: Any
+    roundoff: Any
+    usable: Any
+
+
+class ErrorTest(eqx.Module):
+    """Compare the defect of a step with (atol + rtol‖x‖)/horizon.
+
+    ‖·‖ is the root mean square in the state space, part by part where the state is a tuple, so that
+    parts with different units are each compared with their own size. It is not taken entry by entry:
+    that would ask for a smaller defect wherever an entry passes through zero.
+    """
+
+    rtol: Any
+    atol: Any
+    horizon: Any
+    sizes: Callable[[Tree], list[Any]]
+
+    def attempt(self, t0: Any, t1: Any, x0: Tree, step: Step, span: Any) -> Attempt:
+        """Measure a step from (t0, x0) to t1 in a run of this span."""
+        h = t1 - t0
+        eps, largest = jnp.finfo(h.dtype).eps, jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+        # Step sizes are choices: under differentiation they are constants.
+        error = lax.stop_gradient(self.horizon * self._ratio(step.error, x0, step.x1))
+        # A law that is not solved inside the step may be that of a stage far away: the step was too
+        # large.
+        error = jnp.where(step.solved, error, jnp.inf)
+        # Data that varies within the run has the rounding of t besides, relative to the span.
+        relative = eps * (1.0 + largest / span)
+        rate = self.horizon * self._ratio(step.c[0], x0, step.x1)
+        roundoff = jnp.minimum(_ROUNDINGS * relative, _LARGEST_ROUNDOFF) * rate
+        return Attempt(
+            begin=t0,
+            end=t1,
+            size=h,
+            smallest=8 * eps * largest,
+            error=error,
+            integrated=error * h / self.horizon,
+            roundoff=lax.stop_gradient(roundoff),
+            usable=step.begun & step.finite,
+        )
+
+    def excursion(self, x0: Tree, step: Step) -> Any:
+        """Return the size of what may lie between the samples of the defect, in units of what may
+        stay unseen."""
+        assert step.excursion is not None
+        parts = zip(self.sizes(x0), self.sizes(step.x1), strict=True)
+        least = jnp.min(jnp.stack([self.atol + self.rtol * jnp.maximum(*p) for p in parts]))
+        return lax.stop_gradient(step.excursion(self.rtol, self.atol, least / self.horizon))
+
+    def _ratio(self, error: Tree, before: Tree, after: Tree) -> Any:
+        parts = zip(self.sizes(error), self.sizes(before), self.sizes(after), strict=True)
+        ratios = [e / (self.atol + self.rtol * jnp.maximum(a, b)) for e, a, b in parts]
+        ratio = jnp.max(jnp.stack(ratios)) if len(ratios) > 1 else ratios[0]
+        # NaN must neither accept a step nor lengthen the next one.
+        return jnp.where(jnp.isnan(ratio), jnp.inf, ratio)
+
+
+def root_mean_squares(space: AbstractSpace) -> Callable[[Tree], list[Any]]:
+    """Return the root mean square of each part of a state: its norm over that of the constant 1."""
+    if isinstance(space, Product):
+        spaces = space.spaces
+        return lambda tree: [_mean(s, p) for s, p in zip(spaces, tree, strict=True)]
+    return lambda tree: [_mean(space, tree)]
+
+
+def _mean(space: AbstractSpace, part: Tree) -> Any:
+    norm = space.norm(part)
+    return norm / jnp.sqrt(space.size()).astype(norm.dtype)

@@ -1,0 +1,41 @@
+"""The error budget covers crossings and cannot be overdrawn."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.evolution.control.attempts import NO, YES, attempt
+
+from dvax.evolution.control.error_budget import ErrorBudget
+
+
+def test_random_steps_never_charge_more_than_the_tolerance():
+    rng = np.random.default_rng(0)
+    budget, charged = ErrorBudget.at_start(jnp.asarray(1.0)), 0.0
+    for _ in range(300):
+        tried = attempt(10 ** rng.uniform(-2, 12), 10 ** rng.uniform(-15, 0))
+        covered = budget.covers(tried, jnp.asarray(rng.random() < 0.5))
+        accepted = (tried.error <= 1.0) | covered
+        budget = budget.after(tried, accepted, covered, NO)
+        charged += float(tried.integrated) if bool(accepted & (tried.error > 1.0)) else 0.0
+    assert 0.0 < charged <= 1.0
+    assert float(budget.remaining) == pytest.approx(1.0 - charged, abs=1e-12)
+
+
+def test_a_rejected_step_and_roundoff_are_not_charged():
+    budget = ErrorBudget.at_start(jnp.asarray(1.0))
+    tried = attempt(2.0, 1e-8)
+    for accepted, roundoff in ((NO, NO), (YES, YES)):
+        assert float(budget.after(tried, accepted, YES, roundoff).remaining) == 1.0
+    assert float(budget.after(tried, YES, YES, NO).remaining) < 1.0
+
+
+def test_four_crossings_in_a_row_are_allowed_and_a_good_step_allows_them_again():
+    budget, jump = ErrorBudget.at_start(jnp.asarray(1.0)), attempt(1e9, 1e-14)
+    for _ in range(4):
+        assert bool(budget.may_cross(jump, YES)) and not bool(budget.may_cross(jump, NO))
+        budget = budget.after(jump, YES, NO, NO)
+    assert not bool(budget.may_cross(jump, YES))
+    budget = budget.after(attempt(0.5, 1e-3), YES, NO, NO)
+    assert bool(budget.may_cross(jump, YES))
+    assert not bool(budget.may_cross(attempt(np.inf, 1e-14), YES))
+    assert not bool(budget.may_cross(attempt(1e9, 1e-12), YES))
