@@ -17,8 +17,7 @@ STAIRS = dvax.signals.Table([0.0, 1.0, 2.5, 4.0], [0.0, 3.0, -1.0, 2.0], kind="c
 SPLINE = dvax.signals.Table([0.0, 1.0, 2.5, 4.0], [0.0, 3.0, -1.0, 2.0], kind="cubic")
 PROFILE = jnp.array([0.5, -1.0, 2.0])
 UNRULED = {
-    "a choice among three", "a condition", "a loop", "the larger of sorted",
-    "rounded to a short type",
+    "a choice among three", "a condition", "the larger of sorted", "rounded to a short type",
 }  # fmt: skip
 
 FUNCTIONS = {

@@ -44,13 +44,16 @@ METHODS = {
     "Implicit": dvax.Implicit(),
     "Picard": dvax.Picard(),
 }
+# A window of Picard's method has 64 steps, of which the first few windows are short.
+STEPS = {"Picard": 1000}
 
 
 def solver(method, dt, adjoint):
     def solve(p):
         return dvax.solve(
             problem(), p["x0"], 0.0, p["t1"], p, ts=jnp.array([0.5, 1.5]), dt=dt, rtol=1e-4,
-            atol=1e-6, max_steps=200, method=METHODS[method], adjoint=adjoint, throw=False,
+            atol=1e-6, max_steps=STEPS.get(method, 200), method=METHODS[method], adjoint=adjoint,
+            throw=False,
         )  # fmt: skip
 
     return solve
@@ -95,10 +98,10 @@ def test_failed_lanes_have_nan_and_the_others_their_own_derivative(method, dt, a
         assert np.isfinite(values[0]), name
     # Alone, the lane that succeeded has the same derivative.
     alone, _ = derive(cost)({name: value[0] for name, value in batch.items()})
-    # An implicit step is solved to its tolerance, by other roundings in a batch.
-    rtol = 1e-7 if method == "Implicit" else 1e-9
+    # An implicit step is solved to its tolerance, with other roundings in a batch.
+    rtol, atol = (1e-6, 1e-6) if method == "Implicit" else (1e-9, 1e-12)
     for name in WELL:
-        np.testing.assert_allclose(found[name][0], alone[name], rtol=rtol, atol=1e-12)
+        np.testing.assert_allclose(found[name][0], alone[name], rtol=rtol, atol=atol)
     # Nor has one that is not part of a batch or a larger program.
     failed, _ = derive(cost)({name: value[1] for name, value in batch.items()})
     assert all(np.isnan(value) for value in failed.values())
