@@ -20,7 +20,7 @@ FLOORS = {
     "_tree": -1,
     "_batch": -1,
     "_failure": -1,
-    "_one_function": -1,
+    "_jax": -1,
     "_user_code": 0,
     "_figure_text": -2,
     "spaces": 0,

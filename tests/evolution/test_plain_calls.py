@@ -1,4 +1,4 @@
-"""Solves without outlined programs (`_one_function`): on a JAX that is faster by itself, and on one
+"""Solves without outlined programs (`dvax._jax`): on a JAX that is faster by itself, and on one
 without the interfaces that they are built from, every answer and every derivative stays the same."""
 
 import sys
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dvax
-from dvax import _one_function
+from dvax import _jax
 from dvax.evolution import integrate, reverse
 
 problem = dvax.Problem(
@@ -41,7 +41,7 @@ WAYS = {
 def by(monkeypatch, call):
     """Have every solve call its programs by `call`."""
     for module in (integrate, reverse):
-        monkeypatch.setattr(module, "in_one_function", call)
+        monkeypatch.setattr(module, "outlined", call)
     jax.clear_caches()
 
 
@@ -51,7 +51,7 @@ def usual():
 
 
 def test_plain_programs_give_the_same_answers_and_derivatives(usual, monkeypatch):
-    by(monkeypatch, _one_function._plain)
+    by(monkeypatch, _jax._plain)
     for name, (way, apart) in WAYS.items():
         jax.tree_util.tree_map(
             lambda a, b, name=name, apart=apart: np.testing.assert_allclose(
@@ -74,18 +74,18 @@ def test_newer_releases_of_jax_get_plain_programs(monkeypatch):
     # There the attributes make programs slower, and abort the compiler on some loops.
     for version in [(0, 12, 0), (0, 13, 0), (1, 0, 0)]:
         monkeypatch.setattr(jax, "__version_info__", version)
-        assert _one_function._chosen() is _one_function._plain
+        assert _jax._choose() is _jax._plain
 
 
-@pytest.mark.skipif(not _one_function.OUTLINES, reason="on this JAX programs are plain anyway")
+@pytest.mark.skipif(not _jax.OUTLINES, reason="on this JAX programs are plain anyway")
 @pytest.mark.parametrize("absent", ["jax.experimental.xla_metadata", "jax.interpreters.mlir"])
 def test_programs_are_plain_where_an_interface_is_absent(monkeypatch, absent):
-    for name in [name for name in sys.modules if name.startswith("dvax._one_function.")]:
+    for name in [name for name in sys.modules if name.startswith("dvax._jax.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, absent, None)
     parent, _, last = absent.rpartition(".")
     monkeypatch.delattr(sys.modules[parent], last)
-    assert _one_function._chosen() is _one_function._plain
+    assert _jax._choose() is _jax._plain
 
 
 @pytest.mark.parametrize("way", ["fixed", "vmap"])
@@ -93,4 +93,4 @@ def test_the_attributes_are_set_where_outlines_says_so(way):
     run = WAYS[way][0]
     text = jax.jit(run).lower(3.0).compile().as_text()
     outlined = 'inlineable="false",xla_cpu_small_call="true"' in text
-    assert outlined == _one_function.OUTLINES
+    assert outlined == _jax.OUTLINES

@@ -6,6 +6,10 @@ from decimal import Decimal, localcontext
 from fractions import Fraction
 
 
+class Undecided(Exception):
+    """The search for the active set did not end."""
+
+
 def rational(array):
     """A float array as nested lists of the rationals that its entries are."""
     return [rational(row) for row in array] if array.ndim else Fraction(float(array))
@@ -51,7 +55,7 @@ def box(M, q, lower, upper, guess):
         y = _exchanged(more, q, lower, upper, guess)
         guess = guess if y is None else y
     if y is None:
-        raise AssertionError("no active set")
+        raise Undecided("no active set")
     return y
 
 
@@ -103,7 +107,7 @@ def polyhedron(M, q, G, d, E, e, guess):
         inside = all(a <= b for a, b in zip(times(G, y), d, strict=True))
         if inside and all(v >= 0 for v in multipliers):
             return y
-    raise AssertionError("no active set")
+    raise Undecided("no active set")
 
 
 def ball(M, q, radius, guess):

@@ -93,18 +93,22 @@ def test_the_error_is_below_its_bound_and_successful_means_within_tol(name, n, c
         return found.y, found.error_bound, found.result == RESULTS.successful
 
     ys, bounds, successful = jax.jit(jax.vmap(one))(M, q, gamma, *map(jnp.asarray, given))
-    wrong = []
+    wrong, undecided = [], 0
     for k in range(count):
         y = np.asarray(ys[k])
         if not np.isfinite(y).all():
             assert not successful[k]
             continue
         numbers = [exact.rational(v[k]) for v in (M, q)]
-        truth = solution(*numbers, exact.rational(y), *(exact.rational(v[k]) for v in given))
+        try:
+            truth = solution(*numbers, exact.rational(y), *(exact.rational(v[k]) for v in given))
+        except exact.Undecided:
+            undecided += 1
+            continue
         error = exact.distance(y, truth)
         if not error <= bounds[k] or (successful[k] and error > TOL):
             wrong.append((k, gamma[k], error, float(bounds[k]), bool(successful[k])))
-    assert not wrong
+    assert not wrong and undecided <= count // 100
     # The bound is of use: no larger than a small multiple of ε(‖M‖‖y‖ + ‖q‖)n/γ, in most cases.
     sizes = [
         np.linalg.norm(M[k], 2) * np.linalg.norm(ys[k]) + np.linalg.norm(q[k]) for k in range(count)

@@ -12,7 +12,7 @@ from jax import lax
 
 from .. import _tree
 from .._failure import nan_derivatives_where
-from .._one_function import in_one_function
+from .._jax import outlined
 from ..vi import certify
 from . import excursions, implicit, picard, reverse
 from .closures import opened
@@ -95,7 +95,7 @@ def _solved(setup: Setup, flow: Flow, ts: Any, valid: jax.Array, options: Option
         carries=options.adjoint == "forward",
     )
     if options.adjoint == "forward":
-        saved, end = in_one_function(Loop.run, loop, x0, times)
+        saved, end = outlined(Loop.run, loop, x0, times)
         saved, end = forward_only((saved, end))
     else:
         saved, end = reverse.run(loop, x0, times)
@@ -346,9 +346,9 @@ def _end_alone(end: State | picard.State, complete: Any, t1: Any, measured: bool
     return jtu.tree_map(lambda leaf: leaf[None], one)
 
 
-_BRIEF = 4096
-"""Entries of states whose responses are computed one by one, in one function: for more arithmetic in
-one place than this JAX wakes another thread, which takes longer."""
+_IN_TURN = 4096
+"""Entries of the state from which laws that are solved by iteration are solved one saved time after
+the other: each then stops at its own iteration, with the memory of one."""
 
 
 def _responses(flow, rows, control, moduli):
@@ -361,13 +361,8 @@ def _responses(flow, rows, control, moduli):
     entries = sum(leaf.size for leaf in jtu.tree_leaves(xs))
 
     def every():
-        if not flow.direct and entries > _BRIEF * len(times):
-            # What iterates waits for nobody, and has the memory of one row.
-            return _in_turn(flow, control, tau, *rows)
-        if entries > _BRIEF:
-            return _at_once(flow, control, tau, *rows)
-        given = {"computed": rows, "otherwise": _at_once}
-        return in_one_function(_in_turn, flow, control, tau, **given)
+        respond = _at_once if flow.direct or entries <= _IN_TURN * len(times) else _in_turn
+        return outlined(respond, flow, control, tau, large=rows)
 
     def nothing():
         return jtu.tree_map(lambda s: jnp.full(s.shape, jnp.nan, s.dtype), jax.eval_shape(every))
@@ -383,6 +378,9 @@ def _responses(flow, rows, control, moduli):
 
 
 def _at_once(flow, control, tau, times, xs, guesses):
+    if len(times) == 1:
+        rows = jtu.tree_map(lambda leaf: leaf[0], (times, xs, guesses))
+        return jtu.tree_map(lambda leaf: leaf[None], _response(flow, control, tau, *rows))
     return jax.vmap(partial(_response, flow, control, tau))(times, xs, guesses)
 
 

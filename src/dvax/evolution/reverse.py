@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 
 from .. import _tree
-from .._one_function import in_one_function
+from .._jax import outlined
 from .._tree import Tree
 from .checkpoints import Checkpoints, Stack, how_many
 from .loop import Loop, Record, Saved, State, slack
@@ -45,7 +45,7 @@ def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State
     @jax.custom_vjp
     def solved(*leaves: jax.Array) -> Any:
         x0, loop, ts = whole(leaves)
-        return _states(*in_one_function(Loop.run, loop, x0, ts))
+        return _states(*outlined(Loop.run, loop, x0, ts))
 
     def forward(*given: Any) -> Any:
         leaves = [leaf.value for leaf in given]
@@ -54,7 +54,7 @@ def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State
         def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State]:
             return loop.run(x0, ts, Checkpoints(x0, how_many(x0, loop.max_steps)))
 
-        saved, state = in_one_function(run, loop, x0, ts)
+        saved, state = outlined(run, loop, x0, ts)
         assert state.checkpoints is not None
         moving = _tree.Static(tuple(leaf.perturbed for leaf in given))
         kept = leaves, moving, state.ends, state.checkpoints, state.steps
@@ -68,7 +68,7 @@ def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State
             return _Backward(whole, leaves, moving.value, timing, *history).run(bar)
 
         bar = _States(*map(_given, cotangents[0]))
-        return in_one_function(run, leaves, bar, computed=tuple(history))
+        return outlined(run, leaves, bar, large=tuple(history))
 
     solved.defvjp(forward, backward, symbolic_zeros=True)
     states, rest = solved(*leaves)

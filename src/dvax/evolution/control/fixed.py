@@ -53,7 +53,7 @@ class Fixed(AbstractController):
             return self._time(0, index)
         counts = self._counts()
         # The number of steps up to the end of each segment. A sum of products instead of `cumsum`,
-        # for few segments: XLA compiles it into the loop (`_one_function`).
+        # for few segments: XLA compiles it into the loop (`_jax.outlined`).
         if len(counts) <= 32:
             upto = jnp.sum(np.tri(len(counts), dtype=int) * counts[None], axis=1)
             segment = jnp.sum(upto <= index)
