@@ -55,7 +55,9 @@ def test_the_true_error_is_below_the_tolerance(name, method, tol):
     # Only what is enclosed is called certified.
     key = "certified_bound" if bound.status == "proved" else "estimated_bound"
     assert {"certified_bound", "estimated_bound"} & set(sol.stats) == {key}
-    assert sol.stats[key] == pytest.approx(float(bound.x.max()), rel=1e-9)
+    # The bound that was promised covers roundings of the runs before the last one as well.
+    assert float(bound.x.max()) <= sol.stats[key] * (1 + 1e-9) <= tol * (1 + 1e-9)
+    assert sol.stats[key] == pytest.approx(float(bound.x.max()), rel=1e-3)
     if of_x.max() > 1e-11:
         # Not far below either: the last run aims at seven tenths.
         assert float(bound.x.max()) >= 0.05 * tol

@@ -23,7 +23,7 @@ ENCLOSED = (
     "a jump in the middle", "a pulse that ends see nothing of", "a dead zone by inequality",
     "a number turned into an integer", "a running count", "a tooth", "a remainder",
 )  # fmt: skip
-SAMPLED = ("a condition", "a loop", "rounded to a short type")
+SAMPLED = ("a condition", "rounded to a short type")
 
 
 def problem(f, h=lambda t, x, u, args: 0.0 * u):

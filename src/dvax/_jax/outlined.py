@@ -216,8 +216,7 @@ def _push_forward(leaves: Any, tangents: Any, *, program: ClosedJaxpr, packs: An
         whole = [next(own) if m else leaf for leaf, m in zip(leaves, moves, strict=True)]
         return jaxpr_as_fun(program)(*whole)
 
-    moving = (tuple(compress(part, moves)) for part in (leaves, tangents))
-    out, pushed = jax.jvp(of, *moving)
+    out, pushed = jax.jvp(of, tuple(compress(leaves, moves)), tuple(compress(tangents, moves)))
     zeros = [ad.Zero(jax.typeof(v).to_tangent_aval()) for v in out]
     none = [t.dtype == jax.dtypes.float0 for t in pushed]
     return out, [zero if n else t for zero, n, t in zip(zeros, none, pushed, strict=True)]
