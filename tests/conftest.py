@@ -31,7 +31,7 @@ if os.environ.get("HYPOTHESIS_PROFILE") != "thorough":
         flags.append("--xla_cpu_use_fusion_emitters=false")
     os.environ.setdefault("XLA_FLAGS", " ".join(flags))
 
-    # Every annotation of the library, shapes included, is checked at each call. The hook must stand
+    # Every annotation of the library is checked at each call. The hook must stand
     # before the first import of dvax, hence here and not in a fixture. The application is left out: it
     # promises an answer to input of any type, and a checker would answer first.
     application = {"__init__", "__main__", "runs", "plots", "cli"}

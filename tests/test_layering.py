@@ -54,7 +54,7 @@ NEIGHBOURS = {
     ("sensitivity", "theory"): "what a derivative predicts is shown beside what is certified",
 }
 
-CORE = {"jax", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping", "numpy", "scipy"}
+CORE = {"jax", "equinox", "diffrax", "numpy", "scipy"}
 APPLICATION = {
     *("matplotlib", "numcodecs", "pint", "plotly", "pydantic", "pydantic_core", "rich"),
     *("tomli_w", "typer", "xarray", "zarr"),

@@ -10,7 +10,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-LIBRARY = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping", "numpy")
+LIBRARY = ("jax", "jaxlib", "equinox", "diffrax", "numpy", "scipy")
 APPLICATION = ("typer", "rich", "pydantic", "pint", "xarray", "zarr", "plotly", "matplotlib")
 SYSTEM_PYTHON = Path("/usr/bin/python3")
 

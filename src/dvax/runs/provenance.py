@@ -14,8 +14,6 @@ PACKAGES = (
     "jaxlib",
     "equinox",
     "diffrax",
-    "optimistix",
-    "lineax",
     "numpy",
     "xarray",
     "zarr",
