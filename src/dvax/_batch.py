@@ -6,7 +6,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
 
-def any_of_batch(condition: jax.Array) -> jax.Array:
+def any_lane(condition: jax.Array) -> jax.Array:
     """Whether the condition holds, and under `jax.vmap` whether it does for any problem of the batch.
 
     A branch of `lax.cond` on this is left out where no problem needs it. (On a condition of each
@@ -16,15 +16,15 @@ def any_of_batch(condition: jax.Array) -> jax.Array:
     return _any_p.bind(condition)
 
 
-def largest_of_batch(count: jax.Array) -> jax.Array:
+def largest_of_lanes(count: jax.Array) -> jax.Array:
     """The integer, and under `jax.vmap` the largest one of the batch: a loop of so many turns is then
     one loop for all."""
     return _largest_p.bind(count)
 
 
-def own_turn(condition: jax.Array) -> jax.Array:
+def is_active(condition: jax.Array) -> jax.Array:
     """True, and under `jax.vmap` the condition: whether the turn of a loop that goes on while *any*
-    problem of a batch needs it (`any_of_batch`) is one of this problem's own.
+    problem of a batch needs it (`any_lane`) is one of this problem's own.
 
     A loop on a condition of each problem's own would, after every turn, choose between old and new for
     all that it carries. Here what is written row by row need not be chosen as a whole.
@@ -32,7 +32,7 @@ def own_turn(condition: jax.Array) -> jax.Array:
     return _own_p.bind(condition)
 
 
-def zeros_of_batch(t: jax.Array) -> jax.Array:
+def zeros_like_lanes(t: jax.Array) -> jax.Array:
     """Zeros, and under `jax.vmap` a batch of them where t is one: what has a batch of tangents is to be
     one itself."""
     return _zeros_p.bind(t)
@@ -50,8 +50,8 @@ def _shared(name: str, join) -> Primitive:
     return primitive
 
 
-_any_p = _shared("any_of_batch", jnp.any)
-_largest_p = _shared("largest_of_batch", jnp.max)
+_any_p = _shared("any_lane", jnp.any)
+_largest_p = _shared("largest_of_lanes", jnp.max)
 
 
 def _same_for_each(name: str, made, of_batch) -> Primitive:
@@ -63,5 +63,5 @@ def _same_for_each(name: str, made, of_batch) -> Primitive:
     return primitive
 
 
-_own_p = _same_for_each("own_turn", jnp.ones_like, lambda value: value)
-_zeros_p = _same_for_each("zeros_of_batch", jnp.zeros_like, lambda value: _zeros_p.bind(value))
+_own_p = _same_for_each("is_active", jnp.ones_like, lambda value: value)
+_zeros_p = _same_for_each("zeros_like_lanes", jnp.zeros_like, lambda value: _zeros_p.bind(value))

@@ -44,11 +44,11 @@ _MAX_PACKED = 10**6
 _PACKABLE = tuple(map(np.dtype, "bool int32 int64 uint32 float32 float64".split()))
 
 _OTHERS = frozenset(
-    "abs add add_any and any_of_batch bitcast_convert_type ceil clamp concatenate convert_element_type "
-    "copy div eq expand_dims floor ge gt integer_pow iota is_finite largest_of_batch le lt max "
-    "min mul ne neg nextafter not or own_turn pad rem reshape rev round rsqrt select_n shift_left "
+    "abs add add_any and any_lane bitcast_convert_type ceil clamp concatenate convert_element_type "
+    "copy div eq expand_dims floor ge gt integer_pow iota is_finite largest_of_lanes le lt max "
+    "min mul ne neg nextafter not or is_active pad rem reshape rev round rsqrt select_n shift_left "
     "shift_right_arithmetic shift_right_logical sign slice split sqrt square squeeze stack sub "
-    "transpose xor zeros_of_batch".split()
+    "transpose xor zeros_like_lanes".split()
 )
 _REDUCTIONS = "argmax argmin reduce_and reduce_max reduce_min reduce_or reduce_sum".split()
 _COSTLY = frozenset(

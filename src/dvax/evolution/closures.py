@@ -9,7 +9,7 @@ from .._tree import Tree
 from ..problem import Problem
 
 
-def opened(problem: Problem, t: Any, x: Tree, args: Any) -> Problem:
+def closure_convert(problem: Problem, t: Any, x: Tree, args: Any) -> Problem:
     """The same problem; a callable that closes over traced values, as one written inside a function
     that is being differentiated does, carries them as parts of its own."""
     u = problem.zero_control(x)

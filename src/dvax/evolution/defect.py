@@ -14,7 +14,7 @@ from ..generators import Arc, Growth
 from ..generators.expanded import values
 from .branches import branches
 from .chords import Chord, is_chord
-from .evaluations import Visit
+from .evaluations import Evaluation
 from .excursions import WATCH
 from .extent import Extent
 from .flow import Flow, Rate
@@ -77,7 +77,7 @@ def enclosed(
 
 
 def sampled(
-    flow: Flow, method: AbstractMethod, h: Any, x0: Tree, c: Any, visits: list[Visit]
+    flow: Flow, method: AbstractMethod, h: Any, x0: Tree, c: Any, evaluations: list[Evaluation]
 ) -> Sample:
     """δ at the start, at the samples of the method inside and at the end of the step.
 
@@ -87,11 +87,11 @@ def sampled(
     whose polynomial starts at f̃(t₀, x₀), as most do.
     """
     thetas = method.samples
-    along = [visits[0], *visits[-1 - len(thetas) :]]
-    _, *inner, last = (visit.rate for visit in along)
+    along = [evaluations[0], *evaluations[-1 - len(thetas) :]]
+    _, *inner, last = (one.rate for one in along)
     start, *middle, end = (
-        _tree.sub(flow.rest(visit.x, visit.rate.value), polynomial(c, theta))
-        for theta, visit in zip((0.0, *thetas, 1.0), along, strict=True)
+        _tree.sub(flow.nonlinear_part(one.x, one.rate.value), polynomial(c, theta))
+        for theta, one in zip((0.0, *thetas, 1.0), along, strict=True)
     )
     bumps = []
     for theta, defect in zip(thetas, middle, strict=True):
@@ -99,7 +99,7 @@ def sampled(
         bumps.append(jtu.tree_map(jnp.abs, _tree.sub(defect, line)))
 
     # How well z, the unconstrained value of the law, is predicted by its other samples.
-    zs = [visit.rate.z for visit in along]
+    zs = [one.rate.z for one in along]
     weights = extrapolation((0.0, *thetas, 1.0))
     doubt = jtu.tree_map(
         lambda *z: _DOUBT * sum(w * v for w, v in zip(weights, z, strict=True)), *zs
@@ -113,35 +113,35 @@ def sampled(
     error = jtu.tree_map(lambda *parts: sum(map(jnp.abs, parts)), *ends, bump, unseen)
     space = flow.state_space(x0)
     defect = _MARGIN * method.safety * h * sum(map(space.norm, (*ends, bump, unseen)))
-    law_defect = h * jnp.max(jnp.stack([visit.rate.residual for visit in along]))
-    places = [(visit.x, flow.operator.inverse(visit.rate.y)) for visit in lax.stop_gradient(along)]
+    law_defect = h * jnp.max(jnp.stack([one.rate.residual for one in along]))
+    places = [(one.x, flow.operator.inverse(one.rate.y)) for one in lax.stop_gradient(along)]
     extent = reduce(Extent.joined, [Extent((x, x), (u, u)) for x, u in places])
     return Sample(thetas, [*inner, last], error, defect, law_defect, extent)
 
 
-def _kinked(flow: Flow, visits: list[Visit]) -> Any:
+def _kinked(flow: Flow, evaluations: list[Evaluation]) -> Any:
     """Whether the regime changes from one of them to the next, as far as K, f and h say."""
     problem, args = flow.problem, flow.args
 
-    def signs(visit: Visit) -> jax.Array:
-        known = flow.switches(visit.t, visit.x, visit.rate.z)
-        u = flow.operator.inverse(visit.rate.y)
+    def signs(one: Evaluation) -> jax.Array:
+        known = flow.switches(one.t, one.x, one.rate.z)
+        u = flow.operator.inverse(one.rate.y)
         found = [] if known is None else [known]
         for fn in (problem.f, problem.h):
-            found += branches(lambda t, x, u, fn=fn: fn(t, x, u, args), visit.t, visit.x, u)
+            found += branches(lambda t, x, u, fn=fn: fn(t, x, u, args), one.t, one.x, u)
         return jnp.concatenate([jnp.ravel(s) > 0 for s in found] or [jnp.zeros(0, bool)])
 
-    rows = jnp.stack([signs(visit) for visit in visits])
+    rows = jnp.stack([signs(one) for one in evaluations])
     return jnp.any(rows[1:] != rows[:-1])
 
 
-def _unseen(flow: Flow, visits: list[Visit], doubt: Tree) -> Tree:
+def _unseen(flow: Flow, evaluations: list[Evaluation], doubt: Tree) -> Tree:
     """The most that is hidden at any of them; where projections are iterated, from one place of
     the program, as in `evaluations`."""
     hidden = lambda v: flow.hidden(v.t, v.x, v.rate, doubt)  # noqa: E731
     if flow.direct:
-        return _largest([hidden(visit) for visit in visits])
-    stacked = lax.map(hidden, jtu.tree_map(lambda *leaves: jnp.stack(leaves), *visits))
+        return _largest([hidden(one) for one in evaluations])
+    stacked = lax.map(hidden, jtu.tree_map(lambda *leaves: jnp.stack(leaves), *evaluations))
     return jtu.tree_map(lambda leaf: jnp.max(leaf, axis=0), stacked)
 
 

@@ -250,7 +250,7 @@ def _tolerance(stop: Stop) -> Diagnosis:
 def _stiff(stop: Stop) -> Diagnosis:
     """h λ of order one, for the eigenvalue λ of largest modulus, while x changes slowly."""
     method = stop.setup.method
-    if not isinstance(method, AbstractMethod) or method.linearises:
+    if not isinstance(method, AbstractMethod) or method.is_rosenbrock:
         return Diagnosis()
     whole = isinstance(method, DormandPrince)
     of = stop.velocity if whole else lambda t, x: stop.flow.rate(t, x, None).value

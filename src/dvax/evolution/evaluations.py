@@ -10,12 +10,12 @@ import jax.tree_util as jtu
 from jax import lax
 
 from .. import _tree
-from .._batch import any_of_batch
+from .._batch import any_lane
 from .._tree import Tree
 from .flow import Flow, Rate
 
 
-class Visit(NamedTuple):
+class Evaluation(NamedTuple):
     """Where f̃ was evaluated, and what it was."""
 
     t: Any
@@ -23,15 +23,21 @@ class Visit(NamedTuple):
     rate: Rate
 
 
-Plan = Callable[[Callable[[Any, Tree], Rate]], tuple[tuple[Tree, ...], Tree]]
+Stages = Callable[[Callable[[Any, Tree], Rate]], tuple[tuple[Tree, ...], Tree]]
 """From evaluate(t, x) to (the stage polynomial, x₁)."""
 
-Evaluated = tuple[tuple[tuple[Tree, ...], Tree], list[Visit]]
+Evaluated = tuple[tuple[tuple[Tree, ...], Tree], list[Evaluation]]
 """What a plan comes to, and where it went."""
 
 
 def evaluated(
-    flow: Flow, plan: Plan, begin: Any, x0: Tree, guess: Tree | None, kept: Rate | None, jumped: Any
+    flow: Flow,
+    plan: Stages,
+    begin: Any,
+    x0: Tree,
+    guess: Tree | None,
+    kept: Rate | None,
+    jumped: Any,
 ) -> Evaluated:
     """A plan carried out from x₀, its first rate being `kept` (None: unknown), unless data `jumped`.
     `begin` is any time of the run."""
@@ -40,16 +46,16 @@ def evaluated(
     return _in_turn(flow, plan, begin, x0, guess, kept, jumped)
 
 
-def _straight(flow: Flow, plan: Plan, kept: Rate | None, jumped: Any) -> Evaluated:
-    visits: list[Visit] = []
+def _straight(flow: Flow, plan: Stages, kept: Rate | None, jumped: Any) -> Evaluated:
+    evaluations: list[Evaluation] = []
 
     def evaluate(t: Any, x: Tree) -> Rate:
         look = lambda: flow.rate(t, x, None)  # noqa: E731
-        rate = look() if visits or kept is None else _unless(jumped, kept, look)
-        visits.append(Visit(t, x, rate))
+        rate = look() if evaluations or kept is None else _unless(jumped, kept, look)
+        evaluations.append(Evaluation(t, x, rate))
         return rate
 
-    return plan(evaluate), visits
+    return plan(evaluate), evaluations
 
 
 def _unless(jumped: Any, kept: Rate, look: Callable[[], Rate]) -> Rate:
@@ -65,7 +71,13 @@ def _unless(jumped: Any, kept: Rate, look: Callable[[], Rate]) -> Rate:
 
 
 def _in_turn(
-    flow: Flow, plan: Plan, begin: Any, x0: Tree, guess: Tree | None, kept: Rate | None, jumped: Any
+    flow: Flow,
+    plan: Stages,
+    begin: Any,
+    x0: Tree,
+    guess: Tree | None,
+    kept: Rate | None,
+    jumped: Any,
 ) -> Evaluated:
     """The same by a loop that evaluates f̃ at one place of the program.
 
@@ -78,13 +90,13 @@ def _in_turn(
     """
 
     def run(known: Callable[[int], Rate]) -> Evaluated:
-        visits: list[Visit] = []
+        evaluations: list[Evaluation] = []
 
         def answer(t: Any, x: Tree) -> Rate:
-            visits.append(Visit(t, x, known(len(visits))))
-            return visits[-1].rate
+            evaluations.append(Evaluation(t, x, known(len(evaluations))))
+            return evaluations[-1].rate
 
-        return plan(answer), visits
+        return plan(answer), evaluations
 
     def row(table: Rate, k: Any) -> Rate:
         return jtu.tree_map(lambda leaf: leaf[k], table)
@@ -100,7 +112,7 @@ def _in_turn(
     table = jtu.tree_map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), blank)
     start: Any = 0
     if kept is not None:
-        table, start = _tree.put(table, 0, kept), jnp.where(any_of_batch(jumped), 0, 1)
+        table, start = _tree.put(table, 0, kept), jnp.where(any_lane(jumped), 0, 1)
 
     def one(k: Any, table: Rate) -> Rate:
         t, x = lax.switch(k, [partial(visit, i) for i in range(count)], table)

@@ -33,7 +33,7 @@ import jax.tree_util as jtu
 from .._tree import Tree
 from ..vi import independent
 from .chords import Chord, NoEnclosure, below_parabola, enclose, is_chord
-from .evaluations import Visit
+from .evaluations import Evaluation
 from .flow import Flow, slope
 
 WATCH = 1e-6
@@ -91,14 +91,14 @@ class ExcursionGuard(eqx.Module):
         data = jax.eval_shape(lambda t: self._data(flow, t, x0, flow.problem.zero_control(x0)), t0)
         return jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), data)
 
-    def look(self, flow: Flow, visits: list[Visit], variation: Tree, share: Any) -> Look:
+    def look(self, flow: Flow, evaluations: list[Evaluation], variation: Tree, share: Any) -> Look:
         """Return what the samples of a step leave open, which is this `share` of the run."""
         places, variation = jax.lax.stop_gradient(
-            ([(v.t, v.x, v.rate.y, v.rate.z) for v in visits], variation)
+            ([(v.t, v.x, v.rate.y, v.rate.z) for v in evaluations], variation)
         )
         first = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *places[:-1])
         second = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *places[1:])
-        zero = jnp.zeros_like(visits[0].t)
+        zero = jnp.zeros_like(evaluations[0].t)
         rates, laws = zero, zero
         if self.rates or self.laws:
             with below_parabola():

@@ -84,7 +84,7 @@ class Flow(eqx.Module):
         """x as propagators take it with the least work."""
         return expanded(self.generator, x, known) if self.linear is None else x
 
-    def rest(self, x: Tree, value: Tree) -> Tree:
+    def nonlinear_part(self, x: Tree, value: Tree) -> Tree:
         """f̃ without what is left to the propagator: `value` = f̃(t, x), or f̃(t, x) − Jx."""
         return value if self.linear is None else _tree.sub(value, self.linear.apply(x))
 

@@ -13,7 +13,7 @@ from .._tree import Tree
 from ..errors import InputError, InputProblem
 from .flow import Flow
 from .results import RESULTS
-from .stepper import within
+from .stepper import one_sided_time
 
 _SPLIT = (diffrax.KenCarp3, diffrax.KenCarp4, diffrax.KenCarp5)
 
@@ -89,7 +89,7 @@ def run(
     """From the first of the `stops` to the last, the first step of this `length`."""
 
     begin, end = stops[0], stops[-1]
-    first, last = (within(begin, end, theta, (begin, end)) for theta in (0.0, 1.0))
+    first, last = (one_sided_time(begin, end, theta, (begin, end)) for theta in (0.0, 1.0))
 
     def law(t: Any, x: Tree, _: Any) -> Tree:
         found = flow.rate(jnp.clip(t, first, last), x, flow.guess(x))

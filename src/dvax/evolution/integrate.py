@@ -15,7 +15,7 @@ from .._failure import nan_derivatives_where
 from .._jax import outlined
 from ..vi import certify
 from . import excursions, implicit, picard, reverse
-from .closures import opened
+from .closures import closure_convert
 from .control import (
     AbstractController,
     Adaptive,
@@ -29,12 +29,12 @@ from .forward import forward_only
 from .implicit import Implicit
 from .loop import Loop, Record, Saved, State
 from .method import ETD2RK, AbstractMethod
-from .moving import arrivals, arriving, moved, shift, still
 from .picard import Picard
 from .results import RESULTS
 from .setup import Setup
 from .solution import Solution
 from .stepper import Stepper
+from .time_derivatives import left_derivative, left_derivatives, transport, zero_with_tangent
 
 
 class Options(NamedTuple):
@@ -42,8 +42,8 @@ class Options(NamedTuple):
 
     fixed: bool
     measure: bool
-    ranged: bool
-    careful: bool
+    track_bounds: bool
+    check_finite: bool
     dense: bool
     max_steps: int
     adjoint: str
@@ -56,7 +56,7 @@ def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
     setup.problem.check(setup.number("t0"), setup.x0, setup.args)
     flow = setup.flow()
     flow = dataclasses.replace(
-        flow, problem=opened(setup.problem, setup.number("t0"), setup.x0, flow.args)
+        flow, problem=closure_convert(setup.problem, setup.number("t0"), setup.x0, flow.args)
     )
     valid = setup.is_valid(ts)
     solution = _solved(setup, flow, ts, valid, options)
@@ -89,10 +89,10 @@ def _solved(setup: Setup, flow: Flow, ts: Any, valid: jax.Array, options: Option
         _stepper(setup, method, flow, stops, options),
         controller,
         max_steps=options.max_steps + (knots.shape[0] if options.fixed else 0),
-        guarded=options.careful,
+        check_finite=options.check_finite,
         dense=options.dense,
         progress=options.progress,
-        carries=options.adjoint == "forward",
+        forward_mode=options.adjoint == "forward",
     )
     if options.adjoint == "forward":
         saved, end = outlined(Loop.run, loop, x0, times)
@@ -139,7 +139,9 @@ def _by_windows(
     x0 = setup.x0
     growth = flow.generator.growth(flow.state_space(x0)) if flow.enclosed else None
     ends = stops[0], stops[-1]
-    stepper = Stepper(ETD2RK(), flow, True, False, None, options.ranged, True, ends, None, growth)
+    stepper = Stepper(
+        ETD2RK(), flow, True, False, None, options.track_bounds, True, ends, None, growth
+    )
     rtol, atol, horizon = map(setup.number, ("rtol", "atol", "horizon"))
     sizes = jax.vmap(
         lambda *parts: jnp.stack(root_mean_squares(setup.problem.spaces(x0)[0])(*parts))
@@ -175,7 +177,8 @@ def _by_windows(
     )
     rows = _end_alone(end, complete, stops[-1], True) if saved is None else saved
     if ts is not None:
-        rows = _carried(rows, ts, x0, flow, (still(stops[0]), still(stops[-1])), False)
+        ends = lax.stop_gradient((stops[0], stops[-1]))
+        rows = _carried(rows, ts, x0, flow, ends, False)
     stats = {
         "steps": end.steps, "rejected": end.refused, "t": end.t, "x": end.x,
         "next_dt": end.length / method.nodes, "windows": end.windows, "sweeps": end.sweeps,
@@ -218,15 +221,15 @@ def _stepper(
         measure,
         locate,
         guard,
-        options.ranged,
-        options.careful,
+        options.track_bounds,
+        options.check_finite,
         (t0, t1),
         None,
         growth,
     )
-    if options.fixed and stops.shape[0] == 2 and not method.linearises:
+    if options.fixed and stops.shape[0] == 2 and not method.is_rosenbrock:
         length = (t1 - t0) / step_count(t1 - t0, setup.number("dt"))
-        return dataclasses.replace(stepper, uniform=stepper.factors(length))
+        return dataclasses.replace(stepper, uniform=stepper.propagators(length))
     return stepper
 
 
@@ -263,13 +266,14 @@ def _solution(
         (result == RESULTS.successful) & ~_tree.all_finite(end.x), RESULTS.nonfinite, result
     )
     rows = _end_alone(end, complete, t1, options.measure) if saved is None else saved
-    ends = still(controller.stops[0]), still(t1)
+    ends = lax.stop_gradient((controller.stops[0], t1))
     if options.adjoint == "forward" and controller.adapts:
         # States are those at times that stay where they are.
         if saved is None:
-            rows, ts = rows._replace(t=still(rows.t)), t1[None]
-        by = shift(jnp.where(end.steps > 0, end.t, 0.0))
-        end = end._replace(x=moved(end.x, by, arriving, still(end.t), flow, ends))
+            rows, ts = rows._replace(t=lax.stop_gradient(rows.t)), t1[None]
+        by = zero_with_tangent(jnp.where(end.steps > 0, end.t, 0.0))
+        t = lax.stop_gradient(end.t)
+        end = end._replace(x=transport(end.x, by, left_derivative, t, flow, ends))
     if ts is not None:
         rows = _carried(rows, ts, setup.x0, flow, ends, options.adjoint == "reverse")
     stats = {
@@ -290,16 +294,16 @@ def _carried(
     other is not. Times that were not reached have no state that could move."""
     reached = rows.t < jnp.inf
     t = jnp.where(reached, rows.t, ends[0])
-    apart = shift(jnp.where(reached, ts, ends[0])) - shift(t)
-    given = reached, still(x0), flow, ends
-    x = moved(rows.x, apart, _arrived, t, *given, transposed=transposed)
+    apart = zero_with_tangent(jnp.where(reached, ts, ends[0])) - zero_with_tangent(t)
+    given = reached, lax.stop_gradient(x0), flow, ends
+    x = transport(rows.x, apart, _arrived, t, *given, transposed=transposed)
     return rows._replace(t=rows.t + apart, x=x)
 
 
 def _arrived(ts: jax.Array, xs: Any, reached: Any, x0: Any, flow: Flow, ends: Any) -> Any:
     """x' as the run came to those times that it reached; elsewhere 0, whatever there is."""
     there = lambda x, y: jnp.where(reached.reshape(-1, *(1,) * (x.ndim - 1)), x, y)  # noqa: E731
-    found = arrivals(ts, jtu.tree_map(there, xs, x0), flow, ends)
+    found = left_derivatives(ts, jtu.tree_map(there, xs, x0), flow, ends)
     return jtu.tree_map(lambda leaf: there(leaf, 0.0), found)
 
 

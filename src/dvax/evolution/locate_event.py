@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .._batch import any_of_batch
+from .._batch import any_lane
 
 BRACKET = 1e-5
 """Width of the bracket at which the search ends, as a share of the step."""
@@ -45,7 +45,7 @@ def locate_event(
         a, va, b, vb = bracket
         return _false_position(a, va, b, vb, signs[0], at)
 
-    found = lax.cond(any_of_batch(some), search, lambda: jnp.full_like(values[0][0], jnp.inf))
+    found = lax.cond(any_lane(some), search, lambda: jnp.full_like(values[0][0], jnp.inf))
     return jnp.where(some, found, jnp.inf)
 
 

@@ -14,16 +14,22 @@ import jax.tree_util as jtu
 from jax import lax
 
 from .. import _tree
-from .._batch import any_of_batch, own_turn
+from .._batch import any_lane, is_active
 from .._tree import Tree
 from . import meter
 from .checkpoints import Checkpoints
 from .control import AbstractController
 from .extent import Extent
 from .flow import Flow
-from .moving import arriving, is_moving, moved, shift, still, velocity
 from .results import RESULTS
-from .stepper import Factors, Memory, Stepper, inside, local, within
+from .stepper import Propagators, SolverState, Stepper, interpolate, local, one_sided_time
+from .time_derivatives import (
+    is_differentiated,
+    left_derivative,
+    transport,
+    velocity,
+    zero_with_tangent,
+)
 
 
 class Record(NamedTuple):
@@ -64,8 +70,8 @@ class State(NamedTuple):
     t: Any
     x: Tree
     impulse: tuple[Any, Any]
-    memory: Memory
-    factors: Factors | None
+    solver_state: SolverState
+    propagators: Propagators | None
     control: Any
     jumped: Any
     extent: Extent | None
@@ -83,22 +89,22 @@ class State(NamedTuple):
 class Loop(eqx.Module):
     """A stepper and a controller from the first stop to the last.
 
-    - `guarded`: keep the last good state where a step fails, which costs a choice between the two;
+    - `check_finite`: keep the last good state where a step fails, which costs a choice between the two;
     - `dense`: keep every step; `progress`: say how far the run is;
-    - `carries`: tangents go along with the steps.
+    - `forward_mode`: tangents go along with the steps.
 
     Where steps adapt, tangents are those of the state at times that stand still: a stop that moves
-    carries the jump of x' over it, and what asks for the state at a moving time adds x' (`moving`).
+    carries the jump of x' over it, and what asks for the state at a moving time adds x' (`time_derivatives`).
     Fixed steps move with the stops, and so do their states.
     """
 
     stepper: Stepper
     controller: AbstractController
     max_steps: int = eqx.field(static=True)
-    guarded: bool = eqx.field(static=True)
+    check_finite: bool = eqx.field(static=True)
     dense: bool = eqx.field(static=True)
     progress: bool = eqx.field(static=True)
-    carries: bool = eqx.field(static=True)
+    forward_mode: bool = eqx.field(static=True)
 
     def run(
         self, x0: Tree, ts: jax.Array | None, checkpoints: Checkpoints | None = None
@@ -108,7 +114,7 @@ class Loop(eqx.Module):
         t1 = self.controller.stops[-1]
         if ts is None:
             return None, meter.keep(self._until(state, t1))
-        times, count = still(ts), ts.shape[0]
+        times, count = lax.stop_gradient(ts), ts.shape[0]
         blank = jax.eval_shape(lambda: self._read(state, times[0]))
         rows = jtu.tree_map(lambda s: jnp.zeros((count, *s.shape), s.dtype), blank)
 
@@ -132,13 +138,13 @@ class Loop(eqx.Module):
         records = jtu.tree_map(many, record) if self.dense else None
         if records is not None:
             records = records._replace(start=jnp.full_like(records.start, jnp.inf))
-        own = stepper.uniform is not None or stepper.method.linearises
+        own = stepper.uniform is not None or stepper.method.is_rosenbrock
         return State(
             t=t0,
             x=x0,
             impulse=(zero, zero),
-            memory=stepper.begin(x0),
-            factors=None if own else stepper.factors(self._end(control) - self._held(t0)),
+            solver_state=stepper.begin(x0),
+            propagators=None if own else stepper.propagators(self._end(control) - self._held(t0)),
             control=control,
             jumped=jnp.asarray(True),
             extent=stepper.extent(x0),
@@ -160,7 +166,7 @@ class Loop(eqx.Module):
 
         def turn(carry: tuple[State]) -> tuple[State]:
             (state,) = carry
-            return (self._attempt(state, own_turn(self._goes_on(state, time))),)
+            return (self._attempt(state, is_active(self._goes_on(state, time))),)
 
         return self._repeat(lambda carry: self._goes_on(carry[0], time), turn, (state,))[0]
 
@@ -179,11 +185,11 @@ class Loop(eqx.Module):
 
         def turn(carry: tuple[State, Saved, Any]) -> tuple[State, Saved, Any]:
             state, rows, row = carry
-            state = self._attempt(state, own_turn(goes_on(carry)))
+            state = self._attempt(state, is_active(goes_on(carry)))
             time = _at(times, row)
             met = time <= state.t + slack(state.t)
             # Problems of a batch wait for each other at every saved time.
-            over = (row < count) & ~any_of_batch(~met & (state.result == RESULTS.successful))
+            over = (row < count) & ~any_lane(~met & (state.result == RESULTS.successful))
             put = lambda: _put(rows, row, self._row(state, time, state.x, met, met))  # noqa: E731
             rows = lax.cond(over, put, lambda: rows)
             return state, rows, jnp.where(over, row + 1, row)
@@ -193,21 +199,21 @@ class Loop(eqx.Module):
     def _repeat(self, goes_on: Callable[[Any], Any], turn: Callable[[Any], Any], carry: Any) -> Any:
         """One turn after the other, on a carry that begins with the state. Steps of one length are a
         loop of their own, in which propagators stand still."""
-        ahead = lambda carry: any_of_batch(goes_on(carry))  # noqa: E731
+        ahead = lambda carry: any_lane(goes_on(carry))  # noqa: E731
         if not self._refits(carry[0]):
             return lax.while_loop(ahead, turn, carry)
         # A reverse pass that is differentiated once more: equal lengths are others.
-        moves = is_moving(self.controller.stops)
+        moves = is_differentiated(self.controller.stops)
 
         def same(carry: Any) -> Any:
-            fits = self.stepper.fits(*self._ahead(carry[0])) & ~(moves & self._anew(carry[0]))
+            is_same = self.stepper.match(*self._ahead(carry[0])) & ~(moves & self._anew(carry[0]))
             # Problems of a batch get new propagators together, as soon as one of them needs some.
-            return ~any_of_batch(goes_on(carry) & ~fits)
+            return ~any_lane(goes_on(carry) & ~is_same)
 
         def of_one_length(carry: Any) -> Any:
             state, *rest = carry
-            factors = self.stepper.fitted(*self._ahead(state), self._anew(state))
-            carry = (state._replace(factors=factors), *rest)
+            propagators = self.stepper.reuse_or_build(*self._ahead(state), self._anew(state))
+            carry = (state._replace(propagators=propagators), *rest)
             one = lambda c: (turn(c[0]), jnp.asarray(False))  # noqa: E731
             # One in any case: what is not a number fits nothing.
             more = lambda c: ahead(c[0]) & (c[1] | same(c[0]))  # noqa: E731
@@ -218,12 +224,14 @@ class Loop(eqx.Module):
     def _refits(self, state: State) -> bool:
         """Whether propagators are made between loops, not within them: where lengths are not known
         beforehand and do not move."""
-        return state.factors is not None and not self.carries and self.stepper.uniform is None
+        return (
+            state.propagators is not None and not self.forward_mode and self.stepper.uniform is None
+        )
 
-    def _ahead(self, state: State) -> tuple[Factors, Any, Any]:
+    def _ahead(self, state: State) -> tuple[Propagators, Any, Any]:
         """What fits the next step, if it does, and where that one begins and ends."""
-        assert state.factors is not None
-        return state.factors, self._held(state.t), self._end(state.control)
+        assert state.propagators is not None
+        return state.propagators, self._held(state.t), self._end(state.control)
 
     def _goes_on(self, state: State, time: Any) -> Any:
         """Whether a step is to be taken before `time`."""
@@ -237,11 +245,11 @@ class Loop(eqx.Module):
         """The state after one more attempt, where that is its `own`."""
         begin, end = state.t, self.controller.end(state.control)
         t0, t1, x0 = self._held(begin), self._held(end), self._begun(state, end)
-        factors = state.factors if self._refits(state) else self._factors(state, t0, t1)
-        memory = state.memory
+        propagators = state.propagators if self._refits(state) else self._propagators(state, t0, t1)
+        solver_state = state.solver_state
         if x0 is not state.x:
-            memory = memory._replace(coefficients=None)
-        step = self.stepper.step(t0, t1, x0, memory, factors, state.jumped)
+            solver_state = solver_state._replace(coefficients=None)
+        step = self.stepper.step(t0, t1, x0, solver_state, propagators, state.jumped)
         decision = self.controller.decide(begin, end, x0, step, state.control)
         impulse = jtu.tree_map(jnp.add, state.impulse, step.impulse)
         taken = Record(t0, t1 - t0, x0, step.c)
@@ -251,10 +259,10 @@ class Loop(eqx.Module):
         if extent is not None:
             assert step.extent is not None
             extent = extent.joined(step.extent)
-        ahead = (end, step.x1, impulse, step.memory, decision.jumped, extent)
+        ahead = (end, step.x1, impulse, step.solver_state, decision.jumped, extent)
         last = None if state.last is None else (taken, state.impulse)
-        if self.guarded:
-            behind = (begin, state.x, state.impulse, state.memory, state.jumped, state.extent)
+        if self.check_finite:
+            behind = (begin, state.x, state.impulse, state.solver_state, state.jumped, state.extent)
             ahead, last = _tree.where(decision.accepted, (ahead, last), (behind, state.last))
         checkpoints = state.checkpoints
         if checkpoints is not None:
@@ -263,14 +271,14 @@ class Loop(eqx.Module):
         if self.progress:
             stops = self.controller.stops
             shown = meter.advance(shown, (ahead[0] - stops[0]) / (stops[-1] - stops[0]))
-        t, x, impulse, memory, jumped, extent = ahead
+        t, x, impulse, solver_state, jumped, extent = ahead
         put = lambda table, row: _tree.put_if(own, table, state.steps, row)  # noqa: E731
         after = State(
             t=t,
             x=x,
             impulse=impulse,
-            memory=memory,
-            factors=None if state.factors is None else factors,
+            solver_state=solver_state,
+            propagators=None if state.propagators is None else propagators,
             control=decision.state,
             jumped=jumped,
             extent=extent,
@@ -300,10 +308,11 @@ class Loop(eqx.Module):
             t0, t1 = now, self._end(state.control)
 
             def between() -> Tree:
-                guess = state.memory.guess
-                c = self.stepper.advance(t0, t1, state.x, self._factors(state, t0, t1), guess)[1]
+                guess = state.solver_state.guess
+                propagators = self._propagators(state, t0, t1)
+                _, c, _ = self.stepper.advance(t0, t1, state.x, propagators, guess)
                 record = Record(t0, t1 - t0, state.x, c)
-                return self._inside(record, (time - t0) / (t1 - t0), guess)
+                return self._interpolate(record, (time - t0) / (t1 - t0), guess)
 
             met = time <= t0 + slack(t0)
             reached = met | ((t1 > time) & (state.result == RESULTS.successful))
@@ -311,7 +320,8 @@ class Loop(eqx.Module):
         record, before = state.last
         theta = (time - record.start) / jnp.where(record.length > 0, record.length, 1)
         reached, met = state.t >= time, time >= state.t
-        x = lax.cond(met, lambda: state.x, lambda: self._inside(record, theta, state.memory.guess))
+        guess = state.solver_state.guess
+        x = lax.cond(met, lambda: state.x, lambda: self._interpolate(record, theta, guess))
         row = self._row(state, time, x, reached, met)
         # Inside a step the bound of the whole step is charged: it can only be too large.
         return row._replace(
@@ -325,51 +335,53 @@ class Loop(eqx.Module):
         x = jtu.tree_map(lambda leaf: jnp.where(reached, leaf, jnp.nan), x)
         # The state at the end of a step moves with it; at the beginning of the run, always.
         end = jnp.where(state.steps == 0, state.t, self._held(state.t))
-        time = time + shift(jnp.where(met, end, 0.0))
+        time = time + zero_with_tangent(jnp.where(met, end, 0.0))
         t = jnp.where(reached, time, jnp.inf)
         impulse = state.impulse if self.stepper.measure else None
-        return Saved(t, x, impulse, impulse, state.extent, state.memory.guess)
+        return Saved(t, x, impulse, impulse, state.extent, state.solver_state.guess)
 
     def _held(self, t: Any) -> Any:
         """t, which stands still for the tangents of steps that adapt."""
-        return still(t) if self.carries and self.controller.adapts else t
+        return lax.stop_gradient(t) if self.forward_mode and self.controller.adapts else t
 
     def _end(self, control: Any) -> Any:
         return self._held(self.controller.end(control))
 
     def _begun(self, state: State, end: Any) -> Tree:
         """The state at a time that stands still, at the beginning of a step."""
-        if not (self.carries and self.controller.adapts):
+        if not (self.forward_mode and self.controller.adapts):
             return state.x
-        t0, flow = still(state.t), self.stepper.flow
-        ends, by = jtu.tree_map(still, self.stepper.ends), shift(state.t)
-        x = moved(state.x, by, before, t0, flow, ends, state.jumped)
-        return moved(x, -by, behind, t0 + by, flow, still(end) - t0, ends, state.jumped)
+        t0, flow = lax.stop_gradient(state.t), self.stepper.flow
+        ends, by = lax.stop_gradient(self.stepper.ends), zero_with_tangent(state.t)
+        x = transport(state.x, by, before, t0, flow, ends, state.jumped)
+        return transport(
+            x, -by, behind, t0 + by, flow, lax.stop_gradient(end) - t0, ends, state.jumped
+        )
 
-    def _factors(self, state: State, t0: Any, t1: Any) -> Factors | None:
+    def _propagators(self, state: State, t0: Any, t1: Any) -> Propagators | None:
         """The propagators of a step, None where it makes its own."""
         uniform = self.stepper.uniform
-        if uniform is not None or state.factors is None:
+        if uniform is not None or state.propagators is None:
             return uniform
-        return self.stepper.fitted(state.factors, t0, t1, self._anew(state))
+        return self.stepper.reuse_or_build(state.propagators, t0, t1, self._anew(state))
 
     def _anew(self, state: State) -> Any:
         """Whether the next length may move otherwise; up to the next stop, fixed steps move alike."""
         return jnp.asarray(True) if self.controller.adapts else state.jumped
 
-    def _inside(self, record: Record, theta: Any, guess: Tree | None) -> Tree:
+    def _interpolate(self, record: Record, theta: Any, guess: Tree | None) -> Tree:
         """x_h inside a step."""
         t0, stepper = record.start, self.stepper
         end = t0 + record.length
         flow, _ = local(stepper.method, stepper.flow, t0, end, record.x0, guess, stepper.ends)
-        return inside(flow, record.length, theta, record.x0, record.coefficients)
+        return interpolate(flow, record.length, theta, record.x0, record.coefficients)
 
 
 def before(t: Any, x: Tree, flow: Flow, ends: tuple[Any, Any], jumped: Any) -> Tree:
     """x' before a stop; before the run nothing moves."""
     return lax.cond(
         jumped & (t > ends[0]),
-        lambda: arriving(t, x, flow, ends),
+        lambda: left_derivative(t, x, flow, ends),
         lambda: _tree.zeros_like(x),
     )
 
@@ -378,7 +390,7 @@ def behind(t: Any, x: Tree, flow: Flow, length: Any, ends: tuple[Any, Any], jump
     """x' behind a stop, where a step of this length begins."""
     return lax.cond(
         jumped,
-        lambda: velocity(flow, within(t, t + length, 0.0, ends), x),
+        lambda: velocity(flow, one_sided_time(t, t + length, 0.0, ends), x),
         lambda: _tree.zeros_like(x),
     )
 

@@ -30,9 +30,9 @@ class AbstractMethod(eqx.Module):
     `samples` are the points inside a step where the defect is looked at, apart from those where p was
     made to agree with f̃. `hidden` is the share of |c_q| that a kink inside the step may hide from
     them; then the integral of the defect over a step with one kink or one jump of f̃ inside is at most
-    `safety` times what they show. `halves` says that stages are reached by half a step. A method that
-    `linearises` has A + J in the place of A and f̃ − Jx in that of f̃, with J = Df̃(t₀, x₀); one that
-    `joins` has 0 and f̃ + Ax there.
+    `safety` times what they show. `has_half_stage` says that some stage lies half a step away. Where
+    `is_rosenbrock`, the method has A + J in the place of A and f̃ − Jx in that of f̃, with
+    J = Df̃(t₀, x₀); where `explicit_in_A`, it has 0 and f̃ + Ax there.
     """
 
     order: eqx.AbstractClassVar[int]
@@ -40,9 +40,9 @@ class AbstractMethod(eqx.Module):
     samples: eqx.AbstractClassVar[tuple[float, ...]]
     hidden: eqx.AbstractClassVar[float]
     safety: eqx.AbstractClassVar[float]
-    halves: eqx.AbstractClassVar[bool]
-    linearises: eqx.AbstractClassVar[bool]
-    joins: eqx.AbstractClassVar[bool]
+    has_half_stage: eqx.AbstractClassVar[bool]
+    is_rosenbrock: eqx.AbstractClassVar[bool]
+    explicit_in_A: eqx.AbstractClassVar[bool]
 
     @abc.abstractmethod
     def coefficients(
@@ -92,9 +92,9 @@ class ETD1(AbstractMethod):
     samples: ClassVar[tuple[float, ...]] = ONE_SAMPLE
     hidden: ClassVar[float] = 0.0
     safety: ClassVar[float] = 1.0
-    halves: ClassVar[bool] = False
-    linearises: ClassVar[bool] = False
-    joins: ClassVar[bool] = False
+    has_half_stage: ClassVar[bool] = False
+    is_rosenbrock: ClassVar[bool] = False
+    explicit_in_A: ClassVar[bool] = False
 
     def coefficients(self, evaluate, propagate, first, drift):
         return (first,)
@@ -123,9 +123,9 @@ class ETD2RK(AbstractMethod):
     samples: ClassVar[tuple[float, ...]] = ONE_SAMPLE
     hidden: ClassVar[float] = 0.0
     safety: ClassVar[float] = 1.12
-    halves: ClassVar[bool] = False
-    linearises: ClassVar[bool] = False
-    joins: ClassVar[bool] = False
+    has_half_stage: ClassVar[bool] = False
+    is_rosenbrock: ClassVar[bool] = False
+    explicit_in_A: ClassVar[bool] = False
 
     def coefficients(self, evaluate, propagate, first, drift):
         second = evaluate(1.0, propagate(1.0, (first,)))
@@ -159,9 +159,9 @@ class ETD4RK(AbstractMethod):
     samples: ClassVar[tuple[float, ...]] = TWO_SAMPLES
     hidden: ClassVar[float] = 0.0
     safety: ClassVar[float] = 1.0
-    halves: ClassVar[bool] = True
-    linearises: ClassVar[bool] = False
-    joins: ClassVar[bool] = False
+    has_half_stage: ClassVar[bool] = True
+    is_rosenbrock: ClassVar[bool] = False
+    explicit_in_A: ClassVar[bool] = False
 
     def coefficients(self, evaluate, propagate, first, drift):
         a = evaluate(0.5, propagate(0.5, (first,)))
@@ -209,9 +209,9 @@ class ExpRosenbrock(AbstractMethod):
     # defect is covered for every k.
     hidden: ClassVar[float] = 0.134
     safety: ClassVar[float] = 1.67
-    halves: ClassVar[bool] = False
-    linearises: ClassVar[bool] = True
-    joins: ClassVar[bool] = False
+    has_half_stage: ClassVar[bool] = False
+    is_rosenbrock: ClassVar[bool] = True
+    explicit_in_A: ClassVar[bool] = False
 
     def coefficients(self, evaluate, propagate, first, drift):
         second = evaluate(1.0, propagate(1.0, (first, drift)))

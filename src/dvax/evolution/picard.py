@@ -23,9 +23,9 @@ from ..generators import AbstractGenerator, AbstractPropagator
 from .control import clip_to_stop
 from .extent import Extent
 from .loop import Record, Saved
-from .moving import shift, still
 from .results import RESULTS
-from .stepper import Stepper, inside, within
+from .stepper import Stepper, interpolate, one_sided_time
+from .time_derivatives import zero_with_tangent
 
 
 class Picard(eqx.Module):
@@ -72,7 +72,7 @@ class Picard(eqx.Module):
 
     order: ClassVar[int] = 2
     degree: ClassVar[int] = 1
-    linearises: ClassVar[bool] = False
+    is_rosenbrock: ClassVar[bool] = False
 
     def __check_init__(self) -> None:
         for name in ("nodes", "max_sweeps"):
@@ -142,7 +142,7 @@ class Run(eqx.Module):
         state = self._start(x0)
         if ts is None:
             return None, self._until(state, self.stops[-1])
-        times, count = still(ts), ts.shape[0]
+        times, count = lax.stop_gradient(ts), ts.shape[0]
         blank = jax.eval_shape(lambda: self._read(state, times[0]))
         rows = jtu.tree_map(lambda s: jnp.zeros((count, *s.shape), s.dtype), blank)
 
@@ -234,8 +234,8 @@ class Run(eqx.Module):
         h = (b - a) / many
         steps = jnp.arange(many + 1).astype(h.dtype)
         ends = (a + h * steps).at[-1].set(b)
-        times = ends.at[0].set(within(a, b, 0.0, stepper.ends))
-        times = times.at[-1].set(within(a, b, 1.0, stepper.ends))
+        times = ends.at[0].set(one_sided_time(a, b, 0.0, stepper.ends))
+        times = times.at[-1].set(one_sided_time(a, b, 1.0, stepper.ends))
         flow_over = flow.propagator(h, 2)
         space = flow.state_space(x)
         norm = jax.vmap(space.norm)
@@ -249,15 +249,15 @@ class Run(eqx.Module):
         def rates(X: Tree, Y: Tree | None) -> Any:
             return jax.vmap(flow.rate)(times, X, Y)
 
-        still = jtu.tree_map(lambda leaf: jnp.broadcast_to(leaf, (many + 1, *leaf.shape)), x)
+        constant = jtu.tree_map(lambda leaf: jnp.broadcast_to(leaf, (many + 1, *leaf.shape)), x)
         guess = flow.guess(x)
         if guess is not None:
             guess = jtu.tree_map(
                 lambda leaf: jnp.broadcast_to(leaf, (many + 1, *leaf.shape)), guess
             )
-        before = rates(still, guess)
+        before = rates(constant, guess)
         X = swept(before.value)
-        moved = jnp.max(norm(_tree.sub(X, still)))
+        moved = jnp.max(norm(_tree.sub(X, constant)))
         zero, yes = jnp.zeros_like(moved), jnp.asarray(True)
 
         def goes_on(carry: Any) -> Any:
@@ -287,7 +287,7 @@ class Run(eqx.Module):
         record = Record(ends[:-1], jnp.broadcast_to(h, (many,)), start, c)
         return Window(
             record, end, _rows(X, -1), sample.error, impulse,
-            sample.extent.over_rows() if stepper.ranged else None,
+            sample.extent.over_rows() if stepper.track_bounds else None,
             settled & jnp.all(looked), k, contraction,
         )  # fmt: skip
 
@@ -302,14 +302,14 @@ class Run(eqx.Module):
         x = lax.cond(
             met,
             lambda: state.x,
-            lambda: inside(self.stepper.flow, step.length, theta, step.x0, step.coefficients),
+            lambda: interpolate(self.stepper.flow, step.length, theta, step.x0, step.coefficients),
         )
         x = jtu.tree_map(lambda leaf: jnp.where(reached, leaf, jnp.nan), x)
         started = time > record.start[0]
         impulse = _tree.where(started, state.impulse, state.before)
         settled = _tree.where(time >= state.t, state.impulse, state.before)
         # The state at the end of a window moves with it.
-        time = time + shift(jnp.where(met, state.t, 0.0))
+        time = time + zero_with_tangent(jnp.where(met, state.t, 0.0))
         return Saved(jnp.where(reached, time, jnp.inf), x, impulse, settled, state.extent)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from .flow import Flow
 from .locate_event import locate_event
 from .loop import Record
-from .stepper import inside, local, within
+from .stepper import interpolate, local, one_sided_time
 
 _LOOKS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Where inside a step the signs are looked at."""
@@ -53,13 +53,14 @@ def _changes(
 
     def at(theta: Any, t: Any = None) -> jax.Array:
         t = step.start + theta * step.length if t is None else t
-        x = inside(own, step.length, theta, step.x0, step.coefficients)
+        x = interpolate(own, step.length, theta, step.x0, step.coefficients)
         found = flow.switches(t, x, flow.rate(t, x, flow.guess(x)).z)
         assert found is not None
         return found
 
     values = [
-        at(jnp.asarray(theta, end.dtype), within(step.start, end, theta, run)) for theta in _LOOKS
+        at(jnp.asarray(theta, end.dtype), one_sided_time(step.start, end, theta, run))
+        for theta in _LOOKS
     ]
     if values[0].size == 0:
         return jnp.full_like(end, jnp.inf), values[0] > 0, values[0] > 0

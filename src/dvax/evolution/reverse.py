@@ -26,8 +26,8 @@ from .._jax import outlined
 from .._tree import Tree
 from .checkpoints import Checkpoints, Stack, how_many
 from .loop import Loop, Record, Saved, State, slack
-from .moving import arriving, filled, is_zero, still
-from .stepper import inside, local
+from .stepper import interpolate, local
+from .time_derivatives import instantiate_zeros, is_zero, left_derivative
 
 
 def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State]:
@@ -92,7 +92,7 @@ def _states(saved: Saved | None, state: State) -> tuple[_States, Any]:
     """The run's answer taken apart into what has a derivative and what has none."""
     states = _States(state.x, None if saved is None else saved.x, state.records)
     state = state._replace(
-        x=None, memory=None, factors=None, last=None, ends=None, checkpoints=None, meter=None,
+        x=None, solver_state=None, propagators=None, last=None, ends=None, checkpoints=None, meter=None,
         records=None,
     )  # fmt: skip
     return states, (None if saved is None else saved._replace(x=None), state)
@@ -184,7 +184,8 @@ class _Backward:
         moving = tuple(leaf for leaf, m in zip(self.leaves, self.moving, strict=True) if m)
         time = lambda p: self._parts(p).controller.step_start(i, self.ends)  # noqa: E731
         t, pull = jax.vjp(time, moving)
-        rate = arriving(t, x, self.loop.stepper.flow, jtu.tree_map(still, self.loop.stepper.ends))
+        stepper = self.loop.stepper
+        rate = left_derivative(t, x, stepper.flow, lax.stop_gradient(stepper.ends))
         by = jtu.tree_map(lambda v, r: jnp.sum(v * r), psi, rate)
         return jtu.tree_map(jnp.add, gathered, pull(-sum(jtu.tree_leaves(by)))[0])
 
@@ -208,10 +209,10 @@ class _Backward:
         """(xᵢ₊₁, c), and a guess for the law of another step."""
         t0, t1 = self._times(loop, i)
         stepper = loop.stepper
-        factors = stepper.uniform
-        if factors is None and not stepper.method.linearises:
-            factors = stepper.factors(t1 - t0)
-        x1, c, y = stepper.advance(t0, t1, x, factors, guess)
+        propagators = stepper.uniform
+        if propagators is None and not stepper.method.is_rosenbrock:
+            propagators = stepper.propagators(t1 - t0)
+        x1, c, y = stepper.advance(t0, t1, x, propagators, guess)
         return (x1, c), None if guess is None else lax.stop_gradient(y)
 
     def _replay(self, x: Tree, i: Any, until: Any) -> Tree:
@@ -265,7 +266,7 @@ class _Backward:
     ) -> Any:
         """The times saved in this step from x to x1, the last ones first."""
         assert self.ts is not None
-        ts, (t0, t1) = still(self.ts), self._times(self.loop, i)
+        ts, (t0, t1) = lax.stop_gradient(self.ts), self._times(self.loop, i)
 
         def at(p: Any, x: Tree, c: Any, time: Any) -> Tree:
             loop = self._parts(p)
@@ -273,13 +274,13 @@ class _Backward:
             theta = (time - t0) / (t1 - t0)
             stepper = loop.stepper
             flow, _ = local(stepper.method, stepper.flow, t0, t1, x, self.guess, stepper.ends)
-            return inside(flow, t1 - t0, theta, x, c)
+            return interpolate(flow, t1 - t0, theta, x, c)
 
         def one(carry: Any) -> Any:
             adjoint, behind, bent, gathered, row = carry
             psi = jtu.tree_map(lambda leaf: leaf[row], saved)
 
-            def within() -> Any:
+            def one_sided_time() -> Any:
                 _, pull = jax.vjp(lambda p, x, c: at(p, x, c, ts[row]), moving, x, c)
                 p, v, d = pull(psi)
                 return adjoint, _tree.add(behind, v), _tree.add(bent, d), _tree.add(gathered, p)
@@ -287,7 +288,7 @@ class _Backward:
             def at_end() -> Any:
                 return _tree.add(adjoint, psi), behind, bent, self._stays(psi, x1, i + 1, gathered)
 
-            return *lax.cond(ts[row] >= t1 - slack(t1), at_end, within), row - 1
+            return *lax.cond(ts[row] >= t1 - slack(t1), at_end, one_sided_time), row - 1
 
         return lax.while_loop(lambda c: (c[-1] >= 0) & (ts[c[-1]] > t0 + slack(t0)), one, carry)
 
@@ -296,7 +297,7 @@ def _given(cotangents: Any) -> Any:
     """None where none of them is asked for."""
     if all(map(is_zero, jtu.tree_leaves(cotangents, is_leaf=is_zero))):
         return None
-    return filled(cotangents)
+    return instantiate_zeros(cotangents)
 
 
 def _no_tangent(leaf: Any) -> Any:

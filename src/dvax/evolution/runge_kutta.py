@@ -62,9 +62,9 @@ class DormandPrince(AbstractMethod):
     samples: ClassVar[tuple[float, ...]] = _SAMPLES
     hidden: ClassVar[float] = 0.0
     safety: ClassVar[float] = 2.05
-    halves: ClassVar[bool] = False
-    linearises: ClassVar[bool] = False
-    joins: ClassVar[bool] = True
+    has_half_stage: ClassVar[bool] = False
+    is_rosenbrock: ClassVar[bool] = False
+    explicit_in_A: ClassVar[bool] = True
 
     def coefficients(self, evaluate, propagate, first, drift):
         sum_of = lambda weights, terms: combined(*zip(weights, terms, strict=False))  # noqa: E731

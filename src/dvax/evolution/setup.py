@@ -90,7 +90,7 @@ class Setup(NamedTuple):
             reciprocal, False, self._tolerance(), self.moduli.get("gamma"), self.moduli.get("L_F"),
             solved,
         )  # fmt: skip
-        if isinstance(self.method, AbstractMethod) and self.method.joins:
+        if isinstance(self.method, AbstractMethod) and self.method.explicit_in_A:
             flow = dataclasses.replace(flow, linear=Nothing(flow.generator))
         line = not isinstance(self.method, Implicit) and self.method.degree <= 1
         if direct and intervals and line and _can_enclose(flow, t0, x0):

@@ -19,7 +19,7 @@ from .piecewise.trajectory import Trajectory, signs
 from .regimes import Regimes, regimes
 from .results import RESULTS
 from .setup import Setup
-from .stepper import inside, local
+from .stepper import interpolate, local
 
 if TYPE_CHECKING:
     import xarray
@@ -131,7 +131,7 @@ class Solution(eqx.Module):
             method, flow, step.start, step.start + step.length, step.x0,
             flow.guess(step.x0), run,
         )  # fmt: skip
-        x = inside(own, step.length, theta, step.x0, step.coefficients)
+        x = interpolate(own, step.length, theta, step.x0, step.coefficients)
         rate = flow.rate(t, x, None)
         return x, flow.operator.inverse(rate.y)
 

@@ -169,8 +169,8 @@ def solve(
     options = Options(
         fixed=fixed,
         measure=measured,
-        ranged=measured and of_region(constants),
-        careful=not fixed,
+        track_bounds=measured and of_region(constants),
+        check_finite=not fixed,
         dense=dense,
         max_steps=bound_steps(max_steps, fixed, t0, t1, dt),
         adjoint=adjoint,
@@ -184,7 +184,7 @@ def solve(
     times = None if ts is None else _times(ts)
     if isinstance(method, PiecewiseLinear):
         solution = propagate(
-            setup, times, Limits(options.max_steps, dense, options.ranged, progress)
+            setup, times, Limits(options.max_steps, dense, options.track_bounds, progress)
         )
         if throw and solution.result != RESULTS.successful:
             raise failure(solution.setup, solution.stats, solution.result, solution)
@@ -201,7 +201,7 @@ def solve(
             problem.check_data(t0, t1, x0, args)
             if fixed:
                 # Once more, keeping the last good state, to say where it went wrong.
-                solution = _trim(compiled(setup, times, options._replace(careful=True))[0])
+                solution = _trim(compiled(setup, times, options._replace(check_finite=True))[0])
             if throw:
                 raise failure(solution.setup, solution.stats, solution.result, solution)
     return solution

@@ -17,20 +17,20 @@ from .._tree import Tree
 from ..generators import AbstractPropagator, Arc, Growth
 from ..generators.expanded import coefficients, values
 from .defect import Sample, enclosed, sampled
-from .evaluations import Plan, Visit, evaluated
+from .evaluations import Evaluation, Stages, evaluated
 from .excursions import ExcursionGuard
 from .extent import Extent
 from .flow import Flow, Rate
 from .locate_event import locate_event
 from .method import AbstractMethod, shortened
-from .moving import if_moving
+from .time_derivatives import select_if_differentiated
 
 _SMALL = 64
 """Up to this many entries a look at every one of them is free."""
 
 
-class Memory(NamedTuple):
-    """What an accepted step leaves to the next: the rate at its end, a guess for the law, the
+class SolverState(NamedTuple):
+    """What the next step reuses of an accepted one: the rate at its end, a guess for the law, the
     coefficients of its end in the eigenfunctions of A, and the largest `variation` of the data between
     samples so far (`ExcursionGuard`), each None where it is not needed."""
 
@@ -40,7 +40,7 @@ class Memory(NamedTuple):
     variation: Tree
 
 
-class Factors(NamedTuple):
+class Propagators(NamedTuple):
     """The propagators of a step of this length, of half of it where the method's stages are there, and
     up to the points inside where the defect is sampled."""
 
@@ -72,14 +72,14 @@ class Step(NamedTuple):
     event: Callable[[Any], Any] | None
     excursion: Callable[[Any, Any, Any], Any] | None
     extent: Extent | None
-    memory: Memory
+    solver_state: SolverState
     begun: Any
     solved: Any
     finite: Any
     evaluations: Any
 
 
-def inside(flow: Flow, length: Any, theta: Any, x0: Tree, c: tuple[Tree, ...]) -> Tree:
+def interpolate(flow: Flow, length: Any, theta: Any, x0: Tree, c: tuple[Tree, ...]) -> Tree:
     """x_h(t₀ + θh)."""
     return flow.propagator(theta * length, len(c)).step(x0, shortened(c, theta))
 
@@ -95,13 +95,13 @@ def local(
 ) -> tuple[Flow, Tree | None]:
     """The flow of the step from t₀ to t₁ and its drift: where the method linearises, others than that
     of the run. `guess` is for the law at x₀."""
-    if not method.linearises:
+    if not method.is_rosenbrock:
         return flow, None
-    flow, drift = flow.linearised(within(t0, t1, 0.0, ends), x0, guess)
+    flow, drift = flow.linearised(one_sided_time(t0, t1, 0.0, ends), x0, guess)
     return flow, _tree.scale(t1 - t0, drift)
 
 
-def within(t0: Any, t1: Any, theta: float, ends: tuple[Any, Any]) -> Any:
+def one_sided_time(t0: Any, t1: Any, theta: float, ends: tuple[Any, Any]) -> Any:
     """t₀ + θh, with the ends approached from inside: data may jump there.
 
     A few roundings inside, since two records may round the same moment differently; at the `ends` of
@@ -122,8 +122,8 @@ class Stepper(eqx.Module):
     - `measure`: sample the defect inside every step, which adaptive steps and certificates need;
     - `locate`: look for kinks of the response inside every step;
     - `guard`: bounds the excursions between the samples of a step, None where there can be none;
-    - `ranged`: keep where x_h and u_h have been, which constants of a region need;
-    - `careful`: look for bad values after every step, at the price of a second pass over memory;
+    - `track_bounds`: keep where x_h and u_h have been, which constants of a region need;
+    - `check_finite`: look for bad values after every step, at the price of a second pass over memory;
     - `ends`: first and last time of the run;
     - `uniform`: the propagators, where all steps have one length that is known beforehand;
     - `growth`: of the semigroup, where the defect is enclosed.
@@ -134,90 +134,99 @@ class Stepper(eqx.Module):
     measure: bool = eqx.field(static=True)
     locate: bool = eqx.field(static=True)
     guard: ExcursionGuard | None
-    ranged: bool = eqx.field(static=True)
-    careful: bool = eqx.field(static=True)
+    track_bounds: bool = eqx.field(static=True)
+    check_finite: bool = eqx.field(static=True)
     ends: tuple[Any, Any]
-    uniform: Factors | None
+    uniform: Propagators | None
     growth: Growth | None
 
-    def begin(self, x0: Tree) -> Memory:
+    def begin(self, x0: Tree) -> SolverState:
         """Before the first step nothing is known but where to look first."""
         guess = self.flow.guess(x0)
         # A method that linearises has another A in every step.
-        known = coefficients(x0 if self.method.linearises else self.flow.expand(x0))
+        known = coefficients(x0 if self.method.is_rosenbrock else self.flow.expand(x0))
         if not self.measure:
-            return Memory(None, guess, known, None)
+            return SolverState(None, guess, known, None)
         blank = jax.eval_shape(lambda: self._kept(self.flow.rate(self.ends[0], x0, guess)))
         rate = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), blank)
         none = None if self.guard is None else self.guard.start(self.flow, self.ends[0], x0)
-        return Memory(rate, guess, known, none)
+        return SolverState(rate, guess, known, none)
 
     def extent(self, x0: Tree) -> Extent | None:
         """Before the first step x_h has been at x₀ alone, and u_h nowhere."""
-        if not self.ranged:
+        if not self.track_bounds:
             return None
         return Extent.at_start(x0, self.flow.problem.zero_control(x0))
 
-    def factors(self, h: Any) -> Factors:
+    def propagators(self, h: Any) -> Propagators:
         """Propagators over h."""
         sampled = self.measure and not self.flow.enclosed
-        halves = (0.5,) if self.method.halves else ()
+        half = (0.5,) if self.method.has_half_stage else ()
         # Each length once: a sample may lie where a stage is.
-        thetas = (1.0, *halves, *(self.method.samples if sampled else ()))
+        thetas = (1.0, *half, *(self.method.samples if sampled else ()))
         found = self.flow.propagators(tuple(t * h for t in thetas), self.method.degree + 1)
-        return Factors(h, found[0], found[1] if halves else None, found[1 + len(halves) :])
+        return Propagators(h, found[0], found[1] if half else None, found[1 + len(half) :])
 
-    def fitted(self, factors: Factors, t0: Any, t1: Any, anew: Any) -> Factors:
+    def reuse_or_build(self, propagators: Propagators, t0: Any, t1: Any, anew: Any) -> Propagators:
         """Propagators for this step; those of the last one where the length is the same.
 
         t₀ + h is rounded, so equal steps differ by an ulp of t: that is not a new length. Equal
         lengths may move apart, where `anew` says so: then, if they are differentiated, it is one.
         """
 
-        def fit(h: Any, stepper: Stepper, factors: Factors, slack: Any, new: Any) -> Factors:
-            same = _alike(h, factors.length, slack) & jnp.logical_not(new)
-            return lax.cond(same, lambda: factors, lambda: stepper.factors(h))
+        def fit(h: Any, stepper: Stepper, old: Propagators, slack: Any, new: Any) -> Propagators:
+            same = _alike(h, old.length, slack) & jnp.logical_not(new)
+            return lax.cond(same, lambda: old, lambda: stepper.propagators(h))
 
-        still = lambda h, s, f, slack, _: fit(h, s, f, slack, False)  # noqa: E731
-        return if_moving(fit, still, t1 - t0, self, factors, 2 * _ulp(t0, t1), anew)
+        plain = lambda h, s, p, slack, _: fit(h, s, p, slack, False)  # noqa: E731
+        slack = 2 * _ulp(t0, t1)
+        return select_if_differentiated(fit, plain, t1 - t0, self, propagators, slack, anew)
 
-    def fits(self, factors: Factors, t0: Any, t1: Any) -> Any:
+    def match(self, propagators: Propagators, t0: Any, t1: Any) -> Any:
         """Whether these are the propagators for this step."""
-        return _alike(t1 - t0, factors.length, 2 * _ulp(t0, t1))
+        return _alike(t1 - t0, propagators.length, 2 * _ulp(t0, t1))
 
     def advance(
-        self, t0: Any, t1: Any, x0: Tree, factors: Factors | None, guess: Tree | None
+        self, t0: Any, t1: Any, x0: Tree, propagators: Propagators | None, guess: Tree | None
     ) -> tuple[Tree, tuple[Tree, ...], Tree | None]:
         """(x₁, the stage polynomial, y where the step begins), and nothing else."""
-        self, drift, factors = self._local(t0, t1, x0, factors, guess)
-        plan = self._plan(t0, t1, self.flow.expand(x0), factors, drift, False)
-        found, visits = evaluated(self.flow, plan, self.ends[0], x0, guess, None, True)
+        self, drift, propagators = self._local(t0, t1, x0, propagators, guess)
+        plan = self._stages(t0, t1, self.flow.expand(x0), propagators, drift, False)
+        found, evaluations = evaluated(self.flow, plan, self.ends[0], x0, guess, None, True)
         c, x1 = values(found)
-        return x1, c, visits[0].rate.y
+        return x1, c, evaluations[0].rate.y
 
     def step(
-        self, t0: Any, t1: Any, x0: Tree, memory: Memory, factors: Factors | None, jumped: Any
+        self,
+        t0: Any,
+        t1: Any,
+        x0: Tree,
+        solver_state: SolverState,
+        propagators: Propagators | None,
+        jumped: Any,
     ) -> Step:
-        """One step from t0 to t1. `jumped` says that what memory holds is not the rate at t0."""
-        self, drift, factors = self._local(t0, t1, x0, factors, memory.guess)
-        start = self.flow.expand(x0, memory.coefficients)
-        plan = self._plan(t0, t1, start, factors, drift, self.measure)
+        """Make a step from t0 to t1; `jumped`: the rate in `solver_state` is not that at t0."""
+        self, drift, propagators = self._local(t0, t1, x0, propagators, solver_state.guess)
+        start = self.flow.expand(x0, solver_state.coefficients)
+        plan = self._stages(t0, t1, start, propagators, drift, self.measure)
         # The last evaluation of the previous step was made where this one begins.
-        begin, kept = self.ends[0], memory.rate
-        (c, x1), visits = evaluated(self.flow, plan, begin, x0, memory.guess, kept, jumped)
+        begin, kept = self.ends[0], solver_state.rate
+        (c, x1), evaluations = evaluated(
+            self.flow, plan, begin, x0, solver_state.guess, kept, jumped
+        )
         arc, known = Arc(t1 - t0, start, x1, c), coefficients(x1)
         c, x1 = values((c, x1))
-        first, last = visits[0].rate, visits[-1].rate
+        first, last = evaluations[0].rate, evaluations[-1].rate
         error, impulse, event, excursion, extent = None, (0.0, 0.0), None, None, None
-        variation = memory.variation
+        variation = solver_state.variation
         if self.measure:
-            sample = self._measure(t0, t1, arc, visits, jumped)
+            sample = self._measure(t0, t1, arc, evaluations, jumped)
             error, impulse = sample.error, (sample.defect, sample.law_defect)
-            extent = sample.extent if self.ranged else None
+            extent = sample.extent if self.track_bounds else None
             if self.locate:
                 event = partial(self._event, t0, t1, x0, c, first, sample)
             if self.guard is not None:
-                along = [visits[0], *visits[-1 - len(sample.thetas) :]]
+                along = [evaluations[0], *evaluations[-1 - len(sample.thetas) :]]
                 share = (t1 - t0) / (self.ends[1] - self.ends[0])
                 seen = self.guard.look(self.flow, along, variation, share)
                 excursion, variation = seen.ratio, seen.variation
@@ -226,17 +235,17 @@ class Stepper(eqx.Module):
         else:
             # A look at a large state costs half a step, and a bad entry stays bad (x₁ contains
             # e^{hA}x₀), so `solve` looks at the end and, where it must, runs again carefully.
-            look = self.careful or _size(x1) <= _SMALL
+            look = self.check_finite or _size(x1) <= _SMALL
             finite = _tree.all_finite(x1) if look else jnp.asarray(True)
-        after = Memory(
+        after = SolverState(
             self._kept(last) if self.measure else None,
             None if self.flow.direct else last.y,
             known,
             variation,
         )
-        solved = jnp.all(jnp.stack([visit.rate.solved for visit in visits]))
+        solved = jnp.all(jnp.stack([one.rate.solved for one in evaluations]))
         # The first one was made by the step before, unless nothing is kept, or data jumped.
-        counts = [visit.rate.evaluations for visit in visits]
+        counts = [one.rate.evaluations for one in evaluations]
         own = counts[0] if kept is None else jnp.where(jumped, counts[0], 0)
         return Step(
             x1, c, error, impulse, event, excursion, extent, after, first.solved, solved, finite,
@@ -244,43 +253,49 @@ class Stepper(eqx.Module):
         )  # fmt: skip
 
     def _local(
-        self, t0: Any, t1: Any, x0: Tree, factors: Factors | None, guess: Tree | None
-    ) -> tuple["Stepper", Tree | None, Factors]:
+        self, t0: Any, t1: Any, x0: Tree, propagators: Propagators | None, guess: Tree | None
+    ) -> tuple["Stepper", Tree | None, Propagators]:
         """The stepper with the flow of this step, the drift, and the propagators: those given, unless
         the method linearises."""
-        if not self.method.linearises:
-            assert factors is not None
-            return self, None, factors
+        if not self.method.is_rosenbrock:
+            assert propagators is not None
+            return self, None, propagators
         flow, drift = local(self.method, self.flow, t0, t1, x0, guess, self.ends)
         stepper = dataclasses.replace(self, flow=flow)
-        return stepper, drift, stepper.factors(t1 - t0)
+        return stepper, drift, stepper.propagators(t1 - t0)
 
-    def _plan(
-        self, t0: Any, t1: Any, start: Tree, factors: Factors, drift: Tree | None, measured: bool
-    ) -> Plan:
+    def _stages(
+        self,
+        t0: Any,
+        t1: Any,
+        start: Tree,
+        propagators: Propagators,
+        drift: Tree | None,
+        measured: bool,
+    ) -> Stages:
         """The evaluations of a step: at its start, for its stages, inside, and at its end. States are
         expanded (`AbstractGenerator.expand`), and so are c and x₁."""
 
         def run(evaluate: Callable[[Any, Tree], Rate]) -> tuple[tuple[Tree, ...], Tree]:
             def stage(theta: float, x: Tree) -> Tree:
                 x = values(x)
-                rate = evaluate(self._within(t0, t1, theta), x)
-                return self.flow.expand(self.flow.rest(x, rate.value))
+                rate = evaluate(self._one_sided_time(t0, t1, theta), x)
+                return self.flow.expand(self.flow.nonlinear_part(x, rate.value))
 
             def propagate(theta: float, c: tuple[Tree, ...]) -> Tree:
                 if theta == 1.0:
-                    return factors.full.step(start, c)
-                assert factors.half is not None and theta == 0.5
-                return factors.half.step(start, shortened(c, theta))
+                    return propagators.full.step(start, c)
+                assert propagators.half is not None and theta == 0.5
+                return propagators.half.step(start, shortened(c, theta))
 
             c = self.method.coefficients(stage, propagate, stage(0.0, start), drift)
-            x1 = factors.full.step(start, c)
+            x1 = propagators.full.step(start, c)
             if measured:
                 # No inner ones where the defect is enclosed.
-                for theta, to in zip(self.method.samples, factors.inner, strict=False):
+                for theta, to in zip(self.method.samples, propagators.inner, strict=False):
                     x = to.step(start, shortened(c, theta))
-                    evaluate(self._within(t0, t1, theta), values(x))
-                evaluate(self._within(t0, t1, 1.0), values(x1))
+                    evaluate(self._one_sided_time(t0, t1, theta), values(x))
+                evaluate(self._one_sided_time(t0, t1, 1.0), values(x1))
             return c, x1
 
         return run
@@ -299,17 +314,17 @@ class Stepper(eqx.Module):
 
         def at(theta: Any) -> jax.Array:
             t = t0 + theta * (t1 - t0)
-            x = inside(flow, t1 - t0, theta, x0, c)
+            x = interpolate(flow, t1 - t0, theta, x0, c)
             return switches(t, flow.rate(t, x, first.y))
 
         values = [
-            switches(self._within(t0, t1, theta), rate)
+            switches(self._one_sided_time(t0, t1, theta), rate)
             for theta, rate in zip(thetas, rates, strict=True)
         ]
         return t0 + locate_event(thetas, values, at, wanted) * (t1 - t0)
 
-    def _within(self, t0: Any, t1: Any, theta: float) -> Any:
-        return within(t0, t1, theta, self.ends)
+    def _one_sided_time(self, t0: Any, t1: Any, theta: float) -> Any:
+        return one_sided_time(t0, t1, theta, self.ends)
 
     def look(
         self, t0: Any, t1: Any, x0: Tree, x1: Tree, c: tuple[Tree, ...], guess: Tree | None
@@ -319,14 +334,14 @@ class Stepper(eqx.Module):
 
         def run(evaluate: Callable[[Any, Tree], Rate]) -> tuple[tuple[Tree, ...], Tree]:
             for theta, x in zip((0.0, *self.method.samples, 1.0), points, strict=True):
-                evaluate(self._within(t0, t1, theta), x)
+                evaluate(self._one_sided_time(t0, t1, theta), x)
             return c, x1
 
-        between = [inside(self.flow, t1 - t0, theta, x0, c) for theta in self.method.samples]
+        between = [interpolate(self.flow, t1 - t0, theta, x0, c) for theta in self.method.samples]
         points = [x0, *between, x1]
-        _, visits = evaluated(self.flow, run, self.ends[0], x0, guess, None, True)
-        sample = self._measure(t0, t1, Arc(t1 - t0, x0, x1, c), visits, True)
-        solved = jnp.all(jnp.stack([visit.rate.solved for visit in visits]))
+        _, evaluations = evaluated(self.flow, run, self.ends[0], x0, guess, None, True)
+        sample = self._measure(t0, t1, Arc(t1 - t0, x0, x1, c), evaluations, True)
+        solved = jnp.all(jnp.stack([one.rate.solved for one in evaluations]))
         return sample._replace(rates=[]), solved
 
     def _kept(self, rate: Rate) -> Rate:
@@ -335,18 +350,20 @@ class Stepper(eqx.Module):
             return rate
         return rate._replace(y=None, z=rate.z if self.locate else None)
 
-    def _measure(self, t0: Any, t1: Any, arc: Arc, visits: list[Visit], jumped: Any) -> Sample:
+    def _measure(
+        self, t0: Any, t1: Any, arc: Arc, evaluations: list[Evaluation], jumped: Any
+    ) -> Sample:
         if not self.flow.enclosed:
             x0, c = values((arc.x0, arc.c))
-            return sampled(self.flow, self.method, arc.h, x0, c, visits)
+            return sampled(self.flow, self.method, arc.h, x0, c, evaluations)
         assert self.growth is not None
         # A rate that the step before made was made where that one ended: a few roundings of t earlier,
         # which a steep f tells apart.
-        begin = self._within(t0, t1, 0.0)
+        begin = self._one_sided_time(t0, t1, 0.0)
         begin = jnp.where(jumped, begin, 2.0 * t0 - begin)
-        ends = begin, self._within(t0, t1, 1.0)
+        ends = begin, self._one_sided_time(t0, t1, 1.0)
         span = self.ends[1] - self.ends[0]
-        return enclosed(self.flow, self.growth, ends, arc, visits[-1].rate, span)
+        return enclosed(self.flow, self.growth, ends, arc, evaluations[-1].rate, span)
 
 
 def _alike(h: Any, length: Any, slack: Any) -> Any:

@@ -27,7 +27,7 @@ import jax.tree_util as jtu
 from jax import lax
 
 from .. import _tree
-from .._batch import largest_of_batch
+from .._batch import largest_of_lanes
 from .._tree import Tree
 from .abstract import AbstractGenerator, AbstractPropagator
 from .phi import flow_factors, phi_scalar
@@ -110,7 +110,7 @@ class FaberPropagator(AbstractPropagator):
             return _tree.where(s < self.pieces, new, x)
 
         # Lanes of a batch may have kept propagators of different steps.
-        return turns(largest_of_batch(self.pieces), piece, x0, 1, (_MOST_PIECES,))
+        return turns(largest_of_lanes(self.pieces), piece, x0, 1, (_MOST_PIECES,))
 
     def _sum(self, v: tuple[Tree, ...]) -> Tree:
         """Σₖ Fₖ(A) Σᵢ coefficients[i, k] vᵢ, by Clenshaw's recurrence."""
@@ -135,7 +135,7 @@ class FaberPropagator(AbstractPropagator):
             return new, first
 
         # Whole runs of turns: the coefficients beyond the degree are zero.
-        degree = largest_of_batch(self.degree)
+        degree = largest_of_lanes(self.degree)
         last = -(-degree // _RUN) * _RUN
         zero = _tree.zeros_like(v[0])
         first, second = turns(degree, turn, (zero, zero), _RUN, _BRANCH)
@@ -160,7 +160,7 @@ def propagator(A: AbstractGenerator, found: Range, h: jax.Array, terms: int) -> 
     count = jnp.ceil(jnp.maximum(split, length * rise / _RISE))
     # What is not a number is not computed either, and each lane of a batch answers for itself.
     fits = count <= _MOST_PIECES
-    pieces = largest_of_batch(jnp.where(fits, count, 1.0).astype(int))
+    pieces = largest_of_lanes(jnp.where(fits, count, 1.0).astype(int))
     part = jnp.where(fits, h, jnp.nan) / pieces.astype(h.dtype)
     needed = 2.2 * _long(lax.stop_gradient(part), a, b)
     size = jnp.searchsorted(jnp.asarray(_SIZES[:-1], needed.dtype), needed)
@@ -174,11 +174,11 @@ def propagator(A: AbstractGenerator, found: Range, h: jax.Array, terms: int) -> 
         rows = jnp.stack([jnp.fft.irfft(jnp.conj(value), n)[: n // 2] for value in values])
         return jnp.pad(rows, ((0, 0), (0, _SIZES[-1] // 2 - n // 2)))
 
-    rows = lax.switch(largest_of_batch(size), [partial(series, n) for n in _SIZES], part)
+    rows = lax.switch(largest_of_lanes(size), [partial(series, n) for n in _SIZES], part)
     scale = jnp.sum(jnp.abs(rows), axis=1, keepdims=True)
     matters = lax.stop_gradient(jnp.abs(rows) > jnp.finfo(dtype).eps * scale)
     order = jnp.arange(rows.shape[1])
-    degree = largest_of_batch(jnp.max(jnp.where(matters, order, 0)))
+    degree = largest_of_lanes(jnp.max(jnp.where(matters, order, 0)))
     return FaberPropagator(A, ellipse, jnp.where(order <= degree, rows, 0.0), degree, pieces)
 
 

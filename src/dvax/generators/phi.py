@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .._batch import largest_of_batch
+from .._batch import largest_of_lanes
 from .turns import turns
 
 _TERMS = 20  # of the Taylor series on |z| < 1: 1/20! is below double rounding
@@ -61,7 +61,7 @@ def phi_matrix(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
     norm = lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(z), axis=0)))
     halvings = jnp.ceil(jnp.log2(jnp.where(norm > 1.0, norm, 1.0)))
     # What is not finite stays so; a norm near overflow is no generator's.
-    halvings = largest_of_batch(jnp.clip(halvings, 0, 4**_LEVELS - 1).astype(int))
+    halvings = largest_of_lanes(jnp.clip(halvings, 0, 4**_LEVELS - 1).astype(int))
     small = z * jnp.exp2(-halvings.astype(norm.dtype)).astype(z.dtype)
 
     top = max(order, 1)

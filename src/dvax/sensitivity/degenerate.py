@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import InputError, InputProblem
 from ..evolution import Implicit, Solution
-from ..evolution.stepper import inside, local
+from ..evolution.stepper import interpolate, local
 
 _LOOKS = 8
 """Places in a step where it is looked at the switches."""
@@ -91,7 +91,7 @@ def _looked_at(sol: Solution, count: int) -> tuple[np.ndarray, np.ndarray]:
         end, guess = step.start + step.length, flow.guess(step.x0)
         own, _ = local(method, flow, step.start, end, step.x0, guess, run)
         t = step.start + theta * step.length
-        x = inside(own, step.length, theta, step.x0, step.coefficients)
+        x = interpolate(own, step.length, theta, step.x0, step.coefficients)
         return t, flow.switches(t, x, flow.rate(t, x, flow.guess(x)).z)
 
     each = jax.jit(jax.vmap(lambda step: jax.vmap(lambda theta: look(step, theta))(thetas)))

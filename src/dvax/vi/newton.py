@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from .. import _tree
-from .._batch import any_of_batch
+from .._batch import any_lane
 from .._tree import Tree
 from .abstract import RESULTS, Answer, Frozen
 from .extragradient import extragradient_step
@@ -118,7 +118,7 @@ def safeguarded_newton(
         s, tau, first = carry
         tries = s.wait == 0
         idle = s.z, s.at, s.ahead, s.ahead
-        found = lax.cond(any_of_batch(tries), lambda: newton(vi, s, tau, first), lambda: idle)
+        found = lax.cond(any_lane(tries), lambda: newton(vi, s, tau, first), lambda: idle)
         norm = vi.space.norm(found[3])
         # Nothing is known yet that the first point could halve; but it must lie where F is alike.
         alike = (vi.space.norm(found[2]) <= s.limit) | jnp.isfinite(s.best)
@@ -126,7 +126,7 @@ def safeguarded_newton(
         onward = tries & alike & (s.left > 0) & (norm <= _WILD * s.best) & jnp.isfinite(norm)
         taken = halved | onward
         reached, base, lam, calls = lax.cond(
-            any_of_batch(~taken),
+            any_lane(~taken),
             lambda: safeguard(vi, s, tau),
             lambda: (idle, s.base, s.lam, jnp.asarray(0)),
         )

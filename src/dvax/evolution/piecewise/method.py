@@ -50,4 +50,4 @@ class PiecewiseLinear(eqx.Module):
 
     order: ClassVar[int] = 39
     degree: ClassVar[int] = 20
-    linearises: ClassVar[bool] = False
+    is_rosenbrock: ClassVar[bool] = False

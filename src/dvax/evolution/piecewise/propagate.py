@@ -30,7 +30,7 @@ class Limits(NamedTuple):
 
     max_steps: int
     dense: bool
-    ranged: bool
+    track_bounds: bool
     progress: bool
 
 
@@ -82,7 +82,7 @@ def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
 
 def limits_of(limits: Limits, times: Array) -> tuple[int, Array, bool, bool, bool]:
     """The last arguments of a `Run`."""
-    return limits.max_steps, times, limits.dense, limits.ranged, limits.progress
+    return limits.max_steps, times, limits.dense, limits.track_bounds, limits.progress
 
 
 def _solution(
@@ -120,7 +120,7 @@ def _solution(
         defect=array(defects[:, 0], ()),
         law_defect=array(defects[:, 1], ()),
         settled=(array(settled[:, 0], ()), array(settled[:, 1], ())),
-        extent=_extent(rows, n, x0, u0, P) if limits.ranged and rows else None,
+        extent=_extent(rows, n, x0, u0, P) if limits.track_bounds and rows else None,
         stats={
             "steps": run.accepted, "rejected": run.rejected,
             "evaluations": run.accepted + run.rejected, "switchings": run.switchings,

@@ -34,7 +34,7 @@ class Run:
 
     def __init__(
         self, given: Affine, pivoted: Affine, pieces: list[Piece], x0: Array, weights: Array,
-        tol: tuple[float, float], max_steps: int, times: Array, dense: bool, ranged: bool,
+        tol: tuple[float, float], max_steps: int, times: Array, dense: bool, track_bounds: bool,
         progress: bool,
     ):  # fmt: skip
         self.given, self.system, self.pieces, self.x = given, pivoted, pieces, x0
@@ -60,7 +60,7 @@ class Run:
         self.span = pieces[-1].start + pieces[-1].length - self.t
         m = len(given.low)
         none = np.stack([np.full(m, np.inf), np.full(m, -np.inf)])
-        self.extent = np.hstack([np.stack([x0, x0]), none]) if ranged else None
+        self.extent = np.hstack([np.stack([x0, x0]), none]) if track_bounds else None
 
     def go(self) -> None:
         """Run to the end, or to where `result` says why not."""
