@@ -58,7 +58,7 @@ _COSTLY = frozenset(
 _PARTS = {"dynamic_slice": None, "gather": None, "dynamic_update_slice": 1, "scatter": 2}
 """Operations on a part of an array, which itself may be of any size. The part is the result (None) or
 the argument of this number."""
-_FREE = ("broadcast_in_dim", "stop_gradient")
+_FREE = ("broadcast_in_dim", "stop_gradient", "reshard")
 _NESTED = "jit pjit closed_call custom_jvp_call custom_vjp_call remat2 cond while scan".split()
 
 
@@ -70,11 +70,20 @@ def outlined(run: Callable[..., Any], *args: Any, large: Any = ()) -> Any:
     """
     if jax.default_backend() != "cpu":
         return run(*args, *large)
-    program, shapes, static = eqx.filter_make_jaxpr(run)(*args, *large)
-    small, others = (jtu.tree_leaves(eqx.filter(part, eqx.is_array)) for part in (args, large))
-    packs = [True] * len(small) + [False] * len(others)
-    found = _bind(program, [*small, *others], packs)
-    return eqx.combine(jtu.tree_unflatten(jtu.tree_structure(shapes), found), static)
+    arrays, static = eqx.partition((args, large), eqx.is_array)
+    leaves, tree = jtu.tree_flatten(arrays)
+    packs = [k < len(jtu.tree_leaves(arrays[0])) for k in range(len(leaves))]
+    others: list[Any] = []
+
+    def dynamic(*leaves: Any) -> Any:
+        args, large = eqx.combine(tree.unflatten(leaves), static)
+        out, other = eqx.partition(run(*args, *large), eqx.is_array)
+        others.append(other)
+        return out
+
+    program, shape = jax.make_jaxpr(dynamic, return_shape=True)(*leaves)
+    found = jtu.tree_structure(shape).unflatten(_bind(program, leaves, packs))
+    return eqx.combine(found, others[0])
 
 
 def _bind(program: ClosedJaxpr, leaves: list[Any], packs: list[bool]) -> list[Any]:

@@ -93,9 +93,9 @@ class Loop(eqx.Module):
     - `dense`: keep every step; `progress`: say how far the run is;
     - `forward_mode`: tangents go along with the steps.
 
-    Where steps adapt, tangents are those of the state at times that stand still: a stop that moves
-    carries the jump of x' over it, and what asks for the state at a moving time adds x' (`time_derivatives`).
-    Fixed steps move with the stops, and so do their states.
+    Where steps adapt, tangents are those of the state at constant times: a differentiated stop adds
+    the jump of x' there, and a differentiated time of output adds x' (`time_derivatives`). Fixed steps
+    depend on the stops, and so do their states.
     """
 
     stepper: Stepper
