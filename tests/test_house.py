@@ -298,3 +298,12 @@ def test_a_file_is_one_idea():
     files = [f for top in ("src", "tests", "benchmarks") for f in (ROOT / top).rglob("*.py")]
     long = {str(file.relative_to(ROOT)): lines(file) for file in files if lines(file) > 400}
     assert set(long) == set(LONG), f"longer than 400 lines: {long}; with a reason: {set(LONG)}"
+
+
+def test_the_files_that_the_page_on_the_architecture_names_exist():
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    named = set(re.findall(r"[\w/]+\.py\b", page)) | set(re.findall(r"`([\w/]+/)`", page))
+    assert len(named) > 20
+    homes = [ROOT / "src" / "dvax", ROOT / "src" / "dvax" / "evolution", ROOT]
+    absent = [name for name in sorted(named) if not any((home / name).exists() for home in homes)]
+    assert not absent
