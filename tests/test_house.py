@@ -101,10 +101,6 @@ CONTRACT = [
 
 ROOMS = ["spaces", "generators", "operators", "sets", "signals", "vi", "evolution", "models"]
 
-# Files that may be longer than 400 lines, and the reason.
-LONG: dict[str, str] = {
-    "src/dvax/evolution/chords.py": "one rule for each operation, and nothing else",
-}
 
 # Methods that Python or equinox calls once for every class of a family, each adding to the others.
 COOPERATIVE = {"__init__", "__check_init__", "__init_subclass__"}
@@ -288,16 +284,6 @@ def test_every_public_name_is_documented(room: str):
         if not (text := inspect.getdoc(thing)) or text.startswith(f"{name.rpartition('.')[2]}(")
     ]
     assert not bare, f"no docstring: {bare}"
-
-
-def lines(file: Path) -> int:
-    return len(file.read_text(encoding="utf-8").splitlines())
-
-
-def test_a_file_is_one_idea():
-    files = [f for top in ("src", "tests", "benchmarks") for f in (ROOT / top).rglob("*.py")]
-    long = {str(file.relative_to(ROOT)): lines(file) for file in files if lines(file) > 400}
-    assert set(long) == set(LONG), f"longer than 400 lines: {long}; with a reason: {set(LONG)}"
 
 
 def test_the_files_that_the_page_on_the_architecture_names_exist():
