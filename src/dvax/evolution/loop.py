@@ -206,13 +206,17 @@ class Loop(eqx.Module):
         moves = is_differentiated(self.controller.stops)
 
         def same(carry: Any) -> Any:
-            is_same = self.stepper.match(*self._ahead(carry[0])) & ~(moves & self._anew(carry[0]))
+            is_same = self.stepper.match(*self._ahead(carry[0])) & ~(
+                moves & self._must_rebuild(carry[0])
+            )
             # Problems of a batch get new propagators together, as soon as one of them needs some.
             return ~any_lane(goes_on(carry) & ~is_same)
 
         def of_one_length(carry: Any) -> Any:
             state, *rest = carry
-            propagators = self.stepper.reuse_or_build(*self._ahead(state), self._anew(state))
+            propagators = self.stepper.reuse_or_build(
+                *self._ahead(state), self._must_rebuild(state)
+            )
             carry = (state._replace(propagators=propagators), *rest)
             one = lambda c: (turn(c[0]), jnp.asarray(False))  # noqa: E731
             # One in any case: what is not a number fits nothing.
@@ -363,9 +367,9 @@ class Loop(eqx.Module):
         uniform = self.stepper.uniform
         if uniform is not None or state.propagators is None:
             return uniform
-        return self.stepper.reuse_or_build(state.propagators, t0, t1, self._anew(state))
+        return self.stepper.reuse_or_build(state.propagators, t0, t1, self._must_rebuild(state))
 
-    def _anew(self, state: State) -> Any:
+    def _must_rebuild(self, state: State) -> Any:
         """Whether the next length may move otherwise; up to the next stop, fixed steps move alike."""
         return jnp.asarray(True) if self.controller.adapts else state.jumped
 

@@ -60,7 +60,7 @@ class Step(NamedTuple):
     - `excursion(rtol, atol, rate)`: exceeds 1 where data that moves in time may hide something between
       the samples, given the tolerances of y and of f; None where nothing moves by itself;
     - `extent`: the bounds of x_h and u_h over the step, None where they are not tracked;
-    - `begun`, `solved`: the law was solved at the start, and everywhere;
+    - `start_solved`, `solved`: the law was solved at the start, and everywhere;
     - `finite`: there is no non-finite value that a smaller step would leave;
     - `evaluations`: of F.
     """
@@ -73,7 +73,7 @@ class Step(NamedTuple):
     excursion: Callable[[Any, Any, Any], Any] | None
     extent: Extent | None
     solver_state: SolverState
-    begun: Any
+    start_solved: Any
     solved: Any
     finite: Any
     evaluations: Any
@@ -167,11 +167,13 @@ class Stepper(eqx.Module):
         found = self.flow.propagators(tuple(t * h for t in thetas), self.method.degree + 1)
         return Propagators(h, found[0], found[1] if half else None, found[1 + len(half) :])
 
-    def reuse_or_build(self, propagators: Propagators, t0: Any, t1: Any, anew: Any) -> Propagators:
+    def reuse_or_build(
+        self, propagators: Propagators, t0: Any, t1: Any, rebuild: Any
+    ) -> Propagators:
         """Propagators for this step; those of the last one where the length is the same.
 
         t₀ + h is rounded, so equal steps differ by an ulp of t: that is not a new length. Equal
-        lengths may move apart, where `anew` says so: then, if they are differentiated, it is one.
+        lengths may move apart, where `rebuild` says so: then, if they are differentiated, it is one.
         """
 
         def fit(h: Any, stepper: Stepper, old: Propagators, slack: Any, new: Any) -> Propagators:
@@ -180,7 +182,7 @@ class Stepper(eqx.Module):
 
         plain = lambda h, s, p, slack, _: fit(h, s, p, slack, False)  # noqa: E731
         slack = 2 * _ulp(t0, t1)
-        return select_if_differentiated(fit, plain, t1 - t0, self, propagators, slack, anew)
+        return select_if_differentiated(fit, plain, t1 - t0, self, propagators, slack, rebuild)
 
     def match(self, propagators: Propagators, t0: Any, t1: Any) -> Any:
         """Whether these are the propagators for this step."""

@@ -44,7 +44,7 @@ def test_growth_is_held_back_after_a_rejection_and_comes_back_in_nine_steps():
         limiter = limiter.after(YES, NO, 128.0)
     assert sizes[0] == 1.0 and sizes == sorted(sizes)
     assert sizes[3] == pytest.approx(1.0 + 0.12 * 9) and sizes[6] == MAX_GROWTH
-    # A rejection at an event does not start the count anew.
+    # A rejection at an event does not reset the count.
     assert float(SETTLED.after(NO, YES, 128.0).accepted_in_a_row) == 9.0
 
 

@@ -160,5 +160,5 @@ class Adaptive(AbstractController):
         reason = RESULTS.where(finite, RESULTS.step_too_small, RESULTS.nonfinite)
         reason = RESULTS.where(step.solved, reason, RESULTS.law_unsolved)
         result = RESULTS.where(stuck, reason, RESULTS.successful)
-        result = RESULTS.where(step.begun, result, RESULTS.law_unsolved)
+        result = RESULTS.where(step.start_solved, result, RESULTS.law_unsolved)
         return RESULTS.where(step.finite, result, RESULTS.nonfinite)

@@ -75,7 +75,7 @@ class ErrorTest(eqx.Module):
             error=error,
             integrated=error * h / self.horizon,
             roundoff=lax.stop_gradient(roundoff),
-            usable=step.begun & step.finite,
+            usable=step.start_solved & step.finite,
         )
 
     def excursion(self, x0: Tree, step: Step) -> Any:

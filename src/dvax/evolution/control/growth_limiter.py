@@ -47,7 +47,7 @@ class GrowthLimiter(NamedTuple):
 
     def after(self, accepted: Any, at_event: Any, most: Any) -> "GrowthLimiter":
         """Count an attempt, up to `most`. A rejection that an event explains (`at_event`) does not
-        start the count anew."""
+        reset the count."""
         kept = jnp.minimum(self.accepted_in_a_row + 1.0, most)
         rejected = jnp.where(at_event, jnp.maximum(self.accepted_in_a_row, 1.0), 0.0)
         return GrowthLimiter(jnp.where(accepted, kept, rejected))

@@ -56,14 +56,14 @@ class RoundoffGuard(NamedTuple):
         noise = (error > _SMALLEST_NOISE) & (error < _LARGEST_NOISE)
         fallen = self.reference_error * self.reference_error * ratio**order
         flat = short & noise & (error * error >= fallen)
-        anew = short | (ratio == 1.0)
+        is_reference = short | (ratio == 1.0)
         tries = accepted & (in_a_row >= self.wait)
         found = accepted & (self.noise_floor > 0.0)
         seen = found | (accepted & (flat | tries))
         wait = jnp.where(tries, 2.0 * self.wait, self.wait)
         return RoundoffGuard(
-            reference_size=jnp.where(anew, size, self.reference_size),
-            reference_error=jnp.where(anew, error, self.reference_error),
+            reference_size=jnp.where(is_reference, size, self.reference_size),
+            reference_error=jnp.where(is_reference, error, self.reference_error),
             noise_floor=jnp.where(seen, jnp.maximum(self.noise_floor, error), 0.0),
             wait=jnp.where(found, _PATIENCE, wait),
             last_error=jnp.where(accepted, error, self.last_error),

@@ -118,8 +118,8 @@ def equilibrate(
             blocks = min(2 * len(restricted.blocks), _MOST_BLOCKS)
     raise SolveError(
         f"The user equilibrium was not reached: after {number + 1} rounds its relative gap is "
-        f"{best:.2e}, and {gap:.2e} was asked for. Ask for a larger gap: with numbers of very "
-        "different sizes rounding allows no more."
+        f"{best:.2e}, and {gap:.2e} was asked for. Ask for a larger gap, or check the units of trips "
+        "and capacities: at flows far above the capacities the method may converge no further."
     )
 
 
