@@ -1,67 +1,54 @@
-"""What a batch of problems may share."""
+"""Conditions and counts that the lanes of a `jax.vmap` share."""
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Primitive
-from jax.interpreters import batching, mlir
+from jax.custom_batching import custom_vmap
 
 
+@custom_vmap
 def any_lane(condition: jax.Array) -> jax.Array:
-    """Whether the condition holds, and under `jax.vmap` whether it does for any problem of the batch.
+    """Return the condition; under `jax.vmap`, whether it holds in any lane.
 
-    A branch of `lax.cond` on this is left out where no problem needs it. (On a condition of each
-    problem's own, every branch would be computed for all.) What the branch returns must then be
-    chosen problem by problem.
+    `lax.cond` on a condition of each lane's own computes both branches; on this one it computes the
+    branch only where some lane needs it. What the branch returns must then be selected lane by lane.
     """
-    return _any_p.bind(condition)
+    return condition
 
 
+@any_lane.def_vmap
+def _(size: int, batched: list[bool], condition: jax.Array) -> tuple[jax.Array, bool]:
+    return any_lane(jnp.any(condition, axis=0)), False
+
+
+@custom_vmap
 def largest_of_lanes(count: jax.Array) -> jax.Array:
-    """The integer, and under `jax.vmap` the largest one of the batch: a loop of so many turns is then
-    one loop for all."""
-    return _largest_p.bind(count)
+    """Return the integer; under `jax.vmap`, the largest one of all lanes: a loop with this number of
+    iterations is one loop for all lanes."""
+    return count
 
 
+@largest_of_lanes.def_vmap
+def _(size: int, batched: list[bool], count: jax.Array) -> tuple[jax.Array, bool]:
+    return largest_of_lanes(jnp.max(count, axis=0)), False
+
+
+@custom_vmap
 def is_active(condition: jax.Array) -> jax.Array:
-    """True, and under `jax.vmap` the condition: whether the turn of a loop that goes on while *any*
-    problem of a batch needs it (`any_lane`) is one of this problem's own.
+    """Return True; under `jax.vmap`, the condition: whether an iteration of a loop that runs while
+    *any* lane needs it (`any_lane`) belongs to this lane.
 
-    A loop on a condition of each problem's own would, after every turn, choose between old and new for
-    all that it carries. Here what is written row by row need not be chosen as a whole.
+    A loop on a condition of each lane's own selects between old and new values of its whole carry after
+    every iteration. With this one, tables that are written row by row need no selection.
     """
-    return _own_p.bind(condition)
+    return jnp.ones_like(condition)
+
+
+@is_active.def_vmap
+def _(size: int, batched: list[bool], condition: jax.Array) -> tuple[jax.Array, bool]:
+    return condition, True
 
 
 def zeros_like_lanes(t: jax.Array) -> jax.Array:
-    """Zeros, and under `jax.vmap` a batch of them where t is one: what has a batch of tangents is to be
-    one itself."""
-    return _zeros_p.bind(t)
-
-
-def _shared(name: str, join) -> Primitive:
-    primitive = Primitive(name)
-    primitive.def_impl(lambda value: value)
-    primitive.def_abstract_eval(lambda value: value)
-    mlir.register_lowering(primitive, lambda ctx, value: [value])
-    batching.primitive_batchers[primitive] = lambda given, axes: (
-        primitive.bind(join(given[0], axis=axes[0])),
-        None,
-    )
-    return primitive
-
-
-_any_p = _shared("any_lane", jnp.any)
-_largest_p = _shared("largest_of_lanes", jnp.max)
-
-
-def _same_for_each(name: str, made, of_batch) -> Primitive:
-    primitive = Primitive(name)
-    primitive.def_impl(made)
-    primitive.def_abstract_eval(lambda value: value)
-    mlir.register_lowering(primitive, mlir.lower_fun(made, multiple_results=False))
-    batching.primitive_batchers[primitive] = lambda given, axes: (of_batch(given[0]), axes[0])
-    return primitive
-
-
-_own_p = _same_for_each("is_active", jnp.ones_like, lambda value: value)
-_zeros_p = _same_for_each("zeros_like_lanes", jnp.zeros_like, lambda value: _zeros_p.bind(value))
+    """Return zeros; under `jax.vmap`, one for each lane of t (`jnp.zeros_like` has none): a value with
+    batched tangents has to be batched itself."""
+    return jnp.where(t == t, 0.0, 0.0).astype(t.dtype)

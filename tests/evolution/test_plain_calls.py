@@ -1,6 +1,7 @@
 """Solves without outlined programs (`dvax._jax`): on a JAX that is faster by itself, and on one
 without the interfaces that they are built from, every answer and every derivative stays the same."""
 
+import subprocess
 import sys
 
 import jax
@@ -74,7 +75,7 @@ def test_newer_releases_of_jax_get_plain_programs(monkeypatch):
     # There the attributes make programs slower, and abort the compiler on some loops.
     for version in [(0, 12, 0), (0, 13, 0), (1, 0, 0)]:
         monkeypatch.setattr(jax, "__version_info__", version)
-        assert _jax._choose() is _jax._plain
+        assert _jax._choose_outlined() is _jax._plain
 
 
 @pytest.mark.skipif(not _jax.OUTLINES, reason="on this JAX programs are plain anyway")
@@ -85,7 +86,7 @@ def test_programs_are_plain_where_an_interface_is_absent(monkeypatch, absent):
     monkeypatch.setitem(sys.modules, absent, None)
     parent, _, last = absent.rpartition(".")
     monkeypatch.delattr(sys.modules[parent], last)
-    assert _jax._choose() is _jax._plain
+    assert _jax._choose_outlined() is _jax._plain
 
 
 @pytest.mark.parametrize("way", ["fixed", "vmap"])
@@ -94,3 +95,26 @@ def test_the_attributes_are_set_where_outlines_says_so(way):
     text = jax.jit(run).lower(3.0).compile().as_text()
     outlined = 'inlineable="false",xla_cpu_small_call="true"' in text
     assert outlined == _jax.OUTLINES
+
+
+def test_a_solve_works_where_no_unstable_interface_is_left():
+    program = """
+import sys
+for name in ("outlined", "forward_only"):
+    sys.modules["dvax._jax." + name] = None
+import jax
+del jax.monitoring.register_event_duration_secs_listener
+import dvax
+import dvax._jax
+assert not dvax._jax.OUTLINES
+problem = dvax.Problem(
+    A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+    f=lambda t, x, u, args: 3.0 - 0.5 * x - u, h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+)
+sol = dvax.solve(problem, -1.0, 0.0, 2.0)
+forward = jax.jvp(lambda x: dvax.solve(problem, x, 0.0, 2.0, adjoint="forward").xs[-1], (-1.0,), (1.0,))
+print(f"{float(sol.xs[-1]):.5f} {float(forward[0]):.5f}", sol.stats["compile_time"] > 0)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    # What is traced is timed all the same.
+    assert done.stdout == "1.83609 1.83609 True\n", done.stderr

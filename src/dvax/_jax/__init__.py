@@ -2,7 +2,7 @@
 
 `outlined` compiles small programs as one function of the processor where JAX does not do so itself
 (before 0.12); elsewhere, and where an interface that it needs is absent, it is a plain call.
-`OUTLINES` says which.
+`OUTLINES` says which. `forward_only` only improves an error; without it, values are the same.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,20 @@ def _plain(run: Callable[..., Any], *args: Any, large: Any = (), transposable: b
     return run(*args, *large)
 
 
-def _choose() -> Callable[..., Any]:
+def _identity(tree: Any) -> Any:
+    """Return the same values."""
+    return tree
+
+
+def _choose_forward_only() -> Callable[[Any], Any]:
+    try:
+        from .forward_only import forward_only
+    except (ImportError, AttributeError):
+        return _identity
+    return forward_only
+
+
+def _choose_outlined() -> Callable[..., Any]:
     """Return the outlined call where it is of use and can be built, and the plain one elsewhere."""
     if jax.__version_info__[:2] >= _FASTER_WITHOUT:
         return _plain
@@ -32,7 +45,9 @@ def _choose() -> Callable[..., Any]:
     return outlined
 
 
-outlined: Callable[..., Any] = _choose()
+outlined: Callable[..., Any] = _choose_outlined()
+
+forward_only: Callable[[Any], Any] = _choose_forward_only()
 
 OUTLINES = outlined is not _plain
 """Whether small programs are compiled as one function at the request of dvax."""

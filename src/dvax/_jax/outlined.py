@@ -44,11 +44,11 @@ _MAX_PACKED = 10**6
 _PACKABLE = tuple(map(np.dtype, "bool int32 int64 uint32 float32 float64".split()))
 
 _OTHERS = frozenset(
-    "abs add add_any and any_lane bitcast_convert_type ceil clamp concatenate convert_element_type "
-    "copy div eq expand_dims floor ge gt integer_pow iota is_finite largest_of_lanes le lt max "
-    "min mul ne neg nextafter not or is_active pad rem reshape rev round rsqrt select_n shift_left "
+    "abs add add_any and bitcast_convert_type ceil clamp concatenate convert_element_type "
+    "copy div eq expand_dims floor ge gt integer_pow iota is_finite le lt max "
+    "min mul ne neg nextafter not or pad rem reshape rev round rsqrt select_n shift_left "
     "shift_right_arithmetic shift_right_logical sign slice split sqrt square squeeze stack sub "
-    "transpose xor zeros_like_lanes".split()
+    "transpose xor".split()
 )
 _REDUCTIONS = "argmax argmin reduce_and reduce_max reduce_min reduce_or reduce_sum".split()
 _COSTLY = frozenset(
@@ -59,7 +59,10 @@ _PARTS = {"dynamic_slice": None, "gather": None, "dynamic_update_slice": 1, "sca
 """Operations on a part of an array, which itself may be of any size. The part is the result (None) or
 the argument of this number."""
 _FREE = ("broadcast_in_dim", "stop_gradient", "reshard")
-_NESTED = "jit pjit closed_call custom_jvp_call custom_vjp_call remat2 cond while scan".split()
+_NESTED = frozenset(
+    "jit pjit closed_call custom_jvp_call custom_vjp_call custom_vmap_call remat2 cond scan "
+    "while".split()
+)
 
 
 def outlined(run: Callable[..., Any], *args: Any, large: Any = ()) -> Any:

@@ -17,6 +17,8 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from .._jax.compile_clock import listen
+from .._jax.messages import is_equinox_check
 from ..errors import InputError, InputProblem
 from .integrate import Options, integrate
 from .results import RESULTS
@@ -42,7 +44,7 @@ def compiled(setup: Setup, ts: Any, options: Options) -> tuple[Solution, bool | 
         # One look, through NumPy: through JAX it would be a program of its own.
         reached = bool(np.asarray(reached)) if _tree.is_concrete(reached) else reached
     except jax.errors.JaxRuntimeError as error:
-        if "_EquinoxRuntimeError" in str(error):
+        if is_equinox_check(error):
             # A check within f or h (`eqx.error_if`) is only quoted where Equinox compiles.
             eqx.filter_jit(integrate)(setup, ts, options)
         raise
@@ -88,15 +90,13 @@ class _Clock(threading.local):
 _clock = _Clock()
 
 
-def _compiled_for(event: str, duration_secs: float, **_: Any) -> None:
-    if event in _COMPILING:
-        _clock.compiling += duration_secs
+def _add(stage: str, seconds: float) -> None:
+    # The seconds of tracing are measured by `_traced`.
+    if stage != "trace":
+        _clock.compiling += seconds
 
 
-_COMPILING = tuple(
-    f"/jax/core/compile/{part}_duration" for part in ("jaxpr_to_mlir_module", "backend_compile")
-)
-jax.monitoring.register_event_duration_secs_listener(_compiled_for)
+listen(_add)
 
 
 def _traced(numbers: list[Any], kind: _Kind) -> tuple[list[Any], jax.Array, _tree.Static]:

@@ -12,7 +12,7 @@ from jax import lax
 
 from .. import _tree
 from .._failure import nan_derivatives_where
-from .._jax import outlined
+from .._jax import forward_only, outlined
 from ..vi import certify
 from . import excursions, implicit, picard, reverse
 from .closures import closure_convert
@@ -25,7 +25,6 @@ from .control import (
     step_count,
 )
 from .flow import Flow
-from .forward import forward_only
 from .implicit import Implicit
 from .loop import Loop, Record, Saved, State
 from .method import ETD2RK, AbstractMethod

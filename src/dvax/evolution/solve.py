@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree, _user_code
+from .._jax.messages import is_reverse_only
 from .._tree import Tree
 from ..errors import DifferentiationError, InputError, InputProblem
 from ..problem import Problem
@@ -242,8 +243,7 @@ def _differentiably(
     except jax.errors.UnexpectedTracerError as error:
         raise _user_code.leaked(error) from error
     except (TypeError, ValueError) as error:
-        forward = "forward-mode autodiff" in str(error) or "custom_vjp" in str(error)
-        if options.adjoint == "reverse" and forward:
+        if options.adjoint == "reverse" and is_reverse_only(error):
             raise DifferentiationError(
                 'dvax.solve(adjoint="reverse") cannot be differentiated forward (jax.jvp, '
                 'jax.jacfwd). Pass adjoint="forward": the loop that stores steps for the reverse '

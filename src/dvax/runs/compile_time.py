@@ -3,10 +3,8 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-import jax.monitoring
+from .._jax.compile_clock import listen
 
-_EVENTS = "/jax/core/compile/"
-_HANDED_OVER = _EVENTS + "jaxpr_to_mlir_module_duration"
 # The time loop takes 0.2 s to write down for the compiler, a single operation 0.01 s.
 _LARGE = 0.05
 _spent = 0.0
@@ -18,7 +16,7 @@ def compile_seconds() -> float:
     """Seconds spent on compilation since the first call of this function."""
     global _listening
     if not _listening:
-        jax.monitoring.register_event_duration_secs_listener(_add)
+        listen(_add)
         _listening = True
     return _spent
 
@@ -46,10 +44,9 @@ def announced(announce: Callable[[], None]) -> Iterator[None]:
         _announce = None
 
 
-def _add(event: str, duration_secs: float, **_: str | int) -> None:
+def _add(stage: str, seconds: float) -> None:
     global _spent, _announce
-    if event.startswith(_EVENTS):
-        _spent += duration_secs
-    if event == _HANDED_OVER and duration_secs > _LARGE and _announce is not None:
+    _spent += seconds
+    if stage == "lower" and seconds > _LARGE and _announce is not None:
         call, _announce = _announce, None
         call()

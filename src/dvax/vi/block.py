@@ -5,8 +5,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.extend.core import Primitive
-from jax.interpreters import batching, mlir
+from jax.custom_batching import custom_vmap
 
 _SMALL = 32
 """Up to so many unknowns a block is not cut out: the whole matrix is factorised."""
@@ -15,17 +14,14 @@ _SIZES = 8
 """A compiled program has arrays of fixed size, so a block is cut out in one of so many sizes."""
 
 
+@custom_vmap
 def solve_block(matrix: jax.Array, free: jax.Array, right: jax.Array) -> jax.Array:
-    """d with M_II d_I = right_I for the free unknowns I, and dᵢ = rightᵢ for the others.
+    """Return d with M_II d_I = right_I for the free unknowns I, and dᵢ = rightᵢ for the others.
 
     By LU with partial pivoting; infinite or NaN where the block is singular. The cost is that of a
     block of the smallest of eight sizes that holds the free unknowns; for a batch (by `jax.vmap`), of
     one that holds those of each of its problems. No derivatives: it serves inside iterations.
     """
-    return _solve_block_p.bind(matrix, free, right)
-
-
-def _solve_block(matrix: jax.Array, free: jax.Array, right: jax.Array) -> jax.Array:
     n = matrix.shape[-1]
     if n <= _SMALL:
         return _whole(matrix, free, right)
@@ -34,6 +30,16 @@ def _solve_block(matrix: jax.Array, free: jax.Array, right: jax.Array) -> jax.Ar
     which = jnp.searchsorted(jnp.asarray(sizes[:-1]), most)
     branches = [partial(_cut, size) for size in sizes[:-1]] + [_whole]
     return lax.switch(which, branches, matrix, free, right)
+
+
+@solve_block.def_vmap
+def _(size: int, batched: list[bool], *given: jax.Array) -> tuple[jax.Array, bool]:
+    # One block size for the whole batch: `lax.switch` on one for each would compute all of them.
+    full = [
+        x if own else jnp.broadcast_to(x, (size, *x.shape))
+        for x, own in zip(given, batched, strict=True)
+    ]
+    return solve_block(*full), True
 
 
 def _whole(matrix: jax.Array, free: jax.Array, right: jax.Array) -> jax.Array:
@@ -60,20 +66,3 @@ def _kept(matrix: jax.Array, inside: jax.Array) -> jax.Array:
 
 def _solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
     return jnp.linalg.solve(matrix, right[..., None])[..., 0]
-
-
-def _batched(given: tuple, axes: tuple) -> tuple[jax.Array, int]:
-    """As one batch with one size: with a choice for each, every size would be computed for all."""
-    count = next(x.shape[axis] for x, axis in zip(given, axes, strict=True) if axis is not None)
-    full = [
-        jnp.broadcast_to(x, (count, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
-        for x, axis in zip(given, axes, strict=True)
-    ]
-    return _solve_block_p.bind(*full), 0
-
-
-_solve_block_p = Primitive("solve_block")
-_solve_block_p.def_impl(jax.jit(_solve_block))
-_solve_block_p.def_abstract_eval(lambda matrix, free, right: right)
-mlir.register_lowering(_solve_block_p, mlir.lower_fun(_solve_block, multiple_results=False))
-batching.primitive_batchers[_solve_block_p] = _batched

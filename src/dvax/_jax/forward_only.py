@@ -1,4 +1,4 @@
-"""A loop that carries tangents along stores no steps, and says so where it is asked for others."""
+"""The identity, which refuses to be transposed."""
 
 from typing import Any
 
@@ -6,12 +6,11 @@ import jax.tree_util as jtu
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from .._tree import Tree
 from ..errors import DifferentiationError
 
 
-def forward_only(tree: Tree) -> Tree:
-    """The same values; asking for their reverse derivative says what to do instead.
+def forward_only(tree: Any) -> Any:
+    """Return the same values; their reverse derivative raises an error that says what to do instead.
 
     Without it the error would come from the loop, after `solve` has returned, and name neither.
     """
@@ -26,7 +25,7 @@ def _refuse(cotangent: Any, x: Any) -> Any:
     )
 
 
-# The identity, linear forward and without a transpose.
+# Linear, with a forward rule and without a transpose.
 _forward_only = Primitive("forward_only")
 _forward_only.def_impl(lambda x: x)
 _forward_only.def_abstract_eval(lambda x: x)
