@@ -36,7 +36,7 @@ def test_a_smooth_defect_is_seen_in_its_size(name):
             PROBLEM, x0, 0.0, 4.0, p, dt=4.0 / steps, method=method, dense=True, measure=True,
             max_steps=200,
         )  # fmt: skip
-        flow = sol.setup.flow()
+        flow = sol.flow
 
         def size(t, flow=flow, sol=sol):
             x, x_dot = jax.jvp(lambda s: sol.evaluate(s)[0], (t,), (jnp.ones_like(t),))

@@ -20,9 +20,9 @@ from .. import _tree
 from .._jax.compile_clock import listen
 from .._jax.messages import is_equinox_check
 from ..errors import InputError, InputProblem
-from .integrate import Options, integrate
+from .integrate import integrate
 from .results import RESULTS
-from .setup import Setup
+from .setup import Options, Setup
 from .solution import Solution
 
 

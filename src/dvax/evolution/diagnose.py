@@ -17,7 +17,7 @@ Each cause is tested at the last state (t, x) that was reached, on the functions
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.flatten_util
@@ -35,8 +35,10 @@ from .nonfinite import first_bad
 from .piecewise.method import PiecewiseLinear
 from .results import RESULTS
 from .runge_kutta import DormandPrince
-from .setup import Setup
 from .stopped import LAST_STEPS, Diagnosis, Stop
+
+if TYPE_CHECKING:
+    from .solution import Solution
 
 _LOOSEST = 0.01
 """The loosest rtol that is ever named as a fix."""
@@ -57,16 +59,19 @@ _CHECKED = {name: f"Check {name} there" for name in ("K", "h", "f")} | {
 }
 
 
-def failure(setup: Setup, stats: dict[str, Any], result: RESULTS, solution: Any) -> SolveError:
-    """The `SolveError` of a run that stopped: what happened, the cause, how far it came, what helps."""
-    found = diagnose(setup, stats, result)
+def failure(solution: "Solution") -> SolveError:
+    """Return the `SolveError` of a run that stopped: what happened, the cause, how far it came, what
+    helps."""
+    stats, result = solution.stats, solution.result
+    found = diagnose(solution)
     reached = f"Stopped at t = {float(stats['t']):.17g} after {int(stats['steps'])} steps."
     parts = ("" if found.whole else RESULTS[result], found.cause, reached)
     return SolveError(" ".join(part for part in parts if part), solution, found.fixes)
 
 
-def diagnose(setup: Setup, stats: dict[str, Any], result: RESULTS) -> Diagnosis:
-    """The cause of a failure that the functions themselves show; see the module."""
+def diagnose(solution: "Solution") -> Diagnosis:
+    """Return the cause of a failure that the functions themselves show; see the module."""
+    setup, stats, result = solution.setup, solution.stats, solution.result
     t, step = float(stats["t"]), float(stats["next_dt"])
     t0, t1 = float(setup.setting["t0"]), float(setup.setting["t1"])
     if not math.isfinite(step) or step <= 0:
@@ -77,7 +82,7 @@ def diagnose(setup: Setup, stats: dict[str, Any], result: RESULTS) -> Diagnosis:
     if isinstance(setup.method, PiecewiseLinear):
         step = (t - t0) / max(steps, 1) or t1 - t0  # its steps are as long as its events are apart
     stop = Stop(
-        setup, setup.flow(), t, stats["x"], min(float(step), max(t1 - t, 0.0)), steps,
+        setup, solution.flow, t, stats["x"], min(float(step), max(t1 - t, 0.0)), steps,
         steps + rejected,
     )  # fmt: skip
     causes: list[Callable[[Stop], Diagnosis]] = []

@@ -1,6 +1,6 @@
 """The fallback: an implicit method of Diffrax on x' = Ax + f̃(t, x) as a whole."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -12,7 +12,9 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from .flow import Flow
+from .outcome import Outcome, Saved
 from .results import RESULTS
+from .setup import Options, Setup
 from .stepper import one_sided_time
 
 _SPLIT = (diffrax.KenCarp3, diffrax.KenCarp4, diffrax.KenCarp5)
@@ -64,31 +66,16 @@ class Implicit(eqx.Module):
             )
 
 
-class Outcome(NamedTuple):
-    """How a run went: the saved times and states, infinite and NaN where they were not reached."""
-
-    ts: jax.Array
-    xs: Tree
-    steps: jax.Array
-    rejected: jax.Array
-    result: RESULTS
-
-
-def run(
+def by_implicit_steps(
+    setup: Setup,
     method: Implicit,
     flow: Flow,
-    x0: Tree,
     stops: jax.Array,
     ts: jax.Array | None,
-    controller: diffrax.AbstractStepSizeController,
-    length: Any,
-    max_steps: int,
-    adjoint: str,
-    progress: bool,
+    options: Options,
 ) -> Outcome:
-    """From the first of the `stops` to the last, the first step of this `length`."""
-
-    begin, end = stops[0], stops[-1]
+    """Run implicit steps from the first stop to the last."""
+    begin, end, x0, first_step = stops[0], stops[-1], setup.x0, setup.number("dt0")
     first, last = (one_sided_time(begin, end, theta, (begin, end)) for theta in (0.0, 1.0))
 
     def law(t: Any, x: Tree, _: Any) -> Tree:
@@ -109,16 +96,18 @@ def run(
         method.solver,
         begin,
         end,
-        length,
+        first_step,
         x0,
         saveat=diffrax.SaveAt(t1=True) if ts is None else diffrax.SaveAt(ts=ts),
-        stepsize_controller=controller,
+        stepsize_controller=_controller(setup.number("rtol"), setup.number("atol"), stops),
         adjoint=diffrax.ForwardMode()
-        if adjoint == "forward"
+        if options.adjoint == "forward"
         else diffrax.RecursiveCheckpointAdjoint(),
-        max_steps=max_steps,
+        max_steps=options.max_steps,
         throw=False,
-        progress_meter=diffrax.TextProgressMeter() if progress else diffrax.NoProgressMeter(),
+        progress_meter=diffrax.TextProgressMeter()
+        if options.progress
+        else diffrax.NoProgressMeter(),
     )
     assert found.ts is not None
     # An end that is no number has no steps before it.
@@ -132,13 +121,21 @@ def run(
     out_of_steps = found.result == diffrax.RESULTS.max_steps_reached
     result = RESULTS.where(out_of_steps, RESULTS.max_steps, RESULTS.implicit_unsolved)
     result = RESULTS.where(fine, RESULTS.successful, result)
-    return Outcome(
-        jnp.where(reached, found.ts, jnp.inf), xs, found.stats["num_accepted_steps"],
-        found.stats["num_rejected_steps"], result,
-    )  # fmt: skip
+    times = jnp.where(reached, found.ts, jnp.inf)
+    # What is known of a run that failed is the last saved time that it reached.
+    count = jnp.sum(reached)
+    row = jnp.maximum(count - 1, 0)
+    stats = {
+        "steps": found.stats["num_accepted_steps"],
+        "rejected": found.stats["num_rejected_steps"],
+        "t": jnp.where(count > 0, times[row], begin),
+        "x": jtu.tree_map(lambda leaf, x: jnp.where(count > 0, leaf[row], x), xs, x0),
+        "next_dt": first_step,
+    }
+    return Outcome(Saved(times, xs), stats, result, None)
 
 
-def controller(rtol: Any, atol: Any, stops: jax.Array) -> diffrax.AbstractStepSizeController:
+def _controller(rtol: Any, atol: Any, stops: jax.Array) -> diffrax.AbstractStepSizeController:
     """Steps that adapt and end on the stops."""
     # The error of a stiff step says little about the next one: Diffrax's advice.
     shortest = 8 * jnp.finfo(stops.dtype).eps * jnp.max(jnp.abs(stops))

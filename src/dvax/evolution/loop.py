@@ -21,6 +21,7 @@ from .checkpoints import Checkpoints
 from .control import AbstractController
 from .extent import Extent
 from .flow import Flow
+from .outcome import Record, Saved
 from .results import RESULTS
 from .stepper import Propagators, SolverState, Stepper, interpolate, local, one_sided_time
 from .time_derivatives import (
@@ -30,33 +31,6 @@ from .time_derivatives import (
     velocity,
     zero_with_tangent,
 )
-
-
-class Record(NamedTuple):
-    """What is needed to evaluate a step anywhere inside: x₀ and the stage polynomial."""
-
-    start: jax.Array
-    length: jax.Array
-    x0: Tree
-    coefficients: tuple[Tree, ...]
-
-
-class Saved(NamedTuple):
-    """The state at a saved time, and what has disturbed it.
-
-    `impulse` = (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) up to the end of the step that the time lies in, so
-    that x_h is the exact solution of the system with a disturbance of that size; `settled` is what
-    both were at the start of that step: what has surely acted by then. `extent` says where x_h and u_h
-    have been from the beginning to the end of that step, where it was asked for. None where nothing
-    is measured. `guess` is where the solver of the law may begin.
-    """
-
-    t: Any
-    x: Tree
-    impulse: tuple[Any, Any] | None = None
-    settled: tuple[Any, Any] | None = None
-    extent: Extent | None = None
-    guess: Tree | None = None
 
 
 class State(NamedTuple):

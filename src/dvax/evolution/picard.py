@@ -17,13 +17,17 @@ import jax.tree_util as jtu
 from jax import lax
 
 from .. import _tree
+from .._jax import forward_only
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..generators import AbstractGenerator, AbstractPropagator
-from .control import clip_to_stop
+from .control import clip_to_stop, root_mean_squares
 from .extent import Extent
-from .loop import Record, Saved
+from .flow import Flow
+from .method import ETD2RK
+from .outcome import Outcome, Record, Saved, end_alone, ended, with_tangents
 from .results import RESULTS
+from .setup import Options, Setup
 from .stepper import Stepper, interpolate, one_sided_time
 from .time_derivatives import zero_with_tangent
 
@@ -311,6 +315,63 @@ class Run(eqx.Module):
         # The state at the end of a window moves with it.
         time = time + zero_with_tangent(jnp.where(met, state.t, 0.0))
         return Saved(jnp.where(reached, time, jnp.inf), x, impulse, settled, state.extent)
+
+
+def by_windows(
+    setup: Setup,
+    method: Picard,
+    flow: Flow,
+    stops: jax.Array,
+    ts: jax.Array | None,
+    options: Options,
+) -> Outcome:
+    """Run windows from the first stop to the last."""
+    x0 = setup.x0
+    growth = flow.generator.growth(flow.state_space(x0)) if flow.enclosed else None
+    ends = stops[0], stops[-1]
+    stepper = Stepper(
+        ETD2RK(), flow, True, False, None, options.track_bounds, True, ends, None, growth
+    )
+    rtol, atol, horizon = map(setup.number, ("rtol", "atol", "horizon"))
+    sizes = jax.vmap(
+        lambda *parts: jnp.stack(root_mean_squares(setup.problem.spaces(x0)[0])(*parts))
+    )
+
+    def size(error: Any, before: Any, after: Any) -> Any:
+        """What the defect amounts to, in tolerances: the mean of the steps, since a kink is in one."""
+        scale = atol + rtol * jnp.maximum(sizes(before), sizes(after))
+        ratio = horizon * jnp.max(jnp.mean(sizes(error) / scale, axis=0))
+        return jnp.where(jnp.isnan(ratio), jnp.inf, ratio)
+
+    def matters(change: Any, X: Any, value: Any) -> Any:
+        """Whether f̃ still changes by more than rounding, and by a part of the tolerance that shows
+        beside the defect."""
+        worst = lambda v: jnp.max(sizes(v))  # noqa: E731
+        rounding = 20 * jnp.finfo(setup.dtype).eps * worst(value)
+        more = ~(worst(change) <= rounding)
+        return more if options.fixed else more & ~(size(change, X, X) <= 0.01)
+
+    first = setup.number("dt") if options.fixed else setup.number("dt0")
+    windows = max(1, -(-options.max_steps // method.nodes))
+    if options.fixed:
+        # Each stretch between two knots rounds up to whole windows.
+        windows += stops.shape[0]
+    run = Run(
+        method, stepper, stops, options.fixed, first, size, matters,
+        windows, options.dense,
+    )  # fmt: skip
+    saved, end = forward_only(run.solve(x0, ts))
+    complete = end.t >= stops[-1]
+    rows = end_alone(end, complete, stops[-1], True) if saved is None else saved
+    if ts is not None:
+        ends = lax.stop_gradient((stops[0], stops[-1]))
+        rows = with_tangents(rows, ts, x0, flow, ends, False)
+    stats = {
+        "steps": end.steps, "rejected": end.refused, "t": end.t, "x": end.x,
+        "next_dt": end.length / method.nodes, "windows": end.windows, "sweeps": end.sweeps,
+        "contraction": end.contraction,
+    }  # fmt: skip
+    return Outcome(rows, stats, ended(end.result, complete), end.records)
 
 
 def _pieces(value: Tree) -> tuple[Tree, Tree]:

@@ -1,7 +1,6 @@
-"""What was asked of a solve, and the flow that it settles."""
+"""The arguments of a solve."""
 
-import dataclasses
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,18 +8,13 @@ import jax.tree_util as jtu
 
 from .._tree import Tree
 from ..problem import Problem
-from ..sets import AbstractSet
-from ..vi import AbstractSolver, Auto, analyse, independent
-from . import written
-from .chords import NoEnclosure, constant
-from .faces import faces
-from .flow import Flow, slope
-from .implicit import Implicit
-from .linearised import Nothing
-from .medians import Medians
-from .method import AbstractMethod
-from .picard import Picard
-from .piecewise.method import PiecewiseLinear
+from ..vi import AbstractSolver
+
+if TYPE_CHECKING:
+    from .implicit import Implicit
+    from .method import AbstractMethod
+    from .picard import Picard
+    from .piecewise.method import PiecewiseLinear
 
 
 class Setup(NamedTuple):
@@ -34,7 +28,7 @@ class Setup(NamedTuple):
     x0: Tree
     args: Any
     setting: dict[str, Any]
-    method: AbstractMethod | Implicit | Picard | PiecewiseLinear
+    method: "AbstractMethod | Implicit | Picard | PiecewiseLinear"
     vi_solver: AbstractSolver
     moduli: dict[str, Any]
 
@@ -60,73 +54,21 @@ class Setup(NamedTuple):
             forward &= jnp.min(jnp.asarray(ts, self.dtype)) >= number("t0")
         return forward & positive & tolerances
 
-    def flow(self) -> Flow:
-        """The reduced map, with what the code of f, h and K proves about the law put to use."""
-        problem, x0, vi_solver = self.problem, self.x0, self.vi_solver
-        args = as_arrays(self.args)
-        t0 = self.number("t0")
-        like = problem.zero_control(x0)
-        K = problem.set_at(t0, args)
-        frozen = problem.frozen(t0, x0, args)
-        structure = analyse(frozen, like)
-        intervals = structure.pointwise and structure.affine and K.intervals(like) is not None
-        closed = intervals or (structure.isotropic and not isinstance(like, tuple))
-        solver = vi_solver
-        if isinstance(vi_solver, Auto):
-            solver = vi_solver.choose(frozen, K, like)
-        direct = closed and isinstance(vi_solver, Auto)
-        operator = problem.operator(args)
-        solved = None
-        if not closed and isinstance(vi_solver, Auto) and structure.affine and written.fits(like):
-            solved = self._written_out(frozen, K, like)
-        reciprocal = None
-        if direct and independent(lambda t, x: slope(problem, operator, t, x, args), t0, x0):
-            reciprocal = jtu.tree_map(jnp.reciprocal, slope(problem, operator, t0, x0, args))
-            if structure.isotropic:
-                # One number a part: read from memory once, not once an entry.
-                reciprocal = jtu.tree_map(lambda leaf: leaf.ravel()[0], reciprocal)
-        flow = Flow(
-            problem, args, problem.generator(args), operator, solver, direct or solved is not None,
-            reciprocal, False, self._tolerance(), self.moduli.get("gamma"), self.moduli.get("L_F"),
-            solved,
-        )  # fmt: skip
-        if isinstance(self.method, AbstractMethod) and self.method.explicit_in_A:
-            flow = dataclasses.replace(flow, linear=Nothing(flow.generator))
-        line = not isinstance(self.method, Implicit) and self.method.degree <= 1
-        if direct and intervals and line and _can_enclose(flow, t0, x0):
-            return dataclasses.replace(flow, enclosed=True)
-        return flow
 
-    def _written_out(
-        self, frozen: Any, K: AbstractSet, like: Tree
-    ) -> written.AbstractWritten | None:
-        """The law written out, where its matrix does not depend on t and x."""
-        problem, x0, args, t0 = self.problem, self.x0, as_arrays(self.args), self.number("t0")
-        push = lambda t, x: jax.jacfwd(problem.frozen(t, x, args))(like)  # noqa: E731
-        if K.intervals(like) is None or not independent(push, t0, x0):
-            return None
-        flat = jnp.zeros_like(like).ravel()
-        M = jax.jacfwd(lambda v: frozen(v.reshape(like.shape)).ravel())(flat)
-        return Medians(M) if like.size == 2 else faces(M)
+class Options(NamedTuple):
+    """What a time loop is compiled for, apart from shapes; see `dvax.solve`."""
 
-    def _tolerance(self) -> jax.Array:
-        """Of the law: a thousandth of what the defect may be, and no less than rounding allows."""
-        floor = 100 * jnp.finfo(self.dtype).eps
-        defect = self.number("atol") + self.number("rtol")
-        adaptive = 1e-3 * defect / jnp.maximum(1.0, self.number("horizon"))
-        fixed = jnp.isnan(self.number("dt"))
-        return jnp.maximum(jnp.where(fixed, adaptive, 1e-12), floor)
+    fixed: bool
+    measure: bool
+    track_bounds: bool
+    check_finite: bool
+    dense: bool
+    max_steps: int
+    adjoint: str
+    progress: bool
 
 
 def as_arrays(args: Any) -> Any:
-    """Every Python number with a point as the array that f and h are always handed; integers and
-    flags stay what they are."""
+    """Return args with Python floats as the arrays that f and h always get; integers and flags stay
+    what they are."""
     return jtu.tree_map(lambda v: jnp.asarray(v) if isinstance(v, float) else v, args)
-
-
-def _can_enclose(flow: Flow, t0: jax.Array, x0: Tree) -> bool:
-    try:
-        jax.eval_shape(lambda t, x: flow.enclosure(constant(t), constant(x)), t0, x0)
-    except NoEnclosure:
-        return False
-    return True

@@ -12,10 +12,12 @@ from .._tree import Tree
 from ..errors import InputError, InputProblem
 from .diagnose import failure
 from .extent import Extent
+from .flow import Flow
 from .implicit import Implicit
-from .loop import Record
+from .outcome import Record
 from .piecewise.method import PiecewiseLinear
 from .piecewise.trajectory import Trajectory, signs
+from .plan import Plan
 from .regimes import Regimes, regimes
 from .results import RESULTS
 from .setup import Setup
@@ -46,7 +48,8 @@ class Solution(eqx.Module):
       kinks or read u at saved times), and where the run stands: t, x and the next step; with
       `compile_time` and `run_time` in seconds, unless the solve is part of a larger compiled program;
     - `result`: `dvax.RESULTS.successful`, or what went wrong;
-    - `setup`: what was asked; `records`: the steps, where `dense=True` kept them.
+    - `plan`: what the code of f, h and K proved about the law (None with `PiecewiseLinear`);
+    - `setup`: the arguments; `records`: the steps, where `dense=True` kept them.
 
     ```python
     >>> import dvax
@@ -78,7 +81,14 @@ class Solution(eqx.Module):
     result: RESULTS
     records: Record | Trajectory | None
     enclosed: bool = eqx.field(static=True)
+    plan: Plan | None = eqx.field(static=True)
     setup: Setup
+
+    @property
+    def flow(self) -> Flow:
+        """The reduced map f̃ of the run, by what its plan proved."""
+        plan = Plan.of(self.setup) if self.plan is None else self.plan
+        return plan.flow(self.setup)
 
     def evaluate(self, t: Any) -> tuple[Tree, Tree]:
         """(x(t), u(t)) at any time of a solve made with `dense=True`.
@@ -101,7 +111,7 @@ class Solution(eqx.Module):
             self._check_inside(t, records.start[0], records.end)
             x, y = records.at(t)
             x0, u0 = self.setup.x0, self.us[0]
-            u = self.setup.flow().operator.inverse(y.reshape(u0.shape).astype(u0.dtype))
+            u = self.flow.operator.inverse(y.reshape(u0.shape).astype(u0.dtype))
             return x.reshape(jnp.shape(x0)).astype(self.xs.dtype), u
         if _tree.is_concrete(t):
             return self._within_step(t)
@@ -114,7 +124,7 @@ class Solution(eqx.Module):
 
     def _within_step(self, t: Any) -> tuple[Tree, Tree]:
         """x and u at t, from the record of the step that t lies in."""
-        flow, records = self.setup.flow(), self.records
+        flow, records = self.flow, self.records
         assert isinstance(records, Record)
         t = jnp.asarray(t, records.start.dtype)
         starts = records.start
@@ -177,7 +187,7 @@ class Solution(eqx.Module):
             )
         if isinstance(self.records, Trajectory):
             return Regimes(*signs(self.records))
-        flow = self.setup.flow()
+        flow = self.flow
         x0, t0 = self.setup.x0, self.setup.number("t0")
         if flow.switches(t0, x0, flow.problem.zero_control(x0)) is None:
             raise InputError(
@@ -194,7 +204,7 @@ class Solution(eqx.Module):
     def raise_if_failed(self) -> "Solution":
         """This solution, or a `dvax.SolveError` that carries it."""
         if self.result != RESULTS.successful:
-            raise failure(self.setup, self.stats, self.result, self)
+            raise failure(self)
         return self
 
     def to_xarray(self) -> "xarray.Dataset":

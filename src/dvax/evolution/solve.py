@@ -27,14 +27,13 @@ from .compiled import compiled
 from .control import MAX_GROWTH
 from .diagnose import failure
 from .implicit import Implicit
-from .integrate import Options
 from .method import ETD2RK, AbstractMethod
 from .nonfinite import refuse_nonfinite_data
 from .picard import Picard
 from .piecewise.method import PiecewiseLinear
 from .piecewise.propagate import Limits, propagate
 from .results import RESULTS
-from .setup import Setup, as_arrays
+from .setup import Options, Setup, as_arrays
 from .solution import Solution
 
 _METHOD, _VI_SOLVER = ETD2RK(), Auto()
@@ -188,7 +187,7 @@ def solve(
             setup, times, Limits(options.max_steps, dense, options.track_bounds, progress)
         )
         if throw and solution.result != RESULTS.successful:
-            raise failure(solution.setup, solution.stats, solution.result, solution)
+            raise failure(solution)
         return solution
     solution, reached = _differentiably(setup, times, options)
     if reached is True and not dense:
@@ -204,7 +203,7 @@ def solve(
                 # Once more, keeping the last good state, to say where it went wrong.
                 solution = _trim(compiled(setup, times, options._replace(check_finite=True))[0])
             if throw:
-                raise failure(solution.setup, solution.stats, solution.result, solution)
+                raise failure(solution)
     return solution
 
 

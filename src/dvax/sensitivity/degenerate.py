@@ -74,7 +74,7 @@ def kinks(sol: Solution, *, tol: float = 1e-6) -> list[Kink]:
 
 
 def _switches(sol: Solution) -> bool:
-    flow, x0, t0 = sol.setup.flow(), sol.setup.x0, sol.setup.number("t0")
+    flow, x0, t0 = sol.flow, sol.setup.x0, sol.setup.number("t0")
     found = flow.switches(t0, x0, flow.problem.zero_control(x0))
     return found is not None and found.size > 0
 
@@ -82,7 +82,7 @@ def _switches(sol: Solution) -> bool:
 def _looked_at(sol: Solution, count: int) -> tuple[np.ndarray, np.ndarray]:
     """(times, switches at each of them)."""
     assert sol.records is not None
-    flow, method = sol.setup.flow(), sol.setup.method
+    flow, method = sol.flow, sol.setup.method
     steps = jtu.tree_map(lambda leaf: leaf[:count], sol.records)
     run = steps.start[0], steps.start[-1] + steps.length[-1]
     thetas = jnp.arange(_LOOKS, dtype=steps.start.dtype) / _LOOKS

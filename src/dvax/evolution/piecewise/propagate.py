@@ -130,6 +130,7 @@ def _solution(
         result=getattr(RESULTS, run.result),
         records=_trajectory(run) if limits.dense else None,
         enclosed=False,
+        plan=None,
         setup=setup,
     )  # fmt: skip
 

@@ -1,0 +1,117 @@
+"""What is settled before time runs: what the code of f, h and K proves, and the law's solver."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .._tree import Tree
+from ..vi import AbstractSolver, Auto, analyse, independent
+from . import written
+from .chords import NoEnclosure, constant
+from .faces import faces
+from .flow import Flow, slope
+from .implicit import Implicit
+from .linearised import Nothing
+from .medians import Medians
+from .method import AbstractMethod
+from .setup import Setup, as_arrays
+
+
+class Plan(NamedTuple):
+    """How a run solves its law, without any array: made once a run, and kept by its `Solution`.
+
+    - `closed_form`: the law is F(y) = ay − h(t, x, 0) and y = proj_K(h(t, x, 0)/a);
+    - `one_slope`: a is one number a part, so that it is read from memory once;
+    - `constant_slope`: a depends on neither t nor x;
+    - `small_box`: the law is affine on a box of a few unknowns, with a matrix that depends on neither t
+      nor x, and is solved by a formula;
+    - `solver`: the solver of the law that `dvax.vi.Auto` chose, None where the caller named one;
+    - `enclosed`: f̃ can be enclosed over a whole step, so that the defect is not sampled.
+    """
+
+    closed_form: bool
+    one_slope: bool
+    constant_slope: bool
+    small_box: bool
+    solver: AbstractSolver | None
+    enclosed: bool
+
+    @staticmethod
+    def of(setup: Setup) -> "Plan":
+        """Read the code of f, h and K, traced at the start of the run."""
+        problem, x0, args, t0 = setup.problem, setup.x0, as_arrays(setup.args), setup.number("t0")
+        like = problem.zero_control(x0)
+        if not isinstance(setup.vi_solver, Auto):
+            return Plan(False, False, False, False, None, False)
+        K, frozen = problem.set_at(t0, args), problem.frozen(t0, x0, args)
+        structure, is_box = analyse(frozen, like), K.intervals(like) is not None
+        solver = setup.vi_solver.choose(frozen, K, like)
+        intervals = structure.pointwise and structure.affine and is_box
+        if not intervals and (not structure.isotropic or isinstance(like, tuple)):
+            jacobian = lambda t, x: jax.jacfwd(problem.frozen(t, x, args))(like)  # noqa: E731
+            affine = structure.affine and is_box and written.fits(like)
+            small_box = affine and independent(jacobian, t0, x0)
+            return Plan(False, False, False, small_box, solver, False)
+        operator = problem.operator(args)
+        constant_slope = independent(lambda t, x: slope(problem, operator, t, x, args), t0, x0)
+        plan = Plan(True, structure.isotropic, constant_slope, False, solver, False)
+        line = not isinstance(setup.method, Implicit) and setup.method.degree <= 1
+        if intervals and line and _has_enclosure(plan.flow(setup), t0, x0):
+            return plan._replace(enclosed=True)
+        return plan
+
+    def flow(self, setup: Setup) -> Flow:
+        """Return the reduced map f̃ for the numbers of this call."""
+        problem, x0, args, t0 = setup.problem, setup.x0, as_arrays(setup.args), setup.number("t0")
+        operator, generator, method = problem.operator(args), problem.generator(args), setup.method
+        reciprocal = None
+        if self.closed_form and self.constant_slope:
+            reciprocal = jtu.tree_map(jnp.reciprocal, slope(problem, operator, t0, x0, args))
+            if self.one_slope:
+                reciprocal = jtu.tree_map(lambda leaf: leaf.ravel()[0], reciprocal)
+        explicit = isinstance(method, AbstractMethod) and method.explicit_in_A
+        return Flow(
+            problem=problem,
+            args=args,
+            generator=generator,
+            operator=operator,
+            solver=setup.vi_solver if self.solver is None else self.solver,
+            direct=self.closed_form or self.small_box,
+            reciprocal=reciprocal,
+            enclosed=self.enclosed,
+            tol=_tolerance(setup),
+            gamma=setup.moduli.get("gamma"),
+            L_F=setup.moduli.get("L_F"),
+            written=_small_box(setup) if self.small_box else None,
+            linear=Nothing(generator) if explicit else None,
+        )
+
+
+def _small_box(setup: Setup) -> written.AbstractWritten:
+    """Return the formula of an affine law on a box of a few unknowns."""
+    problem, x0, args, t0 = setup.problem, setup.x0, as_arrays(setup.args), setup.number("t0")
+    like = problem.zero_control(x0)
+    assert isinstance(like, jax.Array)
+    frozen = problem.frozen(t0, x0, args)
+    M = jax.jacfwd(lambda v: frozen(v.reshape(like.shape)).ravel())(jnp.zeros_like(like).ravel())
+    return Medians(M) if like.size == 2 else faces(M)
+
+
+def _tolerance(setup: Setup) -> jax.Array:
+    """Return the tolerance of the law: a thousandth of that of the defect, and no less than rounding
+    allows."""
+    floor = 100 * jnp.finfo(setup.dtype).eps
+    defect = setup.number("atol") + setup.number("rtol")
+    adaptive = 1e-3 * defect / jnp.maximum(1.0, setup.number("horizon"))
+    has_fixed_steps = ~jnp.isnan(setup.number("dt"))
+    return jnp.maximum(jnp.where(has_fixed_steps, 1e-12, adaptive), floor)
+
+
+def _has_enclosure(flow: Flow, t0: jax.Array, x0: Tree) -> bool:
+    try:
+        jax.eval_shape(lambda t, x: flow.enclosure(constant(t), constant(x)), t0, x0)
+    except NoEnclosure:
+        return False
+    return True
