@@ -44,7 +44,7 @@ $(READY): pyproject.toml $(LOCK)
 	@# where the environment tells Python to write no bytecode, or every start would take seconds.
 	@$(PY) -m pip install --quiet --no-deps --no-compile --requirement $(LOCK)
 	@$(PY) -m pip install --quiet --no-deps --no-build-isolation --editable .
-	@env -u PYTHONDONTWRITEBYTECODE $(PY) -c 'import dvax.cli, dvax.runs.driver, dvax.plots.report'
+	@env -u PYTHONDONTWRITEBYTECODE $(PY) -c 'import dvax.app.cli, dvax.app.runs.driver, dvax.app.plots.report'
 	@touch $@
 
 demo: $(READY) ## solve the rough contact strip; results and report in ./demo-run

@@ -20,7 +20,7 @@ print(json.dumps([ended, worked, usage.ru_maxrss, os.waitstatus_to_exitcode(stat
 """A process of its own between this one and the program: Linux counts the memory of whoever starts
 a process as that process's own peak, and this one holds arrays of 10⁶ points."""
 
-MAIN = "from dvax.cli import main; main()"
+MAIN = "from dvax.app.cli import main; main()"
 
 
 class Ended(NamedTuple):

@@ -10,8 +10,8 @@ from matplotlib.colors import ListedColormap
 from matplotlib.patches import Patch
 
 import dvax
+from dvax.app.plots.theme import REGIME_COLOURS, STILL_STYLE, still_axes
 from dvax.models import Thermostat
-from dvax.plots.look import REGIME_COLOURS, STILL_STYLE, still_axes
 
 jax.config.update("jax_enable_x64", True)
 FOLDER = Path(__file__).parent

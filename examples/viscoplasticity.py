@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import dvax
+from dvax.app.plots.panels import Curve, Panel, panels_picture
 from dvax.models import DuvautLions, VonMises
 from dvax.models.duvaut_lions import mandel
-from dvax.plots.panels import Curve, Panel, panels_picture
 
 jax.config.update("jax_enable_x64", True)
 FOLDER = Path(__file__).parent

@@ -34,7 +34,7 @@ if os.environ.get("HYPOTHESIS_PROFILE") != "thorough":
     # Every annotation of the library is checked at each call. The hook must stand
     # before the first import of dvax, hence here and not in a fixture. The application is left out: it
     # promises an answer to input of any type, and a checker would answer first.
-    application = {"__init__", "__main__", "runs", "plots", "cli"}
+    application = {"__init__", "app"}
     jaxtyping.install_import_hook(
         [
             f"dvax.{entry.stem}"

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.plots.synthetic import Recipe, write_run
+from tests.app.plots.synthetic import Recipe, write_run
 
 from dvax._figure_text import entry_text, figure_text
-from dvax.cli.run import _say_figures
-from dvax.plots import build_report
+from dvax.app.cli.run import _say_figures
+from dvax.app.plots import build_report
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64).filter(
     lambda v: v == 0 or 1e-290 < abs(v) < 1e290

@@ -99,7 +99,17 @@ CONTRACT = [
     "models.Traffic",
 ]
 
-ROOMS = ["spaces", "generators", "operators", "sets", "signals", "vi", "evolution", "models"]
+ROOMS = [
+    "spaces",
+    "generators",
+    "operators",
+    "sets",
+    "signals",
+    "vi",
+    "evolution",
+    "formats",
+    "models",
+]
 
 
 # Methods that Python or equinox calls once for every class of a family, each adding to the others.

@@ -29,6 +29,7 @@ FLOORS = {
     "sets": 0,
     "signals": 0,
     "_control_shape": 1,
+    "formats": 1,
     "vi": 1,
     "_knots": 1.5,
     "_switches": 1.5,
@@ -37,12 +38,9 @@ FLOORS = {
     "theory": 4,
     "sensitivity": 4,
     "models": 5,
-    "runs": 5,
-    "plots": 5,
     # The public names: `import dvax` is for those who live above the library.
     "": 5.5,
-    "cli": 6,
-    "__main__": 7,
+    "app": 6,
 }
 
 # Two rooms on one floor where one may look into the other, and why. Each pair must be in use.
@@ -50,7 +48,6 @@ NEIGHBOURS = {
     ("generators", "spaces"): "a growth bound ‖e^{At}‖ ≤ M e^{ωt} is a bound in a space's norm",
     ("operators", "spaces"): "self-adjoint and coercive are meant in a space's inner product",
     ("sets", "spaces"): "a projection is nearest in a space's norm",
-    ("runs", "models"): "a run is a model that a file describes",
     ("sensitivity", "theory"): "what a derivative predicts is shown beside what is certified",
 }
 
@@ -63,7 +60,7 @@ APPLICATION = {
 EXTRAS = {"clarabel", "meshio", "skfem"}
 # What the command line may load before it knows what is asked of it.
 LIGHT = {"typer", "rich"}
-APPLICATION_ROOMS = {"runs", "plots", "cli", "__main__"}
+COMMAND_LINE = "dvax.app.cli"
 
 
 class Import(NamedTuple):
@@ -183,10 +180,11 @@ def foreign(package: Path) -> list[str]:
         if top in {package.name, "__future__"} or top in sys.stdlib_module_names:
             continue
         here = room(importer)
-        if here in {"cli", "__main__", ""} and not deferred:
+        at_start = here == "" or importer in {"dvax.app", COMMAND_LINE}
+        if (at_start or importer.startswith(COMMAND_LINE + ".")) and not deferred:
             # The package's __init__ is loaded by the command line too.
             allowed, why = LIGHT, "the command line loads it at its start"
-        elif here in APPLICATION_ROOMS or deferred:
+        elif here == "app" or deferred:
             allowed, why = CORE | APPLICATION | EXTRAS, "it is not a declared dependency"
         else:
             allowed, why = CORE, "the library below the application needs the JAX stack alone"
@@ -275,13 +273,13 @@ def test_a_planted_foreign_import_is_seen(tmp_path: Path):
     house = plant(
         tmp_path,
         sets__box="import xarray",
-        runs__store="import requests",
-        cli__app="import jax",
+        app__runs__store="import requests",
+        app__cli__program="import jax",
         evolution__solution="def to_xarray():\n    import xarray",
         evolution__stepper="if typing.TYPE_CHECKING:\n    import xarray",
     )
     assert sorted(line.split(":")[0] for line in foreign(house)) == [
-        "dvax.cli.app",
-        "dvax.runs.store",
+        "dvax.app.cli.program",
+        "dvax.app.runs.store",
         "dvax.sets.box",
     ]

@@ -53,7 +53,7 @@ def test_the_wheel_carries_the_demo(wheel: Path):
     demo = {
         name.rpartition("/")[2]: info.file_size
         for info in zipfile.ZipFile(wheel).infolist()
-        if (name := info.filename).startswith("dvax/runs/demo/")
+        if (name := info.filename).startswith("dvax/app/runs/demo/")
     }
     assert {"rough_strip.toml", "load.csv"} <= set(demo)
     assert all(size > 0 for size in demo.values())
@@ -89,7 +89,7 @@ def test_the_metadata_says_what_is_needed(wheel: Path):
     assert [need for need in core if "<" in need] == ["jax<0.13,>=0.10"]
     with zipfile.ZipFile(wheel) as archive:
         (name,) = (n for n in archive.namelist() if n.endswith("entry_points.txt"))
-        assert "dvax = dvax.cli:main" in archive.read(name).decode()
+        assert "dvax = dvax.app.cli:main" in archive.read(name).decode()
 
 
 def test_the_page_on_dependencies_names_those_that_are_declared():
@@ -131,7 +131,7 @@ def help_of(*arguments: str) -> str:
     """The heavy modules that are loaded once `dvax ARGUMENTS --help` has been printed."""
     code = f"""
 import sys
-from dvax.cli import main
+from dvax.app.cli import main
 sys.argv = ["dvax", *{arguments!r}, "--help"]
 try:
     main()
@@ -153,7 +153,7 @@ def test_help_loads_nothing_heavy(arguments: tuple[str, ...]):
 
 @pytest.mark.thorough
 def test_help_is_there_within_a_second():
-    code = "import sys; from dvax.cli import main; sys.argv = ['dvax', '--help']; main()"
+    code = "import sys; from dvax.app.cli import main; sys.argv = ['dvax', '--help']; main()"
     took = []
     for _ in range(5):
         start = time.perf_counter()

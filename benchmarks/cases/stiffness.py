@@ -9,9 +9,10 @@ import equinox as eqx
 import numpy as np
 
 import dvax
+from dvax.formats import read_rts
 from dvax.models import Circuit
 from dvax.models.frame import Accelerogram, Frame
-from dvax.models.market import Market, read_rts
+from dvax.models.market import Market
 
 from ..clock import in_turn, timed
 from ..netlists import multiplier, three_phases

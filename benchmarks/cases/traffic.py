@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvax.models.traffic import Network, Trips, read_network, read_trips
+from dvax.formats import Network, Trips, read_network, read_trips
 from dvax.models.traffic.costs import link_costs
 from dvax.models.traffic.equilibrium import Equilibrium, equilibrate
 from dvax.models.traffic.shortest import ShortestPaths

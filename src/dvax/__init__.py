@@ -9,6 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from . import formats as formats
     from . import generators as generators
     from . import models as models
     from . import operators as operators
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = (
+    "formats",
     "generators",
     "models",
     "operators",

@@ -1,4 +1,4 @@
-"""The one family of exceptions. Every message says what is wrong, the mend, and the reason."""
+"""The one family of exceptions. Every message says what is wrong, the fix, and the reason."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,16 +13,16 @@ class InputProblem:
     """One thing wrong with what the user gave.
 
     `place` says where (a file with line and column, a dotted key, an argument's name), `given` what
-    was found there, `rule` what is required and why, `mend` what to do about it.
+    was found there, `rule` what is required and why, `fix` what to do about it.
     """
 
     place: str
     given: str
     rule: str
-    mend: str
+    fix: str
 
     def __str__(self) -> str:
-        return f"{self.place}: got {self.given}; {self.rule}. {self.mend}"
+        return f"{self.place}: got {self.given}; {self.rule}. {self.fix}"
 
 
 class InputError(DvaxError, ValueError):

@@ -180,7 +180,7 @@ def test_a_bridge_is_refused_by_the_lines_of_its_diodes():
         with pytest.raises(dvax.InputError) as caught:
             Circuit(BRIDGE, **options)
         (problem,) = caught.value.problems
-        assert said in problem.rule and "r_on = 0.1 and g_leak = 1e-9" in problem.mend
+        assert said in problem.rule and "r_on = 0.1 and g_leak = 1e-9" in problem.fix
         first = 4 if "g_leak" not in options else 5
         lines = ", ".join(map(str, range(first, 7)))
         assert problem.place == f"netlist, lines {lines} and 7"

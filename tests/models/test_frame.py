@@ -10,9 +10,9 @@ import scipy.signal
 from tests.models.piecewise_linear import Regime, follow
 
 import dvax
+from dvax.formats.at2 import read_at2
 from dvax.models.frame import Accelerogram, Frame, response_spectrum
 from dvax.models.frame.accelerogram import GRAVITY
-from dvax.models.frame.at2 import read_at2
 from dvax.models.frame.peaks import largest
 
 EL_CENTRO = Path(__file__).parents[3] / "shared" / "data" / "elCentro.at2"
@@ -283,7 +283,7 @@ def test_a_flow_of_a_frame_that_stays_elastic_is_refused():
         Frame(record=RECORD, period=0.5, damping=0.05, viscosity_ratio=0.01)
     (problem,) = caught.value.problems
     assert "viscosity_ratio" in problem.place and "stays elastic" in problem.rule
-    assert "yield_ratio" in problem.mend
+    assert "yield_ratio" in problem.fix
 
 
 def test_records_without_sense_are_refused():

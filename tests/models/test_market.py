@@ -10,7 +10,8 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import lsq_linear, minimize_scalar
 
 import dvax
-from dvax.models.market import Market, MeritOrder, largest_gain, read_rts
+from dvax.formats import read_rts
+from dvax.models.market import Market, MeritOrder, largest_gain
 
 RTS_GMLC = Path(__file__).parents[3] / "shared" / "data" / "RTS-GMLC"
 needs_data = pytest.mark.skipif(

@@ -8,7 +8,8 @@ import pytest
 from tests.selection import mostly_thorough
 
 import dvax
-from dvax.models.market import Market, read_rts
+from dvax.formats import read_rts
+from dvax.models.market import Market
 
 FOLDER = Path(__file__).parents[3] / "shared" / "data" / "RTS-GMLC"
 pytestmark = pytest.mark.skipif(

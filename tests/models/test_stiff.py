@@ -10,8 +10,8 @@ from tests.models.tableau import random_netlist, tableau
 from tests.oracles import affine_box_vi
 
 import dvax
+from dvax.formats.netlist_sources import read_waveform
 from dvax.models.circuit import Circuit
-from dvax.models.circuit.waveforms import read_waveform
 
 RESISTANCES = (1.0, 1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 SOURCES = {

@@ -12,6 +12,7 @@ from tests.models import traffic_networks as networks
 from tests.models.proximal_step import ProximalStep
 
 import dvax
+from dvax import formats
 from dvax.models import traffic
 from dvax.models.traffic.costs import link_costs
 
@@ -314,7 +315,7 @@ def test_a_bad_argument_is_refused_by_name(case):
     with pytest.raises(dvax.InputError) as caught:
         traffic.Traffic(*networks.two_roads(), **({"rho": 10.0} | arguments))
     (problem,) = caught.value.problems
-    assert case.strip() in problem.place and said in f"{problem.rule} {problem.mend}"
+    assert case.strip() in problem.place and said in f"{problem.rule} {problem.fix}"
 
 
 def test_networks_outside_the_class_are_refused():
@@ -342,7 +343,7 @@ def test_sioux_falls():
         pytest.skip(f"the Sioux Falls files are not at {folder}")
     files = folder / "SiouxFalls_net.tntp", folder / "SiouxFalls_trips.tntp"
     model = traffic.Traffic(*files, rho=2000.0)
-    known = traffic.read_flows(folder / "SiouxFalls_flow.tntp", model.network)
+    known = formats.read_flows(folder / "SiouxFalls_flow.tntp", model.network)
     ts = np.array([0.0, 4.0, 8.0, 12.0, 16.0, 20.0, 40.0])
     sol = run(model, model.all_or_nothing(), 40.0, ts, method=dvax.ETD1())
     figures = model.figures(sol)
@@ -381,7 +382,7 @@ def test_a_network_of_the_size_of_anaheim():
 def test_the_examples_of_the_docstrings_print_what_they_say(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = [vars(traffic)[name] for name in ("Network", "Trips", "Incident")]
-    names += [traffic.read_network, traffic.read_trips]
+    names += [formats.read_network, formats.read_trips]
     found = [doctest.DocTestFinder(recurse=False).find(n, module=False, globs={}) for n in names]
     assert all(any(t.examples for t in tests) for tests in found)
     report: list[str] = []

@@ -12,6 +12,7 @@ import numpy as np
 from ... import _tree
 from ...errors import InputError, InputProblem
 from ...evolution import ExpRosenbrock, PiecewiseLinear, Solution, solve
+from ...formats.netlist import Netlist, read_netlist
 from ...generators import Dense
 from ...operators import Diagonal, Scaling
 from ...problem import Problem
@@ -20,7 +21,6 @@ from ...signals import AbstractSignal
 from ...spaces import L2, Euclidean
 from ...theory import Constants
 from . import topology
-from .netlist import Netlist, read_netlist
 from .nodal import Equations, assemble
 
 _SINGULAR = 1e-14

@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .netlist import GROUND, Netlist
+from ...formats.netlist import GROUND, Netlist
 from .topology import Groups
 
 Matrix = np.ndarray

@@ -11,7 +11,7 @@ Then every capacitor voltage and inductor current is a state, and the state is m
 """
 
 from ...errors import InputError, InputProblem
-from .netlist import GROUND, Element, Netlist
+from ...formats.netlist import GROUND, Element, Netlist
 
 
 def check(netlist: Netlist, leaks: bool) -> None:

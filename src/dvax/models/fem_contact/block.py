@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError, InputProblem
-from .optional import needed
+from ...formats.optional import needed
 
 _FLAT = 1e-9
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError, InputProblem
+from ...formats.mesh import read_mesh
+from ...formats.optional import needed
 from .block import block
 from .checks import faults
-from .mesh_file import read
-from .optional import needed
 
 _POINTS = 5
 """Gauss points on an edge."""
@@ -215,7 +215,7 @@ def _mesh(given: Any, contact: str, clamped: str) -> Any:
     if given is None:
         return block()
     if isinstance(given, str | os.PathLike):
-        return read(given, contact, clamped)
+        return read_mesh(given, contact, clamped)
     if isinstance(given, Mapping):
         sizes = ("width", "height", "fine_half_width", "fine", "coarse", "layers", "growth")
         wrong = [

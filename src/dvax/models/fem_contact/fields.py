@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError, InputProblem
+from ...formats.optional import needed
 from .body import ElasticBody
-from .optional import needed
 
 _ENDINGS = (".vtu", ".vtk")
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from ... import _tree
 from ...errors import InputError, InputProblem
+from ...formats.at2 import read_at2
 from ...signals import AbstractSignal
-from .at2 import read_at2
 
 GRAVITY = 9.80665 / 0.0254
 """Standard gravity in in/s². Tables of the field often have 386.4 for it, which is 0.08 % more."""

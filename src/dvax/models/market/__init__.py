@@ -3,5 +3,3 @@
 from .deviation import largest_gain as largest_gain
 from .market import Market as Market
 from .merit import MeritOrder as MeritOrder
-from .rts import RTS as RTS
-from .rts import read_rts as read_rts

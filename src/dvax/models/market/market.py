@@ -11,6 +11,7 @@ import numpy as np
 from ... import _tree
 from ...errors import InputError, InputProblem
 from ...evolution import ExpRosenbrock, Solution, solve
+from ...formats.rts_gmlc import RTS, read_rts
 from ...generators import Scalar
 from ...operators import Scaling
 from ...problem import Problem
@@ -20,7 +21,6 @@ from ...spaces import Euclidean
 from ...theory import Constants
 from .deviation import largest_gain
 from .merit import MeritOrder
-from .rts import RTS, read_rts
 
 _HALVINGS = 60
 """From a price range to the spacing of doubles in it."""
@@ -123,7 +123,7 @@ class Market(eqx.Module):
         Demand is a line through the load of the hour at the reference price, of the same slope always:
         b = reference_price/(elasticity · mean load), α(t) = reference_price + b · load(t).
 
-        **Arguments:** `data`: the folder (`dvax.models.market.read_rts`), or what was read from it.
+        **Arguments:** `data`: the folder (`dvax.formats.read_rts`), or what was read from it.
 
         **Raises:** `dvax.InputError` for what is wrong in the files, and for hours that they have not.
         """

@@ -11,9 +11,9 @@ import numpy as np
 
 from ... import _tree
 from ...errors import InputError, InputProblem
+from ...formats.road_network import Network
 from ...sets import Simplex
 from ...signals import AbstractSignal, Constant, Function, Table
-from .network import Network
 
 
 class Incident(NamedTuple):

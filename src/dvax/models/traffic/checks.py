@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError, InputProblem
-from .network import Network, Trips
+from ...formats.road_network import Network, Trips
+from ...formats.tntp import read_network, read_trips
 from .shortest import ShortestPaths
-from .tntp import read_network, read_trips
 
 
 def loaded(network: Any, trips: Any) -> tuple[Network, Trips]:
@@ -24,7 +24,7 @@ def loaded(network: Any, trips: Any) -> tuple[Network, Trips]:
                 InputProblem(
                     f"dvax.models.Traffic({name})", repr(given)[:60],
                     f"it is a dvax.models.{kind.__name__}, or the name of a TNTP file",
-                    f"Read it: dvax.models.{read.__name__}(...)",
+                    f"Read it: dvax.formats.{read.__name__}(...)",
                 )
             )  # fmt: skip
             continue

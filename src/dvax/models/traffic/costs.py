@@ -8,7 +8,7 @@ import numpy as np
 
 from ... import _tree
 from ...errors import InputError, InputProblem
-from .network import Network
+from ...formats.road_network import Network
 
 
 class LinkCosts(eqx.Module):

@@ -3,9 +3,9 @@
 import numpy as np
 
 from ...errors import InputError, InputProblem
+from ...formats.road_network import Network, Trips
 from .costs import LinkCosts
 from .equilibrium import Equilibrium, Report, equilibrate
-from .network import Network, Trips
 from .shortest import ShortestPaths
 
 _MANY = 1000.0

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .network import Network, Trips
+from ...formats.road_network import Network, Trips
 
 
 class ShortestPaths:

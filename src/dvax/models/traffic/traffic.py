@@ -11,6 +11,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...evolution import Solution
+from ...formats.road_network import Network, Trips
 from ...generators import Scalar
 from ...operators import Scaling
 from ...problem import Problem
@@ -23,7 +24,6 @@ from .costs import LinkCosts, link_costs
 from .equilibrium import all_or_nothing
 from .generation import generated, typical_rho
 from .law import Choices, LinkNewton, Proposal
-from .network import Network, Trips
 from .paths import Incidence, Paths
 from .shortest import ShortestPaths
 

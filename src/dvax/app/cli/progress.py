@@ -1,0 +1,118 @@
+"""What a run says while it runs: a bar with the time left on a terminal, lines in a pipe.
+
+The driver sends events, dicts with `event` one of compiling, compiled, progress, stage, warning,
+stopped. A model that is solved in one piece has stages in the place of progress.
+Compile time is shown apart: it is paid once, and says nothing about how long the rest will take.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from dvax.app.cli.console import remark, remarks
+
+Event = dict[str, Any]
+Listener = Callable[[Event], None]
+
+# In a pipe: one line for each tenth of the run, and a sign of life at least this often.
+LINES, SECONDS_BETWEEN = 10, 30.0
+
+
+@contextmanager
+def progress(unit: str, *, quiet: bool) -> Iterator[Listener]:
+    """A listener for the events of a run whose time is measured in `unit`."""
+    if quiet:
+        yield _warnings_alone
+    elif remarks().is_terminal:
+        with _bar(unit) as listener:
+            yield listener
+    else:
+        yield _Lines(unit)
+
+
+def _warnings_alone(event: Event) -> None:
+    if event["event"] == "warning":
+        remark(f"warning: {event['message']}")
+
+
+class _Lines:
+    """Plain lines: compiled, every tenth of the way or every stage, warnings."""
+
+    def __init__(self, unit: str):
+        self.unit = unit
+        self.tenth = 0
+        self.began = self.spoke = time.monotonic()
+
+    def __call__(self, event: Event) -> None:
+        _warnings_alone(event)
+        if event["event"] == "compiled":
+            remark(f"compiled in {event['compile_seconds']:.1f} s")
+            self.began = self.spoke = time.monotonic()
+        elif event["event"] == "stage":
+            remark(event["stage"])
+        elif event["event"] == "progress":
+            self._advance(event)
+
+    def _advance(self, event: Event) -> None:
+        done = float(event["t"]) / float(event["t_end"])
+        now = time.monotonic()
+        if int(done * LINES) <= self.tenth and now - self.spoke < SECONDS_BETWEEN:
+            return
+        self.tenth, self.spoke = int(done * LINES), now
+        left = (now - self.began) * (1 - done) / done if done > 0 else float("nan")
+        remark(
+            f"t = {event['t']:.6g} of {event['t_end']:.6g}{_unit(event, self.unit)} ({done:.0%}), "
+            f"{event['steps']} steps, {left:.0f} s left"
+        )
+
+
+def _unit(event: Event, unit: str) -> str:
+    """The unit of time with a space before it: that of the event, where it names one."""
+    return f" {event.get('unit', unit)}".rstrip()
+
+
+@contextmanager
+def _bar(unit: str) -> Iterator[Listener]:
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    console = remarks()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TextColumn("{task.fields[where]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("starting", total=None, where="")
+        staged = False
+
+        def listen(event: Event) -> None:
+            nonlocal staged
+            kind = event["event"]
+            if kind == "warning":
+                bar.console.print(f"warning: {event['message']}", markup=False, style="yellow")
+            elif kind == "compiling" and not staged:
+                bar.update(task, description="compiling")
+            elif kind == "compiled":
+                seconds = event["compile_seconds"]
+                bar.console.print(f"compiled in {seconds:.1f} s", markup=False)
+                bar.reset(task, description="solving", where="")
+            elif kind == "stage":
+                # Compiling is a part of the first stage, and says less than its name.
+                staged = True
+                bar.update(task, description=event["stage"])
+            elif kind == "progress":
+                where = f"t = {event['t']:.4g}{_unit(event, unit)}, {event['steps']} steps"
+                bar.update(task, completed=event["t"], total=event["t_end"], where=where)
+
+        yield listen

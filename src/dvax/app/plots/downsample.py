@@ -1,0 +1,176 @@
+"""One pass over the fields of a trajectory: what the pictures need, in memory a laptop has.
+
+A map on a screen has a few hundred cells each way; a run may have 10^6 points and 10^3 frames. The
+pass reads the trajectory block of frames by block of frames and keeps, for every cell of the map,
+the weighted mean and both extremes (so that no narrow peak is lost between the pixels), and for
+every frame the exact shares of the boundary in each regime, over all points.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvax.app.plots.run_reader import RunRecord
+from dvax.errors import InputError, InputProblem
+
+REGIMES = ("unloaded", "active", "saturated")
+SPACE_CELLS = 360
+TIME_CELLS = 480
+BLOCK_BYTES = 32 * 2**20
+
+
+@dataclass(frozen=True)
+class CellMaps:
+    """Fields on a curve, reduced to cells. Arrays have shape (time cells, space cells).
+
+    `common`, `lowest`, `highest` hold regimes (0, 1, 2): the one that covers most of the cell, and
+    the extremes met in it. Edges have one entry more than there are cells.
+    """
+
+    time_edges: np.ndarray
+    space_edges: np.ndarray
+    mean: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    common: np.ndarray
+    lowest: np.ndarray
+    highest: np.ndarray
+    points_per_cell: int
+    frames_per_cell: int
+
+    @property
+    def reduced(self) -> bool:
+        """Whether a cell gathers more than one stored value."""
+        return self.points_per_cell * self.frames_per_cell > 1
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What one pass found. `shares` has shape (3, frames), its columns sum to one.
+
+    `cells` is None on a surface, whose maps are read frame by frame (see `surface.py`).
+    """
+
+    shares: np.ndarray
+    time_mean: np.ndarray
+    pressure_low: float
+    pressure_high: float
+    cells: CellMaps | None
+
+
+def edges(centres: np.ndarray) -> np.ndarray:
+    """Cell edges half-way between increasing centres, the outer ones mirrored; shape (n + 1,)."""
+    if len(centres) == 1:
+        half = 0.5 * (abs(float(centres[0])) or 1.0)
+        return np.array([centres[0] - half, centres[0] + half])
+    middle = 0.5 * (centres[1:] + centres[:-1])
+    first, last = 1.5 * centres[0] - 0.5 * centres[1], 1.5 * centres[-1] - 0.5 * centres[-2]
+    return np.concatenate([[first], middle, [last]])
+
+
+def blocks(run: RunRecord) -> Iterator[slice]:
+    """Slices of frames that fit the memory budget, made of whole chunks of the store where these
+    are not far larger: a part of a chunk costs as much to read as the whole."""
+    chunk, count = run.frames.frames_per_chunk, run.frames.count
+    frame_bytes = 8 * run.frames.points
+    fitting = max(1, BLOCK_BYTES // frame_bytes)
+    step = fitting if chunk * frame_bytes > 4 * BLOCK_BYTES else -(-fitting // chunk) * chunk
+    for start in range(0, count, step):
+        yield slice(start, min(start + step, count))
+
+
+def scan(run: RunRecord) -> Scan:
+    """Read pressure and regime once. InputError where a regime is not 0, 1 or 2."""
+    frames, points = run.frames.count, run.frames.points
+    weight = run.weight / run.weight.sum()
+    shares = np.empty((len(REGIMES), frames))
+    time_mean = np.zeros(points)
+    low, high = np.inf, -np.inf
+    gather = _Gather(run) if len(run.boundary_shape) == 1 else None
+    for block in blocks(run):
+        pressure = run.frames.field("pressure", block).astype(float, copy=False)
+        regime = run.frames.field("regime", block)
+        _check_regime(run, regime, block)
+        for kind in range(len(REGIMES)):
+            shares[kind, block] = (regime == kind) @ weight
+        time_mean += pressure.sum(axis=0) / frames
+        if np.isfinite(pressure).any():
+            low, high = min(low, np.nanmin(pressure)), max(high, np.nanmax(pressure))
+        if gather is not None:
+            gather.take(block, pressure, regime)
+    return Scan(shares, time_mean, float(low), float(high), gather and gather.maps())
+
+
+def _check_regime(run: RunRecord, regime: np.ndarray, block: slice) -> None:
+    wrong = (regime < 0) | (regime >= len(REGIMES))
+    if wrong.any():
+        frame, point = (int(i) for i in np.argwhere(wrong)[0])
+        raise InputError(
+            InputProblem(
+                f"{run.directory / 'trajectory.zarr'}: regime[{block.start + frame}, {point}]",
+                str(regime[frame, point]),
+                "a regime is 0 (unloaded), 1 (active) or 2 (saturated)",
+                "The store is damaged or was written by another tool; run again.",
+            )
+        )
+
+
+class _Gather:
+    """Fold frames into cells: sums for the means, running extremes, regime measure per cell."""
+
+    def __init__(self, run: RunRecord):
+        place = run.frames.line("s").astype(float)
+        # Nodes from a file need not be sorted along the curve; the map's axis must be.
+        order = np.argsort(place, kind="stable")
+        self.order = slice(None) if (np.diff(place) > 0).all() else order
+        frames, points = len(run.time), len(place)
+        self.starts = _starts(points, SPACE_CELLS)
+        time_starts = _starts(frames, TIME_CELLS)
+        self.cell_of_frame = np.repeat(
+            np.arange(len(time_starts)), np.diff(np.append(time_starts, frames))
+        )
+        self.weight = run.weight[self.order]
+        self.space_edges = edges(place[order])[np.append(self.starts, points)]
+        self.time_edges = edges(run.time)[np.append(time_starts, frames)]
+        self.points_per_cell = -(-points // len(self.starts))
+        self.frames_per_cell = -(-frames // len(time_starts))
+        shape = (len(time_starts), len(self.starts))
+        self.sum = np.zeros(shape)
+        self.low, self.high = np.full(shape, np.inf), np.full(shape, -np.inf)
+        self.measure = np.zeros((len(REGIMES), *shape))
+        self.lowest, self.highest = np.full(shape, 2, np.int8), np.zeros(shape, np.int8)
+
+    def take(self, block: slice, pressure: np.ndarray, regime: np.ndarray) -> None:
+        pressure, regime = pressure[:, self.order], regime[:, self.order]
+        into, starts = self.cell_of_frame[block], self.starts
+        np.add.at(self.sum, into, np.add.reduceat(pressure * self.weight, starts, axis=1))
+        np.minimum.at(self.low, into, np.minimum.reduceat(pressure, starts, axis=1))
+        np.maximum.at(self.high, into, np.maximum.reduceat(pressure, starts, axis=1))
+        np.minimum.at(self.lowest, into, np.minimum.reduceat(regime, starts, axis=1))
+        np.maximum.at(self.highest, into, np.maximum.reduceat(regime, starts, axis=1))
+        for kind in range(len(REGIMES)):
+            covered = np.where(regime == kind, self.weight, 0.0)
+            np.add.at(self.measure[kind], into, np.add.reduceat(covered, starts, axis=1))
+
+    def maps(self) -> CellMaps:
+        # Every point of a cell is in exactly one regime, so the measures add up to the cell's own.
+        whole = self.measure.sum(axis=0)
+        return CellMaps(
+            time_edges=self.time_edges,
+            space_edges=self.space_edges,
+            mean=self.sum / whole,
+            low=self.low,
+            high=self.high,
+            common=self.measure.argmax(axis=0).astype(np.int8),
+            lowest=self.lowest,
+            highest=self.highest,
+            points_per_cell=self.points_per_cell,
+            frames_per_cell=self.frames_per_cell,
+        )
+
+
+def _starts(count: int, cells: int) -> np.ndarray:
+    """Where each of at most `cells` nearly equal groups of `count` items begins."""
+    groups = min(count, cells)
+    return (np.arange(groups) * count) // groups

@@ -1,0 +1,157 @@
+"""The page itself: one HTML file that holds its pictures, its script and its style.
+
+Nothing is fetched: Plotly's script is written into the file, and figures are JSON beside it.
+"""
+
+import html
+from collections.abc import Sequence
+from importlib.resources import files
+
+from plotly.offline import get_plotlyjs
+
+from dvax.app.plots.picture import Picture, Views
+from dvax.app.plots.run_reader import UNFINISHED, RunRecord
+from dvax.app.plots.stability import assumptions_table, losses_table
+from dvax.app.plots.tables import constants_table, facts_table, headline_cards
+from dvax.app.plots.theme import counted
+
+_HINT = '<br><span class="hint">Drag in a figure to zoom, double-click to return.</span>'
+
+
+def page(run: RunRecord, pictures: Sequence[Picture], missing: Sequence[str]) -> str:
+    """The whole HTML text. `missing` says, a sentence each, which pictures the run cannot give."""
+    room = files("dvax.app.plots")
+    style = (room / "page.css").read_text(encoding="utf-8")
+    script = (room / "page.js").read_text(encoding="utf-8")
+    shown = "\n".join(map(_section, pictures))
+    absent = "".join(f"<li>{_escape(text)}</li>" for text in missing)
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{_escape(run.title)} · dvax report</title>
+<link rel="icon" href="data:,">
+<style>{style}</style>
+<script>{get_plotlyjs()}</script>
+</head>
+<body>
+<header>
+<h1>{_escape(run.title)}</h1>
+<p>{_escape(_subtitle(run))}{_HINT if pictures else ""}</p>
+</header>
+<main>
+{_banner(run)}
+<section><h2>Headline figures</h2>{headline_cards(run)}</section>
+{shown}
+{f"<section><h2>Not drawn</h2><ul>{absent}</ul></section>" if absent else ""}
+{_stability(run)}
+<section><h2>Constants</h2>{constants_table(run)}
+<p class="caption">Labels are those of the formulas in the paper. The paper's constants use
+magnitudes and not signs: they are conservative, and sharper ones stand beside them where there
+are any.</p>
+</section>
+<section><h2>The run</h2>{facts_table(run)}</section>
+</main>
+<script>{script}</script>
+</body>
+</html>
+"""
+
+
+def _stability(run: RunRecord) -> str:
+    """What the theory says of the system, where the run knows it."""
+    losses, known = losses_table(run), assumptions_table(run)
+    if not (losses or known):
+        return ""
+    caption = (
+        '<p class="caption">The distance of two trajectories grows at most at this rate. The paper\'s '
+        "adds magnitudes; the one with signs sees which feedbacks hold back.</p>"
+    )
+    return f"<section><h2>Stability</h2>{losses}{caption if losses else ''}{known}</section>"
+
+
+def _subtitle(run: RunRecord) -> str:
+    parts = [f"dvax {run.manifest.get('dvax') or ''}".strip()]
+    if run.trajectory is not None:
+        parts.append(f"model {run.trajectory.attrs.get('model', 'unnamed')}")
+        points = " × ".join(str(n) for n in run.boundary_shape)
+        parts.append(f"{points} points, {counted(len(run.time), 'frame')}")
+    elif run.data is not None:
+        parts.append(f"model {run.model}, {run.manifest.get('fit', '')}".rstrip(", "))
+    parts.append(run.status)
+    return " · ".join(parts)
+
+
+def _banner(run: RunRecord) -> str:
+    """What the reader must know first: the run is partial, frames are left out, warnings."""
+    lines: list[str] = []
+    if run.status in UNFINISHED:
+        reach = _reach(run)
+        # A run that was killed could not say why: its manifest still says that it goes on.
+        gone = run.status == "running"
+        reason = "" if gone else str(run.manifest.get("stop_reason") or "")
+        text = " ".join(part for part in (UNFINISHED[run.status], reach, reason) if part)
+        head = "No results." if run.trajectory is None and not run.data else "Partial results."
+        lines.append(
+            f'<div class="banner partial" role="alert"><b>{head}</b> {_escape(text)}</div>'
+        )
+    said = "".join(f"<li>{_escape(text)}</li>" for text in (*run.notes, *run.warnings))
+    if said:
+        lines.append(f'<div class="banner"><b>Notes of the run.</b><ul>{said}</ul></div>')
+    return "\n".join(lines)
+
+
+def _reach(run: RunRecord) -> str:
+    if run.data:
+        return ""  # the reason says how far it came
+    if run.trajectory is None:
+        return "Nothing was written." if run.data is not None else "No frame was written."
+    unit = run.unit("time")
+    end = run.config.get("time", {}).get("end")
+    aim = f" of {end:g} {unit}" if isinstance(end, int | float) else ""
+    held = counted(len(run.time), "frame")
+    return f"It holds {held}, up to t = {run.time[-1]:.6g} {unit}{aim}."
+
+
+def _section(picture: Picture) -> str:
+    # "<" written as an escape: no text of the run can close the script element.
+    figure = str(picture.interactive.to_json()).replace("<", "\\u003c")
+    height = picture.interactive["layout"]["height"]
+    return f"""<section><h2>{_escape(picture.title)}</h2>{_control(picture)}
+<div class="plot" id="{picture.key}" style="min-height:{height}px" role="img"
+ aria-label="{_escape(picture.title)}"></div>
+<script type="application/json" id="{picture.key}-data">{figure}</script>
+<p class="caption">{_escape(picture.caption)}</p></section>"""
+
+
+def _control(picture: Picture) -> str:
+    views = picture.views
+    if views is None:
+        return ""
+    if views.slider:
+        return _slider(picture.key, views)
+    buttons = "".join(
+        f'<button type="button" aria-pressed="{str(index == views.first).lower()}" '
+        f'data-view="{index}">{_escape(label)}</button>'
+        for index, label in enumerate(views.labels)
+    )
+    return (
+        f'<div class="views" data-plot="{picture.key}" data-count="{len(views.labels)}">'
+        f"<span>{_escape(views.name)}</span>{buttons}</div>"
+    )
+
+
+def _slider(key: str, views: Views) -> str:
+    labels = "\n".join(views.labels)
+    return (
+        f'<div class="views" data-plot="{key}" data-count="{len(views.labels)}">'
+        f'<label for="{key}-view">{_escape(views.name)}</label>'
+        f'<input type="range" id="{key}-view" min="0" max="{len(views.labels) - 1}" step="1" '
+        f'value="{views.first}" data-labels="{_escape(labels)}">'
+        f"<output>{_escape(views.labels[views.first])}</output></div>"
+    )
+
+
+def _escape(text: str) -> str:
+    return html.escape(text, quote=True)

@@ -1,0 +1,274 @@
+"""A run directory, read: the trajectory opened lazily, the manifest, the summary, the constants.
+
+Nothing is loaded here but the small files and the time axis; a trajectory of a million points stays
+on disk until a picture asks for it, block by block (see `scan.py`).
+"""
+
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dvax.app.plots.applications.data import Data, read_data
+from dvax.app.plots.frames import Frames, open_frames
+from dvax.errors import InputError, InputProblem
+
+# What manifest.json calls a run that did not reach its end, and what a reader should know of it.
+UNFINISHED = {
+    "running": "The run had not ended when this report was made: it is going on, or was killed.",
+    "killed": "The run was killed before its end.",
+    "interrupted": "The run was interrupted before its end.",
+    "failed": "The run failed before its end.",
+}
+
+
+@dataclass(frozen=True)
+class ConstantRow:
+    """One constant of the theory: its value, its formula's label in the paper, what it rests on.
+
+    `status` is proved, declared, estimated or refuted; `meaning` is one sentence.
+    """
+
+    name: str
+    symbol: str
+    value: Any
+    unit: str
+    label: str
+    status: str
+    meaning: str
+
+
+@dataclass(frozen=True)
+class AssumptionRow:
+    """One assumption of the theory: its label, what it says, its status, and how that is known."""
+
+    label: str
+    statement: str
+    status: str
+    why: str
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What a run directory holds. `trajectory` is None where no frame was written; an application has
+    `data` in its place."""
+
+    directory: Path
+    manifest: Mapping[str, Any]
+    summary: Mapping[str, Mapping[str, Any]]
+    config: Mapping[str, Any]
+    constants: tuple[ConstantRow, ...]
+    warnings: tuple[str, ...]
+    trajectory: Frames | None
+    assumptions: tuple[AssumptionRow, ...] = field(default=())
+    notes: tuple[str, ...] = field(default=())
+    data: Mapping[str, Data] | None = field(default=None)
+
+    @property
+    def model(self) -> str:
+        """The name of the model."""
+        return str(self.manifest.get("model", "contact"))
+
+    @property
+    def title(self) -> str:
+        """The run's name: the dataset's, else the directory's."""
+        named = "" if self.trajectory is None else str(self.trajectory.attrs.get("title", ""))
+        return named or str(self.manifest.get("title") or self.directory.resolve().name)
+
+    @property
+    def status(self) -> str:
+        """The manifest's word: finished, running, interrupted or failed."""
+        return str(self.manifest.get("status", "unknown"))
+
+    @property
+    def frames(self) -> Frames:
+        """The trajectory; asking for it where there is none is a mistake of the caller."""
+        if self.trajectory is None:
+            raise ValueError(
+                f"{self.directory} holds no trajectory; test `trajectory is None` first"
+            )
+        return self.trajectory
+
+    @property
+    def time(self) -> np.ndarray:
+        """Saved times, shape (frames,), in the run's unit of time."""
+        return self.series("time")
+
+    @property
+    def boundary_shape(self) -> tuple[int, ...]:
+        """(n,) on a curve, (n1, n2) on a surface whose points are flattened in C order."""
+        given = self.frames.attrs.get("boundary_shape")
+        if given is None or len(given) == 1:
+            return (self.frames.points,)
+        return tuple(int(n) for n in given)
+
+    @property
+    def weight(self) -> np.ndarray:
+        """Quadrature weights of the boundary's points, shape (point,)."""
+        return self.frames.line("weight").astype(float)
+
+    def has(self, name: str) -> bool:
+        """Whether the trajectory holds the variable `name`."""
+        return self.trajectory is not None and name in self.trajectory
+
+    def series(self, name: str) -> np.ndarray:
+        """A variable over time alone, shape (frames,)."""
+        return self.frames.line(name).astype(float)
+
+    def unit(self, name: str) -> str:
+        """The unit of a variable or coordinate, as the trajectory declares it.
+
+        Norms in L2 over a boundary of dimension d have the unit length^(d/2) in them.
+        """
+        declared = str(self.frames.about(name).get("units", ""))
+        return declared.replace("^(d/2)", "^0.5" if len(self.boundary_shape) == 1 else "")
+
+
+def read_run(directory: Path) -> RunRecord:
+    """Read the run directory `directory`. InputError where it is not one or a file is damaged."""
+    if not (directory / "manifest.json").is_file():
+        raise InputError(
+            InputProblem(
+                str(directory),
+                _other_than_a_run(directory),
+                "a run directory holds manifest.json and trajectory.zarr",
+                "Give the folder that `dvax run ... -o FOLDER` wrote.",
+            )
+        )
+    manifest = _json(directory / "manifest.json")
+    summary_file = directory / "summary.json"
+    config_file = directory / "config.resolved.toml"
+    application = str(manifest.get("model", "contact")) != "contact"
+    store = directory / "trajectory.zarr"
+    trajectory, notes = (None, ()) if application else _trajectory(store)
+    return RunRecord(
+        directory=directory,
+        manifest=manifest,
+        summary=_json(summary_file) if summary_file.is_file() else {},
+        config=_toml(config_file) if config_file.is_file() else {},
+        constants=_constants(trajectory, manifest, directory),
+        warnings=_warnings(directory / "log.jsonl"),
+        trajectory=trajectory,
+        assumptions=_assumptions(trajectory, manifest, directory),
+        notes=notes,
+        data=_data(store) if application else None,
+    )
+
+
+def _other_than_a_run(path: Path) -> str:
+    """What `path` is, where it is no run directory."""
+    if path.is_dir():
+        return "a folder without manifest.json"
+    return "a file, not a folder" if path.exists() else "no such folder"
+
+
+def _damaged(file: Path, error: Exception) -> InputError:
+    return InputError(
+        InputProblem(
+            str(file),
+            f"text that does not parse ({error})",
+            "a run directory's files are written by dvax and must be whole to be read",
+            "Restore the file from a copy, or run again.",
+        )
+    )
+
+
+def _json(file: Path) -> Mapping[str, Any]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise _damaged(file, error) from error
+    if not isinstance(content, dict):
+        raise _damaged(file, ValueError(f"a {type(content).__name__}, not an object"))
+    return content
+
+
+def _toml(file: Path) -> Mapping[str, Any]:
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise _damaged(file, error) from error
+
+
+def _trajectory(store: Path) -> tuple[Frames | None, tuple[str, ...]]:
+    """The frames that are whole, and a note where some were left out."""
+    if not store.exists():
+        return None, ()
+    try:
+        frames, room = open_frames(store)
+    except (OSError, ValueError, KeyError) as error:
+        raise _damaged(store, error) from error
+    whole = 0 if frames is None else frames.count
+    if whole == room:
+        return frames, ()
+    note = (
+        f"{room - whole} of {room} frames have no valid time: "
+        "the run ended before they were complete. They are left out."
+    )
+    return frames, (note,)
+
+
+def _constants(
+    trajectory: Frames | None, manifest: Mapping[str, Any], directory: Path
+) -> tuple[ConstantRow, ...]:
+    """The list in the trajectory's attributes; the manifest's where nothing was written."""
+    rows = _listed(trajectory, "constants", directory)
+    if rows is None:
+        rows = manifest.get("constants")
+    if not isinstance(rows, list):
+        return ()
+    names = tuple(ConstantRow.__dataclass_fields__)
+    return tuple(ConstantRow(**{name: row.get(name, "") for name in names}) for row in rows)
+
+
+def _data(store: Path) -> Mapping[str, Data]:
+    """The results of an application; nothing where there are none yet."""
+    if not store.exists():
+        return {}
+    try:
+        return read_data(store)
+    except (OSError, ValueError, KeyError) as error:
+        raise _damaged(store, error) from error
+
+
+def _assumptions(
+    trajectory: Frames | None, manifest: Mapping[str, Any], directory: Path
+) -> tuple[AssumptionRow, ...]:
+    rows = _listed(trajectory, "assumptions", directory)
+    if rows is None:
+        rows = manifest.get("assumptions")
+    names = tuple(AssumptionRow.__dataclass_fields__)
+    return tuple(AssumptionRow(**{n: str(row.get(n, "")) for n in names}) for row in rows or ())
+
+
+def _listed(trajectory: Frames | None, name: str, directory: Path) -> Any:
+    """A list among the trajectory's attributes, where it is written as JSON."""
+    rows: Any = None if trajectory is None else trajectory.attrs.get(name)
+    if isinstance(rows, str):
+        try:
+            rows = json.loads(rows)
+        except json.JSONDecodeError as error:
+            raise _damaged(directory / "trajectory.zarr" / name, error) from error
+    return rows
+
+
+def _warnings(log: Path) -> tuple[str, ...]:
+    """The warnings of the log, in order, each once. A last line cut off by a kill is not read."""
+    if not log.is_file():
+        return ()
+    found: dict[str, None] = {}
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    for number, line in enumerate(lines):
+        try:
+            event = json.loads(line)
+        except json.JSONDecodeError as error:
+            if number == len(lines) - 1:
+                break
+            raise _damaged(log, error) from error
+        if isinstance(event, dict) and event.get("event") == "warning":
+            found.setdefault(str(event.get("message", "")))
+    return tuple(found)

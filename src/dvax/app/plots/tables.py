@@ -1,0 +1,125 @@
+"""The tables of the page: headline figures, constants with labels, facts of the manifest."""
+
+import html
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from dvax._figure_text import entry_text
+from dvax.app.plots.run_reader import RunRecord
+from dvax.app.plots.theme import number, quantity
+
+# manifest key: the words of the page. Whatever else the manifest holds follows, under its own name.
+FACTS = {
+    "status": "status",
+    "stop_reason": "why it stopped",
+    "started": "started",
+    "finished": "finished",
+    "steps": "steps",
+    "run_seconds": "run time [s]",
+    "compile_seconds": "compile time [s]",
+    "precision": "precision",
+    "device": "device",
+    "platform": "platform",
+    "dvax": "dvax",
+    "python": "Python",
+    "git_commit": "git commit",
+}
+SHOWN_ELSEWHERE = ("constants", "assumptions", "title")
+
+
+def headline_cards(run: RunRecord) -> str:
+    """summary.json: one card a figure, its meaning beneath."""
+    cards = []
+    for name, entry in run.summary.items():
+        if name == "status":
+            continue  # it stands at the top of the page, and among the facts of the run
+        value = entry.get("value")
+        unit = escaped(quantity("", str(entry.get("unit", ""))))
+        # A unit stays on one line, and with the last digits where there is room.
+        shown = f'{escaped(entry_text(entry))} <span class="unit">{unit}</span>'.removesuffix(
+            ' <span class="unit"></span>'
+        )
+        # All digits, for who points at it.
+        whole = "" if isinstance(value, list) else f' title="{escaped(str(value))}"'
+        cards.append(
+            f'<div class="card"><div class="name">{escaped(_words(name))}</div>'
+            f'<div class="value"{whole}>{shown}</div>'
+            f'<div class="meaning">{escaped(str(entry.get("meaning", "")))}</div></div>'
+        )
+    if not cards:
+        return '<p class="caption">The run wrote no figures: they are made when it ends.</p>'
+    return f'<div class="cards">{"".join(cards)}</div>'
+
+
+def constants_table(run: RunRecord) -> str:
+    """Each constant with its value, its formula's label in the paper, its status and meaning."""
+    head = ("constant", "symbol", "value", "paper label", "status", "meaning")
+    rows = [
+        (
+            f"<code>{escaped(row.name)}</code>",
+            escaped(row.symbol),
+            escaped(quantity(row.value, row.unit)),
+            f"<code>{escaped(row.label)}</code>" if row.label else "",
+            status_mark(row.status),
+            escaped(row.meaning),
+        )
+        for row in run.constants
+    ]
+    if not rows:
+        return '<p class="caption">The run directory names no constants.</p>'
+    return table(head, rows)
+
+
+def facts_table(run: RunRecord) -> str:
+    """The manifest, in reading order; nested values one a line."""
+    known = [(FACTS[key], run.manifest[key]) for key in FACTS if key in run.manifest]
+    others = [
+        (_words(key), value)
+        for key, value in run.manifest.items()
+        if key not in FACTS and key not in SHOWN_ELSEWHERE
+    ]
+    rows = [(escaped(name), _fact(value)) for name, value in [*known, *others]]
+    return table(("fact", "value"), rows, kind="pairs")
+
+
+def _fact(value: Any) -> str:
+    if isinstance(value, Mapping):
+        lines = [f"{escaped(str(key))}: {_fact(item)}" for key, item in value.items()]
+        return "<br>".join(lines) if lines else "none"
+    if isinstance(value, list):
+        plain = [item if isinstance(item, str) else json.dumps(item) for item in value]
+        return "<br>".join(map(escaped, plain)) if plain else "none"
+    if value is None:
+        return "none"
+    return escaped(number(value))
+
+
+def table(head: tuple[str, ...], rows: list[tuple[str, ...]], kind: str = "rows") -> str:
+    """An HTML table whose cells carry their column's name: a phone shows each row as a list."""
+    top = "".join(f"<th>{escaped(name)}</th>" for name in head)
+    body = "".join(
+        "<tr>"
+        + "".join(
+            f'<td data-name="{escaped(name)}">{cell}</td>'
+            for name, cell in zip(head, row, strict=True)
+        )
+        + "</tr>"
+        for row in rows
+    )
+    return f'<table class="{kind}"><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>'
+
+
+def _words(name: str) -> str:
+    words = name.replace("_", " ")
+    return f"{words.removesuffix(' si')} (SI)" if words.endswith(" si") else words
+
+
+def status_mark(status: str) -> str:
+    """A status word in its colour."""
+    return f'<span class="status {escaped(status)}">{escaped(status)}</span>'
+
+
+def escaped(text: str) -> str:
+    """Text as it stands in a page."""
+    return html.escape(text, quote=True)

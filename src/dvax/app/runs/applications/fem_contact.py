@@ -1,0 +1,228 @@
+"""`[model] name = "fem-contact"`: a punch pressed into a Kelvin–Voigt body."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from dvax.app.runs.applications.base import (
+    AbstractApplication,
+    Figure,
+    Known,
+    PerRow,
+    Plan,
+    Results,
+    Say,
+    Variable,
+)
+from dvax.app.runs.applications.certificate import certificate
+from dvax.app.runs.solver_options import SolverKeys, check_steps, settings
+from dvax.errors import InputError, InputProblem
+from dvax.evolution import Implicit, Solution
+from dvax.models.fem_contact import ElasticBody, FemContact
+
+_SMALL = 0.1
+"""An indentation above this part of a size of the body or the punch is worth a note."""
+
+_SIZES = ("width", "height", "fine_half_width", "fine", "coarse", "layers", "growth")
+
+
+class FemContactSection(SolverKeys):
+    """The body, the punch and the compliance of the contact, in units of your choice."""
+
+    name: Literal["fem-contact"] = Field(description="the model")
+    mesh: str | None = Field(None, description="a mesh file; without it a block of the sizes below")
+    width: float | None = Field(None, gt=0, description="width of the block")
+    height: float | None = Field(None, gt=0, description="height of the block")
+    fine_half_width: float | None = Field(None, gt=0, description="half width of the fine zone")
+    fine: int | None = Field(None, ge=1, description="columns of elements a side in the fine zone")
+    coarse: int | None = Field(None, ge=1, description="columns a side outside of it")
+    layers: int | None = Field(None, ge=1, description="layers of elements")
+    growth: float | None = Field(None, gt=0, description="ratio of heights of successive layers")
+    contact: str | None = Field(
+        None, description='what the mesh file calls the contact boundary, "contact" if not given'
+    )
+    clamped: str | None = Field(
+        None, description='what the mesh file calls the held boundary, "clamped" if not given'
+    )
+    indentation: float = Field(0.01, gt=0, description="depth to which the punch is pressed")
+    stiffness: float = Field(100.0, gt=0, description="pressure per penetration, beta")
+    pressure_cap: float | None = Field(
+        None, gt=0, description="largest pressure, kappa0; without it there is none"
+    )
+    radius: float = Field(10.0, gt=0, description="radius of the punch")
+    youngs_modulus: float = Field(1.0, gt=0, description="of the body")
+    poisson_ratio: float = Field(0.3, gt=-1, lt=0.5, description="of the body")
+    relaxation_time: float = Field(1.0, gt=0, description="viscosity over elasticity")
+    ramp: float = Field(2.0, gt=0, description="time over which the punch is pressed in")
+    end: float = Field(12.0, gt=0, description="end of the run")
+    frames: int = Field(120, ge=1, le=10**6, description="number of intervals between saved states")
+
+
+class _Loaded:
+    def __init__(self, table: FemContactSection, file: Path | None):
+        self.table, self.per_row = table, PerRow()
+        check_steps(table, table.end, f"the length {table.end:g}")
+        sizes = _given(table, _SIZES)
+        names = _given(table, ("contact", "clamped"))
+        if file is not None and sizes:
+            raise _refused(
+                ("mesh", *sizes), f"mesh together with {', '.join(sizes)}",
+                "a mesh comes from a file or is made from sizes, not both",
+                "Keep mesh, or keep the sizes",
+            )  # fmt: skip
+        if file is None and names:
+            raise _refused(
+                tuple(names), ", ".join(map(repr, names.values())),
+                "it is what a mesh file calls a boundary, and there is no mesh: the block is touched "
+                "at its top and held at its bottom",
+                'Leave it out, or add mesh = "..."',
+            )  # fmt: skip
+        self.body = ElasticBody(
+            file if file is not None else sizes,
+            youngs_modulus=table.youngs_modulus, poisson_ratio=table.poisson_ratio,
+            **names,
+        )  # fmt: skip
+        self.height = float(np.ptp(self.body.nodes[:, 1]))
+        if table.indentation >= self.height:
+            raise _refused(
+                ("indentation",), f"{table.indentation:g}",
+                f"the body is {self.height:g} high, and displacements are small against that",
+                f"Press the punch in by {0.01 * self.height:g}, say, or check the unit",
+            )  # fmt: skip
+        self.contact = FemContact(
+            self.body, indentation=table.indentation, stiffness=table.stiffness,
+            pressure_cap=np.inf if table.pressure_cap is None else table.pressure_cap,
+            radius=table.radius, relaxation_time=table.relaxation_time, ramp=table.ramp,
+        )  # fmt: skip
+
+
+def _given(table: FemContactSection, names: tuple[str, ...]) -> dict[str, Any]:
+    """The values of those keys that the file has."""
+    return {name: getattr(table, name) for name in names if getattr(table, name) is not None}
+
+
+def _refused(keys: tuple[str, ...], given: str, rule: str, mend: str) -> InputError:
+    return InputError(InputProblem(", ".join(f"model.{k}" for k in keys), given, rule, mend))
+
+
+def _notes(model: _Loaded) -> tuple[str, ...]:
+    """What a run will do, and its equations are not meant for."""
+    table, notes = model.table, []
+    for name, size in (("height of the body", model.height), ("radius of the punch", table.radius)):
+        part = table.indentation / size
+        if part > _SMALL:
+            notes.append(
+                f"model.indentation is {part:.0%} of the {name}, {size:g}: the equations are those of "
+                "small displacements, a few per cent of it."
+            )
+    if table.end < table.ramp:
+        notes.append(
+            f"The run ends at {table.end:g} while the punch is still pressed in, until model.ramp = "
+            f"{table.ramp:g}: its last force is not that at the full depth."
+        )
+    return tuple(notes)
+
+
+class FemContactApplication(AbstractApplication[_Loaded]):
+    """The pressure over time, its limit at rest, and the fields at the end for ParaView."""
+
+    section = FemContactSection
+    files = ("mesh",)
+    end = "model.end"
+
+    def read(self, table: Any, paths: Mapping[str, Path], quiet: bool) -> _Loaded:
+        return _Loaded(table, paths.get("mesh"))
+
+    def fit(self, model: _Loaded) -> str:
+        return model.contact.fit
+
+    def known(self, model: _Loaded) -> Known:
+        body = model.body
+        sizes = [
+            ("displacements", str(body.unknowns), "free ones, of quadratic elements"),
+            ("contact points", str(len(body.points)), "Gauss points of the contact boundary"),
+            ("states", str(body.trace.shape[1]), "displacements that the contact can see"),
+        ]
+        return Known(model.contact.constants, (), sizes, _notes(model))
+
+    def plan(self, model: _Loaded, say: Say) -> Plan:
+        m, table = model.contact, model.table
+        say("solving at rest")
+        rest = m.equilibrium()
+        times = np.linspace(0.0, table.end, table.frames + 1)
+        say(f"solving from 0 to {table.end:g}")
+        options = settings(table, method=m.method, rtol=1e-7, atol=1e-11)
+        return Plan(m.problem, m.untouched, times, m.constants, options, rest)
+
+    def results(self, model: _Loaded, plan: Plan, solution: Solution, count: int) -> Results:
+        m, rest, times = model.contact, plan.data, np.asarray(solution.ts)[:count]
+        pressure = model.per_row("pressure", m.pressure, solution.ts, solution.xs)[:count]
+        still, last = m.figures(rest.pressure), m.figures(pressure[-1])
+        force = np.array([m.figures(p)["force"] for p in pressure])
+        s = m.body.points[:, 0]
+        order = np.argsort(s)
+        deformed = m.body.nodes + m.displacement(solution.xs[-1])
+        stress = m.stress(solution.ts[-1], solution.xs[-1])
+        variables = {
+            "time": Variable(("time",), times, "[t]", "time"),
+            "place": Variable(("place",), s[order], "[x]", "contact points"),
+            "force": Variable(("time",), force, "[p][x]", "force on the punch"),
+            "pressure": Variable(("time", "place"), pressure[:, order], "[p]", "contact pressure"),
+            "pressure_at_rest": Variable(
+                ("place",), np.asarray(rest.pressure)[order], "[p]", "contact pressure at rest"
+            ),
+            "nodes": Variable(("node", "axis"), m.body.nodes, "[x]", "nodes"),
+            "deformed": Variable(("node", "axis"), deformed, "[x]", "nodes at the end"),
+            "cells": Variable(("cell", "corner"), m.body.cells(), "1", "nodes of each element"),
+            "stress": Variable(("cell", "component"), stress, "[p]", "xx, yy, zz, xy at the end"),
+        }
+        known = m.constants.status_of("gamma")
+        certified = None if rest.vi.error_bound is None else float(rest.vi.error_bound)
+        figures = {
+            "force": Figure(still["force"], "[p][x]", "force on the punch at rest"),
+            "contact_half_width": Figure(
+                still["contact_half_width"], "[x]", "half of the width under pressure, at rest"
+            ),
+            "saturated_length": Figure(
+                still["saturated_length"], "[x]", "length at the cap, at rest"
+            ),
+            "peak_pressure": Figure(still["peak_pressure"], "[p]", "largest pressure at rest"),
+            "final_force": Figure(last["force"], "[p][x]", "force at the end of the run"),
+            "distance_from_rest": Figure(
+                float(np.abs(pressure[-1] - np.asarray(rest.pressure)).max()), "[p]",
+                "largest difference of the last pressure from that at rest",
+            ),
+            "rest_error_bound": Figure(
+                certified, "[p][x]^(1/2)",
+                f"bound on the error of the pressure at rest, in L2 ({known})", bound=known,
+            ),
+            "decay_rate": Figure(
+                float(m.constants.sharp_decay_rate), "1/[t]",
+                "two states certainly approach at this rate in the norm of the viscosity",
+            ),
+        }  # fmt: skip
+        if not isinstance(solution.setup.method, Implicit):
+            bound = certificate(m.problem, solution, m.constants, count)
+            figures["error_bound"] = Figure(
+                bound.largest, "([p][x]²)^(1/2)",
+                f"bound on the error of the state in the norm of the viscosity ({bound.status})",
+                bound=bound.status,
+            )  # fmt: skip
+            variables["error_bound"] = Variable(
+                ("time",),
+                bound.values,
+                "([p][x]²)^(1/2)",
+                "bound on the error of the state",
+                bound.status,
+            )
+
+        def files(directory: Path) -> None:
+            m.write(directory / "body.vtu", solution.ts[-1], solution.xs[-1])
+
+        return Results(figures, variables, m.constants, int(solution.stats["steps"]), files=files)
+
+
+APPLICATION = FemContactApplication()

@@ -1,0 +1,258 @@
+"""Configurations: a TOML file in, checked settings with every default filled in out.
+
+`load_config` reads and checks everything that can be checked without running: the syntax, the
+schema, the rules between values, the formulas, and every data file. All problems are reported
+together.
+"""
+
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from dvax.app.runs.blocks import longest_block
+from dvax.app.runs.consistency import check_consistency
+from dvax.app.runs.contact_inputs import ContactInputs, read_inputs
+from dvax.app.runs.fields import Sources
+from dvax.app.runs.schema import OPTIONAL, SECTIONS
+from dvax.app.runs.schema_errors import shown, translate, unknown_key
+from dvax.app.runs.settings import Config as Config
+from dvax.app.runs.solver_options import MOST_STEPS, short_dt_max
+from dvax.app.runs.units import Units
+from dvax.errors import InputError, InputProblem
+
+MAX_BYTES = 2**20
+_RTOL = 1e-6
+_ATOL_OF_SCALE = 1e-9  # of the model's own indentation scale
+
+
+def load_config(path: str | Path, *, allow_outside: bool = False) -> Config:
+    """Read, check and complete a configuration file.
+
+    Defaults are filled in, so the result says everything that a run will do. Data files lie in the
+    configuration's folder or below; `allow_outside` lifts that.
+
+    **Raises:** `InputError` with all problems found: syntax (line and column), unknown or missing
+    keys, types, units, ranges, contradictions, formulas (column) and data (file, line and column).
+    """
+    source = Path(path)
+    return check_contact(parse(source), source, allow_outside)
+
+
+def build_contact(config: Config) -> ContactInputs:
+    """The data of a run as arrays and signals. Raises `InputError` if a file changed for the
+    worse."""
+    inputs, problems = read_inputs(config, config.sources, config.units)
+    if inputs is None or problems:
+        raise InputError(*problems)
+    return inputs
+
+
+def with_points(config: Config, points: int) -> Config:
+    """The same configuration on a one-dimensional boundary of other resolution."""
+    boundary = config.boundary.model_copy(update={"points": (points,)})
+    return config.model_copy(update={"boundary": boundary})
+
+
+def parse(source: Path) -> dict[str, Any]:
+    """A TOML file as a table. **Raises:** `InputError` with line and column."""
+
+    def refuse(place: str, given: str, rule: str, mend: str) -> InputError:
+        return InputError(InputProblem(place, given, rule, mend))
+
+    name = source.name
+    try:
+        if not source.is_file():
+            given = "a folder" if source.is_dir() else "no such file"
+            raise refuse(str(source), given, "a configuration is a TOML file", "Check its name.")
+        size = source.stat().st_size
+        if size > MAX_BYTES:
+            raise refuse(
+                name,
+                f"{size} bytes",
+                f"a configuration has at most {MAX_BYTES} bytes",
+                "Put data into CSV or NPY files.",
+            )
+        text = source.read_bytes().decode(
+            "utf-8-sig"
+        )  # Notepad begins a file with a byte-order mark
+        return tomllib.loads(text)
+    except InputError:
+        raise  # it is a ValueError too
+    except OSError as error:
+        raise refuse(
+            str(source), error.strerror or str(error), "it must be readable", "Check it."
+        ) from None
+    except UnicodeDecodeError as error:
+        raise refuse(
+            f"{name}, byte {error.start + 1}",
+            "bytes that are not UTF-8",
+            "TOML is UTF-8",
+            "Save it so.",
+        ) from None
+    except tomllib.TOMLDecodeError as error:
+        message = str(error)
+        found = re.search(r"\(at line (\d+), column (\d+)\)", message)
+        place = f"{name}, line {found[1]}, column {found[2]}" if found else f"{name}, at its end"
+        lines = text.splitlines() or [""]
+        line = lines[min(int(found[1]), len(lines)) - 1] if found else lines[-1]
+        raise refuse(place, repr(line.strip()[:120]), *_broken_toml(message, line)) from None
+    except (RecursionError, ValueError) as error:
+        # tomllib lets the errors of int() and of deep nesting through.
+        raise refuse(
+            name, shown(str(error)), "the file is not readable as TOML", "Write it simpler."
+        ) from None
+
+
+_TOML = (
+    ("Invalid value", "what stands after = is no value of TOML",
+     'Write a number with a point (0.5), true or false, a text in "quotes", or a list [1, 2].'),
+    ("Expected '=' after a key", "a line is key = value, or a heading [table]",
+     "Write = between the key and its value, and put keys with blanks in quotes."),
+    ("Invalid statement", "a line is key = value, or a heading [table]",
+     "Start comments with #, and keys with a letter."),
+    ("Cannot overwrite a value", "every key occurs once in its table",
+     "Remove one of the two lines with this key."),
+    ("Cannot declare", "every heading [table] occurs once, and [[table]] makes entries of a list",
+     "Join the two tables, or write [[table]] for each entry."),
+    ("Expected newline or end of document", "a value ends with its line",
+     'Write one key = value a line, numbers as 0.5 or 1e-3, and quantities in quotes: "5 ms".'),
+    ("Unterminated string", "a text ends with the quote it began with", "Close the quotes."),
+    ("Illegal character", "a text in quotes stands on one line", "Close the quotes on this line."),
+    ("Expected ']' at the end of a table", "a heading ends with ]", "Close the bracket."),
+    ('Expected "\'"', "a text ends with the quote it began with", "Close the quotes."),
+    ("Unclosed array", "a list ends with ]", "Close the bracket."),
+    ("Unescaped", "a backslash in a text in quotes begins an escape",
+     "Write paths with / or in 'single quotes'."),
+)  # fmt: skip
+
+
+def _broken_toml(message: str, line: str) -> tuple[str, str]:
+    """The rule that a line breaks, and the fix, from what the parser says."""
+    for start, rule, fix in _TOML:
+        if message.startswith(start):
+            return f"the file is not TOML: {rule}", fix
+    reason = re.sub(r"\s*\(at .*\)$", "", message)
+    return f"the file is not TOML ({reason})", 'Write key = value; texts in "quotes".'
+
+
+def check_contact(raw: dict[str, Any], source: Path, allow_outside: bool) -> Config:
+    """The configuration of a contact law, checked and completed."""
+    file = source.name
+    problems = [
+        unknown_key(f"{file}: {key}", key, value, list(SECTIONS))
+        for key, value in raw.items()
+        if key not in SECTIONS
+    ]
+    # With broken units, dimensions are still checked, in the default ones.
+    units, broken = _section("units", raw.get("units", {}), file, Units())
+    problems += broken
+    working = units if isinstance(units, Units) else Units()
+    sections: dict[str, BaseModel] = {} if units is None else {"units": units}
+    for name in SECTIONS:
+        if name == "units":
+            continue
+        if name not in raw and name not in OPTIONAL:
+            mend = f"Add [{name}]."
+            problems.append(InputProblem(f"{file}: {name}", "nothing", "it is required", mend))
+            continue
+        section, broken = _section(name, raw.get(name, {}), file, working)
+        problems += broken
+        if section is not None:
+            sections[name] = section
+    between = check_consistency(raw, file)
+    problems += between + _uncountable_steps(sections, file)
+    contradictory = {p.place.removeprefix(f"{file}: ").split(".")[0] for p in between}
+    usable = {name: s for name, s in sections.items() if name not in contradictory}
+    draft = Config.model_construct(**usable)  # pyright: ignore[reportArgumentType]
+    sources = Sources(file, source.parent, allow_outside)
+    quoted = frozenset(
+        name
+        for name in ("demand", "load", "initial")
+        if isinstance(raw.get(name), dict) and isinstance(raw[name].get("value"), str)
+    )
+    draft = _with_defaults(draft, usable)
+    edges = raw.get("boundary")
+    rectangle = isinstance(edges, dict) and "lengths" in edges and "length" not in edges
+    names = ("s1", "s2") if rectangle else ("s",)
+    inputs, found = read_inputs(draft, sources, working, quoted, names)
+    problems += found
+    if problems:
+        raise InputError(*problems)
+    assert inputs is not None
+    solver = draft.solver
+    if solver.dt_max is not None:
+        span = longest_block(inputs.frame_times, inputs.boundary.size)
+        short = short_dt_max(solver.dt_max, solver.max_steps, span, f"{file}: solver")
+        if short is not None:
+            raise InputError(short)
+    if draft.output.points_of_interest is None:
+        places = tuple(
+            tuple(float(c[i]) for c in inputs.boundary.coordinates) for i in inputs.point_indices
+        )
+        output = draft.output.model_copy(update={"points_of_interest": places})
+        draft = draft.model_copy(update={"output": output})
+    draft._source, draft._allow_outside = source, allow_outside
+    return draft
+
+
+def _uncountable_steps(sections: Mapping[str, Any], file: str) -> list[InputProblem]:
+    """A fixed step so short that the run has more steps than can be counted."""
+    if "time" not in sections or "solver" not in sections or sections["solver"].dt is None:
+        return []
+    end, dt = sections["time"].end, sections["solver"].dt
+    if end / dt < MOST_STEPS:
+        return []
+    return [
+        InputProblem(
+            f"{file}: solver.dt",
+            f"{dt:g} for a run of {end:g}",
+            f"a run has fewer than {MOST_STEPS} steps, or they cannot be counted",
+            "Give a longer step.",
+        )
+    ]
+
+
+def _section(
+    name: str, value: Any, file: str, units: Units
+) -> tuple[BaseModel | None, list[InputProblem]]:
+    model = SECTIONS[name]
+    try:
+        return model.model_validate(value, context={"units": units}), []
+    except ValidationError as error:
+        problems = translate(error, file, name, model)
+        refused = {e["loc"][0] for e in error.errors(include_url=False) if e["loc"]}
+    if name not in {"demand", "load", "initial"}:
+        return None, problems
+    # The factors that were not refused are still worth checking: everything is reported at once.
+    rest = {key: v for key, v in value.items() if key not in refused} if refused else {}
+    try:
+        return model.model_validate(rest, context={"units": units}), problems
+    except ValidationError:
+        return None, problems  # what is wrong has been said above
+
+
+def _with_defaults(draft: Config, usable: Mapping[str, BaseModel]) -> Config:
+    """Fill in what depends on the model: tolerances and the companion's perturbation."""
+    if "model" not in usable:
+        return draft
+    # The indentation that carries a point through the active regime (paper,
+    # eq:concrete_contact_states).
+    model = draft.model
+    scale = (1 + model.b_u) * model.kappa0 / (model.beta * model.b_x)
+    update: dict[str, BaseModel] = {}
+    if "solver" in usable and draft.solver.dt is None:
+        solver = draft.solver
+        tolerances = {"rtol": solver.rtol or _RTOL, "atol": solver.atol or _ATOL_OF_SCALE * scale}
+        update["solver"] = solver.model_copy(update=tolerances)
+    if "initial" in usable:
+        initial, change = draft.initial, {}
+        if initial.companion is None:
+            change["companion"] = scale
+        if initial.value is None and initial.expression is None and initial.profile is None:
+            change["value"] = 0.0
+        update["initial"] = initial.model_copy(update=change)
+    return draft.model_copy(update=update)

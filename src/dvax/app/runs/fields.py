@@ -1,0 +1,222 @@
+"""A field on the boundary as the product of its factors.
+
+    field(t, s) = value * expression(t, s) * series(t) * profile(s)
+
+Every factor is optional. At most one of them is a physical quantity, the others are pure numbers;
+where none says a unit, the product is a number in working units.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dvax.app.runs.boundary import Boundary
+from dvax.app.runs.data_file import DataFile, fingerprint, locate
+from dvax.app.runs.expressions import Expression, compile_expression
+from dvax.app.runs.measured import Profile, Series, read_profile, read_series
+from dvax.app.runs.schema import (
+    DemandSection,
+    InitialSection,
+    LoadSection,
+    ProfileSection,
+    SeriesSection,
+)
+from dvax.app.runs.units import Units
+from dvax.errors import InputError, InputProblem
+
+_SAMPLE_TIMES = 33
+_SAMPLE_POINTS = 1000
+
+
+@dataclass(frozen=True)
+class Field:
+    """The factors of a field, in working units and in double precision."""
+
+    constant: float = 1.0
+    expression: Expression | None = None
+    knots: tuple[float, ...] = ()
+    series: Series | None = None
+    profile: Profile | None = None
+    files: tuple[DataFile, ...] = ()
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Where a configuration's data lies: its file's name, its folder, and whether it may leave
+    it."""
+
+    name: str
+    folder: Path
+    allow_outside: bool
+
+
+def read_field(
+    section: DemandSection | LoadSection | InitialSection,
+    key: str,
+    kind: str,
+    sources: Sources,
+    units: Units,
+    boundary: Boundary | tuple[str, ...],
+    end: float | None,
+    *,
+    value_has_unit: bool = False,
+) -> Field:
+    """Read, compile and check all factors of ``[key]``, a quantity of the given `kind`.
+
+    `end` is the end of the run, None where it is not known. Of a boundary that is not known, give
+    the names of the coordinates; profiles then stay unread. Raises `InputError` with the problems
+    of every factor.
+    """
+    problems: list[InputProblem] = []
+    files: list[DataFile] = []
+    prefix = f"{sources.name}: {key}"
+
+    def attempt(read: Callable[[], Any]) -> Any:
+        try:
+            return read()
+        except InputError as error:
+            problems.extend(error.problems)
+            return None
+
+    def opened(part: SeriesSection | ProfileSection, name: str) -> Path | None:
+        place = f"{prefix}.{name}.file"
+        path = attempt(lambda: locate(part.file, sources.folder, sources.allow_outside, place))
+        if path is not None:
+            files.extend(filter(None, [attempt(lambda: fingerprint(part.file, path))]))
+        return path
+
+    names = boundary.names if isinstance(boundary, Boundary) else boundary
+    names = names if isinstance(section, InitialSection) else ("t", *names)
+    text, expression, series, profile = section.expression, None, None, None
+    if text is not None:
+        place = f"{prefix}.expression"
+        expression = attempt(lambda: compile_expression(text, names, place=place))
+    part = None if isinstance(section, InitialSection) else section.series
+    if part is not None and (path := opened(part, "series")) is not None:
+        place = f"{prefix}.series"
+        series = attempt(lambda: read_series(part, path, units, kind, end, place))
+    shape = section.profile
+    where = opened(shape, "profile") if shape is not None else None
+    if shape is not None and where is not None and isinstance(boundary, Boundary):
+        place = f"{prefix}.profile"
+        profile = attempt(lambda: read_profile(shape, where, units, kind, boundary, place))
+    if problems:
+        raise InputError(*problems)
+    carriers = ["value"] if value_has_unit else []
+    carriers += ["series"] if series is not None and series.carries_unit else []
+    carriers += ["profile"] if profile is not None and profile.carries_unit else []
+    if len(carriers) > 1:
+        raise InputError(
+            InputProblem(
+                prefix,
+                f"units in {' and in '.join(carriers)}",
+                f"the factors multiply to {units.of(kind)}, so only one of them carries a unit",
+                "Keep the unit of one factor; the others are pure numbers (columns [1]).",
+            )
+        )
+    knots = () if isinstance(section, InitialSection) else section.knots or ()
+    constant = 1.0 if section.value is None else section.value
+    field = Field(constant, expression, knots, series, profile, tuple(files))
+    if isinstance(boundary, Boundary):
+        _check_finite(field, boundary, end, prefix)
+    return field
+
+
+def space_values(field: Field, boundary: Boundary) -> np.ndarray:
+    """The field (n,) where nothing in it depends on time."""
+    values = np.full(boundary.size, field.constant)
+    if field.expression is not None:
+        values = values * field.expression.numpy(**_variables(field.expression, boundary, 0.0))
+    if field.profile is not None:
+        values = values * field.profile.values
+    return values
+
+
+def perturbation(value: float | str, boundary: Boundary, place: str) -> np.ndarray:
+    """What is added to x0 for the companion: a number, or a formula in the coordinates. (n,)
+
+    Raises `InputError`; a perturbation that vanishes everywhere would compare a run with itself.
+    """
+    field = Field()
+    if isinstance(value, str):
+        field = Field(expression=compile_expression(value, boundary.names, place=place))
+        _check_finite(field, boundary, None, place)
+    values = space_values(field, boundary) * (1.0 if isinstance(value, str) else value)
+    if not np.any(values):
+        raise InputError(
+            InputProblem(
+                place,
+                repr(value),
+                "the companion starts elsewhere, or both trajectories are the same",
+                "Give a perturbation that is not zero, or leave it out for the default.",
+            )
+        )
+    return values
+
+
+def to_signal(field: Field, boundary: Boundary) -> Any:
+    """The field as a `dvax.signals` signal with values (n,), or () where it is the same
+    everywhere."""
+    from dvax import signals
+    from dvax.app.runs.formula_signal import Formula
+
+    factors: list[Any] = []
+    expression = field.expression
+    varies = expression is not None and "t" in expression.uses
+    everywhere = np.asarray(field.constant)
+    if expression is not None and not varies:
+        everywhere = everywhere * expression.numpy(**_variables(expression, boundary, 0.0))
+    if field.profile is not None:
+        everywhere = everywhere * field.profile.values
+    if everywhere.ndim or everywhere != 1.0 or not (varies or field.series):
+        factors.append(signals.Constant(everywhere))
+    if field.series is not None:
+        series = field.series
+        factors.append(signals.Table(series.times, series.values, kind=series.kind))  # pyright: ignore[reportArgumentType]
+    if expression is not None and varies:
+        formula = Formula(expression, boundary.names, boundary.coordinates)
+        factors.append(signals.Function(formula, knots=field.knots))
+    product = factors[0]
+    for factor in factors[1:]:
+        product = signals.Product(product, factor)
+    return product
+
+
+def _variables(expression: Expression, boundary: Boundary, t: float) -> dict[str, Any]:
+    variables: dict[str, Any] = dict(zip(boundary.names, boundary.coordinates, strict=True))
+    return {**variables, "t": t} if "t" in expression.names else variables
+
+
+def _check_finite(field: Field, boundary: Boundary, end: float | None, place: str) -> None:
+    """Look for NaN and infinities on samples: what is found is an error, the rest the run
+    watches."""
+    expression = field.expression
+    if expression is None:
+        return
+    stride = max(1, boundary.size // _SAMPLE_POINTS)
+    coarse = {k: c[::stride] for k, c in zip(boundary.names, boundary.coordinates, strict=True)}
+    fine = dict(zip(boundary.names, boundary.coordinates, strict=True))
+    samples: list[tuple[float, dict[str, Any]]] = [(0.0, fine)]
+    if "t" in expression.uses and end is not None:
+        samples += [(float(t), coarse) for t in np.linspace(0.0, end, _SAMPLE_TIMES)[1:]]
+    for t, coordinates in samples:
+        variables = {**coordinates, "t": t} if "t" in expression.names else coordinates
+        values = np.broadcast_to(
+            expression.numpy(**variables), next(iter(coordinates.values())).shape
+        )
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            at = ", ".join(f"{name} = {c[bad[0]]:.6g}" for name, c in coordinates.items())
+            if "t" in expression.uses:
+                at = f"t = {t:.6g}, {at}"
+            raise InputError(
+                InputProblem(
+                    place,
+                    f"{expression.text!r:.70} with the value {values[bad[0]]} at {at}",
+                    "a field is finite everywhere and at all times",
+                    "Mend the division, root or logarithm there.",
+                )
+            )

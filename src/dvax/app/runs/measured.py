@@ -1,0 +1,229 @@
+"""Measured factors of a field: histories in time and profiles over the boundary, in working
+units."""
+
+import io
+import math
+import tokenize
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dvax.app.runs.boundary import Boundary
+from dvax.app.runs.schema import ProfileSection, SeriesSection
+from dvax.app.runs.units import UnitError, Units
+from dvax.errors import InputError, InputProblem
+from dvax.formats.at2 import read_at2
+from dvax.formats.table import check_increasing, read_bytes, read_columns
+
+# What numpy raises for broken headers and data: its header parser lets the tokenizer's errors
+# through.
+_BROKEN_NPY = (
+    ValueError,
+    TypeError,
+    SyntaxError,
+    KeyError,
+    EOFError,
+    OSError,
+    MemoryError,
+    OverflowError,
+    RecursionError,
+    tokenize.TokenError,
+    Warning,
+)
+_CUBIC_LEAST = 4  # points that a not-a-knot spline needs
+
+
+@dataclass(frozen=True)
+class Series:
+    """Values (m,) at increasing times (m,) [unit of time], joined as `kind` says.
+
+    `carries_unit`: the values are quantities and no pure numbers.
+    """
+
+    times: np.ndarray
+    values: np.ndarray
+    kind: str
+    carries_unit: bool
+
+
+@dataclass(frozen=True)
+class Profile:
+    """One value for each point of the boundary."""
+
+    values: np.ndarray
+    carries_unit: bool
+
+
+def read_series(
+    section: SeriesSection, path: Path, units: Units, kind: str, end: float | None, place: str
+) -> Series:
+    """A history that covers [0, end]; `kind` is the quantity that the field is.
+
+    Raises `InputError`: extrapolating measured data would invent it.
+    """
+    factor = section.per_unit if isinstance(section.per_unit, float) else None
+    if path.suffix.lower() == ".at2":
+        step, raw = read_at2(path)
+        problems = [
+            InputProblem(
+                f"{place}.{key}", repr(value), "an .at2 record has no columns", "Remove it."
+            )
+            for key, value in (("column", section.column), ("time_column", section.time_column))
+            if value not in (None, "time")
+        ]
+        if factor is None:
+            problems.append(
+                InputProblem(
+                    f"{place}.per_unit",
+                    "nothing",
+                    f"an .at2 record is in g, which is no {kind}",
+                    f'Say what 1 g stands for: per_unit = "30 {units.of(kind)}".',
+                )
+            )
+        if problems:
+            raise InputError(*problems)
+        times, unit = step * np.arange(raw.size) * units.factor("s", "time"), "g"
+    else:
+        time, column = read_columns(
+            path, [section.time_column, section.column], section.time_column
+        )
+        check_increasing(path.name, time)
+        times = time.values * _factor(units, time.unit, "time", path.name, time.name)
+        raw, unit = column.values, column.unit
+        if factor is None and unit != "1":
+            factor = _factor(units, unit, kind, path.name, column.name)
+    least = _CUBIC_LEAST if section.kind == "cubic" else 2
+    if times.size < least:
+        raise _error(
+            path.name,
+            f"{times.size} rows",
+            f"a {section.kind} history needs {least} of them at least",
+            "Add measurements.",
+        )
+    # The last time of a table in other units may miss `end` by a rounding error of the conversion.
+    slack = 1e-12 * abs(times[-1])
+    if end is not None and (times[0] > 0 or times[-1] < end - slack):
+        raise _error(
+            place,
+            f"{path.name} from {times[0]:.12g} to {times[-1]:.12g} {units.time}",
+            f"the data covers the run from 0 to {end:.12g} {units.time}: nothing is extrapolated",
+            "Shorten time.end, or measure for longer.",
+        )
+    if end is not None and times[-1] < end:
+        times = np.append(times[:-1], end)
+    return Series(
+        times, raw * (1.0 if factor is None else factor), section.kind, factor is not None
+    )
+
+
+def read_profile(
+    section: ProfileSection, path: Path, units: Units, kind: str, boundary: Boundary, place: str
+) -> Profile:
+    """A profile on the points of the boundary: NPY point by point, CSV interpolated by straight
+    lines.
+
+    Raises `InputError` where lengths differ or the coordinates do not cover the boundary's points.
+    """
+    factor = section.per_unit if isinstance(section.per_unit, float) else None
+    if path.suffix.lower() == ".npy":
+        values = _read_npy(section, path, boundary, place)
+        return Profile(values * (1.0 if factor is None else factor), factor is not None)
+    points = boundary.coordinates[0]
+    if len(boundary.coordinates) > 1:
+        raise _error(
+            f"{place}.file",
+            repr(section.file),
+            "a profile over a rectangle is an NPY array",
+            f"Save it with the shape {boundary.shape}.",
+        )
+    position, column = read_columns(
+        path, [section.position_column, section.column], section.position_column
+    )
+    check_increasing(path.name, position)
+    s = position.values * _factor(units, position.unit, "length", path.name, position.name)
+    slack = 1e-12 * np.max(np.abs(s))
+    if s[0] > points.min() + slack or s[-1] < points.max() - slack:
+        raise _error(
+            place,
+            f"{path.name} from {s[0]:.12g} to {s[-1]:.12g} {units.length}",
+            f"it covers the points from {points.min():.12g} to {points.max():.12g} {units.length}: "
+            "nothing is extrapolated",
+            "Shorten the boundary, or measure further.",
+        )
+    if factor is None and column.unit != "1":
+        factor = _factor(units, column.unit, kind, path.name, column.name)
+    values = np.interp(points, s, column.values) * (1.0 if factor is None else factor)
+    return Profile(values, factor is not None)
+
+
+def check_length(section: ProfileSection, path: Path, shape: tuple[int, ...], place: str) -> None:
+    """Raise `InputError` where an NPY profile does not fit a boundary of this shape, which need not
+    have been built. A CSV profile is interpolated, and fits."""
+    if path.suffix.lower() == ".npy":
+        _of_shape(_load_npy(section, path, place), shape, path, place)
+
+
+def _read_npy(section: ProfileSection, path: Path, boundary: Boundary, place: str) -> np.ndarray:
+    array = _load_npy(section, path, place)
+    _of_shape(array, boundary.shape, path, place)
+    values = array.astype(np.float64).ravel()
+    bad = np.flatnonzero(~np.isfinite(values))
+    if bad.size:
+        first = int(bad[0])
+        raise _error(
+            f"{path.name}, value {first + 1}",
+            f"{values[first]} ({bad.size} such values)",
+            "every value of a profile is finite: a gap is not a value",
+            "Fill the gaps on purpose.",
+        )
+    return values
+
+
+def _of_shape(array: np.ndarray, shape: tuple[int, ...], path: Path, place: str) -> None:
+    size = math.prod(shape)
+    if array.shape not in {(size,), shape}:
+        raise _error(
+            f"{place}.file",
+            f"{path.name} with {array.size} values (shape {array.shape})",
+            f"the boundary has {size} points (shape {shape}), a value for each",
+            "Set boundary.points to the profile's length, or resample the profile.",
+        )
+
+
+def _load_npy(section: ProfileSection, path: Path, place: str) -> np.ndarray:
+    for key, value in (("column", section.column), ("position_column", section.position_column)):
+        if value not in (None, "s"):
+            raise _error(f"{place}.{key}", repr(value), "an NPY file has no columns", "Remove it.")
+    content = read_bytes(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # numpy repairs some headers with a mere warning
+            array = np.load(io.BytesIO(content), allow_pickle=False)
+    except _BROKEN_NPY as e:
+        raise _error(
+            path.name,
+            str(e).splitlines()[0][:120] if str(e) else "an incomplete file",
+            "a profile is an NPY file with an array of numbers, without pickled objects",
+            "Save it with numpy.save(name, array.astype(float)).",
+        ) from None
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        given = str(array.dtype) if isinstance(array, np.ndarray) else type(array).__name__
+        raise _error(
+            path.name, given, "a profile is one array of real numbers", "Save it as float."
+        )
+    return array
+
+
+def _factor(units: Units, unit: str, kind: str, file: str, column: str) -> float:
+    try:
+        return units.factor(unit, kind)
+    except UnitError as error:
+        raise _error(
+            f"{file}, column {column!r}", f"[{unit}]", error.rule, f"{error.fix}."
+        ) from None
+
+
+def _error(place: str, given: str, rule: str, mend: str) -> InputError:
+    return InputError(InputProblem(place, given, rule, mend))

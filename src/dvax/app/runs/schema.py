@@ -1,0 +1,341 @@
+"""The configuration as pydantic models: one class a section of the TOML file.
+
+Every physical quantity is a number in the working units of ``[units]`` or a text "number unit",
+which is converted as it is read, so a validated configuration holds numbers alone. Rules that
+concern one value stand here, as do the reasons for them, which error messages repeat; rules between
+values stand in `dvax.app.runs.consistency`.
+"""
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    ValidationInfo,
+)
+from pydantic_core import PydanticCustomError
+
+from dvax.app.runs.units import UnitError, Units, check_working_unit, is_quantity
+
+ViSolver = Literal[
+    "Auto", "Projection", "Extragradient", "ForwardBackwardForward", "GoldenRatio",
+    "SemismoothNewton", "ActiveSet", "Accelerated",
+]  # fmt: skip
+"""Solvers of the frozen law that need no argument, by their names in `dvax.vi`."""
+MOST_COUNTED = 2**31 - 1
+"""The largest max_steps of `dvax.solve`."""
+MAX_POINTS = 100_000_000
+MAX_FRAMES = 10**7
+
+
+def broken(rule: str, mend: str) -> PydanticCustomError:
+    """What a validator raises: the rule that a value breaks, and the mend."""
+    return PydanticCustomError("rule", "{rule}", {"rule": rule, "mend": mend})
+
+
+LEAST_RTOL = 2.3e-14
+"""A hundred roundings of double precision: the smallest rtol that steps can reach."""
+
+
+def within_precision(rtol: float | None) -> float | None:
+    """A relative tolerance that double precision can reach."""
+    if rtol is not None and rtol < LEAST_RTOL:
+        raise broken(
+            f"a relative tolerance below {LEAST_RTOL:g} cannot be reached in double precision, whose "
+            "rounding is 2.2e-16 an operation",
+            f"Write rtol = {LEAST_RTOL:g} or more; atol is for states near 0",
+        )
+    return rtol
+
+
+def _in_units(value: Any, kind: str, info: ValidationInfo) -> Any:
+    """A text "number unit" as a number in working units; everything else as it is."""
+    if not isinstance(value, str):
+        return value
+    units = (info.context or {}).get("units") or Units()
+    try:
+        return units.convert(value, kind)
+    except UnitError as error:
+        raise broken(error.rule, error.fix) from None
+
+
+def in_quantity(kind: str) -> BeforeValidator:
+    """A number in working units, or a text "number unit" of this kind."""
+
+    def convert(value: Any, info: ValidationInfo) -> Any:
+        return _in_units(value, kind, info)
+
+    return BeforeValidator(convert)
+
+
+def _finite(value: Any, kind: str, info: ValidationInfo, what: str) -> float:
+    number = _in_units(value, kind, info)
+    if type(number) not in (int, float) or not math.isfinite(number):
+        raise broken(
+            f"{what} is a finite number", f'Write a number, or a text such as "2.5 <unit>" ({kind})'
+        )
+    return float(number)
+
+
+def _pair_of_lengths(value: Any, info: ValidationInfo) -> tuple[float, ...]:
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        raise broken("a two-dimensional boundary has two lengths", "Write lengths = [a, b]")
+    pair = tuple(_finite(v, "length", info, "a length") for v in value)
+    if not all(v > 0 for v in pair):
+        raise broken("a length is greater than 0", "Give both sides of the boundary")
+    return pair
+
+
+def _counts(value: Any) -> tuple[int, ...]:
+    counts = tuple(value) if isinstance(value, list | tuple) else (value,)
+    if len(counts) not in (1, 2) or not all(type(n) is int for n in counts):
+        raise broken(
+            "points is a whole number, or two of them", "Write points = 1000 or points = [100, 50]"
+        )
+    if not all(n >= 1 for n in counts) or math.prod(counts) > MAX_POINTS:
+        raise broken(
+            f"a boundary has 1 to {MAX_POINTS} points in all", "Choose the resolution you need"
+        )
+    return counts
+
+
+def _places(value: Any, info: ValidationInfo) -> tuple[tuple[float, ...], ...]:
+    if not isinstance(value, list | tuple):
+        raise broken("points_of_interest is a list", "Write points_of_interest = [2.5, 5.0]")
+    places = []
+    for place in value:
+        parts = place if isinstance(place, list | tuple) else (place,)
+        places.append(tuple(_finite(part, "length", info, "a coordinate") for part in parts))
+    return tuple(places)
+
+
+def _times(value: Any, info: ValidationInfo) -> tuple[float, ...]:
+    if not isinstance(value, list | tuple):
+        raise broken("knots is a list of times", "Write knots = [1.0, 2.0]")
+    return tuple(_finite(part, "time", info, "a time") for part in value)
+
+
+def _perturbation(value: Any, info: ValidationInfo) -> float | str:
+    """A number, a quantity, or else a formula, which `dvax.app.runs.fields` compiles."""
+    if isinstance(value, str) and not is_quantity(value):
+        return value
+    return _finite(value, "indentation", info, "the perturbation")
+
+
+def _working_unit(value: Any, info: ValidationInfo) -> Any:
+    if isinstance(value, str):
+        try:
+            check_working_unit(str(info.field_name), value)
+        except UnitError as error:
+            raise broken(error.rule, error.fix) from None
+    return value
+
+
+class Section(BaseModel):
+    """A table of the file: unknown keys, wrong types, NaN and infinity are errors."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+class UnitsSection(Units):
+    """The working units, each checked to have the dimension of its name."""
+
+    time: Annotated[str, BeforeValidator(_working_unit)] = Field("s", description="a unit of time")
+    length: Annotated[str, BeforeValidator(_working_unit)] = Field(
+        "m", description="the unit of coordinates on the boundary"
+    )
+    indentation: Annotated[str, BeforeValidator(_working_unit)] = Field(
+        "m", description="the unit of x, g and u"
+    )
+    pressure: Annotated[str, BeforeValidator(_working_unit)] = Field(
+        "Pa", description="the unit of y = beta u and kappa0"
+    )
+
+
+class ModelSection(Section):
+    """The contact law of the paper, section 7."""
+
+    name: Literal["contact"] = Field("contact", description="the model")
+    alpha: Annotated[float, in_quantity("rate")] = Field(
+        gt=0, description="relaxation rate: A = -alpha I generates a decaying semigroup"
+    )
+    beta: Annotated[float, in_quantity("stiffness")] = Field(
+        gt=0, description="pressure per reaction: P = beta I must be coercive"
+    )
+    b_x: Annotated[float, in_quantity("number")] = Field(
+        gt=0, description="feedback of the state on the drive q = g - b_x x"
+    )
+    b_u: Annotated[float, in_quantity("number")] = Field(
+        ge=0, description="self-feedback of the reaction: below 0 the law may lose its solution"
+    )
+    d_x: Annotated[float, in_quantity("rate")] = Field(
+        gt=0, description="state feedback in f = ell - d_x x - d_u u"
+    )
+    d_u: Annotated[float, in_quantity("rate")] = Field(
+        gt=0, description="reaction of the pressure in f = ell - d_x x - d_u u"
+    )
+    kappa0: Annotated[float, in_quantity("pressure")] = Field(
+        gt=0, description="pressure capacity: K = {0 <= y <= kappa0} needs an interior"
+    )
+
+
+class BoundarySection(Section):
+    """Gamma_C: ``length`` and ``points``, or ``lengths`` and ``points``, or ``file``."""
+
+    length: Annotated[float, in_quantity("length")] | None = Field(
+        None, gt=0, description="length of a one-dimensional boundary"
+    )
+    lengths: Annotated[tuple[float, ...] | None, PlainValidator(_pair_of_lengths)] = Field(
+        None, description="sides of a rectangular boundary"
+    )
+    points: Annotated[tuple[int, ...] | None, PlainValidator(_counts)] = Field(
+        None, description="midpoints of equal cells, one number a direction"
+    )
+    file: str | None = Field(None, description="CSV file with the columns s and weight")
+
+
+class SeriesSection(Section):
+    """A measured function of time."""
+
+    file: str = Field(description="a CSV file, or an .at2 strong-motion record")
+    column: str | None = Field(None, description="the column of values")
+    time_column: str = Field("time", description="the column of times")
+    kind: Literal["constant", "linear", "cubic"] = Field(
+        "linear",
+        description="how values are joined: held until the next, straight lines, C2 spline",
+    )
+    per_unit: float | str | None = Field(
+        None, description="what one unit of the column stands for, such as 30 um/s per g"
+    )
+
+
+class ProfileSection(Section):
+    """A measured function on the boundary."""
+
+    file: str = Field(description="an NPY file with one value a point, or a CSV file over s")
+    column: str | None = Field(None, description="the column of values")
+    position_column: str = Field("s", description="the column of coordinates")
+    per_unit: float | str | None = Field(
+        None, description="what one unit of the file stands for, such as 1 um"
+    )
+
+
+def _field_quantity(name: str) -> tuple[BeforeValidator, BeforeValidator, BeforeValidator]:
+    """Validators of value, series and profile of a field that is a `name` (indentation, ...)."""
+
+    def table(value: Any, info: ValidationInfo) -> Any:
+        if isinstance(value, dict) and "per_unit" in value:
+            factor = _finite(value["per_unit"], name, info, "per_unit")
+            return {**value, "per_unit": factor}
+        return value
+
+    return in_quantity(name), BeforeValidator(table), BeforeValidator(table)
+
+
+_G = _field_quantity("indentation")
+_L = _field_quantity("indentation rate")
+
+
+class DemandSection(Section):
+    """g(t, s) [indentation]: the product of the factors that are given."""
+
+    value: Annotated[float | None, _G[0]] = Field(None, description="a constant factor")
+    expression: str | None = Field(None, description="a formula in t and s (or s1, s2)")
+    knots: Annotated[tuple[float, ...] | None, PlainValidator(_times)] = Field(
+        None, description="times where the formula has a kink"
+    )
+    series: Annotated[SeriesSection | None, _G[1]] = Field(None, description="a measured history")
+    profile: Annotated[ProfileSection | None, _G[2]] = Field(None, description="a measured profile")
+
+
+class LoadSection(Section):
+    """ell(t, s) [indentation/time]: the product of the factors that are given."""
+
+    value: Annotated[float | None, _L[0]] = Field(None, description="a constant factor")
+    expression: str | None = Field(None, description="a formula in t and s (or s1, s2)")
+    knots: Annotated[tuple[float, ...] | None, PlainValidator(_times)] = Field(
+        None, description="times where the formula has a kink"
+    )
+    series: Annotated[SeriesSection | None, _L[1]] = Field(None, description="a measured history")
+    profile: Annotated[ProfileSection | None, _L[2]] = Field(None, description="a measured profile")
+
+
+class InitialSection(Section):
+    """x(0, s) [indentation]: the product of the factors that are given, and a second start."""
+
+    value: Annotated[float | None, _G[0]] = Field(None, description="a constant factor")
+    expression: str | None = Field(None, description="a formula in s (or s1, s2)")
+    profile: Annotated[ProfileSection | None, _G[2]] = Field(None, description="a measured profile")
+    companion: Annotated[float | str | None, PlainValidator(_perturbation)] = Field(
+        None,
+        description="what is added to x(0, s) to start the second trajectory; by default the "
+        "indentation (1 + b_u) kappa0 / (beta b_x) that moves a point through the active regime",
+    )
+
+
+class TimeSection(Section):
+    """The run ends at `end`; states are saved at `frames` + 1 equidistant times, 0 and end
+    included."""
+
+    end: Annotated[float, in_quantity("time")] = Field(
+        gt=0, description="time passes forward from 0"
+    )
+    frames: int = Field(
+        200, ge=1, le=MAX_FRAMES, description="number of intervals between saved states"
+    )
+
+
+class SolverSection(Section):
+    """Fixed steps `dt`, or steps chosen for `rtol` and `atol`."""
+
+    method: Literal["ETD2RK", "ETD4RK", "ExpRosenbrock", "DormandPrince", "ETD1"] = Field(
+        "ETD2RK", description="of a step"
+    )
+    dt: Annotated[float | None, in_quantity("time")] = Field(None, gt=0, description="a step")
+    rtol: Annotated[float | None, AfterValidator(within_precision)] = Field(
+        None, gt=0, lt=1, description="relative tolerance of a step"
+    )
+    atol: Annotated[float | None, in_quantity("indentation")] = Field(
+        None, gt=0, description="absolute tolerance of a step, an indentation"
+    )
+    dt_max: Annotated[float | None, in_quantity("time")] = Field(
+        None, gt=0, description="the longest step that adapts"
+    )
+    max_steps: int | None = Field(
+        None, ge=1, le=MOST_COUNTED, description="the most steps between two blocks of frames"
+    )
+    vi_solver: ViSolver | None = Field(None, description="of the frozen law, in the place of Auto")
+
+
+class ReportSection(Section):
+    """What is written beside the results of any model."""
+
+    report: bool = Field(True, description="write report.html")
+    png: bool = Field(True, description="write the figures as PNG")
+
+
+class OutputSection(ReportSection):
+    """What is written beside the trajectory of a contact law."""
+
+    points_of_interest: Annotated[tuple[tuple[float, ...], ...] | None, PlainValidator(_places)] = (
+        Field(None, description="places whose histories are shown; each snaps to the nearest point")
+    )
+
+
+SECTIONS: dict[str, type[BaseModel]] = {
+    "units": UnitsSection,
+    "model": ModelSection,
+    "boundary": BoundarySection,
+    "demand": DemandSection,
+    "load": LoadSection,
+    "initial": InitialSection,
+    "time": TimeSection,
+    "solver": SolverSection,
+    "output": OutputSection,
+}
+OPTIONAL = frozenset({"units", "initial", "solver", "output"})

@@ -1,0 +1,149 @@
+"""Pydantic's findings in the words of a configuration file."""
+
+import json
+import re
+from difflib import get_close_matches
+from typing import Any, Literal, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+
+from dvax.app.runs.units import NUMBER, converted
+from dvax.errors import InputProblem
+
+_TYPES = {
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "string_type": "a text in quotes",
+    "bool_type": "true or false",
+    "tuple_type": "a list",
+    "model_type": "a table",
+    "model_attributes_type": "a table",
+    "dict_type": "a table",
+}
+_LIMITS = {
+    "greater_than": ("greater than", "gt"),
+    "greater_than_equal": ("at least", "ge"),
+    "less_than": ("less than", "lt"),
+    "less_than_equal": ("at most", "le"),
+}
+
+
+def shown(value: Any) -> str:
+    """A value for a message: whole where short, its beginning where long."""
+    text = repr(value)
+    return text if len(text) <= 70 else text[:67] + "..."
+
+
+def unknown_key(place: str, key: str, value: Any, known: list[str]) -> InputProblem:
+    """A key that nothing reads, with the nearest one that something does."""
+    close = get_close_matches(key, known, n=1)
+    mend = f"Did you mean {close[0]!r}?" if close else f"Allowed here: {', '.join(known)}."
+    return InputProblem(place, shown(value), f"there is no key {key!r} here", mend)
+
+
+def translate(
+    error: ValidationError, file: str, section: str, model: type[BaseModel]
+) -> list[InputProblem]:
+    """One problem for each finding: file and dotted key, what was given, the rule, the mend."""
+    return [_problem(dict(e), file, section, model) for e in error.errors(include_url=False)]
+
+
+def _problem(
+    error: dict[str, Any], file: str, section: str, model: type[BaseModel]
+) -> InputProblem:
+    path: list[str | int] = list(error["loc"])
+    dotted = _dotted(section, path)
+    place = f"{file}: {dotted}"
+    owner, info = _owner(model, path)
+    about = info.description if info is not None and info.description else "see the documentation"
+    kind, context, given = error["type"], error.get("ctx", {}), shown(error["input"])
+    key = str(path[-1]) if path else section
+    if kind == "extra_forbidden":
+        return unknown_key(place, key, error["input"], list(owner.model_fields))
+    if kind == "missing":
+        sample = _sample(info)
+        return InputProblem(place, "nothing", f"it is required ({about})", f"Add {key} = {sample}")
+    if kind == "rule":
+        return InputProblem(place, given, context["rule"], f"{context['mend']}.")
+    if kind in _LIMITS:
+        sign, name = _LIMITS[kind]
+        rule = f"it must be {sign} {context[name]:g} ({about})"
+        return InputProblem(place, given, rule, "Give such a value; check its sign and unit.")
+    if kind == "finite_number":
+        return InputProblem(place, given, "it must be finite", "Write an ordinary number.")
+    if kind == "literal_error":
+        allowed = [str(a) for a in _literals(info)]
+        close = get_close_matches(str(error["input"]), allowed, n=1)
+        mend = f"Did you mean {close[0]!r}?" if close else "Choose one of these."
+        return InputProblem(place, given, f"it is one of {', '.join(allowed)}", mend)
+    inner = None if info is None else _model_within(info.annotation)
+    if kind == "list_type" and inner is not None:
+        example = ", ".join(f"{name} = {_sample(f)}" for name, f in inner.model_fields.items())
+        rule = f"it is a list of tables ({about}), each with a heading of its own"
+        mend = f"Write [[{dotted}]] in double brackets, and below it {example}."
+        return InputProblem(place, given, rule, mend)
+    if kind in _TYPES:
+        number, text = kind.startswith(("float", "int")), isinstance(error["input"], str)
+        mend = _bare(key, error["input"], about) if number and text else f"Write {_TYPES[kind]}."
+        return InputProblem(place, given, f"it must be {_TYPES[kind]} ({about})", mend)
+    return InputProblem(place, given, str(error["msg"]), "Mend the value.")
+
+
+def _dotted(section: str, path: list[str | int]) -> str:
+    """A path as a reader finds it: tables of a list are counted from 1 on."""
+    return section + "".join(f"[{p + 1}]" if isinstance(p, int) else f".{p}" for p in path)
+
+
+def _bare(key: str, text: str, about: str) -> str:
+    """The mend where a text stands for a bare number: that number, in the unit that the key is in, as
+    far as the text says it."""
+    found = re.search(r"\[([^\[\]]+)\]", about)
+    unit = found[1] if found else None
+    digits = text.strip()
+    number = float(digits) if NUMBER.fullmatch(digits) else converted(text, unit or "1")
+    mend = "Write a bare number, without quotes" + (f", in {unit}" if unit else " or a unit")
+    if number is None:
+        return f"{mend}."
+    return f"{mend}: {key} = {number:.12g}" + (f"  # {unit}" if unit else "")
+
+
+def _sample(info: FieldInfo | None) -> str:
+    """A value for a key as TOML has it, dots where there is no example."""
+    return json.dumps(info.examples[0]) if info is not None and info.examples else "..."
+
+
+def _owner(
+    model: type[BaseModel], path: list[str | int]
+) -> tuple[type[BaseModel], FieldInfo | None]:
+    """The model in which the last part of a path stands, and that part's field if it has one."""
+    owner, info = model, None
+    # The numbers of a list's entries lead into no other model.
+    names = [part for part in path if isinstance(part, str)]
+    for i, part in enumerate(names):
+        info = owner.model_fields.get(part)
+        if info is None or i == len(names) - 1:
+            break
+        inner = _model_within(info.annotation)
+        if inner is None:
+            break
+        owner = inner
+    return owner, info
+
+
+def _model_within(annotation: Any) -> type[BaseModel] | None:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((m for a in get_args(annotation) if (m := _model_within(a)) is not None), None)
+
+
+def _literals(info: FieldInfo | None) -> tuple[Any, ...]:
+    """The values that a key may have, those of an optional key included."""
+    return () if info is None else tuple(_values(info.annotation))
+
+
+def _values(annotation: Any) -> list[Any]:
+    if get_origin(annotation) is Literal:
+        return list(get_args(annotation))
+    return [value for part in get_args(annotation) for value in _values(part)]

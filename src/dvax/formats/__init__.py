@@ -1,0 +1,46 @@
+"""Readers of files that others write: each checks every cell and says what is wrong, with its line.
+
+Names are loaded when they are first used: whoever reads a table needs no mesh.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .at2 import read_at2 as read_at2
+    from .mesh import read_mesh as read_mesh
+    from .netlist import Netlist as Netlist
+    from .netlist import read_netlist as read_netlist
+    from .road_network import Network as Network
+    from .road_network import Trips as Trips
+    from .rts_gmlc import RTS as RTS
+    from .rts_gmlc import read_rts as read_rts
+    from .tntp import Flows as Flows
+    from .tntp import read_flows as read_flows
+    from .tntp import read_network as read_network
+    from .tntp import read_nodes as read_nodes
+    from .tntp import read_trips as read_trips
+
+_HOMES = {
+    "at2": ("read_at2",),
+    "mesh": ("read_mesh",),
+    "netlist": ("Netlist", "read_netlist"),
+    "road_network": ("Network", "Trips"),
+    "rts_gmlc": ("RTS", "read_rts"),
+    "tntp": ("Flows", "read_flows", "read_network", "read_nodes", "read_trips"),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = [*_HOME_OF]  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME_OF:
+        value = getattr(importlib.import_module(f".{_HOME_OF[name]}", __name__), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'dvax.formats' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

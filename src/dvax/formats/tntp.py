@@ -1,0 +1,322 @@
+"""Readers of the four TNTP files: network, trips, flows, nodes.
+
+The format is that of the TransportationNetworks collection (Bar-Gera, Stabler and others).
+"""
+
+import os
+from decimal import Decimal
+from difflib import get_close_matches
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .road_network import Network, Trips, link_problems, trip_problems
+from .tntp_text import (
+    Line,
+    Metadata,
+    Problems,
+    read_header,
+    read_lines,
+    rows_after,
+    to_cells,
+    to_node,
+    to_number,
+)
+
+_LINK_NODES = ("init_node", "term_node")
+_LINK_NUMBERS = ("capacity", "length", "free_flow_time", "b", "power")
+
+
+class Flows(NamedTuple):
+    """Known flows: `volume` and `cost`, one of each a link, in the order of the network."""
+
+    volume: np.ndarray
+    cost: np.ndarray
+
+
+def read_network(path: str | os.PathLike[str]) -> Network:
+    """Read a `_net.tntp` file.
+
+    Its metadata state NUMBER OF ZONES, NUMBER OF NODES, FIRST THRU NODE and NUMBER OF LINKS; its
+    columns are found by name: init_node, term_node, capacity, length, free_flow_time, b, power and,
+    where there is one, toll. Others are left alone.
+
+    **Raises:** `dvax.InputError` with everything that is wrong, each with file and line: missing
+    metadata or columns, counts that disagree, cells that are no numbers, and all that `Network`
+    does not allow.
+
+    ```python
+    >>> import pathlib, tempfile
+    >>> from dvax.formats import read_network
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "road_net.tntp"
+    >>> _ = file.write_text('''<NUMBER OF ZONES> 2
+    ... <NUMBER OF NODES> 2
+    ... <FIRST THRU NODE> 1
+    ... <NUMBER OF LINKS> 1
+    ... <END OF METADATA>
+    ... ~ init_node term_node capacity length free_flow_time b power ;
+    ...   1         2         2000     3.5    4.2            0.15 4  ;
+    ... ''')
+    >>> read_network(file).capacity.tolist()
+    [2000.0]
+
+    ```
+    """
+    lines, problems = read_lines(path), Problems(path)
+    metadata = Metadata(lines, problems)
+    zones, nodes = metadata.count("NUMBER OF ZONES"), metadata.count("NUMBER OF NODES")
+    first, count = metadata.count("FIRST THRU NODE"), metadata.count("NUMBER OF LINKS")
+    header = _header_of(lines, metadata.end)
+    if header is None:
+        problems(
+            None, "no line that names the columns",
+            "which number is the capacity is not guessed",
+            "Write ~ init_node term_node capacity length free_flow_time b power speed toll "
+            "link_type ; above the first row",
+        )  # fmt: skip
+        raise problems.error()
+    rows = rows_after(lines, metadata.end)
+    columns = _table(header, rows, _LINK_NODES, _LINK_NUMBERS, ("toll",), problems)
+    if count is not None and count != len(rows):
+        problems(
+            metadata.line("NUMBER OF LINKS"), f"<NUMBER OF LINKS> {count} and {len(rows)} rows",
+            "the file holds as many links as it states", "Complete the rows or mend the number",
+        )  # fmt: skip
+    if zones is None or nodes is None or first is None or columns is None:
+        raise problems.error()
+    links = SimpleNamespace(
+        zones=zones, nodes=nodes, first_thru_node=first, name=problems.file, **columns
+    )
+    problems.found += link_problems(links)
+    if problems.found:
+        raise problems.error()
+    return Network(**vars(links))
+
+
+def read_trips(path: str | os.PathLike[str]) -> Trips:
+    """Read a `_trips.tntp` file: blocks `Origin k` of entries `destination : trips;`.
+
+    **Raises:** `dvax.InputError` with everything that is wrong, each with file and line: missing
+    metadata, a total that is not the sum of the entries (to the digits that it is written with),
+    entries that are none, and all that `Trips` does not allow.
+
+    ```python
+    >>> import pathlib, tempfile
+    >>> from dvax.formats import read_trips
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "road_trips.tntp"
+    >>> _ = file.write_text('''<NUMBER OF ZONES> 2
+    ... <TOTAL OD FLOW> 900.0
+    ... <END OF METADATA>
+    ... Origin 1
+    ...   1 : 0.0;  2 : 900.0;
+    ... ''')
+    >>> read_trips(file).flow.tolist()
+    [900.0]
+
+    ```
+    """
+    lines, problems = read_lines(path), Problems(path)
+    metadata = Metadata(lines, problems)
+    zones, total = metadata.count("NUMBER OF ZONES"), metadata.number("TOTAL OD FLOW")
+    entries: list[tuple[int, int, float, int]] = []
+    origin: int | None = None
+    begun: dict[int, int] = {}
+    headless = False
+    for number, text in rows_after(lines, metadata.end):
+        if text.lower().startswith("origin"):
+            origin = to_node(text[len("origin") :].strip())
+            if origin is None:
+                problems(
+                    number, repr(text[:40]), "a block begins with Origin and a zone", "Mend it"
+                )
+            elif origin in begun:
+                problems(
+                    number, f"Origin {origin} once more",
+                    f"it stands once: line {begun[origin]} has it", "Join the two blocks",
+                )  # fmt: skip
+            else:
+                begun[origin] = number
+            headless = origin is None
+            continue
+        for entry in filter(None, map(str.strip, text.split(";"))):
+            found = _entry(entry)
+            if found is None:
+                problems(
+                    number, repr(entry[:40]), "an entry is destination : trips, in numbers",
+                    "Mend it, or put a semicolon between entries",
+                )  # fmt: skip
+            elif origin is not None:
+                entries.append((origin, *found, number))
+            elif not headless:
+                problems(
+                    number, repr(entry[:40]), "an entry stands below the Origin it is for",
+                    "Write Origin and a zone above it",
+                )  # fmt: skip
+                headless = True
+    table = SimpleNamespace(
+        name=problems.file,
+        origin=np.array([e[0] for e in entries], np.int64),
+        destination=np.array([e[1] for e in entries], np.int64),
+        flow=np.array([e[2] for e in entries], np.float64),
+        lines=np.array([e[3] for e in entries], np.int64),
+    )
+    if total is not None:
+        written = metadata.values["TOTAL OD FLOW"].text
+        exponent = Decimal(written).as_tuple().exponent
+        assert isinstance(exponent, int)
+        summed = float(table.flow.sum())
+        if abs(summed - total) > 0.5 * 10.0**exponent + 1e-9 * abs(total):
+            problems(
+                metadata.line("TOTAL OD FLOW"), f"{written}, and entries that sum up to {summed:.10g}",
+                "the total is the sum, so that a lost block is seen",
+                "Complete the entries or mend the total",
+            )  # fmt: skip
+    if zones is None:
+        raise problems.error()
+    table.zones = zones
+    problems.found += trip_problems(table)
+    if problems.found:
+        raise problems.error()
+    return Trips(**vars(table))
+
+
+def read_flows(path: str | os.PathLike[str], network: Network) -> Flows:
+    """Read a `_flow.tntp` file: From, To, Volume and Cost of every link of the network.
+
+    **Raises:** `dvax.InputError` for missing columns, cells that are no numbers, links that the
+    network does not have, has twice in the file, or that are missing from it.
+    """
+    lines, problems = read_lines(path), Problems(path)
+    header, rows = _first_row(lines, problems, "From To Volume Cost")
+    columns = _table(header, rows, ("from", "to"), ("volume", "cost"), (), problems)
+    if columns is None:
+        raise problems.error()
+    index = {pair: i for i, pair in enumerate(zip(network.init_node, network.term_node))}
+    rows_of = _one_each(
+        list(zip(columns["from"], columns["to"])), columns["lines"], index, "link from {} to {}",
+        network.name, problems,
+    )  # fmt: skip
+    if problems.found:
+        raise problems.error()
+    return Flows(columns["volume"][rows_of], columns["cost"][rows_of])
+
+
+def read_nodes(path: str | os.PathLike[str], network: Network) -> np.ndarray:
+    """Read a `_node.tntp` file: the coordinates X and Y of every node, in rows.
+
+    **Raises:** `dvax.InputError` for missing columns, cells that are no numbers, nodes that the
+    network does not have, that stand twice, or that are missing.
+    """
+    lines, problems = read_lines(path), Problems(path)
+    header, rows = _first_row(lines, problems, "Node X Y ;")
+    columns = _table(header, rows, ("node",), ("x", "y"), (), problems)
+    if columns is None:
+        raise problems.error()
+    index = {(node,): node - 1 for node in range(1, network.nodes + 1)}
+    rows_of = _one_each(
+        [(node,) for node in columns["node"]], columns["lines"], index, "node {}", network.name,
+        problems,
+    )  # fmt: skip
+    if problems.found:
+        raise problems.error()
+    return np.stack([columns["x"], columns["y"]], axis=1)[rows_of]
+
+
+def _header_of(lines: list[str], start: int) -> Line | None:
+    """The first comment behind the metadata that names a column."""
+    for number, text in enumerate(lines[start:], start=start + 1):
+        names = read_header(text) if text.lstrip().startswith("~") else []
+        if {"init_node", "term_node", "capacity"} & set(names):
+            return Line(number, text)
+    return None
+
+
+def _first_row(lines: list[str], problems: Problems, example: str) -> tuple[Line, list[Line]]:
+    """The header of a file without metadata, which is its first row, with or without a ~."""
+    for number, text in enumerate(lines, start=1):
+        if text.strip():
+            return Line(number, text), rows_after(lines, number)
+    problems(None, "no rows", "the first one names the columns", f"Write {example} there")
+    raise problems.error()
+
+
+def _table(
+    header: Line, rows: list[Line], whole: tuple[str, ...], real: tuple[str, ...],
+    optional: tuple[str, ...], problems: Problems,
+) -> dict[str, Any] | None:  # fmt: skip
+    """The columns by name with the `lines` of their rows, those that can be read; None where a
+    column is missing."""
+    names = read_header(header.text)
+    missing = [name for name in (*whole, *real) if name not in names]
+    for name in missing:
+        close = get_close_matches(name, [n for n in names if n not in (*whole, *real)], n=1)
+        problems(
+            header.number, f"no column {name!r} among {', '.join(names)}", "columns are found by name",
+            f"Write {name} in the place of {close[0]}" if close else f"Add the column {name}",
+        )  # fmt: skip
+    if missing:
+        return None
+    wanted = [name for name in (*whole, *real, *optional) if name in names]
+    table: dict[str, list] = {name: [] for name in wanted}
+    kept: list[int] = []
+    for number, text in rows:
+        cells = to_cells(text)
+        if len(cells) != len(names):
+            problems(
+                number, f"{len(cells)} cells",
+                f"line {header.number} names {len(names)} columns, and a gap is not a value",
+                "Complete the row, or mend the names",
+            )  # fmt: skip
+            continue
+        values: list[int | float] = []
+        for name in wanted:
+            cell = cells[names.index(name)]
+            value = to_node(cell) if name in whole else to_number(cell)
+            if value is None:
+                what = "the number of a node" if name in whole else "a finite decimal number"
+                problems(number, f"{name} {cell[:40]!r}", f"it is {what}", "Mend the cell")
+            else:
+                values.append(value)
+        if len(values) == len(wanted):
+            kept.append(number)
+            for name, value in zip(wanted, values, strict=True):
+                table[name].append(value)
+    columns: dict[str, Any] = {
+        name: np.array(values, np.int64 if name in whole else np.float64)
+        for name, values in table.items()
+    }
+    columns |= {name: None for name in optional if name not in names}
+    columns["lines"] = np.array(kept, np.int64)
+    return columns
+
+
+def _entry(text: str) -> tuple[int, float] | None:
+    parts = [part.strip() for part in text.split(":")]
+    if len(parts) != 2:
+        return None
+    zone, flow = to_node(parts[0]), to_number(parts[1])
+    return None if zone is None or flow is None else (zone, flow)
+
+
+def _one_each(
+    keys: list[tuple], lines: np.ndarray, index: dict[tuple, int], title: str, name: str,
+    problems: Problems,
+) -> np.ndarray:  # fmt: skip
+    """The row of each entry of `index`; what is unknown, missing or there twice is noted."""
+    rows_of = np.full(len(index), -1)
+    for row, (key, line) in enumerate(zip(keys, lines.tolist(), strict=True)):
+        what = title.format(*key)
+        if key not in index:
+            problems(line, f"the {what}", f"{name} has no such one", "Remove the row, or mend it")
+        elif rows_of[index[key]] >= 0:
+            first = lines[rows_of[index[key]]]
+            problems(line, f"the {what} once more", f"line {first} has it", "Remove one of the two")
+        else:
+            rows_of[index[key]] = row
+    for key, i in index.items():
+        if rows_of[i] < 0:
+            problems(
+                None, f"no {title.format(*key)}", f"every one of {name} has a row", "Add the row"
+            )
+    return rows_of

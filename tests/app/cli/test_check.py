@@ -1,0 +1,90 @@
+"""`dvax check`: constants with their labels, sizes, and a verdict; it writes nothing."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.app.cli.contact import write_config
+from typer.testing import CliRunner
+
+from dvax.app.cli import check as check_module
+from dvax.app.cli.program import app
+from dvax.app.cli.sizes import sizes
+from dvax.app.runs.config import build_contact, load_config
+
+
+def row(name: str, **changes: Any) -> dict[str, Any]:
+    given = dict(name=name, symbol=name, value=1.0, unit="", label="ass:x", status="proved")
+    return given | dict(meaning="a modulus") | changes
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    return write_config(tmp_path / "in")
+
+
+def test_the_constants_are_the_paper_s_closed_forms(tree: Path) -> None:
+    before = sorted(tree.parent.parent.rglob("*"))
+    result = CliRunner().invoke(app, ["check", str(tree)])
+    assert result.exit_code == 0, result.output
+    # α = 1.5, β = 0.5, b_x = 1, b_u = 0.5, d_x = 0.2, d_u = 0.6: γ = L_F = 3, L = 2/3, L̃ = 0.6.
+    shown = {line.split()[0]: line for line in result.stdout.splitlines() if line.strip()}
+    assert " 3 um/MPa " in shown["γ"] and "ass:strong_pseudomono" in shown["γ"]
+    assert " 0.666667 " in shown["L"] and "eq:LU_def" in shown["L"]
+    assert " 0.6 1/s " in shown["L̃"]
+    # The growth rate is negative, so C_T = 1 + L; at ρ = β the paper has q_ρ = b_u.
+    assert " 1.66667 " in shown["C_T"] and "cor:hadamard_wellposed" in shown["C_T"]
+    assert " 0.5 " in shown["q_ρ"]
+    assert "0.9 1/s" in shown["η"] and "cor:incremental_stability" in shown["η"]
+    assert sorted(tree.parent.parent.rglob("*")) == before
+
+
+def test_what_holds_is_said_with_its_reason(tree: Path) -> None:
+    result = CliRunner().invoke(app, ["check", str(tree), "--strict"])
+    assert result.exit_code == 0, result.output
+    text = result.stdout
+    assert "one response at every state  holds, proved" in text
+    assert "certified decay              holds, proved" in text
+    assert "projection route             holds, proved" in text
+
+
+def test_a_system_that_does_not_decay_is_in_the_class(tmp_path: Path) -> None:
+    # d_x + d_u b_x/(1 + b_u) = 2.4 > α = 1.5: no certified decay, and the run is as well posed.
+    changes = (("d_x = 0.2", "d_x = 2.0"), ("b_u = 0.5", "b_u = 1.5"))
+    tree = write_config(tmp_path / "in", *changes)
+    result = CliRunner().invoke(app, ["check", str(tree), "--strict"])
+    assert result.exit_code == 0, result.output
+    assert "certified decay              does not hold" in result.stdout
+    assert "projection route             does not hold" in result.stdout
+
+
+@pytest.mark.parametrize("refuted", [row("gamma", status="refuted"), row("gamma", value=-1.0)])
+def test_a_system_outside_the_class_is_refused_only_if_asked(
+    tree: Path, monkeypatch: pytest.MonkeyPatch, refuted: dict[str, Any]
+) -> None:
+    rows = [refuted, row("decay_rate"), row("q_rho")]
+    monkeypatch.setattr(check_module, "constant_rows", lambda config: rows)
+    lenient = CliRunner().invoke(app, ["check", str(tree)])
+    strict = CliRunner().invoke(app, ["check", str(tree), "--strict"])
+    assert (lenient.exit_code, strict.exit_code) == (0, 4)
+    for result in (lenient, strict):
+        assert "error: outside the class of the theory: gamma" in result.stderr
+
+
+def test_sizes_are_those_of_the_run(tree: Path) -> None:
+    config = load_config(tree)
+    rows = {name: (value, remark) for name, value, remark in sizes(config, build_contact(config))}
+    assert rows["points"] == ("24", "quadrature weights add up to 10 mm")
+    assert rows["frames"][0] == "9"
+    assert rows["steps"][0] == "at least 20"
+    assert rows["disk"][0] == f"at most {24 * 9 * 17 / 1024:.3g} KiB"
+
+
+def test_memory_grows_with_the_points(tmp_path: Path) -> None:
+    shown = []
+    for name, points in (("small", "points = 24"), ("large", "points = 1000000")):
+        changes = (("points = 24", points), ('profile = { file = "x0.npy" }', "value = 0.5"))
+        config = load_config(write_config(tmp_path / name, *changes))
+        table = {what: value for what, value, _ in sizes(config, build_contact(config))}
+        shown.append(table["memory"])
+    assert shown == ["about 550 MiB", "about 1.28 GiB"]

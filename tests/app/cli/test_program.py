@@ -1,0 +1,119 @@
+"""The program itself: quick to answer, quiet about Python, honest exit codes."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tests.app.plots.synthetic import Recipe, write_run
+from typer.testing import CliRunner
+
+import dvax
+from dvax import __version__
+from dvax.app.cli import machine, selftest
+from dvax.app.cli.program import app
+
+HEAVY = ("jax", "numpy", "pydantic", "plotly", "matplotlib", "xarray", "zarr", "pint", "diffrax")
+
+
+def python(code: str) -> subprocess.CompletedProcess[str]:
+    paths = [str(Path(dvax.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))},
+    )
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["check", "--help"]])
+def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
+    # Typer itself looks for pydantic when it builds a command with arguments.
+    heavy = [name for name in HEAVY if not (name == "pydantic" and "check" in arguments)]
+    code = (
+        f"import sys; sys.argv = ['dvax', *{arguments!r}]\n"
+        "from dvax.app.cli import main\n"
+        "try: main()\n"
+        "except SystemExit as end: assert not end.code, end.code\n"
+        f"print('HEAVY', [name for name in {heavy!r} if name in sys.modules])\n"
+    )
+    done = python(code)
+    assert done.stdout.splitlines()[-1:] == ["HEAVY []"], done.stdout + done.stderr
+
+
+def test_the_five_commands_are_there() -> None:
+    shown = CliRunner().invoke(app, ["--help"]).output
+    for command in ("run", "check", "report", "demo", "doctor"):
+        assert f"\n  {command} " in shown
+    for later in ("resume", "sweep", "export"):
+        assert f"\n  {later} " not in shown
+
+
+def test_the_version_is_the_package_s() -> None:
+    result = CliRunner().invoke(app, ["--version"])
+    assert (result.exit_code, result.stdout) == (0, f"dvax {__version__}\n")
+
+
+@pytest.mark.parametrize("arguments", [["nonsense"], ["run"], ["run", "a.toml"], ["report", "--x"]])
+def test_wrong_usage_is_bad_input(arguments: list[str]) -> None:
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert "Traceback" not in result.output
+
+
+def test_without_the_application_s_packages_the_mend_is_said() -> None:
+    code = "import sys; sys.modules['typer'] = None\nfrom dvax.app.cli import main\nmain()\n"
+    done = python(code)
+    assert done.returncode == 1
+    assert "pip install 'dvax[app]'" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_report_writes_and_names_the_page(tmp_path: Path) -> None:
+    run_dir = write_run(tmp_path / "run", Recipe((30,), frames=5))
+    result = CliRunner().invoke(app, ["report", str(run_dir)])
+    assert result.exit_code == 0, result.output
+    assert result.stdout.strip() == str(run_dir / "report.html")
+    assert (run_dir / "report.html").is_file()
+
+
+def test_report_of_another_folder_is_refused(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["report", str(tmp_path)])
+    assert result.exit_code == 2
+    assert "manifest.json" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_self_test_s_closed_form_is_the_published_number() -> None:
+    assert abs(selftest.EXACT - 1.8360919559905713) < 1e-15
+
+
+def test_doctor_computes_what_it_should() -> None:
+    result = CliRunner().invoke(app, ["doctor"])
+    assert result.exit_code == 0, result.output
+    for what in ("dvax", "jax", "plotly", "devices", "double", "passed"):
+        assert what in result.stdout
+
+
+def test_doctor_notices_a_wrong_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "dvax.app.cli.doctor.self_test", lambda: selftest.SelfTest(1.8, 3.6e-2, 0.1)
+    )
+    result = CliRunner().invoke(app, ["doctor"])
+    assert result.exit_code == 3
+    assert "off by 3.60e-02" in result.stderr
+
+
+def test_doctor_names_a_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine, "APPLICATION", ("typer", "a-package-that-is-not-there"))
+    result = CliRunner().invoke(app, ["doctor"])
+    assert result.exit_code == 3
+    assert "a-package-that-is-not-there is not installed" in result.stderr
+
+
+def test_an_unwritable_folder_is_told_apart(tmp_path: Path) -> None:
+    assert machine.unwritable(tmp_path) is None
+    assert machine.unwritable(tmp_path / "none") is not None

@@ -1,0 +1,229 @@
+"""The report says what the run directory holds, and never more."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.image import imread
+from tests.app.plots.synthetic import CONSTANTS, Recipe, write_run
+
+from dvax.app.plots import build_report
+from dvax.app.plots.certificate import certificate_picture
+from dvax.app.plots.downsample import scan
+from dvax.app.plots.histories import histories_picture
+from dvax.app.plots.run_reader import read_run
+from dvax.app.plots.separation import separation_picture
+from dvax.app.plots.theme import number, unit_text
+from dvax.errors import InputError
+
+CURVE = {"pressure", "regimes", "histories", "certificate", "separation"}
+SURFACE = CURVE | {"shares"}
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the demo's size, with its report."""
+    run_dir = write_run(tmp_path_factory.mktemp("large") / "run", Recipe((20_000,), frames=801))
+    build_report(run_dir)
+    return run_dir
+
+
+def stills(run_dir: Path) -> set[str]:
+    return {file.stem for file in (run_dir / "figures").glob("*.png")}
+
+
+def test_a_large_run_makes_a_page_that_a_mail_can_carry(large: Path) -> None:
+    page = large / "report.html"
+    assert page.stat().st_size < 12e6
+    assert "a cell gathers up to 56 points and 2 frames" in page.read_text(encoding="utf-8")
+
+
+def test_every_picture_has_a_still_that_is_not_blank(large: Path) -> None:
+    assert stills(large) == CURVE
+    for file in (large / "figures").glob("*.png"):
+        pixels = imread(file)
+        assert min(pixels.shape[:2]) > 400
+        assert pixels[..., :3].std() > 0.05, f"{file.name} is blank"
+
+
+def test_the_page_names_every_constant_with_its_label(large: Path) -> None:
+    text = (large / "report.html").read_text(encoding="utf-8")
+    for name, _, _, _, label, _ in CONSTANTS:
+        assert f"<code>{name}</code>" in text
+        assert f"<code>{label}</code>" in text
+
+
+def test_the_page_fetches_nothing(large: Path) -> None:
+    text = (large / "report.html").read_text(encoding="utf-8")
+    outside_scripts = "".join(part.split("</script>")[-1] for part in text.split("<script"))
+    for fetching in ("http://", "https://", "@import", "url(", "<iframe", "src="):
+        assert fetching not in outside_scripts
+
+
+def test_a_finished_run_shows_no_banner_of_partial_results(large: Path) -> None:
+    assert "Partial results." not in (large / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("status", ["interrupted", "failed", "running"])
+def test_a_run_that_stopped_early_says_so_at_the_top(tmp_path: Path, status: str) -> None:
+    run_dir = write_run(tmp_path / "run", Recipe((40,), frames=21, written=11, status=status))
+    text = build_report(run_dir, stills=False).read_text(encoding="utf-8")
+    banner, pictures = text.index("Partial results."), text.index("<h2>Headline figures")
+    assert banner < pictures
+    assert "It holds 11 frames, up to t = 20 s of 40 s." in text
+    # A run that was killed has no reason to give.
+    assert ("Stopped by Ctrl-C." in text[:pictures]) == (status != "running")
+
+
+@pytest.mark.parametrize("written", [1, 2])
+def test_a_run_of_very_few_frames_still_has_its_pictures(tmp_path: Path, written: int) -> None:
+    run_dir = write_run(tmp_path / "run", Recipe((40,), written=written, status="failed"))
+    build_report(run_dir)
+    assert stills(run_dir) == CURVE
+
+
+def test_a_run_without_frames_gives_a_page_without_pictures(tmp_path: Path) -> None:
+    run_dir = write_run(tmp_path / "run", Recipe((40,), written=0, status="failed"))
+    text = build_report(run_dir).read_text(encoding="utf-8")
+    assert "the run wrote no frame" in text
+    assert 'class="plot"' not in text
+    assert stills(run_dir) == set()
+
+
+def test_a_surface_has_maps_with_a_slider(tmp_path: Path) -> None:
+    run_dir = write_run(tmp_path / "run", Recipe((40, 25), frames=30))
+    text = build_report(run_dir).read_text(encoding="utf-8")
+    assert stills(run_dir) == SURFACE
+    assert text.count('type="range"') == 2
+    assert "24 of 30 saved frames are drawn." in text
+
+
+def test_a_run_without_companion_says_why_a_picture_is_missing(tmp_path: Path) -> None:
+    run_dir = write_run(tmp_path / "run", Recipe((40,), companion=False))
+    text = build_report(run_dir).read_text(encoding="utf-8")
+    assert "Certified decay: the run had no companion trajectory." in text
+    assert stills(run_dir) == CURVE - {"separation"}
+
+
+def test_text_of_the_run_cannot_become_markup(tmp_path: Path) -> None:
+    evil = "</script><script>alert(1)</script><b>"
+    run_dir = write_run(tmp_path / "run", Recipe((40,), title=evil))
+    manifest = json.loads((run_dir / "manifest.json").read_text())
+    (run_dir / "manifest.json").write_text(json.dumps(manifest | {"device": evil}))
+    text = build_report(run_dir, stills=False).read_text(encoding="utf-8")
+    assert "alert(1)" in text
+    assert "<script>alert(1)" not in text
+
+
+def test_frames_without_a_valid_time_are_left_out_and_counted(tmp_path: Path) -> None:
+    run_dir = write_run(tmp_path / "run", Recipe((40,), frames=20))
+    store = run_dir / "trajectory.zarr"
+    data = xr.open_zarr(store, consolidated=False, chunks=None).load()
+    time = data.time.values.copy()
+    time[15:] = np.nan
+    broken = data.assign_coords(time=("time", time, data.time.attrs)).drop_encoding()
+    broken.to_zarr(store, mode="w", consolidated=False)
+    run = read_run(run_dir)
+    assert len(run.time) == 15
+    assert run.notes[0].startswith("5 of 20 frames have no valid time")
+    assert "5 of 20 frames" in build_report(run_dir, stills=False).read_text(encoding="utf-8")
+
+
+def test_a_log_cut_off_by_a_kill_is_read_up_to_there(tmp_path: Path) -> None:
+    run_dir = write_run(tmp_path / "run", Recipe((40,)))
+    with (run_dir / "log.jsonl").open("a") as log:
+        log.write('{"event": "warni')
+    assert read_run(run_dir).warnings == ("A point was snapped to s = 0.25 mm.",)
+
+
+@pytest.mark.parametrize("file", ["manifest.json", "summary.json", "config.resolved.toml"])
+def test_a_damaged_file_is_named(tmp_path: Path, file: str) -> None:
+    run_dir = write_run(tmp_path / "run", Recipe((40,)))
+    (run_dir / file).write_text("{ this is not it")
+    with pytest.raises(InputError, match=file.replace(".", r"\.")):
+        build_report(run_dir)
+    assert not (run_dir / "report.html").exists()
+
+
+def test_a_folder_that_is_no_run_directory_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"manifest\.json"):
+        build_report(tmp_path)
+
+
+def test_the_certificate_s_legend_carries_its_status(tmp_path: Path) -> None:
+    picture = certificate_picture(read_run(write_run(tmp_path / "run", Recipe((40,)))))
+    assert picture is not None
+    names = [trace.name for trace in picture.interactive.data]
+    assert names[:4] == [
+        "bound on the error of x (proved)",
+        "bound on the error of u (declared)",
+        "the same for x, one-sided rate (proved)",
+        "error of the frozen law, u (proved)",
+    ]
+    assert picture.interactive.layout.yaxis.type == "log"
+    # The bound of x is zero at t = 0: a gap on this axis, and the caption says so.
+    assert np.isnan(picture.interactive.data[0].y[0])
+    assert "left as a gap" in picture.caption
+
+
+def test_the_separation_shows_observed_certified_and_sharp(tmp_path: Path) -> None:
+    run = read_run(write_run(tmp_path / "run", Recipe((40,))))
+    picture = separation_picture(run)
+    assert picture is not None
+    drawn = {trace.name: trace for trace in picture.interactive.data if trace.yaxis == "y"}
+    assert list(drawn) == ["observed", "certified, e^(−(η−ML̃)t)", "sharper, one-sided rate"]
+    np.testing.assert_allclose(drawn["observed"].y, run.series("separation_x"))
+    assert "separation of x is 1." in picture.caption
+    # e^(−1.1·40) is far below what double precision can tell apart, and the caption says so.
+    assert "floating-point rounding, which no bound covers" in picture.caption
+
+
+def test_histories_are_those_of_the_points_asked_for(tmp_path: Path) -> None:
+    run_dir = write_run(tmp_path / "run", Recipe((40,)))
+    config = "[time]\nend = 40.0\n[output]\npoints_of_interest = [10.1, 80.0]\n"
+    (run_dir / "config.resolved.toml").write_text(config)
+    run = read_run(run_dir)
+    picture = histories_picture(run, scan(run))
+    place = run.frames.line("s")
+    for wanted in (10.1, 80.0):
+        point = int(np.abs(place - wanted).argmin())
+        name = f"s = {number(float(place[point]), 6)} mm"
+        drawn = [trace for trace in picture.interactive.data if trace.name == name]
+        assert len(drawn) == 2, "pressure and indentation"
+        np.testing.assert_array_equal(
+            drawn[0].y, run.frames.field("pressure", slice(None))[:, point]
+        )
+        np.testing.assert_array_equal(
+            drawn[1].y, run.frames.field("indentation", slice(None))[:, point]
+        )
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"),
+        (4.0, "4"),
+        (1.23456e-7, "1.235 × 10⁻⁷"),
+        (123456.0, "123456"),
+        (4000, "4\u202f000"),
+    ],
+)
+def test_numbers_are_written_for_a_reader(value: float, text: str) -> None:
+    assert number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("unit", "text"),
+    [
+        ("um", "µm"),
+        ("um/s", "µm/s"),
+        ("1", ""),
+        ("um*mm**0.5", "µm mm⁰·⁵"),
+        ("um mm^(1/2)", "µm mm⁰·⁵"),
+        ("dimensionless", ""),
+    ],
+)
+def test_units_are_written_for_a_reader(unit: str, text: str) -> None:
+    assert unit_text(unit) == text

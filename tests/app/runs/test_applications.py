@@ -1,0 +1,204 @@
+"""Configurations of applications: what is refused and how, and what a run leaves behind."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+
+import dvax
+from dvax.app.plots import build_report
+from dvax.app.runs.applications.config import APPLICATIONS, ModelConfig, module_of, read_config
+from dvax.app.runs.applications.driver import run_model
+from dvax.app.runs.compile_time import compile_seconds
+
+TANK = """* a tank that a diode damps in one half-wave
+C1 1 0 1u IC=10
+L1 1 0 10m
+D1 1 0 R=1k
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    where = tmp_path_factory.mktemp("circuit")
+    (where / "tank.cir").write_text(TANK)
+    (where / "tank.toml").write_text(
+        '[model]\nname = "circuit"\nnetlist = "tank.cir"\nt_end = "1 ms"\nframes = 20\n'
+    )
+    return where
+
+
+@pytest.fixture(scope="module")
+def outcome(folder):
+    return run_model(read_config(folder / "tank.toml"), folder / "run")
+
+
+def written(folder, text, name="bad.toml"):
+    file = folder / name
+    file.write_text(text)
+    return file
+
+
+def problems(file, **options):
+    with pytest.raises(dvax.InputError) as caught:
+        read_config(file, **options)
+    return [str(problem) for problem in caught.value.problems]
+
+
+def test_an_unknown_model_is_told_the_names(folder):
+    (told,) = problems(written(folder, '[model]\nname = "circit"\n'))
+    assert "model.name" in told and "fem-contact" in told and "Did you mean 'circuit'?" in told
+
+
+def test_a_name_that_is_missing_is_asked_for(folder):
+    (told,) = problems(written(folder, '[model]\nnetlist = "tank.cir"\nt_end = 1.0\n'))
+    assert "model.name: got nothing" in told and 'Add name = "circuit"' in told
+    assert all(name in told for name in ("contact", *APPLICATIONS))
+    # A contact law needs none.
+    told = problems(written(folder, "[model]\nalpha = 1.0\nperiod = 2.0\n"))
+    assert any("model.period" in line and "no key" in line for line in told)
+
+
+def test_everything_wrong_in_the_table_is_said_at_once(folder):
+    told = problems(
+        written(
+            folder,
+            '[model]\nname = "circuit"\nnetlists = "tank.cir"\nt_end = "5 V"\nr_on = -1.0\n[bnd]\n',
+        )
+    )
+    for word in ("bnd", "netlists", "Did you mean 'netlist'", "t_end", "r_on", "greater than 0"):
+        assert any(word in line for line in told), (word, told)
+
+
+def test_data_lies_beside_the_configuration_unless_allowed(folder, tmp_path):
+    shutil.copy(folder / "tank.cir", tmp_path / "tank.cir")
+    inner = tmp_path / "inner"
+    inner.mkdir()
+    text = '[model]\nname = "circuit"\nnetlist = "{}"\nt_end = 1e-3\n'
+    for name in ("../tank.cir", str(tmp_path / "tank.cir")):
+        file = written(inner, text.format(name))
+        (told,) = problems(file)
+        assert "model.netlist" in told
+        assert isinstance(read_config(file, allow_outside=True), ModelConfig)
+    (told,) = problems(written(inner, text.format("none.cir")))
+    assert "there is no such file" in told
+    (told,) = problems(written(inner, '[model]\nname = "market"\ndata = "no"\nstart_hour = 0\n'))
+    assert "there is no such folder" in told
+
+
+def test_what_is_wrong_in_the_data_comes_with_its_line(folder):
+    (folder / "open.cir").write_text("C1 1 0 1u\nL1 1 0 ten\n")
+    told = problems(
+        written(folder, '[model]\nname = "circuit"\nnetlist = "open.cir"\nt_end = 1.0\n')
+    )
+    assert any("open.cir, line 2" in line for line in told)
+
+
+def test_a_run_leaves_figures_data_and_a_report(folder, outcome):
+    assert outcome.exit_code == 0 and outcome.status == "finished"
+    summary = json.loads((outcome.directory / "summary.json").read_text())
+    assert set(summary["final_state"]) == {"value", "unit", "meaning"}
+    assert len(summary["final_state"]["value"]) == 2
+    assert 0 < summary["error_bound"]["value"] < 1e-8
+    manifest = json.loads((outcome.directory / "manifest.json").read_text())
+    assert manifest["model"] == "circuit" and manifest["fit"] == "exact"
+    assert list(manifest["data"]) == ["tank.cir"]
+    assert any(
+        row["name"] == "gamma" and row["status"] == "proved" for row in manifest["constants"]
+    )
+    with xarray.open_zarr(outcome.directory / "trajectory.zarr", consolidated=False) as data:
+        assert data.sizes["time"] == 21 and "state_C1" in data
+        np.testing.assert_allclose(
+            [data.state_C1[-1], data.state_L1[-1]], summary["final_state"]["value"], rtol=1e-12
+        )
+        assert data.state_C1.attrs["units"] == "V"
+    page = build_report(outcome.directory).read_text()
+    assert "model circuit, exact" in page and "The circuit over time" in page
+    assert (outcome.directory / "figures" / "circuit.png").stat().st_size > 10_000
+
+
+def test_the_resolved_configuration_is_the_same_run(outcome, tmp_path):
+    moved = tmp_path / "moved"
+    shutil.copytree(outcome.directory, moved)
+    again = run_model(read_config(moved / "config.resolved.toml"), tmp_path / "again")
+    assert again.summary == outcome.summary
+    # Each run counts the compilations of its own, and not those of the process before it.
+    manifests = [json.loads((o.directory / "manifest.json").read_text()) for o in (outcome, again)]
+    first, second = (manifest["compile_seconds"] for manifest in manifests)
+    assert first > 0 and first + second <= compile_seconds() + 1e-2
+
+
+def test_a_run_says_what_it_does(outcome):
+    lines = (outcome.directory / "log.jsonl").read_text().splitlines()
+    stages = [event["stage"] for event in map(json.loads, lines) if event["event"] == "stage"]
+    assert stages == ["solving from 0 to 0.001 s", "writing the results"]
+
+
+def test_a_run_directory_of_an_unknown_model_is_refused(outcome, tmp_path):
+    for name in ("circit", "data"):
+        moved = tmp_path / name
+        shutil.copytree(outcome.directory, moved)
+        manifest = json.loads((moved / "manifest.json").read_text())
+        (moved / "manifest.json").write_text(json.dumps(manifest | {"model": name}))
+        with pytest.raises(dvax.InputError) as caught:
+            build_report(moved)
+        (problem,) = caught.value.problems
+        assert "manifest.json" in problem.place and problem.given == repr(name)
+        assert all(known in problem.rule for known in APPLICATIONS)
+
+
+SHARED = Path(__file__).parents[4] / "shared" / "data"
+RUNS = {
+    "frame": (
+        'record = "elCentro.at2"\nperiod = 0.5\ndamping = 0.02\n',
+        ("peak_displacement", 2.676, 2e-3),
+    ),
+    "market": (
+        'data = "RTS-GMLC"\nstart_hour = 4380\nhours = 2\n', ("price", [82.34147234], 1e-9),
+    ),
+    "fem-contact": (
+        "fine = 10\ncoarse = 4\nlayers = 17\nindentation = 0.01\nstiffness = 100.0\n"
+        "pressure_cap = 0.01\n",
+        ("force", 4.67498819e-3, 1e-8),
+    ),
+    "traffic": (
+        'network = "SiouxFalls/SiouxFalls_net.tntp"\ntrips = "SiouxFalls/SiouxFalls_trips.tntp"\n',
+        ("objective", 4231335.287107, 1e-9),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", RUNS)
+def test_the_reference_figures_come_out_of_a_run(name, tmp_path):
+    lines, (figure, value, relative) = RUNS[name]
+    for line in lines.splitlines():
+        given = line.split(" = ")[1].strip('"')
+        if "/" in given or given in ("elCentro.at2", "RTS-GMLC"):
+            if not (SHARED / given).exists():
+                pytest.skip(f"needs {given} under ../shared/data")
+            (tmp_path / given).parent.mkdir(exist_ok=True)
+            copy = shutil.copytree if (SHARED / given).is_dir() else shutil.copy
+            copy(SHARED / given, tmp_path / given)
+    file = written(tmp_path, f'[model]\nname = "{name}"\n{lines}')
+    outcome = run_model(read_config(file), tmp_path / "run")
+    assert outcome.exit_code == 0
+    reached = np.atleast_1d(outcome.summary[figure]["value"])[: np.size(value)]
+    np.testing.assert_allclose(reached, np.atleast_1d(value), rtol=relative)
+    assert build_report(outcome.directory).stat().st_size > 10_000
+    again = read_config(outcome.directory / "config.resolved.toml")
+    assert isinstance(again, ModelConfig) and again.name == name
+
+
+@pytest.mark.parametrize("name", APPLICATIONS)
+def test_every_key_of_a_model_is_on_the_page(name):
+    page = (Path(__file__).parents[3] / "docs" / "applications.md").read_text(encoding="utf-8")
+    table = page.split(f"### {name}\n")[1].split("\n### ")[0]
+    for key, field in module_of(name).APPLICATION.section.model_fields.items():
+        if key != "name":
+            known = isinstance(field.default, int | float | str)
+            told = "required" if field.is_required() else str(field.default) if known else "–"
+            assert f"| `{key}` | {told} |" in table, key

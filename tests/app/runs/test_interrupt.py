@@ -1,0 +1,131 @@
+"""Signals are noted in whatever runs, raised where the main thread waits, and never in a write."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import dvax
+from dvax.app.runs.interrupt import Terminated, Work, interruptible, patience, terminable, writing
+
+BOTH = pytest.mark.parametrize(
+    ("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)]
+)
+
+
+def send(number: int) -> None:
+    os.kill(os.getpid(), number)
+
+
+@pytest.fixture(autouse=True)
+def from_a_terminal() -> Iterator[None]:
+    """Where the tests run in the background of a shell, Ctrl-C is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@BOTH
+def test_a_signal_ends_a_wait(number: int, kind: type[KeyboardInterrupt]) -> None:
+    with terminable():
+        with pytest.raises(KeyboardInterrupt) as caught:
+            interruptible(lambda: (send(number), threading.Event().wait()))
+        assert caught.type is kind and patience() < 2.0
+
+
+@BOTH
+def test_code_that_swallows_exceptions_does_not_swallow_a_signal(
+    number: int, kind: type[KeyboardInterrupt]
+) -> None:
+    survived = False
+    with terminable():
+        try:
+            send(number)
+            time.sleep(0.05)
+        except BaseException:  # noqa: BLE001 (as C code does in a callback)
+            survived = True
+        with pytest.raises(kind):
+            interruptible(lambda: 1)
+    assert not survived
+
+
+@BOTH
+def test_a_write_is_never_cut(number: int, kind: type[KeyboardInterrupt]) -> None:
+    written = []
+    with pytest.raises(kind), terminable():
+        with writing():
+            send(number)
+            written.append("whole")
+        written.append("and after")
+    assert written == ["whole", "and after"]
+
+
+def test_a_second_signal_is_a_second_interruption() -> None:
+    with terminable():
+        for number in (signal.SIGTERM, signal.SIGINT):
+            send(number)
+            with pytest.raises(KeyboardInterrupt):
+                interruptible(lambda: 1)
+        assert interruptible(lambda: 7) == 7
+
+
+def test_a_signal_that_is_ignored_stays_ignored() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with terminable():
+        send(signal.SIGINT)
+        assert interruptible(lambda: 7) == 7
+    signal.signal(signal.SIGINT, before)
+
+
+def test_within_another_the_outer_one_answers() -> None:
+    with pytest.raises(Terminated), terminable():
+        with terminable():
+            send(signal.SIGTERM)
+        raise_here = True
+        assert raise_here and interruptible(lambda: 1)
+
+
+def test_work_has_a_time_and_goes_on() -> None:
+    release = threading.Event()
+    work = Work(lambda: release.wait() and 7)
+    with pytest.raises(TimeoutError):
+        work.result(0.05)
+    release.set()
+    assert work.result() == 7 and patience() == float("inf")
+
+
+HELD = """
+import signal, sys, threading
+signal.signal(signal.SIGINT, signal.default_int_handler)
+import dvax.app.cli.check
+from dvax.app.cli import main
+
+def held(error):  # in the main thread: a lock that nobody gives back, as foreign code may take one
+    lock = threading.Lock()
+    lock.acquire()
+    print("held", file=sys.stderr, flush=True)
+    lock.acquire()
+
+import dvax.app.cli.failure
+dvax.app.cli.failure.complain_of = held
+sys.argv[1:] = ["check", "no such file.toml"]
+main()
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM])
+def test_a_main_thread_that_is_held_up_is_ended_from_outside(number: signal.Signals) -> None:
+    run = subprocess.Popen(
+        [sys.executable, "-c", HELD], stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONPATH": str(Path(dvax.__file__).parents[1])},
+    )  # fmt: skip
+    assert run.stderr is not None and any(line == "held\n" for line in run.stderr)
+    run.send_signal(number)
+    _, said = run.communicate(timeout=100)  # without the signal it would never end
+    assert run.returncode == 128 + number and "Traceback" not in said
