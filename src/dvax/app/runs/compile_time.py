@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from .._jax.compile_clock import listen
+from dvax._jax.compile_clock import listen
 
 # The time loop takes 0.2 s to write down for the compiler, a single operation 0.01 s.
 _LARGE = 0.05
