@@ -17,7 +17,7 @@ Each cause is tested at the last state (t, x) that was reached, on the functions
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Any
 
 import jax
 import jax.flatten_util
@@ -36,9 +36,6 @@ from .piecewise.method import PiecewiseLinear
 from .results import RESULTS
 from .runge_kutta import DormandPrince
 from .stopped import LAST_STEPS, Diagnosis, Stop
-
-if TYPE_CHECKING:
-    from .solution import Solution
 
 _LOOSEST = 0.01
 """The loosest rtol that is ever named as a fix."""
@@ -59,7 +56,7 @@ _CHECKED = {name: f"Check {name} there" for name in ("K", "h", "f")} | {
 }
 
 
-def failure(solution: "Solution") -> SolveError:
+def failure(solution: Any) -> SolveError:
     """Return the `SolveError` of a run that stopped: what happened, the cause, how far it came, what
     helps."""
     stats, result = solution.stats, solution.result
@@ -69,7 +66,7 @@ def failure(solution: "Solution") -> SolveError:
     return SolveError(" ".join(part for part in parts if part), solution, found.fixes)
 
 
-def diagnose(solution: "Solution") -> Diagnosis:
+def diagnose(solution: Any) -> Diagnosis:
     """Return the cause of a failure that the functions themselves show; see the module."""
     setup, stats, result = solution.setup, solution.stats, solution.result
     t, step = float(stats["t"]), float(stats["next_dt"])

@@ -1,6 +1,6 @@
 """The arguments of a solve."""
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,25 +10,20 @@ from .._tree import Tree
 from ..problem import Problem
 from ..vi import AbstractSolver
 
-if TYPE_CHECKING:
-    from .implicit import Implicit
-    from .method import AbstractMethod
-    from .picard import Picard
-    from .piecewise.method import PiecewiseLinear
-
 
 class Setup(NamedTuple):
     """The arguments of a solve that its solution is a function of.
 
     `setting` holds the numbers: t0, t1, dt (NaN for adaptive steps), rtol, atol, dt0, horizon;
-    `moduli` those of γ, L_F and ‖P⁻¹‖ that are known. A plain tuple: one is made at every call.
+    `moduli` those of γ, L_F and ‖P⁻¹‖ that are known; `method` is an `AbstractMethod`, `Implicit`,
+    `Picard` or `PiecewiseLinear`, which all take a setup. A plain tuple: one is made at every call.
     """
 
     problem: Problem
     x0: Tree
     args: Any
     setting: dict[str, Any]
-    method: "AbstractMethod | Implicit | Picard | PiecewiseLinear"
+    method: Any
     vi_solver: AbstractSolver
     moduli: dict[str, Any]
 
