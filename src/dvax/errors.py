@@ -1,6 +1,7 @@
 """The one family of exceptions. Every message says what is wrong, the fix, and the reason."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 
@@ -33,6 +34,20 @@ class InputError(DvaxError, ValueError):
     def __init__(self, *problems: InputProblem):
         self.problems = problems
         super().__init__("\n".join(map(str, problems)))
+
+
+def input_error(place: str, given: str, rule: str, fix: str) -> InputError:
+    """Return an `InputError` with one problem; the arguments are those of `InputProblem`."""
+    return InputError(InputProblem(place, given, rule, fix))
+
+
+@contextmanager
+def collecting(problems: list[InputProblem]) -> Iterator[None]:
+    """Append the problems of an `InputError` raised in the block to `problems`, and go on after it."""
+    try:
+        yield
+    except InputError as error:
+        problems += error.problems
 
 
 @dataclass(frozen=True)

@@ -95,14 +95,14 @@ def test_hours_that_are_not_there(tmp_path, hours):
 
 LOAD, WIND, PV = "DAY_AHEAD_regional_Load.csv", "DAY_AHEAD_wind.csv", "DAY_AHEAD_pv.csv"
 BAD = [
-    ("gen.csv", 1, HEAD.replace("PMax MW", "PMax kW"), "gen.csv, line 1", "Convert the column"),
-    ("gen.csv", 1, HEAD.replace("HR_incr_3", "HR_3"), "gen.csv, line 1", "a column 'HR_incr_3'"),
+    ("gen.csv", 1, HEAD.replace("PMax MW", "PMax kW"), "gen.csv, line 1", "Did you mean 'PMax kW'"),
+    ("gen.csv", 1, HEAD.replace("HR_incr_3", "HR_3"), "gen.csv, line 1", "no column 'HR_incr_3'"),
     ("gen.csv", 1, HEAD.replace("Fuel,", "Bus ID,"), "gen.csv, line 1", "2 times"),
     ("gen.csv", 2, "101_CC_1,101,CC,NG,-300,4.0,7000,7200,7500", "gen.csv, line 2", "≥ 0"),
     ("gen.csv", 2, "101_CC_1,101,CC,NG,0,4.0,7000,7200,7500", "gen.csv, line 2", "has a capacity"),
-    ("gen.csv", 2, "101_CC_1,101,CC,NG,big,4.0,7000,7200,7500", "gen.csv, line 2", "finite number"),
+    ("gen.csv", 2, "101_CC_1,101,CC,NG,big,4.0,7000,7200,7500", "gen.csv, line 2", "finite decimal"),
     ("gen.csv", 2, "101_CC_1,101,CC,NG,300,4.0,7000,7200", "gen.csv, line 2", "8 cells"),
-    ("gen.csv", 2, "101_CC_1,101,CC,NG,300,4.0,7000,7200,NA", "gen.csv, line 2", "finite number"),
+    ("gen.csv", 2, "101_CC_1,101,CC,NG,300,4.0,7000,7200,NA", "gen.csv, line 2", "finite decimal"),
     ("gen.csv", 2, "101_CC_1,101,CC,NG,300,4.0,7000,7200,6000", "gen.csv, line 2", "must not fall"),
     ("gen.csv", 2, "101_CC_1,101,FUSION,NG,300,4.0,7000,7200,7500", "gen.csv, line 2", "one of CT"),
     ("gen.csv", 2, "101_CC_1,1,CC,NG,300,4.0,7000,7200,7500", "gen.csv, line 2", "three digits"),
@@ -112,7 +112,7 @@ BAD = [
     (WIND, 1, f"{CLOCK},109_WIND_9", f"{WIND}, line 1", "of the type WIND"),
     (WIND, 1, f"{CLOCK},202_PV_1", f"{WIND}, line 1", "of the type WIND"),
     (WIND, 5, f"{clock(3)},-1.0", f"{WIND}, line 5", "≥ 0"),
-    (WIND, 5, f"{clock(3)},nan", f"{WIND}, line 5", "finite number"),
+    (WIND, 5, f"{clock(3)},nan", f"{WIND}, line 5", "finite decimal"),
     (WIND, 5, f"{clock(3)},", f"{WIND}, line 5", "a gap is not a value"),
     (WIND, 5, f"{clock(3)},140000", f"{WIND}, line 5", "kW to MW"),
     (PV, 7, f"{clock(6)},10", f"{PV}, line 7", "an hour apart"),
@@ -144,7 +144,7 @@ def test_a_column_that_has_slipped_makes_no_thousand_messages(tmp_path):
     changes = [(WIND, k, f"{clock(k - 2)},gone") for k in range(2, 32)]
     with pytest.raises(dvax.InputError) as caught:
         read_rts(write(tmp_path, changes))
-    assert len(caught.value.problems) == 20
+    assert len(caught.value.problems) == 21
 
 
 def test_files_that_are_missing_are_all_named(tmp_path):

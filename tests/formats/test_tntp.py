@@ -110,14 +110,14 @@ OF_NETWORKS = {
     "zero": ("1\t3\t1\t0", "1\t3\t0\t0", "line 8", "capacity 0", "b = 0"),
     "time": ("0\t50\t0.02", "0\t-50\t0.02", "line 9", "free_flow_time -50", "≥ 0"),
     "node": ("\t3\t4\t1", "\t3\t5\t1", "line 11", "term_node 5", "nodes 1 to 4"),
-    "no node": ("\t3\t4\t1", "\t3\tD\t1", "line 11", "term_node 'D'", "number of a node"),
-    "text": ("\t3\t4\t1", "\t3\t4\tmany", "line 11", "capacity 'many'", "finite decimal"),
-    "infinite": ("\t3\t4\t1", "\t3\t4\t1e999", "line 11", "capacity '1e999'", "finite decimal"),
+    "no node": ("\t3\t4\t1", "\t3\tD\t1", "line 11", "'D'", "that of a node"),
+    "text": ("\t3\t4\t1", "\t3\t4\tmany", "line 11", "'many'", "finite decimal"),
+    "infinite": ("\t3\t4\t1", "\t3\t4\t1e999", "line 11", "'1e999'", "finite decimal"),
     "itself": ("\t3\t4\t1", "\t3\t3\t1", "line 11", "from node 3 to itself", "Remove"),
     "twice": ("\t1\t4\t1", "\t1\t3\t1", "line 9", "from 1 to 3", "line 8 has this one"),
     "short": ("\t1\t4\t1", "\t1\t4", "line 9", "9 cells", "names 10 columns"),
-    "column": ("capacity", "capazity", "line 7", "no column 'capacity'", "in the place of capazity"),
-    "power": ("power", "speeds", "line 7", "no column 'power'", "Add the column power"),
+    "column": ("capacity", "capazity", "line 7", "capazity", "Did you mean 'capazity'"),
+    "power": ("power", "speeds", "line 7", "'speeds'", "Add the column power"),
     "header": ("~", "# ", "some_net.tntp", "no line that names the columns", "init_node term_node"),
     "links": ("LINKS> 5", "LINKS> 6", "line 4", "6 and 5 rows", "as many links as it states"),
     "zones": ("ZONES> 2", "ZONES> 9", "some_net", "9 zones and 4 nodes", "at most as many"),
@@ -176,8 +176,8 @@ OF_FLOWS = {
     "unknown": ("1\t4\t2", "1\t2\t2", "line 3", "link from 1 to 2", "no such one"),
     "missing": ("3\t4\t2\t12\n", "", "some_net.tntp", "no link from 3 to 4", "Add the row"),
     "twice": ("3\t4\t2", "1\t4\t2", "line 5", "link from 1 to 4 once more", "line 3 has it"),
-    "text": ("52\n3", "?\n3", "line 3", "cost '?'", "finite"),
-    "column": ("Volume", "Flow", "line 1", "no column 'volume'", "volume"),
+    "text": ("52\n3", "?\n3", "line 3", "'?'", "finite"),
+    "column": ("Volume", "Flow", "line 1", "'flow'", "no column 'volume'"),
 }
 
 
@@ -195,7 +195,7 @@ def test_flaws_of_node_files_are_named(tmp_path):
     network = formats.read_network(networks.braess(tmp_path)[0])
     text = NODE.replace("3\t0", "7\t0").replace("4\t0\t0", "1\t0\tnorth")
     found = flaws(formats.read_nodes, put(tmp_path, text), network)
-    assert [p.given for p in found] == ["y 'north'", "the node 7", "no node 3", "no node 4"]
+    assert [p.given for p in found] == ["'north'", "the node 7", "no node 3", "no node 4"]
     assert "no rows" in flaws(formats.read_nodes, put(tmp_path, "\n"), network)[0].given
 
 
@@ -205,7 +205,8 @@ def test_all_flaws_of_both_files_come_at_once(tmp_path):
     found = flaws(lambda: traffic.Traffic(net, trips, rate=0.0, rho="much"))
     places = [p.place for p in found]
     assert places == [
-        "dvax.models.Traffic(rate)", "dvax.models.Traffic(rho)", "some_net.tntp, line 12",
+        "dvax.models.Traffic(rate)", "dvax.models.Traffic(rho)",
+        "some_net.tntp, line 12, column 'capacity'",
         "some_net.tntp, line 8", "some_trips.tntp, line 2", "some_trips.tntp, line 6",
     ]  # fmt: skip
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import InputError, InputProblem
+from ..errors import InputError, InputProblem, collecting, input_error
 from .optional import needed
 
 _PLANE = ("triangle", "quad")
@@ -60,10 +60,8 @@ def read_mesh(path: str | os.PathLike[str], contact: str, clamped: str) -> Any:
     found: dict[str, np.ndarray] = {}
     wrong: list[InputProblem] = []
     for role, name in (("contact", contact), ("clamped", clamped)):
-        try:
+        with collecting(wrong):
             found[role] = _facets(mesh, new, raw.edges, name, role, place)
-        except InputError as error:
-            wrong += error.problems
     if wrong:
         raise InputError(*wrong)
     return mesh.with_boundaries(found)
@@ -72,7 +70,7 @@ def read_mesh(path: str | os.PathLike[str], contact: str, clamped: str) -> Any:
 def _load(path: Path, place: str) -> Any:
     meshio = needed("meshio")
     if not path.is_file():
-        raise _refused(place, "no such file", "a mesh is read from a file", "Mend the name")
+        raise input_error(place, "no such file", "a mesh is read from a file", "Fix the name")
     said = io.StringIO()
     try:
         # meshio talks on both channels.
@@ -80,7 +78,7 @@ def _load(path: Path, place: str) -> Any:
             return meshio.read(path)
     except (meshio.ReadError, *_UNREADABLE) as error:
         reason = " ".join(f"{said.getvalue()} {error}".split())
-        raise _refused(
+        raise input_error(
             place, f"what meshio cannot read ({reason[:200]})",
             "the file must be a whole mesh in a format that its ending names",
             "Save it again, as Gmsh 4.1 or 2.2 (.msh), Medit (.mesh), Abaqus (.inp) or VTU",
@@ -98,12 +96,12 @@ def _plane(mesh: Any, place: str) -> Raw:
     )  # tetra, hexahedron, …
     rule = "a body in plane strain is made of triangles or of quadrilaterals with straight sides"
     if solid:
-        raise _refused(
+        raise input_error(
             place, f"cells of type {', '.join(solid)}", rule,
             "Mesh a cross-section of the body (Gmsh: mesh in 2-D)",
         )  # fmt: skip
     if curved:
-        raise _refused(
+        raise input_error(
             place, f"cells of type {', '.join(curved)}", rule,
             "Save the mesh with elements of order 1 (Gmsh: Mesh.ElementOrder = 1); "
             "displacements are quadratic all the same",
@@ -111,7 +109,7 @@ def _plane(mesh: Any, place: str) -> Raw:
     plane = sorted(kinds & set(_PLANE))
     if len(plane) != 1:
         given = "triangles and quadrilaterals" if plane else f"cells of type {sorted(kinds)}"
-        raise _refused(
+        raise input_error(
             place, given, f"{rule}, all of one kind",
             "Recombine all of the elements or none (Gmsh: Recombine Surface), and save the surface "
             "as well as its boundary",
@@ -120,13 +118,13 @@ def _plane(mesh: Any, place: str) -> Raw:
     points = np.asarray(mesh.points, float)
     corners = points[elements.ravel()]
     if not np.isfinite(corners).all():
-        raise _refused(
+        raise input_error(
             place, "coordinates that are not finite", "a node has a place", "Export the mesh again"
         )
     if points.shape[1] > 2:
         depth = np.ptp(corners[:, 2])
         if depth > 1e-9 * np.ptp(corners[:, :2], axis=0).max(initial=0.0):
-            raise _refused(
+            raise input_error(
                 place, f"nodes whose z differs by {depth:g}",
                 "a body in plane strain lies in a plane z = const, its punch above it in y",
                 "Turn the mesh into that plane",
@@ -160,7 +158,7 @@ def _facets(
     """The facets of the mesh that the line elements of a group are."""
     if name not in edges:
         there = ", ".join(map(repr, sorted(edges))) or "none"
-        raise _refused(
+        raise input_error(
             place, f"no line elements in a group {name!r}; groups of lines are: {there}",
             f"the {role} boundary is named in the file",
             f'Name it (Gmsh: Physical Curve("{name}") = {{…}};, and save again), or say '
@@ -174,13 +172,9 @@ def _facets(
     at = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), keys.size - 1)]
     lost = int(np.sum((keys[at] != wanted) | (ends[0] < 0)))
     if lost:
-        raise _refused(
+        raise input_error(
             place, f"{lost} of {wanted.size} lines of {name!r} that are no edges of elements",
             "a boundary runs along edges of elements",
             "Mesh lines and surface together, so that they share their nodes",
         )  # fmt: skip
     return np.unique(at)
-
-
-def _refused(place: str, given: str, rule: str, mend: str) -> InputError:
-    return InputError(InputProblem(place, given, rule, mend))

@@ -15,7 +15,7 @@ no title line. Numbers have engineering suffixes (f p n u m k Meg G T) and may h
 import re
 from dataclasses import dataclass
 
-from ..errors import InputError, InputProblem
+from ..errors import InputError, InputProblem, collecting, input_error
 from ..signals import AbstractSignal
 from .netlist_sources import read_waveform
 from .netlist_values import read_value
@@ -105,10 +105,8 @@ def read_netlist(text: str, name: str = "netlist") -> Netlist:
                     "without regard to case", "Rename one of them",
                 )
             )  # fmt: skip
-        try:
+        with collecting(wrong):
             elements.append(_element(words, place, number))
-        except InputError as error:
-            wrong += error.problems
     if wrong:
         raise InputError(*wrong)
     return Netlist(name, tuple(elements))
@@ -127,22 +125,18 @@ def _element(words: list[str], place: str, line: int) -> Element:
     name = words[0]
     kind = name[0].upper()
     if kind not in _WORDS:
-        raise InputError(
-            InputProblem(
-                place, name, "elements begin with R, L, C, V, I or D, and there are no commands and no "
-                "title", "Put a * before a comment",
-            )
+        raise input_error(
+            place, name, "elements begin with R, L, C, V, I or D, and there are no commands and no "
+            "title", "Put a * before a comment",
         )  # fmt: skip
     rest = [word for word in words[1:] if not re.match(r"[A-Za-z]+=", word)]
     named = [word for word in words[1:] if re.match(r"[A-Za-z]+=", word)]
     least = 2 if kind == "D" else 3
     if len(rest) < least:
         missing = "a node" if len(rest) < 2 else "its value"
-        raise InputError(
-            InputProblem(
-                place, " ".join(words), f"{missing} is missing: an element has a name, two nodes"
-                + ("" if kind == "D" else " and a value"), f"Write {_example(kind)}",
-            )
+        raise input_error(
+            place, " ".join(words), f"{missing} is missing: an element has a name, two nodes"
+            + ("" if kind == "D" else " and a value"), f"Write {_example(kind)}",
         )  # fmt: skip
     a, b = rest[:2]
     wrong: list[InputProblem] = []
@@ -150,41 +144,33 @@ def _element(words: list[str], place: str, line: int) -> Element:
         wrong.append(
             InputProblem(
                 place, f"{name} from {a} to {b}", "both ends are one node, so it does nothing there",
-                "Mend a node, or drop the element",
+                "Fix a node, or drop the element",
             )
         )  # fmt: skip
     found: dict[str, float] = {}
     source = None
-    try:
+    with collecting(wrong):
         if kind in "VI":
             source = read_waveform(rest[2:], _QUANTITY[kind], place)
         elif len(rest) > least:
             why = f"{name} has two nodes" + ("" if kind == "D" else " and one value")
             if kind == "D":
                 why += ", and no models of diodes are known"
-            raise InputError(
-                InputProblem(place, " ".join(rest[least:]), why, f"Write {_example(kind)}")
-            )
+            raise input_error(place, " ".join(rest[least:]), why, f"Write {_example(kind)}")
         elif kind != "D":
             found["value"] = _positive(rest[2], _QUANTITY[kind], place)
-    except InputError as error:
-        wrong += error.problems
     said: dict[str, str] = {}
     for word in named:
-        try:
+        with collecting(wrong):
             key, value = _named(kind, word, place)
             first = said.setdefault(key, word)
             if first is not word:
-                raise InputError(
-                    InputProblem(
-                        place, f"{first} and {word}",
-                        "a word stands once, or it is not known which of them counts",
-                        "Keep one of them",
-                    )
+                raise input_error(
+                    place, f"{first} and {word}",
+                    "a word stands once, or it is not known which of them counts",
+                    "Keep one of them",
                 )  # fmt: skip
             found[key] = value
-        except InputError as error:
-            wrong += error.problems
     if wrong:
         raise InputError(*wrong)
     return Element(kind, name, a, b, line, source=source, **found)
@@ -195,9 +181,7 @@ def _named(kind: str, word: str, place: str) -> tuple[str, float]:
     quantity = _WORDS[kind].get(key.upper())
     if quantity is None:
         known = " and ".join(f"{k}=" for k in _WORDS[kind]) or "none"
-        raise InputError(
-            InputProblem(place, word, f"the words of an element {kind} are {known}", "Drop it")
-        )
+        raise input_error(place, word, f"the words of an element {kind} are {known}", "Drop it")
     if kind == "D":
         return {"R": "series", "G": "leak"}[key.upper()], _positive(text, quantity, place)
     return "initial", read_value(text, quantity, place)
@@ -206,11 +190,9 @@ def _named(kind: str, word: str, place: str) -> tuple[str, float]:
 def _positive(text: str, quantity: str, place: str) -> float:
     value = read_value(text, quantity, place)
     if value <= 0:
-        raise InputError(
-            InputProblem(
-                place, repr(text), f"the {quantity} is positive: energy comes from V and I alone",
-                "Mend the value, or drop the element",
-            )
+        raise input_error(
+            place, repr(text), f"the {quantity} is positive: energy comes from V and I alone",
+            "Fix the value, or drop the element",
         )  # fmt: skip
     return value
 

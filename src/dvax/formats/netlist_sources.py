@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..errors import InputError, InputProblem
+from ..errors import InputError, InputProblem, collecting, input_error
 from ..signals import AbstractSignal, Constant, Function, Table
 from .netlist_values import read_value
 
@@ -87,22 +87,18 @@ def read_waveform(fields: list[str], quantity: str, place: str) -> AbstractSigna
     if call is None:
         numbers = fields[1:] if fields and fields[0].upper() == "DC" else fields
         if len(numbers) != 1 or "(" in whole:
-            raise InputError(
-                InputProblem(
-                    place, repr(whole), "a source is a number, DC number, SIN(...), PWL(...) or "
-                    "PULSE(...)",
-                    "Write one of them after the two nodes",
-                )
+            raise input_error(
+                place, repr(whole), "a source is a number, DC number, SIN(...), PWL(...) or "
+                "PULSE(...)",
+                "Write one of them after the two nodes",
             )  # fmt: skip
         return Constant(read_value(numbers[0], quantity, place))
     shapes = {"SIN": _sine, "PWL": _lines, "PULSE": _pulse}
     shape = shapes.get(call["name"].upper())
     if shape is None:
-        raise InputError(
-            InputProblem(
-                place, call["name"], f"a waveform is one of {', '.join(shapes)}",
-                "Write it as PWL(t v t v ...)",
-            )
+        raise input_error(
+            place, call["name"], f"a waveform is one of {', '.join(shapes)}",
+            "Write it as PWL(t v t v ...)",
         )  # fmt: skip
     return shape(call["inside"].replace(",", " ").split(), quantity, place)
 
@@ -110,17 +106,15 @@ def read_waveform(fields: list[str], quantity: str, place: str) -> AbstractSigna
 def _sine(fields: list[str], quantity: str, place: str) -> AbstractSignal:
     kinds = (quantity, quantity, "frequency", "time", "rate", "angle")
     if not 3 <= len(fields) <= len(kinds):
-        raise InputError(
-            InputProblem(
-                place, f"SIN with {len(fields)} numbers",
-                "it has an offset, an amplitude and a frequency, and may have a delay, a damping and "
-                "a phase in degrees", "Write SIN(0 10 1k)",
-            )
+        raise input_error(
+            place, f"SIN with {len(fields)} numbers",
+            "it has an offset, an amplitude and a frequency, and may have a delay, a damping and "
+            "a phase in degrees", "Write SIN(0 10 1k)",
         )  # fmt: skip
     kinds = kinds[: len(fields)]
     values = _all(fields, kinds, place) + [0.0] * (6 - len(fields))
     wrong = [
-        InputProblem(place, fields[k], f"the {what} is not negative", "Mend the sign")
+        InputProblem(place, fields[k], f"the {what} is not negative", "Fix the sign")
         for k, what in ((2, "frequency"), (3, "delay"), (4, "damping"))
         if values[k] < 0
     ]
@@ -134,19 +128,16 @@ def _sine(fields: list[str], quantity: str, place: str) -> AbstractSignal:
 def _pulse(fields: list[str], quantity: str, place: str) -> AbstractSignal:
     kinds = (quantity, quantity, "time", "time", "time", "time", "time")
     if not 2 <= len(fields) <= len(kinds):
-        raise InputError(
-            InputProblem(
-                place, f"PULSE with {len(fields)} numbers",
-                "it has a low and a high value, and may have a delay, a rise time, a fall time, a "
-                "width "
-                "and a period", "Write PULSE(0 5 0 1n 1n 5u 10u)",
-            )
+        raise input_error(
+            place, f"PULSE with {len(fields)} numbers",
+            "it has a low and a high value, and may have a delay, a rise time, a fall time, a "
+            "width and a period", "Write PULSE(0 5 0 1n 1n 5u 10u)",
         )  # fmt: skip
     values = _all(fields, kinds[: len(fields)], place)
     low, high, delay, rise, fall, width, period = values + _PULSE_DEFAULTS[len(values) :]
     names = ("the delay", "the rise time", "the fall time", "the width", "the period")
     wrong = [
-        InputProblem(place, fields[2 + k], f"{what} is not negative", "Mend the sign")
+        InputProblem(place, fields[2 + k], f"{what} is not negative", "Fix the sign")
         for k, what in enumerate(names[: len(fields) - 2])
         if values[2 + k] < 0
     ]
@@ -172,33 +163,28 @@ _PULSE_DEFAULTS = [0.0, 0.0, 0.0, 0.0, 0.0, np.inf, np.inf]
 
 def _lines(fields: list[str], quantity: str, place: str) -> AbstractSignal:
     if len(fields) < 4 or len(fields) % 2:
-        raise InputError(
-            InputProblem(
-                place, f"PWL with {len(fields)} numbers", "it has pairs of a time and a value, two at "
-                "least", "Write PWL(0 0 1m 5)",
-            )
+        raise input_error(
+            place, f"PWL with {len(fields)} numbers", "it has pairs of a time and a value, two at "
+            "least", "Write PWL(0 0 1m 5)",
         )  # fmt: skip
     values = _all(fields, ("time", quantity) * (len(fields) // 2), place)
     times = np.array(values[::2])
     late = np.flatnonzero(np.diff(times) <= 0)
     if times[0] != 0.0 or late.size:
         given = f"PWL from {times[0]:g} s" if times[0] != 0.0 else fields[2 * int(late[0]) + 2]
-        raise InputError(
-            InputProblem(
-                place, given, "the times begin at 0, where the run does, and increase",
-                "Sort them, and say what the source does from 0 on",
-            )
+        raise input_error(
+            place, given, "the times begin at 0, where the run does, and increase",
+            "Sort them, and say what the source does from 0 on",
         )  # fmt: skip
     return Table(times, np.array(values[1::2]))
 
 
 def _all(fields: list[str], kinds: tuple[str, ...], place: str) -> list[float]:
-    values, wrong = [], []
+    values: list[float] = []
+    wrong: list[InputProblem] = []
     for field, kind in zip(fields, kinds, strict=True):
-        try:
+        with collecting(wrong):
             values.append(read_value(field, kind, place))
-        except InputError as error:
-            wrong += error.problems
     if wrong:
         raise InputError(*wrong)
     return values

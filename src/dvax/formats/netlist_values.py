@@ -3,9 +3,10 @@
 import math
 import re
 
-from ..errors import InputError, InputProblem
+from ..errors import input_error
+from .table import NUMBER
 
-_NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)([A-Za-zµμΩΩ°]*)")
+_VALUE = re.compile(rf"({NUMBER.pattern})([A-Za-zµμΩΩ°]*)")
 
 _SUFFIXES = {
     "": 1.0, "f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3,
@@ -33,18 +34,18 @@ def read_value(text: str, quantity: str, place: str) -> float:
     **Raises:** `dvax.InputError` at `place` for what is no finite number, a unit of another quantity,
     and the two traps of SPICE: a large M (milli there, mega elsewhere) and F alone (femto there).
     """
-    found = _NUMBER.fullmatch(text)
+    found = _VALUE.fullmatch(text)
     if found is None:
-        raise _wrong(
+        raise input_error(
             place, repr(text), f"the {quantity} is a decimal number", "Write 4.7k, 10m or 1e-6"
         )
     digits, tail = found.groups()
     if tail.startswith("M") and not tail.lower().startswith("meg"):
-        raise _wrong(
+        raise input_error(
             place, repr(text), "M is milli in SPICE and mega everywhere else", "Write m or Meg"
         )
     if tail.lower() == "f":
-        raise _wrong(
+        raise input_error(
             place, repr(text), "F alone is femto in SPICE and farad everywhere else",
             "Leave the unit out for farad, or write fF",
         )  # fmt: skip
@@ -54,10 +55,10 @@ def read_value(text: str, quantity: str, place: str) -> float:
         rule = f"the {quantity} is in {UNITS[quantity][0]}, and this is in no unit that is known"
         if other is not None:
             rule = f"the {quantity} is in {UNITS[quantity][0]}, and this has a unit of {other}"
-        raise _wrong(place, repr(text), rule, "Mend the unit, or leave it out")
+        raise input_error(place, repr(text), rule, "Fix the unit, or leave it out")
     value = float(digits) * factor
     if not math.isfinite(value):
-        raise _wrong(place, repr(text), "values are finite", "Mend the exponent")
+        raise input_error(place, repr(text), "values are finite", "Fix the exponent")
     return value
 
 
@@ -68,7 +69,3 @@ def _factor(tail: str, units: tuple[str, ...]) -> float | None:
         if tail.endswith(unit) and head.lower() in _SUFFIXES:
             return _SUFFIXES[head.lower()]
     return None
-
-
-def _wrong(place: str, given: str, rule: str, mend: str) -> InputError:
-    return InputError(InputProblem(place, given, rule, mend))

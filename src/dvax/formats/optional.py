@@ -3,7 +3,7 @@
 import importlib
 from typing import Any
 
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 
 _PACKAGES = {"skfem": "scikit-fem", "meshio": "meshio"}
 
@@ -16,11 +16,9 @@ def needed(module: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise InputError(
-            InputProblem(
-                "dvax.models.ElasticBody",
-                f"no module {module!r}",
-                f"finite elements and mesh files are those of {_PACKAGES[module.split('.')[0]]}",
-                'pip install "dvax[fem]"',
-            )
+        raise input_error(
+            "dvax.models.ElasticBody",
+            f"no module {module!r}",
+            f"finite elements and mesh files are those of {_PACKAGES[module.split('.')[0]]}",
+            'pip install "dvax[fem]"',
         ) from error

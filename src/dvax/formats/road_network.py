@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, InputProblem
+from ..errors import InputError, InputProblem, input_error
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +73,11 @@ class Network:
         found = np.flatnonzero((self.init_node == init_node) & (self.term_node == term_node))
         if found.size == 0:
             leaving = self.term_node[self.init_node == init_node]
-            raise InputError(
-                InputProblem(
-                    f"the link from {init_node} to {term_node}",
-                    f"no such link in {self.name}",
-                    "a link is named by its first and its last node",
-                    f"Links from {init_node} go to {', '.join(map(str, leaving)) or 'no node'}",
-                )
+            raise input_error(
+                f"the link from {init_node} to {term_node}",
+                f"no such link in {self.name}",
+                "a link is named by its first and its last node",
+                f"Links from {init_node} go to {', '.join(map(str, leaving)) or 'no node'}",
             )
         return int(found[0])
 
@@ -151,7 +149,7 @@ def link_problems(links: Any) -> list[InputProblem]:
             InputProblem(
                 links.name, f"{links.zones} zones and {links.nodes} nodes",
                 "zones are the first ones of the nodes, so there are at most as many, and one at least",
-                "Mend the counts",
+                "Fix the counts",
             )
         )  # fmt: skip
     if not 1 <= links.first_thru_node <= links.nodes + 1:
@@ -179,11 +177,11 @@ def link_problems(links: Any) -> list[InputProblem]:
         sound = (values > 0 if strictly else values >= 0) & np.isfinite(values)
         for i in np.flatnonzero(~sound):
             rule = "a positive number" if strictly else "a number ≥ 0"
-            mend = f"Mend the {column}"
+            fix = f"Fix the {column}"
             if column == "capacity":
-                mend += "; a link whose time does not depend on its flow has b = 0"
+                fix += "; a link whose time does not depend on its flow has b = 0"
             problems.append(
-                InputProblem(place(i), f"{column} {values[i]:g}", f"it is {rule}: {why}", mend)
+                InputProblem(place(i), f"{column} {values[i]:g}", f"it is {rule}: {why}", fix)
             )
     for i in np.flatnonzero(links.init_node == links.term_node):
         problems.append(
@@ -214,7 +212,7 @@ def trip_problems(trips: Any) -> list[InputProblem]:
         problems.append(
             InputProblem(
                 place(i), f"{trips.flow[i]:g} trips from {pair}", "trips are a number ≥ 0",
-                "Mend the number",
+                "Fix the number",
             )
         )  # fmt: skip
     for i, first in _repeated(trips.origin, trips.destination):
@@ -239,7 +237,7 @@ def _unknown(
     return [
         InputProblem(
             place(i), f"{column} {values[i]}", f"there are the {kind}s 1 to {largest}",
-            f"Mend the number, or the number of {kind}s",
+            f"Fix the number, or the number of {kind}s",
         )
         for i in np.flatnonzero((values < 1) | (values > largest))
     ]  # fmt: skip

@@ -1,13 +1,14 @@
 """The RTS-GMLC test system: who can make how much electricity at what cost, and who wants it."""
 
 import datetime
+import itertools
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import InputError, InputProblem
-from .hourly import MAX_PROBLEMS, Hourly, Rows, no_files, number, read_hourly, read_rows, same_hours
+from ..errors import InputError, InputProblem, collecting
+from .table import Problems, Table, csv_rows
 
 LEAST_SLOPE = 1e-3
 """$/MWh per MW: the slope of a cost curve that is flat, as those of wind, sun and nuclear power are. It
@@ -29,8 +30,9 @@ _THERMAL = ("CT", "CC", "STEAM", "NUCLEAR")
 # Synchronous condensers make no power; water, heat stores and batteries have a budget of energy, which
 # no law of one hour knows; panels on roofs are behind the meter, inside the load.
 _OTHERS = ("SYNC_COND", "HYDRO", "ROR", "CSP", "STORAGE", "RTPV")
-_TOO_MUCH = 1.1
-"""Times its rating, beyond which what a unit has available is taken for another unit of measure."""
+_CLOCK = ("Year", "Month", "Day", "Period")
+_RATING_MARGIN = 1.1
+"""Factor of its rating above which the output of a unit is taken for another unit of measure."""
 
 
 class RTS(NamedTuple):
@@ -62,7 +64,7 @@ def read_rts(folder: str | Path) -> RTS:
     Wind and photovoltaic units cost nothing (c = 0, a = 10⁻³) and have what the hour brings. Hydro,
     CSP, storage and rooftop units are left out: their hours hang together, or are in the load.
 
-    **Raises:** `dvax.InputError` with file, line, what is wrong and its mend, everything at once (up to
+    **Raises:** `dvax.InputError` with file, line, what is wrong and its fix, everything at once (up to
     20 flaws a file): files or columns that are missing, cells that are no numbers or negative, unknown
     types of units, series of unknown units, units without a series, areas without a load, gaps in
     time, files for different hours, falling heat rates, and values that only another unit of measure
@@ -72,30 +74,41 @@ def read_rts(folder: str | Path) -> RTS:
     """
     folder = Path(folder)
     paths = {name: _place(folder, places) for name, places in _FILES.items()}
-    missing = no_files(list(paths.values()))
-    if missing is not None:
-        raise missing
-    problems: list[InputProblem] = []
-    rows = read_rows(paths["units"], _COLUMNS, problems)
-    thermal, rated = _units(rows, problems) if rows is not None else ({}, {})
-    hourly = {name: read_hourly(paths[name], problems) for name in ("load", "wind", "sun")}
-    tables = [table for table in hourly.values() if table is not None]
-    if len(tables) == 3:
-        same_hours(tables, problems)
-    for name, kind in (("wind", "WIND"), ("sun", "PV")):
-        table = hourly[name]
-        if table is not None and rows is not None:
-            _series(table, rows.file, kind, rated, problems)
-    load, wind, sun = hourly["load"], hourly["wind"], hourly["sun"]
-    if load is not None and rows is not None:
-        _loads(load, rows.file, thermal, rated, problems)
-    if problems or load is None or wind is None or sun is None:
+    problems = [
+        InputProblem(str(path.parent), f"no {path.name}", "the market is read from four files",
+                     "Copy it there from RTS-GMLC's RTS_Data")
+        for path in paths.values() if not path.is_file()
+    ]  # fmt: skip
+    if problems:
         raise InputError(*problems)
-    return _together(thermal, rated, load, wind, sun)
+    units: list[_Unit] = []
+    hourly: dict[str, Hourly] = {}
+    with collecting(problems):
+        units = _read_units(paths["units"])
+    for name in ("load", "wind", "sun"):
+        with collecting(problems):
+            hourly[name] = _read_hourly(paths[name])
+    if problems:
+        raise InputError(*problems)
+    file = paths["units"].name
+    load, wind, sun = hourly["load"], hourly["wind"], hourly["sun"]
+    problems = [
+        *_other_hours(load, wind),
+        *_other_hours(load, sun),
+        *_wrong_series(wind, file, "WIND", units),
+        *_wrong_series(sun, file, "PV", units),
+        *_wrong_load(load, file, units),
+    ]
+    if problems:
+        raise InputError(*problems)
+    return _join(units, load, wind, sun)
 
 
 class _Unit(NamedTuple):
+    """A unit, the line it stands on, and its marginal cost `cost` + `slope` · output."""
+
     line: int
+    name: str
     area: str
     kind: str
     capacity: float
@@ -103,138 +116,192 @@ class _Unit(NamedTuple):
     slope: float
 
 
+class Hourly(NamedTuple):
+    """Numbers by hour: `start`, the first hour; `names` of the columns; `values`, a row an hour;
+    `lines` of the file that the rows stand on."""
+
+    file: str
+    start: datetime.datetime
+    names: list[str]
+    values: np.ndarray
+    lines: np.ndarray
+
+
 def _place(folder: Path, places: tuple[str, ...]) -> Path:
     """Where a file lies: in the folder itself, or where the repository has it."""
     return next((folder / name for name in places if (folder / name).is_file()), folder / places[0])
 
 
-def _units(table: Rows, problems: list[InputProblem]) -> tuple[dict[str, _Unit], dict[str, _Unit]]:
-    """The thermal units, and those whose capacity is measured, by name."""
-    found: list[InputProblem] = []
-    thermal: dict[str, _Unit] = {}
-    rated: dict[str, _Unit] = {}
-    uid, bus, kind = (table.column(name) for name in _COLUMNS[:3])
+def _read_table(path: Path, wanted: tuple[str, ...]) -> Table:
+    """The table of a CSV file that has the `wanted` columns. Raises `InputError`."""
+    problems = Problems(path)
+    rows = csv_rows(path, problems)
+    if len(rows) < 2:
+        rule = "a row of names is followed by rows of data"
+        problems(None, f"{len(rows)} rows", rule, "Copy the file again")
+        raise problems.error()
+    table = Table(*rows[0], rows[1:], problems)
+    table.has(*wanted)
+    problems.raise_any()
+    return table
+
+
+def _read_units(path: Path) -> list[_Unit]:
+    """The thermal units and those whose capacity is measured. Raises `InputError`."""
+    table = _read_table(path, _COLUMNS)
+    problems, units, seen = table.problems, [], set()
     for line, cells in table.rows:
-        name, place = cells[uid].strip(), f"{table.file}, line {line}"
-        if name in thermal or name in rated:
-            found.append(InputProblem(place, name, "a unit is listed once", "Rename or remove it"))
-        what = cells[kind].strip()
-        if what in _OTHERS:
+        name, bus, kind, *numbers = (cells[table.names.index(c)] for c in _COLUMNS)
+        if name in seen:
+            problems(line, name, "a unit is listed once", "Rename or remove it")
+        seen.add(name)
+        if kind in _OTHERS:
             continue
-        if what not in (*_THERMAL, "WIND", "PV"):
+        if kind not in (*_THERMAL, "WIND", "PV"):
             kinds = ", ".join((*_THERMAL, "WIND", "PV", *_OTHERS))
-            found.append(
-                InputProblem(f"{place}, column 'Unit Type'", repr(what), f"it must be one of {kinds}",
-                             "Mend the type")
-            )  # fmt: skip
+            problems(line, repr(kind), f"it must be one of {kinds}", "Fix it", "Unit Type")
             continue
-        columns = _COLUMNS[3:] if what in _THERMAL else _COLUMNS[3:4]
-        values = [number(table.file, line, c, cells[table.column(c)], found) for c in columns]
-        area = cells[bus].strip()
-        if not (len(area) == 3 and area.isdigit()):
-            found.append(
-                InputProblem(f"{place}, column 'Bus ID'", repr(area),
-                             "it must be a bus of three digits, the first of which is its area",
-                             "Mend the number")
-            )  # fmt: skip
-        unit = _Unit(line, area[:1], what, *_curve(place, values, found))
-        (thermal if what in _THERMAL else rated)[name] = unit
-    problems += found[:MAX_PROBLEMS]
-    return thermal, rated
+        if not (len(bus) == 3 and bus.isdigit()):
+            rule = "it must be a bus of three digits, the first of which is its area"
+            problems(line, repr(bus), rule, "Fix the number", "Bus ID")
+        curve = _curve(table, line, numbers if kind in _THERMAL else numbers[:1])
+        units.append(_Unit(line, name, bus[:1], kind, *curve))
+    problems.raise_any()
+    return units
 
 
-def _curve(
-    place: str, values: list[float], problems: list[InputProblem]
-) -> tuple[float, float, float]:
-    """Capacity, c and a of a unit."""
-    capacity = values[0]
-    if len(values) == 1:
+def _curve(table: Table, line: int, cells: list[str]) -> tuple[float, float, float]:
+    """Capacity, c and a of a unit from PMax and, where it burns fuel, its price and heat rates."""
+    capacity, *rest = (
+        table.number(line, c, cell, least=0.0) for c, cell in zip(_COLUMNS[3:], cells, strict=False)
+    )
+    if not rest:
         return capacity, 0.0, LEAST_SLOPE
-    _, fuel, first, last = values
+    fuel, first, last = rest
     if capacity == 0:
-        problems.append(
-            InputProblem(f"{place}, column 'PMax MW'", "0", "a unit that burns fuel has a capacity",
-                         "Mend it, or remove the unit")
-        )  # fmt: skip
+        rule = "a unit that burns fuel has a capacity"
+        table.problems(line, "0", rule, "Fix it, or remove the unit", "PMax MW")
         return np.nan, np.nan, np.nan
     if last < first:
-        problems.append(
-            InputProblem(f"{place}, columns 'HR_incr_1' and 'HR_incr_3'", f"{first:g} and {last:g}",
-                         "incremental heat rates must not fall, or costs are not convex and the "
-                         "hour has no equilibrium of this kind", "Mend the heat rates")
+        table.problems(
+            line, f"HR_incr_1 = {first:g} and HR_incr_3 = {last:g}",
+            "incremental heat rates must not fall, or costs are not convex and the hour has no "
+            "equilibrium of this kind", "Fix the heat rates",
         )  # fmt: skip
     slope = (last - first) * fuel / 1000 / capacity
     return capacity, first * fuel / 1000, max(LEAST_SLOPE, slope)
 
 
-def _series(
-    table: Hourly, units: str, kind: str, rated: dict[str, _Unit], problems: list[InputProblem]
-) -> None:
-    """A column for each unit of a kind and no other, and none above its rating."""
-    of_kind = {name: unit for name, unit in rated.items() if unit.kind == kind}
-    for name in table.names:
-        if name not in of_kind:
-            problems.append(
-                InputProblem(f"{table.file}, line 1", f"a column {name!r}",
-                             f"it must name a unit of the type {kind} in {units}",
-                             "Mend the name, or add the unit")
+def _read_hourly(path: Path) -> Hourly:
+    """The hours of a file with the columns Year, Month, Day, Period (1 to 24). Raises `InputError`."""
+    table = _read_table(path, _CLOCK)
+    problems = table.problems
+    clock = [table.names.index(name) for name in _CLOCK]
+    hours: list[datetime.datetime] = []
+    for line, cells in table.rows:
+        words = [cells[k] for k in clock]
+        try:
+            year, month, day, period = map(int, words)
+            if not 1 <= period <= 24:
+                raise ValueError("a day has the periods 1 to 24")
+            hours.append(datetime.datetime(year, month, day, period - 1))
+        except ValueError as error:
+            fix = "Write Year, Month, Day and Period as integers"
+            problems(line, "/".join(words), f"it must be an hour: {error}", fix)
+    names = [name for name in table.names if name not in _CLOCK]
+    columns = table.columns(names, least=0.0)
+    problems.raise_any()
+    lines = columns["lines"]
+    for k, (before, after) in enumerate(itertools.pairwise(hours), start=1):
+        if after - before != datetime.timedelta(hours=1):
+            problems(
+                int(lines[k]),
+                f"{after:%Y-%m-%d} period {after.hour + 1} after {before:%Y-%m-%d} period "
+                f"{before.hour + 1}",
+                "rows are an hour apart: over a gap nothing is known, and a repeated hour is ambiguous",
+                "Fill in the missing hours on purpose, or remove the repeated ones",
             )  # fmt: skip
-    for name, unit in of_kind.items():
+    problems.raise_any()
+    values = np.stack([columns[name] for name in names], axis=1)
+    return Hourly(path.name, hours[0], names, values, lines)
+
+
+def _other_hours(first: Hourly, other: Hourly) -> list[InputProblem]:
+    """A problem where two files do not cover the same hours."""
+    if (other.start, len(other.values)) == (first.start, len(first.values)):
+        return []
+    told = [f"{len(table.values)} from {table.start:%Y-%m-%d %H:%M}" for table in (first, other)]
+    return [
+        InputProblem(
+            other.file, told[1].replace(" from", " hours from"),
+            f"it must cover the hours of {first.file}: {told[0]}",
+            "Cut the files to the hours that all of them have",
+        )
+    ]  # fmt: skip
+
+
+def _wrong_series(table: Hourly, file: str, kind: str, units: list[_Unit]) -> list[InputProblem]:
+    """Columns that are no unit of a kind, units of it without a column, values above a rating."""
+    rated = {unit.name: unit for unit in units if unit.kind == kind}
+    problems = [
+        InputProblem(f"{table.file}, line 1", f"a column {name!r}",
+                     f"it must name a unit of the type {kind} in {file}",
+                     "Fix the name, or add the unit")
+        for name in table.names if name not in rated
+    ]  # fmt: skip
+    for name, unit in rated.items():
         if name not in table.names:
             problems.append(
-                InputProblem(f"{units}, line {unit.line}", name,
+                InputProblem(f"{file}, line {unit.line}", name,
                              f"what it has available by hour must be a column of {table.file}",
                              "Add the column, or remove the unit")
             )  # fmt: skip
             continue
         values = table.values[:, table.names.index(name)]
         k = int(np.argmax(values))
-        if values[k] > _TOO_MUCH * unit.capacity:
+        if values[k] > _RATING_MARGIN * unit.capacity:
             problems.append(
                 InputProblem(f"{table.file}, line {table.lines[k]}, column {name!r}",
                              f"{values[k]:g} MW of a unit of {unit.capacity:g} MW",
-                             f"nothing makes more than its PMax ({units}, line {unit.line}): mixed "
+                             f"nothing makes more than its PMax ({file}, line {unit.line}): mixed "
                              "units of measure", "Convert kW to MW")
             )  # fmt: skip
+    return problems
 
 
-def _loads(
-    table: Hourly, units: str, thermal: dict[str, _Unit], rated: dict[str, _Unit],
-    problems: list[InputProblem],
-) -> None:  # fmt: skip
-    """A column for each area with units, and a load of the size of the units."""
-    everybody = {**thermal, **rated}
-    for area in sorted({unit.area for unit in everybody.values()} - set(table.names)):
-        unit = next(unit for unit in everybody.values() if unit.area == area)
+def _wrong_load(table: Hourly, file: str, units: list[_Unit]) -> list[InputProblem]:
+    """Areas with units and without a load, and a load of another size than the units."""
+    problems = []
+    for area in sorted({unit.area for unit in units} - set(table.names)):
+        unit = next(unit for unit in units if unit.area == area)
         problems.append(
-            InputProblem(f"{units}, line {unit.line}, column 'Bus ID'", f"area {area}",
+            InputProblem(f"{file}, line {unit.line}, column 'Bus ID'", f"area {area}",
                          f"areas are those of {table.file}: {', '.join(table.names)}",
-                         "Mend the bus, or add the area's load")
+                         "Fix the bus, or add the area's load")
         )  # fmt: skip
-    installed = sum(unit.capacity for unit in everybody.values())
+    installed = sum(unit.capacity for unit in units)
     most = table.values.sum(axis=1).max()
-    if np.isfinite(installed) and not installed / 100 < most < 100 * installed:
+    if not installed / 100 < most < 100 * installed:
         problems.append(
             InputProblem(table.file, f"a greatest load of {most:g} MW",
-                         f"{units} has {installed:g} MW: mixed units of measure",
+                         f"{file} has {installed:g} MW: mixed units of measure",
                          "Convert both to MW")
         )  # fmt: skip
+    return problems
 
 
-def _together(
-    thermal: dict[str, _Unit], rated: dict[str, _Unit], load: Hourly, wind: Hourly, sun: Hourly
-) -> RTS:
-    names = (*thermal, *wind.names, *sun.names)
-    units = [(thermal | rated)[name] for name in names]
-    fixed = np.array([unit.capacity for unit in thermal.values()])
-    shape = (len(load.values), len(fixed))
-    capacity = np.concatenate([np.broadcast_to(fixed, shape), wind.values, sun.values], axis=1)
+def _join(units: list[_Unit], load: Hourly, wind: Hourly, sun: Hourly) -> RTS:
+    """Thermal units in the order of their file, then those of both series in theirs."""
+    by_name = {unit.name: unit for unit in units}
+    thermal = [unit for unit in units if unit.kind in _THERMAL]
+    ordered = [*thermal, *(by_name[name] for name in (*wind.names, *sun.names))]
+    fixed = np.tile([unit.capacity for unit in thermal], (len(load.values), 1))
     return RTS(
-        names,
-        np.array([int(unit.area) for unit in units]),
-        np.array([unit.cost for unit in units]),
-        np.array([unit.slope for unit in units]),
-        capacity,
+        tuple(unit.name for unit in ordered),
+        np.array([int(unit.area) for unit in ordered]),
+        np.array([unit.cost for unit in ordered]),
+        np.array([unit.slope for unit in ordered]),
+        np.concatenate([fixed, wind.values, sun.values], axis=1),
         load.values.sum(axis=1),
         load.start,
     )

@@ -1,245 +1,174 @@
-"""Columns of numbers with units, read from CSV files.
+"""Tables in text files: a row of names, then rows of cells. Every problem is reported with its line.
 
-The first row that is no comment names the columns, each with its unit in brackets::
-
-    # anything after a hash at the start of a line is a comment
-    time [s], load [um/s]
-    0.00, 0.12
-    0.02, 0.31
-
-Every flaw of the file is reported with its line and column, up to `MAX_PROBLEMS` of them at once.
+`read_text` and `csv_rows` read the rows of a file, `Table` finds columns by name and turns cells into
+numbers, and `Problems` collects what is wrong with one file, so that all of it is reported at once.
 """
 
 import csv
 import math
+import os
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError, InputProblem
+from ..errors import InputError, InputProblem, input_error
 
 MAX_PROBLEMS = 20
-NUMBER = re.compile(r"[+-]?(\d+(?:\.\d*)?|\.\d+)([eE][+-]?\d{1,3})?")
+"""Problems of one file that are shown: a shifted column alone makes thousands."""
+NUMBER = re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,3})?")
 """A decimal number; what ``float`` also takes (``nan``, ``1_000``) is refused."""
-_HEADER = re.compile(r"\s*(?P<name>[^\[\]]+?)\s*(\[\s*(?P<unit>[^\[\]]*?)\s*\]\s*)?")
+_COUNT = re.compile(r"\d{1,9}")
 
 
-@dataclass(frozen=True)
-class Column:
-    """A column: finite `values`, their `unit` as written, and the `lines` of the file they stand
-    on."""
+class Problems:
+    """What is wrong with one file. A call adds a problem; `line` is None where it has none."""
 
-    name: str
-    unit: str
-    values: np.ndarray
-    lines: np.ndarray
+    def __init__(self, path: str | os.PathLike[str]):
+        self.file = Path(path).name
+        self.found: list[InputProblem] = []
+
+    def __call__(
+        self, line: int | None, given: str, rule: str, fix: str, column: str | int | None = None
+    ) -> None:
+        place = self.file if line is None else f"{self.file}, line {line}"
+        place += "" if column is None else f", column {column!r}"
+        self.found.append(InputProblem(place, given, rule, fix))
+
+    def raise_any(self) -> None:
+        """Raise an `InputError` where there are problems."""
+        if self.found:
+            raise self.error()
+
+    def error(self) -> InputError:
+        """Return an `InputError` with the first `MAX_PROBLEMS` problems and a count of the rest."""
+        shown, more = self.found[:MAX_PROBLEMS], len(self.found) - MAX_PROBLEMS
+        if more > 0:
+            rule = f"the first {MAX_PROBLEMS} are shown: often they have one cause"
+            shown.append(InputProblem(self.file, f"{more} more problems", rule, "Fix those first"))
+        return InputError(*shown)
 
 
-def read_columns(path: Path, wanted: list[str | None], key_column: str) -> list[Column]:
-    """The `wanted` columns of a CSV file, in that order.
-
-    None stands for "the one column besides `key_column`". Raises `InputError` with every problem:
-    a missing column or unit, a gap, text, NaN or infinity in a number column, rows of other
-    lengths.
-    """
-    name = path.name
-    problems: list[InputProblem] = []
+def read_bytes(path: str | os.PathLike[str], kind: str = "a data file") -> bytes:
+    """The content of a file; `kind` says what it is, in errors. Raises `InputError`."""
     try:
-        text = read_bytes(path).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise _error(
-            f"{name}, byte {error.start + 1}",
-            "bytes that are not UTF-8",
-            "a CSV file is UTF-8 text",
-            "Save it as UTF-8.",
-        ) from None
-    rows = _rows(name, text)
-    if not rows:
-        raise _error(
-            name, "no rows", "the first row names the columns", 'Write "time [s],load [um/s]".'
-        )
-    header_line, header = rows[0]
-    names, units = _read_header(name, header_line, header, problems)
-    chosen = [_choose(name, header_line, w, key_column, names, problems) for w in wanted]
-    for index in {i for i in chosen if i is not None}:
-        if units[index] is None:
-            problems.append(
-                InputProblem(
-                    f"{name}, line {header_line}, column {names[index]!r}",
-                    repr(header[index].strip()),
-                    "a column of numbers says its unit, or nobody knows what the numbers mean",
-                    f'Write "{names[index]} [unit]", or [1] for pure numbers.',
-                )
-            )
-    if any(i is None for i in chosen):
-        raise InputError(*problems[:MAX_PROBLEMS])
-    if len(rows) == 1:
-        problems.append(
-            InputProblem(
-                name, "a header and no data", "a column has values", "Add rows of numbers."
-            )
-        )
-    indices = [i for i in chosen if i is not None]
-    table = _read_numbers(name, rows[1:], names, indices, problems)
-    if problems:
-        raise InputError(*problems[:MAX_PROBLEMS])
-    lines = np.array([line for line, _ in rows[1:]])
-    return [Column(names[i], units[i] or "1", table[:, k], lines) for k, i in enumerate(indices)]
-
-
-def read_bytes(path: Path) -> bytes:
-    """The content of a file. Raises `InputError` where the system refuses to read it."""
-    try:
-        return path.read_bytes()
+        return Path(path).read_bytes()
     except OSError as error:
-        raise _error(
-            path.name,
-            error.strerror or str(error),
-            "a data file must be readable",
-            "Check its permissions.",
+        given = error.strerror or str(error)
+        raise input_error(
+            str(path), given, f"{kind} must be readable", "Check the name and the permissions"
         ) from None
 
 
-def check_increasing(file: str, column: Column) -> None:
-    """Raise `InputError` for every value (at most 20) that does not exceed the one before it."""
-    back = np.flatnonzero(~(np.diff(column.values) > 0))[:MAX_PROBLEMS]
-    if back.size:
-        raise InputError(
-            *(
-                InputProblem(
-                    f"{file}, line {column.lines[i + 1]}, column {column.name!r}",
-                    f"{column.values[i + 1]:.12g} after {column.values[i]:.12g}",
-                    "it must increase strictly: a repeated or reversed value is ambiguous",
-                    "Sort the rows and remove repetitions; two close values make a jump.",
-                )
-                for i in back
-            )
-        )
+def read_text(path: str | os.PathLike[str], kind: str, encoding: str = "latin-1") -> str:
+    """The text of a file. Latin-1 never fails: comments are of any encoding there, and data that is
+    not ASCII is refused where it is read. Raises `InputError`."""
+    try:
+        return read_bytes(path, kind).decode(encoding)
+    except UnicodeDecodeError as error:
+        raise input_error(
+            f"{Path(path).name}, byte {error.start + 1}",
+            "bytes that are not UTF-8", f"{kind} is UTF-8 text", "Save it as UTF-8",
+        ) from None  # fmt: skip
 
 
-def _rows(name: str, text: str) -> list[tuple[int, list[str]]]:
-    """(line, cells) of every row that is neither blank nor a comment."""
+def csv_rows(path: Path, problems: Problems) -> list[tuple[int, list[str]]]:
+    """(line, cells) of every row of a CSV file that is neither blank nor a comment (#)."""
+    text = read_text(path, "a CSV file", "utf-8-sig")
     reader = csv.reader(text.splitlines(), strict=True, skipinitialspace=True)
     rows: list[tuple[int, list[str]]] = []
     try:
         for cells in reader:
-            if any(cell.strip() for cell in cells) and not cells[0].lstrip().startswith("#"):
+            cells = [cell.strip() for cell in cells]
+            if any(cells) and not cells[0].startswith("#"):
                 rows.append((reader.line_num, cells))
     except csv.Error as error:
-        raise _error(
-            f"{name}, line {reader.line_num}",
-            str(error),
-            "every line is cells with commas between",
-            "Check the quotes.",
-        ) from None
+        problems(
+            reader.line_num, str(error), "every line is cells with commas between", "Check the quotes"
+        )  # fmt: skip
+        raise problems.error() from None
     return rows
 
 
-def _read_header(
-    file: str, line: int, header: list[str], problems: list[InputProblem]
-) -> tuple[list[str], list[str | None]]:
-    names: list[str] = []
-    units: list[str | None] = []
-    for number, cell in enumerate(header, start=1):
-        match = _HEADER.fullmatch(cell) if len(cell) <= 200 else None
-        title = match["name"] if match else cell.strip() or f"column {number}"
-        place = f"{file}, line {line}, column {number}"
-        if match is None or NUMBER.fullmatch(title):
-            semicolons = " This file seems to use semicolons; use commas." if ";" in cell else ""
-            problems.append(
-                InputProblem(
-                    place,
-                    repr(cell.strip()[:60]),
-                    "the first row names each column",
-                    f'Write "name [unit]" there, such as "time [s]".{semicolons}',
-                )
+class Table:
+    """Columns by name. Rows of another length than the header are reported and left out."""
+
+    def __init__(
+        self, header: int, names: list[str], rows: list[tuple[int, list[str]]], problems: Problems
+    ):
+        self.header, self.names, self.problems = header, names, problems
+        for name in sorted({name for name in names if names.count(name) > 1}):
+            given = f"{name!r} {names.count(name)} times"
+            problems(header, given, "a column has a name of its own", "Rename or remove the others")
+        rule = f"line {header} names {len(names)} columns, and a gap is not a value"
+        for line, cells in rows:
+            if len(cells) != len(names):
+                problems(line, f"{len(cells)} cells", rule, "Complete the row, or remove it")
+        self.rows = [row for row in rows if len(row[1]) == len(names)]
+
+    def has(self, *wanted: str) -> bool:
+        """Whether all these columns are there; each that is not is reported."""
+        missing = [name for name in wanted if name not in self.names]
+        for name in missing:
+            close = get_close_matches(name, [n for n in self.names if n not in wanted], n=1)
+            fix = f"Add the column {name}"
+            if close:
+                # A unit may stand in the name: the same quantity in another unit is another column.
+                fix = f"Did you mean {close[0]!r}? Rename it, and convert its values to this unit"
+            given = f"columns {', '.join(map(repr, self.names[:12]))}"
+            self.problems(self.header, given, f"there is no column {name!r}", fix)
+        return not missing
+
+    def number(self, line: int, name: str, cell: str, least: float = -math.inf) -> float:
+        """A cell as a finite number of at least `least`; NaN where it is not, which is reported."""
+        value = to_number(cell)
+        if value is not None and value >= least:
+            return value
+        rule = "it is a finite decimal number with a point; a gap is not a value"
+        if value is not None:
+            rule = f"it is a number ≥ {least:g}"
+        given = repr(cell[:40]) if cell else "an empty cell"
+        self.problems(line, given, rule, "Fix the cell, or remove the row", name)
+        return math.nan
+
+    def count(self, line: int, name: str, cell: str) -> float:
+        """A cell as a whole number ≥ 0; NaN where it is not, which is reported."""
+        value = to_count(cell)
+        if value is None:
+            rule = "it is a whole number, such as that of a node"
+            self.problems(line, repr(cell[:40]), rule, "Fix the cell", name)
+        return math.nan if value is None else value
+
+    def columns(
+        self, real: Sequence[str], whole: Sequence[str] = (), least: float = -math.inf
+    ) -> dict[str, np.ndarray]:
+        """Columns of real and of whole numbers by name, and the `lines` of their rows. Rows with a cell
+        that is no number are reported and left out."""
+        values: dict[str, np.ndarray] = {}
+        for name in (*whole, *real):
+            index = self.names.index(name)
+            values[name] = np.array(
+                [
+                    self.count(line, name, cells[index])
+                    if name in whole
+                    else self.number(line, name, cells[index], least)
+                    for line, cells in self.rows
+                ]
             )
-        elif title in names:
-            problems.append(
-                InputProblem(place, repr(title), "a column name stands once", "Rename one of them.")
-            )
-        names.append(title)
-        units.append(match["unit"] or None if match else None)
-    return names, units
+        values["lines"] = np.array([line for line, _ in self.rows], float)
+        good = np.logical_and.reduce([np.isfinite(column) for column in values.values()])
+        kinds = dict.fromkeys((*whole, "lines"), np.int64)
+        return {name: v[good].astype(kinds.get(name, np.float64)) for name, v in values.items()}
 
 
-def _choose(
-    file: str,
-    line: int,
-    wanted: str | None,
-    key_column: str,
-    names: list[str],
-    problems: list[InputProblem],
-) -> int | None:
-    if wanted is None:
-        others = [i for i, name in enumerate(names) if name != key_column]
-        if len(others) == 1:
-            return others[0]
-        problems.append(
-            InputProblem(
-                f"{file}, line {line}",
-                f"columns {', '.join(map(repr, names))}",
-                f"without a column's name there is exactly one besides {key_column!r}",
-                "Add column = with one of these names.",
-            )
-        )
-        return None
-    if wanted in names:
-        return names.index(wanted)
-    close = get_close_matches(wanted, names, n=1)
-    problems.append(
-        InputProblem(
-            f"{file}, line {line}",
-            f"columns {', '.join(map(repr, names))}",
-            f"there is no column {wanted!r}",
-            f"Did you mean {close[0]!r}?" if close else "Name one of these columns.",
-        )
-    )
-    return None
+def to_number(cell: str) -> float | None:
+    """A finite decimal number, or None."""
+    value = float(cell) if NUMBER.fullmatch(cell) else math.nan
+    return value if math.isfinite(value) else None
 
 
-def _read_numbers(
-    file: str,
-    rows: list[tuple[int, list[str]]],
-    names: list[str],
-    indices: list[int],
-    problems: list[InputProblem],
-) -> np.ndarray:
-    table = np.zeros((len(rows), len(indices)))
-    for r, (line, cells) in enumerate(rows):
-        if len(problems) >= MAX_PROBLEMS:
-            break
-        if len(cells) != len(names):
-            problems.append(
-                InputProblem(
-                    f"{file}, line {line}",
-                    f"{len(cells)} cells",
-                    f"every row has {len(names)} cells, as the header has",
-                    "Complete the row or remove it.",
-                )
-            )
-            continue
-        for k, i in enumerate(indices):
-            cell = cells[i].strip()
-            value = float(cell) if NUMBER.fullmatch(cell) else math.nan
-            if math.isfinite(value):
-                table[r, k] = value
-                continue
-            problems.append(
-                InputProblem(
-                    f"{file}, line {line}, column {names[i]!r}",
-                    "an empty cell" if not cell else repr(cell[:40]),
-                    "a gap is not a value"
-                    if not cell
-                    else "a number column holds finite decimal numbers with a point",
-                    "Remove the row or fill in a measured value on purpose.",
-                )
-            )
-    return table
-
-
-def _error(place: str, given: str, rule: str, mend: str) -> InputError:
-    return InputError(InputProblem(place, given, rule, mend))
+def to_count(cell: str) -> int | None:
+    """A whole number ≥ 0 of up to nine digits, or None."""
+    return int(cell) if _COUNT.fullmatch(cell) else None

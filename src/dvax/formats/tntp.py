@@ -1,9 +1,16 @@
 """Readers of the four TNTP files: network, trips, flows, nodes.
 
-The format is that of the TransportationNetworks collection (Bar-Gera, Stabler and others).
+The format is that of the TransportationNetworks collection (Bar-Gera, Stabler and others): metadata in
+angle brackets, then rows.
+
+<NUMBER OF ZONES> 24
+<END OF METADATA>
+~  init_node  term_node  capacity ... ;        a line that begins with ~ names the columns
+   1          2          25900.2  ... ;        all lines behind it are rows
 """
 
 import os
+import re
 from decimal import Decimal
 from difflib import get_close_matches
 from types import SimpleNamespace
@@ -12,20 +19,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .road_network import Network, Trips, link_problems, trip_problems
-from .tntp_text import (
-    Line,
-    Metadata,
-    Problems,
-    read_header,
-    read_lines,
-    rows_after,
-    to_cells,
-    to_node,
-    to_number,
-)
+from .table import Problems, Table, read_text, to_count, to_number
 
 _LINK_NODES = ("init_node", "term_node")
 _LINK_NUMBERS = ("capacity", "length", "free_flow_time", "b", "power")
+_METADATA = re.compile(r"\s*<([^<>]*)>(.*)")
+_END = "END OF METADATA"
+
+
+class Line(NamedTuple):
+    """A line of a file with its number from 1."""
+
+    number: int
+    text: str
 
 
 class Flows(NamedTuple):
@@ -63,8 +69,8 @@ def read_network(path: str | os.PathLike[str]) -> Network:
 
     ```
     """
-    lines, problems = read_lines(path), Problems(path)
-    metadata = Metadata(lines, problems)
+    lines, problems = read_text(path, "a TNTP file").splitlines(), Problems(path)
+    metadata = _Metadata(lines, problems)
     zones, nodes = metadata.count("NUMBER OF ZONES"), metadata.count("NUMBER OF NODES")
     first, count = metadata.count("FIRST THRU NODE"), metadata.count("NUMBER OF LINKS")
     header = _header_of(lines, metadata.end)
@@ -76,12 +82,12 @@ def read_network(path: str | os.PathLike[str]) -> Network:
             "link_type ; above the first row",
         )  # fmt: skip
         raise problems.error()
-    rows = rows_after(lines, metadata.end)
-    columns = _table(header, rows, _LINK_NODES, _LINK_NUMBERS, ("toll",), problems)
+    rows = _rows_after(lines, metadata.end)
+    columns = _read_columns(header, rows, _LINK_NODES, _LINK_NUMBERS, problems, optional="toll")
     if count is not None and count != len(rows):
         problems(
             metadata.line("NUMBER OF LINKS"), f"<NUMBER OF LINKS> {count} and {len(rows)} rows",
-            "the file holds as many links as it states", "Complete the rows or mend the number",
+            "the file holds as many links as it states", "Complete the rows or fix the number",
         )  # fmt: skip
     if zones is None or nodes is None or first is None or columns is None:
         raise problems.error()
@@ -89,8 +95,7 @@ def read_network(path: str | os.PathLike[str]) -> Network:
         zones=zones, nodes=nodes, first_thru_node=first, name=problems.file, **columns
     )
     problems.found += link_problems(links)
-    if problems.found:
-        raise problems.error()
+    problems.raise_any()
     return Network(**vars(links))
 
 
@@ -116,20 +121,18 @@ def read_trips(path: str | os.PathLike[str]) -> Trips:
 
     ```
     """
-    lines, problems = read_lines(path), Problems(path)
-    metadata = Metadata(lines, problems)
+    lines, problems = read_text(path, "a TNTP file").splitlines(), Problems(path)
+    metadata = _Metadata(lines, problems)
     zones, total = metadata.count("NUMBER OF ZONES"), metadata.number("TOTAL OD FLOW")
     entries: list[tuple[int, int, float, int]] = []
     origin: int | None = None
     begun: dict[int, int] = {}
     headless = False
-    for number, text in rows_after(lines, metadata.end):
+    for number, text in _rows_after(lines, metadata.end):
         if text.lower().startswith("origin"):
-            origin = to_node(text[len("origin") :].strip())
+            origin = to_count(text[len("origin") :].strip())
             if origin is None:
-                problems(
-                    number, repr(text[:40]), "a block begins with Origin and a zone", "Mend it"
-                )
+                problems(number, repr(text[:40]), "a block begins with Origin and a zone", "Fix it")
             elif origin in begun:
                 problems(
                     number, f"Origin {origin} once more",
@@ -144,7 +147,7 @@ def read_trips(path: str | os.PathLike[str]) -> Trips:
             if found is None:
                 problems(
                     number, repr(entry[:40]), "an entry is destination : trips, in numbers",
-                    "Mend it, or put a semicolon between entries",
+                    "Fix it, or put a semicolon between entries",
                 )  # fmt: skip
             elif origin is not None:
                 entries.append((origin, *found, number))
@@ -170,14 +173,13 @@ def read_trips(path: str | os.PathLike[str]) -> Trips:
             problems(
                 metadata.line("TOTAL OD FLOW"), f"{written}, and entries that sum up to {summed:.10g}",
                 "the total is the sum, so that a lost block is seen",
-                "Complete the entries or mend the total",
+                "Complete the entries or fix the total",
             )  # fmt: skip
     if zones is None:
         raise problems.error()
     table.zones = zones
     problems.found += trip_problems(table)
-    if problems.found:
-        raise problems.error()
+    problems.raise_any()
     return Trips(**vars(table))
 
 
@@ -187,9 +189,9 @@ def read_flows(path: str | os.PathLike[str], network: Network) -> Flows:
     **Raises:** `dvax.InputError` for missing columns, cells that are no numbers, links that the
     network does not have, has twice in the file, or that are missing from it.
     """
-    lines, problems = read_lines(path), Problems(path)
+    lines, problems = read_text(path, "a TNTP file").splitlines(), Problems(path)
     header, rows = _first_row(lines, problems, "From To Volume Cost")
-    columns = _table(header, rows, ("from", "to"), ("volume", "cost"), (), problems)
+    columns = _read_columns(header, rows, ("from", "to"), ("volume", "cost"), problems)
     if columns is None:
         raise problems.error()
     index = {pair: i for i, pair in enumerate(zip(network.init_node, network.term_node))}
@@ -197,8 +199,7 @@ def read_flows(path: str | os.PathLike[str], network: Network) -> Flows:
         list(zip(columns["from"], columns["to"])), columns["lines"], index, "link from {} to {}",
         network.name, problems,
     )  # fmt: skip
-    if problems.found:
-        raise problems.error()
+    problems.raise_any()
     return Flows(columns["volume"][rows_of], columns["cost"][rows_of])
 
 
@@ -208,9 +209,9 @@ def read_nodes(path: str | os.PathLike[str], network: Network) -> np.ndarray:
     **Raises:** `dvax.InputError` for missing columns, cells that are no numbers, nodes that the
     network does not have, that stand twice, or that are missing.
     """
-    lines, problems = read_lines(path), Problems(path)
+    lines, problems = read_text(path, "a TNTP file").splitlines(), Problems(path)
     header, rows = _first_row(lines, problems, "Node X Y ;")
-    columns = _table(header, rows, ("node",), ("x", "y"), (), problems)
+    columns = _read_columns(header, rows, ("node",), ("x", "y"), problems)
     if columns is None:
         raise problems.error()
     index = {(node,): node - 1 for node in range(1, network.nodes + 1)}
@@ -218,15 +219,14 @@ def read_nodes(path: str | os.PathLike[str], network: Network) -> np.ndarray:
         [(node,) for node in columns["node"]], columns["lines"], index, "node {}", network.name,
         problems,
     )  # fmt: skip
-    if problems.found:
-        raise problems.error()
+    problems.raise_any()
     return np.stack([columns["x"], columns["y"]], axis=1)[rows_of]
 
 
 def _header_of(lines: list[str], start: int) -> Line | None:
     """The first comment behind the metadata that names a column."""
     for number, text in enumerate(lines[start:], start=start + 1):
-        names = read_header(text) if text.lstrip().startswith("~") else []
+        names = _column_names(text) if text.lstrip().startswith("~") else []
         if {"init_node", "term_node", "capacity"} & set(names):
             return Line(number, text)
     return None
@@ -236,66 +236,31 @@ def _first_row(lines: list[str], problems: Problems, example: str) -> tuple[Line
     """The header of a file without metadata, which is its first row, with or without a ~."""
     for number, text in enumerate(lines, start=1):
         if text.strip():
-            return Line(number, text), rows_after(lines, number)
+            return Line(number, text), _rows_after(lines, number)
     problems(None, "no rows", "the first one names the columns", f"Write {example} there")
     raise problems.error()
 
 
-def _table(
+def _read_columns(
     header: Line, rows: list[Line], whole: tuple[str, ...], real: tuple[str, ...],
-    optional: tuple[str, ...], problems: Problems,
+    problems: Problems, optional: str = "",
 ) -> dict[str, Any] | None:  # fmt: skip
-    """The columns by name with the `lines` of their rows, those that can be read; None where a
-    column is missing."""
-    names = read_header(header.text)
-    missing = [name for name in (*whole, *real) if name not in names]
-    for name in missing:
-        close = get_close_matches(name, [n for n in names if n not in (*whole, *real)], n=1)
-        problems(
-            header.number, f"no column {name!r} among {', '.join(names)}", "columns are found by name",
-            f"Write {name} in the place of {close[0]}" if close else f"Add the column {name}",
-        )  # fmt: skip
-    if missing:
+    """The columns by name with the `lines` of their rows; None where a column is missing."""
+    names = _column_names(header.text)
+    cells = [(number, text.rstrip(";").split()) for number, text in rows]
+    table = Table(header.number, names, cells, problems)
+    if not table.has(*whole, *real):
         return None
-    wanted = [name for name in (*whole, *real, *optional) if name in names]
-    table: dict[str, list] = {name: [] for name in wanted}
-    kept: list[int] = []
-    for number, text in rows:
-        cells = to_cells(text)
-        if len(cells) != len(names):
-            problems(
-                number, f"{len(cells)} cells",
-                f"line {header.number} names {len(names)} columns, and a gap is not a value",
-                "Complete the row, or mend the names",
-            )  # fmt: skip
-            continue
-        values: list[int | float] = []
-        for name in wanted:
-            cell = cells[names.index(name)]
-            value = to_node(cell) if name in whole else to_number(cell)
-            if value is None:
-                what = "the number of a node" if name in whole else "a finite decimal number"
-                problems(number, f"{name} {cell[:40]!r}", f"it is {what}", "Mend the cell")
-            else:
-                values.append(value)
-        if len(values) == len(wanted):
-            kept.append(number)
-            for name, value in zip(wanted, values, strict=True):
-                table[name].append(value)
-    columns: dict[str, Any] = {
-        name: np.array(values, np.int64 if name in whole else np.float64)
-        for name, values in table.items()
-    }
-    columns |= {name: None for name in optional if name not in names}
-    columns["lines"] = np.array(kept, np.int64)
-    return columns
+    there = (optional,) if optional in names else ()
+    columns: dict[str, Any] = dict(table.columns((*real, *there), whole))
+    return columns if there or not optional else {**columns, optional: None}
 
 
 def _entry(text: str) -> tuple[int, float] | None:
     parts = [part.strip() for part in text.split(":")]
     if len(parts) != 2:
         return None
-    zone, flow = to_node(parts[0]), to_number(parts[1])
+    zone, flow = to_count(parts[0]), to_number(parts[1])
     return None if zone is None or flow is None else (zone, flow)
 
 
@@ -303,12 +268,12 @@ def _one_each(
     keys: list[tuple], lines: np.ndarray, index: dict[tuple, int], title: str, name: str,
     problems: Problems,
 ) -> np.ndarray:  # fmt: skip
-    """The row of each entry of `index`; what is unknown, missing or there twice is noted."""
+    """The row of each entry of `index`; what is unknown, missing or there twice is reported."""
     rows_of = np.full(len(index), -1)
     for row, (key, line) in enumerate(zip(keys, lines.tolist(), strict=True)):
         what = title.format(*key)
         if key not in index:
-            problems(line, f"the {what}", f"{name} has no such one", "Remove the row, or mend it")
+            problems(line, f"the {what}", f"{name} has no such one", "Remove the row, or fix it")
         elif rows_of[index[key]] >= 0:
             first = lines[rows_of[index[key]]]
             problems(line, f"the {what} once more", f"line {first} has it", "Remove one of the two")
@@ -320,3 +285,92 @@ def _one_each(
                 None, f"no {title.format(*key)}", f"every one of {name} has a row", "Add the row"
             )
     return rows_of
+
+
+class _Metadata:
+    """The lines `<KEY> value` of a file, and where each stands."""
+
+    def __init__(self, lines: list[str], problems: Problems):
+        self.problems = problems
+        self.values: dict[str, Line] = {}
+        self.end = 0
+        for number, text in enumerate(lines, start=1):
+            match = _METADATA.match(text)
+            if match is None:
+                if text.strip() and not text.lstrip().startswith("~"):
+                    break
+                continue
+            key = " ".join(match[1].upper().split())
+            if key == _END:
+                self.end = number
+                return
+            if key in self.values:
+                problems(
+                    number, f"<{key}> once more",
+                    f"it stands once: line {self.values[key].number} has it already",
+                    "Remove one of the two",
+                )  # fmt: skip
+            self.values[key] = Line(number, match[2].strip())
+        problems(
+            None, f"no line <{_END}>", "it parts the metadata from the rows",
+            f"Write <{_END}> on a line of its own behind the metadata",
+        )  # fmt: skip
+
+    def count(self, key: str) -> int | None:
+        """A whole number ≥ 0, or None where it is missing or wrong, which is reported."""
+        found = self._find(key)
+        if found is None:
+            return None
+        if to_count(found.text) is None:
+            self.problems(
+                found.number,
+                f"<{key}> {found.text!r}",
+                "it is a whole number",
+                "Fix the number",
+            )
+            return None
+        return int(found.text)
+
+    def number(self, key: str) -> float | None:
+        """A finite number, or None where it is missing or wrong, which is reported."""
+        found = self._find(key)
+        if found is None:
+            return None
+        value = to_number(found.text)
+        if value is None:
+            self.problems(
+                found.number,
+                f"<{key}> {found.text!r}",
+                "it is a decimal number",
+                "Fix the number",
+            )
+        return value
+
+    def line(self, key: str) -> int | None:
+        return self.values[key].number if key in self.values else None
+
+    def _find(self, key: str) -> Line | None:
+        if key not in self.values:
+            close = get_close_matches(key, self.values, n=1)
+            fix = f"Write <{key}> in the place of <{close[0]}>" if close else f"Add <{key}>"
+            self.problems(None, f"no line <{key}>", "the metadata states it", fix)
+            return None
+        return self.values[key]
+
+
+def _rows_after(lines: list[str], start: int) -> list[Line]:
+    """The lines from `start` on that are neither blank nor comments."""
+    kept = []
+    for number, text in enumerate(lines[start:], start=start + 1):
+        text = text.strip()
+        if text and not text.startswith("~"):
+            kept.append(Line(number, text))
+    return kept
+
+
+def _column_names(text: str) -> list[str]:
+    """The columns that a header line names, in lower case and with _ for blanks, without units."""
+    text = re.sub(r"\([^()]*\)", "", text.strip().lstrip("~").replace(";", " "))
+    cells = text.split("\t") if "\t" in text.strip() else text.split()
+    names = ["_".join(cell.split()).lower() for cell in cells]
+    return [name for name in names if name]

@@ -97,12 +97,6 @@ def write_run(folder: Path, recipe: Recipe = Recipe()) -> Path:
             "beta": BETA,
             "kappa0": KAPPA,
             "dvax_version": "0.1.0",
-            "constants": json.dumps(
-                [
-                    dict(name=n, symbol=s, value=v, unit=u, label=la, status="proved", meaning=m)
-                    for n, s, v, u, la, m in CONSTANTS
-                ]
-            ),
         }
         | ({"boundary_shape": list(recipe.points)} if len(recipe.points) == 2 else {}),
     )
@@ -119,6 +113,10 @@ def write_run(folder: Path, recipe: Recipe = Recipe()) -> Path:
         "compile_seconds": 1.25,
         "run_seconds": 7.5,
         "steps": 4000,
+        "constants": [
+            dict(name=n, symbol=s, value=v, unit=u, label=la, status="proved", meaning=m)
+            for n, s, v, u, la, m in CONSTANTS
+        ],
         "status": recipe.status,
         "stop_reason": "The end time was reached."
         if recipe.status == "finished"

@@ -103,7 +103,9 @@ def test_every_figure_is_drawn_without_an_error(curve: Path, width: int) -> None
     report = look_at(curve, width)
     assert report["wrong"] == []
     assert report["console"] == []
-    assert set(report["drawn"]) == {"pressure", "regimes", "histories", "certificate", "separation"}
+    assert set(report["drawn"]) == {
+        *("pressure", "regimes", "shares", "histories", "certificate", "separation")
+    }
     assert min(report["drawn"].values()) >= 1
     assert report["requests"] == 0
     assert report["overflow"] <= 0, "the page is wider than the screen"

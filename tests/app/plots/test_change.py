@@ -20,7 +20,7 @@ def test_the_curves_are_the_numbers_and_axes_have_units():
         assert np.max(np.abs(views.actual - views.predicted)) < 0.05
     figure = change_figure(seen, time_unit="s", x_unit="mm", u_unit="kPa")
     above, below = figure.axes
-    assert (above.get_ylabel(), below.get_ylabel()) == ("‖Δx‖ [mm]", "‖Δu‖ [kPa]")
+    assert (above.get_ylabel(), below.get_ylabel()) == ("‖Δx‖\n [mm]", "‖Δu‖\n [kPa]")
     assert below.get_xlabel() == "time [s]" and above.get_legend() is not None
     assert above.lines[0].get_label() == "actual difference"
     shown = np.asarray(above.lines[0].get_ydata())

@@ -7,8 +7,8 @@ import pytest
 import xarray as xr
 from tests.app.plots.synthetic import Recipe, write_run
 
-from dvax.app.plots import downsample as scan_module
-from dvax.app.plots.downsample import edges, scan
+from dvax.app.plots import downsample as module
+from dvax.app.plots.downsample import downsample, edges
 from dvax.app.plots.run_reader import read_run
 from dvax.errors import InputError
 
@@ -16,9 +16,9 @@ from dvax.errors import InputError
 @pytest.fixture
 def small_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few cells and one-frame blocks, so that small runs are reduced and read in many parts."""
-    monkeypatch.setattr(scan_module, "SPACE_CELLS", 7)
-    monkeypatch.setattr(scan_module, "TIME_CELLS", 5)
-    monkeypatch.setattr(scan_module, "BLOCK_BYTES", 1)
+    monkeypatch.setattr(module, "SPACE_CELLS", 7)
+    monkeypatch.setattr(module, "TIME_CELLS", 5)
+    monkeypatch.setattr(module, "BLOCK_BYTES", 1)
 
 
 def whole(run_dir: Path) -> xr.Dataset:
@@ -27,7 +27,7 @@ def whole(run_dir: Path) -> xr.Dataset:
 
 def test_shares_are_the_weighted_measure_of_each_regime(tmp_path: Path, small_cells: None) -> None:
     run_dir = write_run(tmp_path / "run", Recipe(points=(31,), frames=12))
-    data, found = whole(run_dir), scan(read_run(run_dir))
+    data, found = whole(run_dir), downsample(read_run(run_dir))
     weight = data.weight.values / data.weight.values.sum()
     for kind in range(3):
         direct = ((data.regime.values == kind) * weight).sum(axis=1)
@@ -38,7 +38,7 @@ def test_shares_are_the_weighted_measure_of_each_regime(tmp_path: Path, small_ce
 
 def test_cells_hold_mean_and_extremes_of_their_block(tmp_path: Path, small_cells: None) -> None:
     run_dir = write_run(tmp_path / "run", Recipe(points=(31,), frames=12))
-    data, cells = whole(run_dir), scan(read_run(run_dir)).cells
+    data, cells = whole(run_dir), downsample(read_run(run_dir)).cells
     assert cells is not None and cells.reduced
     assert cells.mean.shape == (5, 7)
     frames, points = np.arange(5) * 12 // 5, np.arange(7) * 31 // 7
@@ -57,7 +57,7 @@ def test_a_peak_one_point_wide_survives_the_reduction(tmp_path: Path, small_cell
     data = whole(run_dir)
     data.pressure.values[5, 17] = 99.0
     data.drop_encoding().to_zarr(run_dir / "trajectory.zarr", mode="w", consolidated=False)
-    found = scan(read_run(run_dir))
+    found = downsample(read_run(run_dir))
     assert found.cells is not None
     assert found.pressure_high == found.cells.high.max() == 99.0
     assert found.cells.mean.max() < 99.0
@@ -65,10 +65,10 @@ def test_a_peak_one_point_wide_survives_the_reduction(tmp_path: Path, small_cell
 
 def test_nodes_in_any_order_give_the_same_map(tmp_path: Path, small_cells: None) -> None:
     run_dir = write_run(tmp_path / "run", Recipe(points=(31,), frames=12))
-    straight = scan(read_run(run_dir)).cells
+    straight = downsample(read_run(run_dir)).cells
     shuffled = whole(run_dir).isel(point=np.random.default_rng(1).permutation(31))
     shuffled.drop_encoding().to_zarr(run_dir / "trajectory.zarr", mode="w", consolidated=False)
-    mixed = scan(read_run(run_dir)).cells
+    mixed = downsample(read_run(run_dir)).cells
     assert straight is not None and mixed is not None
     np.testing.assert_array_equal(mixed.high, straight.high)
     np.testing.assert_array_equal(mixed.space_edges, straight.space_edges)
@@ -80,7 +80,7 @@ def test_a_regime_outside_the_three_is_named_with_its_place(tmp_path: Path) -> N
     data.regime.values[3, 4] = 7
     data.drop_encoding().to_zarr(run_dir / "trajectory.zarr", mode="w", consolidated=False)
     with pytest.raises(InputError, match=r"regime\[3, 4\]: got 7"):
-        scan(read_run(run_dir))
+        downsample(read_run(run_dir))
 
 
 def test_edges_lie_half_way_between_centres() -> None:
@@ -96,7 +96,7 @@ def test_blocks_are_whole_chunks_unless_these_are_huge(
     data = whole(run_dir).drop_encoding()
     encoding = {name: {"chunks": (chunk, 31)} for name in ("pressure", "indentation", "regime")}
     data.to_zarr(run_dir / "trajectory.zarr", mode="w", consolidated=False, encoding=encoding)
-    monkeypatch.setattr(scan_module, "BLOCK_BYTES", 8 * 31)
-    cut = list(scan_module.blocks(read_run(run_dir)))
+    monkeypatch.setattr(module, "BLOCK_BYTES", 8 * 31)
+    cut = list(module.blocks(read_run(run_dir)))
     assert {block.stop - block.start for block in cut} == sizes
     assert (cut[0].start, cut[-1].stop) == (0, 12)

@@ -11,15 +11,14 @@ from tests.app.plots.synthetic import CONSTANTS, Recipe, write_run
 
 from dvax.app.plots import build_report
 from dvax.app.plots.certificate import certificate_picture
-from dvax.app.plots.downsample import scan
+from dvax.app.plots.downsample import downsample
 from dvax.app.plots.histories import histories_picture
 from dvax.app.plots.run_reader import read_run
 from dvax.app.plots.separation import separation_picture
 from dvax.app.plots.theme import number, unit_text
 from dvax.errors import InputError
 
-CURVE = {"pressure", "regimes", "histories", "certificate", "separation"}
-SURFACE = CURVE | {"shares"}
+PICTURES = {"pressure", "regimes", "shares", "histories", "certificate", "separation"}
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +40,7 @@ def test_a_large_run_makes_a_page_that_a_mail_can_carry(large: Path) -> None:
 
 
 def test_every_picture_has_a_still_that_is_not_blank(large: Path) -> None:
-    assert stills(large) == CURVE
+    assert stills(large) == PICTURES
     for file in (large / "figures").glob("*.png"):
         pixels = imread(file)
         assert min(pixels.shape[:2]) > 400
@@ -81,13 +80,13 @@ def test_a_run_that_stopped_early_says_so_at_the_top(tmp_path: Path, status: str
 def test_a_run_of_very_few_frames_still_has_its_pictures(tmp_path: Path, written: int) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), written=written, status="failed"))
     build_report(run_dir)
-    assert stills(run_dir) == CURVE
+    assert stills(run_dir) == PICTURES
 
 
 def test_a_run_without_frames_gives_a_page_without_pictures(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), written=0, status="failed"))
     text = build_report(run_dir).read_text(encoding="utf-8")
-    assert "the run wrote no frame" in text
+    assert "the run wrote no results" in text
     assert 'class="plot"' not in text
     assert stills(run_dir) == set()
 
@@ -95,7 +94,7 @@ def test_a_run_without_frames_gives_a_page_without_pictures(tmp_path: Path) -> N
 def test_a_surface_has_maps_with_a_slider(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40, 25), frames=30))
     text = build_report(run_dir).read_text(encoding="utf-8")
-    assert stills(run_dir) == SURFACE
+    assert stills(run_dir) == PICTURES
     assert text.count('type="range"') == 2
     assert "24 of 30 saved frames are drawn." in text
 
@@ -104,7 +103,7 @@ def test_a_run_without_companion_says_why_a_picture_is_missing(tmp_path: Path) -
     run_dir = write_run(tmp_path / "run", Recipe((40,), companion=False))
     text = build_report(run_dir).read_text(encoding="utf-8")
     assert "Certified decay: the run had no companion trajectory." in text
-    assert stills(run_dir) == CURVE - {"separation"}
+    assert stills(run_dir) == PICTURES - {"separation"}
 
 
 def test_text_of_the_run_cannot_become_markup(tmp_path: Path) -> None:
@@ -185,19 +184,15 @@ def test_histories_are_those_of_the_points_asked_for(tmp_path: Path) -> None:
     config = "[time]\nend = 40.0\n[output]\npoints_of_interest = [10.1, 80.0]\n"
     (run_dir / "config.resolved.toml").write_text(config)
     run = read_run(run_dir)
-    picture = histories_picture(run, scan(run))
-    place = run.frames.line("s")
+    picture = histories_picture(run, downsample(run))
+    place = run.series("s")
     for wanted in (10.1, 80.0):
         point = int(np.abs(place - wanted).argmin())
         name = f"s = {number(float(place[point]), 6)} mm"
         drawn = [trace for trace in picture.interactive.data if trace.name == name]
         assert len(drawn) == 2, "pressure and indentation"
-        np.testing.assert_array_equal(
-            drawn[0].y, run.frames.field("pressure", slice(None))[:, point]
-        )
-        np.testing.assert_array_equal(
-            drawn[1].y, run.frames.field("indentation", slice(None))[:, point]
-        )
+        np.testing.assert_array_equal(drawn[0].y, run["pressure"].values[:, point])
+        np.testing.assert_array_equal(drawn[1].y, run["indentation"].values[:, point])
 
 
 @pytest.mark.parametrize(

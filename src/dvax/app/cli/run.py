@@ -36,7 +36,7 @@ def run(
     with reported(debug, out):
         from dvax.app.runs.interrupt import interruptible
 
-        # Both are checked before anything is refused: one round is enough to mend all of it.
+        # Both are checked before anything is refused: one round is enough to fix all of it.
         problems: list[InputProblem] = target_problems(out, force=force)
         try:
             loaded = interruptible(lambda: load(config, allow_outside, quiet))

@@ -1,28 +1,18 @@
 """A change of the data seen three ways, as one picture."""
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from dvax.app.plots.lines import positive
-from dvax.app.plots.theme import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    STILL_STYLE,
-    VERMILLION,
-    axis_title,
-    still_axes,
-)
+from dvax.app.plots.panels import Curve, Panel, panels_picture
 from dvax.sensitivity import Change
-from dvax.sensitivity.change import Views
 
-_CURVES = (
-    ("actual", "actual difference", BLUE, "-"),
-    ("predicted", "predicted to first order", ORANGE, "-."),
-    ("certified", "certified (thm. on parameters)", VERMILLION, "--"),
-    ("certified_sharp", "certified, one-sided rate", GREEN, ":"),
-)
+# field of a view: (legend, colour, dash)
+_CURVES = {
+    "actual": ("actual difference", 0, "solid"),
+    "predicted": ("predicted to first order", 4, "dashdot"),
+    "certified": ("certified (thm. on parameters)", 1, "dash"),
+    "certified_sharp": ("certified, one-sided rate", 2, "dot"),
+}
 
 
 def change_figure(
@@ -34,22 +24,13 @@ def change_figure(
 
     **Returns:** a matplotlib figure: `figure.savefig("change.png")`.
     """
-    with rc_context(STILL_STYLE):
-        figure, panels = still_axes(2, 1, figsize=(7.0, 5.6), sharex=True)
-        for axes, words, views, unit in zip(
-            panels, ("‖Δx‖", "‖Δu‖"), (change.x, change.u), (x_unit, u_unit), strict=True
-        ):
-            _panel(axes, change.ts, views)
-            axes.set_ylabel(axis_title(words, unit))
-        panels[-1].set_xlabel(axis_title("time", time_unit))
-        panels[0].legend(loc="lower right", frameon=False)
-        figure.suptitle(f"A change of the data: certified bounds are {change.status}")
-    return figure
-
-
-def _panel(axes, ts: np.ndarray, views: Views) -> None:
-    for name, label, colour, style in _CURVES:
-        values = getattr(views, name)
-        if values is not None:
-            axes.plot(ts, positive(values), style, color=colour, label=label, linewidth=1.8)
-    axes.set_yscale("log")
+    panels = []
+    for words, views, unit in (("‖Δx‖", change.x, x_unit), ("‖Δu‖", change.u, u_unit)):
+        curves = [
+            Curve(np.asarray(change.ts), np.asarray(values), *style)
+            for name, style in _CURVES.items()
+            if (values := getattr(views, name)) is not None
+        ]
+        panels.append(Panel(curves, words, unit, log=True))
+    title = f"A change of the data: certified bounds are {change.status}"
+    return panels_picture("change", title, "", panels, "time", time_unit).still()

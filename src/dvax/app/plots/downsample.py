@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dvax.app.plots.run_reader import RunRecord
-from dvax.errors import InputError, InputProblem
+from dvax.errors import input_error
 
 REGIMES = ("unloaded", "active", "saturated")
 SPACE_CELLS = 360
@@ -46,10 +46,10 @@ class CellMaps:
 
 
 @dataclass(frozen=True)
-class Scan:
-    """What one pass found. `shares` has shape (3, frames), its columns sum to one.
+class Reduced:
+    """The fields of a run, reduced in one pass. `shares` has shape (3, frames), its columns sum to one.
 
-    `cells` is None on a surface, whose maps are read frame by frame (see `surface.py`).
+    `cells` is None on a surface, whose maps are read frame by frame (see `maps.py`).
     """
 
     shares: np.ndarray
@@ -72,25 +72,25 @@ def edges(centres: np.ndarray) -> np.ndarray:
 def blocks(run: RunRecord) -> Iterator[slice]:
     """Slices of frames that fit the memory budget, made of whole chunks of the store where these
     are not far larger: a part of a chunk costs as much to read as the whole."""
-    chunk, count = run.frames.frames_per_chunk, run.frames.count
-    frame_bytes = 8 * run.frames.points
+    chunk, count = run["pressure"].frames_per_chunk, len(run.time)
+    frame_bytes = 8 * run["pressure"].points
     fitting = max(1, BLOCK_BYTES // frame_bytes)
     step = fitting if chunk * frame_bytes > 4 * BLOCK_BYTES else -(-fitting // chunk) * chunk
     for start in range(0, count, step):
         yield slice(start, min(start + step, count))
 
 
-def scan(run: RunRecord) -> Scan:
+def downsample(run: RunRecord) -> Reduced:
     """Read pressure and regime once. InputError where a regime is not 0, 1 or 2."""
-    frames, points = run.frames.count, run.frames.points
-    weight = run.weight / run.weight.sum()
+    frames, points = len(run.time), run["pressure"].points
+    weight = run.series("weight") / run.series("weight").sum()
     shares = np.empty((len(REGIMES), frames))
     time_mean = np.zeros(points)
     low, high = np.inf, -np.inf
     gather = _Gather(run) if len(run.boundary_shape) == 1 else None
     for block in blocks(run):
-        pressure = run.frames.field("pressure", block).astype(float, copy=False)
-        regime = run.frames.field("regime", block)
+        pressure = run["pressure"].frames(block).astype(float, copy=False)
+        regime = run["regime"].frames(block)
         _check_regime(run, regime, block)
         for kind in range(len(REGIMES)):
             shares[kind, block] = (regime == kind) @ weight
@@ -99,20 +99,18 @@ def scan(run: RunRecord) -> Scan:
             low, high = min(low, np.nanmin(pressure)), max(high, np.nanmax(pressure))
         if gather is not None:
             gather.take(block, pressure, regime)
-    return Scan(shares, time_mean, float(low), float(high), gather and gather.maps())
+    return Reduced(shares, time_mean, float(low), float(high), gather and gather.maps())
 
 
 def _check_regime(run: RunRecord, regime: np.ndarray, block: slice) -> None:
     wrong = (regime < 0) | (regime >= len(REGIMES))
     if wrong.any():
         frame, point = (int(i) for i in np.argwhere(wrong)[0])
-        raise InputError(
-            InputProblem(
-                f"{run.directory / 'trajectory.zarr'}: regime[{block.start + frame}, {point}]",
-                str(regime[frame, point]),
-                "a regime is 0 (unloaded), 1 (active) or 2 (saturated)",
-                "The store is damaged or was written by another tool; run again.",
-            )
+        raise input_error(
+            f"{run.directory / 'trajectory.zarr'}: regime[{block.start + frame}, {point}]",
+            str(regime[frame, point]),
+            "a regime is 0 (unloaded), 1 (active) or 2 (saturated)",
+            "The store is damaged or was written by another tool; run again.",
         )
 
 
@@ -120,17 +118,17 @@ class _Gather:
     """Fold frames into cells: sums for the means, running extremes, regime measure per cell."""
 
     def __init__(self, run: RunRecord):
-        place = run.frames.line("s").astype(float)
+        place = run.series("s")
         # Nodes from a file need not be sorted along the curve; the map's axis must be.
         order = np.argsort(place, kind="stable")
         self.order = slice(None) if (np.diff(place) > 0).all() else order
         frames, points = len(run.time), len(place)
-        self.starts = _starts(points, SPACE_CELLS)
-        time_starts = _starts(frames, TIME_CELLS)
+        self.starts = starts(points, SPACE_CELLS)
+        time_starts = starts(frames, TIME_CELLS)
         self.cell_of_frame = np.repeat(
             np.arange(len(time_starts)), np.diff(np.append(time_starts, frames))
         )
-        self.weight = run.weight[self.order]
+        self.weight = run.series("weight")[self.order]
         self.space_edges = edges(place[order])[np.append(self.starts, points)]
         self.time_edges = edges(run.time)[np.append(time_starts, frames)]
         self.points_per_cell = -(-points // len(self.starts))
@@ -170,7 +168,7 @@ class _Gather:
         )
 
 
-def _starts(count: int, cells: int) -> np.ndarray:
+def starts(count: int, cells: int) -> np.ndarray:
     """Where each of at most `cells` nearly equal groups of `count` items begins."""
     groups = min(count, cells)
     return (np.arange(groups) * count) // groups

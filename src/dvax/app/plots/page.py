@@ -10,7 +10,7 @@ from importlib.resources import files
 from plotly.offline import get_plotlyjs
 
 from dvax.app.plots.picture import Picture, Views
-from dvax.app.plots.run_reader import UNFINISHED, RunRecord
+from dvax.app.plots.run_reader import CONTACT, UNFINISHED, RunRecord
 from dvax.app.plots.stability import assumptions_table, losses_table
 from dvax.app.plots.tables import constants_table, facts_table, headline_cards
 from dvax.app.plots.theme import counted
@@ -73,12 +73,12 @@ def _stability(run: RunRecord) -> str:
 
 def _subtitle(run: RunRecord) -> str:
     parts = [f"dvax {run.manifest.get('dvax') or ''}".strip()]
-    if run.trajectory is not None:
-        parts.append(f"model {run.trajectory.attrs.get('model', 'unnamed')}")
+    if run.model != CONTACT:
+        parts.append(f"model {run.model}, {run.manifest.get('fit', '')}".rstrip(", "))
+    elif run.trajectory is not None:
+        parts.append(f"model {CONTACT}")
         points = " × ".join(str(n) for n in run.boundary_shape)
         parts.append(f"{points} points, {counted(len(run.time), 'frame')}")
-    elif run.data is not None:
-        parts.append(f"model {run.model}, {run.manifest.get('fit', '')}".rstrip(", "))
     parts.append(run.status)
     return " · ".join(parts)
 
@@ -92,7 +92,7 @@ def _banner(run: RunRecord) -> str:
         gone = run.status == "running"
         reason = "" if gone else str(run.manifest.get("stop_reason") or "")
         text = " ".join(part for part in (UNFINISHED[run.status], reach, reason) if part)
-        head = "No results." if run.trajectory is None and not run.data else "Partial results."
+        head = "No results." if run.trajectory is None else "Partial results."
         lines.append(
             f'<div class="banner partial" role="alert"><b>{head}</b> {_escape(text)}</div>'
         )
@@ -103,10 +103,10 @@ def _banner(run: RunRecord) -> str:
 
 
 def _reach(run: RunRecord) -> str:
-    if run.data:
-        return ""  # the reason says how far it came
     if run.trajectory is None:
-        return "Nothing was written." if run.data is not None else "No frame was written."
+        return "No results were written."
+    if run.model != CONTACT:
+        return ""  # the reason says how far it came
     unit = run.unit("time")
     end = run.config.get("time", {}).get("end")
     aim = f" of {end:g} {unit}" if isinstance(end, int | float) else ""

@@ -1,25 +1,22 @@
 """From a run directory to its report: `report.html` and `figures/*.png`."""
 
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from dvax.app.plots.applications import application_pictures
 from dvax.app.plots.certificate import certificate_picture
-from dvax.app.plots.downsample import scan
+from dvax.app.plots.downsample import downsample
 from dvax.app.plots.histories import histories_picture
+from dvax.app.plots.maps import map_pictures, shares_picture
 from dvax.app.plots.page import page
 from dvax.app.plots.picture import Picture
-from dvax.app.plots.pressure import pressure_picture
-from dvax.app.plots.regimes import regime_picture
-from dvax.app.plots.run_reader import RunRecord, read_run
+from dvax.app.plots.run_reader import CONTACT, RunRecord, read_run
 from dvax.app.plots.separation import separation_picture
-from dvax.app.plots.surface import surface_pictures
+from dvax.app.runs.rundir import write_whole
 
 
 def build_report(run_dir: Path | str, *, stills: bool = True) -> Path:
@@ -44,9 +41,9 @@ class Report:
         for name, drawn in self.stills.items():
             file = self.directory / "figures" / name
             file.parent.mkdir(exist_ok=True)
-            _written(file, lambda beside, drawn=drawn: beside.write_bytes(drawn))
+            write_whole(file, drawn)
         file = self.directory / "report.html"
-        _written(file, lambda beside: beside.write_text(self.text, encoding="utf-8"))
+        write_whole(file, self.text.encode())
         return file
 
 
@@ -61,30 +58,27 @@ def draw_report(run_dir: Path, *, stills: bool) -> Report:
 
 def _pictures(run: RunRecord) -> tuple[list[Picture], list[str]]:
     """The pictures that the run can give, and a sentence for each that it cannot."""
-    if run.data and "state_part0" in run.data:
-        return [], ["The run was stopped before more than its states could be written."]
-    if run.data:
-        return application_pictures(run.model, run.data), []
     if run.trajectory is None:
-        return [], ["There is no picture, because the run wrote no frame."]
-    found = scan(run)
-    pictures: list[Picture] = []
-    if found.cells is not None:
-        pictures.append(pressure_picture(run, found))
-    else:
-        pictures.extend(surface_pictures(run, found))
-    pictures.append(regime_picture(run, found))
-    pictures.append(histories_picture(run, found))
+        return [], ["There is no picture, because the run wrote no results."]
+    if run.has("state_part0"):
+        return [], ["The run was stopped before more than its states could be written."]
+    if run.model != CONTACT:
+        return application_pictures(run.model, run.trajectory.variables), []
+    reduced = downsample(run)
+    pictures = [
+        *map_pictures(run, reduced),
+        shares_picture(run, reduced),
+        histories_picture(run, reduced),
+    ]
     missing: list[str] = []
-    certificate, separation = certificate_picture(run), separation_picture(run)
-    if certificate is None:
-        missing.append("Certified error: the trajectory holds no error bound.")
-    else:
-        pictures.append(certificate)
-    if separation is None:
-        missing.append("Certified decay: the run had no companion trajectory.")
-    else:
-        pictures.append(separation)
+    for picture, reason in (
+        (certificate_picture(run), "Certified error: the trajectory holds no error bound."),
+        (separation_picture(run), "Certified decay: the run had no companion trajectory."),
+    ):
+        if picture is None:
+            missing.append(reason)
+        else:
+            pictures.append(picture)
     return pictures, missing
 
 
@@ -92,18 +86,3 @@ def _png(picture: Picture) -> bytes:
     drawn = BytesIO()
     picture.still().savefig(drawn, format="png")
     return drawn.getvalue()
-
-
-def _written(file: Path, write: Callable[[Path], Any]) -> None:
-    """Write beside, then rename: a file is whole or the old one, and where the disk is full nothing is
-    left over.
-
-    **Raises:** `OSError` with the name of the file.
-    """
-    beside = file.with_name(file.name + ".part")
-    try:
-        write(beside)
-        os.replace(beside, file)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise type(error)(error.errno, error.strerror, str(file)) from error

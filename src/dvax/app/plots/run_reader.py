@@ -1,7 +1,7 @@
 """A run directory, read: the trajectory opened lazily, the manifest, the summary, the constants.
 
 Nothing is loaded here but the small files and the time axis; a trajectory of a million points stays
-on disk until a picture asks for it, block by block (see `scan.py`).
+on disk until a picture asks for it, block by block (see `downsample.py`).
 """
 
 import json
@@ -9,13 +9,15 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from dvax.app.plots.applications.data import Data, read_data
-from dvax.app.plots.frames import Frames, open_frames
-from dvax.errors import InputError, InputProblem
+from dvax.app.plots.store import Store, Variable, open_store
+from dvax.errors import InputError, input_error
+
+CONTACT = "contact"
+"""The model of a manifest that names none."""
 
 # What manifest.json calls a run that did not reach its end, and what a reader should know of it.
 UNFINISHED = {
@@ -52,10 +54,12 @@ class AssumptionRow:
     why: str
 
 
+Row = TypeVar("Row", ConstantRow, AssumptionRow)
+
+
 @dataclass(frozen=True)
 class RunRecord:
-    """What a run directory holds. `trajectory` is None where no frame was written; an application has
-    `data` in its place."""
+    """What a run directory holds. `trajectory` is None where no results were written."""
 
     directory: Path
     manifest: Mapping[str, Any]
@@ -63,15 +67,14 @@ class RunRecord:
     config: Mapping[str, Any]
     constants: tuple[ConstantRow, ...]
     warnings: tuple[str, ...]
-    trajectory: Frames | None
+    trajectory: Store | None
     assumptions: tuple[AssumptionRow, ...] = field(default=())
     notes: tuple[str, ...] = field(default=())
-    data: Mapping[str, Data] | None = field(default=None)
 
     @property
     def model(self) -> str:
         """The name of the model."""
-        return str(self.manifest.get("model", "contact"))
+        return str(self.manifest.get("model", CONTACT))
 
     @property
     def title(self) -> str:
@@ -85,13 +88,9 @@ class RunRecord:
         return str(self.manifest.get("status", "unknown"))
 
     @property
-    def frames(self) -> Frames:
-        """The trajectory; asking for it where there is none is a mistake of the caller."""
-        if self.trajectory is None:
-            raise ValueError(
-                f"{self.directory} holds no trajectory; test `trajectory is None` first"
-            )
-        return self.trajectory
+    def attrs(self) -> Mapping[str, Any]:
+        """The attributes of the dataset."""
+        return {} if self.trajectory is None else self.trajectory.attrs
 
     @property
     def time(self) -> np.ndarray:
@@ -101,61 +100,59 @@ class RunRecord:
     @property
     def boundary_shape(self) -> tuple[int, ...]:
         """(n,) on a curve, (n1, n2) on a surface whose points are flattened in C order."""
-        given = self.frames.attrs.get("boundary_shape")
+        given = self.attrs.get("boundary_shape")
         if given is None or len(given) == 1:
-            return (self.frames.points,)
+            return (self["pressure"].points,)
         return tuple(int(n) for n in given)
 
-    @property
-    def weight(self) -> np.ndarray:
-        """Quadrature weights of the boundary's points, shape (point,)."""
-        return self.frames.line("weight").astype(float)
+    def __getitem__(self, name: str) -> Variable:
+        """A variable of the trajectory."""
+        if self.trajectory is None:
+            raise KeyError(f"{self.directory} holds no trajectory")
+        return self.trajectory.variables[name]
 
     def has(self, name: str) -> bool:
         """Whether the trajectory holds the variable `name`."""
-        return self.trajectory is not None and name in self.trajectory
+        return self.trajectory is not None and name in self.trajectory.variables
 
     def series(self, name: str) -> np.ndarray:
-        """A variable over time alone, shape (frames,)."""
-        return self.frames.line(name).astype(float)
+        """A variable over time alone or over points alone, in double precision."""
+        return self[name].values.astype(float)
 
     def unit(self, name: str) -> str:
         """The unit of a variable or coordinate, as the trajectory declares it.
 
         Norms in L2 over a boundary of dimension d have the unit length^(d/2) in them.
         """
-        declared = str(self.frames.about(name).get("units", ""))
-        return declared.replace("^(d/2)", "^0.5" if len(self.boundary_shape) == 1 else "")
+        half = "^0.5" if len(self.boundary_shape) == 1 else ""
+        return self[name].unit.replace("^(d/2)", half)
 
 
 def read_run(directory: Path) -> RunRecord:
     """Read the run directory `directory`. InputError where it is not one or a file is damaged."""
     if not (directory / "manifest.json").is_file():
-        raise InputError(
-            InputProblem(
-                str(directory),
-                _other_than_a_run(directory),
-                "a run directory holds manifest.json and trajectory.zarr",
-                "Give the folder that `dvax run ... -o FOLDER` wrote.",
-            )
+        raise input_error(
+            str(directory),
+            _other_than_a_run(directory),
+            "a run directory holds manifest.json and trajectory.zarr",
+            "Give the folder that `dvax run ... -o FOLDER` wrote.",
         )
     manifest = _json(directory / "manifest.json")
     summary_file = directory / "summary.json"
     config_file = directory / "config.resolved.toml"
-    application = str(manifest.get("model", "contact")) != "contact"
-    store = directory / "trajectory.zarr"
-    trajectory, notes = (None, ()) if application else _trajectory(store)
+    trajectory, notes = _trajectory(
+        directory / "trajectory.zarr", needs_time=manifest.get("model", CONTACT) == CONTACT
+    )
     return RunRecord(
         directory=directory,
         manifest=manifest,
         summary=_json(summary_file) if summary_file.is_file() else {},
         config=_toml(config_file) if config_file.is_file() else {},
-        constants=_constants(trajectory, manifest, directory),
+        constants=_rows(ConstantRow, manifest.get("constants")),
         warnings=_warnings(directory / "log.jsonl"),
         trajectory=trajectory,
-        assumptions=_assumptions(trajectory, manifest, directory),
+        assumptions=_rows(AssumptionRow, manifest.get("assumptions")),
         notes=notes,
-        data=_data(store) if application else None,
     )
 
 
@@ -167,13 +164,11 @@ def _other_than_a_run(path: Path) -> str:
 
 
 def _damaged(file: Path, error: Exception) -> InputError:
-    return InputError(
-        InputProblem(
-            str(file),
-            f"text that does not parse ({error})",
-            "a run directory's files are written by dvax and must be whole to be read",
-            "Restore the file from a copy, or run again.",
-        )
+    return input_error(
+        str(file),
+        f"text that does not parse ({error})",
+        "a run directory's files are written by dvax and must be whole to be read",
+        "Restore the file from a copy, or run again.",
     )
 
 
@@ -194,66 +189,29 @@ def _toml(file: Path) -> Mapping[str, Any]:
         raise _damaged(file, error) from error
 
 
-def _trajectory(store: Path) -> tuple[Frames | None, tuple[str, ...]]:
-    """The frames that are whole, and a note where some were left out."""
-    if not store.exists():
+def _trajectory(path: Path, needs_time: bool) -> tuple[Store | None, tuple[str, ...]]:
+    """The results that are whole, and a note where some frames were left out."""
+    if not path.exists():
         return None, ()
     try:
-        frames, room = open_frames(store)
+        store, room = open_store(path)
     except (OSError, ValueError, KeyError) as error:
-        raise _damaged(store, error) from error
-    whole = 0 if frames is None else frames.count
-    if whole == room:
-        return frames, ()
-    note = (
-        f"{room - whole} of {room} frames have no valid time: "
-        "the run ended before they were complete. They are left out."
-    )
-    return frames, (note,)
+        raise _damaged(path, error) from error
+    whole = store.count or 0
+    notes = ()
+    if whole < room:
+        notes = (
+            f"{room - whole} of {room} frames have no valid time: "
+            "the run ended before they were complete. They are left out.",
+        )
+    return (store if whole or not needs_time else None), notes
 
 
-def _constants(
-    trajectory: Frames | None, manifest: Mapping[str, Any], directory: Path
-) -> tuple[ConstantRow, ...]:
-    """The list in the trajectory's attributes; the manifest's where nothing was written."""
-    rows = _listed(trajectory, "constants", directory)
-    if rows is None:
-        rows = manifest.get("constants")
-    if not isinstance(rows, list):
-        return ()
-    names = tuple(ConstantRow.__dataclass_fields__)
-    return tuple(ConstantRow(**{name: row.get(name, "") for name in names}) for row in rows)
-
-
-def _data(store: Path) -> Mapping[str, Data]:
-    """The results of an application; nothing where there are none yet."""
-    if not store.exists():
-        return {}
-    try:
-        return read_data(store)
-    except (OSError, ValueError, KeyError) as error:
-        raise _damaged(store, error) from error
-
-
-def _assumptions(
-    trajectory: Frames | None, manifest: Mapping[str, Any], directory: Path
-) -> tuple[AssumptionRow, ...]:
-    rows = _listed(trajectory, "assumptions", directory)
-    if rows is None:
-        rows = manifest.get("assumptions")
-    names = tuple(AssumptionRow.__dataclass_fields__)
-    return tuple(AssumptionRow(**{n: str(row.get(n, "")) for n in names}) for row in rows or ())
-
-
-def _listed(trajectory: Frames | None, name: str, directory: Path) -> Any:
-    """A list among the trajectory's attributes, where it is written as JSON."""
-    rows: Any = None if trajectory is None else trajectory.attrs.get(name)
-    if isinstance(rows, str):
-        try:
-            rows = json.loads(rows)
-        except json.JSONDecodeError as error:
-            raise _damaged(directory / "trajectory.zarr" / name, error) from error
-    return rows
+def _rows(kind: type[Row], rows: Any) -> tuple[Row, ...]:
+    """A list of the manifest as rows of one kind."""
+    names = tuple(kind.__dataclass_fields__)
+    given = rows if isinstance(rows, list) else []
+    return tuple(kind(**{name: row.get(name, "") for name in names}) for row in given)
 
 
 def _warnings(log: Path) -> tuple[str, ...]:

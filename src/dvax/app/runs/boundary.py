@@ -8,8 +8,8 @@ import numpy as np
 
 from dvax.app.runs.schema import BoundarySection
 from dvax.app.runs.units import UnitError, Units
-from dvax.errors import InputError, InputProblem
-from dvax.formats.table import check_increasing, read_columns
+from dvax.errors import InputError, InputProblem, input_error
+from dvax.formats.csv_columns import check_increasing, read_columns
 
 
 @dataclass(frozen=True)
@@ -91,12 +91,10 @@ def check_size(boundary: Boundary, place: str) -> None:
     least, most = float(boundary.weights.min()), float(boundary.weights.max())
     if farthest <= 1e100 and least >= 1e-200 and most <= 1e200:
         return
-    raise InputError(
-        InputProblem(
-            place,
-            f"coordinates up to {farthest:g} and weights from {least:g} to {most:g}",
-            "coordinates are at most 1e100 and weights between 1e-200 and 1e200, or squares of them "
-            "overflow",
-            "Choose a unit of length nearer to the size of the boundary.",
-        )
+    raise input_error(
+        place,
+        f"coordinates up to {farthest:g} and weights from {least:g} to {most:g}",
+        "coordinates are at most 1e100 and weights between 1e-200 and 1e200, or squares of them "
+        "overflow",
+        "Choose a unit of length nearer to the size of the boundary.",
     )

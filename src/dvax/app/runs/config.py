@@ -22,7 +22,7 @@ from dvax.app.runs.schema_errors import shown, translate, unknown_key
 from dvax.app.runs.settings import Config as Config
 from dvax.app.runs.solver_options import MOST_STEPS, short_dt_max
 from dvax.app.runs.units import Units
-from dvax.errors import InputError, InputProblem
+from dvax.errors import InputError, InputProblem, input_error
 
 MAX_BYTES = 2**20
 _RTOL = 1e-6
@@ -60,8 +60,8 @@ def with_points(config: Config, points: int) -> Config:
 def parse(source: Path) -> dict[str, Any]:
     """A TOML file as a table. **Raises:** `InputError` with line and column."""
 
-    def refuse(place: str, given: str, rule: str, mend: str) -> InputError:
-        return InputError(InputProblem(place, given, rule, mend))
+    def refuse(place: str, given: str, rule: str, fix: str) -> InputError:
+        return input_error(place, given, rule, fix)
 
     name = source.name
     try:
@@ -156,8 +156,8 @@ def check_contact(raw: dict[str, Any], source: Path, allow_outside: bool) -> Con
         if name == "units":
             continue
         if name not in raw and name not in OPTIONAL:
-            mend = f"Add [{name}]."
-            problems.append(InputProblem(f"{file}: {name}", "nothing", "it is required", mend))
+            fix = f"Add [{name}]."
+            problems.append(InputProblem(f"{file}: {name}", "nothing", "it is required", fix))
             continue
         section, broken = _section(name, raw.get(name, {}), file, working)
         problems += broken

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from dvax.errors import InputError, InputProblem
+from dvax.errors import InputError, input_error
 from dvax.formats.table import read_bytes
 
 MAX_BYTES = 256 * 2**20
@@ -32,7 +32,7 @@ def locate(name: str, folder: Path, allow_outside: bool, place: str) -> Path:
         raise _refuse(place, name, "it is a folder, and this is for a file", "Name a file in it.")
     if size is None:
         where = Path(folder.resolve().name) / name
-        raise _refuse(place, name, "there is no such file", f"Put it at {where} or mend the name.")
+        raise _refuse(place, name, "there is no such file", f"Put it at {where} or fix the name.")
     if size > MAX_BYTES:
         raise _refuse(
             place, name, f"it has {size} bytes and a data file at most {MAX_BYTES}",
@@ -50,7 +50,7 @@ def locate_folder(name: str, folder: Path, allow_outside: bool, place: str) -> P
             if resolved.is_file()
             else "there is no such folder"
         )
-        raise _refuse(place, name, what, "Mend the name.")
+        raise _refuse(place, name, what, "Fix the name.")
     return resolved
 
 
@@ -79,8 +79,8 @@ def _resolved(
     return resolved, size
 
 
-def _refuse(place: str, name: str, rule: str, mend: str) -> InputError:
-    return InputError(InputProblem(place, repr(name), rule, mend))
+def _refuse(place: str, name: str, rule: str, fix: str) -> InputError:
+    return input_error(place, repr(name), rule, fix)
 
 
 def fingerprint(name: str, path: Path) -> DataFile:

@@ -37,7 +37,7 @@ from dvax.app.runs.rundir import FrameStore, RunDirectory, process
 from dvax.app.runs.schema import SolverSection
 from dvax.app.runs.solutions import all_finite
 from dvax.app.runs.solver_options import in_keys_of, in_solver_keys
-from dvax.errors import InputError, InputProblem, SolveError
+from dvax.errors import InputError, SolveError, input_error
 from dvax.evolution import ETD1, ETD2RK, ETD4RK, DormandPrince, ExpRosenbrock, Solution, solve
 from dvax.spaces import AbstractSpace
 from dvax.theory import Bound, bound_error
@@ -275,13 +275,11 @@ class _Piece:
 def refuse_existing(out: Path, overwrite: bool) -> None:
     """Results are never written over others unasked."""
     if out.is_dir() and any(out.iterdir()) and not overwrite:
-        raise InputError(
-            InputProblem(
-                str(out),
-                "a folder that is not empty",
-                "results are never written over others unasked",
-                "Give another folder, or ask to overwrite this one",
-            )
+        raise input_error(
+            str(out),
+            "a folder that is not empty",
+            "results are never written over others unasked",
+            "Give another folder, or ask to overwrite this one",
         )
 
 

@@ -171,9 +171,9 @@ class _Builder:
                     f"{name!r} cannot name a variable: it is no identifier or already taken"
                 )
 
-    def refuse(self, node: ast.AST, given: str, rule: str, mend: str) -> _Built:
+    def refuse(self, node: ast.AST, given: str, rule: str, fix: str) -> _Built:
         column = getattr(node, "col_offset", 0) + self.lead + 1
-        self.problems.append(InputProblem(f"{self.place}, column {column}", given, rule, mend))
+        self.problems.append(InputProblem(f"{self.place}, column {column}", given, rule, fix))
         return _Built(lambda xp, env: math.nan)  # never called: the problem is raised
 
     def source(self, node: ast.AST) -> str:
@@ -348,7 +348,7 @@ class _Builder:
                     node,
                     self.source(node),
                     f"its value is {value}, and every constant must be finite",
-                    "Mend the division by zero, the overflow or the argument outside the domain.",
+                    "Fix the division by zero, the overflow or the argument outside the domain.",
                 )
             return _Built(lambda xp, env: value, value)
         evaluations = [part.evaluate for part in parts]

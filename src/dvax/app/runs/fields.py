@@ -25,7 +25,7 @@ from dvax.app.runs.schema import (
     SeriesSection,
 )
 from dvax.app.runs.units import Units
-from dvax.errors import InputError, InputProblem
+from dvax.errors import InputError, InputProblem, input_error
 
 _SAMPLE_TIMES = 33
 _SAMPLE_POINTS = 1000
@@ -109,13 +109,11 @@ def read_field(
     carriers += ["series"] if series is not None and series.carries_unit else []
     carriers += ["profile"] if profile is not None and profile.carries_unit else []
     if len(carriers) > 1:
-        raise InputError(
-            InputProblem(
-                prefix,
-                f"units in {' and in '.join(carriers)}",
-                f"the factors multiply to {units.of(kind)}, so only one of them carries a unit",
-                "Keep the unit of one factor; the others are pure numbers (columns [1]).",
-            )
+        raise input_error(
+            prefix,
+            f"units in {' and in '.join(carriers)}",
+            f"the factors multiply to {units.of(kind)}, so only one of them carries a unit",
+            "Keep the unit of one factor; the others are pure numbers (columns [1]).",
         )
     knots = () if isinstance(section, InitialSection) else section.knots or ()
     constant = 1.0 if section.value is None else section.value
@@ -146,13 +144,11 @@ def perturbation(value: float | str, boundary: Boundary, place: str) -> np.ndarr
         _check_finite(field, boundary, None, place)
     values = space_values(field, boundary) * (1.0 if isinstance(value, str) else value)
     if not np.any(values):
-        raise InputError(
-            InputProblem(
-                place,
-                repr(value),
-                "the companion starts elsewhere, or both trajectories are the same",
-                "Give a perturbation that is not zero, or leave it out for the default.",
-            )
+        raise input_error(
+            place,
+            repr(value),
+            "the companion starts elsewhere, or both trajectories are the same",
+            "Give a perturbation that is not zero, or leave it out for the default.",
         )
     return values
 
@@ -212,11 +208,9 @@ def _check_finite(field: Field, boundary: Boundary, end: float | None, place: st
             at = ", ".join(f"{name} = {c[bad[0]]:.6g}" for name, c in coordinates.items())
             if "t" in expression.uses:
                 at = f"t = {t:.6g}, {at}"
-            raise InputError(
-                InputProblem(
-                    place,
-                    f"{expression.text!r:.70} with the value {values[bad[0]]} at {at}",
-                    "a field is finite everywhere and at all times",
-                    "Mend the division, root or logarithm there.",
-                )
+            raise input_error(
+                place,
+                f"{expression.text!r:.70} with the value {values[bad[0]]} at {at}",
+                "a field is finite everywhere and at all times",
+                "Fix the division, root or logarithm there.",
             )

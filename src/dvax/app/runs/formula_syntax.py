@@ -7,7 +7,7 @@ sees the text, the number and depth of nodes before anything recurses over them.
 import ast
 import warnings
 
-from dvax.errors import InputError, InputProblem
+from dvax.errors import InputError, input_error
 
 MAX_CHARACTERS = 4096
 MAX_NODES = 512
@@ -20,9 +20,9 @@ def parse_formula(text: str, names: tuple[str, ...], place: str) -> ast.expr:
     Raises `InputError`, and nothing else, for every text that has none.
     """
 
-    def refuse(column: int | None, given: str, rule: str, mend: str) -> InputError:
+    def refuse(column: int | None, given: str, rule: str, fix: str) -> InputError:
         where = place if column is None else f"{place}, column {column}"
-        return InputError(InputProblem(where, given, rule, mend))
+        return input_error(where, given, rule, fix)
 
     if not isinstance(text, str):
         raise refuse(

@@ -13,9 +13,10 @@ import numpy as np
 from dvax.app.runs.boundary import Boundary
 from dvax.app.runs.schema import ProfileSection, SeriesSection
 from dvax.app.runs.units import UnitError, Units
-from dvax.errors import InputError, InputProblem
+from dvax.errors import InputError, InputProblem, input_error
 from dvax.formats.at2 import read_at2
-from dvax.formats.table import check_increasing, read_bytes, read_columns
+from dvax.formats.csv_columns import check_increasing, read_columns
+from dvax.formats.table import read_bytes
 
 # What numpy raises for broken headers and data: its header parser lets the tokenizer's errors
 # through.
@@ -96,7 +97,7 @@ def read_series(
             factor = _factor(units, unit, kind, path.name, column.name)
     least = _CUBIC_LEAST if section.kind == "cubic" else 2
     if times.size < least:
-        raise _error(
+        raise input_error(
             path.name,
             f"{times.size} rows",
             f"a {section.kind} history needs {least} of them at least",
@@ -105,7 +106,7 @@ def read_series(
     # The last time of a table in other units may miss `end` by a rounding error of the conversion.
     slack = 1e-12 * abs(times[-1])
     if end is not None and (times[0] > 0 or times[-1] < end - slack):
-        raise _error(
+        raise input_error(
             place,
             f"{path.name} from {times[0]:.12g} to {times[-1]:.12g} {units.time}",
             f"the data covers the run from 0 to {end:.12g} {units.time}: nothing is extrapolated",
@@ -132,7 +133,7 @@ def read_profile(
         return Profile(values * (1.0 if factor is None else factor), factor is not None)
     points = boundary.coordinates[0]
     if len(boundary.coordinates) > 1:
-        raise _error(
+        raise input_error(
             f"{place}.file",
             repr(section.file),
             "a profile over a rectangle is an NPY array",
@@ -145,7 +146,7 @@ def read_profile(
     s = position.values * _factor(units, position.unit, "length", path.name, position.name)
     slack = 1e-12 * np.max(np.abs(s))
     if s[0] > points.min() + slack or s[-1] < points.max() - slack:
-        raise _error(
+        raise input_error(
             place,
             f"{path.name} from {s[0]:.12g} to {s[-1]:.12g} {units.length}",
             f"it covers the points from {points.min():.12g} to {points.max():.12g} {units.length}: "
@@ -172,7 +173,7 @@ def _read_npy(section: ProfileSection, path: Path, boundary: Boundary, place: st
     bad = np.flatnonzero(~np.isfinite(values))
     if bad.size:
         first = int(bad[0])
-        raise _error(
+        raise input_error(
             f"{path.name}, value {first + 1}",
             f"{values[first]} ({bad.size} such values)",
             "every value of a profile is finite: a gap is not a value",
@@ -184,7 +185,7 @@ def _read_npy(section: ProfileSection, path: Path, boundary: Boundary, place: st
 def _of_shape(array: np.ndarray, shape: tuple[int, ...], path: Path, place: str) -> None:
     size = math.prod(shape)
     if array.shape not in {(size,), shape}:
-        raise _error(
+        raise input_error(
             f"{place}.file",
             f"{path.name} with {array.size} values (shape {array.shape})",
             f"the boundary has {size} points (shape {shape}), a value for each",
@@ -195,14 +196,16 @@ def _of_shape(array: np.ndarray, shape: tuple[int, ...], path: Path, place: str)
 def _load_npy(section: ProfileSection, path: Path, place: str) -> np.ndarray:
     for key, value in (("column", section.column), ("position_column", section.position_column)):
         if value not in (None, "s"):
-            raise _error(f"{place}.{key}", repr(value), "an NPY file has no columns", "Remove it.")
+            raise input_error(
+                f"{place}.{key}", repr(value), "an NPY file has no columns", "Remove it."
+            )
     content = read_bytes(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # numpy repairs some headers with a mere warning
             array = np.load(io.BytesIO(content), allow_pickle=False)
     except _BROKEN_NPY as e:
-        raise _error(
+        raise input_error(
             path.name,
             str(e).splitlines()[0][:120] if str(e) else "an incomplete file",
             "a profile is an NPY file with an array of numbers, without pickled objects",
@@ -210,7 +213,7 @@ def _load_npy(section: ProfileSection, path: Path, place: str) -> np.ndarray:
         ) from None
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         given = str(array.dtype) if isinstance(array, np.ndarray) else type(array).__name__
-        raise _error(
+        raise input_error(
             path.name, given, "a profile is one array of real numbers", "Save it as float."
         )
     return array
@@ -220,10 +223,6 @@ def _factor(units: Units, unit: str, kind: str, file: str, column: str) -> float
     try:
         return units.factor(unit, kind)
     except UnitError as error:
-        raise _error(
+        raise input_error(
             f"{file}, column {column!r}", f"[{unit}]", error.rule, f"{error.fix}."
         ) from None
-
-
-def _error(place: str, given: str, rule: str, mend: str) -> InputError:
-    return InputError(InputProblem(place, given, rule, mend))

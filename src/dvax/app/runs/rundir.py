@@ -51,7 +51,7 @@ class RunDirectory:
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Replace a small file as a whole: a reader sees the old one or the new one."""
         text = json.dumps(json_ready(content), indent=2, ensure_ascii=False, allow_nan=False)
-        write_whole(self.path / name, text + "\n")
+        write_whole(self.path / name, f"{text}\n".encode())
 
     def log(self, event: Mapping[str, Any]) -> None:
         """Append an event, with the moment it happened, and hand it to the system at once."""
@@ -64,7 +64,7 @@ class RunDirectory:
         self._log.close()
 
 
-def write_whole(file: Path, text: str) -> None:
+def write_whole(file: Path, content: bytes) -> None:
     """Write beside `file`, then rename: a reader sees the old one or the new one, and where the disk is
     full nothing is left over.
 
@@ -72,8 +72,8 @@ def write_whole(file: Path, text: str) -> None:
     """
     beside = file.with_name(f".{file.name}.new")
     try:
-        with beside.open("w", encoding="utf-8") as opened:
-            opened.write(text)
+        with beside.open("wb") as opened:
+            opened.write(content)
             opened.flush()
             os.fsync(opened.fileno())
         beside.replace(file)
@@ -217,4 +217,4 @@ class FrameStore:
         group["consolidated_metadata"] = {
             "kind": "inline", "must_understand": False, "metadata": about,
         }  # fmt: skip
-        write_whole(self.path / "zarr.json", json.dumps(group))
+        write_whole(self.path / "zarr.json", json.dumps(group).encode())

@@ -33,9 +33,9 @@ MAX_POINTS = 100_000_000
 MAX_FRAMES = 10**7
 
 
-def broken(rule: str, mend: str) -> PydanticCustomError:
-    """What a validator raises: the rule that a value breaks, and the mend."""
-    return PydanticCustomError("rule", "{rule}", {"rule": rule, "mend": mend})
+def broken(rule: str, fix: str) -> PydanticCustomError:
+    """What a validator raises: the rule that a value breaks, and the fix."""
+    return PydanticCustomError("rule", "{rule}", {"rule": rule, "fix": fix})
 
 
 LEAST_RTOL = 2.3e-14

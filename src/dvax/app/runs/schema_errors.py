@@ -39,14 +39,14 @@ def shown(value: Any) -> str:
 def unknown_key(place: str, key: str, value: Any, known: list[str]) -> InputProblem:
     """A key that nothing reads, with the nearest one that something does."""
     close = get_close_matches(key, known, n=1)
-    mend = f"Did you mean {close[0]!r}?" if close else f"Allowed here: {', '.join(known)}."
-    return InputProblem(place, shown(value), f"there is no key {key!r} here", mend)
+    fix = f"Did you mean {close[0]!r}?" if close else f"Allowed here: {', '.join(known)}."
+    return InputProblem(place, shown(value), f"there is no key {key!r} here", fix)
 
 
 def translate(
     error: ValidationError, file: str, section: str, model: type[BaseModel]
 ) -> list[InputProblem]:
-    """One problem for each finding: file and dotted key, what was given, the rule, the mend."""
+    """One problem for each finding: file and dotted key, what was given, the rule, the fix."""
     return [_problem(dict(e), file, section, model) for e in error.errors(include_url=False)]
 
 
@@ -66,7 +66,7 @@ def _problem(
         sample = _sample(info)
         return InputProblem(place, "nothing", f"it is required ({about})", f"Add {key} = {sample}")
     if kind == "rule":
-        return InputProblem(place, given, context["rule"], f"{context['mend']}.")
+        return InputProblem(place, given, context["rule"], f"{context['fix']}.")
     if kind in _LIMITS:
         sign, name = _LIMITS[kind]
         rule = f"it must be {sign} {context[name]:g} ({about})"
@@ -76,19 +76,19 @@ def _problem(
     if kind == "literal_error":
         allowed = [str(a) for a in _literals(info)]
         close = get_close_matches(str(error["input"]), allowed, n=1)
-        mend = f"Did you mean {close[0]!r}?" if close else "Choose one of these."
-        return InputProblem(place, given, f"it is one of {', '.join(allowed)}", mend)
+        fix = f"Did you mean {close[0]!r}?" if close else "Choose one of these."
+        return InputProblem(place, given, f"it is one of {', '.join(allowed)}", fix)
     inner = None if info is None else _model_within(info.annotation)
     if kind == "list_type" and inner is not None:
         example = ", ".join(f"{name} = {_sample(f)}" for name, f in inner.model_fields.items())
         rule = f"it is a list of tables ({about}), each with a heading of its own"
-        mend = f"Write [[{dotted}]] in double brackets, and below it {example}."
-        return InputProblem(place, given, rule, mend)
+        fix = f"Write [[{dotted}]] in double brackets, and below it {example}."
+        return InputProblem(place, given, rule, fix)
     if kind in _TYPES:
         number, text = kind.startswith(("float", "int")), isinstance(error["input"], str)
-        mend = _bare(key, error["input"], about) if number and text else f"Write {_TYPES[kind]}."
-        return InputProblem(place, given, f"it must be {_TYPES[kind]} ({about})", mend)
-    return InputProblem(place, given, str(error["msg"]), "Mend the value.")
+        fix = _bare(key, error["input"], about) if number and text else f"Write {_TYPES[kind]}."
+        return InputProblem(place, given, f"it must be {_TYPES[kind]} ({about})", fix)
+    return InputProblem(place, given, str(error["msg"]), "Fix the value.")
 
 
 def _dotted(section: str, path: list[str | int]) -> str:
@@ -97,16 +97,16 @@ def _dotted(section: str, path: list[str | int]) -> str:
 
 
 def _bare(key: str, text: str, about: str) -> str:
-    """The mend where a text stands for a bare number: that number, in the unit that the key is in, as
+    """The fix where a text stands for a bare number: that number, in the unit that the key is in, as
     far as the text says it."""
     found = re.search(r"\[([^\[\]]+)\]", about)
     unit = found[1] if found else None
     digits = text.strip()
     number = float(digits) if NUMBER.fullmatch(digits) else converted(text, unit or "1")
-    mend = "Write a bare number, without quotes" + (f", in {unit}" if unit else " or a unit")
+    fix = "Write a bare number, without quotes" + (f", in {unit}" if unit else " or a unit")
     if number is None:
-        return f"{mend}."
-    return f"{mend}: {key} = {number:.12g}" + (f"  # {unit}" if unit else "")
+        return f"{fix}."
+    return f"{fix}: {key} = {number:.12g}" + (f"  # {unit}" if unit else "")
 
 
 def _sample(info: FieldInfo | None) -> str:

@@ -17,7 +17,7 @@ from dvax.app.runs.schema import (
     broken,
     within_precision,
 )
-from dvax.errors import Fix, InputError, InputProblem
+from dvax.errors import Fix, InputError, InputProblem, input_error
 from dvax.evolution.arguments import ADAPTIVE_STEPS
 
 MOST_STEPS = 2**30
@@ -88,7 +88,7 @@ def check_steps(table: SolverKeys, span: float, words: str) -> None:
             else f"a run has fewer than {MOST_STEPS} steps, or they cannot be counted"
         )
         fix = f"Write {key} = {span / 100:.3g}, say, or leave it out"
-        raise InputError(InputProblem(f"model.{key}", f"{step:g}", rule, fix))
+        raise input_error(f"model.{key}", f"{step:g}", rule, fix)
     # Of at most a hundred segments, one is at least this long.
     problem = short_dt_max(table.dt_max, table.max_steps, span / SEGMENTS, "model")
     if problem is not None:

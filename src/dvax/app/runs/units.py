@@ -39,7 +39,9 @@ _DIMENSIONS: Mapping[str, str] = {
     "pressure": "[mass] / [length] / [time] ** 2",
 }
 
-_QUANTITY = re.compile(rf"\s*({NUMBER.pattern})(\s*[A-Za-zµμ%°].*?|\s+(?:1\s*/|\().+?)\s*")
+_QUANTITY = re.compile(
+    rf"\s*(?P<number>{NUMBER.pattern})(?P<unit>\s*[A-Za-zµμ%°].*?|\s+(?:1\s*/|\().+?)\s*"
+)
 # A unit is names with single-digit exponents between * / · or blanks, one level of parentheses
 # deep: no number within it can grow, and pint's own parser never sees anything else.
 _EXPONENT = r"(?:\s*(?:\*\*|\^)\s*-?\d)?"
@@ -51,11 +53,11 @@ _UNIT = re.compile(rf"(?:1\s*/\s*)?{_FACTOR}(?:{_BETWEEN}{_FACTOR})*")
 
 
 class UnitError(ValueError):
-    """A text that is no quantity or no unit; `mend` says what to write instead."""
+    """A text that is no quantity or no unit; `fix` says what to write instead."""
 
-    def __init__(self, rule: str, mend: str):
-        self.rule, self.fix = rule, mend
-        super().__init__(f"{rule}. {mend}")
+    def __init__(self, rule: str, fix: str):
+        self.rule, self.fix = rule, fix
+        super().__init__(f"{rule}. {fix}")
 
 
 class Units(BaseModel):
@@ -103,7 +105,7 @@ class Units(BaseModel):
                 "a quantity in quotes is a number and a unit",
                 f'Write "{number} {example}"' if example else "Write the number without quotes",
             )
-        return float(match.group(1)) * self.factor(match.group(4).strip(), kind)
+        return float(match["number"]) * self.factor(match["unit"].strip(), kind)
 
 
 def converted(text: str, unit: str) -> float | None:
@@ -112,12 +114,12 @@ def converted(text: str, unit: str) -> float | None:
     if match is None:
         return None
     try:
-        given, wanted = parse_unit(match.group(4)), parse_unit(unit)
+        given, wanted = parse_unit(match["unit"]), parse_unit(unit)
     except UnitError:
         return None
     if given.dimensionality != wanted.dimensionality:
         return None
-    return float(match.group(1)) * float(_registry().Quantity(1.0, given).to(wanted).magnitude)
+    return float(match["number"]) * float(_registry().Quantity(1.0, given).to(wanted).magnitude)
 
 
 def is_quantity(text: str) -> bool:

@@ -4,30 +4,24 @@ import importlib
 import pkgutil
 from collections.abc import Mapping
 
-from dvax.app.plots.applications.data import Data
 from dvax.app.plots.picture import Picture
-from dvax.errors import InputError, InputProblem
+from dvax.app.plots.store import Variable
+from dvax.errors import input_error
 
-NAMES = tuple(
-    module.name.replace("_", "-")
-    for module in pkgutil.iter_modules(__path__)
-    if module.name != "data"
-)
-"""The applications that have pictures: every module here but the one that reads their results."""
+NAMES = tuple(module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__))
+"""The applications that have pictures: every module here."""
 
 
-def application_pictures(name: str, data: Mapping[str, Data]) -> list[Picture]:
+def application_pictures(name: str, data: Mapping[str, Variable]) -> list[Picture]:
     """The pictures of the application that is called so.
 
     **Raises:** `dvax.InputError` where none is: the name comes from a file that may be damaged.
     """
     if name not in NAMES:
-        raise InputError(
-            InputProblem(
-                "manifest.json: model", repr(name),
-                f"an application is one of {', '.join(NAMES)}",
-                "Restore the file from a copy, or run again with this version of dvax.",
-            )
+        raise input_error(
+            "manifest.json: model", repr(name),
+            f"an application is one of {', '.join(NAMES)}",
+            "Restore the file from a copy, or run again with this version of dvax.",
         )  # fmt: skip
     module = importlib.import_module(f"dvax.app.plots.applications.{name.replace('-', '_')}")
     return module.pictures(data)

@@ -2,14 +2,14 @@
 
 from collections.abc import Mapping
 
-from dvax.app.plots.applications.data import Data
 from dvax.app.plots.panels import Curve, Panel, bound_panel, bound_title, panels_picture
 from dvax.app.plots.picture import Picture
+from dvax.app.plots.store import Variable
 
 _PREFIXES = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
 
 
-def pictures(data: Mapping[str, Data]) -> list[Picture]:
+def pictures(data: Mapping[str, Variable]) -> list[Picture]:
     """Voltages, currents, and what the diodes let through."""
     seconds = data["time"].values
     unit, scale = next(((u, s) for u, s in _PREFIXES.items() if seconds[-1] * s >= 1.0), ("s", 1.0))

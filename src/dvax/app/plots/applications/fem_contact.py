@@ -8,21 +8,21 @@ from matplotlib import rc_context
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
-from dvax.app.plots.applications.data import Data
 from dvax.app.plots.panels import Curve, Panel, bound_panel, panels_picture
 from dvax.app.plots.picture import Picture
+from dvax.app.plots.store import Variable
 from dvax.app.plots.theme import STILL_STYLE, blank, still_axes
 
 _MOMENTS = 5
 _MAP = "viridis"
 
 
-def pictures(data: Mapping[str, Data]) -> list[Picture]:
+def pictures(data: Mapping[str, Variable]) -> list[Picture]:
     """Pressure profiles, force over time, von Mises stress at the end."""
     return [_pressure(data), _force(data), _stress(data)]
 
 
-def _pressure(data: Mapping[str, Data]) -> Picture:
+def _pressure(data: Mapping[str, Variable]) -> Picture:
     times, s, p = (data[name].values for name in ("time", "place", "pressure"))
     # Equally far from each other in what happens, not in time: most of a run is rest.
     done = np.cumsum(np.abs(np.diff(p, axis=0)).sum(axis=1))
@@ -44,7 +44,7 @@ def _pressure(data: Mapping[str, Data]) -> Picture:
     )  # fmt: skip
 
 
-def _force(data: Mapping[str, Data]) -> Picture:
+def _force(data: Mapping[str, Variable]) -> Picture:
     times = data["time"].values
     panels = [Panel([Curve(times, data["force"].values, "force", 0)], "force", "p·x")]
     if "error_bound" in data:
@@ -56,7 +56,7 @@ def _force(data: Mapping[str, Data]) -> Picture:
     )  # fmt: skip
 
 
-def _stress(data: Mapping[str, Data]) -> Picture:
+def _stress(data: Mapping[str, Variable]) -> Picture:
     nodes, cells = data["nodes"].values, data["cells"].values
     xx, yy, zz, xy = data["stress"].values.T
     mises = np.sqrt(0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) + 3 * xy**2)

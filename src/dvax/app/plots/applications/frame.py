@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 
-from dvax.app.plots.applications.data import Data
 from dvax.app.plots.panels import Curve, Panel, bound_panel, bound_title, panels_picture
 from dvax.app.plots.picture import Picture
+from dvax.app.plots.store import Variable
 
 
-def pictures(data: Mapping[str, Data]) -> list[Picture]:
+def pictures(data: Mapping[str, Variable]) -> list[Picture]:
     """Histories, hysteresis, and the certificate."""
     t, d = data["time"].values, data["displacement"].values
     histories = [

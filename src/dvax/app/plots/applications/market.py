@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 
-from dvax.app.plots.applications.data import Data
 from dvax.app.plots.panels import Curve, Panel, panels_picture
 from dvax.app.plots.picture import Picture
+from dvax.app.plots.store import Variable
 
 
-def pictures(data: Mapping[str, Data]) -> list[Picture]:
+def pictures(data: Mapping[str, Variable]) -> list[Picture]:
     """Price and production over the hours."""
     hours = data["hour"].values
     prices = [Curve(hours, data["price"].values, "at rest (Cournot–Nash)", 0)]

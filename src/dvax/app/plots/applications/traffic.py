@@ -9,9 +9,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from dvax.app.plots.applications.data import Data
 from dvax.app.plots.panels import Curve, Panel, bound_panel, panels_picture
 from dvax.app.plots.picture import Picture
+from dvax.app.plots.store import Variable
 from dvax.app.plots.theme import INK, STILL_STYLE, blank, still_axes
 
 _BUSIEST = 5
@@ -20,7 +20,7 @@ _ASIDE = 0.012
 """How far, of the size of the map, a link is drawn to the right of the line between its nodes."""
 
 
-def pictures(data: Mapping[str, Data]) -> list[Picture]:
+def pictures(data: Mapping[str, Variable]) -> list[Picture]:
     """The objective and the busiest links over the days; the map, where places are known."""
     found = [_days(data)]
     if "place" in data:
@@ -28,7 +28,7 @@ def pictures(data: Mapping[str, Data]) -> list[Picture]:
     return found
 
 
-def _days(data: Mapping[str, Data]) -> Picture:
+def _days(data: Mapping[str, Variable]) -> Picture:
     days, objective = data["day"].values, data["objective"].values
     least = float(data["equilibrium"].values)
     if np.isfinite(least):
@@ -59,7 +59,7 @@ def _days(data: Mapping[str, Data]) -> Picture:
     )  # fmt: skip
 
 
-def _map(data: Mapping[str, Data]) -> Picture:
+def _map(data: Mapping[str, Variable]) -> Picture:
     place = data["place"].values.astype(float)
     first, last = (data[name].values.astype(int) - 1 for name in ("init_node", "term_node"))
     load = data["flow"].values[-1] / data["capacity"].values[-1]

@@ -17,7 +17,7 @@ from dvax.app.runs.data_file import DataFile, fingerprint, locate, locate_folder
 from dvax.app.runs.schema import SECTIONS, ModelSection, ReportSection, Section
 from dvax.app.runs.schema_errors import shown, translate, unknown_key
 from dvax.app.runs.units import Units
-from dvax.errors import InputError, InputProblem
+from dvax.errors import InputError, input_error
 
 APPLICATIONS = ("traffic", "market", "frame", "circuit", "fem-contact")
 """The names of `[model]` that are applications."""
@@ -80,34 +80,28 @@ def read_config(
     name = "contact"
     if table is None and not set(raw) & (set(SECTIONS) - {"output"}):
         given = "an empty file" if not raw else f"no [model], but {', '.join(raw)}"
-        raise InputError(
-            InputProblem(
-                f"{source.name}: model", given,
-                f"the table [model] says which model this is, one of {', '.join(NAMES)}",
-                'Write [model] and below it name = "circuit", say, with the keys of that model',
-            )
+        raise input_error(
+            f"{source.name}: model", given,
+            f"the table [model] says which model this is, one of {', '.join(NAMES)}",
+            'Write [model] and below it name = "circuit", say, with the keys of that model',
         )  # fmt: skip
     if isinstance(table, Mapping):
         # A contact law needs no name: it was the only model once.
         name = table.get("name", "contact")
         if "name" not in table and (meant := _meant(table)) is not None:
-            raise InputError(
-                InputProblem(
-                    f"{source.name}: model.name", "nothing",
-                    f"it says which model this is, one of {', '.join(NAMES)}; "
-                    f"these keys are of {meant!r}",
-                    f'Add name = "{meant}"',
-                )
+            raise input_error(
+                f"{source.name}: model.name", "nothing",
+                f"it says which model this is, one of {', '.join(NAMES)}; "
+                f"these keys are of {meant!r}",
+                f'Add name = "{meant}"',
             )  # fmt: skip
     if name == "contact":
         return check_contact(raw, source, allow_outside)
     if not isinstance(name, str) or name not in APPLICATIONS:
         close = get_close_matches(str(name), NAMES, n=1)
-        mend = f"Did you mean {close[0]!r}?" if close else "Choose one of these."
-        raise InputError(
-            InputProblem(
-                f"{source.name}: model.name", shown(name), f"it is one of {', '.join(NAMES)}", mend
-            )
+        fix = f"Did you mean {close[0]!r}?" if close else "Choose one of these."
+        raise input_error(
+            f"{source.name}: model.name", shown(name), f"it is one of {', '.join(NAMES)}", fix
         )
     return _check(raw, name, source, allow_outside, quiet)
 

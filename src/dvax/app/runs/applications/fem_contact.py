@@ -19,7 +19,7 @@ from dvax.app.runs.applications.base import (
 )
 from dvax.app.runs.applications.certificate import certificate
 from dvax.app.runs.solver_options import SolverKeys, check_steps, settings
-from dvax.errors import InputError, InputProblem
+from dvax.errors import InputError, input_error
 from dvax.evolution import Implicit, Solution
 from dvax.models.fem_contact import ElasticBody, FemContact
 
@@ -104,8 +104,8 @@ def _given(table: FemContactSection, names: tuple[str, ...]) -> dict[str, Any]:
     return {name: getattr(table, name) for name in names if getattr(table, name) is not None}
 
 
-def _refused(keys: tuple[str, ...], given: str, rule: str, mend: str) -> InputError:
-    return InputError(InputProblem(", ".join(f"model.{k}" for k in keys), given, rule, mend))
+def _refused(keys: tuple[str, ...], given: str, rule: str, fix: str) -> InputError:
+    return input_error(", ".join(f"model.{k}" for k in keys), given, rule, fix)
 
 
 def _notes(model: _Loaded) -> tuple[str, ...]:

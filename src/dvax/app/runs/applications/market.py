@@ -21,7 +21,7 @@ from dvax.app.runs.applications.base import (
 )
 from dvax.app.runs.applications.certificate import certificate
 from dvax.app.runs.solver_options import SolverKeys, check_steps, settings
-from dvax.errors import InputError, InputProblem
+from dvax.errors import input_error
 from dvax.evolution import ExpRosenbrock, Solution
 from dvax.formats import RTS, read_rts
 from dvax.models.market import Market, largest_gain
@@ -54,12 +54,10 @@ class _Loaded:
         # An hour alone is a moment of the two that it lies between.
         last = len(rts.load) - 1
         if not table.start_hour + table.hours <= last + 1:
-            raise InputError(
-                InputProblem(
-                    "dvax.models.Market.from_rts(start_hour, hours)",
-                    f"{table.start_hour} and {table.hours}",
-                    f"the data have the hours 0 to {last}", "Name hours inside",
-                )
+            raise input_error(
+                "dvax.models.Market.from_rts(start_hour, hours)",
+                f"{table.start_hour} and {table.hours}",
+                f"the data have the hours 0 to {last}", "Name hours inside",
             )  # fmt: skip
         first = min(table.start_hour, last - 1) if table.hours == 1 else table.start_hour
         self.market = Market.from_rts(rts, first, max(2, table.hours), **options)

@@ -20,7 +20,7 @@ from dvax.app.runs.applications.base import (
 from dvax.app.runs.applications.certificate import certificate
 from dvax.app.runs.schema import Section, broken
 from dvax.app.runs.solver_options import SolverKeys, check_steps, settings
-from dvax.errors import InputError, InputProblem, SolveError
+from dvax.errors import SolveError, input_error
 from dvax.evolution import Solution
 from dvax.formats import read_nodes
 from dvax.models.traffic import Incident, Traffic
@@ -93,22 +93,18 @@ class _Loaded:
                 ],
             )  # fmt: skip
         except SolveError as error:
-            raise InputError(
-                InputProblem(
-                    f"{paths['network'].name} and {paths['trips'].name}",
-                    "numbers of which no equilibrium could be found",
-                    "capacities, times and trips are of sizes that rounding can compare",
-                    "Look in both files for very large and very small ones",
-                )
+            raise input_error(
+                f"{paths['network'].name} and {paths['trips'].name}",
+                "numbers of which no equilibrium could be found",
+                "capacities, times and trips are of sizes that rounding can compare",
+                "Look in both files for very large and very small ones",
             ) from error  # fmt: skip
         left = float(np.min(self.traffic.worst / self.traffic.network.capacity))
         if left < _LEAST:
-            raise InputError(
-                InputProblem(
-                    "model.incidents", f"{left:.2g} of a capacity left where several meet",
-                    f"incidents on one link multiply, and {_LEAST:g} or more is left of all: {_WHY}",
-                    _CLOSED,
-                )
+            raise input_error(
+                "model.incidents", f"{left:.2g} of a capacity left where several meet",
+                f"incidents on one link multiply, and {_LEAST:g} or more is left of all: {_WHY}",
+                _CLOSED,
             )  # fmt: skip
         nodes = paths.get("nodes")
         self.places = None if nodes is None else read_nodes(nodes, self.traffic.network)

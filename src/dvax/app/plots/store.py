@@ -1,0 +1,72 @@
+"""trajectory.zarr as pictures read it: variables by name, read when they are asked for.
+
+Read by zarr and not by xarray, whose import (with pandas) takes longer than the pictures.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+
+
+class Variable:
+    """An array of the store: its first `count` frames where it depends on time, else all of it."""
+
+    def __init__(self, array: Any, count: int | None):
+        self._array, self._count = array, count
+        self._attrs = array.attrs.asdict()
+        self.unit = str(self._attrs.get("units", ""))
+        self.status = str(self._attrs.get("status", ""))
+        """How much is known of a bound: proved, declared or estimated."""
+
+    @cached_property
+    def values(self) -> np.ndarray:
+        """All values. Read once: they may lie in many chunks."""
+        over_time = self._array.metadata.dimension_names[:1] == ("time",)
+        return np.asarray(self._array[: self._count] if over_time else self._array[...])
+
+    def frames(self, which: slice | int) -> np.ndarray:
+        """The values at some frames, which lie below `count`."""
+        return np.asarray(self._array[which])
+
+    @property
+    def points(self) -> int:
+        """The length of the last dimension."""
+        return int(self._array.shape[-1])
+
+    @property
+    def frames_per_chunk(self) -> int:
+        """How many frames are stored, and so read, as one."""
+        return int(self._array.chunks[0])
+
+
+@dataclass(frozen=True)
+class Store:
+    """The variables of a run by name, and the attributes of the dataset. `count` is the number of
+    frames that are whole; None where there is no variable `time`."""
+
+    attrs: Mapping[str, Any]
+    variables: Mapping[str, Variable]
+    count: int | None
+
+
+def open_store(path: Path) -> tuple[Store, int]:
+    """The store of a run, and how many frames there is room for.
+
+    A store has its full length from the start, and a frame gets its time when it is complete.
+    Raises `OSError`, `ValueError` or `KeyError` where it is damaged.
+    """
+    group = zarr.open_group(path, mode="r")
+    arrays = dict(group.arrays())
+    count, room = None, 0
+    if "time" in arrays:
+        time = np.asarray(arrays["time"][:], dtype=float)
+        increasing = np.isfinite(time) & (np.diff(time, prepend=-np.inf) > 0)
+        room = len(time)
+        count = room if increasing.all() else int(np.argmin(increasing))
+    variables = {name: Variable(array, count) for name, array in arrays.items()}
+    return Store(group.attrs.asdict(), variables, count), room
