@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.app.plots.synthetic import Recipe, write_run
 
 from dvax._figure_text import entry_text, figure_text
-from dvax.app.cli.run import _say_figures
+from dvax.app.cli.run import _print_figures
 from dvax.app.plots import build_report
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64).filter(
@@ -74,7 +74,7 @@ def test_terminal_page_and_file_agree(tmp_path: Path, capsys: pytest.CaptureFixt
         "tiny": {"value": -1.23456789012345e-13, "unit": "1", "meaning": "small"},
     }
     (run_dir / "summary.json").write_text(json.dumps(summary))
-    _say_figures(summary)
+    _print_figures(summary)
     said = capsys.readouterr().out
     page = build_report(run_dir, stills=False).read_text(encoding="utf-8")
     cards = re.findall(r'<div class="value" title="([^"]*)">(.*?)</div>', page)

@@ -41,13 +41,25 @@ def input_error(place: str, given: str, rule: str, fix: str) -> InputError:
     return InputError(InputProblem(place, given, rule, fix))
 
 
-@contextmanager
-def collecting(problems: list[InputProblem]) -> Iterator[None]:
-    """Append the problems of an `InputError` raised in the block to `problems`, and go on after it."""
-    try:
-        yield
-    except InputError as error:
-        problems += error.problems
+class Problems(list[InputProblem]):
+    """Problems found so far, which are raised together."""
+
+    def add(self, place: str, given: str, rule: str, fix: str) -> None:
+        """Append a problem; the arguments are those of `InputProblem`."""
+        self.append(InputProblem(place, given, rule, fix))
+
+    @contextmanager
+    def collect(self) -> Iterator[None]:
+        """Append the problems of an `InputError` that the block raises, and go on after it."""
+        try:
+            yield
+        except InputError as error:
+            self += error.problems
+
+    def raise_any(self) -> None:
+        """Raise an `InputError` where there are problems."""
+        if self:
+            raise InputError(*self)
 
 
 @dataclass(frozen=True)

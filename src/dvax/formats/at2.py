@@ -9,20 +9,20 @@ import re
 
 import numpy as np
 
-from .table import Problems, read_text, to_number
+from .table import FileProblems, read_text, to_number
 
 _SIZES = re.compile(
     r"NPTS\s*=\s*(?P<points>\d{1,9})\s*,\s*DT\s*=\s*(?P<step>\d*\.?\d+(?:[eE][+-]?\d+)?)"
     r"\s*,?\s*(?P<unit>[A-Za-z]*)",
     re.IGNORECASE,
 )
-_GRAVITY = re.compile(r"units?\b[^\n]*?(\(\s*g\s*\)|\bg\b)", re.IGNORECASE)
+_UNIT_OF_GRAVITY = re.compile(r"units?\b[^\n]*?(\(\s*g\s*\)|\bg\b)", re.IGNORECASE)
 
 
 def read_at2(path: str | os.PathLike[str]) -> tuple[float, np.ndarray]:
     """The step (s) and the accelerations (in units of standard gravity) of an .at2 file. Raises
     `InputError` with the line of every problem."""
-    lines, problems = read_text(path, "an .at2 file").splitlines(), Problems(path)
+    lines, problems = read_text(path, "an .at2 file").splitlines(), FileProblems(path)
     found = next(((i, m) for i, t in enumerate(lines, 1) if (m := _SIZES.search(t))), None)
     if found is None:
         problems(
@@ -38,7 +38,7 @@ def read_at2(path: str | os.PathLike[str]) -> tuple[float, np.ndarray]:
         problems(start, f"NPTS={points}, DT={step:g}", rule, "Fix the line")
     if sizes["unit"].lower() not in {"", "s", "sec", "second", "seconds"}:
         problems(start, repr(sizes["unit"]), "the step is in seconds", "Convert it to SEC")
-    if not any(_GRAVITY.search(line) for line in lines[: start - 1]):
+    if not any(_UNIT_OF_GRAVITY.search(line) for line in lines[: start - 1]):
         problems(
             None, "a description without the unit",
             "an .at2 file states that its values are in units of g",
@@ -56,10 +56,10 @@ def read_at2(path: str | os.PathLike[str]) -> tuple[float, np.ndarray]:
                 problems(number, given, rule, "Fix or remove it")
             else:
                 values.append(value)
-    if not problems.found and len(values) != points:
+    if not problems and len(values) != points:
         problems(
             start, f"NPTS={points} and {len(values)} values",
             "the record holds as many values as it states", "Complete the file or fix NPTS",
         )  # fmt: skip
-    problems.raise_any()
+    problems.check()
     return step, np.array(values)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError, InputProblem
-from .table import MAX_PROBLEMS, NUMBER, Problems, Table, csv_rows
+from .table import MAX_PROBLEMS, NUMBER, FileProblems, Table, csv_rows
 
 _HEADER = re.compile(r"\s*(?P<name>[^\[\]]+?)\s*(\[\s*(?P<unit>[^\[\]]*?)\s*\]\s*)?")
 
@@ -37,7 +37,7 @@ def read_columns(path: Path, wanted: list[str | None], key_column: str) -> list[
     a missing column or unit, a gap, text, NaN or infinity in a number column, rows of other
     lengths.
     """
-    problems = Problems(path)
+    problems = FileProblems(path)
     rows = csv_rows(path, problems)
     if not rows:
         fix = 'Write "time [s],load [um/s]"'
@@ -56,10 +56,11 @@ def read_columns(path: Path, wanted: list[str | None], key_column: str) -> list[
         names.append(title)
         units[title] = match["unit"] or None if match else None
     table = Table(line, names, rows[1:], problems)
-    chosen = [name or _only_other(table, key_column) for name in wanted]
-    if not table.has(*filter(None, chosen)) or None in chosen:
+    there = table.has(*(name for name in wanted if name is not None))
+    named = [name or _only_other(table, key_column) for name in wanted]
+    chosen = [name for name in named if name is not None]
+    if not there or len(chosen) < len(wanted):
         raise problems.error()
-    chosen = [name for name in chosen if name is not None]
     for name in chosen:
         if units[name] is None:
             problems(
@@ -70,7 +71,7 @@ def read_columns(path: Path, wanted: list[str | None], key_column: str) -> list[
     if len(rows) == 1:
         problems(None, "a header and no data", "a column has values", "Add rows of numbers")
     columns = table.columns(chosen)
-    problems.raise_any()
+    problems.check()
     return [Column(name, units[name] or "1", columns[name], columns["lines"]) for name in chosen]
 
 

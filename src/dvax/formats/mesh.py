@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import InputError, InputProblem, collecting, input_error
+from ..errors import Problems, input_error
 from .optional import needed
 
 _PLANE = ("triangle", "quad")
@@ -58,12 +58,11 @@ def read_mesh(path: str | os.PathLike[str], contact: str, clamped: str) -> Any:
         np.ascontiguousarray(corners.reshape(raw.elements.shape).T),
     )
     found: dict[str, np.ndarray] = {}
-    wrong: list[InputProblem] = []
+    wrong = Problems()
     for role, name in (("contact", contact), ("clamped", clamped)):
-        with collecting(wrong):
+        with wrong.collect():
             found[role] = _facets(mesh, new, raw.edges, name, role, place)
-    if wrong:
-        raise InputError(*wrong)
+    wrong.raise_any()
     return mesh.with_boundaries(found)
 
 

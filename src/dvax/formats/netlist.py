@@ -15,7 +15,7 @@ no title line. Numbers have engineering suffixes (f p n u m k Meg G T) and may h
 import re
 from dataclasses import dataclass
 
-from ..errors import InputError, InputProblem, collecting, input_error
+from ..errors import Problems, input_error
 from ..signals import AbstractSignal
 from .netlist_sources import read_waveform
 from .netlist_values import read_value
@@ -90,7 +90,7 @@ def read_netlist(text: str, name: str = "netlist") -> Netlist:
     ```
     """
     elements: list[Element] = []
-    wrong: list[InputProblem] = []
+    wrong = Problems()
     lines: dict[str, int] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         words = _words(line)
@@ -99,16 +99,13 @@ def read_netlist(text: str, name: str = "netlist") -> Netlist:
         place = f"{name}, line {number}"
         first = lines.setdefault(words[0].upper(), number)
         if first != number:
-            wrong.append(
-                InputProblem(
-                    place, words[0], f"line {first} has this name already, and names are told apart "
-                    "without regard to case", "Rename one of them",
-                )
+            wrong.add(
+                place, words[0], f"line {first} has this name already, and names are told apart "
+                "without regard to case", "Rename one of them",
             )  # fmt: skip
-        with collecting(wrong):
+        with wrong.collect():
             elements.append(_element(words, place, number))
-    if wrong:
-        raise InputError(*wrong)
+    wrong.raise_any()
     return Netlist(name, tuple(elements))
 
 
@@ -139,17 +136,15 @@ def _element(words: list[str], place: str, line: int) -> Element:
             + ("" if kind == "D" else " and a value"), f"Write {_example(kind)}",
         )  # fmt: skip
     a, b = rest[:2]
-    wrong: list[InputProblem] = []
+    wrong = Problems()
     if a == b:
-        wrong.append(
-            InputProblem(
-                place, f"{name} from {a} to {b}", "both ends are one node, so it does nothing there",
-                "Fix a node, or drop the element",
-            )
+        wrong.add(
+            place, f"{name} from {a} to {b}", "both ends are one node, so it does nothing there",
+            "Fix a node, or drop the element",
         )  # fmt: skip
     found: dict[str, float] = {}
     source = None
-    with collecting(wrong):
+    with wrong.collect():
         if kind in "VI":
             source = read_waveform(rest[2:], _QUANTITY[kind], place)
         elif len(rest) > least:
@@ -161,7 +156,7 @@ def _element(words: list[str], place: str, line: int) -> Element:
             found["value"] = _positive(rest[2], _QUANTITY[kind], place)
     said: dict[str, str] = {}
     for word in named:
-        with collecting(wrong):
+        with wrong.collect():
             key, value = _named(kind, word, place)
             first = said.setdefault(key, word)
             if first is not word:
@@ -171,8 +166,7 @@ def _element(words: list[str], place: str, line: int) -> Element:
                     "Keep one of them",
                 )  # fmt: skip
             found[key] = value
-    if wrong:
-        raise InputError(*wrong)
+    wrong.raise_any()
     return Element(kind, name, a, b, line, source=source, **found)
 
 

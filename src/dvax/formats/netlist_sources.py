@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..errors import InputError, InputProblem, collecting, input_error
+from ..errors import Problems, input_error
 from ..signals import AbstractSignal, Constant, Function, Table
 from .netlist_values import read_value
 
@@ -113,13 +113,11 @@ def _sine(fields: list[str], quantity: str, place: str) -> AbstractSignal:
         )  # fmt: skip
     kinds = kinds[: len(fields)]
     values = _all(fields, kinds, place) + [0.0] * (6 - len(fields))
-    wrong = [
-        InputProblem(place, fields[k], f"the {what} is not negative", "Fix the sign")
-        for k, what in ((2, "frequency"), (3, "delay"), (4, "damping"))
-        if values[k] < 0
-    ]
-    if wrong:
-        raise InputError(*wrong)
+    wrong = Problems()
+    for k, what in ((2, "frequency"), (3, "delay"), (4, "damping")):
+        if values[k] < 0:
+            wrong.add(place, fields[k], f"the {what} is not negative", "Fix the sign")
+    wrong.raise_any()
     values[5] = np.deg2rad(values[5])
     delay = values[3]
     return Function(Sine(*map(jnp.asarray, values)), knots=[delay] if delay > 0 else [])
@@ -136,25 +134,18 @@ def _pulse(fields: list[str], quantity: str, place: str) -> AbstractSignal:
     values = _all(fields, kinds[: len(fields)], place)
     low, high, delay, rise, fall, width, period = values + _PULSE_DEFAULTS[len(values) :]
     names = ("the delay", "the rise time", "the fall time", "the width", "the period")
-    wrong = [
-        InputProblem(place, fields[2 + k], f"{what} is not negative", "Fix the sign")
-        for k, what in enumerate(names[: len(fields) - 2])
-        if values[2 + k] < 0
-    ]
+    wrong = Problems()
+    for k, what in enumerate(names[: len(fields) - 2]):
+        if values[2 + k] < 0:
+            wrong.add(place, fields[2 + k], f"{what} is not negative", "Fix the sign")
     if not wrong and not period > 0:
-        wrong = [
-            InputProblem(place, fields[6], "the period is positive", "Leave it out for one pulse")
-        ]
+        wrong.add(place, fields[6], "the period is positive", "Leave it out for one pulse")
     if not wrong and rise + width + fall > period:
-        wrong = [
-            InputProblem(
-                place, f"a period of {fields[6]}", "a pulse is over when the next one begins: rise, "
-                "width "
-                f"and fall are {rise + width + fall:.12g} s", "Lengthen the period, or leave it out",
-            )
-        ]  # fmt: skip
-    if wrong:
-        raise InputError(*wrong)
+        wrong.add(
+            place, f"a period of {fields[6]}", "a pulse is over when the next one begins: rise, "
+            f"width and fall are {rise + width + fall:.12g} s", "Lengthen the period, or leave it out",
+        )  # fmt: skip
+    wrong.raise_any()
     return Pulse(low, high, delay, (rise, fall), width, period)
 
 
@@ -181,10 +172,9 @@ def _lines(fields: list[str], quantity: str, place: str) -> AbstractSignal:
 
 def _all(fields: list[str], kinds: tuple[str, ...], place: str) -> list[float]:
     values: list[float] = []
-    wrong: list[InputProblem] = []
+    wrong = Problems()
     for field, kind in zip(fields, kinds, strict=True):
-        with collecting(wrong):
+        with wrong.collect():
             values.append(read_value(field, kind, place))
-    if wrong:
-        raise InputError(*wrong)
+    wrong.raise_any()
     return values

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, InputProblem, input_error
+from ..errors import Problems, input_error
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +61,7 @@ class Network:
         )  # fmt: skip
         if not problems:
             problems = link_problems(self)
-        if problems:
-            raise InputError(*problems)
+        problems.raise_any()
 
     def __len__(self) -> int:
         """The number of links."""
@@ -121,8 +120,7 @@ class Trips:
         problems = _shaped(self, "Trips", ("origin", "destination"), ("flow",))
         if not problems:
             problems = trip_problems(self)
-        if problems:
-            raise InputError(*problems)
+        problems.raise_any()
         inside = self.origin == self.destination
         object.__setattr__(self, "within", float(self.flow[inside].sum()))
         kept = np.flatnonzero(~inside & (self.flow > 0))
@@ -140,25 +138,21 @@ class Trips:
         return _pair_place(self, index)
 
 
-def link_problems(links: Any) -> list[InputProblem]:
+def link_problems(links: Any) -> Problems:
     """What is wrong with each link of a network, or of what has been read of one so far."""
-    problems: list[InputProblem] = []
+    problems = Problems()
     place = lambda i: Network.place(links, i)  # noqa: E731
     if not 1 <= links.zones <= links.nodes:
-        problems.append(
-            InputProblem(
-                links.name, f"{links.zones} zones and {links.nodes} nodes",
-                "zones are the first ones of the nodes, so there are at most as many, and one at least",
-                "Fix the counts",
-            )
+        problems.add(
+            links.name, f"{links.zones} zones and {links.nodes} nodes",
+            "zones are the first ones of the nodes, so there are at most as many, and one at least",
+            "Fix the counts",
         )  # fmt: skip
     if not 1 <= links.first_thru_node <= links.nodes + 1:
-        problems.append(
-            InputProblem(
-                links.name, f"first_thru_node = {links.first_thru_node}",
-                f"it is a node, 1 to {links.nodes}: those below it are never passed through",
-                "Write 1 where every node may be passed through",
-            )
+        problems.add(
+            links.name, f"first_thru_node = {links.first_thru_node}",
+            f"it is a node, 1 to {links.nodes}: those below it are never passed through",
+            "Write 1 where every node may be passed through",
         )  # fmt: skip
     for column in ("init_node", "term_node"):
         problems += _unknown(getattr(links, column), links.nodes, column, "node", place)
@@ -180,47 +174,37 @@ def link_problems(links: Any) -> list[InputProblem]:
             fix = f"Fix the {column}"
             if column == "capacity":
                 fix += "; a link whose time does not depend on its flow has b = 0"
-            problems.append(
-                InputProblem(place(i), f"{column} {values[i]:g}", f"it is {rule}: {why}", fix)
-            )
+            problems.add(place(i), f"{column} {values[i]:g}", f"it is {rule}: {why}", fix)
     for i in np.flatnonzero(links.init_node == links.term_node):
-        problems.append(
-            InputProblem(
-                place(i), f"a link from node {links.init_node[i]} to itself",
-                "it leads nowhere", "Remove it",
-            )
+        problems.add(
+            place(i), f"a link from node {links.init_node[i]} to itself",
+            "it leads nowhere", "Remove it",
         )  # fmt: skip
     for i, first in _repeated(links.init_node, links.term_node):
-        problems.append(
-            InputProblem(
-                place(i), f"a link from {links.init_node[i]} to {links.term_node[i]}",
-                f"two nodes have one link a direction, and {place(first)} has this one",
-                "Remove one, or put a node into the second road",
-            )
+        problems.add(
+            place(i), f"a link from {links.init_node[i]} to {links.term_node[i]}",
+            f"two nodes have one link a direction, and {place(first)} has this one",
+            "Remove one, or put a node into the second road",
         )  # fmt: skip
     return problems
 
 
-def trip_problems(trips: Any) -> list[InputProblem]:
+def trip_problems(trips: Any) -> Problems:
     """What is wrong with each pair of a trip table, or of what has been read of one so far."""
-    problems: list[InputProblem] = []
+    problems = Problems()
     place = lambda i: _pair_place(trips, i)  # noqa: E731
     for column in ("origin", "destination"):
         problems += _unknown(getattr(trips, column), trips.zones, column, "zone", place)
     for i in np.flatnonzero(~((trips.flow >= 0) & np.isfinite(trips.flow))):
         pair = f"{trips.origin[i]} to {trips.destination[i]}"
-        problems.append(
-            InputProblem(
-                place(i), f"{trips.flow[i]:g} trips from {pair}", "trips are a number ≥ 0",
-                "Fix the number",
-            )
+        problems.add(
+            place(i), f"{trips.flow[i]:g} trips from {pair}", "trips are a number ≥ 0",
+            "Fix the number",
         )  # fmt: skip
     for i, first in _repeated(trips.origin, trips.destination):
-        problems.append(
-            InputProblem(
-                place(i), f"trips from {trips.origin[i]} to {trips.destination[i]} once more",
-                f"a pair stands once, and {place(first)} has it", "Add the two up, or remove one",
-            )
+        problems.add(
+            place(i), f"trips from {trips.origin[i]} to {trips.destination[i]} once more",
+            f"a pair stands once, and {place(first)} has it", "Add the two up, or remove one",
         )  # fmt: skip
     return problems
 
@@ -233,14 +217,14 @@ def _pair_place(trips: Any, index: Any) -> str:
 
 def _unknown(
     values: np.ndarray, largest: int, column: str, kind: str, place: Callable[[Any], str]
-) -> list[InputProblem]:
-    return [
-        InputProblem(
-            place(i), f"{column} {values[i]}", f"there are the {kind}s 1 to {largest}",
-            f"Fix the number, or the number of {kind}s",
+) -> Problems:
+    problems = Problems()
+    fix = f"Fix the number, or the number of {kind}s"
+    for i in np.flatnonzero((values < 1) | (values > largest)):
+        problems.add(
+            place(i), f"{column} {values[i]}", f"there are the {kind}s 1 to {largest}", fix
         )
-        for i in np.flatnonzero((values < 1) | (values > largest))
-    ]  # fmt: skip
+    return problems
 
 
 def _repeated(first: np.ndarray, second: np.ndarray) -> list[tuple[int, int]]:
@@ -255,11 +239,9 @@ def _repeated(first: np.ndarray, second: np.ndarray) -> list[tuple[int, int]]:
     return found
 
 
-def _shaped(
-    table: Any, title: str, whole: Sequence[str], real: Sequence[str]
-) -> list[InputProblem]:
+def _shaped(table: Any, title: str, whole: Sequence[str], real: Sequence[str]) -> Problems:
     """Make the columns arrays of one length, or say which are not."""
-    problems, lengths = [], {}
+    problems, lengths = Problems(), {}
     for column in (*whole, *real):
         given = getattr(table, column)
         if given is None:
@@ -268,11 +250,9 @@ def _shaped(
         kinds = "iu" if column in whole else "iuf"
         if values.ndim != 1 or values.dtype.kind not in kinds:
             what = "whole numbers" if column in whole else "real numbers"
-            problems.append(
-                InputProblem(
-                    f"dvax.models.{title}({column})", f"{values.dtype} of shape {values.shape}",
-                    f"it is a vector of {what}", "Give one for each",
-                )
+            problems.add(
+                f"dvax.models.{title}({column})", f"{values.dtype} of shape {values.shape}",
+                f"it is a vector of {what}", "Give one for each",
             )  # fmt: skip
             continue
         values = values.astype(np.int64 if column in whole else np.float64)
@@ -280,11 +260,9 @@ def _shaped(
         object.__setattr__(table, column, values)
         lengths[column] = len(values)
     if len(set(lengths.values())) > 1:
-        problems.append(
-            InputProblem(
-                f"dvax.models.{title}",
-                ", ".join(f"{count} {column}" for column, count in lengths.items()),
-                "all columns have one length", "Give one entry for each",
-            )
+        problems.add(
+            f"dvax.models.{title}",
+            ", ".join(f"{count} {column}" for column, count in lengths.items()),
+            "all columns have one length", "Give one entry for each",
         )  # fmt: skip
     return problems

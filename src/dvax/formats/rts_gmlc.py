@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import InputError, InputProblem, collecting
-from .table import Problems, Table, csv_rows
+from ..errors import InputProblem, Problems
+from .table import FileProblems, Table, csv_rows
 
 LEAST_SLOPE = 1e-3
 """$/MWh per MW: the slope of a cost curve that is flat, as those of wind, sun and nuclear power are. It
@@ -74,33 +74,29 @@ def read_rts(folder: str | Path) -> RTS:
     """
     folder = Path(folder)
     paths = {name: _place(folder, places) for name, places in _FILES.items()}
-    problems = [
-        InputProblem(str(path.parent), f"no {path.name}", "the market is read from four files",
-                     "Copy it there from RTS-GMLC's RTS_Data")
-        for path in paths.values() if not path.is_file()
-    ]  # fmt: skip
-    if problems:
-        raise InputError(*problems)
+    problems = Problems()
+    for path in paths.values():
+        if not path.is_file():
+            fix = "Copy it there from RTS-GMLC's RTS_Data"
+            rule = "the market is read from four files"
+            problems.add(str(path.parent), f"no {path.name}", rule, fix)
+    problems.raise_any()
     units: list[_Unit] = []
     hourly: dict[str, Hourly] = {}
-    with collecting(problems):
+    with problems.collect():
         units = _read_units(paths["units"])
     for name in ("load", "wind", "sun"):
-        with collecting(problems):
+        with problems.collect():
             hourly[name] = _read_hourly(paths[name])
-    if problems:
-        raise InputError(*problems)
+    problems.raise_any()
     file = paths["units"].name
     load, wind, sun = hourly["load"], hourly["wind"], hourly["sun"]
-    problems = [
-        *_other_hours(load, wind),
-        *_other_hours(load, sun),
-        *_wrong_series(wind, file, "WIND", units),
-        *_wrong_series(sun, file, "PV", units),
-        *_wrong_load(load, file, units),
-    ]
-    if problems:
-        raise InputError(*problems)
+    problems += _other_hours(load, wind)
+    problems += _other_hours(load, sun)
+    problems += _wrong_series(wind, file, "WIND", units)
+    problems += _wrong_series(sun, file, "PV", units)
+    problems += _wrong_load(load, file, units)
+    problems.raise_any()
     return _join(units, load, wind, sun)
 
 
@@ -134,7 +130,7 @@ def _place(folder: Path, places: tuple[str, ...]) -> Path:
 
 def _read_table(path: Path, wanted: tuple[str, ...]) -> Table:
     """The table of a CSV file that has the `wanted` columns. Raises `InputError`."""
-    problems = Problems(path)
+    problems = FileProblems(path)
     rows = csv_rows(path, problems)
     if len(rows) < 2:
         rule = "a row of names is followed by rows of data"
@@ -142,7 +138,7 @@ def _read_table(path: Path, wanted: tuple[str, ...]) -> Table:
         raise problems.error()
     table = Table(*rows[0], rows[1:], problems)
     table.has(*wanted)
-    problems.raise_any()
+    problems.check()
     return table
 
 
@@ -166,7 +162,7 @@ def _read_units(path: Path) -> list[_Unit]:
             problems(line, repr(bus), rule, "Fix the number", "Bus ID")
         curve = _curve(table, line, numbers if kind in _THERMAL else numbers[:1])
         units.append(_Unit(line, name, bus[:1], kind, *curve))
-    problems.raise_any()
+    problems.check()
     return units
 
 
@@ -210,7 +206,7 @@ def _read_hourly(path: Path) -> Hourly:
             problems(line, "/".join(words), f"it must be an hour: {error}", fix)
     names = [name for name in table.names if name not in _CLOCK]
     columns = table.columns(names, least=0.0)
-    problems.raise_any()
+    problems.check()
     lines = columns["lines"]
     for k, (before, after) in enumerate(itertools.pairwise(hours), start=1):
         if after - before != datetime.timedelta(hours=1):
@@ -221,7 +217,7 @@ def _read_hourly(path: Path) -> Hourly:
                 "rows are an hour apart: over a gap nothing is known, and a repeated hour is ambiguous",
                 "Fill in the missing hours on purpose, or remove the repeated ones",
             )  # fmt: skip
-    problems.raise_any()
+    problems.check()
     values = np.stack([columns[name] for name in names], axis=1)
     return Hourly(path.name, hours[0], names, values, lines)
 
@@ -243,50 +239,42 @@ def _other_hours(first: Hourly, other: Hourly) -> list[InputProblem]:
 def _wrong_series(table: Hourly, file: str, kind: str, units: list[_Unit]) -> list[InputProblem]:
     """Columns that are no unit of a kind, units of it without a column, values above a rating."""
     rated = {unit.name: unit for unit in units if unit.kind == kind}
-    problems = [
-        InputProblem(f"{table.file}, line 1", f"a column {name!r}",
-                     f"it must name a unit of the type {kind} in {file}",
-                     "Fix the name, or add the unit")
-        for name in table.names if name not in rated
-    ]  # fmt: skip
+    problems = Problems()
+    for name in table.names:
+        if name not in rated:
+            rule = f"it must name a unit of the type {kind} in {file}"
+            fix = "Fix the name, or add the unit"
+            problems.add(f"{table.file}, line 1", f"a column {name!r}", rule, fix)
     for name, unit in rated.items():
         if name not in table.names:
-            problems.append(
-                InputProblem(f"{file}, line {unit.line}", name,
-                             f"what it has available by hour must be a column of {table.file}",
-                             "Add the column, or remove the unit")
-            )  # fmt: skip
+            problems.add(f"{file}, line {unit.line}", name,
+                         f"what it has available by hour must be a column of {table.file}",
+                         "Add the column, or remove the unit")  # fmt: skip
             continue
         values = table.values[:, table.names.index(name)]
         k = int(np.argmax(values))
         if values[k] > _RATING_MARGIN * unit.capacity:
-            problems.append(
-                InputProblem(f"{table.file}, line {table.lines[k]}, column {name!r}",
-                             f"{values[k]:g} MW of a unit of {unit.capacity:g} MW",
-                             f"nothing makes more than its PMax ({file}, line {unit.line}): mixed "
-                             "units of measure", "Convert kW to MW")
-            )  # fmt: skip
+            problems.add(f"{table.file}, line {table.lines[k]}, column {name!r}",
+                         f"{values[k]:g} MW of a unit of {unit.capacity:g} MW",
+                         f"nothing makes more than its PMax ({file}, line {unit.line}): mixed "
+                         "units of measure", "Convert kW to MW")  # fmt: skip
     return problems
 
 
 def _wrong_load(table: Hourly, file: str, units: list[_Unit]) -> list[InputProblem]:
     """Areas with units and without a load, and a load of another size than the units."""
-    problems = []
+    problems = Problems()
     for area in sorted({unit.area for unit in units} - set(table.names)):
         unit = next(unit for unit in units if unit.area == area)
-        problems.append(
-            InputProblem(f"{file}, line {unit.line}, column 'Bus ID'", f"area {area}",
-                         f"areas are those of {table.file}: {', '.join(table.names)}",
-                         "Fix the bus, or add the area's load")
-        )  # fmt: skip
+        problems.add(f"{file}, line {unit.line}, column 'Bus ID'", f"area {area}",
+                     f"areas are those of {table.file}: {', '.join(table.names)}",
+                     "Fix the bus, or add the area's load")  # fmt: skip
     installed = sum(unit.capacity for unit in units)
     most = table.values.sum(axis=1).max()
     if not installed / 100 < most < 100 * installed:
-        problems.append(
-            InputProblem(table.file, f"a greatest load of {most:g} MW",
-                         f"{file} has {installed:g} MW: mixed units of measure",
-                         "Convert both to MW")
-        )  # fmt: skip
+        problems.add(table.file, f"a greatest load of {most:g} MW",
+                     f"{file} has {installed:g} MW: mixed units of measure",
+                     "Convert both to MW")  # fmt: skip
     return problems
 
 

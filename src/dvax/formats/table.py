@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError, InputProblem, input_error
+from ..errors import InputError, Problems, input_error
 
 MAX_PROBLEMS = 20
 """Problems of one file that are shown: a shifted column alone makes thousands."""
@@ -23,32 +23,32 @@ NUMBER = re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,3})?")
 _COUNT = re.compile(r"\d{1,9}")
 
 
-class Problems:
+class FileProblems(Problems):
     """What is wrong with one file. A call adds a problem; `line` is None where it has none."""
 
     def __init__(self, path: str | os.PathLike[str]):
+        super().__init__()
         self.file = Path(path).name
-        self.found: list[InputProblem] = []
 
     def __call__(
         self, line: int | None, given: str, rule: str, fix: str, column: str | int | None = None
     ) -> None:
         place = self.file if line is None else f"{self.file}, line {line}"
         place += "" if column is None else f", column {column!r}"
-        self.found.append(InputProblem(place, given, rule, fix))
-
-    def raise_any(self) -> None:
-        """Raise an `InputError` where there are problems."""
-        if self.found:
-            raise self.error()
+        self.add(place, given, rule, fix)
 
     def error(self) -> InputError:
         """Return an `InputError` with the first `MAX_PROBLEMS` problems and a count of the rest."""
-        shown, more = self.found[:MAX_PROBLEMS], len(self.found) - MAX_PROBLEMS
+        shown, more = self[:MAX_PROBLEMS], len(self) - MAX_PROBLEMS
         if more > 0:
             rule = f"the first {MAX_PROBLEMS} are shown: often they have one cause"
             shown.append(InputProblem(self.file, f"{more} more problems", rule, "Fix those first"))
         return InputError(*shown)
+
+    def check(self) -> None:
+        """Raise `error()` where there are problems."""
+        if self:
+            raise self.error()
 
 
 def read_bytes(path: str | os.PathLike[str], kind: str = "a data file") -> bytes:
@@ -74,7 +74,7 @@ def read_text(path: str | os.PathLike[str], kind: str, encoding: str = "latin-1"
         ) from None  # fmt: skip
 
 
-def csv_rows(path: Path, problems: Problems) -> list[tuple[int, list[str]]]:
+def csv_rows(path: Path, problems: FileProblems) -> list[tuple[int, list[str]]]:
     """(line, cells) of every row of a CSV file that is neither blank nor a comment (#)."""
     text = read_text(path, "a CSV file", "utf-8-sig")
     reader = csv.reader(text.splitlines(), strict=True, skipinitialspace=True)
@@ -96,7 +96,11 @@ class Table:
     """Columns by name. Rows of another length than the header are reported and left out."""
 
     def __init__(
-        self, header: int, names: list[str], rows: list[tuple[int, list[str]]], problems: Problems
+        self,
+        header: int,
+        names: list[str],
+        rows: list[tuple[int, list[str]]],
+        problems: FileProblems,
     ):
         self.header, self.names, self.problems = header, names, problems
         for name in sorted({name for name in names if names.count(name) > 1}):
@@ -116,7 +120,9 @@ class Table:
             fix = f"Add the column {name}"
             if close:
                 # A unit may stand in the name: the same quantity in another unit is another column.
-                fix = f"Did you mean {close[0]!r}? Rename it, and convert its values to this unit"
+                fix = (
+                    f"Did you mean {close[0]!r}? Rename it; convert its values if its unit differs"
+                )
             given = f"columns {', '.join(map(repr, self.names[:12]))}"
             self.problems(self.header, given, f"there is no column {name!r}", fix)
         return not missing
@@ -139,7 +145,7 @@ class Table:
         if value is None:
             rule = "it is a whole number, such as that of a node"
             self.problems(line, repr(cell[:40]), rule, "Fix the cell", name)
-        return math.nan if value is None else value
+        return math.nan if value is None else float(value)
 
     def columns(
         self, real: Sequence[str], whole: Sequence[str] = (), least: float = -math.inf

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .road_network import Network, Trips, link_problems, trip_problems
-from .table import Problems, Table, read_text, to_count, to_number
+from .table import FileProblems, Table, read_text, to_count, to_number
 
 _LINK_NODES = ("init_node", "term_node")
 _LINK_NUMBERS = ("capacity", "length", "free_flow_time", "b", "power")
@@ -69,7 +69,7 @@ def read_network(path: str | os.PathLike[str]) -> Network:
 
     ```
     """
-    lines, problems = read_text(path, "a TNTP file").splitlines(), Problems(path)
+    lines, problems = read_text(path, "a TNTP file").splitlines(), FileProblems(path)
     metadata = _Metadata(lines, problems)
     zones, nodes = metadata.count("NUMBER OF ZONES"), metadata.count("NUMBER OF NODES")
     first, count = metadata.count("FIRST THRU NODE"), metadata.count("NUMBER OF LINKS")
@@ -94,8 +94,8 @@ def read_network(path: str | os.PathLike[str]) -> Network:
     links = SimpleNamespace(
         zones=zones, nodes=nodes, first_thru_node=first, name=problems.file, **columns
     )
-    problems.found += link_problems(links)
-    problems.raise_any()
+    problems += link_problems(links)
+    problems.check()
     return Network(**vars(links))
 
 
@@ -121,7 +121,7 @@ def read_trips(path: str | os.PathLike[str]) -> Trips:
 
     ```
     """
-    lines, problems = read_text(path, "a TNTP file").splitlines(), Problems(path)
+    lines, problems = read_text(path, "a TNTP file").splitlines(), FileProblems(path)
     metadata = _Metadata(lines, problems)
     zones, total = metadata.count("NUMBER OF ZONES"), metadata.number("TOTAL OD FLOW")
     entries: list[tuple[int, int, float, int]] = []
@@ -178,8 +178,8 @@ def read_trips(path: str | os.PathLike[str]) -> Trips:
     if zones is None:
         raise problems.error()
     table.zones = zones
-    problems.found += trip_problems(table)
-    problems.raise_any()
+    problems += trip_problems(table)
+    problems.check()
     return Trips(**vars(table))
 
 
@@ -189,7 +189,7 @@ def read_flows(path: str | os.PathLike[str], network: Network) -> Flows:
     **Raises:** `dvax.InputError` for missing columns, cells that are no numbers, links that the
     network does not have, has twice in the file, or that are missing from it.
     """
-    lines, problems = read_text(path, "a TNTP file").splitlines(), Problems(path)
+    lines, problems = read_text(path, "a TNTP file").splitlines(), FileProblems(path)
     header, rows = _first_row(lines, problems, "From To Volume Cost")
     columns = _read_columns(header, rows, ("from", "to"), ("volume", "cost"), problems)
     if columns is None:
@@ -199,7 +199,7 @@ def read_flows(path: str | os.PathLike[str], network: Network) -> Flows:
         list(zip(columns["from"], columns["to"])), columns["lines"], index, "link from {} to {}",
         network.name, problems,
     )  # fmt: skip
-    problems.raise_any()
+    problems.check()
     return Flows(columns["volume"][rows_of], columns["cost"][rows_of])
 
 
@@ -209,7 +209,7 @@ def read_nodes(path: str | os.PathLike[str], network: Network) -> np.ndarray:
     **Raises:** `dvax.InputError` for missing columns, cells that are no numbers, nodes that the
     network does not have, that stand twice, or that are missing.
     """
-    lines, problems = read_text(path, "a TNTP file").splitlines(), Problems(path)
+    lines, problems = read_text(path, "a TNTP file").splitlines(), FileProblems(path)
     header, rows = _first_row(lines, problems, "Node X Y ;")
     columns = _read_columns(header, rows, ("node",), ("x", "y"), problems)
     if columns is None:
@@ -219,7 +219,7 @@ def read_nodes(path: str | os.PathLike[str], network: Network) -> np.ndarray:
         [(node,) for node in columns["node"]], columns["lines"], index, "node {}", network.name,
         problems,
     )  # fmt: skip
-    problems.raise_any()
+    problems.check()
     return np.stack([columns["x"], columns["y"]], axis=1)[rows_of]
 
 
@@ -232,7 +232,7 @@ def _header_of(lines: list[str], start: int) -> Line | None:
     return None
 
 
-def _first_row(lines: list[str], problems: Problems, example: str) -> tuple[Line, list[Line]]:
+def _first_row(lines: list[str], problems: FileProblems, example: str) -> tuple[Line, list[Line]]:
     """The header of a file without metadata, which is its first row, with or without a ~."""
     for number, text in enumerate(lines, start=1):
         if text.strip():
@@ -243,7 +243,7 @@ def _first_row(lines: list[str], problems: Problems, example: str) -> tuple[Line
 
 def _read_columns(
     header: Line, rows: list[Line], whole: tuple[str, ...], real: tuple[str, ...],
-    problems: Problems, optional: str = "",
+    problems: FileProblems, optional: str = "",
 ) -> dict[str, Any] | None:  # fmt: skip
     """The columns by name with the `lines` of their rows; None where a column is missing."""
     names = _column_names(header.text)
@@ -266,7 +266,7 @@ def _entry(text: str) -> tuple[int, float] | None:
 
 def _one_each(
     keys: list[tuple], lines: np.ndarray, index: dict[tuple, int], title: str, name: str,
-    problems: Problems,
+    problems: FileProblems,
 ) -> np.ndarray:  # fmt: skip
     """The row of each entry of `index`; what is unknown, missing or there twice is reported."""
     rows_of = np.full(len(index), -1)
@@ -290,7 +290,7 @@ def _one_each(
 class _Metadata:
     """The lines `<KEY> value` of a file, and where each stands."""
 
-    def __init__(self, lines: list[str], problems: Problems):
+    def __init__(self, lines: list[str], problems: FileProblems):
         self.problems = problems
         self.values: dict[str, Line] = {}
         self.end = 0

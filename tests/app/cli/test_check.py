@@ -7,9 +7,9 @@ import pytest
 from tests.app.cli.contact import write_config
 from typer.testing import CliRunner
 
-from dvax.app.cli import check as check_module
+from dvax.app.cli.overview import sizes
 from dvax.app.cli.program import app
-from dvax.app.cli.sizes import sizes
+from dvax.app.runs import contact_frames
 from dvax.app.runs.config import build_contact, load_config
 
 
@@ -63,7 +63,7 @@ def test_a_system_outside_the_class_is_refused_only_if_asked(
     tree: Path, monkeypatch: pytest.MonkeyPatch, refuted: dict[str, Any]
 ) -> None:
     rows = [refuted, row("decay_rate"), row("q_rho")]
-    monkeypatch.setattr(check_module, "constant_rows", lambda config: rows)
+    monkeypatch.setattr(contact_frames, "constant_rows", lambda *given: rows)
     lenient = CliRunner().invoke(app, ["check", str(tree)])
     strict = CliRunner().invoke(app, ["check", str(tree), "--strict"])
     assert (lenient.exit_code, strict.exit_code) == (0, 4)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from dvax.app.cli.preload import loaded_ahead
+from dvax.app.cli.preload import preload_when_compiling
 
 MODULE = "colorsys"  # in the standard library, and without consequences
 
@@ -19,13 +19,13 @@ def unloaded(monkeypatch: pytest.MonkeyPatch) -> None:
 def loaded() -> None:
     """Wait for whatever is being loaded, as a program that ends does not."""
     for thread in threading.enumerate():
-        if thread.name == "dvax load":
+        if thread.name == "dvax preload":
             thread.join()
 
 
 def test_events_pass_and_the_first_compilation_loads_the_module() -> None:
     heard: list[dict[str, Any]] = []
-    listen = loaded_ahead(MODULE, heard.append)
+    listen = preload_when_compiling(MODULE, heard.append)
     listen({"event": "warning", "message": "w"})
     assert MODULE not in sys.modules
     listen({"event": "compiling"})
@@ -36,14 +36,14 @@ def test_events_pass_and_the_first_compilation_loads_the_module() -> None:
 
 
 def test_a_run_that_never_compiles_loads_nothing() -> None:
-    listen = loaded_ahead(MODULE, lambda event: None)
+    listen = preload_when_compiling(MODULE, lambda event: None)
     listen({"event": "stopped", "message": "m", "status": "finished"})
     loaded()
     assert MODULE not in sys.modules
 
 
 def test_a_module_that_is_missing_is_left_to_its_use_to_report() -> None:
-    listen = loaded_ahead("no_such_module_anywhere", lambda event: None)
+    listen = preload_when_compiling("no_such_module_anywhere", lambda event: None)
     listen({"event": "compiling"})
     loaded()
     with pytest.raises(ModuleNotFoundError):

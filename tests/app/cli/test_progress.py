@@ -14,13 +14,19 @@ from dvax.app.cli.progress import progress
 def events(count: int) -> Iterator[dict[str, Any]]:
     yield {"event": "compiled", "compile_seconds": 1.25}
     for step in range(1, count + 1):
-        yield {"event": "progress", "t": 2.0 * step / count, "t_end": 2.0, "steps": 10 * step}
+        yield {
+            "event": "progress",
+            "t": 2.0 * step / count,
+            "t_end": 2.0,
+            "steps": 10 * step,
+            "unit": "s",
+        }
     yield {"event": "warning", "message": "the [bold] step shrank"}
     yield {"event": "stopped", "message": "done"}
 
 
 def test_a_pipe_gets_a_line_for_each_tenth(capsys: pytest.CaptureFixture[str]) -> None:
-    with progress("s", quiet=False) as listener:
+    with progress(quiet=False) as listener:
         for event in events(1000):
             listener(event)
     lines = capsys.readouterr().err.splitlines()
@@ -38,16 +44,16 @@ def test_a_model_in_one_piece_says_its_stages(
         {"event": "compiling"},
         {"event": "stage", "stage": "bounding the error"},
     ]
-    with progress("", quiet=False) as listener:
+    with progress(quiet=False) as listener:
         for event in told:
             listener(event)
     assert capsys.readouterr().err.splitlines() == ["solving at rest", "bounding the error"]
     screen = io.StringIO()
     terminal = Console(file=screen, force_terminal=True, width=100, color_system=None)
-    monkeypatch.setattr(progress_module, "remarks", lambda: terminal)
+    monkeypatch.setattr(progress_module, "console", lambda stderr: terminal)
     for end, shown in ((2, "solving at rest"), (3, "bounding the error")):
         screen.truncate(0)
-        with progress("", quiet=False) as listener:
+        with progress(quiet=False) as listener:
             for event in told[:end]:
                 listener(event)
         # What stands there last, when the bar is drawn for the last time.
@@ -56,7 +62,7 @@ def test_a_model_in_one_piece_says_its_stages(
 
 
 def test_quiet_still_warns(capsys: pytest.CaptureFixture[str]) -> None:
-    with progress("s", quiet=True) as listener:
+    with progress(quiet=True) as listener:
         for event in events(10):
             listener(event)
     assert capsys.readouterr().err == "warning: the [bold] step shrank\n"
@@ -65,8 +71,8 @@ def test_quiet_still_warns(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_terminal_gets_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     screen = io.StringIO()
     terminal = Console(file=screen, force_terminal=True, width=100, color_system=None)
-    monkeypatch.setattr(progress_module, "remarks", lambda: terminal)
-    with progress("s", quiet=False) as listener:
+    monkeypatch.setattr(progress_module, "console", lambda stderr: terminal)
+    with progress(quiet=False) as listener:
         for event in events(10):
             listener(event)
     shown = screen.getvalue()
@@ -77,6 +83,6 @@ def test_a_terminal_gets_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_model_names_its_own_unit_or_none(capsys: pytest.CaptureFixture[str]) -> None:
     for unit, shown in (("days", "t = 1 of 2 days (50%)"), ("", "t = 1 of 2 (50%)")):
-        with progress("", quiet=False) as listener:
+        with progress(quiet=False) as listener:
             listener({"event": "progress", "t": 1.0, "t_end": 2.0, "steps": 3, "unit": unit})
         assert capsys.readouterr().err.startswith(shown)

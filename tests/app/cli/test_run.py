@@ -89,7 +89,12 @@ def stand_in(status: str, code: int, directory: Path) -> Callable[..., driver.Ru
         options["on_event"]({"event": "warning", "message": "the step shrank"})
         reason = "f returned NaN at t = 3.2, component 17."
         return driver.RunOutcome(
-            status=status, exit_code=code, stop_reason=reason, directory=directory, summary={}
+            status=status,
+            exit_code=code,
+            stop_reason=reason,
+            directory=directory,
+            summary={},
+            has_results=True,
         )
 
     return run

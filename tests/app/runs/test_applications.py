@@ -11,8 +11,8 @@ import xarray
 import dvax
 from dvax.app.plots import build_report
 from dvax.app.runs.applications.config import APPLICATIONS, ModelConfig, module_of, read_config
-from dvax.app.runs.applications.driver import run_model
 from dvax.app.runs.compile_time import compile_seconds
+from dvax.app.runs.driver import run
 
 TANK = """* a tank that a diode damps in one half-wave
 C1 1 0 1u IC=10
@@ -33,7 +33,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def outcome(folder):
-    return run_model(read_config(folder / "tank.toml"), folder / "run")
+    return run(read_config(folder / "tank.toml"), folder / "run")
 
 
 def written(folder, text, name="bad.toml"):
@@ -123,7 +123,7 @@ def test_a_run_leaves_figures_data_and_a_report(folder, outcome):
 def test_the_resolved_configuration_is_the_same_run(outcome, tmp_path):
     moved = tmp_path / "moved"
     shutil.copytree(outcome.directory, moved)
-    again = run_model(read_config(moved / "config.resolved.toml"), tmp_path / "again")
+    again = run(read_config(moved / "config.resolved.toml"), tmp_path / "again")
     assert again.summary == outcome.summary
     # Each run counts the compilations of its own, and not those of the process before it.
     manifests = [json.loads((o.directory / "manifest.json").read_text()) for o in (outcome, again)]
@@ -184,7 +184,7 @@ def test_the_reference_figures_come_out_of_a_run(name, tmp_path):
             copy = shutil.copytree if (SHARED / given).is_dir() else shutil.copy
             copy(SHARED / given, tmp_path / given)
     file = written(tmp_path, f'[model]\nname = "{name}"\n{lines}')
-    outcome = run_model(read_config(file), tmp_path / "run")
+    outcome = run(read_config(file), tmp_path / "run")
     assert outcome.exit_code == 0
     reached = np.atleast_1d(outcome.summary[figure]["value"])[: np.size(value)]
     np.testing.assert_allclose(reached, np.atleast_1d(value), rtol=relative)

@@ -5,6 +5,7 @@ import time
 import jax
 import numpy as np
 import pytest
+import tomli_w
 
 from dvax.app.runs.config import build_contact, load_config, with_points
 from dvax.app.runs.resolved import write_resolved
@@ -87,7 +88,7 @@ def test_the_resolved_configuration_gives_the_same_run_elsewhere(tmp_path):
     changes = {"initial.expression": "sin(s)", "demand.knots": [0.5], "load.series.kind": "cubic"}
     config = load_config(write(tmp_path / "a", changes))
     inputs = build_contact(config)
-    again = load_config(write_resolved(config, inputs, tmp_path / "b"))
+    again = load_config(write_resolved(config, tmp_path / "b"))
     for section in ("units", "model", "boundary", "initial", "time", "solver", "output"):
         assert getattr(again, section) == getattr(config, section), section
     copied = build_contact(again)
@@ -96,7 +97,7 @@ def test_the_resolved_configuration_gives_the_same_run_elsewhere(tmp_path):
     np.testing.assert_array_equal(copied.demand_signal(0.9), inputs.demand_signal(0.9))
     assert {f.sha256 for f in copied.data_files} == {f.sha256 for f in inputs.data_files}
     for text in ("frames = 4", "atol = ", "companion = ", "points_of_interest", 'kind = "cubic"'):
-        assert text in again.to_toml()
+        assert text in tomli_w.dumps(again.tree())
 
 
 def test_a_rectangle_has_its_points_in_c_order(tmp_path):

@@ -52,7 +52,7 @@ def loads(path) -> bool:
         for problem in refused.problems:
             assert problem.place and problem.given and problem.rule and problem.fix, problem
         return False
-    assert config.to_toml()
+    assert config.tree()
     return True
 
 

@@ -96,9 +96,9 @@ def test_all_flaws_of_a_file_up_to_twenty(tmp_path):
     rows = ["0,1", "1,", "2,x", "3", "4,nan"]
     found = problems_of(write(tmp_path, load_csv="\n".join(["time [s],load [um/s]", *rows])))
     assert [p.place for p in found] == [
+        "load.csv, line 5",
         "load.csv, line 3, column 'load'",
         "load.csv, line 4, column 'load'",
-        "load.csv, line 5",
         "load.csv, line 6, column 'load'",
     ]
     bad = "time [s],load [um/s]\n" + "1,x\n" * 500

@@ -54,15 +54,3 @@ def test_all_three_regimes_occur_and_the_decay_criterion_holds():
     share = seen.mean(axis=1) / record.times.size
     assert np.all(share > 0.1), f"unloaded, active, saturated: {share}"
     assert np.mean(np.all(seen > 0, axis=0)) > 0.5, "most points pass through all three"
-
-
-def test_the_demo_writes_itself_at_any_resolution(tmp_path):
-    (tmp_path / "coarse").mkdir()
-    (tmp_path / "full").mkdir()
-    coarse = build_contact(load_config(generate.write_demo(tmp_path / "coarse", 2500)))
-    assert coarse.boundary.size == 2500 and coarse.x0.shape == (2500,)
-    full = generate.write_demo(tmp_path / "full")
-    for name in (generate.CONFIG, generate.PROFILE, generate.LOAD):
-        assert (full.parent / name).read_bytes() == (generate.FOLDER / name).read_bytes()
-    with pytest.raises(ValueError, match="cannot carry the roughness"):
-        generate.write_demo(tmp_path, 1000)

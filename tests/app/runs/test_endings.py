@@ -33,9 +33,9 @@ def test_where_nothing_can_be_written_the_old_file_stays_and_no_part_is_left(
     tmp_path: Path,
 ) -> None:
     file = tmp_path / "summary.json"
-    write_whole(file, "old")
+    write_whole(file, b"old")
     with room_for(1000), pytest.raises(OSError) as caught:
-        write_whole(file, "x" * 100_000)
+        write_whole(file, b"x" * 100_000)
     assert caught.value.filename == str(file)
     assert file.read_text() == "old" and os.listdir(tmp_path) == ["summary.json"]
 

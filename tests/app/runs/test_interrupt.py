@@ -113,7 +113,7 @@ def held(error):  # in the main thread: a lock that nobody gives back, as foreig
     lock.acquire()
 
 import dvax.app.cli.failure
-dvax.app.cli.failure.complain_of = held
+dvax.app.cli.failure.print_problems = held
 sys.argv[1:] = ["check", "no such file.toml"]
 main()
 """

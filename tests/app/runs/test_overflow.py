@@ -20,12 +20,14 @@ from dvax._figure_text import entry_text
 from dvax.app.cli.program import app
 from dvax.app.plots.lines import LARGEST, positive
 from dvax.app.plots.theme import number
-from dvax.app.runs import driver
+from dvax.app.runs import contact_run, driver
 from dvax.app.runs.blocks import block_length, longest_block
 from dvax.app.runs.config import load_config
-from dvax.app.runs.json_numbers import bound_meaning, json_ready
+from dvax.app.runs.figure import Figure
+from dvax.app.runs.json_numbers import json_ready
+from dvax.app.runs.schema import SolverKeys
 from dvax.app.runs.solutions import all_finite
-from dvax.app.runs.solver_options import short_dt_max
+from dvax.app.runs.solver_options import check_dt_max
 from dvax.errors import InputError, InputProblem, SolveError
 
 INFINITE = {"Hadamard": [("d_x = 0.2", "d_x = 900.0"), ("end = 1.0", "end = 1.2")]}
@@ -48,7 +50,8 @@ def test_a_number_has_one_spelling_in_json_and_one_on_the_screen(value, spelled,
         assert number(known) == entry_text({"value": known}) == shown
     bound = {"value": spelled, "bound": "proved", "error": spelled}
     assert entry_text(bound) == ("≤ 1.5" if spelled == 1.5 else shown)
-    assert ("says nothing" in bound_meaning("a bound", value)) == (not math.isfinite(value))
+    meaning = Figure(value, "1", "a bound", bound="proved").to_json()["meaning"]
+    assert ("says nothing" in meaning) == (not math.isfinite(value))
 
 
 def test_a_log_axis_has_room_for_what_is_drawn() -> None:
@@ -105,7 +108,7 @@ def test_whatever_ends_a_solve_closes_the_manifest(
     def solve(*_: Any, **__: Any) -> None:
         raise error
 
-    monkeypatch.setattr(driver, "solve", solve)
+    monkeypatch.setattr(contact_run, "solve", solve)
     config, out = load_config(write_config(tmp_path / "in")), tmp_path / "out"
     if code is None:
         with pytest.raises(TypeError, match="odd"):
@@ -152,10 +155,13 @@ def test_the_longest_block_is_what_a_solve_covers(frames: int) -> None:
     ]
     span = longest_block(times, 24)
     assert span == max(spans)
-    problem = short_dt_max(1e-9 * span, 1000, span, "a.toml: solver")
-    assert problem is not None and problem.place == "a.toml: solver.dt_max"
+    with pytest.raises(dvax.InputError) as caught:
+        check_dt_max(SolverKeys(dt_max=1e-9 * span, max_steps=1000), span, "a.toml: solver")
+    (problem,) = caught.value.problems
+    assert problem.place == "a.toml: solver.dt_max"
     named = re.search(r"dt_max = (\S+) or more", problem.fix)
-    assert named and short_dt_max(float(named[1]), 1000, span, "") is None
+    assert named is not None
+    check_dt_max(SolverKeys(dt_max=float(named[1]), max_steps=1000), span, "")
 
 
 @pytest.mark.thorough

@@ -19,8 +19,8 @@ from dvax.app.runs.applications.base import Plan
 from dvax.app.runs.applications.certificate import certificate
 from dvax.app.runs.applications.circuit import CircuitApplication
 from dvax.app.runs.applications.config import read_config
-from dvax.app.runs.applications.driver import run_model
-from dvax.app.runs.applications.segments import joined, segments
+from dvax.app.runs.applications.segments import join_pieces, segments
+from dvax.app.runs.driver import run
 from dvax.app.runs.interrupt import Terminated, interruptible
 from dvax.errors import Fix
 
@@ -56,7 +56,7 @@ class Stops:
 def whole(tmp_path_factory):
     """The run to its end."""
     folder = tmp_path_factory.mktemp("whole")
-    return run_model(configured(folder), folder / "out")
+    return run(configured(folder), folder / "out")
 
 
 SOLVE_ERROR = dvax.SolveError(
@@ -76,7 +76,7 @@ def test_a_run_that_stops_keeps_its_frames_and_the_report_opens(
     whole, tmp_path, error, status, code
 ):
     config = configured(tmp_path)
-    outcome = run_model(config, tmp_path / "part", on_event=Stops(3, error))
+    outcome = run(config, tmp_path / "part", on_event=Stops(3, error))
     assert (outcome.exit_code, outcome.status, outcome.has_results) == (code, status, True)
     everything, part = frames_of(whole.directory), frames_of(outcome.directory)
     assert 2 <= part.sizes["time"] < everything.sizes["time"] == 21
@@ -105,13 +105,10 @@ def test_a_run_that_stops_keeps_its_frames_and_the_report_opens(
 
 @pytest.mark.thorough  # a program of its own for every max_steps
 def test_a_failed_solve_keeps_what_it_reached_and_names_the_key_of_the_file(tmp_path):
-    outcome = run_model(configured(tmp_path, "max_steps = 12\n"), tmp_path / "out")
+    outcome = run(configured(tmp_path, "max_steps = 12\n"), tmp_path / "out")
     assert outcome.exit_code == 3 and "Write model.max_steps = " in outcome.stop_reason
     enough = int(outcome.stop_reason.split("model.max_steps = ")[1].split(",")[0])
-    assert (
-        run_model(configured(tmp_path, f"max_steps = {enough}\n"), tmp_path / "again").exit_code
-        == 0
-    )
+    assert run(configured(tmp_path, f"max_steps = {enough}\n"), tmp_path / "again").exit_code == 0
 
 
 def plan_of_the_closed_form(count: int, **settings) -> Plan:
@@ -137,7 +134,7 @@ def plan_of_the_closed_form(count: int, **settings) -> Plan:
 def test_pieces_join_to_a_solution_whose_bound_holds(count, settings):
     plan = plan_of_the_closed_form(count, **settings)
     pieces = list(segments(plan))
-    found = joined(pieces)
+    found = join_pieces(pieces)
     np.testing.assert_array_equal(found.ts, plan.times)
     assert found.defect is not None and found.settled is not None
     assert np.all(np.diff(found.defect) >= 0) and np.all(found.defect >= found.settled[0])
@@ -166,7 +163,7 @@ def test_states_alone_are_kept_where_there_is_no_time_for_more(tmp_path, whole, 
         raise KeyboardInterrupt  # a second signal
 
     monkeypatch.setattr(CircuitApplication, "results", hurried)
-    outcome = run_model(config, tmp_path / "part", on_event=Stops(3, KeyboardInterrupt()))
+    outcome = run(config, tmp_path / "part", on_event=Stops(3, KeyboardInterrupt()))
     assert outcome.exit_code == 130 and "states alone" in outcome.stop_reason
     part, everything = frames_of(outcome.directory), frames_of(whole.directory)
     kept = everything.isel(time=slice(part.sizes["time"]))
@@ -207,29 +204,29 @@ main()
             for stage, command in (
                 ("plan", "run"),
                 ("results", "run"),
-                ("read", "run"),
-                ("read", "check"),
+                ("__init__", "run"),
+                ("__init__", "check"),
             )
         ],
-        [("plan", "run", signal.SIGTERM), ("read", "check", signal.SIGINT)],
+        [("plan", "run", signal.SIGTERM), ("__init__", "check", signal.SIGINT)],
     ),
 )
 def test_a_signal_ends_a_compiled_loop_without_end(tmp_path, stage, command, number):
     configured(tmp_path)
     out = tmp_path / "out"
     words = [command, str(tmp_path / "tank.toml"), *(["-o", str(out)] if command == "run" else [])]
-    run = subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, "-c", FOREVER, stage, *words], stderr=subprocess.PIPE, text=True,
         env=os.environ | {"PYTHONPATH": str(Path(dvax.__file__).parents[1])},
     )  # fmt: skip
-    assert run.stderr is not None
-    for line in run.stderr:
+    assert process.stderr is not None
+    for line in process.stderr:
         if line.startswith("endless"):
             break
-    run.send_signal(number)
-    _, text = run.communicate(timeout=100)  # without the signal it would never end
-    assert run.returncode == (130 if number == signal.SIGINT else 143), text
+    process.send_signal(number)
+    _, text = process.communicate(timeout=100)  # without the signal it would never end
+    assert process.returncode == (130 if number == signal.SIGINT else 143), text
     assert "Traceback" not in text
-    if command == "run" and stage != "read":
+    if command == "run" and stage != "__init__":
         manifest = json.loads((out / "manifest.json").read_text())
         assert manifest["status"] == "interrupted"

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 import dvax
-from dvax.app.runs.applications.config import APPLICATIONS, module_of, read_config
-from dvax.app.runs.schema import SolverSection
-from dvax.app.runs.solver_options import SolverKeys, event_driven, in_keys_of, settings
+from dvax.app.runs.applications.config import APPLICATIONS, module_of, read_config, wording_of
+from dvax.app.runs.schema import SolverKeys, SolverSection
+from dvax.app.runs.solver_options import event_driven, settings
 from dvax.errors import Fix
 
 OPTIONS = {"method", "rtol", "atol", "dt", "dt_max", "max_steps", "vi_solver"}
@@ -57,7 +57,7 @@ def test_what_is_given_goes_to_solve_and_drops_the_defaults_of_the_other_kind(gi
     ],
 )
 def test_a_fix_is_a_key_of_the_file_or_nothing(name: str, fix: Fix, said: str | None) -> None:
-    assert in_keys_of(module_of(name).APPLICATION.section, "model")(fix) == said
+    assert wording_of(module_of(name).APPLICATION, "a.toml").fix(fix) == said
 
 
 @pytest.mark.parametrize(

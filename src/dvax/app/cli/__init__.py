@@ -1,7 +1,7 @@
 """The command line: `dvax run`, `check`, `report`, `demo`, `doctor`.
 
-Thin: it reads what the user typed, calls the rooms below, and says what came of it. Nothing heavy
-is imported before a command needs it, so that `dvax --help` answers at once.
+It reads the arguments, calls `runs` and `plots`, and prints the outcome. Nothing heavy is imported
+before a command needs it, so that `dvax --help` answers at once.
 """
 
 import os
@@ -41,8 +41,8 @@ def _start() -> None:
 
 
 def _end(code: int) -> NoReturn:
-    # All is on disk. The compiler cannot be interrupted: it may still be at work in threads of its own,
-    # and taking the interpreter down around them ends in a crash.
+    # All results are on disk. The compiler cannot be interrupted, and an interpreter that shuts down
+    # while compiler threads run crashes: end the process at once.
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)

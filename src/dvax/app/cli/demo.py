@@ -12,8 +12,6 @@ from dvax.app.cli.load import load
 from dvax.app.cli.options import Debug, Force, Quiet
 from dvax.app.cli.resample import resample
 from dvax.app.cli.run import carry_out
-from dvax.app.cli.target import target_problems
-from dvax.errors import InputError
 
 CONFIG = "rough_strip.toml"
 
@@ -32,10 +30,10 @@ def demo(
 ) -> None:
     """Solve a rough contact strip under an irregular load."""
     with reported(debug, out):
-        problems = target_problems(out, force=force)
-        if problems:
-            raise InputError(*problems)
         from dvax.app.runs.interrupt import interruptible
+        from dvax.app.runs.rundir import target_problems
+
+        target_problems(out, force=force).raise_any()
 
         # The folders must outlive the run, which copies the data it names.
         with as_file(files("dvax.app.runs") / "demo") as shipped, TemporaryDirectory() as sampled:

@@ -1,14 +1,14 @@
-"""`dvax doctor`: what this installation is, and whether it computes what it should."""
+"""`dvax doctor`: describe this installation, and test that it computes correctly."""
 
 from pathlib import Path
 
 import typer
 
 from dvax.app.cli import machine
-from dvax.app.cli.console import complain, table
+from dvax.app.cli.console import print_error, print_table
 from dvax.app.cli.failure import SOLVER_FAILED, reported
+from dvax.app.cli.load import enable_double
 from dvax.app.cli.options import Debug
-from dvax.app.cli.precision import enable_double
 from dvax.app.cli.selftest import ALLOWED, END, self_test
 
 Row = tuple[str, str, str]
@@ -21,9 +21,9 @@ def doctor(debug: Debug = False) -> None:
         from dvax.app.runs.interrupt import interruptible
 
         rows = interruptible(lambda: [*_installation(wrong), *_machine(), *_numbers(wrong)])
-        table(("what", "found", "remark"), rows)
+        print_table(("what", "found", "remark"), rows)
         for text in wrong:
-            complain(f"error: {text}")
+            print_error(f"error: {text}")
         if wrong:
             raise typer.Exit(SOLVER_FAILED)
 
@@ -42,14 +42,11 @@ def _installation(wrong: list[str]) -> list[Row]:
 
 def _machine() -> list[Row]:
     memory = machine.memory_gib()
-    browser, siconos = machine.chromium(), machine.siconos()
     reason = machine.unwritable(Path.cwd())
     return [
         ("cores", str(machine.cores()), "that this process may use"),
         ("memory", "unknown" if memory is None else f"{memory:.1f} GiB", ""),
         ("working folder", str(Path.cwd()), reason or "can be written"),
-        ("Chromium", browser or "none", "only the browser test of the report needs it"),
-        ("Siconos", siconos or "none", "only the benchmarks compare with it"),
     ]
 
 
@@ -59,7 +56,7 @@ def _numbers(wrong: list[str]) -> list[Row]:
     import jax.numpy as jnp
 
     devices = ", ".join(f"{device.device_kind} ({device.platform})" for device in jax.devices())
-    # 1 + 2⁻⁵² differs from 1 in double precision only; asked of the device, not of the setting.
+    # 1 + 2⁻⁵² differs from 1 in double precision only. This tests the device, not the setting.
     double = bool(jax.jit(lambda one: one + 2.0**-52 > one)(jnp.asarray(1.0)))
     if not double:
         wrong.append("the device computes in single precision. Choose another: JAX_PLATFORMS=cpu.")

@@ -1,4 +1,4 @@
-"""What an error becomes: all its problems on the screen, and an exit code for scripts."""
+"""From an error to all its problems on the screen, and to an exit code for scripts."""
 
 import errno
 import shutil
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import typer
 
-from dvax.app.cli.console import complain, complain_of
+from dvax.app.cli.console import print_error, print_problems
 from dvax.errors import DvaxError, InputError, SolveError
 
 BAD_INPUT, SOLVER_FAILED, OUT_OF_CLASS, DISK_FULL = 2, 3, 4, 5
@@ -18,9 +18,9 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 @contextmanager
 def reported(debug: bool, out: Path | None = None) -> Iterator[None]:
-    """Say what went wrong without a traceback (with `debug`, after one) and exit with its code.
+    """Print what went wrong without a traceback (with `debug`, after one) and exit with its code.
 
-    An exception that is none of these is a defect of dvax: it is left to Python, traceback and all.
+    Any other exception is a defect of dvax, and Python prints its traceback.
     """
     from dvax.app.runs.interrupt import TERMINATED, exit_code, terminable
 
@@ -29,33 +29,30 @@ def reported(debug: bool, out: Path | None = None) -> Iterator[None]:
             yield
     except InputError as error:
         _trace(debug)
-        complain_of(error)
+        print_problems(error)
         raise typer.Exit(BAD_INPUT) from error
-    except SolveError as error:
-        _trace(debug)
-        complain(f"error: {error}")
-        raise typer.Exit(SOLVER_FAILED) from error
     except DvaxError as error:
         _trace(debug)
-        complain(f"error: {error}")
-        raise typer.Exit(BAD_INPUT) from error
+        print_error(f"error: {error}")
+        code = SOLVER_FAILED if isinstance(error, SolveError) else BAD_INPUT
+        raise typer.Exit(code) from error
     except OSError as error:
         _trace(debug)
         if error.errno in _FULL:
-            complain(_full(error, out))
+            print_error(_full(error, out))
             raise typer.Exit(DISK_FULL) from error
         place = error.filename or out or "a file"
-        complain(f"error: {place}: {error.strerror or error}. Make it accessible.")
+        print_error(f"error: {place}: {error.strerror or error}. Make it accessible.")
         raise typer.Exit(BAD_INPUT) from error
     except KeyboardInterrupt as stop:
         _trace(debug)
         code = exit_code(stop)
-        complain("terminated" if code == TERMINATED else "interrupted")
+        print_error("terminated" if code == TERMINATED else "interrupted")
         raise typer.Exit(code) from stop
 
 
 def _full(error: OSError, out: Path | None) -> str:
-    """What to do where nothing more can be written: the place, what is left there, the way out."""
+    """The message for a full disk: the place, the free space there, and the fix."""
     place = Path(error.filename or out or Path.cwd())
     folder = next((p for p in (place, *place.parents) if p.is_dir()), Path.cwd())
     left = shutil.disk_usage(folder).free / 2**20
@@ -67,4 +64,4 @@ def _full(error: OSError, out: Path | None) -> str:
 
 def _trace(debug: bool) -> None:
     if debug:
-        complain(traceback.format_exc())
+        print_error(traceback.format_exc())

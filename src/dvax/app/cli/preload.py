@@ -1,7 +1,7 @@
-"""What the report needs, loaded while the compiler works.
+"""Import what the report needs while the compiler works.
 
 Plotly and Matplotlib take a second or two to import. Compiling the time loop takes longer and is
-no Python, so that both go on side by side.
+no Python, so that both run side by side.
 """
 
 from contextlib import suppress
@@ -11,21 +11,20 @@ from threading import Thread
 from dvax.app.cli.progress import Event, Listener
 
 
-def loaded_ahead(module: str, listener: Listener) -> Listener:
-    """A listener in the place of `listener` that imports `module` once the run compiles.
+def preload_when_compiling(module: str, listener: Listener) -> Listener:
+    """A listener that passes events on to `listener`, and imports `module` once the run compiles.
 
-    What goes wrong there goes wrong again, and is said, where the module is used.
+    An import that fails fails again, and is reported, where the module is used.
     """
+
+    def load() -> None:
+        with suppress(Exception):
+            import_module(module)
 
     def listen(event: Event) -> None:
         if event["event"] == "compiling":
-            # Nobody waits for it: who needs the module imports it, and waits for this import then.
-            Thread(target=_load, args=(module,), name="dvax load", daemon=True).start()
+            # No join: an import of the module waits for one that is under way.
+            Thread(target=load, name="dvax preload", daemon=True).start()
         listener(event)
 
     return listen
-
-
-def _load(module: str) -> None:
-    with suppress(Exception):
-        import_module(module)

@@ -14,7 +14,7 @@ app = typer.Typer(
     name="dvax",
     no_args_is_help=True,
     add_completion=False,
-    # A traceback is Python's own, and only for a defect or with --debug: user errors have none.
+    # Tracebacks are Python's own, for defects and with --debug; user errors have none.
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     help=(
@@ -41,7 +41,7 @@ def _program(
         typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
     ] = False,
 ) -> None:
-    """The options of the program itself; each command brings its own."""
+    """Options of the program itself; each command has its own."""
 
 
 for command in (run, check, report, demo, doctor):

@@ -1,8 +1,8 @@
-"""What a run says while it runs: a bar with the time left on a terminal, lines in a pipe.
+"""The progress of a run: a bar with the time left on a terminal, lines in a pipe.
 
 The driver sends events, dicts with `event` one of compiling, compiled, progress, stage, warning,
 stopped. A model that is solved in one piece has stages in the place of progress.
-Compile time is shown apart: it is paid once, and says nothing about how long the rest will take.
+Compile time is shown apart: it occurs once, and does not predict the time of the rest.
 """
 
 import time
@@ -10,47 +10,46 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from dvax.app.cli.console import remark, remarks
+from dvax.app.cli.console import console, print_remark
 
 Event = dict[str, Any]
 Listener = Callable[[Event], None]
 
-# In a pipe: one line for each tenth of the run, and a sign of life at least this often.
+# In a pipe: one line for each tenth of the run, and at least one in this time.
 LINES, SECONDS_BETWEEN = 10, 30.0
 
 
 @contextmanager
-def progress(unit: str, *, quiet: bool) -> Iterator[Listener]:
-    """A listener for the events of a run whose time is measured in `unit`."""
+def progress(*, quiet: bool) -> Iterator[Listener]:
+    """A listener for the events of a run."""
     if quiet:
         yield _warnings_alone
-    elif remarks().is_terminal:
-        with _bar(unit) as listener:
+    elif console(stderr=True).is_terminal:
+        with _bar() as listener:
             yield listener
     else:
-        yield _Lines(unit)
+        yield _Lines()
 
 
 def _warnings_alone(event: Event) -> None:
     if event["event"] == "warning":
-        remark(f"warning: {event['message']}")
+        print_remark(f"warning: {event['message']}")
 
 
 class _Lines:
     """Plain lines: compiled, every tenth of the way or every stage, warnings."""
 
-    def __init__(self, unit: str):
-        self.unit = unit
+    def __init__(self) -> None:
         self.tenth = 0
         self.began = self.spoke = time.monotonic()
 
     def __call__(self, event: Event) -> None:
         _warnings_alone(event)
         if event["event"] == "compiled":
-            remark(f"compiled in {event['compile_seconds']:.1f} s")
+            print_remark(f"compiled in {event['compile_seconds']:.1f} s")
             self.began = self.spoke = time.monotonic()
         elif event["event"] == "stage":
-            remark(event["stage"])
+            print_remark(event["stage"])
         elif event["event"] == "progress":
             self._advance(event)
 
@@ -61,19 +60,19 @@ class _Lines:
             return
         self.tenth, self.spoke = int(done * LINES), now
         left = (now - self.began) * (1 - done) / done if done > 0 else float("nan")
-        remark(
-            f"t = {event['t']:.6g} of {event['t_end']:.6g}{_unit(event, self.unit)} ({done:.0%}), "
+        print_remark(
+            f"t = {event['t']:.6g} of {event['t_end']:.6g}{_unit(event)} ({done:.0%}), "
             f"{event['steps']} steps, {left:.0f} s left"
         )
 
 
-def _unit(event: Event, unit: str) -> str:
-    """The unit of time with a space before it: that of the event, where it names one."""
-    return f" {event.get('unit', unit)}".rstrip()
+def _unit(event: Event) -> str:
+    """The unit of time with a space before it, where the event names one."""
+    return f" {event.get('unit', '')}".rstrip()
 
 
 @contextmanager
-def _bar(unit: str) -> Iterator[Listener]:
+def _bar() -> Iterator[Listener]:
     from rich.progress import (
         BarColumn,
         Progress,
@@ -82,7 +81,6 @@ def _bar(unit: str) -> Iterator[Listener]:
         TimeRemainingColumn,
     )
 
-    console = remarks()
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -92,7 +90,7 @@ def _bar(unit: str) -> Iterator[Listener]:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console) as bar:
+    with Progress(*columns, console=console(stderr=True)) as bar:
         task = bar.add_task("starting", total=None, where="")
         staged = False
 
@@ -108,11 +106,11 @@ def _bar(unit: str) -> Iterator[Listener]:
                 bar.console.print(f"compiled in {seconds:.1f} s", markup=False)
                 bar.reset(task, description="solving", where="")
             elif kind == "stage":
-                # Compiling is a part of the first stage, and says less than its name.
+                # Compiling is a part of the first stage, whose name is more informative.
                 staged = True
                 bar.update(task, description=event["stage"])
             elif kind == "progress":
-                where = f"t = {event['t']:.4g}{_unit(event, unit)}, {event['steps']} steps"
+                where = f"t = {event['t']:.4g}{_unit(event)}, {event['steps']} steps"
                 bar.update(task, completed=event["t"], total=event["t_end"], where=where)
 
         yield listen

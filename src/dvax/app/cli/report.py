@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from dvax.app.cli.console import remark, say
+from dvax.app.cli.console import print_line, print_remark
 from dvax.app.cli.failure import reported
 from dvax.app.cli.options import Debug
 
@@ -25,8 +25,8 @@ def report(
         from dvax.app.runs.rundir import close_killed
 
         if close_killed(directory):
-            remark("the run was killed: its complete frames are kept")
-        say(str(interruptible(lambda: build_report(directory))))
+            print_remark("the run was killed: its complete frames are kept")
+        print_line(str(interruptible(lambda: build_report(directory))))
 
 
 def _import() -> None:

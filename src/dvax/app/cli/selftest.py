@@ -1,4 +1,4 @@
-"""The installation solves a problem with a known solution: C1, the paper's contact law at a point.
+"""A self-test: solve a problem in closed form, C1, the paper's contact law at a point.
 
 α = 1, d_x = ½, d_u = 1, b_x = 2, b_u = 1, β = 1, κ₀ = ½, g = 1, ℓ = 3, x₀ = −1: the point goes from
 saturated through active to unloaded, and x(2) is a number in closed form.
@@ -17,7 +17,7 @@ ALLOWED = 1e-9
 
 @dataclass(frozen=True)
 class SelfTest:
-    """What came out: the computed x(2), its true error, and the seconds it took."""
+    """The computed x(2), its true error, and the time of the solve in seconds."""
 
     value: float
     error: float

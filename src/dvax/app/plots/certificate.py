@@ -33,7 +33,7 @@ def certificate_picture(run: RunRecord) -> Picture | None:
         unit = f" [{run.unit(name)}]" if run.unit(name) and not shared else ""
         curves.append(Curve(run.time, run.series(name), legend + status + unit, colour, dash))
     weak = {run[name].status for name in held} - {"", "proved"}
-    # Nothing is called certified but what is proved.
+    # Only proved bounds are called certified.
     title = f"Error bound against time, {max(weak)}" if weak else "Certified error against time"
     return panels_picture(
         "certificate", title, _caption(run, held), [Panel(curves, "error bound", shared, log=True)],

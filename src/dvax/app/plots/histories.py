@@ -40,8 +40,8 @@ def histories_picture(run: RunRecord, reduced: Reduced) -> Picture:
 
 
 def _choose(run: RunRecord, reduced: Reduced) -> tuple[list[int], str]:
-    """The points that the configuration asks for, and why these; without any, three that tell the run
-    apart."""
+    """Return the points that the configuration names, by default those of the highest, median and
+    lowest mean pressure, and a sentence that says which."""
     asked = run.config.get("output", {}).get("points_of_interest") or []
     if asked:
         nearest = [_nearest(run, np.atleast_1d(np.asarray(place, float))) for place in asked]

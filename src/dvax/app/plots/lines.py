@@ -1,4 +1,4 @@
-"""Curves over time, thinned to what a screen can show without losing a peak."""
+"""Thin curves over time to the resolution of a screen without losing a peak."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The page itself: one HTML file that holds its pictures, its script and its style.
+"""The page: one HTML file that holds its pictures, its script and its style.
 
 Nothing is fetched: Plotly's script is written into the file, and figures are JSON beside it.
 """
@@ -84,11 +84,11 @@ def _subtitle(run: RunRecord) -> str:
 
 
 def _banner(run: RunRecord) -> str:
-    """What the reader must know first: the run is partial, frames are left out, warnings."""
+    """Notices at the top of the page: the run is partial, frames are left out, warnings."""
     lines: list[str] = []
     if run.status in UNFINISHED:
         reach = _reach(run)
-        # A run that was killed could not say why: its manifest still says that it goes on.
+        # The manifest of a killed run still says that the run is going on.
         gone = run.status == "running"
         reason = "" if gone else str(run.manifest.get("stop_reason") or "")
         text = " ".join(part for part in (UNFINISHED[run.status], reach, reason) if part)
@@ -106,7 +106,7 @@ def _reach(run: RunRecord) -> str:
     if run.trajectory is None:
         return "No results were written."
     if run.model != CONTACT:
-        return ""  # the reason says how far it came
+        return ""  # the stop reason states how far the run came
     unit = run.unit("time")
     end = run.config.get("time", {}).get("end")
     aim = f" of {end:g} {unit}" if isinstance(end, int | float) else ""
@@ -115,7 +115,7 @@ def _reach(run: RunRecord) -> str:
 
 
 def _section(picture: Picture) -> str:
-    # "<" written as an escape: no text of the run can close the script element.
+    # "<" is escaped, so that no text of the run can close the script element.
     figure = str(picture.interactive.to_json()).replace("<", "\\u003c")
     height = picture.interactive["layout"]["height"]
     return f"""<section><h2>{_escape(picture.title)}</h2>{_control(picture)}

@@ -90,7 +90,7 @@ def bound_panel(x: np.ndarray, bound: Variable, unit: str, colour: int = 1, **mo
 
 
 def bound_title(bound: Variable) -> str:
-    """What a picture of a bound is called: nothing is certified but what is proved."""
+    """Return the title of a picture of a bound: only a proved bound is called certified."""
     return "Certified error" if bound.status == "proved" else f"Error bound, {bound.status}"
 
 

@@ -1,4 +1,4 @@
-"""What every picture of the report hands over: an interactive figure, a still one, a caption."""
+"""A picture of the report: an interactive figure, a still one, and a caption."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 
 @dataclass(frozen=True)
 class Views:
-    """Alternatives of which one shows at a time: trace i of the figure belongs to `labels[i]`.
+    """Alternative views, one of which is visible at a time: trace i of the figure belongs to
+    `labels[i]`.
 
     `slider` chooses a slider instead of buttons; `name` says what is being chosen; `first` is
     the one that shows when the page opens.

@@ -1,8 +1,7 @@
-"""A run directory, read: the trajectory opened lazily, the manifest, the summary, the constants.
+"""Read a run directory: the manifest, the summary, the constants, and the trajectory lazily.
 
-Nothing is loaded here but the small files and the time axis; a trajectory of a million points stays
-on disk until a picture asks for it, block by block (see `downsample.py`).
-"""
+Only the small files and the time axis are loaded here; the fields of a trajectory are read when a
+picture needs them, block by block (see `downsample.py`)."""
 
 import json
 import tomllib
@@ -19,7 +18,7 @@ from dvax.errors import InputError, input_error
 CONTACT = "contact"
 """The model of a manifest that names none."""
 
-# What manifest.json calls a run that did not reach its end, and what a reader should know of it.
+# The status of a run in manifest.json that did not reach its end, and what it means.
 UNFINISHED = {
     "running": "The run had not ended when this report was made: it is going on, or was killed.",
     "killed": "The run was killed before its end.",
@@ -59,7 +58,7 @@ Row = TypeVar("Row", ConstantRow, AssumptionRow)
 
 @dataclass(frozen=True)
 class RunRecord:
-    """What a run directory holds. `trajectory` is None where no results were written."""
+    """The content of a run directory. `trajectory` is None where no results were written."""
 
     directory: Path
     manifest: Mapping[str, Any]
@@ -157,7 +156,7 @@ def read_run(directory: Path) -> RunRecord:
 
 
 def _other_than_a_run(path: Path) -> str:
-    """What `path` is, where it is no run directory."""
+    """Describe a path that is no run directory."""
     if path.is_dir():
         return "a folder without manifest.json"
     return "a file, not a folder" if path.exists() else "no such folder"

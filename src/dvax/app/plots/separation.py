@@ -1,7 +1,7 @@
 """Two trajectories from different initial states, against the certified decay between them.
 
 Paper, cor:incremental_stability: ‖x₁(t) − x₂(t)‖ ≤ M e^{−(η − M L̃)t} ‖x₀₁ − x₀₂‖, and L times this
-for u. The sharp bound uses the one-sided rate, which knows the sign of −d_x x.
+for u. The sharp bound uses the one-sided rate, which accounts for the sign of −d_x x.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""The tables on stability: what is known of each assumption, and where the certified rate is lost."""
+"""The tables on stability: the status of each assumption, and the terms of the certified rate."""
 
 from dvax.app.plots.run_reader import RunRecord
 from dvax.app.plots.tables import escaped, status_mark, table
@@ -20,8 +20,8 @@ def assumptions_table(run: RunRecord) -> str:
 
 
 def losses_table(run: RunRecord) -> str:
-    """The certified rate of separation, taken apart into what it is made of, beside the rate that sees
-    signs: the largest term is the one to improve."""
+    """The terms of the certified rate of separation, beside the one-sided rate: the largest term is
+    the one to improve."""
     known = {row.name: row for row in run.constants}
     needed = ("omega", "M", "alpha_f", "beta_f", "L", "growth_rate")
     if not all(n in known and isinstance(known[n].value, int | float) for n in needed):

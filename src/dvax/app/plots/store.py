@@ -1,6 +1,6 @@
-"""trajectory.zarr as pictures read it: variables by name, read when they are asked for.
+"""Read trajectory.zarr lazily, variable by variable.
 
-Read by zarr and not by xarray, whose import (with pandas) takes longer than the pictures.
+By zarr and not by xarray, whose import (with pandas) takes longer than drawing the pictures.
 """
 
 from collections.abc import Mapping

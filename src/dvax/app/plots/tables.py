@@ -36,11 +36,11 @@ def headline_cards(run: RunRecord) -> str:
             continue  # it stands at the top of the page, and among the facts of the run
         value = entry.get("value")
         unit = escaped(quantity("", str(entry.get("unit", ""))))
-        # A unit stays on one line, and with the last digits where there is room.
+        # Keep the unit on one line, with the last digits where there is room.
         shown = f'{escaped(entry_text(entry))} <span class="unit">{unit}</span>'.removesuffix(
             ' <span class="unit"></span>'
         )
-        # All digits, for who points at it.
+        # All digits, as a tooltip.
         whole = "" if isinstance(value, list) else f' title="{escaped(str(value))}"'
         cards.append(
             f'<div class="card"><div class="name">{escaped(_words(name))}</div>'

@@ -1,4 +1,5 @@
-"""One look for every picture: colours safe for colour-blind readers, numbers and units as text."""
+"""The theme of all pictures: colours that colour-blind readers can distinguish, numbers and units
+as text."""
 
 import math
 import re
@@ -30,7 +31,7 @@ _SUPERSCRIPT = str.maketrans("-0123456789.", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹·")
 
 
 def number(value: Any, digits: int = 4) -> str:
-    """A number as a reader wants it: `digits` significant ones, powers of ten written out."""
+    """Return a number as text: `digits` significant ones, powers of ten written out."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return NOT_FINITE.get(str(value), str(value))
     if isinstance(value, int):
@@ -45,7 +46,7 @@ def number(value: Any, digits: int = 4) -> str:
 
 
 def unit_text(unit: str) -> str:
-    """A unit for the eye: um as µm, products with a dot, powers raised."""
+    """Return a unit as text: um as µm, powers as superscripts."""
     if unit in ("", "1", "dimensionless"):
         return ""
     text = re.sub(r"\bum\b", "µm", unit).replace("^(1/2)", "^0.5")
@@ -81,12 +82,12 @@ def _axis() -> dict[str, Any]:
     )
 
 
-# Made once, when this file is imported: Plotly loads the parts of a layout when they are first used.
+# Built once at import: Plotly loads the parts of a layout at their first use.
 _TEMPLATE = go.layout.Template(layout=dict(xaxis=_axis(), yaxis=_axis()))
 
 
 def blank(height: int, row_heights: tuple[float, ...] = (1.0,)) -> go.Figure:
-    """An empty interactive figure in the house's look; its title stands in the page, above it.
+    """Return an empty interactive figure in the theme; its title stands in the page, above it.
 
     Several `row_heights` make panels one above the other that share the horizontal axis.
     """
@@ -108,7 +109,7 @@ def blank(height: int, row_heights: tuple[float, ...] = (1.0,)) -> go.Figure:
         shared_xaxes=True,
         row_heights=list(row_heights),
         vertical_spacing=0.05,
-        # Begun with the template, so that Plotly does not read and check one of its own first.
+        # Given a template, Plotly does not read and check its own.
         figure=go.Figure(layout=layout),
     )
 
@@ -134,7 +135,7 @@ def pressure_bar(figure: go.Figure, words: str, height: int) -> dict[str, Any]:
     )
 
 
-# The same look for the still pictures.
+# The same theme for still pictures.
 STILL_STYLE: dict[Any, Any] = {
     "font.size": 10,
     "axes.titlesize": 11,
@@ -160,7 +161,7 @@ def still_axes(
 ) -> tuple[Figure, Any]:
     """A still figure and its axes, as `matplotlib.pyplot.subplots` gives them.
 
-    Without pyplot: no global state to close, and no window system is looked for.
+    Without pyplot there is no global state to close and no window system to load.
     """
     figure = Figure(figsize=figsize, layout="constrained")
     return figure, figure.subplots(rows, columns, **options)

@@ -8,7 +8,7 @@ import numpy as np
 
 from dvax.app.runs.schema import BoundarySection
 from dvax.app.runs.units import UnitError, Units
-from dvax.errors import InputError, InputProblem, input_error
+from dvax.errors import InputProblem, Problems, input_error
 from dvax.formats.csv_columns import check_increasing, read_columns
 
 
@@ -31,7 +31,7 @@ class Boundary:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What formulas call the coordinates."""
+        """The names of the coordinates in formulas."""
         return ("s",) if len(self.coordinates) == 1 else ("s1", "s2")
 
     def nearest(self, place: tuple[float, ...]) -> int:
@@ -43,7 +43,7 @@ class Boundary:
 def build_boundary(section: BoundarySection, nodes: Path | None, units: Units) -> Boundary:
     """Midpoints of equal cells (error O(h^2) of integrals), or the nodes of a file.
 
-    Raises `InputError` for every flaw of the file.
+    Raises `InputError` with every problem of the file.
     """
     if nodes is not None:
         return _from_file(nodes, units)
@@ -61,14 +61,14 @@ def build_boundary(section: BoundarySection, nodes: Path | None, units: Units) -
 def _from_file(path: Path, units: Units) -> Boundary:
     s, weight = read_columns(path, ["s", "weight"], "s")
     check_increasing(path.name, s)
-    problems: list[InputProblem] = []
+    problems = Problems()
     factors = []
     for column in (s, weight):
         try:
             factors.append(units.factor(column.unit, "length"))
         except UnitError as error:
             place = f"{path.name}, column {column.name!r}"
-            problems.append(InputProblem(place, f"[{column.unit}]", error.rule, f"{error.fix}."))
+            problems.add(place, f"[{column.unit}]", error.rule, f"{error.fix}.")
     problems += [
         InputProblem(
             f"{path.name}, line {weight.lines[i]}, column 'weight'",
@@ -78,8 +78,7 @@ def _from_file(path: Path, units: Units) -> Boundary:
         )
         for i in np.flatnonzero(~(weight.values > 0))[:20]
     ]
-    if problems:
-        raise InputError(*problems)
+    problems.raise_any()
     with np.errstate(over="ignore"):  # an infinite coordinate is refused by check_size
         places, weights = s.values * factors[0], weight.values * factors[1]
     return Boundary((places,), weights, (places.size,))

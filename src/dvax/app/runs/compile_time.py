@@ -1,12 +1,12 @@
-"""When JAX compiles, and how long it took: to tell it apart from solving, and to use the time."""
+"""The time that JAX compiles, measured by its monitoring events."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from dvax._jax.compile_clock import listen
 
-# The time loop takes 0.2 s to write down for the compiler, a single operation 0.01 s.
-_LARGE = 0.05
+# Lowering the time loop takes 0.2 s, a single operation 0.01 s.
+_LONG_LOWERING = 0.05
 _spent = 0.0
 _listening = False
 _announce: Callable[[], None] | None = None
@@ -21,19 +21,18 @@ def compile_seconds() -> float:
     return _spent
 
 
-def compile_clock() -> Callable[[], float]:
-    """What tells the seconds spent on compilation since now: those of one run, where a process has
-    several one after the other."""
+def compile_stopwatch() -> Callable[[], float]:
+    """Return a function that returns the seconds spent on compilation since this call."""
     before = compile_seconds()
     return lambda: compile_seconds() - before
 
 
 @contextmanager
-def announced(announce: Callable[[], None]) -> Iterator[None]:
-    """Call `announce` once, when the first large program is traced and goes to the compiler.
+def call_when_compiling(announce: Callable[[], None]) -> Iterator[None]:
+    """Call `announce` once, when the first large program has been lowered and goes to the compiler.
 
-    The compiler needs neither Python nor more than a core: from then on other work costs nothing.
-    While JAX traces, which is Python, it would.
+    The compiler releases the interpreter lock and uses one core, so other work is free from then on;
+    while JAX traces, in Python, it is not.
     """
     global _announce
     compile_seconds()
@@ -47,6 +46,6 @@ def announced(announce: Callable[[], None]) -> Iterator[None]:
 def _add(stage: str, seconds: float) -> None:
     global _spent, _announce
     _spent += seconds
-    if stage == "lower" and seconds > _LARGE and _announce is not None:
+    if stage == "lower" and seconds > _LONG_LOWERING and _announce is not None:
         call, _announce = _announce, None
         call()

@@ -20,13 +20,13 @@ from dvax.app.runs.fields import Sources
 from dvax.app.runs.schema import OPTIONAL, SECTIONS
 from dvax.app.runs.schema_errors import shown, translate, unknown_key
 from dvax.app.runs.settings import Config as Config
-from dvax.app.runs.solver_options import MOST_STEPS, short_dt_max
+from dvax.app.runs.solver_options import check_dt_max, check_steps
 from dvax.app.runs.units import Units
-from dvax.errors import InputError, InputProblem, input_error
+from dvax.errors import InputError, InputProblem, Problems, input_error
 
 MAX_BYTES = 2**20
-_RTOL = 1e-6
-_ATOL_OF_SCALE = 1e-9  # of the model's own indentation scale
+_DEFAULT_RTOL = 1e-6
+_ATOL_OF_SCALE = 1e-9  # relative to the indentation scale of the model
 
 
 def load_config(path: str | Path, *, allow_outside: bool = False) -> Config:
@@ -43,11 +43,10 @@ def load_config(path: str | Path, *, allow_outside: bool = False) -> Config:
 
 
 def build_contact(config: Config) -> ContactInputs:
-    """The data of a run as arrays and signals. Raises `InputError` if a file changed for the
-    worse."""
-    inputs, problems = read_inputs(config, config.sources, config.units)
-    if inputs is None or problems:
-        raise InputError(*problems)
+    """Return the data of a run as arrays and signals. Raises `InputError` where a file has changed and
+    is now wrong."""
+    inputs = read_inputs(config, config.sources, config.units)
+    assert inputs is not None  # all sections are there
     return inputs
 
 
@@ -60,17 +59,16 @@ def with_points(config: Config, points: int) -> Config:
 def parse(source: Path) -> dict[str, Any]:
     """A TOML file as a table. **Raises:** `InputError` with line and column."""
 
-    def refuse(place: str, given: str, rule: str, fix: str) -> InputError:
-        return input_error(place, given, rule, fix)
-
     name = source.name
     try:
         if not source.is_file():
             given = "a folder" if source.is_dir() else "no such file"
-            raise refuse(str(source), given, "a configuration is a TOML file", "Check its name.")
+            raise input_error(
+                str(source), given, "a configuration is a TOML file", "Check its name."
+            )
         size = source.stat().st_size
         if size > MAX_BYTES:
-            raise refuse(
+            raise input_error(
                 name,
                 f"{size} bytes",
                 f"a configuration has at most {MAX_BYTES} bytes",
@@ -83,11 +81,11 @@ def parse(source: Path) -> dict[str, Any]:
     except InputError:
         raise  # it is a ValueError too
     except OSError as error:
-        raise refuse(
+        raise input_error(
             str(source), error.strerror or str(error), "it must be readable", "Check it."
         ) from None
     except UnicodeDecodeError as error:
-        raise refuse(
+        raise input_error(
             f"{name}, byte {error.start + 1}",
             "bytes that are not UTF-8",
             "TOML is UTF-8",
@@ -99,10 +97,10 @@ def parse(source: Path) -> dict[str, Any]:
         place = f"{name}, line {found[1]}, column {found[2]}" if found else f"{name}, at its end"
         lines = text.splitlines() or [""]
         line = lines[min(int(found[1]), len(lines)) - 1] if found else lines[-1]
-        raise refuse(place, repr(line.strip()[:120]), *_broken_toml(message, line)) from None
+        raise input_error(place, repr(line.strip()[:120]), *_broken_toml(message, line)) from None
     except (RecursionError, ValueError) as error:
         # tomllib lets the errors of int() and of deep nesting through.
-        raise refuse(
+        raise input_error(
             name, shown(str(error)), "the file is not readable as TOML", "Write it simpler."
         ) from None
 
@@ -142,12 +140,11 @@ def _broken_toml(message: str, line: str) -> tuple[str, str]:
 def check_contact(raw: dict[str, Any], source: Path, allow_outside: bool) -> Config:
     """The configuration of a contact law, checked and completed."""
     file = source.name
-    problems = [
-        unknown_key(f"{file}: {key}", key, value, list(SECTIONS))
-        for key, value in raw.items()
-        if key not in SECTIONS
-    ]
-    # With broken units, dimensions are still checked, in the default ones.
+    problems = Problems()
+    for key, value in raw.items():
+        if key not in SECTIONS:
+            problems.append(unknown_key(f"{file}: {key}", key, value, list(SECTIONS)))
+    # Where the units are wrong, dimensions are still checked, in the default units.
     units, broken = _section("units", raw.get("units", {}), file, Units())
     problems += broken
     working = units if isinstance(units, Units) else Units()
@@ -157,14 +154,14 @@ def check_contact(raw: dict[str, Any], source: Path, allow_outside: bool) -> Con
             continue
         if name not in raw and name not in OPTIONAL:
             fix = f"Add [{name}]."
-            problems.append(InputProblem(f"{file}: {name}", "nothing", "it is required", fix))
+            problems.add(f"{file}: {name}", "nothing", "it is required", fix)
             continue
         section, broken = _section(name, raw.get(name, {}), file, working)
         problems += broken
         if section is not None:
             sections[name] = section
     between = check_consistency(raw, file)
-    problems += between + _uncountable_steps(sections, file)
+    problems += between
     contradictory = {p.place.removeprefix(f"{file}: ").split(".")[0] for p in between}
     usable = {name: s for name, s in sections.items() if name not in contradictory}
     draft = Config.model_construct(**usable)  # pyright: ignore[reportArgumentType]
@@ -178,17 +175,18 @@ def check_contact(raw: dict[str, Any], source: Path, allow_outside: bool) -> Con
     edges = raw.get("boundary")
     rectangle = isinstance(edges, dict) and "lengths" in edges and "length" not in edges
     names = ("s1", "s2") if rectangle else ("s",)
-    inputs, found = read_inputs(draft, sources, working, quoted, names)
-    problems += found
-    if problems:
-        raise InputError(*problems)
+    inputs = None
+    if "time" in usable and "solver" in usable:
+        end = draft.time.end
+        with problems.collect():
+            check_steps(draft.solver, end, f"the length {end:g}", f"{file}: solver")
+    with problems.collect():
+        inputs = read_inputs(draft, sources, working, quoted, names)
+    problems.raise_any()
     assert inputs is not None
-    solver = draft.solver
-    if solver.dt_max is not None:
-        span = longest_block(inputs.frame_times, inputs.boundary.size)
-        short = short_dt_max(solver.dt_max, solver.max_steps, span, f"{file}: solver")
-        if short is not None:
-            raise InputError(short)
+    check_dt_max(
+        draft.solver, longest_block(inputs.frame_times, inputs.boundary.size), f"{file}: solver"
+    )
     if draft.output.points_of_interest is None:
         places = tuple(
             tuple(float(c[i]) for c in inputs.boundary.coordinates) for i in inputs.point_indices
@@ -197,23 +195,6 @@ def check_contact(raw: dict[str, Any], source: Path, allow_outside: bool) -> Con
         draft = draft.model_copy(update={"output": output})
     draft._source, draft._allow_outside = source, allow_outside
     return draft
-
-
-def _uncountable_steps(sections: Mapping[str, Any], file: str) -> list[InputProblem]:
-    """A fixed step so short that the run has more steps than can be counted."""
-    if "time" not in sections or "solver" not in sections or sections["solver"].dt is None:
-        return []
-    end, dt = sections["time"].end, sections["solver"].dt
-    if end / dt < MOST_STEPS:
-        return []
-    return [
-        InputProblem(
-            f"{file}: solver.dt",
-            f"{dt:g} for a run of {end:g}",
-            f"a run has fewer than {MOST_STEPS} steps, or they cannot be counted",
-            "Give a longer step.",
-        )
-    ]
 
 
 def _section(
@@ -227,12 +208,12 @@ def _section(
         refused = {e["loc"][0] for e in error.errors(include_url=False) if e["loc"]}
     if name not in {"demand", "load", "initial"}:
         return None, problems
-    # The factors that were not refused are still worth checking: everything is reported at once.
+    # Check the remaining factors too, so that all problems are reported at once.
     rest = {key: v for key, v in value.items() if key not in refused} if refused else {}
     try:
         return model.model_validate(rest, context={"units": units}), problems
     except ValidationError:
-        return None, problems  # what is wrong has been said above
+        return None, problems  # the problems are reported above
 
 
 def _with_defaults(draft: Config, usable: Mapping[str, BaseModel]) -> Config:
@@ -246,7 +227,10 @@ def _with_defaults(draft: Config, usable: Mapping[str, BaseModel]) -> Config:
     update: dict[str, BaseModel] = {}
     if "solver" in usable and draft.solver.dt is None:
         solver = draft.solver
-        tolerances = {"rtol": solver.rtol or _RTOL, "atol": solver.atol or _ATOL_OF_SCALE * scale}
+        tolerances = {
+            "rtol": solver.rtol or _DEFAULT_RTOL,
+            "atol": solver.atol or _ATOL_OF_SCALE * scale,
+        }
         update["solver"] = solver.model_copy(update=tolerances)
     if "initial" in usable:
         initial, change = draft.initial, {}

@@ -7,7 +7,7 @@ import numpy as np
 
 from dvax.app.runs.contact_frames import norm_unit
 from dvax.app.runs.contact_inputs import ContactInputs
-from dvax.app.runs.json_numbers import bound_meaning
+from dvax.app.runs.figure import Figure
 from dvax.app.runs.settings import Config
 from dvax.theory import Constants, Status, weakest
 
@@ -60,8 +60,8 @@ class Figures:
         }
 
     @np.errstate(over="ignore", invalid="ignore")  # a rate that overflows is infinite
-    def summary(self, steps: int) -> dict[str, Any]:
-        """Name -> value, unit and meaning, as summary.json holds them."""
+    def summary(self, steps: int) -> dict[str, Figure]:
+        """The figures by name."""
         if not self._last:
             return {}
         u, last, c = self._units, self._last, self._constants
@@ -104,14 +104,7 @@ class Figures:
             ("error_bound_x", "error_bound_sharp_x", "error_bound_u"), self.status
         )
         return {
-            name: {"value": value, "unit": unit, "meaning": meaning}
-            if name not in bounds
-            else {
-                "value": value,
-                "unit": unit,
-                "meaning": bound_meaning(meaning, value),
-                "bound": bounds[name],
-            }
+            name: Figure(value, unit, meaning, bound=bounds.get(name))
             for name, value, unit, meaning in rows
         }
 
@@ -121,7 +114,7 @@ class Figures:
 
 
 def _largest(times: np.ndarray, field: np.ndarray) -> tuple[float, float, int]:
-    # The first that reaches the largest value up to rounding: a plateau begins where it begins.
+    # The first entry that reaches the maximum up to roundoff, so that a plateau is found at its start.
     top = float(field.max())
     reached = np.argmax(field >= top - 1e-12 * abs(top))
     frame, point = np.unravel_index(int(reached), field.shape)
@@ -131,5 +124,5 @@ def _largest(times: np.ndarray, field: np.ndarray) -> tuple[float, float, int]:
 def _larger(
     old: tuple[float, float, int], new: tuple[float, float, int]
 ) -> tuple[float, float, int]:
-    """The one with the larger value; the earlier where rounding alone tells them apart."""
+    """Return the one with the larger value, the earlier one where they differ by roundoff only."""
     return new if new[0] > old[0] + 1e-12 * abs(old[0]) or old[0] == -np.inf else old

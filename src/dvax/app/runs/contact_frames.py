@@ -1,6 +1,7 @@
 """The contact law's frames: which variables a saved time has, and how a block of them is made."""
 
 import json
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 
 from dvax.app.runs.contact_inputs import ContactInputs
 from dvax.app.runs.json_numbers import json_ready
+from dvax.app.runs.run import assumption_rows
 from dvax.app.runs.settings import Config
 from dvax.evolution import Solution
 from dvax.models import Contact
@@ -96,7 +98,10 @@ def constant_rows(constants: Constants, config: Config, T: float, rho: float) ->
 
 
 def attributes(
-    config: Config, rows: list[dict], shape: tuple[int, ...], known: tuple[Assumption, ...]
+    config: Config,
+    rows: Sequence[Mapping[str, Any]],
+    shape: tuple[int, ...],
+    known: tuple[Assumption, ...],
 ) -> dict[str, Any]:
     """Attributes of the whole dataset."""
     return {
@@ -106,14 +111,8 @@ def attributes(
         "kappa0": config.model.kappa0,
         "reaction": "the normalised reaction u is pressure / beta",
         "boundary_shape": list(shape),
-        "constants": json.dumps(json_ready(rows), ensure_ascii=False),
-        "assumptions": json.dumps(
-            [
-                {"label": a.label, "statement": a.statement, "status": a.status, "why": a.why}
-                for a in known
-            ],
-            ensure_ascii=False,
-        ),
+        "constants": json.dumps(json_ready(list(rows)), ensure_ascii=False),
+        "assumptions": json.dumps(assumption_rows(known), ensure_ascii=False),
     }
 
 
@@ -131,7 +130,7 @@ def block_values(
     frames = _of_frames(model, space, main.ts, (main.xs, main.us), (other.xs, other.us))
     values = {name: np.asarray(value) for name, value in frames.items()}
     c, ts = model.constants, np.asarray(main.ts)
-    # Two computed states of this size cannot be told apart any nearer than this.
+    # Roundoff of the distance of two computed states of this size.
     rounding = 64 * np.finfo(main.xs.dtype).eps * values.pop("size")
     initial = values["separation_x"][0] if apart is None else apart
     certified = float(c.M) * np.exp(c.growth_rate * ts) * initial + rounding

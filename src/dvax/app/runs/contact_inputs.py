@@ -1,6 +1,5 @@
-"""Everything that a run of the contact model starts from, as arrays and signals."""
+"""The inputs of a run of the contact model, as arrays and signals."""
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,14 +9,13 @@ from dvax.app.runs.boundary import Boundary, build_boundary, check_size
 from dvax.app.runs.data_file import DataFile, fingerprint, locate
 from dvax.app.runs.expressions import compile_expression
 from dvax.app.runs.fields import Field, Sources, perturbation, read_field, space_values, to_signal
-from dvax.app.runs.measured import check_length
+from dvax.app.runs.measured import read_npy
 from dvax.app.runs.units import Units
-from dvax.errors import InputError, InputProblem
+from dvax.errors import Problems, input_error
 
 if TYPE_CHECKING:
     from dvax.app.runs.settings import Config
 
-_FINE = 10**6
 _KINDS = {"demand": "indentation", "load": "indentation rate", "initial": "indentation"}
 
 
@@ -63,67 +61,55 @@ def read_inputs(
     units: Units,
     value_has_unit: frozenset[str] = frozenset(),
     coordinate_names: tuple[str, ...] = ("s",),
-) -> tuple[ContactInputs | None, list[InputProblem]]:
-    """Read and check all data that a configuration names: (inputs, problems), with all problems.
+) -> ContactInputs | None:
+    """Read and check all data that a configuration names. Raises `InputError` with all problems.
 
     The configuration may lack sections that were refused before; the rest is checked all the same,
-    and the inputs are None. `value_has_unit` names the fields whose value was written with a unit,
+    and None is returned. `value_has_unit` names the fields whose value was written with a unit,
     `coordinate_names` are those of a boundary that was refused.
     """
-    problems: list[InputProblem] = []
+    problems = Problems()
     sections = dict(config.__dict__)
-    time = sections.get("time")
+    time, initial = sections.get("time"), sections.get("initial")
     end = time.end if time is not None else None
-    mismatched = _mismatched_profiles(sections, sources)
-    problems += mismatched
-    described = None if mismatched else sections.get("boundary")
-    boundary, boundary_files = _boundary(described, sources, units, problems)
+    boundary, boundary_files = None, ()
+    with problems.collect():
+        _check_profiles(sections, sources)  # a boundary of very many points takes time and memory
+        boundary, boundary_files = _boundary(sections.get("boundary"), sources, units)
+    place = boundary or coordinate_names
     fields: dict[str, Field] = {}
     for key, kind in _KINDS.items():
-        section = sections.get(key)
-        if section is None:
-            continue
-        try:
-            fields[key] = read_field(
-                section,
-                key,
-                kind,
-                sources,
-                units,
-                boundary or coordinate_names,
-                end,
-                value_has_unit=key in value_has_unit,
-            )
-        except InputError as error:
-            problems += error.problems
-    problems += _between_times(sections, sources.name)
+        if key in sections:
+            with problems.collect():
+                fields[key] = read_field(
+                    sections[key], key, kind, sources, units, place, end,
+                    value_has_unit=key in value_has_unit,
+                )  # fmt: skip
     shift = None
-    initial = sections.get("initial")
     if initial is not None and initial.companion is not None:
-        place = f"{sources.name}: initial.companion"
-        try:
+        key = f"{sources.name}: initial.companion"
+        with problems.collect():
             if boundary is not None:
-                shift = perturbation(initial.companion, boundary, place)
+                shift = perturbation(initial.companion, boundary, key)
             elif isinstance(initial.companion, str):
-                compile_expression(initial.companion, coordinate_names, place=place)
-        except InputError as error:
-            problems += error.problems
-    if boundary is None:
-        return None, problems
-    indices, notices = _points(sections.get("output"), boundary, sources.name, units, problems)
-    if problems or shift is None or time is None or len(fields) < len(_KINDS):
-        return None, problems
+                compile_expression(initial.companion, coordinate_names, place=key)
+    indices, notices = (), []
+    if boundary is not None and "output" in sections:
+        places = sections["output"].points_of_interest
+        with problems.collect():
+            indices, notices = _points(places, boundary, sources.name, units)
+    problems.raise_any()
+    if boundary is None or shift is None or time is None or len(fields) < len(_KINDS):
+        return None
     series = fields["demand"].series
     if series is not None and series.kind == "constant":
         notices.append(
             "The demand jumps (series of kind 'constant'): the theory asks for g continuous in "
             "time, and u jumps with it."
         )
-    x0, companion_x0 = _initial_states(fields["initial"], boundary, shift, sources.name, problems)
-    if problems:
-        return None, problems
+    x0, companion_x0 = _initial_states(fields["initial"], boundary, shift, sources.name)
     files = (*boundary_files, *(f for field in fields.values() for f in field.files))
-    inputs = ContactInputs(
+    return ContactInputs(
         boundary=boundary,
         demand=fields["demand"],
         load=fields["load"],
@@ -134,117 +120,82 @@ def read_inputs(
         data_files=tuple(dict.fromkeys(files)),
         notices=tuple(notices),
     )
-    return inputs, problems
 
 
-def _mismatched_profiles(sections: dict[str, Any], sources: Sources) -> list[InputProblem]:
-    """Profiles of another length than a boundary so fine that building it would take seconds."""
-    points = getattr(sections.get("boundary"), "points", None)
-    problems: list[InputProblem] = []
-    if points is None or math.prod(points) < _FINE:
-        return problems
+def _check_profiles(sections: dict[str, Any], sources: Sources) -> None:
+    """Raise an `InputError` where an NPY profile does not fit the number of points."""
+    shape = getattr(sections.get("boundary"), "points", None)
     for key in _KINDS:
         profile = getattr(sections.get(key), "profile", None)
-        if profile is None:
+        if shape is None or profile is None or not profile.file.lower().endswith(".npy"):
             continue
         place = f"{sources.name}: {key}.profile"
-        try:
-            path = locate(profile.file, sources.folder, sources.allow_outside, f"{place}.file")
-        except InputError:
-            continue  # read_field reports it
-        try:
-            check_length(profile, path, points, place)
-        except InputError as error:
-            problems += error.problems
-    return problems
+        path = locate(profile.file, sources.folder, sources.allow_outside, f"{place}.file")
+        read_npy(profile, path, shape, place)
 
 
 def _initial_states(
-    field: Field, boundary: Boundary, shift: np.ndarray, file: str, problems: list[InputProblem]
+    field: Field, boundary: Boundary, shift: np.ndarray, file: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """x(0) and where the companion starts; a problem where one of them overflows."""
+    """x(0) and the initial state of the companion. Raises `InputError` where one of them overflows."""
     with np.errstate(over="ignore", invalid="ignore"):
         x0 = space_values(field, boundary)
         companion = x0 + shift
-    for key, state in (("initial", x0), ("initial.companion", companion)):
+    for key, state, what in (
+        ("initial", x0, "x(0, s)"),
+        (
+            "initial.companion",
+            companion,
+            "the start of the companion, which is x(0, s) plus companion, by default "
+            "(1 + b_u) kappa0 / (beta b_x),",
+        ),
+    ):
         bad = np.flatnonzero(~np.isfinite(state))
-        if not bad.size:
-            continue
-        what = "x(0, s)"
-        if key == "initial.companion":
-            what = (
-                "where the companion starts, which is x(0, s) plus companion, by default "
-                "(1 + b_u) kappa0 / (beta b_x),"
-            )
-        problems.append(
-            InputProblem(
+        if bad.size:
+            raise input_error(
                 f"{file}: {key}",
                 f"{state[bad[0]]} at point {bad[0] + 1}",
                 f"{what} is finite at every point",
                 "Check the sizes of the factors, and the units that they are in.",
             )
-        )
-        break
     return x0, companion
 
 
 def _boundary(
-    section: Any, sources: Sources, units: Units, problems: list[InputProblem]
+    section: Any, sources: Sources, units: Units
 ) -> tuple[Boundary | None, tuple[DataFile, ...]]:
-    """The boundary, None where it was refused."""
+    """The boundary and its file; None where the section was refused."""
     if section is None:
         return None, ()
-    try:
-        nodes, files = None, ()
-        place = f"{sources.name}: boundary"
-        if section.file is not None:
-            place += ".file"
-            nodes = locate(section.file, sources.folder, sources.allow_outside, place)
-            files = (fingerprint(section.file, nodes),)
-        boundary = build_boundary(section, nodes, units)
-        check_size(boundary, place)
-        return boundary, files
-    except InputError as error:
-        problems += error.problems
-        return None, ()
-
-
-def _between_times(sections: dict[str, Any], file: str) -> list[InputProblem]:
-    time, solver = sections.get("time"), sections.get("solver")
-    if time is None or solver is None or solver.dt is None or solver.dt <= time.end:
-        return []
-    return [
-        InputProblem(
-            f"{file}: solver.dt",
-            f"{solver.dt:.12g}",
-            f"a step is not longer than the run, which ends at {time.end:.12g}",
-            "Give a smaller step.",
-        )
-    ]
+    nodes, files = None, ()
+    place = f"{sources.name}: boundary"
+    if section.file is not None:
+        place += ".file"
+        nodes = locate(section.file, sources.folder, sources.allow_outside, place)
+        files = (fingerprint(section.file, nodes),)
+    boundary = build_boundary(section, nodes, units)
+    check_size(boundary, place)
+    return boundary, files
 
 
 def _points(
-    section: Any, boundary: Boundary, file: str, units: Units, problems: list[InputProblem]
+    places: Any, boundary: Boundary, file: str, units: Units
 ) -> tuple[tuple[int, ...], list[str]]:
-    """Indices of the points of interest, each snapped to the nearest point, and what to say of
-    it."""
-    if section is None:
-        return (), []
-    places = section.points_of_interest
+    """Indices of the points of interest, each snapped to the nearest point, and notices where that is
+    far away. Raises `InputError`."""
     if places is None:
         return _quarters(boundary), []
+    problems = Problems()
     indices: list[int] = []
     notices: list[str] = []
     for number, place in enumerate(places, start=1):
         key = f"{file}: output.points_of_interest[{number}]"
         if len(place) != len(boundary.coordinates):
-            problems.append(
-                InputProblem(
-                    key,
-                    str(list(place)),
-                    f"a point has {len(boundary.coordinates)} coordinate(s), {boundary.names}",
-                    "Write [2.5] on a line and [[2.5, 1.0]] on a rectangle.",
-                )
+            problems.add(
+                key,
+                str(list(place)),
+                f"a point has {len(boundary.coordinates)} coordinate(s), {boundary.names}",
+                "Write [2.5] on a line and [[2.5, 1.0]] on a rectangle.",
             )
             continue
         outside = [
@@ -253,25 +204,24 @@ def _points(
             if not c.min() - _margin(c) <= p <= c.max() + _margin(c)
         ]
         if outside:
-            problems.append(
-                InputProblem(
-                    key,
-                    str(list(place)),
-                    f"{' and '.join(outside)} lies off the boundary",
-                    f"Choose a place on the boundary, in {units.length}.",
-                )
+            problems.add(
+                key,
+                str(list(place)),
+                f"{' and '.join(outside)} lies off the boundary",
+                f"Choose a place on the boundary, in {units.length}.",
             )
             continue
         index = boundary.nearest(place)
         at = tuple(float(c[index]) for c in boundary.coordinates)
         extent = max(float(np.ptp(c)) for c in boundary.coordinates)
-        # Half a cell away is where the point is; a visible distance is worth a word.
+        # Half a cell is expected; a visible distance is reported.
         if max(abs(a - p) for a, p in zip(at, place, strict=True)) > 0.01 * extent:
             notices.append(
                 f"Point of interest {list(place)} {units.length}: the nearest point is "
                 f"{[float(f'{a:.9g}') for a in at]} {units.length}."
             )
         indices.append(index)
+    problems.raise_any()
     return tuple(dict.fromkeys(indices)), notices
 
 

@@ -1,4 +1,4 @@
-"""Files of data: where they may lie, how large they may be, and their fingerprint."""
+"""Data files: permitted places and sizes, and fingerprints."""
 
 import hashlib
 from collections.abc import Callable
@@ -13,7 +13,7 @@ MAX_BYTES = 256 * 2**20
 
 @dataclass(frozen=True)
 class DataFile:
-    """A file that a run has read: as the configuration names it, and what it held."""
+    """A file that a run has read: its name in the configuration, its size and its hash."""
 
     name: str
     path: Path
@@ -57,7 +57,7 @@ def locate_folder(name: str, folder: Path, allow_outside: bool, place: str) -> P
 def _resolved(
     name: str, folder: Path, allow_outside: bool, place: str, kind: Callable[[Path], bool]
 ) -> tuple[Path, int | None]:
-    """The path, and its size where it is of the kind."""
+    """Return the path, and its size where it is of the kind, else None."""
     if not name or "\x00" in name:
         raise _refuse(place, name, "this is no file name", "Name a file beside the configuration.")
     path = Path(name) if allow_outside and Path(name).is_absolute() else folder / name
@@ -84,6 +84,6 @@ def _refuse(place: str, name: str, rule: str, fix: str) -> InputError:
 
 
 def fingerprint(name: str, path: Path) -> DataFile:
-    """Size and SHA-256 of a file, by which a run can be recognised."""
+    """Return the size and the SHA-256 of a file, which identify the data of a run."""
     content = read_bytes(path)
     return DataFile(name, path, len(content), hashlib.sha256(content).hexdigest())

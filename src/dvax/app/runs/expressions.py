@@ -4,15 +4,15 @@ A text such as ``"1 + 0.2*sin(2*pi*t) * where(s < 5, 1, 0)"`` is parsed by Pytho
 then every node is compared with a whitelist: finite numbers, the declared variables, the constants
 ``pi`` and ``e``, ``+ - * / **``, one comparison as the condition of ``where``, and the functions of
 `FUNCTIONS` with their exact number of arguments. What is allowed becomes nested closures over an
-array namespace; nothing is ever evaluated or compiled as Python, so a formula from a stranger can
-do arithmetic and nothing else.
+array namespace; nothing is evaluated or compiled as Python, so a formula from an unknown source
+can do arithmetic only.
 
 The closures take the namespace as an argument: ``jax.numpy`` when the formula stands inside a
 traced right-hand side, and ``numpy`` when a configuration is checked, in double precision, before
 JAX is loaded.
 
-Every subtree without a variable is folded in IEEE double precision, where a bomb becomes an
-infinity in one operation. An infinity or NaN there is an error. Powers have constant exponents of
+Every subtree without a variable is folded in IEEE double precision, where an overflow takes one
+operation. An infinity or NaN there is an error. Powers have constant exponents of
 at most 64 in magnitude, because ``a**t`` has no real value for ``a < 0`` and its derivative is NaN
 at ``a = 0``.
 
@@ -21,6 +21,7 @@ As always with ``where`` under differentiation, both branches are evaluated: kee
 
 import ast
 import math
+import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -30,58 +31,46 @@ from typing import Any
 import numpy as np
 
 from dvax.app.runs.formula_syntax import kind_of, parse_formula, shown
-from dvax.errors import InputError, InputProblem
+from dvax.errors import InputError, Problems
 
 MAX_EXPONENT = 64.0
 MAX_PROBLEMS = 20
 
 _Evaluate = Callable[[Any, Mapping[str, Any]], Any]  # (array namespace, variables) -> value
 
-FUNCTIONS: Mapping[str, tuple[int, Callable[..., Any]]] = MappingProxyType(
+FUNCTIONS: Mapping[str, int] = MappingProxyType(
     {
-        "sin": (1, lambda xp, x: xp.sin(x)),
-        "cos": (1, lambda xp, x: xp.cos(x)),
-        "tan": (1, lambda xp, x: xp.tan(x)),
-        "exp": (1, lambda xp, x: xp.exp(x)),
-        "log": (1, lambda xp, x: xp.log(x)),
-        "sqrt": (1, lambda xp, x: xp.sqrt(x)),
-        "abs": (1, lambda xp, x: xp.abs(x)),
-        "tanh": (1, lambda xp, x: xp.tanh(x)),
-        "sinh": (1, lambda xp, x: xp.sinh(x)),
-        "cosh": (1, lambda xp, x: xp.cosh(x)),
-        "arctan": (1, lambda xp, x: xp.arctan(x)),
-        "atan": (1, lambda xp, x: xp.arctan(x)),
-        "arctan2": (2, lambda xp, y, x: xp.arctan2(y, x)),
-        "minimum": (2, lambda xp, a, b: xp.minimum(a, b)),
-        "maximum": (2, lambda xp, a, b: xp.maximum(a, b)),
-        "clip": (3, lambda xp, x, low, high: xp.minimum(xp.maximum(x, low), high)),
-        "where": (3, lambda xp, condition, a, b: xp.where(condition, a, b)),
-        # heaviside and not a comparison: a NaN stays a NaN.
-        "step": (1, lambda xp, x: xp.heaviside(x, 1.0)),
-        "sign": (1, lambda xp, x: xp.sign(x)),
-        "floor": (1, lambda xp, x: xp.floor(x)),
+        **dict.fromkeys(("sin", "cos", "tan", "arctan", "atan", "sinh", "cosh", "tanh"), 1),
+        **dict.fromkeys(("exp", "log", "sqrt", "abs", "sign", "floor", "step"), 1),
+        **dict.fromkeys(("arctan2", "minimum", "maximum"), 2),
+        **dict.fromkeys(("clip", "where"), 3),
     }
 )
-"""Name -> (number of arguments, closure). ``step(0) = 1``; ``where`` takes a comparison first."""
+"""Name -> number of arguments. ``step(0) = 1``; ``where`` takes a comparison first."""
+
+
+def _function(name: str) -> Callable[..., Any]:
+    """A function of the array namespace and its arguments."""
+    if name == "step":
+        # heaviside and not a comparison: a NaN stays a NaN.
+        return lambda xp, x: xp.heaviside(x, 1.0)
+    return lambda xp, *arguments: getattr(xp, name)(*arguments)
+
 
 CONSTANTS: Mapping[str, float] = MappingProxyType({"pi": math.pi, "e": math.e})
 
-_BINARY: Mapping[type, Callable[[Any, Any], Any]] = MappingProxyType(
-    {
-        ast.Add: lambda a, b: a + b,
-        ast.Sub: lambda a, b: a - b,
-        ast.Mult: lambda a, b: a * b,
-        ast.Div: lambda a, b: a / b,
-    }
-)
-_COMPARE: Mapping[type, Callable[[Any, Any], Any]] = MappingProxyType(
-    {
-        ast.Lt: lambda a, b: a < b,
-        ast.LtE: lambda a, b: a <= b,
-        ast.Gt: lambda a, b: a > b,
-        ast.GtE: lambda a, b: a >= b,
-    }
-)
+_BINARY: Mapping[type, Callable[[Any, Any], Any]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+}
+_COMPARE: Mapping[type, Callable[[Any, Any], Any]] = {
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+}
 
 
 @dataclass(frozen=True)
@@ -107,7 +96,7 @@ class Expression:
 
         self._check(variables)
         arrays = {k: jnp.asarray(v) for k, v in variables.items()}
-        # Whole numbers count as real ones: t = 2 and t = 2.0 are the same time, also in 1 / t**2.
+        # Convert integers to floats: t = 2 and t = 2.0 are the same time, also in 1 / t**2.
         arrays = {
             k: v.astype(float) if jnp.issubdtype(v.dtype, jnp.integer) else v
             for k, v in arrays.items()
@@ -119,7 +108,7 @@ class Expression:
         NaN."""
         self._check(variables)
         arrays = {k: np.asarray(v, dtype=np.float64) for k, v in variables.items()}
-        with np.errstate(all="ignore"):  # the caller judges the values, which carry the inf and NaN
+        with np.errstate(all="ignore"):  # the caller checks for inf and NaN
             return np.asarray(self._evaluate(np, arrays), dtype=np.float64)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -139,9 +128,9 @@ def compile_expression(
 ) -> Expression:
     """Check `text` against the whitelist and return it as a function of `names`.
 
-    `place` opens the place of each problem (a file and key, say). Raises `InputError` with every
-    problem found (at most 20), each with its column; no other exception leaves, whatever the text.
-    """
+    `place` is the start of the place of each problem (a file and key, say). Raises `InputError`
+    with every problem found (at most 20), each with its column; no other exception leaves, whatever
+    the text."""
     tree = parse_formula(text, names, place)
     builder = _Builder(text.strip(), names, place, len(text) - len(text.lstrip()))
     built = builder.number(tree)
@@ -159,12 +148,12 @@ class _Built:
 
 
 class _Builder:
-    """Turns whitelisted nodes into closures; writes a problem for every other node and goes on."""
+    """Turn whitelisted nodes into closures; report every other node and go on."""
 
     def __init__(self, text: str, names: tuple[str, ...], place: str, lead: int):
         self.text, self.names, self.place, self.lead = text, tuple(names), place, lead
         self.used: set[str] = set()
-        self.problems: list[InputProblem] = []
+        self.problems = Problems()
         for name in self.names:
             if not name.isidentifier() or name in FUNCTIONS or name in CONSTANTS:
                 raise ValueError(
@@ -173,7 +162,7 @@ class _Builder:
 
     def refuse(self, node: ast.AST, given: str, rule: str, fix: str) -> _Built:
         column = getattr(node, "col_offset", 0) + self.lead + 1
-        self.problems.append(InputProblem(f"{self.place}, column {column}", given, rule, fix))
+        self.problems.add(f"{self.place}, column {column}", given, rule, fix)
         return _Built(lambda xp, env: math.nan)  # never called: the problem is raised
 
     def source(self, node: ast.AST) -> str:
@@ -298,7 +287,7 @@ class _Builder:
                 "there is no such function" if name not in self.names else f"{name} is a variable",
                 _nearest(name, tuple(FUNCTIONS)),
             )
-        arity, function = FUNCTIONS[name]
+        arity = FUNCTIONS[name]
         if node.keywords or len(node.args) != arity:
             given = f"{len(node.args)} arguments" + (" and keywords" if node.keywords else "")
             return self.refuse(
@@ -311,7 +300,7 @@ class _Builder:
             self.condition(argument) if name == "where" and i == 0 else self.number(argument)
             for i, argument in enumerate(node.args)
         ]
-        return self.apply(node, function, *parts)
+        return self.apply(node, _function(name), *parts)
 
     def condition(self, node: ast.expr) -> _Built:
         if (
@@ -339,9 +328,7 @@ class _Builder:
             return _Built(lambda xp, env: math.nan)
         constants = [part.constant for part in parts]
         if all(constant is not None for constant in constants):
-            with np.errstate(
-                all="ignore"
-            ):  # IEEE double arithmetic: overflow is inf, judged just below
+            with np.errstate(all="ignore"):  # overflow gives inf, which is refused below
                 value = float(operation(np, *(np.float64(c) for c in constants)))
             if not math.isfinite(value):
                 return self.refuse(

@@ -1,4 +1,4 @@
-"""A field on the boundary as the product of its factors.
+"""Fields on the boundary as products of factors.
 
     field(t, s) = value * expression(t, s) * series(t) * profile(s)
 
@@ -6,7 +6,6 @@ Every factor is optional. At most one of them is a physical quantity, the others
 where none says a unit, the product is a number in working units.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from dvax.app.runs.schema import (
     SeriesSection,
 )
 from dvax.app.runs.units import Units
-from dvax.errors import InputError, InputProblem, input_error
+from dvax.errors import Problems, input_error
 
 _SAMPLE_TIMES = 33
 _SAMPLE_POINTS = 1000
@@ -45,8 +44,7 @@ class Field:
 
 @dataclass(frozen=True)
 class Sources:
-    """Where a configuration's data lies: its file's name, its folder, and whether it may leave
-    it."""
+    """The name of a configuration file, its folder, and whether data may lie outside that folder."""
 
     name: str
     folder: Path
@@ -66,45 +64,36 @@ def read_field(
 ) -> Field:
     """Read, compile and check all factors of ``[key]``, a quantity of the given `kind`.
 
-    `end` is the end of the run, None where it is not known. Of a boundary that is not known, give
-    the names of the coordinates; profiles then stay unread. Raises `InputError` with the problems
+    `end` is the end of the run, None where it is unknown. Where the boundary is unknown, pass the names
+    of its coordinates instead; profiles then stay unread. Raises `InputError` with the problems
     of every factor.
     """
-    problems: list[InputProblem] = []
+    problems = Problems()
     files: list[DataFile] = []
     prefix = f"{sources.name}: {key}"
-
-    def attempt(read: Callable[[], Any]) -> Any:
-        try:
-            return read()
-        except InputError as error:
-            problems.extend(error.problems)
-            return None
-
-    def opened(part: SeriesSection | ProfileSection, name: str) -> Path | None:
-        place = f"{prefix}.{name}.file"
-        path = attempt(lambda: locate(part.file, sources.folder, sources.allow_outside, place))
-        if path is not None:
-            files.extend(filter(None, [attempt(lambda: fingerprint(part.file, path))]))
-        return path
-
     names = boundary.names if isinstance(boundary, Boundary) else boundary
     names = names if isinstance(section, InitialSection) else ("t", *names)
-    text, expression, series, profile = section.expression, None, None, None
-    if text is not None:
-        place = f"{prefix}.expression"
-        expression = attempt(lambda: compile_expression(text, names, place=place))
-    part = None if isinstance(section, InitialSection) else section.series
-    if part is not None and (path := opened(part, "series")) is not None:
-        place = f"{prefix}.series"
-        series = attempt(lambda: read_series(part, path, units, kind, end, place))
-    shape = section.profile
-    where = opened(shape, "profile") if shape is not None else None
-    if shape is not None and where is not None and isinstance(boundary, Boundary):
-        place = f"{prefix}.profile"
-        profile = attempt(lambda: read_profile(shape, where, units, kind, boundary, place))
-    if problems:
-        raise InputError(*problems)
+    expression, series, profile = None, None, None
+
+    def open_file(part: SeriesSection | ProfileSection, place: str) -> Path:
+        path = locate(part.file, sources.folder, sources.allow_outside, f"{place}.file")
+        files.append(fingerprint(part.file, path))
+        return path
+
+    with problems.collect():
+        if section.expression is not None:
+            expression = compile_expression(section.expression, names, place=f"{prefix}.expression")
+    with problems.collect():
+        part, place = getattr(section, "series", None), f"{prefix}.series"
+        if part is not None:
+            series = read_series(part, open_file(part, place), units, kind, end, place)
+    with problems.collect():
+        part, place = section.profile, f"{prefix}.profile"
+        if part is not None:
+            path = open_file(part, place)
+            if isinstance(boundary, Boundary):
+                profile = read_profile(part, path, units, kind, boundary, place)
+    problems.raise_any()
     carriers = ["value"] if value_has_unit else []
     carriers += ["series"] if series is not None and series.carries_unit else []
     carriers += ["profile"] if profile is not None and profile.carries_unit else []
@@ -136,7 +125,7 @@ def space_values(field: Field, boundary: Boundary) -> np.ndarray:
 def perturbation(value: float | str, boundary: Boundary, place: str) -> np.ndarray:
     """What is added to x0 for the companion: a number, or a formula in the coordinates. (n,)
 
-    Raises `InputError`; a perturbation that vanishes everywhere would compare a run with itself.
+    Raises `InputError`, also for a perturbation that is zero everywhere.
     """
     field = Field()
     if isinstance(value, str):
@@ -171,7 +160,8 @@ def to_signal(field: Field, boundary: Boundary) -> Any:
         factors.append(signals.Constant(everywhere))
     if field.series is not None:
         series = field.series
-        factors.append(signals.Table(series.times, series.values, kind=series.kind))  # pyright: ignore[reportArgumentType]
+        kind: Any = series.kind
+        factors.append(signals.Table(series.times, series.values, kind=kind))
     if expression is not None and varies:
         formula = Formula(expression, boundary.names, boundary.coordinates)
         factors.append(signals.Function(formula, knots=field.knots))
@@ -187,8 +177,8 @@ def _variables(expression: Expression, boundary: Boundary, t: float) -> dict[str
 
 
 def _check_finite(field: Field, boundary: Boundary, end: float | None, place: str) -> None:
-    """Look for NaN and infinities on samples: what is found is an error, the rest the run
-    watches."""
+    """Raise an `InputError` where samples of the field are NaN or infinite. The run itself checks the
+    values between the samples."""
     expression = field.expression
     if expression is None:
         return

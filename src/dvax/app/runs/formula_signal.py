@@ -13,8 +13,8 @@ from dvax.app.runs.expressions import Expression
 class Formula(eqx.Module):
     """t -> expression(t, s) at all points.
 
-    The coordinates are leaves and not constants of the traced program: XLA would try to fold them,
-    which takes minutes at a million points. Only coordinates that occur in the text are kept.
+    The coordinates are leaves, not constants of the traced program: XLA would fold them, which takes
+    minutes at a million points. Only coordinates that occur in the text are kept.
     """
 
     expression: Expression = eqx.field(static=True)

@@ -1,10 +1,11 @@
 """The limits of a formula's text, and its syntax tree.
 
-Everything here happens before a single node is trusted: the length is checked before the parser
-sees the text, the number and depth of nodes before anything recurses over them.
+The length is checked before the text is parsed, and the number and depth of nodes before anything
+recurses over them.
 """
 
 import ast
+import re
 import warnings
 
 from dvax.errors import InputError, input_error
@@ -17,7 +18,7 @@ MAX_DEPTH = 64
 def parse_formula(text: str, names: tuple[str, ...], place: str) -> ast.expr:
     """The syntax tree of a text within the limits, its offsets counted from its first non-blank.
 
-    Raises `InputError`, and nothing else, for every text that has none.
+    Raises `InputError`, and nothing else, for every other text.
     """
 
     def refuse(column: int | None, given: str, rule: str, fix: str) -> InputError:
@@ -35,16 +36,11 @@ def parse_formula(text: str, names: tuple[str, ...], place: str) -> ast.expr:
             f"an expression has at most {MAX_CHARACTERS} characters",
             "Put long data into a CSV or NPY file (series, profile).",
         )
-    for column, character in enumerate(text, start=1):
-        # One byte a character makes the parser's byte offsets columns, and no look-alike letter
-        # passes.
-        if character == "#" or not _plain(character):
-            raise refuse(
-                column,
-                repr(character),
-                "an expression is plain ASCII without comments",
-                "Remove this character.",
-            )
+    # One byte a character makes the parser's byte offsets columns, and no look-alike letter passes.
+    odd = re.search(r"[^ -~\t\r\n]|#", text)
+    if odd is not None:
+        rule = "an expression is plain ASCII without comments"
+        raise refuse(odd.start() + 1, repr(odd[0]), rule, "Remove this character.")
     flat = text.translate({9: " ", 10: " ", 13: " "})
     if not flat.strip():
         raise refuse(
@@ -70,7 +66,7 @@ def parse_formula(text: str, names: tuple[str, ...], place: str) -> ast.expr:
             f"Write one formula such as {example_of(names)}.",
         ) from None
     nodes, depth = _size(tree)
-    # The depth first, as parsers that give up at it say: Python 3.13 gives up much later.
+    # Check the depth first: older parsers fail at it before the number of nodes is known.
     if depth > MAX_DEPTH:
         raise refuse(
             None,
@@ -88,17 +84,13 @@ def parse_formula(text: str, names: tuple[str, ...], place: str) -> ast.expr:
     return tree
 
 
-def _plain(character: str) -> bool:
-    return character.isascii() and (character.isprintable() or character in "\t\r\n")
-
-
 def example_of(names: tuple[str, ...]) -> str:
     """A formula in the given names, for error messages."""
     return f'"1 + 0.5*sin({names[0]})"' if names else '"2*pi"'
 
 
 def _size(tree: ast.expr) -> tuple[int, int]:
-    """(number of nodes, depth), without recursion: the tree is still a stranger's."""
+    """Return (number of nodes, depth) without recursion, since the depth is not checked yet."""
     nodes, depth, level = 0, 0, [tree]
     while level:
         nodes, depth = nodes + len(level), depth + 1
@@ -117,7 +109,7 @@ def shown(text: str) -> str:
 
 
 def kind_of(node: ast.AST) -> str:
-    """What a node outside the language is called by those who write formulas."""
+    """Return the word for a node that is not part of the language."""
     words = {
         ast.Attribute: "an attribute (a dot)",
         ast.Subscript: "a subscript (brackets)",

@@ -1,15 +1,15 @@
-"""Signals: Ctrl-C and a request to terminate end a command within about two seconds, whatever it does.
+"""Signals: SIGINT (Ctrl-C) and SIGTERM end a command within about two seconds, whatever it does.
 
-Python runs signal handlers in the main thread alone, between two of its own instructions: a compiled
-loop, a long compilation or an import of C code holds them up for as long as it takes, and an exception
-that a handler raises inside of foreign code may be swallowed there. Therefore:
+Python runs signal handlers in the main thread only, between two bytecode instructions: a compiled loop,
+a compilation or an import of a C extension delays them until it ends, and foreign code may swallow an
+exception that a handler raises. Therefore:
 
-- long work is done in a thread of its own (`Work`, `interruptible`) while the main thread waits;
-- a handler only notes the signal, and the wait raises: never in the middle of a write;
-- `end_within` ends the process from another thread where all of that took too long. What is on disk is
-  whole at every moment, since files are renamed into place and frames count from their times on.
+- long work runs in another thread (`Work`, `interruptible`) while the main thread waits;
+- a handler only records the signal, and the wait raises: never in the middle of a write;
+- `end_within` ends the process from another thread where that takes too long. The files on disk are
+  complete at every moment: they are renamed into place, and a frame counts once its time is written.
 
-What a thread still computes is given up; what was finished before is the main thread's, to be written.
+Work that is still running is abandoned; the main thread writes what was finished before.
 """
 
 import math
@@ -25,13 +25,13 @@ INTERRUPTED, TERMINATED = 130, 143
 """Exit codes by the convention of shells: 128 and the number of the signal."""
 
 PATIENCE = 1.2
-"""Seconds after a signal in which figures and the page of what was computed may still be made."""
+"""Seconds after a signal in which the figures and the page of partial results may still be computed."""
 LONGEST = 1.8
 """Seconds after a signal at which the process ends, finished or not."""
 _WRITING = 8.0
-"""Seconds more where results are just being written."""
+"""Additional seconds while results are being written."""
 _WAIT = 0.05
-"""Seconds between two looks at a thread: on Windows a wait without an end is deaf to Ctrl-C."""
+"""Seconds between two polls of a thread: on Windows an unlimited wait ignores Ctrl-C."""
 
 Value = TypeVar("Value")
 
@@ -41,7 +41,7 @@ class Terminated(KeyboardInterrupt):
 
 
 class _State:
-    """The signals of this process that came and were not raised yet, and the time of the first."""
+    """The signals of this process that were received and not raised yet, and the time of the first."""
 
     def __init__(self) -> None:
         self.active = False
@@ -59,13 +59,13 @@ def exit_code(stop: KeyboardInterrupt) -> int:
 
 
 def patience() -> float:
-    """Seconds that are left of `PATIENCE` after a signal; without one, there is no hurry."""
+    """Return the seconds left of `PATIENCE` after a signal; infinite without one."""
     since = time.monotonic() - _state.first
     return math.inf if math.isinf(since) else max(0.0, PATIENCE - since)
 
 
 def raise_if_asked() -> None:
-    """Raise `KeyboardInterrupt`, or `Terminated`, where a signal came since the last time."""
+    """Raise `KeyboardInterrupt` or `Terminated` where a signal was received since the last call."""
     if _state.pending and threading.current_thread() is threading.main_thread():
         number = _state.pending[0]
         _state.pending.clear()
@@ -73,8 +73,8 @@ def raise_if_asked() -> None:
 
 
 class Work(Generic[Value]):
-    """work(), begun in another thread. `work` computes and writes nothing: after a signal it is given
-    up, and its thread goes on until the process ends."""
+    """A call of `work` in another thread. `work` writes nothing: after a signal it is abandoned,
+    and its thread runs until the process ends."""
 
     def __init__(self, work: Callable[[], Value]):
         self._outcome: dict[str, Any] = {}
@@ -91,7 +91,7 @@ class Work(Generic[Value]):
         threading.Thread(target=run, name="dvax work", daemon=True).start()
 
     def result(self, seconds: float = math.inf) -> Value:
-        """What work() returned.
+        """Wait for the value of `work`.
 
         **Raises:** what work() raised, `KeyboardInterrupt` at a signal, or after so many seconds
         `TimeoutError`.
@@ -107,7 +107,7 @@ class Work(Generic[Value]):
 
 
 def interruptible(work: Callable[[], Value], seconds: float = math.inf) -> Value:
-    """Return work(), done in another thread where this is the main one, so that signals are answered.
+    """Return work(), called in another thread where this is the main one, so that signals are handled.
 
     **Raises:** what `Work.result` raises.
     """
@@ -119,10 +119,10 @@ def interruptible(work: Callable[[], Value], seconds: float = math.inf) -> Value
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """Within, both signals are noted, and raised by `interruptible` or at the end: Ctrl-C as
-    `KeyboardInterrupt`, a request to terminate as `Terminated`."""
+    """In the block both signals are recorded, and raised by `interruptible` or at the end: SIGINT as
+    `KeyboardInterrupt`, SIGTERM as `Terminated`."""
     if _state.active or threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may say what signals do
+        yield  # only the main thread may set signal handlers
         return
 
     def note(number: int, frame: Any) -> None:
@@ -149,7 +149,7 @@ def terminable() -> Iterator[None]:
 
 @contextmanager
 def writing() -> Iterator[None]:
-    """Within, results are written: `end_within` waits for them, though not for long."""
+    """In the block results are written: `end_within` waits a few seconds for them."""
     _state.writing += 1
     try:
         yield
@@ -158,11 +158,11 @@ def writing() -> Iterator[None]:
 
 
 def end_within(seconds: float) -> None:
-    """From now on, end this process so many seconds after the first of both signals, from a thread of
-    its own: the last resort, where the main thread is held up in foreign code."""
+    """End this process so many seconds after the first of both signals, from another thread: the last
+    resort where foreign code blocks the main thread."""
     read, write = os.pipe()
     os.set_blocking(write, False)
-    # Written to by Python's handler in C, whatever the main thread is doing.
+    # Python's C handler writes to it, even while the main thread is blocked.
     signal.set_wakeup_fd(write, warn_on_full_buffer=False)
 
     def watch() -> None:

@@ -13,13 +13,12 @@ import numpy as np
 from dvax.app.runs.boundary import Boundary
 from dvax.app.runs.schema import ProfileSection, SeriesSection
 from dvax.app.runs.units import UnitError, Units
-from dvax.errors import InputError, InputProblem, input_error
+from dvax.errors import Problems, input_error
 from dvax.formats.at2 import read_at2
 from dvax.formats.csv_columns import check_increasing, read_columns
 from dvax.formats.table import read_bytes
 
-# What numpy raises for broken headers and data: its header parser lets the tokenizer's errors
-# through.
+# What numpy raises for broken headers and data, errors of its tokenizer included.
 _BROKEN_NPY = (
     ValueError,
     TypeError,
@@ -60,31 +59,26 @@ class Profile:
 def read_series(
     section: SeriesSection, path: Path, units: Units, kind: str, end: float | None, place: str
 ) -> Series:
-    """A history that covers [0, end]; `kind` is the quantity that the field is.
+    """Read a history that covers [0, end]; `kind` is the quantity of the field.
 
-    Raises `InputError`: extrapolating measured data would invent it.
+    Raises `InputError`, also where the data would have to be extrapolated.
     """
     factor = section.per_unit if isinstance(section.per_unit, float) else None
     if path.suffix.lower() == ".at2":
         step, raw = read_at2(path)
-        problems = [
-            InputProblem(
-                f"{place}.{key}", repr(value), "an .at2 record has no columns", "Remove it."
-            )
-            for key, value in (("column", section.column), ("time_column", section.time_column))
-            if value not in (None, "time")
-        ]
+        problems = Problems()
+        for key, value in (("column", section.column), ("time_column", section.time_column)):
+            if value not in (None, "time"):
+                rule = "an .at2 record has no columns"
+                problems.add(f"{place}.{key}", repr(value), rule, "Remove it.")
         if factor is None:
-            problems.append(
-                InputProblem(
-                    f"{place}.per_unit",
-                    "nothing",
-                    f"an .at2 record is in g, which is no {kind}",
-                    f'Say what 1 g stands for: per_unit = "30 {units.of(kind)}".',
-                )
+            problems.add(
+                f"{place}.per_unit",
+                "nothing",
+                f"an .at2 record is in g, which is no {kind}",
+                f'Say what 1 g stands for: per_unit = "30 {units.of(kind)}".',
             )
-        if problems:
-            raise InputError(*problems)
+        problems.raise_any()
         times, unit = step * np.arange(raw.size) * units.factor("s", "time"), "g"
     else:
         time, column = read_columns(
@@ -129,7 +123,7 @@ def read_profile(
     """
     factor = section.per_unit if isinstance(section.per_unit, float) else None
     if path.suffix.lower() == ".npy":
-        values = _read_npy(section, path, boundary, place)
+        values = read_npy(section, path, boundary.shape, place)
         return Profile(values * (1.0 if factor is None else factor), factor is not None)
     points = boundary.coordinates[0]
     if len(boundary.coordinates) > 1:
@@ -159,41 +153,8 @@ def read_profile(
     return Profile(values, factor is not None)
 
 
-def check_length(section: ProfileSection, path: Path, shape: tuple[int, ...], place: str) -> None:
-    """Raise `InputError` where an NPY profile does not fit a boundary of this shape, which need not
-    have been built. A CSV profile is interpolated, and fits."""
-    if path.suffix.lower() == ".npy":
-        _of_shape(_load_npy(section, path, place), shape, path, place)
-
-
-def _read_npy(section: ProfileSection, path: Path, boundary: Boundary, place: str) -> np.ndarray:
-    array = _load_npy(section, path, place)
-    _of_shape(array, boundary.shape, path, place)
-    values = array.astype(np.float64).ravel()
-    bad = np.flatnonzero(~np.isfinite(values))
-    if bad.size:
-        first = int(bad[0])
-        raise input_error(
-            f"{path.name}, value {first + 1}",
-            f"{values[first]} ({bad.size} such values)",
-            "every value of a profile is finite: a gap is not a value",
-            "Fill the gaps on purpose.",
-        )
-    return values
-
-
-def _of_shape(array: np.ndarray, shape: tuple[int, ...], path: Path, place: str) -> None:
-    size = math.prod(shape)
-    if array.shape not in {(size,), shape}:
-        raise input_error(
-            f"{place}.file",
-            f"{path.name} with {array.size} values (shape {array.shape})",
-            f"the boundary has {size} points (shape {shape}), a value for each",
-            "Set boundary.points to the profile's length, or resample the profile.",
-        )
-
-
-def _load_npy(section: ProfileSection, path: Path, place: str) -> np.ndarray:
+def read_npy(section: ProfileSection, path: Path, shape: tuple[int, ...], place: str) -> np.ndarray:
+    """The values of an NPY profile on a boundary of this shape. Raises `InputError`."""
     for key, value in (("column", section.column), ("position_column", section.position_column)):
         if value not in (None, "s"):
             raise input_error(
@@ -213,10 +174,27 @@ def _load_npy(section: ProfileSection, path: Path, place: str) -> np.ndarray:
         ) from None
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         given = str(array.dtype) if isinstance(array, np.ndarray) else type(array).__name__
+        rule = "a profile is one array of real numbers"
+        raise input_error(path.name, given, rule, "Save it as float.")
+    size = math.prod(shape)
+    if array.shape not in {(size,), shape}:
         raise input_error(
-            path.name, given, "a profile is one array of real numbers", "Save it as float."
+            f"{place}.file",
+            f"{path.name} with {array.size} values (shape {array.shape})",
+            f"the boundary has {size} points (shape {shape}), a value for each",
+            "Set boundary.points to the profile's length, or resample the profile.",
         )
-    return array
+    values = array.astype(np.float64).ravel()
+    bad = np.flatnonzero(~np.isfinite(values))
+    if bad.size:
+        first = int(bad[0])
+        raise input_error(
+            f"{path.name}, value {first + 1}",
+            f"{values[first]} ({bad.size} such values)",
+            "every value of a profile is finite: a gap is not a value",
+            "Fill the gaps on purpose.",
+        )
+    return values
 
 
 def _factor(units: Units, unit: str, kind: str, file: str, column: str) -> float:

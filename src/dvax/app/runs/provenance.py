@@ -1,4 +1,4 @@
-"""What a result rests on: versions, machine, precision, data."""
+"""The provenance of a result: versions, machine, precision."""
 
 import platform
 import subprocess
@@ -21,7 +21,7 @@ PACKAGES = (
 
 
 def provenance() -> dict[str, Any]:
-    """Versions of dvax and of what computes, the machine, the precision."""
+    """Return versions of dvax and of the numerical packages, the machine and the precision."""
     device = jax.devices()[0]
     return {
         "dvax": _version("dvax"),
@@ -43,7 +43,8 @@ def _version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """The commit of the source tree dvax runs from, with a + where it was changed; else None."""
+    """Return the commit of the source tree that dvax runs from, with a + where files are modified; None
+    outside of one."""
     folder = Path(__file__).resolve().parent
 
     def git(*words: str) -> str | None:
@@ -55,8 +56,7 @@ def _commit() -> str | None:
             return None
         return done.stdout.strip() if done.returncode == 0 else None
 
-    # Only where this very file is under version control: dvax may be installed inside another
-    # project's checkout.
+    # Only where this file is under version control: dvax may be installed in another checkout.
     if git("ls-files", "--error-unmatch", Path(__file__).name) is None:
         return None
     commit = git("rev-parse", "HEAD")

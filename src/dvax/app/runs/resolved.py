@@ -2,28 +2,39 @@
 
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from dvax.app.runs.contact_inputs import ContactInputs
-from dvax.app.runs.settings import Config
+import tomli_w
+
+if TYPE_CHECKING:
+    from dvax.app.runs.applications.config import ModelConfig
+    from dvax.app.runs.settings import Config
 
 NAME = "config.resolved.toml"
 DATA_FOLDER = "inputs"
 
 
-def write_resolved(config: Config, inputs: ContactInputs, directory: Path) -> Path:
+def write_resolved(config: "Config | ModelConfig", directory: Path) -> Path:
     """Write the complete configuration and copies of its data files into a run directory.
 
-    `load_config` of the written file gives the same run, wherever the directory is moved. Returns
-    the file's path. Raises `OSError` where the disk refuses.
+    Reading the written file gives the same run, wherever the directory is moved. Returns the file's
+    path. Raises `OSError` where the disk refuses.
     """
-    paths = {file.name: file.path for file in inputs.data_files}
-    names: dict[str, str] = {}
-    for key, name in config.data_files().items():
-        source = paths[name]
-        names[key] = f"{DATA_FOLDER}/{key.removesuffix('.file').replace('.', '_')}_{source.name}"
-        target = directory / names[key]
+    tree = config.tree()
+    for key, source in config.data_files():
+        *tables, last = key.split(".")
+        stem = "_".join(tables if last == "file" else [*tables, last])
+        value = f"{DATA_FOLDER}/{stem}_{source.name}"
+        target = directory / value
+        if config.is_folder(key):
+            value = f"{DATA_FOLDER}/{stem}"
+            target = directory / value / source.name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, target)
+        table = tree
+        for name in tables:
+            table = table[name]
+        table[last] = value
     path = directory / NAME
-    path.write_text(config.to_toml(names), encoding="utf-8")
+    path.write_text(tomli_w.dumps(tree), encoding="utf-8")
     return path

@@ -1,4 +1,4 @@
-"""The run directory: what a run leaves behind, readable at every moment.
+"""The run directory: the files of a run, readable at every moment.
 
     config.resolved.toml   every setting; running it again gives the same run
     manifest.json          versions, machine, data, constants, why it stopped
@@ -7,9 +7,9 @@
     trajectory.zarr        frames, as an xarray Dataset
 
 Numbers that are not finite are the strings "inf", "-inf" and "nan" in JSON, which `float` reads.
-Small files are replaced whole (written beside, then renamed). Frames are written into a store that
+Small files are replaced atomically (written beside, then renamed). Frames are written into a store that
 has its full length from the start; the time of a frame is written last and is NaN until then, so a
-frame with a time is a frame that is complete, whatever killed the run.
+frame with a time is complete, whatever killed the run.
 """
 
 import json
@@ -25,6 +25,7 @@ import numpy as np
 import zarr
 
 from dvax.app.runs.json_numbers import json_ready
+from dvax.errors import Problems
 
 FILES = (
     "config.resolved.toml", "manifest.json", "summary.json", "log.jsonl", "report.html",
@@ -49,12 +50,11 @@ class RunDirectory:
         self._log = (path / "log.jsonl").open("a", encoding="utf-8")
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Replace a small file as a whole: a reader sees the old one or the new one."""
-        text = json.dumps(json_ready(content), indent=2, ensure_ascii=False, allow_nan=False)
-        write_whole(self.path / name, f"{text}\n".encode())
+        """Replace a small file atomically."""
+        write_json(self.path / name, content)
 
     def log(self, event: Mapping[str, Any]) -> None:
-        """Append an event, with the moment it happened, and hand it to the system at once."""
+        """Append an event with its time of day, and flush."""
         moment = datetime.now(UTC).isoformat(timespec="milliseconds")
         json.dump({"at": moment, **json_ready(event)}, self._log, ensure_ascii=False)
         self._log.write("\n")
@@ -64,9 +64,15 @@ class RunDirectory:
         self._log.close()
 
 
+def write_json(file: Path, content: Mapping[str, Any]) -> None:
+    """Write an object; numbers that are not finite become strings. Raises `OSError`."""
+    text = json.dumps(json_ready(content), indent=2, ensure_ascii=False, allow_nan=False)
+    write_whole(file, f"{text}\n".encode())
+
+
 def write_whole(file: Path, content: bytes) -> None:
-    """Write beside `file`, then rename: a reader sees the old one or the new one, and where the disk is
-    full nothing is left over.
+    """Write beside `file`, then rename: readers get the old or the new content, and a full disk
+    leaves no partial file.
 
     **Raises:** `OSError` with the name of the file.
     """
@@ -83,29 +89,24 @@ def write_whole(file: Path, content: bytes) -> None:
 
 
 def process() -> dict[str, Any]:
-    """Which process a run is, for the manifest: whether it is still going on can be told from that."""
+    """Return process id and host for the manifest, from which `close_killed` tells whether it still
+    runs."""
     return {"process": os.getpid(), "host": platform.node()}
 
 
 def close_killed(directory: Path) -> bool:
-    """Where the process of an unfinished run is gone, cut the frames off that it had not completed and
-    say so in the manifest. Returns whether that was so."""
+    """Close a run whose process was killed: cut off its incomplete frames and record it in the
+    manifest. Returns whether that was so."""
     file = directory / "manifest.json"
     try:
         manifest = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return False  # who reads the directory next says what is wrong with it
+        return False  # the next reader of the directory reports what is wrong
     ours = isinstance(manifest, dict) and manifest.get("status") == "running"
     if not ours or manifest.get("host") != platform.node() or _alive(manifest.get("process")):
         return False
     reason = "The process was killed, or the machine stopped; it left no word."
-    write_whole(
-        file,
-        json.dumps(
-            {**manifest, "status": "killed", "stop_reason": reason}, indent=2, ensure_ascii=False
-        )
-        + "\n",
-    )
+    write_json(file, {**manifest, "status": "killed", "stop_reason": reason})
     store = directory / "trajectory.zarr"
     if store.is_dir():
         cut_incomplete(store)
@@ -118,12 +119,12 @@ def _alive(number: Any) -> bool:
     except (ProcessLookupError, TypeError, ValueError):
         return False
     except OSError:
-        return True  # it is another user's
+        return True  # the process of another user
     return True
 
 
 def cut_incomplete(path: Path) -> None:
-    """Cut off the frames of a store without a time, which a killed run had not completed."""
+    """Cut off the frames without a time, which a killed run had not completed."""
     group = zarr.open_group(path, mode="r+", use_consolidated=False)
     if "time" not in group:
         return
@@ -152,8 +153,8 @@ class FrameStore:
         points = next(len(values) for dims, values, _ in coords.values() if dims == ("point",))
         sizes = {"time": frames, "point": points}
         chunk = {"time": block, "point": min(points, max(1, _CHUNK_BYTES // (8 * block)))}
-        # Written by zarr alone: xarray takes longer to import than a block to solve. What it needs
-        # to see a Dataset is the names of the dimensions, and this attribute for its coordinates.
+        # Written by zarr alone: importing xarray takes longer than solving a block. To read a Dataset
+        # xarray needs the names of the dimensions, and this attribute for its coordinates.
         group = zarr.open_group(
             path,
             mode="w-",
@@ -180,7 +181,7 @@ class FrameStore:
         self._publish()
 
     def write(self, times: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
-        """Append complete frames; their times go last and make them count."""
+        """Append complete frames; their times are written last."""
         region = slice(self.written, self.written + len(times))
         for name, array in self._arrays.items():
             array[region] = values[name]
@@ -189,7 +190,7 @@ class FrameStore:
         self._publish()
 
     def mark(self, names: tuple[str, ...], status: str) -> None:
-        """State how much is known of these variables (their attribute `status`)."""
+        """Set the attribute `status` of these variables: proved, declared or estimated."""
         for name in names:
             attrs = self._arrays[name].attrs
             if attrs.get("status") != status:
@@ -203,8 +204,8 @@ class FrameStore:
         self._publish()
 
     def _publish(self) -> None:
-        """Replace the group's consolidated metadata, which readers such as xarray take first: every
-        array in it ends with the last complete frame, and so the store of a killed run opens."""
+        """Replace the group's consolidated metadata, which readers such as xarray use: every array
+        in it ends with the last complete frame, so that the store of a killed run opens."""
         about = {
             folder.name: json.loads((folder / "zarr.json").read_text(encoding="utf-8"))
             for folder in sorted(self.path.iterdir())
@@ -218,3 +219,28 @@ class FrameStore:
             "kind": "inline", "must_understand": False, "metadata": about,
         }  # fmt: skip
         write_whole(self.path / "zarr.json", json.dumps(group).encode())
+
+
+def target_problems(out: Path, *, force: bool) -> Problems:
+    """Return the reasons not to write a run into `out`: existing files are kept, unless the user asks
+    otherwise."""
+    problems = Problems()
+    if out.exists() and not out.is_dir():
+        fix = "Give the name of a folder that does not exist yet."
+        problems.add(str(out), "a file", "results are written into a folder", fix)
+    elif out.exists() and any(out.iterdir()):
+        if not force:
+            problems.add(
+                str(out),
+                "a folder that is not empty",
+                "results are never written over others unasked",
+                "Give another folder, or --force to replace what dvax wrote here.",
+            )
+        elif not (out / "manifest.json").is_file():
+            problems.add(
+                str(out),
+                "a folder that is not empty and holds no manifest.json",
+                "--force replaces a run of dvax and deletes nothing else",
+                "Give another folder, or empty this one yourself.",
+            )
+    return problems

@@ -7,7 +7,7 @@ values stand in `dvax.app.runs.consistency`.
 """
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     AfterValidator,
@@ -17,6 +17,7 @@ from pydantic import (
     Field,
     PlainValidator,
     ValidationInfo,
+    field_validator,
 )
 from pydantic_core import PydanticCustomError
 
@@ -27,25 +28,28 @@ ViSolver = Literal[
     "SemismoothNewton", "ActiveSet", "Accelerated",
 ]  # fmt: skip
 """Solvers of the frozen law that need no argument, by their names in `dvax.vi`."""
-MOST_COUNTED = 2**31 - 1
+Method = Literal[
+    "ETD1", "ETD2RK", "ETD4RK", "ExpRosenbrock", "DormandPrince", "Implicit", "PiecewiseLinear"
+]  # fmt: skip
+LARGEST_MAX_STEPS = 2**31 - 1
 """The largest max_steps of `dvax.solve`."""
 MAX_POINTS = 100_000_000
 MAX_FRAMES = 10**7
 
 
-def broken(rule: str, fix: str) -> PydanticCustomError:
-    """What a validator raises: the rule that a value breaks, and the fix."""
+def rule_error(rule: str, fix: str) -> PydanticCustomError:
+    """Return the exception for a validator to raise: the rule that a value breaks, and the fix."""
     return PydanticCustomError("rule", "{rule}", {"rule": rule, "fix": fix})
 
 
 LEAST_RTOL = 2.3e-14
-"""A hundred roundings of double precision: the smallest rtol that steps can reach."""
+"""A hundred unit roundoffs of double precision: the smallest rtol that steps can reach."""
 
 
 def within_precision(rtol: float | None) -> float | None:
     """A relative tolerance that double precision can reach."""
     if rtol is not None and rtol < LEAST_RTOL:
-        raise broken(
+        raise rule_error(
             f"a relative tolerance below {LEAST_RTOL:g} cannot be reached in double precision, whose "
             "rounding is 2.2e-16 an operation",
             f"Write rtol = {LEAST_RTOL:g} or more; atol is for states near 0",
@@ -61,7 +65,7 @@ def _in_units(value: Any, kind: str, info: ValidationInfo) -> Any:
     try:
         return units.convert(value, kind)
     except UnitError as error:
-        raise broken(error.rule, error.fix) from None
+        raise rule_error(error.rule, error.fix) from None
 
 
 def in_quantity(kind: str) -> BeforeValidator:
@@ -76,7 +80,7 @@ def in_quantity(kind: str) -> BeforeValidator:
 def _finite(value: Any, kind: str, info: ValidationInfo, what: str) -> float:
     number = _in_units(value, kind, info)
     if type(number) not in (int, float) or not math.isfinite(number):
-        raise broken(
+        raise rule_error(
             f"{what} is a finite number", f'Write a number, or a text such as "2.5 <unit>" ({kind})'
         )
     return float(number)
@@ -84,21 +88,21 @@ def _finite(value: Any, kind: str, info: ValidationInfo, what: str) -> float:
 
 def _pair_of_lengths(value: Any, info: ValidationInfo) -> tuple[float, ...]:
     if not isinstance(value, list | tuple) or len(value) != 2:
-        raise broken("a two-dimensional boundary has two lengths", "Write lengths = [a, b]")
+        raise rule_error("a two-dimensional boundary has two lengths", "Write lengths = [a, b]")
     pair = tuple(_finite(v, "length", info, "a length") for v in value)
     if not all(v > 0 for v in pair):
-        raise broken("a length is greater than 0", "Give both sides of the boundary")
+        raise rule_error("a length is greater than 0", "Give both sides of the boundary")
     return pair
 
 
 def _counts(value: Any) -> tuple[int, ...]:
     counts = tuple(value) if isinstance(value, list | tuple) else (value,)
     if len(counts) not in (1, 2) or not all(type(n) is int for n in counts):
-        raise broken(
+        raise rule_error(
             "points is a whole number, or two of them", "Write points = 1000 or points = [100, 50]"
         )
     if not all(n >= 1 for n in counts) or math.prod(counts) > MAX_POINTS:
-        raise broken(
+        raise rule_error(
             f"a boundary has 1 to {MAX_POINTS} points in all", "Choose the resolution you need"
         )
     return counts
@@ -106,7 +110,7 @@ def _counts(value: Any) -> tuple[int, ...]:
 
 def _places(value: Any, info: ValidationInfo) -> tuple[tuple[float, ...], ...]:
     if not isinstance(value, list | tuple):
-        raise broken("points_of_interest is a list", "Write points_of_interest = [2.5, 5.0]")
+        raise rule_error("points_of_interest is a list", "Write points_of_interest = [2.5, 5.0]")
     places = []
     for place in value:
         parts = place if isinstance(place, list | tuple) else (place,)
@@ -116,7 +120,7 @@ def _places(value: Any, info: ValidationInfo) -> tuple[tuple[float, ...], ...]:
 
 def _times(value: Any, info: ValidationInfo) -> tuple[float, ...]:
     if not isinstance(value, list | tuple):
-        raise broken("knots is a list of times", "Write knots = [1.0, 2.0]")
+        raise rule_error("knots is a list of times", "Write knots = [1.0, 2.0]")
     return tuple(_finite(part, "time", info, "a time") for part in value)
 
 
@@ -132,7 +136,7 @@ def _working_unit(value: Any, info: ValidationInfo) -> Any:
         try:
             check_working_unit(str(info.field_name), value)
         except UnitError as error:
-            raise broken(error.rule, error.fix) from None
+            raise rule_error(error.rule, error.fix) from None
     return value
 
 
@@ -225,52 +229,55 @@ class ProfileSection(Section):
     )
 
 
-def _field_quantity(name: str) -> tuple[BeforeValidator, BeforeValidator, BeforeValidator]:
-    """Validators of value, series and profile of a field that is a `name` (indentation, ...)."""
+class FieldSection(Section):
+    """A field on the boundary: the product of the factors that are given."""
 
-    def table(value: Any, info: ValidationInfo) -> Any:
+    quantity: ClassVar[str]
+
+    value: float | None = Field(None, description="a constant factor")
+    expression: str | None = Field(None, description="a formula in t and s (or s1, s2)")
+    profile: ProfileSection | None = Field(None, description="a measured profile")
+
+    @field_validator("value", mode="before")
+    @classmethod
+    def _value(cls, value: Any, info: ValidationInfo) -> Any:
+        return _in_units(value, cls.quantity, info)
+
+    @field_validator("series", "profile", mode="before", check_fields=False)
+    @classmethod
+    def _table(cls, value: Any, info: ValidationInfo) -> Any:
         if isinstance(value, dict) and "per_unit" in value:
-            factor = _finite(value["per_unit"], name, info, "per_unit")
+            factor = _finite(value["per_unit"], cls.quantity, info, "per_unit")
             return {**value, "per_unit": factor}
         return value
 
-    return in_quantity(name), BeforeValidator(table), BeforeValidator(table)
 
+class DrivingSection(FieldSection):
+    """A field that may change in time."""
 
-_G = _field_quantity("indentation")
-_L = _field_quantity("indentation rate")
-
-
-class DemandSection(Section):
-    """g(t, s) [indentation]: the product of the factors that are given."""
-
-    value: Annotated[float | None, _G[0]] = Field(None, description="a constant factor")
-    expression: str | None = Field(None, description="a formula in t and s (or s1, s2)")
     knots: Annotated[tuple[float, ...] | None, PlainValidator(_times)] = Field(
         None, description="times where the formula has a kink"
     )
-    series: Annotated[SeriesSection | None, _G[1]] = Field(None, description="a measured history")
-    profile: Annotated[ProfileSection | None, _G[2]] = Field(None, description="a measured profile")
+    series: SeriesSection | None = Field(None, description="a measured history")
 
 
-class LoadSection(Section):
-    """ell(t, s) [indentation/time]: the product of the factors that are given."""
+class DemandSection(DrivingSection):
+    """g(t, s) [indentation]."""
 
-    value: Annotated[float | None, _L[0]] = Field(None, description="a constant factor")
-    expression: str | None = Field(None, description="a formula in t and s (or s1, s2)")
-    knots: Annotated[tuple[float, ...] | None, PlainValidator(_times)] = Field(
-        None, description="times where the formula has a kink"
-    )
-    series: Annotated[SeriesSection | None, _L[1]] = Field(None, description="a measured history")
-    profile: Annotated[ProfileSection | None, _L[2]] = Field(None, description="a measured profile")
+    quantity = "indentation"
 
 
-class InitialSection(Section):
-    """x(0, s) [indentation]: the product of the factors that are given, and a second start."""
+class LoadSection(DrivingSection):
+    """ell(t, s) [indentation/time]."""
 
-    value: Annotated[float | None, _G[0]] = Field(None, description="a constant factor")
-    expression: str | None = Field(None, description="a formula in s (or s1, s2)")
-    profile: Annotated[ProfileSection | None, _G[2]] = Field(None, description="a measured profile")
+    quantity = "indentation rate"
+
+
+class InitialSection(FieldSection):
+    """x(0, s) [indentation], a formula of which depends on s alone, and a second start."""
+
+    quantity = "indentation"
+
     companion: Annotated[float | str | None, PlainValidator(_perturbation)] = Field(
         None,
         description="what is added to x(0, s) to start the second trajectory; by default the "
@@ -290,15 +297,59 @@ class TimeSection(Section):
     )
 
 
-class SolverSection(Section):
-    """Fixed steps `dt`, or steps chosen for `rtol` and `atol`."""
+def _alone(dt: float | None, info: ValidationInfo) -> float | None:
+    """Refuse a fixed step together with tolerances, or with a method that needs them."""
+    given = [name for name in ("rtol", "atol", "dt_max") if info.data.get(name) is not None]
+    if dt is not None and given:
+        raise rule_error(
+            f"steps are fixed by dt, or chosen for {' and '.join(given)}, not both",
+            f"Leave out dt, or {' and '.join(given)}",
+        )
+    if dt is not None and info.data.get("method") == "Implicit":
+        raise rule_error(
+            "the steps of an implicit method are chosen for rtol and atol", "Leave out dt"
+        )
+    return dt
+
+
+def _apart(value: Any, info: ValidationInfo) -> Any:
+    """Refuse options of steps and of law solvers for `PiecewiseLinear`, which has neither."""
+    if value is not None and info.data.get("method") == "PiecewiseLinear":
+        raise rule_error(
+            "PiecewiseLinear steps from one change of the constraints to the next, and solves its law "
+            "in closed form",
+            f"Leave out {info.field_name}, or name another method",
+        )
+    return value
+
+
+class SolverKeys(Section):
+    """Keys that go to `dvax.solve`; one that is left out has the default of the model."""
+
+    method: Method | None = Field(None, description="of a step; by default that of the model")
+    rtol: Annotated[float | None, AfterValidator(within_precision)] = Field(
+        None, gt=0, lt=1, description="relative tolerance of a run"
+    )
+    atol: float | None = Field(None, gt=0, description="absolute tolerance, in units of the state")
+    dt_max: Annotated[float | None, AfterValidator(_apart)] = Field(
+        None, gt=0, description="the longest step that adapts, in units of time"
+    )
+    dt: Annotated[float | None, AfterValidator(_apart), AfterValidator(_alone)] = Field(
+        None, gt=0, description="fixed steps of this length, in the place of rtol and atol"
+    )
+    max_steps: int | None = Field(
+        None, ge=1, le=LARGEST_MAX_STEPS, description="the most steps between two blocks of frames"
+    )
+    vi_solver: Annotated[ViSolver | None, AfterValidator(_apart)] = Field(
+        None, description="of the frozen law; by default that of the model"
+    )
+
+
+class SolverSection(SolverKeys):
+    """The same for a contact law, whose steps and tolerances may have units."""
 
     method: Literal["ETD2RK", "ETD4RK", "ExpRosenbrock", "DormandPrince", "ETD1"] = Field(
         "ETD2RK", description="of a step"
-    )
-    dt: Annotated[float | None, in_quantity("time")] = Field(None, gt=0, description="a step")
-    rtol: Annotated[float | None, AfterValidator(within_precision)] = Field(
-        None, gt=0, lt=1, description="relative tolerance of a step"
     )
     atol: Annotated[float | None, in_quantity("indentation")] = Field(
         None, gt=0, description="absolute tolerance of a step, an indentation"
@@ -306,10 +357,9 @@ class SolverSection(Section):
     dt_max: Annotated[float | None, in_quantity("time")] = Field(
         None, gt=0, description="the longest step that adapts"
     )
-    max_steps: int | None = Field(
-        None, ge=1, le=MOST_COUNTED, description="the most steps between two blocks of frames"
+    dt: Annotated[float | None, in_quantity("time"), AfterValidator(_alone)] = Field(
+        None, gt=0, description="fixed steps of this length"
     )
-    vi_solver: ViSolver | None = Field(None, description="of the frozen law, in the place of Auto")
 
 
 class ReportSection(Section):

@@ -1,4 +1,4 @@
-"""Pydantic's findings in the words of a configuration file."""
+"""Translate errors of pydantic into problems of a configuration file."""
 
 import json
 import re
@@ -31,13 +31,13 @@ _LIMITS = {
 
 
 def shown(value: Any) -> str:
-    """A value for a message: whole where short, its beginning where long."""
+    """Return a value as text for a message, cut off where it is long."""
     text = repr(value)
     return text if len(text) <= 70 else text[:67] + "..."
 
 
 def unknown_key(place: str, key: str, value: Any, known: list[str]) -> InputProblem:
-    """A key that nothing reads, with the nearest one that something does."""
+    """Return the problem of an unknown key, with the nearest known one."""
     close = get_close_matches(key, known, n=1)
     fix = f"Did you mean {close[0]!r}?" if close else f"Allowed here: {', '.join(known)}."
     return InputProblem(place, shown(value), f"there is no key {key!r} here", fix)
@@ -92,13 +92,13 @@ def _problem(
 
 
 def _dotted(section: str, path: list[str | int]) -> str:
-    """A path as a reader finds it: tables of a list are counted from 1 on."""
+    """Return a dotted path; tables of a list are counted from 1."""
     return section + "".join(f"[{p + 1}]" if isinstance(p, int) else f".{p}" for p in path)
 
 
 def _bare(key: str, text: str, about: str) -> str:
-    """The fix where a text stands for a bare number: that number, in the unit that the key is in, as
-    far as the text says it."""
+    """Return the fix for a text in place of a bare number: that number in the unit of the key,
+    where the text states it."""
     found = re.search(r"\[([^\[\]]+)\]", about)
     unit = found[1] if found else None
     digits = text.strip()
@@ -110,7 +110,7 @@ def _bare(key: str, text: str, about: str) -> str:
 
 
 def _sample(info: FieldInfo | None) -> str:
-    """A value for a key as TOML has it, dots where there is no example."""
+    """Return an example value for a key in TOML, dots where there is none."""
     return json.dumps(info.examples[0]) if info is not None and info.examples else "..."
 
 
@@ -119,7 +119,7 @@ def _owner(
 ) -> tuple[type[BaseModel], FieldInfo | None]:
     """The model in which the last part of a path stands, and that part's field if it has one."""
     owner, info = model, None
-    # The numbers of a list's entries lead into no other model.
+    # Indices of lists lead to no other model.
     names = [part for part in path if isinstance(part, str)]
     for i, part in enumerate(names):
         info = owner.model_fields.get(part)

@@ -47,25 +47,18 @@ class Config(Section):
         """Where the data files lie."""
         return Sources(self._source.name, self._source.parent, self._allow_outside)
 
-    def data_files(self) -> dict[str, str]:
-        """Dotted key -> file name, for every data file that the configuration names."""
-        return dict(_files(self.model_dump(exclude_none=True)))
+    def is_folder(self, key: str) -> bool:
+        """Whether a dotted key names a folder: none does."""
+        return False
 
-    def to_toml(self, files: Mapping[str, str] | None = None) -> str:
-        """All settings as TOML; reading it again beside the same data gives the same configuration.
+    def data_files(self) -> list[tuple[str, Path]]:
+        """(dotted key, file) of every data file that the configuration names."""
+        return [(key, self._source.parent / name) for key, name in _files(self.model_dump())]
 
-        `files` gives other names to data files, by dotted key: for a copy elsewhere.
-        """
-        import tomli_w
-
-        tree = _plain(self.model_dump(exclude_none=True))
-        for key, name in (files or {}).items():
-            *path, last = key.split(".")
-            table = tree
-            for part in path:
-                table = table[part]
-            table[last] = name
-        return tomli_w.dumps(tree)
+    def tree(self) -> dict[str, Any]:
+        """All settings as a TOML file has them; reading it beside the same data gives the same
+        configuration."""
+        return _plain(self.model_dump(exclude_none=True))
 
 
 def _files(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
@@ -73,13 +66,13 @@ def _files(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
     for key, value in tree.items():
         if isinstance(value, Mapping):
             found += _files(value, f"{prefix}{key}.")
-        elif key == "file":
+        elif key == "file" and value is not None:
             found.append((f"{prefix}{key}", value))
     return found
 
 
 def _plain(value: Any) -> Any:
-    """Tuples as TOML writes them: one entry stands for itself, more are an array."""
+    """Convert tuples for TOML: one entry becomes a number, several become an array."""
     if isinstance(value, Mapping):
         return {
             key: [_plain(p) for p in inner]

@@ -1,4 +1,4 @@
-"""The solution of one piece of a run: its first rows alone, and whether its states are finite."""
+"""Solutions of one piece of a run: their first rows, and a check that states are finite."""
 
 from typing import Any
 
@@ -20,14 +20,14 @@ def cut(solution: Solution, count: int) -> Solution:
 
 
 def with_fields(solution: Solution, fields: dict[str, Any]) -> Solution:
-    """The solution with `fields` in the place of its own."""
+    """Return the solution with some fields replaced."""
     given = {name: getattr(solution, name) for name in solution.__dataclass_fields__}
     return Solution(**(given | fields))
 
 
 def all_finite(solution: Solution, start: float) -> Solution:
-    """Return `solution`, which began at the time `start`, where all its states are finite. Fixed steps
-    are not checked one by one.
+    """Return `solution`, which starts at the time `start`, where all its states are finite. (The
+    loop does not check fixed steps one by one.)
 
     **Raises:** `dvax.SolveError`, with the saved times before the first state that is not finite, and
     the interval in which the state ceased to be so.

@@ -43,7 +43,7 @@ _QUANTITY = re.compile(
     rf"\s*(?P<number>{NUMBER.pattern})(?P<unit>\s*[A-Za-zµμ%°].*?|\s+(?:1\s*/|\().+?)\s*"
 )
 # A unit is names with single-digit exponents between * / · or blanks, one level of parentheses
-# deep: no number within it can grow, and pint's own parser never sees anything else.
+# deep: no number in it can grow, and nothing else reaches pint's own parser.
 _EXPONENT = r"(?:\s*(?:\*\*|\^)\s*-?\d)?"
 _NAME = rf"[A-Za-zµμ%][A-Za-zµμ_]*{_EXPONENT}"
 _BETWEEN = r"(?:\s*(?:\*(?!\*)|[/·])\s*|\s+)"
@@ -92,7 +92,7 @@ class Units(BaseModel):
                 f"{unit!r} does not measure this: the quantity is {_article(kind)}, in {target}",
                 f"Give it in {target} or a unit that converts to {target}",
             )
-        # Through the exact ratio of scale and not by converting 1.0, which offsets would spoil.
+        # parse_unit refuses units with an offset, so that one number is the ratio.
         return float(registry.Quantity(1.0, given).to(wanted).magnitude)
 
     def convert(self, text: str, kind: str) -> float:
@@ -128,7 +128,7 @@ def is_quantity(text: str) -> bool:
 
 
 def _match(text: str) -> re.Match[str] | None:
-    # The pattern takes quadratic time, which a long text could turn into minutes.
+    # The pattern takes quadratic time, which is minutes for a long text.
     return _QUANTITY.fullmatch(text) if len(text) <= 100 else None
 
 
@@ -157,7 +157,7 @@ def parse_unit(unit: str) -> "pint.Unit":
         parsed = registry.Unit(text.replace("·", "*"))
         one, two = (registry.Quantity(n, parsed).to_base_units().magnitude for n in (1.0, 2.0))
     except (pint.PintError, ValueError, ArithmeticError, AttributeError):
-        # The last is how a quantity of pint says that its unit is neither linear nor known.
+        # pint raises the last for a unit that is neither linear nor known.
         raise UnitError(
             f"{unit!r} is not a known unit", "Write one such as s, mm, um/s or MPa/mm (1 for none)"
         ) from None
@@ -168,7 +168,7 @@ def parse_unit(unit: str) -> "pint.Unit":
 
 @lru_cache(maxsize=1)
 def _registry() -> Any:
-    import pint  # a second of import, spent only where a text with a unit occurs
+    import pint  # the import takes a second: only where a text with a unit occurs
 
     return pint.UnitRegistry(cache_folder=None)
 

@@ -13,7 +13,7 @@ NAMES = tuple(module.name.replace("_", "-") for module in pkgutil.iter_modules(_
 
 
 def application_pictures(name: str, data: Mapping[str, Variable]) -> list[Picture]:
-    """The pictures of the application that is called so.
+    """Return the pictures of an application by its name.
 
     **Raises:** `dvax.InputError` where none is: the name comes from a file that may be damaged.
     """

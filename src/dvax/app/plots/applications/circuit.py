@@ -1,4 +1,4 @@
-"""The circuit: states, and the currents of the diodes, over time."""
+"""Pictures of a circuit: states, and currents of the diodes, over time."""
 
 from collections.abc import Mapping
 
@@ -10,7 +10,7 @@ _PREFIXES = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
 
 
 def pictures(data: Mapping[str, Variable]) -> list[Picture]:
-    """Voltages, currents, and what the diodes let through."""
+    """Voltages, currents, and currents of the diodes."""
     seconds = data["time"].values
     unit, scale = next(((u, s) for u, s in _PREFIXES.items() if seconds[-1] * s >= 1.0), ("s", 1.0))
     if seconds[-1] >= 1.0:

@@ -1,4 +1,4 @@
-"""Contact of a body: the pressure on the way to rest, the force, and the stress inside."""
+"""Pictures of the contact of a body: pressure until rest, force over time, stress inside."""
 
 from collections.abc import Mapping
 
@@ -24,7 +24,7 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
 
 def _pressure(data: Mapping[str, Variable]) -> Picture:
     times, s, p = (data[name].values for name in ("time", "place", "pressure"))
-    # Equally far from each other in what happens, not in time: most of a run is rest.
+    # Moments at equal changes of the pressure, not at equal times: most of a run is rest.
     done = np.cumsum(np.abs(np.diff(p, axis=0)).sum(axis=1))
     rows = np.unique(
         1 + np.searchsorted(done, done[-1] * np.arange(1, _MOMENTS + 1) / (_MOMENTS + 0.01))
@@ -33,7 +33,7 @@ def _pressure(data: Mapping[str, Variable]) -> Picture:
     curves.append(Curve(s, data["pressure_at_rest"].values, "at rest", None, "dash"))
     touched = np.flatnonzero(p.max(axis=0) > 0)
     if touched.size:
-        # A little more than the points that were ever touched.
+        # The points that were ever touched, with a margin.
         first, last = max(touched[0] - 5, 0), touched[-1] + 6
         curves = [Curve(c.x[first:last], c.y[first:last], c.name, c.colour, c.dash) for c in curves]
     return panels_picture(

@@ -1,4 +1,4 @@
-"""The frame: ground, displacement, and the loops of the spring."""
+"""Pictures of a frame: ground, displacement, and hysteresis loops of the spring."""
 
 from collections.abc import Mapping
 

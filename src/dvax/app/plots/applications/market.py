@@ -1,4 +1,4 @@
-"""The market: prices, and what the firms make."""
+"""Pictures of a market: prices and production."""
 
 from collections.abc import Mapping
 

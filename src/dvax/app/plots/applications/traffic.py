@@ -1,4 +1,4 @@
-"""Traffic: the way to equilibrium, and the load of the network."""
+"""Pictures of traffic: convergence to the equilibrium, and the load of the network."""
 
 from collections.abc import Mapping
 
@@ -16,7 +16,7 @@ from dvax.app.plots.theme import INK, STILL_STYLE, blank, still_axes
 
 _BUSIEST = 5
 _MAP = "viridis"
-_ASIDE = 0.012
+_LINK_OFFSET = 0.012
 """How far, of the size of the map, a link is drawn to the right of the line between its nodes."""
 
 
@@ -33,7 +33,7 @@ def _days(data: Mapping[str, Variable]) -> Picture:
     least = float(data["equilibrium"].values)
     if np.isfinite(least):
         excess = (objective - least) / least
-        # Below this, the difference of two objectives is rounding.
+        # Below this, the difference of two objectives is roundoff.
         shown = np.where(excess > 1e-15, excess, np.nan)
         above = Panel([Curve(days, shown, "excess", 0)], "objective, excess", log=True)
         words = "by what part Beckmann's objective is larger than at the equilibrium"
@@ -66,7 +66,7 @@ def _map(data: Mapping[str, Variable]) -> Picture:
     along = place[last] - place[first]
     length = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
     right = np.column_stack([along[:, 1], -along[:, 0]]) / length
-    aside = _ASIDE * np.ptp(place, axis=0).max() * right
+    aside = _LINK_OFFSET * np.ptp(place, axis=0).max() * right
     ends = np.stack([place[first] + aside, place[last] + aside], axis=1)
     top = float(np.quantile(load, 0.98))
     shades = colormaps[_MAP](np.clip(load / top, 0.0, 1.0))

@@ -1,30 +1,18 @@
-"""What an application hands to a run, and what a run asks of it."""
+"""The interface between an application and a run."""
 
 import abc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
 
+from dvax.app.runs.figure import Figure as Figure
 from dvax.app.runs.schema import Section
 from dvax.problem import Problem
 from dvax.theory import Assumption, Constants
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A headline figure: a number, or a list of them; `error`: a proved bound on its error, or on those
-    of its entries, where there is one. A figure that is a bound itself says in `bound` how much is
-    known of it: "proved", "declared" or "estimated"."""
-
-    value: Any
-    unit: str
-    meaning: str
-    error: Any = None
-    bound: str | None = None
 
 
 @dataclass(frozen=True)
@@ -41,8 +29,8 @@ class Variable:
 
 @dataclass(frozen=True)
 class Results:
-    """What a run leaves: figures for summary.json, variables for trajectory.zarr, constants and
-    assumptions for the report; `files` writes what else belongs into the run directory."""
+    """The results of a run: figures for summary.json, variables for trajectory.zarr, constants and
+    assumptions for the report; `files` writes further files into the run directory."""
 
     figures: Mapping[str, Figure]
     variables: Mapping[str, Variable]
@@ -53,9 +41,9 @@ class Results:
     files: Callable[[Path], None] | None = None
 
 
-class Known(NamedTuple):
-    """What is known of a model before anything is solved: its constants and assumptions, sizes as
-    (what, value, remark), and `notes`, sentences about what is allowed but worth knowing."""
+class Description(NamedTuple):
+    """A model before anything is solved: its constants and assumptions, sizes as (what, value,
+    remark), and `notes`, sentences about input that is allowed but unusual."""
 
     constants: Constants | None
     assumptions: tuple[Assumption, ...]
@@ -78,38 +66,35 @@ class Plan:
 
 
 class PerRow:
-    """Functions of one row of a solution over all of its rows, each compiled once for a model. One row
-    after the other: of a large state all at once would need more memory than the solve."""
+    """Map functions over the rows of a solution, each compiled once for a model. Rows are
+    processed one after the other, since a vectorised map of a large state needs more memory than
+    the solve."""
 
     def __init__(self) -> None:
         self._made: dict[str, Callable[..., Any]] = {}
 
     def __call__(self, name: str, function: Callable[..., Any], *rows: Any) -> np.ndarray:
-        """function(*row) at every row of `rows`; by the same `name` it is the same function."""
+        """Return function(*row) at every row of `rows`. A `name` always stands for the same
+        function."""
         if name not in self._made:
             self._made[name] = jax.jit(lambda *rows: jax.lax.map(lambda row: function(*row), rows))
         return np.asarray(self._made[name](*rows))
 
 
 Say = Callable[[str], None]
-"""To be told what a solve is about to do: "solving at rest", for a reader who waits."""
-
-Model = TypeVar("Model")
+"""A function that reports the next stage of a run: "solving at rest"."""
 
 
-class AbstractApplication(abc.ABC, Generic[Model]):
+class AbstractApplication(abc.ABC):
     """A model that the table `[model]` of a configuration describes alone.
 
-    - `section`: that table, for pydantic; the keys in `files` name data files, those in `folders`
-      folders, with the files that are read there;
-    - `keys`: the keys that make an argument of the model, where they are called otherwise than it;
-    - `read`: from the table to the model, everything checked, nothing solved;
-    - `fit`: "exact", or by what it is regularised, or why it is outside the class;
-    - `known`: what can be told before anything is solved;
-    - `plan`: what is to be integrated, all else being computed, saying at each stage what it does;
-    - `results`: from the solution, of which the first `count` rows are meant, to the results.
+    It is made from that table and the places of its data, everything checked and nothing solved; with
+    `quiet` it prints no progress. The constructor raises `dvax.InputError` with all problems.
 
-    `end` is the key of the file for the last time of a run, where there is one.
+    - `section`: the table, for pydantic; the keys in `files` name data files, those in `folders`
+      folders, with the files that are read there;
+    - `keys`: the keys that make an argument of the model, where their names differ from its name;
+    - `end`: the key for the last time of a run, where there is one.
     """
 
     section: ClassVar[type[Section]]
@@ -119,27 +104,26 @@ class AbstractApplication(abc.ABC, Generic[Model]):
     end: ClassVar[str | None] = None
 
     @abc.abstractmethod
-    def read(self, table: Any, paths: Mapping[str, Path], quiet: bool) -> Model:
-        """The model, from its table and where its data lies; `quiet`: without lines of progress.
+    def __init__(self, table: Any, paths: Mapping[str, Path], quiet: bool): ...
 
-        **Raises:** `dvax.InputError` with everything that is wrong.
+    @property
+    @abc.abstractmethod
+    def fit(self) -> str:
+        """Whether the model is in the class: "exact", by what it is regularised, or why it is not."""
+
+    @abc.abstractmethod
+    def describe(self) -> Description:
+        """Constants, assumptions, sizes and notes: what is known before anything is solved."""
+
+    @abc.abstractmethod
+    def plan(self, say: Say) -> Plan:
+        """What to integrate, all else being computed. **Raises:** `dvax.SolveError`."""
+
+    @abc.abstractmethod
+    def results(self, plan: Plan, solution: Any, count: int) -> Results:
+        """The results up to the time number `count` of the plan.
+
+        The `dvax.Solution` has all rows of the plan; rows that were not reached repeat the last of
+        those `count`, so that one compiled program serves all results. It is None where the plan has
+        one time alone.
         """
-
-    @abc.abstractmethod
-    def fit(self, model: Model) -> str:
-        """Whether the model is in the class, exactly or regularised."""
-
-    @abc.abstractmethod
-    def known(self, model: Model) -> Known:
-        """Constants, assumptions, sizes and notes."""
-
-    @abc.abstractmethod
-    def plan(self, model: Model, say: Say) -> Plan:
-        """What to integrate. **Raises:** `dvax.SolveError`."""
-
-    @abc.abstractmethod
-    def results(self, model: Model, plan: Plan, solution: Any, count: int) -> Results:
-        """The results up to the time number `count` of the plan. The `dvax.Solution` has all rows of
-        the plan, and the last of those `count` once more in each that was not reached: what is compiled
-        for the first results serves all later ones. None stands for it where the plan has one time
-        alone."""

@@ -1,4 +1,4 @@
-"""The bound on the error of a run, with what rounding may add to it."""
+"""The bound on the error of a run, roundoff included."""
 
 from typing import Any, NamedTuple
 
@@ -7,13 +7,14 @@ import jax
 import jax.tree_util as jtu
 import numpy as np
 
+from dvax.app.runs.applications.base import Figure, Variable
 from dvax.evolution import Implicit, Solution
 from dvax.problem import Problem
 from dvax.spaces import AbstractSpace
 from dvax.theory import Constants, bound_error
 
-_A_STEP = 16.0
-"""Roundings that a step may add, of the size of the state."""
+_ROUNDOFF_PER_STEP = 16.0
+"""Unit roundoffs of the state that a step may add."""
 
 
 class Certificate(NamedTuple):
@@ -28,6 +29,14 @@ class Certificate(NamedTuple):
         top = float(self.values.max())
         return top if np.isfinite(top) else None
 
+    def figure(self, unit: str, words: str) -> Figure:
+        """The largest bound as a headline figure, with the word for how much is known of it."""
+        return Figure(self.largest, unit, f"{words} ({self.status})", bound=self.status)
+
+    def variable(self, dimension: str, unit: str, words: str) -> Variable:
+        """The bounds at the saved times."""
+        return Variable((dimension,), self.values, unit, words, self.status)
+
     def proved(self, scale: float = 1.0) -> np.ndarray | None:
         """scale · bound at every saved time, where it is proved: what figures are certified to."""
         return scale * self.values if self.status == "proved" else None
@@ -36,8 +45,8 @@ class Certificate(NamedTuple):
 def certificate(
     problem: Problem, solution: Solution, constants: Constants, count: int | None = None
 ) -> Certificate:
-    """`dvax.bound_error`, which holds up to rounding, and what every step may have rounded off: where a
-    solve is exact but for that, a bound of less would be an empty claim. Of the first `count` rows."""
+    """Return `dvax.bound_error` at the first `count` rows, plus the roundoff of all steps, which
+    that bound excludes and which dominates where a solve is exact."""
     if isinstance(solution.setup.method, Implicit):
         # Implicit methods keep no polynomials of their steps, of which a defect could be measured.
         return Certificate(np.full(len(solution.ts[:count]), np.nan), "not known")
@@ -45,7 +54,7 @@ def certificate(
     space = problem.spaces(solution.setup.x0)[0]
     size: Any = _sizes(space, solution.xs)
     eps = np.finfo(jtu.tree_leaves(solution.xs)[0].dtype).eps
-    lost = _A_STEP * eps * (1.0 + float(solution.stats["steps"])) * float(size.max())
+    lost = _ROUNDOFF_PER_STEP * eps * (1.0 + float(solution.stats["steps"])) * float(size.max())
     return Certificate(np.asarray(bound.x)[:count] + lost, bound.status)
 
 

@@ -2,15 +2,15 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
 from dvax.app.runs.applications.base import (
     AbstractApplication,
+    Description,
     Figure,
-    Known,
     PerRow,
     Plan,
     Results,
@@ -18,8 +18,8 @@ from dvax.app.runs.applications.base import (
     Variable,
 )
 from dvax.app.runs.applications.certificate import certificate
-from dvax.app.runs.schema import in_quantity
-from dvax.app.runs.solver_options import SolverKeys, check_steps, event_driven, settings
+from dvax.app.runs.schema import SolverKeys, in_quantity
+from dvax.app.runs.solver_options import check_model_steps, event_driven, settings
 from dvax.evolution import ExpRosenbrock, PiecewiseLinear, Solution
 from dvax.models.circuit import Circuit
 
@@ -39,38 +39,34 @@ class CircuitSection(SolverKeys):
     )
 
 
-class _Loaded:
-    def __init__(self, table: CircuitSection, file: Path):
-        self.table, self.per_row = table, PerRow()
-        self.circuit = Circuit.from_file(file, r_on=table.r_on, g_leak=table.g_leak)
-        self.circuit.check_sources(table.t_end)
-        check_steps(table, table.t_end, f"{table.t_end:g} s")
-
-
-class CircuitApplication(AbstractApplication[_Loaded]):
+class CircuitApplication(AbstractApplication):
     """States, node voltages and diode currents over time."""
 
     section = CircuitSection
     files = ("netlist",)
     end = "model.t_end"
 
-    def read(self, table: Any, paths: Mapping[str, Path], quiet: bool) -> _Loaded:
-        return _Loaded(table, paths["netlist"])
+    def __init__(self, table: CircuitSection, paths: Mapping[str, Path], quiet: bool):
+        self.table, self.per_row = table, PerRow()
+        self.circuit = Circuit.from_file(paths["netlist"], r_on=table.r_on, g_leak=table.g_leak)
+        self.circuit.check_sources(table.t_end)
+        check_model_steps(table, table.t_end, f"{table.t_end:g} s")
 
-    def fit(self, model: _Loaded) -> str:
-        return model.circuit.fit
+    @property
+    def fit(self) -> str:
+        return self.circuit.fit
 
-    def known(self, model: _Loaded) -> Known:
-        c = model.circuit
+    def describe(self) -> Description:
+        c = self.circuit
         sizes = [
             ("states", str(len(c.states)), ", ".join(c.states)),
             ("diodes", str(len(c.diodes)), ", ".join(c.diodes)),
-            ("time", f"0 to {model.table.t_end:g} s", f"{model.table.frames + 1} saved states"),
+            ("time", f"0 to {self.table.t_end:g} s", f"{self.table.frames + 1} saved states"),
         ]
-        return Known(c.constants, (), sizes)
+        return Description(c.constants, (), sizes)
 
-    def plan(self, model: _Loaded, say: Say) -> Plan:
-        c, table = model.circuit, model.table
+    def plan(self, say: Say) -> Plan:
+        c, table = self.circuit, self.table
         say(f"solving from 0 to {table.t_end:g} s")
         times = np.linspace(0.0, table.t_end, table.frames + 1)
         # As `dvax.models.Circuit.solve` has them.
@@ -78,11 +74,11 @@ class CircuitApplication(AbstractApplication[_Loaded]):
         options = settings(table, method=method, rtol=1e-8, atol=1e-9)
         return Plan(c.problem, c.x0, times, c.constants, options, None, "s")
 
-    def results(self, model: _Loaded, plan: Plan, solution: Solution, count: int) -> Results:
-        c, times = model.circuit, np.asarray(solution.ts)[:count]
+    def results(self, plan: Plan, solution: Solution, count: int) -> Results:
+        c, times = self.circuit, np.asarray(solution.ts)[:count]
         bound = certificate(c.problem, solution, c.constants, count)
         volts, amperes = (
-            model.per_row(of.__name__, of, solution.ts, solution.xs, solution.us)[:count]
+            self.per_row(of.__name__, of, solution.ts, solution.xs, solution.us)[:count]
             for of in (c.voltages, c.currents)
         )
         time = ("time",)
@@ -99,21 +95,14 @@ class CircuitApplication(AbstractApplication[_Loaded]):
         for k, name in enumerate(c.diodes):
             words = f"current of diode {name}"
             variables[_key("diode", name)] = Variable(time, amperes[:, k], "A", words)
-        variables["error_bound"] = Variable(
-            time,
-            bound.values,
-            "J^(1/2)",
-            "bound on the error of the state, ‖x‖² = ΣCv² + ΣLi²",
-            bound.status,
-        )
+        words = "bound on the error of the state, ‖x‖² = ΣCv² + ΣLi²"
+        variables["error_bound"] = bound.variable("time", "J^(1/2)", words)
         figures = {
             "final_state": Figure(
                 np.asarray(solution.xs)[-1], "V, A", f"{', '.join(c.states)} at t = {times[-1]:g} s"
             ),
-            "error_bound": Figure(
-                bound.largest, "J^(1/2)",
-                f"bound on the error of the state in the norm of the energy ({bound.status})",
-                bound=bound.status,
+            "error_bound": bound.figure(
+                "J^(1/2)", "bound on the error of the state in the norm of the energy"
             ),
             "decay_rate": Figure(
                 float(c.constants.sharp_decay_rate) + 0.0, "1/s",
@@ -128,4 +117,4 @@ def _key(kind: str, name: str) -> str:
     return f"{kind}_{name}".replace("/", "∕")
 
 
-APPLICATION = CircuitApplication()
+APPLICATION = CircuitApplication

@@ -11,13 +11,13 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from dvax.app.runs.applications.base import AbstractApplication
-from dvax.app.runs.applications.wording import in_keys
 from dvax.app.runs.config import Config, check_contact, parse
 from dvax.app.runs.data_file import DataFile, fingerprint, locate, locate_folder
 from dvax.app.runs.schema import SECTIONS, ModelSection, ReportSection, Section
 from dvax.app.runs.schema_errors import shown, translate, unknown_key
 from dvax.app.runs.units import Units
-from dvax.errors import InputError, input_error
+from dvax.app.runs.wording import Wording
+from dvax.errors import Problems, input_error
 
 APPLICATIONS = ("traffic", "market", "frame", "circuit", "fem-contact")
 """The names of `[model]` that are applications."""
@@ -39,32 +39,44 @@ class ModelConfig:
     table: Section
     output: ReportSection
     source: Path
-    application: AbstractApplication
-    model: Any
+    application: type[AbstractApplication]
+    model: AbstractApplication
     paths: Mapping[str, Path]
 
+    @property
+    def wording(self) -> Wording:
+        """The keys that the arguments of the model come from."""
+        return wording_of(self.application, self.source.name)
+
+    def is_folder(self, key: str) -> bool:
+        """Whether a dotted key names a folder."""
+        return key.removeprefix("model.") in self.application.folders
+
     def data_files(self) -> list[tuple[str, Path]]:
-        """(key, file) of all the data: the files of a folder share its key."""
+        """(dotted key, file) of all the data: the files of a folder share its key."""
         found = []
         for key, path in self.paths.items():
-            inside = self.application.folders.get(key)
-            if inside is None:
-                found.append((key, path))
-            else:
-                found += [(key, path / name) for name in inside if (path / name).is_file()]
+            inside = self.application.folders.get(key, ("",))
+            files = [path / name for name in inside if (path / name).is_file()]
+            found += [(f"model.{key}", file) for file in files]
         return found
 
     def fingerprints(self) -> list[DataFile]:
         """Size and SHA-256 of every data file."""
         return [fingerprint(path.name, path) for _, path in self.data_files()]
 
-    def to_toml(self, paths: Mapping[str, str]) -> str:
-        """All settings as TOML, with these names in the place of those of the data."""
-        import tomli_w
+    def tree(self) -> dict[str, Any]:
+        """All settings as a TOML file has them."""
+        return {
+            "model": self.table.model_dump(exclude_none=True),
+            "output": self.output.model_dump(exclude_none=True),
+        }
 
-        table = {**self.table.model_dump(exclude_none=True), **paths}
-        output = self.output.model_dump(exclude_none=True)
-        return tomli_w.dumps({"model": table, "output": output})
+
+def wording_of(application: type[AbstractApplication], file: str) -> Wording:
+    """The keys of a `file` that the arguments of an application come from."""
+    elsewhere = {} if application.end is None else {"t1": application.end}
+    return Wording(file, "model", application.section, application.keys, elsewhere)
 
 
 def read_config(
@@ -86,14 +98,14 @@ def read_config(
             'Write [model] and below it name = "circuit", say, with the keys of that model',
         )  # fmt: skip
     if isinstance(table, Mapping):
-        # A contact law needs no name: it was the only model once.
+        # A contact law needs no name.
         name = table.get("name", "contact")
-        if "name" not in table and (meant := _meant(table)) is not None:
+        if "name" not in table and (likely := _likely_application(table)) is not None:
             raise input_error(
                 f"{source.name}: model.name", "nothing",
                 f"it says which model this is, one of {', '.join(NAMES)}; "
-                f"these keys are of {meant!r}",
-                f'Add name = "{meant}"',
+                f"these keys are of {likely!r}",
+                f'Add name = "{likely}"',
             )  # fmt: skip
     if name == "contact":
         return check_contact(raw, source, allow_outside)
@@ -106,9 +118,9 @@ def read_config(
     return _check(raw, name, source, allow_outside, quiet)
 
 
-def _meant(table: Mapping[str, Any]) -> str | None:
-    """The application whose keys a table without a name has; None where it has those of a contact
-    law, or of no model."""
+def _likely_application(table: Mapping[str, Any]) -> str | None:
+    """Return the application whose keys a table without a name has; None where they are those of a
+    contact law, or of no model."""
 
     def shared(section: type[BaseModel]) -> int:
         return len(set(table) & set(section.model_fields))
@@ -125,32 +137,26 @@ def _check(
 ) -> ModelConfig:
     file = source.name
     application = module_of(name).APPLICATION
-    problems = [
-        unknown_key(f"{file}: {key}", key, value, list(_SECTIONS))
-        for key, value in raw.items()
-        if key not in _SECTIONS
-    ]
+    problems = Problems()
+    for key, value in raw.items():
+        if key not in _SECTIONS:
+            problems.append(unknown_key(f"{file}: {key}", key, value, list(_SECTIONS)))
     sections: dict[str, Any] = {}
     for key, kind in (("model", application.section), ("output", ReportSection)):
         try:
             sections[key] = kind.model_validate(raw.get(key, {}), context={"units": Units()})
         except ValidationError as error:
             problems += translate(error, file, key, kind)
-    if problems:
-        raise InputError(*problems)
+    problems.raise_any()
     table = sections["model"]
     paths: dict[str, Path] = {}
     for key in (*application.files, *application.folders):
         given = getattr(table, key)
-        if given is None:
-            continue
         find = locate if key in application.files else locate_folder
-        try:
-            paths[key] = find(given, source.parent, allow_outside, f"{file}: model.{key}")
-        except InputError as error:
-            problems += error.problems
-    if problems:
-        raise InputError(*problems)
-    with in_keys(file, application):
-        model = application.read(table, paths, quiet)
+        if given is not None:
+            with problems.collect():
+                paths[key] = find(given, source.parent, allow_outside, f"{file}: model.{key}")
+    problems.raise_any()
+    with wording_of(application, file).in_keys():
+        model = application(table, paths, quiet)
     return ModelConfig(name, table, sections["output"], source, application, model, paths)

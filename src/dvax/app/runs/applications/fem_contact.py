@@ -9,8 +9,8 @@ from pydantic import Field
 
 from dvax.app.runs.applications.base import (
     AbstractApplication,
+    Description,
     Figure,
-    Known,
     PerRow,
     Plan,
     Results,
@@ -18,13 +18,14 @@ from dvax.app.runs.applications.base import (
     Variable,
 )
 from dvax.app.runs.applications.certificate import certificate
-from dvax.app.runs.solver_options import SolverKeys, check_steps, settings
+from dvax.app.runs.schema import SolverKeys
+from dvax.app.runs.solver_options import check_model_steps, settings
 from dvax.errors import InputError, input_error
 from dvax.evolution import Implicit, Solution
 from dvax.models.fem_contact import ElasticBody, FemContact
 
-_SMALL = 0.1
-"""An indentation above this part of a size of the body or the punch is worth a note."""
+_NOTABLE_INDENTATION = 0.1
+"""Indentations above this part of a size of the body or of the punch are noted."""
 
 _SIZES = ("width", "height", "fine_half_width", "fine", "coarse", "layers", "growth")
 
@@ -61,10 +62,17 @@ class FemContactSection(SolverKeys):
     frames: int = Field(120, ge=1, le=10**6, description="number of intervals between saved states")
 
 
-class _Loaded:
-    def __init__(self, table: FemContactSection, file: Path | None):
+class FemContactApplication(AbstractApplication):
+    """The pressure over time, its limit at rest, and the fields at the end for ParaView."""
+
+    section = FemContactSection
+    files = ("mesh",)
+    end = "model.end"
+
+    def __init__(self, table: FemContactSection, paths: Mapping[str, Path], quiet: bool):
+        file = paths.get("mesh")
         self.table, self.per_row = table, PerRow()
-        check_steps(table, table.end, f"the length {table.end:g}")
+        check_model_steps(table, table.end, f"the length {table.end:g}")
         sizes = _given(table, _SIZES)
         names = _given(table, ("contact", "clamped"))
         if file is not None and sizes:
@@ -98,58 +106,21 @@ class _Loaded:
             radius=table.radius, relaxation_time=table.relaxation_time, ramp=table.ramp,
         )  # fmt: skip
 
+    @property
+    def fit(self) -> str:
+        return self.contact.fit
 
-def _given(table: FemContactSection, names: tuple[str, ...]) -> dict[str, Any]:
-    """The values of those keys that the file has."""
-    return {name: getattr(table, name) for name in names if getattr(table, name) is not None}
-
-
-def _refused(keys: tuple[str, ...], given: str, rule: str, fix: str) -> InputError:
-    return input_error(", ".join(f"model.{k}" for k in keys), given, rule, fix)
-
-
-def _notes(model: _Loaded) -> tuple[str, ...]:
-    """What a run will do, and its equations are not meant for."""
-    table, notes = model.table, []
-    for name, size in (("height of the body", model.height), ("radius of the punch", table.radius)):
-        part = table.indentation / size
-        if part > _SMALL:
-            notes.append(
-                f"model.indentation is {part:.0%} of the {name}, {size:g}: the equations are those of "
-                "small displacements, a few per cent of it."
-            )
-    if table.end < table.ramp:
-        notes.append(
-            f"The run ends at {table.end:g} while the punch is still pressed in, until model.ramp = "
-            f"{table.ramp:g}: its last force is not that at the full depth."
-        )
-    return tuple(notes)
-
-
-class FemContactApplication(AbstractApplication[_Loaded]):
-    """The pressure over time, its limit at rest, and the fields at the end for ParaView."""
-
-    section = FemContactSection
-    files = ("mesh",)
-    end = "model.end"
-
-    def read(self, table: Any, paths: Mapping[str, Path], quiet: bool) -> _Loaded:
-        return _Loaded(table, paths.get("mesh"))
-
-    def fit(self, model: _Loaded) -> str:
-        return model.contact.fit
-
-    def known(self, model: _Loaded) -> Known:
-        body = model.body
+    def describe(self) -> Description:
+        body = self.body
         sizes = [
             ("displacements", str(body.unknowns), "free ones, of quadratic elements"),
             ("contact points", str(len(body.points)), "Gauss points of the contact boundary"),
             ("states", str(body.trace.shape[1]), "displacements that the contact can see"),
         ]
-        return Known(model.contact.constants, (), sizes, _notes(model))
+        return Description(self.contact.constants, (), sizes, _notes(self))
 
-    def plan(self, model: _Loaded, say: Say) -> Plan:
-        m, table = model.contact, model.table
+    def plan(self, say: Say) -> Plan:
+        m, table = self.contact, self.table
         say("solving at rest")
         rest = m.equilibrium()
         times = np.linspace(0.0, table.end, table.frames + 1)
@@ -157,9 +128,9 @@ class FemContactApplication(AbstractApplication[_Loaded]):
         options = settings(table, method=m.method, rtol=1e-7, atol=1e-11)
         return Plan(m.problem, m.untouched, times, m.constants, options, rest)
 
-    def results(self, model: _Loaded, plan: Plan, solution: Solution, count: int) -> Results:
-        m, rest, times = model.contact, plan.data, np.asarray(solution.ts)[:count]
-        pressure = model.per_row("pressure", m.pressure, solution.ts, solution.xs)[:count]
+    def results(self, plan: Plan, solution: Solution, count: int) -> Results:
+        m, rest, times = self.contact, plan.data, np.asarray(solution.ts)[:count]
+        pressure = self.per_row("pressure", m.pressure, solution.ts, solution.xs)[:count]
         still, last = m.figures(rest.pressure), m.figures(pressure[-1])
         force = np.array([m.figures(p)["force"] for p in pressure])
         s = m.body.points[:, 0]
@@ -206,18 +177,9 @@ class FemContactApplication(AbstractApplication[_Loaded]):
         }  # fmt: skip
         if not isinstance(solution.setup.method, Implicit):
             bound = certificate(m.problem, solution, m.constants, count)
-            figures["error_bound"] = Figure(
-                bound.largest, "([p][x]²)^(1/2)",
-                f"bound on the error of the state in the norm of the viscosity ({bound.status})",
-                bound=bound.status,
-            )  # fmt: skip
-            variables["error_bound"] = Variable(
-                ("time",),
-                bound.values,
-                "([p][x]²)^(1/2)",
-                "bound on the error of the state",
-                bound.status,
-            )
+            words, unit = "bound on the error of the state", "([p][x]²)^(1/2)"
+            figures["error_bound"] = bound.figure(unit, f"{words} in the norm of the viscosity")
+            variables["error_bound"] = bound.variable("time", unit, words)
 
         def files(directory: Path) -> None:
             m.write(directory / "body.vtu", solution.ts[-1], solution.xs[-1])
@@ -225,4 +187,34 @@ class FemContactApplication(AbstractApplication[_Loaded]):
         return Results(figures, variables, m.constants, int(solution.stats["steps"]), files=files)
 
 
-APPLICATION = FemContactApplication()
+def _given(table: FemContactSection, names: tuple[str, ...]) -> dict[str, Any]:
+    """Return the values of those keys that the file has."""
+    return {name: getattr(table, name) for name in names if getattr(table, name) is not None}
+
+
+def _refused(keys: tuple[str, ...], given: str, rule: str, fix: str) -> InputError:
+    return input_error(", ".join(f"model.{k}" for k in keys), given, rule, fix)
+
+
+def _notes(application: FemContactApplication) -> tuple[str, ...]:
+    """Return sentences about data for which the equations are not meant."""
+    table, notes = application.table, []
+    for name, size in (
+        ("height of the body", application.height),
+        ("radius of the punch", table.radius),
+    ):
+        part = table.indentation / size
+        if part > _NOTABLE_INDENTATION:
+            notes.append(
+                f"model.indentation is {part:.0%} of the {name}, {size:g}: the equations are those of "
+                "small displacements, a few per cent of it."
+            )
+    if table.end < table.ramp:
+        notes.append(
+            f"The run ends at {table.end:g} while the punch is still pressed in, until model.ramp = "
+            f"{table.ramp:g}: its last force is not that at the full depth."
+        )
+    return tuple(notes)
+
+
+APPLICATION = FemContactApplication

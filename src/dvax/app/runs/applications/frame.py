@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -11,16 +11,16 @@ from pydantic import Field
 
 from dvax.app.runs.applications.base import (
     AbstractApplication,
+    Description,
     Figure,
-    Known,
     Plan,
     Results,
     Say,
     Variable,
 )
 from dvax.app.runs.applications.certificate import certificate
-from dvax.app.runs.schema import in_quantity
-from dvax.app.runs.solver_options import SolverKeys, check_steps, event_driven, settings
+from dvax.app.runs.schema import SolverKeys, in_quantity
+from dvax.app.runs.solver_options import check_model_steps, event_driven, settings
 from dvax.evolution import ExpRosenbrock, PiecewiseLinear, Solution
 from dvax.models.frame import Accelerogram, Frame
 from dvax.models.frame.peaks import largest as largest_between
@@ -52,18 +52,7 @@ class FrameSection(SolverKeys):
     )
 
 
-class _Loaded:
-    def __init__(self, table: FrameSection, file: Path):
-        self.table = table
-        self.frame = Frame(
-            record=Accelerogram.from_at2(file), period=table.period, damping=table.damping,
-            yield_ratio=table.yield_ratio, viscosity_ratio=table.viscosity_ratio,
-        )  # fmt: skip
-        long = float(self.frame.record.duration)
-        check_steps(table, long, f"{long:g} s")
-
-
-class FrameApplication(AbstractApplication[_Loaded]):
+class FrameApplication(AbstractApplication):
     """Displacements, the force of the spring, and the ground."""
 
     section = FrameSection
@@ -72,36 +61,43 @@ class FrameApplication(AbstractApplication[_Loaded]):
         "step": ("record",), "acceleration": ("record",),
     }  # fmt: skip
 
-    def read(self, table: Any, paths: Mapping[str, Path], quiet: bool) -> _Loaded:
-        return _Loaded(table, paths["record"])
+    def __init__(self, table: FrameSection, paths: Mapping[str, Path], quiet: bool):
+        self.table = table
+        self.frame = Frame(
+            record=Accelerogram.from_at2(paths["record"]), period=table.period, damping=table.damping,
+            yield_ratio=table.yield_ratio, viscosity_ratio=table.viscosity_ratio,
+        )  # fmt: skip
+        long = float(self.frame.record.duration)
+        check_model_steps(table, long, f"{long:g} s")
 
-    def fit(self, model: _Loaded) -> str:
-        return model.frame.fit
+    @property
+    def fit(self) -> str:
+        return self.frame.fit
 
-    def known(self, model: _Loaded) -> Known:
-        record = model.frame.record
+    def describe(self) -> Description:
+        record = self.frame.record
         count, long = record.samples.shape[0], record.duration
         sizes = [("record", f"{count} samples", f"{record.step:g} s apart, {long:g} s in all")]
-        period, notes = model.table.period, ()
-        # Two samples a period are the least that show an oscillation.
+        period, notes = self.table.period, ()
+        # An oscillation needs at least two samples a period (Nyquist).
         if period < 2.0 * record.step:
             notes = (
                 f"model.period is {period:g} s and samples of the record are {record.step:g} s apart: "
                 "what would shake a frame at this period is not in the record.",
             )
-        return Known(model.frame.constants, (), sizes, notes)
+        return Description(self.frame.constants, (), sizes, notes)
 
-    def plan(self, model: _Loaded, say: Say) -> Plan:
-        frame = model.frame
+    def plan(self, say: Say) -> Plan:
+        frame = self.frame
         say("solving over the record")
-        method = PiecewiseLinear() if event_driven(model.table) else ExpRosenbrock()
-        options = settings(model.table, method=method, rtol=1e-8)
+        method = PiecewiseLinear() if event_driven(self.table) else ExpRosenbrock()
+        options = settings(self.table, method=method, rtol=1e-8)
         return Plan(
             frame.problem, jnp.zeros(3), frame.times, frame.constants, options, None, "s"
         )  # fmt: skip
 
-    def results(self, model: _Loaded, plan: Plan, solution: Solution, count: int) -> Results:
-        frame, constants = model.frame, plan.constants
+    def results(self, plan: Plan, solution: Solution, count: int) -> Results:
+        frame, constants = self.frame, plan.constants
         bound = certificate(frame.problem, solution, constants, count)
         between = (len(plan.times) - 1) // (frame.record.samples.shape[0] - 1)
         d, v, plastic = np.asarray(solution.xs)[:count].T
@@ -127,12 +123,12 @@ class FrameApplication(AbstractApplication[_Loaded]):
         peak = float(np.max(np.abs(d[::between])))
         a = -2.0 * float(frame.damping) * omega * v - spring - ground
         apart = frame.record.step / between
-        # Behind its last row a frame stands still.
+        # Rows that were not reached repeat the last displacement with zero velocity.
         behind = len(plan.times) - count
         moves = np.pad(d, (0, behind), "edge"), np.pad(v, (0, behind)), np.pad(a, (0, behind))
         top = float(_largest_between(*map(jnp.asarray, moves), apart))
         largest = bound.largest
-        # Every displacement is off by no more than the bound, so its peaks are as well.
+        # The bound holds for every displacement, hence for their peaks.
         proved = bound.proved(1.0 / omega)
         within, last = (None, None) if proved is None else (float(proved.max()), float(proved[-1]))
         lengths = {
@@ -171,4 +167,4 @@ class FrameApplication(AbstractApplication[_Loaded]):
         return Results(figures, variables, constants, int(solution.stats["steps"]))
 
 
-APPLICATION = FrameApplication()
+APPLICATION = FrameApplication

@@ -11,8 +11,8 @@ from pydantic import Field
 
 from dvax.app.runs.applications.base import (
     AbstractApplication,
+    Description,
     Figure,
-    Known,
     PerRow,
     Plan,
     Results,
@@ -20,10 +20,11 @@ from dvax.app.runs.applications.base import (
     Variable,
 )
 from dvax.app.runs.applications.certificate import certificate
-from dvax.app.runs.solver_options import SolverKeys, check_steps, settings
+from dvax.app.runs.schema import SolverKeys
+from dvax.app.runs.solver_options import check_model_steps, settings
 from dvax.errors import input_error
 from dvax.evolution import ExpRosenbrock, Solution
-from dvax.formats import RTS, read_rts
+from dvax.formats import read_rts
 from dvax.models.market import Market, largest_gain
 
 
@@ -43,15 +44,25 @@ class MarketSection(SolverKeys):
     elasticity: float = Field(0.3, gt=0, description="of the mean load at the reference price")
 
 
-class _Loaded:
-    def __init__(self, table: MarketSection, rts: RTS):
+class MarketApplication(AbstractApplication):
+    """Prices at rest for every hour, and the sticky price between them."""
+
+    section = MarketSection
+    folders: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "data": (
+            "gen.csv", "DAY_AHEAD_regional_Load.csv", "DAY_AHEAD_wind.csv", "DAY_AHEAD_pv.csv",
+        ),
+    }  # fmt: skip
+
+    def __init__(self, table: MarketSection, paths: Mapping[str, Path], quiet: bool):
         self.table, self.per_row = table, PerRow()
-        check_steps(table, float(max(table.hours - 1, 1)), f"{table.hours} hours")
+        rts = read_rts(paths["data"])
+        check_model_steps(table, float(max(table.hours - 1, 1)), f"{table.hours} hours")
         self.times = np.arange(table.start_hour, table.start_hour + table.hours, dtype=float)
         options: dict[str, Any] = dict(
             speed=table.speed, reference_price=table.reference_price, elasticity=table.elasticity
         )
-        # An hour alone is a moment of the two that it lies between.
+        # One hour alone is solved as a point of an interval of two hours.
         last = len(rts.load) - 1
         if not table.start_hour + table.hours <= last + 1:
             raise input_error(
@@ -62,47 +73,34 @@ class _Loaded:
         first = min(table.start_hour, last - 1) if table.hours == 1 else table.start_hour
         self.market = Market.from_rts(rts, first, max(2, table.hours), **options)
 
+    @property
+    def fit(self) -> str:
+        return self.market.fit
 
-class MarketApplication(AbstractApplication[_Loaded]):
-    """Prices at rest for every hour, and the sticky price between them."""
-
-    section = MarketSection
-    folders: ClassVar[Mapping[str, tuple[str, ...]]] = {
-        "data": (
-            "gen.csv", "DAY_AHEAD_regional_Load.csv", "DAY_AHEAD_wind.csv", "DAY_AHEAD_pv.csv",
-        ),
-    }  # fmt: skip
-
-    def read(self, table: Any, paths: Mapping[str, Path], quiet: bool) -> _Loaded:
-        return _Loaded(table, read_rts(paths["data"]))
-
-    def fit(self, model: _Loaded) -> str:
-        return model.market.fit
-
-    def known(self, model: _Loaded) -> Known:
-        firms = model.market.firms
+    def describe(self) -> Description:
+        firms = self.market.firms
         sizes = [
             ("units", str(firms.shape[0]), f"of {firms.shape[1]} firms"),
-            ("hours", str(len(model.times)), f"from hour {model.table.start_hour} on"),
+            ("hours", str(len(self.times)), f"from hour {self.table.start_hour} on"),
         ]
-        return Known(model.market.constants, (), sizes)
+        return Description(self.market.constants, (), sizes)
 
-    def plan(self, model: _Loaded, say: Say) -> Plan:
-        market, times = model.market, model.times
+    def plan(self, say: Say) -> Plan:
+        market, times = self.market, self.times
         say("solving for the prices at rest")
         prices, made = jax.vmap(market.equilibrium)(jnp.asarray(times))
         rest = np.asarray(prices), np.asarray(made)
         if len(times) > 1:
             say("solving for the sticky price")
         options = settings(
-            model.table, method=ExpRosenbrock(), rtol=1e-8, atol=1e-8, vi_solver=market.law_solver
+            self.table, method=ExpRosenbrock(), rtol=1e-8, atol=1e-8, vi_solver=market.law_solver
         )
         return Plan(market.problem, prices[0], times, market.constants, options, rest, "h")
 
-    def results(self, model: _Loaded, plan: Plan, solution: Solution | None, count: int) -> Results:
-        market, times = model.market, np.asarray(plan.times)[:count]
+    def results(self, plan: Plan, solution: Solution | None, count: int) -> Results:
+        market, times = self.market, np.asarray(plan.times)[:count]
         prices, made = (values[:count] for values in plan.data)
-        every = model.per_row("capacity", market.capacity.value, jnp.asarray(plan.times))
+        every = self.per_row("capacity", market.capacity.value, jnp.asarray(plan.times))
         capacity = every[:count]
         firms = np.asarray(market.firms)
         numbers = np.asarray(market.cost), np.asarray(market.slope), firms, float(market.b)
@@ -127,12 +125,8 @@ class MarketApplication(AbstractApplication[_Loaded]):
             sticky = np.asarray(solution.xs)[:count]
             variables |= {
                 "sticky_price": Variable(("hour",), sticky, "$/MWh", "price that follows demand"),
-                "error_bound": Variable(
-                    ("hour",),
-                    bound.values,
-                    "$/MWh",
-                    "bound on the error of the sticky price",
-                    bound.status,
+                "error_bound": bound.variable(
+                    "hour", "$/MWh", "bound on the error of the sticky price"
                 ),
             }
             under_way = largest_gain(sticky, np.asarray(solution.us)[:count], capacity, *numbers)
@@ -148,11 +142,7 @@ class MarketApplication(AbstractApplication[_Loaded]):
                     float(np.abs(sticky - prices).max()), "$/MWh",
                     "most that the sticky price is away from the price at rest",
                 ),
-                "error_bound": Figure(
-                    bound.largest, "$/MWh",
-                    f"bound on the error of the sticky price ({bound.status})",
-                    bound=bound.status,
-                ),
+                "error_bound": bound.figure("$/MWh", "bound on the error of the sticky price"),
                 "decay_rate": Figure(
                     float(market.constants.sharp_decay_rate), "1/h",
                     "two prices certainly approach at this rate",
@@ -161,4 +151,4 @@ class MarketApplication(AbstractApplication[_Loaded]):
         return Results(figures, variables, market.constants, steps)
 
 
-APPLICATION = MarketApplication()
+APPLICATION = MarketApplication

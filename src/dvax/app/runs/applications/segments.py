@@ -1,7 +1,7 @@
-"""A run in segments of its saved times: each starts from the last state and step of the one before.
+"""A run in segments of its saved times: each starts from the last state and step size of the one
+before.
 
-Between two segments a run can say how far it is, and stop; all that was computed until then is a
-solution like any other.
+Between two segments a run can report its progress and stop; the segments so far are a solution.
 """
 
 import math
@@ -37,7 +37,7 @@ def segments(plan: Plan) -> Iterator[Solution]:
     x, step = plan.x0, None
     for begin in range(0, len(times), length):
         wanted = times[begin : begin + length]
-        # Segments are of one length, so that they share one compilation: the last repeats its end.
+        # Segments have one length, so that they share one compiled program: the last repeats its end.
         ts = np.concatenate([wanted, np.full(length - len(wanted), wanted[-1])])
         start = first if begin == 0 else float(times[begin - 1])
         if not start < ts[-1]:
@@ -61,22 +61,22 @@ def segments(plan: Plan) -> Iterator[Solution]:
         x, step = solution.stats["x"], None if fixed else float(solution.stats["next_dt"])
 
 
-def joined(pieces: list[Solution], count: int | None = None) -> Solution:
-    """One solution of consecutive pieces: integrals of defects go on from piece to piece, and steps
-    are counted together. Its `setup` is that of the first piece. With `count` the last row is repeated
-    up to so many, so that programs of its length serve it however far the run came."""
+def join_pieces(pieces: list[Solution], count: int | None = None) -> Solution:
+    """Join consecutive pieces to one solution: integrals of defects are accumulated and steps are
+    summed. Its `setup` is that of the first piece. With `count` the last row is repeated up to that
+    number, so that programs of one length serve all partial results."""
     fields: dict[str, Any] = {}
     for name in ("ts", "xs", "us", "ys", "law_residual", "law_step", "law_error"):
-        fields[name] = _joined([getattr(piece, name) for piece in pieces])
+        fields[name] = _concatenate([getattr(piece, name) for piece in pieces])
     if pieces[0].defect is not None:
         defects: list[Any] = [(piece.defect, piece.law_defect) for piece in pieces]
         starts: list[Any] = [piece.settled for piece in pieces]
-        # What had come together before each piece began.
+        # The integrals at the start of each piece.
         ends = [np.array([float(one[-1]), float(two[-1])]) for one, two in defects]
         before = np.cumsum([np.zeros(2), *ends[:-1]], axis=0)
         sums = [
             tuple(
-                _joined(
+                _concatenate(
                     [np.asarray(part[k]) + at[k] for part, at in zip(parts, before, strict=True)]
                 )
                 for k in (0, 1)
@@ -107,8 +107,8 @@ def _padded(rows: Any, count: int) -> jax.Array:
     return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], count - len(rows), axis=0)]))
 
 
-def states_alone(pieces: list[Solution]) -> Results:
-    """Times and states as they are, for which nothing needs to be compiled."""
+def states_only(pieces: list[Solution]) -> Results:
+    """Return times and states without figures, which needs no compilation."""
     parts = [jtu.tree_leaves(piece.xs) for piece in pieces]
     leaves = [np.concatenate([np.asarray(v) for v in part]) for part in zip(*parts, strict=True)]
     times = np.concatenate([np.asarray(piece.ts) for piece in pieces])
@@ -122,11 +122,11 @@ def states_alone(pieces: list[Solution]) -> Results:
 
 
 STATE = "state_part"
-"""What the variables of a run are called that had no time for more than its states."""
+"""The variable names of results that consist of states only."""
 
 
-def _joined(parts: list[Any]) -> Any:
+def _concatenate(parts: list[Any]) -> Any:
     if any(part is None for part in parts):
         return None
-    # By NumPy: JAX would compile a program for every number of pieces.
+    # By NumPy: JAX compiles a program for every number of pieces.
     return jtu.tree_map(lambda *leaves: jnp.asarray(np.concatenate(leaves)), *parts)

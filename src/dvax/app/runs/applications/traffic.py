@@ -2,15 +2,15 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field
 
 from dvax.app.runs.applications.base import (
     AbstractApplication,
+    Description,
     Figure,
-    Known,
     PerRow,
     Plan,
     Results,
@@ -18,25 +18,24 @@ from dvax.app.runs.applications.base import (
     Variable,
 )
 from dvax.app.runs.applications.certificate import certificate
-from dvax.app.runs.schema import Section, broken
-from dvax.app.runs.solver_options import SolverKeys, check_steps, settings
+from dvax.app.runs.schema import Section, SolverKeys, rule_error
+from dvax.app.runs.solver_options import check_model_steps, settings
 from dvax.errors import SolveError, input_error
 from dvax.evolution import Solution
 from dvax.formats import read_nodes
 from dvax.models.traffic import Incident, Traffic
 
-_STEP = 0.25
-"""Days a step, where the file says nothing of steps."""
-_LEAST = 0.01
-_WHY = "of less, the link costs so much that rounding hides the costs of all others"
-_CLOSED = "Write 0.01 or more; for a closed road remove its link from the network file"
+_DEFAULT_STEP = 0.25
+"""The default step size, in days."""
+_LEAST_CAPACITY = 0.01
+_CAPACITY_REASON = "of less, the link costs so much that rounding hides the costs of all others"
+_CAPACITY_FIX = "Write 0.01 or more; for a closed road remove its link from the network file"
 
 
-def _enough(value: float) -> float:
-    if not _LEAST <= value <= 1:
-        raise broken(
-            f"it is the part of the capacity that is left, {_LEAST:g} to 1: {_WHY}", _CLOSED
-        )
+def _within_capacity(value: float) -> float:
+    if not _LEAST_CAPACITY <= value <= 1:
+        rule = f"it is the part of the capacity that is left, {_LEAST_CAPACITY:g} to 1"
+        raise rule_error(f"{rule}: {_CAPACITY_REASON}", _CAPACITY_FIX)
     return value
 
 
@@ -45,7 +44,7 @@ class IncidentSection(Section):
 
     init_node: int = Field(ge=1, description="node where the link begins", examples=[10])
     term_node: int = Field(ge=1, description="node where it ends", examples=[16])
-    remaining: Annotated[float, AfterValidator(_enough)] = Field(
+    remaining: Annotated[float, AfterValidator(_within_capacity)] = Field(
         description="part of its capacity that is left", examples=[0.3]
     )
     start: float = Field(description="when it begins [day]", examples=[5.0])
@@ -75,12 +74,19 @@ class TrafficSection(SolverKeys):
     )
 
 
-class _Loaded:
+class TrafficApplication(AbstractApplication):
+    """From the first day, on which all take the road that is fastest when empty, to the equilibrium."""
+
+    section = TrafficSection
+    files = ("network", "trips", "nodes")
+    end = "model.days"
+    keys: ClassVar[Mapping[str, tuple[str, ...]]] = {"link": ("init_node", "term_node")}
+
     def __init__(self, table: TrafficSection, paths: Mapping[str, Path], quiet: bool):
         self.table, self.per_row = table, PerRow()
-        check_steps(table, table.days, f"{table.days:g} days")
+        check_model_steps(table, table.days, f"{table.days:g} days")
         try:
-            # By their names, so that what is wrong in both files is said at once.
+            # By file names, so that the problems of both files are reported at once.
             self.traffic = Traffic(
                 paths["network"], paths["trips"], toll_weight=table.toll_weight,
                 distance_weight=table.distance_weight, rate=table.rate, rho=table.rho, gap=table.gap,
@@ -100,73 +106,48 @@ class _Loaded:
                 "Look in both files for very large and very small ones",
             ) from error  # fmt: skip
         left = float(np.min(self.traffic.worst / self.traffic.network.capacity))
-        if left < _LEAST:
+        if left < _LEAST_CAPACITY:
             raise input_error(
                 "model.incidents", f"{left:.2g} of a capacity left where several meet",
-                f"incidents on one link multiply, and {_LEAST:g} or more is left of all: {_WHY}",
-                _CLOSED,
+                f"incidents on one link multiply, and {_LEAST_CAPACITY:g} or more is left of all: "
+                + _CAPACITY_REASON,
+                _CAPACITY_FIX,
             )  # fmt: skip
         nodes = paths.get("nodes")
         self.places = None if nodes is None else read_nodes(nodes, self.traffic.network)
 
+    @property
+    def fit(self) -> str:
+        return self.traffic.fit
 
-def _notes(table: TrafficSection) -> tuple[str, ...]:
-    """Incidents that the run never meets."""
-    return tuple(
-        f"model.incidents[{number}] lasts from day {i.start:g} to day {i.end:g}, and the run, from day "
-        f"0 to day {table.days:g}, never meets it."
-        for number, i in enumerate(table.incidents, start=1)
-        if i.end <= 0 or i.start >= table.days
-    )
-
-
-def _steps(table: TrafficSection) -> str:
-    adaptive = table.rtol is not None or table.atol is not None
-    return "in adaptive steps" if adaptive else f"in steps of {table.dt or _STEP:g}"
-
-
-class TrafficApplication(AbstractApplication[_Loaded]):
-    """From the first day, on which all take the road that is fastest when empty, to the equilibrium."""
-
-    section = TrafficSection
-    files = ("network", "trips", "nodes")
-    end = "model.days"
-    keys: ClassVar[Mapping[str, tuple[str, ...]]] = {"link": ("init_node", "term_node")}
-
-    def read(self, table: Any, paths: Mapping[str, Path], quiet: bool) -> _Loaded:
-        return _Loaded(table, paths, quiet)
-
-    def fit(self, model: _Loaded) -> str:
-        return model.traffic.fit
-
-    def known(self, model: _Loaded) -> Known:
-        t, table = model.traffic, model.table
+    def describe(self) -> Description:
+        t, table = self.traffic, self.table
         sizes = [
             ("links", str(len(t.network)), f"between {t.network.nodes} nodes"),
             ("pairs", str(len(t.trips)), f"with {float(np.sum(t.trips.flow)):g} trips"),
             ("paths", str(len(t.paths.lengths)), "generated until none of the network costs less"),
             ("days", f"{table.days:g}", _steps(table)),
         ]
-        return Known(t.constants, (), sizes, _notes(table))
+        return Description(t.constants, (), sizes, _notes(table))
 
-    def plan(self, model: _Loaded, say: Say) -> Plan:
-        t, table = model.traffic, model.table
+    def plan(self, say: Say) -> Plan:
+        t, table = self.traffic, self.table
         whole = np.arange(0.0, np.floor(table.days) + 0.5)
         days = whole if whole[-1] == table.days else np.append(whole, table.days)
         say(f"solving {table.days:g} days")
-        step = min(_STEP, table.days)
+        step = min(_DEFAULT_STEP, table.days)
         options = settings(table, dt=step, vi_solver=t.vi_solver)
         return Plan(t.problem, t.all_or_nothing(), days, t.constants, options, None, "days")
 
-    def results(self, model: _Loaded, plan: Plan, solution: Solution, count: int) -> Results:
-        t, days = model.traffic, np.asarray(solution.ts)[:count]
+    def results(self, plan: Plan, solution: Solution, count: int) -> Results:
+        t, days = self.traffic, np.asarray(solution.ts)[:count]
         bound = certificate(t.problem, solution, t.constants, count)
-        each = model.per_row
+        each = self.per_row
         objectives = each("objective", t.objective, solution.ts, solution.xs)[:count]
         spent = each("travel_time", t.total_travel_time, solution.ts, solution.xs)[:count]
         flows = each("flow", t.link_flows, solution.xs)[:count]
         gap = t.relative_gap(days[-1], solution.xs[-1])
-        # Paths were generated for all capacities, the equilibrium is that of the network as it is.
+        # Paths are generated for all capacities; the equilibrium is that of the undisturbed network.
         cut = np.asarray(t.capacity(days[-1])) != np.asarray(t.network.capacity)
         least = np.nan if cut.any() else float(t.objective(days[-1], t.equilibrium))
         found = t.figures(solution)
@@ -181,12 +162,10 @@ class TrafficApplication(AbstractApplication[_Loaded]):
             "capacity": Variable(("day", "link"), capacity, "trip", "capacity of each link"),
             "init_node": Variable(("link",), np.asarray(t.network.init_node), "1", "from"),
             "term_node": Variable(("link",), np.asarray(t.network.term_node), "1", "to"),
-            "error_bound": Variable(
-                day, bound.values, "trip", "bound on the error of path flows", bound.status
-            ),
+            "error_bound": bound.variable("day", "trip", "bound on the error of path flows"),
         }
-        if model.places is not None:
-            variables["place"] = Variable(("node", "axis"), model.places, "1", "places of nodes")
+        if self.places is not None:
+            variables["place"] = Variable(("node", "axis"), self.places, "1", "places of nodes")
         figures = {
             "objective": Figure(
                 found["objective"], "trip cost", "Beckmann's objective, Σ ∫ cost dv, on the last day"
@@ -202,10 +181,7 @@ class TrafficApplication(AbstractApplication[_Loaded]):
                 gap, "1",
                 "share of all cost that would be saved if all took the least cost path of the network",
             ),
-            "error_bound": Figure(
-                bound.largest, "trip", f"bound on the error of the path flows, in ℓ² ({bound.status})",
-                bound=bound.status,
-            ),
+            "error_bound": bound.figure("trip", "bound on the error of the path flows, in ℓ²"),
         }  # fmt: skip
         if np.isfinite(least):
             figures["equilibrium_objective"] = Figure(
@@ -214,4 +190,19 @@ class TrafficApplication(AbstractApplication[_Loaded]):
         return Results(figures, variables, t.constants, int(solution.stats["steps"]))
 
 
-APPLICATION = TrafficApplication()
+def _notes(table: TrafficSection) -> tuple[str, ...]:
+    """Incidents that the run never meets."""
+    return tuple(
+        f"model.incidents[{number}] lasts from day {i.start:g} to day {i.end:g}, and the run, from day "
+        f"0 to day {table.days:g}, never meets it."
+        for number, i in enumerate(table.incidents, start=1)
+        if i.end <= 0 or i.start >= table.days
+    )
+
+
+def _steps(table: TrafficSection) -> str:
+    adaptive = table.rtol is not None or table.atol is not None
+    return "in adaptive steps" if adaptive else f"in steps of {table.dt or _DEFAULT_STEP:g}"
+
+
+APPLICATION = TrafficApplication

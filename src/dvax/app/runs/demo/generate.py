@@ -20,10 +20,8 @@ holds until 20 s and decays, as in strong ground motion (Jennings, Housner, Tsai
 Both use Python's own generator, whose sequence of uniform numbers is the same in all versions.
 """
 
-import io
 import math
 import random
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -74,13 +72,6 @@ def load() -> tuple[np.ndarray, np.ndarray]:
     return times, PEAK * signal / np.max(np.abs(signal))
 
 
-def profile_bytes(points: int = POINTS) -> bytes:
-    """The profile as an NPY file."""
-    buffer = io.BytesIO()
-    np.save(buffer, heights(points), allow_pickle=False)
-    return buffer.getvalue()
-
-
 def load_text() -> str:
     """The load as a CSV file."""
     rows = [f"{t:.2f},{value:.6f}" for t, value in zip(*load(), strict=True)]
@@ -88,29 +79,6 @@ def load_text() -> str:
     return "\n".join([head, "time [s],load [um/s]", *rows]) + "\n"
 
 
-def write_demo(folder: Path, points: int = POINTS) -> Path:
-    """Put the demonstration's configuration and data into an existing folder; the configuration's
-    path.
-
-    Raises `ValueError` unless the surface is resolved: two points at least on its shortest wave.
-    """
-    least = 2 * MODES[-1] + 1
-    if points < least:
-        raise ValueError(
-            f"{points} points cannot carry the roughness, whose shortest wave is "
-            f"{1e3 * LENGTH / MODES[-1]:g} um. Take {least} points or more."
-        )
-    text = (FOLDER / CONFIG).read_text(encoding="utf-8")
-    target = folder / CONFIG
-    target.write_text(text.replace(f"points = {POINTS}", f"points = {points}"), encoding="utf-8")
-    shutil.copyfile(FOLDER / LOAD, folder / LOAD)
-    if points == POINTS:
-        shutil.copyfile(FOLDER / PROFILE, folder / PROFILE)
-    else:
-        (folder / PROFILE).write_bytes(profile_bytes(points))
-    return target
-
-
 if __name__ == "__main__":
-    (FOLDER / PROFILE).write_bytes(profile_bytes())
+    np.save(FOLDER / PROFILE, heights(), allow_pickle=False)
     (FOLDER / LOAD).write_text(load_text(), encoding="utf-8")

@@ -1,0 +1,159 @@
+"""One run: from a checked configuration to a run directory that is readable whatever ends the run."""
+
+import abc
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dvax.app.runs.compile_time import call_when_compiling, compile_stopwatch
+from dvax.app.runs.data_file import DataFile
+from dvax.app.runs.figure import Figure
+from dvax.app.runs.interrupt import exit_code, writing
+from dvax.app.runs.provenance import provenance
+from dvax.app.runs.resolved import write_resolved
+from dvax.app.runs.rundir import RunDirectory, process
+from dvax.app.runs.wording import Wording
+from dvax.errors import InputError, SolveError
+from dvax.theory import Assumption
+
+if TYPE_CHECKING:
+    from dvax.app.runs.applications.config import ModelConfig
+    from dvax.app.runs.settings import Config
+
+Listener = Callable[[dict[str, Any]], None]
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """How a run ended. `exit_code`: 0 finished, 2 input that a solve refused, 3 failed, 130
+    interrupted, 143 asked to terminate. `has_results`: whether any result was written."""
+
+    status: str
+    exit_code: int
+    stop_reason: str
+    directory: Path
+    summary: dict[str, Any]
+    has_results: bool
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a manifest says of a run: the constants as `rows`, the assumptions, the data that were read,
+    and facts of its model; `notices` are sentences for the log."""
+
+    rows: Sequence[Mapping[str, Any]]
+    assumptions: tuple[Assumption, ...]
+    data: Sequence[DataFile]
+    notices: Sequence[str]
+    model: Mapping[str, Any]
+
+
+class AbstractRun(abc.ABC):
+    """A run under way. `facts` stand in the manifest, `wording` turns errors into the words of the
+    configuration file; steps are counted by whoever takes them."""
+
+    facts: Facts
+    wording: Wording
+    directory: RunDirectory
+
+    def __init__(self, config: "Config | ModelConfig", tell: Listener):
+        self.config, self.tell = config, tell
+        self.compiling = compile_stopwatch()
+        self.started, self.clock = datetime.now(UTC), time.monotonic()
+        self.steps = self.rejected = 0
+
+    @abc.abstractmethod
+    def begin(self) -> None:
+        """Prepare the results in the run directory, which is there by now."""
+
+    @abc.abstractmethod
+    def solve(self) -> None:
+        """Solve all of it. **Raises:** what ends a run early."""
+
+    @abc.abstractmethod
+    def reached(self) -> str:
+        """How far the run came, and what is kept: what follows the word "Interrupted"."""
+
+    @abc.abstractmethod
+    def gather(self) -> str:
+        """Prepare the results that there are once `solve` has ended, and return a sentence on what is
+        lost, or nothing."""
+
+    @abc.abstractmethod
+    def write(self) -> tuple[Mapping[str, Figure], bool]:
+        """Complete the results on disk.
+
+        **Returns:** the figures for summary.json, and whether there are any results.
+        """
+
+    def go(self, directory: RunDirectory) -> RunOutcome:
+        """Solve, and leave the results, the summary and the manifest in `directory`."""
+        self.directory = directory
+        write_resolved(self.config, directory.path)
+        self._write_manifest("running", "The run is in progress.")
+        for notice in self.facts.notices:
+            self.event("warning", message=notice)
+        self.begin()
+        status, code, reason = "finished", 0, "The run reached its end."
+        try:
+            with call_when_compiling(lambda: self.event("compiling")), self.wording.in_keys():
+                self.solve()
+        except KeyboardInterrupt as stop:
+            status, code = "interrupted", exit_code(stop)
+            reason = f"Interrupted{self.reached()}."
+        except InputError as error:
+            status, code, reason = "failed", 2, str(error)
+        except SolveError as error:
+            status, code, reason = "failed", 3, error.told(self.wording.fix)
+        except BaseException as error:
+            # The run has ended, and its manifest says so.
+            with suppress(OSError):  # a full disk may be the error itself
+                self.write()
+                self._write_manifest("failed", f"{type(error).__name__}: {error}")
+            raise
+        reason = f"{reason} {self.gather()}".rstrip()
+        with writing():
+            figures, has_results = self.write()
+            figures = {"status": Figure(status, "1", reason), **figures}
+            summary = {name: figure.to_json() for name, figure in figures.items()}
+            directory.write_json("summary.json", summary)
+            self._write_manifest(status, reason)
+            self.event("stopped", message=reason, status=status)
+        return RunOutcome(status, code, reason, directory.path, summary, has_results)
+
+    def event(self, kind: str, **facts: Any) -> None:
+        """Log an event and tell the listener."""
+        event = {"event": kind, **facts}
+        self.directory.log(event)
+        self.tell(event)
+
+    def _write_manifest(self, status: str, reason: str) -> None:
+        seconds, compiling = time.monotonic() - self.clock, self.compiling()
+        now = datetime.now(UTC)
+        content = {
+            **provenance(),
+            **process(),
+            **self.facts.model,
+            "status": status,
+            "stop_reason": reason,
+            "started": self.started.isoformat(timespec="seconds"),
+            "finished": None if status == "running" else now.isoformat(timespec="seconds"),
+            "compile_seconds": round(compiling, 3),
+            "run_seconds": round(max(0.0, seconds - compiling), 3),
+            "steps": self.steps,
+            "rejected_steps": self.rejected,
+            "data": {f.name: {"sha256": f.sha256, "bytes": f.bytes} for f in self.facts.data},
+            "constants": self.facts.rows,
+            "assumptions": assumption_rows(self.facts.assumptions),
+        }
+        self.directory.write_json("manifest.json", content)
+
+
+def assumption_rows(assumptions: Sequence[Assumption]) -> list[dict[str, str]]:
+    """The assumptions as manifest and report show them."""
+    names = ("label", "statement", "status", "why")
+    return [{name: getattr(row, name) for name in names} for row in assumptions]
