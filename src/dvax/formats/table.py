@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError, Problems, input_error
+from ..errors import InputError, InputProblem, Problems, input_error
 
 MAX_PROBLEMS = 20
 """Problems of one file that are shown: a shifted column alone makes thousands."""

@@ -160,9 +160,10 @@ class _Builder:
                     f"{name!r} cannot name a variable: it is no identifier or already taken"
                 )
 
-    def refuse(self, node: ast.AST, given: str, rule: str, fix: str) -> _Built:
+    def refuse(self, node: ast.AST, rule: str, fix: str, given: str = "") -> _Built:
         column = getattr(node, "col_offset", 0) + self.lead + 1
-        self.problems.add(f"{self.place}, column {column}", given, rule, fix)
+        place = f"{self.place}, column {column}"
+        self.problems.add(place, given or self.source(node), rule, fix)
         return _Built(lambda xp, env: math.nan)  # never called: the problem is raised
 
     def source(self, node: ast.AST) -> str:
@@ -192,13 +193,11 @@ class _Builder:
             case ast.Compare():
                 return self.refuse(
                     node,
-                    self.source(node),
                     "a comparison is no number; it stands only as the first argument of where",
                     "Write where(condition, value_if_true, value_if_false), or step(x).",
                 )
         return self.refuse(
             node,
-            self.source(node),
             f"{kind_of(node)} is not part of the expression language",
             "Use numbers, "
             + ", ".join((*self.names, *CONSTANTS))
@@ -211,7 +210,6 @@ class _Builder:
         if type(value) is not int and type(value) is not float:
             return self.refuse(
                 node,
-                self.source(node),
                 f"a {type(value).__name__} is not a number here; numbers are real and finite",
                 "Write a decimal number such as 2 or 1.5e-3.",
             )
@@ -222,7 +220,6 @@ class _Builder:
         if not math.isfinite(number):
             return self.refuse(
                 node,
-                self.source(node),
                 "a number must be finite in double precision (below 1.8e308)",
                 "Use a smaller number or other units.",
             )
@@ -237,15 +234,15 @@ class _Builder:
             return _Built(lambda xp, env: value, value)
         if name in FUNCTIONS:
             return self.refuse(
-                node, repr(name), f"{name} is a function", f"Give it its argument: {name}(...)."
+                node, f"{name} is a function", f"Give it its argument: {name}(...).", repr(name)
             )
         return self.refuse(
             node,
-            repr(name),
             "the variables here are " + ", ".join(self.names)
             if self.names
             else "there is no variable here",
             _nearest(name, (*self.names, *CONSTANTS, *FUNCTIONS)),
+            repr(name),
         )
 
     def power(self, node: ast.expr, left: ast.expr, right: ast.expr) -> _Built:
@@ -255,7 +252,6 @@ class _Builder:
             if not self.problems:
                 self.refuse(
                     right,
-                    self.source(right),
                     "an exponent is a constant: a negative base has no real power where it moves",
                     "Write exp(exponent * log(base)) for a base that is always positive.",
                 )
@@ -263,7 +259,6 @@ class _Builder:
         if abs(value) > MAX_EXPONENT:
             return self.refuse(
                 right,
-                self.source(right),
                 f"an exponent is at most {MAX_EXPONENT:g} in magnitude, or the power overflows",
                 "Scale the base, or write exp(exponent * log(base)).",
             )
@@ -275,7 +270,6 @@ class _Builder:
         if not isinstance(node.func, ast.Name):
             return self.refuse(
                 node.func,
-                self.source(node.func),
                 "only the functions of the expression language can be called, by their plain name",
                 "Use " + ", ".join(FUNCTIONS) + ".",
             )
@@ -283,18 +277,18 @@ class _Builder:
         if name not in FUNCTIONS:
             return self.refuse(
                 node.func,
-                repr(name),
                 "there is no such function" if name not in self.names else f"{name} is a variable",
                 _nearest(name, tuple(FUNCTIONS)),
+                repr(name),
             )
         arity = FUNCTIONS[name]
         if node.keywords or len(node.args) != arity:
             given = f"{len(node.args)} arguments" + (" and keywords" if node.keywords else "")
             return self.refuse(
                 node,
-                f"{name} with {given}",
                 f"{name} takes exactly {arity} plain argument{'s' if arity > 1 else ''}",
                 f"Write {name}({', '.join('abc'[:arity])}).",
+                f"{name} with {given}",
             )
         parts = [
             self.condition(argument) if name == "where" and i == 0 else self.number(argument)
@@ -310,7 +304,6 @@ class _Builder:
         ):
             return self.refuse(
                 node,
-                self.source(node),
                 "the condition of where is one comparison with <, <=, > or >=",
                 "Write where(t < 2, a, b); nest where for more conditions.",
             )
@@ -333,7 +326,6 @@ class _Builder:
             if not math.isfinite(value):
                 return self.refuse(
                     node,
-                    self.source(node),
                     f"its value is {value}, and every constant must be finite",
                     "Fix the division by zero, the overflow or the argument outside the domain.",
                 )

@@ -17,15 +17,16 @@ def check_steps(keys: SolverKeys, span: float, words: str, table: str) -> None:
     """Raise an `InputError` where a fixed step is longer than the run, which has the length `span` (in
     `words`), or so short that steps cannot be counted. The keys stand in `table`."""
     for key, step in (("dt", keys.dt), ("dt_max", keys.dt_max)):
-        if step is None or (step <= span and span / step < MOST_STEPS):
+        if step is None:
             continue
-        rule = (
-            f"a step is not longer than the run, which has {words}"
-            if step > span
-            else f"a run has fewer than {MOST_STEPS} steps, or they cannot be counted"
-        )
-        fix = f"Write {key} = {span / 100:.3g}, say, or leave it out"
-        raise input_error(f"{table}.{key}", f"{step:g}", rule, fix)
+        rule = ""
+        if step > span:
+            rule = f"a step is not longer than the run, which has {words}"
+        elif key == "dt" and span / step >= MOST_STEPS:
+            rule = f"a run has fewer than {MOST_STEPS} steps, or they cannot be counted"
+        if rule:
+            fix = f"Write {key} = {span / 100:.3g}, say, or leave it out"
+            raise input_error(f"{table}.{key}", f"{step:g}", rule, fix)
 
 
 def check_dt_max(keys: SolverKeys, span: float, table: str) -> None:
