@@ -15,6 +15,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "dvax"
 
 FLOORS = {
     "errors": -2,
+    "_lazy": -2,
     "_jaxpr": -2,
     "_smooth_bounds": -2,
     "_tree": -1,

@@ -5,8 +5,9 @@
 Names are loaded when they are first used, so that the command line starts without JAX.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ._lazy import lazy_names
 
 if TYPE_CHECKING:
     from . import formats as formats
@@ -86,21 +87,5 @@ _HOMES = {
     ),
     "vi": ("solve_vi",),
 }
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
-
-__all__ = [*_MODULES, *_HOME_OF, "__version__"]  # pyright: ignore[reportUnsupportedDunderAll]
-
-
-def __getattr__(name: str) -> Any:
-    if name in _MODULES:
-        return importlib.import_module(f".{name}", __name__)
-    if name in _HOME_OF:
-        # Kept as an attribute, so that it is looked up here but once.
-        value = getattr(importlib.import_module(f".{_HOME_OF[name]}", __name__), name)
-        globals()[name] = value
-        return value
-    raise AttributeError(f"module 'dvax' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+_ALL, __getattr__, __dir__ = lazy_names(__name__, _HOMES, _MODULES)
+__all__ = [*_ALL, "__version__"]  # pyright: ignore[reportUnsupportedDunderAll]
