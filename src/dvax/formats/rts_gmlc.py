@@ -247,17 +247,21 @@ def _wrong_series(table: Hourly, file: str, kind: str, units: list[_Unit]) -> li
             problems.add(f"{table.file}, line 1", f"a column {name!r}", rule, fix)
     for name, unit in rated.items():
         if name not in table.names:
-            problems.add(f"{file}, line {unit.line}", name,
-                         f"what it has available by hour must be a column of {table.file}",
-                         "Add the column, or remove the unit")  # fmt: skip
+            problems.add(
+                f"{file}, line {unit.line}", name,
+                f"what it has available by hour must be a column of {table.file}",
+                "Add the column, or remove the unit",
+            )  # fmt: skip
             continue
         values = table.values[:, table.names.index(name)]
         k = int(np.argmax(values))
         if values[k] > _RATING_MARGIN * unit.capacity:
-            problems.add(f"{table.file}, line {table.lines[k]}, column {name!r}",
-                         f"{values[k]:g} MW of a unit of {unit.capacity:g} MW",
-                         f"nothing makes more than its PMax ({file}, line {unit.line}): mixed "
-                         "units of measure", "Convert kW to MW")  # fmt: skip
+            problems.add(
+                f"{table.file}, line {table.lines[k]}, column {name!r}",
+                f"{values[k]:g} MW of a unit of {unit.capacity:g} MW",
+                f"nothing makes more than its PMax ({file}, line {unit.line}): mixed "
+                "units of measure", "Convert kW to MW",
+            )  # fmt: skip
     return problems
 
 
@@ -266,15 +270,19 @@ def _wrong_load(table: Hourly, file: str, units: list[_Unit]) -> list[InputProbl
     problems = Problems()
     for area in sorted({unit.area for unit in units} - set(table.names)):
         unit = next(unit for unit in units if unit.area == area)
-        problems.add(f"{file}, line {unit.line}, column 'Bus ID'", f"area {area}",
-                     f"areas are those of {table.file}: {', '.join(table.names)}",
-                     "Fix the bus, or add the area's load")  # fmt: skip
+        problems.add(
+            f"{file}, line {unit.line}, column 'Bus ID'", f"area {area}",
+            f"areas are those of {table.file}: {', '.join(table.names)}",
+            "Fix the bus, or add the area's load",
+        )  # fmt: skip
     installed = sum(unit.capacity for unit in units)
     most = table.values.sum(axis=1).max()
     if not installed / 100 < most < 100 * installed:
-        problems.add(table.file, f"a greatest load of {most:g} MW",
-                     f"{file} has {installed:g} MW: mixed units of measure",
-                     "Convert both to MW")  # fmt: skip
+        problems.add(
+            table.file, f"a greatest load of {most:g} MW",
+            f"{file} has {installed:g} MW: mixed units of measure",
+            "Convert both to MW",
+        )  # fmt: skip
     return problems
 
 

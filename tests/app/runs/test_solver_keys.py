@@ -73,7 +73,7 @@ def test_a_fix_is_a_key_of_the_file_or_nothing(name: str, fix: Fix, said: str | 
             "Leave out vi_solver, or",
         ),
         ("dt_max = 2.0\n", "model.dt_max", "which has 1 s"),
-        ("dt_max = 1e-12\n", "model.dt_max", "cannot be counted"),
+        ("dt_max = 1e-12\n", "model.dt_max", "more than max_steps"),
         ('method = "etd2rk"\n', "model.method", "one of ETD1, ETD2RK, ETD4RK"),
         ("max_steps = 0\n", "model.max_steps", "at least 1"),
         ("rtol = 1.0\n", "model.rtol", "less than 1"),

@@ -17,8 +17,6 @@ from dvax.models import Contact
 from dvax.spaces import AbstractSpace
 from dvax.theory import Assumption, Bound, Constants, Row
 
-_TIME_ONLY, _FIELD = ("time",), ("time", "point")
-
 
 def coordinates(inputs: ContactInputs, config: Config) -> dict[str, Any]:
     """The boundary's points and weights."""
@@ -39,40 +37,40 @@ def norm_unit(config: Config, dimensions: int) -> str:
     return f"{config.units.indentation} {length}" + ("^(1/2)" if dimensions == 1 else "")
 
 
-def variables(config: Config, dimensions: int, status: str) -> dict[str, Any]:
+def variables(config: Config, dimensions: int) -> dict[str, Any]:
     """Name -> (dimensions, type, attributes) of everything that is saved."""
     u = config.units
     x, p, t = u.indentation, u.pressure, u.time
     norm = norm_unit(config, dimensions)
     rate = f"{x}/{t}"
-    bound = {"status": status}
-    rows = {
-        "indentation": (_FIELD, np.float64, "indentation x", x, {}),
-        "pressure": (_FIELD, np.float64, "contact pressure y = beta u", p, {}),
+    fields = {
+        "indentation": ("indentation x", x, np.float64, {}),
+        "pressure": ("contact pressure y = beta u", p, np.float64, {}),
         "regime": (
-            _FIELD, np.int8, "contact regime", "1",
+            "contact regime", "1", np.int8,
             {"flag_values": [0, 1, 2], "flag_meanings": "unloaded active saturated"},
         ),
-        "demand_mean": (_TIME_ONLY, np.float64, "mean indentation demand g", x, {}),
-        "load_mean": (_TIME_ONLY, np.float64, "mean load ell", rate, {}),
-        "law_error": (_TIME_ONLY, np.float64, "certified bound on ||u - u*|| of the law", norm, {}),
-        "defect": (_TIME_ONLY, np.float64, "accumulated defect of the trajectory", norm, {}),
-        "error_bound_x": (_TIME_ONLY, np.float64, "bound on ||x_h - x||", norm, bound),
-        "error_bound_u": (_TIME_ONLY, np.float64, "bound on ||u_h - u||", norm, bound),
-        "error_bound_sharp_x": (
-            _TIME_ONLY, np.float64, "bound on ||x_h - x||, one-sided rate", norm, bound
-        ),
-        "separation_x": (_TIME_ONLY, np.float64, "||x1 - x2|| of two trajectories", norm, {}),
-        "separation_u": (_TIME_ONLY, np.float64, "||u1 - u2|| of two trajectories", norm, {}),
-        "separation_bound_x": (_TIME_ONLY, np.float64, "certified bound on ||x1 - x2||", norm, {}),
-        "separation_bound_u": (_TIME_ONLY, np.float64, "certified bound on ||u1 - u2||", norm, {}),
-        "separation_sharp_x": (
-            _TIME_ONLY, np.float64, "bound on ||x1 - x2||, one-sided rate", norm, {}
-        ),
     }  # fmt: skip
+    series = {
+        "demand_mean": ("mean indentation demand g", x),
+        "load_mean": ("mean load ell", rate),
+        "law_error": ("certified bound on ||u - u*|| of the law", norm),
+        "defect": ("accumulated defect of the trajectory", norm),
+        "error_bound_x": ("bound on ||x_h - x||", norm),
+        "error_bound_u": ("bound on ||u_h - u||", norm),
+        "error_bound_sharp_x": ("bound on ||x_h - x||, one-sided rate", norm),
+        "separation_x": ("||x1 - x2|| of two trajectories", norm),
+        "separation_u": ("||u1 - u2|| of two trajectories", norm),
+        "separation_bound_x": ("certified bound on ||x1 - x2||", norm),
+        "separation_bound_u": ("certified bound on ||u1 - u2||", norm),
+        "separation_sharp_x": ("bound on ||x1 - x2||, one-sided rate", norm),
+    }
     return {
-        name: (dims, dtype, {"long_name": words, "units": unit, **more})
-        for name, (dims, dtype, words, unit, more) in rows.items()
+        name: (("time", "point"), dtype, {"long_name": words, "units": unit, **more})
+        for name, (words, unit, dtype, more) in fields.items()
+    } | {
+        name: (("time",), np.float64, {"long_name": words, "units": unit})
+        for name, (words, unit) in series.items()
     }
 
 

@@ -70,7 +70,7 @@ class ContactRun(AbstractRun):
             len(inputs.frame_times),
             self.block,
             coordinates(inputs, config),
-            variables(config, len(inputs.boundary.names), "estimated"),
+            variables(config, len(inputs.boundary.names)),
             attributes(config, self.facts.rows, inputs.boundary.shape, self.facts.assumptions),
             {"long_name": "time", "units": config.units.time},
         )

@@ -1,7 +1,6 @@
 """Data files: permitted places and sizes, and fingerprints."""
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,66 +20,44 @@ class DataFile:
     sha256: str
 
 
-def locate(name: str, folder: Path, allow_outside: bool, place: str) -> Path:
-    """The file that a configuration in `folder` calls `name`.
+def locate(
+    name: str, folder: Path, allow_outside: bool, place: str, *, is_folder: bool = False
+) -> Path:
+    """The file (or folder, with `is_folder`) that a configuration in `folder` calls `name`.
 
-    Raises `InputError` where it is missing, no regular file, too large, or outside the folder
+    Raises `InputError` where it is missing, of another kind, too large, or outside the folder
     without `allow_outside`: a configuration from elsewhere must not read other people's files.
     """
-    resolved, size = _resolved(name, folder, allow_outside, place, Path.is_file)
-    if size is None and resolved.is_dir():
-        raise _refuse(place, name, "it is a folder, and this is for a file", "Name a file in it.")
-    if size is None:
-        where = Path(folder.resolve().name) / name
-        raise _refuse(place, name, "there is no such file", f"Put it at {where} or fix the name.")
-    if size > MAX_BYTES:
-        raise _refuse(
-            place, name, f"it has {size} bytes and a data file at most {MAX_BYTES}",
-            "Thin the data out.",
-        )  # fmt: skip
-    return resolved
 
+    def refuse(rule: str, fix: str) -> InputError:
+        return input_error(place, repr(name), rule, fix)
 
-def locate_folder(name: str, folder: Path, allow_outside: bool, place: str) -> Path:
-    """The folder of data that a configuration in `folder` calls `name`; see `locate`."""
-    resolved, size = _resolved(name, folder, allow_outside, place, Path.is_dir)
-    if size is None:
-        what = (
-            "it is a file, and this is for a folder"
-            if resolved.is_file()
-            else "there is no such folder"
-        )
-        raise _refuse(place, name, what, "Fix the name.")
-    return resolved
-
-
-def _resolved(
-    name: str, folder: Path, allow_outside: bool, place: str, kind: Callable[[Path], bool]
-) -> tuple[Path, int | None]:
-    """Return the path, and its size where it is of the kind, else None."""
     if not name or "\x00" in name:
-        raise _refuse(place, name, "this is no file name", "Name a file beside the configuration.")
+        raise refuse("this is no file name", "Name a file beside the configuration.")
     path = Path(name) if allow_outside and Path(name).is_absolute() else folder / name
     try:
         resolved = path.resolve()
         inside = resolved.is_relative_to(folder.resolve())
-        size = resolved.stat().st_size if kind(resolved) else None
+        file, directory = resolved.is_file(), resolved.is_dir()
+        size = resolved.stat().st_size if file else 0
     except (OSError, RuntimeError) as error:
-        raise _refuse(
-            place, name, f"it cannot be opened: {error}", "Check the name and the permissions."
-        ) from None
+        fix = "Check the name and the permissions."
+        raise refuse(f"it cannot be opened: {error}", fix) from None
     if not inside and not allow_outside:
-        raise _refuse(
-            place,
-            name,
-            "data lies in the configuration's folder or below it",
-            "Copy it there, or pass --allow-outside.",
-        )
-    return resolved, size
-
-
-def _refuse(place: str, name: str, rule: str, fix: str) -> InputError:
-    return input_error(place, repr(name), rule, fix)
+        rule = "data lies in the configuration's folder or below it"
+        raise refuse(rule, "Copy it there, or pass --allow-outside.")
+    if is_folder and not directory:
+        rule = "it is a file, and this is for a folder" if file else "there is no such folder"
+        raise refuse(rule, "Fix the name.")
+    if not is_folder and directory:
+        raise refuse("it is a folder, and this is for a file", "Name a file in it.")
+    if not is_folder and not file:
+        where = Path(folder.resolve().name) / name
+        raise refuse("there is no such file", f"Put it at {where} or fix the name.")
+    if size > MAX_BYTES:
+        rule = f"it has {size} bytes and a data file at most {MAX_BYTES}"
+        raise refuse(rule, "Thin the data out.")
+    return resolved
 
 
 def fingerprint(name: str, path: Path) -> DataFile:

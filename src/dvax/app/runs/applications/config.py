@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from dvax.app.runs.applications.base import AbstractApplication
 from dvax.app.runs.config import Config, check_contact, parse
-from dvax.app.runs.data_file import DataFile, fingerprint, locate, locate_folder
+from dvax.app.runs.data_file import DataFile, fingerprint, locate
 from dvax.app.runs.schema import SECTIONS, ModelSection, ReportSection, Section
 from dvax.app.runs.schema_errors import shown, translate, unknown_key
 from dvax.app.runs.units import Units
@@ -152,10 +152,10 @@ def _check(
     paths: dict[str, Path] = {}
     for key in (*application.files, *application.folders):
         given = getattr(table, key)
-        find = locate if key in application.files else locate_folder
         if given is not None:
+            place, is_folder = f"{file}: model.{key}", key in application.folders
             with problems.collect():
-                paths[key] = find(given, source.parent, allow_outside, f"{file}: model.{key}")
+                paths[key] = locate(given, source.parent, allow_outside, place, is_folder=is_folder)
     problems.raise_any()
     with wording_of(application, file).in_keys():
         model = application(table, paths, quiet)
