@@ -7,7 +7,8 @@ import numpy as np
 import scipy.linalg
 
 from .. import _tree
-from ..errors import InputError, InputProblem
+from ..errors import InputError, InputProblem, Problems, input_error
+from ._numbers import positive
 
 
 class Condensed(NamedTuple):
@@ -33,20 +34,20 @@ class Horizon(NamedTuple):
     @classmethod
     def checked(cls, *, A: Any, B: Any, Q: Any, R: Any, horizon: Any, step: Any) -> "Horizon":
         """These, or an `InputError` with all that is wrong."""
-        wrong: list[InputProblem] = []
+        wrong = Problems()
         a, b, q, r = (_matrix(name, v, wrong) for name, v in zip("ABQR", (A, B, Q, R)))
         if not (isinstance(horizon, int) and not isinstance(horizon, bool) and horizon > 0):
-            wrong.append(
-                InputProblem("dvax.models.LinearMPC(horizon)", repr(horizon),
-                             "it must be a positive integer, the number of moves planned",
-                             "Give 10 or 20")
+            wrong.add(
+                "dvax.models.LinearMPC(horizon)", repr(horizon),
+                "it must be a positive integer, the number of moves planned",
+                "Give 10 or 20",
             )  # fmt: skip
-        length = _positive(step, wrong)
+        why = "a planned move is held for this time"
+        length = positive("dvax.models.LinearMPC(step)", step, wrong, why=why)
         if not wrong:
-            wrong = _misfits(a, b, q, r)
-        if wrong:
-            raise InputError(*wrong)
-        return cls(a, b, q, r, horizon, length)
+            wrong += _misfits(a, b, q, r)
+        wrong.raise_any()
+        return cls(a, b, q, r, horizon, float(length))
 
 
 def condense(given: Horizon) -> Condensed:
@@ -93,17 +94,15 @@ def _riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.n
     try:
         return scipy.linalg.solve_discrete_are(A, B, Q, R)
     except np.linalg.LinAlgError as error:
-        raise InputError(
-            InputProblem(
-                "dvax.models.LinearMPC(A, B, Q)",
-                f"a Riccati equation without a stabilising solution ({error})",
-                "the inputs must reach every mode that does not decay, and Q must see it",
-                "Add an actuator, or weigh the mode",
-            )
+        raise input_error(
+            "dvax.models.LinearMPC(A, B, Q)",
+            f"a Riccati equation without a stabilising solution ({error})",
+            "the inputs must reach every mode that does not decay, and Q must see it",
+            "Add an actuator, or weigh the mode",
         ) from error
 
 
-def _matrix(name: str, value: Any, wrong: list[InputProblem]) -> np.ndarray:
+def _matrix(name: str, value: Any, wrong: Problems) -> np.ndarray:
     place = f"dvax.models.LinearMPC({name})"
     try:
         array = _tree.as_float(value, place)
@@ -112,28 +111,13 @@ def _matrix(name: str, value: Any, wrong: list[InputProblem]) -> np.ndarray:
         return np.zeros((0, 0))
     known = _tree.is_concrete(array)
     if not known or np.ndim(array) != 2 or not np.all(np.isfinite(array)):
-        wrong.append(
-            InputProblem(place, _tree.short(array) if known else "a traced array",
-                         "it must be a matrix of finite numbers that are known now",
-                         "Give rows of numbers")
+        wrong.add(
+            place, _tree.short(array) if known else "a traced array",
+            "it must be a matrix of finite numbers that are known now",
+            "Give rows of numbers",
         )  # fmt: skip
         return np.zeros((0, 0))
     return np.asarray(array)
-
-
-def _positive(step: Any, wrong: list[InputProblem]) -> float:
-    try:
-        value = np.asarray(_tree.as_float(step, "dvax.models.LinearMPC(step)"))
-    except InputError as error:
-        wrong += error.problems
-        return 1.0
-    if value.shape == () and 0 < value < np.inf:
-        return float(value)
-    wrong.append(
-        InputProblem("dvax.models.LinearMPC(step)", _tree.short(value),
-                     "it must be a positive time, for which a planned move is held", "Mend it")
-    )  # fmt: skip
-    return 1.0
 
 
 def _misfits(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> list[InputProblem]:
@@ -145,7 +129,7 @@ def _misfits(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> list
         ("R", R, _definite(R, m, 0.0), f"it must be symmetric and ≻ 0, {m} by {m}: γ rests on it"),
     ]
     return [
-        InputProblem(f"dvax.models.LinearMPC({name})", _tree.short(value), rule, "Mend the matrix")
+        InputProblem(f"dvax.models.LinearMPC({name})", _tree.short(value), rule, "Fix the matrix")
         for name, value, holds, rule in rules
         if not holds
     ]

@@ -1,6 +1,5 @@
 """Section 7 of the paper: saturated normal contact on a boundary Γ_C."""
 
-import math
 from typing import Any
 
 import equinox as eqx
@@ -8,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from .. import _tree
-from ..errors import InputError, InputProblem
+from ..errors import Problems
 from ..generators import Scalar
 from ..operators import Scaling
 from ..problem import Problem
@@ -17,6 +16,7 @@ from ..signals import AbstractSignal, as_signal
 from ..spaces import L2, AbstractSpace
 from ..theory import Constants
 from ..vi import natural_residual
+from ._numbers import positive
 
 UNLOADED, ACTIVE, SATURATED = 0, 1, 2
 """The three regimes of eq:concrete_contact_states."""
@@ -88,27 +88,22 @@ class Contact(eqx.Module):
             "alpha": alpha, "beta": beta, "b_x": b_x, "b_u": b_u, "d_x": d_x, "d_u": d_u,
             "kappa0": kappa0,
         }  # fmt: skip
-        wrong: list[InputProblem] = []
+        wrong = Problems()
         for name, value in given.items():
-            try:
-                number = _tree.as_float(value, f"dvax.models.Contact({name})")
-            except InputError as error:
-                wrong += error.problems
-                continue
+            number = positive(
+                f"dvax.models.Contact({name})", value, wrong, zero=name == "b_u",
+                why="paper, Section 7", fix="Put a dependence on space or time into g or ell",
+            )  # fmt: skip
             setattr(self, name, number)
-            wrong += _breaks_rule(name, number)
         self.space = None
         for name, make in (
             ("g", lambda: _signal(g, "g")),
             ("ell", lambda: _signal(ell, "ell")),
             ("space", lambda: None if weights is None else L2(weights)),
         ):
-            try:
+            with wrong.collect():
                 setattr(self, name, make())
-            except InputError as error:
-                wrong += error.problems
-        if wrong:
-            raise InputError(*wrong)
+        wrong.raise_any()
 
     @property
     def problem(self) -> Problem:
@@ -190,29 +185,6 @@ class _Feedback(eqx.Module):
 
     def __call__(self, t: Any, x: Any, u: Any, args: Any) -> jax.Array:
         return self.g(t) - self.b_x * x - self.b_u * u
-
-
-def _breaks_rule(name: str, value: jax.Array) -> list[InputProblem]:
-    zero_allowed = name == "b_u"
-    if jnp.ndim(value) != 0:
-        given, holds = f"an array of shape {jnp.shape(value)}", False
-    elif not _tree.is_concrete(value):
-        return []
-    else:
-        given = f"{float(value):g}"
-        number = float(value)
-        holds = math.isfinite(number) and (number >= 0 if zero_allowed else number > 0)
-    if holds:
-        return []
-    rule = "it must be a number ≥ 0" if zero_allowed else "it must be a positive number"
-    return [
-        InputProblem(
-            f"dvax.models.Contact({name})",
-            given,
-            f"{rule} (paper, Section 7)",
-            "Put a dependence on space or time into g or ell",
-        )
-    ]
 
 
 def _signal(value: Any, name: str) -> AbstractSignal:

@@ -6,10 +6,9 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from .. import _tree
-from ..errors import InputError, InputProblem
+from ..errors import InputError, Problems
 from ..generators import Scalar
 from ..operators import Scaling
 from ..problem import Problem
@@ -17,6 +16,7 @@ from ..sets import AbstractSet, Ball, SecondOrderCone, Translated
 from ..signals import AbstractSignal, Constant, as_signal
 from ..spaces import L2
 from ..theory import Constants
+from ._numbers import positive
 from ._stress import joined, split
 from ._stress import mandel as mandel
 from ._stress import tensor as tensor
@@ -93,28 +93,28 @@ class DuvautLions(eqx.Module):
     strain: AbstractSignal
 
     def __init__(self, *, bulk: Any, shear: Any, relaxation: Any, strain: Any, yields: Any):
-        wrong: list[InputProblem] = []
+        wrong = Problems()
         K, G, self.relaxation = (
-            _positive(name, value, wrong)
+            positive(f"dvax.models.DuvautLions({name})", value, wrong)
             for name, value in (("bulk", bulk), ("shear", shear), ("relaxation", relaxation))
         )
         self.moduli = jnp.concatenate([jnp.reshape(3.0 * K, (1,)), jnp.full(5, 2.0 * G)])
         self.slope = None
         if isinstance(yields, DruckerPrager):
             # q = √(3/2)‖s‖ ≤ M(p + p_t) and y₀ = √3 p: ‖s‖ ≤ (√2/3) M (y₀ + √3 p_t).
-            self.slope = math.sqrt(2.0) / 3.0 * _positive("yields.friction", yields.friction, wrong)
+            place = "dvax.models.DuvautLions(yields.friction)"
+            self.slope = math.sqrt(2.0) / 3.0 * positive(place, yields.friction, wrong)
             self.limit = _limit("yields.tension", yields.tension, wrong, zero=True)
         elif isinstance(yields, VonMises):
             self.limit = _limit("yields.strength", yields.strength, wrong, zero=False)
         else:
-            wrong.append(
-                InputProblem("dvax.models.DuvautLions(yields)", repr(yields),
-                             "it must be a VonMises(strength) or a DruckerPrager(friction, tension)",
-                             "Import them from dvax.models.duvaut_lions")
+            wrong.add(
+                "dvax.models.DuvautLions(yields)", repr(yields),
+                "it must be a VonMises(strength) or a DruckerPrager(friction, tension)",
+                "Import them from dvax.models.duvaut_lions",
             )  # fmt: skip
         self.strain = _strain(strain, wrong)
-        if wrong:
-            raise InputError(*wrong)
+        wrong.raise_any()
 
     @property
     def fit(self) -> str:
@@ -223,28 +223,12 @@ class DuvautLions(eqx.Module):
         return self._trial(t, x)
 
 
-def _positive(name: str, value: Any, wrong: list[InputProblem], zero: bool = False) -> jax.Array:
+def _limit(name: str, value: Any, wrong: Problems, zero: bool) -> AbstractSignal:
     place = f"dvax.models.DuvautLions({name})"
-    try:
-        number = _tree.as_float(value, place)
-    except InputError as error:
-        wrong += error.problems
-        return jnp.ones(())
-    holds = jnp.ndim(number) == 0
-    if holds and _tree.is_concrete(number):
-        holds = bool(np.isfinite(number) and (number >= 0 if zero else number > 0))
-    if holds:
-        return number
-    rule = "it must be a number ≥ 0" if zero else "it must be a positive number"
-    wrong.append(InputProblem(place, _tree.short(number), rule, "Mend it"))
-    return jnp.ones(())
+    return as_signal(value, lambda v: positive(place, v, wrong, zero=zero))
 
 
-def _limit(name: str, value: Any, wrong: list[InputProblem], zero: bool) -> AbstractSignal:
-    return as_signal(value, lambda v: _positive(name, v, wrong, zero))
-
-
-def _strain(value: Any, wrong: list[InputProblem]) -> AbstractSignal:
+def _strain(value: Any, wrong: Problems) -> AbstractSignal:
     place = "dvax.models.DuvautLions(strain)"
     try:
         signal = as_signal(value, lambda v: _tree.as_float(v, place))
@@ -253,9 +237,9 @@ def _strain(value: Any, wrong: list[InputProblem]) -> AbstractSignal:
         return Constant(jnp.zeros(6))
     shape = tuple(jax.eval_shape(signal.value, jnp.zeros(())).shape)
     if shape != (6,):
-        wrong.append(
-            InputProblem(place, f"values of shape {shape}",
-                         "a strain is a Mandel vector of six components",
-                         "Use dvax.models.duvaut_lions.mandel on the tensor")
+        wrong.add(
+            place, f"values of shape {shape}",
+            "a strain is a Mandel vector of six components",
+            "Use dvax.models.duvaut_lions.mandel on the tensor",
         )  # fmt: skip
     return signal

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
-from ..errors import InputError, InputProblem
+from ..errors import InputError, Problems, input_error
 from ..generators import Dense
 from ..operators import Scaling
 from ..problem import Problem
@@ -107,40 +107,35 @@ class LinearMPC(eqx.Module):
     ):
         parts = Horizon.checked(A=A, B=B, Q=Q, R=R, horizon=horizon, step=step)
         n, m = parts.B.shape
-        wrong: list[InputProblem] = []
+        wrong = Problems()
         limits: dict[str, Any] = {"lower": lower, "upper": upper}
         if slew is not None:
             limits["slew"] = slew
         arrays = {name: _vector(name, value, m, wrong) for name, value in limits.items()}
         if not wrong and np.any(arrays["lower"] >= arrays["upper"]):
-            wrong.append(
-                InputProblem("dvax.models.LinearMPC(lower, upper)", f"{lower} and {upper}",
-                             "lower < upper, or there is nothing to choose", "Swap or widen them")
+            wrong.add(
+                "dvax.models.LinearMPC(lower, upper)", f"{lower} and {upper}",
+                "lower < upper, or there is nothing to choose", "Swap or widen them",
             )  # fmt: skip
         if slew is not None and not wrong and np.any(arrays["slew"] <= 0):
-            wrong.append(
-                InputProblem("dvax.models.LinearMPC(slew)", f"{slew}", "it must be positive",
-                             "Leave it out where moves may differ at will")
+            wrong.add(
+                "dvax.models.LinearMPC(slew)", f"{slew}", "it must be positive",
+                "Leave it out where moves may differ at will",
             )  # fmt: skip
         signals = {"target": (target, n), "feed": (feed, m), "disturbance": (disturbance, n)}
         for name, (value, size) in signals.items():
-            try:
+            with wrong.collect():
                 setattr(self, name, _signal(value, size, f"dvax.models.LinearMPC({name})"))
-            except InputError as error:
-                wrong += error.problems
-        if wrong:
-            raise InputError(*wrong)
+        wrong.raise_any()
         found = condense(parts)
         ends = np.linalg.eigvalsh(found.H)
         if ends[0] <= len(ends) * np.finfo(float).eps * ends[-1]:
-            raise InputError(
-                InputProblem(
-                    "dvax.models.LinearMPC(horizon, step)",
-                    f"predictions that grow until λ_max(H) = {ends[-1]:.1e}",
-                    "λ_min(H) ≥ λ_min(R) > 0 makes the law strongly monotone, and is below the "
-                    "rounding of that",
-                    "Shorten the horizon, or stabilise the plant first",
-                )
+            raise input_error(
+                "dvax.models.LinearMPC(horizon, step)",
+                f"predictions that grow until λ_max(H) = {ends[-1]:.1e}",
+                "λ_min(H) ≥ λ_min(R) > 0 makes the law strongly monotone, and is below the "
+                "rounding of that",
+                "Shorten the horizon, or stabilise the plant first",
             )
         self.A, self.B = jnp.asarray(parts.A), jnp.asarray(parts.B)
         self.H, self.G = jnp.asarray(found.H), jnp.asarray(found.G)
@@ -261,7 +256,7 @@ class LinearMPC(eqx.Module):
         return u + shift - self.G @ (x - self.target(t))
 
 
-def _vector(name: str, value: Any, size: int, wrong: list[InputProblem]) -> np.ndarray:
+def _vector(name: str, value: Any, size: int, wrong: Problems) -> np.ndarray:
     """A number for each input."""
     place = f"dvax.models.LinearMPC({name})"
     try:
@@ -270,9 +265,9 @@ def _vector(name: str, value: Any, size: int, wrong: list[InputProblem]) -> np.n
         wrong += error.problems
         return np.zeros(size)
     if given.shape not in ((), (size,)) or not np.all(np.isfinite(given)):
-        wrong.append(
-            InputProblem(place, _tree.short(given), f"a finite number, or {size}, one an input",
-                         "Mend it")
+        wrong.add(
+            place, _tree.short(given), f"a finite number, or {size}, one an input",
+            "Fix it",
         )  # fmt: skip
         return np.zeros(size)
     return np.broadcast_to(given, (size,))
@@ -282,9 +277,9 @@ def _signal(value: Any, size: int, name: str) -> AbstractSignal:
     def constant(value: Any) -> jax.Array:
         given = jnp.zeros(size) if value is None else _tree.as_float(value, name)
         if jnp.shape(given) != (size,):
-            raise InputError(
-                InputProblem(name, f"shape {jnp.shape(given)}", f"it is a vector of {size} entries",
-                             "Give one number an entry")
+            raise input_error(
+                name, f"shape {jnp.shape(given)}", f"it is a vector of {size} entries",
+                "Give one number an entry",
             )  # fmt: skip
         return given
 

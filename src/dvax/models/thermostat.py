@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
-from ..errors import InputError, InputProblem
+from ..errors import InputError, InputProblem, Problems
 from ..generators import Elliptic
 from ..operators import Scaling
 from ..problem import Problem
@@ -17,6 +17,7 @@ from ..sets import Box
 from ..signals import AbstractSignal, as_signal
 from ..spaces import L2
 from ..theory import Constants
+from ._numbers import positive
 
 COOLED, REGULATED, HEATED = -1, 0, 1
 """At the least power, between, and at the greatest."""
@@ -88,9 +89,11 @@ class Thermostat(eqx.Module):
         boundary: Any = "neumann",
         scheme: str = "spectral",
     ):
-        wrong: list[InputProblem] = []
-        self.diffusion = _positive("diffusion", diffusion, wrong)
-        self.gain = _positive("gain", gain, wrong)
+        wrong = Problems()
+        name = "dvax.models.Thermostat"
+        why = "backward in time heat does not flow"
+        self.diffusion = positive(f"{name}(diffusion)", diffusion, wrong, why=why)
+        self.gain = positive(f"{name}(gain)", gain, wrong, why="it heats what is cold")
         try:
             self.generator = Elliptic(shape, lengths, boundary, self.diffusion, scheme=scheme)
         except InputError as error:
@@ -98,20 +101,17 @@ class Thermostat(eqx.Module):
             raise InputError(*wrong, *error.problems) from error
         cells = self.generator.transform.shape
         for name, value in (("reference", reference), ("load", load)):
-            try:
+            with wrong.collect():
                 setattr(self, name, _signal(name, value, cells))
-            except InputError as error:
-                wrong += error.problems
         for name, value in (("lower", lower), ("upper", upper)):
             setattr(self, name, _field(name, value, cells, wrong))
         if not wrong and _tree.is_concrete(self.lower, self.upper):
             if np.any(np.asarray(self.lower) > np.asarray(self.upper)):
-                wrong.append(
-                    InputProblem("dvax.models.Thermostat(lower, upper)", "lower > upper somewhere",
-                                 "the least power is at most the greatest", "Swap them there")
+                wrong.add(
+                    "dvax.models.Thermostat(lower, upper)", "lower > upper somewhere",
+                    "the least power is at most the greatest", "Swap them there",
                 )  # fmt: skip
-        if wrong:
-            raise InputError(*wrong)
+        wrong.raise_any()
         sides = np.broadcast_to(np.asarray(lengths, float), (len(cells),))
         self.lengths = tuple(float(side) for side in sides)
         self.space = L2(jnp.full(cells, math.prod(self.lengths) / math.prod(cells)))
@@ -196,26 +196,7 @@ class Thermostat(eqx.Module):
         return self.gain * (self.reference(t) - x)
 
 
-def _positive(name: str, value: Any, wrong: list[InputProblem]) -> jax.Array:
-    place = f"dvax.models.Thermostat({name})"
-    try:
-        array = _tree.as_float(value, place)
-    except InputError as error:
-        wrong += error.problems
-        return jnp.ones(())
-    holds = jnp.ndim(array) == 0
-    if holds and _tree.is_concrete(array):
-        holds = bool(0 < float(array) < math.inf)
-    if holds:
-        return array
-    why = "backward in time heat does not flow" if name == "diffusion" else "it heats what is cold"
-    wrong.append(
-        InputProblem(place, _tree.short(array), f"it must be a positive number: {why}", "Mend it")
-    )
-    return jnp.ones(())
-
-
-def _field(name: str, value: Any, cells: tuple, wrong: list[InputProblem]) -> jax.Array:
+def _field(name: str, value: Any, cells: tuple, wrong: Problems) -> jax.Array:
     """A number or an array over the cells."""
     place = f"dvax.models.Thermostat({name})"
     try:
@@ -225,9 +206,9 @@ def _field(name: str, value: Any, cells: tuple, wrong: list[InputProblem]) -> ja
         return jnp.zeros(cells)
     fits = jnp.shape(array) in ((), cells)
     if not fits or (_tree.is_concrete(array) and np.any(np.isnan(np.asarray(array)))):
-        wrong.append(
-            InputProblem(place, _tree.short(array), f"a number, or an array over the cells {cells}",
-                         "Give one value a cell")
+        wrong.add(
+            place, _tree.short(array), f"a number, or an array over the cells {cells}",
+            "Give one value a cell",
         )  # fmt: skip
         return jnp.zeros(cells)
     return jnp.broadcast_to(array, cells)
@@ -235,15 +216,12 @@ def _field(name: str, value: Any, cells: tuple, wrong: list[InputProblem]) -> ja
 
 def _signal(name: str, value: Any, cells: tuple) -> AbstractSignal:
     def constant(value: Any) -> jax.Array:
-        wrong: list[InputProblem] = []
+        wrong = Problems()
         field = _field(name, value, cells, wrong)
         if wrong or (_tree.is_concrete(field) and not np.all(np.isfinite(np.asarray(field)))):
             place = f"dvax.models.Thermostat({name})"
             raise InputError(
-                *(
-                    wrong
-                    or [InputProblem(place, _tree.short(field), "it must be finite", "Mend it")]
-                )
+                *(wrong or [InputProblem(place, _tree.short(field), "it must be finite", "Fix it")])
             )
         return field
 

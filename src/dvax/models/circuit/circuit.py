@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ... import _tree
-from ...errors import InputError, InputProblem
+from ...errors import InputError, InputProblem, Problems, input_error
 from ...evolution import ExpRosenbrock, PiecewiseLinear, Solution, solve
 from ...formats.netlist import Netlist, read_netlist
 from ...generators import Dense
@@ -122,11 +122,9 @@ class Circuit(eqx.Module):
         try:
             text = path.read_text(encoding="utf-8")
         except UnicodeDecodeError as error:
-            raise InputError(
-                InputProblem(
-                    path.name, f"byte {error.start} that is not UTF-8", "a netlist is text",
-                    "Save it as UTF-8",
-                )
+            raise input_error(
+                path.name, f"byte {error.start} that is not UTF-8", "a netlist is text",
+                "Save it as UTF-8",
             ) from error  # fmt: skip
         return cls(read_netlist(text, path.name), **options)
 
@@ -254,16 +252,15 @@ def _values(sources: tuple[AbstractSignal, ...], t: Any) -> jax.Array:
 
 
 def _check_options(r_on: float | None, g_leak: float | None) -> None:
-    wrong = [
+    wrong = Problems(
         InputProblem(
             f"dvax.models.Circuit({name})", str(value), f"it must be a positive {what}, or None for "
             "diodes as the netlist has them", "Take r_on = 0.1 and g_leak = 1e-9, and then less",
         )
         for name, value, what in (("r_on", r_on, "resistance"), ("g_leak", g_leak, "conductance"))
         if value is not None and not (math.isfinite(value) and value > 0)
-    ]  # fmt: skip
-    if wrong:
-        raise InputError(*wrong)
+    )  # fmt: skip
+    wrong.raise_any()
 
 
 def _check_modulus(netlist: Netlist, found: Equations) -> None:
@@ -281,13 +278,11 @@ def _check_modulus(netlist: Netlist, found: Equations) -> None:
         one = len(named) == 1
         names = ", ".join(e.name for e in named)
         why = "its current meets" if one else "their currents meet, in some proportion,"
-        raise InputError(
-            InputProblem(
-                netlist.place(*named), f"{names} without R=",
-                f"{why} no resistance, so γ = λ_min(D) = 0 and the law does not determine "
-                + ("it" if one else "them"),
-                "Write R=0.1 there, or regularise all: r_on = 0.1 and g_leak = 1e-9",
-            )
+        raise input_error(
+            netlist.place(*named), f"{names} without R=",
+            f"{why} no resistance, so γ = λ_min(D) = 0 and the law does not determine "
+            + ("it" if one else "them"),
+            "Write R=0.1 there, or regularise all: r_on = 0.1 and g_leak = 1e-9",
         )  # fmt: skip
 
 

@@ -10,19 +10,18 @@ network that is left has one solution for all values of them if and only if
 Then every capacitor voltage and inductor current is a state, and the state is minimal.
 """
 
-from ...errors import InputError, InputProblem
+from ...errors import InputProblem, Problems
 from ...formats.netlist import GROUND, Element, Netlist
 
 
 def check(netlist: Netlist, leaks: bool) -> None:
     """Raise an `InputError` with everything that is wrong; `leaks` says that every diode leaks."""
-    wrong = _missing(netlist)
+    wrong = Problems(_missing(netlist))
     if not wrong:
-        wrong = _floating(netlist)
+        wrong += _floating(netlist)
     if not wrong:
-        wrong = _loops(netlist) + _cuts(netlist, leaks)
-    if wrong:
-        raise InputError(*wrong)
+        wrong += _loops(netlist) + _cuts(netlist, leaks)
+    wrong.raise_any()
 
 
 class Groups:
@@ -57,8 +56,8 @@ def _missing(netlist: Netlist) -> list[InputProblem]:
          "Add one, such as D1 a 0 R=1"),
     ]  # fmt: skip
     return [
-        InputProblem(netlist.name, given, rule, mend)
-        for holds, given, rule, mend in wants
+        InputProblem(netlist.name, given, rule, fix)
+        for holds, given, rule, fix in wants
         if not holds
     ]
 
@@ -71,33 +70,31 @@ def _floating(netlist: Netlist) -> list[InputProblem]:
         groups.join(e.a, e.b)
         for node in (e.a, e.b):
             touching.setdefault(node, []).append(e)
-    wrong = [
+    wrong = Problems(
         InputProblem(
             netlist.place(own[0]), f"node {node}",
             f"it floats: {own[0].name} alone touches it, so no current can flow there",
-            "Mend the name of the node, or drop the element",
+            "Fix the name of the node, or drop the element",
         )
         for node, own in touching.items() if len(own) == 1 and node != GROUND
-    ]  # fmt: skip
+    )  # fmt: skip
     islands: dict[str, list[str]] = {}
     for node in touching:
         if groups.of(node) != GROUND:
             islands.setdefault(groups.of(node), []).append(node)
     for nodes in islands.values():
-        wrong.append(
-            InputProblem(
-                netlist.place(touching[nodes[0]][0]), _listed("node", nodes),
-                "nothing joins it to node 0, so its voltage is anything" if len(nodes) == 1
-                else "nothing joins them to node 0, so their voltages are anything",
-                "Join them to ground, by a large resistor where nothing else does",
-            )
+        wrong.add(
+            netlist.place(touching[nodes[0]][0]), _listed("node", nodes),
+            "nothing joins it to node 0, so its voltage is anything" if len(nodes) == 1
+            else "nothing joins them to node 0, so their voltages are anything",
+            "Join them to ground, by a large resistor where nothing else does",
         )  # fmt: skip
     return wrong
 
 
 def _loops(netlist: Netlist) -> list[InputProblem]:
     """Loops of voltage sources and capacitors."""
-    groups, kept, wrong = Groups(), [], []
+    groups, kept, wrong = Groups(), [], Problems()
     for e in netlist.elements:
         if e.kind not in "VC":
             continue
@@ -105,13 +102,11 @@ def _loops(netlist: Netlist) -> list[InputProblem]:
             kept.append(e)
             continue
         loop = [*_path(kept, e.a, e.b), e]
-        wrong.append(
-            InputProblem(
-                netlist.place(e), _listed("", [x.name for x in loop]),
-                "voltage sources and capacitors close a loop, in which their voltages add up to zero: "
-                "the current in it has no equation",
-                "Put a resistor into the loop, or make one capacitor of those in parallel",
-            )
+        wrong.add(
+            netlist.place(e), _listed("", [x.name for x in loop]),
+            "voltage sources and capacitors close a loop, in which their voltages add up to zero: "
+            "the current in it has no equation",
+            "Put a resistor into the loop, or make one capacitor of those in parallel",
         )  # fmt: skip
     return wrong
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, InputProblem
+from ...errors import InputProblem, Problems
 from ...formats.optional import needed
 
 _FLAT = 1e-9
@@ -34,7 +34,7 @@ def block(
     """
     sizes = {"width": width, "height": height, "fine_half_width": fine_half_width, "growth": growth}
     counts = {"fine": fine, "coarse": coarse, "layers": layers}
-    wrong = [
+    wrong = Problems(
         _problem(
             name, value, "it must be a positive number", "Give a length, or a ratio of heights"
         )
@@ -42,7 +42,7 @@ def block(
         if isinstance(value, bool)
         or not isinstance(value, int | float)
         or not (0 < value < math.inf)
-    ]
+    )
     wrong += [
         _problem(name, value, "it must be an integer ≥ 1", "Give a number of elements")
         for name, value in counts.items()
@@ -56,8 +56,7 @@ def block(
                 "between the two", "Make the block wider or the fine zone narrower",
             )
         )  # fmt: skip
-    if wrong:
-        raise InputError(*wrong)
+    wrong.raise_any()
     skfem = needed("skfem")
     inner = np.linspace(0.0, fine_half_width, fine + 1)
     outer = np.geomspace(fine_half_width, width / 2, coarse + 1)[1:]
@@ -76,21 +75,20 @@ def block(
 
 def _check_sides(columns: np.ndarray, layers: np.ndarray) -> None:
     """Refuse sizes that make elements so flat that they have no area to rounding."""
-    wrong = [
+    wrong = Problems(
         InputProblem(
             f"dvax.models.ElasticBody({', '.join(f'mesh[{key!r}]' for key in keys)})",
             f"elements {thin:.1e} by {long:.1e}", "no side is 10⁹ times the other: there is no area to "
-            "rounding", mend,
+            "rounding", fix,
         )
-        for keys, thin, long, mend in (
+        for keys, thin, long, fix in (
             (("layers", "growth"), layers.min(), columns.max(), "Take fewer layers or a growth near 1"),
             (("fine_half_width", "fine"), columns.min(), layers.max(), "Make the fine zone wider"),
         )
         if not thin > _FLAT * long
-    ]  # fmt: skip
-    if wrong:
-        raise InputError(*wrong)
+    )  # fmt: skip
+    wrong.raise_any()
 
 
-def _problem(name: str, value: Any, rule: str, mend: str) -> InputProblem:
-    return InputProblem(f"dvax.models.ElasticBody(mesh[{name!r}])", repr(value), rule, mend)
+def _problem(name: str, value: Any, rule: str, fix: str) -> InputProblem:
+    return InputProblem(f"dvax.models.ElasticBody(mesh[{name!r}])", repr(value), rule, fix)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, InputProblem
+from ...errors import InputProblem, Problems, input_error
 from ...formats.mesh import read_mesh
 from ...formats.optional import needed
 from .block import block
@@ -82,9 +82,7 @@ class ElasticBody:
         place = (
             str(mesh) if isinstance(mesh, str | os.PathLike) else "dvax.models.ElasticBody(mesh)"
         )
-        wrong = faults(self.mesh, place)
-        if wrong:
-            raise InputError(*wrong)
+        Problems(faults(self.mesh, place)).raise_any()
         self._moduli = lame
         skfem = needed("skfem")
         quads = isinstance(self.mesh, skfem.MeshQuad)
@@ -218,30 +216,27 @@ def _mesh(given: Any, contact: str, clamped: str) -> Any:
         return read_mesh(given, contact, clamped)
     if isinstance(given, Mapping):
         sizes = ("width", "height", "fine_half_width", "fine", "coarse", "layers", "growth")
-        wrong = [
+        wrong = Problems(
             InputProblem(
                 "dvax.models.ElasticBody(mesh)", f"a size {name!r}",
-                f"a block has the sizes {', '.join(sizes)}", "Mend the name, or leave it out",
+                f"a block has the sizes {', '.join(sizes)}", "Fix the name, or leave it out",
             )
             for name in given if name not in sizes
-        ]  # fmt: skip
-        if wrong:
-            raise InputError(*wrong)
+        )  # fmt: skip
+        wrong.raise_any()
         return block(**given)
     skfem = needed("skfem")
     if not isinstance(given, skfem.MeshTri | skfem.MeshQuad):
-        raise InputError(
-            InputProblem(
-                "dvax.models.ElasticBody(mesh)", f"a {type(given).__name__}",
-                "a mesh is a file, the sizes of a block, or a MeshTri or MeshQuad of scikit-fem",
-                "Write it to a file with meshio, and give its name",
-            )
+        raise input_error(
+            "dvax.models.ElasticBody(mesh)", f"a {type(given).__name__}",
+            "a mesh is a file, the sizes of a block, or a MeshTri or MeshQuad of scikit-fem",
+            "Write it to a file with meshio, and give its name",
         )  # fmt: skip
     return given
 
 
 def _lame(young: Any, poisson: Any) -> tuple[float, float]:
-    wrong = [
+    wrong = Problems(
         InputProblem(
             f"dvax.models.ElasticBody({name})", repr(value), rule,
             "Look it up for the material; 0.3 for many metals" if name == "poisson_ratio"
@@ -253,9 +248,8 @@ def _lame(young: Any, poisson: Any) -> tuple[float, float]:
              "it must lie between −1 and 1/2, or the elastic energy is no norm"),
         )
         if isinstance(value, bool) or not isinstance(value, int | float) or not holds(value)
-    ]  # fmt: skip
-    if wrong:
-        raise InputError(*wrong)
+    )  # fmt: skip
+    wrong.raise_any()
     E, nu = float(young), float(poisson)
     return E * nu / ((1 + nu) * (1 - 2 * nu)), E / (2 * (1 + nu))
 
@@ -263,12 +257,10 @@ def _lame(young: Any, poisson: Any) -> tuple[float, float]:
 def _facing(normals: np.ndarray, place: str) -> None:
     away = int(np.sum(normals[:, 1] <= 0))
     if away:
-        raise InputError(
-            InputProblem(
-                place, f"{away} of {len(normals)} points of the contact boundary that face away",
-                "the punch comes from above (+y), so outward normals on this boundary point up",
-                "Turn the mesh, or name the boundary that faces the punch",
-            )
+        raise input_error(
+            place, f"{away} of {len(normals)} points of the contact boundary that face away",
+            "the punch comes from above (+y), so outward normals on this boundary point up",
+            "Turn the mesh, or name the boundary that faces the punch",
         )  # fmt: skip
 
 

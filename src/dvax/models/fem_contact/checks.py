@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputProblem
+from ...errors import InputProblem, Problems
 
 _FLAT = 1e-10
 """An element whose corners are flatter than this, relative to its longest side, has no area to
@@ -81,7 +81,7 @@ def _folds(mesh: Any, place: str) -> list[InputProblem]:
 
 def _boundaries(mesh: Any, place: str) -> list[InputProblem]:
     named = {role: np.asarray((mesh.boundaries or {}).get(role, ())) for role in _ROLES}
-    wrong = [
+    wrong = Problems(
         InputProblem(
             place,
             f"no {role} boundary" if facets.size == 0 else
@@ -91,14 +91,12 @@ def _boundaries(mesh: Any, place: str) -> list[InputProblem]:
         )
         for role, facets in named.items()
         if facets.size == 0 or np.any(mesh.f2t[1, facets] >= 0)
-    ]  # fmt: skip
+    )  # fmt: skip
     both = np.intersect1d(named["contact"], named["clamped"]).size
     if both:
-        wrong.append(
-            InputProblem(
-                place, f"{both} facets that are both contact and clamped",
-                "what is held does not give way to a punch", "Take them out of one of the two",
-            )
+        wrong.add(
+            place, f"{both} facets that are both contact and clamped",
+            "what is held does not give way to a punch", "Take them out of one of the two",
         )  # fmt: skip
     return wrong or _floating(mesh, named["clamped"], place)
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ... import _tree
-from ...errors import InputError, InputProblem
+from ...errors import InputError, Problems, input_error
 from ...evolution import ETD2RK, ExpRosenbrock, Implicit
 from ...generators import Scalar
 from ...operators import Scaling
@@ -117,18 +117,13 @@ class FemContact(eqx.Module):
             centre = 0.5 * float(body.points[:, 0].min() + body.points[:, 0].max())
         numbers["centre"] = centre
         found: dict[str, jax.Array] = {}
-        wrong: list[InputProblem] = []
+        wrong = Problems()
         for name, value in numbers.items():
-            try:
+            with wrong.collect():
                 found[name] = _number(name, value)
-            except InputError as error:
-                wrong += error.problems
-        try:
+        with wrong.collect():
             self.depth, self.final = _history(indentation, ramp)
-        except InputError as error:
-            wrong += error.problems
-        if wrong:
-            raise InputError(*wrong)
+        wrong.raise_any()
         self.body = body
         self.trace, self.weights = jnp.asarray(body.trace), jnp.asarray(body.weights)
         self.lean = jnp.asarray(body.normals[:, 1])
@@ -350,9 +345,9 @@ def _number(name: str, value: Any) -> jax.Array:
     if jnp.ndim(number) != 0:
         raise _refused(name, f"an array of shape {jnp.shape(number)}", rule, "Give one number")
     if _tree.is_concrete(number) and not holds(float(number)):
-        raise _refused(name, f"{float(number):g}", rule, "Mend the value, or its unit")
+        raise _refused(name, f"{float(number):g}", rule, "Fix the value, or its unit")
     return number
 
 
-def _refused(name: str, given: str, rule: str, mend: str) -> InputError:
-    return InputError(InputProblem(f"dvax.models.FemContact({name})", given, rule, mend))
+def _refused(name: str, given: str, rule: str, fix: str) -> InputError:
+    return input_error(f"dvax.models.FemContact({name})", given, rule, fix)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, InputProblem
+from ...errors import input_error
 from ...formats.optional import needed
 from .body import ElasticBody
 
@@ -27,12 +27,10 @@ def write(
     not there.
     """
     if path.suffix not in _ENDINGS or not path.parent.is_dir():
-        raise InputError(
-            InputProblem(
-                "dvax.models.FemContact.write(path)", repr(str(path)),
-                f"it must be a name that ends on {' or '.join(_ENDINGS)}, in a folder that is there",
-                "Make the folder, or mend the name",
-            )
+        raise input_error(
+            "dvax.models.FemContact.write(path)", repr(str(path)),
+            f"it must be a name that ends on {' or '.join(_ENDINGS)}, in a folder that is there",
+            "Make the folder, or fix the name",
         )  # fmt: skip
     meshio = needed("meshio")
     cells = body.cells()

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ... import _tree
-from ...errors import InputError, InputProblem
+from ...errors import Problems
 from ...formats.at2 import read_at2
 from ...signals import AbstractSignal
 
@@ -41,31 +41,24 @@ class Accelerogram(AbstractSignal):
     def __init__(self, step: Any, acceleration: Any):
         name = "dvax.models.Accelerogram"
         samples = _tree.host(_tree.as_float(acceleration, f"{name}(acceleration)"))
-        wrong = []
+        wrong = Problems()
         if not (isinstance(step, float | int) and np.isfinite(step) and step > 0):
-            wrong.append(
-                InputProblem(
-                    f"{name}(step)", repr(step), "it is a positive number of seconds",
-                    "Give the time between two samples",
-                )
+            wrong.add(
+                f"{name}(step)", repr(step), "it is a positive number of seconds",
+                "Give the time between two samples",
             )  # fmt: skip
         if samples.ndim != 1 or samples.size < 2:
-            wrong.append(
-                InputProblem(
-                    f"{name}(acceleration)", f"shape {samples.shape}",
-                    "it is a vector of at least two samples", "Give one number a sample",
-                )
+            wrong.add(
+                f"{name}(acceleration)", f"shape {samples.shape}",
+                "it is a vector of at least two samples", "Give one number a sample",
             )  # fmt: skip
         elif not np.all(np.isfinite(samples)):
             k = int(np.flatnonzero(~np.isfinite(samples))[0])
-            wrong.append(
-                InputProblem(
-                    f"{name}(acceleration)", f"{samples[k]} at sample {k}",
-                    "samples are finite: a gap is not a value", "Fill the gaps on purpose",
-                )
+            wrong.add(
+                f"{name}(acceleration)", f"{samples[k]} at sample {k}",
+                "samples are finite: a gap is not a value", "Fill the gaps on purpose",
             )  # fmt: skip
-        if wrong:
-            raise InputError(*wrong)
+        wrong.raise_any()
         self.step = float(step)
         self.samples = jnp.asarray(GRAVITY * samples)
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ... import _tree
-from ...errors import InputError, InputProblem
+from ...errors import InputError, Problems
 from ...evolution import ExpRosenbrock, PiecewiseLinear, Solution, solve
 from ...generators import Dense
 from ...operators import Scaling
@@ -252,10 +252,10 @@ def _fits(name: str, value: float) -> bool:
 def _checked(record: Any, given: dict[str, Any]) -> dict[str, jax.Array]:
     """The numbers that were given, as arrays."""
     values: dict[str, jax.Array] = {}
-    wrong: list[InputProblem] = []
+    wrong = Problems()
 
-    def say(name: str, given: str, rule: str, mend: str) -> None:
-        wrong.append(InputProblem(f"dvax.models.Frame({name})", given, rule, mend))
+    def say(name: str, given: str, rule: str, fix: str) -> None:
+        wrong.add(f"dvax.models.Frame({name})", given, rule, fix)
 
     if not isinstance(record, Accelerogram):
         say("record", type(record).__name__, "it is a dvax.models.Accelerogram",
@@ -274,7 +274,7 @@ def _checked(record: Any, given: dict[str, Any]) -> dict[str, jax.Array]:
             say(name, f"shape {jnp.shape(number)}", f"it is {rule}",
                 "Use dvax.models.response_spectrum for many frames")  # fmt: skip
         elif _tree.is_concrete(number) and not _fits(name, float(number)):
-            say(name, f"{float(number):g}", f"it is {rule}", "Mend it")
+            say(name, f"{float(number):g}", f"it is {rule}", "Fix it")
     yields = [name for name in ("yield_ratio", "yield_displacement") if given[name] is not None]
     if len(yields) == 2:
         say(
@@ -288,6 +288,5 @@ def _checked(record: Any, given: dict[str, Any]) -> dict[str, jax.Array]:
         say("viscosity_ratio", _tree.short(flow) if _tree.is_concrete(flow) else "a traced value",
             "a frame without a yield force stays elastic and does not flow",
             "Leave it out, or say when the frame yields: yield_ratio = 0.5")  # fmt: skip
-    if wrong:
-        raise InputError(*wrong)
+    wrong.raise_any()
     return values

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ...errors import InputError, InputProblem, SolveError
+from ...errors import Problems, SolveError, input_error
 from ...evolution import DormandPrince, solve
 from .accelerogram import Accelerogram
 from .frame import Frame
@@ -60,31 +60,26 @@ def response_spectrum(
     """
     names = ("period", "damping", "yield_ratio", "viscosity_ratio")
     given = [np.asarray(v, float) for v in (period, damping, yield_ratio, viscosity_ratio)]
-    wrong = []
+    wrong = Problems()
     for name, value in zip(names, given, strict=True):
         bad = ~np.isfinite(value) | (value < 0 if name == "damping" else value <= 0)
         if bad.any():
             place = tuple(int(i) for i in np.argwhere(bad)[0])
             rule = "≥ 0" if name == "damping" else "positive"
-            wrong.append(
-                InputProblem(
-                    f"dvax.models.response_spectrum({name})", f"{value[place]:g} at index {place}",
-                    f"every entry is {rule}", "Mend it",
-                )
+            wrong.add(
+                f"dvax.models.response_spectrum({name})", f"{value[place]:g} at index {place}",
+                f"every entry is {rule}", "Fix it",
             )  # fmt: skip
-    if wrong:
-        raise InputError(*wrong)
+    wrong.raise_any()
     try:
         T, z, ratio, tau = np.broadcast_arrays(*given)
     except ValueError as error:
         shapes = ", ".join(
             f"{name} {value.shape}" for name, value in zip(names, given, strict=True)
         )
-        raise InputError(
-            InputProblem(
-                "dvax.models.response_spectrum", f"shapes {shapes}",
-                "the arguments are broadcast against each other", "Give each an axis of its own",
-            )
+        raise input_error(
+            "dvax.models.response_spectrum", f"shapes {shapes}",
+            "the arguments are broadcast against each other", "Give each an axis of its own",
         ) from error  # fmt: skip
     shape = T.shape
     run = _Runs(record, rtol, chunk, workers)

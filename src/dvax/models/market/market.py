@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ... import _tree
-from ...errors import InputError, InputProblem
+from ...errors import InputError, InputProblem, Problems, input_error
 from ...evolution import ExpRosenbrock, Solution, solve
 from ...formats.rts_gmlc import RTS, read_rts
 from ...generators import Scalar
@@ -83,7 +83,7 @@ class Market(eqx.Module):
         intercept: Any,
         capacity: Any,
     ):
-        wrong: list[InputProblem] = []
+        wrong = Problems()
         given = {"cost": (cost, 1), "slope": (slope, 1), "b": (b, 0), "speed": (speed, 0)}
         for name, (value, axes) in given.items():
             try:
@@ -94,15 +94,12 @@ class Market(eqx.Module):
             setattr(self, name, array)
             wrong += _breaks_rule(name, array, axes)
         for name, value in (("intercept", intercept), ("capacity", capacity)):
-            try:
+            with wrong.collect():
                 setattr(self, name, _signal(value, f"dvax.models.Market({name})"))
-            except InputError as error:
-                wrong += error.problems
         wrong += _not_firms(firm)
         if not wrong:
             wrong += self._sizes(firm)
-        if wrong:
-            raise InputError(*wrong)
+        wrong.raise_any()
         self.firms = jnp.asarray(np.eye(int(np.max(firm)) + 1)[np.asarray(firm)])
 
     @classmethod
@@ -128,11 +125,10 @@ class Market(eqx.Module):
         **Raises:** `dvax.InputError` for what is wrong in the files, and for hours that they have not.
         """
         rts = data if isinstance(data, RTS) else read_rts(data)
-        wrong = _not_hours(start_hour, hours, len(rts.load))
+        wrong = Problems(_not_hours(start_hour, hours, len(rts.load)))
         for name, value in (("reference_price", reference_price), ("elasticity", elasticity)):
             wrong += _breaks_rule(name, _tree.as_float(value, f"dvax.models.Market({name})"), 0)
-        if wrong:
-            raise InputError(*wrong)
+        wrong.raise_any()
         b = reference_price / (elasticity * float(rts.load.mean()))
         rows = slice(start_hour, start_hour + hours)
         times = np.arange(start_hour, start_hour + hours, dtype=float)
@@ -224,13 +220,11 @@ class Market(eqx.Module):
         first, last = self.intercept.span()
         begin, end = first if t0 is None else t0, last if t1 is None else t1
         if not (np.isfinite(begin) and np.isfinite(end)):
-            raise InputError(
-                InputProblem(
-                    "dvax.models.Market.run(t0, t1)",
-                    f"from {begin} to {end}",
-                    "the intercept is no table, which would say how long the run is",
-                    "Give t0 and t1",
-                )
+            raise input_error(
+                "dvax.models.Market.run(t0, t1)",
+                f"from {begin} to {end}",
+                "the intercept is no table, which would say how long the run is",
+                "Give t0 and t1",
             )
         price = self.equilibrium(begin)[0]
         ts = np.append(np.arange(float(begin), float(end)), float(end))
@@ -275,7 +269,7 @@ class Market(eqx.Module):
         first = self.capacity.span()[0]
         at = float(first) if np.isfinite(first) else 0.0
         values = self.capacity.value(at)
-        wrong = [
+        wrong = Problems(
             InputProblem(
                 f"dvax.models.Market({name})", f"shape {shape}",
                 f"it has an entry for each of the {n} units that `firm` names", "Complete it",
@@ -285,15 +279,13 @@ class Market(eqx.Module):
                 ("capacity", jnp.shape(values)),
             )
             if shape != (n,)
-        ]  # fmt: skip
+        )  # fmt: skip
         known = self.capacity.values if isinstance(self.capacity, Table) else values
         if _tree.is_concrete(known) and bool(np.any(np.asarray(known) < 0)):
             k = np.unravel_index(np.argmin(np.asarray(known)), np.shape(known))
-            wrong.append(
-                InputProblem(
-                    "dvax.models.Market(capacity)", f"{float(np.min(known)):g} for unit {k[-1]}",
-                    "a capacity is ≥ 0, or the set of what can be made is empty", "Mend it",
-                )
+            wrong.add(
+                "dvax.models.Market(capacity)", f"{float(np.min(known)):g} for unit {k[-1]}",
+                "a capacity is ≥ 0, or the set of what can be made is empty", "Fix it",
             )  # fmt: skip
         return wrong
 
@@ -340,7 +332,7 @@ def _breaks_rule(name: str, value: jax.Array, axes: int) -> list[InputProblem]:
             f"it must be {what}, finite{' and positive' if positive else ''}",
             "Costs without a slope have no single answer: give a small one"
             if name == "slope"
-            else "Mend the value",
+            else "Fix the value",
         )
     ]
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ...errors import InputError, InputProblem
+from ...errors import input_error
 from ...vi import RESULTS, AbstractSolver, Answer, Frozen
 
 _MOST = 120
@@ -57,15 +57,13 @@ class MeritOrder(AbstractSolver):
     def solve(self, vi: Frozen, y0: Any, tol: Any) -> Answer:
         ends = None if isinstance(y0, tuple) else vi.K.intervals(y0)
         if isinstance(y0, tuple) or ends is None or jnp.shape(y0) != jnp.shape(self.slope):
-            raise InputError(
-                InputProblem(
-                    "dvax.models.market.MeritOrder",
-                    f"a {type(vi.K).__name__} and a guess of another shape than {self.slope.shape}"
-                    if ends is not None
-                    else f"a {type(vi.K).__name__}, which is not a box",
-                    "every unit has a least and a greatest output, and a slope",
-                    "Use dvax.vi.Auto()",
-                )
+            raise input_error(
+                "dvax.models.market.MeritOrder",
+                f"a {type(vi.K).__name__} and a guess of another shape than {self.slope.shape}"
+                if ends is not None
+                else f"a {type(vi.K).__name__}, which is not a box",
+                "every unit has a least and a greatest output, and a slope",
+                "Use dvax.vi.Auto()",
             )
         q = vi.F(jnp.zeros_like(y0))
         z = self._unclipped(q, *ends, y0)

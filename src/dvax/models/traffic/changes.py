@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ... import _tree
-from ...errors import InputError, InputProblem
+from ...errors import InputError, Problems, input_error
 from ...formats.road_network import Network
 from ...sets import Simplex
 from ...signals import AbstractSignal, Constant, Function, Table
@@ -79,7 +79,7 @@ def capacities(
     base = network.capacity
     if not incidents:
         return Constant(jnp.asarray(base)), base[None]
-    problems: list[InputProblem] = []
+    problems = Problems()
     links = []
     for k, incident in enumerate(incidents):
         one = f"incidents[{k}]"
@@ -91,23 +91,18 @@ def capacities(
                 replace(p, place=place, given=f"{p.place}: {p.given}") for p in error.problems
             ]
         if not 0 < incident.remaining <= 1:
-            problems.append(
-                InputProblem(
-                    f"dvax.models.Traffic({one}.remaining)", f"remaining = {incident.remaining}",
-                    "it is the share of the capacity that is left, in (0, 1]",
-                    "Take a small share for a closed link, or remove the link",
-                )
+            problems.add(
+                f"dvax.models.Traffic({one}.remaining)", f"remaining = {incident.remaining}",
+                "it is the share of the capacity that is left, in (0, 1]",
+                "Take a small share for a closed link, or remove the link",
             )  # fmt: skip
         if not -np.inf < incident.start < incident.end < np.inf:
-            problems.append(
-                InputProblem(
-                    f"dvax.models.Traffic({one}.start, {one}.end)",
-                    f"start = {incident.start}, end = {incident.end}",
-                    "it begins before it ends", "Mend the times",
-                )
+            problems.add(
+                f"dvax.models.Traffic({one}.start, {one}.end)",
+                f"start = {incident.start}, end = {incident.end}",
+                "it begins before it ends", "Fix the times",
             )  # fmt: skip
-    if problems:
-        raise InputError(*problems)
+    problems.raise_any()
     remaining, start, end = (
         np.array([getattr(i, name) for i in incidents], float)
         for name in ("remaining", "start", "end")
@@ -159,7 +154,7 @@ def demand_factor(given: Any, peak: Any, pairs: int) -> tuple[AbstractSignal | N
         known = np.asarray(signal.values)
     if known is not None and np.any(known < 0):
         raise _wrong(
-            name, f"a factor of {known.min():g}", "there are no negative trips", "Mend the factors"
+            name, f"a factor of {known.min():g}", "there are no negative trips", "Fix the factors"
         )
     if peak is None:
         if known is None:
@@ -186,5 +181,5 @@ def demand_factor(given: Any, peak: Any, pairs: int) -> tuple[AbstractSignal | N
     return signal, most
 
 
-def _wrong(place: str, given: str, rule: str, mend: str) -> InputError:
-    return InputError(InputProblem(place, given, rule, mend))
+def _wrong(place: str, given: str, rule: str, fix: str) -> InputError:
+    return input_error(place, given, rule, fix)

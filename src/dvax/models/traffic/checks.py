@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, InputProblem
+from ...errors import InputProblem, Problems
 from ...formats.road_network import Network, Trips
 from ...formats.tntp import read_network, read_trips
 from .shortest import ShortestPaths
@@ -15,43 +15,36 @@ from .shortest import ShortestPaths
 def loaded(network: Any, trips: Any) -> tuple[Network, Trips]:
     """Both, read from files where they are names of such. Raises `InputError` with what is wrong in
     either."""
-    problems: list[InputProblem] = []
+    problems = Problems()
     found: list[Any] = []
     for given, kind, read in ((network, Network, read_network), (trips, Trips, read_trips)):
         if not isinstance(given, (kind, str, os.PathLike)):
             name = kind.__name__.lower()
-            problems.append(
-                InputProblem(
-                    f"dvax.models.Traffic({name})", repr(given)[:60],
-                    f"it is a dvax.models.{kind.__name__}, or the name of a TNTP file",
-                    f"Read it: dvax.formats.{read.__name__}(...)",
-                )
+            problems.add(
+                f"dvax.models.Traffic({name})", repr(given)[:60],
+                f"it is a dvax.models.{kind.__name__}, or the name of a TNTP file",
+                f"Read it: dvax.formats.{read.__name__}(...)",
             )  # fmt: skip
             continue
-        try:
+        with problems.collect():
             found.append(given if isinstance(given, kind) else read(given))
-        except InputError as error:
-            problems += error.problems
-    if problems:
-        raise InputError(*problems)
+    problems.raise_any()
     return found[0], found[1]
 
 
 def numbers(**given: Any) -> list[InputProblem]:
     """What is wrong with the numbers of the model, by name."""
     rules = {"rate": "> 0", "rho": "> 0", "gap": "> 0"}
-    problems = []
+    problems = Problems()
     for name, value in given.items():
         if name == "rho" and value is None:
             continue
         real = isinstance(value, int | float | np.number) and not isinstance(value, bool)
         rule = rules.get(name, "≥ 0")
         if not (real and math.isfinite(value) and (value > 0 if rule == "> 0" else value >= 0)):
-            problems.append(
-                InputProblem(
-                    f"dvax.models.Traffic({name})", repr(value), f"it is a number {rule}",
-                    "Mend the number",
-                )
+            problems.add(
+                f"dvax.models.Traffic({name})", repr(value), f"it is a number {rule}",
+                "Fix the number",
             )  # fmt: skip
     return problems
 
@@ -75,7 +68,7 @@ def agreement(network: Network, trips: Trips) -> list[InputProblem]:
         ]  # fmt: skip
     least, _ = ShortestPaths(network, trips).find(np.ones(len(network)))
     cut_off = np.flatnonzero(~np.isfinite(least))
-    problems = [
+    problems = Problems(
         InputProblem(
             trips.place(i),
             f"{trips.flow[i]:g} trips from {trips.origin[i]} to {trips.destination[i]}",
@@ -84,13 +77,11 @@ def agreement(network: Network, trips: Trips) -> list[InputProblem]:
             "Add a link, or leave the trips out",
         )
         for i in cut_off[:20]
-    ]  # fmt: skip
+    )  # fmt: skip
     if len(cut_off) > 20:
-        problems.append(
-            InputProblem(
-                trips.name, f"{len(cut_off) - 20} more pairs without a path",
-                "the first 20 are shown: often one link makes them all", "Mend those first",
-            )
+        problems.add(
+            trips.name, f"{len(cut_off) - 20} more pairs without a path",
+            "the first 20 are shown: often one link makes them all", "Fix those first",
         )  # fmt: skip
     return problems
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from ... import _tree
-from ...errors import InputError, InputProblem
+from ...errors import InputProblem, Problems
 from ...formats.road_network import Network
 
 
@@ -62,17 +62,15 @@ def link_costs(network: Network, toll_weight: Any, distance_weight: Any) -> Link
     **Raises:** `dvax.InputError` where tolls have a weight and the network has none, or a power lies
     between 0 and 1: t′(0) = ∞, so that no L_F is large enough.
     """
-    problems = []
+    problems = Problems()
     charge = distance_weight * network.length
     if network.toll is not None:
         charge = charge + toll_weight * network.toll
     elif toll_weight != 0:
-        problems.append(
-            InputProblem(
-                "dvax.models.Traffic(toll_weight)", f"{toll_weight:g}",
-                f"{network.name} has no column toll, so there is nothing to weigh",
-                "Add the column, or leave out the weight",
-            )
+        problems.add(
+            "dvax.models.Traffic(toll_weight)", f"{toll_weight:g}",
+            f"{network.name} has no column toll, so there is nothing to weigh",
+            "Add the column, or leave out the weight",
         )  # fmt: skip
     scale = network.free_flow_time * network.b
     constant = network.power == 0
@@ -85,8 +83,7 @@ def link_costs(network: Network, toll_weight: Any, distance_weight: Any) -> Link
         )
         for i in np.flatnonzero((network.power > 0) & (network.power < 1) & (scale > 0))
     ]  # fmt: skip
-    if problems:
-        raise InputError(*problems)
+    problems.raise_any()
     time = network.free_flow_time + np.where(constant, scale, 0.0)
     scale = np.where(constant, 0.0, scale)
     # Where nothing is scaled the power is of no account; 1 has a slope everywhere.

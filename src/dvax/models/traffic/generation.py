@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ...errors import InputError, InputProblem
+from ...errors import input_error
 from ...formats.road_network import Network, Trips
 from .costs import LinkCosts
 from .equilibrium import Equilibrium, Report, equilibrate
@@ -47,10 +47,8 @@ def typical_rho(costs: LinkCosts, network: Network, trips: Trips) -> float:
     free = costs.up_to(np.zeros(len(network))).costs(np.zeros(len(network)), network.capacity)
     least, _ = ShortestPaths(network, trips).find(free)
     if not np.any(least > 0):
-        raise InputError(
-            InputProblem(
-                "dvax.models.Traffic(rho)", "None", "on the empty network no trip costs anything, so "
-                "there is no typical cost to choose it by", "Give rho, in trips per unit of cost",
-            )
+        raise input_error(
+            "dvax.models.Traffic(rho)", "None", "on the empty network no trip costs anything, so "
+            "there is no typical cost to choose it by", "Give rho, in trips per unit of cost",
         )  # fmt: skip
     return float(_MANY * trips.flow.mean() * trips.flow.sum() / (trips.flow @ least))

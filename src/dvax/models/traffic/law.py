@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ...errors import InputError, InputProblem
+from ...errors import input_error
 from ...problem import FrozenOperator
 from ...signals import AbstractSignal
 from ...vi import AbstractSolver, Answer, Frozen
@@ -234,12 +234,10 @@ class _Law:
 
     def __init__(self, choices: Choices, vi: Frozen):
         if not (isinstance(vi.F, FrozenOperator) and isinstance(vi.F.h, Proposal)):
-            raise InputError(
-                InputProblem(
-                    "dvax.models.traffic.LinkNewton", f"the operator {vi.F!r}"[:80],
-                    "it solves the law of a dvax.models.Traffic alone",
-                    "Use dvax.vi.Accelerated()",
-                )
+            raise input_error(
+                "dvax.models.traffic.LinkNewton", f"the operator {vi.F!r}"[:80],
+                "it solves the law of a dvax.models.Traffic alone",
+                "Use dvax.vi.Accelerated()",
             )  # fmt: skip
         frozen: FrozenOperator = vi.F
         F, K, h = jax.tree_util.tree_map(lax.stop_gradient, (frozen.x, vi.K, frozen.h))

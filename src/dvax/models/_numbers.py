@@ -1,0 +1,36 @@
+"""Checks of the numbers that models take."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .. import _tree
+from ..errors import Problems
+
+
+def positive(
+    place: str,
+    value: Any,
+    wrong: Problems,
+    *,
+    zero: bool = False,
+    why: str = "",
+    fix: str = "Fix the number, or its unit",
+) -> jax.Array:
+    """Return `value` as an array: a positive number, with `zero` also 0.
+
+    Any other value is added to `wrong`, and 1 is returned in its place. Of a traced value only the
+    shape is checked. `why` is the reason for the rule.
+    """
+    with wrong.collect():
+        number = _tree.as_float(value, place)
+        holds = jnp.ndim(number) == 0
+        if holds and _tree.is_concrete(number):
+            holds = bool(np.isfinite(number) and (number >= 0 if zero else number > 0))
+        if holds:
+            return number
+        rule = "it must be a number ≥ 0" if zero else "it must be a positive number"
+        wrong.add(place, _tree.short(number), rule + (f": {why}" if why else ""), fix)
+    return jnp.ones(())
