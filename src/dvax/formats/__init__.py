@@ -1,6 +1,6 @@
-"""Readers of files that others write: each checks every cell and says what is wrong, with its line.
+"""Readers of files of other programs. Each checks every cell and reports all problems with their lines.
 
-Names are loaded when they are first used: whoever reads a table needs no mesh.
+Names are imported when they are first used: reading a table does not import meshio.
 """
 
 from typing import TYPE_CHECKING

@@ -20,7 +20,7 @@ _UNIT_OF_GRAVITY = re.compile(r"units?\b[^\n]*?(\(\s*g\s*\)|\bg\b)", re.IGNORECA
 
 
 def read_at2(path: str | os.PathLike[str]) -> tuple[float, np.ndarray]:
-    """The step (s) and the accelerations (in units of standard gravity) of an .at2 file. Raises
+    """Return the step (s) and the accelerations (in units of standard gravity) of an .at2 file. Raises
     `InputError` with the line of every problem."""
     lines, problems = read_text(path, "an .at2 file").splitlines(), FileProblems(path)
     found = next(((i, m) for i, t in enumerate(lines, 1) if (m := _SIZES.search(t))), None)

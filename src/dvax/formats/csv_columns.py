@@ -31,7 +31,7 @@ class Column:
 
 
 def read_columns(path: Path, wanted: list[str | None], key_column: str) -> list[Column]:
-    """The `wanted` columns of a CSV file, in that order.
+    """Return the `wanted` columns of a CSV file, in that order.
 
     None stands for "the one column besides `key_column`". Raises `InputError` with every problem:
     a missing column or unit, a gap, text, NaN or infinity in a number column, rows of other
@@ -76,7 +76,7 @@ def read_columns(path: Path, wanted: list[str | None], key_column: str) -> list[
 
 
 def _only_other(table: Table, key_column: str) -> str | None:
-    """The one column besides `key_column`; None where there are others, which is reported."""
+    """Return the one column besides `key_column`; None, and a problem, where there are several."""
     others = [name for name in table.names if name != key_column]
     if len(others) == 1:
         return others[0]

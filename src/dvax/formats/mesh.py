@@ -1,4 +1,4 @@
-"""Meshes from files: Gmsh, Medit, Abaqus and whatever else meshio reads."""
+"""Meshes from files: Gmsh, Medit, Abaqus and all other formats of meshio."""
 
 import contextlib
 import io
@@ -33,8 +33,8 @@ class Raw(NamedTuple):
 
 
 def read_mesh(path: str | os.PathLike[str], contact: str, clamped: str) -> Any:
-    """The mesh of a file, with the boundaries that the file calls `contact` and `clamped` under the
-    names "contact" and "clamped".
+    """Read the mesh of a file; the boundaries that the file calls `contact` and `clamped` get the names
+    "contact" and "clamped".
 
     Elements are triangles or quadrilaterals with straight sides, all of one kind, in a plane. A
     boundary is a group of line elements: a physical curve of Gmsh by its name, or by its number
@@ -72,7 +72,7 @@ def _load(path: Path, place: str) -> Any:
         raise input_error(place, "no such file", "a mesh is read from a file", "Fix the name")
     said = io.StringIO()
     try:
-        # meshio talks on both channels.
+        # meshio prints to both streams.
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             return meshio.read(path)
     except (meshio.ReadError, *_UNREADABLE) as error:
@@ -154,7 +154,7 @@ def _edges(mesh: Any) -> dict[str, np.ndarray]:
 def _facets(
     mesh: Any, new: np.ndarray, edges: dict[str, np.ndarray], name: str, role: str, place: str
 ) -> np.ndarray:
-    """The facets of the mesh that the line elements of a group are."""
+    """Return the facets of the mesh that are line elements of a group."""
     if name not in edges:
         there = ", ".join(map(repr, sorted(edges))) or "none"
         raise input_error(

@@ -58,7 +58,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Netlist:
-    """The elements in the order of the file, and the `name` by which messages call it."""
+    """The elements in the order of the file, and its `name` in messages."""
 
     name: str
     elements: tuple[Element, ...]
@@ -76,10 +76,10 @@ class Netlist:
 
 
 def read_netlist(text: str, name: str = "netlist") -> Netlist:
-    """The elements of a netlist; `name` stands for it in messages.
+    """Read the elements of a netlist; `name` stands for it in messages.
 
     **Raises:** `dvax.InputError` with the line of everything that is wrong: unknown elements, missing
-    nodes, numbers without sense, wrong units, names used twice.
+    nodes, malformed numbers, wrong units, names used twice.
 
     ```python
     >>> from dvax.formats import read_netlist

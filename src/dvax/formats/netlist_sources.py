@@ -1,4 +1,4 @@
-"""What a source of a netlist does in time, as a signal."""
+"""The sources of a netlist as signals."""
 
 import re
 from typing import Any
@@ -76,7 +76,7 @@ _PERIODS = 100_000
 
 
 def read_waveform(fields: list[str], quantity: str, place: str) -> AbstractSignal:
-    """The signal that the end of a source's line describes: ``5``, ``DC 5``,
+    """Return the signal that the end of a source's line describes: ``5``, ``DC 5``,
     ``SIN(offset amplitude frequency [delay damping phase])``, ``PWL(t v t v ...)`` or
     ``PULSE(low high [delay rise fall width period])``.
 

@@ -25,11 +25,11 @@ UNITS = {
     "time": ("s",),
     "angle": ("deg", "°"),
 }
-"""What a quantity may be measured in; rates are 1/s."""
+"""The units of each quantity; rates are 1/s."""
 
 
 def read_value(text: str, quantity: str, place: str) -> float:
-    """`text` as a number in the SI unit of `quantity`: 4.7k, 10mH, 1e-6, 2.2uF.
+    """Return `text` as a number in the SI unit of `quantity`: 4.7k, 10mH, 1e-6, 2.2uF.
 
     **Raises:** `dvax.InputError` at `place` for what is no finite number, a unit of another quantity,
     and the two traps of SPICE: a large M (milli there, mega elsewhere) and F alone (femto there).
@@ -63,7 +63,7 @@ def read_value(text: str, quantity: str, place: str) -> float:
 
 
 def _factor(tail: str, units: tuple[str, ...]) -> float | None:
-    """What the tail of a number multiplies it by, None where that is not in these units."""
+    """Return the factor of a suffix with one of these units, None where it has another."""
     for unit in ("", *units):
         head = tail.removesuffix(unit)
         if tail.endswith(unit) and head.lower() in _SUFFIXES:

@@ -1,4 +1,4 @@
-"""What the extra `fem` brings, imported where it is needed: `import dvax` does without."""
+"""Packages of the extra `fem`, imported where they are needed."""
 
 import importlib
 from typing import Any
@@ -9,7 +9,7 @@ _PACKAGES = {"skfem": "scikit-fem", "meshio": "meshio"}
 
 
 def needed(module: str) -> Any:
-    """The module `meshio`, `skfem`, or a module of it.
+    """Import the module `meshio`, `skfem`, or one of its modules.
 
     **Raises:** `dvax.InputError`, which names the extra, where it is not installed.
     """

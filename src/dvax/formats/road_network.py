@@ -1,4 +1,4 @@
-"""Road networks and trip tables: what they hold, and what must be true of it."""
+"""Road networks and trip tables, and the rules that they satisfy."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -81,7 +81,7 @@ class Network:
         return int(found[0])
 
     def place(self, index: Any) -> str:
-        """Where a link stands: its line, or its number."""
+        """Return the place of a link: its line, or its number."""
         if self.lines is None:
             return f"{self.name}, link {index + 1}"
         return f"{self.name}, line {self.lines[index]}"
@@ -134,12 +134,12 @@ class Trips:
         return len(self.flow)
 
     def place(self, index: Any) -> str:
-        """Where a pair stands: its line, or its number."""
+        """Return the place of a pair: its line, or its number."""
         return _pair_place(self, index)
 
 
 def link_problems(links: Any) -> Problems:
-    """What is wrong with each link of a network, or of what has been read of one so far."""
+    """Return the problems of each link of a network, or of the part that could be read."""
     problems = Problems()
     place = lambda i: Network.place(links, i)  # noqa: E731
     if not 1 <= links.zones <= links.nodes:
@@ -190,7 +190,7 @@ def link_problems(links: Any) -> Problems:
 
 
 def trip_problems(trips: Any) -> Problems:
-    """What is wrong with each pair of a trip table, or of what has been read of one so far."""
+    """Return the problems of each pair of a trip table, or of the part that could be read."""
     problems = Problems()
     place = lambda i: _pair_place(trips, i)  # noqa: E731
     for column in ("origin", "destination"):
@@ -228,7 +228,7 @@ def _unknown(
 
 
 def _repeated(first: np.ndarray, second: np.ndarray) -> list[tuple[int, int]]:
-    """(i, j) for every i whose pair stood before, first at j."""
+    """Return (i, j) for every i whose pair occurs before, first at j."""
     seen: dict[tuple[int, int], int] = {}
     found = []
     for i, pair in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
@@ -240,7 +240,7 @@ def _repeated(first: np.ndarray, second: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _shaped(table: Any, title: str, whole: Sequence[str], real: Sequence[str]) -> Problems:
-    """Make the columns arrays of one length, or say which are not."""
+    """Convert the columns to arrays of one length; return the problems of those that cannot be."""
     problems, lengths = Problems(), {}
     for column in (*whole, *real):
         given = getattr(table, column)

@@ -1,4 +1,4 @@
-"""The RTS-GMLC test system: who can make how much electricity at what cost, and who wants it."""
+"""The RTS-GMLC test system: capacities and costs of the units, and the load."""
 
 import datetime
 import itertools
@@ -27,8 +27,8 @@ _COLUMNS = (
     "GEN UID", "Bus ID", "Unit Type", "PMax MW", "Fuel Price $/MMBTU", "HR_incr_1", "HR_incr_3",
 )  # fmt: skip
 _THERMAL = ("CT", "CC", "STEAM", "NUCLEAR")
-# Synchronous condensers make no power; water, heat stores and batteries have a budget of energy, which
-# no law of one hour knows; panels on roofs are behind the meter, inside the load.
+# Synchronous condensers make no power; hydro, heat stores and batteries have an energy budget, which
+# couples the hours; rooftop panels are behind the meter and part of the load.
 _OTHERS = ("SYNC_COND", "HYDRO", "ROR", "CSP", "STORAGE", "RTPV")
 _CLOCK = ("Year", "Month", "Day", "Period")
 _RATING_MARGIN = 1.1
@@ -53,8 +53,9 @@ class RTS(NamedTuple):
 
 
 def read_rts(folder: str | Path) -> RTS:
-    """The market of the RTS-GMLC data in a folder: the four files gen.csv, DAY_AHEAD_regional_Load.csv,
-    DAY_AHEAD_wind.csv and DAY_AHEAD_pv.csv, or a checkout of the whole repository.
+    """Read the market of the RTS-GMLC data in a folder: the four files gen.csv,
+    DAY_AHEAD_regional_Load.csv, DAY_AHEAD_wind.csv and DAY_AHEAD_pv.csv, or a checkout of the whole
+    repository.
 
     The thermal units (CT, CC, STEAM, NUCLEAR) have their PMax at all hours and the marginal cost of
     their heat-rate curve, HR_incr in BTU/kWh and fuel in $/MMBTU:
@@ -62,7 +63,7 @@ def read_rts(folder: str | Path) -> RTS:
         c = HR_incr_1 · fuel / 1000,    a = max(10⁻³, (HR_incr_3 − HR_incr_1) · fuel / 1000 / PMax).
 
     Wind and photovoltaic units cost nothing (c = 0, a = 10⁻³) and have what the hour brings. Hydro,
-    CSP, storage and rooftop units are left out: their hours hang together, or are in the load.
+    CSP, storage and rooftop units are left out: their hours are coupled, or part of the load.
 
     **Raises:** `dvax.InputError` with file, line, what is wrong and its fix, everything at once (up to
     20 flaws a file): files or columns that are missing, cells that are no numbers or negative, unknown
@@ -129,7 +130,7 @@ def _place(folder: Path, places: tuple[str, ...]) -> Path:
 
 
 def _read_table(path: Path, wanted: tuple[str, ...]) -> Table:
-    """The table of a CSV file that has the `wanted` columns. Raises `InputError`."""
+    """Read the table of a CSV file that has the `wanted` columns. Raises `InputError`."""
     problems = FileProblems(path)
     rows = csv_rows(path, problems)
     if len(rows) < 2:
@@ -143,7 +144,7 @@ def _read_table(path: Path, wanted: tuple[str, ...]) -> Table:
 
 
 def _read_units(path: Path) -> list[_Unit]:
-    """The thermal units and those whose capacity is measured. Raises `InputError`."""
+    """Read the thermal units and those whose capacity is measured. Raises `InputError`."""
     table = _read_table(path, _COLUMNS)
     problems, units, seen = table.problems, [], set()
     for line, cells in table.rows:
@@ -167,7 +168,8 @@ def _read_units(path: Path) -> list[_Unit]:
 
 
 def _curve(table: Table, line: int, cells: list[str]) -> tuple[float, float, float]:
-    """Capacity, c and a of a unit from PMax and, where it burns fuel, its price and heat rates."""
+    """Return capacity, c and a of a unit from PMax and, where it burns fuel, its price and heat
+    rates."""
     capacity, *rest = (
         table.number(line, c, cell, least=0.0) for c, cell in zip(_COLUMNS[3:], cells, strict=False)
     )
@@ -189,7 +191,8 @@ def _curve(table: Table, line: int, cells: list[str]) -> tuple[float, float, flo
 
 
 def _read_hourly(path: Path) -> Hourly:
-    """The hours of a file with the columns Year, Month, Day, Period (1 to 24). Raises `InputError`."""
+    """Read the hours of a file with the columns Year, Month, Day, Period (1 to 24). Raises
+    `InputError`."""
     table = _read_table(path, _CLOCK)
     problems = table.problems
     clock = [table.names.index(name) for name in _CLOCK]
@@ -223,7 +226,7 @@ def _read_hourly(path: Path) -> Hourly:
 
 
 def _other_hours(first: Hourly, other: Hourly) -> list[InputProblem]:
-    """A problem where two files do not cover the same hours."""
+    """Return a problem where two files do not cover the same hours."""
     if (other.start, len(other.values)) == (first.start, len(first.values)):
         return []
     told = [f"{len(table.values)} from {table.start:%Y-%m-%d %H:%M}" for table in (first, other)]
@@ -237,7 +240,7 @@ def _other_hours(first: Hourly, other: Hourly) -> list[InputProblem]:
 
 
 def _wrong_series(table: Hourly, file: str, kind: str, units: list[_Unit]) -> list[InputProblem]:
-    """Columns that are no unit of a kind, units of it without a column, values above a rating."""
+    """Return the problems of a series: unknown units, units without a column, values above a rating."""
     rated = {unit.name: unit for unit in units if unit.kind == kind}
     problems = Problems()
     for name in table.names:
@@ -266,7 +269,7 @@ def _wrong_series(table: Hourly, file: str, kind: str, units: list[_Unit]) -> li
 
 
 def _wrong_load(table: Hourly, file: str, units: list[_Unit]) -> list[InputProblem]:
-    """Areas with units and without a load, and a load of another size than the units."""
+    """Return the problems of the load: areas without one, and a size that does not match the units."""
     problems = Problems()
     for area in sorted({unit.area for unit in units} - set(table.names)):
         unit = next(unit for unit in units if unit.area == area)
@@ -287,7 +290,7 @@ def _wrong_load(table: Hourly, file: str, units: list[_Unit]) -> list[InputProbl
 
 
 def _join(units: list[_Unit], load: Hourly, wind: Hourly, sun: Hourly) -> RTS:
-    """Thermal units in the order of their file, then those of both series in theirs."""
+    """Join all units: the thermal ones in the order of their file, then those of both series."""
     by_name = {unit.name: unit for unit in units}
     thermal = [unit for unit in units if unit.kind in _THERMAL]
     ordered = [*thermal, *(by_name[name] for name in (*wind.names, *sun.names))]

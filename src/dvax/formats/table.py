@@ -1,7 +1,7 @@
 """Tables in text files: a row of names, then rows of cells. Every problem is reported with its line.
 
 `read_text` and `csv_rows` read the rows of a file, `Table` finds columns by name and turns cells into
-numbers, and `Problems` collects what is wrong with one file, so that all of it is reported at once.
+numbers, and `FileProblems` collects what is wrong with one file, so that all of it is reported at once.
 """
 
 import csv
@@ -52,7 +52,7 @@ class FileProblems(Problems):
 
 
 def read_bytes(path: str | os.PathLike[str], kind: str = "a data file") -> bytes:
-    """The content of a file; `kind` says what it is, in errors. Raises `InputError`."""
+    """Return the content of a file; `kind` names it in errors. Raises `InputError`."""
     try:
         return Path(path).read_bytes()
     except OSError as error:
@@ -63,8 +63,8 @@ def read_bytes(path: str | os.PathLike[str], kind: str = "a data file") -> bytes
 
 
 def read_text(path: str | os.PathLike[str], kind: str, encoding: str = "latin-1") -> str:
-    """The text of a file. Latin-1 never fails: comments are of any encoding there, and data that is
-    not ASCII is refused where it is read. Raises `InputError`."""
+    """Return the text of a file. Latin-1 decodes any bytes: comments may have any encoding, and
+    data that is not ASCII is refused by its reader. Raises `InputError`."""
     try:
         return read_bytes(path, kind).decode(encoding)
     except UnicodeDecodeError as error:
@@ -75,7 +75,7 @@ def read_text(path: str | os.PathLike[str], kind: str, encoding: str = "latin-1"
 
 
 def csv_rows(path: Path, problems: FileProblems) -> list[tuple[int, list[str]]]:
-    """(line, cells) of every row of a CSV file that is neither blank nor a comment (#)."""
+    """Return (line, cells) of every row of a CSV file that is neither blank nor a comment (#)."""
     text = read_text(path, "a CSV file", "utf-8-sig")
     reader = csv.reader(text.splitlines(), strict=True, skipinitialspace=True)
     rows: list[tuple[int, list[str]]] = []
@@ -113,7 +113,7 @@ class Table:
         self.rows = [row for row in rows if len(row[1]) == len(names)]
 
     def has(self, *wanted: str) -> bool:
-        """Whether all these columns are there; each that is not is reported."""
+        """Return whether all these columns are there; each missing one is reported."""
         missing = [name for name in wanted if name not in self.names]
         for name in missing:
             close = get_close_matches(name, [n for n in self.names if n not in wanted], n=1)
@@ -128,7 +128,8 @@ class Table:
         return not missing
 
     def number(self, line: int, name: str, cell: str, least: float = -math.inf) -> float:
-        """A cell as a finite number of at least `least`; NaN where it is not, which is reported."""
+        """Return a cell as a finite number of at least `least`; NaN, and a problem, where it is not
+        one."""
         value = to_number(cell)
         if value is not None and value >= least:
             return value
@@ -140,7 +141,7 @@ class Table:
         return math.nan
 
     def count(self, line: int, name: str, cell: str) -> float:
-        """A cell as a whole number ≥ 0; NaN where it is not, which is reported."""
+        """Return a cell as a whole number ≥ 0; NaN, and a problem, where it is not one."""
         value = to_count(cell)
         if value is None:
             rule = "it is a whole number, such as that of a node"

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from dvax.app.plots.run_reader import AssumptionRow, ConstantRow, RunRecord
-from dvax.app.plots.stability import assumptions_table, losses_table
+from dvax.app.plots.tables import assumptions_table, rates_table
 
 VALUES = {"omega": -1.0, "M": 2.0, "alpha_f": 0.3, "beta_f": 0.5, "L": 0.4, "growth_rate": 0.0}
 
@@ -20,7 +20,7 @@ def record(values: dict[str, Any], assumptions: tuple[AssumptionRow, ...] = ()) 
 
 
 def test_the_parts_of_the_rate_add_up_and_the_largest_is_named() -> None:
-    text = losses_table(record(VALUES | {"sharp_decay_rate": 0.75}))
+    text = rates_table(record(VALUES | {"sharp_decay_rate": 0.75}))
     shown = [line.split("</td>") for line in text.split("<tr>")[2:]]
     cells = [[cell.split(">")[-1] for cell in row[:4]] for row in shown]
     parts = {row[1]: row for row in cells}
@@ -33,7 +33,7 @@ def test_the_parts_of_the_rate_add_up_and_the_largest_is_named() -> None:
 
 @pytest.mark.parametrize("missing", VALUES)
 def test_a_run_without_a_constant_has_no_such_table(missing: str) -> None:
-    assert losses_table(record({k: v for k, v in VALUES.items() if k != missing})) == ""
+    assert rates_table(record({k: v for k, v in VALUES.items() if k != missing})) == ""
 
 
 def test_assumptions_are_shown_as_they_are_and_escaped() -> None:

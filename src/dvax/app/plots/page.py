@@ -3,7 +3,6 @@
 Nothing is fetched: Plotly's script is written into the file, and figures are JSON beside it.
 """
 
-import html
 from collections.abc import Sequence
 from importlib.resources import files
 
@@ -11,8 +10,14 @@ from plotly.offline import get_plotlyjs
 
 from dvax.app.plots.picture import Picture, Views
 from dvax.app.plots.run_reader import CONTACT, UNFINISHED, RunRecord
-from dvax.app.plots.stability import assumptions_table, losses_table
-from dvax.app.plots.tables import constants_table, facts_table, headline_cards
+from dvax.app.plots.tables import (
+    assumptions_table,
+    constants_table,
+    escaped,
+    facts_table,
+    headline_cards,
+    rates_table,
+)
 from dvax.app.plots.theme import counted
 
 _HINT = '<br><span class="hint">Drag in a figure to zoom, double-click to return.</span>'
@@ -24,21 +29,21 @@ def page(run: RunRecord, pictures: Sequence[Picture], missing: Sequence[str]) ->
     style = (room / "page.css").read_text(encoding="utf-8")
     script = (room / "page.js").read_text(encoding="utf-8")
     shown = "\n".join(map(_section, pictures))
-    absent = "".join(f"<li>{_escape(text)}</li>" for text in missing)
+    absent = "".join(f"<li>{escaped(text)}</li>" for text in missing)
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{_escape(run.title)} · dvax report</title>
+<title>{escaped(run.title)} · dvax report</title>
 <link rel="icon" href="data:,">
 <style>{style}</style>
 <script>{get_plotlyjs()}</script>
 </head>
 <body>
 <header>
-<h1>{_escape(run.title)}</h1>
-<p>{_escape(_subtitle(run))}{_HINT if pictures else ""}</p>
+<h1>{escaped(run.title)}</h1>
+<p>{escaped(_subtitle(run))}{_HINT if pictures else ""}</p>
 </header>
 <main>
 {_banner(run)}
@@ -60,15 +65,15 @@ are any.</p>
 
 
 def _stability(run: RunRecord) -> str:
-    """What the theory says of the system, where the run knows it."""
-    losses, known = losses_table(run), assumptions_table(run)
-    if not (losses or known):
+    """The section on stability; empty where the run has neither constants nor assumptions."""
+    rates, assumptions = rates_table(run), assumptions_table(run)
+    if not (rates or assumptions):
         return ""
     caption = (
         '<p class="caption">The distance of two trajectories grows at most at this rate. The paper\'s '
-        "adds magnitudes; the one with signs sees which feedbacks hold back.</p>"
+        "adds magnitudes; the one with signs accounts for feedback that stabilises.</p>"
     )
-    return f"<section><h2>Stability</h2>{losses}{caption if losses else ''}{known}</section>"
+    return f"<section><h2>Stability</h2>{rates}{caption if rates else ''}{assumptions}</section>"
 
 
 def _subtitle(run: RunRecord) -> str:
@@ -94,9 +99,9 @@ def _banner(run: RunRecord) -> str:
         text = " ".join(part for part in (UNFINISHED[run.status], reach, reason) if part)
         head = "No results." if run.trajectory is None else "Partial results."
         lines.append(
-            f'<div class="banner partial" role="alert"><b>{head}</b> {_escape(text)}</div>'
+            f'<div class="banner partial" role="alert"><b>{head}</b> {escaped(text)}</div>'
         )
-    said = "".join(f"<li>{_escape(text)}</li>" for text in (*run.notes, *run.warnings))
+    said = "".join(f"<li>{escaped(text)}</li>" for text in (*run.notes, *run.warnings))
     if said:
         lines.append(f'<div class="banner"><b>Notes of the run.</b><ul>{said}</ul></div>')
     return "\n".join(lines)
@@ -118,11 +123,11 @@ def _section(picture: Picture) -> str:
     # "<" is escaped, so that no text of the run can close the script element.
     figure = str(picture.interactive.to_json()).replace("<", "\\u003c")
     height = picture.interactive["layout"]["height"]
-    return f"""<section><h2>{_escape(picture.title)}</h2>{_control(picture)}
+    return f"""<section><h2>{escaped(picture.title)}</h2>{_control(picture)}
 <div class="plot" id="{picture.key}" style="min-height:{height}px" role="img"
- aria-label="{_escape(picture.title)}"></div>
+ aria-label="{escaped(picture.title)}"></div>
 <script type="application/json" id="{picture.key}-data">{figure}</script>
-<p class="caption">{_escape(picture.caption)}</p></section>"""
+<p class="caption">{escaped(picture.caption)}</p></section>"""
 
 
 def _control(picture: Picture) -> str:
@@ -133,12 +138,12 @@ def _control(picture: Picture) -> str:
         return _slider(picture.key, views)
     buttons = "".join(
         f'<button type="button" aria-pressed="{str(index == views.first).lower()}" '
-        f'data-view="{index}">{_escape(label)}</button>'
+        f'data-view="{index}">{escaped(label)}</button>'
         for index, label in enumerate(views.labels)
     )
     return (
         f'<div class="views" data-plot="{picture.key}" data-count="{len(views.labels)}">'
-        f"<span>{_escape(views.name)}</span>{buttons}</div>"
+        f"<span>{escaped(views.name)}</span>{buttons}</div>"
     )
 
 
@@ -146,12 +151,8 @@ def _slider(key: str, views: Views) -> str:
     labels = "\n".join(views.labels)
     return (
         f'<div class="views" data-plot="{key}" data-count="{len(views.labels)}">'
-        f'<label for="{key}-view">{_escape(views.name)}</label>'
+        f'<label for="{key}-view">{escaped(views.name)}</label>'
         f'<input type="range" id="{key}-view" min="0" max="{len(views.labels) - 1}" step="1" '
-        f'value="{views.first}" data-labels="{_escape(labels)}">'
-        f"<output>{_escape(views.labels[views.first])}</output></div>"
+        f'value="{views.first}" data-labels="{escaped(labels)}">'
+        f"<output>{escaped(views.labels[views.first])}</output></div>"
     )
-
-
-def _escape(text: str) -> str:
-    return html.escape(text, quote=True)

@@ -1,4 +1,4 @@
-"""The tables of the page: headline figures, constants with labels, facts of the manifest."""
+"""The tables of the page: headline figures, constants, assumptions, rates, facts of the manifest."""
 
 import html
 import json
@@ -69,6 +69,55 @@ def constants_table(run: RunRecord) -> str:
     if not rows:
         return '<p class="caption">The run directory names no constants.</p>'
     return table(head, rows)
+
+
+def assumptions_table(run: RunRecord) -> str:
+    """Each assumption of the theory with its status and how that is known; empty without any."""
+    rows = [
+        (
+            f"<code>{escaped(row.label)}</code>",
+            escaped(row.statement),
+            status_mark(row.status),
+            escaped(row.why),
+        )
+        for row in run.assumptions
+    ]
+    return table(("assumption", "what it says", "status", "how it is known"), rows) if rows else ""
+
+
+def rates_table(run: RunRecord) -> str:
+    """The terms of the certified rate of separation, beside the one-sided rate: the largest term is
+    the one to improve."""
+    constants = {row.name: row for row in run.constants}
+    needed = ("omega", "M", "alpha_f", "beta_f", "L", "growth_rate")
+    if not all(isinstance(getattr(constants.get(n), "value", None), int | float) for n in needed):
+        return ""
+    omega, M, alpha_f, beta_f, L, growth = (float(constants[name].value) for name in needed)
+    state, response = M * alpha_f, M * beta_f * L
+    largest = "the largest term"
+    rows = [
+        ("growth of the semigroup", "ω", omega, ""),
+        ("f in the state", "M α_f", state, largest if state >= response else ""),
+        ("f in the response", "M β_f L", response, largest if response > state else ""),
+        ("all together", "ω + M L̃", growth, _sense(growth)),
+    ]
+    sharp = constants.get("sharp_decay_rate")
+    if sharp is not None:
+        mu = -float(sharp.value)
+        rows.append(("with signs", "μ", mu, _sense(mu)))
+        rows.append(("lost to absolute values", "ω + M L̃ − μ", growth - mu, ""))
+    unit = constants["growth_rate"].unit
+    cells = [
+        tuple(map(escaped, (words, symbol, quantity(rate, unit), remark)))
+        for words, symbol, rate, remark in rows
+    ]
+    return table(("part of the rate", "symbol", "value", "remark"), cells)
+
+
+def _sense(rate: float) -> str:
+    if rate == 0:
+        return "their distance stays bounded"
+    return "trajectories approach" if rate < 0 else "trajectories may separate"
 
 
 def facts_table(run: RunRecord) -> str:
