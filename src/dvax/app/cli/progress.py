@@ -1,8 +1,8 @@
 """The progress of a run: a bar with the time left on a terminal, lines in a pipe.
 
-The driver sends events, dicts with `event` one of compiling, compiled, progress, stage, warning,
-stopped. A model that is solved in one piece has stages in the place of progress.
-Compile time is shown apart: it occurs once, and does not predict the time of the rest.
+The driver sends events, dicts with `event` one of compiled, progress, stage, warning, stopped. A model
+that is solved in one piece has stages in the place of progress. Compile time is shown apart: it occurs
+once, and does not predict the time of the rest.
 """
 
 import time
@@ -91,23 +91,17 @@ def _bar() -> Iterator[Listener]:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console(stderr=True)) as bar:
-        task = bar.add_task("starting", total=None, where="")
-        staged = False
+        task = bar.add_task("compiling", total=None, where="")
 
         def listen(event: Event) -> None:
-            nonlocal staged
             kind = event["event"]
             if kind == "warning":
                 bar.console.print(f"warning: {event['message']}", markup=False, style="yellow")
-            elif kind == "compiling" and not staged:
-                bar.update(task, description="compiling")
             elif kind == "compiled":
                 seconds = event["compile_seconds"]
                 bar.console.print(f"compiled in {seconds:.1f} s", markup=False)
                 bar.reset(task, description="solving", where="")
             elif kind == "stage":
-                # Compiling is a part of the first stage, whose name is more informative.
-                staged = True
                 bar.update(task, description=event["stage"])
             elif kind == "progress":
                 where = f"t = {event['t']:.4g}{_unit(event)}, {event['steps']} steps"

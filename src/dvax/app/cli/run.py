@@ -1,7 +1,9 @@
 """`dvax run CONFIG.toml -o DIR`: from a configuration to a certified solution on disk."""
 
 import math
+from contextlib import suppress
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -11,7 +13,6 @@ from dvax.app.cli.console import print_line, print_problems, print_remark, print
 from dvax.app.cli.failure import BAD_INPUT, reported
 from dvax.app.cli.load import load
 from dvax.app.cli.options import AllowOutside, ConfigFile, Debug, Force, Quiet
-from dvax.app.cli.preload import preload_when_compiling
 from dvax.app.cli.progress import progress
 from dvax.errors import InputError
 
@@ -53,9 +54,10 @@ def carry_out(config: "Config | ModelConfig", out: Path, *, force: bool, quiet: 
     interruptible(_import)
     from dvax.app.runs import driver
 
+    if config.output.report:
+        # Plotly and Matplotlib take two seconds to import: beside the solve they cost nothing.
+        Thread(target=_import_plots, name="dvax import", daemon=True).start()
     with progress(quiet=quiet) as listener:
-        if config.output.report:
-            listener = preload_when_compiling("dvax.app.plots", listener)
         outcome = driver.run(config, out, overwrite=force, on_event=listener)
     if not quiet:
         _print_figures(outcome.summary)
@@ -77,6 +79,11 @@ def carry_out(config: "Config | ModelConfig", out: Path, *, force: bool, quiet: 
 
 def _import() -> None:
     import dvax.app.runs.driver  # noqa: F401
+
+
+def _import_plots() -> None:
+    with suppress(Exception):  # an import that fails is reported where the report is made
+        import dvax.app.plots  # noqa: F401
 
 
 def _report(outcome: "RunOutcome", png: bool, quiet: bool) -> None:

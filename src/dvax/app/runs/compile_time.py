@@ -1,24 +1,15 @@
-"""The time that JAX compiles, measured by its monitoring events."""
+"""The time that JAX compiles."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 from dvax._jax.compile_clock import listen
 
-# Lowering the time loop takes 0.2 s, a single operation 0.01 s.
-_LONG_LOWERING = 0.05
-_spent = 0.0
-_listening = False
-_announce: Callable[[], None] | None = None
+_seconds = [0.0]
 
 
 def compile_seconds() -> float:
-    """Seconds spent on compilation since the first call of this function."""
-    global _listening
-    if not _listening:
-        listen(_add)
-        _listening = True
-    return _spent
+    """Seconds spent on tracing, lowering and compilation since this module was imported."""
+    return _seconds[0]
 
 
 def compile_stopwatch() -> Callable[[], float]:
@@ -27,25 +18,8 @@ def compile_stopwatch() -> Callable[[], float]:
     return lambda: compile_seconds() - before
 
 
-@contextmanager
-def call_when_compiling(announce: Callable[[], None]) -> Iterator[None]:
-    """Call `announce` once, when the first large program has been lowered and goes to the compiler.
-
-    The compiler releases the interpreter lock and uses one core, so other work is free from then on;
-    while JAX traces, in Python, it is not.
-    """
-    global _announce
-    compile_seconds()
-    _announce = announce
-    try:
-        yield
-    finally:
-        _announce = None
-
-
 def _add(stage: str, seconds: float) -> None:
-    global _spent, _announce
-    _spent += seconds
-    if stage == "lower" and seconds > _LONG_LOWERING and _announce is not None:
-        call, _announce = _announce, None
-        call()
+    _seconds[0] += seconds
+
+
+listen(_add)

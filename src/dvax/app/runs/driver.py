@@ -20,7 +20,7 @@ def run(
 ) -> RunOutcome:
     """Solve what `config` describes and leave a run directory at `out`.
 
-    `on_event` is called with dicts whose "event" is compiling, compiled, progress, warning or
+    `on_event` is called with dicts whose "event" is compiled, progress, warning or
     stopped; of an application also stage.
 
     **Raises:** `dvax.InputError`, with nothing written, where `out` cannot be written or where data

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dvax.app.runs.compile_time import call_when_compiling, compile_stopwatch
+from dvax.app.runs.compile_time import compile_stopwatch
 from dvax.app.runs.data_file import DataFile
 from dvax.app.runs.figure import Figure
 from dvax.app.runs.interrupt import exit_code, writing
@@ -100,7 +100,7 @@ class AbstractRun(abc.ABC):
         self.begin()
         status, code, reason = "finished", 0, "The run reached its end."
         try:
-            with call_when_compiling(lambda: self.event("compiling")), self.wording.in_keys():
+            with self.wording.in_keys():
                 self.solve()
         except KeyboardInterrupt as stop:
             status, code = "interrupted", exit_code(stop)
