@@ -139,15 +139,15 @@ def test_a_file_without_the_boundary_names_those_that_are_there(block, tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("kind", "width", "mend"),
+    ("kind", "width", "fix"),
     [("tetra", 4, "cross-section"), ("triangle6", 6, "order 1"), ("quad8", 8, "order 1")],
 )
-def test_elements_of_another_kind(tmp_path, kind, width, mend):
+def test_elements_of_another_kind(tmp_path, kind, width, fix):
     rng = np.random.default_rng(0)
     path = tmp_path / "other.vtu"
     meshio.Mesh(rng.normal(size=(width, 3)), [(kind, np.arange(width)[None])]).write(path)
     said = refusal(path)
-    assert f"cells of type {kind}" in said and mend in said
+    assert f"cells of type {kind}" in said and fix in said
 
 
 def test_two_kinds_or_none(block, tmp_path):

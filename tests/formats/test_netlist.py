@@ -1,4 +1,4 @@
-"""Netlists: what is read, and what is refused with its line, the rule and the mend."""
+"""Netlists: what is read, and what is refused with its line, the rule and the fix."""
 
 import numpy as np
 import pytest

@@ -125,7 +125,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("file", "line", "text", "place", "says"), BAD)
-def test_what_is_wrong_is_told_with_file_line_and_mend(tmp_path, file, line, text, place, says):
+def test_what_is_wrong_is_told_with_file_line_and_fix(tmp_path, file, line, text, place, says):
     with pytest.raises(dvax.InputError) as caught:
         read_rts(write(tmp_path, [(file, line, text)]))
     told = [str(problem) for problem in caught.value.problems]

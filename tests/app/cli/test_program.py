@@ -64,7 +64,7 @@ def test_wrong_usage_is_bad_input(arguments: list[str]) -> None:
     assert "Traceback" not in result.output
 
 
-def test_without_the_application_s_packages_the_mend_is_said() -> None:
+def test_without_the_application_s_packages_the_fix_is_said() -> None:
     code = "import sys; sys.modules['typer'] = None\nfrom dvax.app.cli import main\nmain()\n"
     done = python(code)
     assert done.returncode == 1

@@ -1,4 +1,4 @@
-"""Bad input: exit code 2, every problem with its place, rule and mend; nothing is written."""
+"""Bad input: exit code 2, every problem with its place, rule and fix; nothing is written."""
 
 from pathlib import Path
 
