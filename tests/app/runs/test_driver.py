@@ -121,15 +121,15 @@ def test_the_recorded_earthquake_drives_the_strip(tmp_path: Path):
     assert 0 < summary["error_bound_x"]["value"] < 1e-2
 
 
-def test_a_run_says_when_the_compiler_works_and_when_it_is_done(tmp_path: Path):
+def test_a_run_reports_compilation_before_progress(tmp_path: Path):
     config = tmp_path / "strip.toml"
     # A size of its own: what another test has compiled is not compiled again.
     text = STRIP.format(load='value = "0.3 um/s"', end=1.0, solver='dt = "0.05 s"')
     config.write_text(text.replace("points = 60", "points = 37"))
     heard: list[str] = []
     run(load_config(config), tmp_path / "out", on_event=lambda event: heard.append(event["event"]))
-    assert heard[:2] == ["compiling", "compiled"]
-    assert heard.count("compiling") == 1 and heard[-1] == "stopped"
+    assert heard[:2] == ["compiled", "progress"]
+    assert heard.count("compiled") == 1 and heard[-1] == "stopped"
 
 
 @pytest.mark.thorough

@@ -79,7 +79,8 @@ class Panel:
         values = np.concatenate([curve.y for curve in self.curves])
         values = values[np.isfinite(values)]
         decades = float(np.ptp(np.log10(values))) if values.size else 0.0
-        return dict(**_LOGARITHMIC, dtick=max(1, math.ceil(decades / 8)))
+        # Within one decade Plotly chooses the ticks.
+        return dict(**_LOGARITHMIC, dtick=math.ceil(decades / 8) if decades > 1.0 else None)
 
 
 def bound_panel(x: np.ndarray, bound: Variable, unit: str, colour: int = 1, **more: Any) -> Panel:
