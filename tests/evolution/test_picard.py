@@ -132,7 +132,7 @@ def test_a_window_that_does_not_converge_is_shortened_or_said():
     run = lambda **how: dvax.solve(  # noqa: E731
         problem, 1.0, 0.0, 1.0, method=dvax.Picard(max_sweeps=12), throw=False, **how
     )
-    assert run(dt=1 / 64).result == dvax.RESULTS.picard_unsettled
+    assert run(dt=1 / 64).result == dvax.RESULTS.picard_unconverged
     adapted = run(rtol=1e-3)
     assert adapted.result == dvax.RESULTS.successful and int(adapted.stats["rejected"]) > 0
     assert float(adapted.xs[0]) == pytest.approx(0.0, abs=1e-5)

@@ -165,9 +165,9 @@ def _sizes(problem: Problem, t0: jax.Array, x0: Tree, args: Any) -> tuple[jax.Ar
 
 def _bounds(solution: Solution, known: _Growth, t0: float) -> Any:
     """The bound at every saved time."""
-    assert solution.defect is not None and solution.settled is not None
-    impulse = (solution.defect, solution.law_defect), solution.settled
-    return _least(t0, solution.ts, impulse, known)[0]
+    assert solution.defect is not None and solution.completed_defect is not None
+    integrated = (solution.defect, solution.law_defect), solution.completed_defect
+    return _least(t0, solution.ts, integrated, known)[0]
 
 
 def _rounding(solution: Solution, known: _Growth, rate: float, t0: float, t1: float) -> float:
@@ -184,19 +184,19 @@ def _rounding(solution: Solution, known: _Growth, rate: float, t0: float, t1: fl
 
 def _all_along(solution: Solution, known: _Growth, t0: float) -> Any:
     """The bound at all times since the saved time before."""
-    assert solution.defect is not None and solution.settled is not None
-    impulse = (solution.defect, solution.law_defect), solution.settled
-    return _least(t0, solution.ts, impulse, known)[1]
+    assert solution.defect is not None and solution.completed_defect is not None
+    integrated = (solution.defect, solution.law_defect), solution.completed_defect
+    return _least(t0, solution.ts, integrated, known)[1]
 
 
 @jax.jit
-def _least(t0: Any, ts: Any, impulse: tuple, known: _Growth) -> tuple[jax.Array, jax.Array]:
+def _least(t0: Any, ts: Any, integrated: tuple, known: _Growth) -> tuple[jax.Array, jax.Array]:
     """At the saved times, and at all times before each of them since the last."""
-    acted, settled = (disturbance(known, *parts) for parts in impulse)
+    acted, completed = (disturbance(known, *parts) for parts in integrated)
     at, on_the_way = [], []
     for M, rate in known.rates:
-        at.append(gronwall(t0, ts, acted, settled, rate, M, 0.0))
-        on_the_way.append(between(t0, ts, acted, settled, rate, M, 0.0, at[-1]))
+        at.append(gronwall(t0, ts, acted, completed, rate, M, 0.0))
+        on_the_way.append(between(t0, ts, acted, completed, rate, M, 0.0, at[-1]))
     return jnp.min(jnp.stack(at), axis=0), jnp.min(jnp.stack(on_the_way), axis=0)
 
 

@@ -20,7 +20,7 @@ from .extent import Extent
 from .flow import Flow, Rate
 from .method import AbstractMethod, extrapolation, polynomial
 
-_DOUBT = 4.0
+_SAFETY = 4.0
 """By how many times its interpolation error z is taken to be uncertain between the samples."""
 
 _MARGIN = 1.25
@@ -102,13 +102,13 @@ def sampled(
     zs = [one.rate.z for one in along]
     weights = extrapolation((0.0, *thetas, 1.0))
     doubt = jtu.tree_map(
-        lambda *z: _DOUBT * sum(w * v for w, v in zip(weights, z, strict=True)), *zs
+        lambda *z: _SAFETY * sum(w * v for w, v in zip(weights, z, strict=True)), *zs
     )
     unseen = _unseen(flow, along[1:], doubt)
     ends = _tree.scale(0.5, start), _tree.scale(0.5, end)
     bump = _largest(bumps)
-    if method.hidden > 0.0:
-        share = jnp.where(_kinked(flow, lax.stop_gradient(along)), method.hidden, 0.0)
+    if method.masked_share > 0.0:
+        share = jnp.where(_kinked(flow, lax.stop_gradient(along)), method.masked_share, 0.0)
         bump = jtu.tree_map(lambda b, bend: b + share * jnp.abs(bend), bump, c[-1])
     error = jtu.tree_map(lambda *parts: sum(map(jnp.abs, parts)), *ends, bump, unseen)
     space = flow.state_space(x0)
@@ -138,10 +138,10 @@ def _kinked(flow: Flow, evaluations: list[Evaluation]) -> Any:
 def _unseen(flow: Flow, evaluations: list[Evaluation], doubt: Tree) -> Tree:
     """The most that is hidden at any of them; where projections are iterated, from one place of
     the program, as in `evaluations`."""
-    hidden = lambda v: flow.hidden(v.t, v.x, v.rate, doubt)  # noqa: E731
+    masked = lambda v: flow.masked_error(v.t, v.x, v.rate, doubt)  # noqa: E731
     if flow.direct:
-        return _largest([hidden(one) for one in evaluations])
-    stacked = lax.map(hidden, jtu.tree_map(lambda *leaves: jnp.stack(leaves), *evaluations))
+        return _largest([masked(one) for one in evaluations])
+    stacked = lax.map(masked, jtu.tree_map(lambda *leaves: jnp.stack(leaves), *evaluations))
     return jtu.tree_map(lambda leaf: jnp.max(leaf, axis=0), stacked)
 
 

@@ -168,7 +168,7 @@ class Flow(eqx.Module):
             [jnp.zeros(0, jnp.result_type(*jtu.tree_leaves(z))), *map(jnp.ravel, found)]
         )
 
-    def hidden(self, t: Any, x: Tree, rate: Rate, error: Tree) -> Tree:
+    def masked_error(self, t: Any, x: Tree, rate: Rate, error: Tree) -> Tree:
         """How far f̃ may be off, entry by entry, because z may be off by ± `error`.
 
         While u sits on the boundary of K, f̃ does not feel z at all, and an error estimate built from

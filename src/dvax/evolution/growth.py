@@ -15,11 +15,11 @@ def disturbance(constants: Any, defect: Any, law_defect: Any) -> Any:
 
 
 def gronwall(
-    t0: Any, ts: Any, impulse: Any, settled: Any, rate: Any, M: Any, initial: Any
+    t0: Any, ts: Any, integrated: Any, completed: Any, rate: Any, M: Any, initial: Any
 ) -> jax.Array:
     """M e^{ct} e₀ + M ∫ e^{c(t−s)} dI(s), from the impulse I known at the saved times only.
 
-    `settled` is what the steps that had ended by then brought, `impulse` has the one under way as well.
+    `completed` is what the steps that had ended by then brought, `integrated` has the one under way as well.
     An ended step acted at any moment since the saved time before it began, so it is charged e^{c₊Δ}
     over the time from there to its end; the step under way is charged in the same way, and for that
     one saved time alone: nothing says how much of it had acted.
@@ -47,20 +47,20 @@ def gronwall(
         return carry, jnp.where(lost, jnp.inf, after)
 
     rate, M = jnp.asarray(rate, ts.dtype), jnp.asarray(M, ts.dtype)
-    impulse, settled = (jnp.asarray(v, ts.dtype) for v in (impulse, settled))
+    integrated, completed = (jnp.asarray(v, ts.dtype) for v in (integrated, completed))
     begin = jnp.asarray(t0, ts.dtype)
     zero = jnp.zeros((), ts.dtype)
     start = (begin, begin, zero, jnp.asarray(M * initial, ts.dtype), begin)
-    return lax.scan(advance, start, (ts, impulse, settled))[1]
+    return lax.scan(advance, start, (ts, integrated, completed))[1]
 
 
 def between(
-    t0: Any, ts: Any, impulse: Any, settled: Any, rate: Any, M: Any, initial: Any, bounds: Any
+    t0: Any, ts: Any, integrated: Any, completed: Any, rate: Any, M: Any, initial: Any, bounds: Any
 ) -> jax.Array:
     """The most that `bounds`, which `gronwall` gave at the saved times, may be at any time between
     the saved time before and this one: e^{c₊Δ} (the bound there + M ∫ dI over the time between)."""
     first = lambda value, rest: jnp.concatenate([jnp.asarray(value, ts.dtype)[None], rest[:-1]])  # noqa: E731
     grown = jnp.exp(jnp.maximum(rate, 0.0) * (ts - first(t0, ts)))
-    most = grown * (first(M * initial, bounds) + M * (impulse - first(0.0, settled)))
+    most = grown * (first(M * initial, bounds) + M * (integrated - first(0.0, completed)))
     # The saved time itself belongs to it.
     return jnp.where(jnp.isnan(most), jnp.inf, jnp.maximum(most, bounds))

@@ -61,7 +61,7 @@ class MatrixLinear(AbstractLinear):
         return back(self.J @ flat)
 
 
-class Nothing(AbstractLinear):
+class NoJacobian(AbstractLinear):
     """J = −A: nothing is left to the propagator, and f̃ has Ax in it."""
 
     A: AbstractGenerator

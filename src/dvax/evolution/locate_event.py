@@ -76,12 +76,12 @@ def _false_position(
         slow = jnp.where(b - a > 0.5 * width, slow + 1, 0)
         return a, va, b, vb, side, slow, count + 1
 
-    def unsettled(s: tuple) -> Any:
+    def is_too_wide(s: tuple) -> Any:
         a, _, b, *_, count = s
         return (b - a > BRACKET) & (count < _MAX_ITERATIONS)
 
     nothing = jnp.asarray(0)
-    return lax.while_loop(unsettled, narrow, (a, va, b, vb, nothing, nothing, nothing))[2]
+    return lax.while_loop(is_too_wide, narrow, (a, va, b, vb, nothing, nothing, nothing))[2]
 
 
 def _reduce(join: Callable, reduction: Callable, v: jax.Array) -> jax.Array:

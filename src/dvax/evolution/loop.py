@@ -43,7 +43,7 @@ class State(NamedTuple):
 
     t: Any
     x: Tree
-    impulse: tuple[Any, Any]
+    integrated_defect: tuple[Any, Any]
     solver_state: SolverState
     propagators: Propagators | None
     control: Any
@@ -116,7 +116,7 @@ class Loop(eqx.Module):
         return State(
             t=t0,
             x=x0,
-            impulse=(zero, zero),
+            integrated_defect=(zero, zero),
             solver_state=stepper.begin(x0),
             propagators=None if own else stepper.propagators(self._end(control) - self._held(t0)),
             control=control,
@@ -229,7 +229,7 @@ class Loop(eqx.Module):
             solver_state = solver_state._replace(coefficients=None)
         step = self.stepper.step(t0, t1, x0, solver_state, propagators, state.jumped)
         decision = self.controller.decide(begin, end, x0, step, state.control)
-        impulse = jtu.tree_map(jnp.add, state.impulse, step.impulse)
+        integrated_defect = jtu.tree_map(jnp.add, state.integrated_defect, step.integrated_defect)
         taken = Record(t0, t1 - t0, x0, step.c)
         # `last` and `records` of a step that is not kept are written over by the next one, or never
         # looked at: nothing ends inside a step that was not kept.
@@ -237,10 +237,17 @@ class Loop(eqx.Module):
         if extent is not None:
             assert step.extent is not None
             extent = extent.joined(step.extent)
-        ahead = (end, step.x1, impulse, step.solver_state, decision.jumped, extent)
-        last = None if state.last is None else (taken, state.impulse)
+        ahead = (end, step.x1, integrated_defect, step.solver_state, decision.jumped, extent)
+        last = None if state.last is None else (taken, state.integrated_defect)
         if self.check_finite:
-            behind = (begin, state.x, state.impulse, state.solver_state, state.jumped, state.extent)
+            behind = (
+                begin,
+                state.x,
+                state.integrated_defect,
+                state.solver_state,
+                state.jumped,
+                state.extent,
+            )
             ahead, last = _tree.where(decision.accepted, (ahead, last), (behind, state.last))
         checkpoints = state.checkpoints
         if checkpoints is not None:
@@ -249,12 +256,12 @@ class Loop(eqx.Module):
         if self.progress:
             stops = self.controller.stops
             shown = meter.advance(shown, (ahead[0] - stops[0]) / (stops[-1] - stops[0]))
-        t, x, impulse, solver_state, jumped, extent = ahead
+        t, x, integrated_defect, solver_state, jumped, extent = ahead
         put = lambda table, row: _tree.put_if(own, table, state.steps, row)  # noqa: E731
         after = State(
             t=t,
             x=x,
-            impulse=impulse,
+            integrated_defect=integrated_defect,
             solver_state=solver_state,
             propagators=None if state.propagators is None else propagators,
             control=decision.state,
@@ -303,8 +310,8 @@ class Loop(eqx.Module):
         row = self._row(state, time, x, reached, met)
         # Inside a step the bound of the whole step is charged: it can only be too large.
         return row._replace(
-            impulse=_tree.where(theta > 0.0, state.impulse, before),
-            settled=_tree.where(time >= state.t, state.impulse, before),
+            integrated_defect=_tree.where(theta > 0.0, state.integrated_defect, before),
+            completed_defect=_tree.where(time >= state.t, state.integrated_defect, before),
         )
 
     def _row(self, state: State, time: Any, x: Tree, reached: Any, met: Any) -> Saved:
@@ -315,8 +322,10 @@ class Loop(eqx.Module):
         end = jnp.where(state.steps == 0, state.t, self._held(state.t))
         time = time + zero_with_tangent(jnp.where(met, end, 0.0))
         t = jnp.where(reached, time, jnp.inf)
-        impulse = state.impulse if self.stepper.measure else None
-        return Saved(t, x, impulse, impulse, state.extent, state.solver_state.guess)
+        integrated_defect = state.integrated_defect if self.stepper.measure else None
+        return Saved(
+            t, x, integrated_defect, integrated_defect, state.extent, state.solver_state.guess
+        )
 
     def _held(self, t: Any) -> Any:
         """t, which stands still for the tangents of steps that adapt."""

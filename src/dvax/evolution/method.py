@@ -28,7 +28,7 @@ class AbstractMethod(eqx.Module):
     q + 1 where f̃ is smooth along the solution.
 
     `samples` are the points inside a step where the defect is looked at, apart from those where p was
-    made to agree with f̃. `hidden` is the share of |c_q| that a kink inside the step may hide from
+    made to agree with f̃. `masked_share` is the share of |c_q| that a kink inside the step may hide from
     them; then the integral of the defect over a step with one kink or one jump of f̃ inside is at most
     `safety` times what they show. `has_half_stage` says that some stage lies half a step away. Where
     `is_rosenbrock`, the method has A + J in the place of A and f̃ − Jx in that of f̃, with
@@ -38,7 +38,7 @@ class AbstractMethod(eqx.Module):
     order: eqx.AbstractClassVar[int]
     degree: eqx.AbstractClassVar[int]
     samples: eqx.AbstractClassVar[tuple[float, ...]]
-    hidden: eqx.AbstractClassVar[float]
+    masked_share: eqx.AbstractClassVar[float]
     safety: eqx.AbstractClassVar[float]
     has_half_stage: eqx.AbstractClassVar[bool]
     is_rosenbrock: eqx.AbstractClassVar[bool]
@@ -90,7 +90,7 @@ class ETD1(AbstractMethod):
     order: ClassVar[int] = 1
     degree: ClassVar[int] = 0
     samples: ClassVar[tuple[float, ...]] = ONE_SAMPLE
-    hidden: ClassVar[float] = 0.0
+    masked_share: ClassVar[float] = 0.0
     safety: ClassVar[float] = 1.0
     has_half_stage: ClassVar[bool] = False
     is_rosenbrock: ClassVar[bool] = False
@@ -121,7 +121,7 @@ class ETD2RK(AbstractMethod):
     order: ClassVar[int] = 2
     degree: ClassVar[int] = 1
     samples: ClassVar[tuple[float, ...]] = ONE_SAMPLE
-    hidden: ClassVar[float] = 0.0
+    masked_share: ClassVar[float] = 0.0
     safety: ClassVar[float] = 1.12
     has_half_stage: ClassVar[bool] = False
     is_rosenbrock: ClassVar[bool] = False
@@ -157,7 +157,7 @@ class ETD4RK(AbstractMethod):
     order: ClassVar[int] = 4
     degree: ClassVar[int] = 2
     samples: ClassVar[tuple[float, ...]] = TWO_SAMPLES
-    hidden: ClassVar[float] = 0.0
+    masked_share: ClassVar[float] = 0.0
     safety: ClassVar[float] = 1.0
     has_half_stage: ClassVar[bool] = True
     is_rosenbrock: ClassVar[bool] = False
@@ -207,7 +207,7 @@ class ExpRosenbrock(AbstractMethod):
     samples: ClassVar[tuple[float, ...]] = ONE_SAMPLE
     # For f̃ = (θ − k)₊ with k = 0.31 the parabola meets f̃ at the sample. With this the mean of the
     # defect is covered for every k.
-    hidden: ClassVar[float] = 0.134
+    masked_share: ClassVar[float] = 0.134
     safety: ClassVar[float] = 1.67
     has_half_stage: ClassVar[bool] = False
     is_rosenbrock: ClassVar[bool] = True

@@ -26,8 +26,8 @@ class Record(NamedTuple):
 class Saved(NamedTuple):
     """The state at a saved time, and what has disturbed it.
 
-    `impulse` = (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) up to the end of the step that the time lies in, so
-    that x_h is the exact solution of the system with a disturbance of that size; `settled` is what
+    `integrated_defect` = (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) up to the end of the step that the time lies in, so
+    that x_h is the exact solution of the system with a disturbance of that size; `completed_defect` is what
     both were at the start of that step: what has surely acted by then. `extent` says where x_h and u_h
     have been from the beginning to the end of that step, where it was asked for. None where nothing
     is measured. `guess` is where the solver of the law may begin.
@@ -35,8 +35,8 @@ class Saved(NamedTuple):
 
     t: Any
     x: Tree
-    impulse: tuple[Any, Any] | None = None
-    settled: tuple[Any, Any] | None = None
+    integrated_defect: tuple[Any, Any] | None = None
+    completed_defect: tuple[Any, Any] | None = None
     extent: Extent | None = None
     guess: Tree | None = None
 
@@ -59,8 +59,10 @@ def ended(result: RESULTS, complete: Any) -> RESULTS:
 def end_alone(end: Any, complete: Any, t1: Any, measured: bool) -> Saved:
     """Return the last state of a run as its one saved time, ∞ where the run is not `complete`."""
     x = jtu.tree_map(lambda leaf: jnp.where(complete, leaf, jnp.nan), end.x)
-    impulse = end.impulse if measured else None
-    one = Saved(jnp.where(complete, t1, jnp.inf), x, impulse, impulse, end.extent)
+    integrated_defect = end.integrated_defect if measured else None
+    one = Saved(
+        jnp.where(complete, t1, jnp.inf), x, integrated_defect, integrated_defect, end.extent
+    )
     return jtu.tree_map(lambda leaf: leaf[None], one)
 
 

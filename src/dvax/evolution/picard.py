@@ -92,16 +92,16 @@ class Picard(eqx.Module):
 
 class Window(NamedTuple):
     """The steps of a window from a to b as one record, the states `after` each, the state at b, the
-    defect of each step, the extent of all, and how the sweeps went; `settled` says that the law was
+    defect of each step, the extent of all, and how the sweeps went; `converged` says that the law was
     solved everywhere and the sweeps converged."""
 
     record: Record
     after: Tree
     end: Tree
     error: Tree
-    impulse: tuple[jax.Array, jax.Array]
+    integrated_defect: tuple[jax.Array, jax.Array]
     extent: Extent | None
-    settled: jax.Array
+    converged: jax.Array
     sweeps: jax.Array
     contraction: jax.Array
 
@@ -115,7 +115,7 @@ class State(NamedTuple):
     stop: Any
     last: Record
     before: tuple[Any, Any]
-    impulse: tuple[Any, Any]
+    integrated_defect: tuple[Any, Any]
     extent: Extent | None
     records: Record | None
     steps: Any
@@ -194,22 +194,26 @@ class Run(eqx.Module):
             b = clip_to_stop(a, state.length, stop)
         window = self._window(a, b, state.x)
         ratio = self.size(window.error, window.record.x0, window.after)
-        kept = window.settled & _tree.all_finite(window.end)
+        kept = window.converged & _tree.all_finite(window.end)
         length = state.length
         stuck = ~kept
         if not self.fixed:
             kept = kept & (ratio <= 1.0)
             positive = jnp.where(ratio > 0.0, ratio, 1.0)
             factor = jnp.where(ratio > 0.0, jnp.sqrt(0.5 / positive), jnp.inf)
-            factor = jnp.where(window.settled, jnp.clip(factor, 0.1, 4.0), 0.25)
+            factor = jnp.where(window.converged, jnp.clip(factor, 0.1, 4.0), 0.25)
             # A window cut short by a knot says little about the length that was planned.
             length = lax.stop_gradient(factor * (b - a))
             length = jnp.where(kept & (factor > 1.0), jnp.maximum(length, state.length), length)
             floor = 8 * many * jnp.finfo(a.dtype).eps * jnp.maximum(jnp.abs(a), jnp.abs(b))
             stuck = ~kept & (b - a <= floor)
-        unsettled = RESULTS.where(window.settled, RESULTS.step_too_small, RESULTS.picard_unsettled)
-        unsettled = RESULTS.where(_tree.all_finite(window.end), unsettled, RESULTS.nonfinite)
-        impulse = jtu.tree_map(lambda v, w: v + jnp.sum(w), state.impulse, window.impulse)
+        unconverged = RESULTS.where(
+            window.converged, RESULTS.step_too_small, RESULTS.picard_unconverged
+        )
+        unconverged = RESULTS.where(_tree.all_finite(window.end), unconverged, RESULTS.nonfinite)
+        integrated_defect = jtu.tree_map(
+            lambda v, w: v + jnp.sum(w), state.integrated_defect, window.integrated_defect
+        )
         records = state.records
         if records is not None:
             place = state.steps + jnp.arange(many)
@@ -221,15 +225,15 @@ class Run(eqx.Module):
         if extent is not None:
             assert window.extent is not None
             extent = extent.joined(window.extent)
-        new = (b, window.end, window.record, state.impulse, impulse, extent)
-        old = (a, state.x, state.last, state.before, state.impulse, state.extent)
-        t, x, record, before, impulse, extent = _tree.where(kept, new, old)
+        new = (b, window.end, window.record, state.integrated_defect, integrated_defect, extent)
+        old = (a, state.x, state.last, state.before, state.integrated_defect, state.extent)
+        t, x, record, before, integrated_defect, extent = _tree.where(kept, new, old)
         return State(
-            t, x, length, jnp.minimum(reached, last), record, before, impulse, extent, records,
+            t, x, length, jnp.minimum(reached, last), record, before, integrated_defect, extent, records,
             jnp.where(kept, state.steps + many, state.steps), state.windows + 1,
             jnp.where(kept, state.refused, state.refused + many), state.sweeps + window.sweeps,
             jnp.maximum(state.contraction, jnp.where(kept, window.contraction, 0.0)),
-            RESULTS.where(stuck, unsettled, RESULTS.successful),
+            RESULTS.where(stuck, unconverged, RESULTS.successful),
         )  # fmt: skip
 
     def _window(self, a: Any, b: Any, x: Tree) -> Window:
@@ -282,17 +286,17 @@ class Run(eqx.Module):
 
         first = (jnp.asarray(1), X, before, moved, zero, yes)
         k, X, known, _, contraction, matters = lax.while_loop(goes_on, sweep, first)
-        settled = jnp.all(known.solved) & ~matters
+        converged = jnp.all(known.solved) & ~matters
         c = _pieces(known.value)
         start, end = _rows(X, slice(-1)), _rows(X, slice(1, None))
         ys = None if guess is None else _rows(known.y, slice(-1))
         sample, looked = jax.vmap(stepper.look)(ends[:-1], ends[1:], start, end, c, ys)
-        impulse = sample.defect, sample.law_defect
+        integrated_defect = sample.defect, sample.law_defect
         record = Record(ends[:-1], jnp.broadcast_to(h, (many,)), start, c)
         return Window(
-            record, end, _rows(X, -1), sample.error, impulse,
+            record, end, _rows(X, -1), sample.error, integrated_defect,
             sample.extent.over_rows() if stepper.track_bounds else None,
-            settled & jnp.all(looked), k, contraction,
+            converged & jnp.all(looked), k, contraction,
         )  # fmt: skip
 
     def _read(self, state: State, time: Any) -> Saved:
@@ -310,11 +314,13 @@ class Run(eqx.Module):
         )
         x = jtu.tree_map(lambda leaf: jnp.where(reached, leaf, jnp.nan), x)
         started = time > record.start[0]
-        impulse = _tree.where(started, state.impulse, state.before)
-        settled = _tree.where(time >= state.t, state.impulse, state.before)
+        integrated_defect = _tree.where(started, state.integrated_defect, state.before)
+        completed_defect = _tree.where(time >= state.t, state.integrated_defect, state.before)
         # The state at the end of a window moves with it.
         time = time + zero_with_tangent(jnp.where(met, state.t, 0.0))
-        return Saved(jnp.where(reached, time, jnp.inf), x, impulse, settled, state.extent)
+        return Saved(
+            jnp.where(reached, time, jnp.inf), x, integrated_defect, completed_defect, state.extent
+        )
 
 
 def by_windows(

@@ -13,7 +13,7 @@ from .chords import NoEnclosure, constant
 from .faces import faces
 from .flow import Flow, slope
 from .implicit import Implicit
-from .linearised import Nothing
+from .linearised import NoJacobian
 from .medians import Medians
 from .method import AbstractMethod
 from .setup import Setup, as_arrays
@@ -85,7 +85,7 @@ class Plan(NamedTuple):
             gamma=setup.moduli.get("gamma"),
             L_F=setup.moduli.get("L_F"),
             written=_small_box(setup) if self.small_box else None,
-            linear=Nothing(generator) if explicit else None,
+            linear=NoJacobian(generator) if explicit else None,
         )
 
 

@@ -12,7 +12,7 @@ class RESULTS(eqx.Enumeration):
         "The step became too small to move t, or to lower its error, while the defect stayed above "
         "the tolerance."
     )
-    picard_unsettled = (
+    picard_unconverged = (
         "Picard's sweeps did not converge on a window, however short, or the law was not solved there. "
         "Shorten dt, or take fewer nodes: dvax.Picard(nodes=16)."
     )

@@ -60,7 +60,7 @@ class DormandPrince(AbstractMethod):
     order: ClassVar[int] = 5
     degree: ClassVar[int] = 3
     samples: ClassVar[tuple[float, ...]] = _SAMPLES
-    hidden: ClassVar[float] = 0.0
+    masked_share: ClassVar[float] = 0.0
     safety: ClassVar[float] = 2.05
     has_half_stage: ClassVar[bool] = False
     is_rosenbrock: ClassVar[bool] = False

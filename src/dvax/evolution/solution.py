@@ -39,7 +39,7 @@ class Solution(eqx.Module):
       the exact solution of the system with a disturbance p − f̃ of that size. `law_defect` is the same
       integral of ‖w‖ over the frozen solves. Both None where not measured (fixed steps, unless
       `measure=True`). `dvax.bound_error` turns them into error bounds;
-    - `settled`: (defect, law_defect) at the start of the step that each saved time lies in;
+    - `completed_defect`: (defect, law_defect) at the start of the step that each saved time lies in;
     - `extent`: between what x_h and u_h stayed from t0 to the end of that step, where `constants=` of a
       region were given;
     - `enclosed`: whether the defect, and the extent, are enclosures over every step
@@ -75,7 +75,7 @@ class Solution(eqx.Module):
     law_error: jax.Array | None
     defect: jax.Array | None
     law_defect: jax.Array | None
-    settled: tuple[jax.Array, jax.Array] | None
+    completed_defect: tuple[jax.Array, jax.Array] | None
     extent: Extent | None
     stats: dict[str, Any]
     result: RESULTS

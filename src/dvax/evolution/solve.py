@@ -285,7 +285,7 @@ def _trim(solution: Solution) -> Solution:
         "law_error",
         "defect",
         "law_defect",
-        "settled",
+        "completed_defect",
         "extent",
     )
     new = [jax.tree_util.tree_map(cut, getattr(solution, name)) for name in fields]

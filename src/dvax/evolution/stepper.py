@@ -54,7 +54,7 @@ class Step(NamedTuple):
     """A step to x₁ with its stage polynomial c.
 
     - `error`: the defect entry by entry, None where it is not measured;
-    - `impulse` = (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) over the step;
+    - `integrated_defect` = (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) over the step;
     - `event(wanted)`: the time of the first kink of the response inside, ∞ where there is none or the
       time is not `wanted`; None where events are not located;
     - `excursion(rtol, atol, rate)`: exceeds 1 where data that moves in time may hide something between
@@ -68,7 +68,7 @@ class Step(NamedTuple):
     x1: Tree
     c: tuple[Tree, ...]
     error: Tree | None
-    impulse: tuple[Any, Any]
+    integrated_defect: tuple[Any, Any]
     event: Callable[[Any], Any] | None
     excursion: Callable[[Any, Any, Any], Any] | None
     extent: Extent | None
@@ -219,11 +219,11 @@ class Stepper(eqx.Module):
         arc, known = Arc(t1 - t0, start, x1, c), coefficients(x1)
         c, x1 = values((c, x1))
         first, last = evaluations[0].rate, evaluations[-1].rate
-        error, impulse, event, excursion, extent = None, (0.0, 0.0), None, None, None
+        error, integrated_defect, event, excursion, extent = None, (0.0, 0.0), None, None, None
         variation = solver_state.variation
         if self.measure:
             sample = self._measure(t0, t1, arc, evaluations, jumped)
-            error, impulse = sample.error, (sample.defect, sample.law_defect)
+            error, integrated_defect = sample.error, (sample.defect, sample.law_defect)
             extent = sample.extent if self.track_bounds else None
             if self.locate:
                 event = partial(self._event, t0, t1, x0, c, first, sample)
@@ -250,7 +250,7 @@ class Stepper(eqx.Module):
         counts = [one.rate.evaluations for one in evaluations]
         own = counts[0] if kept is None else jnp.where(jumped, counts[0], 0)
         return Step(
-            x1, c, error, impulse, event, excursion, extent, after, first.solved, solved, finite,
+            x1, c, error, integrated_defect, event, excursion, extent, after, first.solved, solved, finite,
             sum(counts[1:], own),
         )  # fmt: skip
 

@@ -101,14 +101,14 @@ def bound_error(
         measured = _again(problem, sol, constants)
         apart = jax.vmap(lambda a, b: space.norm(_tree.sub(a, b)))(measured.xs, sol.xs)
     assert measured.defect is not None and measured.law_defect is not None
-    assert measured.settled is not None
+    assert measured.completed_defect is not None
 
-    impulse = (measured.defect, measured.law_defect), measured.settled
+    integrated_defect = (measured.defect, measured.law_defect), measured.completed_defect
     law = sol.law_residual, sol.law_step
     start = _starts(initial_error, sol.ts.dtype)
     begin = sol.setup.setting["t0"]
     t0 = jnp.asarray(begin, sol.ts.dtype)
-    x, u, x_sharp, u_sharp = _bounds(constants, t0, sol.ts, impulse, apart, law, start)
+    x, u, x_sharp, u_sharp = _bounds(constants, t0, sol.ts, integrated_defect, apart, law, start)
     best_x = x if x_sharp is None else jnp.minimum(x, x_sharp)
     best_u = u if u_sharp is None else jnp.minimum(u, u_sharp)
     where: Status = "proved"
@@ -118,7 +118,7 @@ def bound_error(
         where = "proved" if covered else "declared"
         if regional:
             assert measured.extent is not None
-            passed = _on_the_way(constants, t0, sol.ts, impulse, start)
+            passed = _on_the_way(constants, t0, sol.ts, integrated_defect, start)
             law_error = constants.norm_P_inv * (law[0] / constants.gamma + law[1])
             of_u = constants.L * passed + law_error
             spaces = problem.spaces(sol.setup.x0)
@@ -136,13 +136,13 @@ def bound_error(
 
 @jax.jit
 def _bounds(
-    c: Constants, t0: Any, ts: Any, impulse: tuple, apart: Any, law: tuple, start: tuple
+    c: Constants, t0: Any, ts: Any, integrated_defect: tuple, apart: Any, law: tuple, start: tuple
 ) -> tuple:
     """x, u, x_sharp and u_sharp of `Bound`."""
-    acted, settled = (disturbance(c, *parts) for parts in impulse)
+    acted, completed_defect = (disturbance(c, *parts) for parts in integrated_defect)
     law_error = c.norm_P_inv * (law[0] / c.gamma + law[1])
     x, *each = (
-        gronwall(t0, ts, acted, settled, rate, M, initial) + apart
+        gronwall(t0, ts, acted, completed_defect, rate, M, initial) + apart
         for M, rate, initial in _rates(c, start)
     )
     u = c.L * x + law_error
@@ -160,13 +160,15 @@ def _rates(c: Constants, start: tuple) -> list[tuple[Any, Any, Any]]:
 
 
 @jax.jit
-def _on_the_way(c: Constants, t0: Any, ts: Any, impulse: tuple, start: tuple) -> jax.Array:
+def _on_the_way(
+    c: Constants, t0: Any, ts: Any, integrated_defect: tuple, start: tuple
+) -> jax.Array:
     """The bound on x at all times since the saved time before."""
-    acted, settled = (disturbance(c, *parts) for parts in impulse)
+    acted, completed_defect = (disturbance(c, *parts) for parts in integrated_defect)
     each = []
     for M, rate, initial in _rates(c, start):
-        at = gronwall(t0, ts, acted, settled, rate, M, initial)
-        each.append(between(t0, ts, acted, settled, rate, M, initial, at))
+        at = gronwall(t0, ts, acted, completed_defect, rate, M, initial)
+        each.append(between(t0, ts, acted, completed_defect, rate, M, initial, at))
     return jnp.min(jnp.stack(each), axis=0)
 
 

@@ -136,8 +136,8 @@ def test_pieces_join_to_a_solution_whose_bound_holds(count, settings):
     pieces = list(segments(plan))
     found = join_pieces(pieces)
     np.testing.assert_array_equal(found.ts, plan.times)
-    assert found.defect is not None and found.settled is not None
-    assert np.all(np.diff(found.defect) >= 0) and np.all(found.defect >= found.settled[0])
+    assert found.defect is not None and found.completed_defect is not None
+    assert np.all(np.diff(found.defect) >= 0) and np.all(found.defect >= found.completed_defect[0])
     bound = certificate(plan.problem, found, plan.constants)
     error = abs(float(found.xs[-1]) - 1.8360919559905713)
     assert error <= bound.values[-1] < 0.05

@@ -107,7 +107,7 @@ def _solution(
     if gamma is not None and norm_P_inv is not None:
         error = norm_P_inv * (residual / gamma + step)
     defects = np.reshape([r.defect for r in rows], (len(rows), 2))
-    settled = np.reshape([r.settled for r in rows], (len(rows), 2))
+    completed_defect = np.reshape([r.completed_defect for r in rows], (len(rows), 2))
     y = array(ys, u0.shape)
     return Solution(
         ts=array([r.t for r in rows], ()),
@@ -119,7 +119,7 @@ def _solution(
         law_error=error,
         defect=array(defects[:, 0], ()),
         law_defect=array(defects[:, 1], ()),
-        settled=(array(settled[:, 0], ()), array(settled[:, 1], ())),
+        completed_defect=(array(completed_defect[:, 0], ()), array(completed_defect[:, 1], ())),
         extent=_extent(rows, n, x0, u0, P) if limits.track_bounds and rows else None,
         stats={
             "steps": run.accepted, "rejected": run.rejected,

@@ -303,7 +303,7 @@ class Run:
         move to its end."""
         rings = tuple(ring[:3] for ring in found.rings)
         step, begin = Step(piece.start + begin, h, theta, found.x, found.ys, rings), begin + low
-        settled = self.defect, self.law_defect
+        completed_defect = self.defect, self.law_defect
         of_state, of_law = found.residuals
         n, part = len(self.x), step.length * step.used
         mean = radau.mean_residual(step.used)
@@ -333,7 +333,15 @@ class Run:
             q = self.piece.at((begin + thetas * step.length) / piece.length)[:, n:]
             w = y @ self.given.M.T + x @ self.given.C.T + q
             self.rows += [
-                Row(float(self.times[first + k]), x[k], y[k], w[k], done, settled, self.extent)
+                Row(
+                    float(self.times[first + k]),
+                    x[k],
+                    y[k],
+                    w[k],
+                    done,
+                    completed_defect,
+                    self.extent,
+                )
                 for k in range(len(offsets))
             ]
         if self.dense:

@@ -70,7 +70,7 @@ def join_pieces(pieces: list[Solution], count: int | None = None) -> Solution:
         fields[name] = _concatenate([getattr(piece, name) for piece in pieces])
     if pieces[0].defect is not None:
         defects: list[Any] = [(piece.defect, piece.law_defect) for piece in pieces]
-        starts: list[Any] = [piece.settled for piece in pieces]
+        starts: list[Any] = [piece.completed_defect for piece in pieces]
         # The integrals at the start of each piece.
         ends = [np.array([float(one[-1]), float(two[-1])]) for one, two in defects]
         before = np.cumsum([np.zeros(2), *ends[:-1]], axis=0)
@@ -83,7 +83,7 @@ def join_pieces(pieces: list[Solution], count: int | None = None) -> Solution:
             )
             for parts in (defects, starts)
         ]
-        (fields["defect"], fields["law_defect"]), fields["settled"] = sums
+        (fields["defect"], fields["law_defect"]), fields["completed_defect"] = sums
     last = pieces[-1].stats
     counts = {
         name: sum(int(p.stats[name]) for p in pieces)
