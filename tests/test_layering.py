@@ -15,12 +15,11 @@ SOURCE = Path(__file__).parents[1] / "src" / "dvax"
 
 FLOORS = {
     "errors": -2,
-    "_jaxpr": -2,
-    "_smooth_bounds": -2,
     "_tree": -1,
     "_batch": -1,
     "_failure": -1,
     "_jax": -1,
+    "programs": -0.5,
     "_user_code": 0,
     "_figure_text": -2,
     "spaces": 0,
@@ -32,7 +31,6 @@ FLOORS = {
     "formats": 1,
     "vi": 1,
     "_knots": 1.5,
-    "_switches": 1.5,
     "problem": 2,
     "evolution": 3,
     "theory": 4,

@@ -14,9 +14,16 @@ from ..generators import AbstractGenerator, AbstractPropagator, Dense, Diagonal,
 from ..generators.expanded import expanded
 from ..operators import AbstractOperator
 from ..problem import Problem
+from ..programs.enclosure import (
+    LinearEnclosure,
+    NoEnclosure,
+    enclose,
+    is_enclosure,
+    largest,
+    smallest,
+)
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, Frozen
-from .chords import Chord, NoEnclosure, enclose, is_chord, largest, smallest
 from .linearised import AbstractLinear, split
 from .written import AbstractWritten
 
@@ -46,8 +53,8 @@ class Flow(eqx.Module):
     F(y) = ay − h(t, x, 0), pointwise on a set of pointwise intervals, or with one number a on any set,
     and y = proj_K(h(t, x, 0)/a); or affine on a box of few unknowns, and `written` out.
     `reciprocal` is 1/a where a was proved not to depend on t and x, so that it is computed once.
-    `enclosed` says that f̃ can be enclosed over a whole step (`chords`), so that nothing about the
-    defect is guessed. `linear` is A + J where some J joins A in what is left to the propagator.
+    `enclosed` says that f̃ has a linear enclosure over a whole step, so that nothing about the defect
+    is guessed. `linear` is A + J where some J joins A in what is left to the propagator.
     """
 
     problem: Problem
@@ -139,13 +146,15 @@ class Flow(eqx.Module):
         solved = jnp.all((jnp.abs(found.w).ravel() <= most) & (apart <= most))
         return Rate(value, found.y, found.z, residual, solved, jnp.asarray(1))
 
-    def enclosure(self, t: Chord, x: Tree) -> tuple[Tree, Tree]:
-        """(f̃, u) along chords of t and x, as chords, for a direct law on pointwise intervals.
+    def enclosure(self, t: LinearEnclosure, x: Tree) -> tuple[Tree, Tree]:
+        """Return linear enclosures of f̃ and u, given those of t and x.
+
+        The law is direct, on pointwise intervals.
 
         **Raises:** `NoEnclosure` where f, h or K uses an operation without a rule.
         """
         problem, args, P = self.problem, self.args, self.operator
-        start = jtu.tree_map(lambda chord: chord.a, x, is_leaf=is_chord)
+        start = jtu.tree_map(lambda line: line.a, x, is_leaf=is_enclosure)
         zero = problem.zero_control(start)
         drive = enclose(lambda t, x: problem.h(t, x, zero, args), t, x)
         if self.reciprocal is None:
@@ -153,7 +162,7 @@ class Flow(eqx.Module):
         z = enclose(lambda d: jtu.tree_map(jnp.multiply, d, self.reciprocal), drive)
         ends = enclose(lambda t: problem.set_at(t, args).intervals(zero), t)
         y = jtu.tree_map(
-            lambda q, low, up: smallest(largest(q, low), up), z, *ends, is_leaf=is_chord
+            lambda q, low, up: smallest(largest(q, low), up), z, *ends, is_leaf=is_enclosure
         )
         u = enclose(P.inverse, y)
         return enclose(lambda t, x, u: problem.f(t, x, u, args), t, x, u), u

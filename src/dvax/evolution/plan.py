@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._tree import Tree
+from ..programs.enclosure import NoEnclosure, constant
 from ..vi import AbstractSolver, Auto, analyse, independent
 from . import written
-from .chords import NoEnclosure, constant
 from .faces import faces
 from .flow import Flow, slope
 from .implicit import Implicit
