@@ -51,6 +51,7 @@ FUNCTIONS = {
     "interpolation": lambda t: jnp.interp(t, jnp.arange(5.0), PROFILE[jnp.array([0, 1, 2, 1, 0])]),
     "steps of an array": lambda t: PROFILE[jnp.searchsorted(jnp.array([1.0, 2.2]), t)] * t,
     "cumulative": lambda t: jnp.cumsum(PROFILE * jnp.sin(t)),
+    "written into": lambda t: jax.lax.dynamic_update_slice(PROFILE * t, jnp.sin(t)[None], (1,)),
     "taken apart": lambda t: jnp.split(jnp.sin(PROFILE * t), [1])[1],
 }
 

@@ -263,6 +263,14 @@ def _scatter(eqn: Any, given: list[Any]) -> LinearEnclosure | None:
     return _map(lambda p, q: _on(eqn)(p, places, q), _lift(array), _lift(new))
 
 
+def _update(eqn: Any, given: list[Any]) -> LinearEnclosure | None:
+    """The same for a block of the array."""
+    array, new, *places = given
+    if any(map(is_enclosure, places)):
+        return None
+    return _map(lambda p, q: _on(eqn)(p, q, *places), _lift(array), _lift(new))
+
+
 def _convert(eqn: Any, given: list[Any]) -> LinearEnclosure:
     x, of = _lift(given[0]), _on(eqn)
     before, after = eqn.invars[0].aval, eqn.outvars[0].aval
@@ -535,6 +543,7 @@ _OF_ANY_TYPE: dict[str, Rule] = {
     **same_for(COMPARING, _compare),
     **same_for({"gather", "dynamic_slice"}, _take),
     **same_for({"scatter", "scatter-add"}, _scatter),
+    "dynamic_update_slice": _update,
     **same_for(LOGICAL, _discrete),
     "select_n": _select,
     "convert_element_type": _convert,
