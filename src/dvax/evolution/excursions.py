@@ -216,7 +216,7 @@ def _drive(flow: Flow, t: LinearEnclosure, x: Tree) -> Tree:
     dev = jtu.tree_map(lambda line: line.dev, drive, is_leaf=is_enclosure)
     if flow.reciprocal is not None:
         return jtu.tree_map(lambda d, r: jnp.abs(d * r), dev, flow.reciprocal)
-    if flow.direct and flow.written is None:
+    if flow.direct and flow.small_box is None:
         a = slope(problem, flow.operator, t.a, x, args)
         return jtu.tree_map(lambda d, s: jnp.abs(d / s), dev, a)
     return jtu.tree_map(jnp.abs, flow.operator.apply(dev))
