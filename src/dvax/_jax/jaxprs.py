@@ -57,7 +57,8 @@ def inner_program(eqn: Any) -> Any:
         return None
     for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
         inner = eqn.params.get(key)
-        if isinstance(inner, Jaxpr):
+        # From JAX 0.12 on the two types are one, and a program holds its constants.
+        if isinstance(inner, Jaxpr) and not isinstance(inner, ClosedJaxpr):
             inner = ClosedJaxpr(inner, ())
         if isinstance(inner, ClosedJaxpr) and len(inner.jaxpr.invars) == len(eqn.invars):
             return inner
