@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import _control_shape, _knots, _tree, _user_code
-from ._switches import switching_times
 from ._tree import Tree
 from .errors import InputError, InputProblem
 from .generators import AbstractGenerator
 from .operators import AbstractOperator
+from .programs.switching_times import switching_times
 from .sets import AbstractSet
 from .signals import listen
 from .spaces import AbstractSpace

@@ -8,8 +8,8 @@ from tests.selection import mostly_thorough
 from tests.vi import exact
 
 import dvax
+from dvax.programs.rounding import rounding_error
 from dvax.vi import RESULTS
-from dvax.vi.rounding import rounding_error
 
 TOL = 1e-10
 

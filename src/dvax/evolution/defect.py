@@ -12,8 +12,8 @@ from .. import _tree
 from .._tree import Tree
 from ..generators import Arc, Growth
 from ..generators.expanded import values
-from .branches import branches
-from .chords import Chord, is_chord
+from ..programs.branches import branches
+from ..programs.enclosure import LinearEnclosure, is_enclosure
 from .evaluations import Evaluation
 from .excursions import WATCH
 from .extent import Extent
@@ -46,8 +46,8 @@ class Sample(NamedTuple):
 def enclosed(
     flow: Flow, growth: Growth, ends: tuple[Any, Any], arc: Arc, last: Rate, span: Any
 ) -> Sample:
-    """|δ(θ)| ≤ (1−θ)(|δ(0)| + dev) + θ(|δ(1)| + dev) entry by entry, with dev from chord
-    arithmetic, since p is a line; so ∫‖δ‖ is at most the mean of the norms of the two brackets
+    """|δ(θ)| ≤ (1−θ)(|δ(0)| + dev) + θ(|δ(1)| + dev) entry by entry, with dev from a linear
+    enclosure, since p is a line; so ∫‖δ‖ is at most the mean of the norms of the two brackets
     (the norm of their mean would be too little: ends may lie in different entries). δ(0) is
     rounding, unless data jumps where nobody said it would. The step lies between the times `ends`.
 
@@ -59,21 +59,23 @@ def enclosed(
     short = h <= WATCH * span
     space = flow.state_space(x0)
     bend = flow.generator.bend(arc, space, growth)
-    x = jtu.tree_map(Chord, x0, x1, bend)
-    along, u = flow.enclosure(Chord(*ends, jnp.zeros_like(h)), x)
-    at_start = jtu.tree_map(lambda q, p: jnp.abs(q.a - p) + q.dev, along, c[0], is_leaf=is_chord)
+    x = jtu.tree_map(LinearEnclosure, x0, x1, bend)
+    along, u = flow.enclosure(LinearEnclosure(*ends, jnp.zeros_like(h)), x)
+    at_start = jtu.tree_map(
+        lambda q, p: jnp.abs(q.a - p) + q.dev, along, c[0], is_leaf=is_enclosure
+    )
     at_end = jtu.tree_map(
-        lambda q, p: jnp.abs(q.b - p) + q.dev, along, polynomial(c, 1.0), is_leaf=is_chord
+        lambda q, p: jnp.abs(q.b - p) + q.dev, along, polynomial(c, 1.0), is_leaf=is_enclosure
     )
     error = _tree.scale(0.5, _tree.add(at_start, at_end))
-    varies = jtu.tree_map(lambda q: jnp.abs(q.b - q.a), along, is_leaf=is_chord)
+    varies = jtu.tree_map(lambda q: jnp.abs(q.b - q.a), along, is_leaf=is_enclosure)
     # Not where f̃ grows without bound, as 1/t does.
     most = lambda tree: jnp.max(jnp.stack([jnp.max(jnp.abs(v)) for v in jtu.tree_leaves(tree)]))  # noqa: E731
     size = most((x0, x1))
     settles = short & jnp.isfinite(size) & (most(varies) * span <= _SETTLES * size)
     error = jtu.tree_map(lambda e, v: jnp.where(settles & (e == jnp.inf), v, e), error, varies)
     defect = 0.5 * h * (space.norm(at_start) + space.norm(at_end))
-    return Sample((), [last], error, defect, jnp.zeros_like(defect), Extent.of_chords(x, u))
+    return Sample((), [last], error, defect, jnp.zeros_like(defect), Extent.of_enclosures(x, u))
 
 
 def sampled(

@@ -1,6 +1,6 @@
 """Data that moves in time may do more between two samples of a step than the samples show.
 
-Two things are bounded by chord arithmetic in t, in the shape 4θ(1−θ) dev (`below_parabola`):
+Two things are bounded by linear enclosures in t, in the shape 4θ(1−θ) dev (`below_parabola`):
 
 *Excursions.* A switch function s of K (`AbstractSet.switches`) with one sign at two neighbouring
 samples may change it twice between them: a bound that dips, a pulse in h. It keeps its sign where
@@ -31,8 +31,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._tree import Tree
+from ..programs.enclosure import LinearEnclosure, NoEnclosure, below_parabola, enclose, is_enclosure
 from ..vi import independent
-from .chords import Chord, NoEnclosure, below_parabola, enclose, is_chord
 from .evaluations import Evaluation
 from .flow import Flow, slope
 
@@ -130,7 +130,7 @@ class ExcursionGuard(eqx.Module):
     def _pulses(self, flow: Flow, p: tuple, q: tuple) -> tuple[Tree, Tree]:
         """Return how far the data moves from one sample to the next, and how far it may be from the
         line between."""
-        t = Chord(p[0], q[0], jnp.zeros_like(p[0]))
+        t = LinearEnclosure(p[0], q[0], jnp.zeros_like(p[0]))
         # Half way: a factor that is zero at one of the samples hides what it multiplies.
         x, y = jtu.tree_map(lambda a, b: 0.5 * (a + b), (p[1], p[2]), (q[1], q[2]))
         u = flow.operator.inverse(y)
@@ -138,10 +138,12 @@ class ExcursionGuard(eqx.Module):
         # A bound at infinity does not move, and a jump is no measure of what moves smoothly.
         moved = jtu.tree_map(
             lambda c: jnp.where((c.a == c.b) | jnp.isinf(c.dev), 0.0, jnp.abs(c.b - c.a)), data,
-            is_leaf=is_chord,
+            is_leaf=is_enclosure,
         )  # fmt: skip
         dev = jtu.tree_map(
-            lambda c: jnp.where((c.a == c.b) & jnp.isinf(c.a), 0.0, c.dev), data, is_leaf=is_chord
+            lambda c: jnp.where((c.a == c.b) & jnp.isinf(c.a), 0.0, c.dev),
+            data,
+            is_leaf=is_enclosure,
         )
         return moved, dev
 
@@ -164,9 +166,9 @@ class ExcursionGuard(eqx.Module):
 
     def _deviation(self, flow: Flow, p: tuple, q: tuple) -> Any:
         """Return how far the switch functions are from straight lines between two samples."""
-        t = Chord(p[0], q[0], jnp.zeros_like(p[0]))
+        t = LinearEnclosure(p[0], q[0], jnp.zeros_like(p[0]))
         bend = _drive(flow, t, p[1])
-        z = jtu.tree_map(Chord, p[3], q[3], bend)
+        z = jtu.tree_map(LinearEnclosure, p[3], q[3], bend)
         return enclose(lambda t, z: _raveled(flow, t, p[1], z), t, z).dev
 
 
@@ -206,15 +208,15 @@ def _raveled(flow: Flow, t: Any, x: Tree, z: Tree) -> jax.Array:
     return found
 
 
-def _drive(flow: Flow, t: Chord, x: Tree) -> Tree:
+def _drive(flow: Flow, t: LinearEnclosure, x: Tree) -> Tree:
     """Return how far z may be from a line because h depends on t."""
     problem, args = flow.problem, flow.args
     zero = problem.zero_control(x)
     drive = enclose(lambda t: problem.h(t, x, zero, args), t)
-    dev = jtu.tree_map(lambda chord: chord.dev, drive, is_leaf=is_chord)
+    dev = jtu.tree_map(lambda line: line.dev, drive, is_leaf=is_enclosure)
     if flow.reciprocal is not None:
         return jtu.tree_map(lambda d, r: jnp.abs(d * r), dev, flow.reciprocal)
-    if flow.direct and flow.written is None:
+    if flow.direct and flow.small_box is None:
         a = slope(problem, flow.operator, t.a, x, args)
         return jtu.tree_map(lambda d, s: jnp.abs(d / s), dev, a)
     return jtu.tree_map(jnp.abs, flow.operator.apply(dev))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._tree import Tree
-from .chords import is_chord
+from ..programs.enclosure import is_enclosure
 
 
 class Extent(NamedTuple):
@@ -26,8 +26,8 @@ class Extent(NamedTuple):
         return cls((x0, x0), (low, high))
 
     @classmethod
-    def of_chords(cls, x: Tree, u: Tree) -> "Extent":
-        """What chords enclose."""
+    def of_enclosures(cls, x: Tree, u: Tree) -> "Extent":
+        """What linear enclosures hold."""
         return cls(_ends(x), _ends(u))
 
     def over_rows(self) -> "Extent":
@@ -48,9 +48,9 @@ class Extent(NamedTuple):
         )
 
 
-def _ends(chords: Tree) -> tuple[Tree, Tree]:
+def _ends(enclosures: Tree) -> tuple[Tree, Tree]:
     low, high = (
-        jtu.tree_map(lambda q, name=name: getattr(q, name), chords, is_leaf=is_chord)
+        jtu.tree_map(lambda q, name=name: getattr(q, name), enclosures, is_leaf=is_enclosure)
         for name in ("lowest", "highest")
     )
     return low, high

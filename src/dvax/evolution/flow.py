@@ -14,11 +14,18 @@ from ..generators import AbstractGenerator, AbstractPropagator, Dense, Diagonal,
 from ..generators.expanded import expanded
 from ..operators import AbstractOperator
 from ..problem import Problem
+from ..programs.enclosure import (
+    LinearEnclosure,
+    NoEnclosure,
+    enclose,
+    is_enclosure,
+    largest,
+    smallest,
+)
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, Frozen
-from .chords import Chord, NoEnclosure, enclose, is_chord, largest, smallest
 from .linearised import AbstractLinear, split
-from .written import AbstractWritten
+from .small_box import AbstractSmallBox
 
 _SMALL = 400
 """Entries of A, up to which one more operation costs more than its arithmetic."""
@@ -44,10 +51,10 @@ class Flow(eqx.Module):
 
     `direct` says that the law has a closed form, so that no guess is needed: it was proved to be
     F(y) = ay − h(t, x, 0), pointwise on a set of pointwise intervals, or with one number a on any set,
-    and y = proj_K(h(t, x, 0)/a); or affine on a box of few unknowns, and `written` out.
+    and y = proj_K(h(t, x, 0)/a); or affine on a box of few unknowns, solved by the formula `small_box`.
     `reciprocal` is 1/a where a was proved not to depend on t and x, so that it is computed once.
-    `enclosed` says that f̃ can be enclosed over a whole step (`chords`), so that nothing about the
-    defect is guessed. `linear` is A + J where some J joins A in what is left to the propagator.
+    `enclosed` says that f̃ has a linear enclosure over a whole step, so that nothing about the defect
+    is guessed. `linear` is A + J where some J joins A in what is left to the propagator.
     """
 
     problem: Problem
@@ -61,7 +68,7 @@ class Flow(eqx.Module):
     tol: Any
     gamma: Any
     L_F: Any
-    written: AbstractWritten | None = None
+    small_box: AbstractSmallBox | None = None
     linear: AbstractLinear | None = None
 
     def propagator(self, h: Any, terms: int) -> AbstractPropagator:
@@ -108,8 +115,8 @@ class Flow(eqx.Module):
 
     def _closed_form(self, t: Any, x: Tree) -> Rate:
         problem, args = self.problem, self.args
-        if self.written is not None:
-            return self._written_out(self.written, t, x)
+        if self.small_box is not None:
+            return self._by_formula(self.small_box, t, x)
         drive = problem.h(t, x, problem.zero_control(x), args)
         if self.reciprocal is not None:
             z = jtu.tree_map(jnp.multiply, drive, self.reciprocal)
@@ -124,28 +131,30 @@ class Flow(eqx.Module):
         # With a slope that is not positive the law is not monotone, and this is not its solution.
         return Rate(value, y, z, exact, solved, jnp.asarray(1))
 
-    def _written_out(self, written: AbstractWritten, t: Any, x: Tree) -> Rate:
+    def _by_formula(self, small_box: AbstractSmallBox, t: Any, x: Tree) -> Rate:
         problem, args = self.problem, self.args
         zero = problem.zero_control(x)
         bounds = problem.set_at(t, args).intervals(zero)
         assert bounds is not None
         q = problem.frozen(t, x, args)(zero)
-        found = written.solve(q, *bounds)
+        found = small_box.solve(q, *bounds)
         value = problem.f(t, x, self.operator.inverse(found.y), args)
         residual = problem.spaces(x)[1].norm(found.w)
         # Where nothing is found the law has no solution, or is not monotone.
-        most = jnp.maximum(self.tol, 1e3 * written.rounding(found.y, q))
+        most = jnp.maximum(self.tol, 1e3 * small_box.rounding(found.y, q))
         apart = jnp.abs(found.y - jnp.clip(found.z, *bounds)).ravel()
         solved = jnp.all((jnp.abs(found.w).ravel() <= most) & (apart <= most))
         return Rate(value, found.y, found.z, residual, solved, jnp.asarray(1))
 
-    def enclosure(self, t: Chord, x: Tree) -> tuple[Tree, Tree]:
-        """(f̃, u) along chords of t and x, as chords, for a direct law on pointwise intervals.
+    def enclosure(self, t: LinearEnclosure, x: Tree) -> tuple[Tree, Tree]:
+        """Return linear enclosures of f̃ and u, given those of t and x.
+
+        The law is direct, on pointwise intervals.
 
         **Raises:** `NoEnclosure` where f, h or K uses an operation without a rule.
         """
         problem, args, P = self.problem, self.args, self.operator
-        start = jtu.tree_map(lambda chord: chord.a, x, is_leaf=is_chord)
+        start = jtu.tree_map(lambda line: line.a, x, is_leaf=is_enclosure)
         zero = problem.zero_control(start)
         drive = enclose(lambda t, x: problem.h(t, x, zero, args), t, x)
         if self.reciprocal is None:
@@ -153,7 +162,7 @@ class Flow(eqx.Module):
         z = enclose(lambda d: jtu.tree_map(jnp.multiply, d, self.reciprocal), drive)
         ends = enclose(lambda t: problem.set_at(t, args).intervals(zero), t)
         y = jtu.tree_map(
-            lambda q, low, up: smallest(largest(q, low), up), z, *ends, is_leaf=is_chord
+            lambda q, low, up: smallest(largest(q, low), up), z, *ends, is_leaf=is_enclosure
         )
         u = enclose(P.inverse, y)
         return enclose(lambda t, x, u: problem.f(t, x, u, args), t, x, u), u

@@ -15,7 +15,7 @@ from ..generators import AbstractGenerator, AbstractPropagator, Diagonal, Scalar
 from ..generators.dense import MatrixPropagator
 from ..generators.phi import flow_factors, phi_matrix, phi_scalar
 from ..generators.scalar import ElementwisePropagator
-from ..vi.matrix import diagonal_of, matrix_of
+from ..programs.matrix import diagonal_of, matrix_of
 
 _DENSE = 256
 """Up to this many unknowns the matrix of A + J is formed."""

@@ -7,16 +7,14 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._tree import Tree
+from ..programs.enclosure import NoEnclosure, constant
 from ..vi import AbstractSolver, Auto, analyse, independent
-from . import written
-from .chords import NoEnclosure, constant
-from .faces import faces
 from .flow import Flow, slope
 from .implicit import Implicit
 from .linearised import NoJacobian
-from .medians import Medians
 from .method import AbstractMethod
 from .setup import Setup, as_arrays
+from .small_box import AbstractSmallBox, is_small, small_box
 
 
 class Plan(NamedTuple):
@@ -51,9 +49,9 @@ class Plan(NamedTuple):
         intervals = structure.pointwise and structure.affine and is_box
         if not intervals and (not structure.isotropic or isinstance(like, tuple)):
             jacobian = lambda t, x: jax.jacfwd(problem.frozen(t, x, args))(like)  # noqa: E731
-            affine = structure.affine and is_box and written.fits(like)
-            small_box = affine and independent(jacobian, t0, x0)
-            return Plan(False, False, False, small_box, solver, False)
+            affine = structure.affine and is_box and is_small(like)
+            solved_by_formula = affine and independent(jacobian, t0, x0)
+            return Plan(False, False, False, solved_by_formula, solver, False)
         operator = problem.operator(args)
         constant_slope = independent(lambda t, x: slope(problem, operator, t, x, args), t0, x0)
         plan = Plan(True, structure.isotropic, constant_slope, False, solver, False)
@@ -84,19 +82,19 @@ class Plan(NamedTuple):
             tol=_tolerance(setup),
             gamma=setup.moduli.get("gamma"),
             L_F=setup.moduli.get("L_F"),
-            written=_small_box(setup) if self.small_box else None,
+            small_box=_small_box(setup) if self.small_box else None,
             linear=NoJacobian(generator) if explicit else None,
         )
 
 
-def _small_box(setup: Setup) -> written.AbstractWritten:
+def _small_box(setup: Setup) -> AbstractSmallBox:
     """Return the formula of an affine law on a box of a few unknowns."""
     problem, x0, args, t0 = setup.problem, setup.x0, as_arrays(setup.args), setup.number("t0")
     like = problem.zero_control(x0)
     assert isinstance(like, jax.Array)
     frozen = problem.frozen(t0, x0, args)
     M = jax.jacfwd(lambda v: frozen(v.reshape(like.shape)).ravel())(jnp.zeros_like(like).ravel())
-    return Medians(M) if like.size == 2 else faces(M)
+    return small_box(M)
 
 
 def _tolerance(setup: Setup) -> jax.Array:

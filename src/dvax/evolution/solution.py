@@ -43,7 +43,7 @@ class Solution(eqx.Module):
     - `extent`: between what x_h and u_h stayed from t0 to the end of that step, where `constants=` of a
       region were given;
     - `enclosed`: whether the defect, and the extent, are enclosures over every step
-      (`dvax.evolution.chords`) or estimates from samples;
+      (`dvax.programs.enclosure`) or estimates from samples;
     - `stats`: steps accepted and rejected, `evaluations` of F in them (without those that look for
       kinks or read u at saved times), and where the run stands: t, x and the next step; with
       `compile_time` and `run_time` in seconds, unless the solve is part of a larger compiled program;

@@ -7,7 +7,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._tree import Tree
-from .slope import MOST, Part, Slope, TooLarge, Values, columns, is_slope
+from ..programs.slope import MOST, Part, Slope, TooLarge, Values, columns, is_slope
 
 _DENSE = 2_000
 """Up to so many rows or columns singular values are computed."""

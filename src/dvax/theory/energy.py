@@ -22,9 +22,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..errors import InputError, InputProblem
+from ..programs.slope import TooLarge
 from .blocks import spread_out
 from .formulas import convolved
-from .slope import TooLarge
 from .system import Jacobians, System
 
 MOST = 40

@@ -9,11 +9,10 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from .enclosure import Enclosure
+from ..programs.slope import SlopeEnclosure, is_slope
 from .moduli import SMALLNESS, Moduli, moduli
 from .region import Region
 from .search import Pair, counterexample, least_modulus, steepest
-from .slope import is_slope
 from .status import Status
 from .system import System
 from .weighted_law import splits
@@ -146,7 +145,7 @@ def _divided(system: System, region: Region) -> Divided | None:
 
 def _least(weight: Callable[..., Any], system: System, region: Region) -> float:
     """The least value of a(t, x, u) over the region, from below."""
-    enclosure = Enclosure(weight, (jnp.zeros(()), system.x0, system.u0), ())
+    enclosure = SlopeEnclosure(weight, (jnp.zeros(()), system.x0, system.u0), ())
     pieces = [region]
     for _ in range(_ROUNDS):
         pieces = [half for piece in pieces for half in piece.halves(region)] or pieces

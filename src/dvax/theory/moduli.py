@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..programs.slope import TooLarge
 from .blocks import Block
 from .matrix_free import Affine, frozen
 from .one_sided import one_sided
 from .region import Region
-from .slope import TooLarge
 from .system import Jacobians, System
 
 PIECES = 40

@@ -11,10 +11,9 @@ import numpy as np
 
 from .._tree import Tree
 from ..errors import InputError
+from ..programs.slope import Slope, SlopeEnclosure, TooLarge, Values, interval, is_slope
 from ..sets import AbstractSet, Ball, Intersection, Simplex
 from ..spaces import AbstractSpace
-from .enclosure import Enclosure
-from .slope import Slope, TooLarge, Values, interval, is_slope
 from .system import System
 from .weights import roots
 
@@ -67,7 +66,7 @@ def motion(system: System, t0: float, t1: float, knots: Values) -> Motion:
 
     low, high, speed, standing = free[1], free[0], 0.0, True
     try:
-        enclosure = Enclosure(described, (jnp.zeros(()),), (0,))
+        enclosure = SlopeEnclosure(described, (jnp.zeros(()),), (0,))
         for piece in [interval(t0, t1)] if still else times(t0, t1, knots):
             (down, up, moves, gap), _ = enclosure(piece)
             low, high = _least(low, down), _most(high, up)
@@ -159,7 +158,7 @@ def _samples(t0: float, t1: float, knots: Values) -> Values:
 
 def bounded_in_time(fn: Callable[[Any], Tree], t0: float, t1: float, knots: Values) -> bool:
     """Whether fn's code shows that it is bounded on [t0, t1]."""
-    enclosure = Enclosure(fn, (jnp.zeros(()),), ())
+    enclosure = SlopeEnclosure(fn, (jnp.zeros(()),), ())
     values = (x for piece in times(t0, t1, knots) for x in slopes(enclosure(piece).out))
     return all(bool(np.isfinite(x.low).all() and np.isfinite(x.high).all()) for x in values)
 

@@ -24,8 +24,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..programs.slope import TooLarge, Values
 from .blocks import Block, eigenvalues, spread_out
-from .slope import TooLarge, Values
 from .system import Jacobians, System
 
 _ROUNDS = 60

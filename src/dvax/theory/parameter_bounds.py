@@ -11,18 +11,17 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..problem import Problem
+from ..programs.slope import Slope, SlopeEnclosure, TooLarge, interval, is_slope
 from ..sets import Ball
 from ..spaces import AbstractSpace
 from ..vi import independent
 from .blocks import block
 from .constants import Constants
-from .enclosure import Enclosure
 from .formulas import convolved
 from .known import knowledge
 from .motion import motion, slopes, times
 from .parameters import ParameterBounds, ParameterSet
 from .region import Region, between
-from .slope import Slope, TooLarge, interval, is_slope
 from .status import Status
 from .system import System
 from .verify import around_responses, bounded, constants_of, domain_of, met, span, state_like
@@ -163,7 +162,7 @@ def _size(
     nil = lambda leaf: interval(np.zeros(leaf.shape), np.zeros(leaf.shape))  # noqa: E731
     zero, still = jtu.tree_map(nil, system.x0), jtu.tree_map(nil, system.u0)
     still = still if responses is None else responses
-    enclosure = Enclosure(getattr(system, name), system.likes, ())
+    enclosure = SlopeEnclosure(getattr(system, name), system.likes, ())
     space, like = (system.state, system.x0) if name == "f" else (system.control, system.u0)
     worst = 0.0
     for piece in times(float(region.t.low), float(region.t.high), knots):
@@ -176,7 +175,7 @@ def _by_parameter(system: System, name: str, region: Region, knots: np.ndarray) 
     """sup ‖∂f/∂η‖ over the region."""
     space, like = (system.state, system.x0) if name == "f" else (system.control, system.u0)
     ones = [np.ones(leaf.size) for leaf in jtu.tree_leaves(system.eta)]
-    enclosure = Enclosure(getattr(system, name), system.likes, (3,))
+    enclosure = SlopeEnclosure(getattr(system, name), system.likes, (3,))
     worst = 0.0
     try:
         for piece in times(float(region.t.low), float(region.t.high), knots):
@@ -200,9 +199,9 @@ def _kappa(system: System, t0: float, t1: float, knots: np.ndarray) -> float:
             center = jnp.broadcast_to(ball.center, like.shape)
             return jnp.maximum(space.norm(center) - ball.radius, 0.0)
 
-        enclosure = Enclosure(off, time, ())
+        enclosure = SlopeEnclosure(off, time, ())
         return max(float(enclosure(piece).out.high) for piece in pieces)
-    enclosure = Enclosure(lambda t: at(t).project(like, space), time, ())
+    enclosure = SlopeEnclosure(lambda t: at(t).project(like, space), time, ())
     return max(_norm(enclosure(piece).out, space, like) for piece in pieces)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
-from .slope import Slope, interval, is_slope
+from ..programs.slope import Slope, interval, is_slope
 
 
 class Region(NamedTuple):

@@ -9,13 +9,12 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
+from ..programs.slope import SlopeEnclosure, TooLarge, interval, is_slope
 from .assumption import Assumption
 from .certificate import is_declared
-from .enclosure import Enclosure
 from .known import Knowledge
 from .motion import Motion, bounded_in_time, jumps, slopes, times
 from .region import Region
-from .slope import TooLarge, interval, is_slope
 from .status import Status, weakest
 from .system import System
 
@@ -173,7 +172,7 @@ def _moving_feedback(
         why = f"h jumps by {jump[1]:.6g} at t = {jump[0]:.17g}; {_ON_EACH_SIDE}"
         return Assumption(label, statement, "refuted", why, evidence=jump[0])
     try:
-        enclosure = Enclosure(h, (jnp.zeros(()), system.x0, system.u0), (0,))
+        enclosure = SlopeEnclosure(h, (jnp.zeros(()), system.x0, system.u0), (0,))
         speed = 0.0
         for piece in times(*span, knots):
             for x in slopes(enclosure(piece, everywhere.x, everywhere.u).out):

@@ -12,9 +12,9 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
+from ..programs.slope import Slope
 from ..spaces import AbstractSpace
 from .region import Region
-from .slope import Slope
 from .system import System
 from .weights import flat_roots, whole
 

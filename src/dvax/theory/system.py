@@ -9,10 +9,9 @@ import numpy as np
 
 from .._tree import Tree
 from ..problem import Problem
+from ..programs.slope import SlopeEnclosure, TooLarge, interval
 from .blocks import Block, block, identity
-from .enclosure import Enclosure
 from .region import Region
-from .slope import TooLarge, interval
 from .weights import roots
 
 
@@ -44,7 +43,7 @@ class System:
             for fn in (problem.f, problem.h)
         )
         self.likes = time, self.x0, self.u0, self.eta
-        self._f, self._h = (Enclosure(fn, self.likes, (1, 2)) for fn in (self.f, self.h))
+        self._f, self._h = (SlopeEnclosure(fn, self.likes, (1, 2)) for fn in (self.f, self.h))
         P = problem.operator(args)
         self.spectrum = P.spectrum(self.control)
         self.growth = problem.generator(args).growth(self.state)
@@ -88,7 +87,7 @@ class System:
             lambda leaf: interval(np.full(leaf.shape, -np.inf), np.full(leaf.shape, np.inf)), like
         )
         try:
-            out, unknown = Enclosure(apply, (like,), (0,))(anywhere)
+            out, unknown = SlopeEnclosure(apply, (like,), (0,))(anywhere)
             found = block(out, 0, roots(space, like), roots(space, like))
         except TooLarge:
             return None

@@ -12,18 +12,17 @@ from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..evolution.nonfinite import refuse_nonfinite_data
 from ..problem import Problem
+from ..programs.slope import Slope, SlopeEnclosure, TooLarge, interval, is_slope
 from .assumption import Assumption
 from .certificate import is_declared
 from .constants import Constants
 from .domain import Domain
-from .enclosure import Enclosure
 from .energy import energy_norm
 from .known import Knowledge, knowledge
 from .moduli import sharp_rate
 from .motion import Motion, motion
 from .region import Region, between
 from .rows import rows
-from .slope import Slope, TooLarge, interval, is_slope
 from .status import Status, weakest
 from .system import System
 
@@ -216,7 +215,7 @@ def around_responses(system: System, K: Motion) -> Tree:
     y = jtu.tree_map(interval, K.low, K.high)
     P = system.problem.operator(system.args)
     try:
-        return Enclosure(P.inverse, (system.u0,), ())(y).out
+        return SlopeEnclosure(P.inverse, (system.u0,), ())(y).out
     except TooLarge:
         return between(None, system.u0, "dvax.verify(u)")
 

@@ -16,9 +16,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax.extend.core import ClosedJaxpr, Literal
 
-from .._jaxpr import bound, values
+from .._jax.jaxprs import ClosedJaxpr, Literal, bind, read
 from ..problem import Problem
 from .system import System
 
@@ -94,7 +93,7 @@ def _output(traced: ClosedJaxpr, atom: Any) -> Callable[..., jax.Array]:
         for eqn in jaxpr.eqns:
             if atom in known:
                 break
-            known.update(zip(eqn.outvars, bound(eqn, values(known, eqn.invars)), strict=True))
+            known.update(zip(eqn.outvars, bind(eqn, read(known, eqn.invars)), strict=True))
         return jnp.asarray(known[atom])
 
     return fn

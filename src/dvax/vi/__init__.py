@@ -1,5 +1,8 @@
 """The frozen variational inequality VI(K, F): solvers, residuals, certificates, derivatives."""
 
+from ..programs.structure import Structure as Structure
+from ..programs.structure import analyse as analyse
+from ..programs.structure import independent as independent
 from .abstract import RESULTS as RESULTS
 from .abstract import AbstractSolver as AbstractSolver
 from .abstract import Answer as Answer
@@ -23,8 +26,5 @@ from .semismooth_newton import SemismoothNewton as SemismoothNewton
 from .solve import VISolution as VISolution
 from .solve import default_space as default_space
 from .solve import solve_vi as solve_vi
-from .structure import Structure as Structure
-from .structure import analyse as analyse
-from .structure import independent as independent
 from .weighted import Modulus as Modulus
 from .weighted import Weighted as Weighted

@@ -11,12 +11,12 @@ from jax.flatten_util import ravel_pytree
 from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
+from ..programs.matrix import matrix_of
+from ..programs.structure import analyse
 from .abstract import AbstractSolver, Answer, Frozen
 from .block import solve_block
-from .matrix import matrix_of
 from .newton import Linearised, safeguarded_newton
 from .parameters import SAFETY, STEPS, UNKNOWNS, check_parameters, shown
-from .structure import analyse
 
 
 class ActiveSet(AbstractSolver):

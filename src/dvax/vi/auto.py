@@ -6,12 +6,12 @@ import jax.tree_util as jtu
 
 from .._tree import Tree
 from ..errors import InputError, InputProblem
+from ..programs.structure import analyse
 from .abstract import AbstractSolver, Answer, Frozen
 from .active_set import ActiveSet
 from .bracketing import Bracketing, affine_answer, is_pointwise
 from .golden_ratio import GoldenRatio
 from .semismooth_newton import SemismoothNewton
-from .structure import analyse
 
 _NEWTON = 1024
 """Up to so many unknowns a Jacobian is formed and factorised at each step without a thought."""

@@ -11,11 +11,11 @@ from jax import lax
 from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
+from ..programs.structure import Structure, analyse
 from .abstract import RESULTS, AbstractSolver, Answer, Frozen
 from .brackets import Brackets, answer, begin, is_lost, is_open, narrow, trial
 from .implicit import with_implicit_derivative
 from .parameters import STEPS, check_parameters
-from .structure import Structure, analyse
 
 
 class Bracketing(AbstractSolver):

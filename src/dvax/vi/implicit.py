@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._tree import Tree
+from ..programs.matrix import matrix_of
 from .certificate import natural_residual
-from .matrix import matrix_of
 
 _DENSE = 1024  # up to this many unknowns the Jacobian is formed; beyond, GMRES applies it
 

@@ -8,8 +8,8 @@ from jax.flatten_util import ravel_pytree
 
 from .. import _tree
 from .._tree import Tree
+from ..programs.matrix import matrix_of
 from .abstract import AbstractSolver, Answer, Frozen
-from .matrix import matrix_of
 from .newton import Linearised, safeguarded_newton
 from .parameters import SAFETY, STEPS, UNKNOWNS, check_parameters
 

@@ -13,6 +13,7 @@ import jax.tree_util as jtu
 from .. import _tree
 from .._failure import nan_derivatives_where
 from .._tree import Tree
+from ..programs.rounding import rounding_error
 from ..sets import AbstractSet
 from ..spaces import AbstractSpace, Euclidean, Product
 from .abstract import RESULTS, AbstractSolver, Frozen
@@ -22,7 +23,6 @@ from .certificate import certify
 from .iteration import first_step, stopped
 from .parameters import MODULUS, TOLERANCE
 from .projection_error import projection_error
-from .rounding import rounding_error
 from .weighted import Weighted, moduli_belong_to_the_parts
 
 IN_VAIN = RESULTS.max_steps, RESULTS.stalled, RESULTS.cycling, RESULTS.singular
@@ -36,7 +36,7 @@ class VISolution(eqx.Module):
     rounding of F and of w adds to it; `error_bound` ≥ ‖y − y*‖ where γ was given, else None: that is
     (residual + rounding)/γ, and the distance to the certified point where that is not y;
     `rounding_status`, "proved" where K is a pointwise interval and every operation of F has a rule
-    (`dvax.vi.rounding`), else "estimated"; `iterations`, and `evaluations` of F (those for
+    (`dvax.programs.rounding`), else "estimated"; `iterations`, and `evaluations` of F (those for
     derivatives, for rounding, and for the certificate of a closed form, apart); `result`, which is
     `dvax.vi.RESULTS.successful` or says what went wrong; `solver`, the one that was used.
     Derivatives of a solve that failed are NaN, unless it reached the level of rounding.

@@ -12,10 +12,10 @@ from jax.flatten_util import ravel_pytree
 from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
+from ..programs.structure import analyse
 from ..spaces import AbstractSpace
 from .abstract import RESULTS
 from .parameters import shown
-from .structure import analyse
 
 _PROVED = 256
 """Up to so many unknowns the eigenvalues of G's matrix cost no more than about two solves."""

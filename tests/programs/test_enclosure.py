@@ -1,4 +1,4 @@
-"""Chord arithmetic: what it says a function may leave its chord by, the function never exceeds."""
+"""Linear enclosures: a function of time stays within the bound on its distance from a line."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from tests.hard_rates import RATES
 from tests.selection import mostly_thorough
 
 import dvax
-from dvax.evolution.chords import Chord, NoEnclosure, constant, enclose, straight
+from dvax.programs.enclosure import LinearEnclosure, NoEnclosure, constant, enclose, straight
 
 TABLE = dvax.signals.Table([0.0, 1.0, 2.5, 4.0], [0.0, 3.0, -1.0, 2.0])
 STAIRS = dvax.signals.Table([0.0, 1.0, 2.5, 4.0], [0.0, 3.0, -1.0, 2.0], kind="constant")
@@ -51,12 +51,13 @@ FUNCTIONS = {
     "interpolation": lambda t: jnp.interp(t, jnp.arange(5.0), PROFILE[jnp.array([0, 1, 2, 1, 0])]),
     "steps of an array": lambda t: PROFILE[jnp.searchsorted(jnp.array([1.0, 2.2]), t)] * t,
     "cumulative": lambda t: jnp.cumsum(PROFILE * jnp.sin(t)),
+    "written into": lambda t: jax.lax.dynamic_update_slice(PROFILE * t, jnp.sin(t)[None], (1,)),
     "taken apart": lambda t: jnp.split(jnp.sin(PROFILE * t), [1])[1],
 }
 
 
 def farthest(fn, t0, t1):
-    """How far fn leaves its chord on a fine grid, entry by entry."""
+    """How far fn leaves the line between its ends on a fine grid, entry by entry."""
     theta = jnp.linspace(0.0, 1.0, 801)
     values = jax.vmap(lambda s: jnp.asarray(fn(t0 + s * (t1 - t0))))(theta)
     weight = theta.reshape((-1,) + (1,) * (values.ndim - 1))
@@ -72,10 +73,10 @@ def enclosed(fn, t0, t1):
 @given(t0=st.floats(0.0, 3.5), length=st.floats(1e-4, 0.5))
 def test_a_function_stays_within_its_bound(name, t0, length):
     fn, t1 = FUNCTIONS[name], t0 + length
-    chord = enclosed(fn, t0, t1)
-    np.testing.assert_allclose(chord.a, fn(t0), rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(chord.b, fn(t1), rtol=1e-12, atol=1e-12)
-    assert np.all(farthest(fn, t0, t1) <= np.asarray(chord.dev) + 1e-12)
+    line = enclosed(fn, t0, t1)
+    np.testing.assert_allclose(line.a, fn(t0), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(line.b, fn(t1), rtol=1e-12, atol=1e-12)
+    assert np.all(farthest(fn, t0, t1) <= np.asarray(line.dev) + 1e-12)
 
 
 @pytest.mark.parametrize("name", mostly_thorough(RATES, list(RATES)[::2]))
@@ -90,50 +91,52 @@ def test_what_is_made_to_deceive_is_enclosed_or_refused(name):
             enclosed(rate, 0.0, 1.0)
         return
     for t0, t1 in spans:
-        chord = enclosed(rate, t0, t1)
-        assert np.all(farthest(rate, t0, t1) <= np.asarray(chord.dev) + 1e-9), (t0, t1)
+        line = enclosed(rate, t0, t1)
+        assert np.all(farthest(rate, t0, t1) <= np.asarray(line.dev) + 1e-9), (t0, t1)
 
 
 def test_single_precision_is_kept_where_double_is_the_default():
     for name in ("where on time", "clip", "modulus", "square"):
-        chord = enclose(FUNCTIONS[name], straight(jnp.float32(0.9), jnp.float32(1.9)))
-        assert {part.dtype for part in chord} == {jnp.dtype("float32")}, name
+        line = enclose(FUNCTIONS[name], straight(jnp.float32(0.9), jnp.float32(1.9)))
+        assert {part.dtype for part in line} == {jnp.dtype("float32")}, name
 
 
 def test_a_crossing_too_large_for_single_precision_is_bounded():
     steep = lambda t: jnp.maximum(0.0, 4e20 * (t - 0.5))  # noqa: E731
-    chord = enclose(steep, straight(jnp.float32(0.0), jnp.float32(1.0)))
-    assert float(chord.dev) == pytest.approx(1e20, rel=1e-6)
+    line = enclose(steep, straight(jnp.float32(0.0), jnp.float32(1.0)))
+    assert float(line.dev) == pytest.approx(1e20, rel=1e-6)
 
 
 def test_a_crossing_of_numbers_whose_sum_is_none_has_no_bound_rather_than_a_wrong_one():
     ends = jnp.asarray(-1.5e308), jnp.asarray(1.5e308)
-    chord = enclose(lambda t: jnp.maximum(0.0, t), straight(*ends))
-    assert float(chord.dev) >= 0.75e308
+    line = enclose(lambda t: jnp.maximum(0.0, t), straight(*ends))
+    assert float(line.dev) >= 0.75e308
 
 
 @pytest.mark.parametrize(("a", "b"), [(-1e308, 1.0), (1.0, -1e308), (-1e30, 1e-300), (-3.0, 1.0)])
 def test_a_crossing_of_numbers_far_apart_is_not_lost(a, b):
-    chord = enclose(lambda t: jnp.maximum(0.0, t), straight(jnp.asarray(a), jnp.asarray(b)))
-    np.testing.assert_allclose(float(chord.dev), abs(a) * (abs(b) / (abs(a) + abs(b))) or max(b, a))
+    line = enclose(lambda t: jnp.maximum(0.0, t), straight(jnp.asarray(a), jnp.asarray(b)))
+    np.testing.assert_allclose(float(line.dev), abs(a) * (abs(b) / (abs(a) + abs(b))) or max(b, a))
 
 
 @pytest.mark.parametrize("dev", [0.0, 1.0, np.inf])
 @pytest.mark.parametrize("c", [np.inf, 1e-310, 1e-300, 2.0, -3.0])
 def test_a_quotient_by_a_number_has_a_bound_that_is_one(c, dev):
     for number in (c, jnp.asarray(c)):
-        chord = enclose(lambda t, by=number: t / by, Chord(*map(jnp.asarray, (1.0, 2.0, dev))))
-        assert not np.isnan(chord.dev)
+        line = enclose(
+            lambda t, by=number: t / by, LinearEnclosure(*map(jnp.asarray, (1.0, 2.0, dev)))
+        )
+        assert not np.isnan(line.dev)
         if np.isfinite(dev / abs(c)) and abs(c) >= 1e-300:
-            assert float(chord.dev) == pytest.approx(dev / abs(c))
+            assert float(line.dev) == pytest.approx(dev / abs(c))
         if dev > 0.0 and abs(c) < np.inf:
-            assert chord.dev > 0.0
+            assert line.dev > 0.0
 
 
 @pytest.mark.parametrize("factor", [0.0, 5e-324, 1e-310, 1e-300, 3.0])
 def test_a_factor_of_what_has_no_bound_leaves_a_number(factor):
-    chord = enclose(lambda t: factor * t, Chord(*map(jnp.asarray, (0.0, 1.0, jnp.inf))))
-    assert not np.isnan(chord.dev) and (factor < 1e-300 or np.isinf(chord.dev))
+    line = enclose(lambda t: factor * t, LinearEnclosure(*map(jnp.asarray, (0.0, 1.0, jnp.inf))))
+    assert not np.isnan(line.dev) and (factor < 1e-300 or np.isinf(line.dev))
 
 
 @pytest.mark.parametrize("name", ["square", "exponential", "root", "tanh of a product"])
@@ -145,29 +148,29 @@ def test_where_things_are_smooth_the_bound_is_of_second_order_and_not_far_off(na
 
 
 def test_deep_inside_a_bound_nothing_is_left_of_what_is_clipped_away():
-    chord = enclosed(lambda t: jnp.clip(10.0 + jnp.sin(t), 0.0, 1.0), 0.0, 1.0)
-    assert float(chord.dev) == 0.0
+    line = enclosed(lambda t: jnp.clip(10.0 + jnp.sin(t), 0.0, 1.0), 0.0, 1.0)
+    assert float(line.dev) == 0.0
 
 
 def test_a_single_kink_of_a_line_is_exact():
-    chord = enclosed(lambda t: jnp.maximum(t - 0.25, 0.0), 0.0, 1.0)
-    assert float(chord.dev) == pytest.approx(0.75 * 0.25)
+    line = enclosed(lambda t: jnp.maximum(t - 0.25, 0.0), 0.0, 1.0)
+    assert float(line.dev) == pytest.approx(0.75 * 0.25)
 
 
 @pytest.mark.parametrize("signal", [TABLE, STAIRS, SPLINE], ids=["linear", "constant", "cubic"])
 @pytest.mark.parametrize(("t0", "t1"), [(0.0, 1.0), (0.2, 0.7), (1.0, 2.5), (3.9, 4.0)])
 def test_measured_data_between_two_knots(signal, t0, t1):
     last = np.nextafter(t1, 0.0)  # a step ends just inside
-    chord = enclosed(signal.value, t0, last)
+    line = enclosed(signal.value, t0, last)
     found = farthest(signal.value, t0, last)
-    assert np.isfinite(chord.dev) and found <= float(chord.dev) + 1e-12
+    assert np.isfinite(line.dev) and found <= float(line.dev) + 1e-12
     if signal is not SPLINE:
-        assert float(chord.dev) <= 1e-12
+        assert float(line.dev) <= 1e-12
 
 
 def test_data_across_a_knot_has_no_finite_bound_rather_than_a_wrong_one():
-    chord = enclosed(STAIRS.value, 0.9, 1.1)
-    assert not float(chord.dev) < 3.0
+    line = enclosed(STAIRS.value, 0.9, 1.1)
+    assert not float(line.dev) < 3.0
 
 
 @pytest.mark.parametrize("fn", [jnp.cbrt, jnp.tan, jnp.log, lambda t: t**0.5, lambda t: t**-1.5])
@@ -204,9 +207,9 @@ def test_a_bend_of_the_trajectory_is_never_less_than_it_is():
 
 
 def test_constants_do_not_move():
-    chord = enclose(
+    line = enclose(
         lambda a, t: a * a + t,
         constant(jnp.asarray(3.0)),
-        Chord(*map(jnp.asarray, (0.0, 1.0, 0.5))),
+        LinearEnclosure(*map(jnp.asarray, (0.0, 1.0, 0.5))),
     )
-    assert (float(chord.a), float(chord.b), float(chord.dev)) == (9.0, 10.0, 0.5)
+    assert (float(line.a), float(line.b), float(line.dev)) == (9.0, 10.0, 0.5)

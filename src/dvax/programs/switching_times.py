@@ -26,12 +26,12 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
 
-from . import _tree
-from ._jaxpr import bound, is_search, scan_counts, walked
-from .errors import DifferentiationError
-from .vi.structure import CALLS, CUSTOM, inner_jaxpr
+from .. import _tree
+from .._jax.jaxprs import Literal, bind, inner_program, operation, scan_counts
+from ..errors import DifferentiationError
+from .interpreter import Domain, Rule, interpret, is_real, same_for
+from .primitives import LOGICAL, ORDERING, REARRANGING, TABLES
 
 
 class _Lazy:
@@ -78,117 +78,72 @@ class _OfTime:
 
 
 _OTHER = object()
-_COMPARE = {"lt", "le", "gt", "ge", "lt_to", "le_to"}
-_MOVING_PLACES = {
-    "broadcast_in_dim", "reshape", "squeeze", "expand_dims", "copy", "copy_p", "transpose", "rev",
-    "slice", "stop_gradient", "reduce_precision",
-}  # fmt: skip
-_LOGIC = {"and", "or", "not", "xor", "eq", "ne"} | _MOVING_PLACES
 
 
 def switching_times(fn: Callable[..., list[Any]], t: Any, x: Any, u: Any) -> list[jax.Array]:
     """Return the times, in vectors, at which the code of fn(t, x, u) switches; infinite where there is
     none. With them those that fn returns: a list of vectors of times, computed from parameters alone.
     `t` is a time of the run, at which functions of time alone are evaluated."""
-    traced = jax.make_jaxpr(fn)(t, x, u)
     count = len(jtu.tree_leaves((x, u)))
     one, zero = (_Fixed(partial(jnp.full, (), v, jnp.result_type(t))) for v in (1.0, 0.0))
     found: list[jax.Array] = []
-    reader = _Reader(jax.lax.stop_gradient(t), found)
-    known = reader.read(traced, [_Lines([_Line(one, zero)], lambda: reader.t), *[_OTHER] * count])
-    return found + [jnp.ravel(v.get() if isinstance(v, _Fixed) else v) for v in known]
+    reader, now = _Reader(found), jax.lax.stop_gradient(t)
+    domain = Domain(RULES, _is_variable, reader.unknown, reader.apply, _lazily_fixed)
+    given = [_Lines([_Line(one, zero)], lambda: now), *[_OTHER] * count]
+    results = interpret(jax.make_jaxpr(fn)(t, x, u), given, domain)
+    return found + [jnp.ravel(v.get() if isinstance(v, _Fixed) else v) for v in results]
 
 
 class _Reader:
-    def __init__(self, t: Any, found: list[Any]):
-        self.t, self.found = t, found
+    """Collects the times that are found."""
 
-    def read(self, traced: ClosedJaxpr, given: list[Any]) -> list[Any]:
-        return walked(traced, given, self._apply)
+    def __init__(self, found: list[Any]):
+        self.found = found
 
-    def _apply(self, eqn: Any, given: list[Any]) -> list[Any]:
+    def unknown(self, eqn: Any, given: list[Any]) -> list[Any]:
+        """The results of an operation that makes no lines."""
+        return self._results(None, eqn, list(map(_wrapped, given)))
+
+    def apply(self, rule: Rule, eqn: Any, given: list[Any]) -> list[Any] | None:
+        """The results of an operation, whose `rule` gives the lines that they are made of."""
+        given = list(map(_wrapped, given))
+        if operation(eqn) == "searchsorted":
+            return self._search(eqn, given)
+        return self._results(rule, eqn, given)
+
+    def _results(self, rule: Rule | None, eqn: Any, given: list[Any]) -> list[Any]:
         name = eqn.primitive.name
-        given = [
-            v if isinstance(v, _Fixed | _Lines | _OfTime) or v is _OTHER else _fixed(v)
-            for v in given
-        ]
         if name == "select_n" and isinstance(given[0], _OfTime) and not _is_check(given[1:]):
             self._refuse(given[0].pending)
         if name in _STEPS or (name == "convert_element_type" and _becomes_whole(eqn)):
             if isinstance(given[0], _Lines | _OfTime):
-                self._refuse(((self._operands(given), _place(eqn)),))
+                self._refuse(((_operands(given), _place(eqn)),))
         if name in ("scan", "while") and _compares_time(eqn, given):
-            self._refuse(((self._operands(given), _place(eqn)),))
+            self._refuse(((_operands(given), _place(eqn)),))
         if any(v is _OTHER for v in given):
             # What it compares is an event; what else a select chooses by is not known to be one.
-            inner = self._inner(eqn, given)
-            return inner or [_OTHER] * len(eqn.outvars)
-        if all(isinstance(v, _Fixed) for v in given):
-            return self._lazily(eqn, given, _Fixed)
-        if is_search(eqn):
-            row, lines = map(_as_lines, given)
-            if row is not None and lines is not None and len(row) == 1:
-                self.found += [_meeting(line, row[0]) for line in lines]
-                return self._lazily(eqn, given, lambda m: _OfTime(_Lazy(m)))
-        inner = self._inner(eqn, given)
-        if inner is not None:
-            return inner
+            return [_OTHER] * len(eqn.outvars)
         pending = tuple(p for v in given if isinstance(v, _OfTime) for p in v.pending)
-        if name in _COMPARE or name in ("max", "min", "sign", "abs", "clamp"):
+        if name in ORDERING or name in ("max", "min", "sign", "abs", "clamp"):
             pending += self._compared(name, eqn, given)
-        if pending and self._jumps(name, given):
+        if pending and _jumps(name, given):
             self._refuse(pending)
             pending = ()
-        elif not (pending and name == "select_n"):
-            lines = self._lines(name, eqn, given)
+        elif rule is not None and not (pending and name == "select_n"):
+            lines = rule(eqn, given)
             if lines is not None and len(lines) <= _MOST:
-                return [_Lines(lines, lambda: _done(eqn, [self._value(v) for v in given])[0])]
-        is_flag = name in _COMPARE or name in _LOGIC
-        return self._lazily(eqn, given, lambda m: _OfTime(_Lazy(m), pending if is_flag else ()))
+                return [_Lines(lines, lambda: _done(eqn, list(map(_value, given)))[0])]
+        is_flag = name in _FLAGS
+        return _lazily(eqn, given, lambda m: _OfTime(_Lazy(m), pending if is_flag else ()))
 
-    def _inner(self, eqn: Any, given: list[Any]) -> list[Any] | None:
-        name = eqn.primitive.name
-        if name not in CALLS and name not in CUSTOM:
+    def _search(self, eqn: Any, given: list[Any]) -> list[Any] | None:
+        """A place in a sorted row, which changes where t meets its entries; None for a place of
+        anything that is not made of lines."""
+        row, lines = map(_as_lines, given)
+        if row is None or lines is None or len(row) != 1:
             return None
-        if str(eqn.params.get("name", "")).startswith("dvax_"):
-            return None  # tables announce their knots
-        inner = inner_jaxpr(eqn.params)
-        if inner is None or len(inner.jaxpr.invars) != len(given):
-            return None
-        return self.read(inner, given)
-
-    def _lazily(self, eqn: Any, given: list[Any], kind: Callable[..., Any]) -> list[Any]:
-        every = _Lazy(lambda: _done(eqn, [self._value(v) for v in given]))
-        return [kind(lambda k=k: every.get()[k]) for k in range(len(eqn.outvars))]
-
-    def _value(self, v: Any) -> Any:
-        return v.value.get() if isinstance(v, _OfTime) else v.get()
-
-    def _lines(self, name: str, eqn: Any, given: list[Any]) -> list[_Line] | None:
-        """The lines of the outcome, where it consists of such."""
-        do = lambda *v: _done(eqn, list(v))[0]  # noqa: E731
-        each = [lines for v in given if (lines := _as_lines(v)) is not None]
-        known = len(each) == len(given)
-        floating = jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating)
-        if name in ("add", "sub", "add_any") and known:
-            return [_both(do, p, q) for p in each[0] for q in each[1]]
-        if name == "neg" or name in _MOVING_PLACES or name == "convert_element_type":
-            if floating and isinstance(given[0], _Lines):
-                return [_both(do, line) for line in given[0].lines]
-        if name == "mul" and isinstance(given[1], _Lines) and isinstance(given[0], _Fixed):
-            return [_both(lambda v: do(given[0].get(), v), line) for line in given[1].lines]
-        if name in ("mul", "div") and isinstance(given[0], _Lines) and isinstance(given[1], _Fixed):
-            return [_both(lambda v: do(v, given[1].get()), line) for line in given[0].lines]
-        if name == "abs" and isinstance(given[0], _Lines):
-            return [*given[0].lines, *(_both(jnp.negative, line) for line in given[0].lines)]
-        if name == "select_n":
-            each = [lines for v in given[1:] if (lines := _as_lines(v)) is not None]
-            known = len(each) == len(given) - 1
-        if name in ("max", "min", "clamp", "select_n") and floating and known:
-            shape = eqn.outvars[0].aval.shape
-            over = lambda v: jnp.broadcast_to(v, shape)  # noqa: E731
-            return [_both(over, line) for lines in each for line in lines]
-        return None
+        self.found += [_meeting(line, row[0]) for line in lines]
+        return _lazily(eqn, given, lambda m: _OfTime(_Lazy(m)))
 
     def _compared(self, name: str, eqn: Any, given: list[Any]) -> tuple:
         """Keep where lines cross; return what is not resolved."""
@@ -204,27 +159,11 @@ class _Reader:
             if not any(isinstance(v, _Lines | _OfTime) for v in (a, b)):
                 continue
             if p is None or q is None:
-                if name in _COMPARE or name == "sign":
-                    operands = [_Lazy(partial(self._value, v)) for v in (a, b)]
-                    pending += ((operands, _place(eqn)),)
+                if name in ORDERING or name == "sign":
+                    pending += ((_operands([a, b]), _place(eqn)),)
                 continue
             self.found += [_meeting(left, right) for left in p for right in q]
         return pending
-
-    def _jumps(self, name: str, given: list[Any]) -> bool:
-        """Whether what is decided so is surely not continuous."""
-        if name == "select_n":
-            cases = given[1:]
-            if not all(isinstance(v, _Fixed) for v in cases):
-                return False
-            values = [v.get() for v in cases]
-            if not _tree.is_concrete(values):
-                return True
-            return any(not np.array_equal(v, values[0]) for v in values[1:])
-        return name in ("convert_element_type", "sign")
-
-    def _operands(self, given: list[Any]) -> list[Any]:
-        return [_Lazy(partial(self._value, v)) for v in given if v is not _OTHER]
 
     def _refuse(self, pending: tuple) -> None:
         for operands, place in pending:
@@ -232,6 +171,106 @@ class _Reader:
             real = [v for v in values if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
             if not _tree.is_concrete(real):
                 self.found.append(_undifferentiated(place)(*real))
+
+
+def _is_variable(v: Any) -> bool:
+    return isinstance(v, _Lines | _OfTime) or v is _OTHER
+
+
+def _wrapped(v: Any) -> Any:
+    return v if isinstance(v, _Fixed) or _is_variable(v) else _fixed(v)
+
+
+def _value(v: Any) -> Any:
+    return v.value.get() if isinstance(v, _OfTime) else v.get()
+
+
+def _operands(given: list[Any]) -> list[_Lazy]:
+    return [_Lazy(partial(_value, v)) for v in given if v is not _OTHER]
+
+
+def _lazily(eqn: Any, given: list[Any], kind: Callable[..., Any]) -> list[Any]:
+    every = _Lazy(lambda: _done(eqn, list(map(_value, given))))
+    return [kind(lambda k=k: every.get()[k]) for k in range(len(eqn.outvars))]
+
+
+def _lazily_fixed(eqn: Any, given: list[Any]) -> list[Any]:
+    return _lazily(eqn, list(map(_wrapped, given)), _Fixed)
+
+
+def _jumps(name: str, given: list[Any]) -> bool:
+    """Whether what is decided so is surely not continuous."""
+    if name == "select_n":
+        cases = given[1:]
+        if not all(isinstance(v, _Fixed) for v in cases):
+            return False
+        values = [v.get() for v in cases]
+        if not _tree.is_concrete(values):
+            return True
+        return any(not np.array_equal(v, values[0]) for v in values[1:])
+    return name in ("convert_element_type", "sign")
+
+
+# The lines that a result is made of; None where it is not made of lines.
+
+_Some = list[_Line] | None
+
+
+def _sum(eqn: Any, given: list[Any]) -> _Some:
+    first, second = map(_as_lines, given)
+    if first is None or second is None:
+        return None
+    return [_both(partial(_one, eqn), p, q) for p in first for q in second]
+
+
+def _linear(eqn: Any, given: list[Any]) -> _Some:
+    if not isinstance(given[0], _Lines) or not is_real(eqn.outvars[0].aval):
+        return None
+    return [_both(partial(_one, eqn), line) for line in given[0].lines]
+
+
+def _multiple(eqn: Any, given: list[Any]) -> _Some:
+    first, second = given
+    if isinstance(first, _Lines) and isinstance(second, _Fixed):
+        return [_both(lambda v: _one(eqn, v, second.get()), line) for line in first.lines]
+    if eqn.primitive.name == "mul" and isinstance(second, _Lines) and isinstance(first, _Fixed):
+        return [_both(lambda v: _one(eqn, first.get(), v), line) for line in second.lines]
+    return None
+
+
+def _modulus(eqn: Any, given: list[Any]) -> _Some:
+    if not isinstance(given[0], _Lines):
+        return None
+    lines = given[0].lines
+    return [*lines, *(_both(jnp.negative, line) for line in lines)]
+
+
+def _one_of(eqn: Any, given: list[Any]) -> _Some:
+    out = eqn.outvars[0].aval
+    over = lambda v: jnp.broadcast_to(v, out.shape)  # noqa: E731
+    each = [lines for v in given if (lines := _as_lines(v)) is not None]
+    if not is_real(out) or len(each) != len(given):
+        return None
+    return [_both(over, line) for lines in each for line in lines]
+
+
+def _no_lines(eqn: Any, given: list[Any]) -> None:
+    """Of a comparison, which has its crossings; and of a table, which announces its knots."""
+
+
+RULES: dict[str, Rule] = {
+    **same_for({"add", "sub", "add_any"}, _sum),
+    **same_for(REARRANGING | {"reduce_precision", "neg", "convert_element_type"}, _linear),
+    **same_for({"mul", "div"}, _multiple),
+    **same_for({"max", "min", "clamp"}, _one_of),
+    "abs": _modulus,
+    "select_n": lambda eqn, given: _one_of(eqn, given[1:]),
+    **same_for(ORDERING | {"sign", "searchsorted"}, _no_lines),
+    **same_for(TABLES | {"dvax_standing", "dvax_evaluate"}, _no_lines),
+}
+
+_FLAGS = ORDERING | LOGICAL | REARRANGING | {"eq", "ne", "reduce_precision"}
+"""Operations whose results remember the comparisons that are not resolved."""
 
 
 def _is_check(cases: list[Any]) -> bool:
@@ -279,7 +318,7 @@ def _dependence(v: Any) -> set[str]:
     return {"t"} if isinstance(v, _Lines | _OfTime) else set()
 
 
-def _tainted(program: ClosedJaxpr, given: list[set[str]]) -> tuple[bool, list[set[str]]]:
+def _tainted(program: Any, given: list[set[str]]) -> tuple[bool, list[set[str]]]:
     """(whether a comparison of time alone is in it, what the outputs depend on)."""
     known: dict[Any, set[str]] = dict(zip(program.jaxpr.invars, given, strict=True))
     of = lambda v: set() if isinstance(v, Literal) else known.get(v, set())  # noqa: E731
@@ -287,9 +326,8 @@ def _tainted(program: ClosedJaxpr, given: list[set[str]]) -> tuple[bool, list[se
     for eqn in program.jaxpr.eqns:
         depends = set().union(*map(of, eqn.invars))
         name = eqn.primitive.name
-        found |= name in _COMPARE | _STEPS and depends == {"t"}
-        inner = inner_jaxpr(eqn.params) if name in CALLS or name in CUSTOM else None
-        if inner is not None and len(inner.jaxpr.invars) == len(eqn.invars):
+        found |= name in ORDERING | _STEPS and depends == {"t"}
+        if (inner := inner_program(eqn)) is not None:
             found |= _tainted(inner, list(map(of, eqn.invars)))[0]
         known |= dict.fromkeys(eqn.outvars, depends)
     return found, list(map(of, program.jaxpr.outvars))
@@ -326,8 +364,12 @@ def _done(eqn: Any, given: list[Any]) -> list[Any]:
     """One operation; on known numbers at once, also within a program that is being traced."""
     if _tree.is_concrete(given):
         with jax.ensure_compile_time_eval():
-            return bound(eqn, given)
-    return bound(eqn, given)
+            return bind(eqn, given)
+    return bind(eqn, given)
+
+
+def _one(eqn: Any, *given: Any) -> Any:
+    return _done(eqn, list(given))[0]
 
 
 def _as_lines(v: Any) -> list[_Line] | None:

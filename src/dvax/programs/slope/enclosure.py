@@ -11,6 +11,7 @@ and it is a proof, up to the rounding of its own arithmetic. Where an operation 
 jump, the derivative is enclosed by (−∞, ∞): nothing is known, and nothing is claimed.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -19,26 +20,25 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.extend.core import ClosedJaxpr
 
-from .._tree import Tree
-from ..vi.structure import CALLS, CUSTOM, evaluate, inner_jaxpr
-from .slope import Part, Slope, interval, is_slope, nothing
-from .slope_entrywise import ENTRYWISE
-from .slope_moves import MOVING, split
-from .slope_tables import TABLES
+from ..._tree import Tree
+from ..interpreter import Domain, Rule, interpret
+from .rules_elementwise import ELEMENTWISE
+from .rules_structural import STRUCTURAL
+from .rules_tables import TABLES
+from .values import MOST, Part, Slope, TooLarge, entries, interval, is_slope
 
-_RULES = {**ENTRYWISE, **MOVING}
+RULES: dict[str, Rule] = {**ELEMENTWISE, **STRUCTURAL, **TABLES}
 
 
-class Enclosed(NamedTuple):
+class EnclosedSlopes(NamedTuple):
     """The slopes of a function's outputs, and the operations that nothing is known about."""
 
     out: Tree
     unknown: tuple[str, ...]
 
 
-class Enclosure:
+class SlopeEnclosure:
     """fn over regions: traced once, enclosed as often as a region is cut into pieces.
 
     **Arguments:** `fn`; `likes`, its arguments or their shapes; `wrt`, by which of them it is
@@ -49,11 +49,11 @@ class Enclosure:
         shaped = jtu.tree_map(
             lambda v: jax.ShapeDtypeStruct(jnp.shape(v), jnp.result_type(float)), list(likes)
         )
-        self._traced, shape = jax.make_jaxpr(fn, return_shape=True)(*shaped)
+        self._program, shape = jax.make_jaxpr(fn, return_shape=True)(*shaped)
         self._output = jtu.tree_structure(shape)
         self._wrt = [i in wrt for i, like in enumerate(likes) for _ in jtu.tree_leaves(like)]
 
-    def __call__(self, *args: Tree) -> Enclosed:
+    def __call__(self, *args: Tree) -> EnclosedSlopes:
         """The enclosure for these arguments, trees of intervals.
 
         **Raises:** `TooLarge`.
@@ -66,33 +66,36 @@ class Enclosure:
             k += differentiated
         unknown: list[str] = []
         with np.errstate(all="ignore"):
-            results = _interpret(self._traced, inputs, unknown)
+            domain = Domain(RULES, is_slope, partial(_unknown, unknown), _apply)
+            results = interpret(self._program, inputs, domain)
         whole = [r if is_slope(r) else interval(np.asarray(r), np.asarray(r)) for r in results]
-        return Enclosed(self._output.unflatten(whole), tuple(dict.fromkeys(unknown)))
+        return EnclosedSlopes(self._output.unflatten(whole), tuple(dict.fromkeys(unknown)))
 
 
-def _interpret(traced: ClosedJaxpr, inputs: list[Any], unknown: list[str]) -> list[Any]:
-    return evaluate(traced, inputs, is_slope, partial(_apply, unknown))
+def _apply(rule: Rule, eqn: Any, given: list[Any]) -> list[Any] | None:
+    found = rule(eqn, given)
+    if found is None:
+        return None
+    return [_settled(_sane(x)) for x in (found if isinstance(found, list) else [found])]
 
 
-def _apply(unknown: list[str], eqn: Any, given: list[Any]) -> list[Any]:
-    name = eqn.primitive.name
-    table = TABLES.get(eqn.params.get("name", "")) if name in CALLS else None
-    result = None if table is None else table(eqn, given)
-    if result is not None:
-        return [_sane(result)]
-    if name in CALLS or name in CUSTOM:
-        inner = inner_jaxpr(eqn.params)
-        if inner is not None and len(inner.jaxpr.invars) == len(given):
-            return _interpret(inner, given, unknown)
-    if name == "split":
-        return [_settled(_sane(piece)) for piece in split(eqn, given)]
-    rule = _RULES.get(name)
-    result = None if rule is None else rule(eqn, given)
-    if result is None:
-        unknown.append(name)
-        return [nothing(given, out.aval) for out in eqn.outvars]
-    return [_settled(_sane(result))]
+def _unknown(names: list[str], eqn: Any, given: list[Any]) -> list[Slope]:
+    """What an operation without a rule leaves: anything, from everything that went in."""
+    names.append(eqn.primitive.name)
+    return [_anything(given, out.aval) for out in eqn.outvars]
+
+
+def _anything(given: list[Any], aval: Any) -> Slope:
+    parts = {}
+    for value in filter(is_slope, given):
+        for k, part in value.parts.items():
+            if entries(part) * math.prod(aval.shape) > MOST:
+                raise TooLarge
+            shape = (entries(part), *aval.shape)
+            parts[k] = Part(np.zeros(shape), np.full(shape, np.inf), True)
+    if np.issubdtype(aval.dtype, np.bool_):
+        return Slope(np.zeros(aval.shape, bool), np.ones(aval.shape, bool), parts)
+    return Slope(np.full(aval.shape, -np.inf), np.full(aval.shape, np.inf), parts)
 
 
 def _settled(x: Slope) -> Any:

@@ -132,7 +132,9 @@ def test_a_jump_that_cannot_be_read_refuses_the_derivative_of_its_time():
         args = {"a": a, "level": level}
         return dvax.solve(case, START, 0.0, END, args, dt=0.1, max_steps=64).xs[-1]
 
-    with pytest.raises(dvax.DifferentiationError, match=r"not affine in t.*test_switches.*t < a"):
+    with pytest.raises(
+        dvax.DifferentiationError, match=r"not affine in t.*test_switching_times.*t < a"
+    ):
         jax.grad(end)(0.5, 1.0)
     # What has nothing to do with the time of the jump is differentiated as ever.
     assert np.isfinite(jax.grad(end, 1)(0.5, 1.0))

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import dvax
-from dvax.theory.enclosure import Enclosure
-from dvax.theory.slope import TooLarge, interval
+from dvax.programs.slope import SlopeEnclosure, TooLarge, interval
 
 M = jnp.asarray(np.random.default_rng(0).normal(size=(3, 3)))
 
@@ -54,7 +53,7 @@ FUNCTIONS = {
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_values_and_difference_quotients_are_enclosed(name):
     fn, (low, high) = FUNCTIONS[name]
-    enclosure = Enclosure(fn, (jnp.zeros(3),), (0,))
+    enclosure = SlopeEnclosure(fn, (jnp.zeros(3),), (0,))
     rng = np.random.default_rng(1)
     both = jax.jit(jax.vmap(fn))
     for _ in range(30):
@@ -95,19 +94,19 @@ def test_values_and_difference_quotients_are_enclosed(name):
     ],
 )
 def test_what_may_jump_or_has_no_rule_is_not_bounded(fn):
-    out, _ = Enclosure(fn, (jnp.zeros(3),), (0,))(interval(-np.ones(3), np.ones(3)))
+    out, _ = SlopeEnclosure(fn, (jnp.zeros(3),), (0,))(interval(-np.ones(3), np.ones(3)))
     assert np.isinf(out.parts[0].radius).any()
 
 
 def test_an_operation_without_a_rule_is_named():
-    enclosed = Enclosure(jnp.sort, (jnp.zeros(3),), (0,))(interval(-np.ones(3), np.ones(3)))
+    enclosed = SlopeEnclosure(jnp.sort, (jnp.zeros(3),), (0,))(interval(-np.ones(3), np.ones(3)))
     assert enclosed.unknown == ("sort",)
 
 
 def test_what_is_not_differentiated_leaves_no_trace():
     load = jnp.linspace(0.0, 1.0, 11)
     fn = lambda t, v: v * 2.0 + jnp.interp(t, load, load**2)  # noqa: E731
-    out, unknown = Enclosure(fn, (jnp.zeros(()), jnp.zeros(3)), (1,))(
+    out, unknown = SlopeEnclosure(fn, (jnp.zeros(()), jnp.zeros(3)), (1,))(
         interval(0.0, 1.0), interval(-np.inf * np.ones(3), np.inf * np.ones(3))
     )
     assert unknown and out.parts[0].radius.max() == 0.0 and np.all(out.parts[0].center == 2.0)
@@ -115,7 +114,7 @@ def test_what_is_not_differentiated_leaves_no_trace():
 
 def test_affine_functions_of_everything_are_exact():
     everywhere = interval(np.full(3, -np.inf), np.full(3, np.inf))
-    out, _ = Enclosure(lambda v: M @ v[::-1] + 1.0, (jnp.zeros(3),), (0,))(everywhere)
+    out, _ = SlopeEnclosure(lambda v: M @ v[::-1] + 1.0, (jnp.zeros(3),), (0,))(everywhere)
     assert not out.parts[0].radius.any()
     np.testing.assert_array_equal(out.parts[0].center.T, np.asarray(M)[:, ::-1])
 
@@ -125,17 +124,17 @@ def test_a_pointwise_law_on_many_points_needs_no_matrix():
     everywhere = interval(np.full(n, -np.inf), np.full(n, np.inf))
     g = jnp.linspace(0.0, 1.0, n)
     fn = lambda v: jnp.tanh(g * v) - jnp.clip(v, 0.0, 1.0)  # noqa: E731
-    part = Enclosure(fn, (jnp.zeros(n),), (0,))(everywhere).out.parts[0]
+    part = SlopeEnclosure(fn, (jnp.zeros(n),), (0,))(everywhere).out.parts[0]
     assert not part.full
     assert (part.center + part.radius).max() == pytest.approx(1.0)
     assert (part.center - part.radius).min() == pytest.approx(-1.0)
     with pytest.raises(TooLarge):
-        Enclosure(lambda v: v - jnp.sum(v), (jnp.zeros(n),), (0,))(everywhere)
+        SlopeEnclosure(lambda v: v - jnp.sum(v), (jnp.zeros(n),), (0,))(everywhere)
 
 
 def test_pieces_of_a_region_sharpen_what_is_known_of_it():
     fn = lambda v: v * (1.0 - v)  # noqa: E731
-    enclosure = Enclosure(fn, (jnp.zeros(()),), (0,))
+    enclosure = SlopeEnclosure(fn, (jnp.zeros(()),), (0,))
     whole = enclosure(interval(0.0, 1.0)).out
     halves = [enclosure(interval(a, a + 0.5)).out for a in (0.0, 0.5)]
     assert whole.high == pytest.approx(1.0)
@@ -149,7 +148,7 @@ def test_tables_are_enclosed_over_any_stretch_of_time(kind, shape):
     rng = np.random.default_rng(4)
     times = np.sort(rng.uniform(0.0, 3.0, 12))
     table = dvax.signals.Table(times, rng.normal(size=(12, *shape)), kind=kind)
-    enclosure = Enclosure(table.value, (jnp.zeros(()),), (0,))
+    enclosure = SlopeEnclosure(table.value, (jnp.zeros(()),), (0,))
     at = jax.jit(jax.vmap(table.value))
     steady = 0
     for _ in range(60):

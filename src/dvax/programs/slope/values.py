@@ -52,22 +52,47 @@ def is_slope(value: Any) -> bool:
 
 
 def columns(part: Part, size: int) -> Part:
-    """The part as a full one: an axis over the `size` entries of v in front."""
+    """The part as a full one: an axis over the entries of v in front. `size` is that of the largest
+    array that it, or what is made of it, is a derivative of.
+
+    **Raises:** `TooLarge`.
+    """
+    if entries(part) * size > MOST:
+        raise TooLarge
     if part.full:
         return part
-    shape = part.center.shape
-    if size * size > MOST:
-        raise TooLarge
-    spread = lambda v: np.diag(v.ravel()).reshape(size, *shape)  # noqa: E731
+    shape = (entries(part), *part.center.shape)
+    spread = lambda v: np.diag(v.ravel()).reshape(shape)  # noqa: E731
     return Part(spread(part.center), spread(part.radius), True)
+
+
+def entries(part: Part) -> int:
+    """How many entries v has."""
+    return part.center.shape[0] if part.full else part.center.size
 
 
 def mapped(parts: dict[int, Part], fn: Callable[[Part], Part]) -> dict[int, Part]:
     return {k: fn(part) for k, part in parts.items()}
 
 
-def entries(part: Part) -> int:
-    return part.center.shape[0] if part.full else part.center.size
+def together(slopes: list[Slope], full: bool = False, size: int = 0) -> dict[int, list[Part]]:
+    """For every array that one of the slopes depends on, the parts of all of them, zero where there is
+    no dependence, and all diagonal or all full (always full where asked for, for results of this size).
+    """
+    found = {}
+    for k in {k: None for x in slopes for k in x.parts}:
+        given = [x.parts.get(k) for x in slopes]
+        first = next(part for part in given if part is not None)
+        wide = full or any(part is not None and part.full for part in given)
+        parts = []
+        for x, part in zip(slopes, given, strict=True):
+            if part is None:
+                shape = np.shape(x.low)
+                blank = np.zeros((entries(first), *shape) if wide else shape)
+                part = Part(blank, blank, wide)
+            parts.append(columns(part, max(size, np.size(x.low))) if wide else part)
+        found[k] = parts
+    return found
 
 
 def product(a: Values, b: Values) -> Values:
@@ -86,24 +111,16 @@ def scaled(part: Part, low: Values, high: Values) -> Part:
     return Part(middle * part.center, radius, part.full)
 
 
-def plus(a: Part, b: Part, sign: float = 1.0) -> Part:
-    if a.full != b.full:
-        a, b = columns(a, entries(a)), columns(b, entries(b))
-    return Part(a.center + sign * b.center, a.radius + b.radius, a.full)
-
-
-def added(a: dict[int, Part], b: dict[int, Part], sign: float = 1.0) -> dict[int, Part]:
-    out = dict(a)
-    for k, part in b.items():
-        flipped = part._replace(center=sign * part.center)
-        out[k] = plus(a[k], part, sign) if k in a else flipped
-    return out
+def added(x: Slope, y: Slope, sign: float = 1.0) -> dict[int, Part]:
+    """The parts of x ± y."""
+    return {
+        k: Part(a.center + sign * b.center, a.radius + b.radius, a.full)
+        for k, (a, b) in together([x, y]).items()
+    }
 
 
 def hull(a: Part, b: Part) -> Part:
-    """Any derivative between two."""
-    if a.full != b.full:
-        a, b = columns(a, entries(a)), columns(b, entries(b))
+    """Any derivative between two of the same form."""
     low = np.minimum(a.center - a.radius, b.center - b.radius)
     high = np.maximum(a.center + a.radius, b.center + b.radius)
     return between(low, high, a.full)
@@ -116,20 +133,9 @@ def between(low: Values, high: Values, full: bool) -> Part:
     )
 
 
-def nothing(given: list[Any], aval: Any) -> Slope:
-    """What an operation without a rule leaves: anything, from everything that went in."""
-    size = math.prod(aval.shape)
-    low = np.full(aval.shape, -np.inf)
-    parts = {}
-    for value in given:
-        for k, part in value.parts.items() if is_slope(value) else ():
-            if entries(part) * size > MOST:
-                raise TooLarge
-            shape = (entries(part), *aval.shape)
-            parts[k] = Part(np.zeros(shape), np.full(shape, np.inf), True)
-    if np.issubdtype(aval.dtype, np.bool_):
-        return Slope(np.zeros(aval.shape, bool), np.ones(aval.shape, bool), parts)
-    return Slope(low, -low, parts)
+def negative(x: Slope) -> Slope:
+    """−x."""
+    return Slope(-x.high, -x.low, mapped(x.parts, lambda p: p._replace(center=-p.center)))
 
 
 def lift(value: Any, shape: tuple[int, ...]) -> Slope:
@@ -141,17 +147,17 @@ def lift(value: Any, shape: tuple[int, ...]) -> Slope:
         return value
     # Axes of length one are repeated; a scalar has all of them.
     padding = (1,) * (len(shape) - value.low.ndim)
-    parts = {}
-    for k, part in value.parts.items():
-        if entries(part) * math.prod(shape) > MOST:
-            raise TooLarge
-        full = columns(part, entries(part))
+
+    def repeated(part: Part) -> Part:
+        full = columns(part, math.prod(shape))
         center, radius = (
             np.broadcast_to(v.reshape((len(v), *padding, *v.shape[1:])), (len(v), *shape))
             for v in (full.center, full.radius)
         )
-        parts[k] = Part(center, radius, True)
-    return Slope(np.broadcast_to(value.low, shape), np.broadcast_to(value.high, shape), parts)
+        return Part(center, radius, True)
+
+    low, high = (np.broadcast_to(v, shape) for v in (value.low, value.high))
+    return Slope(low, high, mapped(value.parts, repeated))
 
 
 def touched(part: Part) -> Values:

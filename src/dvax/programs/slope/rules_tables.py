@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from .slope import Slope, Values, is_slope, lift, mapped, scaled
-from .slope_entrywise import Rule
+from ..interpreter import Rule
+from .values import Slope, Values, is_slope, lift, mapped, scaled
 
 
 def _linear(eqn: Any, given: list[Any]) -> Slope | None:

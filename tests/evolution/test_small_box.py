@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 import dvax
-from dvax.evolution.faces import faces, sides
-from dvax.evolution.medians import Medians
-from dvax.evolution.written import fits
+from dvax.evolution.small_box import Medians, faces, is_small, sides
 
 INF = np.inf
 
@@ -151,8 +149,8 @@ def test_a_law_without_a_solution_is_not_called_solved():
 
 
 def test_only_a_few_unknowns_are_written_out():
-    assert [fits(jnp.zeros(n)) for n in (1, 2, 4, 5)] == [False, True, True, False]
-    assert not fits((jnp.zeros(2), jnp.zeros(1)))
+    assert [is_small(jnp.zeros(n)) for n in (1, 2, 4, 5)] == [False, True, True, False]
+    assert not is_small((jnp.zeros(2), jnp.zeros(1)))
     assert sides(4).shape == (81, 4)
 
 

@@ -1,0 +1,108 @@
+"""How JAX represents a traced program: its operations, its inner programs and its loops.
+
+A traced program is a `ClosedJaxpr`: a list of equations, each of which applies a primitive to variables
+and literals, and the arrays that the traced function closes over.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+
+def _types() -> tuple[Any, ...]:
+    """Return the types of programs and of their parts, taken from a program that is traced here."""
+    program = jax.make_jaxpr(lambda v: v + 1.0)(1.0)
+    variable, literal = program.jaxpr.eqns[0].invars
+    return type(program), type(program.jaxpr), type(literal), type(variable)
+
+
+try:
+    from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var
+except ImportError:
+    ClosedJaxpr, Jaxpr, Literal, Var = _types()
+
+__all__ = ["ClosedJaxpr", "Jaxpr", "Literal", "Var"]
+
+CUSTOM = frozenset({"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"})
+"""Calls of a function with a derivative rule of its own."""
+
+CALLS = CUSTOM | {
+    "jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint",
+}  # fmt: skip
+"""Primitives that apply one inner program to their arguments."""
+
+
+def bind(eqn: Any, given: list[Any]) -> list[Any]:
+    """Return the results of one operation on these arrays."""
+    with eqn.ctx.manager:
+        found = eqn.primitive.bind(*given, **eqn.primitive.get_bind_params(eqn.params))
+    return list(found) if eqn.primitive.multiple_results else [found]
+
+
+def read(known: dict[Any, Any], atoms: Any) -> list[Any]:
+    """Return the values of variables and literals, given those of the variables."""
+    return [atom.val if isinstance(atom, Literal) else known[atom] for atom in atoms]
+
+
+def variables(atoms: Any) -> set[Any]:
+    """Return those that are not literals."""
+    return {atom for atom in atoms if isinstance(atom, Var)}
+
+
+def inner_program(eqn: Any) -> Any:
+    """Return the program that a call applies to its arguments; None for any other operation."""
+    if eqn.primitive.name not in CALLS:
+        return None
+    for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
+        inner = eqn.params.get(key)
+        # From JAX 0.12 on the two types are one, and a program holds its constants.
+        if isinstance(inner, Jaxpr) and not isinstance(inner, ClosedJaxpr):
+            inner = ClosedJaxpr(inner, ())
+        if isinstance(inner, ClosedJaxpr) and len(inner.jaxpr.invars) == len(eqn.invars):
+            return inner
+    return None
+
+
+def operation(eqn: Any) -> str:
+    """Return the name that rules know an operation by: that of its primitive, or of a called function
+    that dvax marks by its name ("dvax_..."), or "searchsorted"."""
+    name = eqn.params.get("name")
+    if isinstance(name, str) and (name.startswith("dvax_") or _is_search(eqn)):
+        return name
+    return eqn.primitive.name
+
+
+def scan_counts(params: dict[str, Any]) -> tuple[int, int] | None:
+    """Return how many arguments of a `lax.scan` are constant, and how many it carries; None where this
+    JAX represents it in another way."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    try:
+        fixed, carried, *_ = params["ft_in"].elts  # from JAX 0.12 on
+        counts = [len(list(part.vals)) for part in (fixed, carried)]
+    except (AttributeError, KeyError, TypeError, ValueError):
+        return None
+    return counts[0], counts[1]
+
+
+def _is_search(eqn: Any) -> bool:
+    """Whether a call is that of `jnp.searchsorted` for one number, as in `jnp.interp` and in a table
+    with steps: by its name and by its program, which is compared with that of JAX for these shapes."""
+    inner = eqn.params.get("jaxpr")
+    if eqn.params.get("name") != "searchsorted" or inner is None or len(eqn.invars) != 2:
+        return False
+    row, value = (
+        jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype, weak_type=v.aval.weak_type)
+        for v in eqn.invars
+    )
+    if len(row.shape) != 1:
+        return False
+    for side in ("left", "right"):
+        for method in ("scan", "scan_unrolled", "compare_all"):
+            search = partial(jnp.searchsorted, side=side, method=method)
+            own = jax.make_jaxpr(search)(row, value).jaxpr.eqns
+            if len(own) == 1 and str(own[0].params.get("jaxpr")) == str(inner):
+                return True
+    return False

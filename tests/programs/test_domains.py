@@ -1,0 +1,50 @@
+"""The tables of rules: documented, of operations that exist, and independent of one JAX interface."""
+
+import subprocess
+import sys
+
+import jax.extend.core.primitives as primitives
+from tests.programs.primitive_table import parts, table
+
+from dvax.programs import DOMAINS
+
+ELSEWHERE = {
+    # Operations that JAX does not list there, and those of releases other than this one.
+    "bcoo_dot_general", "copy_p", "custom_vjp_call_jaxpr", "expand_dims", "optimization_barrier",
+    "scatter_add", "searchsorted", "split", "stack",
+}  # fmt: skip
+
+
+def test_the_page_says_which_operation_is_known_to_which_domain():
+    assert parts()[1] == table(), "run: python -m tests.programs.primitive_table"
+
+
+def test_every_rule_is_of_an_operation_that_exists():
+    exist = {getattr(p, "name", None) for p in vars(primitives).values()} | ELSEWHERE
+    for domain, rules in DOMAINS.items():
+        wrong = {name for name in rules if not name.startswith("dvax_")} - exist
+        assert not wrong, (domain, wrong)
+
+
+WITHOUT = """
+import sys
+sys.modules["jax.extend.core"] = None
+import importlib.util
+import jax, jax.numpy as jnp
+spec = importlib.util.spec_from_file_location("jaxprs", sys.argv[1])
+jaxprs = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(jaxprs)
+program = jax.make_jaxpr(lambda v: jax.jit(lambda w: w + 2.0)(v))(1.0)
+assert isinstance(program, jaxprs.ClosedJaxpr) and isinstance(program.jaxpr, jaxprs.Jaxpr)
+inner = jaxprs.inner_program(program.jaxpr.eqns[0])
+variable, literal = inner.jaxpr.eqns[0].invars
+assert isinstance(variable, jaxprs.Var) and isinstance(literal, jaxprs.Literal)
+assert jaxprs.read({variable: 3.0}, [variable, literal]) == [3.0, 2.0]
+"""
+
+
+def test_programs_are_read_without_the_types_that_jax_exports():
+    from dvax._jax import jaxprs
+
+    done = subprocess.run([sys.executable, "-c", WITHOUT, jaxprs.__file__], capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()
