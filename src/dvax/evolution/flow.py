@@ -15,7 +15,7 @@ from ..generators.expanded import expanded
 from ..operators import AbstractOperator
 from ..problem import Problem
 from ..spaces import AbstractSpace
-from ..vi import RESULTS, AbstractSolver, Frozen
+from ..vi import RESULTS, AbstractSolver, FrozenVI
 from .chords import Chord, NoEnclosure, enclose, is_chord, largest, smallest
 from .linearised import AbstractLinear, split
 from .written import AbstractWritten
@@ -202,7 +202,7 @@ def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
     many places of a step ask for it."""
     problem, args = flow.problem, flow.args
     start = problem.zero_control(x) if guess is None else guess
-    vi = Frozen(
+    vi = FrozenVI(
         problem.frozen(t, x, args),
         problem.set_at(t, args),
         problem.spaces(x)[1],
