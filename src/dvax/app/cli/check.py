@@ -99,7 +99,7 @@ def _say_assumptions(known: "Sequence[Assumption]") -> None:
 
 def _complain_of_broken(known: "Sequence[Assumption]") -> bool:
     """Say which needed assumptions are refuted, and whether any is."""
-    broken = [row for row in known if row.needed and row.status == "refuted"]
+    broken = [row for row in known if row.is_required and row.status == "refuted"]
     for row in broken:
         complain(f"error: {row.label} does not hold ({row.statement}): {row.why}")
     return bool(broken)
