@@ -91,7 +91,7 @@ def _measure(
 
     @jax.jit
     def solve(c: Any, y0: Any) -> Any:
-        vi = dvax.vi.Frozen(lambda y: law.rule(y, c), dvax.sets.Box(law.lower, law.upper), space)
+        vi = dvax.vi.FrozenVI(lambda y: law.rule(y, c), dvax.sets.Box(law.lower, law.upper), space)
         answer = dvax.vi.Bracketing().solve(vi, y0, 0.0)
         solved = answer.result == dvax.vi.RESULTS.successful
         return answer.y, answer.evaluations, answer.residual, solved

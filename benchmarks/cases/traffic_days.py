@@ -9,7 +9,7 @@ import numpy as np
 
 import dvax
 from dvax.models.traffic import Traffic
-from dvax.vi import Accelerated, Frozen
+from dvax.vi import Accelerated, FrozenVI
 
 from ..section import Section, Table, compare
 from .traffic import networks
@@ -75,7 +75,7 @@ def _laws(
     space = problem.spaces(solution.xs[0])[1]
 
     def solved(x, guess, tol, solver):
-        vi = Frozen(problem.frozen(0.0, x), problem.set_at(0.0), space, 1.0, model.constants.L_F)
+        vi = FrozenVI(problem.frozen(0.0, x), problem.set_at(0.0), space, 1.0, model.constants.L_F)
         return solver.solve(vi, guess, tol)
 
     ways = {

@@ -19,8 +19,8 @@ from .programs.switching_times import switching_times
 from .sets import AbstractSet
 from .signals import listen
 from .spaces import AbstractSpace
-from .vi import AbstractSolver, Answer, Auto, Frozen, default_space
-from .vi.arguments import wrong_solver
+from .vi import AbstractSolver, Answer, Auto, FrozenVI, default_space
+from .vi.arguments import solver_problems
 from .vi.outcome import unless_failed
 
 
@@ -168,12 +168,12 @@ class Problem(eqx.Module):
     def _law(
         self, t: Any, x: Tree, args: Any, solver: Any, y0: Any = None, tol: Any = 1e-10,
         gamma: Any = None, L_F: Any = None,
-    ) -> tuple[Frozen, Answer]:  # fmt: skip
-        if wrong := wrong_solver("solver", solver):
+    ) -> tuple[FrozenVI, Answer]:  # fmt: skip
+        if wrong := solver_problems("solver", solver):
             raise InputError(*wrong)
         space = self.spaces(x)[1]
         guess = self.zero_control(x) if y0 is None else y0
-        vi = Frozen(self.frozen(t, x, args), self.set_at(t, args), space, gamma, L_F)
+        vi = FrozenVI(self.frozen(t, x, args), self.set_at(t, args), space, gamma, L_F)
         return vi, (Auto() if solver is None else solver).solve(vi, guess, tol)
 
     def response(

@@ -12,7 +12,7 @@ from tests.selection import mostly_thorough
 import dvax
 from dvax.models import traffic
 from dvax.models.traffic import law
-from dvax.vi import RESULTS, Accelerated, Frozen
+from dvax.vi import RESULTS, Accelerated, FrozenVI
 
 SHAPES = {
     "square": dict(rows=5, columns=5, zones=8, pairs=30, load=3e4, seed=1),
@@ -40,7 +40,7 @@ def test_the_law_agrees_with_accelerated_gradients(shape, factor, share):
 
     def solved(x, solver, tol):
         space = problem.spaces(x)[1]
-        vi = Frozen(problem.frozen(0.0, x), problem.set_at(0.0), space, 1.0, model.constants.L_F)
+        vi = FrozenVI(problem.frozen(0.0, x), problem.set_at(0.0), space, 1.0, model.constants.L_F)
         return solver.solve(vi, x, tol)
 
     ours = jax.jit(lambda x: solved(x, newton, 0.0))

@@ -23,7 +23,7 @@ def inspect(seed):
 
 def _check(seed):
     made, check = inspect(seed)
-    needed = {row.label: row for row in check.assumptions if row.needed}
+    needed = {row.label: row for row in check.assumptions if row.is_required}
     if made.broken is None:
         assert check.status == "proved", check.table()
         assert check.constants is not None

@@ -7,7 +7,7 @@ import pytest
 
 import dvax
 from dvax.sets import Ball, Box
-from dvax.vi import RESULTS, Frozen, Weighted, refute_gamma
+from dvax.vi import RESULTS, FrozenVI, Weighted, refute_gamma
 from dvax.vi.refute import _least_moduli
 
 END = 3 * np.pi / 2
@@ -112,7 +112,7 @@ def _check_true_moduli(cases, seed):
         F, true, points = _random_case(key)
         out = []
         for K in (Box(-1.0, 1.0), dvax.sets.WholeSpace(), Ball(0.0, 2.0)):
-            vi = Frozen(F, K, dvax.spaces.Euclidean(3))
+            vi = FrozenVI(F, K, dvax.spaces.Euclidean(3))
             out += [found[2] / true for found in _least_moduli(vi, points, true)]
         return jnp.stack(out)
 

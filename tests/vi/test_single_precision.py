@@ -12,7 +12,7 @@ from dvax.sets import Box
 from dvax.vi import (
     Auto,
     Bracketing,
-    Closed,
+    ClosedForm,
     Extragradient,
     ForwardBackwardForward,
     GoldenRatio,
@@ -40,7 +40,7 @@ SOLVERS = {
     "forward-backward-forward": (ForwardBackwardForward(), mixing),
     "golden ratio": (GoldenRatio(), mixing), "projection": (Projection(), mixing),
     "auto": (Auto(), mixing), "bracketing": (Bracketing(), pointwise),
-    "closed": (Closed(), isotropic),
+    "closed": (ClosedForm(), isotropic),
 }  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from dvax.vi import (
     ActiveSet,
     Auto,
     Bracketing,
-    Closed,
+    ClosedForm,
     Extragradient,
     ForwardBackwardForward,
     GoldenRatio,
@@ -160,14 +160,14 @@ def test_auto_chooses_by_what_is_proved():
     assert choose(lambda y: y**3, Box(0.0, 1.0)) is Bracketing
     assert choose(lambda y: y**3 + y[::-1], Box(0.0, 1.0)) is ActiveSet
     assert choose(lambda y: y**3, Ball(0.0, 1.0)) is SemismoothNewton
-    assert choose(lambda y: 3.0 * y - 1.0, Ball(0.0, 1.0)) is Closed
+    assert choose(lambda y: 3.0 * y - 1.0, Ball(0.0, 1.0)) is ClosedForm
     large = jnp.zeros(5000)
     assert isinstance(Auto().choose(lambda y: y**3 + y[::-1], Box(0.0, 1.0), large), GoldenRatio)
 
 
 def test_the_closed_form_is_refused_where_it_does_not_hold():
     with pytest.raises(dvax.InputError, match="one number a"):
-        solve(lambda y: y**3, Ball(0.0, 1.0), [0.0, 0.0], solver=Closed())
+        solve(lambda y: y**3, Ball(0.0, 1.0), [0.0, 0.0], solver=ClosedForm())
 
 
 def test_an_isotropic_law_is_a_projection_for_every_set():

@@ -23,7 +23,7 @@ from ..programs.enclosure import (
     smallest,
 )
 from ..spaces import AbstractSpace
-from ..vi import RESULTS, AbstractSolver, Frozen
+from ..vi import RESULTS, AbstractSolver, FrozenVI
 from .linearised import AbstractLinear, split
 from .small_box import AbstractSmallBox
 
@@ -211,7 +211,7 @@ def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
     many places of a step ask for it."""
     problem, args = flow.problem, flow.args
     start = problem.zero_control(x) if guess is None else guess
-    vi = Frozen(
+    vi = FrozenVI(
         problem.frozen(t, x, args),
         problem.set_at(t, args),
         problem.spaces(x)[1],

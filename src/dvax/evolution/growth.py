@@ -19,7 +19,7 @@ def gronwall(
 ) -> jax.Array:
     """M e^{ct} e₀ + M ∫ e^{c(t−s)} dI(s), from the impulse I known at the saved times only.
 
-    `completed` is what the steps that had ended by then brought, `integrated` has the one under way as well.
+    `completed` is I over the steps that had ended by then; `integrated` includes the step under way.
     An ended step acted at any moment since the saved time before it began, so it is charged e^{c₊Δ}
     over the time from there to its end; the step under way is charged in the same way, and for that
     one saved time alone: nothing says how much of it had acted.

@@ -24,12 +24,12 @@ class Record(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """The state at a saved time, and what has disturbed it.
+    """The state at a saved time, and the defects up to it.
 
-    `integrated_defect` = (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) up to the end of the step that the time lies in, so
-    that x_h is the exact solution of the system with a disturbance of that size; `completed_defect` is what
-    both were at the start of that step: what has surely acted by then. `extent` says where x_h and u_h
-    have been from the beginning to the end of that step, where it was asked for. None where nothing
+    `integrated_defect` = (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) up to the end of the step that the time lies
+    in: x_h is the exact solution of the system with a disturbance of that size. `completed_defect` is
+    the same up to the start of that step. `extent` holds the bounds of x_h and u_h from t0 to the end
+    of that step, where they are tracked. None where nothing
     is measured. `guess` is where the solver of the law may begin.
     """
 

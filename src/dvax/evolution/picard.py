@@ -229,7 +229,8 @@ class Run(eqx.Module):
         old = (a, state.x, state.last, state.before, state.integrated_defect, state.extent)
         t, x, record, before, integrated_defect, extent = _tree.where(kept, new, old)
         return State(
-            t, x, length, jnp.minimum(reached, last), record, before, integrated_defect, extent, records,
+            t, x, length, jnp.minimum(reached, last), record, before, integrated_defect, extent,
+            records,
             jnp.where(kept, state.steps + many, state.steps), state.windows + 1,
             jnp.where(kept, state.refused, state.refused + many), state.sweeps + window.sweeps,
             jnp.maximum(state.contraction, jnp.where(kept, window.contraction, 0.0)),

@@ -250,8 +250,8 @@ class Stepper(eqx.Module):
         counts = [one.rate.evaluations for one in evaluations]
         own = counts[0] if kept is None else jnp.where(jumped, counts[0], 0)
         return Step(
-            x1, c, error, integrated_defect, event, excursion, extent, after, first.solved, solved, finite,
-            sum(counts[1:], own),
+            x1, c, error, integrated_defect, event, excursion, extent, after, first.solved, solved,
+            finite, sum(counts[1:], own),
         )  # fmt: skip
 
     def _local(

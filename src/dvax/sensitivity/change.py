@@ -160,7 +160,7 @@ def _covers(bounds: ParameterBounds, t0: float, t1: float, each: tuple, starts: 
         room = 1e-12 * max(abs(made.t0), abs(made.t1), 1.0)
         if t0 < made.t0 - room or t1 > made.t1 + room:
             wrong.append((f"times [{made.t0:g}, {made.t1:g}]", f"the run is on [{t0:g}, {t1:g}]"))
-        if not all(made.holds(args) for args in each):
+        if not all(made.contains(args) for args in each):
             wrong.append(("a box of parameters", "one of the two parameters is outside it"))
         if made.start_radius is not None and not max(map(float, starts)) <= made.start_radius:
             norms = " and ".join(f"{float(v):.6g}" for v in starts)

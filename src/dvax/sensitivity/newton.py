@@ -8,7 +8,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from .._tree import Tree
-from ..vi import RESULTS, AbstractSolver, Answer, Frozen
+from ..vi import RESULTS, AbstractSolver, Answer, FrozenVI
 
 _MOST = 50
 
@@ -28,7 +28,7 @@ class OneSided(AbstractSolver):
     from there: Π' belongs to τ = 1. A matrix as large as the response is formed.
     """
 
-    def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
+    def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
         start, back = ravel_pytree(y0)
         F = lambda v: ravel_pytree(vi.F(back(v)))[0]  # noqa: E731
         project = lambda v: ravel_pytree(vi.K.project(back(v), vi.space))[0]  # noqa: E731

@@ -1,7 +1,7 @@
-"""The theory as software: constants, stability, the a-posteriori certificate."""
+"""The theory of the paper in code: constants, stability, the a-posteriori error certificate."""
 
 from . import formulas as formulas
-from .assumption import Assumption as Assumption
+from .assumptions import Assumption as Assumption
 from .certificate import Bound as Bound
 from .certificate import bound_error as bound_error
 from .constants import Constants as Constants

@@ -1,4 +1,4 @@
-"""Derivatives as matrices in the norms of their spaces, many small ones where a law is pointwise."""
+"""Derivatives as matrices in the norms of their spaces; for pointwise laws, a stack of small ones."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,16 +9,16 @@ import numpy as np
 from .._tree import Tree
 from ..programs.slope import MOST, Part, Slope, TooLarge, Values, columns, is_slope
 
-_DENSE = 2_000
-"""Up to so many rows or columns singular values are computed."""
+_MAX_DENSE_SIZE = 2_000
+"""Largest number of rows or columns for which singular values are computed."""
 
 
 class Block(NamedTuple):
-    """W_q^{1/2} (∂q/∂v) W_v^{-1/2}, W the weights of the spaces, within `radius` of `center`: its
-    Euclidean norm is that from the one space to the other, and its transpose is the adjoint.
+    """W_q^{1/2} (∂q/∂v) W_v^{-1/2} with the weights W of the spaces, as `center` ± `radius`.
 
-    A stack of matrices, shape (points, rows, columns): one matrix, or where entries at different
-    points do not meet, one a point.
+    Its Euclidean norm is the operator norm between the spaces, and its transpose is the adjoint. It is
+    a stack of matrices of shape (points, rows, columns): a single matrix, or one per point if entries
+    at different points are not coupled.
     """
 
     center: Values
@@ -30,61 +30,58 @@ class Block(NamedTuple):
 
     @property
     def exact(self) -> bool:
+        """Whether every radius is 0."""
         return not self.radius.any()
 
     def __matmul__(self, other: "Block") -> "Block":
-        a, b = alike(self, other)
+        a, b = with_equal_counts(self, other)
         radius = _dot(np.abs(a.center), b.radius) + _dot(a.radius, np.abs(b.center) + b.radius)
         return Block(a.center @ b.center, radius)
 
     def plus(self, other: "Block", sign: float = 1.0) -> "Block":
-        a, b = alike(self, other)
+        a, b = with_equal_counts(self, other)
         return Block(a.center + sign * b.center, a.radius + b.radius)
 
     def times(self, factor: float) -> "Block":
         return Block(factor * self.center, abs(factor) * self.radius)
 
     def norm(self) -> float:
-        """sup ‖·‖ over all that lie within the radius: ‖Δ‖₂ ≤ ‖|Δ|‖₂ ≤ ‖radius‖₂."""
-        return float(np.max(_norms(self.center) + self.slack(), initial=0.0))
+        """Return sup ‖·‖ over the enclosed matrices, with ‖Δ‖₂ ≤ ‖|Δ|‖₂ ≤ ‖radius‖₂."""
+        return float(np.max(_norms(self.center) + self.radius_norms(), initial=0.0))
 
-    def slack(self) -> Values:
-        """‖radius‖ of every matrix."""
+    def radius_norms(self) -> Values:
+        """Return ‖radius‖ of every matrix."""
         return _norms(self.radius)
 
-    def least(self) -> float:
-        """inf ⟨Jd, d⟩/‖d‖²: the least eigenvalue of the symmetric part."""
+    def smallest_quotient(self) -> float:
+        """Return inf ⟨Jd, d⟩/‖d‖², the smallest eigenvalue of the symmetric part."""
         sym = 0.5 * (self.center + self.center.swapaxes(1, 2))
-        spread = _norms(0.5 * (self.radius + self.radius.swapaxes(1, 2)))
-        return float(np.min(eigenvalues(sym)[:, 0] - spread, initial=np.inf))
-
-    def greatest(self) -> float:
-        """sup ⟨Jd, d⟩/‖d‖²."""
-        return -self.times(-1.0).least()
+        radius = _norms(0.5 * (self.radius + self.radius.swapaxes(1, 2)))
+        return float(np.min(eigenvalues(sym)[:, 0] - radius, initial=np.inf))
 
 
 def identity(like: Block) -> Block:
-    """The identity among matrices like these."""
+    """Return the identity as a stack shaped like `like`."""
     points, rows, _ = like.center.shape
     eye = np.broadcast_to(np.eye(rows), (points, rows, rows))
     return Block(eye, np.zeros_like(eye))
 
 
-def alike(a: Block, b: Block) -> tuple[Block, Block]:
-    """Two stacks as stacks of one length."""
+def with_equal_counts(a: Block, b: Block) -> tuple[Block, Block]:
+    """Return two stacks with the same number of matrices."""
     if len(a.center) == len(b.center):
         return a, b
     if len(a.center) == 1 or len(b.center) == 1:
-        return spread_out(a), spread_out(b)
+        return as_one_matrix(a), as_one_matrix(b)
     raise TooLarge
 
 
-def spread_out(a: Block) -> Block:
-    """One large matrix from a stack of small ones. Entry i of part k is row k·points + i."""
+def as_one_matrix(a: Block) -> Block:
+    """Return the stack as a single matrix; entry i of part k is row k·points + i."""
     points, rows, cols = a.center.shape
     if points == 1:
         return a
-    if points * rows > _DENSE or points * cols > _DENSE:
+    if points * rows > _MAX_DENSE_SIZE or points * cols > _MAX_DENSE_SIZE:
         raise TooLarge
 
     def large(stack: Values) -> Values:
@@ -97,8 +94,10 @@ def spread_out(a: Block) -> Block:
 
 
 def block(out: Tree, first: int, roots_out: list[Values], roots_in: list[Values]) -> Block:
-    """∂q/∂v of a tree of slopes q by the parts from `first` on, those of an element v, with the
-    `roots` of the weights of both.
+    """Return ∂q/∂v for a tree of slopes q.
+
+    The parts of the slopes from index `first` on belong to the leaves of the element v. `roots_out` and
+    `roots_in` are the square roots of the weights of both spaces.
 
     **Raises:** `TooLarge`.
     """
@@ -107,23 +106,26 @@ def block(out: Tree, first: int, roots_out: list[Values], roots_in: list[Values]
     if _pointwise(rows, roots_out, roots_in):
         return _stacked(rows, roots_out, roots_in)
     sizes_out, sizes_in = [r.size for r in roots_out], [r.size for r in roots_in]
-    if max(sum(sizes_out), sum(sizes_in)) > _DENSE or sum(sizes_out) * sum(sizes_in) > MOST:
+    if (
+        max(sum(sizes_out), sum(sizes_in)) > _MAX_DENSE_SIZE
+        or sum(sizes_out) * sum(sizes_in) > MOST
+    ):
         raise TooLarge
 
-    def large(pick: Callable[[Part], Values]) -> Values:
+    def assemble(pick: Callable[[Part], Values]) -> Values:
         grid = []
         for row, out in zip(rows, roots_out, strict=True):
-            line = []
+            grid_row = []
             for part, into in zip(row, roots_in, strict=True):
                 if part is None:
-                    line.append(np.zeros((out.size, into.size)))
+                    grid_row.append(np.zeros((out.size, into.size)))
                     continue
                 full = pick(columns(part, into.size)).reshape(into.size, -1).T
-                line.append(_scaled(full, out[:, None], into[None, :]))
-            grid.append(line)
+                grid_row.append(_scaled(full, out[:, None], into[None, :]))
+            grid.append(grid_row)
         return np.block(grid)[None]
 
-    return Block(large(lambda part: part.center), large(lambda part: part.radius))
+    return Block(assemble(lambda part: part.center), assemble(lambda part: part.radius))
 
 
 def _pointwise(rows: list[list[Part | None]], *roots: list[Values]) -> bool:
@@ -146,30 +148,30 @@ def _stacked(
 
 
 def _scaled(values: Values, out: Values, into: Values) -> Values:
-    """values · out / into, without rounding where the weights are the same."""
+    """Return values · out / into, without rounding if the weights are equal."""
     return values * np.where(out == into, 1.0, out / into)
 
 
 def _dot(a: Values, b: Values) -> Values:
-    """a @ b of nonnegative matrices with 0 · ∞ = 0."""
+    """Return a @ b for nonnegative matrices, with 0 · ∞ = 0."""
     if np.isfinite(a).all() and np.isfinite(b).all():
         return a @ b
-    loose = np.isinf(a) * 1.0 @ (b > 0) + (a > 0) * 1.0 @ np.isinf(b)
+    infinite = np.isinf(a) * 1.0 @ (b > 0) + (a > 0) * 1.0 @ np.isinf(b)
     finite = np.where(np.isinf(a), 0.0, a) @ np.where(np.isinf(b), 0.0, b)
-    return np.where(loose > 0, np.inf, finite)
+    return np.where(infinite > 0, np.inf, finite)
 
 
 def _norms(stack: Values) -> Values:
-    """‖·‖₂ of every matrix."""
+    """Return ‖·‖₂ of every matrix."""
     if stack.shape[1:] == (1, 1):
         return np.abs(stack[:, 0, 0])
     infinite: Values = np.any(np.isinf(stack) | np.isnan(stack), axis=(1, 2))
     if not stack.any():
         return np.zeros(len(stack))
-    known = np.where(infinite[:, None, None], 0.0, stack)
-    return np.where(infinite, np.inf, np.linalg.norm(known, 2, axis=(1, 2)))
+    finite = np.where(infinite[:, None, None], 0.0, stack)
+    return np.where(infinite, np.inf, np.linalg.norm(finite, 2, axis=(1, 2)))
 
 
 def eigenvalues(symmetric: Values) -> Values:
-    """Those of every matrix, in order."""
+    """Return the eigenvalues of every matrix in ascending order."""
     return symmetric[:, 0, :1] if symmetric.shape[1:] == (1, 1) else np.linalg.eigvalsh(symmetric)

@@ -1,4 +1,4 @@
-"""The a-posteriori certificate: how far the computed trajectory is from the true one.
+"""The a-posteriori certificate: a bound on the distance from the computed to the exact trajectory.
 
 Let x_h solve x_h' = A x_h + p exactly (every exponential method does, with p its stage polynomial),
 and let δ(s) = ‖p(s) − f̃(s, x_h(s))‖. Subtracting the mild equations,
@@ -9,8 +9,8 @@ and Gronwall's lemma gives, with c = ω + M L̃,
 
     ‖x_h − x‖(t) ≤ M e^{ct}‖x_h(0) − x₀‖ + M ∫₀ᵗ e^{c(t−s)} δ(s) ds.
 
-A never enters δ, so the bound is finite for a partial differential equation. Where f̃ is only
-evaluated through a law solved to ‖w‖, δ gains β_f‖P⁻¹‖‖w‖/γ. With a one-sided constant μ the same
+A does not enter δ, so the bound is finite for a partial differential equation. If the law is solved
+only to the residual ‖w‖, δ increases by β_f‖P⁻¹‖‖w‖/γ. With a one-sided constant μ the same bound
 holds with M = 1 and c = μ: d/dt‖x_h − x‖ ≤ μ‖x_h − x‖ + δ. The response follows, since
 ‖u_h − u‖ ≤ L‖x_h − x‖ + ‖u_h − u_{x_h}‖.
 """
@@ -36,14 +36,13 @@ from .status import Status, weakest
 class Bound(eqx.Module):
     """Bounds on the true error at the saved times of a solution.
 
-    - `ts`; `x` ≥ ‖x_h − x‖ and `u` ≥ ‖u_h − u‖: the better one, at each time, of the next two;
+    - `ts`; `x` ≥ ‖x_h − x‖ and `u` ≥ ‖u_h − u‖: at each time the smaller of the next two;
     - `x_paper`, `u_paper`: with the paper's rate ω + ML̃;
-    - `x_sharp`, `u_sharp`: with the one-sided constant μ, or the rate of an energy norm where that
-      gives less; None where neither is known;
-    - `status`: the weakest of what the bound rests on. "proved" says that the constants are proved,
-      that M, ω and ‖P⁻¹‖ are no smaller than what the structure of A and P gives, and that the
-      defect is enclosed over every step; the moduli of f and h are those that the constants state.
-      "estimated" says that the defect was sampled.
+    - `x_sharp`, `u_sharp`: with the one-sided constant μ or the rate of an energy norm, whichever is
+      smaller; None if neither is known;
+    - `status`: the weakest status among the quantities in the bound. "proved" means that the constants
+      are proved, that M, ω and ‖P⁻¹‖ are at least those implied by the structure of A and P, and that
+      the defect is enclosed over every step. "estimated" means that the defect was sampled.
 
     Bounds hold up to floating-point rounding in the solve itself.
     """
@@ -65,21 +64,22 @@ def bound_error(
 
     **Arguments:** `problem` and `sol`, the solution of it; `constants`, its moduli; `initial_error`,
     a bound on ‖x_h(t0) − x(t0)‖, or the `Bound` of the run that this one continues from its last
-    saved state. (With M > 1 every piece multiplies by M anew.)
+    saved state. (With M > 1 every piece multiplies the bound by M.)
 
-    Where the solve did not measure its defect (fixed steps), or where it went (constants of a region,
-    that the solve was not given), it is run again, and the distance of the two runs is added.
+    If the solve did not record its defect (fixed steps), or the bounds of its trajectory (for constants
+    of a region that were not passed to it), the problem is solved again with the same steps, and the
+    distance of the two runs is added.
 
-    Constants that `dvax.verify` found for a region of x or u are good while the trajectory stays in
-    it: where what encloses it over the steps up to a saved time, with its bound, is not inside, the
-    bounds are infinite from there on. (Between two saved times the bound is taken from the one before
-    and all that disturbs the equation on the way, so many saved times make it the sharper.) For other
-    times or `args` than those verified nobody proved them: then the status is "declared". With a region
-    of u the bounds are those of the one solution whose response stays in it; a law that is monotone
-    there alone may have others.
+    Constants that `dvax.verify` found for a region of x or u hold while the trajectory stays in it.
+    If the enclosure of the trajectory up to a saved time, enlarged by its bound, is not inside the
+    region, the bounds are infinite from there on. (Between two saved times the enlargement uses the
+    bound at the earlier one and all disturbances since, so more saved times make it sharper.) For
+    times or `args` other than those verified the status is "declared". With a region of u, the
+    bounds concern the solution whose response stays in it; a law that is monotone only there may
+    have other solutions.
 
-    **Raises:** `dvax.InputError` where `sol` is not a solution of `problem`, or `initial_error` is
-    not a number ≥ 0.
+    **Raises:** `dvax.InputError` if `sol` is not a solution of `problem`, or `initial_error` is not a
+    number ≥ 0.
 
     ```python
     >>> import dvax
@@ -94,100 +94,106 @@ def bound_error(
     """
     _check(problem, sol, constants, initial_error)
     space = problem.spaces(sol.setup.x0)[0]
-    measured, apart = sol, jnp.zeros_like(sol.ts)
+    measured, distance = sol, jnp.zeros_like(sol.ts)
     domain = constants.domain
     regional = domain is not None and not domain.free
     if sol.defect is None or (regional and sol.extent is None):
-        measured = _again(problem, sol, constants)
-        apart = jax.vmap(lambda a, b: space.norm(_tree.sub(a, b)))(measured.xs, sol.xs)
+        measured = _solve_again(problem, sol, constants)
+        distance = jax.vmap(lambda a, b: space.norm(_tree.sub(a, b)))(measured.xs, sol.xs)
     assert measured.defect is not None and measured.law_defect is not None
     assert measured.completed_defect is not None
 
-    integrated_defect = (measured.defect, measured.law_defect), measured.completed_defect
+    defects = (measured.defect, measured.law_defect), measured.completed_defect
     law = sol.law_residual, sol.law_step
-    start = _starts(initial_error, sol.ts.dtype)
-    begin = sol.setup.setting["t0"]
-    t0 = jnp.asarray(begin, sol.ts.dtype)
-    x, u, x_sharp, u_sharp = _bounds(constants, t0, sol.ts, integrated_defect, apart, law, start)
+    initial = _initial_errors(initial_error, sol.ts.dtype)
+    t0 = jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
+    x, u, x_sharp, u_sharp = _bounds(constants, t0, sol.ts, defects, distance, law, initial)
     best_x = x if x_sharp is None else jnp.minimum(x, x_sharp)
     best_u = u if u_sharp is None else jnp.minimum(u, u_sharp)
-    where: Status = "proved"
+    domain_status: Status = "proved"
     inside = jnp.ones(sol.ts.shape, bool)
     if domain is not None:
-        covered = domain.covers(begin, sol.setup.setting["t1"]) and domain.is_of(sol.setup.args)
-        where = "proved" if covered else "declared"
+        setting = sol.setup.setting
+        covered = domain.covers(setting["t0"], setting["t1"]) and domain.is_of(sol.setup.args)
+        domain_status = "proved" if covered else "declared"
         if regional:
             assert measured.extent is not None
-            passed = _on_the_way(constants, t0, sol.ts, integrated_defect, start)
+            largest_x = _bound_since_previous_time(constants, t0, sol.ts, defects, initial)
             law_error = constants.norm_P_inv * (law[0] / constants.gamma + law[1])
-            of_u = constants.L * passed + law_error
+            largest_u = constants.L * largest_x + law_error
             spaces = problem.spaces(sol.setup.x0)
-            inside = domain.keeps(*measured.extent, passed, of_u, spaces)
+            inside = domain.keeps(*measured.extent, largest_x, largest_u, spaces)
     status = weakest(
         constants.status_of(*(name for name, _ in constants.statuses)),
         "proved" if measured.enclosed else "estimated",
         _status_of_structure(problem, sol, constants),
-        where,
+        domain_status,
     )
-    kept = lambda v: jnp.where(inside, v, jnp.inf)  # noqa: E731
-    sharp = [None if v is None else kept(v) for v in (x_sharp, u_sharp)]
-    return Bound(sol.ts, kept(best_x), kept(best_u), kept(x), kept(u), sharp[0], sharp[1], status)
+
+    def valid(v: jax.Array | None) -> Any:
+        return None if v is None else jnp.where(inside, v, jnp.inf)
+
+    return Bound(
+        sol.ts, valid(best_x), valid(best_u), valid(x), valid(u), valid(x_sharp), valid(u_sharp),
+        status,
+    )  # fmt: skip
 
 
 @jax.jit
 def _bounds(
-    c: Constants, t0: Any, ts: Any, integrated_defect: tuple, apart: Any, law: tuple, start: tuple
+    c: Constants, t0: Any, ts: Any, defects: tuple, distance: Any, law: tuple, initial: tuple
 ) -> tuple:
-    """x, u, x_sharp and u_sharp of `Bound`."""
-    acted, completed_defect = (disturbance(c, *parts) for parts in integrated_defect)
+    """Return x, u, x_sharp and u_sharp of `Bound`."""
+    total, completed = (disturbance(c, *parts) for parts in defects)
     law_error = c.norm_P_inv * (law[0] / c.gamma + law[1])
-    x, *each = (
-        gronwall(t0, ts, acted, completed_defect, rate, M, initial) + apart
-        for M, rate, initial in _rates(c, start)
+    x, *others = (
+        gronwall(t0, ts, total, completed, rate, M, error) + distance
+        for M, rate, error in _rates(c, initial)
     )
     u = c.L * x + law_error
-    if not each:
+    if not others:
         return x, u, None, None
-    sharp = jnp.min(jnp.stack(each), axis=0)
+    sharp = jnp.min(jnp.stack(others), axis=0)
     return x, u, sharp, c.L * sharp + law_error
 
 
-def _rates(c: Constants, start: tuple) -> list[tuple[Any, Any, Any]]:
-    """(M, c) in which errors grow, and what they start with: the paper's first, then the sharp ones."""
-    rates = [(c.M, c.growth_rate, start[0])]
-    rates += [] if c.one_sided is None else [(1.0, c.one_sided, start[1])]
-    return rates + ([] if c.energy is None else [(*c.energy, start[1])])
+def _rates(c: Constants, initial: tuple) -> list[tuple[Any, Any, Any]]:
+    """Return (M, rate, initial error) of every Gronwall estimate: the paper's, then the sharp ones."""
+    rates = [(c.M, c.growth_rate, initial[0])]
+    rates += [] if c.one_sided is None else [(1.0, c.one_sided, initial[1])]
+    return rates + ([] if c.energy is None else [(*c.energy, initial[1])])
 
 
 @jax.jit
-def _on_the_way(
-    c: Constants, t0: Any, ts: Any, integrated_defect: tuple, start: tuple
+def _bound_since_previous_time(
+    c: Constants, t0: Any, ts: Any, defects: tuple, initial: tuple
 ) -> jax.Array:
-    """The bound on x at all times since the saved time before."""
-    acted, completed_defect = (disturbance(c, *parts) for parts in integrated_defect)
-    each = []
-    for M, rate, initial in _rates(c, start):
-        at = gronwall(t0, ts, acted, completed_defect, rate, M, initial)
-        each.append(between(t0, ts, acted, completed_defect, rate, M, initial, at))
-    return jnp.min(jnp.stack(each), axis=0)
+    """Return, for each saved time, the bound on x at all times since the previous saved time."""
+    total, completed = (disturbance(c, *parts) for parts in defects)
+    bounds = []
+    for M, rate, error in _rates(c, initial):
+        at_ts = gronwall(t0, ts, total, completed, rate, M, error)
+        bounds.append(between(t0, ts, total, completed, rate, M, error, at_ts))
+    return jnp.min(jnp.stack(bounds), axis=0)
 
 
 def _check(problem: Problem, sol: Any, constants: Any, initial_error: Any) -> None:
-    wrong: list[InputProblem] = [
+    problems: list[InputProblem] = [
         InputProblem(
-            f"dvax.bound_error({name})", type(given).__name__, f"it is a {kind}", f"Take {source}"
+            f"dvax.bound_error({name})", type(value).__name__, f"it must be a {kind}",
+            f"Pass {source}",
         )
-        for name, given, known, kind, source in (
-            ("sol", sol, isinstance(sol, Solution), "dvax.Solution", "what dvax.solve returned"),
+        for name, value, is_valid, kind, source in (
+            ("sol", sol, isinstance(sol, Solution), "dvax.Solution", "the result of dvax.solve"),
             ("constants", constants, isinstance(constants, Constants), "dvax.Constants",
              "dvax.verify(problem, x0).constants"),
         )
-        if not known
+        if not is_valid
     ]  # fmt: skip
-    if wrong:
-        raise InputError(*wrong)
+    if problems:
+        raise InputError(*problems)
     if sol.setup.problem is not problem and sol.setup.problem != problem:
-        wrong.append(
+        problems.append(
             InputProblem(
                 "dvax.bound_error(problem, sol)",
                 "a solution of another problem",
@@ -196,11 +202,11 @@ def _check(problem: Problem, sol: Any, constants: Any, initial_error: Any) -> No
             )
         )
     if isinstance(sol.setup.method, Implicit):
-        wrong.append(
+        problems.append(
             InputProblem(
                 "dvax.bound_error(sol)",
                 "a solution of dvax.Implicit",
-                "an implicit method keeps no polynomials of its steps, so that its defect is not known",
+                "an implicit method keeps no polynomials of its steps, so its defect is unknown",
                 "Solve with an exponential method",
             )
         )
@@ -208,24 +214,24 @@ def _check(problem: Problem, sol: Any, constants: Any, initial_error: Any) -> No
         number = np.asarray(initial_error)
         real = number.ndim == 0 and np.issubdtype(number.dtype, np.number)
         if not (real and np.isfinite(number) and number >= 0):
-            wrong.append(
+            problems.append(
                 InputProblem(
                     "dvax.bound_error(initial_error)",
                     _tree.short(initial_error),
                     "it must be one number ≥ 0: a bound on ‖x_h(t0) − x(t0)‖",
-                    "Pass 0 where the initial state is exact, or the Bound of the run before",
+                    "Pass 0 if the initial state is exact, or the Bound of the previous run",
                 )
             )
     if isinstance(initial_error, Bound):
-        wrong += _breaks_off(initial_error, sol.setup.setting["t0"])
-    if wrong:
-        raise InputError(*wrong)
+        problems += _continuation_problems(initial_error, sol.setup.setting["t0"])
+    if problems:
+        raise InputError(*problems)
 
 
-def _breaks_off(before: Bound, t0: Any) -> list[InputProblem]:
-    """What is wrong with going on from `before` at t0."""
-    if before.ts.shape[0] > 0:
-        end = before.ts[-1]
+def _continuation_problems(previous: Bound, t0: Any) -> list[InputProblem]:
+    """Return the problems of continuing from the bound `previous` at t0."""
+    if previous.ts.shape[0] > 0:
+        end = previous.ts[-1]
         if not _tree.is_concrete(end, t0) or float(end) == float(np.asarray(t0, end.dtype)):
             return []
         given = f"a Bound up to t = {float(end):.17g} for a run from t0 = {float(t0):.17g}"
@@ -235,14 +241,14 @@ def _breaks_off(before: Bound, t0: Any) -> list[InputProblem]:
         InputProblem(
             "dvax.bound_error(initial_error)",
             given,
-            "a bound is known at saved times only, so a run goes on from the last of them",
-            "Save t1 as well: let it be the last of ts=",
+            "a bound exists at saved times only, so a run can continue only from the last of them",
+            "Save t1 as well: make it the last entry of ts=",
         )
     ]
 
 
-def _starts(initial_error: Any, dtype: Any) -> tuple[Any, Any]:
-    """What the paper's and the sharp bound start with."""
+def _initial_errors(initial_error: Any, dtype: Any) -> tuple[Any, Any]:
+    """Return the initial errors of the paper's and of the sharp bound."""
     if isinstance(initial_error, Bound):
         paper, sharp = initial_error.x_paper, initial_error.x_sharp
         return paper[-1], (paper if sharp is None else sharp)[-1]
@@ -251,45 +257,46 @@ def _starts(initial_error: Any, dtype: Any) -> tuple[Any, Any]:
 
 
 def _status_of_structure(problem: Problem, sol: Solution, c: Constants) -> Status:
-    """Whether M, ω, m_P and ‖P⁻¹‖ are covered by what A and P themselves prove; smaller ones may
-    hold as well, but then it is the caller who says so."""
+    """Return "proved" if M, ω, m_P and ‖P⁻¹‖ are at least as pessimistic as the values proved from A
+    and P. Sharper values may hold as well, but then they are declared."""
     x0, args = sol.setup.x0, sol.setup.args
     state, control = problem.spaces(x0)
     growth = problem.generator(args).growth(state)
     spectrum = problem.operator(args).spectrum(control)
-    covered = (
+    pairs = (
         (c.M, growth.M),
         (c.omega, growth.omega),
         (c.norm_P_inv, spectrum.norm_P_inv),
         (spectrum.m_P, c.m_P),
     )
-    if is_declared(problem.generator(args)) or spectrum.declared or not _tree.is_concrete(covered):
+    if is_declared(problem.generator(args)) or spectrum.declared or not _tree.is_concrete(pairs):
         return "declared"
-    slack = 1e-9  # what rounding may do to an eigenvalue
-    held = [float(a) >= float(b) - slack * abs(float(b)) for a, b in covered]
-    return "proved" if all(held) else "declared"
+    rtol = 1e-9  # rounding error of an eigenvalue
+    covered = [float(a) >= float(b) - rtol * abs(float(b)) for a, b in pairs]
+    return "proved" if all(covered) else "declared"
 
 
 def is_declared(A: AbstractGenerator) -> bool:
-    """Whether the growth bound rests on a numerical range that somebody gave."""
+    """Return whether the growth bound uses a declared numerical range."""
     if isinstance(A, Product):
         return any(map(is_declared, A.parts))
     return isinstance(A, AbstractMatrixFree) and not A.numerical_range().proved
 
 
-def _again(problem: Problem, sol: Solution, constants: Constants) -> Solution:
-    """The same steps, with all that a certificate needs."""
-    was = sol.setup
-    asked = was.setting
-    adaptive = isinstance(asked["dt"], float) and math.isnan(asked["dt"])
-    # A first step that nobody gave is chosen again, with the growth that it allows.
-    given = asked["dt0_growth"] <= MAX_GROWTH
-    longest = None if asked["dt_max"] == math.inf else asked["dt_max"]
+def _solve_again(problem: Problem, sol: Solution, constants: Constants) -> Solution:
+    """Solve again with the same steps, and record all that a certificate needs."""
+    setup = sol.setup
+    setting = setup.setting
+    adaptive = isinstance(setting["dt"], float) and math.isnan(setting["dt"])
+    # A default dt0 is chosen again, together with the larger growth limit of the first step.
+    dt0_was_given = setting["dt0_growth"] <= MAX_GROWTH
+    dt_max = None if setting["dt_max"] == math.inf else setting["dt_max"]
     again = solve(
-        problem, was.x0, asked["t0"], asked["t1"], was.args, sol.ts, None if adaptive else asked["dt"],
-        rtol=asked["rtol"], atol=asked["atol"], dt0=asked["dt0"] if given else None,
-        dt_max=longest, horizon=asked["horizon"],
-        method=was.method, vi_solver=was.vi_solver, constants=constants, measure=True, throw=False,
+        problem, setup.x0, setting["t0"], setting["t1"], setup.args, sol.ts,
+        None if adaptive else setting["dt"],
+        rtol=setting["rtol"], atol=setting["atol"], dt0=setting["dt0"] if dt0_was_given else None,
+        dt_max=dt_max, horizon=setting["horizon"],
+        method=setup.method, vi_solver=setup.vi_solver, constants=constants, measure=True, throw=False,
     )  # fmt: skip
     if again.ts.shape == sol.ts.shape:
         return again
@@ -297,7 +304,7 @@ def _again(problem: Problem, sol: Solution, constants: Constants) -> Solution:
         InputProblem(
             "dvax.bound_error(sol)",
             f"{sol.ts.shape[0]} saved times, of which another run reaches {again.ts.shape[0]}",
-            "what the certificate needs was not kept, and so it solves once more",
-            "Solve with constants= and measure=True, so that it is kept",
+            "the defect was not recorded, so the certificate solves the problem again",
+            "Solve with constants= and measure=True, which records the defect",
         )
     )

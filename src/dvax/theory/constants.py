@@ -1,4 +1,4 @@
-"""The constants of the theory and what follows from them, each found by its label in the paper."""
+"""The constants of the theory and the quantities derived from them, with their labels in the paper."""
 
 from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ _PRIMARY = (
 
 
 class Row(NamedTuple):
-    """One line of `Constants.table`: what a constant is, what it is worth, and how it is known."""
+    """One line of `Constants.table`: a constant with its value, label, status and meaning."""
 
     name: str
     symbol: str
@@ -40,13 +40,13 @@ class Constants(eqx.Module):
     - `M`, `omega`: ‖e^{At}‖ ≤ M e^{ωt} (lem:semigroup_bound_prelim);
     - `m_P`, `norm_P_inv`: min σ(P⁻¹) and ‖P⁻¹‖ (ass:operators);
     - `one_sided` (μ), optional: ⟨A(x−x') + f̃(x) − f̃(x'), x−x'⟩ ≤ μ‖x−x'‖². The paper's constants
-      use |·| where this sees signs, so it is never above ω + M L̃ when M = 1;
-    - `energy` (M, μ), optional: ‖x₁−x₂‖ ≤ M e^{μt}‖Δx₀‖ by contraction in another norm, of condition
-      M² (`dvax.verify(energy=True)` finds one);
-    - `status`: "proved" or "declared" for all of them, or a mapping from name to status;
-    - `domain`: the `args`, times and states for which they hold, from `dvax.verify`; None for all.
+      use absolute values where μ keeps signs, so μ ≤ ω + M L̃ if M = 1;
+      - `energy` (M, μ), optional: ‖x₁−x₂‖ ≤ M e^{μt}‖Δx₀‖ by contraction in another norm, of condition
+        number M² (`dvax.verify(energy=True)` computes one);
+      - `status`: "proved" or "declared" for all of them, or a mapping from name to status;
+      - `domain`: the `args`, times and states for which they hold, from `dvax.verify`; None for all.
 
-    **Raises:** `dvax.InputError` where γ, L_F, m_P or ‖P⁻¹‖ is not positive, a Lipschitz modulus is
+      **Raises:** `dvax.InputError` if γ, L_F, m_P or ‖P⁻¹‖ is not positive, a Lipschitz modulus is
     negative, M < 1, or γ > L_F.
 
     ```python
@@ -104,13 +104,13 @@ class Constants(eqx.Module):
             None if one_sided is None else _tree.as_float(one_sided, "dvax.Constants(one_sided)")
         )
         names: tuple[str, ...] = (*_PRIMARY, "one_sided", "energy")
-        each: dict[str, Status] = {}
+        given_statuses: dict[str, Status] = {}
         for name in names if isinstance(status, str) else status:
-            each[name] = status if isinstance(status, str) else status[name]
-        _check_status(names, each)
-        # What is not there weakens nothing that is made from the rest.
-        there = [n for n in sorted(names) if getattr(self, n) is not None]
-        pairs: list[tuple[str, Status]] = [(n, each.get(n, "declared")) for n in there]
+            given_statuses[name] = status if isinstance(status, str) else status[name]
+        _check_status(names, given_statuses)
+        # A constant that is None has no status, so that it does not weaken the others.
+        present = [n for n in sorted(names) if getattr(self, n) is not None]
+        pairs: list[tuple[str, Status]] = [(n, given_statuses.get(n, "declared")) for n in present]
         self.statuses = tuple(pairs)
         self._check()
 
@@ -134,49 +134,50 @@ class Constants(eqx.Module):
 
     @property
     def decay_rate(self) -> Any:
-        """η − M L̃ with η = −ω: two trajectories approach at this rate where it is positive
+        """η − M L̃ with η = −ω: the rate at which two trajectories approach, if it is positive
         (cor:incremental_stability)."""
         return -self.growth_rate
 
     @property
     def sharp_decay_rate(self) -> Any:
-        """−μ of the one-sided constant, or None where that is not known: ‖x₁−x₂‖ ≤ e^{μt}‖Δx₀‖,
-        since d/dt ½‖x₁−x₂‖² ≤ μ‖x₁−x₂‖²."""
+        """−μ with the one-sided constant μ, or None if that is unknown: ‖x₁−x₂‖ ≤ e^{μt}‖Δx₀‖, since
+        d/dt ½‖x₁−x₂‖² ≤ μ‖x₁−x₂‖²."""
         return None if self.one_sided is None else -_tree.host(self.one_sided)
 
     def hadamard(self, T: Any) -> Any:
-        """C_T = M e^{(ω+ML̃)₊T}(1 + L): ‖(x₁,u₁)−(x₂,u₂)‖ ≤ C_T‖Δx₀‖ (cor:hadamard_wellposed)."""
+        """Return C_T = M e^{(ω+ML̃)₊T}(1 + L), with ‖(x₁,u₁)−(x₂,u₂)‖ ≤ C_T‖Δx₀‖
+        (cor:hadamard_wellposed)."""
         return self.largest_separation(T) * (1.0 + self.L)
 
     def separation(self, t: Any) -> Any:
-        """M e^{(ω+ML̃)t}: ‖x₁(t)−x₂(t)‖ ≤ this · ‖Δx₀‖ (1stestistability)."""
+        """Return S = M e^{(ω+ML̃)t}, with ‖x₁(t)−x₂(t)‖ ≤ S‖Δx₀‖ (1stestistability)."""
         c, lib = _tree.host(self), _tree.library(self, t)
         return c.M * _exp(lib, self.growth_rate * t)
 
     def response_separation(self, t: Any) -> Any:
-        """L M e^{(ω+ML̃)t}: ‖u₁(t)−u₂(t)‖ ≤ this · ‖Δx₀‖ (2ndestistability)."""
+        """Return S = L M e^{(ω+ML̃)t}, with ‖u₁(t)−u₂(t)‖ ≤ S‖Δx₀‖ (2ndestistability)."""
         return self.L * self.separation(t)
 
     def largest_separation(self, T: Any) -> Any:
-        """M e^{(ω+ML̃)₊T}: max over [0, T] of ‖x₁−x₂‖ ≤ this · ‖Δx₀‖ (supesti1); times L for u
-        (supesti2)."""
+        """Return S = M e^{(ω+ML̃)₊T}, with max over [0, T] of ‖x₁−x₂‖ ≤ S‖Δx₀‖ (supesti1); LS is the
+        factor for u (supesti2)."""
         c, lib = _tree.host(self), _tree.library(self, T)
         return c.M * _exp(lib, lib.maximum(self.growth_rate, 0.0) * T)
 
     def sharp_separation(self, t: Any) -> Any:
-        """e^{μt}: the same with the one-sided constant, or None where that is not known."""
+        """Return e^{μt}, the `separation` with the one-sided constant, or None if that is unknown."""
         lib = _tree.library(self, t)
         return None if self.one_sided is None else _exp(lib, _tree.host(self.one_sided) * t)
 
     @property
     def smallness(self) -> tuple[Any, Any]:
-        """(m_P − β_h‖P⁻¹‖, ‖P⁻¹‖(1 + β_h)): γ and L_F where the first is positive
+        """(m_P − β_h‖P⁻¹‖, ‖P⁻¹‖(1 + β_h)), which are a γ and an L_F if the first is positive
         (remark:assstrong (i), eq:Liph)."""
         c = _tree.host(self)
         return c.m_P - c.beta_h * c.norm_P_inv, c.norm_P_inv * (1.0 + c.beta_h)
 
     def contraction_factor(self, rho: Any) -> Any:
-        """q_ρ = ‖I − ρP⁻¹‖ + ρ β_h ‖P⁻¹‖ (eq:smalless), with ‖I − ρP⁻¹‖ from the spectrum."""
+        """Return q_ρ = ‖I − ρP⁻¹‖ + ρ β_h ‖P⁻¹‖ (eq:smalless), with ‖I − ρP⁻¹‖ from the spectrum."""
         c, lib = _tree.host(self), _tree.library(self, rho)
         spread = lib.maximum(abs(1.0 - rho * c.m_P), abs(1.0 - rho * c.norm_P_inv))
         return spread + rho * c.beta_h * c.norm_P_inv
@@ -188,28 +189,30 @@ class Constants(eqx.Module):
         return 2.0 / (c.m_P + c.norm_P_inv)
 
     def bielecki_factor(self, lam: Any) -> Any:
-        """M L̃/(λ − ω): the Picard map contracts by it in the λ-norm, λ > ω + M L̃ (eq:Sop)."""
+        """Return M L̃/(λ − ω), by which the Picard map contracts in the λ-norm if λ > ω + M L̃
+        (eq:Sop)."""
         c = _tree.host(self)
         return c.M * self.L_tilde / (lam - c.omega)
 
     def best_lambda(self, T: Any) -> Any:
-        """The λ of the Bielecki norm for which an error bound in the maximum norm is least.
+        """Return the λ of the Bielecki norm that minimises the error bound in the maximum norm.
 
-        ‖x − Sx‖_λ = r leaves ‖x − x*‖_C ≤ e^{λT} r/(1 − q) with q = ML̃/(λ − ω); with s = λ − ω and
-        a = ML̃ the factor e^{sT}s/(s − a) is least where T s(s − a) = a, s = (a + √(a² + 4a/T))/2.
+        ‖x − Sx‖_λ = r implies ‖x − x*‖_C ≤ e^{λT} r/(1 − q) with q = ML̃/(λ − ω). With s = λ − ω
+        and a = ML̃, the factor e^{sT}s/(s − a) is minimal for T s(s − a) = a, that is s = (a + √(a²
+        + 4a/T))/2.
         """
         c, lib = _tree.host(self), _tree.library(self, T)
         a = c.M * self.L_tilde
         return c.omega + 0.5 * (a + lib.sqrt(a * a + 4.0 * a / T))
 
     def status_of(self, *names: str) -> Status:
-        """The weakest status among the named constants."""
-        words: list[Status] = [word for name, word in self.statuses if name in names]
-        return weakest(*words)
+        """Return the weakest status among the named constants."""
+        statuses: list[Status] = [status for name, status in self.statuses if name in names]
+        return weakest(*statuses)
 
-    @np.errstate(over="ignore", invalid="ignore")  # what overflows is ∞ in the table
+    @np.errstate(over="ignore", invalid="ignore")  # overflow is ∞ in the table
     def table(self, T: Any = None, rho: Any = None) -> list[Row]:
-        """Every constant with its label and status; C_T for the horizon T where it is given."""
+        """Return every constant with its label and status, and C_T if the horizon T is given."""
         rho = self.best_rho if rho is None else rho
         law = ("alpha_h", "norm_P_inv", "gamma")
         flow = (*law, "alpha_f", "beta_f")
@@ -240,10 +243,10 @@ class Constants(eqx.Module):
             ("growth_rate", "ω + M L̃", self.growth_rate, "thm:continuous_dependence", rate,
              "largest rate at which two trajectories can separate"),
             ("decay_rate", "η − M L̃", self.decay_rate, "cor:incremental_stability", rate,
-             "rate at which two trajectories certainly approach, where positive"),
+             "rate at which two trajectories approach, if positive"),
             ("q_rho", "q_ρ", self.contraction_factor(rho), "ass:lipschitz_smallness",
              ("m_P", "norm_P_inv", "beta_h"),
-             f"factor of the projection route at ρ = {_number(rho)}; it works where below 1"),
+             f"factor of the projection route at ρ = {_number(rho)}; it must be below 1"),
         ]  # fmt: skip
         if T is not None:
             rows.append(
@@ -254,7 +257,7 @@ class Constants(eqx.Module):
             rows.append(
                 ("sharp_decay_rate", "−μ", self.sharp_decay_rate,
                  "one-sided, sharper than the paper", ("one_sided",),
-                 "rate of approach that sees the sign of the feedback")
+                 "rate of approach that takes the sign of the feedback into account")
             )  # fmt: skip
         if self.energy is not None:
             overshoot, rate_of_energy = self.energy
@@ -264,10 +267,10 @@ class Constants(eqx.Module):
                  f"rate of approach with an overshoot of {_number(overshoot)}")
             )  # fmt: skip
         return [
-            # −0 is 0.
-            Row(name, symbol, float(value) + 0.0, label, self.status_of(*made_of),
+            # Adding 0 turns −0 into 0.
+            Row(name, symbol, float(value) + 0.0, label, self.status_of(*sources),
                 _meaning(meaning, float(value)))
-            for name, symbol, value, label, made_of, meaning in rows
+            for name, symbol, value, label, sources, meaning in rows
         ]  # fmt: skip
 
     def _check(self) -> None:
@@ -296,13 +299,13 @@ class Constants(eqx.Module):
 
 
 def _exp(lib: Any, exponent: Any) -> Any:
-    """e^exponent, which is ∞ without a warning where it overflows."""
+    """Return e^exponent, or ∞ without a warning if it overflows."""
     with np.errstate(over="ignore"):
         return lib.exp(exponent)
 
 
 def _meaning(meaning: str, value: float) -> str:
-    return meaning if np.isfinite(value) else f"{meaning}; it is not finite, so it says nothing"
+    return meaning if np.isfinite(value) else f"{meaning}; it is not finite, so it gives no bound"
 
 
 def _number(value: Any) -> str:
@@ -314,9 +317,9 @@ def _check_status(names: Collection[str], given: Mapping[str, Any]) -> None:
         InputProblem(
             "dvax.Constants(status)",
             f"{name!r}: {value!r}",
-            f"it must map names among {', '.join(names)} to one of {', '.join(ORDER)}, or a bound "
-            "would claim to rest on something that nobody said",
-            "Mend the name or the word",
+            f"it must map names among {', '.join(names)} to one of {', '.join(ORDER)}, since the "
+            "status of a bound depends on it",
+            "Fix the name or the status",
         )
         for name, value in given.items()
         if name not in names or value not in ORDER

@@ -1,7 +1,8 @@
-"""A norm in which trajectories approach: ‖d‖²_Q = ⟨Qd, d⟩, found by a semidefinite programme.
+"""A norm ‖d‖²_Q = ⟨Qd, d⟩ in which trajectories contract, from a semidefinite program.
 
-For two solutions d = Δx, v = Δu let I ≤ Q ≤ κI. As in `one_sided`, with multipliers Λ ≥ 0 of the law
-(one number; for a box and a diagonal P one a component, since the law then holds for each by itself),
+For the difference d = Δx, v = Δu of two solutions let I ≤ Q ≤ κI. As in `one_sided`, with multipliers
+Λ ≥ 0 of the law (one number, or one per component for a box and a diagonal P, since the law then
+holds in each component),
 
     d/dt ‖d‖²_Q ≤ 2⟨Q(A + F_x)d + QF_u v, d⟩ + 2⟨Λ(H_x d − (I − H_u)v), Pv⟩ ≤ 2μ‖d‖²_Q
 
@@ -10,9 +11,9 @@ wherever the matrix of the quadratic form in (d, v),
     ⎡ QG + GᵀQ − 2μQ     QF_u + H_xᵀΛP ⎤
     ⎣       ·                −N_Λ      ⎦ ⪯ 0,   G = A + F_x,  N_Λ = PΛ(I − H_u) + (I − H_u)ᵀΛP.
 
-Then ‖x₁ − x₂‖ ≤ √κ e^{μt}‖Δx₀‖, and a defect acts with the same M = √κ and rate. For a fixed μ the
-least κ is a semidefinite programme in (Q, Λ, κ). What the solver returns is only a proposal: κ and μ
-are then computed from Q and Λ by eigenvalues, so that the bound does not rest on the solver.
+Then ‖x₁ − x₂‖ ≤ √κ e^{μt}‖Δx₀‖, and a defect acts with the same M = √κ and rate. For a fixed μ,
+minimising κ is a semidefinite program in (Q, Λ, κ). The solver only proposes Q and Λ: κ and μ are then
+computed from them by eigenvalues, so the bound does not depend on the solver's accuracy.
 """
 
 from collections.abc import Callable
@@ -23,21 +24,24 @@ import scipy.sparse as sp
 
 from ..errors import InputError, InputProblem
 from ..programs.slope import TooLarge
-from .blocks import spread_out
-from .formulas import convolved
+from .blocks import as_one_matrix
+from .formulas import growth_integral
 from .system import Jacobians, System
 
-MOST = 40
-"""Unknowns of x and u together, up to which the programme is posed."""
+MAX_UNKNOWNS = 40
+"""Largest number of unknowns of x and u together for which the program is solved."""
 
 _BISECTIONS = 12
 _SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
-_LEAST_MULTIPLIER = 1e-8
+_SMALLEST_MULTIPLIER = 1e-8
 
 
 class EnergyNorm(NamedTuple):
-    """‖x₁ − x₂‖ ≤ M e^{rate·t}‖Δx₀‖, since ‖·‖_Q contracts at this rate: ⟨Qd, d⟩ in coordinates
-    in which the norm of the state space is Euclidean (entries times the roots of the weights)."""
+    """‖x₁ − x₂‖ ≤ M e^{rate·t}‖Δx₀‖, since ‖·‖_Q contracts at this rate.
+
+    Q is given in coordinates in which the norm of the state space is Euclidean, that is, entries are
+    multiplied by the square roots of the weights.
+    """
 
     Q: np.ndarray
     M: float
@@ -45,45 +49,49 @@ class EnergyNorm(NamedTuple):
 
 
 def energy_norm(system: System, J: Jacobians, pointwise: bool, T: float) -> EnergyNorm | None:
-    """The Q for which √κ Φ_μ(T), what a defect may grow to, is least; None where the derivatives of f
-    and h are not constant, or nothing better than the norm of the space was found.
+    """Return the Q that minimises √κ Φ_μ(T), the factor by which a constant defect grows.
 
-    **Raises:** `dvax.InputError` where the solver is not installed.
+    The result is None if the derivatives of f and h are not constant, or no Q improves on the norm of
+    the space.
+
+    **Raises:** `dvax.InputError` if the solver is not installed.
     """
     data = _data(system, J, pointwise)
     if data is None:
         return None
-    # Where u does not move, no norm contracts faster than the linear part does.
+    # If u is constant, no norm contracts faster than the linear part.
     low = float(np.max(np.real(np.linalg.eigvals(data.G))))
-    start = high = _of_the_space(data)
+    start = high = _rate_of_space_norm(data)
     if not np.isfinite(high):
         return None
-    found = []
+    norms = []
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
-        proposal = _solved(data, middle)
+        proposal = _solve_program(data, middle)
         if proposal is None:
             low = middle
         else:
             high = middle
     for share in _SHARES:
         mu = high + share * (start - high) + 1e-9 * (1.0 + abs(high))
-        proposal = _solved(data, mu)
+        proposal = _solve_program(data, mu)
         if proposal is not None:
-            found.append(_proved(*proposal, data))
-    found = [norm for norm in found if norm is not None]
-    if not found:
+            norms.append(_certify(*proposal, data))
+    norms = [norm for norm in norms if norm is not None]
+    if not norms:
         return None
-    return min(found, key=lambda norm: norm.M * float(convolved(norm.rate, T)))
+    return min(norms, key=lambda norm: norm.M * float(growth_integral(norm.rate, T)))
 
 
 class _Data(NamedTuple):
+    """G, F_u, H_x, I − H_u and P as matrices; `componentwise`: each component has a multiplier."""
+
     G: np.ndarray
     F_u: np.ndarray
     H_x: np.ndarray
-    slack: np.ndarray
+    I_minus_H_u: np.ndarray
     P: np.ndarray
-    split: bool
+    componentwise: bool
 
 
 def _data(system: System, J: Jacobians, pointwise: bool) -> _Data | None:
@@ -91,28 +99,29 @@ def _data(system: System, J: Jacobians, pointwise: bool) -> _Data | None:
     if any(b is None or not b.exact for b in blocks):
         return None
     try:
-        f_x, f_u, h_x, h_u, A, P = (spread_out(b).center[0] for b in blocks if b is not None)
+        f_x, f_u, h_x, h_u, A, P = (as_one_matrix(b).center[0] for b in blocks if b is not None)
     except TooLarge:
         return None
-    if len(A) + len(P) > MOST:
+    if len(A) + len(P) > MAX_UNKNOWNS:
         return None
     return _Data(A + f_x, f_u, h_x, np.eye(len(P)) - h_u, P, pointwise)
 
 
 def _form(Q: np.ndarray, multipliers: np.ndarray, data: _Data, mu: float) -> np.ndarray:
-    """The matrix of the quadratic form."""
+    """Return the matrix of the quadratic form in (d, v)."""
     L = np.diag(multipliers)
     corner = Q @ data.G + data.G.T @ Q - 2.0 * mu * Q
     side = Q @ data.F_u + data.H_x.T @ L @ data.P
-    push = data.P @ L @ data.slack
+    push = data.P @ L @ data.I_minus_H_u
     return np.block([[corner, side], [side.T, -(push + push.T)]])
 
 
-def _spread(numbers: np.ndarray, data: _Data) -> np.ndarray:
-    return numbers if data.split else np.full(len(data.P), numbers[0])
+def _multiplier_vector(numbers: np.ndarray, data: _Data) -> np.ndarray:
+    return numbers if data.componentwise else np.full(len(data.P), numbers[0])
 
 
-def _proved(Q: np.ndarray, multipliers: np.ndarray, data: _Data) -> EnergyNorm | None:
+def _certify(Q: np.ndarray, multipliers: np.ndarray, data: _Data) -> EnergyNorm | None:
+    """Return the norm of Q with M and its rate from eigenvalues, or None if it has none."""
     ends = np.linalg.eigvalsh(Q)
     rate = _rate_of(Q, multipliers, data) if ends[0] > 0 else np.inf
     if not np.isfinite(rate):
@@ -121,7 +130,7 @@ def _proved(Q: np.ndarray, multipliers: np.ndarray, data: _Data) -> EnergyNorm |
 
 
 def _rate_of(Q: np.ndarray, multipliers: np.ndarray, data: _Data) -> float:
-    """The least μ for this Q and these multipliers, by eigenvalues."""
+    """Return the smallest μ for this Q and these multipliers, by eigenvalues."""
     n = len(Q)
     form = _form(Q, multipliers, data, 0.0)
     N = -form[n:, n:]
@@ -135,16 +144,16 @@ def _rate_of(Q: np.ndarray, multipliers: np.ndarray, data: _Data) -> float:
     return 0.5 * float(np.linalg.eigvalsh(reduced)[-1]) + 1e-13 * float(np.abs(reduced).max())
 
 
-def _of_the_space(data: _Data) -> float:
-    """μ for Q = I and one multiplier."""
+def _rate_of_space_norm(data: _Data) -> float:
+    """Return μ for Q = I and one multiplier."""
     identity, ones = np.eye(len(data.G)), np.ones(len(data.P))
     return min(_rate_of(identity, t * ones, data) for t in np.geomspace(1e-6, 1e6, 121))
 
 
-def _solved(data: _Data, mu: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """Q and the multipliers with the least κ for this μ."""
+def _solve_program(data: _Data, mu: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the Q and multipliers with the smallest κ for this μ, or None if there are none."""
     n, m = len(data.G), len(data.P)
-    count = m if data.split else 1
+    count = m if data.componentwise else 1
     pairs = [(i, j) for i in range(n) for j in range(i, n)]
 
     def unpack(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -155,22 +164,22 @@ def _solved(data: _Data, mu: float) -> tuple[np.ndarray, np.ndarray] | None:
 
     def cones(z: np.ndarray) -> list[np.ndarray]:
         Q, numbers, kappa = unpack(z)
-        form = _form(Q, _spread(numbers, data), data, mu)
+        form = _form(Q, _multiplier_vector(numbers, data), data, mu)
         return [-form, Q, kappa * np.eye(n) - Q]
 
-    z = _programme(cones, len(pairs) + count + 1, [np.zeros((n + m, n + m)), -np.eye(n), None],
+    z = _minimise(cones, len(pairs) + count + 1, [np.zeros((n + m, n + m)), -np.eye(n), None],
                    range(len(pairs), len(pairs) + count))  # fmt: skip
     if z is None:
         return None
     Q, numbers, _ = unpack(z)
-    return Q, _spread(np.maximum(numbers, _LEAST_MULTIPLIER), data)
+    return Q, _multiplier_vector(np.maximum(numbers, _SMALLEST_MULTIPLIER), data)
 
 
-def _programme(
+def _minimise(
     cones: Callable[[np.ndarray], list[np.ndarray]], size: int, offsets: list, positive: range
 ) -> np.ndarray | None:
-    """The z with the least last entry where cones(z) + offsets ⪰ 0, cones linear, and the entries at
-    `positive` are positive."""
+    """Return the z that minimises its last entry subject to cones(z) + offsets ⪰ 0 and positive entries
+    at `positive`, with linear functions `cones`; None if the solver finds none."""
     clarabel = _solver()
     units = [cones(e) for e in np.eye(size)]
     rows, offset, kinds = [], [], []
@@ -183,14 +192,14 @@ def _programme(
         row = np.zeros((1, size))
         row[0, k] = -1.0
         rows.append(row)
-        offset.append(np.array([-_LEAST_MULTIPLIER]))
+        offset.append(np.array([-_SMALLEST_MULTIPLIER]))
         kinds.append(clarabel.NonnegativeConeT(1))
     settings = clarabel.DefaultSettings()
     settings.verbose = False
-    goal = np.zeros(size)
-    goal[-1] = 1.0
+    objective = np.zeros(size)
+    objective[-1] = 1.0
     solver = clarabel.DefaultSolver(
-        sp.csc_matrix((size, size)), goal, sp.csc_matrix(np.concatenate(rows)),
+        sp.csc_matrix((size, size)), objective, sp.csc_matrix(np.concatenate(rows)),
         np.concatenate(offset), kinds, settings,
     )  # fmt: skip
     answer = solver.solve()
@@ -199,7 +208,8 @@ def _programme(
 
 
 def _packed(S: np.ndarray) -> np.ndarray:
-    """The upper triangle column by column, with √2 off the diagonal: inner products stay."""
+    """Return the upper triangle by columns, off-diagonal entries times √2 to preserve inner
+    products."""
     i, j = np.triu_indices(len(S))
     order = np.lexsort((i, j))
     i, j = i[order], j[order]
@@ -214,8 +224,8 @@ def _solver() -> Any:
             InputProblem(
                 "dvax.verify(energy=True)",
                 "no module named clarabel",
-                "the norm is found by a semidefinite programme, which Clarabel solves",
-                "pip install 'dvax[energy]', or leave energy out",
+                "the norm is found by a semidefinite program, which Clarabel solves",
+                "pip install 'dvax[energy]', or omit energy",
             )
         ) from error
     return clarabel

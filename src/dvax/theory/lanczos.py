@@ -1,30 +1,30 @@
-"""The largest eigenvalue of a symmetric map that is known by its action alone, from above.
+"""An upper bound on the largest eigenvalue of a symmetric map given by its action alone.
 
-Lanczos' method approaches it from below. With a start drawn evenly from the sphere, k steps miss the
-largest eigenvalue λ₁ by more than ε(λ₁ − λₙ) with a probability of at most
+Lanczos' method approaches the eigenvalue from below. With a start vector uniform on the sphere, the
+error after k steps exceeds ε(λ₁ − λₙ) with a probability of at most
 
     1.648 √n e^{−(2k−1)√ε}
 
-(Kuczyński and Woźniakowski, SIAM J. Matrix Anal. Appl. 13 (1992) 1094, Theorem 4.2). So with the
-probability set to 10⁻¹², ε is known before anything is computed, and the bound is θ + ε(λ₁ − λₙ).
+(Kuczyński and Woźniakowski, SIAM J. Matrix Anal. Appl. 13 (1992) 1094, Theorem 4.2). The
+probability is set to 10⁻¹². This determines ε before the computation, and the bound is θ + ε(λ₁ − λₙ).
 """
 
 from collections.abc import Callable
 
 import numpy as np
 
-CHANCE = 1e-12
-"""The probability that a bound does not hold, over the random start."""
+FAILURE_PROBABILITY = 1e-12
+"""The probability, over the random start vector, that a bound does not hold."""
 
-_STEPS = 240
+_MAX_STEPS = 240
 
 
-def greatest(
+def largest_eigenvalue_bound(
     apply: Callable[[np.ndarray], np.ndarray], size: int, least: float | None = None
 ) -> float:
-    """A bound λ ≥ λ₁ of the symmetric map `apply` on vectors of this size.
+    """Return a bound λ ≥ λ₁ for the symmetric map `apply` on vectors of length `size`.
 
-    `least` is a bound from below on its spectrum; without it, one is computed in the same way.
+    `least` is a lower bound of the spectrum; without it, one is computed in the same way.
     """
     theta_low, theta_high, epsilon = _ritz(apply, size)
     if epsilon == 0.0:
@@ -36,8 +36,9 @@ def greatest(
 
 
 def _ritz(apply: Callable[[np.ndarray], np.ndarray], size: int) -> tuple[float, float, float]:
-    """The ends of the Ritz values, and ε; 0 where the Krylov space is the whole space."""
-    steps = min(_STEPS, size)
+    """Return the smallest and largest Ritz value, and ε, which is 0 if the Krylov space is
+    invariant."""
+    steps = min(_MAX_STEPS, size)
     rng = np.random.default_rng(20260101)
     basis = np.zeros((steps, size))
     v = rng.standard_normal(size)
@@ -47,7 +48,7 @@ def _ritz(apply: Callable[[np.ndarray], np.ndarray], size: int) -> tuple[float, 
         basis[k] = v
         w = apply(v)
         diagonal.append(float(v @ w))
-        # Twice, so that rounding does not bring back what was found before.
+        # Orthogonalise twice, since one pass leaves components of rounding size.
         for _ in range(2):
             w = w - basis[: k + 1].T @ (basis[: k + 1] @ w)
         length = float(np.linalg.norm(w))
@@ -56,12 +57,12 @@ def _ritz(apply: Callable[[np.ndarray], np.ndarray], size: int) -> tuple[float, 
             break
         off.append(length)
         v = w / length
-    taken = len(diagonal)
-    T = np.diag(diagonal) + np.diag(off[: taken - 1], 1) + np.diag(off[: taken - 1], -1)
+    count = len(diagonal)
+    T = np.diag(diagonal) + np.diag(off[: count - 1], 1) + np.diag(off[: count - 1], -1)
     ritz = np.linalg.eigvalsh(T)
-    # A space that is left no more holds every eigenvector that the start has a part of, and by chance
-    # it has a part of all: what it found are eigenvalues, the ends among them.
-    if taken < steps or taken == size:
+    # An invariant Krylov space contains every eigenvector with a component in the start vector. With
+    # probability one that is every eigenvector, so the Ritz values include the extreme eigenvalues.
+    if count < steps or count == size:
         return float(ritz[0]), float(ritz[-1]), 0.0
-    root = np.log(1.648 * np.sqrt(size) / CHANCE) / (2 * taken - 1)
+    root = np.log(1.648 * np.sqrt(size) / FAILURE_PROBABILITY) / (2 * count - 1)
     return float(ritz[0]), float(ritz[-1]), float(root**2)

@@ -1,6 +1,7 @@
-"""Moduli of affine data too large to be written out as matrices: by their action, with Lanczos."""
+"""Moduli of affine data too large for matrices: matrix-free, by Lanczos' method."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.flatten_util
@@ -11,18 +12,18 @@ import numpy as np
 from .._tree import Tree
 from ..spaces import AbstractSpace
 from ..vi import analyse, independent
-from .lanczos import greatest
+from .lanczos import largest_eigenvalue_bound
 from .system import System
 from .weights import flat_roots
 
 Action = Callable[[np.ndarray], np.ndarray]
 
 
-def scaled(
+def in_euclidean_coordinates(
     apply: Callable[[Tree], Tree], space_in: AbstractSpace, like_in: Tree, space_out: AbstractSpace,
     like_out: Tree,
 ) -> Callable[[jax.Array], jax.Array]:  # fmt: skip
-    """A map between two spaces in coordinates in which their norms are Euclidean."""
+    """Return a map between two spaces in coordinates in which their norms are Euclidean."""
     flat_in, unravel = jax.flatten_util.ravel_pytree(like_in)
     root_in, root_out = flat_roots(space_in, like_in), flat_roots(space_out, like_out)
 
@@ -33,8 +34,8 @@ def scaled(
     return flat
 
 
-class Linear:
-    """A linear map between two spaces by its action and that of its adjoint, in such coordinates."""
+class LinearMap:
+    """A linear map between two spaces and its adjoint, in Euclidean coordinates."""
 
     apply: Callable[[jax.Array], jax.Array]
     adjoint: Callable[[jax.Array], jax.Array]
@@ -45,7 +46,7 @@ class Linear:
         space_out: AbstractSpace, like_out: Tree,
     ):  # fmt: skip
         flat_in, _ = jax.flatten_util.ravel_pytree(like_in)
-        flat = scaled(apply, space_in, like_in, space_out, like_out)
+        flat = in_euclidean_coordinates(apply, space_in, like_in, space_out, like_out)
         transposed = jax.linear_transpose(flat, jax.ShapeDtypeStruct(flat_in.shape, flat_in.dtype))
         self.size_in = flat_in.size
         self.apply = jax.jit(flat)
@@ -57,34 +58,39 @@ class Linear:
         apply: Callable[[jax.Array], jax.Array],
         adjoint: Callable[[jax.Array], jax.Array],
         size: int,
-    ) -> "Linear":
-        """From both actions."""
-        linear = cls.__new__(cls)
-        linear.apply, linear.adjoint, linear.size_in = apply, adjoint, size
-        return linear
+    ) -> "LinearMap":
+        """Return the linear map with these actions."""
+        linear_map = cls.__new__(cls)
+        linear_map.apply, linear_map.adjoint, linear_map.size_in = apply, adjoint, size
+        return linear_map
 
     def norm(self) -> float:
-        """‖J‖, from above."""
+        """Return an upper bound on ‖J‖."""
 
         @jax.jit
         def gram(v: jax.Array) -> jax.Array:
             return self.adjoint(self.apply(v))
 
-        square = greatest(lambda v: np.asarray(gram(jnp.asarray(v))), self.size_in, least=0.0)
+        square = largest_eigenvalue_bound(
+            lambda v: np.asarray(gram(jnp.asarray(v))), self.size_in, least=0.0
+        )
         return float(np.sqrt(max(square, 0.0)))
 
-    def least(self) -> float:
-        """inf ⟨Jd, d⟩/‖d‖², from below."""
+    def smallest_quotient(self) -> float:
+        """Return a lower bound on inf ⟨Jd, d⟩/‖d‖²."""
 
         @jax.jit
-        def minus(v: jax.Array) -> jax.Array:
+        def negative_symmetric_part(v: jax.Array) -> jax.Array:
             return -0.5 * (self.apply(v) + self.adjoint(v))
 
-        return -greatest(lambda v: np.asarray(minus(jnp.asarray(v))), self.size_in)
+        return -largest_eigenvalue_bound(
+            lambda v: np.asarray(negative_symmetric_part(jnp.asarray(v))), self.size_in
+        )
 
 
-class Affine:
-    """f or h where its code shows that it is affine in x and u, its factors independent of t."""
+class AffineMap:
+    """f or h, for which `is_proved` tests whether it is affine in x and u with factors independent of
+    t."""
 
     def __init__(self, system: System, name: str, t0: float):
         self.system = system
@@ -93,26 +99,30 @@ class Affine:
         self._at = lambda t, xu: fn(t, *xu, system.args)
         self.t0 = jnp.asarray(t0, jnp.result_type(float))
 
-    def proved(self) -> bool:
-        """Whether it is."""
+    def is_proved(self) -> bool:
+        """Return whether the code shows that the map is affine with constant factors."""
         both = self.system.x0, self.system.u0
-        slope = lambda t: jax.jvp(lambda v: self._at(t, v), (both,), (both,))[1]  # noqa: E731
+
+        def slope(t: Any) -> Tree:
+            return jax.jvp(lambda v: self._at(t, v), (both,), (both,))[1]
+
         if not independent(slope, self.t0):
             return False
-        return analyse(lambda flat: self._at(self.t0, flat), both).affine
+        return analyse(lambda v: self._at(self.t0, v), both).affine
 
-    def by_state(self) -> Linear:
-        """∂/∂x."""
+    def by_state(self) -> LinearMap:
+        """Return ∂/∂x."""
         system = self.system
         zero = jtu.tree_map(jnp.zeros_like, system.u0)
-        return Linear(lambda d: self._push((d, zero)), system.state, system.x0, *self.out)
+        return LinearMap(lambda d: self._push((d, zero)), system.state, system.x0, *self.out)
 
-    def by_response(self) -> Linear:
-        """∂/∂u."""
+    def by_response(self) -> LinearMap:
+        """Return ∂/∂u."""
         system = self.system
-        return Linear(self.push_response, system.control, system.u0, *self.out)
+        return LinearMap(self.push_response, system.control, system.u0, *self.out)
 
     def push_response(self, d: Tree) -> Tree:
+        """Return the derivative in the direction d of u."""
         return self._push((jtu.tree_map(jnp.zeros_like, self.system.x0), d))
 
     def _push(self, d: Tree) -> Tree:
@@ -120,15 +130,17 @@ class Affine:
         return jax.jvp(lambda v: self._at(self.t0, v), (both,), (d,))[1]
 
 
-def frozen(system: System, h: Affine) -> Linear:
-    """∂F/∂y = (I − ∂h/∂u) P⁻¹."""
+def frozen_derivative(system: System, h: AffineMap) -> LinearMap:
+    """Return ∂F/∂y = (I − ∂h/∂u) P⁻¹."""
     space, like = system.control, system.u0
     P = system.problem.operator(system.args)
-    slack = Linear(
+    I_minus_H_u = LinearMap(
         lambda v: jtu.tree_map(jnp.subtract, v, h.push_response(v)), space, like, space, like
     )
-    # P⁻¹ is its own adjoint in the space, so that what it is computed by need not be transposed.
-    inverse = jax.jit(scaled(P.inverse, space, like, space, like))
-    return Linear.of(
-        lambda v: slack.apply(inverse(v)), lambda w: inverse(slack.adjoint(w)), slack.size_in
+    # P⁻¹ is self-adjoint in the space, so its code need not be transposed.
+    inverse = jax.jit(in_euclidean_coordinates(P.inverse, space, like, space, like))
+    return LinearMap.of(
+        lambda v: I_minus_H_u.apply(inverse(v)),
+        lambda w: inverse(I_minus_H_u.adjoint(w)),
+        I_minus_H_u.size_in,
     )

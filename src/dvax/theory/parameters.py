@@ -1,4 +1,4 @@
-"""Section 6 of the paper: how far solutions move with the initial state and the parameter."""
+"""Section 6 of the paper: bounds on the change of solutions with initial state and parameter."""
 
 from typing import Any
 
@@ -10,12 +10,12 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from .constants import Constants
-from .formulas import convolved
+from .formulas import growth_integral
 from .status import Status, weakest
 
 
 class ParameterSet(eqx.Module):
-    """low ≤ η ≤ high entry by entry, t0 ≤ t ≤ t1, and ‖ζ‖ ≤ start_radius where that was used."""
+    """low ≤ η ≤ high entry by entry, t0 ≤ t ≤ t1, and ‖ζ‖ ≤ start_radius unless that is None."""
 
     low: Tree
     high: Tree
@@ -23,8 +23,8 @@ class ParameterSet(eqx.Module):
     t1: float
     start_radius: float | None
 
-    def holds(self, args: Any) -> bool:
-        """Whether these parameters lie in the box."""
+    def contains(self, args: Any) -> bool:
+        """Return whether these parameters lie in the box."""
         trees = (self.low, args, self.high)
         low, at, high = (jtu.tree_leaves(tree) for tree in trees)
         if not len(low) == len(at) == len(high):
@@ -34,7 +34,7 @@ class ParameterSet(eqx.Module):
 
 
 class ParameterBounds(eqx.Module):
-    """What a bounded set D of parameters η leaves possible on [0, T] (paper, Section 6).
+    """Bounds on solutions on [0, T] for all parameters η in a bounded set D (paper, Section 6).
 
     **Arguments** (paper's symbol, ass:parametrized_data):
 
@@ -44,11 +44,11 @@ class ParameterBounds(eqx.Module):
     - `C_h0` ≥ ‖h(t, 0, 0, η)‖, `C_f0` ≥ ‖f(t, 0, 0, η)‖, (vi), (vii);
     - `modulus_f`, `modulus_h`: numbers ℓ with ‖f(t,x,u,η₁) − f(t,x,u,η₂)‖ ≤ ℓ_f ‖η₁ − η₂‖, and the same
       for h, (iii);
-    - `status`: of those five;
-    - `domain`: the box, the times and the initial states that they are for, from
-      `dvax.parameter_bounds`; None where nobody says.
+    - `status`: the status of those five;
+    - `domain`: the box, the times and the initial states for which they hold, from
+      `dvax.parameter_bounds`; None if not stated.
 
-    Distances d of parameters are in the norm that `modulus_f` and `modulus_h` are meant in.
+    Distances of parameters are in the norm to which `modulus_f` and `modulus_h` refer.
 
     ```python
     >>> import dvax
@@ -72,7 +72,7 @@ class ParameterBounds(eqx.Module):
     modulus_f: Any
     modulus_h: Any
     domain: ParameterSet | None
-    given: Status = eqx.field(static=True)
+    data_status: Status = eqx.field(static=True)
 
     def __init__(
         self,
@@ -87,8 +87,8 @@ class ParameterBounds(eqx.Module):
         status: Status = "declared",
         domain: ParameterSet | None = None,
     ):
-        self.constants, self.given, self.domain = constants, status, domain
-        wrong = []
+        self.constants, self.data_status, self.domain = constants, status, domain
+        problems = []
         values = dict(
             T=T, kappa_K=kappa_K, C_h0=C_h0, C_f0=C_f0, modulus_f=modulus_f, modulus_h=modulus_h
         )
@@ -96,20 +96,20 @@ class ParameterBounds(eqx.Module):
             number = _tree.as_float(value, f"dvax.ParameterBounds({name})")
             setattr(self, name, number)
             if _tree.is_concrete(number) and not (np.ndim(number) == 0 and float(number) >= 0):
-                wrong.append(
+                problems.append(
                     InputProblem(
                         f"dvax.ParameterBounds({name})", _tree.short(number),
-                        "it must be one number ≥ 0", "Give a bound on it; ∞ says that none is known",
+                        "it must be one number ≥ 0", "Give a bound on it, or ∞ if none is known",
                     )
                 )  # fmt: skip
-        if wrong:
-            raise InputError(*wrong)
+        if problems:
+            raise InputError(*problems)
 
     @property
     def status(self) -> Status:
-        """The weakest status among all that these bounds are made from."""
+        """The weakest status among the quantities in these bounds."""
         c = self.constants
-        return weakest(self.given, c.status_of(*(name for name, _ in c.statuses)))
+        return weakest(self.data_status, c.status_of(*(name for name, _ in c.statuses)))
 
     @property
     def L(self) -> Any:
@@ -122,57 +122,62 @@ class ParameterBounds(eqx.Module):
         return self.constants.L_tilde
 
     def response_radius(self, R: Any) -> Any:
-        """R̂(D, R) with ‖u_x^η(t)‖ ≤ R̂ for ‖x‖ ≤ R (cor:parametrized_state_to_control_bound)."""
+        """Return R̂(D, R) with ‖u_x^η(t)‖ ≤ R̂ for ‖x‖ ≤ R (cor:parametrized_state_to_control_bound)."""
         v, c = _tree.host(self), _tree.host(self.constants)
-        push = c.alpha_h * R + v.C_h0 + (2.0 * c.norm_P_inv + c.L_F) * v.kappa_K
-        return c.norm_P_inv * (v.kappa_K + push / c.gamma)
+        norm_F = c.alpha_h * R + v.C_h0 + (2.0 * c.norm_P_inv + c.L_F) * v.kappa_K
+        return c.norm_P_inv * (v.kappa_K + norm_F / c.gamma)
 
     def state_radius(self, R_initial: Any) -> Any:
-        """R_B^x with ‖x(t)‖ ≤ R_B^x on [0, T] for ‖ζ‖ ≤ R_Λ (lem:parametrized_apriori)."""
+        """Return R_B^x with ‖x(t)‖ ≤ R_B^x on [0, T] for ‖ζ‖ ≤ R_Λ (lem:parametrized_apriori)."""
         v, c = _tree.host(self), _tree.host(self.constants)
         lib = _tree.library(self, R_initial)
-        rest = c.beta_f * self.response_radius(0.0) + v.C_f0
-        start = c.M * R_initial + c.M * rest * convolved(-c.omega, v.T)
+        forcing = c.beta_f * self.response_radius(0.0) + v.C_f0
+        start = c.M * R_initial + c.M * forcing * growth_integral(-c.omega, v.T)
         return lib.exp(lib.maximum(c.omega, 0.0) * v.T) * start * lib.exp(c.M * self.L_tilde * v.T)
 
     def radius(self, R_initial: Any) -> Any:
-        """R_B = max(R_B^x, R̂(D, R_B^x)): a ball that x and u stay in (lem:parametrized_apriori)."""
+        """Return R_B = max(R_B^x, R̂(D, R_B^x)), a bound on ‖x‖ and ‖u‖ (lem:parametrized_apriori)."""
         lib = _tree.library(self, R_initial)
         of_state = self.state_radius(R_initial)
         return lib.maximum(of_state, self.response_radius(of_state))
 
     def response(self, gap_x: Any, gap: Any) -> Any:
-        """‖u_{x₁}^{η₁} − u_{x₂}^{η₂}‖ for ‖x₁ − x₂‖ ≤ gap_x, ‖η₁ − η₂‖ ≤ gap
+        """Return a bound on ‖u_{x₁}^{η₁} − u_{x₂}^{η₂}‖ for ‖x₁ − x₂‖ ≤ gap_x, ‖η₁ − η₂‖ ≤ gap
         (cor:parametrized_state_to_control_compare)."""
         v, c = _tree.host(self), _tree.host(self.constants)
         return c.norm_P_inv / c.gamma * (c.alpha_h * gap_x + v.modulus_h * gap)
 
     def modulus(self, gap: Any) -> Any:
-        """Θ(‖η₁ − η₂‖), by which the reduced map moves (eq:reduced_parameter_modulus)."""
+        """Return Θ(‖η₁ − η₂‖), which bounds the change of the reduced map
+        (eq:reduced_parameter_modulus)."""
         v, c = _tree.host(self), _tree.host(self.constants)
         return (c.beta_f * c.norm_P_inv / c.gamma * v.modulus_h + v.modulus_f) * gap
 
     def state(self, gap_start: Any, gap: Any) -> Any:
-        """max_t ‖x₁ − x₂‖ ≤ M e^{(ω+ML̃)₊T}‖Δζ‖ + M Φ_{ω+ML̃}(T) Θ (thm:parametrized_continuity)."""
+        """Return the bound M e^{(ω+ML̃)₊T}‖Δζ‖ + M Φ_{ω+ML̃}(T) Θ on max_t ‖x₁ − x₂‖
+        (thm:parametrized_continuity)."""
         c = _tree.host(self.constants)
-        return self._moved(c.M, c.growth_rate, gap_start, gap)
+        return self._separation(c.M, c.growth_rate, gap_start, gap)
 
     def control(self, gap_start: Any, gap: Any) -> Any:
-        """max_t ‖u₁ − u₂‖ ≤ ‖P⁻¹‖ℓ_h‖Δη‖/γ + L max_t ‖x₁ − x₂‖ (thm:parametrized_continuity)."""
+        """Return the bound ‖P⁻¹‖ℓ_h‖Δη‖/γ + L max_t ‖x₁ − x₂‖ on max_t ‖u₁ − u₂‖
+        (thm:parametrized_continuity)."""
         return self.response(self.state(gap_start, gap), gap)
 
     def sharp_state(self, gap_start: Any, gap: Any) -> Any:
-        """The same with the one-sided constant: e^{μ₊T}‖Δζ‖ + Φ_μ(T)Θ, since
-        d/dt ‖Δx‖ ≤ μ‖Δx‖ + Θ; None where μ is not known."""
+        """Return `state` with the one-sided constant, e^{μ₊T}‖Δζ‖ + Φ_μ(T)Θ, or None if μ is unknown.
+
+        It follows from d/dt ‖Δx‖ ≤ μ‖Δx‖ + Θ.
+        """
         mu = self.constants.one_sided
-        return None if mu is None else self._moved(1.0, _tree.host(mu), gap_start, gap)
+        return None if mu is None else self._separation(1.0, _tree.host(mu), gap_start, gap)
 
     def sharp_control(self, gap_start: Any, gap: Any) -> Any:
-        """`control` from `sharp_state`; None where μ is not known."""
-        moved = self.sharp_state(gap_start, gap)
-        return None if moved is None else self.response(moved, gap)
+        """Return `control` from `sharp_state`, or None if μ is unknown."""
+        separation = self.sharp_state(gap_start, gap)
+        return None if separation is None else self.response(separation, gap)
 
-    def _moved(self, M: Any, rate: Any, gap_start: Any, gap: Any) -> Any:
+    def _separation(self, M: Any, rate: Any, gap_start: Any, gap: Any) -> Any:
         v, lib = _tree.host(self), _tree.library(self, gap_start, gap)
-        grown = M * lib.exp(lib.maximum(rate, 0.0) * v.T) * gap_start
-        return grown + M * convolved(rate, v.T) * self.modulus(gap)
+        from_start = M * lib.exp(lib.maximum(rate, 0.0) * v.T) * gap_start
+        return from_start + M * growth_integral(rate, v.T) * self.modulus(gap)

@@ -1,4 +1,4 @@
-"""Where a statement about f, h and F is meant to hold: a box of times, states and responses."""
+"""The region for statements about f, h and F: a box of times, states, responses and parameters."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -14,10 +14,9 @@ from ..programs.slope import Slope, interval, is_slope
 
 
 class Region(NamedTuple):
-    """t0 ≤ t ≤ t1, and x, u and the parameter η between bounds, entry by entry: trees of intervals
-    each. η is () where it does not vary.
+    """t0 ≤ t ≤ t1, and x, u and the parameter η between bounds, entry by entry, as trees of intervals.
 
-    A box is convex, so what bounds a derivative on it bounds a Lipschitz modulus.
+    η is () if it is fixed. A box is convex, so a bound on a derivative over it is a Lipschitz modulus.
     """
 
     t: Slope
@@ -31,32 +30,27 @@ class Region(NamedTuple):
         return _slopes(self)
 
     @property
-    def everywhere(self) -> bool:
-        """Whether x and u are free, as the paper has them."""
+    def is_everywhere(self) -> bool:
+        """Whether x and u are unbounded, as in the paper."""
         return all(
             bool(np.isneginf(v.low).all() and np.isposinf(v.high).all())
             for v in _slopes((self.x, self.u))
         )
 
-    @property
-    def bounded(self) -> bool:
-        return all(
-            bool(np.isfinite(v.low).all() and np.isfinite(v.high).all()) for v in _slopes(self)
-        )
-
     def halves(self, whole: "Region") -> Iterator["Region"]:
-        """Cut across the direction in which this piece of `whole` is relatively widest."""
+        """Yield two halves, cut across the entry whose width relative to `whole` is largest."""
         leaves = _slopes(self)
-        best, place = 0.0, None
+        widest, position = 0.0, None
         for k, (v, w) in enumerate(zip(leaves, _slopes(whole), strict=True)):
             width, full = np.asarray(v.high - v.low), np.asarray(w.high - w.low)
-            cuttable = np.isfinite(full) & (full > 0)
-            share = np.where(cuttable, width, 0.0) / np.where(cuttable, full, 1.0)
-            if share.size and share.max() > best:
-                best, place = float(share.max()), (k, np.unravel_index(share.argmax(), share.shape))
-        if place is None:
+            can_cut = np.isfinite(full) & (full > 0)
+            relative = np.where(can_cut, width, 0.0) / np.where(can_cut, full, 1.0)
+            if relative.size and relative.max() > widest:
+                widest = float(relative.max())
+                position = k, np.unravel_index(relative.argmax(), relative.shape)
+        if position is None:
             return
-        k, entry = place
+        k, entry = position
         v = leaves[k]
         middle = 0.5 * (v.low[entry] + v.high[entry])
         for low, high in ((v.low[entry], middle), (middle, v.high[entry])):
@@ -74,34 +68,44 @@ def _slopes(tree: Tree) -> list[Slope]:
     return jtu.tree_leaves(tuple(tree), is_leaf=is_slope)
 
 
-def between(bounds: Any, like: Tree, name: str) -> Tree:
-    """A tree of intervals shaped like `like`, from (low, high): numbers, or elements; or None.
+def as_intervals(bounds: Any, like: Tree, name: str) -> Tree:
+    """Return a tree of intervals shaped like `like`.
+
+    `bounds` is a pair (low, high) of numbers or elements, or None for infinite bounds.
 
     **Raises:** `dvax.InputError`.
     """
     if bounds is None:
         bounds = (-np.inf, np.inf)
     if not (isinstance(bounds, tuple | list) and len(bounds) == 2):
-        raise _wrong(name, bounds, "it must be a pair (low, high) of numbers or elements")
+        raise _error(name, bounds, "it must be a pair (low, high) of numbers or elements")
     ends = []
     for end in bounds:
         end = _tree.as_float(end, name)
         if _tree.shapes(end) == () and not isinstance(end, tuple):
             end = jtu.tree_map(lambda leaf, v=end: np.full(jnp.shape(leaf), float(v)), like)
         if not _tree.same_shape(end, like):
-            raise _wrong(
+            raise _error(
                 name, f"shape {_tree.shapes(end)}", f"elements have shape {_tree.shapes(like)}"
             )
         ends.append(end)
     out = jtu.tree_map(lambda a, b: interval(np.asarray(a), np.asarray(b)), *ends)
     if any(not (v.low <= v.high).all() for v in _slopes((out,))):
-        raise _wrong(name, _tree.short(bounds), "low ≤ high in every entry, or the region is empty")
+        raise _error(
+            name,
+            _tree.short(bounds),
+            "low ≤ high must hold in every entry, otherwise the region is empty",
+        )
     if any(np.isposinf(v.low).any() or np.isneginf(v.high).any() for v in _slopes((out,))):
-        raise _wrong(name, _tree.short(bounds), "low < ∞ and high > −∞, or the region has no point")
+        raise _error(
+            name,
+            _tree.short(bounds),
+            "low < ∞ and high > −∞ must hold, otherwise the region is empty",
+        )
     return out
 
 
-def _wrong(name: str, given: Any, rule: str) -> InputError:
+def _error(name: str, given: Any, rule: str) -> InputError:
     return InputError(
         InputProblem(name, _tree.short(given), rule, "Give the bounds as (low, high)")
     )

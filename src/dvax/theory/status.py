@@ -1,14 +1,14 @@
-"""Words for how much is known about a number, from the strongest to the weakest."""
+"""The status of a number or assumption, from the strongest to the weakest."""
 
 from typing import Literal
 
 Status = Literal["proved", "declared", "estimated", "refuted"]
 
 ORDER: tuple[Status, ...] = ("proved", "declared", "estimated", "refuted")
-"""proved: from structure or a closed form. declared: the user's word. estimated: sampled, a bound
-from the wrong side. refuted: a counterexample is known."""
+"""proved: from the structure of the problem or a closed form. declared: given by the user. estimated:
+from samples, a bound from the wrong side. refuted: a counterexample was found."""
 
 
 def weakest(*statuses: Status) -> Status:
-    """What can be said of a number made from others: no more than of the weakest of them."""
+    """Return the status of a number computed from others: the weakest of theirs."""
     return ORDER[max(map(ORDER.index, statuses), default=0)]

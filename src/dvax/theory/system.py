@@ -1,4 +1,4 @@
-"""A problem's data as matrices: the derivatives of f and h over a region, P⁻¹ and A."""
+"""The data of a problem as matrices: the derivatives of f and h over a region, P⁻¹ and A."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,8 +16,8 @@ from .weights import roots
 
 
 class Jacobians(NamedTuple):
-    """∂f/∂x, ∂f/∂u, ∂h/∂x, ∂h/∂u over a region, in the norms of the spaces; None where too large to be
-    written out. `unknown`: the operations in f and in h that nothing is known about."""
+    """∂f/∂x, ∂f/∂u, ∂h/∂x, ∂h/∂u over a region, in the norms of the spaces; None if too large for a
+    matrix. `unknown`: the operations in f and in h that have no rule."""
 
     f_x: Block | None
     f_u: Block | None
@@ -27,12 +27,15 @@ class Jacobians(NamedTuple):
 
 
 class System:
-    """The data of a problem as matrices in the norms of its spaces: at one parameter, or where it is
-    `varied` for f and h over a region of them; A, P and K are those of `args`."""
+    """The data of a problem as matrices in the norms of its spaces.
+
+    A, P and K belong to the parameter `args`; f and h as well, unless `varied`: then they take the
+    parameter as an argument.
+    """
 
     def __init__(self, problem: Problem, x0: Tree, args: Any, varied: bool = False):
         self.problem, self.args = problem, args
-        self._seen: dict[bytes, Jacobians] = {}
+        self._cache: dict[bytes, Jacobians] = {}
         self.x0, self.u0 = x0, problem.zero_control(x0)
         self.state, self.control = problem.spaces(x0)
         self._roots_x, self._roots_u = roots(self.state, x0), roots(self.control, self.u0)
@@ -52,11 +55,12 @@ class System:
         self.A = self._of_linear(problem.generator(args).apply, self.state, self.x0)
 
     def at(self, region: Region) -> Jacobians:
-        """Over this region; kept, since every modulus looks at nearly the same pieces."""
+        """Return the derivatives over this region, cached because all moduli use nearly the same
+        pieces."""
         key = b"".join(end.tobytes() for v in region.leaves for end in v[:2])
-        if key not in self._seen:
-            self._seen[key] = self._at(region)
-        return self._seen[key]
+        if key not in self._cache:
+            self._cache[key] = self._at(region)
+        return self._cache[key]
 
     def _at(self, region: Region) -> Jacobians:
         parts = len(jtu.tree_leaves(self.x0))
@@ -70,32 +74,33 @@ class System:
                 unknown[name] = ()
                 continue
             roots_out = self._roots_x if name == "f" else self._roots_u
-            blocks.append(_if_small(out, 0, roots_out, self._roots_x))
-            blocks.append(_if_small(out, parts, roots_out, self._roots_u))
+            blocks.append(_block_or_none(out, 0, roots_out, self._roots_x))
+            blocks.append(_block_or_none(out, parts, roots_out, self._roots_u))
         f_x, f_u, h_x, h_u = blocks
         return Jacobians(f_x, f_u, h_x, h_u, unknown)
 
     def frozen(self, h_u: Block) -> Block:
-        """∂F/∂y = (I − ∂h/∂u) P⁻¹ (eq:F_def)."""
+        """Return ∂F/∂y = (I − ∂h/∂u) P⁻¹ (eq:F_def)."""
         if self.P_inv is None:
             raise TooLarge
         return identity(h_u).plus(h_u, -1.0) @ self.P_inv
 
     def _of_linear(self, apply: Callable[[Tree], Tree], space: Any, like: Tree) -> Block | None:
-        """The matrix of a linear map; None where its code does not show it or it is too large."""
+        """Return the matrix of a linear map, or None if it is too large or has operations without a
+        rule."""
         anywhere = jtu.tree_map(
             lambda leaf: interval(np.full(leaf.shape, -np.inf), np.full(leaf.shape, np.inf)), like
         )
         try:
             out, unknown = SlopeEnclosure(apply, (like,), (0,))(anywhere)
-            found = block(out, 0, roots(space, like), roots(space, like))
+            matrix = block(out, 0, roots(space, like), roots(space, like))
         except TooLarge:
             return None
-        return found if not unknown and found.exact else None
+        return matrix if not unknown and matrix.exact else None
 
 
-def _if_small(*given: Any) -> Block | None:
+def _block_or_none(*args: Any) -> Block | None:
     try:
-        return block(*given)
+        return block(*args)
     except TooLarge:
         return None

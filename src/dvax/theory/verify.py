@@ -1,4 +1,4 @@
-"""`dvax.verify`: every assumption of the paper, with what is known about it and how."""
+"""`dvax.verify`: the status of every assumption of the paper, and the constants of a problem."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -13,31 +13,29 @@ from ..errors import InputError, InputProblem
 from ..evolution.nonfinite import refuse_nonfinite_data
 from ..problem import Problem
 from ..programs.slope import Slope, SlopeEnclosure, TooLarge, interval, is_slope
-from .assumption import Assumption
+from .assumptions import Assumption, assumptions
 from .certificate import is_declared
 from .constants import Constants
 from .domain import Domain
 from .energy import energy_norm
-from .known import Knowledge, knowledge
 from .moduli import sharp_rate
-from .motion import Motion, motion
-from .region import Region, between
-from .rows import rows
+from .modulus_status import ModulusStatuses, modulus_statuses
+from .region import Region, as_intervals
+from .set_motion import SetMotion, set_motion
 from .status import Status, weakest
 from .system import System
 
-_REACH = 10.0
-"""A search looks as far as ten times 1 + |x0| where a region has no bounds."""
+_SEARCH_RADIUS = 10.0
+"""Radius of a search in an unbounded region, in units of 1 + |x0|."""
 
 
 class Verification(NamedTuple):
-    """What is known about a problem.
+    """The assumptions and constants of a problem with their statuses.
 
-    - `assumptions`: one line each, found by its label with `check["ass:…"]`;
-    - `constants`: `dvax.Constants` with the status of each, or None where a modulus is missing or γ is
-      not positive;
-    - `route`: "variational inequality" or "projection", which of the paper's two routes gives the
-      better γ.
+    - `assumptions`: the `Assumption`s; `check["ass:…"]` returns the one with this label;
+    - `constants`: `dvax.Constants` with the status of each, or None if a modulus is missing or γ is not
+      positive;
+    - `route`: "variational inequality" or "projection", the route of the paper that gives the larger γ.
     """
 
     assumptions: tuple[Assumption, ...]
@@ -47,23 +45,22 @@ class Verification(NamedTuple):
     def __getitem__(self, label: Any) -> Any:
         if not isinstance(label, str):
             return tuple(self)[label]
-        for row in self.assumptions:
-            if row.label == label:
-                return row
+        for assumption in self.assumptions:
+            if assumption.label == label:
+                return assumption
         raise KeyError(label)
 
     @property
     def status(self) -> Status:
         """The weakest status among the assumptions that the theory needs."""
-        words: list[Status] = [row.status for row in self.assumptions if row.needed]
-        return weakest(*words)
+        statuses: list[Status] = [a.status for a in self.assumptions if a.is_required]
+        return weakest(*statuses)
 
     def table(self) -> str:
-        """The assumptions as lines of text."""
-        width = max(len(row.label) for row in self.assumptions)
+        """Return the assumptions as lines of text."""
+        width = max(len(a.label) for a in self.assumptions)
         return "\n".join(
-            f"{row.label:<{width}}  {row.status:<9}  {row.statement}: {row.why}"
-            for row in self.assumptions
+            f"{a.label:<{width}}  {a.status:<9}  {a.statement}: {a.why}" for a in self.assumptions
         )
 
 
@@ -83,26 +80,26 @@ def verify(
 
     Each assumption is
 
-    - *proved* from the structure of A, P and K and the code of f and h: derivatives that do not change
-      by their singular values and eigenvalues in the norms of the spaces, others by interval
-      arithmetic over the region, laws F = aG by their factors, affine data too large for a matrix by
-      Lanczos' method (which fails with a probability of at most 10⁻¹²);
-    - *declared*, where `declared` gives a modulus that is not proved, and no search contradicts it;
-    - *estimated* from points of the region where nothing better is known: a bound from the wrong side;
+    - *proved* from the structure of A, P and K and the code of f and h. Constant derivatives are
+      bounded
+      by their singular values and eigenvalues in the norms of the spaces, other derivatives by
+      interval arithmetic over the region, laws F = aG by their factors, and affine data too large
+      for a matrix by Lanczos' method (which fails with a probability of at most 10⁻¹²);
+    - *declared*, if `declared` gives a modulus that is not proved, and no search contradicts it;
+    - *estimated* from points of the region otherwise: a bound from the wrong side;
     - *refuted*, with the counterexample.
 
-    **Arguments:** `x0`: a state (its shape is what matters; 0 for a scalar problem); `x`, `u`: the
-    region as (low, high), numbers or elements, where the statements are to hold: everywhere by
-    default, with Pu in a box around K(t) where one is known. Constants that hold in a region only are
-    good for trajectories that stay in it (and where that of u leaves out a part of P⁻¹K(t), the law may
-    have other solutions there). `declared`: moduli by name, or `dvax.Constants`. `energy`:
-    look for a norm in which trajectories approach, for affine data of up to 40 unknowns (needs
-    `dvax[energy]`).
+    **Arguments:** `x0`: a state (only its shape matters; omit it for a scalar problem); `x`, `u`:
+    the region for the statements as (low, high), numbers or elements. By default x is unbounded,
+    and Pu lies in a box around K(t), if one is known. Constants of a region hold for trajectories
+    that stay in it. (If the region of u excludes a part of P⁻¹K(t), the law may have other
+    solutions there.) `declared`: moduli by name, or `dvax.Constants`. `energy`: search for a norm
+    in which trajectories contract, for affine data of up to 40 unknowns (needs `dvax[energy]`).
 
-    Nothing is solved and nothing is refused: what is wrong is said in the answer.
+    The problem is not solved, and an assumption that fails is not an error: the result reports it.
 
-    **Returns:** a `Verification`. **Raises:** `dvax.InputError` where the data do not fit together, or
-    a region is not one.
+    **Returns:** a `Verification`. **Raises:** `dvax.InputError` if the data do not fit together, or a
+    region is invalid.
 
     ```python
     >>> import dvax
@@ -119,53 +116,57 @@ def verify(
 
     ```
     """
-    t0, t1 = span(t0, t1, "dvax.verify(t0, t1)")
+    t0, t1 = time_span(t0, t1, "dvax.verify(t0, t1)")
     _user_code.check_args(args, "dvax.verify")
-    x0 = state_like(problem, x0, t0, args, "dvax.verify(x0)")
+    x0 = state_for(problem, x0, t0, args, "dvax.verify(x0)")
     refuse_nonfinite_data(problem, args, "dvax.verify")
     problem.check(jnp.asarray(t0), x0, args)
     system = System(problem, x0, args)
     knots = np.asarray(problem.knots(t0, t1, x0, args), float)
-    K = motion(system, t0, t1, knots)
-    states = between(x, x0, "dvax.verify(x)")
-    asked = between(u, system.u0, "dvax.verify(u)")
-    responses = met(asked, around_responses(system, K))
+    K = set_motion(system, t0, t1, knots)
+    states = as_intervals(x, x0, "dvax.verify(x)")
+    given_u = as_intervals(u, system.u0, "dvax.verify(u)")
+    responses = intersect(given_u, response_box(system, K))
     time = interval(t0, t1)
     region = Region(time, states, responses)
-    box = Region(time, bounded(states, x0), bounded(responses, system.u0))
-    known = knowledge(system, region, box, _declared(declared))
-    assumptions = tuple(rows(system, region, K, knots, known))
-    # u is around K(t) whatever it does: what it must be watched for is what was asked for.
-    domain = domain_of(time, None if x is None else states, None if u is None else asked, args)
-    constants = constants_of(system, region, known, domain, energy)
-    return Verification(assumptions, constants, _route(system, known))
+    box = Region(time, search_box(states, x0), search_box(responses, system.u0))
+    moduli = modulus_statuses(system, region, box, _declared(declared))
+    statuses = tuple(assumptions(system, region, K, knots, moduli))
+    # P⁻¹K(t) contains every response, so the domain only needs the bounds given by the caller.
+    domain = domain_of(time, None if x is None else states, None if u is None else given_u, args)
+    constants = constants_of(system, region, moduli, domain, energy)
+    return Verification(statuses, constants, _route(system, moduli))
 
 
-def _route(system: System, known: Knowledge) -> str:
-    """Which of the paper's two sufficient conditions gives the larger γ."""
-    small = float(system.spectrum.m_P) - known.of["beta_h"].value * float(
+def _route(system: System, moduli: ModulusStatuses) -> str:
+    """Return which of the paper's two sufficient conditions gives the larger γ."""
+    gamma_by_smallness = float(system.spectrum.m_P) - moduli.by_name["beta_h"].value * float(
         system.spectrum.norm_P_inv
     )
-    return "projection" if known.of["gamma"].value <= small else "variational inequality"
+    return (
+        "projection"
+        if moduli.by_name["gamma"].value <= gamma_by_smallness
+        else "variational inequality"
+    )
 
 
 def constants_of(
-    system: System, region: Region, known: Knowledge, domain: Domain, energy: bool = False
+    system: System, region: Region, moduli: ModulusStatuses, domain: Domain, energy: bool = False
 ) -> Constants | None:
-    """The constants, where every modulus is a number and γ > 0."""
-    values: dict[str, Any] = {name: entry.value for name, entry in known.of.items()}
-    if known.pair is not None or not values["gamma"] > 0:
+    """Return the constants, or None unless every modulus is finite and γ > 0."""
+    values: dict[str, Any] = {name: entry.value for name, entry in moduli.by_name.items()}
+    if moduli.counterexample is not None or not values["gamma"] > 0:
         return None
     if not all(np.isfinite(value) for value in values.values()):
         return None
-    statuses: dict[str, Status] = {name: entry.status for name, entry in known.of.items()}
-    by_hand = is_declared(system.problem.generator(system.args))
-    of_A: Status = "declared" if by_hand else "proved"
-    of_P: Status = "declared" if system.spectrum.declared else "proved"
-    statuses |= {"M": of_A, "omega": of_A, "m_P": of_P, "norm_P_inv": of_P}
-    mu = _sharp(system, region, known)
+    statuses: dict[str, Status] = {name: entry.status for name, entry in moduli.by_name.items()}
+    declared = is_declared(system.problem.generator(system.args))
+    A_status: Status = "declared" if declared else "proved"
+    P_status: Status = "declared" if system.spectrum.declared else "proved"
+    statuses |= {"M": A_status, "omega": A_status, "m_P": P_status, "norm_P_inv": P_status}
+    mu = _one_sided_rate(system, region, moduli)
     if mu is not None:
-        statuses["one_sided"] = weakest(of_A, of_P)
+        statuses["one_sided"] = weakest(A_status, P_status)
     contraction = _energy(system, region) if energy else None
     if contraction is not None:
         statuses["energy"] = "proved"
@@ -178,24 +179,29 @@ def constants_of(
 
 def _energy(system: System, region: Region) -> tuple[float, float] | None:
     t0, t1 = float(region.t.low), float(region.t.high)
-    found = energy_norm(system, system.at(region), _pointwise(system, t0), t1 - t0)
-    return None if found is None else (found.M, found.rate)
+    norm = energy_norm(system, system.at(region), _pointwise(system, t0), t1 - t0)
+    return None if norm is None else (norm.M, norm.rate)
 
 
 def domain_of(time: Slope, x: Tree | None, u: Tree | None, args: Any) -> Domain:
-    """Where the constants hold: between the bounds of x and u that were asked for."""
-    end = lambda tree, i: jtu.tree_map(lambda v: v[i], tree, is_leaf=is_slope)  # noqa: E731
-    both = lambda tree: None if tree is None else (end(tree, 0), end(tree, 1))  # noqa: E731
-    return Domain(float(time.low), float(time.high), both(x), both(u), args)
+    """Return the domain of constants for these times, bounds of x and u, and args."""
+
+    def bounds(tree: Tree | None) -> tuple[Tree, Tree] | None:
+        if tree is None:
+            return None
+        low = jtu.tree_map(lambda v: v.low, tree, is_leaf=is_slope)
+        return low, jtu.tree_map(lambda v: v.high, tree, is_leaf=is_slope)
+
+    return Domain(float(time.low), float(time.high), bounds(x), bounds(u), args)
 
 
-def _sharp(system: System, region: Region, known: Knowledge) -> float | None:
-    """The one-sided rate, of the law without its weight where it has one; None where not known."""
-    gamma, alpha_h = known.of["gamma"].value, known.of["alpha_h"].value
-    proved = known.of["gamma"].status == known.of["alpha_h"].status == "proved"
-    if known.divided is not None:
-        system, found = known.divided.system, known.divided.moduli
-        gamma, alpha_h, proved = found.gamma.value, found.alpha_h.value, True
+def _one_sided_rate(system: System, region: Region, moduli: ModulusStatuses) -> float | None:
+    """Return the one-sided rate μ, with the law G for a law F = aG, or None if it is unknown."""
+    gamma, alpha_h = moduli.by_name["gamma"].value, moduli.by_name["alpha_h"].value
+    proved = moduli.by_name["gamma"].status == moduli.by_name["alpha_h"].status == "proved"
+    if moduli.unweighted is not None:
+        system, proved_moduli = moduli.unweighted.system, moduli.unweighted.moduli
+        gamma, alpha_h, proved = proved_moduli.gamma.value, proved_moduli.alpha_h.value, True
     if not proved or not np.isfinite(alpha_h):
         return None
     mu = sharp_rate(system, region, gamma, alpha_h, _pointwise(system, float(region.t.low)))
@@ -203,27 +209,30 @@ def _sharp(system: System, region: Region, known: Knowledge) -> float | None:
 
 
 def _pointwise(system: System, t: float) -> bool:
-    """Whether the law is one of every point by itself: K a box, and P diagonal."""
+    """Return whether the law acts pointwise: K is a box, and P is diagonal."""
     block = system.P_inv
     if block is None or not (len(block.center) > 1 or block.center.shape == (1, 1, 1)):
         return False
     return system.problem.set_at(jnp.asarray(t), system.args).intervals(system.u0) is not None
 
 
-def around_responses(system: System, K: Motion) -> Tree:
-    """A box around P⁻¹K(t)."""
+def response_box(system: System, K: SetMotion) -> Tree:
+    """Return a box around P⁻¹K(t)."""
     y = jtu.tree_map(interval, K.low, K.high)
     P = system.problem.operator(system.args)
     try:
         return SlopeEnclosure(P.inverse, (system.u0,), ())(y).out
     except TooLarge:
-        return between(None, system.u0, "dvax.verify(u)")
+        return as_intervals(None, system.u0, "dvax.verify(u)")
 
 
-def met(asked: Tree, possible: Tree) -> Tree:
-    """Where the region that was asked for meets the one that responses lie in."""
+def intersect(given: Tree, possible: Tree) -> Tree:
+    """Return the intersection of the given region of u with the box around all responses.
 
-    def met(a: Slope, b: Slope) -> Slope:
+    **Raises:** `dvax.InputError` if it is empty.
+    """
+
+    def one(a: Slope, b: Slope) -> Slope:
         low, high = np.maximum(a.low, b.low), np.minimum(a.high, b.high)
         if not (low <= high).all():
             k = np.unravel_index(np.argmax(low - high), low.shape)
@@ -232,30 +241,30 @@ def met(asked: Tree, possible: Tree) -> Tree:
                     "dvax.verify(u)",
                     f"[{a.low[k]:.6g}, {a.high[k]:.6g}] in entry {tuple(map(int, k))}",
                     f"responses lie in P⁻¹K(t), within [{b.low[k]:.6g}, {b.high[k]:.6g}] there, so "
-                    "that nothing would be said of any of them",
-                    "Leave u out, or widen it",
+                    "the region contains none of them",
+                    "Omit u, or widen it",
                 )
             )
         return interval(low, high)
 
-    return jtu.tree_map(met, asked, possible, is_leaf=is_slope)
+    return jtu.tree_map(one, given, possible, is_leaf=is_slope)
 
 
-def bounded(tree: Tree, middle: Tree) -> Tree:
-    """The bounded box that a search stays in."""
+def search_box(tree: Tree, middle: Tree) -> Tree:
+    """Return the bounded box for a search in the region `tree`."""
 
     def one(v: Slope, m: Any) -> Slope:
         m = np.asarray(m, float)
-        reach = _REACH * (1.0 + np.max(np.abs(m), initial=0.0))
-        low = np.where(np.isfinite(v.low), v.low, np.minimum(m, v.high) - reach)
-        high = np.where(np.isfinite(v.high), v.high, np.maximum(m, low) + reach)
+        radius = _SEARCH_RADIUS * (1.0 + np.max(np.abs(m), initial=0.0))
+        low = np.where(np.isfinite(v.low), v.low, np.minimum(m, v.high) - radius)
+        high = np.where(np.isfinite(v.high), v.high, np.maximum(m, low) + radius)
         return interval(low, high)
 
     return jtu.tree_map(one, tree, middle, is_leaf=is_slope)
 
 
-def span(t0: Any, t1: Any, name: str) -> tuple[float, float]:
-    """Two times that make an interval."""
+def time_span(t0: Any, t1: Any, name: str) -> tuple[float, float]:
+    """Return t0 and t1 as floats after checking that t0 < t1."""
     try:
         begin, end = float(t0), float(t1)
     except (TypeError, ValueError):
@@ -275,8 +284,8 @@ def span(t0: Any, t1: Any, name: str) -> tuple[float, float]:
     return begin, end
 
 
-def state_like(problem: Problem, x0: Tree, t0: float, args: Any, name: str) -> Tree:
-    """A state of this problem: the one given, or zero where its shape is known."""
+def state_for(problem: Problem, x0: Tree, t0: float, args: Any, name: str) -> Tree:
+    """Return a state of this problem: the one given, or zero if its shape is known."""
     if not isinstance(problem, Problem):
         raise InputError(
             InputProblem(
@@ -288,7 +297,7 @@ def state_like(problem: Problem, x0: Tree, t0: float, args: Any, name: str) -> T
         state = _tree.as_float(x0, "x0")
         _tree.require(
             lambda: all(np.isfinite(leaf).all() for leaf in jtu.tree_leaves(state)),
-            name, state, "every entry must be finite", "Correct the state there",
+            name, state, "every entry must be finite", "Correct the entry",
         )  # fmt: skip
         return state
     if problem.state_space is not None:
@@ -301,9 +310,9 @@ def state_like(problem: Problem, x0: Tree, t0: float, args: Any, name: str) -> T
             InputProblem(
                 name,
                 "None",
-                "the problem does not fit a scalar state, and names no state space, so that the shape "
-                "of its states is not known",
-                "Give any state: dvax.verify(problem, x0)",
+                "the problem does not fit a scalar state and names no state space, so the shape of its "
+                "states is unknown",
+                "Pass any state: dvax.verify(problem, x0)",
             ),
             *error.problems,
         ) from error
@@ -311,19 +320,20 @@ def state_like(problem: Problem, x0: Tree, t0: float, args: Any, name: str) -> T
 
 
 def _declared(given: Mapping[str, float] | Constants | None) -> dict[str, float]:
+    """Return the declared moduli by name, after checking names and values."""
     if given is None:
         return {}
     names = ("gamma", "L_F", "alpha_h", "beta_h", "alpha_f", "beta_f")
     if isinstance(given, Constants):
         return {name: float(getattr(given, name)) for name in names}
-    wrong = [name for name in given if name not in names]
+    invalid = [name for name in given if name not in names]
     if not isinstance(given, Mapping):
-        wrong = [type(given).__name__]
-    if wrong:
+        invalid = [type(given).__name__]
+    if invalid:
         raise InputError(
             InputProblem(
                 "dvax.verify(declared)",
-                f"{wrong[0]!r}",
+                f"{invalid[0]!r}",
                 f"it must map names among {', '.join(names)} to numbers",
                 "Correct the name; the others follow from A and P",
             )
@@ -338,7 +348,7 @@ def _declared(given: Mapping[str, float] | Constants | None) -> dict[str, float]
             raise InputError(
                 InputProblem(
                     f"dvax.verify(declared[{name!r}])", repr(value)[:120],
-                    "a modulus is a finite number", "Correct it, or leave it out",
+                    "a modulus must be a finite number", "Correct it, or omit it",
                 )
             )  # fmt: skip
     return values

@@ -1,4 +1,4 @@
-"""The weights of a space, entry by entry: in what they scale, norms are Euclidean."""
+"""The weights of a space, entry by entry; after scaling by their roots, norms are Euclidean."""
 
 from typing import Any
 
@@ -12,16 +12,18 @@ from .._tree import Tree
 from ..spaces import AbstractSpace
 
 
-def whole(space: AbstractSpace, like: Tree) -> Tree:
-    """wᵢ, shaped like an element."""
+def full_weights(space: AbstractSpace, like: Tree) -> Tree:
+    """Return wᵢ, shaped like an element."""
     return jtu.tree_map(lambda leaf, w: jnp.broadcast_to(w, leaf.shape), like, space.weights())
 
 
 def flat_roots(space: AbstractSpace, like: Tree) -> jax.Array:
-    """√wᵢ of an element as one vector."""
-    return jnp.sqrt(jax.flatten_util.ravel_pytree(whole(space, like))[0])
+    """Return √wᵢ as one vector."""
+    return jnp.sqrt(jax.flatten_util.ravel_pytree(full_weights(space, like))[0])
 
 
 def roots(space: AbstractSpace, like: Tree) -> list[Any]:
-    """√wᵢ of every leaf, flat, as NumPy arrays."""
-    return [np.sqrt(np.asarray(w, float)).ravel() for w in jtu.tree_leaves(whole(space, like))]
+    """Return √wᵢ of every leaf as a flat NumPy array."""
+    return [
+        np.sqrt(np.asarray(w, float)).ravel() for w in jtu.tree_leaves(full_weights(space, like))
+    ]

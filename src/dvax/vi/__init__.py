@@ -6,13 +6,13 @@ from ..programs.structure import independent as independent
 from .abstract import RESULTS as RESULTS
 from .abstract import AbstractSolver as AbstractSolver
 from .abstract import Answer as Answer
-from .abstract import Frozen as Frozen
+from .abstract import FrozenVI as FrozenVI
 from .accelerated import Accelerated as Accelerated
 from .active_set import ActiveSet as ActiveSet
 from .auto import Auto as Auto
-from .auto import Closed as Closed
+from .auto import ClosedForm as ClosedForm
 from .bracketing import Bracketing as Bracketing
-from .certificate import Certified as Certified
+from .certificate import Certificate as Certificate
 from .certificate import certify as certify
 from .certificate import natural_residual as natural_residual
 from .certificate import residual_bound as residual_bound

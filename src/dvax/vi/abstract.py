@@ -1,4 +1,4 @@
-"""What a solver of the frozen variational inequality owes."""
+"""The frozen variational inequality, the interface of its solvers, and what they return."""
 
 import abc
 from collections.abc import Callable
@@ -15,7 +15,7 @@ Operator = Callable[[Tree], Tree]
 
 
 class RESULTS(eqx.Enumeration):
-    """How a solve ended, in a sentence."""
+    """How a solve ended, with a message for the user."""
 
     successful = "The tolerance was met."
     max_steps = (
@@ -23,26 +23,26 @@ class RESULTS(eqx.Enumeration):
         "returned with its bound; raise max_steps, loosen tol, or choose another solver."
     )
     stalled = (
-        "The iterate stopped moving before the tolerance was met, or rounding in F keeps its error "
-        "bound above it: rounding allows no more. The best iterate is returned with its bound; "
-        "loosen tol, scale F, or use double precision."
+        "The iterates stopped changing before the tolerance was met, or rounding in F keeps the error "
+        "bound above it. Rounding permits no smaller error. The best iterate is returned with its "
+        "bound; loosen tol, scale F, or use double precision."
     )
     cycling = (
-        "The iterates came back to where they had been before: the method goes round in a circle, "
-        "so F is not what it needs. Choose another solver; the bound of the best iterate holds."
+        "The iterates form a cycle: the method has returned to an earlier iterate, so F does not "
+        "satisfy its assumptions. Choose another solver; the bound of the best iterate holds."
     )
     diverging = (
-        "The iterates left for infinity: VI(K, F) may have no solution, F may not be "
-        "pseudomonotone, or a step was too long. Check F, or bound K."
+        "The iterates diverge: VI(K, F) may have no solution, F may not be pseudomonotone, or a "
+        "step was too long. Check F, or bound K."
     )
     singular = (
-        "The linear systems of the method were singular to rounding, and its safeguard ran out of "
-        "iterations. The best iterate is returned with its bound; choose a first-order solver, or "
-        "raise max_steps."
+        "The linear systems of the method were singular to working precision, and its safeguard "
+        "reached max_steps. The best iterate is returned with its bound; choose a first-order "
+        "solver, or raise max_steps."
     )
     nonfinite = (
         "The operator F or the projection returned NaN or infinity. Evaluate F at the returned y "
-        "to see where."
+        "to find the entries."
     )
     no_bracket = (
         "No sign change of F was found on an unbounded interval, so F is not strongly "
@@ -50,27 +50,27 @@ class RESULTS(eqx.Enumeration):
     )
     wrong_slope = (
         "F is affine with a slope that is not positive somewhere, so it is not strongly "
-        "pseudomonotone and VI(K, F) may have no solution or several. Check the sign of F (of the "
-        "way in which h depends on u)."
+        "pseudomonotone and VI(K, F) may have no solution or several. Check the sign of F, that is, "
+        "the sign with which h depends on u."
     )
     weight_not_positive = (
-        "The weight a of a Weighted operator is not positive at y. y solves VI(K, G), but then need "
-        "not solve VI(K, aG), and others may. Check a, or shrink K."
+        "The weight a of a Weighted operator is not positive at y. y solves VI(K, G), but VI(K, aG) "
+        "may have other solutions. Check a, or shrink K."
     )
     weight_below_bound = (
         "The weight a of a Weighted operator is below M at y: M is refuted as its lower bound, and "
-        "with it γ = Mμ. y and its error bound, which rests on μ alone, hold. Lower M."
+        "with it γ = Mμ. y and its error bound remain valid, since they use μ alone. Lower M."
     )
     not_lipschitz = (
-        "The step shrank to nothing: F jumps, or is steeper than floating-point numbers can "
-        "resolve. Smooth F, or choose another solver."
+        "The step size fell below machine precision: F is discontinuous, or too steep for "
+        "floating-point numbers. Smooth F, or choose another solver."
     )
 
 
-class Frozen(NamedTuple):
+class FrozenVI(NamedTuple):
     """VI(K, F) in a space: find y ∈ K with ⟨F(y), v − y⟩ ≥ 0 for all v ∈ K.
 
-    `gamma` and `L_F` are the moduli of F where they are known, None where not.
+    `gamma` and `L_F` are the moduli of F, or None if they are unknown.
     """
 
     F: Operator
@@ -83,11 +83,14 @@ class Frozen(NamedTuple):
 class Answer(NamedTuple):
     """What a solver returns.
 
-    `y` lies in K. `z` is a point whose projection is y: the unconstrained value of the law, which
-    moves even while y sits on the boundary. `residual` is ‖w‖ for a w ∈ F(y) + N_K(y), so that
-    ‖y − y*‖ ≤ residual/γ; it is 0 where y is the solution in closed form (up to rounding).
-    `evaluations` counts calls of F, those for derivatives of F apart. `length` is the λ that w was
-    divided by, with the roundings of y: w = F(y) − F(·) + (· − y)/λ; ∞ where it was not.
+    - `y` ∈ K, the computed solution;
+    - `z`, a point whose projection is y: the unconstrained value of the law, which changes even
+      while y stays on the boundary of K;
+    - `residual`, ‖w‖ for a w ∈ F(y) + N_K(y), so that ‖y − y*‖ ≤ residual/γ; 0 if y is the solution
+      in closed form (up to rounding);
+    - `evaluations`, the number of calls of F, without those for its derivatives;
+    - `residual_step`, the λ in w = F(y) − F(b) + (b − y)/λ, by which the rounding of y is divided; ∞ if
+      w has no such term.
     """
 
     y: Tree
@@ -96,18 +99,18 @@ class Answer(NamedTuple):
     iterations: jax.Array
     result: RESULTS
     evaluations: jax.Array
-    length: Any = float("inf")
+    residual_step: Any = float("inf")
 
 
 class AbstractSolver(eqx.Module):
-    """A method for VI(K, F). Its answer is differentiable with respect to all that F and K hold.
+    """A method for VI(K, F). Its answer is differentiable with respect to all arrays in F and K.
 
-    `certifies` says that the residual is the norm of a w ∈ F(y) + N_K(y) that the method has found.
-    Where it is not, y is a closed form, or enclosed to rounding, and its w is still to be computed.
+    If `certifies` is true, the method computes a w ∈ F(y) + N_K(y) and returns its norm as the
+    residual. Otherwise y is a closed form or a bracketed root, and the caller must compute w.
     """
 
     certifies: ClassVar[bool] = True
 
     @abc.abstractmethod
-    def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
-        """Solve from the guess y0 until ‖w‖/γ ≤ tol, or ‖w‖ ≤ tol where γ is unknown."""
+    def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
+        """Solve from the guess y0 until ‖w‖/γ ≤ tol, or ‖w‖ ≤ tol if γ is unknown."""

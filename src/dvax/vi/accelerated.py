@@ -8,8 +8,8 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
-from .abstract import AbstractSolver, Answer, Frozen
-from .iteration import Trial, certificate, first_step, iterate
+from .abstract import AbstractSolver, Answer, FrozenVI
+from .iteration import Trial, first_step, iterate, residual_vector
 from .parameters import LEAST, STEPS, check_parameters
 
 
@@ -19,17 +19,17 @@ class Accelerated(AbstractSolver):
     and Bai 2014): about √(L_F/γ) ln(1/ε) iterations, where a method that needs no ψ takes
     L_F/γ ln(1/ε).
 
-    γ and L_F need not be known. λ is halved where λ⟨F(y⁺) − F(z), y⁺ − z⟩ ≤ ½‖y⁺ − z‖² fails: the
-    convexity of ψ makes of it the inequality that FISTA rests on, ψ(y⁺) ≤ ψ(z) + ⟨F(z), y⁺ − z⟩ +
-    ‖y⁺ − z‖²/(2λ), and ψ itself is not needed; elsewhere λ grows by a tenth. The momentum is begun
-    anew where it points uphill, ⟨z − y⁺, y⁺ − y⟩ > 0 (O'Donoghue and Candès 2015), which gives the
-    linear rate without γ.
+    γ and L_F need not be known. λ is halved if λ⟨F(y⁺) − F(z), y⁺ − z⟩ ≤ ½‖y⁺ − z‖² fails, and grows
+    by a tenth otherwise. With the convexity of ψ this test implies the inequality that FISTA needs,
+    ψ(y⁺) ≤ ψ(z) + ⟨F(z), y⁺ − z⟩ + ‖y⁺ − z‖²/(2λ), without evaluating ψ. The momentum is reset to zero
+    if it points uphill, ⟨z − y⁺, y⁺ − y⟩ > 0 (O'Donoghue and Candès 2015), which gives the linear rate
+    without γ.
 
-    Where F is no gradient nothing of this is known; the certificate ‖w‖ holds all the same.
+    If F is not a gradient, convergence is not guaranteed; the certificate ‖w‖ holds nevertheless.
 
-    **Arguments:** `least`, the smallest ‖w‖ that is asked for, whatever the tolerance: what
-    rounding leaves has the size of y and F, and fixed steps of `dvax.solve` ask for 10⁻¹²;
-    `max_steps`, the most iterations.
+    **Arguments:** `least`, a lower limit of the tolerance on ‖w‖ (the roundoff floor scales with y
+    and F, while fixed steps of `dvax.solve` request 10⁻¹²); `max_steps`, the maximum number of
+    iterations.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -48,43 +48,50 @@ class Accelerated(AbstractSolver):
     def __check_init__(self) -> None:
         check_parameters(self, least=LEAST, max_steps=STEPS)
 
-    def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
-        # A proved L_F is that of the worst point; here the slope at hand is what matters. It is taken
-        # by a derivative: near the solution a difference quotient along −F is one of rounding.
-        space, bent, local = vi.space, vi.F, vi._replace(L_F=None)
+    def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
+        # A proved L_F is the slope at the worst point, but the step needs the local slope. It is
+        # computed from a derivative: near the solution a difference quotient along −F contains only
+        # rounding.
+        space, differentiable_F, local = vi.space, vi.F, vi._replace(L_F=None)
 
-        def begin(vi: Frozen, y: Tree) -> tuple:
-            slope = lambda d: lax.stop_gradient(jax.jvp(bent, (y,), (d,))[1])  # noqa: E731
+        def begin(vi: FrozenVI, y: Tree) -> tuple:
+            def slope(d: Tree) -> Tree:
+                return lax.stop_gradient(jax.jvp(differentiable_F, (y,), (d,))[1])
+
             lam = first_step(local, y, vi.F(y), slope)
             return y, y, jnp.ones_like(lam), lam, lam
 
-        def advance(vi: Frozen, state: tuple) -> tuple[tuple, Trial]:
-            y, before, age, last, lam = state
-            older = 0.5 * (1.0 + jnp.sqrt(1.0 + 4.0 * age * age * last / lam))
-            z = _tree.add(y, _tree.scale((age - 1.0) / older, _tree.sub(y, before)))
+        def advance(vi: FrozenVI, state: tuple) -> tuple[tuple, Trial]:
+            y, y_previous, a, lam_previous, lam = state
+            a_next = 0.5 * (1.0 + jnp.sqrt(1.0 + 4.0 * a * a * lam_previous / lam))
+            z = _tree.add(y, _tree.scale((a - 1.0) / a_next, _tree.sub(y, y_previous)))
             Fz = vi.F(z)
             new = vi.K.project(_tree.sub(z, _tree.scale(lam, Fz)), space)
             F_new = vi.F(new)
-            w = certificate(F_new, Fz, z, new, lam)
-            move, turn = _tree.sub(new, z), _tree.sub(F_new, Fz)
+            w = residual_vector(F_new, Fz, z, new, lam)
+            move, change = _tree.sub(new, z), _tree.sub(F_new, Fz)
             square = space.inner(move, move)
-            # What F's rounding may add to the left side.
+            # Bound on the rounding error of F in the left side of the test.
             eps = jnp.finfo(lam.dtype).eps
-            blur = 8 * eps * space.norm(Fz) * jnp.sqrt(square)
-            short = lam * (space.inner(turn, move) - blur) <= 0.5 * square
+            roundoff = 8 * eps * space.norm(Fz) * jnp.sqrt(square)
+            accepted = lam * (space.inner(change, move) - roundoff) <= 0.5 * square
             uphill = space.inner(move, _tree.sub(new, y)) < 0
             state = (
-                _tree.where(short, new, y),
-                _tree.where(short, y, before),
-                jnp.where(short, jnp.where(uphill, 1.0, older), age),
-                jnp.where(short, lam, last),
-                jnp.where(short, 1.1 * lam, 0.5 * lam),
+                _tree.where(accepted, new, y),
+                _tree.where(accepted, y, y_previous),
+                jnp.where(accepted, jnp.where(uphill, 1.0, a_next), a),
+                jnp.where(accepted, lam, lam_previous),
+                jnp.where(accepted, 1.1 * lam, 0.5 * lam),
             )
-            # A swing comes back to where it was, and goes on; at rest is what moves no more without
-            # momentum.
-            still = space.norm(_tree.sub(new, y)) <= 2 * eps * space.norm(new)
-            at_rest = short & (age == 1.0) & still
-            return state, Trial(new, w, F_new, lam, [new, y], 2, tentative=~at_rest, base=(z, lam))
+            # With momentum an iterate may repeat without a cycle, so only a repetition without
+            # momentum counts as stationary.
+            unchanged = space.norm(_tree.sub(new, y)) <= 2 * eps * space.norm(new)
+            stationary = accepted & (a == 1.0) & unchanged
+            return state, Trial(
+                new, w, F_new, lam, [new, y], 2, may_repeat=~stationary, base=(z, lam)
+            )
 
         tol = jnp.maximum(tol, self.least)
-        return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=1, moves=2)
+        return iterate(
+            vi, y0, tol, begin, advance, self.max_steps, initial_evaluations=1, iterate_count=2
+        )

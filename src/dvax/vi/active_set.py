@@ -13,36 +13,36 @@ from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..programs.matrix import matrix_of
 from ..programs.structure import analyse
-from .abstract import AbstractSolver, Answer, Frozen
+from .abstract import AbstractSolver, Answer, FrozenVI
 from .block import solve_block
-from .newton import Linearised, safeguarded_newton
+from .newton import Linearisation, safeguarded_newton
 from .parameters import SAFETY, STEPS, UNKNOWNS, check_parameters, shown
 
 
 class ActiveSet(AbstractSolver):
-    """Newton's method for K = {lower ≤ y ≤ upper}, where each step is a guess of the active set and a
+    """Newton's method for K = {lower ≤ y ≤ upper}: each step predicts the active set and solves a
     linear system for the free unknowns alone.
 
-    With z = y − τF(y), the unknowns with z ≤ lower or z ≥ upper are held at their bounds and the
-    others solve F′_II d_I = −F_I − F′_IA d_A. It is `SemismoothNewton` with the projection's
-    derivative D = diag(0 or 1) eliminated by hand: the same iterates, the same safeguard, the same
-    convergence, F symmetric or not; and a factorisation costs |I|³ instead of n³ (a compiled program
-    has arrays of fixed size, so the block is cut out in one of eight sizes). Where F is affine,
-    which is read off its code, its matrix is formed once.
+    With z = y − τF(y), the unknowns with z ≤ lower or z ≥ upper are fixed at their bounds, and the
+    others solve F′_II d_I = −F_I − F′_IA d_A. This is `SemismoothNewton` with the projection's
+    derivative D = diag(0 or 1) eliminated: it has the same iterates, safeguard and convergence, whether
+    F′ is symmetric or not. A factorisation costs |I|³ instead of n³. (A compiled program has arrays of
+    fixed size, so the block is extracted in one of eight sizes.) If the code of F shows that it is
+    affine, its matrix is formed once.
 
-    Up to `dense` unknowns the matrix is formed; beyond, the block is only applied (by one derivative of
-    F a time), and conjugate gradients (`symmetric=True`: F′ is symmetric) or GMRES solve with it, to
-    min(0.1, ‖w‖/‖w₀‖) at first and tighter as ‖w‖ falls. They need a `preconditioner` where F′ is
-    ill-conditioned, as a differential operator is.
+    Up to `dense` unknowns the matrix is formed. Beyond, the block is applied matrix-free, with one
+    derivative of F per product, in conjugate gradients (`symmetric=True`: F′ is symmetric) or
+    GMRES. Their relative tolerance is min(0.1, ‖w‖/‖w₀‖). They need a `preconditioner` if F′ is
+    ill-conditioned, as a discretised differential operator is.
 
-    Source: Hintermüller, Ito and Kunisch 2002, SIAM J. Optim. 13, 865–888 (the method, and that it
-    is a semismooth Newton method); the safeguard is ours.
+    Source: Hintermüller, Ito and Kunisch 2002, SIAM J. Optim. 13, 865–888 (the method and its
+    equivalence to a semismooth Newton method). The safeguard is not from that paper.
 
     **Arguments:** `step` of the safeguard, in (0, 1); `max_steps`; `dense`; `symmetric`, declared by
-    the caller; `preconditioner(free, r)`, which returns an approximate solution of F′_II d_I = r_I,
-    given where the unknowns are free (a tree of booleans) and an r that is 0 elsewhere, as d shall be.
+    the caller; `preconditioner(free, r)`, which returns an approximate solution d of F′_II d_I = r_I:
+    `free` is a tree of booleans, and r and d are 0 where it is false.
 
-    **Raises:** `dvax.InputError` where K is not a pointwise interval.
+    **Raises:** `dvax.InputError` if K is not a pointwise interval.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -63,7 +63,7 @@ class ActiveSet(AbstractSolver):
 
     def __check_init__(self) -> None:
         check_parameters(self, step=SAFETY, max_steps=STEPS, dense=UNKNOWNS)
-        for name, right, words in (
+        for name, is_valid, rule in (
             ("symmetric", isinstance(self.symmetric, bool), "it must be True or False"),
             (
                 "preconditioner",
@@ -71,33 +71,37 @@ class ActiveSet(AbstractSolver):
                 "it must be callable as (free, r), or None",
             ),
         ):
-            if not right:
+            if not is_valid:
                 given = shown(getattr(self, name))
                 place = f"dvax.vi.ActiveSet({name})"
-                raise InputError(InputProblem(place, given, words, "Leave it out"))
+                raise InputError(InputProblem(place, given, rule, "Omit it"))
 
-    def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
+    def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
         if vi.K.intervals(y0) is None:
             raise InputError(
                 InputProblem(
                     "dvax.vi.ActiveSet",
                     f"a {type(vi.K).__name__}, which is not a pointwise interval",
-                    "only a box has unknowns that are held at a bound or free, one by one",
+                    "only a box fixes or frees each unknown separately",
                     "Use dvax.vi.SemismoothNewton()",
                 )
             )
         size = sum(leaf.size for leaf in jtu.tree_leaves(y0))
-        linear = self._by_lu(vi, y0) if size <= self.dense else self._by_krylov
-        return safeguarded_newton(vi, y0, tol, linear, step=self.step, max_steps=self.max_steps)
+        solve_linear = self._lu_solver(vi, y0) if size <= self.dense else self._krylov_solve
+        return safeguarded_newton(
+            vi, y0, tol, solve_linear, step=self.step, max_steps=self.max_steps
+        )
 
-    def _by_lu(self, vi: Frozen, y0: Tree) -> Callable[[Linearised, Tree], Tree]:
+    def _lu_solver(self, vi: FrozenVI, y0: Tree) -> Callable[[Linearisation, Tree], Tree]:
         constant = None
         if analyse(vi.F, y0).affine:
-            zero = _tree.zeros_like(y0)
-            apply = lambda d: jax.jvp(vi.F, (zero,), (d,))[1]  # noqa: E731
-            constant = jax.lax.stop_gradient(matrix_of(apply, y0))
 
-        def solve(at: Linearised, right: Tree) -> Tree:
+            def derivative(d: Tree) -> Tree:
+                return jax.jvp(vi.F, (_tree.zeros_like(y0),), (d,))[1]
+
+            constant = jax.lax.stop_gradient(matrix_of(derivative, y0))
+
+        def solve(at: Linearisation, right: Tree) -> Tree:
             flat, unravel = ravel_pytree(right)
             matrix = matrix_of(at.slope, right) if constant is None else constant
             free = ravel_pytree(_free(at, right))[0]
@@ -108,24 +112,31 @@ class ActiveSet(AbstractSolver):
 
         return solve
 
-    def _by_krylov(self, at: Linearised, right: Tree) -> Tree:
+    def _krylov_solve(self, at: Linearisation, right: Tree) -> Tree:
         free = _free(at, right)
-        inside = lambda d: jtu.tree_map(lambda f, v: jnp.where(f, v, 0.0), free, d)  # noqa: E731
-        apply = lambda d: inside(at.slope(d))  # noqa: E731  (d is 0 where held, and stays so)
-        given = self.preconditioner
-        M = None if given is None else lambda r: given(free, r)
-        aim = inside(_tree.scale(1.0 / at.tau, right))
-        rtol: Any = jnp.clip(at.shrunk, 1e-10, 0.1)
+
+        def restrict(d: Tree) -> Tree:
+            return jtu.tree_map(lambda f, v: jnp.where(f, v, 0.0), free, d)
+
+        def apply(d: Tree) -> Tree:
+            """Return F′_II d_I; d and the result are 0 at the fixed unknowns."""
+            return restrict(at.slope(d))
+
+        preconditioner = self.preconditioner
+        M = None if preconditioner is None else lambda r: preconditioner(free, r)
+        free_right = restrict(_tree.scale(1.0 / at.tau, right))
+        rtol: Any = jnp.clip(at.reduction, 1e-10, 0.1)
         if self.symmetric:
-            d, _ = jax.scipy.sparse.linalg.cg(apply, aim, tol=rtol, maxiter=1000, M=M)
+            d, _ = jax.scipy.sparse.linalg.cg(apply, free_right, tol=rtol, maxiter=1000, M=M)
         else:
             d, _ = jax.scipy.sparse.linalg.gmres(
-                apply, aim, tol=rtol, atol=0.0, restart=40, maxiter=10, M=M
+                apply, free_right, tol=rtol, atol=0.0, restart=40, maxiter=10, M=M
             )
-        held = _tree.sub(right, _tree.scale(at.tau, at.slope(d)))
-        return jtu.tree_map(jnp.where, free, d, held)
+        fixed = _tree.sub(right, _tree.scale(at.tau, at.slope(d)))
+        return jtu.tree_map(jnp.where, free, d, fixed)
 
 
-def _free(at: Linearised, like: Tree) -> Tree:
-    moved = at.tangent(jtu.tree_map(jnp.ones_like, like))
-    return jtu.tree_map(lambda leaf: leaf > 0, moved)
+def _free(at: Linearisation, like: Tree) -> Tree:
+    """Return which unknowns are free, as a tree of booleans."""
+    derivative = at.tangent(jtu.tree_map(jnp.ones_like, like))
+    return jtu.tree_map(lambda leaf: leaf > 0, derivative)

@@ -1,4 +1,4 @@
-"""What `dvax.solve_vi` asks of its arguments."""
+"""Validation of the arguments of `dvax.solve_vi`."""
 
 import math
 from collections.abc import Callable
@@ -21,77 +21,79 @@ from .weighted import Weighted
 _CALLER = "dvax.solve_vi"
 
 
-def checked_guess(y0: Any) -> Tree:
-    """y0 as arrays of a real floating type, or as plain tuples of these.
+def as_guess(y0: Any) -> Tree:
+    """Return y0 as an array of a real floating type, or as plain tuples of such arrays.
 
     **Raises:** `dvax.InputError` for anything else.
     """
     y0 = _tree.as_float(y0, "y0")
     if isinstance(y0, jax.Array) and y0.dtype.kind == "f":
         return y0
-    return _plain(y0)
+    return _as_plain_tuples(y0)
 
 
-def _plain(y: Any) -> Tree:
+def _as_plain_tuples(y: Any) -> Tree:
     if isinstance(y, tuple):
-        return tuple(map(_plain, y))
+        return tuple(map(_as_plain_tuples, y))
     if not hasattr(y, "dtype"):
         raise InputError(
             InputProblem(
                 f"{_CALLER}(y0)", f"a {type(y).__name__} in a tuple",
-                "y is an array, or a tuple of arrays", "Take the arrays out of it",
+                "y is an array, or a tuple of arrays", "Pass its arrays as a tuple",
             )
         )  # fmt: skip
     if jnp.issubdtype(y.dtype, jnp.complexfloating):
         raise InputError(
             InputProblem(
                 f"{_CALLER}(y0)", f"an array of {y.dtype}", "y is real",
-                "Take real and imaginary part as two components",
+                "Pass real and imaginary parts as two components",
             )
         )  # fmt: skip
     return y
 
 
 def check(F: Any, K: Any, args: Any, solver: Any, space: Any) -> None:
-    """Raise one `InputError` with everything that is not of the right kind."""
-    wrong = []
+    """Raise one `InputError` that lists every argument of a wrong type."""
+    problems = []
     if not callable(F):
-        wrong.append(
+        problems.append(
             InputProblem(
                 f"{_CALLER}(F)", shown(F), "it must be callable as (y, args)",
                 "Write F=lambda y, args: ...",
             )
         )  # fmt: skip
     if not isinstance(K, AbstractSet):
-        moving = callable(K) and not isinstance(K, type)
+        is_time_dependent = callable(K) and not isinstance(K, type)
         fix = (
             "Call it: K=K(t, args), the set at one time"
-            if moving
+            if is_time_dependent
             else "Write dvax.sets.Box(0.0, 1.0)"
         )
-        wrong.append(InputProblem(f"{_CALLER}(K)", shown(K), "it must be a set of dvax.sets", fix))
-    wrong += wrong_solver(f"{_CALLER}(solver)", solver)
+        problems.append(
+            InputProblem(f"{_CALLER}(K)", shown(K), "it must be a set of dvax.sets", fix)
+        )
+    problems += solver_problems(f"{_CALLER}(solver)", solver)
     if not isinstance(space, AbstractSpace | None):
-        wrong.append(
+        problems.append(
             InputProblem(
                 f"{_CALLER}(space)", shown(space), "it must be a space of dvax.spaces, or None",
-                "Leave it out for the Euclidean inner product",
+                "Omit it for the Euclidean inner product",
             )
         )  # fmt: skip
-    if wrong:
-        raise InputError(*wrong)
+    if problems:
+        raise InputError(*problems)
     _user_code.check_args(args, _CALLER)
     for name, given in (("F", F), ("args", args)):
         for leaf in jtu.tree_leaves(given):
             _check_hashable(name, leaf)
 
 
-def wrong_solver(place: str, solver: Any) -> list[InputProblem]:
-    """What is wrong with the `solver` of a law, which None leaves to the default."""
+def solver_problems(place: str, solver: Any) -> list[InputProblem]:
+    """Return the problems of an argument `solver`; None stands for the default."""
     if isinstance(solver, AbstractSolver | None):
         return []
-    rule = "it must be a solver such as dvax.vi.Auto(), made by a call"
-    return [InputProblem(place, shown(solver), rule, "Leave it out for the default")]
+    rule = "it must be an instance of a solver, such as dvax.vi.Auto()"
+    return [InputProblem(place, shown(solver), rule, "Omit it for the default")]
 
 
 def _check_hashable(name: str, leaf: Any) -> None:
@@ -103,17 +105,17 @@ def _check_hashable(name: str, leaf: Any) -> None:
         raise InputError(
             InputProblem(
                 f"{_CALLER}({name})", shown(leaf),
-                "what is not an array is compiled in, so it must be hashable",
+                "a leaf that is not an array becomes a static argument, which must be hashable",
                 "Register its class as a pytree (an equinox.Module is one), or make it hashable",
             )
         ) from None  # fmt: skip
 
 
-def checked_number(name: str, value: Any, rule: Rule, dtype: Any) -> Any:
-    """The argument `name` of `solve_vi`, a number of Python as an array of the type of y.
+def as_number(name: str, value: Any, rule: Rule, dtype: Any) -> Any:
+    """Return a numeric argument of `solve_vi` after checking it.
 
-    Numbers become arrays since of a number written in the code the compiled program would be a
-    program of its own.
+    Python numbers become arrays of the dtype of y, since a Python number would be a static argument:
+    every new value would compile the program again.
     """
     number = value
     if isinstance(value, int | float) and not isinstance(value, bool):
@@ -127,16 +129,16 @@ def checked_number(name: str, value: Any, rule: Rule, dtype: Any) -> Any:
     given = shown(value)
     if number is not value and obeys(rule, float(min(value, 1e308))):
         given += f", which is {number} in {jnp.dtype(dtype).name}"
-    fix = "Leave it out where it is not known" if rule is MODULUS else "Leave it out for 1e-10"
+    fix = "Omit it if it is unknown" if rule is MODULUS else "Omit it for 1e-10"
     raise InputError(InputProblem(f"{_CALLER}({name})", given, rule.words, fix))
 
 
 def check_functions(F: Any, y0: Tree, args: Any, space: AbstractSpace) -> None:
-    """Evaluate F abstractly, and raise an `InputError` unless its value is an element shaped like y0.
+    """Trace F and raise an `InputError` unless its value has the structure and shapes of y0.
 
-    It traces F, so it belongs into what is compiled once.
+    Call it inside the compiled function, so that F is traced only on compilation.
     """
-    zero = jax.eval_shape(space.zeros)  # its type is no part of the program
+    zero = jax.eval_shape(space.zeros)  # abstract, so that its dtype does not enter the program
     if not _tree.same_shape(y0, zero):
         raise InputError(
             InputProblem(
@@ -166,14 +168,15 @@ def check_functions(F: Any, y0: Tree, args: Any, space: AbstractSpace) -> None:
 def _check_function(name: str, fn: Callable[..., Any], y0: Tree, args: Any, caller: str) -> None:
     def traced(y: Tree) -> None:
         out = _user_code.call(name, fn, {"y": y, "args": args}, caller=caller)
-        alike = jtu.tree_structure(out) == jtu.tree_structure(y)
-        # Parts of a tuple may be of several types.
-        parts = zip(jtu.tree_leaves(out), jtu.tree_leaves(y), strict=True) if alike else [(out, y)]
+        same_structure = jtu.tree_structure(out) == jtu.tree_structure(y)
+        # The parts of a tuple may have different dtypes.
+        pairs = zip(jtu.tree_leaves(out), jtu.tree_leaves(y), strict=True)
+        parts = pairs if same_structure else [(out, y)]
         for value, like in parts:
             _user_code.check_values(
                 name, fn, value, like, inputs="y, args", caller=caller, element="the guess y0"
             )
-        problem = _wrong_shape(name, out, y) or _wrong_kind(name, out, y)
+        problem = _shape_problem(name, out, y) or _dtype_problem(name, out, y)
         if problem is not None:
             place = _user_code.place(f"{caller}({name})", fn)
             raise InputError(InputProblem(place, *problem))
@@ -181,7 +184,7 @@ def _check_function(name: str, fn: Callable[..., Any], y0: Tree, args: Any, call
     jax.eval_shape(traced, y0)
 
 
-def _wrong_shape(name: str, out: Any, y: Tree) -> tuple[str, str, str] | None:
+def _shape_problem(name: str, out: Any, y: Tree) -> tuple[str, str, str] | None:
     if _tree.same_shape(out, y):
         return None
     fix = f"Return that shape from {name}, or give y0 the shape that y has"
@@ -194,10 +197,10 @@ def _wrong_shape(name: str, out: Any, y: Tree) -> tuple[str, str, str] | None:
     return given, rule, fix
 
 
-def _wrong_kind(name: str, out: Any, y: Tree) -> tuple[str, str, str] | None:
+def _dtype_problem(name: str, out: Any, y: Tree) -> tuple[str, str, str] | None:
     for leaf, like in zip(jtu.tree_leaves(out), jtu.tree_leaves(y), strict=True):
         if isinstance(leaf, int) or getattr(leaf, "dtype", like.dtype).kind in "iu":
             given = f"a value of {jnp.result_type(leaf)}"
             fix = f"Write numbers with a decimal point, or jnp.asarray(..., {like.dtype})"
-            return given, f"{name}(y, args) is of the floating type of y, {like.dtype}", fix
+            return given, f"{name}(y, args) must have the floating type of y, {like.dtype}", fix
     return None

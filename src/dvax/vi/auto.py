@@ -1,4 +1,4 @@
-"""The default: the surest method that the structure of the problem allows."""
+"""The default solver, which selects a method from the structure and size of the problem."""
 
 from typing import Any, ClassVar
 
@@ -7,23 +7,23 @@ import jax.tree_util as jtu
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..programs.structure import analyse
-from .abstract import AbstractSolver, Answer, Frozen
+from .abstract import AbstractSolver, Answer, FrozenVI
 from .active_set import ActiveSet
 from .bracketing import Bracketing, affine_answer, is_pointwise
 from .golden_ratio import GoldenRatio
 from .semismooth_newton import SemismoothNewton
 
-_NEWTON = 1024
-"""Up to so many unknowns a Jacobian is formed and factorised at each step without a thought."""
+_MAX_NEWTON_UNKNOWNS = 1024
+"""Up to this size, forming and factorising a Jacobian at each step is affordable."""
 
 
 class Auto(AbstractSolver):
-    """Chooses by what is proved about F and K, and by size.
+    """Select a solver from the proved structure of F and K, and from the number of unknowns.
 
-    - F(y) = ay + c with one number a: the closed form y* = proj_K(−c/a), for any K (`Closed`);
+    - F(y) = ay + c with one number a: the closed form y* = proj_K(−c/a), for any K (`ClosedForm`);
     - K a pointwise interval and F pointwise: `Bracketing` (closed form where F is affine);
     - up to 1024 unknowns: `ActiveSet` on a box, `SemismoothNewton` on other sets;
-    - beyond: `GoldenRatio`, which needs neither moduli nor memory.
+    - beyond: `GoldenRatio`, which needs no moduli and forms no matrix.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -35,46 +35,47 @@ class Auto(AbstractSolver):
     """
 
     def choose(self, F: Any, K: Any, like: Tree) -> AbstractSolver:
-        """The solver that will be used for VI(K, F) with unknowns shaped like `like`."""
-        return self.chosen(Frozen(F, K, None), like)  # pyright: ignore[reportArgumentType]
+        """Return the solver for VI(K, F) with unknowns shaped like `like`."""
+        return self.choose_for(FrozenVI(F, K, None), like)  # pyright: ignore[reportArgumentType]
 
-    def chosen(self, vi: Frozen, like: Tree) -> AbstractSolver:
+    def choose_for(self, vi: FrozenVI, like: Tree) -> AbstractSolver:
+        """Return the solver for `vi`, as `choose` does."""
         if analyse(vi.F, like).isotropic and not isinstance(like, tuple):
-            return Closed()
-        applies, _ = is_pointwise(vi, like)
-        if applies:
+            return ClosedForm()
+        if is_pointwise(vi, like):
             return Bracketing()
         size = sum(leaf.size for leaf in jtu.tree_leaves(like))
-        if size > _NEWTON:
+        if size > _MAX_NEWTON_UNKNOWNS:
             return GoldenRatio()
         return SemismoothNewton() if vi.K.intervals(like) is None else ActiveSet()
 
-    def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
-        return self.chosen(vi, y0).solve(vi, y0, tol)
+    def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
+        return self.choose_for(vi, y0).solve(vi, y0, tol)
 
 
-class Closed(AbstractSolver):
-    """y* = proj_K(−c/a) for F(y) = ay + c with one number a > 0 and any K: proj_K(−c/a) is the
-    point with ⟨−c/a − y*, v − y*⟩ ≤ 0 for all v ∈ K, which is a ⟨F(y*)/a, v − y*⟩ ≥ 0.
+class ClosedForm(AbstractSolver):
+    """y* = proj_K(−c/a) for F(y) = ay + c with one number a > 0 and any K.
+
+    The projection satisfies ⟨−c/a − y*, v − y*⟩ ≤ 0 for all v ∈ K, that is ⟨F(y*)/a, v − y*⟩ ≥ 0.
 
     ```python
     >>> import dvax, jax.numpy as jnp
     >>> vi = dvax.solve_vi(lambda y, args: 2.0 * y - 8.0, dvax.sets.Ball(0.0, 1.0), jnp.zeros(2))
     >>> vi.solver, f"{float(vi.y[0]):.6f}"
-    ('Closed', '0.707107')
+    ('ClosedForm', '0.707107')
 
     ```
     """
 
     certifies: ClassVar[bool] = False
 
-    def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
+    def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
         if isinstance(y0, tuple) or not analyse(vi.F, y0).isotropic:
             raise InputError(
                 InputProblem(
-                    "dvax.vi.Closed",
-                    "an F that is not seen to be ay + c with one number a",
-                    "only then is proj_K(−c/a) the solution for every K",
+                    "dvax.vi.ClosedForm",
+                    "an F that its code does not show to be ay + c with one number a",
+                    "only for such an F is proj_K(−c/a) the solution for every K",
                     "Use dvax.vi.Auto()",
                 )
             )

@@ -1,4 +1,4 @@
-"""Linear systems with the block of a matrix that belongs to the free unknowns."""
+"""Linear systems with the block of a matrix for the free unknowns."""
 
 from functools import partial
 
@@ -7,58 +7,58 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
-_SMALL = 32
-"""Up to so many unknowns a block is not cut out: the whole matrix is factorised."""
+_MAX_WHOLE_UNKNOWNS = 32
+"""Up to this size the whole matrix is factorised instead of an extracted block."""
 
-_SIZES = 8
-"""A compiled program has arrays of fixed size, so a block is cut out in one of so many sizes."""
+_BLOCK_SIZES = 8
+"""Number of block sizes: a compiled program has arrays of fixed size, so it has one branch per size."""
 
 
 @custom_vmap
 def solve_block(matrix: jax.Array, free: jax.Array, right: jax.Array) -> jax.Array:
     """Return d with M_II d_I = right_I for the free unknowns I, and dᵢ = rightᵢ for the others.
 
-    By LU with partial pivoting; infinite or NaN where the block is singular. The cost is that of a
-    block of the smallest of eight sizes that holds the free unknowns; for a batch (by `jax.vmap`), of
-    one that holds those of each of its problems. No derivatives: it serves inside iterations.
+    The method is LU with partial pivoting; the result is infinite or NaN if the block is singular. The
+    cost is that of the smallest of eight block sizes that contains the free unknowns, and for a batch
+    (by `jax.vmap`) those of each of its problems. It has no derivatives: it is used inside iterations.
     """
     n = matrix.shape[-1]
-    if n <= _SMALL:
-        return _whole(matrix, free, right)
-    sizes = sorted({-(-n * k // _SIZES) for k in range(1, _SIZES + 1)})
-    most = jnp.max(jnp.sum(free, axis=-1, dtype=int))
-    which = jnp.searchsorted(jnp.asarray(sizes[:-1]), most)
-    branches = [partial(_cut, size) for size in sizes[:-1]] + [_whole]
-    return lax.switch(which, branches, matrix, free, right)
+    if n <= _MAX_WHOLE_UNKNOWNS:
+        return _solve_whole(matrix, free, right)
+    sizes = sorted({-(-n * k // _BLOCK_SIZES) for k in range(1, _BLOCK_SIZES + 1)})
+    free_count = jnp.max(jnp.sum(free, axis=-1, dtype=int))
+    branch = jnp.searchsorted(jnp.asarray(sizes[:-1]), free_count)
+    branches = [partial(_solve_extracted, size) for size in sizes[:-1]] + [_solve_whole]
+    return lax.switch(branch, branches, matrix, free, right)
 
 
 @solve_block.def_vmap
-def _(size: int, batched: list[bool], *given: jax.Array) -> tuple[jax.Array, bool]:
-    # One block size for the whole batch: `lax.switch` on one for each would compute all of them.
+def _(size: int, batched: list[bool], *arrays: jax.Array) -> tuple[jax.Array, bool]:
+    # One block size for the whole batch: a batched `lax.switch` would compute every branch.
     full = [
-        x if own else jnp.broadcast_to(x, (size, *x.shape))
-        for x, own in zip(given, batched, strict=True)
+        x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
+        for x, is_batched in zip(arrays, batched, strict=True)
     ]
     return solve_block(*full), True
 
 
-def _whole(matrix: jax.Array, free: jax.Array, right: jax.Array) -> jax.Array:
-    return _solve(_kept(matrix, free), right)
+def _solve_whole(matrix: jax.Array, free: jax.Array, right: jax.Array) -> jax.Array:
+    return _solve(_with_identity(matrix, free), right)
 
 
-def _cut(size: int, matrix: jax.Array, free: jax.Array, right: jax.Array) -> jax.Array:
+def _solve_extracted(size: int, matrix: jax.Array, free: jax.Array, right: jax.Array) -> jax.Array:
     if matrix.ndim > 2:
-        return jax.vmap(partial(_cut, size))(matrix, free, right)
-    at = jnp.nonzero(free, size=size, fill_value=len(right))[0]
-    inside = at < len(right)
-    block = matrix.at[at].get(mode="clip").at[:, at].get(mode="clip")
-    part = _solve(_kept(block, inside), right.at[at].get(mode="clip"))
-    return right.at[at].set(part, mode="drop")
+        return jax.vmap(partial(_solve_extracted, size))(matrix, free, right)
+    index = jnp.nonzero(free, size=size, fill_value=len(right))[0]
+    is_used = index < len(right)
+    block = matrix.at[index].get(mode="clip").at[:, index].get(mode="clip")
+    part = _solve(_with_identity(block, is_used), right.at[index].get(mode="clip"))
+    return right.at[index].set(part, mode="drop")
 
 
-def _kept(matrix: jax.Array, inside: jax.Array) -> jax.Array:
-    """The matrix with the rows and columns of the others replaced by those of the identity."""
-    both = inside[..., :, None] & inside[..., None, :]
+def _with_identity(matrix: jax.Array, free: jax.Array) -> jax.Array:
+    """Replace the rows and columns of the unknowns that are not free by those of the identity."""
+    both = free[..., :, None] & free[..., None, :]
     return jnp.where(
         both, matrix, jnp.broadcast_to(jnp.eye(matrix.shape[-1], dtype=matrix.dtype), matrix.shape)
     )

@@ -1,4 +1,4 @@
-"""Pointwise intervals: one scalar equation a point, solved for certain."""
+"""Pointwise intervals: one scalar equation per point, solved by bracketed root finding."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -11,32 +11,33 @@ from jax import lax
 from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
-from ..programs.structure import Structure, analyse
-from .abstract import RESULTS, AbstractSolver, Answer, Frozen
-from .brackets import Brackets, answer, begin, is_lost, is_open, narrow, trial
+from ..programs.structure import analyse
+from .abstract import RESULTS, AbstractSolver, Answer, FrozenVI
+from .brackets import Brackets, begin, has_no_sign_change, is_open, narrow, root, trial
 from .implicit import with_implicit_derivative
 from .parameters import STEPS, check_parameters
 
 
 class Bracketing(AbstractSolver):
-    """For K = {lower ≤ y ≤ upper} and Fᵢ depending on yᵢ alone.
+    """Bracketed root finding for K = {lower ≤ y ≤ upper} and Fᵢ depending on yᵢ alone.
 
-    Strong pseudomonotonicity reads F(y)(y − y*) ≥ γ(y − y*)² at every point, so F has one sign on
-    each side of y*: y* = lower where F(lower) ≥ 0, y* = upper where F(upper) ≤ 0, and elsewhere a
-    root between a point of either sign. All points go at once: from the guess by Newton's method
-    until F changes its sign or a bound is reached, then between the two signs by interpolation
-    with values and slopes, and by halving wherever that is slow (`brackets`). Monotonicity of F is
-    not needed, and no starting point can fail. Every point ends between two points of
-    opposite sign that are eight spacings of floating-point numbers apart, whatever `tol` is. Where
-    F is affine (proved from its code), y* is the closed form proj_K(−F(0)/F′).
+    Strong pseudomonotonicity gives F(y)(y − y*) ≥ γ(y − y*)² at every point, so F has one sign on
+    each side of y*: y* = lower if F(lower) ≥ 0, y* = upper if F(upper) ≤ 0, and otherwise y* is a root
+    between two points of opposite sign. All points are treated at once. Newton's method runs from the
+    guess until F changes sign or a bound is reached; the bracket is then narrowed by interpolation
+    with values and slopes, and by bisection wherever interpolation is slow (`brackets`). F need not be
+    monotone, and every starting point converges. Each bracket ends eight spacings of floating-point
+    numbers wide, whatever `tol` is. If F is affine (proved from its code), y* is the closed form
+    proj_K(−F(0)/F′).
 
-    A good guess takes two or three evaluations of F, with a slope each; a smooth law whose steepest
-    part is a thousandth of the interval, up to fifteen; a law with an infinite slope or none at y*
-    is halved, at worst in every third step.
+    A good guess takes two or three evaluations of F and its slope. A smooth law whose steepest part
+    covers a thousandth of the interval takes up to fifteen. A law whose slope at y* is infinite or
+    undefined is bisected at least in every third step.
 
-    **Arguments:** `max_steps`, the most iterations of the root finder, one evaluation each.
+    **Arguments:** `max_steps`, the maximum number of iterations of the root finder, with one
+    evaluation each.
 
-    **Raises:** `dvax.InputError` where K is not a pointwise interval, or F mixes points.
+    **Raises:** `dvax.InputError` if K is not a pointwise interval, or F couples points.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -56,73 +57,74 @@ class Bracketing(AbstractSolver):
     def __check_init__(self) -> None:
         check_parameters(self, max_steps=STEPS)
 
-    def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
+    def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
         structure = analyse(vi.F, y0)
         intervals = vi.K.intervals(y0)
         if intervals is None or not structure.pointwise:
-            raise _not_pointwise(intervals is None)
+            raise _not_pointwise(set_is_interval=intervals is not None)
         if structure.affine:
             return affine_answer(vi, y0)
-        return self._root(vi, y0, intervals)
+        return self._solve_roots(vi, y0, intervals)
 
-    def _root(self, vi: Frozen, y0: Tree, intervals: tuple[Tree, Tree]) -> Answer:
+    def _solve_roots(self, vi: FrozenVI, y0: Tree, intervals: tuple[Tree, Tree]) -> Answer:
         lower, upper = lax.stop_gradient(intervals)
         guess = jtu.tree_map(jnp.clip, lax.stop_gradient(y0), lower, upper)
-        points, count = _roots(_values_and_slopes(vi.F), lower, guess, upper, self.max_steps)
+        brackets, count = _find_roots(_values_and_slopes(vi.F), lower, guess, upper, self.max_steps)
 
-        found = [answer(p) for p in points]
-        y, Fy, slope = (jtu.tree_structure(guess).unflatten(part) for part in zip(*found))
-        # Points not held by a bound must have a root; w there is F itself, and N_K covers the rest.
-        held = jtu.tree_map(
+        roots = [root(p) for p in brackets]
+        y, Fy, slope = (jtu.tree_structure(guess).unflatten(part) for part in zip(*roots))
+        # At an active bound −F ∈ N_K, so w = 0 there; at every other point w = F.
+        at_bound = jtu.tree_map(
             lambda yi, f, lo, up: ((yi <= lo) & (f >= 0)) | ((yi >= up) & (f <= 0)),
             y, Fy, lower, upper,
         )  # fmt: skip
-        w = jtu.tree_map(lambda f, h: jnp.where(h, 0.0, f), Fy, held)
-        # On a bound F points outward; a distance of F/|slope| is how far y is held back.
+        w = jtu.tree_map(lambda f, active: jnp.where(active, 0.0, f), Fy, at_bound)
+        # At an active bound z is a Newton step from y towards the root of F beyond the bound.
         z = jtu.tree_map(
-            lambda yi, f, s, h: yi - jnp.where(h, f / _away(s), 0.0), y, Fy, slope, held
-        )
-        differentiable = with_implicit_derivative(vi, y, 1.0, lambda found: found, pointwise=True)
+            lambda yi, f, s, active: yi - jnp.where(active, f / _safe_divisor(s), 0.0),
+            y, Fy, slope, at_bound,
+        )  # fmt: skip
+        differentiable = with_implicit_derivative(vi, y, 1.0, pointwise=True)
         residual = vi.space.norm(w)
-        result = RESULTS.where(_any(is_open, points), RESULTS.max_steps, RESULTS.successful)
-        result = RESULTS.where(_any(is_lost, points), RESULTS.no_bracket, result)
+        result = RESULTS.where(_any(is_open, brackets), RESULTS.max_steps, RESULTS.successful)
+        result = RESULTS.where(_any(has_no_sign_change, brackets), RESULTS.no_bracket, result)
         result = RESULTS.where(jnp.isfinite(residual), result, RESULTS.nonfinite)
         return Answer(differentiable, lax.stop_gradient(z), residual, count, result, count + 1)
 
 
-def _roots(
+def _find_roots(
     F: Callable[[Tree], tuple[list[Any], list[Any]]],
     lower: Tree,
     guess: Tree,
     upper: Tree,
     max_steps: int,
 ) -> tuple[list[Brackets], jax.Array]:
-    """The brackets, leaf by leaf, and the number of iterations until all of them are closed."""
+    """Return the brackets of every leaf, and the number of iterations until all are closed."""
     leaves, tree = jtu.tree_flatten(guess)
     values = zip(leaves, *F(guess), jtu.tree_leaves(lower), jtu.tree_leaves(upper), strict=True)
-    start = [begin(*point) for point in values]
+    initial = [begin(*point) for point in values]
 
-    # XLA would compute the trial, and F there, anew for each of the seven arrays of a bracket. So
-    # the trial is made an iteration early and carried, and F stands in a branch of its own, always
-    # taken, out of which nothing is copied.
+    # XLA would recompute the trial point, and F there, for each of the seven arrays of a bracket. So
+    # the trial point is computed one iteration ahead and carried, and F is evaluated in a branch that
+    # is always taken: XLA does not duplicate computations across a branch.
     def body(state: tuple) -> tuple:
-        points, at, count, going = state
-        values = lax.cond(going, F, lambda y: (jtu.tree_leaves(y),) * 2, tree.unflatten(at))
-        points = [narrow(p, *new) for p, *new in zip(points, at, *values, strict=True)]
-        at = [trial(p, count + 1) for p in points]
-        return points, at, count + 1, _any(is_open, points)
+        brackets, at, count, running = state
+        values = lax.cond(running, F, lambda y: (jtu.tree_leaves(y),) * 2, tree.unflatten(at))
+        brackets = [narrow(p, *new) for p, *new in zip(brackets, at, *values, strict=True)]
+        at = [trial(p, count + 1) for p in brackets]
+        return brackets, at, count + 1, _any(is_open, brackets)
 
-    first = [trial(p, 0) for p in start]
-    points, _, count, _ = lax.while_loop(
+    first_trial = [trial(p, 0) for p in initial]
+    brackets, _, count, _ = lax.while_loop(
         lambda s: s[3] & (s[2] < max_steps),
         body,
-        (start, first, jnp.asarray(0), _any(is_open, start)),
+        (initial, first_trial, jnp.asarray(0), _any(is_open, initial)),
     )
-    return points, count
+    return brackets, count
 
 
 def _values_and_slopes(F: Callable[[Tree], Tree]) -> Callable[[Tree], tuple[list[Any], list[Any]]]:
-    """y ↦ leaves of F(y) and of F′(y), one number a point, cut off from derivatives."""
+    """Return y ↦ (leaves of F(y), leaves of F′(y)), one number per point, without derivatives."""
 
     def both(y: Tree) -> tuple[list[Any], list[Any]]:
         value, slope = jax.jvp(F, (y,), (jtu.tree_map(jnp.ones_like, y),))
@@ -131,12 +133,12 @@ def _values_and_slopes(F: Callable[[Tree], Tree]) -> Callable[[Tree], tuple[list
     return both
 
 
-def _any(holds: Callable[[Brackets], jax.Array], points: list[Brackets]) -> jax.Array:
-    return jnp.any(jnp.stack([jnp.any(holds(p)) for p in points]))
+def _any(condition: Callable[[Brackets], jax.Array], brackets: list[Brackets]) -> jax.Array:
+    return jnp.any(jnp.stack([jnp.any(condition(p)) for p in brackets]))
 
 
-def affine_answer(vi: Frozen, like: Tree) -> Answer:
-    """F(y) = a y + c pointwise, a ≥ γ > 0: y* = proj_K(−c/a), differentiable as it stands."""
+def affine_answer(vi: FrozenVI, like: Tree) -> Answer:
+    """Return y* = proj_K(−c/a) for F(y) = a y + c pointwise with a ≥ γ > 0, with its derivative."""
     zero = _tree.zeros_like(like)
     ones = jtu.tree_map(jnp.ones_like, zero)
     c, a = jax.jvp(vi.F, (zero,), (ones,))
@@ -150,26 +152,26 @@ def affine_answer(vi: Frozen, like: Tree) -> Answer:
     return Answer(y, z, exact, one, result, one)
 
 
-def _away(slope: jax.Array) -> jax.Array:
-    """|slope|, kept from zero: only a length scale is wanted."""
+def _safe_divisor(slope: jax.Array) -> jax.Array:
+    """Return |slope|, bounded away from zero: it only sets a length scale."""
     return jnp.maximum(jnp.abs(slope), 1e-6)
 
 
-def _not_pointwise(set_is_to_blame: bool) -> InputError:
-    blame = "a set that is not a pointwise interval", "an F that mixes points"
-    given = blame[0] if set_is_to_blame else blame[1]
+def _not_pointwise(*, set_is_interval: bool) -> InputError:
+    given = "an F that couples points"
+    if not set_is_interval:
+        given = "a set that is not a pointwise interval"
     return InputError(
         InputProblem(
             "dvax.vi.Bracketing",
             given,
-            "it solves one scalar inequality a point, so K is a Box and Fᵢ depends on yᵢ alone "
-            "(as far as its code shows)",
+            "it solves one scalar inequality per point, so K must be a Box and the code of F must "
+            "show that Fᵢ depends on yᵢ alone",
             "Use dvax.vi.Auto() or dvax.vi.Extragradient()",
         )
     )
 
 
-def is_pointwise(vi: Frozen, like: Tree) -> tuple[bool, Structure]:
-    """Whether `Bracketing` applies, and the proved structure of F."""
-    structure = analyse(vi.F, like)
-    return vi.K.intervals(like) is not None and structure.pointwise, structure
+def is_pointwise(vi: FrozenVI, like: Tree) -> bool:
+    """Return whether `Bracketing` applies: K is a pointwise interval and F is proved pointwise."""
+    return vi.K.intervals(like) is not None and analyse(vi.F, like).pointwise

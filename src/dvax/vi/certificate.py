@@ -3,15 +3,15 @@
 Throughout, K is closed convex and F strongly pseudomonotone on K with modulus γ, with solution y*.
 
 C0. Let ȳ ∈ K and w ∈ F(ȳ) + N_K(ȳ). Then ‖ȳ − y*‖ ≤ ‖w‖/γ.
-    Proof. n = w − F(ȳ) ∈ N_K(ȳ) gives ⟨F(ȳ), ȳ − y*⟩ ≤ ⟨w, ȳ − y*⟩. y* solves, so
-    ⟨F(y*), ȳ − y*⟩ ≥ 0, and strong pseudomonotonicity gives ⟨F(ȳ), ȳ − y*⟩ ≥ γ‖ȳ − y*‖². ∎
+    Proof. n = w − F(ȳ) ∈ N_K(ȳ) gives ⟨F(ȳ), ȳ − y*⟩ ≤ ⟨w, ȳ − y*⟩. y* is the solution, so
+        ⟨F(y*), ȳ − y*⟩ ≥ 0, and strong pseudomonotonicity gives ⟨F(ȳ), ȳ − y*⟩ ≥ γ‖ȳ − y*‖². ∎
 C1. With r = y − proj_K(y − τF(y)) and F Lipschitz with L_F,
     ‖y − y*‖ ≤ (1 + L_F/γ + 1/(τγ)) ‖r‖ for every y, in K or not.
     Proof. C0 at ȳ = y − r with w = F(ȳ) − F(y) + r/τ, then the triangle inequality. ∎
     For y ∈ K and τ = 1 it is Kim, Vuong and Khanh 2016, Theorem 4.2, the paper's residual bound.
 
-One projection step makes a pair (ȳ, w) for nothing: the projection's own optimality condition puts
-(y − ȳ)/τ − F(y) into N_K(ȳ).
+One projection step yields such a pair (ȳ, w): by the optimality condition of the projection,
+(y − ȳ)/τ − F(y) ∈ N_K(ȳ).
 """
 
 from collections.abc import Callable
@@ -25,35 +25,35 @@ from ..sets import AbstractSet
 from ..spaces import AbstractSpace
 
 
-class Certified(NamedTuple):
-    """A point of K with an element of F + N_K there: w = 0 exactly at the solution."""
+class Certificate(NamedTuple):
+    """A point y ∈ K with a w ∈ F(y) + N_K(y), which is 0 only at the solution."""
 
     y: Tree
     w: Tree
     norm: jax.Array
 
     def bound(self, gamma: Any) -> jax.Array:
-        """‖y − y*‖ ≤ ‖w‖/γ (C0)."""
+        """Return the bound ‖w‖/γ on ‖y − y*‖ (C0)."""
         return self.norm / gamma
 
 
 def natural_residual(
     F: Callable[[Tree], Tree], K: AbstractSet, space: AbstractSpace, y: Tree, tau: Any = 1.0
 ) -> Tree:
-    """R_τ(y) = y − proj_K(y − τF(y)), which vanishes exactly at the solution (τ > 0)."""
+    """Return R_τ(y) = y − proj_K(y − τF(y)), which vanishes only at the solution (τ > 0)."""
     return _tree.sub(y, K.project(_tree.sub(y, _tree.scale(tau, F(y))), space))
 
 
 def certify(
     F: Callable[[Tree], Tree], K: AbstractSet, space: AbstractSpace, y: Tree, tau: Any
-) -> Certified:
-    """One projection step from y: ȳ = proj_K(y − τF(y)), w = F(ȳ) − F(y) + (y − ȳ)/τ."""
+) -> Certificate:
+    """Return ȳ = proj_K(y − τF(y)) with w = F(ȳ) − F(y) + (y − ȳ)/τ: one projection step from y."""
     Fy = F(y)
     ybar = K.project(_tree.sub(y, _tree.scale(tau, Fy)), space)
     w = _tree.add(_tree.sub(F(ybar), Fy), _tree.scale(1.0 / tau, _tree.sub(y, ybar)))
-    return Certified(ybar, w, space.norm(w))
+    return Certificate(ybar, w, space.norm(w))
 
 
 def residual_bound(residual_norm: Any, tau: Any, gamma: Any, L_F: Any) -> Any:
-    """C1: ‖y − y*‖ ≤ (1 + L_F/γ + 1/(τγ)) ‖R_τ(y)‖, for every y."""
+    """Return the bound (1 + L_F/γ + 1/(τγ)) ‖R_τ(y)‖ on ‖y − y*‖, for every y (C1)."""
     return (1.0 + L_F / gamma + 1.0 / (tau * gamma)) * residual_norm

@@ -9,12 +9,12 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
-from .abstract import AbstractSolver, Answer, Frozen
-from .iteration import Trial, certificate, first_step, iterate
+from .abstract import AbstractSolver, Answer, FrozenVI
+from .iteration import Trial, first_step, iterate, residual_vector
 from .parameters import SAFETY, STEPS, check_parameters
 
-_LEAST = 1e-24
-"""By how much a step is shortened at most."""
+_SMALLEST_REDUCTION = 1e-24
+"""Backtracking stops when λ has been reduced by this factor."""
 
 
 class Extragradient(AbstractSolver):
@@ -22,14 +22,14 @@ class Extragradient(AbstractSolver):
 
     With L_F known the step is λ = step/L_F, and for F strongly pseudomonotone with modulus γ every
     iteration contracts: ‖y⁺ − y*‖² ≤ (1 − ab/(a+b)) ‖y − y*‖² with a = 1 − λ²L_F², b = 2λγ.
-    (From ‖y⁺−y*‖² ≤ ‖y−y*‖² − a‖y−z‖² − b‖z−y*‖² (Korpelevich 1976, with strong
-    pseudomonotonicity in the last term) and a p² + b q² ≥ ab/(a+b) (p+q)².)
+    This follows from ‖y⁺−y*‖² ≤ ‖y−y*‖² − a‖y−z‖² − b‖z−y*‖² (Korpelevich 1976, with strong
+    pseudomonotonicity in the last term) and a p² + b q² ≥ ab/(a+b) (p+q)².
     With L_F unknown, λ is found by backtracking until λ‖F(y) − F(z)‖ ≤ step ‖y − z‖
-    (Khobotov 1987), which keeps the same inequality with a = 1 − step².
+    (Khobotov 1987), which implies the same inequality with a = 1 − step².
 
-    The certificate of z costs nothing: w = F(z) − F(y) + (y − z)/λ.
+    The certificate of z needs no further evaluation: w = F(z) − F(y) + (y − z)/λ.
 
-    **Arguments:** `step` in (0, 1); `max_steps`, the most iterations.
+    **Arguments:** `step` in (0, 1); `max_steps`, the maximum number of iterations.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -48,45 +48,47 @@ class Extragradient(AbstractSolver):
         check_parameters(self, step=SAFETY, max_steps=STEPS)
 
     def contraction(self, gamma: Any, L_F: Any) -> Any:
-        """The proven factor q with ‖y⁺ − y*‖ ≤ q‖y − y*‖ at the step λ = step/L_F."""
+        """Return the proved factor q with ‖y⁺ − y*‖ ≤ q‖y − y*‖ at the step λ = step/L_F."""
         return contraction(self.step, gamma, L_F)
 
-    def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
-        begin = partial(starting, self.step)
+    def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
+        begin = partial(initial_state, self.step)
 
-        def advance(vi: Frozen, state: tuple) -> tuple[tuple, Trial]:
+        def advance(vi: FrozenVI, state: tuple) -> tuple[tuple, Trial]:
             y, lam = state
             after, trial = extragradient_step(vi, y, lam, self.step)
-            return (after, trial.step), trial._replace(at=[after])
+            return (after, trial.step), trial._replace(iterates=[after])
 
-        return iterate(vi, y0, tol, begin, advance, self.max_steps, begun=1 + (vi.L_F is None))
+        return iterate(
+            vi, y0, tol, begin, advance, self.max_steps, initial_evaluations=1 + (vi.L_F is None)
+        )
 
 
 def contraction(step: float, gamma: Any, L_F: Any) -> Any:
-    """q of the inequality that this method shares with Tseng's."""
+    """Return the factor q, which Tseng's method has as well."""
     a, b = 1.0 - step**2, 2.0 * step * gamma / L_F
     return jnp.sqrt(1.0 - a * b / (a + b))
 
 
-def starting(step: float, vi: Frozen, y: Tree) -> tuple[Tree, Any]:
-    """The first iterate and the first λ."""
+def initial_state(step: float, vi: FrozenVI, y: Tree) -> tuple[Tree, Any]:
+    """Return the first iterate and the first λ."""
     return y, step * first_step(vi, y, vi.F(y))
 
 
-def extragradient_step(vi: Frozen, y: Tree, lam: Any, step: float) -> tuple[Tree, Trial]:
-    """y⁺, and z with its certificate, from y with a first λ."""
+def extragradient_step(vi: FrozenVI, y: Tree, lam: Any, step: float) -> tuple[Tree, Trial]:
+    """Return y⁺, and z with its certificate, from y and a first λ."""
     Fy = vi.F(y)
-    z, Fz, lam, calls = extrapolate(vi, y, Fy, lam, step)
+    z, Fz, lam, evaluations = extrapolate(vi, y, Fy, lam, step)
     after = vi.K.project(_tree.sub(y, _tree.scale(lam, Fz)), vi.space)
-    # The certificate belongs to z, so z is what is returned.
-    w = certificate(Fz, Fy, y, z, lam)
-    return after, Trial(z, w, Fz, lam, [z], calls + 1, base=(y, lam))
+    # The certificate is one of z, so the trial point is z and not y⁺.
+    w = residual_vector(Fz, Fy, y, z, lam)
+    return after, Trial(z, w, Fz, lam, [z], evaluations + 1, base=(y, lam))
 
 
 def extrapolate(
-    vi: Frozen, y: Tree, Fy: Tree, lam: Any, step: float
+    vi: FrozenVI, y: Tree, Fy: Tree, lam: Any, step: float
 ) -> tuple[Tree, Tree, Any, Any]:
-    """z, F(z), the λ that led there, and how often F was called."""
+    """Return z, F(z), the λ of z, and the number of evaluations of F."""
 
     def trial(lam: Any) -> tuple[Tree, Tree]:
         z = vi.K.project(_tree.sub(y, _tree.scale(lam, Fy)), vi.space)
@@ -95,19 +97,19 @@ def extrapolate(
     if vi.L_F is not None:
         return *trial(lam), lam, 1
 
-    sound = jnp.isfinite(vi.space.norm(Fy))
+    F_is_finite = jnp.isfinite(vi.space.norm(Fy))
 
     def too_long(carry: tuple) -> jax.Array:
         z, Fz, lam, _ = carry
         change = lam * vi.space.norm(_tree.sub(Fz, Fy))
-        # A z where F has no value, or none at all, is too far as well; but there is an end to it.
-        short = change <= step * vi.space.norm(_tree.sub(z, y))
-        return ~short & sound & (lam > _LEAST * grown)
+        # A NaN in z or F(z) also shortens the step; the limit on λ ends the loop.
+        accepted = change <= step * vi.space.norm(_tree.sub(z, y))
+        return ~accepted & F_is_finite & (lam > _SMALLEST_REDUCTION * longest)
 
     def shorten(carry: tuple) -> tuple:
         lam = 0.6 * carry[2]
         return *trial(lam), lam, carry[3] + 1
 
-    # Growing a little first lets λ recover where F is flatter than where it was set.
-    grown = 1.25 * lam
-    return lax.while_loop(too_long, shorten, (*trial(grown), grown, jnp.asarray(1)))
+    # Start from a larger λ, so that it recovers in regions where F is flatter.
+    longest = 1.25 * lam
+    return lax.while_loop(too_long, shorten, (*trial(longest), longest, jnp.asarray(1)))

@@ -6,25 +6,25 @@ import jax.numpy as jnp
 
 from .. import _tree
 from .._tree import Tree
-from .abstract import AbstractSolver, Answer, Frozen
-from .iteration import Trial, certificate, first_step, iterate
+from .abstract import AbstractSolver, Answer, FrozenVI
+from .iteration import Trial, first_step, iterate, residual_vector
 from .parameters import GOLDEN, STEPS, check_parameters
 
-_LONGEST = 1e10
+_LARGEST_STEP = 1e10
 
 
 class GoldenRatio(AbstractSolver):
-    """x̄ = ((φ−1)y + x̄)/φ, y⁺ = proj_K(x̄ − λF(y)): one evaluation and one projection an iteration,
-    and neither γ nor L_F need be known (aGRAAL, Malitsky 2020, Algorithm 1):
+    """x̄ = ((φ−1)y + x̄)/φ, y⁺ = proj_K(x̄ − λF(y)): one evaluation and one projection per iteration,
+    with γ and L_F unknown (aGRAAL, Malitsky 2020, Algorithm 1):
 
         λ⁺ = min{(1/φ + 1/φ²) λ, φθ/(4λ) ‖y − y₋‖²/‖F(y) − F(y₋)‖², 10¹⁰},   θ⁺ = φ λ⁺/λ.
 
     It converges wherever ⟨F(y), y − y*⟩ ≥ 0 on K for a solution y*, which strong pseudomonotonicity
     implies, and linearly under the error bound C1. λ follows the local steepness of F and may grow.
-    φ = 1.5 and not the golden ratio itself, as its author recommends: then λ can grow by 1/9 an
-    iteration.
+    The default φ = 1.5, below the golden ratio, is the author's recommendation: λ can then grow by 1/9
+    per iteration.
 
-    **Arguments:** `phi` in (1, 1.618]; `max_steps`, the most iterations.
+    **Arguments:** `phi` in (1, 1.618]; `max_steps`, the maximum number of iterations.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -42,32 +42,39 @@ class GoldenRatio(AbstractSolver):
     def __check_init__(self) -> None:
         check_parameters(self, phi=GOLDEN, max_steps=STEPS)
 
-    def solve(self, vi: Frozen, y0: Tree, tol: Any) -> Answer:
+    def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
         phi = self.phi
         growth = 1.0 / phi + 1.0 / phi**2
 
-        def begin(vi: Frozen, y: Tree) -> tuple:
+        def begin(vi: FrozenVI, y: Tree) -> tuple:
             Fy = vi.F(y)
             lam = first_step(vi, y, Fy)
-            # A first point apart from y, for the first difference quotient.
+            # A second point, for the first difference quotient.
             after = vi.K.project(_tree.sub(y, _tree.scale(lam, Fy)), vi.space)
             return after, vi.F(after), y, Fy, y, lam, jnp.ones_like(lam)
 
-        def advance(vi: Frozen, state: tuple) -> tuple[tuple, Trial]:
-            y, Fy, before, F_before, average, lam, theta = state
-            moved = vi.space.norm(_tree.sub(y, before))
-            turned = vi.space.norm(_tree.sub(Fy, F_before))
-            flat = turned == 0
-            ratio = moved / jnp.where(flat, 1.0, turned)
+        def advance(vi: FrozenVI, state: tuple) -> tuple[tuple, Trial]:
+            y, Fy, y_previous, F_previous, average, lam, theta = state
+            distance = vi.space.norm(_tree.sub(y, y_previous))
+            change = vi.space.norm(_tree.sub(Fy, F_previous))
+            flat = change == 0
+            ratio = distance / jnp.where(flat, 1.0, change)
             limit = jnp.where(flat, jnp.inf, phi * theta / (4.0 * lam) * ratio**2)
-            new = jnp.minimum(jnp.minimum(growth * lam, limit), _LONGEST)
+            new = jnp.minimum(jnp.minimum(growth * lam, limit), _LARGEST_STEP)
             average = _tree.scale(1 / phi, _tree.add(_tree.scale(phi - 1, y), average))
             after = vi.K.project(_tree.sub(average, _tree.scale(new, Fy)), vi.space)
             F_after = vi.F(after)
-            w = certificate(F_after, Fy, average, after, new)
+            w = residual_vector(F_after, Fy, average, after, new)
             state = after, F_after, y, Fy, average, new, phi * new / lam
             return state, Trial(after, w, F_after, new, [after, average], 1, base=(average, new))
 
         return iterate(
-            vi, y0, tol, begin, advance, self.max_steps, begun=2 + (vi.L_F is None), moves=2
+            vi,
+            y0,
+            tol,
+            begin,
+            advance,
+            self.max_steps,
+            initial_evaluations=2 + (vi.L_F is None),
+            iterate_count=2,
         )

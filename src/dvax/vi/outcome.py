@@ -1,6 +1,5 @@
-"""What a caller of a solver may return of an answer: nothing that does not solve the law."""
+"""Success test of a solver's answer, and the error or NaN for one that failed."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -13,34 +12,34 @@ from .. import _tree
 from .._failure import nan_derivatives_where
 from .._tree import Tree
 from ..errors import Fix, SolveError
-from .abstract import RESULTS, AbstractSolver, Answer, Frozen
+from .abstract import RESULTS, AbstractSolver, Answer, FrozenVI
 from .auto import Auto
-from .iteration import stopped
-from .solve import IN_VAIN, rounding_of
+from .iteration import without_derivatives
+from .solve import missed_tolerance, rounding_of
 
-ROUNDINGS = 64
-"""Iterates that cycle at the level of rounding keep ‖w‖ within so many times its bound. Single
-precision does not reach the tolerance 10⁻¹⁰."""
+_ROUNDING_FACTOR = 64
+"""An answer whose ‖w‖ is within this multiple of its rounding bound is at the roundoff floor. In
+single precision the tolerance 10⁻¹⁰ lies below that floor."""
 
 
-def is_solved(vi: Frozen, answer: Answer) -> Any:
-    """Whether an answer met its tolerance, or missed it by rounding alone."""
-    good = answer.result == RESULTS.successful
-    if _tree.is_concrete(good) and bool(good):
+def is_solved(vi: FrozenVI, answer: Answer) -> Any:
+    """Return whether an answer met its tolerance, or missed it because of rounding alone."""
+    successful = answer.result == RESULTS.successful
+    if _tree.is_concrete(successful) and bool(successful):
         return True
-    vain = functools.reduce(jnp.logical_or, [answer.result == word for word in IN_VAIN])
+    missed = missed_tolerance(answer.result)
     y = jax.lax.stop_gradient(answer.y)
-    rounding, _ = rounding_of(stopped(vi), y, answer.length, answer.residual)
-    return good | (vain & (answer.residual <= ROUNDINGS * rounding))
+    rounding, _ = rounding_of(without_derivatives(vi), y, answer.residual_step, answer.residual)
+    return successful | (missed & (answer.residual <= _ROUNDING_FACTOR * rounding))
 
 
 def unless_failed(
-    vi: Frozen, answer: Answer, read: Callable[[Tree], Tree], solver: AbstractSolver | None
+    vi: FrozenVI, answer: Answer, read: Callable[[Tree], Tree], solver: AbstractSolver | None
 ) -> Tree:
     """Return read(y), computed from the y of an answer that solves the law.
 
-    **Raises:** `dvax.SolveError`, which carries the answer, where it does not; where that is traced,
-    values and derivatives are NaN instead.
+    **Raises:** `dvax.SolveError`, which carries the answer, if it does not solve the law. Under
+    tracing, values and derivatives are NaN instead.
     """
     solved, out = is_solved(vi, answer), read(answer.y)
     if _tree.is_concrete(solved):
@@ -48,30 +47,33 @@ def unless_failed(
             raise _failure(answer, solver)
         return out
     out = jtu.tree_map(lambda leaf: jnp.where(solved, leaf, jnp.nan), out)
-    everything = lambda y: (vi.F(y), eqx.filter(vi.K, eqx.is_inexact_array), read(y))  # noqa: E731
-    inputs = jtu.tree_leaves(eqx.filter_closure_convert(everything, answer.y))
+
+    def dependencies(y: Tree) -> tuple[Tree, Any, Tree]:
+        return vi.F(y), eqx.filter(vi.K, eqx.is_inexact_array), read(y)
+
+    inputs = jtu.tree_leaves(eqx.filter_closure_convert(dependencies, answer.y))
     return nan_derivatives_where(~solved, out, inputs)
 
 
 def _failure(answer: Answer, solver: AbstractSolver | None) -> SolveError:
-    # The first sentence says what happened; what follows speaks of the options of `solve_vi`.
+    # Only the first sentence: the following ones name options of `solve_vi`.
     reason = RESULTS[answer.result].split(". ")[0].rstrip(".")
     name = type(Auto() if solver is None else solver).__name__
     cause = (
         f"The law was not solved by {name}: {reason[0].lower()}{reason[1:]} (‖w‖ = "
         f"{float(answer.residual):.3g} after {int(answer.iterations)} iterations)."
     )
-    other = Fix("solver", "dvax.vi.Auto()", "which chooses by the structure of the law")
+    other = Fix("solver", "dvax.vi.Auto()", "which selects a method from the structure of the law")
     if isinstance(solver, Auto | None):
         other = Fix("solver", "dvax.vi.Extragradient(max_steps=1_000_000)", "a first-order method")
-    sign = Fix("", "", "Check the sign of the way in which h depends on u, or bound K")
-    value = Fix("", "", "Evaluate h at the y of `solution` (u = P⁻¹y) to see where")
-    lawless = (RESULTS.diverging, RESULTS.wrong_slope, RESULTS.no_bracket)
-    if any(bool(answer.result == word) for word in lawless):
+    sign = Fix("", "", "Check the sign with which h depends on u, or bound K")
+    value = Fix("", "", "Evaluate h at the y of `solution` (u = P⁻¹y) to find the entries")
+    not_monotone = (RESULTS.diverging, RESULTS.wrong_slope, RESULTS.no_bracket)
+    if any(bool(answer.result == code) for code in not_monotone):
         fixes = (sign,)
     elif bool(answer.result == RESULTS.nonfinite):
         fixes = (value,)
     else:
-        more = Fix("", "", "A larger max_steps of the solver may be enough")
+        more = Fix("", "", "A larger max_steps of the solver may suffice")
         fixes = (other, more) if bool(answer.result == RESULTS.max_steps) else (other,)
     return SolveError(cause, answer, fixes)

@@ -1,4 +1,4 @@
-"""The numbers that solvers and `dvax.solve_vi` accept as parameters."""
+"""Rules for the numeric parameters of solvers and of `dvax.solve_vi`."""
 
 import math
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from ..errors import InputError, InputProblem
 
 
 class Rule(NamedTuple):
-    """The values that a number may have, in code and in words."""
+    """The admissible values of a number: a predicate and its description."""
 
     holds: Callable[[Any], Any]
     words: str
@@ -30,7 +30,7 @@ UNKNOWNS = Rule(lambda v: v >= 0, "it must be a whole number ≥ 0", True)
 
 
 def obeys(rule: Rule, value: Any) -> bool:
-    """Whether `value` is one real number, and within the `rule` where it is not traced."""
+    """Return whether `value` is one real number that satisfies `rule`; a traced one is not compared."""
     if not _tree.is_number(value):
         return False
     if rule.whole and not (isinstance(value, int) or np.result_type(value).kind in "iu"):
@@ -41,20 +41,20 @@ def obeys(rule: Rule, value: Any) -> bool:
 def check_parameters(solver: Any, **rules: Rule) -> None:
     """Raise an `InputError` with every parameter of a solver that breaks its rule."""
     cls = type(solver)
-    wrong = [
+    problems = [
         InputProblem(
             f"dvax.vi.{cls.__name__}({name})", shown(value), rule.words,
-            f"Leave it out for {cls.__dataclass_fields__[name].default}",
+            f"Omit it for {cls.__dataclass_fields__[name].default}",
         )
         for name, rule in rules.items()
         if not obeys(rule, value := getattr(solver, name))
     ]  # fmt: skip
-    if wrong:
-        raise InputError(*wrong)
+    if problems:
+        raise InputError(*problems)
 
 
 def shown(value: Any) -> str:
-    """A value with its type, on one line."""
+    """Return the value with its type, on one line."""
     if hasattr(value, "dtype") and hasattr(value, "shape"):
         return _tree.short(value) if _is_plain(value) else f"an array of {value.dtype}"
     return " ".join(f"{type(value).__name__} {value!r}".split())[:200]

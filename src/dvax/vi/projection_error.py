@@ -1,4 +1,4 @@
-"""How far the computed projection onto a set may be from the exact one."""
+"""Estimate of the rounding error of a computed projection onto a set."""
 
 from typing import Any, NamedTuple
 
@@ -10,10 +10,10 @@ from .. import sets
 
 
 class ProjectionError(NamedTuple):
-    """The error is at most places · ε · `condition` · (‖y‖ + `data`) + `absolute` (1 + ‖y‖).
+    """The error is at most operations · ε · `condition` · (‖y‖ + `data`) + `absolute` (1 + ‖y‖).
 
-    `data` is the size of the numbers that make the set and enter the projection, `condition` that of
-    its equations, `absolute` what an iterated projection stops at.
+    `data` is the magnitude of the numbers that define the set, `condition` the condition of its
+    equations, and `absolute` the error of an iterative projection at its stopping tolerance.
     """
 
     data: Any
@@ -21,26 +21,26 @@ class ProjectionError(NamedTuple):
     absolute: Any = 0.0
 
 
-_STOPPED = 16.0
-"""Distance from the projection, in units of the last move of an iterated one."""
+_STOPPING_FACTOR = 16.0
+"""Error of an iterative projection relative to its last increment."""
 
 
 def projection_error(K: sets.AbstractSet) -> ProjectionError:
-    """Return the sizes by which the rounding of proj_K is estimated."""
+    """Return the magnitudes from which the rounding error of proj_K is estimated."""
     if isinstance(K, sets.Ball | sets.L1Ball):
-        return ProjectionError(_largest(K.center) + jnp.max(jnp.abs(K.radius)))
+        return ProjectionError(_norm_bound(K.center) + jnp.max(jnp.abs(K.radius)))
     if isinstance(K, sets.Ellipsoid):
-        return ProjectionError(_largest(K.center))
+        return ProjectionError(_norm_bound(K.center))
     if isinstance(K, sets.HalfSpace | sets.Hyperplane):
         normal = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jtu.tree_leaves(K.normal)))
         return ProjectionError(jnp.abs(K.offset) / normal)
     if isinstance(K, sets.AffineSubspace):
-        # The rows have length 1.
+        # The rows of E have norm 1.
         rows = jnp.sqrt(1.0 * K.e.size)
         return ProjectionError(0.0, jnp.maximum(1.0, rows * jnp.linalg.norm(K.pseudoinverse)))
     if isinstance(K, sets.Translated):
         inner = projection_error(K.set)
-        return inner._replace(data=inner.data + _largest(K.offset))
+        return inner._replace(data=inner.data + _norm_bound(K.offset))
     if isinstance(K, sets.Scaled):
         inner = projection_error(K.set)
         return inner._replace(data=inner.data * jnp.abs(K.factor))
@@ -52,17 +52,18 @@ def projection_error(K: sets.AbstractSet) -> ProjectionError:
     if not parts:
         return ProjectionError(0.0)
     inner = [projection_error(part) for part in parts]
-    found = ProjectionError(
-        sum(one.data for one in inner),
-        jnp.max(jnp.stack([jnp.asarray(one.condition) for one in inner])),
-        sum(one.absolute for one in inner),
+    total = ProjectionError(
+        sum(error.data for error in inner),
+        jnp.max(jnp.stack([jnp.asarray(error.condition) for error in inner])),
+        sum(error.absolute for error in inner),
     )
     if isinstance(K, sets.Intersection):
-        found = found._replace(absolute=found.absolute + _STOPPED * K.tol)
-    return found
+        total = total._replace(absolute=total.absolute + _STOPPING_FACTOR * K.tol)
+    return total
 
 
-def _largest(tree: Any) -> jax.Array:
+def _norm_bound(tree: Any) -> jax.Array:
+    """Return √n · max |entry|, a bound on the Euclidean norm that does not overflow."""
     leaves = jtu.tree_leaves(tree)
     entries = sum(leaf.size for leaf in map(jnp.asarray, leaves))
     return jnp.sqrt(1.0 * entries) * jnp.max(jnp.stack([jnp.max(jnp.abs(v)) for v in leaves]))

@@ -16,31 +16,35 @@ from .._tree import Tree
 from ..programs.rounding import rounding_error
 from ..sets import AbstractSet
 from ..spaces import AbstractSpace, Euclidean, Product
-from .abstract import RESULTS, AbstractSolver, Frozen
-from .arguments import check, check_functions, checked_guess, checked_number
+from .abstract import RESULTS, AbstractSolver, FrozenVI
+from .arguments import as_guess, as_number, check, check_functions
 from .auto import Auto
 from .certificate import certify
-from .iteration import first_step, stopped
+from .iteration import first_step, without_derivatives
 from .parameters import MODULUS, TOLERANCE
 from .projection_error import projection_error
-from .weighted import Weighted, moduli_belong_to_the_parts
+from .weighted import Weighted, reject_moduli_of_product
 
-IN_VAIN = RESULTS.max_steps, RESULTS.stalled, RESULTS.cycling, RESULTS.singular
-"""Ends of an iteration that only missed its tolerance."""
+_MISSED_TOLERANCE = RESULTS.max_steps, RESULTS.stalled, RESULTS.cycling, RESULTS.singular
 
 
 class VISolution(eqx.Module):
     """The solution of a variational inequality with its certificate.
 
-    `y` ∈ K; `residual` = ‖w‖ for a w ∈ F(y) + N_K(y), as computed; `rounding`, a bound on what the
-    rounding of F and of w adds to it; `error_bound` ≥ ‖y − y*‖ where γ was given, else None: that is
-    (residual + rounding)/γ, and the distance to the certified point where that is not y;
-    `rounding_status`, "proved" where K is a pointwise interval and every operation of F has a rule
-    (`dvax.programs.rounding`), else "estimated"; `iterations`, and `evaluations` of F (those for
-    derivatives, for rounding, and for the certificate of a closed form, apart); `result`, which is
-    `dvax.vi.RESULTS.successful` or says what went wrong; `solver`, the one that was used.
-    Derivatives of a solve that failed are NaN, unless it reached the level of rounding.
-    For a `dvax.vi.Weighted` operator aG these speak of G, which has the same solution.
+    - `y` ∈ K;
+    - `residual`, ‖w‖ for a w ∈ F(y) + N_K(y), as computed;
+    - `rounding`, a bound on the rounding error of that norm, from F and from w;
+    - `error_bound` ≥ ‖y − y*‖, None if γ was not given: (residual + rounding)/γ, plus the distance from
+      y to the certified point if that is another one;
+    - `iterations`; `evaluations` of F, without those for derivatives, for rounding, and for the
+      certificate of a closed form;
+    - `result`, `dvax.vi.RESULTS.successful` or the reason of the failure;
+    - `solver`, the name of the solver used;
+    - `rounding_status`, "proved" if K is a pointwise interval and every operation of F has a rule
+      (`dvax.programs.rounding`), otherwise "estimated".
+
+    The derivatives of a failed solve are NaN, unless it reached the roundoff floor. For a
+    `dvax.vi.Weighted` operator aG all fields refer to G, which has the same solution.
     """
 
     y: Tree
@@ -69,19 +73,20 @@ def solve_vi(
 
     **Arguments:** `F(y, args)`, traceable; `K`, a set; `y0`, a guess, whose shape is y's; `args`,
     any pytree; `solver`, `dvax.vi.Auto()` by default; `tol`, on the true error ‖y − y*‖ where
-    `gamma` is given, else on the residual ‖w‖; `gamma`, the modulus of strong pseudomonotonicity,
+    `gamma` is given, otherwise on the residual ‖w‖; `gamma`, the modulus of strong pseudomonotonicity,
     declared by the caller; `L_F`, a Lipschitz constant of F; `space`, Euclidean by default.
-    An F = aG that is a `dvax.vi.Weighted` is solved and certified as VI(K, G), by its own moduli.
+    A `dvax.vi.Weighted` operator F = aG is solved and certified as VI(K, G), with its own moduli.
 
-    The solve is compiled at the first call and used again for the same function F, shapes and
-    solver, however `args`, `K`, `y0` and the moduli change. So what changes goes through `args`, as
-    for any function under `jax.jit`: a number that F reads from outside is seen once.
+    The solve is compiled at the first call and reused for the same function F, shapes and solver, for
+    any values of `args`, `K`, `y0` and the moduli. Pass values that change in `args`, as for any
+    function under `jax.jit`: a number that F reads from its closure is read only at compilation.
 
-    **Raises:** `dvax.InputError` where an argument breaks a rule or F cannot be traced, before anything
-    is solved. The values of traced numbers (`gamma`, `L_F`, `tol`) are not checked.
+    **Raises:** `dvax.InputError` if an argument is invalid or F cannot be traced, before the solve
+    starts. The values of traced numbers (`gamma`, `L_F`, `tol`) are not checked.
 
-    **Returns:** a `VISolution`. Iterative methods stop by its `residual`; a closed form or a bracketed
-    root is right to rounding whatever `tol`, and gets its `residual` by a projection step afterwards.
+    **Returns:** a `VISolution`. Iterative methods stop when its `residual` meets the tolerance. A
+    closed form or a bracketed root is accurate to rounding whatever `tol`; its `residual` is
+    computed afterwards by a projection step.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -92,90 +97,96 @@ def solve_vi(
 
     ```
     """
-    y0 = checked_guess(y0)
+    y0 = as_guess(y0)
     check(F, K, args, solver, space)
     space = default_space(y0) if space is None else space
     K.check(y0)
     if isinstance(F, Weighted):
-        moduli_belong_to_the_parts(gamma, L_F)
+        reject_moduli_of_product(gamma, L_F)
     solver = Auto() if solver is None else solver
     dtype = jnp.result_type(*jtu.tree_leaves(y0))
-    tol = checked_number("tol", tol, TOLERANCE, dtype)
-    gamma = None if gamma is None else checked_number("gamma", gamma, MODULUS, dtype)
-    L_F = None if L_F is None else checked_number("L_F", L_F, MODULUS, dtype)
+    tol = as_number("tol", tol, TOLERANCE, dtype)
+    gamma = None if gamma is None else as_number("gamma", gamma, MODULUS, dtype)
+    L_F = None if L_F is None else as_number("L_F", L_F, MODULUS, dtype)
     args = jtu.tree_map(lambda v: jnp.asarray(v, dtype) if isinstance(v, float) else v, args)
-    return _solved(F, K, y0, args, solver, tol, gamma, L_F, space)
+    return _solve_compiled(F, K, y0, args, solver, tol, gamma, L_F, space)
 
 
 @eqx.filter_jit
-def _solved(
+def _solve_compiled(
     F: Any, K: AbstractSet, y0: Tree, args: Any, solver: Any, tol: Any, gamma: Any, L_F: Any,
     space: AbstractSpace,
 ) -> VISolution:  # fmt: skip
-    """One program for all problems that differ in numbers alone, compiled at the first of them."""
+    """Solve and certify; compiled once for all problems that differ in array values alone."""
     check_functions(F, y0, args, space)
     if isinstance(F, Weighted):
-        found = _divided(F, args, K, space, y0, solver, tol)
+        solution = _solve_weighted(F, args, K, space, y0, solver, tol)
     else:
-        frozen = Frozen(lambda y: F(y, args), K, space, gamma, L_F)
-        found = _certified(frozen, y0, solver, tol, gamma, tol)
-    # Where rounding allows no more than was reached, y is as good as its derivative.
-    at_floor = (found.result == RESULTS.stalled) & (found.residual <= 4 * found.rounding)
-    kept = (found.result == RESULTS.successful) | at_floor
-    kept |= found.result == RESULTS.weight_below_bound
-    hidden = jtu.tree_leaves(eqx.filter_closure_convert(F, y0, args))
-    inputs = [hidden, K, y0, args, solver, tol, gamma, L_F, space]
-    return nan_derivatives_where(~kept, found, eqx.filter(inputs, eqx.is_inexact_array))
+        frozen = FrozenVI(lambda y: F(y, args), K, space, gamma, L_F)
+        solution = _solve_and_certify(frozen, y0, solver, tol, gamma, tol)
+    # A solution at the roundoff floor keeps its derivatives.
+    at_floor = (solution.result == RESULTS.stalled) & (solution.residual <= 4 * solution.rounding)
+    has_derivatives = (solution.result == RESULTS.successful) | at_floor
+    has_derivatives |= solution.result == RESULTS.weight_below_bound
+    closure = jtu.tree_leaves(eqx.filter_closure_convert(F, y0, args))
+    inputs = [closure, K, y0, args, solver, tol, gamma, L_F, space]
+    return nan_derivatives_where(
+        ~has_derivatives, solution, eqx.filter(inputs, eqx.is_inexact_array)
+    )
 
 
-def _divided(
+def _solve_weighted(
     F: Weighted, args: Any, K: AbstractSet, space: AbstractSpace, y0: Tree, solver: Any, tol: Any
 ) -> VISolution:
-    """Sol(K, aG) = Sol(K, G), so G is what is solved and certified; a is looked at afterwards."""
-    known = F.modulus(y0, args, space)
-    mu = None if known is None else known.value
-    # A modulus that is proved not to be positive says nothing, and may be so in some lanes only.
-    goal = tol if mu is None else tol * jnp.where(mu > 0, mu, 1.0)
-    found = _certified(Frozen(lambda y: F.G(y, args), K, space), y0, solver, goal, mu, tol)
-    result, bound = F.judged(found.y, args, found.result, found.error_bound)
-    return dataclasses.replace(found, result=result, error_bound=bound)
+    """Solve and certify VI(K, G), which has the solutions of VI(K, aG), and then check a at y."""
+    modulus = F.modulus(y0, args, space)
+    mu = None if modulus is None else modulus.value
+    # A modulus may be proved not to be positive, possibly in some lanes of a batch only. It then gives
+    # no error bound, and the tolerance applies to the residual.
+    residual_tol = tol if mu is None else tol * jnp.where(mu > 0, mu, 1.0)
+    solution = _solve_and_certify(
+        FrozenVI(lambda y: F.G(y, args), K, space), y0, solver, residual_tol, mu, tol
+    )
+    result, bound = F.check_weight(solution.y, args, solution.result, solution.error_bound)
+    return dataclasses.replace(solution, result=result, error_bound=bound)
 
 
-def _certified(
-    frozen: Frozen, y0: Tree, solver: AbstractSolver, goal: Any, gamma: Any, tol: Any
+def _solve_and_certify(
+    frozen: FrozenVI, y0: Tree, solver: AbstractSolver, solver_tol: Any, gamma: Any, tol: Any
 ) -> VISolution:
-    """Solve to the `goal` of the solver, and compare the error bound with `tol`."""
+    """Solve to the tolerance `solver_tol`, and compare the error bound with `tol`."""
     space, K = frozen.space, frozen.K
-    solver = solver.chosen(frozen, y0) if isinstance(solver, Auto) else solver
-    # Where γ is known half of the tolerance is left to rounding.
-    answer = solver.solve(frozen, y0, goal if gamma is None else 0.5 * goal)
-    still, y = stopped(frozen), jax.lax.stop_gradient(answer.y)
-    residual, away = answer.residual, jnp.zeros_like(answer.residual)
-    rounding, proved = rounding_of(still, y, answer.length, residual)
+    solver = solver.choose_for(frozen, y0) if isinstance(solver, Auto) else solver
+    # If γ is known, half of the tolerance is reserved for rounding.
+    answer = solver.solve(frozen, y0, solver_tol if gamma is None else 0.5 * solver_tol)
+    vi, y = without_derivatives(frozen), jax.lax.stop_gradient(answer.y)
+    residual, distance = answer.residual, jnp.zeros_like(answer.residual)
+    rounding, proved = rounding_of(vi, y, answer.residual_step, residual)
     if not solver.certifies:
-        # A projection step from y, whose certificate covers y by the triangle inequality.
-        step = first_step(still, y, still.F(y))
-        checked = certify(still.F, still.K, space, y, step)
-        other, _ = rounding_of(still, checked.y, step, checked.norm)
+        # A projection step from y has a certificate, which bounds the error of y by the triangle
+        # inequality.
+        step = first_step(vi, y, vi.F(y))
+        projected = certify(vi.F, vi.K, space, y, step)
+        projected_rounding, _ = rounding_of(vi, projected.y, step, projected.norm)
         residual = jnp.where(answer.residual > 0, answer.residual, jnp.inf)
-        nearer = checked.norm + other < residual + rounding
-        residual = jnp.where(nearer, checked.norm, residual)
-        rounding = jnp.where(nearer, other, rounding)
-        away = jnp.where(nearer, space.norm(_tree.sub(checked.y, y)), away)
+        smaller = projected.norm + projected_rounding < residual + rounding
+        residual = jnp.where(smaller, projected.norm, residual)
+        rounding = jnp.where(smaller, projected_rounding, rounding)
+        distance = jnp.where(smaller, space.norm(_tree.sub(projected.y, y)), distance)
     bound, result = None, answer.result
     if gamma is not None:
         total = residual + rounding
-        # Where the quotient underflows the bound is the smallest normal number: 0 says "exact".
+        # If the quotient underflows, the bound is the smallest normal number, since 0 means "exact".
         least = jnp.where(total > 0, jnp.finfo(total.dtype).tiny, 0.0)
-        bound = jnp.where(gamma > 0, jnp.maximum(total / gamma, least) + away, jnp.inf)
-        good, within = result == RESULTS.successful, bound <= tol
-        # An iteration that went on in vain at the level of rounding is stalled; so is one that ended
-        # where rounding alone is what keeps the bound above the tolerance.
-        vain = functools.reduce(jnp.logical_or, [result == word for word in IN_VAIN])
+        bound = jnp.where(gamma > 0, jnp.maximum(total / gamma, least) + distance, jnp.inf)
+        successful, within = result == RESULTS.successful, bound <= tol
+        # The result is "stalled" if rounding alone keeps the bound above the tolerance, whether the
+        # iteration met its own tolerance or missed it at the roundoff floor.
+        missed = missed_tolerance(result)
         by_rounding = (residual <= gamma * tol) | (not solver.certifies)
-        limited = (good & by_rounding) | (vain & (residual <= 4 * rounding))
-        result = RESULTS.where((gamma > 0) & limited & ~within, RESULTS.stalled, result)
-        result = RESULTS.where((gamma > 0) & vain & within, RESULTS.successful, result)
+        at_floor = (successful & by_rounding) | (missed & (residual <= 4 * rounding))
+        result = RESULTS.where((gamma > 0) & at_floor & ~within, RESULTS.stalled, result)
+        result = RESULTS.where((gamma > 0) & missed & within, RESULTS.successful, result)
     status = "proved" if proved and K.intervals(y0) is not None else "estimated"
     return VISolution(
         y=answer.y,
@@ -190,33 +201,41 @@ def _certified(
     )
 
 
-def rounding_of(vi: Frozen, y: Tree, length: Any, residual: Any) -> tuple[jax.Array, bool]:
-    """A bound on ‖fl(w) − w‖ for some w ∈ F(y) + N_K(y), and whether that of F is proved.
+def missed_tolerance(result: RESULTS) -> Any:
+    """Return whether an iteration ended without an error, but above its tolerance."""
+    return functools.reduce(jnp.logical_or, [result == code for code in _MISSED_TOLERANCE])
 
-    With z = fl(base − λF(base)) and y = proj_K(z), n = (z − y)/λ is a normal whatever the error of
-    F(base). What is computed is F(y) + [(base − y)/λ − F(base)]: it differs from F(y) + n by the error
-    of F(y), by that of z divided by λ, and by roundings of the terms. The projection onto an interval
-    is exact; that onto another set is taken to be right to (8 + n)ε of the sizes in play
-    (`projection_error`). A norm that underflows is less than that of n numbers of √tiny.
+
+def rounding_of(vi: FrozenVI, y: Tree, step: Any, residual: Any) -> tuple[jax.Array, bool]:
+    """Return a bound on ‖fl(w) − w‖ for some w ∈ F(y) + N_K(y), and whether the error of F is proved.
+
+    With z = fl(b − λF(b)) and y = proj_K(z), n = (z − y)/λ is in N_K(y), whatever the error of
+    F(b). The computed w is F(y) + [(b − y)/λ − F(b)] with λ = `step`. It differs from F(y) + n by
+    the error of F(y), the error of z divided by λ, and the rounding of the terms. The projection
+    onto an interval is exact; that onto another set is assumed accurate to (8 + n)ε relative to the
+    magnitudes in `projection_error`. A norm that underflows is less than that of n numbers of
+    √tiny.
     """
     norm, value = vi.space.norm, vi.F(y)
     error, proved = rounding_error(vi.F, y)
     kind = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y)))
     eps, entries = kind.eps, sum(leaf.size for leaf in jtu.tree_leaves(y))
-    size, force = norm(y), norm(value) + residual
+    size, norm_F = norm(y), norm(value) + residual
     if vi.K.intervals(y) is not None:
-        blur = eps * (2 * size / length + 8 * force)
+        error_w = eps * (2 * size / step + 8 * norm_F)
     else:
-        of_K, places = projection_error(vi.K), 2 * (8 + entries)
-        off = places * of_K.condition * eps * (size + of_K.data) + of_K.absolute * (1.0 + size)
-        blur = off / length + (8 + places) * eps * force
-    # Of the norms themselves, and of this sum.
-    found = 1.01 * (norm(error) + blur) + jnp.sqrt(entries * jnp.asarray(kind.tiny, size.dtype))
-    return jnp.where(jnp.isfinite(residual), found, jnp.inf), proved
+        K_error, operations = projection_error(vi.K), 2 * (8 + entries)
+        error_y = operations * K_error.condition * eps * (size + K_error.data)
+        error_y += K_error.absolute * (1.0 + size)
+        error_w = error_y / step + (8 + operations) * eps * norm_F
+    # The factor 1.01 covers the rounding of the norms and of this sum.
+    underflow = jnp.sqrt(entries * jnp.asarray(kind.tiny, size.dtype))
+    bound = 1.01 * (norm(error) + error_w) + underflow
+    return jnp.where(jnp.isfinite(residual), bound, jnp.inf), proved
 
 
 def default_space(like: Tree) -> AbstractSpace:
-    """The Euclidean space of elements shaped like `like`."""
+    """Return the Euclidean space of elements shaped like `like`."""
     if isinstance(like, tuple):
         return Product(*(default_space(part) for part in like))
     return Euclidean(jnp.shape(like))

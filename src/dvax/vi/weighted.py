@@ -1,4 +1,4 @@
-"""Weighted operators a(y) G(y): a nonmonotone class that is no harder than a monotone one."""
+"""Weighted operators a(y) G(y): nonmonotone, but solved as the monotone operator G."""
 
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
@@ -17,15 +17,15 @@ from ..spaces import AbstractSpace
 from .abstract import RESULTS
 from .parameters import shown
 
-_PROVED = 256
-"""Up to so many unknowns the eigenvalues of G's matrix cost no more than about two solves."""
+_MAX_EIGENVALUE_UNKNOWNS = 256
+"""Up to this size the eigenvalues of G's matrix cost at most about two solves."""
 
 
 class Modulus(NamedTuple):
-    """A modulus and how it is known: "proved", from the code of G, or "declared" by the caller.
+    """A modulus with its status: "proved" from the code of G, or "declared" by the caller.
 
-    A proved one that is not positive says that G is not strongly monotone on the whole space; on a
-    K that lies in a subspace it may still be.
+    If a proved modulus is not positive, G is not strongly monotone on the whole space. It may still be
+    strongly monotone on a K that lies in a subspace.
     """
 
     value: Any
@@ -38,28 +38,28 @@ class Weighted(eqx.Module):
         ⟨G(y) − G(z), y − z⟩ ≥ μ‖y − z‖².
 
     F is then strongly pseudomonotone with modulus γ = Mμ (paper, prop:weighted_strong_pseudomono),
-    and need not be monotone. As a(y) > 0, ⟨a(y)G(y), v − y⟩ ≥ 0 and ⟨G(y), v − y⟩ ≥ 0 say the same:
+    and need not be monotone. As a(y) > 0, ⟨a(y)G(y), v − y⟩ ≥ 0 and ⟨G(y), v − y⟩ ≥ 0 are equivalent:
     VI(K, aG) and VI(K, G) have the same solutions. So `dvax.solve_vi` solves VI(K, G), without the
-    weight, and the certificate rests on μ alone: for w ∈ G(y) + N_K(y), a(y)w ∈ F(y) + N_K(y) and
+    weight, and the certificate uses μ alone: for w ∈ G(y) + N_K(y), a(y)w ∈ F(y) + N_K(y) and
 
         ‖y − y*‖ ≤ ‖w‖/μ ≤ (a(y)/M) ‖w‖/μ = ‖a(y)w‖/γ,
 
-    so what G's certificate says is sharper than F's own by the factor a(y)/M, and needs no M.
-    Derivatives are those of the solution of VI(K, G), hence of VI(K, aG).
+    so the certificate of G is sharper than that of F by the factor a(y)/M, and needs no M. Derivatives
+    are those of the solution of VI(K, G), hence of VI(K, aG).
 
-    `dvax.solve_vi` reports on VI(K, G): `tol` without μ, `residual` and `evaluations` are those of
-    G. At the y that it found it evaluates a once: where a(y) ≤ 0 the result is `weight_not_positive`
-    and the error bound infinite; where a(y) < M, M is refuted, and with it γ = Mμ: the result is
-    `weight_below_bound`, while y and its bound hold.
+    `dvax.solve_vi` reports on VI(K, G): `tol` without μ, `residual` and `evaluations` refer to G. It
+    evaluates a once, at the computed y. If a(y) ≤ 0, the result is `weight_not_positive` and the error
+    bound infinite. If a(y) < M, M is refuted, and with it γ = Mμ: the result is `weight_below_bound`,
+    while y and its bound remain valid.
 
-    A drive must sit inside the bracket: (2 + sin y)(y − q) is weighted, (2 + sin y) y − q is not,
-    and can have three solutions.
+    A load must be inside the factor G: (2 + sin y)(y − q) is weighted, but (2 + sin y) y − q is
+    not, and can have three solutions.
 
-    **Arguments:** `a(y, args)`, a number, and `G(y, args)`, both traceable; `M`, a lower bound of a
-    on K, and `mu`, the modulus of G, where they are known. Where `mu` is not given and G is proved
-    to be affine, G(y) = Jy + c, it is the least eigenvalue of (J + J*)/2 (see `modulus`).
+    **Arguments:** `a(y, args)`, a number, and `G(y, args)`, both traceable; `M`, a lower bound of a on
+    K, and `mu`, the modulus of G, both optional. If `mu` is not given and G is proved to be affine,
+    G(y) = Jy + c, the modulus is the smallest eigenvalue of (J + J*)/2 (see `modulus`).
 
-    **Raises:** `dvax.InputError` where M or mu is not positive and finite. Called outside
+    **Raises:** `dvax.InputError` if M or mu is not positive and finite. If F is called outside
     `dvax.solve_vi`, F(y) is NaN where a(y) is not positive.
 
     ```python
@@ -67,7 +67,7 @@ class Weighted(eqx.Module):
     >>> F = dvax.vi.Weighted(lambda y, q: 2 + jnp.sin(y), lambda y, q: y - q, M=1.0, mu=1.0)
     >>> vi = dvax.solve_vi(F, dvax.sets.Box(0.0, 4.7), jnp.array(0.0), args=3.0)
     >>> float(vi.y), vi.solver, bool(vi.error_bound < 1e-12), float(F.gamma)
-    (3.0, 'Closed', True, 1.0)
+    (3.0, 'ClosedForm', True, 1.0)
 
     ```
     """
@@ -94,56 +94,59 @@ class Weighted(eqx.Module):
                         f"Write {name}=lambda y, args: ...",
                     )
                 )  # fmt: skip
-        self.M = _positive("M", M, "a must be bounded away from 0, or Mμ is no modulus")
-        self.mu = _positive("mu", mu, "G must be strongly monotone, or uniqueness is not known")
+        self.M = _positive("M", M, "a must be bounded away from 0, otherwise Mμ is not a modulus")
+        self.mu = _positive("mu", mu, "G must be strongly monotone, otherwise y* may not be unique")
 
     def __call__(self, y: Tree, args: Any = None) -> Tree:
-        """F(y) = a(y) G(y), NaN where a(y) is not positive."""
+        """Return F(y) = a(y) G(y), or NaN where a(y) is not positive."""
         weight = self.weight(y, args)
         return _tree.scale(jnp.where(weight > 0, weight, jnp.nan), self.G(y, args))
 
     @property
     def gamma(self) -> Any:
-        """γ = Mμ of F, or None where M or mu was not given."""
+        """The modulus γ = Mμ of F, or None if M or mu was not given."""
         return None if self.M is None or self.mu is None else self.M * self.mu
 
     def weight(self, y: Tree, args: Any = None) -> jax.Array:
-        """a(y), checked to be one number."""
+        """Return a(y) after checking that it is one number."""
         weight = jnp.asarray(self.a(y, args))
         if weight.shape != ():
             raise InputError(
                 InputProblem(
                     "dvax.vi.Weighted(a)",
                     f"a value of shape {weight.shape}",
-                    "a(y) must be one number: only that can be divided out of every ⟨F(y), v − y⟩",
+                    "a(y) must be one number, so that it cancels from ⟨F(y), v − y⟩ ≥ 0 for every v",
                     "Return a scalar",
                 )
             )
         return weight
 
     def modulus(self, like: Tree, args: Any, space: AbstractSpace) -> Modulus | None:
-        """μ in `space`: as declared; else proved, where the code of G shows that G(y) = Jy + c.
+        """Return μ in `space`: the declared one, or one proved if the code of G shows G(y) = Jy + c.
 
-        Then ⟨G(y) − G(z), y − z⟩ = ⟨Jd, d⟩, whose least value for ‖d‖ = 1 is the least eigenvalue
-        of (J + J*)/2, here lowered by what rounding may have done. None where G is not seen to be
+        Then ⟨G(y) − G(z), y − z⟩ = ⟨Jd, d⟩, whose minimum for ‖d‖ = 1 is the smallest eigenvalue of
+        (J + J*)/2; a bound on its rounding error is subtracted. The result is None if G is not proved
         affine, or has more than 256 unknowns.
         """
         if self.mu is not None:
             return Modulus(self.mu, "declared")
-        G = lambda y: self.G(y, args)  # noqa: E731
+
+        def G(y: Tree) -> Tree:
+            return self.G(y, args)
+
         size = sum(leaf.size for leaf in jtu.tree_leaves(like))
-        if size > _PROVED or not analyse(G, like).affine:
+        if size > _MAX_EIGENVALUE_UNKNOWNS or not analyse(G, like).affine:
             return None
         return Modulus(jax.lax.stop_gradient(_least_eigenvalue(G, like, space)), "proved")
 
-    def judged(
+    def check_weight(
         self, y: Tree, args: Any, result: RESULTS, bound: jax.Array | None
     ) -> tuple[RESULTS, jax.Array | None]:
-        """What a(y) leaves of a success and of an error bound for VI(K, G)."""
+        """Return the result and error bound of VI(K, G), revised by the value of a(y)."""
         weight = jax.lax.stop_gradient(self.weight(y, args))
         solved = result == RESULTS.successful
         if self.M is not None:
-            # M may be the very minimum of a, and computed in another order.
+            # M may be the exact minimum of a, computed with different rounding.
             below = weight < self.M * (1 - 64 * jnp.finfo(weight.dtype).eps)
             result = RESULTS.where(solved & below, RESULTS.weight_below_bound, result)
         positive = weight > 0
@@ -152,32 +155,35 @@ class Weighted(eqx.Module):
         return result, None if bound is None else jnp.where(positive, bound, jnp.inf)
 
 
-def moduli_belong_to_the_parts(gamma: Any, L_F: Any) -> None:
-    """Raise an `InputError` where moduli of aG are given to a solve of VI(K, G)."""
-    given = {"gamma": gamma, "L_F": L_F}
-    wrong = [
+def reject_moduli_of_product(gamma: Any, L_F: Any) -> None:
+    """Raise an `InputError` if moduli of aG are given to a solve of VI(K, G)."""
+    moduli = {"gamma": gamma, "L_F": L_F}
+    problems = [
         InputProblem(
             f"dvax.solve_vi({name})",
             _tree.short(value),
-            "a Weighted operator brings its own moduli, and those of a(y)G(y) are not those of G, "
-            "which is what is solved",
+            "a Weighted operator brings its own moduli: the solver solves VI(K, G), whose moduli "
+            "differ from those of a(y)G(y)",
             "Give M and mu to dvax.vi.Weighted, or solve VI(K, G) itself: dvax.solve_vi(F.G, ...)",
         )
-        for name, value in given.items()
+        for name, value in moduli.items()
         if value is not None
     ]
-    if wrong:
-        raise InputError(*wrong)
+    if problems:
+        raise InputError(*problems)
 
 
 def _least_eigenvalue(G: Callable[[Tree], Tree], like: Tree, space: AbstractSpace) -> jax.Array:
     flat, unflatten = ravel_pytree(_tree.zeros_like(like))
-    slope = lambda d: ravel_pytree(jax.jvp(G, (unflatten(flat),), (unflatten(d),))[1])[0]  # noqa: E731
+
+    def slope(d: jax.Array) -> jax.Array:
+        return ravel_pytree(jax.jvp(G, (unflatten(flat),), (unflatten(d),))[1])[0]
+
     matrix = jax.vmap(slope, out_axes=1)(jnp.eye(flat.size, dtype=flat.dtype))
     weights = jtu.tree_map(
         lambda w, leaf: jnp.broadcast_to(w, leaf.shape).astype(leaf.dtype), space.weights(), like
     )
-    # ⟨Jd, d⟩ = Σ wᵢ(Jd)ᵢdᵢ is a plain quadratic form of √w d, whose plain norm is ‖d‖.
+    # In terms of √w d, ⟨Jd, d⟩ = Σ wᵢ(Jd)ᵢdᵢ is a Euclidean quadratic form and ‖d‖ the Euclidean norm.
     root = jnp.sqrt(ravel_pytree(weights)[0])
     matrix = root[:, None] * matrix / root[None, :]
     eigenvalues = jnp.linalg.eigvalsh(0.5 * (matrix + matrix.T))
@@ -192,8 +198,8 @@ def _positive(name: str, value: Any, why: str) -> Any:
     if _tree.shapes(value) != ():
         raise InputError(
             InputProblem(
-                f"dvax.vi.Weighted({name})", f"shape {_tree.shapes(value)}", "it is one number",
-                "Give the least of them",
+                f"dvax.vi.Weighted({name})", f"shape {_tree.shapes(value)}", "it must be one number",
+                "Give the smallest of them",
             )
         )  # fmt: skip
     _tree.require(
@@ -201,6 +207,6 @@ def _positive(name: str, value: Any, why: str) -> Any:
         f"dvax.vi.Weighted({name})",
         value,
         f"it must be positive and finite: {why}",
-        "Leave it out where it is not known",
+        "Omit it if it is unknown",
     )
     return value

@@ -36,7 +36,7 @@ class Step(NamedTuple):
 
 class Row(NamedTuple):
     """What is saved at one time: x, y and F(y) = w of the frozen law; the `defect` of both equations up
-    to the end of the step that the time lies in, and `completed_defect`, what it was at its start; `extent`, the
+    to the end of the step that the time lies in, and `completed_defect` up to its start; `extent`, the
     bounds (low, high) of x and y so far, where they are asked for."""
 
     t: float

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ...errors import input_error
-from ...vi import RESULTS, AbstractSolver, Answer, Frozen
+from ...vi import RESULTS, AbstractSolver, Answer, FrozenVI
 
 _MOST = 120
 """Rounds, of which sixty halve an interval of doubles to nothing."""
@@ -54,7 +54,7 @@ class MeritOrder(AbstractSolver):
     coupling: Any
     firms: jax.Array
 
-    def solve(self, vi: Frozen, y0: Any, tol: Any) -> Answer:
+    def solve(self, vi: FrozenVI, y0: Any, tol: Any) -> Answer:
         ends = None if isinstance(y0, tuple) else vi.K.intervals(y0)
         if isinstance(y0, tuple) or ends is None or jnp.shape(y0) != jnp.shape(self.slope):
             raise input_error(

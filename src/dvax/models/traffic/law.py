@@ -35,7 +35,7 @@ from jax import lax
 from ...errors import input_error
 from ...problem import FrozenOperator
 from ...signals import AbstractSignal
-from ...vi import AbstractSolver, Answer, Frozen
+from ...vi import AbstractSolver, Answer, FrozenVI
 from ...vi.iteration import Trial, iterate
 from .costs import LinkCosts
 from .paths import Incidence, Paths
@@ -207,7 +207,7 @@ class LinkNewton(AbstractSolver):
     least: float
     max_steps: int = 300
 
-    def solve(self, vi: Frozen, y0: jax.Array, tol: Any) -> Answer:
+    def solve(self, vi: FrozenVI, y0: jax.Array, tol: Any) -> Answer:
         law = _Law(self.choices, vi)
         start = law.K.project(lax.stop_gradient(y0), vi.space)
         own = law.respond(law.link_flows(start))
@@ -219,20 +219,20 @@ class LinkNewton(AbstractSolver):
             size = len(self.choices.block)
             return _Method(at, jnp.zeros((size, size), start.dtype), jnp.asarray(_PRODUCTS))
 
-        def advance(_: Frozen, method: _Method) -> tuple[_Method, Trial]:
+        def advance(_: FrozenVI, method: _Method) -> tuple[_Method, Trial]:
             new, calls = law.ascend(method)
             w, value = law.certificate(new.at)
             one = jnp.ones((), w.dtype)
             return new, Trial(new.at.y, w, value, one, [new.at.y], calls)
 
         tol = jnp.maximum(jnp.maximum(tol, self.least), law.rounding(at))
-        return iterate(vi, at.y, tol, begin, advance, self.max_steps, begun=2)
+        return iterate(vi, at.y, tol, begin, advance, self.max_steps, initial_evaluations=2)
 
 
 class _Law:
     """The law at a time and a state."""
 
-    def __init__(self, choices: Choices, vi: Frozen):
+    def __init__(self, choices: Choices, vi: FrozenVI):
         if not (isinstance(vi.F, FrozenOperator) and isinstance(vi.F.h, Proposal)):
             raise input_error(
                 "dvax.models.traffic.LinkNewton", f"the operator {vi.F!r}"[:80],

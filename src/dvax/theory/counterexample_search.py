@@ -1,0 +1,237 @@
+"""Sampling and ascent over a region: counterexamples to a modulus, and lower bounds of it."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .. import _tree
+from .._tree import Tree
+from ..programs.slope import is_slope
+from ..spaces import AbstractSpace
+from .region import Region
+from .system import System
+from .weights import flat_roots, full_weights
+
+_STARTS, _ASCENT_STEPS = 256, 60
+"""Number of starting points of a search, and of ascent steps from each."""
+
+_MAX_ENTRIES = 2_000_000
+"""Largest number of entries of all starting points together: in high dimensions there are fewer."""
+
+_ROUNDING_FACTOR = 1e4
+"""Assumed rounding error of F, in units of ε times its norm."""
+
+_MAX_DENSE_SIZE = 64
+"""Up to this size the norm of a derivative is computed from singular values."""
+
+
+class CounterexamplePair(NamedTuple):
+    """Two points y and z of K(t) that contradict the modulus of F at (t, x).
+
+    `forward` = ⟨F(y), z − y⟩ ≥ 0, but `backward` = ⟨F(z), z − y⟩ < γ‖z − y‖² for every γ above `gamma`.
+    """
+
+    t: float
+    x: Tree
+    y: Tree
+    z: Tree
+    gamma: float
+    forward: float
+    backward: float
+
+
+def largest_slope(system: System, region: Region, name: str, by: str) -> float:
+    """Return a lower bound on the Lipschitz modulus of `name` ("f" or "h") in `by` ("x" or "u").
+
+    A search in a bounded region takes the largest norm of the derivative and the largest difference
+    quotient between near and far points.
+    """
+    fn = getattr(system.problem, name)
+    out = system.state if name == "f" else system.control
+    into = system.state if by == "x" else system.control
+
+    def with_argument(t: Any, x: Tree, u: Tree, v: Tree) -> Tree:
+        """Evaluate the function with v in place of x or u."""
+        return fn(t, v, u, system.args) if by == "x" else fn(t, x, v, system.args)
+
+    def norm(point: tuple) -> jax.Array:
+        t, x, u = point
+        return _norm(partial(with_argument, t, x, u), x if by == "x" else u, out, into)
+
+    low, high = _bounds(region)
+    starts = _points(low, high, _STARTS, 1)
+    best = jax.vmap(norm)(_climb(norm, starts, low, high))
+    others = _points(low, high, _STARTS, 2)
+    quotients = []
+    for fraction in (1.0, 1e-3, 1e-6):
+        k = 1 if by == "x" else 2
+        ends = jtu.tree_map(lambda a, b, r=fraction: a + r * (b - a), starts[k], others[k])
+        quotients.append(
+            jax.vmap(lambda p, v: _quotient(with_argument, p, v, out, into, by))(starts, ends)
+        )
+    slopes = jnp.concatenate([best, *quotients])
+    return float(jnp.max(jnp.where(jnp.isfinite(slopes), slopes, 0.0)))
+
+
+def find_counterexample(system: System, region: Region) -> CounterexamplePair | None:
+    """Search a bounded region for two points that no strongly pseudomonotone F admits.
+
+    The pair has a modulus `gamma` below zero, so it refutes every positive one. The result is None if
+    none was found.
+    """
+    low, high = _bounds(region)
+    P, space, args = system.problem.operator(system.args), system.control, system.args
+
+    def points(v: tuple) -> tuple[Tree, Tree, Tree, Tree]:
+        t, x, u, w = v
+        K = system.problem.set_at(t, args)
+        y, z = K.project(P.apply(u), space), K.project(P.apply(w), space)
+        F = system.problem.frozen(t, x, args)
+        return y, z, F(y), F(z)
+
+    def products(v: tuple) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """Return ⟨F(y), z − y⟩, ⟨F(z), z − y⟩, ‖z − y‖ and ‖F(y)‖ + ‖F(z)‖."""
+        y, z, Fy, Fz = points(v)
+        d = _tree.sub(z, y)
+        forward, backward = space.inner(Fy, d), space.inner(Fz, d)
+        return forward, backward, space.norm(d), space.norm(Fy) + space.norm(Fz)
+
+    def violation(v: tuple) -> jax.Array:
+        forward, backward, length, _ = products(v)
+        gain = jnp.minimum(forward, -backward)
+        return jnp.where(length > 1e-6, gain / jnp.maximum(length, 1e-6) ** 2, -jnp.inf)
+
+    t, x, u = low
+    ends = (t, x, u, u), (high[0], high[1], high[2], high[2])
+    candidates = _climb(violation, _points(*ends, 4 * _STARTS, 3), *ends)
+    forward, backward, length, norm_F = jax.vmap(products)(candidates)
+    eps = float(jnp.finfo(length.dtype).eps)
+    gain = jnp.minimum(forward, -backward) - _ROUNDING_FACTOR * eps * norm_F * length
+    gain = jnp.where((length > 1e-6) & jnp.isfinite(gain), gain, -jnp.inf)
+    k = int(jnp.argmax(gain))
+    if not float(gain[k]) > 0:
+        return None
+    worst = jtu.tree_map(lambda leaf: leaf[k], candidates)
+    y, z, *_ = points(worst)
+    return CounterexamplePair(
+        float(worst[0]), worst[1], y, z, float(backward[k] / length[k] ** 2), float(forward[k]),
+        float(backward[k]),
+    )  # fmt: skip
+
+
+def smallest_monotonicity(system: System, region: Region) -> float:
+    """Return the smallest ⟨F(y) − F(z), y − z⟩/‖y − z‖² that a search finds: an upper bound on the
+    modulus of strong monotonicity of F."""
+    P, space, args = system.problem.operator(system.args), system.control, system.args
+    low, high = _bounds(region)
+
+    def negative_quotient(v: tuple) -> jax.Array:
+        t, x, u, w = v
+        K = system.problem.set_at(t, args)
+        F = system.problem.frozen(t, x, args)
+        y, z = K.project(P.apply(u), space), K.project(P.apply(w), space)
+        d = _tree.sub(y, z)
+        product, square = space.inner(_tree.sub(F(y), F(z)), d), space.inner(d, d)
+        return jnp.where(square > 1e-12, -product / jnp.maximum(square, 1e-12), -jnp.inf)
+
+    ends = (*low, low[2]), (*high, high[2])
+    points = _climb(negative_quotient, _points(*ends, _STARTS, 4), *ends)
+    values = jax.vmap(negative_quotient)(points)
+    return -float(jnp.max(jnp.where(jnp.isfinite(values), values, -jnp.inf)))
+
+
+def _climb(value: Callable[[Any], jax.Array], starts: Any, low: Any, high: Any) -> Any:
+    """Return the points after sign-gradient ascent with decreasing steps, accepted if they increase
+    `value`."""
+    width = jtu.tree_map(jnp.subtract, high, low)
+
+    def step(k: Any, carry: tuple) -> tuple:
+        point, best = carry
+        fraction = 0.3 * 0.9**k
+        new = jtu.tree_map(
+            lambda p, g, w, a, b: jnp.clip(p + fraction * w * jnp.sign(jnp.nan_to_num(g)), a, b),
+            point, jax.grad(value)(point), width, low, high,
+        )  # fmt: skip
+        new_value = value(new)
+        better = new_value > best
+        return _tree.where(better, new, point), jnp.where(better, new_value, best)
+
+    def climb(point: Any) -> Any:
+        return jax.lax.fori_loop(0, _ASCENT_STEPS, step, (point, value(point)))[0]
+
+    return jax.jit(jax.vmap(climb))(starts)
+
+
+def _quotient(
+    fn: Callable, point: tuple, end: Tree, out: AbstractSpace, into: AbstractSpace, by: str
+) -> jax.Array:
+    """Return ‖fn(end) − fn(start)‖/‖end − start‖ less a bound on the rounding error, where start is
+    the x or u of `point`."""
+    t, x, u = point
+    start = x if by == "x" else u
+    a, b = fn(t, x, u, end), fn(t, x, u, start)
+    length = into.norm(_tree.sub(end, start))
+    eps = jnp.finfo(length.dtype).eps
+    change = out.norm(_tree.sub(a, b)) - 64 * eps * (out.norm(a) + out.norm(b))
+    return jnp.where(length > 0, change / jnp.where(length > 0, length, 1.0), 0.0)
+
+
+def _norm(
+    fn: Callable[[Tree], Tree], v: Tree, out: AbstractSpace, into: AbstractSpace
+) -> jax.Array:
+    """Return ‖∂fn‖ at v from singular values, or for large arrays by a few power iterations."""
+    size = sum(leaf.size for leaf in jtu.tree_leaves(v))
+    value, derivative = jax.linearize(fn, v)
+    if size <= _MAX_DENSE_SIZE:
+        flat, unravel = jax.flatten_util.ravel_pytree(v)
+        roots = flat_roots(into, v)
+        rows = jax.vmap(lambda e: derivative(unravel(e / roots)))(jnp.eye(size, dtype=flat.dtype))
+        matrix = jax.vmap(lambda row: jax.flatten_util.ravel_pytree(row)[0])(rows)
+        matrix = matrix * flat_roots(out, value)[None, :]
+        square = matrix @ matrix.T
+        return jnp.sqrt(
+            jnp.linalg.norm(square, ord="fro") if size == 1 else _largest_eigenvalue(square)
+        )
+    transpose = jax.linear_transpose(derivative, v)
+    d = jtu.tree_map(jnp.ones_like, v)
+    gain = jnp.zeros(())
+    for _ in range(8):
+        d = _tree.scale(1.0 / jnp.maximum(into.norm(d), 1e-300), d)
+        image = derivative(d)
+        gain = out.norm(image)
+        (d,) = transpose(jtu.tree_map(jnp.multiply, image, full_weights(out, image)))
+        d = jtu.tree_map(jnp.divide, d, full_weights(into, d))
+    return gain
+
+
+def _largest_eigenvalue(square: jax.Array) -> jax.Array:
+    return jnp.maximum(jnp.linalg.eigvalsh(square)[-1], 1e-300)
+
+
+def _bounds(region: Region) -> tuple[Any, Any]:
+    ends = (
+        jtu.tree_map(lambda v, i=i: jnp.asarray(v[i]), tuple(region)[:3], is_leaf=is_slope)
+        for i in (0, 1)
+    )
+    return next(ends), next(ends)
+
+
+def _points(low: Any, high: Any, count: int, seed: int) -> Any:
+    """Return random points, uniform in a box, including its centre and two corners."""
+    rng = np.random.default_rng(seed)
+    size = sum(leaf.size for leaf in jtu.tree_leaves(low))
+    count = max(4, min(count, _MAX_ENTRIES // size))
+
+    def draw(a: jax.Array, b: jax.Array) -> jax.Array:
+        fraction = rng.random((count, *a.shape))
+        fraction[0], fraction[1], fraction[2] = 0.0, 1.0, 0.5
+        low, high = np.asarray(a), np.asarray(b)
+        return jnp.asarray(low + fraction * (high - low), a.dtype)
+
+    return jtu.tree_map(draw, low, high)
