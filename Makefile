@@ -16,10 +16,10 @@ export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types thorough bench format docs lock clean
+.PHONY: help setup demo test test-times lint types thorough bench format docs lock clean
 
 help: ## this list
-	@sed -n 's/^\([a-z]*\):.*## /  make \1@/p' Makefile | awk -F@ '{ printf "%-17s %s\n", $$1, $$2 }'
+	@sed -n 's/^\([a-z-]*\):.*## /  make \1@/p' Makefile | awk -F@ '{ printf "%-17s %s\n", $$1, $$2 }'
 
 setup: $(READY) ## the development environment in ./.venv
 
@@ -54,6 +54,9 @@ demo: $(READY) ## solve the rough contact strip; results and report in ./demo-ru
 test: lint types ## lint, formatting, types and tests (under 10 minutes on two cores)
 	$(PY) -m pytest -n $(WORKERS) --dist worksteal --durations=15
 	@echo 'make test: lint, formatting, types and every test not marked thorough have passed'
+
+test-times: $(READY) ## the tests of make test, with the processor time of each test, file and folder
+	$(PY) -m pytest -n $(WORKERS) --dist worksteal -p tests.processor_time
 
 lint: $(READY) ## ruff: rules and formatting
 	$(PY) -m ruff check .

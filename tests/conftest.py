@@ -6,6 +6,11 @@ import os
 from importlib.metadata import version
 from pathlib import Path
 
+# OpenBLAS divides even small solves among threads, and waiting threads spin: on a machine with other
+# work, a frame under an earthquake took eight times the processor time of a single thread. OpenBLAS
+# reads the variable when NumPy and SciPy are imported, so it is set before the other imports.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import hypothesis
 import jaxtyping
 import pytest

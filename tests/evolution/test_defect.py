@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tests.selection import mostly_thorough
 
 import dvax
 
@@ -22,7 +23,7 @@ PROBLEM = dvax.Problem(
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", mostly_thorough(METHODS, ["ETD2RK", "ExpRosenbrock"]))
 def test_a_smooth_defect_is_seen_in_its_size(name):
     """Random smooth systems, from 20 to 200 steps: no method's defect hides at the sampled places."""
     rng = np.random.default_rng(5)
@@ -62,7 +63,7 @@ CLOCK = dvax.Problem(
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", mostly_thorough(METHODS, ["ETD2RK", "ExpRosenbrock"]))
 def test_a_kink_or_a_jump_within_a_step_hides_nothing(name):
     """One step over it, beside the integral of its defect."""
     places = (jnp.arange(2000.0) + 0.5) / 2000

@@ -53,7 +53,10 @@ def errors(method, counts):
     return [max(map(mean, np.asarray(sol.xs) - exact)) for sol in runs]
 
 
-@pytest.mark.parametrize(("method", "order"), [(dvax.ETD1(), 1.0), (dvax.ETD2RK(), 2.0)])
+@pytest.mark.parametrize(
+    ("method", "order"),
+    [pytest.param(dvax.ETD1(), 1.0, marks=pytest.mark.thorough), (dvax.ETD2RK(), 2.0)],
+)
 def test_orders_over_moving_boundaries(method, order):
     counts = (10, 20, 40, 80, 160, 320, 640)
     slope = np.polyfit(np.log2(counts), np.log2(errors(method, counts)), 1)[0]
@@ -95,7 +98,9 @@ def test_the_boundaries_are_where_the_closed_form_says():
         np.testing.assert_array_equal((u == 0.0)[~near[1]], (from_end > none)[~near[1]])
 
 
-@pytest.mark.parametrize("method", [dvax.ETD1(), dvax.ETD2RK()])
+@pytest.mark.parametrize(
+    "method", [pytest.param(dvax.ETD1(), marks=pytest.mark.thorough), dvax.ETD2RK()]
+)
 def test_the_bound_holds_over_moving_boundaries(method):
     case = c7(N)
     ts = np.linspace(0.0, 1.0, 11)

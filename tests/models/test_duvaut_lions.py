@@ -143,7 +143,13 @@ def test_the_projection_is_the_return_mapping(yields, back):
 
 
 @pytest.mark.parametrize(
-    "way", [SHEAR, TENSION, OEDOMETRIC], ids=["shear", "tension", "oedometric"]
+    "way",
+    [
+        pytest.param(SHEAR, marks=pytest.mark.thorough),
+        pytest.param(TENSION, marks=pytest.mark.thorough),
+        OEDOMETRIC,
+    ],
+    ids=["shear", "tension", "oedometric"],
 )
 def test_along_a_straight_way_the_overstress_is_an_exponential(way):
     # dev σ = s n, and z = s − R obeys z' = 2Gė − z/τ once s has reached R.
@@ -209,8 +215,12 @@ SQUEEZE = 1.5e-3 * np.eye(3) * np.linspace(0.0, 1.0, 9)[:, None, None]
     ("path", "yields", "back"),
     [
         (CYCLE[:, None, None] * SHEAR, VonMises(STRENGTH), radial_return),
-        (WINDING, VonMises(STRENGTH), radial_return),
-        (WINDING - SQUEEZE, DruckerPrager(M, P_T), cone_return),
+        pytest.param(
+            WINDING, VonMises(STRENGTH), radial_return, marks=pytest.mark.thorough
+        ),
+        pytest.param(
+            WINDING - SQUEEZE, DruckerPrager(M, P_T), cone_return, marks=pytest.mark.thorough
+        ),
     ],
     ids=["cycle", "winding", "winding on the cone"],
 )  # fmt: skip

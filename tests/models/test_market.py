@@ -139,9 +139,10 @@ def test_the_first_hours_against_an_integrator_and_a_law_of_others(week):
 
 
 @needs_data
-def test_frozen_data_bring_the_price_to_the_equilibrium(rts, week):
+@pytest.mark.parametrize("hours", [(12,), pytest.param((60, 100), marks=pytest.mark.thorough)])
+def test_frozen_data_bring_the_price_to_the_equilibrium(rts, week, hours):
     times = np.linspace(0.0, 6.0, 168)
-    for k in (12, 60, 100):
+    for k in hours:
         row = JULY + k
         held = lambda value: dvax.signals.Table(times, np.repeat(value[None], 168, axis=0))  # noqa: E731
         frozen = Market(

@@ -141,7 +141,11 @@ def test_a_jump_that_cannot_be_read_refuses_the_derivative_of_its_time():
 
 
 @pytest.mark.parametrize("kind", ["interp", "steps"])
-@pytest.mark.parametrize("method", [None, dvax.DormandPrince()], ids=["default", "DormandPrince"])
+@pytest.mark.parametrize(
+    "method",
+    [None, pytest.param(dvax.DormandPrince(), marks=pytest.mark.thorough)],
+    ids=["default", "DormandPrince"],
+)
 def test_a_spike_in_an_array_is_met_and_its_times_are_differentiated(kind, method):
     """x' = −x + q(t), q read from arrays by JAX's own functions; exact between two of its times."""
     times, n = np.linspace(0.0, 10.0, 1001), 1000

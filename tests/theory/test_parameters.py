@@ -77,7 +77,7 @@ def test_the_constants_of_thm_continuous_dependence_are_their_definition():
     # The best λ against a search.
     factor = lambda lam: np.exp(lam * 1.5) / (1.0 - float(C.bielecki_factor(lam)))  # noqa: E731
     best = float(C.best_lambda(1.5))
-    grid = np.linspace(rate + 1e-3, rate + 10.0, 20_000)
+    grid = np.linspace(rate + 1e-3, rate + 10.0, 500)
     assert factor(best) <= min(map(factor, grid)) * (1 + 1e-9)
     assert 0.0 < float(C.bielecki_factor(best)) < 1.0
 

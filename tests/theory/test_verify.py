@@ -70,7 +70,7 @@ def _hold(made, c):
             "gamma": jnp.where(forward >= 0, backward - c.gamma * dy**2, 0.0),
         }
 
-    for name, room in jax.vmap(pair)(ts, points).items():
+    for name, room in jax.jit(jax.vmap(pair))(ts, points).items():
         assert float(jnp.min(room)) >= -1e-9, name
 
 

@@ -12,7 +12,7 @@ from tests.selection import mostly_thorough
 import dvax
 
 
-@pytest.mark.parametrize("far", mostly_thorough([1e3, 1e4, 1e6, 1e8], [1e4, 1e8]))
+@pytest.mark.parametrize("far", mostly_thorough([1e3, 1e4, 1e6, 1e8], [1e8]))
 @pytest.mark.parametrize("kind", ["Ball", "Translated", "HalfSpace"])
 def test_a_set_far_from_zero_has_its_rounding_in_the_bound(kind, far):
     """Of y − q the solution is the projection of q, in rational arithmetic for a half-space."""
