@@ -38,7 +38,7 @@ program = jax.make_jaxpr(lambda v: jax.jit(lambda w: w + 2.0)(v))(1.0)
 assert isinstance(program, jaxprs.ClosedJaxpr) and isinstance(program.jaxpr, jaxprs.Jaxpr)
 inner = jaxprs.inner_program(program.jaxpr.eqns[0])
 variable, literal = inner.jaxpr.eqns[0].invars
-assert isinstance(variable, jaxprs.Var) and isinstance(literal, jaxprs.Literal)
+assert isinstance(literal, jaxprs.Literal) and not isinstance(variable, jaxprs.Literal)
 assert jaxprs.read({variable: 3.0}, [variable, literal]) == [3.0, 2.0]
 """
 

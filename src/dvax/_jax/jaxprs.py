@@ -14,16 +14,15 @@ import jax.numpy as jnp
 def _types() -> tuple[Any, ...]:
     """Return the types of programs and of their parts, taken from a program that is traced here."""
     program = jax.make_jaxpr(lambda v: v + 1.0)(1.0)
-    variable, literal = program.jaxpr.eqns[0].invars
-    return type(program), type(program.jaxpr), type(literal), type(variable)
+    return type(program), type(program.jaxpr), type(program.jaxpr.eqns[0].invars[1])
 
 
 try:
-    from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var
+    from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 except ImportError:
-    ClosedJaxpr, Jaxpr, Literal, Var = _types()
+    ClosedJaxpr, Jaxpr, Literal = _types()
 
-__all__ = ["ClosedJaxpr", "Jaxpr", "Literal", "Var"]
+__all__ = ["ClosedJaxpr", "Jaxpr", "Literal"]
 
 CUSTOM = frozenset({"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"})
 """Calls of a function with a derivative rule of its own."""
@@ -44,11 +43,6 @@ def bind(eqn: Any, given: list[Any]) -> list[Any]:
 def read(known: dict[Any, Any], atoms: Any) -> list[Any]:
     """Return the values of variables and literals, given those of the variables."""
     return [atom.val if isinstance(atom, Literal) else known[atom] for atom in atoms]
-
-
-def variables(atoms: Any) -> set[Any]:
-    """Return those that are not literals."""
-    return {atom for atom in atoms if isinstance(atom, Var)}
 
 
 def inner_program(eqn: Any) -> Any:
