@@ -332,7 +332,7 @@ ARGUMENTS = {
 VERIFY = {
     "a vector problem": (
         lambda: verify(problem(f=lambda t, x, u, a: x[0] * u)),
-        "verify(x0); Give any state; newcomer.py, line",
+        "verify(x0); Pass any state; newcomer.py, line",
     ),
     "f of three": (lambda: verify(problem(f=lambda t, x, u: x)), "a function of (t, x, u)"),
     "no problem": (lambda: dvax.verify(None), "verify(problem); NoneType"),
@@ -351,7 +351,7 @@ VERIFY = {
     "args NaN": (lambda: verify(problem(f=lambda t, x, u, a: a * u), args=nan), "(args); nan"),
     "bound of nothing": (
         lambda: dvax.bound_error(PLAIN, None, verify().constants),
-        "bound_error(sol); NoneType; what dvax.solve returned",
+        "bound_error(sol); NoneType; the result of dvax.solve",
     ),
     "bound without constants": (
         lambda: dvax.bound_error(PLAIN, solve(), None),

@@ -11,7 +11,7 @@ import pytest
 
 import dvax
 from dvax import _jax
-from dvax.evolution import integrate, reverse
+from dvax.evolution import responses, reverse, steps
 
 problem = dvax.Problem(
     A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
@@ -41,7 +41,7 @@ WAYS = {
 
 def by(monkeypatch, call):
     """Have every solve call its programs by `call`."""
-    for module in (integrate, reverse):
+    for module in (responses, reverse, steps):
         monkeypatch.setattr(module, "outlined", call)
     jax.clear_caches()
 

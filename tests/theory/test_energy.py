@@ -87,14 +87,14 @@ def test_a_proposal_is_measured_and_not_believed():
     G, F_u, H_x = rng.normal(size=(3, 3)) - 2 * np.eye(3), rng.normal(size=(3, 2)), np.ones((2, 3))
     data = energy._Data(G, F_u, H_x, np.diag([1.0, 2.0]), np.eye(2), True)
     root = rng.normal(size=(3, 3))
-    found = energy._proved(root @ root.T + np.eye(3), np.array([0.7, 0.2]), data)
+    found = energy._certify(root @ root.T + np.eye(3), np.array([0.7, 0.2]), data)
     form = energy._form(found.Q, np.array([0.7, 0.2]), data, found.rate)
     assert np.linalg.eigvalsh(form)[-1] <= 1e-9
     assert (
         np.linalg.eigvalsh(energy._form(found.Q, np.array([0.7, 0.2]), data, found.rate - 1e-3))[-1]
         > 0
     )
-    assert energy._proved(np.diag([1.0, 1.0, -1.0]), np.ones(2), data) is None
+    assert energy._certify(np.diag([1.0, 1.0, -1.0]), np.ones(2), data) is None
 
 
 def test_without_the_solver_it_says_what_to_install(monkeypatch):

@@ -147,7 +147,7 @@ def test_the_bound_of_an_unfinished_solve_still_holds():
 
 def test_bracketing_refuses_what_it_cannot_do_and_names_what_can():
     for F, K, word in (
-        (lambda y: y[::-1] ** 3, Box(0.0, 1.0), "mixes points"),
+        (lambda y: y[::-1] ** 3, Box(0.0, 1.0), "couples points"),
         (lambda y: y**3, Ball(0.0, 1.0), "not a pointwise interval"),
     ):
         with pytest.raises(dvax.InputError, match=word) as caught:

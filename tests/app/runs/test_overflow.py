@@ -51,7 +51,7 @@ def test_a_number_has_one_spelling_in_json_and_one_on_the_screen(value, spelled,
     bound = {"value": spelled, "bound": "proved", "error": spelled}
     assert entry_text(bound) == ("≤ 1.5" if spelled == 1.5 else shown)
     meaning = Figure(value, "1", "a bound", bound="proved").to_json()["meaning"]
-    assert ("says nothing" in meaning) == (not math.isfinite(value))
+    assert ("gives no bound" in meaning) == (not math.isfinite(value))
 
 
 def test_a_log_axis_has_room_for_what_is_drawn() -> None:
@@ -68,7 +68,7 @@ def test_constants_that_overflow_warn_nobody_and_say_so() -> None:
         warnings.simplefilter("error")
         row = next(row for row in c.table(1.2) if row.name == "hadamard")
         assert c.separation(1.2) == c.sharp_separation(1.2) == c.largest_separation(1.2) == math.inf
-    assert row.value == math.inf and "says nothing" in row.meaning
+    assert row.value == math.inf and "gives no bound" in row.meaning
 
 
 @pytest.mark.parametrize("changes", mostly_thorough([*INFINITE.values(), *TINY.values()], []))
@@ -91,7 +91,7 @@ def test_a_run_that_overflows_ends_with_all_of_its_files(tmp_path: Path, changes
     assert json.loads((out / "manifest.json").read_text())["status"] == "finished"
     if changes is INFINITE["Hadamard"]:
         bound = json.loads((out / "summary.json").read_text())["error_bound_x"]
-        assert bound["value"] == "inf" and "says nothing" in bound["meaning"]
+        assert bound["value"] == "inf" and "gives no bound" in bound["meaning"]
         assert "∞" in checked.stdout
 
 

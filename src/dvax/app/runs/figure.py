@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-SAYS_NOTHING = "; it is not finite, so it says nothing"
+SAYS_NOTHING = "; it is not finite, so it gives no bound"
 
 
 @dataclass(frozen=True)
