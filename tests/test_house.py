@@ -18,6 +18,7 @@ from pathlib import Path
 
 import equinox as eqx
 import pytest
+from tests.figures import UNSTABLE, unstable_lines
 
 import dvax
 
@@ -303,3 +304,10 @@ def test_the_files_that_the_page_on_the_architecture_names_exist():
     homes = [ROOT / "src" / "dvax", ROOT / "src" / "dvax" / "evolution", ROOT]
     absent = [name for name in sorted(named) if not any((home / name).exists() for home in homes)]
     assert not absent
+
+
+def test_only_the_room_for_it_uses_unstable_interfaces_of_jax():
+    assert list(unstable_lines()) == []
+    # The reader finds what it looks for.
+    assert UNSTABLE.search("from jax.interpreters import mlir")
+    assert UNSTABLE.search("jax.experimental.xla_metadata")

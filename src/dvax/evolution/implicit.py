@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax import lax
 
 from .. import _tree
 from .._tree import Tree
@@ -16,6 +17,7 @@ from .outcome import Outcome, Saved
 from .results import RESULTS
 from .setup import Options, Setup
 from .stepper import one_sided_time
+from .time_derivatives import zero_with_tangent
 
 _SPLIT = (diffrax.KenCarp3, diffrax.KenCarp4, diffrax.KenCarp5)
 
@@ -75,16 +77,18 @@ def by_implicit_steps(
     options: Options,
 ) -> Outcome:
     """Run implicit steps from the first stop to the last."""
-    begin, end, x0, first_step = stops[0], stops[-1], setup.x0, setup.number("dt0")
+    clock, x0, first_step = _Clock(stops), setup.x0, setup.number("dt0")
+    begin, end = clock.stops[0], clock.stops[-1]
     first, last = (one_sided_time(begin, end, theta, (begin, end)) for theta in (0.0, 1.0))
 
-    def law(t: Any, x: Tree, _: Any) -> Tree:
-        found = flow.rate(jnp.clip(t, first, last), x, flow.guess(x))
+    def law(s: Any, x: Tree, _: Any) -> Tree:
+        t, pace = clock.time(jnp.clip(s, first, last))
+        found = flow.rate(t, x, flow.guess(x))
         # A law that is not solved gives no rate: a shorter step is tried.
-        return jtu.tree_map(lambda v: jnp.where(found.solved, v, jnp.nan), found.value)
+        return jtu.tree_map(lambda v: jnp.where(found.solved, pace * v, jnp.nan), found.value)
 
-    def linear(t: Any, x: Tree, _: Any) -> Tree:
-        return flow.generator.apply(x)
+    def linear(s: Any, x: Tree, _: Any) -> Tree:
+        return _tree.scale(clock.time(s)[1], flow.generator.apply(x))
 
     if isinstance(method.solver, _SPLIT):
         terms = diffrax.MultiTerm(diffrax.ODETerm(law), diffrax.ODETerm(linear))
@@ -98,8 +102,8 @@ def by_implicit_steps(
         end,
         first_step,
         x0,
-        saveat=diffrax.SaveAt(t1=True) if ts is None else diffrax.SaveAt(ts=ts),
-        stepsize_controller=_controller(setup.number("rtol"), setup.number("atol"), stops),
+        saveat=diffrax.SaveAt(t1=True) if ts is None else diffrax.SaveAt(ts=clock.inverse(ts)),
+        stepsize_controller=_controller(setup.number("rtol"), setup.number("atol"), clock.stops),
         adjoint=diffrax.ForwardMode()
         if options.adjoint == "forward"
         else diffrax.RecursiveCheckpointAdjoint(),
@@ -121,7 +125,7 @@ def by_implicit_steps(
     out_of_steps = found.result == diffrax.RESULTS.max_steps_reached
     result = RESULTS.where(out_of_steps, RESULTS.max_steps, RESULTS.implicit_unsolved)
     result = RESULTS.where(fine, RESULTS.successful, result)
-    times = jnp.where(reached, found.ts, jnp.inf)
+    times = jnp.where(reached, stops[-1:] if ts is None else ts, jnp.inf)
     # What is known of a run that failed is the last saved time that it reached.
     count = jnp.sum(reached)
     row = jnp.maximum(count - 1, 0)
@@ -133,6 +137,35 @@ def by_implicit_steps(
         "next_dt": first_step,
     }
     return Outcome(Saved(times, xs), stats, result, None)
+
+
+class _Clock:
+    """A map s ↦ t of the time of the solver to that of the problem: the identity in value, and between
+    two stops the affine function that maps their values to the stops themselves.
+
+    Times in s are constants. So Diffrax chooses and differentiates its steps as where no time is
+    differentiated, and all tangents of the stops enter by x' = dt/ds (Ax + f̃(t, x)).
+    """
+
+    def __init__(self, stops: jax.Array) -> None:
+        self.stops = lax.stop_gradient(stops)
+        shift = zero_with_tangent(stops)
+        self._slope = jnp.diff(shift) / jnp.diff(self.stops)
+        self._shift = shift[:-1] - self._slope * self.stops[:-1]
+
+    def time(self, s: Any) -> tuple[Any, Any]:
+        """Return t and dt/ds."""
+        shift, slope = self._at(s)
+        return s + (shift + slope * s), 1.0 + slope
+
+    def inverse(self, t: Any) -> Any:
+        """Return s."""
+        shift, slope = self._at(lax.stop_gradient(t))
+        return (t - shift) / (1.0 + slope)
+
+    def _at(self, s: Any) -> tuple[Any, Any]:
+        piece = jnp.searchsorted(self.stops[1:-1], s, side="left")
+        return self._shift[piece], self._slope[piece]
 
 
 def _controller(rtol: Any, atol: Any, stops: jax.Array) -> diffrax.AbstractStepSizeController:

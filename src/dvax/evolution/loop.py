@@ -18,19 +18,12 @@ from .._batch import any_lane, is_active
 from .._tree import Tree
 from . import meter
 from .checkpoints import Checkpoints
-from .control import AbstractController
+from .control import AbstractController, slack
 from .extent import Extent
-from .flow import Flow
 from .outcome import Record, Saved
 from .results import RESULTS
-from .stepper import Propagators, SolverState, Stepper, interpolate, local, one_sided_time
-from .time_derivatives import (
-    is_differentiated,
-    left_derivative,
-    transport,
-    velocity,
-    zero_with_tangent,
-)
+from .stepper import Propagators, SolverState, Stepper, interpolate, local
+from .time_derivatives import is_differentiated
 
 
 class State(NamedTuple):
@@ -67,9 +60,8 @@ class Loop(eqx.Module):
     - `dense`: keep every step; `progress`: say how far the run is;
     - `forward_mode`: tangents go along with the steps.
 
-    Where steps adapt, tangents are those of the state at constant times: a differentiated stop adds
-    the jump of x' there, and a differentiated time of output adds x' (`time_derivatives`). Fixed steps
-    depend on the stops, and so do their states.
+    A step that ends at a stop has the tangent of that stop; saved rows have those of constant times,
+    or of the end of the step where they meet one (`time_derivatives`).
     """
 
     stepper: Stepper
@@ -118,7 +110,7 @@ class Loop(eqx.Module):
             x=x0,
             integrated_defect=(zero, zero),
             solver_state=stepper.begin(x0),
-            propagators=None if own else stepper.propagators(self._end(control) - self._held(t0)),
+            propagators=None if own else stepper.propagators(controller.end(control) - t0),
             control=control,
             jumped=jnp.asarray(True),
             extent=stepper.extent(x0),
@@ -176,21 +168,16 @@ class Loop(eqx.Module):
         ahead = lambda carry: any_lane(goes_on(carry))  # noqa: E731
         if not self._refits(carry[0]):
             return lax.while_loop(ahead, turn, carry)
-        # A reverse pass that is differentiated once more: equal lengths are others.
-        moves = is_differentiated(self.controller.stops)
+        moves = self._must_rebuild()
 
         def same(carry: Any) -> Any:
-            is_same = self.stepper.match(*self._ahead(carry[0])) & ~(
-                moves & self._must_rebuild(carry[0])
-            )
+            is_same = self.stepper.match(*self._ahead(carry[0])) & ~moves
             # Problems of a batch get new propagators together, as soon as one of them needs some.
             return ~any_lane(goes_on(carry) & ~is_same)
 
         def of_one_length(carry: Any) -> Any:
             state, *rest = carry
-            propagators = self.stepper.reuse_or_build(
-                *self._ahead(state), self._must_rebuild(state)
-            )
+            propagators = self.stepper.reuse_or_build(*self._ahead(state), moves)
             carry = (state._replace(propagators=propagators), *rest)
             one = lambda c: (turn(c[0]), jnp.asarray(False))  # noqa: E731
             # One in any case: what is not a number fits nothing.
@@ -209,7 +196,7 @@ class Loop(eqx.Module):
     def _ahead(self, state: State) -> tuple[Propagators, Any, Any]:
         """What fits the next step, if it does, and where that one begins and ends."""
         assert state.propagators is not None
-        return state.propagators, self._held(state.t), self._end(state.control)
+        return state.propagators, state.t, self.controller.end(state.control)
 
     def _goes_on(self, state: State, time: Any) -> Any:
         """Whether a step is to be taken before `time`."""
@@ -221,14 +208,10 @@ class Loop(eqx.Module):
 
     def _attempt(self, state: State, own: Any) -> State:
         """The state after one more attempt, where that is its `own`."""
-        begin, end = state.t, self.controller.end(state.control)
-        t0, t1, x0 = self._held(begin), self._held(end), self._begun(state, end)
+        t0, t1, x0 = state.t, self.controller.end(state.control), state.x
         propagators = state.propagators if self._refits(state) else self._propagators(state, t0, t1)
-        solver_state = state.solver_state
-        if x0 is not state.x:
-            solver_state = solver_state._replace(coefficients=None)
-        step = self.stepper.step(t0, t1, x0, solver_state, propagators, state.jumped)
-        decision = self.controller.decide(begin, end, x0, step, state.control)
+        step = self.stepper.step(t0, t1, x0, state.solver_state, propagators, state.jumped)
+        decision = self.controller.decide(t0, t1, x0, step, state.control)
         integrated_defect = jtu.tree_map(jnp.add, state.integrated_defect, step.integrated_defect)
         taken = Record(t0, t1 - t0, x0, step.c)
         # `last` and `records` of a step that is not kept are written over by the next one, or never
@@ -237,12 +220,12 @@ class Loop(eqx.Module):
         if extent is not None:
             assert step.extent is not None
             extent = extent.joined(step.extent)
-        ahead = (end, step.x1, integrated_defect, step.solver_state, decision.jumped, extent)
+        ahead = (t1, step.x1, integrated_defect, step.solver_state, decision.jumped, extent)
         last = None if state.last is None else (taken, state.integrated_defect)
         if self.check_finite:
             behind = (
-                begin,
-                state.x,
+                t0,
+                x0,
                 state.integrated_defect,
                 state.solver_state,
                 state.jumped,
@@ -282,15 +265,14 @@ class Loop(eqx.Module):
         after = _tree.where(own, after, bare)
         return after._replace(
             records=None if state.records is None else put(state.records, taken),
-            ends=None if state.ends is None else put(state.ends, end),
+            ends=None if state.ends is None else put(state.ends, t1),
             checkpoints=checkpoints,
         )
 
     def _read(self, state: State, time: Any) -> Saved:
         """The trajectory at a time that the loop has run up to; t = ∞ where it did not get there."""
-        now = self._held(state.t)
         if state.last is None:
-            t0, t1 = now, self._end(state.control)
+            t0, t1 = state.t, self.controller.end(state.control)
 
             def between() -> Tree:
                 guess = state.solver_state.guess
@@ -318,31 +300,15 @@ class Loop(eqx.Module):
         """What is kept of the state x at a saved time, which may not have been `reached`; where it was
         `met`, by the end of a step."""
         x = jtu.tree_map(lambda leaf: jnp.where(reached, leaf, jnp.nan), x)
-        # The state at the end of a step moves with it; at the beginning of the run, always.
-        end = jnp.where(state.steps == 0, state.t, self._held(state.t))
-        time = time + zero_with_tangent(jnp.where(met, end, 0.0))
-        t = jnp.where(reached, time, jnp.inf)
         integrated_defect = state.integrated_defect if self.stepper.measure else None
         return Saved(
-            t, x, integrated_defect, integrated_defect, state.extent, state.solver_state.guess
-        )
-
-    def _held(self, t: Any) -> Any:
-        """t, which stands still for the tangents of steps that adapt."""
-        return lax.stop_gradient(t) if self.forward_mode and self.controller.adapts else t
-
-    def _end(self, control: Any) -> Any:
-        return self._held(self.controller.end(control))
-
-    def _begun(self, state: State, end: Any) -> Tree:
-        """The state at a time that stands still, at the beginning of a step."""
-        if not (self.forward_mode and self.controller.adapts):
-            return state.x
-        t0, flow = lax.stop_gradient(state.t), self.stepper.flow
-        ends, by = lax.stop_gradient(self.stepper.ends), zero_with_tangent(state.t)
-        x = transport(state.x, by, before, t0, flow, ends, state.jumped)
-        return transport(
-            x, -by, behind, t0 + by, flow, lax.stop_gradient(end) - t0, ends, state.jumped
+            jnp.where(reached, time, jnp.inf),
+            x,
+            integrated_defect,
+            integrated_defect,
+            state.extent,
+            state.solver_state.guess,
+            jnp.where(reached & met, state.steps, -1),
         )
 
     def _propagators(self, state: State, t0: Any, t1: Any) -> Propagators | None:
@@ -350,11 +316,11 @@ class Loop(eqx.Module):
         uniform = self.stepper.uniform
         if uniform is not None or state.propagators is None:
             return uniform
-        return self.stepper.reuse_or_build(state.propagators, t0, t1, self._must_rebuild(state))
+        return self.stepper.reuse_or_build(state.propagators, t0, t1, self._must_rebuild())
 
-    def _must_rebuild(self, state: State) -> Any:
-        """Whether the next length may move otherwise; up to the next stop, fixed steps move alike."""
-        return jnp.asarray(True) if self.controller.adapts else state.jumped
+    def _must_rebuild(self) -> Any:
+        """Whether steps of one length need propagators of their own: their tangents may differ."""
+        return is_differentiated(self.controller.stops)
 
     def _interpolate(self, record: Record, theta: Any, guess: Tree | None) -> Tree:
         """x_h inside a step."""
@@ -362,24 +328,6 @@ class Loop(eqx.Module):
         end = t0 + record.length
         flow, _ = local(stepper.method, stepper.flow, t0, end, record.x0, guess, stepper.ends)
         return interpolate(flow, record.length, theta, record.x0, record.coefficients)
-
-
-def before(t: Any, x: Tree, flow: Flow, ends: tuple[Any, Any], jumped: Any) -> Tree:
-    """x' before a stop; before the run nothing moves."""
-    return lax.cond(
-        jumped & (t > ends[0]),
-        lambda: left_derivative(t, x, flow, ends),
-        lambda: _tree.zeros_like(x),
-    )
-
-
-def behind(t: Any, x: Tree, flow: Flow, length: Any, ends: tuple[Any, Any], jumped: Any) -> Tree:
-    """x' behind a stop, where a step of this length begins."""
-    return lax.cond(
-        jumped,
-        lambda: velocity(flow, one_sided_time(t, t + length, 0.0, ends), x),
-        lambda: _tree.zeros_like(x),
-    )
 
 
 def _at(times: jax.Array, row: Any) -> Any:
@@ -391,8 +339,3 @@ def _put(rows: Saved, row: Any, found: Saved) -> Saved:
     """The table with this row, if it has one."""
     last = rows.t.shape[0] - 1
     return _tree.put_if(row <= last, rows, jnp.minimum(row, last), found)
-
-
-def slack(t: Any) -> Any:
-    """How far a saved time may lie from the end of a step and still be it: both are rounded."""
-    return 4 * jnp.finfo(t.dtype).eps * jnp.abs(t)

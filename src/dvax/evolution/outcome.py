@@ -30,7 +30,8 @@ class Saved(NamedTuple):
     in: x_h is the exact solution of the system with a disturbance of that size. `completed_defect` is
     the same up to the start of that step. `extent` holds the bounds of x_h and u_h from t0 to the end
     of that step, where they are tracked. None where nothing
-    is measured. `guess` is where the solver of the law may begin.
+    is measured. `guess` is where the solver of the law may begin. `step` is the number
+    of steps up to this time where a step ends at it, −1 where it lies inside a step.
     """
 
     t: Any
@@ -39,6 +40,7 @@ class Saved(NamedTuple):
     completed_defect: tuple[Any, Any] | None = None
     extent: Extent | None = None
     guess: Tree | None = None
+    step: Any = None
 
 
 class Outcome(NamedTuple):
@@ -66,16 +68,14 @@ def end_alone(end: Any, complete: Any, t1: Any, measured: bool) -> Saved:
     return jtu.tree_map(lambda leaf: leaf[None], one)
 
 
-def with_tangents(
-    rows: Saved, ts: jax.Array, x0: Any, flow: Flow, ends: tuple[Any, Any], transposed: bool
-) -> Saved:
-    """Return the rows with the tangents of the times `ts`: the times of the rows are constants or not,
-    independently of `ts`. Times that were not reached keep their states."""
+def with_tangents(rows: Saved, ts: jax.Array, x0: Any, flow: Flow, ends: tuple[Any, Any]) -> Saved:
+    """Return the rows with the tangents of the saved times `ts`, given rows whose times have the
+    tangents of the ends of steps that they meet. Times that were not reached keep their states."""
     reached = rows.t < jnp.inf
     t = jnp.where(reached, rows.t, ends[0])
     apart = zero_with_tangent(jnp.where(reached, ts, ends[0])) - zero_with_tangent(t)
     given = reached, lax.stop_gradient(x0), flow, ends
-    x = transport(rows.x, apart, _arrived, t, *given, transposed=transposed)
+    x = transport(rows.x, apart, _arrived, t, *given)
     return rows._replace(t=rows.t + apart, x=x)
 
 

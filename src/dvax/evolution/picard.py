@@ -372,7 +372,7 @@ def by_windows(
     rows = end_alone(end, complete, stops[-1], True) if saved is None else saved
     if ts is not None:
         ends = lax.stop_gradient((stops[0], stops[-1]))
-        rows = with_tangents(rows, ts, x0, flow, ends, False)
+        rows = with_tangents(rows, ts, x0, flow, ends)
     stats = {
         "steps": end.steps, "rejected": end.refused, "t": end.t, "x": end.x,
         "next_dt": end.length / method.nodes, "windows": end.windows, "sweeps": end.sweeps,

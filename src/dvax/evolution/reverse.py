@@ -25,9 +25,9 @@ from .. import _tree
 from .._jax import outlined
 from .._tree import Tree
 from .checkpoints import Checkpoints, Stack, how_many
-from .loop import Loop, Record, Saved, State, slack
+from .loop import Loop, Record, Saved, State
 from .stepper import interpolate, local
-from .time_derivatives import instantiate_zeros, is_zero, left_derivative
+from .time_derivatives import instantiate_zeros, is_zero
 
 
 def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State]:
@@ -57,7 +57,8 @@ def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State
         saved, state = outlined(run, loop, x0, ts)
         assert state.checkpoints is not None
         moving = _tree.Static(tuple(leaf.perturbed for leaf in given))
-        kept = leaves, moving, state.ends, state.checkpoints, state.steps
+        met = None if saved is None else saved.step
+        kept = leaves, moving, state.ends, state.checkpoints, state.steps, met
         states, rest = _states(saved, state)
         return (states, rest), kept
 
@@ -108,11 +109,11 @@ def _rejoin(states: _States, rest: Any) -> tuple[Saved | None, State]:
 class _Backward:
     """The pass itself, for one run and what is asked of it."""
 
-    def __init__(self, whole, leaves, moving, timing, ends, checkpoints, steps):
+    def __init__(self, whole, leaves, moving, timing, ends, checkpoints, steps, met):
         self.whole, self.leaves = whole, leaves
         real = [jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in leaves]
         self.moving = [m and r for m, r in zip(moving, real, strict=True)]
-        self.ends, self.checkpoints, self.steps = ends, checkpoints, steps
+        self.ends, self.checkpoints, self.steps, self.met = ends, checkpoints, steps, met
         self.x0, self.loop, self.ts = whole(leaves)
         self.guess = self.loop.stepper.flow.guess(self.x0)
         self.ends_move = any(self.moving[k] for k in timing)
@@ -132,7 +133,13 @@ class _Backward:
         every = how_many(self.x0, self.loop.max_steps) >= self.loop.max_steps
         carry = self._through_all(bar, carry) if every else self._from_checkpoints(bar, carry)
         adjoint, gathered, row, _ = carry
-        adjoint, gathered = self._rest(adjoint, gathered, row, bar)
+        if bar.saved is not None:
+            # Saved times at which no step had been taken show x₀ itself.
+            assert self.ts is not None
+            early = jnp.arange(self.ts.shape[0]) <= row
+            pick = lambda v: jnp.where(early.reshape(-1, *(1,) * (v.ndim - 1)), v, 0.0)  # noqa: E731
+            first = jtu.tree_map(lambda v: jnp.sum(pick(v), axis=0), bar.saved)
+            adjoint = _tree.add(adjoint, first)
         gathered = iter(gathered)
         out = [
             next(gathered) if m else _no_tangent(leaf)
@@ -165,30 +172,6 @@ class _Backward:
         ahead = stack.next(i)
         return stack.push(ahead, self._replay(stack.x, stack.step, ahead))
 
-    def _rest(self, adjoint: Tree, gathered: Any, row: Any, bar: _States) -> tuple[Tree, Any]:
-        """Saved times at which no step had been taken show x₀ itself."""
-        if bar.saved is None:
-            return adjoint, gathered
-        assert self.ts is not None
-        early = jnp.arange(self.ts.shape[0]) <= row
-        pick = lambda v: jnp.where(early.reshape(-1, *(1,) * (v.ndim - 1)), v, 0.0)  # noqa: E731
-        shown = jtu.tree_map(lambda v: jnp.sum(pick(v), axis=0), bar.saved)
-        gathered = self._stays(shown, self.x0, 0, gathered)
-        return _tree.add(adjoint, shown), gathered
-
-    def _stays(self, psi: Tree, x: Tree, i: Any, gathered: Any) -> Any:
-        """The state x that step i begins with moves along with that time, and one that was saved there
-        does not."""
-        if not self.ends_move:
-            return gathered
-        moving = tuple(leaf for leaf, m in zip(self.leaves, self.moving, strict=True) if m)
-        time = lambda p: self._parts(p).controller.step_start(i, self.ends)  # noqa: E731
-        t, pull = jax.vjp(time, moving)
-        stepper = self.loop.stepper
-        rate = left_derivative(t, x, stepper.flow, lax.stop_gradient(stepper.ends))
-        by = jtu.tree_map(lambda v, r: jnp.sum(v * r), psi, rate)
-        return jtu.tree_map(jnp.add, gathered, pull(-sum(jtu.tree_leaves(by)))[0])
-
     def _add_initial(self, out: list[Any], adjoint: Tree) -> list[Any]:
         """The first leaves are those of x₀."""
         for k, part in enumerate(jtu.tree_leaves(adjoint)):
@@ -202,8 +185,12 @@ class _Backward:
         return self.whole([next(ours if m else theirs) for m in self.moving])[1]
 
     def _times(self, loop: Loop, i: Any) -> tuple[Any, Any]:
-        step_start = loop.controller.step_start
-        return step_start(i, self.ends), step_start(i + 1, self.ends)
+        controller = loop.controller
+        t0, t1 = jnp.zeros(2) if self.ends is None else (self._before(i), self.ends[i])
+        return controller.step_start(i, t0), controller.step_start(i + 1, t1)
+
+    def _before(self, i: Any) -> Any:
+        return jnp.where(i > 0, self.ends[jnp.maximum(i - 1, 0)], self.loop.controller.stops[0])
 
     def _advance(self, loop: Loop, i: Any, x: Tree, guess: Tree | None) -> tuple[Any, Any]:
         """(xᵢ₊₁, c), and a guess for the law of another step."""
@@ -235,7 +222,7 @@ class _Backward:
             (x1, c), after = self._advance(self._parts(p), i, x, guess)
             return ((x1, c) if bar.of_insides else (x1,)), (c, after)
 
-        reached, pull, (c, guess) = jax.vjp(step, moving, x, has_aux=True)
+        _, pull, (c, guess) = jax.vjp(step, moving, x, has_aux=True)
         bent = _tree.zeros_like(c)
         behind = _tree.zeros_like(x)
         if bar.records is not None:
@@ -244,7 +231,7 @@ class _Backward:
             gathered = self._recorded(kept, i, moving, gathered)
         if bar.saved is not None:
             adjoint, behind, bent, gathered, row = self._saved_back(
-                i, x, reached[0], c, moving, bar.saved, (adjoint, behind, bent, gathered, row)
+                i, x, c, moving, bar.saved, (adjoint, behind, bent, gathered, row)
             )
         p, x = pull((adjoint, bent) if bar.of_insides else (adjoint,))
         return _tree.add(behind, x), jtu.tree_map(jnp.add, gathered, p), row, guess
@@ -261,12 +248,10 @@ class _Backward:
         _, pull = jax.vjp(step, moving)
         return jtu.tree_map(jnp.add, gathered, pull((kept.start, kept.length))[0])
 
-    def _saved_back(
-        self, i: Any, x: Tree, x1: Tree, c: Any, moving: Any, saved: Tree, carry: Any
-    ) -> Any:
-        """The times saved in this step from x to x1, the last ones first."""
+    def _saved_back(self, i: Any, x: Tree, c: Any, moving: Any, saved: Tree, carry: Any) -> Any:
+        """The times saved in this step from x, the last ones first."""
         assert self.ts is not None
-        ts, (t0, t1) = lax.stop_gradient(self.ts), self._times(self.loop, i)
+        ts, (t0, _) = lax.stop_gradient(self.ts), self._times(self.loop, i)
 
         def at(p: Any, x: Tree, c: Any, time: Any) -> Tree:
             loop = self._parts(p)
@@ -280,17 +265,22 @@ class _Backward:
             adjoint, behind, bent, gathered, row = carry
             psi = jtu.tree_map(lambda leaf: leaf[row], saved)
 
-            def one_sided_time() -> Any:
+            def inside() -> Any:
                 _, pull = jax.vjp(lambda p, x, c: at(p, x, c, ts[row]), moving, x, c)
                 p, v, d = pull(psi)
                 return adjoint, _tree.add(behind, v), _tree.add(bent, d), _tree.add(gathered, p)
 
             def at_end() -> Any:
-                return _tree.add(adjoint, psi), behind, bent, self._stays(psi, x1, i + 1, gathered)
+                return _tree.add(adjoint, psi), behind, bent, gathered
 
-            return *lax.cond(ts[row] >= t1 - slack(t1), at_end, one_sided_time), row - 1
+            return *lax.cond(self.met[row] == i + 1, at_end, inside), row - 1
 
-        return lax.while_loop(lambda c: (c[-1] >= 0) & (ts[c[-1]] > t0 + slack(t0)), one, carry)
+        def goes_on(carry: Any) -> Any:
+            row = carry[-1]
+            is_inside = (self.met[row] < 0) & (ts[row] > t0)
+            return (row >= 0) & (is_inside | (self.met[row] == i + 1))
+
+        return lax.while_loop(goes_on, one, carry)
 
 
 def _given(cotangents: Any) -> Any:

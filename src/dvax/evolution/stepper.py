@@ -23,7 +23,6 @@ from .extent import Extent
 from .flow import Flow, Rate
 from .locate_event import locate_event
 from .method import AbstractMethod, shortened
-from .time_derivatives import select_if_differentiated
 
 _SMALL = 64
 """Up to this many entries a look at every one of them is free."""
@@ -170,23 +169,14 @@ class Stepper(eqx.Module):
     def reuse_or_build(
         self, propagators: Propagators, t0: Any, t1: Any, rebuild: Any
     ) -> Propagators:
-        """Propagators for this step; those of the last one where the length is the same.
-
-        t₀ + h is rounded, so equal steps differ by an ulp of t: that is not a new length. Equal
-        lengths may move apart, where `rebuild` says so: then, if they are differentiated, it is one.
-        """
-
-        def fit(h: Any, stepper: Stepper, old: Propagators, slack: Any, new: Any) -> Propagators:
-            same = _alike(h, old.length, slack) & jnp.logical_not(new)
-            return lax.cond(same, lambda: old, lambda: stepper.propagators(h))
-
-        plain = lambda h, s, p, slack, _: fit(h, s, p, slack, False)  # noqa: E731
-        slack = 2 * _ulp(t0, t1)
-        return select_if_differentiated(fit, plain, t1 - t0, self, propagators, slack, rebuild)
+        """Propagators for this step: those given where they match and need no `rebuild`."""
+        same = self.match(propagators, t0, t1) & ~rebuild
+        return lax.cond(same, lambda: propagators, lambda: self.propagators(t1 - t0))
 
     def match(self, propagators: Propagators, t0: Any, t1: Any) -> Any:
-        """Whether these are the propagators for this step."""
-        return _alike(t1 - t0, propagators.length, 2 * _ulp(t0, t1))
+        """Whether these are the propagators for this step: t₀ + h is rounded, so that equal lengths
+        may differ by an ulp of t."""
+        return jnp.abs(t1 - t0 - propagators.length) <= 2 * _ulp(t0, t1)
 
     def advance(
         self, t0: Any, t1: Any, x0: Tree, propagators: Propagators | None, guess: Tree | None
@@ -366,10 +356,6 @@ class Stepper(eqx.Module):
         ends = begin, self._one_sided_time(t0, t1, 1.0)
         span = self.ends[1] - self.ends[0]
         return enclosed(self.flow, self.growth, ends, arc, evaluations[-1].rate, span)
-
-
-def _alike(h: Any, length: Any, slack: Any) -> Any:
-    return jnp.abs(h - length) <= slack
 
 
 def _ulp(t0: Any, t1: Any) -> Any:

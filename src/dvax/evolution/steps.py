@@ -26,7 +26,7 @@ from .outcome import Outcome, end_alone, ended, with_tangents
 from .results import RESULTS
 from .setup import Options, Setup
 from .stepper import Stepper
-from .time_derivatives import left_derivative, transport, zero_with_tangent
+from .time_derivatives import zero_with_tangent
 
 
 def by_steps(
@@ -59,15 +59,13 @@ def by_steps(
     )
     rows = end_alone(end, complete, t1, options.measure) if saved is None else saved
     ends = lax.stop_gradient((stops[0], t1))
-    if options.adjoint == "forward" and controller.adapts:
-        # States are those at times that stay where they are.
-        if saved is None:
-            rows, ts = rows._replace(t=lax.stop_gradient(rows.t)), t1[None]
-        by = zero_with_tangent(jnp.where(end.steps > 0, end.t, 0.0))
-        t = lax.stop_gradient(end.t)
-        end = end._replace(x=transport(end.x, by, left_derivative, t, flow, ends))
     if ts is not None:
-        rows = with_tangents(rows, ts, x0, flow, ends, options.adjoint == "reverse")
+        assert saved is not None
+        # The state at the end of a step has the tangent of that end.
+        found = jax.vmap(controller.step_start)(saved.step, saved.t)
+        found = zero_with_tangent(jnp.where(saved.step >= 0, found, 0.0))
+        t = lax.stop_gradient(saved.t) + found
+        rows = with_tangents(rows._replace(t=t), ts, x0, flow, ends)
     stats = {
         "steps": end.steps,
         "rejected": end.attempts - end.steps,

@@ -4,6 +4,7 @@ from .adaptive import Adaptive as Adaptive
 from .controller import AbstractController as AbstractController
 from .controller import StepDecision as StepDecision
 from .controller import clip_to_stop as clip_to_stop
+from .controller import slack as slack
 from .error_test import ErrorTest as ErrorTest
 from .error_test import root_mean_squares as root_mean_squares
 from .fixed import Fixed as Fixed

@@ -11,7 +11,7 @@ from ..._tree import Tree
 from ..excursions import WATCH
 from ..results import RESULTS
 from ..stepper import Step
-from .controller import AbstractController, StepDecision, clip_to_stop
+from .controller import AbstractController, StepDecision, clip_to_stop, slack
 from .error_budget import ErrorBudget
 from .error_test import Attempt, ErrorTest
 from .event_bracket import EventBracket
@@ -134,11 +134,10 @@ class Adaptive(AbstractController):
         )
         return StepDecision(accepted, new, jumped, self._result(step, attempt, accepted, exhausted))
 
-    def step_start(self, index, ends):
-        before = jnp.where(index > 0, ends[jnp.maximum(index - 1, 0)], self.stops[0])
-        t = lax.stop_gradient(before)
+    def step_start(self, index, t):
+        t = lax.stop_gradient(t)
         nearest = self.stops[jnp.argmin(jnp.abs(self.stops - t))]
-        return jnp.where(nearest == t, nearest, t)
+        return jnp.where(jnp.abs(nearest - t) <= slack(t), nearest, t)
 
     def _excursion(self, x0: Tree, step: Step, attempt: Attempt, span: Any) -> Any:
         """Return by how much data may have moved unseen between the samples, 1 being the limit."""

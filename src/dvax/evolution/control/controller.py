@@ -55,10 +55,9 @@ class AbstractController(eqx.Module):
         """Return the first step size for a run that is continued from here."""
 
     @abc.abstractmethod
-    def step_start(self, index: Any, ends: Any) -> Any:
-        """Return the start of step number `index` as a function of the stops, given the recorded
-        `ends` of all steps (None for fixed steps). Other ends than stops are constants under
-        differentiation."""
+    def step_start(self, index: Any, t: Any) -> Any:
+        """Return the start of step number `index`, whose value is t, as a function of the stops. The
+        ends of adaptive steps that are no stops are constants under differentiation."""
 
 
 def clip_to_stop(t: Any, size: Any, stop: Any) -> Any:
@@ -68,3 +67,8 @@ def clip_to_stop(t: Any, size: Any, stop: Any) -> Any:
     reaches = size >= rest * (1 - 1e-9)
     inner = t + jnp.where(2 * size > rest, 0.5 * rest, size)
     return jnp.where(reaches, stop, lax.stop_gradient(inner))
+
+
+def slack(t: Any) -> Any:
+    """Return the largest distance at which t is taken for the end of a step: both are rounded."""
+    return 4 * jnp.finfo(t.dtype).eps * jnp.abs(t)

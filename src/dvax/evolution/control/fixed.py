@@ -48,7 +48,7 @@ class Fixed(AbstractController):
         result = RESULTS.where(finite, result, RESULTS.nonfinite)
         return StepDecision(step.solved & finite, new, jumped, result)
 
-    def step_start(self, index, ends):
+    def step_start(self, index, t):
         if self.stops.shape[0] == 2:
             return self._time(0, index)
         counts = self._counts()
