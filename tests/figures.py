@@ -1,4 +1,4 @@
-"""`python -m tests.figures`: the size of the code, and the lines that use unstable interfaces of JAX."""
+"""`python -m tests.figures`: the size of the code, and the lines on unstable interfaces of JAX."""
 
 import ast
 import io
@@ -29,7 +29,9 @@ def main() -> None:
     core = sum(counts[room] for room in ("evolution", "programs", "_jax"))
     print(f"{sum(counts.values()):7,} lines of code, without comments, docstrings and blank lines")
     print(f"{core:7,} of them in evolution, programs and _jax")
-    print(f"{len(list(unstable_lines())):7,} lines outside _jax that use unstable interfaces of JAX")
+    print(
+        f"{len(list(unstable_lines())):7,} lines outside _jax that use unstable interfaces of JAX"
+    )
 
 
 def code_lines(file: Path) -> int:

@@ -347,10 +347,10 @@ def test_what_happens_between_two_saved_times_is_seen(name, region, good):
         problem, 0.0, 0.0, 3.0, ts=ts, rtol=1e-5, atol=1e-8, method=method,
         constants=check.constants,
     )  # fmt: skip
-    assert kept.extent is not None
+    assert kept.bounds is not None
     again = dvax.bound_error(problem, kept, check.constants)
     np.testing.assert_allclose(again.x, bound.x, rtol=1e-6)
-    low, high = kept.extent.x
+    low, high = kept.bounds.x
     assert 1.3 < float(high[1]) < 1.7 and float(low[1]) > -0.1 and float(high[0]) < 0.1
 
 

@@ -1,6 +1,6 @@
 """The mild solution: exponential integrators, step control, `solve`, `Solution`."""
 
-from .extent import Extent as Extent
+from .bounds import Bounds as Bounds
 from .growth import between as between
 from .growth import disturbance as disturbance
 from .growth import gronwall as gronwall

@@ -206,15 +206,15 @@ def of_region(constants: Any) -> bool:
     return domain is not None and not domain.free
 
 
-def _leaves(solution: Solution, constants: Any, bounds: Any) -> float | None:
+def _leaves(solution: Solution, constants: Any, error_bounds: Any) -> float | None:
     """The first saved time by which x or u, with its bound, has been where the constants do not
     hold."""
-    domain, extent = constants.domain, solution.extent
-    assert extent is not None
+    domain, bounds = constants.domain, solution.bounds
+    assert bounds is not None
     law_error = solution.law_residual / constants.gamma + solution.law_step
-    of_u = constants.L * bounds + constants.norm_P_inv * law_error
+    of_u = constants.L * error_bounds + constants.norm_P_inv * law_error
     spaces = solution.setup.problem.spaces(solution.setup.x0)
-    inside = np.asarray(domain.keeps(*extent, bounds, of_u, spaces))
+    inside = np.asarray(domain.keeps(*bounds, error_bounds, of_u, spaces))
     return None if inside.all() else float(solution.ts[int(np.argmin(inside))])
 
 

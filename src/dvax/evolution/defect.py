@@ -14,9 +14,9 @@ from ..generators import Arc, Growth
 from ..generators.expanded import values
 from ..programs.branches import branches
 from ..programs.enclosure import LinearEnclosure, is_enclosure
+from .bounds import Bounds
 from .evaluations import Evaluation
 from .excursions import WATCH
-from .extent import Extent
 from .flow import Flow, Rate
 from .method import AbstractMethod, extrapolation, polynomial
 
@@ -40,7 +40,7 @@ class Sample(NamedTuple):
     error: Tree
     defect: jax.Array
     law_defect: jax.Array
-    extent: Extent
+    bounds: Bounds
 
 
 def enclosed(
@@ -75,7 +75,7 @@ def enclosed(
     settles = short & jnp.isfinite(size) & (most(varies) * span <= _SETTLES * size)
     error = jtu.tree_map(lambda e, v: jnp.where(settles & (e == jnp.inf), v, e), error, varies)
     defect = 0.5 * h * (space.norm(at_start) + space.norm(at_end))
-    return Sample((), [last], error, defect, jnp.zeros_like(defect), Extent.of_enclosures(x, u))
+    return Sample((), [last], error, defect, jnp.zeros_like(defect), Bounds.of_enclosures(x, u))
 
 
 def sampled(
@@ -117,8 +117,8 @@ def sampled(
     defect = _MARGIN * method.safety * h * sum(map(space.norm, (*ends, bump, unseen)))
     law_defect = h * jnp.max(jnp.stack([one.rate.residual for one in along]))
     places = [(one.x, flow.operator.inverse(one.rate.y)) for one in lax.stop_gradient(along)]
-    extent = reduce(Extent.joined, [Extent((x, x), (u, u)) for x, u in places])
-    return Sample(thetas, [*inner, last], error, defect, law_defect, extent)
+    bounds = reduce(Bounds.hull, [Bounds((x, x), (u, u)) for x, u in places])
+    return Sample(thetas, [*inner, last], error, defect, law_defect, bounds)
 
 
 def _kinked(flow: Flow, evaluations: list[Evaluation]) -> Any:

@@ -82,7 +82,7 @@ def _solution(setup: Setup, plan: Plan, flow: Flow, outcome: Outcome) -> Solutio
         defect=None if rows.integrated_defect is None else rows.integrated_defect[0],
         law_defect=None if rows.integrated_defect is None else rows.integrated_defect[1],
         completed_defect=rows.completed_defect,
-        extent=rows.extent,
+        bounds=rows.bounds,
         stats=outcome.stats,
         result=result,
         records=outcome.records,

@@ -17,9 +17,9 @@ from .. import _tree
 from .._batch import any_lane, is_active
 from .._tree import Tree
 from . import meter
+from .bounds import Bounds
 from .checkpoints import Checkpoints
 from .control import AbstractController, slack
-from .extent import Extent
 from .outcome import Record, Saved
 from .results import RESULTS
 from .stepper import Propagators, SolverState, Stepper, interpolate, local
@@ -41,7 +41,7 @@ class State(NamedTuple):
     propagators: Propagators | None
     control: Any
     jumped: Any
-    extent: Extent | None
+    bounds: Bounds | None
     last: tuple[Record, tuple[Any, Any]] | None
     records: Record | None
     ends: jax.Array | None
@@ -113,7 +113,7 @@ class Loop(eqx.Module):
             propagators=None if own else stepper.propagators(controller.end(control) - t0),
             control=control,
             jumped=jnp.asarray(True),
-            extent=stepper.extent(x0),
+            bounds=stepper.bounds(x0),
             last=(record, (zero, zero)) if saves and measure else None,
             records=records,
             ends=jnp.zeros(self.max_steps, t0.dtype)
@@ -216,11 +216,11 @@ class Loop(eqx.Module):
         taken = Record(t0, t1 - t0, x0, step.c)
         # `last` and `records` of a step that is not kept are written over by the next one, or never
         # looked at: nothing ends inside a step that was not kept.
-        extent = state.extent
-        if extent is not None:
-            assert step.extent is not None
-            extent = extent.joined(step.extent)
-        ahead = (t1, step.x1, integrated_defect, step.solver_state, decision.jumped, extent)
+        bounds = state.bounds
+        if bounds is not None:
+            assert step.bounds is not None
+            bounds = bounds.hull(step.bounds)
+        ahead = (t1, step.x1, integrated_defect, step.solver_state, decision.jumped, bounds)
         last = None if state.last is None else (taken, state.integrated_defect)
         if self.check_finite:
             behind = (
@@ -229,7 +229,7 @@ class Loop(eqx.Module):
                 state.integrated_defect,
                 state.solver_state,
                 state.jumped,
-                state.extent,
+                state.bounds,
             )
             ahead, last = _tree.where(decision.accepted, (ahead, last), (behind, state.last))
         checkpoints = state.checkpoints
@@ -239,7 +239,7 @@ class Loop(eqx.Module):
         if self.progress:
             stops = self.controller.stops
             shown = meter.advance(shown, (ahead[0] - stops[0]) / (stops[-1] - stops[0]))
-        t, x, integrated_defect, solver_state, jumped, extent = ahead
+        t, x, integrated_defect, solver_state, jumped, bounds = ahead
         put = lambda table, row: _tree.put_if(own, table, state.steps, row)  # noqa: E731
         after = State(
             t=t,
@@ -249,7 +249,7 @@ class Loop(eqx.Module):
             propagators=None if state.propagators is None else propagators,
             control=decision.state,
             jumped=jumped,
-            extent=extent,
+            bounds=bounds,
             last=last,
             records=None,
             ends=None,
@@ -306,7 +306,7 @@ class Loop(eqx.Module):
             x,
             integrated_defect,
             integrated_defect,
-            state.extent,
+            state.bounds,
             state.solver_state.guess,
             jnp.where(reached & met, state.steps, -1),
         )

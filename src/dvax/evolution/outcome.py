@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 from jax import lax
 
 from .._tree import Tree
-from .extent import Extent
+from .bounds import Bounds
 from .flow import Flow
 from .results import RESULTS
 from .time_derivatives import left_derivatives, transport, zero_with_tangent
@@ -28,7 +28,7 @@ class Saved(NamedTuple):
 
     `integrated_defect` = (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) up to the end of the step that the time lies
     in: x_h is the exact solution of the system with a disturbance of that size. `completed_defect` is
-    the same up to the start of that step. `extent` holds the bounds of x_h and u_h from t0 to the end
+    the same up to the start of that step. `bounds` holds the bounds of x_h and u_h from t0 to the end
     of that step, where they are tracked. None where nothing
     is measured. `guess` is where the solver of the law may begin. `step` is the number
     of steps up to this time where a step ends at it, −1 where it lies inside a step.
@@ -38,7 +38,7 @@ class Saved(NamedTuple):
     x: Tree
     integrated_defect: tuple[Any, Any] | None = None
     completed_defect: tuple[Any, Any] | None = None
-    extent: Extent | None = None
+    bounds: Bounds | None = None
     guess: Tree | None = None
     step: Any = None
 
@@ -63,7 +63,7 @@ def end_alone(end: Any, complete: Any, t1: Any, measured: bool) -> Saved:
     x = jtu.tree_map(lambda leaf: jnp.where(complete, leaf, jnp.nan), end.x)
     integrated_defect = end.integrated_defect if measured else None
     one = Saved(
-        jnp.where(complete, t1, jnp.inf), x, integrated_defect, integrated_defect, end.extent
+        jnp.where(complete, t1, jnp.inf), x, integrated_defect, integrated_defect, end.bounds
     )
     return jtu.tree_map(lambda leaf: leaf[None], one)
 

@@ -21,8 +21,8 @@ from .._jax import forward_only
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..generators import AbstractGenerator, AbstractPropagator
+from .bounds import Bounds
 from .control import clip_to_stop, root_mean_squares
-from .extent import Extent
 from .flow import Flow
 from .method import ETD2RK
 from .outcome import Outcome, Record, Saved, end_alone, ended, with_tangents
@@ -92,7 +92,7 @@ class Picard(eqx.Module):
 
 class Window(NamedTuple):
     """The steps of a window from a to b as one record, the states `after` each, the state at b, the
-    defect of each step, the extent of all, and how the sweeps went; `converged` says that the law was
+    defect of each step, the bounds of all, and how the sweeps went; `converged` says that the law was
     solved everywhere and the sweeps converged."""
 
     record: Record
@@ -100,7 +100,7 @@ class Window(NamedTuple):
     end: Tree
     error: Tree
     integrated_defect: tuple[jax.Array, jax.Array]
-    extent: Extent | None
+    bounds: Bounds | None
     converged: jax.Array
     sweeps: jax.Array
     contraction: jax.Array
@@ -116,7 +116,7 @@ class State(NamedTuple):
     last: Record
     before: tuple[Any, Any]
     integrated_defect: tuple[Any, Any]
-    extent: Extent | None
+    bounds: Bounds | None
     records: Record | None
     steps: Any
     windows: Any
@@ -174,7 +174,7 @@ class Run(eqx.Module):
         nought = jnp.asarray(0)
         return State(
             t0, x0, many * self.first, jnp.asarray(1), rows(many), (zero, zero), (zero, zero),
-            self.stepper.extent(x0), records, nought, nought, nought, nought, zero, RESULTS.successful,
+            self.stepper.bounds(x0), records, nought, nought, nought, nought, zero, RESULTS.successful,
         )  # fmt: skip
 
     def _until(self, state: State, time: Any) -> State:
@@ -221,15 +221,15 @@ class Run(eqx.Module):
             records = jtu.tree_map(lambda leaf, new: leaf.at[place].set(new), records, taken)
         last = self.stops.shape[0] - 1
         reached = jnp.where(kept & (b == stop), state.stop + 1, state.stop)
-        extent = state.extent
-        if extent is not None:
-            assert window.extent is not None
-            extent = extent.joined(window.extent)
-        new = (b, window.end, window.record, state.integrated_defect, integrated_defect, extent)
-        old = (a, state.x, state.last, state.before, state.integrated_defect, state.extent)
-        t, x, record, before, integrated_defect, extent = _tree.where(kept, new, old)
+        bounds = state.bounds
+        if bounds is not None:
+            assert window.bounds is not None
+            bounds = bounds.hull(window.bounds)
+        new = (b, window.end, window.record, state.integrated_defect, integrated_defect, bounds)
+        old = (a, state.x, state.last, state.before, state.integrated_defect, state.bounds)
+        t, x, record, before, integrated_defect, bounds = _tree.where(kept, new, old)
         return State(
-            t, x, length, jnp.minimum(reached, last), record, before, integrated_defect, extent,
+            t, x, length, jnp.minimum(reached, last), record, before, integrated_defect, bounds,
             records,
             jnp.where(kept, state.steps + many, state.steps), state.windows + 1,
             jnp.where(kept, state.refused, state.refused + many), state.sweeps + window.sweeps,
@@ -296,7 +296,7 @@ class Run(eqx.Module):
         record = Record(ends[:-1], jnp.broadcast_to(h, (many,)), start, c)
         return Window(
             record, end, _rows(X, -1), sample.error, integrated_defect,
-            sample.extent.over_rows() if stepper.track_bounds else None,
+            sample.bounds.hull_of_rows() if stepper.track_bounds else None,
             converged & jnp.all(looked), k, contraction,
         )  # fmt: skip
 
@@ -320,7 +320,7 @@ class Run(eqx.Module):
         # The state at the end of a window moves with it.
         time = time + zero_with_tangent(jnp.where(met, state.t, 0.0))
         return Saved(
-            jnp.where(reached, time, jnp.inf), x, integrated_defect, completed_defect, state.extent
+            jnp.where(reached, time, jnp.inf), x, integrated_defect, completed_defect, state.bounds
         )
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
+from .bounds import Bounds
 from .diagnose import failure
-from .extent import Extent
 from .flow import Flow
 from .implicit import Implicit
 from .outcome import Record
@@ -40,9 +40,9 @@ class Solution(eqx.Module):
       integral of ‖w‖ over the frozen solves. Both None where not measured (fixed steps, unless
       `measure=True`). `dvax.bound_error` turns them into error bounds;
     - `completed_defect`: (defect, law_defect) at the start of the step that each saved time lies in;
-    - `extent`: between what x_h and u_h stayed from t0 to the end of that step, where `constants=` of a
+    - `bounds`: between what x_h and u_h stayed from t0 to the end of that step, where `constants=` of a
       region were given;
-    - `enclosed`: whether the defect, and the extent, are enclosures over every step
+    - `enclosed`: whether the defect, and the bounds, are enclosures over every step
       (`dvax.programs.enclosure`) or estimates from samples;
     - `stats`: steps accepted and rejected, `evaluations` of F in them (without those that look for
       kinks or read u at saved times), and where the run stands: t, x and the next step; with
@@ -76,7 +76,7 @@ class Solution(eqx.Module):
     defect: jax.Array | None
     law_defect: jax.Array | None
     completed_defect: tuple[jax.Array, jax.Array] | None
-    extent: Extent | None
+    bounds: Bounds | None
     stats: dict[str, Any]
     result: RESULTS
     records: Record | Trajectory | None

@@ -286,7 +286,7 @@ def _trim(solution: Solution) -> Solution:
         "defect",
         "law_defect",
         "completed_defect",
-        "extent",
+        "bounds",
     )
     new = [jax.tree_util.tree_map(cut, getattr(solution, name)) for name in fields]
     return eqx.tree_at(

@@ -16,10 +16,10 @@ from .._knots import END_ULPS, KNOT_ULPS
 from .._tree import Tree
 from ..generators import AbstractPropagator, Arc, Growth
 from ..generators.expanded import coefficients, values
+from .bounds import Bounds
 from .defect import Sample, enclosed, sampled
 from .evaluations import Evaluation, Stages, evaluated
 from .excursions import ExcursionGuard
-from .extent import Extent
 from .flow import Flow, Rate
 from .locate_event import locate_event
 from .method import AbstractMethod, shortened
@@ -58,7 +58,7 @@ class Step(NamedTuple):
       time is not `wanted`; None where events are not located;
     - `excursion(rtol, atol, rate)`: exceeds 1 where data that moves in time may hide something between
       the samples, given the tolerances of y and of f; None where nothing moves by itself;
-    - `extent`: the bounds of x_h and u_h over the step, None where they are not tracked;
+    - `bounds`: the bounds of x_h and u_h over the step, None where they are not tracked;
     - `start_solved`, `solved`: the law was solved at the start, and everywhere;
     - `finite`: there is no non-finite value that a smaller step would leave;
     - `evaluations`: of F.
@@ -70,7 +70,7 @@ class Step(NamedTuple):
     integrated_defect: tuple[Any, Any]
     event: Callable[[Any], Any] | None
     excursion: Callable[[Any, Any, Any], Any] | None
-    extent: Extent | None
+    bounds: Bounds | None
     solver_state: SolverState
     start_solved: Any
     solved: Any
@@ -151,11 +151,11 @@ class Stepper(eqx.Module):
         none = None if self.guard is None else self.guard.start(self.flow, self.ends[0], x0)
         return SolverState(rate, guess, known, none)
 
-    def extent(self, x0: Tree) -> Extent | None:
+    def bounds(self, x0: Tree) -> Bounds | None:
         """Before the first step x_h has been at x₀ alone, and u_h nowhere."""
         if not self.track_bounds:
             return None
-        return Extent.at_start(x0, self.flow.problem.zero_control(x0))
+        return Bounds.at_start(x0, self.flow.problem.zero_control(x0))
 
     def propagators(self, h: Any) -> Propagators:
         """Propagators over h."""
@@ -209,12 +209,12 @@ class Stepper(eqx.Module):
         arc, known = Arc(t1 - t0, start, x1, c), coefficients(x1)
         c, x1 = values((c, x1))
         first, last = evaluations[0].rate, evaluations[-1].rate
-        error, integrated_defect, event, excursion, extent = None, (0.0, 0.0), None, None, None
+        error, integrated_defect, event, excursion, bounds = None, (0.0, 0.0), None, None, None
         variation = solver_state.variation
         if self.measure:
             sample = self._measure(t0, t1, arc, evaluations, jumped)
             error, integrated_defect = sample.error, (sample.defect, sample.law_defect)
-            extent = sample.extent if self.track_bounds else None
+            bounds = sample.bounds if self.track_bounds else None
             if self.locate:
                 event = partial(self._event, t0, t1, x0, c, first, sample)
             if self.guard is not None:
@@ -240,7 +240,7 @@ class Stepper(eqx.Module):
         counts = [one.rate.evaluations for one in evaluations]
         own = counts[0] if kept is None else jnp.where(jumped, counts[0], 0)
         return Step(
-            x1, c, error, integrated_defect, event, excursion, extent, after, first.solved, solved,
+            x1, c, error, integrated_defect, event, excursion, bounds, after, first.solved, solved,
             finite, sum(counts[1:], own),
         )  # fmt: skip
 

@@ -97,7 +97,7 @@ def bound_error(
     measured, distance = sol, jnp.zeros_like(sol.ts)
     domain = constants.domain
     regional = domain is not None and not domain.free
-    if sol.defect is None or (regional and sol.extent is None):
+    if sol.defect is None or (regional and sol.bounds is None):
         measured = _solve_again(problem, sol, constants)
         distance = jax.vmap(lambda a, b: space.norm(_tree.sub(a, b)))(measured.xs, sol.xs)
     assert measured.defect is not None and measured.law_defect is not None
@@ -117,12 +117,12 @@ def bound_error(
         covered = domain.covers(setting["t0"], setting["t1"]) and domain.is_of(sol.setup.args)
         domain_status = "proved" if covered else "declared"
         if regional:
-            assert measured.extent is not None
+            assert measured.bounds is not None
             largest_x = _bound_since_previous_time(constants, t0, sol.ts, defects, initial)
             law_error = constants.norm_P_inv * (law[0] / constants.gamma + law[1])
             largest_u = constants.L * largest_x + law_error
             spaces = problem.spaces(sol.setup.x0)
-            inside = domain.keeps(*measured.extent, largest_x, largest_u, spaces)
+            inside = domain.keeps(*measured.bounds, largest_x, largest_u, spaces)
     status = weakest(
         constants.status_of(*(name for name, _ in constants.statuses)),
         "proved" if measured.enclosed else "estimated",

@@ -10,7 +10,7 @@ import numpy as np
 from ... import _tree
 from ...errors import DifferentiationError
 from ...spaces import AbstractSpace
-from ..extent import Extent
+from ..bounds import Bounds
 from ..results import RESULTS
 from ..setup import Setup, as_arrays
 from ..solution import Solution
@@ -120,7 +120,7 @@ def _solution(
         defect=array(defects[:, 0], ()),
         law_defect=array(defects[:, 1], ()),
         completed_defect=(array(completed_defect[:, 0], ()), array(completed_defect[:, 1], ())),
-        extent=_extent(rows, n, x0, u0, P) if limits.track_bounds and rows else None,
+        bounds=_bounds(rows, n, x0, u0, P) if limits.track_bounds and rows else None,
         stats={
             "steps": run.accepted, "rejected": run.rejected,
             "evaluations": run.accepted + run.rejected, "switchings": run.switchings,
@@ -135,19 +135,19 @@ def _solution(
     )  # fmt: skip
 
 
-def _extent(rows: list[Row], n: int, x0: Any, u0: Any, P: Any) -> Extent:
+def _bounds(rows: list[Row], n: int, x0: Any, u0: Any, P: Any) -> Bounds:
     """Bounds of x and of u = P⁻¹y, the latter by the sizes of the entries of P⁻¹."""
-    bounds = np.array([r.extent for r in rows])
+    values = np.array([r.bounds for r in rows])
     inverse = np.asarray(
         jax.vmap(lambda v: P.inverse(v.reshape(u0.shape)).ravel())(jnp.eye(u0.size))
     ).T
-    low, high = bounds[:, 0, n:], bounds[:, 1, n:]
+    low, high = values[:, 0, n:], values[:, 1, n:]
     up, down = np.maximum(inverse, 0.0), np.minimum(inverse, 0.0)
     of = lambda v, like: jnp.asarray(v.reshape(len(rows), *like.shape), like.dtype)  # noqa: E731
     with np.errstate(invalid="ignore"):
         u = low @ up.T + high @ down.T, high @ up.T + low @ down.T
-    return Extent(
-        (of(bounds[:, 0, :n], x0), of(bounds[:, 1, :n], x0)), (of(u[0], u0), of(u[1], u0))
+    return Bounds(
+        (of(values[:, 0, :n], x0), of(values[:, 1, :n], x0)), (of(u[0], u0), of(u[1], u0))
     )
 
 

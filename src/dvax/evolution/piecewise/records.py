@@ -36,7 +36,7 @@ class Step(NamedTuple):
 
 class Row(NamedTuple):
     """What is saved at one time: x, y and F(y) = w of the frozen law; the `defect` of both equations up
-    to the end of the step that the time lies in, and `completed_defect` up to its start; `extent`, the
+    to the end of the step that the time lies in, and `completed_defect` up to its start; `bounds`, the
     bounds (low, high) of x and y so far, where they are asked for."""
 
     t: float
@@ -45,7 +45,7 @@ class Row(NamedTuple):
     w: Array
     defect: tuple[float, float]
     completed_defect: tuple[float, float]
-    extent: Array | None
+    bounds: Array | None
 
 
 class Crossing(NamedTuple):
@@ -103,10 +103,10 @@ class Attempt(NamedTuple):
         grows = (np.any(b > _LARGER * a) for a, b in zip((x, y, w), whole, strict=True))
         return theta < _USED or any(grows)
 
-    def widened(self, extent: Array) -> Array:
+    def widened(self, bounds: Array) -> Array:
         """(low, high) that hold a step as well, with the margin of polynomials between samples."""
         x = radau.FROM_NODES @ self.x
         beside = np.concatenate([self.size - np.abs(self.x).max(axis=0), self.swing[0]])
         low = np.concatenate([radau.lowest(v) for v in (x, self.y)]) - beside
         high = -np.concatenate([radau.lowest(-v) for v in (x, self.y)]) + beside
-        return np.stack([np.minimum(extent[0], low), np.maximum(extent[1], high)])
+        return np.stack([np.minimum(bounds[0], low), np.maximum(bounds[1], high)])

@@ -60,7 +60,7 @@ class Run:
         self.span = pieces[-1].start + pieces[-1].length - self.t
         m = len(given.low)
         none = np.stack([np.full(m, np.inf), np.full(m, -np.inf)])
-        self.extent = np.hstack([np.stack([x0, x0]), none]) if track_bounds else None
+        self.bounds = np.hstack([np.stack([x0, x0]), none]) if track_bounds else None
 
     def go(self) -> None:
         """Run to the end, or to where `result` says why not."""
@@ -321,8 +321,8 @@ class Run:
         share = (self.t - self.pieces[0].start) / self.span
         if self.shown + _SHOWN < share < 1.0:
             self._show(share)
-        if self.extent is not None:
-            self.extent = found.widened(self.extent)
+        if self.bounds is not None:
+            self.bounds = found.widened(self.bounds)
         done, first = (self.defect, self.law_defect), len(self.rows)
         offsets = self.times[first:] - piece.start
         # The last step has what rounding may put behind it.
@@ -340,7 +340,7 @@ class Run:
                     w[k],
                     done,
                     completed_defect,
-                    self.extent,
+                    self.bounds,
                 )
                 for k in range(len(offsets))
             ]

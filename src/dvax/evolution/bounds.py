@@ -1,0 +1,62 @@
+"""Bounds on the values that the numerical trajectory has taken.
+
+Constants that hold in a region only prove an error bound if the trajectory stays in that region.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .._tree import Tree
+from ..programs.enclosure import is_enclosure
+
+
+class Bounds(NamedTuple):
+    """Entrywise bounds (low, high) on x_h and on u_h."""
+
+    x: tuple[Tree, Tree]
+    u: tuple[Tree, Tree]
+
+    @classmethod
+    def at_start(cls, x0: Tree, like: Tree) -> "Bounds":
+        """Return the bounds before the first step: x₀ alone for x, the empty interval for u."""
+        low, high = (
+            jtu.tree_map(lambda v, end=end: jnp.full_like(v, end), like)
+            for end in (jnp.inf, -jnp.inf)
+        )
+        return cls((x0, x0), (low, high))
+
+    @classmethod
+    def of_enclosures(cls, x: Tree, u: Tree) -> "Bounds":
+        """Return the bounds of all values in two linear enclosures."""
+        return cls(_ends(x), _ends(u))
+
+    def hull_of_rows(self) -> "Bounds":
+        """Return the tightest bounds on all rows, which are stacked along the first axis."""
+        lowest, highest = partial(jnp.min, axis=0), partial(jnp.max, axis=0)
+        (low_x, high_x), (low_u, high_u) = self
+        return Bounds(
+            (jtu.tree_map(lowest, low_x), jtu.tree_map(highest, high_x)),
+            (jtu.tree_map(lowest, low_u), jtu.tree_map(highest, high_u)),
+        )
+
+    def hull(self, other: "Bounds") -> "Bounds":
+        """Return the tightest bounds that contain both. NaN propagates, and lies in no region."""
+        lowest = partial(jtu.tree_map, jnp.minimum)
+        highest = partial(jtu.tree_map, jnp.maximum)
+        (low_x, high_x), (low_u, high_u) = other
+        return Bounds(
+            (lowest(self.x[0], low_x), highest(self.x[1], high_x)),
+            (lowest(self.u[0], low_u), highest(self.u[1], high_u)),
+        )
+
+
+def _ends(enclosures: Tree) -> tuple[Tree, Tree]:
+    """Return the lower and the upper bounds of the enclosures in a tree."""
+    low, high = (
+        jtu.tree_map(lambda q, name=name: getattr(q, name), enclosures, is_leaf=is_enclosure)
+        for name in ("lowest", "highest")
+    )
+    return low, high
