@@ -27,6 +27,15 @@ class Static:
 jtu.register_pytree_node(Static, lambda s: ((), s.value), lambda value, _: Static(value))
 
 
+class Label(str):
+    """A text in a tree that JAX transforms: a node without leaves."""
+
+    __slots__ = ()
+
+
+jtu.register_pytree_node(Label, lambda text: ((), str(text)), lambda text, _: Label(text))
+
+
 def add(a: Tree, b: Tree) -> Tree:
     return jtu.tree_map(jnp.add, a, b)
 

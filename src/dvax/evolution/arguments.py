@@ -41,7 +41,8 @@ def check(
 
     rule(isinstance(problem, Problem), "problem", _tree.Text(type(problem).__name__),
          "it must be a dvax.Problem", "Build one, or pass that of a model: model.problem")  # fmt: skip
-    rule(isinstance(method, AbstractMethod | Implicit | Picard | PiecewiseLinear), "method", method,
+    known = AbstractMethod | Implicit | Picard | PiecewiseLinear
+    rule(method is None or isinstance(method, known), "method", method,
          "it must be a method such as dvax.ETD2RK()", "Leave it out for the default")  # fmt: skip
     rule(isinstance(vi_solver, AbstractSolver | None), "vi_solver", vi_solver,
          "it must be a solver such as dvax.vi.Auto()", "Leave it out for the default")  # fmt: skip

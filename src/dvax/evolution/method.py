@@ -32,7 +32,8 @@ class AbstractMethod(eqx.Module):
     them; then the integral of the defect over a step with one kink or one jump of f̃ inside is at most
     `safety` times what they show. `has_half_stage` says that some stage lies half a step away. Where
     `is_rosenbrock`, the method has A + J in the place of A and f̃ − Jx in that of f̃, with
-    J = Df̃(t₀, x₀); where `explicit_in_A`, it has 0 and f̃ + Ax there.
+    J = Df̃(t₀, x₀); where `explicit_in_A`, it has 0 and f̃ + Ax there. `pair` numbers two evaluations of
+    a measured step at one time, whose differences show the slope of f̃.
     """
 
     order: eqx.AbstractClassVar[int]
@@ -43,6 +44,7 @@ class AbstractMethod(eqx.Module):
     has_half_stage: eqx.AbstractClassVar[bool]
     is_rosenbrock: eqx.AbstractClassVar[bool]
     explicit_in_A: eqx.AbstractClassVar[bool]
+    pair: eqx.AbstractClassVar[tuple[int, int] | None]
 
     @abc.abstractmethod
     def coefficients(
@@ -95,6 +97,7 @@ class ETD1(AbstractMethod):
     has_half_stage: ClassVar[bool] = False
     is_rosenbrock: ClassVar[bool] = False
     explicit_in_A: ClassVar[bool] = False
+    pair: ClassVar[tuple[int, int] | None] = None
 
     def coefficients(self, evaluate, propagate, first, drift):
         return (first,)
@@ -126,6 +129,7 @@ class ETD2RK(AbstractMethod):
     has_half_stage: ClassVar[bool] = False
     is_rosenbrock: ClassVar[bool] = False
     explicit_in_A: ClassVar[bool] = False
+    pair: ClassVar[tuple[int, int] | None] = (1, -1)
 
     def coefficients(self, evaluate, propagate, first, drift):
         second = evaluate(1.0, propagate(1.0, (first,)))
@@ -162,6 +166,7 @@ class ETD4RK(AbstractMethod):
     has_half_stage: ClassVar[bool] = True
     is_rosenbrock: ClassVar[bool] = False
     explicit_in_A: ClassVar[bool] = False
+    pair: ClassVar[tuple[int, int] | None] = (1, 2)
 
     def coefficients(self, evaluate, propagate, first, drift):
         a = evaluate(0.5, propagate(0.5, (first,)))
@@ -212,6 +217,7 @@ class ExpRosenbrock(AbstractMethod):
     has_half_stage: ClassVar[bool] = False
     is_rosenbrock: ClassVar[bool] = True
     explicit_in_A: ClassVar[bool] = False
+    pair: ClassVar[tuple[int, int] | None] = None
 
     def coefficients(self, evaluate, propagate, first, drift):
         second = evaluate(1.0, propagate(1.0, (first, drift)))

@@ -25,6 +25,10 @@ class RESULTS(eqx.Enumeration):
         "Check "
         "that the law is strongly pseudomonotone (dvax.verify), or use dvax.ExpRosenbrock()."
     )
+    stiff = (
+        "Stability limits the steps of the method, and not accuracy: dvax.ExpRosenbrock() may take "
+        "longer ones."
+    )
     nonfinite = "f, h or K returned NaN or infinity."
     law_unsolved = "The frozen law was not solved to its tolerance."
     invalid_number = (

@@ -65,6 +65,7 @@ class DormandPrince(AbstractMethod):
     has_half_stage: ClassVar[bool] = False
     is_rosenbrock: ClassVar[bool] = False
     explicit_in_A: ClassVar[bool] = True
+    pair: ClassVar[tuple[int, int] | None] = (5, 6)
 
     def coefficients(self, evaluate, propagate, first, drift):
         sum_of = lambda weights, terms: combined(*zip(weights, terms, strict=False))  # noqa: E731

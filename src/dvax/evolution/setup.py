@@ -61,6 +61,7 @@ class Options(NamedTuple):
     max_steps: int
     adjoint: str
     progress: bool
+    stiff_steps: int | None = None
 
 
 def as_arrays(args: Any) -> Any:

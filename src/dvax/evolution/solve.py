@@ -22,12 +22,13 @@ from .arguments import (
     first_step,
     warn_precision,
 )
+from .auto import Choice, choose
 from .certified import certified, of_region
 from .compiled import compiled
 from .control import MAX_GROWTH
 from .diagnose import failure
 from .implicit import Implicit
-from .method import ETD2RK, AbstractMethod
+from .method import AbstractMethod
 from .nonfinite import refuse_nonfinite_data
 from .picard import Picard
 from .piecewise.method import PiecewiseLinear
@@ -36,8 +37,8 @@ from .results import RESULTS
 from .setup import Options, Setup, as_arrays
 from .solution import Solution
 
-_METHOD, _VI_SOLVER = ETD2RK(), Auto()
-"""The defaults, which nothing changes; making them would be felt in a short run."""
+_VI_SOLVER = Auto()
+"""Constructing the default at every call would cost a part of a short run."""
 
 
 def solve(
@@ -77,7 +78,10 @@ def solve(
       run and relative to |x|: the defect is kept below (atol + rtol|x|)/horizon, and steps over kinks
       may add as much again. For a system whose trajectories do not separate, twice the tolerance is
       a bound on the error;
-    - `method`: `dvax.ETD2RK()` by default; `vi_solver`: `dvax.vi.Auto()` by default;
+    - `method`: None chooses one from the structure and the size of the problem, and another one where
+      stability limits its steps (not under `jax.jit` and `jax.grad`); `stats["method"]` names it, with
+      the reason. With `dt` or `constants` it is `dvax.ETD2RK()`. `vi_solver`: `dvax.vi.Auto()` by
+      default;
     - `constants`: `dvax.Constants` (or any object with `gamma`, `L_F`, `norm_P_inv`): lets the law be
       solved to a tolerance on its true error, and certifies every saved u;
     - `certified_tol`: the largest error of x in the norm of the state space that is allowed at any
@@ -128,8 +132,7 @@ def solve(
         _only_adaptive(dt, method)
         check(
             problem, x0, t0, t1, ts, dt, 0.0, 1.0, dt0, dt_max, horizon,
-            _METHOD if method is None else method, adjoint, measure, dense, vi_solver, max_steps,
-            constants, progress,
+            method, adjoint, measure, dense, vi_solver, max_steps, constants, progress,
         )  # fmt: skip
         again: dict[str, Any] = dict(
             method=method, vi_solver=vi_solver, progress=progress, constants=constants, dense=dense,
@@ -142,7 +145,6 @@ def solve(
         most = bound_steps(max_steps, False, t0, t1, None)
         return certified(run, ts, problem, x0, args, begin, end, constants, certified_tol, most)
     x0 = _state(problem, x0)
-    method = _METHOD if method is None else method
     check(
         problem, x0, t0, t1, ts, dt, rtol, atol, dt0, dt_max, horizon, method, adjoint, measure, dense,
         vi_solver, max_steps, constants, progress,
@@ -165,6 +167,10 @@ def solve(
         "dt_max": math.inf if dt_max is None else _number(dt_max),
         "horizon": span if horizon is None else _number(horizon),
     }
+    choice = Choice(method)
+    if method is None:
+        choice = choose(problem, x0, as_arrays(args), span, fixed, constants is not None)
+        method = choice.method
     measured = not isinstance(method, Implicit) and (bool(measure) or not fixed)
     options = Options(
         fixed=fixed,
@@ -189,7 +195,7 @@ def solve(
         if throw and solution.result != RESULTS.successful:
             raise failure(solution)
         return solution
-    solution, reached = _differentiably(setup, times, options)
+    solution, reached = _by(choice, setup, times, options)
     if reached is True and not dense:
         return solution
     if _tree.is_concrete(reached, solution.result, solution.ts, solution.xs):
@@ -232,6 +238,30 @@ def _only_adaptive(dt: Any, method: Any) -> None:
                     "Leave it out, or use dvax.bound_error on the solution",
                 )
             )  # fmt: skip
+
+
+def _by(
+    choice: Choice, setup: Setup, times: Any, options: Options
+) -> tuple[Solution, bool | jax.Array]:
+    """Run the method that was chosen, or the other one where stability limits its steps."""
+    given = setup.problem, setup.x0, setup.args, setup.setting, times
+    guarded = choice.fallback is not None and _tree.is_concrete(*given)
+    text = choice.text()
+    if guarded:
+        solution, reached = _differentiably(
+            setup, times, options._replace(stiff_steps=choice.least)
+        )
+        if isinstance(reached, bool):
+            if solution.result == RESULTS.stiff:
+                text = choice.fallback_text(float(solution.stats["t"]))
+                setup = setup._replace(method=choice.fallback)
+                solution, reached = _differentiably(setup, times, options)
+            solution.stats["method"] = text
+            return solution, reached
+        # f, h or K closes over what is traced, so that no other method can follow this one.
+    solution, reached = _differentiably(setup, times, options)
+    solution.stats["method"] = text
+    return solution, reached
 
 
 def _differentiably(

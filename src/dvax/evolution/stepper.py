@@ -28,6 +28,10 @@ _SMALL = 64
 """Up to this many entries a look at every one of them is free."""
 
 
+_SLOW = 0.1
+"""Rate of change of x, as a share of the slope of f̃, below which a slope is called stiff."""
+
+
 class SolverState(NamedTuple):
     """What the next step reuses of an accepted one: the rate at its end, a guess for the law, the
     coefficients of its end in the eigenfunctions of A, and the largest `variation` of the data between
@@ -61,7 +65,8 @@ class Step(NamedTuple):
     - `bounds`: the bounds of x_h and u_h over the step, None where they are not tracked;
     - `start_solved`, `solved`: the law was solved at the start, and everywhere;
     - `finite`: there is no non-finite value that a smaller step would leave;
-    - `evaluations`: of F.
+    - `evaluations`: of F;
+    - `stiffness`: h times the slope of f̃ between two stages, None where the method has no such pair.
     """
 
     x1: Tree
@@ -76,6 +81,7 @@ class Step(NamedTuple):
     solved: Any
     finite: Any
     evaluations: Any
+    stiffness: Any = None
 
 
 def interpolate(flow: Flow, length: Any, theta: Any, x0: Tree, c: tuple[Tree, ...]) -> Tree:
@@ -241,7 +247,7 @@ class Stepper(eqx.Module):
         own = counts[0] if kept is None else jnp.where(jumped, counts[0], 0)
         return Step(
             x1, c, error, integrated_defect, event, excursion, bounds, after, first.solved, solved,
-            finite, sum(counts[1:], own),
+            finite, sum(counts[1:], own), self._stiffness(t1 - t0, x0, x1, evaluations),
         )  # fmt: skip
 
     def _local(
@@ -291,6 +297,18 @@ class Stepper(eqx.Module):
             return c, x1
 
         return run
+
+    def _stiffness(self, h: Any, x0: Tree, x1: Tree, evaluations: list[Evaluation]) -> Any:
+        """Return h ‖Δf̃‖/‖Δx‖ between two stages of a measured step, NaN where they agree, zero where
+        x itself changes at a comparable rate, so that accuracy asks for such steps too."""
+        if self.method.pair is None or not self.measure:
+            return None
+        one, two = (evaluations[k] for k in self.method.pair)
+        parts = (self.flow.nonlinear_part(e.x, e.rate.value) for e in (one, two))
+        space = self.flow.state_space(one.x)
+        stiffness = h * space.norm(_tree.sub(*parts)) / space.norm(_tree.sub(one.x, two.x))
+        change = space.norm(_tree.sub(x1, x0)) / space.norm(x1)
+        return jnp.where(change < _SLOW * stiffness, stiffness, 0.0)
 
     def _event(
         self, t0: Any, t1: Any, x0: Tree, c: Any, first: Rate, sample: Sample, wanted: Any

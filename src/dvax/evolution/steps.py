@@ -11,6 +11,7 @@ from jax import lax
 from .. import _tree
 from .._jax import forward_only, outlined
 from . import excursions, reverse
+from .auto import FIELD, LARGE_LAW
 from .control import (
     AbstractController,
     Adaptive,
@@ -91,6 +92,7 @@ def _controller(
         first_growth=setup.number("dt0_growth"),
         longest=setup.number("dt_max"),
         order=method.degree + 1,
+        stiff_steps=options.stiff_steps if method.pair is not None else None,
     )
 
 
@@ -123,16 +125,10 @@ def _stepper(
     return stepper
 
 
-_FIELD, _LARGE_LAW = 64, 256
-"""Entries of the law beyond which a state of as many is taken for a field, whose kinks are everywhere;
-and entries of a law beyond which its kinks are never located. A market of 102 units and one price takes
-4 times fewer steps with its kinks located; a field of 128 points takes up to 2 times more."""
-
-
 def _can_locate(flow: Flow, t0: jax.Array, x0: Any) -> bool:
     like = flow.problem.zero_control(x0)
     law, state = (sum(leaf.size for leaf in jtu.tree_leaves(v)) for v in (like, x0))
-    if law > _LARGE_LAW or min(law, state) > _FIELD:
+    if law > LARGE_LAW or min(law, state) > FIELD:
         return False
     known = flow.switches(t0, x0, like)
     return known is not None and known.size > 0

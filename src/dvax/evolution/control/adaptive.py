@@ -17,6 +17,7 @@ from .error_test import Attempt, ErrorTest
 from .event_bracket import EventBracket
 from .growth_limiter import GrowthLimiter, limit_by_excursion, next_size, resume_planned
 from .roundoff_guard import RoundoffGuard
+from .stiffness_guard import StiffnessGuard
 
 
 class Adaptive(AbstractController):
@@ -32,7 +33,9 @@ class Adaptive(AbstractController):
        accepted;
     2. the `GrowthLimiter` chooses the next step size;
     3. the `RoundoffGuard` lets steps grow where the error is roundoff;
-    4. the `EventBracket` ends steps at events that the stepper located.
+    4. the `EventBracket` ends steps at events that the stepper located;
+    5. the `StiffnessGuard` ends the run where stability limits the steps, if another method is worth
+       its own program from `stiff_steps` more steps on (None: never).
 
     `order` is that of the defect; `first` and `longest` are the first and the largest step size, and
     `first_growth` limits the growth after the first step.
@@ -44,6 +47,7 @@ class Adaptive(AbstractController):
     first_growth: Any
     longest: Any
     order: int = eqx.field(static=True)
+    stiff_steps: int | None = eqx.field(static=True, default=None)
 
     adapts: ClassVar[bool] = True
 
@@ -58,6 +62,7 @@ class Adaptive(AbstractController):
         growth: GrowthLimiter
         guard: RoundoffGuard
         event: jax.Array
+        stiffness: StiffnessGuard | None
 
     def init(self):
         first = lax.stop_gradient(jnp.minimum(self.first, self.longest))
@@ -69,6 +74,7 @@ class Adaptive(AbstractController):
             growth=GrowthLimiter.at_start(first),
             guard=RoundoffGuard.at_start(first),
             event=EventBracket.no_event(first).pack(),
+            stiffness=None if self.stiff_steps is None else StiffnessGuard.at_start(),
         )
 
     def end(self, state):
@@ -131,8 +137,20 @@ class Adaptive(AbstractController):
             growth=state.growth.after(accepted, directed, guard.wait),
             guard=guard,
             event=event.pack(),
+            stiffness=None,
         )
-        return StepDecision(accepted, new, jumped, self._result(step, attempt, accepted, exhausted))
+        result = self._result(step, attempt, accepted, exhausted)
+
+        # 5. End the run where stability limits the steps.
+        if state.stiffness is not None and step.stiffness is not None:
+            assert self.stiff_steps is not None
+            counts = accepted & ~at_event & jnp.isfinite(step.stiffness)
+            stiffness = state.stiffness.after(lax.stop_gradient(step.stiffness), counts)
+            remaining = (self.stops[-1] - t1) / attempt.size
+            stiff = stiffness.fires(remaining, self.stiff_steps)
+            result = RESULTS.where(stiff, RESULTS.stiff, result)
+            new = new._replace(stiffness=stiffness)
+        return StepDecision(accepted, new, jumped, result)
 
     def step_start(self, index, t):
         t = lax.stop_gradient(t)

@@ -1,0 +1,169 @@
+"""The choice of a method where the caller names none."""
+
+import math
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .. import _tree
+from .._tree import Label, Tree
+from ..generators import (
+    AbstractGenerator,
+    Dense,
+    Diagonal,
+    Product,
+    Rotation,
+    Scalar,
+    Zero,
+)
+from ..operators import Diagonal as DiagonalOperator
+from ..operators import Scaling
+from ..problem import Problem
+from ..programs.structure import analyse
+from .method import ETD2RK, ETD4RK, ExpRosenbrock
+from .runge_kutta import DormandPrince
+
+FIELD, LARGE_LAW = 64, 256
+"""Entries of the law and of the state beyond which a problem is taken for a field, whose kinks are
+everywhere; and entries of a law beyond which its kinks are never located. A market of 102 units and one
+price takes 4 times fewer steps with its kinks located; a field of 128 points up to 2 times more."""
+
+_EXACT = 12
+"""Unknowns up to which the exponential of A + Df costs less than the steps that it saves."""
+
+_FAST = 300.0
+"""‖A‖ times the span beyond which A is left to its exponential: an explicit method needs a third of
+this number of steps for stability alone."""
+
+_LINEARISABLE = 256
+"""Unknowns up to which `ExpRosenbrock` forms the matrix of A + Df."""
+
+
+class Choice(NamedTuple):
+    """A method, the reason in words, and the method to go on with where steps are limited by stability
+    (None where there is none), which is worth its own program from `least` more steps on."""
+
+    method: Any
+    reason: str = ""
+    fallback: Any = None
+    least: int = 0
+
+    def text(self) -> Label:
+        """Return the name of the method, and the reason where there is one."""
+        name = type(self.method).__name__
+        return Label(f"{name}: {self.reason}" if self.reason else name)
+
+    def fallback_text(self, t: float) -> Label:
+        """Return the name of the other method, and that stability limited the steps of the first."""
+        first, other = type(self.method).__name__, type(self.fallback).__name__
+        return Label(f"{other}: stability limited the steps of {first} at t = {t:.6g}")
+
+
+class Facts(NamedTuple):
+    """What the code of a problem proves, whatever its numbers: `affine` says that f and h are affine in
+    (t, x, u) jointly and the bounds of K in t, so that x' is affine from kink to kink."""
+
+    state: int
+    law: int
+    affine: bool
+    diagonal: bool
+
+
+def choose(
+    problem: Problem, x0: Tree, args: Any, span: Any, fixed: bool, certified: bool
+) -> Choice:
+    """Choose a method for a run over `span`, from the structure and the size of the problem."""
+    if fixed:
+        return Choice(ETD2RK(), "the steps are given")
+    if certified:
+        return Choice(ETD2RK(), "its defect can be enclosed, so that a bound is proved")
+    facts = _facts(problem, x0, args)
+    if min(facts.law, facts.state) > FIELD or facts.law > LARGE_LAW:
+        return _with_fallback(
+            ETD2RK(), f"with {facts.law} unknowns in the law, steps meet kinks at any time", facts
+        )
+    if facts.affine and (facts.state <= _EXACT or facts.diagonal):
+        return Choice(ExpRosenbrock(), "x' is affine in t and x between kinks, where it is exact")
+    fast = norm(problem.generator(args)) * span if _tree.is_concrete(span) else 0.0
+    if fast > _FAST:
+        return _with_fallback(ETD4RK(), f"‖A‖ times the span is {fast:.2g}, left to e^(hA)", facts)
+    return _with_fallback(DormandPrince(), "few unknowns, and nothing is known to be stiff", facts)
+
+
+def _with_fallback(method: Any, reason: str, facts: Facts) -> Choice:
+    if not (facts.diagonal or facts.state <= _LINEARISABLE):
+        return Choice(method, reason)
+    # A step of ExpRosenbrock costs some steps of another method, and many where it forms matrices.
+    times = 4.0 if facts.diagonal else 4.0 + (facts.state / 16) ** 3
+    return Choice(method, reason, ExpRosenbrock(), round(100 * times))
+
+
+def norm(A: AbstractGenerator) -> float:
+    """Return a bound on ‖A‖ where A is a number, diagonal, a small matrix or made of such; infinity for
+    discretised operators; zero for what is traced, of which nothing is known."""
+    if isinstance(A, Product):
+        return max(map(norm, A.parts))
+    if isinstance(A, Zero):
+        return 0.0
+    if not isinstance(A, Scalar | Diagonal | Dense | Rotation):
+        return math.inf
+    if not _tree.is_concrete(A):
+        return 0.0
+    if isinstance(A, Dense):
+        return float(np.linalg.norm(np.asarray(A.matrix)))
+    if isinstance(A, Rotation):
+        return float(np.max(np.hypot(A.a, A.b)))
+    return float(np.max(np.abs(A.a if isinstance(A, Scalar) else A.entries)))
+
+
+_known: dict[Any, Facts] = {}
+"""The facts of problems that were met, by their code and the shapes of their arrays."""
+
+
+def _facts(problem: Problem, x0: Tree, args: Any) -> Facts:
+    leaves, tree = jtu.tree_flatten((problem, x0, args))
+    parts = ((leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf for leaf in leaves)
+    key = tree, tuple(parts)
+    try:
+        if key in _known:
+            return _known[key]
+    except TypeError:
+        return _read(problem, x0, args)  # a part that cannot be hashed is refused later
+    return _known.setdefault(key, _read(problem, x0, args))
+
+
+def _read(problem: Problem, x0: Tree, args: Any) -> Facts:
+    t = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(x0)))
+    problem.check(t, x0, args)
+    like = problem.zero_control(x0)
+    state, law = (sum(leaf.size for leaf in jtu.tree_leaves(v)) for v in (x0, like))
+    affine = _is_affine(problem, args, t, x0, like)
+    return Facts(state, law, affine, _is_diagonal(problem, args, t, x0, like))
+
+
+def _is_affine(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) -> bool:
+    for function in (problem.f, problem.h):
+        if not analyse(lambda v, fn=function: fn(*v, args), (t, x0, like)).affine:
+            return False
+    bounds = problem.set_at(t, args).intervals(like)
+    return (
+        bounds is not None and analyse(lambda t: problem.set_at(t, args).intervals(like), t).affine
+    )
+
+
+def _is_diagonal(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) -> bool:
+    """Return whether A and the derivative of f̃ are diagonal."""
+    A, P = problem.generator(args), problem.operator(args)
+    alone = isinstance(A, Zero | Scalar | Diagonal) and isinstance(P, Scaling | DiagonalOperator)
+    if not alone or not isinstance(x0, jax.Array) or jnp.shape(like) != x0.shape:
+        return False
+    if problem.set_at(t, args).intervals(like) is None:
+        return False
+    return all(
+        analyse(lambda v, fn=function: fn(t, v, v, args), x0).pointwise
+        for function in (problem.f, problem.h)
+    )
