@@ -12,7 +12,7 @@ from .._tree import Tree
 
 ONE_SAMPLE = (5**-0.5,)
 TWO_SAMPLES = (0.5 - 0.5 * 5**-0.5, 0.5 + 0.5 * 5**-0.5)
-"""Where a step is sampled: at irrational places near the middle and near the inner Lobatto points, so
+"""Where a step is sampled: at irrational places near the middle and at the inner Lobatto points, so
 that no step is a multiple of a period of the data at all of its samples and stages."""
 
 
@@ -45,6 +45,7 @@ class AbstractMethod(eqx.Module):
     is_rosenbrock: eqx.AbstractClassVar[bool]
     explicit_in_A: eqx.AbstractClassVar[bool]
     pair: eqx.AbstractClassVar[tuple[int, int] | None]
+    quadrature: eqx.AbstractClassVar[tuple[float, ...] | None]
 
     @abc.abstractmethod
     def coefficients(
@@ -98,6 +99,7 @@ class ETD1(AbstractMethod):
     is_rosenbrock: ClassVar[bool] = False
     explicit_in_A: ClassVar[bool] = False
     pair: ClassVar[tuple[int, int] | None] = None
+    quadrature: ClassVar[tuple[float, ...] | None] = None
 
     def coefficients(self, evaluate, propagate, first, drift):
         return (first,)
@@ -130,6 +132,7 @@ class ETD2RK(AbstractMethod):
     is_rosenbrock: ClassVar[bool] = False
     explicit_in_A: ClassVar[bool] = False
     pair: ClassVar[tuple[int, int] | None] = (1, -1)
+    quadrature: ClassVar[tuple[float, ...] | None] = None
 
     def coefficients(self, evaluate, propagate, first, drift):
         second = evaluate(1.0, propagate(1.0, (first,)))
@@ -167,6 +170,7 @@ class ETD4RK(AbstractMethod):
     is_rosenbrock: ClassVar[bool] = False
     explicit_in_A: ClassVar[bool] = False
     pair: ClassVar[tuple[int, int] | None] = (1, 2)
+    quadrature: ClassVar[tuple[float, ...] | None] = (1 / 12, 5 / 12, 5 / 12, 1 / 12)
 
     def coefficients(self, evaluate, propagate, first, drift):
         a = evaluate(0.5, propagate(0.5, (first,)))
@@ -218,6 +222,7 @@ class ExpRosenbrock(AbstractMethod):
     is_rosenbrock: ClassVar[bool] = True
     explicit_in_A: ClassVar[bool] = False
     pair: ClassVar[tuple[int, int] | None] = None
+    quadrature: ClassVar[tuple[float, ...] | None] = None
 
     def coefficients(self, evaluate, propagate, first, drift):
         second = evaluate(1.0, propagate(1.0, (first, drift)))

@@ -216,9 +216,12 @@ class Stepper(eqx.Module):
         c, x1 = values((c, x1))
         first, last = evaluations[0].rate, evaluations[-1].rate
         error, integrated_defect, event, excursion, bounds = None, (0.0, 0.0), None, None, None
+        stiffness = None
         variation = solver_state.variation
         if self.measure:
-            sample = self._measure(t0, t1, arc, evaluations, jumped)
+            slopes = self._slopes(t1 - t0, evaluations)
+            whole = None if slopes is None else slopes[1]
+            sample = self._measure(t0, t1, arc, evaluations, jumped, whole)
             error, integrated_defect = sample.error, (sample.defect, sample.law_defect)
             bounds = sample.bounds if self.track_bounds else None
             if self.locate:
@@ -228,6 +231,12 @@ class Stepper(eqx.Module):
                 share = (t1 - t0) / (self.ends[1] - self.ends[0])
                 seen = self.guard.look(self.flow, along, variation, share)
                 excursion, variation = seen.ratio, seen.variation
+            if slopes is not None:
+                # Where x itself changes at a comparable rate, accuracy asks for such steps too.
+                space = self.flow.state_space(x0)
+                change = space.norm(_tree.sub(x1, x0)) / space.norm(x1)
+                slope = slopes[1 if self.method.explicit_in_A else 0]
+                stiffness = jnp.where(change < _SLOW * slope, slope, 0.0)
             # Further in, a bad value may come from a step that was too long: it is cut, not fatal.
             finite = _tree.all_finite(first.value)
         else:
@@ -247,7 +256,7 @@ class Stepper(eqx.Module):
         own = counts[0] if kept is None else jnp.where(jumped, counts[0], 0)
         return Step(
             x1, c, error, integrated_defect, event, excursion, bounds, after, first.solved, solved,
-            finite, sum(counts[1:], own), self._stiffness(t1 - t0, x0, x1, evaluations),
+            finite, sum(counts[1:], own), stiffness,
         )  # fmt: skip
 
     def _local(
@@ -298,17 +307,17 @@ class Stepper(eqx.Module):
 
         return run
 
-    def _stiffness(self, h: Any, x0: Tree, x1: Tree, evaluations: list[Evaluation]) -> Any:
-        """Return h ‖Δf̃‖/‖Δx‖ between two stages of a measured step, NaN where they agree, zero where
-        x itself changes at a comparable rate, so that accuracy asks for such steps too."""
-        if self.method.pair is None or not self.measure:
+    def _slopes(self, h: Any, evaluations: list[Evaluation]) -> tuple[Any, Any] | None:
+        """Return h ‖Δf̃‖/‖Δx‖ and h ‖AΔx + Δf̃‖/‖Δx‖ for the difference of two stages at one time, NaN
+        where they agree; None where the method has no such pair."""
+        if self.method.pair is None:
             return None
         one, two = (evaluations[k] for k in self.method.pair)
-        parts = (self.flow.nonlinear_part(e.x, e.rate.value) for e in (one, two))
-        space = self.flow.state_space(one.x)
-        stiffness = h * space.norm(_tree.sub(*parts)) / space.norm(_tree.sub(one.x, two.x))
-        change = space.norm(_tree.sub(x1, x0)) / space.norm(x1)
-        return jnp.where(change < _SLOW * stiffness, stiffness, 0.0)
+        space, apart = self.flow.state_space(one.x), _tree.sub(one.x, two.x)
+        change = _tree.sub(one.rate.value, two.rate.value)
+        whole = _tree.add(change, self.flow.generator.apply(apart))
+        scale = h / space.norm(apart)
+        return lax.stop_gradient((scale * space.norm(change), scale * space.norm(whole)))
 
     def _event(
         self, t0: Any, t1: Any, x0: Tree, c: Any, first: Rate, sample: Sample, wanted: Any
@@ -350,7 +359,7 @@ class Stepper(eqx.Module):
         between = [interpolate(self.flow, t1 - t0, theta, x0, c) for theta in self.method.samples]
         points = [x0, *between, x1]
         _, evaluations = evaluated(self.flow, run, self.ends[0], x0, guess, None, True)
-        sample = self._measure(t0, t1, Arc(t1 - t0, x0, x1, c), evaluations, True)
+        sample = self._measure(t0, t1, Arc(t1 - t0, x0, x1, c), evaluations, True, None)
         solved = jnp.all(jnp.stack([one.rate.solved for one in evaluations]))
         return sample._replace(rates=[]), solved
 
@@ -361,11 +370,17 @@ class Stepper(eqx.Module):
         return rate._replace(y=None, z=rate.z if self.locate else None)
 
     def _measure(
-        self, t0: Any, t1: Any, arc: Arc, evaluations: list[Evaluation], jumped: Any
+        self,
+        t0: Any,
+        t1: Any,
+        arc: Arc,
+        evaluations: list[Evaluation],
+        jumped: Any,
+        slope: Any,
     ) -> Sample:
         if not self.flow.enclosed:
             x0, c = values((arc.x0, arc.c))
-            return sampled(self.flow, self.method, arc.h, x0, c, evaluations)
+            return sampled(self.flow, self.method, arc.h, x0, c, evaluations, slope)
         assert self.growth is not None
         # A rate that the step before made was made where that one ended: a few roundings of t earlier,
         # which a steep f tells apart.

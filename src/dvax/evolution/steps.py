@@ -91,7 +91,7 @@ def _controller(
         first=setup.number("dt0"),
         first_growth=setup.number("dt0_growth"),
         longest=setup.number("dt_max"),
-        order=method.degree + 1,
+        order=method.order,
         stiff_steps=options.stiff_steps if method.pair is not None else None,
     )
 
