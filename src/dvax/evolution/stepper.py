@@ -14,8 +14,8 @@ from jax import lax
 from .. import _tree
 from .._knots import END_ULPS, KNOT_ULPS
 from .._tree import Tree
-from ..generators import AbstractPropagator, Arc, Growth
-from ..generators.expanded import coefficients, values
+from ..generators import AbstractPropagator, FlowStep, Growth
+from ..generators.spectral_state import coefficients, values
 from .defect import Sample, enclosed, sampled
 from .evaluations import Evaluation, Stages, evaluated
 from .excursions import ExcursionGuard
@@ -216,7 +216,7 @@ class Stepper(eqx.Module):
         (c, x1), evaluations = evaluated(
             self.flow, plan, begin, x0, solver_state.guess, kept, jumped
         )
-        arc, known = Arc(t1 - t0, start, x1, c), coefficients(x1)
+        arc, known = FlowStep(t1 - t0, start, x1, c), coefficients(x1)
         c, x1 = values((c, x1))
         first, last = evaluations[0].rate, evaluations[-1].rate
         error, integrated_defect, event, excursion, extent = None, (0.0, 0.0), None, None, None
@@ -342,7 +342,7 @@ class Stepper(eqx.Module):
         between = [interpolate(self.flow, t1 - t0, theta, x0, c) for theta in self.method.samples]
         points = [x0, *between, x1]
         _, evaluations = evaluated(self.flow, run, self.ends[0], x0, guess, None, True)
-        sample = self._measure(t0, t1, Arc(t1 - t0, x0, x1, c), evaluations, True)
+        sample = self._measure(t0, t1, FlowStep(t1 - t0, x0, x1, c), evaluations, True)
         solved = jnp.all(jnp.stack([one.rate.solved for one in evaluations]))
         return sample._replace(rates=[]), solved
 
@@ -353,7 +353,7 @@ class Stepper(eqx.Module):
         return rate._replace(y=None, z=rate.z if self.locate else None)
 
     def _measure(
-        self, t0: Any, t1: Any, arc: Arc, evaluations: list[Evaluation], jumped: Any
+        self, t0: Any, t1: Any, arc: FlowStep, evaluations: list[Evaluation], jumped: Any
     ) -> Sample:
         if not self.flow.enclosed:
             x0, c = values((arc.x0, arc.c))
