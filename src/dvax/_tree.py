@@ -151,7 +151,7 @@ def host(a: Tree) -> Tree:
     return jtu.tree_map(lambda leaf: np.asarray(leaf) if is_concrete(leaf) else leaf, a)
 
 
-def library(*values: Tree) -> Any:
+def array_module(*values: Tree) -> Any:
     """`numpy` where all of these have a value now, else `jax.numpy`."""
     return np if is_concrete(values) else jnp
 

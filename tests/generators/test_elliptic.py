@@ -40,10 +40,10 @@ def test_a_transform_is_the_one_by_its_definition_and_comes_back(shape, boundary
         exact = np.moveaxis(np.tensordot(waves, exact, (1, axis)), 0, axis)
     np.testing.assert_allclose(np.asarray(c), exact, atol=1e-12)
     # What one coefficient can be anywhere.
-    share = np.broadcast_to(np.asarray(transform.shares()), c.shape)
+    amplitude = np.broadcast_to(np.asarray(transform.amplitudes()), c.shape)
     for index in np.ndindex(c.shape):
         one = jnp.zeros_like(c).at[index].set(1.0)
-        assert np.max(np.abs(np.asarray(transform.backward(one)))) <= share[index] * (1 + 1e-12)
+        assert np.max(np.abs(np.asarray(transform.backward(one)))) <= amplitude[index] * (1 + 1e-12)
 
 
 @pytest.mark.parametrize("n", [16, 17])
@@ -133,7 +133,7 @@ def test_the_growth_bound_holds_and_is_reached(shape, boundary):
 
 
 @pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(GRIDS, GRIDS[:5:2]))
-def test_a_step_stays_within_its_bend(shape, boundary):
+def test_a_step_stays_within_its_chord_deviation(shape, boundary):
     A, _, _ = operator(shape, boundary)
     x0, c0, c1 = jnp.asarray(np.random.default_rng(4).normal(size=(3, *shape)))
     space, h = spaces.Euclidean(shape), 0.2
@@ -141,11 +141,11 @@ def test_a_step_stays_within_its_bend(shape, boundary):
     thetas = jnp.linspace(0.0, 1.0, 41)
     path = np.asarray(jax.vmap(step)(thetas))
     line = np.asarray(jax.vmap(lambda s: (1 - s) * x0 + s * path[-1])(thetas))
-    bend = A.bend(
-        dvax.generators.Arc(h, x0, jnp.asarray(path[-1]), (c0, c1)), space, A.growth(space)
+    bound = A.chord_deviation(
+        dvax.generators.FlowStep(h, x0, jnp.asarray(path[-1]), (c0, c1)), space, A.growth(space)
     )
-    assert np.all(np.abs(path - line) <= np.asarray(bend) + 1e-13)
-    assert np.max(np.abs(path - line)) >= 0.02 * float(np.max(np.asarray(bend)))
+    assert np.all(np.abs(path - line) <= np.asarray(bound) + 1e-13)
+    assert np.max(np.abs(path - line)) >= 0.02 * float(np.max(np.asarray(bound)))
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
@@ -190,7 +190,7 @@ def test_single_precision_stays_single_and_parameters_have_derivatives():
         (dict(shape=(2, 2, 2, 2)), "one to three axes"),
         (dict(shape=4, boundary="robin"), "periodic, dirichlet, neumann"),
         (dict(shape=4, lengths=-1.0), "positive and finite"),
-        (dict(shape=4, diffusion=-1.0), "backward in time"),
+        (dict(shape=4, diffusion=-1.0), "generates no semigroup"),
         (dict(shape=(4, 4), diffusion=(1.0, 1.0, 1.0)), "each of the 2 axes"),
         (dict(shape=4, velocity=1.0), "must be periodic"),
         (dict(shape=4, scheme="chebyshev"), "'spectral' or 'differences'"),

@@ -198,7 +198,7 @@ def test_a_declared_interval_makes_the_bound_declared():
         (lambda M, S: generators.FiniteElements(M, S), "tetrahedra"),
         (lambda M, S: generators.FiniteElements(M, S[:-1, :-1], TRIANGLES), "same unknowns"),
         (lambda M, S: generators.FiniteElements(M.toarray(), S), "sparse"),
-        (lambda M, S: generators.FiniteElements(-M, S, TRIANGLES), "positive diagonal"),
+        (lambda M, S: generators.FiniteElements(-M, S, TRIANGLES), "must be positive"),
         (
             lambda M, S: generators.FiniteElements(M + scipy.sparse.triu(M), S, TRIANGLES),
             "symmetric",

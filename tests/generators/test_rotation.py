@@ -41,7 +41,7 @@ def test_the_growth_bound_holds(weights):
     assert omega == 0.2 and (M == 1.0) == (weights[0] == weights[1])
 
 
-def test_a_step_stays_within_its_bend():
+def test_a_step_stays_within_its_chord_deviation():
     rotation, h = generators.Rotation(A, B), 0.1
     x0, c0, c1 = map(split, np.random.default_rng(1).normal(size=(3, 6)))
     scaled = lambda s: tuple(s * v for v in c1)  # noqa: E731
@@ -49,8 +49,10 @@ def test_a_step_stays_within_its_bend():
     thetas = jnp.linspace(0.0, 1.0, 41)
     path = jax.vmap(step)(thetas)
     end = tuple(v[-1] for v in path)
-    bend = rotation.bend(generators.Arc(h, x0, end, (c0, c1)), PLANE, rotation.growth(PLANE))
-    for along, start, last, bound in zip(path, x0, end, bend, strict=True):
+    bounds = rotation.chord_deviation(
+        generators.FlowStep(h, x0, end, (c0, c1)), PLANE, rotation.growth(PLANE)
+    )
+    for along, start, last, bound in zip(path, x0, end, bounds, strict=True):
         line = (1 - thetas[:, None]) * start[None, :] + thetas[:, None] * last[None, :]
         assert np.all(np.abs(np.asarray(along - line)) <= np.asarray(bound)[None, :] + 1e-14)
 
@@ -100,7 +102,7 @@ def test_a_packet_of_schroedingers_equation_keeps_its_norm_and_order_two():
 
 
 def test_what_does_not_fit_is_refused():
-    with pytest.raises(dvax.InputError, match="one shape"):
+    with pytest.raises(dvax.InputError, match="same shape"):
         generators.Rotation(np.zeros(2), np.zeros(3))
     with pytest.raises(dvax.InputError, match="state space"):
         generators.Rotation(A, B).check(spaces.Euclidean(3))

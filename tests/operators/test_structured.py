@@ -140,7 +140,7 @@ ONES = np.ones((2, 1))
         (lambda: operators.Convolution(np.ones(2), 5), "rfftn"),
         (lambda: operators.Convolution(np.ones((2, 2, 2)), (2, 2, 2)), "one or two"),
         (lambda: operators.Convolution(np.array([[1.0], [2.0], [3.0]]), (3, 1)), "real"),
-        (lambda: operators.Convolution(np.ones(2), 2).check(UNEVEN), "weigh the same"),
+        (lambda: operators.Convolution(np.ones(2), 2).check(UNEVEN), "same weight"),
         (lambda: operators.Convolution(np.ones(2), 3).check(PLANE), r"\(3,\)"),
         (lambda: operators.LowRank(1.0, ONES, np.array([0.0])), "not 0"),
         (lambda: operators.LowRank(-1.0, ONES, np.array([1.0])), "positive"),

@@ -187,7 +187,7 @@ def test_an_operation_without_a_rule_is_named():
         enclosed(lambda t: jnp.fft.irfft(jnp.fft.rfft(PROFILE * t), 3), 0.0, 1.0)
 
 
-def test_a_bend_of_the_trajectory_is_never_less_than_it_is():
+def test_the_chord_deviation_bounds_that_of_the_trajectory():
     space = dvax.spaces.Euclidean(2)
     generators = {
         "scalar": dvax.generators.Scalar(-3.0),
@@ -202,7 +202,9 @@ def test_a_bend_of_the_trajectory_is_never_less_than_it_is():
             def at(theta, A=A, h=h, x0=x0, c0=c0, c1=c1):
                 return A.propagator(theta * h, 2).step(x0, (c0, theta * c1))
 
-            bend = A.bend(dvax.generators.Arc(h, x0, at(1.0), (c0, c1)), space, A.growth(space))
+            bend = A.chord_deviation(
+                dvax.generators.FlowStep(h, x0, at(1.0), (c0, c1)), space, A.growth(space)
+            )
             assert np.all(farthest(at, 0.0, 1.0) <= np.asarray(bend) * (1 + 1e-12))
 
 

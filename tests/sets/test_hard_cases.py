@@ -279,5 +279,5 @@ def test_a_set_of_known_numbers_may_be_made_while_something_is_traced():
     )
     assert np.all(np.isfinite(np.asarray(jax.jit(made)(0.5))))
     inside_out = -radius
-    with pytest.raises(dvax.InputError, match="finite radius"):
+    with pytest.raises(dvax.InputError, match="must be finite and ≥ 0"):
         jax.jit(lambda t: sets.Ball(t, inside_out).project(jnp.ones(2), PLANE))(0.5)

@@ -10,8 +10,8 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
-from ..generators import Arc, Growth
-from ..generators.expanded import values
+from ..generators import FlowStep, Growth
+from ..generators.spectral_state import values
 from ..programs.branches import branches
 from ..programs.enclosure import LinearEnclosure, is_enclosure
 from .bounds import Bounds
@@ -47,7 +47,7 @@ class Sample(NamedTuple):
 
 
 def enclosed(
-    flow: Flow, growth: Growth, ends: tuple[Any, Any], arc: Arc, last: Rate, span: Any
+    flow: Flow, growth: Growth, ends: tuple[Any, Any], arc: FlowStep, last: Rate, span: Any
 ) -> Sample:
     """|δ(θ)| ≤ (1−θ)(|δ(0)| + dev) + θ(|δ(1)| + dev) entry by entry, with dev from a linear
     enclosure, since p is a line; so ∫‖δ‖ is at most the mean of the norms of the two brackets
@@ -61,7 +61,7 @@ def enclosed(
     h, x0, x1, c = values(tuple(arc))
     short = h <= WATCH * span
     space = flow.state_space(x0)
-    bend = flow.generator.bend(arc, space, growth)
+    bend = flow.generator.chord_deviation(arc, space, growth)
     x = jtu.tree_map(LinearEnclosure, x0, x1, bend)
     along, u = flow.enclosure(LinearEnclosure(*ends, jnp.zeros_like(h)), x)
     at_start = jtu.tree_map(

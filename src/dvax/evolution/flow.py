@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from .. import _tree
 from .._tree import Tree
 from ..generators import AbstractGenerator, AbstractPropagator, Dense, Diagonal, Scalar
-from ..generators.expanded import expanded
+from ..generators.spectral_state import expand_state
 from ..operators import AbstractOperator
 from ..problem import Problem
 from ..programs.enclosure import (
@@ -89,7 +89,7 @@ class Flow(eqx.Module):
 
     def expand(self, x: Tree, known: Tree = None) -> Tree:
         """x as propagators take it with the least work."""
-        return expanded(self.generator, x, known) if self.linear is None else x
+        return expand_state(self.generator, x, known) if self.linear is None else x
 
     def nonlinear_part(self, x: Tree, value: Tree) -> Tree:
         """f̃ without what is left to the propagator: `value` = f̃(t, x), or f̃(t, x) − Jx."""

@@ -14,8 +14,8 @@ from jax import lax
 from .. import _tree
 from .._knots import END_ULPS, KNOT_ULPS
 from .._tree import Tree
-from ..generators import AbstractPropagator, Arc, Growth
-from ..generators.expanded import coefficients, values
+from ..generators import AbstractPropagator, FlowStep, Growth
+from ..generators.spectral_state import coefficients, values
 from .bounds import Bounds
 from .defect import Sample, enclosed, sampled
 from .evaluations import Evaluation, Stages, evaluated
@@ -212,7 +212,7 @@ class Stepper(eqx.Module):
         (c, x1), evaluations = evaluated(
             self.flow, plan, begin, x0, solver_state.guess, kept, jumped
         )
-        arc, known = Arc(t1 - t0, start, x1, c), coefficients(x1)
+        arc, known = FlowStep(t1 - t0, start, x1, c), coefficients(x1)
         c, x1 = values((c, x1))
         first, last = evaluations[0].rate, evaluations[-1].rate
         error, integrated_defect, event, excursion, bounds = None, (0.0, 0.0), None, None, None
@@ -359,7 +359,7 @@ class Stepper(eqx.Module):
         between = [interpolate(self.flow, t1 - t0, theta, x0, c) for theta in self.method.samples]
         points = [x0, *between, x1]
         _, evaluations = evaluated(self.flow, run, self.ends[0], x0, guess, None, True)
-        sample = self._measure(t0, t1, Arc(t1 - t0, x0, x1, c), evaluations, True, None)
+        sample = self._measure(t0, t1, FlowStep(t1 - t0, x0, x1, c), evaluations, True, None)
         solved = jnp.all(jnp.stack([one.rate.solved for one in evaluations]))
         return sample._replace(rates=[]), solved
 
@@ -373,7 +373,7 @@ class Stepper(eqx.Module):
         self,
         t0: Any,
         t1: Any,
-        arc: Arc,
+        arc: FlowStep,
         evaluations: list[Evaluation],
         jumped: Any,
         slope: Any,

@@ -1,8 +1,8 @@
-"""Generators A of strongly continuous semigroups: e^{hA}, the φ-functions, the growth bound."""
+"""Generators A of strongly continuous semigroups, with e^{hA}, φ-functions and growth bounds."""
 
 from .abstract import AbstractGenerator as AbstractGenerator
 from .abstract import AbstractPropagator as AbstractPropagator
-from .abstract import Arc as Arc
+from .abstract import FlowStep as FlowStep
 from .abstract import Growth as Growth
 from .dense import Dense as Dense
 from .diagonal import Diagonal as Diagonal

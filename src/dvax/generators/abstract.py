@@ -1,4 +1,4 @@
-"""What a generator owes, and the propagator that a step of length h caches."""
+"""The abstract generator, and its propagator over a step of length h."""
 
 import abc
 from typing import Any, NamedTuple
@@ -16,9 +16,11 @@ class Growth(NamedTuple):
     omega: Any
 
 
-class Arc(NamedTuple):
-    """One step of x' = Ax + p: of length h, from x₀ to x₁, under a polynomial with the coefficients c
-    (see `AbstractPropagator`)."""
+class FlowStep(NamedTuple):
+    """One step of x' = Ax + p, of length h, from x₀ to x₁.
+
+    c holds the coefficients of the polynomial p (see `AbstractPropagator`).
+    """
 
     h: Any
     x0: Tree
@@ -27,7 +29,7 @@ class Arc(NamedTuple):
 
 
 class AbstractPropagator(eqx.Module):
-    """The exact flow of x' = Ax + p over one length h, with everything costly computed once.
+    """The exact flow of x' = Ax + p over a step of length h, with precomputed φ-functions.
 
     For the polynomial p(t₀ + θh) = c₀ + c₁θ + … + c_qθ^q,
 
@@ -39,8 +41,9 @@ class AbstractPropagator(eqx.Module):
 
     @abc.abstractmethod
     def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
-        """x(t₀ + h), for at most as many coefficients as the propagator was made for; with its
-        coefficients, where x₀ and all cⱼ have theirs (`dvax.generators.expanded`)."""
+        """Return x(t₀ + h), for at most as many coefficients cⱼ as the propagator was built for.
+
+        If x₀ and all cⱼ are spectral states (`dvax.generators.spectral_state`), so is the result."""
 
 
 class AbstractGenerator(eqx.Module):
@@ -48,30 +51,31 @@ class AbstractGenerator(eqx.Module):
 
     @abc.abstractmethod
     def apply(self, v: Tree) -> Tree:
-        """A v."""
+        """Return A v."""
 
     @abc.abstractmethod
     def propagator(self, h: Any, terms: int) -> AbstractPropagator:
-        """The flow over h ≥ 0 for polynomials of up to `terms` coefficients."""
+        """Return the flow over h ≥ 0 for polynomials with up to `terms` coefficients."""
 
     @abc.abstractmethod
     def adjoint(self, space: AbstractSpace) -> "AbstractGenerator":
-        """A* with ⟨Av, w⟩ = ⟨v, A*w⟩ in `space`."""
+        """Return A* with ⟨Av, w⟩ = ⟨v, A*w⟩ in `space`."""
 
     @abc.abstractmethod
     def growth(self, space: AbstractSpace) -> Growth:
-        """M and ω with ‖e^{At}‖ ≤ M e^{ωt} in the norm of `space`, proved from A's structure."""
+        """Return M and ω with ‖e^{At}‖ ≤ M e^{ωt} in the norm of `space`, proved from A's structure."""
 
     @abc.abstractmethod
-    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
-        """A bound, entry by entry, on how far x(t₀ + θh) lies from its chord, the line between x₀ and
-        x₁, where p has at most two coefficients, given the `growth` of this generator, or of a product
-        that it is a part of, in the norm of `space`."""
+    def chord_deviation(self, step: FlowStep, space: AbstractSpace, growth: Growth) -> Tree:
+        """Return a bound, entry by entry, on |x(t₀ + θh) − (1 − θ)x₀ − θx₁| for 0 ≤ θ ≤ 1.
+
+        The polynomial p has at most two coefficients. `growth` is the growth bound, in the norm of
+        `space`, of this generator or of a product that it is a part of."""
 
     @abc.abstractmethod
     def check(self, space: AbstractSpace) -> None:
-        """Raise an `InputError` where A does not act on the elements of `space`."""
+        """Raise an `InputError` if A does not act on the elements of `space`."""
 
     def semigroup(self, h: Any, v: Tree) -> Tree:
-        """e^{hA} v."""
+        """Return e^{hA} v."""
         return self.propagator(h, 0).step(v, ())

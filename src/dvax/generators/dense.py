@@ -1,4 +1,4 @@
-"""A given as a matrix."""
+"""Generators given by a dense matrix."""
 
 from typing import Any
 
@@ -10,8 +10,8 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
-from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
-from .bend import normwise_bend
+from .abstract import AbstractGenerator, AbstractPropagator, FlowStep, Growth
+from .chord_deviation import normwise_chord_deviation
 from .phi import flow_factors, phi_matrix
 
 
@@ -19,16 +19,17 @@ class Dense(AbstractGenerator):
     """A v = matrix @ v for states that are vectors of n entries.
 
     The growth bound is the logarithmic norm: M = 1 and ω = λ_max of the symmetric part of A in the
-    space's inner product, since d/dt ½‖e^{At}v‖² = ⟨A e^{At}v, e^{At}v⟩ ≤ ω‖e^{At}v‖². For a matrix
-    far from normal that ω is far above the real parts of the eigenvalues. With `omega` given, any
-    number above those, M is √cond(Q) for the Q > 0 with (A − ω)ᵀQ + Q(A − ω) = −I (Lyapunov): in the
-    norm of Q the semigroup grows no faster than e^{ωt}, and that norm is within √cond(Q) of the
-    space's. The bound is checked on the Q found, so it holds though Q is rounded.
+    space's inner product, since d/dt ½‖e^{At}v‖² = ⟨A e^{At}v, e^{At}v⟩ ≤ ω‖e^{At}v‖². For a highly
+    non-normal matrix this ω is much larger than the real parts of the eigenvalues. `omega` may then
+    prescribe any rate above these real parts, with M = √cond(Q) for the solution Q > 0 of Lyapunov's
+    equation (A − ω)ᵀQ + Q(A − ω) = −I: in the norm of Q the semigroup grows at most as e^{ωt}, and
+    this norm is equivalent to that of the space with the factor √cond(Q). The bound is verified for
+    the computed Q, so it holds despite the roundoff in Q.
 
-    **Arguments:** `matrix`: square, in 1/time; `omega`: the rate that the growth bound should have, in
+    **Arguments:** `matrix`: square, in 1/time; `omega`: the prescribed rate of the growth bound, in
     1/time.
 
-    **Raises:** `dvax.InputError` where the matrix is not square, or `omega` not above the real parts
+    **Raises:** `dvax.InputError` if the matrix is not square, or `omega` is not above the real parts
     of its eigenvalues.
 
     ```python
@@ -51,7 +52,7 @@ class Dense(AbstractGenerator):
                 InputProblem(
                     "dvax.generators.Dense(matrix)",
                     f"shape {shape}",
-                    "a generator maps the state space to itself, so its matrix is square",
+                    "a generator maps the state space to itself, so its matrix must be square",
                     "Use dvax.generators.Diagonal for a vector of diagonal entries",
                 )
             )
@@ -61,18 +62,18 @@ class Dense(AbstractGenerator):
             rate = self.omega = _tree.as_number(omega, name, "Give the rate of the growth bound")
             _tree.require(
                 lambda: np.isfinite(rate), name, rate,
-                "the rate of a growth bound is a finite number", "Leave it out, or give a finite one",
+                "the rate of a growth bound must be finite", "Omit it, or give a finite number",
             )  # fmt: skip
             _tree.require(
                 lambda: np.isfinite(self.matrix), "dvax.generators.Dense(matrix)", self.matrix,
-                "every entry must be finite", "Correct the matrix there",
+                "every entry must be finite", "Correct the entries that are not",
             )  # fmt: skip
             _tree.require(
                 lambda: np.max(np.real(np.linalg.eigvals(np.asarray(self.matrix)))) < float(rate),
                 name,
                 rate,
-                "no e^{ωt} bounds the semigroup unless ω is above the real part of every eigenvalue",
-                "Give a larger one, or leave it out for the logarithmic norm",
+                "omega must be above the real part of every eigenvalue, or e^{ωt} is no bound",
+                "Give a larger value, or omit it for the logarithmic norm",
             )
 
     def apply(self, v: Tree) -> Tree:
@@ -91,31 +92,32 @@ class Dense(AbstractGenerator):
         return Dense(self.matrix.T * w[None, :] / w[:, None], self.omega)
 
     def growth(self, space: AbstractSpace) -> Growth:
-        # ⟨Av, v⟩ = vᵀWAv: with q = W^{1/2}v it is qᵀ(W^{1/2}AW^{-1/2})q, so weights only rescale.
+        # ⟨Av, v⟩ = vᵀWAv = qᵀ(W^{1/2}AW^{-1/2})q with q = W^{1/2}v.
         root = jnp.broadcast_to(jnp.sqrt(space.weights()), self.matrix.shape[:1])
         similar = root[:, None] * self.matrix / root[None, :]
         if self.omega is not None:
-            return Growth(_overshoot(similar, self.omega), self.omega)
+            return Growth(_lyapunov_constant(similar, self.omega), self.omega)
         return Growth(jnp.ones(()), jnp.linalg.eigvalsh(0.5 * (similar + similar.T))[-1])
 
-    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
-        return normwise_bend(self, arc, space, growth)
+    def chord_deviation(self, step: FlowStep, space: AbstractSpace, growth: Growth) -> Tree:
+        return normwise_chord_deviation(self, step, space, growth)
 
 
-def _overshoot(matrix: jax.Array, omega: jax.Array) -> jax.Array:
-    """An M with ‖e^{At}‖ ≤ M e^{ωt}, by Lyapunov's equation; ∞ where it shows none."""
+def _lyapunov_constant(matrix: jax.Array, omega: jax.Array) -> jax.Array:
+    """Return M with ‖e^{At}‖ ≤ M e^{ωt} from Lyapunov's equation, or ∞ if it yields no bound."""
     eye = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
     shifted = matrix - omega * eye
     Q = jax.scipy.linalg.solve_sylvester(shifted.T, shifted, -eye)
     Q = 0.5 * (Q + Q.T)
-    sizes = jnp.linalg.eigvalsh(Q)
-    falls = jnp.linalg.eigvalsh(shifted.T @ Q + Q @ shifted)[-1] <= 0.0
-    holds = falls & (sizes[0] > 0.0)
-    return jnp.where(holds, jnp.sqrt(sizes[-1] / jnp.where(holds, sizes[0], 1.0)), jnp.inf)
+    eigenvalues = jnp.linalg.eigvalsh(Q)
+    decreasing = jnp.linalg.eigvalsh(shifted.T @ Q + Q @ shifted)[-1] <= 0.0
+    holds = decreasing & (eigenvalues[0] > 0.0)
+    smallest = jnp.where(holds, eigenvalues[0], 1.0)
+    return jnp.where(holds, jnp.sqrt(eigenvalues[-1] / smallest), jnp.inf)
 
 
 class MatrixPropagator(AbstractPropagator):
-    """Factors that are matrices."""
+    """A propagator whose factors are dense matrices."""
 
     factors: tuple[jax.Array, ...]
 

@@ -1,4 +1,4 @@
-"""A = diag(a₁, …, aₙ)."""
+"""Diagonal generators A = diag(a₁, …, aₙ)."""
 
 from typing import Any
 
@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace
-from .abstract import AbstractGenerator, Arc, Growth
+from .abstract import AbstractGenerator, FlowStep, Growth
 from .phi import flow_factors, phi_scalar
-from .scalar import ElementwisePropagator, elementwise_bend
+from .scalar import ElementwisePropagator, elementwise_chord_deviation
 
 
 class Diagonal(AbstractGenerator):
-    """A v = a ⊙ v, elementwise: M = 1 and ω = max aᵢ in every norm with diagonal weights.
+    """A v = a ⊙ v, elementwise, with M = 1 and ω = max aᵢ in every norm with diagonal weights.
 
     **Arguments:** `entries`: an array of the state's shape, in 1/time.
 
@@ -48,5 +48,5 @@ class Diagonal(AbstractGenerator):
     def growth(self, space: AbstractSpace) -> Growth:
         return Growth(jnp.ones(()), jnp.max(jnp.real(self.entries)))
 
-    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
-        return elementwise_bend(self.entries, arc.h, arc.x0, arc.x1, *arc.c)
+    def chord_deviation(self, step: FlowStep, space: AbstractSpace, growth: Growth) -> Tree:
+        return elementwise_chord_deviation(self.entries, step.h, step.x0, step.x1, *step.c)

@@ -1,4 +1,4 @@
-"""Constant coefficients on a box: diffusion, advection, reaction."""
+"""Diffusion, advection and reaction with constant coefficients on a box."""
 
 from collections.abc import Sequence
 from typing import Any, SupportsIndex
@@ -12,23 +12,29 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
-from .abstract import AbstractPropagator, Arc, Growth
-from .expanded import AbstractModal, Expanded, as_given, coefficients_of, with_coefficients
+from .abstract import AbstractPropagator, FlowStep, Growth
 from .phi import flow_factors, phi_scalar
-from .scalar import elementwise_bend
+from .scalar import elementwise_chord_deviation
+from .spectral_state import (
+    AbstractModal,
+    SpectralState,
+    coefficients_of,
+    in_form_of,
+    with_coefficients,
+)
 from .stencil import Stencil
 from .transforms import BOUNDARIES, Transform, along, times
 
 
 class Elliptic(AbstractModal):
-    """A v = Σᵢ dᵢ ∂ᵢ²v − Σᵢ cᵢ ∂ᵢv + r v on a box of one, two or three dimensions: the Laplacian for
-    d = 1, advection–diffusion with a velocity c, pure advection (skew) for d = 0.
+    """A v = Σᵢ dᵢ ∂ᵢ²v − Σᵢ cᵢ ∂ᵢv + r v on a box in one, two or three dimensions.
 
-    Values sit at the midpoints (j + ½)h of equal cells, h = L/n. A is diagonal in the sines, cosines
-    and waves that its boundary conditions allow, so e^{tA} and the φ-functions are exact for what
-    the grid can show: wave number κ belongs to the eigenvalue −dκ² − icκ + r. In the norm of any
-    space that weighs all points alike the transform is orthogonal, so M = 1 and ω is the largest
-    real part.
+    This is the Laplacian for d = 1, advection–diffusion with a velocity c, and pure advection (a
+    skew-adjoint A) for d = 0. Values are given at the midpoints (j + ½)h of equal cells, h = L/n. A
+    is diagonal in the sines, cosines or complex exponentials of its boundary conditions, so e^{tA}
+    and the φ-functions are exact for every function that the grid resolves. The eigenvalue of the
+    wave number κ is −dκ² − icκ + r. If all points have the same weight the transform is orthogonal,
+    so M = 1 and ω is the largest real part.
 
     **Arguments:**
 
@@ -37,11 +43,11 @@ class Elliptic(AbstractModal):
     - `boundary`: "periodic", "dirichlet" (v = 0 on the faces) or "neumann" (∂v/∂n = 0), for all axes
       or one an axis;
     - `diffusion` ≥ 0, in length²/time, and `velocity`, in length/time: one number or one an axis; a
-      velocity other than 0 needs a periodic axis; `reaction`: a number, in 1/time;
-    - `scheme`: "spectral", or "differences" for the three-point formula of order two, whose
-      eigenvalues are −d (2/h)² sin²(κh/2) and −ic sin(κh)/h.
+      nonzero velocity requires a periodic axis; `reaction`: a number, in 1/time;
+    - `scheme`: "spectral", or "differences" for second-order central differences, whose eigenvalues
+      are −d (2/h)² sin²(κh/2) and −ic sin(κh)/h.
 
-    **Raises:** `dvax.InputError` where these do not fit together.
+    **Raises:** `dvax.InputError` if the arguments are invalid or inconsistent.
 
     Source of the transforms: `dvax.generators.transforms`.
 
@@ -78,16 +84,16 @@ class Elliptic(AbstractModal):
         per_axis = {"lengths": lengths, "diffusion": diffusion, "velocity": velocity}
         L, d, c = (_by_axis(name, value, len(shape)) for name, value in per_axis.items())
         name = "dvax.generators.Elliptic(reaction)"
-        r = _tree.as_number(reaction, name, "Put a rate that varies in space into f")
+        r = _tree.as_number(reaction, name, "Add a rate that varies in space to f")
         _check_numbers(L, d, c, kinds)
         self.transform = Transform(shape, kinds)
-        growing, turning = r, jnp.zeros_like(r)
+        real, imaginary = r, jnp.zeros_like(r)
         for axis in range(len(shape)):
             even, odd = _eigenvalues(self.transform, axis, L[axis], scheme)
-            growing = growing - along(d[axis] * even, axis, len(shape))
-            turning = turning - along(c[axis] * odd, axis, len(shape))
-        still = all(map(_is_zero, c))
-        self.symbol = growing if still else jax.lax.complex(growing, turning)
+            real = real - along(d[axis] * even, axis, len(shape))
+            imaginary = imaginary - along(c[axis] * odd, axis, len(shape))
+        no_advection = all(map(_is_zero, c))
+        self.symbol = real if no_advection else jax.lax.complex(real, imaginary)
         self.stencil = None
         if scheme == "differences":
             cells = [side / n for side, n in zip(L, shape, strict=True)]
@@ -103,8 +109,8 @@ class Elliptic(AbstractModal):
             return self.stencil.apply(v)
         return self.transform.backward(times(self.symbol, self.transform.forward(v)))
 
-    def expand(self, v: Tree, known: Tree = None) -> Expanded:
-        return with_coefficients(v, known, self.transform.forward)
+    def expand(self, v: Tree, coefficients: Tree = None) -> SpectralState:
+        return with_coefficients(v, coefficients, self.transform.forward)
 
     def propagator(self, h: Any, terms: int) -> "SpectralPropagator":
         h = jnp.asarray(h).astype(self.symbol.dtype)
@@ -120,41 +126,44 @@ class Elliptic(AbstractModal):
         )
 
     def adjoint(self, space: AbstractSpace) -> "Elliptic":
-        alike = self.growth(space).M
+        weight_ratio = self.growth(space).M
         _tree.require(
-            lambda: float(alike) <= 1.0 + 1e-12, "dvax.generators.Elliptic.adjoint(space)", alike,
-            "where points weigh differently A* has no constant coefficients",
-            "Use a space that weighs them alike",
+            lambda: float(weight_ratio) <= 1.0 + 1e-12,
+            "dvax.generators.Elliptic.adjoint(space)", weight_ratio,
+            "all points must have the same weight, or A* has no constant coefficients",
+            "Use a space with one weight for all points",
         )  # fmt: skip
         stencil = None if self.stencil is None else self.stencil.adjoint()
-        turned = eqx.tree_at(lambda A: A.symbol, self, jnp.conj(self.symbol))
-        return eqx.tree_at(lambda A: A.stencil, turned, stencil, is_leaf=lambda leaf: leaf is None)
+        adjoint = eqx.tree_at(lambda A: A.symbol, self, jnp.conj(self.symbol))
+        return eqx.tree_at(lambda A: A.stencil, adjoint, stencil, is_leaf=lambda leaf: leaf is None)
 
     def growth(self, space: AbstractSpace) -> Growth:
-        # ‖v‖ lies between the roots of the least and the largest weight times the plain norm, in which
-        # the semigroup is that of a normal operator.
+        # ‖v‖ lies between √(min w) and √(max w) times the Euclidean norm, in which A is normal.
         w = space.weights()
         return Growth(jnp.sqrt(jnp.max(w) / jnp.min(w)), jnp.max(jnp.real(self.symbol)))
 
-    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
-        # Coefficient by coefficient; an eigenfunction is at most 1 anywhere.
-        h, x0, x1, c = arc
+    def chord_deviation(self, step: FlowStep, space: AbstractSpace, growth: Growth) -> Tree:
+        # Bound each coefficient; eigenfunctions are at most 1 in absolute value.
+        h, x0, x1, c = step
         parts = [coefficients_of(v, self.transform.forward) for v in (x0, x1, *c)]
         if jnp.iscomplexobj(self.symbol):
-            start, _, first, *rest = parts
-            slope = times(1.0 / h, rest[0]) if rest else jnp.zeros_like(first)
-            curvature = jnp.abs(self.symbol * (self.symbol * start + first) + slope)
-            rise = jnp.exp(jnp.maximum(jnp.real(self.symbol), 0.0) * h)
-            leaves = h**2 / 8 * rise * curvature
+            start, _, constant, *linear = parts
+            slope = times(1.0 / h, linear[0]) if linear else jnp.zeros_like(constant)
+            curvature = jnp.abs(self.symbol * (self.symbol * start + constant) + slope)
+            amplification = jnp.exp(jnp.maximum(jnp.real(self.symbol), 0.0) * h)
+            bounds = h**2 / 8 * amplification * curvature
         else:
-            leaves = _both(lambda *p: elementwise_bend(self.symbol, h, *p), parts)
-        return jnp.broadcast_to(
-            jnp.sum(self.transform.shares().astype(leaves.dtype) * leaves), self.transform.shape
-        )
+
+            def bound(*parts: jax.Array) -> jax.Array:
+                return elementwise_chord_deviation(self.symbol, h, *parts)
+
+            bounds = _bound_complex(bound, parts)
+        amplitudes = self.transform.amplitudes().astype(bounds.dtype)
+        return jnp.broadcast_to(jnp.sum(amplitudes * bounds), self.transform.shape)
 
 
 class SpectralPropagator(AbstractPropagator):
-    """Factors that multiply the coefficients of a transform."""
+    """A propagator that multiplies the coefficients of a transform."""
 
     transform: Transform
     factors: tuple[jax.Array, ...]
@@ -163,24 +172,24 @@ class SpectralPropagator(AbstractPropagator):
         parts = [coefficients_of(v, self.transform.forward) for v in (x0, *c)]
         products = [times(f, v) for f, v in zip(self.factors, parts, strict=False)]
         total = sum(products[1:], start=products[0])
-        return as_given(x0, total, self.transform.backward)
+        return in_form_of(x0, total, self.transform.backward)
 
 
-def _both(bend: Any, parts: list[jax.Array]) -> jax.Array:
-    """A bound for complex coefficients from one for real ones."""
+def _bound_complex(bound: Any, parts: list[jax.Array]) -> jax.Array:
+    """Return a bound for complex coefficients from the `bound` for real ones."""
     if not jnp.iscomplexobj(parts[0]):
-        return bend(*parts)
-    real, imaginary = (bend(*map(part, parts)) for part in (jnp.real, jnp.imag))
+        return bound(*parts)
+    real, imaginary = (bound(*map(part, parts)) for part in (jnp.real, jnp.imag))
     return jnp.sqrt(real**2 + imaginary**2)
 
 
 def _eigenvalues(
     transform: Transform, axis: int, length: jax.Array, scheme: str
 ) -> tuple[jax.Array, jax.Array]:
-    """κ² and κ, or what differences make of them."""
+    """Return κ² and κ along an axis, or their finite-difference counterparts."""
     n, modes = transform.shape[axis], transform.modes(axis)
     periodic = transform.boundary[axis] == "periodic"
-    # The wave of two cells is its own mirror image: an odd derivative of it is nowhere on the grid.
+    # The odd derivative of the Nyquist mode is zero on the grid.
     odd = np.where(periodic & (2 * np.abs(modes) == n), 0, modes)
     angle = (2 * np.pi if periodic else np.pi) * np.asarray(modes, float)
     angle_odd = (2 * np.pi if periodic else np.pi) * np.asarray(odd, float)
@@ -192,13 +201,13 @@ def _eigenvalues(
 
 def _by_axis(name: str, value: Any, count: int) -> list[jax.Array]:
     if _tree.is_concrete(value):
-        # A number that is known stays known while something else is traced.
+        # Keep a concrete number concrete inside the trace of another function.
         with jax.ensure_compile_time_eval():
-            return _one_each(name, value, count)
-    return _one_each(name, value, count)
+            return _broadcast_to_axes(name, value, count)
+    return _broadcast_to_axes(name, value, count)
 
 
-def _one_each(name: str, value: Any, count: int) -> list[jax.Array]:
+def _broadcast_to_axes(name: str, value: Any, count: int) -> list[jax.Array]:
     full = f"dvax.generators.Elliptic({name})"
     array = _tree.as_array([*value] if isinstance(value, tuple) else value, full)
     if array.shape not in ((), (count,)):
@@ -206,7 +215,7 @@ def _one_each(name: str, value: Any, count: int) -> list[jax.Array]:
             InputProblem(
                 full,
                 f"shape {array.shape}",
-                f"one number, or one for each of the {count} axes",
+                f"it must be one number, or one for each of the {count} axes",
                 f"Give {count} numbers",
             )
         )
@@ -218,7 +227,7 @@ def _is_zero(v: jax.Array) -> bool:
 
 
 def _kinds(boundary: Any, axes: int) -> tuple[Any, ...]:
-    """The boundary condition of every axis."""
+    """Return the boundary condition of every axis."""
     if isinstance(boundary, str):
         return (boundary,) * axes
     return tuple(boundary) if isinstance(boundary, tuple | list | np.ndarray) else (boundary,)
@@ -229,19 +238,20 @@ def _check(shape: tuple[int, ...], kinds: tuple[str, ...], scheme: str) -> None:
     wrong: list[InputProblem] = []
     if not 1 <= len(shape) <= 3:
         wrong.append(
-            InputProblem(f"{name}(shape)", str(shape), "one to three axes of at least one cell",
+            InputProblem(f"{name}(shape)", str(shape),
+                         "there must be one to three axes of at least one cell",
                          "Give the number of cells along each axis")
         )  # fmt: skip
     if len(kinds) != len(shape) or any(str(kind) not in BOUNDARIES for kind in kinds):
         wrong.append(
             InputProblem(f"{name}(boundary)", _tree.line(kinds),
-                         f"one of {', '.join(BOUNDARIES)}, for all axes or one for each",
-                         "Choose from these")
+                         f"it must be one of {', '.join(BOUNDARIES)}, for all axes or for each",
+                         "Choose one of these")
         )  # fmt: skip
     if not isinstance(scheme, str) or scheme not in ("spectral", "differences"):
         wrong.append(
-            InputProblem(f"{name}(scheme)", _tree.line(scheme), "'spectral' or 'differences'",
-                         "Leave it out for the spectral one")
+            InputProblem(f"{name}(scheme)", _tree.line(scheme),
+                         "it must be 'spectral' or 'differences'", "Omit it for 'spectral'")
         )  # fmt: skip
     if wrong:
         raise InputError(*wrong)
@@ -251,12 +261,12 @@ def _check_numbers(L: list, d: list, c: list, kinds: tuple[str, ...]) -> None:
     name = "dvax.generators.Elliptic"
     _tree.require(
         lambda: all(float(v) > 0 and np.isfinite(float(v)) for v in L), f"{name}(lengths)", L,
-        "lengths must be positive and finite", "Give the sides of the box",
+        "lengths must be positive and finite", "Give the side lengths of the box",
     )  # fmt: skip
     _tree.require(
         lambda: all(float(v) >= 0 and np.isfinite(float(v)) for v in d), f"{name}(diffusion)", d,
-        "a diffusion must be ≥ 0: backward in time nothing generates a semigroup",
-        "Mend its sign",
+        "the diffusion must be ≥ 0: a negative one generates no semigroup",
+        "Change its sign",
     )  # fmt: skip
     for axis, (v, kind) in enumerate(zip(c, kinds, strict=True)):
         if kind != "periodic" and not _is_zero(v):
@@ -265,7 +275,7 @@ def _check_numbers(L: list, d: list, c: list, kinds: tuple[str, ...]) -> None:
                     f"{name}(velocity)",
                     f"{_tree.short(v) if _tree.is_concrete(v) else 'a traced number'} along axis "
                     f"{axis}, which is {kind}",
-                    "advection is diagonal in waves alone, so its axis must be periodic",
-                    "Put the advection into f, or give the operator as a sparse matrix",
+                    "advection is diagonal only in the Fourier basis, so its axis must be periodic",
+                    "Add the advection to f, or use dvax.generators.Sparse",
                 )
             )

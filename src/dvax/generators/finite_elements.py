@@ -1,4 +1,4 @@
-"""Finite elements with a consistent mass matrix."""
+"""Finite-element generators with a consistent mass matrix."""
 
 import math
 from typing import Any
@@ -17,31 +17,33 @@ from .sparse import Sparse, Triplets, triplets
 
 
 class FiniteElements(AbstractMatrixFree):
-    """A = −M⁻¹S: M x' = −Sx + … for a mass matrix M and a stiffness matrix S, as they are assembled.
+    """A = −M⁻¹S, for M x' = −Sx + … with the assembled mass matrix M and stiffness matrix S.
 
-    M is symmetric and nearly its own diagonal D: the eigenvalues of D⁻¹M lie in the least interval
-    [l, h] that has those of every element (Wathen 1987), for simplices the same on any mesh. So M⁻¹
-    is a Chebyshev polynomial of fixed degree in D⁻¹M, exact to rounding: linear, differentiable,
-    self-adjoint with M, and no factorisation. With S ≥ 0 symmetric the semigroup contracts in the norm
-    of M, and in that of the space L2(D), where the sets of a response live, its bound is M = √(h/l).
+    M is symmetric with diagonal D. The eigenvalues of D⁻¹M lie in the smallest interval [l, h] that
+    contains those of every element matrix (Wathen 1987); for simplices it is the same on every mesh.
+    M⁻¹ is therefore applied as a Chebyshev polynomial of fixed degree in D⁻¹M, exact to roundoff. This
+    is linear, differentiable and self-adjoint, and needs no factorisation. For symmetric S ≥ 0 the
+    semigroup is a contraction in the norm of M. In the norm of the space L2(D), in which the sets of a
+    response are defined, its growth bound has M = √(h/l).
 
-    A product costs one with S and about 18√(h/l) with M: where a lumped mass will do,
-    `dvax.generators.Sparse` is that much cheaper.
+    A product with A costs one product with S and about 18√(h/l) with M. If a lumped mass matrix is
+    accurate enough, `dvax.generators.Sparse` is cheaper by this factor.
 
     **Arguments:**
 
-    - `mass`, `stiffness`: of SciPy, or `jax.experimental.sparse.BCOO` whose `data` may be traced;
-    - `mass_range`: (l, h). Gershgorin's circles by default, which suffice in one dimension. Where
-      they do not, declare it: (1/2, 2) for linear triangles, (1/2, 5/2) for linear tetrahedra,
-      (1/4, 9/4) for bilinear parallelograms, (1/8, 27/8) for trilinear parallelepipeds;
+    - `mass`, `stiffness`: sparse matrices of SciPy, or `jax.experimental.sparse.BCOO` whose `data`
+      may be traced;
+    - `mass_range`: (l, h). The default is computed from Gershgorin's circles, which suffice in one
+      dimension. Otherwise declare it: (1/2, 2) for linear triangles, (1/2, 5/2) for linear
+      tetrahedra, (1/4, 9/4) for bilinear parallelograms, (1/8, 27/8) for trilinear parallelepipeds;
     - `within`: a `dvax.generators.Range` that contains the numerical range of A in the inner product
-      of M, better than the circles do;
-    - `dissipative`: declares that vᵀSv ≥ 0 for all v, as for any stiffness matrix that was
-      assembled from elements. Circles see it on a rod, not where triangles are obtuse; the growth
-      bound is then far too large, and a long step too costly to be computed.
+      of M, if you know a tighter one than Gershgorin's circles;
+    - `dissipative`: declares that vᵀSv ≥ 0 for all v, as for any stiffness matrix assembled from
+      elements. Gershgorin's circles prove this in one dimension, but not for obtuse triangles. The
+      growth bound is then much too large, and a large step too expensive.
 
-    **Raises:** `dvax.InputError` where the matrices do not fit each other, M is not symmetric, or its
-    interval is not known to be positive.
+    **Raises:** `dvax.InputError` if the sizes of the matrices differ, M is not symmetric, or its
+    interval is not proved to be positive.
 
     Source: A. J. Wathen, Realistic eigenvalue bounds for the Galerkin mass matrix, IMA J. Numer. Anal.
     7 (1987), Table 1; Chebyshev's iteration: Saad, Iterative Methods for Sparse Linear Systems (2003),
@@ -84,58 +86,61 @@ class FiniteElements(AbstractMatrixFree):
         D = jnp.zeros(n, values.dtype).at[rows].add(jnp.where(rows == cols, values, 0.0))
         _tree.require(
             lambda: bool(np.all(np.asarray(D) > 0)), f"{name}(mass)", D,
-            "a mass matrix has a positive diagonal", "Mend the assembly, or drop unused nodes",
+            "the diagonal of a mass matrix must be positive",
+            "Correct the assembly, or remove unused nodes",
         )  # fmt: skip
-        # Both divided by D row by row: self-adjoint in L2(D), where M⁻¹S is (D⁻¹M)⁻¹ D⁻¹S.
-        self.mass = Sparse(_scaled(M, D), D)
-        self.stiffness = Sparse(_scaled(S, -D), D)
+        # M⁻¹S = (D⁻¹M)⁻¹ (D⁻¹S), and both factors are self-adjoint in L2(D).
+        self.mass = Sparse(_divide_rows(M, D), D)
+        self.stiffness = Sparse(_divide_rows(S, -D), D)
         self.diagonal = D
         low, high = _interval(self.mass, mass_range)
         self.middle = jnp.asarray((low + high) / 2, values.dtype)
         self.recursion = _chebyshev(low, high, float(jnp.finfo(values.dtype).eps))
         proved = mass_range is None
-        found = _divided(self.stiffness.range, low, high)._replace(proved=proved)
+        enclosure = _quotient_range(self.stiffness.range, low, high)._replace(proved=proved)
         if dissipative:
-            found = found._replace(high=jnp.minimum(found.high, 0.0), proved=False)
+            enclosure = enclosure._replace(high=jnp.minimum(enclosure.high, 0.0), proved=False)
         if within is not None:
-            found = within._replace(proved=False)
-        self.range = found._replace(weights=D, spread=high / low)
+            enclosure = within._replace(proved=False)
+        self.range = enclosure._replace(weights=D, spread=high / low)
 
     def apply(self, v: Tree) -> Tree:
-        return self._undo(self.stiffness.apply(v))
+        return self._solve_mass(self.stiffness.apply(v))
 
     def load(self, b: Any) -> jax.Array:
-        """M⁻¹b: the element of the state space for a load vector bᵢ = ∫ f φᵢ, as f of a problem needs
-        it."""
-        return self._undo(b / self.diagonal)
+        """Return M⁻¹b, the element of the state space for a load vector bᵢ = ∫ f φᵢ.
+
+        Use it in the f of a problem."""
+        return self._solve_mass(b / self.diagonal)
 
     def numerical_range(self) -> Range:
-        """What the circles, or `within`, enclose."""
+        """Return the enclosure from Gershgorin's circles, or `within`."""
         return self.range
 
-    def _undo(self, b: jax.Array) -> jax.Array:
-        """(D⁻¹M)⁻¹b."""
+    def _solve_mass(self, b: jax.Array) -> jax.Array:
+        """Return (D⁻¹M)⁻¹b."""
         step = b / self.middle
         if not self.recursion:
             return step
-        keep, add = jnp.asarray(np.transpose(self.recursion), step.dtype)
+        step_factors, residual_factors = jnp.asarray(np.transpose(self.recursion), step.dtype)
 
-        def one(k: Any, carry: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
-            x, rest, step = carry
-            x, rest = x + step, rest - self.mass.apply(step)
-            return x, rest, keep[k] * step + add[k] * rest
+        def iteration(k: Any, carry: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+            x, residual, step = carry
+            x, residual = x + step, residual - self.mass.apply(step)
+            return x, residual, step_factors[k] * step + residual_factors[k] * residual
 
-        x, _, step = jax.lax.fori_loop(0, len(self.recursion), one, (jnp.zeros_like(b), b, step))
+        start = (jnp.zeros_like(b), b, step)
+        x, _, step = jax.lax.fori_loop(0, len(self.recursion), iteration, start)
         return x + step
 
 
-def _scaled(matrix: Triplets, by: jax.Array) -> Triplets:
-    """The matrix with row i divided by `by`ᵢ."""
-    return matrix._replace(values=jnp.asarray(matrix.values) / by[matrix.rows])
+def _divide_rows(matrix: Triplets, divisors: jax.Array) -> Triplets:
+    """Return the matrix with row i divided by `divisors`ᵢ."""
+    return matrix._replace(values=jnp.asarray(matrix.values) / divisors[matrix.rows])
 
 
 def _interval(scaled: Sparse, declared: tuple[float, float] | None) -> tuple[float, float]:
-    """[l, h], wide enough for what rounding did to the matrix."""
+    """Return [l, h], enlarged by the roundoff of the matrix; raise an `InputError` unless l > 0."""
     name = "dvax.generators.FiniteElements(mass_range)"
     if declared is not None:
         low, high = map(float, declared)
@@ -144,22 +149,22 @@ def _interval(scaled: Sparse, declared: tuple[float, float] | None) -> tuple[flo
         if not _tree.is_concrete(scaled.range.low):
             raise InputError(
                 InputProblem(
-                    name, "none, with a mass matrix that is traced",
-                    "how often M is applied must be known before its values are",
-                    "Declare the interval: (1/2, 2) for linear triangles, say",
+                    name, "None, with a traced mass matrix",
+                    "the number of products with M must not depend on traced values",
+                    "Declare the interval, such as (1/2, 2) for linear triangles",
                 )
             )  # fmt: skip
         slack = 64 * float(jnp.finfo(scaled.range.low.dtype).eps)
         low = float(scaled.range.low) * (1 - slack)
         high = float(scaled.range.high) * (1 + slack)
-        given = f"none, and Gershgorin's circles give ({low:.3g}, {high:.3g})"
+        given = f"None, and Gershgorin's circles give ({low:.3g}, {high:.3g})"
     if not 0.0 < low <= high < math.inf:
         raise InputError(
             InputProblem(
                 name, given,
-                "M is inverted by a polynomial that is small on an interval 0 < l ≤ h with the "
-                "eigenvalues of D⁻¹M",
-                "Declare what the element has: (1/2, 2) for linear triangles, (1/2, 5/2) for linear "
+                "the eigenvalues of D⁻¹M must lie in a finite interval [l, h] with 0 < l ≤ h, on "
+                "which a polynomial approximates M⁻¹",
+                "Declare that of the element: (1/2, 2) for linear triangles, (1/2, 5/2) for linear "
                 "tetrahedra, (1/4, 9/4) for bilinear parallelograms, (1/8, 27/8) for trilinear boxes",
             )
         )  # fmt: skip
@@ -167,28 +172,31 @@ def _interval(scaled: Sparse, declared: tuple[float, float] | None) -> tuple[flo
 
 
 def _chebyshev(low: float, high: float, eps: float) -> tuple[tuple[float, float], ...]:
-    """The factors of a step's last one and of the residual, in every turn of the iteration."""
+    """Return the factors of the previous step and of the residual in each Chebyshev iteration."""
     theta, delta = (high + low) / 2, (high - low) / 2
     if delta <= 4 * eps * theta:
         return ()
     root = math.sqrt(high / low)
-    # The error falls below 2ρᵏ in the norm of M.
-    turns = math.ceil(math.log(2 * root / eps) / math.log((root + 1) / (root - 1)))
+    # The error after k iterations is at most 2ρᵏ in the norm of M.
+    iterations = math.ceil(math.log(2 * root / eps) / math.log((root + 1) / (root - 1)))
     sigma, factors = theta / delta, []
-    before = 1 / sigma
-    for _ in range(turns):
-        now = 1 / (2 * sigma - before)
-        factors.append((now * before, 2 * now / delta))
-        before = now
+    previous = 1 / sigma
+    for _ in range(iterations):
+        rho = 1 / (2 * sigma - previous)
+        factors.append((rho * previous, 2 * rho / delta))
+        previous = rho
     return tuple(factors)
 
 
-def _divided(found: Range, low: float, high: float) -> Range:
-    """{z/μ : z in the rectangle, l ≤ μ ≤ h}: ⟨Av, v⟩ over the two norms of v."""
+def _quotient_range(enclosure: Range, low: float, high: float) -> Range:
+    """Return an enclosure of {z/μ : z in the rectangle, l ≤ μ ≤ h}.
+
+    μ is the quotient of the squared norms of v in M and in D.
+    """
     return Range(
-        jnp.minimum(found.low / low, found.low / high),
-        jnp.maximum(found.high / low, found.high / high),
-        found.height / low,
+        jnp.minimum(enclosure.low / low, enclosure.low / high),
+        jnp.maximum(enclosure.high / low, enclosure.high / high),
+        enclosure.height / low,
     )
 
 
@@ -197,8 +205,9 @@ def _check(M: Triplets, S: Triplets) -> None:
     if M.size != S.size:
         raise InputError(
             InputProblem(
-                f"{name}(stiffness)", f"{S.size} rows, beside a mass matrix of {M.size}",
-                "both act on the same unknowns", "Assemble them over the same mesh and conditions",
+                f"{name}(stiffness)", f"{S.size} rows, with a mass matrix of {M.size} rows",
+                "both must act on the same unknowns",
+                "Assemble both with the same mesh and boundary conditions",
             )
         )  # fmt: skip
 
@@ -213,5 +222,5 @@ def _check(M: Triplets, S: Triplets) -> None:
 
     _tree.require(
         symmetric, f"{name}(mass)", M.values,
-        "a mass matrix is that of an inner product: symmetric", "Mend its assembly",
+        "a mass matrix must be symmetric", "Correct its assembly",
     )  # fmt: skip

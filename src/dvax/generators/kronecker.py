@@ -1,4 +1,4 @@
-"""A = F ⊗ 1 + 1 ⊗ B: every component of a field by itself, and all of them with each other."""
+"""Kronecker sums A = F ⊗ 1 + 1 ⊗ B: an operator on the grid plus a coupling of components."""
 
 from typing import Any
 
@@ -9,40 +9,40 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace, Euclidean
-from .abstract import AbstractPropagator, Arc, Growth
-from .bend import normwise_bend
+from .abstract import AbstractPropagator, FlowStep, Growth
+from .chord_deviation import normwise_chord_deviation
 from .dense import Dense
 from .diagonal import Diagonal
 from .elliptic import Elliptic
-from .expanded import AbstractModal, as_given, coefficients_of, values, with_coefficients
 from .phi import flow_factors, phi_matrix
 from .scalar import Scalar
+from .spectral_state import AbstractModal, coefficients_of, in_form_of, values, with_coefficients
 from .transforms import Transform
 
 _EXACT = jax.lax.Precision.HIGHEST
 
 
 class KroneckerSum(AbstractModal):
-    """(A v)ᵢ = F vᵢ + Σⱼ Bᵢⱼ vⱼ for states of m components on one grid, of shape (m, *grid): two
-    operators that commute, since F acts along the grid and B across the components. Species that
-    diffuse and react linearly, layers that exchange heat, a wave with friction.
+    """(A v)ᵢ = F vᵢ + Σⱼ Bᵢⱼ vⱼ for states of m components on a grid, of shape (m, *grid).
 
-    A is B + λ in every mode λ of F, so e^{hA} and the φ-functions are those of an m × m matrix a
-    mode, to rounding. They are made anew for every length of step, at the cost of about a hundred
-    products of such matrices a mode; a step itself costs m transforms and one product of a matrix
-    and a vector a mode.
+    The two operators commute, since F acts along the grid and B across the components. Examples are
+    species that diffuse and react linearly, layers that exchange heat, and a wave with friction.
 
-    The growth bound is M = 1 and ω = max Re λ + λ_max(½(B + Bᵀ)), where all points weigh alike.
+    For every eigenvalue λ of F, A acts as the m × m matrix B + λ. The φ-functions of these matrices
+    are computed to roundoff, for every new step size, at the cost of about a hundred products of such
+    matrices a mode. A step costs m transforms and one product of a matrix and a vector a mode.
+
+    The growth bound is M = 1 and ω = max Re λ + λ_max(½(B + Bᵀ)), if all points have the same weight.
 
     **Arguments:** `field`: `Elliptic`, `Diagonal` or `Scalar`, on the grid; `matrix`: B, m × m, in
     1/time.
 
-    **Raises:** `dvax.InputError` where the matrix is not square or the field is of another kind.
+    **Raises:** `dvax.InputError` if the matrix is not square or the field is of another type.
 
     ```python
     >>> import dvax, jax.numpy as jnp
     >>> g = dvax.generators
-    >>> exchange = jnp.array([[-1.0, 1.0], [1.0, -1.0]])            # what one loses the other gains
+    >>> exchange = jnp.array([[-1.0, 1.0], [1.0, -1.0]])            # exchange that conserves the sum
     >>> A = g.KroneckerSum(g.Elliptic(32, lengths=jnp.pi, boundary="neumann"), exchange)
     >>> s = (jnp.arange(32.0) + 0.5) * jnp.pi / 32
     >>> v = A.semigroup(1.0, jnp.stack([jnp.cos(s), -jnp.cos(s)]))  # −1 along s, −2 across
@@ -58,8 +58,8 @@ class KroneckerSum(AbstractModal):
     def __init__(self, field: Elliptic | Diagonal | Scalar, matrix: Any):
         _tree.check_kind(
             field, Elliptic | Diagonal | Scalar, "dvax.generators.KroneckerSum(field)",
-            "it is the generator on the grid: Elliptic, Diagonal or Scalar",
-            "Give that first, such as dvax.generators.Elliptic(32), and then the matrix",
+            "it must be a generator on the grid: Elliptic, Diagonal or Scalar",
+            "Pass the generator first, such as dvax.generators.Elliptic(32), then the matrix",
         )  # fmt: skip
         self.matrix = Dense(matrix).matrix
         self.field = field
@@ -69,9 +69,11 @@ class KroneckerSum(AbstractModal):
             self.matrix, v, axes=1, precision=_EXACT
         )
 
-    def expand(self, v: Tree, known: Tree = None) -> Tree:
+    def expand(self, v: Tree, coefficients: Tree = None) -> Tree:
         transform = _transform(self.field)
-        return v if transform is None else with_coefficients(v, known, jax.vmap(transform.forward))
+        if transform is None:
+            return v
+        return with_coefficients(v, coefficients, jax.vmap(transform.forward))
 
     def propagator(self, h: Any, terms: int) -> "ModalPropagator":
         rates = _rates(self.field)
@@ -92,31 +94,36 @@ class KroneckerSum(AbstractModal):
                 InputProblem(
                     "dvax.generators.KroneckerSum(matrix)",
                     f"shape {self.matrix.shape}",
-                    f"it acts across the first axis of the state, of shape {_tree.shapes(zeros)}",
+                    f"it acts on the first axis of the state, whose shape is {_tree.shapes(zeros)}",
                     f"Stack {m} components on one grid: x0 of shape ({m}, *grid)",
                 )
             )
         self.field.check(Euclidean(zeros.shape[1:]))
 
     def adjoint(self, space: AbstractSpace) -> "KroneckerSum":
-        alike = _spread(space)
+        weight_ratio = _norm_ratio(space)
         _tree.require(
-            lambda: float(alike) <= 1.0 + 1e-12, "dvax.generators.KroneckerSum.adjoint(space)",
-            alike, "where points weigh differently A* is no such sum",
-            "Use a space that weighs them alike",
+            lambda: float(weight_ratio) <= 1.0 + 1e-12,
+            "dvax.generators.KroneckerSum.adjoint(space)", weight_ratio,
+            "all points must have the same weight, or A* is no Kronecker sum",
+            "Use a space with one weight for all points",
         )  # fmt: skip
         return KroneckerSum(self.field.adjoint(Euclidean(space.zeros().shape[1:])), self.matrix.T)
 
     def growth(self, space: AbstractSpace) -> Growth:
-        own = jnp.linalg.eigvalsh(0.5 * (self.matrix + self.matrix.T))[-1]
-        return Growth(_spread(space), jnp.max(jnp.real(_rates(self.field))) + own)
+        coupling = jnp.linalg.eigvalsh(0.5 * (self.matrix + self.matrix.T))[-1]
+        return Growth(_norm_ratio(space), jnp.max(jnp.real(_rates(self.field))) + coupling)
 
-    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
-        return normwise_bend(self, Arc(arc.h, *values((arc.x0, arc.x1, arc.c))), space, growth)
+    def chord_deviation(self, step: FlowStep, space: AbstractSpace, growth: Growth) -> Tree:
+        step = FlowStep(step.h, *values((step.x0, step.x1, step.c)))
+        return normwise_chord_deviation(self, step, space, growth)
 
 
 class ModalPropagator(AbstractPropagator):
-    """One matrix a mode, of shape (*modes, m, m), between a transform of each component and back."""
+    """A propagator with one m × m matrix for every mode of a transform of the components.
+
+    The factors have the shape (*modes, m, m).
+    """
 
     transform: Transform | None
     factors: tuple[jax.Array, ...]
@@ -136,11 +143,11 @@ class ModalPropagator(AbstractPropagator):
         total = sum(parts[1:], start=parts[0])
         if self.transform is None:
             return total
-        return as_given(x0, total, jax.vmap(self.transform.backward))
+        return in_form_of(x0, total, jax.vmap(self.transform.backward))
 
 
 def _rates(field: Elliptic | Diagonal | Scalar) -> jax.Array:
-    """The eigenvalues of F, one a mode."""
+    """Return the eigenvalues of F, one a mode."""
     if isinstance(field, Elliptic):
         return field.symbol
     if isinstance(field, Diagonal):
@@ -152,7 +159,7 @@ def _transform(field: Elliptic | Diagonal | Scalar) -> Transform | None:
     return field.transform if isinstance(field, Elliptic) else None
 
 
-def _spread(space: AbstractSpace) -> jax.Array:
-    """How much the norm of a space may differ from the plain one, up to a factor."""
+def _norm_ratio(space: AbstractSpace) -> jax.Array:
+    """Return the ratio √(max w/min w) between the norm of the space and the Euclidean norm."""
     w = space.weights()
     return jnp.sqrt(jnp.max(w) / jnp.min(w))

@@ -1,12 +1,13 @@
-"""Transforms of n = 2m real numbers on a line by one Fourier transform of m complex ones, which for a
-single line libraries do in half the time.
+"""Real Fourier, cosine and sine transforms of n = 2m numbers by one complex transform of m numbers.
 
-With z = x₀ + ix₁, x₂ + ix₃, … and Z its transform, that of x is
+For a vector this takes half the time of the real transforms of the FFT libraries. With
+z = x₀ + ix₁, x₂ + ix₃, … and its transform Z, the transform of x is
 
     Fₖ = (½ + qₖ) Zₖ + (½ − qₖ) Z̄ₘ₋ₖ,    qₖ = −(i/2) e^{−2πik/n},    Zₘ = Z₀.
 
-Cosines and sines are 2 Re(aₖFₖ) and −2 Im(aₖFₖ) with aₖ = e^{−iπk/2n} (`transforms`), so sums of Re Z,
-Im Z and both backward with fixed factors. For these, n must be a multiple of four.
+The cosine and sine transforms are 2 Re(aₖFₖ) and −2 Im(aₖFₖ) with aₖ = e^{−iπk/2n} (`transforms`).
+They are therefore sums of Re Z and Im Z, in both orders, with fixed factors; n must be a multiple of
+four.
 """
 
 import functools
@@ -18,28 +19,28 @@ import jax.numpy as jnp
 import numpy as np
 
 
-def waves(x: jax.Array) -> jax.Array:
-    """Fₖ, k = 0, …, m."""
+def rfft(x: jax.Array) -> jax.Array:
+    """Return the Fourier coefficients Fₖ of real x, k = 0, …, m."""
     Z = jnp.fft.fft(jax.lax.complex(x[::2], x[1::2]))
     G = jnp.concatenate([Z, Z[:1]])
-    q = _turns(len(x) // 2, G.dtype)
+    q = _twiddles(len(x) // 2, G.dtype)
     return (0.5 + q) * G + (0.5 - q) * jnp.conj(jnp.flip(G))
 
 
-def of_waves(F: jax.Array) -> jax.Array:
-    """The real numbers with this transform."""
+def irfft(F: jax.Array) -> jax.Array:
+    """Return the real numbers with the Fourier coefficients F, the inverse of `rfft`."""
     m = len(F) - 1
-    # The first and the last are real, or taken to be.
-    inner = np.ones(m + 1)
-    inner[[0, m]] = 0.0
-    F = jax.lax.complex(jnp.real(F), jnp.asarray(inner, jnp.real(F).dtype) * jnp.imag(F))
-    q = jnp.conj(_turns(m, F.dtype))
+    # Ignore the imaginary parts of the first and the last coefficient.
+    mask = np.ones(m + 1)
+    mask[[0, m]] = 0.0
+    F = jax.lax.complex(jnp.real(F), jnp.asarray(mask, jnp.real(F).dtype) * jnp.imag(F))
+    q = jnp.conj(_twiddles(m, F.dtype))
     z = jnp.fft.ifft(((0.5 + q) * F + (0.5 - q) * jnp.conj(jnp.flip(F)))[:m])
     return jnp.stack([jnp.real(z), jnp.imag(z)], 1).reshape(2 * m)
 
 
-def cosines(x: jax.Array, sign: float) -> jax.Array:
-    """Σⱼ 2xⱼ cos(kπ(j + ½)/n), k = 0, …, n − 1; with the odd ones of x multiplied by `sign`."""
+def dct(x: jax.Array, sign: float) -> jax.Array:
+    """Return Σⱼ 2xⱼ cos(kπ(j + ½)/n), k = 0, …, n − 1, with xⱼ multiplied by `sign` for odd j."""
     m = len(x) // 2
     first, third = jax.lax.complex(x[::4], x[2::4]), jax.lax.complex(x[3::4], x[1::4])
     Z = jnp.fft.fft(jnp.concatenate([first, sign * jnp.flip(third)]))
@@ -53,15 +54,15 @@ def cosines(x: jax.Array, sign: float) -> jax.Array:
     return jnp.concatenate([2.0 * begin, low, math.sqrt(2.0) * middle, jnp.flip(high)])
 
 
-def of_cosines(c: jax.Array, sign: float) -> jax.Array:
-    """The numbers whose `cosines` these are."""
+def idct(c: jax.Array, sign: float) -> jax.Array:
+    """Return x with `dct(x, sign)` = c."""
     m = len(c) // 2
     up, down = c[1:m], jnp.flip(c[m + 1 :])
     left, right = jnp.flip(c[1:m]), c[m + 1 :]
     ar, ai, br, bi = _factors(m, c.dtype)[4:]
     real = ar * up + ai * down + br * left - bi * right
     imag = ai * up - ar * down + bi * left + br * right
-    # Z₀ has both the mean and what alternates.
+    # Z₀ contains the mean and the alternating component.
     begin, middle = 0.25 * c[:1], math.sqrt(0.125) * c[m : m + 1]
     Z = jnp.concatenate(
         [jax.lax.complex(begin + middle, begin - middle), jax.lax.complex(real, imag)]
@@ -72,22 +73,24 @@ def of_cosines(c: jax.Array, sign: float) -> jax.Array:
     return jnp.stack(columns, 1).reshape(2 * m)
 
 
-def _turns(m: int, dtype: Any) -> jax.Array:
-    """qₖ, k = 0, …, m."""
+def _twiddles(m: int, dtype: Any) -> jax.Array:
+    """Return qₖ, k = 0, …, m."""
     return jnp.asarray(-0.5j * np.exp(-1j * np.pi * np.arange(m + 1) / m), dtype)
 
 
 def _factors(m: int, dtype: Any) -> list[jax.Array]:
-    """Of Zₖ and Z̄ₘ₋ₖ in 2aₖFₖ, and of cₖ − icₙ₋ₖ and cₘ₋ₖ + icₘ₊ₖ in Zₖ, each by real and imaginary
-    part, for k = 1, …, m − 1."""
-    return [jnp.asarray(part, dtype) for part in _written_out(m)]
+    """Return the factors of the transforms for k = 1, …, m − 1, as real and imaginary parts.
+
+    These are the factors of Zₖ and Z̄ₘ₋ₖ in 2aₖFₖ, and those of cₖ − icₙ₋ₖ and cₘ₋ₖ + icₘ₊ₖ in Zₖ.
+    """
+    return [jnp.asarray(part, dtype) for part in _numpy_factors(m)]
 
 
 @functools.cache
-def _written_out(m: int) -> list[np.ndarray]:
+def _numpy_factors(m: int) -> list[np.ndarray]:
     k = np.arange(1, m)
     a = np.exp(-0.25j * np.pi * k / m)
     q = -0.5j * np.exp(-1j * np.pi * k / m)
-    there = a * (1 + 2 * q), a * (1 - 2 * q)
-    back = 0.5 * (0.5 + q.conj()) * a.conj(), 0.5 * (0.5 - q.conj()) * a[::-1]
-    return [part for factor in (*there, *back) for part in (factor.real, factor.imag)]
+    forward = a * (1 + 2 * q), a * (1 - 2 * q)
+    backward = 0.5 * (0.5 + q.conj()) * a.conj(), 0.5 * (0.5 - q.conj()) * a[::-1]
+    return [part for factor in (*forward, *backward) for part in (factor.real, factor.imag)]

@@ -1,4 +1,4 @@
-"""A known by its products and by where its numerical range lies."""
+"""Matrix-free generators, defined by products Av and an enclosure of the numerical range."""
 
 import abc
 from typing import Any
@@ -11,28 +11,29 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
-from .abstract import AbstractGenerator, Arc, Growth
-from .bend import normwise_bend
-from .faber import FaberPropagator, Range, propagator
+from .abstract import AbstractGenerator, FlowStep, Growth
+from .chord_deviation import normwise_chord_deviation
+from .faber import FaberPropagator, Range, faber_propagator
 
 
 class AbstractMatrixFree(AbstractGenerator):
-    """A generator of your own, through two methods: `apply`, the product Av, and `numerical_range`, a
-    rectangle that contains ⟨Av, v⟩/‖v‖² for all complex v.
+    """The base class of user-defined generators.
 
-    All else follows. e^{hA} and the φ-functions are Faber series of products, summed to rounding
-    (`dvax.generators.faber`); the growth bound is M = 1 with ω the right side of the rectangle, since
-    d/dt ½‖e^{At}v‖² = Re⟨A e^{At}v, e^{At}v⟩ ≤ ω‖e^{At}v‖². Both rest on the rectangle: one that is
-    too small makes the series diverge, one that is too large costs products. The number of products
-    for h‖A‖ large is about 6√(h‖A‖) where A is self-adjoint (height 0), and h‖A‖ where it is skew.
+    A subclass defines two methods: `apply`, the product Av, and `numerical_range`, a rectangle that
+    contains ⟨Av, v⟩/‖v‖² for all complex v. e^{hA} and the φ-functions are Faber series of products,
+    summed to roundoff (`dvax.generators.faber`). The growth bound is M = 1, and ω is the right side of
+    the rectangle, since d/dt ½‖e^{At}v‖² = Re⟨A e^{At}v, e^{At}v⟩ ≤ ω‖e^{At}v‖². Both depend on the
+    rectangle: if it is too small the series diverges; if it is too large there are more products than
+    necessary. For large h‖A‖ their number is about 6√(h‖A‖) if A is self-adjoint (height 0), and h‖A‖
+    if it is skew-adjoint.
 
-    `apply` must be linear and traceable by JAX; anything that it depends on and that is a field of the
-    class can be differentiated, forward and backward.
+    `apply` must be linear and traceable by JAX. Fields of the class that it depends on can be
+    differentiated in forward and reverse mode.
 
     ```python
     >>> import dvax, jax.numpy as jnp
     >>> class Chain(dvax.generators.AbstractMatrixFree):
-    ...     "A v = v_{i−1} − 2vᵢ + v_{i+1} between two walls: self-adjoint, eigenvalues in [−4, 0]."
+    ...     "A v = v_{i−1} − 2vᵢ + v_{i+1}, fixed ends: self-adjoint, eigenvalues in [−4, 0]."
     ...     def apply(self, v):
     ...         padded = jnp.pad(v, 1)
     ...         return padded[:-2] - 2.0 * v + padded[2:]
@@ -48,50 +49,50 @@ class AbstractMatrixFree(AbstractGenerator):
 
     @abc.abstractmethod
     def numerical_range(self) -> Range:
-        """The rectangle, and the inner product in which it is meant."""
+        """Return the rectangle, and the inner product to which it refers."""
 
     def propagator(self, h: Any, terms: int) -> FaberPropagator:
         h = jnp.asarray(h, float) if isinstance(h, int | float) else h
-        return propagator(self, self.numerical_range(), h, terms)
+        return faber_propagator(self, self.numerical_range(), h, terms)
 
     def check(self, space: AbstractSpace) -> None:
         v = space.zeros()
         try:
             out = jax.eval_shape(self.apply, v)
         except (TypeError, ValueError) as error:
-            raise self._misfit(v, f"which raises {type(error).__name__}: {error}") from error
+            raise self._shape_error(v, f"which raises {type(error).__name__}: {error}") from error
         if not _tree.same_shape(out, v):
-            raise self._misfit(v, f"which gives shape {_tree.shapes(out)}")
+            raise self._shape_error(v, f"which gives shape {_tree.shapes(out)}")
 
     def adjoint(self, space: AbstractSpace) -> "Adjoint":
         return Adjoint(self, space)
 
     def growth(self, space: AbstractSpace) -> Growth:
-        # The norm of the space lies between two multiples of the one in which the range is meant.
-        found = self.numerical_range()
+        # The norm of the space is equivalent to the norm of the enclosure, with this squared ratio.
+        enclosure = self.numerical_range()
         ratios = jtu.tree_map(
-            lambda w, own: jnp.ravel(w / own), *_alike(space.weights(), found.weights)
+            lambda w, w0: jnp.ravel(w / w0), *_same_structure(space.weights(), enclosure.weights)
         )
         ratio = jnp.concatenate(jtu.tree_leaves(ratios))
-        apart = found.spread * jnp.max(ratio) / jnp.min(ratio)
-        return Growth(jnp.sqrt(apart), jnp.asarray(found.high))
+        squared_ratio = enclosure.spread * jnp.max(ratio) / jnp.min(ratio)
+        return Growth(jnp.sqrt(squared_ratio), jnp.asarray(enclosure.high))
 
-    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
-        return normwise_bend(self, arc, space, growth)
+    def chord_deviation(self, step: FlowStep, space: AbstractSpace, growth: Growth) -> Tree:
+        return normwise_chord_deviation(self, step, space, growth)
 
-    def _misfit(self, v: Tree, what: str) -> InputError:
+    def _shape_error(self, v: Tree, what: str) -> InputError:
         return InputError(
             InputProblem(
                 f"{type(self).__name__}.apply",
                 f"v of shape {_tree.shapes(v)}, {what}",
-                "a generator maps the state space to itself",
-                "Mend apply, or name the space that you mean: state_space= of dvax.Problem",
+                "a generator must map the state space to itself",
+                "Correct apply, or pass state_space= to dvax.Problem",
             )
         )
 
 
 class Adjoint(AbstractMatrixFree):
-    """A* of a matrix-free A in a space: W⁻¹AᵀW for its weights W."""
+    """The adjoint A* = W⁻¹AᵀW of a matrix-free A in a space with weights W."""
 
     of: AbstractMatrixFree
     space: AbstractSpace
@@ -103,15 +104,17 @@ class Adjoint(AbstractMatrixFree):
         return jtu.tree_map(jnp.divide, out, w)
 
     def numerical_range(self) -> Range:
-        """That of A, which is its own mirror image. With v = W⁻¹W₀r it is ⟨A*v, v⟩ in the inner product
-        of W²/W₀ that equals ⟨Ar, r⟩ in that of W₀, and ‖v‖ = ‖r‖."""
-        found = self.of.numerical_range()
-        w, own = _alike(self.space.weights(), found.weights)
-        return found._replace(weights=jtu.tree_map(lambda w, own: w * w / own, w, own))
+        """Return the enclosure of A, which is symmetric to the real axis, with other weights.
+
+        For v = W⁻¹W₀r, ⟨A*v, v⟩ in the inner product of W²/W₀ equals the conjugate of ⟨Ar, r⟩ in that
+        of W₀, and ‖v‖ = ‖r‖."""
+        enclosure = self.of.numerical_range()
+        w, w0 = _same_structure(self.space.weights(), enclosure.weights)
+        return enclosure._replace(weights=jtu.tree_map(lambda w, w0: w * w / w0, w, w0))
 
 
-def _alike(a: Tree, b: Tree) -> tuple[Tree, Tree]:
-    """Two trees of weights with one structure: one number stands for any."""
+def _same_structure(a: Tree, b: Tree) -> tuple[Tree, Tree]:
+    """Return both trees of weights with the same structure: a single number is repeated."""
     if jtu.tree_structure(a) == jtu.tree_structure(b):
         return a, b
     if isinstance(b, tuple):

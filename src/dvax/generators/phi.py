@@ -1,4 +1,4 @@
-"""The φ-functions of a number and of a matrix."""
+"""φ-functions of numbers and of square matrices."""
 
 import functools
 import math
@@ -9,21 +9,21 @@ import jax.numpy as jnp
 from jax import lax
 
 from .._batch import largest_of_lanes
-from .turns import turns
+from .bounded_while import bounded_while
 
-_TERMS = 20  # of the Taylor series on |z| < 1: 1/20! is below double rounding
-_FEW = 8  # rows, up to which a call of a library costs more than a product
-_VERY_FEW = 3  # rows, up to which terms are added as they stand, not by a function of XLA's
-_LEVELS = 3  # 4³ halvings at most: norms up to 10¹⁹
+_TERMS = 20  # terms of the Taylor series on |z| < 1: 1/20! is below the roundoff of doubles
+_MAX_ROWS_BY_SUM = 8  # up to this size a library call takes longer than the product itself
+_MAX_ROWS_UNROLLED = 3  # up to this size unrolled sums are faster than a reduction
+_LOOP_DEPTH = 3  # at most 4³ halvings: norms up to 10¹⁹
 
 
 def phi_scalar(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
-    """(φ₀(z), …, φ_order(z)), elementwise, real or complex, to a few rounding errors.
+    """Return (φ₀(z), …, φ_order(z)), elementwise, real or complex, with errors of a few eps.
 
-    On |z| < 1 the recurrence φₖ₊₁ = (φₖ − 1/k!)/z cancels, so the highest one is summed as a Taylor
-    series and the others follow by the recurrence read downward, which is stable there; on |z| ≥ 1
-    it is read upward. Both branches are evaluated with a harmless argument where they are not
-    taken, so that derivatives stay finite.
+    On |z| < 1 the recurrence φₖ₊₁ = (φₖ − 1/k!)/z suffers from cancellation. There φ_order is summed
+    as a Taylor series, and the others follow from the downward recurrence, which is stable. On
+    |z| ≥ 1 the recurrence is applied upward. The branch that is not selected is evaluated at a
+    regular argument, so that derivatives remain finite.
     """
     if order == 0:
         return (jnp.exp(z),)
@@ -47,27 +47,27 @@ def phi_scalar(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
 
 
 def phi_matrix(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
-    """(φ₀(Z), …, φ_order(Z)) of a square matrix of any norm, to the rounding that Z itself has.
+    """Return (φ₀(Z), …, φ_order(Z)) of a square matrix of any norm, to the roundoff of Z.
 
-    On ‖Z‖ ≤ 1 as for a number: the highest one as a Taylor series, the others by the recurrence read
-    downward. A larger Z is halved s times, and then
+    For ‖Z‖ ≤ 1 the method is that for numbers: a Taylor series for the highest order, and the
+    downward recurrence for the others. A larger Z is halved s times, followed by s doublings
 
         φₖ(2Z) = 2⁻ᵏ (φ₀(Z)φₖ(Z) + Σⱼ φⱼ(Z)/(k − j)!),  j = 1, …, k
 
-    (Skaflestad and Wright 2009), with E = φ₀ − 1 in the place of φ₀, E(2Z) = E(Z)² + 2E(Z): what is
-    slow in a stiff Z keeps its digits, of which squaring φ₀ loses s binary ones.
+    (Skaflestad and Wright 2009), with E = φ₀ − 1 in place of φ₀, E(2Z) = E(Z)² + 2E(Z). This retains
+    the accuracy of the slow modes of a stiff Z, whereas squaring φ₀ loses s bits.
     """
     eye = jnp.eye(z.shape[0], dtype=z.dtype)
     norm = lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(z), axis=0)))
     halvings = jnp.ceil(jnp.log2(jnp.where(norm > 1.0, norm, 1.0)))
-    # What is not finite stays so; a norm near overflow is no generator's.
-    halvings = largest_of_lanes(jnp.clip(halvings, 0, 4**_LEVELS - 1).astype(int))
+    # The number is clipped: a non-finite Z gives non-finite results anyway.
+    halvings = largest_of_lanes(jnp.clip(halvings, 0, 4**_LOOP_DEPTH - 1).astype(int))
     small = z * jnp.exp2(-halvings.astype(norm.dtype)).astype(z.dtype)
 
     top = max(order, 1)
     series = [1.0 / math.factorial(top + j) for j in range(_TERMS - 1, -1, -1)]
     weights = jnp.asarray(series, z.dtype)
-    # A loop and not its turns: a program holds several of these, and all are compiled.
+    # Not unrolled, to limit compile time: a program contains several of these loops.
     taylor = lax.fori_loop(
         1, _TERMS, lambda j, sum_: _product(small, sum_) + weights[j] * eye, weights[0] * eye
     )
@@ -86,17 +86,18 @@ def phi_matrix(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
             new.append(0.5**k * total)
         return _product(E, E) + 2.0 * E, tuple(new)
 
-    E, phis = turns(halvings, double, (_product(small, phis[0]), phis), 1, (4,) * _LEVELS)
+    start = (_product(small, phis[0]), phis)
+    E, phis = bounded_while(halvings, double, start, 1, (4,) * _LOOP_DEPTH)
     return (eye + E, *phis)[: order + 1]
 
 
 def _product(a: jax.Array, b: jax.Array) -> jax.Array:
-    """That of two square matrices; of few numbers term by term, without a call of a library."""
-    if len(a) <= _VERY_FEW:
+    """Return the product of two square matrices, for small ones without a library call."""
+    if len(a) <= _MAX_ROWS_UNROLLED:
         return functools.reduce(jnp.add, [a[:, k, None] * b[None, k] for k in range(len(a))])
-    return jnp.sum(a[:, :, None] * b[None], axis=1) if len(a) <= _FEW else a @ b
+    return jnp.sum(a[:, :, None] * b[None], axis=1) if len(a) <= _MAX_ROWS_BY_SUM else a @ b
 
 
 def flow_factors(h: Any, phis: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-    """(e^{hA}, h 0! φ₁, h 1! φ₂, …): what a propagator multiplies x₀, c₀, c₁, … by."""
+    """Return (e^{hA}, h 0! φ₁, h 1! φ₂, …), the factors of x₀, c₀, c₁, … in a propagator."""
     return phis[0], *(h * math.factorial(j) * phi for j, phi in enumerate(phis[1:]))

@@ -1,4 +1,4 @@
-"""Complex spectrum on pairs of real arrays."""
+"""Generators with complex spectrum, for pairs of real arrays."""
 
 from typing import Any
 
@@ -10,26 +10,26 @@ from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
 from ..spaces import Product as ProductSpace
-from .abstract import AbstractPropagator, Arc, Growth
-from .expanded import AbstractModal, as_given, coefficients_of, with_coefficients
+from .abstract import AbstractPropagator, FlowStep, Growth
 from .phi import flow_factors, phi_scalar
+from .spectral_state import AbstractModal, coefficients_of, in_form_of, with_coefficients
 from .transforms import Transform, times
 
 
 class Rotation(AbstractModal):
-    """A (q, p) = (a q − b p, b q + a p): z = q + ip turns at the rate b and grows at the rate a, entry
-    by entry, or mode by mode of a transform. Its spectrum is a ± ib.
+    """A (q, p) = (a q − b p, b q + a p): z = q + ip rotates at the rate b and grows at the rate a.
 
-    With a = 0 it is skew: e^{tA} keeps ‖q‖² + ‖p‖². Schrödinger's equation iψ' = −Δψ is b = Δ's
-    eigenvalues with ψ = q + ip; the wave equation w'' = Δw is b = −√(−Δ) with q = √(−Δ) w, p = w',
-    whose norm is the energy. M = 1 and ω = max a where q and p are weighed alike, and, for modes, all
-    points of the grid.
+    A acts on each entry, or on each mode of a transform. Its spectrum is a ± ib. For a = 0 it is
+    skew-adjoint, and e^{tA} conserves ‖q‖² + ‖p‖². Schrödinger's equation iψ' = −Δψ has ψ = q + ip and
+    the eigenvalues of Δ as b. The wave equation w'' = Δw has b = −√(−Δ), q = √(−Δ) w and p = w', and
+    its squared norm is the energy. M = 1 and ω = max a if q and p have the same weights, and, with a
+    transform, all points of the grid as well.
 
     **Arguments:** `growth` = a and `turn` = b, real, in 1/time, of the shape of q and p, or of the
-    coefficients of `transform` (the `symbol` of a `dvax.generators.Elliptic` has it, and its
-    `transform` is the one to give).
+    coefficients of `transform`. For the modes of a `dvax.generators.Elliptic`, use its `symbol` and
+    pass its `transform`.
 
-    **Raises:** `dvax.InputError` where the shapes of a and b differ.
+    **Raises:** `dvax.InputError` if the shapes of a and b differ.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -56,16 +56,18 @@ class Rotation(AbstractModal):
                 InputProblem(
                     "dvax.generators.Rotation(growth, turn)",
                     f"shapes {self.a.shape} and {self.b.shape}",
-                    "both act on the same entries",
-                    "Give them one shape, or growth as a number",
+                    "both must have the same shape",
+                    "Give both the same shape, or growth as a number",
                 )
             )
 
     def apply(self, v: Tree) -> Tree:
-        return self.back(_turned(self.a, self.b, self.there(v)))
+        return self.backward(_multiply(self.a, self.b, self.forward(v)))
 
-    def expand(self, v: Tree, known: Tree = None) -> Tree:
-        return v if self.transform is None else with_coefficients(v, known, self.there)
+    def expand(self, v: Tree, coefficients: Tree = None) -> Tree:
+        if self.transform is None:
+            return v
+        return with_coefficients(v, coefficients, self.forward)
 
     def propagator(self, h: Any, terms: int) -> "RotationPropagator":
         z = jax.lax.complex(h * self.a, h * self.b)
@@ -81,11 +83,12 @@ class Rotation(AbstractModal):
             _tree.fits("dvax.generators.Rotation", like, part, "state space, part by part")
 
     def adjoint(self, space: AbstractSpace) -> "Rotation":
-        alike = self.growth(space).M
+        weight_ratio = self.growth(space).M
         _tree.require(
-            lambda: float(alike) <= 1.0 + 1e-12, "dvax.generators.Rotation.adjoint(space)", alike,
-            "where q and p, or points of the grid, weigh differently A* is no Rotation",
-            "Use a space that weighs them alike",
+            lambda: float(weight_ratio) <= 1.0 + 1e-12,
+            "dvax.generators.Rotation.adjoint(space)", weight_ratio,
+            "q and p, and all points of the grid, must have the same weight, or A* is no Rotation",
+            "Use a space with one weight for all points",
         )  # fmt: skip
         return Rotation(self.a, -self.b, self.transform)
 
@@ -93,7 +96,7 @@ class Rotation(AbstractModal):
         parts = space.spaces if isinstance(space, ProductSpace) else (space, space)
         first, second = (part.weights() for part in parts)
         if self.transform is None:
-            # Each pair turns by itself, so only what q and p weigh against each other matters.
+            # Each pair rotates independently, so only the ratio of the weights of q and p matters.
             ratio = first / second
             spread = jnp.maximum(jnp.max(ratio), jnp.max(1.0 / ratio))
         else:
@@ -101,49 +104,53 @@ class Rotation(AbstractModal):
             spread = jnp.maximum(jnp.max(first), jnp.max(second)) / low
         return Growth(jnp.sqrt(spread), jnp.max(self.a))
 
-    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
+    def chord_deviation(self, step: FlowStep, space: AbstractSpace, growth: Growth) -> Tree:
         # z'' = e^{λ(t−t₀)} z''(t₀) with λ = a + ib.
-        h, x0, _, c = arc
-        turn = lambda v: _turned(self.a, self.b, v)  # noqa: E731
-        start, first, *rest = (coefficients_of(v, self.there) for v in (x0, *c))
-        curvature = turn(_tree.add(turn(start), first))
-        if rest:
-            curvature = _tree.add(curvature, _tree.scale(1.0 / h, rest[0]))
-        # |q|² + |p|² is |z|² where q and p are real, and no less than half of it for complex modes.
-        size = jnp.sqrt(sum(jnp.real(v) ** 2 + jnp.imag(v) ** 2 for v in curvature))
-        largest = h**2 / 8 * jnp.exp(jnp.maximum(self.a, 0.0) * h) * size
-        if self.transform is not None:
-            shares = self.transform.shares().astype(largest.dtype)
-            largest = jnp.broadcast_to(jnp.sum(shares * largest), self.transform.shape)
-        return largest, largest
+        h, x0, _, c = step
 
-    def there(self, v: Tree) -> Tree:
-        """The coefficients, part by part, that the generator turns."""
+        def multiply(v: Tree) -> Tree:
+            return _multiply(self.a, self.b, v)
+
+        start, constant, *linear = (coefficients_of(v, self.forward) for v in (x0, *c))
+        curvature = multiply(_tree.add(multiply(start), constant))
+        if linear:
+            curvature = _tree.add(curvature, _tree.scale(1.0 / h, linear[0]))
+        # |q|² + |p|² is |z|² for real q and p, and at least |z|²/2 for complex coefficients.
+        size = jnp.sqrt(sum(jnp.real(v) ** 2 + jnp.imag(v) ** 2 for v in curvature))
+        bound = h**2 / 8 * jnp.exp(jnp.maximum(self.a, 0.0) * h) * size
+        if self.transform is not None:
+            amplitudes = self.transform.amplitudes().astype(bound.dtype)
+            bound = jnp.broadcast_to(jnp.sum(amplitudes * bound), self.transform.shape)
+        return bound, bound
+
+    def forward(self, v: Tree) -> Tree:
+        """Return the coefficients of both parts."""
         return v if self.transform is None else tuple(map(self.transform.forward, v))
 
-    def back(self, v: Tree) -> Tree:
-        """The pair with these coefficients."""
+    def backward(self, v: Tree) -> Tree:
+        """Return the pair with these coefficients."""
         return v if self.transform is None else tuple(map(self.transform.backward, v))
 
 
 class RotationPropagator(AbstractPropagator):
-    """Complex factors on pairs."""
+    """A propagator that multiplies pairs by complex factors."""
 
     generator: Rotation
     factors: tuple[jax.Array, ...]
 
     def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
-        pairs = [coefficients_of(v, self.generator.there) for v in (x0, *c)]
-        turned = [
-            _turned(jnp.real(f), jnp.imag(f), v) for f, v in zip(self.factors, pairs, strict=False)
+        pairs = [coefficients_of(v, self.generator.forward) for v in (x0, *c)]
+        products = [
+            _multiply(jnp.real(f), jnp.imag(f), v)
+            for f, v in zip(self.factors, pairs, strict=False)
         ]
-        total = turned[0]
-        for other in turned[1:]:
-            total = _tree.add(total, other)
-        return as_given(x0, total, self.generator.back)
+        total = products[0]
+        for product in products[1:]:
+            total = _tree.add(total, product)
+        return in_form_of(x0, total, self.generator.backward)
 
 
-def _turned(a: jax.Array, b: jax.Array, v: Tree) -> Tree:
-    """(a + ib)(q + ip) as a pair; q and p may be complex themselves, as coefficients of real fields."""
+def _multiply(a: jax.Array, b: jax.Array, v: Tree) -> Tree:
+    """Return (a + ib)(q + ip) as a pair; q and p may be complex coefficients of real fields."""
     q, p = v
     return times(a, q) - times(b, p), times(b, q) + times(a, p)

@@ -1,4 +1,4 @@
-"""A = a I."""
+"""Multiples A = a I of the identity."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace
-from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
+from .abstract import AbstractGenerator, AbstractPropagator, FlowStep, Growth
 from .phi import flow_factors, phi_scalar
 
 
@@ -47,15 +47,23 @@ class Scalar(AbstractGenerator):
     def growth(self, space: AbstractSpace) -> Growth:
         return Growth(jnp.ones(()), self.a)
 
-    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
-        h, *ends, c = arc
-        return jtu.tree_map(lambda *leaves: elementwise_bend(self.a, h, *leaves), *ends, *c)
+    def chord_deviation(self, step: FlowStep, space: AbstractSpace, growth: Growth) -> Tree:
+        h, *ends, c = step
+
+        def bound(*leaves: Any) -> jax.Array:
+            return elementwise_chord_deviation(self.a, h, *leaves)
+
+        return jtu.tree_map(bound, *ends, *c)
 
 
-def elementwise_bend(a: jax.Array, h: Any, x0: Any, x1: Any, c0: Any, c1: Any = None) -> jax.Array:
-    """For x' = ax + c₀ + c₁(t−t₀)/h with a real: x'' = x''(t₀)e^{a(t−t₀)} has one sign, so x' runs
-    monotonically between its ends and x is convex or concave. Then x leaves its chord by at most
-    h/4 |x'(t₁) − x'(t₀)|, and by at most h²/8 max|x''|."""
+def elementwise_chord_deviation(
+    a: jax.Array, h: Any, x0: Any, x1: Any, c0: Any, c1: Any = None
+) -> jax.Array:
+    """Return a bound on the distance of x from its chord, for x' = ax + c₀ + c₁(t−t₀)/h with a real.
+
+    x'' = x''(t₀)e^{a(t−t₀)} does not change its sign, so x' is monotone and x is convex or concave.
+    The deviation is therefore at most h/4 |x'(t₁) − x'(t₀)|, and at most h²/8 max|x''|.
+    """
     slope = jnp.zeros_like(c0) if c1 is None else c1
     v0, v1 = a * x0 + c0, a * x1 + c0 + slope
     w = jnp.maximum(jnp.abs(a * v0 + slope / h), jnp.abs(a * v1 + slope / h))
@@ -63,7 +71,7 @@ def elementwise_bend(a: jax.Array, h: Any, x0: Any, x1: Any, c0: Any, c1: Any = 
 
 
 class ElementwisePropagator(AbstractPropagator):
-    """Factors that multiply elementwise: A is a number or a diagonal."""
+    """A propagator with elementwise factors, for a scalar or diagonal A."""
 
     factors: tuple[jax.Array, ...]
 

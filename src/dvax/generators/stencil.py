@@ -1,4 +1,4 @@
-"""Three-point formulas on a box of equal cells."""
+"""Three-point finite differences on a box of equal cells."""
 
 import equinox as eqx
 import jax
@@ -8,10 +8,10 @@ from jax import lax
 
 
 class Stencil(eqx.Module):
-    """Σᵢ aᵢ (v₊ − 2v + v₋) − bᵢ (v₊ − v₋) + r v, where v± are the neighbours along axis i: what lies
-    beyond a face is the value before it, with its sign changed where the field is zero on the face.
+    """Σᵢ aᵢ (v₊ − 2v + v₋) − bᵢ (v₊ − v₋) + r v, where v± are the neighbours along axis i.
 
-    `second` holds the aᵢ = dᵢ/h², `first` the bᵢ = cᵢ/2h, None for an axis without a velocity.
+    The ghost value beyond a face is the adjacent interior value, with opposite sign for a Dirichlet
+    condition. `second` holds aᵢ = dᵢ/h², and `first` holds bᵢ = cᵢ/2h, or None without a velocity.
     """
 
     boundary: tuple[str, ...] = eqx.field(static=True)
@@ -24,23 +24,23 @@ class Stencil(eqx.Module):
         for axis, (kind, a, b) in enumerate(
             zip(self.boundary, self.second, self.first, strict=True)
         ):
-            before, behind = _neighbours(v, axis, kind)
-            out = out + a * ((behind - v) + (before - v))
+            left, right = _neighbours(v, axis, kind)
+            out = out + a * ((right - v) + (left - v))
             if b is not None:
-                out = out - b * (behind - before)
+                out = out - b * (right - left)
         return out
 
     def adjoint(self) -> "Stencil":
-        """With the velocity turned round."""
+        """Return the stencil with the opposite velocity."""
         return eqx.tree_at(lambda s: s.first, self, jtu.tree_map(jnp.negative, self.first))
 
 
 def _neighbours(v: jax.Array, axis: int, kind: str) -> tuple[jax.Array, jax.Array]:
-    """v₋ and v₊."""
+    """Return v₋ and v₊ along an axis."""
     n = v.shape[axis]
     first, last = (lax.slice_in_dim(v, k, k + 1, axis=axis) for k in (0, n - 1))
     sign = -1.0 if kind == "dirichlet" else 1.0
-    beyond = (last, first) if kind == "periodic" else (sign * first, sign * last)
-    before = lax.concatenate([beyond[0], lax.slice_in_dim(v, 0, n - 1, axis=axis)], axis)
-    behind = lax.concatenate([lax.slice_in_dim(v, 1, n, axis=axis), beyond[1]], axis)
-    return before, behind
+    ghosts = (last, first) if kind == "periodic" else (sign * first, sign * last)
+    left = lax.concatenate([ghosts[0], lax.slice_in_dim(v, 0, n - 1, axis=axis)], axis)
+    right = lax.concatenate([lax.slice_in_dim(v, 1, n, axis=axis), ghosts[1]], axis)
+    return left, right

@@ -1,4 +1,4 @@
-"""A = 0."""
+"""The zero generator A = 0."""
 
 from typing import Any
 
@@ -7,12 +7,12 @@ import jax.tree_util as jtu
 
 from .._tree import Tree
 from ..spaces import AbstractSpace
-from .abstract import AbstractGenerator, AbstractPropagator, Arc, Growth
-from .scalar import elementwise_bend
+from .abstract import AbstractGenerator, AbstractPropagator, FlowStep, Growth
+from .scalar import elementwise_chord_deviation
 
 
 class Zero(AbstractGenerator):
-    """A = 0 on any space: e^{At} = I, so M = 1 and ω = 0, and the mild solution is that of x' = f̃.
+    """A = 0 on any space: e^{At} = I, M = 1 and ω = 0. The mild solution solves x' = f̃.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -25,11 +25,11 @@ class Zero(AbstractGenerator):
     def apply(self, v: Tree) -> Tree:
         return jtu.tree_map(jnp.zeros_like, v)
 
-    def propagator(self, h: Any, terms: int) -> "Sum":
-        return Sum(jnp.asarray(h))
+    def propagator(self, h: Any, terms: int) -> "PolynomialIntegral":
+        return PolynomialIntegral(jnp.asarray(h))
 
     def check(self, space: AbstractSpace) -> None:
-        """It acts on everything."""
+        """Accept every space."""
 
     def adjoint(self, space: AbstractSpace) -> "Zero":
         return self
@@ -37,20 +37,23 @@ class Zero(AbstractGenerator):
     def growth(self, space: AbstractSpace) -> Growth:
         return Growth(jnp.ones(()), jnp.zeros(()))
 
-    def bend(self, arc: Arc, space: AbstractSpace, growth: Growth) -> Tree:
-        zero = lambda leaf: jnp.zeros((), leaf.dtype)  # noqa: E731
-        h, *ends, c = arc
-        return jtu.tree_map(lambda *v: elementwise_bend(zero(v[0]), h, *v), *ends, *c)
+    def chord_deviation(self, step: FlowStep, space: AbstractSpace, growth: Growth) -> Tree:
+        h, *ends, c = step
+
+        def bound(*leaves: Any) -> Any:
+            return elementwise_chord_deviation(jnp.zeros((), leaves[0].dtype), h, *leaves)
+
+        return jtu.tree_map(bound, *ends, *c)
 
 
-class Sum(AbstractPropagator):
+class PolynomialIntegral(AbstractPropagator):
     """x₀ + h Σⱼ cⱼ/(j + 1), since φ_{j+1}(0) = 1/(j + 1)!."""
 
     h: Any
 
     def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
-        def one(start: Any, *leaves: Any) -> Any:
-            shares = (leaf / (j + 1) for j, leaf in enumerate(leaves))
-            return start + self.h * sum(shares) if leaves else start
+        def integrate(start: Any, *leaves: Any) -> Any:
+            integrals = (leaf / (j + 1) for j, leaf in enumerate(leaves))
+            return start + self.h * sum(integrals) if leaves else start
 
-        return jtu.tree_map(one, x0, *c)
+        return jtu.tree_map(integrate, x0, *c)

@@ -184,7 +184,7 @@ class LinearMPC(eqx.Module):
         """γ = λ_min(H), L_F = λ_max(H), α_h = ‖G‖, β_h = ‖I − H‖, β_f = ‖B‖, and ω the logarithmic norm
         of A. `dvax.verify(mpc.problem, energy=True)` adds a rate of decay in a norm of its own."""
         A, B, H, G = _tree.host((self.A, self.B, self.H, self.G))
-        lib = _tree.library(A, B, H, G)
+        lib = _tree.array_module(A, B, H, G)
         ends = lib.linalg.eigvalsh(H)
         growth = Dense(self.A).growth(Euclidean(A.shape[:1]))
         return Constants(

@@ -1,4 +1,4 @@
-"""P: bounded, self-adjoint, coercive operators between the response u and y = P u."""
+"""Bounded, self-adjoint, coercive operators P, which map the response u to y = P u."""
 
 from .abstract import AbstractOperator as AbstractOperator
 from .abstract import Spectrum as Spectrum

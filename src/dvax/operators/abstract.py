@@ -1,4 +1,4 @@
-"""What P owes (paper, ass:operators (ii))."""
+"""The abstract operator P (paper, ass:operators (ii))."""
 
 import abc
 from typing import Any, NamedTuple
@@ -10,10 +10,10 @@ from ..spaces import AbstractSpace
 
 
 class Spectrum(NamedTuple):
-    """Ends of the spectrum of P: m‖v‖² ≤ ⟨Pv, v⟩ ≤ norm ‖v‖².
+    """Bounds of the spectrum of P: m‖v‖² ≤ ⟨Pv, v⟩ ≤ norm ‖v‖².
 
     `exact`: m and norm are the smallest and largest values of the spectrum; else they enclose it.
-    `declared`: they are what the caller says, and nothing here proves them.
+    `declared`: the caller declared them, without proof.
     """
 
     m: Any
@@ -23,7 +23,7 @@ class Spectrum(NamedTuple):
 
     @property
     def m_P(self) -> Any:
-        """Coercivity modulus of P⁻¹: min σ(P⁻¹) = 1/‖P‖."""
+        """The coercivity modulus of P⁻¹, min σ(P⁻¹) = 1/‖P‖."""
         return 1.0 / self.norm
 
     @property
@@ -33,20 +33,20 @@ class Spectrum(NamedTuple):
 
 
 class AbstractOperator(eqx.Module):
-    """P: linear, bounded, self-adjoint and coercive, with its inverse."""
+    """A linear, bounded, self-adjoint and coercive operator P with its inverse."""
 
     @abc.abstractmethod
     def apply(self, v: Tree) -> Tree:
-        """P v."""
+        """Return P v."""
 
     @abc.abstractmethod
     def inverse(self, v: Tree) -> Tree:
-        """P⁻¹ v."""
+        """Return P⁻¹ v."""
 
     @abc.abstractmethod
     def check(self, space: AbstractSpace) -> None:
-        """Raise an `InputError` where P is not self-adjoint and coercive in `space`."""
+        """Raise an `InputError` if P is not self-adjoint and coercive in `space`."""
 
     @abc.abstractmethod
     def spectrum(self, space: AbstractSpace) -> Spectrum:
-        """The ends of the spectrum in the inner product of `space`, saying what they rest on."""
+        """Return bounds of the spectrum in the inner product of `space`."""

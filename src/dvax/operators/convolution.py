@@ -1,4 +1,4 @@
-"""P as a periodic convolution: translation-invariant, diagonal in Fourier space."""
+"""Operators P that are periodic convolutions: translation-invariant, diagonal in Fourier space."""
 
 from collections.abc import Sequence
 from typing import Any, SupportsIndex
@@ -18,17 +18,16 @@ from .abstract import AbstractOperator, Spectrum
 class Convolution(AbstractOperator):
     """P v = 𝓕⁻¹(σ · 𝓕v) on a periodic grid of one or two dimensions, with a real symbol σ > 0.
 
-    An elastic half-space, or any other body that looks the same from every point of its surface,
-    gives such an operator: traction and displacement of wave number k are in the ratio σ(k). It is
-    self-adjoint where all points of the grid weigh the same, and its spectrum is the set of the
-    values of σ.
+    An elastic half-space, or any other body with a translation-invariant surface, has such an
+    operator: σ(k) is the ratio of traction and displacement at the wave number k. P is self-adjoint
+    if all points of the grid have the same weight. Its spectrum is the set of the values of σ.
 
     **Arguments:** `symbol`: σ at the wave numbers of `jnp.fft.rfftn`, an array of the shape
-    `(*shape[:-1], shape[-1] // 2 + 1)`; `shape`: that of the grid, an integer or a tuple of one or
-    two.
+    `(*shape[:-1], shape[-1] // 2 + 1)`; `shape`: of the grid, an integer or a tuple of one or two
+    integers.
 
-    **Raises:** `dvax.InputError` where a value is not positive and finite, or where σ(k) and σ(−k)
-    differ (in the two columns where both are stored): P v would not be real.
+    **Raises:** `dvax.InputError` if a value is not positive and finite, or if σ(k) and σ(−k) differ
+    in the two columns that contain both, since P v would not be real.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -54,8 +53,8 @@ class Convolution(AbstractOperator):
                 InputProblem(
                     "dvax.operators.Convolution(symbol, shape)",
                     f"shapes {jnp.shape(self.symbol)} and {self.shape}",
-                    f"the grid has one or two dimensions, and the symbol the shape {stored} of "
-                    "its rfftn",
+                    f"the grid must have one or two dimensions, and the symbol the shape {stored} "
+                    "of its rfftn",
                     "Evaluate the symbol at jnp.fft.fftfreq and, along the last axis, rfftfreq",
                 )
             )
@@ -63,15 +62,15 @@ class Convolution(AbstractOperator):
             lambda: jnp.all((self.symbol > 0) & jnp.isfinite(self.symbol)),
             name,
             self.symbol,
-            "P must be coercive and bounded, so its symbol is positive and finite",
-            "Give the wave number 0 a positive value: that of a rigid motion is often forgotten",
+            "P must be coercive and bounded, so its symbol must be positive and finite",
+            "Correct the values that are not; check the wave number 0, a rigid motion",
         )
         _tree.require(
-            lambda: _even(self.symbol, self.shape),
+            lambda: _is_even(self.symbol, self.shape),
             name,
             self.symbol,
-            "the symbol at k and −k must be the same, or P v is not real",
-            "Evaluate it at |k|, or average the two",
+            "the symbol must be equal at k and −k, or P v is not real",
+            "Evaluate it at |k|, or average both values",
         )
 
     def apply(self, v: Tree) -> Tree:
@@ -89,7 +88,7 @@ class Convolution(AbstractOperator):
                     name,
                     f"a grid of shape {self.shape}",
                     f"it acts on the control space, whose elements have shape {_tree.shapes(zeros)}",
-                    "Name the space: control_space= of dvax.Problem",
+                    "Pass control_space= to dvax.Problem",
                 )
             )
         weights = jnp.asarray(space.weights())
@@ -97,7 +96,7 @@ class Convolution(AbstractOperator):
             lambda: np.allclose(weights, np.asarray(weights).flat[0], rtol=1e-13, atol=0.0),
             name,
             weights,
-            "a convolution is self-adjoint only where all points weigh the same",
+            "all points must have the same weight, or a convolution is not self-adjoint",
             "Use dvax.operators.Dense, or a uniform grid",
         )
 
@@ -105,16 +104,17 @@ class Convolution(AbstractOperator):
         return Spectrum(jnp.min(self.symbol), jnp.max(self.symbol))
 
     def _filtered(self, symbol: jax.Array, v: Tree) -> jax.Array:
-        waves = jnp.fft.rfftn(v)
-        # Part by part: a real symbol is not cast to a complex one, nor to another precision.
-        filtered = jax.lax.complex(symbol * waves.real, symbol * waves.imag)
+        spectrum = jnp.fft.rfftn(v)
+        # Multiply real and imaginary parts separately, to avoid a cast of the symbol.
+        filtered = jax.lax.complex(symbol * spectrum.real, symbol * spectrum.imag)
         return jnp.fft.irfftn(filtered, self.shape)
 
 
-def _even(symbol: jax.Array, shape: tuple[int, ...]) -> bool:
-    """Whether σ(k) = σ(−k). Along the last axis −k is not stored, but for 0 and n/2."""
+def _is_even(symbol: jax.Array, shape: tuple[int, ...]) -> bool:
+    """Return whether σ(k) = σ(−k) in the columns 0 and n/2, the only ones that contain both."""
     if len(shape) == 1:
         return True
-    kept = np.asarray(symbol)[:, [0] if shape[-1] % 2 else [0, -1]]
-    opposite = np.roll(kept[::-1], 1, axis=0)
-    return np.allclose(kept, opposite, rtol=1e-6 if kept.dtype == np.float32 else 1e-12, atol=0.0)
+    columns = np.asarray(symbol)[:, [0] if shape[-1] % 2 else [0, -1]]
+    opposite = np.roll(columns[::-1], 1, axis=0)
+    rtol = 1e-6 if columns.dtype == np.float32 else 1e-12
+    return np.allclose(columns, opposite, rtol=rtol, atol=0.0)

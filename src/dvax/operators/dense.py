@@ -1,4 +1,4 @@
-"""P given as a symmetric positive definite matrix."""
+"""Operators P given by a symmetric positive definite matrix."""
 
 from typing import Any
 
@@ -16,10 +16,10 @@ from .abstract import AbstractOperator, Spectrum
 class Dense(AbstractOperator):
     """P v = matrix @ v, self-adjoint and positive definite in the control space's inner product.
 
-    In a Euclidean space the matrix is symmetric; with weights w, diag(w) @ matrix is.
+    In a Euclidean space the matrix must be symmetric; with weights w, diag(w) @ matrix must be.
 
-    **Raises:** `dvax.InputError` where the matrix is not square; and, when a `dvax.Problem` is made
-    of it, where it is not self-adjoint or not positive definite there.
+    **Raises:** `dvax.InputError` if the matrix is not square. `dvax.Problem` raises it if the operator
+    is not self-adjoint and positive definite in the control space.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -42,14 +42,14 @@ class Dense(AbstractOperator):
                 InputProblem(
                     name,
                     f"shape {shape}",
-                    "P maps the control space to itself, so its matrix is square",
+                    "P maps the control space to itself, so its matrix must be square",
                     "Use dvax.operators.Diagonal for a vector of diagonal entries",
                 )
             )
         if _tree.is_concrete(self.matrix):
             _check_positive(name, np.asarray(self.matrix))
-        # The law applies P⁻¹ at every evaluation: a stored inverse is one product that fuses with
-        # what surrounds it, a triangular solve is not; P is well conditioned or nothing else works.
+        # Every evaluation of the law applies P⁻¹. XLA fuses the product with a stored inverse, but
+        # not a triangular solve. The method requires a well-conditioned P in any case.
         self.inverse_matrix = jnp.linalg.inv(self.matrix)
 
     def apply(self, v: Tree) -> Tree:
@@ -66,19 +66,19 @@ class Dense(AbstractOperator):
             lambda: np.allclose(weighted, np.asarray(weighted).T, rtol=1e-13, atol=0.0),
             name,
             self.matrix,
-            f"P must be self-adjoint in {space!r}: diag(weights) @ matrix is symmetric",
-            "If only rounding is in the way, symmetrise the matrix before you give it",
+            f"P must be self-adjoint in {space!r}: diag(weights) @ matrix must be symmetric",
+            "If the asymmetry is roundoff, symmetrise the matrix",
         )
         _tree.require(
             lambda: self.spectrum(space).m > 0,
             name,
             self.matrix,
-            "P must be coercive, so every eigenvalue is positive",
+            "P must be coercive, so every eigenvalue must be positive",
             "Add a multiple of the identity",
         )
 
     def spectrum(self, space: AbstractSpace) -> Spectrum:
-        # Similar to W^{1/2} P W^{-1/2}, which is symmetric where P is self-adjoint for W.
+        # P is similar to W^{1/2} P W^{-1/2}, which is symmetric if P is self-adjoint for W.
         root = jnp.broadcast_to(jnp.sqrt(space.weights()), self.matrix.shape[:1])
         similar = root[:, None] * self.matrix / root[None, :]
         eigenvalues = jnp.linalg.eigvalsh(0.5 * (similar + similar.T))
@@ -86,23 +86,23 @@ class Dense(AbstractOperator):
 
 
 def _check_positive(name: str, matrix: np.ndarray) -> None:
-    """Raise an `InputError` where no inner product with diagonal weights makes P coercive."""
+    """Raise an `InputError` if P is coercive in no inner product with diagonal weights."""
     given = ""
     if not np.isfinite(matrix).all():
-        given = f"{_tree.short(matrix)}, which has entries that are not finite"
+        given = f"{_tree.short(matrix)}, with entries that are not finite"
     elif np.allclose(matrix, matrix.T, rtol=1e-13, atol=0.0):
-        given = _not_definite(matrix)
+        given = _describe_indefinite(matrix)
     elif (sign := np.linalg.slogdet(matrix)[0]) <= 0:  # the product of the eigenvalues
         kind = "a singular matrix" if sign == 0 else "a matrix with a negative determinant"
         given = f"{kind} (rank {np.linalg.matrix_rank(matrix)}, size {len(matrix)})"
     if given:
-        rule = "P must be bounded and coercive, so its matrix is finite and positive definite"
+        rule = "P must be bounded and coercive, so its matrix must be finite and positive definite"
         fix = "Correct the matrix, or add a multiple of the identity"
         raise InputError(InputProblem(name, given, rule, fix))
 
 
-def _not_definite(matrix: np.ndarray) -> str:
-    """What is wrong with a symmetric matrix that is not positive definite, else nothing."""
+def _describe_indefinite(matrix: np.ndarray) -> str:
+    """Return a description of a symmetric matrix, or "" if it is positive definite."""
     try:
         np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:

@@ -1,4 +1,4 @@
-"""P = diag(p₁, …, pₙ)."""
+"""Diagonal operators P = diag(p₁, …, pₙ)."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from .abstract import AbstractOperator, Spectrum
 class Diagonal(AbstractOperator):
     """P v = p ⊙ v, elementwise, with every pᵢ > 0.
 
-    **Raises:** `dvax.InputError` where an entry is not positive and finite.
+    **Raises:** `dvax.InputError` if an entry is not positive and finite.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -34,8 +34,8 @@ class Diagonal(AbstractOperator):
             lambda: jnp.all((self.entries > 0) & jnp.isfinite(self.entries)),
             "dvax.operators.Diagonal(entries)",
             self.entries,
-            "P must be coercive and bounded, so every entry is positive and finite",
-            "Leave out or regularise the entries that are not",
+            "P must be coercive and bounded, so every entry must be positive and finite",
+            "Remove or regularise the entries that are not",
         )
         self.inverse_entries = 1.0 / self.entries
 
@@ -46,7 +46,7 @@ class Diagonal(AbstractOperator):
         return self.inverse_entries * v
 
     def check(self, space: AbstractSpace) -> None:
-        # A positive diagonal is self-adjoint and coercive for every diagonal weight.
+        # A positive diagonal is self-adjoint and coercive for all diagonal weights.
         name = "dvax.operators.Diagonal(entries)"
         _tree.fits(name, self.entries, space.zeros(), "control space")
 

@@ -1,4 +1,4 @@
-"""P = P₁ ⊕ P₂ ⊕ … on tuples."""
+"""Direct sums P = P₁ ⊕ P₂ ⊕ … of operators, for tuples."""
 
 import jax.numpy as jnp
 
@@ -36,17 +36,17 @@ class Product(AbstractOperator):
 
     def check(self, space: AbstractSpace) -> None:
         _tree.fits_parts("dvax.operators.Product", len(self.parts), space.zeros(), "control space")
-        for part, own in zip(self.parts, _parts(space, len(self.parts)), strict=True):
-            part.check(own)
+        for part, part_space in zip(self.parts, _parts(space, len(self.parts)), strict=True):
+            part.check(part_space)
 
     def spectrum(self, space: AbstractSpace) -> Spectrum:
         pairs = zip(self.parts, _parts(space, len(self.parts)), strict=True)
-        ends = [part.spectrum(own) for part, own in pairs]
+        spectra = [part.spectrum(part_space) for part, part_space in pairs]
         return Spectrum(
-            jnp.min(jnp.stack([jnp.asarray(e.m) for e in ends])),
-            jnp.max(jnp.stack([jnp.asarray(e.norm) for e in ends])),
-            exact=all(e.exact for e in ends),
-            declared=any(e.declared for e in ends),
+            jnp.min(jnp.stack([jnp.asarray(s.m) for s in spectra])),
+            jnp.max(jnp.stack([jnp.asarray(s.norm) for s in spectra])),
+            exact=all(s.exact for s in spectra),
+            declared=any(s.declared for s in spectra),
         )
 
 

@@ -1,4 +1,4 @@
-"""P = b I."""
+"""Multiples P = b I of the identity."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from .abstract import AbstractOperator, Spectrum
 class Scaling(AbstractOperator):
     """P v = b v with b > 0.
 
-    **Raises:** `dvax.InputError` where b ≤ 0, as P would not be coercive, or b is not finite.
+    **Raises:** `dvax.InputError` if b ≤ 0 (P would not be coercive) or b is not finite.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -35,10 +35,10 @@ class Scaling(AbstractOperator):
             lambda: np.asarray(self.b) > 0 and np.isfinite(np.asarray(self.b)),
             "dvax.operators.Scaling(b)",
             self.b,
-            "P must be coercive and bounded, so b > 0 and finite",
-            "Give a positive scaling",
+            "P must be coercive and bounded, so b must be positive and finite",
+            "Give a positive number",
         )
-        # Kept: a division for every entry, at every evaluation, would cost more than the law.
+        # Stored: a division for every entry, at every evaluation, would cost more than the law.
         self.inverse_b = 1.0 / self.b
 
     def apply(self, v: Tree) -> Tree:
@@ -48,7 +48,7 @@ class Scaling(AbstractOperator):
         return _tree.scale(self.inverse_b, v)
 
     def check(self, space: AbstractSpace) -> None:
-        """Nothing to do: a positive multiple of I is both in every space."""
+        """Accept every space: a positive multiple of I is self-adjoint and coercive in all."""
 
     def spectrum(self, space: AbstractSpace) -> Spectrum:
         return Spectrum(self.b, self.b)

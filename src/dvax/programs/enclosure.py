@@ -333,8 +333,8 @@ def _loop(eqn: Any, given: list[Any]) -> list[Any]:
 # Rules for functions that dvax knows by name.
 
 
-def _standing(eqn: Any, given: list[Any]) -> LinearEnclosure:
-    """A box's lower bound: whether the box is empty is checked where the law is solved."""
+def _lower_or_inf(eqn: Any, given: list[Any]) -> LinearEnclosure:
+    """Enclose the lower bound of a box; the solver of the law checks whether the box is empty."""
     shape = eqn.outvars[0].aval.shape
     return _map(lambda part: jnp.broadcast_to(part, shape), _lift(given[0]))
 
@@ -549,7 +549,7 @@ _OF_ANY_TYPE: dict[str, Rule] = {
     "convert_element_type": _convert,
     "scan": _loop,
     **same_for(TABLES, _table),
-    "dvax_standing": _standing,
+    "dvax_lower_or_inf": _lower_or_inf,
     "dvax_evaluate": _refuse_evaluate,
     "searchsorted": _search,
 }

@@ -266,7 +266,7 @@ RULES: dict[str, Rule] = {
     "abs": _modulus,
     "select_n": lambda eqn, given: _one_of(eqn, given[1:]),
     **same_for(ORDERING | {"sign", "searchsorted"}, _no_lines),
-    **same_for(TABLES | {"dvax_standing", "dvax_evaluate"}, _no_lines),
+    **same_for(TABLES | {"dvax_lower_or_inf", "dvax_evaluate"}, _no_lines),
 }
 
 _FLAGS = ORDERING | LOGICAL | REARRANGING | {"eq", "ne", "reduce_precision"}

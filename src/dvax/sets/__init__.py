@@ -1,4 +1,4 @@
-"""Closed convex sets K: projection, membership, normal cone, in the inner product of a space."""
+"""Closed convex sets K with their projections in the inner product of a space."""
 
 from .abstract import AbstractSet as AbstractSet
 from .affine import AffineSubspace as AffineSubspace

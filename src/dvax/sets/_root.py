@@ -1,4 +1,4 @@
-"""Roots of decreasing functions of one number, with the derivative of the root itself."""
+"""Roots of decreasing scalar functions, differentiated by the differentiable_root function theorem."""
 
 from collections.abc import Callable
 
@@ -6,24 +6,27 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-_MOST = 100
+_MAX_ITERATIONS = 100
 
 
-def implicit(fn: Callable, find: Callable[[], jax.Array]) -> jax.Array:
-    """The root of `fn` that `find` returns, entry by entry, differentiated as a root: the
-    iteration that finds it is not."""
+def differentiable_root(fn: Callable, find: Callable[[], jax.Array]) -> jax.Array:
+    """Return the root of `fn` that `find` computes, entry by entry.
 
-    def slope_away(g: Callable, b: jax.Array) -> jax.Array:
+    The derivative follows from the differentiable_root function theorem; the iteration of `find` is not
+    differentiated.
+    """
+
+    def divide_by_slope(g: Callable, b: jax.Array) -> jax.Array:
         return b / g(jnp.ones_like(b))
 
     guess = lax.stop_gradient(find())
-    return lax.custom_root(fn, guess, lambda _, at: at, slope_away)
+    return lax.custom_root(fn, guess, lambda _, at: at, divide_by_slope)
 
 
-def in_unit_interval(fn: Callable[[jax.Array], jax.Array], like: jax.Array) -> jax.Array:
-    """The θ ∈ [0, 1] with fn(θ) = 0, for fn decreasing from ≥ 0 to ≤ 0, entry by entry.
+def root_in_unit_interval(fn: Callable[[jax.Array], jax.Array], like: jax.Array) -> jax.Array:
+    """Return θ ∈ [0, 1] with fn(θ) = 0, entry by entry, for fn decreasing from ≥ 0 to ≤ 0.
 
-    Newton's method, and bisection wherever a step would leave what is left of the interval.
+    Newton's method, safeguarded by bisection where a step would leave the bracketing interval.
     """
 
     def find() -> jax.Array:
@@ -33,15 +36,15 @@ def in_unit_interval(fn: Callable[[jax.Array], jax.Array], like: jax.Array) -> j
             low, high = jnp.where(value > 0, at, low), jnp.where(value < 0, at, high)
             newton = at - value / slope
             inside = (newton > low) & (newton < high)
-            # On an end of the interval, or at the root, there is no step to take.
+            # The iterate is unchanged at the root and once the bracket is two adjacent numbers.
             after = jnp.where(value == 0, at, jnp.where(inside, newton, 0.5 * (low + high)))
             return low, high, after, after != at, count + 1
 
-        def unsettled(state: tuple) -> jax.Array:
-            return jnp.any(state[3]) & (state[4] < _MOST)
+        def unconverged(state: tuple) -> jax.Array:
+            return jnp.any(state[3]) & (state[4] < _MAX_ITERATIONS)
 
         zero, one = jnp.zeros_like(like), jnp.ones_like(like)
         start = (zero, one, 0.5 * one, jnp.ones(like.shape, bool), 0)
-        return lax.while_loop(unsettled, advance, start)[2]
+        return lax.while_loop(unconverged, advance, start)[2]
 
-    return implicit(fn, find)
+    return differentiable_root(fn, find)

@@ -1,4 +1,4 @@
-"""The diagonal of a space's inner product, as the projections need it."""
+"""The weights of a space's diagonal inner product, in the form that the projections use."""
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -7,18 +7,18 @@ from .._tree import Tree
 from ..spaces import AbstractSpace
 
 
-def even(space: AbstractSpace) -> bool:
-    """Whether one number weighs every entry alike: projections are then those of ℝⁿ."""
+def has_uniform_weight(space: AbstractSpace) -> bool:
+    """Return whether all entries have the same weight: projections are then Euclidean."""
     leaves = jtu.tree_leaves(space.weights())
     return len(leaves) == 1 and jnp.ndim(leaves[0]) == 0
 
 
 def inverse_weights(space: AbstractSpace, like: Tree) -> Tree:
-    """1/w, entry by entry, shaped like the element `like`."""
+    """Return 1/w, entry by entry, shaped like the element `like`."""
 
     def one(leaf, w):
-        # The plain number of a Euclidean space takes the type of the element; weights that are
-        # data do not, so that a mixture of precisions is seen.
+        # A scalar weight takes the type of the element. An array of weights keeps its own type, so
+        # that mixed precision raises an error instead of a silent cast.
         w = jnp.asarray(w, jnp.result_type(leaf)) if jnp.ndim(w) == 0 else jnp.asarray(w)
         return jnp.broadcast_to(1.0 / w, jnp.shape(leaf))
 

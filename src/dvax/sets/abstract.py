@@ -1,4 +1,4 @@
-"""What a closed convex set owes."""
+"""The abstract closed convex set."""
 
 import abc
 
@@ -13,44 +13,49 @@ from ..spaces import AbstractSpace
 class AbstractSet(eqx.Module):
     """A nonempty closed convex set K in a Hilbert space.
 
-    **The convention at kinks.** The projection is differentiable except where its argument z meets
-    the boundary of K from outside or from inside. There `jax.grad` and `jax.jvp` return the
-    derivative of the *constrained* side: a point exactly on a bound counts as held by it. This one
-    choice, made here for every set, is what every derivative in dvax inherits.
+    **The convention at kinks.** The projection of z is differentiable unless z lies on the boundary
+    of K (or of a face). There `jax.grad` and `jax.jvp` return the derivative of the *constrained*
+    side: a point exactly on a bound counts as active. Every set follows this convention, and every
+    derivative in dvax inherits it.
 
-    **Derivatives** are with respect to the set's own data as well, since K may move. Where the
-    projection needs an iteration, it only finds which face or multiplier holds the point, with
-    derivatives cut; what is differentiated is the formula, or the equation, that holds there.
+    **Derivatives** exist with respect to the data of the set as well, since K may depend on time and
+    parameters. Where a projection iterates, the iteration only determines the active face or the
+    multiplier and is not differentiated; the derivative is that of the formula, or of the equation,
+    that is valid on that face.
 
-    **Data that are traced** cannot be looked at when the set is made. Where they turn out to describe
-    no set, the projection is NaN or infinite: it never passes for a point.
+    **Traced data** cannot be checked when the set is constructed. If they describe an empty set, the
+    projection is NaN or infinite, and so is never mistaken for a point of K.
     """
 
     @abc.abstractmethod
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
-        """proj_K(z), the nearest point of K in the norm of `space`."""
+        """Return proj_K(z), the nearest point of K in the norm of `space`."""
 
     @abc.abstractmethod
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array] | None:
-        """Continuous functions of z, proj_K being smooth in z wherever none of them is zero: a
-        trajectory's kinks are where one of them changes its sign. None where they are not known."""
+        """Return continuous functions of z such that proj_K is smooth in z where none of them is zero.
+
+        The kinks of a trajectory are the sign changes of these functions. Return None if no such
+        functions are available."""
 
     @abc.abstractmethod
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
-        """(lower, upper) with K = {lower ≤ y ≤ upper} pointwise, shaped like `like`; else None."""
+        """Return (lower, upper) with K = {lower ≤ y ≤ upper} pointwise, or None if K is not a box.
+
+        The bounds have the shape of `like`."""
 
     @abc.abstractmethod
     def check(self, like: Tree) -> None:
-        """Raise an `InputError` where K is empty or does not fit elements shaped like `like`."""
+        """Raise an `InputError` if K is empty or does not fit elements shaped like `like`."""
 
     def distance(self, z: Tree, space: AbstractSpace) -> jax.Array:
-        """d_K(z) = ‖z − proj_K(z)‖."""
+        """Return d_K(z) = ‖z − proj_K(z)‖."""
         return space.norm(_tree.sub(z, self.project(z, space)))
 
     def contains(self, y: Tree, space: AbstractSpace, tol: float = 0.0) -> jax.Array:
-        """Whether d_K(y) ≤ tol."""
+        """Return whether d_K(y) ≤ tol."""
         return self.distance(y, space) <= tol
 
     def normal_cone_residual(self, y: Tree, xi: Tree, space: AbstractSpace) -> jax.Array:
-        """‖y − proj_K(y + ξ)‖: zero exactly when ξ ∈ N_K(y) (paper, thm:equivalence_prelim)."""
+        """Return ‖y − proj_K(y + ξ)‖, zero exactly when ξ ∈ N_K(y) (paper, thm:equivalence_prelim)."""
         return space.norm(_tree.sub(y, self.project(_tree.add(y, xi), space)))

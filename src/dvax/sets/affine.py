@@ -9,25 +9,26 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
-from ._weights import even, inverse_weights
+from ._weights import has_uniform_weight, inverse_weights
 from .abstract import AbstractSet
 
-_ROUNDING = 0.75
-"""Equations hold where they do to eps^0.75 of what enters them: 2e-12 in double precision."""
+_ROUNDOFF_EXPONENT = 0.75
+"""An equation is satisfied if its residual is at most eps^0.75 of its terms: 2e-12 in double
+precision."""
 
 
 class AffineSubspace(AbstractSet):
     """K = {y : E y = e}, with plain sums (E y)ₖ = Σᵢ Eₖᵢ yᵢ whatever the space's weights.
 
-    proj_K(z) = z − R (E R)⁺ (E z − e) with R = diag(w)^{−1/2}, through the pseudoinverse, so that
-    equations may repeat each other. In a space without weights it is found once, with the set; it
-    is differentiable in E while the rank of E stays what it is.
+    proj_K(z) = z − R (E R)⁺ (E z − e) with R = diag(w)^{−1/2}. The pseudoinverse admits redundant
+    equations. In a space with one weight for all entries it is computed once, with the set. It is
+    differentiable in E as long as the rank of E is constant.
 
     **Arguments:** `E`: an array of shape (equations, *shape of y): a matrix where y is a vector;
     `e`: a vector, one value an equation.
 
-    **Raises:** `dvax.InputError` where the equations contradict each other, or are not finite.
-    Traced ones that turn out to do so project to NaN.
+    **Raises:** `dvax.InputError` if the equations are inconsistent or not finite. The projection is
+    NaN if traced equations are inconsistent.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -45,30 +46,30 @@ class AffineSubspace(AbstractSet):
 
     def __init__(self, E: Any, e: Any):
         name = "dvax.sets.AffineSubspace"
-        self.E, self.e = linear_rows(name, E, e, "E", "e")
-        rows, _ = unit_rows(self.E, self.e)
+        self.E, self.e = checked_rows(name, E, e, "E", "e")
+        rows, _ = normalised_conditions(self.E, self.e)
         self.pseudoinverse = jnp.linalg.pinv(rows)
         _tree.require(
-            lambda: consistent(self.E, self.e),
+            lambda: has_solution(self.E, self.e),
             f"{name}(E, e)",
             (self.E, self.e),
-            "E y = e has a solution, or the set is empty and the law has none",
-            "Drop or mend the equations that contradict the others",
+            "E y = e must have a solution, or the set is empty and the law has no solution",
+            "Remove or correct the equations that contradict the others",
         )
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
-        rows, values = unit_rows(self.E, self.e)
-        if even(space):
+        rows, values = normalised_conditions(self.E, self.e)
+        if has_uniform_weight(space):
             back = self.pseudoinverse
         else:
             root = jnp.sqrt(inverse_weights(space, z)).reshape(-1)
-            scaled, scale = unit(rows * root[None, :])
+            scaled, scale = normalise_rows(rows * root[None, :])
             back = root[:, None] * jnp.linalg.pinv(scaled) / scale[None, :]
         y = z.reshape(-1)
-        # Twice: what rounding leaves of a far-away z is seen from nearby.
+        # Iterative refinement: the second pass corrects the roundoff of a distant z.
         for _ in range(2):
             y = y - back @ (rows @ y - values)
-        return jnp.where(_solved(rows, values, y), y, jnp.nan).reshape(jnp.shape(z))
+        return jnp.where(_is_solution(rows, values, y), y, jnp.nan).reshape(jnp.shape(z))
 
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
         return []
@@ -77,11 +78,11 @@ class AffineSubspace(AbstractSet):
         return None
 
     def check(self, like: Tree) -> None:
-        fits_rows("dvax.sets.AffineSubspace(E)", self.E, like)
+        check_row_shapes("dvax.sets.AffineSubspace(E)", self.E, like)
 
 
-def linear_rows(name: str, E: Any, e: Any, left: str, right: str) -> tuple[jax.Array, jax.Array]:
-    """(E, e) of conditions on E y, looked at as far as their shapes and values are known."""
+def checked_rows(name: str, E: Any, e: Any, left: str, right: str) -> tuple[jax.Array, jax.Array]:
+    """Return (E, e) as arrays; raise an `InputError` if their shapes or concrete values are wrong."""
     E = _tree.as_array(E, f"{name}({left})")
     e = _tree.as_array(e, f"{name}({right})")
     if jnp.ndim(E) < 1 or jnp.shape(e) != jnp.shape(E)[:1] or jnp.shape(E)[0] == 0:
@@ -89,7 +90,7 @@ def linear_rows(name: str, E: Any, e: Any, left: str, right: str) -> tuple[jax.A
             InputProblem(
                 f"{name}({left}, {right})",
                 f"shapes {jnp.shape(E)} and {jnp.shape(e)}",
-                f"{left} has a row a condition and {right} a number a condition",
+                f"{left} must have one row, and {right} one number, for each condition",
                 f"Give {left} the shape (conditions, *shape of y) and {right} (conditions,)",
             )
         )
@@ -97,45 +98,45 @@ def linear_rows(name: str, E: Any, e: Any, left: str, right: str) -> tuple[jax.A
         lambda: jnp.all(jnp.isfinite(E)) & ~jnp.any(jnp.isnan(e)),
         f"{name}({left}, {right})",
         (E, e),
-        "conditions are made of numbers",
-        "Mend the entries that are not",
+        f"{left} must be finite and {right} must not be NaN",
+        "Correct the entries that are not",
     )
     return E, e
 
 
-def fits_rows(name: str, E: jax.Array, like: Tree) -> None:
+def check_row_shapes(name: str, E: jax.Array, like: Tree) -> None:
     """Raise an `InputError` unless the rows of E are shaped like the element `like`."""
     if isinstance(like, tuple) or jnp.shape(E)[1:] != jnp.shape(like):
         raise InputError(
             InputProblem(
                 name,
                 f"shape {jnp.shape(E)}",
-                f"every row acts on y = P u, of shape {_tree.shapes(like)}",
+                f"every row must have the shape {_tree.shapes(like)} of y = P u",
                 "Give it the shape (conditions, *shape of y)",
             )
         )
 
 
-def unit_rows(E: jax.Array, e: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The same conditions with rows of length one, as a matrix; rows that are zero stay so."""
-    rows, scale = unit(E.reshape(E.shape[0], -1))
+def normalised_conditions(E: jax.Array, e: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the same conditions as a matrix with rows of length one; zero rows are unchanged."""
+    rows, scale = normalise_rows(E.reshape(E.shape[0], -1))
     return rows, e / scale
 
 
-def consistent(E: jax.Array, e: jax.Array) -> jax.Array:
-    """Whether E y = e has a solution, up to rounding."""
-    rows, values = unit_rows(E, e)
+def has_solution(E: jax.Array, e: jax.Array) -> jax.Array:
+    """Return whether E y = e has a solution, up to roundoff."""
+    rows, values = normalised_conditions(E, e)
     back = jnp.linalg.pinv(rows)
     y = back @ values
-    # Corrected as `project` does: rows that are nearly parallel leave much of the rounding.
+    # Iterative refinement as in `project`: nearly parallel rows amplify roundoff.
     for _ in range(2):
         y = y - back @ (rows @ y - values)
-    return jnp.all(jnp.isfinite(e)) & _solved(rows, values, y)
+    return jnp.all(jnp.isfinite(e)) & _is_solution(rows, values, y)
 
 
-def unit(rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(rows scaled to length one, what they were divided by); rows that are zero stay so."""
-    # The largest entry is taken out first: squares of very small ones would vanish.
+def normalise_rows(rows: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return (rows scaled to length one, the scale factors); zero rows are unchanged."""
+    # Divide by the largest entry first: the squares of very small entries would underflow.
     largest = jnp.max(jnp.abs(rows), axis=1, initial=0.0)
     largest = jnp.where(largest == 0, 1.0, largest)
     square = jnp.sum((rows / largest[:, None]) ** 2, axis=1)
@@ -143,6 +144,6 @@ def unit(rows: jax.Array) -> tuple[jax.Array, jax.Array]:
     return rows / scale[:, None], scale
 
 
-def _solved(rows: jax.Array, values: jax.Array, y: jax.Array) -> jax.Array:
-    slack = jnp.finfo(jnp.result_type(y)).eps ** _ROUNDING
+def _is_solution(rows: jax.Array, values: jax.Array, y: jax.Array) -> jax.Array:
+    slack = jnp.finfo(jnp.result_type(y)).eps ** _ROUNDOFF_EXPONENT
     return jnp.all(jnp.abs(rows @ y - values) <= slack * (jnp.abs(values) + jnp.linalg.norm(y)))

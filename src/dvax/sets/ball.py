@@ -15,9 +15,9 @@ from .abstract import AbstractSet
 class Ball(AbstractSet):
     """K = {y : ‖y − center‖ ≤ radius} in the norm of the space.
 
-    **Arguments:** `center`: an element, or a number that stands for a constant one; `radius` ≥ 0.
+    **Arguments:** `center`: an element, or a number for all entries; `radius` ≥ 0.
 
-    **Raises:** `dvax.InputError` where the radius is negative or not finite.
+    **Raises:** `dvax.InputError` if the radius is negative or not finite.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -37,16 +37,16 @@ class Ball(AbstractSet):
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         offset = self._minus_center(z)
         length = space.norm(offset)
-        inside = length < self.radius  # NaN in z, center or radius is not inside: it comes out
+        inside = length < self.radius  # false for NaN in z, center or radius, so NaN propagates
         shrink = jnp.where(inside, 1.0, self.radius / jnp.where(length > 0, length, 1.0))
-        moved = _tree.scale(shrink, offset)
-        # Inside, z itself: center + (z − center) would lose digits for a far-away center.
-        pulled = (
-            _tree.add(self.center, moved)
+        scaled = _tree.scale(shrink, offset)
+        # Inside, return z itself: center + (z − center) has roundoff for a distant center.
+        on_sphere = (
+            _tree.add(self.center, scaled)
             if _tree.same_shape(self.center, z)
-            else jax.tree_util.tree_map(lambda leaf: self.center + leaf, moved)
+            else jax.tree_util.tree_map(lambda leaf: self.center + leaf, scaled)
         )
-        return _tree.where(inside, z, pulled)
+        return _tree.where(inside, z, on_sphere)
 
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
         return [self.radius - space.norm(self._minus_center(z))]
@@ -63,7 +63,7 @@ class Ball(AbstractSet):
                 InputProblem(
                     "dvax.sets.Ball(center, radius)",
                     f"shapes {_tree.shapes(self.center)} and {jnp.shape(self.radius)}",
-                    f"the center is an element of shape {_tree.shapes(like)} or a number, "
+                    f"the center must be an element of shape {_tree.shapes(like)} or a number, "
                     "the radius a number",
                     "Use dvax.sets.Product for one ball a part",
                 )
@@ -76,24 +76,24 @@ class Ball(AbstractSet):
 
 
 def center_and_radius(name: str, center: Any, radius: Any) -> tuple[Tree, jax.Array]:
-    """Those of a ball of any norm, looked at as far as their values are known."""
+    """Return (center, radius) as arrays; raise an `InputError` if their concrete values are wrong."""
     center = _tree.as_float(center, f"{name}(center)")
     radius = _tree.as_array(radius, f"{name}(radius)")
     _tree.require(
         lambda: jnp.all((radius >= 0) & jnp.isfinite(radius)),
         f"{name}(radius)",
         radius,
-        "a ball has a finite radius ≥ 0, or it is empty or the whole space",
+        "the radius must be finite and ≥ 0, or the ball is empty or the whole space",
         "Use dvax.sets.WholeSpace() where there is no constraint",
     )
     _tree.require(
         lambda: _tree.all_finite(center),
         f"{name}(center)",
         center,
-        "a center is a point, with finite entries",
-        "Mend the entries that are not",
+        "the entries of the center must be finite",
+        "Correct the entries that are not",
     )
     if not _tree.is_concrete(radius):
-        # Not known yet: a negative one is made NaN, so that an empty ball stops a solve.
+        # A traced radius: replace a negative one by NaN, so that an empty ball stops a solve.
         radius = jnp.where(radius >= 0, radius, jnp.nan)
     return center, radius

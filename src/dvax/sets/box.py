@@ -16,13 +16,13 @@ from .abstract import AbstractSet
 class Box(AbstractSet):
     """K = {y : lower ≤ y ≤ upper} pointwise; bounds may be infinite.
 
-    The projection clips pointwise. That is the projection of every space whose inner product is
-    diagonal (Euclidean, or with quadrature weights), which all spaces of dvax are; with a full mass
-    matrix it would not be.
+    The projection clips pointwise. This is the projection in every space with a diagonal inner
+    product (Euclidean, or with quadrature weights), as all spaces of dvax have. It would not be the
+    projection in the inner product of a full mass matrix.
 
     **Arguments:** `lower`, `upper`: numbers or arrays, broadcast against y.
 
-    **Raises:** `dvax.InputError` where lower > upper, or a bound is NaN, or lower = +∞.
+    **Raises:** `dvax.InputError` if lower > upper, a bound is NaN, or lower = +∞.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -42,12 +42,12 @@ class Box(AbstractSet):
         shapes = jnp.shape(self.lower), jnp.shape(self.upper)
         if shapes[0] != shapes[1]:
             _check_shapes(*shapes)
-        # In NumPy: in JAX each check is a program of its own, slower than a hundred small steps.
+        # In NumPy: JAX compiles a program for each check, which takes longer than 100 small steps.
         _tree.require(
             lambda: np.all(np.asarray(self.lower) <= np.asarray(self.upper)),
             "dvax.sets.Box(lower, upper)",
             _crossing(self.lower, self.upper),
-            "lower ≤ upper everywhere, or the set is empty and the law has no solution",
+            "lower ≤ upper must hold everywhere, or the set is empty and the law has no solution",
             "Swap the bounds, or widen the interval",
         )
         _tree.require(
@@ -56,18 +56,18 @@ class Box(AbstractSet):
             ),
             "dvax.sets.Box(lower, upper)",
             (self.lower, self.upper),
-            "lower < +∞ and upper > −∞, or the set is empty",
-            "Use −∞ and +∞ for the sides that are free",
+            "lower < +∞ and upper > −∞ must hold, or the set is empty",
+            "Use lower = −∞ and upper = +∞ for unbounded sides",
         )
 
         if not _tree.is_concrete((self.lower, self.upper)):
-            # Bounds that move are not known yet. Where they cross (or are NaN) the projection is
-            # made infinite, so that an empty set stops a solve instead of passing for a point.
-            self.lower = dvax_standing(self.lower, self.upper)
+            # Traced bounds have no values yet. Where they cross (or are NaN) the projection is
+            # infinite, so that an empty set stops a solve.
+            self.lower = dvax_lower_or_inf(self.lower, self.upper)
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
-        # At a bound the bound's own derivative is taken: the convention of AbstractSet. Selections
-        # are also what is fastest: minimum and maximum must look for NaN and signed zeros.
+        # At a bound the derivative is that of the bound: the convention of AbstractSet. Selections
+        # are also faster than minimum and maximum, which handle NaN and signed zeros.
         lower, upper = self.intervals(z)
         return jnp.where(z <= lower, lower, jnp.where(z >= upper, upper, z))
 
@@ -77,7 +77,7 @@ class Box(AbstractSet):
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree]:
         def one(bound: jax.Array) -> jax.Array:
-            # Bounds that were Python numbers take the type of what they bound.
+            # Bounds given as Python numbers take the type of `like`.
             common = jnp.result_type(bound, like)
             bound = bound if bound.dtype == common else bound.astype(common)
             return jnp.broadcast_to(bound, jnp.shape(like))
@@ -118,13 +118,14 @@ def _check_shapes(lower: tuple[int, ...], upper: tuple[int, ...]) -> None:
         raise InputError(
             InputProblem(
                 "dvax.sets.Box(lower, upper)", f"shapes {lower} and {upper}",
-                "both bound the same entries", "Give both one shape, or a number for all entries",
+                "the shapes of both bounds must broadcast",
+                "Give both the same shape, or a number for all entries",
             )
         ) from None  # fmt: skip
 
 
 def _crossing(lower: jax.Array, upper: jax.Array) -> Any:
-    """The bounds as a message shows them: those of the first entry where they cross or are NaN."""
+    """Return the bounds for a message: those of the first entry where they cross or are NaN."""
     if not _tree.is_concrete((lower, upper)):
         return lower, upper
     low, up = np.broadcast_arrays(np.asarray(lower), np.asarray(upper))
@@ -137,7 +138,10 @@ def _crossing(lower: jax.Array, upper: jax.Array) -> Any:
 
 
 @jax.jit
-def dvax_standing(lower: jax.Array, upper: jax.Array) -> jax.Array:
-    """The lower bound, infinite where the interval is empty. A function of its own, by whose name an
-    enclosure over time knows that it is the lower bound wherever there is a set at all."""
+def dvax_lower_or_inf(lower: jax.Array, upper: jax.Array) -> jax.Array:
+    """Return the lower bound, or +∞ where the interval is empty.
+
+    `dvax.programs.enclosure` has a rule for a jitted function of this name: its value is the lower
+    bound wherever the set is not empty.
+    """
     return jnp.where(lower <= upper, lower, jnp.inf)

@@ -1,4 +1,4 @@
-"""Ellipsoids, along the axes or turned."""
+"""Ellipsoids, with axes along the coordinates or rotated."""
 
 from typing import Any
 
@@ -10,27 +10,27 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
-from ._root import implicit
-from ._weights import even, inverse_weights
+from ._root import differentiable_root
+from ._weights import has_uniform_weight, inverse_weights
 from .abstract import AbstractSet
 
-_MOST = 100
+_MAX_ITERATIONS = 100
 
 
 class Ellipsoid(AbstractSet):
     """K = {y : (y − c)ᵀ S⁻¹ (y − c) ≤ 1}, with plain sums whatever the space's weights.
 
-    With ζ = z − c outside, proj_K(z) = c + S (S + λW⁻¹)⁻¹ ζ for the λ > 0 that puts it on the surface:
-    the root of the secular equation ‖S^{1/2}(S + λW⁻¹)⁻¹ζ‖ = 1, by Newton's method on the reciprocal
-    of its left side, which is nearly linear and climbs to the root from the left (Moré and Sorensen
-    1983). A point on the surface is held by it.
+    With ζ = z − c outside, proj_K(z) = c + S (S + λW⁻¹)⁻¹ ζ, where λ > 0 is the root of the secular
+    equation ‖S^{1/2}(S + λW⁻¹)⁻¹ζ‖ = 1. Newton's method is applied to the reciprocal of its left side,
+    which is nearly linear, and increases monotonically to the root (Moré and Sorensen 1983). A point
+    on the surface counts as active.
 
-    **Arguments:** `center`: an array of the shape of y, or a number that stands for a constant one;
-    and one of `radii` > 0: the half-axes along the coordinates, S = diag(radii²), a number or an
-    array of the shape of y; `shape`: the symmetric positive definite matrix S, where y is a vector.
+    **Arguments:** `center`: an array of the shape of y, or a number for all entries; and one of
+    `radii` > 0: the half-axes along the coordinates, S = diag(radii²), a number or an array of the
+    shape of y; `shape`: the symmetric positive definite matrix S, if y is a vector.
 
-    **Raises:** `dvax.InputError` where a radius is not positive and finite, or S is not symmetric
-    positive definite. Traced ones that turn out so project to NaN.
+    **Raises:** `dvax.InputError` if a radius is not positive and finite, or S is not symmetric
+    positive definite. The projection is NaN if traced data violate these conditions.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -53,36 +53,37 @@ class Ellipsoid(AbstractSet):
             lambda: _tree.all_finite(self.center),
             f"{name}(center)",
             self.center,
-            "a center is a point, with finite entries",
-            "Mend the entries that are not",
+            "the entries of the center must be finite",
+            "Correct the entries that are not",
         )
         if (radii is None) == (shape is None):
             raise InputError(
                 InputProblem(
                     f"{name}(radii, shape)",
                     "neither" if radii is None else "both",
-                    "the half-axes along the coordinates or the matrix S make the ellipsoid",
+                    "an ellipsoid is defined by its half-axes along the coordinates or by its matrix S",
                     "Give one of radii= and shape=",
                 )
             )
         self.radii = self.shape = self.principal = None
         if radii is not None:
-            self.radii = _known_radii(f"{name}(radii)", radii)
+            self.radii = _checked_radii(f"{name}(radii)", radii)
             return
-        self.shape = _known_matrix(f"{name}(shape)", shape)
-        # Kept for spaces without weights, so that a solver's loop need not find them again.
-        self.principal = _principal(self.shape)
+        self.shape = _checked_matrix(f"{name}(shape)", shape)
+        # Computed once for spaces with one weight for all entries: a solver's loop reuses the axes.
+        self.principal = _principal_axes(self.shape)
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         offset = z - jnp.broadcast_to(self.center, z.shape)
         inverse_w = inverse_weights(space, z)
         if self.radii is not None:
-            inside, kept = _straight(jnp.broadcast_to(self.radii, z.shape), offset, inverse_w)
+            radii = jnp.broadcast_to(self.radii, z.shape)
+            inside, on_surface = _project_axis_aligned(radii, offset, inverse_w)
         else:
-            known = self.principal if even(space) else None
-            inside, kept = _turned(self.shape, known, offset, inverse_w)
-        # Inside, z itself: c + (z − c) would lose digits for a far-away center.
-        return jnp.where(inside, z, self.center + kept)
+            principal = self.principal if has_uniform_weight(space) else None
+            inside, on_surface = _project_rotated(self.shape, principal, offset, inverse_w)
+        # Inside, return z itself: c + (z − c) has roundoff for a distant center.
+        return jnp.where(inside, z, self.center + on_surface)
 
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
         offset = z - jnp.broadcast_to(self.center, z.shape)
@@ -94,8 +95,8 @@ class Ellipsoid(AbstractSet):
         return None
 
     def check(self, like: Tree) -> None:
-        own = self.shape if self.radii is None else self.radii
-        shape, given = _tree.shapes(like), () if own is None else own.shape
+        data = self.shape if self.radii is None else self.radii
+        shape, given = _tree.shapes(like), () if data is None else data.shape
         fits = not isinstance(like, tuple) and jnp.shape(self.center) in ((), shape)
         if self.shape is None:
             fits = fits and given in ((), shape)
@@ -106,39 +107,42 @@ class Ellipsoid(AbstractSet):
                 InputProblem(
                     "dvax.sets.Ellipsoid(center, radii, shape)",
                     f"shapes {jnp.shape(self.center)} and {given}",
-                    f"center and radii have the shape {shape} of y = P u or are numbers; "
+                    f"center and radii must have the shape {shape} of y = P u or be numbers; "
                     "a matrix acts on vectors",
                     "Use dvax.sets.Product for one ellipsoid a part",
                 )
             )
 
 
-def _straight(
+def _project_axis_aligned(
     radii: jax.Array, offset: jax.Array, inverse_w: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """(inside, the projection minus c), S diagonal: in the coordinates as they are."""
+    """Return (whether inside, projection − c) for the diagonal S = diag(radii²)."""
     inside = _norm(offset / radii) < 1.0
-    offset = jnp.where(inside, radii, offset)  # where no root is asked for, one that exists
+    offset = jnp.where(inside, radii, offset)  # inside, any point for which a root exists
     square = radii * radii / inverse_w
 
     def surface(lam: jax.Array) -> jax.Array:
         return _norm(offset / radii * (square / (square + lam))) - 1.0
 
     fixed = lax.stop_gradient((offset * jnp.sqrt(1.0 / inverse_w), jnp.sqrt(square)))
-    lam = implicit(surface, lambda: _multiplier(*fixed))
+    lam = differentiable_root(surface, lambda: _multiplier(*fixed))
     return inside, offset * (square / (square + lam))
 
 
-def _turned(
+def _project_rotated(
     matrix: Any,
-    known: tuple[jax.Array, jax.Array] | None,
+    principal: tuple[jax.Array, jax.Array] | None,
     offset: jax.Array,
     inverse_w: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """(inside, the projection minus c): the multiplier in the principal axes, whose derivatives
-    need not exist, and all that is differentiated in the coordinates as they are."""
+    """Return (whether inside, projection − c) for a full matrix S.
+
+    The multiplier is computed in the principal axes, whose derivatives need not exist. Everything
+    that is differentiated is computed in the given coordinates.
+    """
     inside = offset @ jnp.linalg.solve(matrix, offset) < 1.0
-    # Where no root is asked for, one that exists: an axis' end is on or outside the surface.
+    # Inside, any point for which a root exists: this corner is on or outside the surface.
     corner = jnp.sqrt(jnp.sum(jnp.diagonal(matrix))) * jnp.ones_like(offset)
     offset = jnp.where(inside, lax.stop_gradient(corner), offset)
 
@@ -151,19 +155,19 @@ def _turned(
 
     def find() -> jax.Array:
         root_w = 1.0 / jnp.sqrt(inverse_w)
-        axes, lengths = known or _principal(root_w[:, None] * matrix * root_w[None, :])
+        axes, lengths = principal or _principal_axes(root_w[:, None] * matrix * root_w[None, :])
         return _multiplier(axes.T @ (root_w * offset), lengths)
 
-    return inside, matrix @ at(implicit(surface, find))
+    return inside, matrix @ at(differentiable_root(surface, find))
 
 
 def _multiplier(zeta: jax.Array, lengths: jax.Array) -> jax.Array:
-    """The λ ≥ 0 with ‖lengths ζ/(lengths² + λ)‖ = 1, for a ζ outside."""
+    """Return λ ≥ 0 with ‖lengths ζ/(lengths² + λ)‖ = 1, for ζ outside the ellipsoid."""
     unit = jnp.max(lengths)
     zeta, lengths = zeta / unit, lengths / unit
     square = lengths * lengths
 
-    def climb(state: tuple) -> tuple:
+    def newton_step(state: tuple) -> tuple:
         _, lam, count = state
         y = lengths * zeta / (square + lam)
         norm = _norm(y)
@@ -171,36 +175,36 @@ def _multiplier(zeta: jax.Array, lengths: jax.Array) -> jax.Array:
         step = (norm - 1.0) / jnp.sum(share * share / (square + lam))
         return lam, lam + step, count + 1
 
-    def climbing(state: tuple) -> jax.Array:
+    def is_increasing(state: tuple) -> jax.Array:
         before, lam, count = state
-        return (lam > before) & (count < _MOST)
+        return (lam > before) & (count < _MAX_ITERATIONS)
 
-    # The longest axis alone gives a bound from the left.
+    # Replacing every half-axis by the longest one gives a lower bound of λ.
     start = jnp.maximum(_norm(lengths * zeta) - 1.0, 0.0)
-    _, lam, _ = lax.while_loop(climbing, climb, climb((start, start, 0)))
+    _, lam, _ = lax.while_loop(is_increasing, newton_step, newton_step((start, start, 0)))
     return jnp.maximum(lam, 0.0) * unit * unit
 
 
-def _known_radii(name: str, given: Any) -> jax.Array:
+def _checked_radii(name: str, given: Any) -> jax.Array:
     radii = _tree.as_array(given, name)
     _tree.require(
         lambda: jnp.all((radii > 0) & jnp.isfinite(radii)),
         name,
         radii,
-        "half-axes are positive and finite, or the set is flat, empty or unbounded",
-        "Use dvax.sets.Product with a dvax.sets.Box for the directions that are flat or free",
+        "half-axes must be positive and finite, or the set is flat, empty or unbounded",
+        "Use dvax.sets.Product with a dvax.sets.Box for fixed or unbounded directions",
     )
     return jnp.where(radii > 0, radii, jnp.nan)
 
 
-def _known_matrix(name: str, given: Any) -> jax.Array:
+def _checked_matrix(name: str, given: Any) -> jax.Array:
     matrix = _tree.as_array(given, name)
     if jnp.ndim(matrix) != 2 or matrix.shape[0] != matrix.shape[1]:
         raise InputError(
             InputProblem(
                 name,
                 f"shape {jnp.shape(matrix)}",
-                "the matrix of an ellipsoid is square",
+                "the matrix of an ellipsoid must be square",
                 "Use radii= for half-axes along the coordinates",
             )
         )
@@ -212,7 +216,7 @@ def _known_matrix(name: str, given: Any) -> jax.Array:
         ),
         name,
         matrix,
-        "the matrix of an ellipsoid is symmetric and positive definite",
+        "the matrix of an ellipsoid must be symmetric and positive definite",
         "Symmetrise it, or add a multiple of the identity",
     )
     symmetric = 0.5 * (matrix + matrix.T)
@@ -220,8 +224,8 @@ def _known_matrix(name: str, given: Any) -> jax.Array:
     return jnp.where(smallest > 0, symmetric, jnp.nan)
 
 
-def _principal(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(axes, half-axes) of the ellipsoid with this matrix."""
+def _principal_axes(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return (axes, half-axes) of the ellipsoid with this matrix."""
     squares, axes = jnp.linalg.eigh(lax.stop_gradient(matrix))
     return axes, jnp.sqrt(squares)
 

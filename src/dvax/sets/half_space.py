@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from .._tree import Tree
 from ..spaces import AbstractSpace
 from .abstract import AbstractSet
-from .hyperplane import along_normal, excess, fits_row, one_row
+from .hyperplane import check_row_shape, checked_row, excess, subtract_along_normal
 
 
 class HalfSpace(AbstractSet):
@@ -19,7 +19,7 @@ class HalfSpace(AbstractSet):
     **Arguments:** `normal`: a, an element (an array of any shape, or a tuple of arrays), not zero;
     `offset`: b, a number.
 
-    **Raises:** `dvax.InputError` where the normal is zero, or something is not finite.
+    **Raises:** `dvax.InputError` if the normal is zero, or an entry is not finite.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -34,12 +34,13 @@ class HalfSpace(AbstractSet):
     offset: jax.Array
 
     def __init__(self, normal: Any, offset: Any):
-        self.normal, self.offset = one_row("dvax.sets.HalfSpace", normal, offset)
+        self.normal, self.offset = checked_row("dvax.sets.HalfSpace", normal, offset)
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         above = excess(self.normal, self.offset, z)
-        # Strictly below the plane nothing is held; on it, and where there is no number, all is.
-        return along_normal(z, jnp.where(above < 0, 0.0, above), self.normal, space)
+        # Inactive strictly below the plane; active on it. The comparison is false for NaN, which
+        # therefore propagates.
+        return subtract_along_normal(z, jnp.where(above < 0, 0.0, above), self.normal, space)
 
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
         return [-excess(self.normal, self.offset, z)]
@@ -48,4 +49,4 @@ class HalfSpace(AbstractSet):
         return None
 
     def check(self, like: Tree) -> None:
-        fits_row("dvax.sets.HalfSpace", self.normal, self.offset, like)
+        check_row_shape("dvax.sets.HalfSpace", self.normal, self.offset, like)

@@ -22,7 +22,7 @@ class Hyperplane(AbstractSet):
     **Arguments:** `normal`: a, an element (an array of any shape, or a tuple of arrays), not zero;
     `offset`: b, a number.
 
-    **Raises:** `dvax.InputError` where the normal is zero, or something is not finite.
+    **Raises:** `dvax.InputError` if the normal is zero, or an entry is not finite.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -37,10 +37,10 @@ class Hyperplane(AbstractSet):
     offset: jax.Array
 
     def __init__(self, normal: Any, offset: Any):
-        self.normal, self.offset = one_row("dvax.sets.Hyperplane", normal, offset)
+        self.normal, self.offset = checked_row("dvax.sets.Hyperplane", normal, offset)
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
-        return along_normal(z, excess(self.normal, self.offset, z), self.normal, space)
+        return subtract_along_normal(z, excess(self.normal, self.offset, z), self.normal, space)
 
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
         return []
@@ -49,11 +49,11 @@ class Hyperplane(AbstractSet):
         return None
 
     def check(self, like: Tree) -> None:
-        fits_row("dvax.sets.Hyperplane", self.normal, self.offset, like)
+        check_row_shape("dvax.sets.Hyperplane", self.normal, self.offset, like)
 
 
-def one_row(name: str, normal: Any, offset: Any) -> tuple[Tree, jax.Array]:
-    """(a, b) of a linear condition, looked at as far as their values are known."""
+def checked_row(name: str, normal: Any, offset: Any) -> tuple[Tree, jax.Array]:
+    """Return (a, b) as arrays; raise an `InputError` if their concrete values are wrong."""
     normal = _tree.as_float(normal, f"{name}(normal)")
     several = "Use dvax.sets.Polyhedron or dvax.sets.AffineSubspace for several conditions"
     offset = _tree.as_number(offset, f"{name}(offset)", several)
@@ -63,43 +63,43 @@ def one_row(name: str, normal: Any, offset: Any) -> tuple[Tree, jax.Array]:
         ),
         f"{name}(normal)",
         normal,
-        "the normal is finite and not zero, or the condition says nothing about y",
+        "the normal must be finite and not zero, or the condition does not restrict y",
         "Use dvax.sets.WholeSpace() where there is no constraint",
     )
     _tree.require(
         lambda: jnp.isfinite(offset),
         f"{name}(offset)",
         offset,
-        "the offset is a finite number",
+        "the offset must be a finite number",
         "Use dvax.sets.WholeSpace() where there is no constraint",
     )
     return normal, offset
 
 
-def fits_row(name: str, normal: Tree, offset: jax.Array, like: Tree) -> None:
-    """Raise an `InputError` unless the normal is an element shaped like `like`, the offset a number."""
+def check_row_shape(name: str, normal: Tree, offset: jax.Array, like: Tree) -> None:
+    """Raise an `InputError` unless the normal is shaped like `like` and the offset is a number."""
     if jnp.ndim(offset) != 0 or not _tree.same_shape(normal, like):
         raise InputError(
             InputProblem(
                 f"{name}(normal, offset)",
                 f"shapes {_tree.shapes(normal)} and {jnp.shape(offset)}",
-                f"the normal is an element, of shape {_tree.shapes(like)}, and the offset a number",
+                f"the normal must have the shape {_tree.shapes(like)}, and the offset be a number",
                 "Use dvax.sets.AffineSubspace or dvax.sets.Polyhedron for several conditions",
             )
         )
 
 
 def excess(normal: Tree, offset: jax.Array, z: Tree) -> jax.Array:
-    """Σᵢ aᵢzᵢ − b."""
+    """Return Σᵢ aᵢzᵢ − b."""
     products = jtu.tree_map(lambda a, v: jnp.sum(a * v), normal, z)
     return sum(jtu.tree_leaves(products), start=-offset)
 
 
-def along_normal(z: Tree, amount: jax.Array, normal: Tree, space: AbstractSpace) -> Tree:
-    """z moved along the normal of the space's inner product until Σᵢ aᵢzᵢ is less by `amount`."""
-    # Scaled to one first: the square of a very small normal would vanish.
+def subtract_along_normal(z: Tree, amount: jax.Array, normal: Tree, space: AbstractSpace) -> Tree:
+    """Return z minus the multiple of a/w that reduces Σᵢ aᵢzᵢ by `amount`."""
+    # Normalise first: the square of a very small normal would underflow.
     size = sum(jnp.sum(jnp.abs(a)) for a in jtu.tree_leaves(normal))
-    size = jnp.where(size > 0, size, jnp.nan)  # a traced normal may turn out to be zero
+    size = jnp.where(size > 0, size, jnp.nan)  # a traced normal may be zero
     unit = jtu.tree_map(lambda a: a / size, normal)
     direction = jtu.tree_map(jnp.multiply, unit, inverse_weights(space, normal))
     square = sum(jtu.tree_leaves(jtu.tree_map(lambda a, v: jnp.sum(a * v), unit, direction)))

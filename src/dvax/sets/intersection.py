@@ -1,4 +1,4 @@
-"""K₁ ∩ K₂ ∩ …, where only the projection onto each is known."""
+"""Intersections K₁ ∩ K₂ ∩ … of sets, from the projections onto each set."""
 
 from typing import Any
 
@@ -16,22 +16,24 @@ from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
 from .abstract import AbstractSet
 
-_DENSE = 512
+_MAX_DENSE_SIZE = 512
+"""Number of unknowns up to which the derivative uses a dense pseudoinverse; beyond, CG."""
 
 
 class Intersection(AbstractSet):
     """K = K₁ ∩ … ∩ Kₘ, projected by Dykstra's method (Boyle and Dykstra 1986).
 
-    Cycle through the sets, yₖ = proj_Kₖ(x + qₖ), qₖ ← x + qₖ − yₖ, x ← yₖ: always z = x + Σ qₖ with
-    qₖ normal to Kₖ at yₖ, and x → proj_K(z).
+    Cycle through the sets, yₖ = proj_Kₖ(x + qₖ), qₖ ← x + qₖ − yₖ, x ← yₖ. Throughout, z = x + Σ qₖ
+    with qₖ normal to Kₖ at yₖ, and x → proj_K(z).
 
-    It stops when all yₖ agree with x to `tol`, and the angle that this leaves open,
-    Σ ⟨qₖ, yₖ − x⟩, is at most tol² (both in the norm of the space, relative to ‖z − x‖ + ‖x‖); a point
-    v ∈ K has ⟨z − x, v − x⟩ at most that angle, so x is the projection as far as it lies in K. What
-    has not stopped after `max_cycles`, above all where K is empty, is NaN: never a point. The method
-    is linear for flat sets and slow for round ones that touch; use `Polyhedron` for many flat ones.
+    The iteration stops when all yₖ agree with x to `tol` and the duality gap Σ ⟨qₖ, yₖ − x⟩ is at
+    most tol² (both in the norm of the space, relative to ‖z − x‖ + ‖x‖). Every v ∈ K satisfies
+    ⟨z − x, v − x⟩ ≤ gap, so x is the projection up to its distance from K. If the iteration has not
+    converged after `max_cycles`, in particular if K is empty, the result is NaN. The method converges
+    linearly for polyhedral sets and slowly for curved sets that touch; use `Polyhedron` for many
+    linear conditions.
 
-    The derivative is that of the conditions above at the end, by their implicit function.
+    The derivative follows from these conditions by the implicit function theorem.
 
     **Arguments:** `sets`, two or more; `tol`; `max_cycles`.
 
@@ -52,7 +54,7 @@ class Intersection(AbstractSet):
         name = "dvax.sets.Intersection"
         _tree.check_tolerance(tol, f"{name}(tol)")
         if not isinstance(max_cycles, int | np.integer) or max_cycles < 1:
-            rule, fix = "it must be a whole number > 0", "Leave it out for the default"
+            rule, fix = "it must be an integer > 0", "Omit it for the default"
             given = _tree.line(max_cycles)
             raise InputError(InputProblem(f"{name}(max_cycles)", given, rule, fix))
         self.sets, self.tol, self.max_cycles = sets, tol, max_cycles
@@ -61,7 +63,7 @@ class Intersection(AbstractSet):
                 InputProblem(
                     "dvax.sets.Intersection",
                     "no sets",
-                    "it needs sets to intersect",
+                    "an intersection needs at least one set",
                     "Use dvax.sets.WholeSpace() where there is no constraint",
                 )
             )
@@ -72,34 +74,35 @@ class Intersection(AbstractSet):
         fixed = jtu.tree_map(lax.stop_gradient, (self.sets, z, space))
 
         def conditions(q: tuple) -> tuple:
-            x = _less(z, q)
+            x = _subtract_all(z, q)
             pairs = zip(self.sets, q, strict=True)
-            return tuple(_tree.sub(x, K.project(_tree.add(x, own), space)) for K, own in pairs)
+            return tuple(_tree.sub(x, K.project(_tree.add(x, qk), space)) for K, qk in pairs)
 
         def find(_: Any, start: tuple) -> tuple:
             return start
 
-        start, good = self._dykstra(*fixed)
+        start, converged = self._dykstra(*fixed)
         q = lax.custom_root(conditions, start, find, _least_squares)
-        x = _less(z, q)
-        return _tree.where(good, x, jtu.tree_map(lambda leaf: jnp.full_like(leaf, jnp.nan), x))
+        x = _subtract_all(z, q)
+        failed = jtu.tree_map(lambda leaf: jnp.full_like(leaf, jnp.nan), x)
+        return _tree.where(converged, x, failed)
 
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array] | None:
-        """Dykstra's method ends without saying which sets hold the point."""
+        """Return None: Dykstra's method does not determine which sets are active."""
         return None
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
-        pairs = [K.intervals(like) for K in self.sets]
-        known = [pair for pair in pairs if pair is not None]
-        if len(known) < len(pairs):
+        intervals = [K.intervals(like) for K in self.sets]
+        boxes = [pair for pair in intervals if pair is not None]
+        if len(boxes) < len(intervals):
             return None
-        lower, upper = known[0]
-        for low, up in known[1:]:
+        lower, upper = boxes[0]
+        for low, up in boxes[1:]:
             lower = jtu.tree_map(jnp.maximum, lower, low)
             upper = jtu.tree_map(jnp.minimum, upper, up)
-        # Intervals that do not meet hold no point: infinite, so that they stop a solve.
+        # Disjoint intervals: an infinite lower bound stops a solve.
         empty = jtu.tree_map(jnp.greater, lower, upper)
-        lower = jtu.tree_map(lambda no, low: jnp.where(no, jnp.inf, low), empty, lower)
+        lower = jtu.tree_map(lambda is_empty, low: jnp.where(is_empty, jnp.inf, low), empty, lower)
         return lower, upper
 
     def check(self, like: Tree) -> None:
@@ -112,68 +115,69 @@ class Intersection(AbstractSet):
             "dvax.sets.Intersection",
             lower,
             "the intervals of these sets must meet, or the intersection is empty",
-            "Widen one of them",
+            "Widen one of the intervals",
         )
 
     def _dykstra(self, sets: tuple, z: Tree, space: AbstractSpace) -> tuple[tuple, jax.Array]:
-        """(the qₖ, whether the stopping rule was met)."""
-        nothing = _tree.zeros_like(z)
+        """Return (the qₖ, whether the iteration converged)."""
+        zero = _tree.zeros_like(z)
 
         def cycle(state: tuple) -> tuple:
             x, q, _, count = state
-            after, ys = [], []
-            for K, own in zip(sets, q, strict=True):
-                raised = _tree.add(x, own)
-                x = K.project(raised, space)
-                after.append(_tree.sub(raised, x))
+            new_q, ys = [], []
+            for K, qk in zip(sets, q, strict=True):
+                sum_ = _tree.add(x, qk)
+                x = K.project(sum_, space)
+                new_q.append(_tree.sub(sum_, x))
                 ys.append(x)
-            gaps = [_tree.sub(y, x) for y in ys]
-            apart = [space.norm(gap) for gap in gaps]
-            angle = [space.inner(own, gap) for own, gap in zip(after, gaps, strict=True)]
+            differences = [_tree.sub(y, x) for y in ys]
+            distances = [space.norm(difference) for difference in differences]
+            gaps = [space.inner(qk, d) for qk, d in zip(new_q, differences, strict=True)]
             size = space.norm(_tree.sub(z, x)) + space.norm(x)
             tol = self._tolerance(size)
-            close = jnp.max(jnp.stack(apart)) <= tol
-            # Rounding alone leaves an angle of eps times the normals.
-            push = jnp.stack([space.norm(own) for own in after])
-            floor = jnp.finfo(size.dtype).eps * jnp.sum(push) * size
-            met = close & (sum(angle) <= tol * tol + 4.0 * floor)
-            return x, tuple(after), met, count + 1
+            close = jnp.max(jnp.stack(distances)) <= tol
+            # The roundoff of the gap is eps times the norms of the qₖ.
+            norms = jnp.stack([space.norm(qk) for qk in new_q])
+            roundoff = jnp.finfo(size.dtype).eps * jnp.sum(norms) * size
+            converged = close & (sum(gaps) <= tol * tol + 4.0 * roundoff)
+            return x, tuple(new_q), converged, count + 1
 
         def unfinished(state: tuple) -> jax.Array:
-            x, _, met, count = state
-            return ~met & (count < self.max_cycles) & _tree.all_finite(x)
+            x, _, converged, count = state
+            return ~converged & (count < self.max_cycles) & _tree.all_finite(x)
 
-        start = (z, (nothing,) * len(sets), jnp.asarray(False), jnp.asarray(0))
-        _, q, met, _ = lax.while_loop(unfinished, cycle, start)
-        return q, met
+        start = (z, (zero,) * len(sets), jnp.asarray(False), jnp.asarray(0))
+        _, q, converged, _ = lax.while_loop(unfinished, cycle, start)
+        return q, converged
 
     def _tolerance(self, size: jax.Array) -> jax.Array:
         return jnp.maximum(self.tol, 8.0 * jnp.finfo(size.dtype).eps).astype(size.dtype) * size
 
 
-def _less(z: Tree, q: tuple) -> Tree:
-    for own in q:
-        z = _tree.sub(z, own)
+def _subtract_all(z: Tree, q: tuple) -> Tree:
+    """Return z − Σ qₖ."""
+    for qk in q:
+        z = _tree.sub(z, qk)
     return z
 
 
 def _least_squares(g: Any, b: Tree) -> Tree:
-    """A q with g(q) = b: the qₖ need not be unique, and x does not depend on which are taken."""
+    """Return a solution q of g(q) = b. The qₖ need not be unique; x does not depend on the choice."""
     flat, unflatten = jax.flatten_util.ravel_pytree(b)
 
     def flat_g(v: jax.Array) -> jax.Array:
         return jax.flatten_util.ravel_pytree(g(unflatten(v)))[0]
 
-    if flat.size <= _DENSE:
+    if flat.size <= _MAX_DENSE_SIZE:
         matrix = jax.jacfwd(flat_g)(jnp.zeros_like(flat))
-        cut = jnp.sqrt(jnp.finfo(flat.dtype).eps)
-        return unflatten(jnp.linalg.pinv(matrix, rtol=cut) @ flat)
+        rtol = jnp.sqrt(jnp.finfo(flat.dtype).eps)
+        return unflatten(jnp.linalg.pinv(matrix, rtol=rtol) @ flat)
     transposed = jax.linear_transpose(flat_g, flat)
 
     def back(v: jax.Array) -> jax.Array:
         return transposed(v)[0]
 
-    found, _ = jax.scipy.sparse.linalg.cg(
+    solution, _ = jax.scipy.sparse.linalg.cg(
         lambda v: back(flat_g(v)), back(flat), tol=1e-12, atol=0.0, maxiter=10 * flat.size
     )
-    return unflatten(found)
+    return unflatten(solution)

@@ -1,4 +1,4 @@
-"""Balls of the sum of absolute values."""
+"""Balls in the ℓ¹ norm."""
 
 from typing import Any
 
@@ -9,8 +9,8 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
-from ._threshold import above, cut, thresholds
-from ._weights import even, inverse_weights
+from ._threshold import entry_thresholds, subtract, subtract_and_clip
+from ._weights import has_uniform_weight, inverse_weights
 from .abstract import AbstractSet
 from .ball import center_and_radius
 
@@ -19,12 +19,12 @@ class L1Ball(AbstractSet):
     """K = {y : Σᵢ |yᵢ − cᵢ| ≤ radius}, with a plain sum whatever the space's weights.
 
     proj_K(z) = c + sign(z − c) max(|z − c| − τ/w, 0): outside, |z − c| is projected onto the simplex
-    of that total. Entries that τ cuts off are held at c.
+    of total `radius`. Entries that the threshold τ clips are active at c.
 
-    **Arguments:** `center`: an array of the shape of y, or a number that stands for a constant one;
-    `radius` ≥ 0, a number.
+    **Arguments:** `center`: an array of the shape of y, or a number for all entries; `radius` ≥ 0, a
+    number.
 
-    **Raises:** `dvax.InputError` where the radius is negative or not finite, or the center is not.
+    **Raises:** `dvax.InputError` if the radius is negative or not finite, or the center is not finite.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -45,19 +45,20 @@ class L1Ball(AbstractSet):
         center = jnp.broadcast_to(self.center, jnp.shape(z))
         offset = z - center
         length = jnp.abs(offset)
-        inside = jnp.sum(length) < self.radius  # NaN is not inside: it comes out
-        kept = cut(*self._cuts(length, space)).reshape(jnp.shape(z))
-        return jnp.where(inside, z, center + jnp.sign(offset) * kept)
+        inside = jnp.sum(length) < self.radius  # false for NaN, which propagates
+        clipped = subtract_and_clip(*self._thresholds(length, space)).reshape(jnp.shape(z))
+        return jnp.where(inside, z, center + jnp.sign(offset) * clipped)
 
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
         length = jnp.abs(z - jnp.broadcast_to(self.center, jnp.shape(z)))
-        return [self.radius - jnp.sum(length), above(*self._cuts(length, space))]
+        return [self.radius - jnp.sum(length), subtract(*self._thresholds(length, space))]
 
-    def _cuts(self, length: jax.Array, space: AbstractSpace) -> tuple:
-        """Where |z − c| is cut off, as `cut` takes it: nowhere inside, where it is all positive."""
+    def _thresholds(self, length: jax.Array, space: AbstractSpace) -> tuple:
+        """Return the arguments of `subtract` and `subtract_and_clip` for |z − c|."""
         flat = length.reshape(-1)
-        inverse_w = None if even(space) else inverse_weights(space, length).reshape(-1)
-        return flat, *thresholds(flat, self.radius, inverse_w), inverse_w
+        uniform = has_uniform_weight(space)
+        inverse_w = None if uniform else inverse_weights(space, length).reshape(-1)
+        return flat, *entry_thresholds(flat, self.radius, inverse_w), inverse_w
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         return None
@@ -69,8 +70,8 @@ class L1Ball(AbstractSet):
                 InputProblem(
                     "dvax.sets.L1Ball(center, radius)",
                     f"shapes {shapes[0]} and {shapes[1]}",
-                    f"the center is an array of the shape {_tree.shapes(like)} of y = P u, or a "
-                    "number, and the radius a number",
+                    f"the center must be an array of the shape {_tree.shapes(like)} of y = P u, or "
+                    "a number, and the radius a number",
                     "Use dvax.sets.Product for one ball a part",
                 )
             )

@@ -13,23 +13,29 @@ from ..spaces import AbstractSpace
 from . import _dual_active_set as dual
 from ._weights import inverse_weights
 from .abstract import AbstractSet
-from .affine import consistent, fits_rows, linear_rows, unit, unit_rows
+from .affine import (
+    check_row_shapes,
+    checked_rows,
+    has_solution,
+    normalise_rows,
+    normalised_conditions,
+)
 
 
 class Polyhedron(AbstractSet):
     """K = {y : G y ≤ d, E y = e}, with plain sums (G y)ₖ = Σᵢ Gₖᵢ yᵢ whatever the space's weights.
 
-    The nearest point and the rows that hold it are found by a dual active-set method, exactly but
-    for rounding (2e-12 of the sizes in play, in double precision), and checked; what fails the check
-    is NaN. Its derivative is that of the projection onto the rows that hold it, in z, G, d, E and e.
-    A row that a point just touches counts as holding it; rows that repeat each other share what
-    moves one of them alone.
+    A dual active-set method determines the nearest point and its active rows, exactly up to roundoff
+    (relative 2e-12 in double precision). The optimality conditions are then checked; the result is
+    NaN if the check fails. The derivative, in z, G, d, E and e, is that of the projection onto the
+    active rows. A row that holds with equality counts as active, even with a zero multiplier. A
+    change of one of several identical rows is distributed over all of them.
 
-    **Arguments:** `G`: an array of shape (rows, *shape of y), a matrix where y is a vector; `d`: a
-    vector, whose entries may be +∞; `E`, `e`: equations, shaped alike, or None.
+    **Arguments:** `G`: an array of shape (rows, *shape of y), a matrix if y is a vector; `d`: a
+    vector, whose entries may be +∞; `E`, `e`: equations of the same form, or None.
 
-    **Raises:** `dvax.InputError` where the set is empty, or entries are NaN. A traced one that turns
-    out to be empty projects to NaN.
+    **Raises:** `dvax.InputError` if the set is empty or entries are NaN. The projection is NaN if
+    traced data describe an empty set.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -47,41 +53,42 @@ class Polyhedron(AbstractSet):
 
     def __init__(self, G: Any, d: Any, E: Any = None, e: Any = None):
         name = "dvax.sets.Polyhedron"
-        self.G, self.d = linear_rows(name, G, d, "G", "d")
+        self.G, self.d = checked_rows(name, G, d, "G", "d")
         if (E is None) != (e is None):
             raise InputError(
                 InputProblem(
                     f"{name}(E, e)",
                     "one without the other",
-                    "E y = e needs both",
-                    "Give both, or neither",
+                    "the equations E y = e need both",
+                    "Give both or neither",
                 )
             )
         if E is None:
             self.E, self.e = jnp.zeros((0, *self.G.shape[1:]), self.G.dtype), self.d[:0]
         else:
-            self.E, self.e = linear_rows(name, E, e, "E", "e")
-            fits_rows(f"{name}(E)", self.E, self.G[0])
+            self.E, self.e = checked_rows(name, E, e, "E", "e")
+            check_row_shapes(f"{name}(E)", self.E, self.G[0])
             _tree.require(
-                lambda: consistent(self.E, self.e),
+                lambda: has_solution(self.E, self.e),
                 f"{name}(E, e)",
                 (self.E, self.e),
-                "E y = e has a solution, or the set is empty and the law has none",
-                "Drop or mend the equations that contradict the others",
+                "E y = e must have a solution, or the set is empty and the law has no solution",
+                "Remove or correct the equations that contradict the others",
             )
         if _tree.is_concrete((self.G, self.d, self.E, self.e)):
-            _refuse_empty(name, *(np.asarray(a) for a in (self.G, self.d, self.E, self.e)))
+            _check_nonempty(name, *(np.asarray(a) for a in (self.G, self.d, self.E, self.e)))
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         return _nearest(*self._flat(z, space))[0].reshape(z.shape)
 
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
-        """Row by row the slack, or less the force of a row that holds. Of rows that repeat each other
-        some share the force that others might as well exert."""
+        """Return, for each row, its slack, or minus its multiplier if the row is active.
+
+        The multipliers of linearly dependent rows are not unique."""
         flat, root, G, d, E, e = self._flat(z, space)
-        y, held, force = _nearest(flat, root, G, d, E, e)
+        y, active, multiplier = _nearest(flat, root, G, d, E, e)
         rows, bounds = _scaled(G, d, root)
-        return [jnp.where(held > 0, -force, bounds - rows @ (y / root))]
+        return [jnp.where(active > 0, -multiplier, bounds - rows @ (y / root))]
 
     def _flat(self, z: Tree, space: AbstractSpace) -> tuple:
         n = z.size
@@ -92,20 +99,21 @@ class Polyhedron(AbstractSet):
         return None
 
     def check(self, like: Tree) -> None:
-        fits_rows("dvax.sets.Polyhedron(G)", self.G, like)
+        check_row_shapes("dvax.sets.Polyhedron(G)", self.G, like)
 
 
 @jax.custom_jvp
 def _nearest(
     z: jax.Array, root: jax.Array, G: jax.Array, d: jax.Array, E: jax.Array, e: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """(the projection, NaN where there is none; 1 for rows of G that hold it, else 0; their forces).
+    """Return (projection, 1 for active rows of G and else 0, multipliers).
 
-    `root` is w^{−1/2}: in the coordinates y/root the norm of the space is the plain one.
+    The projection is NaN if the set is empty. `root` is w^{−1/2}: in the coordinates y/root the norm
+    of the space is the Euclidean norm.
     """
     point, rows, bounds = z / root, *_scaled(G, d, root)
     if len(e):
-        # Into the subspace of the equations first: inequalities alone are left.
+        # Restrict to the affine subspace of the equations; only inequalities remain.
         equations, values = _scaled(E, e, root)
         back = jnp.linalg.pinv(equations)
         base = back @ values
@@ -113,60 +121,61 @@ def _nearest(
         point = point - back @ (equations @ point)
         bounds = bounds - rows @ base
         rows = rows - (rows @ back) @ equations
-        # Shorter than this, of what was one, a row is a sum of the equations' but for rounding.
-        lost = float(jnp.finfo(z.dtype).eps) ** dual.SLACK
-        rows, scale = unit(jnp.where(_length(rows)[:, None] > lost, rows, 0.0))
+        # A row whose projection is shorter than this depends linearly on the equations.
+        roundoff = float(jnp.finfo(z.dtype).eps) ** dual.SLACK
+        rows, scale = normalise_rows(jnp.where(_length(rows)[:, None] > roundoff, rows, 0.0))
         bounds = bounds / scale
         size = (jnp.abs(bounds) + jnp.linalg.norm(base)) / scale
-        solvable = consistent(E, e)
+        solvable = has_solution(E, e)
     else:
         base, size, solvable = jnp.zeros_like(point), jnp.zeros_like(bounds), True
-    found = dual.nearest(rows, bounds, point, size)
-    y = jnp.where(found.good & solvable, found.x + base, jnp.nan)
-    # Nothing held: z itself, without the rounding of the way there and back.
-    free = found.good & ~jnp.any(found.held) & (len(e) == 0)
-    return jnp.where(free, z, y * root), found.held.astype(z.dtype), found.force
+    nearest = dual.nearest_point(rows, bounds, point, size)
+    y = jnp.where(nearest.valid & solvable, nearest.x + base, jnp.nan)
+    # Without active rows, return z itself: scaling there and back has roundoff.
+    interior = nearest.valid & ~jnp.any(nearest.active) & (len(e) == 0)
+    y = jnp.where(interior, z, y * root)
+    return y, nearest.active.astype(z.dtype), nearest.multiplier
 
 
 @_nearest.defjvp
 def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
-    y, held, force = _nearest(*primals)
+    y, active, multiplier = _nearest(*primals)
 
-    def on_face(z, root, G, d, E, e) -> jax.Array:
-        # Rows that do not hold take no part; d may be infinite there.
+    def project_on_face(z, root, G, d, E, e) -> jax.Array:
+        # Inactive rows are set to zero; d may be infinite there.
         rows, bounds = _scaled(
-            jnp.concatenate([E, jnp.where(held[:, None] > 0, G, 0.0)]),
-            jnp.concatenate([e, jnp.where(held > 0, d, 0.0)]),
+            jnp.concatenate([E, jnp.where(active[:, None] > 0, G, 0.0)]),
+            jnp.concatenate([e, jnp.where(active > 0, d, 0.0)]),
             root,
         )
         point = z / root
         return root * (point - jnp.linalg.pinv(rows) @ (rows @ point - bounds))
 
-    _, change = jax.jvp(on_face, primals, tangents)
-    return (y, held, force), (change, jnp.zeros_like(held), jnp.zeros_like(force))
+    _, dy = jax.jvp(project_on_face, primals, tangents)
+    return (y, active, multiplier), (dy, jnp.zeros_like(active), jnp.zeros_like(multiplier))
 
 
 def _scaled(G: jax.Array, d: jax.Array, root: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return unit_rows(G * root[None, :], d)
+    return normalised_conditions(G * root[None, :], d)
 
 
 def _length(rows: jax.Array) -> jax.Array:
     return jnp.sqrt(jnp.sum(rows * rows, axis=1))
 
 
-def _refuse_empty(name: str, G: np.ndarray, d: np.ndarray, E: np.ndarray, e: np.ndarray) -> None:
-    """Raise an `InputError` where no point satisfies all conditions.
+def _check_nonempty(name: str, G: np.ndarray, d: np.ndarray, E: np.ndarray, e: np.ndarray) -> None:
+    """Raise an `InputError` if no point satisfies all conditions.
 
-    The linear programme: the least t with G y ≤ d + t, for rows of length one.
+    Solve the linear programme: minimise t subject to G y ≤ d + t and E y = e, with rows of length one.
     """
-    import scipy.optimize  # heavy, and needed for this alone
+    import scipy.optimize  # a slow import that only this function needs
 
     flat, equations = G.reshape(len(d), -1), E.reshape(len(e), -1) if len(e) else None
     length = np.linalg.norm(flat, axis=1)
     length = np.where(length > 0, length, 1.0)
-    known = d < np.inf
-    rows, bounds = (flat / length[:, None])[known], (d / length)[known]
-    missing = np.inf
+    bounded = d < np.inf
+    rows, bounds = (flat / length[:, None])[bounded], (d / length)[bounded]
+    violation = np.inf
     if np.all(np.isfinite(bounds)):
         size = max(np.max(np.abs(bounds), initial=0.0), np.max(np.abs(e), initial=0.0)) or 1.0
         answer = scipy.optimize.linprog(
@@ -177,17 +186,16 @@ def _refuse_empty(name: str, G: np.ndarray, d: np.ndarray, E: np.ndarray, e: np.
             b_eq=None if equations is None else e / size,
             bounds=[(None, None)] * flat.shape[1] + [(0.0, None)],
         )
-        # Where the programme itself could not be solved nothing is known, and the projection, which
-        # checks what it finds, has the last word.
-        missing = answer.x[-1] * size if answer.status == 0 else 0.0
-        missing = 0.0 if missing <= 1e-6 * size else missing
-    if missing > 0.0:
+        # If the linear programme fails, accept the set: the projection checks its own result.
+        violation = answer.x[-1] * size if answer.status == 0 else 0.0
+        violation = 0.0 if violation <= 1e-6 * size else violation
+    if violation > 0.0:
         raise InputError(
             InputProblem(
                 f"{name}(G, d, E, e)",
-                f"{len(d)} inequalities and {len(e)} equations that no y satisfies: the best one "
-                f"misses some row, scaled to length one, by {missing:.3g}",
-                "the set must hold a point, or the law has no solution",
-                "Raise entries of d, or drop conditions that contradict others",
+                f"{len(d)} inequalities and {len(e)} equations that no y satisfies: the smallest "
+                f"possible violation, for rows scaled to length one, is {violation:.3g}",
+                "the set must not be empty, or the law has no solution",
+                "Increase entries of d, or remove conditions that contradict others",
             )
         )

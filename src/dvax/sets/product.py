@@ -1,4 +1,4 @@
-"""K = K₁ × K₂ × … on tuples."""
+"""Products K = K₁ × K₂ × … of sets, for tuples."""
 
 import jax
 
@@ -11,7 +11,7 @@ from .abstract import AbstractSet
 
 
 class Product(AbstractSet):
-    """K = {(y₁, y₂, …) : yₖ ∈ Kₖ}: projected part by part.
+    """K = {(y₁, y₂, …) : yₖ ∈ Kₖ}; the projection acts on each part separately.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -36,15 +36,16 @@ class Product(AbstractSet):
 
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array] | None:
         parts = [k.switches(p, s) for k, p, s in self._by_part(z, space)]
-        known = [part for part in parts if part is not None]
-        return [s for part in known for s in part] if len(known) == len(parts) else None
+        if any(part is None for part in parts):
+            return None
+        return [s for part in parts if part is not None for s in part]
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
-        pairs = [k.intervals(p) for k, p in zip(self.parts, like, strict=True)]
-        known = [pair for pair in pairs if pair is not None]
-        if len(known) < len(pairs):
+        intervals = [k.intervals(p) for k, p in zip(self.parts, like, strict=True)]
+        boxes = [pair for pair in intervals if pair is not None]
+        if len(boxes) < len(intervals):
             return None
-        return tuple(pair[0] for pair in known), tuple(pair[1] for pair in known)
+        return tuple(pair[0] for pair in boxes), tuple(pair[1] for pair in boxes)
 
     def check(self, like: Tree) -> None:
         if not isinstance(like, tuple) or len(like) != len(self.parts):
@@ -53,7 +54,7 @@ class Product(AbstractSet):
                     "dvax.sets.Product",
                     f"{len(self.parts)} parts",
                     "y = P u must be a tuple with as many parts",
-                    "Name the control space: control_space=dvax.spaces.Product(...)",
+                    "Pass the control space: control_space=dvax.spaces.Product(...)",
                 )
             )
         for part, leaf in zip(self.parts, like, strict=True):

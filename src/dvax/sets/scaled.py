@@ -1,4 +1,4 @@
-"""s K: a set that has been stretched."""
+"""Multiples s K of a set."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ class Scaled(AbstractSet):
 
     **Arguments:** `set`: any set; `factor`: a number, not 0; a negative one reflects the set.
 
-    **Raises:** `dvax.InputError` where the factor is 0 or not finite.
+    **Raises:** `dvax.InputError` if the factor is 0 or not finite.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -43,18 +43,18 @@ class Scaled(AbstractSet):
             lambda: jnp.isfinite(self.factor) & (self.factor != 0),
             name,
             self.factor,
-            "a set is stretched by a finite number that is not 0",
-            "Use dvax.sets.Ball(0.0, 0.0) for the set of the point 0",
+            "the factor must be finite and not 0",
+            "Use dvax.sets.Ball(0.0, 0.0) for the set {0}",
         )
         if not _tree.is_concrete(self.factor):
-            # Not known yet: 0 is made NaN, so that it stops a solve.
+            # A traced factor: replace 0 by NaN, so that it stops a solve.
             self.factor = jnp.where(self.factor == 0, jnp.nan, self.factor)
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
-        return _tree.scale(self.factor, self.set.project(self._shrunk(z), space))
+        return _tree.scale(self.factor, self.set.project(self._unscaled(z), space))
 
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array] | None:
-        return self.set.switches(self._shrunk(z), space)
+        return self.set.switches(self._unscaled(z), space)
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         inner = self.set.intervals(like)
@@ -68,5 +68,5 @@ class Scaled(AbstractSet):
     def check(self, like: Tree) -> None:
         self.set.check(like)
 
-    def _shrunk(self, z: Tree) -> Tree:
+    def _unscaled(self, z: Tree) -> Tree:
         return jtu.tree_map(lambda leaf: leaf / self.factor, z)

@@ -1,4 +1,4 @@
-"""K + a: a set that has been moved."""
+"""Translates K + a of a set."""
 
 from typing import Any
 
@@ -16,9 +16,9 @@ from .abstract import AbstractSet
 class Translated(AbstractSet):
     """K = {y + offset : y ∈ set}: proj_K(z) = offset + proj(z − offset).
 
-    **Arguments:** `set`: any set; `offset`: an element, or a number that stands for a constant one.
+    **Arguments:** `set`: any set; `offset`: an element, or a number for all entries.
 
-    **Raises:** `dvax.InputError` where the offset is not finite.
+    **Raises:** `dvax.InputError` if the offset is not finite.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -43,22 +43,22 @@ class Translated(AbstractSet):
             lambda: _tree.all_finite(self.offset),
             "dvax.sets.Translated(offset)",
             self.offset,
-            "a set is moved by a point, with finite entries",
-            "Mend the entries that are not",
+            "the entries of the offset must be finite",
+            "Correct the entries that are not",
         )
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
-        offset = self._spread(z)
+        offset = self._broadcast(z)
         return _tree.add(offset, self.set.project(_tree.sub(z, offset), space))
 
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array] | None:
-        return self.set.switches(_tree.sub(z, self._spread(z)), space)
+        return self.set.switches(_tree.sub(z, self._broadcast(z)), space)
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         inner = self.set.intervals(like)
         if inner is None:
             return None
-        offset = self._spread(like)
+        offset = self._broadcast(like)
         return _tree.add(inner[0], offset), _tree.add(inner[1], offset)
 
     def check(self, like: Tree) -> None:
@@ -67,13 +67,13 @@ class Translated(AbstractSet):
                 InputProblem(
                     "dvax.sets.Translated(offset)",
                     f"shape {_tree.shapes(self.offset)}",
-                    f"the offset is an element, of shape {_tree.shapes(like)}, or a number",
+                    f"the offset must be an element of shape {_tree.shapes(like)}, or a number",
                     "Give it that shape",
                 )
             )
         self.set.check(like)
 
-    def _spread(self, like: Tree) -> Tree:
+    def _broadcast(self, like: Tree) -> Tree:
         if _is_number(self.offset):
             return jtu.tree_map(lambda leaf: jnp.broadcast_to(self.offset, leaf.shape), like)
         return self.offset

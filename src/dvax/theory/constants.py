@@ -151,7 +151,7 @@ class Constants(eqx.Module):
 
     def separation(self, t: Any) -> Any:
         """Return S = M e^{(ω+ML̃)t}, with ‖x₁(t)−x₂(t)‖ ≤ S‖Δx₀‖ (1stestistability)."""
-        c, lib = _tree.host(self), _tree.library(self, t)
+        c, lib = _tree.host(self), _tree.array_module(self, t)
         return c.M * _exp(lib, self.growth_rate * t)
 
     def response_separation(self, t: Any) -> Any:
@@ -161,12 +161,12 @@ class Constants(eqx.Module):
     def largest_separation(self, T: Any) -> Any:
         """Return S = M e^{(ω+ML̃)₊T}, with max over [0, T] of ‖x₁−x₂‖ ≤ S‖Δx₀‖ (supesti1); LS is the
         factor for u (supesti2)."""
-        c, lib = _tree.host(self), _tree.library(self, T)
+        c, lib = _tree.host(self), _tree.array_module(self, T)
         return c.M * _exp(lib, lib.maximum(self.growth_rate, 0.0) * T)
 
     def sharp_separation(self, t: Any) -> Any:
         """Return e^{μt}, the `separation` with the one-sided constant, or None if that is unknown."""
-        lib = _tree.library(self, t)
+        lib = _tree.array_module(self, t)
         return None if self.one_sided is None else _exp(lib, _tree.host(self.one_sided) * t)
 
     @property
@@ -178,7 +178,7 @@ class Constants(eqx.Module):
 
     def contraction_factor(self, rho: Any) -> Any:
         """Return q_ρ = ‖I − ρP⁻¹‖ + ρ β_h ‖P⁻¹‖ (eq:smalless), with ‖I − ρP⁻¹‖ from the spectrum."""
-        c, lib = _tree.host(self), _tree.library(self, rho)
+        c, lib = _tree.host(self), _tree.array_module(self, rho)
         spread = lib.maximum(abs(1.0 - rho * c.m_P), abs(1.0 - rho * c.norm_P_inv))
         return spread + rho * c.beta_h * c.norm_P_inv
 
@@ -201,7 +201,7 @@ class Constants(eqx.Module):
         and a = ML̃, the factor e^{sT}s/(s − a) is minimal for T s(s − a) = a, that is s = (a + √(a²
         + 4a/T))/2.
         """
-        c, lib = _tree.host(self), _tree.library(self, T)
+        c, lib = _tree.host(self), _tree.array_module(self, T)
         a = c.M * self.L_tilde
         return c.omega + 0.5 * (a + lib.sqrt(a * a + 4.0 * a / T))
 

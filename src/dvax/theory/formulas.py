@@ -20,7 +20,7 @@ __all__ = [
 
 def growth_integral(a: Any, T: Any) -> Any:
     """Return Φ_a(T) = ∫₀ᵀ e^{a(T−s)} ds = (e^{aT} − 1)/a, or T for a = 0 (Section 2.2)."""
-    lib = _tree.library(a, T)
+    lib = _tree.array_module(a, T)
     z = lib.asarray(a * T)
     small = lib.abs(z) < 1e-300
     return T * lib.where(small, 1.0, lib.expm1(z) / lib.where(small, 1.0, z))
@@ -28,7 +28,7 @@ def growth_integral(a: Any, T: Any) -> Any:
 
 def bielecki_equivalence(lam: Any, T: Any) -> tuple[Any, Any]:
     """Return (e^{−λT}, 1), the constants of e^{−λT}‖v‖_C ≤ ‖v‖_λ ≤ ‖v‖_C (lem:bielecki_equiv)."""
-    lib = _tree.library(lam, T)
+    lib = _tree.array_module(lam, T)
     return lib.exp(-lam * T), lib.ones_like(lib.asarray(lam * T))
 
 
@@ -55,7 +55,7 @@ def continuity_coefficients(
 
 def quadratic_root(a: Any, b: Any, gamma: Any) -> Any:
     """Return the bound √(2a/γ + b²/γ²) on s that follows from γs² ≤ a + bs (lem:techni)."""
-    lib = _tree.library(a, b, gamma)
+    lib = _tree.array_module(a, b, gamma)
     return lib.sqrt(2.0 * a / gamma + (b / gamma) ** 2)
 
 

@@ -130,14 +130,14 @@ class ParameterBounds(eqx.Module):
     def state_radius(self, R_initial: Any) -> Any:
         """Return R_B^x with ‖x(t)‖ ≤ R_B^x on [0, T] for ‖ζ‖ ≤ R_Λ (lem:parametrized_apriori)."""
         v, c = _tree.host(self), _tree.host(self.constants)
-        lib = _tree.library(self, R_initial)
+        lib = _tree.array_module(self, R_initial)
         forcing = c.beta_f * self.response_radius(0.0) + v.C_f0
         start = c.M * R_initial + c.M * forcing * growth_integral(-c.omega, v.T)
         return lib.exp(lib.maximum(c.omega, 0.0) * v.T) * start * lib.exp(c.M * self.L_tilde * v.T)
 
     def radius(self, R_initial: Any) -> Any:
         """Return R_B = max(R_B^x, R̂(D, R_B^x)), a bound on ‖x‖ and ‖u‖ (lem:parametrized_apriori)."""
-        lib = _tree.library(self, R_initial)
+        lib = _tree.array_module(self, R_initial)
         of_state = self.state_radius(R_initial)
         return lib.maximum(of_state, self.response_radius(of_state))
 
@@ -178,6 +178,6 @@ class ParameterBounds(eqx.Module):
         return None if separation is None else self.response(separation, gap)
 
     def _separation(self, M: Any, rate: Any, gap_start: Any, gap: Any) -> Any:
-        v, lib = _tree.host(self), _tree.library(self, gap_start, gap)
+        v, lib = _tree.host(self), _tree.array_module(self, gap_start, gap)
         from_start = M * lib.exp(lib.maximum(rate, 0.0) * v.T) * gap_start
         return from_start + M * growth_integral(rate, v.T) * self.modulus(gap)

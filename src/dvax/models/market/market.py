@@ -174,7 +174,7 @@ class Market(eqx.Module):
         cost, slope, firms, b, s = _tree.host(
             (self.cost, self.slope, self.firms, self.b, self.speed)
         )
-        lib = _tree.library(slope, firms, b)
+        lib = _tree.array_module(slope, firms, b)
         n = cost.shape[0]
         ends = lib.linalg.eigvalsh(lib.diag(slope) + b * (firms @ firms.T))
         return Constants(

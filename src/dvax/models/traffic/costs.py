@@ -31,7 +31,7 @@ class LinkCosts(eqx.Module):
 
     def times(self, v: Any, capacity: Any) -> Any:
         """t(v)."""
-        lib = _tree.library(v, capacity)
+        lib = _tree.array_module(v, capacity)
         inner = lib.clip(v, 0.0, self.most)
         formula = self.time + self.scale * (inner / capacity) ** self.power
         first = lib.where(self.power == 1.0, self.scale / capacity, 0.0)  # t′(0)

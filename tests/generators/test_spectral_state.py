@@ -8,8 +8,8 @@ import pytest
 from tests.selection import mostly_thorough
 
 import dvax
-from dvax.generators import Arc
-from dvax.generators.expanded import coefficients, expanded, values
+from dvax.generators import FlowStep
+from dvax.generators.spectral_state import coefficients, expand_state, values
 
 g = dvax.generators
 WAVES = g.Elliptic(12, 2.0, "periodic", diffusion=0.0, velocity=1.5)
@@ -59,34 +59,34 @@ def test_a_step_with_coefficients_is_the_step(name):
     x0, c0, c1 = (state(shape, seed) for seed in range(3))
     step = A.propagator(jnp.asarray(0.3), 2).step
     plain = step(x0, (c0, c1))
-    x1 = step(expanded(A, x0), (expanded(A, c0), expanded(A, c1)))
+    x1 = step(expand_state(A, x0), (expand_state(A, c0), expand_state(A, c1)))
     close(values(x1), plain)
     # Those that come along are the state's own, and are taken for such.
-    close(coefficients(x1), coefficients(expanded(A, values(x1))))
-    again = expanded(A, values(x1), coefficients(x1))
+    close(coefficients(x1), coefficients(expand_state(A, values(x1))))
+    again = expand_state(A, values(x1), coefficients(x1))
     close(values(step(again, ())), A.semigroup(0.3, plain))
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_linear_in_states_is_so_in_coefficients(name):
     A, shape = GENERATORS[name]
-    a, b = (expanded(A, state(shape, seed)) for seed in (3, 4))
+    a, b = (expand_state(A, state(shape, seed)) for seed in (3, 4))
     both = jtu.tree_map(lambda p, q: 2.0 * p - 0.5 * q, a, b)
-    close(both, expanded(A, values(both)))
+    close(both, expand_state(A, values(both)))
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_bend_is_the_same(name):
+def test_the_chord_deviation_is_the_same(name):
     A, shape = GENERATORS[name]
     x0, c0, c1 = (state(shape, seed) for seed in range(3))
     space = space_of(x0)
     h = jnp.asarray(0.2)
     x1 = A.propagator(h, 2).step(x0, (c0, c1))
     growth = A.growth(space)
-    plain = A.bend(Arc(h, x0, x1, (c0, c1)), space, growth)
-    arc = Arc(h, *(jtu.tree_map(jnp.asarray, expanded(A, v)) for v in (x0, x1)),
-              tuple(expanded(A, v) for v in (c0, c1)))  # fmt: skip
-    close(A.bend(arc, space, growth), plain)
+    plain = A.chord_deviation(FlowStep(h, x0, x1, (c0, c1)), space, growth)
+    arc = FlowStep(h, *(jtu.tree_map(jnp.asarray, expand_state(A, v)) for v in (x0, x1)),
+              tuple(expand_state(A, v) for v in (c0, c1)))  # fmt: skip
+    close(A.chord_deviation(arc, space, growth), plain)
 
 
 def test_derivatives_of_a_step_see_no_difference():
@@ -99,7 +99,7 @@ def test_derivatives_of_a_step_see_no_difference():
 
     for argnum in (0, 1):
         slope = lambda lift, k=argnum: jax.grad(end, k)(x0, jnp.asarray(0.3), lift)  # noqa: E731
-        close(slope(lambda v: expanded(A, v)), slope(lambda v: v))
+        close(slope(lambda v: expand_state(A, v)), slope(lambda v: v))
 
 
 @pytest.mark.parametrize("how", [dict(dt=0.02), dict(rtol=1e-4)], ids=["fixed", "adaptive"])
