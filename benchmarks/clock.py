@@ -58,9 +58,9 @@ def in_turn(
     begin within `enough` seconds, but three at least."""
     names = list(samples)
     taken: dict[str, list[float]] = {name: [] for name in names}
-    begun = time.perf_counter()
+    started = time.perf_counter()
     for number in range(rounds):
-        if number >= _FEWEST and time.perf_counter() - begun > enough:
+        if number >= _FEWEST and time.perf_counter() - started > enough:
             break
         first = number % len(names)
         for name in names[first:] + names[:first]:

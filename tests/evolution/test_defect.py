@@ -53,7 +53,7 @@ def test_a_smooth_defect_is_seen_in_its_size(name):
 def bent(t, x, u, p):
     """x₁ is the time, and f kinks or jumps in it: no step ends there by itself."""
     past = x[0] - p["at"]
-    kink = p["bend"] * jnp.maximum(past, 0) + p["jump"] * jnp.heaviside(past, 0.0)
+    kink = p["slope"] * jnp.maximum(past, 0) + p["jump"] * jnp.heaviside(past, 0.0)
     return jnp.stack([jnp.ones_like(past), kink])
 
 
@@ -83,6 +83,6 @@ def test_a_kink_or_a_jump_within_a_step_hides_nothing(name):
         return sol.defect[-1], jnp.mean(jax.vmap(size)(places))
 
     for at in np.random.default_rng(2).uniform(0.0, 1.0, 60):
-        for bend, jump in ((1.0, 0.0), (0.0, 1.0)):
-            defect, integral = step({"at": at, "bend": bend, "jump": jump})
+        for slope, jump in ((1.0, 0.0), (0.0, 1.0)):
+            defect, integral = step({"at": at, "slope": slope, "jump": jump})
             assert integral > 0.0 and float(integral) <= float(defect) + 1e-3

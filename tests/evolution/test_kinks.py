@@ -35,8 +35,8 @@ def test_the_first_of_several_changes_of_sign_is_found():
 @pytest.mark.parametrize("hair", [0.0, 1e-12, 1e-6])
 def test_functions_that_rest_on_zero_or_nearly_so_are_found_to_leave_it(place, hair):
     leaving = lambda theta: jnp.maximum(theta - place, 0.0)[None] - hair  # noqa: E731
-    arriving = lambda theta: jnp.maximum(place - theta, 0.0)[None] - hair  # noqa: E731
-    for at in (leaving, arriving):
+    reaching = lambda theta: jnp.maximum(place - theta, 0.0)[None] - hair  # noqa: E731
+    for at in (leaving, reaching):
         thetas = (0.0, 1.0)
         values = [at(jnp.asarray(theta)) for theta in thetas]
         assert float(locate_event(thetas, values, at)) == pytest.approx(place, abs=2e-5)

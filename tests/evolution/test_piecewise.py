@@ -207,8 +207,8 @@ def test_jumps_are_met_announced_or_not_and_data_that_ends_is_told():
     with pytest.raises(dvax.SolveError, match="NaN") as caught:
         dvax.solve(ending, 0.5, 0.0, 1.0, ts=[0.1, 1.0], method=dvax.PiecewiseLinear())
     assert float(caught.value.solution.stats["t"]) <= 0.3
-    hidden = driven(lambda t: jnp.where(t < 0.3, 0.0, 1.0))
-    sol = dvax.solve(hidden, 0.0, 0.0, 1.0, method=dvax.PiecewiseLinear())
+    switched = driven(lambda t: jnp.where(t < 0.3, 0.0, 1.0))
+    sol = dvax.solve(switched, 0.0, 0.0, 1.0, method=dvax.PiecewiseLinear())
     assert float(sol.xs[0]) == pytest.approx(0.5 * (1 - np.exp(-1.4)), rel=1e-12)
     jump = dvax.signals.Table([0.0, 0.3, 1.0], [0.0, 1.0, 1.0], kind="constant")
     sol = dvax.solve(driven(jump), 0.0, 0.0, 1.0, ts=[0.3, 1.0], method=dvax.PiecewiseLinear())

@@ -71,7 +71,7 @@ def run(
     for name in methods or family.methods:
         if name == "default" and sample.rtol < SECOND_ORDER:
             continue
-        record = judge(family, seed, sample, name, truth, constants, second)
+        record = assess(family, seed, sample, name, truth, constants, second)
         if record.failure:
             # Two methods of SciPy against the one that is wrong: this one, or the third.
             finer, apart = second()
@@ -80,7 +80,7 @@ def run(
                 text = f"no reference: SciPy's methods are {apart:.1e} tolerances apart"
                 record = record._replace(failure=text)
             else:
-                record = judge(family, seed, sample, name, finer, constants, second)
+                record = assess(family, seed, sample, name, finer, constants, second)
         yield record
     if certify and constants is not None:
         method = (methods or family.methods)[0]
@@ -110,13 +110,13 @@ def solve(family: Family, sample: Sample, method: str, **options: Any) -> dvax.S
     )  # fmt: skip
 
 
-def judge(
+def assess(
     family: Family, seed: int, sample: Sample, method: str, truth: Any, constants: Any, second: Any
 ) -> Record:
-    begun = time.perf_counter()
+    started = time.perf_counter()
     sol = solve(family, sample, method)
     steps = int(sol.stats["steps"])
-    spent = time.perf_counter() - begun
+    spent = time.perf_counter() - started
     good = bool(sol.result == dvax.RESULTS.successful)
     ratio, status, excess, failure = np.nan, "", 0.0, ""
     if good:
@@ -144,7 +144,7 @@ def certified(
     family: Family, seed: int, sample: Sample, method: str, truth: Any, constants: Any, second: Any
 ) -> Record:
     """A run with `certified_tol`: refused, or within what it says. Refusing is no failure."""
-    begun = time.perf_counter()
+    started = time.perf_counter()
     wanted = 1e2 * tolerance(sample, truth)
     steps, ratio, excess, result, failure = 0, np.nan, 0.0, "refused", ""
     try:
@@ -163,7 +163,7 @@ def certified(
             failure = f"the certified bound is {excess:.3g} times too small"
     return Record(
         family.name, seed, f"{method}, certified", 0.0, result, ratio, steps, "", excess,
-        time.perf_counter() - begun, failure,
+        time.perf_counter() - started, failure,
     )  # fmt: skip
 
 

@@ -88,15 +88,17 @@ def _periodic(w: Written, ts: Array, stops: Array, method: str | None) -> Array:
     one = np.concatenate([[0.0], inner[np.diff(inner, prepend=0.0) > 1e-9 * period], [period]])
     shifted = w._replace(span=period)
     rows, x = [], np.asarray(w.x0, float)
-    index, settled = 0, False
+    index, converged = 0, False
     done = np.floor(ts / period).astype(int)
     while len(rows) < len(ts):
-        if settled:
+        if converged:
             index = int(done[len(rows)])
         here = ts[len(rows) :][done[len(rows) :] == index] - index * period
         order = np.clip(here, 0.0, period)
         out = _pieces(shifted, 0.0, x, one, np.append(order, period), method)
         rows += list(out[:-1])
-        settled = bool(np.max(np.abs(out[-1] - x)) <= 0.1 * w.accuracy * (1.0 + np.max(np.abs(x))))
+        converged = bool(
+            np.max(np.abs(out[-1] - x)) <= 0.1 * w.accuracy * (1.0 + np.max(np.abs(x)))
+        )
         x, index = out[-1], index + 1
     return np.array(rows)

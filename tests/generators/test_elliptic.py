@@ -141,11 +141,11 @@ def test_a_step_stays_within_its_bend(shape, boundary):
     thetas = jnp.linspace(0.0, 1.0, 41)
     path = np.asarray(jax.vmap(step)(thetas))
     line = np.asarray(jax.vmap(lambda s: (1 - s) * x0 + s * path[-1])(thetas))
-    bend = A.bend(
+    bound = A.bend(
         dvax.generators.Arc(h, x0, jnp.asarray(path[-1]), (c0, c1)), space, A.growth(space)
     )
-    assert np.all(np.abs(path - line) <= np.asarray(bend) + 1e-13)
-    assert np.max(np.abs(path - line)) >= 0.02 * float(np.max(np.asarray(bend)))
+    assert np.all(np.abs(path - line) <= np.asarray(bound) + 1e-13)
+    assert np.max(np.abs(path - line)) >= 0.02 * float(np.max(np.asarray(bound)))
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)

@@ -1,4 +1,4 @@
-"""Consistent mass matrices: linear elements on meshes that nobody arranged."""
+"""Consistent mass matrices: linear elements on unstructured random meshes."""
 
 import jax
 import jax.numpy as jnp

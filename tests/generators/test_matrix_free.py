@@ -1,4 +1,4 @@
-"""Sparse matrices and generators of one's own: Faber series against matrix exponentials, numerical
+"""Sparse and user-defined matrix-free generators: Faber series against matrix exponentials, numerical
 ranges against eigenvalues."""
 
 import jax

@@ -49,8 +49,8 @@ def test_a_step_stays_within_its_bend():
     thetas = jnp.linspace(0.0, 1.0, 41)
     path = jax.vmap(step)(thetas)
     end = tuple(v[-1] for v in path)
-    bend = rotation.bend(generators.Arc(h, x0, end, (c0, c1)), PLANE, rotation.growth(PLANE))
-    for along, start, last, bound in zip(path, x0, end, bend, strict=True):
+    bends = rotation.bend(generators.Arc(h, x0, end, (c0, c1)), PLANE, rotation.growth(PLANE))
+    for along, start, last, bound in zip(path, x0, end, bends, strict=True):
         line = (1 - thetas[:, None]) * start[None, :] + thetas[:, None] * last[None, :]
         assert np.all(np.abs(np.asarray(along - line)) <= np.asarray(bound)[None, :] + 1e-14)
 

@@ -36,7 +36,7 @@ def braess(tmp_path_factory):
 
 def test_braess(braess):
     sol = run(braess, braess.all_or_nothing(), 40.0, [0.0, 40.0])
-    assert sorted(np.asarray(sol.xs[0])) == [0.0, 0.0, 6.0]  # 60 + 16 + 60 for everybody
+    assert sorted(np.asarray(sol.xs[0])) == [0.0, 0.0, 6.0]  # the cost of this path is 60 + 16 + 60
     figures = braess.figures(sol)
     for x in (braess.equilibrium, sol.xs[-1]):
         np.testing.assert_allclose(x, 2.0, atol=1e-7)
@@ -244,7 +244,7 @@ def test_the_moduli_are_never_violated_and_hardly_too_large(city):
     rng, n = np.random.default_rng(3), len(city.equilibrium)
     worst = np.repeat(
         city.trips.flow, city.paths.sizes
-    )  # everybody on every path: no flow is larger
+    )  # the whole demand on every path: no flow is larger
     points = [worst, -worst, 3 * worst, np.zeros(n), np.asarray(city.equilibrium)]
     points += [worst * rng.uniform(-1, 2, n) for _ in range(10)]
     for y, z in itertools.combinations(points, 2):

@@ -1,8 +1,8 @@
-"""The table of docs/programs.md: which operation is known to which domain.
+"""The table of docs/programs.md: which domain has a rule for which operation.
 
     python -m tests.programs.primitive_table
 
-writes it anew.
+writes the table into the page.
 """
 
 from pathlib import Path

@@ -202,8 +202,8 @@ def test_a_bend_of_the_trajectory_is_never_less_than_it_is():
             def at(theta, A=A, h=h, x0=x0, c0=c0, c1=c1):
                 return A.propagator(theta * h, 2).step(x0, (c0, theta * c1))
 
-            bend = A.bend(dvax.generators.Arc(h, x0, at(1.0), (c0, c1)), space, A.growth(space))
-            assert np.all(farthest(at, 0.0, 1.0) <= np.asarray(bend) * (1 + 1e-12))
+            bound = A.bend(dvax.generators.Arc(h, x0, at(1.0), (c0, c1)), space, A.growth(space))
+            assert np.all(farthest(at, 0.0, 1.0) <= np.asarray(bound) * (1 + 1e-12))
 
 
 def test_constants_do_not_move():

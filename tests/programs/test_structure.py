@@ -120,9 +120,9 @@ def test_the_truth_itself_withstands_a_sample(name):
     rng = np.random.default_rng(0)
     a, b = rng.uniform(-3, 3, (2, 3))
     at = lambda y: np.asarray(F(jnp.asarray(y)), float)  # noqa: E731
-    bend = np.max(np.abs(at(a) + at(b) - 2 * at((a + b) / 2)))
+    curvature = np.max(np.abs(at(a) + at(b) - 2 * at((a + b) / 2)))
     if affine:
-        assert bend < 1e-12
+        assert curvature < 1e-12
     changed = a.copy()
     changed[0] += 1.0
     if pointwise:

@@ -61,9 +61,9 @@ def test_the_standard_errors_are_what_they_say():
     rng = np.random.default_rng(1)
     data = [exact + NOISE * rng.normal(size=200) for _ in range(100)]
     fitted(data[0])[0].block_until_ready()
-    begun = time.perf_counter()
+    started = time.perf_counter()
     results = [jax.device_get(fitted(d)) for d in data]
-    print(f"a fit takes {(time.perf_counter() - begun) / 100:.3f} s")
+    print(f"a fit takes {(time.perf_counter() - started) / 100:.3f} s")
     off = np.array([(p - TRUTH) / e for p, e in results])
     within = np.sum(np.all(np.abs(off) <= 3.0, axis=1))
     print(f"{within} of 100 within three standard errors; spread of the ratio {off.std(axis=0)}")

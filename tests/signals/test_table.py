@@ -133,6 +133,6 @@ def test_a_listener_hears_every_table_at_its_own_time_and_no_other():
     assert sorted(float(k) for knots in heard.knots for k in knots) == [0, 0.25, 0.5, 1, 3, 4]
     assert [name for _, _, name in heard.spans if name == "Table"] == ["Table", "Table"]
     assert len(heard.elsewhere) == 1 and "Table" in heard.elsewhere[0]
-    # Outside the block nobody listens.
+    # Outside the block no listener is active.
     a(0.5)
     assert len(heard.knots) == 3

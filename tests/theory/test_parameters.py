@@ -183,6 +183,6 @@ def test_what_section_6_keeps_fixed_may_not_use_the_parameter():
         dvax.parameter_bounds(moving, 1.0, 2.0)
     with pytest.raises(dvax.InputError, match="low ≤ high"):
         dvax.parameter_bounds(contact(None), jnp.ones(4), jnp.zeros(4))
-    # ∂f/∂d_x = x is not bounded, and nobody said where x stays.
+    # ∂f/∂d_x = x is not bounded without a bound on x.
     with pytest.raises(dvax.InputError, match="start_radius"):
         dvax.parameter_bounds(contact(None), jnp.zeros(4), jnp.ones(4))

@@ -107,7 +107,7 @@ def mathiesen(x, _):
 
 def traffic(h, _):
     """Three routes 1–3–4, 1–2–3–4 and 1–2–4 of a net with five links of cost A + B v²: no toll on
-    the way through the middle, and yet nobody takes it."""
+    the route through the middle, whose flow is 0 at the solution."""
     uses = jnp.array([[1.0, 0, 0], [0, 1, 1], [0, 1, 0], [1, 1, 0], [0, 0, 1]])
     free, steep = jnp.array([25.0, 25, 75, 25, 25]), jnp.array([0.01, 0.01, 0.001, 0.01, 0.01])
     return uses.T @ (free + steep * (uses @ h) ** 2)

@@ -87,7 +87,7 @@ def test_under_the_callers_jit_there_is_one_trace_as_well():
 
 
 def test_what_F_closes_over_in_a_transformation_is_differentiated_and_mapped():
-    # A function made anew around a traced number is a new function, not the compiled old one.
+    # A closure over a traced number is a new function, not the one compiled before.
     def solution(c):
         return dvax.solve_vi(lambda y, _: y + y**3 - c, Box(-9.0, 9.0), jnp.zeros(())).y
 

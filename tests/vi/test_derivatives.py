@@ -82,7 +82,7 @@ def test_first_and_second_derivatives_of_a_nonlinear_law(solver):
 
     y = 1.3
     c = y**3 + y
-    slope, bend = 1 / (3 * y**2 + 1), -6 * y / (3 * y**2 + 1) ** 3
+    slope, curvature = 1 / (3 * y**2 + 1), -6 * y / (3 * y**2 + 1) ** 3
     assert float(solution(c)) == pytest.approx(y, abs=1e-12)
     assert float(jax.grad(solution)(c)) == pytest.approx(slope, rel=1e-10)
     assert float(jax.jvp(solution, (c,), (1.0,))[1]) == pytest.approx(slope, rel=1e-10)
@@ -91,7 +91,7 @@ def test_first_and_second_derivatives_of_a_nonlinear_law(solver):
         jax.grad(jax.grad(solution)),
         jax.jacfwd(jax.jacfwd(solution)),
     ):
-        assert float(second(c)) == pytest.approx(bend, rel=1e-8)
+        assert float(second(c)) == pytest.approx(curvature, rel=1e-8)
 
 
 def test_jvp_and_vjp_are_transposes_and_agree_with_differences():

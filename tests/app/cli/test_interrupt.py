@@ -19,7 +19,7 @@ import dvax
     "number", mostly_thorough([signal.SIGINT, signal.SIGTERM], [signal.SIGINT])
 )
 def test_a_signal_ends_a_run_in_good_order(tmp_path: Path, number: signal.Signals) -> None:
-    # A million steps: nobody waits for its end.
+    # A million steps: the run is certainly not over when the signal arrives.
     changes = (("dt = 0.05", "dt = 1e-6"), ("frames = 8", "frames = 200"))
     config = write_config(tmp_path / "in", *changes)
     # As from a terminal: where the tests themselves run in the background, Ctrl-C is ignored, and what

@@ -108,7 +108,7 @@ def test_a_killed_run_is_closed_and_one_that_goes_on_is_not(tmp_path: Path) -> N
     file.write_text(
         json.dumps({"status": "running", **process(), "process": gone(), "host": "other"})
     )
-    assert not close_killed(tmp_path)  # nobody here can know
+    assert not close_killed(tmp_path)  # the state of a process on another host is unknown
 
 
 def test_frames_without_a_time_are_cut_off(tmp_path: Path) -> None:

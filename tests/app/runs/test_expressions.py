@@ -175,7 +175,7 @@ TOKENS = (
 ).split(" ")
 
 
-def judge(text: str) -> bool:
+def parses_safely(text: str) -> bool:
     """Whether the text is a formula; then it computes. No exception but InputError leaves."""
     try:
         expression = compile_expression(text)
@@ -193,11 +193,11 @@ def test_random_token_soup_raises_input_errors_alone(cases):
     passed = 0
     for _ in range(cases):
         joint = dice.choice(("", " "))
-        passed += judge(joint.join(dice.choices(TOKENS, k=dice.randint(1, 14))))
+        passed += parses_safely(joint.join(dice.choices(TOKENS, k=dice.randint(1, 14))))
     assert cases / 200 < passed < cases, "the soup reaches both verdicts"
 
 
 @settings(max_examples=500, deadline=None, database=None, derandomize=True)
 @given(st.text(max_size=80) | st.lists(st.sampled_from(TOKENS), max_size=40).map("".join))
 def test_arbitrary_text_raises_input_errors_alone(text):
-    judge(text)
+    parses_safely(text)

@@ -106,7 +106,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 import dvax.app.cli.check
 from dvax.app.cli import main
 
-def held(error):  # in the main thread: a lock that nobody gives back, as foreign code may take one
+def held(error):  # in the main thread: a lock that is never released, as third-party code may take
     lock = threading.Lock()
     lock.acquire()
     print("held", file=sys.stderr, flush=True)
