@@ -24,8 +24,8 @@ PROBLEM = dvax.Problem(
 
 
 @pytest.mark.parametrize("name", mostly_thorough(METHODS, ["ETD2RK", "ExpRosenbrock"]))
-def test_a_smooth_defect_is_seen_in_its_size(name):
-    """Random smooth systems, from 20 to 200 steps: no method's defect hides at the sampled places."""
+def test_sampled_defect_of_smooth_systems_has_the_size_of_its_integral(name):
+    """For random smooth systems in 20 to 200 steps, the samples do not miss the defect."""
     rng = np.random.default_rng(5)
     method = METHODS[name]
     flow = None
@@ -64,8 +64,8 @@ CLOCK = dvax.Problem(
 
 
 @pytest.mark.parametrize("name", mostly_thorough(METHODS, ["ETD2RK", "ExpRosenbrock"]))
-def test_a_kink_or_a_jump_within_a_step_hides_nothing(name):
-    """One step over it, beside the integral of its defect."""
+def test_sampled_defect_covers_a_kink_or_a_jump_within_a_step(name):
+    """For one step over it, the charge covers the integral of the defect."""
     places = (jnp.arange(2000.0) + 0.5) / 2000
 
     @jax.jit

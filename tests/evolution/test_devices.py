@@ -57,6 +57,6 @@ CASES = ["a field", "its gradient", "a batch", "a batch on each"]
 
 
 @pytest.mark.parametrize("case", mostly_thorough(CASES, ["a field", "a batch on each"]))
-def test_what_devices_share_is_what_one_computes(case):
+def test_sharded_solve_equals_the_solve_on_one_device(case):
     program = textwrap.dedent(PROGRAM).replace("CASE", repr(case))
     subprocess.run([sys.executable, "-c", program], check=True)

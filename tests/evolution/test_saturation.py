@@ -92,7 +92,7 @@ OFTEN = [*RUNS[::3], ("pulses", "DormandPrince")]
 
 
 @pytest.mark.parametrize(("name", "method"), mostly_thorough(RUNS, OFTEN))
-def test_the_error_follows_the_tolerance_through_saturation(name, method):
+def test_error_follows_the_tolerance_through_saturation(name, method):
     problem, x0, T, exact = SYSTEMS[name]()
     for tol in TOLERANCES if method == "ETD2RK" else (*TOLERANCES, 1e-10):
         sol = dvax.solve(problem, x0, 0.0, T, rtol=tol, atol=tol, method=METHODS[method])
@@ -102,7 +102,7 @@ def test_the_error_follows_the_tolerance_through_saturation(name, method):
 
 
 @pytest.mark.parametrize("dt", [None, 0.3])
-def test_jumps_of_data_on_knots_are_integrated_exactly(dt):
+def test_jumps_of_data_at_knots_are_integrated_exactly(dt):
     # x' = −x + load, the load a staircase: x is a sum of exponentials, and no step is too long.
     times = np.array([0.0, 0.31, 0.32, 1.7, 2.9, 4.0])
     values = np.array([1.0, -50.0, 2.0, 0.0, 7.0, 7.0])
