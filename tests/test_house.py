@@ -207,14 +207,14 @@ def resolve(name: str) -> object:
     return thing
 
 
-def test_every_class_is_abstract_or_final():
+def test_classes_are_abstract_or_final():
     classes = family()
     assert len(classes) > 10
     faults = faults_of(classes)
     assert not faults, "\n".join(faults)
 
 
-def test_planted_faults_are_seen():
+def test_class_faults_are_detected():
     class AbstractShape(eqx.Module):
         @abc.abstractmethod
         def area(self) -> float: ...
@@ -244,7 +244,7 @@ def test_planted_faults_are_seen():
         pass
 
     def short(*classes: type) -> list[str]:
-        prefix = f"{__name__}.{test_planted_faults_are_seen.__qualname__}.<locals>."
+        prefix = f"{__name__}.{test_class_faults_are_detected.__qualname__}.<locals>."
         return [fault.replace(prefix, "") for fault in faults_of(classes)]
 
     assert short(AbstractShape, Disc) == []
@@ -260,7 +260,7 @@ def test_planted_faults_are_seen():
 
 
 @pytest.mark.parametrize("name", CONTRACT)
-def test_a_contract_name_has_an_example_that_runs(name: str):
+def test_public_names_have_an_example_that_runs(name: str):
     thing = resolve(name)
     finder = doctest.DocTestFinder(recurse=False)
     found = finder.find(thing, name, module=False, globs={})
@@ -273,7 +273,7 @@ def test_a_contract_name_has_an_example_that_runs(name: str):
     assert runner.summarize(verbose=False).failed == 0, "".join(report)
 
 
-def test_the_example_of_the_readme_prints_what_it_says(tmp_path: Path):
+def test_readme_example_prints_the_documented_output(tmp_path: Path):
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     examples = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", text, flags=re.DOTALL)
     assert len(examples) == text.count("```python") == 1
@@ -285,7 +285,7 @@ def test_the_example_of_the_readme_prints_what_it_says(tmp_path: Path):
 
 
 @pytest.mark.parametrize("room", ROOMS)
-def test_every_public_name_is_documented(room: str):
+def test_public_names_are_documented(room: str):
     names = public(room)
     assert names
     bare = [
@@ -297,7 +297,7 @@ def test_every_public_name_is_documented(room: str):
     assert not bare, f"no docstring: {bare}"
 
 
-def test_the_files_that_the_page_on_the_architecture_names_exist():
+def test_architecture_page_names_existing_files():
     page = (ROOT / "docs" / "architecture.md").read_text()
     named = set(re.findall(r"[\w/]+\.py\b", page)) | set(re.findall(r"`([\w/]+/)`", page))
     assert len(named) > 20
@@ -306,7 +306,7 @@ def test_the_files_that_the_page_on_the_architecture_names_exist():
     assert not absent
 
 
-def test_only_the_room_for_it_uses_unstable_interfaces_of_jax():
+def test_unstable_jax_interfaces_are_used_in_one_folder_only():
     assert list(unstable_lines()) == []
     # The reader finds what it looks for.
     assert UNSTABLE.search("from jax.interpreters import mlir")

@@ -192,26 +192,26 @@ def foreign(package: Path) -> list[str]:
     return wrong
 
 
-def test_every_room_has_a_floor():
+def test_folders_have_a_floor():
     assert {room(name) for name in modules(SOURCE)} <= set(FLOORS)
 
 
-def test_imports_go_down():
+def test_imports_go_to_lower_floors_only():
     wrong, _ = wrong_floors(SOURCE)
     assert not wrong, "\n".join(wrong)
 
 
-def test_every_exception_is_in_use():
+def test_import_exceptions_are_in_use():
     _, used = wrong_floors(SOURCE)
     assert used == set(NEIGHBOURS)
 
 
 @pytest.mark.parametrize("of", ["modules", "rooms"])
-def test_no_circles(of: str):
+def test_imports_have_no_cycles(of: str):
     assert circle(dependence(SOURCE, of)) == []
 
 
-def test_foreign_packages_are_declared_and_stay_in_their_rooms():
+def test_third_party_imports_are_declared_and_restricted_to_their_folders():
     wrong = foreign(SOURCE)
     assert not wrong, "\n".join(wrong)
 
@@ -239,20 +239,20 @@ def plant(folder: Path, **files: str) -> Path:
         "from ..generators.scalar import Scalar",
     ],
 )
-def test_a_planted_import_upward_or_sideways_is_seen(tmp_path: Path, text: str):
+def test_import_upward_or_sideways_is_detected(tmp_path: Path, text: str):
     house = plant(tmp_path, sets__box=text, evolution__solve="", generators__scalar="")
     (house / "evolution" / "__init__.py").touch()
     wrong, _ = wrong_floors(house)
     assert len(wrong) == 1 and wrong[0].startswith("dvax.sets.box:")
 
 
-def test_an_import_downward_is_not_reported(tmp_path: Path):
+def test_import_downward_is_not_reported(tmp_path: Path):
     house = plant(tmp_path, vi__residual="from ..sets.box import Box", sets__box="import jax")
     assert wrong_floors(house) == ([], set())
     assert foreign(house) == []
 
 
-def test_a_planted_circle_is_seen(tmp_path: Path):
+def test_import_cycle_is_detected(tmp_path: Path):
     house = plant(
         tmp_path,
         sets__box="from .ball import Ball",
@@ -268,7 +268,7 @@ def test_a_planted_circle_is_seen(tmp_path: Path):
     assert set(circle(dependence(other, "rooms"))) == {"sets", "signals"}
 
 
-def test_a_planted_foreign_import_is_seen(tmp_path: Path):
+def test_undeclared_third_party_import_is_detected(tmp_path: Path):
     house = plant(
         tmp_path,
         sets__box="import xarray",

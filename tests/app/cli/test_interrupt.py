@@ -18,7 +18,9 @@ import dvax
 @pytest.mark.parametrize(
     "number", mostly_thorough([signal.SIGINT, signal.SIGTERM], [signal.SIGINT])
 )
-def test_a_signal_ends_a_run_in_good_order(tmp_path: Path, number: signal.Signals) -> None:
+def test_signal_ends_a_run_with_its_exit_code_and_readable_results(
+    tmp_path: Path, number: signal.Signals
+) -> None:
     # A million steps: the run is certainly not over when the signal arrives.
     changes = (("dt = 0.05", "dt = 1e-6"), ("frames = 8", "frames = 200"))
     config = write_config(tmp_path / "in", *changes)
