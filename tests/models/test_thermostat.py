@@ -136,7 +136,7 @@ def test_thermostat_steady_free_boundary_agrees_with_the_closed_form():
     assert errors[1] < 2e-3 and errors[0] / errors[1] > 6.0, errors
 
 
-def test_thermostat_insulated_plate_conserves_heat():
+def test_thermostat_insulated_plate_gains_the_supplied_heat():
     s1, s2 = plate().points
     load = jnp.asarray(np.exp(-10 * ((s1 - 0.4) ** 2 + (s2 - 0.6) ** 2)))
     model = plate(load=load, upper=jnp.asarray(np.where(s1 < 0.75, 3.0, 0.0)), lower=0.0)

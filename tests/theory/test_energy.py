@@ -70,7 +70,7 @@ def test_energy_norm_proves_decay_where_moduli_give_growth():
     assert names["energy_rate"].value > 0
 
 
-def test_energy_norm_rate_is_at_most_that_of_the_space_norm():
+def test_energy_norm_growth_is_at_most_that_of_the_space_norm():
     for name in ("C1", "C2", "C3"):
         case = ALL[name]()
         c = dvax.verify(

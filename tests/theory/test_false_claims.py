@@ -158,7 +158,7 @@ def test_verify_does_not_mistake_a_slope_at_a_late_time_for_a_jump(begin, slope)
     assert check["ass:time_regularity (ii)"].status == "proved"
 
 
-def test_certified_run_stays_in_the_region_of_its_constants():
+def test_certified_tol_rejects_constants_of_a_region_that_the_run_leaves():
     grows = problem(
         A=dvax.generators.Scalar(0.0), K=dvax.sets.Box(-10.0, 10.0),
         f=lambda t, x, u, a: 20 * jnp.maximum(x - 0.5, 0.0) + 1.0 + jnp.sin(20 * t) - 0.0 * u,
@@ -197,7 +197,7 @@ def test_verify_proves_a_pseudomonotone_law_with_zero_slope():
     assert check.constants is not None and float(check.constants.gamma) == pytest.approx(1.0)
 
 
-def test_certified_run_stays_in_the_region_between_saved_times():
+def test_certified_tol_checks_the_region_between_saved_times():
     """For x = sin t, which exceeds 0.6 for a while, constants up to 0.6 do not hold then."""
     k = lambda x: 12 * jnp.tanh(5 * jnp.maximum(jnp.abs(x) - 0.6, 0.0))  # noqa: E731
     system = problem(

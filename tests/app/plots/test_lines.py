@@ -24,6 +24,6 @@ def test_thinned_curve_keeps_gaps() -> None:
     assert np.isfinite(values[kept]).sum() >= 20
 
 
-def test_logarithmic_curve_has_gaps_at_nonpositive_values() -> None:
+def test_logarithmic_curve_has_gaps_at_nonpositive_and_nonfinite_values() -> None:
     given_values = np.array([1.0, 0.0, -1.0, np.inf, np.nan])
     np.testing.assert_array_equal(positive(given_values), [1.0] + 4 * [np.nan])
