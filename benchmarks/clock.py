@@ -1,4 +1,4 @@
-"""Timing two or more things in turn, so that a busy machine slows all of them alike.
+"""Alternating timing of two or more functions, so that load on the machine affects all of them alike.
 
 One sample of each is taken a round, in an order that rotates, and ratios are formed round by round:
 their median is what is reported, with the smallest and the largest beside it.

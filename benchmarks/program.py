@@ -1,4 +1,4 @@
-"""The `dvax` program as a user starts it, with the time it took and the memory it held."""
+"""The `dvax` program as a user starts it, with its time and its memory."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""Road networks of the size and the congestion of real ones, the same at every call."""
+"""Generated road networks with the size and the congestion of real ones, equal at every call."""
 
 import numpy as np
 import scipy.sparse.csgraph

@@ -1,4 +1,4 @@
-"""Three masses between two walls, steered by model predictive control without sampling."""
+"""Three masses between two walls, controlled by continuous-time model predictive control."""
 
 from pathlib import Path
 

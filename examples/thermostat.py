@@ -1,4 +1,4 @@
-"""A plate under a flame that wanders, and its saturated heaters."""
+"""A plate under a moving heat source, with saturated heaters."""
 
 from pathlib import Path
 

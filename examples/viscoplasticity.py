@@ -1,4 +1,4 @@
-"""A steel point on a path that turns from tension to shear, after Duvaut and Lions."""
+"""A steel point on a strain path from tension to shear, by the law of Duvaut and Lions."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Cases of wrong input, tried in a process of its own, and what was said of each.
+"""Cases of wrong input, tried in a separate process, with the messages.
 
 A module of cases has `CASES`: by group and name an attempt and words of the message, "; " between them.
 """

@@ -1,4 +1,4 @@
-"""Data that is no number, array, shape or part is refused where it is given; the rest is taken."""
+"""Data of a wrong kind, shape or type are rejected where they are given; valid data are accepted."""
 
 import jax
 import jax.numpy as jnp

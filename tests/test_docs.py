@@ -1,4 +1,4 @@
-"""The pages of docs/: their examples run, and the page on the frozen law leaves nothing out."""
+"""The pages of docs/: their examples run, and the page on the frozen law is complete."""
 
 import doctest
 import inspect

@@ -1,4 +1,4 @@
-"""The programs of examples/ run, and what they print is true."""
+"""The programs of examples/ run, and print correct numbers."""
 
 import runpy
 from pathlib import Path

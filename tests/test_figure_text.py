@@ -1,4 +1,4 @@
-"""A figure reads the same everywhere, with the digits that are known."""
+"""A figure has the same text everywhere, with its certified digits."""
 
 import json
 import re

@@ -1,7 +1,7 @@
-"""The habits of the house that no linter knows.
+"""Conventions of the code that no linter checks.
 
-A class is abstract or final and behaviour is not overridden (equinox's own `strict` flag checks
-nothing). A public name says what it is, and shows it in an example that runs. A file is one idea.
+A class is abstract or final, and concrete methods are not overridden (equinox's own `strict` flag
+checks nothing). A public name has a docstring with an example that runs.
 """
 
 import abc

@@ -1,4 +1,4 @@
-"""The house stands: a room imports only from floors below its own, and nothing goes in circles.
+"""The layers: a folder imports only from floors below its own, without cycles.
 
 The imports are read from the sources, those inside functions and under TYPE_CHECKING included: a
 dependence that is only a type is still a dependence.

@@ -1,4 +1,4 @@
-"""What a user installs: a whole wheel, a core without extras, a command line that is quick."""
+"""The installed package: a complete wheel, a core without extras, a fast command line."""
 
 import email
 import itertools

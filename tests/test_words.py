@@ -165,7 +165,7 @@ PENDING_NAMES: dict[str, set[str]] = {
     "src/dvax/_figure_text.py": {"_FEW"},
     "src/dvax/_tree.py": {"mend"},
     "src/dvax/evolution": {
-        "Factors", "_MOST", "_SMALL", "begun", "bend", "look", "moving",
+        "Factors", "_MOST", "_SMALL", "begun", "bend", "guarded", "look", "moving",
     },
     "src/dvax/formats": {"begun"},
     "src/dvax/generators": {"Expanded", "_FEW", "bend", "of_waves", "turns", "waves"},

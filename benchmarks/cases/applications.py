@@ -1,4 +1,4 @@
-"""The applications against what people use for them today."""
+"""The applications against the usual tools."""
 
 import importlib.util
 import time

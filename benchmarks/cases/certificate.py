@@ -1,4 +1,4 @@
-"""What the certificate costs on a field, and how far above the true error it is on C1."""
+"""The cost of the certificate on a field, and its ratio to the true error on C1."""
 
 import functools
 import time

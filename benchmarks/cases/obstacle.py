@@ -1,4 +1,4 @@
-"""An obstacle problem without a matrix, grid by grid, and a path of warm starts."""
+"""A matrix-free obstacle problem on several grids, and a path of warm starts."""
 
 import functools
 from typing import Any

@@ -1,4 +1,4 @@
-"""What a call hands to its compiled loop, and what it gives back of it."""
+"""The arguments and results of `dvax.solve` around its compiled loop."""
 
 import equinox as eqx
 import jax

@@ -1,4 +1,4 @@
-"""C1 to C4 of `tests.closed_forms`, solved to the accuracy that was asked for."""
+"""C1 to C4 of `tests.closed_forms`, solved to the requested accuracy."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""The measured defect beside its integral by quadrature along the dense output."""
+"""The measured defect against its integral by quadrature along the dense output."""
 
 import jax
 import jax.numpy as jnp

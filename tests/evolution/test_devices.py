@@ -1,4 +1,4 @@
-"""Several devices share a field, or the runs of a batch, and nothing changes."""
+"""Sharding of a field, or of the runs of a batch, over several devices does not change the results."""
 
 import subprocess
 import sys

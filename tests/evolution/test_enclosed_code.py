@@ -1,4 +1,4 @@
-"""Code that enclosures have to read: it ends no run, and hides nothing from the guard."""
+"""Code in f, h and K that enclosures have to cover: runs succeed, and pulses are not missed."""
 
 import itertools
 

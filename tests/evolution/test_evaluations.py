@@ -1,4 +1,4 @@
-"""Where the solver of an iterated law begins."""
+"""The initial guess of the solver of an iterated law."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""What moves between two samples of a step is seen: dips of a bound, pulses, periods, jumps."""
+"""Changes between two samples of a step are not missed: dips of a bound, pulses, periods, jumps."""
 
 import jax
 import jax.numpy as jnp

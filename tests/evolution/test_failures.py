@@ -1,4 +1,4 @@
-"""When something breaks: what, when, where, and what was computed before stays readable."""
+"""Failed runs: cause, time and place are reported, and earlier results are kept."""
 
 import itertools
 

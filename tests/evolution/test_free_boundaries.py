@@ -1,4 +1,4 @@
-"""A field whose free boundaries move: orders, tolerances, and where the boundaries are."""
+"""A field with moving free boundaries: orders, tolerances, and the position of the boundaries."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""Derivatives of the solution map: C1's are known in closed form."""
+"""Derivatives of the solution map against the closed form of C1."""
 
 import jax
 import jax.numpy as jnp

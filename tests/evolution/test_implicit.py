@@ -1,4 +1,4 @@
-"""The implicit fallback: Diffrax's accuracy on closed forms, and what it does not do, said at once."""
+"""`Implicit`: Diffrax's accuracy on closed forms, and errors for unsupported options."""
 
 import diffrax
 import jax

@@ -1,4 +1,4 @@
-"""Kinks of the response are found, steps end there, and no way of meeting a bound stops a run."""
+"""Kinks of the response are located, steps end there, and no kind of contact ends a run."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Generators with operators and sets, on solutions that were chosen first."""
+"""Manufactured solutions for combinations of generators, operators and sets."""
 
 import numpy as np
 import pytest

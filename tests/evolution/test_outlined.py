@@ -1,5 +1,5 @@
-"""Small programs are compiled as one function; their results do not change, and what XLA cannot compile
-so is left as it is."""
+"""Small programs are compiled as one function with equal results; programs that XLA cannot compile so
+are left unchanged."""
 
 import jax
 import jax.numpy as jnp

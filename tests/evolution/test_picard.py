@@ -1,4 +1,4 @@
-"""The fixed point over windows: order, tolerance and bound as for steps, and what it says of itself."""
+"""`Picard` over windows: order, tolerance, bound and failures."""
 
 import jax
 import jax.numpy as jnp

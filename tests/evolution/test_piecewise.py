@@ -1,4 +1,4 @@
-"""Systems that are affine between switchings, against closed forms and against matrix exponentials."""
+"""`PiecewiseLinear` against closed forms and matrix exponentials."""
 
 import jax
 import jax.numpy as jnp

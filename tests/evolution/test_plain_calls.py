@@ -1,5 +1,5 @@
-"""Solves without outlined programs (`dvax._jax`): on a JAX that is faster by itself, and on one
-without the interfaces that they are built from, every answer and every derivative stays the same."""
+"""Solves without outlined programs (`dvax._jax`): on newer JAX, and without the interfaces that
+outlined programs need, all results and derivatives are the same."""
 
 import subprocess
 import sys

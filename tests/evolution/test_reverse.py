@@ -1,4 +1,4 @@
-"""The reverse pass against the forward one, which shares none of its code, in every kind of run."""
+"""Reverse mode against forward mode, which shares no code with it, for every kind of run."""
 
 import itertools
 

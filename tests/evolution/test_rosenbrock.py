@@ -1,4 +1,4 @@
-"""The exponential Rosenbrock method: order 3 however stiff f̃ is, exact where f̃ is linear in pieces."""
+"""`ExpRosenbrock`: order 3 for any stiffness of f̃, and exact for piecewise linear f̃."""
 
 import jax
 import jax.numpy as jnp

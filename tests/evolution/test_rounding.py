@@ -1,4 +1,4 @@
-"""Right-hand sides whose rounding is as large as the tolerance."""
+"""Right-hand sides whose rounding error is as large as the tolerance."""
 
 import jax.numpy as jnp
 import numpy as np

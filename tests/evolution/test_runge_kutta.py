@@ -1,4 +1,4 @@
-"""The explicit method of order 5: on the whole right-hand side, over kinks, and dense."""
+"""`DormandPrince`: orders on the whole right-hand side, across kinks, and of the dense output."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""While u sits on its bound an embedded estimate sees nothing; the step control must see anyway.
+"""While u is saturated, an embedded error estimate is zero; the step-size control must not rely on it.
 
 Three systems whose u is constant for long and then leaves its bound briefly. An estimate that is
 blind there has an error that does not shrink with the tolerance at all.

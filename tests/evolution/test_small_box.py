@@ -1,5 +1,5 @@
-"""The law written out, by medians and face by face: it satisfies the law, and its derivative is that of
-its face."""
+"""The law on small boxes, by medians and face by face: it is satisfied, and its derivative is that of
+the face."""
 
 import itertools
 

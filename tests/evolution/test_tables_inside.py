@@ -1,4 +1,4 @@
-"""Tables that f makes itself: their kinks are steps' ends like those of tables made outside."""
+"""Tables that f creates: steps end at their kinks, as for tables created outside."""
 
 import jax.numpy as jnp
 import numpy as np

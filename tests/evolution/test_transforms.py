@@ -1,4 +1,4 @@
-"""Compiled once, vectorised, and the same in every way of calling."""
+"""`dvax.solve` under `jit` and `vmap`: it compiles once, and all ways of calling agree."""
 
 import jax
 import jax.numpy as jnp

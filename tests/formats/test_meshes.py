@@ -1,4 +1,4 @@
-"""Meshes for the finite-element contact: files of several formats, and every way to be no mesh."""
+"""Meshes for the finite-element contact: several file formats, and invalid meshes."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Netlists: what is read, and what is refused with its line, the rule and the fix."""
+"""Netlists: accepted lines, and errors with line, rule and fix."""
 
 import numpy as np
 import pytest

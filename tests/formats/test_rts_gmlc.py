@@ -1,4 +1,4 @@
-"""The loader of RTS-GMLC folders: a small system of our own, read right, and broken in every way."""
+"""The reader of RTS-GMLC folders: a small system, read correctly, and with errors of every kind."""
 
 import datetime
 

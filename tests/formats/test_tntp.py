@@ -1,4 +1,4 @@
-"""TNTP files: what is read is what was written, and every flaw is named with its line."""
+"""TNTP files: round trips, and errors with their lines."""
 
 import numpy as np
 import pytest

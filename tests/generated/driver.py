@@ -1,4 +1,4 @@
-"""Samples of a family through dvax and through SciPy, side by side."""
+"""Solve samples of a family with dvax and with SciPy, and compare them."""
 
 import time
 import zlib

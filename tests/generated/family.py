@@ -1,4 +1,4 @@
-"""What a family of problems is: one structure, which is compiled once, and numbers drawn at random."""
+"""A family of problems: one structure, compiled once, with numbers drawn at random."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""Numbers as functions of time that are hard on a step control: one formula for JAX and NumPy each.
+"""Functions of time that are difficult for step-size control, with one formula each for JAX and NumPy.
 
 A profile is drawn on [0, span]; `shifted` moves its times by t0, for a run that begins there. Its
 `breaks` are the times where its formula is not smooth, with more around narrow features, so that a

@@ -1,4 +1,4 @@
-"""Laws that a projection solves: any set, moved by any profile.
+"""Laws that are solved by a projection onto a set, which any profile moves.
 
     x' = A x + b u + e_f F(t),      u ∈ q(t) + e_h H(t) − g x − c u − N_{K(t)}(u)
 

@@ -1,4 +1,4 @@
-"""The trajectory by SciPy, with the law written by hand; nothing here comes from dvax."""
+"""The trajectory by SciPy with a hand-written law, without any code of dvax."""
 
 import itertools
 from collections.abc import Callable

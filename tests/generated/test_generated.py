@@ -1,5 +1,5 @@
-"""Generated problems beside SciPy with the law written by hand: no successful run above ten times its
-tolerance, no bound below the error, and no run that dies.
+"""Generated problems against SciPy with a hand-written law: the error of a successful run is at most
+ten tolerances, bounds are above the error, and no run crashes.
 
 `python -m tests.generated` prints a table of all that fails, and runs one problem alone.
 """

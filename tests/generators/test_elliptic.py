@@ -1,4 +1,4 @@
-"""Constant coefficients on a box, against matrices that numpy writes down and scipy exponentiates."""
+"""`Elliptic` against matrices by NumPy and their exponentials by SciPy."""
 
 import functools
 import itertools

@@ -1,4 +1,4 @@
-"""States with their coefficients: whatever is made of them is what is made of the states alone."""
+"""States with their spectral coefficients: all operations agree with those on plain states."""
 
 import jax
 import jax.numpy as jnp

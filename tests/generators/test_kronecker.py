@@ -1,4 +1,4 @@
-"""A field and a matrix across its components: they commute, and the flow is that of both."""
+"""`KroneckerSum`: field and matrix commute, and the semigroup is the product of both."""
 
 import jax
 import jax.numpy as jnp

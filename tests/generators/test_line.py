@@ -1,4 +1,4 @@
-"""Transforms on a line by half as many complex numbers, against SciPy's and as linear maps."""
+"""One-dimensional transforms with half as many complex numbers, against SciPy's and as linear maps."""
 
 import jax
 import jax.numpy as jnp

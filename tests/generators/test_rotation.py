@@ -1,4 +1,4 @@
-"""Complex spectrum: pairs that turn, against the matrices that they are."""
+"""`Rotation` (complex spectrum) against its matrix."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Systems that are linear in pieces, followed from one switching to the next: an oracle.
+"""An oracle for piecewise linear systems, which proceeds from one switching to the next.
 
 In each regime x' = Mz for z = (x, load, its slope, 1), so that z moves by a matrix exponential; where
 an expression cᵀz of the regime falls below zero, another regime begins. scipy finds the moment.

@@ -1,4 +1,4 @@
-"""Circuits: their equations against a second analysis, their trajectories against exact ones."""
+"""Circuits: equations against an independent analysis, trajectories against exact ones."""
 
 import itertools
 import json

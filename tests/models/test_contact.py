@@ -1,4 +1,4 @@
-"""Section 7 of the paper, its formulas coded a second time."""
+"""The contact law against the formulas of Section 7 of the paper, coded independently."""
 
 import jax.numpy as jnp
 import numpy as np

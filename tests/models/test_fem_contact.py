@@ -1,4 +1,4 @@
-"""The finite-element contact: reference figures, Hertz, and the whole body without condensation."""
+"""The finite-element contact: reference forces, Hertz, and the whole body without condensation."""
 
 from pathlib import Path
 

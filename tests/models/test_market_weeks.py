@@ -1,4 +1,4 @@
-"""Every week of the RTS-GMLC year ends at the default tolerances, wherever hours are counted from."""
+"""Every week of the RTS-GMLC year is solved at the default tolerances, for any origin of time."""
 
 from pathlib import Path
 

@@ -1,5 +1,5 @@
-"""Multipliers of voltage and bridges of three phases: many diodes switch at one time, and capacitors
-hang on each other by nothing but diodes of almost no resistance."""
+"""Voltage multipliers and three-phase bridges: many diodes switch at the same time, and capacitors are
+connected by diodes of almost no resistance only."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Day-to-day traffic: closed forms, a linear programme as oracle, and what can never happen."""
+"""Day-to-day traffic: closed forms, a linear programme as oracle, and invariants."""
 
 import dataclasses
 import doctest

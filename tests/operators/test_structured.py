@@ -1,4 +1,4 @@
-"""Operators that are never written out act as the matrices they stand for."""
+"""Structured operators agree with their matrices."""
 
 import functools
 

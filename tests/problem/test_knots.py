@@ -1,4 +1,4 @@
-"""Tables are found wherever they hide, and no step jumps over what they know."""
+"""The knots of tables are found anywhere in a problem, and steps end at them."""
 
 import itertools
 

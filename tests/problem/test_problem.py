@@ -1,4 +1,4 @@
-"""`Problem`: the frozen operator, the response, the reduced map, and what it refuses."""
+"""`Problem`: the frozen operator, the response, the reduced map, and rejected input."""
 
 import ast
 import os

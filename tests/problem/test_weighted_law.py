@@ -1,4 +1,4 @@
-"""A weighted law (paper, remark:assstrong (ii)) in a coupled system, and the one without its weight."""
+"""A weighted law (paper, remark:assstrong (ii)) in a coupled system equals that without weight."""
 
 import jax.numpy as jnp
 import numpy as np

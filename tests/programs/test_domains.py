@@ -1,4 +1,4 @@
-"""The tables of rules: documented, of operations that exist, and independent of one JAX interface."""
+"""The tables of rules: documented, for existing operations, and independent of one JAX interface."""
 
 import subprocess
 import sys

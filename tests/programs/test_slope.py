@@ -1,4 +1,4 @@
-"""Slope arithmetic encloses values and difference quotients, for every operation that it knows."""
+"""Slope arithmetic encloses values and difference quotients, for every operation with a rule."""
 
 import jax
 import jax.numpy as jnp

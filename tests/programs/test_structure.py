@@ -1,4 +1,4 @@
-"""What a function's code proves about it: never more than is true, and enough to be useful.
+"""The structure of a function from its code: claims are true, and sufficient for the fast paths.
 
 Each function stands beside the truth, decided by hand: is it affine, is Fᵢ a function of yᵢ alone,
 is it ay + c with one number a. `analyse` may say less than the truth, never more; for the laws that

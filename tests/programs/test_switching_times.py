@@ -1,4 +1,4 @@
-"""Jumps that the code of f, h and K shows are knots: steps end there and derivatives include them."""
+"""Jumps detected in the code of f, h and K are knots: steps end there, derivatives include them."""
 
 import itertools
 

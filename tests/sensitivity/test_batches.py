@@ -1,4 +1,4 @@
-"""Gradients of many runs at once, and of a long one."""
+"""Gradients of batches, and of a long run."""
 
 import subprocess
 import sys

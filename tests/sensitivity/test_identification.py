@@ -1,5 +1,5 @@
-"""What people do with derivatives: four parameters of a contact law from a noisy record, with their
-standard errors; and how far linearisation is from sampling."""
+"""Applications of derivatives: a fit of four contact parameters with standard errors, and linearisation
+against sampling."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""Derivatives in times: the first, the last, those saved at, and those at which data jump."""
+"""Derivatives in times: the first, the last, the saved ones, and those of jumps."""
 
 import itertools
 

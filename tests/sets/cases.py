@@ -1,4 +1,4 @@
-"""One example of every set in ℝ⁴, with what is known of it without dvax.
+"""One example of every set in ℝ⁴, with properties that do not depend on dvax.
 
 `make(data)` builds the set from a vector of its own data; `violation(y)` is how far y breaks the
 set's definition; `members(rng)` draws points of it from that definition, corners included; `rows`

@@ -1,4 +1,4 @@
-"""What every projection owes, set by set, with and without weights."""
+"""Properties of every projection, set by set, with and without weights."""
 
 import functools
 from itertools import combinations

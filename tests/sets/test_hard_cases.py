@@ -1,4 +1,4 @@
-"""Kinks, degenerate sets, far-away points, and sets that turn out to be none."""
+"""Kinks, degenerate sets, distant points, and sets that are empty under tracing."""
 
 import jax
 import jax.numpy as jnp

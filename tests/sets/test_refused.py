@@ -1,4 +1,4 @@
-"""Empty or inconsistent sets, and those that do not fit, are named before anything runs."""
+"""Empty, inconsistent or misshapen sets are rejected before a run."""
 
 import jax.numpy as jnp
 import numpy as np

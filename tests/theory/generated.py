@@ -1,4 +1,4 @@
-"""Systems whose place in the theory is known: half of them break just one assumption, by a margin."""
+"""Systems with known properties: half of them violate exactly one assumption, by a margin."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""`certified_tol`: the true error is below what was asked; what cannot be had is said at once."""
+"""`certified_tol`: the true error is below it, and unattainable values are rejected."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""The constants of the paper, by their formulas coded a second time."""
+"""The constants of the paper against an independent implementation of their formulas."""
 
 import numpy as np
 import pytest

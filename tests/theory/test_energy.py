@@ -1,4 +1,4 @@
-"""A norm in which trajectories approach: what it says is true, and the solver is not believed."""
+"""Norms in which trajectories approach: the rates hold, independently of the solver."""
 
 import builtins
 

@@ -1,4 +1,4 @@
-"""What a sceptical reader once got called proved, or refuted, and was not."""
+"""Cases for which an earlier version wrongly reported proved or refuted."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""A bound that is called proved stands where a step's ends see nothing of what happens inside.
+"""Proved bounds hold for functions of time that vary between the ends of a step.
 
 x' = r(t), with a law that stays out of the way: the true solution is ∫ r, by quadrature between the
 places where r jumps or bends.

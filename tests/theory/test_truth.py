@@ -1,5 +1,5 @@
-"""Certificates beside the truth: known solutions, three methods, five tolerances; and pairs of
-trajectories of C2 and of random affine systems beside every estimate of Section 6.
+"""Certificates against true errors: known solutions, three methods, five tolerances; and pairs of
+trajectories of C2 and of random affine systems against every estimate of Section 6.
 
 `pytest -m "" -s tests/theory/test_truth.py` prints the tables.
 """

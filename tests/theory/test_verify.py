@@ -1,4 +1,4 @@
-"""What is called proved is true, what is called refuted is false."""
+"""Statements that `verify` calls proved are true, and those it calls refuted are false."""
 
 import jax
 import jax.numpy as jnp

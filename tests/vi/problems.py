@@ -1,4 +1,4 @@
-"""Published variational inequalities with their solutions, and where to start from.
+"""Published variational inequalities with their solutions and starting points.
 
 Sources: Malitsky 2020, Khanh and Vuong 2014, Fukushima 1986, Mathiesen 1987, MCPLIB (Billups,
 Munson), Murty 1988, Fathi 1979, Ahn 1983, Murphy, Sherali and Soyster 1982; solutions as published,

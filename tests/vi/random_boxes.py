@@ -1,4 +1,4 @@
-"""Random affine variational inequalities on boxes whose solutions are known without projecting.
+"""Random affine variational inequalities on boxes, with solutions found without projections.
 
 Every case is VI({lower ≤ y ≤ upper}, My + q) in `SIZE` unknowns with M nonsymmetric and ⟨Mv, v⟩ ≥ γ‖v‖²
 for a γ that is known. Smaller cases are filled up by entries of zero width. Three families:

@@ -1,4 +1,4 @@
-"""How a batch of solves ended, lane by lane."""
+"""Summaries of the results of a batch of solves."""
 
 from collections import Counter
 

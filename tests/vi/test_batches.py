@@ -1,4 +1,4 @@
-"""Under `jax.vmap` every lane is its own problem: what one of them does moves no other."""
+"""Under `jax.vmap` every lane is an independent problem."""
 
 import jax
 import jax.numpy as jnp

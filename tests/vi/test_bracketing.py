@@ -1,4 +1,4 @@
-"""Pointwise intervals: how many evaluations of F they take, and that no guess changes the answer."""
+"""Pointwise intervals: the number of evaluations of F, and independence of the guess."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""C0 and C1 are never below the true error, and the proven contraction is never beaten by fact.
+"""C0 and C1 are never below the true error, and the proved contraction factor holds.
 
 The truth comes from trying every face of the box (`tests.oracles`), which shares no idea with a
 projection method.

@@ -1,4 +1,4 @@
-"""Solves that differ in numbers alone share one compiled program, called plainly or under `jax.jit`."""
+"""Solves that differ only in numbers share one compiled program, directly or under `jax.jit`."""
 
 import time
 

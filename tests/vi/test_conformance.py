@@ -1,5 +1,5 @@
-"""Published variational inequalities (`tests.vi.problems`), solved to 1e-9 of a solution from their
-published starts and from 100 others: a method solves, or says why not."""
+"""Published variational inequalities (`tests.vi.problems`), from their published starts and 100 others:
+a solver is within 1e-9 of a solution, or reports a failure."""
 
 import itertools
 from typing import Any

@@ -1,4 +1,4 @@
-"""Derivatives of a solution with respect to all that F and K hold: implicit, never unrolled."""
+"""Derivatives of a solution with respect to all data in F and K, by the implicit function theorem."""
 
 import jax
 import jax.numpy as jnp

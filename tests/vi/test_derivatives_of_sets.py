@@ -1,4 +1,4 @@
-"""Derivatives with respect to all that K and F hold, beside those of the Lagrange conditions by hand.
+"""Derivatives with respect to all data in K and F, against those of the Lagrange conditions by hand.
 
 Where G holds (Gy = d, G of full rank) with multipliers ν, My + q + Gᵀν = 0 and Gy = d; differentiated,
 

@@ -1,6 +1,6 @@
-"""The trap: (2 + sin y)y − q with an additive drive is not pseudomonotone and has three solutions.
+"""(2 + sin y)y − q with an additive drive is not pseudomonotone and has three solutions.
 
-Whoever solves it finds one of the three, and none of them may be sold as the only one.
+A solver finds one of the three, and must not report it as the only one.
 """
 
 import jax

@@ -1,4 +1,4 @@
-"""Every solver on random boxes: within 1e-8 of the oracle's solution, or it says why not."""
+"""Every solver on random boxes: within 1e-8 of the oracle's solution, or a reported failure."""
 
 import jax
 import jax.numpy as jnp

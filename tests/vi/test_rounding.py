@@ -1,4 +1,4 @@
-"""Rounding is in the error bound of `solve_vi`: against rational arithmetic, down to γ = 2⁻⁴⁰."""
+"""The error bound of `solve_vi` includes rounding: against rational arithmetic, down to γ = 2⁻⁴⁰."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Bounds that count the rounding of projections, of far guesses, of doubtful switches and of norms."""
+"""Error bounds include rounding of projections, distant guesses, uncertain comparisons and norms."""
 
 import math
 from fractions import Fraction

@@ -1,4 +1,4 @@
-"""In single precision a solve is single from end to end, and says what that cannot reach."""
+"""A solve in single precision uses no double precision, and reports what it cannot reach."""
 
 import jax
 import jax.numpy as jnp

@@ -1,5 +1,4 @@
-"""Solvers at the edges: degenerate slopes, bounds that coincide or are missing, and failures that
-must say so."""
+"""Special cases of solvers: zero slopes, equal or missing bounds, and failures."""
 
 import jax
 import jax.numpy as jnp

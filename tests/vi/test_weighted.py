@@ -1,4 +1,4 @@
-"""a(y)G(y) is solved as G: the same solution, derivatives and more of a certificate, for less."""
+"""a(y)G(y) is solved as G: the same solution and derivatives, a sharper certificate, less cost."""
 
 import jax
 import jax.numpy as jnp

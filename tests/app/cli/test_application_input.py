@@ -1,5 +1,5 @@
-"""Applications from the command line: what is refused, in the words of the file; what is noted; and
-what is said when a run fails."""
+"""Applications from the command line: rejected input with the keys of the file, notes, and the messages
+of failed runs."""
 
 import json
 import re

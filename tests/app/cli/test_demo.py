@@ -1,4 +1,4 @@
-"""`dvax demo`: the strip that dvax brings along, whole or at another resolution."""
+"""`dvax demo`: the demonstration strip, at full and at other resolutions."""
 
 import json
 from importlib.resources import files

@@ -1,4 +1,4 @@
-"""Ctrl-C during a run: exit code 130, 143 for SIGTERM; no traceback; what was computed is readable."""
+"""Ctrl-C during a run: exit code 130 (143 for SIGTERM), no traceback; results are readable."""
 
 import json
 import os

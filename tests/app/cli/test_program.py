@@ -1,4 +1,4 @@
-"""The program itself: quick to answer, quiet about Python, honest exit codes."""
+"""The program: fast help, messages without tracebacks, and correct exit codes."""
 
 import os
 import subprocess

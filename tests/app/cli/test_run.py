@@ -1,4 +1,4 @@
-"""`dvax run`: results on disk, figures on the screen, an exit code that tells what happened."""
+"""`dvax run`: results on disk, figures on the terminal, and the exit code."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Both signals, at many times, in every command: it ends by itself, and what it leaves is readable."""
+"""Both signals, at many times, in every command: the command ends and leaves readable results."""
 
 import json
 import os

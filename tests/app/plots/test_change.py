@@ -1,4 +1,4 @@
-"""The picture of a change: its curves are the numbers, and every axis says what it shows."""
+"""The figure of a change: its curves are the numbers, and its axes have labels and units."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""One pass over the fields gives what a direct computation on the whole arrays gives."""
+"""Downsampling in one pass agrees with a direct computation on the whole arrays."""
 
 from pathlib import Path
 

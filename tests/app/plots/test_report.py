@@ -1,4 +1,4 @@
-"""The report says what the run directory holds, and never more."""
+"""The report shows the content of the run directory, and nothing else."""
 
 import json
 from pathlib import Path

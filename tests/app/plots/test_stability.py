@@ -1,4 +1,4 @@
-"""The stability section: where the certified rate comes from, and what is known of the assumptions."""
+"""The stability section: the parts of the certified rate, and the status of the assumptions."""
 
 from pathlib import Path
 from typing import Any

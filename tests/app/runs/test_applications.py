@@ -1,4 +1,4 @@
-"""Configurations of applications: what is refused and how, and what a run leaves behind."""
+"""Configurations of applications: rejected input, and the files that a run writes."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""A configuration says everything a run will do, in numbers whose units are known."""
+"""A configuration determines a run completely, in numbers with known units."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""Whatever a configuration or its data holds: it loads, or InputError says what is wrong."""
+"""A mutated configuration or data file either loads or raises an InputError."""
 
 import random
 

@@ -1,4 +1,4 @@
-"""Measured data is read exactly or refused with file, line and column; nothing is invented."""
+"""Measured data are read exactly, or rejected with file, line and column."""
 
 import io
 import pickle

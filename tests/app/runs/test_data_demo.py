@@ -1,4 +1,4 @@
-"""The demonstration's files are what their script says, and all of its physics occurs."""
+"""The files of the demonstration are the output of their script, and show all three regimes."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A run directory says what is true: its bounds hold, and its pieces fit together."""
+"""Runs: their bounds hold, and the files of a run directory agree with each other."""
 
 import json
 from pathlib import Path

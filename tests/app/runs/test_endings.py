@@ -1,4 +1,4 @@
-"""What is left when a run is killed or the disk is full."""
+"""The state of a run directory after a kill or on a full disk."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The expression language computes what is written, and nothing else can be written in it."""
+"""The expression language evaluates formulas, and rejects everything else."""
 
 import math
 import pickle

@@ -1,4 +1,4 @@
-"""Signals are noted in whatever runs, raised where the main thread waits, and never in a write."""
+"""Signals are recorded at any time, raised while the main thread waits, and never during a write."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""Numbers that overflow, and solves that refuse their input, leave a run directory that is true."""
+"""Run directories are correct after numbers overflow, and after a solve rejects its input."""
 
 import json
 import math

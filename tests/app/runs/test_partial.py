@@ -1,4 +1,4 @@
-"""Runs of applications that stop early: what was computed is kept, readable, and the same."""
+"""Runs of applications that stop early: the computed part is kept, readable, and unchanged."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""A bound made from samples is called estimated everywhere, and only what is proved certified."""
+"""A sampled bound is called estimated in every place, and only proved bounds are called certified."""
 
 import json
 import re

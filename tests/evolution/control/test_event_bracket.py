@@ -1,4 +1,4 @@
-"""The event bracket: steps end before an event, cross it, and go on."""
+"""The event bracket: steps end before an event, cross it, and continue."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""The growth limiter: the size that the error allows, within limits."""
+"""The growth limiter: the step size that the error allows, within limits."""
 
 import jax.numpy as jnp
 import pytest

@@ -1,4 +1,4 @@
-"""The roundoff guard tells roundoff from the error of a method."""
+"""The roundoff guard distinguishes roundoff from the error of a method."""
 
 import jax.numpy as jnp
 import numpy as np
