@@ -126,7 +126,7 @@ def all_modules() -> Iterator[str]:
 
 
 def family(root: type = eqx.Module) -> list[type]:
-    """Every subclass of `root` that dvax defines, itself loaded whole."""
+    """Every subclass of `root` in dvax, with all its modules imported."""
     for name in all_modules():
         importlib.import_module(name)
     seen: dict[type, None] = {}
@@ -153,7 +153,7 @@ def abstract_members(cls: type) -> set[str]:
 
 
 def behaviour(cls: type) -> dict[str, object]:
-    """The methods and properties that `cls` itself writes down."""
+    """The methods and properties that `cls` itself defines."""
     kinds = (property, classmethod, staticmethod)
     return {
         name: member
@@ -165,7 +165,7 @@ def behaviour(cls: type) -> dict[str, object]:
 
 
 def faults_of(classes: Iterable[type]) -> list[str]:
-    """What breaks 'abstract or final, and nothing concrete is overridden', as sentences."""
+    """Violations of 'abstract or final, and no concrete method is overridden', as sentences."""
     classes = list(classes)
     faults = []
     for cls in classes:
@@ -187,7 +187,7 @@ def faults_of(classes: Iterable[type]) -> list[str]:
 
 
 def public(room: str) -> dict[str, object]:
-    """The classes and functions of dvax that a room's __init__ offers."""
+    """The classes and functions of dvax that the `__init__` of a folder exports."""
     module = importlib.import_module(f"dvax.{room}")
     # Some are loaded when they are first asked for.
     offered = {name: getattr(module, name) for name in getattr(module, "__all__", vars(module))}

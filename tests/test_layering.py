@@ -124,7 +124,7 @@ def room(module: str) -> str:
 
 
 def wrong_floors(package: Path) -> tuple[list[str], set[tuple[str, str]]]:
-    """Imports that do not go down, as sentences, and the neighbours that are in use."""
+    """Imports that do not go to a lower floor, as sentences, and the allowed neighbours in use."""
     wrong, used = [], set()
     for importer, line, imported, _ in imports(package):
         if imported.split(".")[0] != package.name:
@@ -141,7 +141,7 @@ def wrong_floors(package: Path) -> tuple[list[str], set[tuple[str, str]]]:
 
 
 def circle(graph: dict[str, set[str]]) -> list[str]:
-    """The nodes of one circle of `graph`, in order; empty if it has none."""
+    """The nodes of one cycle of `graph`, in order; empty if there is none."""
     done: set[str] = set()
 
     def descend(node: str, path: list[str]) -> list[str]:
@@ -161,7 +161,7 @@ def circle(graph: dict[str, set[str]]) -> list[str]:
 
 
 def dependence(package: Path, of: str) -> dict[str, set[str]]:
-    """Who imports whom inside `package`, between 'modules' or between 'rooms'."""
+    """The imports inside `package`, between 'modules' or between 'rooms'."""
     graph: dict[str, set[str]] = {}
     for importer, _, imported, _ in imports(package):
         if imported.split(".")[0] == package.name and importer != package.name:
@@ -172,7 +172,7 @@ def dependence(package: Path, of: str) -> dict[str, set[str]]:
 
 
 def foreign(package: Path) -> list[str]:
-    """Imports of packages that the importing room may not need, as sentences."""
+    """Imports of packages that the importing folder may not use, as sentences."""
     wrong = []
     for importer, line, imported, deferred in imports(package):
         top = imported.split(".")[0]
@@ -217,7 +217,7 @@ def test_third_party_imports_are_declared_and_restricted_to_their_folders():
 
 
 def plant(folder: Path, **files: str) -> Path:
-    """A small house named dvax with the given files, '__' standing for '/'."""
+    """Create a small package named dvax with the given files, '__' standing for '/'."""
     package = folder / "dvax"
     for name, text in {"__init__": "", **files}.items():
         file = package / ("__init__.py" if name == "__init__" else name.replace("__", "/") + ".py")

@@ -128,7 +128,7 @@ def test_environment_is_consistent():
 
 
 def help_of(*arguments: str) -> str:
-    """The heavy modules that are loaded once `dvax ARGUMENTS --help` has been printed."""
+    """The large modules that are loaded after `dvax ARGUMENTS --help`."""
     code = f"""
 import sys
 from dvax.app.cli import main

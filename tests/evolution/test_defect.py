@@ -51,7 +51,7 @@ def test_sampled_defect_of_smooth_systems_has_the_size_of_its_integral(name):
 
 
 def bent(t, x, u, p):
-    """x₁ is the time, and f kinks or jumps in it: no step ends there by itself."""
+    """The right-hand side whose x₁ is the time, with a kink or a jump in x₁: no step ends there."""
     past = x[0] - p["at"]
     kink = p["slope"] * jnp.maximum(past, 0) + p["jump"] * jnp.heaviside(past, 0.0)
     return jnp.stack([jnp.ones_like(past), kink])

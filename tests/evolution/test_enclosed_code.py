@@ -51,7 +51,7 @@ CODE = {
 
 
 def by_hand(drive, end, breaks):
-    """x' = −x + clip(2 − x, −1, 1) + drive(t) from 0, piece by piece."""
+    """Solve x' = −x + clip(2 − x, −1, 1) + drive(t) from 0, piece by piece."""
     x, times = np.zeros(1), [0.0, *sorted({float(t) for t in breaks if 0 < t < end}), end]
     for a, b in itertools.pairwise(times):
         rate = lambda t, x: -x + np.clip(2 - x, -1, 1) + float(drive(t))  # noqa: E731
@@ -99,7 +99,7 @@ PULSES = {
 
 
 def tent(lib, t, c, w=0.05):
-    """Of height 1 between c − w and c + w about, by a function that is not affine in t."""
+    """Return a tent of height 1 on about [c − w, c + w], by a function that is not affine in t."""
     return lib.maximum(0.0, 1.0 - lib.abs(t**2 - c**2) / (2 * c * w))
 
 

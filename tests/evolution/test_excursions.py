@@ -21,7 +21,7 @@ RTOL = 1e-6
 
 
 def end_of(problem, t1, method):
-    """x(t1) from 0 as a function of args, compiled once."""
+    """Return x(t1) from 0 as a function of args, compiled once."""
     return jax.jit(
         lambda a: dvax.solve(
             problem, jnp.zeros(()), 0.0, t1, a, rtol=RTOL, atol=1e-9, method=method, throw=False

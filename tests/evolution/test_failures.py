@@ -105,7 +105,7 @@ def test_moving_set_that_becomes_empty_ends_the_run():
 
 
 def refused_when_traced(method):
-    """What each traced number that breaks a rule is given to."""
+    """The calls that take each invalid traced number."""
     run = lambda t1=1.0, **options: dvax.solve(  # noqa: E731
         system(""), jnp.array([0.5, 2.0, -1.0]), 0.0, t1, method=method, **options
     )

@@ -46,7 +46,7 @@ def test_rod_with_free_boundaries_is_solved_exactly_along_its_closed_form():
 
 
 def errors(method, counts):
-    """The largest one at the saved times, for so many steps."""
+    """Return the largest error at the saved times, for each number of steps."""
     case, (x0, ts, exact) = c7(N), disturbed()
     runs = (
         dvax.solve(case.problem, x0, 0.0, 1.0, ts=ts, dt=1.0 / k, method=method) for k in counts

@@ -26,7 +26,7 @@ def test_implicit_solves_the_contact_law_across_kinks():
 
 
 def stiff(n):
-    """A chain with a fast reaction that couples neighbours, towards a known field."""
+    """A chain with a fast reaction that couples neighbours, relaxing to a known field."""
     target = jnp.linspace(0.2, 0.8, n)
     laplacian = 100.0 * (jnp.eye(n, k=1) + jnp.eye(n, k=-1) - 2.0 * jnp.eye(n))
     return target, dvax.Problem(

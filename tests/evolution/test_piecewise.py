@@ -12,7 +12,7 @@ from dvax.evolution.piecewise import inputs, radau
 
 
 def held(stiffness, **kwargs):
-    """x' = 1 − x + u, held above 2 by a spring of this stiffness, nearly."""
+    """The problem x' = 1 − x + u, where a spring of this stiffness keeps x nearly above 2."""
     return dvax.Problem(
         A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, np.inf),
         f=lambda t, x, u, args: 1.0 - x + u, h=lambda t, x, u, args: -stiffness * (x - 2.0), **kwargs,

@@ -40,7 +40,7 @@ WAYS = {
 
 
 def by(monkeypatch, call):
-    """Have every solve call its programs by `call`."""
+    """Let every solve call its programs through `call`."""
     for module in (responses, reverse, steps):
         monkeypatch.setattr(module, "outlined", call)
     jax.clear_caches()

@@ -16,7 +16,7 @@ PLAIN = dvax.operators.Scaling(1.0)
 
 
 def pendulum(A):
-    """x' = Ax + f with a law that no bound is ever active in."""
+    """The problem x' = Ax + f, with a law whose bounds are never active."""
     return dvax.Problem(
         A=A, P=PLAIN, K=dvax.sets.WholeSpace(),
         f=lambda t, x, u, args: jnp.stack([jnp.cos(t), u[0]]) - 0.2 * x * x,

@@ -40,7 +40,7 @@ def filtered(h, lower, upper, kinks, T, x0):
 
 
 def crossings(h, level, T):
-    """Where a smooth h meets a level, to rounding."""
+    """The times at which a smooth h crosses a level, to rounding."""
     from scipy.optimize import brentq
 
     grid = np.linspace(0, T, 20_001)
@@ -50,21 +50,21 @@ def crossings(h, level, T):
 
 
 def swings():
-    """±1 nearly always, with fast passages in between: 10 sin 7t."""
+    """±1 nearly always, with fast transitions: 10 sin 7t."""
     h, T = lambda t: 10 * np.sin(7 * t), 4.0
     exact = filtered(h, -1.0, 1.0, crossings(h, 1.0, T) + crossings(h, -1.0, T), T, 0.3)
     return forced(lambda t: 10 * jnp.sin(7 * t), -1.0, 1.0), 0.3, T, np.array(exact)
 
 
 def pulses():
-    """0 for most of each period, and a full pulse at its crest."""
+    """0 for most of each period, and a full pulse at its maximum."""
     h, T = lambda t: 300 * (np.sin(t) - 0.97), 9.0
     exact = filtered(h, 0.0, 1.0, crossings(h, 1.0, T) + crossings(h, 0.0, T), T, 0.0)
     return forced(lambda t: 300 * (jnp.sin(t) - 0.97), 0.0, 1.0), 0.0, T, np.array(exact)
 
 
 def bumper():
-    """An oscillator that meets a stiff bumper at the crest of its swing: u depends on the state."""
+    """An oscillator that touches a stiff bumper at its maximum: u depends on the state."""
     A = np.array([[-0.02, 1.0], [-1.0, -0.02]])
     problem = dvax.Problem(
         A=dvax.generators.Dense(A),

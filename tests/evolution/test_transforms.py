@@ -10,7 +10,7 @@ import dvax
 
 
 def counted():
-    """C1 with a count of how often f is traced."""
+    """C1 with a counter of the traces of f."""
     traces = []
 
     def f(t, x, u, args):

@@ -16,7 +16,7 @@ NAMES = {"contact": [7, 1], "clamped": [4, 1], "block": [1, 2]}
 
 @pytest.fixture(scope="module")
 def block():
-    """A block, and what a file holds of it: nodes, elements, and lines with their group."""
+    """A block, and the content of its file: nodes, elements, and lines with their group."""
     body = ElasticBody(SIZES)
     mesh = body.mesh
     lines = np.concatenate([mesh.facets[:, mesh.boundaries[k]].T for k in ("contact", "clamped")])

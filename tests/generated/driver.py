@@ -46,7 +46,7 @@ def run(
     bounds: bool = True,
     certify: bool = False,
 ) -> Iterator[Record]:
-    """The sample number `seed` by each method; with `bounds` on the error of each, and once more to
+    """Solve sample `seed` by each method; with `bounds`, also bound each error, and solve once more to
     a certified tolerance."""
     sample = sample_of(family, seed)
     ts = sample.ts - sample.t0
@@ -88,17 +88,17 @@ def run(
 
 
 def sample_of(family: Family, seed: int) -> Sample:
-    """Number `seed` of a family, each family with random numbers of its own."""
+    """Sample number `seed` of a family; each family has its own random numbers."""
     return family.draw(np.random.default_rng([seed, zlib.crc32(family.name.encode())]))
 
 
 def tolerance(sample: Sample, truth: Any) -> float:
-    """atol + rtol max|x| of the run, |·| the root mean square."""
+    """Return atol + rtol max|x| of the run, with the root mean square as |·|."""
     return float(sample.atol + sample.rtol * np.max(_size(truth)))
 
 
 def _size(x: Any) -> Any:
-    """The root mean square, as the step control has it."""
+    """The root mean square, as in the step-size control."""
     return np.sqrt(np.mean(np.square(x), axis=1))
 
 
@@ -143,7 +143,7 @@ def assess(
 def certified(
     family: Family, seed: int, sample: Sample, method: str, truth: Any, constants: Any, second: Any
 ) -> Record:
-    """A run with `certified_tol`: refused, or within what it says. Refusing is no failure."""
+    """Run with `certified_tol`: an error message, or a result within the tolerance, is correct."""
     started = time.perf_counter()
     wanted = 1e2 * tolerance(sample, truth)
     steps, ratio, excess, result, failure = 0, np.nan, 0.0, "refused", ""
@@ -168,7 +168,7 @@ def certified(
 
 
 def reached(sol: dvax.Solution) -> float:
-    """The bound that a run with `certified_tol` ended with, certified or estimated."""
+    """The bound at the end of a run with `certified_tol`, certified or estimated."""
     return sol.stats.get("certified_bound", sol.stats.get("estimated_bound", np.inf))
 
 

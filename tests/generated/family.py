@@ -78,7 +78,7 @@ def tolerance(
 
 
 def accuracy_for(rtol: float) -> float:
-    """Of a reference that a run at this tolerance is held against."""
+    """The accuracy of the reference for a run at this tolerance."""
     return max(1e-5 * rtol, FINEST)
 
 

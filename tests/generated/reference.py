@@ -54,7 +54,7 @@ def _cut(breaks: list[float], span: float, refine: int) -> Array:
 def _pieces(
     w: Written, begin: float, x: Array, stops: Array, ts: Array, method: str | None
 ) -> Array:
-    """Piece by piece: no step reaches over a break, and none is longer than a third of a piece."""
+    """Solve piece by piece: no step crosses a break, and none exceeds a third of a piece."""
     method = method or ("LSODA" if w.stiff else "DOP853")
     # A step ends at every time that is asked for: dense output is less accurate than the steps.
     apart = np.min(np.abs(stops[:, None] - ts[None]), axis=0) > 1e-12 * w.span
@@ -81,7 +81,7 @@ def _pieces(
 
 
 def _periodic(w: Written, ts: Array, stops: Array, method: str | None) -> Array:
-    """Period after period, until one changes nothing any more: all later ones are like the last."""
+    """Solve period by period, until the solution is periodic: later periods equal the last."""
     period = w.period
     assert period is not None
     inner = stops[(stops > 0) & (stops < (1.0 - 1e-9) * period)]

@@ -24,7 +24,7 @@ FIELDS = {
 
 
 def matrix_of(A, shape):
-    """A written out."""
+    """The dense matrix of A."""
     n = int(np.prod(shape))
     columns = jax.vmap(lambda v: A.apply(v.reshape(shape)).ravel())(jnp.eye(n))
     return np.asarray(columns).T

@@ -280,7 +280,7 @@ def test_sparse_rejects_invalid_arguments(make, word):
 
 
 def decays(rates, h):
-    """Whether a diagonal matrix, given as a sparse one, decays as it must."""
+    """Return the number of pieces of a step of a diagonal matrix, after checking its decay."""
     A = generators.Sparse(scipy.sparse.diags_array(rates).tocsr())
     propagator = A.propagator(jnp.asarray(h), 0)
     found = np.asarray(propagator.step(jnp.ones(len(rates)), ()))

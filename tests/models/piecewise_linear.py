@@ -71,7 +71,7 @@ def follow(
 
 
 def _moment(M: Array, z: Array, c: Array, h: float) -> float:
-    """When cᵀz falls below zero on the way to h."""
+    """Return the time in [0, h] at which cᵀz becomes negative."""
 
     def value(s: float) -> float:
         return float(c @ (scipy.linalg.expm(M * s) @ z))

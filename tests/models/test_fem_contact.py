@@ -155,7 +155,7 @@ def test_fem_contact_fully_saturated_body_creeps_exponentially(bodies):
 
 
 def bulged():
-    """Triangles under a top that is not flat, so that normals differ from point to point."""
+    """Triangles under a curved top, so that the normals vary from point to point."""
     mesh = skfem.MeshTri.init_tensor(np.linspace(-2.0, 2.0, 25), np.linspace(-2.0, 0.0, 13))
     points = mesh.p.copy()
     points[1] += 0.02 * (1 + points[1] / 2) * np.cos(2 * points[0])
@@ -166,7 +166,7 @@ def bulged():
 
 
 class Whole:
-    """All displacements of a body of triangles, assembled a second time."""
+    """All displacements of a body of triangles, assembled independently."""
 
     def __init__(self, mesh):
         element = skfem.ElementVector(skfem.ElementTriP2())

@@ -21,7 +21,7 @@ STEP = 0.02
 
 
 def quake():
-    """Twelve seconds of shaking that grows and decays, with all periods from 0.1 s to 3 s."""
+    """Twelve seconds of ground motion that grows and decays, with all periods from 0.1 s to 3 s."""
     rng = np.random.default_rng(4)
     t = STEP * np.arange(601)
     waves = sum(
@@ -57,7 +57,7 @@ def viscoplastic(period, damping, limit, tau):
 
 
 def elastoplastic(period, damping, limit):
-    """The limit: the spring holds its force while the frame moves on, until it turns."""
+    """The limit: the spring keeps its force while the frame moves, until its velocity changes sign."""
     w = 2 * np.pi / period
     over = np.array([1.0, 0, -1, 0, 0, -limit])
     under = np.array([-1.0, 0, 1, 0, 0, -limit])
@@ -71,7 +71,7 @@ def elastoplastic(period, damping, limit):
 
 
 def exactly(regimes, ground, between=1, step=1.25e-3):
-    """The states at `between` times in every step of the record, and the load there."""
+    """The states at `between` times in every step of the record, and the load at these times."""
     knots = STEP * np.arange(len(ground))
     times = np.interp(
         np.arange((len(ground) - 1) * between + 1) / between, np.arange(len(ground)), knots
@@ -81,7 +81,7 @@ def exactly(regimes, ground, between=1, step=1.25e-3):
 
 
 def peak_of(regimes, ground):
-    """max |d|: at each of 32 times a step, the parabola through d, v and d'' has its top."""
+    """max |d|: for each of 32 times per step, the maximum of the parabola through d, v and d''."""
     run, load = exactly(regimes, ground, between=32, step=1.0)
     elastic = regimes["elastic"].rate[1]
     x = np.column_stack([run.states, load, 0 * load, np.ones_like(load)])

@@ -57,7 +57,7 @@ def bounded_least_squares(market, t):
 
 
 def made_at(market, t, p):
-    """What all units make at a price, each firm's marginal cost λ = p − bQ(λ) found by halving."""
+    """The production of all units at a price; marginal costs λ = p − bQ(λ) by bisection."""
     c, a, firms, cap, _, b = numpy_data(market, t)
     low, high = np.full(firms.shape[1], -1e4), np.full(firms.shape[1], 1e4)
     for _ in range(80):

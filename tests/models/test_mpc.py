@@ -17,7 +17,7 @@ from dvax.models.mpc import LinearMPC
 
 
 def chain(**changed):
-    """Three masses between two walls, pushed at the first."""
+    """Three masses between two walls, with the force on the first."""
     S = 2 * np.eye(3) - np.eye(3, k=1) - np.eye(3, k=-1)
     given = dict(
         A=np.block([[np.zeros((3, 3)), np.eye(3)], [-S, -0.5 * np.eye(3)]]),
@@ -142,7 +142,7 @@ def test_mpc_lipschitz_constant_of_several_inputs_is_the_largest_slope():
 
 @pytest.fixture(scope="module")
 def loop(mpc):
-    """Three runs, as one batch, and the proof that they approach."""
+    """Three runs, as one batch, and the proof that they approach each other."""
     check = dvax.verify(mpc.problem, t0=0.0, t1=20.0, energy=True)
     x0 = np.array(
         [[1.5, 1.5, 1.5, 0, 0, 0], [-2.0, 0.0, 2.0, 1.0, 0, 0], [0, 0, 0, -1.0, 2.0, 0.5]]

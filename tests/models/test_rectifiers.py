@@ -10,7 +10,7 @@ from dvax.models.circuit import Circuit
 
 
 def drawn(seed, most_stages=4):
-    """A circuit of one of the two kinds, of any scale: its netlist, and its end."""
+    """A random circuit of one of the two kinds, of any scale: its netlist, and its end time."""
     rng = np.random.default_rng([7, seed])
     ten = lambda low, high: 10 ** rng.uniform(np.log10(low), np.log10(high))  # noqa: E731
     if seed % 2:

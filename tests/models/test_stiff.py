@@ -43,7 +43,7 @@ FEW = [
 
 
 def agrees_at_any_resistance(case):
-    """It ends, the law holds, and the work follows from what happens and not from r."""
+    """Check that the run ends, the law holds, and the cost does not grow with 1/r."""
     r, capacity, stray, inductance, kind = case
     source, end, events = SOURCES[kind]
     circuit = Circuit(rectifier(r, source, capacity, stray, inductance))

@@ -84,7 +84,7 @@ def test_equilibrium_has_no_path_with_less_cost(case, one_way):
 
 
 def free(network):
-    """The same network, where a third of all links costs nothing and another third has no time."""
+    """The same network, where a third of all links has no cost and another third no travel time."""
     rng, scale = np.random.default_rng(9), network.free_flow_time.copy()
     chosen = rng.integers(0, 3, len(network))
     length = np.where(chosen > 0, network.length, 0.0)

@@ -57,7 +57,7 @@ FUNCTIONS = {
 
 
 def farthest(fn, t0, t1):
-    """How far fn leaves the line between its ends on a fine grid, entry by entry."""
+    """The largest distance of fn from the line between its ends on a fine grid, entry by entry."""
     theta = jnp.linspace(0.0, 1.0, 801)
     values = jax.vmap(lambda s: jnp.asarray(fn(t0 + s * (t1 - t0))))(theta)
     weight = theta.reshape((-1,) + (1,) * (values.ndim - 1))

@@ -29,7 +29,7 @@ def quotient(problem, x0, t1, args, dx0, dargs):
 
 
 def corner():
-    """At rest with both entries on their bounds, held by no force; nothing is linear."""
+    """At rest with both entries on their bounds and without force; nothing is linear."""
     return dvax.Problem(
         A=dvax.generators.Scalar(-0.3), P=dvax.operators.Dense(jnp.array([[1.2, 0.3], [0.3, 0.9]])),
         K=lambda t, args: dvax.sets.Box(0.0 * args["low"], 4.0),
@@ -39,7 +39,7 @@ def corner():
 
 
 def disc():
-    """Turns on the unit circle, to which z belongs all the time."""
+    """Motion on the unit circle, with z on its boundary at all times."""
     spin = jnp.array([[0.0, 2.0], [-2.0, 0.0]])
     return dvax.Problem(
         A=ZERO, P=ONE, K=dvax.sets.Ball(0.0, 1.0), f=lambda t, x, u, args: spin @ x + (x - u),
@@ -48,7 +48,7 @@ def disc():
 
 
 def rise():
-    """Waits at the upper bound η of u, held by no force."""
+    """At rest at the upper bound η of u, without force."""
     return dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=ONE, K=lambda t, args: dvax.sets.Box(-5.0, args["top"]),
         f=lambda t, x, u, args: args["top"] * 0.0 + 1.5 - 0.5 * u, h=lambda t, x, u, args: x,

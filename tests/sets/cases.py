@@ -71,7 +71,7 @@ def _ball(rng: np.random.Generator) -> np.ndarray:
 
 
 def _poly(rng: np.random.Generator) -> np.ndarray:
-    """As far as the rows allow along a random direction: a point on the boundary."""
+    """The farthest feasible point along a random direction: a point on the boundary."""
     v = 3.0 * rng.normal(size=N)
     return v * min(1.0, np.min(np.where(G @ v > 0, D / np.maximum(G @ v, 1e-300), np.inf)))
 

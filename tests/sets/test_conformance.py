@@ -25,7 +25,7 @@ every_space = pytest.mark.parametrize(
 
 @functools.cache
 def compiled(name: str, kind: str):
-    """The projection of many points at once, and from many data: jit and vmap of it."""
+    """The projection of many points, and for many data, in one call: jit and vmap."""
 
     def one(data, z):
         return CASES[name].make(data).project(z, SPACES[kind])
@@ -34,7 +34,7 @@ def compiled(name: str, kind: str):
 
 
 def project(name: str, kind: str, z: np.ndarray, data: np.ndarray | None = None) -> np.ndarray:
-    """In lots of one size, so that every set is compiled once."""
+    """Project points in batches of one size, so that every set is compiled once."""
     data = np.tile(CASES[name].data, (len(z), 1)) if data is None else data
     found = []
     for start in range(0, len(z), LOT):
@@ -46,7 +46,7 @@ def project(name: str, kind: str, z: np.ndarray, data: np.ndarray | None = None)
 
 
 def points(name: str, count: int = 24) -> np.ndarray:
-    """Near, far, and inside."""
+    """Points near, far, and inside."""
     rng = np.random.default_rng(11)
     z = rng.normal(size=(count, N)) * np.repeat([0.3, 1.0, 3.0, 30.0], count // 4)[:, None]
     z[0] = CASES[name].members(rng)
@@ -75,7 +75,7 @@ def test_projection_is_the_nearest_point_in_the_norm_of_the_space(name, kind):
 
 
 def by_faces(z, w, G, d, E, e):
-    """The nearest point among those of all faces: rows of G taken as equations, all ways."""
+    """The nearest point among those of all faces: every choice of rows of G as equations."""
     best, answer = np.inf, None
     for k in range(min(len(d), len(z)) + 1):
         for held in combinations(range(len(d)), k):

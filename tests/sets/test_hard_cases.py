@@ -19,7 +19,7 @@ def slope(K, z, space=PLANE):
 
 
 def tangent(*normals):
-    """The projection onto what is left when the normals are held."""
+    """The projection onto the orthogonal complement of the active normals."""
     rows = np.array(normals, float)
     return np.eye(rows.shape[1]) - np.linalg.pinv(rows) @ rows
 

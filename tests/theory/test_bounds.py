@@ -168,7 +168,7 @@ def _contact(alpha, load):
 
 
 def _reference(alpha, load, ts, breaks=()):
-    """The same point by an explicit Runge–Kutta method of order 8, in steps far below its kinks."""
+    """The same point by an explicit Runge–Kutta method of order 8 with very short steps."""
 
     def rate(t, x):
         u = np.clip(0.5 * (1.0 - 2.0 * x), 0.0, 0.5)

@@ -14,7 +14,7 @@ from dvax.theory import energy
 
 
 def sheared(n, m, seed, pointwise):
-    """A stable matrix far from normal, and a law that feeds back a little."""
+    """A stable nonnormal matrix, and a law with weak feedback."""
     rng = np.random.default_rng(seed)
     A = np.diag(-rng.uniform(0.5, 2.0, n)) + np.triu(4.0 * rng.normal(size=(n, n)), 1)
     F_u, H_x = 0.2 * rng.normal(size=(n, m)), 0.2 * rng.normal(size=(m, n))

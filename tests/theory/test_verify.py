@@ -43,7 +43,7 @@ def _check(seed):
 
 
 def _hold(made, c):
-    """The moduli bound what random pairs show."""
+    """Check that the moduli bound those of random pairs."""
     rng = np.random.default_rng(5)
     problem = made.problem
     n, m = made.x0.size, problem.control_space.zeros().size

@@ -32,7 +32,7 @@ class Problem(NamedTuple):
 
 
 def spread(size, length=10.0):
-    """Starts about the positive orthant, some of them outside it."""
+    """Starting points around the positive orthant, some outside it."""
 
     def draw(rng, count):
         return np.abs(rng.normal(size=(count, size))) * length * rng.choice([1, -0.1], (count, 1))

@@ -123,7 +123,7 @@ def test_derivative_in_the_guess_is_zero():
 
 
 def chain(n, pull, left_pull):
-    """A law on a chain of n unknowns, each drawn to its neighbours."""
+    """A law on a chain of n unknowns, coupled to their neighbours."""
 
     def F(y, args):
         left, right = jnp.roll(y, 1).at[0].set(0.0), jnp.roll(y, -1).at[-1].set(0.0)

@@ -27,7 +27,7 @@ def solve(K, args, solver=None, tol=1e-13):
 
 
 def by_hand(y, G, nu, dM=0.0, dq=0.0, dG=0.0, dd=0.0, M=M):
-    """dy, for rows G that hold and their multipliers ν."""
+    """dy for active rows G and their multipliers ν."""
     rows = len(G)
     system = np.block([[M, G.T], [G, np.zeros((rows, rows))]])
     dM, dG = np.broadcast_to(dM, M.shape), np.broadcast_to(dG, G.shape)

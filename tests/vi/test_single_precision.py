@@ -58,7 +58,7 @@ def given(dtype):
 
 
 def types(jaxpr):
-    """The types of all values in a program, inner programs included."""
+    """The types of all values in a program, including inner programs."""
     for eqn in jaxpr.eqns:
         for out in eqn.outvars:
             yield eqn.primitive.name, getattr(out.aval, "dtype", None)

@@ -139,7 +139,7 @@ NEED_FEM = {
 
 
 def refused(config: Path, expected: dict[str, tuple[str, ...]]) -> None:
-    """Check and run both refuse it: each problem once, at its place; and nothing is written."""
+    """Assert that `check` and `run` both report each error once at its place, and write nothing."""
     for command in (["check", str(config)], ["run", str(config), "-o", str(config.parent / "out")]):
         result = CliRunner().invoke(app, command)
         assert (result.exit_code, result.stdout) == (2, ""), result.output

@@ -16,7 +16,7 @@ from dvax.app.runs import driver
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
-    """A run of the real driver, and what the command said."""
+    """A run of the real driver, with the output of the command."""
     folder = tmp_path_factory.mktemp("run")
     config = write_config(folder / "in")
     result = CliRunner().invoke(app, ["run", str(config), "-o", str(folder / "out")])
@@ -82,7 +82,7 @@ def test_run_force_deletes_only_files_of_dvax(tmp_path: Path) -> None:
 
 
 def stand_in(status: str, code: int, directory: Path) -> Callable[..., driver.RunOutcome]:
-    """A driver that stops as told, having written a partial run directory."""
+    """Replace the driver by one that stops as given, after it wrote a partial run directory."""
 
     def run(config: Any, out: Path, **options: Any) -> driver.RunOutcome:
         write_run(directory, Recipe((30,), frames=20, written=6, status=status))

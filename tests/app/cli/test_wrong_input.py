@@ -64,7 +64,7 @@ TABLES = {
 
 
 def refused(config: Path, out: Path, *named: str) -> str:
-    """Run and check; both refuse, name everything in `named`, and write nothing."""
+    """Assert that `run` and `check` report everything in `named`, and write nothing."""
     before = sorted(out.parent.rglob("*"))
     for command in (["run", str(config), "-o", str(out)], ["check", str(config)]):
         result = CliRunner().invoke(app, command)

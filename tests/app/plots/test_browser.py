@@ -74,7 +74,7 @@ def chromium(*arguments: str, profile: Path) -> subprocess.CompletedProcess[str]
 
 
 def look_at(page: Path, width: int) -> dict[str, Any]:
-    """Load a copy of `page` that reports on itself; returns what it said, and the console."""
+    """Load a copy of `page` that reports on itself; return its report, and the console output."""
     probe = page.with_name(f"probe-{width}.html")
     text = page.read_text(encoding="utf-8")
     probe.write_text(text.replace("<head>", f"<head>{COLLECT}", 1), encoding="utf-8")

@@ -20,7 +20,7 @@ from dvax.app.runs.rundir import FrameStore, close_killed, cut_incomplete, proce
 
 @contextmanager
 def room_for(size: int):
-    """No file may grow beyond `size` bytes: what a full disk does, without filling one."""
+    """Limit files to `size` bytes, which acts like a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -84,7 +84,7 @@ def test_run_directory_shows_only_complete_frames_at_any_time(tmp_path: Path, bl
 
 
 def gone() -> int:
-    """The number of a process that has ended."""
+    """Return the id of a process that has ended."""
     done = subprocess.Popen([sys.executable, "-c", ""])
     done.wait()
     return done.pid

@@ -176,7 +176,7 @@ TOKENS = (
 
 
 def parses_safely(text: str) -> bool:
-    """Whether the text is a formula; then it computes. No exception but InputError leaves."""
+    """Return whether the text is a formula, which is then evaluated; only InputError may be raised."""
     try:
         expression = compile_expression(text)
     except InputError as refused:

@@ -54,7 +54,7 @@ class Stops:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The run to its end."""
+    """The complete run."""
     folder = tmp_path_factory.mktemp("whole")
     return run(configured(folder), folder / "out")
 
@@ -110,7 +110,7 @@ def test_failed_run_keeps_its_frames_and_names_the_key(tmp_path):
 
 
 def plan_of_the_closed_form(count: int, **settings) -> Plan:
-    """The paper's contact law at a point: x(2) is known in closed form."""
+    """The contact law of the paper at a point: x(2) has a closed form."""
     model = dvax.models.Contact(
         alpha=1.0, beta=1.0, b_x=2.0, b_u=1.0, d_x=0.5, d_u=1.0, kappa0=0.5, g=1.0, ell=3.0
     )
