@@ -37,7 +37,7 @@ def main() -> None:
         "Times are medians of samples taken in turn, after compilation; ratios are formed round by"
     )
     print("round. benchmarks/README.md says how to read the tables.", flush=True)
-    begun = time.perf_counter()
+    started = time.perf_counter()
     sections: list[Section] = []
     loads: list[str] = []
     for name in CASES:
@@ -47,7 +47,7 @@ def main() -> None:
         sections.append(load(name)(options.full))
         print(f"\n{as_text(sections[-1])}\n(load at its start: {loads[-1]})", flush=True)
     facts["load after"] = machine.load()
-    facts["seconds"] = f"{time.perf_counter() - begun:.0f}"
+    facts["seconds"] = f"{time.perf_counter() - started:.0f}"
     print(f"\nTargets\n-------\n{verdicts(sections)}")
     print(f"\n{facts['seconds']} s; load afterwards: {facts['load after']}")
     if options.save:

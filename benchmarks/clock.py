@@ -1,4 +1,4 @@
-"""Timing two or more things in turn, so that a busy machine slows all of them alike.
+"""Alternating timing of two or more functions, so that load on the machine affects all of them alike.
 
 One sample of each is taken a round, in an order that rotates, and ratios are formed round by round:
 their median is what is reported, with the smallest and the largest beside it.
@@ -58,9 +58,9 @@ def in_turn(
     begin within `enough` seconds, but three at least."""
     names = list(samples)
     taken: dict[str, list[float]] = {name: [] for name in names}
-    begun = time.perf_counter()
+    started = time.perf_counter()
     for number in range(rounds):
-        if number >= _FEWEST and time.perf_counter() - begun > enough:
+        if number >= _FEWEST and time.perf_counter() - started > enough:
             break
         first = number % len(names)
         for name in names[first:] + names[:first]:

@@ -1,4 +1,4 @@
-"""`dvax.solve` in the ways a program calls it: as it stands, and within a function under jax.jit."""
+"""`dvax.solve` as programs call it: directly, and within a function under jax.jit."""
 
 from collections.abc import Callable
 from typing import Any

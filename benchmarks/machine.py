@@ -1,4 +1,4 @@
-"""On what the figures were taken."""
+"""A description of the machine on which the figures were measured."""
 
 import importlib.metadata
 import os

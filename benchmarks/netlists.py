@@ -1,4 +1,4 @@
-"""Netlists of rectifiers with many diodes, which the tests of circuits take as well."""
+"""Netlists of rectifiers with many diodes, also used by the tests of circuits."""
 
 
 def multiplier(

@@ -1,4 +1,4 @@
-"""The `dvax` program as a user starts it, with the time it took and the memory it held."""
+"""The `dvax` program as a user starts it, with its time and its memory."""
 
 import json
 import subprocess
@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 _LAUNCHER = """
 import json, os, subprocess, sys, time
-begun = time.perf_counter()
+started = time.perf_counter()
 with open(sys.argv[1], "w") as said:
     child = subprocess.Popen(sys.argv[2:], stdin=subprocess.DEVNULL, stdout=said, stderr=said)
     _, status, usage = os.wait4(child.pid, 0)
-ended = time.perf_counter() - begun
+ended = time.perf_counter() - started
 worked = usage.ru_utime + usage.ru_stime
 print(json.dumps([ended, worked, usage.ru_maxrss, os.waitstatus_to_exitcode(status)]))
 """

@@ -1,5 +1,5 @@
-"""The systems of the work–precision case, each written three times: as the problem it is for dvax, and
-with its law solved by hand for tools that know no law, in JAX and in NumPy."""
+"""The systems of the work–precision case, each written three times: as a problem of dvax, and with its
+law solved by hand in JAX and in NumPy, for tools without laws."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

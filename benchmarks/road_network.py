@@ -1,4 +1,4 @@
-"""Road networks of the size and the congestion of real ones, the same at every call."""
+"""Generated road networks with the size and the congestion of real ones, equal at every call."""
 
 import numpy as np
 import scipy.sparse.csgraph
@@ -15,7 +15,7 @@ def region(
     0.5 to 1.5 units long, costs follow BPR with b = 0.15 and power 4; connectors cost nothing but
     their length. Of all pairs the `pairs` with the largest a_i a_j exp(−distance/6) have trips, in
     proportion, scaled so that a twentieth of all streets has more than `load` times its capacity
-    where everybody takes the path that is least on the empty network.
+    if all trips take the shortest path of the empty network.
     """
     rng = np.random.default_rng(seed)
     node = np.arange(rows * columns).reshape(rows, columns)

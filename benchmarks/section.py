@@ -1,4 +1,4 @@
-"""What a case reports: comparisons with targets, further tables, and notes."""
+"""The report of a case: comparisons with targets, further tables, and notes."""
 
 from dataclasses import dataclass, field
 from typing import Literal

@@ -1,4 +1,9 @@
-"""A plate under a flame that wanders, and its saturated heaters."""
+"""A plate under a moving heat source, with saturated heaters.
+
+The program solves for the temperature with a proved error bound. It draws the temperature and the
+regions of least power, regulation and full power at the end. The page docs/models/thermostat.md
+explains the model.
+"""
 
 from pathlib import Path
 
@@ -18,6 +23,8 @@ FOLDER = Path(__file__).parent
 
 
 def main(folder: Path = FOLDER) -> dict[str, float]:
+    """Draw the picture into `folder`, and return the numbers that the program prints."""
+
     def flame(t):
         return 1.5 * jnp.exp(-30.0 * ((s1 - 0.5 - 0.3 * jnp.sin(t)) ** 2 + (s2 - 0.5) ** 2))
 
@@ -32,7 +39,7 @@ def main(folder: Path = FOLDER) -> dict[str, float]:
         constants=plate.constants,
     )  # fmt: skip
     bound = dvax.bound_error(plate.problem, sol, plate.constants)
-    # Off, regulating and at full power, from pale to strong.
+    # 0: least power, 1: regulating, 2: full power; the colours become stronger.
     order = np.asarray(plate.regimes(ts[-1], sol.xs[-1])) + 1
     with rc_context({**STILL_STYLE, "axes.grid": False}):
         drawn, axes = still_axes(1, 2, figsize=(10, 4))

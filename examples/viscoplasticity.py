@@ -1,4 +1,8 @@
-"""A steel point on a path that turns from tension to shear, after Duvaut and Lions."""
+"""A steel point on a strain path from tension to shear, by the law of Duvaut and Lions.
+
+The program solves for three relaxation times, and draws the stress paths with the yield surface. The
+page docs/models/duvaut-lions.md explains the model.
+"""
 
 from pathlib import Path
 
@@ -16,6 +20,7 @@ FOLDER = Path(__file__).parent
 
 
 def main(folder: Path = FOLDER) -> dict[str, float]:
+    """Draw the picture into `folder`, and return the numbers that the program prints."""
     shear = mandel(jnp.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
     tension = mandel(jnp.diag(jnp.array([1.0, -0.5, -0.5])))
     corners = np.array(
@@ -36,7 +41,7 @@ def main(folder: Path = FOLDER) -> dict[str, float]:
         bounds.append(float(dvax.bound_error(steel.problem, sol, steel.constants).x.max()))
         stress = np.asarray(jax.vmap(steel.stress)(sol.ts, sol.xs))
         along = [stress @ np.asarray(v) / np.linalg.norm(v) for v in (tension, shear)]
-        # On these axes von Mises' cylinder is a circle of the radius √(2/3) σ_y.
+        # On these axes the von Mises cylinder is a circle with the radius √(2/3) σ_y.
         found.append(Curve(along[0], along[1], f"τ = {relaxation:g} s", k))
         peaks[f"peak_stress_{relaxation:g}"] = float(steel.figures(sol)["peak_stress"])
     angle = np.linspace(0.0, 2 * np.pi, 200)

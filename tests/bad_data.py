@@ -1,4 +1,4 @@
-"""Data that the constructors refuse: one process tries all of it and prints what was said.
+"""Data that the constructors reject: one process tries all of them and prints the messages.
 
 A process of its own, as for `tests/newcomer.py`: the tests check annotations, which users do not.
 """

@@ -1,4 +1,4 @@
-"""What every test runs under: double precision, checked shapes, repeatable random cases."""
+"""The environment of every test: double precision, checked shapes, repeatable random cases."""
 
 import gc
 import itertools

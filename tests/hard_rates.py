@@ -1,5 +1,5 @@
-"""Functions of time made to deceive: jumps and kinks where a step does not look, in every form in which
-a program can write them. With each, the places in (0, 1) where it jumps or bends."""
+"""Adversarial functions of time: jumps and kinks between samples of a step, in every form of code. Each
+has the list of its jumps and kinks in (0, 1)."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Systems with a solution that was chosen first: any set, operator and generator.
+"""Systems with a manufactured solution, for any set, operator and generator.
 
 With a smooth x*, any curve z* and y* = proj_K(z*), u* = P⁻¹y*, ξ* = z* − y* ∈ N_K(y*),
 

@@ -1,4 +1,4 @@
-"""Bad input as a newcomer gives it: one process tries all of it and prints what was said.
+"""Typical mistakes of new users: one process tries all of them and prints the messages.
 
 A process of its own, since the tests check annotations and promotion, which users do not: there
 `max_steps="9"` would be refused by the checker, and never reach dvax.

@@ -1,4 +1,4 @@
-"""Answers found without dvax and without JAX: what its results are compared with."""
+"""Solutions without dvax and without JAX, for comparison."""
 
 from decimal import Decimal, localcontext
 from itertools import product

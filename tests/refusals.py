@@ -1,4 +1,4 @@
-"""Cases of wrong input, tried in a process of its own, and what was said of each.
+"""Cases of wrong input, tried in a separate process, with the messages.
 
 A module of cases has `CASES`: by group and name an attempt and words of the message, "; " between them.
 """
@@ -16,7 +16,7 @@ import dvax
 
 
 def said(attempt) -> tuple[str, str]:
-    """The kind of exception and its message."""
+    """The type of an exception and its message."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -28,7 +28,7 @@ def said(attempt) -> tuple[str, str]:
 
 
 def print_all(cases) -> None:
-    """Try all of them, and print what was said as JSON."""
+    """Try all cases, and print the messages as JSON."""
     tried = {
         f"{group}: {name}": said(attempt)
         for group, those in cases.items()
@@ -46,7 +46,7 @@ def names_and_words(module: ModuleType) -> list[tuple[str, str]]:
 
 
 def answers_of(module: ModuleType) -> dict[str, tuple[str, str]]:
-    """What `module` prints in a process of its own."""
+    """The output of `module`, run in a separate process."""
     paths = [Path(dvax.__file__).parents[1], Path(__file__).parents[1]]
     done = subprocess.run(
         [sys.executable, str(module.__file__)], capture_output=True, text=True, timeout=600,

@@ -1,4 +1,4 @@
-"""Which of many cases run every time; the others run in `make thorough`."""
+"""Selection of the cases that run in `make test`; the others run in `make thorough`."""
 
 from collections.abc import Collection, Iterable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Data that is no number, array, shape or part is refused where it is given; the rest is taken."""
+"""Data of a wrong kind, shape or type are rejected where they are given; valid data are accepted."""
 
 import jax
 import jax.numpy as jnp
@@ -25,12 +25,12 @@ def test_bad_data_is_an_input_error_on_one_line_with_place_and_fix(answers, name
     assert "asarray(dvax" not in message, "the fix is code of the caller"
 
 
-def test_none_that_is_not_args_is_not_said_to_be(answers):
+def test_none_in_data_is_not_reported_as_args(answers):
     assert "args=" not in answers["solve: None from elsewhere"][1]
 
 
 @pytest.mark.parametrize("size", [np.int64(4), np.int32(4), (np.int64(4),), [4]])
-def test_integers_of_numpy_are_sizes(size):
+def test_numpy_integers_are_accepted_as_sizes(size):
     assert spaces.Euclidean(size).zeros().shape == (4,)
     assert generators.Elliptic(size).transform.shape == (4,)
     assert operators.Convolution(jnp.ones(3), size).shape == (4,)
@@ -47,7 +47,7 @@ def test_integers_of_numpy_are_sizes(size):
         (np.arange(2), [0.0, 1.0]),
     ],
 )
-def test_knots_are_a_time_or_a_list_of_times(knots, times):
+def test_knots_accept_a_time_or_a_list_of_times(knots, times):
     assert signals.Function(jnp.sin, knots).knots().tolist() == times
 
 
@@ -68,5 +68,5 @@ def test_knots_are_a_time_or_a_list_of_times(knots, times):
         (lambda: jax.grad(lambda p: operators.Dense([[p]]).inverse(jnp.ones(1))[0])(2.0), -0.25),
     ],
 )  # fmt: skip
-def test_data_that_is_right_is_taken(make, value):
+def test_valid_data_are_accepted(make, value):
     np.testing.assert_allclose(make(), value)

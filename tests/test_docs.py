@@ -1,4 +1,4 @@
-"""The pages of docs/: their examples run, and the page on the frozen law leaves nothing out."""
+"""The pages of docs/: their examples run, and the page on the frozen law is complete."""
 
 import doctest
 import inspect
@@ -22,7 +22,7 @@ def blocks(page: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
-def test_the_examples_of_a_page_print_what_it_says(
+def test_page_examples_print_the_documented_output(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(tmp_path)  # some write files
@@ -37,11 +37,11 @@ def test_the_examples_of_a_page_print_what_it_says(
     assert runner.summarize(verbose=False).failed == 0, "".join(report)
 
 
-def test_some_page_has_examples():
+def test_pages_have_examples():
     assert sum(len(blocks(page)) for page in PAGES) >= 9
 
 
-def test_every_page_is_linked():
+def test_pages_are_linked_from_the_index_and_the_site():
     site = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8")
     index = (DOCS / "index.md").read_text(encoding="utf-8")
     for page in PAGES:
@@ -57,7 +57,7 @@ def public(module: object, base: type) -> list[str]:
     ]
 
 
-def test_every_set_solver_and_result_has_its_line():
+def test_page_on_the_frozen_law_lists_every_set_solver_and_result():
     text = (DOCS / "variational-inequalities.md").read_text(encoding="utf-8")
     names = [
         *public(dvax.sets, dvax.sets.AbstractSet),

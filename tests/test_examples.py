@@ -1,4 +1,4 @@
-"""The programs of examples/ run, and what they print is true."""
+"""The programs of examples/ run, and print correct numbers."""
 
 import runpy
 from pathlib import Path
@@ -97,7 +97,7 @@ def predictive_control(found: dict[str, float]) -> None:
 TRUE = {check.__name__: check for check in (predictive_control, thermostat, viscoplasticity)}
 
 
-def test_every_example_is_here():
+def test_examples_are_all_listed_in_this_test():
     assert {file.stem for file in EXAMPLES.glob("*.py")} == set(TRUE)
     told = (EXAMPLES / "README.md").read_text(encoding="utf-8")
     assert all(f"`{name}.py`" in told for name in TRUE)
@@ -105,7 +105,7 @@ def test_every_example_is_here():
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", TRUE)
-def test_an_example_prints_what_is_true_and_draws(name, tmp_path):
+def test_examples_print_correct_numbers_and_draw(name, tmp_path):
     found = runpy.run_path(str(EXAMPLES / f"{name}.py"))["main"](tmp_path)
     TRUE[name](found)
     assert 0.0 < found["error_bound"] < 1e-3

@@ -1,4 +1,4 @@
-"""A figure reads the same everywhere, with the digits that are known."""
+"""A figure has the same text everywhere, with its certified digits."""
 
 import json
 import re
@@ -20,19 +20,21 @@ ERRORS = st.floats(min_value=1e-280, max_value=1e280)
 
 
 @given(FINITE)
-def test_ten_digits_where_no_error_is_known(value: float) -> None:
+def test_figure_without_an_error_bound_has_ten_digits(value: float) -> None:
     assert float(figure_text(value)) == pytest.approx(value, rel=5e-10, abs=0.0)
 
 
 @given(FINITE, ERRORS)
-def test_what_is_shown_contains_all_that_is_certified(value: float, error: float) -> None:
+def test_figure_with_an_error_bound_contains_the_certified_interval(
+    value: float, error: float
+) -> None:
     shown, told = figure_text(value, error).split(" ± ")
     # The bound is rounded up, and the value off by no more than a unit of the bound's first digit.
     assert error <= float(told) * (1 + 1e-12) <= 1.11 * error
     assert abs(float(shown) - value) <= max(error, 1e-16 * abs(value)) * (1 + 1e-9)
 
 
-def test_particular_figures() -> None:
+def test_figure_text_of_examples() -> None:
     assert figure_text(1286032.12345) == "1286032.123"
     assert figure_text(-0.0) == "0"
     assert figure_text(3) == "3" and figure_text(None) == "not known"
@@ -42,7 +44,7 @@ def test_particular_figures() -> None:
 
 
 @given(st.floats(min_value=1e-280, max_value=1e280))
-def test_two_digits_of_a_bound_rounded_up(value: float) -> None:
+def test_bound_text_has_two_digits_rounded_up(value: float) -> None:
     shown = entry_text({"value": value, "bound": "estimated"})
     assert shown.startswith("≤ ")
     told = float(shown.removeprefix("≤ "))
@@ -51,7 +53,7 @@ def test_two_digits_of_a_bound_rounded_up(value: float) -> None:
     assert len(digits) <= 2
 
 
-def test_particular_bounds() -> None:
+def test_bound_text_of_examples() -> None:
     texts = [
         entry_text({"value": value, "bound": "proved"})
         for value in (1065.322453, 0.3101843489, 2.3316511e-11, 0.0, 99.1)
@@ -60,7 +62,9 @@ def test_particular_bounds() -> None:
     assert entry_text({"value": None, "bound": "estimated"}) == "not known"
 
 
-def test_terminal_page_and_file_agree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_figure_text_agrees_on_terminal_page_and_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), frames=21))
     summary = {
         "objective": {"value": 4231335.287107123, "unit": "trip cost", "meaning": "no error"},

@@ -1,7 +1,7 @@
-"""The habits of the house that no linter knows.
+"""Conventions of the code that no linter checks.
 
-A class is abstract or final and behaviour is not overridden (equinox's own `strict` flag checks
-nothing). A public name says what it is, and shows it in an example that runs. A file is one idea.
+A class is abstract or final, and concrete methods are not overridden (equinox's own `strict` flag
+checks nothing). A public name has a docstring with an example that runs.
 """
 
 import abc
@@ -126,7 +126,7 @@ def all_modules() -> Iterator[str]:
 
 
 def family(root: type = eqx.Module) -> list[type]:
-    """Every subclass of `root` that dvax defines, itself loaded whole."""
+    """Every subclass of `root` in dvax, with all its modules imported."""
     for name in all_modules():
         importlib.import_module(name)
     seen: dict[type, None] = {}
@@ -153,7 +153,7 @@ def abstract_members(cls: type) -> set[str]:
 
 
 def behaviour(cls: type) -> dict[str, object]:
-    """The methods and properties that `cls` itself writes down."""
+    """The methods and properties that `cls` itself defines."""
     kinds = (property, classmethod, staticmethod)
     return {
         name: member
@@ -165,7 +165,7 @@ def behaviour(cls: type) -> dict[str, object]:
 
 
 def faults_of(classes: Iterable[type]) -> list[str]:
-    """What breaks 'abstract or final, and nothing concrete is overridden', as sentences."""
+    """Violations of 'abstract or final, and no concrete method is overridden', as sentences."""
     classes = list(classes)
     faults = []
     for cls in classes:
@@ -187,7 +187,7 @@ def faults_of(classes: Iterable[type]) -> list[str]:
 
 
 def public(room: str) -> dict[str, object]:
-    """The classes and functions of dvax that a room's __init__ offers."""
+    """The classes and functions of dvax that the `__init__` of a folder exports."""
     module = importlib.import_module(f"dvax.{room}")
     # Some are loaded when they are first asked for.
     offered = {name: getattr(module, name) for name in getattr(module, "__all__", vars(module))}
@@ -207,14 +207,14 @@ def resolve(name: str) -> object:
     return thing
 
 
-def test_every_class_is_abstract_or_final():
+def test_classes_are_abstract_or_final():
     classes = family()
     assert len(classes) > 10
     faults = faults_of(classes)
     assert not faults, "\n".join(faults)
 
 
-def test_planted_faults_are_seen():
+def test_class_faults_are_detected():
     class AbstractShape(eqx.Module):
         @abc.abstractmethod
         def area(self) -> float: ...
@@ -244,7 +244,7 @@ def test_planted_faults_are_seen():
         pass
 
     def short(*classes: type) -> list[str]:
-        prefix = f"{__name__}.{test_planted_faults_are_seen.__qualname__}.<locals>."
+        prefix = f"{__name__}.{test_class_faults_are_detected.__qualname__}.<locals>."
         return [fault.replace(prefix, "") for fault in faults_of(classes)]
 
     assert short(AbstractShape, Disc) == []
@@ -260,7 +260,7 @@ def test_planted_faults_are_seen():
 
 
 @pytest.mark.parametrize("name", CONTRACT)
-def test_a_contract_name_has_an_example_that_runs(name: str):
+def test_public_names_have_an_example_that_runs(name: str):
     thing = resolve(name)
     finder = doctest.DocTestFinder(recurse=False)
     found = finder.find(thing, name, module=False, globs={})
@@ -273,7 +273,7 @@ def test_a_contract_name_has_an_example_that_runs(name: str):
     assert runner.summarize(verbose=False).failed == 0, "".join(report)
 
 
-def test_the_example_of_the_readme_prints_what_it_says(tmp_path: Path):
+def test_readme_example_prints_the_documented_output(tmp_path: Path):
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     examples = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", text, flags=re.DOTALL)
     assert len(examples) == text.count("```python") == 1
@@ -285,7 +285,7 @@ def test_the_example_of_the_readme_prints_what_it_says(tmp_path: Path):
 
 
 @pytest.mark.parametrize("room", ROOMS)
-def test_every_public_name_is_documented(room: str):
+def test_public_names_are_documented(room: str):
     names = public(room)
     assert names
     bare = [
@@ -297,7 +297,7 @@ def test_every_public_name_is_documented(room: str):
     assert not bare, f"no docstring: {bare}"
 
 
-def test_the_files_that_the_page_on_the_architecture_names_exist():
+def test_architecture_page_names_existing_files():
     page = (ROOT / "docs" / "architecture.md").read_text()
     named = set(re.findall(r"[\w/]+\.py\b", page)) | set(re.findall(r"`([\w/]+/)`", page))
     assert len(named) > 20
@@ -306,7 +306,7 @@ def test_the_files_that_the_page_on_the_architecture_names_exist():
     assert not absent
 
 
-def test_only_the_room_for_it_uses_unstable_interfaces_of_jax():
+def test_unstable_jax_interfaces_are_used_in_one_folder_only():
     assert list(unstable_lines()) == []
     # The reader finds what it looks for.
     assert UNSTABLE.search("from jax.interpreters import mlir")

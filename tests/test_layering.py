@@ -1,4 +1,4 @@
-"""The house stands: a room imports only from floors below its own, and nothing goes in circles.
+"""The layers: a folder imports only from floors below its own, without cycles.
 
 The imports are read from the sources, those inside functions and under TYPE_CHECKING included: a
 dependence that is only a type is still a dependence.
@@ -124,7 +124,7 @@ def room(module: str) -> str:
 
 
 def wrong_floors(package: Path) -> tuple[list[str], set[tuple[str, str]]]:
-    """Imports that do not go down, as sentences, and the neighbours that are in use."""
+    """Imports that do not go to a lower floor, as sentences, and the allowed neighbours in use."""
     wrong, used = [], set()
     for importer, line, imported, _ in imports(package):
         if imported.split(".")[0] != package.name:
@@ -141,7 +141,7 @@ def wrong_floors(package: Path) -> tuple[list[str], set[tuple[str, str]]]:
 
 
 def circle(graph: dict[str, set[str]]) -> list[str]:
-    """The nodes of one circle of `graph`, in order; empty if it has none."""
+    """The nodes of one cycle of `graph`, in order; empty if there is none."""
     done: set[str] = set()
 
     def descend(node: str, path: list[str]) -> list[str]:
@@ -161,7 +161,7 @@ def circle(graph: dict[str, set[str]]) -> list[str]:
 
 
 def dependence(package: Path, of: str) -> dict[str, set[str]]:
-    """Who imports whom inside `package`, between 'modules' or between 'rooms'."""
+    """The imports inside `package`, between 'modules' or between 'rooms'."""
     graph: dict[str, set[str]] = {}
     for importer, _, imported, _ in imports(package):
         if imported.split(".")[0] == package.name and importer != package.name:
@@ -172,7 +172,7 @@ def dependence(package: Path, of: str) -> dict[str, set[str]]:
 
 
 def foreign(package: Path) -> list[str]:
-    """Imports of packages that the importing room may not need, as sentences."""
+    """Imports of packages that the importing folder may not use, as sentences."""
     wrong = []
     for importer, line, imported, deferred in imports(package):
         top = imported.split(".")[0]
@@ -192,32 +192,32 @@ def foreign(package: Path) -> list[str]:
     return wrong
 
 
-def test_every_room_has_a_floor():
+def test_folders_have_a_floor():
     assert {room(name) for name in modules(SOURCE)} <= set(FLOORS)
 
 
-def test_imports_go_down():
+def test_imports_go_to_lower_floors_only():
     wrong, _ = wrong_floors(SOURCE)
     assert not wrong, "\n".join(wrong)
 
 
-def test_every_exception_is_in_use():
+def test_import_exceptions_are_in_use():
     _, used = wrong_floors(SOURCE)
     assert used == set(NEIGHBOURS)
 
 
 @pytest.mark.parametrize("of", ["modules", "rooms"])
-def test_no_circles(of: str):
+def test_imports_have_no_cycles(of: str):
     assert circle(dependence(SOURCE, of)) == []
 
 
-def test_foreign_packages_are_declared_and_stay_in_their_rooms():
+def test_third_party_imports_are_declared_and_restricted_to_their_folders():
     wrong = foreign(SOURCE)
     assert not wrong, "\n".join(wrong)
 
 
 def plant(folder: Path, **files: str) -> Path:
-    """A small house named dvax with the given files, '__' standing for '/'."""
+    """Create a small package named dvax with the given files, '__' standing for '/'."""
     package = folder / "dvax"
     for name, text in {"__init__": "", **files}.items():
         file = package / ("__init__.py" if name == "__init__" else name.replace("__", "/") + ".py")
@@ -239,20 +239,20 @@ def plant(folder: Path, **files: str) -> Path:
         "from ..generators.scalar import Scalar",
     ],
 )
-def test_a_planted_import_upward_or_sideways_is_seen(tmp_path: Path, text: str):
+def test_import_upward_or_sideways_is_detected(tmp_path: Path, text: str):
     house = plant(tmp_path, sets__box=text, evolution__solve="", generators__scalar="")
     (house / "evolution" / "__init__.py").touch()
     wrong, _ = wrong_floors(house)
     assert len(wrong) == 1 and wrong[0].startswith("dvax.sets.box:")
 
 
-def test_an_import_downward_is_not_reported(tmp_path: Path):
+def test_import_downward_is_not_reported(tmp_path: Path):
     house = plant(tmp_path, vi__residual="from ..sets.box import Box", sets__box="import jax")
     assert wrong_floors(house) == ([], set())
     assert foreign(house) == []
 
 
-def test_a_planted_circle_is_seen(tmp_path: Path):
+def test_import_cycle_is_detected(tmp_path: Path):
     house = plant(
         tmp_path,
         sets__box="from .ball import Ball",
@@ -268,7 +268,7 @@ def test_a_planted_circle_is_seen(tmp_path: Path):
     assert set(circle(dependence(other, "rooms"))) == {"sets", "signals"}
 
 
-def test_a_planted_foreign_import_is_seen(tmp_path: Path):
+def test_undeclared_third_party_import_is_detected(tmp_path: Path):
     house = plant(
         tmp_path,
         sets__box="import xarray",

@@ -1,4 +1,4 @@
-"""Whatever a newcomer gets wrong is answered by an `InputError` that names the place and the fix."""
+"""Mistakes of new users raise an `InputError` that names the place and the fix."""
 
 import pytest
 from tests import newcomer

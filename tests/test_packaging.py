@@ -1,4 +1,4 @@
-"""What a user installs: a whole wheel, a core without extras, a command line that is quick."""
+"""The installed package: a complete wheel, a core without extras, a fast command line."""
 
 import email
 import itertools
@@ -37,7 +37,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
-def test_the_wheel_holds_every_file_of_the_package(wheel: Path):
+def test_wheel_contains_every_file_of_the_package(wheel: Path):
     inside = set(zipfile.ZipFile(wheel).namelist())
     package = ROOT / "src" / "dvax"
     files = {
@@ -49,7 +49,7 @@ def test_the_wheel_holds_every_file_of_the_package(wheel: Path):
     assert {name.split("/")[0] for name in inside - files} == {f"dvax-{version(wheel)}.dist-info"}
 
 
-def test_the_wheel_carries_the_demo(wheel: Path):
+def test_wheel_contains_the_demo(wheel: Path):
     demo = {
         name.rpartition("/")[2]: info.file_size
         for info in zipfile.ZipFile(wheel).infolist()
@@ -69,7 +69,7 @@ def version(wheel: Path) -> str:
     return metadata(wheel)["Version"]
 
 
-def test_the_metadata_says_what_is_needed(wheel: Path):
+def test_metadata_lists_the_requirements(wheel: Path):
     about = metadata(wheel)
     assert about["Requires-Python"] == ">=3.11"
     assert about["License-Expression"] == "Apache-2.0"
@@ -92,7 +92,7 @@ def test_the_metadata_says_what_is_needed(wheel: Path):
         assert "dvax = dvax.app.cli:main" in archive.read(name).decode()
 
 
-def test_the_page_on_dependencies_names_those_that_are_declared():
+def test_dependencies_page_names_the_declared_packages():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     needs = [
         *declared["dependencies"],
@@ -105,30 +105,30 @@ def test_the_page_on_dependencies_names_those_that_are_declared():
     assert named == {re.split("[<>]", need)[0] for need in needs} - {"dvax[fem]"}
 
 
-def test_the_library_imports_what_it_depends_on():
+def test_library_imports_its_declared_dependencies():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
     code = "\n".join(path.read_text() for path in (ROOT / "src" / "dvax").rglob("*.py"))
     for name in (re.split("[<>]", need)[0] for need in declared):
         assert re.search(rf"^\s*(import|from) {name}\b", code, re.MULTILINE), name
 
 
-def test_the_citation_is_of_this_version(wheel: Path):
+def test_citation_has_the_current_version(wheel: Path):
     assert f"\nversion: {version(wheel)}\n" in (ROOT / "CITATION.cff").read_text()
 
 
-def test_the_lock_names_versions_and_nothing_else():
+def test_lock_file_contains_only_versions():
     for line in (ROOT / "requirements-dev.lock").read_text().splitlines():
         if not line.lstrip().startswith("#"):
             assert "==" in line and "://" not in line and not line.startswith("-"), line
 
 
-def test_the_environment_is_consistent():
+def test_environment_is_consistent():
     # `make` installs the lock without resolving it, so a package that the lock forgot shows here.
     run(sys.executable, "-m", "pip", "check")
 
 
 def help_of(*arguments: str) -> str:
-    """The heavy modules that are loaded once `dvax ARGUMENTS --help` has been printed."""
+    """The large modules that are loaded after `dvax ARGUMENTS --help`."""
     code = f"""
 import sys
 from dvax.app.cli import main
@@ -145,14 +145,14 @@ print("heavy:", *(name for name in {HEAVY!r} if name in sys.modules))
 
 
 @pytest.mark.parametrize("arguments", [(), ("run",), ("demo",)], ids=" ".join)
-def test_help_loads_nothing_heavy(arguments: tuple[str, ...]):
+def test_help_imports_no_large_packages(arguments: tuple[str, ...]):
     # Typer itself loads pydantic, where it is installed, to look at a command's parameters.
     allowed = {"pydantic"} if arguments else set()
     assert set(help_of(*arguments).split()) <= allowed
 
 
 @pytest.mark.thorough
-def test_help_is_there_within_a_second():
+def test_help_takes_less_than_a_second():
     code = "import sys; from dvax.app.cli import main; sys.argv = ['dvax', '--help']; main()"
     took = []
     for _ in range(5):
@@ -164,7 +164,7 @@ def test_help_is_there_within_a_second():
 
 
 @pytest.mark.thorough
-def test_the_library_works_from_its_wheel_without_extras(wheel: Path, tmp_path: Path):
+def test_wheel_works_without_extras(wheel: Path, tmp_path: Path):
     place = tmp_path / "clean"
     venv.create(place, with_pip=True)
     python = place / "bin" / "python"

@@ -1,4 +1,4 @@
-"""One case a file, each a function `run(full) -> Section`; loaded when it is asked for."""
+"""The cases, one per file: each is a function `run(full) -> Section`, imported on demand."""
 
 import importlib
 from typing import Protocol, cast

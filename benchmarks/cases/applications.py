@@ -1,4 +1,4 @@
-"""The applications against what people use for them today."""
+"""The applications against the usual tools."""
 
 import importlib.util
 import time
@@ -32,7 +32,7 @@ def run(full: bool) -> Section:
             "dvax as called, after compilation but in the spectrum; the others as a user writes them. "
             "Errors are of what the row names, against a run of dvax at a tighter tolerance. Circuit: "
             "Siconos, EulerMoreauOSI with θ = ½ and an LCP a step, its stepping alone. Oscillators: "
-            "dvax compiles anew in every call, runs every frame elastic first, and uses all cores; "
+            "dvax compiles in every call, runs every frame elastic first, and uses all cores; "
             "scipy's LSODA, plain Python on one core with the law as a clip and the yield limit "
             "given, restarted at no kink, its peaks read off 8 points a sample; four run, their time "
             "is multiplied, and errors are of these four. Market: a week's hours in one jitted "

@@ -1,4 +1,4 @@
-"""What the certificate costs on a field, and how far above the true error it is on C1."""
+"""The cost of the certificate on a field, and its ratio to the true error on C1."""
 
 import functools
 import time
@@ -39,7 +39,7 @@ def run(full: bool) -> Section:
             "saved times, the true error from the closed form; 'sharp' uses the one-sided "
             "constant. Errors there are of ETD1 and ETD2RK at the rtol named, atol = rtol/1000. "
             "certified_tol: all its runs together, beside the fewest fixed steps (of a ladder of "
-            "tenths) whose true error, which nobody knows beforehand, is just below it."
+            "tenths) whose true error, unknown beforehand, is just below it."
         ),
         tables=[Table("bound / true error on C1", _HEADER, _closeness())],
     )
@@ -85,9 +85,9 @@ def _large() -> list[tuple[str, ...]]:
             f=lambda t, x, u, args, push=push: push(u),
             h=lambda t, x, u, args, push=push: x - push(u),
         )  # fmt: skip
-        begun = time.perf_counter()
+        started = time.perf_counter()
         check = dvax.verify(problem, jnp.zeros(_LARGE))
-        taken = time.perf_counter() - begun
+        taken = time.perf_counter() - started
         assert check.constants is not None
         ratio = float(check.constants.beta_f) / norm
         found.append((name, f"{taken:.1f}", check.status, f"{ratio:.4f}", "≤ 10 s"))

@@ -1,4 +1,4 @@
-"""What a derivative costs over the plain solve, by reverse and by forward mode."""
+"""The cost of a derivative relative to the plain solve, in reverse and in forward mode."""
 
 from collections.abc import Callable
 from dataclasses import replace

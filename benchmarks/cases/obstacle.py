@@ -1,4 +1,4 @@
-"""An obstacle problem without a matrix, grid by grid, and a path of warm starts."""
+"""A matrix-free obstacle problem on several grids, and a path of warm starts."""
 
 import functools
 from typing import Any
@@ -56,9 +56,9 @@ def run(full: bool) -> Section:
         ("law", "solves a turn", "mean", "most"), [],
     )  # fmt: skip
     section.tables.append(path)
-    for name, bend in (("affine", 0.0), ("with 0.1 y³", 0.1)):
+    for name, cubic in (("affine", 0.0), ("with 0.1 y³", 0.1)):
         for solves in _PATHS:
-            mean, most = _along_a_path(solves, bend)
+            mean, most = _along_a_path(solves, cubic)
             path.rows.append((name, str(solves), f"{mean:.2f}", str(most)))
         section.comparisons.append(
             Comparison(
@@ -124,7 +124,7 @@ def _measure(table: Table, guess: jax.Array, side: int, rounds: int) -> int:
     return int(found.evaluations)
 
 
-def _along_a_path(solves: int, bend: float) -> tuple[float, int]:
+def _along_a_path(solves: int, cubic: float) -> tuple[float, int]:
     """The mean and the largest number of evaluations a solve, each solve started from the last."""
     n = 100
     rng = np.random.default_rng(0)
@@ -135,7 +135,7 @@ def _along_a_path(solves: int, bend: float) -> tuple[float, int]:
 
     def law(y: jax.Array, angle: jax.Array) -> jax.Array:
         drive = jnp.cos(angle) * drives[0] + jnp.sin(angle) * drives[1]
-        return matrix @ y + bend * y**3 - drive
+        return matrix @ y + cubic * y**3 - drive
 
     def step(y: jax.Array, angle: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         found = dvax.solve_vi(law, dvax.sets.Box(-1.0, 1.0), y, args=angle, gamma=1.0)

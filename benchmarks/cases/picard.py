@@ -1,4 +1,4 @@
-"""All times of a window at once against one step after the other, on the device that JAX has."""
+"""All times of a window at once against sequential steps, on the device that JAX uses."""
 
 from typing import Any
 

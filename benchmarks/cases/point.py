@@ -1,4 +1,4 @@
-"""Fixed steps at a single point: what the time loop itself costs."""
+"""Fixed steps at a single point: the cost of the time loop itself."""
 
 import jax.numpy as jnp
 

@@ -15,7 +15,7 @@ from ..layout import duration
 from ..section import Comparison, Section, Table, Target, compare
 
 _POINTS = 10**6
-_MOST = 15
+_TARGET_EVALUATIONS = 15
 _OFF = (0.0, 1e-8, 1e-5, 1e-3)
 """How far the guesses of warm starts are from the solution."""
 
@@ -133,7 +133,9 @@ def _measure(
             "evaluations of F",
             spread(taken["solve"]).middle,
             None,
-            target=None if law.steep else Target("≤", _MOST, int(count), " evaluations"),
+            target=None
+            if law.steep
+            else Target("≤", _TARGET_EVALUATIONS, int(count), " evaluations"),
             rounds=rounds,
         )
     )

@@ -1,4 +1,4 @@
-"""What it costs to save every step."""
+"""The cost of saving every step."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""From a signal to the end of a command, at many times of it."""
+"""The time from a signal to the end of a command, for many times of the signal."""
 
 import os
 import signal

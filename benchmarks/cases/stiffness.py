@@ -1,4 +1,4 @@
-"""What almost no resistance and almost no viscosity cost, and a week of a market wherever it begins."""
+"""The cost of very small resistance and viscosity, and of a market week for any start hour."""
 
 import os
 from collections.abc import Callable

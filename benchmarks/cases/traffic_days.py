@@ -18,7 +18,7 @@ _STEP, _END = 0.25, 40.0
 _LAWS = (0.0, 1.0, 4.0, 16.0)
 _AT = ", ".join(f"{day:g}" for day in _LAWS)
 _GAP = 1e-6
-_MOST = 20_000
+_MAX_ITERATIONS = 20_000
 _PAIRS = 10_000
 
 
@@ -37,16 +37,16 @@ def run(full: bool) -> Section:
         if len(trips) > _PAIRS and not full:
             continue
         toll, distance = weights
-        begun = time.process_time()
+        started = time.process_time()
         model = Traffic(network, trips, toll_weight=toll, distance_weight=distance, gap=_GAP)
-        generated = time.process_time() - begun
+        generated = time.process_time() - started
         days = np.sort([*_LAWS, *(day + _STEP for day in _LAWS), _END])
-        begun = time.process_time()
+        started = time.process_time()
         solution = dvax.solve(
             model.problem, model.all_or_nothing(), 0.0, _END, ts=days, dt=_STEP, measure=True,
             vi_solver=model.vi_solver, constants=model.constants,
         )  # fmt: skip
-        spent = time.process_time() - begun
+        spent = time.process_time() - started
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
         assert solution.defect is not None and solution.law_defect is not None
         rows.append(
@@ -71,7 +71,7 @@ def _laws(
 ) -> None:
     """A law a step after each of the days, in both ways."""
     problem, newton = model.problem, model.vi_solver
-    first_order = Accelerated(max_steps=_MOST)
+    first_order = Accelerated(max_steps=_MAX_ITERATIONS)
     space = problem.spaces(solution.xs[0])[1]
 
     def solved(x, guess, tol, solver):
@@ -90,9 +90,9 @@ def _laws(
         found = {way: call(x, guess, tol) for way, call in ways.items()}
         for _ in range(rounds):
             for way, call in ways.items():
-                begun = time.perf_counter()
+                started = time.perf_counter()
                 jax.block_until_ready(call(x, guess, tol).y)
-                taken[way].append(time.perf_counter() - begun)
+                taken[way].append(time.perf_counter() - started)
         one, other = found["ours"], found["theirs"]
         counts = f"{int(one.iterations)} iterations against {int(other.iterations)}"
         section.comparisons.append(

@@ -29,7 +29,7 @@ _LONGEST = {False: 2.0, True: 10.0}
 """Seconds after which a tool is not asked for more digits, in a short and in a full run."""
 _ENOUGH = 20.0
 """Seconds of rounds at one level, after which three rounds are enough."""
-_MOST = 10**6
+_MAX_STEPS = 10**6
 _OURS = "dvax"
 _WANTED = {"scipy": 10.0, "Diffrax": 1.0, "Siconos": 10.0, "CasADi": 10.0}
 """How many times faster dvax is to be than each tool on a small system; on the finest field 5."""
@@ -90,10 +90,10 @@ def _race(section: Section, race: Race, entrants: dict[str, Entrant], full: bool
     tools: dict[str, Tool] = {}
     print(f"work and precision: {race.name}", file=sys.stderr, flush=True)
     for name, entrant in entrants.items():
-        begun = time.perf_counter()
+        started = time.perf_counter()
         entrant.solve(entrant.settings[0])
         tools[name] = Tool(
-            entrant, time.perf_counter() - begun, _errors(race, entrant, _LONGEST[full])
+            entrant, time.perf_counter() - started, _errors(race, entrant, _LONGEST[full])
         )
     rows = []
     for level in _LEVELS:
@@ -159,7 +159,7 @@ def _ours(race: Race, method: Any) -> Callable[[float], Any]:
     def solve(x0: Any, rtol: Any) -> Any:
         return dvax.solve(
             race.problem, x0, 0.0, race.end, rtol=rtol, atol=1e-3 * rtol, method=method,
-            max_steps=_MOST,
+            max_steps=_MAX_STEPS,
         ).xs[-1]  # fmt: skip
 
     x0 = jnp.asarray(race.x0)
@@ -172,7 +172,7 @@ def _diffrax(race: Race, solver: Any) -> Callable[[float], Any]:
     @jax.jit
     def solve(x0: Any, rtol: Any) -> Any:
         answer = diffrax.diffeqsolve(
-            term, solver, 0.0, race.end, None, x0, max_steps=_MOST, throw=False,
+            term, solver, 0.0, race.end, None, x0, max_steps=_MAX_STEPS, throw=False,
             stepsize_controller=diffrax.PIDController(rtol=rtol, atol=1e-3 * rtol),
             saveat=diffrax.SaveAt(t1=True),
         )  # fmt: skip
@@ -205,10 +205,10 @@ def _errors(race: Race, entrant: Entrant, longest: float) -> list[tuple[float, f
     """(setting, error), tightest last, until the error has twice been below the last level."""
     found: list[tuple[float, float]] = []
     for setting in entrant.settings:
-        begun = time.perf_counter()
+        started = time.perf_counter()
         found.append((setting, race.error(entrant.solve(setting))))
         last = [error for _, error in found[-2:]]
-        if max(last) < 0.5 * _LEVELS[-1] or time.perf_counter() - begun > longest:
+        if max(last) < 0.5 * _LEVELS[-1] or time.perf_counter() - started > longest:
             break
     return found
 

@@ -1,1 +1,1 @@
-"""What a user would write or take instead of dvax."""
+"""The tools and hand-written programs that a user would use instead of dvax."""

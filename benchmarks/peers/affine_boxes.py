@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-_LEAST, _MOST, _TURN = 0.5, 10.0, 5.0
+_LEAST_EIGENVALUE, _LARGEST_EIGENVALUE, _SKEW_NORM = 0.5, 10.0, 5.0
 
 
 class Affine(NamedTuple):
@@ -32,7 +32,9 @@ def _one(n: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     basis, _ = np.linalg.qr(rng.standard_normal((n, n)))
     skew = rng.standard_normal((n, n))
     skew = skew - skew.T
-    M = (basis * np.linspace(_LEAST, _MOST, n)) @ basis.T + skew * _TURN / np.linalg.norm(skew, 2)
+    M = (
+        basis * np.linspace(_LEAST_EIGENVALUE, _LARGEST_EIGENVALUE, n)
+    ) @ basis.T + skew * _SKEW_NORM / np.linalg.norm(skew, 2)
     y = rng.uniform(-1.0, 1.0, n)
     where = rng.integers(0, 3, n)
     lower = np.where(where == 0, y, y - rng.uniform(0.1, 1.0, n))

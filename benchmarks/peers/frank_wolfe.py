@@ -60,7 +60,7 @@ def frank_wolfe(
     network: Network, trips: Trips, charge: np.ndarray, gaps: list[float], longest: float
 ) -> tuple[dict[float, float], np.ndarray]:
     """(seconds until each relative gap, those reached within `longest` seconds; the link flows)."""
-    begun = time.perf_counter()
+    started = time.perf_counter()
     scale = network.free_flow_time * network.b / network.capacity**network.power
     p, free = network.power, network.free_flow_time + charge
     steep = np.where(p > 0, scale * p, 0.0)
@@ -75,13 +75,13 @@ def frank_wolfe(
     v = load(cost(np.zeros(len(network))))[1]
     targets: list[np.ndarray] = []
     length = 0.0
-    while time.perf_counter() - begun < longest:
+    while time.perf_counter() - started < longest:
         c, D = cost(v), slope(v)
         least, y = load(c)
         gap = (float(v @ c) - least) / float(v @ c)
         for goal in gaps:
             if gap <= goal:
-                reached.setdefault(goal, time.perf_counter() - begun)
+                reached.setdefault(goal, time.perf_counter() - started)
         if len(reached) == len(gaps):
             break
         towards = y - v
@@ -118,8 +118,8 @@ def _exact(cost, slope, v: np.ndarray, dv: np.ndarray) -> float:
         if alpha == 1.0 and rise <= 0:
             return 1.0
         low, high = (low, alpha) if rise > 0 else (alpha, high)
-        bend = float(slope(at) @ (dv * dv))
-        new = alpha - rise / bend if bend > 0 else low
+        curvature = float(slope(at) @ (dv * dv))
+        new = alpha - rise / curvature if curvature > 0 else low
         new = new if low < new < high else 0.5 * (low + high)
         if abs(new - alpha) <= 1e-10 * alpha:
             return new

@@ -1,11 +1,11 @@
-"""The least that can be written by hand: one `lax.fori_loop` with ETD2RK and the clip in its body.
+"""The minimal hand-written program: one `lax.fori_loop` with ETD2RK and the clip in its body.
 
     u(x) = clip(β (g − b_x x)/(1 + b_u), 0, κ₀)/β,      f̃(x) = ℓ − d_x x − d_u u(x)
     a = e^z x + hφ₁(z) f̃(x),      x ← a + hφ₂(z) (f̃(a) − f̃(x)),      z = −αh
 
-No saving but in `saved`, no statistics, no check for NaN, and a loop count that nobody has to find
-out. For the reverse mode it is a `lax.scan`, since a `fori_loop` of an unknown count has none; all its
-states are kept.
+It saves states in `saved` only, has no statistics and no check for NaN, and its loop count is given.
+The reverse mode uses a `lax.scan` that keeps all states, since a `fori_loop` with an unknown count has
+no reverse mode.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Siconos from here: a process of the Python that has it, spoken to line by line."""
+"""A client for Siconos: it starts the Python that has Siconos, and exchanges lines with it."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""What a call hands to its compiled loop, and what it gives back of it."""
+"""The arguments and results of `dvax.solve` around its compiled loop."""
 
 import equinox as eqx
 import jax
@@ -20,14 +20,14 @@ def problem(f):
     )
 
 
-def test_what_was_asked_is_not_copied():
+def test_solution_holds_the_given_problem_and_args_without_copies():
     case = c1()
     sol = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, dt=0.1)
     assert sol.setup.problem is case.problem
     assert sol.setup.args is case.args
 
 
-def test_whole_numbers_for_times_and_steps_are_the_same_run():
+def test_integer_times_and_steps_give_the_same_run_as_floats():
     case = c1()
     whole = dvax.solve(case.problem, -1.0, 0, 2, args=case.args, dt=1)
     point = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, dt=1.0)
@@ -35,7 +35,7 @@ def test_whole_numbers_for_times_and_steps_are_the_same_run():
     assert int(whole.stats["steps"]) == 2
 
 
-def test_integers_and_flags_in_args_stay_python_and_numbers_become_arrays_everywhere():
+def test_args_keep_python_integers_and_flags_and_convert_floats_to_arrays():
     seen = []
 
     def f(t, x, u, args):
@@ -55,7 +55,7 @@ def test_integers_and_flags_in_args_stay_python_and_numbers_become_arrays_everyw
     assert abs(float(off.xs[0] - sol.xs[-1])) > 0.1
 
 
-def test_a_check_within_f_is_quoted():
+def test_error_if_inside_f_is_raised_with_its_message():
     def f(t, x, u, args):
         return eqx.error_if(3.0 - 0.5 * x - u, x > 1.0, "x left the range of the table")
 
@@ -64,7 +64,8 @@ def test_a_check_within_f_is_quoted():
 
 
 @pytest.mark.parametrize("steps", [dict(dt=0.1), dict(rtol=1e-6)], ids=["fixed", "adaptive"])
-def test_a_law_may_tell_what_it_is_asked(steps):
+def test_h_may_contain_a_debug_callback(steps):
+    """A callback inside h is called, and does not change the solution."""
     told = []
 
     def h(t, x, u, args):
@@ -78,7 +79,7 @@ def test_a_law_may_tell_what_it_is_asked(steps):
     assert told and abs(float(found - want)) < 1e-5
 
 
-def test_the_law_at_the_saved_states_is_certified_in_a_large_state_as_at_a_point():
+def test_saved_responses_of_a_field_are_certified_like_those_of_points():
     case = c1()
     x0 = np.linspace(-1.0, 3.0, 5000)
     field = dvax.solve(case.problem, x0, 0.0, 2.0, args=case.args, ts=[1.0, 2.0], dt=0.01)
@@ -88,7 +89,7 @@ def test_the_law_at_the_saved_states_is_certified_in_a_large_state_as_at_a_point
     assert np.all(np.asarray(field.law_residual) <= 1e-12)
 
 
-def test_a_flag_and_a_number_that_compare_equal_are_two_programs():
+def test_args_with_true_and_1_compile_to_different_programs():
     def f(t, x, u, args):
         return (100.0 if args["on"] is True else 3.0) - 0.5 * x - u
 
@@ -101,7 +102,7 @@ def test_a_flag_and_a_number_that_compare_equal_are_two_programs():
     assert flag > 10.0 * number and run(1) == number
 
 
-def test_a_parameter_that_cannot_be_compiled_in_is_named():
+def test_unhashable_args_raise_an_error_that_names_them():
     system = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
         f=lambda t, x, u, args: -u, h=lambda t, x, u, args: x - u,
@@ -111,7 +112,7 @@ def test_a_parameter_that_cannot_be_compiled_in_is_named():
 
 
 @pytest.mark.parametrize("steps", [dict(rtol=1e-3, atol=1e-3), dict(dt=0.1, measure=True)])
-def test_single_precision_is_kept_from_end_to_end(steps):
+def test_solve_keeps_single_precision(steps):
     one = jnp.float32
     system = dvax.Problem(
         A=dvax.generators.Scalar(one(-1.0)), P=dvax.operators.Scaling(one(1.0)),
@@ -124,7 +125,7 @@ def test_single_precision_is_kept_from_end_to_end(steps):
 
 
 @pytest.mark.parametrize("steps", [{"rtol": 1e-6}, {"dt": 0.01}], ids=["adaptive", "fixed"])
-def test_progress_is_shown_when_asked_and_changes_nothing(steps, capfd):
+def test_progress_output_appears_on_request_and_does_not_change_the_solution(steps, capfd):
     case = c1()
     silent = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, **steps)
     assert "%" not in "".join(capfd.readouterr())
@@ -139,7 +140,7 @@ def test_progress_is_shown_when_asked_and_changes_nothing(steps, capfd):
 @pytest.mark.parametrize(
     ("method", "a_step"), [(dvax.ETD1(), 1), (dvax.ETD2RK(), 2), (dvax.DormandPrince(), 7)]
 )
-def test_evaluations_are_those_of_the_stages(method, a_step):
+def test_stats_count_the_evaluations_of_all_stages(method, a_step):
     case = c1()
     sol = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, dt=0.1, method=method)
     assert int(sol.stats["evaluations"]) == 20 * a_step
@@ -151,7 +152,7 @@ def test_evaluations_are_those_of_the_stages(method, a_step):
     assert int(sol.stats["evaluations"]) == 20 * (a_step + samples) + 1
 
 
-def test_a_law_that_is_iterated_is_evaluated_more_often():
+def test_stats_count_the_evaluations_of_an_iterated_law():
     case = c1()
     run = dict(args=case.args, dt=0.1)
     iterated = dvax.solve(
@@ -160,7 +161,7 @@ def test_a_law_that_is_iterated_is_evaluated_more_often():
     assert int(iterated.stats["evaluations"]) > 2 * 40
 
 
-def test_time_to_compile_is_told_from_time_to_run():
+def test_stats_separate_compile_time_and_run_time():
     f = lambda t, x, u, args: 2.5 - 0.5 * x - u  # noqa: E731
     fresh = problem(f)
     first, again = (dvax.solve(fresh, -1.0, 0.0, 2.0, rtol=1e-5).stats for _ in range(2))

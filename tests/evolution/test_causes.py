@@ -49,7 +49,7 @@ ESCAPES = [
     ("p", "c", "method"),
     mostly_thorough(ESCAPES, [(2.0, 1.0, dvax.DormandPrince()), (3.0, 20.0, dvax.ETD2RK())]),
 )
-def test_a_finite_time_escape_is_told_with_its_time(p, c, method):
+def test_cause_finite_time_escape_names_the_time(p, c, method):
     problem = make(lambda t, x, u, args: c * (1.0 + jnp.abs(x) ** p))
     escape = math.pi / (c * p * math.sin(math.pi / p))
     error = failure(problem, t1=3.0 * escape, method=method)
@@ -63,7 +63,7 @@ def test_a_finite_time_escape_is_told_with_its_time(p, c, method):
     assert dvax.solve(problem, 0.0, 0.0, end, method=dvax.DormandPrince(), **loose).xs.shape == (1,)
 
 
-def test_growth_that_is_no_escape_is_not_called_one():
+def test_cause_exponential_growth_is_not_reported_as_escape():
     error = failure(make(lambda t, x, u, args: x), x0=1.0, t1=1e4, rtol=1e-3)
     assert "escape" not in str(error) and "exponential growth" in error.cause
     error = failure(make(lambda t, x, u, args: t - x), x0=1.0, t1=50.0, max_steps=9)
@@ -78,7 +78,7 @@ def test_growth_that_is_no_escape_is_not_called_one():
 
 
 @pytest.mark.parametrize("most", [1, 20, 60, 100])
-def test_a_circuit_that_needs_more_steps_is_told_that_and_nothing_else(most):
+def test_cause_too_few_steps_of_a_circuit_is_the_only_one_reported(most):
     # A multiplier with 20 periods of its source: with 20 steps not even these have a piece each.
     circuit = Circuit(multiplier(4, 1e-6, 1e-7, 1e4, 325.0, 1e6, 1e-6, 10.0))
     with pytest.raises(dvax.SolveError) as caught:
@@ -96,7 +96,7 @@ def test_a_circuit_that_needs_more_steps_is_told_that_and_nothing_else(most):
         [("f", 0.37, 2), ("K", 1.0, 0)],
     ),
 )
-def test_the_function_the_time_and_the_component_of_a_bad_value_are_told(name, at, k):
+def test_cause_nonfinite_value_names_function_time_and_component(name, at, k):
     def spoil(which, t):
         bad = (jnp.arange(3) == k) & (t >= at) & (which == name)
         return jnp.where(bad, jnp.nan, 0.0)
@@ -112,7 +112,7 @@ def test_the_function_the_time_and_the_component_of_a_bad_value_are_told(name, a
     assert name == "K" or f"({k},)" in error.cause  # the box is refused as a whole
 
 
-def test_a_response_that_is_not_finite_is_no_success_where_f_does_not_feel_it():
+def test_nonfinite_response_fails_even_if_f_does_not_depend_on_it():
     upper = jnp.array([1.0, jnp.nan])
     problem = make(
         lambda t, x, u, args: -x, K=lambda t, args: sets.Box(0.0, jnp.where(t < 1.5, 1.0, upper))
@@ -121,7 +121,7 @@ def test_a_response_that_is_not_finite_is_no_success_where_f_does_not_feel_it():
     assert "K is " in error.cause
 
 
-def test_a_state_that_leaves_the_domain_of_f_is_told_where_it_does():
+def test_cause_state_outside_the_domain_of_f_names_the_place():
     # x' = −1 from ½ under √x, with a part that is NaN below 0.
     problem = make(lambda t, x, u, args: -1.0 + 0.0 * jnp.log(x))
     error = failure(problem, x0=0.5, t1=2.0)
@@ -131,7 +131,7 @@ def test_a_state_that_leaves_the_domain_of_f_is_told_where_it_does():
     )
 
 
-def test_a_law_that_is_not_monotone_is_told_with_its_eigenvalue():
+def test_cause_nonmonotone_law_names_the_eigenvalue():
     gain = jnp.array([1.0, 3.0, 0.5])
     problem = make(lambda t, x, u, args: -u, h=lambda t, x, u, args: 1.0 - x + gain * u)
     error = failure(problem, x0=jnp.zeros(3), t1=1.0)
@@ -139,7 +139,7 @@ def test_a_law_that_is_not_monotone_is_told_with_its_eigenvalue():
 
 
 @pytest.mark.parametrize("rate", mostly_thorough([1e4, 1e5, 1e7, 1e9], [1e7]))
-def test_stiffness_is_told_and_the_method_that_is_named_helps(rate):
+def test_cause_stiffness_suggests_a_method_that_succeeds(rate):
     problem = make(lambda t, x, u, args: -rate * (x - jnp.cos(t)))
     error = failure(problem, t1=1.0, method=dvax.DormandPrince(), max_steps=4000)
     assert "stiff" in error.cause
@@ -149,7 +149,7 @@ def test_stiffness_is_told_and_the_method_that_is_named_helps(rate):
     assert float(found.xs[-1]) == pytest.approx(math.cos(1.0), abs=1e-3)
 
 
-def test_a_number_of_steps_that_is_told_is_enough():
+def test_suggested_max_steps_suffices():
     problem = make(lambda t, x, u, args: jnp.cos(5.0 * t) - x)
     error = failure(problem, t1=20.0, max_steps=300, rtol=1e-6)
     enough = int(fixes(error)["max_steps"])
@@ -157,7 +157,7 @@ def test_a_number_of_steps_that_is_told_is_enough():
     dvax.solve(problem, 0.0, 0.0, 20.0, max_steps=enough, rtol=1e-6)
 
 
-def test_a_tolerance_below_rounding_is_told_and_the_one_that_is_named_is_reached():
+def test_cause_tolerance_below_rounding_suggests_an_attainable_tolerance():
     problem = make(lambda t, x, u, args: jnp.sin(t) - x)
     with pytest.warns(UserWarning, match="cannot be reached"):
         error = failure(problem, x0=1.0, t1=1.0, rtol=1e-20, atol=0.0, max_steps=10_000)
@@ -171,7 +171,7 @@ def test_a_tolerance_below_rounding_is_told_and_the_one_that_is_named_is_reached
 
 
 @pytest.mark.parametrize("t0", [1e15, -1e15])
-def test_times_that_are_too_large_for_their_rounding_are_told(t0):
+def test_cause_rounding_of_large_times_is_reported(t0):
     problem = make(lambda t, x, u, args: -x, h=lambda t, x, u, args: 1.0 - 2.0 * x - u)
     error = failure(problem, x0=1.0, t0=t0, t1=t0 + 100.0)
     assert "rounding of t" in error.cause and "Count time from" in str(error)
@@ -182,12 +182,12 @@ RESTING = make(lambda t, x, u, args: -1e-20 * x)  # one program for all spans
 
 @pytest.mark.parametrize("t0", [1.0, -1.0, 4036.4, 1e15])
 @pytest.mark.parametrize("ulps", mostly_thorough([1, 2, 3, 8, 64, 300, 512], [1, 64]))
-def test_spans_of_a_few_roundings_have_an_answer(t0, ulps):
+def test_solve_over_a_span_of_a_few_roundings_succeeds(t0, ulps):
     t1 = t0 + ulps * float(np.spacing(abs(t0)))
     assert float(dvax.solve(RESTING, 1.0, t0, t1).xs[-1]) == pytest.approx(1.0, abs=1e-14)
 
 
-def test_u_takes_the_shape_that_P_or_K_fixes():
+def test_shape_of_u_follows_from_P_or_K():
     # x ∈ ℝ², u ∈ ℝ³, given by K alone, by P alone, by both, and by the parts of a product.
     options = [
         (operators.Scaling(1.0), sets.Box(jnp.zeros(3), jnp.ones(3))),
@@ -213,7 +213,7 @@ def test_u_takes_the_shape_that_P_or_K_fixes():
     np.testing.assert_allclose(second, 1.0, atol=1e-9)
 
 
-def test_where_the_state_fits_u_has_its_shape():
+def test_shape_of_u_is_that_of_the_state_if_both_fit():
     # A matrix of the size of x, and bounds that are numbers, leave u what x is.
     problem = make(lambda t, x, u, args: -u, h=lambda t, x, u, args: x)
     assert problem.zero_control(jnp.zeros(4)).shape == (4,)
@@ -244,14 +244,14 @@ EMPTIED = [
         [(EMPTIED[0], dvax.ETD2RK())],
     ),
 )
-def test_a_set_that_becomes_empty_is_told_with_its_time(K, method):
+def test_cause_empty_set_names_the_time(K, method):
     error = failure(make(lambda t, x, u, args: u - x, K=K), x0=0.1, t1=1.0, method=method)
     # Of no value that is not finite: the set is refused, by its own words.
     assert str(error).startswith("K is refused at t = 0.5")
     assert "empty" in error.cause and "Check K there." in str(error)
 
 
-def test_what_is_infinite_at_the_start_is_said_so():
+def test_cause_nonfinite_value_at_the_start_is_reported():
     error = failure(make(lambda t, x, u, args: 1.0 / t), x0=0.1, t1=1.0)
     assert "next to t = 0 " in error.cause or "f is inf" in error.cause
     assert "t1" not in fixes(error)
@@ -277,7 +277,7 @@ METHODS = {
         [(n, m) for n in RELAYS for m in METHODS], [("one", "ETD2RK"), ("friction", "ETD4RK")]
     ),
 )
-def test_a_switch_of_x_is_told_and_can_be_written_as_a_law(name, method):
+def test_cause_relay_in_x_is_reported_and_can_be_written_as_a_law(name, method):
     rate, g, x0, when = RELAYS[name]
     problem = make(lambda t, x, u, args: rate(x, jnp.sign(g(x))))
     error = failure(problem, x0=jnp.asarray(x0), t1=20.0, method=METHODS[method])

@@ -1,4 +1,4 @@
-"""C1 to C4 of `tests.closed_forms`, solved to the accuracy that was asked for."""
+"""C1 to C4 of `tests.closed_forms`, solved to the requested accuracy."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,7 @@ import dvax
 
 
 @pytest.mark.parametrize("name", mostly_thorough(ALL, ["C1", "C4"]))
-def test_adaptive_steps_reach_nine_digits_at_the_end(name):
+def test_adaptive_solve_of_closed_forms_reaches_nine_digits(name):
     case = ALL[name]()
     sol = dvax.solve(
         case.problem, jnp.asarray(case.x0), 0.0, case.t1, args=case.args, rtol=1e-10, atol=1e-10
@@ -32,7 +32,7 @@ PAIRS = [(name, method) for name in ALL for method in METHODS]
     ("name", "method"),
     mostly_thorough(PAIRS, [("C1", "DormandPrince"), ("C3", "ETD4RK")]),
 )
-def test_no_error_is_ten_times_its_tolerance(name, method):
+def test_error_of_closed_forms_is_below_ten_tolerances(name, method):
     case, ts = ALL[name](), np.linspace(0.0, ALL[name]().t1, 9)
     exact = np.array([case.exact(t)[0] for t in ts])
     for rtol in (1e-4, 1e-7, 1e-10):
@@ -46,7 +46,7 @@ def test_no_error_is_ten_times_its_tolerance(name, method):
 
 
 @pytest.mark.parametrize("name", mostly_thorough(ALL, ["C3"]))
-def test_every_saved_time_is_right_and_every_saved_response_certified(name):
+def test_saved_states_of_closed_forms_are_accurate_and_responses_certified(name):
     case = ALL[name]()
     ts = np.linspace(0.0, case.t1, 33)
     sol = dvax.solve(
@@ -64,7 +64,7 @@ def test_every_saved_time_is_right_and_every_saved_response_certified(name):
         np.testing.assert_allclose(np.asarray(P.apply(u)), np.asarray(y), atol=1e-13)
 
 
-def test_the_closed_forms_agree_with_a_general_solver():
+def test_closed_forms_agree_with_a_general_ode_solver():
     # The oracles are checked too: DOP853 on the reduced equations, with the law written by hand.
     clip = lambda v, a, b: min(max(v, a), b)  # noqa: E731
     runs = {
@@ -97,7 +97,7 @@ def test_the_closed_forms_agree_with_a_general_solver():
     np.testing.assert_allclose(out.y[:, -1], ALL["C2"]().exact(4.0)[0], atol=1e-10)
 
 
-def test_the_published_figures_of_c1():
+def test_c1_has_the_published_figures():
     assert C1_KINKS == pytest.approx((0.31333575283049, 0.52405678414614), abs=1e-13)
     assert c1_solution(2.0)[0] == pytest.approx(1.8360919559905713, abs=1e-14)
     assert c1_derivatives()[0] == pytest.approx(0.06146551650353571, abs=1e-14)

@@ -1,4 +1,4 @@
-"""The measured defect beside its integral by quadrature along the dense output."""
+"""The measured defect against its integral by quadrature along the dense output."""
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +24,8 @@ PROBLEM = dvax.Problem(
 
 
 @pytest.mark.parametrize("name", mostly_thorough(METHODS, ["ETD2RK", "ExpRosenbrock"]))
-def test_a_smooth_defect_is_seen_in_its_size(name):
-    """Random smooth systems, from 20 to 200 steps: no method's defect hides at the sampled places."""
+def test_sampled_defect_of_smooth_systems_has_the_size_of_its_integral(name):
+    """For random smooth systems in 20 to 200 steps, the samples do not miss the defect."""
     rng = np.random.default_rng(5)
     method = METHODS[name]
     flow = None
@@ -51,9 +51,9 @@ def test_a_smooth_defect_is_seen_in_its_size(name):
 
 
 def bent(t, x, u, p):
-    """x₁ is the time, and f kinks or jumps in it: no step ends there by itself."""
+    """The right-hand side whose x₁ is the time, with a kink or a jump in x₁: no step ends there."""
     past = x[0] - p["at"]
-    kink = p["bend"] * jnp.maximum(past, 0) + p["jump"] * jnp.heaviside(past, 0.0)
+    kink = p["slope"] * jnp.maximum(past, 0) + p["jump"] * jnp.heaviside(past, 0.0)
     return jnp.stack([jnp.ones_like(past), kink])
 
 
@@ -64,8 +64,8 @@ CLOCK = dvax.Problem(
 
 
 @pytest.mark.parametrize("name", mostly_thorough(METHODS, ["ETD2RK", "ExpRosenbrock"]))
-def test_a_kink_or_a_jump_within_a_step_hides_nothing(name):
-    """One step over it, beside the integral of its defect."""
+def test_sampled_defect_covers_a_kink_or_a_jump_within_a_step(name):
+    """For one step over it, the charge covers the integral of the defect."""
     places = (jnp.arange(2000.0) + 0.5) / 2000
 
     @jax.jit
@@ -83,6 +83,6 @@ def test_a_kink_or_a_jump_within_a_step_hides_nothing(name):
         return sol.defect[-1], jnp.mean(jax.vmap(size)(places))
 
     for at in np.random.default_rng(2).uniform(0.0, 1.0, 60):
-        for bend, jump in ((1.0, 0.0), (0.0, 1.0)):
-            defect, integral = step({"at": at, "bend": bend, "jump": jump})
+        for slope, jump in ((1.0, 0.0), (0.0, 1.0)):
+            defect, integral = step({"at": at, "slope": slope, "jump": jump})
             assert integral > 0.0 and float(integral) <= float(defect) + 1e-3

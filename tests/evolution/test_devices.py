@@ -1,4 +1,4 @@
-"""Several devices share a field, or the runs of a batch, and nothing changes."""
+"""Sharding of a field, or of the runs of a batch, over several devices does not change the results."""
 
 import subprocess
 import sys
@@ -57,6 +57,6 @@ CASES = ["a field", "its gradient", "a batch", "a batch on each"]
 
 
 @pytest.mark.parametrize("case", mostly_thorough(CASES, ["a field", "a batch on each"]))
-def test_what_devices_share_is_what_one_computes(case):
+def test_sharded_solve_equals_the_solve_on_one_device(case):
     program = textwrap.dedent(PROGRAM).replace("CASE", repr(case))
     subprocess.run([sys.executable, "-c", program], check=True)

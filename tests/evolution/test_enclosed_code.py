@@ -1,4 +1,4 @@
-"""Code that enclosures have to read: it ends no run, and hides nothing from the guard."""
+"""Code in f, h and K that enclosures have to cover: runs succeed, and pulses are not missed."""
 
 import itertools
 
@@ -51,7 +51,7 @@ CODE = {
 
 
 def by_hand(drive, end, breaks):
-    """x' = −x + clip(2 − x, −1, 1) + drive(t) from 0, piece by piece."""
+    """Solve x' = −x + clip(2 − x, −1, 1) + drive(t) from 0, piece by piece."""
     x, times = np.zeros(1), [0.0, *sorted({float(t) for t in breaks if 0 < t < end}), end]
     for a, b in itertools.pairwise(times):
         rate = lambda t, x: -x + np.clip(2 - x, -1, 1) + float(drive(t))  # noqa: E731
@@ -77,7 +77,7 @@ def driven(drive):
          ("tanh", "DormandPrince")],
     ),
 )  # fmt: skip
-def test_ordinary_code_in_f_is_solved(name, method):
+def test_solve_handles_common_jax_code_in_f(name, method):
     drive, plain, breaks = CODE[name]
     sol = dvax.solve(driven(drive), 0.0, 0.0, 9.7, method=METHODS[method], max_steps=200_000)
     assert abs(float(sol.xs[-1]) - by_hand(plain, 9.7, breaks)) <= 1e-6
@@ -99,7 +99,7 @@ PULSES = {
 
 
 def tent(lib, t, c, w=0.05):
-    """Of height 1 between c − w and c + w about, by a function that is not affine in t."""
+    """Return a tent of height 1 on about [c − w, c + w], by a function that is not affine in t."""
     return lib.maximum(0.0, 1.0 - lib.abs(t**2 - c**2) / (2 * c * w))
 
 
@@ -110,7 +110,7 @@ def tent(lib, t, c, w=0.05):
         [("after a start-up", "ExpRosenbrock"), ("beside a maximum", "DormandPrince")],
     ),
 )
-def test_a_pulse_is_not_hidden_by_what_is_larger(name, method):
+def test_pulse_beside_larger_data_is_not_missed(name, method):
     drive = PULSES[name]
     breaks = [1.0, *range(5, 40, 5), *(np.pi / 4 + np.pi * np.arange(12))]
     breaks += [np.sqrt(c * c + s * 2 * c * 0.05) for c in (30.0, 33.4) for s in (-1, 0, 1)]
@@ -122,7 +122,7 @@ def test_a_pulse_is_not_hidden_by_what_is_larger(name, method):
     assert abs(float(sol.xs[-1]) - truth) <= 1e-4
 
 
-def test_a_factor_that_is_zero_at_a_sample_hides_nothing():
+def test_pulse_with_a_factor_that_is_zero_at_a_sample_is_not_missed():
     c, w, d = 59.3, 0.15, 13.8
     problem = dvax.Problem(
         A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-1.0, 1.0),

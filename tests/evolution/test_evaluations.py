@@ -1,4 +1,4 @@
-"""Where the solver of an iterated law begins."""
+"""The initial guess of the solver of an iterated law."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,8 @@ from dvax.evolution.evaluations import _along_line
 from dvax.vi import SemismoothNewton
 
 
-def test_a_guess_lies_on_the_line_through_its_neighbours():
+def test_law_guess_interpolates_linearly_between_neighbouring_times():
+    """The guess is exact for affine functions between known times, and the nearest value outside."""
     # Of an affine function everything between two known times is exact; outside, the nearest is.
     value = lambda t: (np.array([2.0, -1.0]) * t, 3.0 - t)  # noqa: E731
     rng = np.random.default_rng(1)
@@ -26,13 +27,13 @@ def test_a_guess_lies_on_the_line_through_its_neighbours():
                 np.testing.assert_allclose(one, other, rtol=1e-15, atol=1e-15)
 
 
-def test_the_latest_of_several_at_one_time_is_taken():
+def test_law_guess_takes_the_latest_of_several_values_at_one_time():
     times = jnp.array([0.0, 1.0, 1.0, 1.0])
     rows = jnp.array([0.0, 1.0, 2.0, jnp.nan])
     assert float(_along_line(times, rows, 3)) == 2.0
 
 
-def test_responses_at_saved_times_are_those_of_the_law_from_anywhere():
+def test_responses_at_saved_times_do_not_depend_on_the_guess():
     rng = np.random.default_rng(0)
     M = rng.normal(size=(8, 8))
     M, q = jnp.asarray(M @ M.T / 8 + 0.5 * np.eye(8)), jnp.asarray(rng.normal(size=8))

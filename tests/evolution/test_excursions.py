@@ -1,4 +1,4 @@
-"""What moves between two samples of a step is seen: dips of a bound, pulses, periods, jumps."""
+"""Changes between two samples of a step are not missed: dips of a bound, pulses, periods, jumps."""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ RTOL = 1e-6
 
 
 def end_of(problem, t1, method):
-    """x(t1) from 0 as a function of args, compiled once."""
+    """Return x(t1) from 0 as a function of args, compiled once."""
     return jax.jit(
         lambda a: dvax.solve(
             problem, jnp.zeros(()), 0.0, t1, a, rtol=RTOL, atol=1e-9, method=method, throw=False
@@ -35,7 +35,7 @@ ALL = [(dip, method) for dip in DIPS for method in METHODS]
 @pytest.mark.parametrize(
     ("dip", "method"), mostly_thorough(ALL, [("vee", "DormandPrince"), ("bell", "ExpRosenbrock")])
 )
-def test_a_bound_that_dips_within_a_step_is_met(dip, method):
+def test_dip_of_a_bound_within_a_step_is_resolved(dip, method):
     """x' = u − 0.1x, u = min(0.05, k(t)): by quadrature of e^{−0.1(2 − s)} min(0.05, k(s))."""
     k = DIPS[dip]
     problem = dvax.Problem(
@@ -52,7 +52,7 @@ def test_a_bound_that_dips_within_a_step_is_met(dip, method):
 
 @pytest.mark.parametrize("kind", ["where", "floor"])
 @pytest.mark.parametrize("method", mostly_thorough(METHODS, ["DormandPrince"]))
-def test_no_jump_ends_a_run_wherever_it_lies(kind, method):
+def test_hidden_jump_does_not_end_a_run(kind, method):
     """x' = −x ± 1 with the sign changing at a; `floor` hides the time of the jump from the code."""
     before = {
         "where": lambda t, a: jnp.where(t < a, 1.0, -1.0),
@@ -70,7 +70,7 @@ def test_no_jump_ends_a_run_wherever_it_lies(kind, method):
 
 @pytest.mark.parametrize("method", mostly_thorough(METHODS, ["DormandPrince"]))
 @pytest.mark.parametrize("start", [0.0, pytest.param(-3e5, marks=pytest.mark.thorough)])
-def test_hundreds_of_jumps_end_no_run_at_a_tight_tolerance(method, start):
+def test_hundreds_of_hidden_jumps_do_not_end_a_run_at_a_tight_tolerance(method, start):
     """x' = −x ± 1, the sign changing with `floor` every 1/151; x in closed form at the last change."""
     every = 1.0 / 151.0
     problem = dvax.Problem(
@@ -97,7 +97,7 @@ def test_hundreds_of_jumps_end_no_run_at_a_tight_tolerance(method, start):
         [(200.0, "DormandPrince")],
     ),
 )
-def test_data_of_many_whole_periods_are_not_taken_for_constant(span, method):
+def test_periodic_data_over_whole_periods_are_not_taken_for_constant(span, method):
     """x' = −x + u, u = sin²(2πt) within a ball; the span is a whole number of periods."""
     problem = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Ball(0.0, 5.0),

@@ -1,4 +1,4 @@
-"""When something breaks: what, when, where, and what was computed before stays readable."""
+"""Failed runs: cause, time and place are reported, and earlier results are kept."""
 
 import itertools
 
@@ -34,7 +34,7 @@ def system(broken):
     ("name", "dt"),
     mostly_thorough(itertools.product("fhK", (None, 0.02)), [("f", 0.02), ("K", None)]),
 )
-def test_nan_stops_the_run_and_the_function_the_time_and_the_component_are_named(name, dt):
+def test_nan_ends_the_run_and_the_error_names_function_time_and_component(name, dt):
     x0, ts = jnp.array([0.5, 2.0, -1.0]), np.linspace(0, 2, 20)  # none of them 0.7 itself
     with pytest.raises(dvax.SolveError) as caught:
         dvax.solve(system(name), x0, 0.0, 2.0, ts=ts, dt=dt, rtol=1e-5)
@@ -53,7 +53,7 @@ def test_nan_stops_the_run_and_the_function_the_time_and_the_component_are_named
 
 
 @pytest.mark.parametrize("dt", [0.02, 0.1])
-def test_what_was_saved_at_the_end_of_steps_before_a_failure_is_kept(dt):
+def test_saved_states_before_a_failure_are_kept(dt):
     ts = np.linspace(0.0, 2.0, 21)
     sol = dvax.solve(system("f"), jnp.array([0.5, 0.8, 0.9]), 0.0, 2.0, ts=ts, dt=dt, throw=False)
     assert sol.result == RESULTS.nonfinite
@@ -61,21 +61,21 @@ def test_what_was_saved_at_the_end_of_steps_before_a_failure_is_kept(dt):
     np.testing.assert_allclose(sol.xs[:, 2], 0.9 * np.exp(-2 * ts[:8]), atol=1e-2)
 
 
-def test_without_throw_the_result_says_it():
+def test_throw_false_returns_the_failure_as_result():
     sol = dvax.solve(system("f"), jnp.zeros(3), 0.0, 2.0, rtol=1e-3, throw=False)
     assert sol.result == RESULTS.nonfinite
     with pytest.raises(dvax.SolveError, match="NaN"):
         sol.raise_if_failed()
 
 
-def test_too_few_steps_is_a_failure_with_a_partial_result():
+def test_max_steps_failure_has_a_partial_result():
     with pytest.raises(dvax.SolveError, match="max_steps") as caught:
         dvax.solve(system("none"), jnp.ones(3), 0.0, 50.0, ts=[0.0, 1e-6, 50.0], max_steps=16)
     assert 0 < len(caught.value.solution.ts) < 3
 
 
 @pytest.mark.parametrize("gain", mostly_thorough([3.0, 1.0], [3.0]))
-def test_a_law_that_has_no_solution_is_not_called_solved(gain):
+def test_law_without_a_solution_fails(gain):
     # F(y) = (1 − gain) y + …: not strongly pseudomonotone, so the closed form proj(−c/a) means
     # nothing.
     for set_ in (dvax.sets.Box(0.0, 0.5), dvax.sets.Ball(0.0, 0.5)):
@@ -90,7 +90,7 @@ def test_a_law_that_has_no_solution_is_not_called_solved(gain):
             dvax.solve(problem, jnp.zeros(2), 0.0, 1.0)
 
 
-def test_a_moving_set_that_becomes_empty_stops_the_run():
+def test_moving_set_that_becomes_empty_ends_the_run():
     problem = dvax.Problem(
         A=dvax.generators.Scalar(-1.0),
         P=dvax.operators.Scaling(1.0),
@@ -105,7 +105,7 @@ def test_a_moving_set_that_becomes_empty_stops_the_run():
 
 
 def refused_when_traced(method):
-    """What each traced number that breaks a rule is given to."""
+    """The calls that take each invalid traced number."""
     run = lambda t1=1.0, **options: dvax.solve(  # noqa: E731
         system(""), jnp.array([0.5, 2.0, -1.0]), 0.0, t1, method=method, **options
     )
@@ -135,7 +135,8 @@ TRACED = [
 @pytest.mark.parametrize(
     ("name", "method"), mostly_thorough(TRACED, [("t1 before t0", "ETD2RK"), ("dt", "ETD2RK")])
 )
-def test_traced_numbers_that_break_a_rule_give_no_answer(name, method):
+def test_traced_invalid_numbers_return_nan_and_invalid_number(name, method):
+    """Invalid traced arguments give times ∞, states NaN and RESULTS.invalid_number."""
     call, value = refused_when_traced(getattr(dvax, method)())[name]
 
     def found(v):

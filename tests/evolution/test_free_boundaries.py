@@ -1,4 +1,4 @@
-"""A field whose free boundaries move: orders, tolerances, and where the boundaries are."""
+"""A field with moving free boundaries: orders, tolerances, and the position of the boundaries."""
 
 import functools
 
@@ -37,7 +37,8 @@ def disturbed():
     return x0, ts, exact.y.T
 
 
-def test_smooth_as_it_is_along_its_closed_form_the_rod_is_solved_exactly():
+def test_rod_with_free_boundaries_is_solved_exactly_along_its_closed_form():
+    """The reduced map is zero along the closed form, so that only rounding remains."""
     # x = e^{tA}x₀ there, and f̃ is zero: what is left is rounding, whatever the kinks beside it.
     case = c7(N)
     sol = dvax.solve(case.problem, case.x0, 0.0, 1.0, dt=0.05)
@@ -45,7 +46,7 @@ def test_smooth_as_it_is_along_its_closed_form_the_rod_is_solved_exactly():
 
 
 def errors(method, counts):
-    """The largest one at the saved times, for so many steps."""
+    """Return the largest error at the saved times, for each number of steps."""
     case, (x0, ts, exact) = c7(N), disturbed()
     runs = (
         dvax.solve(case.problem, x0, 0.0, 1.0, ts=ts, dt=1.0 / k, method=method) for k in counts
@@ -57,13 +58,13 @@ def errors(method, counts):
     ("method", "order"),
     [pytest.param(dvax.ETD1(), 1.0, marks=pytest.mark.thorough), (dvax.ETD2RK(), 2.0)],
 )
-def test_orders_over_moving_boundaries(method, order):
+def test_order_of_convergence_over_moving_boundaries(method, order):
     counts = (10, 20, 40, 80, 160, 320, 640)
     slope = np.polyfit(np.log2(counts), np.log2(errors(method, counts)), 1)[0]
     assert abs(-slope - order) < 0.15
 
 
-def test_the_fourth_order_method_is_ahead_though_not_of_its_order():
+def test_etd4rk_is_more_accurate_than_etd2rk_over_moving_boundaries():
     counts = (10, 40, 160)
     second, fourth = (errors(method, counts) for method in (dvax.ETD2RK(), dvax.ETD4RK()))
     assert all(f < 0.5 * s for f, s in zip(fourth, second, strict=True))
@@ -78,14 +79,14 @@ def test_the_fourth_order_method_is_ahead_though_not_of_its_order():
         pytest.param(dvax.ETD4RK(), 1e-10, marks=pytest.mark.thorough),
     ],
 )
-def test_what_is_asked_is_what_comes_out(method, rtol):
+def test_error_over_moving_boundaries_is_below_twice_the_tolerance(method, rtol):
     case, (x0, ts, exact) = c7(N), disturbed()
     sol = dvax.solve(case.problem, x0, 0.0, 1.0, ts=ts, rtol=rtol, atol=1e-3 * rtol, method=method)
     # What the steps promise is twice the tolerance, relative to |x| ≤ 1.
     assert max(map(mean, np.asarray(sol.xs) - exact)) < 2.0 * rtol
 
 
-def test_the_boundaries_are_where_the_closed_form_says():
+def test_free_boundaries_agree_with_the_closed_form():
     case = c7(N)
     ts = np.array([0.0, 0.15, 0.3])
     sol = dvax.solve(case.problem, case.x0, 0.0, 0.3, ts=ts, rtol=1e-7)
@@ -101,7 +102,7 @@ def test_the_boundaries_are_where_the_closed_form_says():
 @pytest.mark.parametrize(
     "method", [pytest.param(dvax.ETD1(), marks=pytest.mark.thorough), dvax.ETD2RK()]
 )
-def test_the_bound_holds_over_moving_boundaries(method):
+def test_error_bound_holds_over_moving_boundaries(method):
     case = c7(N)
     ts = np.linspace(0.0, 1.0, 11)
     sol = dvax.solve(

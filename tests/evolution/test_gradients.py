@@ -1,4 +1,4 @@
-"""Derivatives of the solution map: C1's are known in closed form."""
+"""Derivatives of the solution map against the closed form of C1."""
 
 import jax
 import jax.numpy as jnp
@@ -18,13 +18,13 @@ def end(x0, ell, adjoint):
     return sol.xs[-1]
 
 
-def test_reverse_derivatives_of_c1():
+def test_reverse_derivatives_of_c1_agree_with_the_closed_form():
     found = jax.grad(end, argnums=(0, 1))(-1.0, 3.0, "reverse")
     for value, exact in zip(found, c1_derivatives(), strict=True):
         assert float(value) == pytest.approx(exact, abs=1e-8)
 
 
-def test_forward_derivatives_of_c1():
+def test_forward_derivatives_of_c1_agree_with_the_closed_form():
     for k, exact in enumerate(c1_derivatives()):
         tangent = (1.0, 0.0) if k == 0 else (0.0, 1.0)
         _, found = jax.jvp(lambda a, b: end(a, b, "forward"), (-1.0, 3.0), tangent)
@@ -32,7 +32,7 @@ def test_forward_derivatives_of_c1():
 
 
 @pytest.mark.parametrize("adjoint", ["reverse", "forward"])
-def test_fixed_steps_differentiate_to_first_order_in_the_step_across_kinks(adjoint):
+def test_derivative_with_fixed_steps_is_of_first_order_across_kinks(adjoint):
     def last(x0, dt):
         return dvax.solve(CASE.problem, x0, 0.0, 2.0, args=CASE.args, dt=dt, adjoint=adjoint).xs[-1]
 
@@ -42,7 +42,7 @@ def test_fixed_steps_differentiate_to_first_order_in_the_step_across_kinks(adjoi
         assert error < 0.05 * dt
 
 
-def test_the_response_has_a_derivative_too():
+def test_response_is_differentiable():
     # In contact u = ½ − x, so du/dx0 = −dx/dx0; dx/dx0 there is e^{−1.5 t₁} e^{−(t−t₁)/2}.
     t = 0.45
     assert C1_KINKS[0] < t < C1_KINKS[1]
@@ -56,7 +56,7 @@ def test_the_response_has_a_derivative_too():
     np.testing.assert_allclose(np.asarray(found), [exact, -exact], atol=1e-7)
 
 
-def test_the_wrong_adjoint_is_an_error_that_names_the_right_one():
+def test_wrong_adjoint_raises_an_error_that_names_the_right_one():
     with pytest.raises(dvax.DifferentiationError, match='adjoint="forward"'):
         jax.jvp(lambda x: end(x, 3.0, "reverse"), (-1.0,), (1.0,))
     with pytest.raises(dvax.DifferentiationError, match='adjoint="reverse"'):

@@ -1,4 +1,4 @@
-"""The implicit fallback: Diffrax's accuracy on closed forms, and what it does not do, said at once."""
+"""`Implicit`: Diffrax's accuracy on closed forms, and errors for unsupported options."""
 
 import diffrax
 import jax
@@ -13,7 +13,7 @@ from dvax import generators, signals
 PLAIN = dvax.operators.Scaling(1.0)
 
 
-def test_the_contact_law_through_its_kinks():
+def test_implicit_solves_the_contact_law_across_kinks():
     case, ts = c1(), np.linspace(0.0, 2.0, 9)
     sol = dvax.solve(
         case.problem, case.x0, 0.0, 2.0, args=case.args, ts=ts, rtol=1e-8, method=dvax.Implicit(),
@@ -26,7 +26,7 @@ def test_the_contact_law_through_its_kinks():
 
 
 def stiff(n):
-    """A chain with a fast reaction that couples neighbours, towards a known field."""
+    """A chain with a fast reaction that couples neighbours, relaxing to a known field."""
     target = jnp.linspace(0.2, 0.8, n)
     laplacian = 100.0 * (jnp.eye(n, k=1) + jnp.eye(n, k=-1) - 2.0 * jnp.eye(n))
     return target, dvax.Problem(
@@ -37,14 +37,14 @@ def stiff(n):
 
 
 @pytest.mark.thorough
-def test_a_stiff_system_of_some_size():
+def test_implicit_solves_a_stiff_system():
     target, problem = stiff(300)
     sol = dvax.solve(problem, jnp.zeros(300), 0.0, 1.0, method=dvax.Implicit(diffrax.Kvaerno3()))
     np.testing.assert_allclose(np.asarray(sol.xs[0]), np.asarray(target), atol=1e-6)
     assert int(sol.stats["steps"]) < 400
 
 
-def test_the_law_may_be_the_explicit_part():
+def test_implicit_accepts_the_law_as_explicit_part():
     case = c1()
     sol = dvax.solve(
         case.problem, case.x0, 0.0, 2.0, args=case.args, rtol=1e-7,
@@ -54,7 +54,7 @@ def test_the_law_may_be_the_explicit_part():
 
 
 @pytest.mark.thorough
-def test_derivatives_go_both_ways():
+def test_implicit_has_derivatives_in_both_modes():
     # A step over a kink, where Diffrax makes it short and no more, has a derivative of its own.
     case = c1()
 
@@ -79,7 +79,7 @@ def pushed(times, values):
     )  # fmt: skip
 
 
-def test_steps_end_where_data_jumps():
+def test_implicit_steps_end_at_jumps_of_data():
     problem = pushed([0.0, 0.37, 1.0], [1.0, -3.0, 0.0])
     sol = dvax.solve(problem, 0.0, 0.0, 1.0, method=dvax.Implicit(diffrax.Kvaerno3()))
     assert float(sol.xs[0]) == pytest.approx(0.37 - 3.0 * 0.63, abs=1e-12)
@@ -94,7 +94,7 @@ def test_steps_end_where_data_jumps():
         (dict(dt=0.1), "follows from rtol and atol"),
     ],
 )
-def test_what_it_does_not_do_is_refused(asked, words):
+def test_implicit_rejects_unsupported_options(asked, words):
     case = c1()
     with pytest.raises(dvax.InputError, match=words):
         dvax.solve(case.problem, case.x0, 0.0, 2.0, args=case.args, method=dvax.Implicit(), **asked)
@@ -102,7 +102,7 @@ def test_what_it_does_not_do_is_refused(asked, words):
         dvax.Implicit(diffrax.Tsit5())
 
 
-def test_failures_have_their_sentences():
+def test_implicit_failures_have_messages():
     case = c1()
     run = lambda **how: dvax.solve(  # noqa: E731
         case.problem, case.x0, 0.0, 2.0, args=case.args, method=dvax.Implicit(), throw=False, **how

@@ -1,4 +1,4 @@
-"""Kinks of the response are found, steps end there, and no way of meeting a bound stops a run."""
+"""Kinks of the response are located, steps end there, and no kind of contact ends a run."""
 
 import itertools
 
@@ -15,7 +15,7 @@ from dvax import sets
 from dvax.evolution.locate_event import locate_event
 
 
-def test_the_first_of_several_changes_of_sign_is_found():
+def test_locate_event_returns_the_first_sign_change():
     def at(theta):
         # Zeros at 0.8 and at 0.3 (steep), none in the third, and one that is infinite.
         flat, steep = (theta - 0.8) * (0.1 + theta**2), jnp.tanh(40 * (0.3 - theta))
@@ -33,16 +33,16 @@ def test_the_first_of_several_changes_of_sign_is_found():
 
 @pytest.mark.parametrize("place", [1e-4, 0.123, 0.5, 0.9, 0.9999])
 @pytest.mark.parametrize("hair", [0.0, 1e-12, 1e-6])
-def test_functions_that_rest_on_zero_or_nearly_so_are_found_to_leave_it(place, hair):
+def test_locate_event_finds_where_a_function_reaches_or_leaves_zero(place, hair):
     leaving = lambda theta: jnp.maximum(theta - place, 0.0)[None] - hair  # noqa: E731
-    arriving = lambda theta: jnp.maximum(place - theta, 0.0)[None] - hair  # noqa: E731
-    for at in (leaving, arriving):
+    reaching = lambda theta: jnp.maximum(place - theta, 0.0)[None] - hair  # noqa: E731
+    for at in (leaving, reaching):
         thetas = (0.0, 1.0)
         values = [at(jnp.asarray(theta)) for theta in thetas]
         assert float(locate_event(thetas, values, at)) == pytest.approx(place, abs=2e-5)
 
 
-def test_order_four_comes_back_over_kinks_that_nobody_announced():
+def test_etd4rk_keeps_order_four_across_unannounced_kinks():
     case = c1()
     steps, errors = [], []
     for rtol in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7):
@@ -111,7 +111,7 @@ OFTEN = [
 
 
 @pytest.mark.parametrize(("name", "method"), mostly_thorough(RUNS, OFTEN))
-def test_grazing_and_chatter_end_with_the_accuracy_that_was_asked_for(name, method):
+def test_grazing_and_chattering_kinks_are_solved_to_the_tolerance(name, method):
     z, method = CURVES[name], METHODS[method]
     rtol = 1e-6
     sol = dvax.solve(driven(z), 0.0, 0.0, 2.0, rtol=rtol, atol=rtol, method=method)
@@ -123,7 +123,7 @@ def test_grazing_and_chatter_end_with_the_accuracy_that_was_asked_for(name, meth
     assert int(sol.stats["rejected"]) <= share * int(sol.stats["steps"])
 
 
-def test_a_law_too_rough_for_any_step_ends_with_a_sentence():
+def test_law_that_is_not_lipschitz_in_time_raises_solve_error():
     # Steeper and steeper towards t = 1: not Lipschitz in time, which the paper asks for.
     def z(t):
         s = jnp.maximum(jnp.abs(t - 1.0), 1e-12)
@@ -134,7 +134,7 @@ def test_a_law_too_rough_for_any_step_ends_with_a_sentence():
 
 
 @pytest.mark.thorough
-def test_kinks_at_the_same_instant_cost_no_more_than_one():
+def test_simultaneous_kinks_cost_no_more_than_one():
     angles = jnp.linspace(0.5, 1.5, 5)
     together = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=sets.Box(-jnp.inf, 1.0),
@@ -150,7 +150,8 @@ def test_kinks_at_the_same_instant_cost_no_more_than_one():
 
 
 @pytest.mark.thorough
-def test_a_batch_takes_each_of_its_lanes_over_its_own_kinks():
+def test_kinks_of_a_batch_are_located_per_lane():
+    """Each lane of a batch has the solution and the numbers of steps that it has alone."""
     case = c1()
     starts = jnp.array([-1.0, -0.3, 0.2, 0.9, 1.5])
     run = lambda x0: dvax.solve(  # noqa: E731
@@ -186,7 +187,7 @@ SETS = {
 
 
 @pytest.mark.parametrize("name", mostly_thorough(SETS, ["ball"]))
-def test_kinks_of_every_kind_of_set(name):
+def test_kinks_are_located_for_every_kind_of_set(name):
     K, z = SETS[name]
     size = z(0.0).size
     space = dvax.spaces.Euclidean(size)
@@ -220,7 +221,7 @@ def test_regimes_are_those_of_the_closed_form():
 
 
 @pytest.mark.thorough
-def test_data_that_jumps_changes_the_regime_where_it_jumps():
+def test_regimes_change_at_jumps_of_data():
     problem = driven(lambda t: jnp.where(t < 0.7, 0.5, 1.5))
     sol = dvax.solve(problem, 0.0, 0.0, 2.0, dense=True, max_steps=4096)
     times, positive = sol.regimes()
@@ -239,14 +240,14 @@ def test_data_that_jumps_changes_the_regime_where_it_jumps():
     assert positive.tolist() == [[True, True], [True, False], [True, True]]
 
 
-def test_a_set_without_kinks_has_one_regime():
+def test_regimes_of_a_set_without_kinks_are_one():
     problem = driven(jnp.sin, sets.WholeSpace())
     sol = dvax.solve(problem, 0.0, 0.0, 2.0, rtol=1e-3, dense=True, max_steps=4096)
     times, positive = sol.regimes()
     assert times.tolist() == [0.0, 2.0] and positive.shape == (1, 0)
 
 
-def test_regimes_need_the_steps_and_a_set_that_has_switches():
+def test_regimes_require_dense_output_and_a_set_with_switches():
     with pytest.raises(dvax.InputError, match="dense=True"):
         dvax.solve(driven(jnp.sin), 0.0, 0.0, 2.0).regimes()
     K, z = SETS["intersection, whose kinks are not known"]

@@ -1,4 +1,4 @@
-"""Generators with operators and sets, on solutions that were chosen first."""
+"""Manufactured solutions for combinations of generators, operators and sets."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ TS = np.linspace(0.0, 1.5, 7)
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("generator", "operator", "kind"), CASES)
-def test_the_chosen_solution_comes_out_at_the_nominal_order(generator, operator, kind):
+def test_manufactured_solution_is_reached_with_the_nominal_order(generator, operator, kind):
     made = manufactured(generator, operator, kind)
     for method, counts in ((dvax.ETD2RK(), [32, 64, 128, 256]), (dvax.ETD4RK(), [16, 32, 64, 128])):
         errors = []

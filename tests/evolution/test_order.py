@@ -18,7 +18,8 @@ def slope(counts, errors):
 
 
 @each_method
-def test_order_on_the_shrinking_ball_while_the_state_is_outside_it(method, order, fewest):
+def test_order_on_the_shrinking_ball(method, order, fewest):
+    """The order is nominal while the state is outside the ball."""
     # C3 up to t = 2 < t*: smooth, with a moving curved set, a skew part in A, and a nonlinear f̃.
     case = c3()
     counts = fewest * np.array([1, 2, 4, 8])
@@ -52,7 +53,7 @@ def test_order_on_the_contact_law_with_its_kinks_on_the_grid(method, order, fewe
     assert found == pytest.approx(order, abs=0.05)
 
 
-def test_a_law_that_is_polynomial_in_time_is_integrated_exactly():
+def test_polynomial_forcing_is_integrated_exactly():
     # f̃ constant: ETD1 is exact; a line in t: ETD2RK is; a parabola: ETD4RK is, in one step, however
     # stiff A is.
     def problem(f):
@@ -79,7 +80,8 @@ def test_a_law_that_is_polynomial_in_time_is_integrated_exactly():
         np.testing.assert_allclose(np.asarray(sol.xs[-1]), exact, rtol=1e-12)
 
 
-def test_a_field_with_free_boundaries_keeps_order_two_and_gains_digits_from_order_four():
+def test_order_on_a_field_with_free_boundaries():
+    """The order is 2, and the method of order 4 is more accurate."""
     # Heat with a saturated contact law at each point; the free boundaries move through the grid.
     n = 127
     s = (np.arange(n) + 0.5) * np.pi / n

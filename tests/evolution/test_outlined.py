@@ -1,5 +1,5 @@
-"""Small programs are compiled as one function; their results do not change, and what XLA cannot compile
-so is left as it is."""
+"""Small programs are compiled as one function with equal results; programs that XLA cannot compile so
+are left unchanged."""
 
 import jax
 import jax.numpy as jnp
@@ -71,7 +71,7 @@ LARGE = {
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_what_is_small_is_one_function_with_the_same_values(name):
+def test_outlined_small_program_is_one_function_with_equal_values(name):
     run = looped(SMALL[name])
     program = compiled(run, V)
     assert is_one(program)
@@ -79,14 +79,14 @@ def test_what_is_small_is_one_function_with_the_same_values(name):
 
 
 @pytest.mark.parametrize("name", LARGE)
-def test_what_a_library_does_is_left_alone(name):
+def test_outlined_leaves_large_programs_and_library_calls_unchanged(name):
     run = looped(LARGE[name])
     program = compiled(run, V)
     assert not is_one(program)
     np.testing.assert_allclose(program(V), jax.jit(run)(V), rtol=1e-13)
 
 
-def test_arguments_of_every_kind_arrive_as_they_left():
+def test_outlined_passes_arguments_of_every_type_unchanged():
     given = (
         jnp.array([1, -(2**53) - 1]), jnp.array(True), jnp.array(3, jnp.int32),
         jnp.array([1.5, jnp.nan, jnp.inf], jnp.float32), jnp.array([[1 + 2j, -3j]]), V,
@@ -106,7 +106,7 @@ def test_arguments_of_every_kind_arrive_as_they_left():
     np.testing.assert_array_equal(turns, V + 7.0)
 
 
-def test_arguments_that_turn_out_to_be_of_no_use_do_no_harm():
+def test_outlined_accepts_unused_arguments():
     # Whole numbers, since the compiler sees that 0·n is 0.
     def run(v, n, table):
         return looped(lambda k, v: 0.5 * v + (0 * n).astype(v.dtype) + 0 * table[0])(v)
@@ -120,7 +120,7 @@ def test_arguments_that_turn_out_to_be_of_no_use_do_no_harm():
     np.testing.assert_allclose(program(*args), run(*args))
 
 
-def test_what_a_computed_argument_is_for_may_turn_out_to_be_nothing():
+def test_outlined_accepts_computed_arguments_that_are_eliminated():
     def run(v, table):
         return looped(lambda k, v: 0.5 * v + jnp.where(table[k] == table[k], 0.0, 1.0))(v)
 
@@ -135,7 +135,7 @@ def test_what_a_computed_argument_is_for_may_turn_out_to_be_nothing():
     assert float(jax.grad(end)(1.0)) == pytest.approx(np.exp(-0.75), rel=1e-4)
 
 
-def test_what_is_closed_over_is_handed_over():
+def test_outlined_passes_closed_over_values_as_arguments():
     @jax.jit
     def outer(v, scale, long):
         near = outlined(looped(lambda k, v: v * scale), v)
@@ -146,13 +146,13 @@ def test_what_is_closed_over_is_handed_over():
     np.testing.assert_allclose(far, 0.5**7 * V)
 
 
-def test_a_key_may_be_closed_over():
+def test_outlined_accepts_a_closed_over_random_key():
     key = jax.random.key(3)
     run = looped(lambda k, v: v * jax.random.uniform(jax.random.fold_in(key, k)))
     np.testing.assert_array_equal(outlined(run, V), jax.jit(run)(V))
 
 
-def test_numbers_that_take_the_type_of_what_they_meet_still_do():
+def test_outlined_keeps_weak_types():
     def run(v, scale):
         return jax.lax.fori_loop(0, 7, lambda k, v: v * scale, v)
 
@@ -162,7 +162,7 @@ def test_numbers_that_take_the_type_of_what_they_meet_still_do():
     np.testing.assert_allclose(found, 0.5**7 * V, rtol=1e-6)
 
 
-def test_constants_may_be_arguments_and_everything_may_be_constant():
+def test_outlined_accepts_constant_arguments():
     run = looped(lambda k, v: 0.5 * v + 1.0)
     for n in (5, 999, 8000):
         v = np.random.default_rng(0).normal(size=n)
@@ -170,7 +170,7 @@ def test_constants_may_be_arguments_and_everything_may_be_constant():
 
 
 @pytest.mark.parametrize("n", [9, 3000, 50_000])
-def test_constants_as_long_as_they_like_go_along_with_what_was_computed(n):
+def test_outlined_accepts_long_constants_beside_computed_arguments(n):
     # The compiler ends the process over a long constant beside another argument.
     table = jnp.asarray(np.random.default_rng(0).normal(size=n))
 
@@ -197,7 +197,7 @@ def test_constants_as_long_as_they_like_go_along_with_what_was_computed(n):
         np.testing.assert_allclose(found, exact)
 
 
-def test_a_batch_is_outlined_and_derivatives_are_those_of_the_program():
+def test_outlined_batch_and_its_derivatives_equal_those_of_the_plain_program():
     run = looped(lambda k, v: jax.lax.dynamic_update_index_in_dim(jnp.sin(v), v[k % N], 1, 0))
     whole = lambda v: outlined(run, v)  # noqa: E731
     for lanes in (20, 700):
@@ -214,7 +214,7 @@ def test_a_batch_is_outlined_and_derivatives_are_those_of_the_program():
     np.testing.assert_allclose(back(V), 2.0 * V)
 
 
-def test_all_directions_at_once_are_a_batch():
+def test_outlined_jacfwd_equals_that_of_the_plain_program():
     # A product of a matrix and a vector becomes one of matrices, which a library does.
     M, v = jnp.asarray(np.random.default_rng(0).normal(size=(8, 8)) / 4), jnp.arange(8.0) / 8
     run = lambda v: looped(lambda k, v: jnp.tanh(M @ v))(v)  # noqa: E731
@@ -222,14 +222,15 @@ def test_all_directions_at_once_are_a_batch():
     np.testing.assert_allclose(whole(v), jax.jacfwd(run)(v), atol=1e-14)
 
 
-def test_what_does_not_move_has_no_derivative_to_go_wrong():
+def test_outlined_jvp_is_finite_with_undifferentiated_arguments():
+    """The derivative of a constant argument, infinite here, is not computed."""
     run = lambda v, a: looped(lambda k, v: v * jnp.sqrt(a) + jnp.abs(v) ** a)(v)  # noqa: E731
     push = lambda v: jax.jvp(lambda v: outlined(run, v, jnp.zeros(())), (v,), (v,))  # noqa: E731
     assert np.isfinite(jax.jit(push)(V)[1]).all()
 
 
 @pytest.mark.parametrize("case", [c1, c2, c3], ids=["C1", "C2", "C3"])
-def test_small_systems_are_solved_in_one_function(case):
+def test_outlined_solve_of_a_small_system_is_one_function(case):
     # What makes a step of a small system cheap: should a new operation end it, this says so.
     problem, x0, t1, _, _, args = case()
 

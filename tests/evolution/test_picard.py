@@ -1,4 +1,4 @@
-"""The fixed point over windows: order, tolerance and bound as for steps, and what it says of itself."""
+"""`Picard` over windows: order, tolerance, bound and failures."""
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ def solve(case, **how):
     return sol, np.array(off)
 
 
-def test_order_two_on_the_shrinking_ball():
+def test_picard_has_order_two_on_the_shrinking_ball():
     case = c3()
     counts = np.array([64, 128, 256, 512])
     errors = []
@@ -38,7 +38,7 @@ def test_order_two_on_the_shrinking_ball():
 
 
 @pytest.mark.parametrize("make", mostly_thorough([c1, c2, c3], [c1]))
-def test_the_error_is_below_its_bound_and_near_the_tolerance(make):
+def test_picard_error_is_below_its_bound_and_near_the_tolerance(make):
     case = make()
     sol, off = solve(case, rtol=1e-5, atol=1e-5)
     bound = dvax.bound_error(case.problem, sol, case.constants)
@@ -48,13 +48,13 @@ def test_the_error_is_below_its_bound_and_near_the_tolerance(make):
     assert int(sol.stats["sweeps"]) < 20 * int(sol.stats["windows"])
 
 
-def test_the_bound_of_the_contact_law_is_proved_as_with_steps():
+def test_picard_bound_of_the_contact_law_is_proved():
     case = c1()
     sol, _ = solve(case, rtol=1e-4, atol=1e-4)
     assert sol.enclosed
 
 
-def test_sweeps_converge_faster_the_more_of_them_there_are():
+def test_picard_sweeps_converge_superlinearly():
     # x' = −3u, u = x: the k-th correction is at most (3W)^k/k! of the first.
     problem = dvax.Problem(
         A=generators.Zero(), P=PLAIN, K=dvax.sets.WholeSpace(),
@@ -66,7 +66,7 @@ def test_sweeps_converge_faster_the_more_of_them_there_are():
     assert int(sol.stats["windows"]) == 1 and 15 <= int(sol.stats["sweeps"]) <= 28
 
 
-def test_the_two_ways_to_add_up_agree():
+def test_picard_sums_in_turn_and_by_doubling_agree():
     rng = np.random.default_rng(3)
     A = generators.Dense(rng.normal(size=(3, 3)))
     h = jnp.asarray(0.1)
@@ -84,7 +84,7 @@ def iterated(K):
 
 
 @pytest.mark.thorough
-def test_a_law_that_is_iterated_is_solved_as_one_batch():
+def test_picard_solves_an_iterated_law_as_one_batch():
     problem = iterated(lambda t, args: dvax.sets.Ball(0.0, 0.7 * jnp.exp(-t)))
     x0 = jnp.array([2.0, 0.3])
     ours = dvax.solve(
@@ -98,7 +98,7 @@ def test_a_law_that_is_iterated_is_solved_as_one_batch():
     np.testing.assert_allclose(np.asarray(u), np.asarray(theirs.us[0]), atol=5e-5)
 
 
-def test_windows_end_where_data_jumps():
+def test_picard_windows_end_at_jumps_of_data():
     table = signals.Table([0.0, 0.37, 1.0], [1.0, -3.0, 0.0], kind="constant")
     problem = dvax.Problem(
         A=generators.Zero(), P=PLAIN, K=dvax.sets.WholeSpace(), f=lambda t, x, u, args: table(t),
@@ -110,7 +110,7 @@ def test_windows_end_where_data_jumps():
         assert int(sol.stats["rejected"]) == 0
 
 
-def test_forward_derivatives_and_no_others():
+def test_picard_has_forward_derivatives_only():
     case = c1()
 
     def end(x0, ell):
@@ -124,7 +124,8 @@ def test_forward_derivatives_and_no_others():
         jax.grad(lambda v: end(*v))(given)
 
 
-def test_a_window_that_does_not_converge_is_shortened_or_said():
+def test_picard_window_without_convergence_is_shortened_or_fails():
+    """Adaptive windows are shortened; a fixed one ends with picard_unconverged."""
     problem = dvax.Problem(
         A=generators.Zero(), P=PLAIN, K=dvax.sets.WholeSpace(),
         f=lambda t, x, u, args: -200.0 * u, h=lambda t, x, u, args: 2.0 * x - u,
@@ -139,7 +140,7 @@ def test_a_window_that_does_not_converge_is_shortened_or_said():
     assert run(rtol=1e-3, max_steps=64).result == dvax.RESULTS.max_steps
 
 
-def test_a_batch_is_what_its_lanes_are_alone():
+def test_picard_batch_equals_its_lanes():
     case = c1()
     run = lambda ell: dvax.solve(  # noqa: E731
         case.problem, -1.0, 0.0, 2.0, args=(ell,), rtol=1e-4, method=dvax.Picard()
@@ -149,7 +150,7 @@ def test_a_batch_is_what_its_lanes_are_alone():
     np.testing.assert_allclose(np.asarray(together), [float(run(ell)) for ell in ells], rtol=1e-12)
 
 
-def test_numbers_that_are_none_are_refused():
+def test_picard_rejects_parameters_that_are_not_positive_integers():
     for bad in (dict(nodes=0), dict(max_sweeps=-1)):
         with pytest.raises(dvax.InputError, match="positive integer"):
             dvax.Picard(**bad)

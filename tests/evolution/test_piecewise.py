@@ -1,4 +1,4 @@
-"""Systems that are affine between switchings, against closed forms and against matrix exponentials."""
+"""`PiecewiseLinear` against closed forms and matrix exponentials."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from dvax.evolution.piecewise import inputs, radau
 
 
 def held(stiffness, **kwargs):
-    """x' = 1 − x + u, held above 2 by a spring of this stiffness, nearly."""
+    """The problem x' = 1 − x + u, where a spring of this stiffness keeps x nearly above 2."""
     return dvax.Problem(
         A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, np.inf),
         f=lambda t, x, u, args: 1.0 - x + u, h=lambda t, x, u, args: -stiffness * (x - 2.0), **kwargs,
@@ -20,7 +20,7 @@ def held(stiffness, **kwargs):
 
 
 @pytest.mark.parametrize("stiffness", [1.0, 1e3, 1e8, 1e15])
-def test_a_spring_of_any_stiffness_is_met_where_it_begins(stiffness):
+def test_piecewise_contact_with_a_spring_of_any_stiffness_is_exact(stiffness):
     ts = np.array([0.5, np.log(3.0), 1.2, 4.0])
     sol = dvax.solve(
         held(stiffness), 4.0, 0.0, 4.0, ts=ts, rtol=1e-8, method=dvax.PiecewiseLinear(), dense=True
@@ -43,7 +43,7 @@ def test_a_spring_of_any_stiffness_is_met_where_it_begins(stiffness):
 
 
 @pytest.mark.parametrize("seed", mostly_thorough(range(6), [0]))
-def test_random_systems_agree_with_matrix_exponentials(seed):
+def test_piecewise_random_systems_agree_with_matrix_exponentials(seed):
     rng = np.random.default_rng(seed)
     n, m = 3, 2
     R, S = rng.normal(size=(n, n)), rng.normal(size=(m, m))
@@ -68,7 +68,7 @@ def test_random_systems_agree_with_matrix_exponentials(seed):
     assert float(jnp.max(one.law_residual)) < 1e-12
 
 
-def test_the_defect_bounds_the_error_and_a_region_is_seen():
+def test_piecewise_defect_bounds_the_error():
     problem = held(50.0)
     constants = dvax.verify(problem, 4.0, 0.0, 4.0).constants
     sol = dvax.solve(
@@ -81,7 +81,7 @@ def test_the_defect_bounds_the_error_and_a_region_is_seen():
     assert bound.status == "estimated" and not sol.enclosed
 
 
-def test_an_oscillation_beside_a_constraint_takes_no_step_a_period():
+def test_piecewise_oscillation_beside_a_constraint_needs_no_step_per_period():
     # x'' = −ω²x with ω = 10⁶ for a second, and a law that it does not reach: exact by one cosine.
     w = 1e6
     problem = dvax.Problem(
@@ -100,7 +100,7 @@ def test_an_oscillation_beside_a_constraint_takes_no_step_a_period():
     assert int(sol.stats["steps"]) < 60
 
 
-def test_first_crossings_are_found_and_touching_is_none():
+def test_piecewise_first_crossings_are_found_and_contacts_are_not_crossings():
     theta = radau.GRID
     assert radau.first_negative((theta - 0.3) ** 2, 1e-14) == (1.0, False)
     found, crosses = radau.first_negative((theta - 0.3) ** 2 - 1e-10, 1e-14)
@@ -120,7 +120,7 @@ def test_first_crossings_are_found_and_touching_is_none():
 
 
 @pytest.mark.parametrize("seed", mostly_thorough(range(12), range(3)))
-def test_first_crossings_beside_waves_are_those_of_dense_samples(seed):
+def test_piecewise_first_crossings_with_oscillations_agree_with_dense_samples(seed):
     rng = np.random.default_rng(seed)
     c = rng.normal(size=6) / np.arange(1, 7) ** 2
     values = np.polynomial.chebyshev.chebval(2 * radau.GRID - 1, c)
@@ -142,7 +142,7 @@ def test_first_crossings_beside_waves_are_those_of_dense_samples(seed):
         assert not crosses or at < level + 2e-5  # below between two samples
 
 
-def test_progress_is_printed_as_other_methods_do_and_changes_nothing(capfd):
+def test_piecewise_progress_output_does_not_change_the_solution(capfd):
     run = lambda **kwargs: dvax.solve(  # noqa: E731
         held(50.0), 4.0, 0.0, 4.0, ts=[1.0, 4.0], method=dvax.PiecewiseLinear(), **kwargs
     )
@@ -157,7 +157,7 @@ def test_progress_is_printed_as_other_methods_do_and_changes_nothing(capfd):
 
 @pytest.mark.parametrize("level", [1e4, 1e2, 1.0, 1e-6])
 @pytest.mark.parametrize("M", [1e-8, 1e-10, 1e-13])
-def test_rounding_hides_no_switching(level, M):
+def test_piecewise_switching_below_rounding_is_detected(level, M):
     # x follows s(t) up through a response u = (s − x)/M ≥ 0, and z counts it. Beside s = 10⁴ the
     # rounding of s − x is more than all of s', and the law alone does not show the sign of u.
     problem = dvax.Problem(
@@ -173,7 +173,7 @@ def test_rounding_hides_no_switching(level, M):
     assert int(sol.stats["switchings"]) == 2
 
 
-def test_the_method_says_what_it_is_not_for():
+def test_piecewise_rejects_unsupported_problems():
     method = dvax.PiecewiseLinear()
     curved = dvax.Problem(
         A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1.0),
@@ -196,7 +196,7 @@ def test_the_method_says_what_it_is_not_for():
             traced(4.0)
 
 
-def test_jumps_are_met_announced_or_not_and_data_that_ends_is_told():
+def test_piecewise_locates_jumps_and_reports_nan_data():
     def driven(s):
         return dvax.Problem(
             A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1.0),
@@ -207,8 +207,8 @@ def test_jumps_are_met_announced_or_not_and_data_that_ends_is_told():
     with pytest.raises(dvax.SolveError, match="NaN") as caught:
         dvax.solve(ending, 0.5, 0.0, 1.0, ts=[0.1, 1.0], method=dvax.PiecewiseLinear())
     assert float(caught.value.solution.stats["t"]) <= 0.3
-    hidden = driven(lambda t: jnp.where(t < 0.3, 0.0, 1.0))
-    sol = dvax.solve(hidden, 0.0, 0.0, 1.0, method=dvax.PiecewiseLinear())
+    switched = driven(lambda t: jnp.where(t < 0.3, 0.0, 1.0))
+    sol = dvax.solve(switched, 0.0, 0.0, 1.0, method=dvax.PiecewiseLinear())
     assert float(sol.xs[0]) == pytest.approx(0.5 * (1 - np.exp(-1.4)), rel=1e-12)
     jump = dvax.signals.Table([0.0, 0.3, 1.0], [0.0, 1.0, 1.0], kind="constant")
     sol = dvax.solve(driven(jump), 0.0, 0.0, 1.0, ts=[0.3, 1.0], method=dvax.PiecewiseLinear())
@@ -217,7 +217,7 @@ def test_jumps_are_met_announced_or_not_and_data_that_ends_is_told():
     assert float(sol.us[0]) == pytest.approx(1.0)
 
 
-def test_a_wave_of_a_thousand_periods_is_no_constant():
+def test_piecewise_forcing_with_a_thousand_periods_is_resolved():
     problem = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-9.0, 9.0),
         f=lambda t, x, u, args: jnp.sin(2000 * jnp.pi * t) ** 2, h=lambda t, x, u, args: x,
@@ -231,7 +231,7 @@ def test_a_wave_of_a_thousand_periods_is_no_constant():
     assert len(found) > 500 and float(sol.xs[-1]) == pytest.approx(exact, rel=1e-11)
 
 
-def test_matrix_exponentials_are_those_of_scipy_between_knots():
+def test_piecewise_matrix_exponentials_agree_with_scipy_between_knots():
     # A line that turns at knots, through one mode: exact by an augmented exponential.
     table = dvax.signals.Table([0.0, 0.4, 1.0], [0.0, 2.0, -1.0])
     A = np.array([[-3.0, 50.0], [-50.0, -1.0]])

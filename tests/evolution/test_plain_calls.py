@@ -1,5 +1,5 @@
-"""Solves without outlined programs (`dvax._jax`): on a JAX that is faster by itself, and on one
-without the interfaces that they are built from, every answer and every derivative stays the same."""
+"""Solves without outlined programs (`dvax._jax`): on newer JAX, and without the interfaces that
+outlined programs need, all results and derivatives are the same."""
 
 import subprocess
 import sys
@@ -40,7 +40,7 @@ WAYS = {
 
 
 def by(monkeypatch, call):
-    """Have every solve call its programs by `call`."""
+    """Let every solve call its programs through `call`."""
     for module in (responses, reverse, steps):
         monkeypatch.setattr(module, "outlined", call)
     jax.clear_caches()
@@ -51,7 +51,7 @@ def usual():
     return {name: way(3.0) for name, (way, _) in WAYS.items()}
 
 
-def test_plain_programs_give_the_same_answers_and_derivatives(usual, monkeypatch):
+def test_plain_programs_give_the_same_solutions_and_derivatives(usual, monkeypatch):
     by(monkeypatch, _jax._plain)
     for name, (way, apart) in WAYS.items():
         jax.tree_util.tree_map(
@@ -64,14 +64,14 @@ def test_plain_programs_give_the_same_answers_and_derivatives(usual, monkeypatch
     jax.clear_caches()
 
 
-def test_the_answer_is_that_of_the_closed_form(usual):
+def test_outlined_and_plain_solution_is_the_closed_form(usual):
     # x is saturated up to ln(1.6)/1.5, in contact for 2 ln(10/9), and free from then on.
     free = 2.0 - np.log(1.6) / 1.5 - 2.0 * np.log(10 / 9)
     assert float(usual["adaptive"]) == pytest.approx(2.0 - 1.5 * np.exp(-1.5 * free), abs=1e-8)
     assert float(usual["grad"]) == pytest.approx(0.6402593, abs=1e-6)
 
 
-def test_newer_releases_of_jax_get_plain_programs(monkeypatch):
+def test_newer_jax_releases_use_plain_programs(monkeypatch):
     # There the attributes make programs slower, and abort the compiler on some loops.
     for version in [(0, 12, 0), (0, 13, 0), (1, 0, 0)]:
         monkeypatch.setattr(jax, "__version_info__", version)
@@ -80,7 +80,7 @@ def test_newer_releases_of_jax_get_plain_programs(monkeypatch):
 
 @pytest.mark.skipif(not _jax.OUTLINES, reason="on this JAX programs are plain anyway")
 @pytest.mark.parametrize("absent", ["jax.experimental.xla_metadata", "jax.interpreters.mlir"])
-def test_programs_are_plain_where_an_interface_is_absent(monkeypatch, absent):
+def test_absent_jax_interface_selects_plain_programs(monkeypatch, absent):
     for name in [name for name in sys.modules if name.startswith("dvax._jax.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, absent, None)
@@ -90,14 +90,14 @@ def test_programs_are_plain_where_an_interface_is_absent(monkeypatch, absent):
 
 
 @pytest.mark.parametrize("way", ["fixed", "vmap"])
-def test_the_attributes_are_set_where_outlines_says_so(way):
+def test_outline_attributes_are_set_if_and_only_if_OUTLINES(way):
     run = WAYS[way][0]
     text = jax.jit(run).lower(3.0).compile().as_text()
     outlined = 'inlineable="false",xla_cpu_small_call="true"' in text
     assert outlined == _jax.OUTLINES
 
 
-def test_a_solve_works_where_no_unstable_interface_is_left():
+def test_solve_works_without_unstable_jax_interfaces():
     program = """
 import sys
 for name in ("outlined", "forward_only"):

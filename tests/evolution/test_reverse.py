@@ -1,4 +1,4 @@
-"""The reverse pass against the forward one, which shares none of its code, in every kind of run."""
+"""Reverse mode against forward mode, which shares no code with it, for every kind of run."""
 
 import itertools
 
@@ -55,7 +55,7 @@ OFTEN = [("fixed", 4, 0.0)]
 
 
 @pytest.mark.parametrize(("kind", "places", "cubic"), mostly_thorough(CASES, OFTEN))
-def test_backward_is_forward_transposed(kind, places, cubic, monkeypatch):
+def test_reverse_mode_is_the_transpose_of_forward_mode(kind, places, cubic, monkeypatch):
     monkeypatch.setattr(checkpoints, "_MOST", places)
     problem = system(cubic)
 
@@ -72,7 +72,7 @@ def test_backward_is_forward_transposed(kind, places, cubic, monkeypatch):
     np.testing.assert_allclose(np.asarray(found), np.asarray(exact), rtol=close, atol=close)
 
 
-def test_checkpoints_hold_every_state_that_they_say_they_do():
+def test_checkpoints_return_the_stored_states():
     kept = Checkpoints(jnp.zeros(()), 8)
     put = jax.jit(lambda kept, i: kept.put(i, 1.0 * i))
     for n in range(100):
@@ -88,8 +88,8 @@ def test_checkpoints_hold_every_state_that_they_say_they_do():
     (8, 1, 0), (8, 8, 0), (8, 9, 1), (8, 64, 3), (2, 30, 16), (1, 12, 6), (32, 100, 1),
     pytest.param(32, 10_000, 5, marks=pytest.mark.thorough),
 ])  # fmt: skip
-def test_every_state_comes_back_in_turn(places, steps, most):
-    """Steps are additions of 1 here, so that a state is its own number."""
+def test_checkpoints_return_every_state_in_reverse_order(places, steps, most):
+    """Steps are additions of 1, so that a state is its own number."""
     state = lambda i: i.astype(float)  # noqa: E731
     top = jax.jit(lambda stack: (stack.step, stack.x))
     ahead_of = jax.jit(lambda stack, i: stack.next(i))
@@ -111,7 +111,7 @@ def test_every_state_comes_back_in_turn(places, steps, most):
 
 
 @pytest.mark.parametrize("size", [1, 100_000, 10_000_000, 1_000_000_000])
-def test_checkpoints_take_what_was_set_aside(size):
+def test_checkpoints_use_at_most_the_memory_limit(size):
     x0 = jax.ShapeDtypeStruct((size,), np.dtype(float))
     count = how_many(x0, 2**20)
     assert count * 8 * size <= max(2**30, 16 * 8 * size)
@@ -119,7 +119,7 @@ def test_checkpoints_take_what_was_set_aside(size):
 
 
 @pytest.mark.thorough
-def test_the_end_time_and_a_knot_have_derivatives():
+def test_reverse_derivatives_in_the_end_time_and_a_knot():
     case = c1()
 
     def end(t1):
@@ -145,7 +145,7 @@ def test_the_end_time_and_a_knot_have_derivatives():
 
 
 @pytest.mark.thorough
-def test_the_dense_output_has_derivatives():
+def test_reverse_derivatives_of_the_dense_output():
     case = c1()
 
     def dense(x0):
@@ -157,7 +157,7 @@ def test_the_dense_output_has_derivatives():
     assert float(jax.grad(dense)(-1.0)) == pytest.approx(np.exp(-0.15), abs=1e-6)
 
 
-def test_second_derivatives_and_batches_of_derivatives():
+def test_reverse_second_derivatives_and_batches_of_derivatives():
     problem = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 5.0),
         f=lambda t, x, u, args: -args * x**2 - u, h=lambda t, x, u, args: x - u,
@@ -178,7 +178,7 @@ def test_second_derivatives_and_batches_of_derivatives():
     assert float(second) == pytest.approx(float(jax.hessian(exact)(1.0, 0.4)), rel=2e-3)
 
 
-def test_a_parameter_that_f_closes_over_has_its_derivative():
+def test_reverse_derivative_in_a_closed_over_parameter():
     case = c1()
 
     def end(ell):
@@ -193,7 +193,7 @@ def test_a_parameter_that_f_closes_over_has_its_derivative():
     assert float(jax.grad(end)(3.0)) == pytest.approx(c1_derivatives()[1], abs=1e-6)
 
 
-def test_a_run_that_cannot_raise_shows_that_it_failed():
+def test_failed_run_under_jit_returns_nan():
     case = c1()
     run = lambda x0: dvax.solve(case.problem, x0, 0.0, 2.0, case.args, max_steps=8).xs  # noqa: E731
     assert np.isnan(jax.jit(run)(-1.0)).all()

@@ -1,4 +1,4 @@
-"""The exponential Rosenbrock method: order 3 however stiff f̃ is, exact where f̃ is linear in pieces."""
+"""`ExpRosenbrock`: order 3 for any stiffness of f̃, and exact for piecewise linear f̃."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ def slope(counts, errors):
     return -np.polyfit(np.log(counts), np.log(errors), 1)[0]
 
 
-def test_order_on_the_shrinking_ball():
+def test_exp_rosenbrock_has_order_three_on_the_shrinking_ball():
     case = c3()
     counts = 8 * np.array([1, 2, 4, 8])
     errors = []
@@ -53,7 +53,7 @@ def tracked(gain, t1):
     return x0, solve_ivp(rate, (0.0, t1), x0, method="Radau", rtol=1e-12, atol=1e-12).y[:, -1]
 
 
-def test_order_where_the_feedback_is_stiff():
+def test_exp_rosenbrock_keeps_its_order_with_stiff_feedback():
     # Steps of 20 to 160 times the time that the feedback takes: the defect is of order 3, and the error
     # what the feedback makes of it.
     x0, exact = tracked(1e4, 1.6)
@@ -69,7 +69,7 @@ def test_order_where_the_feedback_is_stiff():
     assert slope(counts, defects) == pytest.approx(3.0, abs=0.1)
 
 
-def test_the_steps_do_not_follow_the_gain():
+def test_exp_rosenbrock_number_of_steps_does_not_grow_with_the_gain():
     gain = 1e4
     x0, exact = tracked(gain, 1.6)
     sol = dvax.solve(tracking(gain), x0, 0.0, 1.6, rtol=1e-5, atol=1e-5, method=METHOD)
@@ -77,7 +77,7 @@ def test_the_steps_do_not_follow_the_gain():
     assert int(sol.stats["steps"]) < 1000  # 67 000 by ETD2RK for the larger gain
 
 
-def test_what_is_linear_in_pieces_is_solved_to_rounding():
+def test_exp_rosenbrock_solves_piecewise_linear_systems_to_rounding():
     case, ts = c1(), np.linspace(0.0, 2.0, 9)
     sol = dvax.solve(
         case.problem, case.x0, 0.0, 2.0, args=case.args, ts=ts, method=METHOD, dense=True,
@@ -94,7 +94,7 @@ def test_what_is_linear_in_pieces_is_solved_to_rounding():
 
 
 @pytest.mark.thorough
-def test_derivatives_go_both_ways():
+def test_exp_rosenbrock_has_derivatives_in_both_modes():
     case = c1()
 
     def end(x0, ell, adjoint):
@@ -111,7 +111,7 @@ def test_derivatives_go_both_ways():
 
 
 @pytest.mark.thorough
-def test_derivatives_of_a_coupled_law_that_is_iterated(uncached):
+def test_exp_rosenbrock_derivatives_of_an_iterated_coupled_law(uncached):
     def end(args, adjoint):
         problem = dvax.Problem(
             A=lambda args: generators.Dense(args["A"]), P=PLAIN,
@@ -136,7 +136,7 @@ def test_derivatives_of_a_coupled_law_that_is_iterated(uncached):
 
 
 @pytest.mark.thorough
-def test_a_batch_is_what_its_lanes_are_alone():
+def test_exp_rosenbrock_batch_equals_its_lanes():
     run = lambda gain: dvax.solve(  # noqa: E731
         tracking(gain), jnp.array([0.9, 0.1]), 0.0, 0.4, rtol=1e-4, atol=1e-4, method=METHOD
     ).xs[-1]
@@ -154,7 +154,8 @@ def field(n, coupled):
     )  # fmt: skip
 
 
-def test_points_on_their_own_need_no_matrix_and_a_large_coupled_state_is_refused():
+def test_exp_rosenbrock_needs_no_matrix_for_pointwise_laws():
+    """A pointwise law of any size is solved; a large coupled state raises an error."""
     x0 = jnp.linspace(0.0, 1.0, 5000)
     sol = dvax.solve(field(5000, False), x0, 0.0, 1.0, dt=0.02, method=METHOD)
     alone = dvax.solve(field(1, False), x0[:1], 0.0, 1.0, dt=0.02, method=METHOD)

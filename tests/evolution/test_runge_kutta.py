@@ -1,4 +1,4 @@
-"""The explicit method of order 5: on the whole right-hand side, over kinks, and dense."""
+"""`DormandPrince`: orders on the whole right-hand side, across kinks, and of the dense output."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ PLAIN = dvax.operators.Scaling(1.0)
 
 
 def pendulum(A):
-    """x' = Ax + f with a law that no bound is ever active in."""
+    """The problem x' = Ax + f, with a law whose bounds are never active."""
     return dvax.Problem(
         A=A, P=PLAIN, K=dvax.sets.WholeSpace(),
         f=lambda t, x, u, args: jnp.stack([jnp.cos(t), u[0]]) - 0.2 * x * x,
@@ -25,7 +25,7 @@ def pendulum(A):
     )  # fmt: skip
 
 
-def test_one_step_is_that_of_scipys_rk45_and_so_is_its_dense_output():
+def test_dormand_prince_step_and_dense_output_equal_those_of_scipy_rk45():
     # SciPy's method of the same name, written by others from the same paper; Shampine's dense output.
     matrix = np.array([[-0.3, 1.2], [-0.9, 0.1]])
     x0, h = np.array([0.4, -0.7]), 0.4
@@ -47,7 +47,7 @@ def test_one_step_is_that_of_scipys_rk45_and_so_is_its_dense_output():
         )
 
 
-def test_orders_of_the_ends_of_steps_of_what_lies_between_and_of_the_defect():
+def test_dormand_prince_orders_of_steps_dense_output_and_defect():
     case = c3()
     counts = np.array([20, 40, 80, 160])
     ends, between, defects = [], [], []
@@ -69,7 +69,7 @@ def test_orders_of_the_ends_of_steps_of_what_lies_between_and_of_the_defect():
     assert orders[2] == pytest.approx(4.0, abs=0.15)
 
 
-def test_order_on_a_system_without_kinks_beside_scipys():
+def test_dormand_prince_order_on_a_smooth_system_agrees_with_scipy():
     matrix = np.array([[-0.3, 1.2], [-0.9, 0.1]])
     x0 = np.array([0.4, -0.7])
     exact = solve_ivp(
@@ -88,7 +88,7 @@ def test_order_on_a_system_without_kinks_beside_scipys():
     assert found == pytest.approx(5.0, abs=0.15)
 
 
-def test_order_five_comes_back_over_kinks_that_nobody_announced():
+def test_dormand_prince_keeps_order_five_across_unannounced_kinks():
     case = c1()
     steps, errors = [], []
     for rtol in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9):
@@ -106,7 +106,7 @@ def test_order_five_comes_back_over_kinks_that_nobody_announced():
     assert found > 4.5
 
 
-def test_regimes_are_those_of_the_closed_form():
+def test_dormand_prince_regimes_are_those_of_the_closed_form():
     case = c1()
     sol = dvax.solve(
         case.problem, jnp.asarray(case.x0), 0.0, 2.0, args=case.args, rtol=1e-9, method=METHOD,
@@ -118,7 +118,7 @@ def test_regimes_are_those_of_the_closed_form():
 
 
 @pytest.mark.thorough
-def test_derivatives_are_those_of_the_closed_form():
+def test_dormand_prince_derivatives_are_those_of_the_closed_form():
     case = c1()
 
     def end(x0, args, adjoint):
@@ -132,7 +132,8 @@ def test_derivatives_are_those_of_the_closed_form():
         assert float(found) == pytest.approx(exact[0], rel=1e-6)
 
 
-def test_a_stiff_system_costs_steps_and_no_digits():
+def test_dormand_prince_is_accurate_on_a_stiff_system():
+    """A stiff system needs more steps, and is as accurate."""
     problem = dvax.Problem(
         A=generators.Diagonal(jnp.array([-2e3, -1.0])), P=PLAIN, K=dvax.sets.Box(-0.5, 0.5),
         f=lambda t, x, u, args: u[::-1], h=lambda t, x, u, args: jnp.sin(3.0 * t) - x - u,
@@ -146,7 +147,7 @@ def test_a_stiff_system_costs_steps_and_no_digits():
 
 
 @pytest.mark.thorough
-def test_a_law_that_is_iterated_and_a_state_of_two_parts():
+def test_dormand_prince_solves_an_iterated_law_with_a_tuple_state():
     turn = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
     coupled = dvax.Problem(
         A=generators.Product(generators.Scalar(-1.0), generators.Dense(turn)), P=PLAIN,

@@ -1,4 +1,4 @@
-"""While u sits on its bound an embedded estimate sees nothing; the step control must see anyway.
+"""While u is saturated, an embedded error estimate is zero; the step-size control must not rely on it.
 
 Three systems whose u is constant for long and then leaves its bound briefly. An estimate that is
 blind there has an error that does not shrink with the tolerance at all.
@@ -40,7 +40,7 @@ def filtered(h, lower, upper, kinks, T, x0):
 
 
 def crossings(h, level, T):
-    """Where a smooth h meets a level, to rounding."""
+    """The times at which a smooth h crosses a level, to rounding."""
     from scipy.optimize import brentq
 
     grid = np.linspace(0, T, 20_001)
@@ -50,21 +50,21 @@ def crossings(h, level, T):
 
 
 def swings():
-    """±1 nearly always, with fast passages in between: 10 sin 7t."""
+    """±1 nearly always, with fast transitions: 10 sin 7t."""
     h, T = lambda t: 10 * np.sin(7 * t), 4.0
     exact = filtered(h, -1.0, 1.0, crossings(h, 1.0, T) + crossings(h, -1.0, T), T, 0.3)
     return forced(lambda t: 10 * jnp.sin(7 * t), -1.0, 1.0), 0.3, T, np.array(exact)
 
 
 def pulses():
-    """0 for most of each period, and a full pulse at its crest."""
+    """0 for most of each period, and a full pulse at its maximum."""
     h, T = lambda t: 300 * (np.sin(t) - 0.97), 9.0
     exact = filtered(h, 0.0, 1.0, crossings(h, 1.0, T) + crossings(h, 0.0, T), T, 0.0)
     return forced(lambda t: 300 * (jnp.sin(t) - 0.97), 0.0, 1.0), 0.0, T, np.array(exact)
 
 
 def bumper():
-    """An oscillator that meets a stiff bumper at the crest of its swing: u depends on the state."""
+    """An oscillator that touches a stiff bumper at its maximum: u depends on the state."""
     A = np.array([[-0.02, 1.0], [-1.0, -0.02]])
     problem = dvax.Problem(
         A=dvax.generators.Dense(A),
@@ -92,7 +92,7 @@ OFTEN = [*RUNS[::3], ("pulses", "DormandPrince")]
 
 
 @pytest.mark.parametrize(("name", "method"), mostly_thorough(RUNS, OFTEN))
-def test_the_error_follows_the_tolerance_through_saturation(name, method):
+def test_error_follows_the_tolerance_through_saturation(name, method):
     problem, x0, T, exact = SYSTEMS[name]()
     for tol in TOLERANCES if method == "ETD2RK" else (*TOLERANCES, 1e-10):
         sol = dvax.solve(problem, x0, 0.0, T, rtol=tol, atol=tol, method=METHODS[method])
@@ -102,7 +102,7 @@ def test_the_error_follows_the_tolerance_through_saturation(name, method):
 
 
 @pytest.mark.parametrize("dt", [None, 0.3])
-def test_jumps_of_data_on_knots_are_integrated_exactly(dt):
+def test_jumps_of_data_at_knots_are_integrated_exactly(dt):
     # x' = −x + load, the load a staircase: x is a sum of exponentials, and no step is too long.
     times = np.array([0.0, 0.31, 0.32, 1.7, 2.9, 4.0])
     values = np.array([1.0, -50.0, 2.0, 0.0, 7.0, 7.0])

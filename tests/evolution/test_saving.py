@@ -27,13 +27,13 @@ def test_dense_output_saved_times_and_the_exact_solution_agree():
     assert float(dense.ts[-1]) == 4.0 and np.array_equal(dense.xs[-1], saved.xs[-1])
 
 
-def test_without_times_the_end_alone_is_saved():
+def test_ts_none_saves_the_end_only():
     sol = dvax.solve(c1().problem, -1.0, 0.0, 2.0, args=c1().args)
     assert np.asarray(sol.ts).tolist() == [2.0]
     assert sol.xs.shape == sol.us.shape == sol.ys.shape == (1,)
 
 
-def test_the_same_time_may_be_asked_for_twice_and_fixed_steps_save_between_steps():
+def test_ts_may_repeat_a_time_and_lie_between_fixed_steps():
     ts = [0.0, 0.15, 0.15, 0.3, 1.0]
     sol = dvax.solve(c1().problem, -1.0, 0.0, 1.0, args=c1().args, ts=ts, dt=0.01)
     assert np.array_equal(np.asarray(sol.ts), ts)
@@ -54,7 +54,7 @@ TIMES = {
 
 
 @pytest.mark.parametrize("which", mostly_thorough(TIMES, ["every step", "some of each"]))
-def test_rows_are_written_as_steps_end_or_from_inside_them(which):
+def test_saved_rows_agree_with_the_dense_output(which):
     """Of the same steps, whichever are saved: against the dense output, and in a batch, where the
     steps of each end elsewhere and one of the runs fails."""
     problem, args, ts = c1().problem, c1().args, TIMES[which]
@@ -84,7 +84,7 @@ def test_rows_are_written_as_steps_end_or_from_inside_them(which):
 
 
 @pytest.mark.parametrize("which", ["every step", "some of each"])
-def test_saved_rows_have_the_same_derivatives_by_both_modes(which):
+def test_derivatives_of_saved_rows_agree_in_both_modes(which):
     weights = jnp.asarray(np.random.default_rng(0).normal(size=len(TIMES[which])))
 
     def total(x0, ell, adjoint):
@@ -110,7 +110,7 @@ def test_saved_rows_have_the_same_derivatives_by_both_modes(which):
 
 
 @pytest.mark.parametrize("t", [-0.1, 2.5])
-def test_nothing_is_evaluated_outside_the_solve(t):
+def test_evaluate_outside_the_solved_interval_raises_an_error(t):
     sol = dvax.solve(
         c1().problem, -1.0, 0.0, 2.0, args=c1().args, dense=True, rtol=1e-3, max_steps=4096
     )
@@ -118,7 +118,7 @@ def test_nothing_is_evaluated_outside_the_solve(t):
         sol.evaluate(t)
 
 
-def test_evaluate_without_dense_says_what_to_ask_for():
+def test_evaluate_without_dense_names_the_option():
     sol = dvax.solve(c1().problem, -1.0, 0.0, 2.0, args=c1().args)
     with pytest.raises(dvax.InputError, match="dense=True"):
         sol.evaluate(1.0)
@@ -136,7 +136,7 @@ def test_evaluate_without_dense_says_what_to_ask_for():
         (dict(rtol=-1.0, dt0=0.0, horizon=-2.0), ["rtol", "dt0", "horizon"]),
     ],
 )
-def test_settings_that_make_no_sense_are_refused_all_at_once(wrong, words):
+def test_invalid_solve_options_are_all_reported_at_once(wrong, words):
     with pytest.raises(dvax.InputError) as caught:
         dvax.solve(c1().problem, -1.0, 0.0, 2.0, args=c1().args, **wrong)
     for word in words:
@@ -144,18 +144,18 @@ def test_settings_that_make_no_sense_are_refused_all_at_once(wrong, words):
 
 
 @pytest.mark.parametrize(("t0", "t1"), [(1.0, 0.0), (0.0, 0.0), (0.0, np.inf), (np.nan, 1.0)])
-def test_time_runs_forward_and_is_finite(t0, t1):
+def test_time_span_must_be_increasing_and_finite(t0, t1):
     with pytest.raises(dvax.InputError, match="t0, t1"):
         dvax.solve(c1().problem, -1.0, t0, t1, args=c1().args)
 
 
-def test_a_state_with_a_bad_entry_is_refused_with_its_place():
+def test_initial_state_with_a_nonfinite_entry_names_its_position():
     with pytest.raises(dvax.InputError, match=r"nan at index \(1,\)"):
         dvax.solve(c2().problem, jnp.array([0.0, np.nan]), 0.0, 1.0)
 
 
 @pytest.mark.thorough
-def test_a_tuple_state_with_a_response_of_another_shape_equals_the_stacked_problem():
+def test_tuple_state_equals_the_stacked_problem():
     # x = (a, b) with a a number and b a pair; u = (v, w) with v a pair and w a number.
     g, o, k, s = dvax.generators, dvax.operators, dvax.sets, dvax.spaces
     B = np.array([[-1.0, 2.0], [-2.0, -1.0]])
@@ -208,7 +208,7 @@ def test_a_tuple_state_with_a_response_of_another_shape_equals_the_stacked_probl
 
 
 @pytest.mark.thorough
-def test_xarray_carries_the_trajectory():
+def test_to_xarray_contains_the_trajectory():
     pytest.importorskip("xarray", reason="the extra dvax[app] is not installed")
     sol = dvax.solve(c2().problem, jnp.asarray(c2().x0), 0.0, 1.0, ts=[0.0, 0.5, 1.0])
     data = sol.to_xarray()

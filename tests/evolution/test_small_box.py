@@ -1,5 +1,5 @@
-"""The law written out, by medians and face by face: it satisfies the law, and its derivative is that of
-its face."""
+"""The law on small boxes, by medians and face by face: it is satisfied, and its derivative is that of
+the face."""
 
 import itertools
 
@@ -25,7 +25,7 @@ each_way = pytest.mark.parametrize(("way", "n"), WAYS, ids=["medians", "9", "27"
 
 
 @each_way
-def test_the_point_satisfies_the_law_whatever_the_bounds(way, n):
+def test_small_box_solution_satisfies_the_law_for_any_bounds(way, n):
     rng = np.random.default_rng(n)
     M = definite(rng, n)
     found = way(jnp.asarray(M))
@@ -62,7 +62,8 @@ MONOTONE = {
 
 
 @pytest.mark.parametrize("kind", MONOTONE)
-def test_medians_solve_every_law_that_is_monotone_and_has_a_solution(kind):
+def test_small_box_medians_solve_every_monotone_law(kind):
+    """The medians solve every monotone law that has a solution."""
     rng = np.random.default_rng(7)
     M = np.array(MONOTONE[kind])
     count = 3000
@@ -87,7 +88,8 @@ def test_medians_solve_every_law_that_is_monotone_and_has_a_solution(kind):
 
 
 @pytest.mark.parametrize("way", [Medians, faces])
-def test_the_derivative_is_that_of_the_face_and_a_touching_entry_is_held(way):
+def test_small_box_derivative_is_that_of_the_face(way):
+    """An entry that touches its bound counts as held."""
     M = np.array([[2.0, 0.7], [-0.3, 1.0]])
     found = way(jnp.asarray(M))
     low, up = jnp.full(2, -1.0), jnp.full(2, 1.0)
@@ -113,7 +115,7 @@ def test_the_derivative_is_that_of_the_face_and_a_touching_entry_is_held(way):
 
 
 @pytest.mark.thorough
-def test_what_is_written_out_is_what_is_iterated():
+def test_small_box_solve_equals_the_iterated_law():
     M = np.array([[2.0, 0.5], [0.1, 1.0]])
     problem = dvax.Problem(
         A=dvax.generators.Dense(jnp.array([[-0.3, 2.0], [-2.0, -0.1]])),
@@ -137,7 +139,7 @@ def test_what_is_written_out_is_what_is_iterated():
     assert float(slope) == pytest.approx(central, rel=1e-4)
 
 
-def test_a_law_without_a_solution_is_not_called_solved():
+def test_small_box_law_without_a_solution_fails():
     problem = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),
         K=dvax.sets.Box(jnp.array([0.0, 0.0]), jnp.array([jnp.inf, jnp.inf])),
@@ -148,13 +150,13 @@ def test_a_law_without_a_solution_is_not_called_solved():
         dvax.solve(problem, jnp.ones(2), 0.0, 1.0)
 
 
-def test_only_a_few_unknowns_are_written_out():
+def test_small_box_applies_to_two_to_four_unknowns():
     assert [is_small(jnp.zeros(n)) for n in (1, 2, 4, 5)] == [False, True, True, False]
     assert not is_small((jnp.zeros(2), jnp.zeros(1)))
     assert sides(4).shape == (81, 4)
 
 
-def test_a_law_of_large_gain_is_solved_to_what_rounding_leaves():
+def test_small_box_law_of_large_gain_is_solved_to_rounding():
     """A bridge of diodes with 1 µS and 1 mΩ: eigenvalues of M from 1e-3 to 1e6."""
     leak, on, s = 1e6, 1e-3, 0.5 * np.array([-1.0, 1.0, 1.0, -1.0])
     signs = np.array([1.0, 1.0, -1.0, -1.0])

@@ -1,4 +1,4 @@
-"""Tables that f makes itself: their kinks are steps' ends like those of tables made outside."""
+"""Tables that f creates: steps end at their kinks, as for tables created outside."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +23,7 @@ TIMES, VALUES = np.array([0.0, 0.3, 0.31, 0.7, 1.0]), np.array([0.0, 1.0, -2.0, 
         [("linear", dvax.ETD2RK(), 0.0)],
     ),
 )
-def test_the_integral_of_a_table_is_exact(kind, method, shift):
+def test_table_created_inside_f_is_integrated_exactly(kind, method, shift):
     times = TIMES.copy()
     times[1:-1] += shift * TIMES[1:-1] * (1.0 - TIMES[1:-1])
 

@@ -1,4 +1,4 @@
-"""Compiled once, vectorised, and the same in every way of calling."""
+"""`dvax.solve` under `jit` and `vmap`: it compiles once, and all ways of calling agree."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import dvax
 
 
 def counted():
-    """C1 with a count of how often f is traced."""
+    """C1 with a counter of the traces of f."""
     traces = []
 
     def f(t, x, u, args):
@@ -28,7 +28,7 @@ def counted():
 
 
 @pytest.mark.parametrize("number", [float, jnp.asarray], ids=["Python numbers", "arrays"])
-def test_new_tolerances_times_states_and_parameters_compile_nothing(number):
+def test_new_tolerances_times_states_and_parameters_do_not_recompile(number):
     problem, traces = counted()
     ts = np.linspace(0, 2, 5)
     x0, ell = number(-1.0), number(3.0)
@@ -43,7 +43,7 @@ def test_new_tolerances_times_states_and_parameters_compile_nothing(number):
     assert int(second.stats["steps"]) > int(first.stats["steps"])
 
 
-def test_fixed_steps_of_another_length_compile_nothing_either():
+def test_fixed_steps_of_another_length_do_not_recompile():
     problem, traces = counted()
     dvax.solve(problem, -1.0, 0.0, 2.0, args=3.0, dt=0.01)
     before = len(traces)
@@ -68,13 +68,13 @@ def test_vmap_over_states_and_parameters_equals_a_loop():
             np.testing.assert_allclose(np.asarray(whole[k]), np.asarray(single), atol=1e-12)
 
 
-def test_a_solve_inside_jit_is_the_solve_outside():
+def test_solve_inside_jit_equals_the_solve_outside():
     case = c1()
     run = lambda x0: dvax.solve(case.problem, x0, 0.0, 2.0, args=case.args, rtol=1e-6).xs  # noqa: E731
     np.testing.assert_allclose(jax.jit(run)(-1.0), run(-1.0), rtol=0, atol=1e-14)
 
 
-def test_a_run_in_two_halves_is_the_run():
+def test_run_in_two_halves_equals_the_whole_run():
     case = c1()
     whole = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, dt=1 / 64)
     half = dvax.solve(case.problem, -1.0, 0.0, 1.0, args=case.args, dt=1 / 64)
@@ -82,7 +82,7 @@ def test_a_run_in_two_halves_is_the_run():
     np.testing.assert_allclose(np.asarray(rest.xs), np.asarray(whole.xs), rtol=0, atol=1e-14)
 
 
-def test_f_may_pass_through_a_spectrum():
+def test_f_may_use_fourier_transforms():
     n = 32
     s = jnp.arange(float(n)) * (2.0 * jnp.pi / n)
     symbol = jnp.exp(-(jnp.arange(n // 2 + 1.0) ** 2) / 50.0).astype(complex)

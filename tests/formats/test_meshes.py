@@ -1,4 +1,4 @@
-"""Meshes for the finite-element contact: files of several formats, and every way to be no mesh."""
+"""Meshes for the finite-element contact: several file formats, and invalid meshes."""
 
 import sys
 
@@ -16,7 +16,7 @@ NAMES = {"contact": [7, 1], "clamped": [4, 1], "block": [1, 2]}
 
 @pytest.fixture(scope="module")
 def block():
-    """A block, and what a file holds of it: nodes, elements, and lines with their group."""
+    """A block, and the content of its file: nodes, elements, and lines with their group."""
     body = ElasticBody(SIZES)
     mesh = body.mesh
     lines = np.concatenate([mesh.facets[:, mesh.boundaries[k]].T for k in ("contact", "clamped")])
@@ -63,7 +63,7 @@ def same(found, body):
     np.testing.assert_allclose(np.sort(found.points[:, 0]), np.sort(body.points[:, 0]), atol=1e-14)
 
 
-def test_a_file_of_each_format_is_the_mesh_that_was_written(block, tmp_path):
+def test_mesh_files_of_every_format_round_trip(block, tmp_path):
     body, *parts = block
     mesh = file_of(*parts)
     path = tmp_path / "new.msh"
@@ -81,7 +81,7 @@ def test_a_file_of_each_format_is_the_mesh_that_was_written(block, tmp_path):
     same(ElasticBody(tmp_path / "block.mesh", contact="7", clamped="4"), body)
 
 
-def test_triangles_come_to_the_same_compliance(tmp_path):
+def test_mesh_of_triangles_converges_to_the_compliance_of_quadrilaterals(tmp_path):
     """Two discretisations of one body agree better the finer they are."""
     apart = []
     for fine, coarse, growth in ((4, 3, 1.1), (8, 6, 1.1**0.5)):
@@ -99,7 +99,7 @@ def test_triangles_come_to_the_same_compliance(tmp_path):
     assert apart[1] < 0.7 * apart[0] < 2e-3
 
 
-def test_the_nodes_of_a_cell_are_in_the_order_of_vtk(block):
+def test_vtk_output_has_cell_nodes_in_the_order_of_vtk(block):
     quads = block[0]
     triangles = ElasticBody(quads.mesh.to_meshtri())
     for body, sides in ((quads, 4), (triangles, 3)):
@@ -111,7 +111,7 @@ def test_the_nodes_of_a_cell_are_in_the_order_of_vtk(block):
     np.testing.assert_allclose(quads.areas().sum(), triangles.areas().sum(), rtol=1e-12)
 
 
-def test_a_mesh_of_scikit_fem_and_a_mapping_are_taken_too(block):
+def test_elastic_body_accepts_a_scikit_fem_mesh_and_a_mapping(block):
     body = block[0]
     same(ElasticBody(body.mesh), body)
     stiff = ElasticBody(SIZES, youngs_modulus=4.0)
@@ -125,7 +125,7 @@ def refusal(path, **settings):
     return str(caught.value)
 
 
-def test_a_file_without_the_boundary_names_those_that_are_there(block, tmp_path):
+def test_mesh_without_a_named_boundary_lists_the_existing_names(block, tmp_path):
     path = tmp_path / "block.msh"
     file_of(*block[1:]).write(path, file_format="gmsh22")
     said = refusal(path, contact="top")
@@ -142,7 +142,7 @@ def test_a_file_without_the_boundary_names_those_that_are_there(block, tmp_path)
     ("kind", "width", "fix"),
     [("tetra", 4, "cross-section"), ("triangle6", 6, "order 1"), ("quad8", 8, "order 1")],
 )
-def test_elements_of_another_kind(tmp_path, kind, width, fix):
+def test_mesh_with_unsupported_elements_is_rejected(tmp_path, kind, width, fix):
     rng = np.random.default_rng(0)
     path = tmp_path / "other.vtu"
     meshio.Mesh(rng.normal(size=(width, 3)), [(kind, np.arange(width)[None])]).write(path)
@@ -150,7 +150,7 @@ def test_elements_of_another_kind(tmp_path, kind, width, fix):
     assert f"cells of type {kind}" in said and fix in said
 
 
-def test_two_kinds_or_none(block, tmp_path):
+def test_mesh_with_two_kinds_of_elements_or_none_is_rejected(block, tmp_path):
     _, points, elements, lines, _ = block
     path = tmp_path / "mixed.vtu"
     meshio.Mesh(points, [("quad", elements[1:]), ("triangle", elements[:1, :3])]).write(path)
@@ -159,7 +159,7 @@ def test_two_kinds_or_none(block, tmp_path):
     assert "['line']" in refusal(path)
 
 
-def test_a_mesh_that_leaves_its_plane(block, tmp_path):
+def test_mesh_outside_a_plane_is_rejected(block, tmp_path):
     _, points, *rest = block
     lifted = points.copy()
     lifted[5, 2] = 0.25
@@ -181,7 +181,7 @@ def spoiled(block, change):
     )
 
 
-def test_elements_without_an_inside(block):
+def test_mesh_with_flat_or_crossed_elements_is_rejected(block):
     def flat(points, elements):
         points[:, elements[3, 10]] = points[:, elements[0, 10]]
 
@@ -203,7 +203,7 @@ def test_elements_without_an_inside(block):
     assert "inverted" in refusal(spoiled(block, far))
 
 
-def test_elements_on_one_side_of_an_edge(block):
+def test_mesh_with_folded_or_duplicate_elements_is_rejected(block):
     def twice(points, elements):
         return points, np.c_[elements, elements[:, 10]]
 
@@ -215,7 +215,7 @@ def test_elements_on_one_side_of_an_edge(block):
     assert "1 edges with both elements on one side" in said and "(1, 0)" in said
 
 
-def test_boundaries_that_bound_nothing(block, tmp_path):
+def test_mesh_with_missing_inner_or_shared_boundaries_is_rejected(block, tmp_path):
     body, points, elements, lines, groups = block
     mesh = body.mesh
     inner = np.flatnonzero(mesh.f2t[1] >= 0)[:3]
@@ -235,7 +235,7 @@ def test_boundaries_that_bound_nothing(block, tmp_path):
     assert "1 of 14 lines of 'contact' that are no edges" in refusal(path)
 
 
-def test_a_part_that_nothing_holds(block):
+def test_mesh_with_an_unclamped_part_is_rejected(block):
     mesh = block[0].mesh
     beside = skfem.MeshQuad(np.c_[mesh.p, mesh.p + [[5.0], [0.5]]],
                             np.c_[mesh.t, mesh.t + mesh.nvertices])  # fmt: skip
@@ -258,7 +258,7 @@ def test_a_part_that_nothing_holds(block):
         ("half.vtu", "<VTKFile><Unstruct"), ("block.xyz1", "1 2 3"), ("empty.msh", ""),
     ],
 )  # fmt: skip
-def test_what_cannot_be_read(tmp_path, capsys, name, text):
+def test_unreadable_mesh_file_is_rejected(tmp_path, capsys, name, text):
     path = tmp_path / name
     path.write_text(text)
     said = refusal(path)
@@ -266,7 +266,7 @@ def test_what_cannot_be_read(tmp_path, capsys, name, text):
     assert capsys.readouterr() == ("", "")
 
 
-def test_a_file_that_is_not_there(tmp_path):
+def test_missing_mesh_file_is_rejected(tmp_path):
     assert "no such file" in refusal(tmp_path / "none.msh")
 
 
@@ -278,17 +278,17 @@ def test_a_file_that_is_not_there(tmp_path):
         ({"fine_half_width": 4.0}, "fine_half_width"), ({"depth": 3.0}, "depth"),
     ],
 )  # fmt: skip
-def test_every_bad_size_is_refused_by_name(sizes, name):
+def test_block_sizes_out_of_range_are_rejected_by_name(sizes, name):
     assert repr(name) in refusal(sizes)
 
 
-def test_moduli_and_what_is_no_mesh():
+def test_elastic_body_rejects_invalid_moduli_and_meshes():
     with pytest.raises(dvax.InputError) as caught:
         ElasticBody(SIZES, youngs_modulus=0.0, poisson_ratio=0.5)
     assert len(caught.value.problems) == 2
     assert "a list" in refusal([1, 2, 3])
 
 
-def test_without_the_extra_it_is_named(monkeypatch):
+def test_elastic_body_without_the_fem_extra_names_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "skfem", None)
     assert 'pip install "dvax[fem]"' in refusal(SIZES)

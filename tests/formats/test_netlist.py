@@ -1,4 +1,4 @@
-"""Netlists: what is read, and what is refused with its line, the rule and the fix."""
+"""Netlists: accepted lines, and errors with line, rule and fix."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ TANK = "C1 1 0 1u IC=10\nL1 1 0 10m\nD1 1 0 R=1k\n"
         ("3nS", "conductance", 3e-9), ("7ms", "time", 7e-3), ("+2A", "current", 2.0),
     ],
 )  # fmt: skip
-def test_numbers_have_suffixes_and_units(text, quantity, value):
+def test_netlist_numbers_have_suffixes_and_units(text, quantity, value):
     assert read_value(text, quantity, "here") == pytest.approx(value, rel=1e-15)
 
 
@@ -43,7 +43,7 @@ def test_numbers_have_suffixes_and_units(text, quantity, value):
         ("3xyz", "resistance", "in no unit that is known"),
     ],
 )
-def test_numbers_without_sense_are_refused(text, quantity, said):
+def test_netlist_rejects_invalid_numbers(text, quantity, said):
     with pytest.raises(dvax.InputError) as caught:
         read_value(text, quantity, "a.net, line 3")
     (problem,) = caught.value.problems
@@ -90,7 +90,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_wrong_is_said_with_its_line(name):
+def test_netlist_errors_name_their_line(name):
     added, line, said = REFUSED[name]
     with pytest.raises(dvax.InputError) as caught:
         Circuit(TANK + added)
@@ -100,7 +100,7 @@ def test_what_is_wrong_is_said_with_its_line(name):
     assert problem.fix and problem.given
 
 
-def test_a_diode_without_resistance_is_named_and_the_regularised_circuit_offered():
+def test_netlist_error_for_diodes_without_resistance_suggests_regularisation():
     text = TANK.replace(" R=1k", "")
     with pytest.raises(dvax.InputError) as caught:
         Circuit(text)
@@ -114,14 +114,14 @@ def test_a_diode_without_resistance_is_named_and_the_regularised_circuit_offered
     assert Circuit(TANK, r_on=0.1).fit == "exact"
 
 
-def test_words_that_stand_twice_are_shown_both():
+def test_netlist_error_for_duplicate_keywords_shows_both():
     with pytest.raises(dvax.InputError) as caught:
         read_netlist("C1 1 0 1u IC=10 IC=5\nD1 1 0 R=1k R=2k", "x")
     said = [(problem.place, problem.given) for problem in caught.value.problems]
     assert said == [("x, line 1", "IC=10 and IC=5"), ("x, line 2", "R=1k and R=2k")]
 
 
-def test_a_source_that_ends_before_the_run_is_named_with_its_line():
+def test_netlist_source_shorter_than_the_run_names_its_line():
     circuit = Circuit(TANK + "R1 1 2 1k\nV1 2 0 PWL(0 0 1m 5)\nI1 0 1 PWL(0 0 9m 1)")
     circuit.check_sources(1e-3)
     for ask in (circuit.check_sources, circuit.solve):
@@ -136,14 +136,14 @@ def test_a_source_that_ends_before_the_run_is_named_with_its_line():
         assert "t_end = 0.001" in problem.fix
 
 
-def test_what_is_missing_from_the_whole_is_said_at_once():
+def test_netlist_errors_of_the_whole_circuit_are_reported_at_once():
     with pytest.raises(dvax.InputError) as caught:
         Circuit("R1 a b 5\nR2 a b 6")
     given = [problem.given for problem in caught.value.problems]
     assert given == ["no node 0", "no capacitor and no inductor", "no diode"]
 
 
-def test_all_lines_that_are_wrong_are_said_at_once():
+def test_netlist_reports_all_invalid_lines_at_once():
     with pytest.raises(dvax.InputError) as caught:
         Circuit("X1 a 0 5\nR1 a 0 -1\n\n* fine\nC1 a\nC1 a 0 1u\n")
     places = [problem.place for problem in caught.value.problems]
@@ -151,13 +151,13 @@ def test_all_lines_that_are_wrong_are_said_at_once():
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, np.inf, np.nan])
-def test_options_that_regularise_nothing_are_refused(value):
+def test_circuit_rejects_regularisation_options_without_effect(value):
     with pytest.raises(dvax.InputError) as caught:
         Circuit(TANK, r_on=value, g_leak=value)
     assert [p.place.split("(")[1] for p in caught.value.problems] == ["r_on)", "g_leak)"]
 
 
-def test_files_are_called_by_their_name(tmp_path):
+def test_netlist_errors_name_the_file(tmp_path):
     good, bad, binary = (tmp_path / name for name in ("good.net", "bad.net", "binary.net"))
     good.write_text("# Siconos's CircuitRLCD\n" + TANK + ".end\n", encoding="utf-8")
     bad.write_text(TANK + "R1 1 0 5H\n", encoding="utf-8")
@@ -171,7 +171,7 @@ def test_files_are_called_by_their_name(tmp_path):
         Circuit.from_file(tmp_path / "none.net")
 
 
-def test_lines_are_read_as_written():
+def test_netlist_lines_are_parsed_exactly():
     net = read_netlist(
         "l1 a 0 1m ic = 2 ; first\nV1 b 0 dc 5V\nV2 c 0 sin( 0, 1, 50 )\nD1 a b", "x"
     )

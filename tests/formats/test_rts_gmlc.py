@@ -1,4 +1,4 @@
-"""The loader of RTS-GMLC folders: a small system of our own, read right, and broken in every way."""
+"""The reader of RTS-GMLC folders: a small system, read correctly, and with errors of every kind."""
 
 import datetime
 
@@ -48,7 +48,7 @@ def write(folder, changes=(), places=None):
     return folder
 
 
-def test_a_small_system_is_what_its_files_say(tmp_path):
+def test_rts_folder_of_a_small_system_is_read_exactly(tmp_path):
     rts = read_rts(write(tmp_path))
     assert rts.names == ("101_CC_1", "201_CT_1", "201_NUC_1", "102_WIND_1", "202_PV_1")
     assert rts.area.tolist() == [1, 2, 2, 1, 2]
@@ -60,7 +60,7 @@ def test_a_small_system_is_what_its_files_say(tmp_path):
     np.testing.assert_allclose(rts.capacity[10], [300.0, 50.0, 200.0, 70.25, 72.0])
 
 
-def test_a_checkout_of_the_repository_is_read_as_well(tmp_path):
+def test_rts_checkout_of_the_repository_is_read(tmp_path):
     series = "RTS_Data/timeseries_data_files"
     places = {
         "gen.csv": "RTS_Data/SourceData/gen.csv",
@@ -72,7 +72,7 @@ def test_a_checkout_of_the_repository_is_read_as_well(tmp_path):
     np.testing.assert_array_equal(one.capacity, two.capacity)
 
 
-def test_a_market_of_some_hours(tmp_path):
+def test_market_from_rts_covers_a_range_of_hours(tmp_path):
     rts = read_rts(write(tmp_path))
     market = Market.from_rts(rts, 4, 6)
     b = 40.0 / (0.3 * rts.load.mean())
@@ -88,7 +88,7 @@ def test_a_market_of_some_hours(tmp_path):
 
 
 @pytest.mark.parametrize("hours", [(-1, 5), (0, 1), (0, 31), (25, 6), (0.0, 5), (True, 5)])
-def test_hours_that_are_not_there(tmp_path, hours):
+def test_market_from_rts_rejects_missing_hours(tmp_path, hours):
     with pytest.raises(dvax.InputError, match="the hours 0 to 29"):
         Market.from_rts(write(tmp_path), *hours)
 
@@ -125,14 +125,14 @@ BAD = [
 
 
 @pytest.mark.parametrize(("file", "line", "text", "place", "says"), BAD)
-def test_what_is_wrong_is_told_with_file_line_and_fix(tmp_path, file, line, text, place, says):
+def test_rts_errors_name_file_line_and_fix(tmp_path, file, line, text, place, says):
     with pytest.raises(dvax.InputError) as caught:
         read_rts(write(tmp_path, [(file, line, text)]))
     told = [str(problem) for problem in caught.value.problems]
     assert any(one.startswith(place) and says in one for one in told), told
 
 
-def test_all_of_it_is_told_at_once(tmp_path):
+def test_rts_errors_are_reported_at_once(tmp_path):
     changes = [(file, line, text) for file, line, text, *_ in (BAD[3], BAD[17], BAD[22], BAD[25])]
     with pytest.raises(dvax.InputError) as caught:
         read_rts(write(tmp_path, changes))
@@ -140,14 +140,15 @@ def test_all_of_it_is_told_at_once(tmp_path):
     assert all(file in text for file in ("gen.csv", WIND, PV)), text
 
 
-def test_a_column_that_has_slipped_makes_no_thousand_messages(tmp_path):
+def test_rts_errors_of_one_column_are_limited_to_twenty_messages(tmp_path):
+    """A shifted column gives twenty messages and one summary."""
     changes = [(WIND, k, f"{clock(k - 2)},gone") for k in range(2, 32)]
     with pytest.raises(dvax.InputError) as caught:
         read_rts(write(tmp_path, changes))
     assert len(caught.value.problems) == 21
 
 
-def test_files_that_are_missing_are_all_named(tmp_path):
+def test_rts_missing_files_are_all_named(tmp_path):
     write(tmp_path)
     (tmp_path / "gen.csv").unlink()
     (tmp_path / PV).unlink()

@@ -1,4 +1,4 @@
-"""TNTP files: what is read is what was written, and every flaw is named with its line."""
+"""TNTP files: round trips, and errors with their lines."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def write(network):
     return "\n".join(lines) + "\n"
 
 
-def test_what_was_written_is_read(tmp_path):
+def test_tntp_files_round_trip(tmp_path):
     network, trips = networks.grid(5, 6, 9, 50, 2e4, seed=3)
     again = formats.read_network(put(tmp_path, write(network)))
     for name in ("zones", "nodes", "first_thru_node"):
@@ -71,7 +71,8 @@ def test_what_was_written_is_read(tmp_path):
         np.testing.assert_array_equal(getattr(table, name), getattr(trips, name))
 
 
-def test_columns_are_found_by_name_with_units_blanks_and_strangers(tmp_path):
+def test_tntp_columns_are_identified_by_name(tmp_path):
+    """Units, blanks and unknown columns are accepted."""
     names = (
         "speed (km/h)|B|Power|Term node |Init node|Free Flow Time (min)|Length|Capacity (veh/h)|;"
     )
@@ -83,7 +84,7 @@ def test_columns_are_found_by_name_with_units_blanks_and_strangers(tmp_path):
     assert (network.init_node[0], network.term_node[0]) == (1, 2) and network.toll is None
 
 
-def test_flows_and_nodes_come_in_the_order_of_the_network(tmp_path):
+def test_tntp_flows_and_nodes_follow_the_order_of_the_network(tmp_path):
     network = formats.read_network(networks.braess(tmp_path)[0])
     flows = formats.read_flows(put(tmp_path, FLOW), network)
     assert flows.volume.tolist() == [4, 2, 2, 2, 4] and flows.cost.tolist() == [40, 52, 52, 12, 40]
@@ -91,7 +92,7 @@ def test_flows_and_nodes_come_in_the_order_of_the_network(tmp_path):
     assert nodes.tolist() == [[-1.0, 0.5], [1.0, 0.5], [0.0, 1.0], [0.0, 0.0]]
 
 
-def test_a_real_network_is_read():
+def test_tntp_real_network_is_read():
     folder = networks.SIOUX_FALLS
     if not folder.is_dir():
         pytest.skip(f"the Sioux Falls files are not at {folder}")
@@ -131,7 +132,7 @@ OF_NETWORKS = {
 
 
 @pytest.mark.parametrize("case", OF_NETWORKS)
-def test_a_flaw_of_a_network_is_named_with_its_line(case, tmp_path):
+def test_tntp_network_errors_name_their_line(case, tmp_path):
     old, new, place, given, said = OF_NETWORKS[case]
     assert old in NET
     found = flaws(formats.read_network, put(tmp_path, NET.replace(old, new, 1)))
@@ -156,7 +157,7 @@ OF_TRIPS = {
 
 
 @pytest.mark.parametrize("case", OF_TRIPS)
-def test_a_flaw_of_a_trip_table_is_named_with_its_line(case, tmp_path):
+def test_tntp_trip_errors_name_their_line(case, tmp_path):
     old, new, place, given, said = OF_TRIPS[case]
     assert old in TRIPS
     text = TRIPS.replace(old, new, 1)
@@ -166,7 +167,7 @@ def test_a_flaw_of_a_trip_table_is_named_with_its_line(case, tmp_path):
     assert said in f"{matching[0].rule} {matching[0].fix}"
 
 
-def test_a_total_is_compared_to_the_digits_that_it_has(tmp_path):
+def test_tntp_total_flow_is_compared_within_its_digits(tmp_path):
     rounded = TRIPS.replace("FLOW> 6.0", "FLOW> 7e+000").replace("6.0;", "6.6;")
     assert formats.read_trips(put(tmp_path, rounded)).flow.tolist() == [6.6]
     assert flaws(formats.read_trips, put(tmp_path, rounded.replace("6.6", "6.4")))
@@ -182,7 +183,7 @@ OF_FLOWS = {
 
 
 @pytest.mark.parametrize("case", OF_FLOWS)
-def test_a_flaw_of_known_flows_is_named(case, tmp_path):
+def test_tntp_flow_file_errors_are_named(case, tmp_path):
     network = formats.read_network(networks.braess(tmp_path)[0])
     old, new, place, given, said = OF_FLOWS[case]
     assert old in FLOW
@@ -191,7 +192,7 @@ def test_a_flaw_of_known_flows_is_named(case, tmp_path):
     assert said in f"{found[0].rule} {found[0].fix}"
 
 
-def test_flaws_of_node_files_are_named(tmp_path):
+def test_tntp_node_file_errors_are_named(tmp_path):
     network = formats.read_network(networks.braess(tmp_path)[0])
     text = NODE.replace("3\t0", "7\t0").replace("4\t0\t0", "1\t0\tnorth")
     found = flaws(formats.read_nodes, put(tmp_path, text), network)
@@ -199,7 +200,7 @@ def test_flaws_of_node_files_are_named(tmp_path):
     assert "no rows" in flaws(formats.read_nodes, put(tmp_path, "\n"), network)[0].given
 
 
-def test_all_flaws_of_both_files_come_at_once(tmp_path):
+def test_tntp_errors_of_both_files_are_reported_at_once(tmp_path):
     net = put(tmp_path, NET.replace("1\t3\t1", "1\t3\t-1").replace("\t4\t2\t1", "\t4\t2\tx"))
     trips = put(tmp_path, TRIPS.replace("6.0;", "-6.0;"), "some_trips.tntp")
     found = flaws(lambda: traffic.Traffic(net, trips, rate=0.0, rho="much"))
@@ -211,18 +212,18 @@ def test_all_flaws_of_both_files_come_at_once(tmp_path):
     ]  # fmt: skip
 
 
-def test_of_very_many_flaws_the_first_twenty_are_shown(tmp_path):
+def test_tntp_reports_at_most_twenty_errors(tmp_path):
     rows = "".join(f"1 {k} -1 0 1 0 4 0 0 1 ;\n" for k in range(100, 700))
     found = flaws(formats.read_network, put(tmp_path, NET.replace("LINKS> 5", "LINKS> 605") + rows))
     assert len(found) == 21 and found[-1].given == "1180 more problems"
 
 
-def test_a_file_that_is_not_there(tmp_path):
+def test_tntp_missing_file_is_rejected(tmp_path):
     found = flaws(formats.read_network, tmp_path / "none_net.tntp")
     assert "none_net.tntp" in found[0].place and "No such file" in found[0].given
 
 
-def test_demand_that_no_path_serves_is_named(tmp_path):
+def test_tntp_demand_without_a_path_is_named(tmp_path):
     net, trips = networks.braess(tmp_path)
     both = TRIPS.replace("6.0\n", "9.0\n", 1) + "Origin 2\n 1 : 3.0;\n"
     (one,) = flaws(traffic.Traffic, net, put(tmp_path, both, "some_trips.tntp"))
@@ -240,7 +241,7 @@ def test_demand_that_no_path_serves_is_named(tmp_path):
     assert "3 zones and 2" in one.given
 
 
-def test_arrays_are_checked_like_files():
+def test_traffic_arrays_are_checked_like_files():
     columns = dict(
         init_node=[1, 1], term_node=[2, 7], capacity=[1.0, -1.0], length=[0.0, 0.0],
         free_flow_time=[1.0, 1.0], b=[0.0, np.nan], power=[1.0, 1.0],

@@ -42,7 +42,7 @@ def main() -> int:
     print(f"{'problems':>8} {'runs':>5} {'wrong':>5} {'died':>5} {'bound':>5} {'CPU s':>6}  family")
     for family in chosen:
         jax.clear_caches()  # each family has programs of its own, and memory maps are limited
-        begun, runs, failed = time.process_time(), [], []
+        started, runs, failed = time.process_time(), [], []
         for seed in range(asked.first, asked.first + asked.samples):
             bounds = asked.bounds > 0 and seed % asked.bounds == 0
             try:
@@ -63,7 +63,7 @@ def main() -> int:
                 if r.failure
             ]
         counts = [sum(word in r.failure for r in runs) for word in ("wrong", "died", "bound")]
-        spent = time.process_time() - begun
+        spent = time.process_time() - started
         figures = " ".join(f"{n:5d}" for n in (len(runs), *counts))
         print(f"{asked.samples:8d} {figures} {spent:6.1f}  {family.name}")
         if failed:

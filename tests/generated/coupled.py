@@ -1,4 +1,4 @@
-"""Laws that no projection alone solves, controls of another size than states, tuples."""
+"""Generated problems whose law is not a projection, whose u and x differ in shape, or with tuples."""
 
 from typing import Any
 

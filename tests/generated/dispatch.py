@@ -1,5 +1,5 @@
-"""Power markets in hours: capacities and demand in pieces of lines, at hours up to 8784, with wind
-whose capacity is within a few MW of what it would make without it."""
+"""Power markets by the hour: piecewise linear capacities and demand, at hours up to 8784, with wind
+whose capacity is within a few MW of its unconstrained production."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Samples of a family through dvax and through SciPy, side by side."""
+"""Solve samples of a family with dvax and with SciPy, and compare them."""
 
 import time
 import zlib
@@ -46,7 +46,7 @@ def run(
     bounds: bool = True,
     certify: bool = False,
 ) -> Iterator[Record]:
-    """The sample number `seed` by each method; with `bounds` on the error of each, and once more to
+    """Solve sample `seed` by each method; with `bounds`, also bound each error, and solve once more to
     a certified tolerance."""
     sample = sample_of(family, seed)
     ts = sample.ts - sample.t0
@@ -71,7 +71,7 @@ def run(
     for name in methods or family.methods:
         if name == "default" and sample.rtol < SECOND_ORDER:
             continue
-        record = judge(family, seed, sample, name, truth, constants, second)
+        record = assess(family, seed, sample, name, truth, constants, second)
         if record.failure:
             # Two methods of SciPy against the one that is wrong: this one, or the third.
             finer, apart = second()
@@ -80,7 +80,7 @@ def run(
                 text = f"no reference: SciPy's methods are {apart:.1e} tolerances apart"
                 record = record._replace(failure=text)
             else:
-                record = judge(family, seed, sample, name, finer, constants, second)
+                record = assess(family, seed, sample, name, finer, constants, second)
         yield record
     if certify and constants is not None:
         method = (methods or family.methods)[0]
@@ -88,17 +88,17 @@ def run(
 
 
 def sample_of(family: Family, seed: int) -> Sample:
-    """Number `seed` of a family, each family with random numbers of its own."""
+    """Sample number `seed` of a family; each family has its own random numbers."""
     return family.draw(np.random.default_rng([seed, zlib.crc32(family.name.encode())]))
 
 
 def tolerance(sample: Sample, truth: Any) -> float:
-    """atol + rtol max|x| of the run, |·| the root mean square."""
+    """Return atol + rtol max|x| of the run, with the root mean square as |·|."""
     return float(sample.atol + sample.rtol * np.max(_size(truth)))
 
 
 def _size(x: Any) -> Any:
-    """The root mean square, as the step control has it."""
+    """The root mean square, as in the step-size control."""
     return np.sqrt(np.mean(np.square(x), axis=1))
 
 
@@ -110,13 +110,13 @@ def solve(family: Family, sample: Sample, method: str, **options: Any) -> dvax.S
     )  # fmt: skip
 
 
-def judge(
+def assess(
     family: Family, seed: int, sample: Sample, method: str, truth: Any, constants: Any, second: Any
 ) -> Record:
-    begun = time.perf_counter()
+    started = time.perf_counter()
     sol = solve(family, sample, method)
     steps = int(sol.stats["steps"])
-    spent = time.perf_counter() - begun
+    spent = time.perf_counter() - started
     good = bool(sol.result == dvax.RESULTS.successful)
     ratio, status, excess, failure = np.nan, "", 0.0, ""
     if good:
@@ -143,8 +143,8 @@ def judge(
 def certified(
     family: Family, seed: int, sample: Sample, method: str, truth: Any, constants: Any, second: Any
 ) -> Record:
-    """A run with `certified_tol`: refused, or within what it says. Refusing is no failure."""
-    begun = time.perf_counter()
+    """Run with `certified_tol`: an error message, or a result within the tolerance, is correct."""
+    started = time.perf_counter()
     wanted = 1e2 * tolerance(sample, truth)
     steps, ratio, excess, result, failure = 0, np.nan, 0.0, "refused", ""
     try:
@@ -163,12 +163,12 @@ def certified(
             failure = f"the certified bound is {excess:.3g} times too small"
     return Record(
         family.name, seed, f"{method}, certified", 0.0, result, ratio, steps, "", excess,
-        time.perf_counter() - begun, failure,
+        time.perf_counter() - started, failure,
     )  # fmt: skip
 
 
 def reached(sol: dvax.Solution) -> float:
-    """The bound that a run with `certified_tol` ended with, certified or estimated."""
+    """The bound at the end of a run with `certified_tol`, certified or estimated."""
     return sol.stats.get("certified_bound", sol.stats.get("estimated_bound", np.inf))
 
 

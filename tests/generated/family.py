@@ -1,4 +1,4 @@
-"""What a family of problems is: one structure, which is compiled once, and numbers drawn at random."""
+"""A family of problems: one structure, compiled once, with numbers drawn at random."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -78,7 +78,7 @@ def tolerance(
 
 
 def accuracy_for(rtol: float) -> float:
-    """Of a reference that a run at this tolerance is held against."""
+    """The accuracy of the reference for a run at this tolerance."""
     return max(1e-5 * rtol, FINEST)
 
 

@@ -1,4 +1,4 @@
-"""Numbers as functions of time that are hard on a step control: one formula for JAX and NumPy each.
+"""Functions of time that are difficult for step-size control, with one formula each for JAX and NumPy.
 
 A profile is drawn on [0, span]; `shifted` moves its times by t0, for a run that begins there. Its
 `breaks` are the times where its formula is not smooth, with more around narrow features, so that a
@@ -91,7 +91,7 @@ def _pulse(lib: Any, t: Any, p: Numbers) -> Any:
 
 
 def _trapezoid(lib: Any, t: Any, p: Numbers) -> Any:
-    """Up within a tenth of the width, down again, by clip."""
+    """A trapezoid that rises and falls within a tenth of its width, by clip."""
     s = (t - p["a"]) / p["w"]
     return lib.sum(p["d"] * lib.clip(lib.minimum(10.0 * s, 10.0 - 10.0 * s), 0.0, 1.0))
 
@@ -124,7 +124,7 @@ def _at(p: Numbers, span: float) -> list[float]:
 
 
 def _waves(least: float, most: float, low: float = 0.3, high: float = 0.9) -> Callable:
-    """A whole number of periods, or not, in the span: log-uniform between these."""
+    """The number of periods in the span, integer or not, log-uniform between these."""
 
     def draw(rng: np.random.Generator, span: float) -> Numbers:
         count = float(np.exp(rng.uniform(np.log(least), np.log(most))))

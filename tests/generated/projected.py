@@ -1,4 +1,4 @@
-"""Laws that a projection solves: any set, moved by any profile.
+"""Laws that are solved by a projection onto a set, which any profile moves.
 
     x' = A x + b u + e_f F(t),      u ∈ q(t) + e_h H(t) − g x − c u − N_{K(t)}(u)
 
@@ -161,13 +161,13 @@ def projected(
 
 
 def _period(p: dict[str, Numbers], periodic: bool) -> float | None:
-    """The one period of the data, where all of it has the same."""
+    """The common period of the data, if there is one."""
     widths = [v["w"] for v in p.values() if "w" in v]
     return float(widths[0]) if periodic and len(widths) == 1 else None
 
 
 def _matrix(rng: Any, generator: str, n: int) -> Array:
-    """Of a contraction: dissipative in the plain norm."""
+    """The matrix of a contraction: dissipative in the Euclidean norm."""
     if generator == "Diagonal":
         return -(10.0 ** rng.uniform(-1.0, 3.0, n))
     if generator == "Dense":

@@ -44,7 +44,7 @@ def second_order_cone(z: Array, slope: float) -> Array:
 
 
 def ellipsoid(z: Array, radii: Array) -> Array:
-    """λ ≥ 0 with Σ (rᵢzᵢ/(rᵢ² + λ))² = 1, by Newton's method from the left, where it climbs."""
+    """λ ≥ 0 with Σ (rᵢzᵢ/(rᵢ² + λ))² = 1, by Newton's method from the left, where it is monotone."""
     square = radii * radii
     scaled = (radii * z) ** 2
     if np.sum(scaled / square**2) <= 1.0:
@@ -74,7 +74,7 @@ def polyhedron(z: Array, faces: list[tuple], G: Array, d: Array) -> Array:
 
 
 def faces_of(G: Array) -> list[tuple]:
-    """(rows that hold, their pseudoinverse) for every independent choice."""
+    """(active rows, their pseudoinverse) for every independent choice."""
     every = [
         (list(r), len(r)) for k in range(G.shape[1] + 1) for r in combinations(range(len(G)), k)
     ]

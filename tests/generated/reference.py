@@ -1,4 +1,4 @@
-"""The trajectory by SciPy, with the law written by hand; nothing here comes from dvax."""
+"""The trajectory by SciPy with a hand-written law, without any code of dvax."""
 
 import itertools
 from collections.abc import Callable
@@ -54,7 +54,7 @@ def _cut(breaks: list[float], span: float, refine: int) -> Array:
 def _pieces(
     w: Written, begin: float, x: Array, stops: Array, ts: Array, method: str | None
 ) -> Array:
-    """Piece by piece: no step reaches over a break, and none is longer than a third of a piece."""
+    """Solve piece by piece: no step crosses a break, and none exceeds a third of a piece."""
     method = method or ("LSODA" if w.stiff else "DOP853")
     # A step ends at every time that is asked for: dense output is less accurate than the steps.
     apart = np.min(np.abs(stops[:, None] - ts[None]), axis=0) > 1e-12 * w.span
@@ -81,22 +81,24 @@ def _pieces(
 
 
 def _periodic(w: Written, ts: Array, stops: Array, method: str | None) -> Array:
-    """Period after period, until one changes nothing any more: all later ones are like the last."""
+    """Solve period by period, until the solution is periodic: later periods equal the last."""
     period = w.period
     assert period is not None
     inner = stops[(stops > 0) & (stops < (1.0 - 1e-9) * period)]
     one = np.concatenate([[0.0], inner[np.diff(inner, prepend=0.0) > 1e-9 * period], [period]])
     shifted = w._replace(span=period)
     rows, x = [], np.asarray(w.x0, float)
-    index, settled = 0, False
+    index, converged = 0, False
     done = np.floor(ts / period).astype(int)
     while len(rows) < len(ts):
-        if settled:
+        if converged:
             index = int(done[len(rows)])
         here = ts[len(rows) :][done[len(rows) :] == index] - index * period
         order = np.clip(here, 0.0, period)
         out = _pieces(shifted, 0.0, x, one, np.append(order, period), method)
         rows += list(out[:-1])
-        settled = bool(np.max(np.abs(out[-1] - x)) <= 0.1 * w.accuracy * (1.0 + np.max(np.abs(x))))
+        converged = bool(
+            np.max(np.abs(out[-1] - x)) <= 0.1 * w.accuracy * (1.0 + np.max(np.abs(x)))
+        )
         x, index = out[-1], index + 1
     return np.array(rows)

@@ -1,4 +1,4 @@
-"""Every set of dvax, with its numbers drawn at random and its projection by hand.
+"""Every set of dvax, with random data and a hand-written projection.
 
 Each is moved by a number e, 0 where nothing happens: most shrink by the factor 1 − e, so e < 1.
 """

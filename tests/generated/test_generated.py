@@ -1,5 +1,5 @@
-"""Generated problems beside SciPy with the law written by hand: no successful run above ten times its
-tolerance, no bound below the error, and no run that dies.
+"""Generated problems against SciPy with a hand-written law: the error of a successful run is at most
+ten tolerances, bounds are above the error, and no run crashes.
 
 `python -m tests.generated` prints a table of all that fails, and runs one problem alone.
 """
@@ -35,13 +35,13 @@ def check(records):
 
 
 @pytest.mark.parametrize("name", mostly_thorough(ALWAYS, list(ALWAYS)[1:3]))
-def test_few(name):
+def test_generated_problems_few(name):
     check([r for k in range(FEW) for r in driver.run(FAMILIES[name], k, ALWAYS[name], k == 0)])
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", FAMILIES)
-def test_many(name):
+def test_generated_problems_many(name):
     jax.clear_caches()  # each family has programs of its own, and memory maps are limited
     family = FAMILIES[name]
     check(
@@ -53,13 +53,13 @@ def test_many(name):
     )
 
 
-def test_ten_thousand():
+def test_generated_problems_ten_thousand():
     assert sum(family.samples for family in FAMILIES.values()) >= 10_000
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_a_projection_by_hand_is_the_nearest_point(name):
-    """⟨z − y, v − y⟩ ≤ 0 for all v of the set, which are projections as well; and it is not at rest."""
+def test_reference_projection_is_the_nearest_point(name):
+    """⟨z − y, v − y⟩ ≤ 0 for all v of the set, which are projections as well; and some z is outside."""
     kind, rng, moved = SETS[name], np.random.default_rng(1), 0.0
     for _ in range(20):
         p, e = kind.draw(rng), float(rng.uniform(-0.5, 0.9))
@@ -71,7 +71,7 @@ def test_a_projection_by_hand_is_the_nearest_point(name):
     assert (moved > 0.0) == (name != "WholeSpace")
 
 
-def test_the_reference_on_a_short_contact():
+def test_reference_solution_of_a_short_contact_is_the_closed_form():
     """x' = min(w, |s − a|) − x/10 in closed form, and as periods that are skipped."""
     a, w, k = 0.4, 0.05, 0.1
     written = reference.Written(

@@ -1,4 +1,4 @@
-"""Constant coefficients on a box, against matrices that numpy writes down and scipy exponentiates."""
+"""`Elliptic` against matrices by NumPy and their exponentials by SciPy."""
 
 import functools
 import itertools
@@ -24,7 +24,7 @@ USUAL = [(s, b) for s, b in KINDS if s in ((1,), (5,))] + [
 
 
 @pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(KINDS, USUAL))
-def test_a_transform_is_the_one_by_its_definition_and_comes_back(shape, boundary):
+def test_elliptic_transform_agrees_with_its_definition_and_inverts(shape, boundary):
     x = np.random.default_rng(0).normal(size=shape)
     transform = Transform(shape, boundary)
     c = transform.forward(jnp.asarray(x))
@@ -47,7 +47,7 @@ def test_a_transform_is_the_one_by_its_definition_and_comes_back(shape, boundary
 
 
 @pytest.mark.parametrize("n", [16, 17])
-def test_cosines_and_sines_are_scipys(n):
+def test_elliptic_cosine_and_sine_transforms_agree_with_scipy(n):
     x = np.random.default_rng(1).normal(size=(n, n))
     found = Transform((n, n), ("neumann", "dirichlet")).forward(jnp.asarray(x))
     exact = scipy.fft.dst(scipy.fft.dct(x, axis=0), axis=1)[:, ::-1]
@@ -97,7 +97,7 @@ def operator(shape, boundary):
 
 
 @pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(GRIDS, GRIDS[2::2]))
-def test_differences_are_their_matrix(shape, boundary):
+def test_elliptic_differences_equal_their_matrix(shape, boundary):
     A, matrix, _ = operator(shape, boundary)
     rng, size = np.random.default_rng(2), int(np.prod(shape))
     x0, c0, c1 = rng.normal(size=(3, size))
@@ -117,7 +117,7 @@ def test_differences_are_their_matrix(shape, boundary):
 
 
 @pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(GRIDS, GRIDS[1::2]))
-def test_the_growth_bound_holds_and_is_reached(shape, boundary):
+def test_elliptic_growth_bound_holds_and_is_sharp(shape, boundary):
     A, matrix, _ = operator(shape, boundary)
     M, omega = map(float, A.growth(spaces.Euclidean(shape)))
     assert M == 1.0
@@ -133,7 +133,7 @@ def test_the_growth_bound_holds_and_is_reached(shape, boundary):
 
 
 @pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(GRIDS, GRIDS[:5:2]))
-def test_a_step_stays_within_its_chord_deviation(shape, boundary):
+def test_elliptic_step_stays_within_its_curvature_bound(shape, boundary):
     A, _, _ = operator(shape, boundary)
     x0, c0, c1 = jnp.asarray(np.random.default_rng(4).normal(size=(3, *shape)))
     space, h = spaces.Euclidean(shape), 0.2
@@ -149,7 +149,7 @@ def test_a_step_stays_within_its_chord_deviation(shape, boundary):
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-def test_the_spectral_scheme_is_exact_for_what_the_grid_shows(boundary):
+def test_elliptic_spectral_scheme_is_exact_for_resolved_modes(boundary):
     n, length, k = 24, 3.0, 4
     s = (np.arange(n) + 0.5) * length / n
     wave = {"periodic": 2 * np.pi, "dirichlet": np.pi, "neumann": np.pi}[boundary] * k / length
@@ -161,7 +161,7 @@ def test_the_spectral_scheme_is_exact_for_what_the_grid_shows(boundary):
     np.testing.assert_allclose(np.asarray(found), exact, atol=1e-13)
 
 
-def test_pure_advection_keeps_the_norm_of_what_it_moves():
+def test_elliptic_pure_advection_conserves_the_norm():
     A = generators.Elliptic((8, 9), 1.0, "periodic", diffusion=0.0, velocity=(0.3, -0.2))
     x = jnp.asarray(np.random.default_rng(5).normal(size=(8, 9)))
     far = A.semigroup(100.0, x)
@@ -170,7 +170,7 @@ def test_pure_advection_keeps_the_norm_of_what_it_moves():
     assert float(A.growth(spaces.Euclidean((8, 9))).omega) == 0.0
 
 
-def test_single_precision_stays_single_and_parameters_have_derivatives():
+def test_elliptic_keeps_single_precision_and_differentiates_parameters():
     one = np.float32
     A = generators.Elliptic(8, one(1.0), "periodic", one(0.1), one(0.2), one(0.0))
     assert A.semigroup(one(0.1), jnp.ones(8, one)).dtype == np.float32
@@ -196,12 +196,12 @@ def test_single_precision_stays_single_and_parameters_have_derivatives():
         (dict(shape=4, scheme="chebyshev"), "'spectral' or 'differences'"),
     ],
 )
-def test_what_does_not_fit_is_refused(arguments, words):
+def test_elliptic_rejects_invalid_arguments(arguments, words):
     with pytest.raises(dvax.InputError, match=words):
         generators.Elliptic(**arguments)
 
 
-def test_numbers_that_are_known_stay_known_while_others_are_traced():
+def test_elliptic_static_coefficients_stay_static_beside_traced_ones():
     """No advection is no advection also where the diffusion is a parameter under jit."""
     x = jnp.arange(1.0, 5.0)
     made = lambda d: dvax.generators.Elliptic(4, 1.0, "neumann", diffusion=d)  # noqa: E731

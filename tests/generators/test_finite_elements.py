@@ -1,4 +1,4 @@
-"""Consistent mass matrices: linear elements on meshes that nobody arranged."""
+"""Consistent mass matrices: linear elements on unstructured random meshes."""
 
 import jax
 import jax.numpy as jnp
@@ -63,7 +63,7 @@ semigroup = jax.jit(lambda A, h, v: A.semigroup(h, v))
 
 
 @pytest.mark.parametrize("name", MESHES)
-def test_the_semigroup_is_that_of_the_pencil(name):
+def test_finite_elements_semigroup_is_that_of_the_pencil(name):
     M, S, interval = MESHES[name]
     A = generators.FiniteElements(M, S, interval, dissipative=True)
     dense = -np.linalg.solve(M.toarray(), S.toarray())
@@ -78,7 +78,7 @@ def test_the_semigroup_is_that_of_the_pencil(name):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_element_decides_the_interval(seed):
+def test_finite_elements_mass_eigenvalues_lie_in_the_interval_of_the_element(seed):
     # Wathen's theorem for linear triangles, on which the declared interval rests.
     M, _ = assembled(*mesh(40, seed))
     D = M.diagonal()
@@ -97,13 +97,13 @@ CORNERS = {  # D⁻¹M of one element: of simplices, and of boxes as products of
 
 
 @pytest.mark.parametrize("interval", CORNERS)
-def test_the_intervals_that_are_named_are_those_of_the_elements(interval):
+def test_finite_elements_named_intervals_are_those_of_the_elements(interval):
     values = np.linalg.eigvalsh(CORNERS[interval])
     np.testing.assert_allclose([values[0], values[-1]], interval)
 
 
 @pytest.mark.parametrize("name", MESHES)
-def test_the_numerical_range_lies_in_the_rectangle(name):
+def test_finite_elements_numerical_range_lies_in_the_rectangle(name):
     M, S, interval = MESHES[name]
     found = generators.FiniteElements(M, S, interval).numerical_range()
     rates = scipy.linalg.eigvalsh(-S.toarray(), M.toarray())
@@ -111,7 +111,7 @@ def test_the_numerical_range_lies_in_the_rectangle(name):
     assert float(found.height) <= 1e-9 * abs(float(found.low))
 
 
-def test_the_growth_bound_holds_where_responses_live():
+def test_finite_elements_growth_bound_holds_in_diagonal_norms():
     M, S, interval = MESHES["triangles"]
     A = generators.FiniteElements(M, S, interval, dissipative=True)
     D = M.diagonal()
@@ -125,7 +125,7 @@ def test_the_growth_bound_holds_where_responses_live():
     assert float(A.growth(spaces.L2(D)).M) == pytest.approx(2.0)
 
 
-def test_the_adjoint_is_the_adjoint():
+def test_finite_elements_adjoint_is_correct():
     M, S, interval = MESHES["triangles"]
     A = generators.FiniteElements(M, S, interval)
     rng = np.random.default_rng(5)
@@ -138,7 +138,7 @@ def test_the_adjoint_is_the_adjoint():
 
 
 @pytest.mark.thorough
-def test_derivatives_in_the_entries_of_both_matrices():
+def test_finite_elements_derivatives_in_the_entries_of_both_matrices():
     _, M, S = rod(12)
     place = jnp.asarray(np.stack(M.tocoo().coords, axis=1))
     data, other = (jnp.asarray(v.tocoo().data) for v in (M, S))
@@ -167,7 +167,7 @@ def test_derivatives_in_the_entries_of_both_matrices():
 
 
 @pytest.mark.thorough
-def test_a_rod_cools_as_it_should_to_second_order_in_the_mesh():
+def test_finite_elements_cooling_rod_has_order_two_in_the_mesh():
     errors = []
     for n in (9, 19, 39):
         nodes, M, S = rod(n)
@@ -185,7 +185,7 @@ def test_a_rod_cools_as_it_should_to_second_order_in_the_mesh():
     assert (orders > 1.85).all()
 
 
-def test_a_declared_interval_makes_the_bound_declared():
+def test_finite_elements_bound_from_a_declared_interval_is_declared():
     M, S, interval = MESHES["triangles"]
     assert is_declared(generators.FiniteElements(M, S, interval))
     assert is_declared(generators.FiniteElements(*rod(10)[1:], dissipative=True))
@@ -206,7 +206,7 @@ def test_a_declared_interval_makes_the_bound_declared():
         (lambda M, S: generators.FiniteElements(M, S, (0.0, 2.0)), "mass_range"),
     ],
 )
-def test_what_does_not_fit_is_refused(make, word):
+def test_finite_elements_rejects_invalid_arguments(make, word):
     M, S, _ = MESHES["triangles"]
     with pytest.raises(dvax.InputError, match=word):
         make(M, S)

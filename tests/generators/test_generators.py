@@ -25,7 +25,7 @@ def _flow(matrix, h, x0, c0, c1, c2):
 
 @pytest.mark.parametrize("name", MATRICES)
 @pytest.mark.parametrize("h", [1e-3, 0.7])
-def test_the_propagator_solves_the_equation_with_a_quadratic_forcing(name, h):
+def test_propagator_solves_the_equation_with_quadratic_forcing(name, h):
     A = MATRICES[name]
     x0, c = (
         np.array([1.0, -2.0, 0.5]),
@@ -40,19 +40,19 @@ def test_the_propagator_solves_the_equation_with_a_quadratic_forcing(name, h):
 
 
 @pytest.mark.parametrize("name", MATRICES)
-def test_the_semigroup_is_the_matrix_exponential(name):
+def test_semigroup_is_the_matrix_exponential(name):
     A, v = MATRICES[name], np.array([0.2, 1.0, -0.4])
     found = np.asarray(generators.Dense(A).semigroup(0.9, jnp.asarray(v)))
     np.testing.assert_allclose(found, scipy.linalg.expm(0.9 * A) @ v, rtol=1e-12, atol=1e-13)
 
 
-def test_the_semigroup_law_holds():
+def test_semigroup_law_holds():
     A, v = generators.Dense(MATRICES["non-normal"]), jnp.array([0.2, 1.0, -0.4])
     twice = A.semigroup(0.3, A.semigroup(0.5, v))
     np.testing.assert_allclose(np.asarray(A.semigroup(0.8, v)), np.asarray(twice), rtol=1e-13)
 
 
-def test_scalar_diagonal_dense_and_product_are_the_same_operator_in_other_clothes():
+def test_scalar_diagonal_dense_and_product_agree_on_the_same_operator():
     a, x0 = np.array([-0.5, -0.5]), np.array([1.0, -3.0])
     c = (jnp.array([0.2, -1.0]), jnp.array([1.0, 2.0]))
     h, x = 0.37, jnp.asarray(x0)
@@ -73,7 +73,7 @@ def test_scalar_diagonal_dense_and_product_are_the_same_operator_in_other_clothe
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_no_random_matrix_breaks_its_growth_bound_and_none_could_have_a_smaller_one(weighted):
+def test_dense_growth_bound_holds_and_is_sharp_for_random_matrices(weighted):
     rng = np.random.default_rng(20261121 + weighted)
     for _ in range(25):
         n = 4
@@ -90,7 +90,7 @@ def test_no_random_matrix_breaks_its_growth_bound_and_none_could_have_a_smaller_
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_a_matrix_far_from_normal_has_a_bound_that_decays_and_holds(weighted):
+def test_dense_growth_bound_of_a_nonnormal_matrix_decays(weighted):
     # ‖e^{At}‖ rises above 100 before it decays: the logarithmic norm is +149.
     A = np.array([[-1.0, 300.0], [0.0, -1.2]])
     w = np.array([0.3, 2.0]) if weighted else np.ones(2)
@@ -106,7 +106,7 @@ def test_a_matrix_far_from_normal_has_a_bound_that_decays_and_holds(weighted):
     assert float(generators.Dense(A).growth(space).omega) > 50
 
 
-def test_growth_of_the_other_generators_is_read_off():
+def test_growth_bounds_of_scalar_diagonal_zero_and_product():
     plane = spaces.Euclidean(2)
     assert float(generators.Scalar(-0.7).growth(plane).omega) == -0.7
     assert float(generators.Diagonal(jnp.array([-3.0, -0.2])).growth(plane).omega) == -0.2
@@ -127,7 +127,7 @@ def test_growth_of_the_other_generators_is_read_off():
         (lambda: generators.Diagonal(np.array([1, 2])), "int64"),
     ],
 )
-def test_what_is_no_generator_is_refused_with_what_was_given(make, word):
+def test_generators_reject_invalid_arguments(make, word):
     with pytest.raises(dvax.InputError, match=word):
         make()
 
@@ -141,7 +141,7 @@ def test_what_is_no_generator_is_refused_with_what_was_given(make, word):
         generators.Product(generators.Scalar(-1.0), generators.Scalar(-1.0)),
     ],
 )
-def test_a_generator_of_another_size_than_the_state_is_refused(A):
+def test_generator_of_another_size_than_the_state_is_rejected(A):
     with pytest.raises(dvax.InputError, match=r"dvax\.generators"):
         A.check(spaces.Euclidean(2))
 
@@ -172,7 +172,7 @@ ADJOINTS = {
 
 
 @pytest.mark.parametrize("name", ADJOINTS)
-def test_the_adjoint_and_its_semigroup_change_sides(name):
+def test_adjoint_and_its_semigroup_satisfy_the_inner_product_identity(name):
     A, space = ADJOINTS[name]
     rng = np.random.default_rng(7)
     v, w = (
@@ -186,7 +186,7 @@ def test_the_adjoint_and_its_semigroup_change_sides(name):
         assert float(space.inner(left, w)) == pytest.approx(float(space.inner(v, right)), rel=1e-11)
 
 
-def test_an_adjoint_of_another_kind_is_refused():
+def test_adjoint_of_another_kind_is_rejected():
     with pytest.raises(dvax.InputError, match="no constant coefficients"):
         generators.Elliptic(4).adjoint(weighted(4, alike=False))
     uneven = spaces.Product(spaces.L2(np.ones(2)), spaces.L2(np.full(2, 3.0)))
@@ -194,7 +194,7 @@ def test_an_adjoint_of_another_kind_is_refused():
         generators.Rotation(np.zeros(2), np.ones(2)).adjoint(uneven)
 
 
-def test_a_matrix_of_any_norm_has_its_exponential():
+def test_dense_exponential_of_a_matrix_of_any_norm():
     # JAX's own gives NaN beyond a norm of 3·10⁵, and squaring e^{hA} as it stands loses ten digits.
     A = np.array([[-1e9, 3.0], [0.0, -0.5]])
     found = np.asarray(generators.Dense(A).semigroup(2.0, jnp.array([1.0, 1.0])))

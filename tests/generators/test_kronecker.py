@@ -1,4 +1,4 @@
-"""A field and a matrix across its components: they commute, and the flow is that of both."""
+"""`KroneckerSum`: field and matrix commute, and the semigroup is the product of both."""
 
 import jax
 import jax.numpy as jnp
@@ -24,14 +24,14 @@ FIELDS = {
 
 
 def matrix_of(A, shape):
-    """A written out."""
+    """The dense matrix of A."""
     n = int(np.prod(shape))
     columns = jax.vmap(lambda v: A.apply(v.reshape(shape)).ravel())(jnp.eye(n))
     return np.asarray(columns).T
 
 
 @pytest.mark.parametrize("name", FIELDS)
-def test_the_flow_is_that_of_the_matrix_exponential(name):
+def test_kronecker_semigroup_is_the_matrix_exponential(name):
     A = generators.KroneckerSum(FIELDS[name], B)
     shape = (3, *GRID)
     dense = matrix_of(A, shape)
@@ -47,7 +47,7 @@ def test_the_flow_is_that_of_the_matrix_exponential(name):
         np.testing.assert_allclose(found, exact, atol=1e-12 * max(1.0, np.abs(exact).max()))
 
 
-def test_the_pair_commutes_and_the_growth_bound_holds():
+def test_kronecker_parts_commute_and_the_growth_bound_holds():
     field = FIELDS["fixed and free ends"]
     A = generators.KroneckerSum(field, B)
     v = jnp.asarray(RNG.normal(size=(3, *GRID)))
@@ -66,7 +66,7 @@ def test_the_pair_commutes_and_the_growth_bound_holds():
     assert float(bound.omega) == pytest.approx(exact, rel=1e-12)
 
 
-def test_the_adjoint_is_the_adjoint():
+def test_kronecker_adjoint_is_correct():
     space = spaces.Euclidean((3, *GRID))
     A = generators.KroneckerSum(FIELDS["advection"], B)
     v, w = jnp.asarray(RNG.normal(size=(2, 3, *GRID)))
@@ -74,7 +74,7 @@ def test_the_adjoint_is_the_adjoint():
     assert float(left) == pytest.approx(float(space.inner(v, A.adjoint(space).semigroup(0.3, w))))
 
 
-def test_a_solve_is_that_of_the_same_matrix():
+def test_kronecker_solve_equals_that_of_the_dense_matrix():
     field = generators.Elliptic(6, 1.0, "neumann", diffusion=0.05)
     coupling = np.array([[-0.5, 0.5], [0.3, -0.3]])
     laws = dict(
@@ -92,7 +92,7 @@ def test_a_solve_is_that_of_the_same_matrix():
 
 
 @pytest.mark.thorough
-def test_derivatives_in_the_matrix_and_the_field():
+def test_kronecker_derivatives_in_the_matrix_and_the_field():
     v = jnp.asarray(RNG.normal(size=(2, 5)))
 
     def end(coupling, diffusion):
@@ -104,7 +104,7 @@ def test_derivatives_in_the_matrix_and_the_field():
 
 
 @pytest.mark.parametrize("shape", [(2, *GRID), (*GRID, 3), ()])
-def test_what_does_not_fit_is_refused(shape):
+def test_kronecker_rejects_invalid_arguments(shape):
     A = generators.KroneckerSum(FIELDS["fixed and free ends"], B)
     with pytest.raises(dvax.InputError, match="KroneckerSum|Elliptic"):
         A.check(spaces.Euclidean(shape))

@@ -1,4 +1,4 @@
-"""Transforms on a line by half as many complex numbers, against SciPy's and as linear maps."""
+"""One-dimensional transforms with half as many complex numbers, against SciPy's and as linear maps."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ def numbers(n):
 
 
 @SIZES
-def test_waves_are_the_fourier_transform_of_real_numbers(n):
+def test_line_transform_is_the_real_fourier_transform(n):
     x = numbers(n)
     F = np.fft.rfft(x)
     np.testing.assert_allclose(rfft(jnp.asarray(x)), F, atol=1e-12)
@@ -28,7 +28,7 @@ def test_waves_are_the_fourier_transform_of_real_numbers(n):
 
 
 @SIZES
-def test_what_no_real_numbers_have_is_left_out_on_the_way_back(n):
+def test_line_inverse_transform_ignores_imaginary_parts_of_real_modes(n):
     F = np.fft.rfft(numbers(n)) + 0j
     F[[0, -1]] += [2j, -3j]
     back = np.fft.irfft(F, n)
@@ -36,7 +36,7 @@ def test_what_no_real_numbers_have_is_left_out_on_the_way_back(n):
 
 
 @SIZES
-def test_cosines_and_sines_are_those_of_type_two(n):
+def test_line_cosine_and_sine_transforms_are_of_type_two(n):
     x = numbers(n)
     for sign, whole in ((1.0, scipy.fft.dct(x, 2)), (-1.0, scipy.fft.dst(x, 2)[::-1])):
         np.testing.assert_allclose(dct(jnp.asarray(x), sign), whole, atol=1e-12)
@@ -44,7 +44,7 @@ def test_cosines_and_sines_are_those_of_type_two(n):
 
 
 @SIZES
-def test_derivatives_go_both_ways(n):
+def test_line_transforms_have_derivatives_in_both_modes(n):
     rng = np.random.default_rng(n)
     x, y = jnp.asarray(rng.normal(size=(2, n)))
     for there in (lambda v: dct(v, -1.0), lambda v: idct(v, 1.0)):
@@ -55,7 +55,7 @@ def test_derivatives_go_both_ways(n):
         np.testing.assert_allclose(moved @ w, y @ pull(w)[0], rtol=1e-11)
 
 
-def test_single_precision_stays_single():
+def test_line_transforms_keep_single_precision():
     x = jnp.asarray(numbers(32), jnp.float32)
     c = dct(x, 1.0)
     assert c.dtype == jnp.float32 and idct(c, 1.0).dtype == jnp.float32

@@ -1,4 +1,4 @@
-"""Sparse matrices and generators of one's own: Faber series against matrix exponentials, numerical
+"""Sparse and user-defined matrix-free generators: Faber series against matrix exponentials, numerical
 ranges against eigenvalues."""
 
 import jax
@@ -66,7 +66,7 @@ X0, C = RNG.normal(size=N), RNG.normal(size=(3, N))
 
 
 @pytest.mark.parametrize("name", MATRICES)
-def test_the_flow_is_that_of_the_matrix_exponential(name):
+def test_sparse_semigroup_is_the_matrix_exponential(name):
     A = generators.Sparse(MATRICES[name], weights_of(name))
     dense = MATRICES[name].toarray()
     for h in (1e-3, 0.1, 2.0):
@@ -77,7 +77,7 @@ def test_the_flow_is_that_of_the_matrix_exponential(name):
         assert np.abs(found - expected).max() <= size * np.abs(expected).max()
 
 
-def test_the_number_of_products_is_what_the_documentation_says():
+def test_sparse_number_of_products_is_as_documented():
     heat = generators.Sparse(MATRICES["heat"]).propagator(jnp.asarray(2.0), 2)
     wave = generators.Sparse(MATRICES["advection"]).propagator(jnp.asarray(2.0), 2)
     assert int(heat.degree) <= 6 * np.sqrt(2.0 * 800) and int(heat.substeps) == 1
@@ -94,7 +94,7 @@ def supports(A, w):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_the_numerical_range_lies_in_the_rectangle_and_in_the_ellipse(seed):
+def test_sparse_numerical_range_lies_in_rectangle_and_ellipse(seed):
     rng = np.random.default_rng(seed)
     n = 12
     A = scattered(rng, n, rng.uniform(0.05, 0.6)).toarray()
@@ -115,14 +115,14 @@ def test_the_numerical_range_lies_in_the_rectangle_and_in_the_ellipse(seed):
         assert support <= cos * centre + np.hypot(a * cos, b * sin) + 1e-10
 
 
-def test_constant_coefficients_have_the_ellipse_that_they_have():
+def test_sparse_ellipse_of_constant_coefficients_is_exact():
     found = generators.Sparse(MATRICES["advection and diffusion"]).numerical_range()
     np.testing.assert_allclose(found.ellipse, (-100.0, 100.0, 120.0))
     np.testing.assert_allclose(found[:3], (-200.0, 0.0, 120.0))
 
 
 @pytest.mark.parametrize("name", ["heat", "far from normal", "weighted heat", "scattered"])
-def test_the_growth_bound_holds_in_its_own_norm_and_in_another(name):
+def test_sparse_growth_bound_holds_in_two_norms(name):
     dense, w = MATRICES[name].toarray(), np.broadcast_to(weights_of(name), N)
     A = generators.Sparse(MATRICES[name], weights_of(name))
     other = RNG.uniform(0.5, 2.0, N)
@@ -136,7 +136,7 @@ def test_the_growth_bound_holds_in_its_own_norm_and_in_another(name):
 
 
 @pytest.mark.parametrize("own", [False, True])
-def test_the_adjoint_is_the_adjoint_and_has_its_own_flow(own):
+def test_sparse_adjoint_and_its_semigroup_are_correct(own):
     name = "weighted heat" if own else "advection and diffusion"
     A = generators.Sparse(MATRICES[name], weights_of(name))
     space = spaces.L2(RNG.uniform(0.5, 2.0, N))
@@ -155,7 +155,7 @@ def test_the_adjoint_is_the_adjoint_and_has_its_own_flow(own):
 
 
 @pytest.mark.thorough
-def test_derivatives_in_all_that_enters_go_both_ways():
+def test_sparse_derivatives_in_all_arguments_in_both_modes():
     pattern = MATRICES["advection and diffusion"].tocoo()
     places = jnp.asarray(np.stack([pattern.row, pattern.col], 1))
 
@@ -180,7 +180,7 @@ def test_derivatives_in_all_that_enters_go_both_ways():
 
 
 @pytest.mark.thorough
-def test_the_derivative_at_zero_is_the_map_itself():
+def test_sparse_derivative_at_zero_is_the_operator():
     # A Krylov space has nothing to show there; a polynomial is the same everywhere.
     pattern = MATRICES["advection and diffusion"]
     A = generators.Sparse(pattern)
@@ -190,7 +190,7 @@ def test_the_derivative_at_zero_is_the_map_itself():
     )
 
 
-def test_the_lanes_of_a_batch_are_what_they_are_alone():
+def test_sparse_batch_equals_its_lanes():
     A = generators.Sparse(MATRICES["heat"])
     hs = jnp.asarray([1e-3, 0.05, 2.0])
     x0 = jnp.asarray(X0)
@@ -214,7 +214,7 @@ class Waves(generators.AbstractMatrixFree):
         return generators.Range(0.0, 0.0, 2.0 * self.stiffness)
 
 
-def test_a_generator_of_ones_own_is_two_methods():
+def test_matrix_free_subclass_needs_two_methods():
     A = Waves(30.0)
     q, p = jnp.asarray(X0), jnp.asarray(C[0])
     space = spaces.Product(spaces.Euclidean(N), spaces.Euclidean(N))
@@ -235,7 +235,7 @@ def test_a_generator_of_ones_own_is_two_methods():
 
 
 @pytest.mark.thorough
-def test_a_solve_is_that_of_the_same_operator_by_transforms():
+def test_sparse_solve_equals_that_of_elliptic():
     n = 30
     h = 1.0 / n
     ends = np.r_[-3.0, np.full(n - 2, -2.0), -3.0]
@@ -274,13 +274,13 @@ def test_a_solve_is_that_of_the_same_operator_by_transforms():
         (lambda: Waves(1.0).check(spaces.Euclidean(2)), "Waves.apply"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_what_was_given(make, word):
+def test_sparse_rejects_invalid_arguments(make, word):
     with pytest.raises(dvax.InputError, match=word):
         make()
 
 
 def decays(rates, h):
-    """Whether a diagonal matrix, given as a sparse one, decays as it must."""
+    """Return the number of pieces of a step of a diagonal matrix, after checking its decay."""
     A = generators.Sparse(scipy.sparse.diags_array(rates).tocsr())
     propagator = A.propagator(jnp.asarray(h), 0)
     found = np.asarray(propagator.step(jnp.ones(len(rates)), ()))
@@ -291,7 +291,7 @@ def decays(rates, h):
 
 
 @pytest.mark.thorough
-def test_a_step_too_stiff_for_one_series_is_taken_in_pieces_or_not_at_all():
+def test_sparse_stiff_step_is_split_or_returns_nan():
     rates = -np.array([0.0, 1e-6, 1e-6, 0.1, 1.0])
     assert decays(1e6 * rates, 1.0) == 1
     assert decays(1e8 * rates, 1.0) > 1
@@ -299,7 +299,7 @@ def test_a_step_too_stiff_for_one_series_is_taken_in_pieces_or_not_at_all():
     assert np.isnan(np.asarray(A.semigroup(1.0, jnp.ones(5)))).all()
 
 
-def test_what_is_not_a_number_stays_so():
+def test_sparse_propagates_nan():
     places = jnp.asarray([[0, 0], [1, 1]])
     make = lambda values: generators.Sparse(BCOO((values, places), shape=(2, 2)))  # noqa: E731
     end = jax.jit(lambda values, h: make(values).semigroup(h, jnp.ones(2)))
@@ -313,7 +313,7 @@ def test_what_is_not_a_number_stays_so():
     assert np.isnan(lanes[1]).all()
 
 
-def test_single_precision_stays_single_and_costs_as_little():
+def test_sparse_keeps_single_precision_at_equal_cost():
     matrix = MATRICES["stiff heat"].astype(np.float32)
     propagator = generators.Sparse(matrix).propagator(jnp.asarray(0.5, jnp.float32), 2)
     assert int(propagator.substeps) == 1 and int(propagator.degree) < 6 * np.sqrt(0.5 * 4e5)
@@ -324,7 +324,7 @@ def test_single_precision_stays_single_and_costs_as_little():
     assert np.max(np.abs(np.asarray(found) - expected)) < 3e-3 * np.max(np.abs(expected))
 
 
-def test_rows_that_only_turn_beside_rows_that_only_decay():
+def test_sparse_ellipse_of_skew_and_decaying_rows_is_bounded():
     matrix = np.diag([0.0, 0.0, -9.0, 5.0]) + np.array(
         [[0, 3, 0, 0], [-3, 0, 2, 0], [0, -2, 0, 0.5], [0, 0, -0.5, 0]]
     )
@@ -351,7 +351,7 @@ def chain():
 
 
 @pytest.mark.thorough
-def test_a_solve_has_derivatives_in_the_entries_of_a_symmetric_matrix():
+def test_sparse_solve_has_derivatives_in_the_entries_of_a_symmetric_matrix():
     values = jnp.asarray(HEAT.data) / 50.0
     x0 = jnp.asarray(np.abs(X0))
     end = lambda v: jnp.sum(  # noqa: E731
@@ -366,7 +366,7 @@ def test_a_solve_has_derivatives_in_the_entries_of_a_symmetric_matrix():
 
 
 @pytest.mark.thorough
-def test_the_lanes_of_an_adaptive_batch_are_what_they_are_alone():
+def test_sparse_adaptive_batch_equals_its_lanes():
     values = jnp.asarray(HEAT.data)
     x0 = jnp.asarray(np.abs(X0))
     run = lambda s: dvax.solve(  # noqa: E731
@@ -378,7 +378,7 @@ def test_the_lanes_of_an_adaptive_batch_are_what_they_are_alone():
         np.testing.assert_allclose(np.asarray(found), np.asarray(run(scale)), atol=1e-11)
 
 
-def test_a_better_rectangle_can_be_declared():
+def test_sparse_accepts_a_declared_rectangle():
     known = generators.Range(-800.0, -1.0)
     A = generators.Sparse(MATRICES["heat"], within=known)
     assert float(A.growth(spaces.Euclidean(N)).omega) == -1.0
@@ -389,7 +389,7 @@ def test_a_better_rectangle_can_be_declared():
     )
 
 
-def test_a_bound_that_rests_on_a_declared_range_is_declared():
+def test_sparse_bound_from_a_declared_range_is_declared():
     known = generators.Range(-800.0, 0.0, proved=True)
     ours = generators.Sparse(MATRICES["heat"])
     theirs = generators.Sparse(MATRICES["heat"], within=known)

@@ -42,7 +42,7 @@ def test_phi_functions_agree_with_their_integral(k):
 
 
 @pytest.mark.parametrize("z", [0.0, -0.4, 0.4, -3.0])
-def test_the_derivative_of_phi_is_finite_and_right_also_at_zero(z):
+def test_phi_derivative_is_finite_and_correct_at_zero(z):
     # φₖ′(z) = (φₖ(z) − k φ_{k+1}(z) − (the part that comes from 1/k!))/…: from the series
     # Σ j z^{j−1}/(j+k)!, which is φₖ′ = φₖ − k φₖ₊₁ for k ≥ 1 and φ₀′ = φ₀.
     slopes = np.asarray(jax.jit(jax.jacfwd(lambda x: jnp.stack(phi_scalar(x, 3))))(jnp.asarray(z)))
@@ -52,7 +52,7 @@ def test_the_derivative_of_phi_is_finite_and_right_also_at_zero(z):
     np.testing.assert_allclose(back, exact, rtol=1e-12)
 
 
-def test_phi_of_a_complex_number_keeps_its_imaginary_part():
+def test_phi_of_a_complex_number_has_the_correct_imaginary_part():
     # φ₁(iθ) = (e^{iθ} − 1)/(iθ), on both branches; a lost imaginary part halves every order.
     for theta in (0.3, 4.0):
         found = complex(phi_scalar(jnp.asarray(1j * theta), 1)[1])
@@ -88,7 +88,7 @@ def test_phi_of_a_matrix_is_the_integral_of_the_matrix_exponential(name):
         np.testing.assert_allclose(found[k], exact, atol=1e-10 * max(scale, 1.0), err_msg=f"φ{k}")
 
 
-def test_flow_factors_carry_the_factorials_and_the_length():
+def test_flow_factors_include_factorials_and_step_size():
     # ∫₀^h e^{(h−s)a} (s/h)^j ds by quadrature, for a = −2, h = 0.3.
     h, a = 0.3, -2.0
     found = flow_factors(jnp.asarray(h), phi_scalar(jnp.asarray(h * a), 3))

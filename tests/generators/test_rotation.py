@@ -1,4 +1,4 @@
-"""Complex spectrum: pairs that turn, against the matrices that they are."""
+"""`Rotation` (complex spectrum) against its matrix."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ def split(v):
     return jnp.asarray(v[:3]), jnp.asarray(v[3:])
 
 
-def test_it_is_its_matrix():
+def test_rotation_equals_its_matrix():
     rotation, dense = generators.Rotation(A, B), generators.Dense(MATRIX)
     x0, c0, c1, c2 = np.random.default_rng(0).normal(size=(4, 6))
     found = rotation.propagator(0.7, 3).step(split(x0), tuple(map(split, (c0, c1, c2))))
@@ -28,7 +28,7 @@ def test_it_is_its_matrix():
 
 
 @pytest.mark.parametrize("weights", [(1.0, 1.0), (0.3, 2.0)])
-def test_the_growth_bound_holds(weights):
+def test_rotation_growth_bound_holds(weights):
     space = spaces.Product(*(spaces.L2(np.full(3, w)) for w in weights))
     M, omega = map(float, generators.Rotation(A, B).growth(space))
     root = np.diag(np.sqrt(np.repeat(weights, 3)))
@@ -41,7 +41,7 @@ def test_the_growth_bound_holds(weights):
     assert omega == 0.2 and (M == 1.0) == (weights[0] == weights[1])
 
 
-def test_a_step_stays_within_its_chord_deviation():
+def test_rotation_step_stays_within_its_curvature_bound():
     rotation, h = generators.Rotation(A, B), 0.1
     x0, c0, c1 = map(split, np.random.default_rng(1).normal(size=(3, 6)))
     scaled = lambda s: tuple(s * v for v in c1)  # noqa: E731
@@ -57,7 +57,7 @@ def test_a_step_stays_within_its_chord_deviation():
         assert np.all(np.abs(np.asarray(along - line)) <= np.asarray(bound)[None, :] + 1e-14)
 
 
-def test_a_wave_keeps_its_energy_and_comes_back_after_a_period():
+def test_rotation_wave_conserves_energy_and_is_periodic():
     laplacian = generators.Elliptic(32, np.pi, "dirichlet")
     frequency = jnp.sqrt(-laplacian.symbol)
     wave = generators.Rotation(0.0, -frequency, laplacian.transform)
@@ -74,7 +74,7 @@ def test_a_wave_keeps_its_energy_and_comes_back_after_a_period():
     np.testing.assert_allclose(np.asarray(p), -3 * np.sin(1.2) * np.sin(3 * s), atol=1e-13)
 
 
-def test_a_packet_of_schroedingers_equation_keeps_its_norm_and_order_two():
+def test_rotation_schroedinger_packet_conserves_norm_with_order_two():
     # i ψ' = −ψ_ss + V ψ with V in f: ‖ψ‖ stays to the order of the method.
     laplacian = generators.Elliptic(64, 2 * np.pi, "periodic")
     s = np.arange(64) * 2 * np.pi / 64
@@ -101,7 +101,7 @@ def test_a_packet_of_schroedingers_equation_keeps_its_norm_and_order_two():
     assert np.log2(errors[1] / errors[2]) == pytest.approx(2.0, abs=0.15)
 
 
-def test_what_does_not_fit_is_refused():
+def test_rotation_rejects_invalid_arguments():
     with pytest.raises(dvax.InputError, match="same shape"):
         generators.Rotation(np.zeros(2), np.zeros(3))
     with pytest.raises(dvax.InputError, match="state space"):

@@ -1,4 +1,4 @@
-"""States with their coefficients: whatever is made of them is what is made of the states alone."""
+"""States with their spectral coefficients: all operations agree with those on plain states."""
 
 import jax
 import jax.numpy as jnp
@@ -54,7 +54,7 @@ def close(a, b):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_step_with_coefficients_is_the_step(name):
+def test_spectral_state_step_equals_the_plain_step(name):
     A, shape = GENERATORS[name]
     x0, c0, c1 = (state(shape, seed) for seed in range(3))
     step = A.propagator(jnp.asarray(0.3), 2).step
@@ -68,7 +68,7 @@ def test_a_step_with_coefficients_is_the_step(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_is_linear_in_states_is_so_in_coefficients(name):
+def test_spectral_state_operations_are_linear(name):
     A, shape = GENERATORS[name]
     a, b = (expand_state(A, state(shape, seed)) for seed in (3, 4))
     both = jtu.tree_map(lambda p, q: 2.0 * p - 0.5 * q, a, b)
@@ -76,7 +76,7 @@ def test_what_is_linear_in_states_is_so_in_coefficients(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_chord_deviation_is_the_same(name):
+def test_spectral_state_curvature_bound_is_the_same(name):
     A, shape = GENERATORS[name]
     x0, c0, c1 = (state(shape, seed) for seed in range(3))
     space = space_of(x0)
@@ -89,7 +89,7 @@ def test_the_chord_deviation_is_the_same(name):
     close(A.chord_deviation(arc, space, growth), plain)
 
 
-def test_derivatives_of_a_step_see_no_difference():
+def test_spectral_state_derivatives_equal_those_of_the_plain_step():
     A, shape = GENERATORS["dirichlet"]
     x0, c0 = state(shape, 0), state(shape, 1)
     w = state(shape, 2)
@@ -103,7 +103,7 @@ def test_derivatives_of_a_step_see_no_difference():
 
 
 @pytest.mark.parametrize("how", [dict(dt=0.02), dict(rtol=1e-4)], ids=["fixed", "adaptive"])
-def test_a_method_that_linearises_has_no_use_for_them(how):
+def test_exp_rosenbrock_works_without_spectral_states(how):
     # In every step A has another J beside it, and other eigenfunctions.
     problem = dvax.Problem(
         A=HEAT, P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.4),

@@ -1,4 +1,4 @@
-"""Systems that are linear in pieces, followed from one switching to the next: an oracle.
+"""An oracle for piecewise linear systems, which proceeds from one switching to the next.
 
 In each regime x' = Mz for z = (x, load, its slope, 1), so that z moves by a matrix exponential; where
 an expression cᵀz of the regime falls below zero, another regime begins. scipy finds the moment.
@@ -71,7 +71,7 @@ def follow(
 
 
 def _moment(M: Array, z: Array, c: Array, h: float) -> float:
-    """When cᵀz falls below zero on the way to h."""
+    """Return the time in [0, h] at which cᵀz becomes negative."""
 
     def value(s: float) -> float:
         return float(c @ (scipy.linalg.expm(M * s) @ z))

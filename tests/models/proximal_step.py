@@ -18,7 +18,7 @@ import numpy as np
 from dvax.models.traffic.costs import LinkCosts
 from dvax.models.traffic.paths import Paths
 
-_MOST = 60
+_MAX_NEWTON_STEPS = 60
 """Newton steps; where they do not do, ρ was too large."""
 
 _PATIENCE = 4
@@ -41,7 +41,7 @@ class ProximalStep:
         return self.transposed @ x
 
     def solve(
-        self, x: np.ndarray, rho: float, tol: float, most: int = _MOST
+        self, x: np.ndarray, rho: float, tol: float, most: int = _MAX_NEWTON_STEPS
     ) -> tuple[np.ndarray, int]:
         """(y, the Newton steps that it took) to ‖r‖ ≤ tol‖Δy‖, or what rounding allows."""
         v = self.flows(x)

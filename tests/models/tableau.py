@@ -1,4 +1,4 @@
-"""A second analysis of circuits, equation by equation, and random circuits to try it on."""
+"""An independent analysis of circuits, equation by equation, and random circuits for it."""
 
 from typing import NamedTuple
 

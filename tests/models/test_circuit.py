@@ -1,4 +1,4 @@
-"""Circuits: their equations against a second analysis, their trajectories against exact ones."""
+"""Circuits: equations against an independent analysis, trajectories against exact ones."""
 
 import itertools
 import json
@@ -63,7 +63,7 @@ def theta_scheme(theta, h, count):
     return np.array(out)
 
 
-def test_the_tank_is_the_system_on_paper():
+def test_circuit_matrices_of_the_tank_agree_with_the_hand_derivation():
     circuit = Circuit(TANK)
     assert circuit.fit == "exact" and circuit.states == ("C1", "L1") and circuit.diodes == ("D1",)
     for name, matrix in (
@@ -73,7 +73,7 @@ def test_the_tank_is_the_system_on_paper():
         np.testing.assert_allclose(np.asarray(getattr(circuit, name)), matrix, rtol=1e-15)
 
 
-def test_the_tank_is_solved_to_rounding_with_its_switchings(tank, exact):
+def test_circuit_tank_and_its_switchings_are_solved_to_rounding(tank, exact):
     _, solution = tank
     assert len(exact.switchings) == 16
     errors = np.abs(np.asarray(solution.xs) - exact.states)
@@ -82,7 +82,7 @@ def test_the_tank_is_solved_to_rounding_with_its_switchings(tank, exact):
     np.testing.assert_allclose(found, exact.switchings, atol=1e-9)
 
 
-def test_the_bound_covers_the_error_and_is_small(tank, exact):
+def test_circuit_error_bound_holds_and_is_small(tank, exact):
     circuit, solution = tank
     bound = dvax.bound_error(circuit.problem, solution, circuit.constants)
     errors = np.sqrt((np.asarray(solution.xs) - exact.states) ** 2 @ np.array([C, L]))
@@ -92,7 +92,7 @@ def test_the_bound_covers_the_error_and_is_small(tank, exact):
     assert np.all(np.asarray(solution.law_residual) < 1e-12 * 10.0)  # of ten volts
 
 
-def test_trajectories_of_a_circuit_never_separate(tank):
+def test_circuit_trajectories_do_not_separate(tank):
     circuit, solution = tank
     other = dvax.solve(
         circuit.problem, jnp.array([-3.0, 0.05]), 0.0, TIMES[-1], ts=TIMES,
@@ -103,7 +103,7 @@ def test_trajectories_of_a_circuit_never_separate(tank):
     assert float(circuit.constants.one_sided) == 0.0
 
 
-def test_the_reference_file_is_a_scheme_and_not_the_truth(tank, exact):
+def test_circuit_siconos_reference_file_is_the_output_of_its_scheme(tank, exact):
     if not REFERENCE.exists():
         pytest.skip(
             "needs the CircuitRLCD.ref of Siconos's tutorials under ../shared/data/circuits"
@@ -154,7 +154,7 @@ def siconos(circuit, h, steps):
     return np.array(json.loads(line.removeprefix("answer ")))
 
 
-def test_siconos_tends_to_the_same_state(tank, exact):
+def test_circuit_siconos_converges_to_the_same_state(tank, exact):
     if (
         not Path(PYTHON).exists()
         or subprocess.run(
@@ -171,7 +171,7 @@ def test_siconos_tends_to_the_same_state(tank, exact):
     assert errors[1] < 0.1 * errors[0] < 0.05
 
 
-def test_a_bridge_is_refused_by_the_lines_of_its_diodes():
+def test_circuit_bridge_without_resistance_is_rejected_with_its_lines():
     for options, said in (
         ({}, "nothing but D1, D2, D3, D4 joins the part with node p to the rest"),
         ({"r_on": 1.0}, "nothing but D1, D2, D3, D4 joins the part with node p to the rest"),
@@ -187,7 +187,7 @@ def test_a_bridge_is_refused_by_the_lines_of_its_diodes():
 
 
 @pytest.mark.thorough
-def test_the_regularised_bridge_tends_to_the_ideal_one():
+def test_circuit_regularised_bridge_converges_to_the_ideal_one():
     # Between ideal diodes the resistor always sees |v|, and current of the sign of v: it is linear.
     damped = np.array([[-1 / (R * C), -1 / C], [1 / L, 0.0]])
     ts = TIMES[1::10]
@@ -215,7 +215,7 @@ def test_the_regularised_bridge_tends_to_the_ideal_one():
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_the_equations_are_those_of_a_second_analysis(seed):
+def test_circuit_equations_agree_with_an_independent_analysis(seed):
     rng = np.random.default_rng(seed)
     text = random_netlist(rng, island=seed % 2 == 0)
     circuit, other = Circuit(text), tableau(text)
@@ -241,7 +241,7 @@ def test_the_equations_are_those_of_a_second_analysis(seed):
         assert np.all(values[0][1] >= -1e-10) and np.all(values[0][2] >= -1e-8)
 
 
-def test_the_constants_are_proved_and_no_circuit_separates_trajectories():
+def test_circuit_constants_are_proved_and_the_one_sided_rate_is_not_positive():
     for text, options in (
         (BRIDGE, {"r_on": 1.0, "g_leak": 1e-6}),
         (random_netlist(np.random.default_rng(3), island=True), {}),
@@ -264,7 +264,7 @@ def test_the_constants_are_proved_and_no_circuit_separates_trajectories():
 
 
 @pytest.mark.thorough
-def test_a_rectifier_on_the_mains_agrees_with_scipy():
+def test_circuit_mains_rectifier_agrees_with_scipy():
     text = """
     V1 in 0 SIN(1 12 50 3m 20 30)    ; offset amplitude frequency delay damping phase
     D1 in out R=2
@@ -294,7 +294,7 @@ def test_a_rectifier_on_the_mains_agrees_with_scipy():
 
 
 @pytest.mark.parametrize("series", [1.0, 100.0])
-def test_a_stiff_diode_under_a_sine_does_not_stall_where_the_voltage_is_tiny(series):
+def test_circuit_stiff_diode_with_a_sine_source_does_not_stall_at_small_voltages(series):
     circuit = Circuit(f"V1 a 0 SIN(0 10 1k)\nR1 a b 1k\nC1 b 0 1u\nD1 b 0 R={series}\n")
     ts = np.linspace(0.0, 5e-3, 6)[1:]
     sol = circuit.solve(5e-3, ts, rtol=1e-6, max_steps=50_000)

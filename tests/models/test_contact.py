@@ -1,4 +1,4 @@
-"""Section 7 of the paper, its formulas coded a second time."""
+"""The contact law against the formulas of Section 7 of the paper, coded independently."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +13,7 @@ def build(**changed):
     return dvax.models.Contact(**{**GOOD, "g": 1.0, "ell": 3.0, **changed})
 
 
-def test_the_constants_are_those_of_section_7():
+def test_contact_constants_are_those_of_section_7():
     rng = np.random.default_rng(1)
     for _ in range(20):
         p = {name: float(rng.exponential() + 0.05) for name in GOOD}
@@ -36,7 +36,7 @@ def test_the_constants_are_those_of_section_7():
         assert c.status_of("gamma", "L_F", "one_sided") == "proved"
 
 
-def test_the_constants_of_the_problem_itself_are_the_declared_ones():
+def test_contact_constants_agree_with_those_of_its_problem():
     model = build()
     plane = dvax.spaces.Euclidean(2)
     spectrum = model.problem.operator().spectrum(plane)
@@ -44,7 +44,7 @@ def test_the_constants_of_the_problem_itself_are_the_declared_ones():
     assert float(model.problem.generator().growth(plane).omega) == float(model.constants.omega)
 
 
-def test_pressure_regimes_and_residual_at_many_drives():
+def test_contact_pressure_regimes_and_residual_for_many_drives():
     model = build(g=np.linspace(-3.0, 3.0, 41), ell=0.0)
     x = np.linspace(1.0, -1.0, 41)
     q = np.linspace(-3.0, 3.0, 41) - 2.0 * x
@@ -69,20 +69,20 @@ def test_pressure_regimes_and_residual_at_many_drives():
         np.testing.assert_allclose(found, expected, atol=1e-13)
 
 
-def test_the_ends_of_the_regimes_belong_to_unloaded_and_saturated():
+def test_contact_regime_boundaries_belong_to_unloaded_and_saturated():
     model = build(g=0.0, b_x=1.0, beta=1.0, b_u=1.0, kappa0=0.5)
     # q = −x, saturation at q = 1.
     assert [int(model.regimes(0.0, x)) for x in (0.0, -0.5, -1.0)] == [0, 1, 2]
 
 
-def test_the_rate_is_that_of_eq_concrete_state():
+def test_contact_rate_is_that_of_eq_concrete_state():
     model = build(g=lambda t: jnp.sin(t), ell=lambda t: 2.0 * t)
     t, x = 0.8, 0.1
     u = min(max((np.sin(t) - 2.0 * x) / 1.4, 0.0), 0.6 / 0.7)
     assert float(model.problem.reduced(t, x)) == pytest.approx(2 * t - 0.5 * x - 1.1 * u, abs=1e-14)
 
 
-def test_other_units_tell_the_same_story():
+def test_contact_solution_does_not_depend_on_the_units():
     # Indentation in mm instead of m, pressure in kPa instead of MPa, time in min instead of s.
     X, P, T = 1e3, 1e3, 1 / 60
     t1 = 4.0
@@ -116,13 +116,13 @@ BAD = [
 
 
 @pytest.mark.parametrize(("name", "value"), BAD)
-def test_every_bad_parameter_is_refused_by_name(name, value):
+def test_contact_rejects_bad_parameters_by_name(name, value):
     with pytest.raises(dvax.InputError) as caught:
         build(**{name: value})
     assert name in caught.value.problems[0].place and len(caught.value.problems) == 1
 
 
-def test_all_bad_parameters_are_refused_at_once():
+def test_contact_reports_all_bad_parameters_at_once():
     bad = {name: value for name, value in BAD if name != "weights"} | {"weights": [0.0]}
     with pytest.raises(dvax.InputError) as caught:
         build(**bad)
@@ -132,7 +132,7 @@ def test_all_bad_parameters_are_refused_at_once():
     assert len(caught.value.problems) == len(bad)
 
 
-def test_zero_self_feedback_is_allowed_and_large_too():
+def test_contact_accepts_zero_and_large_self_feedback():
     # b_u ≥ 1 is beyond the projection route (q_ρ = b_u), and the law is solved all the same.
     for b_u in (0.0, 5.0):
         model = build(b_u=b_u)
@@ -140,7 +140,7 @@ def test_zero_self_feedback_is_allowed_and_large_too():
         assert float(model.problem.response(0.0, 0.2)) == pytest.approx(q / (1 + b_u))
 
 
-def test_points_carry_their_weights():
+def test_contact_points_have_their_weights():
     w = np.array([0.5, 2.0, 0.25])
     model = build(weights=w, g=np.array([1.0, 2.0, 3.0]))
     x = np.array([1.0, -1.0, 2.0])

@@ -92,7 +92,7 @@ def random_stresses(count, size=1.0, seed=1):
     return T + np.swapaxes(T, 1, 2)
 
 
-def test_vectors_keep_the_inner_product_of_tensors():
+def test_mandel_vectors_keep_the_inner_product_of_tensors():
     S, T = random_stresses(20), random_stresses(20, seed=2)
     np.testing.assert_allclose(BASIS @ BASIS.T, np.eye(6), atol=1e-15)
     for of in (mandel, lambda A: split(mandel(A))):
@@ -102,7 +102,7 @@ def test_vectors_keep_the_inner_product_of_tensors():
     np.testing.assert_allclose(np.asarray(tensor(joined(split(mandel(S))))), S, atol=1e-14)
 
 
-def test_elasticity_is_diagonal_and_its_energy_the_norm():
+def test_duvaut_lions_elasticity_is_diagonal_and_its_energy_is_the_norm():
     model = point(WINDING, yields=DruckerPrager(M, P_T))
     e = 1e-4 * random_stresses(1)[0]
     stress = tensor(joined(model.moduli * split(mandel(jnp.asarray(e)))))
@@ -119,7 +119,7 @@ def test_elasticity_is_diagonal_and_its_energy_the_norm():
     [(VonMises(STRENGTH), radial_return), (DruckerPrager(M, P_T), cone_return)],
     ids=["von Mises", "Drucker-Prager"],
 )
-def test_the_projection_is_the_return_mapping(yields, back):
+def test_duvaut_lions_projection_is_the_return_mapping(yields, back):
     model = point(WINDING, yields=yields)
     pressures = 0.2 * np.arange(-2, 4).repeat(10)[:, None, None]
     sizes = np.tile(np.linspace(0.01, 0.2, 10), 6)[:, None, None]
@@ -151,7 +151,7 @@ def test_the_projection_is_the_return_mapping(yields, back):
     ],
     ids=["shear", "tension", "oedometric"],
 )
-def test_along_a_straight_way_the_overstress_is_an_exponential(way):
+def test_duvaut_lions_overstress_on_a_straight_path_is_exponential(way):
     # dev σ = s n, and z = s − R obeys z' = 2Gė − z/τ once s has reached R.
     rate = 2e-3
     model = point(rate * TIMES[:, None, None] * way)
@@ -173,7 +173,7 @@ def test_along_a_straight_way_the_overstress_is_an_exponential(way):
     assert figures["plastic_strain"] == pytest.approx(np.sqrt(2 / 3) * plastic, abs=1e-9)
 
 
-def test_a_strength_that_falls_under_a_strain_that_stays():
+def test_duvaut_lions_overstress_with_decreasing_strength_is_the_closed_form():
     # ‖s‖ = R(t) + z, with R' = −r and z' = r − z/τ from where R meets the stress.
     def strength(t):
         return 0.4 - 0.05 * t
@@ -190,7 +190,7 @@ def test_a_strength_that_falls_under_a_strain_that_stays():
 
 
 @pytest.mark.thorough
-def test_on_the_cone_the_flow_dilates_and_the_overstress_is_an_exponential():
+def test_duvaut_lions_flow_on_the_cone_dilates_with_exponential_overstress():
     # On the smooth face f = q − M(p + p_t) obeys f' = n·Cε' − f/τ, n = ∂f/∂σ, with a fixed n.
     rate = 2e-3
     model = point(rate * TIMES[:, None, None] * SHEAR, yields=DruckerPrager(M, P_T))
@@ -224,7 +224,7 @@ SQUEEZE = 1.5e-3 * np.eye(3) * np.linspace(0.0, 1.0, 9)[:, None, None]
     ],
     ids=["cycle", "winding", "winding on the cone"],
 )  # fmt: skip
-def test_without_a_delay_it_is_the_return_mapping(path, yields, back):
+def test_duvaut_lions_converges_to_the_return_mapping(path, yields, back):
     limit = rate_independent(path, back)
     errors = []
     for tau in (0.04, 0.02, 0.01):
@@ -235,7 +235,7 @@ def test_without_a_delay_it_is_the_return_mapping(path, yields, back):
     assert errors[0] < 0.1 and np.all((ratios > 1.7) & (ratios < 2.2)), (errors, ratios)
 
 
-def test_the_constants_are_those_that_verify_proves():
+def test_duvaut_lions_constants_are_proved_by_verify():
     model = point(WINDING)
     mine = model.constants
     check = dvax.verify(model.problem, model.virgin, 0.0, 4.0)
@@ -247,7 +247,7 @@ def test_the_constants_are_those_that_verify_proves():
 
 
 @pytest.mark.thorough
-def test_those_of_the_cone_too():
+def test_duvaut_lions_constants_of_the_cone_are_proved_by_verify():
     model = point(WINDING, yields=DruckerPrager(M, P_T))
     check = dvax.verify(model.problem, model.virgin, 0.0, 4.0)
     assert check.status == "proved"
@@ -256,7 +256,7 @@ def test_those_of_the_cone_too():
         assert float(getattr(model.constants, name)) == pytest.approx(value, abs=1e-9), name
 
 
-def test_two_histories_of_one_strain_do_not_separate():
+def test_duvaut_lions_trajectories_of_one_strain_do_not_separate():
     model = point(WINDING)
     starts = 1e-3 * np.random.default_rng(4).normal(size=(2, 5))
     one, two = (led(model, x0=jnp.asarray(x), rtol=1e-8) for x in starts)
@@ -265,7 +265,7 @@ def test_two_histories_of_one_strain_do_not_separate():
     assert np.all(np.diff(apart) <= 1e-9) and apart[-1] < 0.8 * apart[0]
 
 
-def test_many_points_are_one_batch():
+def test_duvaut_lions_many_points_are_one_batch():
     ways = np.stack([SHEAR, TENSION, OEDOMETRIC]) * np.array([1.0, 2.0, -1.0])[:, None, None] * 2e-3
     rows = np.asarray(mandel(ways))[:, None, :] * TIMES[:, None]
 
@@ -292,14 +292,14 @@ BAD = [
 
 
 @pytest.mark.parametrize(("name", "value"), BAD)
-def test_every_bad_parameter_is_refused_by_name(name, value):
+def test_duvaut_lions_rejects_bad_parameters_by_name(name, value):
     good = dict(bulk=K, shear=G, relaxation=TAU, strain=np.zeros(6), yields=VonMises(STRENGTH))
     with pytest.raises(dvax.InputError) as caught:
         DuvautLions(**(good | {name: value}))
     assert name in caught.value.problems[0].place and len(caught.value.problems) == 1
 
 
-def test_bad_parameters_are_refused_at_once():
+def test_duvaut_lions_reports_all_bad_parameters_at_once():
     with pytest.raises(dvax.InputError) as caught:
         DuvautLions(
             bulk=-1.0, shear="soft", relaxation=0.0, strain=np.zeros(5),

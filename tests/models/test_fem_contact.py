@@ -1,4 +1,4 @@
-"""The finite-element contact: reference figures, Hertz, and the whole body without condensation."""
+"""The finite-element contact: reference forces, Hertz, and the whole body without condensation."""
 
 from pathlib import Path
 
@@ -36,7 +36,7 @@ def force(model, pressure):
     return model.figures(pressure)["force"]
 
 
-def test_three_meshes_converge_to_the_reference_forces(bodies):
+def test_fem_contact_forces_converge_on_three_meshes(bodies):
     found = []
     for body, dofs, points, free, capped in zip(bodies, DOFS, POINTS, UNCAPPED, CAPPED):
         assert (body.unknowns, len(body.points)) == (dofs, points)
@@ -58,7 +58,7 @@ def test_three_meshes_converge_to_the_reference_forces(bodies):
     assert np.all(steps[1] < 0.2 * steps[0])
 
 
-def test_a_stiff_contact_is_that_of_hertz(bodies):
+def test_fem_contact_of_a_stiff_surface_agrees_with_hertz(bodies):
     body = bodies[2]
     model = build(body, stiffness=1e4, pressure_cap=np.inf)
     rest = model.equilibrium()
@@ -85,7 +85,7 @@ def run(bodies):
     )  # fmt: skip
 
 
-def test_the_transient_reaches_the_variational_inequality(run):
+def test_fem_contact_transient_reaches_the_steady_variational_inequality(run):
     model, sol = run
     rest = model.equilibrium()
     away = np.max(np.abs(np.asarray(sol.ys[-1]) - np.asarray(rest.pressure)))
@@ -98,7 +98,7 @@ def test_the_transient_reaches_the_variational_inequality(run):
     assert np.all(np.diff(np.log(distance[late])) <= -0.5 + 1e-6)
 
 
-def test_the_bound_on_the_trajectory_is_proved_and_holds(bodies):
+def test_fem_contact_trajectory_bound_is_proved_and_holds(bodies):
     model = build(bodies[0])
     settings = dict(ts=np.linspace(1.0, 6.0, 6), rtol=0.0, method=model.method)
     coarse, fine = (
@@ -113,7 +113,7 @@ def test_the_bound_on_the_trajectory_is_proved_and_holds(bodies):
     assert np.max(found.x) < 2e-5 and np.max(true) > 10 * np.max(sharp.x)
 
 
-def test_the_constants_are_proved_again_from_the_code(bodies):
+def test_fem_contact_constants_are_proved_by_verify(bodies):
     model = build(bodies[0], relaxation_time=2.0, b_u=0.25)
     check = dvax.verify(model.problem, model.untouched, 0.0, 4.0)
     assert check.status == "proved"
@@ -130,7 +130,7 @@ def test_the_constants_are_proved_again_from_the_code(bodies):
     assert float(c.sharp_decay_rate) == 0.5
 
 
-def test_two_bodies_approach_in_the_energy(bodies):
+def test_fem_contact_trajectories_approach_in_the_energy_norm(bodies):
     model = build(bodies[0], stiffness=30.0)
     starts = np.random.default_rng(3).normal(size=(2, model.untouched.size)) * 0.01
     ts = np.linspace(0.0, 3.0, 13)
@@ -142,7 +142,7 @@ def test_two_bodies_approach_in_the_energy(bodies):
     assert np.all(distance <= np.exp(-ts) * distance[0] + 4e-7)
 
 
-def test_a_body_at_its_cap_everywhere_creeps_as_one_exponential(bodies):
+def test_fem_contact_fully_saturated_body_creeps_exponentially(bodies):
     body, tau, cap = bodies[0], 1.7, 1e-4
     model = build(body, indentation=lambda t: 2.0 + 0.0 * t, pressure_cap=cap, relaxation_time=tau)
     ts = np.array([0.3, 1.0, 4.0])
@@ -155,7 +155,7 @@ def test_a_body_at_its_cap_everywhere_creeps_as_one_exponential(bodies):
 
 
 def bulged():
-    """Triangles under a top that is not flat, so that normals differ from point to point."""
+    """Triangles under a curved top, so that the normals vary from point to point."""
     mesh = skfem.MeshTri.init_tensor(np.linspace(-2.0, 2.0, 25), np.linspace(-2.0, 0.0, 13))
     points = mesh.p.copy()
     points[1] += 0.02 * (1 + points[1] / 2) * np.cos(2 * points[0])
@@ -166,7 +166,7 @@ def bulged():
 
 
 class Whole:
-    """All displacements of a body of triangles, assembled a second time."""
+    """All displacements of a body of triangles, assembled independently."""
 
     def __init__(self, mesh):
         element = skfem.ElementVector(skfem.ElementTriP2())
@@ -203,7 +203,7 @@ def euler(M, B, w, model, dt, steps):
     return x, np.array(out)
 
 
-def test_the_condensed_body_is_the_whole_one():
+def test_fem_contact_condensed_body_equals_the_whole_body():
     mesh = bulged()
     whole, body = Whole(mesh), ElasticBody(mesh)
     assert body.unknowns == whole.K.shape[0] == 2 * 49 * 24
@@ -228,7 +228,7 @@ def test_the_condensed_body_is_the_whole_one():
     assert root * np.linalg.norm(y) == pytest.approx(np.sqrt(0.7 * x @ (whole.K @ x)), rel=1e-9)
 
 
-def test_the_state_of_rest_is_that_of_a_quadratic_programme(bodies):
+def test_fem_contact_steady_state_solves_a_quadratic_programme(bodies):
     model = build(bodies[0], b_u=0.5)
     body, rest = bodies[0], model.equilibrium()
     # min ½⟨p, (1.5/β + C)p⟩ + ⟨g, p⟩ over the box, as least squares, by Stark and Parker's method.
@@ -247,7 +247,7 @@ def test_the_state_of_rest_is_that_of_a_quadratic_programme(bodies):
     assert float(jnp.linalg.norm(rate)) < 1e-9
 
 
-def test_newton_alone_cycles_and_the_model_does_not(bodies):
+def test_fem_contact_equilibrium_converges_where_newton_cycles(bodies):
     body = bodies[0]
     C = body.trace @ (body.trace * body.weights[:, None]).T
     gap = body.points[:, 0] ** 2 / 20.0 - 0.01
@@ -275,7 +275,7 @@ def test_newton_alone_cycles_and_the_model_does_not(bodies):
         assert int(rest.vi.iterations) < 10
 
 
-def test_the_stress_balances_the_punch(run, tmp_path: Path):
+def test_fem_contact_stress_balances_the_punch(run, tmp_path: Path):
     model, sol = run
     t, x = float(sol.ts[3]), sol.xs[3]
     p = np.asarray(sol.ys[3])
@@ -304,7 +304,7 @@ def test_the_stress_balances_the_punch(run, tmp_path: Path):
         model.write(tmp_path / "at.stl", t, x)
 
 
-def test_a_measured_history_presses_the_punch(bodies):
+def test_fem_contact_indentation_may_be_a_table(bodies):
     record = dvax.signals.Table([0.0, 2.0, 3.0, 5.0], [0.0, 0.01, 0.01, 0.002])
     model = build(bodies[0], indentation=record)
     same = build(bodies[0])
@@ -321,7 +321,7 @@ def test_a_measured_history_presses_the_punch(bodies):
 
 
 @pytest.mark.thorough
-def test_the_force_has_a_derivative_in_every_parameter(bodies):
+def test_fem_contact_force_has_derivatives_in_all_parameters(bodies):
     body = bodies[0]
 
     def resultant(values):
@@ -337,7 +337,7 @@ def test_the_force_has_a_derivative_in_every_parameter(bodies):
         assert float(slope[k]) == pytest.approx(float(quotient), rel=1e-5)
 
 
-def test_other_units_tell_the_same_story(bodies):
+def test_fem_contact_solution_does_not_depend_on_the_units(bodies):
     sizes = dict(zip(("fine", "coarse", "layers"), MESHES[0]))
     mm = ElasticBody({**sizes, "width": 8e3, "height": 4e3, "fine_half_width": 500.0},
                      youngs_modulus=200.0)  # fmt: skip
@@ -348,7 +348,7 @@ def test_other_units_tell_the_same_story(bodies):
         assert figures[name] == pytest.approx(unit * plain[name], rel=1e-9), name
 
 
-def test_a_punch_that_is_held_above_touches_nothing(bodies):
+def test_fem_contact_punch_above_the_body_exerts_no_force(bodies):
     model = build(bodies[0])
     rest = model.equilibrium(-0.001)
     assert set(model.figures(rest.pressure).values()) == {0.0}
@@ -368,13 +368,13 @@ BAD = [
 
 
 @pytest.mark.parametrize(("name", "value"), BAD)
-def test_every_bad_parameter_is_refused_by_name(bodies, name, value):
+def test_fem_contact_rejects_bad_parameters_by_name(bodies, name, value):
     with pytest.raises(dvax.InputError) as caught:
         build(bodies[0], **{name: value})
     assert [name in problem.place for problem in caught.value.problems] == [True]
 
 
-def test_all_bad_parameters_are_refused_at_once(bodies):
+def test_fem_contact_reports_all_bad_parameters_at_once(bodies):
     with pytest.raises(dvax.InputError) as caught:
         build(bodies[0], stiffness=0.0, pressure_cap=0.0, indentation=np.nan, b_u=-1.0)
     assert len(caught.value.problems) == 4

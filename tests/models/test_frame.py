@@ -21,7 +21,7 @@ STEP = 0.02
 
 
 def quake():
-    """Twelve seconds of shaking that grows and decays, with all periods from 0.1 s to 3 s."""
+    """Twelve seconds of ground motion that grows and decays, with all periods from 0.1 s to 3 s."""
     rng = np.random.default_rng(4)
     t = STEP * np.arange(601)
     waves = sum(
@@ -57,7 +57,7 @@ def viscoplastic(period, damping, limit, tau):
 
 
 def elastoplastic(period, damping, limit):
-    """The limit: the spring holds its force while the frame moves on, until it turns."""
+    """The limit: the spring keeps its force while the frame moves, until its velocity changes sign."""
     w = 2 * np.pi / period
     over = np.array([1.0, 0, -1, 0, 0, -limit])
     under = np.array([-1.0, 0, 1, 0, 0, -limit])
@@ -71,7 +71,7 @@ def elastoplastic(period, damping, limit):
 
 
 def exactly(regimes, ground, between=1, step=1.25e-3):
-    """The states at `between` times in every step of the record, and the load there."""
+    """The states at `between` times in every step of the record, and the load at these times."""
     knots = STEP * np.arange(len(ground))
     times = np.interp(
         np.arange((len(ground) - 1) * between + 1) / between, np.arange(len(ground)), knots
@@ -81,7 +81,7 @@ def exactly(regimes, ground, between=1, step=1.25e-3):
 
 
 def peak_of(regimes, ground):
-    """max |d|: at each of 32 times a step, the parabola through d, v and d'' has its top."""
+    """max |d|: for each of 32 times per step, the maximum of the parabola through d, v and d''."""
     run, load = exactly(regimes, ground, between=32, step=1.0)
     elastic = regimes["elastic"].rate[1]
     x = np.column_stack([run.states, load, 0 * load, np.ones_like(load)])
@@ -94,7 +94,7 @@ def peak_of(regimes, ground):
 AT2 = "A record\nThe units are (g)\nNPTS=  5, DT= .50000 SEC\n 0.1 0.2 -0.3\n 4.0E-01 0.5\n"
 
 
-def test_a_record_is_read_from_its_file(tmp_path):
+def test_accelerogram_is_read_from_its_file(tmp_path):
     file = tmp_path / "r.at2"
     file.write_text(AT2)
     record = Accelerogram.from_at2(file)
@@ -115,7 +115,7 @@ PEAKS = [
 
 
 @pytest.mark.parametrize(("T", "z", "published", "opensees"), mostly_thorough(PEAKS, PEAKS[:1]))
-def test_elastic_peaks_are_those_of_the_published_table(el_centro, T, z, published, opensees):
+def test_frame_elastic_peaks_agree_with_the_published_table(el_centro, T, z, published, opensees):
     record = Accelerogram(STEP, el_centro)
     # OpenSees begins with a step from rest, so that its record has a zero more, and has g = 386.4.
     other = Accelerogram(STEP, np.concatenate([[0.0], el_centro]) * 386.4 / GRAVITY)
@@ -132,7 +132,7 @@ def test_elastic_peaks_are_those_of_the_published_table(el_centro, T, z, publish
         assert more == pytest.approx(0.0049, abs=2e-4)
 
 
-def test_the_elastic_frame_agrees_with_scipy():
+def test_frame_elastic_response_agrees_with_scipy():
     T, z = 0.37, 0.03
     w = 2 * np.pi / T
     system = ([[0, 1], [-w * w, -2 * z * w]], [[0], [-1]], [[1, 0]], [[0]])
@@ -144,7 +144,7 @@ def test_the_elastic_frame_agrees_with_scipy():
     np.testing.assert_allclose(np.asarray(solution.xs)[:, 2], 0.0, atol=0.0)
 
 
-def test_the_viscoplastic_frame_is_solved_to_rounding():
+def test_frame_viscoplastic_response_is_solved_to_rounding():
     T, z, limit, tau = 0.5, 0.05, 0.3, 0.01
     run, _ = exactly(viscoplastic(T, z, limit, tau), GROUND)
     assert len(run.switchings) > 10
@@ -160,7 +160,7 @@ def test_the_viscoplastic_frame_is_solved_to_rounding():
     [(1e-3, 1e-4), pytest.param((1e-3, 1e-4, 1e-5), marks=pytest.mark.thorough)],
     ids=["two", "three"],
 )
-def test_what_yields_slowly_tends_to_what_yields_at_once(taus):
+def test_frame_viscoplastic_response_converges_to_the_elastoplastic_one(taus):
     T, z, ratio = 0.5, 0.05, 0.2
     elastic = Frame(record=RECORD, period=T, damping=z).figures()["largest_displacement"]
     limit = ratio * elastic
@@ -177,7 +177,7 @@ def test_what_yields_slowly_tends_to_what_yields_at_once(taus):
     np.testing.assert_allclose(np.log10(np.array(errors[:-1]) / errors[1:]), 1.0, atol=0.1)
 
 
-def test_the_frame_yields_at_its_elastic_force_and_not_above():
+def test_frame_with_yield_ratio_one_does_not_yield():
     arguments = dict(record=RECORD, period=0.8, damping=0.02, viscosity_ratio=0.01)
     just = Frame(yield_ratio=1.0 + 1e-9, **arguments).solve()
     assert np.all(np.asarray(just.xs)[:, 2] == 0.0)
@@ -185,7 +185,7 @@ def test_the_frame_yields_at_its_elastic_force_and_not_above():
     assert np.abs(np.asarray(less.xs)[:, 2]).max() > 1e-4
 
 
-def test_twice_the_earthquake_on_twice_the_strength_is_twice_the_displacement():
+def test_frame_displacement_scales_with_record_and_strength():
     arguments = dict(period=0.6, damping=0.02, yield_ratio=0.3, viscosity_ratio=0.02)
     once = Frame(record=RECORD, **arguments).figures()
     twice = Frame(record=Accelerogram(STEP, 2 * GROUND), **arguments).figures()
@@ -194,7 +194,7 @@ def test_twice_the_earthquake_on_twice_the_strength_is_twice_the_displacement():
 
 
 @pytest.mark.thorough
-def test_a_spectrum_is_that_of_its_frames():
+def test_response_spectrum_equals_single_frames():
     T, z = np.array([0.5, 0.8, 1.7]), np.array([[0.02], [0.1]])
     ratio, tau = np.array([[[0.2]], [[0.6]]]), 0.01
     found = response_spectrum(RECORD, T, z, ratio, tau, chunk=12)
@@ -211,7 +211,7 @@ def test_a_spectrum_is_that_of_its_frames():
 @pytest.mark.parametrize(
     "taus", [[1.2e-4, 1e-8], pytest.param([1e-5, 1e-6, 1e-7], marks=pytest.mark.thorough)]
 )
-def test_a_spectrum_of_any_viscosity_is_that_of_its_frames(taus):
+def test_response_spectrum_of_any_viscosity_equals_single_frames(taus):
     # On both sides of the η/k from which on frames are solved one by one, and far beyond it.
     T, z, ratio = np.array([[0.4], [1.1]]), 0.05, 0.4
     record = Accelerogram(STEP, GROUND[:81])
@@ -222,7 +222,7 @@ def test_a_spectrum_of_any_viscosity_is_that_of_its_frames(taus):
         assert found.peak[k] == pytest.approx(exact, rel=1e-6)
 
 
-def test_the_constants_are_proved():
+def test_frame_constants_are_proved():
     frame = Frame(
         record=RECORD, period=0.5, damping=0.05, yield_displacement=0.5, viscosity_ratio=0.02
     )
@@ -234,7 +234,7 @@ def test_the_constants_are_proved():
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.02, 0.3])
-def test_the_energy_of_a_difference_grows_no_faster_than_stated(damping):
+def test_frame_energy_of_a_difference_satisfies_its_bound(damping):
     frame = Frame(
         record=RECORD, period=0.5, damping=damping, yield_displacement=0.5, viscosity_ratio=0.02
     )
@@ -254,7 +254,7 @@ def test_the_energy_of_a_difference_grows_no_faster_than_stated(damping):
     assert M == pytest.approx(np.sqrt(sizes[-1] / sizes[0]), rel=1e-9)
 
 
-def test_a_record_is_a_line_between_samples_and_nothing_outside():
+def test_accelerogram_is_linear_between_samples_and_zero_outside():
     table = dvax.signals.Table(RECORD.knots(), GRAVITY * GROUND)
     for t in [*np.random.default_rng(0).uniform(0, 12, 50), *RECORD.knots()[:9], RECORD.duration]:
         assert float(RECORD(t)) == pytest.approx(float(table(t)), rel=1e-12, abs=1e-9)
@@ -262,7 +262,7 @@ def test_a_record_is_a_line_between_samples_and_nothing_outside():
     assert GRAVITY == pytest.approx(386.0886, abs=1e-4)
 
 
-def test_the_top_between_two_times_is_found():
+def test_frame_peak_between_two_times_is_found():
     # Exactly for a quintic, and within 1e-7 of a sine that is looked at 13 times a period.
     p = np.polynomial.Polynomial([0.1, 2.0, -1.0, -0.1, 0.02, -0.01])
     t = np.array([0.0, 1.5])
@@ -286,13 +286,13 @@ BAD = [
 
 
 @pytest.mark.parametrize(("name", "value"), BAD)
-def test_every_bad_argument_is_refused_by_name(name, value):
+def test_frame_rejects_bad_arguments_by_name(name, value):
     with pytest.raises(dvax.InputError) as caught:
         Frame(**{**GOOD, name: value})
     assert len(caught.value.problems) == 1 and name in caught.value.problems[0].place
 
 
-def test_a_flow_of_a_frame_that_stays_elastic_is_refused():
+def test_frame_rejects_viscosity_without_yield_strength():
     with pytest.raises(dvax.InputError) as caught:
         Frame(record=RECORD, period=0.5, damping=0.05, viscosity_ratio=0.01)
     (problem,) = caught.value.problems
@@ -300,7 +300,7 @@ def test_a_flow_of_a_frame_that_stays_elastic_is_refused():
     assert "yield_ratio" in problem.fix
 
 
-def test_records_without_sense_are_refused():
+def test_accelerogram_rejects_invalid_records():
     for step, samples, said in (
         (0.0, [0.1, 0.2], "step"), (0.02, [0.1], "two samples"),
         (0.02, [0.1, np.nan, 0.3], "nan at sample 1"),
@@ -310,7 +310,7 @@ def test_records_without_sense_are_refused():
         assert said in str(caught.value) and len(caught.value.problems) == 1
 
 
-def test_a_spectrum_refuses_what_its_frames_would():
+def test_response_spectrum_rejects_what_frames_reject():
     for arguments, said in (
         (([0.5, -1.0], 0.05, 0.5, 0.01), "response_spectrum(period): got -1 at index (1,)"),
         ((0.5, -0.05, 0.5, 0.0), "response_spectrum(viscosity_ratio): got 0 at index ()"),
@@ -322,7 +322,7 @@ def test_a_spectrum_refuses_what_its_frames_would():
 
 
 @pytest.mark.thorough
-def test_ten_thousand_frames(el_centro):
+def test_response_spectrum_of_ten_thousand_frames(el_centro):
     record = Accelerogram(STEP, el_centro)
     T = np.geomspace(0.2, 3.0, 50)[:, None, None]
     z = np.array([0.0, 0.02, 0.05, 0.1, 0.2])[:, None]

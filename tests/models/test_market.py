@@ -57,7 +57,7 @@ def bounded_least_squares(market, t):
 
 
 def made_at(market, t, p):
-    """What all units make at a price, each firm's marginal cost λ = p − bQ(λ) found by halving."""
+    """The production of all units at a price; marginal costs λ = p − bQ(λ) by bisection."""
     c, a, firms, cap, _, b = numpy_data(market, t)
     low, high = np.full(firms.shape[1], -1e4), np.full(firms.shape[1], 1e4)
     for _ in range(80):
@@ -69,7 +69,7 @@ def made_at(market, t, p):
 
 
 @needs_data
-def test_the_hourly_equilibria_of_rts_gmlc(rts):
+def test_market_hourly_equilibria_of_rts_gmlc(rts):
     assert len(rts.names) == 102 and rts.capacity.shape == (8784, 102)
     year = Market.from_rts(rts, 0, 8784)
     assert float(year.b) == pytest.approx(0.031102779, abs=5e-10)
@@ -87,7 +87,7 @@ def test_the_hourly_equilibria_of_rts_gmlc(rts):
 
 
 @needs_data
-def test_the_constants_of_rts_gmlc(week):
+def test_market_constants_of_rts_gmlc(week):
     market, _ = week
     c = market.constants
     assert float(c.gamma) == 1e-3 and float(c.L_F) == pytest.approx(4.2734, abs=5e-5)
@@ -96,7 +96,7 @@ def test_the_constants_of_rts_gmlc(week):
 
 
 @needs_data
-def test_a_july_week(week):
+def test_market_week_in_july(week):
     market, sol = week
     figures = market.figures(sol)
     assert len(figures["price"]) == 168
@@ -121,7 +121,7 @@ def test_a_july_week(week):
 
 
 @needs_data
-def test_the_first_hours_against_an_integrator_and_a_law_of_others(week):
+def test_market_first_hours_agree_with_an_independent_integrator_and_law(week):
     market, sol = week
 
     def rate(t, p):
@@ -140,7 +140,7 @@ def test_the_first_hours_against_an_integrator_and_a_law_of_others(week):
 
 @needs_data
 @pytest.mark.parametrize("hours", [(12,), pytest.param((60, 100), marks=pytest.mark.thorough)])
-def test_frozen_data_bring_the_price_to_the_equilibrium(rts, week, hours):
+def test_market_price_with_constant_data_converges_to_the_equilibrium(rts, week, hours):
     times = np.linspace(0.0, 6.0, 168)
     for k in hours:
         row = JULY + k
@@ -167,7 +167,7 @@ def small(**changed):
     return Market(**(given | changed))
 
 
-def test_two_equal_firms_are_the_duopoly_of_the_textbook():
+def test_market_of_two_equal_firms_is_the_textbook_duopoly():
     # p = α − bQ, cost cu + au²/2: each firm makes (α − c)/(3b + a).
     market = small(
         cost=[10.0, 10.0], slope=[0.5, 0.5], firm=[0, 1], b=0.25, intercept=60.0,
@@ -184,7 +184,7 @@ def test_two_equal_firms_are_the_duopoly_of_the_textbook():
     assert float(sol.xs[0]) == pytest.approx(float(p) + 8.0 * np.exp(-rate), abs=1e-6)
 
 
-def test_the_equilibrium_and_its_derivative_against_bounded_least_squares():
+def test_market_equilibrium_and_derivative_agree_with_bounded_least_squares():
     market = small()
     p, u = market.equilibrium(0.0)
     v, price = bounded_least_squares(market, 0.0)
@@ -242,7 +242,7 @@ def test_merit_order_has_the_derivative_of_the_law():
     assert np.count_nonzero(np.abs(np.asarray(mine)).sum(axis=1)) < 5  # and some are not
 
 
-def test_merit_order_does_not_pass_a_law_of_another_form():
+def test_merit_order_rejects_a_law_of_another_form():
     solver = MeritOrder(jnp.ones(2), 1.0, jnp.ones((2, 1)))
     M = jnp.array([[3.0, 0.0], [0.0, 2.0]])
     vi = dvax.solve_vi(
@@ -257,7 +257,7 @@ def test_merit_order_does_not_pass_a_law_of_another_form():
         dvax.solve_vi(lambda y, _: y, dvax.sets.Box(0.0, 5.0), jnp.zeros(3), solver=solver)
 
 
-def test_a_firm_that_is_off_its_best_response_gains_what_a_search_finds():
+def test_market_deviation_profit_agrees_with_a_search():
     market = small(capacity=[100.0, 500.0, 200.0, 0.0, 400.0])
     p, u = map(np.asarray, market.equilibrium(0.0))
     c, a, firms, cap, _, b = numpy_data(market, 0.0)
@@ -274,7 +274,7 @@ def test_a_firm_that_is_off_its_best_response_gains_what_a_search_finds():
     assert largest_gain(p[None], u[None], cap[None], c, a, firms, b) >= found
 
 
-def test_the_constants_are_those_that_verify_proves():
+def test_market_constants_are_proved_by_verify():
     market = small()
     mine = market.constants
     found = dvax.verify(market.problem, jnp.asarray(40.0), 0.0, 1.0).constants
@@ -285,7 +285,7 @@ def test_the_constants_are_those_that_verify_proves():
     assert float(found.one_sided) <= -2.0 + 1e-9 and float(mine.one_sided) == -2.0
 
 
-def test_prices_of_two_starts_approach_as_the_one_sided_rate_says():
+def test_market_prices_approach_with_the_one_sided_rate():
     market = small()
     ends = [
         float(dvax.solve(market.problem, p, 0.0, 1.5, vi_solver=market.law_solver).xs[0])
@@ -303,13 +303,13 @@ BAD = [
 
 
 @pytest.mark.parametrize(("name", "value"), BAD)
-def test_every_bad_parameter_is_refused_by_name(name, value):
+def test_market_rejects_bad_parameters_by_name(name, value):
     with pytest.raises(dvax.InputError) as caught:
         small(**{name: value})
     assert name in caught.value.problems[0].place and len(caught.value.problems) == 1
 
 
-def test_bad_parameters_are_refused_at_once():
+def test_market_reports_all_bad_parameters_at_once():
     with pytest.raises(dvax.InputError) as caught:
         small(cost=float("nan"), slope="steep", firm=[1], b=0.0, speed=0.0, intercept="high")
     assert len(caught.value.problems) == 6

@@ -1,4 +1,4 @@
-"""Every week of the RTS-GMLC year ends at the default tolerances, wherever hours are counted from."""
+"""Every week of the RTS-GMLC year is solved at the default tolerances, for any origin of time."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ def data():
 
 
 @pytest.mark.parametrize("start", mostly_thorough(WEEKS, [8616]))
-def test_a_week_ends_at_the_default_tolerances(data, start):
+def test_market_weeks_succeed_at_the_default_tolerances(data, start):
     market = Market.from_rts(data, start, min(168, len(data.load) - start))
     sol = market.run()
     assert float(sol.ts[-1]) == float(market.intercept.span()[1])
@@ -33,14 +33,14 @@ def test_a_week_ends_at_the_default_tolerances(data, start):
 
 
 @pytest.mark.thorough
-def test_the_whole_year_ends_in_one_run(data):
+def test_market_whole_year_succeeds_in_one_run(data):
     sol = Market.from_rts(data, 0, len(data.load)).run()
     assert np.isfinite(np.asarray(sol.xs)).all() and sol.ts.shape == (len(data.load),)
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("start", [0, 4000, 8500])
-def test_wind_of_every_five_minutes(data, start):
+def test_market_with_wind_data_every_five_minutes(data, start):
     market = Market.from_rts(data, start, 168)
     rng, times = np.random.default_rng(start), start + np.arange(167 * 12 + 1) / 12.0
     hourly = np.asarray(market.capacity.values)

@@ -17,7 +17,7 @@ from dvax.models.mpc import LinearMPC
 
 
 def chain(**changed):
-    """Three masses between two walls, pushed at the first."""
+    """Three masses between two walls, with the force on the first."""
     S = 2 * np.eye(3) - np.eye(3, k=1) - np.eye(3, k=-1)
     given = dict(
         A=np.block([[np.zeros((3, 3)), np.eye(3)], [-S, -0.5 * np.eye(3)]]),
@@ -38,7 +38,7 @@ def least_squares(H, q, low, up):
     return lsq_linear(root, -np.linalg.solve(root.T, q), (low, up), "bvls", tol=1e-15).x
 
 
-def test_the_programme_is_the_cost_of_the_horizon(mpc):
+def test_mpc_programme_is_the_cost_of_the_horizon(mpc):
     A, B, *_ = cont2discrete((np.asarray(mpc.A), np.asarray(mpc.B), np.eye(6), 0.0), 0.25)
     # The Riccati equation by going back in time until nothing changes.
     cost = np.eye(6)
@@ -64,7 +64,7 @@ def test_the_programme_is_the_cost_of_the_horizon(mpc):
         assert condensed == pytest.approx(apart, rel=1e-11)
 
 
-def test_the_plan_is_that_of_a_solver_of_others_at_many_states(mpc):
+def test_mpc_plan_agrees_with_an_independent_solver_at_many_states(mpc):
     rng = np.random.default_rng(4)
     x = rng.normal(size=(200, 6)) * rng.uniform(0.05, 4.0, (200, 1))
     plans = np.asarray(jax.jit(jax.vmap(lambda x: mpc.plan(0.0, x)))(x))[..., 0]
@@ -75,14 +75,14 @@ def test_the_plan_is_that_of_a_solver_of_others_at_many_states(mpc):
         np.testing.assert_allclose(plan, other, atol=1e-9)
 
 
-def test_where_no_limit_is_active_the_law_is_the_regulator(mpc):
+def test_mpc_without_active_limits_is_the_regulator(mpc):
     rng = np.random.default_rng(5)
     x = 0.05 * rng.normal(size=(100, 6))
     moves = np.asarray(jax.jit(jax.vmap(lambda x: mpc.move(0.0, x)))(x))
     np.testing.assert_allclose(moves, -x @ np.asarray(mpc.regulator).T, atol=1e-14)
 
 
-def test_limits_on_changes_against_a_conic_solver():
+def test_mpc_slew_limits_agree_with_a_conic_solver():
     mpc = chain(slew=0.15, horizon=8)
     rng = np.random.default_rng(6)
     x = rng.normal(size=(24, 6))
@@ -104,7 +104,7 @@ def test_limits_on_changes_against_a_conic_solver():
     assert mpc.lipschitz.regions is None
 
 
-def test_the_lipschitz_constants_hold_each_sharper_than_the_last(mpc):
+def test_mpc_lipschitz_constants_hold_and_become_sharper(mpc):
     theory, projection, regions = mpc.lipschitz
     assert regions <= projection <= theory
     H, G = np.asarray(mpc.H), np.asarray(mpc.G)
@@ -124,7 +124,7 @@ def test_the_lipschitz_constants_hold_each_sharper_than_the_last(mpc):
     assert 0.5 * regions < seen <= regions * (1 + 1e-12)
 
 
-def test_several_inputs_have_their_regions_too():
+def test_mpc_lipschitz_constant_of_several_inputs_is_the_largest_slope():
     mpc = chain(B=np.eye(6)[:, [3, 5]], R=np.diag([0.5, 0.8]), horizon=3, lower=[-0.5, -0.2])
     H, G = np.asarray(mpc.H), np.asarray(mpc.G)
     most = 0.0
@@ -142,7 +142,7 @@ def test_several_inputs_have_their_regions_too():
 
 @pytest.fixture(scope="module")
 def loop(mpc):
-    """Three runs, as one batch, and the proof that they approach."""
+    """Three runs, as one batch, and the proof that they approach each other."""
     check = dvax.verify(mpc.problem, t0=0.0, t1=20.0, energy=True)
     x0 = np.array(
         [[1.5, 1.5, 1.5, 0, 0, 0], [-2.0, 0.0, 2.0, 1.0, 0, 0], [0, 0, 0, -1.0, 2.0, 0.5]]
@@ -154,7 +154,7 @@ def loop(mpc):
     return check, [run(jnp.asarray(x)) for x in x0]
 
 
-def test_closed_loop_decay_is_proved_and_seen(mpc, loop):
+def test_mpc_closed_loop_decay_is_proved_and_observed(mpc, loop):
     check, runs = loop
     assert check.status == "proved" and check.constants.status_of("energy") == "proved"
     overshoot, rate = map(float, check.constants.energy)
@@ -170,13 +170,13 @@ def test_closed_loop_decay_is_proved_and_seen(mpc, loop):
     assert 0.0 < figures["held"] < 0.5 and figures["lipschitz"] == mpc.lipschitz.regions
 
 
-def test_the_constants_are_those_that_verify_proves(mpc, loop):
+def test_mpc_constants_are_proved_by_verify(mpc, loop):
     mine, found = mpc.constants, loop[0].constants
     for name in ("gamma", "L_F", "alpha_h", "beta_h", "alpha_f", "beta_f", "omega", "L"):
         assert float(getattr(mine, name)) == pytest.approx(float(getattr(found, name))), name
 
 
-def test_the_loop_against_an_integrator_and_a_programme_of_others(mpc, loop):
+def test_mpc_loop_agrees_with_an_independent_integrator_and_solver(mpc, loop):
     H, G, A, B = map(np.asarray, (mpc.H, mpc.G, mpc.A, mpc.B))
     run = loop[1][0]
 
@@ -188,7 +188,7 @@ def test_the_loop_against_an_integrator_and_a_programme_of_others(mpc, loop):
     np.testing.assert_allclose(np.asarray(run.xs)[[5, 10]], other.y.T, atol=2e-6)
 
 
-def test_a_reachable_target_is_where_the_loop_rests(mpc):
+def test_mpc_loop_converges_to_a_reachable_target(mpc):
     # Held by u_s = 0.3 at the first mass: S x_s = (0.3, 0, 0).
     rest = np.array([0.225, 0.15, 0.075, 0.0, 0.0, 0.0])
     there = chain(target=rest, feed=[0.3], disturbance=lambda t: jnp.zeros(6))
@@ -219,13 +219,13 @@ BAD = [
 
 
 @pytest.mark.parametrize(("name", "value"), BAD)
-def test_every_bad_parameter_is_refused_by_name(name, value):
+def test_mpc_rejects_bad_parameters_by_name(name, value):
     with pytest.raises(dvax.InputError) as caught:
         chain(**{name: value})
     assert name in caught.value.problems[0].place and len(caught.value.problems) == 1
 
 
-def test_bad_parameters_are_refused_at_once():
+def test_mpc_reports_all_bad_parameters_at_once():
     with pytest.raises(dvax.InputError) as caught:
         chain(Q=-np.eye(6), R=np.zeros((1, 1)), B=np.zeros((5, 1)))
     assert len(caught.value.problems) == 3
@@ -234,7 +234,7 @@ def test_bad_parameters_are_refused_at_once():
     assert len(caught.value.problems) == 3
 
 
-def test_a_plant_that_its_inputs_cannot_hold_is_refused():
+def test_mpc_rejects_a_plant_that_cannot_be_stabilised():
     A = np.diag([0.5, 1.0, -1.0, -1.0, -1.0, -1.0])  # the second mode grows, and nothing pushes it
     with pytest.raises(dvax.InputError, match="stabilising"):
         chain(A=A, B=np.eye(6)[:, [0]])

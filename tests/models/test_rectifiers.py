@@ -1,5 +1,5 @@
-"""Multipliers of voltage and bridges of three phases: many diodes switch at one time, and capacitors
-hang on each other by nothing but diodes of almost no resistance."""
+"""Voltage multipliers and three-phase bridges: many diodes switch at the same time, and capacitors are
+connected by diodes of almost no resistance only."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from dvax.models.circuit import Circuit
 
 
 def drawn(seed, most_stages=4):
-    """A circuit of one of the two kinds, of any scale: its netlist, and its end."""
+    """A random circuit of one of the two kinds, of any scale: its netlist, and its end time."""
     rng = np.random.default_rng([7, seed])
     ten = lambda low, high: 10 ** rng.uniform(np.log10(low), np.log10(high))  # noqa: E731
     if seed % 2:
@@ -35,7 +35,7 @@ def drawn(seed, most_stages=4):
     # 45: three equal lines and strays, whose ringing is that of a triple eigenvalue but for rounding.
     [0, 1, 2, 45, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(3, 240) if s != 45)],
 )
-def test_rectifiers_of_any_scale_run_at_the_defaults(seed):
+def test_rectifiers_of_any_scale_succeed_at_the_defaults(seed):
     text, _, end = drawn(seed)
     circuit, ts = Circuit(text), np.linspace(0.0, end, 31)
     sol = circuit.solve(end, ts)
@@ -48,7 +48,7 @@ def test_rectifiers_of_any_scale_run_at_the_defaults(seed):
     assert np.abs(np.asarray(sol.law_step)).max() <= size
 
 
-def test_the_order_of_lines_does_not_matter():
+def test_rectifiers_do_not_depend_on_the_order_of_lines():
     # Ringing rates of a symmetric bridge are near each other; their vectors depended on the order, and
     # the bridge with its filter first took a step for every few periods.
     lines = three_phases(0.1, 50.0, 1e-6, 1e-9, 1e-3, 10.0).splitlines()
@@ -67,7 +67,7 @@ def test_the_order_of_lines_does_not_matter():
 @pytest.mark.parametrize(
     "seed", [0, 4, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(6, 60, 2))]
 )
-def test_multipliers_agree_with_a_hundred_digits(seed):
+def test_multipliers_agree_with_hundred_digit_arithmetic(seed):
     text, source, end = drawn(seed, most_stages=2)
     ts = np.linspace(0.0, 0.25 * end, 13)
     try:

@@ -43,7 +43,7 @@ FEW = [
 
 
 def agrees_at_any_resistance(case):
-    """It ends, the law holds, and the work follows from what happens and not from r."""
+    """Check that the run ends, the law holds, and the cost does not grow with 1/r."""
     r, capacity, stray, inductance, kind = case
     source, end, events = SOURCES[kind]
     circuit = Circuit(rectifier(r, source, capacity, stray, inductance))
@@ -62,17 +62,17 @@ def agrees_at_any_resistance(case):
 
 
 @pytest.mark.parametrize("case", FEW)
-def test_diodes_of_almost_no_resistance_run_at_the_defaults(case):
+def test_stiff_diodes_of_small_resistance_succeed_at_the_defaults(case):
     agrees_at_any_resistance(case)
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("case", CASES)
-def test_every_resistance_stray_and_source_runs_at_the_defaults(case):
+def test_stiff_circuits_with_any_resistance_parasitics_and_source_succeed_at_the_defaults(case):
     agrees_at_any_resistance(case)
 
 
-def test_the_ideal_diode_is_the_limit_and_is_met_in_proportion_to_r():
+def test_stiff_diode_converges_to_the_ideal_one_linearly_in_r():
     ends = [
         np.asarray(Circuit(rectifier(r, "SIN(0 10 1k)")).solve(0.4e-3).xs[-1])
         for r in (1e-2, 1e-3, 1e-4, 1e-5)
@@ -89,7 +89,7 @@ def test_the_ideal_diode_is_the_limit_and_is_met_in_proportion_to_r():
         pytest.param((1e-6, "SIN(0 10 1k)", "1n"), marks=pytest.mark.thorough),
     ],
 )
-def test_a_stiff_rectifier_agrees_with_radau(case):
+def test_stiff_rectifier_agrees_with_radau(case):
     r, source, capacity = case
     text = rectifier(r, source, capacity)
     circuit, ts = Circuit(text), np.linspace(0.0, 1.2e-3, 25)
@@ -126,7 +126,7 @@ def test_a_stiff_rectifier_agrees_with_radau(case):
     np.testing.assert_allclose(mine, found.y.T[:, columns], atol=2e-6)
 
 
-def test_a_bridge_and_a_clipper_of_almost_ideal_diodes():
+def test_stiff_bridge_and_clipper_of_almost_ideal_diodes():
     bridge = """
     V1 a 0 SIN(0 10 1k)
     D1 a p
@@ -171,7 +171,7 @@ def stiffened(seed):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(60))
-def test_random_circuits_of_stiff_diodes_agree_with_the_second_analysis(seed):
+def test_stiff_random_circuits_agree_with_an_independent_analysis(seed):
     text = stiffened(seed)
     sources = [line for line in text.splitlines() if line[0] in "VI"]
     plain = tableau(text)
@@ -195,7 +195,7 @@ def test_random_circuits_of_stiff_diodes_agree_with_the_second_analysis(seed):
 
 
 @pytest.mark.parametrize("seed", [27, 40])
-def test_the_last_time_is_saved_where_the_last_step_ends_within_rounding_of_it(seed):
+def test_stiff_run_saves_a_last_time_within_rounding_of_the_last_step(seed):
     ts = np.linspace(0.0, 2.0, 9)
     sol = Circuit(stiffened(seed)).solve(ts[-1], ts)
     np.testing.assert_array_equal(sol.ts, ts)
@@ -254,7 +254,7 @@ def drawn(rng, mild=False):
 @pytest.mark.parametrize(
     "seed", [0, 3, 5, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(6, 300))]
 )
-def test_circuits_of_any_kind_and_scale_run_at_the_defaults(seed):
+def test_circuits_of_any_kind_and_scale_succeed_at_the_defaults(seed):
     text, _, end, events = drawn(np.random.default_rng(seed))
     circuit, ts = Circuit(text), np.linspace(0.0, end, 21)
     sol = circuit.solve(end, ts)
@@ -270,7 +270,7 @@ def test_circuits_of_any_kind_and_scale_run_at_the_defaults(seed):
     "seed",
     [2, 25, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(26, 200) if s != 153)],
 )
-def test_circuits_of_any_kind_and_scale_agree_with_a_hundred_digits(seed):
+def test_circuits_of_any_kind_and_scale_agree_with_hundred_digit_arithmetic(seed):
     text, source, end, _ = drawn(np.random.default_rng(seed))
     ts = np.linspace(0.0, end, 21)
     try:
@@ -290,7 +290,7 @@ def test_circuits_of_any_kind_and_scale_agree_with_a_hundred_digits(seed):
 @pytest.mark.parametrize(
     "seed", [1, 2, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(3, 60) if s != 45)]
 )
-def test_circuits_of_any_kind_agree_with_radau_on_the_second_analysis(seed):
+def test_circuits_of_any_kind_agree_with_radau_on_an_independent_analysis(seed):
     text, source, end, _ = drawn(np.random.default_rng(1000 + seed), mild=True)
     circuit, ts = Circuit(text), np.linspace(0.0, end, 13)
     mine = np.asarray(circuit.solve(end, ts).xs)
@@ -336,7 +336,7 @@ def test_circuits_of_any_kind_agree_with_radau_on_the_second_analysis(seed):
     np.testing.assert_allclose(mine, found, atol=3e-5 * np.abs(found).max(axis=0).max())
 
 
-def test_a_pulse_is_that_of_spice():
+def test_pulse_source_agrees_with_spice():
     pulse = read_waveform(["PULSE(1 5 10u 2u 4u 20u 100u)"], "voltage", "here")
     times = 1e-6 * np.array([0, 10, 11, 12, 20, 32, 34, 36, 60, 110, 111, 1e3 + 11, 1e3 + 33])
     values = [1, 1, 3, 5, 5, 5, 3, 1, 1, 1, 3, 3, 4]

@@ -23,7 +23,7 @@ def records():
 
 
 @pytest.mark.parametrize("name", ["waves", "pulse", "walk"])
-def test_the_work_of_a_frame_does_not_grow_as_its_viscosity_goes(name):
+def test_frame_cost_does_not_grow_for_small_viscosity(name):
     record = dict(records())[name]
     knots = record.samples.shape[0]
     peaks, counts = [], []
@@ -38,7 +38,7 @@ def test_the_work_of_a_frame_does_not_grow_as_its_viscosity_goes(name):
 
 
 @pytest.mark.parametrize("ratio", [1e-4, 1e-8])
-def test_the_distance_to_the_elastoplastic_frame_is_bounded(ratio):
+def test_elastoplastic_distance_bounds_the_difference(ratio):
     T, z, limit = 0.5, 0.05, 0.5
     run, _ = exactly(elastoplastic(T, z, limit), GROUND[:151], step=1.25e-3)
     frame = Frame(record=Accelerogram(STEP, GROUND[:151]), period=T, damping=z,
@@ -54,7 +54,7 @@ def test_the_distance_to_the_elastoplastic_frame_is_bounded(ratio):
 @pytest.mark.thorough
 @pytest.mark.parametrize("ratio", [1e-2, 1e-5, 1e-7, 1e-8])
 @pytest.mark.parametrize("strength", [0.125, 0.5])
-def test_el_centro_at_any_viscosity(ratio, strength):
+def test_frame_under_el_centro_at_any_viscosity(ratio, strength):
     if not EL_CENTRO.exists():
         pytest.skip("needs elCentro.at2 of OpenSees's verification examples under ../shared/data")
     record = Accelerogram.from_at2(EL_CENTRO)

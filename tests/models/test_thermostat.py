@@ -26,7 +26,7 @@ def mode(model):
     return jnp.asarray(phi), (2 * np.pi / 1.5) ** 2 + np.pi**2
 
 
-def test_where_nothing_saturates_an_eigenfunction_decays_with_both_rates():
+def test_thermostat_without_saturation_decays_with_both_rates():
     model = plate()
     phi, eigenvalue = mode(model)
     sol = dvax.solve(model.problem, 20.0 + 0.3 * phi, 0.0, 0.5, rtol=1e-8)
@@ -35,7 +35,7 @@ def test_where_nothing_saturates_an_eigenfunction_decays_with_both_rates():
     assert model.figures(sol)["regulated"] == 1.0
 
 
-def test_at_full_power_a_step_of_any_length_is_exact():
+def test_thermostat_at_full_power_is_exact_for_any_step():
     model = plate()
     phi, eigenvalue = mode(model)
     sol = dvax.solve(model.problem, 10.0 + phi, 0.0, 2.0, dt=2.0)
@@ -60,7 +60,7 @@ def manufactured():
     return plate(load=load), phi, lambda t: 20.0 + np.asarray(a(t) * phi)
 
 
-def test_a_manufactured_field_with_moving_free_boundaries(manufactured):
+def test_thermostat_manufactured_field_with_moving_free_boundaries(manufactured):
     model, phi, exact = manufactured
     errors = []
     for steps in (40, 80, 160):
@@ -71,7 +71,7 @@ def test_a_manufactured_field_with_moving_free_boundaries(manufactured):
     assert errors[-1] < 2e-3 and np.all((orders > 1.8) & (orders < 2.3)), (errors, orders)
 
 
-def test_the_regimes_lie_between_level_lines(manufactured):
+def test_thermostat_regimes_lie_between_level_lines(manufactured):
     model, phi, exact = manufactured
     for t in (0.0, 0.2, 1.4):
         depth = -GAIN * 0.9 * np.cos(2.0 * t) * np.asarray(phi)
@@ -85,7 +85,7 @@ def test_the_regimes_lie_between_level_lines(manufactured):
         np.testing.assert_allclose(response, power, atol=1e-12)
 
 
-def test_the_bound_is_proved_and_above_the_true_error(manufactured):
+def test_thermostat_bound_is_proved_and_above_the_true_error(manufactured):
     model, phi, exact = manufactured
     ts = np.linspace(0.0, 1.0, 5)
     sol = dvax.solve(model.problem, 20.0 + 0.9 * phi, 0.0, 1.0, ts=ts, rtol=1e-6, atol=1e-4)
@@ -117,7 +117,7 @@ def free_boundary(kappa, k, g, side):
     return sigma, profile
 
 
-def test_at_rest_the_free_boundary_is_where_a_parabola_meets_a_cosh():
+def test_thermostat_steady_free_boundary_agrees_with_the_closed_form():
     kappa, k, g = 0.2, 12.0, 4.0
     sigma, profile = free_boundary(kappa, k, g, 1.0)
     assert 0.1 < sigma < 0.4
@@ -136,7 +136,7 @@ def test_at_rest_the_free_boundary_is_where_a_parabola_meets_a_cosh():
     assert errors[1] < 2e-3 and errors[0] / errors[1] > 6.0, errors
 
 
-def test_an_insulated_plate_keeps_the_heat_that_it_gets():
+def test_thermostat_insulated_plate_gains_the_supplied_heat():
     s1, s2 = plate().points
     load = jnp.asarray(np.exp(-10 * ((s1 - 0.4) ** 2 + (s2 - 0.6) ** 2)))
     model = plate(load=load, upper=jnp.asarray(np.where(s1 < 0.75, 3.0, 0.0)), lower=0.0)
@@ -151,7 +151,7 @@ def test_an_insulated_plate_keeps_the_heat_that_it_gets():
     assert np.all(np.asarray(sol.us)[:, 12:] == 0.0) and np.all(np.asarray(sol.us)[0, :12] == 3.0)
 
 
-def test_any_two_states_approach_as_proved():
+def test_thermostat_states_approach_with_the_proved_rate():
     model = plate(boundary="dirichlet", lower=-50.0, upper=50.0, reference=0.0)
     rate = KAPPA * np.pi**2 * (1 / 1.5**2 + 1.0)
     c = model.constants
@@ -166,7 +166,7 @@ def test_any_two_states_approach_as_proved():
     assert np.all(np.array(apart) <= allowed * (1 + 1e-9)) and apart[-1] < 0.5 * allowed[-1]
 
 
-def test_insulated_plates_at_full_power_stay_apart_so_that_no_rate_is_claimed():
+def test_thermostat_insulated_plate_at_full_power_has_rate_zero():
     model = plate()
     assert float(model.constants.sharp_decay_rate) == pytest.approx(0.0, abs=1e-12)
     cold = [jnp.full((24, 16), value) for value in (5.0, 6.0)]
@@ -175,7 +175,7 @@ def test_insulated_plates_at_full_power_stay_apart_so_that_no_rate_is_claimed():
 
 
 @pytest.mark.parametrize("boundary", ["dirichlet", "neumann", "periodic"])
-def test_the_constants_are_those_that_verify_proves(boundary):
+def test_thermostat_constants_are_proved_by_verify(boundary):
     model = plate(boundary=boundary)
     mine = model.constants
     check = dvax.verify(model.problem, jnp.zeros((24, 16)))
@@ -187,7 +187,7 @@ def test_the_constants_are_those_that_verify_proves(boundary):
     assert float(mine.one_sided) <= float(found.one_sided) + 1e-9
 
 
-def test_the_weights_are_the_areas_of_the_cells():
+def test_thermostat_weights_are_the_areas_of_the_cells():
     model = plate()
     assert float(jnp.sum(model.space.w)) == pytest.approx(1.5)
     s1, s2 = model.points
@@ -203,13 +203,13 @@ BAD = [
 
 
 @pytest.mark.parametrize(("name", "value"), BAD)
-def test_every_bad_parameter_is_refused_by_name(name, value):
+def test_thermostat_rejects_bad_parameters_by_name(name, value):
     with pytest.raises(dvax.InputError) as caught:
         plate(**{name: value})
     assert name in caught.value.problems[0].place and len(caught.value.problems) == 1
 
 
-def test_bad_parameters_are_refused_at_once():
+def test_thermostat_reports_all_bad_parameters_at_once():
     with pytest.raises(dvax.InputError) as caught:
         plate(diffusion=-1.0, gain=0.0, reference="warm", load=np.zeros(3), lower=np.zeros(2))
     assert len(caught.value.problems) == 5

@@ -1,4 +1,4 @@
-"""Day-to-day traffic: closed forms, a linear programme as oracle, and what can never happen."""
+"""Day-to-day traffic: closed forms, a linear programme as oracle, and invariants."""
 
 import dataclasses
 import doctest
@@ -34,9 +34,9 @@ def braess(tmp_path_factory):
     return traffic.Traffic(*networks.braess(tmp_path_factory.mktemp("braess")))
 
 
-def test_braess(braess):
+def test_traffic_braess_network_reaches_its_equilibrium(braess):
     sol = run(braess, braess.all_or_nothing(), 40.0, [0.0, 40.0])
-    assert sorted(np.asarray(sol.xs[0])) == [0.0, 0.0, 6.0]  # 60 + 16 + 60 for everybody
+    assert sorted(np.asarray(sol.xs[0])) == [0.0, 0.0, 6.0]  # the cost of this path is 60 + 16 + 60
     figures = braess.figures(sol)
     for x in (braess.equilibrium, sol.xs[-1]):
         np.testing.assert_allclose(x, 2.0, atol=1e-7)
@@ -48,7 +48,7 @@ def test_braess(braess):
     assert braess.fit.startswith("exact") and braess.relative_gap(0.0, sol.xs[-1]) <= 1e-8
 
 
-def test_the_law_is_the_proximal_step_found_face_by_face(braess):
+def test_traffic_law_agrees_with_the_enumeration_of_faces(braess):
     incidence = braess.paths.incidence().toarray()
     slope = incidence @ np.diag([10.0, 1.0, 1.0, 1.0, 10.0]) @ incidence.T
     start = incidence @ np.array([0.0, 50.0, 50.0, 10.0, 0.0])
@@ -82,7 +82,7 @@ def two_roads_share(factor=1.0, remaining=1.0, toll=0.0, distance=0.0):
     return (1.0 + a * d - 4.0 * toll - 5.0 * distance) / (0.1 + a)
 
 
-def test_tolls_and_lengths_count_as_they_are_weighed():
+def test_traffic_tolls_and_lengths_enter_with_their_weights():
     for toll, distance in ((0.0, 0.0), (0.5, 0.0), (0.0, 0.25), (0.5, 0.25)):
         model = traffic.Traffic(
             *networks.two_roads(), toll_weight=toll, distance_weight=distance, rho=10.0
@@ -96,7 +96,7 @@ def test_tolls_and_lengths_count_as_they_are_weighed():
         assert time == pytest.approx(np.dot(times, v), rel=1e-13)  # tolls are not time
 
 
-def test_a_rush_and_an_incident_are_followed():
+def test_traffic_follows_changing_demand_and_an_incident():
     rush = dvax.signals.Table([0.0, 10.0, 12.0, 60.0], [1.0, 1.0, 1.5, 1.5])
     hole = traffic.Incident((1, 3), 0.4, 30.0, 45.0)
     model = traffic.Traffic(*networks.two_roads(), rho=50.0, demand=rush, incidents=[hole])
@@ -123,7 +123,7 @@ def test_a_rush_and_an_incident_are_followed():
 
 
 @pytest.mark.parametrize("case", ["one path", "no congestion", "constant costs"])
-def test_a_network_without_a_choice_or_without_congestion_runs(case):
+def test_traffic_network_without_choice_or_congestion_is_solved(case):
     # Two roads of equal cost for the last case; no link is stiff, or no pair has two paths.
     congested = case == "one path"
     columns = dict(
@@ -138,7 +138,7 @@ def test_a_network_without_a_choice_or_without_congestion_runs(case):
     np.testing.assert_allclose(sol.xs[-1], model.equilibrium, rtol=1e-9)
 
 
-def test_incidents_on_one_link_multiply():
+def test_traffic_incidents_on_one_link_multiply():
     holes = [traffic.Incident((1, 3), 0.5, 1.0, 4.0), traffic.Incident((1, 3), 0.4, 3.0, 5.0)]
     model = traffic.Traffic(*networks.two_roads(), rho=50.0, incidents=holes)
     each = [float(model.capacity(t)[1]) for t in (0.0, 1.0, 3.0, 4.0, 5.0)]
@@ -150,7 +150,7 @@ def rush_at(t):
     return np.interp(t, [0.0, 10.0, 12.0, 60.0], [1.0, 1.0, 1.5, 1.5])
 
 
-def test_demand_beyond_its_peak_is_no_number_and_stops_a_run():
+def test_traffic_demand_above_its_peak_is_nan_and_ends_the_run():
     rush = lambda t: 1.0 + 0.1 * t  # noqa: E731
     model = traffic.Traffic(*networks.two_roads(), rho=50.0, demand=rush, peak=1.4)
     totals = [float(model.problem.set_at(t).total[0]) for t in (0.0, 4.0, 4.1, -10.5)]
@@ -178,7 +178,7 @@ def days(city):
     return [run(city, x0, 24.0, ts) for x0 in starts]
 
 
-def test_no_flow_on_the_network_costs_less_at_the_equilibrium(city):
+def test_traffic_equilibrium_has_the_least_cost_over_all_flows(city):
     # c(v)·w ≥ c(v)·v for all flows w makes v the least of Φ, which is convex; w by linear programming
     # on links, with neither paths nor split nodes.
     network, trips = city.network, city.trips
@@ -195,7 +195,7 @@ def test_no_flow_on_the_network_costs_less_at_the_equilibrium(city):
     assert least < 0.8 * float(city.objective(0.0, city.equilibrium))
 
 
-def test_days_lead_to_the_equilibrium_and_trips_are_conserved(city, days):
+def test_traffic_converges_to_the_equilibrium_and_conserves_trips(city, days):
     least = float(city.objective(0.0, city.equilibrium))
     for sol in days:
         objective = np.array([float(city.objective(0.0, x)) for x in sol.xs])
@@ -207,7 +207,7 @@ def test_days_lead_to_the_equilibrium_and_trips_are_conserved(city, days):
         assert float(jnp.min(sol.xs)) >= 0.0
 
 
-def test_two_trajectories_never_separate(city, days):
+def test_traffic_trajectories_do_not_separate(city, days):
     apart = np.linalg.norm(np.asarray(days[0].xs) - np.asarray(days[1].xs), axis=1)
     tolerance = 40 * city.vi_solver.least
     assert apart[0] > 1e3 and np.all(np.diff(apart) <= tolerance)
@@ -215,7 +215,7 @@ def test_two_trajectories_never_separate(city, days):
     assert float(c.growth_rate) == 0.0 == float(c.sharp_decay_rate) and float(c.L) == 1.0
 
 
-def test_responses_are_within_their_certificate(city, days):
+def test_traffic_responses_are_within_their_certificate(city, days):
     # By a Newton method with dense matrices, which shares no code with the solver but link costs.
     costs = jax.tree_util.tree_map(np.asarray, city.link_costs)
     step = ProximalStep(costs, city.network.capacity, city.paths, city.trips.flow)
@@ -227,7 +227,7 @@ def test_responses_are_within_their_certificate(city, days):
             assert tries < 500 and error <= float(bound) + rounding and float(bound) <= 1e-2
 
 
-def test_the_slope_of_the_objective_is_the_cost_of_every_path(city):
+def test_traffic_objective_gradient_is_the_path_costs(city):
     for x in (city.all_or_nothing(), city.equilibrium):
         slope = jax.grad(lambda x: city.objective(0.0, x))(x)
         along = city.incidence.along(city.costs(0.0, x))
@@ -237,14 +237,14 @@ def test_the_slope_of_the_objective_is_the_cost_of_every_path(city):
 # The constants.
 
 
-def test_the_moduli_are_never_violated_and_hardly_too_large(city):
+def test_traffic_moduli_hold_and_are_nearly_sharp(city):
     c, problem = city.constants, city.problem
     assert c.status_of("gamma", "L_F", "alpha_h", "beta_h", "beta_f", "one_sided") == "proved"
     F = jax.jit(lambda y: problem.frozen(0.0, jnp.zeros_like(y))(y))
     rng, n = np.random.default_rng(3), len(city.equilibrium)
     worst = np.repeat(
         city.trips.flow, city.paths.sizes
-    )  # everybody on every path: no flow is larger
+    )  # the whole demand on every path: no flow is larger
     points = [worst, -worst, 3 * worst, np.zeros(n), np.asarray(city.equilibrium)]
     points += [worst * rng.uniform(-1, 2, n) for _ in range(10)]
     for y, z in itertools.combinations(points, 2):
@@ -262,7 +262,8 @@ def test_the_moduli_are_never_violated_and_hardly_too_large(city):
     assert exact <= float(c.L_F) <= 1.01 * exact
 
 
-def test_costs_are_the_slope_of_their_integral_and_go_on_straight():
+def test_traffic_costs_are_the_derivative_of_their_integral():
+    """Beyond the largest flow the costs are extended linearly."""
     network, _ = networks.grid(5, 5, 8, 20, 1e4, seed=4)
     costs = link_costs(network, 0.3, 0.4).up_to(2.0 * network.capacity)
     rng, capacity = np.random.default_rng(5), network.capacity
@@ -310,7 +311,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_bad_argument_is_refused_by_name(case):
+def test_traffic_rejects_bad_arguments_by_name(case):
     arguments, said = BAD[case]
     with pytest.raises(dvax.InputError) as caught:
         traffic.Traffic(*networks.two_roads(), **({"rho": 10.0} | arguments))
@@ -318,7 +319,7 @@ def test_a_bad_argument_is_refused_by_name(case):
     assert case.strip() in problem.place and said in f"{problem.rule} {problem.fix}"
 
 
-def test_networks_outside_the_class_are_refused():
+def test_traffic_rejects_networks_outside_the_class():
     def refused(columns, **arguments):
         with pytest.raises(dvax.InputError) as caught:
             traffic.Traffic(*networks.two_roads(**columns), **arguments)
@@ -337,7 +338,7 @@ def test_networks_outside_the_class_are_refused():
 # Real sizes.
 
 
-def test_sioux_falls():
+def test_traffic_sioux_falls_agrees_with_published_flows():
     folder = networks.SIOUX_FALLS
     if not folder.is_dir():
         pytest.skip(f"the Sioux Falls files are not at {folder}")
@@ -365,7 +366,7 @@ def test_sioux_falls():
 
 
 @pytest.mark.thorough
-def test_a_network_of_the_size_of_anaheim():
+def test_traffic_network_of_the_size_of_anaheim():
     network, trips = networks.grid(20, 18, 38, 1400, 4e4, seed=2, one_way=True)
     assert network.nodes == 398 and len(network) == 910 and len(trips) == 1400
     model = traffic.Traffic(network, trips, **WEIGHTS)
@@ -379,7 +380,7 @@ def test_a_network_of_the_size_of_anaheim():
     assert figures["max_conservation_error"] <= 1e-12
 
 
-def test_the_examples_of_the_docstrings_print_what_they_say(tmp_path, monkeypatch):
+def test_traffic_docstring_examples_print_the_documented_output(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = [vars(traffic)[name] for name in ("Network", "Trips", "Incident")]
     names += [formats.read_network, formats.read_trips]

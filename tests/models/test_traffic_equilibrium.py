@@ -70,7 +70,7 @@ MANY = [
     "case", [*SMALL, *(pytest.param(c, marks=pytest.mark.thorough) for c in MANY)], ids=str
 )
 @pytest.mark.parametrize("one_way", [False, True])
-def test_nobody_has_a_path_that_costs_less(case, one_way):
+def test_equilibrium_has_no_path_with_less_cost(case, one_way):
     *shape, load, seed = case
     if one_way:
         shape[:2] = [n + n % 2 for n in shape[:2]]
@@ -84,7 +84,7 @@ def test_nobody_has_a_path_that_costs_less(case, one_way):
 
 
 def free(network):
-    """The same network, where a third of all links costs nothing and another third has no time."""
+    """The same network, where a third of all links has no cost and another third no travel time."""
     rng, scale = np.random.default_rng(9), network.free_flow_time.copy()
     chosen = rng.integers(0, 3, len(network))
     length = np.where(chosen > 0, network.length, 0.0)
@@ -95,7 +95,7 @@ def free(network):
 
 
 @pytest.mark.parametrize("load", [1e3, 1e5])
-def test_links_that_cost_nothing_are_links(load):
+def test_equilibrium_accepts_links_without_cost(load):
     network, trips = networks.grid(6, 6, 10, 60, load, seed=5)
     network = free(network)
     assert np.sum(network.free_flow_time + network.length == 0) > 5
@@ -106,7 +106,7 @@ def test_links_that_cost_nothing_are_links(load):
     assert abs(c @ v - cheapest) <= 1e-9 * (c @ v)
 
 
-def test_pairs_without_trips_change_nothing():
+def test_equilibrium_ignores_pairs_without_trips():
     network, trips = networks.grid(5, 6, 8, 30, 3e4, seed=3)
     every = [(o, d) for o in range(1, 9) for d in range(1, 9)]
     flow = dict(zip(zip(trips.origin.tolist(), trips.destination.tolist()), trips.flow))
@@ -118,7 +118,7 @@ def test_pairs_without_trips_change_nothing():
 
 @pytest.mark.parametrize("power", [1.0, 1.5, 2.0, 4.0, 6.0])
 @pytest.mark.parametrize("number", [2, 7])
-def test_parallel_roads_share_trips_as_their_closed_form_says(power, number):
+def test_equilibrium_of_parallel_roads_is_the_closed_form(power, number):
     """`number` roads of t = 1 + 0.15 (v/k)^p, k = 1, 2, …, each through a node of its own: at a common
     cost 1 + λ each carries k (λ/0.15)^(1/p), so that flows are in proportion to capacities."""
     k = np.arange(1.0, number + 1)
@@ -142,7 +142,7 @@ def test_parallel_roads_share_trips_as_their_closed_form_says(power, number):
     assert len(found.flows) == number
 
 
-def test_the_same_equilibrium_whatever_the_blocks(monkeypatch):
+def test_equilibrium_does_not_depend_on_the_blocks(monkeypatch):
     network, trips = networks.grid(8, 8, 14, 120, 5e4, seed=6)
     flows = []
     for size in (50_000, 20):
@@ -153,7 +153,7 @@ def test_the_same_equilibrium_whatever_the_blocks(monkeypatch):
     np.testing.assert_allclose(flows[0], flows[1], rtol=1e-5, atol=1e-3)
 
 
-def test_a_sweep_keeps_sums_and_link_flows_and_lowers_the_objective():
+def test_equilibrium_sweep_conserves_sums_and_reduces_the_objective():
     network, trips = networks.grid(6, 7, 12, 60, 6e4, seed=1)
     costs = link_costs(network, 0.3, 0.4).up_to(np.full(len(network), trips.flow.sum()))
     found = solved(network, trips, gap=1e-3)
@@ -176,7 +176,7 @@ def test_a_sweep_keeps_sums_and_link_flows_and_lowers_the_objective():
     assert problem.excess() <= 1e-6 * at_first
 
 
-def test_what_paths_share_is_left_out_of_their_differences():
+def test_path_differences_omit_shared_links():
     # Pair 0 has two paths that share links 0 and 3, pair 1 one path, pair 2 three without a common one.
     links = [[0, 1, 3], [0, 2, 3], [4, 0], [5], [1, 6], [2, 6]]
     paths = Paths(
@@ -192,7 +192,7 @@ def test_what_paths_share_is_left_out_of_their_differences():
     np.testing.assert_allclose(found.fixed + matrix.T @ x[found.rows], paths.incidence().T @ x)
 
 
-def test_what_rounding_does_not_allow_is_refused():
+def test_equilibrium_gap_below_rounding_is_rejected():
     network, trips = networks.grid(4, 4, 5, 10, 2e4, seed=7)
     with pytest.raises(dvax.SolveError, match="larger gap"):
         solved(network, trips, gap=1e-25)
@@ -200,7 +200,7 @@ def test_what_rounding_does_not_allow_is_refused():
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("load", "seed"), [(4e4, 1), (4e5, 2)])
-def test_a_network_with_thousands_of_pairs(load, seed):
+def test_equilibrium_of_a_network_with_thousands_of_pairs(load, seed):
     network, trips = networks.grid(20, 20, 80, 6000, load, seed)
     found = solved(network, trips, gap=1e-11)
     check(network, trips, found, 1e-11, paths_alike=1e-7)

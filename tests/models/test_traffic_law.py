@@ -28,7 +28,7 @@ EVERY = [(s, d, r) for s in SHAPES for d in (0.5, 1.0, 2.0) for r in (1e-3, 1e-1
     ("shape", "factor", "share"),
     mostly_thorough(EVERY, [("square", 1.0, 1.0), ("one way", 2.0, 0.1)]),
 )
-def test_the_law_agrees_with_accelerated_gradients(shape, factor, share):
+def test_link_newton_agrees_with_accelerated_gradients(shape, factor, share):
     network, trips = networks.grid(**SHAPES[shape])
     trips = traffic.Trips(trips.zones, trips.origin, trips.destination, factor * trips.flow)
     usual = traffic.Traffic(network, trips)
@@ -57,7 +57,7 @@ def test_the_law_agrees_with_accelerated_gradients(shape, factor, share):
         x = x + 0.5 * (one.y - x)
 
 
-def test_the_block_is_that_of_the_dense_matrix():
+def test_link_newton_block_is_that_of_the_dense_matrix():
     # S = Δ P Δᵀ, P = diag(used) − mean over the used paths of a pair, of dense matrices.
     model = traffic.Traffic(*networks.grid(**SHAPES["one way"]))
     choices, rng = model.vi_solver.choices, np.random.default_rng(6)
@@ -77,13 +77,13 @@ def test_the_block_is_that_of_the_dense_matrix():
     np.testing.assert_allclose(diagonal, np.diag(S), atol=1e-13)
 
 
-def test_another_law_is_refused():
+def test_link_newton_rejects_another_law():
     solver = traffic.Traffic(*networks.two_roads(), rho=10.0).vi_solver
     with pytest.raises(dvax.InputError, match="Traffic alone"):
         dvax.solve_vi(lambda y, args: y, dvax.sets.Simplex(1.0), jnp.ones(2), solver=solver)
 
 
-def test_pairs_without_a_choice_have_a_law_too():
+def test_link_newton_solves_pairs_without_a_choice():
     network = traffic.Network(
         zones=2, nodes=2, first_thru_node=1, init_node=[1, 2], term_node=[2, 1],
         capacity=[10.0, 10.0], length=[1.0, 1.0], free_flow_time=[5.0, 5.0], b=[0.15, 0.15],

@@ -18,7 +18,7 @@ def self_adjoint(rng, weights):
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_the_spectrum_of_a_matrix_is_that_of_its_quadratic_form(weighted):
+def test_dense_spectrum_is_that_of_its_quadratic_form(weighted):
     rng = np.random.default_rng(3 + weighted)
     for n in (1, 2, 5):
         w = rng.uniform(0.1, 3.0, n) if weighted else np.ones(n)
@@ -34,7 +34,7 @@ def test_the_spectrum_of_a_matrix_is_that_of_its_quadratic_form(weighted):
         assert float(found.norm_P_inv) == pytest.approx(1 / low, rel=1e-9)
 
 
-def test_inverse_undoes_apply():
+def test_operator_inverse_undoes_apply():
     rng = np.random.default_rng(5)
     v = rng.normal(size=3)
     matrix = self_adjoint(rng, np.ones(3))
@@ -49,7 +49,7 @@ def test_inverse_undoes_apply():
         np.testing.assert_allclose(np.asarray(P.inverse(applied)), v, rtol=1e-11)
 
 
-def test_a_sum_acts_part_by_part_and_its_spectrum_spans_those_of_the_parts():
+def test_product_operator_acts_part_by_part_and_joins_spectra():
     matrix = np.array([[2.0, 0.5], [0.5, 1.0]])
     P = operators.Product(operators.Scaling(0.3), operators.Dense(matrix))
     space = spaces.Product(spaces.Euclidean(4), spaces.Euclidean(2))
@@ -93,6 +93,6 @@ PLANE = spaces.Euclidean(2)
         ),
     ],
 )
-def test_what_is_not_self_adjoint_and_coercive_is_refused(refused, word):
+def test_operators_reject_matrices_that_are_not_self_adjoint_and_coercive(refused, word):
     with pytest.raises(dvax.InputError, match=word):
         refused()

@@ -1,4 +1,4 @@
-"""Operators that are never written out act as the matrices they stand for."""
+"""Structured operators agree with their matrices."""
 
 import functools
 
@@ -38,7 +38,7 @@ def check_all(P, space, matrix, shape):
 
 
 @pytest.mark.parametrize("n", [7, 8])
-def test_a_convolution_is_the_circulant_of_its_kernel(n):
+def test_convolution_equals_the_circulant_matrix_of_its_kernel(n):
     symbol = 1.0 / (0.3 + np.arange(n // 2 + 1))
     P = operators.Convolution(symbol, n)
     ends = check_all(P, spaces.L2(np.full(n, 0.1)), scipy.linalg.circulant(
@@ -47,7 +47,7 @@ def test_a_convolution_is_the_circulant_of_its_kernel(n):
 
 
 @pytest.mark.parametrize("shape", [(4, 6), (5, 3)])
-def test_a_convolution_in_the_plane(shape):
+def test_convolution_in_two_dimensions(shape):
     k = np.hypot(*np.meshgrid(
         np.fft.fftfreq(shape[0], 1 / shape[0]), np.fft.rfftfreq(shape[1], 1 / shape[1]),
         indexing="ij"))  # fmt: skip
@@ -62,7 +62,7 @@ def test_a_convolution_in_the_plane(shape):
 
 
 @pytest.mark.parametrize("s", [[2.0, 0.5], [2.0, -0.02]])
-def test_low_rank(s):
+def test_low_rank_operator_equals_its_matrix(s):
     n, s = 6, np.array(s)
     U, d = RNG.normal(size=(n, 2)), RNG.uniform(0.5, 2.0, n)
     for diagonal in (d, 0.7):
@@ -77,7 +77,7 @@ def test_low_rank(s):
     check_all(operators.LowRank(d, blocks, s), spaces.L2(w), matrix, (n,))
 
 
-def test_bounds_of_a_large_low_rank_operator_say_that_they_are_bounds():
+def test_low_rank_spectrum_of_a_large_operator_is_marked_as_bounds():
     n = 600
     U, d = RNG.normal(size=(n, 2)) / 20, RNG.uniform(0.5, 2.0, n)
     s = np.array([3.0, -0.2])
@@ -91,7 +91,7 @@ def test_bounds_of_a_large_low_rank_operator_say_that_they_are_bounds():
     assert check_all(full, spaces.Euclidean(3), np.diag([3.0, 3.0, 5.0]), (3,)).exact
 
 
-def test_a_matrix_free_operator_is_inverted_in_its_own_space():
+def test_matrix_free_inverse_uses_the_inner_product_of_the_space():
     n = 8
     root = RNG.normal(size=(n, n))
     symmetric = root @ root.T + np.eye(n)
@@ -109,7 +109,7 @@ def test_a_matrix_free_operator_is_inverted_in_its_own_space():
         assert both.declared and not both.exact
 
 
-def test_the_inverse_of_a_matrix_free_operator_is_differentiated_as_an_inverse():
+def test_matrix_free_inverse_is_differentiated_implicitly():
     M, v = jnp.array([[2.0, 0.5], [0.5, 1.0]]), jnp.array([1.0, 2.0])
 
     def free(a):
@@ -124,7 +124,7 @@ def test_the_inverse_of_a_matrix_free_operator_is_differentiated_as_an_inverse()
     )
 
 
-def test_an_inverse_that_is_not_reached_is_no_number():
+def test_matrix_free_inverse_without_convergence_is_nan():
     skew = operators.MatrixFree(lambda v: jnp.array([v[1], -v[0]]), 0.5, 2.0)
     assert not np.all(np.isfinite(np.asarray(skew.inverse(jnp.array([1.0, 2.0])))))
 
@@ -161,6 +161,6 @@ ONES = np.ones((2, 1))
         (lambda: operators.MatrixFree(lambda v: v, 1.0, 1.0).check(UNEVEN), "weights="),
     ],
 )
-def test_what_is_not_self_adjoint_and_coercive_is_refused(refused, word):
+def test_structured_operators_reject_data_that_are_not_coercive(refused, word):
     with pytest.raises(dvax.InputError, match=word):
         refused()

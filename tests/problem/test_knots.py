@@ -1,4 +1,4 @@
-"""Tables are found wherever they hide, and no step jumps over what they know."""
+"""The knots of tables are found anywhere in a problem, and steps end at them."""
 
 import itertools
 
@@ -35,12 +35,12 @@ DATA = Table([-1.0, 0.5, 1.5, 9.0], [0.0, 1.0, 0.0, 1.0])
     ],
     ids=["f", "h", "K", "a product"],
 )
-def test_a_table_is_found_wherever_it_hides(made):
+def test_knots_of_a_table_are_found_anywhere_in_the_problem(made):
     assert made.knots(0.0, 2.0, ZERO).tolist() == [0.5, 1.5]
     assert made.knots(0.5, 1.5, ZERO).tolist() == []
 
 
-def test_a_table_that_comes_with_the_parameters_is_found():
+def test_knots_of_a_table_in_args_are_found():
     made = problem(f=lambda t, x, u, args: args["load"](t) - u)
     assert made.knots(0.0, 2.0, ZERO, {"load": DATA}).tolist() == [0.5, 1.5]
 
@@ -51,13 +51,13 @@ def test_knots_of_several_signals_are_merged_once():
     assert made.knots(0.0, 2.0, ZERO).tolist() == [0.5, 0.75, 1.5]
 
 
-def test_a_shifted_time_is_warned_about():
+def test_knots_of_a_table_at_a_shifted_time_give_a_warning():
     made = problem(f=lambda t, x, u, args: DATA(t - 0.25) - u)
     with pytest.warns(UserWarning, match="other than t itself"):
         assert made.knots(0.0, 2.0, ZERO).tolist() == []
 
 
-def test_data_that_does_not_cover_the_run_is_refused_before_it_starts():
+def test_data_that_do_not_cover_the_run_are_rejected():
     made = problem(f=lambda t, x, u, args: DATA(t) - u)
     for t0, t1 in ((0.0, 9.5), (-1.5, 2.0)):
         with pytest.raises(dvax.InputError, match="never extrapolated"):
@@ -71,7 +71,7 @@ def test_data_that_does_not_cover_the_run_is_refused_before_it_starts():
         [("constant", None), ("linear", 0.4)],
     ),
 )
-def test_a_pulse_narrower_than_any_step_is_integrated(kind, dt):
+def test_knots_resolve_a_pulse_narrower_than_a_step(kind, dt):
     # x' = −x + pulse, from rest: a load of a millionth of the run, which every step would miss.
     start, width, height, end = 3.0, 1e-5, 1e5, 10.0
     if kind == "constant":

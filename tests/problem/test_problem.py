@@ -1,4 +1,4 @@
-"""`Problem`: the frozen operator, the response, the reduced map, and what it refuses."""
+"""`Problem`: the frozen operator, the response, the reduced map, and rejected input."""
 
 import ast
 import os
@@ -27,14 +27,14 @@ def make(**changed):
     return dvax.Problem(**{**parts, **changed})
 
 
-def test_the_frozen_operator_is_the_papers():
+def test_frozen_operator_agrees_with_the_paper():
     y, x = np.array([0.2, -0.7]), np.array([1.0, 3.0])
     u = np.linalg.solve(MATRIX, y)
     found = make().frozen(0.4, jnp.asarray(x))(jnp.asarray(y))
     np.testing.assert_allclose(np.asarray(found), u - (1.0 + x - 0.3 * u), rtol=1e-13)
 
 
-def test_the_response_solves_the_law_and_the_reduced_map_uses_it():
+def test_response_solves_the_law_and_enters_the_reduced_map():
     # y is in K, and P⁻¹y − h(P⁻¹y) has the sign that the bounds ask for, entry by entry.
     x = np.array([-1.2, 3.0])
     made = make()
@@ -47,7 +47,7 @@ def test_the_response_solves_the_law_and_the_reduced_map_uses_it():
     np.testing.assert_allclose(reduced, 0.4 - x - u, rtol=1e-12)
 
 
-def test_everything_may_depend_on_the_parameters_and_the_set_on_time():
+def test_problem_data_may_depend_on_args_and_K_on_time():
     made = dvax.Problem(
         A=lambda a: generators.Scalar(-a),
         P=lambda a: operators.Scaling(a),
@@ -76,14 +76,14 @@ def test_everything_may_depend_on_the_parameters_and_the_set_on_time():
         ({"state_space": spaces.Euclidean(2)}, jnp.zeros(3), ["x0", "(3,)", "(2,)"]),
     ],
 )
-def test_what_does_not_fit_is_refused_with_its_name_and_both_shapes(changed, x0, words):
+def test_problem_rejects_wrong_shapes_by_name(changed, x0, words):
     with pytest.raises(dvax.InputError) as caught:
         dvax.solve(make(**changed), x0, 0.0, 1.0)
     for word in words:
         assert word in str(caught.value)
 
 
-def test_everything_that_does_not_fit_is_named_at_once():
+def test_problem_reports_all_wrong_shapes_at_once():
     made = make(
         A=generators.Diagonal(jnp.ones(3)),
         P=operators.Dense(jnp.array([[1.0, 2.0], [0.0, 1.0]])),
@@ -117,7 +117,7 @@ print(places(lambda: dvax.solve("problem", 0.0, 1.0, 0.0, method="Euler", adjoin
 """
 
 
-def test_things_of_the_wrong_kind_are_named_all_at_once():
+def test_problem_reports_all_wrong_types_at_once():
     # In an interpreter without run-time annotations, which would answer first: a user has none.
     here = {**os.environ, "PYTHONPATH": str(Path(dvax.__file__).parents[1])}
     run = subprocess.run(
@@ -131,7 +131,7 @@ def test_things_of_the_wrong_kind_are_named_all_at_once():
 
 
 @pytest.mark.parametrize("x0", [np.array([1, 2]), "zero", None, True, 1j])
-def test_a_state_that_is_not_of_real_numbers_is_refused(x0):
+def test_problem_rejects_a_state_that_is_not_real(x0):
     with pytest.raises(dvax.InputError, match="x0"):
         dvax.solve(make(), x0, 0.0, 1.0)
 
@@ -144,7 +144,7 @@ def test_a_state_that_is_not_of_real_numbers_is_refused(x0):
         ({0: 2.0, "n": 3.0}, "keys of several types"),
     ],
 )
-def test_parameters_that_jax_cannot_take_are_refused(args, given):
+def test_problem_rejects_args_that_jax_cannot_trace(args, given):
     for name, call in {"solve": dvax.solve, "verify": dvax.verify}.items():
         with pytest.raises(dvax.InputError) as caught:
             call(make(), jnp.zeros(2), 0.0, 1.0, args)
@@ -152,6 +152,6 @@ def test_parameters_that_jax_cannot_take_are_refused(args, given):
         assert given in caught.value.problems[0].given
 
 
-def test_texts_among_the_parameters_are_left_alone():
+def test_problem_accepts_strings_in_args():
     sol = dvax.solve(make(), jnp.zeros(2), 0.0, 1.0, {"load": 2.0, "name": "of a run"})
     assert sol.result == dvax.RESULTS.successful

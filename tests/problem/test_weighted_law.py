@@ -1,4 +1,4 @@
-"""A weighted law (paper, remark:assstrong (ii)) in a coupled system, and the one without its weight."""
+"""A weighted law (paper, remark:assstrong (ii)) in a coupled system equals that without weight."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,14 +29,14 @@ WHOLE, DIVIDED = coupled(lambda y: 2.0 + jnp.sin(y)), coupled(lambda y: 1.0)
 
 
 @pytest.mark.parametrize("x", [-6.0, -4.0, -1.5, 0.1, 2.5])
-def test_the_response_is_that_of_the_law_without_its_weight(x):
+def test_weighted_law_has_the_response_of_the_law_without_weight(x):
     exact = np.clip(0.2 - x, 0.0, 3 * np.pi / 2) / 2.0
     for problem in (WHOLE, DIVIDED):
         assert float(problem.response(0.0, x)) == pytest.approx(exact, abs=1e-10)
 
 
 @pytest.mark.thorough
-def test_the_trajectory_is_that_of_the_law_without_its_weight():
+def test_weighted_law_has_the_trajectory_of_the_law_without_weight():
     ts = jnp.linspace(0.0, 3.0, 13)
     whole, divided = (
         dvax.solve(problem, 1.0, 0.0, 3.0, ts=ts, rtol=1e-6, atol=1e-6)

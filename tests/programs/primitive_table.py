@@ -1,8 +1,8 @@
-"""The table of docs/programs.md: which operation is known to which domain.
+"""The table of docs/programs.md: which domain has a rule for which operation.
 
     python -m tests.programs.primitive_table
 
-writes it anew.
+writes the table into the page.
 """
 
 from pathlib import Path
@@ -14,7 +14,7 @@ BEGIN, END = "<!-- table: begin -->\n", "<!-- table: end -->\n"
 
 
 def table() -> str:
-    """One row an operation, one column a domain."""
+    """One row per operation, one column per domain."""
     names = sorted({name for rules in DOMAINS.values() for name in rules})
     rows = [["operation", *DOMAINS], ["---"] * (len(DOMAINS) + 1)]
     rows += [[f"`{n}`", *("✓" if n in rules else "" for rules in DOMAINS.values())] for n in names]
@@ -22,7 +22,7 @@ def table() -> str:
 
 
 def parts() -> tuple[str, str, str]:
-    """The page before the table, the table, and the page behind it."""
+    """The page before the table, the table, and the page after it."""
     before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
     found, after = rest.split(END)
     return before, found, after

@@ -1,4 +1,4 @@
-"""The tables of rules: documented, of operations that exist, and independent of one JAX interface."""
+"""The tables of rules: documented, for existing operations, and independent of one JAX interface."""
 
 import subprocess
 import sys
@@ -15,11 +15,11 @@ ELSEWHERE = {
 }  # fmt: skip
 
 
-def test_the_page_says_which_operation_is_known_to_which_domain():
+def test_documentation_table_lists_the_rules_of_every_domain():
     assert parts()[1] == table(), "run: python -m tests.programs.primitive_table"
 
 
-def test_every_rule_is_of_an_operation_that_exists():
+def test_every_rule_belongs_to_an_existing_operation():
     exist = {getattr(p, "name", None) for p in vars(primitives).values()} | ELSEWHERE
     for domain, rules in DOMAINS.items():
         wrong = {name for name in rules if not name.startswith("dvax_")} - exist
@@ -43,7 +43,7 @@ assert jaxprs.read({variable: 3.0}, [variable, literal]) == [3.0, 2.0]
 """
 
 
-def test_programs_are_read_without_the_types_that_jax_exports():
+def test_interpreter_works_without_exported_jaxpr_types():
     from dvax._jax import jaxprs
 
     done = subprocess.run([sys.executable, "-c", WITHOUT, jaxprs.__file__], capture_output=True)

@@ -57,7 +57,7 @@ FUNCTIONS = {
 
 
 def farthest(fn, t0, t1):
-    """How far fn leaves the line between its ends on a fine grid, entry by entry."""
+    """The largest distance of fn from the line between its ends on a fine grid, entry by entry."""
     theta = jnp.linspace(0.0, 1.0, 801)
     values = jax.vmap(lambda s: jnp.asarray(fn(t0 + s * (t1 - t0))))(theta)
     weight = theta.reshape((-1,) + (1,) * (values.ndim - 1))
@@ -71,7 +71,7 @@ def enclosed(fn, t0, t1):
 @pytest.mark.parametrize("name", FUNCTIONS)
 @settings(max_examples=25)
 @given(t0=st.floats(0.0, 3.5), length=st.floats(1e-4, 0.5))
-def test_a_function_stays_within_its_bound(name, t0, length):
+def test_enclosure_bounds_every_function(name, t0, length):
     fn, t1 = FUNCTIONS[name], t0 + length
     line = enclosed(fn, t0, t1)
     np.testing.assert_allclose(line.a, fn(t0), rtol=1e-12, atol=1e-12)
@@ -80,7 +80,7 @@ def test_a_function_stays_within_its_bound(name, t0, length):
 
 
 @pytest.mark.parametrize("name", mostly_thorough(RATES, list(RATES)[::2]))
-def test_what_is_made_to_deceive_is_enclosed_or_refused(name):
+def test_enclosure_of_adversarial_functions_holds_or_is_refused(name):
     rate, breaks = RATES[name]
     rng = np.random.default_rng(0)
     spans = [(k / n, (k + 1) / n) for n in (1, 4, 7) for k in range(n)]
@@ -95,33 +95,33 @@ def test_what_is_made_to_deceive_is_enclosed_or_refused(name):
         assert np.all(farthest(rate, t0, t1) <= np.asarray(line.dev) + 1e-9), (t0, t1)
 
 
-def test_single_precision_is_kept_where_double_is_the_default():
+def test_enclosure_keeps_single_precision():
     for name in ("where on time", "clip", "modulus", "square"):
         line = enclose(FUNCTIONS[name], straight(jnp.float32(0.9), jnp.float32(1.9)))
         assert {part.dtype for part in line} == {jnp.dtype("float32")}, name
 
 
-def test_a_crossing_too_large_for_single_precision_is_bounded():
+def test_enclosure_of_a_crossing_with_overflowing_product_is_finite():
     steep = lambda t: jnp.maximum(0.0, 4e20 * (t - 0.5))  # noqa: E731
     line = enclose(steep, straight(jnp.float32(0.0), jnp.float32(1.0)))
     assert float(line.dev) == pytest.approx(1e20, rel=1e-6)
 
 
-def test_a_crossing_of_numbers_whose_sum_is_none_has_no_bound_rather_than_a_wrong_one():
+def test_enclosure_of_a_crossing_with_overflowing_sum_is_not_too_small():
     ends = jnp.asarray(-1.5e308), jnp.asarray(1.5e308)
     line = enclose(lambda t: jnp.maximum(0.0, t), straight(*ends))
     assert float(line.dev) >= 0.75e308
 
 
 @pytest.mark.parametrize(("a", "b"), [(-1e308, 1.0), (1.0, -1e308), (-1e30, 1e-300), (-3.0, 1.0)])
-def test_a_crossing_of_numbers_far_apart_is_not_lost(a, b):
+def test_enclosure_of_a_crossing_with_ends_far_apart_is_exact(a, b):
     line = enclose(lambda t: jnp.maximum(0.0, t), straight(jnp.asarray(a), jnp.asarray(b)))
     np.testing.assert_allclose(float(line.dev), abs(a) * (abs(b) / (abs(a) + abs(b))) or max(b, a))
 
 
 @pytest.mark.parametrize("dev", [0.0, 1.0, np.inf])
 @pytest.mark.parametrize("c", [np.inf, 1e-310, 1e-300, 2.0, -3.0])
-def test_a_quotient_by_a_number_has_a_bound_that_is_one(c, dev):
+def test_enclosure_of_a_quotient_is_never_nan(c, dev):
     for number in (c, jnp.asarray(c)):
         line = enclose(
             lambda t, by=number: t / by, LinearEnclosure(*map(jnp.asarray, (1.0, 2.0, dev)))
@@ -134,32 +134,32 @@ def test_a_quotient_by_a_number_has_a_bound_that_is_one(c, dev):
 
 
 @pytest.mark.parametrize("factor", [0.0, 5e-324, 1e-310, 1e-300, 3.0])
-def test_a_factor_of_what_has_no_bound_leaves_a_number(factor):
+def test_enclosure_of_a_product_with_an_unbounded_factor_is_not_nan(factor):
     line = enclose(lambda t: factor * t, LinearEnclosure(*map(jnp.asarray, (0.0, 1.0, jnp.inf))))
     assert not np.isnan(line.dev) and (factor < 1e-300 or np.isinf(line.dev))
 
 
 @pytest.mark.parametrize("name", ["square", "exponential", "root", "tanh of a product"])
-def test_where_things_are_smooth_the_bound_is_of_second_order_and_not_far_off(name):
+def test_enclosure_of_smooth_functions_is_of_second_order(name):
     bounds = [float(enclosed(FUNCTIONS[name], 0.9, 0.9 + h).dev) for h in (0.1, 0.05, 0.025)]
     assert bounds[0] / bounds[1] == pytest.approx(4.0, rel=0.25)
     assert bounds[1] / bounds[2] == pytest.approx(4.0, rel=0.15)
     assert bounds[2] <= 30 * float(farthest(FUNCTIONS[name], 0.9, 0.925))
 
 
-def test_deep_inside_a_bound_nothing_is_left_of_what_is_clipped_away():
+def test_enclosure_of_a_saturated_clip_is_exact():
     line = enclosed(lambda t: jnp.clip(10.0 + jnp.sin(t), 0.0, 1.0), 0.0, 1.0)
     assert float(line.dev) == 0.0
 
 
-def test_a_single_kink_of_a_line_is_exact():
+def test_enclosure_of_a_line_with_one_kink_is_exact():
     line = enclosed(lambda t: jnp.maximum(t - 0.25, 0.0), 0.0, 1.0)
     assert float(line.dev) == pytest.approx(0.75 * 0.25)
 
 
 @pytest.mark.parametrize("signal", [TABLE, STAIRS, SPLINE], ids=["linear", "constant", "cubic"])
 @pytest.mark.parametrize(("t0", "t1"), [(0.0, 1.0), (0.2, 0.7), (1.0, 2.5), (3.9, 4.0)])
-def test_measured_data_between_two_knots(signal, t0, t1):
+def test_enclosure_of_a_table_between_two_knots(signal, t0, t1):
     last = np.nextafter(t1, 0.0)  # a step ends just inside
     line = enclosed(signal.value, t0, last)
     found = farthest(signal.value, t0, last)
@@ -168,26 +168,26 @@ def test_measured_data_between_two_knots(signal, t0, t1):
         assert float(line.dev) <= 1e-12
 
 
-def test_data_across_a_knot_has_no_finite_bound_rather_than_a_wrong_one():
+def test_enclosure_across_a_knot_is_infinite():
     line = enclosed(STAIRS.value, 0.9, 1.1)
     assert not float(line.dev) < 3.0
 
 
 @pytest.mark.parametrize("fn", [jnp.cbrt, jnp.tan, jnp.log, lambda t: t**0.5, lambda t: t**-1.5])
-def test_a_singularity_within_the_step_has_no_finite_bound(fn):
+def test_enclosure_across_a_singularity_is_infinite(fn):
     middle = 0.5 * np.pi if fn is jnp.tan else 0.0
     with jax.debug_nans(False):
         assert not np.isfinite(enclosed(lambda t: fn(t + middle), -0.25, 0.75).dev)
 
 
-def test_an_operation_without_a_rule_is_named():
+def test_enclosure_names_operations_without_a_rule():
     with pytest.raises(NoEnclosure, match="digamma"):
         enclosed(jax.scipy.special.digamma, 1.0, 2.0)
     with pytest.raises(NoEnclosure, match="fft"):
         enclosed(lambda t: jnp.fft.irfft(jnp.fft.rfft(PROFILE * t), 3), 0.0, 1.0)
 
 
-def test_the_chord_deviation_bounds_that_of_the_trajectory():
+def test_trajectory_curvature_is_below_its_bound():
     space = dvax.spaces.Euclidean(2)
     generators = {
         "scalar": dvax.generators.Scalar(-3.0),
@@ -208,7 +208,7 @@ def test_the_chord_deviation_bounds_that_of_the_trajectory():
             assert np.all(farthest(at, 0.0, 1.0) <= np.asarray(bend) * (1 + 1e-12))
 
 
-def test_constants_do_not_move():
+def test_enclosure_of_constants_has_no_deviation():
     line = enclose(
         lambda a, t: a * a + t,
         constant(jnp.asarray(3.0)),

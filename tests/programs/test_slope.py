@@ -1,4 +1,4 @@
-"""Slope arithmetic encloses values and difference quotients, for every operation that it knows."""
+"""Slope arithmetic encloses values and difference quotients, for every operation with a rule."""
 
 import jax
 import jax.numpy as jnp
@@ -56,7 +56,7 @@ FUNCTIONS = {
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_values_and_difference_quotients_are_enclosed(name):
+def test_slope_encloses_values_and_difference_quotients(name):
     fn, (low, high) = FUNCTIONS[name]
     enclosure = SlopeEnclosure(fn, (jnp.zeros(3),), (0,))
     rng = np.random.default_rng(1)
@@ -103,17 +103,17 @@ def test_values_and_difference_quotients_are_enclosed(name):
         lambda v: jnp.sort(v),
     ],
 )
-def test_what_may_jump_or_has_no_rule_is_not_bounded(fn):
+def test_slope_of_functions_with_jumps_or_without_rules_is_unbounded(fn):
     out, _ = SlopeEnclosure(fn, (jnp.zeros(3),), (0,))(interval(-np.ones(3), np.ones(3)))
     assert np.isinf(out.parts[0].radius).any()
 
 
-def test_an_operation_without_a_rule_is_named():
+def test_slope_names_operations_without_a_rule():
     enclosed = SlopeEnclosure(jnp.sort, (jnp.zeros(3),), (0,))(interval(-np.ones(3), np.ones(3)))
     assert enclosed.unknown == ("sort",)
 
 
-def test_what_is_not_differentiated_leaves_no_trace():
+def test_slope_ignores_undifferentiated_arguments():
     load = jnp.linspace(0.0, 1.0, 11)
     fn = lambda t, v: v * 2.0 + jnp.interp(t, load, load**2)  # noqa: E731
     out, unknown = SlopeEnclosure(fn, (jnp.zeros(()), jnp.zeros(3)), (1,))(
@@ -122,14 +122,14 @@ def test_what_is_not_differentiated_leaves_no_trace():
     assert unknown and out.parts[0].radius.max() == 0.0 and np.all(out.parts[0].center == 2.0)
 
 
-def test_affine_functions_of_everything_are_exact():
+def test_slope_of_affine_functions_is_exact():
     everywhere = interval(np.full(3, -np.inf), np.full(3, np.inf))
     out, _ = SlopeEnclosure(lambda v: M @ v[::-1] + 1.0, (jnp.zeros(3),), (0,))(everywhere)
     assert not out.parts[0].radius.any()
     np.testing.assert_array_equal(out.parts[0].center.T, np.asarray(M)[:, ::-1])
 
 
-def test_a_pointwise_law_on_many_points_needs_no_matrix():
+def test_slope_of_a_pointwise_law_needs_no_matrix():
     n = 100_000
     everywhere = interval(np.full(n, -np.inf), np.full(n, np.inf))
     g = jnp.linspace(0.0, 1.0, n)
@@ -142,7 +142,7 @@ def test_a_pointwise_law_on_many_points_needs_no_matrix():
         SlopeEnclosure(lambda v: v - jnp.sum(v), (jnp.zeros(n),), (0,))(everywhere)
 
 
-def test_pieces_of_a_region_sharpen_what_is_known_of_it():
+def test_slope_over_pieces_of_a_region_is_sharper():
     fn = lambda v: v * (1.0 - v)  # noqa: E731
     enclosure = SlopeEnclosure(fn, (jnp.zeros(()),), (0,))
     whole = enclosure(interval(0.0, 1.0)).out
@@ -154,7 +154,7 @@ def test_pieces_of_a_region_sharpen_what_is_known_of_it():
 
 @pytest.mark.parametrize("kind", ["constant", "linear", "cubic"])
 @pytest.mark.parametrize("shape", [(), (2,)])
-def test_tables_are_enclosed_over_any_stretch_of_time(kind, shape):
+def test_slope_encloses_tables_over_any_interval_of_time(kind, shape):
     rng = np.random.default_rng(4)
     times = np.sort(rng.uniform(0.0, 3.0, 12))
     table = dvax.signals.Table(times, rng.normal(size=(12, *shape)), kind=kind)

@@ -1,4 +1,4 @@
-"""What a function's code proves about it: never more than is true, and enough to be useful.
+"""The structure of a function from its code: claims are true, and sufficient for the fast paths.
 
 Each function stands beside the truth, decided by hand: is it affine, is Fᵢ a function of yᵢ alone,
 is it ay + c with one number a. `analyse` may say less than the truth, never more; for the laws that
@@ -106,7 +106,7 @@ MUST_SAY_ALL = [
 
 
 @pytest.mark.parametrize("name", TRUTH)
-def test_no_more_is_claimed_than_is_true(name):
+def test_structure_claims_are_true(name):
     F, *truth = TRUTH[name]
     claimed = analyse(F, jnp.ones(3))
     for claim, fact, word in zip(claimed, truth, claimed._fields, strict=True):
@@ -114,15 +114,15 @@ def test_no_more_is_claimed_than_is_true(name):
 
 
 @pytest.mark.parametrize("name", TRUTH)
-def test_the_truth_itself_withstands_a_sample(name):
+def test_structure_table_of_expected_properties_agrees_with_samples(name):
     # The table above is checked too: differences at random points show what is affine or pointwise.
     F, affine, pointwise, isotropic = TRUTH[name]
     rng = np.random.default_rng(0)
     a, b = rng.uniform(-3, 3, (2, 3))
     at = lambda y: np.asarray(F(jnp.asarray(y)), float)  # noqa: E731
-    bend = np.max(np.abs(at(a) + at(b) - 2 * at((a + b) / 2)))
+    curvature = np.max(np.abs(at(a) + at(b) - 2 * at((a + b) / 2)))
     if affine:
-        assert bend < 1e-12
+        assert curvature < 1e-12
     changed = a.copy()
     changed[0] += 1.0
     if pointwise:
@@ -133,12 +133,12 @@ def test_the_truth_itself_withstands_a_sample(name):
 
 
 @pytest.mark.parametrize("name", MUST_SAY_ALL)
-def test_the_laws_with_a_fast_path_are_recognised(name):
+def test_structure_recognises_laws_with_a_fast_path(name):
     F, *truth = TRUTH[name]
     assert list(analyse(F, jnp.ones(3))) == truth
 
 
-def test_a_permutation_of_axes_hidden_in_a_reshape_is_not_pointwise():
+def test_structure_of_a_reshape_with_permuted_axes_is_not_pointwise():
     transposed = lambda y: lax.reshape(y, (3, 3), dimensions=(1, 0))  # noqa: E731
     assert not analyse(transposed, MATRIX).pointwise
     assert analyse(lambda y: y.reshape(9).reshape(3, 3) * 1.0, MATRIX).affine
@@ -158,16 +158,16 @@ PAIR = (jnp.ones(2), jnp.ones(2))
     ],
     ids=["parts alone", "swapped", "coupled", "multiplied", "one bent"],
 )
-def test_parts_of_a_tuple_are_told_apart(F, expected):
+def test_structure_distinguishes_parts_of_a_tuple(F, expected):
     assert tuple(analyse(F, PAIR)) == expected
 
 
-def test_a_law_without_y_is_not_given_a_slope():
+def test_structure_of_a_constant_law_is_not_isotropic():
     constant = analyse(lambda y: C, jnp.ones(3))
     assert constant.affine and constant.pointwise and not constant.isotropic
 
 
-def test_what_is_told_of_y_on_the_way_changes_nothing():
+def test_structure_ignores_debug_callbacks():
     def F(y):
         jax.debug.callback(lambda y: None, y)
         return 2.0 * y - 1.0
@@ -175,7 +175,7 @@ def test_what_is_told_of_y_on_the_way_changes_nothing():
     assert analyse(F, jnp.ones(3)) == analyse(lambda y: 2.0 * y - 1.0, jnp.ones(3))
 
 
-def test_independence():
+def test_independent_detects_dependence_on_t_and_x():
     x, t = jnp.ones(3), jnp.ones(())
     assert independent(lambda t, x: jnp.full(3, 2.0), t, x)
     assert independent(lambda t, x: C * 2.0, t, x)

@@ -1,4 +1,4 @@
-"""Jumps that the code of f, h and K shows are knots: steps end there and derivatives include them."""
+"""Jumps detected in the code of f, h and K are knots: steps end there, derivatives include them."""
 
 import itertools
 
@@ -74,7 +74,7 @@ CASES = [
     ("where", "form", "method", "dt", "count"),
     mostly_thorough(CASES, [("K", "t - a > 0", "ETD2RK", 0.11, 2)]),
 )
-def test_jumps_that_comparisons_show_have_their_derivative(where, form, method, dt, count):
+def test_switching_times_of_comparisons_have_exact_derivatives(where, form, method, dt, count):
     times = np.linspace(0.3, 1.7, count) + 0.01 * np.sqrt(2) * np.arange(count)
     case = problem(where, form)
     np.testing.assert_array_equal(
@@ -101,7 +101,7 @@ def test_jumps_that_comparisons_show_have_their_derivative(where, form, method, 
         np.testing.assert_allclose(found, closed_form(a)[1], atol=near)
 
 
-def test_knots_are_read_off_lines_in_time_alone():
+def test_switching_times_come_from_affine_functions_of_time_only():
     def knots(s, args=None):
         case = problem("f", "t < a")
         case = dvax.Problem(A=case.A, P=case.P, K=dvax.sets.Box(-9.0, 9.0), f=s, h=case.h)
@@ -122,7 +122,7 @@ def test_knots_are_read_off_lines_in_time_alone():
     np.testing.assert_allclose(knots(several, {"on": jnp.array([1.1, 0.4, 7.0])}), [0.4, 1.1])
 
 
-def test_a_jump_that_cannot_be_read_refuses_the_derivative_of_its_time():
+def test_derivative_in_the_time_of_an_undetected_jump_raises_an_error():
     def end(a, level):
         case = dvax.Problem(
             A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-9.0, 9.0),
@@ -146,7 +146,7 @@ def test_a_jump_that_cannot_be_read_refuses_the_derivative_of_its_time():
     [None, pytest.param(dvax.DormandPrince(), marks=pytest.mark.thorough)],
     ids=["default", "DormandPrince"],
 )
-def test_a_spike_in_an_array_is_met_and_its_times_are_differentiated(kind, method):
+def test_switching_times_of_interpolated_arrays_are_differentiated(kind, method):
     """x' = −x + q(t), q read from arrays by JAX's own functions; exact between two of its times."""
     times, n = np.linspace(0.0, 10.0, 1001), 1000
     values = np.where(np.arange(n + 1) == 377, 50.0, 0.1)
@@ -216,13 +216,13 @@ def _end_with(drive):
 
 
 @pytest.mark.parametrize("name", HIDDEN)
-def test_a_derivative_in_a_time_that_the_code_hides_is_refused(name):
+def test_derivative_in_a_time_hidden_by_code_raises_an_error(name):
     with pytest.raises(dvax.DifferentiationError, match="may jump at a time"):
         jax.grad(_end_with(HIDDEN[name]))(0.7)
 
 
 @pytest.mark.parametrize("name", READ)
-def test_a_derivative_that_moves_no_jump_is_not_refused(name):
+def test_derivative_that_moves_no_jump_is_computed(name):
     end, a = _end_with(READ[name]), 0.7
     difference = (end(a + 1e-5) - end(a - 1e-5)) / 2e-5
     np.testing.assert_allclose(jax.grad(end)(a), difference, rtol=1e-4, atol=1e-5)

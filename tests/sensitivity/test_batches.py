@@ -1,4 +1,4 @@
-"""Gradients of many runs at once, and of a long one."""
+"""Gradients of batches, and of a long run."""
 
 import subprocess
 import sys
@@ -13,8 +13,8 @@ from tests.closed_forms import c1, c1_solution
 import dvax
 
 
-def test_a_batch_of_adaptive_runs_has_the_gradients_of_single_ones():
-    """Each has steps and kinks of its own, and one waits while others go on."""
+def test_gradients_of_an_adaptive_batch_equal_those_of_single_runs():
+    """Each lane has its own steps and kinks, and waits when it has ended."""
     case = c1()
 
     def end(x0, load):
@@ -32,7 +32,7 @@ def test_a_batch_of_adaptive_runs_has_the_gradients_of_single_ones():
 
 
 @pytest.mark.thorough
-def test_ten_thousand_steps_of_a_large_state_are_differentiated_in_four_gigabytes():
+def test_gradient_of_ten_thousand_steps_fits_in_four_gigabytes():
     program = """
         import jax, jax.numpy as jnp, dvax
         jax.config.update("jax_enable_x64", True)
@@ -68,8 +68,8 @@ ROWS = np.array([0.0, 0.25, 0.5, 1.0, 1.93, 2.0])
 @pytest.mark.parametrize(
     "ts", [pytest.param(None, marks=pytest.mark.thorough), ROWS], ids=["the last", "rows"]
 )
-def test_derivatives_of_a_batch_are_those_of_its_runs(ts, steps):
-    """Both ways round, by both modes, of x and u, in everything that differs or is shared."""
+def test_derivatives_of_a_batch_equal_those_of_its_runs(ts, steps):
+    """In either order of transformations and either mode, of x and u, in mapped and shared data."""
     case = c1()
 
     def total(x0, load, adjoint):
@@ -90,8 +90,8 @@ def test_derivatives_of_a_batch_are_those_of_its_runs(ts, steps):
         np.testing.assert_allclose(found[1], exact[1], rtol=1e-8)
 
 
-def test_a_batch_of_derivatives_may_be_nothing_but_zeros():
-    """XLA then leaves out the whole loop, and stops at a call whose arguments are of no use."""
+def test_derivatives_of_a_batch_may_all_be_zero():
+    """XLA then eliminates the whole loop, and aborts on unused arguments of an outlined call."""
     case = c1()
 
     def total(unused, x0, ts):

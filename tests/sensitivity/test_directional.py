@@ -29,7 +29,7 @@ def quotient(problem, x0, t1, args, dx0, dargs):
 
 
 def corner():
-    """At rest with both entries on their bounds, held by no force; nothing is linear."""
+    """At rest with both entries on their bounds and without force; nothing is linear."""
     return dvax.Problem(
         A=dvax.generators.Scalar(-0.3), P=dvax.operators.Dense(jnp.array([[1.2, 0.3], [0.3, 0.9]])),
         K=lambda t, args: dvax.sets.Box(0.0 * args["low"], 4.0),
@@ -39,7 +39,7 @@ def corner():
 
 
 def disc():
-    """Turns on the unit circle, to which z belongs all the time."""
+    """Motion on the unit circle, with z on its boundary at all times."""
     spin = jnp.array([[0.0, 2.0], [-2.0, 0.0]])
     return dvax.Problem(
         A=ZERO, P=ONE, K=dvax.sets.Ball(0.0, 1.0), f=lambda t, x, u, args: spin @ x + (x - u),
@@ -48,7 +48,7 @@ def disc():
 
 
 def rise():
-    """Waits at the upper bound η of u, held by no force."""
+    """At rest at the upper bound η of u, without force."""
     return dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=ONE, K=lambda t, args: dvax.sets.Box(-5.0, args["top"]),
         f=lambda t, x, u, args: args["top"] * 0.0 + 1.5 - 0.5 * u, h=lambda t, x, u, args: x,
@@ -81,7 +81,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", mostly_thorough(CASES, {"disc, in"}))
-def test_on_a_kink_the_derivative_is_the_limit_of_one_sided_differences(name):
+def test_directional_derivative_on_a_kink_is_the_limit_of_one_sided_differences(name):
     make, x0, args, dx0, dargs = CASES[name]
     problem = make()
     found = dvax.directional_derivative(problem, x0, 0.0, 1.0, args, dx0=dx0, dargs=dargs)
@@ -95,7 +95,7 @@ def test_on_a_kink_the_derivative_is_the_limit_of_one_sided_differences(name):
     assert np.max(np.abs(np.asarray(found.dxs[-1] + back.dxs[-1]))) > 1e-3
 
 
-def test_at_rest_on_a_kink_both_sides_have_their_own_exponential():
+def test_directional_derivative_at_rest_on_a_kink_depends_on_the_side():
     rest = dvax.Problem(
         A=ZERO, P=ONE, K=dvax.sets.Box(0.0, 9.0), f=lambda t, x, u, args: u - 2.0 * x,
         h=lambda t, x, u, args: x,
@@ -110,7 +110,7 @@ def test_at_rest_on_a_kink_both_sides_have_their_own_exponential():
 
 
 @pytest.mark.thorough
-def test_where_kinks_are_crossed_it_is_the_ordinary_derivative():
+def test_directional_derivative_across_kinks_is_the_ordinary_derivative():
     case = c1()
     by_start, _ = c1_derivatives()
     found = dvax.directional_derivative(case.problem, -1.0, 0.0, 2.0, case.args, dx0=1.0)
@@ -119,8 +119,8 @@ def test_where_kinks_are_crossed_it_is_the_ordinary_derivative():
 
 
 @pytest.mark.thorough
-def test_every_kind_of_parameter_moves_as_with_jvp():
-    """A, P, K, f and h depend on η; off kinks."""
+def test_directional_derivative_in_every_parameter_equals_jvp():
+    """For parameters of A, P, K, f and h, away from kinks."""
     problem = dvax.Problem(
         A=lambda p: dvax.generators.Dense(p["A"]), P=lambda p: dvax.operators.Diagonal(p["P"]),
         K=lambda t, p: dvax.sets.Ball(p["c"] * jnp.sin(t), p["r"]),
@@ -149,8 +149,8 @@ def test_every_kind_of_parameter_moves_as_with_jvp():
     np.testing.assert_allclose(np.asarray(found.dus), np.asarray(dus), rtol=1e-6, atol=1e-7)
 
 
-def test_a_kink_crosses_touches_or_stays():
-    """z is what it is told to be: it crosses at 1, touches at 2 and stays from 3 on."""
+def test_kinks_are_classified_as_crossing_touching_or_staying():
+    """z crosses at 1, touches at 2 and stays from 3 on."""
     z = lambda t: jnp.where(t < 1.5, 1.0 - t, jnp.where(t < 3.0, -2.0 * (t - 2.0) ** 2, 0.0))  # noqa: E731
     smooth = lambda t: jnp.where((t > 2.5) & (t < 3.0), -2.0 * (3.0 - t) ** 2, z(t))  # noqa: E731
     problem = dvax.Problem(
@@ -165,7 +165,7 @@ def test_a_kink_crosses_touches_or_stays():
     assert found[2].start == pytest.approx(3.0, abs=2e-3) and found[2].end == 4.0
 
 
-def test_wrong_directions_are_refused():
+def test_directional_derivative_rejects_wrong_directions():
     case = c1()
     with pytest.raises(dvax.InputError, match=r"dx0.*shape"):
         dvax.directional_derivative(case.problem, -1.0, 0.0, 2.0, case.args, dx0=jnp.ones(2))
@@ -181,8 +181,8 @@ def test_wrong_directions_are_refused():
 
 
 @pytest.mark.thorough
-def test_a_measured_load_that_jumps_may_move_too():
-    """x' = −x + load(t) − u with u = max(0, x − 1): linear between jumps and kinks."""
+def test_directional_derivative_in_the_values_of_a_table():
+    """x' = −x + load(t) − u with u = max(0, x − 1) is linear between jumps and kinks."""
     times = [0.0, 0.5, 1.2, 2.0]
     problem = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=ONE, K=dvax.sets.Box(0.0, 9.0),
@@ -205,8 +205,8 @@ def test_a_measured_load_that_jumps_may_move_too():
 
 
 @pytest.mark.thorough
-def test_a_set_that_moves_much_faster_than_its_response_is_looked_at_nearby():
-    """A half-plane that turns; z leaves its corner far slower than the plane does."""
+def test_directional_derivative_with_a_fast_rotating_half_plane():
+    """z leaves the corner much more slowly than the half-plane rotates."""
     e = jnp.array([0.0, 1.0])
     problem = dvax.Problem(
         A=ZERO, P=ONE, h=lambda t, x, u, a: e + 1e-4 * x,
@@ -223,7 +223,7 @@ def test_a_set_that_moves_much_faster_than_its_response_is_looked_at_nearby():
 
 
 @pytest.mark.thorough
-def test_a_ball_that_shrinks_onto_a_response_at_rest_on_it():
+def test_directional_derivative_with_a_shrinking_ball():
     spin = jnp.array([[0.0, 2.0], [-2.0, 0.0]])
     problem = dvax.Problem(
         A=ZERO, P=ONE, K=lambda t, r: dvax.sets.Ball(0.0, r), h=lambda t, x, u, r: x,
@@ -237,7 +237,7 @@ def test_a_ball_that_shrinks_onto_a_response_at_rest_on_it():
 
 
 @pytest.mark.thorough
-def test_a_product_of_boxes_and_a_state_of_two_parts():
+def test_directional_derivative_with_a_product_of_boxes_and_a_tuple_state():
     space = dvax.spaces.Product(dvax.spaces.Euclidean(2), dvax.spaces.Euclidean())
     problem = dvax.Problem(
         A=ZERO, P=ONE, K=dvax.sets.Product(dvax.sets.Box(0.0, 9.0), dvax.sets.Box(0.0, 9.0)),
@@ -258,7 +258,7 @@ def test_a_product_of_boxes_and_a_state_of_two_parts():
 
 
 @pytest.mark.thorough
-def test_single_precision_and_places_where_args_are_none():
+def test_directional_derivative_accepts_single_precision_and_none_in_args():
     problem = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=ONE, K=dvax.sets.Box(0.0, 0.5),
         f=lambda t, x, u, a: a[0] - 0.5 * x - u, h=lambda t, x, u, a: 1.0 - 2 * x - u,

@@ -53,7 +53,7 @@ OFTEN = {("ETD2RK", "Ball")}
 
 
 @pytest.mark.parametrize(("method", "kind"), mostly_thorough(CASES, OFTEN))
-def test_derivatives_in_everything_are_differences(method, kind, uncached):
+def test_derivatives_in_all_data_agree_with_central_differences(method, kind, uncached):
     names = list(GENERATORS)
     made = GENERATORS[names[CASES.index((method, kind)) % len(names)]]
     twist = jnp.asarray(0.3 * (ROWS[:3] - ROWS[:3].T))

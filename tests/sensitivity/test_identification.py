@@ -1,5 +1,5 @@
-"""What people do with derivatives: four parameters of a contact law from a noisy record, with their
-standard errors; and how far linearisation is from sampling."""
+"""Applications of derivatives: a fit of four contact parameters with standard errors, and linearisation
+against sampling."""
 
 import time
 
@@ -46,7 +46,7 @@ def fitted(data):
     return found, jnp.sqrt(variance * jnp.diag(jnp.linalg.inv(J.T @ J)))
 
 
-def test_four_parameters_of_a_contact_law_from_a_noisy_record():
+def test_fit_of_four_contact_parameters_to_a_noisy_record():
     noise = NOISE * np.random.default_rng(0).normal(size=(1, 200))
     found, error = fitted(observed(TRUTH) + noise[0])
     for name, value, spread, true in zip(NAMES, found, error, TRUTH, strict=True):
@@ -56,14 +56,14 @@ def test_four_parameters_of_a_contact_law_from_a_noisy_record():
 
 
 @pytest.mark.thorough
-def test_the_standard_errors_are_what_they_say():
+def test_standard_errors_agree_with_the_spread_of_repeated_fits():
     exact = np.asarray(observed(TRUTH))
     rng = np.random.default_rng(1)
     data = [exact + NOISE * rng.normal(size=200) for _ in range(100)]
     fitted(data[0])[0].block_until_ready()
-    begun = time.perf_counter()
+    started = time.perf_counter()
     results = [jax.device_get(fitted(d)) for d in data]
-    print(f"a fit takes {(time.perf_counter() - begun) / 100:.3f} s")
+    print(f"a fit takes {(time.perf_counter() - started) / 100:.3f} s")
     off = np.array([(p - TRUTH) / e for p, e in results])
     within = np.sum(np.all(np.abs(off) <= 3.0, axis=1))
     print(f"{within} of 100 within three standard errors; spread of the ratio {off.std(axis=0)}")
@@ -73,7 +73,7 @@ def test_the_standard_errors_are_what_they_say():
 
 
 @pytest.mark.thorough
-def test_linearised_uncertainty_is_that_of_samples_where_the_spread_is_small():
+def test_linearised_uncertainty_agrees_with_samples_for_small_spread():
     """The spread of x and u at every time from that of the parameters, by J Σ Jᵀ and by 2 000
     samples."""
     spread = jnp.array([0.02, 0.005, 0.02, 0.03])

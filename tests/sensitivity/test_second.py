@@ -42,7 +42,7 @@ OFTEN = {("heat", "ETD2RK", "fixed")}
 
 
 @pytest.mark.parametrize(("made", "method", "steps"), mostly_thorough(CASES, OFTEN))
-def test_the_derivative_of_a_gradient_is_that_of_forward_mode(made, method, steps, uncached):
+def test_hessian_by_forward_over_reverse_equals_forward_over_forward(made, method, steps, uncached):
     pair = made == "Rotation"
 
     def f(t, x, u, p):

@@ -14,7 +14,7 @@ SETTINGS = dict(method=dvax.ETD4RK(), rtol=1e-8, atol=1e-10, max_steps=2**14)
 
 
 @pytest.mark.thorough
-def test_the_bounds_of_c2_push_as_a_linear_equation_says():
+def test_derivative_in_the_bounds_of_c2_solves_a_linear_equation():
     """y rides a corner, so that z = x₁ + ix₂ has z' = (−1 − 2i)z − (P⁻¹ of what the bound moves by)."""
     case = c2()
     t1, rate = 2.0, -1.0 - 2.0j
@@ -50,7 +50,7 @@ def ball(center, radius, t1):
 
 
 @pytest.mark.parametrize("t1", mostly_thorough([2.0, 4.0], {4.0}))
-def test_radius_and_centre_of_c3(t1):
+def test_derivative_in_radius_and_centre_of_c3_is_the_closed_form(t1):
     """|x| = (2 − rt)e^{−t/2} until it meets the ball at 2/r − 1, and from there r e^{…}: at t = 4,
     d|x|/dr = (1/r − 2/r²)|x|, so that the kink moves as well."""
     case = c3()

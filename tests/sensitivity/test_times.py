@@ -1,4 +1,4 @@
-"""Derivatives in times: the first, the last, those saved at, and those at which data jump."""
+"""Derivatives in times: the first, the last, the saved ones, and those of jumps."""
 
 import itertools
 
@@ -61,7 +61,7 @@ OFTEN = {"ETD4RK, adaptive", "ETD2RK, fixed"}
 
 
 @pytest.mark.parametrize("name", mostly_thorough(METHODS, OFTEN))
-def test_derivatives_in_every_time_are_those_of_the_solution(name):
+def test_derivatives_in_all_times_agree_with_the_closed_form(name):
     method, settings, tol = METHODS[name]
 
     def saved(t0, eta, t1, ts, adjoint):
@@ -109,7 +109,7 @@ ENDS = list(
 
 
 @pytest.mark.parametrize(("name", "adjoint"), mostly_thorough(ENDS, {ENDS[0]}))
-def test_the_end_alone_moves_with_the_end(name, adjoint):
+def test_derivative_of_the_last_state_in_all_times(name, adjoint):
     method, settings, tol = METHODS[name]
 
     def last(times):
@@ -133,7 +133,7 @@ def test_the_end_alone_moves_with_the_end(name, adjoint):
 
 
 @pytest.mark.parametrize(("name", "adjoint"), mostly_thorough(ENDS[:4], {ENDS[1]}))
-def test_dense_output_stays_where_it_is_and_moves_with_its_own_time(name, adjoint):
+def test_derivative_of_dense_output_in_its_time_and_the_end(name, adjoint):
     method, settings, _ = METHODS[name]
 
     def between(times):
@@ -154,7 +154,7 @@ def test_dense_output_stays_where_it_is_and_moves_with_its_own_time(name, adjoin
 
 
 @pytest.mark.parametrize(("name", "adjoint"), mostly_thorough(ENDS[:4], {ENDS[0]}))
-def test_a_saved_time_that_meets_a_time_of_the_problem_moves_with_it_from_before(name, adjoint):
+def test_derivative_of_a_state_saved_at_a_jump_uses_the_left_limit(name, adjoint):
     method, settings, tol = METHODS[name]
 
     def saved(times):
@@ -184,7 +184,7 @@ SECOND = list(
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("name", "adjoint", "within"), SECOND)
-def test_second_derivatives_in_every_time(name, adjoint, within):
+def test_second_derivatives_in_all_times(name, adjoint, within):
     method, settings, _ = METHODS[name]
     weights = jnp.arange(1.0, 4.0) if within else jnp.ones(1)
 
@@ -207,8 +207,8 @@ def test_second_derivatives_in_every_time(name, adjoint, within):
     assert_close(found, jax.jacfwd(jax.jacrev(truth))(given), 1e-6)
 
 
-def test_equal_steps_move_apart_in_the_derivative_of_a_gradient():
-    """Many are as long as the one before, and the last one alone moves with the end."""
+def test_second_derivatives_distinguish_equal_adaptive_steps():
+    """Many steps are as long as the one before, and only the last one depends on the end."""
     rate = lambda t, x, pace: jnp.sin(pace * t) + 0.3 * jnp.sin(3 * x) * jnp.cos(pace * t)  # noqa: E731
     curved = dvax.Problem(
         A=dvax.generators.Scalar(-RATE), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-9.0, 9.0),
@@ -234,7 +234,7 @@ def test_equal_steps_move_apart_in_the_derivative_of_a_gradient():
     assert_close(found[2][2], 2.0 * (v**2 + x * bent), 1e-5)
 
 
-def test_fixed_steps_move_apart_at_a_jump_in_the_derivative_of_a_gradient():
+def test_second_derivatives_distinguish_fixed_steps_at_a_jump():
     def square(given):
         t0, eta, t1 = given
         return dvax.solve(
@@ -247,7 +247,7 @@ def test_fixed_steps_move_apart_at_a_jump_in_the_derivative_of_a_gradient():
 
 
 @pytest.mark.parametrize("name", mostly_thorough(OFTEN, ["ETD2RK, fixed"]))
-def test_linearize_gives_the_values_and_the_derivatives(name):
+def test_linearize_returns_values_and_derivatives_in_times(name):
     # As least squares do: the values must be known before the tangents are.
     method, settings, tol = METHODS[name]
 
@@ -292,7 +292,7 @@ COUPLED = list(
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("name", "adjoint"), COUPLED)
-def test_derivatives_in_every_time_of_a_coupled_system(name, adjoint):
+def test_derivatives_in_all_times_of_a_coupled_system(name, adjoint):
     method, settings, _ = METHODS[name]
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(7, 2)))
 
@@ -324,7 +324,7 @@ def test_derivatives_in_every_time_of_a_coupled_system(name, adjoint):
     np.testing.assert_allclose(jax.jit(derivative(asked))(given), want, rtol=1e-6, atol=1e-6)
 
 
-def test_where_no_time_is_differentiated_x_dot_at_saved_times_is_not():
+def test_derivative_without_times_does_not_differentiate_x_dot():
     # √x has no derivative at x(1) = 0, where no stage of ETD1 is.
     emptying = dvax.Problem(
         A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-9.0, 9.0),

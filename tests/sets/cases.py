@@ -1,4 +1,4 @@
-"""One example of every set in ℝ⁴, with what is known of it without dvax.
+"""One example of every set in ℝ⁴, with properties that do not depend on dvax.
 
 `make(data)` builds the set from a vector of its own data; `violation(y)` is how far y breaks the
 set's definition; `members(rng)` draws points of it from that definition, corners included; `rows`
@@ -71,7 +71,7 @@ def _ball(rng: np.random.Generator) -> np.ndarray:
 
 
 def _poly(rng: np.random.Generator) -> np.ndarray:
-    """As far as the rows allow along a random direction: a point on the boundary."""
+    """The farthest feasible point along a random direction: a point on the boundary."""
     v = 3.0 * rng.normal(size=N)
     return v * min(1.0, np.min(np.where(G @ v > 0, D / np.maximum(G @ v, 1e-300), np.inf)))
 

@@ -1,4 +1,4 @@
-"""What every projection owes, set by set, with and without weights."""
+"""Properties of every projection, set by set, with and without weights."""
 
 import functools
 from itertools import combinations
@@ -25,7 +25,7 @@ every_space = pytest.mark.parametrize(
 
 @functools.cache
 def compiled(name: str, kind: str):
-    """The projection of many points at once, and from many data: jit and vmap of it."""
+    """The projection of many points, and for many data, in one call: jit and vmap."""
 
     def one(data, z):
         return CASES[name].make(data).project(z, SPACES[kind])
@@ -34,7 +34,7 @@ def compiled(name: str, kind: str):
 
 
 def project(name: str, kind: str, z: np.ndarray, data: np.ndarray | None = None) -> np.ndarray:
-    """In lots of one size, so that every set is compiled once."""
+    """Project points in batches of one size, so that every set is compiled once."""
     data = np.tile(CASES[name].data, (len(z), 1)) if data is None else data
     found = []
     for start in range(0, len(z), LOT):
@@ -46,7 +46,7 @@ def project(name: str, kind: str, z: np.ndarray, data: np.ndarray | None = None)
 
 
 def points(name: str, count: int = 24) -> np.ndarray:
-    """Near, far, and inside."""
+    """Points near, far, and inside."""
     rng = np.random.default_rng(11)
     z = rng.normal(size=(count, N)) * np.repeat([0.3, 1.0, 3.0, 30.0], count // 4)[:, None]
     z[0] = CASES[name].members(rng)
@@ -55,7 +55,7 @@ def points(name: str, count: int = 24) -> np.ndarray:
 
 @every_space
 @every_set
-def test_a_projection_is_the_one_of_its_space(name, kind):
+def test_projection_is_the_nearest_point_in_the_norm_of_the_space(name, kind):
     case, w = CASES[name], WEIGHTS[kind]
     rng = np.random.default_rng(5)
     z = points(name)
@@ -75,7 +75,7 @@ def test_a_projection_is_the_one_of_its_space(name, kind):
 
 
 def by_faces(z, w, G, d, E, e):
-    """The nearest point among those of all faces: rows of G taken as equations, all ways."""
+    """The nearest point among those of all faces: every choice of rows of G as equations."""
     best, answer = np.inf, None
     for k in range(min(len(d), len(z)) + 1):
         for held in combinations(range(len(d)), k):
@@ -91,7 +91,7 @@ def by_faces(z, w, G, d, E, e):
 
 @every_space
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.rows is not None])
-def test_a_flat_set_agrees_with_the_enumeration_of_its_faces(name, kind):
+def test_projection_onto_polyhedral_sets_agrees_with_face_enumeration(name, kind):
     z = points(name, 4)
     exact = [by_faces(v, WEIGHTS[kind], *(CASES[name].rows or ())) for v in z]
     np.testing.assert_allclose(project(name, kind, z), exact, atol=1e-9)
@@ -101,7 +101,7 @@ def test_a_flat_set_agrees_with_the_enumeration_of_its_faces(name, kind):
 @pytest.mark.parametrize(
     "name", ["second-order cone", "ellipsoid, radii", "ellipsoid, matrix", "intersection"]
 )
-def test_a_round_set_agrees_with_a_general_minimiser(name, kind):
+def test_projection_onto_curved_sets_agrees_with_a_general_minimiser(name, kind):
     case, w = CASES[name], WEIGHTS[kind]
     # Smooth conditions for the minimiser, ≥ 0 inside.
     inside = {
@@ -136,7 +136,7 @@ EACH = [(name, "plain" if name == "intersection" else "weighted") for name in CA
 @pytest.mark.parametrize(
     ("name", "kind"), mostly_thorough([*EACH, *((name, "plain") for name in OWN_WAY)], EACH[::3])
 )
-def test_both_derivatives_are_the_slope_in_the_point_and_in_the_data(name, kind):
+def test_projection_derivatives_in_point_and_data_in_both_modes(name, kind):
     n = len(CASES[name].data)
 
     def flat(v):
@@ -166,7 +166,7 @@ def test_both_derivatives_are_the_slope_in_the_point_and_in_the_data(name, kind)
 
 
 @every_other_set
-def test_single_precision_stays_single(name):
+def test_projection_keeps_single_precision(name):
     data = jnp.asarray(CASES[name].data, jnp.float32)
     z = jnp.asarray(points(name)[5], jnp.float32)
     space = spaces.L2(jnp.asarray(WEIGHTS["weighted"], jnp.float32))
@@ -177,7 +177,7 @@ def test_single_precision_stays_single(name):
 
 
 @every_other_set
-def test_nothing_hides_a_value_that_is_not_a_number(name):
+def test_projection_propagates_nan_for_every_set(name):
     z = np.full((1, N), 0.2)
     z[0, 1] = np.nan
     assert np.isnan(project(name, "plain", z)[0, 1])
@@ -186,7 +186,7 @@ def test_nothing_hides_a_value_that_is_not_a_number(name):
 
 @every_space
 @every_other_set
-def test_the_derivative_jumps_where_a_switch_changes_its_sign_and_nowhere_else(name, kind):
+def test_projection_derivative_jumps_exactly_at_sign_changes_of_switches(name, kind):
     case, space = CASES[name], SPACES[kind]
     rng = np.random.default_rng(8)
     # From the inside (the middle of two members) and past it, out to somewhere.
@@ -221,7 +221,7 @@ def test_the_derivative_jumps_where_a_switch_changes_its_sign_and_nowhere_else(n
 
 
 @pytest.mark.thorough
-def test_a_row_that_says_what_others_say_does_not_switch_by_itself():
+def test_polyhedron_redundant_row_is_not_a_switch():
     # (1, 1)·y ≤ 0 follows from y ≤ 0: the projection is 0 on the whole quadrant y ≥ 0.
     rows = jnp.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
     K, space = sets.Polyhedron(rows, jnp.zeros(3)), spaces.Euclidean(2)

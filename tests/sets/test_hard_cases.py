@@ -1,4 +1,4 @@
-"""Kinks, degenerate sets, far-away points, and sets that turn out to be none."""
+"""Kinks, degenerate sets, distant points, and sets that are empty under tracing."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ def slope(K, z, space=PLANE):
 
 
 def tangent(*normals):
-    """The projection onto what is left when the normals are held."""
+    """The projection onto the orthogonal complement of the active normals."""
     rows = np.array(normals, float)
     return np.eye(rows.shape[1]) - np.linalg.pinv(rows) @ rows
 
@@ -42,14 +42,14 @@ ON_THE_EDGE = {
 
 
 @pytest.mark.parametrize("name", mostly_thorough(ON_THE_EDGE, ["half-space", "apex"]))
-def test_a_point_exactly_on_the_boundary_is_held_by_it(name):
+def test_projection_derivative_on_the_boundary_is_the_held_one(name):
     K, z, normals = ON_THE_EDGE[name]
     np.testing.assert_allclose(np.asarray(K.project(jnp.asarray(z), PLANE)), z, atol=1e-15)
     np.testing.assert_allclose(slope(K, z), tangent(*normals), atol=1e-12)
 
 
 @pytest.mark.thorough
-def test_a_point_on_an_ellipsoid_moves_along_it():
+def test_ellipsoid_derivative_on_the_boundary_is_tangential():
     K = sets.Ellipsoid(0.0, radii=jnp.array([2.0, 1.0]))
     s = slope(K, [2.0, 0.0])
     np.testing.assert_allclose(s[0], [0.0, 0.0], atol=1e-12)
@@ -57,7 +57,7 @@ def test_a_point_on_an_ellipsoid_moves_along_it():
     np.testing.assert_allclose(slope(turned, [2.0, 0.0]), s, atol=1e-12)
 
 
-def test_held_points_move_with_the_data():
+def test_projection_derivative_in_the_data_of_held_points():
     z = jnp.array([2.0, 2.0])
     edge = jax.grad(lambda b: sets.HalfSpace(jnp.ones(2), b).project(z, PLANE)[0])
     assert float(edge(1.0)) == pytest.approx(0.5)
@@ -70,7 +70,7 @@ def test_held_points_move_with_the_data():
 
 
 @pytest.mark.thorough
-def test_second_derivatives_are_those_of_the_face():
+def test_projection_second_derivatives_are_those_of_the_face():
     K, z = sets.Ellipsoid(0.0, radii=jnp.array([2.0, 1.0])), jnp.array([3.0, 2.0])
     one = lambda v: K.project(v, UNEVEN)[0]  # noqa: E731
     exact = np.asarray(jax.hessian(one)(z))
@@ -113,7 +113,7 @@ DEGENERATE = {
 
 
 @pytest.mark.parametrize("name", mostly_thorough(DEGENERATE, list(DEGENERATE)[1::3]))
-def test_degenerate_sets_are_sets(name):
+def test_projection_onto_degenerate_sets(name):
     K, z, exact = DEGENERATE[name]
     found = np.asarray(jax.jit(lambda z: K.project(z, PLANE))(jnp.asarray(z)))
     np.testing.assert_allclose(found, exact, atol=1e-11)
@@ -121,7 +121,7 @@ def test_degenerate_sets_are_sets(name):
 
 
 @pytest.mark.parametrize("unit", [1e-8, 1e8])
-def test_units_do_not_matter(unit):
+def test_projection_is_scale_invariant(unit):
     z = np.array([3.0, 1.0])
     S = np.array([[2.0, 0.3], [0.3, 0.5]])
 
@@ -145,7 +145,7 @@ def test_units_do_not_matter(unit):
 
 
 @pytest.mark.parametrize("space", [PLANE, UNEVEN], ids=["plain", "weighted"])
-def test_far_away_points_lose_no_digits_of_a_simplex_or_a_corner(space):
+def test_projection_of_distant_points_keeps_all_digits(space):
     z = jnp.array([1e8, 1e8 + 1.0])
     p = np.asarray(sets.Simplex(3.0).project(z, space))
     assert p.sum() == pytest.approx(3.0, abs=1e-14)
@@ -180,14 +180,14 @@ TURNS_OUT_EMPTY = {
 
 
 @pytest.mark.parametrize("name", mostly_thorough(TURNS_OUT_EMPTY, list(TURNS_OUT_EMPTY)[::2]))
-def test_a_set_that_turns_out_to_be_none_projects_to_no_point(name):
+def test_projection_onto_a_traced_empty_set_is_nan(name):
     found = jax.jit(lambda a, z: TURNS_OUT_EMPTY[name](a).project(z, PLANE))(
         1.0, jnp.array([0.1, 0.2])
     )
     assert np.all(np.isnan(np.asarray(found)))
 
 
-def test_a_moving_set_works_in_a_problem():
+def test_moving_set_works_in_a_problem():
     def K(t, args):
         return sets.Polyhedron(jnp.ones((1, 2)), args["cap"] + t)
 
@@ -203,7 +203,7 @@ def test_a_moving_set_works_in_a_problem():
     assert float(jax.grad(cap)(jnp.asarray(0.5))) == pytest.approx(0.5)
 
 
-def test_intervals_of_moved_stretched_and_common_boxes():
+def test_intervals_of_translated_scaled_and_intersected_boxes():
     like, box = jnp.zeros(2), sets.Box(0.0, 1.0)
     ends = lambda K: [np.asarray(e).tolist() for e in K.intervals(like)]  # noqa: E731
     assert ends(sets.Translated(box, 1.0)) == [[1.0, 1.0], [2.0, 2.0]]
@@ -214,7 +214,7 @@ def test_intervals_of_moved_stretched_and_common_boxes():
     assert sets.Intersection(box, sets.Simplex(1.0)).intervals(like) is None
 
 
-def test_tuples_may_be_coupled_by_one_condition():
+def test_half_space_over_a_tuple_couples_its_parts():
     space = spaces.Product(PLANE, spaces.L2(np.array([4.0])))
     K = sets.HalfSpace((np.array([1.0, 0.0]), np.array([2.0])), 0.0)
     z = (jnp.array([2.0, 5.0]), jnp.array([1.0]))
@@ -227,7 +227,7 @@ def test_tuples_may_be_coupled_by_one_condition():
     assert float(K.distance(q, space)) < 1e-9 and float(q[0][0]) == pytest.approx(0.5)
 
 
-def test_cones_and_simplices_lie_along_the_last_axis():
+def test_cones_and_simplices_use_the_last_axis():
     z = np.random.default_rng(0).normal(size=(2, 3, 4))
     whole, part = spaces.L2(np.ones((2, 3, 4)) * [1.0, 2, 3, 4]), spaces.L2(np.arange(1.0, 5))
     for K, one in (
@@ -241,7 +241,7 @@ def test_cones_and_simplices_lie_along_the_last_axis():
             np.testing.assert_allclose(found[row], alone(jnp.asarray(z[row])), atol=1e-14)
 
 
-def test_many_simplices_of_unequal_size_are_as_each_alone():
+def test_simplices_of_unequal_size_equal_single_ones():
     rng = np.random.default_rng(4)
     sizes, totals = rng.integers(1, 40, 60), rng.uniform(0, 3, 60)
     z, w = rng.normal(size=sizes.sum()), rng.uniform(0.2, 3.0, sizes.sum())
@@ -257,8 +257,8 @@ def test_many_simplices_of_unequal_size_are_as_each_alone():
         np.testing.assert_allclose(p, np.maximum(v - levels[count] / own, 0.0), atol=1e-13)
 
 
-def test_what_is_nearest_to_the_apex_of_a_cone_is_found_at_any_distance():
-    """Points of the polar cone: the apex, with every row held, though nothing gives a length there."""
+def test_cone_projection_to_the_apex_is_exact_at_any_distance():
+    """For points of the polar cone, the apex is the projection and every row counts as held."""
     rng = np.random.default_rng(8)
     for n in (2, 3, 5):
         rows = rng.normal(size=(n, n))
@@ -271,7 +271,7 @@ def test_what_is_nearest_to_the_apex_of_a_cone_is_found_at_any_distance():
         assert np.all(np.abs(found) <= 1e-14 * np.linalg.norm(shares @ rows, axis=1)[:, None])
 
 
-def test_a_set_of_known_numbers_may_be_made_while_something_is_traced():
+def test_sets_of_concrete_numbers_can_be_created_under_tracing():
     radius, rows = jnp.asarray(0.8), jnp.eye(2)
     made = lambda t: (  # noqa: E731
         sets.Ball(t * jnp.ones(2), radius).project(jnp.full(2, 3.0), PLANE)

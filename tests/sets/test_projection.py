@@ -52,7 +52,7 @@ def norm(v):
 
 @given(kinds, vectors)
 @settings(max_examples=150)
-def test_a_projection_lies_in_the_set_and_stays_where_it_is(K, z):
+def test_projection_lies_in_the_set_and_is_idempotent(K, z):
     p = project(K, z)
     again = project(K, p)
     np.testing.assert_allclose(again, p, rtol=1e-14, atol=1e-12)
@@ -66,13 +66,14 @@ def test_a_projection_lies_in_the_set_and_stays_where_it_is(K, z):
 
 @given(kinds, vectors, vectors)
 @settings(max_examples=150)
-def test_a_projection_is_nonexpansive(K, a, b):
+def test_projection_is_nonexpansive(K, a, b):
     assert norm(project(K, a) - project(K, b)) <= norm(a - b) * (1 + 1e-12) + 1e-12
 
 
 @given(kinds, vectors, vectors)
 @settings(max_examples=150)
-def test_no_point_of_the_set_makes_an_acute_angle_with_the_residual(K, z, other):
+def test_projection_satisfies_the_variational_inequality(K, z, other):
+    """No point of the set makes an acute angle with the residual."""
     p, v = project(K, z), project(K, other)
     angle = np.sum(WEIGHTS * (z - p) * (v - p))
     assert angle <= 1e-11 * (1 + norm(z - p) * (1 + norm(v - p)))
@@ -80,12 +81,12 @@ def test_no_point_of_the_set_makes_an_acute_angle_with_the_residual(K, z, other)
 
 @given(kinds, vectors, vectors)
 @settings(max_examples=50)
-def test_no_point_of_the_set_is_nearer(K, z, other):
+def test_projection_is_the_nearest_point(K, z, other):
     v = project(K, other)
     assert norm(z - project(K, z)) <= norm(z - v) + 1e-11
 
 
-def test_the_projection_onto_a_ball_minimises_the_distance_of_its_own_space():
+def test_projection_onto_ball_is_nearest_in_the_norm_of_the_space():
     # By brute force over the boundary of {‖y‖_w ≤ 1} in the plane: an ellipse, where the Euclidean
     # nearest point is another one.
     w, z = np.array([1.0, 9.0]), np.array([2.0, 1.0])
@@ -99,7 +100,7 @@ def test_the_projection_onto_a_ball_minimises_the_distance_of_its_own_space():
     assert np.linalg.norm(found - euclidean) > 0.1
 
 
-def test_a_product_projects_part_by_part_in_the_norm_of_each_part():
+def test_projection_onto_product_acts_part_by_part():
     K = sets.Product(
         sets.Ball(jnp.array([1.0, 0.0]), 2.0), sets.Box(0.0, np.inf), sets.WholeSpace()
     )
@@ -115,7 +116,7 @@ def test_a_product_projects_part_by_part_in_the_norm_of_each_part():
     assert float(K.distance(z, space)) == pytest.approx(np.sqrt(10.0))
 
 
-def test_distance_membership_and_normal_cone():
+def test_set_distance_membership_and_normal_cone_residual():
     K, line = sets.Box(0.0, 1.0), spaces.Euclidean()
     assert float(K.distance(jnp.asarray(3.5), line)) == 2.5
     assert bool(K.contains(jnp.asarray(1.0), line))
@@ -132,7 +133,7 @@ def test_distance_membership_and_normal_cone():
         assert (residual == 0.0) is inside
 
 
-def test_intervals_are_given_where_the_set_is_one_a_point():
+def test_set_intervals_exist_for_pointwise_intervals_only():
     like = jnp.zeros(3)
     low, up = sets.Box(0.0, jnp.array([1.0, 2.0, np.inf])).intervals(like)
     assert np.asarray(low).tolist() == [0.0, 0.0, 0.0]
@@ -150,13 +151,14 @@ def test_intervals_are_given_where_the_set_is_one_a_point():
 
 
 @pytest.mark.parametrize(("z", "slope"), [(-0.1, 0), (0.0, 0), (0.3, 1), (0.5, 0), (0.9, 0)])
-def test_a_point_on_a_bound_is_held_by_it(z, slope):
+def test_box_derivative_on_a_bound_is_the_held_one(z, slope):
     K, line = sets.Box(0.0, 0.5), spaces.Euclidean()
     assert float(jax.grad(lambda z: K.project(z, line))(z)) == slope
     assert float(jax.jvp(lambda z: K.project(z, line), (z,), (1.0,))[1]) == slope
 
 
-def test_a_held_point_moves_with_its_bound_and_an_equal_interval_with_the_lower_one():
+def test_box_derivative_of_held_points_is_that_of_the_bound():
+    """An interval of length 0 moves with its lower bound."""
     line = spaces.Euclidean()
     moved = jax.grad(lambda low, up, z: sets.Box(low, up).project(z, line), argnums=(0, 1, 2))
     assert [float(g) for g in moved(0.0, 0.5, 0.5)] == [0.0, 1.0, 0.0]
@@ -164,7 +166,7 @@ def test_a_held_point_moves_with_its_bound_and_an_equal_interval_with_the_lower_
     assert [float(g) for g in moved(0.2, 0.2, 0.2)] == [1.0, 0.0, 0.0]
 
 
-def test_the_derivative_of_a_ball_is_that_of_the_held_side_on_its_boundary():
+def test_ball_derivative_on_the_boundary_is_the_held_one():
     plane, z = spaces.Euclidean(2), np.array([0.6, 0.8])
     slope = jax.jacfwd(lambda z: sets.Ball(0.0, 1.0).project(z, plane))
     # On the unit circle: I − zzᵀ, the tangential part; inside: I.
@@ -199,7 +201,7 @@ def test_the_derivative_of_a_ball_is_that_of_the_held_side_on_its_boundary():
         (lambda: sets.Product(sets.Box(0.0, 1.0)).check(jnp.zeros(2)), "1 parts"),
     ],
 )
-def test_an_empty_set_or_one_that_does_not_fit_is_refused(make, word):
+def test_sets_reject_empty_or_misshapen_data(make, word):
     with pytest.raises(dvax.InputError, match=word):
         make()
 
@@ -213,13 +215,13 @@ def test_an_empty_set_or_one_that_does_not_fit_is_refused(make, word):
         lambda a: sets.Ball(a * np.nan, 1.0),
     ],
 )
-def test_a_set_that_turns_out_empty_in_a_compiled_program_projects_to_no_point(K):
+def test_projection_onto_an_empty_set_under_jit_is_nan(K):
     # Nothing can be raised there, so that what comes out must not look like a solution.
     found = jax.jit(lambda a, z: K(a).project(z, spaces.Euclidean(2)))(1.0, jnp.array([0.1, 0.2]))
     assert not np.any(np.isfinite(np.asarray(found)))
 
 
-def test_nothing_hides_a_value_that_is_not_a_number():
+def test_projection_propagates_nan():
     plane, z = spaces.Euclidean(2), jnp.array([np.nan, 0.1])
     for K in (sets.Box(0.0, 1.0), sets.Ball(0.0, 1.0), sets.WholeSpace()):
         assert np.isnan(np.asarray(K.project(z, plane))[0])

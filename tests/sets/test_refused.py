@@ -1,4 +1,4 @@
-"""Empty or inconsistent sets, and those that do not fit, are named before anything runs."""
+"""Empty, inconsistent or misshapen sets are rejected before a run."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -62,6 +62,6 @@ SQUARE = np.vstack([np.eye(2), -np.eye(2)])
         (lambda: sets.Scaled(sets.Box(0.0, 1.0), np.ones(2)), "one number"),
     ],
 )
-def test_what_is_empty_or_does_not_fit_is_named(make, word):
+def test_empty_or_inconsistent_sets_are_rejected_by_name(make, word):
     with pytest.raises(dvax.InputError, match=word):
         make()

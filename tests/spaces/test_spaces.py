@@ -29,7 +29,7 @@ def lift(a):
 
 @given(elements, elements)
 @settings(max_examples=50)
-def test_the_inner_product_of_a_sum_is_the_sum_of_weighted_inner_products(a, b):
+def test_product_inner_product_is_the_sum_of_weighted_inner_products(a, b):
     found = float(SUM.inner(lift(a), lift(b)))
     size = np.sqrt(exact(a, a) * exact(b, b))
     assert found == pytest.approx(exact(a, b), abs=1e-13 * size + 1e-300)
@@ -37,7 +37,7 @@ def test_the_inner_product_of_a_sum_is_the_sum_of_weighted_inner_products(a, b):
 
 @given(elements, elements)
 @settings(max_examples=50)
-def test_cauchy_schwarz_and_the_triangle_inequality(a, b):
+def test_norm_satisfies_cauchy_schwarz_and_the_triangle_inequality(a, b):
     a, b = lift(a), lift(b)
     na, nb = float(SUM.norm(a)), float(SUM.norm(b))
     assert abs(float(SUM.inner(a, b))) <= na * nb * (1 + 1e-12) + 1e-300
@@ -45,7 +45,7 @@ def test_cauchy_schwarz_and_the_triangle_inequality(a, b):
     assert float(SUM.norm(both)) <= (na + nb) * (1 + 1e-12)
 
 
-def test_the_norm_is_the_quadrature_of_the_square():
+def test_l2_norm_is_the_quadrature_of_the_square():
     n = 1000
     s = (np.arange(n) + 0.5) / n
     space = spaces.L2(np.full(n, 1.0 / n))
@@ -53,7 +53,7 @@ def test_the_norm_is_the_quadrature_of_the_square():
     assert float(space.size()) == pytest.approx(1.0)
 
 
-def test_the_norm_has_derivative_zero_at_zero_and_the_unit_vector_elsewhere():
+def test_norm_derivative_is_zero_at_zero_and_the_unit_vector_elsewhere():
     space = spaces.L2(WEIGHTS)
     slope = jax.grad(space.norm)
     assert np.asarray(slope(jnp.zeros(3))).tolist() == [0.0, 0.0, 0.0]
@@ -62,7 +62,7 @@ def test_the_norm_has_derivative_zero_at_zero_and_the_unit_vector_elsewhere():
     np.testing.assert_allclose(np.asarray(slope(jnp.asarray(a))), unit, rtol=1e-14)
 
 
-def test_zeros_have_the_shape_of_the_elements_and_weights_make_the_inner_product():
+def test_space_zeros_have_the_shape_of_its_elements():
     assert spaces.Euclidean().zeros().shape == ()
     assert spaces.Euclidean(3).zeros().shape == (3,)
     assert spaces.Euclidean((2, 5)).zeros().shape == (2, 5)
@@ -85,22 +85,22 @@ def test_zeros_have_the_shape_of_the_elements_and_weights_make_the_inner_product
         (spaces.Euclidean(3), (jnp.zeros(3),), [r"((3,),)", r"(3,)"]),
     ],
 )
-def test_a_wrong_shape_is_refused_with_both_shapes_named(space, element, words):
+def test_space_check_names_both_shapes(space, element, words):
     with pytest.raises(dvax.InputError) as caught:
         space.check(element, "x0")
     for word in ["x0", *words]:
         assert word in str(caught.value)
 
 
-def test_a_right_shape_passes():
+def test_space_check_accepts_the_right_shape():
     SUM.check((jnp.zeros(()), jnp.zeros(3)), "x0")
 
 
 @pytest.mark.parametrize("bad", [[1.0, 0.0], [1.0, -2.0], [1.0, np.nan], [np.inf, 1.0]])
-def test_weights_that_make_no_inner_product_are_refused(bad):
+def test_l2_rejects_weights_that_are_not_positive(bad):
     with pytest.raises(dvax.InputError, match="weights"):
         spaces.L2(np.array(bad))
 
 
-def test_the_norm_of_something_that_is_not_a_number_is_not_a_number():
+def test_norm_propagates_nan():
     assert np.isnan(float(SUM.norm((jnp.asarray(1.0), jnp.array([0.0, np.nan, 1.0])))))

@@ -1,4 +1,4 @@
-"""Systems whose place in the theory is known: half of them break just one assumption, by a margin."""
+"""Systems with known properties: half of them violate exactly one assumption, by a margin."""
 
 from typing import Any, NamedTuple
 
@@ -128,7 +128,7 @@ def _weighted(rng: Any, n: int, m: int, parts: _Parts) -> Generated:
 
 
 def _not_monotone(rng: Any, n: int, m: int, parts: _Parts) -> Generated:
-    """F affine, zero inside K, and pushing the wrong way from there in one direction."""
+    """F affine, zero inside K, and not monotone in one direction."""
     J = np.eye(m)
     J[0, 0] = -0.5
     H_u = np.eye(m) - J @ np.linalg.inv(parts.inverse)

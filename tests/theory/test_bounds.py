@@ -26,7 +26,7 @@ OFTEN = {
 
 
 @pytest.mark.parametrize(("name", "run"), mostly_thorough(itertools.product(ALL, RUNS), OFTEN))
-def test_the_bound_is_above_the_true_error_at_every_saved_time(name, run):
+def test_bound_error_is_above_the_true_error_at_every_saved_time(name, run):
     case = ALL[name]()
     ts = np.linspace(0.0, case.t1, 17)[1:]
     sol = dvax.solve(
@@ -51,7 +51,7 @@ def test_the_bound_is_above_the_true_error_at_every_saved_time(name, run):
         assert np.all(np.asarray(bound.x_sharp) <= np.asarray(bound.x_paper) * (1 + 1e-12))
 
 
-def test_a_worse_solution_has_a_larger_bound():
+def test_bound_error_is_larger_for_a_less_accurate_solution():
     case = ALL["C1"]()
     at = lambda tol: float(  # noqa: E731
         dvax.bound_error(
@@ -64,7 +64,7 @@ def test_a_worse_solution_has_a_larger_bound():
     assert fine < 0.1 * coarse
 
 
-def test_an_error_in_the_initial_state_is_propagated():
+def test_bound_error_propagates_an_initial_error():
     case = ALL["C1"]()
     sol = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, rtol=1e-6)
     without = dvax.bound_error(case.problem, sol, case.constants)
@@ -73,7 +73,7 @@ def test_an_error_in_the_initial_state_is_propagated():
     assert float(given.x_paper[-1] - without.x_paper[-1]) == pytest.approx(0.01 * np.e, rel=1e-9)
 
 
-def test_an_initial_error_that_is_none_is_refused():
+def test_bound_error_rejects_an_invalid_initial_error():
     case = ALL["C1"]()
     sol = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, rtol=1e-3)
     for wrong in (-1e-3, np.nan, np.inf, [0.0, 1.0], "0"):
@@ -100,21 +100,22 @@ def _pieces(c):
 
 
 @pytest.mark.thorough
-def test_a_run_in_pieces_has_the_bounds_of_the_whole():
+def test_bound_error_of_a_run_in_pieces_equals_that_of_the_whole():
     whole, pieces = _pieces(ALL["C1"]().constants)
     for name in whole:
         np.testing.assert_allclose(pieces[name], whole[name], rtol=1e-10, err_msg=name)
 
 
 @pytest.mark.thorough
-def test_an_overshoot_is_charged_again_at_every_piece():
+def test_bound_error_of_pieces_includes_the_overshoot_of_each():
+    """With M > 1 the bound of pieces is larger, since they need not share one semigroup."""
     # Nothing says that the pieces have one semigroup in common.
     whole, pieces = _pieces(replaced(ALL["C1"]().constants, M=2.0))
     assert np.all(pieces["x_paper"] >= whole["x_paper"] * (1 - 1e-12))
     assert pieces["x_paper"][-1] > 1.5 * whole["x_paper"][-1]
 
 
-def test_a_bound_is_gone_on_with_only_from_where_it_stands():
+def test_bound_error_continues_only_from_the_last_bounded_time():
     case = ALL["C1"]()
     run = lambda x, t0, t1, ts: dvax.solve(  # noqa: E731
         case.problem, x, t0, t1, args=case.args, ts=ts, dt=0.125, measure=True
@@ -133,7 +134,7 @@ def replaced(constants, **more):
     return dvax.Constants(**(given | more))
 
 
-def test_constants_below_what_the_operators_prove_are_only_declared():
+def test_bound_error_with_constants_below_the_proved_ones_is_declared():
     case = ALL["C1"]()
     sol = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, rtol=1e-4)
     status = lambda c: dvax.bound_error(case.problem, sol, c).status  # noqa: E731
@@ -143,7 +144,7 @@ def test_constants_below_what_the_operators_prove_are_only_declared():
         assert status(replaced(case.constants, **smaller)) == "declared"
 
 
-def test_the_error_of_the_response_does_not_rest_on_what_the_solve_was_told():
+def test_bound_error_of_the_response_ignores_the_constants_given_to_solve():
     # A nonmonotone weight: the law is solved by iteration, so that its error is more than rounding.
     case = ALL["C4"]()
     told = replaced(case.constants, gamma=10 * case.constants.gamma, L_F=10 * case.constants.L_F)
@@ -167,7 +168,7 @@ def _contact(alpha, load):
 
 
 def _reference(alpha, load, ts, breaks=()):
-    """The same point by an explicit Runge–Kutta method of order 8, in steps far below its kinks."""
+    """The same point by an explicit Runge–Kutta method of order 8 with very short steps."""
 
     def rate(t, x):
         u = np.clip(0.5 * (1.0 - 2.0 * x), 0.0, 0.5)
@@ -185,8 +186,8 @@ def _reference(alpha, load, ts, breaks=()):
     return np.concatenate(out)
 
 
-def test_saving_often_does_not_loosen_a_bound():
-    """A step is charged once, however many saved times lie in it."""
+def test_bound_error_does_not_grow_with_the_number_of_saved_times():
+    """A step is counted once, for any number of saved times in it."""
     case = ALL["C1"]()
     end = {}
     for count in (1, 2000):
@@ -202,7 +203,7 @@ def test_saving_often_does_not_loosen_a_bound():
 
 
 @pytest.mark.parametrize("dt", mostly_thorough([0.1, 0.05], [0.1]))
-def test_saved_times_between_steps_of_a_stiff_contact_are_covered(dt):
+def test_bound_error_covers_saved_times_between_steps_of_a_stiff_contact(dt):
     # Trajectories approach fast here, so a bound must not let an impulse decay before it acted.
     load = lambda t, np: 300.0 * np.sin(20.0 * t)  # noqa: E731
     model, ts = _contact(50.0, load), np.linspace(0.0, 2.0, 2001)[1:]
@@ -215,7 +216,7 @@ def test_saved_times_between_steps_of_a_stiff_contact_are_covered(dt):
 
 
 @pytest.mark.parametrize("name", mostly_thorough(["ETD1", "ETD2RK"], ["ETD1"]))
-def test_a_load_that_stops_on_a_step_nobody_announced_is_covered(name):
+def test_bound_error_covers_an_unannounced_jump_at_the_end_of_a_step(name):
     # What floor does is not read off the code as a time (t < 1 would be).
     load = lambda t, np: 3.0 * (1.0 - np.minimum(np.floor(t), 1.0))  # noqa: E731
     model, ts = _contact(1.0, load), np.linspace(0.0, 2.0, 41)[1:]
@@ -228,7 +229,7 @@ def test_a_load_that_stops_on_a_step_nobody_announced_is_covered(name):
     assert np.all(np.asarray(bound.x_sharp) >= error - 1e-8)
 
 
-def test_a_solution_of_another_problem_is_refused():
+def test_bound_error_rejects_a_solution_of_another_problem():
     one, four = ALL["C1"](), ALL["C4"]()
     sol = dvax.solve(one.problem, -1.0, 0.0, 2.0, args=one.args, rtol=1e-3)
     with pytest.raises(dvax.InputError, match="another problem"):
@@ -256,7 +257,7 @@ def _pair(p, x0s):
     )  # fmt: skip
 
 
-def test_no_pair_of_trajectories_of_a_contact_problem_breaks_the_estimates():
+def test_pairs_of_contact_trajectories_satisfy_the_estimates():
     rng = np.random.default_rng(6)
     decaying, sharpest = 0, 0.0
     for _ in range(60):
@@ -280,7 +281,7 @@ def test_no_pair_of_trajectories_of_a_contact_problem_breaks_the_estimates():
     assert decaying > 3 and sharpest > 0.3
 
 
-def test_constants_of_a_region_are_good_while_the_trajectory_stays_in_it():
+def test_bound_error_with_constants_of_a_region_is_finite_inside_it():
     case = ALL["C1"]()
     ts = np.linspace(0.0, 2.0, 21)[1:]
     run = lambda t1, ts: dvax.solve(  # noqa: E731
@@ -330,7 +331,7 @@ BETWEEN = [(name, *case) for name in ("steps of ETD2RK", "windows of Picard") fo
 @pytest.mark.parametrize(
     ("name", "region", "good"), mostly_thorough(BETWEEN, [*BETWEEN[:2], BETWEEN[3], BETWEEN[5]])
 )
-def test_what_happens_between_two_saved_times_is_seen(name, region, good):
+def test_bound_error_detects_leaving_the_region_between_saved_times(name, region, good):
     method = dvax.ETD2RK() if name == "steps of ETD2RK" else dvax.Picard()
     """The saved states are within 0.1 of 0, whatever has been in between."""
     problem = excursion()
@@ -355,7 +356,7 @@ def test_what_happens_between_two_saved_times_is_seen(name, region, good):
 
 
 @pytest.mark.parametrize("bound", [1.2, 2.0])
-def test_no_run_is_certified_by_constants_that_it_left_in_between(bound):
+def test_certified_tol_fails_if_the_trajectory_leaves_the_region(bound):
     problem = excursion()
     constants = dvax.verify(problem, 0.0, 0.0, 3.0, x=(-0.5, bound)).constants
     run = lambda: dvax.solve(problem, 0.0, 0.0, 3.0, constants=constants, certified_tol=1e-3)  # noqa: E731
@@ -366,7 +367,7 @@ def test_no_run_is_certified_by_constants_that_it_left_in_between(bound):
         assert float(run().stats["certified_bound"]) <= 1e-3
 
 
-def test_a_method_without_a_defect_is_refused():
+def test_bound_error_rejects_a_method_without_a_defect():
     case = ALL["C1"]()
     sol = dvax.solve(
         case.problem, -1.0, 0.0, 2.0, args=case.args, rtol=1e-3, method=dvax.Implicit()

@@ -1,4 +1,4 @@
-"""`certified_tol`: the true error is below what was asked; what cannot be had is said at once."""
+"""`certified_tol`: the true error is below it, and unattainable values are rejected."""
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +39,7 @@ def errors(case, x0, sol):
 
 
 @pytest.mark.parametrize(("name", "method", "tol"), mostly_thorough(CASES, OFTEN))
-def test_the_true_error_is_below_the_tolerance(name, method, tol):
+def test_certified_tol_is_above_the_true_error(name, method, tol):
     case, x0, constants = system(name)
     ts = np.linspace(0.0, case.t1, 21)[1:]
     sol = dvax.solve(
@@ -65,7 +65,7 @@ def test_the_true_error_is_below_the_tolerance(name, method, tol):
         print(f"{name} {method} {tol:g}: bound / error {float(bound.x.max()) / of_x.max():.1f}")
 
 
-def test_what_rounding_forbids_is_said_before_anything_runs():
+def test_certified_tol_below_rounding_is_rejected_before_the_run():
     case, x0, constants = system("C1")
     with pytest.raises(dvax.InputError, match=r"c = -0\.5.*in reach here is about [\d.e-]+"):
         dvax.solve(case.problem, x0, 0.0, 2.0, case.args, constants=constants, certified_tol=1e-15)
@@ -78,7 +78,7 @@ def test_what_rounding_forbids_is_said_before_anything_runs():
         dvax.solve(case.problem, x0, 0.0, 200.0, case.args, constants=alone, certified_tol=1e-3)
 
 
-def test_arguments_that_do_not_go_together_are_refused():
+def test_certified_tol_rejects_conflicting_arguments():
     case, x0, constants = system("C1")
     run = lambda **more: dvax.solve(case.problem, x0, 0.0, 2.0, case.args, **more)  # noqa: E731
     with pytest.raises(dvax.InputError, match=r"constants.*rests on the constants"):
@@ -100,7 +100,7 @@ def test_arguments_that_do_not_go_together_are_refused():
         )(x0)
 
 
-def test_a_run_that_fails_is_returned_as_failed_and_not_as_certified():
+def test_certified_tol_reports_a_failed_run_as_failed():
     case, x0, constants = system("C1")
     sol = dvax.solve(
         case.problem, x0, 0.0, 2.0, case.args, constants=constants, certified_tol=1e-5, max_steps=3,

@@ -1,4 +1,4 @@
-"""The constants of the paper, by their formulas coded a second time."""
+"""The constants of the paper against an independent implementation of their formulas."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def formulas(c, T, rho, lam):
     }
 
 
-def test_the_formulas_on_random_constants():
+def test_constants_agree_with_their_formulas():
     rng = np.random.default_rng(4)
     for _ in range(100):
         low, high = np.sort(rng.exponential(size=2))
@@ -55,7 +55,7 @@ def test_the_formulas_on_random_constants():
         assert all(norm_at(r) >= best - 1e-12 for r in np.linspace(0, 3 / norm, 200))
 
 
-def test_the_published_constants():
+def test_constants_of_the_published_example():
     one, two = c1().constants, c2().constants
     assert (float(one.L), float(one.L_tilde)) == (1.0, 1.5)
     assert float(one.hadamard(2.0)) == pytest.approx(2 * np.e, rel=1e-14)
@@ -64,7 +64,7 @@ def test_the_published_constants():
     assert float(two.L) == pytest.approx(0.3711482167, abs=1e-10)
 
 
-def test_random_affine_systems_obey_the_constants_of_their_matrices():
+def test_constants_hold_for_random_affine_systems():
     # F(y) = P⁻¹y − (H_x x − H_u P⁻¹y): every inequality that the constants stand for, at random
     # points, with moduli from numpy's norms and eigenvalues.
     rng = np.random.default_rng(5)
@@ -109,19 +109,19 @@ def test_random_affine_systems_obey_the_constants_of_their_matrices():
         ({"alpha_f": "large"}, "alpha_f"),
     ],
 )
-def test_constants_that_cannot_be_are_refused(changed, name):
+def test_constants_reject_invalid_values(changed, name):
     with pytest.raises(dvax.InputError, match=rf"Constants\({name}\)"):
         dvax.Constants(**{**GOOD, **changed})
 
 
-def test_all_bad_constants_are_named_at_once():
+def test_constants_report_all_invalid_values_at_once():
     with pytest.raises(dvax.InputError) as caught:
         dvax.Constants(**{**GOOD, "M": 0.0, "alpha_f": -1.0, "m_P": -1.0})
     for name in ("M", "alpha_f", "m_P"):
         assert f"Constants({name})" in str(caught.value)
 
 
-def test_a_number_is_no_better_known_than_what_it_is_made_from():
+def test_constants_status_is_the_weakest_of_its_inputs():
     c = dvax.Constants(**GOOD, status={"gamma": "proved", "alpha_h": "estimated"})
     assert c.status_of("gamma") == "proved"
     assert c.status_of("gamma", "M") == "declared"
@@ -133,7 +133,7 @@ def test_a_number_is_no_better_known_than_what_it_is_made_from():
     assert "sharp_decay_rate" not in rows
 
 
-def test_a_misspelt_status_is_refused():
+def test_constants_reject_an_unknown_status():
     for status in ({"gama": "proved"}, {"gamma": "certain"}):
         word = next(iter(status))
         with pytest.raises(dvax.InputError, match=word):

@@ -1,4 +1,4 @@
-"""A norm in which trajectories approach: what it says is true, and the solver is not believed."""
+"""Norms in which trajectories approach: the rates hold, independently of the solver."""
 
 import builtins
 
@@ -14,7 +14,7 @@ from dvax.theory import energy
 
 
 def sheared(n, m, seed, pointwise):
-    """A stable matrix far from normal, and a law that feeds back a little."""
+    """A stable nonnormal matrix, and a law with weak feedback."""
     rng = np.random.default_rng(seed)
     A = np.diag(-rng.uniform(0.5, 2.0, n)) + np.triu(4.0 * rng.normal(size=(n, n)), 1)
     F_u, H_x = 0.2 * rng.normal(size=(n, m)), 0.2 * rng.normal(size=(m, n))
@@ -35,7 +35,7 @@ SIZES = [(2, 2, True), (3, 2, False), (5, 3, True)]
 
 
 @pytest.mark.parametrize(("n", "m", "pointwise"), mostly_thorough(SIZES, {(2, 2, True)}))
-def test_no_pair_of_trajectories_is_faster_than_the_norm_says(n, m, pointwise):
+def test_energy_norm_bounds_the_distance_of_trajectories(n, m, pointwise):
     rng = np.random.default_rng(9)
     better = 0
     for seed in range(4):
@@ -53,7 +53,7 @@ def test_no_pair_of_trajectories_is_faster_than_the_norm_says(n, m, pointwise):
     assert better >= 3
 
 
-def test_decay_is_certified_where_absolute_values_see_growth():
+def test_energy_norm_proves_decay_where_moduli_give_growth():
     problem = sheared(3, 2, 0, True)
     c = dvax.verify(problem, jnp.zeros(3), 0.0, 6.0, energy=True).constants
     assert float(c.decay_rate) < 0 and float(c.sharp_decay_rate) < 0 and float(c.energy[1]) < 0
@@ -70,7 +70,7 @@ def test_decay_is_certified_where_absolute_values_see_growth():
     assert names["energy_rate"].value > 0
 
 
-def test_it_is_never_worse_than_the_norm_of_the_space_on_the_closed_forms():
+def test_energy_norm_growth_is_at_most_that_of_the_space_norm():
     for name in ("C1", "C2", "C3"):
         case = ALL[name]()
         c = dvax.verify(
@@ -81,8 +81,8 @@ def test_it_is_never_worse_than_the_norm_of_the_space_on_the_closed_forms():
         assert grown(M, rate) <= grown(1.0, float(c.one_sided)) * (1 + 1e-6)
 
 
-def test_a_proposal_is_measured_and_not_believed():
-    """Whatever Q and multipliers come in, the rate that goes out is the one they have."""
+def test_energy_norm_rate_is_recomputed_from_the_proposed_norm():
+    """For any Q and multipliers, the returned rate is the one that they have."""
     rng = np.random.default_rng(1)
     G, F_u, H_x = rng.normal(size=(3, 3)) - 2 * np.eye(3), rng.normal(size=(3, 2)), np.ones((2, 3))
     data = energy._Data(G, F_u, H_x, np.diag([1.0, 2.0]), np.eye(2), True)
@@ -97,7 +97,7 @@ def test_a_proposal_is_measured_and_not_believed():
     assert energy._certify(np.diag([1.0, 1.0, -1.0]), np.ones(2), data) is None
 
 
-def test_without_the_solver_it_says_what_to_install(monkeypatch):
+def test_energy_norm_without_the_solver_names_the_extra(monkeypatch):
     real = builtins.__import__
 
     def without(name, *given, **more):

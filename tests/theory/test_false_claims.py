@@ -1,4 +1,4 @@
-"""What a sceptical reader once got called proved, or refuted, and was not."""
+"""Cases for which an earlier version wrongly reported proved or refuted."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ def problem(**other):
     return dvax.Problem(**{**GIVEN, **other})
 
 
-def test_a_reshape_may_permute_the_axes_first():
+def test_verify_bounds_a_reshape_with_permuted_axes():
     left, right = jnp.array([[-100.0, 0.0], [0.0, 0.0]]), jnp.array([0.0, 100.0, 0.0, 0.0])
     f = lambda t, x, u, a: left @ x + (jnp.ravel(x, order="F") * right).reshape(2, 2)  # noqa: E731
     c = dvax.verify(problem(f=f), jnp.zeros((2, 2))).constants
@@ -27,7 +27,7 @@ def test_a_reshape_may_permute_the_axes_first():
     assert float(c.one_sided) >= np.linalg.eigvalsh(0.5 * (J + J.T))[-1] - 1 - 1e-9
 
 
-def test_a_law_that_is_not_pointwise_bounds_its_response_as_a_whole():
+def test_verify_bounds_the_response_of_a_coupled_law_as_a_whole():
     first, second = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.001])
     wave = lambda u: jnp.array([0.0, 1.0]) * jnp.sin(2 * jnp.pi * u) / (2 * jnp.pi)  # noqa: E731
     system = problem(
@@ -58,13 +58,13 @@ def test_a_law_that_is_not_pointwise_bounds_its_response_as_a_whole():
         ),
     ],
 )
-def test_what_jumps_within_the_set_is_not_proved(K, h):
+def test_verify_does_not_prove_a_law_with_a_jump_inside_the_set(K, h):
     check = dvax.verify(problem(K=K, h=h))
     assert check["ass:strong_pseudomono"].status != "proved"
     assert check["ass:lipschitz_smallness"].status != "proved"
 
 
-def test_a_filled_in_entry_does_not_move():
+def test_verify_treats_filled_entries_of_a_gather_as_constant():
     outside = jnp.array([7])
     f = lambda t, x, u, a: (  # noqa: E731
         x.at[outside].get(mode="fill", fill_value=-7.0) + 14 * jnp.maximum(x, 0.0)
@@ -73,7 +73,7 @@ def test_a_filled_in_entry_does_not_move():
     assert float(c.alpha_f) == pytest.approx(14.0)
 
 
-def test_a_user_s_function_may_have_any_name():
+def test_verify_accepts_user_functions_with_names_of_dvax():
     @jax.jit
     def linear_table(knots, weights, s):
         return jnp.sum(weights * jnp.maximum(s - knots, 0.0))
@@ -84,7 +84,7 @@ def test_a_user_s_function_may_have_any_name():
     assert float(c.alpha_f) >= 2.0
 
 
-def test_a_declared_spectrum_proves_nothing():
+def test_verify_with_a_declared_spectrum_is_not_proved():
     n = 3000
     e = jnp.zeros(n).at[0].set(1.0)
     P = dvax.operators.MatrixFree(lambda v: v + 3 * e * v, m=1.0, norm=4.0)
@@ -100,7 +100,7 @@ def test_a_declared_spectrum_proves_nothing():
     assert float(found.gamma) == pytest.approx(0.45, rel=1e-6)
 
 
-def test_a_weighted_law_over_a_declared_spectrum_is_declared():
+def test_verify_of_a_weighted_law_with_a_declared_spectrum_is_declared():
     h = lambda t, x, u, a: u - (2.0 + jnp.sin(x[0])) * (u - 0.1 * jnp.tanh(u))  # noqa: E731
     for declared, P in enumerate(
         (dvax.operators.Scaling(2.0), dvax.operators.MatrixFree(lambda v: 2.0 * v, m=2.0, norm=2.0))
@@ -111,7 +111,7 @@ def test_a_weighted_law_over_a_declared_spectrum_is_declared():
         assert "F = aG" in row.why
 
 
-def test_constants_of_one_parameter_prove_nothing_for_another():
+def test_verify_constants_hold_for_their_args_only():
     f = lambda t, x, u, a: a["k"] * x - u  # noqa: E731
     system = problem(f=f, K=dvax.sets.Box(-1.0, 1.0))
     one, other = {"k": jnp.asarray(1.0)}, {"k": jnp.asarray(3.0)}
@@ -125,7 +125,7 @@ def test_constants_of_one_parameter_prove_nothing_for_another():
         dvax.solve(system, 0.1, 0.0, 2.0, one, constants=c, certified_tol=1e-3)
 
 
-def test_an_empty_set_that_stands_still_is_not_proved_to_stand():
+def test_verify_does_not_prove_an_empty_intersection():
     balls = dvax.sets.Intersection(
         dvax.sets.Ball(0.0, 1.0), dvax.sets.Ball(jnp.array([5.0, 0.0]), 1.0)
     )
@@ -134,7 +134,7 @@ def test_an_empty_set_that_stands_still_is_not_proved_to_stand():
 
 
 @pytest.mark.parametrize("knot", [0.5, 0.0])
-def test_a_jump_is_none_the_less_one_where_nobody_looked(knot):
+def test_verify_detects_jumps_in_time_at_any_knot(knot):
     switch = dvax.signals.Function(
         lambda t: jnp.where(t < knot, -5.0, -3.0), knots=jnp.array([knot])
     )
@@ -147,7 +147,7 @@ def test_a_jump_is_none_the_less_one_where_nobody_looked(knot):
 
 
 @pytest.mark.parametrize(("begin", "slope"), [(1e5, 1.0), (1.7e9, 1e-3)])
-def test_a_slope_at_a_late_time_is_no_jump(begin, slope):
+def test_verify_does_not_mistake_a_slope_at_a_late_time_for_a_jump(begin, slope):
     times = begin + 3600.0 * np.arange(4)
     load = dvax.signals.Table(times, np.array([1.0, 1.0, 1.0 + slope * 3600, 1.0]))
     system = problem(
@@ -158,7 +158,7 @@ def test_a_slope_at_a_late_time_is_no_jump(begin, slope):
     assert check["ass:time_regularity (ii)"].status == "proved"
 
 
-def test_a_certified_run_does_not_leave_the_region_of_its_constants():
+def test_certified_tol_rejects_constants_of_a_region_that_the_run_leaves():
     grows = problem(
         A=dvax.generators.Scalar(0.0), K=dvax.sets.Box(-10.0, 10.0),
         f=lambda t, x, u, a: 20 * jnp.maximum(x - 0.5, 0.0) + 1.0 + jnp.sin(20 * t) - 0.0 * u,
@@ -177,28 +177,28 @@ def test_a_certified_run_does_not_leave_the_region_of_its_constants():
     assert np.isinf(float(dvax.bound_error(reacts, sol, c).x[-1]))
 
 
-def test_bounds_of_parameters_in_a_region_are_the_caller_s_word():
+def test_parameter_bounds_in_a_region_are_declared():
     f = lambda t, x, u, a: 20 * a["k"] * jnp.maximum(x - 0.5, 0.0) + a["c"] - u * 0.0  # noqa: E731
     ends = {"k": 1.0, "c": 1.0}, {"k": 1.0, "c": 1.1}
     bounds = dvax.parameter_bounds(problem(f=f), *ends, 0.0, x=(-1.0, 0.5))
     assert bounds.status == "declared"
 
 
-def test_single_precision_runs_have_bounds_from_double_precision_constants():
+def test_bound_error_of_a_single_precision_run_accepts_double_constants():
     short = problem(K=dvax.sets.Box(jnp.float32(0.0), jnp.float32(1.0)))
     c = dvax.verify(short, jnp.zeros(2, jnp.float32)).constants
     sol = dvax.solve(short, jnp.ones(2, jnp.float32), 0.0, 1.0, rtol=1e-3)
     assert np.isfinite(float(dvax.bound_error(short, sol, c).x[-1]))
 
 
-def test_a_pseudomonotone_law_may_be_flatter_than_its_modulus():
+def test_verify_proves_a_pseudomonotone_law_with_zero_slope():
     flat = problem(K=dvax.sets.Box(1.0, 2.0), h=lambda t, x, u, a: u - (2 / u) * u)
     check = dvax.verify(flat)
     assert check.constants is not None and float(check.constants.gamma) == pytest.approx(1.0)
 
 
-def test_a_certified_run_does_not_leave_the_region_between_its_saved_times():
-    """x = sin t, which is past 0.6 for a while: what holds up to there does not hold then."""
+def test_certified_tol_checks_the_region_between_saved_times():
+    """For x = sin t, which exceeds 0.6 for a while, constants up to 0.6 do not hold then."""
     k = lambda x: 12 * jnp.tanh(5 * jnp.maximum(jnp.abs(x) - 0.6, 0.0))  # noqa: E731
     system = problem(
         A=dvax.generators.Zero(), K=dvax.sets.Box(0.0, 0.5), h=lambda t, x, u, a: 0.0 * x,
@@ -217,7 +217,7 @@ def test_a_certified_run_does_not_leave_the_region_between_its_saved_times():
     )
 
 
-def test_radii_are_counted_from_the_origin():
+def test_parameter_bounds_measure_radii_from_the_origin():
     steep = lambda t, x, u, a: a * x + 10 * jnp.tanh(10 * x) + 0.0 * u  # noqa: E731
     system = problem(f=steep, h=lambda t, x, u, a: -u)
     with pytest.raises(dvax.InputError, match="region without 0"):
@@ -227,7 +227,7 @@ def test_radii_are_counted_from_the_origin():
             dvax.parameter_bounds(system, 0.0, 0.01, 1.0, start_radius=radius)
 
 
-def test_bounds_of_a_box_of_parameters_say_nothing_outside_it():
+def test_parameter_bounds_do_not_hold_outside_their_box():
     system = problem(
         K=dvax.sets.Box(0.0, 0.5), f=lambda t, x, u, a: a**3 - 0.5 * x - u,
         h=lambda t, x, u, a: 1.0 - 2 * x - u,

@@ -1,4 +1,4 @@
-"""A bound that is called proved stands where a step's ends see nothing of what happens inside.
+"""Proved bounds hold for functions of time that vary between the ends of a step.
 
 x' = r(t), with a law that stays out of the way: the true solution is ∫ r, by quadrature between the
 places where r jumps or bends.
@@ -51,7 +51,7 @@ def integral(rate, breaks, t):
         itertools.product(ENCLOSED, METHODS), list(zip(ENCLOSED, itertools.cycle(METHODS)))[::2]
     ),
 )
-def test_a_bound_called_proved_is_above_the_error(name, method):
+def test_proved_bound_is_above_the_error_for_hard_rates(name, method):
     rate, breaks = RATES[name]
     system = problem(lambda t, x, u, args: rate(t) + 0.0 * u)
     truth = np.array([integral(jax.jit(rate), breaks, t) for t in TS])
@@ -69,14 +69,14 @@ def test_a_bound_called_proved_is_above_the_error(name, method):
 
 
 @pytest.mark.parametrize("name", mostly_thorough(SAMPLED, SAMPLED[::2]))
-def test_what_cannot_be_enclosed_is_called_an_estimate(name):
+def test_bound_without_enclosure_is_estimated(name):
     rate, _ = RATES[name]
     system = problem(lambda t, x, u, args: rate(t) + 0.0 * u)
     sol = dvax.solve(system, 0.0, 0.0, 1.0, dt=0.25, measure=True)
     assert dvax.bound_error(system, sol, CONSTANTS).status == "estimated"
 
 
-def test_a_jump_that_nobody_announced_is_found_by_adaptive_steps():
+def test_adaptive_steps_locate_unannounced_jumps():
     rate, _ = RATES["a jump in the middle"]
     system = problem(lambda t, x, u, args: rate(t) + 0.0 * u)
     sol = dvax.solve(system, 0.0, 0.0, 1.0, ts=TS, rtol=1e-4, atol=1e-4, dt0=0.125)
@@ -86,7 +86,7 @@ def test_a_jump_that_nobody_announced_is_found_by_adaptive_steps():
     assert bound.x[-1] < 1e-3
 
 
-def test_a_run_that_ends_before_its_first_saved_time_has_an_empty_bound():
+def test_bound_of_a_run_without_saved_times_is_empty():
     rate, _ = RATES["a short pulse"]
     system = problem(lambda t, x, u, args: rate(t) + 0.0 * u)
     sol = dvax.solve(system, 0.0, 0.0, 1.0, ts=TS, rtol=1e-9, atol=1e-9, max_steps=2, throw=False)
@@ -94,7 +94,8 @@ def test_a_run_that_ends_before_its_first_saved_time_has_an_empty_bound():
     assert dvax.bound_error(system, sol, CONSTANTS).x.shape == (0,)
 
 
-def test_a_defect_that_turns_with_the_semigroup_is_not_averaged():
+def test_bound_integrates_the_norm_of_a_rotating_defect():
+    """The norms of the defect add up, while the norm of its mean would be smaller."""
     # The defect swings from one axis to the other while e^{At} turns with it, so that its norms add
     # up: ∫‖δ‖ is 0.81 h, where the norm of the mean is 0.71 h.
     h = 0.25
@@ -118,7 +119,7 @@ def test_a_defect_that_turns_with_the_semigroup_is_not_averaged():
     assert float(bound.x[-1]) >= error
 
 
-def test_a_root_that_never_leaves_zero_costs_nothing():
+def test_enclosure_of_a_root_that_stays_zero_is_finite():
     # Its slope is infinite there, and nothing moves.
     system = problem(lambda t, x, u, args: 1.0 - x + jnp.sqrt(jnp.maximum(t - 5.0, 0.0)) + 0.0 * u)
     fixed = dvax.solve(system, 0.0, 0.0, 1.0, dt=0.1, measure=True)
@@ -137,7 +138,7 @@ def test_a_root_that_never_leaves_zero_costs_nothing():
     ],
     ids=["opening", "opening and closing"],
 )
-def test_an_interval_that_shrinks_to_a_point_is_no_empty_one(upper, response):
+def test_interval_that_shrinks_to_a_point_is_not_empty(upper, response):
     # u is held at the upper end, so that x = ∫ u.
     system = dvax.Problem(
         A=dvax.generators.Scalar(0.0), P=dvax.operators.Scaling(1.0),
@@ -152,7 +153,7 @@ def test_an_interval_that_shrinks_to_a_point_is_no_empty_one(upper, response):
         assert bound.status == "proved" and error <= float(bound.x[-1]) < 0.1
 
 
-def test_a_function_with_its_own_derivative_may_depend_on_the_parameters_alone():
+def test_enclosure_accepts_custom_jvp_functions_of_args():
     system = problem(lambda t, x, u, args: jax.nn.relu(args) - x + 0.0 * u)
     sol = dvax.solve(system, 0.0, 0.0, 1.0, args=jnp.asarray(1.0), dt=0.01, measure=True)
     assert sol.enclosed

@@ -22,8 +22,8 @@ def phi(a, T):
     return quad(lambda s: np.exp(a * (T - s)), 0.0, T)[0]
 
 
-def test_every_formula_of_section_6_is_its_definition():
-    """Written out once more from the paper, with numbers in the place of attributes."""
+def test_section_6_formulas_agree_with_their_definition():
+    """Written out once more from the paper, with numbers instead of attributes."""
     L = 1.7 * 1.4 / 0.8
     L_tilde = 0.6 + 1.2 * L
     rate = -0.7 + 2.0 * L_tilde
@@ -51,7 +51,7 @@ def test_every_formula_of_section_6_is_its_definition():
     assert BOUNDS.status == "proved"
 
 
-def test_the_formulas_without_an_object_are_their_definition():
+def test_section_6_functions_agree_with_their_definition():
     for a in (-3.0, -1e-9, 0.0, 1e-320, 1e-9, 2.0):
         assert float(formulas.growth_integral(a, 1.3)) == pytest.approx(phi(a, 1.3), rel=1e-12)
     low, high = formulas.bielecki_equivalence(2.0, 1.5)
@@ -66,7 +66,7 @@ def test_the_formulas_without_an_object_are_their_definition():
     assert residual_bound(0.1, 1.0, 0.8, 3.0) == pytest.approx(((3.0 + 1.0) / 0.8 + 1.0) * 0.1)
 
 
-def test_the_constants_of_thm_continuous_dependence_are_their_definition():
+def test_continuous_dependence_constants_agree_with_their_definition():
     L, L_tilde = 1.7 * 1.4 / 0.8, 0.6 + 1.2 * 1.7 * 1.4 / 0.8
     rate = -0.7 + 2.0 * L_tilde
     assert float(C.separation(0.5)) == pytest.approx(2.0 * np.exp(rate * 0.5))
@@ -82,8 +82,8 @@ def test_the_constants_of_thm_continuous_dependence_are_their_definition():
     assert 0.0 < float(C.bielecki_factor(best)) < 1.0
 
 
-def test_the_response_moves_as_fast_as_the_bounds_say_and_no_faster():
-    """A half-plane that turns, and a monotone law: the Lipschitz bound and the paper's square root."""
+def test_response_in_time_satisfies_its_lipschitz_bound():
+    """For a rotating half-plane and a monotone law: the Lipschitz bound and the paper's square root."""
     rng = np.random.default_rng(2)
     J = np.array([[2.0, -1.0], [1.0, 1.0]])
     gamma, L_F = np.linalg.eigvalsh(0.5 * (J + J.T))[0], np.linalg.norm(J, 2)
@@ -116,7 +116,7 @@ def test_the_response_moves_as_fast_as_the_bounds_say_and_no_faster():
     assert worst > 0.05
 
 
-def test_wrong_numbers_are_refused():
+def test_parameter_bounds_reject_invalid_numbers():
     with pytest.raises(dvax.InputError, match=r"kappa_K.*≥ 0"):
         dvax.ParameterBounds(C, **{**GIVEN, "kappa_K": -1.0})
 
@@ -132,7 +132,7 @@ def contact(eta):
     )
 
 
-def test_the_bounds_of_a_box_of_parameters_hold_for_pairs_of_trajectories():
+def test_parameter_bounds_hold_for_pairs_of_trajectories():
     low, high = jnp.array([2.5, 0.4, 0.8, 1.5]), jnp.array([3.5, 0.6, 1.2, 2.5])
     problem = contact(None)
     bounds = dvax.parameter_bounds(problem, low, high, t1=2.0, start_radius=2.0)
@@ -174,7 +174,7 @@ def test_the_bounds_of_a_box_of_parameters_hold_for_pairs_of_trajectories():
     assert np.all(sharp <= np.asarray(bounds.state(d_start, d_eta)) * (1 + 1e-12))
 
 
-def test_what_section_6_keeps_fixed_may_not_use_the_parameter():
+def test_parameter_bounds_reject_parameters_in_A_P_and_K():
     moving = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),
         K=lambda t, p: dvax.sets.Box(0.0, p), f=lambda t, x, u, p: p - u, h=lambda t, x, u, p: -x - u,
@@ -183,6 +183,6 @@ def test_what_section_6_keeps_fixed_may_not_use_the_parameter():
         dvax.parameter_bounds(moving, 1.0, 2.0)
     with pytest.raises(dvax.InputError, match="low ≤ high"):
         dvax.parameter_bounds(contact(None), jnp.ones(4), jnp.zeros(4))
-    # ∂f/∂d_x = x is not bounded, and nobody said where x stays.
+    # ∂f/∂d_x = x is not bounded without a bound on x.
     with pytest.raises(dvax.InputError, match="start_radius"):
         dvax.parameter_bounds(contact(None), jnp.zeros(4), jnp.ones(4))

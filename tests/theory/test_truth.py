@@ -1,5 +1,5 @@
-"""Certificates beside the truth: known solutions, three methods, five tolerances; and pairs of
-trajectories of C2 and of random affine systems beside every estimate of Section 6.
+"""Certificates against true errors: known solutions, three methods, five tolerances; and pairs of
+trajectories of C2 and of random affine systems against every estimate of Section 6.
 
 `pytest -m "" -s tests/theory/test_truth.py` prints the tables.
 """
@@ -68,12 +68,12 @@ def ratios(name, method):
     return found
 
 
-def test_the_bound_is_above_the_truth():
+def test_certificates_are_above_the_true_error():
     assert len(ratios("C3", "ETD4RK")) == 3
 
 
 @pytest.mark.thorough
-def test_half_of_all_bounds_are_within_five_times_the_error():
+def test_certificates_are_within_five_errors_for_half_of_the_cases():
     rows = {method: [row for name in NAMES for row in ratios(name, method)] for method in METHODS}
     for method, found in rows.items():
         sharp, paper = np.median(np.array(found), axis=0)
@@ -172,7 +172,7 @@ def pairs(problem, low, high, dim, t1, seed):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", ["C2", *range(6)])
-def test_pairs_of_parameters_and_initial_states_obey_section_6(name):
+def test_certificates_of_section_6_hold_for_pairs(name):
     if name == "C2":
         found = pairs(c2_of(None), *C2_BOX, 2, 4.0, 1)
     else:

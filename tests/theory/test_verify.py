@@ -1,4 +1,4 @@
-"""What is called proved is true, what is called refuted is false."""
+"""Statements that `verify` calls proved are true, and those it calls refuted are false."""
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +43,7 @@ def _check(seed):
 
 
 def _hold(made, c):
-    """The moduli bound what random pairs show."""
+    """Check that the moduli bound those of random pairs."""
     rng = np.random.default_rng(5)
     problem = made.problem
     n, m = made.x0.size, problem.control_space.zeros().size
@@ -79,18 +79,18 @@ OFTEN = [0, 2, 4, *range(1, 23, 2)]
 
 
 @pytest.mark.parametrize("seed", OFTEN)
-def test_a_generated_system(seed):
+def test_verify_is_correct_on_a_generated_system(seed):
     _check(seed)
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("seed", [6, *range(8, 400, 2)])
-def test_two_hundred_generated_systems(seed):
+def test_verify_is_correct_on_two_hundred_generated_systems(seed):
     _check(seed)
     _check(seed + 1)
 
 
-def test_the_additive_drive_is_refuted_with_a_counterexample():
+def test_verify_refutes_the_additive_drive_with_a_counterexample():
     made, check = inspect(3)
     row = check["ass:strong_pseudomono"]
     assert row.status == "refuted" and check.constants is None
@@ -103,7 +103,7 @@ def test_the_additive_drive_is_refuted_with_a_counterexample():
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_the_constants_of_the_closed_forms_are_proved(name):
+def test_verify_proves_the_constants_of_the_closed_forms(name):
     case = ALL[name]()
     region = {"x": (0.0, 6.0)} if name == "C4" else {}
     check = dvax.verify(case.problem, jnp.asarray(case.x0), 0.0, case.t1, case.args, **region)
@@ -122,7 +122,7 @@ def test_the_constants_of_the_closed_forms_are_proved(name):
 
 
 @pytest.mark.parametrize("n", [16, 20_000])
-def test_a_field_with_a_pointwise_law_is_proved_at_any_size(n):
+def test_verify_proves_a_field_with_a_pointwise_law_at_any_size(n):
     case = c7(n)
     check = dvax.verify(case.problem, jnp.asarray(case.x0), 0.0, 1.0)
     assert check.status == "proved"
@@ -133,7 +133,7 @@ def test_a_field_with_a_pointwise_law_is_proved_at_any_size(n):
     assert float(c.one_sided) == pytest.approx(float(c.omega) + 0.8, abs=1e-9)
 
 
-def test_the_contact_law_has_the_constants_of_section_7():
+def test_verify_gives_the_contact_law_the_constants_of_section_7():
     model = dvax.models.Contact(
         alpha=1.3, beta=0.7, b_x=2.0, b_u=3.0, d_x=0.5, d_u=1.1, kappa0=0.5,
         g=lambda t: jnp.sin(t), ell=3.0,
@@ -155,14 +155,14 @@ def cubic(**other):
     return dvax.Problem(**{**given, **other})
 
 
-def test_a_region_makes_finite_what_is_not_finite_everywhere():
+def test_verify_in_a_region_proves_finite_moduli():
     assert dvax.verify(cubic())["ass:f_lipschitz"].status == "estimated"
     within = dvax.verify(cubic(), x=(-2.0, 1.0))
     assert within["ass:f_lipschitz"].status == "proved"
     assert float(within.constants.alpha_f) == pytest.approx(12.0)
 
 
-def test_what_is_declared_is_declared_and_may_be_refuted():
+def test_verify_keeps_or_refutes_declared_moduli():
     # The code of h has an operation without a rule, so that nothing is proved of it.
     without = dvax.verify(cubic())
     assert without["ass:strong_pseudomono"].status == "estimated"
@@ -175,7 +175,7 @@ def test_what_is_declared_is_declared_and_may_be_refuted():
     assert "declared as 0.25" in wrong["ass:lipschitz_smallness"].why
 
 
-def test_wrong_arguments_are_named():
+def test_verify_rejects_wrong_arguments_by_name():
     problem = cubic()
     with pytest.raises(dvax.InputError, match=r"x0.*shape"):
         dvax.verify(cubic(A=dvax.generators.Diagonal(jnp.ones(3)), f=lambda t, x, u, args: -x - u))
@@ -195,8 +195,8 @@ LARGE = [(kind, n) for n in (5, 3000) for kind in ("scatter", "sparse", "transfo
 
 
 @pytest.mark.parametrize(("kind", "n"), mostly_thorough(LARGE, {*LARGE[:3], ("scatter", 3000)}))
-def test_affine_data_that_no_matrix_is_made_of(kind, n):
-    """Where operations have no rule, or the matrix no room: Lanczos on what is proved to be affine."""
+def test_verify_bounds_large_affine_data_by_lanczos(kind, n):
+    """For operations without a rule, or too large for a matrix: Lanczos' method on affine data."""
     rng = np.random.default_rng(7)
     if kind == "transform":
         factors = jnp.asarray(rng.uniform(-0.5, 0.3, n // 2 + 1))
@@ -229,8 +229,8 @@ def test_affine_data_that_no_matrix_is_made_of(kind, n):
         assert 0.97 * (1 + least) <= float(c.gamma) <= (1 + least) * (1 + 1e-9)
 
 
-def test_data_that_jumps_is_seen_wherever_it_hides():
-    """Not at x = 0, not at y = 1: a jump is no continuity all the same."""
+def test_verify_does_not_prove_continuity_of_data_with_jumps():
+    """Also if the jump has no effect at x = 0 or y = 1."""
     step = dvax.signals.Table([0.0, 0.5, 1.0], [2.0, 3.0, 3.0], kind="constant")
     times_x = cubic(f=lambda t, x, u, args: -u, h=lambda t, x, u, args: -step(t) * x - u)
     check = dvax.verify(times_x)
@@ -247,7 +247,7 @@ def test_data_that_jumps_is_seen_wherever_it_hides():
     assert check["ass:time_regularity (ii)"].status == "proved"
 
 
-def test_a_sharp_declared_modulus_is_not_refuted_by_rounding():
+def test_verify_does_not_refute_a_sharp_declared_modulus():
     large = cubic(
         f=lambda t, x, u, args: 1e9 + jax.lax.sort(x[None])[0] - u, h=lambda t, x, u, args: -u
     )

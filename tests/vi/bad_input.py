@@ -1,5 +1,5 @@
 """Wrong calls of `dvax.solve_vi`, its solvers and `Problem.response`: one process tries all of them and
-prints what was said.
+prints the messages.
 
 A process of its own, since the tests check annotations, and the checker would answer before dvax.
 """

@@ -7,7 +7,7 @@ from fractions import Fraction
 
 
 class Undecided(Exception):
-    """The search for the active set did not end."""
+    """The search for the active set did not terminate."""
 
 
 def rational(array):

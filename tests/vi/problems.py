@@ -1,4 +1,4 @@
-"""Published variational inequalities with their solutions, and where to start from.
+"""Published variational inequalities with their solutions and starting points.
 
 Sources: Malitsky 2020, Khanh and Vuong 2014, Fukushima 1986, Mathiesen 1987, MCPLIB (Billups,
 Munson), Murty 1988, Fathi 1979, Ahn 1983, Murphy, Sherali and Soyster 1982; solutions as published,
@@ -32,7 +32,7 @@ class Problem(NamedTuple):
 
 
 def spread(size, length=10.0):
-    """Starts about the positive orthant, some of them outside it."""
+    """Starting points around the positive orthant, some outside it."""
 
     def draw(rng, count):
         return np.abs(rng.normal(size=(count, size))) * length * rng.choice([1, -0.1], (count, 1))
@@ -107,7 +107,7 @@ def mathiesen(x, _):
 
 def traffic(h, _):
     """Three routes 1–3–4, 1–2–3–4 and 1–2–4 of a net with five links of cost A + B v²: no toll on
-    the way through the middle, and yet nobody takes it."""
+    the route through the middle, whose flow is 0 at the solution."""
     uses = jnp.array([[1.0, 0, 0], [0, 1, 1], [0, 1, 0], [1, 1, 0], [0, 0, 1]])
     free, steep = jnp.array([25.0, 25, 75, 25, 25]), jnp.array([0.01, 0.01, 0.001, 0.01, 0.01])
     return uses.T @ (free + steep * (uses @ h) ** 2)

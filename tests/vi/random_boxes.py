@@ -1,4 +1,4 @@
-"""Random affine variational inequalities on boxes whose solutions are known without projecting.
+"""Random affine variational inequalities on boxes, with solutions found without projections.
 
 Every case is VI({lower ≤ y ≤ upper}, My + q) in `SIZE` unknowns with M nonsymmetric and ⟨Mv, v⟩ ≥ γ‖v‖²
 for a γ that is known. Smaller cases are filled up by entries of zero width. Three families:
@@ -63,7 +63,7 @@ def by_faces(matrix, q, lower, upper):
 
 
 def by_pivoting(matrix, q, lower, upper):
-    """From the face with all entries free where they may be, change the first entry that is wrong."""
+    """Start with all entries free where possible, and change the first wrong entry repeatedly."""
     face = np.where(lower == upper, -1, 0)
     answer, open_ = np.full_like(q, np.nan), np.arange(len(q))
     for _ in range(2000):
@@ -110,13 +110,13 @@ def degenerate(rng, M, q, lower, upper, y):
 
 
 def moduli(M):
-    """γ and L, each on the safe side of its rounding."""
+    """Bounds on γ and L, each on the safe side of its rounding error."""
     L = np.linalg.norm(M, 2, axis=(1, 2)) * (1 + 1e-12)
     return np.linalg.eigvalsh(0.5 * (M + M.swapaxes(1, 2)))[:, 0] - 1e-14 * L, L
 
 
 def filled(rng, M, q, lower, upper, y):
-    """The same case with more unknowns, each of zero width, anywhere among the others."""
+    """The same case with further unknowns of zero width, inserted anywhere."""
     count, size = q.shape
     more = SIZE - size
     point = rng.normal(size=(count, more))

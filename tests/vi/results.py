@@ -1,4 +1,4 @@
-"""How a batch of solves ended, lane by lane."""
+"""Summaries of the results of a batch of solves."""
 
 from collections import Counter
 
@@ -17,7 +17,7 @@ def successful(vi):
 
 
 def reasons(vi, lanes):
-    """The failures among `lanes`, by name. Every lane ends in one word."""
+    """The failures among `lanes`, by name, one per lane."""
     said = {name: np.asarray(vi.result == getattr(RESULTS, name)) & lanes for name in FAILURES}
     count = Counter({name: int(word.sum()) for name, word in said.items() if word.any()})
     assert count.total() == int(np.sum(lanes & ~successful(vi)))

@@ -10,7 +10,7 @@ from dvax.sets import Ball, Box
 from dvax.vi import RESULTS, Accelerated
 
 
-def test_an_ill_conditioned_gradient_on_simplices_is_followed_to_its_least_point():
+def test_accelerated_minimises_an_ill_conditioned_quadratic_on_simplices():
     # Made from its answer: y* with the multipliers of three simplices, κ = 10⁴.
     rng = np.random.default_rng(6)
     basis = np.linalg.qr(rng.normal(size=(60, 60)))[0]
@@ -34,7 +34,7 @@ def test_an_ill_conditioned_gradient_on_simplices_is_followed_to_its_least_point
 
 
 @pytest.mark.parametrize("K", [Box(-0.1, 0.2), Ball(0.0, 0.5)], ids=["box", "ball"])
-def test_a_convex_function_that_is_not_quadratic(K):
+def test_accelerated_minimises_a_convex_function(K):
     # ψ(y) = Σ log(1 + e^(Gy − b)) + ½|y|²: γ = 1, by L-BFGS-B or SLSQP.
     rng = np.random.default_rng(3)
     G, b = 3.0 * rng.normal(size=(40, 12)), rng.normal(size=40)
@@ -75,14 +75,14 @@ def test_a_convex_function_that_is_not_quadratic(K):
     ],
     ids=["NaN", "no solution", "a jump"],
 )  # fmt: skip
-def test_a_failure_is_never_called_a_success(F, K, result):
+def test_accelerated_failure_is_not_reported_as_success(F, K, result):
     vi = dvax.solve_vi(lambda y, args: F(y), K, jnp.full(2, 0.5), solver=Accelerated())
     assert vi.result != RESULTS.successful
     assert result is None or vi.result == result
     assert not float(vi.residual) < 0.5
 
 
-def test_where_f_is_no_gradient_the_certificate_holds_all_the_same():
+def test_accelerated_certificate_holds_if_f_is_not_a_gradient():
     # A strong rotation with γ = 1: nothing is known of the method, all is known of its bound.
     matrix = jnp.array([[1.0, 20.0], [-20.0, 1.0]])
     F = lambda y, args: matrix @ y - 1.0  # noqa: E731

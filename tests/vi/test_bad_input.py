@@ -19,13 +19,14 @@ def answers():
 
 
 @pytest.mark.parametrize(("name", "words"), NAMES, ids=[name for name, _ in NAMES])
-def test_a_wrong_argument_is_an_input_error_on_one_line(answers, name, words):
+def test_solve_vi_rejects_wrong_arguments_in_one_line(answers, name, words):
     is_a_good_refusal(answers[name], words)
     message = answers[name][1]
     assert len(message.splitlines()) == 1 and "Traceback" not in message
 
 
-def test_what_is_traced_is_not_refused_and_fits_may_be_of_other_kinds():
+def test_solve_vi_accepts_traced_moduli_and_mixed_types():
+    """A traced invalid γ gives an infinite bound; parts of a tuple may differ in type."""
     K, F = sets.Box(0.0, 1.0), bad_input.F3
     bound = jax.jit(lambda gamma: dvax.solve_vi(F, K, jnp.zeros(2), gamma=gamma).error_bound)
     assert np.isinf(bound(jnp.asarray(-1.0))) and float(bound(jnp.asarray(1.0))) < 1e-10
@@ -44,7 +45,7 @@ FEW = dvax.vi.Projection(5)
 
 
 @pytest.mark.parametrize("name", ["response", "reduced"])
-def test_a_law_that_is_not_solved_has_no_response(name):
+def test_response_of_an_unsolved_law_raises_solve_error(name):
     x = jnp.zeros(2)
     with pytest.raises(dvax.SolveError, match=r"Projection: the largest number of iterations"):
         getattr(ROTATION, name)(0.0, x, solver=FEW)
@@ -52,7 +53,7 @@ def test_a_law_that_is_not_solved_has_no_response(name):
     np.testing.assert_allclose(getattr(ROTATION, name)(0.0, x), right, atol=1e-9)
 
 
-def test_under_transformations_it_is_nan_with_nan_derivatives():
+def test_response_of_an_unsolved_law_is_nan_under_transformations():
     R = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
     law = bad_input.cyclic(h=lambda t, x, u, args: u - args * (R @ u - x))
     few = lambda a: jnp.sum(law.reduced(0.0, jnp.ones(2), a - 1.0, solver=FEW))  # noqa: E731
@@ -64,7 +65,7 @@ def test_under_transformations_it_is_nan_with_nan_derivatives():
     np.testing.assert_allclose(good(jnp.zeros(2)), [1.0, -1.0], atol=1e-9)
 
 
-def test_single_precision_does_not_make_a_law_unsolved():
+def test_response_in_single_precision_is_solved():
     M = jnp.array([[2.0, -1.0], [1.0, 2.0]], jnp.float32)
     problem = bad_input.cyclic(
         P=dvax.operators.Scaling(jnp.float32(1.0)), K=sets.Box(jnp.float32(-5e3), jnp.float32(5e3)),

@@ -1,4 +1,4 @@
-"""Under `jax.vmap` every lane is its own problem: what one of them does moves no other."""
+"""Under `jax.vmap` every lane is an independent problem."""
 
 import jax
 import jax.numpy as jnp
@@ -61,7 +61,7 @@ CHEAP = ("auto",)
     "name",
     [pytest.param(n, marks=() if n in CHEAP else pytest.mark.thorough) for n in SOLVERS],
 )
-def test_a_lane_is_what_it_is_alone_whatever_the_others_do(name):
+def test_solve_vi_lanes_are_independent(name):
     run = jax.jit(
         jax.vmap(lambda *given: solve(SOLVERS[name], *given)),
     )
@@ -90,7 +90,7 @@ def test_a_lane_is_what_it_is_alone_whatever_the_others_do(name):
         same(some, together, lane)
 
 
-def test_pointwise_lanes_are_independent_as_well():
+def test_solve_vi_pointwise_lanes_are_independent():
     run = jax.jit(
         jax.vmap(
             lambda c, lower, upper: dvax.solve_vi(
@@ -109,7 +109,7 @@ def test_pointwise_lanes_are_independent_as_well():
 
 
 @pytest.mark.thorough  # a program for each
-def test_one_of_the_three_may_be_mapped_and_the_others_shared():
+def test_solve_vi_maps_over_one_of_F_K_and_args():
     # F's data, the set's data, or the guess: each lane equals the plain call.
     y0, (M, q, wild), lower, upper = jax.tree.map(jnp.asarray, lanes(2))
     solver = GoldenRatio()

@@ -1,4 +1,4 @@
-"""Pointwise intervals: how many evaluations of F they take, and that no guess changes the answer."""
+"""Pointwise intervals: the number of evaluations of F, and independence of the guess."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,7 +31,7 @@ def solve(name, y0, count=POINTS):
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_fifteen_evaluations_solve_every_point_and_three_from_a_good_guess(name):
+def test_bracketing_needs_at_most_fifteen_evaluations_and_three_from_the_solution(name):
     law, lower, upper, drive = LAWS[name]
     vi = solve(name, jnp.zeros(POINTS))
     assert int(vi.evaluations) <= 15
@@ -45,13 +45,13 @@ def test_fifteen_evaluations_solve_every_point_and_three_from_a_good_guess(name)
     assert int(solve(name, vi.y).evaluations) <= 3
 
 
-def test_the_answer_does_not_depend_on_the_guess():
+def test_bracketing_solution_does_not_depend_on_the_guess():
     found = [solve("pseudomonotone", jnp.full(101, guess), 101).y for guess in (-1e9, 0.3, 1e9)]
     for y in found[1:]:
         np.testing.assert_allclose(np.asarray(y), np.asarray(found[0]), rtol=1e-14, atol=1e-15)
 
 
-def test_a_root_without_a_slope_or_with_an_infinite_one_takes_a_bounded_number():
+def test_bracketing_evaluations_are_bounded_at_roots_with_zero_or_infinite_slope():
     c = jnp.linspace(-0.3, 1.3, 1001)
     for power, most in ((3.0, 240), (0.5, 60)):
         law = lambda y, c, p=power: jnp.sign(y - c) * jnp.abs(y - c) ** p  # noqa: E731
@@ -62,7 +62,7 @@ def test_a_root_without_a_slope_or_with_an_infinite_one_takes_a_bounded_number()
 
 
 @pytest.mark.parametrize("bound", [0.9332785790714507, -1e-3, 1e12])
-def test_a_bound_that_is_met_from_next_to_it_is_the_answer(bound):
+def test_bracketing_from_a_guess_beside_the_bound_returns_the_bound(bound):
     # The guess is a few spacings from the bound: nothing is left to narrow, and no sign has changed.
     for side in (-1.0, 1.0):
         law = lambda y, c, side=side: (y - c) + jnp.tanh(y - c) + 0 * side  # noqa: E731

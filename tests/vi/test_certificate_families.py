@@ -72,11 +72,11 @@ OFTEN = {
 
 
 @pytest.mark.parametrize(("kind", "weight"), sorted(OFTEN))
-def test_the_bounds_hold_for_nonmonotone_operators(kind, weight):
+def test_error_bounds_hold_for_nonmonotone_operators(kind, weight):
     check(kind, weight, 4, jnp.float64, seed=1)
 
 
-def test_the_bounds_hold_in_single_precision_but_for_rounding():
+def test_error_bounds_hold_in_single_precision_up_to_rounding():
     check("box", "a wave", 4, jnp.float32, seed=2)
 
 
@@ -84,5 +84,5 @@ def test_the_bounds_hold_in_single_precision_but_for_rounding():
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 @pytest.mark.parametrize("weight", WEIGHTS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_bounds_hold_at_a_hundred_thousand_points(kind, weight, dtype):
+def test_error_bounds_hold_at_a_hundred_thousand_points(kind, weight, dtype):
     check(kind, weight, 13, dtype, seed=3)

@@ -1,4 +1,4 @@
-"""C0 and C1 are never below the true error, and the proven contraction is never beaten by fact.
+"""C0 and C1 are never below the true error, and the proved contraction factor holds.
 
 The truth comes from trying every face of the box (`tests.oracles`), which shares no idea with a
 projection method.
@@ -83,7 +83,7 @@ def test_certificates_are_never_below_the_true_error_on_many_problems():
     check_certificates(10_000, seed=8)
 
 
-def test_the_oracle_itself_solves_what_it_should():
+def test_affine_box_oracle_is_a_fixed_point_of_projection():
     rng = np.random.default_rng(0)
     for _ in range(20):
         M, q, lower, upper, _, L = random_problem(rng)
@@ -93,7 +93,7 @@ def test_the_oracle_itself_solves_what_it_should():
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["L_F known", "backtracking"])
-def test_random_boxes_are_solved_with_an_honest_bound(known):
+def test_extragradient_bound_holds_on_random_boxes(known):
     def run(M, q, lower, upper, gamma, L):
         vi = dvax.solve_vi(
             lambda y, _: M @ y + q, dvax.sets.Box(lower, upper), jnp.zeros(4), gamma=gamma,
@@ -137,7 +137,7 @@ METHODS = {
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_every_step_contracts_at_least_as_proved(name):
+def test_contraction_factor_holds_for_every_step(name):
     solver, step, length, attained = METHODS[name]
     rng = np.random.default_rng(13)
     worst = 0.0
@@ -164,7 +164,8 @@ def test_every_step_contracts_at_least_as_proved(name):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_the_solver_takes_the_steps_that_the_contraction_speaks_of(name):
+def test_contraction_factor_bounds_the_iterations_of_the_solver(name):
+    """To gain ten digits, a solver needs at most ln(1e10)/ln(1/q) iterations."""
     # From iteration counts alone: to gain 10 more digits it needs no more than ln(1e10)/ln(1/q).
     solver = METHODS[name][0]
     M, q = np.array([[1.0, 6.0], [-6.0, 1.0]]), np.array([-1.0, 2.0])

@@ -1,4 +1,4 @@
-"""Solves that differ in numbers alone share one compiled program, called plainly or under `jax.jit`."""
+"""Solves that differ only in numbers share one compiled program, directly or under `jax.jit`."""
 
 import time
 
@@ -38,7 +38,7 @@ def counted(counts):
     [pytest.param(s, marks=() if s is None else pytest.mark.thorough) for s in SOLVERS],
     ids=lambda solver: "auto" if solver is None else type(solver).__name__,
 )
-def test_other_numbers_are_solved_without_a_trace_of_F(solver):
+def test_solve_vi_does_not_retrace_for_other_numbers(solver):
     counts = []
     F, rng = counted(counts), np.random.default_rng(0)
     took, first = [], 0
@@ -63,7 +63,7 @@ def test_other_numbers_are_solved_without_a_trace_of_F(solver):
 
 
 @pytest.mark.thorough  # three programs
-def test_another_shape_or_set_is_another_program():
+def test_solve_vi_compiles_again_for_another_shape_or_set():
     counts = []
     F = counted(counts)
     dvax.solve_vi(F, Box(0.0, 1.0), jnp.zeros(2), jnp.ones(2), GoldenRatio())
@@ -75,7 +75,7 @@ def test_another_shape_or_set_is_another_program():
     assert len(counts) > before
 
 
-def test_under_the_callers_jit_there_is_one_trace_as_well():
+def test_solve_vi_under_jit_traces_once():
     counts = []
     F = counted(counts)
     solve = jax.jit(lambda y0, target, K: dvax.solve_vi(F, K, y0, target).y)
@@ -86,8 +86,8 @@ def test_under_the_callers_jit_there_is_one_trace_as_well():
     assert float(y[1] + y[1] ** 3) == pytest.approx(12.0, rel=1e-12)
 
 
-def test_what_F_closes_over_in_a_transformation_is_differentiated_and_mapped():
-    # A function made anew around a traced number is a new function, not the compiled old one.
+def test_solve_vi_differentiates_and_maps_closed_over_values():
+    # A closure over a traced number is a new function, not the one compiled before.
     def solution(c):
         return dvax.solve_vi(lambda y, _: y + y**3 - c, Box(-9.0, 9.0), jnp.zeros(())).y
 

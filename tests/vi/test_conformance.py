@@ -1,5 +1,5 @@
-"""Published variational inequalities (`tests.vi.problems`), solved to 1e-9 of a solution from their
-published starts and from 100 others: a method solves, or says why not."""
+"""Published variational inequalities (`tests.vi.problems`), from their published starts and 100 others:
+a solver is within 1e-9 of a solution, or reports a failure."""
 
 import itertools
 from typing import Any
@@ -68,7 +68,7 @@ def cases():
 
 
 @pytest.mark.parametrize(("name", "solver"), list(cases()))
-def test_a_method_solves_a_published_problem_or_says_why_not(name, solver):
+def test_solvers_solve_published_problems_or_report_failure(name, solver):
     problem = PROBLEMS[name]
     vi, published = solved(name, SOLVERS[solver])
     good = successful(vi)
@@ -92,7 +92,7 @@ def test_a_method_solves_a_published_problem_or_says_why_not(name, solver):
 @pytest.mark.parametrize(
     "name", sorted({*PROBLEMS} - {"fukushima2", "mathiesen as an intersection"})
 )
-def test_the_listed_points_solve_by_the_first_order_conditions(name):
+def test_published_solutions_satisfy_the_first_order_conditions(name):
     # ⟨F(y*), v − y*⟩ ≥ 0 for many v of K, as the inequality is written. (Where K is an intersection,
     # the published multipliers below say it.)
     problem = PROBLEMS[name]
@@ -116,7 +116,7 @@ def at(name, x):
     return np.asarray(PROBLEMS[name].F(jnp.asarray(x), PROBLEMS[name].args))
 
 
-def test_the_published_multipliers_balance_the_operator():
+def test_published_multipliers_balance_the_operator():
     first, second = PROBLEMS["fukushima1"].solutions[0], PROBLEMS["fukushima2"].solutions[0]
     np.testing.assert_allclose(
         at("fukushima1", first) + 0.9 * gradient([1, 0.4, 0.6], first), 0, atol=1e-14
@@ -134,7 +134,7 @@ def test_the_published_multipliers_balance_the_operator():
     np.testing.assert_allclose(at("disk2d", y) + 0.95301552916 * gradient([1, 1], y), 0, atol=1e-10)
 
 
-def test_the_seven_solutions_on_the_simplex_are_those_of_its_faces():
+def test_simplex_problem_has_seven_solutions_by_enumeration_of_faces():
     # On each face F = μ1 for some μ and Σx = 4; off it F ≥ μ. Every face, many starts, by MINPACK.
     def F(x):
         quadratic = [[3, 2, 0, 0, 2], [2, 0, 0, 0, 1], [3, 1, 0, 0, 2], [1, 0, 0, 0, 3]]
@@ -185,14 +185,14 @@ def test_paper1d_is_the_clip_of_its_parameter(solver):
         assert np.all(np.asarray(vi.error_bound) >= error - 4e-16 * np.abs(cs))
 
 
-def test_billups_is_solved_by_bracketing_where_local_methods_are_trapped_at_zero():
+def test_billups_problem_is_solved_by_bracketing_from_any_start():
     # (x − 1)² − 1.01 on [0, ∞) has the root 1 + √1.01; merit functions stall at 0.
     for start in (0.0, 0.5, 3.0, 100.0):
         vi = dvax.solve_vi(lambda y, _: (y - 1.0) ** 2 - 1.01, ORTHANT, jnp.asarray(start))
         assert float(vi.y) == pytest.approx(2.004987562112089, abs=1e-9)
 
 
-def test_the_permuted_problem_has_the_permuted_solution():
+def test_permuted_problem_has_the_permuted_solution():
     F, K, (solution,) = PROBLEMS["expweight_box3"][:3]
     solve = jax.jit(
         lambda order, back: (

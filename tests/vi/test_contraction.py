@@ -82,11 +82,11 @@ def check(name, rounds, seed):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_every_step_towards_a_nonmonotone_solution_contracts_at_least_as_proved(name):
+def test_contraction_factor_holds_for_nonmonotone_operators(name):
     check(name, 1, seed=17)
 
 
 @pytest.mark.thorough  # 10⁵ starts a method
 @pytest.mark.parametrize("name", METHODS)
-def test_every_step_of_many_contracts_at_least_as_proved(name):
+def test_contraction_factor_holds_for_many_nonmonotone_operators(name):
     check(name, 17, seed=18)

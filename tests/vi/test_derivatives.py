@@ -1,4 +1,4 @@
-"""Derivatives of a solution with respect to all that F and K hold: implicit, never unrolled."""
+"""Derivatives of a solution with respect to all data in F and K, by the implicit function theorem."""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ def box_solution(q):
     return vi.y
 
 
-def test_on_a_box_the_free_entries_move_by_the_inverse_of_their_block():
+def test_derivative_on_a_box_is_the_inverse_of_the_free_block():
     y = np.asarray(box_solution(jnp.asarray(Q)))
     free = np.abs(y) < 1 - 1e-6
     assert 0 < free.sum() < 3  # one entry free, the others held: both kinds are tested
@@ -32,7 +32,7 @@ def test_on_a_box_the_free_entries_move_by_the_inverse_of_their_block():
 
 
 @pytest.mark.thorough
-def test_held_entries_follow_their_bound():
+def test_derivative_of_held_entries_is_that_of_their_bound():
     def solution(upper):
         F = lambda y, _: jnp.asarray(M) @ y + jnp.asarray(Q)  # noqa: E731
         return dvax.solve_vi(F, Box(-1.0, upper), jnp.zeros(3), tol=1e-13).y
@@ -50,7 +50,7 @@ def test_held_entries_follow_their_bound():
         )
 
 
-def test_on_a_ball_the_derivative_is_that_of_the_lagrange_conditions():
+def test_derivative_on_a_ball_satisfies_the_lagrange_conditions():
     # My + q + μy = 0, |y| = r: differentiate these two equations by hand.
     q, r = np.array([-5.0, -3.0, 1.0]), 0.8
 
@@ -74,7 +74,7 @@ SOLVERS = [Bracketing(), Extragradient(), Auto()]
 
 
 @pytest.mark.parametrize("solver", mostly_thorough(SOLVERS, SOLVERS[2:]))
-def test_first_and_second_derivatives_of_a_nonlinear_law(solver):
+def test_derivatives_of_a_nonlinear_law_of_first_and_second_order(solver):
     # y³ + y = c on [−10, 10]: y' = 1/(3y² + 1), y'' = −6y/(3y² + 1)³.
     def solution(c):
         F = lambda y, c: y**3 + y - c  # noqa: E731
@@ -82,7 +82,7 @@ def test_first_and_second_derivatives_of_a_nonlinear_law(solver):
 
     y = 1.3
     c = y**3 + y
-    slope, bend = 1 / (3 * y**2 + 1), -6 * y / (3 * y**2 + 1) ** 3
+    slope, curvature = 1 / (3 * y**2 + 1), -6 * y / (3 * y**2 + 1) ** 3
     assert float(solution(c)) == pytest.approx(y, abs=1e-12)
     assert float(jax.grad(solution)(c)) == pytest.approx(slope, rel=1e-10)
     assert float(jax.jvp(solution, (c,), (1.0,))[1]) == pytest.approx(slope, rel=1e-10)
@@ -91,7 +91,7 @@ def test_first_and_second_derivatives_of_a_nonlinear_law(solver):
         jax.grad(jax.grad(solution)),
         jax.jacfwd(jax.jacfwd(solution)),
     ):
-        assert float(second(c)) == pytest.approx(bend, rel=1e-8)
+        assert float(second(c)) == pytest.approx(curvature, rel=1e-8)
 
 
 def test_jvp_and_vjp_are_transposes_and_agree_with_differences():
@@ -115,7 +115,7 @@ def test_jvp_and_vjp_are_transposes_and_agree_with_differences():
     )
 
 
-def test_the_guess_has_no_derivative():
+def test_derivative_in_the_guess_is_zero():
     F = lambda y, _: y**3 + y - 2.0  # noqa: E731
     for solver in (Bracketing(), Extragradient()):
         slope = jax.grad(lambda y0, s=solver: dvax.solve_vi(F, Box(-5.0, 5.0), y0, solver=s).y)(0.4)
@@ -123,7 +123,7 @@ def test_the_guess_has_no_derivative():
 
 
 def chain(n, pull, left_pull):
-    """A law on a chain of n unknowns, each drawn to its neighbours."""
+    """A law on a chain of n unknowns, coupled to their neighbours."""
 
     def F(y, args):
         left, right = jnp.roll(y, 1).at[0].set(0.0), jnp.roll(y, -1).at[-1].set(0.0)
@@ -134,7 +134,7 @@ def chain(n, pull, left_pull):
 
 
 @pytest.mark.thorough
-def test_beyond_the_dense_size_derivatives_come_by_gmres_both_ways(monkeypatch):
+def test_derivatives_of_large_problems_use_gmres_in_both_modes(monkeypatch):
     monkeypatch.setattr(implicit, "_DENSE", 32)
     F, drive, K = chain(150, 0.4, 0.7)
     weights = np.cos(np.arange(len(drive)))
@@ -153,7 +153,7 @@ def test_beyond_the_dense_size_derivatives_come_by_gmres_both_ways(monkeypatch):
 
 
 @pytest.mark.thorough
-def test_beyond_the_dense_size_single_precision_has_derivatives_too(monkeypatch):
+def test_derivatives_of_large_problems_in_single_precision(monkeypatch):
     monkeypatch.setattr(implicit, "_DENSE", 32)
     F, drive, K = chain(150, 0.4, 0.7)
     drive = jnp.asarray(drive, jnp.float32)
@@ -170,7 +170,7 @@ def test_beyond_the_dense_size_single_precision_has_derivatives_too(monkeypatch)
 
 
 @pytest.mark.thorough
-def test_a_derivative_that_gmres_does_not_reach_is_no_number():
+def test_derivative_is_nan_if_gmres_does_not_converge():
     # A chain so stiff that a thousand iterations without a preconditioner do not solve it.
     F, drive, K = chain(1200, 1e9, 1.0)
     K = Box(-1e12, 1e12)

@@ -1,4 +1,4 @@
-"""Derivatives with respect to all that K and F hold, beside those of the Lagrange conditions by hand.
+"""Derivatives with respect to all data in K and F, against those of the Lagrange conditions by hand.
 
 Where G holds (Gy = d, G of full rank) with multipliers ν, My + q + Gᵀν = 0 and Gy = d; differentiated,
 
@@ -27,7 +27,7 @@ def solve(K, args, solver=None, tol=1e-13):
 
 
 def by_hand(y, G, nu, dM=0.0, dq=0.0, dG=0.0, dd=0.0, M=M):
-    """dy, for rows G that hold and their multipliers ν."""
+    """dy for active rows G and their multipliers ν."""
     rows = len(G)
     system = np.block([[M, G.T], [G, np.zeros((rows, rows))]])
     dM, dG = np.broadcast_to(dM, M.shape), np.broadcast_to(dG, G.shape)
@@ -51,7 +51,7 @@ def jvp_and_vjp(solution, at, rng):
 
 
 @pytest.mark.thorough  # a long program: the active set, and derivatives of a pseudo-inverse
-def test_on_a_polyhedron_with_respect_to_rows_offsets_and_the_operator():
+def test_derivative_on_a_polyhedron_in_rows_offsets_and_operator():
     G = np.array(
         [[1.0, 1.0, 0.0, 0.0], [0.0, 1.0, -1.0, 0.5], [-1.0, 0.0, 0.0, -1.0], [0, 0, -1, 0]]
     )
@@ -70,7 +70,7 @@ def test_on_a_polyhedron_with_respect_to_rows_offsets_and_the_operator():
     np.testing.assert_allclose(back, exact, atol=1e-9)
 
 
-def test_on_a_simplex_with_respect_to_its_total():
+def test_derivative_on_a_simplex_in_its_total():
     at = (M, Q, np.array(1.7))
     y, (dM, dq, dtotal), forward, back = jvp_and_vjp(
         lambda v: solve(Simplex(v[2]), (v[0], v[1])), at, np.random.default_rng(1)
@@ -85,7 +85,7 @@ def test_on_a_simplex_with_respect_to_its_total():
 
 
 @pytest.mark.thorough  # beside `test_derivatives.py`, the center
-def test_on_a_ball_with_respect_to_center_and_radius():
+def test_derivative_on_a_ball_in_center_and_radius():
     # The one row is (y − c)ᵀ, which turns with y: ν stands on the diagonal as well.
     center, radius = np.array([0.3, -0.2, 0.1, 0.0]), np.array(0.8)
     y, (dM, dq, dc, dr), forward, back = jvp_and_vjp(
@@ -118,7 +118,7 @@ TOUCHING = (np.array([[2.0, 1.0], [-1.0, 3.0]]), np.array([-1.0, -4.0]))
     ],
     ids=lambda s: type(s).__name__,
 )
-def test_an_entry_that_just_touches_its_bound_counts_as_held(solver):
+def test_derivative_of_an_entry_that_touches_its_bound_is_the_held_one(solver):
     # The convention of AbstractSet.
     by_q, by_lower = touching(solver, np.array([0.0, 1.0]))
     np.testing.assert_array_equal(by_q, np.zeros((2, 2)))
@@ -128,7 +128,7 @@ def test_an_entry_that_just_touches_its_bound_counts_as_held(solver):
 # From elsewhere y₁ may end a rounding above 0, where nothing holds it.
 @pytest.mark.thorough
 @pytest.mark.parametrize("solver", [Auto(), GoldenRatio()], ids=lambda s: type(s).__name__)
-def test_an_entry_that_touches_but_for_rounding_has_the_derivative_of_one_side(solver):
+def test_derivative_of_an_entry_near_its_bound_is_one_sided(solver):
     by_q, by_lower = touching(solver, np.zeros(2))
     free = np.array_equal(by_q, [[-0.5, 0.0], [0.0, 0.0]]) and not by_lower.any()
     held = not by_q.any() and np.array_equal(by_lower, [[1.0, 0.0], [0.0, 0.0]])
@@ -153,7 +153,7 @@ def touching(solver, start):
 
 @pytest.mark.thorough  # three programs, and their derivatives' derivatives
 @pytest.mark.parametrize("kind", ["box", "ball", "simplex"])
-def test_second_derivatives_where_the_solution_is_smooth(kind):
+def test_second_derivatives_of_a_smooth_solution(kind):
     # Central differences of the first derivative, which the tests above compare with formulas.
     make = {"box": lambda s: Box(-1.0, s), "ball": lambda s: Ball(0.0, s), "simplex": Simplex}[kind]
 

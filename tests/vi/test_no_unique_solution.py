@@ -1,6 +1,6 @@
-"""The trap: (2 + sin y)y − q with an additive drive is not pseudomonotone and has three solutions.
+"""(2 + sin y)y − q with an additive drive is not pseudomonotone and has three solutions.
 
-Whoever solves it finds one of the three, and none of them may be sold as the only one.
+A solver finds one of the three, and must not report it as the only one.
 """
 
 import jax
@@ -34,7 +34,7 @@ def law(y, q):
     return (2.0 + jnp.sin(y)) * y - q
 
 
-def test_there_are_three_solutions_and_the_operator_is_not_pseudomonotone():
+def test_additive_drive_has_three_solutions_and_is_not_pseudomonotone():
     F = lambda y: (2.0 + np.sin(y)) * y - DRIVE  # noqa: E731
     np.testing.assert_allclose(F(THREE[:2]), 0.0, atol=1e-14)
     assert F(END) < 0  # held by the upper bound
@@ -51,7 +51,7 @@ def test_there_are_three_solutions_and_the_operator_is_not_pseudomonotone():
     [pytest.param(s, marks=() if isinstance(s, Auto) else pytest.mark.thorough) for s in SOLVERS],
     ids=lambda s: type(s).__name__,
 )
-def test_one_of_the_three_is_found_and_nothing_is_claimed_of_the_others(solver):
+def test_solve_vi_returns_one_of_three_solutions_without_a_bound(solver):
     starts = np.random.default_rng(0).uniform(-1, END + 1, 200)
     vi = jax.jit(
         jax.vmap(
@@ -70,7 +70,7 @@ def test_one_of_the_three_is_found_and_nothing_is_claimed_of_the_others(solver):
     assert vi.error_bound is None  # a bound on ‖y − y*‖ would say that there is one y*
 
 
-def test_a_plain_call_without_a_modulus_bounds_nothing():
+def test_solve_vi_without_a_modulus_has_no_error_bound():
     for start in (0.0, 2.0, 4.7):
         vi = dvax.solve_vi(law, Box(0.0, END), jnp.asarray(start), DRIVE)
         assert vi.error_bound is None

@@ -51,13 +51,13 @@ def errors(solver, counts, most):
     return np.array(found)
 
 
-def test_the_error_of_second_differences_is_of_order_two():
+def test_obstacle_error_of_second_differences_is_of_order_two():
     found = errors(GoldenRatio(max_steps=50_000), COUNTS[:2], 100)
     np.testing.assert_allclose(found, [3.5e-4, 9.8e-5], rtol=0.05)
 
 
 @pytest.mark.thorough  # as many iterations as the condition number asks for
-def test_the_order_holds_to_four_hundred_points():
+def test_obstacle_order_holds_up_to_four_hundred_points():
     found = errors(GoldenRatio(max_steps=500_000), COUNTS, MOST)
     np.testing.assert_allclose(found, [3.5e-4, 9.8e-5, 2.5e-5, 6.2e-6], rtol=0.05)
     orders = np.log(found[:-1] / found[1:]) / np.log((COUNTS[1:] + 1) / (COUNTS[:-1] + 1))
@@ -66,6 +66,6 @@ def test_the_order_holds_to_four_hundred_points():
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("solver", [Auto(), SemismoothNewton()], ids=lambda s: type(s).__name__)
-def test_newton_finds_the_contact_of_a_hundred_points(solver):
+def test_newton_solves_the_obstacle_with_a_hundred_points(solver):
     found = errors(solver, COUNTS[1:2], 100)
     np.testing.assert_allclose(found, [9.8e-5], rtol=0.05)

@@ -1,4 +1,4 @@
-"""Every solver on random boxes: within 1e-8 of the oracle's solution, or it says why not."""
+"""Every solver on random boxes: within 1e-8 of the oracle's solution, or a reported failure."""
 
 import jax
 import jax.numpy as jnp
@@ -79,18 +79,18 @@ OFTEN = ("auto", "golden ratio")
     "name",
     [pytest.param(n, marks=() if n in OFTEN else pytest.mark.thorough) for n in SOLVERS],
 )
-def test_a_box_is_solved_or_the_result_says_why_not(name):
+def test_random_boxes_are_solved_or_report_failure(name):
     check(name, seed=1)
 
 
 @pytest.mark.thorough  # ten thousand boxes for each solver
 @pytest.mark.parametrize("name", SOLVERS)
-def test_ten_thousand_boxes_are_solved_or_the_result_says_why_not(name):
+def test_ten_thousand_random_boxes_are_solved_or_report_failure(name):
     for seed in range(2, 12):
         check(name, seed)
 
 
-def test_the_two_oracles_agree_and_the_exact_cases_are_exact():
+def test_random_box_oracles_agree_and_exact_cases_are_exact():
     M, q, lower, upper = drawn(np.random.default_rng(3), 60, 5)
     by_face, by_pivot = by_faces(M, q, lower, upper), by_pivoting(M, q, lower, upper)
     np.testing.assert_allclose(by_face, by_pivot, rtol=0, atol=1e-12)

@@ -20,7 +20,8 @@ def trap(y, _):
     return (2 + jnp.sin(y)) * y - DRIVE
 
 
-def test_the_trap_has_three_solutions_and_none_is_called_the_only_one():
+def test_refute_gamma_by_three_solutions_of_the_additive_drive():
+    """The three solutions have no error bound, and refute every modulus."""
     found = [
         dvax.solve_vi(trap, Box(0.0, END), jnp.array(y0), solver=dvax.vi.SemismoothNewton())
         for y0 in THREE + np.array([0.05, -0.02, -0.05])
@@ -36,12 +37,12 @@ def test_the_trap_has_three_solutions_and_none_is_called_the_only_one():
 
 
 @pytest.mark.parametrize("pair", [(0, 1), (0, 2), (1, 2)])
-def test_any_two_solutions_refute_every_modulus(pair):
+def test_refute_gamma_by_any_two_solutions(pair):
     broken = refute_gamma(trap, Box(0.0, END), 1e-9, jnp.asarray(THREE[list(pair)]))
     assert broken is not None and broken.gamma < 1e-9
 
 
-def test_points_that_are_no_solutions_refute_by_the_definition():
+def test_refute_gamma_by_points_that_violate_the_definition():
     broken = refute_gamma(trap, Box(0.0, END), 1e-6, jnp.linspace(0.0, END, 40))
     assert broken is not None
     y, z = float(broken.y), float(broken.z)
@@ -49,7 +50,7 @@ def test_points_that_are_no_solutions_refute_by_the_definition():
     assert float(trap(z, None)) * (z - y) == pytest.approx(broken.gamma * (z - y) ** 2, rel=1e-9)
 
 
-def test_a_modulus_that_is_too_large_is_refuted_and_the_true_one_is_not():
+def test_refute_gamma_refutes_too_large_moduli_and_not_the_true_one():
     # ⟨F(y), y − z⟩ = 0.5‖y − z‖² + a rotation: 0.5 exactly.
     F = lambda y, _: 0.5 * y + 4.0 * jnp.stack([-y[1], y[0]]) - 1.0  # noqa: E731
     points = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (200, 2)))
@@ -58,7 +59,7 @@ def test_a_modulus_that_is_too_large_is_refuted_and_the_true_one_is_not():
     assert broken is not None and 0.5 <= broken.gamma < 0.6
 
 
-def test_the_points_of_a_tuple_and_a_weighted_operator():
+def test_refute_gamma_accepts_tuples_and_weighted_operators():
     K = dvax.sets.Product(Box(0.0, 1.0), Box(0.0, 1.0))
     F = lambda y, _: (-y[0], y[1])  # noqa: E731
     points = (jnp.array([0.0, 1.0]), jnp.array([0.0, 0.0]))  # both solve it
@@ -73,7 +74,7 @@ def test_the_points_of_a_tuple_and_a_weighted_operator():
     [(jnp.ones((1, 2)), 1.0, "two points"), (jnp.ones(()), 1.0, "two points"),
      (jnp.ones((3, 2)), 0.0, "positive")],
 )  # fmt: skip
-def test_what_cannot_be_tried_is_refused(points, gamma, word):
+def test_refute_gamma_rejects_invalid_arguments(points, gamma, word):
     with pytest.raises(dvax.InputError, match=word):
         refute_gamma(lambda y, _: y, Box(0.0, 1.0), gamma, points)
 
@@ -124,10 +125,10 @@ def _check_true_moduli(cases, seed):
 
 
 @pytest.mark.thorough
-def test_a_true_modulus_is_never_refuted():
+def test_refute_gamma_never_refutes_a_true_modulus():
     _check_true_moduli(4_000, seed=1)
 
 
 @pytest.mark.thorough  # 10⁵ operators on three sets, 30 pairs each
-def test_a_true_modulus_is_never_refuted_in_many_cases():
+def test_refute_gamma_never_refutes_a_true_modulus_in_many_cases():
     _check_true_moduli(100_000, seed=2)

@@ -1,4 +1,4 @@
-"""Rounding is in the error bound of `solve_vi`: against rational arithmetic, down to γ = 2⁻⁴⁰."""
+"""The error bound of `solve_vi` includes rounding: against rational arithmetic, down to γ = 2⁻⁴⁰."""
 
 import jax
 import jax.numpy as jnp
@@ -81,7 +81,7 @@ SETS = {
         [("box", 6, 40, 0), ("simplex", 4, 100, 0)],
     ),
 )
-def test_the_error_is_below_its_bound_and_successful_means_within_tol(name, n, count, seed):
+def test_error_bound_with_rounding_holds_and_success_means_within_tol(name, n, count, seed):
     data, make, solution = SETS[name]
     rng, gamma, M, q = cases(n, count, seed)
     given = data(n, count, rng)
@@ -119,7 +119,7 @@ def test_the_error_is_below_its_bound_and_successful_means_within_tol(name, n, c
 
 
 @pytest.mark.parametrize("n", [1, 7])
-def test_the_rounding_of_an_affine_map_is_the_textbook_one(n):
+def test_rounding_of_an_affine_map_is_the_textbook_bound(n):
     rng = np.random.default_rng(n)
     for scale in (1.0, 1e8):
         M, y = rng.normal(size=(n, n)) * scale, rng.normal(size=n)
@@ -142,15 +142,15 @@ def test_the_rounding_of_an_affine_map_is_the_textbook_one(n):
 
 
 @pytest.mark.parametrize("F", [lambda M, y: M @ y + 1.0, lambda M, y: y @ M + 1.0])
-def test_nothing_is_multiplied_by_the_errors_of_what_is_exact(F):
-    """One product for the value, and one for the error: |M||y|."""
+def test_rounding_analysis_needs_one_product_for_exact_factors(F):
+    """One product gives the value, and one the error: |M||y|."""
     M = jnp.asarray(np.random.default_rng(0).normal(size=(5, 5)))
     traced = jax.make_jaxpr(lambda y: rounding_error(lambda y: F(M, y), y)[0])(jnp.ones(5))
     names = [eqn.primitive.name for eqn in traced.jaxpr.eqns]
     assert names.count("dot_general") == 2
 
 
-def test_laws_that_are_not_affine_have_a_bound_and_unknown_operations_only_an_estimate():
+def test_rounding_of_nonlinear_laws_is_proved_and_estimated_without_a_rule():
     y = jnp.linspace(-2.0, 3.0, 40)
     smooth = lambda y: y**3 + jnp.tanh(5.0 * y) / (2.0 + jnp.cos(y)) - jnp.exp(y) + jnp.sum(y**2)  # noqa: E731
     bound, proved = rounding_error(smooth, y)
@@ -166,7 +166,7 @@ def test_laws_that_are_not_affine_have_a_bound_and_unknown_operations_only_an_es
     assert not proved
 
 
-def test_stalled_says_that_rounding_is_above_the_tolerance():
+def test_stalled_is_returned_if_rounding_exceeds_the_tolerance():
     M = jnp.array([[1e6, 3e3], [-3e3, 1e-3]])
     solve = lambda tol: dvax.solve_vi(  # noqa: E731
         lambda y, q: M @ y - q, dvax.sets.Box(-9.0, 9.0), jnp.zeros(2), jnp.ones(2) / 3, tol=tol,
@@ -177,7 +177,7 @@ def test_stalled_says_that_rounding_is_above_the_tolerance():
     assert solve(1e-10).rounding_status == "proved"
 
 
-def test_a_failed_inequality_has_no_derivative():
+def test_derivative_of_a_failed_solve_vi_is_nan():
     M = jnp.array([[2.0, -1.0], [1.0, 3.0]])
 
     def y(upper, q, K, steps):

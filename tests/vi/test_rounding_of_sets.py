@@ -1,4 +1,4 @@
-"""Bounds that count the rounding of projections, of far guesses, of doubtful switches and of norms."""
+"""Error bounds include rounding of projections, distant guesses, uncertain comparisons and norms."""
 
 import math
 from fractions import Fraction
@@ -14,8 +14,8 @@ import dvax
 
 @pytest.mark.parametrize("far", mostly_thorough([1e3, 1e4, 1e6, 1e8], [1e8]))
 @pytest.mark.parametrize("kind", ["Ball", "Translated", "HalfSpace"])
-def test_a_set_far_from_zero_has_its_rounding_in_the_bound(kind, far):
-    """Of y − q the solution is the projection of q, in rational arithmetic for a half-space."""
+def test_error_bound_includes_rounding_of_sets_far_from_zero(kind, far):
+    """For F(y) = y − q the solution is the projection of q, in rational arithmetic."""
     rng, wrong = np.random.default_rng(0), []
     for _ in range(12):
         q, a = rng.normal(size=2), rng.normal(size=2)
@@ -57,7 +57,7 @@ def _root(v):
 
 @pytest.mark.parametrize("solver", [dvax.vi.Projection(), dvax.vi.Accelerated()])
 @pytest.mark.parametrize("far", mostly_thorough([1e4, 1e6, 1e9, 1e12], [1e9]))
-def test_a_guess_far_away_has_its_rounding_in_the_bound(solver, far):
+def test_error_bound_includes_rounding_of_a_distant_guess(solver, far):
     rng, N = np.random.default_rng(0), 200
     y0, q = far * rng.uniform(1, 2, (N, 1)), rng.normal(size=(N, 1))
     g = rng.uniform(0.5, 4, N)
@@ -75,7 +75,7 @@ def test_a_guess_far_away_has_its_rounding_in_the_bound(solver, far):
     assert all(e <= Fraction(float(b)) for e, b in zip(off, bound, strict=True))
 
 
-def test_a_norm_that_underflows_bounds_nothing():
+def test_error_bound_accounts_for_norms_that_underflow():
     w = np.float32(1e-20)
     vi = dvax.solve_vi(
         lambda y, q: w * jnp.array([1, 3], jnp.float32) * y - q,
@@ -98,7 +98,7 @@ DOUBTFUL = {
 
 
 @pytest.mark.parametrize("name", DOUBTFUL)
-def test_what_rounding_may_decide_in_F_is_in_the_bound(name):
+def test_error_bound_covers_comparisons_in_F_decided_by_rounding(name):
     phi, c, exact = DOUBTFUL[name]
     vi = dvax.solve_vi(
         lambda y, args: y - phi((args[0] + args[1]) - args[0]), dvax.sets.Box(-1.0, 1.0),

@@ -1,4 +1,4 @@
-"""In single precision a solve is single from end to end, and says what that cannot reach."""
+"""A solve in single precision uses no double precision, and reports what it cannot reach."""
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +58,7 @@ def given(dtype):
 
 
 def types(jaxpr):
-    """The types of all values in a program, inner programs included."""
+    """The types of all values in a program, including inner programs."""
     for eqn in jaxpr.eqns:
         for out in eqn.outvars:
             yield eqn.primitive.name, getattr(out.aval, "dtype", None)
@@ -68,7 +68,7 @@ def types(jaxpr):
 
 @pytest.mark.parametrize("gamma", [None, 0.5])
 @pytest.mark.parametrize("name", SOLVERS)
-def test_no_number_of_a_single_precision_solve_is_double(name, gamma):
+def test_solve_vi_keeps_single_precision(name, gamma):
     traced, shape = jax.make_jaxpr(
         lambda *v: run(name, 1e-4, gamma, *v), return_shape=True
     )(*given(jnp.float32))  # fmt: skip
@@ -82,7 +82,7 @@ def test_no_number_of_a_single_precision_solve_is_double(name, gamma):
     "name",
     [pytest.param(n, marks=() if n == "auto" else pytest.mark.thorough) for n in SOLVERS],
 )
-def test_single_precision_reaches_what_it_can_and_says_so_where_it_cannot(name):
+def test_solve_vi_in_single_precision_reaches_rounding_or_reports_stalled(name):
     # One program for both tolerances, as `tol` is a number among the others.
     solve = jax.jit(lambda tol, *v: run(name, tol, jnp.float32(0.5), *v))
     # Its short steps are lost in rounding first.

@@ -1,5 +1,4 @@
-"""Solvers at the edges: degenerate slopes, bounds that coincide or are missing, and failures that
-must say so."""
+"""Special cases of solvers: zero slopes, equal or missing bounds, and failures."""
 
 import jax
 import jax.numpy as jnp
@@ -98,11 +97,11 @@ def test_bracketing_solves_all_points_of_a_field_at_once():
         (lambda y: -y - 1.0, Box(0.0, INF), SemismoothNewton(), RESULTS.diverging),
     ],
 )  # fmt: skip
-def test_a_failure_is_never_called_a_success(F, K, solver, result):
+def test_solver_failures_are_not_reported_as_success(F, K, solver, result):
     assert solve(F, K, np.full(2, 0.3), solver=solver).result == result
 
 
-def test_a_law_steeper_than_rounding_is_solved_to_the_nearest_numbers():
+def test_newton_solves_a_law_steeper_than_rounding_to_two_spacings():
     # |F| ≥ 3.4·10⁻⁷ on all floating-point numbers (128 y is exact, the rounding of the rest is 4·10⁻⁸):
     # the iterates stop moving beside the root. Whether w is 0 there depends on the compiler.
     vi = solve(
@@ -118,7 +117,7 @@ STEPPING = [Extragradient(), ForwardBackwardForward(), GoldenRatio(), Semismooth
 
 
 @pytest.mark.parametrize("solver", STEPPING, ids=lambda solver: type(solver).__name__)
-def test_a_step_that_has_sunk_into_rounding_certifies_nothing(solver):
+def test_step_below_rounding_gives_no_certificate(solver):
     # A jump from −10 to 1 at the start itself: no step is short enough, until y − λF(y) is y, where
     # (y − z)/λ + F(z) − F(y) is 0.
     F = lambda y: jnp.where(y < 0.5, -10.0, 1.0) + 0.0 * y  # noqa: E731
@@ -127,7 +126,7 @@ def test_a_step_that_has_sunk_into_rounding_certifies_nothing(solver):
     assert float(vi.residual) > 0.5
 
 
-def test_a_method_that_goes_round_in_a_circle_says_so():
+def test_projection_on_a_rotation_returns_cycling():
     # A rotation on a disk with a step that turns by a third: the projection method comes back.
     F = lambda y: jnp.array([[0.0, -1.0], [1.0, 0.0]]) @ y  # noqa: E731
     vi = solve(F, Ball(0.0, 1.0), [1.0, 0.0], solver=Projection(), gamma=3**-0.5, L_F=3**-0.25)
@@ -135,7 +134,7 @@ def test_a_method_that_goes_round_in_a_circle_says_so():
     assert vi.result == RESULTS.cycling
 
 
-def test_the_bound_of_an_unfinished_solve_still_holds():
+def test_error_bound_holds_after_too_few_iterations():
     for solver in (
         Extragradient(max_steps=3), Bracketing(max_steps=3), Projection(max_steps=3),
         ForwardBackwardForward(max_steps=3), GoldenRatio(max_steps=3),
@@ -145,7 +144,7 @@ def test_the_bound_of_an_unfinished_solve_still_holds():
         assert float(vi.error_bound) >= abs(float(vi.y) - np.log(2)) > 1e-8
 
 
-def test_bracketing_refuses_what_it_cannot_do_and_names_what_can():
+def test_bracketing_rejects_coupled_laws_and_names_alternatives():
     for F, K, word in (
         (lambda y: y[::-1] ** 3, Box(0.0, 1.0), "couples points"),
         (lambda y: y**3, Ball(0.0, 1.0), "not a pointwise interval"),
@@ -155,7 +154,7 @@ def test_bracketing_refuses_what_it_cannot_do_and_names_what_can():
         assert "Extragradient" in str(caught.value)
 
 
-def test_auto_chooses_by_what_is_proved():
+def test_auto_chooses_the_solver_by_the_proved_structure():
     choose = lambda F, K: type(Auto().choose(F, K, jnp.zeros(2)))  # noqa: E731
     assert choose(lambda y: y**3, Box(0.0, 1.0)) is Bracketing
     assert choose(lambda y: y**3 + y[::-1], Box(0.0, 1.0)) is ActiveSet
@@ -165,12 +164,12 @@ def test_auto_chooses_by_what_is_proved():
     assert isinstance(Auto().choose(lambda y: y**3 + y[::-1], Box(0.0, 1.0), large), GoldenRatio)
 
 
-def test_the_closed_form_is_refused_where_it_does_not_hold():
+def test_closed_form_rejects_laws_without_one():
     with pytest.raises(dvax.InputError, match="one number a"):
         solve(lambda y: y**3, Ball(0.0, 1.0), [0.0, 0.0], solver=ClosedForm())
 
 
-def test_an_isotropic_law_is_a_projection_for_every_set():
+def test_closed_form_of_an_isotropic_law_is_a_projection():
     z = np.array([3.0, -4.0])
     space = dvax.spaces.L2(np.array([1.0, 0.25]))
     vi = solve(lambda y: 2.0 * (y - jnp.asarray(z)), Ball(0.0, 1.0), np.zeros(2), space=space)
@@ -179,7 +178,7 @@ def test_an_isotropic_law_is_a_projection_for_every_set():
     assert int(vi.iterations) == 1
 
 
-def test_parts_of_a_tuple_are_solved_together():
+def test_solve_vi_solves_coupled_parts_of_a_tuple():
     # Coupled parts on different sets equal the stacked problem on one box.
     M = np.array([[2.0, 0.3, 0.0], [-0.3, 1.0, 0.5], [0.1, -0.5, 3.0]])
     q = np.array([-1.0, -4.0, 0.2])
@@ -207,7 +206,7 @@ ALL = [
 @pytest.mark.parametrize(
     "solver", mostly_thorough(ALL, ALL[:2]), ids=lambda solver: type(solver).__name__
 )
-def test_vmap_equals_a_loop(solver):
+def test_solve_vi_under_vmap_equals_a_loop(solver):
     cs = jnp.array([-1.0, 0.3, 2.0, 4.9])
     K = Box(0.0, 4.0)
 
@@ -219,7 +218,7 @@ def test_vmap_equals_a_loop(solver):
     np.testing.assert_allclose(together, [float(one(c)) for c in cs], rtol=0, atol=1e-12)
 
 
-def test_single_precision_stays_single_and_reaches_what_it_can():
+def test_solvers_keep_single_precision():
     y0 = jnp.zeros(2, jnp.float32)
     target = jnp.array([0.3, 2.0], jnp.float32)
     for solver in (Bracketing(), Extragradient()):

@@ -1,4 +1,4 @@
-"""a(y)G(y) is solved as G: the same solution, derivatives and more of a certificate, for less."""
+"""a(y)G(y) is solved as G: the same solution and derivatives, a sharper certificate, less cost."""
 
 import jax
 import jax.numpy as jnp
@@ -56,7 +56,7 @@ FAMILIES = {
 
 
 @pytest.mark.parametrize("name", mostly_thorough(FAMILIES, ["paper1d"]))
-def test_the_published_families_are_solved_without_their_weight(name):
+def test_weighted_published_families_are_solved(name):
     a, G, M, mu, K, solution = FAMILIES[name]
     for law in (Weighted(a, G, M=M, mu=mu), Weighted(a, G, M=M), Weighted(a, G)):
         vi = dvax.solve_vi(law, K, jnp.full(solution.shape, 0.3))
@@ -67,7 +67,7 @@ def test_the_published_families_are_solved_without_their_weight(name):
 
 
 @pytest.mark.parametrize("name", mostly_thorough(FAMILIES, ["paper1d", "expweight_box3"]))
-def test_less_work_than_with_the_weight(name):
+def test_weighted_needs_no_more_evaluations_than_the_product(name):
     a, G, M, mu, K, solution = FAMILIES[name]
     law, y0 = Weighted(a, G, M=M, mu=mu), jnp.full(solution.shape, 0.3)
     divided = dvax.solve_vi(law, K, y0)
@@ -84,7 +84,7 @@ ROUND = (Ball(0.0, 0.8), Simplex(1.0))
     [pytest.param(K, marks=pytest.mark.thorough) for K in (Box(-1.0, 1.0), *ROUND)],
     ids=lambda K: type(K).__name__,
 )
-def test_random_weights_do_not_move_the_solution(K):
+def test_weighted_solution_does_not_depend_on_the_weight(K):
     def both(matrix, b, mu, q):
         law = Weighted(bump(q), affine, M=q, mu=mu)
         solver = SemismoothNewton()
@@ -120,7 +120,7 @@ def test_random_weights_do_not_move_the_solution(K):
     assert divided.mean() < whole.mean()
 
 
-def test_the_certificate_of_G_is_the_sharper_one():
+def test_weighted_certificate_of_G_is_sharper_than_that_of_aG():
     # ‖w‖/μ against ‖a(y)w‖/(Mμ), at points that are not yet solutions.
     solver = SemismoothNewton(max_steps=2)
     solution = FAMILIES["expweight_box3"][-1]
@@ -136,7 +136,7 @@ def test_the_certificate_of_G_is_the_sharper_one():
 
 
 @pytest.mark.thorough
-def test_derivatives_are_those_of_the_whole_operator():
+def test_weighted_derivatives_equal_those_of_the_product():
     def solution(args, divided):
         law = Weighted(
             lambda y, args: bump(args["q"])(y, None), lambda y, args: args["M"] @ y + args["b"]
@@ -158,7 +158,7 @@ def test_derivatives_are_those_of_the_whole_operator():
                 np.testing.assert_allclose(found, by_differences, atol=2e-9)
 
 
-def test_the_modulus_is_proved_where_the_code_shows_it():
+def test_weighted_modulus_is_proved_from_an_affine_G():
     rng = np.random.default_rng(5)
     matrix, b, mu = random_case(rng, 4)
     law = Weighted(bump(0.3), affine)
@@ -182,7 +182,7 @@ def test_the_modulus_is_proved_where_the_code_shows_it():
     assert vi.result == RESULTS.successful and vi.error_bound is None
 
 
-def test_a_matrix_that_is_not_definite_gives_no_bound_and_no_claim():
+def test_weighted_with_an_indefinite_matrix_has_no_bound():
     # Positive definite on the differences of a simplex only: y₁ + y₂ = 1.
     matrix = jnp.array([[1.0, 2.0], [2.0, 1.0]])
     law = Weighted(bump(0.5), lambda y, _: jnp.array([[3.0, 4.0], [4.0, 3.0]]) @ y - matrix[0])
@@ -191,7 +191,7 @@ def test_a_matrix_that_is_not_definite_gives_no_bound_and_no_claim():
         assert np.isinf(float(vi.error_bound))
 
 
-def test_a_weight_that_is_not_positive_is_said():
+def test_weighted_with_a_nonpositive_weight_is_reported():
     vi = dvax.solve_vi(
         Weighted(lambda y, _: y - 1.0, lambda y, _: y - 0.5, mu=1.0), Box(0.0, 2.0), 0.0
     )
@@ -205,7 +205,7 @@ def test_a_weight_that_is_not_positive_is_said():
     assert np.isnan(float(law(jnp.array(0.5)))) and float(law(jnp.array(2.0))) == 1.5
 
 
-def test_a_lower_bound_that_is_none_is_refuted():
+def test_weighted_with_a_wrong_lower_bound_is_reported():
     law = Weighted(lambda y, c: 2 + jnp.sin(y), lambda y, c: y - c, M=1.5, mu=1.0)
     fine = dvax.solve_vi(law, Box(0.0, 4.7), 0.0, args=1.0)
     assert fine.result == RESULTS.successful
@@ -217,13 +217,13 @@ def test_a_lower_bound_that_is_none_is_refuted():
     assert dvax.solve_vi(law, Box(-1.0, 1.0), jnp.zeros(3)).result == RESULTS.successful
 
 
-def test_a_failed_solve_stays_a_failure():
+def test_weighted_failure_of_the_inner_solve_is_reported():
     law = Weighted(lambda y, _: -1.0 + 0.0 * y[0], lambda y, _: jnp.exp(y) - 2.0, mu=1.0)
     vi = dvax.solve_vi(law, Ball(0.0, 9.0), jnp.zeros(2), solver=SemismoothNewton(max_steps=1))
     assert vi.result == RESULTS.max_steps
 
 
-def test_lanes_of_a_batch_are_judged_apart():
+def test_weighted_lanes_have_their_own_results():
     law = Weighted(lambda y, c: y - 1.0, lambda y, c: y - c, M=0.5, mu=1.0)
     solve = jax.vmap(lambda c: dvax.solve_vi(law, Box(0.0, 9.0), jnp.zeros(()), c))
     vi = solve(jnp.array([0.5, 1.2, 3.0]))
@@ -233,7 +233,7 @@ def test_lanes_of_a_batch_are_judged_apart():
     np.testing.assert_allclose(np.asarray(vi.y), [0.5, 1.2, 3.0])
 
 
-def test_single_precision_stays_single():
+def test_weighted_keeps_single_precision():
     y0 = jnp.zeros(3, jnp.float32)
     matrix, shift = jnp.asarray(WEIGHT, jnp.float32), jnp.asarray(SHIFT, jnp.float32)
     for mu in (1.5, None):
@@ -244,7 +244,7 @@ def test_single_precision_stays_single():
         assert law(vi.y).dtype == jnp.float32
 
 
-def test_parts_share_one_weight():
+def test_weighted_parts_of_a_tuple_share_one_weight():
     law = Weighted(
         lambda y, _: 2 + jnp.sin(y[0]), lambda y, _: (y[0] - 0.5, y[1] + y[0] - 2.0), M=1.0
     )
@@ -270,6 +270,6 @@ def solved(law, **settings):
         (lambda: solved(Weighted(bump(1.0), lambda y, _: y), L_F=1.0), "brings its own moduli"),
     ],
 )  # fmt: skip
-def test_what_is_no_weighted_operator_is_refused(make, word):
+def test_weighted_rejects_invalid_arguments(make, word):
     with pytest.raises(dvax.InputError, match=word):
         make()

@@ -1,4 +1,4 @@
-"""A small valid configuration of the contact law with its data, and ways to spoil it."""
+"""A small valid configuration of the contact law with its data, and ways to make it invalid."""
 
 from pathlib import Path
 

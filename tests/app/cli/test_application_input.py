@@ -1,5 +1,5 @@
-"""Applications from the command line: what is refused, in the words of the file; what is noted; and
-what is said when a run fails."""
+"""Applications from the command line: rejected input with the keys of the file, notes, and the messages
+of failed runs."""
 
 import json
 import re
@@ -139,7 +139,7 @@ NEED_FEM = {
 
 
 def refused(config: Path, expected: dict[str, tuple[str, ...]]) -> None:
-    """Check and run both refuse it: each problem once, at its place; and nothing is written."""
+    """Assert that `check` and `run` both report each error once at its place, and write nothing."""
     for command in (["check", str(config)], ["run", str(config), "-o", str(config.parent / "out")]):
         result = CliRunner().invoke(app, command)
         assert (result.exit_code, result.stdout) == (2, ""), result.output
@@ -153,15 +153,13 @@ def refused(config: Path, expected: dict[str, tuple[str, ...]]) -> None:
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_wrong_is_said_in_the_words_of_the_file(name: str, tmp_path: Path) -> None:
+def test_application_errors_name_keys_of_the_file(name: str, tmp_path: Path) -> None:
     text, netlist, expected = REFUSED[name]
     refused(write(tmp_path, text, netlist), expected)
 
 
 @pytest.mark.parametrize("name", NEED_FEM)
-def test_what_is_wrong_with_a_body_is_said_in_the_words_of_the_file(
-    name: str, tmp_path: Path
-) -> None:
+def test_fem_contact_errors_name_keys_of_the_file(name: str, tmp_path: Path) -> None:
     pytest.importorskip("skfem")
     text, expected = NEED_FEM[name]
     refused(write(tmp_path, text), expected)
@@ -187,7 +185,7 @@ NOTED = {
 
 
 @pytest.mark.parametrize("name", NOTED)
-def test_what_is_allowed_but_worth_knowing_is_noted(name: str, tmp_path: Path) -> None:
+def test_check_notes_unusual_input(name: str, tmp_path: Path) -> None:
     text, notes = NOTED[name]
     if "fem-contact" in text:
         pytest.importorskip("skfem")
@@ -215,7 +213,7 @@ INPUT_ERROR = dvax.InputError(
         (KeyboardInterrupt(), 130, "interrupted: Interrupted before there were results."),
     ],
 )
-def test_a_run_that_stops_claims_no_partial_results(
+def test_failed_run_without_results_reports_none(
     error: BaseException, code: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def solve(*_: Any) -> None:

@@ -23,7 +23,7 @@ def tree(tmp_path: Path) -> Path:
     return write_config(tmp_path / "in")
 
 
-def test_the_constants_are_the_paper_s_closed_forms(tree: Path) -> None:
+def test_check_prints_the_constants_of_the_paper(tree: Path) -> None:
     before = sorted(tree.parent.parent.rglob("*"))
     result = CliRunner().invoke(app, ["check", str(tree)])
     assert result.exit_code == 0, result.output
@@ -39,7 +39,7 @@ def test_the_constants_are_the_paper_s_closed_forms(tree: Path) -> None:
     assert sorted(tree.parent.parent.rglob("*")) == before
 
 
-def test_what_holds_is_said_with_its_reason(tree: Path) -> None:
+def test_check_prints_assumptions_with_reasons(tree: Path) -> None:
     result = CliRunner().invoke(app, ["check", str(tree), "--strict"])
     assert result.exit_code == 0, result.output
     text = result.stdout
@@ -48,7 +48,7 @@ def test_what_holds_is_said_with_its_reason(tree: Path) -> None:
     assert "projection route             holds, proved" in text
 
 
-def test_a_system_that_does_not_decay_is_in_the_class(tmp_path: Path) -> None:
+def test_check_accepts_a_system_without_decay(tmp_path: Path) -> None:
     # d_x + d_u b_x/(1 + b_u) = 2.4 > α = 1.5: no certified decay, and the run is as well posed.
     changes = (("d_x = 0.2", "d_x = 2.0"), ("b_u = 0.5", "b_u = 1.5"))
     tree = write_config(tmp_path / "in", *changes)
@@ -59,7 +59,7 @@ def test_a_system_that_does_not_decay_is_in_the_class(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("refuted", [row("gamma", status="refuted"), row("gamma", value=-1.0)])
-def test_a_system_outside_the_class_is_refused_only_if_asked(
+def test_check_strict_rejects_a_system_outside_the_class(
     tree: Path, monkeypatch: pytest.MonkeyPatch, refuted: dict[str, Any]
 ) -> None:
     rows = [refuted, row("decay_rate"), row("q_rho")]
@@ -71,7 +71,7 @@ def test_a_system_outside_the_class_is_refused_only_if_asked(
         assert "error: outside the class of the theory: gamma" in result.stderr
 
 
-def test_sizes_are_those_of_the_run(tree: Path) -> None:
+def test_check_prints_the_sizes_of_the_run(tree: Path) -> None:
     config = load_config(tree)
     rows = {name: (value, remark) for name, value, remark in sizes(config, build_contact(config))}
     assert rows["points"] == ("24", "quadrature weights add up to 10 mm")
@@ -80,7 +80,7 @@ def test_sizes_are_those_of_the_run(tree: Path) -> None:
     assert rows["disk"][0] == f"at most {24 * 9 * 17 / 1024:.3g} KiB"
 
 
-def test_memory_grows_with_the_points(tmp_path: Path) -> None:
+def test_check_memory_estimate_grows_with_the_points(tmp_path: Path) -> None:
     shown = []
     for name, points in (("small", "points = 24"), ("large", "points = 1000000")):
         changes = (("points = 24", points), ('profile = { file = "x0.npy" }', "value = 0.5"))

@@ -1,4 +1,4 @@
-"""`dvax demo`: the strip that dvax brings along, whole or at another resolution."""
+"""`dvax demo`: the demonstration strip, at full and at other resolutions."""
 
 import json
 from importlib.resources import files
@@ -15,7 +15,7 @@ from dvax.app.runs.config import build_contact, load_config
 DEMO = Path(str(files("dvax.app.runs") / "demo"))
 
 
-def test_the_demo_runs_at_a_few_points_and_stands_on_its_own(tmp_path: Path) -> None:
+def test_demo_runs_at_few_points_and_is_self_contained(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     result = CliRunner().invoke(app, ["demo", "-o", str(out), "--points", "50"])
     assert result.exit_code == 0, result.output
@@ -27,7 +27,7 @@ def test_the_demo_runs_at_a_few_points_and_stands_on_its_own(tmp_path: Path) -> 
     assert build_contact(again).boundary.size == 50
 
 
-def test_the_demo_never_writes_over_other_files(tmp_path: Path) -> None:
+def test_demo_does_not_overwrite_other_files(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     for force in ([], ["--force"]):
         result = CliRunner().invoke(app, ["demo", "-o", str(tmp_path), "--points", "50", *force])
@@ -35,13 +35,13 @@ def test_the_demo_never_writes_over_other_files(tmp_path: Path) -> None:
         assert [file.name for file in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_a_demo_without_points_is_wrong_usage(tmp_path: Path) -> None:
+def test_demo_without_points_is_wrong_usage(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["demo", "-o", str(tmp_path / "out"), "--points", "0"])
     assert result.exit_code == 2
     assert not (tmp_path / "out").exists()
 
 
-def test_sampling_at_the_same_points_changes_nothing(tmp_path: Path) -> None:
+def test_demo_resampling_at_the_same_points_is_the_identity(tmp_path: Path) -> None:
     shipped = load_config(DEMO / CONFIG)
     count = shipped.boundary.points
     assert count is not None
@@ -54,7 +54,7 @@ def test_sampling_at_the_same_points_changes_nothing(tmp_path: Path) -> None:
     )
 
 
-def test_a_coarser_strip_lies_within_the_finer_one(tmp_path: Path) -> None:
+def test_demo_coarse_strip_lies_within_the_fine_one(tmp_path: Path) -> None:
     fine = build_contact(load_config(DEMO / CONFIG)).demand.profile
     coarse = build_contact(load_config(resample(DEMO / CONFIG, tmp_path, 4000))).demand.profile
     assert fine is not None and coarse is not None

@@ -1,4 +1,4 @@
-"""Ctrl-C during a run: exit code 130, 143 for SIGTERM; no traceback; what was computed is readable."""
+"""Ctrl-C during a run: exit code 130 (143 for SIGTERM), no traceback; results are readable."""
 
 import json
 import os
@@ -18,8 +18,10 @@ import dvax
 @pytest.mark.parametrize(
     "number", mostly_thorough([signal.SIGINT, signal.SIGTERM], [signal.SIGINT])
 )
-def test_a_signal_ends_a_run_in_good_order(tmp_path: Path, number: signal.Signals) -> None:
-    # A million steps: nobody waits for its end.
+def test_signal_ends_a_run_with_its_exit_code_and_readable_results(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    # A million steps: the run is certainly not over when the signal arrives.
     changes = (("dt = 0.05", "dt = 1e-6"), ("frames = 8", "frames = 200"))
     config = write_config(tmp_path / "in", *changes)
     # As from a terminal: where the tests themselves run in the background, Ctrl-C is ignored, and what

@@ -1,4 +1,4 @@
-"""The program itself: quick to answer, quiet about Python, honest exit codes."""
+"""The program: fast help, messages without tracebacks, and correct exit codes."""
 
 import os
 import subprocess
@@ -30,7 +30,7 @@ def python(code: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["check", "--help"]])
-def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
+def test_help_imports_no_large_packages(arguments: list[str]) -> None:
     # Typer itself looks for pydantic when it builds a command with arguments.
     heavy = [name for name in HEAVY if not (name == "pydantic" and "check" in arguments)]
     code = (
@@ -44,7 +44,7 @@ def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
     assert done.stdout.splitlines()[-1:] == ["HEAVY []"], done.stdout + done.stderr
 
 
-def test_the_five_commands_are_there() -> None:
+def test_program_has_five_commands() -> None:
     shown = CliRunner().invoke(app, ["--help"]).output
     for command in ("run", "check", "report", "demo", "doctor"):
         assert f"\n  {command} " in shown
@@ -52,19 +52,19 @@ def test_the_five_commands_are_there() -> None:
         assert f"\n  {later} " not in shown
 
 
-def test_the_version_is_the_package_s() -> None:
+def test_version_option_prints_the_package_version() -> None:
     result = CliRunner().invoke(app, ["--version"])
     assert (result.exit_code, result.stdout) == (0, f"dvax {__version__}\n")
 
 
 @pytest.mark.parametrize("arguments", [["nonsense"], ["run"], ["run", "a.toml"], ["report", "--x"]])
-def test_wrong_usage_is_bad_input(arguments: list[str]) -> None:
+def test_wrong_usage_has_the_exit_code_of_bad_input(arguments: list[str]) -> None:
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2
     assert "Traceback" not in result.output
 
 
-def test_without_the_application_s_packages_the_fix_is_said() -> None:
+def test_missing_app_packages_give_an_error_with_the_fix() -> None:
     code = "import sys; sys.modules['typer'] = None\nfrom dvax.app.cli import main\nmain()\n"
     done = python(code)
     assert done.returncode == 1
@@ -72,7 +72,7 @@ def test_without_the_application_s_packages_the_fix_is_said() -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_report_writes_and_names_the_page(tmp_path: Path) -> None:
+def test_report_writes_and_prints_the_path_of_the_page(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((30,), frames=5))
     result = CliRunner().invoke(app, ["report", str(run_dir)])
     assert result.exit_code == 0, result.output
@@ -80,25 +80,25 @@ def test_report_writes_and_names_the_page(tmp_path: Path) -> None:
     assert (run_dir / "report.html").is_file()
 
 
-def test_report_of_another_folder_is_refused(tmp_path: Path) -> None:
+def test_report_rejects_a_folder_that_is_not_a_run_directory(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["report", str(tmp_path)])
     assert result.exit_code == 2
     assert "manifest.json" in result.stderr
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_self_test_s_closed_form_is_the_published_number() -> None:
+def test_doctor_self_test_uses_the_published_number() -> None:
     assert abs(selftest.EXACT - 1.8360919559905713) < 1e-15
 
 
-def test_doctor_computes_what_it_should() -> None:
+def test_doctor_reports_success() -> None:
     result = CliRunner().invoke(app, ["doctor"])
     assert result.exit_code == 0, result.output
     for what in ("dvax", "jax", "plotly", "devices", "double", "passed"):
         assert what in result.stdout
 
 
-def test_doctor_notices_a_wrong_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_detects_a_wrong_result(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "dvax.app.cli.doctor.self_test", lambda: selftest.SelfTest(1.8, 3.6e-2, 0.1)
     )
@@ -114,6 +114,6 @@ def test_doctor_names_a_missing_package(monkeypatch: pytest.MonkeyPatch) -> None
     assert "a-package-that-is-not-there is not installed" in result.stderr
 
 
-def test_an_unwritable_folder_is_told_apart(tmp_path: Path) -> None:
+def test_unwritable_folder_is_reported_as_such(tmp_path: Path) -> None:
     assert machine.unwritable(tmp_path) is None
     assert machine.unwritable(tmp_path / "none") is not None

@@ -25,7 +25,7 @@ def events(count: int) -> Iterator[dict[str, Any]]:
     yield {"event": "stopped", "message": "done"}
 
 
-def test_a_pipe_gets_a_line_for_each_tenth(capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_in_a_pipe_prints_a_line_per_tenth(capsys: pytest.CaptureFixture[str]) -> None:
     with progress(quiet=False) as listener:
         for event in events(1000):
             listener(event)
@@ -36,7 +36,7 @@ def test_a_pipe_gets_a_line_for_each_tenth(capsys: pytest.CaptureFixture[str]) -
     assert lines[11] == "warning: the [bold] step shrank"
 
 
-def test_a_model_in_one_piece_says_its_stages(
+def test_progress_of_a_model_without_segments_prints_its_stages(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = [
@@ -61,14 +61,14 @@ def test_a_model_in_one_piece_says_its_stages(
         assert "compiling" not in screen.getvalue().split("\r")[-1]
 
 
-def test_quiet_still_warns(capsys: pytest.CaptureFixture[str]) -> None:
+def test_quiet_prints_warnings(capsys: pytest.CaptureFixture[str]) -> None:
     with progress(quiet=True) as listener:
         for event in events(10):
             listener(event)
     assert capsys.readouterr().err == "warning: the [bold] step shrank\n"
 
 
-def test_a_terminal_gets_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_on_a_terminal_is_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     screen = io.StringIO()
     terminal = Console(file=screen, force_terminal=True, width=100, color_system=None)
     monkeypatch.setattr(progress_module, "console", lambda stderr: terminal)
@@ -81,7 +81,7 @@ def test_a_terminal_gets_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "warning: the [bold] step shrank" in shown
 
 
-def test_a_model_names_its_own_unit_or_none(capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_uses_the_unit_of_the_model(capsys: pytest.CaptureFixture[str]) -> None:
     for unit, shown in (("days", "t = 1 of 2 days (50%)"), ("", "t = 1 of 2 (50%)")):
         with progress(quiet=False) as listener:
             listener({"event": "progress", "t": 1.0, "t_end": 2.0, "steps": 3, "unit": unit})

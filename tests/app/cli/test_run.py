@@ -1,4 +1,4 @@
-"""`dvax run`: results on disk, figures on the screen, an exit code that tells what happened."""
+"""`dvax run`: results on disk, figures on the terminal, and the exit code."""
 
 import json
 from collections.abc import Callable
@@ -16,14 +16,14 @@ from dvax.app.runs import driver
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
-    """A run of the real driver, and what the command said."""
+    """A run of the real driver, with the output of the command."""
     folder = tmp_path_factory.mktemp("run")
     config = write_config(folder / "in")
     result = CliRunner().invoke(app, ["run", str(config), "-o", str(folder / "out")])
     return folder / "out", result
 
 
-def test_a_run_ends_with_zero_and_a_report(finished: tuple[Path, Any]) -> None:
+def test_run_exits_with_zero_and_writes_a_report(finished: tuple[Path, Any]) -> None:
     out, result = finished
     assert result.exit_code == 0, result.output
     assert json.loads((out / "manifest.json").read_text())["status"] == "finished"
@@ -32,7 +32,7 @@ def test_a_run_ends_with_zero_and_a_report(finished: tuple[Path, Any]) -> None:
     assert f"report: {out / 'report.html'}" in result.stderr
 
 
-def test_the_figures_of_the_summary_are_said(finished: tuple[Path, Any]) -> None:
+def test_run_prints_the_figures_of_the_summary(finished: tuple[Path, Any]) -> None:
     out, result = finished
     summary = json.loads((out / "summary.json").read_text())
     assert summary
@@ -41,25 +41,25 @@ def test_the_figures_of_the_summary_are_said(finished: tuple[Path, Any]) -> None
     assert f"{summary['status']['value']}: {summary['status']['meaning']}" in result.stderr
 
 
-def test_compile_time_is_said_apart_from_progress(finished: tuple[Path, Any]) -> None:
+def test_run_prints_compile_time_separately(finished: tuple[Path, Any]) -> None:
     _, result = finished
     assert "compiled in " in result.stderr
     assert "steps" in result.stderr
 
 
-def test_the_manifest_records_double_precision(finished: tuple[Path, Any]) -> None:
+def test_run_manifest_records_double_precision(finished: tuple[Path, Any]) -> None:
     out, _ = finished
     manifest = json.loads((out / "manifest.json").read_text())
     assert "64" in str(manifest["precision"])
 
 
-def test_quiet_says_nothing(tmp_path: Path) -> None:
+def test_run_quiet_prints_nothing(tmp_path: Path) -> None:
     config = write_config(tmp_path / "in")
     result = CliRunner().invoke(app, ["run", str(config), "-o", str(tmp_path / "out"), "--quiet"])
     assert (result.exit_code, result.output) == (0, "")
 
 
-def test_results_are_replaced_only_when_told(tmp_path: Path, finished: tuple[Path, Any]) -> None:
+def test_run_replaces_results_only_with_force(tmp_path: Path, finished: tuple[Path, Any]) -> None:
     config = write_config(tmp_path / "in")
     out = write_run(tmp_path / "out", Recipe((30,)))
     refused = CliRunner().invoke(app, ["run", str(config), "-o", str(out)])
@@ -71,7 +71,7 @@ def test_results_are_replaced_only_when_told(tmp_path: Path, finished: tuple[Pat
     assert json.loads((out / "manifest.json").read_text())["steps"] != 4000
 
 
-def test_force_deletes_nothing_that_dvax_did_not_write(tmp_path: Path) -> None:
+def test_run_force_deletes_only_files_of_dvax(tmp_path: Path) -> None:
     config = write_config(tmp_path / "in")
     out = tmp_path / "home"
     out.mkdir()
@@ -82,7 +82,7 @@ def test_force_deletes_nothing_that_dvax_did_not_write(tmp_path: Path) -> None:
 
 
 def stand_in(status: str, code: int, directory: Path) -> Callable[..., driver.RunOutcome]:
-    """A driver that stops as told, having written a partial run directory."""
+    """Replace the driver by one that stops as given, after it wrote a partial run directory."""
 
     def run(config: Any, out: Path, **options: Any) -> driver.RunOutcome:
         write_run(directory, Recipe((30,), frames=20, written=6, status=status))
@@ -101,7 +101,7 @@ def stand_in(status: str, code: int, directory: Path) -> Callable[..., driver.Ru
 
 
 @pytest.mark.parametrize(("status", "code"), [("failed", 3), ("interrupted", 130)])
-def test_a_run_that_stops_early_says_why_and_keeps_what_it_has(
+def test_failed_run_prints_the_reason_and_keeps_its_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, status: str, code: int
 ) -> None:
     out = tmp_path / "out"
@@ -115,7 +115,7 @@ def test_a_run_that_stops_early_says_why_and_keeps_what_it_has(
     assert "Partial results." in (out / "report.html").read_text(encoding="utf-8")
 
 
-def test_an_interrupt_outside_the_run_is_130(
+def test_interrupt_outside_the_run_exits_with_130(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def run(*_: Any, **__: Any) -> driver.RunOutcome:

@@ -1,4 +1,4 @@
-"""Both signals, at many times, in every command: it ends by itself, and what it leaves is readable."""
+"""Both signals, at many times, in every command: the command ends and leaves readable results."""
 
 import json
 import os
@@ -44,7 +44,7 @@ TRIALS = [
     ("command", "seconds", "number", "twice"),
     mostly_thorough(TRIALS, [(COMMANDS[0], 4.7, signal.SIGTERM, False)]),
 )
-def test_whenever_a_signal_comes_the_command_ends_in_good_order(
+def test_signal_at_any_time_ends_a_command_with_readable_results(
     tmp_path: Path, command: tuple[str, ...], seconds: float, number: signal.Signals, twice: bool
 ) -> None:
     if "fem-contact" in command:

@@ -64,7 +64,7 @@ TABLES = {
 
 
 def refused(config: Path, out: Path, *named: str) -> str:
-    """Run and check; both refuse, name everything in `named`, and write nothing."""
+    """Assert that `run` and `check` report everything in `named`, and write nothing."""
     before = sorted(out.parent.rglob("*"))
     for command in (["run", str(config), "-o", str(out)], ["check", str(config)]):
         result = CliRunner().invoke(app, command)
@@ -78,23 +78,23 @@ def refused(config: Path, out: Path, *named: str) -> str:
 
 
 @pytest.mark.parametrize("name", SPOILED)
-def test_a_spoiled_configuration_is_refused(tmp_path: Path, name: str) -> None:
+def test_run_rejects_an_invalid_configuration(tmp_path: Path, name: str) -> None:
     changes, named = SPOILED[name]
     refused(write_config(tmp_path / "in", *changes), tmp_path / "out", *named)
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_a_spoiled_table_is_refused_with_its_line(tmp_path: Path, name: str) -> None:
+def test_run_rejects_an_invalid_table_with_its_line(tmp_path: Path, name: str) -> None:
     config = write_config(tmp_path / "in", csv=CSV.replace(*TABLES[name]))
     refused(config, tmp_path / "out", "load.csv")
 
 
-def test_a_start_of_the_wrong_length_names_both_lengths(tmp_path: Path) -> None:
+def test_run_with_an_initial_state_of_wrong_length_names_both_lengths(tmp_path: Path) -> None:
     config = write_config(tmp_path / "in", x0=23)
     refused(config, tmp_path / "out", "initial", "23", "24")
 
 
-def test_all_problems_are_said_at_once_the_folder_s_too(tmp_path: Path) -> None:
+def test_run_reports_all_errors_at_once_including_the_output_folder(tmp_path: Path) -> None:
     config = write_config(
         tmp_path / "in",
         (KAPPA, "kappa0 = -1.0"),
@@ -111,11 +111,11 @@ def test_all_problems_are_said_at_once_the_folder_s_too(tmp_path: Path) -> None:
     assert [file.name for file in out.iterdir()] == ["precious.txt"]
 
 
-def test_a_missing_configuration_is_an_input_error(tmp_path: Path) -> None:
+def test_missing_configuration_is_an_input_error(tmp_path: Path) -> None:
     refused(tmp_path / "none.toml", tmp_path / "out", "none.toml")
 
 
-def test_a_plain_pipe_gets_one_line_a_fact(tmp_path: Path) -> None:
+def test_errors_in_a_pipe_are_printed_one_line_per_fact(tmp_path: Path) -> None:
     config = write_config(tmp_path / "in", (KAPPA, "kappa0 = -1.0"))
     text = refused(config, tmp_path / "out", "model.kappa0")
     lines = [line for line in text.splitlines() if line]
@@ -124,7 +124,7 @@ def test_a_plain_pipe_gets_one_line_a_fact(tmp_path: Path) -> None:
     assert "\x1b" not in text
 
 
-def test_a_file_in_the_place_of_a_run_directory_is_called_a_file(tmp_path: Path) -> None:
+def test_file_instead_of_a_run_directory_is_reported_as_a_file(tmp_path: Path) -> None:
     config = write_config(tmp_path / "in")
     result = CliRunner().invoke(app, ["report", str(config)])
     assert result.exit_code == 2 and "a file, not a folder" in result.stderr

@@ -1,4 +1,4 @@
-"""Run directories made by hand: what a driver writes, from formulas that need no solver."""
+"""Run directories from formulas, without a solver, in the format that a run writes."""
 
 import json
 from dataclasses import dataclass

@@ -74,7 +74,7 @@ def chromium(*arguments: str, profile: Path) -> subprocess.CompletedProcess[str]
 
 
 def look_at(page: Path, width: int) -> dict[str, Any]:
-    """Load a copy of `page` that reports on itself; returns what it said, and the console."""
+    """Load a copy of `page` that reports on itself; return its report, and the console output."""
     probe = page.with_name(f"probe-{width}.html")
     text = page.read_text(encoding="utf-8")
     probe.write_text(text.replace("<head>", f"<head>{COLLECT}", 1), encoding="utf-8")
@@ -99,7 +99,7 @@ def curve(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("width", [1280, 500])
-def test_every_figure_is_drawn_without_an_error(curve: Path, width: int) -> None:
+def test_report_draws_every_figure_without_a_console_error(curve: Path, width: int) -> None:
     report = look_at(curve, width)
     assert report["wrong"] == []
     assert report["console"] == []
@@ -114,7 +114,7 @@ def test_every_figure_is_drawn_without_an_error(curve: Path, width: int) -> None
 
 
 @pytest.mark.thorough
-def test_a_slider_shows_the_other_frame(tmp_path: Path) -> None:
+def test_report_slider_shows_another_frame(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((30, 20), frames=5))
     report = look_at(build_report(run_dir, stills=False), 1280)
     assert report["wrong"] == [] and report["console"] == []
@@ -122,7 +122,7 @@ def test_a_slider_shows_the_other_frame(tmp_path: Path) -> None:
     assert report["drawn"]["pressure"] >= 1
 
 
-def test_the_picture_on_the_screen_is_not_blank(curve: Path, tmp_path: Path) -> None:
+def test_report_picture_is_not_blank(curve: Path, tmp_path: Path) -> None:
     shot = tmp_path / "shot.png"
     chromium(
         f"--screenshot={shot}", "--window-size=1280,4200", f"file://{curve}", profile=tmp_path / "p"
@@ -134,7 +134,7 @@ def test_the_picture_on_the_screen_is_not_blank(curve: Path, tmp_path: Path) -> 
         assert near.sum() > 2000, f"no area in the regime colour {colour}"
 
 
-def test_a_broken_page_is_noticed(curve: Path, tmp_path: Path) -> None:
+def test_broken_page_is_detected(curve: Path, tmp_path: Path) -> None:
     broken = tmp_path / "report.html"
     text = curve.read_text(encoding="utf-8")
     broken.write_text(text.replace("Plotly.newPlot(", "Plotly.newPlotty(", 1), encoding="utf-8")

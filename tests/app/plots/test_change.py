@@ -1,4 +1,4 @@
-"""The picture of a change: its curves are the numbers, and every axis says what it shows."""
+"""The figure of a change: its curves are the numbers, and its axes have labels and units."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ import dvax
 from dvax.app.plots.change import change_figure
 
 
-def test_the_curves_are_the_numbers_and_axes_have_units():
+def test_change_figure_shows_the_numbers_with_units():
     problem = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
         f=lambda t, x, u, ell: ell - 0.5 * x - u, h=lambda t, x, u, ell: 1.0 - 2.0 * x - u,

@@ -1,4 +1,4 @@
-"""One pass over the fields gives what a direct computation on the whole arrays gives."""
+"""Downsampling in one pass agrees with a direct computation on the whole arrays."""
 
 from pathlib import Path
 
@@ -25,7 +25,9 @@ def whole(run_dir: Path) -> xr.Dataset:
     return xr.open_zarr(run_dir / "trajectory.zarr", consolidated=False, chunks=None).load()
 
 
-def test_shares_are_the_weighted_measure_of_each_regime(tmp_path: Path, small_cells: None) -> None:
+def test_regime_shares_are_the_weighted_measure_of_each_regime(
+    tmp_path: Path, small_cells: None
+) -> None:
     run_dir = write_run(tmp_path / "run", Recipe(points=(31,), frames=12))
     data, found = whole(run_dir), downsample(read_run(run_dir))
     weight = data.weight.values / data.weight.values.sum()
@@ -36,7 +38,9 @@ def test_shares_are_the_weighted_measure_of_each_regime(tmp_path: Path, small_ce
     assert found.shares.max(axis=1).min() > 0, "every regime must occur, or the test sees nothing"
 
 
-def test_cells_hold_mean_and_extremes_of_their_block(tmp_path: Path, small_cells: None) -> None:
+def test_downsampled_cells_hold_mean_and_extremes_of_their_block(
+    tmp_path: Path, small_cells: None
+) -> None:
     run_dir = write_run(tmp_path / "run", Recipe(points=(31,), frames=12))
     data, cells = whole(run_dir), downsample(read_run(run_dir)).cells
     assert cells is not None and cells.reduced
@@ -52,7 +56,7 @@ def test_cells_hold_mean_and_extremes_of_their_block(tmp_path: Path, small_cells
             assert cells.common[i, j] == np.bincount(regime.ravel(), minlength=3).argmax()
 
 
-def test_a_peak_one_point_wide_survives_the_reduction(tmp_path: Path, small_cells: None) -> None:
+def test_downsampling_keeps_a_peak_of_one_point(tmp_path: Path, small_cells: None) -> None:
     run_dir = write_run(tmp_path / "run", Recipe(points=(31,), frames=12))
     data = whole(run_dir)
     data.pressure.values[5, 17] = 99.0
@@ -63,7 +67,9 @@ def test_a_peak_one_point_wide_survives_the_reduction(tmp_path: Path, small_cell
     assert found.cells.mean.max() < 99.0
 
 
-def test_nodes_in_any_order_give_the_same_map(tmp_path: Path, small_cells: None) -> None:
+def test_downsampled_map_does_not_depend_on_the_order_of_nodes(
+    tmp_path: Path, small_cells: None
+) -> None:
     run_dir = write_run(tmp_path / "run", Recipe(points=(31,), frames=12))
     straight = downsample(read_run(run_dir)).cells
     shuffled = whole(run_dir).isel(point=np.random.default_rng(1).permutation(31))
@@ -74,7 +80,7 @@ def test_nodes_in_any_order_give_the_same_map(tmp_path: Path, small_cells: None)
     np.testing.assert_array_equal(mixed.space_edges, straight.space_edges)
 
 
-def test_a_regime_outside_the_three_is_named_with_its_place(tmp_path: Path) -> None:
+def test_unknown_regime_is_reported_with_its_place(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe(points=(31,), frames=12))
     data = whole(run_dir)
     data.regime.values[3, 4] = 7
@@ -83,13 +89,13 @@ def test_a_regime_outside_the_three_is_named_with_its_place(tmp_path: Path) -> N
         downsample(read_run(run_dir))
 
 
-def test_edges_lie_half_way_between_centres() -> None:
+def test_cell_edges_lie_half_way_between_centres() -> None:
     np.testing.assert_allclose(edges(np.array([0.0, 1.0, 3.0])), [-0.5, 0.5, 2.0, 4.0])
     np.testing.assert_allclose(edges(np.array([2.0])), [1.0, 3.0])
 
 
 @pytest.mark.parametrize(("chunk", "sizes"), [(3, {3}), (4, {4}), (12, {1})])
-def test_blocks_are_whole_chunks_unless_these_are_huge(
+def test_blocks_are_whole_chunks_up_to_a_size_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk: int, sizes: set[int]
 ) -> None:
     run_dir = write_run(tmp_path / "run", Recipe(points=(31,), frames=12))

@@ -1,4 +1,4 @@
-"""The report says what the run directory holds, and never more."""
+"""The report shows the content of the run directory, and nothing else."""
 
 import json
 from pathlib import Path
@@ -33,13 +33,13 @@ def stills(run_dir: Path) -> set[str]:
     return {file.stem for file in (run_dir / "figures").glob("*.png")}
 
 
-def test_a_large_run_makes_a_page_that_a_mail_can_carry(large: Path) -> None:
+def test_report_of_a_large_run_has_a_limited_size(large: Path) -> None:
     page = large / "report.html"
     assert page.stat().st_size < 12e6
     assert "a cell gathers up to 56 points and 2 frames" in page.read_text(encoding="utf-8")
 
 
-def test_every_picture_has_a_still_that_is_not_blank(large: Path) -> None:
+def test_report_pictures_have_nonblank_png_files(large: Path) -> None:
     assert stills(large) == PICTURES
     for file in (large / "figures").glob("*.png"):
         pixels = imread(file)
@@ -47,26 +47,26 @@ def test_every_picture_has_a_still_that_is_not_blank(large: Path) -> None:
         assert pixels[..., :3].std() > 0.05, f"{file.name} is blank"
 
 
-def test_the_page_names_every_constant_with_its_label(large: Path) -> None:
+def test_report_lists_every_constant_with_its_label(large: Path) -> None:
     text = (large / "report.html").read_text(encoding="utf-8")
     for name, _, _, _, label, _ in CONSTANTS:
         assert f"<code>{name}</code>" in text
         assert f"<code>{label}</code>" in text
 
 
-def test_the_page_fetches_nothing(large: Path) -> None:
+def test_report_makes_no_network_request(large: Path) -> None:
     text = (large / "report.html").read_text(encoding="utf-8")
     outside_scripts = "".join(part.split("</script>")[-1] for part in text.split("<script"))
     for fetching in ("http://", "https://", "@import", "url(", "<iframe", "src="):
         assert fetching not in outside_scripts
 
 
-def test_a_finished_run_shows_no_banner_of_partial_results(large: Path) -> None:
+def test_report_of_a_finished_run_has_no_banner(large: Path) -> None:
     assert "Partial results." not in (large / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("status", ["interrupted", "failed", "running"])
-def test_a_run_that_stopped_early_says_so_at_the_top(tmp_path: Path, status: str) -> None:
+def test_report_of_a_stopped_run_begins_with_its_status(tmp_path: Path, status: str) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), frames=21, written=11, status=status))
     text = build_report(run_dir, stills=False).read_text(encoding="utf-8")
     banner, pictures = text.index("Partial results."), text.index("<h2>Headline figures")
@@ -77,13 +77,13 @@ def test_a_run_that_stopped_early_says_so_at_the_top(tmp_path: Path, status: str
 
 
 @pytest.mark.parametrize("written", [1, 2])
-def test_a_run_of_very_few_frames_still_has_its_pictures(tmp_path: Path, written: int) -> None:
+def test_report_of_few_frames_has_pictures(tmp_path: Path, written: int) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), written=written, status="failed"))
     build_report(run_dir)
     assert stills(run_dir) == PICTURES
 
 
-def test_a_run_without_frames_gives_a_page_without_pictures(tmp_path: Path) -> None:
+def test_report_without_frames_has_no_pictures(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), written=0, status="failed"))
     text = build_report(run_dir).read_text(encoding="utf-8")
     assert "the run wrote no results" in text
@@ -91,7 +91,7 @@ def test_a_run_without_frames_gives_a_page_without_pictures(tmp_path: Path) -> N
     assert stills(run_dir) == set()
 
 
-def test_a_surface_has_maps_with_a_slider(tmp_path: Path) -> None:
+def test_report_of_a_surface_has_maps_with_a_slider(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40, 25), frames=30))
     text = build_report(run_dir).read_text(encoding="utf-8")
     assert stills(run_dir) == PICTURES
@@ -99,14 +99,14 @@ def test_a_surface_has_maps_with_a_slider(tmp_path: Path) -> None:
     assert "24 of 30 saved frames are drawn." in text
 
 
-def test_a_run_without_companion_says_why_a_picture_is_missing(tmp_path: Path) -> None:
+def test_report_without_companion_explains_the_missing_picture(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), companion=False))
     text = build_report(run_dir).read_text(encoding="utf-8")
     assert "Certified decay: the run had no companion trajectory." in text
     assert stills(run_dir) == PICTURES - {"separation"}
 
 
-def test_text_of_the_run_cannot_become_markup(tmp_path: Path) -> None:
+def test_report_escapes_text_of_the_run(tmp_path: Path) -> None:
     evil = "</script><script>alert(1)</script><b>"
     run_dir = write_run(tmp_path / "run", Recipe((40,), title=evil))
     manifest = json.loads((run_dir / "manifest.json").read_text())
@@ -116,7 +116,7 @@ def test_text_of_the_run_cannot_become_markup(tmp_path: Path) -> None:
     assert "<script>alert(1)" not in text
 
 
-def test_frames_without_a_valid_time_are_left_out_and_counted(tmp_path: Path) -> None:
+def test_report_omits_and_counts_frames_without_a_valid_time(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), frames=20))
     store = run_dir / "trajectory.zarr"
     data = xr.open_zarr(store, consolidated=False, chunks=None).load()
@@ -130,7 +130,7 @@ def test_frames_without_a_valid_time_are_left_out_and_counted(tmp_path: Path) ->
     assert "5 of 20 frames" in build_report(run_dir, stills=False).read_text(encoding="utf-8")
 
 
-def test_a_log_cut_off_by_a_kill_is_read_up_to_there(tmp_path: Path) -> None:
+def test_report_reads_a_truncated_log(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,)))
     with (run_dir / "log.jsonl").open("a") as log:
         log.write('{"event": "warni')
@@ -138,7 +138,7 @@ def test_a_log_cut_off_by_a_kill_is_read_up_to_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("file", ["manifest.json", "summary.json", "config.resolved.toml"])
-def test_a_damaged_file_is_named(tmp_path: Path, file: str) -> None:
+def test_report_names_a_damaged_file(tmp_path: Path, file: str) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,)))
     (run_dir / file).write_text("{ this is not it")
     with pytest.raises(InputError, match=file.replace(".", r"\.")):
@@ -146,12 +146,12 @@ def test_a_damaged_file_is_named(tmp_path: Path, file: str) -> None:
     assert not (run_dir / "report.html").exists()
 
 
-def test_a_folder_that_is_no_run_directory_is_refused(tmp_path: Path) -> None:
+def test_report_rejects_a_folder_that_is_no_run_directory(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"manifest\.json"):
         build_report(tmp_path)
 
 
-def test_the_certificate_s_legend_carries_its_status(tmp_path: Path) -> None:
+def test_report_certificate_legend_shows_its_status(tmp_path: Path) -> None:
     picture = certificate_picture(read_run(write_run(tmp_path / "run", Recipe((40,)))))
     assert picture is not None
     names = [trace.name for trace in picture.interactive.data]
@@ -167,7 +167,7 @@ def test_the_certificate_s_legend_carries_its_status(tmp_path: Path) -> None:
     assert "left as a gap" in picture.caption
 
 
-def test_the_separation_shows_observed_certified_and_sharp(tmp_path: Path) -> None:
+def test_report_separation_shows_observed_certified_and_sharp(tmp_path: Path) -> None:
     run = read_run(write_run(tmp_path / "run", Recipe((40,))))
     picture = separation_picture(run)
     assert picture is not None
@@ -179,7 +179,7 @@ def test_the_separation_shows_observed_certified_and_sharp(tmp_path: Path) -> No
     assert "floating-point rounding, which no bound covers" in picture.caption
 
 
-def test_histories_are_those_of_the_points_asked_for(tmp_path: Path) -> None:
+def test_report_histories_are_those_of_the_requested_points(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,)))
     config = "[time]\nend = 40.0\n[output]\npoints_of_interest = [10.1, 80.0]\n"
     (run_dir / "config.resolved.toml").write_text(config)
@@ -205,7 +205,7 @@ def test_histories_are_those_of_the_points_asked_for(tmp_path: Path) -> None:
         (4000, "4\u202f000"),
     ],
 )
-def test_numbers_are_written_for_a_reader(value: float, text: str) -> None:
+def test_report_number_format(value: float, text: str) -> None:
     assert number(value) == text
 
 
@@ -220,5 +220,5 @@ def test_numbers_are_written_for_a_reader(value: float, text: str) -> None:
         ("dimensionless", ""),
     ],
 )
-def test_units_are_written_for_a_reader(unit: str, text: str) -> None:
+def test_report_unit_format(unit: str, text: str) -> None:
     assert unit_text(unit) == text

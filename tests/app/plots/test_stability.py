@@ -1,4 +1,4 @@
-"""The stability section: where the certified rate comes from, and what is known of the assumptions."""
+"""The stability section: the parts of the certified rate, and the status of the assumptions."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ def record(values: dict[str, Any], assumptions: tuple[AssumptionRow, ...] = ()) 
     return RunRecord(Path("."), {}, {}, {}, rows, (), None, assumptions)
 
 
-def test_the_parts_of_the_rate_add_up_and_the_largest_is_named() -> None:
+def test_stability_table_parts_add_up_and_the_largest_is_named() -> None:
     text = rates_table(record(VALUES | {"sharp_decay_rate": 0.75}))
     shown = [line.split("</td>") for line in text.split("<tr>")[2:]]
     cells = [[cell.split(">")[-1] for cell in row[:4]] for row in shown]
@@ -32,11 +32,11 @@ def test_the_parts_of_the_rate_add_up_and_the_largest_is_named() -> None:
 
 
 @pytest.mark.parametrize("missing", VALUES)
-def test_a_run_without_a_constant_has_no_such_table(missing: str) -> None:
+def test_stability_table_is_absent_without_constants(missing: str) -> None:
     assert rates_table(record({k: v for k, v in VALUES.items() if k != missing})) == ""
 
 
-def test_assumptions_are_shown_as_they_are_and_escaped() -> None:
+def test_stability_assumptions_are_shown_and_escaped() -> None:
     row = AssumptionRow("ass:x", "a < b", "refuted", "at t = 1 & x = 2")
     text = assumptions_table(record(VALUES, (row,)))
     assert "a &lt; b" in text and "at t = 1 &amp; x = 2" in text

@@ -1,4 +1,4 @@
-"""A small configuration beside small data, from which the tests start."""
+"""A small configuration with small data, as a starting point of the tests."""
 
 import copy
 from pathlib import Path

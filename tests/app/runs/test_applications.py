@@ -1,4 +1,4 @@
-"""Configurations of applications: what is refused and how, and what a run leaves behind."""
+"""Configurations of applications: rejected input, and the files that a run writes."""
 
 import json
 import shutil
@@ -48,12 +48,12 @@ def problems(file, **options):
     return [str(problem) for problem in caught.value.problems]
 
 
-def test_an_unknown_model_is_told_the_names(folder):
+def test_unknown_model_error_lists_the_names(folder):
     (told,) = problems(written(folder, '[model]\nname = "circit"\n'))
     assert "model.name" in told and "fem-contact" in told and "Did you mean 'circuit'?" in told
 
 
-def test_a_name_that_is_missing_is_asked_for(folder):
+def test_missing_model_name_is_reported(folder):
     (told,) = problems(written(folder, '[model]\nnetlist = "tank.cir"\nt_end = 1.0\n'))
     assert "model.name: got nothing" in told and 'Add name = "circuit"' in told
     assert all(name in told for name in ("contact", *APPLICATIONS))
@@ -62,7 +62,7 @@ def test_a_name_that_is_missing_is_asked_for(folder):
     assert any("model.period" in line and "no key" in line for line in told)
 
 
-def test_everything_wrong_in_the_table_is_said_at_once(folder):
+def test_model_table_errors_are_reported_at_once(folder):
     told = problems(
         written(
             folder,
@@ -73,7 +73,7 @@ def test_everything_wrong_in_the_table_is_said_at_once(folder):
         assert any(word in line for line in told), (word, told)
 
 
-def test_data_lies_beside_the_configuration_unless_allowed(folder, tmp_path):
+def test_data_files_must_lie_beside_the_configuration_unless_allowed(folder, tmp_path):
     shutil.copy(folder / "tank.cir", tmp_path / "tank.cir")
     inner = tmp_path / "inner"
     inner.mkdir()
@@ -89,7 +89,7 @@ def test_data_lies_beside_the_configuration_unless_allowed(folder, tmp_path):
     assert "there is no such folder" in told
 
 
-def test_what_is_wrong_in_the_data_comes_with_its_line(folder):
+def test_data_errors_name_their_line(folder):
     (folder / "open.cir").write_text("C1 1 0 1u\nL1 1 0 ten\n")
     told = problems(
         written(folder, '[model]\nname = "circuit"\nnetlist = "open.cir"\nt_end = 1.0\n')
@@ -97,7 +97,7 @@ def test_what_is_wrong_in_the_data_comes_with_its_line(folder):
     assert any("open.cir, line 2" in line for line in told)
 
 
-def test_a_run_leaves_figures_data_and_a_report(folder, outcome):
+def test_application_run_writes_figures_data_and_a_report(folder, outcome):
     assert outcome.exit_code == 0 and outcome.status == "finished"
     summary = json.loads((outcome.directory / "summary.json").read_text())
     assert set(summary["final_state"]) == {"value", "unit", "meaning"}
@@ -120,7 +120,7 @@ def test_a_run_leaves_figures_data_and_a_report(folder, outcome):
     assert (outcome.directory / "figures" / "circuit.png").stat().st_size > 10_000
 
 
-def test_the_resolved_configuration_is_the_same_run(outcome, tmp_path):
+def test_resolved_configuration_gives_the_same_run(outcome, tmp_path):
     moved = tmp_path / "moved"
     shutil.copytree(outcome.directory, moved)
     again = run(read_config(moved / "config.resolved.toml"), tmp_path / "again")
@@ -131,13 +131,13 @@ def test_the_resolved_configuration_is_the_same_run(outcome, tmp_path):
     assert first > 0 and first + second <= compile_seconds() + 1e-2
 
 
-def test_a_run_says_what_it_does(outcome):
+def test_application_run_prints_its_stages(outcome):
     lines = (outcome.directory / "log.jsonl").read_text().splitlines()
     stages = [event["stage"] for event in map(json.loads, lines) if event["event"] == "stage"]
     assert stages == ["solving from 0 to 0.001 s", "writing the results"]
 
 
-def test_a_run_directory_of_an_unknown_model_is_refused(outcome, tmp_path):
+def test_run_directory_of_an_unknown_model_is_rejected(outcome, tmp_path):
     for name in ("circit", "data"):
         moved = tmp_path / name
         shutil.copytree(outcome.directory, moved)
@@ -173,7 +173,7 @@ RUNS = {
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", RUNS)
-def test_the_reference_figures_come_out_of_a_run(name, tmp_path):
+def test_application_run_gives_the_reference_figures(name, tmp_path):
     lines, (figure, value, relative) = RUNS[name]
     for line in lines.splitlines():
         given = line.split(" = ")[1].strip('"')
@@ -194,7 +194,7 @@ def test_the_reference_figures_come_out_of_a_run(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", APPLICATIONS)
-def test_every_key_of_a_model_is_on_the_page(name):
+def test_applications_page_lists_every_key_of_a_model(name):
     page = (Path(__file__).parents[3] / "docs" / "applications.md").read_text(encoding="utf-8")
     table = page.split(f"### {name}\n")[1].split("\n### ")[0]
     for key, field in module_of(name).APPLICATION.section.model_fields.items():

@@ -1,4 +1,4 @@
-"""A configuration says everything a run will do, in numbers whose units are known."""
+"""A configuration determines a run completely, in numbers with known units."""
 
 import time
 
@@ -14,7 +14,7 @@ from dvax.errors import InputError
 from .example import LOAD, REMOVE, STRIP, write
 
 
-def test_the_fields_are_the_products_of_their_factors(tmp_path):
+def test_config_fields_are_products_of_their_factors(tmp_path):
     inputs = build_contact(load_config(write(tmp_path)))
     s = (np.arange(8) + 0.5) * 2.5
     np.testing.assert_allclose(inputs.boundary.coordinates[0], s, rtol=1e-15)
@@ -29,13 +29,13 @@ def test_the_fields_are_the_products_of_their_factors(tmp_path):
     np.testing.assert_allclose(traced, inputs.load_signal(0.35), rtol=1e-14)
 
 
-def test_the_default_companion_crosses_the_active_regime(tmp_path):
+def test_config_default_companion_crosses_the_active_regime(tmp_path):
     inputs = build_contact(load_config(write(tmp_path)))
     # b_x dx = (1 + b_u) kappa0 / beta is the width of the active regime in the drive q.
     np.testing.assert_allclose(0.8 * (inputs.companion_x0 - inputs.x0), 1.6 * 2.0 / 2.0)
 
 
-def test_quantities_with_units_are_the_same_numbers(tmp_path):
+def test_config_quantities_with_units_are_converted(tmp_path):
     plain = load_config(write(tmp_path))
     quantities = {
         "model.alpha": "60 1/min",
@@ -55,7 +55,7 @@ def test_quantities_with_units_are_the_same_numbers(tmp_path):
             )
 
 
-def test_working_units_change_numbers_and_not_physics(tmp_path):
+def test_config_working_units_do_not_change_the_physics(tmp_path):
     """The same strip in seconds and millimetres, and in minutes and metres."""
     inputs = build_contact(load_config(write(tmp_path)))
     units = {"time": "min", "length": "m", "indentation": "nm", "pressure": "Pa"}
@@ -82,7 +82,7 @@ def test_working_units_change_numbers_and_not_physics(tmp_path):
     np.testing.assert_allclose(other.companion_x0, to_nm * inputs.companion_x0, rtol=1e-12)
 
 
-def test_the_resolved_configuration_gives_the_same_run_elsewhere(tmp_path):
+def test_config_resolved_file_gives_the_same_run_elsewhere(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     changes = {"initial.expression": "sin(s)", "demand.knots": [0.5], "load.series.kind": "cubic"}
@@ -100,7 +100,7 @@ def test_the_resolved_configuration_gives_the_same_run_elsewhere(tmp_path):
         assert text in tomli_w.dumps(again.tree())
 
 
-def test_a_rectangle_has_its_points_in_c_order(tmp_path):
+def test_config_rectangle_has_points_in_c_order(tmp_path):
     changes = {
         "boundary": {"lengths": [4.0, "3 mm"], "points": [2, 3]},
         "demand": {"expression": "s1 + 10*s2"},
@@ -115,7 +115,7 @@ def test_a_rectangle_has_its_points_in_c_order(tmp_path):
     assert inputs.point_indices == (2,)
 
 
-def test_midpoints_integrate_with_second_order(tmp_path):
+def test_config_midpoint_weights_are_of_second_order(tmp_path):
     errors = []
     for n in (20, 40):
         changes = {"boundary.points": n, "demand": {"expression": "exp(s/20)"}}
@@ -125,7 +125,7 @@ def test_midpoints_integrate_with_second_order(tmp_path):
     assert errors[0] / errors[1] == pytest.approx(4.0, abs=0.02)
 
 
-def test_nodes_from_a_file(tmp_path):
+def test_config_nodes_from_a_file(tmp_path):
     changes = {"boundary": {"file": "nodes.csv"}, "demand": {"expression": "s"}}
     nodes = "s [cm],weight [mm]\n0.1,0.5\n0.3,2\n0.35,0.25\n"
     inputs = build_contact(load_config(write(tmp_path, changes, nodes_csv=nodes)))
@@ -133,26 +133,26 @@ def test_nodes_from_a_file(tmp_path):
     np.testing.assert_allclose(inputs.boundary.weights, [0.5, 2, 0.25])
 
 
-def test_points_of_interest_snap_and_say_so(tmp_path):
+def test_config_points_of_interest_snap_with_a_note(tmp_path):
     changes = {"output.points_of_interest": ["0.5 cm", 6.25]}
     inputs = build_contact(load_config(write(tmp_path, changes)))
     assert inputs.point_indices == (1, 2)
     assert len(inputs.notices) == 1 and "nearest point is [3.75] mm" in inputs.notices[0]
 
 
-def test_a_demand_that_jumps_is_noticed(tmp_path):
+def test_config_demand_with_a_jump_gives_a_note(tmp_path):
     series = {"file": "load.csv", "kind": "constant", "per_unit": "1 um"}
     inputs = build_contact(load_config(write(tmp_path, {"demand": {"series": series}})))
     assert any("continuous in time" in notice for notice in inputs.notices)
 
 
-def test_knots_of_a_formula_reach_the_signal(tmp_path):
+def test_config_knots_of_a_formula_reach_the_signal(tmp_path):
     demand = {"expression": "where(t < 1, t, 1)", "knots": ["1000 ms"]}
     signal = build_contact(load_config(write(tmp_path, {"demand": demand}))).demand_signal
     np.testing.assert_allclose(signal.knots(), [1.0])
 
 
-def test_another_resolution(tmp_path):
+def test_config_with_another_resolution(tmp_path):
     config = load_config(write(tmp_path, {"demand": {"value": 1.0}}))
     assert build_contact(with_points(config, 50)).boundary.size == 50
 
@@ -224,7 +224,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_what_is_wrong_is_said_with_its_place_and_rule(case, tmp_path):
+def test_config_errors_name_place_and_rule(case, tmp_path):
     changes, place, said = WRONG[case]
     with pytest.raises(InputError) as caught:
         load_config(write(tmp_path, changes))
@@ -235,7 +235,7 @@ def test_what_is_wrong_is_said_with_its_place_and_rule(case, tmp_path):
     assert problem.given and problem.fix
 
 
-def test_long_texts_cost_no_time(tmp_path):
+def test_config_long_strings_are_rejected_fast(tmp_path):
     blanks, digits = " " * 200_000, "1" * 200_000
     start = time.perf_counter()
     for changes in (
@@ -253,7 +253,7 @@ def test_long_texts_cost_no_time(tmp_path):
     assert time.perf_counter() - start < 3.0
 
 
-def test_all_problems_come_at_once(tmp_path):
+def test_config_errors_are_reported_at_once(tmp_path):
     changes = {
         "colour": "red",
         "units.pressure": "mm",
@@ -278,7 +278,7 @@ def test_all_problems_come_at_once(tmp_path):
         assert key in places, key
 
 
-def test_toml_syntax_has_line_and_column(tmp_path):
+def test_config_toml_syntax_errors_name_line_and_column(tmp_path):
     path = tmp_path / "run.toml"
     for text, place in (
         ("[model]\nalpha = = 2\n", "run.toml, line 2, column 9"),
@@ -300,7 +300,7 @@ def test_toml_syntax_has_line_and_column(tmp_path):
             load_config(missing)
 
 
-def test_data_stays_in_the_folder_unless_allowed(tmp_path):
+def test_config_data_must_lie_in_the_folder_unless_allowed(tmp_path):
     inner = tmp_path / "inner"
     inner.mkdir()
     (tmp_path / "outside.csv").write_text(LOAD)
@@ -330,7 +330,7 @@ def test_data_stays_in_the_folder_unless_allowed(tmp_path):
         ("a = [1, 2\n", ("at its end", "Close the bracket")),
     ],
 )
-def test_a_file_that_cannot_be_read_is_told_in_words_of_a_file(tmp_path, text, words):
+def test_config_unreadable_file_is_reported_as_a_file(tmp_path, text, words):
     from dvax.app.runs.applications.config import read_config
 
     file = tmp_path / "run.toml"

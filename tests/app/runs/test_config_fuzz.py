@@ -1,4 +1,4 @@
-"""Whatever a configuration or its data holds: it loads, or InputError says what is wrong."""
+"""A mutated configuration or data file either loads or raises an InputError."""
 
 import random
 
@@ -57,7 +57,7 @@ def loads(path) -> bool:
 
 
 @pytest.mark.parametrize("cases", [1500, pytest.param(100_000, marks=pytest.mark.thorough)])
-def test_mutated_configurations(cases, tmp_path):
+def test_config_fuzzing_loads_or_raises_input_error(cases, tmp_path):
     dice = random.Random(cases)
     path = write(tmp_path, {"solver.rtol": 1e-7, "initial.companion": "1 um"})
     text = path.read_text()
@@ -69,7 +69,7 @@ def test_mutated_configurations(cases, tmp_path):
 
 
 @pytest.mark.parametrize("cases", [500, pytest.param(20_000, marks=pytest.mark.thorough)])
-def test_mutated_data(cases, tmp_path):
+def test_data_fuzzing_loads_or_raises_input_error(cases, tmp_path):
     dice = random.Random(cases)
     changes = {"demand.profile": {"file": "strip.npy"}, "boundary": {"file": "nodes.csv"}}
     nodes = "s [mm],weight [mm]\n" + "".join(f"{i},0.5\n" for i in range(8))

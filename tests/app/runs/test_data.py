@@ -1,4 +1,4 @@
-"""Measured data is read exactly or refused with file, line and column; nothing is invented."""
+"""Measured data are read exactly, or rejected with file, line and column."""
 
 import io
 import pickle
@@ -21,7 +21,8 @@ def problems_of(path):
     return caught.value.problems
 
 
-def test_times_and_values_are_converted_and_non_uniform_times_kept(tmp_path):
+def test_series_times_and_values_are_converted(tmp_path):
+    """Nonuniform times are kept."""
     table = (
         '# a comment\ntime [ms], "load [mm/s]",note []\n\n0,1e-3,a\n500,+2.E-3,b\n2000,-.5,"c,d"\n'
     )
@@ -33,7 +34,7 @@ def test_times_and_values_are_converted_and_non_uniform_times_kept(tmp_path):
     np.testing.assert_allclose(inputs.load_signal.knots(), [0, 0.5, 2.0], rtol=1e-15)
 
 
-def test_a_pure_record_is_scaled_by_per_unit(tmp_path):
+def test_series_without_unit_is_scaled_by_per_unit(tmp_path):
     table = "t [s],level [1]\n0,1\n2,3\n"
     series = {"file": "r.csv", "time_column": "t", "per_unit": "30 mm/s"}
     inputs = build_contact(load_config(write(tmp_path, {"load": {"series": series}}, r_csv=table)))
@@ -85,14 +86,14 @@ FLAWS = {
 
 
 @pytest.mark.parametrize("case", FLAWS)
-def test_a_flaw_is_named_with_its_place(case, tmp_path):
+def test_data_flaw_is_named_with_its_place(case, tmp_path):
     table, place, said = FLAWS[case]
     first = problems_of(write(tmp_path, load_csv=table))[0]
     assert place in first.place and "load" in first.place, first
     assert any(part in str(first) for part in said.split("|")), first
 
 
-def test_all_flaws_of_a_file_up_to_twenty(tmp_path):
+def test_data_flaws_are_reported_up_to_twenty(tmp_path):
     rows = ["0,1", "1,", "2,x", "3", "4,nan"]
     found = problems_of(write(tmp_path, load_csv="\n".join(["time [s],load [um/s]", *rows])))
     assert [p.place for p in found] == [
@@ -105,18 +106,18 @@ def test_all_flaws_of_a_file_up_to_twenty(tmp_path):
     assert len(problems_of(write(tmp_path, load_csv=bad))) == 21
 
 
-def test_bytes_that_are_no_text(tmp_path):
+def test_data_bytes_that_are_not_text_are_rejected(tmp_path):
     assert "UTF-8" in str(problems_of(write(tmp_path, load_csv=b"time [s],load [um/s]\n\xff"))[0])
 
 
-def test_a_missing_column_names_the_nearest(tmp_path):
+def test_missing_column_error_names_the_nearest(tmp_path):
     table = LOAD.replace("load", "left_load")
     changes = {"load.series": {"file": "load.csv", "column": "left_laod"}}
     (problem,) = problems_of(write(tmp_path, changes, load_csv=table))
     assert problem.fix.startswith("Did you mean 'left_load'?")
 
 
-def test_a_last_time_may_miss_the_end_by_rounding_alone(tmp_path):
+def test_series_may_end_before_the_run_by_rounding_only(tmp_path):
     # 0.1 min is 6.000000000000001 or 5.999999999999999 s in some order of multiplications.
     for unit, last in (("min", "0.1"), ("hour", repr(0.1 / 60)), ("ms", "6000")):
         table = f"time [{unit}],load [um/s]\n0,1\n{last},2\n"
@@ -130,7 +131,7 @@ def npy(array) -> bytes:
     return buffer.getvalue()
 
 
-def test_a_profile_gives_both_lengths_when_they_differ(tmp_path):
+def test_profile_of_wrong_length_names_both_lengths(tmp_path):
     changes = {"demand.profile.file": "other.npy"}
     (problem,) = problems_of(write(tmp_path, changes, other_npy=npy(np.ones(5))))
     assert "5 values" in problem.given and "8 points" in problem.rule
@@ -140,7 +141,7 @@ def test_a_profile_gives_both_lengths_when_they_differ(tmp_path):
     assert "9 values" in problem.given and "8 points" in problem.rule
 
 
-def test_bad_arrays_are_refused_and_nothing_is_unpickled(tmp_path):
+def test_npy_arrays_are_validated_and_never_unpickled(tmp_path):
     class Trap:
         def __reduce__(self):
             return (Path.touch, (tmp_path / "sprung",))
@@ -164,7 +165,7 @@ def test_bad_arrays_are_refused_and_nothing_is_unpickled(tmp_path):
     assert not (tmp_path / "sprung").exists()
 
 
-def test_a_measured_profile_is_interpolated_and_not_extrapolated(tmp_path):
+def test_profile_is_interpolated_and_not_extrapolated(tmp_path):
     changes = {"demand": {"profile": {"file": "p.csv"}}}
     table = "s [cm],height [mm]\n0,0\n1,0.01\n2,0\n"
     inputs = build_contact(load_config(write(tmp_path, changes, p_csv=table)))
@@ -175,7 +176,7 @@ def test_a_measured_profile_is_interpolated_and_not_extrapolated(tmp_path):
     assert "nothing is extrapolated" in problem.rule and "18.75" in problem.rule
 
 
-def test_an_array_over_a_rectangle(tmp_path):
+def test_profile_array_over_a_rectangle(tmp_path):
     changes = {
         "boundary": {"lengths": [2.0, 3.0], "points": [2, 4]},
         "demand": {"profile": {"file": "p.npy"}},
@@ -197,7 +198,7 @@ NPTS=  5, DT= .50000 SEC
 MOTION = {"load": {"series": {"file": "r.at2", "per_unit": "30 um/s"}}}
 
 
-def test_a_strong_motion_record(tmp_path):
+def test_at2_record_is_read(tmp_path):
     for text in (AT2, AT2 + "*** End Data ***\n", AT2.replace("The units are (g)", "UNITS OF G")):
         inputs = build_contact(load_config(write(tmp_path, MOTION, r_at2=text)))
         signal = inputs.load_signal
@@ -217,12 +218,12 @@ def test_a_strong_motion_record(tmp_path):
         (".50000 SEC", "0.0 SEC", "r.at2, line 3", "positive step"),
     ],
 )
-def test_a_broken_strong_motion_record(old, new, place, said, tmp_path):
+def test_at2_record_with_errors_is_rejected(old, new, place, said, tmp_path):
     problem = problems_of(write(tmp_path, MOTION, r_at2=AT2.replace(old, new)))[0]
     assert problem.place.startswith(place) and said in str(problem), problem
 
 
-def test_a_strong_motion_record_needs_a_meaning(tmp_path):
+def test_at2_record_requires_per_unit(tmp_path):
     changes = {"load": {"series": {"file": "r.at2"}}}
     (problem,) = problems_of(write(tmp_path, changes, r_at2=AT2))
     assert problem.place == "run.toml: load.series.per_unit"
@@ -232,7 +233,7 @@ def test_a_strong_motion_record_needs_a_meaning(tmp_path):
 @pytest.mark.skipif(
     not EL_CENTRO.exists(), reason="the El Centro record is not beside the checkout"
 )
-def test_the_el_centro_record(tmp_path):
+def test_at2_el_centro_record_is_read(tmp_path):
     changes = {
         "load": {"series": {"file": "elCentro.at2", "per_unit": "30 um/s"}},
         "time.end": 31.16,
@@ -246,7 +247,7 @@ def test_the_el_centro_record(tmp_path):
     assert np.max(np.abs(series.values)) / 30 == pytest.approx(0.319, abs=1e-3)
 
 
-def test_a_file_that_is_too_large(tmp_path, monkeypatch):
+def test_data_file_that_is_too_large_is_rejected(tmp_path, monkeypatch):
     monkeypatch.setattr("dvax.app.runs.data_file.MAX_BYTES", 20)
     found = problems_of(write(tmp_path))
     assert any("at most 20" in p.rule for p in found)

@@ -1,4 +1,4 @@
-"""The demonstration's files are what their script says, and all of its physics occurs."""
+"""The files of the demonstration are the output of their script, and show all three regimes."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from dvax.app.runs.config import build_contact, load_config
 from dvax.app.runs.demo import generate
 
 
-def test_the_shipped_files_come_from_the_script():
+def test_demo_files_are_the_output_of_their_script():
     shipped = np.load(generate.FOLDER / generate.PROFILE, allow_pickle=False)
     np.testing.assert_allclose(shipped, generate.heights(), rtol=0, atol=1e-12)
     rows = (generate.FOLDER / generate.LOAD).read_text().splitlines()
@@ -18,7 +18,7 @@ def test_the_shipped_files_come_from_the_script():
     np.testing.assert_allclose(a, b, rtol=0, atol=1.01e-6)
 
 
-def test_the_surface_is_self_affine_with_the_stated_height():
+def test_demo_surface_is_self_affine_with_the_stated_height():
     height = generate.heights()
     assert np.mean(height) == pytest.approx(0.8, abs=1e-12)
     assert np.std(height) == pytest.approx(0.8, abs=1e-12)
@@ -29,12 +29,12 @@ def test_the_surface_is_self_affine_with_the_stated_height():
     assert np.sum(power[k]) == pytest.approx(np.sum(power), rel=1e-12), "band-limited"
 
 
-def test_the_surface_is_the_same_at_every_resolution():
+def test_demo_surface_is_the_same_at_every_resolution():
     # Midpoints of 20 000 cells are, every third one, midpoints of a third as many cells.
     np.testing.assert_allclose(generate.heights(2001 * 3)[1::3], generate.heights(2001), atol=1e-11)
 
 
-def test_all_three_regimes_occur_and_the_decay_criterion_holds():
+def test_demo_has_three_regimes_and_satisfies_the_decay_criterion():
     config = load_config(generate.FOLDER / generate.CONFIG)
     m, inputs = config.model, build_contact(config)
     assert inputs.boundary.size == 20_000

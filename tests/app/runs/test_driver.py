@@ -1,4 +1,4 @@
-"""A run directory says what is true: its bounds hold, and its pieces fit together."""
+"""Runs: their bounds hold, and the files of a run directory agree with each other."""
 
 import json
 from pathlib import Path
@@ -66,7 +66,7 @@ def assert_what_every_run_promises(frames: xr.Dataset) -> None:
 
 
 @pytest.mark.thorough
-def test_the_bound_of_a_coarse_run_covers_its_distance_to_a_fine_one(tmp_path: Path):
+def test_run_bound_covers_the_distance_to_a_fine_run(tmp_path: Path):
     load = 'expression = "2*sin(3*t)"'
     coarse, _, _ = solved(tmp_path / "coarse", load, 6.0, 'dt = "0.05 s"')
     fine, _, _ = solved(tmp_path / "fine", load, 6.0, "rtol = 1e-9")
@@ -81,7 +81,7 @@ def test_the_bound_of_a_coarse_run_covers_its_distance_to_a_fine_one(tmp_path: P
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("method", ["ETD4RK", "ExpRosenbrock", "DormandPrince"])
-def test_every_method_has_its_run_and_its_bound(tmp_path: Path, method: str):
+def test_run_with_every_method_has_a_bound(tmp_path: Path, method: str):
     load = 'expression = "2*sin(3*t)"'
     runs = {
         name: solved(tmp_path / name, load, 6.0, f'dt = "{dt} s"\nmethod = "{name}"')[0]
@@ -94,7 +94,7 @@ def test_every_method_has_its_run_and_its_bound(tmp_path: Path, method: str):
     assert np.all(apart <= bound)
 
 
-def test_summary_and_manifest_agree_with_the_frames(tmp_path: Path):
+def test_run_summary_and_manifest_agree_with_the_frames(tmp_path: Path):
     frames, summary, manifest = solved(tmp_path / "run", 'value = "0.3 um/s"', 2.0, "rtol = 1e-6")
     force = frames["pressure"].values @ frames["weight"].values
     assert summary["peak_force"]["value"] == pytest.approx(force.max())
@@ -109,7 +109,7 @@ def test_summary_and_manifest_agree_with_the_frames(tmp_path: Path):
 
 
 @pytest.mark.skipif(not EL_CENTRO.is_file(), reason="the El Centro record is not on this machine")
-def test_the_recorded_earthquake_drives_the_strip(tmp_path: Path):
+def test_run_of_the_strip_under_a_recorded_earthquake(tmp_path: Path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "elCentro.at2").write_bytes(EL_CENTRO.read_bytes())
     load = 'series = { file = "elCentro.at2", per_unit = "30 um/s" }'
@@ -121,7 +121,7 @@ def test_the_recorded_earthquake_drives_the_strip(tmp_path: Path):
     assert 0 < summary["error_bound_x"]["value"] < 1e-2
 
 
-def test_a_run_reports_compilation_before_progress(tmp_path: Path):
+def test_run_reports_compilation_before_progress(tmp_path: Path):
     config = tmp_path / "strip.toml"
     # A size of its own: what another test has compiled is not compiled again.
     text = STRIP.format(load='value = "0.3 um/s"', end=1.0, solver='dt = "0.05 s"')
@@ -133,7 +133,7 @@ def test_a_run_reports_compilation_before_progress(tmp_path: Path):
 
 
 @pytest.mark.thorough
-def test_a_main_trajectory_that_fails_shortens_its_companion(tmp_path: Path):
+def test_run_failure_of_the_main_trajectory_shortens_its_companion(tmp_path: Path):
     config = tmp_path / "strip.toml"
     # No number about t = 1.27, which lies between the samples of the check on reading.
     hole = "0.3 + 0*sqrt((t - 1.27)**2 - 1e-4)"

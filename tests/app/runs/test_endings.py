@@ -1,4 +1,4 @@
-"""What is left when a run is killed or the disk is full."""
+"""The state of a run directory after a kill or on a full disk."""
 
 import json
 import os
@@ -20,7 +20,7 @@ from dvax.app.runs.rundir import FrameStore, close_killed, cut_incomplete, proce
 
 @contextmanager
 def room_for(size: int):
-    """No file may grow beyond `size` bytes: what a full disk does, without filling one."""
+    """Limit files to `size` bytes, which acts like a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -29,7 +29,7 @@ def room_for(size: int):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_where_nothing_can_be_written_the_old_file_stays_and_no_part_is_left(
+def test_failed_write_keeps_the_old_file_and_leaves_no_part(
     tmp_path: Path,
 ) -> None:
     file = tmp_path / "summary.json"
@@ -41,7 +41,7 @@ def test_where_nothing_can_be_written_the_old_file_stays_and_no_part_is_left(
 
 
 @pytest.mark.parametrize("stills", [True, False])
-def test_a_report_without_room_names_path_and_fix_and_leaves_nothing(
+def test_report_on_a_full_disk_names_path_and_fix(
     tmp_path: Path, stills: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), frames=21))
@@ -73,7 +73,7 @@ def block(first: int, count: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
 
 @pytest.mark.parametrize("blocks", [0, 1, 3])
-def test_at_every_moment_xarray_sees_the_complete_frames_alone(tmp_path: Path, blocks: int) -> None:
+def test_run_directory_shows_only_complete_frames_at_any_time(tmp_path: Path, blocks: int) -> None:
     store = store_of(tmp_path, 41)
     for k in range(blocks):
         store.write(*block(2 * k, 2))
@@ -84,13 +84,13 @@ def test_at_every_moment_xarray_sees_the_complete_frames_alone(tmp_path: Path, b
 
 
 def gone() -> int:
-    """The number of a process that has ended."""
+    """Return the id of a process that has ended."""
     done = subprocess.Popen([sys.executable, "-c", ""])
     done.wait()
     return done.pid
 
 
-def test_a_killed_run_is_closed_and_one_that_goes_on_is_not(tmp_path: Path) -> None:
+def test_close_killed_closes_dead_runs_only(tmp_path: Path) -> None:
     store = store_of(tmp_path, 41)
     store.write(*block(0, 2))
     file = tmp_path / "manifest.json"
@@ -108,10 +108,10 @@ def test_a_killed_run_is_closed_and_one_that_goes_on_is_not(tmp_path: Path) -> N
     file.write_text(
         json.dumps({"status": "running", **process(), "process": gone(), "host": "other"})
     )
-    assert not close_killed(tmp_path)  # nobody here can know
+    assert not close_killed(tmp_path)  # the state of a process on another host is unknown
 
 
-def test_frames_without_a_time_are_cut_off(tmp_path: Path) -> None:
+def test_frames_without_a_time_are_removed(tmp_path: Path) -> None:
     store = store_of(tmp_path, 9)
     store.write(*block(0, 2))
     store._arrays["pressure"][2:4] = 7.0  # the run is killed here
@@ -120,7 +120,7 @@ def test_frames_without_a_time_are_cut_off(tmp_path: Path) -> None:
         assert seen.sizes["time"] == 2 and not seen["pressure"].isnull().any()
 
 
-def test_a_page_of_a_killed_run_says_so(tmp_path: Path) -> None:
+def test_report_of_a_killed_run_states_it(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), frames=21, written=11, status="running"))
     file = run_dir / "manifest.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | process() | {"process": gone()}))

@@ -1,4 +1,4 @@
-"""The expression language computes what is written, and nothing else can be written in it."""
+"""The expression language evaluates formulas, and rejects everything else."""
 
 import math
 import pickle
@@ -38,7 +38,7 @@ SAME_AS_NUMPY = {
 
 
 @pytest.mark.parametrize("text", SAME_AS_NUMPY)
-def test_a_formula_has_the_value_of_its_mathematics(text):
+def test_expression_value_is_that_of_the_formula(text):
     expression = compile_expression(text)
     expected = SAME_AS_NUMPY[text]
     with jax.enable_x64(True):
@@ -48,12 +48,12 @@ def test_a_formula_has_the_value_of_its_mathematics(text):
     np.testing.assert_allclose(expression.numpy(t=T, s=S), expected, rtol=1e-14, atol=1e-14)
 
 
-def test_every_function_is_exercised_above():
+def test_expression_functions_are_all_tested():
     used = " ".join(SAME_AS_NUMPY)
     assert all(f"{name}(" in used for name in FUNCTIONS)
 
 
-def test_derivatives_and_batches_go_through():
+def test_expression_supports_derivatives_and_batches():
     expression = compile_expression("t**2 * sin(s) + where(s > 0, s**3, -s)")
     with jax.enable_x64(True):
         slope = jax.vmap(jax.grad(lambda s: expression(t=2.0, s=s)))(jnp.asarray(S))
@@ -64,17 +64,17 @@ def test_derivatives_and_batches_go_through():
     assert at_zero == 1.0, "a whole power has its derivative at zero too"
 
 
-def test_whole_numbers_are_real_numbers():
+def test_expression_integers_are_real_numbers():
     assert float(compile_expression("1/t**2")(t=2, s=0)) == 0.25
 
 
-def test_step_keeps_nan_and_is_one_at_zero():
+def test_expression_step_keeps_nan_and_is_one_at_zero():
     step = compile_expression("step(t)")
     assert step.numpy(t=0.0, s=0.0) == 1.0 and step.numpy(t=-1e-300, s=0.0) == 0.0
     assert np.isnan(step.numpy(t=math.nan, s=0.0))
 
 
-def test_an_expression_is_a_value():
+def test_expression_is_hashable_and_comparable():
     a, b = compile_expression("t + s"), compile_expression("t + s")
     assert a == b and hash(a) == hash(b)
     assert a != compile_expression("t + s", ("t", "s", "r"))
@@ -84,7 +84,7 @@ def test_an_expression_is_a_value():
     assert again == a and again.numpy(t=1.0, s=2.0) == 3.0
 
 
-def test_a_call_names_exactly_the_variables():
+def test_expression_call_requires_exactly_its_variables():
     with pytest.raises(TypeError, match="is a function of t, s; it was called with t"):
         compile_expression("t")(t=1.0)
 
@@ -148,12 +148,12 @@ ATTACKS = {
 @pytest.mark.parametrize(
     "text", ATTACKS, ids=lambda text: text[:24].encode("unicode_escape").decode()
 )
-def test_what_is_no_formula_is_refused_with_its_reason(text):
+def test_expression_rejects_invalid_formulas_with_a_reason(text):
     with pytest.raises(InputError, match=ATTACKS[text]):
         compile_expression(text)
 
 
-def test_the_place_is_the_column_in_the_text_as_written():
+def test_expression_error_names_the_column():
     with pytest.raises(InputError) as caught:
         compile_expression("   t + sine(t)\n + rubbish", place="load.expression")
     assert [p.place for p in caught.value.problems] == [
@@ -163,7 +163,7 @@ def test_the_place_is_the_column_in_the_text_as_written():
     assert caught.value.problems[0].fix == "Did you mean 'sin'?"
 
 
-def test_what_is_no_text():
+def test_expression_rejects_values_that_are_not_strings():
     with pytest.raises(InputError, match="an expression is a text"):
         compile_expression(3)
 
@@ -175,8 +175,8 @@ TOKENS = (
 ).split(" ")
 
 
-def judge(text: str) -> bool:
-    """Whether the text is a formula; then it computes. No exception but InputError leaves."""
+def parses_safely(text: str) -> bool:
+    """Return whether the text is a formula, which is then evaluated; only InputError may be raised."""
     try:
         expression = compile_expression(text)
     except InputError as refused:
@@ -188,16 +188,16 @@ def judge(text: str) -> bool:
 
 
 @pytest.mark.parametrize("cases", [20_000, pytest.param(300_000, marks=pytest.mark.thorough)])
-def test_random_token_soup_raises_input_errors_alone(cases):
+def test_expression_random_tokens_raise_input_errors_only(cases):
     dice = random.Random(cases)
     passed = 0
     for _ in range(cases):
         joint = dice.choice(("", " "))
-        passed += judge(joint.join(dice.choices(TOKENS, k=dice.randint(1, 14))))
+        passed += parses_safely(joint.join(dice.choices(TOKENS, k=dice.randint(1, 14))))
     assert cases / 200 < passed < cases, "the soup reaches both verdicts"
 
 
 @settings(max_examples=500, deadline=None, database=None, derandomize=True)
 @given(st.text(max_size=80) | st.lists(st.sampled_from(TOKENS), max_size=40).map("".join))
-def test_arbitrary_text_raises_input_errors_alone(text):
-    judge(text)
+def test_expression_arbitrary_text_raises_input_errors_only(text):
+    parses_safely(text)

@@ -1,4 +1,4 @@
-"""Signals are noted in whatever runs, raised where the main thread waits, and never in a write."""
+"""Signals are recorded at any time, raised while the main thread waits, and never during a write."""
 
 import os
 import signal
@@ -32,7 +32,7 @@ def from_a_terminal() -> Iterator[None]:
 
 
 @BOTH
-def test_a_signal_ends_a_wait(number: int, kind: type[KeyboardInterrupt]) -> None:
+def test_signal_ends_a_wait(number: int, kind: type[KeyboardInterrupt]) -> None:
     with terminable():
         with pytest.raises(KeyboardInterrupt) as caught:
             interruptible(lambda: (send(number), threading.Event().wait()))
@@ -40,7 +40,7 @@ def test_a_signal_ends_a_wait(number: int, kind: type[KeyboardInterrupt]) -> Non
 
 
 @BOTH
-def test_code_that_swallows_exceptions_does_not_swallow_a_signal(
+def test_signal_is_not_swallowed_by_broad_except_clauses(
     number: int, kind: type[KeyboardInterrupt]
 ) -> None:
     survived = False
@@ -56,7 +56,7 @@ def test_code_that_swallows_exceptions_does_not_swallow_a_signal(
 
 
 @BOTH
-def test_a_write_is_never_cut(number: int, kind: type[KeyboardInterrupt]) -> None:
+def test_signal_does_not_interrupt_a_write(number: int, kind: type[KeyboardInterrupt]) -> None:
     written = []
     with pytest.raises(kind), terminable():
         with writing():
@@ -66,7 +66,7 @@ def test_a_write_is_never_cut(number: int, kind: type[KeyboardInterrupt]) -> Non
     assert written == ["whole", "and after"]
 
 
-def test_a_second_signal_is_a_second_interruption() -> None:
+def test_second_signal_interrupts_again() -> None:
     with terminable():
         for number in (signal.SIGTERM, signal.SIGINT):
             send(number)
@@ -75,7 +75,7 @@ def test_a_second_signal_is_a_second_interruption() -> None:
         assert interruptible(lambda: 7) == 7
 
 
-def test_a_signal_that_is_ignored_stays_ignored() -> None:
+def test_ignored_signal_stays_ignored() -> None:
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     with terminable():
         send(signal.SIGINT)
@@ -83,7 +83,7 @@ def test_a_signal_that_is_ignored_stays_ignored() -> None:
     signal.signal(signal.SIGINT, before)
 
 
-def test_within_another_the_outer_one_answers() -> None:
+def test_nested_terminable_is_handled_by_the_outer_one() -> None:
     with pytest.raises(Terminated), terminable():
         with terminable():
             send(signal.SIGTERM)
@@ -91,7 +91,7 @@ def test_within_another_the_outer_one_answers() -> None:
         assert raise_here and interruptible(lambda: 1)
 
 
-def test_work_has_a_time_and_goes_on() -> None:
+def test_work_result_with_timeout_leaves_the_work_running() -> None:
     release = threading.Event()
     work = Work(lambda: release.wait() and 7)
     with pytest.raises(TimeoutError):
@@ -106,7 +106,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 import dvax.app.cli.check
 from dvax.app.cli import main
 
-def held(error):  # in the main thread: a lock that nobody gives back, as foreign code may take one
+def held(error):  # in the main thread: a lock that is never released, as third-party code may take
     lock = threading.Lock()
     lock.acquire()
     print("held", file=sys.stderr, flush=True)
@@ -120,7 +120,7 @@ main()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM])
-def test_a_main_thread_that_is_held_up_is_ended_from_outside(number: signal.Signals) -> None:
+def test_blocked_main_thread_is_terminated(number: signal.Signals) -> None:
     run = subprocess.Popen(
         [sys.executable, "-c", HELD], stderr=subprocess.PIPE, text=True,
         env=os.environ | {"PYTHONPATH": str(Path(dvax.__file__).parents[1])},

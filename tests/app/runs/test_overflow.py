@@ -1,4 +1,4 @@
-"""Numbers that overflow, and solves that refuse their input, leave a run directory that is true."""
+"""Run directories are correct after numbers overflow, and after a solve rejects its input."""
 
 import json
 import math
@@ -39,7 +39,7 @@ TINY = {"norms": [('beta = "0.5 MPa/um"', "beta = 1e-300")]}
     [(math.inf, "inf", "∞"), (-math.inf, "-inf", "−∞"), (math.nan, "nan", "NaN"), (1.5, 1.5, "1.5"),
      (np.float64(np.inf), "inf", "∞")],
 )  # fmt: skip
-def test_a_number_has_one_spelling_in_json_and_one_on_the_screen(value, spelled, shown) -> None:
+def test_nonfinite_numbers_have_one_spelling_in_json_and_one_in_text(value, spelled, shown) -> None:
     content = json_ready({"rows": [{"value": value}], "pair": (value, "text", None, True)})
     text = json.dumps(content, allow_nan=False)
     assert json.loads(text) == {
@@ -54,12 +54,12 @@ def test_a_number_has_one_spelling_in_json_and_one_on_the_screen(value, spelled,
     assert ("gives no bound" in meaning) == (not math.isfinite(value))
 
 
-def test_a_log_axis_has_room_for_what_is_drawn() -> None:
+def test_log_axis_covers_the_curve() -> None:
     values = np.array([0.0, -1.0, np.inf, np.nan, 1e300, LARGEST, 1e-300])
     np.testing.assert_array_equal(np.isnan(positive(values)), [True] * 5 + [False] * 2)
 
 
-def test_constants_that_overflow_warn_nobody_and_say_so() -> None:
+def test_constants_that_overflow_give_no_warning_and_a_note() -> None:
     c = dvax.Constants(
         gamma=1.0, L_F=1.0, alpha_h=1.0, beta_h=0.0, alpha_f=900.0, beta_f=1.0, M=1.0, omega=-1.0,
         m_P=1.0, norm_P_inv=1.0, one_sided=900.0,
@@ -72,7 +72,7 @@ def test_constants_that_overflow_warn_nobody_and_say_so() -> None:
 
 
 @pytest.mark.parametrize("changes", mostly_thorough([*INFINITE.values(), *TINY.values()], []))
-def test_a_run_that_overflows_ends_with_all_of_its_files(tmp_path: Path, changes: Any) -> None:
+def test_run_that_overflows_writes_all_files(tmp_path: Path, changes: Any) -> None:
     config, out = write_config(tmp_path / "in", *changes), tmp_path / "out"
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
@@ -102,7 +102,7 @@ REFUSED = InputError(InputProblem("dvax.solve(dt_max)", "1e-12", "it is too shor
     ("error", "code"),
     [(REFUSED, 2), (SolveError("f is nan at t = 3."), 3), (TypeError("odd"), None)],
 )
-def test_whatever_ends_a_solve_closes_the_manifest(
+def test_failed_solve_closes_the_manifest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, code: int | None
 ) -> None:
     def solve(*_: Any, **__: Any) -> None:
@@ -125,7 +125,7 @@ def test_whatever_ends_a_solve_closes_the_manifest(
 
 
 @pytest.mark.parametrize("bad", [0, 2, 3])
-def test_a_state_that_is_not_finite_is_a_failure_with_its_time(bad: int) -> None:
+def test_nonfinite_state_is_a_failure_with_its_time(bad: int) -> None:
     ts = np.array([1.0, 1.5, 2.0])
     solution = dvax.solve(
         dvax.models.Contact(
@@ -146,7 +146,7 @@ def test_a_state_that_is_not_finite_is_a_failure_with_its_time(bad: int) -> None
 
 
 @pytest.mark.parametrize("frames", [2, 3, 9, 81, 1000])
-def test_the_longest_block_is_what_a_solve_covers(frames: int) -> None:
+def test_longest_block_is_what_a_solve_covers(frames: int) -> None:
     times = np.linspace(0.0, 1.0, frames)
     block = block_length(frames, 24)
     spans = [
@@ -166,7 +166,7 @@ def test_the_longest_block_is_what_a_solve_covers(frames: int) -> None:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("method", ["ETD2RK", "ETD4RK"])
-def test_the_number_of_steps_that_a_failure_names_suffices(tmp_path: Path, method: str) -> None:
+def test_suggested_max_steps_of_a_run_suffices(tmp_path: Path, method: str) -> None:
     def ended(folder: str, steps: int) -> driver.RunOutcome:
         keys = f'max_steps = {steps}\nmethod = "{method}"'
         config = write_config(tmp_path / folder, ("dt = 0.05", keys))
@@ -184,7 +184,7 @@ def test_the_number_of_steps_that_a_failure_names_suffices(tmp_path: Path, metho
      ("float32", True, "Give x0 as float64, or pass rtol = 1.3e-05 or more"),
      ("float32", False, r"jax_enable_x64', True\) before anything else, or pass rtol = 1.3e-05")],
 )  # fmt: skip
-def test_the_fix_for_a_precision_can_be_followed(dtype: str, x64: bool, said: str) -> None:
+def test_suggested_tolerance_for_the_precision_suffices(dtype: str, x64: bool, said: str) -> None:
     from dvax.evolution.arguments import warn_precision
 
     before = jax.config.read("jax_enable_x64")
@@ -201,7 +201,7 @@ def test_the_fix_for_a_precision_can_be_followed(dtype: str, x64: bool, said: st
         jax.config.update("jax_enable_x64", before)
 
 
-def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path: Path) -> None:
+def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
     config = write_config(tmp_path)
     config.write_bytes(b"\xef\xbb\xbf" + config.read_bytes())
     assert load_config(config).time.end == 1.0

@@ -1,4 +1,4 @@
-"""Runs of applications that stop early: what was computed is kept, readable, and the same."""
+"""Runs of applications that stop early: the computed part is kept, readable, and unchanged."""
 
 import json
 import os
@@ -54,7 +54,7 @@ class Stops:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The run to its end."""
+    """The complete run."""
     folder = tmp_path_factory.mktemp("whole")
     return run(configured(folder), folder / "out")
 
@@ -72,9 +72,7 @@ SOLVE_ERROR = dvax.SolveError(
         (SOLVE_ERROR, "failed", 3),
     ],
 )
-def test_a_run_that_stops_keeps_its_frames_and_the_report_opens(
-    whole, tmp_path, error, status, code
-):
+def test_stopped_run_keeps_its_frames_and_has_a_report(whole, tmp_path, error, status, code):
     config = configured(tmp_path)
     outcome = run(config, tmp_path / "part", on_event=Stops(3, error))
     assert (outcome.exit_code, outcome.status, outcome.has_results) == (code, status, True)
@@ -104,7 +102,7 @@ def test_a_run_that_stops_keeps_its_frames_and_the_report_opens(
 
 
 @pytest.mark.thorough  # a program of its own for every max_steps
-def test_a_failed_solve_keeps_what_it_reached_and_names_the_key_of_the_file(tmp_path):
+def test_failed_run_keeps_its_frames_and_names_the_key(tmp_path):
     outcome = run(configured(tmp_path, "max_steps = 12\n"), tmp_path / "out")
     assert outcome.exit_code == 3 and "Write model.max_steps = " in outcome.stop_reason
     enough = int(outcome.stop_reason.split("model.max_steps = ")[1].split(",")[0])
@@ -112,7 +110,7 @@ def test_a_failed_solve_keeps_what_it_reached_and_names_the_key_of_the_file(tmp_
 
 
 def plan_of_the_closed_form(count: int, **settings) -> Plan:
-    """The paper's contact law at a point: x(2) is known in closed form."""
+    """The contact law of the paper at a point: x(2) has a closed form."""
     model = dvax.models.Contact(
         alpha=1.0, beta=1.0, b_x=2.0, b_u=1.0, d_x=0.5, d_u=1.0, kappa0=0.5, g=1.0, ell=3.0
     )
@@ -131,7 +129,7 @@ def plan_of_the_closed_form(count: int, **settings) -> Plan:
         [(41, {}), (41, {"dt": 0.01})],
     ),
 )
-def test_pieces_join_to_a_solution_whose_bound_holds(count, settings):
+def test_segments_join_to_a_solution_whose_bound_holds(count, settings):
     plan = plan_of_the_closed_form(count, **settings)
     pieces = list(segments(plan))
     found = join_pieces(pieces)
@@ -156,7 +154,7 @@ def test_pieces_join_to_a_solution_whose_bound_holds(count, settings):
     assert bound.status == other.status
 
 
-def test_states_alone_are_kept_where_there_is_no_time_for_more(tmp_path, whole, monkeypatch):
+def test_stopped_run_without_time_keeps_states_only(tmp_path, whole, monkeypatch):
     config = configured(tmp_path)
 
     def hurried(*given):
@@ -172,7 +170,7 @@ def test_states_alone_are_kept_where_there_is_no_time_for_more(tmp_path, whole, 
     assert "Partial results." in page and "more than its states" in page
 
 
-def test_work_in_a_thread_returns_and_raises_as_it_would_here():
+def test_work_in_a_thread_returns_and_raises_like_a_call():
     assert interruptible(lambda: 7) == 7
     with pytest.raises(dvax.InputError, match="x0"):
         interruptible(lambda: dvax.verify(plan_of_the_closed_form(2).problem, float("nan")))
@@ -211,7 +209,7 @@ main()
         [("plan", "run", signal.SIGTERM), ("__init__", "check", signal.SIGINT)],
     ),
 )
-def test_a_signal_ends_a_compiled_loop_without_end(tmp_path, stage, command, number):
+def test_signal_ends_an_endless_compiled_loop(tmp_path, stage, command, number):
     configured(tmp_path)
     out = tmp_path / "out"
     words = [command, str(tmp_path / "tank.toml"), *(["-o", str(out)] if command == "run" else [])]

@@ -51,7 +51,7 @@ def values(count: int, first: int = 0) -> dict[str, np.ndarray]:
     }
 
 
-def test_xarray_finds_coordinates_units_and_attributes(store: FrameStore) -> None:
+def test_run_directory_has_coordinates_units_and_attributes_for_xarray(store: FrameStore) -> None:
     store.write(np.arange(3.0), values(3))
     frames = opened(store)
     assert set(frames.coords) == {"time", "s", "weight"}
@@ -73,9 +73,7 @@ def test_xarray_finds_coordinates_units_and_attributes(store: FrameStore) -> Non
     }
 
 
-def test_the_store_is_what_xarray_itself_would_have_laid_out(
-    store: FrameStore, tmp_path: Path
-) -> None:
+def test_run_directory_store_equals_that_of_xarray(store: FrameStore, tmp_path: Path) -> None:
     fixed = xr.Dataset(coords=opened(store)[["s", "weight"]].coords)
     fixed.to_zarr(tmp_path / "own.zarr", consolidated=False, zarr_format=3)
     for name in ("s", "weight"):
@@ -89,7 +87,7 @@ def test_the_store_is_what_xarray_itself_would_have_laid_out(
         assert here.read_bytes() == there.read_bytes()
 
 
-def test_a_frame_has_a_time_only_when_it_is_whole(store: FrameStore) -> None:
+def test_frame_has_a_time_only_if_it_is_complete(store: FrameStore) -> None:
     store.write(np.arange(3.0), values(3))
     broken = values(3, first=3)
     del broken["error_bound_x"]
@@ -100,7 +98,7 @@ def test_a_frame_has_a_time_only_when_it_is_whole(store: FrameStore) -> None:
     np.testing.assert_array_equal(frames["pressure"][:3], values(3)["pressure"])
 
 
-def test_what_is_marked_and_cut_off_is_on_disk(store: FrameStore) -> None:
+def test_marked_and_truncated_frames_are_on_disk(store: FrameStore) -> None:
     store.write(np.arange(3.0), values(3))
     store.mark(("error_bound_x",), "proved")
     store.write(np.array([3.0]), values(1, first=3))
@@ -111,7 +109,7 @@ def test_what_is_marked_and_cut_off_is_on_disk(store: FrameStore) -> None:
     np.testing.assert_array_equal(frames["pressure"], values(4)["pressure"])
 
 
-def test_neither_a_run_nor_its_report_loads_xarray_or_pandas() -> None:
+def test_run_and_report_do_not_import_xarray_or_pandas() -> None:
     program = (
         "import sys, dvax.app.runs.driver, dvax.app.plots\n"
         "print([name for name in ('xarray', 'pandas') if name in sys.modules])"

@@ -24,7 +24,7 @@ CIRCUIT = '[model]\nname = "circuit"\nnetlist = "a.cir"\nt_end = 1.0\n'
 
 
 @pytest.mark.parametrize("name", APPLICATIONS)
-def test_every_table_has_every_option(name: str) -> None:
+def test_solver_options_exist_in_every_model_table(name: str) -> None:
     section = module_of(name).APPLICATION.section
     assert issubclass(section, SolverKeys) and set(section.model_fields) >= OPTIONS
     assert set(SolverSection.model_fields) == OPTIONS
@@ -32,7 +32,7 @@ def test_every_table_has_every_option(name: str) -> None:
 
 
 @pytest.mark.parametrize("given", GIVEN)
-def test_what_is_given_goes_to_solve_and_drops_the_defaults_of_the_other_kind(given) -> None:
+def test_solver_options_go_to_solve_and_replace_conflicting_defaults(given) -> None:
     keywords = settings(SolverKeys.model_validate(given), rtol=1e-8, atol=1e-9, method="its own")
     for name, value in given.items():
         kind = type(keywords[name]).__name__ if name in ("method", "vi_solver") else keywords[name]
@@ -56,7 +56,9 @@ def test_what_is_given_goes_to_solve_and_drops_the_defaults_of_the_other_kind(gi
         (Fix("", "", "Check f there"), "Check f there"),
     ],
 )
-def test_a_fix_is_a_key_of_the_file_or_nothing(name: str, fix: Fix, said: str | None) -> None:
+def test_solver_fix_names_a_key_of_the_file_or_nothing(
+    name: str, fix: Fix, said: str | None
+) -> None:
     assert wording_of(module_of(name).APPLICATION, "a.toml").fix(fix) == said
 
 
@@ -80,7 +82,7 @@ def test_a_fix_is_a_key_of_the_file_or_nothing(name: str, fix: Fix, said: str | 
         ("rtoll = 1e-3\n", "model.rtoll", "Did you mean 'rtol'?"),
     ],
 )  # fmt: skip
-def test_options_that_do_not_go_together_are_refused(
+def test_solver_options_in_conflict_are_rejected(
     tmp_path: Path, more: str, place: str, words: str
 ) -> None:
     (tmp_path / "a.cir").write_text(TANK)
@@ -97,5 +99,5 @@ def test_options_that_do_not_go_together_are_refused(
     [({}, True), ({"rtol": 1e-6}, True), ({"dt": 0.1}, False), ({"dt_max": 0.1}, False),
      ({"vi_solver": "Auto"}, False), ({"method": "ETD2RK"}, False)],
 )  # fmt: skip
-def test_options_of_steps_ask_for_a_method_that_takes_steps(given, expected: bool) -> None:
+def test_solver_step_options_require_a_stepping_method(given, expected: bool) -> None:
     assert event_driven(SolverKeys.model_validate(given)) is expected

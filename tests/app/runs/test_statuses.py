@@ -1,4 +1,4 @@
-"""A bound made from samples is called estimated everywhere, and only what is proved certified."""
+"""A sampled bound is called estimated in every place, and only proved bounds are called certified."""
 
 import json
 import re
@@ -54,7 +54,9 @@ CASES = [
     ("write", "method", "status"),
     mostly_thorough(CASES, [CASES[1], CASES[2]]),
 )
-def test_every_place_has_the_word(tmp_path: Path, write: Any, method: str, status: str) -> None:
+def test_bound_status_is_shown_in_every_place(
+    tmp_path: Path, write: Any, method: str, status: str
+) -> None:
     if write is CASES[-1][0]:
         pytest.importorskip("skfem")
     config, out = write(tmp_path / "in", method), tmp_path / "out"

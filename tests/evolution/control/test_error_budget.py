@@ -8,7 +8,8 @@ from tests.evolution.control.attempts import NO, YES, attempt
 from dvax.evolution.control.error_budget import ErrorBudget
 
 
-def test_random_steps_never_charge_more_than_the_tolerance():
+def test_error_budget_charges_at_most_the_tolerance_over_random_steps():
+    """The sum of all charges stays below the tolerance."""
     rng = np.random.default_rng(0)
     budget, charged = ErrorBudget.at_start(jnp.asarray(1.0)), 0.0
     for _ in range(300):
@@ -21,7 +22,7 @@ def test_random_steps_never_charge_more_than_the_tolerance():
     assert float(budget.remaining) == pytest.approx(1.0 - charged, abs=1e-12)
 
 
-def test_a_rejected_step_and_roundoff_are_not_charged():
+def test_error_budget_does_not_charge_rejected_steps_and_roundoff():
     budget = ErrorBudget.at_start(jnp.asarray(1.0))
     tried = attempt(2.0, 1e-8)
     for accepted, roundoff in ((NO, NO), (YES, YES)):
@@ -29,7 +30,8 @@ def test_a_rejected_step_and_roundoff_are_not_charged():
     assert float(budget.after(tried, YES, YES, NO).remaining) < 1.0
 
 
-def test_four_crossings_in_a_row_are_allowed_and_a_good_step_allows_them_again():
+def test_error_budget_allows_four_crossings_until_the_next_accurate_step():
+    """Four successive crossings are allowed; an accurate step restores the budget."""
     budget, jump = ErrorBudget.at_start(jnp.asarray(1.0)), attempt(1e9, 1e-14)
     for _ in range(4):
         assert bool(budget.may_cross(jump, YES)) and not bool(budget.may_cross(jump, NO))

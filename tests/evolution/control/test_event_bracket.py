@@ -1,4 +1,4 @@
-"""The event bracket: steps end before an event, cross it, and go on."""
+"""The event bracket: steps end before an event, cross it, and continue."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,12 +15,12 @@ def located(time, size=0.1, before=NOTHING):
     return before.after(attempt(5.0, size), jnp.asarray(time), size, YES)
 
 
-def test_no_event_limits_nothing():
+def test_event_bracket_without_event_does_not_limit_the_step():
     assert float(NOTHING.limit(0.3, jnp.asarray(1.0))) == 1.0
     assert not bool(NOTHING.is_known())
 
 
-def test_a_step_ends_before_the_event_and_the_next_one_behind_it():
+def test_event_bracket_ends_a_step_before_the_event_and_the_next_after_it():
     bracket, directed = located(0.35)
     assert bool(directed)
     before = bracket.limit(0.3, jnp.asarray(1.0))
@@ -30,25 +30,25 @@ def test_a_step_ends_before_the_event_and_the_next_one_behind_it():
     assert float(bracket.limit(before, jnp.asarray(0.353))) == 0.353
 
 
-def test_a_second_estimate_by_a_smaller_step_is_known_more_closely():
+def test_event_bracket_narrows_with_an_estimate_from_a_smaller_step():
     first, _ = located(0.35)
     second, _ = located(0.3501, 0.004, first)
     assert float(second.margin) < 0.1 * float(first.margin)
     assert float(second.margin) >= 4.0 * 1e-14
 
 
-def test_an_event_that_was_passed_is_discarded():
+def test_event_bracket_discards_a_passed_event():
     bracket, _ = located(0.35)
     assert bool(bracket.discard_passed(0.34).is_known())
     assert not bool(bracket.discard_passed(0.36).is_known())
 
 
-def test_an_accepted_step_locates_nothing():
+def test_event_bracket_of_an_accepted_step_locates_no_event():
     bracket, directed = NOTHING.after(attempt(0.5, 0.1), jnp.asarray(0.35), 0.1, NO)
     assert not bool(directed) and not bool(bracket.is_known())
 
 
-def test_steps_that_make_no_progress_are_directed_at_most_eight_times():
+def test_event_bracket_directs_at_most_eight_steps_without_progress():
     bracket, count = NOTHING, 0
     for _ in range(20):
         bracket, directed = located(0.35, 0.1, bracket)

@@ -1,4 +1,4 @@
-"""The roundoff guard tells roundoff from the error of a method."""
+"""The roundoff guard distinguishes roundoff from the error of a method."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,13 +16,13 @@ def after_sizes(error_at, order, sizes):
 
 
 @pytest.mark.parametrize("order", [1, 2, 4])
-def test_an_error_of_the_method_is_no_noise(order):
+def test_roundoff_guard_does_not_mistake_a_method_error_for_noise(order):
     guard = after_sizes(lambda h: 5.0 * h**order, order, 0.5 ** np.arange(6))
     assert float(guard.noise_floor) == 0.0
 
 
 @pytest.mark.parametrize("order", [1, 2, 4])
-def test_an_error_that_does_not_fall_is_noise_and_steps_double(order):
+def test_roundoff_guard_doubles_steps_if_the_error_does_not_decrease(order):
     rng = np.random.default_rng(order)
     guard = after_sizes(lambda h: rng.uniform(1.0, 2.0), order, 0.5 ** np.arange(6))
     assert float(guard.noise_floor) >= 1.0
@@ -32,12 +32,13 @@ def test_an_error_that_does_not_fall_is_noise_and_steps_double(order):
 
 
 @pytest.mark.parametrize("error", [0.05, 1e5])
-def test_errors_without_effect_and_errors_of_jumps_are_no_noise(error):
+def test_roundoff_guard_ignores_negligible_errors_and_errors_of_jumps(error):
     guard = after_sizes(lambda h: error, 2, 0.5 ** np.arange(6))
     assert float(guard.noise_floor) == 0.0
 
 
-def test_twice_the_size_is_tried_after_128_steps_and_then_ever_more_seldom():
+def test_roundoff_guard_tries_twice_the_step_size_at_growing_intervals():
+    """The first trial comes after 128 steps, later ones at growing intervals."""
     guard = RoundoffGuard.at_start(jnp.asarray(1.0))
     trials = []
     for k in range(1, 600):
