@@ -109,7 +109,7 @@ class Solution(eqx.Module):
         if isinstance(self.records, Trajectory):
             records = self.records
             self._check_inside(t, records.start[0], records.end)
-            x, y = records.at(t)
+            x, y = records.evaluate(t)
             x0, u0 = self.setup.x0, self.us[0]
             u = self.flow.operator.inverse(y.reshape(u0.shape).astype(u0.dtype))
             return x.reshape(jnp.shape(x0)).astype(self.xs.dtype), u
