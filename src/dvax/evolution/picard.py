@@ -291,7 +291,7 @@ class Run(eqx.Module):
         c = _pieces(known.value)
         start, end = _rows(X, slice(-1)), _rows(X, slice(1, None))
         ys = None if guess is None else _rows(known.y, slice(-1))
-        sample, looked = jax.vmap(stepper.look)(ends[:-1], ends[1:], start, end, c, ys)
+        sample, looked = jax.vmap(stepper.estimate_defect)(ends[:-1], ends[1:], start, end, c, ys)
         integrated_defect = sample.defect, sample.law_defect
         record = Record(ends[:-1], jnp.broadcast_to(h, (many,)), start, c)
         return Window(
