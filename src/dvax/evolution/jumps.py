@@ -78,8 +78,8 @@ def find_jump(stop: Stop) -> Diagnosis:
                 Fix(
                     "", "",
                     f"Declare the time, so that a step ends there: write the part of {name} that jumps "
-                    f"as dvax.signals.Function(fn, knots=[{b:.15g}]), or compare t with the time directly "
-                    "(jnp.where(t < a, …))",
+                    f"as dvax.signals.Function(fn, knots=[{b:.15g}]), or compare t with the time "
+                    "directly (jnp.where(t < a, …))",
                 ),
             ),
         )  # fmt: skip
