@@ -21,8 +21,8 @@ class RESULTS(eqx.Enumeration):
         "infinite there, or jump; else pass dvax.Implicit(solver) a solver with another root finder."
     )
     switching_unresolved = (
-        "The constraints changed repeatedly at one time, and no mode is consistent after it. Check that "
-        "the law is strongly pseudomonotone (dvax.verify), or use dvax.ExpRosenbrock()."
+        "The constraints changed repeatedly at one time, and no mode is consistent after it. Check "
+        "that the law is strongly pseudomonotone (dvax.verify), or use dvax.ExpRosenbrock()."
     )
     stiff = (
         "Stability limits the steps of the method, and not accuracy: dvax.ExpRosenbrock() may take "

@@ -81,10 +81,10 @@ class AbstractSmallBox(eqx.Module):
 
     def active_bounds(self, y: jax.Array, q: jax.Array, low: jax.Array, up: jax.Array) -> jax.Array:
         """Return −1 or 1 for entries of z = y − F(y) at or beyond the lower or upper bound, else 0."""
-        z, slack = y - (self.M @ y + q), 8 * self.roundoff(y, q)
+        z, slack = y - (self.M @ y + q), 8 * self.rounding(y, q)
         return jnp.where(z <= low + slack, -1, jnp.where(z >= up - slack, 1, 0))
 
-    def roundoff(self, y: jax.Array, q: jax.Array) -> jax.Array:
+    def rounding(self, y: jax.Array, q: jax.Array) -> jax.Array:
         """Return the roundoff error of My + q, entry by entry."""
         y = jnp.abs(y.ravel())
         return jnp.finfo(q.dtype).eps * (jnp.abs(q.ravel()) + jnp.abs(self.M) @ y + y)
@@ -117,7 +117,7 @@ class Faces(AbstractSmallBox):
         active = self.active_bounds(best, q, low, up)
         index = jnp.sum((active + 1) * 3 ** jnp.arange(q.size)[::-1])
         # Prefer the face of the active bounds, for its derivative, if its point solves the law too.
-        slack = 8 * self.roundoff(best, q)
+        slack = 8 * self.rounding(best, q)
         return points[jnp.where(residual[index] <= residual[first] + jnp.min(slack), index, first)]
 
 
