@@ -9,7 +9,7 @@ from tests.selection import mostly_thorough
 
 import dvax
 from dvax import generators, signals
-from dvax.evolution.picard import by_doubling, in_turn
+from dvax.evolution.picard import accumulate_by_doubling, accumulate_sequentially
 
 PLAIN = dvax.operators.Scaling(1.0)
 
@@ -70,7 +70,9 @@ def test_picard_sums_in_turn_and_by_doubling_agree():
     rng = np.random.default_rng(3)
     A = generators.Dense(rng.normal(size=(3, 3)))
     h = jnp.asarray(0.1)
-    both = jax.jit(lambda v: (in_turn(A.propagator(h, 2), v), by_doubling(A, h, v)))
+    both = jax.jit(
+        lambda v: (accumulate_sequentially(A.propagator(h, 2), v), accumulate_by_doubling(A, h, v))
+    )
     for count in (2, 37):
         one, other = both(rng.normal(size=(count, 3)))
         np.testing.assert_allclose(np.asarray(other), np.asarray(one), rtol=1e-11, atol=1e-11)

@@ -223,7 +223,7 @@ def test_piecewise_forcing_with_a_thousand_periods_is_resolved():
         f=lambda t, x, u, args: jnp.sin(2000 * jnp.pi * t) ** 2, h=lambda t, x, u, args: x,
     )  # fmt: skip
     stops = np.array([0.0, 1.0])
-    found = inputs.pieces(problem, stops, jnp.asarray(0.0), None, 100_000)
+    found = inputs.build_pieces(problem, stops, jnp.asarray(0.0), None, 100_000)
     w = 4000 * np.pi
     sol = dvax.solve(problem, 0.0, 0.0, 1.0, method=dvax.PiecewiseLinear())
     e = np.exp(-1.0)

@@ -12,7 +12,7 @@ from tests.selection import mostly_thorough
 import dvax
 from dvax import generators
 from dvax.evolution import checkpoints
-from dvax.evolution.checkpoints import Checkpoints, how_many
+from dvax.evolution.checkpoints import Checkpoints, checkpoint_count
 
 A = np.array([[-0.5, -3.0], [3.0, -0.5]])
 X0 = jnp.array([2.0, 0.3])
@@ -113,7 +113,7 @@ def test_checkpoints_return_every_state_in_reverse_order(places, steps, most):
 @pytest.mark.parametrize("size", [1, 100_000, 10_000_000, 1_000_000_000])
 def test_checkpoints_use_at_most_the_memory_limit(size):
     x0 = jax.ShapeDtypeStruct((size,), np.dtype(float))
-    count = how_many(x0, 2**20)
+    count = checkpoint_count(x0, 2**20)
     assert count * 8 * size <= max(2**30, 16 * 8 * size)
     assert count >= 16
 

@@ -1,10 +1,10 @@
-"""Steps chosen for a bound on the error: `certified_tol` of `dvax.solve`.
+"""Step sizes for a given bound on the error: `certified_tol` of `dvax.solve`.
 
-With a defect of the norm δ all along, ‖x_h − x‖(t) ≤ M Φ_c(t) δ, c = ω + ML̃. So the tolerance of the
-step control follows from the one that is asked for, up to a factor of a few that a run shows. The first
-run is cheap, whatever is asked for. Its bound and its number of steps predict those of the next one, so
-that a tolerance out of reach is refused after it. A bound is called certified where the defect is
-enclosed over every step, and estimated where it is sampled.
+If the norm of the defect is at most δ, then ‖x_h − x‖(t) ≤ M Φ_c(t) δ with c = ω + ML̃. This gives the
+tolerance of the step control up to a small factor, which a run determines. The first run is always
+cheap. Its bound and its number of steps predict those of the next run, and an unreachable tolerance is
+refused after the first run. A bound is called certified if enclosures bound the defect over every step,
+and estimated if the defect is sampled.
 """
 
 from collections.abc import Callable
@@ -24,23 +24,23 @@ from .growth import between, disturbance, gronwall
 from .results import RESULTS
 from .solution import Solution
 
-_COARSE = 100.0
-"""How much coarser the first run is."""
+_FIRST_RUN_FACTOR = 100.0
+"""Ratio of the tolerance of the first run to the predicted one."""
 
-_CHEAP = 1e-5
-"""Of the size of state and rate: the finest tolerance of the first run."""
+_FIRST_RUN_TOLERANCE = 1e-5
+"""Smallest tolerance of the first run, relative to the size of state and rate."""
 
-_AIM = 0.7
-"""The share of the tolerance that a run aims at, so that it need not be made again."""
+_TARGET_SHARE = 0.7
+"""The share of the tolerance that later runs aim at, so that they rarely miss it."""
 
-_RUNS = 8
-_LOOKS = 256
-"""Times up to each of which it is looked whether a run stays in the region of its constants."""
+_MAX_RUNS = 8
+_REGION_CHECKS = 256
+"""Number of times at which to check that a run stays in the region of its constants."""
 
-_ROUNDINGS = 256.0
-"""A rate f̃ is taken to be known to so many roundings of its size, and no defect to be smaller."""
+_RATE_ROUNDOFF = 256.0
+"""Assumed rounding error of f̃, in units of eps times its size: no defect is smaller."""
 
-_NEEDED = ("M", "growth_rate", "beta_f", "norm_P_inv", "gamma")
+_REQUIRED_CONSTANTS = ("M", "growth_rate", "beta_f", "norm_P_inv", "gamma")
 
 
 def certified(
@@ -55,55 +55,61 @@ def certified(
     tol: float,
     max_steps: int,
 ) -> Solution:
-    """The solution whose bound is at most `tol` at every saved time;
-    `run(ts, atol)` solves with this absolute tolerance and no relative one.
+    """Return a solution whose error bound is at most `tol` at every saved time.
 
-    **Raises:** `dvax.InputError` where rounding alone leaves a bound above `tol`.
+    `run(ts, atol)` solves with this absolute tolerance and rtol = 0.
+
+    **Raises:** `dvax.InputError` if `tol` is out of reach, because of roundoff or of `max_steps`.
     """
     _check(constants, tol, x0)
     _check_domain(constants, args, t0, t1)
-    known, span = _growth(constants), t1 - t0
-    grown = known.grown(span)
+    growth, span = _growth(constants), t1 - t0
+    amplification = growth.amplification(span)
     size, largest = (float(v) for v in _sizes(problem, jnp.asarray(t0), x0, args))
     eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(x0))).eps)
-    reachable = _ROUNDINGS * eps * largest * grown
+    reachable = _RATE_ROUNDOFF * eps * largest * amplification
     if not tol >= reachable:
-        raise _hopeless(tol, reachable, known, span, "the roundoff of f alone grows to that")
+        raise _out_of_reach(tol, reachable, growth, span, "the roundoff of f alone grows to that")
     # The step control holds the root mean square of the defect below atol/span.
-    atol = tol / grown * span / size
+    atol = tol / amplification * span / size
     scale = 1.0 + largest / size
-    coarse = max(_COARSE * atol, _CHEAP * scale)
+    coarse = max(_FIRST_RUN_FACTOR * atol, _FIRST_RUN_TOLERANCE * scale)
     atol = coarse if coarse < 0.1 * scale else max(atol, min(coarse, 0.1 * scale))
     before, bound, steps = np.inf, np.inf, 0
-    for _ in range(_RUNS):
+    for _ in range(_MAX_RUNS):
         solution = run(ts, atol)
         if solution.result != RESULTS.successful:
             return solution  # throw=False: the result says what failed, and nothing is certified
-        bounds = _bounds(solution, known, t0)
-        rounding = _rounding(solution, known, max(size, largest), t0, t1)
+        bounds = _bounds(solution, growth, t0)
+        rounding = _rounding(solution, growth, max(size, largest), t0, t1)
         if rounding > 0.5 * tol:
-            many = f"roundoff of x in {int(solution.stats['steps'])} steps, and of t"
-            raise _hopeless(tol, max(2.0 * rounding, reachable), known, span, many)
+            reason = f"roundoff of x in {int(solution.stats['steps'])} steps, and of t"
+            raise _out_of_reach(tol, max(2.0 * rounding, reachable), growth, span, reason)
         last, bound = bound, float(np.max(np.asarray(bounds))) + rounding
         if bound <= tol:
             if of_region(constants):
-                # The same steps, saved more often: the bounds in between are the sharper for it.
-                looks = run(np.linspace(t0, t1, _LOOKS + 1)[1:], atol)
-                left = _leaves(looks, constants, _all_along(looks, known, t0))
-                if left is not None:
-                    raise _outside(left)
+                # The same steps with more saved times, which make the bounds between them sharper.
+                denser = run(np.linspace(t0, t1, _REGION_CHECKS + 1)[1:], atol)
+                exit_time = _exit_time(denser, constants, _interval_bounds(denser, growth, t0))
+                if exit_time is not None:
+                    raise _outside(exit_time)
             return _with_bound(solution, bound)
-        taken = int(solution.stats["steps"])
-        # Where other rules than the tolerance chose the steps, an equal bound says nothing. Elsewhere
-        # it falls like a power of their number, by half the order at the very least.
-        expected = last * (steps / taken) ** (0.5 * _order(solution))
-        if np.isfinite(last) and bound > expected and taken > 1.5 * steps:
-            why = f"{taken} steps gave {bound:.3g}, and {steps} gave {last:.3g}: roundoff"
-            raise _hopeless(tol, min(bound, last), known, span, why)
-        before, steps = atol, taken
-        atol = min(0.5 * atol, _AIM * atol * tol / bound) if np.isfinite(bound) else 0.1 * atol
-        _predict(solution, before / atol, tol, bound, max_steps, known, span)
-    raise _hopeless(tol, bound, known, span, "every finer run fell short of its prediction")
+        new_steps = int(solution.stats["steps"])
+        # The bound should decrease at least with half the order in the number of steps. If it does not
+        # although there are many more steps, roundoff dominates. (With about the same number of steps,
+        # the tolerance did not determine them, and the comparison is meaningless.)
+        expected = last * (steps / new_steps) ** (0.5 * _order(solution))
+        if np.isfinite(last) and bound > expected and new_steps > 1.5 * steps:
+            why = f"{new_steps} steps gave {bound:.3g}, and {steps} gave {last:.3g}: roundoff"
+            raise _out_of_reach(tol, min(bound, last), growth, span, why)
+        before, steps = atol, new_steps
+        atol = (
+            min(0.5 * atol, _TARGET_SHARE * atol * tol / bound)
+            if np.isfinite(bound)
+            else 0.1 * atol
+        )
+        _predict(solution, before / atol, tol, bound, max_steps, growth, span)
+    raise _out_of_reach(tol, bound, growth, span, "every finer run missed its predicted bound")
 
 
 def _predict(
@@ -112,11 +118,13 @@ def _predict(
     tol: float,
     bound: float,
     max_steps: int,
-    known: "_Growth",
+    growth: "_Growth",
     span: float,
 ) -> None:
-    """Refuse a run with a `finer` tolerance that would take more than `max_steps`: a defect of order p
-    takes finer^{1/p} times the steps."""
+    """Raise if a run whose tolerance is smaller by the factor `finer` needs more than `max_steps`.
+
+    With a defect of order p the number of steps grows by finer^{1/p}.
+    """
     order = _order(solution)
     steps = int(solution.stats["steps"]) + int(solution.stats["rejected"])
     needed = steps * finer ** (1.0 / order)
@@ -124,29 +132,33 @@ def _predict(
         least = bound * (steps / max_steps) ** order
         name = type(solution.setup.method).__name__
         why = f"it would take about {needed:.2g} steps of {name}, and max_steps is {max_steps}"
-        raise _hopeless(tol, least, known, span, why)
+        raise _out_of_reach(tol, least, growth, span, why)
 
 
 def _order(solution: Solution) -> int:
-    """p, where the defect is O(h^p)."""
+    """Return the order p of the defect O(h^p)."""
     return getattr(solution.setup.method, "degree", 1) + 1
 
 
 class _Growth(NamedTuple):
-    """What a disturbance grows by, as numbers: properties of `Constants` cost a run of C1 to read."""
+    """The growth of disturbances: pairs (M, c) in `rates`, and constants of the problem.
+
+    They are copied once, because each read of some properties of `Constants` computes a bound.
+    """
 
     rates: list[tuple[float, float]]
     beta_f: float
     norm_P_inv: float
     gamma: float
 
-    def grown(self, span: float) -> float:
-        """M Φ_c(T): what a defect of 1 may grow to."""
+    def amplification(self, span: float) -> float:
+        """Return the smallest M Φ_c(T): a bound on the error that a defect of norm 1 causes."""
         return min(M * _convolved(rate, span) for M, rate in self.rates)
 
 
 def _growth(constants: Any) -> _Growth:
-    """(M, c) of the paper, (1, μ) one-sided, and that of an energy norm, as far as they are known."""
+    """Return the growth pairs: (M, c) of the paper, (1, μ) one-sided, and that of an energy norm, as
+    far as `constants` has them."""
     one_sided, energy = (getattr(constants, name, None) for name in ("one_sided", "energy"))
     rates = [(float(constants.M), float(constants.growth_rate))]
     rates += [] if one_sided is None else [(1.0, float(one_sided))]
@@ -156,59 +168,65 @@ def _growth(constants: Any) -> _Growth:
 
 @eqx.filter_jit
 def _sizes(problem: Problem, t0: jax.Array, x0: Tree, args: Any) -> tuple[jax.Array, jax.Array]:
-    """‖1‖, and how large states and rates are, roughly: the response is left out, since to solve for
-    it takes much longer to compile."""
+    """Return ‖1‖ and the size of x or of f, whichever is larger.
+
+    The response is set to zero, because solving for it takes much longer to compile.
+    """
     space = problem.spaces(x0)[0]
     rate = problem.f(t0, x0, problem.zero_control(x0), args)
     return jnp.sqrt(space.size()), jnp.maximum(space.norm(rate), space.norm(x0))
 
 
-def _bounds(solution: Solution, known: _Growth, t0: float) -> Any:
-    """The bound at every saved time."""
+def _bounds(solution: Solution, growth: _Growth, t0: float) -> Any:
+    """Return the bound at every saved time."""
     assert solution.defect is not None and solution.completed_defect is not None
     integrated = (solution.defect, solution.law_defect), solution.completed_defect
-    return _least(t0, solution.ts, integrated, known)[0]
+    return _smallest_bounds(t0, solution.ts, integrated, growth)[0]
 
 
-def _rounding(solution: Solution, known: _Growth, rate: float, t0: float, t1: float) -> float:
-    """What rounding may add to the error: of x, twice a step; of t, at which data is evaluated and x is
-    known, x' being of the size `rate`."""
+def _rounding(solution: Solution, growth: _Growth, rate: float, t0: float, t1: float) -> float:
+    """Return an estimate of the error due to roundoff: of x, twice a step, and of t, with |x'| of the
+    size `rate`."""
     space = solution.setup.problem.spaces(solution.setup.x0)[0]
     sizes = jax.vmap(space.norm)(solution.xs)
     size = float(np.maximum(np.max(np.asarray(sizes)), space.norm(solution.setup.x0)))
     eps = float(jnp.finfo(solution.setup.dtype).eps)
     steps = int(solution.stats["steps"])
-    grows = min(M * np.exp(min(max(c, 0.0) * (t1 - t0), 700.0)) for M, c in known.rates)
-    return float(grows) * eps * (2.0 * steps * size + 4.0 * max(abs(t0), abs(t1)) * rate)
+    factor = min(M * np.exp(min(max(c, 0.0) * (t1 - t0), 700.0)) for M, c in growth.rates)
+    return float(factor) * eps * (2.0 * steps * size + 4.0 * max(abs(t0), abs(t1)) * rate)
 
 
-def _all_along(solution: Solution, known: _Growth, t0: float) -> Any:
-    """The bound at all times since the saved time before."""
+def _interval_bounds(solution: Solution, growth: _Growth, t0: float) -> Any:
+    """Return bounds that hold on the interval from the last saved time to each saved time."""
     assert solution.defect is not None and solution.completed_defect is not None
     integrated = (solution.defect, solution.law_defect), solution.completed_defect
-    return _least(t0, solution.ts, integrated, known)[1]
+    return _smallest_bounds(t0, solution.ts, integrated, growth)[1]
 
 
 @jax.jit
-def _least(t0: Any, ts: Any, integrated: tuple, known: _Growth) -> tuple[jax.Array, jax.Array]:
-    """At the saved times, and at all times before each of them since the last."""
-    acted, completed = (disturbance(known, *parts) for parts in integrated)
-    at, on_the_way = [], []
-    for M, rate in known.rates:
-        at.append(gronwall(t0, ts, acted, completed, rate, M, 0.0))
-        on_the_way.append(between(t0, ts, acted, completed, rate, M, 0.0, at[-1]))
-    return jnp.min(jnp.stack(at), axis=0), jnp.min(jnp.stack(on_the_way), axis=0)
+def _smallest_bounds(
+    t0: Any, ts: Any, integrated: tuple, growth: _Growth
+) -> tuple[jax.Array, jax.Array]:
+    """Return the smallest bounds over all growth pairs: at the saved times, and between them."""
+    total, completed = (disturbance(growth, *parts) for parts in integrated)
+    at_ts, between_ts = [], []
+    for M, rate in growth.rates:
+        at_ts.append(gronwall(t0, ts, total, completed, rate, M, 0.0))
+        between_ts.append(between(t0, ts, total, completed, rate, M, 0.0, at_ts[-1]))
+    return jnp.min(jnp.stack(at_ts), axis=0), jnp.min(jnp.stack(between_ts), axis=0)
 
 
 def of_region(constants: Any) -> bool:
-    """Whether x or u must stay somewhere for these to hold."""
+    """Return whether the constants hold in a bounded region of x or u only."""
     domain = getattr(constants, "domain", None)
     return domain is not None and not domain.free
 
 
-def _leaves(solution: Solution, constants: Any, error_bounds: Any) -> float | None:
-    """The first saved time by which x or u, with its bound, has been where the constants do not
-    hold."""
+def _exit_time(solution: Solution, constants: Any, error_bounds: Any) -> float | None:
+    """Return the first saved time by which x or u may have left the region of the constants, or None.
+
+    The bounds on x_h and u_h are enlarged by their error bounds.
+    """
     domain, bounds = constants.domain, solution.bounds
     assert bounds is not None
     law_error = solution.law_residual / constants.gamma + solution.law_step
@@ -230,7 +248,7 @@ def _outside(t: float) -> InputError:
 
 
 def _check_domain(constants: Any, args: Any, t0: float, t1: float) -> None:
-    """A run is certified only by constants that hold for it."""
+    """Raise if the constants were verified for other times or other `args`."""
     domain = getattr(constants, "domain", None)
     wrong: list[InputProblem] = []
     if domain is not None and not domain.covers(t0, t1):
@@ -238,7 +256,7 @@ def _check_domain(constants: Any, args: Any, t0: float, t1: float) -> None:
             InputProblem(
                 "dvax.solve(constants)",
                 f"constants verified on [{domain.t0:.17g}, {domain.t1:.17g}]",
-                f"the run goes from {t0:.17g} to {t1:.17g}, and nobody proved them for other times",
+                f"they must cover the run, which goes from {t0:.17g} to {t1:.17g}",
                 f"Verify for these: dvax.verify(problem, x0, {t0:g}, {t1:g}, args)",
             )
         )
@@ -261,12 +279,14 @@ def _with_bound(solution: Solution, bound: float) -> Solution:
 
 
 def _convolved(a: float, T: float) -> float:
-    """Φ_a(T)."""
+    """Return Φ_a(T) = ∫₀ᵀ e^{as} ds."""
     return T if a == 0.0 else float(np.expm1(min(a * T, 700.0)) / a)
 
 
-def _hopeless(tol: float, reachable: float, known: _Growth, span: float, why: str) -> InputError:
-    M, rate = min(known.rates, key=lambda pair: pair[0] * _convolved(pair[1], span))
+def _out_of_reach(
+    tol: float, reachable: float, growth: _Growth, span: float, why: str
+) -> InputError:
+    M, rate = min(growth.rates, key=lambda pair: pair[0] * _convolved(pair[1], span))
     return InputError(
         InputProblem(
             "dvax.solve(certified_tol)",
@@ -274,14 +294,14 @@ def _hopeless(tol: float, reachable: float, known: _Growth, span: float, why: st
             f"errors may grow like M e^{{ct}} with M = {M:g} and c = {rate:g}, a defect by "
             f"M Φ_c(T) = {M * _convolved(rate, span):.3g} over T = {span:g}, and the least "
             f"bound in reach here is about {reachable:.3g} ({why})",
-            "Ask for more than that, solve for a shorter time, or find sharper constants: "
-            "dvax.verify gives a one-sided rate where it can",
+            "Choose a larger certified_tol, solve for a shorter time, or find sharper constants: "
+            "dvax.verify gives a one-sided rate where possible",
         )
     )
 
 
 def _check(constants: Any, tol: Any, x0: Tree) -> None:
-    missing = [name for name in _NEEDED if getattr(constants, name, None) is None]
+    missing = [name for name in _REQUIRED_CONSTANTS if getattr(constants, name, None) is None]
     if constants is None or missing:
         raise InputError(
             InputProblem(
@@ -296,8 +316,8 @@ def _check(constants: Any, tol: Any, x0: Tree) -> None:
             InputProblem(
                 "dvax.solve(certified_tol)",
                 "a traced value",
-                "steps are chosen by what earlier runs showed, which a compiled program cannot do",
-                "Call it outside jax.jit, and pass the atol of the solution found to solve inside",
+                "the tolerance of a run depends on the results of earlier runs",
+                "Call dvax.solve outside jax.jit first, and pass the atol of that solution inside",
             )
         )
     if not (_tree.is_number(tol) and np.isfinite(tol) and tol > 0):

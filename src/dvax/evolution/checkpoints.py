@@ -1,4 +1,4 @@
-"""Some of the states that steps began with, for a reverse pass that cannot keep them all."""
+"""Checkpoints: states at the starts of some steps, for a reverse pass that cannot store them all."""
 
 from typing import Any, NamedTuple
 
@@ -10,26 +10,25 @@ import jax.tree_util as jtu
 from .. import _tree
 from .._tree import Tree
 
-_BYTES = 2**30
-"""What checkpoints may take, of all kinds together."""
+_MAX_BYTES = 2**30
+"""Largest memory of all checkpoints together."""
 
-_FEWEST, _MOST = 16, 4096
+_MIN_COUNT, _MAX_COUNT = 16, 4096
 
-_CHEAP, _ENOUGH = 2**22, 32
-"""Bytes that cost nothing to keep; checkpoints that do for a run of large states: to touch new memory
-takes longer than to compute a step several times more."""
+_FREE_BYTES, _LARGE_STATE_COUNT = 2**22, 32
+"""Memory whose use costs no time, and the number of checkpoints for states that exceed it: accessing
+new memory takes longer than computing a step several times again."""
 
-_TURNS = 12
-"""Up to this many times more is a step computed where that saves places."""
+_MAX_RECOMPUTATIONS = 12
+"""Largest number of times that a step is computed again to save memory."""
 
 
 class Checkpoints(eqx.Module):
-    """The states before the steps 0, s, 2s, … in C = 2ᵇ places, with s = 2ʲ doubled whenever the
-    places run out: then every other state is given up, and nothing is moved.
+    """The states at the starts of steps 0, s, 2s, … in C = 2ᵇ slots (`places`), with s = 2ʲ.
 
-    The k-th of them is kept in the place whose number is k with its b bits rotated left j times:
-    when s doubles, the even ones stay where they are, (k, j) ↦ (k/2, j+1) is the same place, and the
-    places of the odd ones are filled in order.
+    When the slots are full, s doubles and every other state is dropped, without copying. The k-th state
+    is in the slot whose number is k with its b bits rotated left by j: when s doubles, (k, j) ↦
+    (k/2, j+1) is the same slot for even k, and the slots of the odd states are reused in order.
     """
 
     places: Tree
@@ -43,26 +42,28 @@ class Checkpoints(eqx.Module):
         self.j = jnp.asarray(0)
 
     def put(self, index: Any, x: Tree, counts: Any = True) -> "Checkpoints":
-        """Step number `index` begins with x, where that `counts`. Steps come in order; one may come
-        again."""
+        """Return the checkpoints after storing x, the state at the start of step `index`, if `counts`.
+
+        Steps must come in order; a step may be repeated.
+        """
         full = counts & ((index >> self.j) >= 2**self.bits)
         j = jnp.where(full, self.j + 1, self.j)
         kept = counts & (index == ((index >> j) << j))
-        # What is not kept goes to a place of its own, since not to write would be to copy.
+        # Write a state that is not kept to an extra slot: a conditional write would copy the array.
         place = jnp.where(kept, self._place(index >> j, j), 2**self.bits)
         places = _tree.put(self.places, place, x)
         return eqx.tree_at(lambda c: (c.places, c.j), self, (places, j))
 
     def before(self, index: Any) -> tuple[Any, Tree]:
-        """The last step up to `index` whose beginning is kept, and that."""
+        """Return the last step up to `index` that has a checkpoint, and the state at its start."""
         k = index >> self.j
         place = self._place(k, self.j)
         return k << self.j, jtu.tree_map(lambda leaf: leaf[place], self.places)
 
     def stack(self, steps: Any) -> "Stack":
-        """What is kept of a run of so many steps."""
+        """Return the checkpoints of a run of this number of steps as a stack."""
         numbers = jnp.arange(2**self.bits)
-        # The place of what was not kept is free as well.
+        # The extra slot is free too.
         order = jnp.append(self._place(numbers, self.j), 2**self.bits)
         height = ((steps - 1) >> self.j) + 1
         return Stack(self.places, order, jnp.append(numbers << self.j, 0), height)
@@ -75,8 +76,11 @@ class Checkpoints(eqx.Module):
 
 
 class Stack(NamedTuple):
-    """Some of the states that steps began with, the last of them on top: the one at height k, that of
-    the step at[k], is in the place order[k]; places further up are free."""
+    """A stack of checkpoints with the latest step on top.
+
+    The entry at height k belongs to step `at[k]` and is in the slot `order[k]` of `places`. The slots
+    of higher entries are free.
+    """
 
     places: Tree
     order: jax.Array
@@ -85,7 +89,7 @@ class Stack(NamedTuple):
 
     @property
     def step(self) -> Any:
-        """The step that begins with the state on top."""
+        """The step of the entry on top."""
         return self.at[self.height - 1]
 
     @property
@@ -101,29 +105,30 @@ class Stack(NamedTuple):
         return self._replace(height=self.height - 1)
 
     def next(self, target: Any) -> Any:
-        """The next state to keep on the way from the top to that of step `target`.
+        """Return the next step to store on the way from the step on top to step `target`.
 
-        With s free places and every step computed at most r times more, C(s + r − 1, r) states are
-        within reach (Griewank 1992); of d of them the best to keep first is number d r/(s + r),
-        nearly, with the least r that will do.
+        With s free slots, and every step computed at most r times again, C(s + r − 1, r) states are
+        reachable (Griewank 1992). For a distance d, the best step to store first is about d r/(s + r),
+        with the smallest r for which d is reachable.
         """
-        apart, free = target - self.step, len(self.order) - self.height
+        distance, free = target - self.step, len(self.order) - self.height
         r, reach = 1, jnp.ones((), jnp.float32)
-        for turn in range(1, _TURNS + 1):
-            reach = reach * (free + (turn - 1)).astype(jnp.float32) / turn
-            r = r + jnp.where(reach < apart.astype(jnp.float32), 1, 0)
-        ahead = -(-(apart * r) // (free + r))
-        return self.step + jnp.where(free > 1, jnp.clip(ahead, 1, apart), apart)
+        for k in range(1, _MAX_RECOMPUTATIONS + 1):
+            reach = reach * (free + (k - 1)).astype(jnp.float32) / k
+            r = r + jnp.where(reach < distance.astype(jnp.float32), 1, 0)
+        offset = -(-(distance * r) // (free + r))
+        return self.step + jnp.where(free > 1, jnp.clip(offset, 1, distance), distance)
 
 
-def how_many(x0: Tree, max_steps: int) -> int:
-    """Of checkpoints of a run from x0."""
+def checkpoint_count(x0: Tree, max_steps: int) -> int:
+    """Return the number of checkpoints of a run from x0, a power of two."""
     size = max(1, sum(leaf.size * leaf.dtype.itemsize for leaf in jtu.tree_leaves(x0)))
-    affordable = max(_FEWEST, _BYTES // size)
-    enough = max(_CHEAP // size, _ENOUGH)
-    return _power(min(affordable, _MOST, enough, _power(2 * max_steps - 1)))
+    memory_limit = max(_MIN_COUNT, _MAX_BYTES // size)
+    speed_limit = max(_FREE_BYTES // size, _LARGE_STATE_COUNT)
+    step_limit = _power_of_two(2 * max_steps - 1)
+    return _power_of_two(min(memory_limit, _MAX_COUNT, speed_limit, step_limit))
 
 
-def _power(count: int) -> int:
-    """The largest power of two up to it."""
+def _power_of_two(count: int) -> int:
+    """Return the largest power of two that is at most `count`."""
     return 2 ** (count.bit_length() - 1)

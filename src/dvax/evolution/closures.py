@@ -1,4 +1,4 @@
-"""What f, h, K, A and P close over, brought out where a derivative can reach it."""
+"""Conversion of traced closure variables of f, h, K, A and P to arguments, for derivatives."""
 
 from typing import Any
 
@@ -10,12 +10,20 @@ from ..problem import Problem
 
 
 def closure_convert(problem: Problem, t: Any, x: Tree, args: Any) -> Problem:
-    """The same problem; a callable that closes over traced values, as one written inside a function
-    that is being differentiated does, carries them as parts of its own."""
+    """Return the problem with the traced closure variables of its callables as leaves of the pytree.
+
+    (A callable defined inside a differentiated function may close over traced values.)
+    """
     u = problem.zero_control(x)
-    given = {"f": (t, x, u, args), "h": (t, x, u, args), "K": (t, args), "A": (args,), "P": (args,)}
+    signatures = {
+        "f": (t, x, u, args),
+        "h": (t, x, u, args),
+        "K": (t, args),
+        "A": (args,),
+        "P": (args,),
+    }
     changed: dict[str, Any] = {}
-    for name, inputs in given.items():
+    for name, inputs in signatures.items():
         fn = getattr(problem, name)
         if isinstance(fn, eqx.Module):
             continue

@@ -1,8 +1,8 @@
-"""One compiled time loop for all calls of one kind: the same code on the same shapes.
+"""The compiled time loop, cached for calls with the same code and the same shapes.
 
-What a call costs besides its steps is to find out that it is of that kind. `jax.jit` finds out in
-microseconds where it is handed a flat list of numbers and one hashable rest; so a setup is taken
-apart here, and its solution put together, around the setup itself: what was asked is not copied.
+The overhead of a call is the lookup of the compiled program. `jax.jit` needs microseconds for a flat
+list of numbers and one hashable static argument. This module therefore flattens a setup into these two,
+and rebuilds the solution around the original setup, which is not copied.
 """
 
 import math
@@ -27,37 +27,37 @@ from .solution import Solution
 
 
 def compiled(setup: Setup, ts: Any, options: Options) -> tuple[Solution, bool | jax.Array]:
-    """The solution, and whether all of it was reached."""
+    """Return the solution, and whether the run succeeded and reached all saved times."""
     code, code_tree = jtu.tree_flatten((setup.problem, setup.method, setup.vi_solver))
     data, data_tree = jtu.tree_flatten((setup.x0, setup.args, setup.setting, setup.moduli, ts))
-    # A Python number in the data is data: compiled in, every new tolerance would compile again. In
-    # the code (a setting of a solver) it may decide what is done.
+    # Python floats in the data are traced, so that a new tolerance does not recompile. In the code
+    # (settings of a solver) they are static, since they may decide a branch.
     numbers = [leaf if eqx.is_array(leaf) else None for leaf in code]
     numbers += [leaf if isinstance(leaf, float) or eqx.is_array(leaf) else None for leaf in data]
-    rest = tuple(
-        _exactly(leaf) if number is None else None
+    static = tuple(
+        _exact_key(leaf) if number is None else None
         for leaf, number in zip(code + data, numbers, strict=True)
     )
-    begun, _clock.compiling = time.perf_counter(), 0.0
+    start, _clock.compiling = time.perf_counter(), 0.0
     try:
-        arrays, reached, shape = _run(numbers, _Kind(code_tree, data_tree, rest, options))
-        # One look, through NumPy: through JAX it would be a program of its own.
+        arrays, reached, shape = _run(numbers, _Signature(code_tree, data_tree, static, options))
+        # Convert by NumPy: by JAX this would compile and run another program.
         reached = bool(np.asarray(reached)) if _tree.is_concrete(reached) else reached
     except jax.errors.JaxRuntimeError as error:
         if is_equinox_check(error):
-            # A check within f or h (`eqx.error_if`) is only quoted where Equinox compiles.
+            # Run again under Equinox, which reports the message of an `eqx.error_if` in f or h.
             eqx.filter_jit(integrate)(setup, ts, options)
         raise
     solution = jtu.tree_unflatten(shape.value, [*arrays, setup])
     if isinstance(reached, bool):
         compiling = _clock.compiling
-        spent = time.perf_counter() - begun
+        spent = time.perf_counter() - start
         solution.stats.update(compile_time=compiling, run_time=spent - compiling)
     return solution, reached
 
 
-def _exactly(leaf: Any) -> tuple[Any, ...]:
-    """A leaf as a key that tells 1 from True and 1.0, and 0.0 from −0.0, which `==` does not."""
+def _exact_key(leaf: Any) -> tuple[Any, ...]:
+    """Return a hashable key of a static leaf that distinguishes 1, True and 1.0, and 0.0 and −0.0."""
     try:
         hash(leaf)
     except TypeError as error:
@@ -65,24 +65,24 @@ def _exactly(leaf: Any) -> tuple[Any, ...]:
             InputProblem(
                 "dvax.solve(problem, args)",
                 f"{type(leaf).__name__} {_tree.line(leaf)}",
-                "what is not an array is compiled in, so it must be hashable",
-                "Register its class as a pytree (an equinox.Module is one), or make it hashable",
+                "values that are not arrays are static arguments, which must be hashable",
+                "Register its class as a pytree (such as an equinox.Module), or make it hashable",
             )
         ) from error
     return type(leaf), leaf, math.copysign(1.0, leaf) if isinstance(leaf, float) else None
 
 
-class _Kind(NamedTuple):
-    """All of a call but its numbers."""
+class _Signature(NamedTuple):
+    """The static argument: the tree structures of code and data, the static leaves, and the options."""
 
     code: Any
     data: Any
-    rest: tuple[Any, ...]
+    static: tuple[Any, ...]
     options: Options
 
 
 class _Clock(threading.local):
-    """Seconds that this thread has spent on the program of its call until it ran."""
+    """Seconds that this thread has spent on tracing and compiling the program of its call."""
 
     compiling: float = 0.0
 
@@ -91,7 +91,7 @@ _clock = _Clock()
 
 
 def _add(stage: str, seconds: float) -> None:
-    # The seconds of tracing are measured by `_traced`.
+    # `_traced` measures the time of tracing.
     if stage != "trace":
         _clock.compiling += seconds
 
@@ -99,25 +99,27 @@ def _add(stage: str, seconds: float) -> None:
 listen(_add)
 
 
-def _traced(numbers: list[Any], kind: _Kind) -> tuple[list[Any], jax.Array, _tree.Static]:
-    begun = time.perf_counter()
-    found = _integrated(numbers, kind)
-    # Programs that were compiled meanwhile are in this already.
-    _clock.compiling = time.perf_counter() - begun
-    return found
+def _traced(numbers: list[Any], signature: _Signature) -> tuple[list[Any], jax.Array, _tree.Static]:
+    start = time.perf_counter()
+    outputs = _integrated(numbers, signature)
+    # Assign instead of adding: this time includes programs compiled while tracing.
+    _clock.compiling = time.perf_counter() - start
+    return outputs
 
 
-def _integrated(numbers: list[Any], kind: _Kind) -> tuple[list[Any], jax.Array, _tree.Static]:
-    leaves = [r[1] if n is None else n for n, r in zip(numbers, kind.rest, strict=True)]
-    split = kind.code.num_leaves
-    problem, method, vi_solver = jtu.tree_unflatten(kind.code, leaves[:split])
-    x0, args, setting, moduli, ts = jtu.tree_unflatten(kind.data, leaves[split:])
+def _integrated(
+    numbers: list[Any], signature: _Signature
+) -> tuple[list[Any], jax.Array, _tree.Static]:
+    leaves = [r[1] if n is None else n for n, r in zip(numbers, signature.static, strict=True)]
+    split = signature.code.num_leaves
+    problem, method, vi_solver = jtu.tree_unflatten(signature.code, leaves[:split])
+    x0, args, setting, moduli, ts = jtu.tree_unflatten(signature.data, leaves[split:])
     setup = Setup(problem, x0, args, setting, method, vi_solver, moduli)
-    solution = integrate(setup, ts, kind.options)
+    solution = integrate(setup, ts, signature.options)
     reached = (solution.result == RESULTS.successful) & jnp.all(jnp.isfinite(solution.ts))
     arrays, tree = jtu.tree_flatten(solution, is_leaf=lambda node: node is setup)
     assert arrays.pop() is setup
-    # The structure of a solution that has the setup for its last leaf.
+    # `tree` is the structure of a solution whose last leaf is the setup.
     return arrays, reached, _tree.Static(tree)
 
 

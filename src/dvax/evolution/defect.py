@@ -16,7 +16,7 @@ from ..programs.branches import branches
 from ..programs.enclosure import LinearEnclosure, is_enclosure
 from .bounds import Bounds
 from .evaluations import Evaluation
-from .excursions import WATCH
+from .excursions import TRUSTED_STEP_SHARE
 from .flow import Flow, Rate
 from .method import AbstractMethod, combined, extrapolation, polynomial
 
@@ -59,7 +59,7 @@ def enclosed(
     moves from one end to the other."""
     ends, arc, growth, span = lax.stop_gradient((ends, arc, growth, span))
     h, x0, x1, c = values(tuple(arc))
-    short = h <= WATCH * span
+    short = h <= TRUSTED_STEP_SHARE * span
     space = flow.state_space(x0)
     bend = flow.generator.chord_deviation(arc, space, growth)
     x = jtu.tree_map(LinearEnclosure, x0, x1, bend)

@@ -1,18 +1,17 @@
-"""Why a solve stopped: the cause that there is evidence for, and the options that help.
+"""Diagnosis of a failed solve: the cause, and the options that fix it.
 
-Each cause is tested at the last state (t, x) that was reached, on the functions themselves:
+The tests evaluate the functions of the problem near the last state (t, x). They detect:
 
-- a value that is not finite, by evaluating K, P, A, h and f along x + s x' over the last step, with the
-  earliest such time found by bisection;
-- a jump of K, h or f in t, by bisection of a few steps around t; many jumps of one height are
-  rounding;
-- a jump of x' as a function of x, by bisection on the line along x';
-- a finite-time escape, x' growing as |x|^p with p > 1, infinite after |x| / ((p − 1) |x'|);
-- rounding: steps of the size of the spacing of floating-point numbers at t, or a tolerance below the
-  rounding of f;
-- stiffness: a derivative of f̃ (or of Ax + f̃ for explicit methods) of which h times the largest
-  eigenvalue, found by power iteration, is of order one while x changes far more slowly;
-- a law that is not monotone, by the smallest eigenvalue of the symmetric part of ∂F/∂y.
+- a non-finite value: evaluate K, P, A, h and f along x + s x' over the next steps, and bisect for the
+  earliest such time;
+- a jump of K, h or f in t: bisect a few steps around t; many jumps of one height are roundoff;
+- a jump of x' as a function of x: bisect on the line along x';
+- a finite-time escape: x' grows as |x|^p with p > 1, so x is infinite after |x| / ((p − 1) |x'|);
+- roundoff: steps as small as the spacing of floating-point numbers at t, or a tolerance below the
+  rounding error of f;
+- stiffness: the largest eigenvalue of the derivative of f̃ (of Ax + f̃ for explicit methods), found by
+  power iteration, times h is of order one, while x changes far more slowly;
+- a law that is not monotone: the smallest eigenvalue of the symmetric part of ∂F/∂y is not positive.
 """
 
 import math
@@ -37,18 +36,17 @@ from .results import RESULTS
 from .runge_kutta import DormandPrince
 from .stopped import LAST_STEPS, Diagnosis, Stop
 
-_LOOSEST = 0.01
-"""The loosest rtol that is ever named as a fix."""
-_DENSE = 64
-"""Unknowns up to which a derivative of the law is formed as a matrix."""
-_STABLE = 3.0
-"""The largest stable step times the modulus of a negative eigenvalue: from 2 to 3.3 by the method."""
-_LINEARISABLE = 400
-"""Unknowns up to which `ExpRosenbrock` is the method to name for a stiff problem."""
-
-
-_MANY_STEPS = 100
-"""Attempts from which the pace of the rest of a run can be told."""
+_MAX_RTOL = 0.01
+"""Largest rtol that a fix proposes."""
+_MAX_DENSE_LAW = 64
+"""Largest number of unknowns for which the derivative of the law is formed as a matrix."""
+_STABILITY_LIMIT = 3.0
+"""The largest stable step times the modulus of a negative eigenvalue: 2 to 3.3, depending on the
+method."""
+_MAX_ROSENBROCK = 400
+"""Largest number of unknowns for which a fix proposes `ExpRosenbrock` for a stiff problem."""
+_MIN_ATTEMPTS = 100
+"""Smallest number of attempts from which the number of remaining steps is extrapolated."""
 _REFUSED = "refused: "
 _CHECKED = {name: f"Check {name} there" for name in ("K", "h", "f")} | {
     "A x": "Check A, and how large x becomes",
@@ -57,24 +55,23 @@ _CHECKED = {name: f"Check {name} there" for name in ("K", "h", "f")} | {
 
 
 def failure(solution: Any) -> SolveError:
-    """Return the `SolveError` of a run that stopped: what happened, the cause, how far it came, what
-    helps."""
+    """Return the `SolveError` of a failed run: result, cause, time reached and fixes."""
     stats, result = solution.stats, solution.result
     found = diagnose(solution)
     reached = f"Stopped at t = {float(stats['t']):.17g} after {int(stats['steps'])} steps."
-    parts = ("" if found.whole else RESULTS[result], found.cause, reached)
+    parts = ("" if found.replaces_result else RESULTS[result], found.cause, reached)
     return SolveError(" ".join(part for part in parts if part), solution, found.fixes)
 
 
 def diagnose(solution: Any) -> Diagnosis:
-    """Return the cause of a failure that the functions themselves show; see the module."""
+    """Return the cause of a failure according to the tests of this module, or an empty diagnosis."""
     setup, stats, result = solution.setup, solution.stats, solution.result
     t, step = float(stats["t"]), float(stats["next_dt"])
     t0, t1 = float(setup.setting["t0"]), float(setup.setting["t1"])
     if not math.isfinite(step) or step <= 0:
         step = setup.setting["dt"] if math.isfinite(setup.setting["dt"]) else (t1 - t0) * 1e-3
     if isinstance(setup.method, Implicit):
-        step = t1 - t  # such a run is known up to the last saved time that it reached
+        step = t1 - t  # t is the last saved time, and steps after it are not recorded
     steps, rejected = int(stats["steps"]), int(stats["rejected"])
     if isinstance(setup.method, PiecewiseLinear):
         step = (t - t0) / max(steps, 1) or t1 - t0  # its steps are as long as its events are apart
@@ -90,12 +87,12 @@ def diagnose(solution: Any) -> Diagnosis:
         causes += [_law]
     causes += [_escape]
     if result != RESULTS.law_unsolved and result != RESULTS.nonfinite:
-        # What runs from event to event has data and laws without such causes: its code was proved.
+        # PiecewiseLinear accepts only code for which these causes are excluded.
         by_steps = not isinstance(setup.method, PiecewiseLinear)
         causes += [find_jump, find_discontinuity] if by_steps else []
         causes += [_resolution, *([_tolerance, _stiff] if by_steps else [])]
     if result == RESULTS.max_steps:
-        causes += [_too_few]
+        causes += [_max_steps]
     for cause in causes:
         found = cause(stop)
         if found.cause:
@@ -104,7 +101,7 @@ def diagnose(solution: Any) -> Diagnosis:
 
 
 def _nonfinite(stop: Stop) -> Diagnosis:
-    """The first of A, P, K, h, f that is not finite on the way to the next step."""
+    """Detect the first function among A, P, K, h, f that is not finite in the next steps."""
     flow, problem, args = stop.flow, stop.flow.problem, stop.flow.args
     like = problem.zero_control(stop.x)
     begin, velocity = stop.time(stop.t), None
@@ -112,7 +109,7 @@ def _nonfinite(stop: Stop) -> Diagnosis:
         try:
             velocity = stop.velocity(begin, stop.x)
         except InputError:
-            pass  # K is refused at t itself: the search below says so
+            pass  # K raises at t; the search below reports it
     if velocity is None or first_bad(velocity):
         velocity = _tree.zeros_like(stop.x)
 
@@ -157,7 +154,7 @@ def _nonfinite(stop: Stop) -> Diagnosis:
 
 
 def _escape(stop: Stop) -> Diagnosis:
-    """|x| grows as a power of itself above 1 (a finite-time escape), or exponentially without end."""
+    """Detect a finite-time escape (|x'| grows as |x|^p with p > 1), or exponential growth."""
     size, first = _largest(stop.x), _largest(stop.setup.x0)
     if not size > 10.0 * (1.0 + first):
         return Diagnosis()
@@ -169,8 +166,10 @@ def _escape(stop: Stop) -> Diagnosis:
         scale = size / speed
 
         def power_of(share: float) -> float:
-            """Of |x| in |x'|, from a state that is larger by this share of itself, at the same t: what
-            a drive makes of x' is no escape."""
+            """Return p, from x' at a state that is larger by this share, at the same t.
+
+            (At a later t, a growing input would be mistaken for an escape.)
+            """
             later = jtu.tree_map(lambda a, b: a + stop.time(share * scale) * b, stop.x, v)
             larger, faster = _largest(later), _largest(stop.velocity(stop.time(stop.t), later))
             grows = larger > size and faster > 0
@@ -199,12 +198,12 @@ def _escape(stop: Stop) -> Diagnosis:
 
 
 def _largest(x: Tree) -> float:
-    """max |xᵢ|: a norm would overflow before the state does."""
+    """Return max |xᵢ|, which overflows later than a norm."""
     return float(max(np.max(np.abs(np.asarray(leaf))) for leaf in jtu.tree_leaves(x)))
 
 
 def _resolution(stop: Stop) -> Diagnosis:
-    """Steps of the size of the spacing of floating-point numbers at t."""
+    """Detect steps of the size of the spacing of floating-point numbers at t."""
     t0, t1 = stop.span
     if not (stop.ulp > 0 and stop.step <= 64.0 * stop.ulp and stop.ulp > 1e-14 * (t1 - t0)):
         return Diagnosis()
@@ -222,15 +221,15 @@ def _resolution(stop: Stop) -> Diagnosis:
 
 
 def _tolerance(stop: Stop) -> Diagnosis:
-    """A tolerance below the rounding of f̃."""
+    """Detect a tolerance below the rounding error of f̃."""
     rtol, atol, horizon = (float(stop.setup.setting[n]) for n in ("rtol", "atol", "horizon"))
     if math.isfinite(stop.setup.setting["dt"]):
         return Diagnosis()
     size = stop.norm(stop.x)
     rate = stop.norm(stop.flow.rate(stop.time(stop.t), stop.x, None).value)
     eps = float(jnp.finfo(stop.setup.dtype).eps)
-    asked, possible = (atol + rtol * size) / horizon, 16.0 * eps * max(rate, size / horizon)
-    if not asked < possible:
+    required, possible = (atol + rtol * size) / horizon, 16.0 * eps * max(rate, size / horizon)
+    if not required < possible:
         return Diagnosis()
     reachable = 100.0 * possible * horizon / max(size, 1e-300)
     speed, (t0, t1) = stop.norm(stop.velocity(stop.time(stop.t), stop.x)), stop.span
@@ -240,26 +239,27 @@ def _tolerance(stop: Stop) -> Diagnosis:
             (Fix("", "", "Check whether f or h is infinite at the start of the run"),),
         )
     fix = Fix("rtol", f"{reachable:.1g}", "which rounding allows")
-    if reachable > _LOOSEST:
-        fix = Fix("t1", f"{stop.span[0] + horizon * _LOOSEST / reachable:.3g}", "a shorter run")
+    if reachable > _MAX_RTOL:
+        fix = Fix("t1", f"{stop.span[0] + horizon * _MAX_RTOL / reachable:.3g}", "a shorter run")
     return Diagnosis(
-        f"The tolerance asks for a defect below (atol + rtol |x|)/horizon = {asked:.3g}, and the "
+        f"The tolerance requires a defect below (atol + rtol |x|)/horizon = {required:.3g}, and the "
         f"rounding of f alone is {possible:.3g}.",
         (fix,),
     )
 
 
 def _stiff(stop: Stop) -> Diagnosis:
-    """h λ of order one, for the eigenvalue λ of largest modulus, while x changes slowly."""
+    """Detect stiffness: h λ is of order one for the eigenvalue λ of largest modulus, while x changes
+    slowly."""
     method = stop.setup.method
     if not isinstance(method, AbstractMethod) or method.is_rosenbrock:
         return Diagnosis()
-    whole = isinstance(method, DormandPrince)
-    of = stop.velocity if whole else lambda t, x: stop.flow.rate(t, x, None).value
+    is_explicit_in_A = isinstance(method, DormandPrince)
+    rate_of = stop.velocity if is_explicit_in_A else lambda t, x: stop.flow.rate(t, x, None).value
     t = stop.time(stop.t)
-    push = jax.jit(lambda v: jax.jvp(lambda x: of(t, x), (stop.x,), (v,))[1])
+    jvp = jax.jit(lambda v: jax.jvp(lambda x: rate_of(t, x), (stop.x,), (v,))[1])
     space = stop.flow.state_space(stop.x)
-    # A fixed vector with a part in every direction.
+    # Start the power iteration from a fixed vector that is unlikely to miss an eigenvector.
     v = jtu.tree_map(
         lambda leaf: jnp.cos(1.0 + jnp.arange(leaf.size, dtype=leaf.dtype)).reshape(leaf.shape),
         stop.x,
@@ -267,36 +267,37 @@ def _stiff(stop: Stop) -> Diagnosis:
     rate, sign = 0.0, 0.0
     for _ in range(30):
         v = _tree.scale(1.0 / space.norm(v), v)
-        w = push(v)
+        w = jvp(v)
         rate, sign = stop.norm(w), float(space.inner(v, w))
         if not (math.isfinite(rate) and rate > 0):
             return Diagnosis()
         v = w
     t0, t1 = stop.span
     own = stop.norm(stop.velocity(t, stop.x)) / max(stop.norm(stop.x), 1e-300)
-    # At the limit already, or with more steps at the limit to come than there were in all.
+    # Report stiffness if the steps are at the stability limit, or if more steps of that length remain
+    # than there were so far.
     at_limit = rate * max(stop.step, (stop.t - t0) / max(stop.steps, 1)) > 0.3
-    left = rate * (t1 - stop.t) / _STABLE
+    left = rate * (t1 - stop.t) / _STABILITY_LIMIT
     if not (sign < 0 and rate * (t1 - t0) > 1e3 and own < 0.1 * rate):
         return Diagnosis()
     if not (at_limit or left > stop.attempts):
         return Diagnosis()
-    many = sum(leaf.size for leaf in jtu.tree_leaves(stop.x)) > _LINEARISABLE
-    what = "Ax + f" if whole else "f"
+    many = sum(leaf.size for leaf in jtu.tree_leaves(stop.x)) > _MAX_ROSENBROCK
+    what = "Ax + f" if is_explicit_in_A else "f"
     return Diagnosis(
         f"The problem is stiff for {type(method).__name__}: {what} has an eigenvalue of about "
-        f"{-rate:.3g}, so that a stable step is at most about {_STABLE / rate:.2g}, while x itself "
-        f"changes at the rate {own:.3g}. From here to t1 that is {left:.2g} steps at least.",
+        f"{-rate:.3g}, so that a stable step is at most about {_STABILITY_LIMIT / rate:.2g}, while x "
+        f"itself changes at the rate {own:.3g}. From here to t1 that is {left:.2g} steps at least.",
         (Fix("method", "Implicit" if many else "ExpRosenbrock", "which is stable there"),),
     )
 
 
-def _too_few(stop: Stop) -> Diagnosis:
-    """The number of steps, and what the run would need at its last pace."""
+def _max_steps(stop: Stop) -> Diagnosis:
+    """Report the number of steps, and an estimate of the number that the run needs."""
     t0, t1 = stop.span
     horizon = float(stop.setup.setting["horizon"])
-    # A piece of a longer run: its end is no time that the caller of the run has named, and the
-    # pieces that follow have the same max_steps.
+    # In a run solved in pieces, the user did not choose the end of this piece, and max_steps must
+    # suffice for later pieces too.
     is_piece = horizon > 1.000001 * (t1 - t0)
     far = horizon if is_piece else t1 - stop.t
     left = far / max(stop.step, 5e-324)
@@ -306,10 +307,10 @@ def _too_few(stop: Stop) -> Diagnosis:
         else f", with t1 = {t1:.12g} still {t1 - stop.t:.3g} away and a last "
     )
     text += f"step of {stop.step:.3g}."
-    # The first few steps say little about the pace of the later ones.
-    enough = 2.0 * stop.attempts + (1.5 if stop.attempts >= _MANY_STEPS else 10.0) * left
+    # After a few steps the extrapolation is unreliable, so use a larger factor.
+    enough = 2.0 * stop.attempts + (1.5 if stop.attempts >= _MIN_ATTEMPTS else 10.0) * left
     if isinstance(stop.setup.method, PiecewiseLinear):
-        # Its events may all lie at the start, where a circuit is switched on.
+        # Its events may all lie at the start, for example when a circuit is switched on.
         enough = min(enough, 100.0 * stop.attempts)
     if enough < 2**31:
         return Diagnosis(text, (Fix("max_steps", f"{math.ceil(enough)}", "at this pace"),))
@@ -319,7 +320,7 @@ def _too_few(stop: Stop) -> Diagnosis:
 
 
 def _law(stop: Stop) -> Diagnosis:
-    """Whether F(y) = P⁻¹y − h(t, x, P⁻¹y) fails to be monotone at the last state."""
+    """Detect a law F(y) = P⁻¹y − h(t, x, P⁻¹y) that is not monotone at the last state."""
     problem, args, t = stop.flow.problem, stop.flow.args, stop.time(stop.t)
     at = f"at t = {stop.t:.12g}"
     y = stop.flow.rate(t, stop.x, None).y
@@ -328,7 +329,7 @@ def _law(stop: Stop) -> Diagnosis:
         y = like
     flat, unravel = jax.flatten_util.ravel_pytree(y)
     fix = Fix("", "", "Check the sign of the way in which h depends on u")
-    if flat.size <= _DENSE:
+    if flat.size <= _MAX_DENSE_LAW:
         F = problem.frozen(t, stop.x, args)
         M = np.asarray(jax.jacfwd(lambda v: jax.flatten_util.ravel_pytree(F(unravel(v)))[0])(flat))
         if np.isfinite(M).all():
@@ -341,7 +342,7 @@ def _law(stop: Stop) -> Diagnosis:
                     (fix,),
                 )
     return Diagnosis(
-        f"The law had not been solved to its tolerance {at}.",
+        f"The solver of the law did not reach its tolerance {at}.",
         (
             Fix("vi_solver", "Extragradient", "or another solver of dvax.vi with more iterations"),
             fix,

@@ -24,7 +24,7 @@ from ..programs.enclosure import (
 )
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, FrozenVI
-from .linearised import AbstractLinear, split
+from .linearised import AbstractLinear, linearise
 from .small_box import AbstractSmallBox
 
 _SMALL = 400
@@ -100,7 +100,7 @@ class Flow(eqx.Module):
         value = lambda t, x: self.rate(t, x, guess).value  # noqa: E731
         _, push = jax.linearize(value, t, x)
         drift = push(jnp.ones_like(t), _tree.zeros_like(x))
-        linear = split(self.generator, lambda v: push(jnp.zeros_like(t), v), x)
+        linear = linearise(self.generator, lambda v: push(jnp.zeros_like(t), v), x)
         return dataclasses.replace(self, linear=linear), drift
 
     def rate(self, t: Any, x: Tree, guess: Tree | None) -> Rate:

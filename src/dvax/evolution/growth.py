@@ -1,4 +1,4 @@
-"""How a disturbance of the equation grows into an error of the state (Gronwall's lemma)."""
+"""Error bounds of the state for a disturbance of the equation, by Gronwall's lemma."""
 
 from typing import Any
 
@@ -8,8 +8,10 @@ from jax import lax
 
 
 def disturbance(constants: Any, defect: Any, law_defect: Any) -> Any:
-    """∫ ‖x_h' − Ax_h − f̃‖ from the defect and ∫ ‖w‖ of the frozen solves: a law solved to ‖w‖ disturbs
-    f̃ by at most β_f‖P⁻¹‖‖w‖/γ."""
+    """Return a bound on ∫ ‖x_h' − Ax_h − f̃‖ from the integrated defects of the state and of the law.
+
+    A law solved up to ‖w‖ disturbs f̃ by at most β_f‖P⁻¹‖‖w‖/γ.
+    """
     gain = constants.beta_f * constants.norm_P_inv / constants.gamma
     return defect + gain * law_defect
 
@@ -17,34 +19,36 @@ def disturbance(constants: Any, defect: Any, law_defect: Any) -> Any:
 def gronwall(
     t0: Any, ts: Any, integrated: Any, completed: Any, rate: Any, M: Any, initial: Any
 ) -> jax.Array:
-    """M e^{ct} e₀ + M ∫ e^{c(t−s)} dI(s), from the impulse I known at the saved times only.
+    """Return M e^{ct} e₀ + M ∫ e^{c(t−s)} dI(s) at the times `ts`, for c = `rate` and e₀ = `initial`.
 
-    `completed` is I over the steps that had ended by then; `integrated` includes the step under way.
-    An ended step acted at any moment since the saved time before it began, so it is charged e^{c₊Δ}
-    over the time from there to its end; the step under way is charged in the same way, and for that
-    one saved time alone: nothing says how much of it had acted.
+    The integrated disturbance I is given at the saved times only: `completed` over the completed
+    steps, and `integrated` including the whole step that contains the saved time. A completed step may
+    have acted at any time since the last saved time before its start, so its contribution is
+    multiplied by e^{c₊Δ}, where Δ is the time from there to now. The current step is treated alike, at
+    this saved time only, because I over a part of a step is unknown.
     """
 
-    def advance(carry: tuple, now: tuple) -> tuple:
-        # `bound` holds at `base` for the steps ended by then; the others act after `early`.
-        early, base, ended, bound, last = carry
-        time, total, done = now
-        decayed = jnp.exp(rate * (time - base)) * bound
-        grown = M * jnp.exp(jnp.maximum(rate, 0.0) * (time - early))
-        after = decayed + grown * (total - ended)
-        # What has no bound keeps none: ∞ − ∞, and an impulse that is not a number, say nothing.
-        lost = ~jnp.isfinite(total) | jnp.isnan(after)
-        moved = (done > ended) | lost
-        new = jnp.where(lost, jnp.inf, decayed + grown * (done - ended))
+    def advance(carry: tuple, row: tuple) -> tuple:
+        # `bound` holds at time `base` and includes the disturbance `included`; the rest of the
+        # disturbance acts after time `earliest`.
+        earliest, base, included, bound, last = carry
+        time, total, done = row
+        propagated = jnp.exp(rate * (time - base)) * bound
+        factor = M * jnp.exp(jnp.maximum(rate, 0.0) * (time - earliest))
+        current = propagated + factor * (total - included)
+        # Once the bound is infinite or NaN, it remains infinite.
+        is_lost = ~jnp.isfinite(total) | jnp.isnan(current)
+        is_updated = (done > included) | is_lost
+        new = jnp.where(is_lost, jnp.inf, propagated + factor * (done - included))
         carry = (
-            # A step under way began after the saved time before this one, whose own has ended.
-            jnp.where(moved, jnp.where(total > done, last, time), early),
-            jnp.where(moved, time, base),
-            jnp.where(moved, done, ended),
-            jnp.where(moved, new, bound),
+            # The current step, if there is one, began after the last saved time.
+            jnp.where(is_updated, jnp.where(total > done, last, time), earliest),
+            jnp.where(is_updated, time, base),
+            jnp.where(is_updated, done, included),
+            jnp.where(is_updated, new, bound),
             time,
         )
-        return carry, jnp.where(lost, jnp.inf, after)
+        return carry, jnp.where(is_lost, jnp.inf, current)
 
     rate, M = jnp.asarray(rate, ts.dtype), jnp.asarray(M, ts.dtype)
     integrated, completed = (jnp.asarray(v, ts.dtype) for v in (integrated, completed))
@@ -57,10 +61,17 @@ def gronwall(
 def between(
     t0: Any, ts: Any, integrated: Any, completed: Any, rate: Any, M: Any, initial: Any, bounds: Any
 ) -> jax.Array:
-    """The most that `bounds`, which `gronwall` gave at the saved times, may be at any time between
-    the saved time before and this one: e^{c₊Δ} (the bound there + M ∫ dI over the time between)."""
-    first = lambda value, rest: jnp.concatenate([jnp.asarray(value, ts.dtype)[None], rest[:-1]])  # noqa: E731
-    grown = jnp.exp(jnp.maximum(rate, 0.0) * (ts - first(t0, ts)))
-    most = grown * (first(M * initial, bounds) + M * (integrated - first(0.0, completed)))
-    # The saved time itself belongs to it.
-    return jnp.where(jnp.isnan(most), jnp.inf, jnp.maximum(most, bounds))
+    """Return bounds that hold on each interval from the last saved time to this one.
+
+    `bounds` are those of `gronwall` at the saved times. On an interval of length Δ the error is at most
+    e^{c₊Δ} (the bound at its start + M ∫ dI over the interval).
+    """
+
+    def shift(value: Any, rows: Any) -> jax.Array:
+        """Return the rows moved by one, with `value` in front."""
+        return jnp.concatenate([jnp.asarray(value, ts.dtype)[None], rows[:-1]])
+
+    factor = jnp.exp(jnp.maximum(rate, 0.0) * (ts - shift(t0, ts)))
+    inside = factor * (shift(M * initial, bounds) + M * (integrated - shift(0.0, completed)))
+    # The interval includes its end.
+    return jnp.where(jnp.isnan(inside), jnp.inf, jnp.maximum(inside, bounds))

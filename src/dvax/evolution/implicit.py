@@ -1,4 +1,4 @@
-"""The fallback: an implicit method of Diffrax on x' = Ax + f̃(t, x) as a whole."""
+"""Implicit Runge–Kutta methods of Diffrax, applied to the whole right-hand side Ax + f̃(t, x)."""
 
 from typing import Any
 
@@ -23,21 +23,22 @@ _SPLIT = (diffrax.KenCarp3, diffrax.KenCarp4, diffrax.KenCarp5)
 
 
 class Implicit(eqx.Module):
-    """An implicit Runge–Kutta method of Diffrax, by default Kvaerno's of order 5, for what no
-    exponential method should solve: an f̃ that is stiff and couples more unknowns than
-    `ExpRosenbrock` takes, or an A whose exponential costs too much.
+    """An implicit Runge–Kutta method of Diffrax, by default Kværnø's method of order 5.
 
-    A is only applied. Each step solves equations as large as the state by Newton's method, which by
-    default forms their matrix: some thousand unknowns. `rtol` and `atol` then mean what Diffrax means
-    by them, the error of one step; nothing is certified (`Solution.defect` is None), kinks are not
-    looked for (derivatives of a run that crosses some are as good as the steps there are short), and
-    steps are not kept: name the times in `ts=`. Steps end on the knots of data.
+    Use it where exponential methods are expensive: f̃ is stiff and couples more unknowns than
+    `ExpRosenbrock` accepts, or the exponential of A costs too much.
 
-    **Arguments:** `solver`: any implicit solver of Diffrax, with root finder and linear solver of its
-    own if need be. To its KenCarp methods A is the implicit part and the law the explicit one.
+    The method only applies A. Each step solves equations of the size of the state by Newton's method,
+    by default with a dense matrix, which is feasible up to some thousand unknowns. `rtol` and `atol`
+    refer to the error of one step, as in Diffrax. There are no certificates (`Solution.defect` is
+    None). Events are not located, so derivatives of a run with events have errors of the order of the
+    steps there. Steps are not recorded: list the times in `ts=`. Steps end at the knots of data.
 
-    **Raises:** `dvax.InputError` where the solver is not implicit, or where `dvax.solve` is asked for
-    `dt`, `dense=True` or `measure=True`.
+    **Arguments:** `solver`: any implicit solver of Diffrax, with its root finder and linear solver. The
+    KenCarp methods treat A implicitly and the law explicitly.
+
+    **Raises:** `dvax.InputError` if the solver is not implicit, and if `dvax.solve` gets `dt`,
+    `dense=True` or `measure=True` with this method.
 
     Source: Kværnø, BIT 44 (2004); Diffrax, https://docs.kidger.site/diffrax.
 
@@ -46,7 +47,7 @@ class Implicit(eqx.Module):
     >>> stiff = dvax.Problem(
     ...     A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 9.0),
     ...     f=lambda t, x, u, args: 1.0 - x + u, h=lambda t, x, u, args: -1e4 * (x - 2.0) - u,
-    ... )                              # a spring of 5000 holds x above 2, nearly
+    ... )                              # a spring of stiffness 5000 keeps x above 2, nearly
     >>> sol = dvax.solve(stiff, 4.0, 0.0, 4.0, method=dvax.Implicit())
     >>> print(f"{float(sol.xs[0]):.6f}")
     1.999800
@@ -63,12 +64,12 @@ class Implicit(eqx.Module):
                     "dvax.Implicit(solver)",
                     f"{type(self.solver).__name__}",
                     "it must be an implicit solver of Diffrax",
-                    "diffrax.Kvaerno5(), Kvaerno3() or KenCarp4(), say; leave it out for the first",
+                    "Use diffrax.Kvaerno5() (the default), Kvaerno3() or KenCarp4(), for example",
                 )
             )
 
 
-def by_implicit_steps(
+def solve_by_implicit_steps(
     setup: Setup,
     method: Implicit,
     flow: Flow,
@@ -76,16 +77,16 @@ def by_implicit_steps(
     ts: jax.Array | None,
     options: Options,
 ) -> Outcome:
-    """Run implicit steps from the first stop to the last."""
+    """Solve by `Implicit` from the first stop to the last."""
     clock, x0, first_step = _Clock(stops), setup.x0, setup.number("dt0")
     begin, end = clock.stops[0], clock.stops[-1]
     first, last = (one_sided_time(begin, end, theta, (begin, end)) for theta in (0.0, 1.0))
 
     def law(s: Any, x: Tree, _: Any) -> Tree:
-        t, pace = clock.time(jnp.clip(s, first, last))
-        found = flow.rate(t, x, flow.guess(x))
-        # A law that is not solved gives no rate: a shorter step is tried.
-        return jtu.tree_map(lambda v: jnp.where(found.solved, pace * v, jnp.nan), found.value)
+        t, dt_ds = clock.time(jnp.clip(s, first, last))
+        rate = flow.rate(t, x, flow.guess(x))
+        # If the law is not solved, NaN makes Diffrax try a shorter step.
+        return jtu.tree_map(lambda v: jnp.where(rate.solved, dt_ds * v, jnp.nan), rate.value)
 
     def linear(s: Any, x: Tree, _: Any) -> Tree:
         return _tree.scale(clock.time(s)[1], flow.generator.apply(x))
@@ -95,7 +96,7 @@ def by_implicit_steps(
     else:
         terms = diffrax.ODETerm(lambda t, x, _: _tree.add(linear(t, x, _), law(t, x, _)))
 
-    found = diffrax.diffeqsolve(
+    solution = diffrax.diffeqsolve(
         terms,
         method.solver,
         begin,
@@ -113,25 +114,25 @@ def by_implicit_steps(
         if options.progress
         else diffrax.NoProgressMeter(),
     )
-    assert found.ts is not None
-    # An end that is no number has no steps before it.
-    fine = (found.result == diffrax.RESULTS.successful) & (end > begin)
-    # Without ts the one time is that of the last good step.
-    reached = jnp.isfinite(found.ts) & (fine if ts is None else True)
+    assert solution.ts is not None
+    # If the end is NaN, there are no steps.
+    is_successful = (solution.result == diffrax.RESULTS.successful) & (end > begin)
+    # Without ts, the single time of a failed run is that of its last accepted step.
+    reached = jnp.isfinite(solution.ts) & (is_successful if ts is None else True)
     xs = jtu.tree_map(
         lambda leaf: jnp.where(reached.reshape(-1, *(1,) * (leaf.ndim - 1)), leaf, jnp.nan),
-        found.ys,
+        solution.ys,
     )
-    out_of_steps = found.result == diffrax.RESULTS.max_steps_reached
-    result = RESULTS.where(out_of_steps, RESULTS.max_steps, RESULTS.implicit_unsolved)
-    result = RESULTS.where(fine, RESULTS.successful, result)
+    is_out_of_steps = solution.result == diffrax.RESULTS.max_steps_reached
+    result = RESULTS.where(is_out_of_steps, RESULTS.max_steps, RESULTS.implicit_unsolved)
+    result = RESULTS.where(is_successful, RESULTS.successful, result)
     times = jnp.where(reached, stops[-1:] if ts is None else ts, jnp.inf)
-    # What is known of a run that failed is the last saved time that it reached.
+    # Of a failed run, report the last saved time that it reached.
     count = jnp.sum(reached)
     row = jnp.maximum(count - 1, 0)
     stats = {
-        "steps": found.stats["num_accepted_steps"],
-        "rejected": found.stats["num_rejected_steps"],
+        "steps": solution.stats["num_accepted_steps"],
+        "rejected": solution.stats["num_rejected_steps"],
         "t": jnp.where(count > 0, times[row], begin),
         "x": jtu.tree_map(lambda leaf, x: jnp.where(count > 0, leaf[row], x), xs, x0),
         "next_dt": first_step,
@@ -140,11 +141,11 @@ def by_implicit_steps(
 
 
 class _Clock:
-    """A map s ↦ t of the time of the solver to that of the problem: the identity in value, and between
-    two stops the affine function that maps their values to the stops themselves.
+    """A map s ↦ t from the time of the solver to the time of the problem.
 
-    Times in s are constants. So Diffrax chooses and differentiates its steps as where no time is
-    differentiated, and all tangents of the stops enter by x' = dt/ds (Ax + f̃(t, x)).
+    Its value is the identity. Between two stops it is the affine function whose tangents at the ends
+    are those of the stops. Times s are constants, so that Diffrax does not differentiate its steps,
+    and the tangents of the stops enter only through x' = dt/ds (Ax + f̃(t, x)).
     """
 
     def __init__(self, stops: jax.Array) -> None:
@@ -169,8 +170,8 @@ class _Clock:
 
 
 def _controller(rtol: Any, atol: Any, stops: jax.Array) -> diffrax.AbstractStepSizeController:
-    """Steps that adapt and end on the stops."""
-    # The error of a stiff step says little about the next one: Diffrax's advice.
+    """Return an adaptive step size controller whose steps end at the stops."""
+    # These coefficients are those that Diffrax recommends for stiff problems.
     shortest = 8 * jnp.finfo(stops.dtype).eps * jnp.max(jnp.abs(stops))
     adaptive = diffrax.PIDController(
         rtol, atol, pcoeff=0.3, icoeff=0.4, dtmin=shortest, force_dtmin=False

@@ -1,4 +1,4 @@
-"""A function from the arguments of a solve to its solution, compiled as a whole."""
+"""The traceable function from the arguments of a solve to its solution."""
 
 import dataclasses
 from typing import Any
@@ -12,10 +12,10 @@ from .. import _tree
 from .._failure import nan_derivatives_where
 from .closures import closure_convert
 from .flow import Flow
-from .implicit import Implicit, by_implicit_steps
+from .implicit import Implicit, solve_by_implicit_steps
 from .method import AbstractMethod
 from .outcome import Outcome
-from .picard import Picard, by_windows
+from .picard import Picard, solve_by_windows
 from .plan import Plan
 from .responses import responses
 from .results import RESULTS
@@ -25,8 +25,8 @@ from .steps import by_steps
 
 
 def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
-    """Return the solution. Where the run failed, its derivatives are NaN."""
-    # Shapes and knots are checked here, while tracing: a call that is compiled pays nothing.
+    """Return the solution. If the run failed, its derivatives are NaN."""
+    # Check shapes and knots while tracing, so that compiled calls do not pay for it.
     setup.problem.check(setup.number("t0"), setup.x0, setup.args)
     plan = Plan.of(setup)
     flow = plan.flow(setup)
@@ -38,7 +38,7 @@ def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
     result = RESULTS.where(valid, outcome.result, RESULTS.invalid_number)
     solution = _solution(setup, plan, flow, outcome._replace(result=result))
     failed = (solution.result != RESULTS.successful) | ~jnp.all(solution.ts < jnp.inf)
-    # The setup is no output.
+    # The setup is not an output of the compiled program.
     arrays, tree = jtu.tree_flatten(solution, is_leaf=lambda node: node is setup)
     assert arrays.pop() is setup
     given = eqx.filter((flow, setup, ts), eqx.is_inexact_array)
@@ -48,15 +48,15 @@ def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
 def _run(setup: Setup, flow: Flow, ts: Any, valid: jax.Array, options: Options) -> Outcome:
     """Run the method from t0 over the knots of the data to t1."""
     method, t0, t1 = setup.method, setup.number("t0"), setup.number("t1")
-    # No step is made and no time is saved where the numbers are not valid.
+    # If the numbers are invalid, t1 = NaN prevents all steps and saved times.
     t1 = jnp.where(valid, t1, jnp.nan)
     knots = jnp.asarray(setup.problem.knots(t0, t1, setup.x0, setup.args), setup.dtype)
     stops = jnp.concatenate([t0[None], knots, t1[None]])
     times = None if ts is None else jnp.where(valid, jnp.asarray(ts, setup.dtype), jnp.nan)
     if isinstance(method, Implicit):
-        return by_implicit_steps(setup, method, flow, stops, times, options)
+        return solve_by_implicit_steps(setup, method, flow, stops, times, options)
     if isinstance(method, Picard):
-        return by_windows(setup, method, flow, stops, times, options)
+        return solve_by_windows(setup, method, flow, stops, times, options)
     assert isinstance(method, AbstractMethod)  # PiecewiseLinear runs on the host
     return by_steps(setup, method, flow, stops, times, options)
 
@@ -66,7 +66,7 @@ def _solution(setup: Setup, plan: Plan, flow: Flow, outcome: Outcome) -> Solutio
     us, ys, residual, law_step, law_error = responses(
         flow, (rows.t, rows.x, rows.guess), setup.problem.spaces(setup.x0)[1], setup.moduli
     )
-    # f may not feel a response that is not finite, and the solution would hold it all the same.
+    # A non-finite response is a failure even if f does not depend on it.
     result = outcome.result
     result = RESULTS.where(
         (result == RESULTS.successful) & ~_tree.all_finite(us), RESULTS.nonfinite, result

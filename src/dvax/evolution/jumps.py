@@ -1,4 +1,4 @@
-"""A jump of K, h or f in t or in x, or the steps that rounding makes of it, where a run stopped."""
+"""Detection of jumps of K, h or f in t or in x near the time at which a run stopped."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,19 +11,18 @@ from .._tree import Tree
 from ..errors import Fix, InputError
 from .stopped import LAST_STEPS, Diagnosis, Stop
 
-_JUMP, _ROUNDINGS = 1e-7, 1e3
-"""A change of a function within two roundings of t is a jump above this part of its size, or so many
-of its own roundings."""
-_IN_X = 1e-3
-"""A change of x' between two states that rounding tells apart is a jump above this part of its size."""
-_FAR = 1e3
-"""|t| in lengths of the run, from which on t itself is a term that cancels."""
-_STAIR = 1e-3
-"""Part of the size of a function below which many jumps of it are taken for rounding."""
+_MIN_JUMP, _MIN_JUMP_EPS = 1e-7, 1e3
+"""Smallest jump of a function in t, relative to its size, and the same in units of eps."""
+_MIN_JUMP_IN_X = 1e-3
+"""Smallest jump of x' between two neighbouring states, relative to its size."""
+_MAX_TIME_RATIO = 1e3
+"""Ratio of |t| to the length of the run above which the roundoff of t is blamed."""
+_MAX_ROUNDOFF_JUMP = 1e-3
+"""Jumps smaller than this part of the function are roundoff if there are many of them."""
 
 
 def find_jump(stop: Stop) -> Diagnosis:
-    """A jump of K, h or f in t, next to where the run stopped."""
+    """Detect a jump of K, h or f in t near the time at which the run stopped."""
     flow, problem, args = stop.flow, stop.flow.problem, stop.flow.args
     t0, t1 = stop.span
     width = LAST_STEPS * max(stop.step, 4.0 * stop.ulp)
@@ -44,14 +43,14 @@ def find_jump(stop: Stop) -> Diagnosis:
             )
 
         try:
-            again = _change(values(stop.t), values(stop.t))[0]
+            difference = _change(values(stop.t), values(stop.t))[0]
             a, b, before, after = _narrow(values, low, high, stop.ulp)
         except InputError:
-            continue  # refused within the window: that is another cause
-        if again > 0.0:
+            continue  # the function raises in this interval, which is another cause
+        if difference > 0.0:
             return Diagnosis(
-                f"{name} has two values at one time, {again:.3g} apart at t = {stop.t:.12g}: it is no "
-                "function of its arguments.",
+                f"{name} returned two values that differ by {difference:.3g} for the same arguments, "
+                f"at t = {stop.t:.12g}: it is not a function of its arguments.",
                 (
                     Fix(
                         "", "",
@@ -62,25 +61,25 @@ def find_jump(stop: Stop) -> Diagnosis:
             )  # fmt: skip
         change, k = _change(before, after)
         size = float(np.max(np.abs(np.stack([before, after])), initial=0.0))
-        if not (change > max(_JUMP, _ROUNDINGS * eps) * size and b - a < 1e-9 * (t1 - t0)):
+        if not (change > max(_MIN_JUMP, _MIN_JUMP_EPS * eps) * size and b - a < 1e-9 * (t1 - t0)):
             continue
-        # Both halves of what is longer, the part before the jump or the part after it.
+        # Search for similar jumps in both halves of the longer part beside this one.
         left, right = max((low, a), (b, high), key=lambda part: part[1] - part[0])
         middle = 0.5 * (left + right)
-        beside = [_narrow(values, *part, stop.ulp) for part in ((left, middle), (middle, right))]
-        many = all(_change(*found[2:])[0] > 0.25 * change for found in beside)
-        if many and change < _STAIR * size:
-            return _stairs(stop, name, change, b)
+        others = [_narrow(values, *part, stop.ulp) for part in ((left, middle), (middle, right))]
+        are_many = all(_change(*other[2:])[0] > 0.25 * change for other in others)
+        if are_many and change < _MAX_ROUNDOFF_JUMP * size:
+            return _roundoff_jumps(stop, name, change, b)
         where = f" in component {k}" if before.size > 1 else ""
         return Diagnosis(
             f"{name} jumps from {before[k]:.6g} to {after[k]:.6g}{where} at t = {b:.15g}, and no "
-            "step across a jump that is not announced meets the tolerance.",
+            "step across an undeclared jump meets the tolerance.",
             (
                 Fix(
                     "", "",
-                    f"Name the time, so that a step ends there: write what jumps in {name} as "
-                    f"dvax.signals.Function(fn, knots=[{b:.15g}]) and evaluate that, or compare t with "
-                    "the time itself (jnp.where(t < a, …))",
+                    f"Declare the time, so that a step ends there: write the part of {name} that jumps "
+                    f"as dvax.signals.Function(fn, knots=[{b:.15g}]), or compare t with the time "
+                    "directly (jnp.where(t < a, …))",
                 ),
             ),
         )  # fmt: skip
@@ -88,15 +87,15 @@ def find_jump(stop: Stop) -> Diagnosis:
 
 
 def find_discontinuity(stop: Stop) -> Diagnosis:
-    """A jump of f̃ in x, at fixed t, on the line along x' through where the run stopped."""
+    """Detect a jump of f̃ in x at fixed t, on the line along x' through the last state."""
     t = stop.time(stop.t)
-    along = stop.velocity(t, stop.x)
-    speed = stop.norm(along)
+    direction = stop.velocity(t, stop.x)
+    speed = stop.norm(direction)
     if not (np.isfinite(speed) and speed > 0.0):
         return Diagnosis()
 
     def velocity(s: float) -> Tree:
-        return stop.velocity(t, jtu.tree_map(lambda x, v: x + stop.time(s) * v, stop.x, along))
+        return stop.velocity(t, jtu.tree_map(lambda x, v: x + stop.time(s) * v, stop.x, direction))
 
     def values(s: float) -> np.ndarray:
         return np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(velocity(s))])
@@ -104,24 +103,24 @@ def find_discontinuity(stop: Stop) -> Diagnosis:
     eps = float(jnp.finfo(stop.setup.dtype).eps)
     ulp = eps * stop.norm(stop.x) / speed
     far = LAST_STEPS * max(stop.step, 4.0 * stop.ulp, 4.0 * ulp)
-    within = max(ulp, 1e-12 * far)
-    a, b, *_ = _narrow(values, -far, far, within)
-    # Next to the jump and not at it, where sign(0) = 0 lies between both sides.
-    before, after = values(a - 4.0 * within), values(b + 4.0 * within)
+    width = max(ulp, 1e-12 * far)
+    a, b, *_ = _narrow(values, -far, far, width)
+    # Evaluate beside the jump, since a value at the jump, such as sign(0) = 0, may lie between.
+    before, after = values(a - 4.0 * width), values(b + 4.0 * width)
     change, k = _change(before, after)
     size = float(np.max(np.abs(np.stack([before, after])), initial=0.0))
-    # What is only steep changes more over a wider part.
-    wider, _ = _change(values(a - 32.0 * within), values(b + 32.0 * within))
-    if not (change > _IN_X * size and change > 0.5 * wider):
+    # A function that is steep, but continuous, changes more over a wider interval.
+    wider, _ = _change(values(a - 32.0 * width), values(b + 32.0 * width))
+    if not (change > _MIN_JUMP_IN_X * size and change > 0.5 * wider):
         return Diagnosis()
     where = f" in component {k}" if before.size > 1 else ""
-    # The jump itself is a direction in which both sides differ.
+    # Compare the components of both sides along the jump.
     jump = after - before
-    enters = float(before @ jump) * float(after @ jump) < 0.0
-    slides = " It points to the jump from both sides: the solution would slide along it."
+    is_sliding = float(before @ jump) * float(after @ jump) < 0.0
+    sliding = " It points to the jump from both sides: the solution would slide along it."
     return Diagnosis(
         f"x' jumps as a function of x, from {before[k]:.6g} to {after[k]:.6g}{where}, at t = "
-        f"{stop.t:.12g}.{slides if enters else ''} A solution needs f to be continuous in x.",
+        f"{stop.t:.12g}.{sliding if is_sliding else ''} A solution needs f to be continuous in x.",
         (
             Fix(
                 "", "",
@@ -135,7 +134,8 @@ def find_discontinuity(stop: Stop) -> Diagnosis:
 def _narrow(
     values: Callable[[float], np.ndarray], a: float, b: float, ulp: float
 ) -> tuple[float, float, np.ndarray, np.ndarray]:
-    """The part of [a, b] of about two roundings in which the values change most, by bisection."""
+    """Return the subinterval of [a, b] of length 2 ulp in which the values change most, by bisection,
+    and the values at its ends."""
     before, after = values(a), values(b)
     while b - a > 2.0 * max(ulp, 5e-324):
         middle = 0.5 * (a + b)
@@ -149,26 +149,26 @@ def _narrow(
     return a, b, before, after
 
 
-def _stairs(stop: Stop, name: str, height: float, t: float) -> Diagnosis:
-    """Jumps of about one height beside each other: rounding of terms far larger than their sum."""
+def _roundoff_jumps(stop: Stop, name: str, height: float, t: float) -> Diagnosis:
+    """Return the diagnosis of many jumps of one height: roundoff of large terms that cancel."""
     horizon = float(stop.setup.setting["horizon"])
     t0, t1 = stop.span
-    cure = f"Write {name} so that large terms do not cancel"
-    if max(abs(t0), abs(t1)) > _FAR * (t1 - t0):
-        cure = "Count time from the start of the run, so that |t| is not large against t1 − t0"
+    fix = f"Write {name} so that large terms do not cancel"
+    if max(abs(t0), abs(t1)) > _MAX_TIME_RATIO * (t1 - t0):
+        fix = "Count time from the start of the run, so that |t| is not large against t1 − t0"
     return Diagnosis(
-        f"{name} changes in jumps of about {height:.3g} near t = {t:.12g}, as the rounding of terms "
-        "that cancel does, and the tolerance asks for less.",
-        (Fix("atol", f"{2.0 * height * horizon:.1g}", "which rounding allows"), Fix("", "", cure)),
+        f"{name} changes in jumps of about {height:.3g} near t = {t:.12g}, as roundoff of terms that "
+        "cancel does, and the tolerance requires less.",
+        (Fix("atol", f"{2.0 * height * horizon:.1g}", "which rounding allows"), Fix("", "", fix)),
     )
 
 
 def _change(a: np.ndarray, b: np.ndarray) -> tuple[float, int]:
-    """The largest change of a component, and which it is."""
+    """Return the largest change of a component, and its index."""
     if a.size == 0:
         return 0.0, 0
     with np.errstate(invalid="ignore"):  # bounds of K may be infinite
-        apart = np.where(a == b, 0.0, np.abs(b - a))
-    apart = np.where(np.isfinite(apart), apart, 0.0)
-    k = int(np.argmax(apart))
-    return float(apart[k]), k
+        change = np.where(a == b, 0.0, np.abs(b - a))
+    change = np.where(np.isfinite(change), change, 0.0)
+    k = int(np.argmax(change))
+    return float(change[k]), k

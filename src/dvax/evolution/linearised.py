@@ -1,4 +1,4 @@
-"""f̃ taken apart at one point into what is linear in x, which joins A, and the rest."""
+"""The linearisation A + J of the right-hand side at one point, J = Df̃, and its propagators."""
 
 import abc
 from typing import Any
@@ -17,24 +17,24 @@ from ..generators.phi import flow_factors, phi_matrix, phi_scalar
 from ..generators.scalar import ElementwisePropagator
 from ..programs.matrix import diagonal_of, matrix_of
 
-_DENSE = 256
-"""Up to this many unknowns the matrix of A + J is formed."""
+_MAX_DENSE = 256
+"""Largest number of unknowns for which the matrix A + J is formed."""
 
 
 class AbstractLinear(eqx.Module):
-    """A + J, where J = Df̃ at some point."""
+    """The linear operator A + J, where J = Df̃ at some point."""
 
     @abc.abstractmethod
     def propagator(self, h: Any, terms: int) -> AbstractPropagator:
-        """The flow of x' = (A + J)x + p over h."""
+        """Return the flow of x' = (A + J)x + p over h, for polynomials p with `terms` coefficients."""
 
     @abc.abstractmethod
     def apply(self, v: Tree) -> Tree:
-        """J v."""
+        """Return J v."""
 
 
 class ElementwiseLinear(AbstractLinear):
-    """A and J both diagonal."""
+    """A + J with A and J diagonal."""
 
     A: jax.Array
     J: jax.Array
@@ -47,7 +47,7 @@ class ElementwiseLinear(AbstractLinear):
 
 
 class MatrixLinear(AbstractLinear):
-    """A and J as matrices, on the entries of the state in a row."""
+    """A + J as dense matrices that act on the flattened state."""
 
     A: jax.Array
     J: jax.Array
@@ -62,7 +62,7 @@ class MatrixLinear(AbstractLinear):
 
 
 class NoJacobian(AbstractLinear):
-    """J = −A: nothing is left to the propagator, and f̃ has Ax in it."""
+    """The choice J = −A, for explicit methods: A + J = 0, and f̃ includes Ax."""
 
     A: AbstractGenerator
 
@@ -74,7 +74,7 @@ class NoJacobian(AbstractLinear):
 
 
 class FlatPropagator(AbstractPropagator):
-    """A propagator of vectors, for states of any shape."""
+    """A propagator of flat vectors, applied to states of any shape."""
 
     of: AbstractPropagator
 
@@ -83,25 +83,25 @@ class FlatPropagator(AbstractPropagator):
         return back(self.of.step(flat, tuple(jax.flatten_util.ravel_pytree(v)[0] for v in c)))
 
 
-def split(generator: AbstractGenerator, change: Any, x: Tree) -> AbstractLinear:
-    """A + J from the derivative v ↦ Jv at x.
+def linearise(generator: AbstractGenerator, jvp: Any, x: Tree) -> AbstractLinear:
+    """Return A + J from the derivative `jvp`: v ↦ Jv at x.
 
-    **Raises:** `dvax.InputError` where neither A and J are diagonal nor x is small enough for a matrix.
+    **Raises:** `dvax.InputError` if A and J are not both diagonal and x is too large for a matrix.
     """
     if isinstance(generator, Zero | Scalar | Diagonal) and isinstance(x, jax.Array):
-        entries = diagonal_of(change, x)
+        entries = diagonal_of(jvp, x)
         if entries is not None:
             A = jnp.broadcast_to(generator.apply(jnp.ones_like(x)), x.shape)
             return ElementwiseLinear(A, entries)
     size = sum(leaf.size for leaf in jtu.tree_leaves(x))
-    if size > _DENSE:
+    if size > _MAX_DENSE:
         raise InputError(
             InputProblem(
                 "dvax.solve(method=dvax.ExpRosenbrock())",
                 f"{size} unknowns that A or f couples",
-                f"its exponential is that of A + Df, which is formed as a matrix up to {_DENSE} "
-                "unknowns, and beyond only where A is a number or diagonal and f acts point by point",
+                f"it forms the matrix A + Df, which may have at most {_MAX_DENSE} unknowns unless A is "
+                "a number or diagonal and f acts point by point",
                 "Use dvax.Implicit(), or the default method with more steps",
             )
         )
-    return MatrixLinear(matrix_of(generator.apply, x), matrix_of(change, x))
+    return MatrixLinear(matrix_of(generator.apply, x), matrix_of(jvp, x))

@@ -1,4 +1,4 @@
-"""Numbers that are not finite: where the first one is, and data that holds one."""
+"""Detection of NaN and infinity in trees and in the data of a problem."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from .setup import Setup
 
 
 def refuse_nonfinite_data(problem: Problem, args: Any, caller: str) -> None:
-    """Raise an `InputError` where A, P, K or args hold NaN (A and P also infinity)."""
+    """Raise an `InputError` if A, P, K or args contain NaN, or if A or P contain infinity."""
     wrong = []
     for name, data in (("A", problem.A), ("P", problem.P), ("K", problem.K), ("args", args)):
         found = first_bad(data, allow_infinite=name in ("K", "args"))
@@ -29,8 +29,8 @@ def refuse_nonfinite_data(problem: Problem, args: Any, caller: str) -> None:
 
 
 def first_bad(tree: Tree, allow_infinite: bool = False) -> str:
-    """The first value in a tree that is NaN (or infinite), with its place; "" where there is none."""
-    # A solution among the args has settings that are no data of the problem.
+    """Describe the first NaN (or infinity) in a tree and its position; return "" if there is none."""
+    # Skip setups: a solution among the args contains one, and its settings may be NaN.
     whole = jtu.tree_leaves(tree, is_leaf=lambda v: isinstance(v, Setup))
     leaves = [leaf for leaf in whole if isinstance(leaf, float | np.ndarray | jax.Array)]
     for k, leaf in enumerate(leaves):

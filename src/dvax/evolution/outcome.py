@@ -1,4 +1,4 @@
-"""What a run over the stops returns, whatever steps it took."""
+"""The output of a time loop, common to all methods: saved rows, statistics, records."""
 
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from .time_derivatives import left_derivatives, transport, zero_with_tangent
 
 
 class Record(NamedTuple):
-    """What is needed to evaluate a step anywhere inside: x₀ and the stage polynomial."""
+    """The dense output of a step: its start, length, x₀ and stage polynomial."""
 
     start: jax.Array
     length: jax.Array
@@ -26,12 +26,12 @@ class Record(NamedTuple):
 class Saved(NamedTuple):
     """The state at a saved time, and the defects up to it.
 
-    `integrated_defect` = (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) up to the end of the step that the time lies
-    in: x_h is the exact solution of the system with a disturbance of that size. `completed_defect` is
-    the same up to the start of that step. `bounds` holds the bounds of x_h and u_h from t0 to the end
-    of that step, where they are tracked. None where nothing
-    is measured. `guess` is where the solver of the law may begin. `step` is the number
-    of steps up to this time where a step ends at it, −1 where it lies inside a step.
+    - `integrated_defect`: (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) up to the end of the step that contains t,
+      None if it is not measured. (x_h is the exact solution of the system with this disturbance.)
+    - `completed_defect`: the same up to the start of that step;
+    - `bounds`: the bounds of x_h and u_h from t0 to the end of that step, None if they are not tracked;
+    - `guess`: the initial guess for the solver of the law;
+    - `step`: the number of steps up to t if a step ends at t, −1 if t lies inside a step.
     """
 
     t: Any
@@ -44,8 +44,8 @@ class Saved(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The saved times with their states, the entries of `Solution.stats`, how the run ended, and the
-    steps where they were kept."""
+    """The rows at the saved times, the entries of `Solution.stats`, the result, and the records of the
+    steps if `dense=True`."""
 
     rows: Saved
     stats: dict[str, Any]
@@ -54,12 +54,12 @@ class Outcome(NamedTuple):
 
 
 def ended(result: RESULTS, complete: Any) -> RESULTS:
-    """Return the result of a run: one that stopped early without an error took too many steps."""
+    """Return the result of a run: `max_steps` if it is incomplete without another error."""
     return RESULTS.where((result == RESULTS.successful) & ~complete, RESULTS.max_steps, result)
 
 
 def end_alone(end: Any, complete: Any, t1: Any, measured: bool) -> Saved:
-    """Return the last state of a run as its one saved time, ∞ where the run is not `complete`."""
+    """Return a single row with the last state of a run, with t = ∞ if the run is not `complete`."""
     x = jtu.tree_map(lambda leaf: jnp.where(complete, leaf, jnp.nan), end.x)
     integrated_defect = end.integrated_defect if measured else None
     one = Saved(
@@ -69,18 +69,24 @@ def end_alone(end: Any, complete: Any, t1: Any, measured: bool) -> Saved:
 
 
 def with_tangents(rows: Saved, ts: jax.Array, x0: Any, flow: Flow, ends: tuple[Any, Any]) -> Saved:
-    """Return the rows with the tangents of the saved times `ts`, given rows whose times have the
-    tangents of the ends of steps that they meet. Times that were not reached keep their states."""
+    """Return the rows with the tangents of the saved times `ts`.
+
+    The times of the given rows have the tangents of step ends instead. Rows that were not reached keep
+    their states.
+    """
     reached = rows.t < jnp.inf
     t = jnp.where(reached, rows.t, ends[0])
-    apart = zero_with_tangent(jnp.where(reached, ts, ends[0])) - zero_with_tangent(t)
+    difference = zero_with_tangent(jnp.where(reached, ts, ends[0])) - zero_with_tangent(t)
     given = reached, lax.stop_gradient(x0), flow, ends
-    x = transport(rows.x, apart, _arrived, t, *given)
-    return rows._replace(t=rows.t + apart, x=x)
+    x = transport(rows.x, difference, _derivatives, t, *given)
+    return rows._replace(t=rows.t + difference, x=x)
 
 
-def _arrived(ts: jax.Array, xs: Any, reached: Any, x0: Any, flow: Flow, ends: Any) -> Any:
-    """Return the left derivative at the times that were reached, and 0 at the others."""
-    there = lambda x, y: jnp.where(reached.reshape(-1, *(1,) * (x.ndim - 1)), x, y)  # noqa: E731
-    found = left_derivatives(ts, jtu.tree_map(there, xs, x0), flow, ends)
-    return jtu.tree_map(lambda leaf: there(leaf, 0.0), found)
+def _derivatives(ts: jax.Array, xs: Any, reached: Any, x0: Any, flow: Flow, ends: Any) -> Any:
+    """Return the left derivatives of x at the reached times, and 0 at the others."""
+
+    def where_reached(x: Any, y: Any) -> Any:
+        return jnp.where(reached.reshape(-1, *(1,) * (x.ndim - 1)), x, y)
+
+    derivatives = left_derivatives(ts, jtu.tree_map(where_reached, xs, x0), flow, ends)
+    return jtu.tree_map(lambda leaf: where_reached(leaf, 0.0), derivatives)

@@ -1,10 +1,11 @@
-"""The paper's own fixed point, many times at once.
+"""Picard iteration for the fixed point of the paper, parallel in time.
 
 The mild solution is the fixed point of (Sx)(t) = e^{A(t−a)}x(a) + ∫ₐᵗ e^{A(t−s)} f̃(s, x(s)) ds, which
-contracts in the norm sup e^{−λ(t−a)}‖x(t)‖ for λ large (paper, eq:Sop). Here S is applied to a
-window of times as a whole: f̃ at all of them in one batch, p linear between them, and the integral
-exactly, by propagators. The fixed point is the trapezoidal one, of order 2; how far the iterate is from
-it shows in the defect p − f̃(·, x_h), which is sampled, or enclosed, as for any other method.
+contracts in the norm sup e^{−λ(t−a)}‖x(t)‖ for large λ (paper, eq:Sop). Each sweep applies S to a
+window of times: it evaluates f̃ at all times in one batch, interpolates linearly between them (p), and
+integrates p exactly by propagators. The fixed point is that of the exponential trapezoidal rule, of
+order 2. The defect p − f̃(·, x_h) measures the distance of the iterate from the solution. It is
+sampled, or enclosed, as for the other methods.
 """
 
 from collections.abc import Callable
@@ -33,27 +34,28 @@ from .time_derivatives import zero_with_tangent
 
 
 class Picard(eqx.Module):
-    """Picard's iteration on windows of `nodes` steps, all of whose times are computed at once.
+    """Picard iteration on windows of `nodes` steps, parallel over the times of a window.
 
         X^{k+1}(t) = e^{A(t−a)}x(a) + ∫ₐᵗ e^{A(t−s)} p^k(s) ds,     p^k linear through f̃(tᵢ, X^k(tᵢ))
 
-    Each sweep solves the frozen law at all times of the window as one batch; the integral takes as many
-    turns as the logarithm of `nodes` on an accelerator, and one after the other on a CPU. The error
-    falls as (M L̃ W)^k/k! for a window of length W, so windows of a few times 1/L̃ take some ten sweeps.
-    Order 2, as `ETD2RK`, which on a CPU needs fewer evaluations: this is for many cores and few
-    unknowns. Windows are as long as the defect integrated over them is at most its share of the
-    tolerance; one that does not converge is shortened.
+    Each sweep solves the frozen law at all times of the window as one batch. The integrals take
+    log₂(`nodes`) operations in sequence on an accelerator, and `nodes` operations on a CPU. The error
+    decreases as (M L̃ W)^k/k! for a window of length W, so windows of a few times 1/L̃ take about ten
+    sweeps. The order is 2, as for `ETD2RK`, which needs fewer evaluations on a CPU: this method is for
+    many cores and few unknowns. The window length is adaptive: the integrated defect must be at most
+    its share of the tolerance, and a window that does not converge is shortened.
 
-    `Solution.stats` has besides the usual: `windows`, `sweeps` (of all of them) and `contraction`, the
-    largest ratio of two successive corrections in the largest norm over a window: an observation.
+    `Solution.stats` also has `windows`, the total number of `sweeps`, and `contraction`: the largest
+    observed ratio of two successive corrections, in the maximum norm over a window.
     `dvax.Constants.bielecki_factor` bounds it in the λ-norm. Every window has `nodes` equal steps, so
-    fixed steps are shorter than `dt` on a short stretch.
+    fixed steps are shorter than `dt` on a short interval between knots.
 
-    Forward derivatives only (`jax.jvp`, `jax.jacfwd`).
+    It has forward derivatives only (`jax.jvp`, `jax.jacfwd`).
 
-    **Arguments:** `nodes`: steps of a window; `max_sweeps`: the most in one window.
+    **Arguments:** `nodes`: the number of steps of a window; `max_sweeps`: the largest number of sweeps
+    in one window.
 
-    **Raises:** `dvax.InputError` where these are no positive integers.
+    **Raises:** `dvax.InputError` if these are not positive integers.
 
     Source: the paper, Section 4; in parallel: Wu and Chen, SIAM J. Sci. Comput. 42 (2020).
 
@@ -91,9 +93,13 @@ class Picard(eqx.Module):
 
 
 class Window(NamedTuple):
-    """The steps of a window from a to b as one record, the states `after` each, the state at b, the
-    defect of each step, the bounds of all, and how the sweeps went; `converged` says that the law was
-    solved everywhere and the sweeps converged."""
+    """The result of the sweeps on a window.
+
+    - `record`: the steps; `after`: the states at their ends; `end`: the state at the end of the window;
+    - `error`, `integrated_defect`: the error estimate and the defect of each step;
+    - `bounds`: bounds on x_h and u_h, None if they are not tracked;
+    - `converged`: the law was solved at all times, and the sweeps converged.
+    """
 
     record: Record
     after: Tree
@@ -107,29 +113,35 @@ class Window(NamedTuple):
 
 
 class State(NamedTuple):
-    """Where the run stands: at t with x, after `steps` kept steps and `windows` attempted windows."""
+    """The state of a run at time t, after `steps` accepted steps and `windows` attempted windows.
+
+    `last` holds the steps of the last window, and `completed_defect` the defect up to its start.
+    """
 
     t: Any
     x: Tree
     length: Any
     stop: Any
     last: Record
-    before: tuple[Any, Any]
+    completed_defect: tuple[Any, Any]
     integrated_defect: tuple[Any, Any]
     bounds: Bounds | None
     records: Record | None
     steps: Any
     windows: Any
-    refused: Any
+    rejected: Any
     sweeps: Any
     contraction: Any
     result: RESULTS
 
 
 class Run(eqx.Module):
-    """Windows from the first stop to the last. `fixed` steps are no longer than `first`; others adapt
-    to keep the `size` of the defect below 1. A window has converged where a sweep changes f̃ by so
-    little that it `matters` no more."""
+    """A run over windows from the first stop to the last.
+
+    With `fixed` steps their length is at most `first`. Otherwise `first` is the first length, and the
+    control keeps the `size` of the defect below 1. A window has converged when the change of f̃ by a
+    sweep is no longer `is_significant`.
+    """
 
     method: Picard
     stepper: Stepper
@@ -137,27 +149,26 @@ class Run(eqx.Module):
     fixed: bool = eqx.field(static=True)
     first: Any
     size: Callable[[Tree, Tree, Tree], Any]
-    matters: Callable[[Tree, Tree, Tree], Any]
+    is_significant: Callable[[Tree, Tree, Tree], Any]
     max_windows: int = eqx.field(static=True)
     dense: bool = eqx.field(static=True)
 
     def solve(self, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State]:
-        """The states at the times `ts`, and where the run ended."""
+        """Return the rows at the times `ts`, and the state at the end of the run."""
         state = self._start(x0)
         if ts is None:
-            return None, self._until(state, self.stops[-1])
+            return None, self._advance_to(state, self.stops[-1])
         times, count = lax.stop_gradient(ts), ts.shape[0]
-        blank = jax.eval_shape(lambda: self._read(state, times[0]))
+        blank = jax.eval_shape(lambda: self._row(state, times[0]))
         rows = jtu.tree_map(lambda s: jnp.zeros((count, *s.shape), s.dtype), blank)
 
         def visit(k: Any, carry: tuple[State, Saved]) -> tuple[State, Saved]:
             state, rows = carry
-            state = self._until(state, times[k])
-            found = self._read(state, times[k])
-            return state, _tree.put(rows, k, found)
+            state = self._advance_to(state, times[k])
+            return state, _tree.put(rows, k, self._row(state, times[k]))
 
         state, rows = lax.fori_loop(0, count, visit, (state, rows))
-        return rows, self._until(state, self.stops[-1])
+        return rows, self._advance_to(state, self.stops[-1])
 
     def _start(self, x0: Tree) -> State:
         t0, many = self.stops[0], self.method.nodes
@@ -177,36 +188,37 @@ class Run(eqx.Module):
             self.stepper.bounds(x0), records, nought, nought, nought, nought, zero, RESULTS.successful,
         )  # fmt: skip
 
-    def _until(self, state: State, time: Any) -> State:
-        def goes_on(state: State) -> Any:
-            going = state.result == RESULTS.successful
-            return (state.t < time) & going & (state.windows < self.max_windows)
+    def _advance_to(self, state: State, time: Any) -> State:
+        def should_continue(state: State) -> Any:
+            is_successful = state.result == RESULTS.successful
+            return (state.t < time) & is_successful & (state.windows < self.max_windows)
 
-        return lax.while_loop(goes_on, lambda state: self._attempt(state), state)
+        return lax.while_loop(should_continue, lambda state: self._attempt(state), state)
 
     def _attempt(self, state: State) -> State:
         a, many, stop = state.t, self.method.nodes, self.stops[state.stop]
         if self.fixed:
-            # As many whole windows as there must be, all alike.
+            # Divide the rest of the interval into the smallest number of equal windows.
             count = jnp.maximum(jnp.ceil((stop - a) / state.length * (1 - 1e-12)), 1.0)
             b = jnp.where(count > 1, a + (stop - a) / count, stop)
         else:
             b = clip_to_stop(a, state.length, stop)
         window = self._window(a, b, state.x)
         ratio = self.size(window.error, window.record.x0, window.after)
-        kept = window.converged & _tree.all_finite(window.end)
+        is_accepted = window.converged & _tree.all_finite(window.end)
         length = state.length
-        stuck = ~kept
+        has_failed = ~is_accepted
         if not self.fixed:
-            kept = kept & (ratio <= 1.0)
+            is_accepted = is_accepted & (ratio <= 1.0)
             positive = jnp.where(ratio > 0.0, ratio, 1.0)
             factor = jnp.where(ratio > 0.0, jnp.sqrt(0.5 / positive), jnp.inf)
             factor = jnp.where(window.converged, jnp.clip(factor, 0.1, 4.0), 0.25)
-            # A window cut short by a knot says little about the length that was planned.
+            # A knot may have shortened this window, so an accepted window does not reduce the length.
             length = lax.stop_gradient(factor * (b - a))
-            length = jnp.where(kept & (factor > 1.0), jnp.maximum(length, state.length), length)
+            is_longer = is_accepted & (factor > 1.0)
+            length = jnp.where(is_longer, jnp.maximum(length, state.length), length)
             floor = 8 * many * jnp.finfo(a.dtype).eps * jnp.maximum(jnp.abs(a), jnp.abs(b))
-            stuck = ~kept & (b - a <= floor)
+            has_failed = ~is_accepted & (b - a <= floor)
         unconverged = RESULTS.where(
             window.converged, RESULTS.step_too_small, RESULTS.picard_unconverged
         )
@@ -216,25 +228,31 @@ class Run(eqx.Module):
         )
         records = state.records
         if records is not None:
-            place = state.steps + jnp.arange(many)
-            taken = window.record._replace(start=jnp.where(kept, window.record.start, jnp.inf))
-            records = jtu.tree_map(lambda leaf, new: leaf.at[place].set(new), records, taken)
+            indices = state.steps + jnp.arange(many)
+            start = jnp.where(is_accepted, window.record.start, jnp.inf)
+            steps = window.record._replace(start=start)
+            records = jtu.tree_map(lambda leaf, new: leaf.at[indices].set(new), records, steps)
         last = self.stops.shape[0] - 1
-        reached = jnp.where(kept & (b == stop), state.stop + 1, state.stop)
+        next_stop = jnp.where(is_accepted & (b == stop), state.stop + 1, state.stop)
         bounds = state.bounds
         if bounds is not None:
             assert window.bounds is not None
             bounds = bounds.hull(window.bounds)
         new = (b, window.end, window.record, state.integrated_defect, integrated_defect, bounds)
-        old = (a, state.x, state.last, state.before, state.integrated_defect, state.bounds)
-        t, x, record, before, integrated_defect, bounds = _tree.where(kept, new, old)
+        old = (
+            a, state.x, state.last, state.completed_defect, state.integrated_defect, state.bounds,
+        )  # fmt: skip
+        t, x, record, completed_defect, integrated_defect, bounds = _tree.where(
+            is_accepted, new, old
+        )
         return State(
-            t, x, length, jnp.minimum(reached, last), record, before, integrated_defect, bounds,
-            records,
-            jnp.where(kept, state.steps + many, state.steps), state.windows + 1,
-            jnp.where(kept, state.refused, state.refused + many), state.sweeps + window.sweeps,
-            jnp.maximum(state.contraction, jnp.where(kept, window.contraction, 0.0)),
-            RESULTS.where(stuck, unconverged, RESULTS.successful),
+            t, x, length, jnp.minimum(next_stop, last), record, completed_defect, integrated_defect,
+            bounds, records,
+            jnp.where(is_accepted, state.steps + many, state.steps), state.windows + 1,
+            jnp.where(is_accepted, state.rejected, state.rejected + many),
+            state.sweeps + window.sweeps,
+            jnp.maximum(state.contraction, jnp.where(is_accepted, window.contraction, 0.0)),
+            RESULTS.where(has_failed, unconverged, RESULTS.successful),
         )  # fmt: skip
 
     def _window(self, a: Any, b: Any, x: Tree) -> Window:
@@ -245,15 +263,15 @@ class Run(eqx.Module):
         ends = (a + h * steps).at[-1].set(b)
         times = ends.at[0].set(one_sided_time(a, b, 0.0, stepper.ends))
         times = times.at[-1].set(one_sided_time(a, b, 1.0, stepper.ends))
-        flow_over = flow.propagator(h, 2)
+        propagator = flow.propagator(h, 2)
         space = flow.state_space(x)
         norm = jax.vmap(space.norm)
 
-        def swept(value: Tree) -> Tree:
-            """The trajectory under p, linear through these values of f̃."""
-            c = _pieces(value)
-            pushed = jax.vmap(lambda *c: flow_over.step(_tree.zeros_like(x), c))(*c)
-            return _accumulated(flow.generator, flow_over, h, x, pushed)
+        def trajectory(value: Tree) -> Tree:
+            """Return the trajectory under p, which interpolates these values of f̃ linearly."""
+            c = _linear_pieces(value)
+            increments = jax.vmap(lambda *c: propagator.step(_tree.zeros_like(x), c))(*c)
+            return _accumulate(flow.generator, propagator, h, x, increments)
 
         def rates(X: Tree, Y: Tree | None) -> Any:
             return jax.vmap(flow.rate)(times, X, Y)
@@ -264,67 +282,72 @@ class Run(eqx.Module):
             guess = jtu.tree_map(
                 lambda leaf: jnp.broadcast_to(leaf, (many + 1, *leaf.shape)), guess
             )
-        before = rates(constant, guess)
-        X = swept(before.value)
-        moved = jnp.max(norm(_tree.sub(X, constant)))
-        zero, yes = jnp.zeros_like(moved), jnp.asarray(True)
+        first_rates = rates(constant, guess)
+        X = trajectory(first_rates.value)
+        first_change = jnp.max(norm(_tree.sub(X, constant)))
+        zero, yes = jnp.zeros_like(first_change), jnp.asarray(True)
 
-        def goes_on(carry: Any) -> Any:
-            k, _, _, moved, _, matters = carry
-            return matters & (k < self.method.max_sweeps) & (moved < jnp.inf)
+        def should_continue(carry: Any) -> Any:
+            k, _, _, change, _, is_significant = carry
+            return is_significant & (k < self.method.max_sweeps) & (change < jnp.inf)
 
         def sweep(carry: Any) -> Any:
-            k, X, known, moved, contraction, _ = carry
-            found = rates(X, None if guess is None else known.y)
-            new = swept(found.value)
-            change = jnp.max(norm(_tree.sub(new, X)))
-            ratio = change / jnp.where(moved > 0.0, moved, 1.0)
-            # Corrections that are rounding have no ratio to speak of.
-            told = change > 1e4 * jnp.finfo(h.dtype).eps * (1.0 + jnp.max(norm(new)))
-            contraction = jnp.where(told, jnp.maximum(contraction, ratio), contraction)
-            off = _tree.sub(found.value, known.value)
-            return k + 1, new, found, change, contraction, self.matters(off, new, found.value)
+            k, X, last, last_change, contraction, _ = carry
+            new = rates(X, None if guess is None else last.y)
+            new_X = trajectory(new.value)
+            change = jnp.max(norm(_tree.sub(new_X, X)))
+            ratio = change / jnp.where(last_change > 0.0, last_change, 1.0)
+            # The ratio of corrections of the size of roundoff is meaningless.
+            floor = 1e4 * jnp.finfo(h.dtype).eps * (1.0 + jnp.max(norm(new_X)))
+            contraction = jnp.where(change > floor, jnp.maximum(contraction, ratio), contraction)
+            rate_change = _tree.sub(new.value, last.value)
+            is_significant = self.is_significant(rate_change, new_X, new.value)
+            return k + 1, new_X, new, change, contraction, is_significant
 
-        first = (jnp.asarray(1), X, before, moved, zero, yes)
-        k, X, known, _, contraction, matters = lax.while_loop(goes_on, sweep, first)
-        converged = jnp.all(known.solved) & ~matters
-        c = _pieces(known.value)
+        first = (jnp.asarray(1), X, first_rates, first_change, zero, yes)
+        k, X, last, _, contraction, is_significant = lax.while_loop(should_continue, sweep, first)
+        converged = jnp.all(last.solved) & ~is_significant
+        c = _linear_pieces(last.value)
         start, end = _rows(X, slice(-1)), _rows(X, slice(1, None))
-        ys = None if guess is None else _rows(known.y, slice(-1))
-        sample, looked = jax.vmap(stepper.look)(ends[:-1], ends[1:], start, end, c, ys)
+        ys = None if guess is None else _rows(last.y, slice(-1))
+        sample, is_measured = jax.vmap(stepper.estimate_defect)(
+            ends[:-1], ends[1:], start, end, c, ys
+        )
         integrated_defect = sample.defect, sample.law_defect
         record = Record(ends[:-1], jnp.broadcast_to(h, (many,)), start, c)
         return Window(
             record, end, _rows(X, -1), sample.error, integrated_defect,
             sample.bounds.hull_of_rows() if stepper.track_bounds else None,
-            converged & jnp.all(looked), k, contraction,
+            converged & jnp.all(is_measured), k, contraction,
         )  # fmt: skip
 
-    def _read(self, state: State, time: Any) -> Saved:
-        """The trajectory at a time in the last window; t = ∞ where the run did not get there."""
+    def _row(self, state: State, time: Any) -> Saved:
+        """Return the trajectory at a time in the last window; t = ∞ if the run did not reach it."""
         record = state.last
         i = jnp.sum(record.start <= time) - 1
         step = jtu.tree_map(lambda leaf: leaf[jnp.maximum(i, 0)], record)
         theta = (time - step.start) / jnp.where(step.length > 0, step.length, 1)
         reached = state.t >= time
-        met = time >= state.t
+        is_end = time >= state.t
         x = lax.cond(
-            met,
+            is_end,
             lambda: state.x,
             lambda: interpolate(self.stepper.flow, step.length, theta, step.x0, step.coefficients),
         )
         x = jtu.tree_map(lambda leaf: jnp.where(reached, leaf, jnp.nan), x)
-        started = time > record.start[0]
-        integrated_defect = _tree.where(started, state.integrated_defect, state.before)
-        completed_defect = _tree.where(time >= state.t, state.integrated_defect, state.before)
-        # The state at the end of a window moves with it.
-        time = time + zero_with_tangent(jnp.where(met, state.t, 0.0))
+        is_inside = time > record.start[0]
+        integrated_defect = _tree.where(is_inside, state.integrated_defect, state.completed_defect)
+        completed_defect = _tree.where(
+            time >= state.t, state.integrated_defect, state.completed_defect
+        )
+        # At the end of a window the row has the tangent of that time.
+        time = time + zero_with_tangent(jnp.where(is_end, state.t, 0.0))
         return Saved(
             jnp.where(reached, time, jnp.inf), x, integrated_defect, completed_defect, state.bounds
         )
 
 
-def by_windows(
+def solve_by_windows(
     setup: Setup,
     method: Picard,
     flow: Flow,
@@ -332,7 +355,7 @@ def by_windows(
     ts: jax.Array | None,
     options: Options,
 ) -> Outcome:
-    """Run windows from the first stop to the last."""
+    """Solve by `Picard` from the first stop to the last."""
     x0 = setup.x0
     growth = flow.generator.growth(flow.state_space(x0)) if flow.enclosed else None
     ends = stops[0], stops[-1]
@@ -344,27 +367,31 @@ def by_windows(
         lambda *parts: jnp.stack(root_mean_squares(setup.problem.spaces(x0)[0])(*parts))
     )
 
-    def size(error: Any, before: Any, after: Any) -> Any:
-        """What the defect amounts to, in tolerances: the mean of the steps, since a kink is in one."""
-        scale = atol + rtol * jnp.maximum(sizes(before), sizes(after))
+    def size(error: Any, completed_defect: Any, after: Any) -> Any:
+        """Return the defect in units of the tolerance, averaged over the steps of the window.
+
+        (The maximum would reject windows for an event in a single step.)
+        """
+        scale = atol + rtol * jnp.maximum(sizes(completed_defect), sizes(after))
         ratio = horizon * jnp.max(jnp.mean(sizes(error) / scale, axis=0))
         return jnp.where(jnp.isnan(ratio), jnp.inf, ratio)
 
-    def matters(change: Any, X: Any, value: Any) -> Any:
-        """Whether f̃ still changes by more than rounding, and by a part of the tolerance that shows
-        beside the defect."""
-        worst = lambda v: jnp.max(sizes(v))  # noqa: E731
-        rounding = 20 * jnp.finfo(setup.dtype).eps * worst(value)
-        more = ~(worst(change) <= rounding)
-        return more if options.fixed else more & ~(size(change, X, X) <= 0.01)
+    def is_significant(change: Any, X: Any, value: Any) -> Any:
+        """Return whether a change of f̃ exceeds roundoff, and 0.01 of the tolerance if steps adapt."""
+        largest = lambda v: jnp.max(sizes(v))  # noqa: E731
+        rounding = 20 * jnp.finfo(setup.dtype).eps * largest(value)
+        exceeds_rounding = ~(largest(change) <= rounding)
+        return (
+            exceeds_rounding if options.fixed else exceeds_rounding & ~(size(change, X, X) <= 0.01)
+        )
 
     first = setup.number("dt") if options.fixed else setup.number("dt0")
     windows = max(1, -(-options.max_steps // method.nodes))
     if options.fixed:
-        # Each stretch between two knots rounds up to whole windows.
+        # The number of windows is rounded up on each interval between two knots.
         windows += stops.shape[0]
     run = Run(
-        method, stepper, stops, options.fixed, first, size, matters,
+        method, stepper, stops, options.fixed, first, size, is_significant,
         windows, options.dense,
     )  # fmt: skip
     saved, end = forward_only(run.solve(x0, ts))
@@ -374,55 +401,60 @@ def by_windows(
         ends = lax.stop_gradient((stops[0], stops[-1]))
         rows = with_tangents(rows, ts, x0, flow, ends)
     stats = {
-        "steps": end.steps, "rejected": end.refused, "t": end.t, "x": end.x,
+        "steps": end.steps, "rejected": end.rejected, "t": end.t, "x": end.x,
         "next_dt": end.length / method.nodes, "windows": end.windows, "sweeps": end.sweeps,
         "contraction": end.contraction,
     }  # fmt: skip
     return Outcome(rows, stats, ended(end.result, complete), end.records)
 
 
-def _pieces(value: Tree) -> tuple[Tree, Tree]:
-    """(c₀, c₁) of each step from the values at its ends."""
+def _linear_pieces(value: Tree) -> tuple[Tree, Tree]:
+    """Return (c₀, c₁) of each step from the values of f̃ at its ends."""
     left = _rows(value, slice(-1))
     return left, _tree.sub(_rows(value, slice(1, None)), left)
 
 
 def _rows(tree: Tree, cut: Any) -> Tree:
-    """The rows of each leaf."""
+    """Return the rows `cut` of each leaf."""
     return jtu.tree_map(lambda leaf: leaf[cut], tree)
 
 
-def _accumulated(
-    A: AbstractGenerator, over: AbstractPropagator, h: Any, x: Tree, pushed: Tree
+def _accumulate(
+    A: AbstractGenerator, propagator: AbstractPropagator, h: Any, x: Tree, increments: Tree
 ) -> Tree:
-    """x₀ = x and xᵢ₊₁ = e^{hA}xᵢ + pushedᵢ, all of them."""
+    """Return all states x₀ = x, xᵢ₊₁ = e^{hA}xᵢ + incrementsᵢ, stacked."""
     first = jtu.tree_map(lambda leaf: leaf[None], x)
-    joined = jtu.tree_map(lambda a, b: jnp.concatenate([a, b]), first, pushed)
+    terms = jtu.tree_map(lambda a, b: jnp.concatenate([a, b]), first, increments)
     return lax.platform_dependent(
-        joined,
-        cpu=lambda joined: in_turn(over, joined),
-        default=lambda joined: by_doubling(A, h, joined),
+        terms,
+        cpu=lambda terms: accumulate_sequentially(propagator, terms),
+        default=lambda terms: accumulate_by_doubling(A, h, terms),
     )
 
 
-def in_turn(over: AbstractPropagator, pushed: Tree) -> Tree:
-    """xᵢ = e^{hA}xᵢ₋₁ + pushedᵢ from x₀ = pushed₀, one after the other."""
+def accumulate_sequentially(propagator: AbstractPropagator, terms: Tree) -> Tree:
+    """Return all x₀ = terms₀, xᵢ = e^{hA}xᵢ₋₁ + termsᵢ, computed one after the other."""
 
-    def one(x: Tree, push: Tree) -> tuple[Tree, Tree]:
-        new = _tree.add(over.step(x, ()), push)
+    def advance(x: Tree, term: Tree) -> tuple[Tree, Tree]:
+        new = _tree.add(propagator.step(x, ()), term)
         return new, new
 
-    start = _rows(pushed, 0)
-    _, xs = lax.scan(one, start, _rows(pushed, slice(1, None)))
+    start = _rows(terms, 0)
+    _, xs = lax.scan(advance, start, _rows(terms, slice(1, None)))
     return jtu.tree_map(lambda a, b: jnp.concatenate([a[None], b]), start, xs)
 
 
-def by_doubling(A: AbstractGenerator, h: Any, pushed: Tree) -> Tree:
-    """The same in as many turns as the logarithm of their number: after r of them, entry i is the sum
-    of e^{(i−j)hA}pushedⱼ over the 2ʳ entries j up to it."""
-    count, apart = jtu.tree_leaves(pushed)[0].shape[0], 1
-    while apart < count:
-        moved = jax.vmap(lambda v, k=apart: A.semigroup(k * h, v))(_rows(pushed, slice(-apart)))
-        pushed = jtu.tree_map(lambda leaf, m, k=apart: leaf.at[k:].add(m), pushed, moved)
-        apart *= 2
-    return pushed
+def accumulate_by_doubling(A: AbstractGenerator, h: Any, terms: Tree) -> Tree:
+    """Return the states of `accumulate_sequentially` by a parallel prefix sum.
+
+    After r of log₂(count) passes, entry i is the sum of e^{(i−j)hA}termsⱼ over the last 2ʳ entries
+    j ≤ i.
+    """
+    count, distance = jtu.tree_leaves(terms)[0].shape[0], 1
+    while distance < count:
+        shifted = jax.vmap(lambda v, k=distance: A.semigroup(k * h, v))(
+            _rows(terms, slice(-distance))
+        )
+        terms = jtu.tree_map(lambda leaf, m, k=distance: leaf.at[k:].add(m), terms, shifted)
+        distance *= 2
+    return terms

@@ -1,4 +1,4 @@
-"""What is settled before time runs: what the code of f, h and K proves, and the law's solver."""
+"""The plan of a run: properties of the law that its code proves, and the solver of the law."""
 
 from typing import NamedTuple
 
@@ -18,15 +18,15 @@ from .small_box import AbstractSmallBox, is_small, small_box
 
 
 class Plan(NamedTuple):
-    """How a run solves its law, without any array: made once a run, and kept by its `Solution`.
+    """The way in which a run solves its law: static, made once per run, and stored in its `Solution`.
 
-    - `closed_form`: the law is F(y) = ay − h(t, x, 0) and y = proj_K(h(t, x, 0)/a);
-    - `one_slope`: a is one number a part, so that it is read from memory once;
-    - `constant_slope`: a depends on neither t nor x;
-    - `small_box`: the law is affine on a box of a few unknowns, with a matrix that depends on neither t
-      nor x, and is solved by a formula;
-    - `solver`: the solver of the law that `dvax.vi.Auto` chose, None where the caller named one;
-    - `enclosed`: f̃ can be enclosed over a whole step, so that the defect is not sampled.
+    - `closed_form`: the law is F(y) = ay − h(t, x, 0), so that y = proj_K(h(t, x, 0)/a);
+    - `one_slope`: a is one number for each part, which saves memory traffic;
+    - `constant_slope`: a does not depend on t and x;
+    - `small_box`: the law is affine on a box of a few unknowns, its matrix does not depend on t and x,
+      and a formula solves it;
+    - `solver`: the solver of the law that `dvax.vi.Auto` chose, None if the user gave one;
+    - `enclosed`: f̃ has an enclosure over a whole step, so that the defect is not sampled.
     """
 
     closed_form: bool
@@ -38,7 +38,7 @@ class Plan(NamedTuple):
 
     @staticmethod
     def of(setup: Setup) -> "Plan":
-        """Read the code of f, h and K, traced at the start of the run."""
+        """Return the plan from the code of f, h and K, traced at the start of the run."""
         problem, x0, args, t0 = setup.problem, setup.x0, as_arrays(setup.args), setup.number("t0")
         like = problem.zero_control(x0)
         if not isinstance(setup.vi_solver, Auto):
@@ -98,8 +98,7 @@ def _small_box(setup: Setup) -> AbstractSmallBox:
 
 
 def _tolerance(setup: Setup) -> jax.Array:
-    """Return the tolerance of the law: a thousandth of that of the defect, and no less than rounding
-    allows."""
+    """Return the tolerance of the law: a thousandth of that of the defect, but at least 100 eps."""
     floor = 100 * jnp.finfo(setup.dtype).eps
     defect = setup.number("atol") + setup.number("rtol")
     adaptive = 1e-3 * defect / jnp.maximum(1.0, setup.number("horizon"))

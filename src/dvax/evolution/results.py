@@ -1,10 +1,10 @@
-"""How a solve may end."""
+"""The results of a solve: success and the kinds of failure."""
 
 import equinox as eqx
 
 
 class RESULTS(eqx.Enumeration):
-    """How a solve ended, in a sentence."""
+    """The result of a solve, described in a sentence."""
 
     successful = "The end time was reached."
     max_steps = "The largest number of steps was reached before t1."
@@ -13,16 +13,15 @@ class RESULTS(eqx.Enumeration):
         "the tolerance."
     )
     picard_unconverged = (
-        "Picard's sweeps did not converge on a window, however short, or the law was not solved there. "
-        "Shorten dt, or take fewer nodes: dvax.Picard(nodes=16)."
+        "Picard's sweeps did not converge on the shortest window, or the law was not solved there. "
+        "Shorten dt, or use fewer nodes: dvax.Picard(nodes=16)."
     )
     implicit_unsolved = (
-        "The equations of an implicit step were not solved, however short the step. f, h or K may be "
-        "NaN or infinite there, or jump; or give dvax.Implicit(solver) a root finder of its own."
+        "The equations of the shortest implicit step were not solved. f, h or K may be NaN or "
+        "infinite there, or jump; else pass dvax.Implicit(solver) a solver with another root finder."
     )
     switching_unresolved = (
-        "The constraints changed again and again at one time, so that no mode goes on from there. "
-        "Check "
+        "The constraints changed repeatedly at one time, and no mode is consistent after it. Check "
         "that the law is strongly pseudomonotone (dvax.verify), or use dvax.ExpRosenbrock()."
     )
     stiff = (

@@ -24,7 +24,7 @@ from jax import lax
 from .. import _tree
 from .._jax import outlined
 from .._tree import Tree
-from .checkpoints import Checkpoints, Stack, how_many
+from .checkpoints import Checkpoints, Stack, checkpoint_count
 from .loop import Loop, Record, Saved, State
 from .stepper import interpolate, local
 from .time_derivatives import instantiate_zeros, is_zero
@@ -52,7 +52,7 @@ def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State
         x0, loop, ts = whole(leaves)
 
         def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State]:
-            return loop.run(x0, ts, Checkpoints(x0, how_many(x0, loop.max_steps)))
+            return loop.run(x0, ts, Checkpoints(x0, checkpoint_count(x0, loop.max_steps)))
 
         saved, state = outlined(run, loop, x0, ts)
         assert state.checkpoints is not None
@@ -130,7 +130,7 @@ class _Backward:
             jnp.asarray(row),
             self.guess,
         )
-        every = how_many(self.x0, self.loop.max_steps) >= self.loop.max_steps
+        every = checkpoint_count(self.x0, self.loop.max_steps) >= self.loop.max_steps
         carry = self._through_all(bar, carry) if every else self._from_checkpoints(bar, carry)
         adjoint, gathered, row, _ = carry
         if bar.saved is not None:

@@ -1,4 +1,4 @@
-"""An explicit Runge–Kutta method, for systems of which nothing is stiff."""
+"""An explicit Runge–Kutta method for systems that are not stiff."""
 
 from typing import ClassVar
 
@@ -13,7 +13,7 @@ _STAGES = (
     (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
 )
 _WEIGHTS = (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84)
-_BEND = (
+_DENSE_WEIGHTS = (
     -12715105075 / 11282082432,
     0.0,
     87487479700 / 32700410799,
@@ -22,26 +22,27 @@ _BEND = (
     -1453857185 / 822651844,
     69997945 / 29380423,
 )
-"""Of k₁, …, k₇ in the bend r of the dense output."""
+"""The weights dᵢ of k₁, …, k₇ in the term r of the dense output."""
 _SAMPLES = (TWO_SAMPLES[0], TWO_SAMPLES[0] ** 0.5, TWO_SAMPLES[1])
 """The defect is close to a multiple of θ(1−θ)(1 − 5(2θ−1)²), whose mean is zero. At its zeros, the
-inner Lobatto points, the part that does not cancel shows; near the middle its size, 1.7 times the mean
-of its modulus."""
+inner Lobatto points, the samples show the part that does not cancel; near the middle its size,
+1.7 times the mean of its modulus."""
 
 
 class DormandPrince(AbstractMethod):
-    """The explicit Runge–Kutta method of order 5 of Dormand and Prince (1980), RK5(4)7M, on the whole
-    right-hand side g(t, x) = Ax + f̃(t, x): for few unknowns, and an A that is not stiff.
+    """The explicit Runge–Kutta method RK5(4)7M of order 5 of Dormand and Prince (1980).
+
+    It treats the whole right-hand side g(t, x) = Ax + f̃(t, x) explicitly. Use it for few unknowns and
+    an A that is not stiff.
 
         kᵢ = g(t₀ + cᵢh, x₀ + h Σⱼ aᵢⱼkⱼ),   x₁ = x₀ + hm,   m = Σ bᵢkᵢ,   k₇ = g(t₀ + h, x₁)
         x_h(t₀ + θh) = x₀ + h (θm + θ(1−θ)(k₁ − m) + θ²(1−θ)(2m − k₁ − k₇) + θ²(1−θ)²r),
 
-    where r = Σ dᵢkᵢ is that of Shampine (Hairer, Nørsett and Wanner 1993, Section II.6), with which a
-    step is off by O(h⁵) inside. Order 5 where f̃ is smooth along the solution; h‖A‖ is limited as
-    for any explicit method (stable for hλ from about −3.3), which the step control finds out: a stiff
-    A costs steps, not digits. The defect x_h' − Ax_h − f̃ is of order 4. Seven evaluations. Steps that
-    end at kinks have their order, as with the other methods. No exponentials are formed, so that a
-    step whose length is new costs no more than any other.
+    where r = Σ dᵢkᵢ is that of Shampine (Hairer, Nørsett and Wanner 1993, Section II.6). The error of
+    the dense output is O(h⁵), and the defect x_h' − Ax_h − f̃ is of order 4. A step takes seven
+    evaluations. The order is 5 if f̃ is smooth along the solution, and also if steps end at events.
+    The method is stable for real hλ ≥ −3.3 only; the error control then limits the steps, so a stiff A
+    costs steps and not accuracy. There are no exponentials, so a new step size has no extra cost.
 
     ```python
     >>> import dvax
@@ -75,8 +76,13 @@ class DormandPrince(AbstractMethod):
             k.append(evaluate(node, propagate(1.0, (sum_of(weights, k),))))
         mean = sum_of(_WEIGHTS, k)
         last = evaluate(1.0, propagate(1.0, (mean,)))
-        bend = sum_of(_BEND, [*k, last])
-        # The derivative of x_h, by powers of θ.
+        dense_term = sum_of(_DENSE_WEIGHTS, [*k, last])
+        # The coefficients of x_h' in powers of θ.
         back, gap = (1.0, first), combined((2.0, mean), (-1.0, first), (-1.0, last))
-        slope = combined((-2.0, first), (2.0, mean), (2.0, gap), (2.0, bend))
-        return combined(back), slope, combined((-3.0, gap), (-6.0, bend)), combined((4.0, bend))
+        slope = combined((-2.0, first), (2.0, mean), (2.0, gap), (2.0, dense_term))
+        return (
+            combined(back),
+            slope,
+            combined((-3.0, gap), (-6.0, dense_term)),
+            combined((4.0, dense_term)),
+        )

@@ -1,4 +1,4 @@
-"""The arguments of a solve."""
+"""The arguments of a solve: `Setup`, and the static `Options` of its loop."""
 
 from typing import Any, NamedTuple
 
@@ -12,11 +12,13 @@ from ..vi import AbstractSolver
 
 
 class Setup(NamedTuple):
-    """The arguments of a solve that its solution is a function of.
+    """The arguments that determine the solution.
 
-    `setting` holds the numbers: t0, t1, dt (NaN for adaptive steps), rtol, atol, dt0, horizon;
-    `moduli` those of γ, L_F and ‖P⁻¹‖ that are known; `method` is an `AbstractMethod`, `Implicit`,
-    `Picard` or `PiecewiseLinear`, which all take a setup. A plain tuple: one is made at every call.
+    - `setting`: the numbers t0, t1, dt (NaN for adaptive steps), rtol, atol, dt0, dt_max and horizon;
+    - `moduli`: γ, L_F and ‖P⁻¹‖, as far as they are given;
+    - `method`: an `AbstractMethod`, `Implicit`, `Picard` or `PiecewiseLinear`.
+
+    It is a plain tuple, since every call makes one.
     """
 
     problem: Problem
@@ -29,29 +31,29 @@ class Setup(NamedTuple):
 
     @property
     def dtype(self) -> Any:
-        """The floating type of the state, which time shares."""
+        """The floating-point type of the state and of time."""
         return jnp.result_type(*jtu.tree_leaves(self.x0))
 
     def number(self, name: str) -> jax.Array:
-        """An entry of `setting`, in the type of the state."""
+        """Return an entry of `setting` in the type of the state."""
         return jnp.asarray(self.setting[name], self.dtype)
 
     def is_valid(self, ts: Any) -> jax.Array:
-        """Whether the numbers obey the rules of `arguments.check`, which cannot look at traced ones."""
+        """Return whether the numbers obey the rules of `arguments.check`, which skips traced ones."""
         number = self.number
         lengths = jnp.stack([number(name) for name in ("dt0", "dt_max", "horizon")])
         # dt is NaN where steps adapt.
         positive = jnp.all(lengths > 0) & ~(number("dt") <= 0)
         rtol, atol = number("rtol"), number("atol")
         tolerances = (rtol >= 0) & (atol >= 0) & (rtol + atol > 0)
-        forward = number("t1") > number("t0")
+        is_forward = number("t1") > number("t0")
         if ts is not None:
-            forward &= jnp.min(jnp.asarray(ts, self.dtype)) >= number("t0")
-        return forward & positive & tolerances
+            is_forward &= jnp.min(jnp.asarray(ts, self.dtype)) >= number("t0")
+        return is_forward & positive & tolerances
 
 
 class Options(NamedTuple):
-    """What a time loop is compiled for, apart from shapes; see `dvax.solve`."""
+    """Static options of a time loop; see `dvax.solve`."""
 
     fixed: bool
     measure: bool
@@ -65,6 +67,5 @@ class Options(NamedTuple):
 
 
 def as_arrays(args: Any) -> Any:
-    """Return args with Python floats as the arrays that f and h always get; integers and flags stay
-    what they are."""
+    """Return args with Python floats converted to arrays; integers and flags remain static."""
     return jtu.tree_map(lambda v: jnp.asarray(v) if isinstance(v, float) else v, args)

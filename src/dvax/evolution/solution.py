@@ -1,4 +1,4 @@
-"""What a solve returns."""
+"""The result of `dvax.solve`."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -28,28 +28,29 @@ if TYPE_CHECKING:
 
 
 class Solution(eqx.Module):
-    """A trajectory with its response, its errors and how it was computed.
+    """A trajectory with its response, its error measures and statistics of the run.
 
-    - `ts`: the saved times; `xs`, `us`, `ys`: states, responses u and y = P u there, each with a
-      leading time axis;
+    - `ts`: the saved times;
+    - `xs`, `us`, `ys`: states, responses u and y = P u at the saved times, with a leading time axis;
     - `law_error`: a certified bound on ‖u − u*‖ of the frozen law at each saved time (C0 of
-      `dvax.vi.certificate`), or None where γ was not given (`constants=`), ‖P⁻¹‖(‖w‖/γ + ‖ȳ − y‖)
-      with `law_residual` = ‖w‖ and `law_step` = ‖ȳ − y‖ of one projection step from y;
-    - `defect`: ∫ ‖p − f̃(·, x_h)‖ ds up to each saved time, where x_h is the computed trajectory: it is
-      the exact solution of the system with a disturbance p − f̃ of that size. `law_defect` is the same
-      integral of ‖w‖ over the frozen solves. Both None where not measured (fixed steps, unless
-      `measure=True`). `dvax.bound_error` turns them into error bounds;
-    - `completed_defect`: (defect, law_defect) at the start of the step that each saved time lies in;
-    - `bounds`: between what x_h and u_h stayed from t0 to the end of that step, where `constants=` of a
-      region were given;
-    - `enclosed`: whether the defect, and the bounds, are enclosures over every step
-      (`dvax.programs.enclosure`) or estimates from samples;
-    - `stats`: steps accepted and rejected, `evaluations` of F in them (without those that look for
-      kinks or read u at saved times), and where the run stands: t, x and the next step; with
-      `compile_time` and `run_time` in seconds, unless the solve is part of a larger compiled program;
-    - `result`: `dvax.RESULTS.successful`, or what went wrong;
-    - `plan`: what the code of f, h and K proved about the law (None with `PiecewiseLinear`);
-    - `setup`: the arguments; `records`: the steps, where `dense=True` kept them.
+      `dvax.vi.certificate`), ‖P⁻¹‖(‖w‖/γ + ‖ȳ − y‖); None if `constants=` does not give γ;
+    - `law_residual`, `law_step`: ‖w‖ and ‖ȳ − y‖ of one projection step from y;
+    - `defect`: ∫ ‖p − f̃(·, x_h)‖ ds up to each saved time. The computed trajectory x_h is the exact
+      solution of the system with the disturbance p − f̃. `dvax.bound_error` computes error bounds from
+      it. None if it is not measured (fixed steps without `measure=True`);
+    - `law_defect`: the integral of ‖w‖ over the frozen solves, or None;
+    - `completed_defect`: (defect, law_defect) at the start of the step that contains each saved time;
+    - `bounds`: bounds on x_h and u_h from t0 to the end of that step, if `constants=` hold in a region
+      only, else None;
+    - `enclosed`: True if the defect and `bounds` are enclosures over every step
+      (`dvax.programs.enclosure`), False if samples estimate them;
+    - `stats`: the numbers of accepted `steps`, of `rejected` steps and of `evaluations` of F in steps
+      (without those for event location and for u at saved times); `t`, `x` and the next step size at
+      the end of the run; `compile_time` and `run_time` in seconds, unless the solve is part of a larger
+      compiled program;
+    - `result`: `dvax.RESULTS.successful`, or the kind of failure;
+    - `plan`: properties of the law proved from the code of f, h and K (None with `PiecewiseLinear`);
+    - `setup`: the arguments; `records`: the steps, if `dense=True`.
 
     ```python
     >>> import dvax
@@ -86,44 +87,45 @@ class Solution(eqx.Module):
 
     @property
     def flow(self) -> Flow:
-        """The reduced map f̃ of the run, by what its plan proved."""
+        """The reduced map f̃ of the run, according to its plan."""
         plan = Plan.of(self.setup) if self.plan is None else self.plan
         return plan.flow(self.setup)
 
     def evaluate(self, t: Any) -> tuple[Tree, Tree]:
-        """(x(t), u(t)) at any time of a solve made with `dense=True`.
+        """Return (x(t), u(t)) at any time of a solve with `dense=True`.
 
-        x is the step's own polynomial propagated exactly in A; u is solved from the law at (t, x).
+        x is the dense output of the step, exact in A; u is the solution of the law at (t, x).
 
-        **Raises:** `dvax.InputError` where the steps were not kept, or t lies outside them.
+        **Raises:** `dvax.InputError` if the steps were not recorded, or if t lies outside them.
         """
         if self.records is None:
             raise InputError(
                 InputProblem(
                     "Solution.evaluate",
                     f"t = {t}",
-                    "the steps were not kept, so nothing is known between the saved times",
-                    "Solve with dense=True, or name the times in ts=",
+                    "the steps were not recorded, so only the saved times are available",
+                    "Solve with dense=True, or list the times in ts=",
                 )
             )
         if isinstance(self.records, Trajectory):
             records = self.records
             self._check_inside(t, records.start[0], records.end)
-            x, y = records.at(t)
+            x, y = records.evaluate(t)
             x0, u0 = self.setup.x0, self.us[0]
             u = self.flow.operator.inverse(y.reshape(u0.shape).astype(u0.dtype))
             return x.reshape(jnp.shape(x0)).astype(self.xs.dtype), u
         if _tree.is_concrete(t):
             return self._within_step(t)
 
-        # A call by name: a step in data that is the trajectory of another run needs no enclosure.
+        # Outline the call under a name: if f uses the trajectory of another run as data, enclosures
+        # recognise this name and skip the call.
         def dvax_evaluate(t: Any) -> tuple[Tree, Tree]:
             return self._within_step(t)
 
         return jax.jit(dvax_evaluate)(t)
 
     def _within_step(self, t: Any) -> tuple[Tree, Tree]:
-        """x and u at t, from the record of the step that t lies in."""
+        """Return x and u at t, from the record of the step that contains t."""
         flow, records = self.flow, self.records
         assert isinstance(records, Record)
         t = jnp.asarray(t, records.start.dtype)
@@ -151,17 +153,16 @@ class Solution(eqx.Module):
                 InputProblem(
                     "Solution.evaluate",
                     f"t = {float(t):g}",
-                    f"the solve covers [{float(first):g}, {float(end):g}]",
-                    "Solve further, or ask for a time inside",
+                    f"t must lie in [{float(first):g}, {float(end):g}], which the solve covers",
+                    "Solve on a longer interval, or choose a time inside",
                 )
             )
 
     def regimes(self) -> Regimes:
-        """The times at which the response enters or leaves the boundary of K, and on what side of which
-        bound it is between them, for a solve made with `dense=True`.
+        """Return the times at which active constraints change, and the active constraints between them,
+        for a solve with `dense=True`.
 
-        **Raises:** `dvax.InputError` where the steps were not kept, or K does not say where its
-        projection has kinks.
+        **Raises:** `dvax.InputError` if the steps were not recorded, or if K has no switch functions.
 
         ```python
         >>> import dvax
@@ -180,8 +181,8 @@ class Solution(eqx.Module):
             raise InputError(
                 InputProblem(
                     "Solution.regimes",
-                    "a solution without its steps" if self.records is None else "no step at all",
-                    "changes between the saved times are found on the steps themselves",
+                    "a solution without records" if self.records is None else "a run without steps",
+                    "the changes are located on the recorded steps",
                     "Solve with dense=True",
                 )
             )
@@ -194,25 +195,26 @@ class Solution(eqx.Module):
                 InputProblem(
                     "Solution.regimes",
                     f"a {type(flow.problem.set_at(t0, flow.args)).__name__}",
-                    "the set must say where its projection has kinks (dvax.sets.AbstractSet.switches)",
-                    "Give the set as one that does, a dvax.sets.Polyhedron, say",
+                    "the set must have switch functions (dvax.sets.AbstractSet.switches)",
+                    "Write K as a set that has them, such as dvax.sets.Polyhedron",
                 )
             )
         assert not isinstance(self.setup.method, Implicit | PiecewiseLinear)
         return regimes(flow, self.setup.method, self.records, int(self.stats["steps"]))
 
     def raise_if_failed(self) -> "Solution":
-        """This solution, or a `dvax.SolveError` that carries it."""
+        """Return this solution if the run succeeded, else raise a `dvax.SolveError` that contains
+        it."""
         if self.result != RESULTS.successful:
             raise failure(self)
         return self
 
     def to_xarray(self) -> "xarray.Dataset":
-        """The saved trajectory as an `xarray.Dataset` with dimension `time`.
+        """Return the saved trajectory as an `xarray.Dataset` with dimension `time`.
 
         Parts of a tuple state become `x0`, `x1`, …; axes of an array become `x_dim0`, ….
 
-        **Raises:** `ModuleNotFoundError` where xarray (the extra `dvax[app]`) is not installed.
+        **Raises:** `ModuleNotFoundError` if xarray (the extra `dvax[app]`) is not installed.
         """
         import xarray
 

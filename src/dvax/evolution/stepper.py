@@ -229,7 +229,7 @@ class Stepper(eqx.Module):
             if self.guard is not None:
                 along = [evaluations[0], *evaluations[-1 - len(sample.thetas) :]]
                 share = (t1 - t0) / (self.ends[1] - self.ends[0])
-                seen = self.guard.look(self.flow, along, variation, share)
+                seen = self.guard.estimate(self.flow, along, variation, share)
                 excursion, variation = seen.ratio, seen.variation
             if slopes is not None:
                 # Where x itself changes at a comparable rate, accuracy asks for such steps too.
@@ -345,7 +345,7 @@ class Stepper(eqx.Module):
     def _one_sided_time(self, t0: Any, t1: Any, theta: float) -> Any:
         return one_sided_time(t0, t1, theta, self.ends)
 
-    def look(
+    def estimate_defect(
         self, t0: Any, t1: Any, x0: Tree, x1: Tree, c: tuple[Tree, ...], guess: Tree | None
     ) -> tuple[Sample, Any]:
         """The defect of a step that was made elsewhere, and whether the law was solved where it was

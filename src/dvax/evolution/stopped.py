@@ -1,4 +1,4 @@
-"""Where a run stopped, and what a search for the cause returns."""
+"""The last state of a failed run (`Stop`), and the result of a test for a cause (`Diagnosis`)."""
 
 from typing import Any, NamedTuple
 
@@ -12,20 +12,27 @@ from .flow import Flow
 from .setup import Setup
 
 LAST_STEPS = 64.0
-"""Steps ahead of the last state in which a cause is looked for."""
+"""Number of steps after the last state that the search for a cause covers."""
 
 
 class Diagnosis(NamedTuple):
-    """The cause in a sentence or two ("" where there is no evidence), and what helps."""
+    """A cause in one or two sentences ("" if there is no evidence), and fixes.
+
+    If `replaces_result`, the cause also says what happened, so that the error omits the text of the
+    result.
+    """
 
     cause: str = ""
     fixes: tuple[Fix, ...] = ()
-    whole: bool = False
-    """Whether the cause says what happened, too."""
+    replaces_result: bool = False
 
 
 class Stop(NamedTuple):
-    """Where a run stopped, with all that the tests of causes need."""
+    """The last state of a failed run, as the tests for causes need it.
+
+    `step` is the next step size, `steps` the number of accepted steps, and `attempts` the number of
+    accepted and rejected ones.
+    """
 
     setup: Setup
     flow: Flow
@@ -48,7 +55,7 @@ class Stop(NamedTuple):
         return jnp.asarray(t, self.setup.dtype)
 
     def velocity(self, t: Any, x: Tree) -> Tree:
-        """x' = Ax + f̃(t, x)."""
+        """Return x' = Ax + f̃(t, x)."""
         return _tree.add(self.flow.generator.apply(x), self.flow.rate(t, x, None).value)
 
     def norm(self, x: Tree) -> float:

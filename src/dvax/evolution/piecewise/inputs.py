@@ -1,9 +1,9 @@
-"""The inputs g(t) and q(t) of an affine system as polynomials in pieces.
+"""Piecewise polynomial approximation of the inputs g(t) and q(t) of an affine system.
 
-Between two knots of the data they are analytic. A stretch on which they are lines is one piece; others
-are halved until Chebyshev interpolation has converged, which its coefficients and further points show.
-The points are no fraction of a period apart from each other, so that a wave does not pass for a
-constant.
+The inputs are analytic between two knots of the data. An interval on which they are linear in t is one
+piece. Other intervals are bisected until Chebyshev interpolation has converged, according to the decay
+of its coefficients and to its error at check points. The spacing of the points is irregular, so that
+aliasing does not turn a wave into a constant.
 """
 
 from typing import Any, NamedTuple
@@ -21,16 +21,19 @@ Array = np.ndarray
 
 _POINTS = np.cos(np.pi * (np.arange(STAGES + 1) + 0.5) / (STAGES + 1))
 _TO_COEFFICIENTS = np.linalg.inv(np.polynomial.chebyshev.chebvander(_POINTS, STAGES))
-_LINE = np.array([-0.93, -0.5441, 0.0713, 0.4129, 0.8537])
-_EXTRA = np.array([-0.9871, -0.4127, 0.0317, 0.3719, 0.8853])
-_NOISE = 64.0
-"""Roundings of t and of the value that a sample may be off by."""
+_LINE_SAMPLES = np.array([-0.93, -0.5441, 0.0713, 0.4129, 0.8537])
+_CHECK_POINTS = np.array([-0.9871, -0.4127, 0.0317, 0.3719, 0.8853])
+_ROUNDOFF_FACTOR = 64.0
+"""Bound on the rounding error of a sample, in units of eps times the size of t and of the value."""
 
 
 class Piece(NamedTuple):
-    """(g, q) on [start, start + length], by Chebyshev coefficients, a row each degree; `noise` is what
-    rounding of t and of the values leaves undetermined. `error`, how far the polynomial was off at
-    points that did not make it, is an estimate and no bound."""
+    """The polynomial approximation of (g, q) on [start, start + length].
+
+    - `coefficients`: Chebyshev coefficients, one row per degree;
+    - `noise`: the uncertainty of each entry due to rounding of t and of the values;
+    - `error`: the largest error at the check points, an estimate and not a bound.
+    """
 
     start: float
     length: float
@@ -38,46 +41,50 @@ class Piece(NamedTuple):
     noise: Array
     error: Array
 
-    def at(self, places: Array) -> Array:
-        """(g, q), a row each place in [0, 1]."""
+    def evaluate(self, positions: Array) -> Array:
+        """Return (g, q), one row per relative position in [0, 1]."""
         if len(self.coefficients) == 1:
-            return np.broadcast_to(self.coefficients[0], (len(places), self.error.size))
-        s = 2.0 * np.asarray(places) - 1.0
+            return np.broadcast_to(self.coefficients[0], (len(positions), self.error.size))
+        s = 2.0 * np.asarray(positions) - 1.0
         return np.polynomial.chebyshev.chebval(s, self.coefficients).T
 
     def local(self, begin: float, length: float) -> Array:
-        """The coefficients of the polynomial on a part of the piece, those left out that are rounding:
-        on a part that is short the samples would differ by nothing else."""
+        """Return the Chebyshev coefficients of the polynomial on [begin, begin + length] of the piece.
+
+        Coefficients below the roundoff level are dropped: on a short interval all coefficients of high
+        degree are rounding errors.
+        """
         c = self.coefficients
-        s, share = 2.0 * (begin + 0.5 * length) / self.length - 1.0, length / self.length
+        s, ratio = 2.0 * (begin + 0.5 * length) / self.length - 1.0, length / self.length
         if len(c) <= 2:
-            return np.stack([c[0] + s * c[1], share * c[1]]) if len(c) == 2 else c
-        values = np.polynomial.chebyshev.chebval(s + share * _POINTS, c).T
-        found = _TO_COEFFICIENTS @ values
-        seen = np.abs(found) > _CHOPPED * np.abs(c).sum(axis=0)
-        degree = int(np.flatnonzero(seen.any(axis=1)).max(initial=1))
-        return (
-            np.where(np.arange(degree + 1)[:, None] < 2, 1.0, seen[: degree + 1])
-            * found[: degree + 1]
-        )
+            return np.stack([c[0] + s * c[1], ratio * c[1]]) if len(c) == 2 else c
+        values = np.polynomial.chebyshev.chebval(s + ratio * _POINTS, c).T
+        new = _TO_COEFFICIENTS @ values
+        significant = np.abs(new) > _CHOP_TOLERANCE * np.abs(c).sum(axis=0)
+        degree = int(np.flatnonzero(significant.any(axis=1)).max(initial=1))
+        keep = np.where(np.arange(degree + 1)[:, None] < 2, 1.0, significant[: degree + 1])
+        return keep * new[: degree + 1]
 
 
 def values(coefficients: Array, basis: Array) -> Array:
-    """The polynomials at the points of a basis (a row each, a column each degree)."""
+    """Return the values of polynomials at the points of `basis` (one row per point)."""
     return basis[:, : len(coefficients)] @ coefficients
 
 
-def basis(places: Array) -> Array:
-    """Chebyshev polynomials at places in [0, 1]."""
-    return np.polynomial.chebyshev.chebvander(2.0 * places - 1.0, STAGES)
+def basis(positions: Array) -> Array:
+    """Return the Chebyshev polynomials at positions in [0, 1]: a row per point, a column per degree."""
+    return np.polynomial.chebyshev.chebvander(2.0 * positions - 1.0, STAGES)
 
 
-_CHOPPED = 16.0 * np.finfo(float).eps
+_CHOP_TOLERANCE = 16.0 * np.finfo(float).eps
 
 
-class Unresolved(Exception):
-    """No polynomial fits the inputs around a time, on however short a piece; or they are not finite
-    there, or need more pieces than there may be. `result` is the name of that in `dvax.RESULTS`."""
+class UnresolvedInput(Exception):
+    """The approximation of the inputs failed at time `t`.
+
+    `result` names the reason in `dvax.RESULTS`: the inputs are not finite (`nonfinite`), the shortest
+    piece is still inaccurate (`step_too_small`), or there are too many pieces (`max_steps`).
+    """
 
     def __init__(self, t: float, result: str):
         super().__init__(t)
@@ -93,92 +100,105 @@ def _samples(problem: Problem, args: Any, x: Tree, u: Tree, ts: Any) -> Any:
     return jax.vmap(one)(ts)
 
 
-def pieces(problem: Problem, stops: Array, x0: Any, args: Any, most: int) -> list[Piece]:
-    """Those of all stretches between `stops`.
+def build_pieces(
+    problem: Problem, stops: Array, x0: Any, args: Any, max_pieces: int
+) -> list[Piece]:
+    """Return pieces that approximate the inputs between the first and the last of `stops`.
 
-    **Raises:** `Unresolved` where a stretch of a few roundings of t, or `most` pieces, do not do.
+    **Raises:** `UnresolvedInput` where the inputs are not finite, where an interval of a few units of
+    roundoff in t is still too long, or where more than `max_pieces` pieces are necessary.
     """
     dtype = jnp.result_type(x0)
     x, u = jnp.zeros_like(x0), problem.zero_control(x0)
     eps = float(jnp.finfo(dtype).eps)
 
-    def sampled(starts: Array, lengths: Array, places: Array) -> Array:
-        """Values at these places of every stretch: [stretch, place, entry]."""
-        ts = (starts[:, None] + lengths[:, None] * (0.5 + 0.5 * places)).ravel()
-        # In powers of two: the program is compiled for few counts.
+    def sample(starts: Array, lengths: Array, positions: Array) -> Array:
+        """Return the values at these positions in every interval: [interval, position, entry]."""
+        ts = (starts[:, None] + lengths[:, None] * (0.5 + 0.5 * positions)).ravel()
+        # Pad the number of samples to a power of two, so that few shapes are compiled.
         padded = np.pad(ts, (0, (1 << (len(ts) - 1).bit_length()) - len(ts)), mode="edge")
         values = np.asarray(_samples(problem, args, x, u, jnp.asarray(padded, dtype)), float)
-        values = values[: len(ts)].reshape(len(starts), len(places), -1)
+        values = values[: len(ts)].reshape(len(starts), len(positions), -1)
         bad = ~np.isfinite(values).all(axis=(1, 2))
         if bad.any():
-            raise Unresolved(float(starts[bad][0]), "nonfinite")
+            raise UnresolvedInput(float(starts[bad][0]), "nonfinite")
         return values
 
-    done: list[Piece] = []
+    accepted: list[Piece] = []
     starts, lengths = stops[:-1], np.diff(stops)
-    values = sampled(starts, lengths, _LINE)
-    slope = (values[:, -1] - values[:, 0]) / (_LINE[-1] - _LINE[0])
-    middle = values[:, 0] - _LINE[0] * slope
-    off = np.abs(values - middle[:, None] - _LINE[:, None] * slope[:, None]).max(axis=1)
+    values = sample(starts, lengths, _LINE_SAMPLES)
+    slope = (values[:, -1] - values[:, 0]) / (_LINE_SAMPLES[-1] - _LINE_SAMPLES[0])
+    middle = values[:, 0] - _LINE_SAMPLES[0] * slope
+    misfit = np.abs(values - middle[:, None] - _LINE_SAMPLES[:, None] * slope[:, None]).max(axis=1)
     ends = np.abs(starts) + lengths
-    noise = _NOISE * eps * (np.abs(values).max(axis=1) + np.abs(slope) * (ends / lengths)[:, None])
-    lines = (off <= noise).all(axis=1)
+    noise = (
+        _ROUNDOFF_FACTOR
+        * eps
+        * (np.abs(values).max(axis=1) + np.abs(slope) * (ends / lengths)[:, None])
+    )
+    lines = (misfit <= noise).all(axis=1)
     for k in np.flatnonzero(lines):
         rows = np.stack([middle[k], slope[k]])
         flat = np.all(np.abs(slope[k]) <= noise[k])
-        done.append(Piece(starts[k], lengths[k], rows[:1] if flat else rows, noise[k], 0 * off[k]))
+        accepted.append(
+            Piece(starts[k], lengths[k], rows[:1] if flat else rows, noise[k], 0 * misfit[k])
+        )
     starts, lengths = starts[~lines], lengths[~lines]
-    places = np.concatenate([_POINTS, _EXTRA])
+    positions = np.concatenate([_POINTS, _CHECK_POINTS])
     while len(starts):
-        values = sampled(starts, lengths, places)
+        values = sample(starts, lengths, positions)
         nodes, extra = values[:, : STAGES + 1], values[:, STAGES + 1 :]
         c = np.einsum("ij,kjl->kil", _TO_COEFFICIENTS, nodes)
-        basis = np.polynomial.chebyshev.chebvander(_EXTRA, STAGES)
-        off = np.abs(np.einsum("ij,kjl->kil", basis, c) - extra).max(axis=1)
-        steep = np.abs(c[:, 1:]).sum(axis=1)
-        near = ((np.abs(starts) + lengths) / lengths)[:, None]
-        noise = _NOISE * eps * (np.abs(c).sum(axis=1) + steep * near)
+        basis = np.polynomial.chebyshev.chebvander(_CHECK_POINTS, STAGES)
+        misfit = np.abs(np.einsum("ij,kjl->kil", basis, c) - extra).max(axis=1)
+        slope_size = np.abs(c[:, 1:]).sum(axis=1)
+        magnification = ((np.abs(starts) + lengths) / lengths)[:, None]
+        noise = _ROUNDOFF_FACTOR * eps * (np.abs(c).sum(axis=1) + slope_size * magnification)
         tail = np.abs(c[:, -3:]).max(axis=1)
-        good = ((off <= noise) & (tail <= noise)).all(axis=1)
-        error = np.maximum(off - noise, 0.0)
-        done += [
-            Piece(starts[k], lengths[k], c[k], noise[k], error[k]) for k in np.flatnonzero(good)
+        converged = ((misfit <= noise) & (tail <= noise)).all(axis=1)
+        error = np.maximum(misfit - noise, 0.0)
+        accepted += [
+            Piece(starts[k], lengths[k], c[k], noise[k], error[k])
+            for k in np.flatnonzero(converged)
         ]
-        starts, lengths = starts[~good], lengths[~good]
+        starts, lengths = starts[~converged], lengths[~converged]
         short = lengths <= 1e3 * eps * (np.abs(starts) + lengths)
         if short.any():
-            raise Unresolved(float(starts[short][0]), "step_too_small")
-        if len(done) + len(starts) > most:
-            raise Unresolved(float(stops[0]), "max_steps")
+            raise UnresolvedInput(float(starts[short][0]), "step_too_small")
+        if len(accepted) + len(starts) > max_pieces:
+            raise UnresolvedInput(float(stops[0]), "max_steps")
         half = 0.5 * lengths
         starts = np.stack([starts, starts + half], axis=1).ravel()
         lengths = np.repeat(half, 2)
-    return _joined(sorted(done, key=lambda piece: piece.start))
+    return _close_gaps(sorted(accepted, key=lambda piece: piece.start))
 
 
-def _joined(pieces: list[Piece]) -> list[Piece]:
-    """The same pieces, continuous where they meet within their noise: the value of the one with less of
-    it is taken, and a line is added to the other. A steep edge far from t = 0 is not known better."""
+def _close_gaps(pieces: list[Piece]) -> list[Piece]:
+    """Return the pieces, made continuous where neighbours differ by no more than their noise.
+
+    The piece with less noise keeps its value, and the other one is corrected by a linear function. (A
+    slope_size edge far from t = 0 has large noise, since rounding of t changes its value.)
+    """
     changes = np.zeros((len(pieces), 2, len(pieces[0].noise)))
     for k in range(len(pieces) - 1):
         left, right = pieces[k], pieces[k + 1]
-        apart = right.at(np.zeros(1))[0] - left.at(np.ones(1))[0]
-        same = np.abs(apart) <= left.noise + right.noise
-        changes[k, 1] = np.where(same & (left.noise > right.noise), apart, 0.0)
-        changes[k + 1, 0] = np.where(same & (left.noise <= right.noise), -apart, 0.0)
-    found = []
+        gap = right.evaluate(np.zeros(1))[0] - left.evaluate(np.ones(1))[0]
+        agrees = np.abs(gap) <= left.noise + right.noise
+        changes[k, 1] = np.where(agrees & (left.noise > right.noise), gap, 0.0)
+        changes[k + 1, 0] = np.where(agrees & (left.noise <= right.noise), -gap, 0.0)
+    corrected = []
     for piece, (first, last) in zip(pieces, changes, strict=True):
         c = piece.coefficients
         if first.any() or last.any():
             c = np.concatenate([c, np.zeros((max(0, 2 - len(c)), c.shape[1]))])
             c[0] += 0.5 * (first + last)
             c[1] += 0.5 * (last - first)
-        found.append(piece._replace(coefficients=c))
-    return found
+        corrected.append(piece._replace(coefficients=c))
+    return corrected
 
 
-def continuous(before: Piece, after: Piece) -> bool:
-    """Whether the inputs go on from one piece to the next without a jump."""
-    end, start = before.at(np.ones(1))[0], after.at(np.zeros(1))[0]
+def is_continuous(before: Piece, after: Piece) -> bool:
+    """Return whether the inputs are continuous at the common end of two pieces."""
+    end, start = before.evaluate(np.ones(1))[0], after.evaluate(np.zeros(1))[0]
     size = np.abs(before.coefficients).sum(axis=0) + np.abs(after.coefficients).sum(axis=0)
-    return bool(np.all(np.abs(end - start) <= 8.0 * _NOISE * np.finfo(float).eps * size))
+    return bool(np.all(np.abs(end - start) <= 8.0 * _ROUNDOFF_FACTOR * np.finfo(float).eps * size))

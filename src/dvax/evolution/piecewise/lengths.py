@@ -1,34 +1,45 @@
-"""The length of the next step of one mode, from the time scales of the mode."""
+"""Proposals for the length of the next step, from the time scales of the mode."""
 
 import numpy as np
 
 from .modes import Equations
 
 
-def shorter(own: Equations, h: float, excess: float, before: float) -> float:
-    """The step to try next: half of it, as long as that pays (by 2²⁰ where the solution is resolved,
-    but for little); else the next time scale of the mode, since a transient is there that is not."""
-    if excess < 1e6 and excess < 0.1 * before:
+def shorten(equations: Equations, h: float, error_ratio: float, last_error_ratio: float) -> float:
+    """Return the length to try after a rejected step.
+
+    Halving reduces the error by up to 2²⁰ once the polynomial resolves the solution. As long as
+    halving is that effective, return h/2. Otherwise a transient is unresolved: return the next shorter
+    time scale of the mode.
+    """
+    if error_ratio < 1e6 and error_ratio < 0.1 * last_error_ratio:
         return 0.5 * h
-    shorter = own.scales[own.scales < 0.6 * h]
+    shorter = equations.scales[equations.scales < 0.6 * h]
     return float(shorter[-1]) if len(shorter) else h / 8.0
 
 
-def longer(own: Equations, h: float, excess: float) -> float:
-    """The step to try next: while a transient lasts, much the same; else the next time scale."""
-    if excess > 1e-2:
-        return h if excess > 0.1 else 1.5 * h
-    longer = own.scales[own.scales > 1.5 * h]
+def lengthen(equations: Equations, h: float, error_ratio: float) -> float:
+    """Return the length to try after an accepted step.
+
+    While a transient lasts the error ratio is large: return about the same length. Otherwise return the
+    next longer time scale of the mode.
+    """
+    if error_ratio > 1e-2:
+        return h if error_ratio > 0.1 else 1.5 * h
+    longer = equations.scales[equations.scales > 1.5 * h]
     return float(longer[0]) if len(longer) else np.inf
 
 
-def until(own: Equations, h: float, theta: float) -> float:
-    """The step that ends soon after θ, no shorter than the shortest time scale of the mode."""
-    return max(1.25 * theta * h, float(own.scales[0]) if len(own.scales) else h)
+def length_past(equations: Equations, h: float, theta: float) -> float:
+    """Return the length of a step that ends soon after the switching at θ of a step of length h.
+
+    It is at least the shortest time scale of the mode.
+    """
+    return max(1.25 * theta * h, float(equations.scales[0]) if len(equations.scales) else h)
 
 
 def two_sum(a: float, b: float) -> tuple[float, float]:
-    """a + b and what rounding takes from it."""
+    """Return a + b, rounded, and its rounding error."""
     total = a + b
     other = total - a
     return total, (a - (total - other)) + (b - other)

@@ -1,4 +1,4 @@
-"""A solve by `PiecewiseLinear`, from its setup to its solution."""
+"""Solve a problem by `PiecewiseLinear`, from `Setup` to `Solution`."""
 
 import time
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from ..bounds import Bounds
 from ..results import RESULTS
 from ..setup import Setup, as_arrays
 from ..solution import Solution
-from .inputs import Piece, Unresolved, pieces
+from .inputs import Piece, UnresolvedInput, build_pieces
 from .radau import STAGES
 from .records import Row
 from .run import Run
@@ -25,8 +25,13 @@ Array = np.ndarray
 
 
 class Limits(NamedTuple):
-    """The most steps, rejected ones included; whether to keep all of them, to bound x and u, and to
-    print the percentage of the run that is done."""
+    """Options of a run.
+
+    - `max_steps`: the largest number of accepted and rejected steps;
+    - `dense`: keep the polynomials of all steps;
+    - `track_bounds`: bound x and u;
+    - `progress`: print the completed percentage.
+    """
 
     max_steps: int
     dense: bool
@@ -35,58 +40,61 @@ class Limits(NamedTuple):
 
 
 def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
-    """The solution; where it fails, up to the last saved time that was reached.
+    """Return the solution, up to the last saved time that was reached if the run fails.
 
-    **Raises:** `dvax.InputError` where the problem is not affine in pieces; `dvax.DifferentiationError`
+    **Raises:** `dvax.InputError` if the problem is not piecewise affine; `dvax.DifferentiationError`
     under `jax.jit`, `jax.grad` and `jax.vmap`.
     """
     numbers = setup.problem, setup.x0, setup.args, setup.setting, ts
     if not _tree.is_concrete(*numbers):
         raise DifferentiationError(
-            "dvax.PiecewiseLinear runs on the host and cannot be traced: no jax.jit, jax.grad, jax.jvp "
-            "or jax.vmap around it. Use method=dvax.ExpRosenbrock() there: it solves the same systems, "
-            "as long as they are not too stiff."
+            "dvax.PiecewiseLinear runs on the host and cannot be traced by jax.jit, jax.grad, "
+            "jax.jvp or jax.vmap. Use method=dvax.ExpRosenbrock() there: it solves the same systems "
+            "if they are not too stiff."
         )
-    begun = time.perf_counter()
+    setup_start = time.perf_counter()
     problem, x0, args = setup.problem, jnp.asarray(setup.x0), as_arrays(setup.args)
     t0, t1, rtol, atol = (float(setup.setting[name]) for name in ("t0", "t1", "rtol", "atol"))
     problem.check(t0, x0, args)
     knots = np.asarray(problem.knots(t0, t1, x0, args), float)
     stops = np.concatenate([[t0], knots, [t1]])
-    given = affine(problem, t0, x0, args)
+    system = affine(problem, t0, x0, args)
     state, control = problem.spaces(x0)
     weights = np.asarray(jax.vmap(lambda v: state.norm(v.reshape(x0.shape)))(jnp.eye(x0.size)))
     times = np.array([t1]) if ts is None else np.asarray(ts, float)
     try:
-        found = pieces(problem, stops, x0, args, limits.max_steps)
-    except Unresolved as error:
-        nothing = [Piece(t0, t1 - t0, np.zeros((1, 1)), np.zeros(1), np.zeros(1))]
+        pieces = build_pieces(problem, stops, x0, args, limits.max_steps)
+    except UnresolvedInput as error:
+        placeholder = [Piece(t0, t1 - t0, np.zeros((1, 1)), np.zeros(1), np.zeros(1))]
         run = Run(
-            given, given, nothing, np.asarray(x0, float).ravel(), weights, (rtol, atol),
-            *limits_of(limits, times),
+            system, system, placeholder, np.asarray(x0, float).ravel(), weights, (rtol, atol),
+            *_run_options(limits, times),
         )  # fmt: skip
         run.t, run.result = error.t, error.result
         if run.result == "max_steps":
-            run.rejected = limits.max_steps  # a step for each piece is too many
-        prepared = time.perf_counter()
+            run.rejected = limits.max_steps  # each piece needs at least one step
+        setup_end = time.perf_counter()
     else:
         run = Run(
-            given, pivoted(given), found, np.asarray(x0, float).ravel(), weights, (rtol, atol),
-            *limits_of(limits, times),
+            system, pivoted(system), pieces, np.asarray(x0, float).ravel(), weights, (rtol, atol),
+            *_run_options(limits, times),
         )  # fmt: skip
-        prepared = time.perf_counter()
-        run.go()
-    timing = {"compile_time": prepared - begun, "run_time": time.perf_counter() - prepared}
-    return _solution(setup, x0, run, given, (state, control), limits, timing)
+        setup_end = time.perf_counter()
+        run.advance()
+    timing = {
+        "compile_time": setup_end - setup_start,
+        "run_time": time.perf_counter() - setup_end,
+    }
+    return _solution(setup, x0, run, system, (state, control), limits, timing)
 
 
-def limits_of(limits: Limits, times: Array) -> tuple[int, Array, bool, bool, bool]:
-    """The last arguments of a `Run`."""
+def _run_options(limits: Limits, times: Array) -> tuple[int, Array, bool, bool, bool]:
+    """Return the last arguments of `Run`."""
     return limits.max_steps, times, limits.dense, limits.track_bounds, limits.progress
 
 
 def _solution(
-    setup: Setup, x0: Any, run: Run, given: Affine, spaces: tuple[AbstractSpace, AbstractSpace],
+    setup: Setup, x0: Any, run: Run, system: Affine, spaces: tuple[AbstractSpace, AbstractSpace],
     limits: Limits, timing: dict[str, float],
 ) -> Solution:  # fmt: skip
     rows, dtype, problem = run.rows, x0.dtype, setup.problem
@@ -97,11 +105,11 @@ def _solution(
         np.reshape(np.array(values, float), (len(rows), *shape)), dtype
     )
     ys, w = (np.reshape(np.array([r[k] for r in rows]), (len(rows), m)) for k in (2, 3))
-    tau = 1.0 / max(float(np.linalg.norm(given.M, 2)), np.finfo(float).tiny)
-    # One projection step, as in `dvax.vi.certificate`; F is affine.
-    moved = ys - np.clip(ys - tau * w, given.low, given.up)
+    tau = 1.0 / max(float(np.linalg.norm(system.M, 2)), np.finfo(float).tiny)
+    # One projection step as in `dvax.vi.certificate`, simplified for affine F.
+    moved = ys - np.clip(ys - tau * w, system.low, system.up)
     size = lambda v: jax.vmap(spaces[1].norm)(array(v, u0.shape))  # noqa: E731
-    residual, step = size(moved / tau - moved @ given.M.T), size(moved)
+    residual, step = size(moved / tau - moved @ system.M.T), size(moved)
     gamma, norm_P_inv = setup.moduli.get("gamma"), setup.moduli.get("norm_P_inv")
     error = None
     if gamma is not None and norm_P_inv is not None:
@@ -136,7 +144,7 @@ def _solution(
 
 
 def _bounds(rows: list[Row], n: int, x0: Any, u0: Any, P: Any) -> Bounds:
-    """Bounds of x and of u = P⁻¹y, the latter by the sizes of the entries of P⁻¹."""
+    """Return bounds on x and on u = P⁻¹y, the latter by interval arithmetic with the matrix P⁻¹."""
     values = np.array([r.bounds for r in rows])
     inverse = np.asarray(
         jax.vmap(lambda v: P.inverse(v.reshape(u0.shape)).ravel())(jnp.eye(u0.size))
@@ -152,18 +160,22 @@ def _bounds(rows: list[Row], n: int, x0: Any, u0: Any, P: Any) -> Bounds:
 
 
 def _trajectory(run: Run) -> Trajectory:
-    steps, (n, m) = run.steps, run.given.B.shape
-    count, most = len(steps), max((len(step.rings) for step in steps), default=0)
+    """Return the steps of a run as arrays, with oscillations padded to the same number."""
+    steps, (n, m) = run.steps, run.system.B.shape
+    count, width = len(steps), max((len(step.oscillations) for step in steps), default=0)
     stack = lambda name, *shape: np.reshape(  # noqa: E731
         [getattr(step, name) for step in steps], (count, *shape)
     )
-    rates = np.zeros((count, most), complex)
-    ring_x, ring_y = np.zeros((count, most, n), complex), np.zeros((count, most, m), complex)
+    rates = np.zeros((count, width), complex)
+    oscillation_x, oscillation_y = (
+        np.zeros((count, width, n), complex),
+        np.zeros((count, width, m), complex),
+    )
     for k, step in enumerate(steps):
-        for i, (rate, x, y) in enumerate(step.rings):
-            rates[k, i], ring_x[k, i], ring_y[k, i] = rate, x, y
+        for i, (rate, x, y) in enumerate(step.oscillations):
+            rates[k, i], oscillation_x[k, i], oscillation_y[k, i] = rate, x, y
     return Trajectory(
         stack("start"), stack("length"), stack("used"), stack("x", STAGES + 1, n),
-        stack("y", STAGES, m), rates, ring_x, ring_y,
+        stack("y", STAGES, m), rates, oscillation_x, oscillation_y,
         np.array([t for t, _ in run.events]), np.reshape([mode for _, mode in run.events], (-1, m)),
     )  # fmt: skip

@@ -1,60 +1,68 @@
-"""Signs of what a step computed: the first constraint that changes, and violations that slack masks."""
+"""Sign tests of a computed step: the first failing condition, and violations masked by the slack."""
 
 from collections.abc import Callable
 
 import numpy as np
 
 from . import radau
-from .modes import Condition, Equations, Mode, changed
+from .modes import Condition, Equations, Mode, mode_after
 from .records import Attempt, MaskedViolation
 from .system import Affine
 
 
-def locate_event(own: Equations, found: Attempt, h: float) -> tuple[float, Condition | None]:
-    """(θ, condition) of the first condition that fails; (θ, None) where all hold up to θ."""
+def locate_event(
+    equations: Equations, attempt: Attempt, h: float
+) -> tuple[float, Condition | None]:
+    """Return θ and the condition that fails first there, or (θ, None) if all hold up to θ."""
     theta, first = 1.0, None
-    for c in own.conditions:
+    for c in equations.conditions:
         k = int(c.of_w)
-        grid, slack, swing = (v[k] for v in ((found.y, found.w), found.slack, found.swing))
+        grid, slack, swing = (
+            v[k] for v in ((attempt.y, attempt.w), attempt.slack, attempt.amplitude)
+        )
         signed, allowed = c.sign * (grid[:, c.i] - c.bound), float(slack[c.i])
         if theta == 0.0 or radau.lowest(signed) - swing[c.i] >= -allowed:
             continue
         waves = [
             radau.Wave(rate * h, c.sign * amplitude)
-            for rate, amplitude in found.waves(k, c.i)
+            for rate, amplitude in attempt.waves(k, c.i)
             if amplitude != 0.0
         ]
-        when, fails = radau.first_negative(signed, allowed, theta, waves)
-        if fails or when < theta:
-            theta, first = when, c if fails else None
+        candidate, fails = radau.first_negative(signed, allowed, theta, waves)
+        if fails or candidate < theta:
+            theta, first = candidate, c if fails else None
     return theta, first
 
 
 def masked_violation(
-    of: Callable[[Mode], Equations],
-    given: Affine,
-    own: Equations,
-    found: Attempt,
+    equations_of: Callable[[Mode], Equations],
+    system: Affine,
+    equations: Equations,
+    attempt: Attempt,
     theta: float,
     h: float,
 ) -> MaskedViolation:
-    """What y and w are beyond their bounds within the slack up to θ, in the mean, and by how much the
-    state would differ had the constraints changed."""
-    violation, state_error = np.zeros((2, len(own.mode))), np.zeros(found.x.shape[1])
+    """Return the mean violations of bounds up to θ that the slack masks, and their effect on x."""
+    violation, state_error = np.zeros((2, len(equations.mode))), np.zeros(attempt.x.shape[1])
     before = radau.GRID <= theta
     thetas = radau.GRID[before]
-    # The trapezoidal rule, since samples are dense at the ends.
-    part = np.gradient(thetas) if len(thetas) > 1 else np.ones(1)
-    for c in own.conditions if theta > 0.0 else ():
+    # Use the weights of the trapezoidal rule: the samples are denser at the ends.
+    weights = np.gradient(thetas) if len(thetas) > 1 else np.ones(1)
+    for c in equations.conditions if theta > 0.0 else ():
         k = int(c.of_w)
-        value = (found.y, found.w)[k][before, c.i] - c.bound
-        for rate, amplitude in found.waves(k, c.i):
+        value = (attempt.y, attempt.w)[k][before, c.i] - c.bound
+        for rate, amplitude in attempt.waves(k, c.i):
             value = value + 2.0 * np.real(amplitude * np.exp(rate * h * thetas))
-        mean = np.average(np.clip(-c.sign * value, 0.0, found.slack[k][c.i]), weights=part)
+        mean = np.average(np.clip(-c.sign * value, 0.0, attempt.slack[k][c.i]), weights=weights)
         violation[k, c.i] = mean
         if mean > 0.0:
-            # A residual below zero is a response in the mode that would follow, and what follows from
-            # a response that would be at its bound there is known from that mode as well.
-            response = mean / given.M[c.i, c.i] if c.of_w else mean
-            state_error += of(changed(own.mode, c)).reach(theta * h, given.B)[:, c.i] * response
+            # In the mode after a switching, a negative residual w becomes a response w/M. The gain of
+            # that mode gives the effect of the response on the state.
+            response = mean / system.M[c.i, c.i] if c.of_w else mean
+            state_error += (
+                equations_of(mode_after(equations.mode, c)).disturbance_gain(theta * h, system.B)[
+                    :, c.i
+                ]
+                * response
+            )
     return MaskedViolation(violation, state_error)

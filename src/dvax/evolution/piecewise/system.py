@@ -1,13 +1,13 @@
-"""A problem that is affine in state and response, as matrices, and the variables it is solved in.
+"""A problem that is affine in state and response, in matrix form, and the choice of its unknowns.
 
     x' = Ax + By + g(t),    w = My + Cx + q(t),    wᵢ ≥ 0 where yᵢ = lᵢ,  wᵢ ≤ 0 where yᵢ = uᵢ,
     else wᵢ = 0.
 
-Each pair (yᵢ, wᵢ) has an independent member pᵢ and a dependent one dᵢ, so that the equations read
-x' = Ax + Bp + g, d = Mp + Cx + q. Which member is independent is decided once a run, by principal
-pivots: a member that the other one determines through a large coefficient makes large entries of A that
-cancel when the constraint is active. Nothing is eliminated after that: where d is prescribed, p stays
-an unknown beside x. So a small M (the resistance of a diode) never becomes a large entry of a matrix.
+Each pair (yᵢ, wᵢ) has an independent member pᵢ and a dependent member dᵢ, so that the equations read
+x' = Ax + Bp + g, d = Mp + Cx + q. Principal pivots choose the independent members once per run. A bad
+choice makes large entries of A that cancel when the constraint is active. No further elimination
+occurs: where d is prescribed, p remains an unknown beside x. A small M (the resistance of a diode)
+therefore never becomes a large entry of a matrix.
 """
 
 from typing import Any, NamedTuple
@@ -26,12 +26,15 @@ from ...vi import analyse, independent
 Array = np.ndarray
 
 LARGEST = 64
-"""The most states and the most responses: a step solves dense equations in all of them."""
+"""Largest number of states and of responses: a step solves dense equations in all of them."""
 
 
 class Affine(NamedTuple):
-    """The matrices; `low` ≤ y ≤ `up`; `swapped` says of which pairs w is the independent member;
-    `inputs` maps (g, q) as the problem has them to those of these variables, one matrix for both."""
+    """The matrices of a system and the bounds `low` ≤ y ≤ `up`.
+
+    - `swapped`: a mask of the pairs whose independent member is w;
+    - `inputs`: the matrix that maps (g, q) of the problem to (g, q) in these variables.
+    """
 
     A: Array
     B: Array
@@ -42,37 +45,37 @@ class Affine(NamedTuple):
     swapped: Array
     inputs: Array
 
-    def modified(self, i: int) -> "Affine":
-        """The same system with the members of pair i exchanged (a principal pivot)."""
+    def pivot(self, i: int) -> "Affine":
+        """Return the system with the members of pair i exchanged (a principal pivot)."""
         n, m = self.B.shape
-        whole = np.block([[self.A, self.B], [self.C, self.M]])
+        block = np.block([[self.A, self.B], [self.C, self.M]])
         k = n + i
-        pivot = whole[k, k]
-        row, column = whole[k] / pivot, whole[:, k] / pivot
-        new = whole - np.outer(whole[:, k], row)
+        pivot = block[k, k]
+        row, column = block[k] / pivot, block[:, k] / pivot
+        new = block - np.outer(block[:, k], row)
         new[k], new[:, k], new[k, k] = -row, column, 1.0 / pivot
-        # d = … + q determines p = (d − … − q)/pivot.
-        given = np.eye(n + m)
-        given[:, k] -= column
-        given[k] = 0.0
-        given[k, k] = -1.0 / pivot
+        # Solving d = … + q for p gives p = (d − … − q)/pivot.
+        inputs = np.eye(n + m)
+        inputs[:, k] -= column
+        inputs[k] = 0.0
+        inputs[k, k] = -1.0 / pivot
         swapped = self.swapped.copy()
         swapped[i] = ~swapped[i]
         return self._replace(
             A=new[:n, :n], B=new[:n, n:], C=new[n:, :n], M=new[n:, n:], swapped=swapped,
-            inputs=given @ self.inputs,
+            inputs=inputs @ self.inputs,
         )  # fmt: skip
 
 
 def affine(problem: Problem, t0: Any, x0: Tree, args: Any) -> Affine:
-    """The system of `problem`, proved from its code to be affine with constant matrices.
+    """Return the system of `problem`, after proving that it is affine with constant matrices.
 
-    **Raises:** `dvax.InputError` where the code of f, h or K does not show it.
+    **Raises:** `dvax.InputError` if the code of f, h or K does not prove it.
     """
     u0 = problem.zero_control(x0)
     _check(problem, t0, x0, u0, args)
-    found = _matrices(problem, args, x0, u0, jnp.asarray(t0, jnp.result_type(x0)))
-    A, B, M, C, low, up = (np.asarray(v, float) for v in found)
+    matrices = _matrices(problem, args, x0, u0, jnp.asarray(t0, jnp.result_type(x0)))
+    A, B, M, C, low, up = (np.asarray(v, float) for v in matrices)
     n, m = B.shape
     return Affine(A, B, M, C, low, up, np.zeros(m, bool), np.eye(n + m))
 
@@ -86,8 +89,8 @@ def _check(problem: Problem, t0: Any, x0: Tree, u0: Tree, args: Any) -> None:
         raise InputError(
             InputProblem(
                 place, f"a state or response of {given}",
-                f"it is for one array of at most {LARGEST} entries each",
-                "Leave method out, or name another",
+                f"state and response must each be one array of at most {LARGEST} entries",
+                "Omit method, or choose another one",
             )
         )  # fmt: skip
     t, both = jnp.asarray(t0, jnp.result_type(x0)), (x0, u0)
@@ -98,9 +101,9 @@ def _check(problem: Problem, t0: Any, x0: Tree, u0: Tree, args: Any) -> None:
         if not (constant and analyse(lambda both, joint=joint: joint(t, both), both).affine):
             wrong.append(
                 InputProblem(
-                    f"{place}: {name}", "code that does not show it", f"{name} must be affine in "
-                    "(x, u) with coefficients that do not depend on t",
-                    "Leave method out, or name another",
+                    f"{place}: {name}", "code that is not proved to be affine",
+                    f"{name} must be affine in (x, u) with coefficients that do not depend on t",
+                    "Omit method, or choose another one",
                 )
             )  # fmt: skip
     bounds = lambda t: problem.set_at(t, args).intervals(u0)  # noqa: E731
@@ -108,7 +111,7 @@ def _check(problem: Problem, t0: Any, x0: Tree, u0: Tree, args: Any) -> None:
         wrong.append(
             InputProblem(
                 f"{place}: K", type(problem.set_at(t, args)).__name__,
-                "K must be a box that does not move", "Leave method out, or name another",
+                "K must be a box that does not move", "Omit method, or choose another one",
             )
         )  # fmt: skip
     if wrong:
@@ -132,19 +135,23 @@ def _matrices(problem: Problem, args: Any, x0: Any, u0: Any, t: Any) -> tuple[An
     bounds = problem.set_at(t, args).intervals(u0)
     assert bounds is not None
     low, up = (v.ravel() for v in bounds)
-    # What f has of the generator with the opposite sign cancels here, before anything is computed.
+    # Terms of f that cancel terms of the generator do so here, before the time integration.
     return linear + f_x, f_u @ inverse, inverse - h_u @ inverse, -h_x, low, up
 
 
 def pivoted(system: Affine) -> Affine:
-    """The system with members of pairs exchanged one by one, where that halves A, or makes it smaller
-    and M not much larger: the noise of a dependent member is in proportion to its coefficients."""
+    """Return the system after the principal pivots that reduce roundoff.
+
+    Pairs are tested one by one. A pivot is accepted if it halves the sum of |A|, or if it reduces this
+    sum without enlarging M much: the roundoff of a dependent member is proportional to its
+    coefficients.
+    """
     size = np.abs(system.A).sum()
     for i in range(len(system.low)):
         if system.M[i, i] > 0.0:
-            other = system.modified(i)
-            smaller = np.abs(other.A).sum()
-            tame = np.abs(other.M).max() <= 10.0 * np.abs(system.M).max()
-            if smaller < (size if tame else 0.5 * size):
-                system, size = other, smaller
+            candidate = system.pivot(i)
+            candidate_size = np.abs(candidate.A).sum()
+            keeps_m_small = np.abs(candidate.M).max() <= 10.0 * np.abs(system.M).max()
+            if candidate_size < (size if keeps_m_small else 0.5 * size):
+                system, size = candidate, candidate_size
     return system
