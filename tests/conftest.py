@@ -1,5 +1,7 @@
 """The environment of every test: double precision, checked shapes, repeatable random cases."""
 
+import contextlib
+import ctypes
 import gc
 import itertools
 import os
@@ -85,6 +87,11 @@ def _few_programs():
         resident = int(_PAGES.read_text().split()[1])
         if mappings > _AT_MOST or resident > _MOST_PAGES:
             jax.clear_caches()
+            gc.collect()
+            # glibc keeps what was freed. The memory would stay near the limit, so that every 25th
+            # test dropped all programs, for five seconds and the time to compile them again.
+            with contextlib.suppress(AttributeError):
+                ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture
