@@ -1,0 +1,111 @@
+"""The method of a plain call: chosen by structure, changed where stability limits the steps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tests.closed_forms as closed_forms
+from scipy.integrate import solve_ivp
+from tests.selection import mostly_thorough
+
+import dvax
+
+TOLERANCES = [1e-4, 1e-6, 1e-8, 1e-10]
+CASES = [(name, tol) for name in closed_forms.ALL for tol in TOLERANCES]
+
+
+@pytest.mark.parametrize(("name", "tol"), mostly_thorough(CASES, [("C1", 1e-6), ("C4", 1e-8)]))
+def test_plain_call_meets_its_tolerance_in_few_steps(name, tol):
+    case = closed_forms.ALL[name]()
+    sol = dvax.solve(case.problem, case.x0, 0.0, case.t1, case.args, rtol=tol, atol=tol)
+    exact = case.exact(case.t1)[0]
+    error = np.sqrt(np.mean((np.asarray(sol.xs[-1]) - exact) ** 2))
+    assert error <= tol * (1.0 + np.sqrt(np.mean(exact**2)))
+    assert int(sol.stats["steps"]) <= 700
+
+
+def spring(stiffness, push):
+    """A spring of this stiffness holds x above 1.5, while a force moves it slowly."""
+    return dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1e6),
+        f=lambda t, x, u, args: push(t) - x + u,
+        h=lambda t, x, u, args: -stiffness * (x - 1.5) - u,
+    )  # fmt: skip
+
+
+STIFFNESSES = [3e3, 1e4, 1e5, 1e6]
+
+
+@pytest.mark.parametrize("stiffness", mostly_thorough(STIFFNESSES, [1e4]))
+def test_stiff_law_is_solved_by_a_method_without_a_limit_of_stability(stiffness):
+    problem = spring(stiffness, lambda t: 1.0 + jnp.sin(t))
+    sol = dvax.solve(problem, 4.0, 0.0, 8.0)
+    assert sol.stats["method"].startswith("ExpRosenbrock: stability limited the steps")
+    assert int(sol.stats["steps"]) < 2000
+
+    def by_hand(t, x):
+        return 1.0 + np.sin(t) - x + np.maximum(0.5 * stiffness * (1.5 - x), 0.0)
+
+    want = solve_ivp(by_hand, (0.0, 8.0), [4.0], method="Radau", rtol=1e-10, atol=1e-12).y[0, -1]
+    assert abs(float(sol.xs[-1]) - want) <= 2e-6 * (1.0 + abs(want))
+
+
+def test_affine_problem_is_solved_exactly_between_kinks():
+    case = closed_forms.c1()
+    sol = dvax.solve(case.problem, case.x0, 0.0, case.t1, case.args)
+    assert sol.stats["method"].startswith("ExpRosenbrock: ")
+    assert int(sol.stats["steps"]) < 40
+
+
+def test_oscillation_is_not_taken_for_stiffness():
+    turning = dvax.Problem(
+        A=dvax.generators.Dense(jnp.array([[-0.1, 20.0], [-20.0, -0.1]])),
+        P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-0.5, 0.5),
+        f=lambda t, x, u, args: jnp.stack([u, jnp.sin(t)]),
+        h=lambda t, x, u, args: -3.0 * x[0] ** 3 - u,
+        control_space=dvax.spaces.Euclidean(()),
+    )  # fmt: skip
+    sol = dvax.solve(turning, jnp.array([1.0, 0.0]), 0.0, 5.0)
+    assert sol.stats["method"].startswith("DormandPrince: ")
+
+
+def test_known_constants_and_fixed_steps_keep_the_method_whose_defect_is_enclosed():
+    case = closed_forms.c1()
+    known = dvax.solve(
+        case.problem, case.x0, 0.0, 1.0, case.args, rtol=1e-3, constants=case.constants
+    )
+    assert known.enclosed and known.stats["method"].startswith("ETD2RK: ")
+    fixed = dvax.solve(case.problem, case.x0, 0.0, 1.0, case.args, dt=0.1)
+    assert fixed.stats["method"] == "ETD2RK: the steps are given"
+
+
+def test_named_method_is_kept_however_stiff():
+    problem = spring(1e4, lambda t: 1.0 + jnp.sin(t))
+    sol = dvax.solve(problem, 4.0, 0.0, 1.5, method=dvax.DormandPrince(), rtol=1e-4)
+    assert sol.stats["method"] == "DormandPrince" and bool(sol.result == dvax.RESULTS.successful)
+
+
+def test_choice_does_not_depend_on_transformations():
+    problem = spring(3e3, lambda t: 1.0 + jnp.sin(t))
+
+    def last(x0):
+        sol = dvax.solve(problem, x0, 0.0, 3.0)
+        return sol.xs[-1], sol.stats["method"]
+
+    # Traced, a run cannot be followed by another: it goes on as it began.
+    value, label = jax.jit(last)(4.0)
+    assert label.startswith("DormandPrince: ")
+    slope, label = jax.grad(last, has_aux=True)(4.0)
+    assert label.startswith("DormandPrince: ")
+    np.testing.assert_allclose(value, last(4.0)[0], atol=1e-5)
+    # At t = 3 the spring has long forgotten where it began.
+    assert abs(float(slope)) < 1e-6
+
+
+def test_function_that_closes_over_a_traced_number_is_followed_to_the_end():
+    def last(pull):
+        problem = spring(3e3, lambda t: pull + jnp.sin(t))
+        return dvax.solve(problem, 4.0, 0.0, 3.0).xs[-1]
+
+    rest = lambda pull: (pull + np.sin(3.0) + 1.5e3 * 1.5) / (1.0 + 1.5e3)  # noqa: E731
+    np.testing.assert_allclose(jax.jit(last)(1.0), rest(1.0), atol=1e-3)
