@@ -31,15 +31,15 @@ _RUNS: tuple[tuple[str, dvax.ETD1 | dvax.ETD2RK, tuple[float, ...]], ...] = (
 
 def run(full: bool) -> Section:
     section = Section(
-        title="certificate: what it costs, and how close it comes",
+        title="certificate: its cost, and its ratio to the true error",
         fair=(
             f"Cost: dvax.solve as called, {_POINTS:.0e} points, {_STEPS} fixed steps, with "
-            "measure=True beside measure=False, which does not sample the defect and certifies "
-            f"nothing. Closeness: bound / true error of C1 at t = 2, adaptive steps, {_TIMES} "
-            "saved times, the true error from the closed form; 'sharp' uses the one-sided "
-            "constant. Errors there are of ETD1 and ETD2RK at the rtol named, atol = rtol/1000. "
-            "certified_tol: all its runs together, beside the fewest fixed steps (of a ladder of "
-            "tenths) whose true error, unknown beforehand, is just below it."
+            "measure=True against measure=False, which does not sample the defect and certifies "
+            f"nothing. Ratio: bound / true error of C1 at t = 2, adaptive steps, {_TIMES} saved "
+            "times, the true error from the closed form; 'sharp' uses the one-sided constant. These "
+            "errors are of ETD1 and ETD2RK at the given rtol, atol = rtol/1000. certified_tol: the "
+            "time of all its runs, against the smallest number of fixed steps (in steps of a tenth) "
+            "whose true error, unknown beforehand, is just below it."
         ),
         tables=[Table("bound / true error on C1", _HEADER, _closeness())],
     )
