@@ -202,10 +202,10 @@ def test_trajectory_curvature_is_below_its_bound():
             def at(theta, A=A, h=h, x0=x0, c0=c0, c1=c1):
                 return A.propagator(theta * h, 2).step(x0, (c0, theta * c1))
 
-            bend = A.chord_deviation(
+            bound = A.chord_deviation(
                 dvax.generators.FlowStep(h, x0, at(1.0), (c0, c1)), space, A.growth(space)
             )
-            assert np.all(farthest(at, 0.0, 1.0) <= np.asarray(bend) * (1 + 1e-12))
+            assert np.all(farthest(at, 0.0, 1.0) <= np.asarray(bound) * (1 + 1e-12))
 
 
 def test_enclosure_of_constants_has_no_deviation():
