@@ -296,7 +296,7 @@ def test_frame_rejects_viscosity_without_yield_strength():
     with pytest.raises(dvax.InputError) as caught:
         Frame(record=RECORD, period=0.5, damping=0.05, viscosity_ratio=0.01)
     (problem,) = caught.value.problems
-    assert "viscosity_ratio" in problem.place and "stays elastic" in problem.rule
+    assert "viscosity_ratio" in problem.place and "is elastic" in problem.rule
     assert "yield_ratio" in problem.fix
 
 

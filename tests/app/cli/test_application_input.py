@@ -39,7 +39,7 @@ def write(folder: Path, text: str, netlist: str = TANK) -> Path:
 REFUSED: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     "short source": (
         CIRCUIT, TANK + "R1 1 2 1k\nV1 2 0 PWL(0 0 1m 5)\n",
-        {"a.cir, line 5": ("V1, which is known from 0 to 0.001 s", "t_end = 0.001")},
+        {"a.cir, line 5": ("V1, which is defined from 0 to 0.001 s", "t_end = 0.001")},
     ),
     "word twice": (CIRCUIT, "C1 1 0 1u IC=1 IC=2\n", {"a.cir, line 1": ("IC=1 and IC=2",)}),
     "nothing in time": (
@@ -62,7 +62,7 @@ REFUSED: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     ),
     "flow alone": (
         FRAME + 'viscosity_ratio = "10 ms"\n', TANK,
-        {"a.toml: model.viscosity_ratio": ("given: 0.01", "stays elastic", "Leave it out")},
+        {"a.toml: model.viscosity_ratio": ("given: 0.01", "is elastic", "Omit it")},
     ),
     "points of interest": (
         FRAME + "[output]\npoints_of_interest = [1.0]\n", TANK,
