@@ -300,7 +300,7 @@ def test_fem_contact_stress_balances_the_punch(run, tmp_path: Path):
     np.testing.assert_allclose(near, seen, atol=0.02 * np.max(np.abs(seen)))
     middle = np.argmin(np.abs(contact.points[:, 0]))
     assert seen[middle] == pytest.approx(near[middle], rel=1e-3)
-    with pytest.raises(dvax.InputError, match="ends on .vtu or .vtk"):
+    with pytest.raises(dvax.InputError, match="extension .vtu or .vtk"):
         model.write(tmp_path / "at.stl", t, x)
 
 

@@ -23,12 +23,13 @@ from dvax.app.runs.schema import SolverKeys, in_quantity
 from dvax.app.runs.solver_options import check_model_steps, event_driven, settings
 from dvax.evolution import ExpRosenbrock, PiecewiseLinear, Solution
 from dvax.models.frame import Accelerogram, Frame
+from dvax.models.frame.peaks import peak_displacement
 
 _INCH = 0.0254
 """Metres in an inch, exactly."""
 
 
-_peak_displacement = jax.jit(largest_between)
+_peak_displacement = jax.jit(peak_displacement)
 
 
 class FrameSection(SolverKeys):
@@ -47,7 +48,7 @@ class FrameSection(SolverKeys):
         None,
         gt=0,
         description="viscosity over stiffness, eta/k [s], of a frame that yields; "
-        "elastoplastic as it goes to 0",
+        "elastoplastic as it tends to 0",
     )
 
 
