@@ -188,7 +188,7 @@ def euler(M, B, w, model, dt, steps):
     beta, cap = float(model.beta), float(model.kappa0)
     a, x, out = float(model.tau) / dt, np.zeros(M.shape[0]), []
     for k in range(1, steps + 1):
-        g = np.asarray(model.gap - model.lean * model.depth(jnp.asarray(k * dt)))
+        g = np.asarray(model.gap - model.vertical_normal * model.depth(jnp.asarray(k * dt)))
         old = a * (M @ x)
         for _ in range(40):
             drive = beta * (B @ x - g)

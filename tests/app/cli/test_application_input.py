@@ -113,7 +113,7 @@ REFUSED: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     ),
     "no duration": (
         ROADS + INCIDENT.replace("1.0", "2.0"), TANK,
-        {"a.toml: model.incidents[1].start, model.incidents[1].end": ("it begins before it ends",)},
+        {"a.toml: model.incidents[1].start, model.incidents[1].end": ("start < end must hold",)},
     ),
 }  # fmt: skip
 NEED_FEM = {
@@ -122,7 +122,7 @@ NEED_FEM = {
     ),
     "too many layers": (
         BODY.replace("layers = 2", "layers = 300"),
-        {"a.toml: model.layers, model.growth": ("no area to rounding", "Take fewer layers or")},
+        {"a.toml: model.layers, model.growth": ("roundoff dominates the area", "Use fewer layers or")},
     ),
     "a mesh and sizes": (
         BODY + 'mesh = "a.msh"\n',
