@@ -48,7 +48,7 @@ class FrameSection(SolverKeys):
         None,
         gt=0,
         description="viscosity over stiffness, eta/k [s], of a frame that yields; "
-        "elastoplastic as it tends to 0",
+        "elastoplastic as it goes to 0",
     )
 
 
