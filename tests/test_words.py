@@ -162,20 +162,12 @@ EXCEPTIONS = {("CHANGELOG.md", "mend"): "the old name of an attribute"}
 
 # Not yet renamed: folder (or file) -> names. Delete an entry when its folder is clean.
 PENDING_NAMES: dict[str, set[str]] = {
-    "src/dvax/_figure_text.py": {"_FEW"},
-    "src/dvax/_tree.py": {"mend"},
     "src/dvax/evolution": {
         "Factors", "_MOST", "_SMALL", "begun", "bend", "guarded", "look", "moving",
     },
     "src/dvax/formats": {"begun"},
-    "src/dvax/generators": {"Expanded", "_FEW", "bend", "of_waves", "turns", "waves"},
-    "src/dvax/models": {"_MOST", "bend", "joins"},
     "src/dvax/programs": {"_MOST", "_OTHER", "bend", "carries", "settled"},
-    "src/dvax/sensitivity": {"Ahead", "_MOST", "bend"},
-    "src/dvax/sets": {"_MOST"},
-    "src/dvax/signals": {"Heard", "elsewhere"},
     # These tests call functions of src/dvax that still have the old names.
-    "tests/generators": {"bend", "of_waves"},
     "tests/programs": {"bend"},
 }  # fmt: skip
 
