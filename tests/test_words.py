@@ -164,14 +164,9 @@ EXCEPTIONS = {("CHANGELOG.md", "mend"): "the old name of an attribute"}
 
 # Not yet renamed: folder (or file) -> names. Delete an entry when its folder is clean.
 PENDING_NAMES: dict[str, set[str]] = {
-    "src/dvax/_figure_text.py": {"_FEW"},
-    "src/dvax/_tree.py": {"mend"},
     "src/dvax/evolution": {"_SMALL", "bend", "guarded", "look", "moving"},
     "src/dvax/formats": {"begun"},
-    "src/dvax/models": {"_MOST", "bend", "joins"},
     "src/dvax/programs": {"_MOST", "_OTHER", "bend", "carries", "settled"},
-    "src/dvax/sensitivity": {"Ahead", "_MOST", "bend"},
-    "src/dvax/signals": {"Heard", "elsewhere"},
 }  # fmt: skip
 
 # Not yet rewritten: folders (or files) of prose. Delete an entry when its folder is clean.

@@ -1,8 +1,8 @@
-"""dvax: coupled nonsmooth dynamical systems, solved with proofs.
+"""dvax: coupled nonsmooth dynamical systems, solved with certified error bounds.
 
     x' = Ax + f(t, x, u) in the mild sense,      u ∈ h(t, x, u) − N_{K(t)}(P u)
 
-Names are loaded when they are first used, so that the command line starts without JAX.
+Each name is imported at its first use, so that the command line starts without JAX.
 """
 
 from typing import TYPE_CHECKING

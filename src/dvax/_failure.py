@@ -1,8 +1,8 @@
-"""Derivatives of a computation that failed: NaN, in every mode and with respect to every input.
+"""NaN derivatives of a failed computation, in every mode and with respect to every input.
 
-What an iteration or a time loop returns when it fails has derivatives of its own (of the partial
-result, often 0), and they are not those of the solution. NaN values alone do not show this: a loop
-that never ran, or a select that masks an entry, turns a NaN cotangent into 0.
+If an iteration or a time loop fails, the derivatives of its partial result (often 0) are not those of
+the solution. NaN values do not ensure NaN derivatives: a loop without iterations, or a select that
+masks an entry, replaces a NaN cotangent by 0.
 """
 
 from functools import partial
@@ -14,10 +14,10 @@ import jax.tree_util as jtu
 
 
 def nan_derivatives_where(failed: Any, outputs: Any, inputs: Any) -> Any:
-    """Return `outputs`, whose derivatives of any order with respect to the real leaves of `inputs`
-    are NaN where `failed` holds, and unchanged where it does not.
+    """Return `outputs` with NaN derivatives if `failed` is true, and unchanged derivatives otherwise.
 
-    `outputs` is a tree of arrays; `failed`, a boolean of shape ().
+    This holds for derivatives of any order with respect to the real leaves of `inputs`. `outputs` is a
+    tree of arrays, and `failed` a boolean of shape ().
     """
     leaves, tree = jtu.tree_flatten(outputs)
     is_real = [_is_real(leaf) for leaf in leaves]
@@ -37,19 +37,21 @@ def _marked(outputs: list[Any], inputs: list[Any], failed: Any) -> list[Any]:
 @partial(_marked.defjvp, symbolic_zeros=True)
 def _(primals: tuple, tangents: tuple) -> tuple[list[Any], list[Any]]:
     outputs, inputs, failed = primals
-    along, turns, _ = tangents
-    moving = [turn for turn in turns if not _is_zero(turn)]
+    output_tangents, input_tangents, _ = tangents
+    nonzero = [tangent for tangent in input_tangents if not _is_zero(tangent)]
     values = _marked(outputs, inputs, failed)
-    along = [jnp.zeros(leaf.shape, leaf.dtype) if _is_zero(leaf) else leaf for leaf in along]
-    if not outputs or not moving:
-        return values, along
+    output_tangents = [
+        jnp.zeros(leaf.shape, leaf.dtype) if _is_zero(leaf) else leaf for leaf in output_tangents
+    ]
+    if not outputs or not nonzero:
+        return values, output_tangents
     dtype = jnp.finfo(jnp.result_type(*outputs)).dtype
-    total = sum(jnp.sum(jnp.real(turn)).astype(dtype) for turn in moving)
-    # A factor that depends on the inputs in the same way gives the higher derivatives.
+    total = sum(jnp.sum(jnp.real(tangent)).astype(dtype) for tangent in nonzero)
+    # The factor depends on the inputs in the same way, so that higher derivatives are NaN as well.
     (nan,) = _marked([jnp.asarray(jnp.nan, dtype)], inputs, failed)
-    # A select on either side of the product, because 0 · NaN is NaN in either direction.
-    lost = jnp.where(failed, jnp.where(failed, total, 0.0) * nan, 0.0)
-    return values, [leaf + lost.astype(leaf.dtype) for leaf in along]
+    # Select on both sides of the product, since 0 · NaN is NaN in forward and in reverse mode.
+    nan_term = jnp.where(failed, jnp.where(failed, total, 0.0) * nan, 0.0)
+    return values, [leaf + nan_term.astype(leaf.dtype) for leaf in output_tangents]
 
 
 def _is_zero(leaf: Any) -> bool:

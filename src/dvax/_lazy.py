@@ -24,7 +24,7 @@ def lazy_names(
         value = importlib.import_module(f".{home or name}", package)
         if home is not None:
             value = getattr(value, name)
-        # Kept as an attribute, so that Python looks it up here only once.
+        # Stored as an attribute, so that Python calls this function only once for each name.
         setattr(sys.modules[package], name, value)
         return value
 

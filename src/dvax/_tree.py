@@ -18,7 +18,7 @@ Tree = Any
 
 
 class Static:
-    """Anything, as a part of a tree that has no leaves."""
+    """A pytree node without leaves that contains an arbitrary static value."""
 
     def __init__(self, value: Any):
         self.value = value
@@ -49,21 +49,23 @@ def scale(c: Any, a: Tree) -> Tree:
 
 
 def where(condition: Any, a: Tree, b: Tree) -> Tree:
-    one = lambda p, q: p if p is q else jnp.where(condition, p, q)  # noqa: E731
-    return jtu.tree_map(one, a, b)
+    """Return a if the condition is true, else b, without an operation for identical leaves."""
+    return jtu.tree_map(lambda p, q: p if p is q else jnp.where(condition, p, q), a, b)
 
 
 def put(table: Tree, index: Any, row: Tree) -> Tree:
-    """The table of rows with one of them written over, as one move: a scatter is more than that."""
+    """Return the table with one row replaced, by a dynamic update, which is faster than a scatter."""
     return jtu.tree_map(
         lambda leaf, new: lax.dynamic_update_index_in_dim(leaf, new, index, 0), table, row
     )
 
 
 def put_if(condition: Any, table: Tree, index: Any, row: Tree) -> Tree:
-    """The same, where the condition holds. (To choose between two tables would be to copy one.)"""
-    kept = jtu.tree_map(lambda leaf: lax.dynamic_index_in_dim(leaf, index, 0, False), table)
-    return put(table, index, where(condition, row, kept))
+    """Return the table with one row replaced if the condition is true.
+
+    Only the row is selected: a select between two tables would copy one."""
+    old_row = jtu.tree_map(lambda leaf: lax.dynamic_index_in_dim(leaf, index, 0, False), table)
+    return put(table, index, where(condition, row, old_row))
 
 
 def zeros_like(a: Tree) -> Tree:
@@ -71,14 +73,16 @@ def zeros_like(a: Tree) -> Tree:
 
 
 def all_finite(a: Tree) -> jax.Array:
-    """Whether every entry is finite. 0·v is NaN exactly where v is not, and a sum of products is one
-    pass over memory, where a test of each entry and a reduction of the answers would be two."""
+    """Return whether every entry is finite.
+
+    0·v is NaN exactly if v is not finite. A sum of products is one pass over memory; a test of each
+    entry followed by a reduction would be two."""
     total = sum(jnp.sum(0.0 * leaf) for leaf in jtu.tree_leaves(a))
     return jnp.isfinite(total)
 
 
 def shapes(a: Tree) -> Tree:
-    """The tree with every array replaced by its shape: what two compatible trees share."""
+    """Return the tree with every array replaced by its shape."""
     return jtu.tree_map(jnp.shape, a)
 
 
@@ -90,15 +94,14 @@ def same_shape(a: Tree, b: Tree) -> bool:
 
 
 def fits(name: str, given: Any, like: Tree, what: str) -> None:
-    """Raise an `InputError` unless the array `given` has the very shape of `like`."""
+    """Raise an `InputError` unless the array `given` has exactly the shape of `like`."""
     if isinstance(like, tuple) or jnp.shape(given) != jnp.shape(like):
         raise InputError(
             InputProblem(
                 name,
                 f"shape {jnp.shape(given)}",
                 f"it acts entry by entry on the {what}, whose elements have shape {shapes(like)}",
-                "Give it that shape, or name the space that you mean (state_space= or "
-                "control_space= of dvax.Problem)",
+                "Give it that shape, or pass state_space= or control_space= to dvax.Problem",
             )
         )
 
@@ -111,7 +114,7 @@ def fits_matrix(name: str, matrix: Any, like: Tree, what: str) -> None:
                 name,
                 f"shape {jnp.shape(matrix)}",
                 f"it acts on the {what}, whose elements have shape {shapes(like)}",
-                "A matrix acts on vectors: give it as many rows, or state and control as vectors",
+                "Give it as many rows as the vector has entries; state and control must be vectors",
             )
         )
 
@@ -124,13 +127,13 @@ def fits_parts(name: str, count: int, like: Tree, what: str) -> None:
                 name,
                 f"{count} parts",
                 f"it acts on the {what}, whose elements have shape {shapes(like)}",
-                "Give one part for each, and name the spaces with dvax.spaces.Product(...)",
+                "Give one part for each, and pass the spaces as dvax.spaces.Product(...)",
             )
         )
 
 
 def is_concrete(*trees: Tree) -> bool:
-    """Whether every leaf has a value now, so that a check on values can be made at all."""
+    """Return whether no leaf is traced, so that values can be checked."""
     for leaf in jtu.tree_leaves(trees):
         if isinstance(leaf, jax.core.Tracer):
             return False
@@ -138,7 +141,7 @@ def is_concrete(*trees: Tree) -> bool:
 
 
 def is_number(value: Any) -> bool:
-    """Whether this is one real number, traced or not: no flag, text or array of several."""
+    """Return whether the value is one real number, traced or not, and no bool."""
     if isinstance(value, int | float):
         return not isinstance(value, bool)
     kind = getattr(getattr(value, "dtype", None), "kind", "")
@@ -146,13 +149,14 @@ def is_number(value: Any) -> bool:
 
 
 def host(a: Tree) -> Tree:
-    """What has a value now as NumPy arrays, the rest as it is. On a few numbers JAX would compile
-    every operation as a program of its own."""
+    """Return the tree with concrete leaves as NumPy arrays.
+
+    NumPy is faster for few numbers: JAX compiles every operation on concrete values separately."""
     return jtu.tree_map(lambda leaf: np.asarray(leaf) if is_concrete(leaf) else leaf, a)
 
 
 def array_module(*values: Tree) -> Any:
-    """`numpy` where all of these have a value now, else `jax.numpy`."""
+    """Return `numpy` if no value is traced, else `jax.numpy`."""
     return np if is_concrete(values) else jnp
 
 
@@ -160,10 +164,11 @@ _TREE = "it must be a real number, a floating-point array, or a tuple of these"
 
 
 def as_float(a: Tree, name: str) -> Tree:
-    """Arrays of a floating type from what the user gave; Python numbers take JAX's default type.
+    """Return a state or control given by the user as floating-point arrays.
 
-    States and controls are arrays and tuples of them. An integer or boolean *array* is refused rather
-    than cast: its owner may have meant integer arithmetic, and a silent cast would hide that.
+    It may be an array, or a tuple of these. Python numbers take JAX's default type. Raise an
+    `InputError` for an integer or boolean *array*: a silent cast would hide unintended integer
+    arithmetic.
     """
     if isinstance(a, tuple) and a:
         parts = [as_float(part, name) for part in a]
@@ -172,7 +177,7 @@ def as_float(a: Tree, name: str) -> Tree:
 
 
 def as_floats(a: Tree, name: str) -> Tree:
-    """The same for the parameters of a problem, which may be any tree."""
+    """Return the parameters of a problem, an arbitrary tree, as floating-point arrays."""
     if not jtu.tree_leaves(a):
         raise _not_real(name, a)
     return jtu.tree_map(
@@ -180,21 +185,21 @@ def as_floats(a: Tree, name: str) -> Tree:
     )
 
 
-def as_array(a: Any, name: str, least: int = 1) -> jax.Array:
-    """One array of at least `least` entries, where no tuple of arrays will do."""
+def as_array(a: Any, name: str, min_size: int = 1) -> jax.Array:
+    """Return one floating-point array of at least `min_size` entries; a tuple is an error."""
     if isinstance(a, tuple):
         fix = f"Write jnp.array({[*a]!r})" if _are_numbers(a) else "Join them into one array"
         rule = "it must be one array: a tuple is an element of a direct sum, one array a part"
         raise InputError(InputProblem(name, line(a), rule, fix))
     array = _float_array(a, name, "it must be a real number or a floating-point array")
-    if array.size < least:
+    if array.size < min_size:
         given, rule = f"an array of shape {array.shape}", "it must have at least one entry"
         raise InputError(InputProblem(name, given, rule, "Give a number or a vector with entries"))
     return array
 
 
 def as_number(a: Any, name: str, fix: str) -> jax.Array:
-    """One number; `fix` says what to do about an array of several."""
+    """Return one floating-point number; `fix` is the advice for an array of several numbers."""
     if isinstance(a, tuple):
         raise InputError(InputProblem(name, line(a), "it must be one number", fix))
     number = _float_array(a, name, "it must be one real number")
@@ -204,16 +209,16 @@ def as_number(a: Any, name: str, fix: str) -> jax.Array:
 
 
 def as_shape(shape: Any, name: str, fix: str) -> tuple[int, ...]:
-    """The shape of an array: (n,) for a whole number n > 0, or a tuple of such numbers."""
+    """Return the shape of an array, (n,) for an integer n > 0, or a tuple of such integers."""
     try:
         sizes = tuple(shape) if np.ndim(shape) else (shape,)
-        whole = tuple(operator.index(n) for n in sizes)
+        integers = tuple(operator.index(n) for n in sizes)
     except (TypeError, ValueError):
-        sizes, whole = (), (0,)
-    if any(isinstance(n, bool) for n in sizes) or min(whole, default=1) < 1:
-        rule = "it is a whole number > 0, or a tuple of these"
+        sizes, integers = (), (0,)
+    if any(isinstance(n, bool) for n in sizes) or min(integers, default=1) < 1:
+        rule = "it must be a whole number > 0, or a tuple of these"
         raise InputError(InputProblem(name, line(shape), rule, fix))
-    return whole
+    return integers
 
 
 def check_kind(given: Any, kind: Any, name: str, rule: str, fix: str) -> None:
@@ -223,10 +228,10 @@ def check_kind(given: Any, kind: Any, name: str, rule: str, fix: str) -> None:
 
 
 def check_parts(parts: tuple[Any, ...], kind: type, name: str, example: str) -> None:
-    """Raise an `InputError` unless there are parts and each is an instance of `kind`."""
+    """Raise an `InputError` unless there is at least one part and each is an instance of `kind`."""
     noun = kind.__name__.removeprefix("Abstract").lower()
     fix = f"Give one argument a part, such as dvax.{noun}s.{example}"
-    rule = f"every part is one of dvax.{noun}s"
+    rule = f"every part must be one of dvax.{noun}s"
     for number, part in enumerate(parts, start=1):
         check_kind(part, kind, f"{name}, part {number}", rule, fix)
     if not parts:
@@ -234,7 +239,7 @@ def check_parts(parts: tuple[Any, ...], kind: type, name: str, example: str) -> 
 
 
 def check_tolerance(tol: Any, name: str) -> None:
-    """Raise an `InputError` unless `tol` is a finite number ≥ 0 with a value."""
+    """Raise an `InputError` unless `tol` is a finite number ≥ 0 that is not traced."""
     number = isinstance(tol, int | float | np.floating) and not isinstance(tol, bool)
     if not (number and 0 <= tol < np.inf):
         rule = "it must be a finite number ≥ 0 that is not traced"
@@ -246,7 +251,7 @@ def _are_numbers(a: tuple[Any, ...]) -> bool:
 
 
 def _float_array(leaf: Any, name: str, rule: str = _TREE) -> jax.Array:
-    # `dtypes.issubdtype` and `asarray` cost as much as a hundred steps of a small system.
+    # Avoid `dtypes.issubdtype` and `asarray`, which take as long as 100 steps of a small system.
     if isinstance(leaf, jax.Array) and leaf.dtype in _FLOATS:
         return leaf
     if isinstance(leaf, int | float) and not isinstance(leaf, bool):
@@ -282,36 +287,36 @@ def _from_list(numbers: list[Any], name: str) -> Any:
     )
 
 
-def require(condition: Callable[[], Any], name: str, given: Any, rule: str, mend: str) -> None:
-    """Raise an `InputError` unless `condition()` is true, in all entries, on concrete values.
+def require(condition: Callable[[], Any], name: str, given: Any, rule: str, fix: str) -> None:
+    """Raise an `InputError` unless `condition()` is true in all entries.
 
-    Values that are traced (inside `jax.jit`, `jax.grad`, ...) cannot be looked at, so they pass.
+    Traced values (inside `jax.jit`, `jax.grad`, ...) cannot be checked, and are accepted.
     """
     if not is_concrete(given):
         return
-    # What has a value may be met while something else is traced.
+    # Concrete values may occur inside the trace of another function.
     with jax.ensure_compile_time_eval():
-        found = condition()
-        holds = bool(np.all(found)) if np.ndim(found) else bool(found)
+        result = condition()
+        holds = bool(np.all(result)) if np.ndim(result) else bool(result)
     if not holds:
-        raise InputError(InputProblem(name, short(given), rule, mend))
+        raise InputError(InputProblem(name, short(given), rule, fix))
 
 
-def refuse_nan(name: str, a: Tree) -> None:
-    """Raise an `InputError` where an entry of a concrete array is NaN."""
+def check_not_nan(name: str, a: Tree) -> None:
+    """Raise an `InputError` if an entry of a concrete array is NaN."""
     for leaf in jtu.tree_leaves(a):
         if is_concrete(leaf) and np.isnan(np.asarray(leaf)).any():
             raise InputError(
-                InputProblem(name, short(leaf), "it must be a number", "Correct the NaN entries")
+                InputProblem(name, short(leaf), "it must not be NaN", "Correct the NaN entries")
             )
 
 
 class Text(str):
-    """A value that a message shows as it stands."""
+    """A text that messages contain unchanged."""
 
 
 def short(value: Any) -> str:
-    """A value as a message shows it, on one line: whole when small, summarised when large."""
+    """Return a value on one line for a message, and a summary of a large one."""
     if isinstance(value, Text):
         return str(value)
     leaves = jtu.tree_leaves(value)
@@ -329,20 +334,21 @@ def _short_array(leaf: Any) -> str:
         return " ".join(str(array).split())
     if array.dtype.kind not in "iuf":
         return f"an array of {array.dtype} of shape {array.shape}"
-    known = array[~np.isnan(array)] if array.dtype.kind == "f" else array
-    unknown = array.size - known.size
-    range_ = f" with range [{known.min():.6g}, {known.max():.6g}]" if known.size else ""
-    return f"an array of shape {array.shape}{range_}" + (f" and {unknown} NaN" if unknown else "")
+    numbers = array[~np.isnan(array)] if array.dtype.kind == "f" else array
+    nan_count = array.size - numbers.size
+    range_ = f" with range [{numbers.min():.6g}, {numbers.max():.6g}]" if numbers.size else ""
+    nans = f" and {nan_count} NaN" if nan_count else ""
+    return f"an array of shape {array.shape}{range_}{nans}"
 
 
-def line(value: Any, most: int = 120) -> str:
-    """repr(value) on one line of at most `most` characters."""
+def line(value: Any, max_length: int = 120) -> str:
+    """Return repr(value) on one line of at most `max_length` characters."""
     text = " ".join(repr(value).split())
-    return text if len(text) <= most else text[: most - 3] + "..."
+    return text if len(text) <= max_length else text[: max_length - 3] + "..."
 
 
 def _described(value: Any) -> str:
-    """The type of a value, and the value where that says more."""
+    """Return the type of a value, and the value itself unless it is an array or a class."""
     kind = type(value).__name__
     if value is None:
         return "None"
@@ -359,16 +365,16 @@ def _described(value: Any) -> str:
 
 def _not_real(name: str, given: Any, rule: str = _TREE) -> InputError:
     if isinstance(given, list):
-        rule = "a list must have real numbers, and rows of one length"
+        rule = "a list must contain real numbers, in rows of one length"
     if getattr(getattr(given, "dtype", None), "kind", "") == "c":
-        rule = "data and states are real"
+        rule = "data and states are real, so the numbers must be real"
     argument = name.rpartition("(")[2].rstrip(")")
     argument = argument if argument.isidentifier() else "value"
     return InputError(InputProblem(name, _described(given), rule, _conversion(given, argument)))
 
 
 def _conversion(given: Any, argument: str) -> str:
-    """How to make real numbers of `given`, the value of `argument`."""
+    """Return advice on converting `given`, the value of `argument`, to real numbers."""
     if isinstance(given, str):
         try:
             return f"Write {float(given)!r}, without quotation marks"
@@ -385,7 +391,7 @@ def _conversion(given: Any, argument: str) -> str:
     if isinstance(given, list):
         return "Correct its entries, or join arrays of several shapes in a tuple"
     if isinstance(given, np.ma.MaskedArray):
-        return f"Say what stands in for masked entries: {argument}.filled(0.0)"
+        return f"Replace the masked entries by numbers: {argument}.filled(0.0)"
     dtype = getattr(given, "dtype", None)
     kind = getattr(dtype, "kind", "")
     if isinstance(given, complex) or kind == "c":

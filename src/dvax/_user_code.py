@@ -1,10 +1,9 @@
-"""The user's own functions (f, h, A, P and K of a problem, F of `dvax.solve_vi`), called for the first
-time.
+"""The first call of user-defined functions, with errors that name the file and line of the user's code.
 
-JAX traces them, and that is where most first programs stop: too few parameters, an `if` on a traced
-value, a NumPy function, shapes that do not fit. The exceptions of Python and JAX point into the
-libraries; here they become an `InputError` with the file and the line of the user's code.
-"""
+The functions are f, h, A, P and K of a problem and F of `dvax.solve_vi`. JAX traces them, and many
+first programs fail there: too few parameters, an `if` on a traced value, a NumPy function, wrong
+shapes. The exceptions of Python and JAX point into the libraries. This module converts them to an
+`InputError`."""
 
 import dis
 import inspect
@@ -22,7 +21,7 @@ from . import _tree
 from .errors import DvaxError, InputError, InputProblem
 
 _LIBRARIES = {"dvax", "equinox", "jax", "jaxlib", "jaxtyping", "numpy", "scipy", "optimistix"}
-"""Packages whose frames are no code of the user."""
+"""Packages whose frames are not the user's code."""
 
 
 def call(
@@ -34,11 +33,10 @@ def call(
 ) -> Any:
     """Return fn(*inputs.values()) for the argument `name` of `caller`.
 
-    `about` says where the shape of u comes from, for messages.
+    `about` describes the origin of the shape of u, for messages.
 
-    **Raises:** `dvax.InputError` where fn has other parameters, or raises an exception that a usual
-    mistake leads to. Any other exception keeps its type and gets a note.
-    """
+    **Raises:** `dvax.InputError` if fn has other parameters, or raises an exception that is typical
+    of a common mistake. Any other exception keeps its type and gets a note."""
     at = f"{caller}({name})"
     _check_parameters(at, name, fn, inputs)
     try:
@@ -46,23 +44,23 @@ def call(
     except DvaxError:
         raise
     except (TypeError, ValueError, LookupError, AttributeError) as error:
-        raise InputError(_explained(at, name, fn, inputs, about, error)) from error
+        raise InputError(_explain(at, name, fn, inputs, about, error)) from error
     except Exception as error:
         error.add_note(f"Raised in {name} of {caller}, {_place(fn, error.__traceback__)}.")
         raise
 
 
-def leaked(error: jax.errors.UnexpectedTracerError) -> InputError:
-    """The `InputError` for a traced array that f, h or K keeps, or hands on, beyond a call."""
-    found = re.search(r"created on line (\S+?):(\d+)", str(error))
-    place = f"{found[1]}, line {found[2]}" if found else "f, h, A, P or K of dvax.Problem"
+def leaked_tracer_error(error: jax.errors.UnexpectedTracerError) -> InputError:
+    """Return the `InputError` for a traced array that f, h or K stores beyond a call."""
+    match = re.search(r"created on line (\S+?):(\d+)", str(error))
+    place = f"{match[1]}, line {match[2]}" if match else "f, h, A, P or K of dvax.Problem"
     return InputError(
         InputProblem(
             place,
-            "a traced array that is used after the call that made it",
-            "a dvax.signals.Table (or an array that is kept in a global) is made inside of f, h or K, "
-            "where it has no values yet, and steps must end at the times of tables",
-            "Make it once, outside of the function, or hand it over in args",
+            "a traced array that is used after the call that created it",
+            "a dvax.signals.Table, or an array stored in a global, must not be created inside of f, h "
+            "or K, where it is traced and its times are unknown",
+            "Create it once, outside of the function, or pass it in args",
         )
     )
 
@@ -76,52 +74,55 @@ def check_values(
     caller: str = "dvax.Problem",
     element: str = "the state x0",
 ) -> None:
-    """Raise an `InputError` unless `out` = fn(`inputs`) consists of real numbers of the type of x, an
-    `element` of which messages speak."""
-    wide = jnp.result_type(*jtu.tree_leaves(x))
+    """Raise an `InputError` unless `out` = fn(`inputs`) consists of real numbers of the type of x.
 
-    def refuse(given: str, rule: str, fix: str) -> None:
+    `element` is the name of x in messages."""
+    expected = jnp.result_type(*jtu.tree_leaves(x))
+
+    def fail(given: str, rule: str, fix: str) -> None:
         raise InputError(InputProblem(f"{caller}({name}), {_place(fn)}", given, rule, fix))
 
     for leaf in jtu.tree_leaves(out):
         if not _is_numeric(leaf):
-            refuse(
+            fail(
                 f"{type(leaf).__name__} {_line(repr(leaf))}",
-                f"{name}({inputs}) returns an array, or a tuple of arrays",
+                f"{name}({inputs}) must be a function that returns an array, or a tuple of arrays",
                 "Return numbers: jnp.stack([...]) joins several into one array",
             )
-        own = _dtype(leaf, wide)
-        common = jnp.promote_types(wide, own)
+        dtype = _dtype(leaf, expected)
+        common = jnp.promote_types(expected, dtype)
         if jnp.issubdtype(common, jnp.complexfloating):
-            refuse(
+            fail(
                 f"a value of {common}", f"{name}({inputs}) is real, as {element} is",
-                "Return its real part, or take real and imaginary part as two components",
+                "Return its real part, or real and imaginary part as two components",
             )  # fmt: skip
-        if _is_flag(leaf):
-            refuse(
-                "a value of bool", f"{name}({inputs}) is a number",
-                "Say which: jnp.where(condition, 1.0, 0.0)",
+        if _is_bool(leaf):
+            fail(
+                "a value of bool", f"{name}({inputs}) must return numbers",
+                "Convert it: jnp.where(condition, 1.0, 0.0)",
             )  # fmt: skip
-        if own != wide:
-            refuse(f"a value of {jnp.dtype(own)}", *_other_precision(own, wide, element))
+        if dtype != expected:
+            fail(f"a value of {jnp.dtype(dtype)}", *_precision_rule(dtype, expected, element))
 
 
 def check_precision(name: str, data: Any, x: Any) -> None:
-    """Raise an `InputError` where an array in `data` is of another type than the state: arithmetic
-    would change the type of the state at the first step, or lose half of its digits."""
-    wide = jnp.result_type(*jtu.tree_leaves(x))
+    """Raise an `InputError` if an array in `data` has another floating type than the state.
+
+    Arithmetic would then change the type of the state in the first step, or lose half of its digits."""
+    expected = jnp.result_type(*jtu.tree_leaves(x))
     for leaf in jtu.tree_leaves(data):
         if isinstance(leaf, jax.Array) and leaf.dtype.kind == "f":
-            own = _dtype(leaf, wide)
-            if own != wide:
-                given = f"data of {jnp.dtype(own)}"
-                words = _other_precision(own, wide, "the state x0")
-                raise InputError(InputProblem(f"dvax.Problem({name})", given, *words))
+            dtype = _dtype(leaf, expected)
+            if dtype != expected:
+                given = f"data of {jnp.dtype(dtype)}"
+                rule, fix = _precision_rule(dtype, expected, "the state x0")
+                raise InputError(InputProblem(f"dvax.Problem({name})", given, rule, fix))
 
 
 def check_args(args: Any, caller: str) -> None:
-    """Raise an `InputError` where JAX cannot take `args`: keys that have no order, arrays of text or of
-    Python objects."""
+    """Raise an `InputError` if `args` is no pytree of numbers.
+
+    Dict keys may not be sortable, and arrays may contain text or Python objects."""
     place = f"{caller}(args)"
     try:
         leaves = jtu.tree_leaves(args)
@@ -133,43 +134,43 @@ def check_args(args: Any, caller: str) -> None:
     for leaf in leaves:
         if isinstance(leaf, np.ndarray) and leaf.dtype.kind not in "biufc":
             given = f"an array of {leaf.dtype}, {_tree.short(leaf)}"
-            fix = "Convert it, np.asarray(..., float), and keep texts beside it, as str"
-            raise InputError(InputProblem(place, given, "the arrays in args hold numbers", fix))
+            fix = "Convert it, np.asarray(..., float), and pass texts as str"
+            rule = "the arrays in args must contain numbers"
+            raise InputError(InputProblem(place, given, rule, fix))
 
 
-def _other_precision(own: Any, wide: Any, element: str) -> tuple[str, str]:
-    """The rule that numbers of the type `own` break beside an `element` of the type `wide`, and the
-    fix."""
+def _precision_rule(dtype: Any, expected: Any, element: str) -> tuple[str, str]:
+    """Return the rule and the fix for numbers of `dtype` with an `element` of the type `expected`."""
     x = element.split()[-1]
     fix = (
         f"Give {x} in that type, jnp.asarray({x}, float) in double precision, or the data in {x}'s"
     )
-    if jnp.promote_types(own, wide) == wide:
-        fix = f"Give the data in that type: jnp.asarray(..., jnp.{jnp.dtype(wide).name})"
-    return f"{element} is of {jnp.dtype(wide).name}, and nothing is converted unasked", fix
+    if jnp.promote_types(dtype, expected) == expected:
+        fix = f"Give the data in that type: jnp.asarray(..., jnp.{jnp.dtype(expected).name})"
+    return f"{element} is of {jnp.dtype(expected).name}, and types are not converted silently", fix
 
 
 def _is_numeric(leaf: Any) -> bool:
-    """Whether a leaf is a number or an array of them (flags and complex numbers included)."""
+    """Return whether a leaf is a number or an array of numbers, including bool and complex."""
     if isinstance(leaf, np.ndarray | np.generic):
         return leaf.dtype.kind not in "OSUMm"
     number = isinstance(leaf, bool | int | float | complex)
     return number or (hasattr(leaf, "dtype") and hasattr(leaf, "shape"))
 
 
-def _is_flag(leaf: Any) -> bool:
+def _is_bool(leaf: Any) -> bool:
     return isinstance(leaf, bool) or getattr(leaf, "dtype", None) == np.dtype(bool)
 
 
-def _dtype(leaf: Any, wide: Any) -> Any:
-    """The type that a leaf has beside the state: Python's numbers and weak types take the state's."""
+def _dtype(leaf: Any, expected: Any) -> Any:
+    """Return the type of a leaf; Python numbers and weak types take the `expected` type."""
     if isinstance(leaf, bool | int | float):
-        return wide
+        return expected
     dtype = jnp.result_type(leaf)
     if jnp.issubdtype(dtype, jnp.complexfloating):
         return dtype
     weak = getattr(leaf, "weak_type", False) or not jnp.issubdtype(dtype, jnp.floating)
-    return wide if weak else dtype
+    return expected if weak else dtype
 
 
 def _check_parameters(
@@ -178,7 +179,7 @@ def _check_parameters(
     try:
         signature = inspect.signature(fn)
     except (TypeError, ValueError):
-        return  # some functions written in C have none
+        return  # some C functions have no signature
     try:
         signature.bind(*inputs.values())
     except TypeError:
@@ -187,12 +188,12 @@ def _check_parameters(
             InputProblem(
                 f"{at}, {_place(fn)}", f"a function of {signature}",
                 f"it is called as {name}({names})",
-                f"Write {name}=lambda {names}: ..., also where not all of them are used",
+                f"Write {name}=lambda {names}: ..., even if some parameters are unused",
             )
         ) from None  # fmt: skip
 
 
-def _explained(
+def _explain(
     at: str, name: str, fn: Callable[..., Any], inputs: Mapping[str, Any], about: str,
     error: Exception,
 ) -> InputProblem:  # fmt: skip
@@ -209,52 +210,55 @@ def _explained(
 def _reason(
     name: str, fn: Callable[..., Any], inputs: Mapping[str, Any], error: Exception
 ) -> tuple[str, str]:
-    """The rule that was broken, and the fix."""
-    traced = f"JAX traces {name}, so that its arguments have no values yet where"
+    """Return the rule that was violated, and the fix."""
+    traced = f"JAX traces {name}, so that its arguments have no values, which"
     if isinstance(error, jax.errors.TracerBoolConversionError):
         return (
-            f"{traced} `if`, `while`, `and`, `or`, `not`, `min` and `max` need one",
+            f"{traced} `if`, `while`, `and`, `or`, `not`, `min` and `max` require",
             "Write jnp.where(condition, a, b) for `if`, jnp.logical_and(a, b) for `and`, "
             "jnp.maximum(a, b) for `max`",
         )
     if isinstance(error, jax.errors.NonConcreteBooleanIndexError):
-        return f"{traced} a mask selects entries", "Write jnp.where(mask, a, b) for a[mask]"
+        return f"{traced} indexing by a mask requires", "Write jnp.where(mask, a, b) for a[mask]"
     if isinstance(error, jax.errors.TracerArrayConversionError):
         return (
-            f"{traced} a function of NumPy needs one",
+            f"{traced} a NumPy function requires",
             "Use jax.numpy: `import jax.numpy as jnp`, and jnp.sin(x) for np.sin(x)",
         )
     if isinstance(error, jax.errors.TracerIntegerConversionError):
         return (
-            f"{traced} an index or the bound of a loop needs one",
+            f"{traced} a list index or a loop bound requires",
             "Write jnp.take(a, i) for a list at i, jax.lax.fori_loop for a loop",
         )
     if isinstance(error, jax.errors.ConcretizationTypeError):
         return (
-            f"{traced} float(), int() or a function of `math` needs one",
-            "Leave out float(); write jnp.sin(x) for math.sin(x)",
+            f"{traced} float(), int() or a function of `math` requires",
+            "Remove float(); write jnp.sin(x) for math.sin(x)",
         )
     if isinstance(error, jax.errors.UnexpectedTracerError):
         return (
-            f"{name} keeps an array of its own for another call, and traced arrays end with the call",
-            "Return all that is needed, and make data outside of the function",
+            f"{name} stores an array for another call, but traced arrays are valid only in one call",
+            "Return all results, and create data outside of the function",
         )
     if "immutable" in str(error) or "item assignment" in str(error):
-        return "arrays of JAX cannot be written into", "Write x = x.at[i].set(v) for x[i] = v"
+        return "JAX arrays are immutable", "Write x = x.at[i].set(v) for x[i] = v"
     if inputs.get("args", 0) is None and _reads_args(fn, error):
         return f"{name} reads args, and no args were given", "Pass args=... to the call"
     fix = "Fix that line"
     if "u" in inputs:
         fix += (
-            "; where u has another shape, name it: control_space=dvax.spaces.Euclidean(()) of "
-            "dvax.Problem for a single number, Euclidean(3) for a vector of 3"
+            "; if u has another shape, pass it to dvax.Problem: "
+            "control_space=dvax.spaces.Euclidean(()) for a single number, Euclidean(3) for a vector "
+            "of 3"
         )
-    return f"{name}({', '.join(inputs)}) must be evaluable by JAX", fix
+    return f"JAX must be able to trace {name}({', '.join(inputs)})", fix
 
 
 def _reads_args(fn: Callable[..., Any], error: Exception) -> bool:
-    """Whether the error is about None, and the statement of the user's code that raised it reads a
-    parameter that is None: args, or what args was handed on to."""
+    """Return whether the error is due to args=None.
+
+    The error must refer to None, and the statement of the user's code that raised it must read a
+    parameter that is None: args, or a parameter to which args was passed."""
     if "NoneType" not in str(error):
         return False
     frame, instruction, trace = None, 0, error.__traceback__
@@ -265,20 +269,21 @@ def _reads_args(fn: Callable[..., Any], error: Exception) -> bool:
     if frame is None:
         return False
     code, names = frame.f_code, frame.f_locals
-    own = {*code.co_varnames[: code.co_argcount + code.co_kwonlyargcount], *_last_parameter(fn)}
+    parameter_count = code.co_argcount + code.co_kwonlyargcount
+    parameters = {*code.co_varnames[:parameter_count], *_last_parameter(fn)}
     first, last = [*code.co_positions()][instruction // 2][:2]
     for step in dis.get_instructions(code):
         at = step.positions.lineno if step.positions else None
         if first is None or last is None or at is None or not first <= at <= last:
             continue
         read = step.argval if isinstance(step.argval, tuple) else (step.argval,)
-        if any(isinstance(n, str) and n in own and names.get(n, 0) is None for n in read):
+        if any(isinstance(n, str) and n in parameters and names.get(n, 0) is None for n in read):
             return True
     return False
 
 
 def _last_parameter(fn: Callable[..., Any]) -> list[str]:
-    """The name that fn gives to args."""
+    """Return the name of fn's last parameter, which is args."""
     try:
         return [*inspect.signature(fn).parameters][-1:]
     except (TypeError, ValueError):
@@ -291,12 +296,14 @@ def _in_library(trace: TracebackType) -> bool:
 
 
 def place(at: str, fn: Callable[..., Any]) -> str:
-    """The place of an argument `at`, with the file and the line where the function begins."""
+    """Return the name `at` of an argument with the file and line of the function's definition."""
     return f"{at}, {_place(fn)}"
 
 
 def _place(fn: Callable[..., Any], trace: TracebackType | None = None) -> str:
-    """File and line of the user's code: the innermost frame of `trace` in it, else where fn begins."""
+    """Return file and line of the innermost frame of `trace` in the user's code.
+
+    Without such a frame, return those of the definition of fn."""
     place = None
     while trace is not None:
         if not _in_library(trace):
@@ -304,14 +311,14 @@ def _place(fn: Callable[..., Any], trace: TracebackType | None = None) -> str:
         trace = trace.tb_next
     if place is None:
         inner = inspect.unwrap(getattr(fn, "func", fn))
-        # A callable object, such as an equinox.Module, has its code in its class.
+        # The code of a callable object, such as an equinox.Module, is in its class.
         code = getattr(inner, "__code__", None) or getattr(type(inner).__call__, "__code__", None)
-        known = code is not None
-        place = f"{code.co_filename}, line {code.co_firstlineno}" if known else f"{fn!r}"
+        has_code = code is not None
+        place = f"{code.co_filename}, line {code.co_firstlineno}" if has_code else f"{fn!r}"
     return place
 
 
 def _line(text: str) -> str:
-    """The first line of a text, at most 160 characters of it."""
+    """Return the first line of a text, at most 160 characters of it."""
     first = text.strip().split("\n", 1)[0]
     return first if len(first) <= 160 else first[:157] + "..."

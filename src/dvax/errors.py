@@ -1,4 +1,4 @@
-"""The one family of exceptions. Every message says what is wrong, the fix, and the reason."""
+"""The exceptions of dvax. Every message states what is wrong, the rule, and the fix."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 
 class DvaxError(Exception):
-    """Base of every error that dvax raises on purpose."""
+    """The base class of all exceptions of dvax."""
 
 
 @dataclass(frozen=True)
 class InputProblem:
-    """One thing wrong with what the user gave.
+    """A problem with the input of the user.
 
-    `place` says where (a file with line and column, a dotted key, an argument's name), `given` what
-    was found there, `rule` what is required and why, `fix` what to do about it.
+    `place` is its location (a file with line and column, a dotted key, an argument's name), `given` the
+    value, `rule` the requirement with its reason, and `fix` the remedy.
     """
 
     place: str
@@ -27,7 +27,7 @@ class InputProblem:
 
 
 class InputError(DvaxError, ValueError):
-    """What the user gave breaks a rule. All problems found are listed, not only the first."""
+    """The input of the user violates a rule. The error lists all problems, not only the first."""
 
     problems: tuple[InputProblem, ...]
 
@@ -42,7 +42,7 @@ def input_error(place: str, given: str, rule: str, fix: str) -> InputError:
 
 
 class Problems(list[InputProblem]):
-    """Problems found so far, which are raised together."""
+    """A list of problems that are raised together."""
 
     def add(self, place: str, given: str, rule: str, fix: str) -> None:
         """Append a problem; the arguments are those of `InputProblem`."""
@@ -50,23 +50,23 @@ class Problems(list[InputProblem]):
 
     @contextmanager
     def collect(self) -> Iterator[None]:
-        """Append the problems of an `InputError` that the block raises, and go on after it."""
+        """Append the problems of an `InputError` that the block raises, and continue after it."""
         try:
             yield
         except InputError as error:
             self += error.problems
 
     def raise_any(self) -> None:
-        """Raise an `InputError` where there are problems."""
+        """Raise an `InputError` if there are problems."""
         if self:
             raise InputError(*self)
 
 
 @dataclass(frozen=True)
 class Fix:
-    """An option that a caller may change after a `SolveError`: its name, a value for it, and why.
+    """A remedy for a `SolveError`: an option, a value for it, and the reason `why`.
 
-    Without an option, `why` is a sentence of its own.
+    If `option` is empty, `why` is a complete sentence.
     """
 
     option: str
@@ -74,7 +74,7 @@ class Fix:
     why: str
 
     def in_python(self) -> str:
-        """As an argument of `dvax.solve`."""
+        """Return the remedy as an argument of `dvax.solve`."""
         if not self.option:
             return self.why
         value = f"dvax.{self.value}()" if self.option == "method" else self.value
@@ -83,21 +83,21 @@ class Fix:
 
 
 class SolveError(DvaxError, RuntimeError):
-    """A solve stopped before its end; the partial result is in `solution` where there is one.
+    """A solve failed before its end; `solution` is the partial result, if there is one.
 
-    `cause` says what happened and what the evidence is, `fixes` which options help, by name, so that a
-    caller with other names for them (the keys of a file) can say it in its own words.
+    `cause` describes the failure and its evidence. `fixes` names options that may help, so that a
+    caller with other names for them (the keys of a configuration file) can phrase them differently.
     """
 
     def __init__(self, cause: str, solution: object = None, fixes: tuple[Fix, ...] = ()):
         self.cause, self.solution, self.fixes = cause, solution, fixes
-        super().__init__(self.told(Fix.in_python))
+        super().__init__(self.message(Fix.in_python))
 
-    def told(self, phrase: Callable[[Fix], str | None]) -> str:
-        """The message, with each fix in the words of the caller; None drops one."""
-        said = [text for fix in self.fixes if (text := phrase(fix))]
-        return " ".join([self.cause, *(f"{text}." for text in said)])
+    def message(self, phrase: Callable[[Fix], str | None]) -> str:
+        """Return the message, with `phrase(fix)` for each fix; None omits it."""
+        texts = [text for fix in self.fixes if (text := phrase(fix))]
+        return " ".join([self.cause, *(f"{text}." for text in texts)])
 
 
 class DifferentiationError(DvaxError, TypeError):
-    """A derivative was asked for in a mode that the chosen adjoint cannot serve."""
+    """The chosen adjoint does not support the requested differentiation mode."""

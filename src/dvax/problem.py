@@ -1,4 +1,4 @@
-"""The coupled system: A, P, K, f and h together."""
+"""The coupled problem of A, P, K, f and h."""
 
 import warnings
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from .vi.outcome import unless_failed
 
 @dataclass(frozen=True, eq=False)
 class FrozenOperator:
-    """F(y) = P⁻¹y − h(t, x, P⁻¹y), whose parts a solver of one law may read."""
+    """F(y) = P⁻¹y − h(t, x, P⁻¹y), with its parts as fields for specialised solvers."""
 
     P: AbstractOperator
     h: Callable[[Any, Tree, Tree, Any], Tree]
@@ -45,8 +45,8 @@ class Problem(eqx.Module):
         x(t) = e^{At} x₀ + ∫₀ᵗ e^{A(t−s)} f(s, x(s), u(s)) ds        (eq:state_mild)
         u(t) ∈ h(t, x(t), u(t)) − N_{K(t)}(P u(t))                   (eq:inclusion)
 
-    With y = P u the law is VI(K(t), F), F(y) = P⁻¹y − h(t, x, P⁻¹y) (eq:F_def). Where F is strongly
-    pseudomonotone and Lipschitz it has one solution u_x(t), and the system is x' = Ax + f̃(t, x).
+    With y = P u the law is VI(K(t), F), F(y) = P⁻¹y − h(t, x, P⁻¹y) (eq:F_def). If F is strongly
+    pseudomonotone and Lipschitz it has a unique solution u_x(t), and the system is x' = Ax + f̃(t, x).
 
     **Arguments:**
 
@@ -54,12 +54,12 @@ class Problem(eqx.Module):
     - `P`: a `dvax.operators` object, or a callable `args -> operator`;
     - `K`: a `dvax.sets` object, or a callable `(t, args) -> set`;
     - `f(t, x, u, args)`, `h(t, x, u, args)`: traceable by JAX; x and u are arrays, or tuples of
-      them;
-    - `state_space`, `control_space`: where they are not plain Euclidean. u has the shape that P and K
-      fix (a matrix, or bounds that are vectors), else that of x: name the control space where u has
-      another, `control_space=dvax.spaces.Euclidean(())` for a single number beside a vector x.
+      arrays;
+    - `state_space`, `control_space`: needed if they are not Euclidean. u has the shape that P and K
+      determine (by a matrix, or vectors of bounds), else that of x. Pass the control space if u has
+      another shape, such as `control_space=dvax.spaces.Euclidean(())` for a number u and a vector x.
 
-    `args` is the paper's parameter η: any pytree, handed to all of them.
+    `args` is the parameter η of the paper: any pytree, which is passed to all of these.
 
     ```python
     >>> import dvax
@@ -127,27 +127,27 @@ class Problem(eqx.Module):
             raise InputError(*wrong)
 
     def generator(self, args: Any = None) -> AbstractGenerator:
-        """A for these args."""
+        """Return A for these args."""
         return self.A if isinstance(self.A, AbstractGenerator) else self.A(args)
 
     def operator(self, args: Any = None) -> AbstractOperator:
-        """P for these args."""
+        """Return P for these args."""
         return self.P if isinstance(self.P, AbstractOperator) else self.P(args)
 
     def set_at(self, t: Any, args: Any = None) -> AbstractSet:
-        """K(t) for these args."""
+        """Return K(t) for these args."""
         return self.K if isinstance(self.K, AbstractSet) else self.K(t, args)
 
     def spaces(self, x: Tree) -> tuple[AbstractSpace, AbstractSpace]:
-        """The state and the control space, for states shaped like x."""
+        """Return the state space and the control space, for states shaped like x."""
         state = default_space(x) if self.state_space is None else self.state_space
         if self.control_space is not None:
             return state, self.control_space
-        fixed = _control_shape.fixed_by(self.P, self.K, x)
-        return state, state if fixed is None else default_space(fixed)
+        zero = _control_shape.control_zero(self.P, self.K, x)
+        return state, state if zero is None else default_space(zero)
 
     def frozen(self, t: Any, x: Tree, args: Any = None) -> "FrozenOperator":
-        """The frozen operator F_{t,x}(y) = P⁻¹y − h(t, x, P⁻¹y) (paper, eq:F_def)."""
+        """Return the frozen operator F_{t,x}(y) = P⁻¹y − h(t, x, P⁻¹y) (paper, eq:F_def)."""
         return FrozenOperator(self.operator(args), self.h, t, x, args)
 
     def law(
@@ -162,7 +162,7 @@ class Problem(eqx.Module):
         gamma: Any = None,
         L_F: Any = None,
     ) -> Answer:
-        """Solve the frozen law for y = P u_x(t), from the guess y0 (zero by default)."""
+        """Solve the frozen law for y = P u_x(t), from the guess y0 (default 0)."""
         return self._law(t, x, args, solver, y0, tol, gamma, L_F)[1]
 
     def _law(
@@ -179,42 +179,45 @@ class Problem(eqx.Module):
     def response(
         self, t: Any, x: Tree, args: Any = None, *, solver: AbstractSolver | None = None
     ) -> Tree:
-        """The state-to-control map u_x(t) (paper, lem:unique_u), solved to 1e-10 in residual or to
-        rounding.
+        """Return the state-to-control map u_x(t) (paper, lem:unique_u).
 
-        **Raises:** `dvax.SolveError` where the law is not solved; where that is traced (`jax.jit`,
+        The residual is at most 1e-10, or the roundoff.
+
+        **Raises:** `dvax.SolveError` if the solver fails. If the failure is traced (`jax.jit`,
         `jax.vmap`), values and derivatives are NaN instead.
         """
-        return self._of_response(t, x, args, solver, lambda t, x, u: u)
+        return self._apply_to_response(t, x, args, solver, lambda t, x, u: u)
 
     def reduced(
         self, t: Any, x: Tree, args: Any = None, *, solver: AbstractSolver | None = None
     ) -> Tree:
-        """The reduced map f̃(t, x) = f(t, x, u_x(t)) (paper, eq. reduced). Raises as `response` does."""
-        return self._of_response(t, x, args, solver, lambda t, x, u: self.f(t, x, u, args))
+        """Return the reduced map f̃(t, x) = f(t, x, u_x(t)) (paper, eq. reduced).
 
-    def _of_response(
-        self, t: Any, x: Tree, args: Any, solver: Any, read: Callable[[Any, Tree, Tree], Tree]
+        Raises the errors of `response`."""
+        return self._apply_to_response(t, x, args, solver, lambda t, x, u: self.f(t, x, u, args))
+
+    def _apply_to_response(
+        self, t: Any, x: Tree, args: Any, solver: Any, fn: Callable[[Any, Tree, Tree], Tree]
     ) -> Tree:
-        """read(t, x, u_x(t)), from a law that is solved."""
+        """Return fn(t, x, u_x(t)) after checking the input and the solution of the law."""
         x, t = _tree.as_float(x, "x"), _tree.as_float(t, "t")
         for name, value in (("t", t), ("x", x)):
-            _tree.refuse_nan(name, value)
+            _tree.check_not_nan(name, value)
         _user_code.check_args(args, "dvax.Problem.response")
         self.check(t, x, args)
         vi, answer = self._law(t, x, args, solver)
         P = self.operator(args)
-        return unless_failed(vi, answer, lambda y: read(t, x, P.inverse(y)), solver)
+        return unless_failed(vi, answer, lambda y: fn(t, x, P.inverse(y)), solver)
 
     def check(self, t: Any, x: Tree, args: Any = None) -> None:
-        """Raise an `InputError` with everything that does not fit: parameters, spaces, shapes, P, K."""
+        """Raise an `InputError` with all problems of parameters, spaces, shapes, A, P and K."""
         state, control = self.spaces(x)
         state.check(x, "x0")
         u = self.zero_control(x)
         problems: list[InputProblem] = []
         for attempt in (
-            lambda: self._made("A", self.A, {"args": args}, AbstractGenerator, x).check(state),
-            lambda: self._made("P", self.P, {"args": args}, AbstractOperator, x).check(control),
+            lambda: self._evaluate("A", self.A, {"args": args}, AbstractGenerator, x).check(state),
+            lambda: self._evaluate("P", self.P, {"args": args}, AbstractOperator, x).check(control),
             lambda: self._check_set(t, x, u, args),
             lambda: self._check_values("f", self.f, (t, x, u, args), x, "state"),
             lambda: self._check_values("h", self.h, (t, x, u, args), u, "control"),
@@ -226,35 +229,35 @@ class Problem(eqx.Module):
         if problems:
             raise InputError(*problems)
 
-    def _made(self, name: str, made: Any, inputs: dict[str, Any], kind: type, x: Tree) -> Any:
-        """A, P or K, made from its arguments where it is a callable, and of the right kind."""
-        if not isinstance(made, kind):
-            made = _user_code.call(name, made, inputs)
-            if not isinstance(made, kind):
+    def _evaluate(self, name: str, value: Any, inputs: dict[str, Any], kind: type, x: Tree) -> Any:
+        """Return A, P or K, called with its arguments if it is a callable, after checking its type."""
+        if not isinstance(value, kind):
+            value = _user_code.call(name, value, inputs)
+            if not isinstance(value, kind):
                 raise InputError(
                     InputProblem(
                         f"dvax.Problem({name})",
-                        f"a callable that returns {type(made).__name__} {made!r}"[:200],
+                        f"a callable that returns {type(value).__name__} {value!r}"[:200],
                         f"{name}({', '.join(inputs)}) must return an instance of dvax."
                         f"{kind.__module__.split('.')[1]}.{kind.__name__}",
                         f"See dvax.{kind.__module__.split('.')[1]}",
                     )
                 )
-        _user_code.check_precision(name, made, x)
-        return made
+        _user_code.check_precision(name, value, x)
+        return value
 
     def _check_set(self, t: Any, x: Tree, u: Tree, args: Any) -> None:
         def traced(t: Any) -> None:
-            self._made("K", self.K, {"t": t, "args": args}, AbstractSet, x)
+            self._evaluate("K", self.K, {"t": t, "args": args}, AbstractSet, x)
 
-        jax.eval_shape(traced, t)  # a run traces t, even if this check does not
+        jax.eval_shape(traced, t)  # with a traced t, as in a run
         self.set_at(t, args).check(u)
 
     def _check_values(
         self, name: str, fn: Callable[..., Any], inputs: tuple, element: Tree, space: str
     ) -> None:
-        """Evaluate f or h abstractly, and compare the shape of its value with that of an element."""
-        source = self._source_of_shape(inputs[1])
+        """Evaluate f or h abstractly, and check that its value has the shape of `element`."""
+        source = self._shape_origin(inputs[1])
 
         def traced(t: Any, x: Tree, u: Tree) -> Any:
             named = {"t": t, "x": x, "u": u, "args": inputs[3]}
@@ -268,69 +271,71 @@ class Problem(eqx.Module):
                 InputProblem(
                     f"dvax.Problem({name})",
                     f"a value of shape {_tree.shapes(out)}",
-                    f"{name}(t, x, u, args) must lie in the {space} space, whose elements have "
+                    f"{name}(t, x, u, args) must be in the {space} space, whose elements have "
                     f"shape {_tree.shapes(element)}; it was called with x of shape "
                     f"{_tree.shapes(inputs[1])} and u of shape {_tree.shapes(inputs[2])}{source}",
-                    _fix_of_shape(name, out, element, space),
+                    _shape_fix(name, out, element, space),
                 )
             )
 
-    def _source_of_shape(self, x: Tree) -> str:
-        """Why u has the shape that it has, for messages."""
+    def _shape_origin(self, x: Tree) -> str:
+        """Return the origin of the shape of u, for messages."""
         if self.control_space is not None:
             return f" (of control_space={self.control_space!r})"
-        if _control_shape.fixed_by(self.P, self.K, x) is None:
+        if _control_shape.control_zero(self.P, self.K, x) is None:
             return " (that of x, since P and K fix no other and control_space= is not given)"
         parts = (f"{n}, {type(p).__name__}" for n, p in (("P", self.P), ("K", self.K)))
         return f" (which {' and '.join(parts)}, fix)"
 
     def knots(self, t0: Any, t1: Any, x: Tree, args: Any = None) -> Any:
-        """The times in (t0, t1) where the data in f, h or K is not smooth, sorted: the knots of their
-        signals, and the times at which their code compares an affine function of t (`t < a`).
+        """Return the sorted times in (t0, t1) at which the data in f, h or K are not smooth.
 
-        **Raises:** `dvax.InputError` where some data does not cover [t0, t1].
+        They are the knots of signals, and the times at which code compares an affine function of t
+        (`t < a`).
+
+        **Raises:** `dvax.InputError` if some data do not cover [t0, t1].
         """
-        u, evaluations, heard = self.zero_control(x), self._evaluations(args), {}
+        u, evaluations, reports = self.zero_control(x), self._evaluations(args), {}
 
-        def listener(t: Any, x: Tree, u: Tree) -> list[Any]:
+        def traced_knots(t: Any, x: Tree, u: Tree) -> list[Any]:
             for name, evaluate in evaluations.items():
-                with listen(t) as heard[name]:
+                with listen(t) as reports[name]:
                     evaluate(t, x, u)
             # Knots that are computed from args leave this trace as outputs.
-            every = (knots for one in heard.values() for knots in one.knots)
-            return [knots for knots in every if not _tree.is_concrete(knots)]
+            all_knots = (knots for report in reports.values() for knots in report.knots)
+            return [knots for knots in all_knots if not _tree.is_concrete(knots)]
 
         time = jnp.asarray(t0, jnp.result_type(float))
-        switches = switching_times(listener, time, x, u)
-        for name in sorted({text for one in heard.values() for text in one.elsewhere}):
+        switches = switching_times(traced_knots, time, x, u)
+        for name in sorted({text for report in reports.values() for text in report.unresolved}):
             warnings.warn(
                 f"{name} is evaluated at a time other than t itself (shifted, scaled, or inside "
-                "another jit), so its knots in t are unknown and a step may jump over one. Shift "
+                "another jit), so its knots in t are unknown and a step may pass one. Shift "
                 "its times instead, or wrap it as dvax.signals.Function(fn, knots=...).",
                 stacklevel=4,
             )
-        _check_spans([(*span, name) for name in heard for span in heard[name].spans], t0, t1)
-        announced = (knots for one in heard.values() for knots in one.knots)
-        listed = [*filter(_tree.is_concrete, announced), *switches]
+        _check_spans([(*span, name) for name in reports for span in reports[name].spans], t0, t1)
+        signal_knots = (knots for report in reports.values() for knots in report.knots)
+        listed = [*filter(_tree.is_concrete, signal_knots), *switches]
         if not listed:
             return np.zeros(0)
-        return _knots.between(listed, t0, t1)
+        return _knots.merge(listed, t0, t1)
 
     def check_data(self, t0: Any, t1: Any, x: Tree, args: Any = None) -> None:
-        """Evaluate K, f and h at (t0, x) untraced, where data that they make themselves has values.
+        """Evaluate K, f and h at (t0, x) with concrete values, to check the data that they create.
 
-        **Raises:** `dvax.InputError` where such data is refused, or does not cover [t0, t1].
+        **Raises:** `dvax.InputError` if such data are invalid, or do not cover [t0, t1].
         """
         if not _tree.is_concrete(t0, t1, x, args):
             return
-        t, u, heard = jnp.asarray(t0, jnp.result_type(float)), self.zero_control(x), {}
+        t, u, reports = jnp.asarray(t0, jnp.result_type(float)), self.zero_control(x), {}
         for name, evaluate in self._evaluations(args).items():
-            with listen(t) as heard[name]:
+            with listen(t) as reports[name]:
                 evaluate(t, x, u)
-        _check_spans([(*span, name) for name in heard for span in heard[name].spans], t0, t1)
+        _check_spans([(*span, name) for name in reports for span in reports[name].spans], t0, t1)
 
     def _evaluations(self, args: Any) -> dict[str, Callable[[Any, Tree, Tree], Any]]:
-        """K, f and h as functions of (t, x, u)."""
+        """Return K, f and h as functions of (t, x, u)."""
         return {
             "K": lambda t, x, u: self.set_at(t, args),
             "f": lambda t, x, u: self.f(t, x, u, args),
@@ -338,18 +343,18 @@ class Problem(eqx.Module):
         }
 
     def zero_control(self, x: Tree) -> Tree:
-        """The zero of the control space, in the floating type of x."""
+        """Return the zero of the control space, in the floating type of x."""
         if self.control_space is None:
-            fixed = _control_shape.fixed_by(self.P, self.K, x)
-            return _tree.zeros_like(x) if fixed is None else fixed
+            zero = _control_shape.control_zero(self.P, self.K, x)
+            return _tree.zeros_like(x) if zero is None else zero
         dtype = jnp.result_type(*jax.tree_util.tree_leaves(x))
         return jax.tree_util.tree_map(lambda leaf: leaf.astype(dtype), self.control_space.zeros())
 
 
-def _fix_of_shape(name: str, out: Tree, element: Tree, space: str) -> str:
+def _shape_fix(name: str, out: Tree, element: Tree, space: str) -> str:
     if isinstance(out, list | tuple) and not isinstance(element, tuple):
         return f"Join the components: return jnp.stack([...]) from {name}"
-    fix = f"Return that shape from {name}, or name the space: {space}_space= of dvax.Problem"
+    fix = f"Return that shape from {name}, or pass {space}_space= to dvax.Problem"
     shape = getattr(out, "shape", None)
     given = shape is not None and space == "control"
     return fix + (f", such as control_space=dvax.spaces.Euclidean({shape})" if given else "")
@@ -362,7 +367,7 @@ def _check_spans(spans: list[tuple[Any, Any, str, str]], t0: Any, t1: Any) -> No
         InputProblem(
             f"a {name} in {where}",
             f"data from t = {float(first):g} to {float(last):g}",
-            f"it must cover [t0, t1] = [{float(t0):g}, {float(t1):g}]: data is never extrapolated",
+            f"it must cover [t0, t1] = [{float(t0):g}, {float(t1):g}]: data are never extrapolated",
             "Shorten the time span, or extend the data",
         )
         for first, last, name, where in spans

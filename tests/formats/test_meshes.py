@@ -192,7 +192,7 @@ def test_mesh_with_flat_or_crossed_elements_is_rejected(block):
         elements[[0, 1], 10] = elements[[1, 0], 10]
 
     assert (
-        "1 elements that are inverted (crossed or dented), the first of them number 11"
+        "1 elements that are inverted (self-intersecting or not convex), the first of them number 11"
         in refusal(spoiled(block, crossed))
     )
 

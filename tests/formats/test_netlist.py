@@ -77,15 +77,15 @@ REFUSED = {
     "odd lines": ("V1 1 0 PWL(0 1 2)", "line 4", "pairs of a time and a value"),
     "late lines": ("V1 1 0 PWL(1m 1 2m 2)", "line 4", "begin at 0"),
     "lines back in time": ("V1 1 0 PWL(0 1 2m 2 1m 3)", "line 4", "and increase"),
-    "dangling node": ("R1 1 2 5", "line 4", "R1 alone touches it"),
-    "island": ("R1 2 3 5\nR2 2 3 5", "line 4", "nothing joins them to node 0"),
-    "capacitor loop": ("C2 1 0 1u", "line 4", "close a loop"),
-    "capacitors and a source": ("C2 1 2 1u\nV1 2 0 5", "line 5", "close a loop"),
+    "dangling node": ("R1 1 2 5", "line 4", "only R1 is connected to it"),
+    "island": ("R1 2 3 5\nR2 2 3 5", "line 4", "they are not connected to node 0"),
+    "capacitor loop": ("C2 1 0 1u", "line 4", "form a loop"),
+    "capacitors and a source": ("C2 1 2 1u\nV1 2 0 5", "line 5", "form a loop"),
     "cut of inductors": ("L2 1 2 1m\nL3 2 0 1m", "lines 4 and 5", "inductors and current sources"),
     "cut of a diode": ("L2 1 2 1m\nD2 2 0 R=1", "line 5", "no modulus γ > 0"),
     "word twice": ("C2 1 2 1u IC=10 ic=5\nR1 2 0 1", "line 4", "a word stands once"),
     "no resistance": ("D2 1 0", "line 4", "its current meets no resistance"),
-    "two in parallel": ("R1 1 2 5\nD2 2 0\nD3 2 0", "lines 5 and 6", "in some proportion"),
+    "two in parallel": ("R1 1 2 5\nD2 2 0\nD3 2 0", "lines 5 and 6", "some combination"),
 }
 
 
@@ -108,7 +108,7 @@ def test_netlist_error_for_diodes_without_resistance_suggests_regularisation():
     assert "D1 without R=" in problem.given and "γ = λ_min(D) = 0" in problem.rule
     assert "r_on = 0.1" in problem.fix
     circuit = Circuit(text, r_on=0.1)
-    assert circuit.fit == "regularised by r_on = 0.1 Ω: ideal diodes as they go to 0"
+    assert circuit.fit == "regularised by r_on = 0.1 Ω: ideal diodes in the limit 0"
     assert float(circuit.constants.gamma) == pytest.approx(0.1)
     # What the line says is not written over.
     assert Circuit(TANK, r_on=0.1).fit == "exact"
@@ -130,7 +130,7 @@ def test_netlist_source_shorter_than_the_run_names_its_line():
         (problem,) = caught.value.problems
         assert problem.place == "netlist, line 5"
         assert (
-            problem.given == "V1, which is known from 0 to 0.001 s"
+            problem.given == "V1, which is defined from 0 to 0.001 s"
             and "t_end = 0.005 s" in problem.rule
         )
         assert "t_end = 0.001" in problem.fix

@@ -173,8 +173,8 @@ def test_circuit_siconos_converges_to_the_same_state(tank, exact):
 
 def test_circuit_bridge_without_resistance_is_rejected_with_its_lines():
     for options, said in (
-        ({}, "nothing but D1, D2, D3, D4 joins the part with node p to the rest"),
-        ({"r_on": 1.0}, "nothing but D1, D2, D3, D4 joins the part with node p to the rest"),
+        ({}, "only D1, D2, D3, D4 connects the part with node p to the rest"),
+        ({"r_on": 1.0}, "only D1, D2, D3, D4 connects the part with node p to the rest"),
         ({"g_leak": 1e-6}, "no resistance, so γ = λ_min(D) = 0"),
     ):
         with pytest.raises(dvax.InputError) as caught:

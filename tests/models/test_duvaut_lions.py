@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import dvax
-from dvax.models._stress import BASIS, joined, split
+from dvax.models._stress import BASIS, join, split
 from dvax.models.duvaut_lions import DruckerPrager, DuvautLions, VonMises, mandel, tensor
 
 K, G, TAU, STRENGTH = 160.0, 80.0, 0.1, 0.25
@@ -99,13 +99,13 @@ def test_mandel_vectors_keep_the_inner_product_of_tensors():
         together = np.sum(np.asarray(of(S)) * np.asarray(of(T)), axis=1)
         np.testing.assert_allclose(together, np.einsum("kij,kij->k", S, T), rtol=1e-12)
     np.testing.assert_allclose(np.asarray(tensor(mandel(S))), S, atol=1e-15)
-    np.testing.assert_allclose(np.asarray(tensor(joined(split(mandel(S))))), S, atol=1e-14)
+    np.testing.assert_allclose(np.asarray(tensor(join(split(mandel(S))))), S, atol=1e-14)
 
 
 def test_duvaut_lions_elasticity_is_diagonal_and_its_energy_is_the_norm():
     model = point(WINDING, yields=DruckerPrager(M, P_T))
     e = 1e-4 * random_stresses(1)[0]
-    stress = tensor(joined(model.moduli * split(mandel(jnp.asarray(e)))))
+    stress = tensor(join(model.moduli * split(mandel(jnp.asarray(e)))))
     np.testing.assert_allclose(np.asarray(stress), elastic(e), atol=1e-14)
     state, control = model.problem.spaces(jnp.zeros(6))
     energy = np.sum(elastic(e) * e)

@@ -188,7 +188,7 @@ def euler(M, B, w, model, dt, steps):
     beta, cap = float(model.beta), float(model.kappa0)
     a, x, out = float(model.tau) / dt, np.zeros(M.shape[0]), []
     for k in range(1, steps + 1):
-        g = np.asarray(model.gap - model.lean * model.depth(jnp.asarray(k * dt)))
+        g = np.asarray(model.gap - model.vertical_normal * model.depth(jnp.asarray(k * dt)))
         old = a * (M @ x)
         for _ in range(40):
             drive = beta * (B @ x - g)
@@ -300,7 +300,7 @@ def test_fem_contact_stress_balances_the_punch(run, tmp_path: Path):
     np.testing.assert_allclose(near, seen, atol=0.02 * np.max(np.abs(seen)))
     middle = np.argmin(np.abs(contact.points[:, 0]))
     assert seen[middle] == pytest.approx(near[middle], rel=1e-3)
-    with pytest.raises(dvax.InputError, match="ends on .vtu or .vtk"):
+    with pytest.raises(dvax.InputError, match="extension .vtu or .vtk"):
         model.write(tmp_path / "at.stl", t, x)
 
 

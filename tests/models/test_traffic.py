@@ -298,14 +298,14 @@ BAD = {
     "toll_weight": (dict(toll_weight=-0.1), "≥ 0"),
     "distance_weight": (dict(distance_weight=True), "≥ 0"),
     "demand": (dict(demand=1.5), "signal or a callable"),
-    "(demand)": (dict(demand=TABLE([0.0, 1.0], [1.0, -1.0])), "negative trips"),
-    "peak": (dict(demand=lambda t: 1.0 + t), "cannot be read off"),
+    "(demand)": (dict(demand=TABLE([0.0, 1.0], [1.0, -1.0])), "must be ≥ 0"),
+    "peak": (dict(demand=lambda t: 1.0 + t), "maximum of a Function is unknown"),
     "(peak)": (dict(demand=lambda t: 1.0 + t, peak=0.0), "positive"),
     "(demand) ": (dict(demand=TABLE([0.0, 1.0], [[1.0, 1.0], [2.0, 2.0]])), "each of the 1 pairs"),
     "incidents[0].link": (dict(incidents=[traffic.Incident((3, 1), 0.5, 0.0, 1.0)]), "3 go to 2"),
     "incidents[0].remaining": (dict(incidents=[traffic.Incident((3, 2), 0.0, 0.0, 1.0)]), "(0, 1]"),
     "incidents[0].start": (
-        dict(incidents=[traffic.Incident((3, 2), 0.5, 2.0, 1.0)]), "before it ends",
+        dict(incidents=[traffic.Incident((3, 2), 0.5, 2.0, 1.0)]), "start < end",
     ),
 }  # fmt: skip
 

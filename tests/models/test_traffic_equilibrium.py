@@ -146,7 +146,7 @@ def test_equilibrium_does_not_depend_on_the_blocks(monkeypatch):
     network, trips = networks.grid(8, 8, 14, 120, 5e4, seed=6)
     flows = []
     for size in (50_000, 20):
-        monkeypatch.setattr(restricted_module, "_BLOCK", size)
+        monkeypatch.setattr(restricted_module, "_BLOCK_ENTRIES", size)
         found = solved(network, trips)
         check(network, trips, found, 1e-12)
         flows.append(found.paths.incidence().T @ found.flows)

@@ -29,20 +29,20 @@ def exact(kind, t):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_table_interpolates_as_scipy_does(kind):
+def test_a_table_joins_its_values_as_scipy_does(kind):
     table = Table(TIMES, VALUES, kind)
     found = np.asarray(jax.jit(jax.vmap(table.value))(jnp.asarray(ASKED)))
     np.testing.assert_allclose(found, exact(kind, ASKED), rtol=1e-12, atol=1e-12)
 
 
-def test_constant_table_takes_the_new_value_at_a_jump():
+def test_a_constant_table_takes_the_new_value_at_a_jump():
     table = Table([0.0, 1.0, 2.0], [5.0, 7.0, 9.0], "constant")
     before = float(np.nextafter(1.0, 0.0))
     assert [float(table(t)) for t in (0.0, before, 1.0, 1.5, 2.0)] == [5.0, 5.0, 7.0, 7.0, 9.0]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_table_does_not_extrapolate(kind):
+def test_nothing_is_extrapolated(kind):
     table = Table(TIMES, VALUES, kind)
     outside = [np.nextafter(-1.0, -2), -5.0, np.nextafter(2.5, 3), 1e9]
     found = np.asarray(jax.vmap(table.value)(jnp.asarray(outside)))
@@ -50,7 +50,7 @@ def test_table_does_not_extrapolate(kind):
     assert np.all(np.isfinite(np.asarray(jax.vmap(table.value)(jnp.array([-1.0, 2.5])))))
 
 
-def test_cubic_table_of_four_points_is_the_cubic_polynomial():
+def test_a_cubic_table_of_four_points_is_the_cubic_through_them():
     t = np.array([0.0, 0.4, 1.1, 3.0])
     table = Table(t, t**3 - 2 * t**2 + 1, "cubic")
     s = np.linspace(0, 3, 31)
@@ -59,7 +59,7 @@ def test_cubic_table_of_four_points_is_the_cubic_polynomial():
 
 
 @pytest.mark.parametrize("count", [4096, 4097])
-def test_long_table_equals_short_table(count):
+def test_long_tables_find_their_piece_as_short_ones_do(count):
     t = np.linspace(0, 1, count)
     table = Table(t, np.sin(9 * t))
     asked = np.random.default_rng(1).uniform(0, 1, 50)
@@ -68,7 +68,7 @@ def test_long_table_equals_short_table(count):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_table_gradient_in_its_values_is_exact(kind):
+def test_a_table_is_linear_in_its_values_and_its_gradient_says_how(kind):
     t = 0.37
     weights = jax.jacrev(lambda v: Table(TIMES, v, kind)(t))(jnp.asarray(VALUES[:, 0]))
     np.testing.assert_allclose(
@@ -84,7 +84,7 @@ def test_table_gradient_in_its_values_is_exact(kind):
     np.testing.assert_allclose(np.asarray(weights), [by_hand(e) for e in unit], atol=1e-12)
 
 
-def test_product_of_profile_and_table_is_a_separable_field():
+def test_a_product_of_a_profile_and_a_record_is_a_separable_field():
     profile, record = np.array([1.0, -2.0, 4.0]), Table(TIMES, VALUES[:, 0])
     field = Product(Constant(profile), record)
     expected = profile * np.interp(0.3, TIMES, VALUES[:, 0])
@@ -108,31 +108,31 @@ def test_product_of_profile_and_table_is_a_separable_field():
         (lambda: Constant(float("nan")), ["finite"]),
     ],
 )
-def test_table_rejects_bad_data_with_its_place(make, words):
+def test_bad_data_is_refused_with_its_place(make, words):
     with pytest.raises(dvax.InputError) as caught:
         make()
     for word in words:
         assert word in str(caught.value)
 
 
-def test_listen_records_the_knots_of_all_signals_at_the_given_time():
+def test_a_listener_hears_every_table_at_its_own_time_and_no_other():
     a, b = Table([0.0, 1.0], [0.0, 1.0]), Table([0.5, 3.0, 4.0], [0.0, 1.0, 2.0])
     kinked = Function(lambda t: jnp.abs(t - 0.25), knots=[0.25])
 
     def use(t):
-        with listen(t) as heard:
+        with listen(t) as reports:
             Product(a, b)(t)
             kinked(t)
             Constant(2.0)(t)
             b(t - 1.0)
-        return heard
+        return reports
 
     found = []
     jax.eval_shape(lambda t: (found.append(use(t)), t)[1], jnp.zeros(()))
-    heard = found[0]
-    assert sorted(float(k) for knots in heard.knots for k in knots) == [0, 0.25, 0.5, 1, 3, 4]
-    assert [name for _, _, name in heard.spans if name == "Table"] == ["Table", "Table"]
-    assert len(heard.elsewhere) == 1 and "Table" in heard.elsewhere[0]
-    # Outside the block no listener is active.
+    reports = found[0]
+    assert sorted(float(k) for knots in reports.knots for k in knots) == [0, 0.25, 0.5, 1, 3, 4]
+    assert [name for _, _, name in reports.spans if name == "Table"] == ["Table", "Table"]
+    assert len(reports.unresolved) == 1 and "Table" in reports.unresolved[0]
+    # Outside the block no signal is recorded.
     a(0.5)
-    assert len(heard.knots) == 3
+    assert len(reports.knots) == 3

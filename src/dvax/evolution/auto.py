@@ -147,7 +147,7 @@ def _read(problem: Problem, x0: Tree, args: Any) -> Facts:
 
 def _is_affine(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) -> bool:
     for function in (problem.f, problem.h):
-        if not analyse(lambda v, fn=function: fn(*v, args), (t, x0, like)).affine:
+        if not analyse(lambda v, fn=function: fn(v[0], v[1], v[2], args), (t, x0, like)).affine:
             return False
     bounds = problem.set_at(t, args).intervals(like)
     return (

@@ -270,7 +270,7 @@ def _differentiably(
     try:
         return compiled(setup, times, options)
     except jax.errors.UnexpectedTracerError as error:
-        raise _user_code.leaked(error) from error
+        raise _user_code.leaked_tracer_error(error) from error
     except (TypeError, ValueError) as error:
         if options.adjoint == "reverse" and is_reverse_only(error):
             raise DifferentiationError(

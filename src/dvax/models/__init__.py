@@ -1,6 +1,6 @@
-"""Ready models: a problem with its constants and what its figures mean.
+"""Ready models: problems with proved constants and named results.
 
-Names are loaded when they are first used: nobody needs a mesh for a market.
+Each name is imported at its first use, so that a market does not import a mesh library.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""Checks of the numbers that models take."""
+"""Checks of the numerical arguments of models."""
 
 from typing import Any
 

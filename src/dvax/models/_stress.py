@@ -1,4 +1,4 @@
-"""Symmetric tensors as vectors in which isotropic elasticity is diagonal."""
+"""Symmetric tensors as vectors in a basis that diagonalises isotropic elasticity."""
 
 import math
 from typing import Any
@@ -23,10 +23,10 @@ BASIS = np.array(
 
 
 def mandel(tensor: Any) -> jax.Array:
-    """(T₁₁, T₂₂, T₃₃, √2T₂₃, √2T₁₃, √2T₁₂) of a symmetric tensor, shape (…, 3, 3) to (…, 6).
+    """Return (T₁₁, T₂₂, T₃₃, √2T₂₃, √2T₁₃, √2T₁₂) of a symmetric tensor, shape (…, 3, 3) to (…, 6).
 
-    The factors √2 make the inner product of vectors that of tensors, a·b = A : B; with Voigt's factors
-    (1 for stress, 2 for strain) it would be neither, and no projection would be the nearest point.
+    With the factors √2 the inner product of the vectors equals that of the tensors, a·b = A : B. With
+    Voigt's factors (1 for stress, 2 for strain) it would not, and projections would be wrong.
 
     ```python
     >>> import jax.numpy as jnp
@@ -44,7 +44,7 @@ def mandel(tensor: Any) -> jax.Array:
 
 
 def tensor(vector: Any) -> jax.Array:
-    """The symmetric tensor of a Mandel vector, shape (…, 6) to (…, 3, 3)."""
+    """Return the symmetric tensor of a Mandel vector, shape (…, 6) to (…, 3, 3)."""
     v = jnp.asarray(vector)
     off = v[..., 3:] / _ROOT2
     rows = [
@@ -56,12 +56,12 @@ def tensor(vector: Any) -> jax.Array:
 
 
 def split(vector: Any) -> jax.Array:
-    """(−tr/√3, five components of the deviator) of a Mandel vector: a rotation, norms stay."""
+    """Return (−tr/√3, five components of the deviator) of a Mandel vector, an orthogonal map."""
     v = jnp.asarray(vector)
     return v @ jnp.asarray(BASIS.T, v.dtype)
 
 
-def joined(parts: Any) -> jax.Array:
-    """The Mandel vector of `split` components."""
+def join(parts: Any) -> jax.Array:
+    """Return the Mandel vector with these `split` components."""
     y = jnp.asarray(parts)
     return y @ jnp.asarray(BASIS, y.dtype)

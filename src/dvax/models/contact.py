@@ -1,4 +1,4 @@
-"""Section 7 of the paper: saturated normal contact on a boundary Γ_C."""
+"""Saturated normal contact on a boundary Γ_C (paper, Section 7)."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ UNLOADED, ACTIVE, SATURATED = 0, 1, 2
 
 
 class Contact(eqx.Module):
-    """A rigid demand pressed against a yielding boundary of finite pressure capacity.
+    """Normal contact with a compliant boundary of finite pressure capacity.
 
         x' = ℓ(t) − (α + d_x) x − d_u u                 (eq:concrete_state)
         u ∈ g(t) − b_x x − b_u u − N_K(β u)             (eq:concrete_contact_law)
@@ -43,9 +43,9 @@ class Contact(eqx.Module):
     - `weights`: quadrature weights of the points, whose sum is the measure of Γ_C; None for a
       single point or for plain vectors.
 
-    **Raises:** `dvax.InputError` for every parameter that breaks its rule.
+    **Raises:** `dvax.InputError` with all invalid parameters.
 
-    All the constants are closed forms (`constants`), proved in Section 7.
+    All constants have closed forms (`constants`), which Section 7 proves.
 
     ```python
     >>> import dvax
@@ -92,7 +92,7 @@ class Contact(eqx.Module):
         for name, value in given.items():
             number = positive(
                 f"dvax.models.Contact({name})", value, wrong, zero=name == "b_u",
-                why="paper, Section 7", fix="Put a dependence on space or time into g or ell",
+                why="paper, Section 7", fix="Express a dependence on space or time by g or ell",
             )  # fmt: skip
             setattr(self, name, number)
         self.space = None
@@ -107,7 +107,7 @@ class Contact(eqx.Module):
 
     @property
     def problem(self) -> Problem:
-        """The coupled system: A = −αI, P = βI, K = [0, κ₀], eq:concrete_f and eq:concrete_h."""
+        """The problem with A = −αI, P = βI, K = [0, κ₀], eq:concrete_f and eq:concrete_h."""
         return Problem(
             A=Scalar(-_tree.host(self.alpha)),
             P=Scaling(self.beta),
@@ -119,9 +119,11 @@ class Contact(eqx.Module):
 
     @property
     def constants(self) -> Constants:
-        """γ_c = L_F = (1+b_u)/β, α_h = b_x, β_h = b_u, α_f = d_x, β_f = d_u, M = 1, ω = −α, and the
-        one-sided rate: at every point ∂f̃/∂x lies between −d_x and −d_x + d_u b_x/(1+b_u), so
-        μ = −(α + d_x − d_u b_x/(1+b_u)), where the paper's |d_x| gives −(α − d_x − …)."""
+        """The proved constants of the problem.
+
+        γ_c = L_F = (1+b_u)/β, α_h = b_x, β_h = b_u, α_f = d_x, β_f = d_u, M = 1 and ω = −α. At every
+        point −d_x ≤ ∂f̃/∂x ≤ −d_x + d_u b_x/(1+b_u), so the one-sided rate is
+        μ = −(α + d_x − d_u b_x/(1+b_u)); the bound of the paper, with |d_x|, is −(α − d_x − …)."""
         alpha, beta, b_x, b_u, d_x, d_u = _tree.host(
             (self.alpha, self.beta, self.b_x, self.b_u, self.d_x, self.d_u)
         )
@@ -142,23 +144,24 @@ class Contact(eqx.Module):
         )
 
     def drive(self, t: Any, x: Any) -> jax.Array:
-        """The effective contact drive q = g(t) − b_x x (eq:concrete_drive), in [x]."""
+        """Return the effective contact drive q = g(t) − b_x x (eq:concrete_drive), in [x]."""
         return self.g(t) - self.b_x * x
 
     def pressure(self, t: Any, x: Any) -> jax.Array:
-        """p = proj_{[0,κ₀]}(β q/(1+b_u)) (eq:concrete_pressure_law), in [p]."""
+        """Return p = proj_{[0,κ₀]}(β q/(1+b_u)) (eq:concrete_pressure_law), in [p]."""
         return jnp.clip(self.beta / (1.0 + self.b_u) * self.drive(t, x), 0.0, self.kappa0)
 
     def regimes(self, t: Any, x: Any) -> jax.Array:
-        """0 unloaded (q ≤ 0), 1 active, 2 saturated (q ≥ (1+b_u)κ₀/β)
-        (eq:concrete_contact_states)."""
+        """Return 0 where unloaded (q ≤ 0), 1 where active, 2 where saturated (q ≥ (1+b_u)κ₀/β).
+
+        Source: eq:concrete_contact_states."""
         q = self.drive(t, x)
         full = (1.0 + self.b_u) / self.beta * self.kappa0
         regime = jnp.where(q <= 0.0, UNLOADED, jnp.where(q >= full, SATURATED, ACTIVE))
         return regime.astype(jnp.int8)
 
     def residual(self, tau: Any, t: Any, x: Any, y: Any) -> jax.Array:
-        """R_τ(t, x, y) = y − proj_K(y − τF(y)), zero exactly at the pressure of the law (τ > 0)."""
+        """Return R_τ(t, x, y) = y − proj_K(y − τF(y)), zero exactly at the pressure (τ > 0)."""
         problem = self.problem
         x, y = _tree.as_float(x, "x"), _tree.as_float(y, "y")
         space = problem.spaces(y)[1]

@@ -1,4 +1,4 @@
-"""Viscoplasticity of Duvaut and Lions at a material point."""
+"""Duvaut–Lions viscoplasticity at a material point."""
 
 import math
 from typing import Any, NamedTuple
@@ -17,57 +17,61 @@ from ..signals import AbstractSignal, Constant, as_signal
 from ..spaces import L2
 from ..theory import Constants
 from ._numbers import positive
-from ._stress import joined, split
+from ._stress import join, split
 from ._stress import mandel as mandel
 from ._stress import tensor as tensor
 
 
 class VonMises(NamedTuple):
-    """√(3/2)‖dev σ‖ ≤ σ_y: `strength` σ_y > 0, a number, a `dvax.signals` or a callable of t."""
+    """The yield condition √(3/2)‖dev σ‖ ≤ σ_y.
+
+    `strength` is σ_y > 0: a number, a `dvax.signals` or a callable of t.
+    """
 
     strength: Any
 
 
 class DruckerPrager(NamedTuple):
-    """√(3/2)‖dev σ‖ ≤ M (p + p_t) with the pressure p = −tr σ/3: a cone. `friction` M > 0, a number;
-    `tension` p_t ≥ 0, what the material bears of hydrostatic tension: a number, a `dvax.signals` or a
-    callable of t."""
+    """The yield condition √(3/2)‖dev σ‖ ≤ M (p + p_t) with the pressure p = −tr σ/3: a cone.
+
+    `friction` is M > 0, a number. `tension` is the hydrostatic tensile strength p_t ≥ 0: a number, a
+    `dvax.signals` or a callable of t.
+    """
 
     friction: float
     tension: Any
 
 
 class DuvautLions(eqx.Module):
-    """A material point that yields with a delay, driven by a strain history ε(t).
+    """A viscoplastic material point under a prescribed strain history ε(t).
 
         ε_p' = C⁻¹(σ − u)/τ,   σ = C(ε(t) − ε_p),   u = proj_K(σ) in the norm σ : C⁻¹ : σ
 
-    ε_p is the plastic strain, σ the stress, u the nearest stress that the material bears at rest. C is
-    isotropic, C e = K tr(e) 1 + 2G dev e. The nearest point in the energy norm is the closest-point
-    projection of computational plasticity: C⁻¹(σ − u) is normal to K at u, so the flow is associated,
-    and as τ → 0 the stress becomes that of rate-independent plasticity, at the order τ.
+    ε_p is the plastic strain, σ the stress, and u the nearest admissible stress. C is isotropic,
+    C e = K tr(e) 1 + 2G dev e. The projection in the energy norm is the closest-point projection of
+    computational plasticity: C⁻¹(σ − u) is normal to K at u, so the flow is associated. As τ → 0 the
+    stress converges to that of rate-independent plasticity, with an error of order τ.
 
-    In `split` components of Mandel's vectors (the trace, five of the deviator: a rotation) C is the
-    diagonal c = (3K, 2G, …, 2G). The state is ε_p in the norm with weights c, the control u in the norm
-    with weights 1/c, both elastic energies, and as a problem of this library A = −1/τ, P = I,
-    h = c(ε − x), f = (ε − u/c)/τ. K is
+    In `split` components of Mandel vectors (the trace and five components of the deviator) C is
+    diagonal, c = (3K, 2G, …, 2G). The state is ε_p in the norm with weights c, and the control is u in
+    the norm with weights 1/c; both are elastic energies. The problem has A = −1/τ, P = I,
+    h = c(ε − x) and f = (ε − u/c)/τ. K is
 
-    - Drucker and Prager's cone, a `dvax.sets.SecondOrderCone` moved to its apex, projected in these
-      weights: six components;
-    - von Mises' cylinder. In σ : C⁻¹ : σ = (tr σ)²/(9K) + ‖dev σ‖²/(2G) the two terms of a distance are
-      least each by itself; nothing holds the trace, so it stays, and of the deviators with
-      √(3/2)‖s‖ ≤ σ_y the nearest one is on the radius, whatever the number 1/(2G). So the clip of the
-      deviator, the radial return, is exact; the pressure is elastic, and state and control are the
-      five components of the deviators, with a `dvax.sets.Ball` of radius σ_y √(2/3)/√(2G) in the energy
-      norm. The law is then ε_p' = (σ − u)/η with the viscosity η = 2Gτ.
+    - the Drucker–Prager cone, a translated `dvax.sets.SecondOrderCone`, projected with these weights:
+      six components;
+    - the von Mises cylinder. Since σ : C⁻¹ : σ = (tr σ)²/(9K) + ‖dev σ‖²/(2G) and K does not restrict
+      the trace, the projection leaves the trace unchanged and scales the deviator (radial return). The
+      pressure is elastic, and state and control are the five components of the deviators, with a
+      `dvax.sets.Ball` of radius σ_y √(2/3)/√(2G) in the energy norm. The law is then
+      ε_p' = (σ − u)/η with the viscosity η = 2Gτ.
 
     **Units:** K, G, σ and strengths in one unit of stress; τ and t in one unit of time.
 
     **Arguments:** `bulk` K > 0, `shear` G > 0, `relaxation` τ > 0: numbers; `strain`: ε(t) as a Mandel
     vector (`mandel`), a `dvax.signals` or a callable of t; `yields`: `VonMises(…)` or
-    `DruckerPrager(…)`. Many points are a `jax.vmap`.
+    `DruckerPrager(…)`. Use `jax.vmap` for many points.
 
-    **Raises:** `dvax.InputError` for everything that breaks its rule.
+    **Raises:** `dvax.InputError` with all invalid arguments.
 
     Source: Duvaut and Lions 1972, chapter V; Simo and Hughes 1998, Computational Inelasticity, sections
     2.7 and 3.6.
@@ -118,19 +122,19 @@ class DuvautLions(eqx.Module):
 
     @property
     def fit(self) -> str:
-        """The model is in the class of the theory as it stands."""
+        """How the model relates to the class of the theory."""
         return (
             "exact (rate-independent plasticity is its limit as the relaxation time τ → 0, at O(τ))"
         )
 
     @property
     def problem(self) -> Problem:
-        """The coupled system, in `split` components: those that yield."""
-        c = self._active
+        """The coupled problem, in those `split` components that the yield condition restricts."""
+        c = self._active_moduli
         return Problem(
             A=Scalar(-1.0 / _tree.host(self.relaxation)),
             P=Scaling(1.0),
-            K=self._at_rest,
+            K=self._yield_set,
             f=self._rate,
             h=self._feedback,
             state_space=L2(c),
@@ -139,9 +143,11 @@ class DuvautLions(eqx.Module):
 
     @property
     def constants(self) -> Constants:
-        """In the energy norms γ = L_F = 1, α_h = ‖C‖ = 1, β_f = 1/τ, ω = −1/τ: ω + L̃ = 0. Two histories
-        of the same strain never separate, and inside the yield set they do not approach; the one-sided
-        rate is 0 as well, since ⟨Δσ, Δu⟩ ≤ ‖Δσ‖²."""
+        """The proved constants in the energy norms.
+
+        γ = L_F = 1, α_h = ‖C‖ = 1, β_f = 1/τ, ω = −1/τ, so ω + L̃ = 0. The distance between two
+        solutions with the same strain history never increases, and inside the yield set it is
+        constant. The one-sided rate is 0 as well, since ⟨Δσ, Δu⟩ ≤ ‖Δσ‖²."""
         rate = 1.0 / _tree.host(self.relaxation)
         return Constants(
             gamma=1.0,
@@ -160,25 +166,27 @@ class DuvautLions(eqx.Module):
 
     @property
     def virgin(self) -> jax.Array:
-        """The state without plastic strain: zeros, five of them (von Mises) or six."""
-        return jnp.zeros_like(self._active)
+        """The state without plastic strain: five zeros (von Mises) or six."""
+        return jnp.zeros_like(self._active_moduli)
 
     def stress(self, t: Any, x: Any) -> jax.Array:
-        """σ = C(ε(t) − ε_p), a Mandel vector, at the state x."""
-        return joined(self.moduli * (split(self.strain(t)) - self._whole(x)))
+        """Return σ = C(ε(t) − ε_p), a Mandel vector, at the state x."""
+        return join(self.moduli * (split(self.strain(t)) - self._all_components(x)))
 
     def plastic_strain(self, x: Any) -> jax.Array:
-        """ε_p as a Mandel vector."""
-        return joined(self._whole(x))
+        """Return ε_p as a Mandel vector."""
+        return join(self._all_components(x))
 
     def von_mises(self, t: Any, x: Any) -> jax.Array:
-        """q = √(3/2)‖dev σ‖, in units of stress."""
+        """Return q = √(3/2)‖dev σ‖, in units of stress."""
         return math.sqrt(1.5) * jnp.linalg.norm(self._trial(t, x)[-5:])
 
     def figures(self, solution: Any) -> dict[str, Any]:
-        """Over the saved times, in units of stress: `peak_stress`, the largest q; `overstress`, the
-        largest ‖σ − u‖, which is what the delay lets the stress leave the yield set by. At the last
-        one: `final_stress`, a Mandel vector, and `plastic_strain`, √(2/3)‖ε_p‖."""
+        """Return the results of a solution.
+
+        Over the saved times, in units of stress: `peak_stress`, the largest q; `overstress`, the
+        largest distance ‖σ − u‖ from the yield set. At the last saved time: `final_stress`, a Mandel
+        vector, and `plastic_strain`, √(2/3)‖ε_p‖."""
         ts, xs = solution.ts, solution.xs
         trial = jax.vmap(self._trial)(ts, xs)
         return {
@@ -189,25 +197,26 @@ class DuvautLions(eqx.Module):
         }
 
     @property
-    def _active(self) -> jax.Array:
-        """c of the components that yield: of a von Mises material the five of the deviator."""
+    def _active_moduli(self) -> jax.Array:
+        """c of the components of the problem: for von Mises, the five of the deviator."""
         return self.moduli[1:] if self.slope is None else self.moduli
 
-    def _whole(self, x: Any) -> jax.Array:
-        """The six components of a state."""
+    def _all_components(self, x: Any) -> jax.Array:
+        """Return the six components of a state."""
         return jnp.concatenate([jnp.zeros_like(x[:1]), x]) if self.slope is None else x
 
-    def _strained(self, t: Any) -> jax.Array:
-        """The components of ε(t) that yield."""
+    def _active_strain(self, t: Any) -> jax.Array:
+        """Return the components of ε(t) that are components of the problem."""
         parts = split(self.strain(t))
         return parts[1:] if self.slope is None else parts
 
     def _trial(self, t: Any, x: Any) -> jax.Array:
-        return self._active * (self._strained(t) - x)
+        """Return the trial stress c(ε(t) − x)."""
+        return self._active_moduli * (self._active_strain(t) - x)
 
     @property
-    def _at_rest(self) -> Any:
-        """K, or the callable that says what it is at t where it moves."""
+    def _yield_set(self) -> Any:
+        """K, or a callable (t, args) ↦ K if the yield limit depends on time."""
         return self._set(0.0, None) if isinstance(self.limit, Constant) else self._set
 
     def _set(self, t: Any, args: Any) -> AbstractSet:
@@ -217,7 +226,7 @@ class DuvautLions(eqx.Module):
         return Translated(SecondOrderCone(self.slope), apex)
 
     def _rate(self, t: Any, x: Any, u: Any, args: Any) -> jax.Array:
-        return (self._strained(t) - u / self._active) / self.relaxation
+        return (self._active_strain(t) - u / self._active_moduli) / self.relaxation
 
     def _feedback(self, t: Any, x: Any, u: Any, args: Any) -> jax.Array:
         return self._trial(t, x)
@@ -239,7 +248,7 @@ def _strain(value: Any, wrong: Problems) -> AbstractSignal:
     if shape != (6,):
         wrong.add(
             place, f"values of shape {shape}",
-            "a strain is a Mandel vector of six components",
-            "Use dvax.models.duvaut_lions.mandel on the tensor",
+            "a strain must be a Mandel vector of six components",
+            "Convert the tensor with dvax.models.duvaut_lions.mandel",
         )  # fmt: skip
     return signal

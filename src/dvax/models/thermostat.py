@@ -1,4 +1,4 @@
-"""Heat in a plate whose heaters and coolers have a greatest power."""
+"""Heat conduction with distributed thermostats of limited power."""
 
 import math
 from typing import Any
@@ -20,7 +20,7 @@ from ..theory import Constants
 from ._numbers import positive
 
 COOLED, REGULATED, HEATED = -1, 0, 1
-"""At the least power, between, and at the greatest."""
+"""The regimes: minimal power, intermediate power, maximal power."""
 
 
 class Thermostat(eqx.Module):
@@ -29,14 +29,14 @@ class Thermostat(eqx.Module):
         x' = κΔx + u + ℓ(t)
         u ∈ k(T_ref − x) − N_K(u),   K = {g₁ ≤ u ≤ g₂},   so that u = clip(k(T_ref − x), g₁, g₂)
 
-    in X = U = L²(Ω), with insulated walls (Neumann), walls held at 0 (Dirichlet), or a periodic
-    plate. u is the heating power, negative where it cools. Between the regions at g₁, at g₂ and in
-    between run free boundaries, where k(T_ref − x) meets a limit. (With −u for the flow through a
-    semipermeable membrane these are the laws of Duvaut and Lions, in the interior.)
+    in X = U = L²(Ω), with insulated walls (Neumann), walls of temperature 0 (Dirichlet), or periodic
+    boundary conditions. u is the heating power, negative for cooling. Free boundaries, on which
+    k(T_ref − x) equals a limit, separate the three regimes. (With −u as the flow through a
+    semipermeable membrane this is the interior law of Duvaut and Lions.)
 
-    As a problem of this library: A = κΔ, P = I, h = k(T_ref − x), f = u + ℓ; F(y) = y − h(x) has
-    γ = L_F = 1. On a grid L² has the area of a cell as weight, the projection is the clip, and Δ is
-    exact for what the grid can show.
+    The problem has A = κΔ, P = I, h = k(T_ref − x) and f = u + ℓ; F(y) = y − h(x) has γ = L_F = 1. On a
+    grid the weight of L² is the area of a cell, the projection is the clip, and Δ is exact for every
+    function that the grid resolves.
 
     **Units:** with temperature in [T], length in [s], time in [t]: κ in [s]²/[t]; k in 1/[t]; u, g₁, g₂
     and ℓ in [T]/[t] (power over heat capacity); T_ref in [T].
@@ -46,7 +46,7 @@ class Thermostat(eqx.Module):
     numbers, arrays over the cells, `dvax.signals` or callables of t; `lower` g₁ ≤ `upper` g₂: numbers
     or arrays over the cells (equal where there is no heater).
 
-    **Raises:** `dvax.InputError` for everything that breaks its rule.
+    **Raises:** `dvax.InputError` with all invalid arguments.
 
     Source: Duvaut and Lions 1972, Les inéquations en mécanique et en physique, chapter I.
 
@@ -91,13 +91,13 @@ class Thermostat(eqx.Module):
     ):
         wrong = Problems()
         name = "dvax.models.Thermostat"
-        why = "backward in time heat does not flow"
+        why = "a negative diffusivity is ill-posed"
         self.diffusion = positive(f"{name}(diffusion)", diffusion, wrong, why=why)
-        self.gain = positive(f"{name}(gain)", gain, wrong, why="it heats what is cold")
+        self.gain = positive(f"{name}(gain)", gain, wrong, why="heating must decrease with x")
         try:
             self.generator = Elliptic(shape, lengths, boundary, self.diffusion, scheme=scheme)
         except InputError as error:
-            # Without a grid the fields cannot be looked at.
+            # Without a grid the fields cannot be checked.
             raise InputError(*wrong, *error.problems) from error
         cells = self.generator.transform.shape
         for name, value in (("reference", reference), ("load", load)):
@@ -109,7 +109,7 @@ class Thermostat(eqx.Module):
             if np.any(np.asarray(self.lower) > np.asarray(self.upper)):
                 wrong.add(
                     "dvax.models.Thermostat(lower, upper)", "lower > upper somewhere",
-                    "the least power is at most the greatest", "Swap them there",
+                    "lower ≤ upper must hold in every cell", "Swap the bounds there",
                 )  # fmt: skip
         wrong.raise_any()
         sides = np.broadcast_to(np.asarray(lengths, float), (len(cells),))
@@ -118,12 +118,12 @@ class Thermostat(eqx.Module):
 
     @property
     def fit(self) -> str:
-        """The model is in the class of the theory as it stands."""
+        """How the model relates to the class of the theory."""
         return "exact"
 
     @property
     def problem(self) -> Problem:
-        """The coupled system, in L²(Ω) for x and u."""
+        """The coupled problem, in L²(Ω) for x and u."""
         return Problem(
             A=self.generator,
             P=Scaling(1.0),
@@ -135,9 +135,12 @@ class Thermostat(eqx.Module):
 
     @property
     def constants(self) -> Constants:
-        """γ = L_F = 1, α_h = k, β_h = α_f = 0, β_f = 1, M = 1, ω = −κλ₁ with the least eigenvalue λ₁ of
-        −Δ: 0 for insulated walls. And the one-sided rate μ = ω: heating falls where the plate is
-        warmer, ⟨u(x₁) − u(x₂), x₁ − x₂⟩ ≤ 0, while the paper's ω + k counts it as if it rose."""
+        """The proved constants.
+
+        γ = L_F = 1, α_h = k, β_h = α_f = 0, β_f = 1, M = 1, and ω = −κλ₁ with the smallest
+        eigenvalue λ₁ of −Δ, which is 0 for insulated walls. The one-sided rate is μ = ω, since
+        heating decreases with temperature, ⟨u(x₁) − u(x₂), x₁ − x₂⟩ ≤ 0; the rate of the paper, ω +
+        k, ignores this sign."""
         growth = self.generator.growth(self.space)
         return Constants(
             gamma=1.0,
@@ -156,36 +159,41 @@ class Thermostat(eqx.Module):
 
     @property
     def points(self) -> tuple[np.ndarray, ...]:
-        """The coordinates of the cells' midpoints, one array of their shape an axis."""
+        """The coordinates of the cell midpoints, one array an axis."""
         cells = self.generator.transform.shape
         axes = [(np.arange(n) + 0.5) * side / n for n, side in zip(cells, self.lengths)]
         return tuple(np.meshgrid(*axes, indexing="ij"))
 
     def power(self, t: Any, x: Any) -> jax.Array:
-        """u = clip(k(T_ref − x), g₁, g₂) at every cell."""
+        """Return u = clip(k(T_ref − x), g₁, g₂) in every cell."""
         return jnp.clip(self.gain * (self.reference(t) - x), self.lower, self.upper)
 
     def regimes(self, t: Any, x: Any) -> jax.Array:
-        """−1 where u = g₁, 1 where u = g₂, 0 between them; 1 where they are equal."""
+        """Return −1 where u = g₁, 1 where u = g₂ (also if g₁ = g₂), and 0 in between."""
         z = self.gain * (self.reference(t) - x)
         regime = jnp.where(z >= self.upper, HEATED, jnp.where(z <= self.lower, COOLED, REGULATED))
         return regime.astype(jnp.int8)
 
     def figures(self, solution: Any) -> dict[str, float]:
-        """At the last saved time: `mean_temperature`; `power`, the integral of u over Ω; `heated`,
-        `regulated` and `cooled`, the shares of Ω in each regime; and `decay_rate`, at which any two
-        states approach, proved."""
+        """Return the results at the last saved time.
+
+        `mean_temperature`; `power`: the integral of u over Ω; `heated`, `regulated` and `cooled`: the
+        fraction of Ω in each regime; `decay_rate`: the proved rate at which the distance of any two
+        states decreases."""
         t, x, u = (jax.tree_util.tree_map(lambda v: v[-1], v) for v in
                    (solution.ts, solution.xs, solution.us))  # fmt: skip
         area, regime = self.space.w, np.asarray(self.regimes(t, x))
         total = float(jnp.sum(area))
-        share = lambda name: float(np.mean(regime == name))  # noqa: E731  (cells are alike)
+
+        def fraction(name: int) -> float:
+            return float(np.mean(regime == name))  # all cells have the same area
+
         return {
             "mean_temperature": float(jnp.sum(area * x)) / total,
             "power": float(jnp.sum(area * u)),
-            "heated": share(HEATED),
-            "regulated": share(REGULATED),
-            "cooled": share(COOLED),
+            "heated": fraction(HEATED),
+            "regulated": fraction(REGULATED),
+            "cooled": fraction(COOLED),
             "decay_rate": float(-self.constants.one_sided),
         }
 
@@ -197,7 +205,7 @@ class Thermostat(eqx.Module):
 
 
 def _field(name: str, value: Any, cells: tuple, wrong: Problems) -> jax.Array:
-    """A number or an array over the cells."""
+    """Return an array over the cells; add problems to `wrong`."""
     place = f"dvax.models.Thermostat({name})"
     try:
         array = _tree.as_float(value, place)
@@ -207,8 +215,8 @@ def _field(name: str, value: Any, cells: tuple, wrong: Problems) -> jax.Array:
     fits = jnp.shape(array) in ((), cells)
     if not fits or (_tree.is_concrete(array) and np.any(np.isnan(np.asarray(array)))):
         wrong.add(
-            place, _tree.short(array), f"a number, or an array over the cells {cells}",
-            "Give one value a cell",
+            place, _tree.short(array), f"it must be a number, or an array over the cells {cells}",
+            "Give one value for each cell",
         )  # fmt: skip
         return jnp.zeros(cells)
     return jnp.broadcast_to(array, cells)
@@ -221,7 +229,10 @@ def _signal(name: str, value: Any, cells: tuple) -> AbstractSignal:
         if wrong or (_tree.is_concrete(field) and not np.all(np.isfinite(np.asarray(field)))):
             place = f"dvax.models.Thermostat({name})"
             raise InputError(
-                *(wrong or [InputProblem(place, _tree.short(field), "it must be finite", "Fix it")])
+                *(
+                    wrong
+                    or [InputProblem(place, _tree.short(field), "it must be finite", "Correct it")]
+                )
             )
         return field
 

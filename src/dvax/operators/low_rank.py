@@ -53,8 +53,8 @@ class LowRank(AbstractOperator):
     def __init__(self, diagonal: Any, U: Any, s: Any):
         name = "dvax.operators.LowRank"
         self.diagonal = _tree.as_array(diagonal, f"{name}(diagonal)")
-        self.U = _tree.as_array(U, f"{name}(U)", least=0)
-        self.s = _tree.as_array(s, f"{name}(s)", least=0)
+        self.U = _tree.as_array(U, f"{name}(U)", min_size=0)
+        self.s = _tree.as_array(s, f"{name}(s)", min_size=0)
         shapes = jnp.shape(self.diagonal), jnp.shape(self.U), jnp.shape(self.s)
         if (
             len(shapes[1]) != 2

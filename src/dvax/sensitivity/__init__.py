@@ -1,4 +1,4 @@
-"""Derivatives of the solution map (ζ, η) ↦ (x, u), and what they mean at a kink."""
+"""Derivatives of the solution map (ζ, η) ↦ (x, u), at kinks as well."""
 
 from .change import Change as Change
 from .change import change as change

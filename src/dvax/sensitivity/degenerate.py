@@ -1,8 +1,8 @@
-"""Where along a trajectory the response has a kink, and of what kind.
+"""The kinks of the response along a trajectory, and their types.
 
-The sets say by continuous functions s(z) where their projections have kinks (`switches`): at s = 0.
-A trajectory that *crosses* zero transversally leaves the state differentiable, and u is not at that
-one moment; so does one that *touches* zero and turns back. One that *stays* there has only one-sided
+The kinks of a projection are the zeros of continuous functions s(z), the `switches` of the set. If s
+*crosses* zero transversally, or *touches* zero without a change of sign, the state is differentiable,
+and u is not differentiable at that time only. If s *stays* at zero, there are only one-sided
 derivatives from then on: `jax.grad` returns that of the constrained side.
 """
 
@@ -17,16 +17,19 @@ from ..errors import InputError, InputProblem
 from ..evolution import Implicit, Solution
 from ..evolution.stepper import interpolate, local
 
-_LOOKS = 8
-"""Places in a step where it is looked at the switches."""
+_SAMPLES_PER_STEP = 8
+"""Number of evaluations of the switches in a step."""
 
-_MOMENT = 1e-3
-"""The share of a run that counts as a moment."""
+_MAX_INSTANT = 1e-3
+"""An interval shorter than this fraction of the run counts as an instant."""
 
 
 class Kink(NamedTuple):
-    """From `start` to `end` (one moment but where it stays) the `switch` of the set is zero. For a
-    `dvax.sets.Box` of m entries switch i < m is the lower bound of entry i, m + i the upper one."""
+    """A zero of a switch from `start` to `end`; these are equal unless the switch stays at zero.
+
+    `switch` is the index of the switch of the set. For a `dvax.sets.Box` of m entries, switch i < m is
+    the lower bound of entry i, and switch m + i the upper bound.
+    """
 
     start: float
     end: float
@@ -35,12 +38,12 @@ class Kink(NamedTuple):
 
 
 def kinks(sol: Solution, *, tol: float = 1e-6) -> list[Kink]:
-    """The kinks of the response along a solution made with `dense=True`, in order of time.
+    """Return the kinks of the response along a solution with `dense=True`, in order of time.
 
-    A switch below `tol` in size counts as zero: it must be above the error of the solution. What stays
-    there for less than a thousandth of the run counts as a moment.
+    A switch counts as zero if its absolute value is below `tol`, which must exceed the error of the
+    solution. A zero over less than a thousandth of the run counts as an instant.
 
-    **Raises:** `dvax.InputError` where the steps were not kept, or by an implicit method.
+    **Raises:** `dvax.InputError` if the solution has no dense output, or is of an implicit method.
 
     ```python
     >>> import dvax
@@ -58,84 +61,85 @@ def kinks(sol: Solution, *, tol: float = 1e-6) -> list[Kink]:
         raise InputError(
             InputProblem(
                 "dvax.sensitivity.kinks",
-                "a solution without its steps",
-                "what happens between the saved times is looked at on the steps themselves",
+                "a solution without dense output",
+                "the kinks between saved times are located on the steps of the solution",
                 "Solve with dense=True and an exponential method",
             )
         )
     count = int(sol.stats["steps"])
-    if count == 0 or not _switches(sol):
+    if count == 0 or not _has_switches(sol):
         return []
-    times, values = _looked_at(sol, count)
-    found: list[Kink] = []
+    times, values = _sample_switches(sol, count)
+    result: list[Kink] = []
     for k in range(values.shape[1]):
-        found += _of_one(times, values[:, k], k, tol)
-    return sorted(found)
+        result += _kinks_of_switch(times, values[:, k], k, tol)
+    return sorted(result)
 
 
-def _switches(sol: Solution) -> bool:
+def _has_switches(sol: Solution) -> bool:
     flow, x0, t0 = sol.flow, sol.setup.x0, sol.setup.number("t0")
-    found = flow.switches(t0, x0, flow.problem.zero_control(x0))
-    return found is not None and found.size > 0
+    switches = flow.switches(t0, x0, flow.problem.zero_control(x0))
+    return switches is not None and switches.size > 0
 
 
-def _looked_at(sol: Solution, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(times, switches at each of them)."""
+def _sample_switches(sol: Solution, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return (times, values of the switches at these times)."""
     assert sol.records is not None
     flow, method = sol.flow, sol.setup.method
     steps = jtu.tree_map(lambda leaf: leaf[:count], sol.records)
     run = steps.start[0], steps.start[-1] + steps.length[-1]
-    thetas = jnp.arange(_LOOKS, dtype=steps.start.dtype) / _LOOKS
+    thetas = jnp.arange(_SAMPLES_PER_STEP, dtype=steps.start.dtype) / _SAMPLES_PER_STEP
 
-    def look(step, theta):
+    def sample(step, theta):
         end, guess = step.start + step.length, flow.guess(step.x0)
-        own, _ = local(method, flow, step.start, end, step.x0, guess, run)
+        step_flow, _ = local(method, flow, step.start, end, step.x0, guess, run)
         t = step.start + theta * step.length
-        x = interpolate(own, step.length, theta, step.x0, step.coefficients)
+        x = interpolate(step_flow, step.length, theta, step.x0, step.coefficients)
         return t, flow.switches(t, x, flow.rate(t, x, flow.guess(x)).z)
 
-    each = jax.jit(jax.vmap(lambda step: jax.vmap(lambda theta: look(step, theta))(thetas)))
+    sample_steps = jax.jit(jax.vmap(lambda step: jax.vmap(lambda th: sample(step, th))(thetas)))
     last = jtu.tree_map(lambda leaf: leaf[-1], steps)
-    (times, values), (end, at_end) = each(steps), jax.jit(look)(last, jnp.ones((), thetas.dtype))
+    times, values = sample_steps(steps)
+    end, at_end = jax.jit(sample)(last, jnp.ones((), thetas.dtype))
     return (
         np.append(np.asarray(times).ravel(), np.asarray(end)),
         np.concatenate([np.asarray(values).reshape(times.size, -1), np.asarray(at_end)[None]]),
     )
 
 
-def _of_one(times: np.ndarray, s: np.ndarray, switch: int, tol: float) -> list[Kink]:
-    """The kinks of one switch, from its values."""
-    found: list[Kink] = []
-    near = np.abs(s) <= tol
+def _kinks_of_switch(times: np.ndarray, s: np.ndarray, switch: int, tol: float) -> list[Kink]:
+    """Return the kinks of one switch, from its sampled values."""
+    result: list[Kink] = []
+    is_zero = np.abs(s) <= tol
     i = 0
     while i < len(s):
-        if near[i]:
+        if is_zero[i]:
             j = i
-            while j + 1 < len(s) and near[j + 1]:
+            while j + 1 < len(s) and is_zero[j + 1]:
                 j += 1
             before, after = (s[i - 1] if i > 0 else 0.0), (s[j + 1] if j + 1 < len(s) else 0.0)
             start, end = float(times[i]), float(times[j])
-            lasts = end - start > _MOMENT * (times[-1] - times[0])
-            kind = "stays" if lasts else "crosses" if before * after < 0 else "touches"
+            stays = end - start > _MAX_INSTANT * (times[-1] - times[0])
+            kind = "stays" if stays else "crosses" if before * after < 0 else "touches"
             if kind != "stays":
                 start = end = float(times[i + int(np.argmin(np.abs(s[i : j + 1])))])
-            found.append(Kink(start, end, switch, kind))
+            result.append(Kink(start, end, switch, kind))
             i = j + 1
             continue
-        if i + 1 < len(s) and s[i] * s[i + 1] < 0 and not near[i + 1]:
-            moment = float(times[i] + (times[i + 1] - times[i]) * s[i] / (s[i] - s[i + 1]))
-            found.append(Kink(moment, moment, switch, "crosses"))
+        if i + 1 < len(s) and s[i] * s[i + 1] < 0 and not is_zero[i + 1]:
+            t = float(times[i] + (times[i + 1] - times[i]) * s[i] / (s[i] - s[i + 1]))
+            result.append(Kink(t, t, switch, "crosses"))
         elif 0 < i < len(s) - 1 and abs(s[i]) <= min(abs(s[i - 1]), abs(s[i + 1])):
-            # The parabola through three values may come nearer than any of them.
-            least = abs(s[i]) - _dip(s[i - 1 : i + 2])
-            if least <= tol:
-                found.append(Kink(float(times[i]), float(times[i]), switch, "touches"))
+            # The minimum of the parabola through three values may be smaller than all of them.
+            minimum = abs(s[i]) - _distance_to_vertex(s[i - 1 : i + 2])
+            if minimum <= tol:
+                result.append(Kink(float(times[i]), float(times[i]), switch, "touches"))
         i += 1
-    return found
+    return result
 
 
-def _dip(s: np.ndarray) -> float:
-    """How much nearer to zero than its middle value the parabola through three values comes."""
+def _distance_to_vertex(s: np.ndarray) -> float:
+    """Return the middle one of three values of |s|, minus the minimum of the parabola through them."""
     a, b, c = np.abs(s)
-    bend = a - 2 * b + c
-    return 0.0 if bend <= 0 else (a - c) ** 2 / (8 * bend)
+    curvature = a - 2 * b + c
+    return 0.0 if curvature <= 0 else (a - c) ** 2 / (8 * curvature)

@@ -1,15 +1,14 @@
-"""The one-sided directional derivative of the solution map, at kinks as well.
+"""One-sided directional derivatives of the solution map, at kinks as well.
 
-Along a direction (δζ, δη) the trajectory (x, u) changes, to first order, by (δx, δu) with
+Along a direction (δζ, δη) the trajectory (x, u) changes to first order by (δx, δu) with
 
     δx' = Aδx + (∂A)x + f_x δx + f_u δu + f_η δη,            δx(0) = δζ,
     δy(t) ∈ C(t):  ⟨F_y δy + F_x δx + F_η δη, v − δy⟩ ≥ 0 for all v ∈ C(t),
 
-δu = P⁻¹(δy − (∂P)u), with the critical cone C(t) of K at the base trajectory (`critical`): the
-variation of a coupled system is a coupled system, and `dvax.solve` solves it. Where y is held weakly
-(at a bound that exerts no force) the cone is a half-line and the derivative is not linear in the
-direction; everywhere else this is what `jax.jvp` gives.
-"""
+δu = P⁻¹(δy − (∂P)u), with the critical cone C(t) of K at the base trajectory (`critical`). The
+variation of a coupled system is thus a coupled system, which `dvax.solve` solves. Where a
+constraint is weakly active (with a zero multiplier) the cone is a half-line, and the derivative is
+not linear in the direction. Otherwise it equals that of `jax.jvp`."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -26,16 +25,16 @@ from ..errors import InputError, InputProblem
 from ..evolution import ETD4RK, AbstractMethod, Solution, solve
 from ..problem import Problem
 from ..signals import Table, listen
-from .critical import code, critical
+from .critical import activity, critical_cone
 from .degenerate import Kink, kinks
 from .newton import OneSided
 
 
 class Directional(NamedTuple):
-    """(δx, δu) at the times `ts`, for the base trajectory `sol` (with its steps), and the kinks of it.
+    """(δx, δu) at the times `ts`, the base trajectory `sol` (with dense output), and its kinks.
 
-    `dxs`, `dus` have a leading time axis. Where no kink `stays`, the derivative is the ordinary one.
-    """
+    `dxs`, `dus` have a leading time axis. If no kink `stays`, the derivative is linear in the
+    direction."""
 
     ts: jax.Array
     dxs: Tree
@@ -45,21 +44,26 @@ class Directional(NamedTuple):
 
 
 class _Base(eqx.Module):
-    """What the variation is about."""
+    """The base trajectory, and the direction of the variation.
+
+    `varied` are the leaves of args that change along `direction`, `fixed` the others. `activities` is
+    the activity between kinks, as a function of time.
+    """
 
     problem: Problem
     sol: Solution
-    moving: Any
-    rest: Any
+    varied: Any
+    fixed: Any
     direction: Any
     tol: Any
-    codes: Any
+    activities: Any
 
-    def args(self, moving: Any) -> Any:
-        return eqx.combine(moving, self.rest)
+    def args(self, varied: Any) -> Any:
+        """Return args with these varied leaves."""
+        return eqx.combine(varied, self.fixed)
 
     def at(self, t: Any) -> tuple[Tree, Tree, Tree]:
-        """(x, u, y) of the base trajectory."""
+        """Return (x, u, y) of the base trajectory."""
         x, u = self.sol.evaluate(t)
         return x, u, self.problem.operator(self.sol.setup.args).apply(u)
 
@@ -80,30 +84,30 @@ def directional_derivative(
     tol: float = 1e-6,
     max_steps: int = 2**14,
 ) -> Directional:
-    """(δx, δu) with x(ζ + εδζ, η + εδη) = x + ε δx + o(ε) for ε ↓ 0, and u likewise.
+    """Return (δx, δu) with x(ζ + εδζ, η + εδη) = x + ε δx + o(ε) for ε ↓ 0, and u likewise.
 
-    **Arguments:** as in `dvax.solve` (the method is ETD4RK by default); `dx0`, `dargs`: the
-    direction, shaped like x0 and args, zero where None (`None` leaves in `dargs` stand still as
-    well); `tol`: a bound counts as reached within it, in y, and as exerting no force below it, in F.
-    It must be well above the error of the base trajectory; what happens within it of a kink is taken
-    to happen at the kink, and on sets with curved boundaries the answer is off by its order.
+    **Arguments:** as in `dvax.solve` (the default method is ETD4RK); `dx0`, `dargs`: the direction,
+    shaped like x0 and args, with None for zero (also for leaves of `dargs`); `tol`: a constraint is
+    active if y is within `tol` of its bound, and weakly active if F is below `tol`. It must be well
+    above the error of the base trajectory. Kinks within `tol` of each other are not distinguished, and
+    for sets with curved boundaries the error of the result is of the order of `tol`.
 
-    f and h are differentiated as `jax.jvp` does: kinks of their own have its convention.
+    f and h are differentiated as in `jax.jvp`, with its convention at their own kinks.
 
-    **Returns:** a `dvax.Directional`. **Raises:** `dvax.InputError` where the direction does not fit;
-    `dvax.SolveError` where one of the two solves fails.
+    **Returns:** a `dvax.Directional`. **Raises:** `dvax.InputError` if the direction does not fit;
+    `dvax.SolveError` if one of the two solves fails.
 
     Source: the affine variational inequality on the critical cone (Robinson 1980); Pang and Stewart
     (2009) for the differential equation.
 
     ```python
     >>> import dvax, jax.numpy as jnp
-    >>> rest = dvax.Problem(                 # at rest on the kink of u = max(x, 0)
+    >>> problem = dvax.Problem(              # stationary at the kink of u = max(x, 0)
     ...     A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 9.0),
     ...     f=lambda t, x, u, args: u - 2.0 * x, h=lambda t, x, u, args: x,
     ... )
-    >>> up = dvax.directional_derivative(rest, 0.0, 0.0, 1.0, dx0=1.0)
-    >>> down = dvax.directional_derivative(rest, 0.0, 0.0, 1.0, dx0=-1.0)
+    >>> up = dvax.directional_derivative(problem, 0.0, 0.0, 1.0, dx0=1.0)
+    >>> down = dvax.directional_derivative(problem, 0.0, 0.0, 1.0, dx0=-1.0)
     >>> [round(float(d.dxs[0]), 6) for d in (up, down)]     # e⁻¹ and −e⁻²
     [0.367879, -0.135335]
     >>> [kink.kind for kink in up.kinks]
@@ -115,53 +119,67 @@ def directional_derivative(
         raise InputError(
             InputProblem(
                 "dvax.directional_derivative", "a traced value",
-                "where kinks are is looked up between the two solves, which no compiled program can",
-                "Call it outside jax.jit; off kinks jax.jvp of dvax.solve is the same and compiles",
+                "the kinks are located between the two solves, which requires concrete values",
+                "Call it outside jax.jit; away from kinks jax.jvp of dvax.solve is equal and compiles",
             )
         )  # fmt: skip
     x0 = _tree.as_float(x0, "x0")
-    dx0, moving, rest, direction = check_direction(x0, args, dx0, dargs)
+    dx0, varied, fixed, direction = check_direction(x0, args, dx0, dargs)
     dx0 = jtu.tree_map(lambda d, a: d.astype(a.dtype), dx0, x0)
     method = ETD4RK() if method is None else method
     settings: dict[str, Any] = dict(rtol=rtol, atol=atol, max_steps=max_steps, method=method)
     sol = solve(problem, x0, t0, t1, args, ts, dense=True, **settings)
-    found = kinks(sol, tol=tol)
+    base_kinks = kinks(sol, tol=tol)
     begin, end = float(t0), float(t1)
-    inner = [t for kink in found for t in (kink.start, kink.end) if begin < t < end]
+    inner = [t for kink in base_kinks for t in (kink.start, kink.end) if begin < t < end]
     inner += [float(t) for t in problem.knots(begin, end, x0, args)]
     times = np.array(sorted({begin, *inner, end}))
-    base = _Base(problem, sol, moving, rest, direction, jnp.asarray(tol), None)
+    base = _Base(problem, sol, varied, fixed, direction, jnp.asarray(tol), None)
     base = eqx.tree_at(
-        lambda b: b.codes, base, _codes(base, times, tol), is_leaf=lambda v: v is None
+        lambda b: b.activities, base, _activities(base, times, tol), is_leaf=lambda v: v is None
     )
-    varied = Problem(
+    variation_problem = Problem(
         A=_generator, P=_operator, K=_cone, f=_rate, h=_law,
         state_space=problem.state_space, control_space=problem.control_space,
     )  # fmt: skip
-    # Of first order in the direction, whatever its size.
+    # Normalise the direction: the derivative is positively homogeneous.
     scale = float(_tree_size((dx0, direction)))
     if scale == 0.0:
-        return Directional(sol.ts, _tree.zeros_like(sol.xs), _tree.zeros_like(sol.us), sol, found)
-    unit = lambda tree: jtu.tree_map(lambda v: v / scale, tree)  # noqa: E731
-    base = eqx.tree_at(lambda b: b.direction, base, unit(direction), is_leaf=lambda v: v is None)
-    pointwise = problem.set_at(sol.setup.number("t0"), args).intervals(problem.zero_control(x0))
-    solver = OneSided() if pointwise is None else None
-    variation = solve(varied, unit(dx0), t0, t1, base, ts, vi_solver=solver, **settings)
-    dus = jax.vmap(lambda t, v: _tree.add(v, _shift(base, t)))(variation.ts, variation.us)
-    back = lambda tree: jtu.tree_map(lambda v: scale * v, tree)  # noqa: E731
-    return Directional(variation.ts, back(variation.xs), back(dus), sol, found)
+        dxs, dus = _tree.zeros_like(sol.xs), _tree.zeros_like(sol.us)
+        return Directional(sol.ts, dxs, dus, sol, base_kinks)
+
+    def normalise(tree: Tree) -> Tree:
+        return jtu.tree_map(lambda v: v / scale, tree)
+
+    base = eqx.tree_at(
+        lambda b: b.direction, base, normalise(direction), is_leaf=lambda v: v is None
+    )
+    bounds = problem.set_at(sol.setup.number("t0"), args).intervals(problem.zero_control(x0))
+    solver = OneSided() if bounds is None else None
+    variation = solve(
+        variation_problem, normalise(dx0), t0, t1, base, ts, vi_solver=solver, **settings
+    )
+    dus = jax.vmap(lambda t, v: _tree.add(v, _inverse_variation(base, t)))(
+        variation.ts, variation.us
+    )
+    dxs, dus = _tree.scale(scale, variation.xs), _tree.scale(scale, dus)
+    return Directional(variation.ts, dxs, dus, sol, base_kinks)
 
 
-def _codes(base: _Base, times: np.ndarray, tol: float) -> Any:
-    """What is constant between kinks, as signals that say where those are: steps end there."""
+def _activities(base: _Base, times: np.ndarray, tol: float) -> Any:
+    """Return the activity as piecewise constant signals; the kinks are their knots, where steps end."""
 
     def at(t: Any) -> Tree:
         _, _, y = base.at(t)
-        return code(_set(base, t)(base.moving), y, _force(base, t), _control(base), tol)
+        return activity(_set(base, t)(base.varied), y, _multiplier(base, t), _control(base), tol)
 
-    middles = jax.jit(jax.vmap(at))(jnp.asarray(0.5 * (times[:-1] + times[1:])))
-    whole = lambda leaf: np.concatenate([np.asarray(leaf), np.asarray(leaf)[-1:]])  # noqa: E731
-    return jtu.tree_map(lambda leaf: Table(times, whole(leaf), kind="constant"), middles)
+    midpoints = jax.jit(jax.vmap(at))(jnp.asarray(0.5 * (times[:-1] + times[1:])))
+
+    def table(leaf: Any) -> Table:
+        values = np.asarray(leaf)
+        return Table(times, np.concatenate([values, values[-1:]]), kind="constant")
+
+    return jtu.tree_map(table, midpoints)
 
 
 def _generator(base: _Base) -> Any:
@@ -173,103 +191,118 @@ def _operator(base: _Base) -> Any:
 
 
 def _cone(t: Any, base: _Base) -> Any:
-    now = jtu.tree_map(lambda table: table(t), base.codes, is_leaf=lambda v: isinstance(v, Table))
-    with listen(None):  # the knots of the data are among the times of the codes
+    flags = jtu.tree_map(
+        lambda table: table(t), base.activities, is_leaf=lambda v: isinstance(v, Table)
+    )
+    with listen(None):  # the knots of the data are among the knots of the activities
         _, _, y = base.at(t)
-        return critical(
-            _set(base, t), base.moving, base.direction, y, _force(base, t), now, base.tol
-        )
+        w = _multiplier(base, t)
+        return critical_cone(_set(base, t), base.varied, base.direction, y, w, flags, base.tol)
 
 
 def _set(base: _Base, t: Any) -> Any:
-    """η ↦ K(t, η)."""
-    return lambda moving: base.problem.set_at(t, base.args(moving))
+    """Return the function η ↦ K(t, η)."""
+    return lambda varied: base.problem.set_at(t, base.args(varied))
 
 
 def _control(base: _Base) -> Any:
     return base.problem.spaces(base.sol.setup.x0)[1]
 
 
-def _force(base: _Base, t: Any) -> Tree:
-    """w = −F(y) ∈ N_K(y)."""
+def _multiplier(base: _Base, t: Any) -> Tree:
+    """Return w = −F(y) ∈ N_K(y)."""
     x, _, y = base.at(t)
     return jtu.tree_map(jnp.negative, base.problem.frozen(t, x, base.sol.setup.args)(y))
 
 
-def _shift(base: _Base, t: Any) -> Tree:
-    """∂(P⁻¹)y along δη: what u moves by while y stands."""
+def _inverse_variation(base: _Base, t: Any) -> Tree:
+    """Return ∂(P⁻¹)y along δη, the variation of u for fixed y."""
     _, _, y = base.at(t)
-    inverse = lambda moving: base.problem.operator(base.args(moving)).inverse(y)  # noqa: E731
-    return jax.jvp(inverse, (base.moving,), (base.direction,))[1]
+
+    def inverse(varied: Any) -> Tree:
+        return base.problem.operator(base.args(varied)).inverse(y)
+
+    return jax.jvp(inverse, (base.varied,), (base.direction,))[1]
 
 
 def _rate(t: Any, dx: Tree, v: Tree, base: _Base) -> Tree:
-    """f_x δx + f_u δu + f_η δη + (∂A)x."""
-    f = lambda x, u, moving: base.problem.f(t, x, u, base.args(moving))  # noqa: E731
-    push = lambda x, moving: base.problem.generator(base.args(moving)).apply(x)  # noqa: E731
+    """Return f_x δx + f_u δu + f_η δη + (∂A)x."""
+
+    def f(x: Tree, u: Tree, varied: Any) -> Tree:
+        return base.problem.f(t, x, u, base.args(varied))
+
+    def generator(x: Tree, varied: Any) -> Tree:
+        return base.problem.generator(base.args(varied)).apply(x)
+
     with listen(None):
         x, u, _ = base.at(t)
-        du = _tree.add(v, _shift(base, t))
-        rate = jax.jvp(f, (x, u, base.moving), (dx, du, base.direction))[1]
-        drift = jax.jvp(partial(push, x), (base.moving,), (base.direction,))[1]
+        du = _tree.add(v, _inverse_variation(base, t))
+        rate = jax.jvp(f, (x, u, base.varied), (dx, du, base.direction))[1]
+        drift = jax.jvp(partial(generator, x), (base.varied,), (base.direction,))[1]
     return _tree.add(rate, drift)
 
 
 def _law(t: Any, dx: Tree, v: Tree, base: _Base) -> Tree:
-    """v − (F_y δy + F_x δx + F_η δη) with δy = Pv: the h of which that is the frozen operator."""
-    F = lambda y, x, moving: base.problem.frozen(t, x, base.args(moving))(y)  # noqa: E731
+    """Return v − (F_y δy + F_x δx + F_η δη) with δy = Pv.
+
+    With this h the frozen operator of the variation is F_y δy + F_x δx + F_η δη."""
+
+    def F(y: Tree, x: Tree, varied: Any) -> Tree:
+        return base.problem.frozen(t, x, base.args(varied))(y)
+
     with listen(None):
         x, _, y = base.at(t)
         dy = base.problem.operator(base.sol.setup.args).apply(v)
-        return _tree.sub(v, jax.jvp(F, (y, x, base.moving), (dy, dx, base.direction))[1])
+        return _tree.sub(v, jax.jvp(F, (y, x, base.varied), (dy, dx, base.direction))[1])
 
 
 def check_direction(x0: Tree, args: Any, dx0: Tree, dargs: Any) -> tuple[Tree, Any, Any, Any]:
-    """(dx0, what moves of args, the rest, its direction); an `InputError` where they do not fit."""
+    """Return (dx0, varied leaves of args, fixed leaves, direction of the varied leaves).
+
+    Raise an `InputError` if the direction does not fit."""
     dx0 = _tree.zeros_like(x0) if dx0 is None else _tree.as_float(dx0, "dx0")
-    moving, rest, direction = _apart(args, dargs)
-    _check(x0, dx0, moving, direction)
-    return dx0, moving, rest, direction
+    varied, fixed, direction = _partition(args, dargs)
+    _check_shapes(x0, dx0, varied, direction)
+    return dx0, varied, fixed, direction
 
 
-def _apart(args: Any, dargs: Any) -> tuple[Any, Any, Any]:
-    """(what moves, the rest, the direction), each shaped like args with None in the other places."""
+def _partition(args: Any, dargs: Any) -> tuple[Any, Any, Any]:
+    """Return (varied leaves, fixed leaves, direction), as trees like args with None elsewhere."""
     leaves, structure = jtu.tree_flatten(args, is_leaf=lambda v: v is None)
     given, shape = jtu.tree_flatten(dargs, is_leaf=lambda v: v is None)
     if dargs is None:
         given, shape = [None] * len(leaves), structure
     if shape != structure:
-        raise _wrong("dargs", f"the structure {shape}", f"that of args is {structure}")
+        raise _error("dargs", f"the structure {shape}", f"it must have that of args, {structure}")
     for a, d in zip(leaves, given, strict=True):
         if d is not None and not (isinstance(a, float) or eqx.is_inexact_array(a)):
-            rule = f"{a!r} in args is no real number with a point"
-            raise _wrong("dargs", f"{_tree.short(d)}", rule)
+            rule = f"{a!r} in args is not of a floating type, so its direction must be None"
+            raise _error("dargs", f"{_tree.short(d)}", rule)
         if d is not None and (isinstance(d, bool) or not np.all(np.isfinite(np.asarray(d)))):
-            raise _wrong("dargs", f"{_tree.short(d)}", "it must be made of finite numbers")
-    moving, rest = (
-        [a if (d is None) is still else None for a, d in zip(leaves, given, strict=True)]
-        for still in (False, True)
+            raise _error("dargs", f"{_tree.short(d)}", "its entries must be finite numbers")
+    varied, fixed = (
+        [a if (d is None) is is_fixed else None for a, d in zip(leaves, given, strict=True)]
+        for is_fixed in (False, True)
     )
-    # Tangents have the type of what they are tangents of.
-    along = [
+    # A tangent must have the type of its primal.
+    direction = [
         None if d is None else jnp.asarray(d, jnp.result_type(a))
         for a, d in zip(leaves, given, strict=True)
     ]
-    return tuple(structure.unflatten(part) for part in (moving, rest, along))
+    return tuple(structure.unflatten(part) for part in (varied, fixed, direction))
 
 
-def _check(x0: Tree, dx0: Tree, moving: Any, direction: Any) -> None:
-    for name, a, b in (("dx0", x0, dx0), ("dargs", moving, direction)):
+def _check_shapes(x0: Tree, dx0: Tree, varied: Any, direction: Any) -> None:
+    for name, a, b in (("dx0", x0, dx0), ("dargs", varied, direction)):
         if not _tree.same_shape(a, b):
-            raise _wrong(name, f"shape {_tree.shapes(b)}", f"it must have shape {_tree.shapes(a)}")
+            raise _error(name, f"shape {_tree.shapes(b)}", f"it must have shape {_tree.shapes(a)}")
 
 
-def _wrong(name: str, got: str, rule: str) -> InputError:
+def _error(name: str, given: str, rule: str) -> InputError:
     return InputError(
         InputProblem(
-            f"dvax.directional_derivative({name})", got,
-            f"{rule}: a direction has a number for every number that moves",
-            "Give it that shape, or leave it out where nothing moves",
+            f"dvax.directional_derivative({name})", given, rule,
+            "Give a direction of the same structure and shapes, with None for fixed leaves",
         )
     )  # fmt: skip
 

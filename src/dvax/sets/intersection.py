@@ -54,7 +54,7 @@ class Intersection(AbstractSet):
         name = "dvax.sets.Intersection"
         _tree.check_tolerance(tol, f"{name}(tol)")
         if not isinstance(max_cycles, int | np.integer) or max_cycles < 1:
-            rule, fix = "it must be an integer > 0", "Omit it for the default"
+            rule, fix = "it must be a whole number > 0", "Omit it for the default"
             given = _tree.line(max_cycles)
             raise InputError(InputProblem(f"{name}(max_cycles)", given, rule, fix))
         self.sets, self.tol, self.max_cycles = sets, tol, max_cycles

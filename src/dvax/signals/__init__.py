@@ -1,7 +1,7 @@
-"""Data as functions of time, with the knots that a step must not jump over."""
+"""Data as functions of time, with knots at which steps must end."""
 
 from .abstract import AbstractSignal as AbstractSignal
-from .abstract import Heard as Heard
+from .abstract import SignalReports as SignalReports
 from .abstract import listen as listen
 from .constant import Constant as Constant
 from .function import Function as Function

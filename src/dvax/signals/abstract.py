@@ -1,9 +1,8 @@
-"""What a signal owes, and how an integrator learns which signals it depends on.
+"""The abstract signal, and the detection of the signals that a function evaluates.
 
-An integrator must end its steps on the knots of measured data: between them the data is smooth,
-across them it is not, and a knot stepped over can lose a whole pulse. The data hides inside f, h
-and K, which are ordinary functions, so they are listened to: while `listen()` is active, every
-signal that is evaluated reports itself.
+Steps must end at the knots of measured data: between knots the data are smooth, at a knot they are not,
+and a step over a knot can miss a whole pulse. f, h and K are ordinary functions that may evaluate
+signals. While `listen()` is active, every signal records its knots when it is evaluated.
 """
 
 import abc
@@ -20,63 +19,68 @@ import numpy as np
 _active = threading.local()
 
 
-class Heard:
-    """What was reported while listening: the knots, the span where all data exists, warnings."""
+class SignalReports:
+    """The records of evaluated signals.
+
+    `knots` are their knots, and `spans` the intervals on which they are defined, with their types.
+    `unresolved` names the signals whose knots in t are unknown, since they were evaluated at another
+    time than t.
+    """
 
     def __init__(self, time: Any):
         self.time = time
         self.knots: list[Any] = []
         self.spans: list[tuple[Any, Any, str]] = []
-        self.elsewhere: list[str] = []
+        self.unresolved: list[str] = []
 
 
 @contextlib.contextmanager
-def listen(time: Any) -> Iterator[Heard]:
-    """Collect every signal evaluated at `time` (this very tracer) inside the `with` block."""
-    heard = Heard(time)
-    previous = getattr(_active, "heard", None)
-    _active.heard = heard
+def listen(time: Any) -> Iterator[SignalReports]:
+    """Record every signal that is evaluated at `time` (the same tracer object) in the `with` block."""
+    reports = SignalReports(time)
+    previous = getattr(_active, "reports", None)
+    _active.reports = reports
     try:
-        yield heard
+        yield reports
     finally:
-        _active.heard = previous
+        _active.reports = previous
 
 
 class AbstractSignal(eqx.Module):
-    """A function of time with values in arrays of one shape."""
+    """A function of time whose values are arrays of one shape."""
 
     @abc.abstractmethod
     def value(self, t: Any) -> jax.Array:
-        """The value at time t; at a jump, the limit from the right."""
+        """Return the value at time t; at a jump, the limit from the right."""
 
     @abc.abstractmethod
     def knots(self) -> Any:
-        """The sorted times where the signal or a derivative jumps; an array, maybe empty."""
+        """Return the sorted times where the signal or a derivative jumps, an array."""
 
     @abc.abstractmethod
     def span(self) -> tuple[Any, Any]:
-        """First and last time where the signal is defined. Outside it, its value is NaN."""
+        """Return the first and last time where the signal is defined; it is NaN outside."""
 
     def __call__(self, t: Any) -> jax.Array:
         self.report(t)
         return self.value(t)
 
     def report(self, t: Any) -> None:
-        """Tell a listener, if there is one, about the knots and the span."""
-        heard: Heard | None = getattr(_active, "heard", None)
-        if heard is None:
+        """Record the knots and the span if `listen` is active."""
+        reports: SignalReports | None = getattr(_active, "reports", None)
+        if reports is None:
             return
         knots, (first, last) = self.knots(), self.span()
-        if np.shape(knots)[0] == 0 and not _bounded(first, last):
+        if np.shape(knots)[0] == 0 and not _is_bounded(first, last):
             return
-        if t is not heard.time:
+        if t is not reports.time:
             # The knots in the integrator's time are unknown: t was shifted, scaled or recomputed.
-            heard.elsewhere.append(repr(self))
+            reports.unresolved.append(repr(self))
             return
-        heard.knots.append(knots)
-        heard.spans.append((first, last, type(self).__name__))
+        reports.knots.append(knots)
+        reports.spans.append((first, last, type(self).__name__))
 
 
-def _bounded(first: Any, last: Any) -> bool:
+def _is_bounded(first: Any, last: Any) -> bool:
     traced = isinstance(first, jax.core.Tracer) or isinstance(last, jax.core.Tracer)
     return traced or bool(np.isfinite(first) or np.isfinite(last))

@@ -1,4 +1,4 @@
-"""The same value at all times."""
+"""Constant signals."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ class Constant(AbstractSignal):
 
     ```
 
-    **Raises:** `dvax.InputError` where the value is not finite.
+    **Raises:** `dvax.InputError` if the value is not finite.
     """
 
     constant: jax.Array
@@ -30,8 +30,8 @@ class Constant(AbstractSignal):
             lambda: np.all(np.isfinite(self.constant)),
             "dvax.signals.Constant(value)",
             self.constant,
-            "data must be finite: a gap is not a value",
-            "Fill the gaps on purpose",
+            "data must be finite",
+            "Replace the values that are not",
         )
 
     def value(self, t: Any) -> jax.Array:

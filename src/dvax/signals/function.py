@@ -1,4 +1,4 @@
-"""A formula in time."""
+"""Signals given by a function of time."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,7 @@ from .abstract import AbstractSignal
 
 
 class Function(AbstractSignal):
-    """s(t) = fn(t) for a smooth, traceable `fn`; name the times where it is not smooth in `knots`.
+    """s(t) = fn(t) for a traceable `fn` that is smooth except at the times `knots`.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -49,7 +49,7 @@ class Function(AbstractSignal):
 
 
 def _times(knots: Any) -> np.ndarray:
-    """One time, or a vector of times."""
+    """Return the knots, one time or several, as a vector."""
     try:
         times = np.atleast_1d(np.asarray(knots))
     except ValueError:  # rows of several lengths
@@ -59,7 +59,7 @@ def _times(knots: Any) -> np.ndarray:
         raise InputError(
             InputProblem(
                 "dvax.signals.Function(knots)", _tree.line(knots),
-                "it is a time, or a list of times where fn is not smooth: real numbers",
+                "it must be a time, or a list of times, where fn is not smooth",
                 "Write knots=[0.5, 1.0]",
             )
         )  # fmt: skip

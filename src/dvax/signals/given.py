@@ -1,4 +1,4 @@
-"""What a user may give where a function of time is wanted."""
+"""Conversion of user input to signals."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,8 +9,9 @@ from .function import Function
 
 
 def as_signal(value: Any, constant: Callable[[Any], Any]) -> AbstractSignal:
-    """A signal as it is, a callable of t as a `Function`; of anything else `constant` makes the array
-    of a `Constant`, or raises.
+    """Return a signal unchanged, a callable of t as a `Function`, and other values as a `Constant`.
+
+    `constant` converts the value of a `Constant` to an array, or raises an error.
 
     ```python
     >>> import dvax, jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Products of signals: a profile over space times a record in time."""
+"""Products of signals, such as a spatial profile times a time series."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from .constant import Constant
 
 
 class Product(AbstractSignal):
-    """s(t) = a(t) b(t), with broadcasting: a profile times a record is a separable field.
+    """s(t) = a(t) b(t), with broadcasting. A profile times a time series is a separable field.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -38,7 +38,7 @@ class Product(AbstractSignal):
         return self.a(t) * self.b(t)
 
     def knots(self) -> Any:
-        # The factors report their own knots when they are evaluated.
+        # The factors record their knots when they are evaluated.
         return np.zeros(0)
 
     def span(self) -> tuple[Any, Any]:

@@ -1,4 +1,4 @@
-"""Measured data: values at increasing times, joined by constants, lines or cubics."""
+"""Measured data: piecewise constant, piecewise linear or cubic interpolation of samples."""
 
 from typing import Any, Literal
 
@@ -15,18 +15,16 @@ Kind = Literal["constant", "linear", "cubic"]
 
 
 class Table(AbstractSignal):
-    """Data (tᵢ, vᵢ) as a function of time, defined on [t₀, t_last] and NaN outside.
+    """The interpolant of data (tᵢ, vᵢ), defined on [t₀, t_last] and NaN outside.
 
-    - `kind="constant"`: vᵢ on [tᵢ, tᵢ₊₁), so it jumps at every time, and the value at a jump is
-      the new one;
-    - `kind="linear"`: straight lines, with kinks at the times;
-    - `kind="cubic"`: the C² spline with not-a-knot ends, whose third derivative jumps there.
+    - `kind="constant"`: vᵢ on [tᵢ, tᵢ₊₁), with a jump at every time;
+    - `kind="linear"`: piecewise linear, with kinks at the times;
+    - `kind="cubic"`: the C² spline with not-a-knot ends, whose third derivative jumps at the times.
 
     **Arguments:** `times`: increasing, at least two (four for cubic); `values`: one a time along
     the first axis, of any trailing shape.
 
-    **Raises:** `dvax.InputError` where times do not increase, lengths differ, or data is not
-    finite.
+    **Raises:** `dvax.InputError` if times do not increase, lengths differ, or data are not finite.
 
     ```python
     >>> import dvax
@@ -55,14 +53,14 @@ class Table(AbstractSignal):
                     "Choose one of them",
                 )
             )
-        # Times stay NumPy where they can: knots are then known without running anything.
+        # Concrete times are NumPy arrays, so that knots are known without running a program.
         self.times = _numbers(times, f"{name}(times)") if _tree.is_concrete(times) else times
         self.values = _tree.as_float(
             values if hasattr(values, "dtype") else _numbers(values, f"{name}(values)"),
             f"{name}(values)",
         )
         self.kind = kind
-        _check(name, self.times, self.values, least=4 if kind == "cubic" else 2)
+        _check(name, self.times, self.values, min_count=4 if kind == "cubic" else 2)
         self.slopes = _spline_slopes(self.times, self.values) if kind == "cubic" else None
 
     def value(self, t: Any) -> jax.Array:
@@ -86,70 +84,70 @@ def _numbers(values: Any, name: str) -> np.ndarray:
     except (TypeError, ValueError):
         raise InputError(
             InputProblem(
-                name, " ".join(repr(values).split())[:120], "it is a list or array of numbers",
-                "Write numbers, and rows of one length",
+                name, " ".join(repr(values).split())[:120], "it must be a list or array of numbers",
+                "Give numbers, in rows of one length",
             )
         ) from None  # fmt: skip
 
 
-# Functions of their own, by whose names an enclosure over time knows what they are.
+# Jitted separately: `dvax.programs` has rules for functions of these names.
 
 
 @jax.jit
 def dvax_constant_table(times: jax.Array, values: jax.Array, t: Any) -> jax.Array:
-    """vᵢ on [tᵢ, tᵢ₊₁)."""
-    i, _ = _place(times, t)
+    """Return vᵢ for t in [tᵢ, tᵢ₊₁)."""
+    i, _ = _locate(times, t)
     out = jnp.where(t >= times[i + 1], values[i + 1], values[i])
-    return _within(times, t, out)
+    return _nan_outside(times, t, out)
 
 
 @jax.jit
 def dvax_linear_table(times: jax.Array, values: jax.Array, t: Any) -> jax.Array:
-    """Straight lines."""
-    i, s = _place(times, t)
+    """Return the piecewise linear interpolant at t."""
+    i, s = _locate(times, t)
     v0, v1 = values[i], values[i + 1]
-    return _within(times, t, v0 + s * (v1 - v0))
+    return _nan_outside(times, t, v0 + s * (v1 - v0))
 
 
 @jax.jit
 def dvax_cubic_table(times: jax.Array, values: jax.Array, slopes: jax.Array, t: Any) -> jax.Array:
-    """The cubics with these slopes at the times."""
-    i, s = _place(times, t)
+    """Return the cubic Hermite interpolant with these slopes at t."""
+    i, s = _locate(times, t)
     width = times[i + 1] - times[i]
     v0, v1 = values[i], values[i + 1]
     d0, d1 = slopes[i] * width, slopes[i + 1] * width
     jump = v1 - v0
     out = v0 + s * (d0 + s * ((3 * jump - 2 * d0 - d1) + s * (d0 + d1 - 2 * jump)))
-    return _within(times, t, out)
+    return _nan_outside(times, t, out)
 
 
-_UNROLLED = 4096
-"""Times up to which the bisection is unrolled."""
+_MAX_UNROLLED_TIMES = 4096
+"""Number of times up to which the bisection is unrolled."""
 
 
-def _place(times: jax.Array, t: Any) -> tuple[jax.Array, jax.Array]:
-    """i with tᵢ ≤ t ≤ tᵢ₊₁, and how far between the two t is."""
-    # Measured a lookup: counting 68 ns for 168 times and 3.9 µs for 8784; bisection 27 ns unrolled,
+def _locate(times: jax.Array, t: Any) -> tuple[jax.Array, jax.Array]:
+    """Return i with tᵢ ≤ t ≤ tᵢ₊₁, and the relative position of t between these times."""
+    # Time of a lookup: counting 68 ns for 168 times and 3.9 µs for 8784; bisection 27 ns unrolled,
     # 100 ns as a loop.
     count = times.shape[0]
-    method = "scan_unrolled" if count <= _UNROLLED else "scan"
-    passed = jnp.searchsorted(times, t, side="right", method=method)
-    i = jnp.clip(passed - 1, 0, count - 2)
+    method = "scan_unrolled" if count <= _MAX_UNROLLED_TIMES else "scan"
+    position = jnp.searchsorted(times, t, side="right", method=method)
+    i = jnp.clip(position - 1, 0, count - 2)
     left, right = times[i], times[i + 1]
     return i, (t - left) / (right - left)
 
 
-def _within(times: jax.Array, t: Any, out: jax.Array) -> jax.Array:
+def _nan_outside(times: jax.Array, t: Any, out: jax.Array) -> jax.Array:
     return jnp.where((t >= times[0]) & (t <= times[-1]), out, jnp.nan)
 
 
-def _check(name: str, times: Any, values: jax.Array, least: int) -> None:
-    if np.ndim(times) != 1 or times.shape[0] < least or values.shape[:1] != times.shape:
+def _check(name: str, times: Any, values: jax.Array, min_count: int) -> None:
+    if np.ndim(times) != 1 or times.shape[0] < min_count or values.shape[:1] != times.shape:
         raise InputError(
             InputProblem(
                 f"{name}(times, values)",
                 f"shapes {np.shape(times)} and {values.shape}",
-                f"times is a vector of at least {least} entries, values has one entry a time",
+                f"times must be a vector of at least {min_count} entries, with one value for each",
                 "Give one value (or row of values) for each time",
             )
         )
@@ -160,8 +158,8 @@ def _check(name: str, times: Any, values: jax.Array, least: int) -> None:
                 InputProblem(
                     f"{name}(times)",
                     f"times[{gaps[0]}] = {times[gaps[0]]}",
-                    "times must be finite, or a value has no place",
-                    "Drop the rows without a time",
+                    "times must be finite",
+                    "Remove the rows without a time",
                 )
             )
         wrong = np.flatnonzero(~(np.diff(times) > 0))
@@ -172,23 +170,23 @@ def _check(name: str, times: Any, values: jax.Array, least: int) -> None:
                     f"{name}(times)",
                     f"times[{i}] = {times[i]:.17g}, times[{i + 1}] = {times[i + 1]:.17g}",
                     "times must increase strictly, or the signal has two values at one time",
-                    "Sort the data and drop repeated times",
+                    "Sort the data and remove repeated times",
                 )
             )
     _tree.require(
         lambda: np.all(np.isfinite(values)),
         f"{name}(values)",
         values,
-        "measured values must be finite: a gap is not a value",
-        "Drop the times of missing values, or fill them on purpose",
+        "measured values must be finite",
+        "Remove the times of missing values, or fill them explicitly",
     )
 
 
 def _spline_slopes(times: Any, values: jax.Array) -> jax.Array:
-    """Derivatives at the knots of the not-a-knot C² spline (de Boor 1978, chapter IV).
+    """Return the derivatives at the knots of the not-a-knot C² spline (de Boor 1978, chapter IV).
 
-    Continuity of the second derivative at inner knots is tridiagonal in the slopes; one cubic over
-    the first two (last two) intervals gives the end rows.
+    Continuity of the second derivative at inner knots is a tridiagonal system for the slopes. The first
+    and the last row state that one cubic covers the first two and the last two intervals.
     """
     t = jnp.asarray(times)
     n = t.shape[0]

@@ -1,4 +1,4 @@
-"""Hilbert spaces: the inner product that norms, adjoints, projections and constants refer to."""
+"""Hilbert spaces, with the inner products of norms, adjoints, projections and constants."""
 
 from .abstract import AbstractSpace as AbstractSpace
 from .euclidean import Euclidean as Euclidean

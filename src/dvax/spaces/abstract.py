@@ -1,4 +1,4 @@
-"""What a Hilbert space owes."""
+"""The abstract Hilbert space."""
 
 import abc
 
@@ -16,24 +16,24 @@ class AbstractSpace(eqx.Module):
 
     @abc.abstractmethod
     def inner(self, a: Tree, b: Tree) -> jax.Array:
-        """The inner product ⟨a, b⟩, a scalar."""
+        """Return the inner product ⟨a, b⟩, a scalar."""
 
     @abc.abstractmethod
     def zeros(self) -> Tree:
-        """The zero element; its structure is the structure of every element."""
+        """Return the zero element; every element has its structure and shapes."""
 
     @abc.abstractmethod
     def weights(self) -> Tree:
-        """The diagonal weights w with ⟨a, b⟩ = Σ wᵢ aᵢ bᵢ, broadcastable to an element."""
+        """Return the weights w with ⟨a, b⟩ = Σ wᵢ aᵢ bᵢ, which broadcast to an element."""
 
     def norm(self, a: Tree) -> jax.Array:
-        """‖a‖ = √⟨a, a⟩. Its derivative at 0 is taken as 0, not NaN."""
+        """Return ‖a‖ = √⟨a, a⟩, with the derivative 0 (not NaN) at 0."""
         square = self.inner(a, a)
-        zero = square == 0  # not "positive": NaN is neither, and must come out as NaN
+        zero = square == 0  # false for NaN, which propagates
         return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, square)))
 
     def size(self) -> jax.Array:
-        """‖1‖² = Σ wᵢ: what turns a norm into a root mean square."""
+        """Return ‖1‖² = Σ wᵢ; a norm divided by its square root is a root mean square."""
         ones = jax.tree_util.tree_map(jnp.ones_like, self.zeros())
         return self.inner(ones, ones)
 
@@ -45,7 +45,7 @@ class AbstractSpace(eqx.Module):
                     name,
                     f"shape {_tree.shapes(a)}",
                     f"it must be an element of {self!r}, of shape {_tree.shapes(self.zeros())}",
-                    f"Give {name} that shape, or name the space that you mean "
-                    "(state_space= or control_space= of dvax.Problem)",
+                    f"Give {name} that shape, or pass another state_space= or control_space= to "
+                    "dvax.Problem",
                 )
             )

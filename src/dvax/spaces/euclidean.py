@@ -1,4 +1,4 @@
-"""ℝⁿ, or any array shape, with the dot product."""
+"""Euclidean spaces of arrays of any shape."""
 
 from collections.abc import Sequence
 from typing import SupportsIndex
@@ -12,9 +12,9 @@ from .abstract import AbstractSpace
 
 
 class Euclidean(AbstractSpace):
-    """Arrays of one shape with ⟨a, b⟩ = Σ aᵢ bᵢ.
+    """The space of arrays of a given shape with ⟨a, b⟩ = Σ aᵢ bᵢ.
 
-    **Arguments:** `shape`: the arrays' shape; an integer n means `(n,)`, nothing means a scalar.
+    **Arguments:** `shape`: the shape; an integer n means `(n,)`, and the default is a scalar.
 
     ```python
     >>> import dvax, jax.numpy as jnp

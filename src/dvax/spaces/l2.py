@@ -1,4 +1,4 @@
-"""L² on points with quadrature weights (a lumped mass matrix is the same thing)."""
+"""L² with quadrature weights, or equivalently a lumped mass matrix."""
 
 from typing import Any
 
@@ -12,11 +12,11 @@ from .abstract import AbstractSpace
 
 
 class L2(AbstractSpace):
-    """Arrays of values at quadrature points with ⟨a, b⟩ = Σ wᵢ aᵢ bᵢ, the rule for ∫ a b.
+    """The space of values at quadrature points with ⟨a, b⟩ = Σ wᵢ aᵢ bᵢ ≈ ∫ a b.
 
     **Arguments:** `weights`: positive, one a point; their sum is the measure of the domain.
 
-    **Raises:** `dvax.InputError` where a weight is not positive and finite.
+    **Raises:** `dvax.InputError` if a weight is not positive and finite.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -36,7 +36,7 @@ class L2(AbstractSpace):
             "dvax.spaces.L2(weights)",
             self.w,
             "quadrature weights must be positive and finite, or ⟨·,·⟩ is no inner product",
-            "Drop the points that carry no weight",
+            "Remove the points with weight 0",
         )
 
     def inner(self, a: Tree, b: Tree) -> jax.Array:

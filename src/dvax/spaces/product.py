@@ -1,4 +1,4 @@
-"""Direct sums: elements are tuples."""
+"""Direct sums of spaces, whose elements are tuples."""
 
 import jax
 

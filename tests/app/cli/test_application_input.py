@@ -39,7 +39,7 @@ def write(folder: Path, text: str, netlist: str = TANK) -> Path:
 REFUSED: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     "short source": (
         CIRCUIT, TANK + "R1 1 2 1k\nV1 2 0 PWL(0 0 1m 5)\n",
-        {"a.cir, line 5": ("V1, which is known from 0 to 0.001 s", "t_end = 0.001")},
+        {"a.cir, line 5": ("V1, which is defined from 0 to 0.001 s", "t_end = 0.001")},
     ),
     "word twice": (CIRCUIT, "C1 1 0 1u IC=1 IC=2\n", {"a.cir, line 1": ("IC=1 and IC=2",)}),
     "nothing in time": (
@@ -62,7 +62,7 @@ REFUSED: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     ),
     "flow alone": (
         FRAME + 'viscosity_ratio = "10 ms"\n', TANK,
-        {"a.toml: model.viscosity_ratio": ("given: 0.01", "stays elastic", "Leave it out")},
+        {"a.toml: model.viscosity_ratio": ("given: 0.01", "is elastic", "Omit it")},
     ),
     "points of interest": (
         FRAME + "[output]\npoints_of_interest = [1.0]\n", TANK,
@@ -113,7 +113,7 @@ REFUSED: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     ),
     "no duration": (
         ROADS + INCIDENT.replace("1.0", "2.0"), TANK,
-        {"a.toml: model.incidents[1].start, model.incidents[1].end": ("it begins before it ends",)},
+        {"a.toml: model.incidents[1].start, model.incidents[1].end": ("start < end must hold",)},
     ),
 }  # fmt: skip
 NEED_FEM = {
@@ -122,7 +122,7 @@ NEED_FEM = {
     ),
     "too many layers": (
         BODY.replace("layers = 2", "layers = 300"),
-        {"a.toml: model.layers, model.growth": ("no area to rounding", "Take fewer layers or")},
+        {"a.toml: model.layers, model.growth": ("roundoff dominates the area", "Use fewer layers or")},
     ),
     "a mesh and sizes": (
         BODY + 'mesh = "a.msh"\n',

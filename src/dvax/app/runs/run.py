@@ -108,7 +108,7 @@ class AbstractRun(abc.ABC):
         except InputError as error:
             status, code, reason = "failed", 2, str(error)
         except SolveError as error:
-            status, code, reason = "failed", 3, error.told(self.wording.fix)
+            status, code, reason = "failed", 3, error.message(self.wording.fix)
         except BaseException as error:
             # The run has ended, and its manifest says so.
             with suppress(OSError):  # a full disk may be the error itself

@@ -1,4 +1,4 @@
-"""A rectangle with a mesh that is fine where a punch meets it."""
+"""A graded mesh of a rectangle, refined under the punch."""
 
 import math
 from typing import Any
@@ -8,7 +8,8 @@ import numpy as np
 from ...errors import InputProblem, Problems
 from ...formats.optional import needed
 
-_FLAT = 1e-9
+_MIN_ASPECT_RATIO = 1e-9
+"""Smallest ratio of the sides of an element; below, its area is dominated by roundoff."""
 
 
 def block(
@@ -20,15 +21,14 @@ def block(
     layers: Any = 21,
     growth: Any = 1.18,
 ) -> Any:
-    """The rectangle |x| ≤ width/2, −height ≤ y ≤ 0 of quadrilaterals, symmetric about x = 0, the top
-    named "contact" and the bottom "clamped".
+    """Return a mesh of the rectangle |x| ≤ width/2, −height ≤ y ≤ 0, symmetric about x = 0.
 
-    On each side `fine` columns of one width reach out to `fine_half_width`, and `coarse` ones from
-    there to the edge, whose ends are in geometric progression. The `layers` grow downward, each
-    `growth` times as high as the one above. The reference meshes are (fine, coarse, layers) =
-    (10, 4, 17), (20, 9, 21), (40, 19, 25).
+    The boundary "contact" is the top, and "clamped" the bottom. On each side of x = 0 there are `fine`
+    columns of equal width up to `fine_half_width`, and `coarse` columns with abscissae in geometric
+    progression up to the edge. Each of the `layers` is `growth` times as high as the one above. The
+    reference meshes have (fine, coarse, layers) = (10, 4, 17), (20, 9, 21) and (40, 19, 25).
 
-    **Raises:** `dvax.InputError` for every size that breaks its rule.
+    **Raises:** `dvax.InputError` with all invalid sizes.
 
     **Returns:** a scikit-fem `MeshQuad`.
     """
@@ -52,8 +52,8 @@ def block(
         wrong.append(
             _problem(
                 "fine_half_width", fine_half_width,
-                f"it must be less than half of the width, {width / 2:g}: the coarse columns lie "
-                "between the two", "Make the block wider or the fine zone narrower",
+                f"it must be less than half of the width, {width / 2:g}, where the coarse columns end",
+                "Make the block wider or the fine zone narrower",
             )
         )  # fmt: skip
     wrong.raise_any()
@@ -67,25 +67,26 @@ def block(
     _check_sides(np.diff(right), np.diff(y))
     mesh = skfem.MeshQuad.init_tensor(np.concatenate([-right[::-1], right[1:]]), y)
     middle = mesh.p[1, mesh.facets].mean(axis=0)
-    # The ends of y are exact, and a facet in between is not near them.
+    # The first and the last value of y are exact, so they can be compared by equality.
     return mesh.with_boundaries(
         {"contact": np.flatnonzero(middle == 0.0), "clamped": np.flatnonzero(middle == y[0])}
     )
 
 
 def _check_sides(columns: np.ndarray, layers: np.ndarray) -> None:
-    """Refuse sizes that make elements so flat that they have no area to rounding."""
+    """Raise an `InputError` if elements are so flat that roundoff dominates their area."""
     wrong = Problems(
         InputProblem(
             f"dvax.models.ElasticBody({', '.join(f'mesh[{key!r}]' for key in keys)})",
-            f"elements {thin:.1e} by {long:.1e}", "no side is 10⁹ times the other: there is no area to "
-            "rounding", fix,
+            f"elements {thin:.1e} by {long:.1e}", "the ratio of the sides must be below 10⁹, or "
+            "roundoff dominates the area", fix,
         )
         for keys, thin, long, fix in (
-            (("layers", "growth"), layers.min(), columns.max(), "Take fewer layers or a growth near 1"),
+            (("layers", "growth"), layers.min(), columns.max(),
+             "Use fewer layers or a growth closer to 1"),
             (("fine_half_width", "fine"), columns.min(), layers.max(), "Make the fine zone wider"),
         )
-        if not thin > _FLAT * long
+        if not thin > _MIN_ASPECT_RATIO * long
     )  # fmt: skip
     wrong.raise_any()
 

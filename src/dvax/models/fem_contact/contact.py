@@ -1,4 +1,4 @@
-"""The Kelvin–Voigt body under a rigid punch, with a normal compliance of finite pressure."""
+"""A Kelvin–Voigt body under a rigid punch, with normal compliance and a pressure cap."""
 
 import math
 import os
@@ -23,21 +23,21 @@ from ...theory import Constants
 from ...vi import AbstractSolver
 from ..contact import ACTIVE, SATURATED, UNLOADED
 from .body import ElasticBody
+from .equilibrium import Equilibrium, Law, solve_equilibrium
 from .fields import write
-from .rest import Equilibrium, Law, at_rest
 
 RAMP = 2.0
-"""Time over which a punch is pressed in where only the depth is given."""
+"""Default duration of the indentation ramp."""
 
-_STIFF = 2000.0
-"""Up to this rate, in 1/τ, many short steps cost less than few that form a matrix exponential."""
+_MAX_EXPLICIT_RATE = 2000.0
+"""Up to this rate, in 1/τ, many short explicit steps cost less than few with a matrix exponential."""
 
-_EXPONENTIAL = 256
-"""Up to so many states `ExpRosenbrock` forms a matrix."""
+_MAX_DENSE_STATES = 256
+"""Largest number of states for `ExpRosenbrock`, which forms a dense matrix."""
 
 
 class FemContact(eqx.Module):
-    """A block of Kelvin–Voigt material under a rigid parabolic punch, quasistatic.
+    """A Kelvin–Voigt body under a rigid parabolic punch, quasistatic.
 
         𝒜x' + ℬx = −γ_ν* p in V',    𝒜 = τℬ,    p = βu on Γ_C
         u ∈ γ_ν x − g(t) − b_u u − N_K(βu),    K = {0 ≤ p ≤ κ₀},    U = L²(Γ_C)
@@ -49,25 +49,27 @@ class FemContact(eqx.Module):
 
         A = −𝒜⁻¹ℬ = −I/τ,    P = βI,    f = −𝒜⁻¹γ_ν* P u,    h = γ_ν x − g(t) − b_u u.
 
-    **The state.** The law sees and moves x in V₁ = (ker γ_ν)^⊥ alone, which A leaves invariant; in
-    ker γ_ν every displacement decays as e^{−t/τ} by itself. So x stands here for its coordinates in
-    an orthonormal basis of V₁ (`ElasticBody.trace`): nothing is approximated, norms are those of V,
-    and the bulk is `displacement(x)`. f and h are then −Tᵀ W P u/√τ and Tx/√τ − g − b_u u.
+    **The state.** The law couples only to the component of x in V₁ = (ker γ_ν)^⊥, which is invariant
+    under A. The component in ker γ_ν decays independently as e^{−t/τ}. The state x of the model holds
+    the coordinates in an orthonormal basis of V₁ (`ElasticBody.trace`). This is no approximation; norms
+    are those of V, and `displacement(x)` returns the full field. In these coordinates f and h are
+    −Tᵀ W P u/√τ and Tx/√τ − g − b_u u.
 
     **Arguments:**
 
-    - `body`: an `ElasticBody`, which carries the mesh and the elastic moduli;
-    - `indentation`: the depth δ that is reached on a ramp over `ramp` (2 units of time by default), or
-      the history δ(t): one of `dvax.signals`, or a callable of t;
+    - `body`: an `ElasticBody` with the mesh and the elastic moduli;
+    - `indentation`: the final depth δ of a linear ramp of the duration `ramp` (default 2), or the
+      history δ(t): one of `dvax.signals`, or a callable of t;
     - `stiffness`: β > 0, in [p]/[x]; `pressure_cap`: κ₀ > 0 in [p], ∞ for none;
-    - `radius`: R > 0 of the punch, ∞ for a flat one; `centre`: where its axis is, the middle of Γ_C
-      by default; `relaxation_time`: τ > 0; `b_u` ≥ 0: feedback of the response on itself.
+    - `radius`: R > 0 of the punch, ∞ for a flat one; `centre`: the position of its axis, by default
+      the middle of Γ_C; `relaxation_time`: τ > 0; `b_u` ≥ 0: feedback of the response on itself.
 
-    **Raises:** `dvax.InputError` for every parameter that breaks its rule.
+    **Raises:** `dvax.InputError` with all invalid parameters.
 
     Lengths are in one unit [x], pressures and moduli in one [p], times in one [t]; a force is in
-    [p][x], for a slice of unit thickness. The constants are proved (docs/models/fem-contact.md): the
-    paper's rate ω + ML̃ is positive by far, βc₁/τ − 1/τ, and the flow contracts with 1/τ all the same.
+    [p][x], for a slice of unit thickness. The constants are proved (docs/models/fem-contact.md). The
+    growth rate ω + ML̃ of the paper is positive and large, βc₁/τ − 1/τ, but the flow contracts with
+    the rate 1/τ.
 
     ```python
     >>> import jax, dvax
@@ -87,10 +89,10 @@ class FemContact(eqx.Module):
     body: ElasticBody = eqx.field(static=True)
     trace: jax.Array
     weights: jax.Array
-    lean: jax.Array
+    vertical_normal: jax.Array
     gap: jax.Array
     depth: AbstractSignal
-    final: jax.Array | None
+    final_depth: jax.Array | None
     beta: jax.Array
     kappa0: jax.Array
     tau: jax.Array
@@ -116,40 +118,44 @@ class FemContact(eqx.Module):
         if centre is None:
             centre = 0.5 * float(body.points[:, 0].min() + body.points[:, 0].max())
         numbers["centre"] = centre
-        found: dict[str, jax.Array] = {}
+        values: dict[str, jax.Array] = {}
         wrong = Problems()
         for name, value in numbers.items():
             with wrong.collect():
-                found[name] = _number(name, value)
+                values[name] = _number(name, value)
         with wrong.collect():
-            self.depth, self.final = _history(indentation, ramp)
+            self.depth, self.final_depth = _history(indentation, ramp)
         wrong.raise_any()
         self.body = body
         self.trace, self.weights = jnp.asarray(body.trace), jnp.asarray(body.weights)
-        self.lean = jnp.asarray(body.normals[:, 1])
-        s, y = jnp.asarray(body.points[:, 0]) - found["centre"], jnp.asarray(body.points[:, 1])
-        self.gap = self.lean * (s**2 / (2.0 * found["radius"]) + (body.top - y))
-        self.beta, self.kappa0 = found["stiffness"], found["pressure_cap"]
-        self.tau, self.b_u = found["relaxation_time"], found["b_u"]
+        self.vertical_normal = jnp.asarray(body.normals[:, 1])
+        s, y = jnp.asarray(body.points[:, 0]) - values["centre"], jnp.asarray(body.points[:, 1])
+        self.gap = self.vertical_normal * (s**2 / (2.0 * values["radius"]) + (body.top - y))
+        self.beta, self.kappa0 = values["stiffness"], values["pressure_cap"]
+        self.tau, self.b_u = values["relaxation_time"], values["b_u"]
 
     @property
     def problem(self) -> Problem:
-        """The coupled system: A = −I/τ, P = βI, K = [0, κ₀], states Euclidean, U = L²(Γ_C)."""
+        """The problem with A = −I/τ, P = βI, K = [0, κ₀], a Euclidean state space, U = L²(Γ_C)."""
         return Problem(
             A=Scalar(-1.0 / _tree.host(self.tau)),
             P=Scaling(self.beta),
             K=Box(0.0, self.kappa0),
-            f=_Push(self.trace, self.weights, self.beta, self.tau),
-            h=_Penetration(self.trace, self.gap, self.lean, self.depth, self.tau, self.b_u),
+            f=_PressureRate(self.trace, self.weights, self.beta, self.tau),
+            h=_Penetration(
+                self.trace, self.gap, self.vertical_normal, self.depth, self.tau, self.b_u
+            ),
             state_space=Euclidean(self.trace.shape[1]),
             control_space=L2(self.weights),
         )
 
     @property
     def constants(self) -> Constants:
-        """γ = L_F = (1+b_u)/β, α_h = ‖γ_ν‖ = √(c₁/τ) with c₁ = ‖C‖, β_h = b_u, α_f = 0,
-        β_f = β‖γ_ν‖, M = 1, ω = −1/τ, m_P = ‖P⁻¹‖ = 1/β, and the one-sided rate μ = −1/τ: what the
-        contact adds, −⟨Δp, γ_νΔx⟩ ≤ −(1+b_u)/β ‖Δp‖², has one sign."""
+        """The proved constants.
+
+        γ = L_F = (1+b_u)/β, α_h = ‖γ_ν‖ = √(c₁/τ) with c₁ = ‖C‖, β_h = b_u, α_f = 0, β_f = β‖γ_ν‖,
+        M = 1, ω = −1/τ, m_P = ‖P⁻¹‖ = 1/β. The one-sided rate is μ = −1/τ, since the contact term
+        −⟨Δp, γ_νΔx⟩ ≤ −(1+b_u)/β ‖Δp‖² is never positive."""
         beta, tau, b_u = _tree.host((self.beta, self.tau, self.b_u))
         norm = (self.body.compliance[0] / tau) ** 0.5
         return Constants(
@@ -169,42 +175,46 @@ class FemContact(eqx.Module):
 
     @property
     def steady_constants(self) -> tuple[Any, Any]:
-        """(γ, L_F) of the law at rest, F(p) = (1+b_u)p/β + Cp + g: ((1+b_u)/β, (1+b_u)/β + c₁), since
-        0 ≤ C ≤ c₁."""
+        """(γ, L_F) of the static law F(p) = (1+b_u)p/β + Cp + g.
+
+        They are ((1+b_u)/β, (1+b_u)/β + c₁), since 0 ≤ C ≤ c₁."""
         beta, b_u = _tree.host((self.beta, self.b_u))
         gamma = (1.0 + b_u) / beta
         return gamma, gamma + self.body.compliance[0]
 
     @property
     def fit(self) -> str:
-        """How the model lies in the class."""
+        """How the model relates to the class of the theory."""
         return "exact"
 
     @property
     def untouched(self) -> jax.Array:
-        """The state of a body that nothing has touched."""
+        """The state without displacement, zeros."""
         return jnp.zeros_like(self.trace[0])
 
     @property
     def method(self) -> ETD2RK | ExpRosenbrock | Implicit:
-        """What to solve with. The law makes a rate 1 + βc₁/(1+b_u) of 1/τ. Up to 2000: `ETD2RK`, whose
-        steps are as short as that and cost two products with T, and whose error bound is proved.
-        Beyond: `ExpRosenbrock`, exact between kinks, up to 256 states; then `Implicit`."""
+        """The recommended method, which depends on the fastest rate (1 + βc₁/(1+b_u))/τ.
+
+        Up to 2000/τ it is `ETD2RK`, with steps of the order of the inverse rate that cost two products
+        with T, and with a proved error bound. Beyond, it is `ExpRosenbrock`, which is exact between
+        kinks, for up to 256 states, and `Implicit` for more."""
         beta, b_u = float(self.beta), float(self.b_u)
-        if 1.0 + beta * self.body.compliance[0] / (1.0 + b_u) <= _STIFF:
+        if 1.0 + beta * self.body.compliance[0] / (1.0 + b_u) <= _MAX_EXPLICIT_RATE:
             return ETD2RK()
-        return ExpRosenbrock() if self.trace.shape[1] <= _EXPONENTIAL else Implicit()
+        return ExpRosenbrock() if self.trace.shape[1] <= _MAX_DENSE_STATES else Implicit()
 
     def penetration(self, t: Any, x: Any) -> jax.Array:
-        """γ_ν x − g(t), positive where the bodies overlap, at the points of Γ_C."""
-        return (self.trace @ x) / jnp.sqrt(self.tau) - self.gap + self.lean * self.depth(t)
+        """Return γ_ν x − g(t) at the points of Γ_C, positive where the bodies overlap."""
+        normal_displacement = (self.trace @ x) / jnp.sqrt(self.tau)
+        return normal_displacement - self.gap + self.vertical_normal * self.depth(t)
 
     def pressure(self, t: Any, x: Any) -> jax.Array:
-        """p = proj_{[0,κ₀]}(β(γ_ν x − g(t))/(1+b_u))."""
+        """Return p = proj_{[0,κ₀]}(β(γ_ν x − g(t))/(1+b_u))."""
         return jnp.clip(self._drive(t, x), 0.0, self.kappa0)
 
     def regimes(self, t: Any, x: Any) -> jax.Array:
-        """0 apart, 1 in contact, 2 at the cap."""
+        """Return 0 where separated, 1 where in contact, 2 where at the cap."""
         drive = self._drive(t, x)
         regime = jnp.where(
             drive <= 0.0, UNLOADED, jnp.where(drive >= self.kappa0, SATURATED, ACTIVE)
@@ -214,55 +224,61 @@ class FemContact(eqx.Module):
     def equilibrium(
         self, indentation: Any = None, *, solver: AbstractSolver | None = None, tol: Any = 1e-9
     ) -> Equilibrium:
-        """The state at rest under a punch held at the depth `indentation`, by default the end of the
-        ramp. There γ_ν x = −Cp, so p solves VI(K, F) with F(p) = (1+b_u)p/β + Cp + g; `tol` is on
-        its true error in L²(Γ_C), relative to the largest pressure that the punch could cause,
+        """Return the static equilibrium at the depth `indentation`, by default the final one.
+
+        There γ_ν x = −Cp, so p solves VI(K, F) with F(p) = (1+b_u)p/β + Cp + g. `tol` bounds the error
+        of p in L²(Γ_C), relative to the largest pressure that the punch could cause,
         min(κ₀, βδ/(1+b_u)). `solver`: `dvax.vi.ActiveSet` by default.
 
-        **Raises:** `dvax.InputError` where a history is given as a function of time and no depth.
+        **Raises:** `dvax.InputError` if the model has a history and no depth is given.
         """
-        given = self.final if indentation is None else indentation
+        given = self.final_depth if indentation is None else indentation
         if given is None:
-            raise _refused(
-                "indentation", "a history and, for the equilibrium, no depth",
-                "a history need not come to rest", "Call equilibrium(depth) with a depth to hold",
+            raise _error(
+                "indentation", "a history, and no depth for the equilibrium",
+                "a history has no final depth", "Call equilibrium(depth) with a constant depth",
             )  # fmt: skip
         depth = _tree.as_float(given, "indentation")
         law = Law(
-            self.trace, self.weights, self.gap - self.lean * depth,
+            self.trace, self.weights, self.gap - self.vertical_normal * depth,
             self.beta / (1.0 + self.b_u), self.kappa0,
         )  # fmt: skip
-        found = at_rest(law, float(self.body.compliance[0]), solver, tol)
-        x = -jnp.sqrt(self.tau) * ((self.weights * found.y) @ self.trace)
-        return Equilibrium(found.y, x, found)
+        vi = solve_equilibrium(law, float(self.body.compliance[0]), solver, tol)
+        x = -jnp.sqrt(self.tau) * ((self.weights * vi.y) @ self.trace)
+        return Equilibrium(vi.y, x, vi)
 
     def figures(self, pressure: Any) -> dict[str, float]:
-        """The headline figures of a pressure on Γ_C: `force`, the resultant against the punch, in
-        [p][x]; `contact_half_width`, half of the way between the outermost points under pressure;
-        `saturated_length`, the measure of the points at κ₀, in [x]; `peak_pressure`, in [p]."""
+        """Return the results for a pressure on Γ_C.
+
+        `force`: the resultant on the punch, in [p][x]; `contact_half_width`: half of the distance
+        between the outermost points in contact; `saturated_length`: the measure of the points at κ₀,
+        in [x]; `peak_pressure`, in [p]."""
         p, w, s = np.asarray(pressure), self.body.weights, self.body.points[:, 0]
-        under = s[p > 0]
+        in_contact = s[p > 0]
         return {
             "force": float(np.sum(w * self.body.normals[:, 1] * p)),
-            "contact_half_width": 0.5 * float(np.ptp(under)) if under.size else 0.0,
+            "contact_half_width": 0.5 * float(np.ptp(in_contact)) if in_contact.size else 0.0,
             "saturated_length": float(np.sum(w[p >= float(self.kappa0)])),
             "peak_pressure": float(p.max()),
         }
 
     def displacement(self, x: Any) -> np.ndarray:
-        """The displacement of every node of the body, (n, 2), for a state x; its part in ker γ_ν, which
-        a body that was at rest has not, left out."""
+        """Return the displacement of every node of the body, (n, 2), for a state x.
+
+        Its component in ker γ_ν is omitted; it is zero for a body that is initially undeformed."""
         return self.body.displacement(np.asarray(x) / math.sqrt(float(self.tau)))
 
     def stress(self, t: Any, x: Any) -> np.ndarray:
-        """The means over the elements of the stress ℬε(x) + 𝒜ε(x'), elastic and viscous: σ_xx, σ_yy,
-        σ_zz, σ_xy. With 𝒜 = τℬ it balances p(t) as an elastic stress at rest would."""
-        return self.body.stress(self.body.pushed(self.pressure(t, x)))
+        """Return the element means σ_xx, σ_yy, σ_zz, σ_xy of the stress ℬε(x) + 𝒜ε(x').
+
+        With 𝒜 = τℬ it equals the elastic stress of a static body under the pressure p(t)."""
+        return self.body.stress(self.body.displacement_under(self.pressure(t, x)))
 
     def write(self, path: str | os.PathLike[str], t: Any, x: Any) -> tuple[Path, Path]:
-        """The fields at time t as two files that ParaView opens, .vtu or .vtk: the body with its
-        displacement and stress, and beside it, "-contact" in its name, the points of Γ_C with
-        pressure, penetration and regime. Returns the two paths."""
+        """Write the fields at time t to two files, .vtu or .vtk, and return their paths.
+
+        The first has the body with its displacement and stress. The second, NAME-contact, has the
+        points of Γ_C with pressure, penetration and regime."""
         contact = {
             "pressure": np.asarray(self.pressure(t, x)),
             "penetration": np.asarray(self.penetration(t, x)),
@@ -274,7 +290,7 @@ class FemContact(eqx.Module):
         return self.beta / (1.0 + self.b_u) * self.penetration(t, x)
 
 
-class _Push(eqx.Module):
+class _PressureRate(eqx.Module):
     """f = −𝒜⁻¹γ_ν* P u, in coordinates."""
 
     trace: jax.Array
@@ -291,18 +307,19 @@ class _Penetration(eqx.Module):
 
     trace: jax.Array
     gap: jax.Array
-    lean: jax.Array
+    vertical_normal: jax.Array
     depth: AbstractSignal
     tau: jax.Array
     b_u: jax.Array
 
     def __call__(self, t: Any, x: Any, u: Any, args: Any) -> jax.Array:
-        seen = (self.trace @ x) / jnp.sqrt(self.tau)
-        return seen - self.gap + self.lean * self.depth(t) - self.b_u * u
+        normal_displacement = (self.trace @ x) / jnp.sqrt(self.tau)
+        penetration = normal_displacement - self.gap + self.vertical_normal * self.depth(t)
+        return penetration - self.b_u * u
 
 
 class _Ramp(eqx.Module):
-    """δ(t), straight up to its end and constant from there."""
+    """δ(t), a linear ramp followed by a constant."""
 
     depth: jax.Array
     time: float = eqx.field(static=True)
@@ -312,23 +329,23 @@ class _Ramp(eqx.Module):
 
 
 def _history(value: Any, ramp: Any) -> tuple[AbstractSignal, jax.Array | None]:
-    """δ(t), and its last value where that is known."""
+    """Return δ(t), and its final value for a ramp."""
     if isinstance(value, AbstractSignal) or callable(value):
         if ramp is not None:
-            raise _refused("ramp", repr(ramp), "a history of indentation has its own times",
-                           "Leave it out")  # fmt: skip
+            raise _error("ramp", repr(ramp), "a history of indentation has no ramp",
+                         "Omit it")  # fmt: skip
         return value if isinstance(value, AbstractSignal) else Function(value), None
     depth = _number("indentation", value)
     time = RAMP if ramp is None else ramp
     if isinstance(time, bool) or not isinstance(time, int | float) or not 0 < time < math.inf:
-        raise _refused("ramp", repr(time), "it must be a positive number, a time",
-                       "Give a short one for a sudden indentation")  # fmt: skip
+        raise _error("ramp", repr(time), "it must be a positive number, a duration",
+                     "Give a small one for a sudden indentation")  # fmt: skip
     return Function(_Ramp(depth, float(time)), knots=[float(time)]), depth
 
 
 _RULES: dict[str, tuple[Any, str]] = {
-    "stiffness": (lambda v: 0 < v < math.inf, "it must be a positive number, the compliance's 1/β > 0 "
-                  "being what makes the law strongly monotone"),
+    "stiffness": (lambda v: 0 < v < math.inf, "it must be a positive number: the law is strongly "
+                  "monotone with 1/β"),
     "pressure_cap": (lambda v: v > 0, "it must be positive (∞ for no cap)"),
     "radius": (lambda v: v > 0, "it must be positive (∞ for a flat punch)"),
     "relaxation_time": (lambda v: 0 < v < math.inf, "it must be a positive number, viscosity over "
@@ -343,11 +360,11 @@ def _number(name: str, value: Any) -> jax.Array:
     number = _tree.as_float(value, f"dvax.models.FemContact({name})")
     holds, rule = _RULES[name]
     if jnp.ndim(number) != 0:
-        raise _refused(name, f"an array of shape {jnp.shape(number)}", rule, "Give one number")
+        raise _error(name, f"an array of shape {jnp.shape(number)}", rule, "Give one number")
     if _tree.is_concrete(number) and not holds(float(number)):
-        raise _refused(name, f"{float(number):g}", rule, "Fix the value, or its unit")
+        raise _error(name, f"{float(number):g}", rule, "Correct the value, or its unit")
     return number
 
 
-def _refused(name: str, given: str, rule: str, fix: str) -> InputError:
+def _error(name: str, given: str, rule: str, fix: str) -> InputError:
     return input_error(f"dvax.models.FemContact({name})", given, rule, fix)

@@ -1,4 +1,4 @@
-"""The fields of a body for ParaView and its kin."""
+"""Files with the fields of a body, for ParaView."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +10,7 @@ from ...errors import input_error
 from ...formats.optional import needed
 from .body import ElasticBody
 
-_ENDINGS = (".vtu", ".vtk")
+_EXTENSIONS = (".vtu", ".vtk")
 
 
 def write(
@@ -20,17 +20,20 @@ def write(
     stress: np.ndarray,
     contact: Mapping[str, np.ndarray],
 ) -> tuple[Path, Path]:
-    """Two files: the elements with the displacement of their nodes, and stress and von Mises' stress as
-    means of each; and beside it the contact points with the fields of `contact`.
+    """Write the fields of the body and those of its contact points; return the two paths.
 
-    **Raises:** `dvax.InputError` where the name has another ending than .vtu or .vtk, or its folder is
-    not there.
+    The first file has the elements with the displacements of their nodes and the element means of the
+    stress and the von Mises stress. The second, NAME-contact, has the contact points with the fields
+    of `contact`.
+
+    **Raises:** `dvax.InputError` if the extension is not .vtu or .vtk, or the folder does not exist.
     """
-    if path.suffix not in _ENDINGS or not path.parent.is_dir():
+    if path.suffix not in _EXTENSIONS or not path.parent.is_dir():
         raise input_error(
             "dvax.models.FemContact.write(path)", repr(str(path)),
-            f"it must be a name that ends on {' or '.join(_ENDINGS)}, in a folder that is there",
-            "Make the folder, or fix the name",
+            f"it must be a file name with the extension {' or '.join(_EXTENSIONS)} in an existing "
+            "folder",
+            "Create the folder, or correct the name",
         )  # fmt: skip
     meshio = needed("meshio")
     cells = body.cells()
@@ -41,26 +44,27 @@ def write(
         point_data={"displacement": _in_space(displacement)},
         cell_data={"stress": [_tensor(stress)], "von_mises": [von_mises(stress)]},
     ).write(path)
-    beside = path.with_name(f"{path.stem}-contact{path.suffix}")
+    contact_path = path.with_name(f"{path.stem}-contact{path.suffix}")
     points = np.arange(len(body.points))[:, None]
     meshio.Mesh(_in_space(body.points), [("vertex", points)], point_data=dict(contact)).write(
-        beside
+        contact_path
     )
-    return path, beside
+    return path, contact_path
 
 
 def von_mises(stress: Any) -> np.ndarray:
-    """√(½((σ_xx−σ_yy)² + (σ_yy−σ_zz)² + (σ_zz−σ_xx)²) + 3σ_xy²)."""
+    """Return √(½((σ_xx−σ_yy)² + (σ_yy−σ_zz)² + (σ_zz−σ_xx)²) + 3σ_xy²)."""
     xx, yy, zz, xy = np.asarray(stress).T
     return np.sqrt(0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) + 3 * xy**2)
 
 
 def _in_space(vectors: np.ndarray) -> np.ndarray:
+    """Return plane vectors with a third component 0."""
     return np.column_stack([vectors, np.zeros(len(vectors))])
 
 
 def _tensor(stress: np.ndarray) -> np.ndarray:
-    """The nine entries, row by row, as VTK keeps a tensor."""
+    """Return the nine entries of the tensor, row by row, as VTK expects."""
     xx, yy, zz, xy = stress.T
-    o = np.zeros_like(xx)
-    return np.stack([xx, xy, o, xy, yy, o, o, o, zz], axis=1)
+    zero = np.zeros_like(xx)
+    return np.stack([xx, xy, zero, xy, yy, zero, zero, zero, zz], axis=1)

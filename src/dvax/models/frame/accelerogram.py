@@ -1,4 +1,4 @@
-"""The ground's acceleration as it was recorded: evenly spaced samples, and lines between them."""
+"""Ground acceleration records: evenly spaced samples with linear interpolation."""
 
 import os
 from typing import Any
@@ -13,18 +13,18 @@ from ...formats.at2 import read_at2
 from ...signals import AbstractSignal
 
 GRAVITY = 9.80665 / 0.0254
-"""Standard gravity in in/s². Tables of the field often have 386.4 for it, which is 0.08 % more."""
+"""Standard gravity in in/s². Earthquake engineering often uses 386.4, which is 0.08 % larger."""
 
 
 class Accelerogram(AbstractSignal):
-    """a_g(t) in in/s², for samples in units of standard gravity, `step` seconds apart from t = 0 on.
+    """a_g(t) in in/s², from samples in units of standard gravity every `step` seconds from t = 0.
 
-    It is what `dvax.signals.Table(kind="linear")` is, but that the place of t is found by a division
-    and not by a search: ten thousand oscillators ask for it seven times a step.
+    It is a `dvax.signals.Table(kind="linear")` that finds the interval of t by a division instead of a
+    search, since response spectra evaluate it for thousands of oscillators seven times a step.
 
     **Arguments:** `step` in s, positive; `acceleration` in g, at least two samples.
 
-    **Raises:** `dvax.InputError` where the step is not positive, or samples are not finite.
+    **Raises:** `dvax.InputError` if the step is not positive or samples are not finite.
 
     ```python
     >>> from dvax.models import Accelerogram
@@ -44,19 +44,19 @@ class Accelerogram(AbstractSignal):
         wrong = Problems()
         if not (isinstance(step, float | int) and np.isfinite(step) and step > 0):
             wrong.add(
-                f"{name}(step)", repr(step), "it is a positive number of seconds",
+                f"{name}(step)", repr(step), "it must be a positive number of seconds",
                 "Give the time between two samples",
             )  # fmt: skip
         if samples.ndim != 1 or samples.size < 2:
             wrong.add(
                 f"{name}(acceleration)", f"shape {samples.shape}",
-                "it is a vector of at least two samples", "Give one number a sample",
+                "it must be a vector of at least two samples", "Give one number for each sample",
             )  # fmt: skip
         elif not np.all(np.isfinite(samples)):
             k = int(np.flatnonzero(~np.isfinite(samples))[0])
             wrong.add(
                 f"{name}(acceleration)", f"{samples[k]} at sample {k}",
-                "samples are finite: a gap is not a value", "Fill the gaps on purpose",
+                "all samples must be finite", "Fill the gaps explicitly",
             )  # fmt: skip
         wrong.raise_any()
         self.step = float(step)
@@ -64,10 +64,12 @@ class Accelerogram(AbstractSignal):
 
     @classmethod
     def from_at2(cls, path: str | os.PathLike[str]) -> "Accelerogram":
-        """The record of a file in the PEER strong-motion format: lines of description that say that
-        values are in g, a line such as `NPTS=  1559, DT= .02000 SEC`, and the values.
+        """Return the record of a file in the PEER strong-motion format.
 
-        **Raises:** `dvax.InputError` with the line of every flaw.
+        The file has lines of description that state the unit g, a line such as
+        `NPTS=  1559, DT= .02000 SEC`, and the values.
+
+        **Raises:** `dvax.InputError` with the lines of all errors.
         """
         return cls(*read_at2(path))
 
@@ -88,8 +90,11 @@ class Accelerogram(AbstractSignal):
 
 @jax.jit
 def dvax_linear_table(times: jax.Array, values: jax.Array, t: Any) -> jax.Array:
-    """Straight lines between evenly spaced times. It has the name of the function that it is, of
-    `dvax.signals.Table`: by that name `dvax.verify` knows what it encloses."""
+    """Interpolate linearly between evenly spaced times.
+
+    It has the name of the corresponding function of `dvax.signals.Table`, for which `dvax.programs`
+    has rules.
+    """
     first, width = times[0], times[1] - times[0]
     place = (t - first) / width
     k = jnp.clip(jnp.floor(place), 0.0, float(times.shape[0] - 2))

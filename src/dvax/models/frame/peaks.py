@@ -1,34 +1,34 @@
-"""The largest displacement between two samples, from what is known at both."""
+"""The largest displacement of a trajectory, between samples as well."""
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-_ROUNDS = 5
+_NEWTON_ITERATIONS = 5
 
 
-def largest(d: jax.Array, v: jax.Array, a: jax.Array, h: Any) -> jax.Array:
-    """max |d| over all times, for displacements d, velocities v and accelerations a at times h apart.
+def peak_displacement(d: jax.Array, v: jax.Array, a: jax.Array, h: Any) -> jax.Array:
+    """Return max |d| over all times, from displacements, velocities and accelerations every h.
 
-    Between two of them d is taken to be the quintic that fits all six numbers, and its extremum is
-    where its velocity, nearly a cubic, is zero. With ω h = 0.5 a sine is met within 10⁻⁷.
+    Between two samples d is the quintic Hermite interpolant. Its extremum is approximated by the zero
+    of the cubic interpolant of the velocity. For a sine with ω h = 0.5 the error is below 10⁻⁷.
     """
     d0, d1, v0, v1, a0, a1 = d[:-1], d[1:], v[:-1], v[1:], h * a[:-1], h * a[1:]
     # The cubic v₀ + s(a₀ + s(b + s c)) through both velocities and accelerations, s = (t − t₀)/h.
     rise = v1 - v0
     b, c = 3.0 * rise - 2.0 * a0 - a1, a0 + a1 - 2.0 * rise
-    turns = (v0 > 0) != (v1 > 0)
-    s = jnp.where(turns, v0 / jnp.where(turns, v0 - v1, 1.0), 0.0)
-    for _ in range(_ROUNDS):
+    has_extremum = (v0 > 0) != (v1 > 0)
+    s = jnp.where(has_extremum, v0 / jnp.where(has_extremum, v0 - v1, 1.0), 0.0)
+    for _ in range(_NEWTON_ITERATIONS):
         value, slope = v0 + s * (a0 + s * (b + s * c)), a0 + s * (2.0 * b + 3.0 * s * c)
         s = jnp.clip(s - value / jnp.where(slope != 0, slope, 1.0), 0.0, 1.0)
 
-    def moved(s: Any) -> Any:
+    def increment(s: Any) -> Any:
         return h * s * (v0 + s * (a0 / 2.0 + s * (b / 3.0 + s * c / 4.0)))
 
-    # What the cubic misses at the end, spread so that neither v nor a changes at the ends.
-    missed = d1 - d0 - moved(1.0)
-    top = d0 + moved(s) + missed * s**3 * (10.0 - s * (15.0 - 6.0 * s))
-    ends = jnp.max(jnp.abs(d))
-    return jnp.maximum(ends, jnp.max(jnp.where(turns, jnp.abs(top), 0.0)))
+    # Correct the integral of the cubic by a quintic that changes neither v nor a at the ends.
+    correction = d1 - d0 - increment(1.0)
+    extremum = d0 + increment(s) + correction * s**3 * (10.0 - s * (15.0 - 6.0 * s))
+    samples = jnp.max(jnp.abs(d))
+    return jnp.maximum(samples, jnp.max(jnp.where(has_extremum, jnp.abs(extremum), 0.0)))

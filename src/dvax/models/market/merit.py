@@ -1,4 +1,4 @@
-"""The law of firms that pool their units: merit order, in closed form."""
+"""A finite solver for the law of firms with several units, by merit order."""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -9,30 +9,30 @@ from jax import lax
 from ...errors import input_error
 from ...vi import RESULTS, AbstractSolver, Answer, FrozenVI
 
-_MOST = 120
-"""Rounds, of which sixty halve an interval of doubles to nothing."""
+_MAX_ITERATIONS = 120
+"""Twice the number of bisections that reduce an interval to adjacent floating-point numbers."""
 
 
 class MeritOrder(AbstractSolver):
-    """The solution of VI(K, F) for F(y)ᵢ = aᵢyᵢ + b Q_f + qᵢ, i ∈ f, on a box, to rounding.
+    """Solve VI(K, F) for F(y)ᵢ = aᵢyᵢ + b Q_f + qᵢ, i ∈ f, on a box, to roundoff.
 
-    Q_f = Σ_{i∈f} yᵢ is what the firm f of unit i makes. Given Q_f every unit is a clip,
-    yᵢ = clip(−(qᵢ + bQ_f)/aᵢ, lowerᵢ, upperᵢ), so a firm is one scalar equation
+    Q_f = Σ_{i∈f} yᵢ is the output of the firm f of unit i. Given Q_f, every unit is a clip,
+    yᵢ = clip(−(qᵢ + bQ_f)/aᵢ, lowerᵢ, upperᵢ), so each firm has one scalar equation
 
         g_f(Q) = Σ_{i∈f} clip(−(qᵢ + bQ)/aᵢ, lowerᵢ, upperᵢ) − Q = 0,
 
-    strictly falling and linear in pieces. Newton's method, all firms at once, starts from the guess and
-    stops where a step ends in the piece that it was computed for, which is then solved exactly; a step
-    that leaves the interval in which g_f is known to change its sign is replaced by its middle, so
-    that nothing can cycle. From a guess nearby that is one to three rounds of n clips, and no matrix,
-    where a factorisation of the free block takes n³/3 operations. The derivative is that of the last
-    formula, with the held units held.
+    which is strictly decreasing and piecewise linear. Newton's method, for all firms at once, starts
+    from the guess. It terminates when a step ends in the linear piece for which it was computed, and is
+    then exact. A step that leaves the bracketing interval is replaced by bisection, which excludes
+    cycles. From a close guess this takes one to three iterations of n clips, without a matrix, whereas
+    a factorisation of the inactive block takes n³/3 operations. The derivative is that of the final
+    formula with fixed active units.
 
-    **Arguments:** `slope`: a > 0, a vector; `coupling`: b > 0; `firms`: one row a unit and one column a
-    firm, 1 where the unit belongs to the firm and else 0.
+    **Arguments:** `slope`: a > 0, a vector; `coupling`: b > 0; `firms`: a matrix with one row a
+    unit and one column a firm, 1 if the unit belongs to the firm and else 0.
 
-    **Raises:** `dvax.InputError` where K is not a box of as many unknowns. That F is of this form is
-    the caller's word; what is found is put into F, and the result is `stalled` where it is no solution.
+    **Raises:** `dvax.InputError` if K is not a box with this number of unknowns. The caller must ensure
+    that F has this form. The solution is verified with F, and the result is `stalled` if it fails.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -62,22 +62,22 @@ class MeritOrder(AbstractSolver):
                 f"a {type(vi.K).__name__} and a guess of another shape than {self.slope.shape}"
                 if ends is not None
                 else f"a {type(vi.K).__name__}, which is not a box",
-                "every unit has a least and a greatest output, and a slope",
+                "K must be a box, with one unknown for each entry of slope",
                 "Use dvax.vi.Auto()",
             )
         q = vi.F(jnp.zeros_like(y0))
         z = self._unclipped(q, *ends, y0)
         y = vi.K.project(z, vi.space)
-        w = lax.stop_gradient(_outward(vi.F(y), y, *ends))
-        # What the largest terms of F may lose in rounding; F off its form leaves far more.
+        w = lax.stop_gradient(_smallest_residual(vi.F(y), y, *ends))
+        # The roundoff of the largest terms of F; an F of another form has a much larger residual.
         size = (
             jnp.max(jnp.abs(q))
             + jnp.max(self.slope * jnp.abs(y))
             + self.coupling * jnp.sum(jnp.abs(y))
         )
-        lost = jnp.max(jnp.abs(w)) <= 1e4 * jnp.finfo(q.dtype).eps * lax.stop_gradient(size)
+        solved = jnp.max(jnp.abs(w)) <= 1e4 * jnp.finfo(q.dtype).eps * lax.stop_gradient(size)
         residual = vi.space.norm(w)
-        result = RESULTS.where(lost, RESULTS.successful, RESULTS.stalled)
+        result = RESULTS.where(solved, RESULTS.successful, RESULTS.stalled)
         result = RESULTS.where(jnp.isfinite(residual), result, RESULTS.nonfinite)
         one = jnp.asarray(1)
         return Answer(y, lax.stop_gradient(z), residual, one, result, 2 * one)
@@ -85,55 +85,61 @@ class MeritOrder(AbstractSolver):
     def _unclipped(
         self, q: jax.Array, lower: jax.Array, upper: jax.Array, guess: jax.Array
     ) -> jax.Array:
-        """−(q + bQ)/a with the Q of the solution."""
-        held = lax.stop_gradient(self._held(*lax.stop_gradient((q, lower, upper, guess))))
-        Q = self._made(q, lower, upper, held)
+        """Return −(q + bQ)/a with the Q of the solution."""
+        active = lax.stop_gradient(self._active_set(*lax.stop_gradient((q, lower, upper, guess))))
+        Q = self._output(q, lower, upper, active)
         return -(q + self.coupling * (self.firms @ Q)) / self.slope
 
-    def _made(self, q: jax.Array, lower: jax.Array, upper: jax.Array, held: "_Held") -> jax.Array:
-        """Q of every firm where these units are held: the zero of its piece of g."""
+    def _output(
+        self, q: jax.Array, lower: jax.Array, upper: jax.Array, active: "_ActiveSet"
+    ) -> jax.Array:
+        """Return Q of every firm for a fixed active set: the zero of the linear piece of g."""
         firms, a = self.firms, self.slope
-        free = jnp.where(held.free[:, None], firms, 0.0)
-        bound = jnp.where(held.above, upper, lower)
-        pushed = jnp.sum(free * (-q / a)[:, None] + (firms - free) * bound[:, None], axis=0)
-        return pushed / (1.0 + self.coupling * jnp.sum(free / a[:, None], axis=0))
+        inactive = jnp.where(active.inactive[:, None], firms, 0.0)
+        bound = jnp.where(active.upper, upper, lower)
+        total = jnp.sum(inactive * (-q / a)[:, None] + (firms - inactive) * bound[:, None], axis=0)
+        return total / (1.0 + self.coupling * jnp.sum(inactive / a[:, None], axis=0))
 
-    def _held(self, q: jax.Array, lower: jax.Array, upper: jax.Array, guess: jax.Array) -> "_Held":
-        """Which units are free, and which of the others are at their upper bound."""
+    def _active_set(
+        self, q: jax.Array, lower: jax.Array, upper: jax.Array, guess: jax.Array
+    ) -> "_ActiveSet":
+        """Return the active set of the solution."""
         firms, a, b = self.firms, self.slope, self.coupling
 
-        def at(Q: jax.Array) -> tuple[jax.Array, _Held]:
+        def at(Q: jax.Array) -> tuple[jax.Array, _ActiveSet]:
             z = -(q + b * (firms @ Q)) / a
-            return z, _Held((z > lower) & (z < upper), z >= upper)
+            return z, _ActiveSet((z > lower) & (z < upper), z >= upper)
 
-        def go_on(state: tuple) -> jax.Array:
-            return state[-1] & (state[-2] < _MOST)
+        def unfinished(state: tuple) -> jax.Array:
+            return state[-1] & (state[-2] < _MAX_ITERATIONS)
 
         def advance(state: tuple) -> tuple:
             Q, low, high, count, _ = state
-            z, held = at(Q)
+            z, active = at(Q)
             excess = firms.T @ jnp.clip(z, lower, upper) - Q
             low, high = jnp.where(excess >= 0, Q, low), jnp.where(excess <= 0, Q, high)
-            new = self._made(q, lower, upper, held)
-            there = at(new)[1]
-            # The zero of a piece that lies in it is the zero of g.
-            moved = (there.free != held.free) | (there.above != held.above)
-            solved = firms.T @ jnp.where(moved, 1.0, 0.0) == 0
+            new = self._output(q, lower, upper, active)
+            new_active = at(new)[1]
+            # If the zero of a linear piece lies in that piece, it is the zero of g.
+            changed = (new_active.inactive != active.inactive) | (new_active.upper != active.upper)
+            solved = firms.T @ jnp.where(changed, 1.0, 0.0) == 0
             inside = (new > low) & (new < high)
             Q = jnp.where(solved | inside, new, 0.5 * (low + high))
             return Q, low, high, count + 1, ~jnp.all(solved)
 
         Q = firms.T @ jnp.clip(guess, lower, upper)
         start = (Q, firms.T @ lower, firms.T @ upper, jnp.asarray(0), jnp.asarray(True))
-        return at(lax.while_loop(go_on, advance, start)[0])[1]
+        return at(lax.while_loop(unfinished, advance, start)[0])[1]
 
 
-class _Held(NamedTuple):
-    free: jax.Array
-    above: jax.Array
+class _ActiveSet(NamedTuple):
+    """Which units are at no bound, and which are at their upper bound."""
+
+    inactive: jax.Array
+    upper: jax.Array
 
 
-def _outward(F: jax.Array, y: jax.Array, lower: jax.Array, upper: jax.Array) -> jax.Array:
-    """The least w ∈ F + N_K(y) at a point y of the box."""
+def _smallest_residual(F: jax.Array, y: jax.Array, lower: jax.Array, upper: jax.Array) -> jax.Array:
+    """Return the element w ∈ F + N_K(y) of smallest norm at a point y of the box."""
     w = jnp.where(y <= lower, jnp.minimum(F, 0.0), F)
     return jnp.where(y >= upper, jnp.where(y <= lower, 0.0, jnp.maximum(F, 0.0)), w)

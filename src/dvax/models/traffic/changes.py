@@ -1,4 +1,4 @@
-"""What changes with time: capacities by incidents, demand by a factor."""
+"""Time-dependent data: capacities with incidents, and demand with a factor."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,11 +17,11 @@ from ...signals import AbstractSignal, Constant, Function, Table
 
 
 class Incident(NamedTuple):
-    """The link from node `link[0]` to node `link[1]` has the share `remaining` of its capacity for
-    start ≤ t < end.
+    """A reduction of the capacity of a link for start ≤ t < end.
 
-    Incidents on one link at one time multiply. A share is positive: nobody knows what a closed link
-    costs, and a network without it is another network.
+    The link from node `link[0]` to node `link[1]` has the fraction `remaining` > 0 of its capacity.
+    The fractions of simultaneous incidents on one link multiply. A closed link has no finite cost;
+    model it by a network without the link.
 
     ```python
     >>> from dvax.models.traffic import Incident
@@ -37,8 +37,8 @@ class Incident(NamedTuple):
     end: float
 
 
-class _Cut(eqx.Module):
-    """The capacities at a time."""
+class _Capacity(eqx.Module):
+    """The capacities as a function of time."""
 
     base: jax.Array
     links: jax.Array
@@ -47,13 +47,13 @@ class _Cut(eqx.Module):
     end: jax.Array
 
     def __call__(self, t: Any) -> jax.Array:
-        now = (self.start <= t) & (t < self.end)
-        share = jnp.where(now, self.remaining, jnp.ones_like(self.remaining))
-        return self.base.at[self.links].multiply(share)
+        active = (self.start <= t) & (t < self.end)
+        fraction = jnp.where(active, self.remaining, jnp.ones_like(self.remaining))
+        return self.base.at[self.links].multiply(fraction)
 
 
 class _Demand(eqx.Module):
-    """K(t): the path flows of every pair are ≥ 0 and sum up to d(t) = factor(t)·trips."""
+    """K(t): the path flows of every pair are ≥ 0 and add up to d(t) = factor(t)·trips."""
 
     factor: AbstractSignal
     most: jax.Array
@@ -62,19 +62,19 @@ class _Demand(eqx.Module):
 
     def __call__(self, t: Any, args: Any) -> Simplex:
         factor = self.factor(t)
-        # Bounds hold up to `most`; NaN stops a run that goes beyond, but for the rounding of a signal.
-        room = self.most * (1 + 16 * jnp.finfo(self.most.dtype).eps)
-        held = jnp.where((factor >= 0) & (factor <= room), factor, jnp.nan)
-        return eqx.tree_at(lambda K: K.total, self.simplices, held * self.base)
+        # The constants are proved up to `most`; beyond it, except for roundoff, NaN stops the run.
+        limit = self.most * (1 + 16 * jnp.finfo(self.most.dtype).eps)
+        factor = jnp.where((factor >= 0) & (factor <= limit), factor, jnp.nan)
+        return eqx.tree_at(lambda K: K.total, self.simplices, factor * self.base)
 
 
 def capacities(
     network: Network, incidents: Sequence[Incident]
 ) -> tuple[AbstractSignal, np.ndarray]:
-    """The capacities as a function of time, and all values that they take, one a row.
+    """Return the capacities as a function of time, and all values that they take, one a row.
 
-    **Raises:** `dvax.InputError` for every incident on a link that is not there, with a share outside
-    (0, 1], or without a duration.
+    **Raises:** `dvax.InputError` for every incident on a missing link, with a fraction outside (0, 1],
+    or with start ≥ end.
     """
     base = network.capacity
     if not incidents:
@@ -93,37 +93,37 @@ def capacities(
         if not 0 < incident.remaining <= 1:
             problems.add(
                 f"dvax.models.Traffic({one}.remaining)", f"remaining = {incident.remaining}",
-                "it is the share of the capacity that is left, in (0, 1]",
-                "Take a small share for a closed link, or remove the link",
+                "it must be the remaining fraction of the capacity, in (0, 1]",
+                "Use a small fraction for a closed link, or remove the link",
             )  # fmt: skip
         if not -np.inf < incident.start < incident.end < np.inf:
             problems.add(
                 f"dvax.models.Traffic({one}.start, {one}.end)",
                 f"start = {incident.start}, end = {incident.end}",
-                "it begins before it ends", "Fix the times",
+                "start < end must hold, and both be finite", "Correct the times",
             )  # fmt: skip
     problems.raise_any()
     remaining, start, end = (
         np.array([getattr(i, name) for i in incidents], float)
         for name in ("remaining", "start", "end")
     )
-    cut = _Cut(
+    capacity = _Capacity(
         jnp.asarray(base), jnp.asarray(np.array(links), jnp.int32), jnp.asarray(remaining),
         jnp.asarray(start), jnp.asarray(end),
     )  # fmt: skip
     times = np.unique(np.concatenate([start, end]))
     values = [base]
     for t in times:
-        now = base.copy()
-        np.multiply.at(now, np.array(links), np.where((start <= t) & (t < end), remaining, 1.0))
-        values.append(now)
-    return Function(cut, knots=times), np.unique(np.stack(values), axis=0)
+        value = base.copy()
+        np.multiply.at(value, np.array(links), np.where((start <= t) & (t < end), remaining, 1.0))
+        values.append(value)
+    return Function(capacity, knots=times), np.unique(np.stack(values), axis=0)
 
 
 def demand_set(
     trips: np.ndarray, sizes: np.ndarray, factor: AbstractSignal | None, most: np.ndarray
 ) -> Any:
-    """K: a set where the demand rests, else a callable (t, args)."""
+    """Return K: a set if the demand is constant, else a callable (t, args)."""
     simplices = Simplex(jnp.asarray(trips), sizes=sizes)
     if factor is None:
         return simplices
@@ -131,10 +131,10 @@ def demand_set(
 
 
 def demand_factor(given: Any, peak: Any, pairs: int) -> tuple[AbstractSignal | None, np.ndarray]:
-    """The factor as a signal, None where it is 1, and the most that it comes to, a number a pair.
+    """Return the factor as a signal (None if it is 1), and its maximum for each pair.
 
-    **Raises:** `dvax.InputError` where it is neither a signal nor callable, has values of a wrong
-    shape or below 0, or its peak is not known.
+    **Raises:** `dvax.InputError` if the factor is neither a signal nor callable, has values of a wrong
+    shape or below 0, or its maximum is unknown.
     """
     name = "dvax.models.Traffic(demand)"
     if given is None and peak is None:
@@ -142,44 +142,41 @@ def demand_factor(given: Any, peak: Any, pairs: int) -> tuple[AbstractSignal | N
     signal: Any = given
     if not isinstance(given, AbstractSignal):
         if not callable(given):
-            raise _wrong(
-                name, repr(given), "it is a signal or a callable of t, the factor of all trips",
-                "Give dvax.signals.Table(times, factors), say",
+            raise input_error(
+                name, repr(given), "it must be a signal or a callable of t, the factor of all trips",
+                "Give a signal, such as dvax.signals.Table(times, factors)",
             )  # fmt: skip
         signal = Function(given)
-    known = None
+    samples = None
     if isinstance(signal, Constant):
-        known = np.asarray(signal.constant)[None]
+        samples = np.asarray(signal.constant)[None]
     elif isinstance(signal, Table) and signal.kind != "cubic":
-        known = np.asarray(signal.values)
-    if known is not None and np.any(known < 0):
-        raise _wrong(
-            name, f"a factor of {known.min():g}", "there are no negative trips", "Fix the factors"
+        samples = np.asarray(signal.values)
+    if samples is not None and np.any(samples < 0):
+        raise input_error(
+            name, f"a factor of {samples.min():g}", "factors must be ≥ 0", "Correct the factors"
         )
     if peak is None:
-        if known is None:
-            raise _wrong(
+        if samples is None:
+            raise input_error(
                 "dvax.models.Traffic(peak)", "None",
-                f"the largest value of a {type(signal).__name__} cannot be read off it, and the "
-                "bounds on flows rest on it",
+                f"the maximum of a {type(signal).__name__} is unknown, and the bounds on flows "
+                "depend on it",
                 "Give peak=, a number that the factor never exceeds",
             )  # fmt: skip
-        peak = known.max(axis=0)
+        peak = samples.max(axis=0)
     most = np.asarray(peak, float)
-    shape = jax.eval_shape(signal.value, 0.0).shape if known is None else known.shape[1:]
-    for what, found in (("demand", shape), ("peak", most.shape)):
-        if found not in ((), (pairs,)):
-            raise _wrong(
-                f"dvax.models.Traffic({what})", f"values of shape {found}",
-                f"it is one factor, or one for each of the {pairs} pairs", "Give it that shape",
+    shape = jax.eval_shape(signal.value, 0.0).shape if samples is None else samples.shape[1:]
+    for what, given_shape in (("demand", shape), ("peak", most.shape)):
+        if given_shape not in ((), (pairs,)):
+            raise input_error(
+                f"dvax.models.Traffic({what})", f"values of shape {given_shape}",
+                f"it must be one factor, or one for each of the {pairs} pairs",
+                "Give it this shape",
             )  # fmt: skip
     if not np.all((most > 0) & np.isfinite(most)):
-        raise _wrong(
-            "dvax.models.Traffic(peak)", _tree.short(most), "without trips nothing is to be solved",
+        raise input_error(
+            "dvax.models.Traffic(peak)", _tree.short(most), "the maximum must be positive and finite",
             "Give a positive number",
         )  # fmt: skip
     return signal, most
-
-
-def _wrong(place: str, given: str, rule: str, fix: str) -> InputError:
-    return input_error(place, given, rule, fix)

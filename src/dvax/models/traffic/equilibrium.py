@@ -1,11 +1,11 @@
-"""User equilibria to rounding, with the paths that carry them, by column generation.
+"""User equilibria to roundoff, with the paths that carry flow, by column generation.
 
-Flows x on paths are a user equilibrium where they minimise Beckmann's Φ(Δx) over K, the flows that
-add up to the demand of every pair (Beckmann, McGuire and Winsten 1956). Each round finds the least
-cost path of every pair on the whole network, adds those that cost less than all that their pair has
-(Leventhal, Nemhauser and Trotter 1973), and reduces Φ over the paths there are (`RestrictedProblem`).
-How far x is from the end is its gap: the share of Σ xc that would be saved if everybody took the
-least cost path of the whole network at these costs. It bounds the error of Φ.
+Path flows x are a user equilibrium if they minimise Beckmann's Φ(Δx) over K, the flows that add up to
+the demand of every pair (Beckmann, McGuire and Winsten 1956). Each iteration computes the shortest path
+of every pair on the whole network, adds it if it costs less than all paths of its pair (Leventhal,
+Nemhauser and Trotter 1973), and reduces Φ over the current paths (`RestrictedProblem`). The relative
+gap is the fraction of Σ xc that would be saved if all trips took the shortest paths of the whole
+network at these costs. It bounds the error of Φ.
 """
 
 import time
@@ -20,32 +20,32 @@ from .paths import Paths
 from .restricted import RestrictedProblem
 from .shortest import ShortestPaths
 
-_SAME = 1e-13
-"""Costs that differ by so little, relatively, are the same: they are sums of a few dozen numbers."""
+_COST_ROUNDOFF = 1e-13
+"""Relative roundoff of path costs, which are sums of several dozen numbers."""
 
-_EQUAL = 1e-6
-"""Paths whose costs differ by so little at an equilibrium are all kept: trips may take any of them."""
+_KEEP_TOLERANCE = 1e-6
+"""Paths within this relative difference of the shortest path are kept at the equilibrium."""
 
-_ROUNDS, _PATIENCE = 500, 60
-"""The most rounds, and the most in a row that need reduce neither the gap nor Φ noticeably."""
+_MAX_ITERATIONS, _MAX_STAGNATION = 500, 60
+"""The largest number of iterations, and of consecutive iterations without progress in gap or Φ."""
 
-_SWEEPS = 4
-"""Sweeps between two searches for shortest paths, unless the gap over the given paths has fallen to
-`_WITHIN` of the whole one before."""
-_WITHIN = 0.05
+_MAX_SWEEPS = 4
+"""Largest number of sweeps between two shortest-path searches."""
+_RESTRICTED_GAP_RATIO = 0.05
+"""Sweeps end once the gap over the current paths is below this fraction of the gap of the network."""
 
-_FULL, _CUT, _MOST_BLOCKS = 0.5, 0.1, 1024
-"""Shares of a step that the line search leaves: above and below, blocks become larger and smaller."""
+_LARGE_STEP, _SMALL_STEP, _MAX_BLOCKS = 0.5, 0.1, 1024
+"""Step lengths of the line search above which blocks are enlarged, and below which they are split."""
 
-_SILENCE = 2.0
+_REPORT_INTERVAL = 2.0
 """Seconds between two reports."""
 
 Report = Callable[[str], None]
-"""Receives a sentence about the progress."""
+"""A function that receives a message about the progress."""
 
 
 class Equilibrium(NamedTuple):
-    """Path flows, and their gap over all paths of the network."""
+    """Path flows, and their relative gap over all paths of the network."""
 
     paths: Paths
     flows: np.ndarray
@@ -61,10 +61,12 @@ def equilibrate(
     gap: float,
     report: Report | None = None,
 ) -> Equilibrium:
-    """A user equilibrium to this gap, on the `paths` given (without them, those that are least on the
-    empty network) and those that had to be added and cost no more.
+    """Return a user equilibrium to this relative gap.
 
-    **Raises:** `dvax.SolveError` where rounding, or the number of rounds, does not allow the gap.
+    Its paths are the given `paths` (by default the shortest ones of the empty network) and the added
+    ones that are shortest at the equilibrium.
+
+    **Raises:** `dvax.SolveError` if roundoff, or the number of iterations, does not allow the gap.
     """
     free = costs.costs(np.zeros(len(capacity)), capacity)
     if paths is None:
@@ -72,68 +74,69 @@ def equilibrate(
         every = np.arange(len(demand))
         paths = Paths(*search.trace(tree, every), np.ones(len(demand), int), len(capacity))
     x = all_or_nothing(paths, free, demand)
-    kept = np.ones(len(x), bool)
+    given = np.ones(len(x), bool)
     blocks = None
-    best, lowest, since, spoke = np.inf, np.inf, 0, time.monotonic()
-    for number in range(_ROUNDS):
+    best, lowest, stagnation, last_report = np.inf, np.inf, 0, time.monotonic()
+    for number in range(_MAX_ITERATIONS):
         incidence = paths.incidence()
         v = incidence.T @ x
         c = costs.costs(v, capacity)
         least, tree = search.find(c)
-        along = incidence @ c
-        spent = float(x @ along)
-        # Differences first: they are small where their sums are not.
-        saved = float(x @ (along - np.repeat(least, paths.sizes)))
-        now = max(saved / spent, 0.0) if spent > 0 else 0.0
-        if report is not None and time.monotonic() - spoke > _SILENCE:
-            spoke = time.monotonic()
-            report(f"round {number}: {len(x)} paths, relative gap {now:.1e}")
-        if now <= gap:
-            # Paths that were added, cost more in the end and carry nothing: the equilibrium needs none.
-            kept |= (x > 0) | (along <= np.repeat(least, paths.sizes) * (1 + _EQUAL))
-            return Equilibrium(paths.chosen(kept), x[kept], now)
+        path_costs = incidence @ c
+        total_cost = float(x @ path_costs)
+        # Subtract before summing, to avoid cancellation.
+        saving = float(x @ (path_costs - np.repeat(least, paths.sizes)))
+        current_gap = max(saving / total_cost, 0.0) if total_cost > 0 else 0.0
+        if report is not None and time.monotonic() - last_report > _REPORT_INTERVAL:
+            last_report = time.monotonic()
+            report(f"iteration {number}: {len(x)} paths, relative gap {current_gap:.1e}")
+        if current_gap <= gap:
+            # Remove added paths that carry no flow and are not shortest.
+            shortest = path_costs <= np.repeat(least, paths.sizes) * (1 + _KEEP_TOLERANCE)
+            kept = given | (x > 0) | shortest
+            return Equilibrium(paths.select(kept), x[kept], current_gap)
         value = float(costs.integrals(v, capacity).sum())
-        progress = now < 0.9 * best or value < 0.999 * lowest
-        best, lowest = min(now, best), min(value, lowest)
-        since = 0 if progress else since + 1
-        if since > _PATIENCE:
+        progress = current_gap < 0.9 * best or value < 0.999 * lowest
+        best, lowest = min(current_gap, best), min(value, lowest)
+        stagnation = 0 if progress else stagnation + 1
+        if stagnation > _MAX_STAGNATION:
             break
-        own = np.minimum.reduceat(along, paths.starts)
-        worse = np.flatnonzero(own > least * (1 + _SAME))
-        if worse.size:
-            # A path that costs less than all those of its pair is none of them.
-            paths, moved = paths.joined(*search.trace(tree, worse), worse)
-            x, kept = (_moved(values, moved, len(paths.lengths)) for values in (x, kept))
+        current_least = np.minimum.reduceat(path_costs, paths.starts)
+        improvable = np.flatnonzero(current_least > least * (1 + _COST_ROUNDOFF))
+        if improvable.size:
+            # A path that costs less than all paths of its pair is not among them.
+            paths, positions = paths.insert(*search.trace(tree, improvable), improvable)
+            x, given = (_scatter(v, positions, len(paths.lengths)) for v in (x, given))
         restricted = RestrictedProblem(costs, capacity, paths, demand, x, blocks)
-        for _ in range(_SWEEPS):
+        for _ in range(_MAX_SWEEPS):
             restricted.sweep()
-            if restricted.excess() <= _WITHIN * saved:
+            if restricted.excess() <= _RESTRICTED_GAP_RATIO * saving:
                 break
         x = restricted.flows()
-        # Where full steps do, larger blocks converge faster: with one it is Newton's method. Where
-        # the pairs of a block hinder each other, smaller ones do, down to one pair at a time.
-        if restricted.shortest >= _FULL:
+        # After full steps larger blocks converge faster; one block is Newton's method. After short
+        # steps the pairs of a block interfere, and smaller blocks converge faster.
+        if restricted.shortest_step >= _LARGE_STEP:
             blocks = len(restricted.blocks) // 2
-        elif restricted.shortest < _CUT:
-            blocks = min(2 * len(restricted.blocks), _MOST_BLOCKS)
+        elif restricted.shortest_step < _SMALL_STEP:
+            blocks = min(2 * len(restricted.blocks), _MAX_BLOCKS)
     raise SolveError(
-        f"The user equilibrium was not reached: after {number + 1} rounds its relative gap is "
-        f"{best:.2e}, and {gap:.2e} was asked for. Ask for a larger gap, or check the units of trips "
-        "and capacities: at flows far above the capacities the method may converge no further."
+        f"The user equilibrium was not reached: after {number + 1} iterations its relative gap is "
+        f"{best:.2e}, above the required {gap:.2e}. Pass a larger gap, or check the units of trips "
+        "and capacities: at flows far above the capacities the method may not converge further."
     )
 
 
 def all_or_nothing(paths: Paths, c: np.ndarray, demand: np.ndarray) -> np.ndarray:
-    """All trips of a pair on its path with the least cost."""
-    along = paths.incidence() @ c
-    order = np.lexsort((along, paths.pairs))
-    x = np.zeros(len(along))
+    """Return the flows with all trips of a pair on its path of least cost."""
+    path_costs = paths.incidence() @ c
+    order = np.lexsort((path_costs, paths.pairs))
+    x = np.zeros(len(path_costs))
     x[order[paths.starts]] = demand
     return x
 
 
-def _moved(values: np.ndarray, places: np.ndarray, size: int) -> np.ndarray:
-    """The values at their new places, and zeros at the others."""
-    spread = np.zeros(size, values.dtype)
-    spread[places] = values
-    return spread
+def _scatter(values: np.ndarray, positions: np.ndarray, size: int) -> np.ndarray:
+    """Return an array of this size with the values at `positions`, and zeros elsewhere."""
+    result = np.zeros(size, values.dtype)
+    result[positions] = values
+    return result

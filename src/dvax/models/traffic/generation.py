@@ -1,4 +1,4 @@
-"""The paths that a traffic model needs: those of its equilibria, as they are and as they become."""
+"""Generation of the paths of a traffic model, from its equilibria for all capacities and demands."""
 
 import numpy as np
 
@@ -8,20 +8,22 @@ from .costs import LinkCosts
 from .equilibrium import Equilibrium, Report, equilibrate
 from .shortest import ShortestPaths
 
-_MANY = 1000.0
-"""The default ρ lets a difference of a typical cost move so many typical flows. Then an equilibrium
-is reached within weeks where hardly anything is congested too; with ρ a hundred times less, the law
-is solved in half the time, and Sioux Falls is as fast at its equilibrium."""
+_FLOWS_PER_COST = 1000.0
+"""The default ρ in units of mean flow over mean cost. With it networks with little congestion also
+reach the equilibrium within weeks. A hundredth of it halves the time of solving the law, and Sioux
+Falls reaches its equilibrium equally fast."""
 
 
-def generated(
+def generate_paths(
     costs: LinkCosts, network: Network, trips: Trips, capacities: np.ndarray, peak: np.ndarray,
     gap: float, report: Report | None = None,
 ) -> Equilibrium:  # fmt: skip
-    """The equilibrium of the network and the trips as they are, on all paths that are needed for it,
-    and for those of every row of `capacities`, with these trips and with those of the `peak`."""
+    """Return the equilibrium for the unmodified capacities and trips, on all generated paths.
+
+    These are the paths of the equilibria for every row of `capacities`, with the given trips and with
+    those of the `peak`."""
     search = ShortestPaths(network, trips)
-    plain = [(network.capacity, trips.flow)]
+    unmodified = [(network.capacity, trips.flow)]
     changed = [
         (capacity, demand)
         for demand in (peak, trips.flow)
@@ -31,24 +33,24 @@ def generated(
     if np.array_equal(peak, trips.flow):
         changed = changed[: len(changed) // 2]
     paths = None
-    # The plain one comes last, so that its flows are on all of the paths.
-    for capacity, demand in changed + plain:
+    # The unmodified one is last, so that its flows refer to all paths.
+    for capacity, demand in changed + unmodified:
         bounded = costs.up_to(np.full(len(network), demand.sum()))
-        reached = equilibrate(bounded, capacity, search, demand, paths, gap, report)
-        paths = reached.paths
-    return reached
+        equilibrium = equilibrate(bounded, capacity, search, demand, paths, gap, report)
+        paths = equilibrium.paths
+    return equilibrium
 
 
 def typical_rho(costs: LinkCosts, network: Network, trips: Trips) -> float:
-    """1000 mean flows over the mean cost of the empty network.
+    """Return 1000 mean flows over the mean cost of the empty network.
 
-    **Raises:** `dvax.InputError` where that costs nothing.
+    **Raises:** `dvax.InputError` if this cost is 0.
     """
     free = costs.up_to(np.zeros(len(network))).costs(np.zeros(len(network)), network.capacity)
     least, _ = ShortestPaths(network, trips).find(free)
     if not np.any(least > 0):
         raise input_error(
-            "dvax.models.Traffic(rho)", "None", "on the empty network no trip costs anything, so "
-            "there is no typical cost to choose it by", "Give rho, in trips per unit of cost",
+            "dvax.models.Traffic(rho)", "None", "the default is relative to the mean cost on the "
+            "empty network, which is 0", "Give rho, in trips per unit of cost",
         )  # fmt: skip
-    return float(_MANY * trips.flow.mean() * trips.flow.sum() / (trips.flow @ least))
+    return float(_FLOWS_PER_COST * trips.flow.mean() * trips.flow.sum() / (trips.flow @ least))

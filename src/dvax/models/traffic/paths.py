@@ -1,4 +1,4 @@
-"""Sets of paths: which links each one takes, pair by pair."""
+"""Sets of paths, as lists of links for every pair."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,10 +11,10 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class Paths:
-    """The paths of all pairs, those of one pair side by side.
+    """The paths of all pairs, ordered by pair.
 
-    `links` holds the links of all paths one after the other, `lengths` how many each has, `sizes` how
-    many paths each pair has; there are `count` links in the network.
+    `links` holds the concatenated links of all paths, `lengths` the number of links of each path,
+    `sizes` the number of paths of each pair, and `count` the number of links of the network.
     """
 
     links: np.ndarray
@@ -24,7 +24,7 @@ class Paths:
 
     @property
     def starts(self) -> np.ndarray:
-        """The first path of every pair."""
+        """The index of the first path of every pair."""
         return np.cumsum(self.sizes) - self.sizes
 
     @property
@@ -33,21 +33,21 @@ class Paths:
         return np.repeat(np.arange(len(self.sizes)), self.sizes)
 
     def incidence(self) -> Any:
-        """Δᵀ as a sparse matrix: a row a path, with a one for each of its links."""
+        """Return Δᵀ as a sparse matrix: one row a path, with ones at its links."""
         from scipy.sparse import csr_array
 
         ends = np.concatenate([[0], np.cumsum(self.lengths)])
         shape = len(self.lengths), self.count
         return csr_array((np.ones(len(self.links)), self.links, ends), shape=shape)
 
-    def chosen(self, which: np.ndarray) -> "Paths":
-        """The paths where `which` is true; every pair must keep one."""
-        sizes = np.add.reduceat(which.astype(int), self.starts)
-        links = self.links[np.repeat(which, self.lengths)]
-        return Paths(links, self.lengths[which], sizes, self.count)
+    def select(self, mask: np.ndarray) -> "Paths":
+        """Return the paths where `mask` is true, at least one for every pair."""
+        sizes = np.add.reduceat(mask.astype(int), self.starts)
+        links = self.links[np.repeat(mask, self.lengths)]
+        return Paths(links, self.lengths[mask], sizes, self.count)
 
     def differences(self, demand: np.ndarray) -> "Differences":
-        """What the choice between paths changes, for flows that add up to `demand`."""
+        """Return the reduced paths of pairs with several paths, for flows that add up to `demand`."""
         several = self.sizes > 1
         rows = np.flatnonzero(np.repeat(several, self.sizes))
         sizes = self.sizes[several]
@@ -57,49 +57,48 @@ class Paths:
         links = self.links[np.repeat(begin[rows], lengths) + offset]
         pair = np.repeat(np.arange(len(sizes)), sizes)
         row = np.repeat(np.arange(len(rows)), lengths)
-        # A link is shared by all paths of its pair where (pair, link) occurs once for each of them.
+        # A link is on all paths of its pair if (pair, link) occurs once for each of them.
         key = pair[row] * self.count + links
         order = np.argsort(key, kind="stable")
-        fresh = np.append(True, key[order][1:] != key[order][:-1])
-        group = np.cumsum(fresh) - 1
+        is_new = np.append(True, key[order][1:] != key[order][:-1])
+        group = np.cumsum(is_new) - 1
         shared = np.empty(len(key), bool)
         shared[order] = np.bincount(group)[group] == sizes[pair[row[order]]]
         first = np.cumsum(sizes) - sizes
         once = shared & (row == first[pair[row]])
         pairs = np.flatnonzero(several)
         fixed = np.bincount(links[once], demand[pairs][pair[row[once]]], self.count).astype(float)
-        alone = np.repeat(~several, self.sizes)
-        only = np.repeat(np.repeat(demand, self.sizes), self.lengths)[
-            np.repeat(alone, self.lengths)
+        single = np.repeat(~several, self.sizes)
+        single_flows = np.repeat(np.repeat(demand, self.sizes), self.lengths)[
+            np.repeat(single, self.lengths)
         ]
-        fixed += np.bincount(self.links[np.repeat(alone, self.lengths)], only, self.count)
+        fixed += np.bincount(self.links[np.repeat(single, self.lengths)], single_flows, self.count)
         ends = np.append(0, np.cumsum(np.bincount(row[~shared], minlength=len(rows))))
         return Differences(rows, pairs, sizes, links[~shared], ends, fixed, self.count)
 
-    def joined(
+    def insert(
         self, links: np.ndarray, lengths: np.ndarray, pairs: np.ndarray
     ) -> tuple["Paths", np.ndarray]:
-        """(these paths and one more for each of the `pairs`, where each of the old ones is now)."""
-        owner = np.concatenate([self.pairs, pairs])
-        order = np.argsort(owner, kind="stable")
-        every = np.concatenate([self.lengths, lengths])
-        begin = np.cumsum(every) - every
-        new = every[order]
+        """Return (these paths and one more for each of `pairs`, the new indices of the old paths)."""
+        pair = np.concatenate([self.pairs, pairs])
+        order = np.argsort(pair, kind="stable")
+        all_lengths = np.concatenate([self.lengths, lengths])
+        begin = np.cumsum(all_lengths) - all_lengths
+        new = all_lengths[order]
         offset = np.arange(new.sum()) - np.repeat(np.cumsum(new) - new, new)
         flat = np.concatenate([self.links, links])[np.repeat(begin[order], new) + offset]
-        sizes = np.bincount(owner, minlength=len(self.sizes))
-        moved = np.argsort(order, kind="stable")[: len(self.lengths)]
-        return Paths(flat, new, sizes, self.count), moved
+        sizes = np.bincount(pair, minlength=len(self.sizes))
+        positions = np.argsort(order, kind="stable")[: len(self.lengths)]
+        return Paths(flat, new, sizes, self.count), positions
 
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """The paths of the pairs that have several, without the links that all paths of a pair share.
+    """The paths of pairs with several paths, without the links that all paths of a pair share.
 
-    `rows` are their numbers among all paths, `pairs` those of the pairs among all pairs, `sizes` how
-    many paths each pair has; `links` up to `ends` are those of each row, and `fixed` the link flows
-    that no choice changes: v = fixed + Δ′x.
-    """
+    `rows` are the indices of these paths among all paths, `pairs` the indices of their pairs,
+    `sizes` the numbers of paths of these pairs. `links[ends[k]:ends[k + 1]]` are the links of row
+    k. `fixed` are the link flows that do not depend on the choice of paths: v = fixed + Δ′x."""
 
     rows: np.ndarray
     pairs: np.ndarray
@@ -110,7 +109,7 @@ class Differences:
     count: int
 
     def matrix(self, first: int, last: int) -> Any:
-        """The rows from `first` to before `last`, sparse, with a one for each link."""
+        """Return the rows `first`, …, `last` − 1 as a sparse matrix with ones at their links."""
         from scipy.sparse import csr_array
 
         ends = self.ends[first : last + 1]
@@ -120,11 +119,10 @@ class Differences:
 
 
 class Incidence(eqx.Module):
-    """Δ, the links of paths, as JAX applies it: v = Δx adds the flows of the paths over each link,
-    and Δᵀc the costs of the links along each path.
+    """The link-path incidence Δ for JAX: v = Δx are link flows, Δᵀc are path costs.
 
-    Both go through the links of all paths one after the other: tables with a row for each step of a
-    path, filled up to the longest, take XLA much longer where few paths are long.
+    Both process the concatenated links of all paths. Tables padded to the longest path take much longer
+    if few paths are long.
     """
 
     path: jax.Array
@@ -138,18 +136,21 @@ class Incidence(eqx.Module):
         self.number, self.count = len(lengths), count
 
     def flows(self, x: jax.Array) -> jax.Array:
-        """v = Δx."""
-        taken = _computed(x).at[self.path].get(mode="promise_in_bounds")
-        nothing = jnp.zeros(self.count, x.dtype)
-        return nothing.at[self.link].add(taken, mode="promise_in_bounds")
+        """Return v = Δx."""
+        path_flows = _materialise(x).at[self.path].get(mode="promise_in_bounds")
+        zero = jnp.zeros(self.count, x.dtype)
+        return zero.at[self.link].add(path_flows, mode="promise_in_bounds")
 
     def along(self, c: jax.Array) -> jax.Array:
-        """Δᵀc."""
-        passed = _computed(c).at[self.link].get(mode="promise_in_bounds")
-        return jax.ops.segment_sum(passed, self.path, self.number, indices_are_sorted=True)
+        """Return Δᵀc."""
+        link_costs = _materialise(c).at[self.link].get(mode="promise_in_bounds")
+        return jax.ops.segment_sum(link_costs, self.path, self.number, indices_are_sorted=True)
 
 
-def _computed(a: jax.Array) -> jax.Array:
-    """The same array, written to memory by a scatter. XLA fuses what precedes a gather into it, barrier
-    or not, and would compute the power of a link's cost once for every path over it."""
+def _materialise(a: jax.Array) -> jax.Array:
+    """Return the same array, written to memory by a scatter.
+
+    XLA fuses the computation of a gather's operand into the gather, even across an optimisation
+    barrier. It would then compute the power in a link's cost once for every path over the link.
+    """
     return jnp.zeros_like(a).at[jnp.arange(len(a))].set(a, mode="promise_in_bounds")

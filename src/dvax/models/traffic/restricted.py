@@ -1,16 +1,16 @@
-"""Beckmann's problem over given paths, by projected Newton steps for blocks of pairs in turn.
+"""Beckmann's problem over given paths, by block Gauss–Seidel with projected Newton steps.
 
-    min Φ(Δx) over x ≥ 0 whose paths sum up to the demand of every pair.
+    min Φ(Δx) over x ≥ 0 whose paths add up to the demand of every pair.
 
-A Newton step for all pairs at once moves too many of them onto the same links: thousands of pairs
-share two alternatives, and each would move all of its flow. So the pairs are divided into blocks, and
-a block's step starts from the link flows that the blocks before it left (Gauss–Seidel). Within a
-block the pairs are coupled by the Hessian: the conjugate gradient method minimises the quadratic
-model of Φ on the paths that carry flow after a scaled projected gradient step (Bertsekas 1982), and
-on smaller faces while paths would carry less than nothing. Every step ends in an exact line search.
+A Newton step for all pairs at once overshoots: thousands of pairs share two alternatives, and each
+would move all of its flow. So the pairs are divided into blocks, and the step of a block starts from
+the link flows after the previous block (Gauss–Seidel). Within a block the Hessian couples the pairs.
+The conjugate gradient method minimises the quadratic model of Φ on the face of the paths that carry
+flow after a scaled projected gradient step (Bertsekas 1982), and on smaller faces while flows would be
+negative. Every step ends with an exact line search.
 
-Only pairs with two paths or more have a choice, and only the links that not all paths of a pair share
-change its costs: all others are constants here.
+Only pairs with at least two paths are unknowns, and only links that are not on all paths of a pair
+affect its choice; the other flows are constants.
 """
 
 import itertools
@@ -21,37 +21,36 @@ import numpy as np
 from .costs import LinkCosts
 from .paths import Paths
 
-_BLOCK = 50_000
-_BLOCKS = 32
-"""Entries of a block, about: of fewer, NumPy's overhead of 1 ms a step is the largest part. With 32
-blocks Chicago's sketch network needs a third of the sweeps that it needs with one."""
+_BLOCK_ENTRIES = 50_000
+_MAX_BLOCKS = 32
+"""Target number of matrix entries in a block, and largest number of blocks. In smaller blocks NumPy's
+overhead of 1 ms a step dominates. With 32 blocks Chicago's sketch network needs a third of the sweeps
+that it needs with one block."""
 
-_SCALES = 0.5, 0.05, 0.005
-"""Lengths of the scaled gradient step that predicts which paths are used. A full one overshoots for
-pairs that share links: half of it needs two thirds of the steps on Chicago's sketch network."""
+_PREDICTION_SCALES = 0.5, 0.05, 0.005
+"""Lengths of the scaled gradient step that predicts which paths carry flow. A full step overshoots for
+pairs that share links: with one half, Chicago's sketch network needs two thirds of the steps."""
 
-_SHORT = 0.25
-"""A step of which the line search leaves less is computed again, with a shorter prediction and with
-larger slopes."""
+_SHORT_STEP = 0.25
+"""A step with a smaller step length is computed again, with a shorter prediction and larger slopes."""
 
-_FACES = 5
-"""Faces that a step tries, each a part of the one before."""
+_MAX_FACES = 5
+"""Largest number of nested faces in a step."""
 
-_REDUCTION = 0.1
-_MOST_PRODUCTS = 200
-"""The conjugate gradient method reduces the residual by this factor, within so many products."""
+_CG_TOLERANCE = 0.1
+_MAX_PRODUCTS = 200
+"""Relative residual of the conjugate gradient method, and largest number of products."""
 
-_LEVEL = 1e-15
-"""The slope of Φ at the end of a step is level below this share of the cost of all trips. Flows that
-move between paths of the same links change Φ by rounding alone, and the step that empties paths must
-not be cut for it."""
+_SLOPE_ROUNDOFF = 1e-15
+"""A slope of Φ below this fraction of the total cost is treated as zero. Moving flow between paths with
+the same links changes Φ only by roundoff, which must not shorten a step that empties paths."""
 
 
 class RestrictedProblem:
-    """The problem over `paths`, from the flows `x` on.
+    """Beckmann's problem over `paths`, with the initial flows `x`.
 
-    `flows()` are those it has reached; `shortest` is the smallest share of a step that a line search
-    has left so far.
+    `flows()` returns the current flows. `shortest_step` is the smallest step length of all line
+    searches.
     """
 
     def __init__(
@@ -64,7 +63,7 @@ class RestrictedProblem:
         starts = np.append(np.cumsum(rows.sizes) - rows.sizes, len(rows.rows))
         ends = rows.ends[starts]
         if blocks is None:
-            blocks = int(np.clip(ends[-1] // _BLOCK, 1, _BLOCKS))
+            blocks = int(np.clip(ends[-1] // _BLOCK_ENTRIES, 1, _MAX_BLOCKS))
         blocks = max(1, min(blocks, len(rows.sizes)))
         cuts = np.searchsorted(ends, np.linspace(0, ends[-1], blocks + 1))
         cuts[0], cuts[-1] = 0, len(rows.sizes)
@@ -76,22 +75,22 @@ class RestrictedProblem:
             for a, b in itertools.pairwise(cuts.tolist())
             if b > a
         ]  # fmt: skip
-        self.shortest = 1.0
+        self.shortest_step = 1.0
         self.v = sum((block.transposed @ block.x for block in self.blocks), rows.fixed)
 
     def sweep(self) -> None:
-        """A step for every block."""
+        """Take a step for every block."""
         for block in self.blocks:
             self.v, length = block.step(self.costs, self.capacity, self.v)
-            self.shortest = min(self.shortest, length)
+            self.shortest_step = min(self.shortest_step, length)
 
     def excess(self) -> float:
-        """What all trips would save on the least cost paths of the set."""
+        """Return the total cost minus that on the shortest ones of the given paths."""
         c = self.costs.costs(self.v, self.capacity)
         return float(sum(block.x @ block.gradient(c) for block in self.blocks))
 
     def flows(self) -> np.ndarray:
-        """x on all paths."""
+        """Return x on all paths."""
         x = self.start.copy()
         if self.blocks:
             x[self.rows] = np.concatenate([block.x for block in self.blocks])
@@ -99,7 +98,7 @@ class RestrictedProblem:
 
 
 class _Block:
-    """Some of the pairs: `matrix` has a row a path, `sizes` counts those of each pair."""
+    """A block of pairs: `matrix` has one row a path, `sizes` are the numbers of paths of the pairs."""
 
     def __init__(self, matrix: Any, sizes: np.ndarray, demand: np.ndarray, x: np.ndarray) -> None:
         self.matrix, self.transposed = matrix, matrix.T
@@ -109,142 +108,155 @@ class _Block:
     def step(
         self, costs: LinkCosts, capacity: np.ndarray, v: np.ndarray
     ) -> tuple[np.ndarray, float]:
-        """Move x; return (what v, the link flows of all trips, become; the share of the step)."""
+        """Update x; return (the link flows v of all trips after the step, the step length)."""
         c, D = costs.costs(v, capacity), costs.slopes(v, capacity)
         g = self.gradient(c)
-        best, reached, share = 0.0, (self.x, v), 1.0
-        for scale in _SCALES:
+        best, result, best_length = 0.0, (self.x, v), 1.0
+        for scale in _PREDICTION_SCALES:
             target = self._target(g, D, scale)
-            move = target - self.x
-            descent = -float(g @ move)
+            dx = target - self.x
+            descent = -float(g @ dx)
             if not descent > 0:
                 break
-            dv = self.transposed @ move
-            length = _line_search(costs, capacity, v, dv, _LEVEL * float(c @ v))
+            dv = self.transposed @ dx
+            length = _line_search(costs, capacity, v, dv, _SLOPE_ROUNDOFF * float(c @ v))
             if length * descent > best:
-                x = target if length == 1.0 else np.maximum(self.x + length * move, 0.0)
-                best, share = length * descent, length
-                reached = x, np.maximum(v + length * dv, 0.0)
-            if length >= _SHORT:
+                x = target if length == 1.0 else np.maximum(self.x + length * dx, 0.0)
+                best, best_length = length * descent, length
+                result = x, np.maximum(v + length * dv, 0.0)
+            if length >= _SHORT_STEP:
                 break
-            # The slopes at v, 0 on an empty link, are no measure of such a move: the mean ones are.
+            # Replace the slopes at v (0 on an empty link) by the mean slopes along the step.
             rise = costs.costs(np.maximum(v + dv, 0.0), capacity) - c
             D = np.maximum(D, np.where(dv == 0, 0.0, rise / np.where(dv == 0, 1.0, dv)))
-        self.x = reached[0]
-        return reached[1], share
+        self.x = result[0]
+        return result[1], best_length
 
     def _target(self, g: np.ndarray, D: np.ndarray, scale: float) -> np.ndarray:
-        """The point to move towards: Newton's, or the scaled gradient's where that descends more."""
-        inverse, extra = self._metric(g, D)
-        ahead = self._project(self.x - scale * g * inverse, inverse)
-        free = ahead > 0
-        for _ in range(_FACES):
-            y = self.x + self._newton(g, D, free, inverse, extra)
-            # Paths that would carry less than nothing leave the face, and the others move again.
+        """Return the Newton point, or the scaled gradient point if its predicted descent is larger."""
+        inverse, regularisation = self._metric(g, D)
+        predicted = self._project(self.x - scale * g * inverse, inverse)
+        free = predicted > 0
+        for _ in range(_MAX_FACES):
+            y = self.x + self._newton(g, D, free, inverse, regularisation)
+            # Remove paths with negative flow from the face, and repeat.
             if not np.any(y < 0):
                 break
             free &= y > 0
         target = self._project(y, inverse)
-        return target if g @ (target - self.x) <= 1e-3 * (g @ (ahead - self.x)) else ahead
+        newton_descends = g @ (target - self.x) <= 1e-3 * (g @ (predicted - self.x))
+        return target if newton_descends else predicted
 
     def gradient(self, c: np.ndarray) -> np.ndarray:
-        """The costs of all paths above the least one of their pair: a constant a pair changes nothing,
-        and without it fewer digits are lost."""
-        along = self.matrix @ c
-        return along - self._each(np.minimum.reduceat(along, self.starts))
+        """Return the path costs minus the least cost of each pair.
+
+        A constant for each pair does not change the problem; subtracting it reduces cancellation."""
+        path_costs = self.matrix @ c
+        return path_costs - self._to_paths(np.minimum.reduceat(path_costs, self.starts))
 
     def _metric(self, g: np.ndarray, D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(1/m, ε): m, a diagonal that stands for the Hessian, and ε, which is added to it.
+        """Return (1/m, ε): a diagonal approximation m of the Hessian, and a regularisation ε.
 
-        Where costs hardly depend on flows, a pair's whole demand may move: m is at least a share of
-        the difference of its costs over its demand. ε vanishes with the excess cost of the pair.
-        """
+        If costs hardly depend on flows, the whole demand of a pair may move. So m is at least a
+        fraction of the cost difference of the pair over its demand. ε tends to 0 with the excess
+        cost of the pair."""
         m = self.matrix @ D
         demand = self.demand
         excess = self._sum(g * self.x) / demand
         least = 1e-3 * np.maximum.reduceat(g, self.starts) / demand
         least = np.maximum(least, 1e-12 * max(float(np.max(m)), float(np.max(g)) / demand.mean()))
-        extra = self._each(1e-3 * excess / demand)
-        # Where nothing has a cost every point is a solution, and any metric will do.
-        m = np.maximum(m, self._each(least)) + extra
-        return 1.0 / np.where(m > 0, m, 1.0), extra
+        regularisation = self._to_paths(1e-3 * excess / demand)
+        # If all costs are zero, every point is a solution, and the metric is arbitrary.
+        m = np.maximum(m, self._to_paths(least)) + regularisation
+        return 1.0 / np.where(m > 0, m, 1.0), regularisation
 
     def _newton(
-        self, g: np.ndarray, D: np.ndarray, free: np.ndarray, inverse: np.ndarray, extra: np.ndarray
+        self,
+        g: np.ndarray,
+        D: np.ndarray,
+        free: np.ndarray,
+        inverse: np.ndarray,
+        regularisation: np.ndarray,
     ) -> np.ndarray:
-        """δ with δ = −x off the `free` paths and Σ δ = 0 for every pair, which minimises
-        gᵀδ + ½δᵀ(ΔᵀDΔ + ε)δ nearly: conjugate gradients, preconditioned by m on that face."""
+        """Return the Newton step δ on the face of the `free` paths.
+
+        δ = −x on the other paths and Σ δ = 0 for every pair. It minimises gᵀδ + ½δᵀ(ΔᵀDΔ + ε)δ
+        approximately, by conjugate gradients with the preconditioner m on this face."""
         weight = np.where(free, inverse, 0.0)
-        share = weight / self._each(self._sum(weight))
+        fraction = weight / self._to_paths(self._sum(weight))
 
-        def face(r: np.ndarray) -> np.ndarray:
-            return weight * r - share * self._each(self._sum(weight * r))
+        def precondition(r: np.ndarray) -> np.ndarray:
+            return weight * r - fraction * self._to_paths(self._sum(weight * r))
 
-        def curved(p: np.ndarray) -> np.ndarray:
-            return self.matrix @ (D * (self.transposed @ p)) + extra * p
+        def hessian_product(p: np.ndarray) -> np.ndarray:
+            return self.matrix @ (D * (self.transposed @ p)) + regularisation * p
 
         delta = np.where(free, 0.0, -self.x)
-        delta -= share * self._each(self._sum(delta))
-        r = g + curved(delta)
-        z = face(r)
+        delta -= fraction * self._to_paths(self._sum(delta))
+        r = g + hessian_product(delta)
+        z = precondition(r)
         p, size = -z, float(r @ z)
-        # Emptied paths may have moved flow onto steep links: their residual is no measure.
-        goal = _REDUCTION**2 * min(size, float(g @ face(g)))
-        for _ in range(_MOST_PRODUCTS):
+        # Emptied paths may have moved flow onto steep links, so their residual sets no tolerance.
+        goal = _CG_TOLERANCE**2 * min(size, float(g @ precondition(g)))
+        for _ in range(_MAX_PRODUCTS):
             if not size > goal:
                 break
-            Hp = curved(p)
-            bend = float(p @ Hp)
-            if not bend > 0:
+            Hp = hessian_product(p)
+            curvature = float(p @ Hp)
+            if not curvature > 0:
                 break
-            delta += (size / bend) * p
-            r += (size / bend) * Hp
-            z = face(r)
+            delta += (size / curvature) * p
+            r += (size / curvature) * Hp
+            z = precondition(r)
             new = float(r @ z)
             p, size = -z + (new / size) * p, new
         return delta
 
     def _project(self, z: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-        """Each pair's flows on its own simplex: y = (z − τ/m)₊ with the one τ that reaches the demand,
-        to which Newton's method climbs in finitely many steps (Michelot 1986)."""
-        # With all paths on the face τ is too low. (A shift of z first would lose the digits of pairs
-        # with very different m.)
+        """Project the flows of each pair onto its simplex: y = (z − τ/m)₊.
+
+        Newton's method determines τ from the demand, monotonically and in finitely many steps (Michelot
+        1986)."""
+        # The τ with all paths positive is a lower bound. (Shifting z first would cause cancellation for
+        # pairs with very different m.)
         tau = (self._sum(z) - self.demand) / self._sum(inverse)
         while True:
-            y = z - self._each(tau) * inverse
-            above = y > 0
-            reach = self._sum(np.where(above, z, 0.0)) - self.demand
-            higher = reach / self._sum(np.where(above, inverse, 0.0))
-            if not np.any(higher > tau):
+            y = z - self._to_paths(tau) * inverse
+            positive = y > 0
+            surplus = self._sum(np.where(positive, z, 0.0)) - self.demand
+            new_tau = surplus / self._sum(np.where(positive, inverse, 0.0))
+            if not np.any(new_tau > tau):
                 y = np.maximum(y, 0.0)
-                # Sums that are exact whatever the rounding of τ.
-                return y * self._each(self.demand / self._sum(y))
-            tau = np.maximum(tau, higher)
+                # Scale, so that the sums are exact despite the roundoff in τ.
+                return y * self._to_paths(self.demand / self._sum(y))
+            tau = np.maximum(tau, new_tau)
 
     def _sum(self, a: np.ndarray) -> np.ndarray:
+        """Return the sums over the paths of each pair."""
         return np.add.reduceat(a, self.starts)
 
-    def _each(self, a: np.ndarray) -> np.ndarray:
+    def _to_paths(self, a: np.ndarray) -> np.ndarray:
+        """Return, for every path, the number of its pair."""
         return np.repeat(a, self.sizes)
 
 
 def _line_search(
-    costs: LinkCosts, capacity: np.ndarray, v: np.ndarray, dv: np.ndarray, level: float
+    costs: LinkCosts, capacity: np.ndarray, v: np.ndarray, dv: np.ndarray, slope_tolerance: float
 ) -> float:
-    """The α in (0, 1] that minimises Φ(v + α dv), by Newton's method on its slope between bounds."""
+    """Return the α in (0, 1] that minimises Φ(v + α dv), by a safeguarded Newton method."""
 
     def at(alpha: float) -> np.ndarray:
         return np.maximum(v + alpha * dv, 0.0)
 
-    if costs.costs(at(1.0), capacity) @ dv <= level:
+    if costs.costs(at(1.0), capacity) @ dv <= slope_tolerance:
         return 1.0
     low, high, alpha = 0.0, 1.0, 1.0
     for _ in range(40):
         flows = at(alpha)
         slope = float(costs.costs(flows, capacity) @ dv)
         low, high = (low, alpha) if slope > 0 else (alpha, high)
-        bend = float(costs.slopes(flows, capacity) @ (dv * dv))
-        new = alpha - slope / bend if bend > 0 else low
+        curvature = float(costs.slopes(flows, capacity) @ (dv * dv))
+        new = alpha - slope / curvature if curvature > 0 else low
         if not low < new < high:
             new = 0.5 * (low + high)
         if abs(new - alpha) <= 1e-3 * alpha:

@@ -23,13 +23,13 @@ from dvax.app.runs.schema import SolverKeys, in_quantity
 from dvax.app.runs.solver_options import check_model_steps, event_driven, settings
 from dvax.evolution import ExpRosenbrock, PiecewiseLinear, Solution
 from dvax.models.frame import Accelerogram, Frame
-from dvax.models.frame.peaks import largest as largest_between
+from dvax.models.frame.peaks import peak_displacement
 
 _INCH = 0.0254
 """Metres in an inch, exactly."""
 
 
-_largest_between = jax.jit(largest_between)
+_peak_displacement = jax.jit(peak_displacement)
 
 
 class FrameSection(SolverKeys):
@@ -126,7 +126,7 @@ class FrameApplication(AbstractApplication):
         # Rows that were not reached repeat the last displacement with zero velocity.
         behind = len(plan.times) - count
         moves = np.pad(d, (0, behind), "edge"), np.pad(v, (0, behind)), np.pad(a, (0, behind))
-        top = float(_largest_between(*map(jnp.asarray, moves), apart))
+        top = float(_peak_displacement(*map(jnp.asarray, moves), apart))
         largest = bound.largest
         # The bound holds for every displacement, hence for their peaks.
         proved = bound.proved(1.0 / omega)

@@ -105,7 +105,7 @@ class TrafficApplication(AbstractApplication):
                 "capacities, times and trips are of sizes that rounding can compare",
                 "Look in both files for very large and very small ones",
             ) from error  # fmt: skip
-        left = float(np.min(self.traffic.worst / self.traffic.network.capacity))
+        left = float(np.min(self.traffic.least_capacity / self.traffic.network.capacity))
         if left < _LEAST_CAPACITY:
             raise input_error(
                 "model.incidents", f"{left:.2g} of a capacity left where several meet",
