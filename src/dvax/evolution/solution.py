@@ -44,7 +44,8 @@ class Solution(eqx.Module):
       only, else None;
     - `enclosed`: True if the defect and `bounds` are enclosures over every step
       (`dvax.programs.enclosure`), False if samples estimate them;
-    - `stats`: the numbers of accepted `steps`, of `rejected` steps and of `evaluations` of F in steps
+    - `stats`: the `method`, with the reason where it was chosen; the numbers of accepted `steps`, of
+      `rejected` steps and of `evaluations` of F in steps
       (without those for event location and for u at saved times); `t`, `x` and the next step size at
       the end of the run; `compile_time` and `run_time` in seconds, unless the solve is part of a larger
       compiled program;
@@ -57,7 +58,7 @@ class Solution(eqx.Module):
     >>> model = dvax.models.Contact(alpha=1.0, beta=1.0, b_x=2.0, b_u=1.0, d_x=0.5, d_u=1.0,
     ...                             kappa0=0.5, g=1.0, ell=3.0)
     >>> sol = dvax.solve(model.problem, -1.0, 0.0, 2.0, ts=[0.0, 1.0, 2.0], dense=True,
-    ...                  max_steps=10_000)
+    ...                  method=dvax.ETD2RK(), max_steps=10_000)
     >>> sol.xs.shape, sol.enclosed
     ((3,), True)
     >>> x, u = sol.evaluate(0.4)

@@ -74,10 +74,10 @@ def solve(
       as t0 and t1 are;
     - `dt`: fixed steps, no longer than this (the fewest equal ones between knots of the data);
       without it, steps adapt;
-    - `rtol`, `atol`: the disturbance that the computed trajectory may amount to, integrated over the
-      run and relative to |x|: the defect is kept below (atol + rtol|x|)/horizon, and steps over kinks
-      may add as much again. For a system whose trajectories do not separate, twice the tolerance is
-      a bound on the error;
+    - `rtol`, `atol`: the integral of the defect over the run may amount to atol + rtol|x|, and steps
+      over kinks may add as much again. Where trajectories do not separate, that is the size of the
+      error of x. Methods of order above 3 keep the signed integral so small, over smooth steps, and the
+      others that of the norm, with which twice the tolerance is a bound;
     - `method`: None chooses one from the structure and the size of the problem, and another one where
       stability limits its steps (not under `jax.jit` and `jax.grad`); `stats["method"]` names it, with
       the reason. With `dt` or `constants` it is `dvax.ETD2RK()`. `vi_solver`: `dvax.vi.Auto()` by

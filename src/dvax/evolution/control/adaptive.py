@@ -21,7 +21,8 @@ from .stiffness_guard import StiffnessGuard
 
 
 class Adaptive(AbstractController):
-    """Steps whose defect is at most (atol + rtol‖x‖)/horizon.
+    """Steps whose defect is at most (atol + rtol‖x‖)/horizon in the mean: of its norm, or the signed
+    mean where it cancels over a smooth step.
 
     The defect integrated over these steps is then at most the tolerance. Steps over kinks and jumps may
     amount to the tolerance once more (`ErrorBudget`), so that the computed trajectory is the exact one
