@@ -1,4 +1,4 @@
-"""Conditions and counts that the lanes of a `jax.vmap` share."""
+"""Conditions and counts shared by all lanes of a `jax.vmap`."""
 
 import jax
 import jax.numpy as jnp
@@ -7,10 +7,10 @@ from jax.custom_batching import custom_vmap
 
 @custom_vmap
 def any_lane(condition: jax.Array) -> jax.Array:
-    """Return the condition; under `jax.vmap`, whether it holds in any lane.
+    """Return the condition; under `jax.vmap`, return whether it holds in any lane.
 
-    `lax.cond` on a condition of each lane's own computes both branches; on this one it computes the
-    branch only where some lane needs it. What the branch returns must then be selected lane by lane.
+    `lax.cond` on a batched condition computes both branches. On this one it computes the branch only if
+    a lane needs it; the caller must then select its result lane by lane.
     """
     return condition
 
@@ -22,8 +22,10 @@ def _(size: int, batched: list[bool], condition: jax.Array) -> tuple[jax.Array, 
 
 @custom_vmap
 def largest_of_lanes(count: jax.Array) -> jax.Array:
-    """Return the integer; under `jax.vmap`, the largest one of all lanes: a loop with this number of
-    iterations is one loop for all lanes."""
+    """Return the integer; under `jax.vmap`, return the largest one of all lanes.
+
+    A loop with this number of iterations is one loop for all lanes.
+    """
     return count
 
 
@@ -34,11 +36,12 @@ def _(size: int, batched: list[bool], count: jax.Array) -> tuple[jax.Array, bool
 
 @custom_vmap
 def is_active(condition: jax.Array) -> jax.Array:
-    """Return True; under `jax.vmap`, the condition: whether an iteration of a loop that runs while
-    *any* lane needs it (`any_lane`) belongs to this lane.
+    """Return True; under `jax.vmap`, return the condition.
 
-    A loop on a condition of each lane's own selects between old and new values of its whole carry after
-    every iteration. With this one, tables that are written row by row need no selection.
+    A loop on `any_lane(condition)` continues while *any* lane needs it, and this function tells whether
+    an iteration belongs to this lane. A loop on the batched condition would select between the old and
+    the new values of its whole carry after every iteration; here, tables that are written row by row
+    need no selection.
     """
     return jnp.ones_like(condition)
 
@@ -49,6 +52,8 @@ def _(size: int, batched: list[bool], condition: jax.Array) -> tuple[jax.Array, 
 
 
 def zeros_like_lanes(t: jax.Array) -> jax.Array:
-    """Return zeros; under `jax.vmap`, one for each lane of t (`jnp.zeros_like` has none): a value with
-    batched tangents has to be batched itself."""
+    """Return zeros of the shape of t that are batched if t is; `jnp.zeros_like` is not batched.
+
+    (A value with batched tangents must be batched itself.)
+    """
     return jnp.where(t == t, 0.0, 0.0).astype(t.dtype)

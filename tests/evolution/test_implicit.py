@@ -89,9 +89,9 @@ def test_implicit_steps_end_at_jumps_of_data():
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        (dict(dense=True), "no polynomials of its steps"),
-        (dict(measure=True), "no polynomials of its steps"),
-        (dict(dt=0.1), "follows from rtol and atol"),
+        (dict(dense=True), "no polynomials of their steps"),
+        (dict(measure=True), "no polynomials of their steps"),
+        (dict(dt=0.1), "by rtol and atol"),
     ],
 )
 def test_implicit_rejects_unsupported_options(asked, words):

@@ -1,8 +1,8 @@
-"""Everything that rests on interfaces which JAX does not promise to keep, each with a plain fallback.
+"""All code that uses unstable interfaces of JAX, with fallbacks.
 
-`outlined` compiles small programs as one function of the processor where JAX does not do so itself
-(before 0.12); elsewhere, and where an interface that it needs is absent, it is a plain call.
-`OUTLINES` says which. `forward_only` only improves an error; without it, values are the same.
+`outlined` compiles a small program as one CPU function on JAX before 0.12. From 0.12 on, JAX does this
+itself, and `outlined` is a plain call; so it is if an interface is missing. `OUTLINES` says which.
+`forward_only` improves an error message only.
 """
 
 from collections.abc import Callable
@@ -10,8 +10,8 @@ from typing import Any
 
 import jax
 
-_FASTER_WITHOUT = (0, 12)
-"""The first release of JAX that compiles small programs well by itself."""
+_FIRST_WITHOUT = (0, 12)
+"""The first release of JAX on which outlining is not necessary."""
 
 
 def _plain(run: Callable[..., Any], *args: Any, large: Any = (), transposable: bool = False) -> Any:
@@ -21,7 +21,7 @@ def _plain(run: Callable[..., Any], *args: Any, large: Any = (), transposable: b
 
 
 def _identity(tree: Any) -> Any:
-    """Return the same values."""
+    """Return the argument."""
     return tree
 
 
@@ -34,13 +34,13 @@ def _choose_forward_only() -> Callable[[Any], Any]:
 
 
 def _choose_outlined() -> Callable[..., Any]:
-    """Return the outlined call where it is of use and can be built, and the plain one elsewhere."""
-    if jax.__version_info__[:2] >= _FASTER_WITHOUT:
+    """Return the outlined call if it is useful and available, else the plain one."""
+    if jax.__version_info__[:2] >= _FIRST_WITHOUT:
         return _plain
     try:
         from .outlined import outlined
     except (ImportError, AttributeError):
-        # A JAX without the interfaces that it is built from: slower, with the same results.
+        # This JAX lacks an interface: plain calls are slower, with the same results.
         return _plain
     return outlined
 
@@ -50,4 +50,4 @@ outlined: Callable[..., Any] = _choose_outlined()
 forward_only: Callable[[Any], Any] = _choose_forward_only()
 
 OUTLINES = outlined is not _plain
-"""Whether small programs are compiled as one function at the request of dvax."""
+"""True if dvax compiles small programs as one function."""

@@ -1,4 +1,4 @@
-"""Seconds that JAX spends on tracing, lowering and compilation, from the events that it reports."""
+"""The time that JAX spends on tracing, lowering and compilation, from its monitoring events."""
 
 from collections.abc import Callable
 
@@ -14,8 +14,10 @@ _listeners: list[Callable[[str, float], None]] = []
 
 
 def listen(listener: Callable[[str, float], None]) -> None:
-    """Call `listener(stage, seconds)` after every "trace", "lower" and "compile" from now on. A JAX
-    that reports no such events never calls it: the seconds of compilation are then 0."""
+    """Register `listener(stage, seconds)`, to be called after every "trace", "lower" and "compile".
+
+    If JAX does not report these events, it is never called, and compile times are reported as 0.
+    """
     if not _listeners:
         _register()
     _listeners.append(listener)

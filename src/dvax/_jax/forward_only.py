@@ -1,4 +1,4 @@
-"""The identity, which refuses to be transposed."""
+"""An identity with forward derivatives only: its transpose raises an error."""
 
 from typing import Any
 
@@ -10,9 +10,10 @@ from ..errors import DifferentiationError
 
 
 def forward_only(tree: Any) -> Any:
-    """Return the same values; their reverse derivative raises an error that says what to do instead.
+    """Return the values unchanged; their reverse derivative raises a `dvax.DifferentiationError`.
 
-    Without it the error would come from the loop, after `solve` has returned, and name neither.
+    Without it JAX would raise an error from inside the loop, after `solve` has returned, that does not
+    name the options of dvax.
     """
     return jtu.tree_map(_forward_only.bind, tree)
 
@@ -20,12 +21,12 @@ def forward_only(tree: Any) -> Any:
 def _refuse(cotangent: Any, x: Any) -> Any:
     raise DifferentiationError(
         'dvax.solve(adjoint="forward") and dvax.Picard cannot be differentiated backward (jax.grad, '
-        'jax.vjp). Pass adjoint="reverse", the default, and another method: a loop that carries '
-        "tangents along stores no steps."
+        'jax.vjp), because their loops do not store the steps. Pass adjoint="reverse", the default, '
+        "and another method."
     )
 
 
-# Linear, with a forward rule and without a transpose.
+# A linear primitive with a forward rule, whose transpose raises.
 _forward_only = Primitive("forward_only")
 _forward_only.def_impl(lambda x: x)
 _forward_only.def_abstract_eval(lambda x: x)

@@ -1,4 +1,4 @@
-"""How JAX represents a traced program: its operations, its inner programs and its loops.
+"""Access to traced programs (jaxprs): operations, inner programs and loops.
 
 A traced program is a `ClosedJaxpr`: a list of equations, each of which applies a primitive to variables
 and literals, and the arrays that the traced function closes over.
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 
 def _types() -> tuple[Any, ...]:
-    """Return the types of programs and of their parts, taken from a program that is traced here."""
+    """Return the types `ClosedJaxpr`, `Jaxpr` and `Literal`, from a program that is traced here."""
     program = jax.make_jaxpr(lambda v: v + 1.0)(1.0)
     return type(program), type(program.jaxpr), type(program.jaxpr.eqns[0].invars[1])
 
@@ -25,7 +25,7 @@ except ImportError:
 __all__ = ["ClosedJaxpr", "Jaxpr", "Literal"]
 
 CUSTOM = frozenset({"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"})
-"""Calls of a function with a derivative rule of its own."""
+"""Calls of a function with a custom derivative rule."""
 
 CALLS = CUSTOM | {
     "jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint",
@@ -33,25 +33,25 @@ CALLS = CUSTOM | {
 """Primitives that apply one inner program to their arguments."""
 
 
-def bind(eqn: Any, given: list[Any]) -> list[Any]:
+def bind(eqn: Any, operands: list[Any]) -> list[Any]:
     """Return the results of one operation on these arrays."""
     with eqn.ctx.manager:
-        found = eqn.primitive.bind(*given, **eqn.primitive.get_bind_params(eqn.params))
-    return list(found) if eqn.primitive.multiple_results else [found]
+        results = eqn.primitive.bind(*operands, **eqn.primitive.get_bind_params(eqn.params))
+    return list(results) if eqn.primitive.multiple_results else [results]
 
 
-def read(known: dict[Any, Any], atoms: Any) -> list[Any]:
-    """Return the values of variables and literals, given those of the variables."""
-    return [atom.val if isinstance(atom, Literal) else known[atom] for atom in atoms]
+def read(environment: dict[Any, Any], atoms: Any) -> list[Any]:
+    """Return the values of variables and literals in an environment of variables."""
+    return [atom.val if isinstance(atom, Literal) else environment[atom] for atom in atoms]
 
 
 def inner_program(eqn: Any) -> Any:
-    """Return the program that a call applies to its arguments; None for any other operation."""
+    """Return the program that a call applies to its arguments, or None for another operation."""
     if eqn.primitive.name not in CALLS:
         return None
     for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
         inner = eqn.params.get(key)
-        # From JAX 0.12 on the two types are one, and a program holds its constants.
+        # From JAX 0.12 on the two types are the same, and a program contains its constants.
         if isinstance(inner, Jaxpr) and not isinstance(inner, ClosedJaxpr):
             inner = ClosedJaxpr(inner, ())
         if isinstance(inner, ClosedJaxpr) and len(inner.jaxpr.invars) == len(eqn.invars):
@@ -60,8 +60,11 @@ def inner_program(eqn: Any) -> Any:
 
 
 def operation(eqn: Any) -> str:
-    """Return the name that rules know an operation by: that of its primitive, or of a called function
-    that dvax marks by its name ("dvax_..."), or "searchsorted"."""
+    """Return the name of an operation in tables of rules.
+
+    It is the name of the primitive, or of a called function: "searchsorted", or "dvax_..." for
+    functions of dvax that have a rule of their own.
+    """
     name = eqn.params.get("name")
     if isinstance(name, str) and (name.startswith("dvax_") or _is_search(eqn)):
         return name
@@ -69,21 +72,24 @@ def operation(eqn: Any) -> str:
 
 
 def scan_counts(params: dict[str, Any]) -> tuple[int, int] | None:
-    """Return how many arguments of a `lax.scan` are constant, and how many it carries; None where this
-    JAX represents it in another way."""
+    """Return the numbers of constant and of carried arguments of a `lax.scan`, or None if this JAX
+    represents it in another way."""
     if "num_consts" in params:
         return params["num_consts"], params["num_carry"]
     try:
-        fixed, carried, *_ = params["ft_in"].elts  # from JAX 0.12 on
-        counts = [len(list(part.vals)) for part in (fixed, carried)]
+        constants, carry, *_ = params["ft_in"].elts  # from JAX 0.12 on
+        counts = [len(list(part.vals)) for part in (constants, carry)]
     except (AttributeError, KeyError, TypeError, ValueError):
         return None
     return counts[0], counts[1]
 
 
 def _is_search(eqn: Any) -> bool:
-    """Whether a call is that of `jnp.searchsorted` for one number, as in `jnp.interp` and in a table
-    with steps: by its name and by its program, which is compared with that of JAX for these shapes."""
+    """Return whether a call is `jnp.searchsorted` for one number, as in `jnp.interp` and in a piecewise
+    constant table.
+
+    Its name must match, and its program must equal that of JAX for these shapes.
+    """
     inner = eqn.params.get("jaxpr")
     if eqn.params.get("name") != "searchsorted" or inner is None or len(eqn.invars) != 2:
         return False
@@ -96,7 +102,7 @@ def _is_search(eqn: Any) -> bool:
     for side in ("left", "right"):
         for method in ("scan", "scan_unrolled", "compare_all"):
             search = partial(jnp.searchsorted, side=side, method=method)
-            own = jax.make_jaxpr(search)(row, value).jaxpr.eqns
-            if len(own) == 1 and str(own[0].params.get("jaxpr")) == str(inner):
+            expected = jax.make_jaxpr(search)(row, value).jaxpr.eqns
+            if len(expected) == 1 and str(expected[0].params.get("jaxpr")) == str(inner):
                 return True
     return False

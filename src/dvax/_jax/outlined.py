@@ -1,12 +1,11 @@
-"""Small programs as one function of the processor, on JAX 0.10 and 0.11.
+"""Compilation of small programs as one CPU function, on JAX 0.10 and 0.11.
 
-Those releases compile a program for a CPU to a list of kernels, and to call one takes longer than the
-arithmetic on a few numbers. XLA can compile a call as one function instead, and does so of its own
-accord for the smallest loops. Two attributes request it where a program is known to be small.
+These releases compile a program for the CPU to a list of kernels, and a kernel call takes longer than
+arithmetic on a few numbers. XLA can compile a call as one function instead; by default it does so for
+the smallest loops only. Two attributes request it for programs that are known to be small.
 
-From JAX 0.12 on XLA does this itself; there, on other devices, and wherever an interface that this
-file needs is absent, programs go to XLA as they are. The file can go with the support of Python 3.11,
-whose last JAX is 0.10.2.
+From JAX 0.12 on XLA does this by default. There, on other devices, and if an interface is missing,
+programs are not outlined. Remove this file with the support of Python 3.11, whose last JAX is 0.10.2.
 """
 
 import math
@@ -25,25 +24,25 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jax.lax import GatherScatterMode
 
-_LARGEST = 8192
-"""Entries of an array that is computed: for more, several cores are worth more than few kernels."""
+_MAX_ENTRIES = 8192
+"""Largest number of entries of a computed array: larger arrays gain more from several cores."""
 
-_LARGEST_REDUCED = 2048
-"""The same of a reduction: XLA reduces longer arrays by calls of a library, which one function cannot
-contain."""
+_MAX_REDUCED = 2048
+"""The same for the argument of a reduction: XLA reduces longer arrays by library calls, which one
+function cannot contain."""
 
-_LARGEST_COSTLY = 500
+_MAX_COSTLY = 500
 """The same for functions that cost many times as much as a product."""
 
-_LARGEST_MATRIX = 5
-"""Rows of a matrix that is multiplied by a matrix: larger products are calls of a library as well."""
+_MAX_MATRIX = 5
+"""Largest number of rows in a product of two matrices: larger products are library calls too."""
 
 _MAX_PACKED = 10**6
-"""Entries of all arguments together."""
+"""Largest number of entries of all packed arguments together."""
 
 _PACKABLE = tuple(map(np.dtype, "bool int32 int64 uint32 float32 float64".split()))
 
-_OTHERS = frozenset(
+_ELEMENTWISE = frozenset(
     "abs add add_any and bitcast_convert_type ceil clamp concatenate convert_element_type "
     "copy div eq expand_dims floor ge gt integer_pow iota is_finite le lt max "
     "min mul ne neg nextafter not or pad rem reshape rev round rsqrt select_n shift_left "
@@ -56,8 +55,8 @@ _COSTLY = frozenset(
     "sin sinh tan tanh".split()
 )
 _PARTS = {"dynamic_slice": None, "gather": None, "dynamic_update_slice": 1, "scatter": 2}
-"""Operations on a part of an array, which itself may be of any size. The part is the result (None) or
-the argument of this number."""
+"""Operations on a part of an array of any size. The part is the result (None), or the argument of this
+number."""
 _FREE = ("broadcast_in_dim", "stop_gradient", "reshard")
 _NESTED = frozenset(
     "jit pjit closed_call custom_jvp_call custom_vjp_call custom_vmap_call remat2 cond scan "
@@ -66,10 +65,10 @@ _NESTED = frozenset(
 
 
 def outlined(run: Callable[..., Any], *args: Any, large: Any = ()) -> Any:
-    """Return run(*args, *large), compiled as one function where the program is small.
+    """Return run(*args, *large), compiled as one function if the program is small.
 
-    The arrays in `large` may be of any size. A batch of the program is outlined in turn; its tangents
-    are not.
+    The arrays in `large` may be of any size. Under `jax.vmap` the batched program is outlined too;
+    tangents are not outlined.
     """
     if jax.default_backend() != "cpu":
         return run(*args, *large)
@@ -85,12 +84,12 @@ def outlined(run: Callable[..., Any], *args: Any, large: Any = ()) -> Any:
         return out
 
     program, shape = jax.make_jaxpr(dynamic, return_shape=True)(*leaves)
-    found = jtu.tree_structure(shape).unflatten(_bind(program, leaves, packs))
-    return eqx.combine(found, others[0])
+    results = jtu.tree_structure(shape).unflatten(_bind(program, leaves, packs))
+    return eqx.combine(results, others[0])
 
 
 def _bind(program: ClosedJaxpr, leaves: list[Any], packs: list[bool]) -> list[Any]:
-    """Return the results of a program, as one function where it is small."""
+    """Return the results of a program, outlined if it is small."""
     jaxpr = program.jaxpr
     leaves, packs = [*program.consts, *leaves], [True] * len(program.consts) + packs
     invars, names = [*jaxpr.constvars, *jaxpr.invars], jaxpr.debug_info.with_unknown_names()
@@ -104,15 +103,15 @@ def _bind(program: ClosedJaxpr, leaves: list[Any], packs: list[bool]) -> list[An
     return _outlined_p.bind(*leaves, program=program, packs=tuple(packs))
 
 
-# Which programs are small, and made of what one function can do: asking for one that cannot be
-# compiled so is an error that no program can catch.
+# The following functions decide which programs are small and contain only operations that XLA can
+# compile in one function. A request for another program aborts the process.
 
 
 def _is_small(program: ClosedJaxpr) -> bool:
     return _are_few(program.consts) and all(map(_is_small_equation, program.jaxpr.eqns))
 
 
-def _are_few(arrays: Any, most: int = _LARGEST) -> bool:
+def _are_few(arrays: Any, most: int = _MAX_ENTRIES) -> bool:
     return all(math.prod(jnp.shape(array)) <= most for array in arrays)
 
 
@@ -121,48 +120,48 @@ def _is_small_equation(eqn: Any) -> bool:
     if name in _NESTED:
         return all(map(_is_small, _nested_programs(eqn.params)))
     if name in _PARTS:
-        place = _PARTS[name]
-        part = results[0] if place is None else eqn.invars[place].aval
-        # XLA compiles a scatter so only where it writes one row, the same for a whole batch.
-        row = name != "scatter" or (
+        number = _PARTS[name]
+        part = results[0] if number is None else eqn.invars[number].aval
+        # XLA supports only a scatter that writes one row, the same for a whole batch.
+        is_supported = name != "scatter" or (
             math.prod(eqn.invars[1].aval.shape[:-1]) == 1
             and eqn.params["mode"] == GatherScatterMode.CLIP
         )
-        return row and _are_few([part])
+        return is_supported and _are_few([part])
     if name in _COSTLY:
-        return _are_few(results, _LARGEST_COSTLY)
+        return _are_few(results, _MAX_COSTLY)
     if name == "dot_general":
         return _is_plain_product(eqn, *(v.aval for v in eqn.invars))
     if name in _REDUCTIONS:
-        return _are_few([eqn.invars[0].aval], _LARGEST_REDUCED)
-    return name in _FREE or (name in _OTHERS and _are_few(results))
+        return _are_few([eqn.invars[0].aval], _MAX_REDUCED)
+    return name in _FREE or (name in _ELEMENTWISE and _are_few(results))
 
 
 def _nested_programs(params: dict[str, Any]) -> list[ClosedJaxpr]:
-    found = []
+    programs = []
     for value in params.values():
         for one in value if isinstance(value, tuple | list) else (value,):
             if isinstance(one, ClosedJaxpr | Jaxpr):
-                found.append(one if isinstance(one, ClosedJaxpr) else ClosedJaxpr(one, ()))
-    return found
+                programs.append(one if isinstance(one, ClosedJaxpr) else ClosedJaxpr(one, ()))
+    return programs
 
 
 def _is_plain_product(eqn: Any, first: Any, second: Any) -> bool:
-    """Return whether it is of a real matrix and a vector, or of two tiny matrices."""
+    """Return whether a product is that of a real matrix and a vector, or of two tiny matrices."""
     batched = eqn.params["dimension_numbers"][1] != ((), ())
     real = first.dtype == second.dtype and jnp.issubdtype(first.dtype, jnp.floating)
     if batched or not real or max(first.ndim, second.ndim) > 2:
         return False
-    tiny = max(*first.shape, *second.shape, 0) <= _LARGEST_MATRIX
+    tiny = max(*first.shape, *second.shape, 0) <= _MAX_MATRIX
     return tiny if first.ndim == second.ndim == 2 else _are_few([first, second])
 
 
-# The arguments are packed into one array: XLA aborts on arguments of an outlined call that turn out to
-# be unused or constant, and every argument costs time at each call.
+# Pack the arguments into one array: XLA aborts on arguments of an outlined call that are unused or
+# constant, and every argument costs time at each call.
 
 
 def _pack(leaf: Any) -> jax.Array:
-    """Return an array as floating numbers, bit by bit where it holds integers."""
+    """Return an array as a floating-point vector; integers are converted bitwise."""
     leaf, wide = jnp.asarray(leaf), jnp.result_type(float)
     if leaf.dtype.kind != "f":
         leaf = jax.lax.bitcast_convert_type(leaf.astype(jnp.result_type(int)), wide)
@@ -180,21 +179,21 @@ def _unpack(vector: jax.Array, like: list[Any]) -> list[jax.Array]:
     return leaves
 
 
-def _as_it_is(*leaves: Any, program: ClosedJaxpr, packs: Any) -> list[Any]:
+def _call_plainly(*leaves: Any, program: ClosedJaxpr, packs: Any) -> list[Any]:
     return jaxpr_as_fun(program)(*leaves)
 
 
-def _as_function(*leaves: Any, program: ClosedJaxpr, packs: Any) -> list[Any]:
+def _call_outlined(*leaves: Any, program: ClosedJaxpr, packs: Any) -> list[Any]:
     few, many = list(compress(leaves, packs)), list(compress(leaves, [not p for p in packs]))
     like = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in few]
 
     def call(vector: jax.Array, many: list[Any]) -> tuple[list[Any], list[Any]]:
         small, rest = iter(_unpack(vector, like)), iter(many)
         whole = [next(small if p else rest) for p in packs]
-        # What is returned is used.
+        # Return an entry of each argument, so that none is unused.
         return jaxpr_as_fun(program)(*whole), [leaf.ravel()[0] for leaf in (vector, *many)]
 
-    # An entry of each large array goes along, since the vector itself may turn out to be constant.
+    # Pack an entry of each large array too, since the vector might be constant otherwise.
     vector = jnp.concatenate([_pack(leaf) for leaf in (*few, *(m.ravel()[:1] for m in many))])
     attributes = {"inlineable": "false", "xla_cpu_small_call": "true"}
     marked: Any = set_xla_metadata(jax.jit(call)(vector, many), **attributes)
@@ -202,43 +201,46 @@ def _as_function(*leaves: Any, program: ClosedJaxpr, packs: Any) -> list[Any]:
 
 
 def _lower(ctx: Any, *leaves: Any, **params: Any) -> Any:
-    """Outline a program that one device runs. XLA may put the communication between several anywhere
-    into a program that is theirs, and one function cannot hold it."""
+    """Lower a program, outlined if it runs on one device.
+
+    With several devices, XLA may insert communication, which one function cannot contain.
+    """
     context = ctx.module_context.axis_context
     if isinstance(context, mlir.ShardingContext):
-        alone = context.num_devices == 1
+        is_on_one_device = context.num_devices == 1
     else:
-        alone = context.manual_axes == frozenset(context.mesh.axis_names)
-    run = _as_function if alone else _as_it_is
+        is_on_one_device = context.manual_axes == frozenset(context.mesh.axis_names)
+    run = _call_outlined if is_on_one_device else _call_plainly
     return mlir.lower_fun(run, multiple_results=True)(ctx, *leaves, **params)
 
 
 def _batch(leaves: Any, axes: Any, *, program: ClosedJaxpr, packs: Any) -> Any:
-    whole = jax.vmap(jaxpr_as_fun(program), in_axes=tuple(axes))
-    found = _bind(jax.make_jaxpr(whole)(*leaves), list(leaves), list(packs))
-    return found, [0] * len(found)
+    batched = jax.vmap(jaxpr_as_fun(program), in_axes=tuple(axes))
+    results = _bind(jax.make_jaxpr(batched)(*leaves), list(leaves), list(packs))
+    return results, [0] * len(results)
 
 
-def _push_forward(leaves: Any, tangents: Any, *, program: ClosedJaxpr, packs: Any) -> Any:
+def _jvp(leaves: Any, tangents: Any, *, program: ClosedJaxpr, packs: Any) -> Any:
     """Return values and tangents by a plain program, which can be linearised and transposed."""
-    moves = [not isinstance(tangent, ad.Zero) for tangent in tangents]
+    has_tangent = [not isinstance(tangent, ad.Zero) for tangent in tangents]
 
-    def of(*moving: Any) -> list[Any]:
-        own = iter(moving)
-        whole = [next(own) if m else leaf for leaf, m in zip(leaves, moves, strict=True)]
-        return jaxpr_as_fun(program)(*whole)
+    def run(*differentiated: Any) -> list[Any]:
+        own = iter(differentiated)
+        inputs = [next(own) if d else leaf for leaf, d in zip(leaves, has_tangent, strict=True)]
+        return jaxpr_as_fun(program)(*inputs)
 
-    out, pushed = jax.jvp(of, tuple(compress(leaves, moves)), tuple(compress(tangents, moves)))
+    primals = tuple(compress(leaves, has_tangent))
+    out, out_tangents = jax.jvp(run, primals, tuple(compress(tangents, has_tangent)))
     zeros = [ad.Zero(jax.typeof(v).to_tangent_aval()) for v in out]
-    none = [t.dtype == jax.dtypes.float0 for t in pushed]
-    return out, [zero if n else t for zero, n, t in zip(zeros, none, pushed, strict=True)]
+    is_zero = [t.dtype == jax.dtypes.float0 for t in out_tangents]
+    return out, [zero if n else t for zero, n, t in zip(zeros, is_zero, out_tangents, strict=True)]
 
 
 _outlined_p = Primitive("outlined")
 _outlined_p.multiple_results = True
-_outlined_p.def_impl(lambda *leaves, **params: jax.jit(partial(_as_it_is, **params))(*leaves))
+_outlined_p.def_impl(lambda *leaves, **params: jax.jit(partial(_call_plainly, **params))(*leaves))
 _outlined_p.def_abstract_eval(lambda *leaves, program, **_: program.out_avals)
-mlir.register_lowering(_outlined_p, mlir.lower_fun(_as_it_is, multiple_results=True))
+mlir.register_lowering(_outlined_p, mlir.lower_fun(_call_plainly, multiple_results=True))
 mlir.register_lowering(_outlined_p, _lower, platform="cpu", cacheable=False)
 batching.primitive_batchers[_outlined_p] = _batch
-ad.primitive_jvps[_outlined_p] = _push_forward
+ad.primitive_jvps[_outlined_p] = _jvp

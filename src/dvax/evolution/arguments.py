@@ -55,7 +55,7 @@ def check(
              "Omit it for the default")  # fmt: skip
     if isinstance(method, Implicit):
         for name, flag in (("measure", measure), ("dense", dense)):
-            rule(not flag, name, True, "implicit methods do not record the polynomials of their steps",
+            rule(not flag, name, True, "implicit methods record no polynomials of their steps",
                  "Omit it and list the times in ts=, or use an exponential method")  # fmt: skip
         rule(dt is None, "dt", dt, "implicit methods choose their steps by rtol and atol, which also "
              "control the solution of their equations", "Omit it")  # fmt: skip

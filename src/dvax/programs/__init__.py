@@ -1,7 +1,7 @@
-"""Programs that JAX has traced, read operation by operation for what they prove.
+"""Abstract interpretation of programs traced by JAX: proofs about the code of f, h, K and F.
 
-Each domain answers one question about the code of f, h, K or F, by one table of rules
-(`interpreter.Domain`); `DOMAINS` lists them.
+Each domain answers one question by a table of rules for operations (`interpreter.Domain`). `DOMAINS`
+lists the tables.
 """
 
 from collections.abc import Mapping

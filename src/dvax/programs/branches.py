@@ -1,4 +1,4 @@
-"""Where the code of a function of x and u branches: kinks and jumps that are not those of K."""
+"""Branches in the code of f or h that depend on x or u: kinks and jumps besides those of K."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -18,23 +18,25 @@ class _OfState(NamedTuple):
 
 
 def branches(fn: Callable[..., Tree], t: Any, x: Tree, u: Tree) -> list[jax.Array]:
-    """What changes its sign where fn(t, x, u) branches by x or u: the differences of what it compares,
-    and the arguments of |·| and sign. Branches by t alone are knots. Loops and conditions are not
-    entered."""
-    found: list[jax.Array] = []
+    """Return quantities that change sign where fn(t, x, u) branches on x or u.
 
-    def evaluate(eqn: Any, given: list[Any]) -> list[Any]:
-        return list(map(_OfState, bind(eqn, [_value(v) for v in given])))
+    They are differences of compared values, and arguments of |·| and sign. Branches on t alone are
+    knots, and not included. Bodies of loops and of conditionals are not examined.
+    """
+    switches: list[jax.Array] = []
 
-    def apply(rule: Rule, eqn: Any, given: list[Any]) -> list[Any]:
+    def evaluate(eqn: Any, operands: list[Any]) -> list[Any]:
+        return list(map(_OfState, bind(eqn, [_value(v) for v in operands])))
+
+    def apply(rule: Rule, eqn: Any, operands: list[Any]) -> list[Any]:
         if is_real(eqn.invars[0].aval):
-            found.extend(rule(eqn, [_value(v) for v in given]))
-        return evaluate(eqn, given)
+            switches.extend(rule(eqn, [_value(v) for v in operands]))
+        return evaluate(eqn, operands)
 
     domain = Domain(RULES, lambda v: isinstance(v, _OfState), evaluate, apply)
-    given = [t, *map(_OfState, jtu.tree_leaves((x, u)))]
-    interpret(jax.make_jaxpr(fn)(t, x, u), given, domain)
-    return found
+    operands = [t, *map(_OfState, jtu.tree_leaves((x, u)))]
+    interpret(jax.make_jaxpr(fn)(t, x, u), operands, domain)
+    return switches
 
 
 def _value(v: Any) -> Any:
@@ -46,4 +48,4 @@ RULES: dict[str, Rule] = {
     **same_for({"abs", "sign"}, lambda eqn, v: [v[0]]),
     "clamp": lambda eqn, v: [v[1] - v[0], v[1] - v[2]],
 }
-"""What changes its sign where an operation branches."""
+"""The quantities that change sign where an operation branches."""

@@ -1,9 +1,9 @@
-"""The matrix of a linear map, read off the map's own operations.
+"""The matrix of a linear map, from the operations of its traced program.
 
-A linear map traced to a program is a list of operations. Its matrix is carried through them, column
-after column, but as long as it is diagonal it stays a vector; and a product with a given matrix then
-*is* that matrix, with its columns scaled. So the matrix of d ↦ Md + φ′(y)d costs a pass over M, where
-applying the map to n unit vectors would cost the n³ operations of several factorisations.
+The interpreter propagates the matrix of all intermediate values. As long as it is diagonal, it is
+stored as a vector. The product of a constant matrix with such a value is that matrix with scaled
+columns. Hence the matrix of d ↦ Md + φ′(y)d takes one pass over M, while applying the map to n unit
+vectors would take n³ operations.
 """
 
 from collections.abc import Callable
@@ -20,19 +20,20 @@ from .interpreter import Domain, Rule, interpret, same_for
 
 
 class _Diagonal(NamedTuple):
-    """A value whose k-th entry (in the order of memory) is `factor`'s k-th times the k-th unknown."""
+    """A value whose k-th entry (in memory order) is the k-th entry of `factor` times the k-th
+    unknown."""
 
     factor: jax.Array
 
 
 class _Columns(NamedTuple):
-    """A value that depends on the unknowns through `columns`: one more axis, the last."""
+    """A value with the matrix `columns`, whose last axis is that of the unknowns."""
 
     columns: jax.Array
 
 
 def matrix_of(linear: Callable[[Tree], Tree], like: Tree) -> jax.Array:
-    """The matrix of `linear` between elements shaped like `like`, as flat vectors."""
+    """Return the matrix of `linear` on flattened elements of the shape of `like`."""
     if isinstance(like, tuple):
         flat, unravel = jax.flatten_util.ravel_pytree(like)
         return matrix_of(lambda d: jax.flatten_util.ravel_pytree(linear(unravel(d)))[0], flat)
@@ -43,8 +44,8 @@ def matrix_of(linear: Callable[[Tree], Tree], like: Tree) -> jax.Array:
 
 
 def diagonal_of(linear: Callable[[jax.Array], jax.Array], like: jax.Array) -> jax.Array | None:
-    """The diagonal of `linear` on arrays shaped like `like`, where its operations show that the matrix
-    has nothing else; None where they do not."""
+    """Return the diagonal of `linear` if its operations prove that its matrix is diagonal, else
+    None."""
     out = _image(linear, like)
     if not _depends(out):
         return jnp.zeros_like(like)
@@ -52,7 +53,7 @@ def diagonal_of(linear: Callable[[jax.Array], jax.Array], like: jax.Array) -> ja
 
 
 def _image(linear: Callable[[Any], Any], like: jax.Array) -> Any:
-    """The image of the identity; what does not depend on the unknowns is computed as it is."""
+    """Return the image of the identity, by interpretation."""
     (out,) = interpret(jax.make_jaxpr(linear)(like), [_Diagonal(jnp.ones_like(like))], _DOMAIN)
     return out
 
@@ -68,44 +69,44 @@ def _depends(value: Any) -> bool:
     return isinstance(value, _Diagonal | _Columns)
 
 
-def _factors(given: list[Any]) -> list[Any]:
-    return [value.factor if isinstance(value, _Diagonal) else value for value in given]
+def _factors(operands: list[Any]) -> list[Any]:
+    return [value.factor if isinstance(value, _Diagonal) else value for value in operands]
 
 
-def _entrywise(eqn: Any, given: list[Any]) -> _Diagonal:
-    return _Diagonal(bind(eqn, _factors(given))[0])
+def _entrywise(eqn: Any, operands: list[Any]) -> _Diagonal:
+    return _Diagonal(bind(eqn, _factors(operands))[0])
 
 
-def _reshape(eqn: Any, given: list[Any]) -> _Diagonal | None:
+def _reshape(eqn: Any, operands: list[Any]) -> _Diagonal | None:
     # A reshape may permute the axes first.
-    return None if eqn.params.get("dimensions") is not None else _entrywise(eqn, given)
+    return None if eqn.params.get("dimensions") is not None else _entrywise(eqn, operands)
 
 
-def _broadcast_in_dim(eqn: Any, given: list[Any]) -> _Diagonal | None:
-    out, factor = eqn.outvars[0].aval, given[0].factor
+def _broadcast_in_dim(eqn: Any, operands: list[Any]) -> _Diagonal | None:
+    out, factor = eqn.outvars[0].aval, operands[0].factor
     return _Diagonal(factor.reshape(out.shape)) if out.size == factor.size else None
 
 
-def _sum(eqn: Any, given: list[Any]) -> _Diagonal | None:
-    # What does not depend on the unknowns is zero here, or the map would not be linear.
+def _sum(eqn: Any, operands: list[Any]) -> _Diagonal | None:
+    # A term that does not depend on the unknowns is zero, since the map is linear.
     shape = eqn.outvars[0].aval.shape
-    if any(value.factor.shape != shape for value in given if _depends(value)):
+    if any(value.factor.shape != shape for value in operands if _depends(value)):
         return None
-    return _Diagonal(jnp.broadcast_to(bind(eqn, _factors(given))[0], shape))
+    return _Diagonal(jnp.broadcast_to(bind(eqn, _factors(operands))[0], shape))
 
 
-def _multiple(eqn: Any, given: list[Any]) -> _Diagonal | None:
-    return _sum(eqn, given) if sum(map(_depends, given)) == 1 else None
+def _multiple(eqn: Any, operands: list[Any]) -> _Diagonal | None:
+    return _sum(eqn, operands) if sum(map(_depends, operands)) == 1 else None
 
 
-def _choice(eqn: Any, given: list[Any]) -> _Diagonal | None:
-    return None if _depends(given[0]) else _entrywise(eqn, given)
+def _choice(eqn: Any, operands: list[Any]) -> _Diagonal | None:
+    return None if _depends(operands[0]) else _entrywise(eqn, operands)
 
 
-def _product(eqn: Any, given: list[Any]) -> _Columns | None:
-    """A given array times a vector of unknowns: the array, its summed axis moved to the end."""
+def _product(eqn: Any, operands: list[Any]) -> _Columns | None:
+    """Return the constant array, with its summed axis moved to the end and scaled by the diagonal."""
     (of_left, of_right), (batch, _) = eqn.params["dimension_numbers"]
-    left, right = given
+    left, right = operands
     array, vector, axes = (right, left, of_right) if _depends(left) else (left, right, of_left)
     if _depends(array) or batch or len(axes) != 1 or vector.factor.ndim != 1:
         return None
@@ -114,9 +115,9 @@ def _product(eqn: Any, given: list[Any]) -> _Columns | None:
     return _Columns(lax.convert_element_type(columns, eqn.outvars[0].aval.dtype))
 
 
-def _column_by_column(eqn: Any, given: list[Any]) -> list[_Columns]:
-    axes = [-1 if _depends(value) else None for value in given]
-    full = [_columns(value) if _depends(value) else value for value in given]
+def _column_by_column(eqn: Any, operands: list[Any]) -> list[_Columns]:
+    axes = [-1 if _depends(value) else None for value in operands]
+    full = [_columns(value) if _depends(value) else value for value in operands]
     results = jax.vmap(lambda *g: bind(eqn, list(g)), in_axes=axes, out_axes=-1)(*full)
     return [_Columns(result) for result in results]
 
@@ -129,19 +130,19 @@ RULES: dict[str, Rule] = {
     "broadcast_in_dim": _broadcast_in_dim,
     "select_n": _choice,
     "dot_general": _product,
-    # As a whole: parameters of the map are differentiated by the rule of the function.
+    # Do not enter these calls, so that their derivative rules apply to parameters of the map.
     **same_for(CUSTOM, _column_by_column),
 }
-"""What becomes of a diagonal; None where it becomes a full matrix by no shorter way."""
+"""The rules for diagonal values; a rule returns None if the result is a general matrix."""
 
 
-def _apply(rule: Rule, eqn: Any, given: list[Any]) -> list[Any] | None:
+def _apply(rule: Rule, eqn: Any, operands: list[Any]) -> list[Any] | None:
     if rule is _column_by_column:
-        return _column_by_column(eqn, given)
-    if any(isinstance(value, _Columns) for value in given):
+        return _column_by_column(eqn, operands)
+    if any(isinstance(value, _Columns) for value in operands):
         return None
-    found = rule(eqn, given)
-    return None if found is None else [found]
+    result = rule(eqn, operands)
+    return None if result is None else [result]
 
 
 _DOMAIN = Domain(RULES, _depends, _column_by_column, _apply)

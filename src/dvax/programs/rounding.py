@@ -1,19 +1,19 @@
 """A bound on the rounding error of evaluating F, by running error analysis.
 
-Every intermediate value v of the traced program of F is carried with a bound e ≥ |fl(v) − v|, where v
-is what exact arithmetic makes of the same inputs and constants (Higham 2002, Accuracy and Stability
-of Numerical Algorithms, Section 3.3). With the unit roundoff below ε:
+The interpreter propagates a bound e ≥ |fl(v) − v| for every intermediate value v of the traced program,
+where v is the value in exact arithmetic for the same inputs and constants (Higham 2002, Accuracy and
+Stability of Numerical Algorithms, Section 3.3). With a unit roundoff below ε:
 
     sum        e = e_a + e_b + ε|v|
     product    e = |a|e_b + |b|e_a + e_a e_b + ε|v|
     quotient   e = (e_a + |v|e_b)/(|b| − e_b) + ε|v|
     Σ, k terms e = Σ e_i + kε Σ|a_i|, in any order of summation; matrix products likewise
-    φ(a)       e = sup|φ′|e_a + 8ε|v| over [a − e_a, a + e_a], φ being right to a few ulps
-    a < b      in doubt where |a − b| ≤ e_a + e_b: what it chooses is then off by how far the cases are
-               apart; steps (sign, floor) likewise
+    φ(a)       e = sup|φ′|e_a + 8ε|v| over [a − e_a, a + e_a], for φ accurate to a few ulps
+    a < b      uncertain if |a − b| ≤ e_a + e_b: a selection then has the difference of the cases as its
+               error; likewise for steps (sign, floor)
 
-For F(y) = My − q it is (n + 3)ε(|M||y| + |q|), as it should be. An operation without a rule gets an
-estimate from the relative errors of its arguments, and then the result is not proved.
+For F(y) = My − q the bound is (n + 3)ε(|M||y| + |q|). An operation without a rule gets an estimate from
+the relative errors of its arguments, and the result is then not proved.
 """
 
 import functools
@@ -34,7 +34,7 @@ from .smooth import SMOOTH_NAMES, smooth
 
 
 class _Value(NamedTuple):
-    """A computed array and a bound on its error, entry by entry; whether it is `exact`, its error 0."""
+    """A computed array and an entrywise bound on its error, which is 0 if it is `exact`."""
 
     value: jax.Array
     error: jax.Array
@@ -42,14 +42,15 @@ class _Value(NamedTuple):
 
 
 def rounding_error(F: Callable[[Tree], Tree], y: Tree) -> tuple[Tree, bool]:
-    """A bound on |fl(F(y)) − F(y)|, entry by entry, and whether every operation of F has a rule."""
+    """Return an entrywise bound on |fl(F(y)) − F(y)|, and whether it is proved: every operation of F
+    has a rule."""
     program, shape = jax.make_jaxpr(F, return_shape=True)(y)
     unknown: set[str] = set()
     apply = partial(_with_errors, unknown)
-    # Every operation rounds, those on constants as well.
+    # Operations on constants round too, so all values are abstract.
     domain = Domain(RULES, lambda value: True, partial(apply, None), apply)
-    found = interpret(program, [_exact(leaf) for leaf in jtu.tree_leaves(y)], domain)
-    return jtu.tree_structure(shape).unflatten([_lift(v).error for v in found]), not unknown
+    results = interpret(program, [_exact(leaf) for leaf in jtu.tree_leaves(y)], domain)
+    return jtu.tree_structure(shape).unflatten([_lift(v).error for v in results]), not unknown
 
 
 def _exact(value: Any) -> _Value:
@@ -69,13 +70,14 @@ def _eps(array: Any) -> float:
     return float(jnp.finfo(array.dtype).eps)
 
 
-def _with_errors(unknown: set[str], rule: Rule | None, eqn: Any, given: list[Any]) -> list[Any]:
-    """The results of an operation with their errors: by a rule, or estimated, and its name kept."""
-    out = bind(eqn, [_value(v) for v in given])
+def _with_errors(unknown: set[str], rule: Rule | None, eqn: Any, operands: list[Any]) -> list[Any]:
+    """Return the results of an operation with their errors. Without a rule, estimate the errors and add
+    the name of the operation to `unknown`."""
+    out = bind(eqn, [_value(v) for v in operands])
     if not any(map(is_real, out)):
-        # Integers are taken as computed, and so are truth values of which rounding leaves no doubt.
-        return [_doubted(eqn, given, v) if v.dtype == bool else v for v in out]
-    x = list(map(_lift, given))
+        # Integers count as exact; Boolean values may be uncertain.
+        return [_with_doubt(eqn, operands, v) if v.dtype == bool else v for v in out]
+    x = list(map(_lift, operands))
     if rule is None or any(jnp.issubdtype(v.value.dtype, jnp.complexfloating) for v in x):
         unknown.add(eqn.primitive.name)
         return [_Value(v, _estimate(v, x)) for v in out]
@@ -84,16 +86,16 @@ def _with_errors(unknown: set[str], rule: Rule | None, eqn: Any, given: list[Any
     return [_Value(v, e) for v, e in zip(out, errors, strict=True)]
 
 
-# The rules: the error of the result v of an operation on x.
+# Each rule returns the error of the result v of an operation on x.
 
 
-def _of_errors(eqn: Any, x: list[_Value], v: jax.Array) -> list[jax.Array]:
-    """Of operations that only move entries."""
+def _rearranged(eqn: Any, x: list[_Value], v: jax.Array) -> list[jax.Array]:
+    """Return the error for an operation that only rearranges entries."""
     return [jnp.abs(e) for e in bind(eqn, [one.error for one in x])]
 
 
-def _at_places(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
-    """Of entries of x at the places that the other arguments say."""
+def _indexed(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
+    """Return the error of entries of x at the indices in the other arguments."""
     return bind(eqn, [x[0].error, *(one.value for one in x[1:])])[0]
 
 
@@ -102,9 +104,9 @@ def _select(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
     chosen = bind(eqn, [which.value, *(case.error for case in cases)])[0]
     if which.exact:
         return chosen
-    # Where the condition is in doubt the value may be that of any case.
-    apart = [jnp.abs(case.value - v) + case.error for case in cases]
-    return jnp.where(which.error > 0, functools.reduce(jnp.maximum, apart), chosen)
+    # Where the condition is uncertain, the exact value may be that of any case.
+    distances = [jnp.abs(case.value - v) + case.error for case in cases]
+    return jnp.where(which.error > 0, functools.reduce(jnp.maximum, distances), chosen)
 
 
 def _extremum(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
@@ -116,7 +118,7 @@ def _largest_error(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
 
 
 def _step(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
-    # A value that its error may carry over a step is off by the height of the steps between.
+    # If the error of x may cross a step, the error of the result is the height of the steps.
     return jnp.where(x[0].error > 0, _rise(eqn, x[0], v), 0.0)
 
 
@@ -126,8 +128,8 @@ def _clamp(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
 
 def _convert(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
     error = x[0].error.astype(v.dtype)
-    longer = is_real(x[0].value) and _eps(x[0].value) >= _eps(v)
-    return error if longer else error + _eps(v) * jnp.abs(v)
+    is_exact = is_real(x[0].value) and _eps(x[0].value) >= _eps(v)
+    return error if is_exact else error + _eps(v) * jnp.abs(v)
 
 
 def _sum(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
@@ -141,9 +143,9 @@ def _product(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
 
 def _quotient(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
     (_, p, _), (b, q, _) = x
-    room = jnp.abs(b) - q
-    error = (p + jnp.abs(v) * q) / jnp.where(room > 0, room, 1.0)
-    return jnp.where(room > 0, error, jnp.inf) + _eps(v) * jnp.abs(v)
+    least = jnp.abs(b) - q
+    error = (p + jnp.abs(v) * q) / jnp.where(least > 0, least, 1.0)
+    return jnp.where(least > 0, error, jnp.inf) + _eps(v) * jnp.abs(v)
 
 
 def _long_sum(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
@@ -160,26 +162,26 @@ def _matrix_product(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
     a, b = jnp.abs(a), jnp.abs(b)
     times = lambda r, s: bind(eqn, [r, s])[0]  # noqa: E731
     error = times(a, q + (count + 2) * _eps(v) * b)
-    # A product with an array of zeros is no matter of time alone: XLA's CPU backend gets one wrong,
-    # now and then, that it fuses with a sum (jaxlib 0.10.2).
+    # Skip the product with zeros if a is exact. This also avoids a bug of XLA's CPU backend, which
+    # sometimes computes such a product wrongly when it fuses it with a sum (jaxlib 0.10.2).
     return error if exact else error + times(p, b + q)
 
 
 def _smooth(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
-    # Of the largest slope within the error: where the argument is exact, a slope that may be
-    # infinite does not matter.
+    # Use the largest slope in the interval of the argument. If the argument is exact, the slope does
+    # not enter, even if it is infinite.
     phi = smooth(eqn)
     assert phi is not None
     slope = phi.bounds(x[0].value - x[0].error, x[0].value + x[0].error)[0]
-    through = jnp.where(x[0].error > 0, 1.01 * slope * x[0].error, 0.0)
+    propagated = jnp.where(x[0].error > 0, 1.01 * slope * x[0].error, 0.0)
     power = abs(eqn.params["y"]) if eqn.primitive.name == "integer_pow" else 0
-    return through + (8 + 2 * power) * _eps(v) * jnp.abs(v)
+    return propagated + (8 + 2 * power) * _eps(v) * jnp.abs(v)
 
 
 RULES: dict[str, Rule] = {
-    **same_for(REARRANGING | JOINING, _of_errors),
-    **same_for({"neg", "real", "imag", "optimization_barrier", "pad"}, _of_errors),
-    **same_for({"dynamic_slice", "gather"}, _at_places),
+    **same_for(REARRANGING | JOINING, _rearranged),
+    **same_for({"neg", "real", "imag", "optimization_barrier", "pad"}, _rearranged),
+    **same_for({"dynamic_slice", "gather"}, _indexed),
     **same_for({"max", "min"}, _extremum),
     **same_for({"reduce_max", "reduce_min"}, _largest_error),
     **same_for({"add", "sub", "add_any"}, _sum),
@@ -194,28 +196,28 @@ RULES: dict[str, Rule] = {
     "div": _quotient,
     "dot_general": _matrix_product,
 }
-"""From an equation, its arguments and its result to the error of the result."""
+"""Functions of an equation, its arguments and its result that return the error of the result."""
 
 
 def _times(factor: jax.Array, error: jax.Array) -> jax.Array:
-    """factor · error with 0 · ∞ = 0: a factor that is zero leaves nothing of an error."""
+    """Return factor · error with 0 · ∞ = 0."""
     return jnp.where((error > 0) & (factor > 0), factor * error, 0.0)
 
 
 def _rise(eqn: Any, x: _Value, v: jax.Array) -> jax.Array:
-    """How far a step function of x may be from its computed value v."""
+    """Return a bound on the error of v, the computed value of a step function at x."""
     ends = [bind(eqn, [end])[0] for end in (x.value - x.error, x.value + x.error)]
     return functools.reduce(jnp.maximum, [jnp.abs(end - v) for end in ends])
 
 
-def _doubted(eqn: Any, given: list[Any], v: jax.Array) -> Any:
-    """A truth value with error 1 where rounding may have decided it, else as it is."""
-    if not any(isinstance(one, _Value) for one in given):
+def _with_doubt(eqn: Any, operands: list[Any], v: jax.Array) -> Any:
+    """Return a Boolean value with error 1 where rounding may have changed it, 0 elsewhere."""
+    if not any(isinstance(one, _Value) for one in operands):
         return v
-    x = [_lift(one) for one in given]
+    x = [_lift(one) for one in operands]
     if eqn.primitive.name in COMPARING and all(is_real(one.value) for one in x):
-        room = x[0].error + x[1].error
-        doubt = (room > 0) & (jnp.abs(x[0].value - x[1].value) <= room)
+        error = x[0].error + x[1].error
+        doubt = (error > 0) & (jnp.abs(x[0].value - x[1].value) <= error)
     else:
         doubt = functools.reduce(jnp.logical_or, [jnp.any(one.error > 0) for one in x])
         if all(one.value.shape in ((), v.shape) for one in x):
@@ -224,7 +226,8 @@ def _doubted(eqn: Any, given: list[Any], v: jax.Array) -> Any:
 
 
 def _estimate(out: jax.Array, x: list[_Value]) -> jax.Array:
-    """Errors relative to the largest entries, through an operation that is not badly conditioned."""
+    """Return an estimate of the errors, relative to the largest entries, for a well-conditioned
+    operation."""
     if not jnp.issubdtype(out.dtype, jnp.inexact):
         return jnp.zeros_like(out)
     eps, relative, size = _eps(out), jnp.asarray(0.0, jnp.finfo(out.dtype).dtype), 1

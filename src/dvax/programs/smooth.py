@@ -1,10 +1,10 @@
 """Smooth functions φ of one variable over an interval: the ranges of φ and φ′, bounds on |φ′| and |φ″|.
 
-One entry of `SMOOTH` makes a primitive known to every domain that reads programs: to the linear
-enclosure and to rounding by its bounds, to slopes by its ranges, and to the structure as pointwise.
+An entry of `SMOOTH` adds a primitive to every domain: linear enclosures and rounding use its bounds,
+slopes use its ranges, and the structure treats it as pointwise.
 
-|φ′| and |φ″| of most functions rise to one peak and fall behind it, as functions of x, or of |x| where
-φ is even or odd. Over an interval they are largest at the place that is nearest to the peak.
+For most functions |φ′| and |φ″| increase up to one peak and decrease after it, as functions of x, or of
+|x| if φ is even or odd. Their maximum over an interval is at the point closest to the peak.
 """
 
 import math
@@ -20,15 +20,15 @@ Ends = tuple[Any, Any]
 Bounds = Callable[[jax.Array, jax.Array], Ends]
 Range = Callable[[Any, Any], Ends]
 Formula = Callable[[Any, Any], Any]
-"""From the module of arrays (NumPy or jax.numpy) and x to a value."""
+"""A function of the array module (NumPy or jax.numpy) and of x."""
 
 
 class Smooth(NamedTuple):
-    """What is known of φ over an interval [low, high].
+    """Functions of an interval [low, high] that bound φ and its derivatives there.
 
-    - `bounds`: (sup|φ′|, sup|φ″|) by JAX, infinite where φ is not smooth or not defined;
-    - `values`, `slopes`: the least and the largest value of φ and of φ′ by NumPy, NaN for `values`
-      where φ is not defined; None where there is no rule.
+    - `bounds`: returns (sup|φ′|, sup|φ″|), in JAX, infinite where φ is not smooth or not defined;
+    - `values`, `slopes`: return the smallest and the largest value of φ and of φ′, in NumPy; `values`
+      returns NaN where φ is not defined. None if there is no rule.
     """
 
     bounds: Bounds
@@ -44,18 +44,18 @@ def _size(low: jax.Array, high: jax.Array) -> jax.Array:
 
 
 def _nearest(low: jax.Array, high: jax.Array) -> jax.Array:
-    """The distance of the interval from zero."""
+    """Return the distance of the interval from zero."""
     return jnp.where(low > 0, low, jnp.where(high < 0, -high, 0.0))
 
 
-def _range(phi: Callable[[Any], Any], *turns: Any) -> Range:
-    """The range of a φ that is monotone between its turning points."""
+def _range(phi: Callable[[Any], Any], *extrema: Any) -> Range:
+    """Return the range of φ, which is monotone between its `extrema`, as a function of an interval."""
 
-    def over(low: Any, high: Any) -> Ends:
-        values = [phi(place) for place in (low, high, *(np.clip(t, low, high) for t in turns))]
+    def range_over(low: Any, high: Any) -> Ends:
+        values = [phi(x) for x in (low, high, *(np.clip(v, low, high) for v in extrema))]
         return np.minimum.reduce(values), np.maximum.reduce(values)
 
-    return over
+    return range_over
 
 
 def _peaked(
@@ -66,27 +66,28 @@ def _peaked(
     symmetric: bool = False,
     domain: tuple[float, float] = _EVERYWHERE,
 ) -> Smooth:
-    """φ with φ′ and φ″ (up to its sign), and the `peaks` of their absolute values.
+    """Return the bounds of φ, from φ′, φ″ (up to its sign) and the `peaks` of |φ′| and |φ″|.
 
-    `symmetric`: these are even, and the peaks are those for x ≥ 0. A turning point of φ or φ′ is 0.
+    If `symmetric`, |φ′| and |φ″| are even and the peaks are those for x ≥ 0. Extrema of φ and φ′, if
+    there are any, are at 0.
     """
 
     def bounds(low: jax.Array, high: jax.Array) -> Ends:
-        places = low, high
+        ends = low, high
         if symmetric:
-            places = _nearest(low, high), _size(low, high)
-        first, second = (jnp.clip(peak, *places) for peak in peaks)
-        found = jnp.abs(slope(jnp, first)), jnp.abs(curvature(jnp, second))
+            ends = _nearest(low, high), _size(low, high)
+        first, second = (jnp.clip(peak, *ends) for peak in peaks)
+        suprema = jnp.abs(slope(jnp, first)), jnp.abs(curvature(jnp, second))
         if domain == _EVERYWHERE:
-            return found
+            return suprema
         inside = (low >= domain[0]) & (high <= domain[1])
-        return jnp.where(inside, found[0], jnp.inf), jnp.where(inside, found[1], jnp.inf)
+        return jnp.where(inside, suprema[0], jnp.inf), jnp.where(inside, suprema[1], jnp.inf)
 
     return Smooth(bounds, _range(phi, 0.0), _range(lambda v: slope(np, v), 0.0))
 
 
 def integer_power(n: int) -> Smooth:
-    """xⁿ; for n < 0 not bounded on an interval that holds zero."""
+    """Return the bounds of xⁿ; for n < 0 they are infinite on an interval that contains zero."""
 
     def bounds(low: jax.Array, high: jax.Array) -> Ends:
         if n < 0:
@@ -98,22 +99,23 @@ def integer_power(n: int) -> Smooth:
     def slope(v: Any) -> Any:
         return n * v ** (n - 1) if n > 0 else n / v ** (1 - n)
 
-    def apart(over: Range) -> Range:
-        """The range over intervals without zero, on which the function is monotone."""
+    def without_zero(over: Range) -> Range:
+        """Return the range over intervals without zero, and NaN over others."""
 
-        def of(low: Any, high: Any) -> Ends:
-            some = (low > 0) | (high < 0)
-            return over(np.where(some, low, np.nan), np.where(some, high, np.nan))
+        def range_over(low: Any, high: Any) -> Ends:
+            is_valid = (low > 0) | (high < 0)
+            return over(np.where(is_valid, low, np.nan), np.where(is_valid, high, np.nan))
 
-        return of
+        return range_over
 
     if n < 0:
-        return Smooth(bounds, apart(_range(lambda v: 1.0 / v**-n)), apart(_range(slope)))
+        values = without_zero(_range(lambda v: 1.0 / v**-n))
+        return Smooth(bounds, values, without_zero(_range(slope)))
     return Smooth(bounds, _range(lambda v: v**n, 0.0), _range(slope if n else np.zeros_like, 0.0))
 
 
 def positive_power(p: float) -> Smooth:
-    """x^p for p > 0 and x ≥ 0."""
+    """Return the bounds of x^p for p > 0 and x ≥ 0."""
     real = lambda v: np.where(v < 0.0, np.nan, v)  # noqa: E731
     return Smooth(
         lambda low, high: power_bounds(low, high, p),
@@ -123,41 +125,44 @@ def positive_power(p: float) -> Smooth:
 
 
 def power_bounds(low: jax.Array, high: jax.Array, c: Any) -> Ends:
-    """Bound the derivatives of x^c with a fixed c, where it is a number: for x ≥ 0, or whole c."""
-    # A bound below zero is loose, or c is whole and the size of x counts.
+    """Bound the derivatives of x^c for a constant c where x^c is defined: for x ≥ 0, or for integer
+    c."""
+    # If low < 0, either the enclosure of x ≥ 0 is loose, or c is an integer and |x| determines the
+    # bounds.
     low, high = jnp.maximum(low, 0.0), _size(low, high)
 
-    def most(p: Any, factor: Any) -> jax.Array:
-        worst = jnp.abs(factor) * jnp.maximum(low**p, high**p)
-        return jnp.where(factor == 0.0, 0.0, jnp.where(jnp.isnan(worst), jnp.inf, worst))
+    def bound(p: Any, factor: Any) -> jax.Array:
+        largest = jnp.abs(factor) * jnp.maximum(low**p, high**p)
+        return jnp.where(factor == 0.0, 0.0, jnp.where(jnp.isnan(largest), jnp.inf, largest))
 
-    return most(c - 1.0, c), most(c - 2.0, c * (c - 1.0))
+    return bound(c - 1.0, c), bound(c - 2.0, c * (c - 1.0))
 
 
 def exponential_bounds(low: jax.Array, high: jax.Array, base: Any) -> Ends:
-    """Bound the derivatives of base^x with a fixed base."""
+    """Bound the derivatives of base^x for a constant base."""
     rate = jnp.log(base)
-    most = jnp.maximum(base**low, base**high)
-    slope, curvature = jnp.abs(rate) * most, rate**2 * most
-    good = jnp.isfinite(rate)
-    return jnp.where(good, slope, jnp.inf), jnp.where(good, curvature, jnp.inf)
+    largest = jnp.maximum(base**low, base**high)
+    slope, curvature = jnp.abs(rate) * largest, rate**2 * largest
+    is_finite = jnp.isfinite(rate)
+    return jnp.where(is_finite, slope, jnp.inf), jnp.where(is_finite, curvature, jnp.inf)
 
 
 def _tangent_bounds(low: jax.Array, high: jax.Array) -> Ends:
     branch = lambda v: jnp.floor(v / math.pi + 0.5)  # noqa: E731
-    # A pole that rounding may have moved into the interval counts as in it.
+    # Enlarge the interval, so that rounding cannot hide a pole near its ends.
     slack = 1e-6 * (1.0 + _size(low, high))
-    one = branch(low - slack) == branch(high + slack)
+    has_no_pole = branch(low - slack) == branch(high + slack)
     largest = _size(jnp.tan(low), jnp.tan(high))
     slope = 1.0 + largest**2
-    return jnp.where(one, slope, jnp.inf), jnp.where(one, 2.0 * largest * slope, jnp.inf)
+    curvature = 2.0 * largest * slope
+    return jnp.where(has_no_pole, slope, jnp.inf), jnp.where(has_no_pole, curvature, jnp.inf)
 
 
 def _wave(shift: float) -> Smooth:
-    """sin(x + shift)."""
+    """Return the bounds of sin(x + shift)."""
 
     def over(shift: float) -> Range:
-        def of(low: Any, high: Any) -> Ends:
+        def range_over(low: Any, high: Any) -> Ends:
             a, b = (low + shift) / (2 * np.pi), (high + shift) / (2 * np.pi)
             wide = ~(b - a < 1.0)
             top, bottom = (np.floor(b - q) >= np.ceil(a - q) for q in (0.25, -0.25))
@@ -167,7 +172,7 @@ def _wave(shift: float) -> Smooth:
                 np.where(wide | top, 1.0, np.maximum(*ends)),
             )
 
-        return of
+        return range_over
 
     ones = lambda low, high: (jnp.ones_like(low), jnp.ones_like(low))  # noqa: E731
     return Smooth(ones, over(shift), over(shift + np.pi / 2))
@@ -178,7 +183,7 @@ def _exp(xp: Any, v: Any) -> Any:
 
 
 def _sech2(xp: Any, v: Any) -> Any:
-    # 1 − tanh² would cancel to 0 where the slope is small and not 0.
+    # 1 − tanh² would cancel to 0 for large |v|, where the slope is small but not 0.
     return 1.0 / xp.cosh(xp.minimum(xp.abs(v), 350.0)) ** 2
 
 
@@ -187,7 +192,7 @@ def _gauss(xp: Any, v: Any) -> Any:
 
 
 _OUTWARD = (math.inf, math.inf)
-"""|φ′| and |φ″| grow up to the end of the domain."""
+"""Peaks of functions whose |φ′| and |φ″| increase up to the end of the domain."""
 
 SMOOTH: dict[str, Smooth] = {
     "exp": _peaked(np.exp, _exp, _exp, _OUTWARD),
@@ -269,12 +274,12 @@ SMOOTH: dict[str, Smooth] = {
     ),
     "square": integer_power(2),
 }  # fmt: skip
-"""By the names of JAX's primitives."""
+"""The smooth functions by the names of JAX primitives."""
 
 SMOOTH_NAMES = SMOOTH.keys() | {"integer_pow"}
 
 
 def smooth(eqn: Any) -> Smooth | None:
-    """Return the smooth function that an operation applies to its one argument, if it does."""
+    """Return the smooth function of one argument that an operation computes, or None."""
     name = eqn.primitive.name
     return integer_power(eqn.params["y"]) if name == "integer_pow" else SMOOTH.get(name)

@@ -1,9 +1,8 @@
-"""What an operator's own code proves about it: affine? pointwise?
+"""Proofs from the code of an operator that it is affine, pointwise, or independent of its arguments.
 
-A function traced to a program is a list of primitive operations, so its dependence on y can be read
-off, operation by operation, and what is read is a proof: adding two affine things is affine,
-multiplying two that both contain y is not. Sampling could never say as much. Whatever is not
-understood is taken to be general.
+The interpreter propagates the dependence on y through the operations of the traced program: a sum of
+affine terms is affine, a product of two factors that depend on y is not. This is a proof, which
+sampling could not give. An operation without a rule counts as a general dependence.
 """
 
 from collections.abc import Callable
@@ -21,11 +20,12 @@ from .smooth import SMOOTH
 
 
 class Structure(NamedTuple):
-    """What is proved of F; False means "not shown", never "shown not to be".
+    """Proved properties of F. False means "not proved", not "disproved".
 
-    `affine`: F(y) = Jy + c with J independent of y. `pointwise`: Fᵢ depends on yᵢ alone.
-    `isotropic`: affine and pointwise with one factor for all entries, F(y) = ay + c, so that
-    y* = proj_K(−c/a) for every K (each part of a tuple may have its own a).
+    - `affine`: F(y) = Jy + c with J independent of y;
+    - `pointwise`: Fᵢ depends on yᵢ only;
+    - `isotropic`: affine and pointwise with one factor for all entries, F(y) = ay + c, so that
+      y* = proj_K(−c/a) for every K. Each part of a tuple may have another a.
     """
 
     affine: bool
@@ -34,11 +34,13 @@ class Structure(NamedTuple):
 
 
 class _Dependence(NamedTuple):
-    """How one intermediate value depends on y.
+    """The dependence of an intermediate value on y.
 
-    `degree`: 0 independent, 1 affine, 2 anything. `leaf`: the leaf of y that it depends on entry by
-    entry, by number and shape (None: several leaves, mixed entries, or no dependence). `uniform`: the
-    same number in every entry; of degree 1, that leaf times one number, plus what is independent of y.
+    - `degree`: 0 independent, 1 affine, 2 general;
+    - `leaf`: the number and shape of the leaf of y on which it depends entry by entry; None if it
+      depends on several leaves, on mixed entries, or not at all;
+    - `uniform`: for degree 0, all entries are equal; for degree 1, the value is one number times that
+      leaf, plus a term that is independent of y.
     """
 
     degree: int
@@ -47,7 +49,7 @@ class _Dependence(NamedTuple):
 
 
 def analyse(F: Callable[[Tree], Tree], like: Tree) -> Structure:
-    """The structure of F at arguments shaped like `like`, proved from its operations."""
+    """Return the structure of F for arguments of the shape of `like`, proved from its operations."""
     shapes = [tuple(jnp.shape(leaf)) for leaf in jtu.tree_leaves(like)]
     inputs = [_Dependence(1, leaf, True) for leaf in enumerate(shapes)]
     outputs = _read(jax.make_jaxpr(F)(like), inputs)
@@ -60,7 +62,7 @@ def analyse(F: Callable[[Tree], Tree], like: Tree) -> Structure:
 
 
 def independent(fn: Callable[..., Tree], *args: Tree) -> bool:
-    """Whether no output of fn(*args) depends on any of the args, as far as its code shows."""
+    """Return whether the code of `fn` proves that no output of fn(*args) depends on the args."""
     program = jax.make_jaxpr(fn)(*args)
     inputs = [_Dependence(1, None, False) for _ in program.jaxpr.invars]
     return all(out.degree == 0 for out in _read(program, inputs))
@@ -71,100 +73,106 @@ def _read(program: Any, inputs: list[_Dependence]) -> list[_Dependence]:
 
 
 def _lift(value: Any) -> _Dependence:
-    """What is known of a value; an array does not depend on y."""
+    """Return the dependence of a value; a concrete array does not depend on y."""
     if isinstance(value, _Dependence):
         return value
     return _Dependence(0, None, jnp.shape(value) == ())
 
 
-def _together(eqn: Any, given: list[_Dependence]) -> _Dependence:
-    """What a sum of the arguments is."""
+def _together(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    """Return the dependence of a sum of the arguments."""
     shape = eqn.outvars[0].aval.shape
-    present = [(value, atom) for value, atom in zip(given, eqn.invars, strict=True) if value.degree]
+    present = [
+        (value, atom) for value, atom in zip(operands, eqn.invars, strict=True) if value.degree
+    ]
     leaves = {value.leaf for value, _ in present}
-    # Entry by entry only while shapes agree: anything else moves entries about.
+    # The sum is entrywise only if all shapes agree.
     leaf = leaves.pop() if len(leaves) == 1 else None
     if leaf is None or leaf[1] != shape or any(atom.aval.shape != shape for _, atom in present):
         leaf = None
     uniform = leaf is not None and all(value.uniform for value, _ in present)
-    return _Dependence(max(value.degree for value in given), leaf, uniform)
+    return _Dependence(max(value.degree for value in operands), leaf, uniform)
 
 
-def _product(eqn: Any, given: list[_Dependence]) -> _Dependence:
-    degree = min(2, sum(value.degree for value in given))
-    return _scaled(eqn, given)._replace(degree=degree)
+def _product(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    degree = min(2, sum(value.degree for value in operands))
+    return _scaled(eqn, operands)._replace(degree=degree)
 
 
-def _scaled(eqn: Any, given: list[_Dependence]) -> _Dependence:
-    found = _together(eqn, given)
-    return found._replace(uniform=found.uniform and all(value.uniform for value in given))
+def _scaled(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    total = _together(eqn, operands)
+    return total._replace(uniform=total.uniform and all(value.uniform for value in operands))
 
 
-def _quotient(eqn: Any, given: list[_Dependence]) -> _Dependence:
-    found = _scaled(eqn, given)
-    return found._replace(degree=2) if given[1].degree else found
+def _quotient(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    quotient = _scaled(eqn, operands)
+    return quotient._replace(degree=2) if operands[1].degree else quotient
 
 
-def _choice(eqn: Any, given: list[_Dependence]) -> _Dependence:
-    found = _together(eqn, given)._replace(uniform=False)
-    return found._replace(degree=2) if given[0].degree else found
+def _choice(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    choice = _together(eqn, operands)._replace(uniform=False)
+    return choice._replace(degree=2) if operands[0].degree else choice
 
 
-def _conversion(eqn: Any, given: list[_Dependence]) -> _Dependence:
-    # To integers, booleans and shorter floating types it makes steps.
+def _conversion(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    # A conversion to integers, Booleans or a shorter floating-point type is a step function.
     before, after = eqn.invars[0].aval.dtype, eqn.outvars[0].aval.dtype
     exact = jnp.issubdtype(after, jnp.inexact) and (
         not jnp.issubdtype(before, jnp.inexact) or jnp.finfo(after).eps <= jnp.finfo(before).eps
     )
-    found = _together(eqn, given)
-    return found if exact else found._replace(degree=2)
+    value = _together(eqn, operands)
+    return value if exact else value._replace(degree=2)
 
 
-def _pointwise(eqn: Any, given: list[_Dependence]) -> _Dependence:
-    return _Dependence(2, _together(eqn, given).leaf, False)
+def _pointwise(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    return _Dependence(2, _together(eqn, operands).leaf, False)
 
 
-def _mixing(eqn: Any, given: list[_Dependence]) -> _Dependence:
-    """Linear in every argument; entries change their places, or are added up."""
-    return _Dependence(max(value.degree for value in given), None, False)
+def _mixing(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    """Return the dependence of an operation that is linear in every argument, but not entrywise."""
+    return _Dependence(max(value.degree for value in operands), None, False)
 
 
-def _picking(eqn: Any, given: list[_Dependence]) -> _Dependence:
-    """The same in the first argument alone: places that depend on y are not linear in it."""
-    return _Dependence(2 if any(v.degree for v in given[1:]) else given[0].degree, None, False)
+def _picking(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    """Return the dependence of an operation that is linear in its first argument only: it is not linear
+    in indices."""
+    return _Dependence(
+        2 if any(v.degree for v in operands[1:]) else operands[0].degree, None, False
+    )
 
 
-def _reshaping(eqn: Any, given: list[_Dependence]) -> _Dependence:
+def _reshaping(eqn: Any, operands: list[_Dependence]) -> _Dependence:
     # A reshape may permute the axes first.
-    same = eqn.invars[0].aval.shape == eqn.outvars[0].aval.shape
-    keeps = same and eqn.params.get("dimensions") in (None, ())
-    return given[0] if keeps else _mixing(eqn, given)
+    same_shape = eqn.invars[0].aval.shape == eqn.outvars[0].aval.shape
+    is_identity = same_shape and eqn.params.get("dimensions") in (None, ())
+    return operands[0] if is_identity else _mixing(eqn, operands)
 
 
-def _matrix_product(eqn: Any, given: list[_Dependence]) -> _Dependence:
-    return _Dependence(min(2, sum(value.degree for value in given)), None, False)
+def _matrix_product(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    return _Dependence(min(2, sum(value.degree for value in operands)), None, False)
 
 
-def _sparse_product(eqn: Any, given: list[_Dependence]) -> _Dependence:
-    # The second argument holds the places of the first.
-    return _general(eqn, given) if given[1].degree else _matrix_product(eqn, given)
+def _sparse_product(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    # The second argument contains the indices of the entries in the first one.
+    return _general(eqn, operands) if operands[1].degree else _matrix_product(eqn, operands)
 
 
-def _scatter_add(eqn: Any, given: list[_Dependence]) -> _Dependence:
-    return _general(eqn, given) if given[1].degree else _mixing(eqn, given)
+def _scatter_add(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    return _general(eqn, operands) if operands[1].degree else _mixing(eqn, operands)
 
 
-def _linear_solve(eqn: Any, given: list[_Dependence]) -> _Dependence:
-    return _general(eqn, given) if given[0].degree else _mixing(eqn, given)
+def _linear_solve(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    return _general(eqn, operands) if operands[0].degree else _mixing(eqn, operands)
 
 
-def _general(eqn: Any, given: list[Any]) -> _Dependence:
+def _general(eqn: Any, operands: list[Any]) -> _Dependence:
     return _Dependence(2, None, False)
 
 
-def _custom(eqn: Any, given: list[Any]) -> list[_Dependence] | None:
-    """A derivative rule of its own need not be the slope of the values."""
-    results = entered(eqn, given, _DOMAIN)
+def _custom(eqn: Any, operands: list[Any]) -> list[_Dependence] | None:
+    """Return the dependence of a call with a custom derivative rule, which need not be the derivative
+    of the values: any dependence counts as general."""
+    results = entered(eqn, operands, _DOMAIN)
     if results is None:
         return None
     return [out._replace(degree=2) if out.degree else out for out in map(_lift, results)]
@@ -192,31 +200,31 @@ RULES: dict[str, Rule] = {
     "convert_element_type": _conversion,
     "bcoo_dot_general": _sparse_product,
     "triangular_solve": _linear_solve,
-    # Linear in value, but its derivative is 0, and the slope of a law is taken by differentiating.
+    # Its value is linear, but its derivative is 0, and the slope of a law is its derivative.
     "stop_gradient": _pointwise,
 }  # fmt: skip
 
 _UNIFORM = {
     name for name, rule in RULES.items() if rule in (_pointwise, _together, _product, _quotient)
 } | {"convert_element_type", "broadcast_in_dim"}
-"""Operations that make one number of arguments that are one number each."""
+"""Operations whose result has equal entries if each of their arguments has."""
 
 
-def _apply(rule: Rule, eqn: Any, given: list[Any]) -> list[_Dependence] | None:
-    found = rule(eqn, list(map(_lift, given)))
-    return [found] * len(eqn.outvars) if isinstance(found, _Dependence) else found
+def _apply(rule: Rule, eqn: Any, operands: list[Any]) -> list[_Dependence] | None:
+    result = rule(eqn, list(map(_lift, operands)))
+    return [result] * len(eqn.outvars) if isinstance(result, _Dependence) else result
 
 
-def _constant(eqn: Any, given: list[Any]) -> list[_Dependence]:
-    """The results of an operation on what does not depend on y."""
-    same = eqn.primitive.name in _UNIFORM and all(_lift(value).uniform for value in given)
-    return [_Dependence(0, None, same or out.aval.shape == ()) for out in eqn.outvars]
+def _constant(eqn: Any, operands: list[Any]) -> list[_Dependence]:
+    """Return the results of an operation whose arguments do not depend on y."""
+    uniform = eqn.primitive.name in _UNIFORM and all(_lift(value).uniform for value in operands)
+    return [_Dependence(0, None, uniform or out.aval.shape == ()) for out in eqn.outvars]
 
 
 _DOMAIN = Domain(
     RULES,
     is_abstract=lambda value: isinstance(value, _Dependence) and value.degree > 0,
-    unknown=lambda eqn, given: [_general(eqn, given)] * len(eqn.outvars),
+    unknown=lambda eqn, operands: [_general(eqn, operands)] * len(eqn.outvars),
     apply=_apply,
     evaluate=_constant,
 )

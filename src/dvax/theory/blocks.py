@@ -7,7 +7,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._tree import Tree
-from ..programs.slope import MOST, Part, Slope, TooLarge, Values, columns, is_slope
+from ..programs.slope import MAX_ENTRIES, Part, Slope, TooLarge, Values, columns, is_slope
 
 _MAX_DENSE_SIZE = 2_000
 """Largest number of rows or columns for which singular values are computed."""
@@ -108,7 +108,7 @@ def block(out: Tree, first: int, roots_out: list[Values], roots_in: list[Values]
     sizes_out, sizes_in = [r.size for r in roots_out], [r.size for r in roots_in]
     if (
         max(sum(sizes_out), sum(sizes_in)) > _MAX_DENSE_SIZE
-        or sum(sizes_out) * sum(sizes_in) > MOST
+        or sum(sizes_out) * sum(sizes_in) > MAX_ENTRIES
     ):
         raise TooLarge
 

@@ -1,9 +1,9 @@
-"""Slope arithmetic: a program's values and its derivatives over a whole region."""
+"""Slope arithmetic: enclosures of the values and derivatives of a program over a region."""
 
 from .enclosure import RULES as RULES
 from .enclosure import EnclosedSlopes as EnclosedSlopes
 from .enclosure import SlopeEnclosure as SlopeEnclosure
-from .values import MOST as MOST
+from .values import MAX_ENTRIES as MAX_ENTRIES
 from .values import Part as Part
 from .values import Slope as Slope
 from .values import TooLarge as TooLarge

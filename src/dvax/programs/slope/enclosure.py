@@ -1,14 +1,14 @@
 """Slope arithmetic: an enclosure of a function's values and of its derivative over a whole region.
 
-Every quantity is carried as a `Slope`: an interval of values, and for each array it is differentiated
-by an interval of derivatives, as center and radius. Each operation of the user's f and h, read off its
-jaxpr, has a rule that keeps this true for *every* point of the region, the generalised derivative of
-max, min and |·| included. So what comes out bounds the Lipschitz modulus over a convex region,
+Every quantity is represented by a `Slope`: an interval of values, and for each array of variables an
+interval of derivatives, as center and radius. Each operation has a rule that is valid for *every* point
+of the region, and includes the generalised derivatives of max, min and |·|. The result bounds the
+Lipschitz modulus over a convex region,
 
     ‖fn(v) − fn(w)‖ ≤ sup ‖∂fn‖ ‖v − w‖,
 
-and it is a proof, up to the rounding of its own arithmetic. Where an operation has no rule, or may
-jump, the derivative is enclosed by (−∞, ∞): nothing is known, and nothing is claimed.
+rigorously except for the rounding errors of the interval arithmetic. If an operation has no rule, or
+may jump, its derivative is enclosed by (−∞, ∞).
 """
 
 import math
@@ -26,23 +26,23 @@ from ..interpreter import Domain, Rule, interpret
 from .rules_elementwise import ELEMENTWISE
 from .rules_structural import STRUCTURAL
 from .rules_tables import TABLES
-from .values import MOST, Part, Slope, TooLarge, entries, interval, is_slope
+from .values import MAX_ENTRIES, Part, Slope, TooLarge, entries, interval, is_slope
 
 RULES: dict[str, Rule] = {**ELEMENTWISE, **STRUCTURAL, **TABLES}
 
 
 class EnclosedSlopes(NamedTuple):
-    """The slopes of a function's outputs, and the operations that nothing is known about."""
+    """The slopes of the outputs of a function, and the names of the operations without a rule."""
 
     out: Tree
     unknown: tuple[str, ...]
 
 
 class SlopeEnclosure:
-    """fn over regions: traced once, enclosed as often as a region is cut into pieces.
+    """The enclosure of fn as a function of a region; fn is traced once.
 
-    **Arguments:** `fn`; `likes`, its arguments or their shapes; `wrt`, by which of them it is
-    differentiated. The k-th part of a slope belongs to the k-th leaf of those, in their order.
+    **Arguments:** `fn`: the function; `likes`: its arguments or their shapes; `wrt`: the numbers of the
+    arguments by which it is differentiated. The k-th part of a slope belongs to the k-th leaf of these.
     """
 
     def __init__(self, fn: Callable[..., Tree], likes: Sequence[Tree], wrt: Sequence[int]):
@@ -54,9 +54,9 @@ class SlopeEnclosure:
         self._wrt = [i in wrt for i, like in enumerate(likes) for _ in jtu.tree_leaves(like)]
 
     def __call__(self, *args: Tree) -> EnclosedSlopes:
-        """The enclosure for these arguments, trees of intervals.
+        """Return the enclosure for these arguments, which are trees of intervals.
 
-        **Raises:** `TooLarge`.
+        **Raises:** `TooLarge` if a matrix of derivatives is too large.
         """
         inputs, k = [], 0
         leaves = jtu.tree_leaves(args, is_leaf=is_slope)
@@ -68,28 +68,31 @@ class SlopeEnclosure:
         with np.errstate(all="ignore"):
             domain = Domain(RULES, is_slope, partial(_unknown, unknown), _apply)
             results = interpret(self._program, inputs, domain)
-        whole = [r if is_slope(r) else interval(np.asarray(r), np.asarray(r)) for r in results]
-        return EnclosedSlopes(self._output.unflatten(whole), tuple(dict.fromkeys(unknown)))
+        slopes = [r if is_slope(r) else interval(np.asarray(r), np.asarray(r)) for r in results]
+        return EnclosedSlopes(self._output.unflatten(slopes), tuple(dict.fromkeys(unknown)))
 
 
-def _apply(rule: Rule, eqn: Any, given: list[Any]) -> list[Any] | None:
-    found = rule(eqn, given)
-    if found is None:
+def _apply(rule: Rule, eqn: Any, operands: list[Any]) -> list[Any] | None:
+    result = rule(eqn, operands)
+    if result is None:
         return None
-    return [_settled(_sane(x)) for x in (found if isinstance(found, list) else [found])]
+    return [
+        _constant_if_decided(_without_nan(x))
+        for x in (result if isinstance(result, list) else [result])
+    ]
 
 
-def _unknown(names: list[str], eqn: Any, given: list[Any]) -> list[Slope]:
-    """What an operation without a rule leaves: anything, from everything that went in."""
+def _unknown(names: list[str], eqn: Any, operands: list[Any]) -> list[Slope]:
+    """Return unbounded results that depend on all arguments, and append the name of the operation."""
     names.append(eqn.primitive.name)
-    return [_anything(given, out.aval) for out in eqn.outvars]
+    return [_anything(operands, out.aval) for out in eqn.outvars]
 
 
-def _anything(given: list[Any], aval: Any) -> Slope:
+def _anything(operands: list[Any], aval: Any) -> Slope:
     parts = {}
-    for value in filter(is_slope, given):
+    for value in filter(is_slope, operands):
         for k, part in value.parts.items():
-            if entries(part) * math.prod(aval.shape) > MOST:
+            if entries(part) * math.prod(aval.shape) > MAX_ENTRIES:
                 raise TooLarge
             shape = (entries(part), *aval.shape)
             parts[k] = Part(np.zeros(shape), np.full(shape, np.inf), True)
@@ -98,20 +101,20 @@ def _anything(given: list[Any], aval: Any) -> Slope:
     return Slope(np.full(aval.shape, -np.inf), np.full(aval.shape, np.inf), parts)
 
 
-def _settled(x: Slope) -> Any:
-    """A comparison that is decided all over the region is a constant there."""
+def _constant_if_decided(x: Slope) -> Any:
+    """Return a comparison that has the same result in the whole region as a constant."""
     return x.low if x.low.dtype == bool and (x.low == x.high).all() else x
 
 
-def _sane(x: Slope) -> Slope:
-    """Where arithmetic with infinities left no number, nothing is known."""
+def _without_nan(x: Slope) -> Slope:
+    """Return the slope with unbounded intervals in place of NaN, the result of ∞ − ∞ and the like."""
     if x.low.dtype == bool:
         return x
     parts = {}
     for k, p in x.parts.items():
-        lost = np.isnan(p.center) | np.isnan(p.radius) | np.isinf(p.center)
-        if lost.any():
-            p = Part(np.where(lost, 0.0, p.center), np.where(lost, np.inf, p.radius), p.full)
+        unknown = np.isnan(p.center) | np.isnan(p.radius) | np.isinf(p.center)
+        if unknown.any():
+            p = Part(np.where(unknown, 0.0, p.center), np.where(unknown, np.inf, p.radius), p.full)
         parts[k] = p
     low = np.where(np.isnan(x.low), -np.inf, x.low)
     return Slope(low, np.where(np.isnan(x.high), np.inf, x.high), parts)

@@ -1,4 +1,4 @@
-"""The rules of slope arithmetic for operations entry by entry."""
+"""The rules of slope arithmetic for elementwise operations."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,6 +15,7 @@ from .values import (
     Values,
     added,
     hull,
+    is_dependent,
     is_slope,
     lift,
     mapped,
@@ -22,28 +23,27 @@ from .values import (
     product,
     scaled,
     together,
-    touched,
 )
 
 Ends = tuple[Values, Values]
 
 
-def _lifted(eqn: Any, given: list[Any]) -> list[Slope]:
-    return [lift(value, eqn.outvars[0].aval.shape) for value in given]
+def _lifted(eqn: Any, operands: list[Any]) -> list[Slope]:
+    return [lift(value, eqn.outvars[0].aval.shape) for value in operands]
 
 
-def _add(eqn: Any, given: list[Any]) -> Slope:
-    x, y = _lifted(eqn, given)
+def _add(eqn: Any, operands: list[Any]) -> Slope:
+    x, y = _lifted(eqn, operands)
     return Slope(x.low + y.low, x.high + y.high, added(x, y))
 
 
-def _sub(eqn: Any, given: list[Any]) -> Slope:
-    x, y = _lifted(eqn, given)
+def _sub(eqn: Any, operands: list[Any]) -> Slope:
+    x, y = _lifted(eqn, operands)
     return Slope(x.low - y.high, x.high - y.low, added(x, y, -1.0))
 
 
-def _mul(eqn: Any, given: list[Any]) -> Slope:
-    return _times(*_lifted(eqn, given))
+def _mul(eqn: Any, operands: list[Any]) -> Slope:
+    return _times(*_lifted(eqn, operands))
 
 
 def _times(x: Slope, y: Slope) -> Slope:
@@ -54,15 +54,15 @@ def _times(x: Slope, y: Slope) -> Slope:
     return Slope(low, high, added(x._replace(parts=by_x), y._replace(parts=by_y)))
 
 
-def _div(eqn: Any, given: list[Any]) -> Slope | None:
+def _div(eqn: Any, operands: list[Any]) -> Slope | None:
     if not is_real(eqn.outvars[0].aval):
         return None  # integers are divided with a remainder
-    x, y = _lifted(eqn, given)
+    x, y = _lifted(eqn, operands)
     return _times(x, _composed(integer_power(-1), y))
 
 
-def _neg(eqn: Any, given: list[Any]) -> Slope:
-    return negative(given[0])
+def _neg(eqn: Any, operands: list[Any]) -> Slope:
+    return negative(operands[0])
 
 
 def _largest(x: Slope, y: Slope) -> Slope:
@@ -81,25 +81,25 @@ def _smallest(x: Slope, y: Slope) -> Slope:
     return negative(_largest(negative(x), negative(y)))
 
 
-def _max(eqn: Any, given: list[Any]) -> Slope:
-    return _largest(*_lifted(eqn, given))
+def _max(eqn: Any, operands: list[Any]) -> Slope:
+    return _largest(*_lifted(eqn, operands))
 
 
-def _min(eqn: Any, given: list[Any]) -> Slope:
-    return _smallest(*_lifted(eqn, given))
+def _min(eqn: Any, operands: list[Any]) -> Slope:
+    return _smallest(*_lifted(eqn, operands))
 
 
-def _clamp(eqn: Any, given: list[Any]) -> Slope:
-    low, x, high = _lifted(eqn, given)
+def _clamp(eqn: Any, operands: list[Any]) -> Slope:
+    low, x, high = _lifted(eqn, operands)
     return _smallest(_largest(x, low), high)
 
 
-def _abs(eqn: Any, given: list[Any]) -> Slope:
-    return _largest(given[0], negative(given[0]))
+def _abs(eqn: Any, operands: list[Any]) -> Slope:
+    return _largest(operands[0], negative(operands[0]))
 
 
 def _composed(phi: Smooth, x: Slope) -> Slope:
-    """φ(x), from the ranges of φ and φ′; nothing is known of φ′ where φ is not defined."""
+    """Return φ(x) from the ranges of φ and φ′; the derivative is unbounded where φ is not defined."""
     assert phi.values is not None and phi.slopes is not None
     low, high = phi.values(x.low, x.high)
     down, up = phi.slopes(x.low, x.high)
@@ -107,63 +107,64 @@ def _composed(phi: Smooth, x: Slope) -> Slope:
     return Slope(low, high, mapped(x.parts, lambda part: scaled(part, down, up)))
 
 
-def _smooth(eqn: Any, given: list[Any]) -> Slope | None:
+def _smooth(eqn: Any, operands: list[Any]) -> Slope | None:
     phi = smooth(eqn)
-    return None if phi is None or phi.values is None else _composed(phi, given[0])
+    return None if phi is None or phi.values is None else _composed(phi, operands[0])
 
 
-def _pow(eqn: Any, given: list[Any]) -> Slope | None:
-    """vᵖ for a fixed number p > 0 and v ≥ 0."""
-    x, p = given
+def _pow(eqn: Any, operands: list[Any]) -> Slope | None:
+    """Return vᵖ for a constant number p > 0 and v ≥ 0."""
+    x, p = operands
     if is_slope(p) or not is_slope(x) or np.size(p) != 1 or not float(p) > 0:
         return None
     return _composed(positive_power(float(p)), x)
 
 
 def _stairs(phi: Callable[[Values], Values]) -> Rule:
-    """A φ of steps: constant where both ends of the interval are on the same one."""
+    """Return the rule of a step function φ, which is constant where its values at both ends agree."""
 
-    def rule(eqn: Any, given: list[Any]) -> Slope:
-        (x,) = given
+    def rule(eqn: Any, operands: list[Any]) -> Slope:
+        (x,) = operands
         low, high = phi(x.low), phi(x.high)
         jump = np.where(low == high, 0.0, np.inf)
         level = lambda p: Part(  # noqa: E731
-            np.zeros_like(p.center), np.where(touched(p), jump, 0.0), p.full
+            np.zeros_like(p.center), np.where(is_dependent(p), jump, 0.0), p.full
         )
         return Slope(low, high, mapped(x.parts, level))
 
     return rule
 
 
-def _round(eqn: Any, given: list[Any]) -> Slope | None:
-    """Halves go to the even side, or away from zero."""
+def _round(eqn: Any, operands: list[Any]) -> Slope | None:
+    """Return x rounded; ties go to even, or away from zero."""
     to_even = eqn.params["rounding_method"] == lax.RoundingMethod.TO_NEAREST_EVEN
     away = lambda v: np.sign(v) * np.floor(np.abs(v) + 0.5)  # noqa: E731
-    return _stairs(np.round if to_even else away)(eqn, given)
+    return _stairs(np.round if to_even else away)(eqn, operands)
 
 
-def _decided(low: Values, high: Values, *given: Slope) -> Slope:
-    """Truth values: no derivatives, but 1 in the place of one where there is a dependence."""
+def _decided(low: Values, high: Values, *operands: Slope) -> Slope:
+    """Return Boolean values. Their parts are no derivatives, but marks: 1 where there is a
+    dependence."""
     marks = {}
-    for k, parts in together(list(given)).items():
-        mark = sum(touched(part) * 1.0 for part in parts)
+    for k, parts in together(list(operands)).items():
+        mark = sum(is_dependent(part) * 1.0 for part in parts)
         marks[k] = Part(mark, np.zeros_like(mark), parts[0].full)
     return Slope(low, high, marks)
 
 
 def _compare(decide: Callable[[Slope, Slope], Ends]) -> Rule:
-    def rule(eqn: Any, given: list[Any]) -> Slope:
-        x, y = _lifted(eqn, given)
+    def rule(eqn: Any, operands: list[Any]) -> Slope:
+        x, y = _lifted(eqn, operands)
         return _decided(*decide(x, y), x, y)
 
     return rule
 
 
-def _equal(eqn: Any, given: list[Any]) -> Slope:
-    x, y = _lifted(eqn, given)
+def _equal(eqn: Any, operands: list[Any]) -> Slope:
+    x, y = _lifted(eqn, operands)
     surely = (x.low == x.high) & (y.low == y.high) & (x.low == y.low)
     if eqn.invars[0] is eqn.invars[1]:
-        # A value is compared with itself to find NaN.
+        # Code compares a value with itself to detect NaN.
         surely = np.ones(x.low.shape, bool)
     return _decided(surely, surely | (x.low <= y.high) & (y.low <= x.high), x, y)
 
@@ -173,10 +174,10 @@ def _opposite(x: Slope) -> Slope:
 
 
 def _logic(fn: Callable[..., Values]) -> Rule:
-    """What grows with each of its truth values."""
+    """Return the rule of a logical function that increases with each of its arguments."""
 
-    def rule(eqn: Any, given: list[Any]) -> Slope | None:
-        x = _lifted(eqn, given)
+    def rule(eqn: Any, operands: list[Any]) -> Slope | None:
+        x = _lifted(eqn, operands)
         if not all(v.low.dtype == bool for v in x):
             return None
         return _decided(fn(*(v.low for v in x)), fn(*(v.high for v in x)), *x)
@@ -184,36 +185,36 @@ def _logic(fn: Callable[..., Values]) -> Rule:
     return rule
 
 
-def _not(eqn: Any, given: list[Any]) -> Slope | None:
-    return _opposite(given[0]) if given[0].low.dtype == bool else None
+def _not(eqn: Any, operands: list[Any]) -> Slope | None:
+    return _opposite(operands[0]) if operands[0].low.dtype == bool else None
 
 
-def _select(eqn: Any, given: list[Any]) -> Slope | None:
-    which, *cases = _lifted(eqn, given)
+def _select(eqn: Any, operands: list[Any]) -> Slope | None:
+    which, *cases = _lifted(eqn, operands)
     if len(cases) != 2 or which.low.dtype != bool:
         return None
     no, yes = cases
-    known = which.low == which.high
-    pick = lambda a, b, other: np.where(known, np.where(which.low, b, a), other)  # noqa: E731
+    is_decided = which.low == which.high
+    pick = lambda a, b, other: np.where(is_decided, np.where(which.low, b, a), other)  # noqa: E731
     parts = {}
     for k, (a, b, by_choice) in together([no, yes, which]).items():
         both = hull(a, b)
-        # Where the choice itself may change with v the value may jump.
-        loose = np.where(touched(by_choice), np.inf, both.radius)
+        # If the choice depends on v, the value may jump.
+        radius = np.where(is_dependent(by_choice), np.inf, both.radius)
         center = pick(a.center, b.center, both.center)
-        parts[k] = Part(center, pick(a.radius, b.radius, loose), a.full)
+        parts[k] = Part(center, pick(a.radius, b.radius, radius), a.full)
     low = pick(no.low, yes.low, np.minimum(no.low, yes.low))
     return Slope(low, pick(no.high, yes.high, np.maximum(no.high, yes.high)), parts)
 
 
-def _convert(eqn: Any, given: list[Any]) -> Slope | None:
-    (x,) = given
+def _convert(eqn: Any, operands: list[Any]) -> Slope | None:
+    (x,) = operands
     before, after = eqn.invars[0].aval, eqn.outvars[0].aval
     if not is_real(after):
         return None
     if is_real(before):
         return x if jnp.finfo(after.dtype).eps <= jnp.finfo(before.dtype).eps else None
-    return _stairs(lambda v: np.asarray(v, float))(eqn, given)
+    return _stairs(lambda v: np.asarray(v, float))(eqn, operands)
 
 
 ELEMENTWISE: dict[str, Rule] = {
@@ -233,7 +234,7 @@ ELEMENTWISE: dict[str, Rule] = {
     "ceil": _stairs(np.ceil),
     "round": _round,
     "eq": _equal,
-    "ne": lambda eqn, given: _opposite(_equal(eqn, given)),
+    "ne": lambda eqn, operands: _opposite(_equal(eqn, operands)),
     "lt": _compare(lambda x, y: (x.high < y.low, x.low < y.high)),
     "le": _compare(lambda x, y: (x.high <= y.low, x.low <= y.high)),
     "gt": _compare(lambda x, y: (x.low > y.high, x.high > y.low)),

@@ -1,4 +1,4 @@
-"""The rules of slope arithmetic for operations that move entries about or add them up."""
+"""The rules of slope arithmetic for operations that rearrange or add entries, and for products."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -23,28 +23,29 @@ from .values import (
 )
 
 Move = Callable[[Any, int, list[Values]], Values]
-"""From an equation, a number of extra axes in front and its arguments with those axes to its result."""
+"""A function of an equation, a number of extra axes in front, and the arguments with these axes, which
+returns the result of the operation."""
 
 
 def _linear(move: Move) -> Rule:
-    """What moves entries about or adds them up, as it does with those of every derivative."""
+    """Return the rule of a linear operation: it acts on the columns of derivatives as on values."""
 
-    def rule(eqn: Any, given: list[Any]) -> Slope:
-        x = [lift(v, tuple(atom.aval.shape)) for v, atom in zip(given, eqn.invars, strict=True)]
+    def rule(eqn: Any, operands: list[Any]) -> Slope:
+        x = [lift(v, tuple(atom.aval.shape)) for v, atom in zip(operands, eqn.invars, strict=True)]
         out = eqn.outvars[0].aval
         # A reshape may permute the axes first.
         permutes = eqn.primitive.name == "reshape" and eqn.params["dimensions"] is not None
         in_order = eqn.primitive.name in _IN_ORDER and out.size == x[0].low.size and not permutes
-        most = max([out.size, *(v.low.size for v in x)])
+        size = max([out.size, *(v.low.size for v in x)])
         parts = {}
-        for k, moved in together(x, full=len(x) > 1, size=most).items():
-            diagonal = in_order and not moved[0].full
-            if diagonal:
-                center, radius = (v.reshape(out.shape) for v in moved[0][:2])
+        for k, own in together(x, full=len(x) > 1, size=size).items():
+            is_diagonal = in_order and not own[0].full
+            if is_diagonal:
+                center, radius = (v.reshape(out.shape) for v in own[0][:2])
             else:
-                full = [columns(part, most) for part in moved]
+                full = [columns(part, size) for part in own]
                 center, radius = (move(eqn, 1, [part[i] for part in full]) for i in (0, 1))
-            parts[k] = Part(center, radius, not diagonal)
+            parts[k] = Part(center, radius, not is_diagonal)
         low, high = move(eqn, 0, [v.low for v in x]), move(eqn, 0, [v.high for v in x])
         return Slope(low, high, parts)
 
@@ -54,20 +55,20 @@ def _linear(move: Move) -> Rule:
 _IN_ORDER = {"reshape", "squeeze", "expand_dims", "broadcast_in_dim", "copy", "copy_p"}
 
 
-def _as_it_is(eqn: Any, extra: int, given: list[Values]) -> Values:
-    return given[0]
+def _identity(eqn: Any, extra: int, operands: list[Values]) -> Values:
+    return operands[0]
 
 
-def _reshape(eqn: Any, extra: int, given: list[Values]) -> Values:
-    (v,) = given
+def _reshape(eqn: Any, extra: int, operands: list[Values]) -> Values:
+    (v,) = operands
     order = eqn.params.get("dimensions") if eqn.primitive.name == "reshape" else None
     if order is not None:
         v = v.transpose(*range(extra), *(extra + axis for axis in order))
     return v.reshape((*v.shape[:extra], *eqn.outvars[0].aval.shape))
 
 
-def _broadcast_in_dim(eqn: Any, extra: int, given: list[Values]) -> Values:
-    (v,) = given
+def _broadcast_in_dim(eqn: Any, extra: int, operands: list[Values]) -> Values:
+    (v,) = operands
     shape = eqn.outvars[0].aval.shape
     wide = [1] * len(shape)
     for axis, place in enumerate(eqn.params["broadcast_dimensions"]):
@@ -75,73 +76,73 @@ def _broadcast_in_dim(eqn: Any, extra: int, given: list[Values]) -> Values:
     return np.broadcast_to(v.reshape((*v.shape[:extra], *wide)), (*v.shape[:extra], *shape))
 
 
-def _transpose(eqn: Any, extra: int, given: list[Values]) -> Values:
+def _transpose(eqn: Any, extra: int, operands: list[Values]) -> Values:
     order = [extra + axis for axis in eqn.params["permutation"]]
-    return given[0].transpose(*range(extra), *order)
+    return operands[0].transpose(*range(extra), *order)
 
 
-def _slice(eqn: Any, extra: int, given: list[Values]) -> Values:
+def _slice(eqn: Any, extra: int, operands: list[Values]) -> Values:
     p = eqn.params
     strides = p["strides"] or (1,) * len(p["start_indices"])
     cuts = [slice(*cut) for cut in zip(p["start_indices"], p["limit_indices"], strides)]
-    return given[0][(*(slice(None),) * extra, *cuts)]
+    return operands[0][(*(slice(None),) * extra, *cuts)]
 
 
-def _rev(eqn: Any, extra: int, given: list[Values]) -> Values:
-    return np.flip(given[0], tuple(extra + axis for axis in eqn.params["dimensions"]))
+def _rev(eqn: Any, extra: int, operands: list[Values]) -> Values:
+    return np.flip(operands[0], tuple(extra + axis for axis in eqn.params["dimensions"]))
 
 
-def _reduce_sum(eqn: Any, extra: int, given: list[Values]) -> Values:
-    return given[0].sum(axis=tuple(extra + axis for axis in eqn.params["axes"]))
+def _reduce_sum(eqn: Any, extra: int, operands: list[Values]) -> Values:
+    return operands[0].sum(axis=tuple(extra + axis for axis in eqn.params["axes"]))
 
 
-def _concatenate(eqn: Any, extra: int, given: list[Values]) -> Values:
-    return np.concatenate(given, eqn.params["dimension"] + extra)
+def _concatenate(eqn: Any, extra: int, operands: list[Values]) -> Values:
+    return np.concatenate(operands, eqn.params["dimension"] + extra)
 
 
-def _stack(eqn: Any, extra: int, given: list[Values]) -> Values:
-    return np.stack(given, eqn.params["axis"] + extra)
+def _stack(eqn: Any, extra: int, operands: list[Values]) -> Values:
+    return np.stack(operands, eqn.params["axis"] + extra)
 
 
-def _split(eqn: Any, given: list[Any]) -> list[Slope]:
-    """The pieces along an axis, as `ravel_pytree` takes a vector apart."""
+def _split(eqn: Any, operands: list[Any]) -> list[Slope]:
+    """Return the pieces along an axis, for example those of `ravel_pytree`."""
     axis, sizes = eqn.params["axis"], list(map(int, eqn.params["sizes"]))
     if len(sizes) == 1:
-        return given
+        return operands
     pieces = []
     for end, size in zip(np.cumsum(sizes), sizes, strict=True):
         cut = slice(end - size, end)
         take = lambda eqn, extra, v, cut=cut: v[0][(*(slice(None),) * (extra + axis), cut)]  # noqa: E731
-        pieces.append(_linear(take)(eqn, given))
+        pieces.append(_linear(take)(eqn, operands))
     return pieces
 
 
-def _at_places(eqn: Any, given: list[Any]) -> Slope | None:
-    """What is linear in its first argument and picks or adds entries at places given by the others:
-    by the operation itself, column after column."""
-    x, *places = given
-    if any(map(is_slope, places)):
+def _indexed(eqn: Any, operands: list[Any]) -> Slope | None:
+    """Return the slope of an operation that is linear in its first argument, with constant indices in
+    the others: apply it to each column of the derivatives."""
+    x, *indices = operands
+    if any(map(is_slope, indices)):
         return None
 
     def derivative(stack: Values) -> Values:
-        # What is filled in from outside does not move with anything.
+        # Fill values are constants, with derivative 0.
         params = dict(eqn.primitive.get_bind_params(eqn.params))
         if "fill_value" in params:
             params["fill_value"] = 0.0
-        each = [eqn.primitive.bind(jnp.asarray(v), *places, **params) for v in stack]
+        each = [eqn.primitive.bind(jnp.asarray(v), *indices, **params) for v in stack]
         return np.stack([np.asarray(v) for v in each])
 
-    def moved(part: Part) -> Part:
+    def derivative_part(part: Part) -> Part:
         full = columns(part, max(x.low.size, eqn.outvars[0].aval.size))
         return Part(derivative(full.center), derivative(full.radius), True)
 
-    low, high = (np.asarray(bind(eqn, [jnp.asarray(v), *places])[0]) for v in (x.low, x.high))
-    return Slope(low, high, mapped(x.parts, moved))
+    low, high = (np.asarray(bind(eqn, [jnp.asarray(v), *indices])[0]) for v in (x.low, x.high))
+    return Slope(low, high, mapped(x.parts, derivative_part))
 
 
-def _reduce_max(eqn: Any, given: list[Any]) -> Slope:
-    """The largest entry: its derivative lies between those of the entries that it may be."""
-    (x,) = given
+def _reduce_max(eqn: Any, operands: list[Any]) -> Slope:
+    """Return the largest entry, whose derivative lies in the hull of those of all entries."""
+    (x,) = operands
     axes = tuple(eqn.params["axes"])
 
     def largest(part: Part) -> Part:
@@ -153,12 +154,12 @@ def _reduce_max(eqn: Any, given: list[Any]) -> Slope:
     return Slope(x.low.max(axis=axes), x.high.max(axis=axes), mapped(x.parts, largest))
 
 
-def _reduce_min(eqn: Any, given: list[Any]) -> Slope:
-    return negative(_reduce_max(eqn, [negative(given[0])]))
+def _reduce_min(eqn: Any, operands: list[Any]) -> Slope:
+    return negative(_reduce_max(eqn, [negative(operands[0])]))
 
 
 def _einsum(eqn: Any, extra: tuple[int, int]) -> str:
-    """The product of a dot_general, each side behind so many extra axes."""
+    """Return the einsum formula of a dot_general with `extra` axes in front of each side."""
     (of_left, of_right), (batch_left, batch_right) = eqn.params["dimension_numbers"]
     names = iter("abcdefghijklmnopqrstuvw")
     left = [next(names) for _ in eqn.invars[0].aval.shape]
@@ -175,7 +176,7 @@ def _einsum(eqn: Any, extra: tuple[int, int]) -> str:
 
 
 class _Ball(NamedTuple):
-    """Center and radius, the radius infinite where an end is."""
+    """An interval array as center and radius."""
 
     center: Values
     radius: Values
@@ -186,30 +187,30 @@ def _ball(x: Slope) -> _Ball:
 
 
 def _times(spec: str, x: Any, y: Any) -> _Ball:
-    """The product of two interval arrays, as center and radius."""
+    """Return the product of two interval arrays."""
 
     def dot(a: Values, b: Values) -> Values:
         return np.einsum(spec, a, b, optimize=True)
 
     def bound(a: Values, b: Values) -> Values:
-        loose = dot(np.isinf(a) * 1.0, (b > 0) * 1.0) + dot((a > 0) * 1.0, np.isinf(b) * 1.0)
+        infinite = dot(np.isinf(a) * 1.0, (b > 0) * 1.0) + dot((a > 0) * 1.0, np.isinf(b) * 1.0)
         finite = dot(np.where(np.isinf(a), 0.0, a), np.where(np.isinf(b), 0.0, b))
-        return np.where(loose > 0, np.inf, finite)
+        return np.where(infinite > 0, np.inf, finite)
 
     radius = bound(np.abs(x.center), y.radius) + bound(x.radius, np.abs(y.center) + y.radius)
     return _Ball(dot(x.center, y.center), radius)
 
 
-def _dot_general(eqn: Any, given: list[Any]) -> Slope:
-    left, right = (lift(v, tuple(atom.aval.shape)) for v, atom in zip(given, eqn.invars))
+def _dot_general(eqn: Any, operands: list[Any]) -> Slope:
+    left, right = (lift(v, tuple(atom.aval.shape)) for v, atom in zip(operands, eqn.invars))
     x, y = _ball(left), _ball(right)
     value = _times(_einsum(eqn, (0, 0)), x, y)
     out = eqn.outvars[0].aval.size
 
     def by(side: Slope, spec: str, times: Callable[[str, Part], _Ball]) -> Slope:
-        """The derivative of the product by what one side depends on."""
-        wide = lambda part: columns(part, max(side.low.size, out))  # noqa: E731
-        parts = mapped(side.parts, lambda part: Part(*times(spec, wide(part)), True))
+        """Return the derivatives of the product through one side."""
+        full = lambda part: columns(part, max(side.low.size, out))  # noqa: E731
+        parts = mapped(side.parts, lambda part: Part(*times(spec, full(part)), True))
         return Slope(value.center, value.center, parts)
 
     by_left = by(left, _einsum(eqn, (1, 0)), lambda spec, part: _times(spec, part, y))
@@ -219,7 +220,7 @@ def _dot_general(eqn: Any, given: list[Any]) -> Slope:
 
 
 STRUCTURAL: dict[str, Rule] = {
-    **same_for({"stop_gradient", "copy", "copy_p"}, _linear(_as_it_is)),
+    **same_for({"stop_gradient", "copy", "copy_p"}, _linear(_identity)),
     **same_for({"reshape", "squeeze", "expand_dims"}, _linear(_reshape)),
     "broadcast_in_dim": _linear(_broadcast_in_dim),
     "transpose": _linear(_transpose),
@@ -229,7 +230,7 @@ STRUCTURAL: dict[str, Rule] = {
     "concatenate": _linear(_concatenate),
     "stack": _linear(_stack),
     "split": _split,
-    **same_for({"gather", "dynamic_slice", "cumsum"}, _at_places),
+    **same_for({"gather", "dynamic_slice", "cumsum"}, _indexed),
     "reduce_max": _reduce_max,
     "reduce_min": _reduce_min,
     "dot_general": _dot_general,

@@ -1,7 +1,8 @@
-"""The rules of slope arithmetic for measured data: a table of values as one operation.
+"""The rules of slope arithmetic for `dvax.signals.Table`, as one operation.
 
-Operation by operation a lookup is nothing that could be bounded, since the place in the table moves
-with t; as a whole it is: between two times it takes the values there and at the knots between.
+The operations of a lookup have no bounds one by one, because the index in the table depends on t. The
+whole lookup has: over an interval of t its range follows from the values at the ends and at the knots
+between.
 """
 
 from typing import Any
@@ -12,8 +13,8 @@ from ..interpreter import Rule
 from .values import Slope, Values, is_slope, lift, mapped, scaled
 
 
-def _linear(eqn: Any, given: list[Any]) -> Slope | None:
-    span = _span(eqn, given)
+def _linear(eqn: Any, operands: list[Any]) -> Slope | None:
+    span = _span(eqn, operands)
     if span is None:
         return None
     times, values, t, pieces = span
@@ -24,8 +25,8 @@ def _linear(eqn: Any, given: list[Any]) -> Slope | None:
     return _slope(eqn, t, reached, slopes[first : last + 1])
 
 
-def _constant(eqn: Any, given: list[Any]) -> Slope | None:
-    span = _span(eqn, given)
+def _constant(eqn: Any, operands: list[Any]) -> Slope | None:
+    span = _span(eqn, operands)
     if span is None:
         return None
     times, values, t, (first, last) = span
@@ -35,15 +36,16 @@ def _constant(eqn: Any, given: list[Any]) -> Slope | None:
     return _slope(eqn, t, reached, np.stack([-jumps, jumps]))
 
 
-def _cubic(eqn: Any, given: list[Any]) -> Slope | None:
-    """A cubic lies within the hull of its Bernstein coefficients, and so does its derivative."""
-    if is_slope(given[2]):
+def _cubic(eqn: Any, operands: list[Any]) -> Slope | None:
+    """Return the slope of a cubic table, from the convex hull of Bernstein coefficients of the pieces
+    and of their derivatives."""
+    if is_slope(operands[2]):
         return None
-    span = _span(eqn, [given[0], given[1], given[3]])
+    span = _span(eqn, [operands[0], operands[1], operands[3]])
     if span is None:
         return None
     times, values, t, (first, last) = span
-    slopes = np.asarray(given[2], float)
+    slopes = np.asarray(operands[2], float)
     width = _widths(times, values)[first : last + 1]
     v0, v1 = values[first : last + 1], values[first + 1 : last + 2]
     d0, d1 = slopes[first : last + 1], slopes[first + 1 : last + 2]
@@ -52,9 +54,10 @@ def _cubic(eqn: Any, given: list[Any]) -> Slope | None:
     return _slope(eqn, t, np.concatenate([v0, b1, b2, v1]), np.concatenate([d0, middle, d1]))
 
 
-def _span(eqn: Any, given: list[Any]) -> tuple[Values, Values, Slope, tuple[int, int]] | None:
-    """The table, t, and the first and last piece that t may lie in; None where it may lie outside."""
-    times, values, t = given
+def _span(eqn: Any, operands: list[Any]) -> tuple[Values, Values, Slope, tuple[int, int]] | None:
+    """Return times, values, t, and the first and last piece that may contain t, or None if t may lie
+    outside the table."""
+    times, values, t = operands
     if is_slope(times) or is_slope(values) or not is_slope(t) or t.low.shape != ():
         return None
     times, values = np.asarray(times, float), np.asarray(values, float)

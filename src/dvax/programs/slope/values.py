@@ -1,7 +1,7 @@
-"""What slope arithmetic works on: an interval of values, and an interval of derivatives.
+"""The values of slope arithmetic: intervals of values with intervals of derivatives.
 
-A derivative by an array v is kept as a vector as long as the k-th entry depends on the k-th of v alone:
-for a law that is solved point by point on 10⁵ points no matrix would fit.
+A derivative with respect to an array v is stored as a vector if it is diagonal: for a pointwise law on
+10⁵ points the matrix would not fit into memory.
 """
 
 import math
@@ -11,21 +11,21 @@ from typing import Any, NamedTuple
 import numpy as np
 
 Values = Any
-"""An array, or the scalar that NumPy makes of one without axes."""
+"""An array, or the scalar that NumPy returns for an array without axes."""
 
-MOST = 4_000_000
-"""Entries of the largest matrix that is written out."""
+MAX_ENTRIES = 4_000_000
+"""Largest number of entries of a matrix of derivatives."""
 
 
 class TooLarge(Exception):
-    """A matrix of derivatives that is not diagonal and has more than `MOST` entries."""
+    """A matrix of derivatives is not diagonal and has more than `MAX_ENTRIES` entries."""
 
 
 class Part(NamedTuple):
-    """∂q/∂v for one array v: every entry within `radius` of `center`.
+    """The derivative ∂q/∂v for one array v: every entry lies within `radius` of `center`.
 
-    Diagonal: shaped like q, the k-th entry of q depends on the k-th of v alone. Full: one more axis,
-    the first, over the entries of v.
+    If not `full`, it is diagonal and has the shape of q: the k-th entry of q depends on the k-th entry
+    of v only. If `full`, it has one more axis in front, that of the entries of v.
     """
 
     center: Values
@@ -34,7 +34,7 @@ class Part(NamedTuple):
 
 
 class Slope(NamedTuple):
-    """low ≤ q ≤ high, and ∂q/∂vₖ for every k among `parts`; q depends on no other vₖ."""
+    """The bounds low ≤ q ≤ high, and ∂q/∂vₖ for every k in `parts`; q does not depend on other vₖ."""
 
     low: Values
     high: Values
@@ -42,7 +42,7 @@ class Slope(NamedTuple):
 
 
 def interval(low: Any, high: Any) -> Slope:
-    """A quantity that lies between two arrays, and that nothing is differentiated by."""
+    """Return a quantity between two arrays, without derivatives."""
     low, high = np.broadcast_arrays(np.asarray(low, float), np.asarray(high, float))
     return Slope(low, high, {})
 
@@ -52,12 +52,12 @@ def is_slope(value: Any) -> bool:
 
 
 def columns(part: Part, size: int) -> Part:
-    """The part as a full one: an axis over the entries of v in front. `size` is that of the largest
-    array that it, or what is made of it, is a derivative of.
+    """Return the part in full form. `size` is the largest number of entries of q and of the quantities
+    that are computed from it.
 
-    **Raises:** `TooLarge`.
+    **Raises:** `TooLarge` if the matrix would be too large.
     """
-    if entries(part) * size > MOST:
+    if entries(part) * size > MAX_ENTRIES:
         raise TooLarge
     if part.full:
         return part
@@ -67,7 +67,7 @@ def columns(part: Part, size: int) -> Part:
 
 
 def entries(part: Part) -> int:
-    """How many entries v has."""
+    """Return the number of entries of v."""
     return part.center.shape[0] if part.full else part.center.size
 
 
@@ -76,43 +76,45 @@ def mapped(parts: dict[int, Part], fn: Callable[[Part], Part]) -> dict[int, Part
 
 
 def together(slopes: list[Slope], full: bool = False, size: int = 0) -> dict[int, list[Part]]:
-    """For every array that one of the slopes depends on, the parts of all of them, zero where there is
-    no dependence, and all diagonal or all full (always full where asked for, for results of this size).
+    """Return, for every array on which a slope depends, the parts of all slopes in the same form.
+
+    Missing parts are zero. All parts are full if one of them is, or if `full`; `size` is the number of
+    entries of the result.
     """
-    found = {}
+    parts_by_array = {}
     for k in {k: None for x in slopes for k in x.parts}:
-        given = [x.parts.get(k) for x in slopes]
-        first = next(part for part in given if part is not None)
-        wide = full or any(part is not None and part.full for part in given)
+        operands = [x.parts.get(k) for x in slopes]
+        first = next(part for part in operands if part is not None)
+        is_full = full or any(part is not None and part.full for part in operands)
         parts = []
-        for x, part in zip(slopes, given, strict=True):
+        for x, part in zip(slopes, operands, strict=True):
             if part is None:
                 shape = np.shape(x.low)
-                blank = np.zeros((entries(first), *shape) if wide else shape)
-                part = Part(blank, blank, wide)
-            parts.append(columns(part, max(size, np.size(x.low))) if wide else part)
-        found[k] = parts
-    return found
+                zero = np.zeros((entries(first), *shape) if is_full else shape)
+                part = Part(zero, zero, is_full)
+            parts.append(columns(part, max(size, np.size(x.low))) if is_full else part)
+        parts_by_array[k] = parts
+    return parts_by_array
 
 
 def product(a: Values, b: Values) -> Values:
-    """a b with 0 · ∞ = 0."""
+    """Return a b with 0 · ∞ = 0."""
     out = a * b
     return np.where((a == 0) | (b == 0), 0.0, out) if np.isnan(out).any() else out
 
 
 def scaled(part: Part, low: Values, high: Values) -> Part:
-    """The part times a number, entry by entry, that lies between low and high."""
-    known = np.isfinite(low) & np.isfinite(high)
-    middle = np.where(known, 0.5 * (low + high), 0.0)
-    spread = np.where(known, 0.5 * (high - low), np.inf)
+    """Return the part times numbers between low and high, entry by entry."""
+    is_bounded = np.isfinite(low) & np.isfinite(high)
+    middle = np.where(is_bounded, 0.5 * (low + high), 0.0)
+    spread = np.where(is_bounded, 0.5 * (high - low), np.inf)
     radius = product(np.abs(middle), part.radius)
     radius = radius + product(spread, np.abs(part.center) + part.radius)
     return Part(middle * part.center, radius, part.full)
 
 
 def added(x: Slope, y: Slope, sign: float = 1.0) -> dict[int, Part]:
-    """The parts of x ± y."""
+    """Return the parts of x ± y."""
     return {
         k: Part(a.center + sign * b.center, a.radius + b.radius, a.full)
         for k, (a, b) in together([x, y]).items()
@@ -120,32 +122,32 @@ def added(x: Slope, y: Slope, sign: float = 1.0) -> dict[int, Part]:
 
 
 def hull(a: Part, b: Part) -> Part:
-    """Any derivative between two of the same form."""
+    """Return the smallest part that contains two parts of the same form."""
     low = np.minimum(a.center - a.radius, b.center - b.radius)
     high = np.maximum(a.center + a.radius, b.center + b.radius)
     return between(low, high, a.full)
 
 
 def between(low: Values, high: Values, full: bool) -> Part:
-    known = np.isfinite(low) & np.isfinite(high)
-    return Part(
-        np.where(known, 0.5 * (low + high), 0.0), np.where(known, 0.5 * (high - low), np.inf), full
-    )
+    """Return the part between two bounds; the radius is infinite where a bound is."""
+    is_bounded = np.isfinite(low) & np.isfinite(high)
+    center = np.where(is_bounded, 0.5 * (low + high), 0.0)
+    return Part(center, np.where(is_bounded, 0.5 * (high - low), np.inf), full)
 
 
 def negative(x: Slope) -> Slope:
-    """−x."""
+    """Return −x."""
     return Slope(-x.high, -x.low, mapped(x.parts, lambda p: p._replace(center=-p.center)))
 
 
 def lift(value: Any, shape: tuple[int, ...]) -> Slope:
-    """A slope of this shape, from a slope or an array that broadcasts to it."""
+    """Return a slope of this shape from a slope or an array, by broadcasting."""
     if not is_slope(value):
         value = np.asarray(value)
         value = Slope(value, value, {})
     if value.low.shape == shape:
         return value
-    # Axes of length one are repeated; a scalar has all of them.
+    # Add axes of length one in front, then repeat.
     padding = (1,) * (len(shape) - value.low.ndim)
 
     def repeated(part: Part) -> Part:
@@ -160,6 +162,6 @@ def lift(value: Any, shape: tuple[int, ...]) -> Slope:
     return Slope(low, high, mapped(value.parts, repeated))
 
 
-def touched(part: Part) -> Values:
-    """Where q depends on v at all."""
+def is_dependent(part: Part) -> Values:
+    """Return a mask of the entries of the derivative that may be nonzero."""
     return (part.center != 0) | (part.radius != 0)
