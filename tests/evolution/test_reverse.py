@@ -56,7 +56,7 @@ OFTEN = [("fixed", 4, 0.0)]
 
 @pytest.mark.parametrize(("kind", "places", "cubic"), mostly_thorough(CASES, OFTEN))
 def test_reverse_mode_is_the_transpose_of_forward_mode(kind, places, cubic, monkeypatch):
-    monkeypatch.setattr(checkpoints, "_MOST", places)
+    monkeypatch.setattr(checkpoints, "_MAX_COUNT", places)
     problem = system(cubic)
 
     def loss(given, adjoint):
