@@ -184,19 +184,19 @@ def _call_plainly(*leaves: Any, program: ClosedJaxpr, packs: Any) -> list[Any]:
 
 
 def _call_outlined(*leaves: Any, program: ClosedJaxpr, packs: Any) -> list[Any]:
-    few, many = list(compress(leaves, packs)), list(compress(leaves, [not p for p in packs]))
-    like = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in few]
+    packed, large = list(compress(leaves, packs)), list(compress(leaves, [not p for p in packs]))
+    like = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in packed]
 
-    def call(vector: jax.Array, many: list[Any]) -> tuple[list[Any], list[Any]]:
-        small, rest = iter(_unpack(vector, like)), iter(many)
+    def call(vector: jax.Array, large: list[Any]) -> tuple[list[Any], list[Any]]:
+        small, rest = iter(_unpack(vector, like)), iter(large)
         whole = [next(small if p else rest) for p in packs]
         # Return an entry of each argument, so that none is unused.
-        return jaxpr_as_fun(program)(*whole), [leaf.ravel()[0] for leaf in (vector, *many)]
+        return jaxpr_as_fun(program)(*whole), [leaf.ravel()[0] for leaf in (vector, *large)]
 
     # Pack an entry of each large array too, since the vector might be constant otherwise.
-    vector = jnp.concatenate([_pack(leaf) for leaf in (*few, *(m.ravel()[:1] for m in many))])
+    vector = jnp.concatenate([_pack(leaf) for leaf in (*packed, *(m.ravel()[:1] for m in large))])
     attributes = {"inlineable": "false", "xla_cpu_small_call": "true"}
-    marked: Any = set_xla_metadata(jax.jit(call)(vector, many), **attributes)
+    marked: Any = set_xla_metadata(jax.jit(call)(vector, large), **attributes)
     return marked[0]
 
 

@@ -219,7 +219,7 @@ def _smallest_bounds(
 def of_region(constants: Any) -> bool:
     """Return whether the constants hold in a bounded region of x or u only."""
     domain = getattr(constants, "domain", None)
-    return domain is not None and not domain.free
+    return domain is not None and not domain.is_unbounded
 
 
 def _exit_time(solution: Solution, constants: Any, error_bounds: Any) -> float | None:
@@ -232,7 +232,7 @@ def _exit_time(solution: Solution, constants: Any, error_bounds: Any) -> float |
     law_error = solution.law_residual / constants.gamma + solution.law_step
     of_u = constants.L * error_bounds + constants.norm_P_inv * law_error
     spaces = solution.setup.problem.spaces(solution.setup.x0)
-    inside = np.asarray(domain.keeps(*bounds, error_bounds, of_u, spaces))
+    inside = np.asarray(domain.contains(*bounds, error_bounds, of_u, spaces))
     return None if inside.all() else float(solution.ts[int(np.argmin(inside))])
 
 
@@ -260,7 +260,7 @@ def _check_domain(constants: Any, args: Any, t0: float, t1: float) -> None:
                 f"Verify for these: dvax.verify(problem, x0, {t0:g}, {t1:g}, args)",
             )
         )
-    if domain is not None and not domain.is_of(args):
+    if domain is not None and not domain.has_args(args):
         wrong.append(
             InputProblem(
                 "dvax.solve(constants)",

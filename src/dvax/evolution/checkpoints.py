@@ -24,21 +24,21 @@ _MAX_RECOMPUTATIONS = 12
 
 
 class Checkpoints(eqx.Module):
-    """The states at the starts of steps 0, s, 2s, … in C = 2ᵇ slots (`places`), with s = 2ʲ.
+    """The states at the starts of steps 0, s, 2s, … in C = 2ᵇ slots, with s = 2ʲ.
 
     When the slots are full, s doubles and every other state is dropped, without copying. The k-th state
     is in the slot whose number is k with its b bits rotated left by j: when s doubles, (k, j) ↦
     (k/2, j+1) is the same slot for even k, and the slots of the odd states are reused in order.
     """
 
-    places: Tree
+    slots: Tree
     j: jax.Array
     bits: int = eqx.field(static=True)
 
     def __init__(self, like: Tree, count: int):
         self.bits = count.bit_length() - 1
         assert count == 2**self.bits
-        self.places = jtu.tree_map(lambda v: jnp.zeros((count + 1, *v.shape), v.dtype), like)
+        self.slots = jtu.tree_map(lambda v: jnp.zeros((count + 1, *v.shape), v.dtype), like)
         self.j = jnp.asarray(0)
 
     def put(self, index: Any, x: Tree, counts: Any = True) -> "Checkpoints":
@@ -48,27 +48,27 @@ class Checkpoints(eqx.Module):
         """
         full = counts & ((index >> self.j) >= 2**self.bits)
         j = jnp.where(full, self.j + 1, self.j)
-        kept = counts & (index == ((index >> j) << j))
+        is_kept = counts & (index == ((index >> j) << j))
         # Write a state that is not kept to an extra slot: a conditional write would copy the array.
-        place = jnp.where(kept, self._place(index >> j, j), 2**self.bits)
-        places = _tree.put(self.places, place, x)
-        return eqx.tree_at(lambda c: (c.places, c.j), self, (places, j))
+        slot = jnp.where(is_kept, self._slot(index >> j, j), 2**self.bits)
+        slots = _tree.put(self.slots, slot, x)
+        return eqx.tree_at(lambda c: (c.slots, c.j), self, (slots, j))
 
     def before(self, index: Any) -> tuple[Any, Tree]:
         """Return the last step up to `index` that has a checkpoint, and the state at its start."""
         k = index >> self.j
-        place = self._place(k, self.j)
-        return k << self.j, jtu.tree_map(lambda leaf: leaf[place], self.places)
+        slot = self._slot(k, self.j)
+        return k << self.j, jtu.tree_map(lambda leaf: leaf[slot], self.slots)
 
     def stack(self, steps: Any) -> "Stack":
         """Return the checkpoints of a run of this number of steps as a stack."""
         numbers = jnp.arange(2**self.bits)
         # The extra slot is free too.
-        order = jnp.append(self._place(numbers, self.j), 2**self.bits)
+        order = jnp.append(self._slot(numbers, self.j), 2**self.bits)
         height = ((steps - 1) >> self.j) + 1
-        return Stack(self.places, order, jnp.append(numbers << self.j, 0), height)
+        return Stack(self.slots, order, jnp.append(numbers << self.j, 0), height)
 
-    def _place(self, k: Any, j: Any) -> Any:
+    def _slot(self, k: Any, j: Any) -> Any:
         if self.bits == 0:
             return jnp.zeros_like(k)
         r = j % self.bits
@@ -78,11 +78,11 @@ class Checkpoints(eqx.Module):
 class Stack(NamedTuple):
     """A stack of checkpoints with the latest step on top.
 
-    The entry at height k belongs to step `at[k]` and is in the slot `order[k]` of `places`. The slots
+    The entry at height k belongs to step `at[k]` and is in the slot `order[k]`. The slots
     of higher entries are free.
     """
 
-    places: Tree
+    slots: Tree
     order: jax.Array
     at: jax.Array
     height: jax.Array
@@ -94,12 +94,12 @@ class Stack(NamedTuple):
 
     @property
     def x(self) -> Tree:
-        place = self.order[self.height - 1]
-        return jtu.tree_map(lambda leaf: leaf[place], self.places)
+        slot = self.order[self.height - 1]
+        return jtu.tree_map(lambda leaf: leaf[slot], self.slots)
 
     def push(self, step: Any, x: Tree) -> "Stack":
-        places = _tree.put(self.places, self.order[self.height], x)
-        return Stack(places, self.order, _tree.put(self.at, self.height, step), self.height + 1)
+        slots = _tree.put(self.slots, self.order[self.height], x)
+        return Stack(slots, self.order, _tree.put(self.at, self.height, step), self.height + 1)
 
     def pop(self) -> "Stack":
         return self._replace(height=self.height - 1)

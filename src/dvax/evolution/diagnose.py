@@ -57,10 +57,10 @@ _CHECKED = {name: f"Check {name} there" for name in ("K", "h", "f")} | {
 def failure(solution: Any) -> SolveError:
     """Return the `SolveError` of a failed run: result, cause, time reached and fixes."""
     stats, result = solution.stats, solution.result
-    found = diagnose(solution)
+    diagnosis = diagnose(solution)
     reached = f"Stopped at t = {float(stats['t']):.17g} after {int(stats['steps'])} steps."
-    parts = ("" if found.replaces_result else RESULTS[result], found.cause, reached)
-    return SolveError(" ".join(part for part in parts if part), solution, found.fixes)
+    parts = ("" if diagnosis.replaces_result else RESULTS[result], diagnosis.cause, reached)
+    return SolveError(" ".join(part for part in parts if part), solution, diagnosis.fixes)
 
 
 def diagnose(solution: Any) -> Diagnosis:
@@ -94,9 +94,9 @@ def diagnose(solution: Any) -> Diagnosis:
     if result == RESULTS.max_steps:
         causes += [_max_steps]
     for cause in causes:
-        found = cause(stop)
-        if found.cause:
-            return found
+        diagnosis = cause(stop)
+        if diagnosis.cause:
+            return diagnosis
     return Diagnosis()
 
 
@@ -104,10 +104,10 @@ def _nonfinite(stop: Stop) -> Diagnosis:
     """Detect the first function among A, P, K, h, f that is not finite in the next steps."""
     flow, problem, args = stop.flow, stop.flow.problem, stop.flow.args
     like = problem.zero_control(stop.x)
-    begin, velocity = stop.time(stop.t), None
+    start, velocity = stop.time(stop.t), None
     if not first_bad(stop.x):
         try:
-            velocity = stop.velocity(begin, stop.x)
+            velocity = stop.velocity(start, stop.x)
         except InputError:
             pass  # K raises at t; the search below reports it
     if velocity is None or first_bad(velocity):
@@ -134,22 +134,22 @@ def _nonfinite(stop: Stop) -> Diagnosis:
 
     far = min(stop.span[1] - stop.t, LAST_STEPS * max(stop.step, 4.0 * stop.ulp))
     offsets = [0.0, *(far * np.geomspace(1e-12, 1.0, 13))] if far > 0 else [0.0]
-    good = 0.0
+    last_good = 0.0
     for ahead in offsets:
         for name in pieces(ahead):
-            found = bad(name, ahead)
-            if not found:
+            diagnosis = bad(name, ahead)
+            if not diagnosis:
                 continue
-            low, high = good, float(ahead)
+            low, high = last_good, float(ahead)
             while high - low > max(stop.ulp, 1e-9 * high) and high > 0:
                 middle = 0.5 * (low + high)
                 low, high = (low, middle) if bad(name, middle) else (middle, high)
-            at, what = f"at t = {stop.t + high:.12g}", bad(name, high) or found
+            at, what = f"at t = {stop.t + high:.12g}", bad(name, high) or diagnosis
             fixes = (Fix("", "", _CHECKED[name]),)
             if what.startswith(_REFUSED):
                 return Diagnosis(f"{name} is refused {at}: {what[len(_REFUSED) :]}.", fixes, True)
             return Diagnosis(f"{name} is {what} {at}.", fixes)
-        good = float(ahead)
+        last_good = float(ahead)
     return Diagnosis()
 
 
@@ -282,13 +282,13 @@ def _stiff(stop: Stop) -> Diagnosis:
         return Diagnosis()
     if not (at_limit or left > stop.attempts):
         return Diagnosis()
-    many = sum(leaf.size for leaf in jtu.tree_leaves(stop.x)) > _MAX_ROSENBROCK
+    is_large = sum(leaf.size for leaf in jtu.tree_leaves(stop.x)) > _MAX_ROSENBROCK
     what = "Ax + f" if is_explicit_in_A else "f"
     return Diagnosis(
         f"The problem is stiff for {type(method).__name__}: {what} has an eigenvalue of about "
         f"{-rate:.3g}, so that a stable step is at most about {_STABILITY_LIMIT / rate:.2g}, while x "
         f"itself changes at the rate {own:.3g}. From here to t1 that is {left:.2g} steps at least.",
-        (Fix("method", "Implicit" if many else "ExpRosenbrock", "which is stable there"),),
+        (Fix("method", "Implicit" if is_large else "ExpRosenbrock", "which is stable there"),),
     )
 
 

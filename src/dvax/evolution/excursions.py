@@ -101,29 +101,31 @@ class ExcursionGuard(eqx.Module):
         self, flow: Flow, evaluations: list[Evaluation], variation: Tree, share: Any
     ) -> ExcursionEstimate:
         """Return bounds on the changes between the samples of a step of this `share` of the run."""
-        places, variation = jax.lax.stop_gradient(
+        samples, variation = jax.lax.stop_gradient(
             ([(v.t, v.x, v.rate.y, v.rate.z) for v in evaluations], variation)
         )
-        first = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *places[:-1])
-        second = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *places[1:])
+        first = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *samples[:-1])
+        second = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *samples[1:])
         zero = jnp.zeros_like(evaluations[0].t)
         rates, laws = zero, zero
         if self.rates or self.laws:
             with below_parabola():
-                moved, dev = jax.vmap(lambda p, q: self._pulses(flow, p, q))(first, second)
-            most = lambda tree: jtu.tree_map(lambda leaf: jnp.max(leaf, axis=0), tree)  # noqa: E731
+                changes, dev = jax.vmap(lambda p, q: self._pulses(flow, p, q))(first, second)
+            largest = lambda tree: jtu.tree_map(lambda leaf: jnp.max(leaf, axis=0), tree)  # noqa: E731
             decay = 0.5 ** (_HALVINGS * share)
-            variation = jtu.tree_map(lambda v, m: jnp.maximum(decay * v, m), variation, most(moved))
+            variation = jtu.tree_map(
+                lambda v, m: jnp.maximum(decay * v, m), variation, largest(changes)
+            )
             excess = jtu.tree_map(
-                lambda d, v: jnp.max(d - _VARIATION_SHARE * v, initial=0.0), most(dev), variation
+                lambda d, v: jnp.max(d - _VARIATION_SHARE * v, initial=0.0), largest(dev), variation
             )
             rates, laws = (_largest(part) if part else zero for part in excess)
 
         def excursion(ignored: Any) -> Any:
-            return self._excursion(flow, places, first, second, ignored) if self.switches else zero
+            return self._excursion(flow, samples, first, second, ignored) if self.switches else zero
 
         # Use y and not z: an entry of z far outside K corresponds to a y at the bound.
-        size = _largest([jnp.abs(leaf) for p in places for leaf in jtu.tree_leaves(p[2])])
+        size = _largest([jnp.abs(leaf) for p in samples for leaf in jtu.tree_leaves(p[2])])
         return ExcursionEstimate(excursion, size, rates, laws, variation)
 
     def _data(self, flow: Flow, t: Any, x: Tree, u: Tree) -> tuple[list[Any], list[Any]]:
@@ -144,7 +146,7 @@ class ExcursionGuard(eqx.Module):
         u = flow.operator.inverse(y)
         data = enclose(lambda t: self._data(flow, t, x, u), t)
         # Infinite bounds do not change, and jumps do not count as variation.
-        moved = jtu.tree_map(
+        changes = jtu.tree_map(
             lambda c: jnp.where((c.a == c.b) | jnp.isinf(c.dev), 0.0, jnp.abs(c.b - c.a)), data,
             is_leaf=is_enclosure,
         )  # fmt: skip
@@ -153,16 +155,16 @@ class ExcursionGuard(eqx.Module):
             data,
             is_leaf=is_enclosure,
         )
-        return moved, dev
+        return changes, dev
 
-    def _excursion(self, flow: Flow, places: Any, first: Any, second: Any, ignored: Any) -> Any:
+    def _excursion(self, flow: Flow, samples: Any, first: Any, second: Any, ignored: Any) -> Any:
         """Return the largest ratio of a deviation to the deviation that may change a sign."""
-        rows = [_switches(flow, t, x, z) for t, x, _, z in places]
+        rows = [_switches(flow, t, x, z) for t, x, _, z in samples]
         if self.enclosed:
             with below_parabola():
                 dev = jax.vmap(lambda p, q: self._deviation(flow, p, q))(first, second)
         else:
-            dev = _SAMPLING_SAFETY * _sampled_deviation([place[0] for place in places], rows)
+            dev = _SAMPLING_SAFETY * _sampled_deviation([place[0] for place in samples], rows)
         s0, s1 = jnp.stack(rows[:-1]), jnp.stack(rows[1:])
         changes = (s0 > 0) != (s1 > 0)
         room = (jnp.sqrt(jnp.abs(s0)) + jnp.sqrt(jnp.abs(s1))) ** 2

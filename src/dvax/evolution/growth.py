@@ -52,9 +52,9 @@ def gronwall(
 
     rate, M = jnp.asarray(rate, ts.dtype), jnp.asarray(M, ts.dtype)
     integrated, completed = (jnp.asarray(v, ts.dtype) for v in (integrated, completed))
-    begin = jnp.asarray(t0, ts.dtype)
+    first_time = jnp.asarray(t0, ts.dtype)
     zero = jnp.zeros((), ts.dtype)
-    start = (begin, begin, zero, jnp.asarray(M * initial, ts.dtype), begin)
+    start = (first_time, first_time, zero, jnp.asarray(M * initial, ts.dtype), first_time)
     return lax.scan(advance, start, (ts, integrated, completed))[1]
 
 

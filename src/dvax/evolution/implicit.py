@@ -79,8 +79,8 @@ def solve_by_implicit_steps(
 ) -> Outcome:
     """Solve by `Implicit` from the first stop to the last."""
     clock, x0, first_step = _Clock(stops), setup.x0, setup.number("dt0")
-    begin, end = clock.stops[0], clock.stops[-1]
-    first, last = (one_sided_time(begin, end, theta, (begin, end)) for theta in (0.0, 1.0))
+    start, end = clock.stops[0], clock.stops[-1]
+    first, last = (one_sided_time(start, end, theta, (start, end)) for theta in (0.0, 1.0))
 
     def law(s: Any, x: Tree, _: Any) -> Tree:
         t, dt_ds = clock.time(jnp.clip(s, first, last))
@@ -99,7 +99,7 @@ def solve_by_implicit_steps(
     solution = diffrax.diffeqsolve(
         terms,
         method.solver,
-        begin,
+        start,
         end,
         first_step,
         x0,
@@ -116,7 +116,7 @@ def solve_by_implicit_steps(
     )
     assert solution.ts is not None
     # If the end is NaN, there are no steps.
-    is_successful = (solution.result == diffrax.RESULTS.successful) & (end > begin)
+    is_successful = (solution.result == diffrax.RESULTS.successful) & (end > start)
     # Without ts, the single time of a failed run is that of its last accepted step.
     reached = jnp.isfinite(solution.ts) & (is_successful if ts is None else True)
     xs = jtu.tree_map(
@@ -133,7 +133,7 @@ def solve_by_implicit_steps(
     stats = {
         "steps": solution.stats["num_accepted_steps"],
         "rejected": solution.stats["num_rejected_steps"],
-        "t": jnp.where(count > 0, times[row], begin),
+        "t": jnp.where(count > 0, times[row], start),
         "x": jtu.tree_map(lambda leaf, x: jnp.where(count > 0, leaf[row], x), xs, x0),
         "next_dt": first_step,
     }

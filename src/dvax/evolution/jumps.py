@@ -67,8 +67,8 @@ def find_jump(stop: Stop) -> Diagnosis:
         left, right = max((low, a), (b, high), key=lambda part: part[1] - part[0])
         middle = 0.5 * (left + right)
         others = [_narrow(values, *part, stop.ulp) for part in ((left, middle), (middle, right))]
-        are_many = all(_change(*other[2:])[0] > 0.25 * change for other in others)
-        if are_many and change < _MAX_ROUNDOFF_JUMP * size:
+        has_similar_jumps = all(_change(*other[2:])[0] > 0.25 * change for other in others)
+        if has_similar_jumps and change < _MAX_ROUNDOFF_JUMP * size:
             return _roundoff_jumps(stop, name, change, b)
         where = f" in component {k}" if before.size > 1 else ""
         return Diagnosis(

@@ -18,11 +18,13 @@ def refuse_nonfinite_data(problem: Problem, args: Any, caller: str) -> None:
     """Raise an `InputError` if A, P, K or args contain NaN, or if A or P contain infinity."""
     wrong = []
     for name, data in (("A", problem.A), ("P", problem.P), ("K", problem.K), ("args", args)):
-        found = first_bad(data, allow_infinite=name in ("K", "args"))
-        if found:
+        description = first_bad(data, allow_infinite=name in ("K", "args"))
+        if description:
             place = f"{caller}(args)" if name == "args" else f"dvax.Problem({name})"
             wrong.append(
-                InputProblem(place, found, "its numbers must be finite", "Correct the data there")
+                InputProblem(
+                    place, description, "its numbers must be finite", "Correct the data there"
+                )
             )
     if wrong:
         raise InputError(*wrong)

@@ -171,7 +171,7 @@ class Run(eqx.Module):
         return rows, self._advance_to(state, self.stops[-1])
 
     def _start(self, x0: Tree) -> State:
-        t0, many = self.stops[0], self.method.nodes
+        t0, nodes = self.stops[0], self.method.nodes
         zero = jnp.zeros_like(t0)
         blank = _tree.zeros_like(x0)
         one = Record(t0, zero, x0, (blank, blank))
@@ -180,11 +180,11 @@ class Run(eqx.Module):
         )
         records = None
         if self.dense:
-            records = rows(self.max_windows * many)
+            records = rows(self.max_windows * nodes)
             records = records._replace(start=jnp.full_like(records.start, jnp.inf))
         nought = jnp.asarray(0)
         return State(
-            t0, x0, many * self.first, jnp.asarray(1), rows(many), (zero, zero), (zero, zero),
+            t0, x0, nodes * self.first, jnp.asarray(1), rows(nodes), (zero, zero), (zero, zero),
             self.stepper.bounds(x0), records, nought, nought, nought, nought, zero, RESULTS.successful,
         )  # fmt: skip
 
@@ -196,7 +196,7 @@ class Run(eqx.Module):
         return lax.while_loop(should_continue, lambda state: self._attempt(state), state)
 
     def _attempt(self, state: State) -> State:
-        a, many, stop = state.t, self.method.nodes, self.stops[state.stop]
+        a, nodes, stop = state.t, self.method.nodes, self.stops[state.stop]
         if self.fixed:
             # Divide the rest of the interval into the smallest number of equal windows.
             count = jnp.maximum(jnp.ceil((stop - a) / state.length * (1 - 1e-12)), 1.0)
@@ -217,7 +217,7 @@ class Run(eqx.Module):
             length = lax.stop_gradient(factor * (b - a))
             is_longer = is_accepted & (factor > 1.0)
             length = jnp.where(is_longer, jnp.maximum(length, state.length), length)
-            floor = 8 * many * jnp.finfo(a.dtype).eps * jnp.maximum(jnp.abs(a), jnp.abs(b))
+            floor = 8 * nodes * jnp.finfo(a.dtype).eps * jnp.maximum(jnp.abs(a), jnp.abs(b))
             has_failed = ~is_accepted & (b - a <= floor)
         unconverged = RESULTS.where(
             window.converged, RESULTS.step_too_small, RESULTS.picard_unconverged
@@ -228,7 +228,7 @@ class Run(eqx.Module):
         )
         records = state.records
         if records is not None:
-            indices = state.steps + jnp.arange(many)
+            indices = state.steps + jnp.arange(nodes)
             start = jnp.where(is_accepted, window.record.start, jnp.inf)
             steps = window.record._replace(start=start)
             records = jtu.tree_map(lambda leaf, new: leaf.at[indices].set(new), records, steps)
@@ -248,18 +248,18 @@ class Run(eqx.Module):
         return State(
             t, x, length, jnp.minimum(next_stop, last), record, completed_defect, integrated_defect,
             bounds, records,
-            jnp.where(is_accepted, state.steps + many, state.steps), state.windows + 1,
-            jnp.where(is_accepted, state.rejected, state.rejected + many),
+            jnp.where(is_accepted, state.steps + nodes, state.steps), state.windows + 1,
+            jnp.where(is_accepted, state.rejected, state.rejected + nodes),
             state.sweeps + window.sweeps,
             jnp.maximum(state.contraction, jnp.where(is_accepted, window.contraction, 0.0)),
             RESULTS.where(has_failed, unconverged, RESULTS.successful),
         )  # fmt: skip
 
     def _window(self, a: Any, b: Any, x: Tree) -> Window:
-        stepper, many = self.stepper, self.method.nodes
+        stepper, nodes = self.stepper, self.method.nodes
         flow = stepper.flow
-        h = (b - a) / many
-        steps = jnp.arange(many + 1).astype(h.dtype)
+        h = (b - a) / nodes
+        steps = jnp.arange(nodes + 1).astype(h.dtype)
         ends = (a + h * steps).at[-1].set(b)
         times = ends.at[0].set(one_sided_time(a, b, 0.0, stepper.ends))
         times = times.at[-1].set(one_sided_time(a, b, 1.0, stepper.ends))
@@ -276,11 +276,11 @@ class Run(eqx.Module):
         def rates(X: Tree, Y: Tree | None) -> Any:
             return jax.vmap(flow.rate)(times, X, Y)
 
-        constant = jtu.tree_map(lambda leaf: jnp.broadcast_to(leaf, (many + 1, *leaf.shape)), x)
+        constant = jtu.tree_map(lambda leaf: jnp.broadcast_to(leaf, (nodes + 1, *leaf.shape)), x)
         guess = flow.guess(x)
         if guess is not None:
             guess = jtu.tree_map(
-                lambda leaf: jnp.broadcast_to(leaf, (many + 1, *leaf.shape)), guess
+                lambda leaf: jnp.broadcast_to(leaf, (nodes + 1, *leaf.shape)), guess
             )
         first_rates = rates(constant, guess)
         X = trajectory(first_rates.value)
@@ -314,7 +314,7 @@ class Run(eqx.Module):
             ends[:-1], ends[1:], start, end, c, ys
         )
         integrated_defect = sample.defect, sample.law_defect
-        record = Record(ends[:-1], jnp.broadcast_to(h, (many,)), start, c)
+        record = Record(ends[:-1], jnp.broadcast_to(h, (nodes,)), start, c)
         return Window(
             record, end, _rows(X, -1), sample.error, integrated_defect,
             sample.bounds.hull_of_rows() if stepper.track_bounds else None,

@@ -211,8 +211,8 @@ def _compare(eqn: Any, operands: list[Any]) -> LinearEnclosure:
     x, y = map(_lift, operands)
     a, b = _at_ends(eqn, x, y)
     dev = x.dev + y.dev
-    apart = lambda p, q: jnp.abs(p.astype(_real(p)) - q.astype(_real(q)))  # noqa: E731
-    margin = jnp.minimum(apart(x.a, y.a), apart(x.b, y.b))
+    distance = lambda p, q: jnp.abs(p.astype(_real(p)) - q.astype(_real(q)))  # noqa: E731
+    margin = jnp.minimum(distance(x.a, y.a), distance(x.b, y.b))
     # If the results at both ends agree, a line has the same result in between. With a deviation this
     # holds only if the difference is larger than the deviation.
     same_side = ((x.a < y.a) == (x.b < y.b)) & ((x.a > y.a) == (x.b > y.b))

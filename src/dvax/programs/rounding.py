@@ -234,9 +234,9 @@ def _estimate(out: jax.Array, x: list[_Value]) -> jax.Array:
     for value in x:
         if value.value.size == 0 or not jnp.issubdtype(value.value.dtype, jnp.inexact):
             continue
-        most = jnp.max(jnp.abs(value.value)).astype(relative.dtype)
+        largest = jnp.max(jnp.abs(value.value)).astype(relative.dtype)
         worst = jnp.max(jnp.abs(value.error)).astype(relative.dtype)
-        relative = relative + worst / jnp.where(most > 0, most, 1.0)
+        relative = relative + worst / jnp.where(largest > 0, largest, 1.0)
         size = max(size, value.value.size)
-    most = jnp.max(jnp.abs(out)) if out.size else jnp.zeros((), relative.dtype)
-    return jnp.full(out.shape, (8 * relative + size * eps) * most, jnp.finfo(out.dtype).dtype)
+    largest = jnp.max(jnp.abs(out)) if out.size else jnp.zeros((), relative.dtype)
+    return jnp.full(out.shape, (8 * relative + size * eps) * largest, jnp.finfo(out.dtype).dtype)

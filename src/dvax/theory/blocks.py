@@ -30,7 +30,7 @@ class Block(NamedTuple):
 
     @property
     def exact(self) -> bool:
-        """Whether every radius is 0."""
+        """True if every radius is 0."""
         return not self.radius.any()
 
     def __matmul__(self, other: "Block") -> "Block":

@@ -96,7 +96,7 @@ def bound_error(
     space = problem.spaces(sol.setup.x0)[0]
     measured, distance = sol, jnp.zeros_like(sol.ts)
     domain = constants.domain
-    regional = domain is not None and not domain.free
+    regional = domain is not None and not domain.is_unbounded
     if sol.defect is None or (regional and sol.bounds is None):
         measured = _solve_again(problem, sol, constants)
         distance = jax.vmap(lambda a, b: space.norm(_tree.sub(a, b)))(measured.xs, sol.xs)
@@ -114,7 +114,7 @@ def bound_error(
     inside = jnp.ones(sol.ts.shape, bool)
     if domain is not None:
         setting = sol.setup.setting
-        covered = domain.covers(setting["t0"], setting["t1"]) and domain.is_of(sol.setup.args)
+        covered = domain.covers(setting["t0"], setting["t1"]) and domain.has_args(sol.setup.args)
         domain_status = "proved" if covered else "declared"
         if regional:
             assert measured.bounds is not None
@@ -122,7 +122,7 @@ def bound_error(
             law_error = constants.norm_P_inv * (law[0] / constants.gamma + law[1])
             largest_u = constants.L * largest_x + law_error
             spaces = problem.spaces(sol.setup.x0)
-            inside = domain.keeps(*measured.bounds, largest_x, largest_u, spaces)
+            inside = domain.contains(*measured.bounds, largest_x, largest_u, spaces)
     status = weakest(
         constants.status_of(*(name for name, _ in constants.statuses)),
         "proved" if measured.enclosed else "estimated",

@@ -1,4 +1,4 @@
-"""Where constants hold: at what parameter, for what times and states."""
+"""The validity of constants: an interval of time, one value of `args`, and bounds on x and u."""
 
 from typing import Any
 
@@ -14,8 +14,11 @@ from ..spaces import AbstractSpace
 
 
 class Domain(eqx.Module):
-    """t0 ≤ t ≤ t1, one `args`, and x and u between bounds (low, high), entry by entry: None where x
-    may be anything, and u anything within P⁻¹K(t)."""
+    """The set of times, parameters, states and responses for which constants hold.
+
+    They hold for t0 ≤ t ≤ t1 and one value of `args`. `x` and `u` are entrywise bounds (low, high);
+    None means any x, and any u in P⁻¹K(t).
+    """
 
     t0: float
     t1: float
@@ -33,45 +36,49 @@ class Domain(eqx.Module):
         args: Any,
     ):
         self.t0, self.t1, self.x, self.u = t0, t1, x, u
-        self.values, self.frame = _taken_apart(args)
+        self.values, self.frame = _numbers_and_rest(args)
 
     @property
-    def free(self) -> bool:
+    def is_unbounded(self) -> bool:
+        """True if x and u are unrestricted."""
         return self.x is None and self.u is None
 
     def covers(self, t0: Any, t1: Any) -> bool:
-        """Whether a run from t0 to t1 is within these times (traced times are nobody's to see)."""
+        """Return whether a run from t0 to t1 lies in the interval of time; False for traced times."""
         if not _tree.is_concrete(t0, t1):
             return False
-        room = 1e-12 * max(abs(self.t0), abs(self.t1))
-        return self.t0 - room <= float(t0) and float(t1) <= self.t1 + room
+        margin = 1e-12 * max(abs(self.t0), abs(self.t1))
+        return self.t0 - margin <= float(t0) and float(t1) <= self.t1 + margin
 
-    def is_of(self, args: Any) -> bool:
-        """Whether these are the `args` of the constants (traced ones are nobody's to see)."""
-        values, frame = _taken_apart(args)
+    def has_args(self, args: Any) -> bool:
+        """Return whether `args` equals that of the constants; False for traced values."""
+        values, frame = _numbers_and_rest(args)
         if frame != self.frame or not _tree.is_concrete(values, self.values):
             return False
         return all(np.array_equal(a, b) for a, b in zip(values, self.values, strict=True))
 
-    def keeps(
+    def contains(
         self,
         x: tuple[Tree, Tree],
         u: tuple[Tree, Tree],
-        of_x: jax.Array,
-        of_u: jax.Array,
+        x_error: jax.Array,
+        u_error: jax.Array,
         spaces: tuple[AbstractSpace, ...],
     ) -> jax.Array:
-        """For each saved time whether all states and responses within these bounds of what lies between
-        x = (low, high), and u, in norm, are inside; and whether they were at all the times before."""
-        held = jnp.ones(of_x.shape, bool)
-        for values, bound, ends, space in zip((x, u), (of_x, of_u), (self.x, self.u), spaces):
+        """Return, for each saved time, whether the exact x and u lie in the domain up to that time.
+
+        `x` and `u` are bounds (low, high) on the computed values, and `x_error` and `u_error` are
+        bounds on the norms of their errors.
+        """
+        inside = jnp.ones(x_error.shape, bool)
+        for values, error, ends, space in zip((x, u), (x_error, u_error), (self.x, self.u), spaces):
             if ends is not None:
-                held = held & _inside(*values, bound, ends, space)
-        return jnp.cumsum(~held) == 0
+                inside = inside & _inside(*values, error, ends, space)
+        return jnp.cumsum(~inside) == 0
 
 
-def _taken_apart(args: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """The numbers in args, and all the rest of it."""
+def _numbers_and_rest(args: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """Return the numbers in args, and its structure with the other leaves."""
     leaves, structure = jtu.tree_flatten(args)
     numbers = tuple(leaf for leaf in leaves if eqx.is_array_like(leaf))
     others = tuple(None if eqx.is_array_like(leaf) else leaf for leaf in leaves)
@@ -81,7 +88,8 @@ def _taken_apart(args: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
 def _inside(
     lows: Tree, highs: Tree, bound: jax.Array, ends: tuple[Tree, Tree], space: AbstractSpace
 ) -> jax.Array:
-    held = jnp.ones(bound.shape, bool)
+    """Return whether all values in [lows, highs] with errors of norm ≤ `bound` lie between `ends`."""
+    all_inside = jnp.ones(bound.shape, bool)
     weights = jtu.tree_map(
         lambda leaf, w: np.broadcast_to(w, leaf.shape[1:]), lows, space.weights()
     )
@@ -89,5 +97,5 @@ def _inside(
     for least, most, w, low, high in zip(*leaves, strict=True):
         reach = bound.reshape(-1, *(1,) * (least.ndim - 1)) / jnp.sqrt(w)[None]
         inside = (least - reach >= low[None]) & (most + reach <= high[None])
-        held = held & jnp.all(inside.reshape(len(bound), -1), axis=1)
-    return held
+        all_inside = all_inside & jnp.all(inside.reshape(len(bound), -1), axis=1)
+    return all_inside

@@ -122,7 +122,8 @@ class ParameterBounds(eqx.Module):
         return self.constants.L_tilde
 
     def response_radius(self, R: Any) -> Any:
-        """Return R̂(D, R) with ‖u_x^η(t)‖ ≤ R̂ for ‖x‖ ≤ R (cor:parametrized_state_to_control_bound)."""
+        """Return R̂(D, R) with ‖u_x^η(t)‖ ≤ R̂ for ‖x‖ ≤ R
+        (cor:parametrized_state_to_control_bound)."""
         v, c = _tree.host(self), _tree.host(self.constants)
         norm_F = c.alpha_h * R + v.C_h0 + (2.0 * c.norm_P_inv + c.L_F) * v.kappa_K
         return c.norm_P_inv * (v.kappa_K + norm_F / c.gamma)

@@ -31,7 +31,7 @@ class Region(NamedTuple):
 
     @property
     def is_everywhere(self) -> bool:
-        """Whether x and u are unbounded, as in the paper."""
+        """True if x and u are unbounded, as in the paper."""
         return all(
             bool(np.isneginf(v.low).all() and np.isposinf(v.high).all())
             for v in _slopes((self.x, self.u))

@@ -1,4 +1,4 @@
-"""How the data change in time: bounds and speed of K(t), bounds and jumps of f and h."""
+"""Bounds on the data over time: position and speed of K(t), values and jumps of f and h."""
 
 import itertools
 from collections.abc import Callable, Iterator

@@ -82,18 +82,19 @@ def _single(made: dict[Any, Any], atom: Any) -> Any | None:
 
 
 def _output(traced: ClosedJaxpr, atom: Any) -> Callable[..., jax.Array]:
-    """The function that computes this value in the place of the output."""
+    """Return a function that computes an intermediate value of a program instead of its output."""
     if isinstance(atom, Literal):
-        return lambda *given: jnp.asarray(atom.val)
+        return lambda *inputs: jnp.asarray(atom.val)
     jaxpr = traced.jaxpr
 
-    def fn(*given: Any) -> jax.Array:
-        known = dict(zip(jaxpr.constvars, traced.consts, strict=True))
-        known.update(zip(jaxpr.invars, jtu.tree_leaves(given), strict=True))
+    def fn(*inputs: Any) -> jax.Array:
+        environment = dict(zip(jaxpr.constvars, traced.consts, strict=True))
+        environment.update(zip(jaxpr.invars, jtu.tree_leaves(inputs), strict=True))
         for eqn in jaxpr.eqns:
-            if atom in known:
+            if atom in environment:
                 break
-            known.update(zip(eqn.outvars, bind(eqn, read(known, eqn.invars)), strict=True))
-        return jnp.asarray(known[atom])
+            results = bind(eqn, read(environment, eqn.invars))
+            environment.update(zip(eqn.outvars, results, strict=True))
+        return jnp.asarray(environment[atom])
 
     return fn

@@ -15,7 +15,7 @@ Operator = Callable[[Tree], Tree]
 
 
 class RESULTS(eqx.Enumeration):
-    """How a solve ended, with a message for the user."""
+    """The result of a solve, with a message for the user."""
 
     successful = "The tolerance was met."
     max_steps = (
@@ -81,7 +81,7 @@ class FrozenVI(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What a solver returns.
+    """The result of a solver.
 
     - `y` ∈ K, the computed solution;
     - `z`, a point whose projection is y: the unconstrained value of the law, which changes even

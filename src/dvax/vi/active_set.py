@@ -105,7 +105,8 @@ class ActiveSet(AbstractSolver):
             flat, unravel = ravel_pytree(right)
             matrix = matrix_of(at.slope, right) if constant is None else constant
             free = ravel_pytree(_free(at, right))[0]
-            # The held ones: d = right. The free ones: τF′_II d_I = right_I, d_A acting through z only.
+            # Fixed unknowns: d = right. Free unknowns: τF′_II d_I = right_I, where d_A acts through z
+            # only.
             scaled = jnp.where(free, flat / at.tau, 0.0)
             d = jnp.where(free, solve_block(matrix, free, scaled), 0.0)
             return unravel(jnp.where(free, d, flat - at.tau * (matrix @ d)))

@@ -22,7 +22,7 @@ class Projection(AbstractSolver):
     one evaluation of F and one projection each.
 
     If γ or L_F is unknown, λ = λ₀/(1 + j), with j the number of iterations that did not reduce the
-    contracting_step ‖w‖ by a thousandth. Either j remains bounded, and ‖w‖ decreases geometrically;
+    smallest ‖w‖ by a thousandth. Either j remains bounded, and ‖w‖ decreases geometrically;
     or j → ∞, and then λ → 0 with Σλ = ∞, under which the method converges for every strongly
     pseudomonotone Lipschitz F (same source, Theorem 4.1), but not linearly.
 

@@ -107,9 +107,12 @@ def _solution(
     ys, w = (np.reshape(np.array([r[k] for r in rows]), (len(rows), m)) for k in (2, 3))
     tau = 1.0 / max(float(np.linalg.norm(system.M, 2)), np.finfo(float).tiny)
     # One projection step as in `dvax.vi.certificate`, simplified for affine F.
-    moved = ys - np.clip(ys - tau * w, system.low, system.up)
+    projection_step = ys - np.clip(ys - tau * w, system.low, system.up)
     size = lambda v: jax.vmap(spaces[1].norm)(array(v, u0.shape))  # noqa: E731
-    residual, step = size(moved / tau - moved @ system.M.T), size(moved)
+    residual, step = (
+        size(projection_step / tau - projection_step @ system.M.T),
+        size(projection_step),
+    )
     gamma, norm_P_inv = setup.moduli.get("gamma"), setup.moduli.get("norm_P_inv")
     error = None
     if gamma is not None and norm_P_inv is not None:

@@ -108,10 +108,10 @@ class Run:
             # With more switchings at one time than constraints, the law at this time does not determine
             # the next mode.
             if self.switches_here > len(self.mode):
-                crossed = self._cross(piece, begin, low)
-                if isinstance(crossed, str):
-                    return crossed
-                begin, low = crossed
+                crossing = self._cross(piece, begin, low)
+                if isinstance(crossing, str):
+                    return crossing
+                begin, low = crossing
             equations = self.equations_of(self.mode)
             remaining = (piece.length - begin) - low
             h = min(proposal, remaining)
@@ -304,12 +304,12 @@ class Run:
         the state, try less slack, and finally none: the signs are then those of the polynomials.
         """
         for share in _SLACK_FACTORS:
-            tried = attempt._replace(slack=(share * attempt.slack[0], share * attempt.slack[1]))
-            theta, condition = locate_event(equations, tried, h)
-            masked = masked_violation(self.equations_of, self.original, equations, tried, theta, h)
-            if self._is_negligible(masked, tried):
+            trial = attempt._replace(slack=(share * attempt.slack[0], share * attempt.slack[1]))
+            theta, condition = locate_event(equations, trial, h)
+            masked = masked_violation(self.equations_of, self.original, equations, trial, theta, h)
+            if self._is_negligible(masked, trial):
                 break
-        return tried, theta, condition, masked
+        return trial, theta, condition, masked
 
     def _is_negligible(self, masked: MaskedViolation, attempt: Attempt) -> bool:
         """Return whether masked violations use a small part of the remaining tolerance."""
@@ -356,7 +356,7 @@ class Run:
             self._print_progress(share)
         if self.bounds is not None:
             self.bounds = attempt.widen(self.bounds)
-        done, first = (self.defect, self.law_defect), len(self.rows)
+        total_defect, first = (self.defect, self.law_defect), len(self.rows)
         offsets = self.times[first:] - piece.start
         # The last step includes saved times that rounding puts after its end.
         offsets = offsets if last else offsets[: np.searchsorted(offsets, end)]
@@ -371,7 +371,7 @@ class Run:
                     x[k],
                     y[k],
                     w[k],
-                    done,
+                    total_defect,
                     completed_defect,
                     self.bounds,
                 )

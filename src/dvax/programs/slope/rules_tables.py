@@ -21,8 +21,8 @@ def _linear(eqn: Any, operands: list[Any]) -> Slope | None:
     first, last = pieces
     slopes = (values[1:] - values[:-1]) / _widths(times, values)
     ends = [_at(times, values, float(end)) for end in (t.low, t.high)]
-    reached = np.stack([*ends, *values[first + 1 : last + 1]])
-    return _slope(eqn, t, reached, slopes[first : last + 1])
+    values_in_span = np.stack([*ends, *values[first + 1 : last + 1]])
+    return _slope(eqn, t, values_in_span, slopes[first : last + 1])
 
 
 def _constant(eqn: Any, operands: list[Any]) -> Slope | None:
@@ -31,9 +31,9 @@ def _constant(eqn: Any, operands: list[Any]) -> Slope | None:
         return None
     times, values, t, (first, last) = span
     last = last + 1 if float(t.high) >= times[-1] else last
-    reached = values[first : last + 1]
-    jumps = np.where(reached.min(axis=0) == reached.max(axis=0), 0.0, np.inf)
-    return _slope(eqn, t, reached, np.stack([-jumps, jumps]))
+    values_in_span = values[first : last + 1]
+    jumps = np.where(values_in_span.min(axis=0) == values_in_span.max(axis=0), 0.0, np.inf)
+    return _slope(eqn, t, values_in_span, np.stack([-jumps, jumps]))
 
 
 def _cubic(eqn: Any, operands: list[Any]) -> Slope | None:
@@ -73,11 +73,11 @@ def _span(eqn: Any, operands: list[Any]) -> tuple[Values, Values, Slope, tuple[i
     )
 
 
-def _slope(eqn: Any, t: Slope, reached: Values, slopes: Values) -> Slope:
-    low, high = reached.min(axis=0), reached.max(axis=0)
-    moving = lift(t, eqn.outvars[0].aval.shape)
+def _slope(eqn: Any, t: Slope, values_in_span: Values, slopes: Values) -> Slope:
+    low, high = values_in_span.min(axis=0), values_in_span.max(axis=0)
+    lifted = lift(t, eqn.outvars[0].aval.shape)
     down, up = slopes.min(axis=0), slopes.max(axis=0)
-    return Slope(low, high, mapped(moving.parts, lambda part: scaled(part, down, up)))
+    return Slope(low, high, mapped(lifted.parts, lambda part: scaled(part, down, up)))
 
 
 def _at(times: Values, values: Values, t: float) -> Values:
