@@ -76,8 +76,8 @@ class _OfTime:
     in the source.
     """
 
-    def __init__(self, value: _Lazy, pending: tuple = (), is_flag: bool = False):
-        self.value, self.pending, self.is_flag = value, pending, is_flag
+    def __init__(self, value: _Lazy, pending: tuple = ()):
+        self.value, self.pending = value, pending
 
 
 _OTHER = object()

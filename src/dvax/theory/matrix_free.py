@@ -16,8 +16,6 @@ from .lanczos import largest_eigenvalue_bound
 from .system import System
 from .weights import flat_roots
 
-Action = Callable[[np.ndarray], np.ndarray]
-
 
 def in_euclidean_coordinates(
     apply: Callable[[Tree], Tree], space_in: AbstractSpace, like_in: Tree, space_out: AbstractSpace,
