@@ -203,8 +203,10 @@ def _moving_feedback(
                     fastest = np.abs(part.center) + part.radius
                     speed = max(speed, float(np.max(fastest, initial=0.0)))
         if np.isfinite(speed):
-            shown = f", |∂h/∂t| ≤ {speed:.6g}" if speed < 1e50 else ""
-            return Assumption(label, statement, "proved", f"by its code, Lipschitz in t{shown}")
+            speed_text = f", |∂h/∂t| ≤ {speed:.6g}" if speed < 1e50 else ""
+            return Assumption(
+                label, statement, "proved", f"by its code, Lipschitz in t{speed_text}"
+            )
     except TooLarge:
         pass
     return Assumption(label, statement, "estimated", "no proof from the code of h")

@@ -234,13 +234,13 @@ def _continuation_problems(previous: Bound, t0: Any) -> list[InputProblem]:
         end = previous.ts[-1]
         if not _tree.is_concrete(end, t0) or float(end) == float(np.asarray(t0, end.dtype)):
             return []
-        given = f"a Bound up to t = {float(end):.17g} for a run from t0 = {float(t0):.17g}"
+        value_text = f"a Bound up to t = {float(end):.17g} for a run from t0 = {float(t0):.17g}"
     else:
-        given = "a Bound without a saved time"
+        value_text = "a Bound without a saved time"
     return [
         InputProblem(
             "dvax.bound_error(initial_error)",
-            given,
+            value_text,
             "a bound exists at saved times only, so a run can continue only from the last of them",
             "Save t1 as well: make it the last entry of ts=",
         )

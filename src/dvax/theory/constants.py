@@ -97,8 +97,8 @@ class Constants(eqx.Module):
         if energy is not None:
             M_energy, rate = (_tree.as_float(v, "dvax.Constants(energy)") for v in energy)
             self.energy = M_energy, rate
-        given = (gamma, L_F, alpha_h, beta_h, alpha_f, beta_f, M, omega, m_P, norm_P_inv)
-        for name, value in zip(_PRIMARY, given, strict=True):
+        values = (gamma, L_F, alpha_h, beta_h, alpha_f, beta_f, M, omega, m_P, norm_P_inv)
+        for name, value in zip(_PRIMARY, values, strict=True):
             setattr(self, name, _tree.as_float(value, f"dvax.Constants({name})"))
         self.one_sided = (
             None if one_sided is None else _tree.as_float(one_sided, "dvax.Constants(one_sided)")
@@ -312,7 +312,7 @@ def _number(value: Any) -> str:
     return f"{float(value):.6g}"
 
 
-def _check_status(names: Collection[str], given: Mapping[str, Any]) -> None:
+def _check_status(names: Collection[str], values: Mapping[str, Any]) -> None:
     wrong = [
         InputProblem(
             "dvax.Constants(status)",
@@ -321,7 +321,7 @@ def _check_status(names: Collection[str], given: Mapping[str, Any]) -> None:
             "status of a bound depends on it",
             "Fix the name or the status",
         )
-        for name, value in given.items()
+        for name, value in values.items()
         if name not in names or value not in ORDER
     ]
     if wrong:

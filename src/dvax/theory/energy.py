@@ -183,10 +183,10 @@ def _minimise(
     clarabel = _solver()
     units = [cones(e) for e in np.eye(size)]
     rows, offset, kinds = [], [], []
-    for k, given in enumerate(offsets):
+    for k, part in enumerate(offsets):
         matrices = [unit[k] for unit in units]
         rows.append(-np.stack([_packed(S) for S in matrices], axis=1))
-        offset.append(np.zeros(len(rows[-1])) if given is None else _packed(given))
+        offset.append(np.zeros(len(rows[-1])) if part is None else _packed(part))
         kinds.append(clarabel.PSDTriangleConeT(len(matrices[0])))
     for k in positive:
         row = np.zeros((1, size))

@@ -132,7 +132,7 @@ def parameter_bounds(
     )
 
 
-def _including_origin(name: str, given: Any, tree: Tree) -> Tree:
+def _including_origin(name: str, bounds: Any, tree: Tree) -> Tree:
     """Return the region, extended to contain 0.
 
     The estimates of Section 6 start from f(t, 0, 0) and h(t, 0, 0), so the moduli must hold between 0
@@ -140,7 +140,7 @@ def _including_origin(name: str, given: Any, tree: Tree) -> Tree:
     """
 
     def one(v: Slope) -> Slope:
-        if given is not None and not ((v.low <= 0) & (v.high >= 0)).all():
+        if bounds is not None and not ((v.low <= 0) & (v.high >= 0)).all():
             raise InputError(
                 InputProblem(
                     f"dvax.parameter_bounds({name})", "a region without 0",

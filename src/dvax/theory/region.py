@@ -105,7 +105,7 @@ def as_intervals(bounds: Any, like: Tree, name: str) -> Tree:
     return out
 
 
-def _error(name: str, given: Any, rule: str) -> InputError:
+def _error(name: str, value: Any, rule: str) -> InputError:
     return InputError(
-        InputProblem(name, _tree.short(given), rule, "Give the bounds as (low, high)")
+        InputProblem(name, _tree.short(value), rule, "Give the bounds as (low, high)")
     )

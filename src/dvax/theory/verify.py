@@ -226,8 +226,8 @@ def response_box(system: System, K: SetMotion) -> Tree:
         return as_intervals(None, system.u0, "dvax.verify(u)")
 
 
-def intersect(given: Tree, possible: Tree) -> Tree:
-    """Return the intersection of the given region of u with the box around all responses.
+def intersect(region: Tree, possible: Tree) -> Tree:
+    """Return the intersection of a region of u with the box around all responses.
 
     **Raises:** `dvax.InputError` if it is empty.
     """
@@ -247,7 +247,7 @@ def intersect(given: Tree, possible: Tree) -> Tree:
             )
         return interval(low, high)
 
-    return jtu.tree_map(one, given, possible, is_leaf=is_slope)
+    return jtu.tree_map(one, region, possible, is_leaf=is_slope)
 
 
 def search_box(tree: Tree, middle: Tree) -> Tree:
@@ -319,16 +319,16 @@ def state_for(problem: Problem, x0: Tree, t0: float, args: Any, name: str) -> Tr
     return zero
 
 
-def _declared(given: Mapping[str, float] | Constants | None) -> dict[str, float]:
+def _declared(declared: Mapping[str, float] | Constants | None) -> dict[str, float]:
     """Return the declared moduli by name, after checking names and values."""
-    if given is None:
+    if declared is None:
         return {}
     names = ("gamma", "L_F", "alpha_h", "beta_h", "alpha_f", "beta_f")
-    if isinstance(given, Constants):
-        return {name: float(getattr(given, name)) for name in names}
-    invalid = [name for name in given if name not in names]
-    if not isinstance(given, Mapping):
-        invalid = [type(given).__name__]
+    if isinstance(declared, Constants):
+        return {name: float(getattr(declared, name)) for name in names}
+    invalid = [name for name in declared if name not in names]
+    if not isinstance(declared, Mapping):
+        invalid = [type(declared).__name__]
     if invalid:
         raise InputError(
             InputProblem(
@@ -339,7 +339,7 @@ def _declared(given: Mapping[str, float] | Constants | None) -> dict[str, float]
             )
         )
     values: dict[str, float] = {}
-    for name, value in given.items():
+    for name, value in declared.items():
         try:
             values[name] = float(value)
         except (TypeError, ValueError):

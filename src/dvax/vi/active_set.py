@@ -16,7 +16,7 @@ from ..programs.structure import analyse
 from .abstract import AbstractSolver, Answer, FrozenVI
 from .block import solve_block
 from .newton import Linearisation, safeguarded_newton
-from .parameters import SAFETY, STEPS, UNKNOWNS, check_parameters, shown
+from .parameters import SAFETY, STEPS, UNKNOWNS, check_parameters, describe
 
 
 class ActiveSet(AbstractSolver):
@@ -72,9 +72,9 @@ class ActiveSet(AbstractSolver):
             ),
         ):
             if not is_valid:
-                given = shown(getattr(self, name))
+                value_text = describe(getattr(self, name))
                 place = f"dvax.vi.ActiveSet({name})"
-                raise InputError(InputProblem(place, given, rule, "Omit it"))
+                raise InputError(InputProblem(place, value_text, rule, "Omit it"))
 
     def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
         if vi.K.intervals(y0) is None:

@@ -15,7 +15,7 @@ from ..errors import InputError, InputProblem
 from ..sets import AbstractSet
 from ..spaces import AbstractSpace
 from .abstract import AbstractSolver
-from .parameters import MODULUS, Rule, obeys, shown
+from .parameters import MODULUS, Rule, describe, obeys
 from .weighted import Weighted
 
 _CALLER = "dvax.solve_vi"
@@ -58,7 +58,7 @@ def check(F: Any, K: Any, args: Any, solver: Any, space: Any) -> None:
     if not callable(F):
         problems.append(
             InputProblem(
-                f"{_CALLER}(F)", shown(F), "it must be callable as (y, args)",
+                f"{_CALLER}(F)", describe(F), "it must be callable as (y, args)",
                 "Write F=lambda y, args: ...",
             )
         )  # fmt: skip
@@ -70,21 +70,21 @@ def check(F: Any, K: Any, args: Any, solver: Any, space: Any) -> None:
             else "Write dvax.sets.Box(0.0, 1.0)"
         )
         problems.append(
-            InputProblem(f"{_CALLER}(K)", shown(K), "it must be a set of dvax.sets", fix)
+            InputProblem(f"{_CALLER}(K)", describe(K), "it must be a set of dvax.sets", fix)
         )
     problems += solver_problems(f"{_CALLER}(solver)", solver)
     if not isinstance(space, AbstractSpace | None):
         problems.append(
             InputProblem(
-                f"{_CALLER}(space)", shown(space), "it must be a space of dvax.spaces, or None",
+                f"{_CALLER}(space)", describe(space), "it must be a space of dvax.spaces, or None",
                 "Omit it for the Euclidean inner product",
             )
         )  # fmt: skip
     if problems:
         raise InputError(*problems)
     _user_code.check_args(args, _CALLER)
-    for name, given in (("F", F), ("args", args)):
-        for leaf in jtu.tree_leaves(given):
+    for name, value in (("F", F), ("args", args)):
+        for leaf in jtu.tree_leaves(value):
             _check_hashable(name, leaf)
 
 
@@ -93,7 +93,7 @@ def solver_problems(place: str, solver: Any) -> list[InputProblem]:
     if isinstance(solver, AbstractSolver | None):
         return []
     rule = "it must be an instance of a solver, such as dvax.vi.Auto()"
-    return [InputProblem(place, shown(solver), rule, "Omit it for the default")]
+    return [InputProblem(place, describe(solver), rule, "Omit it for the default")]
 
 
 def _check_hashable(name: str, leaf: Any) -> None:
@@ -104,7 +104,7 @@ def _check_hashable(name: str, leaf: Any) -> None:
     except TypeError:
         raise InputError(
             InputProblem(
-                f"{_CALLER}({name})", shown(leaf),
+                f"{_CALLER}({name})", describe(leaf),
                 "a leaf that is not an array becomes a static argument, which must be hashable",
                 "Register its class as a pytree (an equinox.Module is one), or make it hashable",
             )
@@ -126,11 +126,11 @@ def as_number(name: str, value: Any, rule: Rule, dtype: Any) -> Any:
             number = np.asarray(math.inf, dtype)
     if obeys(rule, number):
         return number
-    given = shown(value)
+    value_text = describe(value)
     if number is not value and obeys(rule, float(min(value, 1e308))):
-        given += f", which is {number} in {jnp.dtype(dtype).name}"
+        value_text += f", which is {number} in {jnp.dtype(dtype).name}"
     fix = "Omit it if it is unknown" if rule is MODULUS else "Omit it for 1e-10"
-    raise InputError(InputProblem(f"{_CALLER}({name})", given, rule.words, fix))
+    raise InputError(InputProblem(f"{_CALLER}({name})", value_text, rule.words, fix))
 
 
 def check_functions(F: Any, y0: Tree, args: Any, space: AbstractSpace) -> None:
@@ -157,7 +157,7 @@ def check_functions(F: Any, y0: Tree, args: Any, space: AbstractSpace) -> None:
         if not _tree.is_number(out) and jnp.shape(out) == ():
             raise InputError(
                 InputProblem(
-                    "dvax.vi.Weighted(a)", shown(out), "a(y, args) must be one real number",
+                    "dvax.vi.Weighted(a)", describe(out), "a(y, args) must be one real number",
                     "Return a scalar",
                 )
             )  # fmt: skip
@@ -192,15 +192,19 @@ def _shape_problem(name: str, out: Any, y: Tree) -> tuple[str, str, str] | None:
         fix = f"Join the components: return jnp.stack([...]) from {name}"
     if out is None:
         fix = f"End {name} with `return`"
-    given = "None" if out is None else f"a value of shape {_tree.shapes(out)}"
+    value_text = "None" if out is None else f"a value of shape {_tree.shapes(out)}"
     rule = f"{name}(y, args) must have the shape of y, which is {_tree.shapes(y)} as y0 is"
-    return given, rule, fix
+    return value_text, rule, fix
 
 
 def _dtype_problem(name: str, out: Any, y: Tree) -> tuple[str, str, str] | None:
     for leaf, like in zip(jtu.tree_leaves(out), jtu.tree_leaves(y), strict=True):
         if isinstance(leaf, int) or getattr(leaf, "dtype", like.dtype).kind in "iu":
-            given = f"a value of {jnp.result_type(leaf)}"
+            value_text = f"a value of {jnp.result_type(leaf)}"
             fix = f"Write numbers with a decimal point, or jnp.asarray(..., {like.dtype})"
-            return given, f"{name}(y, args) must have the floating type of y, {like.dtype}", fix
+            return (
+                value_text,
+                f"{name}(y, args) must have the floating type of y, {like.dtype}",
+                fix,
+            )
     return None

@@ -158,13 +158,13 @@ def _safe_divisor(slope: jax.Array) -> jax.Array:
 
 
 def _not_pointwise(*, set_is_interval: bool) -> InputError:
-    given = "an F that couples points"
+    value_text = "an F that couples points"
     if not set_is_interval:
-        given = "a set that is not a pointwise interval"
+        value_text = "a set that is not a pointwise interval"
     return InputError(
         InputProblem(
             "dvax.vi.Bracketing",
-            given,
+            value_text,
             "it solves one scalar inequality per point, so K must be a Box and the code of F must "
             "show that Fᵢ depends on yᵢ alone",
             "Use dvax.vi.Auto() or dvax.vi.Extragradient()",

@@ -43,7 +43,7 @@ def check_parameters(solver: Any, **rules: Rule) -> None:
     cls = type(solver)
     problems = [
         InputProblem(
-            f"dvax.vi.{cls.__name__}({name})", shown(value), rule.words,
+            f"dvax.vi.{cls.__name__}({name})", describe(value), rule.words,
             f"Omit it for {cls.__dataclass_fields__[name].default}",
         )
         for name, rule in rules.items()
@@ -53,7 +53,7 @@ def check_parameters(solver: Any, **rules: Rule) -> None:
         raise InputError(*problems)
 
 
-def shown(value: Any) -> str:
+def describe(value: Any) -> str:
     """Return the value with its type, on one line."""
     if hasattr(value, "dtype") and hasattr(value, "shape"):
         return _tree.short(value) if _is_plain(value) else f"an array of {value.dtype}"

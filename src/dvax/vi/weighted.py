@@ -15,7 +15,7 @@ from ..errors import InputError, InputProblem
 from ..programs.structure import analyse
 from ..spaces import AbstractSpace
 from .abstract import RESULTS
-from .parameters import shown
+from .parameters import describe
 
 _MAX_EIGENVALUE_UNKNOWNS = 256
 """Up to this size the eigenvalues of G's matrix cost at most about two solves."""
@@ -90,7 +90,7 @@ class Weighted(eqx.Module):
             if not callable(fn):
                 raise InputError(
                     InputProblem(
-                        f"dvax.vi.Weighted({name})", shown(fn), "it must be callable as (y, args)",
+                        f"dvax.vi.Weighted({name})", describe(fn), "it must be callable as (y, args)",
                         f"Write {name}=lambda y, args: ...",
                     )
                 )  # fmt: skip
