@@ -35,8 +35,9 @@ _SETTLES = 1e-3
 
 
 class Sample(NamedTuple):
-    """The defect of one step: entry by entry for the step control, integrated for certificates; the
-    rates along x_h that it was made from, the last one at the end; and where x_h and u_h have been."""
+    """The defect of one step: its modulus entry by entry for the step control (`error`), and its signed
+    mean where it cancels (`signed`, else None); integrated for certificates; the rates along x_h that
+    it was made from, the last one at the end; and where x_h and u_h have been."""
 
     thetas: tuple[float, ...]
     rates: list[Rate]
@@ -44,6 +45,7 @@ class Sample(NamedTuple):
     defect: jax.Array
     law_defect: jax.Array
     bounds: Bounds
+    signed: Tree | None = None
 
 
 def enclosed(
@@ -97,7 +99,7 @@ def sampled(
     kink, up to the `safety` of the method and a margin for steps with two. δ(0) is zero for a method
     whose polynomial starts at f̃(t₀, x₀), as most do.
 
-    Over a smooth step of a method with a `quadrature`, `error` is the signed mean |∫δ|/h, with a share
+    Over a smooth step of a method with a `quadrature`, `signed` is the signed mean |∫δ|/h, with a share
     of the mean modulus for ∫ (1 − θ) h B δ, where `slope` = h‖B‖ and B = A + Df̃: to first order the
     error of x₁ is ∫ e^{(1−θ)hB} δ. The integral for certificates stays that of the modulus.
     """
@@ -129,20 +131,22 @@ def sampled(
         share = jnp.where(kinked, method.masked_share, 0.0)
         bump = jtu.tree_map(lambda b, bend: b + share * jnp.abs(bend), bump, c[-1])
     error = jtu.tree_map(lambda *parts: sum(map(jnp.abs, parts)), *ends, bump)
+    signed = None
     if method.quadrature is not None:
         mean = combined(*zip(method.quadrature, (start, *middle, end), strict=True))
         # A defect of mean zero still acts on the way through the step.
         share = jnp.minimum(_MOMENT * jnp.where(jnp.isfinite(slope), slope, jnp.inf), 1.0)
-        error = jtu.tree_map(
+        signed = jtu.tree_map(
             lambda m, e: jnp.where(kinked, e, jnp.minimum(jnp.abs(m) + share * e, e)), mean, error
         )
+        signed = _tree.add(signed, unseen)
     error = _tree.add(error, unseen)
     space = flow.state_space(x0)
     defect = _MARGIN * method.safety * h * sum(map(space.norm, (*ends, bump, unseen)))
     law_defect = h * jnp.max(jnp.stack([one.rate.residual for one in along]))
     places = [(one.x, flow.operator.inverse(one.rate.y)) for one in lax.stop_gradient(along)]
     bounds = reduce(Bounds.hull, [Bounds((x, x), (u, u)) for x, u in places])
-    return Sample(thetas, [*inner, last], error, defect, law_defect, bounds)
+    return Sample(thetas, [*inner, last], error, defect, law_defect, bounds, signed)
 
 
 def _kinked(flow: Flow, evaluations: list[Evaluation]) -> Any:

@@ -82,7 +82,9 @@ def diagnose(solution: Any) -> Diagnosis:
     causes: list[Callable[[Stop], Diagnosis]] = []
     at_floor = stop.step <= 64.0 * max(stop.ulp, 5e-324)
     if result != RESULTS.max_steps or at_floor:
-        causes += [_nonfinite]
+        # Overflow is the end of growth.
+        overflows = _largest(stop.x) > 1e100
+        causes += [_escape, _nonfinite] if overflows else [_nonfinite]
     if result == RESULTS.law_unsolved:
         causes += [_law]
     causes += [_escape]

@@ -56,7 +56,8 @@ class Propagators(NamedTuple):
 class Step(NamedTuple):
     """A step to x₁ with its stage polynomial c.
 
-    - `error`: the defect entry by entry, None where it is not measured;
+    - `error`: the modulus of the defect entry by entry, None where it is not measured; `signed`: its
+      signed mean, None where it does not cancel;
     - `integrated_defect` = (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) over the step;
     - `event(wanted)`: the time of the first kink of the response inside, ∞ where there is none or the
       time is not `wanted`; None where events are not located;
@@ -82,6 +83,7 @@ class Step(NamedTuple):
     finite: Any
     evaluations: Any
     stiffness: Any = None
+    signed: Tree | None = None
 
 
 def interpolate(flow: Flow, length: Any, theta: Any, x0: Tree, c: tuple[Tree, ...]) -> Tree:
@@ -216,13 +218,14 @@ class Stepper(eqx.Module):
         c, x1 = values((c, x1))
         first, last = evaluations[0].rate, evaluations[-1].rate
         error, integrated_defect, event, excursion, bounds = None, (0.0, 0.0), None, None, None
-        stiffness = None
+        stiffness, signed = None, None
         variation = solver_state.variation
         if self.measure:
             slopes = self._slopes(t1 - t0, evaluations)
             whole = None if slopes is None else slopes[1]
             sample = self._measure(t0, t1, arc, evaluations, jumped, whole)
             error, integrated_defect = sample.error, (sample.defect, sample.law_defect)
+            signed = sample.signed
             bounds = sample.bounds if self.track_bounds else None
             if self.locate:
                 event = partial(self._event, t0, t1, x0, c, first, sample)
@@ -256,7 +259,7 @@ class Stepper(eqx.Module):
         own = counts[0] if kept is None else jnp.where(jumped, counts[0], 0)
         return Step(
             x1, c, error, integrated_defect, event, excursion, bounds, after, first.solved, solved,
-            finite, sum(counts[1:], own), stiffness,
+            finite, sum(counts[1:], own), stiffness, signed,
         )  # fmt: skip
 
     def _local(

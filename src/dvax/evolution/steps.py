@@ -92,6 +92,7 @@ def _controller(
         first_growth=setup.number("dt0_growth"),
         longest=setup.number("dt_max"),
         order=method.order,
+        defect_order=method.degree + 1,
         stiff_steps=options.stiff_steps if method.pair is not None else None,
     )
 

@@ -61,9 +61,14 @@ class Dense(AbstractOperator):
     def check(self, space: AbstractSpace) -> None:
         name = "dvax.operators.Dense(matrix)"
         _tree.fits_matrix(name, self.matrix, space.zeros(), "control space")
-        weighted = jnp.asarray(space.weights()).reshape(-1, 1) * self.matrix
+
+        def is_symmetric() -> bool:
+            # NumPy: in a function that JAX traces, its own product would be traced.
+            weighted = np.asarray(space.weights()).reshape(-1, 1) * np.asarray(self.matrix)
+            return np.allclose(weighted, weighted.T, rtol=1e-13, atol=0.0)
+
         _tree.require(
-            lambda: np.allclose(weighted, np.asarray(weighted).T, rtol=1e-13, atol=0.0),
+            is_symmetric,
             name,
             self.matrix,
             f"P must be self-adjoint in {space!r}: diag(weights) @ matrix must be symmetric",

@@ -10,7 +10,7 @@ NO, YES = jnp.asarray(False), jnp.asarray(True)
 def attempt(error, size, horizon=1.0, smallest=1e-14):
     return Attempt(
         begin=jnp.asarray(0.0), end=jnp.asarray(size), size=jnp.asarray(size),
-        smallest=jnp.asarray(smallest), error=jnp.asarray(error),
+        smallest=jnp.asarray(smallest), error=jnp.asarray(error), modulus=jnp.asarray(error),
         integrated=jnp.asarray(error * size / horizon), roundoff=jnp.asarray(0.0),
         usable=jnp.asarray(True),
     )  # fmt: skip

@@ -38,8 +38,8 @@ class Adaptive(AbstractController):
     5. the `StiffnessGuard` ends the run where stability limits the steps, if another method is worth
        its own program from `stiff_steps` more steps on (None: never).
 
-    `order` is that of the defect; `first` and `longest` are the first and the largest step size, and
-    `first_growth` limits the growth after the first step.
+    `order` is that of the mean defect, `defect_order` that of its modulus; `first` and `longest` are
+    the first and the largest step size, and `first_growth` limits the growth after the first step.
     """
 
     stops: jax.Array
@@ -48,6 +48,7 @@ class Adaptive(AbstractController):
     first_growth: Any
     longest: Any
     order: int = eqx.field(static=True)
+    defect_order: int = eqx.field(static=True)
     stiff_steps: int | None = eqx.field(static=True, default=None)
 
     adapts: ClassVar[bool] = True
@@ -89,7 +90,8 @@ class Adaptive(AbstractController):
         attempt = self.test.attempt(t0, t1, x0, step, span)
 
         # 1. Accept or reject.
-        is_noise = state.guard.is_noise(attempt.error, self.order)
+        attempt = attempt.by_modulus(state.guard.noise_floor > 0.0, self.test.horizon)
+        is_noise = state.guard.is_noise(attempt.modulus, self.defect_order)
         is_roundoff = lax.stop_gradient(is_noise & (attempt.error <= attempt.roundoff))
         covered = state.budget.covers(attempt, is_noise) | is_roundoff
         is_resolved = 4.0 * attempt.smallest <= TRUSTED_STEP_SHARE * span
@@ -110,7 +112,11 @@ class Adaptive(AbstractController):
 
         # 3. Let steps grow where errors are roundoff.
         guard = state.guard.after(
-            attempt.size, attempt.error, accepted, state.growth.accepted_in_a_row, self.order
+            attempt.size,
+            attempt.modulus,
+            accepted,
+            state.growth.accepted_in_a_row,
+            self.defect_order,
         )
         size = guard.lengthen(size, attempt.size, accepted)
         size = resume_planned(size, attempt, accepted, state.size)

@@ -24,7 +24,8 @@ class Attempt(NamedTuple):
 
     - `begin`, `end`, `size`: its times, and end − begin;
     - `smallest`: the smallest step size, eight roundings of t;
-    - `error`: the largest defect divided by the tolerance (1 is the limit);
+    - `error`: the largest defect divided by the tolerance (1 is the limit), signed where it cancels;
+    - `modulus`: the same of the modulus of the defect;
     - `integrated`: the defect integrated over the step, in units of the tolerance of the whole run;
     - `roundoff`: the largest `error` that rounding of f̃ and of t can explain;
     - `usable`: the law was solved at `begin`, and no value is non-finite that a smaller step would
@@ -36,9 +37,16 @@ class Attempt(NamedTuple):
     size: Any
     smallest: Any
     error: Any
+    modulus: Any
     integrated: Any
     roundoff: Any
     usable: Any
+
+    def by_modulus(self, noisy: Any, horizon: Any) -> "Attempt":
+        """Return the attempt as measured by the modulus where errors are `noisy`: roundoff cancels by
+        chance in a signed mean, so that no step size would bring it below a tolerance for long."""
+        error = jnp.where(noisy, self.modulus, self.error)
+        return self._replace(error=error, integrated=error * self.size / horizon)
 
 
 class ErrorTest(eqx.Module):
@@ -59,10 +67,13 @@ class ErrorTest(eqx.Module):
         h = t1 - t0
         eps, largest = jnp.finfo(h.dtype).eps, jnp.maximum(jnp.abs(t0), jnp.abs(t1))
         # Step sizes are choices: under differentiation they are constants.
-        error = lax.stop_gradient(self.horizon * self._ratio(step.error, x0, step.x1))
+        modulus = lax.stop_gradient(self.horizon * self._ratio(step.error, x0, step.x1))
+        error = modulus
+        if step.signed is not None:
+            error = lax.stop_gradient(self.horizon * self._ratio(step.signed, x0, step.x1))
         # A law that is not solved inside the step may be that of a stage far away: the step was too
         # large.
-        error = jnp.where(step.solved, error, jnp.inf)
+        error, modulus = (jnp.where(step.solved, v, jnp.inf) for v in (error, modulus))
         # Data that varies within the run has the rounding of t besides, relative to the span.
         relative = eps * (1.0 + largest / span)
         rate = self.horizon * self._ratio(step.c[0], x0, step.x1)
@@ -73,6 +84,7 @@ class ErrorTest(eqx.Module):
             size=h,
             smallest=8 * eps * largest,
             error=error,
+            modulus=modulus,
             integrated=error * h / self.horizon,
             roundoff=lax.stop_gradient(roundoff),
             usable=step.start_solved & step.finite,
