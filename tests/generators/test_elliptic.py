@@ -18,8 +18,7 @@ from dvax.generators.transforms import BOUNDARIES, Transform
 SHAPES = [(1,), (2,), (5,), (8,), (4, 6), (5, 7), (3, 4, 5)]
 KINDS = [(s, b) for s in SHAPES for b in itertools.product(BOUNDARIES, repeat=len(s))]
 USUAL = [(s, b) for s, b in KINDS if s in ((1,), (5,))] + [
-    ((5, 7), ("neumann", "dirichlet")), ((4, 6), ("periodic", "neumann")),
-    ((4, 6), ("dirichlet", "periodic")), ((3, 4, 5), ("dirichlet", "periodic", "neumann")),
+    ((5, 7), ("neumann", "dirichlet")), ((3, 4, 5), ("dirichlet", "periodic", "neumann")),
 ]  # fmt: skip
 
 
@@ -46,7 +45,7 @@ def test_elliptic_transform_agrees_with_its_definition_and_inverts(shape, bounda
         assert np.max(np.abs(np.asarray(transform.backward(one)))) <= amplitude[index] * (1 + 1e-12)
 
 
-@pytest.mark.parametrize("n", [16, 17])
+@pytest.mark.parametrize("n", mostly_thorough([16, 17], [17]))
 def test_elliptic_cosine_and_sine_transforms_agree_with_scipy(n):
     x = np.random.default_rng(1).normal(size=(n, n))
     found = Transform((n, n), ("neumann", "dirichlet")).forward(jnp.asarray(x))
