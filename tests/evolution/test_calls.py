@@ -72,6 +72,7 @@ def test_error_if_inside_f_is_raised_with_its_message():
     ],
 )
 def test_h_may_contain_a_debug_callback(steps):
+    """A callback inside h is called, and does not change the solution."""
     told = []
 
     def h(t, x, u, args):

@@ -64,7 +64,7 @@ def test_cause_finite_time_escape_names_the_time(p, c, method):
 
 
 @pytest.mark.parametrize("steps", mostly_thorough([60, 90, 120], [90]))
-def test_growth_faster_than_exponential_is_not_called_an_escape(steps):
+def test_cause_growth_faster_than_exponential_is_not_reported_as_escape(steps):
     # A drive that grows faster than any exponential, and a state that only follows it.
     error = failure(
         make(lambda t, x, u, args: jnp.exp(t**2) - x), t1=6.0, max_steps=steps, rtol=1e-8,
@@ -73,7 +73,7 @@ def test_growth_faster_than_exponential_is_not_called_an_escape(steps):
     assert "escape" not in str(error)
 
 
-def test_growth_that_is_no_escape_is_not_called_one():
+def test_cause_exponential_growth_is_not_reported_as_escape():
     error = failure(make(lambda t, x, u, args: x), x0=1.0, t1=1e4, rtol=1e-3)
     assert "escape" not in str(error) and "exponential growth" in error.cause
     error = failure(make(lambda t, x, u, args: t - x), x0=1.0, t1=50.0, max_steps=9)

@@ -58,6 +58,6 @@ CASES = [["a batch", "a batch on each"], ["a field", "its gradient"]]
 
 
 @pytest.mark.parametrize("names", mostly_thorough(CASES, CASES[:1]))
-def test_sharded_solve_equals_the_solve_on_one_device(case):
+def test_sharded_solve_equals_the_solve_on_one_device(names):
     program = textwrap.dedent(PROGRAM).replace("NAMES", repr(names))
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -181,7 +181,7 @@ def days(city):
     shares = np.random.default_rng(2).exponential(size=len(city.equilibrium))
     other = shares * np.repeat(city.trips.flow / per_pair(city, shares), city.paths.sizes)
     starts = city.all_or_nothing(), jnp.asarray(other)
-    return [run(city, x0, 24.0, ts, method=dvax.ETD1()) for x0 in starts]
+    return [run(city, x0, 24.0, ts) for x0 in starts]
 
 
 def test_traffic_equilibrium_has_the_least_cost_over_all_flows(city):
@@ -345,7 +345,7 @@ def test_traffic_rejects_networks_outside_the_class():
 
 
 @pytest.fixture(scope="module")
-def test_traffic_sioux_falls_agrees_with_published_flows():
+def sioux_falls():
     folder = networks.SIOUX_FALLS
     if not folder.is_dir():
         pytest.skip(f"the Sioux Falls files are not at {folder}")
@@ -354,7 +354,7 @@ def test_traffic_sioux_falls_agrees_with_published_flows():
     return model, formats.read_flows(folder / "SiouxFalls_flow.tntp", model.network)
 
 
-def test_sioux_falls(sioux_falls):
+def test_traffic_sioux_falls_agrees_with_published_flows(sioux_falls):
     model, known = sioux_falls
     spent = float(model.total_travel_time(0.0, model.equilibrium))
     assert spent == pytest.approx(7_480_225.344921, rel=1e-9)
@@ -366,7 +366,7 @@ def test_sioux_falls(sioux_falls):
 
 
 @pytest.mark.thorough
-def test_days_lead_to_the_equilibrium_of_sioux_falls(sioux_falls):
+def test_traffic_days_of_sioux_falls_converge_to_published_flows(sioux_falls):
     model, known = sioux_falls
     ts = np.array([0.0, 4.0, 8.0, 12.0, 16.0, 20.0, 40.0])
     sol = run(model, model.all_or_nothing(), 40.0, ts, method=dvax.ETD1())

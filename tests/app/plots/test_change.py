@@ -10,7 +10,7 @@ from dvax.app.plots.change import change_figure
 from dvax.sensitivity.change import Change, Views
 
 
-def test_the_curves_are_the_numbers_and_axes_have_units():
+def test_change_figure_shows_the_numbers_with_units():
     ts = np.linspace(0.0, 2.0, 5)
     x, u = (Views(a * ts, 1.1 * a * ts, 5 * a * ts, 2 * a * ts) for a in (1.0, 0.5))
     seen = Change(ts, x, u, cast(Any, None), "proved")
@@ -26,7 +26,7 @@ def test_the_curves_are_the_numbers_and_axes_have_units():
 
 # The example of `dvax.sensitivity.change` has the largest of these numbers.
 @pytest.mark.thorough
-def test_a_change_is_within_its_bounds_and_near_its_prediction():
+def test_change_lies_within_its_bounds_and_near_its_prediction():
     problem = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
         f=lambda t, x, u, ell: ell - 0.5 * x - u, h=lambda t, x, u, ell: 1.0 - 2.0 * x - u,
