@@ -9,7 +9,10 @@ from tests.selection import mostly_thorough
 
 PROGRAM = """
     import os
-    os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
+    # Beside the flags of the tests, with which XLA compiles faster.
+    os.environ["XLA_FLAGS"] = (
+        os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
+    )
     import jax
     import jax.numpy as jnp
     import numpy as np
