@@ -199,7 +199,7 @@ def test_moving_set_works_in_a_problem():
         f=lambda t, x, u, args: u,
         h=lambda t, x, u, args: 2.0 + x - u,
     )
-    cap = lambda c: problem.response(0.5, jnp.zeros(2), {"cap": c[None]})[0]  # noqa: E731
+    cap = jax.jit(lambda c: problem.response(0.5, jnp.zeros(2), {"cap": c[None]})[0])
     assert float(cap(jnp.asarray(0.5))) == pytest.approx(0.5)
     assert float(jax.grad(cap)(jnp.asarray(0.5))) == pytest.approx(0.5)
 
