@@ -13,10 +13,11 @@ T = TypeVar("T")
 def once(make: Callable[P, T]) -> Callable[P, T]:
     """Return `make` with its results kept: dvax compiles one program for all calls with the same
     functions. Arrays are made outside of a trace that may be under way at the first call."""
+    kept = functools.cache(make)
 
-    @functools.cache
-    def made(*given, **named):
+    @functools.wraps(make)
+    def made(*given: P.args, **named: P.kwargs) -> T:
         with jax.ensure_compile_time_eval():
-            return make(*given, **named)
+            return kept(*given, **named)
 
-    return functools.wraps(make)(made)
+    return made
