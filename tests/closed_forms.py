@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from tests.once import once
 
 import dvax
 
@@ -51,6 +52,7 @@ def c1_derivatives() -> tuple[float, float]:
     )
 
 
+@once
 def c1() -> ClosedForm:
     """Section 7 at one point; args is (ℓ,)."""
     problem = dvax.Problem(
@@ -93,6 +95,7 @@ def c2_solution(t: float) -> tuple[Array, Array]:
     return np.array([z.real, z.imag]), inverse @ corner
 
 
+@once
 def c2() -> ClosedForm:
     problem = dvax.Problem(
         A=dvax.generators.Dense(jnp.array([[-1.0, 2.0], [-2.0, -1.0]])),
@@ -120,6 +123,7 @@ def c3_solution(t: float) -> tuple[Array, Array]:
     return length * direction, min(length, 0.5 * np.exp(-t / 2)) * direction
 
 
+@once
 def c3() -> ClosedForm:
     problem = dvax.Problem(
         A=dvax.generators.Dense(jnp.array([[-0.5, -3.0], [3.0, -0.5]])),
@@ -145,6 +149,7 @@ def c4_solution(t: float) -> tuple[Array, Array]:
     return x, x
 
 
+@once
 def c4() -> ClosedForm:
     """F(y) = (2 + sin y)(y − x): strongly pseudomonotone with γ = 1, not monotone."""
     problem = dvax.Problem(
@@ -168,6 +173,7 @@ def c7_solution(n: int, t: float) -> tuple[Array, Array]:
     return x, np.clip((1.0 - 1.5 * x) / 1.5, 0.0, 0.4)
 
 
+@once
 def c7(n: int) -> ClosedForm:
     """Heat in a rod with fixed ends and a saturated law at each of n points, x = e^{−t} sin s: u = 0.4
     where s < arcsin(4eᵗ/15), nearer to an end than that, and u = 0 where s > arcsin(2eᵗ/3)."""

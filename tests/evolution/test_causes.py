@@ -47,7 +47,7 @@ ESCAPES = [
 
 @pytest.mark.parametrize(
     ("p", "c", "method"),
-    mostly_thorough(ESCAPES, [(2.0, 1.0, dvax.DormandPrince()), (3.0, 20.0, dvax.ETD2RK())]),
+    mostly_thorough(ESCAPES, [(3.0, 20.0, dvax.ETD2RK())]),
 )
 def test_cause_finite_time_escape_names_the_time(p, c, method):
     problem = make(lambda t, x, u, args: c * (1.0 + jnp.abs(x) ** p))
@@ -63,18 +63,21 @@ def test_cause_finite_time_escape_names_the_time(p, c, method):
     assert dvax.solve(problem, 0.0, 0.0, end, method=dvax.DormandPrince(), **loose).xs.shape == (1,)
 
 
+@pytest.mark.parametrize("steps", mostly_thorough([60, 90, 120], [90]))
+def test_cause_growth_faster_than_exponential_is_not_reported_as_escape(steps):
+    # A drive that grows faster than any exponential, and a state that only follows it.
+    error = failure(
+        make(lambda t, x, u, args: jnp.exp(t**2) - x), t1=6.0, max_steps=steps, rtol=1e-8,
+        method=dvax.DormandPrince(),
+    )  # fmt: skip
+    assert "escape" not in str(error)
+
+
 def test_cause_exponential_growth_is_not_reported_as_escape():
     error = failure(make(lambda t, x, u, args: x), x0=1.0, t1=1e4, rtol=1e-3)
     assert "escape" not in str(error) and "exponential growth" in error.cause
     error = failure(make(lambda t, x, u, args: t - x), x0=1.0, t1=50.0, max_steps=9)
     assert "grow" not in error.cause.split("max_steps")[0]
-    # A drive that grows faster than any exponential, and a state that only follows it.
-    for steps in (60, 90, 120):
-        error = failure(
-            make(lambda t, x, u, args: jnp.exp(t**2) - x), t1=6.0, max_steps=steps, rtol=1e-8,
-            method=dvax.DormandPrince(),
-        )  # fmt: skip
-        assert "escape" not in str(error)
 
 
 @pytest.mark.parametrize("most", [1, 20, 60, 100])
@@ -170,7 +173,7 @@ def test_cause_tolerance_below_rounding_suggests_an_attainable_tolerance():
     assert float(found.xs[-1]) == pytest.approx(exact, abs=1e-8)
 
 
-@pytest.mark.parametrize("t0", [1e15, -1e15])
+@pytest.mark.parametrize("t0", mostly_thorough([1e15, -1e15], [1e15]))
 def test_cause_rounding_of_large_times_is_reported(t0):
     problem = make(lambda t, x, u, args: -x, h=lambda t, x, u, args: 1.0 - 2.0 * x - u)
     error = failure(problem, x0=1.0, t0=t0, t1=t0 + 100.0, method=dvax.ETD2RK())
@@ -273,9 +276,7 @@ METHODS = {
 
 @pytest.mark.parametrize(
     ("name", "method"),
-    mostly_thorough(
-        [(n, m) for n in RELAYS for m in METHODS], [("one", "ETD2RK"), ("friction", "ETD4RK")]
-    ),
+    mostly_thorough([(n, m) for n in RELAYS for m in METHODS], [("one", "ETD2RK")]),
 )
 def test_cause_relay_in_x_is_reported_and_can_be_written_as_a_law(name, method):
     rate, g, x0, when = RELAYS[name]

@@ -10,7 +10,7 @@ from tests.selection import mostly_thorough
 import dvax
 
 
-@pytest.mark.parametrize("name", mostly_thorough(ALL, ["C1", "C4"]))
+@pytest.mark.parametrize("name", mostly_thorough(ALL, ["C4"]))
 def test_adaptive_solve_of_closed_forms_reaches_nine_digits(name):
     case = ALL[name]()
     sol = dvax.solve(
@@ -30,7 +30,7 @@ PAIRS = [(name, method) for name in ALL for method in METHODS]
 
 @pytest.mark.parametrize(
     ("name", "method"),
-    mostly_thorough(PAIRS, [("C1", "DormandPrince"), ("C3", "ETD4RK")]),
+    mostly_thorough(PAIRS, [("C1", "DormandPrince")]),
 )
 def test_error_of_closed_forms_is_below_ten_tolerances(name, method):
     case, ts = ALL[name](), np.linspace(0.0, ALL[name]().t1, 9)

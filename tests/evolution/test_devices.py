@@ -9,7 +9,10 @@ from tests.selection import mostly_thorough
 
 PROGRAM = """
     import os
-    os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
+    # Beside the flags of the tests, with which XLA compiles faster.
+    os.environ["XLA_FLAGS"] = (
+        os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
+    )
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -39,24 +42,25 @@ PROGRAM = """
         return jax.shard_map(run, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
 
     lanes, starts = jax.vmap(end(scalar)), jnp.linspace(-1.0, 1.0, 6)
-    run, alike, x0, is_one = {
+    cases = {
         "a field": (end(field), end(field), jnp.sin(s), False),
         "its gradient": (*2 * (jax.grad(lambda x0: jnp.sum(end(field)(x0) ** 2)),), s, False),
         "a batch": (lanes, lanes, starts, False),
         "a batch on each": (apart(lanes), lanes, starts, True),
-    }[CASE]
-    program = jax.jit(run).lower(jax.device_put(x0, shared)).compile()
-    found = program(jax.device_put(x0, shared))
-    assert found.sharding.device_set == set(jax.devices())
-    assert ("xla_cpu_small_call" in program.as_text()) == is_one
-    np.testing.assert_allclose(found, jax.jit(alike)(x0), rtol=1e-9, atol=1e-12)
+    }
+    for run, alike, x0, is_one in (cases[name] for name in NAMES):
+        program = jax.jit(run).lower(jax.device_put(x0, shared)).compile()
+        found = program(jax.device_put(x0, shared))
+        assert found.sharding.device_set == set(jax.devices())
+        assert ("xla_cpu_small_call" in program.as_text()) == is_one
+        np.testing.assert_allclose(found, jax.jit(alike)(x0), rtol=1e-9, atol=1e-12)
 """
 
 
-CASES = ["a field", "its gradient", "a batch", "a batch on each"]
+CASES = [["a batch", "a batch on each"], ["a field", "its gradient"]]
 
 
-@pytest.mark.parametrize("case", mostly_thorough(CASES, ["a field", "a batch on each"]))
-def test_sharded_solve_equals_the_solve_on_one_device(case):
-    program = textwrap.dedent(PROGRAM).replace("CASE", repr(case))
+@pytest.mark.parametrize("names", mostly_thorough(CASES, CASES[:1]))
+def test_sharded_solve_equals_the_solve_on_one_device(names):
+    program = textwrap.dedent(PROGRAM).replace("NAMES", repr(names))
     subprocess.run([sys.executable, "-c", program], check=True)

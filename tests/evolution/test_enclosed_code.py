@@ -73,8 +73,7 @@ def driven(drive):
     ("name", "method"),
     mostly_thorough(
         [(n, m) for n in CODE for m in METHODS],
-        [("scatter", "ETD2RK"), ("digitize", "ETD2RK"), ("power at zero", "ETD2RK"),
-         ("tanh", "DormandPrince")],
+        [("scatter", "ETD2RK"), ("tanh", "DormandPrince")],
     ),
 )  # fmt: skip
 def test_solve_handles_common_jax_code_in_f(name, method):
@@ -107,7 +106,7 @@ def tent(lib, t, c, w=0.05):
     ("name", "method"),
     mostly_thorough(
         [(n, m) for n in PULSES for m in METHODS],
-        [("after a start-up", "ExpRosenbrock"), ("beside a maximum", "DormandPrince")],
+        [("beside a maximum", "DormandPrince")],
     ),
 )
 def test_pulse_beside_larger_data_is_not_missed(name, method):

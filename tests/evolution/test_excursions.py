@@ -32,9 +32,7 @@ def end_of(problem, t1, method):
 ALL = [(dip, method) for dip in DIPS for method in METHODS]
 
 
-@pytest.mark.parametrize(
-    ("dip", "method"), mostly_thorough(ALL, [("vee", "DormandPrince"), ("bell", "ExpRosenbrock")])
-)
+@pytest.mark.parametrize(("dip", "method"), mostly_thorough(ALL, [("vee", "DormandPrince")]))
 def test_dip_of_a_bound_within_a_step_is_resolved(dip, method):
     """x' = u − 0.1x, u = min(0.05, k(t)): by quadrature of e^{−0.1(2 − s)} min(0.05, k(s))."""
     k = DIPS[dip]

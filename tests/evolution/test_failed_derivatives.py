@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tests.once import once
 from tests.selection import mostly_thorough
 
 import dvax
@@ -22,6 +23,7 @@ KINDS = {
 }
 
 
+@once
 def problem():
     def f(t, x, u, p):
         pole = p["s"] * jnp.where(p["s"] > 0, 1.0 / (t - 0.7), 0.0)
@@ -79,7 +81,7 @@ def lanes(method, dt):
             if case not in {("Implicit", 0.05, a) for a in ("reverse", "forward")}
             and case[::2] != ("Picard", "reverse")
         ],
-        [("ETD2RK", None, "reverse"), ("ETD2RK", 0.05, "forward")],
+        [("ETD2RK", None, "reverse")],
     ),
 )
 def test_derivatives_of_failed_lanes_are_nan_and_others_are_correct(method, dt, adjoint):
@@ -108,7 +110,7 @@ def test_derivatives_of_failed_lanes_are_nan_and_others_are_correct(method, dt, 
 
 
 @pytest.mark.parametrize(
-    "mode", mostly_thorough(["hessian", "twice forward", "twice back", "linearize"], [])
+    "mode", mostly_thorough(["hessian", "twice forward", "twice back", "linearize"], ["linearize"])
 )
 def test_second_derivatives_and_linearisations_of_failed_lanes_are_nan(mode):
     first = "forward" if mode in ("twice forward", "linearize") else "reverse"

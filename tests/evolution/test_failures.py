@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tests.once import once
 from tests.selection import mostly_thorough
 
 import dvax
@@ -14,6 +15,7 @@ from dvax.evolution import RESULTS
 BREAKS = 0.7
 
 
+@once
 def system(broken):
     """x' = −x − u of three entries, u = proj_{[0,1]}(x); from t = 0.7 on one of f, h, K is broken."""
 
@@ -32,7 +34,7 @@ def system(broken):
 
 @pytest.mark.parametrize(
     ("name", "dt"),
-    mostly_thorough(itertools.product("fhK", (None, 0.02)), [("f", 0.02), ("K", None)]),
+    mostly_thorough(itertools.product("fhK", (None, 0.02)), [("f", 0.02)]),
 )
 def test_nan_ends_the_run_and_the_error_names_function_time_and_component(name, dt):
     x0, ts = jnp.array([0.5, 2.0, -1.0]), np.linspace(0, 2, 20)  # none of them 0.7 itself
@@ -52,7 +54,7 @@ def test_nan_ends_the_run_and_the_error_names_function_time_and_component(name, 
     np.testing.assert_allclose(np.asarray(sol.xs[:, 2]), -np.exp(-sol.ts), atol=1e-3)
 
 
-@pytest.mark.parametrize("dt", [0.02, 0.1])
+@pytest.mark.parametrize("dt", mostly_thorough([0.02, 0.1], [0.1]))
 def test_saved_states_before_a_failure_are_kept(dt):
     ts = np.linspace(0.0, 2.0, 21)
     sol = dvax.solve(system("f"), jnp.array([0.5, 0.8, 0.9]), 0.0, 2.0, ts=ts, dt=dt, throw=False)

@@ -73,7 +73,7 @@ def test_etd4rk_is_more_accurate_than_etd2rk_over_moving_boundaries():
 @pytest.mark.parametrize(
     ("method", "rtol"),
     [
-        (dvax.ETD2RK(), 1e-4),
+        pytest.param(dvax.ETD2RK(), 1e-4, marks=pytest.mark.thorough),
         pytest.param(dvax.ETD2RK(), 1e-7, marks=pytest.mark.thorough),
         (dvax.ETD4RK(), 1e-7),
         pytest.param(dvax.ETD4RK(), 1e-10, marks=pytest.mark.thorough),

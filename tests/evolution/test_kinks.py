@@ -105,7 +105,6 @@ OFTEN = [
     ("touches the bound and turns back", "ETD4RK"),
     ("slides along the bound", "ETD4RK"),
     ("leaves the bound from rest on it", "ETD4RK"),
-    ("leaves the bound from rest on it", "ETD2RK"),
     ("infinitely many kinks", "ETD4RK"),
 ]
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from tests.closed_forms import c1, c2, c3
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax import _jax
@@ -169,7 +170,7 @@ def test_outlined_accepts_constant_arguments():
         np.testing.assert_allclose(jax.jit(lambda v=v: outlined(run, jnp.asarray(v)))(), run(v))
 
 
-@pytest.mark.parametrize("n", [9, 3000, 50_000])
+@pytest.mark.parametrize("n", mostly_thorough([9, 3000, 50_000], [9, 50_000]))
 def test_outlined_accepts_long_constants_beside_computed_arguments(n):
     # The compiler ends the process over a long constant beside another argument.
     table = jnp.asarray(np.random.default_rng(0).normal(size=n))
@@ -229,7 +230,7 @@ def test_outlined_jvp_is_finite_with_undifferentiated_arguments():
     assert np.isfinite(jax.jit(push)(V)[1]).all()
 
 
-@pytest.mark.parametrize("case", [c1, c2, c3], ids=["C1", "C2", "C3"])
+@pytest.mark.parametrize("case", mostly_thorough([c1, c2, c3], [c1, c3]))
 def test_outlined_solve_of_a_small_system_is_one_function(case):
     # What makes a step of a small system cheap: should a new operation end it, this says so.
     problem, x0, t1, _, _, args = case()

@@ -18,8 +18,7 @@ from dvax.generators.transforms import BOUNDARIES, Transform
 SHAPES = [(1,), (2,), (5,), (8,), (4, 6), (5, 7), (3, 4, 5)]
 KINDS = [(s, b) for s in SHAPES for b in itertools.product(BOUNDARIES, repeat=len(s))]
 USUAL = [(s, b) for s, b in KINDS if s in ((1,), (5,))] + [
-    ((5, 7), ("neumann", "dirichlet")), ((4, 6), ("periodic", "neumann")),
-    ((4, 6), ("dirichlet", "periodic")), ((3, 4, 5), ("dirichlet", "periodic", "neumann")),
+    ((5, 7), ("neumann", "dirichlet")), ((3, 4, 5), ("dirichlet", "periodic", "neumann")),
 ]  # fmt: skip
 
 
@@ -46,7 +45,7 @@ def test_elliptic_transform_agrees_with_its_definition_and_inverts(shape, bounda
         assert np.max(np.abs(np.asarray(transform.backward(one)))) <= amplitude[index] * (1 + 1e-12)
 
 
-@pytest.mark.parametrize("n", [16, 17])
+@pytest.mark.parametrize("n", mostly_thorough([16, 17], [17]))
 def test_elliptic_cosine_and_sine_transforms_agree_with_scipy(n):
     x = np.random.default_rng(1).normal(size=(n, n))
     found = Transform((n, n), ("neumann", "dirichlet")).forward(jnp.asarray(x))
@@ -96,21 +95,25 @@ def operator(shape, boundary):
     return A, matrix_of(shape, lengths, boundary, diffusion, velocity, -0.3), numbers
 
 
-@pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(GRIDS, GRIDS[2::2]))
+@pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(GRIDS, GRIDS[2::4]))
 def test_elliptic_differences_equal_their_matrix(shape, boundary):
     A, matrix, _ = operator(shape, boundary)
     rng, size = np.random.default_rng(2), int(np.prod(shape))
     x0, c0, c1 = rng.normal(size=(3, size))
     box = lambda v: jnp.asarray(v.reshape(shape))  # noqa: E731
     close = functools.partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-11)
-    close(np.asarray(A.apply(box(x0))).ravel(), matrix @ x0)
-    turned = A.adjoint(spaces.Euclidean(shape))
-    close(np.asarray(turned.apply(box(x0))).ravel(), matrix.T @ x0)
-    close(
-        np.asarray(turned.semigroup(0.7, box(x0))).ravel(), scipy.linalg.expm(0.7 * matrix.T) @ x0
-    )
-    close(np.asarray(A.semigroup(0.7, box(x0))).ravel(), scipy.linalg.expm(0.7 * matrix) @ x0)
-    flow = A.propagator(0.7, 2).step(box(x0), (box(c0), box(c1)))
+
+    @jax.jit
+    def products(x0, c0, c1):
+        turned = A.adjoint(spaces.Euclidean(shape))
+        flow = A.propagator(0.7, 2).step(x0, (c0, c1))
+        plain = A.apply(x0), A.semigroup(0.7, x0)
+        return *plain, turned.apply(x0), turned.semigroup(0.7, x0), flow
+
+    *found, flow = products(box(x0), box(c0), box(c1))
+    expected = [M @ x0 for B in (matrix, matrix.T) for M in (B, scipy.linalg.expm(0.7 * B))]
+    for one, other in zip(found, expected, strict=True):
+        close(np.asarray(one).ravel(), other)
     dense = generators.Dense(matrix).propagator(0.7, 2)
     exact = dense.step(jnp.asarray(x0), (jnp.asarray(c0), jnp.asarray(c1)))
     close(np.asarray(flow).ravel(), np.asarray(exact))
@@ -132,7 +135,7 @@ def test_elliptic_growth_bound_holds_and_is_sharp(shape, boundary):
         assert np.linalg.norm(moved, 2) <= M * np.exp(omega * t) * (1 + 1e-12)
 
 
-@pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(GRIDS, GRIDS[:5:2]))
+@pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(GRIDS, GRIDS[:5:4]))
 def test_elliptic_step_stays_within_its_curvature_bound(shape, boundary):
     A, _, _ = operator(shape, boundary)
     x0, c0, c1 = jnp.asarray(np.random.default_rng(4).normal(size=(3, *shape)))

@@ -139,7 +139,8 @@ def test_market_first_hours_agree_with_an_independent_integrator_and_law(week):
 
 
 @needs_data
-@pytest.mark.parametrize("hours", [(12,), pytest.param((60, 100), marks=pytest.mark.thorough)])
+@pytest.mark.thorough  # the duopoly below converges to its equilibrium in every run
+@pytest.mark.parametrize("hours", [(12,), (60, 100)])
 def test_market_price_with_constant_data_converges_to_the_equilibrium(rts, week, hours):
     times = np.linspace(0.0, 6.0, 168)
     for k in hours:

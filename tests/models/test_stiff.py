@@ -194,7 +194,7 @@ def test_stiff_random_circuits_agree_with_an_independent_analysis(seed):
     )
 
 
-@pytest.mark.parametrize("seed", [27, 40])
+@pytest.mark.parametrize("seed", [27, pytest.param(40, marks=pytest.mark.thorough)])
 def test_stiff_run_saves_a_last_time_within_rounding_of_the_last_step(seed):
     ts = np.linspace(0.0, 2.0, 9)
     sol = Circuit(stiffened(seed)).solve(ts[-1], ts)
@@ -252,7 +252,7 @@ def drawn(rng, mild=False):
 
 
 @pytest.mark.parametrize(
-    "seed", [0, 3, 5, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(6, 300))]
+    "seed", [0, 3, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(5, 300))]
 )
 def test_circuits_of_any_kind_and_scale_succeed_at_the_defaults(seed):
     text, _, end, events = drawn(np.random.default_rng(seed))
@@ -268,7 +268,10 @@ def test_circuits_of_any_kind_and_scale_succeed_at_the_defaults(seed):
 # ended after eight minutes.
 @pytest.mark.parametrize(
     "seed",
-    [2, 25, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(26, 200) if s != 153)],
+    [
+        25,
+        *(pytest.param(s, marks=pytest.mark.thorough) for s in (2, *range(26, 200)) if s != 153),
+    ],
 )
 def test_circuits_of_any_kind_and_scale_agree_with_hundred_digit_arithmetic(seed):
     text, source, end, _ = drawn(np.random.default_rng(seed))
@@ -288,7 +291,7 @@ def test_circuits_of_any_kind_and_scale_agree_with_hundred_digit_arithmetic(seed
 
 
 @pytest.mark.parametrize(
-    "seed", [1, 2, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(3, 60) if s != 45)]
+    "seed", [1, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(2, 60) if s != 45)]
 )
 def test_circuits_of_any_kind_agree_with_radau_on_an_independent_analysis(seed):
     text, source, end, _ = drawn(np.random.default_rng(1000 + seed), mild=True)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from tests.models.test_frame import GROUND, RECORD, STEP, elastoplastic, exactly
 from tests.models.test_stiff import work
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax.models.frame import Accelerogram, Frame
@@ -22,7 +23,7 @@ def records():
     yield "walk", Accelerogram(0.02, 0.3 * white / np.abs(white).max())
 
 
-@pytest.mark.parametrize("name", ["waves", "pulse", "walk"])
+@pytest.mark.parametrize("name", mostly_thorough(["waves", "pulse", "walk"], ["walk"]))
 def test_frame_cost_does_not_grow_for_small_viscosity(name):
     record = dict(records())[name]
     knots = record.samples.shape[0]
@@ -37,7 +38,7 @@ def test_frame_cost_does_not_grow_for_small_viscosity(name):
     assert counts[-1] < 2 * counts[0] and int(sol.stats["switchings"]) >= 2
 
 
-@pytest.mark.parametrize("ratio", [1e-4, 1e-8])
+@pytest.mark.parametrize("ratio", mostly_thorough([1e-4, 1e-8], [1e-8]))
 def test_elastoplastic_distance_bounds_the_difference(ratio):
     T, z, limit = 0.5, 0.05, 0.5
     run, _ = exactly(elastoplastic(T, z, limit), GROUND[:151], step=1.25e-3)

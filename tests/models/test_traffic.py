@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from tests.models import traffic_networks as networks
 from tests.models.proximal_step import ProximalStep
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax import formats
@@ -122,7 +123,12 @@ def test_traffic_follows_changing_demand_and_an_incident():
     assert float(model.constants.L_F) == pytest.approx(1 + 50.0 * 0.5, rel=1e-6)
 
 
-@pytest.mark.parametrize("case", ["one path", "no congestion", "constant costs"])
+@pytest.mark.parametrize(
+    "case",
+    mostly_thorough(
+        ["one path", "no congestion", "constant costs"], ["one path", "constant costs"]
+    ),
+)
 def test_traffic_network_without_choice_or_congestion_is_solved(case):
     # Two roads of equal cost for the last case; no link is stiff, or no pair has two paths.
     congested = case == "one path"
@@ -338,13 +344,30 @@ def test_traffic_rejects_networks_outside_the_class():
 # Real sizes.
 
 
-def test_traffic_sioux_falls_agrees_with_published_flows():
+@pytest.fixture(scope="module")
+def sioux_falls():
     folder = networks.SIOUX_FALLS
     if not folder.is_dir():
         pytest.skip(f"the Sioux Falls files are not at {folder}")
     files = folder / "SiouxFalls_net.tntp", folder / "SiouxFalls_trips.tntp"
     model = traffic.Traffic(*files, rho=2000.0)
-    known = formats.read_flows(folder / "SiouxFalls_flow.tntp", model.network)
+    return model, formats.read_flows(folder / "SiouxFalls_flow.tntp", model.network)
+
+
+def test_traffic_sioux_falls_agrees_with_published_flows(sioux_falls):
+    model, known = sioux_falls
+    spent = float(model.total_travel_time(0.0, model.equilibrium))
+    assert spent == pytest.approx(7_480_225.344921, rel=1e-9)
+    assert float(model.objective(0.0, model.equilibrium)) == pytest.approx(
+        4_231_335.287107440, rel=1e-12
+    )
+    np.testing.assert_allclose(model.link_flows(model.equilibrium), known.volume, atol=1e-3)
+    np.testing.assert_allclose(model.costs(0.0, model.equilibrium), known.cost, atol=1e-6)
+
+
+@pytest.mark.thorough
+def test_traffic_days_of_sioux_falls_converge_to_published_flows(sioux_falls):
+    model, known = sioux_falls
     ts = np.array([0.0, 4.0, 8.0, 12.0, 16.0, 20.0, 40.0])
     sol = run(model, model.all_or_nothing(), 40.0, ts, method=dvax.ETD1())
     figures = model.figures(sol)
@@ -352,15 +375,9 @@ def test_traffic_sioux_falls_agrees_with_published_flows():
     # Of first order in the distance to the equilibrium, which falls by e^(−t/2) (`above` is of second
     # order and falls by e^(−t)): e⁻²⁰ = 2·10⁻⁹ after 40 days, as found, so 10⁻⁹ would be too much.
     assert figures["total_travel_time"] == pytest.approx(7_480_225.344921, rel=1e-8)
-    spent = float(model.total_travel_time(0.0, model.equilibrium))
-    assert spent == pytest.approx(7_480_225.344921, rel=1e-9)
-    assert float(model.objective(0.0, model.equilibrium)) == pytest.approx(
-        4_231_335.287107440, rel=1e-12
-    )
     assert figures["max_conservation_error"] <= 1e-12
-    for x in (model.equilibrium, sol.xs[-1]):
-        np.testing.assert_allclose(model.link_flows(x), known.volume, atol=1e-3)
-        np.testing.assert_allclose(model.costs(0.0, x), known.cost, atol=1e-6)
+    np.testing.assert_allclose(model.link_flows(sol.xs[-1]), known.volume, atol=1e-3)
+    np.testing.assert_allclose(model.costs(0.0, sol.xs[-1]), known.cost, atol=1e-6)
     above = [float(model.objective(0.0, x)) / 4_231_335.287107440 - 1 for x in sol.xs]
     assert above[1:6] == pytest.approx([3.0e-3, 4.8e-5, 8.8e-7, 1.6e-8, 3.0e-10], rel=0.1)
 

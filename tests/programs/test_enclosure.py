@@ -1,5 +1,7 @@
 """Linear enclosures: a function of time stays within the bound on its distance from a line."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -61,22 +63,27 @@ def farthest(fn, t0, t1):
     theta = jnp.linspace(0.0, 1.0, 801)
     values = jax.vmap(lambda s: jnp.asarray(fn(t0 + s * (t1 - t0))))(theta)
     weight = theta.reshape((-1,) + (1,) * (values.ndim - 1))
-    return np.abs(values - ((1 - weight) * values[:1] + weight * values[-1:])).max(axis=0)
+    return jnp.abs(values - ((1 - weight) * values[:1] + weight * values[-1:])).max(axis=0)
 
 
 def enclosed(fn, t0, t1):
     return enclose(fn, straight(jnp.asarray(t0), jnp.asarray(t1)))
 
 
+@functools.cache
+def compiled(fn):
+    """The enclosure of fn over [t0, t1], fn at both ends, and `farthest`, in one program."""
+    return jax.jit(lambda t0, t1: (enclosed(fn, t0, t1), fn(t0), fn(t1), farthest(fn, t0, t1)))
+
+
 @pytest.mark.parametrize("name", FUNCTIONS)
 @settings(max_examples=25)
 @given(t0=st.floats(0.0, 3.5), length=st.floats(1e-4, 0.5))
 def test_enclosure_bounds_every_function(name, t0, length):
-    fn, t1 = FUNCTIONS[name], t0 + length
-    line = enclosed(fn, t0, t1)
-    np.testing.assert_allclose(line.a, fn(t0), rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(line.b, fn(t1), rtol=1e-12, atol=1e-12)
-    assert np.all(farthest(fn, t0, t1) <= np.asarray(line.dev) + 1e-12)
+    line, start, end, found = compiled(FUNCTIONS[name])(t0, t0 + length)
+    np.testing.assert_allclose(line.a, start, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(line.b, end, rtol=1e-12, atol=1e-12)
+    assert np.all(np.asarray(found) <= np.asarray(line.dev) + 1e-12)
 
 
 @pytest.mark.parametrize("name", mostly_thorough(RATES, list(RATES)[::2]))
@@ -91,8 +98,8 @@ def test_enclosure_of_adversarial_functions_holds_or_is_refused(name):
             enclosed(rate, 0.0, 1.0)
         return
     for t0, t1 in spans:
-        line = enclosed(rate, t0, t1)
-        assert np.all(farthest(rate, t0, t1) <= np.asarray(line.dev) + 1e-9), (t0, t1)
+        line, _, _, found = compiled(rate)(t0, t1)
+        assert np.all(np.asarray(found) <= np.asarray(line.dev) + 1e-9), (t0, t1)
 
 
 def test_enclosure_keeps_single_precision():

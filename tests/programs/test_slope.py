@@ -153,7 +153,9 @@ def test_slope_over_pieces_of_a_region_is_sharper():
 
 
 @pytest.mark.parametrize("kind", ["constant", "linear", "cubic"])
-@pytest.mark.parametrize("shape", [(), (2,)])
+@pytest.mark.parametrize(
+    "shape", [pytest.param((), marks=pytest.mark.thorough), (2,)], ids=["one", "two"]
+)
 def test_slope_encloses_tables_over_any_interval_of_time(kind, shape):
     rng = np.random.default_rng(4)
     times = np.sort(rng.uniform(0.0, 3.0, 12))

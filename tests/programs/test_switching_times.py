@@ -140,7 +140,7 @@ def test_derivative_in_the_time_of_an_undetected_jump_raises_an_error():
     assert np.isfinite(jax.grad(end, 1)(0.5, 1.0))
 
 
-@pytest.mark.parametrize("kind", ["interp", "steps"])
+@pytest.mark.parametrize("kind", mostly_thorough(["interp", "steps"], ["steps"]))
 @pytest.mark.parametrize(
     "method",
     [None, pytest.param(dvax.DormandPrince(), marks=pytest.mark.thorough)],
@@ -221,7 +221,7 @@ def test_derivative_in_a_time_hidden_by_code_raises_an_error(name):
         jax.grad(_end_with(HIDDEN[name]))(0.7)
 
 
-@pytest.mark.parametrize("name", READ)
+@pytest.mark.parametrize("name", mostly_thorough(READ, ["a table", "a loop that compares x"]))
 def test_derivative_that_moves_no_jump_is_computed(name):
     end, a = _end_with(READ[name]), 0.7
     difference = (end(a + 1e-5) - end(a - 1e-5)) / 2e-5

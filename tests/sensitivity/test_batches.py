@@ -63,7 +63,11 @@ ROWS = np.array([0.0, 0.25, 0.5, 1.0, 1.93, 2.0])
 
 
 @pytest.mark.parametrize(
-    "steps", [dict(dt=0.05), dict(rtol=1e-4, max_steps=2**11)], ids=["dt", "rtol"]
+    "steps",
+    [
+        pytest.param(dict(dt=0.05), id="dt"),
+        pytest.param(dict(rtol=1e-4, max_steps=2**11), id="rtol", marks=pytest.mark.thorough),
+    ],
 )
 @pytest.mark.parametrize(
     "ts", [pytest.param(None, marks=pytest.mark.thorough), ROWS], ids=["the last", "rows"]

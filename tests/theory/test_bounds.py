@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from tests.closed_forms import ALL
+from tests.once import once
 from tests.selection import mostly_thorough
 
 import dvax
@@ -21,7 +22,7 @@ RUNS = {
 
 
 OFTEN = {
-    ("C1", "fixed ETD1"), ("C1", "adaptive ETD2RK"),
+    ("C1", "adaptive ETD2RK"),
 }  # fmt: skip
 
 
@@ -308,6 +309,7 @@ def test_bound_error_with_constants_of_a_region_is_finite_inside_it():
     assert dvax.bound_error(case.problem, longer, check().constants).status == "declared"
 
 
+@once
 def excursion() -> dvax.Problem:
     """x is near 0 but for a pulse at t = ½, which lifts it to 1.5; u = x/2 up to 1."""
     return dvax.Problem(
@@ -329,7 +331,7 @@ BETWEEN = [(name, *case) for name in ("steps of ETD2RK", "windows of Picard") fo
 
 
 @pytest.mark.parametrize(
-    ("name", "region", "good"), mostly_thorough(BETWEEN, [*BETWEEN[:2], BETWEEN[3], BETWEEN[5]])
+    ("name", "region", "good"), mostly_thorough(BETWEEN, [BETWEEN[0], BETWEEN[3]])
 )
 def test_bound_error_detects_leaving_the_region_between_saved_times(name, region, good):
     method = dvax.ETD2RK() if name == "steps of ETD2RK" else dvax.Picard()

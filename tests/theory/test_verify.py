@@ -102,7 +102,7 @@ def test_verify_refutes_the_additive_drive_with_a_counterexample():
     assert "⟨F(z), z − y⟩" in row.why
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", mostly_thorough(ALL, ["C2", "C3", "C4"]))
 def test_verify_proves_the_constants_of_the_closed_forms(name):
     case = ALL[name]()
     region = {"x": (0.0, 6.0)} if name == "C4" else {}
@@ -121,7 +121,7 @@ def test_verify_proves_the_constants_of_the_closed_forms(name):
         assert steepest <= float(c.L_F) <= 1.25 * steepest
 
 
-@pytest.mark.parametrize("n", [16, 20_000])
+@pytest.mark.parametrize("n", mostly_thorough([16, 20_000], [20_000]))
 def test_verify_proves_a_field_with_a_pointwise_law_at_any_size(n):
     case = c7(n)
     check = dvax.verify(case.problem, jnp.asarray(case.x0), 0.0, 1.0)
@@ -194,7 +194,7 @@ def test_verify_rejects_wrong_arguments_by_name():
 LARGE = [(kind, n) for n in (5, 3000) for kind in ("scatter", "sparse", "transform")]
 
 
-@pytest.mark.parametrize(("kind", "n"), mostly_thorough(LARGE, {*LARGE[:3], ("scatter", 3000)}))
+@pytest.mark.parametrize(("kind", "n"), mostly_thorough(LARGE, {*LARGE[1:3], ("scatter", 3000)}))
 def test_verify_bounds_large_affine_data_by_lanczos(kind, n):
     """For operations without a rule, or too large for a matrix: Lanczos' method on affine data."""
     rng = np.random.default_rng(7)

@@ -170,11 +170,12 @@ def test_contraction_factor_bounds_the_iterations_of_the_solver(name):
     solver = METHODS[name][0]
     M, q = np.array([[1.0, 6.0], [-6.0, 1.0]]), np.array([-1.0, 2.0])
     L, gamma = float(np.linalg.norm(M, 2)), 1.0
+    F = lambda y, _: jnp.asarray(M) @ y + jnp.asarray(q)  # noqa: E731
     counts = [
         int(
             dvax.solve_vi(
-                lambda y, _: jnp.asarray(M) @ y + jnp.asarray(q), dvax.sets.Box(-9.0, 9.0),
-                jnp.full(2, 5.0), solver=solver, gamma=gamma, L_F=L, tol=tol,
+                F, dvax.sets.Box(-9.0, 9.0), jnp.full(2, 5.0), solver=solver, gamma=gamma, L_F=L,
+                tol=tol,
             ).iterations
         )
         for tol in (1e-2, 1e-12)

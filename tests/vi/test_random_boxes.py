@@ -72,7 +72,7 @@ def check(name, seed):
     assert good[easy].mean() >= SOLVERS[name][2]
 
 
-OFTEN = ("auto", "golden ratio")
+OFTEN = ("auto",)
 
 
 @pytest.mark.parametrize(

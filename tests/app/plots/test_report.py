@@ -8,6 +8,7 @@ import pytest
 import xarray as xr
 from matplotlib.image import imread
 from tests.app.plots.synthetic import CONSTANTS, Recipe, write_run
+from tests.selection import mostly_thorough
 
 from dvax.app.plots import build_report
 from dvax.app.plots.certificate import certificate_picture
@@ -76,7 +77,7 @@ def test_report_of_a_stopped_run_begins_with_its_status(tmp_path: Path, status: 
     assert ("Stopped by Ctrl-C." in text[:pictures]) == (status != "running")
 
 
-@pytest.mark.parametrize("written", [1, 2])
+@pytest.mark.parametrize("written", mostly_thorough([1, 2], [1]))
 def test_report_of_few_frames_has_pictures(tmp_path: Path, written: int) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), written=written, status="failed"))
     build_report(run_dir)
