@@ -55,7 +55,7 @@ def test_tolerance_below_rounding_fails_early_and_the_suggested_one_succeeds():
     found = run(2e-8)
     assert found.result == RESULTS.step_too_small
     assert int(found.stats["steps"]) < 10_000
-    with pytest.raises(dvax.SolveError, match="rounding of terms that cancel") as told:
+    with pytest.raises(dvax.SolveError, match="roundoff of terms that cancel") as told:
         run(2e-8, throw=True)
     # What is named as a fix helps.
     (named,) = [fix.value for fix in told.value.fixes if fix.option == "atol"]

@@ -157,7 +157,7 @@ def test_kinks_are_classified_as_crossing_touching_or_staying():
         A=ZERO, P=ONE, K=dvax.sets.Box(0.0, 9.0), f=lambda t, x, u, args: u - x,
         h=lambda t, x, u, args: smooth(t) + 0.0 * x,
     )  # fmt: skip
-    sol = dvax.solve(problem, 0.0, 0.0, 4.0, dense=True, max_steps=2**14)
+    sol = dvax.solve(problem, 0.0, 0.0, 4.0, dense=True, max_steps=2**14, method=dvax.ETD2RK())
     found = dvax.sensitivity.kinks(sol)
     assert [kink.kind for kink in found] == ["crosses", "touches", "stays"]
     assert found[0].start == pytest.approx(1.0, abs=1e-6)

@@ -15,7 +15,7 @@ from tests.selection import mostly_thorough
 import dvax
 
 RUNS = {
-    "adaptive ETD2RK": dict(rtol=1e-5, atol=1e-5),
+    "adaptive ETD2RK": dict(rtol=1e-5, atol=1e-5, method=dvax.ETD2RK()),
     "fixed ETD2RK": dict(dt=1 / 128),
     "fixed ETD1": dict(dt=1 / 128, method=dvax.ETD1()),
 }
@@ -67,7 +67,7 @@ def test_bound_error_is_larger_for_a_less_accurate_solution():
 
 def test_bound_error_propagates_an_initial_error():
     case = ALL["C1"]()
-    sol = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, rtol=1e-6)
+    sol = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, rtol=1e-6, method=dvax.ETD2RK())
     without = dvax.bound_error(case.problem, sol, case.constants)
     given = dvax.bound_error(case.problem, sol, case.constants, initial_error=0.01)
     # M e^{(ω + ML̃)T} · 0.01 with ω + ML̃ = ½.
@@ -76,7 +76,7 @@ def test_bound_error_propagates_an_initial_error():
 
 def test_bound_error_rejects_an_invalid_initial_error():
     case = ALL["C1"]()
-    sol = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, rtol=1e-3)
+    sol = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, rtol=1e-3, method=dvax.ETD2RK())
     for wrong in (-1e-3, np.nan, np.inf, [0.0, 1.0], "0"):
         with pytest.raises(dvax.InputError, match="initial_error"):
             dvax.bound_error(case.problem, sol, case.constants, initial_error=wrong)
@@ -137,7 +137,7 @@ def replaced(constants, **more):
 
 def test_bound_error_with_constants_below_the_proved_ones_is_declared():
     case = ALL["C1"]()
-    sol = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, rtol=1e-4)
+    sol = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, rtol=1e-4, method=dvax.ETD2RK())
     status = lambda c: dvax.bound_error(case.problem, sol, c).status  # noqa: E731
     assert status(case.constants) == "declared"
     assert status(replaced(case.constants)) == "proved"
@@ -232,7 +232,7 @@ def test_bound_error_covers_an_unannounced_jump_at_the_end_of_a_step(name):
 
 def test_bound_error_rejects_a_solution_of_another_problem():
     one, four = ALL["C1"](), ALL["C4"]()
-    sol = dvax.solve(one.problem, -1.0, 0.0, 2.0, args=one.args, rtol=1e-3)
+    sol = dvax.solve(one.problem, -1.0, 0.0, 2.0, args=one.args, rtol=1e-3, method=dvax.ETD2RK())
     with pytest.raises(dvax.InputError, match="another problem"):
         dvax.bound_error(four.problem, sol, four.constants)
 

@@ -117,7 +117,7 @@ def test_verify_constants_hold_for_their_args_only():
     one, other = {"k": jnp.asarray(1.0)}, {"k": jnp.asarray(3.0)}
     c = dvax.verify(system, 0.0, args=one).constants
     for args, status in ((one, "proved"), ({"k": 1.0}, "proved"), (other, "declared")):
-        sol = dvax.solve(system, 0.1, 0.0, 1.0, args)
+        sol = dvax.solve(system, 0.1, 0.0, 1.0, args, method=dvax.ETD2RK())
         assert dvax.bound_error(system, sol, c).status == status
     with pytest.raises(dvax.InputError, match="another args"):
         dvax.solve(system, 0.1, 0.0, 1.0, other, constants=c, certified_tol=1e-3)
@@ -173,7 +173,7 @@ def test_certified_tol_rejects_constants_of_a_region_that_the_run_leaves():
     c = dvax.verify(reacts, 0.0, 0.0, 1.0, u=(-1.0, 0.5)).constants
     with pytest.raises(dvax.InputError, match="larger region"):
         dvax.solve(reacts, 0.0, 0.0, 0.8, constants=c, certified_tol=1e-2)
-    sol = dvax.solve(reacts, 0.0, 0.0, 0.8, rtol=1e-4)
+    sol = dvax.solve(reacts, 0.0, 0.0, 0.8, rtol=1e-4, method=dvax.ETD2RK())
     assert np.isinf(float(dvax.bound_error(reacts, sol, c).x[-1]))
 
 

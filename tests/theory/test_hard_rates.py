@@ -79,7 +79,9 @@ def test_bound_without_enclosure_is_estimated(name):
 def test_adaptive_steps_locate_unannounced_jumps():
     rate, _ = RATES["a jump in the middle"]
     system = problem(lambda t, x, u, args: rate(t) + 0.0 * u)
-    sol = dvax.solve(system, 0.0, 0.0, 1.0, ts=TS, rtol=1e-4, atol=1e-4, dt0=0.125)
+    sol = dvax.solve(
+        system, 0.0, 0.0, 1.0, ts=TS, rtol=1e-4, atol=1e-4, dt0=0.125, method=dvax.ETD2RK()
+    )
     bound = dvax.bound_error(system, sol, CONSTANTS)
     error = np.abs(np.asarray(sol.xs) - np.array([0.0, 0.25, 0.5]))
     assert bound.status == "proved" and np.all(np.asarray(bound.x) >= error - 1e-12)
@@ -89,7 +91,18 @@ def test_adaptive_steps_locate_unannounced_jumps():
 def test_bound_of_a_run_without_saved_times_is_empty():
     rate, _ = RATES["a short pulse"]
     system = problem(lambda t, x, u, args: rate(t) + 0.0 * u)
-    sol = dvax.solve(system, 0.0, 0.0, 1.0, ts=TS, rtol=1e-9, atol=1e-9, max_steps=2, throw=False)
+    sol = dvax.solve(
+        system,
+        0.0,
+        0.0,
+        1.0,
+        ts=TS,
+        rtol=1e-9,
+        atol=1e-9,
+        max_steps=2,
+        throw=False,
+        method=dvax.ETD2RK(),
+    )
     assert sol.result == dvax.RESULTS.max_steps
     assert dvax.bound_error(system, sol, CONSTANTS).x.shape == (0,)
 
@@ -126,7 +139,7 @@ def test_enclosure_of_a_root_that_stays_zero_is_finite():
     bound = dvax.bound_error(system, fixed, CONSTANTS)
     error = abs(float(fixed.xs[-1]) - (1.0 - np.exp(-1.0)))
     assert bound.status == "proved" and error <= float(bound.x[-1]) < 0.1
-    adaptive = dvax.solve(system, 0.0, 0.0, 1.0, rtol=1e-6)
+    adaptive = dvax.solve(system, 0.0, 0.0, 1.0, rtol=1e-6, method=dvax.ETD2RK())
     assert float(adaptive.xs[-1]) == pytest.approx(1.0 - np.exp(-1.0), abs=1e-6)
 
 
@@ -147,7 +160,7 @@ def test_interval_that_shrinks_to_a_point_is_not_empty(upper, response):
     )  # fmt: skip
     truth = quad(response, 0.0, 2.0, points=[np.pi / 4, np.pi / 2], limit=200)[0]
     for steps in (dict(dt=0.01, measure=True), dict(rtol=1e-5, atol=1e-7)):
-        sol = dvax.solve(system, 0.0, 0.0, 2.0, **steps)
+        sol = dvax.solve(system, 0.0, 0.0, 2.0, method=dvax.ETD2RK(), **steps)
         bound = dvax.bound_error(system, sol, CONSTANTS)
         error = abs(float(sol.xs[-1]) - truth)
         assert bound.status == "proved" and error <= float(bound.x[-1]) < 0.1
