@@ -122,7 +122,9 @@ def _kinks_of_switch(times: np.ndarray, s: np.ndarray, switch: int, tol: float) 
             stays = end - start > _MAX_INSTANT * (times[-1] - times[0])
             kind = "stays" if stays else "crosses" if before * after < 0 else "touches"
             if kind != "stays":
-                start = end = float(times[i + int(np.argmin(np.abs(s[i : j + 1])))])
+                nearest = i + int(np.argmin(np.abs(s[i : j + 1])))
+                touches = kind == "touches"
+                start = end = _vertex_time(times, s, nearest) if touches else float(times[nearest])
             result.append(Kink(start, end, switch, kind))
             i = j + 1
             continue
@@ -133,7 +135,8 @@ def _kinks_of_switch(times: np.ndarray, s: np.ndarray, switch: int, tol: float) 
             # The minimum of the parabola through three values may be smaller than all of them.
             minimum = abs(s[i]) - _distance_to_vertex(s[i - 1 : i + 2])
             if minimum <= tol:
-                result.append(Kink(float(times[i]), float(times[i]), switch, "touches"))
+                vertex = _vertex_time(times, s, i)
+                result.append(Kink(vertex, vertex, switch, "touches"))
         i += 1
     return result
 
@@ -143,3 +146,17 @@ def _distance_to_vertex(s: np.ndarray) -> float:
     a, b, c = np.abs(s)
     curvature = a - 2 * b + c
     return 0.0 if curvature <= 0 else (a - c) ** 2 / (8 * curvature)
+
+
+def _vertex_time(times: np.ndarray, s: np.ndarray, i: int) -> float:
+    """Return the time of the vertex of the parabola through three neighbouring values, or that of the
+    middle one where the parabola is a line or its vertex lies outside."""
+    if not 0 < i < len(s) - 1:
+        return float(times[i])
+    before, middle, after = times[i - 1 : i + 2]
+    first = (s[i] - s[i - 1]) / (middle - before)
+    second = ((s[i + 1] - s[i]) / (after - middle) - first) / (after - before)
+    if second == 0.0:
+        return float(middle)
+    vertex = 0.5 * (before + middle) - 0.5 * first / second
+    return float(vertex if before <= vertex <= after else middle)
