@@ -18,6 +18,9 @@ rounding by 1/γ."""
 _LARGEST_ROUNDOFF = 1e-4
 """Share of f̃ above which no defect counts as roundoff, whatever t is."""
 
+_INSIDE = 0.5
+"""Largest error inside a step whose defect has mean zero, in h times the mean modulus."""
+
 
 class Attempt(NamedTuple):
     """An attempted step, as the parts of the controller use it.
@@ -71,6 +74,8 @@ class ErrorTest(eqx.Module):
         error = modulus
         if step.signed is not None:
             error = lax.stop_gradient(self.horizon * self._ratio(step.signed, x0, step.x1))
+            # Inside the step the defect has not cancelled yet.
+            error = jnp.maximum(error, _INSIDE * modulus * h / self.horizon)
         # A law that is not solved inside the step may be that of a stage far away: the step was too
         # large.
         error, modulus = (jnp.where(step.solved, v, jnp.inf) for v in (error, modulus))
