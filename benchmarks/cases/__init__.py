@@ -12,6 +12,7 @@ CASES = (
     "siconos",
     "tools",
     "work_precision",
+    "defaults",
     "transforms",
     "certificate",
     "derivatives",

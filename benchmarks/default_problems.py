@@ -1,0 +1,193 @@
+"""Problems of many kinds for the choice of a method, each written twice: as a problem of dvax, and with
+its law solved by hand in NumPy, for references that share no code."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.integrate import solve_ivp
+
+import dvax
+from dvax import generators, sets
+
+from .races import contact, heat, moving_box, shrinking_ball
+
+PLAIN = dvax.operators.Scaling(1.0)
+
+
+class Case(NamedTuple):
+    """x(0) = x0 up to `end`; `field(t, x)` is the right-hand side with the law solved by hand, by
+    NumPy, or None where `exact` is known."""
+
+    name: str
+    problem: dvax.Problem
+    x0: np.ndarray
+    end: float
+    field: Callable[[float, np.ndarray], Any] | None = None
+    exact: np.ndarray | None = None
+
+    def reference(self) -> np.ndarray:
+        """Return x(end), from the closed form or from SciPy's Radau at 1e-12."""
+        if self.exact is not None:
+            return np.asarray(self.exact)
+        field = self.field
+        assert field is not None
+        found = solve_ivp(
+            lambda t, x: np.asarray(field(t, x)), (0.0, self.end), self.x0,
+            method="Radau", rtol=1e-12, atol=1e-14, max_step=self.end / 500,
+        )  # fmt: skip
+        assert found.success, found.message
+        return found.y[:, -1]
+
+
+def cases(full: bool) -> list[Case]:
+    """Return the problems: small ones, stiff ones, oscillations, fields; the large field if `full`."""
+    races = [contact(), moving_box(), shrinking_ball(), heat(64)]
+    found = [Case(r.name, r.problem, r.x0, r.end, exact=r.exact) for r in races]
+    found += [_oscillator(k) for k in (3.0, 1e3)]
+    found += [_diode(r) for r in (10.0, 0.1, 1e-3)]
+    found += [_spring(k) for k in (1e2, 1e4, 1e6)]
+    found += [_saturated_gain(k) for k in (1.0, 1e2, 1e4)]
+    found += [_van_der_pol(m) for m in (1.0, 50.0)]
+    found += [_turning(w) for w in (3.0, 30.0)]
+    found += [_clipped_drive(), _pendulum(), _stiff_diagonal()]
+    return found + [_strip(n) for n in ((1000, 100_000) if full else (1000,))]
+
+
+def _planar(**parts: Any) -> dvax.Problem:
+    return dvax.Problem(P=PLAIN, control_space=dvax.spaces.Euclidean(()), **parts)
+
+
+def _oscillator(k: float) -> Case:
+    """x'' = −x, with a spring of stiffness k below 0."""
+    problem = _planar(
+        A=generators.Dense(jnp.array([[0.0, 1.0], [-1.0, 0.0]])), K=sets.Box(0.0, jnp.inf),
+        f=lambda t, x, u, args: jnp.stack([0.0 * u, u]),
+        h=lambda t, x, u, args: u - (u / k + x[0]),
+    )  # fmt: skip
+    return Case(
+        f"oscillator with a spring of {k:g} on one side", problem, np.array([1.0, 0.0]), 20.0,
+        lambda t, x: [x[1], -x[0] + max(0.0, -k * x[0])],
+    )  # fmt: skip
+
+
+def _diode(r: float) -> Case:
+    """A driven LC circuit whose voltage a diode of resistance r keeps above 0."""
+    problem = _planar(
+        A=generators.Dense(jnp.array([[0.0, -1.0], [1.0, -0.1]])), K=sets.Box(0.0, jnp.inf),
+        f=lambda t, x, u, args: jnp.stack([jnp.sin(2 * t) + u, 0.0 * u]),
+        h=lambda t, x, u, args: u - (r * u + x[0]),
+    )  # fmt: skip
+    return Case(
+        f"circuit with a diode of {r:g} Ω", problem, np.array([1.0, 0.0]), 10.0,
+        lambda t, x: [-x[1] + np.sin(2 * t) + max(0.0, -x[0] / r), x[0] - 0.1 * x[1]],
+    )  # fmt: skip
+
+
+def _spring(k: float) -> Case:
+    """A spring of stiffness k holds x above 1.5 against a slow force."""
+    problem = dvax.Problem(
+        A=generators.Zero(), P=PLAIN, K=sets.Box(0.0, jnp.inf),
+        f=lambda t, x, u, args: 1.0 + jnp.sin(t) - x + u, h=lambda t, x, u, args: -k * (x - 1.5),
+    )  # fmt: skip
+    return Case(
+        f"spring of {k:g}", problem, np.array([4.0]), 8.0,
+        lambda t, x: 1.0 + np.sin(t) - x + np.maximum(0.0, k * (1.5 - x)),
+    )  # fmt: skip
+
+
+def _saturated_gain(k: float) -> Case:
+    """A feedback of gain k, saturated at ±2, makes x follow sin t."""
+    problem = dvax.Problem(
+        A=generators.Scalar(-1.0), P=PLAIN, K=sets.Box(-2.0, 2.0),
+        f=lambda t, x, u, args: u, h=lambda t, x, u, args: k * (jnp.sin(t) - x),
+    )  # fmt: skip
+    return Case(
+        f"saturated feedback of gain {k:g}", problem, np.array([2.0]), 10.0,
+        lambda t, x: -x + np.clip(k * (np.sin(t) - x), -2.0, 2.0),
+    )  # fmt: skip
+
+
+def _van_der_pol(m: float) -> Case:
+    problem = _planar(
+        A=generators.Zero(), K=sets.Box(-0.5, 0.5), h=lambda t, x, u, args: -x[0],
+        f=lambda t, x, u, args: jnp.stack([x[1], m * (1 - x[0] ** 2) * x[1] - x[0] + u]),
+    )  # fmt: skip
+    return Case(
+        f"van der Pol, {m:g}, with a bounded force", problem, np.array([2.0, 0.0]),
+        15.0 if m < 10 else 60.0,
+        lambda t, x: [x[1], m * (1 - x[0] ** 2) * x[1] - x[0] + np.clip(-x[0], -0.5, 0.5)],
+    )  # fmt: skip
+
+
+def _turning(w: float) -> Case:
+    problem = _planar(
+        A=generators.Dense(jnp.array([[-0.1, w], [-w, -0.1]])), K=sets.Box(-0.5, 0.5),
+        f=lambda t, x, u, args: jnp.stack([u, jnp.sin(t)]), h=lambda t, x, u, args: -3 * x[0],
+    )  # fmt: skip
+    return Case(
+        f"rotation at the rate {w:g}", problem, np.array([1.0, 0.0]), 5.0,
+        lambda t, x: [
+            -0.1 * x[0] + w * x[1] + np.clip(-3 * x[0], -0.5, 0.5),
+            -w * x[0] - 0.1 * x[1] + np.sin(t),
+        ],
+    )  # fmt: skip
+
+
+def _clipped_drive() -> Case:
+    problem = dvax.Problem(
+        A=generators.Scalar(-1.0), P=PLAIN, K=sets.Box(0.0, 0.5),
+        f=lambda t, x, u, args: jnp.sin(5 * t) - u,
+        h=lambda t, x, u, args: 0.5 * (x + jnp.cos(7 * t)),
+    )  # fmt: skip
+    return Case(
+        "clipped periodic drive", problem, np.array([0.0]), 20.0,
+        lambda t, x: -x + np.sin(5 * t) - np.clip(0.5 * (x + np.cos(7 * t)), 0.0, 0.5),
+    )  # fmt: skip
+
+
+def _pendulum() -> Case:
+    problem = _planar(
+        A=generators.Zero(), K=sets.Box(-0.3, 0.3), h=lambda t, x, u, args: -2.0 * x[1],
+        f=lambda t, x, u, args: jnp.stack([x[1], -jnp.sin(x[0]) - 0.1 * x[1] + u]),
+    )  # fmt: skip
+    return Case(
+        "pendulum with a bounded torque", problem, np.array([2.0, 0.0]), 15.0,
+        lambda t, x: [x[1], -np.sin(x[0]) - 0.1 * x[1] + np.clip(-2.0 * x[1], -0.3, 0.3)],
+    )  # fmt: skip
+
+
+def _stiff_diagonal() -> Case:
+    rates = np.array([-1.0, -1e2, -1e4])
+    problem = dvax.Problem(
+        A=generators.Diagonal(jnp.asarray(rates)), P=PLAIN, K=sets.Box(0.0, 0.4),
+        f=lambda t, x, u, args: jnp.sin(t) - u, h=lambda t, x, u, args: x,
+    )  # fmt: skip
+    return Case(
+        "rates of 1, 100 and 10⁴", problem, np.array([1.0, 0.5, 0.2]), 5.0,
+        lambda t, x: rates * x + np.sin(t) - np.clip(x, 0.0, 0.4),
+    )  # fmt: skip
+
+
+def _strip(n: int) -> Case:
+    """Independent points, each with x' = c − 1.5 x − clip(g − 2x, 0, ½) of its own: by hand, from the
+    closed form of each regime in turn."""
+    s = np.linspace(0.0, 1.0, n)
+    load, gap, x0 = 3.0 + s, 0.5 + 0.2 * np.sin(6 * s), -np.ones(n)
+    problem = dvax.Problem(
+        A=generators.Scalar(-1.0), P=PLAIN, K=sets.Box(0.0, 0.5),
+        f=lambda t, x, u, args: jnp.asarray(load) - 0.5 * x - u,
+        h=lambda t, x, u, args: jnp.asarray(gap) - x,
+    )  # fmt: skip
+    # u = ½ while x < g − ½, then g − x up to x = g, then 0: x rises throughout.
+    levels = (gap - 0.5, gap, np.full(n, np.inf))
+    forces = ((load - 0.5, 1.5), (load - gap, 0.5), (load, 1.5))
+    x, left = x0.copy(), np.full(n, 2.0)
+    for level, (force, rate) in zip(levels, forces, strict=True):
+        rest = force / rate
+        with np.errstate(divide="ignore", invalid="ignore"):
+            needed = np.log((rest - x) / (rest - level)) / rate
+        spent = np.where(np.isfinite(needed), np.clip(needed, 0.0, left), left)
+        x, left = rest + (x - rest) * np.exp(-rate * spent), left - spent
+    return Case(f"strip of {n} points", problem, x0, 2.0, exact=x)
