@@ -50,7 +50,7 @@ NEIGHBOURS = {
     ("sensitivity", "theory"): "what a derivative predicts is shown beside what is certified",
 }
 
-CORE = {"jax", "equinox", "diffrax", "numpy", "scipy"}
+CORE = {"jax", "equinox", "diffrax", "numpy", "optimistix", "scipy"}
 APPLICATION = {
     *("matplotlib", "numcodecs", "pint", "plotly", "pydantic", "pydantic_core", "rich"),
     *("tomli_w", "typer", "xarray", "zarr"),

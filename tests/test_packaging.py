@@ -82,7 +82,7 @@ def test_metadata_lists_the_requirements(wheel: Path):
     }
     core = [need for need in about.get_all("Requires-Dist", []) if "extra ==" not in need]
     assert {re.split("[<>]", need)[0] for need in core} == {
-        *("jax", "equinox", "diffrax", "numpy", "scipy"),
+        *("jax", "equinox", "diffrax", "numpy", "optimistix", "scipy"),
     }
     assert all(">=" in need for need in core)
     # Traced programs are read, so that a minor release of JAX can change what they look like.

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import optimistix
 from jax import lax
 
 from .. import _tree
@@ -80,6 +81,7 @@ def solve_by_implicit_steps(
     """Solve by `Implicit` from the first stop to the last."""
     clock, x0, first_step = _Clock(stops), setup.x0, setup.number("dt0")
     start, end = clock.stops[0], clock.stops[-1]
+    rtol, atol = setup.number("rtol"), setup.number("atol")
     first, last = (one_sided_time(start, end, theta, (start, end)) for theta in (0.0, 1.0))
 
     def law(s: Any, x: Tree, _: Any) -> Tree:
@@ -98,13 +100,13 @@ def solve_by_implicit_steps(
 
     solution = diffrax.diffeqsolve(
         terms,
-        method.solver,
+        _with_newton(method.solver, rtol, atol),
         start,
         end,
         first_step,
         x0,
         saveat=diffrax.SaveAt(t1=True) if ts is None else diffrax.SaveAt(ts=clock.inverse(ts)),
-        stepsize_controller=_controller(setup.number("rtol"), setup.number("atol"), clock.stops),
+        stepsize_controller=_controller(rtol, atol, clock.stops),
         adjoint=diffrax.ForwardMode()
         if options.adjoint == "forward"
         else diffrax.RecursiveCheckpointAdjoint(),
@@ -167,6 +169,19 @@ class _Clock:
     def _at(self, s: Any) -> tuple[Any, Any]:
         piece = jnp.searchsorted(self.stops[1:-1], s, side="left")
         return self._shift[piece], self._slope[piece]
+
+
+def _with_newton(solver: Any, rtol: Any, atol: Any) -> Any:
+    """Return a KenCarp solver with Newton's method in the place of Diffrax's own root finder.
+
+    The implicit part is linear there, so that the chord iteration is exact after one iterate. The rate
+    of convergence that it estimates from the next one is then 0/0 or roundoff, and Diffrax 0.7.2
+    rejects step after step if XLA compiles with optimisation.
+    """
+    if not isinstance(solver, _SPLIT) or not isinstance(solver.root_finder, diffrax.VeryChord):
+        return solver
+    newton = optimistix.Newton(rtol=1e-3 * rtol, atol=1e-3 * atol)
+    return eqx.tree_at(lambda s: s.root_finder, solver, newton)
 
 
 def _controller(rtol: Any, atol: Any, stops: jax.Array) -> diffrax.AbstractStepSizeController:
