@@ -74,9 +74,16 @@ class Facts(NamedTuple):
 
 
 def choose(
-    problem: Problem, x0: Tree, args: Any, span: Any, fixed: bool, certified: bool
+    problem: Problem,
+    x0: Tree,
+    args: Any,
+    span: Any,
+    tol: float,
+    fixed: bool,
+    certified: bool,
 ) -> Choice:
-    """Choose a method for a run over `span`, from the structure and the size of the problem."""
+    """Choose a method for a run over `span` at the tolerance `tol`, from the structure and the size of
+    the problem."""
     if fixed:
         return Choice(ETD2RK(), "the steps are given")
     if certified:
@@ -84,21 +91,30 @@ def choose(
     facts = _facts(problem, x0, args)
     if min(facts.law, facts.state) > FIELD or facts.law > LARGE_LAW:
         return _with_fallback(
-            ETD2RK(), f"with {facts.law} unknowns in the law, steps meet kinks at any time", facts
+            ETD2RK(),
+            f"with {facts.law} unknowns in the law, steps meet kinks at any time",
+            facts,
+            tol,
         )
     if facts.affine and (facts.state <= _EXACT or facts.diagonal):
         return Choice(ExpRosenbrock(), "x' is affine in t and x between kinks, where it is exact")
     fast = norm(problem.generator(args)) * span if _tree.is_concrete(span) else 0.0
     if fast > _FAST:
-        return _with_fallback(ETD4RK(), f"‖A‖ times the span is {fast:.2g}, left to e^(hA)", facts)
-    return _with_fallback(DormandPrince(), "few unknowns, and nothing is known to be stiff", facts)
+        return _with_fallback(
+            ETD4RK(), f"‖A‖ times the span is {fast:.2g}, left to e^(hA)", facts, tol
+        )
+    return _with_fallback(
+        DormandPrince(), "few unknowns, and nothing is known to be stiff", facts, tol
+    )
 
 
-def _with_fallback(method: Any, reason: str, facts: Facts) -> Choice:
+def _with_fallback(method: Any, reason: str, facts: Facts, tol: float) -> Choice:
     if not (facts.diagonal or facts.state <= _LINEARISABLE):
         return Choice(method, reason)
     # A step of ExpRosenbrock costs some steps of another method, and many where it forms matrices.
     times = 4.0 if facts.diagonal else 4.0 + (facts.state / 16) ** 3
+    # Its own steps, of order 3, become as many as the stable ones of the other method.
+    times *= max(1.0, 1e-4 / tol) ** (1 / 3)
     return Choice(method, reason, ExpRosenbrock(), round(100 * times))
 
 

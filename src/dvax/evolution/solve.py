@@ -169,7 +169,10 @@ def solve(
     }
     choice = Choice(method)
     if method is None:
-        choice = choose(problem, x0, as_arrays(args), span, fixed, constants is not None)
+        tol = max(rtol, atol) if _tree.is_concrete(rtol, atol) else 1.0
+        choice = choose(
+            problem, x0, as_arrays(args), span, float(tol), fixed, constants is not None
+        )
         method = choice.method
     measured = not isinstance(method, Implicit) and (bool(measure) or not fixed)
     options = Options(
@@ -252,7 +255,7 @@ def _by(
             setup, times, options._replace(stiff_steps=choice.least)
         )
         if isinstance(reached, bool):
-            if solution.result == RESULTS.stiff:
+            if not reached and solution.result == RESULTS.stiff:
                 text = choice.fallback_text(float(solution.stats["t"]))
                 setup = setup._replace(method=choice.fallback)
                 solution, reached = _differentiably(setup, times, options)
