@@ -46,5 +46,5 @@ def test_responses_at_saved_times_do_not_depend_on_the_guess():
     ts = np.array([0.0, 0.1, 0.5, 0.77, 1.0])
     sol = dvax.solve(problem, jnp.zeros(8), 0.0, 1.0, ts=ts, vi_solver=solver, dt=0.2)
     respond = jax.jit(jax.vmap(lambda t, x: problem.response(t, x, solver=solver)))
-    anew = respond(sol.ts, sol.xs)
-    np.testing.assert_allclose(sol.us, anew, atol=1e-9)
+    again = respond(sol.ts, sol.xs)
+    np.testing.assert_allclose(sol.us, again, atol=1e-9)

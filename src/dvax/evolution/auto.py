@@ -136,8 +136,11 @@ def norm(A: AbstractGenerator) -> float:
     return float(np.max(np.abs(A.a if isinstance(A, Scalar) else A.entries)))
 
 
-_known: dict[Any, Facts] = {}
-"""The facts of problems that were met, by their code and the shapes of their arrays."""
+_FACTS: dict[Any, Facts] = {}
+"""The facts of the latest problems, by their code and the shapes of their arrays."""
+
+_MAX_FACTS = 256
+"""Problems whose facts are kept: a key keeps the functions of a problem alive."""
 
 
 def _facts(problem: Problem, x0: Tree, args: Any) -> Facts:
@@ -145,11 +148,13 @@ def _facts(problem: Problem, x0: Tree, args: Any) -> Facts:
     parts = ((leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf for leaf in leaves)
     key = tree, tuple(parts)
     try:
-        if key in _known:
-            return _known[key]
+        if key in _FACTS:
+            return _FACTS[key]
     except TypeError:
         return _read(problem, x0, args)  # a part that cannot be hashed is refused later
-    return _known.setdefault(key, _read(problem, x0, args))
+    if len(_FACTS) >= _MAX_FACTS:
+        _FACTS.clear()
+    return _FACTS.setdefault(key, _read(problem, x0, args))
 
 
 def _read(problem: Problem, x0: Tree, args: Any) -> Facts:

@@ -198,7 +198,7 @@ def solve(
         if throw and solution.result != RESULTS.successful:
             raise failure(solution)
         return solution
-    solution, reached = _by(choice, setup, times, options)
+    solution, reached = _run_chosen(choice, setup, times, options)
     if reached is True and not dense:
         return solution
     if _tree.is_concrete(reached, solution.result, solution.ts, solution.xs):
@@ -243,7 +243,7 @@ def _only_adaptive(dt: Any, method: Any) -> None:
             )  # fmt: skip
 
 
-def _by(
+def _run_chosen(
     choice: Choice, setup: Setup, times: Any, options: Options
 ) -> tuple[Solution, bool | jax.Array]:
     """Run the method that was chosen, or the other one where stability limits its steps."""

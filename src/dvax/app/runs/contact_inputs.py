@@ -44,13 +44,13 @@ class ContactInputs:
 
     @property
     def demand_signal(self) -> Any:
-        """g as a `dvax.signals` signal, values (n,) or (); built anew in JAX's current
+        """g as a `dvax.signals` signal, values (n,) or (); built again in JAX's current
         precision."""
         return to_signal(self.demand, self.boundary)
 
     @property
     def load_signal(self) -> Any:
-        """ell as a `dvax.signals` signal, values (n,) or (); built anew in JAX's current
+        """ell as a `dvax.signals` signal, values (n,) or (); built again in JAX's current
         precision."""
         return to_signal(self.load, self.boundary)
 

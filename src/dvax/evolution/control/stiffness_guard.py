@@ -9,8 +9,7 @@ _LIMIT = 0.3
 to 3.3 on the negative axis, and the error test keeps them a few times below that."""
 
 _VOTES, _CLEAR = 15, 6
-"""Accepted steps above the limit, net of those below it, that end the run; and consecutive steps below
-it that reset the count."""
+"""Accepted steps above the limit that end the run; consecutive steps below it that reset the count."""
 
 
 class StiffnessGuard(NamedTuple):

@@ -44,7 +44,7 @@ def response_spectrum(
     step sizes. `workers` threads (by default the number of processors) run chunks in parallel. Frames
     with η/k below 1/200 of the step of the record are too stiff for this explicit method. `Frame.solve`
     solves them one after the other, at a cost that does not depend on η/k. `rtol` is that of
-    `dvax.solve`; the relative errors of the peaks are about thirty times smaller.
+    `dvax.solve`; the relative errors of the peaks are smaller.
 
     **Raises:** `dvax.InputError` if an argument is invalid for `Frame`; `dvax.SolveError` if a run
     failed, with the parameters of the frame.
