@@ -150,8 +150,8 @@ def sampled(
 
 
 def _kinked(flow: Flow, evaluations: list[Evaluation]) -> Any:
-    """Whether the regime changes from one of them to the next, as far as f and h say; always where K
-    does not say."""
+    """Return whether the regime changes between two of the evaluations, as far as the switches of K and
+    the branches of f and h show; true if K has no switches."""
     problem, args = flow.problem, flow.args
     if flow.switches(evaluations[0].t, evaluations[0].x, evaluations[0].rate.z) is None:
         return jnp.asarray(True)
