@@ -140,6 +140,13 @@ def is_concrete(*trees: Tree) -> bool:
     return True
 
 
+def primal(a: Tree) -> Tree:
+    """Return the tree without its tangents, which is concrete where only derivatives are traced
+    (`jax.grad` outside `jax.jit`)."""
+    traced = lambda leaf: isinstance(leaf, jax.core.Tracer)  # noqa: E731
+    return jtu.tree_map(lambda leaf: jax.lax.stop_gradient(leaf) if traced(leaf) else leaf, a)
+
+
 def is_number(value: Any) -> bool:
     """Return whether the value is one real number, traced or not, and no bool."""
     if isinstance(value, int | float):

@@ -11,6 +11,7 @@ from tests.once import once
 from tests.selection import mostly_thorough
 
 import dvax
+from dvax import generators
 from dvax.evolution import RESULTS
 
 # x' = −x + ½u + sin(wt)/10 + s/(t − 0.7) + n(t), u = proj_{[−1,1]}((x + a)/(1 − g)), n NaN after b.
@@ -129,3 +130,74 @@ def test_second_derivatives_and_linearisations_of_failed_lanes_are_nan(mode):
         "twice back": jax.jacfwd(jax.jacrev(end, (0, 1)), (0, 1)),
     }[mode](0.3, 0.4)
     assert np.isnan(jax.tree_util.tree_leaves(twice)).all()
+
+
+DERIVATIVES = {
+    "grad": ("reverse", jax.grad),
+    "vjp": ("reverse", lambda g: lambda v: jax.vjp(g, v)[1](1.0)[0]),
+    "hessian": ("reverse", jax.hessian),
+    "jacfwd": ("forward", jax.jacfwd),
+    "jvp": ("forward", lambda g: lambda v: jax.jvp(g, (v,), (1.0,))[1]),
+    "linearize": ("forward", lambda g: lambda v: jax.linearize(g, v)[1](1.0)),
+}
+
+
+@pytest.mark.parametrize("kind", mostly_thorough([*KINDS], ["not a number"]))
+@pytest.mark.parametrize("method", mostly_thorough([None, "ETD2RK", "ExpRosenbrock"], [None]))
+@pytest.mark.parametrize("name", mostly_thorough([*DERIVATIVES], ["grad", "jacfwd"]))
+@pytest.mark.parametrize("dt", mostly_thorough([None, 0.05], [None]))
+def test_a_failed_run_raises_inside_a_derivative_and_is_nan_inside_jit(kind, method, name, dt):
+    if dt is not None and kind not in ("law without solution", "not a number"):
+        pytest.skip("fixed steps meet neither")
+    adjoint, derive = DERIVATIVES[name]
+    p = WELL | KINDS[kind]
+
+    def end(a, closed_over=False):
+        """The last state, with the parameter in args, or in what f and h close over."""
+        q = p | {"a": a}
+        given, data = problem(), q
+        if closed_over:
+            f, h = given.f, given.h
+            given = dvax.Problem(
+                A=given.A, P=given.P, K=given.K, f=lambda t, x, u, args: f(t, x, u, q),
+                h=lambda t, x, u, args: h(t, x, u, q),
+            )  # fmt: skip
+            data = None
+        return dvax.solve(
+            given, 0.4, 0.0, 2.0, data, dt=dt, rtol=1e-4, atol=1e-6, adjoint=adjoint,
+            max_steps=200, method=None if method is None else METHODS[method],
+        ).xs[-1]  # fmt: skip
+
+    with pytest.raises(dvax.SolveError) as plain:
+        end(0.3)
+    for closed_over in (False, True):
+        with pytest.raises(dvax.SolveError) as caught:
+            derive(partial(end, closed_over=closed_over))(0.3)
+        # The fields of the message are numbers, found as without a derivative.
+        assert caught.value.solution.result == plain.value.solution.result
+        assert caught.value.cause.split(" ")[:3] == plain.value.cause.split(" ")[:3]
+        assert np.isnan(jax.jit(partial(end, closed_over=closed_over))(0.3))
+        assert np.isnan(jax.jit(derive(partial(end, closed_over=closed_over)))(0.3))
+        assert np.isnan(
+            jax.vmap(derive(partial(end, closed_over=closed_over)))(jnp.full(2, 0.3))
+        ).all()
+
+
+def test_stability_changes_the_method_inside_a_derivative():
+    # Van der Pol's oscillator on its slow branch, where x' = −x/(μ(1 − x²)).
+    problem = dvax.Problem(
+        A=generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-1.0, 1.0),
+        f=lambda t, x, u, mu: jnp.stack([x[1], mu * (1 - x[0] ** 2) * x[1] - x[0] + u[0]]),
+        h=lambda t, x, u, mu: x[:1], control_space=dvax.spaces.Euclidean((1,)),
+    )  # fmt: skip
+    methods = []
+
+    def end(mu):
+        sol = dvax.solve(problem, jnp.array([2.0, 0.0]), 0.0, 20.0, mu)
+        methods.append(sol.stats["method"])
+        return sol.xs[-1, 0]
+
+    derivative = jax.grad(end)(1000.0)
+    assert methods[0].startswith("ExpRosenbrock")
+    difference = (end(1001.0) - end(999.0)) / 2
+    assert float(derivative) == pytest.approx(float(difference), rel=1e-4)

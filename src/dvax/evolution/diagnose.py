@@ -27,6 +27,7 @@ import numpy as np
 from .. import _tree
 from .._tree import Tree
 from ..errors import Fix, InputError, SolveError
+from .auto import FIELD
 from .implicit import Implicit
 from .jumps import find_discontinuity, find_jump
 from .method import AbstractMethod
@@ -308,15 +309,26 @@ def _max_steps(stop: Stop) -> Diagnosis:
         if is_piece
         else f", with t1 = {t1:.12g} still {t1 - stop.t:.3g} away and a last "
     )
+    method, rtol = stop.setup.method, float(stop.setup.setting["rtol"])
     text += f"step of {stop.step:.3g}."
+    adaptive = isinstance(method, AbstractMethod) and not math.isfinite(stop.setup.setting["dt"])
+    if adaptive:
+        text += (
+            f" {type(method).__name__}, of order {method.order}, is limited by the tolerance "
+            f"(rtol = {rtol:.3g}, atol = {float(stop.setup.setting['atol']):.3g}): one 100 times as "
+            f"large needs about {100 ** (1 / method.order):.2g} times fewer steps."
+        )
     # After a few steps the extrapolation is unreliable, so use a larger factor.
     enough = 2.0 * stop.attempts + (1.5 if stop.attempts >= _MIN_ATTEMPTS else 10.0) * left
     if isinstance(stop.setup.method, PiecewiseLinear):
         # Its events may all lie at the start, for example when a circuit is switched on.
         enough = min(enough, 100.0 * stop.attempts)
     if enough < 2**31:
-        return Diagnosis(text, (Fix("max_steps", f"{math.ceil(enough)}", "at this pace"),))
-    rtol = float(stop.setup.setting["rtol"])
+        fixes = [Fix("max_steps", f"{math.ceil(enough)}", "at this pace")]
+        size = sum(leaf.size for leaf in jtu.tree_leaves(stop.x))
+        if adaptive and method.order < 4 and size <= FIELD:
+            fixes += [Fix("method", "DormandPrince", "of order 5, which may take fewer steps")]
+        return Diagnosis(text, tuple(fixes))
     more = (Fix("method", "ExpRosenbrock", "whose steps may be longer"),)
     return Diagnosis(text, (*more, Fix("rtol", f"{min(1e-2, 100 * rtol):.1g}", "for longer steps")))
 

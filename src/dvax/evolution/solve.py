@@ -79,7 +79,7 @@ def solve(
       error of x. Methods of order above 3 keep the signed integral so small, over smooth steps, and the
       others that of the norm, with which twice the tolerance is a bound;
     - `method`: None chooses one from the structure and the size of the problem, and another one where
-      stability limits its steps (not under `jax.jit` and `jax.grad`); `stats["method"]` names it, with
+      stability limits its steps (not under `jax.jit` and `jax.vmap`); `stats["method"]` names it, with
       the reason. With `dt` or `constants` it is `dvax.ETD2RK()`. `vi_solver`: `dvax.vi.Auto()` by
       default;
     - `constants`: `dvax.Constants` (or any object with `gamma`, `L_F`, `norm_P_inv`): lets the law be
@@ -101,8 +101,9 @@ def solve(
     - `max_steps`: the most steps, 2²⁰ by default for adaptive ones; with fixed steps, counted;
     - `adjoint`: "reverse" serves `jax.grad` and `jax.vjp`, "forward" serves `jax.jvp` and
       `jax.jacfwd`: one loop cannot serve both;
-    - `throw`: raise where the solve fails; otherwise look at `result`. Under `jax.jit` nothing can
-      raise: times that were not reached are infinite there, and their states NaN.
+    - `throw`: raise where the solve fails, inside `jax.grad` too; otherwise look at `result`. Under
+      `jax.jit` and `jax.vmap` nothing can raise: times that were not reached are infinite there, their
+      states NaN, and all derivatives NaN.
 
     **Kinks.** Where u enters or leaves the boundary of K its slope jumps, and with it that of f̃. With
     at most 64 unknowns in the law, and a K that has `switches`, adaptive steps end there, and each
@@ -199,21 +200,44 @@ def solve(
             raise failure(solution)
         return solution
     solution, reached = _run_chosen(choice, setup, times, options)
+    setup = solution.setup
     if reached is True and not dense:
         return solution
-    if _tree.is_concrete(reached, solution.result, solution.ts, solution.xs):
+    if _tree.is_concrete(solution.ts, solution.xs):
         solution = _trim(solution)
-        if solution.result != RESULTS.successful:
-            # Data that ends too early is NaN from there on: then that is what is wrong.
-            refuse_nonfinite_data(problem, args, "dvax.solve")
-            problem.knots(t0, t1, x0, as_arrays(args))
-            problem.check_data(t0, t1, x0, args)
-            if fixed:
-                # Once more, keeping the last good state, to say where it went wrong.
-                solution = _trim(compiled(setup, times, options._replace(check_finite=True))[0])
+    if reached is False:
+        traced = not _tree.is_concrete(solution.ts, solution.xs)
+        if traced:
+            # Inside of `jax.grad`, though not of `jax.jit` or `jax.vmap`, the values are known.
+            setup, times, ended = _tree.primal((setup, times, solution))
+            setup = setup._replace(problem=setup.problem.without_tangents())
+            ended = eqx.tree_at(lambda s: s.setup, ended, setup)
+        else:
+            ended = solution
+        if _tree.is_concrete(setup, times, ended.ts, ended.xs):
+            ended = _examined(setup, times, options, ended)
             if throw:
-                raise failure(solution)
+                raise failure(ended)
+            return solution if traced else ended
     return solution
+
+
+def _examined(setup: Setup, times: Any, options: Options, solution: Solution) -> Solution:
+    """Return a failed run up to where it failed, unless the input explains the failure.
+
+    **Raises:** `dvax.InputError`.
+    """
+    # Data that ends too early is NaN from there on: then that is what is wrong.
+    problem, x0, args = setup.problem, setup.x0, setup.args
+    t0, t1 = setup.setting["t0"], setup.setting["t1"]
+    refuse_nonfinite_data(problem, args, "dvax.solve")
+    problem.knots(t0, t1, x0, as_arrays(args))
+    problem.check_data(t0, t1, x0, args)
+    if options.fixed:
+        # Once more, keeping the last good state, to say where it went wrong.
+        solution, _ = compiled(setup, times, options._replace(check_finite=True))
+        solution = _tree.primal(solution)
+    return _trim(solution)
 
 
 def _state(problem: Any, x0: Any) -> Tree:
@@ -248,7 +272,7 @@ def _run_chosen(
 ) -> tuple[Solution, bool | jax.Array]:
     """Run the method that was chosen, or the other one where stability limits its steps."""
     given = setup.problem, setup.x0, setup.args, setup.setting, times
-    guarded = choice.fallback is not None and _tree.is_concrete(*given)
+    guarded = choice.fallback is not None and _tree.is_concrete(_tree.primal(given))
     text = choice.text()
     if guarded:
         solution, reached = _differentiably(
@@ -256,7 +280,7 @@ def _run_chosen(
         )
         if isinstance(reached, bool):
             if not reached and solution.result == RESULTS.stiff:
-                text = choice.fallback_text(float(solution.stats["t"]))
+                text = choice.fallback_text(float(_tree.primal(solution.stats["t"])))
                 setup = setup._replace(method=choice.fallback)
                 solution, reached = _differentiably(setup, times, options)
             solution.stats["method"] = text

@@ -152,11 +152,12 @@ class Adaptive(AbstractController):
         if state.stiffness is not None and step.stiffness is not None:
             assert self.stiff_steps is not None
             counts = accepted & ~at_event & jnp.isfinite(step.stiffness)
-            stiffness = state.stiffness.after(lax.stop_gradient(step.stiffness), counts)
+            stiffness = lax.stop_gradient(step.stiffness)
+            votes = state.stiffness.after(stiffness, counts)
             remaining = (self.stops[-1] - t1) / attempt.size
-            stiff = stiffness.fires(remaining, self.stiff_steps)
+            stiff = votes.fires(stiffness, counts, remaining, self.stiff_steps)
             result = RESULTS.where(stiff, RESULTS.stiff, result)
-            new = new._replace(stiffness=stiffness)
+            new = new._replace(stiffness=votes)
         return StepDecision(accepted, new, jumped, result)
 
     def step_start(self, index, t):

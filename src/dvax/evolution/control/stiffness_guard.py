@@ -34,7 +34,9 @@ class StiffnessGuard(NamedTuple):
         votes = jnp.where(above, self.votes + 1, self.votes)
         return StiffnessGuard(jnp.where(clear >= _CLEAR, 0, votes), clear)
 
-    def fires(self, remaining: Any, least: int) -> Any:
-        """Return whether the run should end here: at the present size `remaining` more steps are
-        needed, and another method is worth its own program from the `least` on."""
-        return (self.votes >= _VOTES) & (remaining >= least)
+    def fires(self, stiffness: Any, counts: Any, remaining: Any, least: int) -> Any:
+        """Return whether the run should end after this attempt: of its size `remaining` more steps are
+        needed, and another method is worth its own program from the `least` on. A short step before
+        a kink says nothing of the sizes to come, and does not end the run."""
+        is_limited = counts & (stiffness > _LIMIT)
+        return is_limited & (self.votes >= _VOTES) & (remaining >= least)
