@@ -2,8 +2,7 @@
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import wraps
+from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -138,17 +137,6 @@ class Problem(eqx.Module):
     def set_at(self, t: Any, args: Any = None) -> AbstractSet:
         """Return K(t) for these args."""
         return self.K if isinstance(self.K, AbstractSet) else self.K(t, args)
-
-    def without_tangents(self) -> "Problem":
-        """Return the problem of the values alone, those that its functions close over included."""
-
-        def primal(part: Any) -> Any:
-            if isinstance(part, AbstractGenerator | AbstractOperator | AbstractSet):
-                return _tree.primal(part)
-            return wraps(part)(lambda *inputs: _tree.primal(part(*inputs)))
-
-        parts = {name: primal(getattr(self, name)) for name in ("A", "P", "K", "f", "h")}
-        return replace(self, **parts)
 
     def spaces(self, x: Tree) -> tuple[AbstractSpace, AbstractSpace]:
         """Return the state space and the control space, for states shaped like x."""

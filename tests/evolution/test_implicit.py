@@ -121,3 +121,29 @@ def test_implicit_failures_have_messages():
     partial = failure.value.solution
     np.testing.assert_allclose(np.asarray(partial.ts), [0.25])
     np.testing.assert_allclose(np.asarray(partial.xs), [0.25], atol=1e-9)
+
+
+@pytest.mark.parametrize("solver", [diffrax.Kvaerno5(), diffrax.KenCarp4()])
+def test_knots_outside_of_the_run_change_nothing(solver):
+    # x' = −x + u + 0.1 (t > b), u = x + 0.3 up to the kink at x = 0.7; no b lies inside of the run.
+    problem = dvax.Problem(
+        A=generators.Scalar(-1.0), P=PLAIN, K=dvax.sets.Box(-1.0, 1.0),
+        f=lambda t, x, u, b: u + jnp.where(t > b, 0.1, 0.0), h=lambda t, x, u, b: x + 0.3,
+    )  # fmt: skip
+
+    def end(t1, b):
+        sol = dvax.solve(problem, 0.4, 0.0, t1, b, rtol=1e-6, method=dvax.Implicit(solver))
+        assert int(sol.stats["rejected"]) <= 10
+        return sol.xs[-1]
+
+    # Up to the kink x' = 0.3 (0.4 before 0 is never seen), then x' = 1 − x.
+    x1 = 1.0 - 0.3 * np.exp(-(2.0 - 1.0))
+    for b in (2.0001, 9.0, 1e9):
+        value, slope = jax.value_and_grad(end)(2.0, b)
+        np.testing.assert_allclose(value, x1, atol=1e-5)
+        # The kink is not located, and the derivative of the step over it is that of one side.
+        np.testing.assert_allclose(slope, 1.0 - x1, atol=5e-3)
+    for b in (-9.0, -1e-3):
+        sol = dvax.solve(problem, 0.4, 0.0, 2.0, b, rtol=1e-6, method=dvax.Implicit(solver))
+        kink = 0.3 / 0.4
+        np.testing.assert_allclose(sol.xs[-1], 1.1 - 0.4 * np.exp(-(2.0 - kink)), atol=1e-5)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
 
 from .. import _tree
@@ -36,7 +37,8 @@ _SETTLES = 1e-3
 
 class Sample(NamedTuple):
     """The defect of one step: its modulus entry by entry for the step control (`error`), and its signed
-    mean where it cancels (`signed`, else None); integrated for certificates; the rates along x_h that
+    mean where it cancels (`signed`, else None), and its `mean` with its sign; whether the regime
+    changes inside (`kinked`); integrated for certificates; the rates along x_h that
     it was made from, the last one at the end; and where x_h and u_h have been."""
 
     thetas: tuple[float, ...]
@@ -46,6 +48,8 @@ class Sample(NamedTuple):
     law_defect: jax.Array
     bounds: Bounds
     signed: Tree | None = None
+    mean: Tree | None = None
+    kinked: Any = True
 
 
 def enclosed(
@@ -132,8 +136,9 @@ def sampled(
         bump = jtu.tree_map(lambda b, bend: b + share * jnp.abs(bend), bump, c[-1])
     error = jtu.tree_map(lambda *parts: sum(map(jnp.abs, parts)), *ends, bump)
     signed = None
+    weights = method.quadrature or _interpolatory((0.0, *thetas, 1.0))
+    mean = combined(*zip(weights, (start, *middle, end), strict=True))
     if method.quadrature is not None:
-        mean = combined(*zip(method.quadrature, (start, *middle, end), strict=True))
         # A defect of mean zero still acts on the way through the step.
         share = jnp.minimum(_MOMENT * jnp.where(jnp.isfinite(slope), slope, jnp.inf), 1.0)
         signed = jtu.tree_map(
@@ -146,7 +151,13 @@ def sampled(
     law_defect = h * jnp.max(jnp.stack([one.rate.residual for one in along]))
     places = [(one.x, flow.operator.inverse(one.rate.y)) for one in lax.stop_gradient(along)]
     bounds = reduce(Bounds.hull, [Bounds((x, x), (u, u)) for x, u in places])
-    return Sample(thetas, [*inner, last], error, defect, law_defect, bounds, signed)
+    return Sample(thetas, [*inner, last], error, defect, law_defect, bounds, signed, mean, kinked)
+
+
+def _interpolatory(nodes: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the weights of the quadrature on [0, 1] that is exact for polynomials through the nodes."""
+    powers = np.vander(nodes, increasing=True).T
+    return tuple(np.linalg.solve(powers, 1.0 / np.arange(1.0, len(nodes) + 1.0)).tolist())
 
 
 def _kinked(flow: Flow, evaluations: list[Evaluation]) -> Any:

@@ -22,6 +22,9 @@ from .time_derivatives import zero_with_tangent
 
 _SPLIT = (diffrax.KenCarp3, diffrax.KenCarp4, diffrax.KenCarp5)
 
+_SMALL_CORRECTION = 1e-4
+"""Size of a correction of the chord iteration, in tolerances, that ends it at once."""
+
 
 class Implicit(eqx.Module):
     """An implicit Runge–Kutta method of Diffrax, by default Kværnø's method of order 5.
@@ -29,7 +32,7 @@ class Implicit(eqx.Module):
     Use it where exponential methods are expensive: f̃ is stiff and couples more unknowns than
     `ExpRosenbrock` accepts, or the exponential of A costs too much.
 
-    The method only applies A. Each step solves equations of the size of the state by Newton's method,
+    The method only applies A. Each step solves equations of the size of the state by the chord iteration,
     by default with a dense matrix, which is feasible up to some thousand unknowns. `rtol` and `atol`
     refer to the error of one step, as in Diffrax. There are no certificates (`Solution.defect` is
     None). Events are not located, so derivatives of a run with events have errors of the order of the
@@ -100,7 +103,7 @@ def solve_by_implicit_steps(
 
     solution = diffrax.diffeqsolve(
         terms,
-        _with_newton(method.solver, rtol, atol),
+        _with_chord(method.solver, rtol, atol),
         start,
         end,
         first_step,
@@ -153,7 +156,9 @@ class _Clock:
     def __init__(self, stops: jax.Array) -> None:
         self.stops = lax.stop_gradient(stops)
         shift = zero_with_tangent(stops)
-        self._slope = jnp.diff(shift) / jnp.diff(self.stops)
+        # Knots outside of the run stand at its ends.
+        lengths = jnp.diff(self.stops)
+        self._slope = jnp.diff(shift) / jnp.where(lengths > 0, lengths, 1.0)
         self._shift = shift[:-1] - self._slope * self.stops[:-1]
 
     def time(self, s: Any) -> tuple[Any, Any]:
@@ -171,17 +176,31 @@ class _Clock:
         return self._shift[piece], self._slope[piece]
 
 
-def _with_newton(solver: Any, rtol: Any, atol: Any) -> Any:
-    """Return a KenCarp solver with Newton's method in the place of Diffrax's own root finder.
+class _Chord(diffrax.VeryChord):
+    """Diffrax's chord iteration, which also ends where a correction is far below the tolerance.
 
-    The implicit part is linear there, so that the chord iteration is exact after one iterate. The rate
-    of convergence that it estimates from the next one is then 0/0 or roundoff, and Diffrax 0.7.2
-    rejects step after step if XLA compiles with optimisation.
+    Where the equations are linear, or affine up to the kinks, one iterate is exact. The rate of
+    convergence that Diffrax 0.7.2 estimates from the next correction is then 0/0 or roundoff, and it
+    rejects step after step.
     """
-    if not isinstance(solver, _SPLIT) or not isinstance(solver.root_finder, diffrax.VeryChord):
+
+    # Diffrax declares floats; those of a run may be traced.
+    rtol: Any
+    atol: Any
+
+    def terminate(self, fn, y, args, options, state, tags):
+        done, result = super().terminate(fn, y, args, options, state, tags)
+        solved = state.result == optimistix.RESULTS.successful
+        small = (state.step >= 2) & (state.diffsize < _SMALL_CORRECTION) & solved
+        return done | small, optimistix.RESULTS.where(small, optimistix.RESULTS.successful, result)
+
+
+def _with_chord(solver: Any, rtol: Any, atol: Any) -> Any:
+    """Return the solver with `_Chord` in the place of Diffrax's own root finder."""
+    if not isinstance(solver.root_finder, diffrax.VeryChord):
         return solver
-    newton = optimistix.Newton(rtol=1e-3 * rtol, atol=1e-3 * atol)
-    return eqx.tree_at(lambda s: s.root_finder, solver, newton)
+    chord = _Chord(rtol, atol, norm=optimistix.rms_norm)
+    return eqx.tree_at(lambda s: s.root_finder, solver, chord)
 
 
 def _controller(rtol: Any, atol: Any, stops: jax.Array) -> diffrax.AbstractStepSizeController:
@@ -193,4 +212,8 @@ def _controller(rtol: Any, atol: Any, stops: jax.Array) -> diffrax.AbstractStepS
     )
     if stops.shape[0] == 2:
         return adaptive
-    return diffrax.ClipStepSizeController(adaptive, jump_ts=stops[1:-1])
+    # Knots outside of the run stand at its ends, where Diffrax would add a step of length zero.
+    first, knots, last = stops[0], stops[1:-1], stops[-1]
+    knots = jnp.where(knots <= first, 2 * first - last, knots)
+    knots = jnp.where(knots >= last, 2 * last - first, knots)
+    return diffrax.ClipStepSizeController(adaptive, jump_ts=knots)

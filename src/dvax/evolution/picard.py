@@ -360,7 +360,7 @@ def solve_by_windows(
     growth = flow.generator.growth(flow.state_space(x0)) if flow.enclosed else None
     ends = stops[0], stops[-1]
     stepper = Stepper(
-        ETD2RK(), flow, True, False, None, options.track_bounds, True, ends, None, growth
+        ETD2RK(), flow, True, False, None, options.track_bounds, True, False, ends, None, growth
     )
     rtol, atol, horizon = map(setup.number, ("rtol", "atol", "horizon"))
     sizes = jax.vmap(

@@ -24,6 +24,7 @@ from .arguments import (
 )
 from .auto import Choice, choose
 from .certified import certified, of_region
+from .closures import closure_convert
 from .compiled import compiled
 from .control import MAX_GROWTH
 from .diagnose import failure
@@ -209,8 +210,10 @@ def solve(
         traced = not _tree.is_concrete(solution.ts, solution.xs)
         if traced:
             # Inside of `jax.grad`, though not of `jax.jit` or `jax.vmap`, the values are known.
+            args = as_arrays(setup.args)
+            problem = closure_convert(problem, setup.number("t0"), setup.x0, args)
+            setup = setup._replace(problem=problem, args=args)
             setup, times, ended = _tree.primal((setup, times, solution))
-            setup = setup._replace(problem=setup.problem.without_tangents())
             ended = eqx.tree_at(lambda s: s.setup, ended, setup)
         else:
             ended = solution

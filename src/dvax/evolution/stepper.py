@@ -34,13 +34,15 @@ _SLOW = 0.1
 
 class SolverState(NamedTuple):
     """What the next step reuses of an accepted one: the rate at its end, a guess for the law, the
-    coefficients of its end in the eigenfunctions of A, and the largest `variation` of the data between
-    samples so far (`ExcursionGuard`), each None where it is not needed."""
+    coefficients of its end in the eigenfunctions of A, the largest `variation` of the data between
+    samples so far (`ExcursionGuard`), and an estimate of the `error` of x, each None where it is not
+    needed."""
 
     rate: Rate | None
     guess: Tree | None
     coefficients: Tree
     variation: Tree
+    error: Tree | None = None
 
 
 class Propagators(NamedTuple):
@@ -67,7 +69,8 @@ class Step(NamedTuple):
     - `start_solved`, `solved`: the law was solved at the start, and everywhere;
     - `finite`: there is no non-finite value that a smaller step would leave;
     - `evaluations`: of F;
-    - `stiffness`: h times the slope of f̃ between two stages, None where the method has no such pair.
+    - `stiffness`: h times the slope of f̃ between two stages, None where the method has no such pair;
+    - `carried`: the estimated error of x₀, and what the step leaves of it, None where it is not estimated.
     """
 
     x1: Tree
@@ -84,6 +87,7 @@ class Step(NamedTuple):
     evaluations: Any
     stiffness: Any = None
     signed: Tree | None = None
+    carried: tuple[Tree, Tree] | None = None
 
 
 def interpolate(flow: Flow, length: Any, theta: Any, x0: Tree, c: tuple[Tree, ...]) -> Tree:
@@ -131,6 +135,7 @@ class Stepper(eqx.Module):
     - `guard`: bounds the excursions between the samples of a step, None where there can be none;
     - `track_bounds`: keep where x_h and u_h have been, which constants of a region need;
     - `check_finite`: look for bad values after every step, at the price of a second pass over memory;
+    - `estimate`: carry an estimate of the error of x along;
     - `ends`: first and last time of the run;
     - `uniform`: the propagators, where all steps have one length that is known beforehand;
     - `growth`: of the semigroup, where the defect is enclosed.
@@ -143,6 +148,7 @@ class Stepper(eqx.Module):
     guard: ExcursionGuard | None
     track_bounds: bool = eqx.field(static=True)
     check_finite: bool = eqx.field(static=True)
+    estimate: bool = eqx.field(static=True)
     ends: tuple[Any, Any]
     uniform: Propagators | None
     growth: Growth | None
@@ -157,7 +163,8 @@ class Stepper(eqx.Module):
         blank = jax.eval_shape(lambda: self._kept(self.flow.rate(self.ends[0], x0, guess)))
         rate = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), blank)
         none = None if self.guard is None else self.guard.start(self.flow, self.ends[0], x0)
-        return SolverState(rate, guess, known, none)
+        error = _tree.zeros_like(x0) if self.estimate else None
+        return SolverState(rate, guess, known, none, error)
 
     def bounds(self, x0: Tree) -> Bounds | None:
         """Before the first step x_h has been at x₀ alone, and u_h nowhere."""
@@ -191,7 +198,7 @@ class Stepper(eqx.Module):
     ) -> tuple[Tree, tuple[Tree, ...], Tree | None]:
         """(x₁, the stage polynomial, y where the step begins), and nothing else."""
         self, drift, propagators = self._local(t0, t1, x0, propagators, guess)
-        plan = self._stages(t0, t1, self.flow.expand(x0), propagators, drift, False)
+        plan = self._stages(t0, t1, self.flow.expand(x0), propagators, drift, False, None)
         found, evaluations = evaluated(self.flow, plan, self.ends[0], x0, guess, None, True)
         c, x1 = values(found)
         return x1, c, evaluations[0].rate.y
@@ -208,7 +215,10 @@ class Stepper(eqx.Module):
         """Make a step from t0 to t1; `jumped`: the rate in `solver_state` is not that at t0."""
         self, drift, propagators = self._local(t0, t1, x0, propagators, solver_state.guess)
         start = self.flow.expand(x0, solver_state.coefficients)
-        plan = self._stages(t0, t1, start, propagators, drift, self.measure)
+        probe = None
+        if self.estimate and not self.method.is_rosenbrock:
+            probe = partial(self._probe, t1 - t0, x0, solver_state.error)
+        plan = self._stages(t0, t1, start, propagators, drift, self.measure, probe)
         # The last evaluation of the previous step was made where this one begins.
         begin, kept = self.ends[0], solver_state.rate
         (c, x1), evaluations = evaluated(
@@ -218,7 +228,7 @@ class Stepper(eqx.Module):
         c, x1 = values((c, x1))
         first, last = evaluations[0].rate, evaluations[-1].rate
         error, integrated_defect, event, excursion, bounds = None, (0.0, 0.0), None, None, None
-        stiffness, signed = None, None
+        stiffness, signed, carried, error_estimate = None, None, None, None
         variation = solver_state.variation
         if self.measure:
             slopes = self._slopes(t1 - t0, evaluations)
@@ -226,6 +236,25 @@ class Stepper(eqx.Module):
             sample = self._measure(t0, t1, arc, evaluations, jumped, whole)
             error, integrated_defect = sample.error, (sample.defect, sample.law_defect)
             signed = sample.signed
+            if self.estimate:
+                before, after = self._carried(
+                    t1 - t0, x0, solver_state.error, evaluations, propagators, len(sample.thetas)
+                )
+                error_estimate = _finite_or_zero(
+                    _tree.add(after, _tree.scale(t1 - t0, sample.mean))
+                )
+                # What decays in one regime may not in the next, nor does it in the computed
+                # trajectory where the method is at the limit of its stability.
+                stable = ~jnp.asarray(sample.kinked)
+                share = jnp.where(stable, 1.0, 0.0) * (
+                    1.0
+                    if slopes is None
+                    else _stable_share(slopes[1 if self.method.explicit_in_A else 0])
+                )
+                carried = (
+                    before,
+                    _tree.add(_tree.scale(share, after), _tree.scale(1.0 - share, before)),
+                )
             bounds = sample.bounds if self.track_bounds else None
             if self.locate:
                 event = partial(self._event, t0, t1, x0, c, first, sample)
@@ -252,6 +281,7 @@ class Stepper(eqx.Module):
             None if self.flow.direct else last.y,
             known,
             variation,
+            error_estimate,
         )
         solved = jnp.all(jnp.stack([one.rate.solved for one in evaluations]))
         # The first one was made by the step before, unless nothing is kept, or data jumped.
@@ -259,7 +289,7 @@ class Stepper(eqx.Module):
         own = counts[0] if kept is None else jnp.where(jumped, counts[0], 0)
         return Step(
             x1, c, error, integrated_defect, event, excursion, bounds, after, first.solved, solved,
-            finite, sum(counts[1:], own), stiffness, signed,
+            finite, sum(counts[1:], own), stiffness, signed, carried,
         )  # fmt: skip
 
     def _local(
@@ -282,9 +312,11 @@ class Stepper(eqx.Module):
         propagators: Propagators,
         drift: Tree | None,
         measured: bool,
+        probe: Callable[[Tree], Tree] | None,
     ) -> Stages:
-        """The evaluations of a step: at its start, for its stages, inside, and at its end. States are
-        expanded (`AbstractGenerator.expand`), and so are c and x₁."""
+        """The evaluations of a step: at its start, for its stages, at the state that `probe` makes of
+        c₀, inside, and at its end. States are expanded (`AbstractGenerator.expand`), and so are c and
+        x₁."""
 
         def run(evaluate: Callable[[Any, Tree], Rate]) -> tuple[tuple[Tree, ...], Tree]:
             def stage(theta: float, x: Tree) -> Tree:
@@ -300,6 +332,8 @@ class Stepper(eqx.Module):
 
             c = self.method.coefficients(stage, propagate, stage(0.0, start), drift)
             x1 = propagators.full.step(start, c)
+            if probe is not None:
+                evaluate(self._one_sided_time(t0, t1, 0.0), probe(values(c[0])))
             if measured:
                 # No inner ones where the defect is enclosed.
                 for theta, to in zip(self.method.samples, propagators.inner, strict=False):
@@ -309,6 +343,50 @@ class Stepper(eqx.Module):
             return c, x1
 
         return run
+
+    def _probe(self, h: Any, x0: Tree, error: Tree, c0: Tree) -> Tree:
+        """Return a state next to x₀ in the direction of its estimated error."""
+        return _tree.add(x0, _tree.scale(self._probe_scale(h, x0, error, c0), error))
+
+    def _probe_scale(self, h: Any, x0: Tree, error: Tree, c0: Tree) -> Any:
+        """Return the factor that makes the estimated error as large as a difference quotient needs."""
+        space = self.flow.state_space(x0)
+        size, length = space.norm(x0) + h * space.norm(c0), space.norm(error)
+        scale = jnp.sqrt(jnp.finfo(length.dtype).eps) * size
+        return lax.stop_gradient(
+            jnp.where(length > 0, scale / jnp.where(length > 0, length, 1.0), 0.0)
+        )
+
+    def _carried(
+        self,
+        h: Any,
+        x0: Tree,
+        error: Tree,
+        evaluations: list[Evaluation],
+        propagators: Propagators,
+        inner: int,
+    ) -> tuple[Tree, Tree]:
+        """Return the estimated error of x₀, and what the step leaves of it at most: e^{hA}(e + ¼hBe) with
+        B the derivative of f̃ (of Ax + f̃ where the method is explicit in A).
+
+        On the negative axis 1 + ¼z is above e^z for z ≥ −3.9 and stable for z ≥ −8, where the methods
+        are: no part of the error is taken to decay faster than it does.
+        """
+        x0, error, evaluations, propagators = lax.stop_gradient(
+            (x0, error, evaluations, propagators)
+        )
+        left = error
+        if not self.method.is_rosenbrock:
+            first, probe = evaluations[0], evaluations[-2 - inner]
+            scale = self._probe_scale(h, x0, error, self.flow.nonlinear_part(x0, first.rate.value))
+            change = _tree.sub(
+                self.flow.nonlinear_part(probe.x, probe.rate.value),
+                self.flow.nonlinear_part(x0, first.rate.value),
+            )
+            share = jnp.where(scale > 0, 0.25 * h / jnp.where(scale > 0, scale, 1.0), 0.0)
+            left = _tree.add(error, _tree.scale(share, change))
+        left = values(propagators.full.step(self.flow.expand(left), ()))
+        return error, _finite_or_zero(left)
 
     def _slopes(self, h: Any, evaluations: list[Evaluation]) -> tuple[Any, Any] | None:
         """Return h ‖Δf̃‖/‖Δx‖ and h ‖AΔx + Δf̃‖/‖Δx‖ for the difference of two stages at one time, NaN
@@ -392,6 +470,17 @@ class Stepper(eqx.Module):
         ends = begin, self._one_sided_time(t0, t1, 1.0)
         span = self.ends[1] - self.ends[0]
         return enclosed(self.flow, self.growth, ends, arc, evaluations[-1].rate, span)
+
+
+def _stable_share(slope: Any) -> Any:
+    """Return 1 where h times the slope of what the method treats explicitly is at most 1, and 0 from 2."""
+    return jnp.where(jnp.isfinite(slope), jnp.clip(2.0 - slope, 0.0, 1.0), 1.0)
+
+
+def _finite_or_zero(v: Tree) -> Tree:
+    """Return v, or zero if an entry is not finite."""
+    v = lax.stop_gradient(v)
+    return _tree.where(_tree.all_finite(v), v, _tree.zeros_like(v))
 
 
 def _ulp(t0: Any, t1: Any) -> Any:

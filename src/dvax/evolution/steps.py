@@ -87,7 +87,7 @@ def _controller(
     rtol, atol, horizon = map(setup.number, ("rtol", "atol", "horizon"))
     return Adaptive(
         stops,
-        ErrorTest(rtol, atol, horizon, sizes),
+        ErrorTest(rtol, atol, horizon, sizes, certify=bool(setup.moduli)),
         first=setup.number("dt0"),
         first_growth=setup.number("dt0_growth"),
         longest=setup.number("dt_max"),
@@ -116,6 +116,7 @@ def _stepper(
         guard,
         options.track_bounds,
         options.check_finite,
+        _estimates(setup, method, flow, options),
         (t0, t1),
         None,
         growth,
@@ -124,6 +125,12 @@ def _stepper(
         length = (t1 - t0) / step_count(t1 - t0, setup.number("dt"))
         return dataclasses.replace(stepper, uniform=stepper.propagators(length))
     return stepper
+
+
+def _estimates(setup: Setup, method: AbstractMethod, flow: Flow, options: Options) -> bool:
+    """Return whether steps may owe what decays: not for a certificate, and not by a method of order 2
+    or less, whose steps meet kinks at any time."""
+    return not options.fixed and not flow.enclosed and not setup.moduli and method.order > 2
 
 
 def _can_locate(flow: Flow, t0: jax.Array, x0: Any) -> bool:

@@ -64,6 +64,7 @@ class ErrorTest(eqx.Module):
     atol: Any
     horizon: Any
     sizes: Callable[[Tree], list[Any]]
+    certify: bool = eqx.field(static=True)
 
     def attempt(self, t0: Any, t1: Any, x0: Tree, step: Step, span: Any) -> Attempt:
         """Measure a step from (t0, x0) to t1 in a run of this span."""
@@ -72,12 +73,15 @@ class ErrorTest(eqx.Module):
         # Step sizes are choices: under differentiation they are constants.
         modulus = lax.stop_gradient(self.horizon * self._ratio(step.error, x0, step.x1))
         error = modulus
-        if step.signed is not None:
+        if step.signed is not None and not self.certify:
             error = lax.stop_gradient(self.horizon * self._ratio(step.signed, x0, step.x1))
-            # Inside the step the defect has not cancelled yet.
-            error = jnp.maximum(error, _INSIDE * modulus * h / self.horizon)
+        integrated = error * h / self.horizon
+        if step.carried is not None:
+            error = error / (1.0 + self._allowance(h, x0, step))
         # A law that is not solved inside the step may be that of a stage far away: the step was too
         # large.
+        # Inside the step the defect has not cancelled or decayed yet.
+        error = jnp.maximum(error, _INSIDE * modulus * h / self.horizon)
         error, modulus = (jnp.where(step.solved, v, jnp.inf) for v in (error, modulus))
         # Data that varies within the run has the rounding of t besides, relative to the span.
         relative = eps * (1.0 + largest / span)
@@ -90,10 +94,22 @@ class ErrorTest(eqx.Module):
             smallest=8 * eps * largest,
             error=error,
             modulus=modulus,
-            integrated=error * h / self.horizon,
+            integrated=jnp.where(step.solved, integrated, jnp.inf),
             roundoff=lax.stop_gradient(roundoff),
             usable=step.start_solved & step.finite,
         )
+
+    def _allowance(self, h: Any, x0: Tree, step: Step) -> Any:
+        """Return by how much the defect may exceed its share of the tolerance, relative to that.
+
+        Of the estimated error e a step leaves the part c < 1 where trajectories approach each other.
+        With E = |e|/tolerance, a defect that integrates to (1 − c)(1 − E) tolerances keeps E below 1.
+        """
+        assert step.carried is not None
+        before, after = (self._ratio(e, x0, step.x1) for e in step.carried)
+        decay = 1.0 - after / jnp.where(before > 0.0, before, 1.0)
+        room = jnp.clip(decay, 0.0, 1.0) * jnp.maximum(1.0 - before, 0.0)
+        return lax.stop_gradient(jnp.where(before > 0.0, room * self.horizon / h, 0.0))
 
     def excursion(self, x0: Tree, step: Step) -> Any:
         """Return the size of what may lie between the samples of the defect, in units of what may
