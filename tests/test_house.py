@@ -42,6 +42,7 @@ CONTRACT = [
     "ETD2RK",
     "ETD4RK",
     "DormandPrince",
+    "Event",
     "ExpRosenbrock",
     "Implicit",
     "Picard",

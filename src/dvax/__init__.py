@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from .evolution import ETD4RK as ETD4RK
     from .evolution import RESULTS as RESULTS
     from .evolution import DormandPrince as DormandPrince
+    from .evolution import Event as Event
     from .evolution import ExpRosenbrock as ExpRosenbrock
     from .evolution import Implicit as Implicit
     from .evolution import Picard as Picard
@@ -66,6 +67,7 @@ _HOMES = {
         "ETD2RK",
         "ETD4RK",
         "DormandPrince",
+        "Event",
         "ExpRosenbrock",
         "Implicit",
         "Picard",

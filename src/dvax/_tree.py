@@ -53,6 +53,11 @@ def where(condition: Any, a: Tree, b: Tree) -> Tree:
     return jtu.tree_map(lambda p, q: p if p is q else jnp.where(condition, p, q), a, b)
 
 
+def wide(condition: jax.Array, like: jax.Array) -> jax.Array:
+    """Return a condition for each row with as many axes as `like`, a table of rows."""
+    return condition.reshape(-1, *(1,) * (like.ndim - 1))
+
+
 def put(table: Tree, index: Any, row: Tree) -> Tree:
     """Return the table with one row replaced, by a dynamic update, which is faster than a scatter."""
     return jtu.tree_map(

@@ -1,6 +1,8 @@
 """The mild solution: exponential integrators, step control, `solve`, `Solution`."""
 
 from .bounds import Bounds as Bounds
+from .event import Event as Event
+from .event import Events as Events
 from .growth import between as between
 from .growth import disturbance as disturbance
 from .growth import gronwall as gronwall

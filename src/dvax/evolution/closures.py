@@ -25,13 +25,19 @@ def closure_convert(problem: Problem, t: Any, x: Tree, args: Any) -> Problem:
     changed: dict[str, Any] = {}
     for name, inputs in signatures.items():
         fn = getattr(problem, name)
-        if isinstance(fn, eqx.Module):
-            continue
-        converted: Any = eqx.filter_closure_convert(fn, *inputs)
-        if not _tree.is_concrete(getattr(converted, "consts", ())):
+        converted = convert(fn, *inputs)
+        if converted is not fn:
             changed[name] = converted
     if not changed:
         return problem
     return eqx.tree_at(
         lambda p: [getattr(p, name) for name in changed], problem, list(changed.values())
     )
+
+
+def convert(fn: Any, *inputs: Any) -> Any:
+    """Return a callable with its traced closure variables as leaves, or itself if there are none."""
+    if isinstance(fn, eqx.Module):
+        return fn
+    converted: Any = eqx.filter_closure_convert(fn, *inputs)
+    return fn if _tree.is_concrete(getattr(converted, "consts", ())) else converted

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
@@ -21,14 +20,14 @@ from .._jax.compile_clock import listen
 from .._jax.messages import is_equinox_check
 from ..errors import InputError, InputProblem
 from .integrate import integrate
-from .results import RESULTS
+from .results import has_failed
 from .setup import Options, Setup
 from .solution import Solution
 
 
 def compiled(setup: Setup, ts: Any, options: Options) -> tuple[Solution, bool | jax.Array]:
     """Return the solution, and whether the run succeeded and reached all saved times."""
-    code, code_tree = jtu.tree_flatten((setup.problem, setup.method, setup.vi_solver))
+    code, code_tree = jtu.tree_flatten((setup.problem, setup.method, setup.vi_solver, setup.events))
     data, data_tree = jtu.tree_flatten((setup.x0, setup.args, setup.setting, setup.moduli, ts))
     # Python floats in the data are traced, so that a new tolerance does not recompile. In the code
     # (settings of a solver) they are static, since they may decide a branch.
@@ -112,11 +111,11 @@ def _integrated(
 ) -> tuple[list[Any], jax.Array, _tree.Static]:
     leaves = [r[1] if n is None else n for n, r in zip(numbers, signature.static, strict=True)]
     split = signature.code.num_leaves
-    problem, method, vi_solver = jtu.tree_unflatten(signature.code, leaves[:split])
+    problem, method, vi_solver, events = jtu.tree_unflatten(signature.code, leaves[:split])
     x0, args, setting, moduli, ts = jtu.tree_unflatten(signature.data, leaves[split:])
-    setup = Setup(problem, x0, args, setting, method, vi_solver, moduli)
+    setup = Setup(problem, x0, args, setting, method, vi_solver, moduli, events)
     solution = integrate(setup, ts, signature.options)
-    reached = (solution.result == RESULTS.successful) & jnp.all(jnp.isfinite(solution.ts))
+    reached = ~has_failed(solution.result, solution.ts)
     arrays, tree = jtu.tree_flatten(solution, is_leaf=lambda node: node is setup)
     assert arrays.pop() is setup
     # `tree` is the structure of a solution whose last leaf is the setup.

@@ -67,6 +67,10 @@ def failure(solution: Any) -> SolveError:
 def diagnose(solution: Any) -> Diagnosis:
     """Return the cause of a failure according to the tests of this module, or an empty diagnosis."""
     setup, stats, result = solution.setup, solution.stats, solution.result
+    if result == RESULTS.max_events:
+        return _max_events(solution)
+    if result == RESULTS.event_nonfinite:
+        return Diagnosis()
     t, step = float(stats["t"]), float(stats["next_dt"])
     t0, t1 = float(setup.setting["t0"]), float(setup.setting["t1"])
     if not math.isfinite(step) or step <= 0:
@@ -293,6 +297,18 @@ def _stiff(stop: Stop) -> Diagnosis:
         f"itself changes at the rate {own:.3g}. From here to t1 that is {left:.2g} steps at least.",
         (Fix("method", "Implicit" if is_large else "ExpRosenbrock", "which is stable there"),),
     )
+
+
+def _max_events(solution: Any) -> Diagnosis:
+    """Report the last interval between two events, which tells whether they accumulate."""
+    times = np.asarray(solution.events.ts)
+    apart = f", the last two {times[-1] - times[-2]:.3g} apart" if len(times) > 1 else ""
+    text = f"Number of events: {len(times)}{apart}."
+    fixes = (
+        Fix("max_events", f"{4 * len(times)}", "if there are more of them"),
+        Fix("", "", "If they accumulate (Zeno's paradox), end the run before by a terminal event"),
+    )
+    return Diagnosis(text, fixes)
 
 
 def _max_steps(stop: Stop) -> Diagnosis:

@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 from .. import _tree
 from .._failure import nan_derivatives_where
 from .closures import closure_convert
+from .event_arguments import checked_events
 from .flow import Flow
 from .implicit import Implicit, solve_by_implicit_steps
 from .method import AbstractMethod
@@ -18,7 +19,7 @@ from .outcome import Outcome
 from .picard import Picard, solve_by_windows
 from .plan import Plan
 from .responses import responses
-from .results import RESULTS
+from .results import RESULTS, has_failed, is_success
 from .setup import Options, Setup
 from .solution import Solution
 from .steps import by_steps
@@ -34,14 +35,15 @@ def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
         flow, problem=closure_convert(setup.problem, setup.number("t0"), setup.x0, flow.args)
     )
     valid = setup.is_valid(ts)
-    outcome = _run(setup, flow, ts, valid, options)
+    events = checked_events(setup, flow.args)
+    outcome = _run(setup._replace(events=events), flow, ts, valid, options)
     result = RESULTS.where(valid, outcome.result, RESULTS.invalid_number)
     solution = _solution(setup, plan, flow, outcome._replace(result=result))
-    failed = (solution.result != RESULTS.successful) | ~jnp.all(solution.ts < jnp.inf)
+    failed = has_failed(solution.result, solution.ts)
     # The setup is not an output of the compiled program.
     arrays, tree = jtu.tree_flatten(solution, is_leaf=lambda node: node is setup)
     assert arrays.pop() is setup
-    given = eqx.filter((flow, setup, ts), eqx.is_inexact_array)
+    given = eqx.filter((flow, setup, events, ts), eqx.is_inexact_array)
     return tree.unflatten([*nan_derivatives_where(failed, arrays, given), setup])
 
 
@@ -66,10 +68,13 @@ def _solution(setup: Setup, plan: Plan, flow: Flow, outcome: Outcome) -> Solutio
     us, ys, residual, law_step, law_error = responses(
         flow, (rows.t, rows.x, rows.guess), setup.problem.spaces(setup.x0)[1], setup.moduli
     )
-    # A non-finite response is a failure even if f does not depend on it.
+    # A non-finite response is a failure even if f does not depend on it. Rows behind a terminal event
+    # are NaN.
     result = outcome.result
+    skipped = (rows.t == jnp.inf) & (result == RESULTS.terminal_event)
+    reached = jtu.tree_map(lambda u: jnp.where(_tree.wide(skipped, u), 0.0, u), us)
     result = RESULTS.where(
-        (result == RESULTS.successful) & ~_tree.all_finite(us), RESULTS.nonfinite, result
+        is_success(result) & ~_tree.all_finite(reached), RESULTS.nonfinite, result
     )
     return Solution(
         ts=rows.t,
@@ -86,6 +91,7 @@ def _solution(setup: Setup, plan: Plan, flow: Flow, outcome: Outcome) -> Solutio
         stats=outcome.stats,
         result=result,
         records=outcome.records,
+        events=outcome.events,
         enclosed=flow.enclosed,
         plan=plan,
         setup=setup,

@@ -19,10 +19,11 @@ from .._tree import Tree
 from . import meter
 from .bounds import Bounds
 from .checkpoints import Checkpoints
-from .control import AbstractController, slack
+from .control import AbstractController, StepDecision, slack
+from .event_watch import EventWatch, Watched
 from .outcome import Record, Saved
 from .results import RESULTS
-from .stepper import Propagators, SolverState, Stepper, interpolate, local
+from .stepper import Propagators, SolverState, Step, Stepper, interpolate, local
 from .time_derivatives import is_differentiated
 
 
@@ -51,6 +52,7 @@ class State(NamedTuple):
     attempts: Any
     evaluations: Any
     meter: Any
+    watched: Watched | None
 
 
 class Loop(eqx.Module):
@@ -58,7 +60,8 @@ class Loop(eqx.Module):
 
     - `check_finite`: keep the last good state where a step fails, which costs a choice between the two;
     - `dense`: keep every step; `progress`: say how far the run is;
-    - `forward_mode`: tangents go along with the steps.
+    - `forward_mode`: tangents go along with the steps;
+    - `watch`: the events of the user.
 
     A step that ends at a stop has the tangent of that stop; saved rows have those of constant times,
     or of the end of the step where they meet one (`time_derivatives`).
@@ -71,6 +74,7 @@ class Loop(eqx.Module):
     dense: bool = eqx.field(static=True)
     progress: bool = eqx.field(static=True)
     forward_mode: bool = eqx.field(static=True)
+    watch: EventWatch | None = None
 
     def run(
         self, x0: Tree, ts: jax.Array | None, checkpoints: Checkpoints | None = None
@@ -120,11 +124,12 @@ class Loop(eqx.Module):
             if checkpoints is not None and controller.adapts
             else None,
             checkpoints=checkpoints,
-            result=RESULTS.successful,
+            result=RESULTS.successful if self.watch is None else self.watch.first_result(),
             steps=jnp.asarray(0),
             attempts=jnp.asarray(0),
             evaluations=jnp.asarray(0),
             meter=meter.begin() if self.progress else None,
+            watched=None if self.watch is None else self.watch.begin(stepper.flow, t0, x0),
         )
 
     def _until(self, state: State, time: Any) -> State:
@@ -212,8 +217,12 @@ class Loop(eqx.Module):
         propagators = state.propagators if self._refits(state) else self._propagators(state, t0, t1)
         step = self.stepper.step(t0, t1, x0, state.solver_state, propagators, state.jumped)
         decision = self.controller.decide(t0, t1, x0, step, state.control)
-        integrated_defect = jtu.tree_map(jnp.add, state.integrated_defect, step.integrated_defect)
         taken = Record(t0, t1 - t0, x0, step.c)
+        watched = state.watched
+        if self.watch is not None:
+            active = own & decision.accepted
+            step, decision, watched = self._observe(state, step, decision, taken, t1, active)
+        integrated_defect = jtu.tree_map(jnp.add, state.integrated_defect, step.integrated_defect)
         # `last` and `records` of a step that is not kept are written over by the next one, or never
         # looked at: nothing ends inside a step that was not kept.
         bounds = state.bounds
@@ -259,14 +268,55 @@ class Loop(eqx.Module):
             attempts=state.attempts + 1,
             evaluations=state.evaluations + step.evaluations,
             meter=shown,
+            watched=watched,
         )
         # Tables are not chosen as a whole but written, or not.
         bare = state._replace(records=None, ends=None, checkpoints=None)
+        if watched is not None and state.watched is not None:
+            bare = bare._replace(watched=state.watched._replace(rows=watched.rows))
         after = _tree.where(own, after, bare)
         return after._replace(
             records=None if state.records is None else put(state.records, taken),
             ends=None if state.ends is None else put(state.ends, t1),
             checkpoints=checkpoints,
+        )
+
+    def _observe(
+        self, state: State, step: Step, decision: StepDecision, taken: Record, t1: Any, active: Any
+    ) -> tuple[Step, StepDecision, Watched]:
+        """Return the step, the decision and the events after watching an accepted step: it is rejected
+        where it must end at an event, and its last state is that behind the resets."""
+        assert self.watch is not None and state.watched is not None
+        guess = step.solver_state.guess
+        seen = self.watch.observe(
+            self.stepper, state.watched, taken, t1, step.x1, guess, state.steps, active
+        )
+        repeated = active & (seen.event < jnp.inf)
+        # Events behind the count are written over.
+        old = state.watched._replace(rows=seen.watched.rows)
+        watched = _tree.where(active & ~repeated, seen.watched, old)
+        jumped, solver_state = seen.jumped & active, step.solver_state
+        restarted = lax.cond(
+            any_lane(jumped),
+            lambda: self.stepper.restart(solver_state, seen.x),
+            lambda: solver_state,
+        )
+        step = step._replace(
+            x1=_tree.where(jumped, seen.x, step.x1),
+            solver_state=_tree.where(jumped, restarted, solver_state),
+        )
+        shortened = self.controller.shorten(state.control, seen.event, seen.margin)
+        ends = active & (seen.result != RESULTS.successful)
+        result = RESULTS.where(ends, seen.result, decision.result)
+        return (
+            step,
+            StepDecision(
+                accepted=decision.accepted & ~repeated,
+                state=_tree.where(repeated, shortened, decision.state),
+                jumped=decision.jumped | jumped,
+                result=RESULTS.where(repeated, RESULTS.successful, result),
+            ),
+            watched,
         )
 
     def _read(self, state: State, time: Any) -> Saved:

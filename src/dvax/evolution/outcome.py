@@ -9,6 +9,7 @@ from jax import lax
 
 from .._tree import Tree
 from .bounds import Bounds
+from .event import Events
 from .flow import Flow
 from .results import RESULTS
 from .time_derivatives import left_derivatives, transport, zero_with_tangent
@@ -44,13 +45,14 @@ class Saved(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The rows at the saved times, the entries of `Solution.stats`, the result, and the records of the
-    steps if `dense=True`."""
+    """The rows at the saved times, the entries of `Solution.stats`, the result, the records of the
+    steps if `dense=True`, and the events of the user."""
 
     rows: Saved
     stats: dict[str, Any]
     result: RESULTS
     records: Record | None
+    events: Events | None = None
 
 
 def ended(result: RESULTS, complete: Any) -> RESULTS:

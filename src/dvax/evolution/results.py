@@ -1,12 +1,19 @@
 """The results of a solve: success and the kinds of failure."""
 
+from typing import Any
+
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 
 
 class RESULTS(eqx.Enumeration):
     """The result of a solve, described in a sentence."""
 
     successful = "The end time was reached."
+    terminal_event = "A terminal event ended the run."
+    event_nonfinite = "The function of an event returned NaN or infinity."
+    max_events = "More than max_events events happened, or they accumulate at one time."
     max_steps = "The largest number of steps was reached before t1."
     step_too_small = (
         "The step became too small to move t, or to lower its error, while the defect stayed above "
@@ -34,3 +41,14 @@ class RESULTS(eqx.Enumeration):
         "A traced number breaks a rule: t0 < t1, no saved time before t0; dt, dt0, dt_max and horizon "
         "positive; rtol and atol not negative, and one of them positive."
     )
+
+
+def is_success(result: RESULTS) -> Any:
+    """Return whether a run reached its end: t1, or a terminal event."""
+    return (result == RESULTS.successful) | (result == RESULTS.terminal_event)
+
+
+def has_failed(result: RESULTS, ts: jax.Array) -> jax.Array:
+    """Return whether a run failed, or missed one of its saved times `ts` before a terminal event."""
+    ended = result == RESULTS.terminal_event
+    return ~is_success(result) | ~(ended | jnp.all(ts < jnp.inf))

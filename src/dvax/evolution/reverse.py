@@ -58,7 +58,10 @@ def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State
         assert state.checkpoints is not None
         moving = _tree.Static(tuple(leaf.perturbed for leaf in given))
         met = None if saved is None else saved.step
-        kept = leaves, moving, state.ends, state.checkpoints, state.steps, met
+        rows = None
+        if state.watched is not None:
+            rows = state.watched.rows._replace(x=None), state.watched.count
+        kept = leaves, moving, state.ends, state.checkpoints, state.steps, met, rows
         states, rest = _states(saved, state)
         return (states, rest), kept
 
@@ -82,19 +85,24 @@ class _States(NamedTuple):
     last: Tree
     saved: Tree | None
     records: Record | None
+    events: Tree | None
 
     @property
     def of_insides(self) -> bool:
         """Whether anything within steps has one, not their ends alone."""
-        return self.saved is not None or self.records is not None
+        return any(v is not None for v in (self.saved, self.records, self.events))
 
 
 def _states(saved: Saved | None, state: State) -> tuple[_States, Any]:
     """The run's answer taken apart into what has a derivative and what has none."""
-    states = _States(state.x, None if saved is None else saved.x, state.records)
+    watched, events = state.watched, None
+    if watched is not None:
+        events = watched.rows.x
+        watched = watched._replace(rows=watched.rows._replace(x=None))
+    states = _States(state.x, None if saved is None else saved.x, state.records, events)
     state = state._replace(
         x=None, solver_state=None, propagators=None, last=None, ends=None, checkpoints=None, meter=None,
-        records=None,
+        records=None, watched=watched,
     )  # fmt: skip
     return states, (None if saved is None else saved._replace(x=None), state)
 
@@ -103,14 +111,17 @@ def _rejoin(states: _States, rest: Any) -> tuple[Saved | None, State]:
     saved, state = rest
     if saved is not None:
         saved = saved._replace(x=states.saved)
-    return saved, state._replace(x=states.last, records=states.records)
+    watched = state.watched
+    if watched is not None:
+        watched = watched._replace(rows=watched.rows._replace(x=states.events))
+    return saved, state._replace(x=states.last, records=states.records, watched=watched)
 
 
 class _Backward:
     """The pass itself, for one run and what is asked of it."""
 
-    def __init__(self, whole, leaves, moving, timing, ends, checkpoints, steps, met):
-        self.whole, self.leaves = whole, leaves
+    def __init__(self, whole, leaves, moving, timing, ends, checkpoints, steps, met, events):
+        self.events, self.whole, self.leaves = events, whole, leaves
         real = [jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in leaves]
         self.moving = [m and r for m, r in zip(moving, real, strict=True)]
         self.ends, self.checkpoints, self.steps, self.met = ends, checkpoints, steps, met
@@ -127,12 +138,12 @@ class _Backward:
         carry = (
             adjoint,
             jtu.tree_map(jnp.zeros_like, moving),
-            jnp.asarray(row),
+            (jnp.asarray(row), None if self.events is None else self.events[1] - 1),
             self.guess,
         )
         every = checkpoint_count(self.x0, self.loop.max_steps) >= self.loop.max_steps
         carry = self._through_all(bar, carry) if every else self._from_checkpoints(bar, carry)
-        adjoint, gathered, row, _ = carry
+        adjoint, gathered, (row, _), _ = carry
         if bar.saved is not None:
             # Saved times at which no step had been taken show x₀ itself.
             assert self.ts is not None
@@ -193,21 +204,28 @@ class _Backward:
         return jnp.where(i > 0, self.ends[jnp.maximum(i - 1, 0)], self.loop.controller.stops[0])
 
     def _advance(self, loop: Loop, i: Any, x: Tree, guess: Tree | None) -> tuple[Any, Any]:
-        """(xᵢ₊₁, c), and a guess for the law of another step."""
+        """(xᵢ₊₁, c, the end of the step before its events reset it), and a guess for the law of another
+        step."""
         t0, t1 = self._times(loop, i)
         stepper = loop.stepper
         propagators = stepper.uniform
         if propagators is None and not stepper.method.is_rosenbrock:
             propagators = stepper.propagators(t1 - t0)
         x1, c, y = stepper.advance(t0, t1, x, propagators, guess)
-        return (x1, c), None if guess is None else lax.stop_gradient(y)
+        behind = x1
+        if self.events is not None:
+            assert loop.watch is not None
+            rows, count = self.events
+            fired, widths = loop.watch.fired(rows, count, i)
+            behind, _ = loop.watch.jump(stepper.flow, t1, x1, fired, widths, guess)
+        return (behind, c, x1), None if guess is None else lax.stop_gradient(y)
 
     def _replay(self, x: Tree, i: Any, until: Any) -> Tree:
         """x_until from xᵢ."""
 
         def one(carry: Any) -> Any:
             i, x, guess = carry
-            (x, _), guess = self._advance(self.loop, i, x, guess)
+            (x, *_), guess = self._advance(self.loop, i, x, guess)
             return i + 1, x, guess
 
         return lax.while_loop(lambda c: c[0] < until, one, (i, x, self.guess))[1]
@@ -219,11 +237,12 @@ class _Backward:
         moving = tuple(leaf for leaf, m in zip(self.leaves, self.moving, strict=True) if m)
 
         def step(p: Any, x: Tree) -> tuple[Any, Any]:
-            (x1, c), after = self._advance(self._parts(p), i, x, guess)
-            return ((x1, c) if bar.of_insides else (x1,)), (c, after)
+            (x1, c, end), after = self._advance(self._parts(p), i, x, guess)
+            return ((x1, c, end) if bar.of_insides else (x1,)), (c, after)
 
         _, pull, (c, guess) = jax.vjp(step, moving, x, has_aux=True)
-        bent = _tree.zeros_like(c)
+        row, event = row
+        bent, at_end = _tree.zeros_like(c), _tree.zeros_like(x)
         behind = _tree.zeros_like(x)
         if bar.records is not None:
             kept = jtu.tree_map(lambda leaf: leaf[i], bar.records)
@@ -233,8 +252,12 @@ class _Backward:
             adjoint, behind, bent, gathered, row = self._saved_back(
                 i, x, c, moving, bar.saved, (adjoint, behind, bent, gathered, row)
             )
-        p, x = pull((adjoint, bent) if bar.of_insides else (adjoint,))
-        return _tree.add(behind, x), jtu.tree_map(jnp.add, gathered, p), row, guess
+        if bar.events is not None:
+            behind, bent, at_end, gathered, event = self._events_back(
+                i, x, c, moving, bar.events, (behind, bent, at_end, gathered, event)
+            )
+        p, x = pull((adjoint, bent, at_end) if bar.of_insides else (adjoint,))
+        return _tree.add(behind, x), jtu.tree_map(jnp.add, gathered, p), (row, event), guess
 
     def _recorded(self, kept: Record, i: Any, moving: Any, gathered: Any) -> Any:
         """Where a kept step begins, and its length."""
@@ -253,21 +276,12 @@ class _Backward:
         assert self.ts is not None
         ts, (t0, _) = lax.stop_gradient(self.ts), self._times(self.loop, i)
 
-        def at(p: Any, x: Tree, c: Any, time: Any) -> Tree:
-            loop = self._parts(p)
-            t0, t1 = self._times(loop, i)
-            theta = (time - t0) / (t1 - t0)
-            stepper = loop.stepper
-            flow, _ = local(stepper.method, stepper.flow, t0, t1, x, self.guess, stepper.ends)
-            return interpolate(flow, t1 - t0, theta, x, c)
-
         def one(carry: Any) -> Any:
             adjoint, behind, bent, gathered, row = carry
             psi = jtu.tree_map(lambda leaf: leaf[row], saved)
 
             def inside() -> Any:
-                _, pull = jax.vjp(lambda p, x, c: at(p, x, c, ts[row]), moving, x, c)
-                p, v, d = pull(psi)
+                p, v, d = self._pull_inside(i, ts[row], moving, x, c, psi)
                 return adjoint, _tree.add(behind, v), _tree.add(bent, d), _tree.add(gathered, p)
 
             def at_end() -> Any:
@@ -281,6 +295,41 @@ class _Backward:
             return (row >= 0) & (is_inside | (self.met[row] == i + 1))
 
         return lax.while_loop(goes_on, one, carry)
+
+    def _events_back(
+        self, i: Any, x: Tree, c: Any, moving: Any, events: Tree, carry: Any
+    ) -> tuple[Any, ...]:
+        """The events of this step from x, the last ones first."""
+        rows, _ = self.events
+
+        def one(carry: Any) -> Any:
+            behind, bent, at_end, gathered, row = carry
+            psi = jtu.tree_map(lambda leaf: leaf[row], events)
+
+            def inside() -> Any:
+                p, v, d = self._pull_inside(i, rows.time[row], moving, x, c, psi)
+                return _tree.add(behind, v), _tree.add(bent, d), at_end, _tree.add(gathered, p)
+
+            def end() -> Any:
+                return behind, bent, _tree.add(at_end, psi), gathered
+
+            return *lax.cond(rows.at_end[row], end, inside), row - 1
+
+        goes_on = lambda carry: (carry[-1] >= 0) & (rows.step[carry[-1]] == i)  # noqa: E731
+        return lax.while_loop(goes_on, one, carry)
+
+    def _pull_inside(self, i: Any, time: Any, moving: Any, x: Tree, c: Any, psi: Tree) -> Any:
+        """The cotangents of the parameters, xᵢ and c of a state inside of step i."""
+
+        def at(p: Any, x: Tree, c: Any) -> Tree:
+            loop = self._parts(p)
+            t0, t1 = self._times(loop, i)
+            stepper = loop.stepper
+            flow, _ = local(stepper.method, stepper.flow, t0, t1, x, self.guess, stepper.ends)
+            return interpolate(flow, t1 - t0, (time - t0) / (t1 - t0), x, c)
+
+        _, pull = jax.vjp(at, moving, x, c)
+        return pull(psi)
 
 
 def _given(cotangents: Any) -> Any:

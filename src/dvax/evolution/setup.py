@@ -9,6 +9,7 @@ import jax.tree_util as jtu
 from .._tree import Tree
 from ..problem import Problem
 from ..vi import AbstractSolver
+from .event import Event
 
 
 class Setup(NamedTuple):
@@ -16,7 +17,8 @@ class Setup(NamedTuple):
 
     - `setting`: the numbers t0, t1, dt (NaN for adaptive steps), rtol, atol, dt0, dt_max and horizon;
     - `moduli`: γ, L_F and ‖P⁻¹‖, as far as they are given;
-    - `method`: an `AbstractMethod`, `Implicit`, `Picard` or `PiecewiseLinear`.
+    - `method`: an `AbstractMethod`, `Implicit`, `Picard` or `PiecewiseLinear`;
+    - `events`: of the user.
 
     It is a plain tuple, since every call makes one.
     """
@@ -28,6 +30,7 @@ class Setup(NamedTuple):
     method: Any
     vi_solver: AbstractSolver
     moduli: dict[str, Any]
+    events: tuple[Event, ...] = ()
 
     @property
     def dtype(self) -> Any:
@@ -64,6 +67,7 @@ class Options(NamedTuple):
     adjoint: str
     progress: bool
     stiff_steps: int | None = None
+    max_events: int = 0
 
 
 def as_arrays(args: Any) -> Any:

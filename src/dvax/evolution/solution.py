@@ -12,6 +12,7 @@ from .._tree import Tree
 from ..errors import InputError, InputProblem
 from .bounds import Bounds
 from .diagnose import failure
+from .event import Events
 from .flow import Flow
 from .implicit import Implicit
 from .outcome import Record
@@ -19,7 +20,7 @@ from .piecewise.method import PiecewiseLinear
 from .piecewise.trajectory import Trajectory, signs
 from .plan import Plan
 from .regimes import Regimes, regimes
-from .results import RESULTS
+from .results import RESULTS, is_success
 from .setup import Setup
 from .stepper import interpolate, local
 
@@ -49,9 +50,11 @@ class Solution(eqx.Module):
       (without those for event location and for u at saved times); `t`, `x` and the next step size at
       the end of the run; `compile_time` and `run_time` in seconds, unless the solve is part of a larger
       compiled program;
-    - `result`: `dvax.RESULTS.successful`, or the kind of failure;
+    - `result`: `dvax.RESULTS.successful`, `dvax.RESULTS.terminal_event` where a terminal event ended
+      the run, or the kind of failure;
     - `plan`: properties of the law proved from the code of f, h and K (None with `PiecewiseLinear`);
-    - `setup`: the arguments; `records`: the steps, if `dense=True`.
+    - `setup`: the arguments; `records`: the steps, if `dense=True`;
+    - `events`: the events of `events=`, a `dvax.evolution.Events`, else None.
 
     ```python
     >>> import dvax
@@ -82,6 +85,7 @@ class Solution(eqx.Module):
     stats: dict[str, Any]
     result: RESULTS
     records: Record | Trajectory | None
+    events: Events | None
     enclosed: bool = eqx.field(static=True)
     plan: Plan | None = eqx.field(static=True)
     setup: Setup
@@ -206,7 +210,7 @@ class Solution(eqx.Module):
     def raise_if_failed(self) -> "Solution":
         """Return this solution if the run succeeded, else raise a `dvax.SolveError` that contains
         it."""
-        if self.result != RESULTS.successful:
+        if not is_success(self.result):
             raise failure(self)
         return self
 

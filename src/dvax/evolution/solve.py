@@ -1,6 +1,7 @@
 """`dvax.solve`: the mild solution of a coupled system."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -28,6 +29,8 @@ from .closures import closure_convert
 from .compiled import compiled
 from .control import MAX_GROWTH
 from .diagnose import failure
+from .event import Event
+from .event_arguments import check_events
 from .implicit import Implicit
 from .method import AbstractMethod
 from .nonfinite import refuse_nonfinite_data
@@ -66,6 +69,8 @@ def solve(
     max_steps: int | None = None,
     adjoint: str = "reverse",
     throw: bool = True,
+    events: Sequence[Event] = (),
+    max_events: int = 256,
 ) -> Solution:
     """Solve x' = Ax + f(t, x, u), u ∈ h(t, x, u) − N_{K(t)}(P u) from x(t0) = x0 up to t1.
 
@@ -102,6 +107,8 @@ def solve(
     - `max_steps`: the most steps, 2²⁰ by default for adaptive ones; with fixed steps, counted;
     - `adjoint`: "reverse" serves `jax.grad` and `jax.vjp`, "forward" serves `jax.jvp` and
       `jax.jacfwd`: one loop cannot serve both;
+    - `events`: a list of `dvax.Event`: functions of (t, x, u) whose zeros are recorded, end the run, or
+      reset the state; `max_events`: the largest number of zeros, of all events together;
     - `throw`: raise where the solve fails, inside `jax.grad` too; otherwise look at `result`. Under
       `jax.jit` and `jax.vmap` nothing can raise: times that were not reached are infinite there, their
       states NaN, and all derivatives NaN.
@@ -129,6 +136,7 @@ def solve(
 
     ```
     """
+    check_events(events, max_events, method, dt, certified_tol is not None)
     if certified_tol is not None:
         x0 = _state(problem, x0)
         _only_adaptive(dt, method)
@@ -139,6 +147,7 @@ def solve(
         again: dict[str, Any] = dict(
             method=method, vi_solver=vi_solver, progress=progress, constants=constants, dense=dense,
             dt0=dt0, dt_max=dt_max, max_steps=max_steps, adjoint=adjoint, throw=throw,
+            events=events, max_events=max_events,
         )  # fmt: skip
         begin, end = float(t0), float(t1)
         run = lambda times, atol: solve(  # noqa: E731
@@ -186,12 +195,13 @@ def solve(
         max_steps=bound_steps(max_steps, fixed, t0, t1, dt),
         adjoint=adjoint,
         progress=progress,
+        max_events=max_events if events else 0,
     )
     if dense and isinstance(method, AbstractMethod):
         entries = sum(leaf.size for leaf in jax.tree_util.tree_leaves(x0))
         check_memory(entries, jnp.dtype(dtype).itemsize, options.max_steps, method.degree)
     vi_solver = _VI_SOLVER if vi_solver is None else vi_solver
-    setup = Setup(problem, x0, args, setting, method, vi_solver, _moduli(constants))
+    setup = Setup(problem, x0, args, setting, method, vi_solver, _moduli(constants), tuple(events))
     times = None if ts is None else _times(ts)
     if isinstance(method, PiecewiseLinear):
         solution = propagate(
@@ -202,7 +212,7 @@ def solve(
         return solution
     solution, reached = _run_chosen(choice, setup, times, options)
     setup = solution.setup
-    if reached is True and not dense:
+    if reached is True and not dense and not events:
         return solution
     if _tree.is_concrete(solution.ts, solution.xs):
         solution = _trim(solution)
@@ -330,7 +340,10 @@ def _number(v: Any) -> Any:
 
 
 def _trim(solution: Solution) -> Solution:
-    """Only the times that were reached: the others are infinite."""
+    """Only the times that were reached, and the events that happened: the others are infinite."""
+    if solution.events is not None:
+        count = int((np.asarray(solution.events.index) >= 0).sum())
+        solution = eqx.tree_at(lambda s: s.events, solution, solution.events.rows(slice(count)))
     reached = np.isfinite(np.asarray(solution.ts))
     if reached.all() and solution.records is None:
         return solution

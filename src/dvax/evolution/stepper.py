@@ -166,6 +166,11 @@ class Stepper(eqx.Module):
         error = _tree.zeros_like(x0) if self.estimate else None
         return SolverState(rate, guess, known, none, error)
 
+    def restart(self, solver_state: SolverState, x: Tree) -> SolverState:
+        """Return the state of the stepper after the state of the run was set to x."""
+        known = coefficients(x if self.method.is_rosenbrock else self.flow.expand(x))
+        return solver_state._replace(coefficients=known)
+
     def bounds(self, x0: Tree) -> Bounds | None:
         """Before the first step x_h has been at x₀ alone, and u_h nowhere."""
         if not self.track_bounds:

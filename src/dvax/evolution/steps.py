@@ -10,6 +10,7 @@ from jax import lax
 
 from .. import _tree
 from .._jax import forward_only, outlined
+from .._tree import Tree
 from . import excursions, reverse
 from .auto import FIELD, LARGE_LAW
 from .control import (
@@ -20,8 +21,10 @@ from .control import (
     root_mean_squares,
     step_count,
 )
+from .event import Events
+from .event_watch import EventWatch
 from .flow import Flow
-from .loop import Loop
+from .loop import Loop, State
 from .method import AbstractMethod
 from .outcome import Outcome, end_alone, ended, with_tangents
 from .results import RESULTS
@@ -40,6 +43,9 @@ def by_steps(
 ) -> Outcome:
     """Run steps of a method from the first stop to the last."""
     controller, x0, t1 = _controller(setup, method, stops, options), setup.x0, stops[-1]
+    watch = None
+    if setup.events:
+        watch, x0 = _watch(setup, flow, stops[0], options)
     loop = Loop(
         _stepper(setup, method, flow, stops, options),
         controller,
@@ -48,6 +54,7 @@ def by_steps(
         dense=options.dense,
         progress=options.progress,
         forward_mode=options.adjoint == "forward",
+        watch=watch,
     )
     if options.adjoint == "forward":
         saved, end = forward_only(outlined(Loop.run, loop, x0, ts))
@@ -58,6 +65,13 @@ def by_steps(
     result = RESULTS.where(
         (result == RESULTS.successful) & ~_tree.all_finite(end.x), RESULTS.nonfinite, result
     )
+    events = None
+    if watch is not None:
+        assert end.watched is not None
+        rows, count = end.watched.rows, end.watched.count
+        events = outlined(EventWatch.finish, watch, flow, rows, count, stops[0], setup.x0)
+        if saved is None:
+            end, t1, complete = _to_event(end, events, t1, complete)
     rows = end_alone(end, complete, t1, options.measure) if saved is None else saved
     ends = lax.stop_gradient((stops[0], t1))
     if ts is not None:
@@ -75,7 +89,25 @@ def by_steps(
         "x": end.x,
         "next_dt": controller.next_size(end.control),
     }
-    return Outcome(rows, stats, result, end.records)
+    return Outcome(rows, stats, result, end.records, events)
+
+
+def _watch(setup: Setup, flow: Flow, t0: jax.Array, options: Options) -> tuple[EventWatch, Tree]:
+    """Return the watch of the events, and the state behind the events at t0."""
+    at_start = jnp.zeros(len(setup.events), bool)
+    rtol, atol = setup.number("rtol"), setup.number("atol")
+    watch = EventWatch(setup.events, rtol, atol, at_start, options.max_events)
+    return watch.start(flow, t0, setup.x0)
+
+
+def _to_event(end: State, events: Events, t1: Any, complete: Any) -> tuple[State, Any, Any]:
+    """Return the end of the run at the terminal event, if there was one."""
+    assert end.watched is not None
+    last = jnp.clip(end.watched.count - 1, 0, events.ts.shape[0] - 1)
+    at_event = end.result == RESULTS.terminal_event
+    t, x = jtu.tree_map(lambda leaf: leaf[last], (events.ts, events.xs_after))
+    x = _tree.where(at_event, x, end.x)
+    return end._replace(x=x), jnp.where(at_event, t, t1), complete | at_event
 
 
 def _controller(

@@ -67,14 +67,24 @@ def transport(x: Tree, shift: Any, rate: Callable[..., Tree], t: Any, *given: An
         if is_zero(tangents[1]):
             return same(*primals), along[0]
 
-        def midpoint(x: Tree, shift: Any, real: Any) -> Tree:
+        def moved(x: Tree, shift: Any, real: Any) -> Tree:
             t, given = eqx.combine(real, other, static)
-            middle = _plus(x, 0.5 * shift, rate(t, x, *given))
-            return _plus(x, shift, rate(t + 0.5 * shift, middle, *given))
+            return midpoint(x, shift, rate, t, *given)
 
-        return same(*primals), jax.jvp(midpoint, tuple(args), along)[1]
+        return same(*primals), jax.jvp(moved, tuple(args), along)[1]
 
     return same(x, shift, real, other)
+
+
+def midpoint(x: Tree, shift: Any, rate: Callable[..., Tree], t: Any, *given: Any) -> Tree:
+    """Return x at t + shift along x' = rate(t, x, *given), by one step of the midpoint rule from t."""
+    middle = _plus(x, 0.5 * shift, rate(t, x, *given))
+    return _plus(x, shift, rate(t + 0.5 * shift, middle, *given))
+
+
+def velocity(t: Any, x: Tree, flow: Flow) -> Tree:
+    """Return x' = Ax + f̃(t, x)."""
+    return _tree.add(flow.generator.apply(x), flow.rate(t, x, flow.guess(x)).value)
 
 
 def _plus(x: Tree, by: Any, rate: Tree) -> Tree:
@@ -95,7 +105,7 @@ def left_derivatives(ts: Any, xs: Tree, flow: Flow, ends: tuple[Any, Any]) -> Tr
         ulps = jnp.where((t <= begin) | (t >= end), END_ULPS, KNOT_ULPS)
         inset = ulps * jnp.finfo(t.dtype).eps * jnp.maximum(jnp.abs(t), jnp.abs(begin))
         t = t + jax.lax.stop_gradient(jnp.where(t > begin, -inset, inset))
-        return _tree.add(flow.generator.apply(x), flow.rate(t, x, flow.guess(x)).value)
+        return velocity(t, x, flow)
 
     return jax.vmap(left_derivative)(ts, xs)
 

@@ -78,11 +78,16 @@ def bound_error(
     bounds concern the solution whose response stays in it; a law that is monotone only there may
     have other solutions.
 
+    Events that are only recorded change no step, and no bound. A run that a terminal event ended has
+    bounds at its saved times, its last one included: they compare the two trajectories at the same
+    time, and the exact one may meet its own event a little earlier or later. Events with a reset are
+    refused.
+
     The bound is proved where the defect of `sol` is enclosed: solve with these `constants=`, or name
     `method=dvax.ETD2RK()`. Where the defect was sampled, it is an estimate.
 
-    **Raises:** `dvax.InputError` if `sol` is not a solution of `problem`, or `initial_error` is not a
-    number ≥ 0.
+    **Raises:** `dvax.InputError` if `sol` is not a solution of `problem`, has events with a
+    reset, or `initial_error` is not a number ≥ 0.
 
     ```python
     >>> import dvax
@@ -211,6 +216,16 @@ def _check(problem: Problem, sol: Any, constants: Any, initial_error: Any) -> No
                 "a solution of dvax.Implicit",
                 "an implicit method keeps no polynomials of its steps, so its defect is unknown",
                 "Solve with an exponential method",
+            )
+        )
+    if any(event.reset is not None for event in sol.setup.events):
+        problems.append(
+            InputProblem(
+                "dvax.bound_error(sol)",
+                "a solution of events with a reset",
+                "the computed and the exact trajectory are reset at different times, and in between "
+                "their distance is that of the reset, which no constant of the problem bounds",
+                "Bound the pieces between the events, solved one by one with initial_error=",
             )
         )
     if not isinstance(initial_error, Bound) and _tree.is_concrete(initial_error):

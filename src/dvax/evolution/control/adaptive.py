@@ -160,6 +160,12 @@ class Adaptive(AbstractController):
             new = new._replace(stiffness=votes)
         return StepDecision(accepted, new, jumped, result)
 
+    def shorten(self, state, time, margin):
+        # The step size that is planned stays, as at a kink.
+        tries = EventBracket.unpack(state.event).tries
+        event = EventBracket(time, margin, jnp.zeros_like(time), tries)
+        return state._replace(end=time + margin, event=event.pack())
+
     def step_start(self, index, t):
         t = lax.stop_gradient(t)
         nearest = self.stops[jnp.argmin(jnp.abs(self.stops - t))]

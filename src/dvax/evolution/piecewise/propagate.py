@@ -140,6 +140,7 @@ def _solution(
         },
         result=getattr(RESULTS, run.result),
         records=_trajectory(run) if limits.dense else None,
+        events=None,
         enclosed=False,
         plan=None,
         setup=setup,

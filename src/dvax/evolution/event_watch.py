@@ -1,0 +1,474 @@
+"""The events of a run: recorded after each accepted step, and the resets.
+
+An event that neither ends the run nor resets the state is located on the dense output of the step, like
+a saved time, and changes no step. A step that contains another event is repeated and ends a little
+behind it, at a time t. The event is at t + s with g(t + s, Φ_s(x)) = 0, where Φ is the flow. Newton's
+method finds s < 0, and the run continues at t with
+
+    x⁺ = Φ_{−s} R Φ_s(x),      s = s(x),
+
+where R is the reset. The derivative of this map is the saltation matrix (Aizerman and Gantmakher 1958):
+the time of the event depends on x, and t is a constant. Every derivative of a run with events follows.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+
+from .. import _tree
+from .._batch import any_lane
+from .._failure import nan_derivatives_where
+from .._tree import Tree
+from .event import Event, Events
+from .event_search import RESTART, Walk, arrives, next_event, touches
+from .flow import Flow
+from .outcome import Record
+from .results import RESULTS
+from .stepper import Stepper, interpolate, local, one_sided_time
+from .time_derivatives import midpoint, velocity
+
+_WINDOW = 1e-6
+"""Largest distance of an event from the end of the step that ends behind it, in lengths of the step."""
+
+_BRACKET = 1e-10
+"""Length of the interval in which an event is located, in lengths of the step."""
+
+_MIN_ULPS, _BRACKET_ULPS = 16, 4
+"""The smallest values of both, in roundings of t."""
+
+_TOUCH = 2.0
+"""An extremum of g counts as zero within this many tolerances."""
+
+_ACCUMULATION = 8
+"""Stops that follow each other by less than this many smallest distances are taken to accumulate."""
+
+_STRAIGHT = 0.75
+"""Ratio of g to its slope times the time since a reset below which g was reset to another slope."""
+
+
+class Rows(NamedTuple):
+    """A table of the events.
+
+    - `time`: close to the event, a constant under differentiation; `index`: of the event in the list;
+    - `step`: the number of the step, −1 at the start of the run; `at_end`: whether the step ends there;
+    - `width`: the largest distance of the event from `time`, 0 where g only touches zero;
+    - `x`: the state at `time`, before all resets.
+    """
+
+    time: Any
+    index: Any
+    step: Any
+    at_end: Any
+    width: Any
+    x: Tree
+
+
+class Watched(NamedTuple):
+    """The state of the watch after a step.
+
+    - `values`, `slopes` (per unit of time) of the functions; `sizes`: their largest values so far;
+    - `reach`: the length over which the functions are resolved;
+    - `rows`, `count`: the events so far; `stop`: the time of the last step that ended at an event.
+    """
+
+    values: jax.Array
+    slopes: jax.Array
+    sizes: jax.Array
+    reach: Any
+    rows: Rows
+    count: Any
+    stop: Any
+
+
+class Observation(NamedTuple):
+    """The result of watching a step.
+
+    - `event`, `margin`: the time of the event for which the step must be repeated, ∞ if it stands, and
+      how far behind the event the step must end;
+    - `jumped`, `x`: whether the state was reset at the end of the step, and the state there;
+    - `result`: `RESULTS.successful`, or the reason for which the run ends here.
+    """
+
+    watched: Watched
+    event: Any
+    margin: Any
+    jumped: Any
+    x: Tree
+    result: RESULTS
+
+
+class EventWatch(eqx.Module):
+    """The events of a run; `at_start` says which of them happen at its start."""
+
+    events: tuple[Event, ...]
+    rtol: Any
+    atol: Any
+    at_start: jax.Array
+    max_events: int = eqx.field(static=True)
+
+    @property
+    def _directions(self) -> jax.Array:
+        return jnp.asarray([event.direction for event in self.events])
+
+    @property
+    def _stops(self) -> jax.Array:
+        return jnp.asarray([event.stops for event in self.events])
+
+    @property
+    def _resets(self) -> list[int]:
+        return [k for k, event in enumerate(self.events) if event.reset is not None]
+
+    def values(self, flow: Flow, t: Any, x: Tree, guess: Tree | None) -> jax.Array:
+        """Return the values of all functions."""
+        u = _response(flow, t, x, guess)
+        dtype = jnp.result_type(*jtu.tree_leaves(x))
+        return jnp.stack(
+            [jnp.asarray(e.function(t, x, u, flow.args), dtype).reshape(()) for e in self.events]
+        )
+
+    def along_flow(
+        self, flow: Flow, t: Any, x: Tree, guess: Tree | None, s: Any = 0.0
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return values and slopes at t + s on the solution through (t, x)."""
+        value = lambda s: self.values(flow, t + s, _flow_by(flow, t, x, s), guess)  # noqa: E731
+        s = jnp.asarray(s, t.dtype)
+        return jax.jvp(value, (s,), (jnp.ones_like(s),))
+
+    def start(self, flow: Flow, t0: Any, x0: Tree) -> tuple["EventWatch", Tree]:
+        """Return the watch with the events at t0, those whose functions are zero there and leave zero
+        in their direction, and the state behind their resets."""
+        guess = flow.guess(x0)
+        own, there, t, x = jtu.tree_map(_constant, (self, flow, t0, x0))
+        values, slopes = own.along_flow(there, t, x, guess)
+        direction = jnp.sign(slopes).astype(self._directions.dtype)
+        counts = (self._directions == 0) | (self._directions == direction)
+        fired = (values == 0) & counts
+        x0, _ = self.jump(flow, t0, x0, fired, jnp.full(len(fired), jnp.inf), guess)
+        return eqx.tree_at(lambda w: w.at_start, self, fired), x0
+
+    def begin(self, flow: Flow, t0: Any, x0: Tree) -> Watched:
+        """Return the state of the watch before the first step from x0, behind the resets at t0."""
+        own, there, t, x = jtu.tree_map(_constant, (self, flow, t0, x0))
+        values, slopes = own.along_flow(there, t, x, there.guess(x))
+        many, dtype = self.max_events, t0.dtype
+        rows = Rows(
+            jnp.full(many, jnp.inf, dtype),
+            jnp.full(many, -1),
+            jnp.full(many, -1),
+            jnp.zeros(many, bool),
+            jnp.zeros(many, dtype),
+            jtu.tree_map(lambda leaf: jnp.zeros((many, *leaf.shape), leaf.dtype), x0),
+        )
+        first = Rows(t0, -1, -1, True, jnp.full(len(self.events), jnp.inf), x0)
+        rows, count = self._put(rows, self.at_start, jnp.asarray(0), first)
+        # A function that is zero at the start, and stays unchanged, is not at a sign that it changes.
+        unchanged = self.at_start & ~jnp.any(self.at_start & self._stops)
+        values = jnp.where(unchanged, 0.0, values)
+        infinite = jnp.full_like(t0, jnp.inf)
+        return Watched(values, slopes, jnp.abs(values), infinite, rows, count, -infinite)
+
+    def first_result(self) -> RESULTS:
+        """Return the result before the first step: `RESULTS.terminal_event` if a terminal event happens
+        at the start."""
+        return self._result(jnp.sum(self.at_start), self.at_start, jnp.asarray(False))
+
+    def _result(self, count: Any, fired: jax.Array, accumulates: Any) -> RESULTS:
+        terminal = jnp.asarray([event.terminal for event in self.events])
+        ends = jnp.any(fired & terminal)
+        result = RESULTS.where(ends, RESULTS.terminal_event, RESULTS.successful)
+        most = (count > self.max_events) | accumulates
+        return RESULTS.where(most, RESULTS.max_events, result)
+
+    def observe(
+        self,
+        stepper: Stepper,
+        watched: Watched,
+        step: Record,
+        end: Any,
+        x1: Tree,
+        guess: Tree | None,
+        number: Any,
+        active: Any,
+    ) -> Observation:
+        """Watch the accepted step number `number`, to `end` and x1, if the lane is `active`."""
+        search: Any = partial(EventWatch._search, active=active)
+        walk, fired, widths, table, count = search(
+            *jtu.tree_map(_constant, (self, stepper, watched, step, end, guess))
+        )
+        h, before, rows = end - step.start, watched.count, watched.rows
+        width = lax.stop_gradient(_width(step.start, end))
+        time = lax.stop_gradient(step.start + walk.b * h)
+        stops = jnp.any(fired & self._stops)
+        at_end = stops & (end - time <= width)
+        event, margin = jnp.where(stops & ~at_end, time, jnp.inf), 0.5 * width
+        numbers = jnp.arange(self.max_events)
+        new = (numbers >= before) & (numbers < count)
+        rows = Rows(
+            time=table.time,
+            index=table.index,
+            step=jnp.where(new, number, rows.step),
+            at_end=rows.at_end & ~new,
+            width=table.width,
+            x=self._fill(stepper, rows.x, table.time, before, count, step, end, guess),
+        )
+        inside = Watched(
+            values=walk.va,
+            slopes=walk.da / h,
+            sizes=jnp.maximum(watched.sizes, jnp.abs(walk.vb)),
+            reach=walk.reach * h * jnp.where(at_end, RESTART, 1.0),
+            rows=rows,
+            count=count,
+            stop=watched.stop,
+        )
+        own, flow, t, x = jtu.tree_map(_constant, (self, stepper.flow, end, x1))
+
+        def stop() -> Observation:
+            # What changes its sign between the event and the end of the step happens with it.
+            reached = own.values(flow, t, x, guess)
+            now = at_end & (fired | arrives(walk.va, reached, self._directions))
+            x_after, shifts = self.jump(stepper.flow, end, x1, now, widths, guess)
+            new = jtu.tree_map(_constant, x_after)
+            values, slopes = own.along_flow(flow, t, new, guess)
+            end_row = Rows(t, -1, number, True, widths, x1)
+            table, total = self._put(rows, now, count, end_row)
+            accumulates = at_end & (t - watched.stop <= _ACCUMULATION * _MIN_ULPS * _ulp(t))
+            # After the reset g returned through zero at once, instead of passing it at constant slope.
+            crossed = now & (jnp.sign(values) == jnp.sign(reached))
+            bent = jnp.abs(values) < _STRAIGHT * jnp.abs(slopes * shifts)
+            accumulates |= jnp.any(crossed & bent)
+            after = inside._replace(
+                values=jnp.where(at_end, values, inside.values),
+                slopes=jnp.where(at_end, slopes, inside.slopes),
+                rows=table,
+                count=total,
+                stop=jnp.where(at_end, t, watched.stop),
+            )
+            jumped = jnp.any(now & jnp.asarray([k in self._resets for k in range(len(now))]))
+            result = self._result(total, now, accumulates)
+            return Observation(after, event, margin, jumped, x_after, result)
+
+        def go_on() -> Observation:
+            none = jnp.zeros_like(fired)
+            result = self._result(count, none, jnp.asarray(False))
+            return Observation(inside, event, margin, jnp.asarray(False), x1, result)
+
+        seen = lax.cond(any_lane(at_end), stop, go_on)
+        finite = jnp.all(jnp.isfinite(walk.vb)) | ~active
+        return seen._replace(result=RESULTS.where(finite, seen.result, RESULTS.event_nonfinite))
+
+    def _search(
+        self,
+        stepper: Stepper,
+        watched: Watched,
+        step: Record,
+        end: Any,
+        guess: Tree | None,
+        active: Any,
+    ) -> tuple[Walk, jax.Array, jax.Array, Rows, Any]:
+        """Walk along a step to its end, or to the first event at which it must end. Return the walk,
+        which events happen where it stops, their widths, a table with the times, indices and widths of
+        the others, and the number of its rows."""
+        t0, h, *_ = step
+        at_x = self._states(stepper, step, end, guess)
+        inset = end - one_sided_time(t0, end, 1.0, stepper.ends)
+
+        def values(theta: Any) -> jax.Array:
+            t = t0 + theta * h - jnp.where(theta >= 1.0, inset, 0.0)
+            return self.values(stepper.flow, t, at_x(theta), guess)
+
+        def at(theta: Any) -> tuple[jax.Array, jax.Array]:
+            return jax.jvp(values, (theta,), (jnp.ones_like(theta),))
+
+        touch = _TOUCH * (self.atol + self.rtol * watched.sizes)
+        ulp = jnp.maximum(_ulp(t0), _ulp(end)) / h + jnp.finfo(t0.dtype).eps
+        limits = self._directions, touch, jnp.maximum(_BRACKET, _BRACKET_ULPS * ulp)
+        width = _width(t0, end)
+
+        def happens(walk: Walk) -> tuple[jax.Array, jax.Array]:
+            arrived = arrives(walk.va, walk.vb, self._directions)
+            near = touches(walk.va, walk.da, walk.vb, walk.db, walk.b - walk.a, *limits[:2])
+            return walk.found & (arrived | near), jnp.where(near & ~arrived, 0.0, width)
+
+        def one(carry: tuple[Walk, Rows, Any]) -> tuple[Walk, Rows, Any]:
+            walk, table, count = carry
+            walk = next_event(walk, at, *limits)
+            fired, widths = happens(walk)
+            onward = walk.found & ~jnp.any(fired & self._stops)
+            row = Rows(t0 + walk.b * h, -1, None, None, widths, None)
+            table, count = self._put(table, fired & onward, count, row)
+            return _tree.where(onward, walk.onward(), walk), table, count
+
+        reach = jnp.minimum(watched.reach / h, 1.0)
+        first = Walk.at(jnp.zeros_like(t0), watched.values, watched.slopes * h, reach)
+        first = first._replace(ended=~active)
+        table = watched.rows._replace(step=None, at_end=None, x=None)
+        carry = first, table, watched.count
+        walk, table, count = lax.while_loop(lambda c: ~(c[0].found | c[0].ended), one, carry)
+        return walk, *happens(walk), table, count
+
+    def _states(
+        self, stepper: Stepper, step: Record, end: Any, guess: Tree | None
+    ) -> Callable[[Any], Tree]:
+        """Return the dense output of a step as a function of θ."""
+        t0, h, x0, c = step
+        flow, _ = local(stepper.method, stepper.flow, t0, end, x0, guess, stepper.ends)
+        return lambda theta: interpolate(flow, h, theta, x0, c)
+
+    def _fill(
+        self,
+        stepper: Stepper,
+        table: Tree,
+        times: jax.Array,
+        before: Any,
+        count: Any,
+        step: Record,
+        end: Any,
+        guess: Tree | None,
+    ) -> Tree:
+        """Return the table with the states of the events inside a step."""
+        at_x = self._states(stepper, step, end, guess)
+        last = jnp.minimum(count, self.max_events)
+
+        def one(carry: tuple[Any, Tree]) -> tuple[Any, Tree]:
+            k, table = carry
+            row = jnp.minimum(k, self.max_events - 1)
+            theta = (times[row] - step.start) / step.length
+            return k + 1, _tree.put_if(k < last, table, row, at_x(theta))
+
+        return lax.while_loop(lambda carry: any_lane(carry[0] < last), one, (before, table))[1]
+
+    def _put(self, rows: Rows, fired: jax.Array, count: Any, row: Rows) -> tuple[Rows, Any]:
+        """Return the table with a row for each event that fired at one time, as far as there is room,
+        and the number of events."""
+        like = jtu.tree_map(lambda new, table: jnp.asarray(new, table.dtype), row, rows)
+        # `index` and `width` differ from event to event.
+
+        def put(k: Any, carry: tuple[Rows, Any]) -> tuple[Rows, Any]:
+            rows, count = carry
+            new = like._replace(index=k.astype(rows.index.dtype), width=like.width[k])
+            place = jnp.minimum(count, self.max_events - 1)
+            rows = _tree.put_if(fired[k] & (count < self.max_events), rows, place, new)
+            return rows, jnp.where(fired[k], count + 1, count)
+
+        return lax.fori_loop(0, len(self.events), put, (rows, count))
+
+    def jump(
+        self, flow: Flow, t: Any, x: Tree, fired: jax.Array, widths: jax.Array, guess: Tree | None
+    ) -> tuple[Tree, jax.Array]:
+        """Return the state at t after the resets of the events that fired at most `widths` before t, in
+        the order of the list, given the state x without these resets; and s ≤ 0 for each event."""
+        shifts = [jnp.zeros_like(t)] * len(self.events)
+        for k in self._resets:
+            find = partial(self._shift, flow, t, x, k, fired[k], widths[k], guess)
+            shifts[k] = lax.cond(any_lane(fired[k]), find, lambda: jnp.zeros_like(t))
+        for k in self._resets:
+            change = partial(self._change, flow, t, shifts[k], k, guess)
+            x = _tree.where(fired[k], lax.cond(any_lane(fired[k]), change, lambda x: x, x), x)
+        return x, jnp.stack(shifts)
+
+    def _change(self, flow: Flow, t: Any, s: Any, k: int, guess: Tree | None, x: Tree) -> Tree:
+        """Return Φ_{−s} R Φ_s(x) for the reset R of event k."""
+        return _flow_by(flow, t + s, self._reset(flow, t, s, k, guess, x)[1], -s)
+
+    def _reset(
+        self, flow: Flow, t: Any, s: Any, k: int, guess: Tree | None, x: Tree
+    ) -> tuple[Tree, Tree]:
+        """Return the states before and behind event k at t + s."""
+        before = _flow_by(flow, t, x, s)
+        reset = self.events[k].reset
+        if reset is None:
+            return before, before
+        u = _response(flow, t + s, before, guess)
+        return before, reset(t + s, before, u, flow.args)
+
+    def _shift(
+        self, flow: Flow, t: Any, x: Tree, k: Any, fired: Any, width: Any, guess: Tree | None
+    ) -> Any:
+        """Return s with g(t + s, Φ_s(x)) = 0 for event k: two steps of Newton's method from 0.
+
+        At an extremum that touches zero, and where g jumps, s is 0 and its derivatives are NaN.
+        """
+
+        def newton(_: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+            values, slopes = self.along_flow(flow, t, x, guess, carry[0])
+            slope = slopes[k]
+            return carry[0] - values[k] / jnp.where(slope == 0, 1.0, slope), slope != 0
+
+        # The derivatives of two steps from the zero are those of the zero, up to the second.
+        s, exists = lax.fori_loop(0, 2, newton, (jnp.zeros_like(t), jnp.asarray(True)))
+        exists &= jnp.abs(s) <= 2.0 * width
+        s = jnp.where(fired & exists, s, 0.0)
+        return nan_derivatives_where(fired & ~exists, s, (flow, t, x))
+
+    def fired(self, rows: Rows, count: Any, step: Any) -> tuple[jax.Array, jax.Array]:
+        """Return which events happened at the end of a step, and their widths."""
+        own = (jnp.arange(self.max_events) < count) & rows.at_end & (rows.step == step)
+        of_event = [own & (rows.index == k) for k in range(len(self.events))]
+        widths = [jnp.max(jnp.where(mine, rows.width, 0.0)) for mine in of_event]
+        return jnp.stack([jnp.any(mine) for mine in of_event]), jnp.stack(widths)
+
+    def finish(self, flow: Flow, rows: Rows, count: Any, t0: Any, x0: Tree) -> Events:
+        """Return the events of a run from (t0, x0), the state before the resets at t0."""
+        at_start = rows.step < 0
+        rows = rows._replace(
+            time=jnp.where(at_start & (rows.index >= 0), t0, rows.time),
+            x=jtu.tree_map(lambda a, b: jnp.where(_tree.wide(at_start, a), b, a), rows.x, x0),
+        )
+        valid = jnp.arange(self.max_events) < count
+        guess, n = flow.guess(x0), len(self.events)
+
+        def one(before: tuple[Any, Tree], given: tuple[Any, Rows]) -> tuple[Any, Any]:
+            valid, row = given
+
+            def happen() -> tuple[Any, Any, Tree, Tree, Tree]:
+                step, x = before
+                # Events at the end of one step see the states that the earlier ones left.
+                x = _tree.where(row.at_end & (step == row.step), x, row.x)
+                s = self._shift(flow, row.time, row.x, row.index, valid, row.width, guess)
+                branches = [partial(self._reset, flow, row.time, s, k, guess) for k in range(n)]
+                seen, after = lax.switch(row.index, branches, x)
+                kept = _flow_by(flow, row.time + s, after, -s)
+                step = jnp.where(row.at_end, row.step, -2)
+                return step, row.time + s, seen, after, kept
+
+            def skip() -> tuple[Any, Any, Tree, Tree, Tree]:
+                nan = jtu.tree_map(lambda leaf: jnp.full_like(leaf, jnp.nan), row.x)
+                return before[0], jnp.full_like(row.time, jnp.inf), nan, nan, before[1]
+
+            step, time, seen, after, kept = lax.cond(valid, happen, skip)
+            return (step, kept), (time, seen, after)
+
+        first = jnp.full_like(count, -2), jtu.tree_map(lambda leaf: leaf[0], rows.x)
+        _, (times, seen, after) = lax.scan(one, first, (valid, rows))
+        index = jnp.where(valid, rows.index, -1)
+        return Events(times, index, seen, after, tuple(event.name for event in self.events))
+
+
+def _constant(leaf: Any) -> Any:
+    return lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf
+
+
+def _response(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Tree:
+    return flow.operator.inverse(flow.rate(t, x, guess).y)
+
+
+def _flow_by(flow: Flow, t: Any, x: Tree, s: Any) -> Tree:
+    """Return Φ_s(x) up to O(s³)."""
+    return midpoint(x, s, velocity, t, flow)
+
+
+def _ulp(t: Any) -> Any:
+    return jnp.finfo(t.dtype).eps * jnp.abs(t)
+
+
+def _width(t0: Any, t1: Any) -> Any:
+    """Return the largest distance of an event from the end of a step that ends behind it."""
+    ulp = jnp.maximum(_ulp(t0), _ulp(t1))
+    eps = jnp.finfo(t0.dtype).eps
+    return jnp.maximum(jnp.maximum(_WINDOW, _MIN_ULPS * eps) * (t1 - t0), _MIN_ULPS * ulp)
