@@ -155,7 +155,7 @@ def sampled(
 
 
 def _interpolatory(nodes: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the weights of the quadrature on [0, 1] that is exact for polynomials through the nodes."""
+    """Return the weights of the interpolatory quadrature on [0, 1] with these nodes."""
     powers = np.vander(nodes, increasing=True).T
     return tuple(np.linalg.solve(powers, 1.0 / np.arange(1.0, len(nodes) + 1.0)).tolist())
 

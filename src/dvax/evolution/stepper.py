@@ -16,6 +16,7 @@ from .._knots import END_ULPS, KNOT_ULPS
 from .._tree import Tree
 from ..generators import AbstractPropagator, FlowStep, Growth
 from ..generators.spectral_state import coefficients, values
+from . import error_estimate
 from .bounds import Bounds
 from .defect import Sample, enclosed, sampled
 from .evaluations import Evaluation, Stages, evaluated
@@ -70,7 +71,7 @@ class Step(NamedTuple):
     - `finite`: there is no non-finite value that a smaller step would leave;
     - `evaluations`: of F;
     - `stiffness`: h times the slope of f̃ between two stages, None where the method has no such pair;
-    - `carried`: the estimated error of x₀, and what the step leaves of it, None where it is not estimated.
+    - `carried`: the estimated error of x₀, and what the step leaves of it, None where not estimated;
     """
 
     x1: Tree
@@ -222,7 +223,8 @@ class Stepper(eqx.Module):
         start = self.flow.expand(x0, solver_state.coefficients)
         probe = None
         if self.estimate and not self.method.is_rosenbrock:
-            probe = partial(self._probe, t1 - t0, x0, solver_state.error)
+            space = self.flow.state_space(x0)
+            probe = partial(error_estimate.probe, space, t1 - t0, x0, solver_state.error)
         plan = self._stages(t0, t1, start, propagators, drift, self.measure, probe)
         # The last evaluation of the previous step was made where this one begins.
         begin, kept = self.ends[0], solver_state.rate
@@ -233,7 +235,7 @@ class Stepper(eqx.Module):
         c, x1 = values((c, x1))
         first, last = evaluations[0].rate, evaluations[-1].rate
         error, integrated_defect, event, excursion, bounds = None, (0.0, 0.0), None, None, None
-        stiffness, signed, carried, error_estimate = None, None, None, None
+        stiffness, signed, carried, estimate = None, None, None, None
         variation = solver_state.variation
         if self.measure:
             slopes = self._slopes(t1 - t0, evaluations)
@@ -242,23 +244,9 @@ class Stepper(eqx.Module):
             error, integrated_defect = sample.error, (sample.defect, sample.law_defect)
             signed = sample.signed
             if self.estimate:
-                before, after = self._carried(
-                    t1 - t0, x0, solver_state.error, evaluations, propagators, len(sample.thetas)
-                )
-                error_estimate = _finite_or_zero(
-                    _tree.add(after, _tree.scale(t1 - t0, sample.mean))
-                )
-                # What decays in one regime may not in the next, nor does it in the computed
-                # trajectory where the method is at the limit of its stability.
-                stable = ~jnp.asarray(sample.kinked)
-                share = jnp.where(stable, 1.0, 0.0) * (
-                    1.0
-                    if slopes is None
-                    else _stable_share(slopes[1 if self.method.explicit_in_A else 0])
-                )
-                carried = (
-                    before,
-                    _tree.add(_tree.scale(share, after), _tree.scale(1.0 - share, before)),
+                slope = None if slopes is None else slopes[self.method.explicit_in_A]
+                carried, estimate = self._carried(
+                    t1 - t0, x0, solver_state.error, evaluations, propagators, sample, slope
                 )
             bounds = sample.bounds if self.track_bounds else None
             if self.locate:
@@ -272,7 +260,7 @@ class Stepper(eqx.Module):
                 # Where x itself changes at a comparable rate, accuracy asks for such steps too.
                 space = self.flow.state_space(x0)
                 change = space.norm(_tree.sub(x1, x0)) / space.norm(x1)
-                slope = slopes[1 if self.method.explicit_in_A else 0]
+                slope = slopes[self.method.explicit_in_A]
                 stiffness = jnp.where(change < _SLOW * slope, slope, 0.0)
             # Further in, a bad value may come from a step that was too long: it is cut, not fatal.
             finite = _tree.all_finite(first.value)
@@ -286,7 +274,7 @@ class Stepper(eqx.Module):
             None if self.flow.direct else last.y,
             known,
             variation,
-            error_estimate,
+            estimate,
         )
         solved = jnp.all(jnp.stack([one.rate.solved for one in evaluations]))
         # The first one was made by the step before, unless nothing is kept, or data jumped.
@@ -349,49 +337,34 @@ class Stepper(eqx.Module):
 
         return run
 
-    def _probe(self, h: Any, x0: Tree, error: Tree, c0: Tree) -> Tree:
-        """Return a state next to x₀ in the direction of its estimated error."""
-        return _tree.add(x0, _tree.scale(self._probe_scale(h, x0, error, c0), error))
-
-    def _probe_scale(self, h: Any, x0: Tree, error: Tree, c0: Tree) -> Any:
-        """Return the factor that makes the estimated error as large as a difference quotient needs."""
-        space = self.flow.state_space(x0)
-        size, length = space.norm(x0) + h * space.norm(c0), space.norm(error)
-        scale = jnp.sqrt(jnp.finfo(length.dtype).eps) * size
-        return lax.stop_gradient(
-            jnp.where(length > 0, scale / jnp.where(length > 0, length, 1.0), 0.0)
-        )
-
     def _carried(
         self,
         h: Any,
         x0: Tree,
-        error: Tree,
+        error: Tree | None,
         evaluations: list[Evaluation],
         propagators: Propagators,
-        inner: int,
-    ) -> tuple[Tree, Tree]:
-        """Return the estimated error of x₀, and what the step leaves of it at most: e^{hA}(e + ¼hBe) with
-        B the derivative of f̃ (of Ax + f̃ where the method is explicit in A).
-
-        On the negative axis 1 + ¼z is above e^z for z ≥ −3.9 and stable for z ≥ −8, where the methods
-        are: no part of the error is taken to decay faster than it does.
-        """
-        x0, error, evaluations, propagators = lax.stop_gradient(
-            (x0, error, evaluations, propagators)
+        sample: Sample,
+        slope: Any,
+    ) -> tuple[tuple[Tree, Tree], Tree]:
+        """Return the estimated error of x₀ and what the step leaves of it, and that of x₁."""
+        x0, error, evaluations, propagators, sample = lax.stop_gradient(
+            (x0, error, evaluations, propagators, sample)
         )
         left = error
         if not self.method.is_rosenbrock:
-            first, probe = evaluations[0], evaluations[-2 - inner]
-            scale = self._probe_scale(h, x0, error, self.flow.nonlinear_part(x0, first.rate.value))
-            change = _tree.sub(
-                self.flow.nonlinear_part(probe.x, probe.rate.value),
-                self.flow.nonlinear_part(x0, first.rate.value),
+            space = self.flow.state_space(x0)
+            probe, first = evaluations[-2 - len(sample.thetas)], evaluations[0]
+            there, here = (
+                self.flow.nonlinear_part(x, one.rate.value)
+                for x, one in ((probe.x, probe), (x0, first))
             )
-            share = jnp.where(scale > 0, 0.25 * h / jnp.where(scale > 0, scale, 1.0), 0.0)
-            left = _tree.add(error, _tree.scale(share, change))
-        left = values(propagators.full.step(self.flow.expand(left), ()))
-        return error, _finite_or_zero(left)
+            left = error_estimate.with_decay(space, h, x0, error, there, here)
+        left = error_estimate.finite_or_zero(
+            values(propagators.full.step(self.flow.expand(left), ()))
+        )
+        after = error_estimate.finite_or_zero(_tree.add(left, _tree.scale(h, sample.mean)))
+        return (error, error_estimate.counted(error, left, sample.kinked, slope)), after
 
     def _slopes(self, h: Any, evaluations: list[Evaluation]) -> tuple[Any, Any] | None:
         """Return h ‖Δf̃‖/‖Δx‖ and h ‖AΔx + Δf̃‖/‖Δx‖ for the difference of two stages at one time, NaN
@@ -475,17 +448,6 @@ class Stepper(eqx.Module):
         ends = begin, self._one_sided_time(t0, t1, 1.0)
         span = self.ends[1] - self.ends[0]
         return enclosed(self.flow, self.growth, ends, arc, evaluations[-1].rate, span)
-
-
-def _stable_share(slope: Any) -> Any:
-    """Return 1 where h times the slope of what the method treats explicitly is at most 1, and 0 from 2."""
-    return jnp.where(jnp.isfinite(slope), jnp.clip(2.0 - slope, 0.0, 1.0), 1.0)
-
-
-def _finite_or_zero(v: Tree) -> Tree:
-    """Return v, or zero if an entry is not finite."""
-    v = lax.stop_gradient(v)
-    return _tree.where(_tree.all_finite(v), v, _tree.zeros_like(v))
 
 
 def _ulp(t0: Any, t1: Any) -> Any:
