@@ -34,9 +34,10 @@ class Implicit(eqx.Module):
 
     The method only applies A. Each step solves equations of the size of the state by the chord
     iteration, by default with a dense matrix, which is feasible up to some thousand unknowns. `rtol`
-    and `atol` refer to the error of one step, as in Diffrax. There are no certificates (`Solution.defect`
-    is None). Events are not located, so derivatives of a run with events have errors of the order of the
-    steps there. Steps are not recorded: list the times in `ts=`. Steps end at the knots of data.
+    and `atol` refer to the error of one step, as in Diffrax. There are no certificates
+    (`Solution.defect` is None). Events are not located, so derivatives of a run with events have errors
+    of the order of the steps there. Steps are not recorded: list the times in `ts=`. Steps end at the
+    knots of data.
 
     **Arguments:** `solver`: any implicit solver of Diffrax, with its root finder and linear solver. The
     KenCarp methods treat A implicitly and the law explicitly.
