@@ -25,6 +25,7 @@ from ..operators import Scaling
 from ..problem import Problem
 from ..programs.structure import analyse
 from .method import ETD2RK, ETD4RK, ExpRosenbrock
+from .results import RESULTS
 from .runge_kutta import DormandPrince
 
 FIELD, LARGE_LAW = 64, 256
@@ -44,23 +45,29 @@ _LINEARISABLE = 256
 
 
 class Choice(NamedTuple):
-    """A method, the reason in words, and the method to go on with where steps are limited by stability
-    (None where there is none), which is worth its own program from `least` more steps on."""
+    """A method, the reason in words ("" if the caller named it), and the method to go on with where
+    steps are limited by stability (None where there is none), which is worth its own program from
+    `least` more steps on."""
 
     method: Any
     reason: str = ""
     fallback: Any = None
-    least: int = 0
+    least: int | None = None
 
-    def text(self) -> Label:
+    def text(self, where: str = "") -> Label:
         """Return the name of the method, and the reason where there is one."""
         name = type(self.method).__name__
-        return Label(f"{name}: {self.reason}" if self.reason else name)
+        return Label(f"{name}: {self.reason}{where}" if self.reason else name)
 
-    def fallback_text(self, t: float) -> Label:
-        """Return the name of the other method, and that stability limited the steps of the first."""
-        first, other = type(self.method).__name__, type(self.fallback).__name__
-        return Label(f"{other}: stability limited the steps of {first} at t = {t:.6g}")
+    def after(self, result: RESULTS) -> "Choice | None":
+        """Return the choice after a run of the method that ended with `result`."""
+        first = type(self.method).__name__
+        if result == RESULTS.stiff:
+            return Choice(self.fallback, f"stability limited the steps of {first}")
+        if result == RESULTS.step_too_small and not isinstance(self.method, ETD2RK):
+            # Its defect is zero where f̃ is a line in t, however steep, and enclosed elsewhere.
+            return Choice(ETD2RK(), f"rounding limited the steps of {first}")
+        return None
 
 
 class Facts(NamedTuple):

@@ -283,19 +283,21 @@ def _only_adaptive(dt: Any, method: Any) -> None:
 def _run_chosen(
     choice: Choice, setup: Setup, times: Any, options: Options
 ) -> tuple[Solution, bool | jax.Array]:
-    """Run the method that was chosen, or the other one where stability limits its steps."""
+    """Run the method that was chosen, or another one where stability or rounding limits its steps."""
     given = setup.problem, setup.x0, setup.args, setup.setting, times
-    guarded = choice.fallback is not None and _tree.is_concrete(_tree.primal(given))
     text = choice.text()
-    if guarded:
+    if choice.reason and _tree.is_concrete(_tree.primal(given)):
         solution, reached = _differentiably(
             setup, times, options._replace(stiff_steps=choice.least)
         )
         if isinstance(reached, bool):
-            if not reached and solution.result == RESULTS.stiff:
-                text = choice.fallback_text(float(_tree.primal(solution.stats["t"])))
-                setup = setup._replace(method=choice.fallback)
-                solution, reached = _differentiably(setup, times, options)
+            other = None if reached else choice.after(solution.result)
+            if other is not None:
+                t = float(_tree.primal(solution.stats["t"]))
+                again = setup._replace(method=other.method)
+                second, reached = _differentiably(again, times, options)
+                if reached or solution.result == RESULTS.stiff:
+                    text, solution = other.text(f" at t = {t:.6g}"), second
             solution.stats["method"] = text
             return solution, reached
         # f, h or K closes over what is traced, so that no other method can follow this one.

@@ -103,7 +103,7 @@ def test_stopped_run_keeps_its_frames_and_has_a_report(whole, tmp_path, error, s
 
 @pytest.mark.thorough  # a program of its own for every max_steps
 def test_failed_run_keeps_its_frames_and_names_the_key(tmp_path):
-    outcome = run(configured(tmp_path, "max_steps = 12\n"), tmp_path / "out")
+    outcome = run(configured(tmp_path, "max_steps = 1\n"), tmp_path / "out")
     assert outcome.exit_code == 3 and "Write model.max_steps = " in outcome.stop_reason
     enough = int(outcome.stop_reason.split("model.max_steps = ")[1].split(",")[0])
     assert run(configured(tmp_path, f"max_steps = {enough}\n"), tmp_path / "again").exit_code == 0

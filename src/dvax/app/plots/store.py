@@ -26,7 +26,7 @@ class Variable:
     @cached_property
     def values(self) -> np.ndarray:
         """All values. Read once: they may lie in many chunks."""
-        over_time = self._array.metadata.dimension_names[:1] == ("time",)
+        over_time = (self._array.metadata.dimension_names or ())[:1] == ("time",)
         return np.asarray(self._array[: self._count] if over_time else self._array[...])
 
     def frames(self, which: slice | int) -> np.ndarray:
