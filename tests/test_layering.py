@@ -18,6 +18,7 @@ FLOORS = {
     "_lazy": -2,
     "_tree": -1,
     "_batch": -1,
+    "_small_matrices": -1,
     "_failure": -1,
     "_jax": -1,
     "programs": -0.5,

@@ -13,6 +13,7 @@ CASES = (
     "tools",
     "work_precision",
     "defaults",
+    "compile",
     "transforms",
     "certificate",
     "derivatives",

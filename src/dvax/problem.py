@@ -21,7 +21,7 @@ from .signals import listen
 from .spaces import AbstractSpace
 from .vi import AbstractSolver, Answer, Auto, FrozenVI, default_space
 from .vi.arguments import solver_problems
-from .vi.outcome import unless_failed
+from .vi.outcome import raise_failure, unless_failed
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,12 +181,14 @@ class Problem(eqx.Module):
     ) -> Tree:
         """Return the state-to-control map u_x(t) (paper, lem:unique_u).
 
-        The residual is at most 1e-10, or the roundoff.
+        The residual is at most 1e-10, or the roundoff. The first call compiles; later calls with the
+        same functions and shapes reuse the program. Pass values that change in `args`: a number that
+        f, h, A, P or K reads from its closure is read at compilation only.
 
         **Raises:** `dvax.SolveError` if the solver fails. If the failure is traced (`jax.jit`,
         `jax.vmap`), values and derivatives are NaN instead.
         """
-        return self._apply_to_response(t, x, args, solver, lambda t, x, u: u)
+        return self._solve_law(t, x, args, solver, of_rate=False)
 
     def reduced(
         self, t: Any, x: Tree, args: Any = None, *, solver: AbstractSolver | None = None
@@ -194,20 +196,25 @@ class Problem(eqx.Module):
         """Return the reduced map f̃(t, x) = f(t, x, u_x(t)) (paper, eq. reduced).
 
         Raises the errors of `response`."""
-        return self._apply_to_response(t, x, args, solver, lambda t, x, u: self.f(t, x, u, args))
+        return self._solve_law(t, x, args, solver, of_rate=True)
 
-    def _apply_to_response(
-        self, t: Any, x: Tree, args: Any, solver: Any, fn: Callable[[Any, Tree, Tree], Tree]
-    ) -> Tree:
-        """Return fn(t, x, u_x(t)) after checking the input and the solution of the law."""
+    def _solve_law(self, t: Any, x: Tree, args: Any, solver: Any, of_rate: bool) -> Tree:
+        """Return u_x(t), or f̃(t, x) if `of_rate`, after checking the input and the solution of the
+        law."""
         x, t = _tree.as_float(x, "x"), _tree.as_float(t, "t")
         for name, value in (("t", t), ("x", x)):
             _tree.check_not_nan(name, value)
         _user_code.check_args(args, "dvax.Problem.response")
         self.check(t, x, args)
-        vi, answer = self._law(t, x, args, solver)
-        P = self.operator(args)
-        return unless_failed(vi, answer, lambda y: fn(t, x, P.inverse(y)), solver)
+        if wrong := solver_problems("solver", solver):
+            raise InputError(*wrong)
+        # Without this a number would be a static argument, and a new one compile a new program.
+        numbers = jax.tree_util.tree_map(
+            lambda v: jnp.asarray(v) if isinstance(v, float) else v, args
+        )
+        out, solved, answer = _solve_compiled(self, t, x, numbers, solver, of_rate)
+        raise_failure(solved, answer, solver)
+        return out
 
     def check(self, t: Any, x: Tree, args: Any = None) -> None:
         """Raise an `InputError` with all problems of parameters, spaces, shapes, A, P and K."""
@@ -349,6 +356,21 @@ class Problem(eqx.Module):
             return _tree.zeros_like(x) if zero is None else zero
         dtype = jnp.result_type(*jax.tree_util.tree_leaves(x))
         return jax.tree_util.tree_map(lambda leaf: leaf.astype(dtype), self.control_space.zeros())
+
+
+@eqx.filter_jit
+def _solve_compiled(
+    problem: Problem, t: Any, x: Tree, args: Any, solver: Any, of_rate: bool
+) -> tuple[Tree, Any, Answer]:
+    """Return u_x(t) or f̃(t, x), whether the law was solved, and the answer of the solver."""
+    vi, answer = problem._law(t, x, args, solver)
+    P = problem.operator(args)
+
+    def read(y: Tree) -> Tree:
+        u = P.inverse(y)
+        return problem.f(t, x, u, args) if of_rate else u
+
+    return *unless_failed(vi, answer, read), answer
 
 
 def _shape_fix(name: str, out: Tree, element: Tree, space: str) -> str:

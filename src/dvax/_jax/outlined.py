@@ -37,6 +37,10 @@ _MAX_COSTLY = 500
 _MAX_MATRIX = 5
 """Largest number of rows in a product of two matrices: larger products are library calls too."""
 
+_MAX_EQUATIONS = 15_000
+"""Largest number of operations: the compile time of one function grows faster than its length (18 000
+operations take 21 s, and as separate kernels 7 s)."""
+
 _MAX_PACKED = 10**6
 """Largest number of entries of all packed arguments together."""
 
@@ -59,8 +63,8 @@ _PARTS = {"dynamic_slice": None, "gather": None, "dynamic_update_slice": 1, "sca
 number."""
 _FREE = ("broadcast_in_dim", "stop_gradient", "reshard")
 _NESTED = frozenset(
-    "jit pjit closed_call custom_jvp_call custom_vjp_call custom_vmap_call remat2 cond scan "
-    "while".split()
+    "custom_linear_solve jit pjit closed_call custom_jvp_call custom_vjp_call custom_vmap_call remat2 "
+    "cond scan while".split()
 )
 
 
@@ -97,7 +101,10 @@ def _bind(program: ClosedJaxpr, leaves: list[Any], packs: list[bool]) -> list[An
     packed = list(compress(leaves, packs))
     numbers = all(leaf.dtype in _PACKABLE for leaf in packed)
     if not (
-        numbers and 0 < sum(leaf.size for leaf in packed) <= _MAX_PACKED and _is_small(program)
+        numbers
+        and 0 < sum(leaf.size for leaf in packed) <= _MAX_PACKED
+        and _is_small(program)
+        and _count(program) <= _MAX_EQUATIONS
     ):
         return jaxpr_as_fun(program)(*leaves)
     return _outlined_p.bind(*leaves, program=program, packs=tuple(packs))
@@ -105,6 +112,11 @@ def _bind(program: ClosedJaxpr, leaves: list[Any], packs: list[bool]) -> list[An
 
 # The following functions decide which programs are small and contain only operations that XLA can
 # compile in one function. A request for another program aborts the process.
+
+
+def _count(program: ClosedJaxpr) -> int:
+    """Return the number of operations of a program, with those of its inner programs."""
+    return sum(1 + sum(map(_count, _nested_programs(e.params))) for e in program.jaxpr.eqns)
 
 
 def _is_small(program: ClosedJaxpr) -> bool:

@@ -164,18 +164,18 @@ def _kinked(flow: Flow, evaluations: list[Evaluation]) -> Any:
     """Return whether the regime changes between two of the evaluations, as far as the switches of K and
     the branches of f and h show; true if K has no switches."""
     problem, args = flow.problem, flow.args
-    if flow.switches(evaluations[0].t, evaluations[0].x, evaluations[0].rate.z) is None:
+    known = [flow.switches_of(one.t, one.x, one.rate) for one in evaluations]
+    if known[0] is None:
         return jnp.asarray(True)
 
-    def signs(one: Evaluation) -> jax.Array:
-        known = flow.switches(one.t, one.x, one.rate.z)
+    def signs(one: Evaluation, switches: Any) -> jax.Array:
         u = flow.operator.inverse(one.rate.y)
-        found = [] if known is None else [known]
+        found = [switches]
         for fn in (problem.f, problem.h):
             found += branches(lambda t, x, u, fn=fn: fn(t, x, u, args), one.t, one.x, u)
-        return jnp.concatenate([jnp.ravel(s) > 0 for s in found] or [jnp.zeros(0, bool)])
+        return jnp.concatenate([jnp.ravel(s) > 0 for s in found])
 
-    rows = jnp.stack([signs(one) for one in evaluations])
+    rows = jnp.stack(list(map(signs, evaluations, known)))
     return jnp.any(rows[1:] != rows[:-1])
 
 

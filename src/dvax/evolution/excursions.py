@@ -101,9 +101,8 @@ class ExcursionGuard(eqx.Module):
         self, flow: Flow, evaluations: list[Evaluation], variation: Tree, share: Any
     ) -> ExcursionEstimate:
         """Return bounds on the changes between the samples of a step of this `share` of the run."""
-        samples, variation = jax.lax.stop_gradient(
-            ([(v.t, v.x, v.rate.y, v.rate.z) for v in evaluations], variation)
-        )
+        evaluations, variation = jax.lax.stop_gradient((evaluations, variation))
+        samples = [(v.t, v.x, v.rate.y, v.rate.z) for v in evaluations]
         first = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *samples[:-1])
         second = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *samples[1:])
         zero = jnp.zeros_like(evaluations[0].t)
@@ -122,7 +121,10 @@ class ExcursionGuard(eqx.Module):
             rates, laws = (_largest(part) if part else zero for part in excess)
 
         def excursion(ignored: Any) -> Any:
-            return self._excursion(flow, samples, first, second, ignored) if self.switches else zero
+            if not self.switches:
+                return zero
+            rows = [flow.switches_of(v.t, v.x, v.rate) for v in evaluations]
+            return self._excursion(flow, samples, rows, first, second, ignored)
 
         # Use y and not z: an entry of z far outside K corresponds to a y at the bound.
         size = _largest([jnp.abs(leaf) for p in samples for leaf in jtu.tree_leaves(p[2])])
@@ -157,9 +159,10 @@ class ExcursionGuard(eqx.Module):
         )
         return changes, dev
 
-    def _excursion(self, flow: Flow, samples: Any, first: Any, second: Any, ignored: Any) -> Any:
+    def _excursion(
+        self, flow: Flow, samples: Any, rows: Any, first: Any, second: Any, ignored: Any
+    ) -> Any:
         """Return the largest ratio of a deviation to the deviation that may change a sign."""
-        rows = [_switches(flow, t, x, z) for t, x, _, z in samples]
         if self.enclosed:
             with below_parabola():
                 dev = jax.vmap(lambda p, q: self._deviation(flow, p, q))(first, second)

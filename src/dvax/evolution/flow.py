@@ -35,7 +35,8 @@ class Rate(NamedTuple):
     """f̃(t, x) and the law behind it.
 
     `value` = f(t, x, u); y = P u; `z`, whose projection onto K is y (both None where not kept);
-    `residual` = ‖w‖ of the frozen solve; `solved`, whether it met its tolerance; `evaluations` of F.
+    `residual` = ‖w‖ of the frozen solve; `solved`, whether it met its tolerance; `evaluations` of F;
+    `switches`, the switch functions of K at z, where the flow keeps them (`Flow.keeps_switches`).
     """
 
     value: Tree
@@ -44,6 +45,7 @@ class Rate(NamedTuple):
     residual: jax.Array
     solved: jax.Array
     evaluations: jax.Array
+    switches: jax.Array | None = None
 
 
 class Flow(eqx.Module):
@@ -55,6 +57,8 @@ class Flow(eqx.Module):
     `reciprocal` is 1/a where a was proved not to depend on t and x, so that it is computed once.
     `enclosed` says that f̃ has a linear enclosure over a whole step, so that nothing about the defect
     is guessed. `linear` is A + J where some J joins A in what is left to the propagator.
+    With `keeps_switches`, `rate` also returns the switch functions of a law that is solved by
+    iteration, so that they are compiled once with it and not wherever they are read.
     """
 
     problem: Problem
@@ -70,6 +74,7 @@ class Flow(eqx.Module):
     L_F: Any
     small_box: AbstractSmallBox | None = None
     linear: AbstractLinear | None = None
+    keeps_switches: bool = eqx.field(static=True, default=False)
 
     def propagator(self, h: Any, terms: int) -> AbstractPropagator:
         """The exact flow over h of x' = Ax + p, or of x' = (A + J)x + p."""
@@ -167,7 +172,11 @@ class Flow(eqx.Module):
         u = enclose(P.inverse, y)
         return enclose(lambda t, x, u: problem.f(t, x, u, args), t, x, u), u
 
-    def switches(self, t: Any, x: Tree, z: Tree) -> jax.Array | None:
+    def switches_of(self, t: Any, x: Tree, rate: Rate) -> jax.Array | None:
+        """`switches` at (t, x), whose rate this is."""
+        return self.switches(t, x, rate.z) if rate.switches is None else rate.switches
+
+    def switches(self, t: Any, x: Tree, z: Tree | None) -> jax.Array | None:
         """What changes its sign where the response has a kink; None where K does not say."""
         K, space = self.problem.set_at(t, self.args), self.problem.spaces(x)[1]
         found = K.switches(z, space)
@@ -221,7 +230,11 @@ def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
     answer = flow.solver.solve(vi, start, flow.tol)
     value = problem.f(t, x, flow.operator.inverse(answer.y), args)
     solved = answer.result == RESULTS.successful
-    return Rate(value, answer.y, answer.z, answer.residual, solved, answer.evaluations)
+    switches = flow.switches(t, x, answer.z) if flow.keeps_switches else None
+    return Rate(
+        value, answer.y, answer.z, answer.residual, solved, answer.evaluations,
+        jax.lax.stop_gradient(switches),
+    )  # fmt: skip
 
 
 def slope(problem: Problem, operator: AbstractOperator, t: Any, x: Tree, args: Any) -> Tree:

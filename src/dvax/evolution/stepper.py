@@ -386,7 +386,7 @@ class Stepper(eqx.Module):
         flow, thetas = self.flow, (0.0, *sample.thetas, 1.0)
 
         def switches(t: Any, rate: Rate) -> jax.Array:
-            found = flow.switches(t, x0, rate.z)
+            found = flow.switches_of(t, x0, rate)
             assert found is not None
             return lax.stop_gradient(found)
 

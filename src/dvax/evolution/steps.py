@@ -138,6 +138,7 @@ def _stepper(
         # Once a run: for a matrix it takes an eigenvalue.
         growth = flow.generator.growth(flow.state_space(setup.x0))
     locate = not options.fixed and _can_locate(flow, t0, setup.x0)
+    flow = dataclasses.replace(flow, keeps_switches=locate and not flow.direct)
     watch = not options.fixed and measure and not flow.enclosed
     guard = excursions.guard(flow, t0, setup.x0) if watch else None
     stepper = Stepper(

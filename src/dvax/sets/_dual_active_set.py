@@ -20,6 +20,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from .._small_matrices import combine, times
+
 SLACK = 0.75
 """A row is satisfied if its violation is at most eps^0.75 of its terms: 2e-12 in double precision."""
 
@@ -61,7 +63,7 @@ def nearest_point(rows: jax.Array, bounds: jax.Array, z: jax.Array, size: jax.Ar
     size = jnp.where(finite, jnp.abs(bounds), 0.0) + size
 
     def slack(x: jax.Array) -> jax.Array:
-        return jnp.where(finite, rows @ x - jnp.where(finite, bounds, 0.0), -jnp.inf)
+        return jnp.where(finite, times(rows, x) - jnp.where(finite, bounds, 0.0), -jnp.inf)
 
     # At the apex of a cone x should be 0; its roundoff is relative to the norm of z.
     residue = eps ** (1.0 + SLACK) * jnp.linalg.norm(z)
@@ -82,12 +84,12 @@ def nearest_point(rows: jax.Array, bounds: jax.Array, z: jax.Array, size: jax.Ar
         normal = rows[row]
         # The component of the normal orthogonal to the active rows. The second pass removes the
         # roundoff of the first.
-        coefficients = s.dual @ normal
-        direction = normal - coefficients @ _masked(s.active, rows)
-        correction = s.dual @ direction
+        coefficients = times(s.dual, normal)
+        direction = normal - combine(coefficients, _masked(s.active, rows))
+        correction = times(s.dual, direction)
         coefficients = coefficients + correction
-        direction = direction - correction @ _masked(s.active, rows)
-        square = direction @ direction
+        direction = direction - combine(correction, _masked(s.active, rows))
+        square = jnp.sum(direction * direction)
         independent = square > (1e3 * eps) ** 2
 
         full_step = jnp.where(independent, jnp.maximum(slack(s.x)[row], 0.0) / square, jnp.inf)
@@ -95,27 +97,34 @@ def nearest_point(rows: jax.Array, bounds: jax.Array, z: jax.Array, size: jax.Ar
         divisor = jnp.where(decreasing, coefficients, 1.0)
         ratios = jnp.where(decreasing, s.multiplier / divisor, jnp.inf)
         dropped = jnp.argmin(ratios)
-        step = jnp.minimum(full_step, ratios[dropped])
+        smallest_ratio = ratios[dropped]
+        step = jnp.minimum(full_step, smallest_ratio)
         failed = ~(step < jnp.inf)
-        adds_row = full_step <= ratios[dropped]
+        adds_row = full_step <= smallest_ratio
 
-        multiplier = jnp.maximum(s.multiplier - step * coefficients, 0.0).at[row].add(step)
+        # Masks instead of indexed updates, which compile to much longer code.
+        is_row, is_dropped = index == row, (index == dropped) & ~adds_row
+        multiplier = jnp.maximum(s.multiplier - step * coefficients, 0.0)
+        multiplier = multiplier + jnp.where(is_row, step, 0.0)
+        multiplier = jnp.where(is_dropped, 0.0, multiplier)
         x = s.x - jnp.where(independent, step, 0.0) * direction
-        added_dual = direction / square
-        with_row = (s.dual - jnp.outer(coefficients, added_dual)).at[row].set(added_dual)
+        # Rank-one update of the pseudoinverse with the added row, or without the dropped one.
         dropped_dual = s.dual[dropped]
-        overlap = s.dual @ dropped_dual / jnp.where(adds_row, 1.0, dropped_dual @ dropped_dual)
-        without_row = (s.dual - jnp.outer(overlap, dropped_dual)).at[dropped].set(0.0)
-        active = jnp.where(adds_row, s.active.at[row].set(True), s.active.at[dropped].set(False))
-        dual = jnp.where(adds_row, with_row, without_row)
-        multiplier = jnp.where(adds_row, multiplier, multiplier.at[dropped].set(0.0))
+        length = jnp.where(adds_row, 1.0, jnp.sum(dropped_dual * dropped_dual))
+        overlap = times(s.dual, dropped_dual) / length
+        new_dual = jnp.where(adds_row, direction / square, dropped_dual)
+        weights = jnp.where(adds_row, coefficients, overlap)
+        dual = s.dual - weights[:, None] * new_dual[None, :]
+        dual = jnp.where((is_row & adds_row)[:, None], new_dual[None, :], dual)
+        dual = jnp.where(is_dropped[:, None], 0.0, dual)
+        active = (s.active | (is_row & adds_row)) & ~is_dropped
         # Project back onto the active rows: this corrects the roundoff of a distant z.
-        x = x - jnp.where(active, slack(x), 0.0) @ dual
+        x = x - combine(jnp.where(active, slack(x), 0.0), dual)
         violation = violations(x, active)
         pending = ~adds_row
         return _State(x, dual, multiplier, active, row, pending, violation, failed, s.count + 1)
 
-    none = jnp.zeros(m, bool)
+    none, index = jnp.zeros(m, bool), jnp.arange(m)
     start = _State(
         x=z,
         dual=jnp.zeros((m, n), dtype),
@@ -129,10 +138,10 @@ def nearest_point(rows: jax.Array, bounds: jax.Array, z: jax.Array, size: jax.Ar
     )
     end = lax.while_loop(unfinished, advance, start)
     # Check the optimality conditions: x in the set, z − x a nonnegative sum of active normals.
-    multiplier = end.dual @ (z - end.x)
+    multiplier = times(end.dual, z - end.x)
     magnitude = jnp.linalg.norm(z) + jnp.linalg.norm(end.x)
     kkt_tolerance = jnp.sqrt(eps) * 1e-2 * magnitude  # well above the accumulated roundoff
-    residual = z - end.x - multiplier @ _masked(end.active, rows)
+    residual = z - end.x - combine(multiplier, _masked(end.active, rows))
     stationary = jnp.linalg.norm(residual) <= kkt_tolerance
     feasible = jnp.all(~(slack(end.x) > 2.0 * tolerance(end.x)))
     nonnegative = jnp.all(multiplier >= -kkt_tolerance)

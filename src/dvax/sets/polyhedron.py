@@ -5,8 +5,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
 from .. import _tree
+from .._small_matrices import pseudoinverse
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
@@ -115,7 +117,7 @@ def _nearest(
     if len(e):
         # Restrict to the affine subspace of the equations; only inequalities remain.
         equations, values = _scaled(E, e, root)
-        back = jnp.linalg.pinv(equations)
+        back = pseudoinverse(equations)
         base = back @ values
         point = point - base - back @ (equations @ point - values)
         point = point - back @ (equations @ point)
@@ -137,7 +139,6 @@ def _nearest(
     return y, nearest.active.astype(z.dtype), nearest.multiplier
 
 
-@_nearest.defjvp
 def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
     y, active, multiplier = _nearest(*primals)
 
@@ -148,11 +149,25 @@ def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
             jnp.concatenate([e, jnp.where(active > 0, d, 0.0)]),
             root,
         )
-        point = z / root
-        return root * (point - jnp.linalg.pinv(rows) @ (rows @ point - bounds))
+        point, back = z / root, pseudoinverse(rows)
+        # Sums of products: for a batch of tangents, matrix products would be calls of a library.
+        excess = jnp.sum(rows * point[None, :], axis=1) - bounds
+        return root * (point - jnp.sum(back * excess[None, :], axis=1))
 
-    _, dy = jax.jvp(project_on_face, primals, tangents)
+    # Inputs without a tangent are constants: the derivative in z alone is a projection.
+    moving = [k for k, v in enumerate(tangents) if not isinstance(v, SymbolicZero)]
+
+    def of_moving(*values: jax.Array) -> jax.Array:
+        inputs = list(primals)
+        for k, value in zip(moving, values, strict=True):
+            inputs[k] = value
+        return project_on_face(*inputs)
+
+    _, dy = jax.jvp(of_moving, [primals[k] for k in moving], [tangents[k] for k in moving])
     return (y, active, multiplier), (dy, jnp.zeros_like(active), jnp.zeros_like(multiplier))
+
+
+_nearest.defjvp(_nearest_jvp, symbolic_zeros=True)
 
 
 def _scaled(G: jax.Array, d: jax.Array, root: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -19,6 +19,7 @@ from .certificate import residual_bound as residual_bound
 from .extragradient import Extragradient as Extragradient
 from .forward_backward_forward import ForwardBackwardForward as ForwardBackwardForward
 from .golden_ratio import GoldenRatio as GoldenRatio
+from .lemke import Lemke as Lemke
 from .projection import Projection as Projection
 from .refute import Counterexample as Counterexample
 from .refute import refute_gamma as refute_gamma

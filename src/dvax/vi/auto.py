@@ -11,6 +11,7 @@ from .abstract import AbstractSolver, Answer, FrozenVI
 from .active_set import ActiveSet
 from .bracketing import Bracketing, affine_answer, is_pointwise
 from .golden_ratio import GoldenRatio
+from .lemke import Lemke, is_affine_on_polyhedron
 from .semismooth_newton import SemismoothNewton
 
 _MAX_NEWTON_UNKNOWNS = 1024
@@ -22,6 +23,7 @@ class Auto(AbstractSolver):
 
     - F(y) = ay + c with one number a: the closed form y* = proj_K(−c/a), for any K (`ClosedForm`);
     - K a pointwise interval and F pointwise: `Bracketing` (closed form where F is affine);
+    - F affine, K a simplex or a polyhedron of at most 16 unknowns: `Lemke`;
     - up to 1024 unknowns: `ActiveSet` on a box, `SemismoothNewton` on other sets;
     - beyond: `GoldenRatio`, which needs no moduli and forms no matrix.
 
@@ -47,7 +49,9 @@ class Auto(AbstractSolver):
         size = sum(leaf.size for leaf in jtu.tree_leaves(like))
         if size > _MAX_NEWTON_UNKNOWNS:
             return GoldenRatio()
-        return SemismoothNewton() if vi.K.intervals(like) is None else ActiveSet()
+        if vi.K.intervals(like) is not None:
+            return ActiveSet()
+        return Lemke() if is_affine_on_polyhedron(vi, like) else SemismoothNewton()
 
     def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
         return self.choose_for(vi, y0).solve(vi, y0, tol)

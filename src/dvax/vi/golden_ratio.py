@@ -43,38 +43,46 @@ class GoldenRatio(AbstractSolver):
         check_parameters(self, phi=GOLDEN, max_steps=STEPS)
 
     def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
-        phi = self.phi
-        growth = 1.0 / phi + 1.0 / phi**2
+        return golden_ratio(vi, y0, tol, self.max_steps, phi=self.phi)
 
-        def begin(vi: FrozenVI, y: Tree) -> tuple:
-            Fy = vi.F(y)
-            lam = first_step(vi, y, Fy)
-            # A second point, for the first difference quotient.
-            after = vi.K.project(_tree.sub(y, _tree.scale(lam, Fy)), vi.space)
-            return after, vi.F(after), y, Fy, y, lam, jnp.ones_like(lam)
 
-        def advance(vi: FrozenVI, state: tuple) -> tuple[tuple, Trial]:
-            y, Fy, y_previous, F_previous, average, lam, theta = state
-            distance = vi.space.norm(_tree.sub(y, y_previous))
-            change = vi.space.norm(_tree.sub(Fy, F_previous))
-            flat = change == 0
-            ratio = distance / jnp.where(flat, 1.0, change)
-            limit = jnp.where(flat, jnp.inf, phi * theta / (4.0 * lam) * ratio**2)
-            new = jnp.minimum(jnp.minimum(growth * lam, limit), _LARGEST_STEP)
-            average = _tree.scale(1 / phi, _tree.add(_tree.scale(phi - 1, y), average))
-            after = vi.K.project(_tree.sub(average, _tree.scale(new, Fy)), vi.space)
-            F_after = vi.F(after)
-            w = residual_vector(F_after, Fy, average, after, new)
-            state = after, F_after, y, Fy, average, new, phi * new / lam
-            return state, Trial(after, w, F_after, new, [after, average], 1, base=(average, new))
+def golden_ratio(
+    vi: FrozenVI, y0: Tree, tol: Any, max_steps: int, first: Any = None, phi: float = 1.5
+) -> Answer:
+    """Run the golden ratio algorithm.
 
-        return iterate(
-            vi,
-            y0,
-            tol,
-            begin,
-            advance,
-            self.max_steps,
-            initial_evaluations=2 + (vi.L_F is None),
-            iterate_count=2,
-        )
+    Without a `first` step λ₀ is a difference quotient at proj_K(y0), and a projection step from there
+    gives the second point. With one, both points are proj_K(y0), which saves evaluations if y0 is close
+    to the solution.
+    """
+    growth = 1.0 / phi + 1.0 / phi**2
+
+    def begin(vi: FrozenVI, y: Tree) -> tuple:
+        Fy = vi.F(y)
+        if first is not None:
+            lam = jnp.asarray(first)
+            return y, Fy, y, Fy, y, lam, jnp.ones_like(lam)
+        lam = first_step(vi, y, Fy)
+        # A second point, for the first difference quotient.
+        after = vi.K.project(_tree.sub(y, _tree.scale(lam, Fy)), vi.space)
+        return after, vi.F(after), y, Fy, y, lam, jnp.ones_like(lam)
+
+    def advance(vi: FrozenVI, state: tuple) -> tuple[tuple, Trial]:
+        y, Fy, y_previous, F_previous, average, lam, theta = state
+        distance = vi.space.norm(_tree.sub(y, y_previous))
+        change = vi.space.norm(_tree.sub(Fy, F_previous))
+        flat = change == 0
+        ratio = distance / jnp.where(flat, 1.0, change)
+        limit = jnp.where(flat, jnp.inf, phi * theta / (4.0 * lam) * ratio**2)
+        new = jnp.minimum(jnp.minimum(growth * lam, limit), _LARGEST_STEP)
+        average = _tree.scale(1 / phi, _tree.add(_tree.scale(phi - 1, y), average))
+        after = vi.K.project(_tree.sub(average, _tree.scale(new, Fy)), vi.space)
+        F_after = vi.F(after)
+        w = residual_vector(F_after, Fy, average, after, new)
+        state = after, F_after, y, Fy, average, new, phi * new / lam
+        return state, Trial(after, w, F_after, new, [after, average], 1, base=(average, new))
+
+    evaluations = 1 if first is not None else 2 + (vi.L_F is None)
+    return iterate(
+        vi, y0, tol, begin, advance, max_steps, initial_evaluations=evaluations, iterate_count=2
+    )

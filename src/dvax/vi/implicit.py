@@ -16,6 +16,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
+from .._small_matrices import solve
 from .._tree import Tree
 from ..programs.matrix import matrix_of
 from .certificate import natural_residual
@@ -55,7 +56,7 @@ def _general_solve(g: Callable[[Tree], Tree], b: Tree) -> Tree:
     singular = ~(jnp.min(pivots) > flat.size * eps * jnp.max(pivots))
     # A factor of NaN or 1 keeps the result linear in b, as transposition requires.
     factor = jnp.where(singular, jnp.nan, jnp.ones((), flat.dtype))
-    return unflatten(jnp.linalg.solve(matrix, flat) * factor)
+    return unflatten(solve(matrix, flat) * factor)
 
 
 def _krylov_solve(g: Callable[[jax.Array], jax.Array], b: jax.Array) -> jax.Array:

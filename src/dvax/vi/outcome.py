@@ -25,34 +25,34 @@ single precision the tolerance 10⁻¹⁰ lies below that floor."""
 def is_solved(vi: FrozenVI, answer: Answer) -> Any:
     """Return whether an answer met its tolerance, or missed it because of rounding alone."""
     successful = answer.result == RESULTS.successful
-    if _tree.is_concrete(successful) and bool(successful):
-        return True
     missed = missed_tolerance(answer.result)
     y = jax.lax.stop_gradient(answer.y)
     rounding, _ = rounding_of(without_derivatives(vi), y, answer.residual_step, answer.residual)
     return successful | (missed & (answer.residual <= _ROUNDING_FACTOR * rounding))
 
 
-def unless_failed(
-    vi: FrozenVI, answer: Answer, read: Callable[[Tree], Tree], solver: AbstractSolver | None
-) -> Tree:
-    """Return read(y), computed from the y of an answer that solves the law.
+def unless_failed(vi: FrozenVI, answer: Answer, read: Callable[[Tree], Tree]) -> tuple[Tree, Any]:
+    """Return read(y) for the y of an answer, and whether the answer solves the law.
 
-    **Raises:** `dvax.SolveError`, which carries the answer, if it does not solve the law. Under
-    tracing, values and derivatives are NaN instead.
+    If it does not, values and derivatives are NaN.
     """
     solved, out = is_solved(vi, answer), read(answer.y)
-    if _tree.is_concrete(solved):
-        if not bool(solved):
-            raise _failure(answer, solver)
-        return out
     out = jtu.tree_map(lambda leaf: jnp.where(solved, leaf, jnp.nan), out)
 
     def dependencies(y: Tree) -> tuple[Tree, Any, Tree]:
         return vi.F(y), eqx.filter(vi.K, eqx.is_inexact_array), read(y)
 
     inputs = jtu.tree_leaves(eqx.filter_closure_convert(dependencies, answer.y))
-    return nan_derivatives_where(~solved, out, inputs)
+    return nan_derivatives_where(~solved, out, inputs), solved
+
+
+def raise_failure(solved: Any, answer: Answer, solver: AbstractSolver | None) -> None:
+    """Raise a `dvax.SolveError`, which carries the answer, if it does not solve the law.
+
+    Under tracing nothing can be raised.
+    """
+    if _tree.is_concrete(solved) and not bool(solved):
+        raise _failure(answer, solver)
 
 
 def _failure(answer: Answer, solver: AbstractSolver | None) -> SolveError:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from .. import _tree
+from .._small_matrices import product, solve
 from .._tree import Tree
 from ..programs.matrix import matrix_of
 from .abstract import AbstractSolver, Answer, FrozenVI
@@ -62,9 +63,9 @@ class SemismoothNewton(AbstractSolver):
 def _solve_by_lu(at: Linearisation, right: Tree) -> Tree:
     flat, unravel = ravel_pytree(right)
     slope, tangent = matrix_of(at.slope, right), matrix_of(at.tangent, right)
-    matrix = (at.tau * slope - jnp.eye(flat.size, dtype=flat.dtype)) @ tangent
-    matrix = matrix + jnp.eye(flat.size, dtype=flat.dtype)
-    return unravel(jnp.linalg.solve(matrix, flat))
+    identity = jnp.eye(flat.size, dtype=flat.dtype)
+    matrix = product(at.tau * slope - identity, tangent) + identity
+    return unravel(solve(matrix, flat))
 
 
 def _solve_by_gmres(at: Linearisation, right: Tree) -> Tree:

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dvax.app.cli.cache import enable_compilation_cache
+
 if TYPE_CHECKING:
     from dvax.app.runs.applications.config import ModelConfig
     from dvax.app.runs.config import Config
@@ -22,6 +24,7 @@ def load(file: Path, allow_outside: bool, quiet: bool = False) -> "Config | Mode
     **Raises:** `dvax.InputError`.
     """
     enable_double()
+    enable_compilation_cache()
     from dvax.app.runs.applications.config import read_config
 
     return read_config(file, allow_outside=allow_outside, quiet=quiet)
