@@ -80,10 +80,10 @@ def solve(
       as t0 and t1 are;
     - `dt`: fixed steps, no longer than this (the fewest equal ones between knots of the data);
       without it, steps adapt;
-    - `rtol`, `atol`: the integral of the defect over the run may amount to atol + rtol|x|, and steps
-      over kinks may add as much again. Where trajectories do not separate, that is the size of the
-      error of x. Methods of order above 3 keep the signed integral so small, over smooth steps, and the
-      others that of the norm, with which twice the tolerance is a bound;
+    - `rtol`, `atol`: the error of x is meant to be below atol + rtol|x| where trajectories do not
+      separate. With `ETD1` and `ETD2RK`, or with `constants`, the integral of the norm of the defect is
+      at most twice that. Other methods keep the signed integral so small over smooth steps, and let
+      a step owe more where earlier errors decay;
     - `method`: None chooses one from the structure and the size of the problem, and another one where
       stability limits its steps (not under `jax.jit` and `jax.vmap`); `stats["method"]` names it, with
       the reason. With `dt` or `constants` it is `dvax.ETD2RK()`. `vi_solver`: `dvax.vi.Auto()` by

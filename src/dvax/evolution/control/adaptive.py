@@ -22,9 +22,9 @@ from .stiffness_guard import StiffnessGuard
 
 class Adaptive(AbstractController):
     """Steps whose defect is at most (atol + rtol‖x‖)/horizon in the mean: of its norm, or the signed
-    mean where it cancels over a smooth step.
+    mean where it cancels over a smooth step; or more, where earlier errors decay (`ErrorTest`).
 
-    The defect integrated over these steps is then at most the tolerance. Steps over kinks and jumps may
+    Without such a decay the defect integrated over these steps is at most the tolerance. Steps over kinks and jumps may
     amount to the tolerance once more (`ErrorBudget`), so that the computed trajectory is the exact one
     of a system with a disturbance of at most twice the tolerance.
 
