@@ -55,7 +55,16 @@ def ratios(name, method):
     found = []
     for tol in TOLERANCES[method]:
         sol = dvax.solve(
-            problem, x0, 0.0, t1, args, ts, rtol=tol, atol=0.1 * tol, method=METHODS[method]
+            problem,
+            x0,
+            0.0,
+            t1,
+            args,
+            ts,
+            rtol=tol,
+            atol=0.1 * tol,
+            method=METHODS[method],
+            constants=constants,
         )
         bound = dvax.bound_error(problem, sol, constants)
         error = np.asarray(jax.vmap(lambda a, b: norm(a - b))(sol.xs, truth))

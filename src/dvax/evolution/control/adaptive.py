@@ -24,9 +24,9 @@ class Adaptive(AbstractController):
     """Steps whose defect is at most (atol + rtol‖x‖)/horizon in the mean: of its norm, or the signed
     mean where it cancels over a smooth step; or more, where earlier errors decay (`ErrorTest`).
 
-    Without such a decay the defect integrated over these steps is at most the tolerance. Steps over kinks and jumps may
-    amount to the tolerance once more (`ErrorBudget`), so that the computed trajectory is the exact one
-    of a system with a disturbance of at most twice the tolerance.
+    Without such a decay the defect integrated over these steps is at most the tolerance. Steps over
+    kinks and jumps may amount to the tolerance once more (`ErrorBudget`), so that the computed
+    trajectory is the exact one of a system with a disturbance of at most twice the tolerance.
 
     `decide` composes the parts in this order; each is a file of this folder:
 
