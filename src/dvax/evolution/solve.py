@@ -207,6 +207,7 @@ def solve(
         solution = propagate(
             setup, times, Limits(options.max_steps, dense, options.track_bounds, progress)
         )
+        solution.stats["method"] = choice.text()
         if throw and solution.result != RESULTS.successful:
             raise failure(solution)
         return solution

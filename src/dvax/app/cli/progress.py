@@ -62,8 +62,14 @@ class _Lines:
         left = (now - self.began) * (1 - done) / done if done > 0 else float("nan")
         print_remark(
             f"t = {event['t']:.6g} of {event['t_end']:.6g}{_unit(event)} ({done:.0%}), "
-            f"{event['steps']} steps, {left:.0f} s left"
+            f"{_steps(event)}, {left:.0f} s left"
         )
+
+
+def _steps(event: Event) -> str:
+    """The steps so far, with the name of the method."""
+    method = str(event.get("method", "")).partition(":")[0]
+    return f"{event['steps']} steps" + (f" of {method}" if method else "")
 
 
 def _unit(event: Event) -> str:
@@ -104,7 +110,7 @@ def _bar() -> Iterator[Listener]:
             elif kind == "stage":
                 bar.update(task, description=event["stage"])
             elif kind == "progress":
-                where = f"t = {event['t']:.4g}{_unit(event)}, {event['steps']} steps"
+                where = f"t = {event['t']:.4g}{_unit(event)}, {_steps(event)}"
                 bar.update(task, completed=event["t"], total=event["t_end"], where=where)
 
         yield listen

@@ -15,6 +15,7 @@ FACTS = {
     "stop_reason": "why it stopped",
     "started": "started",
     "finished": "finished",
+    "method": "method",
     "steps": "steps",
     "run_seconds": "run time [s]",
     "compile_seconds": "compile time [s]",

@@ -110,6 +110,7 @@ class ContactRun(AbstractRun):
             main, other = self._end(a), self._end(b)
             error, defect = bound, values["defect"][-1]
             self.steps += int(a.stats["steps"])
+            self.method = str(a.stats["method"])
             self.rejected += int(a.stats["rejected"])
             if first == 0:
                 self.event("compiled", compile_seconds=self.compiling())
@@ -118,6 +119,7 @@ class ContactRun(AbstractRun):
                 t=float(wanted[-1]),
                 t_end=float(times[-1]),
                 steps=self.steps,
+                method=self.method,
                 unit=self.config.units.time,
             )
 

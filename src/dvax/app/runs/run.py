@@ -54,7 +54,7 @@ class Facts:
 
 class AbstractRun(abc.ABC):
     """A run under way. `facts` stand in the manifest, `wording` turns errors into the words of the
-    configuration file; steps are counted by whoever takes them."""
+    configuration file; whoever takes steps counts them, and names the method."""
 
     facts: Facts
     wording: Wording
@@ -65,6 +65,7 @@ class AbstractRun(abc.ABC):
         self.compiling = compile_stopwatch()
         self.started, self.clock = datetime.now(UTC), time.monotonic()
         self.steps = self.rejected = 0
+        self.method = ""
 
     @abc.abstractmethod
     def begin(self) -> None:
@@ -144,6 +145,7 @@ class AbstractRun(abc.ABC):
             "finished": None if status == "running" else now.isoformat(timespec="seconds"),
             "compile_seconds": round(compiling, 3),
             "run_seconds": round(max(0.0, seconds - compiling), 3),
+            "method": self.method,
             "steps": self.steps,
             "rejected_steps": self.rejected,
             "data": {f.name: {"sha256": f.sha256, "bytes": f.bytes} for f in self.facts.data},

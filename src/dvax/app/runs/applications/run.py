@@ -49,10 +49,11 @@ class ApplicationRun(AbstractRun):
                 self.last = None
                 self.event("compiled", compile_seconds=self.compiling())
             self.steps += int(piece.stats["steps"])
+            self.method = str(piece.stats["method"])
             begin, t = float(plan.times[0]), float(piece.ts[-1])
             self.event(
                 "progress", t=t - begin, t_end=float(plan.times[-1]) - begin, steps=self.steps,
-                unit=plan.time_unit,
+                method=self.method, unit=plan.time_unit,
             )  # fmt: skip
         self._stage("writing the results")
         self.last = Work(self._compute(plan))
