@@ -1,5 +1,5 @@
 """Problems of many kinds for the choice of a method, each written twice: as a problem of dvax, and with
-its law solved by hand in NumPy, for references that share no code."""
+its law solved by hand, for references and peers that share no code."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -17,24 +17,22 @@ PLAIN = dvax.operators.Scaling(1.0)
 
 
 class Case(NamedTuple):
-    """x(0) = x0 up to `end`; `field(t, x)` is the right-hand side with the law solved by hand, by
-    NumPy, or None where `exact` is known."""
+    """x(0) = x0 up to `end`; `field(t, x, lib)` is the right-hand side with the law solved by hand, by
+    NumPy or JAX. x(end) is `exact` where that is known."""
 
     name: str
     problem: dvax.Problem
     x0: np.ndarray
     end: float
-    field: Callable[[float, np.ndarray], Any] | None = None
+    field: Callable[[Any, Any, Any], Any]
     exact: np.ndarray | None = None
 
     def reference(self) -> np.ndarray:
         """Return x(end), from the closed form or from SciPy's Radau at 1e-12."""
         if self.exact is not None:
             return np.asarray(self.exact)
-        field = self.field
-        assert field is not None
         found = solve_ivp(
-            lambda t, x: np.asarray(field(t, x)), (0.0, self.end), self.x0,
+            lambda t, x: np.asarray(self.field(t, x, np)), (0.0, self.end), self.x0,
             method="Radau", rtol=1e-12, atol=1e-14, max_step=self.end / 500,
         )  # fmt: skip
         assert found.success, found.message
@@ -43,16 +41,19 @@ class Case(NamedTuple):
 
 def cases(full: bool) -> list[Case]:
     """Return the problems: small ones, stiff ones, oscillations, fields; the large field if `full`."""
-    races = [contact(), moving_box(), shrinking_ball(), heat(64)]
-    found = [Case(r.name, r.problem, r.x0, r.end, exact=r.exact) for r in races]
-    found += [_oscillator(k) for k in (3.0, 1e3)]
-    found += [_diode(r) for r in (10.0, 0.1, 1e-3)]
-    found += [_spring(k) for k in (1e2, 1e4, 1e6)]
-    found += [_saturated_gain(k) for k in (1.0, 1e2, 1e4)]
-    found += [_van_der_pol(m) for m in (1.0, 50.0)]
-    found += [_turning(w) for w in (3.0, 30.0)]
+    races = [contact(), moving_box(), shrinking_ball(), heat(16), heat(64), heat(256)]
+    found = [Case(r.name, r.problem, r.x0, r.end, r.field, r.exact) for r in races]
+    found += [_oscillator(k) for k in (3.0, 30.0, 1e3, 1e5)]
+    found += [_diode(r) for r in (10.0, 1.0, 0.1, 1e-2, 1e-3)]
+    found += [_spring(k) for k in (1e2, 1e3, 1e4, 1e6)]
+    found += [_saturated_gain(k) for k in (1.0, 10.0, 1e2, 1e3, 1e4)]
+    found += [_van_der_pol(m) for m in (1.0, 10.0, 50.0)]
+    found += [_turning(w) for w in (3.0, 30.0, 100.0)]
     found += [_clipped_drive(), _pendulum(), _stiff_diagonal()]
-    return found + [_strip(n) for n in ((1000, 100_000) if full else (1000,))]
+    found += [_chain(n) for n in (5, 40)]
+    found += [_shares(n) for n in (4, 12)]
+    found += [_creep(eta) for eta in (1.0, 1e-2, 1e-4)]
+    return found + [_strip(n) for n in ((100, 1000, 100_000) if full else (100,))]
 
 
 def _planar(**parts: Any) -> dvax.Problem:
@@ -68,7 +69,7 @@ def _oscillator(k: float) -> Case:
     )  # fmt: skip
     return Case(
         f"oscillator with a spring of {k:g} on one side", problem, np.array([1.0, 0.0]), 20.0,
-        lambda t, x: [x[1], -x[0] + max(0.0, -k * x[0])],
+        lambda t, x, lib: lib.stack([x[1], -x[0] + lib.maximum(0.0, -k * x[0])]),
     )  # fmt: skip
 
 
@@ -81,7 +82,9 @@ def _diode(r: float) -> Case:
     )  # fmt: skip
     return Case(
         f"circuit with a diode of {r:g} Ω", problem, np.array([1.0, 0.0]), 10.0,
-        lambda t, x: [-x[1] + np.sin(2 * t) + max(0.0, -x[0] / r), x[0] - 0.1 * x[1]],
+        lambda t, x, lib: lib.stack(
+            [-x[1] + lib.sin(2 * t) + lib.maximum(0.0, -x[0] / r), x[0] - 0.1 * x[1]]
+        ),
     )  # fmt: skip
 
 
@@ -93,7 +96,7 @@ def _spring(k: float) -> Case:
     )  # fmt: skip
     return Case(
         f"spring of {k:g}", problem, np.array([4.0]), 8.0,
-        lambda t, x: 1.0 + np.sin(t) - x + np.maximum(0.0, k * (1.5 - x)),
+        lambda t, x, lib: 1.0 + lib.sin(t) - x + lib.maximum(0.0, k * (1.5 - x)),
     )  # fmt: skip
 
 
@@ -105,7 +108,7 @@ def _saturated_gain(k: float) -> Case:
     )  # fmt: skip
     return Case(
         f"saturated feedback of gain {k:g}", problem, np.array([2.0]), 10.0,
-        lambda t, x: -x + np.clip(k * (np.sin(t) - x), -2.0, 2.0),
+        lambda t, x, lib: -x + lib.clip(k * (lib.sin(t) - x), -2.0, 2.0),
     )  # fmt: skip
 
 
@@ -117,7 +120,9 @@ def _van_der_pol(m: float) -> Case:
     return Case(
         f"van der Pol, {m:g}, with a bounded force", problem, np.array([2.0, 0.0]),
         15.0 if m < 10 else 60.0,
-        lambda t, x: [x[1], m * (1 - x[0] ** 2) * x[1] - x[0] + np.clip(-x[0], -0.5, 0.5)],
+        lambda t, x, lib: lib.stack(
+            [x[1], m * (1 - x[0] ** 2) * x[1] - x[0] + lib.clip(-x[0], -0.5, 0.5)]
+        ),
     )  # fmt: skip
 
 
@@ -128,10 +133,12 @@ def _turning(w: float) -> Case:
     )  # fmt: skip
     return Case(
         f"rotation at the rate {w:g}", problem, np.array([1.0, 0.0]), 5.0,
-        lambda t, x: [
-            -0.1 * x[0] + w * x[1] + np.clip(-3 * x[0], -0.5, 0.5),
-            -w * x[0] - 0.1 * x[1] + np.sin(t),
-        ],
+        lambda t, x, lib: lib.stack(
+            [
+                -0.1 * x[0] + w * x[1] + lib.clip(-3 * x[0], -0.5, 0.5),
+                -w * x[0] - 0.1 * x[1] + lib.sin(t),
+            ]
+        ),
     )  # fmt: skip
 
 
@@ -143,7 +150,7 @@ def _clipped_drive() -> Case:
     )  # fmt: skip
     return Case(
         "clipped periodic drive", problem, np.array([0.0]), 20.0,
-        lambda t, x: -x + np.sin(5 * t) - np.clip(0.5 * (x + np.cos(7 * t)), 0.0, 0.5),
+        lambda t, x, lib: -x + lib.sin(5 * t) - lib.clip(0.5 * (x + lib.cos(7 * t)), 0.0, 0.5),
     )  # fmt: skip
 
 
@@ -154,7 +161,9 @@ def _pendulum() -> Case:
     )  # fmt: skip
     return Case(
         "pendulum with a bounded torque", problem, np.array([2.0, 0.0]), 15.0,
-        lambda t, x: [x[1], -np.sin(x[0]) - 0.1 * x[1] + np.clip(-2.0 * x[1], -0.3, 0.3)],
+        lambda t, x, lib: lib.stack(
+            [x[1], -lib.sin(x[0]) - 0.1 * x[1] + lib.clip(-2.0 * x[1], -0.3, 0.3)]
+        ),
     )  # fmt: skip
 
 
@@ -166,7 +175,61 @@ def _stiff_diagonal() -> Case:
     )  # fmt: skip
     return Case(
         "rates of 1, 100 and 10⁴", problem, np.array([1.0, 0.5, 0.2]), 5.0,
-        lambda t, x: rates * x + np.sin(t) - np.clip(x, 0.0, 0.4),
+        lambda t, x, lib: rates * x + lib.sin(t) - lib.clip(x, 0.0, 0.4),
+    )  # fmt: skip
+
+
+def _chain(n: int) -> Case:
+    """n masses on springs and dampers, the first one driven against a stop of stiffness 1000."""
+    laplacian = np.eye(n, k=1) + np.eye(n, k=-1) - 2.0 * np.eye(n)
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [laplacian, 0.1 * laplacian]])
+    drive = np.zeros(2 * n)
+    drive[2 * n - 1] = 1.0
+    stop = np.zeros(2 * n)
+    stop[n] = 1.0
+    problem = dvax.Problem(
+        A=generators.Dense(jnp.asarray(A)), P=PLAIN, K=sets.Box(0.0, jnp.inf),
+        f=lambda t, x, u, args: jnp.asarray(drive) * jnp.sin(t) + jnp.asarray(stop) * u,
+        h=lambda t, x, u, args: u - (1e-3 * u + x[0] + 0.1),
+        control_space=dvax.spaces.Euclidean(()),
+    )  # fmt: skip
+    return Case(
+        f"chain of {n} masses with a stop", problem, np.zeros(2 * n), 10.0,
+        lambda t, x, lib: (
+            A @ x + drive * lib.sin(t) + stop * lib.maximum(0.0, -1e3 * (x[0] + 0.1))
+        ),
+    )  # fmt: skip
+
+
+def _shares(n: int) -> Case:
+    """Shares on the simplex that follow payoffs, which the state lowers and a season moves."""
+    phase = 2.0 * np.pi * np.arange(n) / n
+
+    def projected(v: Any, lib: Any) -> Any:
+        """The projection on the simplex, by sorting (Held, Wolfe and Crowder 1974)."""
+        down = -lib.sort(-v)
+        level = (lib.cumsum(down) - 1.0) / lib.arange(1, n + 1)
+        return lib.maximum(v - lib.max(level), 0.0)
+
+    problem = dvax.Problem(
+        A=generators.Scalar(-0.5), P=PLAIN, K=sets.Simplex(1.0), f=lambda t, x, u, args: u,
+        h=lambda t, x, u, args: jnp.sin(t + jnp.asarray(phase)) - x,
+    )  # fmt: skip
+    return Case(
+        f"shares on a simplex of {n}", problem, np.full(n, 1.0 / n), 10.0,
+        lambda t, x, lib: -0.5 * x + projected(lib.sin(t + phase) - x, lib),
+    )  # fmt: skip
+
+
+def _creep(eta: float) -> Case:
+    """A viscoplastic bar under a cycle of strain: stress above 1 relaxes at the rate 1/η."""
+    problem = dvax.Problem(
+        A=generators.Zero(), P=PLAIN, K=sets.Box(-1.0, 1.0),
+        f=lambda t, x, u, args: 2.0 * jnp.cos(t) - (x - u) / eta, h=lambda t, x, u, args: x,
+    )  # fmt: skip
+    return Case(
+        f"viscoplastic bar of viscosity {eta:g}", problem, np.array([0.0]), 10.0,
+        lambda t, x, lib: 2.0 * lib.cos(t) - (x - lib.clip(x, -1.0, 1.0)) / eta,
     )  # fmt: skip
 
 
@@ -190,4 +253,7 @@ def _strip(n: int) -> Case:
             needed = np.log((rest - x) / (rest - level)) / rate
         spent = np.where(np.isfinite(needed), np.clip(needed, 0.0, left), left)
         x, left = rest + (x - rest) * np.exp(-rate * spent), left - spent
-    return Case(f"strip of {n} points", problem, x0, 2.0, exact=x)
+    return Case(
+        f"strip of {n} points", problem, x0, 2.0,
+        lambda t, x, lib: load - 1.5 * x - lib.clip(gap - x, 0.0, 0.5), x,
+    )  # fmt: skip

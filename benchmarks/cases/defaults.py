@@ -1,4 +1,4 @@
-"""A call with no options beside each single method: success, error in tolerances, and time."""
+"""A call with no options beside each single method, and beside other tools with the law by hand."""
 
 import sys
 import time
@@ -13,11 +13,14 @@ import dvax
 from ..clock import in_turn, spread, timed
 from ..default_problems import Case, cases
 from ..layout import duration
+from ..peers.by_hand import Solve, solvers
 from ..section import Comparison, Section, Table, Target
 
 _TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
 _METHODS = (dvax.ETD2RK(), dvax.ETD4RK(), dvax.DormandPrince(), dvax.ExpRosenbrock())
 _MOST_STEPS = 200_000
+_ENOUGH, _NEAR = 0.1, 1000.0
+"""Errors in tolerances: below the first, less is worth no more; above the second, no peer counts."""
 _LONGEST = 0.3
 """Seconds beyond which a named method is left out of the comparison, at this tolerance and below."""
 
@@ -30,16 +33,34 @@ def run(full: bool) -> Section:
             "with each method named. The error is that of x(t1), its root mean square in units of "
             "tol (1 + that of x), against closed forms or SciPy's Radau at 1e-12 with the law "
             "written by hand. A time is a median after compilation. Methods that fail, need more "
-            f"than {_MOST_STEPS} steps or miss ten tolerances do not count."
+            f"than {_MOST_STEPS} steps or miss ten tolerances do not count. Peers get the same "
+            "tolerances; a cell is ahead where time times error is smaller than that of every peer, an "
+            "error below a tenth of the tolerance being worth no more than that. SciPy runs the law in "
+            "NumPy, Diffrax in one compiled function."
         ),
     )
-    rows, errors, ratios, failures = [], [], [], 0
+    rows, errors, ratios, failures, beside, ahead = [], [], [], 0, [], []
     for case in cases(full):
         print(f"defaults: {case.name}", file=sys.stderr, flush=True)
         truth = case.reference()
         named = {type(method).__name__: method for method in _METHODS}
+        peers = solvers(case)
         for tol in _TOLERANCES:
-            row, error, ratio = _cell(case, truth, tol, named, full)
+            row, error, ratio, own = _cell(case, truth, tol, named, full)
+            others = _peers(case, truth, tol, peers, full)
+            score = own * max(error, _ENOUGH)
+            best = min(others, key=lambda name: others[name][2], default="-")
+            ahead.append(np.isfinite(score) and all(score <= v[2] for v in others.values()))
+            beside.append(
+                (case.name, f"{tol:g}", f"{error:.2g}, {duration(own)}")
+                + (
+                    (best, f"{others[best][0]:.2g}, {duration(others[best][1])}")
+                    if others
+                    else ("-", "-")
+                )
+                + ("yes" if ahead[-1] else "no",)
+            )
+            print("    " + "  ".join(beside[-1][2:]), file=sys.stderr, flush=True)
             print("  " + "  ".join(row[1:]), file=sys.stderr, flush=True)
             rows.append(row)
             failures += not np.isfinite(error)
@@ -47,6 +68,8 @@ def run(full: bool) -> Section:
             ratios.append(ratio)
     header = ("problem", "tolerance", "method chosen", "steps", "error", "time", "best", "ratio")
     section.tables.append(Table("the default call", header, rows))
+    header = ("problem", "tolerance", "dvax: error, time", "best peer", "error, time", "ahead")
+    section.tables.append(Table("beside other tools", header, beside))
     finite = np.asarray(errors)[np.isfinite(errors)]
     figures = [
         ("calls that fail", "≤", 0.0, float(failures)),
@@ -55,6 +78,7 @@ def run(full: bool) -> Section:
         ("largest error in tolerances", "≤", 3.0, float(np.max(finite))),
         ("time over the best method's, median", "≤", 1.5, float(np.nanmedian(ratios))),
         ("time over the best method's, largest", "≤", 3.0, float(np.nanmax(ratios))),
+        ("share of cells ahead of all peers", "≥", 0.9, float(np.mean(ahead))),
     ]
     for name, sign, value, reached in figures:
         target = Target(sign, value, reached)  # pyright: ignore[reportArgumentType]
@@ -64,11 +88,10 @@ def run(full: bool) -> Section:
 
 def _cell(
     case: Case, truth: np.ndarray, tol: float, named: dict[str, Any], full: bool
-) -> tuple[Any, float, float]:
-    """Return a row of the table, the error in tolerances, and the ratio of times. Methods that are too
-    slow leave `named`."""
+) -> tuple[Any, float, float, float]:
+    """Return a row of the table, the error in tolerances, the ratio of times, and the time. Methods
+    that are too slow leave `named`."""
     x0 = jnp.asarray(case.x0)
-    scale = tol * (1.0 + np.sqrt(np.mean(truth**2)))
 
     def solve(method: Any) -> dvax.Solution:
         return dvax.solve(
@@ -79,7 +102,7 @@ def _cell(
     def error_of(solution: dvax.Solution) -> float:
         if solution.result != dvax.RESULTS.successful:
             return np.inf
-        return float(np.sqrt(np.mean((np.asarray(solution.xs[-1]) - truth) ** 2)) / scale)
+        return _error(np.asarray(solution.xs[-1]), truth, tol)
 
     first = solve(None)
     able = {"": timed(lambda: jax.block_until_ready(solve(None).xs))}
@@ -105,4 +128,31 @@ def _cell(
         case.name, f"{tol:g}", first.stats["method"].split(":")[0], str(int(first.stats["steps"])),
         f"{error:.2g}", duration(own), best or "-", f"{ratio:.2f}",
     )  # fmt: skip
-    return row, error, ratio
+    return row, error, ratio, own
+
+
+def _peers(
+    case: Case, truth: np.ndarray, tol: float, peers: dict[str, Solve], full: bool
+) -> dict[str, tuple[float, float, float]]:
+    """Return error in tolerances, time and their product for the peers that come near the tolerance.
+    Those that are too slow leave `peers`."""
+    found = {}
+    for name, solve in list(peers.items()):
+        error = _error(solve(tol), truth, tol)
+        start = time.perf_counter()
+        solve(tol)
+        if time.perf_counter() - start > _LONGEST:
+            del peers[name]
+        if error < _NEAR:
+            run = timed(lambda solve=solve: solve(tol)) if name in peers else None
+            if run is not None:
+                middle = spread(in_turn({name: run}, 7 if full else 3)[name]).middle
+                found[name] = error, middle, middle * max(error, _ENOUGH)
+    return found
+
+
+def _error(x: np.ndarray, truth: np.ndarray, tol: float) -> float:
+    """Return the root mean square of the error in units of tol (1 + that of x), infinity for NaN."""
+    scale = tol * (1.0 + np.sqrt(np.mean(truth**2)))
+    found = float(np.sqrt(np.mean((x - truth) ** 2)) / scale)
+    return found if np.isfinite(found) else np.inf
