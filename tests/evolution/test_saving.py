@@ -27,6 +27,21 @@ def test_dense_output_saved_times_and_the_exact_solution_agree():
     assert float(dense.ts[-1]) == 4.0 and np.array_equal(dense.xs[-1], saved.xs[-1])
 
 
+def test_dense_runs_have_room_for_the_steps_that_they_take():
+    # More steps than there is room for at first, and a state whose 2²⁰ steps would fill the memory.
+    case = c1()
+    sol = dvax.solve(
+        case.problem, -1.0, 0.0, 2.0, args=case.args, rtol=1e-8, method=dvax.ETD2RK(), dense=True
+    )
+    assert int(sol.stats["steps"]) > 4096
+    for t in (0.0, 0.7, 1.999):
+        np.testing.assert_allclose(float(sol.evaluate(t)[0]), c1_solution(t)[0], atol=1e-7)
+    many = dvax.solve(
+        case.problem, -jnp.ones(20_000), 0.0, 2.0, args=case.args, rtol=1e-3, dense=True
+    )
+    np.testing.assert_allclose(many.evaluate(1.0)[0], c1_solution(1.0)[0], atol=1e-2)
+
+
 def test_ts_none_saves_the_end_only():
     sol = dvax.solve(c1().problem, -1.0, 0.0, 2.0, args=c1().args)
     assert np.asarray(sol.ts).tolist() == [2.0]

@@ -41,6 +41,9 @@ from .results import RESULTS
 from .setup import Options, Setup, as_arrays
 from .solution import Solution
 
+_FIRST_ROOM = 2**12
+"""Steps that a run with `dense=True` has room for at first."""
+
 _VI_SOLVER = Auto()
 """Constructing the default at every call would cost a part of a short run."""
 
@@ -100,7 +103,8 @@ def solve(
       between them it is for you to know;
     - `measure`: whether to sample the defect inside steps. Adaptive steps always do; fixed steps only
       when asked, since it doubles their cost;
-    - `dense`: keep every step, for `Solution.evaluate`; memory grows with `max_steps`;
+    - `dense`: keep every step, for `Solution.evaluate`. Under `jax.jit` there is room for `max_steps`
+      of them, and else for as many as the run needs;
     - `dt0`, `horizon`: first step and length of the whole run, to continue a run in pieces. Without
       `dt0` the first step is 10⁻⁶ of the run, and its error estimate chooses the second one;
     - `dt_max`: the longest adaptive step, for data with features that no sample may miss;
@@ -197,9 +201,6 @@ def solve(
         progress=progress,
         max_events=max_events if events else 0,
     )
-    if dense and isinstance(method, AbstractMethod):
-        entries = sum(leaf.size for leaf in jax.tree_util.tree_leaves(x0))
-        check_memory(entries, jnp.dtype(dtype).itemsize, options.max_steps, method.degree)
     vi_solver = _VI_SOLVER if vi_solver is None else vi_solver
     setup = Setup(problem, x0, args, setting, method, vi_solver, _moduli(constants), tuple(events))
     times = None if ts is None else _times(ts)
@@ -211,7 +212,10 @@ def solve(
         if throw and solution.result != RESULTS.successful:
             raise failure(solution)
         return solution
-    solution, reached = _run_chosen(choice, setup, times, options)
+    if dense and isinstance(method, AbstractMethod):
+        solution, reached = _run_recorded(choice, setup, times, options)
+    else:
+        solution, reached = _run_chosen(choice, setup, times, options)
     setup = solution.setup
     if reached is True and not dense and not events:
         return solution
@@ -279,6 +283,23 @@ def _only_adaptive(dt: Any, method: Any) -> None:
                     "Leave it out, or use dvax.bound_error on the solution",
                 )
             )  # fmt: skip
+
+
+def _run_recorded(
+    choice: Choice, setup: Setup, times: Any, options: Options
+) -> tuple[Solution, bool | jax.Array]:
+    """Run with room for few steps first, and with more where the run needs them: `max_steps` bounds the
+    work, and not the size of the records."""
+    most, room = options.max_steps, options.max_steps
+    if not options.fixed and _tree.is_concrete(_tree.primal((setup, times))):
+        room = min(most, _FIRST_ROOM)
+    entries = sum(leaf.size for leaf in jax.tree_util.tree_leaves(setup.x0))
+    while True:
+        check_memory(entries, jnp.dtype(setup.dtype).itemsize, room, setup.method.degree)
+        solution, reached = _run_chosen(choice, setup, times, options._replace(max_steps=room))
+        if reached is not False or solution.result != RESULTS.max_steps or room == most:
+            return solution, reached
+        room = min(most, 16 * room)
 
 
 def _run_chosen(
