@@ -35,7 +35,7 @@ def rts():
 @pytest.fixture(scope="module")
 def week(rts):
     market = Market.from_rts(rts, JULY, 168)
-    return market, market.run(rtol=1e-6, atol=1e-6)
+    return market, market.run(rtol=1e-6, atol=1e-6, constants=market.constants)
 
 
 def numpy_data(market, t):

@@ -109,7 +109,8 @@ class ErrorTest(eqx.Module):
         before, after = (self._ratio(e, x0, step.x1) for e in step.carried)
         decay = 1.0 - after / jnp.where(before > 0.0, before, 1.0)
         room = jnp.clip(decay, 0.0, 1.0) * jnp.maximum(1.0 - before, 0.0)
-        return lax.stop_gradient(jnp.where(before > 0.0, room * self.horizon / h, 0.0))
+        known = (before > 0.0) & jnp.isfinite(before) & jnp.isfinite(after)
+        return lax.stop_gradient(jnp.where(known, room * self.horizon / h, 0.0))
 
     def excursion(self, x0: Tree, step: Step) -> Any:
         """Return the size of what may lie between the samples of the defect, in units of what may
