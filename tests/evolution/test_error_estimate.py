@@ -1,5 +1,5 @@
-"""Steps may add what earlier errors lose, and the error stays below the tolerance: rates of decay of 1 to
-10⁴, slow and fast parts, and trajectories that approach each other first and separate later."""
+"""Steps may add what earlier errors lose, and the error stays below the tolerance: rates of decay of 1
+to 10⁴, slow and fast parts, and trajectories that approach each other first and separate later."""
 
 from types import SimpleNamespace
 
