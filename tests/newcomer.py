@@ -248,7 +248,7 @@ ARGUMENTS = {
     "measure text": (lambda: solve(measure="yes"), "(measure); 'yes'"),
     "dense text": (lambda: solve(dense="yes"), "(dense); 'yes'"),
     "dense without end": (
-        lambda: solve(x0=jnp.zeros(1000), dense=True, max_steps=2**31 - 1),
+        lambda: jax.jit(lambda x0: solve(x0=x0, dense=True, max_steps=2**31 - 1))(jnp.zeros(1000)),
         "GiB; max_steps",
     ),
     "constants text": (lambda: solve(constants="a"), "(constants); 'a'"),

@@ -42,7 +42,10 @@ from .setup import Options, Setup, as_arrays
 from .solution import Solution
 
 _FIRST_ROOM = 2**12
-"""Steps that a run with `dense=True` has room for at first."""
+"""Steps that a run with `dense=True` has room for at first, with few entries of the state."""
+
+_LEAST_ROOM, _FIRST_ENTRIES = 64, 10**8
+"""The same with many entries: as many as make `_FIRST_ENTRIES` entries in all, and at least 64."""
 
 _VI_SOLVER = Auto()
 """Constructing the default at every call would cost a part of a short run."""
@@ -291,9 +294,9 @@ def _run_recorded(
     """Run with room for few steps first, and with more where the run needs them: `max_steps` bounds the
     work, and not the size of the records."""
     most, room = options.max_steps, options.max_steps
-    if not options.fixed and _tree.is_concrete(_tree.primal((setup, times))):
-        room = min(most, _FIRST_ROOM)
     entries = sum(leaf.size for leaf in jax.tree_util.tree_leaves(setup.x0))
+    if not options.fixed and _tree.is_concrete(_tree.primal((setup, times))):
+        room = min(most, _FIRST_ROOM, max(_LEAST_ROOM, _FIRST_ENTRIES // max(1, entries)))
     while True:
         check_memory(entries, jnp.dtype(setup.dtype).itemsize, room, setup.method.degree)
         solution, reached = _run_chosen(choice, setup, times, options._replace(max_steps=room))
