@@ -95,7 +95,8 @@ def solve_by_implicit_steps(
         return jtu.tree_map(lambda v: jnp.where(rate.solved, dt_ds * v, jnp.nan), rate.value)
 
     def linear(s: Any, x: Tree, _: Any) -> Tree:
-        return _tree.scale(clock.time(s)[1], flow.generator.apply(x))
+        # The last stage may lie a rounding behind the end, where the clock has no tangent.
+        return _tree.scale(clock.time(jnp.clip(s, first, last))[1], flow.generator.apply(x))
 
     if isinstance(method.solver, _SPLIT):
         terms = diffrax.MultiTerm(diffrax.ODETerm(law), diffrax.ODETerm(linear))
