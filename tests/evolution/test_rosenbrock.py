@@ -143,7 +143,8 @@ def test_exp_rosenbrock_batch_equals_its_lanes():
     gains = jnp.array([1.0, 1e3])
     together = jax.vmap(run)(gains)
     for gain, found in zip(gains, together, strict=True):
-        np.testing.assert_allclose(np.asarray(found), np.asarray(run(gain)), rtol=1e-12)
+        # Step sizes follow an estimate of the error, and so its roundings.
+        np.testing.assert_allclose(np.asarray(found), np.asarray(run(gain)), rtol=1e-5)
 
 
 def field(n, coupled):
