@@ -1,7 +1,7 @@
 """An estimate e of the error of x that goes along with the steps.
 
-The computed trajectory solves x_h' = Ax_h + f̃ + δ, so that e' = (A + Df̃)e + δ to first order. A step
-from t₀ takes e to
+The computed trajectory solves x_h' = Ax_h + p, so that e = x − x_h solves e' = (A + Df̃)e + δ to first
+order, with δ = f̃(·, x_h) − p. A step from t₀ takes e to
 
     e₁ = e^{hA}(e + ¼hBe) + ∫ δ,   B = Df̃(t₀, x₀),
 

@@ -202,13 +202,13 @@ class Flow(eqx.Module):
 
         base, linear = jax.jvp(project, (rate.z,), (error,))
 
-        def moved(sign: float) -> Tree:
+        def difference(sign: float) -> Tree:
             line = _tree.add(base, _tree.scale(sign, linear))
             curved = _tree.sub(project(_tree.add(rate.z, _tree.scale(sign, error))), line)
             shifted = self.problem.f(t, x, _tree.add(u, P.inverse(curved)), self.args)
             return jtu.tree_map(lambda a, b: jnp.abs(a - b), shifted, rate.value)
 
-        return jtu.tree_map(jnp.maximum, moved(1.0), moved(-1.0))
+        return jtu.tree_map(jnp.maximum, difference(1.0), difference(-1.0))
 
     def state_space(self, x: Tree) -> AbstractSpace:
         return self.problem.spaces(x)[0]

@@ -19,7 +19,7 @@ from .._tree import Tree
 from . import meter
 from .bounds import Bounds
 from .checkpoints import Checkpoints
-from .control import AbstractController, StepDecision, slack
+from .control import AbstractController, Adaptive, StepDecision, slack
 from .event_watch import EventWatch, Watched
 from .outcome import Record, Saved
 from .results import RESULTS
@@ -305,6 +305,7 @@ class Loop(eqx.Module):
             x1=_tree.where(jumped, seen.x, step.x1),
             solver_state=_tree.where(jumped, restarted, solver_state),
         )
+        assert isinstance(self.controller, Adaptive)  # `check_events` refuses fixed steps
         shortened = self.controller.shorten(state.control, seen.event, seen.margin)
         ends = active & (seen.result != RESULTS.successful)
         result = RESULTS.where(ends, seen.result, decision.result)

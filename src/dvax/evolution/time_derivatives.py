@@ -67,11 +67,11 @@ def transport(x: Tree, shift: Any, rate: Callable[..., Tree], t: Any, *given: An
         if is_zero(tangents[1]):
             return same(*primals), along[0]
 
-        def moved(x: Tree, shift: Any, real: Any) -> Tree:
+        def shifted(x: Tree, shift: Any, real: Any) -> Tree:
             t, given = eqx.combine(real, other, static)
             return midpoint(x, shift, rate, t, *given)
 
-        return same(*primals), jax.jvp(moved, tuple(args), along)[1]
+        return same(*primals), jax.jvp(shifted, tuple(args), along)[1]
 
     return same(x, shift, real, other)
 

@@ -160,7 +160,8 @@ class Adaptive(AbstractController):
             new = new._replace(stiffness=votes)
         return StepDecision(accepted, new, jumped, result)
 
-    def shorten(self, state, time, margin):
+    def shorten(self, state: Any, time: Any, margin: Any) -> Any:
+        """Return the state whose next attempt ends at time + margin, close behind an event."""
         # The step size that is planned stays, as at a kink.
         tries = EventBracket.unpack(state.event).tries
         event = EventBracket(time, margin, jnp.zeros_like(time), tries)

@@ -55,10 +55,6 @@ class AbstractController(eqx.Module):
         """Return the first step size for a run that is continued from here."""
 
     @abc.abstractmethod
-    def shorten(self, state: Any, time: Any, margin: Any) -> Any:
-        """Return the state whose next attempt ends at time + margin, close behind an event."""
-
-    @abc.abstractmethod
     def step_start(self, index: Any, t: Any) -> Any:
         """Return the start of step number `index`, whose value is t, as a function of the stops. The
         ends of adaptive steps that are no stops are constants under differentiation."""

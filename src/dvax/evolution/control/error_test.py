@@ -58,6 +58,8 @@ class ErrorTest(eqx.Module):
     ‖·‖ is the root mean square in the state space, part by part where the state is a tuple, so that
     parts with different units are each compared with their own size. It is not taken entry by entry:
     that would ask for a smaller defect wherever an entry passes through zero.
+
+    `certify`: the defect counts by its modulus alone, as a certificate integrates it.
     """
 
     rtol: Any
@@ -78,10 +80,10 @@ class ErrorTest(eqx.Module):
         integrated = error * h / self.horizon
         if step.carried is not None:
             error = error / (1.0 + self._allowance(h, x0, step))
-        # A law that is not solved inside the step may be that of a stage far away: the step was too
-        # large.
         # Inside the step the defect has not cancelled or decayed yet.
         error = jnp.maximum(error, _INSIDE * modulus * h / self.horizon)
+        # A law that is not solved inside the step may be that of a stage far away: the step was too
+        # large.
         error, modulus = (jnp.where(step.solved, v, jnp.inf) for v in (error, modulus))
         # Data that varies within the run has the rounding of t besides, relative to the span.
         relative = eps * (1.0 + largest / span)

@@ -48,9 +48,6 @@ class Fixed(AbstractController):
         result = RESULTS.where(finite, result, RESULTS.nonfinite)
         return StepDecision(step.solved & finite, new, jumped, result)
 
-    def shorten(self, state, time, margin):
-        raise NotImplementedError("events need adaptive steps")  # `check_events` refuses dt
-
     def step_start(self, index, t):
         if self.stops.shape[0] == 2:
             return self._time(0, index)
