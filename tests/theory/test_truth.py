@@ -87,7 +87,7 @@ def test_certificates_are_above_the_true_error():
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", NAMES)
 def test_certificates_are_above_the_true_error_of_steps_chosen_for_the_error(name):
-    assert ratios(name, "ETD4RK", certify=False)
+    ratios(name, "ETD4RK", certify=False)  # asserts the bounds; some errors are all roundoff
 
 
 @pytest.mark.thorough

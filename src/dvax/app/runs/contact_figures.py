@@ -94,7 +94,7 @@ class Figures:
             ("decay_rate", float(c.decay_rate), f"1/{u.time}",
              "two trajectories certainly approach at this rate, where positive"),
             ("sharp_decay_rate", float(c.sharp_decay_rate), f"1/{u.time}",
-             "the same, seeing the sign of the feedback"),
+             "the same rate, where the sign of the feedback counts"),
             ("final_separation", last["separation_x"], norm,
              "‖x1 − x2‖ of the two trajectories at the end"),
             ("steps", steps, "1", "accepted time steps"),
