@@ -16,7 +16,6 @@ class ETD3RK(dvax.evolution.AbstractMethod):
     order: ClassVar[int] = 3
     degree: ClassVar[int] = 2
     samples: ClassVar[tuple[float, ...]] = TWO_SAMPLES
-    masked_share: ClassVar[float] = 0.0
     safety: ClassVar[float] = 1.0
     has_half_stage: ClassVar[bool] = True
     is_rosenbrock: ClassVar[bool] = False

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -23,7 +24,7 @@ from ..generators import (
 from ..operators import Diagonal as DiagonalOperator
 from ..operators import Scaling
 from ..problem import Problem
-from ..programs.structure import analyse
+from ..programs.structure import analyse, independent
 from .method import ETD2RK, ETD4RK, ExpRosenbrock
 from .results import RESULTS
 from .runge_kutta import DormandPrince
@@ -39,6 +40,10 @@ _EXACT = 12
 _FAST = 300.0
 """‖A‖ times the span beyond which A is left to its exponential: an explicit method needs a third of
 this number of steps for stability alone."""
+
+_SLOPES = 150.0
+"""The spectral radius of A + Df̃ times the span, for constant derivatives of f and h, beyond which
+`ExpRosenbrock` is faster at every tolerance, for few unknowns: it has the linear part exactly."""
 
 _LINEARISABLE = 256
 """Unknowns up to which `ExpRosenbrock` forms the matrix of A + Df."""
@@ -72,12 +77,14 @@ class Choice(NamedTuple):
 
 class Facts(NamedTuple):
     """What the code of a problem proves, whatever its numbers: `affine` says that f and h are affine in
-    (t, x, u) jointly and the bounds of K in t, so that x' is affine from kink to kink."""
+    (t, x, u) jointly and the bounds of K in t, so that x' is affine from kink to kink; `linear`, that
+    the derivatives of f and h in x and u are constant."""
 
     state: int
     law: int
     affine: bool
     diagonal: bool
+    linear: bool
 
 
 def choose(
@@ -105,6 +112,14 @@ def choose(
         )
     if facts.affine and (facts.state <= _EXACT or facts.diagonal):
         return Choice(ExpRosenbrock(), "x' is affine in t and x between kinks, where it is exact")
+    if facts.linear and _tree.is_concrete(span, problem, args):
+        slopes = largest_slope(problem, x0, args, facts) * span
+        # The exponential of a matrix costs as much as many steps.
+        least = _SLOPES * (1.0 if facts.diagonal else 1.0 + (facts.state / 4) ** 3)
+        if slopes > least:
+            return Choice(
+                ExpRosenbrock(), f"the slope of Ax + f̃ times the span is {slopes:.2g}, and it is constant"
+            )
     fast = norm(problem.generator(args)) * span if _tree.is_concrete(span) else 0.0
     if fast > _FAST:
         return _with_fallback(
@@ -119,9 +134,9 @@ def _with_fallback(method: Any, reason: str, facts: Facts, tol: float) -> Choice
     if not (facts.diagonal or facts.state <= _LINEARISABLE):
         return Choice(method, reason)
     # A step of ExpRosenbrock costs some steps of another method, and many where it forms matrices.
-    times = 4.0 if facts.diagonal else 4.0 + (facts.state / 16) ** 3
-    # Its own steps, of order 3, become as many as the stable ones of the other method.
-    times *= max(1.0, 1e-4 / tol) ** (1 / 3)
+    times = 10.0 if facts.diagonal else 10.0 + (facts.state / 16) ** 3
+    # Its own steps, of order 4, become as many as the stable ones of the other method.
+    times *= max(1.0, 1e-4 / tol) ** (1 / 4)
     return Choice(method, reason, ExpRosenbrock(), round(100 * times))
 
 
@@ -170,7 +185,74 @@ def _read(problem: Problem, x0: Tree, args: Any) -> Facts:
     like = problem.zero_control(x0)
     state, law = (sum(leaf.size for leaf in jtu.tree_leaves(v)) for v in (x0, like))
     affine = _is_affine(problem, args, t, x0, like)
-    return Facts(state, law, affine, _is_diagonal(problem, args, t, x0, like))
+    diagonal = _is_diagonal(problem, args, t, x0, like)
+    few = state + law <= 2 * _EXACT or (diagonal and state <= FIELD)
+    linear = few and _is_linear(problem, args, t, x0, like)
+    return Facts(state, law, affine, diagonal, linear)
+
+
+def _is_linear(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) -> bool:
+    """Return whether the derivatives of f and h in x and u are constant, and A is read as a matrix."""
+    if math.isinf(norm(problem.generator(args))):
+        return False
+
+    def derivative(fn: Any, t: Any, x: Tree, u: Tree) -> Tree:
+        along = jtu.tree_map(jnp.ones_like, (x, u))
+        return jax.jvp(lambda x, u: fn(t, x, u, args), (x, u), along)[1]
+
+    # One direction stands for all: the code is the same.
+    return all(
+        independent(lambda t, x, u, fn=fn: derivative(fn, t, x, u), t, x0, like)
+        for fn in (problem.f, problem.h)
+    )
+
+
+_Known = tuple[Any, float]
+_SLOPES_OF: dict[tuple[int, ...], _Known] = {}
+"""The largest slopes of the latest problems, by the identity of the problem and of its args, both of
+which an entry keeps alive."""
+
+
+def largest_slope(problem: Problem, x0: Tree, args: Any, facts: Facts) -> float:
+    """Return the larger spectral radius of A + Df̃ for u ∈ h − 0 inside K, and for u held at the
+    boundary, where the derivatives of f and h are constant."""
+    key = (id(problem), *map(id, jtu.tree_leaves(args)))
+    if key not in _SLOPES_OF:
+        if len(_SLOPES_OF) >= _MAX_FACTS:
+            _SLOPES_OF.clear()
+        radii = _radii(problem, x0, args, facts.diagonal)
+        _SLOPES_OF[key] = (problem, args), max(map(float, radii))
+    return _SLOPES_OF[key][1]
+
+
+def _radii(problem: Problem, x0: Tree, args: Any, diagonal: bool) -> list[Any]:
+    t = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(x0)))
+    like = problem.zero_control(x0)
+
+    @jax.jit
+    def derivatives(arrays: Any) -> Any:
+        problem, x, u = eqx.combine(arrays, static)
+        A = problem.generator(args)
+        f = lambda x, u: problem.f(t, x, u, args)  # noqa: E731
+        h = lambda x, u: problem.h(t, x, u, args)  # noqa: E731
+        fx = lambda x: _tree.add(A.apply(x), f(x, u))  # noqa: E731
+        fns = (fx, x), (lambda u: f(x, u), u), (lambda x: h(x, u), x), (lambda u: h(x, u), u)
+        if diagonal:
+            ones = lambda v: jtu.tree_map(jnp.ones_like, v)  # noqa: E731
+            return [jax.jvp(fn, (at,), (ones(at),))[1].ravel() for fn, at in fns]
+        return [_matrix(fn, at) for fn, at in fns]
+
+    arrays, static = eqx.partition((problem, x0, like), eqx.is_array)
+    fx, fu, hx, hu = map(np.asarray, derivatives(arrays))
+    if diagonal:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            free = fx + fu * hx / (1.0 - hu)
+        return [np.max(np.abs(v[np.isfinite(v)]), initial=0.0) for v in (fx, free)]
+    systems = [fx]
+    system = np.eye(len(hu)) - hu
+    if np.linalg.matrix_rank(system) == len(hu):
+        systems.append(fx + fu @ np.linalg.solve(system, hx))
+    return [np.max(np.abs(np.linalg.eigvals(J))) for J in systems if np.all(np.isfinite(J))] or [0.0]
 
 
 def _is_affine(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) -> bool:
@@ -195,3 +277,8 @@ def _is_diagonal(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree
         analyse(lambda v, fn=function: fn(t, v, v, args), x0).pointwise
         for function in (problem.f, problem.h)
     )
+
+
+def _matrix(fn: Any, at: Tree) -> jax.Array:
+    flat, back = jax.flatten_util.ravel_pytree(at)
+    return jax.jacfwd(lambda v: jax.flatten_util.ravel_pytree(fn(back(v)))[0])(flat)

@@ -1,5 +1,6 @@
 """How far a step's polynomial p is from f̃ along the trajectory x_h that it makes: δ = p − f̃(·, x_h)."""
 
+from collections.abc import Callable
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -30,6 +31,9 @@ may have more than `safety` allows for; of the generated problems one bound was 
 
 _MOMENT = 0.3
 """Part of the mean modulus of a defect of mean zero that its first moment may have."""
+
+_UNRESOLVED = 0.1
+"""Part of the mean modulus of a defect that a polynomial through its samples may not show."""
 
 _SETTLES = 1e-3
 """Part of x by which a change of f̃ within a short step may change x over the run."""
@@ -95,6 +99,7 @@ def sampled(
     c: Any,
     evaluations: list[Evaluation],
     slope: Any,
+    propagate: Callable[[tuple[Tree, ...]], Tree] | None,
 ) -> Sample:
     """δ at the start, at the samples of the method inside and at the end of the step.
 
@@ -105,7 +110,9 @@ def sampled(
 
     Over a smooth step of a method with a `quadrature`, `signed` is the signed mean |∫δ|/h, with a share
     of the mean modulus for ∫ (1 − θ) h B δ, where `slope` = h‖B‖ and B = A + Df̃: to first order the
-    error of x₁ is ∫ e^{(1−θ)hB} δ. The integral for certificates stays that of the modulus.
+    error of x₁ is ∫ e^{(1−θ)hB} δ. A method that linearises has B at hand: `propagate` maps the
+    coefficients of a polynomial to that integral, times h, and `signed` is it for the polynomial
+    through the samples. The integral for certificates stays that of the modulus.
     """
     thetas = method.samples
     along = [evaluations[0], *evaluations[-1 - len(thetas) :]]
@@ -129,15 +136,20 @@ def sampled(
     ends = _tree.scale(0.5, start), _tree.scale(0.5, end)
     bump = _largest(bumps)
     kinked = jnp.asarray(True)
-    if method.masked_share > 0.0 or method.quadrature is not None:
+    if method.quadrature is not None or propagate is not None:
         kinked = _kinked(flow, lax.stop_gradient(along))
-    if method.masked_share > 0.0:
-        share = jnp.where(kinked, method.masked_share, 0.0)
-        bump = jtu.tree_map(lambda b, bend: b + share * jnp.abs(bend), bump, c[-1])
     error = jtu.tree_map(lambda *parts: sum(map(jnp.abs, parts)), *ends, bump)
     signed = None
-    weights = method.quadrature or _interpolatory((0.0, *thetas, 1.0))
-    mean = combined(*zip(weights, (start, *middle, end), strict=True))
+    defects, nodes = (start, *middle, end), (0.0, *thetas, 1.0)
+    if propagate is not None:
+        mean = _tree.scale(1.0 / h, propagate(_interpolant(nodes, defects)))
+        signed = jtu.tree_map(
+            lambda m, e: jnp.where(kinked, e, jnp.abs(m) + _UNRESOLVED * e), mean, error
+        )
+        signed = _tree.add(signed, unseen)
+    else:
+        weights = method.quadrature or _interpolatory(nodes)
+        mean = combined(*zip(weights, defects, strict=True))
     if method.quadrature is not None:
         # A defect of mean zero still acts on the way through the step.
         share = jnp.minimum(_MOMENT * jnp.where(jnp.isfinite(slope), slope, jnp.inf), 1.0)
@@ -152,6 +164,12 @@ def sampled(
     places = [(one.x, flow.operator.inverse(one.rate.y)) for one in lax.stop_gradient(along)]
     bounds = reduce(Bounds.hull, [Bounds((x, x), (u, u)) for x, u in places])
     return Sample(thetas, [*inner, last], error, defect, law_defect, bounds, signed, mean, kinked)
+
+
+def _interpolant(nodes: tuple[float, ...], values: tuple[Tree, ...]) -> tuple[Tree, ...]:
+    """Return the coefficients of the polynomial with these values at the nodes."""
+    rows = np.linalg.inv(np.vander(nodes, increasing=True)).tolist()
+    return tuple(combined(*zip(row, values, strict=True)) for row in rows)
 
 
 def _interpolatory(nodes: tuple[float, ...]) -> tuple[float, ...]:

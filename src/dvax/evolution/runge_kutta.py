@@ -61,7 +61,6 @@ class DormandPrince(AbstractMethod):
     order: ClassVar[int] = 5
     degree: ClassVar[int] = 3
     samples: ClassVar[tuple[float, ...]] = _SAMPLES
-    masked_share: ClassVar[float] = 0.0
     safety: ClassVar[float] = 1.85
     has_half_stage: ClassVar[bool] = False
     is_rosenbrock: ClassVar[bool] = False

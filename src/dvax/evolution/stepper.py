@@ -240,7 +240,11 @@ class Stepper(eqx.Module):
         if self.measure:
             slopes = self._slopes(t1 - t0, evaluations)
             whole = None if slopes is None else slopes[1]
-            sample = self._measure(t0, t1, arc, evaluations, jumped, whole)
+            propagate = None
+            if self.method.is_rosenbrock:
+                zero = _tree.zeros_like(x0)
+                propagate = lambda c: propagators.full.step(zero, c)  # noqa: E731
+            sample = self._measure(t0, t1, arc, evaluations, jumped, whole, propagate)
             error, integrated_defect = sample.error, (sample.defect, sample.law_defect)
             signed = sample.signed
             if self.estimate:
@@ -418,7 +422,7 @@ class Stepper(eqx.Module):
         between = [interpolate(self.flow, t1 - t0, theta, x0, c) for theta in self.method.samples]
         points = [x0, *between, x1]
         _, evaluations = evaluated(self.flow, run, self.ends[0], x0, guess, None, True)
-        sample = self._measure(t0, t1, FlowStep(t1 - t0, x0, x1, c), evaluations, True, None)
+        sample = self._measure(t0, t1, FlowStep(t1 - t0, x0, x1, c), evaluations, True, None, None)
         solved = jnp.all(jnp.stack([one.rate.solved for one in evaluations]))
         return sample._replace(rates=[]), solved
 
@@ -436,10 +440,11 @@ class Stepper(eqx.Module):
         evaluations: list[Evaluation],
         jumped: Any,
         slope: Any,
+        propagate: Callable[[tuple[Tree, ...]], Tree] | None,
     ) -> Sample:
         if not self.flow.enclosed:
             x0, c = values((arc.x0, arc.c))
-            return sampled(self.flow, self.method, arc.h, x0, c, evaluations, slope)
+            return sampled(self.flow, self.method, arc.h, x0, c, evaluations, slope, propagate)
         assert self.growth is not None
         # A rate that the step before made was made where that one ended: a few roundings of t earlier,
         # which a steep f tells apart.
