@@ -378,11 +378,7 @@ def _trim(solution: Solution) -> Solution:
     fields = (
         "ts",
         "xs",
-        "us",
-        "ys",
-        "law_residual",
-        "law_step",
-        "law_error",
+        "law",
         "defect",
         "law_defect",
         "completed_defect",
