@@ -20,6 +20,7 @@ FLOORS = {
     "_batch": -1,
     "_small_matrices": -1,
     "_failure": -1,
+    "_once": -2,
     "_jax": -1,
     "programs": -0.5,
     "_user_code": 0,

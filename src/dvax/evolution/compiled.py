@@ -19,7 +19,7 @@ from .._jax.messages import is_equinox_check
 from .closures import closure_convert
 from .integrate import integrate
 from .results import has_failed
-from .setup import Options, Setup, as_arrays
+from .setup import Options, Setup, as_arrays, pack, unpack
 from .signature import Signature, flatten
 from .solution import Solution
 
@@ -28,12 +28,12 @@ def compiled(setup: Setup, ts: Any, options: Options) -> tuple[Solution, bool | 
     """Return the solution, and whether the run succeeded and reached all saved times."""
     numbers, signature = flatten(
         (setup.problem, setup.method, setup.vi_solver, setup.events),
-        (setup.x0, setup.args, setup.setting, setup.moduli, ts),
-        options,
+        (setup.x0, setup.args, setup.moduli, ts),
+        (options, tuple(setup.setting)),
     )
     start, _clock.compiling = time.perf_counter(), 0.0
     try:
-        arrays, reached, static = _run(numbers, signature)
+        arrays, reached, static = _run(numbers, pack(setup.setting), signature)
         # Convert by NumPy: by JAX this would compile and run another program.
         reached = bool(np.asarray(reached)) if _tree.is_concrete(reached) else reached
     except jax.errors.JaxRuntimeError as error:
@@ -73,21 +73,25 @@ def _add(stage: str, seconds: float) -> None:
 listen(_add)
 
 
-def _traced(numbers: list[Any], signature: Signature) -> tuple[list[Any], jax.Array, _tree.Static]:
+def _traced(
+    numbers: list[Any], entries: Any, signature: Signature
+) -> tuple[list[Any], jax.Array, _tree.Static]:
     start = time.perf_counter()
-    outputs = _integrated(numbers, signature)
+    outputs = _integrated(numbers, entries, signature)
     # Assign instead of adding: this time includes programs compiled while tracing.
     _clock.compiling = time.perf_counter() - start
     return outputs
 
 
 def _integrated(
-    numbers: list[Any], signature: Signature
+    numbers: list[Any], entries: Any, signature: Signature
 ) -> tuple[list[Any], jax.Array, _tree.Static]:
     (problem, method, vi_solver, events), data = signature.unflatten(numbers)
-    x0, args, setting, moduli, ts = data
+    x0, args, moduli, ts = data
+    options, names = signature.options
+    setting = unpack(entries, names)
     setup = Setup(problem, x0, args, setting, method, vi_solver, moduli, events)
-    solution, closes_over_traced = integrate(setup, ts, signature.options)
+    solution, closes_over_traced = integrate(setup, ts, options)
     reached = ~has_failed(solution.result, solution.ts)
     arrays, tree = jtu.tree_flatten(solution, is_leaf=lambda node: node is setup)
     assert arrays.pop() is setup
@@ -95,4 +99,4 @@ def _integrated(
     return arrays, reached, _tree.Static((tree, closes_over_traced))
 
 
-_run = jax.jit(_traced, static_argnums=1)
+_run = jax.jit(_traced, static_argnums=2)

@@ -16,7 +16,7 @@ from .._tree import Tree
 from .plan import Plan
 from .responses import Responses, responses
 from .results import has_failed
-from .setup import Setup
+from .setup import Setup, pack, unpack
 from .signature import Signature, flatten
 
 _SETTING = "t0", "dt", "rtol", "atol", "horizon"
@@ -32,13 +32,6 @@ class Saved(NamedTuple):
     result: Any
 
 
-class _Batch(NamedTuple):
-    """The number of leading axes of a batch, and which of the numbers of the program have them."""
-
-    depth: int
-    axes: tuple[int | None, ...]
-
-
 def saved_responses(setup: Setup, plan: Plan, rows: Saved) -> tuple[Responses, jax.Array]:
     """Return the responses of a run at its saved times, and the first of these times at which the run
     succeeded and its response is not finite (∞ if there is none).
@@ -47,37 +40,41 @@ def saved_responses(setup: Setup, plan: Plan, rows: Saved) -> tuple[Responses, j
     solution that left `equinox.filter_vmap` have the axes of the batch in front, and so have these.
     """
     code = setup.problem, setup.vi_solver, plan
-    setting = {name: setup.setting[name] for name in _SETTING}
-    data = setup.x0, setup.args, setting, setup.moduli, rows
-    batch = None
-    if jnp.ndim(rows.ts) > 1:
-        leaves = jtu.tree_leaves((code, data))
-        axes = tuple(0 if eqx.is_array(leaf) else None for leaf in leaves)
-        batch = _Batch(jnp.ndim(rows.ts) - 1, axes)
-    numbers, signature = flatten(code, data, batch)
-    if not _tree.is_concrete(numbers):
-        return _compiled(numbers, signature)
+    setting = pack({name: setup.setting[name] for name in _SETTING})
+    data = setup.x0, setup.args, setup.moduli, rows
+    numbers, signature = flatten(code, data, rows.ts.ndim - 1)
+    given = numbers, setting
+    if not _tree.is_concrete(given):
+        return _compiled(*given, signature)
     with jax.ensure_compile_time_eval():
         try:
-            return _compiled(numbers, signature)
+            return _compiled(*given, signature)
         except jax.errors.JaxRuntimeError as error:
             if is_equinox_check(error):
                 # Run again under Equinox, which reports the message of an `eqx.error_if` in f or h.
-                eqx.filter_jit(partial(_batched, signature=signature))(numbers)
+                eqx.filter_jit(_batched)(*given, signature)
             raise
 
 
-def _batched(numbers: list[Any], signature: Signature) -> tuple[Responses, jax.Array]:
-    run, batch = partial(_responses, signature=signature), signature.options
-    if batch is not None:
-        for _ in range(batch.depth):
-            run = jax.vmap(run, in_axes=(list(batch.axes),))
-    return run(numbers)
+def _batched(numbers: list[Any], setting: Any, signature: Signature) -> tuple[Responses, jax.Array]:
+    """Return the responses of a batch, whose axes are in front of all arrays.
+
+    Python floats, which no transformation has seen, have none: nor has a setting of these alone.
+    """
+    run, depth = partial(_responses, signature=signature), signature.options
+    seen = numbers, setting if isinstance(setting, list) else None
+    axes = jtu.tree_map(lambda leaf: 0 if jnp.ndim(leaf) >= depth else None, seen)
+    for _ in range(depth):
+        run = jax.vmap(run, in_axes=axes)
+    return run(numbers, setting)
 
 
-def _responses(numbers: list[Any], signature: Signature) -> tuple[Responses, jax.Array]:
+def _responses(
+    numbers: list[Any], entries: Any, signature: Signature
+) -> tuple[Responses, jax.Array]:
     (problem, vi_solver, plan), data = signature.unflatten(numbers)
-    x0, args, setting, moduli, rows = data
+    x0, args, moduli, rows = data
+    setting = unpack(entries, _SETTING)
     # The response does not depend on the method.
     setup = Setup(problem, x0, args, setting, None, vi_solver, moduli)
     control = problem.spaces(x0)[1]
@@ -93,4 +90,4 @@ def _responses(numbers: list[Any], signature: Signature) -> tuple[Responses, jax
     return found, lax.stop_gradient(first)
 
 
-_compiled = jax.jit(_batched, static_argnums=1)
+_compiled = jax.jit(_batched, static_argnums=2)

@@ -108,27 +108,27 @@ class Solution(eqx.Module):
     @property
     def us(self) -> Tree:
         """The responses u at the saved times."""
-        return self.responses().us
+        return _responses(self).us
 
     @property
     def ys(self) -> Tree:
         """y = P u at the saved times."""
-        return self.responses().ys
+        return _responses(self).ys
 
     @property
     def law_residual(self) -> jax.Array:
         """‖w‖ of one projection step from y, at the saved times."""
-        return self.responses().law_residual
+        return _responses(self).law_residual
 
     @property
     def law_step(self) -> jax.Array:
         """‖ȳ − y‖ of one projection step from y, at the saved times."""
-        return self.responses().law_step
+        return _responses(self).law_step
 
     @property
     def law_error(self) -> jax.Array | None:
         """The certified bound on ‖u − u*‖ at the saved times, or None."""
-        return self.responses().law_error
+        return _responses(self).law_error
 
     def responses(self) -> Responses:
         """Return u, y and their certificates at the saved times, as one named tuple.
@@ -139,29 +139,7 @@ class Solution(eqx.Module):
         **Raises:** `dvax.SolveError` if the run succeeded, and the law has no finite solution at a
         saved time. Where it is traced, values and derivatives are NaN instead.
         """
-        if isinstance(self.law, Responses):
-            return self.law
-        assert self.plan is not None
-        trace, found = self.__dict__.get(_CACHE, (None, None))
-        if found is not None and (trace is None or trace == current_trace()):
-            return found
-        rows = Saved(self.ts, self.xs, self.law.ys, self.result)
-        found, missing = saved_responses(self.setup, self.plan, rows)
-        concrete = _tree.is_concrete(found, missing)
-        if concrete and (first := float(np.asarray(missing).min())) < math.inf:
-            raise self._without_response(first, found)
-        # The fields of the module are frozen, and this is none.
-        object.__setattr__(self, _CACHE, (None if concrete else current_trace(), found))
-        return found
-
-    def _without_response(self, t: float, found: Responses) -> SolveError:
-        fields = {"law": found, "result": RESULTS.nonfinite}
-        return SolveError(
-            f"The law has no finite solution at the saved time t = {t:.17g}, though all steps "
-            "were made.",
-            dataclasses.replace(self, **fields),
-            (Fix("", "", f"Solve the law alone there: dvax.Problem.law({t:g}, x, args)"),),
-        )
+        return _responses(self)
 
     @property
     def flow(self) -> Flow:
@@ -307,3 +285,31 @@ class Solution(eqx.Module):
             if series is not None:
                 variables[name] = (("time",), np.asarray(series))
         return xarray.Dataset(variables, coords={"time": np.asarray(self.ts)})
+
+
+def _responses(solution: Solution) -> Responses:
+    """`Solution.responses`, without the module that Equinox makes at each call of a method (15 µs)."""
+    if isinstance(solution.law, Responses):
+        return solution.law
+    assert solution.plan is not None
+    trace, found = solution.__dict__.get(_CACHE, (None, None))
+    if found is not None and (trace is None or trace == current_trace()):
+        return found
+    rows = Saved(solution.ts, solution.xs, solution.law.ys, solution.result)
+    found, missing = saved_responses(solution.setup, solution.plan, rows)
+    concrete = _tree.is_concrete(found, missing)
+    if concrete and (first := float(np.asarray(missing).min())) < math.inf:
+        raise _without_response(solution, first, found)
+    # The fields of the module are frozen, and this is none.
+    object.__setattr__(solution, _CACHE, (None if concrete else current_trace(), found))
+    return found
+
+
+def _without_response(solution: Solution, t: float, found: Responses) -> SolveError:
+    fields = {"law": found, "result": RESULTS.nonfinite}
+    return SolveError(
+        f"The law has no finite solution at the saved time t = {t:.17g}, though all steps "
+        "were made.",
+        dataclasses.replace(solution, **fields),
+        (Fix("", "", f"Solve the law alone there: dvax.Problem.law({t:g}, x, args)"),),
+    )

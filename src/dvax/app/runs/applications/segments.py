@@ -51,11 +51,13 @@ def segments(plan: Plan) -> Iterator[Solution]:
                 plan.problem, x, start, float(ts[-1]), None, ts, constants=plan.constants,
                 dt0=step, horizon=last - first, **measure, **plan.settings,
             )  # fmt: skip
-            solution.responses()  # here, where a signal can interrupt the compilation
-            return solution
+            solution = all_finite(solution, start)
+            # Here, where a signal can interrupt the compilation, and for all times of the segment,
+            # whose number determines the program.
+            return with_fields(solution, {"law": solution.responses()})
 
         try:
-            solution = all_finite(interruptible(piece), start)
+            solution = interruptible(piece)
         except SolveError as error:
             if isinstance(error.solution, Solution) and len(error.solution.ts):
                 yield error.solution
