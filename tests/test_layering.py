@@ -58,7 +58,7 @@ APPLICATION = {
     *("tomli_w", "typer", "xarray", "zarr"),
 }
 # Extras that a function asks for when it is called, and says so where they are missing.
-EXTRAS = {"clarabel", "meshio", "skfem"}
+EXTRAS = {"clarabel", "flatbuffers", "meshio", "skfem"}
 # What the command line may load before it knows what is asked of it.
 LIGHT = {"typer", "rich"}
 COMMAND_LINE = "dvax.app.cli"
