@@ -20,6 +20,7 @@ FLOORS = {
     "_batch": -1,
     "_small_matrices": -1,
     "_failure": -1,
+    "_once": -2,
     "_jax": -1,
     "programs": -0.5,
     "_user_code": 0,
@@ -57,7 +58,7 @@ APPLICATION = {
     *("tomli_w", "typer", "xarray", "zarr"),
 }
 # Extras that a function asks for when it is called, and says so where they are missing.
-EXTRAS = {"clarabel", "meshio", "skfem"}
+EXTRAS = {"clarabel", "flatbuffers", "meshio", "skfem"}
 # What the command line may load before it knows what is asked of it.
 LIGHT = {"typer", "rich"}
 COMMAND_LINE = "dvax.app.cli"

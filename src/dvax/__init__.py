@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from .evolution import Picard as Picard
     from .evolution import PiecewiseLinear as PiecewiseLinear
     from .evolution import Solution as Solution
+    from .evolution import export as export
+    from .evolution import load_exported as load_exported
     from .evolution import solve as solve
     from .problem import Problem as Problem
     from .sensitivity import Directional as Directional
@@ -74,6 +76,8 @@ _HOMES = {
         "PiecewiseLinear",
         "RESULTS",
         "Solution",
+        "export",
+        "load_exported",
         "solve",
     ),
     "problem": ("Problem",),

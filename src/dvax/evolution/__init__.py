@@ -3,6 +3,10 @@
 from .bounds import Bounds as Bounds
 from .event import Event as Event
 from .event import Events as Events
+from .exported import Exported as Exported
+from .exported import ExportedSolution as ExportedSolution
+from .exported import load_exported as load_exported
+from .exporting import export as export
 from .growth import between as between
 from .growth import disturbance as disturbance
 from .growth import gronwall as gronwall

@@ -23,6 +23,8 @@ ADAPTIVE_STEPS = 2**20
 """Default of max_steps in adaptive solves."""
 _MAX_FIXED_STEPS = 2**30
 """Largest number of steps of a solve with fixed steps."""
+_METHODS = AbstractMethod | Implicit | Picard | PiecewiseLinear
+_FLAGS = bool | np.bool_ | None
 MAX_STEP_COUNT = 2**31 - 1
 """Largest value of max_steps: steps are counted in 32 bits."""
 
@@ -42,16 +44,15 @@ def check(
 
     rule(isinstance(problem, Problem), "problem", _tree.Text(type(problem).__name__),
          "it must be a dvax.Problem", "Build one, or pass that of a model: model.problem")  # fmt: skip
-    methods = AbstractMethod | Implicit | Picard | PiecewiseLinear
-    rule(method is None or isinstance(method, methods), "method", method,
+    rule(method is None or isinstance(method, _METHODS), "method", method,
          "it must be a method such as dvax.ETD2RK()", "Omit it for the default")  # fmt: skip
-    rule(isinstance(vi_solver, AbstractSolver | None), "vi_solver", vi_solver,
+    rule(vi_solver is None or isinstance(vi_solver, AbstractSolver), "vi_solver", vi_solver,
          "it must be a solver such as dvax.vi.Auto()", "Omit it for the default")  # fmt: skip
     rule(adjoint in ("reverse", "forward"), "adjoint", adjoint,
          "it must be 'reverse' or 'forward'",
          "Use 'reverse' with jax.grad, 'forward' with jax.jvp")  # fmt: skip
     for name, flag in (("measure", measure), ("dense", dense), ("progress", progress)):
-        rule(isinstance(flag, bool | np.bool_ | None), name, flag, "it must be True or False",
+        rule(isinstance(flag, _FLAGS), name, flag, "it must be True or False",
              "Omit it for the default")  # fmt: skip
     if isinstance(method, Implicit):
         for name, flag in (("measure", measure), ("dense", dense)):
@@ -97,7 +98,7 @@ def check(
              "Write a number such as 1.0")  # fmt: skip
     if not unusable & {"t0", "t1"} and _tree.is_concrete(t0, t1):
         span = float(t1) - float(t0) if math.isfinite(t0) and math.isfinite(t1) else math.nan
-        least = 2.0**12 * _tiny(jnp.result_type(*jax.tree_util.tree_leaves(x0)))
+        least = 2.0**12 * _tiny(_tree.dtype(x0))
         if not least <= span < math.inf:
             given = _tree.Text(f"{t0}, {t1}")
             rule(span > 0, "t0, t1", given, "t0 < t1, both finite: a semigroup runs forward only",
@@ -244,8 +245,8 @@ def check_memory(state: int, itemsize: int, steps: int, degree: int) -> None:
 
 def warn_precision(x0: Any, rtol: Any) -> None:
     """Warn if rtol is below the roundoff level of the precision of x0."""
-    dtype = jnp.result_type(*jax.tree_util.tree_leaves(x0))
-    eps = float(jnp.finfo(dtype).eps)
+    dtype = _tree.dtype(x0)
+    eps = _eps(dtype)
     if _tree.is_concrete(rtol) and float(rtol) == 0.0:
         return  # only atol applies, and the size of x during the run is unknown
     if _tree.is_concrete(rtol) and float(rtol) < 100 * eps:

@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Label, Tree
+from ..errors import InputError
 from ..generators import (
     AbstractGenerator,
     Dense,
@@ -28,11 +29,20 @@ from ..programs.structure import analyse, independent
 from .method import ETD2RK, ETD4RK, ExpRosenbrock
 from .results import RESULTS
 from .runge_kutta import DormandPrince
+from .signature import flat
 
 FIELD, LARGE_LAW = 64, 256
 """Entries of the law and of the state beyond which a problem is taken for a field, whose kinks are
 everywhere; and entries of a law beyond which its kinks are never located. A market of 102 units and one
 price takes 4 times fewer steps with its kinks located; a field of 128 points up to 2 times more."""
+
+_ETD2RK, _ETD4RK, _DORMANDPRINCE, _EXPROSENBROCK = (
+    ETD2RK(),
+    ETD4RK(),
+    DormandPrince(),
+    ExpRosenbrock(),
+)
+"""Modules that are made once, since making and flattening one takes 10 µs."""
 
 _EXACT = 12
 """Unknowns up to which the exponential of A + Df costs less than the steps that it saves."""
@@ -41,9 +51,10 @@ _FAST = 300.0
 """‖A‖ times the span beyond which A is left to its exponential: an explicit method needs a third of
 this number of steps for stability alone."""
 
-_SLOPES = 150.0
+_SLOPES, _SLOPES_OF_MATRICES = 60.0, 150.0
 """The spectral radius of A + Df̃ times the span, for constant derivatives of f and h, beyond which
-`ExpRosenbrock` is faster at every tolerance, for few unknowns: it has the linear part exactly."""
+`ExpRosenbrock` is faster, which has the linear part exactly: where it is diagonal, and where it is a
+small matrix."""
 
 _LINEARISABLE = 256
 """Unknowns up to which `ExpRosenbrock` forms the matrix of A + Df."""
@@ -57,7 +68,7 @@ class Choice(NamedTuple):
     method: Any
     reason: str = ""
     fallback: Any = None
-    least: int | None = None
+    least: float = math.inf
 
     def text(self, where: str = "") -> Label:
         """Return the name of the method, and the reason where there is one."""
@@ -71,7 +82,7 @@ class Choice(NamedTuple):
             return Choice(self.fallback, f"stability limited the steps of {first}")
         if result == RESULTS.step_too_small and not isinstance(self.method, ETD2RK):
             # Its defect is zero where f̃ is a line in t, however steep, and enclosed elsewhere.
-            return Choice(ETD2RK(), f"rounding limited the steps of {first}")
+            return Choice(_ETD2RK, f"rounding limited the steps of {first}")
         return None
 
 
@@ -99,34 +110,36 @@ def choose(
     """Choose a method for a run over `span` at the tolerance `tol`, from the structure and the size of
     the problem."""
     if fixed:
-        return Choice(ETD2RK(), "the steps are given")
+        return Choice(_ETD2RK, "the steps are given")
     if certified:
-        return Choice(ETD2RK(), "its defect can be enclosed, so that a bound is proved")
+        return Choice(_ETD2RK, "its defect can be enclosed, so that a bound is proved")
     facts = _facts(problem, x0, args)
     if min(facts.law, facts.state) > FIELD or facts.law > LARGE_LAW:
         return _with_fallback(
-            ETD2RK(),
+            _ETD2RK,
             f"with {facts.law} unknowns in the law, steps meet kinks at any time",
             facts,
             tol,
         )
     if facts.affine and (facts.state <= _EXACT or facts.diagonal):
-        return Choice(ExpRosenbrock(), "x' is affine in t and x between kinks, where it is exact")
+        return Choice(_EXPROSENBROCK, "x' is affine in t and x between kinks, where it is exact")
     if facts.linear and _tree.is_concrete(span, problem, args):
         slopes = largest_slope(problem, x0, args, facts) * span
         # The exponential of a matrix costs as much as many steps.
-        least = _SLOPES * (1.0 if facts.diagonal else 1.0 + (facts.state / 4) ** 3)
+        matrices = _SLOPES_OF_MATRICES * (1.0 + (facts.state / 4) ** 3)
+        least = _SLOPES if facts.diagonal else matrices
         if slopes > least:
             return Choice(
-                ExpRosenbrock(), f"the slope of Ax + f̃ times the span is {slopes:.2g}, and it is constant"
+                _EXPROSENBROCK,
+                f"the constant slope of Ax + f̃ times the span is {slopes:.2g}",
             )
     fast = norm(problem.generator(args)) * span if _tree.is_concrete(span) else 0.0
     if fast > _FAST:
         return _with_fallback(
-            ETD4RK(), f"‖A‖ times the span is {fast:.2g}, left to e^(hA)", facts, tol
+            _ETD4RK, f"‖A‖ times the span is {fast:.2g}, left to e^(hA)", facts, tol
         )
     return _with_fallback(
-        DormandPrince(), "few unknowns, and nothing is known to be stiff", facts, tol
+        _DORMANDPRINCE, "few unknowns, and nothing is known to be stiff", facts, tol
     )
 
 
@@ -137,7 +150,7 @@ def _with_fallback(method: Any, reason: str, facts: Facts, tol: float) -> Choice
     times = 10.0 if facts.diagonal else 10.0 + (facts.state / 16) ** 3
     # Its own steps, of order 4, become as many as the stable ones of the other method.
     times *= max(1.0, 1e-4 / tol) ** (1 / 4)
-    return Choice(method, reason, ExpRosenbrock(), round(100 * times))
+    return Choice(method, reason, _EXPROSENBROCK, 100.0 * times)
 
 
 def norm(A: AbstractGenerator) -> float:
@@ -166,13 +179,13 @@ _MAX_FACTS = 256
 
 
 def _facts(problem: Problem, x0: Tree, args: Any) -> Facts:
-    leaves, tree = jtu.tree_flatten((problem, x0, args))
+    leaves, tree = jtu.tree_flatten((x0, args))
     parts = ((leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf for leaf in leaves)
-    key = tree, tuple(parts)
     try:
+        key = flat(problem).key, tree, tuple(parts)
         if key in _FACTS:
             return _FACTS[key]
-    except TypeError:
+    except (InputError, TypeError):
         return _read(problem, x0, args)  # a part that cannot be hashed is refused later
     if len(_FACTS) >= _MAX_FACTS:
         _FACTS.clear()
@@ -207,8 +220,7 @@ def _is_linear(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) 
     )
 
 
-_Known = tuple[Any, float]
-_SLOPES_OF: dict[tuple[int, ...], _Known] = {}
+_KNOWN: dict[tuple[int, ...], tuple[Any, float]] = {}
 """The largest slopes of the latest problems, by the identity of the problem and of its args, both of
 which an entry keeps alive."""
 
@@ -217,12 +229,12 @@ def largest_slope(problem: Problem, x0: Tree, args: Any, facts: Facts) -> float:
     """Return the larger spectral radius of A + Df̃ for u ∈ h − 0 inside K, and for u held at the
     boundary, where the derivatives of f and h are constant."""
     key = (id(problem), *map(id, jtu.tree_leaves(args)))
-    if key not in _SLOPES_OF:
-        if len(_SLOPES_OF) >= _MAX_FACTS:
-            _SLOPES_OF.clear()
+    if key not in _KNOWN:
+        if len(_KNOWN) >= _MAX_FACTS:
+            _KNOWN.clear()
         radii = _radii(problem, x0, args, facts.diagonal)
-        _SLOPES_OF[key] = (problem, args), max(map(float, radii))
-    return _SLOPES_OF[key][1]
+        _KNOWN[key] = (problem, args), max(map(float, radii))
+    return _KNOWN[key][1]
 
 
 def _radii(problem: Problem, x0: Tree, args: Any, diagonal: bool) -> list[Any]:
@@ -252,7 +264,9 @@ def _radii(problem: Problem, x0: Tree, args: Any, diagonal: bool) -> list[Any]:
     system = np.eye(len(hu)) - hu
     if np.linalg.matrix_rank(system) == len(hu):
         systems.append(fx + fu @ np.linalg.solve(system, hx))
-    return [np.max(np.abs(np.linalg.eigvals(J))) for J in systems if np.all(np.isfinite(J))] or [0.0]
+    return [np.max(np.abs(np.linalg.eigvals(J))) for J in systems if np.all(np.isfinite(J))] or [
+        0.0
+    ]
 
 
 def _is_affine(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) -> bool:

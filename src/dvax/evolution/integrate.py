@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .. import _tree
 from .._failure import nan_derivatives_where
 from .closures import closure_convert
 from .event_arguments import checked_events
@@ -18,15 +17,18 @@ from .method import AbstractMethod
 from .outcome import Outcome
 from .picard import Picard, solve_by_windows
 from .plan import Plan
-from .responses import responses
+from .responses import are_finite
 from .results import RESULTS, has_failed, is_success
 from .setup import Options, Setup
-from .solution import Solution
+from .solution import Guesses, Solution
 from .steps import by_steps
 
 
-def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
-    """Return the solution. If the run failed, its derivatives are NaN."""
+def integrate(setup: Setup, ts: Any, options: Options) -> tuple[Solution, bool]:
+    """Return the solution, and whether functions of the problem close over traced values.
+
+    If the run failed, the derivatives of the solution are NaN.
+    """
     # Check shapes and knots while tracing, so that compiled calls do not pay for it.
     setup.problem.check(setup.number("t0"), setup.x0, setup.args)
     plan = Plan.of(setup)
@@ -44,7 +46,8 @@ def integrate(setup: Setup, ts: Any, options: Options) -> Solution:
     arrays, tree = jtu.tree_flatten(solution, is_leaf=lambda node: node is setup)
     assert arrays.pop() is setup
     given = eqx.filter((flow, setup, events, ts), eqx.is_inexact_array)
-    return tree.unflatten([*nan_derivatives_where(failed, arrays, given), setup])
+    arrays = nan_derivatives_where(failed, arrays, given)
+    return tree.unflatten([*arrays, setup]), flow.problem is not setup.problem
 
 
 def _run(setup: Setup, flow: Flow, ts: Any, valid: jax.Array, options: Options) -> Outcome:
@@ -65,25 +68,16 @@ def _run(setup: Setup, flow: Flow, ts: Any, valid: jax.Array, options: Options) 
 
 def _solution(setup: Setup, plan: Plan, flow: Flow, outcome: Outcome) -> Solution:
     rows = outcome.rows
-    us, ys, residual, law_step, law_error = responses(
-        flow, (rows.t, rows.x, rows.guess), setup.problem.spaces(setup.x0)[1], setup.moduli
-    )
     # A non-finite response is a failure even if f does not depend on it. Rows behind a terminal event
     # are NaN.
     result = outcome.result
     skipped = (rows.t == jnp.inf) & (result == RESULTS.terminal_event)
-    reached = jtu.tree_map(lambda u: jnp.where(_tree.wide(skipped, u), 0.0, u), us)
-    result = RESULTS.where(
-        is_success(result) & ~_tree.all_finite(reached), RESULTS.nonfinite, result
-    )
+    finite = jnp.all(are_finite(flow, (rows.t, rows.x, rows.guess)) | skipped)
+    result = RESULTS.where(is_success(result) & ~finite, RESULTS.nonfinite, result)
     return Solution(
         ts=rows.t,
         xs=rows.x,
-        us=us,
-        ys=ys,
-        law_residual=residual,
-        law_step=law_step,
-        law_error=law_error,
+        law=Guesses(rows.guess),
         defect=None if rows.integrated_defect is None else rows.integrated_defect[0],
         law_defect=None if rows.integrated_defect is None else rows.integrated_defect[1],
         completed_defect=rows.completed_defect,

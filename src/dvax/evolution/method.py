@@ -29,8 +29,8 @@ class AbstractMethod(eqx.Module):
 
     `samples` are the points inside a step where the defect is looked at, apart from those where p was
     made to agree with f̃; the integral of the defect over a step with one kink or one jump of f̃ inside
-    is at most `safety` times what they show. `has_half_stage` says that some stage lies half a step away. Where
-    `is_rosenbrock`, the method has A + J in the place of A and f̃ − Jx in that of f̃, with
+    is at most `safety` times what they show. `has_half_stage` says that some stage lies half a step
+    away. Where `is_rosenbrock`, the method has A + J in the place of A and f̃ − Jx in that of f̃, with
     J = Df̃(t₀, x₀); where `explicit_in_A`, it has 0 and f̃ + Ax there. `pair` numbers two evaluations of
     a measured step at one time, whose differences show the slope of f̃.
     """

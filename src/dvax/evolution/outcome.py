@@ -60,12 +60,12 @@ def ended(result: RESULTS, complete: Any) -> RESULTS:
     return RESULTS.where((result == RESULTS.successful) & ~complete, RESULTS.max_steps, result)
 
 
-def end_alone(end: Any, complete: Any, t1: Any, measured: bool) -> Saved:
+def end_alone(end: Any, complete: Any, t1: Any, measured: bool, guess: Tree | None) -> Saved:
     """Return a single row with the last state of a run, with t = ∞ if the run is not `complete`."""
     x = jtu.tree_map(lambda leaf: jnp.where(complete, leaf, jnp.nan), end.x)
     integrated_defect = end.integrated_defect if measured else None
     one = Saved(
-        jnp.where(complete, t1, jnp.inf), x, integrated_defect, integrated_defect, end.bounds
+        jnp.where(complete, t1, jnp.inf), x, integrated_defect, integrated_defect, end.bounds, guess
     )
     return jtu.tree_map(lambda leaf: leaf[None], one)
 

@@ -396,7 +396,7 @@ def solve_by_windows(
     )  # fmt: skip
     saved, end = forward_only(run.solve(x0, ts))
     complete = end.t >= stops[-1]
-    rows = end_alone(end, complete, stops[-1], True) if saved is None else saved
+    rows = end_alone(end, complete, stops[-1], True, None) if saved is None else saved
     if ts is not None:
         ends = lax.stop_gradient((stops[0], stops[-1]))
         rows = with_tangents(rows, ts, x0, flow, ends)

@@ -52,3 +52,8 @@ def has_failed(result: RESULTS, ts: jax.Array) -> jax.Array:
     """Return whether a run failed, or missed one of its saved times `ts` before a terminal event."""
     ended = result == RESULTS.terminal_event
     return ~is_success(result) | ~(ended | jnp.all(ts < jnp.inf))
+
+
+def result_names() -> list[str]:
+    """Return the names of all results, sorted."""
+    return sorted(RESULTS._name_to_item)

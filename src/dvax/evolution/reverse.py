@@ -26,7 +26,7 @@ from .._jax import outlined
 from .._tree import Tree
 from .checkpoints import Checkpoints, Stack, checkpoint_count
 from .loop import Loop, Record, Saved, State
-from .stepper import interpolate, local
+from .stepper import SolverState, interpolate, local
 from .time_derivatives import instantiate_zeros, is_zero
 
 
@@ -100,9 +100,11 @@ def _states(saved: Saved | None, state: State) -> tuple[_States, Any]:
         events = watched.rows.x
         watched = watched._replace(rows=watched.rows._replace(x=None))
     states = _States(state.x, None if saved is None else saved.x, state.records, events)
+    # Of the solver's state, the run returns the guess for the law.
+    guess = SolverState(None, state.solver_state.guess, None, None)
     state = state._replace(
-        x=None, solver_state=None, propagators=None, last=None, ends=None, checkpoints=None, meter=None,
-        records=None, watched=watched,
+        x=None, solver_state=guess, propagators=None, last=None, ends=None, checkpoints=None,
+        meter=None, records=None, watched=watched,
     )  # fmt: skip
     return states, (None if saved is None else saved._replace(x=None), state)
 

@@ -5,7 +5,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 
+from .. import _tree
 from .._tree import Tree
 from ..problem import Problem
 from ..vi import AbstractSolver
@@ -15,7 +17,8 @@ from .event import Event
 class Setup(NamedTuple):
     """The arguments that determine the solution.
 
-    - `setting`: the numbers t0, t1, dt (NaN for adaptive steps), rtol, atol, dt0, dt_max and horizon;
+    - `setting`: the numbers t0, t1, dt (NaN for adaptive steps), rtol, atol, dt0, dt_max and horizon,
+      and the `stiff_steps` of the stiffness guard;
     - `moduli`: γ, L_F and ‖P⁻¹‖, as far as they are given;
     - `method`: an `AbstractMethod`, `Implicit`, `Picard` or `PiecewiseLinear`;
     - `events`: of the user.
@@ -35,7 +38,7 @@ class Setup(NamedTuple):
     @property
     def dtype(self) -> Any:
         """The floating-point type of the state and of time."""
-        return jnp.result_type(*jtu.tree_leaves(self.x0))
+        return _tree.dtype(self.x0)
 
     def number(self, name: str) -> jax.Array:
         """Return an entry of `setting` in the type of the state."""
@@ -66,8 +69,20 @@ class Options(NamedTuple):
     max_steps: int
     adjoint: str
     progress: bool
-    stiff_steps: int | None = None
+    watch_stiffness: bool = False
     max_events: int = 0
+
+
+def pack(setting: dict[str, Any]) -> Any:
+    """Return a setting as one vector if its entries are Python floats: each argument of a compiled
+    program costs 1.5 µs a call."""
+    entries = list(setting.values())
+    return np.array(entries) if all(type(entry) is float for entry in entries) else entries
+
+
+def unpack(entries: Any, names: tuple[str, ...]) -> dict[str, Any]:
+    """Return the setting with these entries."""
+    return dict(zip(names, entries, strict=True))
 
 
 def as_arrays(args: Any) -> Any:

@@ -1,6 +1,8 @@
 """The result of `dvax.solve`."""
 
-from typing import TYPE_CHECKING, Any
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
+from .._jax.traces import current_trace
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import Fix, InputError, InputProblem, SolveError
 from .bounds import Bounds
 from .diagnose import failure
 from .event import Events
@@ -20,7 +23,9 @@ from .piecewise.method import PiecewiseLinear
 from .piecewise.trajectory import Trajectory, signs
 from .plan import Plan
 from .regimes import Regimes, regimes
+from .responses import Responses
 from .results import RESULTS, is_success
+from .saved_responses import Saved, saved_responses
 from .setup import Setup
 from .stepper import interpolate, local
 
@@ -28,11 +33,24 @@ if TYPE_CHECKING:
     import xarray
 
 
+_CACHE = "_computed_responses"
+"""The name under which a solution keeps its responses, with the trace that they belong to. It is no
+field, and so no part of the pytree."""
+
+
+class Guesses(NamedTuple):
+    """The initial guesses `ys` for the law at the saved times, from which responses are computed when
+    they are read. None: zero, or the law has a closed form."""
+
+    ys: Tree | None
+
+
 class Solution(eqx.Module):
     """A trajectory with its response, its error measures and statistics of the run.
 
-    - `ts`: the saved times;
-    - `xs`, `us`, `ys`: states, responses u and y = P u at the saved times, with a leading time axis;
+    - `ts`: the saved times; `xs`: the states there, with a leading time axis;
+    - `us`, `ys`: the responses u and y = P u at the saved times. They and the next two are computed
+      when one of them is first read (`responses`);
     - `law_error`: a certified bound on ‖u − u*‖ of the frozen law at each saved time (C0 of
       `dvax.vi.certificate`), ‖P⁻¹‖(‖w‖/γ + ‖ȳ − y‖); None if `constants=` does not give γ;
     - `law_residual`, `law_step`: ‖w‖ and ‖ȳ − y‖ of one projection step from y;
@@ -53,7 +71,8 @@ class Solution(eqx.Module):
     - `result`: `dvax.RESULTS.successful`, `dvax.RESULTS.terminal_event` where a terminal event ended
       the run, or the kind of failure;
     - `plan`: properties of the law proved from the code of f, h and K (None with `PiecewiseLinear`);
-    - `setup`: the arguments; `records`: the steps, if `dense=True`;
+    - `setup`: the arguments; `records`: the steps, if `dense=True`; `law`: what the responses are
+      computed from;
     - `events`: the events of `events=`, a `dvax.evolution.Events`, else None.
 
     ```python
@@ -73,11 +92,7 @@ class Solution(eqx.Module):
 
     ts: jax.Array
     xs: Tree
-    us: Tree
-    ys: Tree
-    law_residual: jax.Array
-    law_step: jax.Array
-    law_error: jax.Array | None
+    law: Guesses | Responses
     defect: jax.Array | None
     law_defect: jax.Array | None
     completed_defect: tuple[jax.Array, jax.Array] | None
@@ -89,6 +104,42 @@ class Solution(eqx.Module):
     enclosed: bool = eqx.field(static=True)
     plan: Plan | None = eqx.field(static=True)
     setup: Setup
+
+    @property
+    def us(self) -> Tree:
+        """The responses u at the saved times."""
+        return _responses(self).us
+
+    @property
+    def ys(self) -> Tree:
+        """y = P u at the saved times."""
+        return _responses(self).ys
+
+    @property
+    def law_residual(self) -> jax.Array:
+        """‖w‖ of one projection step from y, at the saved times."""
+        return _responses(self).law_residual
+
+    @property
+    def law_step(self) -> jax.Array:
+        """‖ȳ − y‖ of one projection step from y, at the saved times."""
+        return _responses(self).law_step
+
+    @property
+    def law_error(self) -> jax.Array | None:
+        """The certified bound on ‖u − u*‖ at the saved times, or None."""
+        return _responses(self).law_error
+
+    def responses(self) -> Responses:
+        """Return u, y and their certificates at the saved times, as one named tuple.
+
+        They are computed when they are first read, by one compiled program, and kept. A copy that a
+        JAX transformation makes of this solution computes them again.
+
+        **Raises:** `dvax.SolveError` if the run succeeded, and the law has no finite solution at a
+        saved time. Where it is traced, values and derivatives are NaN instead.
+        """
+        return _responses(self)
 
     @property
     def flow(self) -> Flow:
@@ -234,3 +285,31 @@ class Solution(eqx.Module):
             if series is not None:
                 variables[name] = (("time",), np.asarray(series))
         return xarray.Dataset(variables, coords={"time": np.asarray(self.ts)})
+
+
+def _responses(solution: Solution) -> Responses:
+    """`Solution.responses`, without the module that Equinox makes at each call of a method (15 µs)."""
+    if isinstance(solution.law, Responses):
+        return solution.law
+    assert solution.plan is not None
+    trace, found = solution.__dict__.get(_CACHE, (None, None))
+    if found is not None and (trace is None or trace == current_trace()):
+        return found
+    rows = Saved(solution.ts, solution.xs, solution.law.ys, solution.result)
+    found, missing = saved_responses(solution.setup, solution.plan, rows)
+    concrete = _tree.is_concrete(found, missing)
+    if concrete and (first := float(np.asarray(missing).min())) < math.inf:
+        raise _without_response(solution, first, found)
+    # The fields of the module are frozen, and this is none.
+    object.__setattr__(solution, _CACHE, (None if concrete else current_trace(), found))
+    return found
+
+
+def _without_response(solution: Solution, t: float, found: Responses) -> SolveError:
+    fields = {"law": found, "result": RESULTS.nonfinite}
+    return SolveError(
+        f"The law has no finite solution at the saved time t = {t:.17g}, though all steps "
+        "were made.",
+        dataclasses.replace(solution, **fields),
+        (Fix("", "", f"Solve the law alone there: dvax.Problem.law({t:g}, x, args)"),),
+    )

@@ -39,6 +39,7 @@ from .piecewise.method import PiecewiseLinear
 from .piecewise.propagate import Limits, propagate
 from .results import RESULTS
 from .setup import Options, Setup, as_arrays
+from .signature import flat
 from .solution import Solution
 
 _FIRST_ROOM = 2**12
@@ -173,7 +174,7 @@ def solve(
         warn_precision(x0, rtol)
     t0, t1 = _number(t0), _number(t1)
     span = t1 - t0
-    dtype = jnp.result_type(*jax.tree_util.tree_leaves(x0))
+    dtype = _tree.dtype(x0)
     setting = {
         "t0": t0,
         "t1": t1,
@@ -184,6 +185,7 @@ def solve(
         "dt0_growth": FIRST_GROWTH if dt0 is None else MAX_GROWTH,
         "dt_max": math.inf if dt_max is None else _number(dt_max),
         "horizon": span if horizon is None else _number(horizon),
+        "stiff_steps": math.inf,
     }
     choice = Choice(method)
     if method is None:
@@ -309,11 +311,12 @@ def _run_chosen(
     choice: Choice, setup: Setup, times: Any, options: Options
 ) -> tuple[Solution, bool | jax.Array]:
     """Run the method that was chosen, or another one where stability or rounding limits its steps."""
-    given = setup.problem, setup.x0, setup.args, setup.setting, times
     text = choice.text()
-    if choice.reason and _tree.is_concrete(_tree.primal(given)):
+    if choice.reason and _has_values(setup, times):
+        # A number of its own, so that one program serves every tolerance.
+        guarded = setup._replace(setting={**setup.setting, "stiff_steps": choice.least})
         solution, reached = _differentiably(
-            setup, times, options._replace(stiff_steps=choice.least)
+            guarded, times, options._replace(watch_stiffness=choice.fallback is not None)
         )
         if isinstance(reached, bool):
             other = None if reached else choice.after(solution.result)
@@ -329,6 +332,14 @@ def _run_chosen(
     solution, reached = _differentiably(setup, times, options)
     solution.stats["method"] = text
     return solution, reached
+
+
+def _has_values(setup: Setup, times: Any) -> bool:
+    """Return whether no argument is traced, except for derivatives."""
+    given = setup.x0, setup.args, setup.setting, times
+    if flat(setup.problem).is_concrete and _tree.is_concrete(given):
+        return True
+    return _tree.is_concrete(_tree.primal((setup.problem, given)))
 
 
 def _differentiably(
@@ -378,11 +389,7 @@ def _trim(solution: Solution) -> Solution:
     fields = (
         "ts",
         "xs",
-        "us",
-        "ys",
-        "law_residual",
-        "law_step",
-        "law_error",
+        "law",
         "defect",
         "law_defect",
         "completed_defect",

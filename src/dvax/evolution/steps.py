@@ -72,7 +72,8 @@ def by_steps(
         events = outlined(EventWatch.finish, watch, flow, rows, count, stops[0], setup.x0)
         if saved is None:
             end, t1, complete = _to_event(end, events, t1, complete)
-    rows = end_alone(end, complete, t1, options.measure) if saved is None else saved
+    guess = end.solver_state.guess
+    rows = end_alone(end, complete, t1, options.measure, guess) if saved is None else saved
     ends = lax.stop_gradient((stops[0], t1))
     if ts is not None:
         assert saved is not None
@@ -125,7 +126,9 @@ def _controller(
         longest=setup.number("dt_max"),
         order=method.order,
         defect_order=method.degree + 1,
-        stiff_steps=options.stiff_steps if method.pair is not None else None,
+        stiff_steps=setup.number("stiff_steps")
+        if options.watch_stiffness and method.pair is not None
+        else None,
     )
 
 

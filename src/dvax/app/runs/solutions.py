@@ -9,8 +9,7 @@ from dvax.errors import Fix, SolveError
 from dvax.evolution import Solution
 
 _ROWS = (
-    "ts", "xs", "us", "ys", "law_residual", "law_step", "law_error", "defect", "law_defect",
-    "completed_defect",
+    "ts", "xs", "law", "defect", "law_defect", "completed_defect",
 )  # fmt: skip
 
 

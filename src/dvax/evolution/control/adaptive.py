@@ -36,7 +36,7 @@ class Adaptive(AbstractController):
     3. the `RoundoffGuard` lets steps grow where the error is roundoff;
     4. the `EventBracket` ends steps at events that the stepper located;
     5. the `StiffnessGuard` ends the run where stability limits the steps, if another method is worth
-       its own program from `stiff_steps` more steps on (None: never).
+       its own program from `stiff_steps` more steps on (None: not watched).
 
     `order` is that of the mean defect, `defect_order` that of its modulus; `first` and `longest` are
     the first and the largest step size, and `first_growth` limits the growth after the first step.
@@ -49,7 +49,7 @@ class Adaptive(AbstractController):
     longest: Any
     order: int = eqx.field(static=True)
     defect_order: int = eqx.field(static=True)
-    stiff_steps: int | None = eqx.field(static=True, default=None)
+    stiff_steps: Any = None
 
     adapts: ClassVar[bool] = True
 

@@ -34,7 +34,7 @@ class StiffnessGuard(NamedTuple):
         votes = jnp.where(above, self.votes + 1, self.votes)
         return StiffnessGuard(jnp.where(clear >= _CLEAR, 0, votes), clear)
 
-    def fires(self, stiffness: Any, counts: Any, remaining: Any, least: int) -> Any:
+    def fires(self, stiffness: Any, counts: Any, remaining: Any, least: Any) -> Any:
         """Return whether the run should end after this attempt: of its size `remaining` more steps are
         needed, and another method is worth its own program from the `least` on. A short step before
         a kink says nothing of the sizes to come, and does not end the run."""

@@ -11,6 +11,7 @@ from ... import _tree
 from ...errors import DifferentiationError
 from ...spaces import AbstractSpace
 from ..bounds import Bounds
+from ..responses import Responses
 from ..results import RESULTS
 from ..setup import Setup, as_arrays
 from ..solution import Solution
@@ -123,11 +124,7 @@ def _solution(
     return Solution(
         ts=array([r.t for r in rows], ()),
         xs=array([r.x for r in rows], x0.shape),
-        us=jax.vmap(P.inverse)(y) if rows else y,
-        ys=y,
-        law_residual=residual,
-        law_step=step,
-        law_error=error,
+        law=Responses(jax.vmap(P.inverse)(y) if rows else y, y, residual, step, error),
         defect=array(defects[:, 0], ()),
         law_defect=array(defects[:, 1], ()),
         completed_defect=(array(completed_defect[:, 0], ()), array(completed_defect[:, 1], ())),

@@ -19,6 +19,7 @@ from dvax.app.runs.solutions import all_finite, cut, with_fields
 from dvax.app.runs.solver_options import SEGMENTS
 from dvax.errors import SolveError
 from dvax.evolution import Implicit, Solution, solve
+from dvax.evolution.responses import Responses
 
 
 def segments(plan: Plan) -> Iterator[Solution]:
@@ -46,13 +47,17 @@ def segments(plan: Plan) -> Iterator[Solution]:
         def piece(
             start: float = start, ts: np.ndarray = ts, x: Any = x, step: Any = step
         ) -> Solution:
-            return solve(
+            solution = solve(
                 plan.problem, x, start, float(ts[-1]), None, ts, constants=plan.constants,
                 dt0=step, horizon=last - first, **measure, **plan.settings,
             )  # fmt: skip
+            solution = all_finite(solution, start)
+            # Here, where a signal can interrupt the compilation, and for all times of the segment,
+            # whose number determines the program.
+            return with_fields(solution, {"law": solution.responses()})
 
         try:
-            solution = all_finite(interruptible(piece), start)
+            solution = interruptible(piece)
         except SolveError as error:
             if isinstance(error.solution, Solution) and len(error.solution.ts):
                 yield error.solution
@@ -66,8 +71,10 @@ def join_pieces(pieces: list[Solution], count: int | None = None) -> Solution:
     summed. Its `setup` is that of the first piece. With `count` the last row is repeated up to that
     number, so that programs of one length serve all partial results."""
     fields: dict[str, Any] = {}
-    for name in ("ts", "xs", "us", "ys", "law_residual", "law_step", "law_error"):
+    for name in ("ts", "xs"):
         fields[name] = _concatenate([getattr(piece, name) for piece in pieces])
+    laws = zip(*(piece.responses() for piece in pieces), strict=True)
+    fields["law"] = Responses(*map(_concatenate, map(list, laws)))
     if pieces[0].defect is not None:
         defects: list[Any] = [(piece.defect, piece.law_defect) for piece in pieces]
         starts: list[Any] = [piece.completed_defect for piece in pieces]
