@@ -78,12 +78,16 @@ def product(A: jax.Array, B: jax.Array) -> jax.Array:
     return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
 
 
-@jax.custom_jvp
 def pseudoinverse(rows: jax.Array) -> jax.Array:
-    """Return the pseudoinverse of a matrix whose rows have length one or zero.
+    """Return the pseudoinverse of a matrix whose rows have length one or zero."""
+    return as_pseudoinverse(lax.stop_gradient(_pseudoinverse(lax.stop_gradient(rows))), rows)
 
-    The rows are added one by one (Greville 1960). A row adds its component orthogonal to the earlier
-    ones; a row that depends on them is distributed over them. Matrices of many rows take an SVD.
+
+def _pseudoinverse(rows: jax.Array) -> jax.Array:
+    """Return the pseudoinverse by adding the rows one by one (Greville 1960).
+
+    A row adds its component orthogonal to the earlier ones; a row that depends on them is distributed
+    over them. Matrices of many rows take an SVD.
     """
     m, n = rows.shape
     if m > 2 * MAX_ROWS or m == 0:
@@ -109,12 +113,18 @@ def pseudoinverse(rows: jax.Array) -> jax.Array:
     return lax.fori_loop(0, m, add_row, jnp.zeros((m, n), rows.dtype)).T
 
 
-@pseudoinverse.defjvp
+@jax.custom_jvp
+def as_pseudoinverse(inverse: jax.Array, rows: jax.Array) -> jax.Array:
+    """Return `inverse`, which is the pseudoinverse of `rows`, with its derivative in `rows`."""
+    return inverse
+
+
+@as_pseudoinverse.defjvp
 def _(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
     """Return B = A⁺ and dB = −B dA B + B Bᵀ dAᵀ (I − A B) + (I − B A) dAᵀ Bᵀ B, for a constant rank
     (Golub and Pereyra 1973)."""
-    (A,), (dA,) = primals, tangents
-    B = pseudoinverse(A)
+    A, dA = primals[1], tangents[1]
+    B = as_pseudoinverse(*primals)
     first = B @ (B.T @ (dA.T - (dA.T @ A) @ B))
     second = (dA.T - B @ (A @ dA.T)) @ B.T @ B
     return B, first + second - B @ dA @ B

@@ -31,7 +31,7 @@ def test_solve_vi_accepts_traced_moduli_and_mixed_types():
     bound = jax.jit(lambda gamma: dvax.solve_vi(F, K, jnp.zeros(2), gamma=gamma).error_bound)
     assert np.isinf(bound(jnp.asarray(-1.0))) and float(bound(jnp.asarray(1.0))) < 1e-10
     # Of a γ so large the quotient underflows, and the bound is not 0 for that.
-    assert 0 < float(bound(jnp.asarray(1e300))) < 1e-300
+    assert 0 < float(bound(jnp.asarray(1e300))) < 1e-299
     # Parts of a tuple may be of several types, and F may be a number for a number.
     pair = jnp.zeros(2), jnp.zeros(3, jnp.float32)
     with jax.numpy_dtype_promotion("standard"):

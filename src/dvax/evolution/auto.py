@@ -227,17 +227,23 @@ which an entry keeps alive."""
 
 def largest_slope(problem: Problem, x0: Tree, args: Any, facts: Facts) -> float:
     """Return the larger spectral radius of A + Df̃ for u ∈ h − 0 inside K, and for u held at the
-    boundary, where the derivatives of f and h are constant."""
+    boundary, where the derivatives of f and h are constant; zero where their code closes over traced
+    values."""
     key = (id(problem), *map(id, jtu.tree_leaves(args)))
     if key not in _KNOWN:
         if len(_KNOWN) >= _MAX_FACTS:
             _KNOWN.clear()
-        radii = _radii(problem, x0, args, facts.diagonal)
+        with jax.ensure_compile_time_eval():
+            radii = _radii(problem, x0, args, facts.diagonal)
+        if radii is None:
+            return 0.0
         _KNOWN[key] = (problem, args), max(map(float, radii))
     return _KNOWN[key][1]
 
 
-def _radii(problem: Problem, x0: Tree, args: Any, diagonal: bool) -> list[Any]:
+def _radii(problem: Problem, x0: Tree, args: Any, diagonal: bool) -> list[Any] | None:
+    # Any state will do, and x0 may be traced.
+    x0 = jtu.tree_map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), x0)
     t = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(x0)))
     like = problem.zero_control(x0)
 
@@ -255,7 +261,10 @@ def _radii(problem: Problem, x0: Tree, args: Any, diagonal: bool) -> list[Any]:
         return [_matrix(fn, at) for fn, at in fns]
 
     arrays, static = eqx.partition((problem, x0, like), eqx.is_array)
-    fx, fu, hx, hu = map(np.asarray, derivatives(arrays))
+    found = derivatives(arrays)
+    if not _tree.is_concrete(found):
+        return None
+    fx, fu, hx, hu = map(np.asarray, found)
     if diagonal:
         with np.errstate(divide="ignore", invalid="ignore"):
             free = fx + fu * hx / (1.0 - hu)

@@ -10,8 +10,11 @@ If a violated row depends on active rows none of which can be dropped, no point 
 An interior-point method finds the face only to the square root of its tolerance where an active row
 has a zero multiplier. This method finds the face exactly, and so the derivative on it.
 
-The pseudoinverse B of the active rows is kept by rank-one updates. The only operations are products
-of a matrix with a vector, which are fast under `vmap` and on accelerators.
+Rows that hold with equality at the end are active too, with the multiplier 0: the same loop adds them
+last, without a move. So it returns the pseudoinverse B of all active rows, and I − BN is the derivative
+of the projection. The pseudoinverse is kept by rank-one updates (Greville 1960 for rows that depend on
+others). The only operations are products of a matrix with a vector, which are fast under `vmap` and on
+accelerators.
 """
 
 from typing import NamedTuple
@@ -27,7 +30,8 @@ SLACK = 0.75
 
 
 class Projection(NamedTuple):
-    """The projection x, its active rows, their multipliers, and whether x is a valid projection.
+    """The projection x, its active rows, their multipliers, the transposed pseudoinverse of the active
+    rows (zero for the others), and whether x is a valid projection.
 
     An active row may have the multiplier 0.
     """
@@ -35,18 +39,20 @@ class Projection(NamedTuple):
     x: jax.Array
     active: jax.Array
     multiplier: jax.Array
+    dual: jax.Array
     valid: jax.Array
 
 
 class _State(NamedTuple):
+    """`row` is the next row to add. Its `priority` is ∞ if the move towards it was interrupted, its
+    violation, 0 if it holds with equality, and −∞ if no row is left."""
+
     x: jax.Array
-    dual: jax.Array  # B: N_A Bᵀ = I on the active rows A, zero on the others
+    dual: jax.Array
     multiplier: jax.Array
     active: jax.Array
-    row: jax.Array  # the current violated row, if `pending`
-    pending: jax.Array
-    violation: jax.Array
-    failed: jax.Array
+    row: jax.Array
+    priority: jax.Array
     count: jax.Array
 
 
@@ -58,97 +64,95 @@ def nearest_point(rows: jax.Array, bounds: jax.Array, z: jax.Array, size: jax.Ar
     """
     m, n = rows.shape
     dtype = jnp.result_type(z)
-    eps = jnp.finfo(dtype).eps
-    finite = jnp.isfinite(bounds)
-    size = jnp.where(finite, jnp.abs(bounds), 0.0) + size
+    eps, index = jnp.finfo(dtype).eps, jnp.arange(m, dtype=jnp.uint32)
+    # A row without a bound is never active.
+    is_bounded = jnp.isfinite(bounds)
+    rows, bounds = jnp.where(is_bounded[:, None], rows, 0.0), jnp.where(is_bounded, bounds, 1.0)
+    # At the apex of a cone x should be 0; its roundoff is relative to the norm of z.
+    length_z = _norm(z)
+    absolute = eps**SLACK * (jnp.abs(bounds) + size) + eps ** (1.0 + SLACK) * length_z
 
     def slack(x: jax.Array) -> jax.Array:
-        return jnp.where(finite, times(rows, x) - jnp.where(finite, bounds, 0.0), -jnp.inf)
-
-    # At the apex of a cone x should be 0; its roundoff is relative to the norm of z.
-    residue = eps ** (1.0 + SLACK) * jnp.linalg.norm(z)
+        return times(rows, x) - bounds
 
     def tolerance(x: jax.Array) -> jax.Array:
-        return eps**SLACK * (size + jnp.linalg.norm(x)) + residue
+        return absolute + eps**SLACK * _norm(x)
 
-    def violations(x: jax.Array, active: jax.Array) -> jax.Array:
-        violation = slack(x)
-        return jnp.where(~active & (violation > tolerance(x)), violation, 0.0)
+    def next_row(x: jax.Array, active: jax.Array, multiplier: jax.Array) -> tuple:
+        excess, least = slack(x), tolerance(x)
+        tied = jnp.where(excess >= -least, 0.0, -jnp.inf)
+        priority = jnp.where(excess > least, excess, tied)
+        priority = jnp.where(multiplier > 0, jnp.inf, priority)
+        priority = jnp.where(active, -jnp.inf, priority)
+        row = lax.argmax(priority, 0, jnp.uint32)
+        return row, _entry(priority, row)
 
     def unfinished(s: _State) -> jax.Array:
-        violated = s.pending | jnp.any(s.violation > 0)
-        return violated & ~s.failed & (s.count < 50 + 10 * m)
+        return (s.priority > -jnp.inf) & (s.count < 50 + 10 * m)
 
     def advance(s: _State) -> _State:
-        row = jnp.where(s.pending, s.row, jnp.argmax(s.violation))
-        normal = rows[row]
+        normal, bound = _entry(rows, s.row), _entry(bounds, s.row)
         # The component of the normal orthogonal to the active rows. The second pass removes the
-        # roundoff of the first.
+        # roundoff of the first. (Inactive rows have coefficients 0.)
         coefficients = times(s.dual, normal)
-        direction = normal - combine(coefficients, _masked(s.active, rows))
+        direction = normal - combine(coefficients, rows)
         correction = times(s.dual, direction)
         coefficients = coefficients + correction
-        direction = direction - combine(correction, _masked(s.active, rows))
+        direction = direction - combine(correction, rows)
         square = jnp.sum(direction * direction)
-        independent = square > (1e3 * eps) ** 2
+        is_independent = square > (1e3 * eps) ** 2
 
-        full_step = jnp.where(independent, jnp.maximum(slack(s.x)[row], 0.0) / square, jnp.inf)
-        decreasing = s.active & (coefficients > 10 * eps)
-        divisor = jnp.where(decreasing, coefficients, 1.0)
-        ratios = jnp.where(decreasing, s.multiplier / divisor, jnp.inf)
-        dropped = jnp.argmin(ratios)
-        smallest_ratio = ratios[dropped]
+        violated = s.priority > 0
+        excess = jnp.maximum(jnp.sum(normal * s.x) - bound, 0.0)
+        full_step = jnp.where(is_independent, excess / square, jnp.inf)
+        full_step = jnp.where(violated, full_step, 0.0)
+        ratios = jnp.where(coefficients > 10 * eps, s.multiplier / coefficients, jnp.inf)
+        dropped = lax.argmin(ratios, 0, jnp.uint32)
+        smallest_ratio = _entry(ratios, dropped)
         step = jnp.minimum(full_step, smallest_ratio)
-        failed = ~(step < jnp.inf)
         adds_row = full_step <= smallest_ratio
+        failed = ~(step < jnp.inf)
 
         # Masks instead of indexed updates, which compile to much longer code.
-        is_row, is_dropped = index == row, (index == dropped) & ~adds_row
+        is_added, is_dropped = (index == s.row) & adds_row, (index == dropped) & ~adds_row
         multiplier = jnp.maximum(s.multiplier - step * coefficients, 0.0)
-        multiplier = multiplier + jnp.where(is_row, step, 0.0)
+        multiplier = multiplier + jnp.where(index == s.row, step, 0.0)
         multiplier = jnp.where(is_dropped, 0.0, multiplier)
-        x = s.x - jnp.where(independent, step, 0.0) * direction
         # Rank-one update of the pseudoinverse with the added row, or without the dropped one.
-        dropped_dual = s.dual[dropped]
-        length = jnp.where(adds_row, 1.0, jnp.sum(dropped_dual * dropped_dual))
-        overlap = times(s.dual, dropped_dual) / length
-        new_dual = jnp.where(adds_row, direction / square, dropped_dual)
+        dropped_dual = _entry(s.dual, dropped)
+        spread = combine(coefficients, s.dual) / (1.0 + jnp.sum(coefficients * coefficients))
+        new_dual = jnp.where(is_independent, direction / square, spread)
+        new_dual = jnp.where(adds_row, new_dual, dropped_dual)
+        overlap = times(s.dual, dropped_dual) / jnp.sum(dropped_dual * dropped_dual)
         weights = jnp.where(adds_row, coefficients, overlap)
         dual = s.dual - weights[:, None] * new_dual[None, :]
-        dual = jnp.where((is_row & adds_row)[:, None], new_dual[None, :], dual)
+        dual = jnp.where(is_added[:, None], new_dual[None, :], dual)
         dual = jnp.where(is_dropped[:, None], 0.0, dual)
-        active = (s.active | (is_row & adds_row)) & ~is_dropped
+        active = (s.active | is_added) & ~is_dropped
+        x = s.x - jnp.where(is_independent, step, 0.0) * direction
         # Project back onto the active rows: this corrects the roundoff of a distant z.
-        x = x - combine(jnp.where(active, slack(x), 0.0), dual)
-        violation = violations(x, active)
-        pending = ~adds_row
-        return _State(x, dual, multiplier, active, row, pending, violation, failed, s.count + 1)
+        x = jnp.where(violated, x - combine(slack(x), dual), s.x)
+        row, priority = next_row(x, active, multiplier)
+        priority = jnp.where(failed, -jnp.inf, priority)
+        return _State(x, dual, multiplier, active, row, priority, s.count + 1)
 
-    none, index = jnp.zeros(m, bool), jnp.arange(m)
+    none, zero = jnp.zeros(m, bool), jnp.zeros(m, dtype)
     start = _State(
-        x=z,
-        dual=jnp.zeros((m, n), dtype),
-        multiplier=jnp.zeros(m, dtype),
-        active=none,
-        row=jnp.asarray(0),
-        pending=jnp.asarray(False),
-        violation=violations(z, none),
-        failed=jnp.asarray(False),
-        count=jnp.asarray(0),
+        z, jnp.zeros((m, n), dtype), zero, none, *next_row(z, none, zero), jnp.asarray(0)
     )
     end = lax.while_loop(unfinished, advance, start)
     # Check the optimality conditions: x in the set, z − x a nonnegative sum of active normals.
-    multiplier = times(end.dual, z - end.x)
-    magnitude = jnp.linalg.norm(z) + jnp.linalg.norm(end.x)
-    kkt_tolerance = jnp.sqrt(eps) * 1e-2 * magnitude  # well above the accumulated roundoff
-    residual = z - end.x - combine(multiplier, _masked(end.active, rows))
-    stationary = jnp.linalg.norm(residual) <= kkt_tolerance
-    feasible = jnp.all(~(slack(end.x) > 2.0 * tolerance(end.x)))
-    nonnegative = jnp.all(multiplier >= -kkt_tolerance)
-    valid = feasible & stationary & nonnegative & ~end.failed & jnp.isfinite(magnitude)
-    active = end.active | (jnp.abs(slack(end.x)) <= tolerance(end.x))
-    return Projection(end.x, active, jnp.where(end.active, end.multiplier, 0.0), valid)
+    size = length_z + _norm(end.x)
+    residual = _norm(z - end.x - combine(end.multiplier, rows))
+    # The limit is well above the accumulated roundoff.
+    stationary = (residual <= jnp.sqrt(eps) * 1e-2 * size) & (size < jnp.inf)
+    feasible = jnp.all(slack(end.x) <= 2.0 * tolerance(end.x))
+    return Projection(end.x, end.active, end.multiplier, end.dual, feasible & stationary)
 
 
-def _masked(mask: jax.Array, rows: jax.Array) -> jax.Array:
-    return jnp.where(mask[:, None], rows, 0.0)
+def _entry(array: jax.Array, index: jax.Array) -> jax.Array:
+    return lax.dynamic_index_in_dim(array, index, keepdims=False)
+
+
+def _norm(x: jax.Array) -> jax.Array:
+    return jnp.sqrt(jnp.sum(x * x))

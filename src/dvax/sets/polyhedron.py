@@ -5,10 +5,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.custom_derivatives import SymbolicZero
 
 from .. import _tree
-from .._small_matrices import pseudoinverse
+from .._small_matrices import as_pseudoinverse, pseudoinverse
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
@@ -88,8 +89,8 @@ class Polyhedron(AbstractSet):
 
         The multipliers of linearly dependent rows are not unique."""
         flat, root, G, d, E, e = self._flat(z, space)
-        y, active, multiplier = _nearest(flat, root, G, d, E, e)
-        rows, bounds = _scaled(G, d, root)
+        y, active, multiplier, _ = _nearest(flat, root, G, d, E, e)
+        rows, bounds = normalised_conditions(G * root[None, :], d)
         return [jnp.where(active > 0, -multiplier, bounds - rows @ (y / root))]
 
     def _flat(self, z: Tree, space: AbstractSpace) -> tuple:
@@ -107,52 +108,64 @@ class Polyhedron(AbstractSet):
 @jax.custom_jvp
 def _nearest(
     z: jax.Array, root: jax.Array, G: jax.Array, d: jax.Array, E: jax.Array, e: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return (projection, 1 for active rows of G and else 0, multipliers).
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Return (projection, 1 for active rows of G and else 0, multipliers, B).
 
-    The projection is NaN if the set is empty. `root` is w^{−1/2}: in the coordinates y/root the norm
-    of the space is the Euclidean norm.
+    B is the transposed pseudoinverse of the active rows that `_reduce` returns. The projection is NaN
+    if the set is empty. `root` is w^{−1/2}: in the coordinates y/root the norm of the space is the
+    Euclidean norm.
     """
-    point, rows, bounds = z / root, *_scaled(G, d, root)
+    point, rows, bounds, base, scale = _reduce(z, root, G, d, E, e)
     if len(e):
-        # Restrict to the affine subspace of the equations; only inequalities remain.
-        equations, values = _scaled(E, e, root)
-        back = pseudoinverse(equations)
-        base = back @ values
-        point = point - base - back @ (equations @ point - values)
-        point = point - back @ (equations @ point)
-        bounds = bounds - rows @ base
-        rows = rows - (rows @ back) @ equations
-        # A row whose projection is shorter than this depends linearly on the equations.
-        roundoff = float(jnp.finfo(z.dtype).eps) ** dual.SLACK
-        rows, scale = normalise_rows(jnp.where(_length(rows)[:, None] > roundoff, rows, 0.0))
-        bounds = bounds / scale
-        size = (jnp.abs(bounds) + jnp.linalg.norm(base)) / scale
+        size = jnp.abs(bounds) + jnp.sqrt(jnp.sum(base * base)) / scale
         solvable = has_solution(E, e)
     else:
-        base, size, solvable = jnp.zeros_like(point), jnp.zeros_like(bounds), True
+        size, solvable = jnp.zeros_like(bounds), True
     nearest = dual.nearest_point(rows, bounds, point, size)
     y = jnp.where(nearest.valid & solvable, nearest.x + base, jnp.nan)
     # Without active rows, return z itself: scaling there and back has roundoff.
     interior = nearest.valid & ~jnp.any(nearest.active) & (len(e) == 0)
     y = jnp.where(interior, z, y * root)
-    return y, nearest.active.astype(z.dtype), nearest.multiplier
+    return y, nearest.active.astype(z.dtype), nearest.multiplier, nearest.dual
+
+
+def _reduce(
+    z: jax.Array, root: jax.Array, G: jax.Array, d: jax.Array, E: jax.Array, e: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array, Any, Any]:
+    """Return (point, rows, bounds, base, scale) with proj_K(z) = root (base + x), where x is the
+    projection of the point onto {x : rows x ≤ bounds}.
+
+    The rows have length one or zero. Equations restrict x to their null space; `base` is their solution
+    of least norm, and `scale` the length of the rows in the null space.
+    """
+    point, (rows, bounds) = z / root, normalised_conditions(G * root[None, :], d)
+    if not len(e):
+        return point, rows, bounds, 0.0, 1.0
+    equations, values = normalised_conditions(E * root[None, :], e)
+    back = pseudoinverse(equations)
+    base = back @ values
+    point = point - base - back @ (equations @ point - values)
+    point = point - back @ (equations @ point)
+    bounds = bounds - rows @ base
+    rows = rows - (rows @ back) @ equations
+    # A row whose projection is shorter than this depends linearly on the equations.
+    roundoff = float(jnp.finfo(z.dtype).eps) ** dual.SLACK
+    is_long = jnp.sum(rows * rows, axis=1) > roundoff**2
+    rows, scale = normalise_rows(jnp.where(is_long[:, None], rows, 0.0))
+    return point, rows, bounds / scale, base, scale
 
 
 def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
-    y, active, multiplier = _nearest(*primals)
+    y, active, multiplier, inverse = _nearest(*primals)
 
     def project_on_face(z, root, G, d, E, e) -> jax.Array:
         # Inactive rows are set to zero; d may be infinite there.
-        rows, bounds = _scaled(
-            jnp.concatenate([E, jnp.where(active[:, None] > 0, G, 0.0)]),
-            jnp.concatenate([e, jnp.where(active > 0, d, 0.0)]),
-            root,
-        )
-        point, back = z / root, pseudoinverse(rows)
+        G, d = jnp.where(active[:, None] > 0, G, 0.0), jnp.where(active > 0, d, 0.0)
+        point, rows, bounds, base, _ = _reduce(z, root, G, d, E, e)
+        back = as_pseudoinverse(lax.stop_gradient(inverse).T, rows)
         # Sums of products: for a batch of tangents, matrix products would be calls of a library.
         excess = jnp.sum(rows * point[None, :], axis=1) - bounds
-        return root * (point - jnp.sum(back * excess[None, :], axis=1))
+        return root * (point - jnp.sum(back * excess[None, :], axis=1) + base)
 
     # Inputs without a tangent are constants: the derivative in z alone is a projection.
     moving = [k for k, v in enumerate(tangents) if not isinstance(v, SymbolicZero)]
@@ -164,18 +177,11 @@ def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
         return project_on_face(*inputs)
 
     _, dy = jax.jvp(of_moving, [primals[k] for k in moving], [tangents[k] for k in moving])
-    return (y, active, multiplier), (dy, jnp.zeros_like(active), jnp.zeros_like(multiplier))
+    results = y, active, multiplier, inverse
+    return results, (dy, *map(jnp.zeros_like, results[1:]))
 
 
 _nearest.defjvp(_nearest_jvp, symbolic_zeros=True)
-
-
-def _scaled(G: jax.Array, d: jax.Array, root: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return normalised_conditions(G * root[None, :], d)
-
-
-def _length(rows: jax.Array) -> jax.Array:
-    return jnp.sqrt(jnp.sum(rows * rows, axis=1))
 
 
 def _check_nonempty(name: str, G: np.ndarray, d: np.ndarray, E: np.ndarray, e: np.ndarray) -> None:

@@ -23,7 +23,7 @@ class ActiveSet(AbstractSolver):
     """Newton's method for K = {lower ≤ y ≤ upper}: each step predicts the active set and solves a
     linear system for the free unknowns alone.
 
-    With z = y − τF(y), the unknowns with z ≤ lower or z ≥ upper are fixed at their bounds, and the
+    With y = proj_K(z), the unknowns with z ≤ lower or z ≥ upper are fixed at their bounds, and the
     others solve F′_II d_I = −F_I − F′_IA d_A. This is `SemismoothNewton` with the projection's
     derivative D = diag(0 or 1) eliminated: it has the same iterates, safeguard and convergence, whether
     F′ is symmetric or not. A factorisation costs |I|³ instead of n³. (A compiled program has arrays of
@@ -38,9 +38,10 @@ class ActiveSet(AbstractSolver):
     Source: Hintermüller, Ito and Kunisch 2002, SIAM J. Optim. 13, 865–888 (the method and its
     equivalence to a semismooth Newton method). The safeguard is not from that paper.
 
-    **Arguments:** `step` of the safeguard, in (0, 1); `max_steps`; `dense`; `symmetric`, declared by
-    the caller; `preconditioner(free, r)`, which returns an approximate solution d of F′_II d_I = r_I:
-    `free` is a tree of booleans, and r and d are 0 where it is false.
+    **Arguments:** `step` of the safeguard, in (0, 1); `max_steps`, the maximum number of iterations (as
+    in `SemismoothNewton`); `dense`; `symmetric`, declared by the caller; `preconditioner(free, r)`,
+    which returns an approximate solution d of F′_II d_I = r_I: `free` is a tree of booleans, and r and
+    d are 0 where it is false.
 
     **Raises:** `dvax.InputError` if K is not a pointwise interval.
 
@@ -56,7 +57,7 @@ class ActiveSet(AbstractSolver):
     """
 
     step: float = 0.7
-    max_steps: int = 1000
+    max_steps: int = 2000
     dense: int = 1024
     symmetric: bool = False
     preconditioner: Callable[[Tree, Tree], Tree] | None = None

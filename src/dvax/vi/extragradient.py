@@ -13,7 +13,11 @@ from .abstract import AbstractSolver, Answer, FrozenVI
 from .iteration import Trial, first_step, iterate, residual_vector
 from .parameters import SAFETY, STEPS, check_parameters
 
-_SMALLEST_REDUCTION = 1e-24
+GROWTH, REDUCTION = 1.25, 0.6
+"""Backtracking starts from the last λ times `GROWTH`, so that λ recovers in regions where F is flatter,
+and reduces it by `REDUCTION`."""
+
+SMALLEST_REDUCTION = 1e-24
 """Backtracking stops when λ has been reduced by this factor."""
 
 
@@ -104,12 +108,11 @@ def extrapolate(
         change = lam * vi.space.norm(_tree.sub(Fz, Fy))
         # A NaN in z or F(z) also shortens the step; the limit on λ ends the loop.
         accepted = change <= step * vi.space.norm(_tree.sub(z, y))
-        return ~accepted & F_is_finite & (lam > _SMALLEST_REDUCTION * longest)
+        return ~accepted & F_is_finite & (lam > SMALLEST_REDUCTION * longest)
 
     def shorten(carry: tuple) -> tuple:
-        lam = 0.6 * carry[2]
+        lam = REDUCTION * carry[2]
         return *trial(lam), lam, carry[3] + 1
 
-    # Start from a larger λ, so that it recovers in regions where F is flatter.
-    longest = 1.25 * lam
+    longest = GROWTH * lam
     return lax.while_loop(too_long, shorten, (*trial(longest), longest, jnp.asarray(1)))

@@ -31,6 +31,7 @@ class Trial(NamedTuple):
     - `evaluations` of F in this iteration;
     - `result`, the code to report if no further iteration is allowed;
     - `may_repeat`: the point may repeat an earlier one although the method is not cycling;
+    - `rejected`: the method does not continue from this point. It may repeat, and it may be infinite;
     - `residual_step`, the λ in w, if it differs from `step`;
     - `base`, (b, λ) if w contains (b − y)/λ.
     """
@@ -43,6 +44,7 @@ class Trial(NamedTuple):
     evaluations: Any
     result: RESULTS = RESULTS.max_steps
     may_repeat: Any = False
+    rejected: Any = False
     residual_step: Any = None
     base: tuple[Tree, Any] | None = None
 
@@ -77,14 +79,17 @@ def iterate(
     *,
     initial_evaluations: int,
     iterate_count: int = 1,
+    projects_start: bool = True,
 ) -> Answer:
     """Advance from proj_K(y0) until ‖w‖/γ ≤ tol (‖w‖ ≤ tol if γ is unknown) or the method fails.
 
     **Arguments:** `initial_evaluations`, the number of evaluations of F in `begin`;
-    `iterate_count`, the number of elements in `Trial.iterates`.
+    `iterate_count`, the number of elements in `Trial.iterates`; `projects_start`: if false, the method
+    advances from y0 itself.
     """
-    frozen, target = without_derivatives(vi), tol if vi.gamma is None else vi.gamma * tol
-    start = lax.stop_gradient(vi.K.project(lax.stop_gradient(y0), vi.space))
+    frozen, target, start = without_derivatives(vi), residual_target(vi, tol), lax.stop_gradient(y0)
+    if projects_start:
+        start = lax.stop_gradient(vi.K.project(start, vi.space))
     dtype = jnp.result_type(*jtu.tree_leaves(start))
     eps, norm = jnp.finfo(dtype).eps, vi.space.norm
     divergence_radius = _DIVERGENCE_FACTOR * (1.0 + norm(start))
@@ -109,19 +114,22 @@ def iterate(
             norm_F > target
         )
         meaningless = (rounding / lam > 0.1 * norm_F) & F_is_large & (vi.L_F is None)
-        finite = jnp.isfinite(residual) & jnp.isfinite(size)
+        accepted = ~jnp.asarray(trial.rejected)
+        finite = (jnp.isfinite(residual) & jnp.isfinite(size)) | ~accepted
         residual = jnp.where(meaningless, jnp.inf, residual)
-        better = residual < s.residual
+        # The first point replaces the start in any case, since the start may lie outside of K.
+        better = (residual < s.residual) | (s.count == 0)
         done = residual <= target
         # The iterates changed by rounding alone, since the last iteration (stalled) or since the
         # checkpoint (cycling). Brent's algorithm renews the checkpoint at every power of two, so it
         # finds cycles of any length.
+        is_new = accepted & ~jnp.asarray(trial.may_repeat)
         stalled = total_norm(_tree.sub(trial.iterates, s.iterates)) <= 4 * eps * size
-        stalled &= ~jnp.asarray(trial.may_repeat)
+        stalled &= is_new
         cycling = total_norm(_tree.sub(trial.iterates, s.checkpoint)) <= 32 * eps * size
-        cycling &= ~jnp.asarray(trial.may_repeat)
+        cycling &= is_new
         step_vanished = jnp.asarray(trial.step < 1e3 * eps)
-        diverging = (norm(trial.y) > divergence_radius) & ~better
+        diverging = (norm(trial.y) > divergence_radius) & ~better & accepted
         result = trial.result
         for holds, code in (
             (cycling, RESULTS.cycling),
@@ -134,12 +142,12 @@ def iterate(
             result = RESULTS.where(holds, code, result)
         count = s.count + 1
         running = ~(done | stalled | cycling | diverging | step_vanished) & finite
-        renew = count >= 2 * s.checkpoint_count
+        renew = (count >= 2 * s.checkpoint_count) & is_new
         return _State(
             method=method,
             y=_tree.where(better, trial.y, s.y),
             value=_tree.where(better, trial.value, s.value),
-            residual=jnp.where(better, residual, s.residual),
+            residual=jnp.where(residual < s.residual, residual, s.residual),
             iterates=trial.iterates,
             checkpoint=_tree.where(renew, trial.iterates, s.checkpoint),
             checkpoint_count=jnp.where(renew, count, s.checkpoint_count),
@@ -176,6 +184,21 @@ def without_derivatives(vi: FrozenVI) -> FrozenVI:
     return vi._replace(
         F=lambda y: lax.stop_gradient(vi.F(y)), K=jtu.tree_map(lax.stop_gradient, vi.K)
     )
+
+
+def residual_target(vi: FrozenVI, tol: Any) -> Any:
+    """Return the ‖w‖ that meets the tolerance."""
+    return tol if vi.gamma is None else vi.gamma * tol
+
+
+def inverse_slope(vi: FrozenVI, Fy: Tree, slope: Callable[[Tree], Tree]) -> jax.Array:
+    """Return 1/L_F, or if L_F is unknown ‖F(y)‖/‖F′(y)F(y)‖, with the derivative `slope` of F at y."""
+    norm_F = vi.space.norm(Fy)
+    if vi.L_F is not None:
+        return jnp.asarray(1.0 / vi.L_F, norm_F.dtype)
+    change = vi.space.norm(slope(Fy))
+    is_defined = (norm_F > 0) & (change > 0) & jnp.isfinite(change)
+    return jnp.where(is_defined, norm_F / jnp.where(is_defined, change, 1.0), 1.0)
 
 
 def first_step(

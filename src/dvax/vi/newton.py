@@ -14,20 +14,17 @@ from .. import _tree
 from .._batch import any_lane
 from .._tree import Tree
 from .abstract import RESULTS, Answer, FrozenVI
-from .extragradient import extragradient_step
-from .iteration import Trial, first_step, iterate
+from .extragradient import GROWTH, REDUCTION, SMALLEST_REDUCTION
+from .iteration import Trial, inverse_slope, iterate, residual_target
 
 
 class Linearisation(NamedTuple):
-    """The linearisation of F at `at`, and of the projection at z.
+    """The linearisation of F at y = proj_K(z), and of the projection at z.
 
-    `slope` applies F′(at), and `tangent` an element D of the generalised derivative of the projection
+    `slope` applies F′(y), and `tangent` an element D of the generalised derivative of the projection
     at z. `reduction` is ‖w‖ relative to its first value, for the tolerance of iterative linear solvers.
     """
 
-    vi: FrozenVI
-    at: Tree
-    z: Tree
     slope: Callable[[Tree], Tree]
     tangent: Callable[[Tree], Tree]
     tau: jax.Array
@@ -35,7 +32,7 @@ class Linearisation(NamedTuple):
 
 
 LinearSolver = Callable[[Linearisation, Tree], Tree]
-"""Return d with τF′(at) D d + (I − D) d = right."""
+"""Return d with τF′(y) D d + (I − D) d = right."""
 
 _FIRST_RUN_LENGTH = 5
 """Number of consecutive Newton steps that may fail to halve the best ‖w‖, in the first run: a few
@@ -44,16 +41,20 @@ steps identify most active sets."""
 _DIVERGENCE_RATIO = 10.0
 """A Newton point is rejected if its ‖w‖ exceeds this multiple of the best."""
 
-_TRUST_RATIO = 1e3
-"""The first Newton point is rejected if ‖F‖ exceeds this multiple of its value in the linearisation:
-the point is then outside the region where the linearisation approximates F."""
+_TRUST_RATIO = 2e3
+"""The first Newton point is rejected if ‖F‖ exceeds this multiple of its value at the start: the point
+is then outside the region where the linearisation approximates F."""
+
+_START, _NEWTON, _PREDICTOR, _CORRECTOR = range(4)
+"""The kinds of trials."""
 
 
 class _State(NamedTuple):
-    """- `z`; `linear_value`, the linearisation of F at `at`, evaluated at proj_K(z);
-    - `base` and `lam`, the iterate and step of the safeguard;
-    - `best`, the ‖w‖ that Newton steps must halve; `steps_left`, how many may still fail to, of the
-      `run_length` that the current run allows;
+    """- `z`, the next trial, and its `kind`;
+    - `tau`, the λ of the start and of Newton trials;
+    - `base` and `base_value` = F(base), the iterate of the safeguard, and `lam`, its λ;
+    - `best`, the ‖w‖ that Newton steps must halve; `first`, its first value; `steps_left`, how many
+      may still fail to, of the `run_length` that the current run allows;
     - `wait`, the number of safeguard steps until the next Newton run; `next_wait`, that number after
       the next failed run;
     - `singular`, whether the last linear system was singular;
@@ -61,11 +62,13 @@ class _State(NamedTuple):
     """
 
     z: Tree
-    at: Tree
-    linear_value: Tree
+    kind: jax.Array
+    tau: jax.Array
     base: Tree
+    base_value: Tree
     lam: jax.Array
     best: jax.Array
+    first: jax.Array
     steps_left: jax.Array
     run_length: jax.Array
     wait: jax.Array
@@ -79,116 +82,128 @@ def safeguarded_newton(
 ) -> Answer:
     """Solve Φ(z) = F(y) + (z − y)/τ = 0 with y = proj_K(z); the value Φ(z) is the certificate w.
 
-    The first linearisation is made at y₀ with z = y₀ − τF(y₀), as for the natural map. This takes one
-    evaluation of F, and from a good guess a second one ends the solve. A run of Newton steps continues
-    while it halves the best ‖w‖ at least every sixth step. A failed run doubles the number of steps
-    allowed to the next one, since the contact set of an obstacle problem may change node by node.
-    Otherwise extragradient steps are made, from the last point that halved ‖w‖ or from the last
-    extragradient iterate.
+    Every iteration tries one z: it projects z, evaluates F at y = proj_K(z), and has the certificate
+    w = F(y) + (z − y)/λ ∈ F(y) + N_K(y) for any λ > 0. A trial is of one of four kinds:
+
+    - the start, z = y₀;
+    - a Newton step, z⁺ = z + d, with λ = τ. It is accepted if it halves the best ‖w‖, or while the run
+      of Newton steps may go on without;
+    - the predictor of an extragradient step from b, z = b − λF(b). It is rejected with a shorter λ
+      until λ‖F(y) − F(b)‖ ≤ step ‖y − b‖;
+    - its corrector, z = b − λF(ȳ), with the predictor's ȳ; its y is the next b.
+
+    From a good guess the second iteration ends the solve. A run of Newton steps continues while it
+    halves the best ‖w‖ at least every sixth step. A failed run doubles the number of steps allowed to
+    the next one, since the contact set of an obstacle problem may change node by node. Otherwise
+    extragradient steps are made, from the last point that halved ‖w‖ or from the last extragradient
+    iterate.
+
+    All kinds share one loop body, and so one projection, F and linear system: the compile time of a
+    program is proportional to their number.
     """
     # `iterate` passes an F without derivatives (`without_derivatives`), but Newton's method needs F′.
     differentiable_F = vi.F
+    target, norm = residual_target(vi, tol), vi.space.norm
 
-    def slope_at(y: Tree) -> Callable[[Tree], Tree]:
-        return lambda d: lax.stop_gradient(jax.jvp(differentiable_F, (y,), (d,))[1])
+    def advance(vi: FrozenVI, s: _State) -> tuple[_State, Trial]:
+        y, tangent = _linearise(lambda z: vi.K.project(z, vi.space), s.z)
+        value, slope = _linearise(differentiable_F, y)
+        norm_F = norm(value)
+        is_start, is_newton = s.kind == _START, s.kind == _NEWTON
+        is_predictor, is_corrector = s.kind == _PREDICTOR, s.kind == _CORRECTOR
+        tau = lax.cond(any_lane(is_start), lambda: inverse_slope(vi, value, slope), lambda: s.tau)
+        tau = jnp.where(is_start, tau, s.tau)
+        lam = jnp.where(is_start, step * tau, s.lam)
+        residual_step = jnp.where(is_predictor | is_corrector, lam, tau)
+        offset = _tree.sub(s.z, y)
+        w = _tree.add(value, _tree.scale(1.0 / residual_step, offset))
+        residual = norm(w)
 
-    def begin(vi: FrozenVI, y: Tree) -> tuple:
-        Fy, slope = vi.F(y), slope_at(y)
-        tau = first_step(vi, y, Fy, slope)
-        z = _tree.sub(y, _tree.scale(tau, Fy))
-        change = slope(_tree.sub(vi.K.project(z, vi.space), y))
-        infinity, run_length = jnp.full_like(tau, jnp.inf), jnp.asarray(_FIRST_RUN_LENGTH)
-        state = _State(
-            z=z,
-            at=y,
-            linear_value=_tree.add(Fy, change),
-            base=y,
-            lam=step * tau,
-            best=infinity,
-            steps_left=run_length,
-            run_length=run_length,
-            wait=jnp.asarray(0),
-            next_wait=jnp.asarray(1),
-            singular=jnp.asarray(False),
-            trust_limit=_TRUST_RATIO * (vi.space.norm(Fy) + vi.space.norm(change)),
+        # The first Newton point has no earlier ‖w‖ to halve, so its ‖F‖ is limited instead.
+        trusted = is_newton & ((norm_F <= s.trust_limit) | jnp.isfinite(s.best))
+        halved = trusted & (residual <= 0.5 * s.best)
+        continues = trusted & (s.steps_left > 0) & (residual <= _DIVERGENCE_RATIO * s.best)
+        continues &= ~halved & jnp.isfinite(residual)
+        failed = is_newton & ~halved & ~continues
+        shortens = jnp.zeros_like(failed)
+        if vi.L_F is None:
+            change = lam * norm(_tree.sub(value, s.base_value))
+            # A NaN in y or F(y) also shortens the step; the limit on λ ends the reduction.
+            shortens = is_predictor & ~(change <= step * norm(_tree.sub(y, s.base)))
+            shortens &= lam > SMALLEST_REDUCTION * tau
+        moves_base = is_start | halved | is_corrector
+        base, base_value = _tree.where(moves_base, (y, value), (s.base, s.base_value))
+        wait = jnp.where(failed, s.next_wait, jnp.where(is_corrector, s.wait - 1, 0))
+        wait = jnp.where(is_predictor, s.wait, wait)
+        next_is_newton = (wait == 0) & ~is_predictor
+        next_is_corrector = is_predictor & ~shortens
+
+        # The same normal vector with the λ of Newton's method. (D is that of z. It differs if K is
+        # curved and λ is not τ, in the first step after the safeguard.)
+        z = _tree.add(y, _tree.scale(tau / residual_step, offset))
+        first = jnp.where(jnp.isfinite(s.first), s.first, residual)
+        least = jnp.where(residual < s.best, residual, s.best)
+        best = jnp.where(is_start | continues | failed, s.best, least)
+
+        def newton() -> Tree:
+            reduction = jnp.where(jnp.isfinite(best), best / first, 1.0)
+            right = _tree.scale(-tau, w)
+            return _tree.add(z, solve(Linearisation(slope, tangent, tau, reduction), right))
+
+        solves = next_is_newton & (residual > target)
+        newton_z = lax.cond(any_lane(solves), newton, lambda: z)
+        if vi.L_F is None:
+            # Start from a larger λ, so that it recovers in regions where F is flatter.
+            starts = ~next_is_newton & ~is_predictor
+            lam = jnp.where(shortens, REDUCTION * lam, jnp.where(starts, GROWTH * lam, lam))
+        direction = _tree.where(next_is_corrector, value, base_value)
+        safeguard_z = _tree.sub(base, _tree.scale(lam, direction))
+        next_kind = jnp.where(
+            next_is_newton, _NEWTON, jnp.where(next_is_corrector, _CORRECTOR, _PREDICTOR)
         )
-        return state, tau, infinity
-
-    def newton(vi: FrozenVI, s: _State, tau: Any, first: Any) -> tuple[Tree, Tree, Tree, Tree]:
-        def project(z: Tree) -> Tree:
-            return vi.K.project(z, vi.space)
-
-        def tangent(d: Tree) -> Tree:
-            return jax.jvp(project, (s.z,), (d,))[1]
-
-        right = _tree.sub(_tree.scale(-tau, s.linear_value), _tree.sub(s.z, project(s.z)))
-        reduction = jnp.where(jnp.isfinite(first), s.best / first, 1.0)
-        d = solve(Linearisation(vi, s.at, s.z, slope_at(s.at), tangent, tau, reduction), right)
-        z = _tree.add(s.z, d)
-        y = project(z)
-        Fy = vi.F(y)
-        return z, y, Fy, _tree.add(Fy, _tree.scale(1.0 / tau, _tree.sub(z, y)))
-
-    def safeguard(vi: FrozenVI, s: _State, tau: Any) -> tuple:
-        base, trial = extragradient_step(vi, s.base, s.lam, step)
-        # w − F(y) ∈ N_K(y), so y + τ(w − F(y)) projects onto y and has the same w.
-        normal = _tree.sub(trial.w, trial.value)
-        z = _tree.add(trial.y, _tree.scale(tau, normal))
-        return (z, trial.y, trial.value, trial.w), base, trial.step, jnp.asarray(trial.evaluations)
-
-    def advance(vi: FrozenVI, carry: tuple) -> tuple[tuple, Trial]:
-        s, tau, first = carry
-        newton_is_due = s.wait == 0
-        unchanged = s.z, s.at, s.linear_value, s.linear_value
-        newton_point = lax.cond(
-            any_lane(newton_is_due), lambda: newton(vi, s, tau, first), lambda: unchanged
-        )
-        norm = vi.space.norm(newton_point[3])
-        # The first point has no earlier ‖w‖ to halve, so its ‖F‖ is limited instead.
-        trusted = (vi.space.norm(newton_point[2]) <= s.trust_limit) | jnp.isfinite(s.best)
-        halved = newton_is_due & (norm <= 0.5 * s.best) & trusted
-        may_continue = newton_is_due & trusted & (s.steps_left > 0) & jnp.isfinite(norm)
-        may_continue &= norm <= _DIVERGENCE_RATIO * s.best
-        accepted = halved | may_continue
-        safeguard_point, base, lam, evaluations = lax.cond(
-            any_lane(~accepted),
-            lambda: safeguard(vi, s, tau),
-            lambda: (unchanged, s.base, s.lam, jnp.asarray(0)),
-        )
-        z, y, value, w = _tree.where(accepted, newton_point, safeguard_point)
-        base = _tree.where(halved, y, _tree.where(accepted, s.base, base))
-        residual_step = jnp.where(accepted, tau, lam)
-        lam = jnp.where(accepted, s.lam, lam)
-        evaluations = jnp.where(accepted, 0, evaluations)
-        norm = vi.space.norm(w)
-        failed = newton_is_due & ~accepted
+        run_length = jnp.where(failed, 2 * s.run_length, s.run_length)
         new = _State(
-            z=z,
-            at=y,
-            linear_value=value,
+            z=_tree.where(next_is_newton, newton_z, safeguard_z),
+            kind=next_kind,
+            tau=tau,
             base=base,
+            base_value=base_value,
             lam=lam,
-            best=jnp.where(halved | ~accepted, jnp.minimum(s.best, norm), s.best),
+            best=best,
+            first=first,
             steps_left=jnp.where(
-                halved,
-                s.run_length,
-                jnp.where(failed, 2 * s.run_length, s.steps_left - jnp.where(newton_is_due, 1, 0)),
+                halved | failed, run_length, s.steps_left - jnp.where(is_newton, 1, 0)
             ),
-            run_length=jnp.where(failed, 2 * s.run_length, s.run_length),
-            wait=jnp.where(accepted, 0, jnp.where(failed, s.next_wait, s.wait - 1)),
+            run_length=run_length,
+            wait=wait,
             next_wait=jnp.where(
                 halved, 1, jnp.where(failed, jnp.minimum(2 * s.next_wait, 8), s.next_wait)
             ),
-            singular=jnp.where(newton_is_due, ~_tree.all_finite(newton_point[0]), s.singular),
-            trust_limit=s.trust_limit,
+            singular=jnp.where(solves, ~_tree.all_finite(newton_z), s.singular),
+            trust_limit=jnp.where(is_start, _TRUST_RATIO * norm_F, s.trust_limit),
         )
-        first = jnp.where(jnp.isfinite(first), first, norm)
         result = RESULTS.where(new.singular, RESULTS.singular, RESULTS.max_steps)
-        evaluations = evaluations + jnp.where(newton_is_due, 1, 0)
         trial = Trial(
-            y, w, value, tau, [z, base], evaluations, result,
-            may_repeat=accepted & ~halved, residual_step=residual_step,
+            y, w, value, tau, [z, base], 1, result, may_repeat=continues,
+            rejected=failed | shortens, residual_step=residual_step,
         )  # fmt: skip
-        return (new, tau, first), trial
+        return new, trial
 
-    return iterate(vi, y0, tol, begin, advance, max_steps, initial_evaluations=1, iterate_count=2)
+    def begin(vi: FrozenVI, y0: Tree) -> _State:
+        one = jnp.ones((), jnp.result_type(*jax.tree_util.tree_leaves(y0)))
+        infinity, run_length = jnp.inf * one, jnp.asarray(_FIRST_RUN_LENGTH)
+        return _State(
+            y0, jnp.asarray(_START), one, y0, y0, one, infinity, infinity, run_length, run_length,
+            jnp.asarray(0), jnp.asarray(1), jnp.asarray(False), infinity,
+        )  # fmt: skip
+
+    return iterate(
+        vi, y0, tol, begin, advance, max_steps, initial_evaluations=0, iterate_count=2,
+        projects_start=False,
+    )  # fmt: skip
+
+
+def _linearise(fn: Callable[[Tree], Tree], at: Tree) -> tuple[Tree, Callable[[Tree], Tree]]:
+    """Return fn(at) and the derivative of fn there, as constants of an outer differentiation."""
+    value, push = jax.linearize(fn, at)
+    return lax.stop_gradient(value), lambda d: lax.stop_gradient(push(d))

@@ -19,10 +19,14 @@ class SemismoothNewton(AbstractSolver):
     """Newton's method for the normal map Φ(z) = F(y) + (z − y)/τ with y = proj_K(z), whose value is
     the certificate w: [F′(y) D + (I − D)/τ] d = −Φ(z), z⁺ = z + d, D ∈ ∂proj_K(z).
 
-    The first step is that of the natural map y − proj_K(y − τF(y)) at the guess. A run of Newton steps
-    continues while it halves the best ‖w‖ at least every sixth step (after a failed run every eleventh,
-    and so on, doubling). Otherwise extragradient steps are made, from their own last iterate or from
-    the last Newton point that halved ‖w‖. After a failed run, 1, 2, 4, then 8 of them precede the next.
+    The first step starts at z = y₀, the guess. A run of Newton steps continues while it halves the best
+    ‖w‖ at least every sixth step (after a failed run every eleventh, and so on, doubling). Otherwise
+    extragradient steps are made, from their own last iterate or from the last Newton point that halved
+    ‖w‖. After a failed run, 1, 2, 4, then 8 of them precede the next.
+
+    An iteration is one projection and one evaluation of F: a Newton step, or the predictor or the
+    corrector of an extragradient step (or a predictor whose step is then shortened). The projection of
+    the guess is the first.
 
     If infinitely many Newton steps halve ‖w‖, then ‖w‖ → 0; if finitely many do, the tail is the
     extragradient method. So the method converges wherever the extragradient method does. Near y* the
@@ -33,7 +37,8 @@ class SemismoothNewton(AbstractSolver):
     relative tolerance min(0.1, ‖w‖/‖w₀‖). For boxes, `ActiveSet` is the same method with much
     smaller systems.
 
-    **Arguments:** `step` of the safeguard, in (0, 1); `max_steps`; `dense`.
+    **Arguments:** `step` of the safeguard, in (0, 1); `max_steps`, the maximum number of iterations;
+    `dense`.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -46,7 +51,7 @@ class SemismoothNewton(AbstractSolver):
     """
 
     step: float = 0.7
-    max_steps: int = 1000
+    max_steps: int = 2000
     dense: int = 1024
 
     def __check_init__(self) -> None:
