@@ -20,16 +20,20 @@ def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
     """
     if len(right) > MAX_ROWS:
         return jnp.linalg.solve(matrix, right)
-
-    def eliminated(of: jax.Array, vector: jax.Array) -> jax.Array:
-        return lax.stop_gradient(eliminate(of, vector)[0])
-
     return lax.custom_linear_solve(
         lambda x: matrix @ x,
         right,
-        lambda _, vector: eliminated(lax.stop_gradient(matrix), vector),
-        lambda _, vector: eliminated(lax.stop_gradient(matrix).T, vector),
+        lambda _, vector: solve_constant(matrix, vector),
+        lambda _, vector: solve_constant(matrix.T, vector),
     )
+
+
+def solve_constant(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    """Return x with matrix · x = right, for a vector and without derivatives."""
+    matrix, right = lax.stop_gradient((matrix, right))
+    if len(right) > MAX_ROWS:
+        return jnp.linalg.solve(matrix, right)
+    return lax.stop_gradient(eliminate(matrix, right)[0])
 
 
 def eliminate(matrix: jax.Array, right: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -200,15 +200,26 @@ class Flow(eqx.Module):
         project = lambda z: K.project(z, space)  # noqa: E731
         u = P.inverse(rate.y)
 
-        base, linear = jax.jvp(project, (rate.z,), (error,))
+        zero = _tree.zeros_like(error)
+        points = [rate.z, _tree.add(rate.z, error), _tree.sub(rate.z, error)]
+        if self.direct:
+            base, linear = jax.jvp(project, (rate.z,), (error,))
+            above, below = map(project, points[1:])
+        else:
+            # One projection of a batch: a projection that iterates takes long to compile.
+            stack = lambda *trees: jtu.tree_map(lambda *leaves: jnp.stack(leaves), *trees)  # noqa: E731
+            values, tangents = jax.jvp(
+                jax.vmap(project), (stack(*points),), (stack(error, zero, zero),)
+            )
+            row = lambda k, tree: jtu.tree_map(lambda leaf: leaf[k], tree)  # noqa: E731
+            base, above, below, linear = *(row(k, values) for k in range(3)), row(0, tangents)
 
-        def difference(sign: float) -> Tree:
-            line = _tree.add(base, _tree.scale(sign, linear))
-            curved = _tree.sub(project(_tree.add(rate.z, _tree.scale(sign, error))), line)
+        def difference(sign: float, end: Tree) -> Tree:
+            curved = _tree.sub(end, _tree.add(base, _tree.scale(sign, linear)))
             shifted = self.problem.f(t, x, _tree.add(u, P.inverse(curved)), self.args)
             return jtu.tree_map(lambda a, b: jnp.abs(a - b), shifted, rate.value)
 
-        return jtu.tree_map(jnp.maximum, difference(1.0), difference(-1.0))
+        return jtu.tree_map(jnp.maximum, difference(1.0, above), difference(-1.0, below))
 
     def state_space(self, x: Tree) -> AbstractSpace:
         return self.problem.spaces(x)[0]

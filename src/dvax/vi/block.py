@@ -7,6 +7,8 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
+from .._small_matrices import MAX_ROWS, solve_constant
+
 _MAX_WHOLE_UNKNOWNS = 32
 """Up to this size the whole matrix is factorised instead of an extracted block."""
 
@@ -65,4 +67,8 @@ def _with_identity(matrix: jax.Array, free: jax.Array) -> jax.Array:
 
 
 def _solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    return jnp.linalg.solve(matrix, right[..., None])[..., 0]
+    if matrix.ndim > 2 and right.shape[-1] <= MAX_ROWS:
+        return jax.vmap(_solve)(matrix, right)
+    if matrix.ndim > 2:
+        return jnp.linalg.solve(matrix, right[..., None])[..., 0]
+    return solve_constant(matrix, right)

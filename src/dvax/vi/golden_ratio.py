@@ -52,8 +52,8 @@ def golden_ratio(
     """Run the golden ratio algorithm.
 
     Without a `first` step λ₀ is a difference quotient at proj_K(y0), and a projection step from there
-    gives the second point. With one, both points are proj_K(y0), which saves evaluations if y0 is close
-    to the solution.
+    gives the second point. With one, both points are y0, which saves evaluations and projections if y0
+    is close to the solution; F must then be defined at y0 even if it lies outside of K.
     """
     growth = 1.0 / phi + 1.0 / phi**2
 
@@ -84,5 +84,6 @@ def golden_ratio(
 
     evaluations = 1 if first is not None else 2 + (vi.L_F is None)
     return iterate(
-        vi, y0, tol, begin, advance, max_steps, initial_evaluations=evaluations, iterate_count=2
-    )
+        vi, y0, tol, begin, advance, max_steps, initial_evaluations=evaluations, iterate_count=2,
+        projects_start=first is None,
+    )  # fmt: skip

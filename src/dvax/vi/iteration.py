@@ -5,6 +5,7 @@ w ∈ F(y) + N_K(y), its certificate (C0). The loop returns the point with the s
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +15,7 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
+from ..spaces import AbstractSpace
 from .abstract import RESULTS, Answer, FrozenVI
 from .implicit import with_implicit_derivative
 
@@ -87,11 +89,12 @@ def iterate(
     `iterate_count`, the number of elements in `Trial.iterates`; `projects_start`: if false, the method
     advances from y0 itself.
     """
-    frozen, target, start = without_derivatives(vi), residual_target(vi, tol), lax.stop_gradient(y0)
+    frozen, start = without_derivatives(vi), lax.stop_gradient(y0)
+    target = residual_target(frozen, lax.stop_gradient(tol))
     if projects_start:
         start = lax.stop_gradient(vi.K.project(start, vi.space))
     dtype = jnp.result_type(*jtu.tree_leaves(start))
-    eps, norm = jnp.finfo(dtype).eps, vi.space.norm
+    eps, norm = jnp.finfo(dtype).eps, partial(norm_of_constant, frozen.space)
     divergence_radius = _DIVERGENCE_FACTOR * (1.0 + norm(start))
 
     def total_norm(elements: list[Tree]) -> Any:
@@ -181,9 +184,8 @@ def iterate(
 
 def without_derivatives(vi: FrozenVI) -> FrozenVI:
     """Return the same problem without derivatives: the iteration is not differentiated."""
-    return vi._replace(
-        F=lambda y: lax.stop_gradient(vi.F(y)), K=jtu.tree_map(lax.stop_gradient, vi.K)
-    )
+    K, space, gamma, L_F = jtu.tree_map(lax.stop_gradient, (vi.K, vi.space, vi.gamma, vi.L_F))
+    return FrozenVI(lambda y: lax.stop_gradient(vi.F(y)), K, space, gamma, L_F)
 
 
 def residual_target(vi: FrozenVI, tol: Any) -> Any:
@@ -191,12 +193,17 @@ def residual_target(vi: FrozenVI, tol: Any) -> Any:
     return tol if vi.gamma is None else vi.gamma * tol
 
 
+def norm_of_constant(space: AbstractSpace, a: Tree) -> jax.Array:
+    """Return ‖a‖ by fewer operations than `space.norm`, which also has a derivative at 0."""
+    return jnp.sqrt(space.inner(a, a))
+
+
 def inverse_slope(vi: FrozenVI, Fy: Tree, slope: Callable[[Tree], Tree]) -> jax.Array:
     """Return 1/L_F, or if L_F is unknown ‖F(y)‖/‖F′(y)F(y)‖, with the derivative `slope` of F at y."""
-    norm_F = vi.space.norm(Fy)
+    norm_F = norm_of_constant(vi.space, Fy)
     if vi.L_F is not None:
         return jnp.asarray(1.0 / vi.L_F, norm_F.dtype)
-    change = vi.space.norm(slope(Fy))
+    change = norm_of_constant(vi.space, slope(Fy))
     is_defined = (norm_F > 0) & (change > 0) & jnp.isfinite(change)
     return jnp.where(is_defined, norm_F / jnp.where(is_defined, change, 1.0), 1.0)
 

@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ from .._batch import any_lane
 from .._tree import Tree
 from .abstract import RESULTS, Answer, FrozenVI
 from .extragradient import GROWTH, REDUCTION, SMALLEST_REDUCTION
-from .iteration import Trial, inverse_slope, iterate, residual_target
+from .iteration import Trial, inverse_slope, iterate, norm_of_constant, residual_target
 
 
 class Linearisation(NamedTuple):
@@ -103,9 +104,10 @@ def safeguarded_newton(
     """
     # `iterate` passes an F without derivatives (`without_derivatives`), but Newton's method needs F′.
     differentiable_F = vi.F
-    target, norm = residual_target(vi, tol), vi.space.norm
+    target = residual_target(vi, tol)
 
     def advance(vi: FrozenVI, s: _State) -> tuple[_State, Trial]:
+        norm = partial(norm_of_constant, vi.space)
         y, tangent = _linearise(lambda z: vi.K.project(z, vi.space), s.z)
         value, slope = _linearise(differentiable_F, y)
         norm_F = norm(value)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from .. import _tree
-from .._small_matrices import product, solve
+from .._small_matrices import product, solve_constant
 from .._tree import Tree
 from ..programs.matrix import matrix_of
 from .abstract import AbstractSolver, Answer, FrozenVI
@@ -70,7 +70,7 @@ def _solve_by_lu(at: Linearisation, right: Tree) -> Tree:
     slope, tangent = matrix_of(at.slope, right), matrix_of(at.tangent, right)
     identity = jnp.eye(flat.size, dtype=flat.dtype)
     matrix = product(at.tau * slope - identity, tangent) + identity
-    return unravel(solve(matrix, flat))
+    return unravel(solve_constant(matrix, flat))
 
 
 def _solve_by_gmres(at: Linearisation, right: Tree) -> Tree:
