@@ -137,9 +137,8 @@ def nearest_point(rows: jax.Array, bounds: jax.Array, z: jax.Array, size: jax.Ar
         return _State(x, dual, multiplier, active, row, priority, s.count + 1)
 
     none, zero = jnp.zeros(m, bool), jnp.zeros(m, dtype)
-    start = _State(
-        z, jnp.zeros((m, n), dtype), zero, none, *next_row(z, none, zero), jnp.asarray(0)
-    )
+    row, priority = next_row(z, none, zero)
+    start = _State(z, jnp.zeros((m, n), dtype), zero, none, row, priority, jnp.asarray(0))
     end = lax.while_loop(unfinished, advance, start)
     # Check the optimality conditions: x in the set, z − x a nonnegative sum of active normals.
     size = length_z + _norm(end.x)
