@@ -1,5 +1,7 @@
 """The method of a plain call: chosen by structure, changed where stability limits the steps."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,7 @@ from scipy.integrate import solve_ivp
 from tests.selection import mostly_thorough
 
 import dvax
+from dvax.evolution.auto import choose
 
 TOLERANCES = [1e-4, 1e-6, 1e-8, 1e-10]
 CASES = [(name, tol) for name in closed_forms.ALL for tol in TOLERANCES]
@@ -24,11 +27,11 @@ def test_plain_call_meets_its_tolerance_in_few_steps(name, tol):
     assert int(sol.stats["steps"]) <= 700
 
 
-def spring(stiffness, push):
-    """A spring of this stiffness holds x above 1.5, while a force moves it slowly."""
+def spring(stiffness, push, power=1):
+    """A spring of this stiffness holds x above 1.5, while a force moves it against a drag x^power."""
     return dvax.Problem(
         A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1e6),
-        f=lambda t, x, u, args: push(t) - x + u,
+        f=lambda t, x, u, args: push(t) - x**power + u,
         h=lambda t, x, u, args: -stiffness * (x - 1.5) - u,
     )  # fmt: skip
 
@@ -36,15 +39,18 @@ def spring(stiffness, push):
 STIFFNESSES = [3e3, 1e4, 1e5, 1e6]
 
 
+@pytest.mark.parametrize("power", [1, 2])
 @pytest.mark.parametrize("stiffness", mostly_thorough(STIFFNESSES, [1e4]))
-def test_stiff_law_is_solved_by_a_method_without_a_limit_of_stability(stiffness):
-    problem = spring(stiffness, lambda t: 1.0 + jnp.sin(t))
+def test_stiff_law_is_solved_by_a_method_without_a_limit_of_stability(stiffness, power):
+    """Constant slopes are read from the code; others show in the run."""
+    problem = spring(stiffness, lambda t: 1.0 + jnp.sin(t), power)
     sol = dvax.solve(problem, 4.0, 0.0, 8.0)
-    assert sol.stats["method"].startswith("ExpRosenbrock: stability limited the steps")
+    reason = "the constant slope" if power == 1 else "stability limited the steps"
+    assert sol.stats["method"].startswith(f"ExpRosenbrock: {reason}")
     assert int(sol.stats["steps"]) < 2000
 
     def by_hand(t, x):
-        return 1.0 + np.sin(t) - x + np.maximum(0.5 * stiffness * (1.5 - x), 0.0)
+        return 1.0 + np.sin(t) - x**power + np.maximum(0.5 * stiffness * (1.5 - x), 0.0)
 
     want = solve_ivp(by_hand, (0.0, 8.0), [4.0], method="Radau", rtol=1e-10, atol=1e-12).y[0, -1]
     assert abs(float(sol.xs[-1]) - want) <= 2e-6 * (1.0 + abs(want))
@@ -86,7 +92,7 @@ def test_named_method_is_kept_however_stiff():
 
 
 def test_choice_does_not_depend_on_transformations():
-    problem = spring(3e3, lambda t: 1.0 + jnp.sin(t))
+    problem = spring(3e3, lambda t: 1.0 + jnp.sin(t), power=2)
 
     def last(x0):
         sol = dvax.solve(problem, x0, 0.0, 4.5)
@@ -100,6 +106,33 @@ def test_choice_does_not_depend_on_transformations():
     np.testing.assert_allclose(value, last(4.0)[0], atol=1e-5)
     # In contact, x has forgotten where it began.
     assert abs(float(slope)) < 1e-6
+
+
+def test_constant_slopes_are_read_under_transformations():
+    problem = spring(3e3, lambda t: 1.0 + jnp.sin(t))
+
+    def last(x0):
+        sol = dvax.solve(problem, x0, 0.0, 4.5)
+        return sol.xs[-1], sol.stats["method"]
+
+    for call in (last, jax.jit(last), lambda x0: jax.grad(last, has_aux=True)(x0)):
+        assert call(4.0)[1].startswith("ExpRosenbrock: the constant slope")
+
+
+SLOPES = list(itertools.product((-1.0, 3.0), (2.0, -2.0), (-40.0, 70.0), (-1.0, 0.5)))
+
+
+@pytest.mark.parametrize("slopes", SLOPES)
+def test_largest_slope_is_that_of_the_free_or_of_the_held_response(slopes):
+    fx, fu, hx, hu = slopes
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(0.5), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1.0),
+        f=lambda t, x, u, args: fx * x + fu * u + jnp.cos(t),
+        h=lambda t, x, u, args: hx * x + hu * u + t,
+    )  # fmt: skip
+    choice = choose(problem, jnp.asarray(0.1), None, 3.0, 1e-6, False, False)
+    largest = 3.0 * max(abs(0.5 + fx), abs(0.5 + fx + fu * hx / (1.0 - hu)))
+    assert f"the span is {largest:.2g}" in choice.reason
 
 
 def test_function_that_closes_over_a_traced_number_is_followed_to_the_end():
