@@ -36,6 +36,14 @@ def solve_constant(matrix: jax.Array, right: jax.Array) -> jax.Array:
     return lax.stop_gradient(eliminate(matrix, right)[0])
 
 
+def pivots(matrix: jax.Array) -> jax.Array:
+    """Return the pivots of the elimination with partial pivoting, without derivatives."""
+    matrix = lax.stop_gradient(matrix)
+    if len(matrix) > MAX_ROWS:
+        return jnp.diagonal(lax.linalg.lu(matrix)[0])
+    return lax.stop_gradient(eliminate(matrix, matrix[:, :0])[1])
+
+
 def eliminate(matrix: jax.Array, right: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return x and the pivots of Gauss–Jordan elimination with partial pivoting, for a vector or the
     columns of a matrix `right`.
@@ -129,6 +137,6 @@ def _(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
     (Golub and Pereyra 1973)."""
     A, dA = primals[1], tangents[1]
     B = as_pseudoinverse(*primals)
-    first = B @ (B.T @ (dA.T - (dA.T @ A) @ B))
-    second = (dA.T - B @ (A @ dA.T)) @ B.T @ B
-    return B, first + second - B @ dA @ B
+    of_rows = product(product(B, B.T), dA.T - product(product(dA.T, A), B))
+    of_columns = product(dA.T - product(B, product(A, dA.T)), product(B.T, B))
+    return B, of_rows + of_columns - product(product(B, dA), B)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import _control_shape, _knots, _tree, _user_code
+from ._jax import outlined
 from ._tree import Tree
 from .errors import InputError, InputProblem
 from .generators import AbstractGenerator
@@ -363,14 +364,18 @@ def _solve_compiled(
     problem: Problem, t: Any, x: Tree, args: Any, solver: Any, of_rate: bool
 ) -> tuple[Tree, Any, Answer]:
     """Return u_x(t) or f̃(t, x), whether the law was solved, and the answer of the solver."""
-    vi, answer = problem._law(t, x, args, solver)
-    P = problem.operator(args)
 
-    def read(y: Tree) -> Tree:
-        u = P.inverse(y)
-        return problem.f(t, x, u, args) if of_rate else u
+    def run(problem: Problem, t: Any, x: Tree, args: Any) -> tuple[Tree, Any, Answer]:
+        vi, answer = problem._law(t, x, args, solver)
+        P = problem.operator(args)
 
-    return *unless_failed(vi, answer, read), answer
+        def read(y: Tree) -> Tree:
+            u = P.inverse(y)
+            return problem.f(t, x, u, args) if of_rate else u
+
+        return *unless_failed(vi, answer, read), answer
+
+    return outlined(run, problem, t, x, args)
 
 
 def _shape_fix(name: str, out: Tree, element: Tree, space: str) -> str:

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 import dvax
-from dvax.sets import Ball, Box
+from dvax.sets import Ball, Box, Polyhedron
 from dvax.vi import (
     Bracketing,
     Extragradient,
     ForwardBackwardForward,
+    FrozenVI,
     GoldenRatio,
     Projection,
     SemismoothNewton,
@@ -95,3 +96,27 @@ def test_solve_vi_differentiates_and_maps_closed_over_values():
     ys, slopes = jax.vmap(jax.value_and_grad(solution))(cs)
     np.testing.assert_allclose(ys, [0.0, 1.0, 2.0], atol=1e-12)
     np.testing.assert_allclose(slopes, [1.0, 1 / 4, 1 / 13], rtol=1e-10)
+
+
+def test_newton_projects_and_evaluates_at_one_place_of_its_program(monkeypatch):
+    """Compile time grows with their number. The derivative of the solution traces them twice more."""
+    counts, places = [], []
+    project = Polyhedron.project
+    monkeypatch.setattr(
+        Polyhedron, "project", lambda *args: places.append("project") or project(*args)
+    )
+    K = Polyhedron(jnp.array([[1.0, 1.0], [-1.0, 2.0]]), jnp.array([1.0, 0.5]))
+    F = counted(counts)
+    vi = FrozenVI(lambda y: F(y, jnp.ones(2)), K, dvax.spaces.Euclidean(2))
+    jax.make_jaxpr(lambda y0: SemismoothNewton().solve(vi, y0, 1e-10).residual)(jnp.zeros(2))
+    assert len(places) <= 3 and len(counts) <= 3
+
+
+def test_newton_from_a_solution_ends_after_two_evaluations():
+    """The first finds F at the solution and its face, the second the certificate."""
+    K = Polyhedron(jnp.array([[1.0, 1.0], [-1.0, 2.0]]), jnp.array([1.0, 0.5]))
+    solved = lambda y0: dvax.solve_vi(counted([]), K, y0, jnp.ones(2), SemismoothNewton())  # noqa: E731
+    first = solved(jnp.array([5.0, -3.0]))
+    again = solved(first.y)
+    assert int(again.evaluations) == int(again.iterations) == 2
+    np.testing.assert_allclose(again.y, first.y, atol=1e-12)

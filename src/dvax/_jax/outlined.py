@@ -61,7 +61,7 @@ _COSTLY = frozenset(
 _PARTS = {"dynamic_slice": None, "gather": None, "dynamic_update_slice": 1, "scatter": 2}
 """Operations on a part of an array of any size. The part is the result (None), or the argument of this
 number."""
-_FREE = ("broadcast_in_dim", "stop_gradient", "reshard")
+_FREE = ("broadcast_in_dim", "stop_gradient", "reshard", "empty2")
 _NESTED = frozenset(
     "custom_linear_solve jit pjit closed_call custom_jvp_call custom_vjp_call custom_vmap_call remat2 "
     "cond scan while".split()

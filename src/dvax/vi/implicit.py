@@ -16,7 +16,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._small_matrices import solve
+from .._small_matrices import pivots, solve
 from .._tree import Tree
 from ..programs.matrix import matrix_of
 from .certificate import natural_residual
@@ -51,9 +51,8 @@ def _general_solve(g: Callable[[Tree], Tree], b: Tree) -> Tree:
             _krylov_solve(lambda d: jax.flatten_util.ravel_pytree(g(unflatten(d)))[0], flat)
         )
     matrix = matrix_of(g, b)
-    pivots = jnp.abs(jnp.diagonal(jax.lax.linalg.lu(jax.lax.stop_gradient(matrix))[0]))
-    eps = jnp.finfo(flat.dtype).eps
-    singular = ~(jnp.min(pivots) > flat.size * eps * jnp.max(pivots))
+    sizes, eps = jnp.abs(pivots(matrix)), jnp.finfo(flat.dtype).eps
+    singular = ~(jnp.min(sizes) > flat.size * eps * jnp.max(sizes))
     # A factor of NaN or 1 keeps the result linear in b, as transposition requires.
     factor = jnp.where(singular, jnp.nan, jnp.ones((), flat.dtype))
     return unflatten(solve(matrix, flat) * factor)

@@ -181,7 +181,7 @@ def solve_complementarity(N: jax.Array, c: jax.Array, may_bind: jax.Array) -> ja
         return ~state[4] & (state[3] < 20 + 10 * m)
 
     feasible = jnp.all(c >= 0)
-    start = tableau, index, jnp.asarray(artificial), jnp.asarray(0), feasible
+    start = tableau, index, jnp.asarray(artificial, index.dtype), jnp.asarray(0), feasible
     tableau, basis, _, count, over = lax.while_loop(unfinished, pivot, start)
     solved = over & (count >= 0)
     # λₖ is the right side of the row in which it is basic.
