@@ -226,7 +226,8 @@ class Exported:
         return [leaf for _, leaf in arrays]
 
     def _solution(self, inputs: list[Any]) -> ExportedSolution:
-        fields = dict(self._exported.call(inputs))
+        returned: Any = self._exported.call(inputs)
+        fields: dict[str, Any] = dict(returned)
         state, control = self.header.state, self.header.control
         for name, parts in (("xs", state), ("us", control), ("ys", control)):
             fields[name] = rebuild(parts, fields[name])
