@@ -1,6 +1,7 @@
 """The choice of a method where the caller names none."""
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -29,7 +30,7 @@ from ..programs.structure import analyse, independent
 from .method import ETD2RK, ETD4RK, ExpRosenbrock
 from .results import RESULTS
 from .runge_kutta import DormandPrince
-from .signature import flat
+from .signature import Signature, flat, flatten
 
 FIELD, LARGE_LAW = 64, 256
 """Entries of the law and of the state beyond which a problem is taken for a field, whose kinks are
@@ -247,21 +248,8 @@ def _radii(problem: Problem, x0: Tree, args: Any, diagonal: bool) -> list[Any] |
     t = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(x0)))
     like = problem.zero_control(x0)
 
-    @jax.jit
-    def derivatives(arrays: Any) -> Any:
-        problem, x, u = eqx.combine(arrays, static)
-        A = problem.generator(args)
-        f = lambda x, u: problem.f(t, x, u, args)  # noqa: E731
-        h = lambda x, u: problem.h(t, x, u, args)  # noqa: E731
-        fx = lambda x: _tree.add(A.apply(x), f(x, u))  # noqa: E731
-        fns = (fx, x), (lambda u: f(x, u), u), (lambda x: h(x, u), x), (lambda u: h(x, u), u)
-        if diagonal:
-            ones = lambda v: jtu.tree_map(jnp.ones_like, v)  # noqa: E731
-            return [jax.jvp(fn, (at,), (ones(at),))[1].ravel() for fn, at in fns]
-        return [_matrix(fn, at) for fn, at in fns]
-
-    arrays, static = eqx.partition((problem, x0, like), eqx.is_array)
-    found = derivatives(arrays)
+    numbers, signature = flatten((problem,), (t, x0, like, args), diagonal)
+    found = _derivatives(numbers, signature)
     if not _tree.is_concrete(found):
         return None
     fx, fu, hx, hu = map(np.asarray, found)
@@ -276,6 +264,21 @@ def _radii(problem: Problem, x0: Tree, args: Any, diagonal: bool) -> list[Any] |
     return [np.max(np.abs(np.linalg.eigvals(J))) for J in systems if np.all(np.isfinite(J))] or [
         0.0
     ]
+
+
+@partial(jax.jit, static_argnums=1)
+def _derivatives(numbers: list[Any], signature: Signature) -> list[jax.Array]:
+    """Return ∂(Ax + f)/∂x, ∂f/∂u, ∂h/∂x and ∂h/∂u: their diagonals where they are diagonal."""
+    (problem,), (t, x, u, args) = signature.unflatten(numbers)
+    A = problem.generator(args)
+    f = lambda x, u: problem.f(t, x, u, args)  # noqa: E731
+    h = lambda x, u: problem.h(t, x, u, args)  # noqa: E731
+    fx = lambda x: _tree.add(A.apply(x), f(x, u))  # noqa: E731
+    fns = (fx, x), (lambda u: f(x, u), u), (lambda x: h(x, u), x), (lambda u: h(x, u), u)
+    if signature.options:
+        ones = lambda v: jtu.tree_map(jnp.ones_like, v)  # noqa: E731
+        return [jax.jvp(fn, (at,), (ones(at),))[1].ravel() for fn, at in fns]
+    return [_matrix(fn, at) for fn, at in fns]
 
 
 def _is_affine(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) -> bool:
