@@ -30,6 +30,7 @@ from ..programs.structure import analyse, independent
 from .method import ETD2RK, ETD4RK, ExpRosenbrock
 from .results import RESULTS
 from .runge_kutta import DormandPrince
+from .setup import as_arrays
 from .signature import Signature, flat, flatten
 
 FIELD, LARGE_LAW = 64, 256
@@ -124,17 +125,15 @@ def choose(
         )
     if facts.affine and (facts.state <= _EXACT or facts.diagonal):
         return Choice(_EXPROSENBROCK, "x' is affine in t and x between kinks, where it is exact")
-    if facts.linear and _tree.is_concrete(span, problem, args):
-        slopes = largest_slope(problem, x0, args, facts) * span
-        # The exponential of a matrix costs as much as many steps.
-        matrices = _SLOPES_OF_MATRICES * (1.0 + (facts.state / 4) ** 3)
-        least = _SLOPES if facts.diagonal else matrices
-        if slopes > least:
-            return Choice(
-                _EXPROSENBROCK,
-                f"the constant slope of Ax + f̃ times the span is {slopes:.2g}",
-            )
-    fast = norm(problem.generator(args)) * span if _tree.is_concrete(span) else 0.0
+    rates = _rates(problem, x0, args, facts) if _tree.is_concrete(span) else _UNKNOWN
+    # The exponential of a matrix costs as much as many steps.
+    matrices = _SLOPES_OF_MATRICES * (1.0 + (facts.state / 4) ** 3)
+    if rates.slope * span > (_SLOPES if facts.diagonal else matrices):
+        return Choice(
+            _EXPROSENBROCK,
+            f"the constant slope of Ax + f̃ times the span is {rates.slope * span:.2g}",
+        )
+    fast = rates.norm * span
     if fast > _FAST:
         return _with_fallback(
             _ETD4RK, f"‖A‖ times the span is {fast:.2g}, left to e^(hA)", facts, tol
@@ -181,16 +180,22 @@ _MAX_FACTS = 256
 
 def _facts(problem: Problem, x0: Tree, args: Any) -> Facts:
     leaves, tree = jtu.tree_flatten((x0, args))
-    parts = ((leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf for leaf in leaves)
     try:
-        key = flat(problem).key, tree, tuple(parts)
+        key = flat(problem).key, tree, tuple(map(_kind, leaves))
         if key in _FACTS:
             return _FACTS[key]
     except (InputError, TypeError):
-        return _read(problem, x0, args)  # a part that cannot be hashed is refused later
+        return _read(problem, x0, as_arrays(args))  # what cannot be hashed is refused later
     if len(_FACTS) >= _MAX_FACTS:
         _FACTS.clear()
-    return _FACTS.setdefault(key, _read(problem, x0, args))
+    return _FACTS.setdefault(key, _read(problem, x0, as_arrays(args)))
+
+
+def _kind(leaf: Any) -> Any:
+    """Return what the facts depend on: numbers are traced, as in `signature.flatten`."""
+    if eqx.is_array(leaf):
+        return leaf.shape, leaf.dtype
+    return float if isinstance(leaf, float) else leaf
 
 
 def _read(problem: Problem, x0: Tree, args: Any) -> Facts:
@@ -221,25 +226,46 @@ def _is_linear(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) 
     )
 
 
-_KNOWN: dict[tuple[int, ...], tuple[Any, float]] = {}
-"""The largest slopes of the latest problems, by the identity of the problem and of its args, both of
-which an entry keeps alive."""
+class Rates(NamedTuple):
+    """How fast trajectories change: a bound on ‖A‖, and the `slope` of Ax + f̃, zero where unknown."""
+
+    norm: float
+    slope: float
 
 
-def largest_slope(problem: Problem, x0: Tree, args: Any, facts: Facts) -> float:
+_UNKNOWN = Rates(0.0, 0.0)
+
+_RATES: dict[Any, tuple[Any, Rates]] = {}
+"""The rates of the latest problems, by the identity of the problem and of the arrays in its args, both
+of which an entry keeps alive."""
+
+
+def _rates(problem: Problem, x0: Tree, args: Any, facts: Facts) -> Rates:
+    leaves = jtu.tree_leaves(args)
+    key = id(problem), *(leaf if isinstance(leaf, float) else id(leaf) for leaf in leaves)
+    if key in _RATES:
+        return _RATES[key][1]
+    kept, args = args, as_arrays(args)
+    is_known = flat(problem).is_concrete and _tree.is_concrete(args)
+    slope = 0.0
+    if is_known and facts.linear:
+        slope = largest_slope(problem, x0, args, facts)
+        is_known = slope is not None
+    rates = Rates(norm(problem.generator(args)), slope or 0.0)
+    if is_known:
+        if len(_RATES) >= _MAX_FACTS:
+            _RATES.clear()
+        _RATES[key] = (problem, kept), rates
+    return rates
+
+
+def largest_slope(problem: Problem, x0: Tree, args: Any, facts: Facts) -> float | None:
     """Return the larger spectral radius of A + Df̃ for u ∈ h − 0 inside K, and for u held at the
-    boundary, where the derivatives of f and h are constant; zero where their code closes over traced
+    boundary, where the derivatives of f and h are constant; None where their code closes over traced
     values."""
-    key = (id(problem), *map(id, jtu.tree_leaves(args)))
-    if key not in _KNOWN:
-        if len(_KNOWN) >= _MAX_FACTS:
-            _KNOWN.clear()
-        with jax.ensure_compile_time_eval():
-            radii = _radii(problem, x0, args, facts.diagonal)
-        if radii is None:
-            return 0.0
-        _KNOWN[key] = (problem, args), max(map(float, radii))
-    return _KNOWN[key][1]
+    with jax.ensure_compile_time_eval():
+        radii = _radii(problem, x0, args, facts.diagonal)
+    return None if radii is None else max(map(float, radii))
 
 
 def _radii(problem: Problem, x0: Tree, args: Any, diagonal: bool) -> list[Any] | None:
