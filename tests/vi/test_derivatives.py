@@ -135,7 +135,7 @@ def chain(n, pull, left_pull):
 
 @pytest.mark.thorough
 def test_derivatives_of_large_problems_use_gmres_in_both_modes(monkeypatch):
-    monkeypatch.setattr(implicit, "_DENSE", 32)
+    monkeypatch.setattr(implicit, "_MAX_DENSE_UNKNOWNS", 32)
     F, drive, K = chain(150, 0.4, 0.7)
     weights = np.cos(np.arange(len(drive)))
     solved = lambda q: dvax.solve_vi(F, K, jnp.zeros_like(q), q, dvax.vi.ActiveSet(dense=2000)).y  # noqa: E731
@@ -154,7 +154,7 @@ def test_derivatives_of_large_problems_use_gmres_in_both_modes(monkeypatch):
 
 @pytest.mark.thorough
 def test_derivatives_of_large_problems_in_single_precision(monkeypatch):
-    monkeypatch.setattr(implicit, "_DENSE", 32)
+    monkeypatch.setattr(implicit, "_MAX_DENSE_UNKNOWNS", 32)
     F, drive, K = chain(150, 0.4, 0.7)
     drive = jnp.asarray(drive, jnp.float32)
     K = Box(jnp.float32(0.0), jnp.float32(1.5))
