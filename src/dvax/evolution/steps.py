@@ -120,7 +120,14 @@ def _controller(
     rtol, atol, horizon = map(setup.number, ("rtol", "atol", "horizon"))
     return Adaptive(
         stops,
-        ErrorTest(rtol, atol, horizon, sizes, certify=bool(setup.moduli)),
+        ErrorTest(
+            rtol,
+            atol,
+            horizon,
+            sizes,
+            certify=bool(setup.moduli),
+            knows_decay=method.is_rosenbrock,
+        ),
         first=setup.number("dt0"),
         first_growth=setup.number("dt0_growth"),
         longest=setup.number("dt_max"),

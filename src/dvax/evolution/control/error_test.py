@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jax import lax
 
 from ..._tree import Tree
@@ -59,7 +60,9 @@ class ErrorTest(eqx.Module):
     parts with different units are each compared with their own size. It is not taken entry by entry:
     that would ask for a smaller defect wherever an entry passes through zero.
 
-    `certify`: the defect counts by its modulus alone, as a certificate integrates it.
+    - `certify`: the defect counts by its modulus alone, as a certificate integrates it;
+    - `knows_decay`: e is carried by the linear part of f̃ too, as a method that linearises does, and not
+      by a difference quotient.
     """
 
     rtol: Any
@@ -67,6 +70,7 @@ class ErrorTest(eqx.Module):
     horizon: Any
     sizes: Callable[[Tree], list[Any]]
     certify: bool = eqx.field(static=True)
+    knows_decay: bool = eqx.field(static=True)
 
     def attempt(self, t0: Any, t1: Any, x0: Tree, step: Step, span: Any) -> Attempt:
         """Measure a step from (t0, x0) to t1 in a run of this span."""
@@ -79,7 +83,7 @@ class ErrorTest(eqx.Module):
             error = lax.stop_gradient(self.horizon * self._ratio(step.signed, x0, step.x1))
         integrated = error * h / self.horizon
         if step.carried is not None:
-            error = error / (1.0 + self._allowance(h, x0, step))
+            error = self._of_estimate(h, integrated, x0, step)
         # Inside the step the defect has not cancelled or decayed yet.
         error = jnp.maximum(error, _INSIDE * modulus * h / self.horizon)
         # A law that is not solved inside the step may be that of a stage far away: the step was too
@@ -101,18 +105,33 @@ class ErrorTest(eqx.Module):
             usable=step.start_solved & step.finite,
         )
 
-    def _allowance(self, h: Any, x0: Tree, step: Step) -> Any:
-        """Return by how much the defect may exceed its share of the tolerance, relative to that.
+    def _of_estimate(self, h: Any, integrated: Any, x0: Tree, step: Step) -> Any:
+        """Return the error of a step that is measured by the estimated error e of x.
 
-        Of the estimated error e a step leaves the part c < 1 where trajectories approach each other.
-        With E = |e|/tolerance, a defect that integrates to (1 − c)(1 − E) tolerances keeps E below 1.
+        With |·| in tolerances, a step leaves l of e and adds d with |d| = `integrated`. It may add λd
+        with |l + λd|² = max(|e|, |l|)² + h/horizon, where l and d count by the moduli of their entries:
+        then |e|² stays below 1. That is
+
+            1/λ = (p + √(p² + r|d|²))/r,   p = ⟨l, d⟩,   r = h/horizon + max(|e|² − |l|², 0).
+
+        Defects in different entries, as kinks in a field are, thus add up as their squares do.
+        If the decay of e is known, |λd| = (1 − |l|/|e|)(1 − |e|) + h/horizon is allowed as well, which
+        keeps |e| below 1 too.
         """
-        assert step.carried is not None
-        before, after = (self._ratio(e, x0, step.x1) for e in step.carried)
-        decay = 1.0 - after / jnp.where(before > 0.0, before, 1.0)
-        room = jnp.clip(decay, 0.0, 1.0) * jnp.maximum(1.0 - before, 0.0)
-        known = (before > 0.0) & jnp.isfinite(before) & jnp.isfinite(after)
-        return lax.stop_gradient(jnp.where(known, room * self.horizon / h, 0.0))
+        assert step.carried is not None and step.signed is not None
+        before, left = (self._ratio(e, x0, step.x1) for e in step.carried)
+        both = jtu.tree_map(lambda l, d: jnp.abs(l) + h * d, step.carried[1], step.signed)
+        share = h / self.horizon
+        p = 0.5 * (self._ratio(both, x0, step.x1) ** 2 - left**2 - integrated**2)
+        p, r = jnp.maximum(p, 0.0), share + jnp.maximum(before**2 - left**2, 0.0)
+        error = (p + jnp.sqrt(p**2 + r * integrated**2)) / r
+        if self.knows_decay:
+            decay = 1.0 - left / jnp.where(before > 0.0, before, 1.0)
+            room = jnp.clip(decay, 0.0, 1.0) * jnp.maximum(1.0 - before, 0.0)
+            error = jnp.minimum(error, integrated / (jnp.where(before > 0.0, room, 0.0) + share))
+        known = jnp.isfinite(before) & jnp.isfinite(left)
+        error = jnp.where(known, error, integrated / share)
+        return lax.stop_gradient(jnp.where(jnp.isnan(error), jnp.inf, error))
 
     def excursion(self, x0: Tree, step: Step) -> Any:
         """Return the size of what may lie between the samples of the defect, in units of what may
