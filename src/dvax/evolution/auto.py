@@ -23,10 +23,9 @@ from ..generators import (
     Scalar,
     Zero,
 )
-from ..operators import Diagonal as DiagonalOperator
-from ..operators import Scaling
 from ..problem import Problem
 from ..programs.structure import analyse, independent
+from .flow import is_pointwise
 from .method import ETD2RK, ETD4RK, ExpRosenbrock
 from .results import RESULTS
 from .runge_kutta import DormandPrince
@@ -204,7 +203,7 @@ def _read(problem: Problem, x0: Tree, args: Any) -> Facts:
     like = problem.zero_control(x0)
     state, law = (sum(leaf.size for leaf in jtu.tree_leaves(v)) for v in (x0, like))
     affine = _is_affine(problem, args, t, x0, like)
-    diagonal = _is_diagonal(problem, args, t, x0, like)
+    diagonal = _is_diagonal(problem, args, t, x0)
     few = state + law <= 2 * _EXACT or (diagonal and state <= FIELD)
     linear = few and _is_linear(problem, args, t, x0, like)
     return Facts(state, law, affine, diagonal, linear)
@@ -317,17 +316,11 @@ def _is_affine(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) 
     )
 
 
-def _is_diagonal(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) -> bool:
+def _is_diagonal(problem: Problem, args: Any, t: jax.Array, x0: Tree) -> bool:
     """Return whether A and the derivative of f̃ are diagonal."""
-    A, P = problem.generator(args), problem.operator(args)
-    alone = isinstance(A, Zero | Scalar | Diagonal) and isinstance(P, Scaling | DiagonalOperator)
-    if not alone or not isinstance(x0, jax.Array) or jnp.shape(like) != x0.shape:
-        return False
-    if problem.set_at(t, args).intervals(like) is None:
-        return False
-    return all(
-        analyse(lambda v, fn=function: fn(t, v, v, args), x0).pointwise
-        for function in (problem.f, problem.h)
+    A = problem.generator(args)
+    return isinstance(A, Zero | Scalar | Diagonal) and is_pointwise(
+        problem, problem.operator(args), t, x0, args
     )
 
 

@@ -180,21 +180,30 @@ def _interpolatory(nodes: tuple[float, ...]) -> tuple[float, ...]:
 
 def _kinked(flow: Flow, evaluations: list[Evaluation]) -> Any:
     """Return whether the regime changes between two of the evaluations, as far as the switches of K and
-    the branches of f and h show; true if K has no switches."""
+    the branches of f and h show; true if K has no switches. Of a flow that is pointwise, it is said for
+    each entry."""
     problem, args = flow.problem, flow.args
     known = [flow.switches_of(one.t, one.x, one.rate) for one in evaluations]
     if known[0] is None:
         return jnp.asarray(True)
 
-    def signs(one: Evaluation, switches: Any) -> jax.Array:
+    def signs(one: Evaluation, switches: Any) -> list[jax.Array]:
         u = flow.operator.inverse(one.rate.y)
         found = [switches]
+        if flow.pointwise:
+            found = [part.reshape(one.x.shape) for part in jnp.split(switches, switches.size // one.x.size)]
         for fn in (problem.f, problem.h):
             found += branches(lambda t, x, u, fn=fn: fn(t, x, u, args), one.t, one.x, u)
-        return jnp.concatenate([jnp.ravel(s) > 0 for s in found])
+        return [s > 0 for s in found]
 
-    rows = jnp.stack(list(map(signs, evaluations, known)))
-    return jnp.any(rows[1:] != rows[:-1])
+    kinked = jnp.asarray(False)
+    rows = list(map(signs, evaluations, known))
+    for series in zip(*rows, strict=True):
+        stacked = jnp.stack(series)
+        changed = jnp.any(stacked[1:] != stacked[:-1], axis=0)
+        is_entrywise = flow.pointwise and changed.shape == evaluations[0].x.shape
+        kinked = kinked | (changed if is_entrywise else jnp.any(changed))
+    return kinked
 
 
 def _unseen(flow: Flow, evaluations: list[Evaluation], doubt: Tree) -> Tree:

@@ -12,7 +12,8 @@ from .. import _tree
 from .._tree import Tree
 from ..generators import AbstractGenerator, AbstractPropagator, Dense, Diagonal, Scalar
 from ..generators.spectral_state import expand_state
-from ..operators import AbstractOperator
+from ..operators import AbstractOperator, Scaling
+from ..operators import Diagonal as DiagonalOperator
 from ..problem import Problem
 from ..programs.enclosure import (
     LinearEnclosure,
@@ -22,6 +23,7 @@ from ..programs.enclosure import (
     largest,
     smallest,
 )
+from ..programs.structure import analyse
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, FrozenVI
 from .linearised import AbstractLinear, linearise
@@ -58,7 +60,8 @@ class Flow(eqx.Module):
     `enclosed` says that f̃ has a linear enclosure over a whole step, so that nothing about the defect
     is guessed. `linear` is A + J where some J joins A in what is left to the propagator.
     With `keeps_switches`, `rate` also returns the switch functions of a law that is solved by
-    iteration, so that they are compiled once with it and not wherever they are read.
+    iteration, so that they are compiled once with it and not wherever they are read. `pointwise` says
+    that x is one array, each entry of which alone acts on that entry of f̃, at a time.
     """
 
     problem: Problem
@@ -75,6 +78,7 @@ class Flow(eqx.Module):
     small_box: AbstractSmallBox | None = None
     linear: AbstractLinear | None = None
     keeps_switches: bool = eqx.field(static=True, default=False)
+    pointwise: bool = eqx.field(static=True, default=False)
 
     def propagator(self, h: Any, terms: int) -> AbstractPropagator:
         """The exact flow over h of x' = Ax + p, or of x' = (A + J)x + p."""
@@ -246,6 +250,21 @@ def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
         value, answer.y, answer.z, answer.residual, solved, answer.evaluations,
         jax.lax.stop_gradient(switches),
     )  # fmt: skip
+
+
+def is_pointwise(problem: Problem, operator: AbstractOperator, t: Any, x: Tree, args: Any) -> bool:
+    """Return whether each entry of f̃(t, x) depends on t and on that entry of x alone."""
+    like = problem.zero_control(x)
+    if not isinstance(x, jax.Array) or jnp.shape(like) != x.shape:
+        return False
+    if not isinstance(operator, Scaling | DiagonalOperator):
+        return False
+    if problem.set_at(t, args).intervals(like) is None:
+        return False
+    return all(
+        analyse(lambda v, fn=function: fn(t, v, v, args), x).pointwise
+        for function in (problem.f, problem.h)
+    )
 
 
 def slope(problem: Problem, operator: AbstractOperator, t: Any, x: Tree, args: Any) -> Tree:

@@ -23,7 +23,7 @@ from .control import (
 )
 from .event import Events
 from .event_watch import EventWatch
-from .flow import Flow
+from .flow import Flow, is_pointwise
 from .loop import Loop, State
 from .method import AbstractMethod
 from .outcome import Outcome, end_alone, ended, with_tangents
@@ -148,7 +148,13 @@ def _stepper(
         # Once a run: for a matrix it takes an eigenvalue.
         growth = flow.generator.growth(flow.state_space(setup.x0))
     locate = not options.fixed and _can_locate(flow, t0, setup.x0)
-    flow = dataclasses.replace(flow, keeps_switches=locate and not flow.direct)
+    flow = dataclasses.replace(
+        flow,
+        keeps_switches=locate and not flow.direct,
+        pointwise=measure
+        and not flow.enclosed
+        and is_pointwise(flow.problem, flow.operator, t0, setup.x0, flow.args),
+    )
     watch = not options.fixed and measure and not flow.enclosed
     guard = excursions.guard(flow, t0, setup.x0) if watch else None
     stepper = Stepper(
