@@ -191,7 +191,7 @@ def _kinked(flow: Flow, evaluations: list[Evaluation]) -> Any:
         u = flow.operator.inverse(one.rate.y)
         found = [switches]
         if flow.pointwise:
-            found = [part.reshape(one.x.shape) for part in jnp.split(switches, switches.size // one.x.size)]
+            found = list(switches.reshape((-1, *one.x.shape)))
         for fn in (problem.f, problem.h):
             found += branches(lambda t, x, u, fn=fn: fn(t, x, u, args), one.t, one.x, u)
         return [s > 0 for s in found]

@@ -60,7 +60,8 @@ class ExcursionEstimate(NamedTuple):
     - `excursion(size)`: the largest ratio of a deviation to the deviation that may change a sign, if
       excursions up to `size` are ignored;
     - `law_size`: the largest |y|;
-    - `rates`, `laws`: the deviations of the data of f, and of h and K, minus V/4;
+    - `rates`, `laws`: the deviations of the data of f, in the root mean square, and of h and K, minus
+      V/4;
     - `variation`: V after the step.
     """
 
@@ -116,9 +117,11 @@ class ExcursionGuard(eqx.Module):
                 lambda v, m: jnp.maximum(decay * v, m), variation, largest(changes)
             )
             excess = jtu.tree_map(
-                lambda d, v: jnp.max(d - _VARIATION_SHARE * v, initial=0.0), largest(dev), variation
+                lambda d, v: jnp.maximum(d - _VARIATION_SHARE * v, 0.0), largest(dev), variation
             )
-            rates, laws = (_largest(part) if part else zero for part in excess)
+            # A pulse in one entry of f changes x as its share of the mean does.
+            means = [jnp.sqrt(jnp.mean(leaf**2)) for leaf in excess[0]]
+            rates, laws = (_largest(part) if part else zero for part in (means, excess[1]))
 
         def excursion(ignored: Any) -> Any:
             if not self.switches:

@@ -15,7 +15,7 @@ _SAFETY = 0.5
 _MAX_CUT = 0.1
 """Least factor of the step size."""
 
-_EXCURSION_CUT = 0.3
+_EXCURSION_CUT = 0.6
 """Largest factor of the step size after a step that may hide an excursion."""
 
 GROWTH_RATE, GROWTH_STEPS = 0.12, 9.0
