@@ -35,7 +35,11 @@ from .signature import Signature, flat, flatten
 FIELD, LARGE_LAW = 64, 256
 """Entries of the law and of the state beyond which a problem is taken for a field, whose kinks are
 everywhere; and entries of a law beyond which its kinks are never located. A market of 102 units and one
-price takes 4 times fewer steps with its kinks located; a field of 128 points up to 2 times more."""
+price takes 4 times fewer steps with its kinks located; a field of 128 points up to 2 times more, unless
+the tolerance is tight."""
+
+TIGHT = 1e-7
+"""Tolerance up to which the kinks of a field of at most `LARGE_LAW` entries are located too."""
 
 _ETD2RK, _ETD4RK, _DORMANDPRINCE, _EXPROSENBROCK = (
     ETD2RK(),
@@ -44,6 +48,10 @@ _ETD2RK, _ETD4RK, _DORMANDPRINCE, _EXPROSENBROCK = (
     ExpRosenbrock(),
 )
 """Modules that are made once, since making and flattening one takes 10 µs."""
+
+_LOOSE = 1e-5
+"""Tolerance from which steps of order 2 with three evaluations beat those of order 4 with ten, where A
+is left to its exponential."""
 
 _EXACT = 12
 """Unknowns up to which the exponential of A + Df costs less than the steps that it saves."""
@@ -89,14 +97,21 @@ class Choice(NamedTuple):
 
 class Facts(NamedTuple):
     """What the code of a problem proves, whatever its numbers: `affine` says that f and h are affine in
-    (t, x, u) jointly and the bounds of K in t, so that x' is affine from kink to kink; `linear`, that
-    the derivatives of f and h in x and u are constant."""
+    (t, x, u) jointly and the bounds of K in t, so that x' is affine from kink to kink; `pointwise`,
+    that f̃ acts entry by entry, and `diagonal`, that A does too; `linear`, that the derivatives of f
+    and h in x and u are constant."""
 
     state: int
     law: int
     affine: bool
+    pointwise: bool
     diagonal: bool
     linear: bool
+
+    @property
+    def is_field(self) -> bool:
+        """Whether there are so many unknowns that steps meet kinks at any time."""
+        return min(self.law, self.state) > FIELD or self.law > LARGE_LAW
 
 
 def choose(
@@ -108,21 +123,21 @@ def choose(
     fixed: bool,
     certified: bool,
 ) -> Choice:
-    """Choose a method for a run over `span` at the tolerance `tol`, from the structure and the size of
-    the problem."""
+    """Choose a method for a run over `span` at the tolerance `tol` (NaN if it is traced), from the
+    structure and the size of the problem."""
     if fixed:
         return Choice(_ETD2RK, "the steps are given")
     if certified:
         return Choice(_ETD2RK, "its defect can be enclosed, so that a bound is proved")
     facts = _facts(problem, x0, args)
-    if min(facts.law, facts.state) > FIELD or facts.law > LARGE_LAW:
+    if facts.is_field and not facts.pointwise:
         return _with_fallback(
             _ETD2RK,
             f"with {facts.law} unknowns in the law, steps meet kinks at any time",
             facts,
             tol,
         )
-    if facts.affine and (facts.state <= _EXACT or facts.diagonal):
+    if facts.affine and not facts.is_field and (facts.state <= _EXACT or facts.diagonal):
         return Choice(_EXPROSENBROCK, "x' is affine in t and x between kinks, where it is exact")
     rates = _rates(problem, x0, args, facts) if _tree.is_concrete(span) else _UNKNOWN
     # The exponential of a matrix costs as much as many steps.
@@ -134,12 +149,12 @@ def choose(
         )
     fast = rates.norm * span
     if fast > _FAST:
-        return _with_fallback(
-            _ETD4RK, f"‖A‖ times the span is {fast:.2g}, left to e^(hA)", facts, tol
-        )
-    return _with_fallback(
-        _DORMANDPRINCE, "few unknowns, and nothing is known to be stiff", facts, tol
-    )
+        reason = f"‖A‖ times the span is {fast:.2g}, left to e^(hA)"
+        if tol >= _LOOSE:
+            return _with_fallback(_ETD2RK, f"{reason}, and the tolerance is loose", facts, tol)
+        return _with_fallback(_ETD4RK, reason, facts, tol)
+    size = "f̃ acts entry by entry" if facts.is_field else "few unknowns"
+    return _with_fallback(_DORMANDPRINCE, f"{size}, and nothing is known to be stiff", facts, tol)
 
 
 def _with_fallback(method: Any, reason: str, facts: Facts, tol: float) -> Choice:
@@ -203,10 +218,11 @@ def _read(problem: Problem, x0: Tree, args: Any) -> Facts:
     like = problem.zero_control(x0)
     state, law = (sum(leaf.size for leaf in jtu.tree_leaves(v)) for v in (x0, like))
     affine = _is_affine(problem, args, t, x0, like)
-    diagonal = _is_diagonal(problem, args, t, x0)
+    pointwise = is_pointwise(problem, problem.operator(args), t, x0, args)
+    diagonal = pointwise and isinstance(problem.generator(args), Zero | Scalar | Diagonal)
     few = state + law <= 2 * _EXACT or (diagonal and state <= FIELD)
     linear = few and _is_linear(problem, args, t, x0, like)
-    return Facts(state, law, affine, diagonal, linear)
+    return Facts(state, law, affine, pointwise, diagonal, linear)
 
 
 def _is_linear(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) -> bool:
@@ -313,14 +329,6 @@ def _is_affine(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) 
     bounds = problem.set_at(t, args).intervals(like)
     return (
         bounds is not None and analyse(lambda t: problem.set_at(t, args).intervals(like), t).affine
-    )
-
-
-def _is_diagonal(problem: Problem, args: Any, t: jax.Array, x0: Tree) -> bool:
-    """Return whether A and the derivative of f̃ are diagonal."""
-    A = problem.generator(args)
-    return isinstance(A, Zero | Scalar | Diagonal) and is_pointwise(
-        problem, problem.operator(args), t, x0, args
     )
 
 

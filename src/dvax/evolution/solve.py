@@ -189,7 +189,7 @@ def solve(
     }
     choice = Choice(method)
     if method is None:
-        tol = max(rtol, atol) if _tree.is_concrete(rtol, atol) else 1.0
+        tol = max(rtol, atol) if _tree.is_concrete(rtol, atol) else math.nan
         choice = choose(problem, x0, args, span, float(tol), fixed, constants is not None)
         method = choice.method
     measured = not isinstance(method, Implicit) and (bool(measure) or not fixed)

@@ -11,8 +11,9 @@ from jax import lax
 from .. import _tree
 from .._jax import forward_only, outlined
 from .._tree import Tree
+from ..problem import Problem
 from . import excursions, reverse
-from .auto import FIELD, LARGE_LAW
+from .auto import FIELD, LARGE_LAW, TIGHT
 from .control import (
     AbstractController,
     Adaptive,
@@ -133,6 +134,9 @@ def _controller(
         longest=setup.number("dt_max"),
         order=method.order,
         defect_order=method.degree + 1,
+        locates=True
+        if min(_sizes(setup.problem, setup.x0)) <= FIELD
+        else jnp.maximum(rtol, atol) <= TIGHT,
         stiff_steps=setup.number("stiff_steps")
         if options.watch_stiffness and method.pair is not None
         else None,
@@ -147,14 +151,11 @@ def _stepper(
     if measure and flow.enclosed:
         # Once a run: for a matrix it takes an eigenvalue.
         growth = flow.generator.growth(flow.state_space(setup.x0))
+    if measure and not flow.enclosed:
+        pointwise = is_pointwise(flow.problem, flow.operator, t0, setup.x0, flow.args)
+        flow = dataclasses.replace(flow, pointwise=pointwise)
     locate = not options.fixed and _can_locate(flow, t0, setup.x0)
-    flow = dataclasses.replace(
-        flow,
-        keeps_switches=locate and not flow.direct,
-        pointwise=measure
-        and not flow.enclosed
-        and is_pointwise(flow.problem, flow.operator, t0, setup.x0, flow.args),
-    )
+    flow = dataclasses.replace(flow, keeps_switches=locate and not flow.direct)
     watch = not options.fixed and measure and not flow.enclosed
     guard = excursions.guard(flow, t0, setup.x0) if watch else None
     stepper = Stepper(
@@ -184,8 +185,16 @@ def _estimates(setup: Setup, method: AbstractMethod, flow: Flow, options: Option
 
 def _can_locate(flow: Flow, t0: jax.Array, x0: Any) -> bool:
     like = flow.problem.zero_control(x0)
-    law, state = (sum(leaf.size for leaf in jtu.tree_leaves(v)) for v in (like, x0))
-    if law > LARGE_LAW or min(law, state) > FIELD:
+    law, state = _sizes(flow.problem, x0)
+    if law > LARGE_LAW or (min(law, state) > FIELD and not flow.pointwise):
         return False
     known = flow.switches(t0, x0, like)
     return known is not None and known.size > 0
+
+
+def _sizes(problem: Problem, x0: Any) -> tuple[int, int]:
+    """Return the numbers of entries of the law and of the state."""
+    law, state = (
+        sum(leaf.size for leaf in jtu.tree_leaves(v)) for v in (problem.zero_control(x0), x0)
+    )
+    return law, state

@@ -40,6 +40,7 @@ class Adaptive(AbstractController):
 
     `order` is that of the mean defect, `defect_order` that of its modulus; `first` and `longest` are
     the first and the largest step size, and `first_growth` limits the growth after the first step.
+    Events are located if `locates`.
     """
 
     stops: jax.Array
@@ -49,6 +50,7 @@ class Adaptive(AbstractController):
     longest: Any
     order: int = eqx.field(static=True)
     defect_order: int = eqx.field(static=True)
+    locates: Any
     stiff_steps: Any = None
 
     adapts: ClassVar[bool] = True
@@ -183,7 +185,8 @@ class Adaptive(AbstractController):
         """Return the time of the first event inside a step that is too long for it, ∞ for none."""
         if step.event is None:
             return jnp.full_like(attempt.size, jnp.inf)
-        return lax.stop_gradient(step.event((attempt.error > 1.0) | (excursion > 1.0)))
+        wanted = (attempt.error > 1.0) | (excursion > 1.0)
+        return lax.stop_gradient(step.event(wanted & self.locates))
 
     def _result(self, step: Step, attempt: Attempt, accepted: Any, exhausted: Any) -> RESULTS:
         # A step size is rounded with the two times that it lies between.
