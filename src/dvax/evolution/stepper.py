@@ -367,7 +367,11 @@ class Stepper(eqx.Module):
         left = error_estimate.finite_or_zero(
             values(propagators.full.step(self.flow.expand(left), ()))
         )
-        after = error_estimate.finite_or_zero(_tree.add(left, _tree.scale(h, sample.mean)))
+        after = error_estimate.finite_or_zero(
+            jtu.tree_map(
+                lambda l, m: l + jnp.where(l < 0, -1, 1) * jnp.abs(h * m), left, sample.mean
+            )
+        )
         return (error, error_estimate.counted(error, left, sample.kinked, slope)), after
 
     def _slopes(self, h: Any, evaluations: list[Evaluation]) -> tuple[Any, Any] | None:

@@ -50,7 +50,8 @@ class Attempt(NamedTuple):
         """Return the attempt as measured by the modulus where errors are `noisy`: roundoff cancels by
         chance in a signed mean, so that no step size would bring it below a tolerance for long."""
         error = jnp.where(noisy, self.modulus, self.error)
-        return self._replace(error=error, integrated=error * self.size / horizon)
+        integrated = jnp.where(noisy, self.modulus * self.size / horizon, self.integrated)
+        return self._replace(error=error, integrated=integrated)
 
 
 class ErrorTest(eqx.Module):
@@ -82,17 +83,20 @@ class ErrorTest(eqx.Module):
         if step.signed is not None and not self.certify:
             error = lax.stop_gradient(self.horizon * self._ratio(step.signed, x0, step.x1))
         integrated = error * h / self.horizon
+        # Data that varies within the run has the rounding of t besides, relative to the span.
+        relative = eps * (1.0 + largest / span)
+        rate = self.horizon * self._ratio(step.c[0], x0, step.x1)
+        roundoff = jnp.minimum(_ROUNDINGS * relative, _LARGEST_ROUNDOFF) * rate
         if step.carried is not None:
-            error = self._of_estimate(h, integrated, x0, step)
+            estimated = self._of_estimate(h, integrated, x0, step)
+            # In the unit of the error.
+            unit = jnp.where(error > 0.0, estimated / jnp.where(error > 0.0, error, 1.0), 1.0)
+            error, roundoff = estimated, roundoff * jnp.where(jnp.isfinite(unit), unit, 1.0)
         # Inside the step the defect has not cancelled or decayed yet.
         error = jnp.maximum(error, _INSIDE * modulus * h / self.horizon)
         # A law that is not solved inside the step may be that of a stage far away: the step was too
         # large.
         error, modulus = (jnp.where(step.solved, v, jnp.inf) for v in (error, modulus))
-        # Data that varies within the run has the rounding of t besides, relative to the span.
-        relative = eps * (1.0 + largest / span)
-        rate = self.horizon * self._ratio(step.c[0], x0, step.x1)
-        roundoff = jnp.minimum(_ROUNDINGS * relative, _LARGEST_ROUNDOFF) * rate
         return Attempt(
             begin=t0,
             end=t1,
@@ -114,13 +118,18 @@ class ErrorTest(eqx.Module):
 
             1/λ = (p + √(p² + r|d|²))/r,   p = ⟨l, d⟩,   r = h/horizon + max(|e|² − |l|², 0).
 
+        A larger |e| or |l| counts as 1: where a jump has left more, its decay must not be spent.
+
         Defects in different entries, as kinks in a field are, thus add up as their squares do.
         If the decay of e is known, |λd| = (1 − |l|/|e|)(1 − |e|) + h/horizon is allowed as well, which
         keeps |e| below 1 too.
         """
-        assert step.carried is not None and step.signed is not None
+        assert step.carried is not None
         before, left = (self._ratio(e, x0, step.x1) for e in step.carried)
-        both = jtu.tree_map(lambda l, d: jnp.abs(l) + h * d, step.carried[1], step.signed)
+        scale = 1.0 / jnp.maximum(left, 1.0)
+        before, left = jnp.minimum(before, 1.0), jnp.minimum(left, 1.0)
+        added = step.error if step.signed is None else step.signed
+        both = jtu.tree_map(lambda l, d: scale * jnp.abs(l) + h * d, step.carried[1], added)
         share = h / self.horizon
         p = 0.5 * (self._ratio(both, x0, step.x1) ** 2 - left**2 - integrated**2)
         p, r = jnp.maximum(p, 0.0), share + jnp.maximum(before**2 - left**2, 0.0)
@@ -129,8 +138,6 @@ class ErrorTest(eqx.Module):
             decay = 1.0 - left / jnp.where(before > 0.0, before, 1.0)
             room = jnp.clip(decay, 0.0, 1.0) * jnp.maximum(1.0 - before, 0.0)
             error = jnp.minimum(error, integrated / (jnp.where(before > 0.0, room, 0.0) + share))
-        known = jnp.isfinite(before) & jnp.isfinite(left)
-        error = jnp.where(known, error, integrated / share)
         return lax.stop_gradient(jnp.where(jnp.isnan(error), jnp.inf, error))
 
     def excursion(self, x0: Tree, step: Step) -> Any:
