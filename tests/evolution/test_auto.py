@@ -142,3 +142,64 @@ def test_function_that_closes_over_a_traced_number_is_followed_to_the_end():
 
     rest = lambda pull: (pull + np.sin(4.5) + 1.5e3 * 1.5) / (1.0 + 1.5e3)  # noqa: E731
     np.testing.assert_allclose(jax.jit(last)(1.0), rest(1.0), atol=1e-3)
+
+
+def field(n, generator=None):
+    """n points with x' = Ax + c − 1.5 x − clip(g − 2x, 0, ½), each with its own c and g."""
+    s = jnp.linspace(0.0, 1.0, n)
+    return dvax.Problem(
+        A=dvax.generators.Scalar(-1.0) if generator is None else generator,
+        P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+        f=lambda t, x, u, args: 3.0 + s + 0.3 * jnp.sin(5.0 * t) - 0.5 * x - u,
+        h=lambda t, x, u, args: 0.5 + 0.2 * jnp.sin(6.0 * s) - x,
+    )  # fmt: skip
+
+
+FIELDS = list(itertools.product((65, 100, 256, 257, 2000), TOLERANCES))
+
+
+@pytest.mark.parametrize(("n", "tol"), mostly_thorough(FIELDS, [(100, 1e-8), (257, 1e-4)]))
+def test_field_meets_its_tolerance_in_few_steps(n, tol):
+    problem = field(n)
+    sol = dvax.solve(problem, -jnp.ones(n), 0.0, 2.0, rtol=tol, atol=tol)
+    assert sol.stats["method"].startswith("DormandPrince: f̃ acts entry by entry")
+    s = np.linspace(0.0, 1.0, n)
+
+    def by_hand(t, x):
+        return (
+            3.0
+            + s
+            + 0.3 * np.sin(5.0 * t)
+            - 1.5 * x
+            - np.clip(0.5 + 0.2 * np.sin(6 * s) - x, 0, 0.5)
+        )
+
+    exact = solve_ivp(by_hand, (0.0, 2.0), -np.ones(n), "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    error = np.sqrt(np.mean((np.asarray(sol.xs[-1]) - exact) ** 2))
+    assert error <= tol * (1.0 + np.sqrt(np.mean(exact**2)))
+    # Each point has two kinks; steps of order 2 become 1.5e3, 3e3, 1.5e4 and 1.5e5.
+    assert int(sol.stats["steps"]) <= 0.3 * tol**-0.5 + 4 * min(n, 300) + 100
+
+
+def test_field_is_left_to_its_exponential_by_a_method_that_suits_the_tolerance():
+    n = 80
+    heat = field(n, dvax.generators.Elliptic(n, 1.0, boundary="dirichlet"))
+    solved = lambda tol: dvax.solve(heat, jnp.zeros(n), 0.0, 0.3, rtol=tol, atol=tol)  # noqa: E731
+    loose, tight = solved(1e-4), solved(1e-7)
+    assert loose.stats["method"].startswith("ETD2RK: ‖A‖ times the span is inf")
+    assert tight.stats["method"].startswith("ETD4RK: ‖A‖ times the span is inf")
+    np.testing.assert_allclose(loose.xs, tight.xs, atol=1e-4)
+    # Under `jax.jit` the tolerance is traced.
+    traced = jax.jit(lambda tol: dvax.solve(heat, jnp.zeros(n), 0.0, 0.3, rtol=tol, atol=tol).xs)
+    np.testing.assert_allclose(traced(1e-7), tight.xs, atol=1e-12)
+
+
+def test_field_with_a_coupled_law_keeps_order_two():
+    n = 80
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+        f=lambda t, x, u, args: jnp.cos(t) - u,
+        h=lambda t, x, u, args: x - 0.1 * (jnp.roll(u, 1) + jnp.roll(u, -1)),
+    )  # fmt: skip
+    sol = dvax.solve(problem, jnp.linspace(0.0, 1.0, n), 0.0, 0.5, rtol=1e-3, atol=1e-3)
+    assert sol.stats["method"].startswith("ETD2RK: with 80 unknowns in the law")

@@ -49,7 +49,7 @@ ARGS = {
 X0, T1, TS = jnp.array([0.5, -0.4, 0.9]), jnp.array(0.99), np.array([0.33, 0.9])
 """Not a multiple of the step: there one more, however short, would begin."""
 CASES = list(itertools.product(METHODS, SETS))
-OFTEN = {("ETD2RK", "Ball")}
+OFTEN = {("ETD2RK", "Ball"), ("Picard", "Ball")}
 
 
 @pytest.mark.parametrize(("method", "kind"), mostly_thorough(CASES, OFTEN))

@@ -55,7 +55,8 @@ METHODS = {
         dvax.ETD4RK(), dict(dt=1 / 320, max_steps=600, measure=True), 1e-7,
     ),
     "Picard": (dvax.Picard(), dict(dt=1 / 320, max_steps=600), 2e-5),
-    "Implicit": (dvax.Implicit(), dict(rtol=1e-10, atol=1e-10), 1e-6),
+    # Its steps cross kinks, where derivatives are as good as steps are short.
+    "Implicit": (dvax.Implicit(), dict(rtol=1e-12, atol=1e-12), 2e-6),
 }  # fmt: skip
 
 

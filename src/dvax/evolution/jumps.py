@@ -69,6 +69,8 @@ def find_jump(stop: Stop) -> Diagnosis:
         others = [_narrow(values, *part, stop.ulp) for part in ((left, middle), (middle, right))]
         has_similar_jumps = all(_change(*other[2:])[0] > 0.25 * change for other in others)
         if has_similar_jumps and change < _MAX_ROUNDOFF_JUMP * size:
+            if change < _largest_defect(stop):
+                continue
             return _roundoff_jumps(stop, name, change, b)
         where = f" in component {k}" if before.size > 1 else ""
         return Diagnosis(
@@ -147,6 +149,12 @@ def _narrow(
         else:
             a, before = middle, between
     return a, b, before, after
+
+
+def _largest_defect(stop: Stop) -> float:
+    """Return the defect that the tolerance allows."""
+    rtol, atol, horizon = (float(stop.setup.setting[n]) for n in ("rtol", "atol", "horizon"))
+    return (atol + rtol * stop.norm(stop.x)) / horizon
 
 
 def _roundoff_jumps(stop: Stop, name: str, height: float, t: float) -> Diagnosis:
