@@ -65,6 +65,10 @@ _SLOPES, _SLOPES_OF_MATRICES = 60.0, 150.0
 `ExpRosenbrock` is faster, which has the linear part exactly: where it is diagonal, and where it is a
 small matrix."""
 
+_TURNS_TOL = 1e-6
+"""Tolerance below which the limit of `_SLOPES_OF_MATRICES` falls for imaginary parts, as the steps of a
+method of order 5 do."""
+
 _LINEARISABLE = 256
 """Unknowns up to which `ExpRosenbrock` forms the matrix of A + Df."""
 
@@ -142,7 +146,9 @@ def choose(
     rates = _rates(problem, x0, args, facts) if _tree.is_concrete(span) else _UNKNOWN
     # The exponential of a matrix costs as much as many steps.
     matrices = _SLOPES_OF_MATRICES * (1.0 + (facts.state / 4) ** 3)
-    if rates.slope * span > (_SLOPES if facts.diagonal else matrices):
+    # Explicit steps follow each turn, the more of them the tighter the tolerance.
+    turns = matrices * min(1.0, (tol / _TURNS_TOL) ** 0.2) if tol > 0 else matrices
+    if rates.slope * span > (_SLOPES if facts.diagonal else matrices) or rates.turn * span > turns:
         return Choice(
             _EXPROSENBROCK,
             f"the constant slope of Ax + f̃ times the span is {rates.slope * span:.2g}",
@@ -242,13 +248,15 @@ def _is_linear(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) 
 
 
 class Rates(NamedTuple):
-    """How fast trajectories change: a bound on ‖A‖, and the `slope` of Ax + f̃, zero where unknown."""
+    """How fast trajectories change: a bound on ‖A‖, the spectral radius `slope` of Ax + f̃, and the
+    largest imaginary part `turn` of its eigenvalues, both zero where unknown."""
 
     norm: float
     slope: float
+    turn: float
 
 
-_UNKNOWN = Rates(0.0, 0.0)
+_UNKNOWN = Rates(0.0, 0.0, 0.0)
 
 _RATES: dict[Any, tuple[Any, Rates]] = {}
 """The rates of the latest problems, by the identity of the problem and of the arrays in its args, both
@@ -262,11 +270,13 @@ def _rates(problem: Problem, x0: Tree, args: Any, facts: Facts) -> Rates:
         return _RATES[key][1]
     kept, args = args, as_arrays(args)
     is_known = flat(problem).is_concrete and _tree.is_concrete(args)
-    slope = 0.0
+    values: list[complex] | None = []
     if is_known and facts.linear:
-        slope = largest_slope(problem, x0, args, facts)
-        is_known = slope is not None
-    rates = Rates(norm(problem.generator(args)), slope or 0.0)
+        values = _eigenvalues(problem, x0, args, facts)
+        is_known = values is not None
+    slope = max(map(abs, values or [0.0]))
+    turn = max(abs(v.imag) for v in values or [0.0])
+    rates = Rates(norm(problem.generator(args)), slope, turn)
     if is_known:
         if len(_RATES) >= _MAX_FACTS:
             _RATES.clear()
@@ -274,16 +284,15 @@ def _rates(problem: Problem, x0: Tree, args: Any, facts: Facts) -> Rates:
     return rates
 
 
-def largest_slope(problem: Problem, x0: Tree, args: Any, facts: Facts) -> float | None:
-    """Return the larger spectral radius of A + Df̃ for u ∈ h − 0 inside K, and for u held at the
-    boundary, where the derivatives of f and h are constant; None where their code closes over traced
-    values."""
+def _eigenvalues(problem: Problem, x0: Tree, args: Any, facts: Facts) -> list[complex] | None:
+    """Return the eigenvalues of A + Df̃ for u ∈ h − 0 inside K, and for u held at the boundary, where
+    the derivatives of f and h are constant; None where their code closes over traced values."""
     with jax.ensure_compile_time_eval():
-        radii = _radii(problem, x0, args, facts.diagonal)
-    return None if radii is None else max(map(float, radii))
+        found = _spectra(problem, x0, args, facts.diagonal)
+    return None if found is None else np.concatenate(found).astype(complex).tolist()
 
 
-def _radii(problem: Problem, x0: Tree, args: Any, diagonal: bool) -> list[Any] | None:
+def _spectra(problem: Problem, x0: Tree, args: Any, diagonal: bool) -> list[Any] | None:
     # Any state will do, and x0 may be traced.
     x0 = jtu.tree_map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), x0)
     t = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(x0)))
@@ -297,14 +306,12 @@ def _radii(problem: Problem, x0: Tree, args: Any, diagonal: bool) -> list[Any] |
     if diagonal:
         with np.errstate(divide="ignore", invalid="ignore"):
             free = fx + fu * hx / (1.0 - hu)
-        return [np.max(np.abs(v[np.isfinite(v)]), initial=0.0) for v in (fx, free)]
+        return [v[np.isfinite(v)] for v in (fx, free)]
     systems = [fx]
     system = np.eye(len(hu)) - hu
     if np.linalg.matrix_rank(system) == len(hu):
         systems.append(fx + fu @ np.linalg.solve(system, hx))
-    return [np.max(np.abs(np.linalg.eigvals(J))) for J in systems if np.all(np.isfinite(J))] or [
-        0.0
-    ]
+    return [np.linalg.eigvals(J) for J in systems if np.all(np.isfinite(J))] or [np.zeros(1)]
 
 
 @partial(jax.jit, static_argnums=1)
