@@ -14,7 +14,8 @@ from dvax.evolution import RESULTS
 def test_dense_output_saved_times_and_the_exact_solution_agree():
     case = c3()
     ts = np.array([0.0, 0.013, 0.5, 1.7, 2.999, 3.0, 3.4, 4.0])
-    common = dict(args=case.args, rtol=1e-5, atol=1e-5)
+    # (Order 2: its steps do not follow roundings, which differ between the two programs.)
+    common = dict(args=case.args, rtol=1e-5, atol=1e-5, method=dvax.ETD2RK())
     x0 = jnp.asarray(case.x0)
     saved = dvax.solve(case.problem, x0, 0.0, 4.0, ts=ts, **common)
     dense = dvax.solve(case.problem, x0, 0.0, 4.0, dense=True, max_steps=4096, **common)
