@@ -180,8 +180,8 @@ def _interpolatory(nodes: tuple[float, ...]) -> tuple[float, ...]:
 
 def _kinked(flow: Flow, evaluations: list[Evaluation]) -> Any:
     """Return whether the regime changes between two of the evaluations, as far as the switches of K and
-    the branches of f and h show; true if K has no switches. Of a flow that is pointwise, it is said for
-    each entry."""
+    the branches of f and h show; true if K has no switches. For a pointwise flow, return that of each
+    entry."""
     problem, args = flow.problem, flow.args
     known = [flow.switches_of(one.t, one.x, one.rate) for one in evaluations]
     if known[0] is None:

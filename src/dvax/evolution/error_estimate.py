@@ -10,6 +10,9 @@ B and no A for one that is explicit in A. On the negative axis 1 + ¼z is above 
 stable for z ≥ −8, where the methods are: no part of e is taken to decay faster than the error does. Be
 is a difference quotient, from an evaluation of f̃ next to x₀.
 
+The entries of ∫ δ are added with the signs of those of e: e turns less than the error does, and would
+cancel where the error adds up.
+
 Only a decay within one regime, by a step that is far from the limit of stability, counts
 (`ErrorTest` says what for): e is no bound.
 """

@@ -61,7 +61,7 @@ class Flow(eqx.Module):
     is guessed. `linear` is A + J where some J joins A in what is left to the propagator.
     With `keeps_switches`, `rate` also returns the switch functions of a law that is solved by
     iteration, so that they are compiled once with it and not wherever they are read. `pointwise` says
-    that x is one array, each entry of which alone acts on that entry of f̃, at a time.
+    that each entry of f̃ depends on t and on that entry of x alone.
     """
 
     problem: Problem
