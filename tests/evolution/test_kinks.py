@@ -1,6 +1,7 @@
 """Kinks of the response are located, steps end there, and no kind of contact ends a run."""
 
 import itertools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -246,9 +247,37 @@ def test_regimes_of_a_set_without_kinks_are_one():
     assert times.tolist() == [0.0, 2.0] and positive.shape == (1, 0)
 
 
-def test_regimes_require_dense_output_and_a_set_with_switches():
-    with pytest.raises(dvax.InputError, match="dense=True"):
-        dvax.solve(driven(jnp.sin), 0.0, 0.0, 2.0).regimes()
+@pytest.mark.parametrize("options", [
+    {"rtol": 1e-6}, {"dt": 0.05}, {"rtol": 1e-9, "method": dvax.ETD4RK(), "dt0": 0.01, "dt_max": 0.3},
+    {"rtol": 1e-4, "method": dvax.PiecewiseLinear()},
+    {"rtol": 1e-6, "constants": SimpleNamespace(gamma=1.0, L_F=1.0, norm_P_inv=1.0)},
+])  # fmt: skip
+def test_regimes_without_dense_are_those_with_it(options):
+    case = c1()
+    run = lambda **more: dvax.solve(  # noqa: E731
+        case.problem, jnp.asarray(case.x0), 0.0, 2.0, case.args, **options, **more
+    )
+    (times, positive), (expected, signs) = run().regimes(), run(dense=True).regimes()
+    np.testing.assert_allclose(times, expected, atol=1e-12)
+    assert positive.tolist() == signs.tolist() == [[True, False], [True, True], [False, True]]
+
+
+def test_regimes_follow_a_run_that_resets_its_state():
+    case = c1()
+    back = dvax.Event(lambda t, x, u, args: x - 1.0, reset=lambda t, x, u, args: -x, direction=1)
+    run = lambda **more: dvax.solve(  # noqa: E731
+        case.problem, jnp.asarray(case.x0), 0.0, 2.0, case.args, events=[back], **more
+    )
+    (times, positive), (expected, signs) = run().regimes(), run(dense=True).regimes()
+    np.testing.assert_allclose(times, expected, atol=1e-12)
+    assert len(times) > 4 and positive.tolist() == signs.tolist()
+
+
+def test_regimes_require_steps_outside_of_jit_and_a_set_with_switches():
+    with pytest.raises(dvax.InputError, match="implicit methods record no polynomials"):
+        dvax.solve(driven(jnp.sin), 0.0, 0.0, 2.0, method=dvax.Implicit()).regimes()
+    with pytest.raises(dvax.InputError, match="outside of jax.jit"):
+        jax.jit(lambda x: dvax.solve(driven(jnp.sin), x, 0.0, 2.0).regimes().times)(0.0)
     K, z = SETS["intersection, whose kinks are not known"]
     sol = dvax.solve(driven(z, K), np.zeros(2), 0.0, 0.1, dense=True, max_steps=1024)
     with pytest.raises(dvax.InputError, match="Intersection"):

@@ -134,6 +134,30 @@ def test_evaluate_outside_the_solved_interval_raises_an_error(t):
         sol.evaluate(t)
 
 
+@pytest.mark.parametrize("method", [dvax.ETD4RK(), dvax.PiecewiseLinear()])
+def test_evaluate_at_an_array_of_times_gives_a_row_for_each(method):
+    case = c1()
+    sol = dvax.solve(
+        case.problem,
+        jnp.asarray(case.x0),
+        0.0,
+        2.0,
+        case.args,
+        dense=True,
+        method=method,
+        rtol=1e-8,
+    )
+    times = np.linspace(0.0, 2.0, 6).reshape(2, 3)
+    x, u = sol.evaluate(times)
+    assert x.shape == (2, 3, *np.shape(case.x0)) and u.shape[:2] == (2, 3)
+    for index in np.ndindex(2, 3):
+        one, response = sol.evaluate(times[index])
+        np.testing.assert_allclose(x[index], one, atol=1e-14)
+        np.testing.assert_allclose(u[index], response, atol=1e-14)
+    with pytest.raises(dvax.InputError, match=r"t = 2.5.*\[0, 2\]"):
+        sol.evaluate([0.5, 2.5])
+
+
 def test_evaluate_without_dense_names_the_option():
     sol = dvax.solve(c1().problem, -1.0, 0.0, 2.0, args=c1().args)
     with pytest.raises(dvax.InputError, match="dense=True"):

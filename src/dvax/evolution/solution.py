@@ -148,7 +148,8 @@ class Solution(eqx.Module):
         return plan.flow(self.setup)
 
     def evaluate(self, t: Any) -> tuple[Tree, Tree]:
-        """Return (x(t), u(t)) at any time of a solve with `dense=True`.
+        """Return (x(t), u(t)) at any time of a solve with `dense=True`, or at each time of an array,
+        whose axes then come first in x and u.
 
         x is the dense output of the step, exact in A; u is the solution of the law at (t, x).
 
@@ -163,9 +164,22 @@ class Solution(eqx.Module):
                     "Solve with dense=True, or list the times in ts=",
                 )
             )
+        self._check_inside(t)
+        if not jnp.ndim(t):
+            return self._at(t)
+        times = jnp.ravel(jnp.asarray(t, self.ts.dtype))
+        if isinstance(self.records, Trajectory):
+            each = [self._at(t) for t in np.asarray(times)]
+            rows = jax.tree_util.tree_map(lambda *leaves: jnp.stack(leaves), *each)
+        else:
+            rows = jax.vmap(self._at)(times)
+        axes = jnp.shape(t)
+        return jax.tree_util.tree_map(lambda leaf: leaf.reshape(axes + leaf.shape[1:]), rows)
+
+    def _at(self, t: Any) -> tuple[Tree, Tree]:
+        """Return x and u at one time."""
         if isinstance(self.records, Trajectory):
             records = self.records
-            self._check_inside(t, records.start[0], records.end)
             x, y = records.evaluate(t)
             x0, u0 = self.setup.x0, self.us[0]
             u = self.flow.operator.inverse(y.reshape(u0.shape).astype(u0.dtype))
@@ -185,12 +199,8 @@ class Solution(eqx.Module):
         flow, records = self.flow, self.records
         assert isinstance(records, Record)
         t = jnp.asarray(t, records.start.dtype)
-        starts = records.start
-        first, last = starts[0], jnp.max(jnp.where(jnp.isfinite(starts), starts, -jnp.inf))
-        i = jnp.clip(jnp.searchsorted(starts, t, side="right") - 1, 0)
+        i = jnp.clip(jnp.searchsorted(records.start, t, side="right") - 1, 0)
         step = jax.tree_util.tree_map(lambda leaf: leaf[i], records)
-        end = last + records.length[jnp.searchsorted(starts, last)]
-        self._check_inside(t, first, end)
         theta = (t - step.start) / step.length
         run = self.setup.number("t0"), self.setup.number("t1")
         method = self.setup.method
@@ -203,28 +213,42 @@ class Solution(eqx.Module):
         rate = flow.rate(t, x, None)
         return x, flow.operator.inverse(rate.y)
 
-    def _check_inside(self, t: Any, first: Any, end: Any) -> None:
-        if _tree.is_concrete(t, first, end) and not first <= t <= end:
+    def _check_inside(self, t: Any) -> None:
+        records = self.records
+        assert records is not None
+        if not _tree.is_concrete(t, records.start):
+            return
+        starts, times = np.asarray(records.start), np.asarray(t)
+        last = int(np.isfinite(starts).sum()) - 1
+        first = starts[0]
+        end = (
+            records.end if isinstance(records, Trajectory) else starts[last] + records.length[last]
+        )
+        outside = times[~((first <= times) & (times <= end))]
+        if outside.size:
             raise InputError(
                 InputProblem(
                     "Solution.evaluate",
-                    f"t = {float(t):g}",
+                    f"t = {float(outside.flat[0]):g}",
                     f"t must lie in [{float(first):g}, {float(end):g}], which the solve covers",
                     "Solve on a longer interval, or choose a time inside",
                 )
             )
 
     def regimes(self) -> Regimes:
-        """Return the times at which active constraints change, and the active constraints between them,
-        for a solve with `dense=True`.
+        """Return the times at which active constraints change, and the active constraints between them.
 
-        **Raises:** `dvax.InputError` if the steps were not recorded, or if K has no switch functions.
+        They are located on the steps of a solve with `dense=True`; without it the run is made once more
+        with it.
+
+        **Raises:** `dvax.InputError` if the run took no steps, if its method records none
+        (`dvax.Implicit`), if it is part of a compiled program, or if K has no switch functions.
 
         ```python
         >>> import dvax
         >>> model = dvax.models.Contact(alpha=1.0, beta=1.0, b_x=2.0, b_u=1.0, d_x=0.5, d_u=1.0,
         ...                             kappa0=0.5, g=1.0, ell=3.0)
-        >>> sol = dvax.solve(model.problem, -1.0, 0.0, 2.0, rtol=1e-8, dense=True, max_steps=20_000)
+        >>> sol = dvax.solve(model.problem, -1.0, 0.0, 2.0, rtol=1e-8)
         >>> times, positive = sol.regimes()
         >>> [f"{t:.6f}" for t in times]                        # held above, free, held at 0
         ['0.000000', '0.313336', '0.524057', '2.000000']
@@ -233,15 +257,21 @@ class Solution(eqx.Module):
 
         ```
         """
-        if self.records is None or int(self.stats["steps"]) == 0:
+        if not _tree.is_concrete(self.ts, self.xs, self.setup.setting):
             raise InputError(
                 InputProblem(
-                    "Solution.regimes",
-                    "a solution without records" if self.records is None else "a run without steps",
-                    "the changes are located on the recorded steps",
-                    "Solve with dense=True",
+                    "Solution.regimes", "a solution inside a compiled program",
+                    "their number, and with it the shape of the result, depends on values",
+                    "Call it outside of jax.jit, jax.vmap and jax.grad",
                 )
-            )
+            )  # fmt: skip
+        if int(self.stats["steps"]) == 0:
+            raise InputError(
+                InputProblem(
+                    "Solution.regimes", "a run without steps", "the changes are located on its steps",
+                    "Look at why the run failed: its result and stats",
+                )
+            )  # fmt: skip
         if isinstance(self.records, Trajectory):
             return Regimes(*signs(self.records))
         flow = self.flow
@@ -255,6 +285,11 @@ class Solution(eqx.Module):
                     "Write K as a set that has them, such as dvax.sets.Polyhedron",
                 )
             )
+        if self.records is None:
+            # Here, since this module is below `solve`.
+            from .recorded import recorded
+
+            return recorded(self).regimes()
         assert not isinstance(self.setup.method, Implicit | PiecewiseLinear)
         return regimes(flow, self.setup.method, self.records, int(self.stats["steps"]))
 

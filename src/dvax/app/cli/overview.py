@@ -49,8 +49,8 @@ def _of_application(config: "ModelConfig") -> Overview:
     known = config.model.describe()
     files = [("data", f.name, f"sha256 {f.sha256[:16]}…") for f in config.fingerprints()]
     rows = constant_rows(known.constants)
-    fit = config.model.fit
-    return Overview(fit, rows, known.assumptions, [], [*known.sizes, *files], known.notes)
+    sizes = [*known.sizes, steps_of_application(config.model.settings), *files]
+    return Overview(config.model.fit, rows, known.assumptions, [], sizes, known.notes)
 
 
 def _of_contact(config: "Config") -> Overview:
@@ -118,6 +118,19 @@ def _steps(config: "Config") -> tuple[str, str]:
         least = -(-config.time.end // solver.dt)
         return f"at least {least:.0f}", f"{solver.method}, fixed, no longer than {solver.dt:g}"
     return "adaptive", f"{solver.method}, rtol {solver.rtol:g}, atol {solver.atol:g}"
+
+
+def steps_of_application(settings: Mapping[str, Any]) -> Row:
+    """The row of the steps of an application with these settings, the method named."""
+    method = settings.get("method")
+    # `dvax.solve` takes this one where steps are given.
+    name = "ETD2RK" if method is None else type(method).__name__
+    if settings.get("dt") is not None:
+        return ("steps", f"fixed, no longer than {settings['dt']:g}", name)
+    if name == "PiecewiseLinear":
+        return ("steps", "from kink to kink, each solved exactly", name)
+    tolerances = [f"{key} {settings[key]:g}" for key in ("rtol", "atol") if key in settings]
+    return ("steps", "adaptive", ", ".join([name, *tolerances]))
 
 
 def _bytes(count: float) -> str:

@@ -54,7 +54,8 @@ class Description(NamedTuple):
 @dataclass(frozen=True)
 class Plan:
     """What a run integrates: the problem from x0 at the first of `times` up to the last, saved at all
-    of them, with these `settings` for `dvax.solve`. `data` is the application's own."""
+    of them, with these `settings` (`AbstractApplication.settings`). `data` is the application's
+    own."""
 
     problem: Problem
     x0: Any
@@ -110,6 +111,11 @@ class AbstractApplication(abc.ABC):
     @abc.abstractmethod
     def fit(self) -> str:
         """Whether the model is in the class: "exact", by what it is regularised, or why it is not."""
+
+    @property
+    @abc.abstractmethod
+    def settings(self) -> Mapping[str, Any]:
+        """The method, steps and tolerances: keywords for `dvax.solve`."""
 
     @abc.abstractmethod
     def describe(self) -> Description:

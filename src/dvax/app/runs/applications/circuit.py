@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -56,6 +56,12 @@ class CircuitApplication(AbstractApplication):
     def fit(self) -> str:
         return self.circuit.fit
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        # As `dvax.models.Circuit.solve` has them.
+        method = PiecewiseLinear() if event_driven(self.table) else ExpRosenbrock()
+        return settings(self.table, method=method, rtol=1e-8, atol=1e-9)
+
     def describe(self) -> Description:
         c = self.circuit
         sizes = [
@@ -69,10 +75,7 @@ class CircuitApplication(AbstractApplication):
         c, table = self.circuit, self.table
         say(f"solving from 0 to {table.t_end:g} s")
         times = np.linspace(0.0, table.t_end, table.frames + 1)
-        # As `dvax.models.Circuit.solve` has them.
-        method = PiecewiseLinear() if event_driven(table) else ExpRosenbrock()
-        options = settings(table, method=method, rtol=1e-8, atol=1e-9)
-        return Plan(c.problem, c.x0, times, c.constants, options, None, "s")
+        return Plan(c.problem, c.x0, times, c.constants, self.settings, None, "s")
 
     def results(self, plan: Plan, solution: Solution, count: int) -> Results:
         c, times = self.circuit, np.asarray(solution.ts)[:count]

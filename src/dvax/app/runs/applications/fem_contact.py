@@ -119,14 +119,17 @@ class FemContactApplication(AbstractApplication):
         ]
         return Description(self.contact.constants, (), sizes, _notes(self))
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        return settings(self.table, method=self.contact.method, rtol=1e-7, atol=1e-11)
+
     def plan(self, say: Say) -> Plan:
         m, table = self.contact, self.table
         say("solving at rest")
         rest = m.equilibrium()
         times = np.linspace(0.0, table.end, table.frames + 1)
         say(f"solving from 0 to {table.end:g}")
-        options = settings(table, method=m.method, rtol=1e-7, atol=1e-11)
-        return Plan(m.problem, m.untouched, times, m.constants, options, rest)
+        return Plan(m.problem, m.untouched, times, m.constants, self.settings, rest)
 
     def results(self, plan: Plan, solution: Solution, count: int) -> Results:
         m, rest, times = self.contact, plan.data, np.asarray(solution.ts)[:count]

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -87,13 +87,16 @@ class FrameApplication(AbstractApplication):
             )
         return Description(self.frame.constants, (), sizes, notes)
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        method = PiecewiseLinear() if event_driven(self.table) else ExpRosenbrock()
+        return settings(self.table, method=method, rtol=1e-8)
+
     def plan(self, say: Say) -> Plan:
         frame = self.frame
         say("solving over the record")
-        method = PiecewiseLinear() if event_driven(self.table) else ExpRosenbrock()
-        options = settings(self.table, method=method, rtol=1e-8)
         return Plan(
-            frame.problem, jnp.zeros(3), frame.times, frame.constants, options, None, "s"
+            frame.problem, jnp.zeros(3), frame.times, frame.constants, self.settings, None, "s"
         )  # fmt: skip
 
     def results(self, plan: Plan, solution: Solution, count: int) -> Results:

@@ -85,6 +85,13 @@ class MarketApplication(AbstractApplication):
         ]
         return Description(self.market.constants, (), sizes)
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        solver = self.market.law_solver
+        return settings(
+            self.table, method=ExpRosenbrock(), rtol=1e-8, atol=1e-8, vi_solver=solver
+        )  # fmt: skip
+
     def plan(self, say: Say) -> Plan:
         market, times = self.market, self.times
         say("solving for the prices at rest")
@@ -92,10 +99,7 @@ class MarketApplication(AbstractApplication):
         rest = np.asarray(prices), np.asarray(made)
         if len(times) > 1:
             say("solving for the sticky price")
-        options = settings(
-            self.table, method=ExpRosenbrock(), rtol=1e-8, atol=1e-8, vi_solver=market.law_solver
-        )
-        return Plan(market.problem, prices[0], times, market.constants, options, rest, "h")
+        return Plan(market.problem, prices[0], times, market.constants, self.settings, rest, "h")
 
     def results(self, plan: Plan, solution: Solution | None, count: int) -> Results:
         market, times = self.market, np.asarray(plan.times)[:count]

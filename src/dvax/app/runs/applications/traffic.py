@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -130,14 +130,17 @@ class TrafficApplication(AbstractApplication):
         ]
         return Description(t.constants, (), sizes, _notes(table))
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        step = min(_DEFAULT_STEP, self.table.days)
+        return settings(self.table, dt=step, vi_solver=self.traffic.vi_solver)
+
     def plan(self, say: Say) -> Plan:
         t, table = self.traffic, self.table
         whole = np.arange(0.0, np.floor(table.days) + 0.5)
         days = whole if whole[-1] == table.days else np.append(whole, table.days)
         say(f"solving {table.days:g} days")
-        step = min(_DEFAULT_STEP, table.days)
-        options = settings(table, dt=step, vi_solver=t.vi_solver)
-        return Plan(t.problem, t.all_or_nothing(), days, t.constants, options, None, "days")
+        return Plan(t.problem, t.all_or_nothing(), days, t.constants, self.settings, None, "days")
 
     def results(self, plan: Plan, solution: Solution, count: int) -> Results:
         t, days = self.traffic, np.asarray(solution.ts)[:count]
