@@ -53,6 +53,7 @@ def cases(full: bool) -> list[Case]:
     found += [_chain(n) for n in (5, 40)]
     found += [_shares(n) for n in (4, 12)]
     found += [_creep(eta) for eta in (1.0, 1e-2, 1e-4)]
+    found += [_manufactured(A, K) for A in _MATRICES for K in _SETS]
     return found + [_strip(n) for n in ((100, 1000, 100_000) if full else (100,))]
 
 
@@ -257,3 +258,95 @@ def _strip(n: int) -> Case:
         f"strip of {n} points", problem, x0, 2.0,
         lambda t, x, lib: load - 1.5 * x - lib.clip(gap - x, 0.0, 0.5), x,
     )  # fmt: skip
+
+
+_MATRICES: dict[str, tuple[Any, np.ndarray]] = {
+    "A = 0": (generators.Zero(), np.zeros((3, 3))),
+    "rates up to 2000": (
+        generators.Diagonal(jnp.array([-0.5, -40.0, -2e3])), np.diag([-0.5, -40.0, -2e3]),
+    ),
+    "A far from normal": (
+        generators.Dense(jnp.array([[-1.0, 30.0, 0.0], [0.0, -1.3, 5.0], [0.0, 0.0, -2.0]])),
+        np.array([[-1.0, 30.0, 0.0], [0.0, -1.3, 5.0], [0.0, 0.0, -2.0]]),
+    ),
+    "a rotation at the rate 10": (
+        generators.Dense(jnp.array([[0.0, 10.0, 0.0], [-10.0, 0.0, 0.0], [0.0, 0.0, -1.0]])),
+        np.array([[0.0, 10.0, 0.0], [-10.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+    ),
+}  # fmt: skip
+"""Generators of the manufactured problems, with their matrices."""
+
+
+def _on_ball(t: Any, v: Any, lib: Any) -> Any:
+    """The projection on the ball around 0.1 t of radius 1 − 0.2 t."""
+    away = v - 0.1 * t
+    length = lib.sqrt(lib.sum(away**2) + 1e-300)
+    return 0.1 * t + away * lib.minimum(1.0, (1.0 - 0.2 * t) / length)
+
+
+def _on_simplex(t: Any, v: Any, lib: Any) -> Any:
+    """The projection on the simplex of total 1 + 0.3 cos t, by sorting (Held, Wolfe and Crowder
+    1974)."""
+    down = -lib.sort(-v)
+    level = (lib.cumsum(down) - 1.0 - 0.3 * lib.cos(t)) / lib.arange(1.0, 4.0)
+    return lib.maximum(v - lib.max(level), 0.0)
+
+
+def _on_half_space(t: Any, v: Any, lib: Any) -> Any:
+    """The projection on y₁ + 2y₂ + 3y₃ ≤ 0.3 t."""
+    normal = lib.arange(1.0, 4.0)
+    return v - lib.maximum(lib.sum(normal * v) - 0.3 * t, 0.0) * normal / 14.0
+
+
+_SETS: dict[str, tuple[Any, Callable[..., Any]]] = {
+    "box": (
+        lambda t: sets.Box(-0.5 * jnp.exp(-t), 0.6 + 0.1 * jnp.sin(t)),
+        lambda t, v, lib: lib.clip(v, -0.5 * lib.exp(-t), 0.6 + 0.1 * lib.sin(t)),
+    ),
+    "ball": (lambda t: sets.Ball(jnp.full(3, 0.1) * t, 1.0 - 0.2 * t), _on_ball),
+    "simplex": (lambda t: sets.Simplex(1.0 + 0.3 * jnp.cos(t)), _on_simplex),
+    "half-space": (lambda t: sets.HalfSpace(jnp.arange(1.0, 4.0), 0.3 * t), _on_half_space),
+}
+"""Sets that move, with their projections by hand."""
+
+
+def _manufactured(generator: str, kind: str) -> Case:
+    """x* is a smooth curve and y* the projection of another one on K(t), so that the constraints change
+    again and again; P = 0.7, u* = y*/0.7, ξ* = z* − y* ∈ N_K(y*), and
+
+        f = x*′ − Ax* + F_x (x − x*) + F_u (u − u*),   h = H_x (x − x*) − ½(u − u*) + u* + ξ*,
+
+    so that y = proj_K(0.7 (H_x (x − x*) + 1.5 u* + ξ*)/1.5) by hand."""
+    A, matrix = _MATRICES[generator]
+    K, project = _SETS[kind]
+    rng, pace, end = np.random.default_rng(7), np.arange(1.0, 4.0) / 3.0, 3.0
+    F_x, F_u, H_x = (size * rng.normal(size=(3, 3)) / np.sqrt(3.0) for size in (0.4, 0.8, 0.8))
+    # What A multiplies by much is small in x*, as in a smooth field.
+    size = 1.0 / np.maximum(1.0, 0.1 * np.max(np.abs(matrix), axis=1) ** 0.9)
+
+    def curves(t: Any, lib: Any) -> tuple[Any, Any, Any, Any]:
+        """x*, x*′, u* and ξ*."""
+        z = 1.2 * lib.sin(2.5 * t + 1.3 * lib.arange(3.0)) + 0.2
+        y = project(t, z, lib)
+        angle = pace * t + pace
+        return size * lib.sin(angle), size * pace * lib.cos(angle), y / 0.7, z - y
+
+    def f(t: Any, x: Any, u: Any, args: Any) -> Any:
+        at, rate, u_star, _ = curves(t, jnp)
+        return rate - matrix @ at + F_x @ (x - at) + F_u @ (u - u_star)
+
+    def h(t: Any, x: Any, u: Any, args: Any) -> Any:
+        at, _, u_star, outward = curves(t, jnp)
+        return H_x @ (x - at) - 0.5 * (u - u_star) + u_star + outward
+
+    def field(t: Any, x: Any, lib: Any) -> Any:
+        at, rate, u_star, outward = curves(t, lib)
+        u = project(t, 0.7 * (H_x @ (x - at) + 1.5 * u_star + outward) / 1.5, lib) / 0.7
+        return matrix @ (x - at) + rate + F_x @ (x - at) + F_u @ (u - u_star)
+
+    problem = dvax.Problem(
+        A=A, P=dvax.operators.Scaling(0.7), K=lambda t, args: K(t), f=f, h=h,
+        control_space=dvax.spaces.Euclidean(3),
+    )  # fmt: skip
+    x0, exact = (np.asarray(curves(t, np)[0]) for t in (0.0, end))
+    return Case(f"manufactured, {generator}, {kind}", problem, x0, end, field, exact)

@@ -36,6 +36,7 @@ FLOORS = {
     "_knots": 1.5,
     "problem": 2,
     "evolution": 3,
+    "ensembles": 3.5,
     "theory": 4,
     "sensitivity": 4,
     "models": 5,

@@ -29,6 +29,7 @@ CASES = (
     "applications",
     "stiffness",
     "picard",
+    "ensemble",
 )
 """The names that --only takes, in the order of a run."""
 

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from . import signals as signals
     from . import spaces as spaces
     from . import vi as vi
+    from .ensembles import Ensemble as Ensemble
+    from .ensembles import Fold as Fold
+    from .ensembles import ensemble as ensemble
     from .errors import DifferentiationError as DifferentiationError
     from .errors import DvaxError as DvaxError
     from .errors import InputError as InputError
@@ -63,6 +66,7 @@ _MODULES = (
     "vi",
 )
 _HOMES = {
+    "ensembles": ("Ensemble", "Fold", "ensemble"),
     "errors": ("DifferentiationError", "DvaxError", "InputError", "SolveError"),
     "evolution": (
         "ETD1",

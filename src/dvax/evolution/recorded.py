@@ -2,7 +2,7 @@
 
 import math
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,7 +29,7 @@ def recorded(solution: "Solution") -> "Solution":
     tolerances = {name: number[name] for name in ("rtol", "atol")}
     if math.isnan(number["dt"]):
         attempts = sum(int(solution.stats[name]) for name in ("steps", "rejected"))
-        steps = tolerances | {
+        steps: dict[str, Any] = tolerances | {
             "dt0": None if has_default_dt0 else number["dt0"],
             "dt_max": number["dt_max"] if math.isfinite(number["dt_max"]) else None,
             "max_steps": max(ADAPTIVE_STEPS, attempts),

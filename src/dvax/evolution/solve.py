@@ -174,39 +174,16 @@ def solve(
     if not fixed:
         warn_precision(x0, rtol)
     t0, t1 = _number(t0), _number(t1)
-    span = t1 - t0
-    dtype = _tree.dtype(x0)
-    setting = {
-        "t0": t0,
-        "t1": t1,
-        "dt": math.nan if dt is None else _number(dt),
-        "rtol": _number(rtol),
-        "atol": _number(atol),
-        "dt0": first_step(span, t0, t1, dtype) if dt0 is None else _number(dt0),
-        "dt0_growth": FIRST_GROWTH if dt0 is None else MAX_GROWTH,
-        "dt_max": math.inf if dt_max is None else _number(dt_max),
-        "horizon": span if horizon is None else _number(horizon),
-        "stiff_steps": math.inf,
-    }
     choice = Choice(method)
     if method is None:
         tol = max(rtol, atol) if _tree.is_concrete(rtol, atol) else math.nan
-        choice = choose(problem, x0, args, span, float(tol), fixed, constants is not None)
-        method = choice.method
-    measured = not isinstance(method, Implicit) and (bool(measure) or not fixed)
-    options = Options(
-        fixed=fixed,
-        measure=measured,
-        track_bounds=measured and of_region(constants),
-        check_finite=not fixed,
-        dense=dense,
-        max_steps=bound_steps(max_steps, fixed, t0, t1, dt),
-        adjoint=adjoint,
-        progress=progress,
-        max_events=max_events if events else 0,
-    )
-    vi_solver = _VI_SOLVER if vi_solver is None else vi_solver
-    setup = Setup(problem, x0, args, setting, method, vi_solver, _moduli(constants), tuple(events))
+        choice = choose(problem, x0, args, t1 - t0, float(tol), fixed, constants is not None)
+    setup, options = arranged(
+        problem, x0, t0, t1, args, dt, rtol, atol, choice.method, vi_solver, progress, constants,
+        measure, dense, dt0, dt_max, horizon, bound_steps(max_steps, fixed, t0, t1, dt), adjoint,
+        events, max_events,
+    )  # fmt: skip
+    method = choice.method
     times = None if ts is None else _times(ts)
     if isinstance(method, PiecewiseLinear):
         solution = propagate(
@@ -242,6 +219,60 @@ def solve(
                 raise failure(ended)
             return solution if traced else ended
     return solution
+
+
+def arranged(
+    problem: Problem,
+    x0: Tree,
+    t0: Any,
+    t1: Any,
+    args: Any,
+    dt: Any,
+    rtol: Any,
+    atol: Any,
+    method: Any,
+    vi_solver: AbstractSolver | None,
+    progress: bool,
+    constants: Any,
+    measure: bool | None,
+    dense: bool,
+    dt0: Any,
+    dt_max: Any,
+    horizon: Any,
+    max_steps: int,
+    adjoint: str,
+    events: Sequence[Event],
+    max_events: int,
+) -> tuple[Setup, Options]:
+    """Return the setup and the options of a run from the arguments of `solve`, which are checked."""
+    fixed, span = dt is not None, t1 - t0
+    setting = {
+        "t0": t0,
+        "t1": t1,
+        "dt": math.nan if dt is None else _number(dt),
+        "rtol": _number(rtol),
+        "atol": _number(atol),
+        "dt0": first_step(span, t0, t1, _tree.dtype(x0)) if dt0 is None else _number(dt0),
+        "dt0_growth": FIRST_GROWTH if dt0 is None else MAX_GROWTH,
+        "dt_max": math.inf if dt_max is None else _number(dt_max),
+        "horizon": span if horizon is None else _number(horizon),
+        "stiff_steps": math.inf,
+    }
+    measured = not isinstance(method, Implicit) and (bool(measure) or not fixed)
+    options = Options(
+        fixed=fixed,
+        measure=measured,
+        track_bounds=measured and of_region(constants),
+        check_finite=not fixed,
+        dense=dense,
+        max_steps=max_steps,
+        adjoint=adjoint,
+        progress=progress,
+        max_events=max_events if events else 0,
+    )
+    solver = _VI_SOLVER if vi_solver is None else vi_solver
+    setup = Setup(problem, x0, args, setting, method, solver, _moduli(constants), tuple(events))
+    return setup, options
 
 
 def _examined(setup: Setup, times: Any, options: Options, solution: Solution) -> Solution:

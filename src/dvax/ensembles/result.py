@@ -1,0 +1,127 @@
+"""The result of `dvax.ensemble`."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax.tree_util as jtu
+import numpy as np
+
+from .. import _tree
+from .._tree import Tree
+from ..errors import InputError, InputProblem
+from ..evolution import RESULTS, Solution
+from .moments import Moments
+
+
+class Fold(NamedTuple):
+    """A reduction over the members that succeeded, in their order: carry = add(carry, value), from
+    `start`; `value` is what a member's `observe=` returns. `add` is a JAX function.
+
+    ```python
+    >>> import jax.numpy as jnp
+    >>> import dvax
+    >>> largest = dvax.Fold(-jnp.inf, lambda carry, x: jnp.maximum(carry, jnp.max(x)))
+
+    ```
+    """
+
+    start: Tree
+    add: Callable[[Tree, Tree], Tree]
+
+
+@dataclasses.dataclass(frozen=True)
+class Ensemble:
+    """The members of `dvax.ensemble`, of which some may have failed.
+
+    - `values`: what `observe=` returned, a leading axis counting the members; NaN where a member failed
+      before it was reached, None with `keep=False`;
+    - `failed`: for each member, whether it failed; `results`: its `dvax.RESULTS`, with a leading axis;
+      `ts`: the time that it reached;
+    - `steps`, `rejected`: its numbers of accepted and rejected steps; `switched`: whether another
+      method went on where stability or rounding limited the steps of the first; `method`: their names,
+      with the reason where dvax chose;
+    - `moments`: count, mean and squares of the members that succeeded (`dvax.ensembles.Moments`);
+    - `folded`: the results of `folds=`, by name.
+    """
+
+    values: Tree | None
+    failed: Any
+    results: Any
+    ts: Any
+    steps: Any
+    rejected: Any
+    switched: Any
+    method: str
+    moments: Moments
+    folded: Mapping[str, Tree]
+    again: Callable[[int], Solution] | None = dataclasses.field(repr=False, default=None)
+
+    def __len__(self) -> int:
+        return len(self.failed)
+
+    @property
+    def mean(self) -> Tree:
+        """The mean of the members that succeeded."""
+        return self.moments.mean
+
+    @property
+    def std(self) -> Tree:
+        """Their standard deviation, with count − 1 in the denominator."""
+        return self.moments.standard_deviation()
+
+    def quantile(self, q: Any) -> Tree:
+        """Return the quantiles q in [0, 1] of the members that succeeded; for a list of them, with a
+        leading axis.
+
+        **Raises:** `dvax.InputError` if the values were not kept.
+        """
+        if self.values is None:
+            raise InputError(
+                InputProblem(
+                    "Ensemble.quantile", "an ensemble with keep=False",
+                    "quantiles are computed from the values of all members",
+                    "Observe little, such as observe=lambda sol: sol.xs[-1], and keep it",
+                )
+            )  # fmt: skip
+        xp = _tree.array_module(self.values, self.failed)
+        if xp is np:
+            valid = ~self.failed
+            return jtu.tree_map(lambda leaf: np.quantile(leaf[valid], q, axis=0), self.values)
+
+        def quantile(leaf: Any) -> Any:
+            away = self.failed.reshape(-1, *(1,) * (leaf.ndim - 1))
+            return xp.nanquantile(xp.where(away, xp.nan, leaf), xp.asarray(q), axis=0)
+
+        return jtu.tree_map(quantile, self.values)
+
+    def failures(self) -> dict[int, str]:
+        """Return the result of each failed member, in a sentence, by its number."""
+        each = lambda k: jtu.tree_map(lambda leaf: leaf[k], self.results)  # noqa: E731
+        return {
+            int(k): f"{RESULTS[each(k)]} Stopped at t = {float(self.ts[k]):.10g} after "
+            f"{int(self.steps[k])} steps."
+            for k in np.flatnonzero(np.asarray(self.failed))
+        }
+
+    def member(self, k: int) -> Solution:
+        """Solve member k alone.
+
+        **Raises:** `dvax.SolveError` with the cause, if it fails; `dvax.InputError` if the ensemble is
+        part of a compiled program.
+        """
+        if self.again is None:
+            raise InputError(
+                InputProblem(
+                    "Ensemble.member", "an ensemble inside a compiled program",
+                    "its inputs have no values", "Call it outside of jax.jit and jax.grad",
+                )
+            )  # fmt: skip
+        return self.again(k)
+
+
+jtu.register_dataclass(
+    Ensemble,
+    [f.name for f in dataclasses.fields(Ensemble) if f.name not in ("method", "again")],
+    ["method", "again"],
+)
