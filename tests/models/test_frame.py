@@ -203,7 +203,8 @@ def test_response_spectrum_equals_single_frames():
     for k in np.ndindex(2, 2, 3):
         period, damping, limit = T[k[2]], z[k[1], 0], found.yield_displacement[k]
         exact = peak_of(viscoplastic(period, damping, limit, tau), GROUND)
-        assert found.peak[k] == pytest.approx(exact, rel=1e-6)
+        # Well below rtol, 1e-4 by default.
+        assert found.peak[k] == pytest.approx(exact, rel=1e-5)
         frame = Frame(record=RECORD, period=period, damping=damping)
         assert found.elastic[k] == pytest.approx(frame.figures()["largest_displacement"], rel=1e-6)
 
@@ -330,7 +331,7 @@ def test_response_spectrum_of_ten_thousand_frames(el_centro):
     found = response_spectrum(record, T, z, ratio, 0.01)
     assert found.peak.shape == (50, 5, 40)
     # With all of its elastic strength a frame does not yield.
-    np.testing.assert_allclose(found.peak[..., -1], found.elastic[..., -1], rtol=1e-7)
+    np.testing.assert_allclose(found.peak[..., -1], found.elastic[..., -1], rtol=1e-6)
     rng = np.random.default_rng(0)
     for _ in range(6):
         k = tuple(rng.integers(found.peak.shape))

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .frame import Frame as Frame
     from .frame import response_spectrum as response_spectrum
     from .market import Market as Market
+    from .model import Model as Model
     from .mpc import LinearMPC as LinearMPC
     from .thermostat import Thermostat as Thermostat
     from .traffic import Incident as Incident
@@ -33,6 +34,7 @@ _HOMES = {
     "fem_contact": ("ElasticBody", "FemContact"),
     "frame": ("Accelerogram", "Frame", "response_spectrum"),
     "market": ("Market",),
+    "model": ("Model",),
     "mpc": ("LinearMPC",),
     "thermostat": ("Thermostat",),
     "traffic": ("Incident", "Network", "Traffic", "Trips"),

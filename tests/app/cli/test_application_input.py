@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import dvax
 from dvax.app.cli.program import app
-from dvax.app.runs.applications.circuit import CircuitApplication
+from dvax.app.runs.applications.models.circuit import CircuitApplication
 
 CIRCUIT = '[model]\nname = "circuit"\nnetlist = "a.cir"\nt_end = "5 ms"\n'
 FRAME = '[model]\nname = "frame"\nrecord = "a.at2"\nperiod = 0.5\ndamping = 0.05\n'

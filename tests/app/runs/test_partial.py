@@ -17,8 +17,8 @@ import dvax
 from dvax.app.plots import build_report
 from dvax.app.runs.applications.base import Plan
 from dvax.app.runs.applications.certificate import certificate
-from dvax.app.runs.applications.circuit import CircuitApplication
 from dvax.app.runs.applications.config import read_config
+from dvax.app.runs.applications.models.circuit import CircuitApplication
 from dvax.app.runs.applications.segments import join_pieces, segments
 from dvax.app.runs.driver import run
 from dvax.app.runs.interrupt import Terminated, interruptible
@@ -180,7 +180,7 @@ FOREVER = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
 import jax
-from dvax.app.runs.applications.circuit import CircuitApplication
+from dvax.app.runs.applications.models.circuit import CircuitApplication
 
 def endless(self, *given):
     print("endless", file=sys.stderr, flush=True)

@@ -9,7 +9,7 @@ from dvax._figure_text import NOT_FINITE
 from dvax.app.cli.console import print_error, print_line, print_remark, print_table
 from dvax.app.cli.failure import OUT_OF_CLASS, reported
 from dvax.app.cli.load import load
-from dvax.app.cli.options import AllowOutside, ConfigFile, Debug
+from dvax.app.cli.options import AllowCode, AllowOutside, ConfigFile, Debug
 from dvax.app.cli.overview import outside_the_class, overview
 
 
@@ -20,13 +20,14 @@ def check(
         typer.Option("--strict", help="Exit with 4 where the system is outside the class."),
     ] = False,
     allow_outside: AllowOutside = False,
+    allow_code: AllowCode = False,
     debug: Debug = False,
 ) -> None:
     """Check CONFIG.toml and its data: constants, assumptions, sizes. Nothing is written."""
     with reported(debug):
         from dvax.app.runs.interrupt import interruptible
 
-        loaded = interruptible(lambda: load(config, allow_outside))
+        loaded = interruptible(lambda: load(config, allow_outside, allow_code=allow_code))
         found = interruptible(lambda: overview(loaded))
         print_line(f"{loaded.source}: no problem in the configuration and its data", "bold")
         if found.fit:

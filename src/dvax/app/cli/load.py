@@ -18,7 +18,9 @@ def enable_double() -> None:
     jax.config.update("jax_enable_x64", True)
 
 
-def load(file: Path, allow_outside: bool, quiet: bool = False) -> "Config | ModelConfig":
+def load(
+    file: Path, allow_outside: bool, quiet: bool = False, allow_code: bool = False
+) -> "Config | ModelConfig":
     """Import JAX and read `file`. Takes seconds: call it by `interruptible`.
 
     **Raises:** `dvax.InputError`.
@@ -27,4 +29,4 @@ def load(file: Path, allow_outside: bool, quiet: bool = False) -> "Config | Mode
     enable_compilation_cache()
     from dvax.app.runs.applications.config import read_config
 
-    return read_config(file, allow_outside=allow_outside, quiet=quiet)
+    return read_config(file, allow_outside=allow_outside, quiet=quiet, allow_code=allow_code)

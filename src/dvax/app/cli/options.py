@@ -11,6 +11,10 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but warn
 ConfigFile = Annotated[
     Path, typer.Argument(metavar="CONFIG.toml", help="The configuration of the run.")
 ]
+AllowCode = Annotated[
+    bool,
+    typer.Option("--allow-code", help="Run the Python file that CONFIG.toml names as its model."),
+]
 AllowOutside = Annotated[
     bool,
     typer.Option("--allow-outside", help="Let CONFIG.toml name data outside of its own folder."),

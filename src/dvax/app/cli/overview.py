@@ -123,9 +123,10 @@ def _steps(config: "Config") -> tuple[str, str]:
 def steps_of_application(settings: Mapping[str, Any]) -> Row:
     """The row of the steps of an application with these settings, the method named."""
     method = settings.get("method")
-    # `dvax.solve` takes this one where steps are given.
-    name = "ETD2RK" if method is None else type(method).__name__
+    name = "chosen from the problem" if method is None else type(method).__name__
     if settings.get("dt") is not None:
+        # `dvax.solve` takes this one where steps are given.
+        name = "ETD2RK" if method is None else name
         return ("steps", f"fixed, no longer than {settings['dt']:g}", name)
     if name == "PiecewiseLinear":
         return ("steps", "from kink to kink, each solved exactly", name)

@@ -7,6 +7,7 @@ import typer
 from dvax.app.cli.check import check
 from dvax.app.cli.demo import demo
 from dvax.app.cli.doctor import doctor
+from dvax.app.cli.new import new
 from dvax.app.cli.report import report
 from dvax.app.cli.run import run
 
@@ -44,5 +45,5 @@ def _program(
     """Options of the program itself; each command has its own."""
 
 
-for command in (run, check, report, demo, doctor):
+for command in (new, check, run, report, demo, doctor):
     app.command()(command)

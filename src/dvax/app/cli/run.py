@@ -12,7 +12,7 @@ from dvax._figure_text import entry_text
 from dvax.app.cli.console import print_line, print_problems, print_remark, print_table
 from dvax.app.cli.failure import BAD_INPUT, reported
 from dvax.app.cli.load import load
-from dvax.app.cli.options import AllowOutside, ConfigFile, Debug, Force, Quiet
+from dvax.app.cli.options import AllowCode, AllowOutside, ConfigFile, Debug, Force, Quiet
 from dvax.app.cli.progress import progress
 from dvax.errors import InputError
 
@@ -30,6 +30,7 @@ def run(
     force: Force = False,
     quiet: Quiet = False,
     allow_outside: AllowOutside = False,
+    allow_code: AllowCode = False,
     debug: Debug = False,
 ) -> None:
     """Solve the system that CONFIG.toml describes; results, manifest and report go into DIR."""
@@ -40,7 +41,7 @@ def run(
         # Both are checked before anything is refused, so that one round is enough to fix all of it.
         problems = target_problems(out, force=force)
         try:
-            loaded = interruptible(lambda: load(config, allow_outside, quiet))
+            loaded = interruptible(lambda: load(config, allow_outside, quiet, allow_code))
         except InputError as error:
             raise InputError(*error.problems, *problems) from error
         problems.raise_any()

@@ -68,5 +68,8 @@ def open_store(path: Path) -> tuple[Store, int]:
         increasing = np.isfinite(time) & (np.diff(time, prepend=-np.inf) > 0)
         room = len(time)
         count = room if increasing.all() else int(np.argmin(increasing))
-    variables = {name: Variable(array, count) for name, array in arrays.items()}
+    order = str(group.attrs.asdict().get("variable_order", "")).split()
+    names = [name for name in order if name in arrays]
+    names += [name for name in arrays if name not in names]
+    variables = {name: Variable(arrays[name], count) for name in names}
     return Store(group.attrs.asdict(), variables, count), room

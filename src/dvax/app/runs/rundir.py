@@ -204,21 +204,25 @@ class FrameStore:
         self._publish()
 
     def _publish(self) -> None:
-        """Replace the group's consolidated metadata, which readers such as xarray use: every array
-        in it ends with the last complete frame, so that the store of a killed run opens."""
-        about = {
-            folder.name: json.loads((folder / "zarr.json").read_text(encoding="utf-8"))
-            for folder in sorted(self.path.iterdir())
-            if (folder / "zarr.json").is_file()
-        }
-        for each in about.values():
-            if each.get("dimension_names", [None])[0] == "time":
-                each["shape"][0] = self.written
-        group = json.loads((self.path / "zarr.json").read_text(encoding="utf-8"))
-        group["consolidated_metadata"] = {
-            "kind": "inline", "must_understand": False, "metadata": about,
-        }  # fmt: skip
-        write_whole(self.path / "zarr.json", json.dumps(group).encode())
+        consolidate(self.path, self.written)
+
+
+def consolidate(path: Path, frames: int | None = None) -> None:
+    """Replace the consolidated metadata of a store, which readers such as xarray use. With `frames`
+    every array in it ends with the last complete frame, so that the store of a killed run opens."""
+    about = {
+        folder.name: json.loads((folder / "zarr.json").read_text(encoding="utf-8"))
+        for folder in sorted(path.iterdir())
+        if (folder / "zarr.json").is_file()
+    }
+    for each in about.values():
+        if frames is not None and each.get("dimension_names", [None])[:1] == ["time"]:
+            each["shape"][0] = frames
+    group = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+    group["consolidated_metadata"] = {
+        "kind": "inline", "must_understand": False, "metadata": about,
+    }  # fmt: skip
+    write_whole(path / "zarr.json", json.dumps(group).encode())
 
 
 def target_problems(out: Path, *, force: bool) -> Problems:

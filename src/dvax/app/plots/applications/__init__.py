@@ -6,22 +6,27 @@ from collections.abc import Mapping
 
 from dvax.app.plots.picture import Picture
 from dvax.app.plots.store import Variable
+from dvax.app.runs.applications import models
 from dvax.errors import input_error
 
 NAMES = tuple(module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__))
-"""The applications that have pictures: every module here."""
+"""The applications that have pictures of their own: every module here."""
+
+_MODELS = tuple(module.name.replace("_", "-") for module in pkgutil.iter_modules(models.__path__))
+_DEFAULT = "python"
 
 
 def application_pictures(name: str, data: Mapping[str, Variable]) -> list[Picture]:
-    """Return the pictures of an application by its name.
+    """Return the pictures of an application by its name: its own, or the default ones.
 
-    **Raises:** `dvax.InputError` where none is: the name comes from a file that may be damaged.
+    **Raises:** `dvax.InputError` for the name of no model: it comes from a file that may be damaged.
     """
-    if name not in NAMES:
+    if name not in (*NAMES, *_MODELS):
         raise input_error(
             "manifest.json: model", repr(name),
-            f"an application is one of {', '.join(NAMES)}",
+            f"an application is one of {', '.join(_MODELS)}",
             "Restore the file from a copy, or run again with this version of dvax.",
         )  # fmt: skip
-    module = importlib.import_module(f"dvax.app.plots.applications.{name.replace('-', '_')}")
+    own = name if name in NAMES else _DEFAULT
+    module = importlib.import_module(f"dvax.app.plots.applications.{own.replace('-', '_')}")
     return module.pictures(data)

@@ -60,10 +60,11 @@ class Plan:
     problem: Problem
     x0: Any
     times: np.ndarray
-    constants: Constants
+    constants: Constants | None
     settings: Mapping[str, Any]
     data: Any = None
     time_unit: str = ""
+    args: Any = None
 
 
 class PerRow:
@@ -92,13 +93,14 @@ class AbstractApplication(abc.ABC):
     It is made from that table and the places of its data, everything checked and nothing solved; with
     `quiet` it prints no progress. The constructor raises `dvax.InputError` with all problems.
 
-    - `section`: the table, for pydantic; the keys in `files` name data files, those in `folders`
-      folders, with the files that are read there;
+    - `section`: the table, for pydantic; `table`: the checked one, complete;
+    - `files`, `folders`: the keys that name data files, and folders with the files that are read there;
     - `keys`: the keys that make an argument of the model, where their names differ from its name;
     - `end`: the key for the last time of a run, where there is one.
     """
 
     section: ClassVar[type[Section]]
+    table: Any
     files: ClassVar[tuple[str, ...]] = ()
     folders: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     keys: ClassVar[Mapping[str, tuple[str, ...]]] = {}

@@ -1,6 +1,7 @@
 """Configurations of applications: `[model]` says everything, `[output]` what is written beside."""
 
 import importlib
+import pkgutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -10,6 +11,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from dvax.app.runs.applications import models
 from dvax.app.runs.applications.base import AbstractApplication
 from dvax.app.runs.config import Config, check_contact, parse
 from dvax.app.runs.data_file import DataFile, fingerprint, locate
@@ -19,8 +21,13 @@ from dvax.app.runs.units import Units
 from dvax.app.runs.wording import Wording
 from dvax.errors import Problems, input_error
 
-APPLICATIONS = ("traffic", "market", "frame", "circuit", "fem-contact")
-"""The names of `[model]` that are applications."""
+OWN = "python"
+"""The name of `[model]` for a problem of the user's own."""
+
+APPLICATIONS = tuple(
+    sorted(module.name.replace("_", "-") for module in pkgutil.iter_modules(models.__path__))
+)
+"""The names of `[model]` that are applications: every module in `models`."""
 
 NAMES = ("contact", *APPLICATIONS)
 _SECTIONS = ("model", "output")
@@ -28,7 +35,7 @@ _SECTIONS = ("model", "output")
 
 def module_of(name: str) -> ModuleType:
     """The module of an application, imported when it is asked for."""
-    return importlib.import_module(f"dvax.app.runs.applications.{name.replace('-', '_')}")
+    return importlib.import_module(f"{models.__name__}.{name.replace('-', '_')}")
 
 
 @dataclass(frozen=True)
@@ -80,9 +87,14 @@ def wording_of(application: type[AbstractApplication], file: str) -> Wording:
 
 
 def read_config(
-    path: str | Path, *, allow_outside: bool = False, quiet: bool = False
+    path: str | Path,
+    *,
+    allow_outside: bool = False,
+    quiet: bool = False,
+    allow_code: bool = False,
 ) -> Config | ModelConfig:
-    """Read, check and complete a configuration file of any model; `quiet`: without lines of progress.
+    """Read, check and complete a configuration file of any model; `quiet`: without lines of progress;
+    `allow_code`: a Python file that it names may run.
 
     **Raises:** `dvax.InputError` with all problems found, those of the data files included.
     """
@@ -99,8 +111,12 @@ def read_config(
         )  # fmt: skip
     if isinstance(table, Mapping):
         # A contact law needs no name.
-        name = table.get("name", "contact")
-        if "name" not in table and (likely := _likely_application(table)) is not None:
+        name = table.get("name", OWN if OWN in table else "contact")
+        if (
+            "name" not in table
+            and name != OWN
+            and (likely := _likely_application(table)) is not None
+        ):
             raise input_error(
                 f"{source.name}: model.name", "nothing",
                 f"it says which model this is, one of {', '.join(NAMES)}; "
@@ -115,6 +131,12 @@ def read_config(
         raise input_error(
             f"{source.name}: model.name", shown(name), f"it is one of {', '.join(NAMES)}", fix
         )
+    if name == OWN and not allow_code:
+        raise input_error(
+            f"{source.name}: model.{OWN}", shown(table.get(OWN) if isinstance(table, Mapping) else ""),
+            "a run of this configuration executes the code of that file, which can do all that you can",
+            "Read the file, and pass --allow-code if you trust it",
+        )  # fmt: skip
     return _check(raw, name, source, allow_outside, quiet)
 
 
@@ -159,4 +181,4 @@ def _check(
     problems.raise_any()
     with wording_of(application, file).in_keys():
         model = application(table, paths, quiet)
-    return ModelConfig(name, table, sections["output"], source, application, model, paths)
+    return ModelConfig(name, model.table, sections["output"], source, application, model, paths)

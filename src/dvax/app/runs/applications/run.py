@@ -13,6 +13,7 @@ from dvax.app.runs.applications.config import ModelConfig
 from dvax.app.runs.applications.segments import join_pieces, segments, states_only
 from dvax.app.runs.interrupt import Work, interruptible, patience
 from dvax.app.runs.run import AbstractRun, Facts, Listener
+from dvax.app.runs.rundir import consolidate
 from dvax.evolution import Solution
 from dvax.theory import Constants
 
@@ -109,6 +110,9 @@ class ApplicationRun(AbstractRun):
         self.event("stage", stage=words)
 
 
+_ORDER = "variable_order"
+
+
 def constant_rows(constants: Constants | None) -> list[dict[str, Any]]:
     """The table of constants; an application's units are those of its own description."""
     if constants is None:
@@ -119,7 +123,9 @@ def constant_rows(constants: Constants | None) -> list[dict[str, Any]]:
 def write_dataset(path: Path, variables: Mapping[str, Variable], attrs: Mapping[str, Any]) -> None:
     """Write a zarr group that xarray opens as a Dataset."""
     coordinates = [name for name, v in variables.items() if v.dims == (name,)]
-    attributes = {**attrs, "coordinates": " ".join(coordinates)}
+    # A store lists its arrays in no order.
+    order = " ".join(variables)
+    attributes = {**attrs, "coordinates": " ".join(coordinates), _ORDER: order}
     group = zarr.open_group(path, mode="w-", zarr_format=3, attributes=attributes)
     for name, v in variables.items():
         about: dict[str, Any] = {"long_name": v.words, "units": v.unit}
@@ -127,3 +133,4 @@ def write_dataset(path: Path, variables: Mapping[str, Variable], attrs: Mapping[
             about["status"] = v.status
         values = np.asarray(v.values)
         group.create_array(name, data=values, dimension_names=v.dims, attributes=about)
+    consolidate(path)

@@ -48,7 +48,7 @@ def segments(plan: Plan) -> Iterator[Solution]:
             start: float = start, ts: np.ndarray = ts, x: Any = x, step: Any = step
         ) -> Solution:
             solution = solve(
-                plan.problem, x, start, float(ts[-1]), None, ts, constants=plan.constants,
+                plan.problem, x, start, float(ts[-1]), plan.args, ts, constants=plan.constants,
                 dt0=step, horizon=last - first, **measure, **plan.settings,
             )  # fmt: skip
             solution = all_finite(solution, start)

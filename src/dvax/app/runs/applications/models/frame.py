@@ -100,7 +100,7 @@ class FrameApplication(AbstractApplication):
         )  # fmt: skip
 
     def results(self, plan: Plan, solution: Solution, count: int) -> Results:
-        frame, constants = self.frame, plan.constants
+        frame, constants = self.frame, self.frame.constants
         bound = certificate(frame.problem, solution, constants, count)
         between = (len(plan.times) - 1) // (frame.record.samples.shape[0] - 1)
         d, v, plastic = np.asarray(solution.xs)[:count].T

@@ -1,0 +1,321 @@
+"""`[model] python = "file.py:build"`: a problem of the user's own."""
+
+import importlib.util
+import inspect
+import sys
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+import jax.tree_util as jtu
+import numpy as np
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    Field,
+    ValidationError,
+    create_model,
+    model_validator,
+)
+
+from dvax.app.runs.applications.base import (
+    AbstractApplication,
+    Description,
+    Figure,
+    Plan,
+    Results,
+    Say,
+    Variable,
+)
+from dvax.app.runs.applications.certificate import Certificate, certificate
+from dvax.app.runs.schema import Section, SolverKeys, rule_error
+from dvax.app.runs.schema_errors import translate
+from dvax.app.runs.solver_options import check_model_steps, settings
+from dvax.app.runs.units import converted
+from dvax.errors import DvaxError, InputError, input_error
+from dvax.evolution import Solution
+from dvax.evolution.auto import choose
+from dvax.models import Model
+from dvax.theory import Constants, verify
+
+_FIGURES = 12
+"""Up to this many final values are figures of the summary."""
+
+
+class PythonSection(SolverKeys):
+    """The function that builds the model, its parameters, and how long to run it."""
+
+    name: Literal["python"] = Field("python", description="the model")
+    python: str = Field(description="Python file, and the function in it that builds the model")
+    function: str = Field(
+        "build", description="the function, which may stand behind the file: a.py:build"
+    )
+    parameters: dict[str, Any] = Field(
+        default_factory=dict, description="the arguments of that function"
+    )
+    t_end: float | None = Field(None, description="end of the run, by default that of the model")
+    frames: int = Field(200, ge=1, le=10**6, description="number of intervals between saved states")
+    certify: bool = Field(
+        False, description="choose steps whose defect can be bounded, and not the fastest ones"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _split(cls, given: Any) -> Any:
+        if isinstance(given, dict) and isinstance(given.get("python"), str):
+            file, _, function = given["python"].rpartition(":")
+            if file and function.isidentifier():
+                return {**given, "python": file, "function": function}
+        return given
+
+
+class PythonApplication(AbstractApplication):
+    """States and responses over time, by the names that the model gives them."""
+
+    section = PythonSection
+    files = ("python",)
+    end = "model.t_end"
+
+    def __init__(self, table: PythonSection, paths: Mapping[str, Path], quiet: bool):
+        self.file = paths["python"]
+        build = _function(self.file, table.function)
+        arguments, given = _arguments(build, table.parameters)
+        self.table = table.model_copy(update={"parameters": given})
+        model = _run(self.file, lambda: build(*arguments))
+        if not isinstance(model, Model):
+            raise input_error(
+                f"{self.file.name}: {table.function}", type(model).__name__,
+                "it must return a dvax.models.Model",
+                "Write return dvax.models.Model(problem, x0, t_end)",
+            )  # fmt: skip
+        self.own = model
+        self.t_end = float(model.t_end if table.t_end is None else table.t_end)
+        if not self.t_end > model.t0:
+            raise input_error(
+                "model.t_end",
+                f"{self.t_end:g}",
+                f"the run begins at {model.t0:g}",
+                "Write a later time",
+            )
+        check_model_steps(
+            table, self.t_end - model.t0, f"{self.t_end - model.t0:g} {model.time_unit}"
+        )
+
+    @property
+    def fit(self) -> str:
+        return f"a problem of one's own: {self.file.name}"
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return settings(self.table, **self.own.settings)
+
+    @cached_property
+    def verification(self) -> Any:
+        """What `dvax.verify` says of the problem."""
+        m = self.own
+        check = lambda: verify(m.problem, m.x0, m.t0, self.t_end, m.args)  # noqa: E731
+        return _run(self.file, check)
+
+    @property
+    def constants(self) -> Constants | None:
+        return self.own.constants or self.verification.constants
+
+    def describe(self) -> Description:
+        m = self.own
+        count = sum(np.size(leaf) for leaf in jtu.tree_leaves(m.x0))
+        law = sum(np.size(leaf) for leaf in jtu.tree_leaves(m.problem.zero_control(m.x0)))
+        sizes = [
+            ("states", str(count), ", ".join(m.states)),
+            ("responses", str(law), ", ".join(m.responses)),
+            (
+                "time",
+                f"{m.t0:g} to {self.t_end:g} {m.time_unit}",
+                f"{self.table.frames + 1} saved states",
+            ),
+        ]
+        notes = [f"The code of {self.file.name}:{self.table.function} is executed."]
+        if self.settings.get("method") is None and self.settings.get("dt") is None:
+            sizes.append(("method", *self._choice()))
+        return Description(self.constants, self.verification.assumptions, sizes, tuple(notes))
+
+    def _choice(self) -> tuple[str, str]:
+        """Return the method that `dvax.solve` will choose, and the reason."""
+        m, given = self.own, {"rtol": 1e-6, "atol": 1e-9} | self.settings
+        found = choose(
+            m.problem, m.x0, m.args, self.t_end - m.t0, float(max(given["rtol"], given["atol"])), False,
+            self.table.certify,
+        )  # fmt: skip
+        name, _, reason = str(found.text()).partition(": ")
+        return name, reason
+
+    def plan(self, say: Say) -> Plan:
+        m = self.own
+        say(f"solving from {m.t0:g} to {self.t_end:g} {m.time_unit}".rstrip())
+        times = np.linspace(m.t0, self.t_end, self.table.frames + 1)
+        constants = self.constants if self.table.certify else None
+        return Plan(
+            m.problem, m.x0, times, constants, self.settings, None, m.time_unit, m.args
+        )  # fmt: skip
+
+    def results(self, plan: Plan, solution: Solution, count: int) -> Results:
+        m, times = self.own, np.asarray(solution.ts)[:count]
+        variables = {"time": Variable(("time",), times, m.time_unit, "time")}
+        figures: dict[str, Figure] = {}
+        last = f"at t = {times[-1]:g} {m.time_unit}".rstrip()
+        for which, rows in (("states", solution.xs), ("responses", solution.us)):
+            for name, (values, unit) in m.series(which, rows).items():
+                key, values = name.replace("/", "∕"), values[:count]
+                dims = ("time", *(f"{key}_{k}" for k in range(values.ndim - 1)))
+                variables[key] = Variable(dims, values, unit, f"{which.removesuffix('s')} {name}")
+                if values.ndim == 1 and len(figures) < _FIGURES:
+                    figures[f"final_{key}"] = Figure(float(values[-1]), unit, f"{name} {last}")
+        bound = self._bound(solution, count)
+        if bound is not None:
+            words = "bound on the error of the state in the norm of the state space"
+            variables["error_bound"] = bound.variable("time", "", words)
+            figures["error_bound"] = bound.figure("", words)
+        if m.figures is not None:
+            of = m.figures
+            found = _run(self.file, lambda: of(solution))
+            figures |= {
+                name: Figure(*_figure(self.file, name, entry)) for name, entry in found.items()
+            }
+        return Results(
+            figures, variables, self.constants, int(solution.stats["steps"]),
+            self.verification.assumptions,
+        )  # fmt: skip
+
+    def _bound(self, solution: Solution, count: int) -> Certificate | None:
+        constants = self.constants
+        if constants is None or solution.defect is None:
+            return None
+        return certificate(self.own.problem, solution, constants, count)
+
+
+def _figure(file: Path, name: str, entry: Any) -> tuple[Any, str, str]:
+    if not (isinstance(entry, tuple) and len(entry) == 3):
+        raise input_error(
+            f"{file.name}: figures", repr(entry)[:70], f"{name!r} is (value, unit, meaning)",
+            'Write {"largest force": (3.0, "N", "over the run")}',
+        )  # fmt: skip
+    value, unit, meaning = entry
+    return np.asarray(value).tolist(), str(unit), str(meaning)
+
+
+def _function(file: Path, name: str) -> Callable[..., Any]:
+    """Import a file, and return its function of that name."""
+    module = _run(file, lambda: _import(file))
+    found = getattr(module, name, None)
+    if not callable(found):
+        known = [
+            n
+            for n, v in vars(module).items()
+            if inspect.isfunction(v) and v.__module__ == module.__name__
+        ]
+        raise input_error(
+            "model.python", f"{file.name}:{name}", f"{file.name} has no function {name!r}",
+            f"It has {', '.join(known)}" if known else f"Write def {name}(...) in it",
+        )  # fmt: skip
+    return found
+
+
+def _import(file: Path) -> ModuleType:
+    # Beside it may lie modules that it imports.
+    folder = str(file.parent)
+    if folder not in sys.path:
+        sys.path.append(folder)
+    name = f"dvax_own_{file.stem}"
+    spec = importlib.util.spec_from_file_location(name, file)
+    if spec is None or spec.loader is None:
+        raise input_error(
+            "model.python", repr(file.name), "it must be a Python file", "Name it *.py"
+        )
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def _run(file: Path, work: Callable[[], Any]) -> Any:
+    """Return work(), code of the user.
+
+    **Raises:** `dvax.InputError` that names the line in `file` where an exception comes from.
+    """
+    try:
+        return work()
+    except DvaxError:
+        raise
+    except Exception as error:
+        lines = [
+            f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(file)
+        ]
+        if isinstance(error, SyntaxError) and error.lineno:
+            lines.append(error.lineno)
+        place = f"{file.name}, line {lines[-1]}" if lines else file.name
+        raise input_error(
+            place, f"{type(error).__name__}: {error}"[:300], "the file must run without an exception",
+            "Fix that line; --debug shows the traceback",
+        ) from error  # fmt: skip
+
+
+def _arguments(
+    build: Callable[..., Any], given: dict[str, Any]
+) -> tuple[list[Any], dict[str, Any]]:
+    """Return the arguments for `build` from the table of parameters, and that table, completed.
+
+    Parameters are those of the function, each with its type, or one pydantic model. Annotated[float,
+    "mm"] has a unit: a text such as "2 cm" is converted.
+    """
+    hints = get_type_hints(build, include_extras=True)
+    names = list(inspect.signature(build).parameters.values())
+    only = hints.get(names[0].name) if len(names) == 1 else None
+    kind: type[BaseModel]
+    is_model = False
+    if isinstance(only, type) and issubclass(only, BaseModel):
+        kind, is_model = only, True
+    else:
+        fields: dict[str, Any] = {}
+        for p in names:
+            if p.name not in hints or p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD):
+                raise input_error(
+                    f"model.python: {build.__name__}({p.name})", str(p), "each parameter has a type",
+                    f"Write {p.name}: float = 1.0, or {p.name}: Annotated[float, \"mm\"]",
+                )  # fmt: skip
+            default = ... if p.default is p.empty else p.default
+            fields[p.name] = (_with_unit(hints[p.name]), default)
+        kind = create_model("Parameters", __base__=Section, **fields)
+    try:
+        made = kind.model_validate(given)
+    except ValidationError as error:
+        # The name of the file is added where it is known (`Wording`).
+        found = translate(error, "", "model.parameters", kind)
+        raise InputError(*(replace(p, place=p.place.removeprefix(": ")) for p in found)) from error
+    complete = made.model_dump(exclude_none=True)
+    return [made] if is_model else [getattr(made, p.name) for p in names], complete
+
+
+def _with_unit(hint: Any) -> Any:
+    """Return a type whose unit, a text among its annotations, converts quantities."""
+    if get_origin(hint) is not Annotated:
+        return hint
+    of, *about = get_args(hint)
+    unit = next((a for a in about if isinstance(a, str)), None)
+    if unit is None:
+        return hint
+
+    def convert(value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        number = converted(value, unit)
+        if number is None:
+            raise rule_error(f"it is a number in {unit}, or a quantity", f'Write "2.5 {unit}"')
+        return number
+
+    return Annotated[of, BeforeValidator(convert), Field(description=f"[{unit}]")]
+
+
+APPLICATION = PythonApplication

@@ -1,0 +1,116 @@
+"""A problem with what a run of the command line needs besides."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax.tree_util as jtu
+import numpy as np
+
+from .. import _tree
+from .._tree import Tree
+from ..errors import Problems
+from ..evolution import Solution
+from ..problem import Problem
+from ..theory import Constants
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A problem, where it starts, how long it runs, and names and units for its states and responses.
+
+    A function that returns one is a model of the command line: `[model] python = "file.py:build"`.
+
+    - `problem`, `x0`, `args`: as in `dvax.solve`; `t0`, `t_end`: first and last time, in `time_unit`;
+    - `states`: a name for each entry of x with its unit, or for each part of a tuple, such as
+      {"position": "m", "velocity": "m/s"}; `responses`: the same for u;
+    - `constants`: proved or declared `dvax.Constants`, by default those of `dvax.verify`;
+    - `settings`: options of `dvax.solve`, such as {"rtol": 1e-8};
+    - `figures`: a function of the `dvax.Solution` to numbers for the summary, by name: (value, unit,
+      meaning).
+
+    **Raises:** `dvax.InputError` if the names do not fit.
+
+    ```python
+    >>> import dvax
+    >>> problem = dvax.Problem(
+    ...     A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+    ...     f=lambda t, x, u, args: 3.0 - 0.5 * x - u, h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+    ... )
+    >>> model = dvax.models.Model(problem, -1.0, 2.0, states={"depth": "mm"}, responses={"force": "N"})
+    >>> model.time_unit
+    's'
+
+    ```
+    """
+
+    problem: Problem
+    x0: Tree
+    t_end: float
+    t0: float = 0.0
+    args: Any = None
+    states: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    responses: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    time_unit: str = "s"
+    title: str = ""
+    constants: Constants | None = None
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    figures: Callable[[Solution], Mapping[str, tuple[Any, str, str]]] | None = None
+
+    def __post_init__(self) -> None:
+        _tree.check_kind(
+            self.problem, Problem, "dvax.models.Model(problem)", "it must be a dvax.Problem",
+            "Build one with dvax.Problem(A=…, P=…, K=…, f=…, h=…)",
+        )  # fmt: skip
+        object.__setattr__(self, "x0", _tree.as_float(self.x0, "x0"))
+        wrong = Problems()
+        for name, t in (("t0", self.t0), ("t_end", self.t_end)):
+            if not (_tree.is_number(t) and np.isfinite(t)):
+                wrong.add(
+                    f"dvax.models.Model({name})", _tree.line(t), "it must be a finite number",
+                    "Write a number such as 2.0",
+                )  # fmt: skip
+        wrong.raise_any()
+        if not self.t0 < self.t_end:
+            wrong.add(
+                "dvax.models.Model(t0, t_end)", f"{self.t0}, {self.t_end}", "t0 < t_end",
+                "Swap or correct them",
+            )  # fmt: skip
+        elements = {"states": self.x0, "responses": self.problem.zero_control(self.x0)}
+        for which, element in elements.items():
+            names = getattr(self, which)
+            parts, entries = _counts(element)
+            if names and len(names) not in (parts, entries):
+                wrong.add(
+                    f"dvax.models.Model({which})", ", ".join(names),
+                    f"it needs a name for each of the {entries} entries"
+                    + (f", or for each of the {parts} parts" if parts != entries else ""),
+                    "Add or remove names",
+                )  # fmt: skip
+        wrong.raise_any()
+
+    def series(self, which: str, rows: Tree) -> dict[str, tuple[np.ndarray, str]]:
+        """Return values and unit of each named entry or part of `rows`, those of the "states" or the
+        "responses" at the saved times, a time axis in front."""
+        names: Mapping[str, str] = getattr(self, which)
+        leaves = [np.asarray(leaf) for leaf in jtu.tree_leaves(rows)]
+        element = self.x0 if which == "states" else self.problem.zero_control(self.x0)
+        parts, entries = _counts(element)
+        symbol = "x" if which == "states" else "u"
+        if not names:
+            count = entries if entries <= _NAMED else parts
+            names = {symbol if count == 1 else f"{symbol}{k}": "" for k in range(count)}
+        if len(names) == entries:
+            flat = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
+            return {n: (flat[:, k], unit) for k, (n, unit) in enumerate(names.items())}
+        return {n: (leaf, u) for leaf, (n, u) in zip(leaves, names.items(), strict=True)}
+
+
+_NAMED = 12
+"""Up to this many entries without names are numbered one by one."""
+
+
+def _counts(element: Tree) -> tuple[int, int]:
+    """Return the numbers of parts and of entries."""
+    leaves = jtu.tree_leaves(element)
+    return len(leaves), sum(np.size(leaf) for leaf in leaves)
