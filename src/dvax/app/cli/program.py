@@ -9,6 +9,7 @@ from dvax.app.cli.demo import demo
 from dvax.app.cli.doctor import doctor
 from dvax.app.cli.new import new
 from dvax.app.cli.report import report
+from dvax.app.cli.resume import resume
 from dvax.app.cli.run import run
 
 app = typer.Typer(
@@ -45,5 +46,5 @@ def _program(
     """Options of the program itself; each command has its own."""
 
 
-for command in (new, check, run, report, demo, doctor):
+for command in (new, check, run, resume, report, demo, doctor):
     app.command()(command)

@@ -48,8 +48,16 @@ def run(
         carry_out(loaded, out, force=force, quiet=quiet)
 
 
-def carry_out(config: "Config | ModelConfig", out: Path, *, force: bool, quiet: bool) -> None:
-    """Run a checked configuration, make its report, print the figures; exit with the run's code."""
+def carry_out(
+    config: "Config | ModelConfig",
+    out: Path,
+    *,
+    force: bool = False,
+    quiet: bool = False,
+    resume: bool = False,
+) -> None:
+    """Run a checked configuration, or go on with its run, make its report, print the figures; exit
+    with the run's code."""
     from dvax.app.runs.interrupt import interruptible
 
     interruptible(_import)
@@ -59,7 +67,10 @@ def carry_out(config: "Config | ModelConfig", out: Path, *, force: bool, quiet: 
         # Plotly and Matplotlib take two seconds to import: beside the solve they cost nothing.
         Thread(target=_import_plots, name="dvax import", daemon=True).start()
     with progress(quiet=quiet) as listener:
-        outcome = driver.run(config, out, overwrite=force, on_event=listener)
+        if resume:
+            outcome = driver.resume(config, out, listener)
+        else:
+            outcome = driver.run(config, out, overwrite=force, on_event=listener)
     if not quiet:
         _print_figures(outcome.summary)
     if outcome.exit_code:
@@ -70,6 +81,8 @@ def carry_out(config: "Config | ModelConfig", out: Path, *, force: bool, quiet: 
             else "the settings and the log are"
         )
         print_remark(f"{kept} in {outcome.directory}")
+        if outcome.status == "interrupted":
+            print_remark(f"to go on: dvax resume {outcome.directory}")
     elif not quiet:
         print_remark(f"{outcome.status}: {outcome.stop_reason}")
     if config.output.report:

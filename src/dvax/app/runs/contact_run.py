@@ -5,14 +5,15 @@ A block starts from the last state and step size of the one before, so results d
 blocks, and the store is readable whenever and however the run ends.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from dvax.app.runs.blocks import block_length
+from dvax.app.runs.checkpoints import Checkpoint
 from dvax.app.runs.config import Config, build_contact
 from dvax.app.runs.contact_figures import Figures
 from dvax.app.runs.contact_frames import (
@@ -26,7 +27,7 @@ from dvax.app.runs.contact_model import assumptions, contact_model
 from dvax.app.runs.figure import Figure
 from dvax.app.runs.interrupt import Work, interruptible
 from dvax.app.runs.run import AbstractRun, Facts, Listener
-from dvax.app.runs.rundir import FrameStore
+from dvax.app.runs.rundir import FrameStore, damaged_files
 from dvax.app.runs.schema import SolverSection
 from dvax.app.runs.solutions import all_finite
 from dvax.app.runs.solver_options import settings
@@ -34,7 +35,7 @@ from dvax.app.runs.wording import Wording
 from dvax.errors import SolveError
 from dvax.evolution import Solution, solve
 from dvax.spaces import AbstractSpace
-from dvax.theory import Bound, bound_error
+from dvax.theory import Bound, Status, bound_error
 
 _ELSEWHERE = {"t0": "time", "t1": "time.end", "ts": "time.frames", "x0": "initial"}
 _BOUNDS = ("error_bound_x", "error_bound_u", "error_bound_sharp_x")
@@ -65,27 +66,56 @@ class ContactRun(AbstractRun):
 
     def begin(self) -> None:
         inputs, config = self.inputs, self.config
-        self.store = FrameStore(
-            self.directory.path / "trajectory.zarr",
-            len(inputs.frame_times),
-            self.block,
-            coordinates(inputs, config),
-            variables(config, len(inputs.boundary.names)),
-            attributes(config, self.facts.rows, inputs.boundary.shape, self.facts.assumptions),
-            {"long_name": "time", "units": config.units.time},
+        self.at = self.kept = _Reached(_Piece(inputs.x0), _Piece(inputs.companion_x0))
+        path = self.directory.path / "trajectory.zarr"
+        known = variables(config, len(inputs.boundary.names))
+        for saved in reversed(self.saved):
+            reached = _Reached.of(saved)
+            damaged = damaged_files(path, reached.files)
+            if damaged is None:
+                self.at = self.kept = reached
+                break
+            self.event("warning", message=f"{damaged} is damaged: it is not used.")
+        if self.at.frames == 0:
+            self.directory.remove(path.name)
+            self.store = FrameStore(
+                path,
+                len(inputs.frame_times),
+                self.block,
+                coordinates(inputs, config),
+                known,
+                attributes(config, self.facts.rows, inputs.boundary.shape, self.facts.assumptions),
+                {"long_name": "time", "units": config.units.time},
+            )
+            return
+        self.store = FrameStore.reopen(
+            path, len(inputs.frame_times), list(known), self.at.frames, self.at.files
         )
+        self.steps, self.rejected, self.method = self.at.steps, self.at.rejected, self.at.method
+        for first in range(0, self.at.frames, self.block):
+            frames = slice(first, first + self.block)
+            self.figures.add(inputs.frame_times[frames], self.store.read(frames), self.at.status)
+
+    def checkpoint(self) -> None:
+        if self.at.frames == self.kept.frames:
+            return
+        arrays, about = self.at.to_checkpoint()
+        about["files"] = self.store.files()
+        self.checkpoints.save(self.at.frames, arrays, about)
+        self.checkpoints.keep(2)
+        self.kept = self.at
 
     def solve(self) -> None:
-        times = self.inputs.frame_times
-        main, other = _Piece(self.inputs.x0), _Piece(self.inputs.companion_x0)
-        apart, error, defect = None, 0.0, 0.0
-        for first in range(0, len(times), self.block):
+        times, at = self.inputs.frame_times, self.at
+        main, other = at.main, at.other
+        apart, error, defect = at.apart, at.error, at.defect
+        for first in range(at.frames, len(times), self.block):
             wanted = times[first : first + self.block]
             # Blocks have one length, so that they share one compiled program: the last repeats its end.
             ts = np.concatenate([wanted, np.full(self.block - len(wanted), wanted[-1])])
             start = times[max(first - 1, 0)]
             # After the first block, which compiles, the two trajectories run on two cores.
-            beside = self._solve_beside(other, start, ts) if first else None
+            beside = self._solve_beside(other, start, ts) if first > at.frames else None
             failure = None
             try:
                 a = self._solve(main, start, ts)
@@ -112,7 +142,13 @@ class ContactRun(AbstractRun):
             self.steps += int(a.stats["steps"])
             self.method = str(a.stats["method"])
             self.rejected += int(a.stats["rejected"])
-            if first == 0:
+            self.at = _Reached(
+                main, other, apart, error, defect, self.store.written, self.steps, self.rejected,
+                self.method, self.figures.status,
+            )  # fmt: skip
+            if self.checkpoints.is_due():
+                self.checkpoint()
+            if first == at.frames:
                 self.event("compiled", compile_seconds=self.compiling())
             self.event(
                 "progress",
@@ -169,3 +205,49 @@ class _Piece:
 
     x: Any
     dt: Any = None
+
+
+@dataclass(frozen=True)
+class _Reached:
+    """What the next block starts from: the ends of both trajectories, their first distance, the error
+    bound and the integrated defect so far, and counts."""
+
+    main: _Piece
+    other: _Piece
+    apart: float | None = None
+    error: Any = 0.0
+    defect: Any = 0.0
+    frames: int = 0
+    steps: int = 0
+    rejected: int = 0
+    method: str = ""
+    status: Status = "proved"
+    files: Mapping[str, str] = field(default_factory=dict)
+    """The hashes of the files of these frames."""
+
+    def to_checkpoint(self) -> tuple[list[Any], dict[str, Any]]:
+        """Return arrays and facts; of the bound its last row."""
+        assert isinstance(self.error, Bound)
+        bound = {f.name: getattr(self.error, f.name) for f in fields(self.error)}
+        rows = {name: v for name, v in bound.items() if name != "status" and v is not None}
+        main, other = self.main, self.other
+        arrays = [main.x, other.x, self.defect, *(np.asarray(v)[-1:] for v in rows.values())]
+        about = {
+            "dt": [None if p.dt is None else float(p.dt) for p in (main, other)],
+            "apart": self.apart, "bound": list(rows), "bound_status": self.error.status,
+            "frames": self.frames, "steps": self.steps, "rejected": self.rejected,
+            "method": self.method, "status": self.status,
+        }  # fmt: skip
+        return arrays, about
+
+    @staticmethod
+    def of(saved: Checkpoint) -> "_Reached":
+        about = saved.about
+        main, other, defect, *rows = saved.arrays
+        bound: dict[str, Any] = dict.fromkeys((f.name for f in fields(Bound)), None)
+        bound |= zip(about["bound"], map(jnp.asarray, rows), strict=True)
+        return _Reached(
+            _Piece(main, about["dt"][0]), _Piece(other, about["dt"][1]), float(about["apart"]),
+            Bound(**bound | {"status": about["bound_status"]}), defect[()], about["frames"],
+            about["steps"], about["rejected"], about["method"], about["status"], about["files"],
+        )  # fmt: skip

@@ -30,16 +30,35 @@ def run(
     target_problems(out, force=overwrite).raise_any()
     tell = on_event or (lambda event: None)
 
-    def prepare() -> AbstractRun:
-        if isinstance(config, ModelConfig):
-            return ApplicationRun(config, tell)
-        return ContactRun(config, tell)
-
     with terminable():
+        task = interruptible(lambda: _prepared(config, tell))
         # The folder stays empty until a manifest can describe it.
-        task = interruptible(prepare)
         directory = RunDirectory(out, clear=True)
         try:
             return task.go(directory)
         finally:
             directory.close()
+
+
+def resume(
+    config: Config | ModelConfig, directory: Path, on_event: Listener | None = None
+) -> RunOutcome:
+    """Go on with a run that ended early, from its checkpoints; `config` is its resolved one. The
+    results are those of a run that was not interrupted.
+
+    **Raises:** `dvax.InputError` if another process writes the run, or if configuration, data or
+    versions have changed.
+    """
+    with terminable():
+        task = interruptible(lambda: _prepared(config, on_event or (lambda event: None)))
+        opened = RunDirectory(directory, clear=False)
+        try:
+            return task.go(opened, resume=True)
+        finally:
+            opened.close()
+
+
+def _prepared(config: Config | ModelConfig, tell: Listener) -> AbstractRun:
+    if isinstance(config, ModelConfig):
+        return ApplicationRun(config, tell)
+    return ContactRun(config, tell)

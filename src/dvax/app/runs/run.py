@@ -4,11 +4,12 @@ import abc
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dvax.app.runs.checkpoints import Checkpoint, Checkpoints
 from dvax.app.runs.compile_time import compile_stopwatch
 from dvax.app.runs.data_file import DataFile
 from dvax.app.runs.figure import Figure
@@ -69,7 +70,12 @@ class AbstractRun(abc.ABC):
 
     @abc.abstractmethod
     def begin(self) -> None:
-        """Prepare the results in the run directory, which is there by now."""
+        """Prepare the results in the run directory, which is there by now, and take up the saved
+        `checkpoints` of a run that goes on."""
+
+    @abc.abstractmethod
+    def checkpoint(self) -> None:
+        """Save what `solve` has reached, if that is not saved yet."""
 
     @abc.abstractmethod
     def solve(self) -> None:
@@ -91,10 +97,25 @@ class AbstractRun(abc.ABC):
         **Returns:** the figures for summary.json, and whether there are any results.
         """
 
-    def go(self, directory: RunDirectory) -> RunOutcome:
-        """Solve, and leave the results, the summary and the manifest in `directory`."""
+    def go(self, directory: RunDirectory, *, resume: bool = False) -> RunOutcome:
+        """Solve, and leave the results, the summary and the manifest in `directory`; with `resume` go
+        on from the checkpoints there.
+
+        **Raises:** `dvax.InputError` if they are of another configuration, other data or versions.
+        """
         self.directory = directory
-        write_resolved(self.config, directory.path)
+        seconds = self.config.output.checkpoint_seconds
+        self.checkpoints = Checkpoints(directory.path, self._identity(), seconds)
+        self.saved: list[Checkpoint] = []
+        if resume:
+            self.saved, damaged = self.checkpoints.load()
+            # The name of the first configuration, and not that of the resolved one.
+            title = {"title": directory.title()} if directory.title() else {}
+            self.facts = replace(self.facts, model={**self.facts.model, **title})
+            for file in damaged:
+                self.event("warning", message=f"{file} is damaged: it is not used.")
+        else:
+            write_resolved(self.config, directory.path)
         self._write_manifest("running", "The run is in progress.")
         for notice in self.facts.notices:
             self.event("warning", message=notice)
@@ -103,6 +124,7 @@ class AbstractRun(abc.ABC):
         try:
             with self.wording.in_keys():
                 self.solve()
+            self.checkpoints.clear()
         except KeyboardInterrupt as stop:
             status, code = "interrupted", exit_code(stop)
             reason = f"Interrupted{self.reached()}."
@@ -116,6 +138,9 @@ class AbstractRun(abc.ABC):
                 self.write()
                 self._write_manifest("failed", f"{type(error).__name__}: {error}")
             raise
+        if status != "finished":
+            with writing():
+                self.checkpoint()
         reason = f"{reason} {self.gather()}".rstrip()
         with writing():
             figures, has_results = self.write()
@@ -125,6 +150,18 @@ class AbstractRun(abc.ABC):
             self._write_manifest(status, reason)
             self.event("stopped", message=reason, status=status)
         return RunOutcome(status, code, reason, directory.path, summary, has_results)
+
+    def _identity(self) -> dict[str, str]:
+        """Return the settings, the data and the versions, which must be the same for a run to go on."""
+        files = {key for key, _ in self.config.data_files()}
+        made_by = provenance()
+        packages = {name: str(made_by["packages"][name]) for name in ("jax", "jaxlib", "numpy")}
+        return {
+            **{k: v for k, v in _settings(self.config.tree()).items() if k not in files},
+            **{f"data {file.name}": file.sha256 for file in self.facts.data},
+            **{name: str(made_by[name]) for name in ("dvax", "device", "precision")},
+            **packages,
+        }
 
     def event(self, kind: str, **facts: Any) -> None:
         """Log an event and tell the listener."""
@@ -153,6 +190,17 @@ class AbstractRun(abc.ABC):
             "assumptions": assumption_rows(self.facts.assumptions),
         }
         self.directory.write_json("manifest.json", content)
+
+
+def _settings(tree: Mapping[str, Any], path: str = "") -> dict[str, str]:
+    """Return all settings but those of the output by their dotted keys."""
+    found: dict[str, str] = {}
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            found |= _settings(value, f"{path}{key}.")
+        elif not path.startswith("output."):
+            found[f"{path}{key}"] = repr(value)
+    return found
 
 
 def assumption_rows(assumptions: Sequence[Assumption]) -> list[dict[str, str]]:

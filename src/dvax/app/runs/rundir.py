@@ -5,6 +5,7 @@
     summary.json           the model's headline figures
     log.jsonl              one JSON object an event
     trajectory.zarr        frames, as an xarray Dataset
+    checkpoints            states that an unfinished run can go on from
 
 Numbers that are not finite are the strings "inf", "-inf" and "nan" in JSON, which `float` reads.
 Small files are replaced atomically (written beside, then renamed). Frames are written into a store that
@@ -12,11 +13,12 @@ has its full length from the start; the time of a frame is written last and is N
 frame with a time is complete, whatever killed the run.
 """
 
+import hashlib
 import json
 import os
 import platform
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,14 +26,16 @@ from typing import Any
 import numpy as np
 import zarr
 
+from dvax.app.runs import checkpoints
 from dvax.app.runs.json_numbers import json_ready
+from dvax.app.runs.lock import lock
 from dvax.errors import Problems
 
 FILES = (
     "config.resolved.toml", "manifest.json", "summary.json", "log.jsonl", "report.html",
     "body.vtu", "body-contact.vtu",
 )  # fmt: skip
-FOLDERS = ("trajectory.zarr", "figures", "inputs")
+FOLDERS = ("trajectory.zarr", "figures", "inputs", checkpoints.FOLDER)
 _CHUNK_BYTES = 2**23
 
 
@@ -41,6 +45,7 @@ class RunDirectory:
     def __init__(self, path: Path, *, clear: bool):
         self.path = path
         path.mkdir(parents=True, exist_ok=True)
+        self._lock = lock(path)
         if clear:
             for name in FILES:
                 (path / name).unlink(missing_ok=True)
@@ -60,8 +65,21 @@ class RunDirectory:
         self._log.write("\n")
         self._log.flush()
 
+    def title(self) -> str:
+        """Return the title in the manifest, "" if there is none."""
+        try:
+            manifest = json.loads((self.path / "manifest.json").read_text(encoding="utf-8"))
+            return str(manifest.get("title", ""))
+        except (OSError, ValueError, AttributeError):
+            return ""
+
+    def remove(self, name: str) -> None:
+        """Remove a folder of results, to write it again."""
+        shutil.rmtree(self.path / name, ignore_errors=True)
+
     def close(self) -> None:
         self._log.close()
+        self._lock.close()
 
 
 def write_json(file: Path, content: Mapping[str, Any]) -> None:
@@ -178,7 +196,39 @@ class FrameStore:
             create(name, dims, values.dtype, meta)[...] = values
         self._time = create("time", ("time",), np.float64, time_attrs)
         self._arrays = {name: create(name, *variable) for name, variable in variables.items()}
+        self._hashes: dict[str, str] = {}
         self._publish()
+
+    @classmethod
+    def reopen(
+        cls, path: Path, frames: int, names: Sequence[str], written: int, hashes: Mapping[str, str]
+    ) -> "FrameStore":
+        """Return a store that was written before, cut to its first `written` frames, with room for
+        all."""
+        group: Any = zarr.open_group(path, mode="r+", use_consolidated=False)
+        store = object.__new__(cls)
+        store.path, store.written, store._hashes = path, written, dict(hashes)
+        store._time = group["time"]
+        store._arrays = {name: group[name] for name in names}
+        for array in (store._time, *store._arrays.values()):
+            # What was behind is removed, and not only hidden.
+            array.resize((written, *array.shape[1:]))
+            array.resize((frames, *array.shape[1:]))
+        store._publish()
+        return store
+
+    def read(self, frames: slice) -> dict[str, np.ndarray]:
+        """Return the variables of some frames."""
+        stop = min(frames.stop, self.written)
+        return {name: np.asarray(a[frames.start : stop]) for name, a in self._arrays.items()}
+
+    def files(self) -> dict[str, str]:
+        """Return the SHA-256 of every file with frames. Files of whole blocks are read once."""
+        for file in sorted(self.path.rglob("c/**/*")):
+            name = str(file.relative_to(self.path))
+            if file.is_file() and name not in self._hashes:
+                self._hashes[name] = _sha256(file)
+        return dict(self._hashes)
 
     def write(self, times: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
         """Append complete frames; their times are written last."""
@@ -205,6 +255,22 @@ class FrameStore:
 
     def _publish(self) -> None:
         consolidate(self.path, self.written)
+
+
+def damaged_files(path: Path, hashes: Mapping[str, str]) -> str | None:
+    """Return the first file of a store whose SHA-256 is not this one, None if all are."""
+    for name, known in hashes.items():
+        file = path / name
+        try:
+            if _sha256(file) != known:
+                return str(file)
+        except OSError:
+            return str(file)
+    return None
+
+
+def _sha256(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def consolidate(path: Path, frames: int | None = None) -> None:

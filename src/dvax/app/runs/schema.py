@@ -367,6 +367,9 @@ class ReportSection(Section):
 
     report: bool = Field(True, description="write report.html")
     png: bool = Field(True, description="write the figures as PNG")
+    checkpoint_seconds: float = Field(
+        5.0, ge=0, description="seconds between two checkpoints, from which dvax resume goes on"
+    )
 
 
 class OutputSection(ReportSection):

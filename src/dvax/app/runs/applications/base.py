@@ -96,7 +96,8 @@ class AbstractApplication(abc.ABC):
     - `section`: the table, for pydantic; `table`: the checked one, complete;
     - `files`, `folders`: the keys that name data files, and folders with the files that are read there;
     - `keys`: the keys that make an argument of the model, where their names differ from its name;
-    - `end`: the key for the last time of a run, where there is one.
+    - `end`: the key for the last time of a run, where there is one;
+    - `title`: of the run, by default that of the configuration.
     """
 
     section: ClassVar[type[Section]]
@@ -105,6 +106,7 @@ class AbstractApplication(abc.ABC):
     folders: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     keys: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     end: ClassVar[str | None] = None
+    title: str = ""
 
     @abc.abstractmethod
     def __init__(self, table: Any, paths: Mapping[str, Path], quiet: bool): ...

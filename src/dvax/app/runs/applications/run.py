@@ -10,7 +10,15 @@ import zarr
 
 from dvax.app.runs.applications.base import Figure, Plan, Results, Variable
 from dvax.app.runs.applications.config import ModelConfig
-from dvax.app.runs.applications.segments import join_pieces, segments, states_only
+from dvax.app.runs.applications.segments import (
+    end_of,
+    from_checkpoint,
+    join_pieces,
+    segment_length,
+    segments,
+    states_only,
+    to_checkpoint,
+)
 from dvax.app.runs.interrupt import Work, interruptible, patience
 from dvax.app.runs.run import AbstractRun, Facts, Listener
 from dvax.app.runs.rundir import consolidate
@@ -27,8 +35,8 @@ class ApplicationRun(AbstractRun):
         super().__init__(config, tell)
         self.model, self.wording = config.model, config.wording
         known = self.model.describe()
-        self.title = f"{config.name}, {config.source.stem}"
-        about = {"model": config.name, "title": self.title, "fit": self.model.fit}
+        title = self.model.title or f"{config.name}, {config.source.stem}"
+        about = {"model": config.name, "title": title, "fit": self.model.fit}
         rows = constant_rows(known.constants)
         self.facts = Facts(rows, known.assumptions, config.fingerprints(), known.notes, about)
         self.plan: Plan | None = None
@@ -37,13 +45,24 @@ class ApplicationRun(AbstractRun):
         self.results: Results | None = None
 
     def begin(self) -> None:
-        """Results are written when there are any."""
+        # Results are written when there are any.
+        self.directory.remove("trajectory.zarr")
+        # Each is a piece: none can be missing before another one.
+        whole = [c for k, c in enumerate(self.saved) if c.number == k]
+        self.saved, self.kept = whole, len(whole)
 
     def solve(self) -> None:
         plan = self.plan = interruptible(lambda: self.model.plan(self._stage))
-        for piece in segments(plan):
+        # One piece is solved at least: the others are made like it.
+        count = -(-len(plan.times) // segment_length(plan))
+        saved = self.saved[: count - 1]
+        x, step = end_of(saved[-1], plan) if saved else (None, None)
+        for piece in segments(plan, len(saved), x, step):
+            if not self.pieces:
+                self.pieces = [from_checkpoint(c, piece, plan) for c in saved]
+                self.steps = sum(int(one.stats["steps"]) for one in self.pieces)
             self.pieces.append(piece)
-            if len(self.pieces) == 1:
+            if len(self.pieces) == len(saved) + 1:
                 # Compile all programs of the figures now, so that they need no time after an interrupt.
                 self.last = Work(self._compute(plan))
                 self.last.result()
@@ -56,9 +75,21 @@ class ApplicationRun(AbstractRun):
                 "progress", t=t - begin, t_end=float(plan.times[-1]) - begin, steps=self.steps,
                 method=self.method, unit=plan.time_unit,
             )  # fmt: skip
+            if self.checkpoints.is_due():
+                self.checkpoint()
         self._stage("writing the results")
         self.last = Work(self._compute(plan))
         self.results = self.last.result()
+
+    def checkpoint(self) -> None:
+        if self.plan is None:
+            return
+        fixed = self.plan.settings.get("dt") is not None
+        for number, piece in enumerate(self.pieces[self.kept :], start=self.kept):
+            arrays, about = to_checkpoint(piece)
+            next_dt = None if fixed else float(piece.stats["next_dt"])
+            self.checkpoints.save(number, arrays, about | {"next_dt": next_dt})
+            self.kept = number + 1
 
     def reached(self) -> str:
         if self.plan is None or not self.pieces:
@@ -88,7 +119,7 @@ class ApplicationRun(AbstractRun):
             self.facts = replace(self.facts, rows=constant_rows(results.constants))
         for notice in results.notices:
             self.event("warning", message=notice)
-        attrs = {"title": self.title, "model": self.config.name}
+        attrs = {"title": self.facts.model["title"], "model": self.config.name}
         write_dataset(self.directory.path / "trajectory.zarr", results.variables, attrs)
         if results.files is not None:
             results.files(self.directory.path)

@@ -13,7 +13,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from dvax._tree import Label
 from dvax.app.runs.applications.base import Plan, Results, Variable
+from dvax.app.runs.checkpoints import Checkpoint
 from dvax.app.runs.interrupt import interruptible
 from dvax.app.runs.solutions import all_finite, cut, with_fields
 from dvax.app.runs.solver_options import SEGMENTS
@@ -22,25 +24,26 @@ from dvax.evolution import Implicit, Solution, solve
 from dvax.evolution.responses import Responses
 
 
-def segments(plan: Plan) -> Iterator[Solution]:
-    """The pieces of the solution, in order. Each is cut to its own times.
+def segments(plan: Plan, first: int = 0, x: Any = None, step: Any = None) -> Iterator[Solution]:
+    """The pieces of the solution from number `first` on, in order, each cut to its own times: from the
+    state x and with the step size that the piece before ended with.
 
     **Raises:** `dvax.SolveError` after the last piece that was reached, the piece that failed (where
     it reached a saved time) included.
     """
     times = np.asarray(plan.times, float)
-    first, last = float(times[0]), float(times[-1])
+    t0, last = float(times[0]), float(times[-1])
     if len(times) == 1:
         return
     fixed = plan.settings.get("dt") is not None
     measure = {} if isinstance(plan.settings.get("method"), Implicit) else {"measure": True}
-    length = max(2, math.ceil(len(times) / SEGMENTS))
-    x, step = plan.x0, None
-    for begin in range(0, len(times), length):
+    length = segment_length(plan)
+    x = plan.x0 if first == 0 else x
+    for begin in range(first * length, len(times), length):
         wanted = times[begin : begin + length]
         # Segments have one length, so that they share one compiled program: the last repeats its end.
         ts = np.concatenate([wanted, np.full(length - len(wanted), wanted[-1])])
-        start = first if begin == 0 else float(times[begin - 1])
+        start = t0 if begin == 0 else float(times[begin - 1])
         if not start < ts[-1]:
             ts, wanted = ts[:1], wanted[:1]  # a single time, at the very start
 
@@ -49,7 +52,7 @@ def segments(plan: Plan) -> Iterator[Solution]:
         ) -> Solution:
             solution = solve(
                 plan.problem, x, start, float(ts[-1]), plan.args, ts, constants=plan.constants,
-                dt0=step, horizon=last - first, **measure, **plan.settings,
+                dt0=step, horizon=last - t0, **measure, **plan.settings,
             )  # fmt: skip
             solution = all_finite(solution, start)
             # Here, where a signal can interrupt the compilation, and for all times of the segment,
@@ -64,6 +67,44 @@ def segments(plan: Plan) -> Iterator[Solution]:
             raise
         yield cut(solution, len(wanted))
         x, step = solution.stats["x"], None if fixed else float(solution.stats["next_dt"])
+
+
+def segment_length(plan: Plan) -> int:
+    """The number of saved times of a piece."""
+    return max(2, math.ceil(len(plan.times) / SEGMENTS))
+
+
+_SAVED = ("ts", "xs", "law", "defect", "law_defect", "completed_defect", "stats")
+
+
+def to_checkpoint(piece: Solution) -> tuple[list[Any], dict[str, Any]]:
+    """Return the arrays of a piece and facts about it, for a checkpoint: first the state at its end."""
+    end = jtu.tree_leaves(piece.stats["x"])
+    rows = jtu.tree_leaves({name: getattr(piece, name) for name in _SAVED})
+    method = str(piece.stats["method"])
+    return [*end, *rows], {"method": method, "enclosed": piece.enclosed, "parts": len(end)}
+
+
+def end_of(saved: Checkpoint, plan: Plan) -> tuple[Any, float | None]:
+    """Return the state and the step size with which the next piece begins."""
+    parts = int(saved.about["parts"])
+    x = jtu.tree_structure(plan.x0).unflatten([jnp.asarray(leaf) for leaf in saved.arrays[:parts]])
+    step = saved.about["next_dt"]
+    return x, None if step is None else float(step)
+
+
+def from_checkpoint(saved: Checkpoint, like: Solution, plan: Plan) -> Solution:
+    """Return the piece of a checkpoint; `like` is another piece of the same run."""
+    tree = jtu.tree_structure({name: getattr(like, name) for name in _SAVED})
+    fields = tree.unflatten(saved.arrays[int(saved.about["parts"]) :])
+    fields["stats"]["method"] = Label(saved.about["method"])
+    setup = like.setup
+    if saved.number == 0:
+        # That of the whole run (`join_pieces`).
+        ends = {"t0": float(plan.times[0]), "t1": float(np.asarray(fields["ts"])[-1])}
+        x0 = jtu.tree_map(jnp.asarray, plan.x0)
+        setup = setup._replace(x0=x0, setting={**setup.setting, **ends})
+    return with_fields(like, fields | {"setup": setup, "enclosed": bool(saved.about["enclosed"])})
 
 
 def join_pieces(pieces: list[Solution], count: int | None = None) -> Solution:

@@ -92,7 +92,7 @@ class PythonApplication(AbstractApplication):
                 "it must return a dvax.models.Model",
                 "Write return dvax.models.Model(problem, x0, t_end)",
             )  # fmt: skip
-        self.own = model
+        self.own, self.title = model, model.title
         self.t_end = float(model.t_end if table.t_end is None else table.t_end)
         if not self.t_end > model.t0:
             raise input_error(
