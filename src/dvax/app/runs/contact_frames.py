@@ -97,13 +97,14 @@ def constant_rows(constants: Constants, config: Config, T: float, rho: float) ->
 
 def attributes(
     config: Config,
+    title: str,
     rows: Sequence[Mapping[str, Any]],
     shape: tuple[int, ...],
     known: tuple[Assumption, ...],
 ) -> dict[str, Any]:
     """Attributes of the whole dataset."""
     return {
-        "title": f"contact law, {config.source.stem}",
+        "title": title,
         "model": "contact",
         "beta": config.model.beta,
         "kappa0": config.model.kappa0,

@@ -57,7 +57,7 @@ class ContactRun(AbstractRun):
             assumptions(config, inputs),
             inputs.data_files,
             inputs.notices,
-            {"points": inputs.boundary.size},
+            {"points": inputs.boundary.size, "title": f"contact law, {config.source.stem}"},
         )
         file = config.source.name
         self.wording = Wording(file, "solver", SolverSection, elsewhere=_ELSEWHERE)
@@ -68,7 +68,9 @@ class ContactRun(AbstractRun):
         inputs, config = self.inputs, self.config
         self.at = self.kept = _Reached(_Piece(inputs.x0), _Piece(inputs.companion_x0))
         path = self.directory.path / "trajectory.zarr"
-        known = variables(config, len(inputs.boundary.names))
+        new, old = (path.with_name(f".{path.name}.{which}") for which in ("new", "old"))
+        if not path.exists() and new.exists():
+            new.rename(path)  # a process was killed between the two renames below
         for saved in reversed(self.saved):
             reached = _Reached.of(saved)
             damaged = damaged_files(path, reached.files)
@@ -76,25 +78,32 @@ class ContactRun(AbstractRun):
                 self.at = self.kept = reached
                 break
             self.event("warning", message=f"{damaged} is damaged: it is not used.")
+        self.directory.remove(new.name)
+        self.store = FrameStore(
+            new,
+            len(inputs.frame_times),
+            self.block,
+            coordinates(inputs, config),
+            variables(config, len(inputs.boundary.names)),
+            attributes(
+                config, self.facts.model["title"], self.facts.rows, inputs.boundary.shape,
+                self.facts.assumptions,
+            ),
+            {"long_name": "time", "units": config.units.time},
+        )  # fmt: skip
+        self.store.adopt(path, self.at.frames, self.at.files)
+        if path.exists():
+            path.rename(old)
+        self.store.move(path)
+        self.directory.remove(old.name)
         if self.at.frames == 0:
-            self.directory.remove(path.name)
-            self.store = FrameStore(
-                path,
-                len(inputs.frame_times),
-                self.block,
-                coordinates(inputs, config),
-                known,
-                attributes(config, self.facts.rows, inputs.boundary.shape, self.facts.assumptions),
-                {"long_name": "time", "units": config.units.time},
-            )
             return
-        self.store = FrameStore.reopen(
-            path, len(inputs.frame_times), list(known), self.at.frames, self.at.files
-        )
         self.steps, self.rejected, self.method = self.at.steps, self.at.rejected, self.at.method
+        self.going_on(float(inputs.frame_times[self.at.frames - 1]), config.units.time)
         for first in range(0, self.at.frames, self.block):
             frames = slice(first, first + self.block)
             self.figures.add(inputs.frame_times[frames], self.store.read(frames), self.at.status)
+        self.store.mark(_BOUNDS, self.figures.status)
 
     def checkpoint(self) -> None:
         if self.at.frames == self.kept.frames:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from dvax.app.runs.checkpoints import Checkpoint, Checkpoints
 from dvax.app.runs.compile_time import compile_stopwatch
-from dvax.app.runs.data_file import DataFile
+from dvax.app.runs.data_file import DataFile, fingerprint
 from dvax.app.runs.figure import Figure
 from dvax.app.runs.interrupt import exit_code, writing
 from dvax.app.runs.provenance import provenance
@@ -112,6 +112,9 @@ class AbstractRun(abc.ABC):
             # The name of the first configuration, and not that of the resolved one.
             title = {"title": directory.title()} if directory.title() else {}
             self.facts = replace(self.facts, model={**self.facts.model, **title})
+            if directory.lost:
+                words = f"log.jsonl was damaged: {directory.lost} of its lines are removed."
+                self.event("warning", message=words)
             for file in damaged:
                 self.event("warning", message=f"{file} is damaged: it is not used.")
         else:
@@ -153,15 +156,25 @@ class AbstractRun(abc.ABC):
 
     def _identity(self) -> dict[str, str]:
         """Return the settings, the data and the versions, which must be the same for a run to go on."""
-        files = {key for key, _ in self.config.data_files()}
+        files = self.config.data_files()
+        keys = {key for key, _ in files}
+        # Copies have other names than the files that they were made from.
+        data = {
+            f"data of {key}, {k}": fingerprint(key, path).sha256
+            for k, (key, path) in enumerate(files)
+        }
         made_by = provenance()
         packages = {name: str(made_by["packages"][name]) for name in ("jax", "jaxlib", "numpy")}
         return {
-            **{k: v for k, v in _settings(self.config.tree()).items() if k not in files},
-            **{f"data {file.name}": file.sha256 for file in self.facts.data},
+            **{k: v for k, v in _settings(self.config.tree()).items() if k not in keys},
+            **data,
             **{name: str(made_by[name]) for name in ("dvax", "device", "precision")},
             **packages,
         }
+
+    def going_on(self, t: float, unit: str) -> None:
+        """Tell that the run goes on from this time."""
+        self.event("stage", stage=f"going on from t = {t:.10g} {unit}".rstrip())
 
     def event(self, kind: str, **facts: Any) -> None:
         """Log an event and tell the listener."""

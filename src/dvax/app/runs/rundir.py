@@ -18,7 +18,7 @@ import json
 import os
 import platform
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,10 @@ FILES = (
     "config.resolved.toml", "manifest.json", "summary.json", "log.jsonl", "report.html",
     "body.vtu", "body-contact.vtu",
 )  # fmt: skip
-FOLDERS = ("trajectory.zarr", "figures", "inputs", checkpoints.FOLDER)
+FOLDERS = (
+    "trajectory.zarr", ".trajectory.zarr.new", ".trajectory.zarr.old", "figures", "inputs",
+    checkpoints.FOLDER,
+)  # fmt: skip
 _CHUNK_BYTES = 2**23
 
 
@@ -52,6 +55,8 @@ class RunDirectory:
             for name in FOLDERS:
                 if (path / name).exists():
                     shutil.rmtree(path / name)
+        self.lost = 0 if clear else _repair(path / "log.jsonl")
+        """Lines of the log that were damaged, and removed."""
         self._log = (path / "log.jsonl").open("a", encoding="utf-8")
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
@@ -80,6 +85,22 @@ class RunDirectory:
     def close(self) -> None:
         self._log.close()
         self._lock.close()
+
+
+def _repair(log: Path) -> int:
+    """Remove the lines of a log that are no JSON, and return their number."""
+    if not log.is_file():
+        return 0
+    kept, lines = [], log.read_bytes().splitlines()
+    for line in lines:
+        try:
+            json.loads(line.decode())
+            kept.append(line)
+        except ValueError:
+            pass
+    if len(kept) < len(lines):
+        write_whole(log, b"".join(line + b"\n" for line in kept))
+    return len(lines) - len(kept)
 
 
 def write_json(file: Path, content: Mapping[str, Any]) -> None:
@@ -199,23 +220,23 @@ class FrameStore:
         self._hashes: dict[str, str] = {}
         self._publish()
 
-    @classmethod
-    def reopen(
-        cls, path: Path, frames: int, names: Sequence[str], written: int, hashes: Mapping[str, str]
-    ) -> "FrameStore":
-        """Return a store that was written before, cut to its first `written` frames, with room for
-        all."""
+    def adopt(self, other: Path, written: int, hashes: Mapping[str, str]) -> None:
+        """Take over the first `written` frames of another store, in these files. Its metadata are not
+        used: they have no hashes."""
+        for name in hashes:
+            target = self.path / name
+            if not target.exists():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(other / name, target)
+        self.written, self._hashes = written, dict(hashes)
+        self._publish()
+
+    def move(self, path: Path) -> None:
+        """Rename the store."""
+        self.path = self.path.rename(path)
         group: Any = zarr.open_group(path, mode="r+", use_consolidated=False)
-        store = object.__new__(cls)
-        store.path, store.written, store._hashes = path, written, dict(hashes)
-        store._time = group["time"]
-        store._arrays = {name: group[name] for name in names}
-        for array in (store._time, *store._arrays.values()):
-            # What was behind is removed, and not only hidden.
-            array.resize((written, *array.shape[1:]))
-            array.resize((frames, *array.shape[1:]))
-        store._publish()
-        return store
+        self._time = group["time"]
+        self._arrays = {name: group[name] for name in self._arrays}
 
     def read(self, frames: slice) -> dict[str, np.ndarray]:
         """Return the variables of some frames."""
@@ -223,7 +244,7 @@ class FrameStore:
         return {name: np.asarray(a[frames.start : stop]) for name, a in self._arrays.items()}
 
     def files(self) -> dict[str, str]:
-        """Return the SHA-256 of every file with frames. Files of whole blocks are read once."""
+        """Return the SHA-256 of every file of values. Files of complete blocks are read once."""
         for file in sorted(self.path.rglob("c/**/*")):
             name = str(file.relative_to(self.path))
             if file.is_file() and name not in self._hashes:

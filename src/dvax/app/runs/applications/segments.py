@@ -96,7 +96,8 @@ def end_of(saved: Checkpoint, plan: Plan) -> tuple[Any, float | None]:
 def from_checkpoint(saved: Checkpoint, like: Solution, plan: Plan) -> Solution:
     """Return the piece of a checkpoint; `like` is another piece of the same run."""
     tree = jtu.tree_structure({name: getattr(like, name) for name in _SAVED})
-    fields = tree.unflatten(saved.arrays[int(saved.about["parts"]) :])
+    rows = map(jnp.asarray, saved.arrays[int(saved.about["parts"]) :])
+    fields = tree.unflatten(rows)
     fields["stats"]["method"] = Label(saved.about["method"])
     setup = like.setup
     if saved.number == 0:
