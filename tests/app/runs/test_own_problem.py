@@ -1,4 +1,4 @@
-"""A problem of one's own from the command line: `[model] python = "file.py:build"`."""
+"""A problem of your own from the command line: `[model] python = "file.py:build"`."""
 
 import json
 import subprocess
@@ -78,7 +78,7 @@ def test_the_report_says_that_code_ran_and_draws_the_variables_in_order(outcome)
     assert "The code of own.py:build is executed." in page
     assert page.index('"depth') < page.index('"force')
     manifest = json.loads((outcome.directory / "manifest.json").read_text())
-    assert "own.py" in manifest["data"] and manifest["fit"] == "a problem of one's own: own.py"
+    assert "own.py" in manifest["data"] and manifest["fit"] == "a problem of your own: own.py"
 
 
 def test_a_run_directory_runs_again(outcome, tmp_path):

@@ -1,4 +1,4 @@
-"""`dvax new DIR`: a problem of one's own to start from."""
+"""`dvax new DIR`: a problem of your own to start from."""
 
 from importlib.resources import files
 from pathlib import Path
@@ -18,7 +18,7 @@ def new(
     out: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to make.")],
     debug: Debug = False,
 ) -> None:
-    """Write a small problem of one's own: a Python file, its configuration, and a test."""
+    """Write a small problem of your own: a Python file, its configuration, and a test."""
     with reported(debug, out):
         taken = [name for name in FILES if (out / name).exists()]
         if taken or (out.exists() and not out.is_dir()):

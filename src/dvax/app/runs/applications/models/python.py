@@ -107,7 +107,7 @@ class PythonApplication(AbstractApplication):
 
     @property
     def fit(self) -> str:
-        return f"a problem of one's own: {self.file.name}"
+        return f"a problem of your own: {self.file.name}"
 
     @property
     def settings(self) -> dict[str, Any]:
