@@ -135,7 +135,9 @@ def test_members_that_fail_leave_the_others_alone():
     np.testing.assert_allclose(found.mean, found.values[good].mean(), rtol=1e-14)
     np.testing.assert_allclose(found.std, found.values[good].std(ddof=1), rtol=1e-12)
     np.testing.assert_allclose(found.quantile(0.5), np.median(found.values[good]))
-    assert set(found.failures()) == {1, 4} and "Stopped at t = 0.49999" in found.failures()[1]
+    told = found.failures()
+    assert set(told) == {1, 4}
+    assert "The step became too small" in told[1] and "Stopped at t = 0.49999" in told[1]
     with pytest.raises(dvax.SolveError, match="finite-time escape"):
         found.member(1)
 
@@ -307,6 +309,7 @@ SHAPE = {"load": LOADS[:3]}
     ((STARTS[:3], 0.0, 1.0, SHAPE, [[0.5], [1.0], [2.0]]), {}, r"ts\) of member 2"),
     ((STARTS[:3], 0.0, 1.0, SHAPE), {"axes": (0, 1)}, r"ensemble\(axes\)"),
     ((STARTS[:3], 0.0, 1.0, SHAPE), {"axes": (0, {"lode": 0})}, r"ensemble\(axes\)"),
+    ((STARTS[:3], 0.0, 1.0, SHAPE), {"axes": (0, 0, 0)}, "it must be a pair"),
     ((STARTS[:3], 0.0, 1.0, SHAPE), {"method": dvax.PiecewiseLinear()}, "runs in Python"),
     ((STARTS[:3], 0.0, 1.0, SHAPE), {"rtol": -1.0}, "positive and finite"),
     ((STARTS[:0], 0.0, 1.0, {"load": LOADS[:0]}), {}, "at least one"),
@@ -344,3 +347,44 @@ assert every.values.tobytes() == one.values.tobytes()
 def test_members_are_the_same_on_all_devices():
     flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
     subprocess.run([sys.executable, "-c", ON_DEVICES], env=os.environ | flags, check=True)
+
+
+def test_an_ensemble_without_success_has_no_mean():
+    with pytest.warns(UserWarning, match="3 of 3 members failed"):
+        found = dvax.ensemble(
+            loaded(), STARTS[:3], 0.0, 1.0, {"load": LOADS[:3]}, max_steps=2, rtol=1e-9
+        )
+    assert (
+        np.isnan(found.mean) and np.isnan(found.std) and np.isnan(found.quantile([0.1, 0.9])).all()
+    )
+    assert "largest number of steps" in found.failures()[0]
+
+
+@pytest.mark.parametrize("place", [0, 2])
+def test_a_member_that_does_not_start_at_a_number_fails_alone(place):
+    starts = np.array(STARTS[:4])
+    starts[place] = np.nan
+    with pytest.warns(
+        UserWarning, match=f"1 of 4 members failed, the first of them number {place}"
+    ):
+        found = dvax.ensemble(loaded(), starts, 0.0, 1.0, {"load": LOADS[:4]})
+    assert np.flatnonzero(found.failed).tolist() == [place]
+
+
+def test_an_ensemble_keeps_its_inputs():
+    loads = np.array(LOADS[:3])
+    found = dvax.ensemble(loaded(), -1.0, 0.0, 1.0, {"load": loads})
+    loads[:] = 100.0
+    np.testing.assert_allclose(found.member(1).xs[0], found.values[1], atol=1e-12)
+    with pytest.raises(dvax.InputError, match="numbered from 0 to 2"):
+        found.member(3)
+
+
+def test_moments_of_complex_values_and_quantiles_of_flags():
+    rows = RNG.normal(size=50) + 1j * RNG.normal(size=50)
+    found = Moments.of(rows[:20], np.ones(20, bool)).merge(Moments.of(rows[20:], np.ones(30, bool)))
+    np.testing.assert_allclose(found.standard_deviation(), rows.std(ddof=1), rtol=1e-12)
+    flags = dvax.ensemble(
+        loaded(), -1.0, 0.0, 1.0, {"load": LOADS[:5]}, observe=lambda sol: sol.xs[-1] > 0.0
+    )
+    assert 0.0 <= flags.quantile(0.5) <= 1.0

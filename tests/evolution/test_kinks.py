@@ -262,6 +262,17 @@ def test_regimes_without_dense_are_those_with_it(options):
     assert positive.tolist() == signs.tolist() == [[True, False], [True, True], [False, True]]
 
 
+def test_regimes_of_a_failed_run_end_where_it_ended():
+    case = c1()
+    run = lambda **more: dvax.solve(  # noqa: E731
+        case.problem, jnp.asarray(case.x0), 0.0, 2.0, case.args, max_steps=12, throw=False, **more
+    )
+    stopped = run()
+    (times, _), (expected, _) = stopped.regimes(), run(dense=True).regimes()
+    np.testing.assert_allclose(times, expected, atol=1e-12)
+    assert times[-1] == pytest.approx(float(stopped.stats["t"])) and times[-1] < 1.0
+
+
 def test_regimes_follow_a_run_that_resets_its_state():
     case = c1()
     back = dvax.Event(lambda t, x, u, args: x - 1.0, reset=lambda t, x, u, args: -x, direction=1)

@@ -40,7 +40,7 @@ def ensemble(
     args: Any = None,
     ts: Any = None,
     *,
-    axes: tuple[Any, Any] = (0, 0),
+    axes: tuple[Any, ...] = (0, 0),
     observe: Callable[[Solution], Tree] | None = None,
     keep: bool = True,
     folds: Mapping[str, Fold] | None = None,
@@ -111,11 +111,12 @@ def ensemble(
         adjoint=adjoint, events=events, max_events=max_events,
     )  # fmt: skip
     check_events(events, max_events, method, dt, False)
-    check_own(method, observe, folds, keep, lanes)
+    check_own(method, observe, folds, keep, lanes, axes)
     states, times = _tree.as_float(x0s, "x0s"), (_times(t0), _times(t1))
     inputs = Inputs.of(states, as_arrays(args), *times, _times(ts), axes)
     _check_times(inputs)
-    x0, own_args, begin, end, own_ts = inputs.member(0)
+    # A member whose x0 is not finite fails alone.
+    x0, own_args, begin, end, own_ts = inputs.member(inputs.example())
     check(
         problem, x0, begin, end, own_ts, dt, rtol, atol, dt0, dt_max, horizon, method, adjoint,
         measure, False, vi_solver, max_steps, constants, progress,
@@ -182,7 +183,8 @@ def _ensemble(
         if other is not None and len(members):
             collect(kept, program(other), inputs, members, devices)
             switched[members] = True
-            text += f"; {len(members)} members by {other.text()}"
+            count = f"{len(members)} member" + ("" if len(members) == 1 else "s")
+            text += f"; {count} by {other.text()}"
     rows, moments = kept.rows, kept.moments
     assert rows is not None and moments is not None
 
@@ -230,13 +232,20 @@ def _longest(inputs: Inputs) -> tuple[Any, Any]:
     return inputs.member(int(np.argmax(t1 - t0 + np.zeros(inputs.count))))[2:4]
 
 
-def check_own(method: Any, observe: Any, folds: Any, keep: Any, lanes: Any) -> None:
+def check_own(
+    method: Any, observe: Any, folds: Any, keep: Any, lanes: Any, axes: Any = (0, 0)
+) -> None:
     """Raise one `InputError` with everything that is wrong with the arguments of an ensemble alone."""
     wrong = Problems()
     if isinstance(method, PiecewiseLinear):
         wrong.add(
             "dvax.ensemble(method)", "PiecewiseLinear", "it runs in Python, one member at a time",
             "Leave it out, or use dvax.ExpRosenbrock()",
+        )  # fmt: skip
+    if not (isinstance(axes, tuple) and len(axes) == 2):
+        wrong.add(
+            "dvax.ensemble(axes)", _tree.line(axes), "it must be a pair, for x0s and for args",
+            "Write axes=(0, 0), the default, or axes=(0, None) if all members share args",
         )  # fmt: skip
     if not (observe is None or callable(observe)):
         wrong.add(

@@ -44,7 +44,8 @@ class Inputs(NamedTuple):
             *([] if ts is None else [np.ndim(ts) > 1]),
         ]
         paths, tree = jtu.tree_flatten_with_path(inputs)
-        leaves = [_tree.host(leaf) for _, leaf in paths]
+        # Copies: the ensemble solves single members later.
+        leaves = [np.array(leaf) if _is_array(leaf) else leaf for _, leaf in paths]
         lengths = {
             _NAMES[path[0].idx] + jtu.keystr(path[1:]): np.shape(leaf)
             for (path, leaf), is_own in zip(paths, own, strict=True)
@@ -69,9 +70,21 @@ class Inputs(NamedTuple):
             [leaf[k] if own else leaf for leaf, own in zip(self.leaves, self.own, strict=True)]
         )
 
+    def example(self) -> int:
+        """Return the number of the first member with finite values, 0 if there is none."""
+        finite = np.ones(self.count, bool)
+        for leaf, own in zip(self.leaves, self.own, strict=True):
+            if own and _tree.is_concrete(leaf) and leaf.dtype.kind in "fc":
+                finite &= np.isfinite(leaf).reshape(self.count, -1).all(axis=1)
+        return int(np.argmax(finite))
+
     def rows(self, members: Any) -> list[Any]:
         """Return the leaves that differ, of these members."""
         return [leaf[members] for leaf, own in zip(self.leaves, self.own, strict=True) if own]
+
+
+def _is_array(leaf: Any) -> bool:
+    return _tree.is_concrete(leaf) and isinstance(leaf, jax.Array | np.ndarray)
 
 
 def _own(axes: Any, of: Any, name: str) -> list[bool]:

@@ -25,11 +25,12 @@ class Moments(NamedTuple):
 
         def mean(leaf: Any) -> Any:
             kept = xp.where(_wide(valid, leaf), leaf, 0.0)
-            return xp.sum(kept, axis=0) / xp.maximum(count, 1).astype(kept.dtype)
+            mean = xp.sum(kept, axis=0) / xp.maximum(count, 1).astype(kept.dtype)
+            return xp.where(count > 0, mean, xp.nan)
 
         def squares(leaf: Any, mean: Any) -> Any:
             away = xp.where(_wide(valid, leaf), leaf, mean) - mean
-            return xp.sum(away**2, axis=0)
+            return xp.sum(xp.abs(away) ** 2, axis=0)
 
         means = jtu.tree_map(mean, rows)
         return Moments(count, means, jtu.tree_map(squares, rows, means))
@@ -37,13 +38,18 @@ class Moments(NamedTuple):
     def merge(self, other: "Moments") -> "Moments":
         """Return the moments of both sets of rows (Chan, Golub and LeVeque 1983)."""
         count = self.count + other.count
-        if not count:
+        if not other.count:
             return self
+        if not self.count:
+            return other
         share = other.count / count
         away = jtu.tree_map(lambda a, b: b - a, self.mean, other.mean)
         mean = jtu.tree_map(lambda a, d: a + share * d, self.mean, away)
         squares = jtu.tree_map(
-            lambda a, b, d: a + b + self.count * share * d**2, self.squares, other.squares, away
+            lambda a, b, d: a + b + self.count * share * abs(d) ** 2,
+            self.squares,
+            other.squares,
+            away,
         )
         return Moments(count, mean, squares)
 

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
@@ -87,7 +88,12 @@ class Ensemble:
         xp = _tree.array_module(self.values, self.failed)
         if xp is np:
             valid = ~self.failed
-            return jtu.tree_map(lambda leaf: np.quantile(leaf[valid], q, axis=0), self.values)
+            if not valid.any():
+                return jtu.tree_map(
+                    lambda leaf: np.full(np.shape(q) + leaf.shape[1:], np.nan), self.values
+                )
+            rows = lambda leaf: leaf[valid].astype(float) if leaf.dtype == bool else leaf[valid]  # noqa: E731
+            return jtu.tree_map(lambda leaf: np.quantile(rows(leaf), q, axis=0), self.values)
 
         def quantile(leaf: Any) -> Any:
             away = self.failed.reshape(-1, *(1,) * (leaf.ndim - 1))
@@ -97,7 +103,8 @@ class Ensemble:
 
     def failures(self) -> dict[int, str]:
         """Return the result of each failed member, in a sentence, by its number."""
-        each = lambda k: jtu.tree_map(lambda leaf: leaf[k], self.results)  # noqa: E731
+        # Messages are looked up by arrays of JAX.
+        each = lambda k: jtu.tree_map(lambda leaf: jnp.asarray(leaf[k]), self.results)  # noqa: E731
         return {
             int(k): f"{RESULTS[each(k)]} Stopped at t = {float(self.ts[k]):.10g} after "
             f"{int(self.steps[k])} steps."
@@ -115,6 +122,13 @@ class Ensemble:
                 InputProblem(
                     "Ensemble.member", "an ensemble inside a compiled program",
                     "its inputs have no values", "Call it outside of jax.jit and jax.grad",
+                )
+            )  # fmt: skip
+        if not -len(self) <= k < len(self):
+            raise InputError(
+                InputProblem(
+                    "Ensemble.member(k)", str(k), f"members are numbered from 0 to {len(self) - 1}",
+                    "Give such a number",
                 )
             )  # fmt: skip
         return self.again(k)

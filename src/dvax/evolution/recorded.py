@@ -8,6 +8,7 @@ import numpy as np
 
 from .arguments import ADAPTIVE_STEPS, first_step
 from .piecewise.method import PiecewiseLinear
+from .results import is_success
 from .solve import solve
 
 if TYPE_CHECKING:
@@ -28,11 +29,13 @@ def recorded(solution: "Solution") -> "Solution":
     has_default_dt0 = number["dt0"] == float(first_step(t1 - t0, t0, t1, setup.dtype))
     tolerances = {name: number[name] for name in ("rtol", "atol")}
     if math.isnan(number["dt"]):
+        succeeded = bool(is_success(solution.result))
         attempts = sum(int(solution.stats[name]) for name in ("steps", "rejected"))
         steps: dict[str, Any] = tolerances | {
             "dt0": None if has_default_dt0 else number["dt0"],
             "dt_max": number["dt_max"] if math.isfinite(number["dt_max"]) else None,
-            "max_steps": max(ADAPTIVE_STEPS, attempts),
+            # A run that failed stops where it did.
+            "max_steps": max(ADAPTIVE_STEPS, attempts) if succeeded else attempts,
         }
     else:
         steps = tolerances | {"dt": number["dt"], "measure": solution.defect is not None}

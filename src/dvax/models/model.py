@@ -1,4 +1,4 @@
-"""A problem with what a run of the command line needs besides."""
+"""A problem with its initial state, duration, names and units, for the command line."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -25,7 +25,8 @@ class Model:
     - `states`: a name for each entry of x with its unit, or for each part of a tuple, such as
       {"position": "m", "velocity": "m/s"}; `responses`: the same for u;
     - `constants`: proved or declared `dvax.Constants`, by default those of `dvax.verify`;
-    - `settings`: options of `dvax.solve`, such as {"rtol": 1e-8};
+    - `settings`: options of `dvax.solve`, such as {"rtol": 1e-8}: method, rtol, atol, dt, dt_max,
+      max_steps, vi_solver;
     - `figures`: a function of the `dvax.Solution` to numbers for the summary, by name: (value, unit,
       meaning).
 
@@ -64,6 +65,33 @@ class Model:
         )  # fmt: skip
         object.__setattr__(self, "x0", _tree.as_float(self.x0, "x0"))
         wrong = Problems()
+        for name in ("states", "responses", "settings"):
+            value = getattr(self, name)
+            if not isinstance(value, Mapping):
+                wrong.add(
+                    f"dvax.models.Model({name})", _tree.line(value), "it must be a dictionary",
+                    'Write states={"position": "m"}, say',
+                )  # fmt: skip
+        if not (self.constants is None or isinstance(self.constants, Constants)):
+            wrong.add(
+                "dvax.models.Model(constants)", _tree.line(self.constants),
+                "they must be dvax.Constants", "Leave them out for those of dvax.verify",
+            )  # fmt: skip
+        wrong.raise_any()
+        for name in self.settings:
+            if name not in _SETTINGS:
+                wrong.add(
+                    f"dvax.models.Model(settings[{name!r}])", _tree.line(self.settings[name]),
+                    f"a run has the options {', '.join(_SETTINGS)}", "Leave it out",
+                )  # fmt: skip
+        names = [*self.states, *self.responses]
+        for name in dict.fromkeys(names):
+            if name in _RESERVED or names.count(name) > 1:
+                why = "is of the results already" if name in _RESERVED else "stands for two of them"
+                wrong.add(
+                    "dvax.models.Model(states, responses)", repr(name), f"this name {why}",
+                    "Choose another one",
+                )  # fmt: skip
         for name, t in (("t0", self.t0), ("t_end", self.t_end)):
             if not (_tree.is_number(t) and np.isfinite(t)):
                 wrong.add(
@@ -105,6 +133,9 @@ class Model:
             return {n: (flat[:, k], unit) for k, (n, unit) in enumerate(names.items())}
         return {n: (leaf, u) for leaf, (n, u) in zip(leaves, names.items(), strict=True)}
 
+
+_SETTINGS = ("method", "rtol", "atol", "dt", "dt_max", "max_steps", "vi_solver")
+_RESERVED = ("time", "error_bound")
 
 _NAMED = 12
 """Up to this many entries without names are numbered one by one."""

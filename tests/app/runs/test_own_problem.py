@@ -128,6 +128,11 @@ def test_code_is_not_executed_without_the_flag(tmp_path):
     ("import no_such_module\n", TABLE, "own.py, line 1: got ModuleNotFoundError"),
     (POINT.replace('{"depth": "mm"}', '{"a": "", "b": ""}'), TABLE, "a name for each of the 1 entries"),
     (POINT.replace("x0, 2.0", "x0, -2.0"), TABLE, "t0 < t_end"),
+    (POINT.replace('{"depth": "mm"}', '{"time": "s"}'), TABLE, "this name is of the results already"),
+    (POINT.replace('{"depth": "mm"}', '{"force": "N"}'), TABLE, "stands for two of them"),
+    (POINT.replace('{"rtol": 1e-8}', '{"events": []}'), TABLE, "a run has the options method, rtol"),
+    (POINT.replace("points: int = 1", "points: int = 'a'"), TABLE, "model.parameters.points"),
+    (POINT.replace("load: float", "load: lode"), TABLE, "NameError: name 'lode' is not defined"),
 ])  # fmt: skip
 def test_wrong_input_is_named_with_its_place(tmp_path, code, table, words):
     told = " ".join(problems(tmp_path, code, table))
@@ -140,16 +145,40 @@ def test_parameters_may_be_a_pydantic_model(tmp_path):
         "from pydantic import BaseModel\nclass P(BaseModel):\n    load: float = 3.0\n\n"
         "def build(p: P):\n    load, limit, points = p.load, 0.5, 1",
     )
+    (told,) = problems(tmp_path, code, TABLE + "[model.parameters]\nlaod = 2.0\n")
+    assert "Did you mean 'load'?" in told
     config = read_config(
         written(tmp_path, code, TABLE + "[model.parameters]\nload = 2.0\n"), allow_code=True
     )
     assert config.tree()["model"]["parameters"] == {"load": 2.0}
 
 
+def test_parameters_may_be_keywords_choices_and_lists(tmp_path):
+    code = POINT.replace(
+        'def build(load: float = 3.0, limit: Annotated[float, "N"] = 0.5, points: int = 1):',
+        "import enum\nclass Kind(enum.Enum):\n    small = 'small'\n    large = 'large'\n\n"
+        "def build(*, kind: Kind = Kind.small, limits: tuple[float, float] = (0.0, 0.5),\n"
+        '          load: Annotated[float, "N"] = "3000 mN"):\n    limit, points = limits[1], 1\n'
+        "    assert kind is Kind.large and load == 3.0",
+    )
+    table = TABLE + '[model.parameters]\nkind = "large"\nlimits = [0.0, 0.25]\n'
+    config = read_config(written(tmp_path, code, table), allow_code=True)
+    found = config.tree()["model"]["parameters"]
+    assert found == {"kind": "large", "limits": [0.0, 0.25], "load": 3.0}
+
+
 def test_check_names_the_method_and_the_reason(tmp_path):
     result = CliRunner().invoke(app, ["check", str(written(tmp_path)), "--allow-code"])
     assert result.exit_code == 0
     assert "ExpRosenbrock" in result.stdout and "affine" in result.stdout
+
+
+def test_check_names_the_line_of_an_error_in_a_function_of_the_problem(tmp_path):
+    file = written(tmp_path, POINT.replace("1.0 - 2.0 * x - u", "damping * x"))
+    for command in (["check", str(file)], ["run", str(file), "-o", str(tmp_path / "out")]):
+        result = CliRunner().invoke(app, [*command, "--allow-code"])
+        assert result.exit_code == 2
+        assert "own.py, line" in result.stderr and "name 'damping' is not defined" in result.stderr
 
 
 def test_new_writes_a_problem_that_runs_and_whose_test_passes(tmp_path):

@@ -111,6 +111,89 @@ def test_a_resumed_run_equals_one_that_was_not_interrupted(folder, part):
         assert manifest.get(key) == whole.get(key)
 
 
+def test_a_run_that_failed_within_a_piece_resumes_at_its_beginning(tmp_path):
+    """f is NaN for 1.03 < t < 1.09, and 21 frames make pieces of 0.2."""
+    hole = POINT.replace(
+        "load - 0.5 * x - u",
+        "load - 0.5 * x - u + jnp.where((t > 1.03) & (t < 1.09), jnp.nan, 0.0)",
+    )
+    (tmp_path / "own.py").write_text(hole)
+    config = tmp_path / "run.toml"
+    config.write_text(TABLE.replace("frames = 20", "frames = 400") + OUTPUT)
+    first = run(read_config(config, allow_code=True), tmp_path / "out")
+    assert first.exit_code == 3 and "NaN" in first.stop_reason
+    before = results(tmp_path / "out")
+    again = go_on(tmp_path / "out")
+    assert (again.exit_code, again.stop_reason) == (3, first.stop_reason)
+    assert results(tmp_path / "out") == before
+
+
+def test_results_stay_until_there_are_better_ones(made, tmp_path):
+    part = Path(shutil.copytree(made["circuit"] / "part", tmp_path / "part"))
+    before = {name: data for name, data in results(part).items() if name != "summary.json"}
+
+    def stops(event):
+        if event.get("stage", "").startswith("going on"):
+            raise KeyboardInterrupt
+
+    assert go_on(part, stops).exit_code == 130
+    after = results(part)
+    assert {name: after[name] for name in before} == before
+    assert go_on(part).exit_code == 0
+    assert results(part) == results(made["circuit"] / "whole")
+
+
+def test_checkpoints_stay_until_the_results_are_written(made, tmp_path, monkeypatch):
+    part = Path(shutil.copytree(made["circuit"] / "part", tmp_path / "part"))
+
+    def full(*given):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("dvax.app.runs.applications.run.write_dataset", full)
+        with pytest.raises(OSError, match="No space"):
+            go_on(part)
+    assert (part / "checkpoints").is_dir()
+    assert go_on(part).exit_code == 0
+    assert results(part) == results(made["circuit"] / "whole")
+
+
+def test_a_checkpoint_that_cannot_be_written_is_a_warning(tmp_path, monkeypatch):
+    def full(*given):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Checkpoints, "save", full)
+    outcome = run(read_config(circuit(tmp_path)), tmp_path / "out", on_event=Stops(3, SOLVE_ERROR))
+    assert (outcome.exit_code, outcome.has_results) == (3, True)
+    assert any(
+        "No checkpoint could be written" in w["message"]
+        for w in events(tmp_path / "out", "warning")
+    )
+
+
+def test_figures_that_fail_leave_the_states(tmp_path):
+    file = own(tmp_path)
+    (tmp_path / "own.py").write_text(POINT.replace("jnp.max(sol.us)", "[][1]"))
+    outcome = run(read_config(file, allow_code=True), tmp_path / "out")
+    assert outcome.exit_code == 2 and outcome.has_results
+    assert (
+        "own.py, line" in outcome.stop_reason
+        and "Its states alone were kept" in outcome.stop_reason
+    )
+
+
+def test_left_over_folders_do_not_stop_a_run(made, tmp_path):
+    part = Path(shutil.copytree(made["contact"] / "part", tmp_path / "part"))
+    (part / ".trajectory.zarr.old" / "a").mkdir(parents=True)
+    (part / "checkpoints" / "step_000008 (copy)").mkdir()
+    assert go_on(part).exit_code == 0
+    assert results(part) == results(made["contact"] / "whole")
+    begun = tmp_path / "begun"
+    begun.mkdir()
+    lock(begun).close()
+    assert run(read_config(made["circuit"] / "run.toml"), begun).exit_code == 0
+
+
 def files_of(directory: Path) -> list[str]:
     return sorted(str(p.relative_to(directory)) for p in directory.rglob("*") if p.is_file())
 

@@ -3,6 +3,7 @@
 import math
 from contextlib import suppress
 from pathlib import Path
+from shlex import quote
 from threading import Thread
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -62,6 +63,7 @@ def carry_out(
 
     interruptible(_import)
     from dvax.app.runs import driver
+    from dvax.app.runs.applications.config import OWN
 
     if config.output.report:
         # Plotly and Matplotlib take two seconds to import: beside the solve they cost nothing.
@@ -82,7 +84,8 @@ def carry_out(
         )
         print_remark(f"{kept} in {outcome.directory}")
         if outcome.status == "interrupted":
-            print_remark(f"to go on: dvax resume {outcome.directory}")
+            flag = " --allow-code" if getattr(config, "name", "") == OWN else ""
+            print_remark(f"to go on: dvax resume {quote(str(outcome.directory))}{flag}")
     elif not quiet:
         print_remark(f"{outcome.status}: {outcome.stop_reason}")
     if config.output.report:

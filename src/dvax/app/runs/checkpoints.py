@@ -12,6 +12,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import shutil
 import time
 from collections.abc import Mapping, Sequence
@@ -25,6 +26,7 @@ from dvax.app.runs.json_numbers import json_ready
 from dvax.errors import Problems
 
 FOLDER = "checkpoints"
+_NAME = re.compile(r"step_(\d+)")
 _STATE, _MANIFEST, _BESIDE = "state.npz", "MANIFEST.json", ".new"
 
 
@@ -115,7 +117,8 @@ class Checkpoints:
         return found, damaged
 
     def _places(self) -> list[Path]:
-        return sorted(p for p in self.folder.glob("step_*") if p.suffix != _BESIDE)
+        found = {int(m[1]): p for p in self.folder.glob("step_*") if (m := _NAME.fullmatch(p.name))}
+        return [found[number] for number in sorted(found)]
 
     def _check(self, identity: Mapping[str, str]) -> None:
         problems = Problems()

@@ -27,7 +27,7 @@ from dvax.app.runs.contact_model import assumptions, contact_model
 from dvax.app.runs.figure import Figure
 from dvax.app.runs.interrupt import Work, interruptible
 from dvax.app.runs.run import AbstractRun, Facts, Listener
-from dvax.app.runs.rundir import FrameStore, damaged_files
+from dvax.app.runs.rundir import FrameStore, damaged_files, new_store, recover_store
 from dvax.app.runs.schema import SolverSection
 from dvax.app.runs.solutions import all_finite
 from dvax.app.runs.solver_options import settings
@@ -68,9 +68,7 @@ class ContactRun(AbstractRun):
         inputs, config = self.inputs, self.config
         self.at = self.kept = _Reached(_Piece(inputs.x0), _Piece(inputs.companion_x0))
         path = self.directory.path / "trajectory.zarr"
-        new, old = (path.with_name(f".{path.name}.{which}") for which in ("new", "old"))
-        if not path.exists() and new.exists():
-            new.rename(path)  # a process was killed between the two renames below
+        recover_store(path)
         for saved in reversed(self.saved):
             reached = _Reached.of(saved)
             damaged = damaged_files(path, reached.files)
@@ -78,9 +76,8 @@ class ContactRun(AbstractRun):
                 self.at = self.kept = reached
                 break
             self.event("warning", message=f"{damaged} is damaged: it is not used.")
-        self.directory.remove(new.name)
         self.store = FrameStore(
-            new,
+            new_store(path),
             len(inputs.frame_times),
             self.block,
             coordinates(inputs, config),
@@ -92,10 +89,7 @@ class ContactRun(AbstractRun):
             {"long_name": "time", "units": config.units.time},
         )  # fmt: skip
         self.store.adopt(path, self.at.frames, self.at.files)
-        if path.exists():
-            path.rename(old)
         self.store.move(path)
-        self.directory.remove(old.name)
         if self.at.frames == 0:
             return
         self.steps, self.rejected, self.method = self.at.steps, self.at.rejected, self.at.method
@@ -156,7 +150,7 @@ class ContactRun(AbstractRun):
                 self.method, self.figures.status,
             )  # fmt: skip
             if self.checkpoints.is_due():
-                self.checkpoint()
+                self.try_checkpoint()
             if first == at.frames:
                 self.event("compiled", compile_seconds=self.compiling())
             self.event(

@@ -127,7 +127,6 @@ class AbstractRun(abc.ABC):
         try:
             with self.wording.in_keys():
                 self.solve()
-            self.checkpoints.clear()
         except KeyboardInterrupt as stop:
             status, code = "interrupted", exit_code(stop)
             reason = f"Interrupted{self.reached()}."
@@ -143,7 +142,7 @@ class AbstractRun(abc.ABC):
             raise
         if status != "finished":
             with writing():
-                self.checkpoint()
+                self.try_checkpoint()
         reason = f"{reason} {self.gather()}".rstrip()
         with writing():
             figures, has_results = self.write()
@@ -152,6 +151,8 @@ class AbstractRun(abc.ABC):
             directory.write_json("summary.json", summary)
             self._write_manifest(status, reason)
             self.event("stopped", message=reason, status=status)
+            if status == "finished":
+                self.checkpoints.clear()
         return RunOutcome(status, code, reason, directory.path, summary, has_results)
 
     def _identity(self) -> dict[str, str]:
@@ -171,6 +172,14 @@ class AbstractRun(abc.ABC):
             **{name: str(made_by[name]) for name in ("dvax", "device", "precision")},
             **packages,
         }
+
+    def try_checkpoint(self) -> None:
+        """Save a checkpoint, or warn: a run does not fail because of it."""
+        try:
+            self.checkpoint()
+        except OSError as error:
+            with suppress(OSError):  # the log may lie on the same full disk
+                self.event("warning", message=f"No checkpoint could be written: {error}")
 
     def going_on(self, t: float, unit: str) -> None:
         """Tell that the run goes on from this time."""

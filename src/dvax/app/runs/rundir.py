@@ -28,6 +28,7 @@ import zarr
 
 from dvax.app.runs import checkpoints
 from dvax.app.runs.json_numbers import json_ready
+from dvax.app.runs.lock import NAME as LOCK
 from dvax.app.runs.lock import lock
 from dvax.errors import Problems
 
@@ -232,8 +233,9 @@ class FrameStore:
         self._publish()
 
     def move(self, path: Path) -> None:
-        """Rename the store."""
-        self.path = self.path.rename(path)
+        """Put the store in the place of the one at `path`."""
+        replace_store(self.path, path)
+        self.path = path
         group: Any = zarr.open_group(path, mode="r+", use_consolidated=False)
         self._time = group["time"]
         self._arrays = {name: group[name] for name in self._arrays}
@@ -294,6 +296,30 @@ def _sha256(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
+def new_store(path: Path) -> Path:
+    """Return the path of a new store that will replace the one at `path`."""
+    new = path.with_name(f".{path.name}.new")
+    shutil.rmtree(new, ignore_errors=True)
+    return new
+
+
+def replace_store(new: Path, path: Path) -> None:
+    """Rename a complete store to `path`, in the place of the one there."""
+    old = path.with_name(f".{path.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    if path.exists():
+        path.rename(old)
+    new.rename(path)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def recover_store(path: Path) -> None:
+    """Complete `replace_store` if a process was killed between its two renames."""
+    new = path.with_name(f".{path.name}.new")
+    if not path.exists() and new.exists():
+        new.rename(path)
+
+
 def consolidate(path: Path, frames: int | None = None) -> None:
     """Replace the consolidated metadata of a store, which readers such as xarray use. With `frames`
     every array in it ends with the last complete frame, so that the store of a killed run opens."""
@@ -312,6 +338,11 @@ def consolidate(path: Path, frames: int | None = None) -> None:
     write_whole(path / "zarr.json", json.dumps(group).encode())
 
 
+def _is_begun(out: Path) -> bool:
+    """Return whether a folder holds only what a run writes before its manifest."""
+    return {file.name for file in out.iterdir()} <= {*FILES, *FOLDERS, LOCK}
+
+
 def target_problems(out: Path, *, force: bool) -> Problems:
     """Return the reasons not to write a run into `out`: existing files are kept, unless the user asks
     otherwise."""
@@ -319,7 +350,7 @@ def target_problems(out: Path, *, force: bool) -> Problems:
     if out.exists() and not out.is_dir():
         fix = "Give the name of a folder that does not exist yet."
         problems.add(str(out), "a file", "results are written into a folder", fix)
-    elif out.exists() and any(out.iterdir()):
+    elif out.exists() and any(file.name != LOCK for file in out.iterdir()):
         if not force:
             problems.add(
                 str(out),
@@ -327,7 +358,7 @@ def target_problems(out: Path, *, force: bool) -> Problems:
                 "results are never written over others unasked",
                 "Give another folder, or --force to replace what dvax wrote here.",
             )
-        elif not (out / "manifest.json").is_file():
+        elif not (out / "manifest.json").is_file() and not _is_begun(out):
             problems.add(
                 str(out),
                 "a folder that is not empty and holds no manifest.json",

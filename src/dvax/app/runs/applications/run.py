@@ -21,7 +21,7 @@ from dvax.app.runs.applications.segments import (
 )
 from dvax.app.runs.interrupt import Work, interruptible, patience
 from dvax.app.runs.run import AbstractRun, Facts, Listener
-from dvax.app.runs.rundir import consolidate
+from dvax.app.runs.rundir import consolidate, new_store, replace_store
 from dvax.evolution import Solution
 from dvax.theory import Constants
 
@@ -41,13 +41,12 @@ class ApplicationRun(AbstractRun):
         self.facts = Facts(rows, known.assumptions, config.fingerprints(), known.notes, about)
         self.plan: Plan | None = None
         self.pieces: list[Solution] = []
+        self.complete = 0
         self.last: Work[Results] | None = None
         self.results: Results | None = None
 
     def begin(self) -> None:
-        # Results are written when there are any.
-        self.directory.remove("trajectory.zarr")
-        # Each is a piece: none can be missing before another one.
+        # Results are written when there are any. Each checkpoint is a piece of the solution.
         whole = [c for k, c in enumerate(self.saved) if c.number == k]
         self.saved, self.kept = whole, len(whole)
 
@@ -64,6 +63,10 @@ class ApplicationRun(AbstractRun):
                 self.pieces = [from_checkpoint(c, piece, plan) for c in saved]
                 self.steps = sum(int(one.stats["steps"]) for one in self.pieces)
             self.pieces.append(piece)
+            begin = (len(self.pieces) - 1) * segment_length(plan)
+            # The piece in which a solve failed has fewer rows, and no run can resume after it.
+            if len(piece.ts) == len(plan.times[begin : begin + segment_length(plan)]):
+                self.complete = len(self.pieces)
             if len(self.pieces) == len(saved) + 1:
                 # Compile all programs of the figures now, so that they need no time after an interrupt.
                 self.last = Work(self._compute(plan))
@@ -78,7 +81,7 @@ class ApplicationRun(AbstractRun):
                 method=self.method, unit=plan.time_unit,
             )  # fmt: skip
             if self.checkpoints.is_due():
-                self.checkpoint()
+                self.try_checkpoint()
         self._stage("writing the results")
         self.last = Work(self._compute(plan))
         self.results = self.last.result()
@@ -87,7 +90,8 @@ class ApplicationRun(AbstractRun):
         if self.plan is None:
             return
         fixed = self.plan.settings.get("dt") is not None
-        for number, piece in enumerate(self.pieces[self.kept :], start=self.kept):
+        for number in range(self.kept, self.complete):
+            piece = self.pieces[number]
             arrays, about = to_checkpoint(piece)
             next_dt = None if fixed else float(piece.stats["next_dt"])
             self.checkpoints.save(number, arrays, about | {"next_dt": next_dt})
@@ -109,6 +113,10 @@ class ApplicationRun(AbstractRun):
         except (KeyboardInterrupt, TimeoutError):
             self.results = states_only(self.pieces)
             return "Its states alone were kept: there was no time for figures."
+        except Exception as error:  # noqa: BLE001 (of the user's figures, say; the reason names it)
+            self.results = states_only(self.pieces)
+            reason = f"{type(error).__name__}: {error}"
+            return f"Its states alone were kept: the figures failed with {reason}"
         return ""
 
     def write(self) -> tuple[Mapping[str, Figure], bool]:
@@ -159,11 +167,13 @@ def write_dataset(path: Path, variables: Mapping[str, Variable], attrs: Mapping[
     # A store lists its arrays in no order.
     order = " ".join(variables)
     attributes = {**attrs, "coordinates": " ".join(coordinates), _ORDER: order}
-    group = zarr.open_group(path, mode="w-", zarr_format=3, attributes=attributes)
+    new = new_store(path)
+    group = zarr.open_group(new, mode="w-", zarr_format=3, attributes=attributes)
     for name, v in variables.items():
         about: dict[str, Any] = {"long_name": v.words, "units": v.unit}
         if v.status:
             about["status"] = v.status
         values = np.asarray(v.values)
         group.create_array(name, data=values, dimension_names=v.dims, attributes=about)
-    consolidate(path)
+    consolidate(new)
+    replace_store(new, path)

@@ -95,6 +95,8 @@ def end_of(saved: Checkpoint, plan: Plan) -> tuple[Any, float | None]:
 
 def from_checkpoint(saved: Checkpoint, like: Solution, plan: Plan) -> Solution:
     """Return the piece of a checkpoint; `like` is another piece of the same run."""
+    # A piece in which the solve failed has no responses yet.
+    like = with_fields(like, {"law": like.responses()})
     tree = jtu.tree_structure({name: getattr(like, name) for name in _SAVED})
     rows = map(jnp.asarray, saved.arrays[int(saved.about["parts"]) :])
     fields = tree.unflatten(rows)

@@ -33,7 +33,7 @@ from dvax.app.runs.applications.base import (
 )
 from dvax.app.runs.applications.certificate import Certificate, certificate
 from dvax.app.runs.schema import Section, SolverKeys, rule_error
-from dvax.app.runs.schema_errors import translate
+from dvax.app.runs.schema_errors import translate, unknown_key
 from dvax.app.runs.solver_options import check_model_steps, settings
 from dvax.app.runs.units import converted
 from dvax.errors import DvaxError, InputError, input_error
@@ -83,9 +83,9 @@ class PythonApplication(AbstractApplication):
     def __init__(self, table: PythonSection, paths: Mapping[str, Path], quiet: bool):
         self.file = paths["python"]
         build = _function(self.file, table.function)
-        arguments, given = _arguments(build, table.parameters)
+        arguments, given = _run(self.file, lambda: _arguments(build, table.parameters))
         self.table = table.model_copy(update={"parameters": given})
-        model = _run(self.file, lambda: build(*arguments))
+        model = _run(self.file, lambda: build(**arguments))
         if not isinstance(model, Model):
             raise input_error(
                 f"{self.file.name}: {table.function}", type(model).__name__,
@@ -93,6 +93,7 @@ class PythonApplication(AbstractApplication):
                 "Write return dvax.models.Model(problem, x0, t_end)",
             )  # fmt: skip
         self.own, self.title = model, model.title
+        _run(self.file, lambda: model.problem.check(model.t0, model.x0, model.args))
         self.t_end = float(model.t_end if table.t_end is None else table.t_end)
         if not self.t_end > model.t0:
             raise input_error(
@@ -180,7 +181,13 @@ class PythonApplication(AbstractApplication):
             figures["error_bound"] = bound.figure("", words)
         if m.figures is not None:
             of = m.figures
-            found = _run(self.file, lambda: of(solution))
+            found = _run(self.file, lambda: dict(of(solution)))
+            taken = sorted(set(found) & set(figures))
+            if taken:
+                raise input_error(
+                    f"{self.file.name}: figures", ", ".join(taken), "these names are taken",
+                    "Choose others",
+                )  # fmt: skip
             figures |= {
                 name: Figure(*_figure(self.file, name, entry)) for name, entry in found.items()
             }
@@ -203,7 +210,8 @@ def _figure(file: Path, name: str, entry: Any) -> tuple[Any, str, str]:
             'Write {"largest force": (3.0, "N", "over the run")}',
         )  # fmt: skip
     value, unit, meaning = entry
-    return np.asarray(value).tolist(), str(unit), str(meaning)
+    number = _run(file, lambda: np.asarray(value, float))
+    return number.tolist(), str(unit), str(meaning)
 
 
 def _function(file: Path, name: str) -> Callable[..., Any]:
@@ -227,7 +235,7 @@ def _import(file: Path) -> ModuleType:
     # Beside it may lie modules that it imports.
     folder = str(file.parent)
     if folder not in sys.path:
-        sys.path.append(folder)
+        sys.path.insert(0, folder)
     name = f"dvax_own_{file.stem}"
     spec = importlib.util.spec_from_file_location(name, file)
     if spec is None or spec.loader is None:
@@ -264,7 +272,7 @@ def _run(file: Path, work: Callable[[], Any]) -> Any:
 
 def _arguments(
     build: Callable[..., Any], given: dict[str, Any]
-) -> tuple[list[Any], dict[str, Any]]:
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the arguments for `build` from the table of parameters, and that table, completed.
 
     Parameters are those of the function, each with its type, or one pydantic model. Annotated[float,
@@ -286,16 +294,33 @@ def _arguments(
                     f"Write {p.name}: float = 1.0, or {p.name}: Annotated[float, \"mm\"]",
                 )  # fmt: skip
             default = ... if p.default is p.empty else p.default
-            fields[p.name] = (_with_unit(hints[p.name]), default)
+            # Numbers, flags and texts as they are; a list of TOML may be a tuple, a text a choice.
+            strict = _plain(hints[p.name]) in (bool, int, float, str)
+            field: Any = Field(default, strict=strict, validate_default=True)
+            fields[p.name] = (_with_unit(hints[p.name]), field)
         kind = create_model("Parameters", __base__=Section, **fields)
+    unknown = [
+        unknown_key(f"model.parameters.{key}", key, value, list(kind.model_fields))
+        for key, value in given.items()
+        if key not in kind.model_fields and kind.model_config.get("extra") != "allow"
+    ]
+    if unknown:
+        raise InputError(*unknown)
     try:
         made = kind.model_validate(given)
     except ValidationError as error:
         # The name of the file is added where it is known (`Wording`).
         found = translate(error, "", "model.parameters", kind)
         raise InputError(*(replace(p, place=p.place.removeprefix(": ")) for p in found)) from error
-    complete = made.model_dump(exclude_none=True)
-    return [made] if is_model else [getattr(made, p.name) for p in names], complete
+    complete = made.model_dump(mode="json", exclude_none=True)
+    if is_model:
+        return {names[0].name: made}, complete
+    return {p.name: getattr(made, p.name) for p in names}, complete
+
+
+def _plain(hint: Any) -> Any:
+    """Return a type without its annotations."""
+    return get_args(hint)[0] if get_origin(hint) is Annotated else hint
 
 
 def _with_unit(hint: Any) -> Any:
@@ -312,7 +337,10 @@ def _with_unit(hint: Any) -> Any:
             return value
         number = converted(value, unit)
         if number is None:
-            raise rule_error(f"it is a number in {unit}, or a quantity", f'Write "2.5 {unit}"')
+            raise rule_error(
+                f"it is a number in {unit}, or a text with a number and a unit of that dimension",
+                f'Write "2.5 {unit}"',
+            )
         return number
 
     return Annotated[of, BeforeValidator(convert), Field(description=f"[{unit}]")]
