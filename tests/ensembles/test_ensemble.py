@@ -137,7 +137,11 @@ def test_members_that_fail_leave_the_others_alone():
     np.testing.assert_allclose(found.quantile(0.5), np.median(found.values[good]))
     told = found.failures()
     assert set(told) == {1, 4}
-    assert "The step became too small" in told[1] and "Stopped at t = 0.49999" in told[1]
+    assert (
+        not found.switched.any()
+        and "The step became too small" in told[1]
+        and "Stopped at t = 0.5000" in told[1]
+    )
     with pytest.raises(dvax.SolveError, match="finite-time escape"):
         found.member(1)
 
@@ -153,7 +157,7 @@ def test_members_that_are_stiff_get_another_method():
         problem, jnp.array([2.0, 0.0]), 0.0, 60.0, np.array([1.0, 2.0, 300.0]), axes=(None, 0)
     )
     assert found.switched.tolist() == [False, False, True] and not found.failed.any()
-    assert "1 members by ExpRosenbrock: stability limited the steps" in found.method
+    assert "; 1 member by ExpRosenbrock: stability limited the steps" in found.method
     alone = dvax.solve(problem, jnp.array([2.0, 0.0]), 0.0, 60.0, 300.0)
     np.testing.assert_allclose(found.values[2], alone.xs[0], rtol=1e-9)
 

@@ -44,11 +44,10 @@ class Collected:
         """Add the rows of these members."""
         if self.rows is None:
             self.rows = self._tables(found)
-        put = lambda table, rows: table.__setitem__(members, rows)  # noqa: E731
         observed = found.observed
         if not self.keep:
             found = found._replace(observed=None)
-        jtu.tree_map(put, self.rows, found)
+        self.put(members, found)
         valid = ~found.failed
         moments = Moments.of(observed, valid)
         self.moments = moments if self.moments is None else self.moments.merge(moments)
@@ -57,6 +56,14 @@ class Collected:
         self.done += len(members)
         if self.progress:
             self._show()
+
+    def take(self, members: np.ndarray) -> Row:
+        """Return the rows of these members."""
+        return jtu.tree_map(lambda table: table[members], self.rows)
+
+    def put(self, members: np.ndarray, rows: Row) -> None:
+        """Replace the rows of these members."""
+        jtu.tree_map(lambda table, row: table.__setitem__(members, row), self.rows, rows)
 
     def _tables(self, found: Row) -> Row:
         """Return tables for all members, from the rows of some."""

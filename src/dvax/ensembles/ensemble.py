@@ -180,10 +180,18 @@ def _ensemble(
         assert kept.rows is not None
         members = np.flatnonzero(np.asarray(kept.rows.result == result))
         other = choice.after(result) if choice.reason else None
-        if other is not None and len(members):
-            collect(kept, program(other), inputs, members, devices)
-            switched[members] = True
-            count = f"{len(members)} member" + ("" if len(members) == 1 else "s")
+        if other is None or not len(members):
+            continue
+        before = kept.take(members)
+        collect(kept, program(other), inputs, members, devices)
+        solved = np.ones(len(members), bool)
+        if result == RESULTS.step_too_small:
+            # Where the other method fails too, the first failure tells more.
+            solved = ~kept.rows.failed[members]
+            kept.put(members[~solved], jtu.tree_map(lambda rows, s=solved: rows[~s], before))
+        if solved.any():
+            switched[members[solved]] = True
+            count = f"{solved.sum()} member" + ("" if solved.sum() == 1 else "s")
             text += f"; {count} by {other.text()}"
     rows, moments = kept.rows, kept.moments
     assert rows is not None and moments is not None

@@ -188,10 +188,10 @@ def test_left_over_folders_do_not_stop_a_run(made, tmp_path):
     (part / "checkpoints" / "step_000008 (copy)").mkdir()
     assert go_on(part).exit_code == 0
     assert results(part) == results(made["contact"] / "whole")
-    begun = tmp_path / "begun"
-    begun.mkdir()
-    lock(begun).close()
-    assert run(read_config(made["circuit"] / "run.toml"), begun).exit_code == 0
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    lock(empty).close()
+    assert run(read_config(made["circuit"] / "run.toml"), empty).exit_code == 0
 
 
 def files_of(directory: Path) -> list[str]:
