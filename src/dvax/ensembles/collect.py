@@ -1,6 +1,5 @@
 """The rows of an ensemble, solved piece by piece and collected."""
 
-import os
 import sys
 import time
 from collections.abc import Mapping
@@ -16,6 +15,7 @@ from jax import lax
 from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
+from ..evolution.arguments import machine_memory
 from .inputs import Inputs
 from .members import Program, Row
 from .moments import Moments
@@ -71,7 +71,7 @@ class Collected:
             found = found._replace(observed=None)
         leaves = jtu.tree_leaves(found)
         needed = sum(leaf.nbytes // len(leaf) for leaf in leaves) * self.count
-        available = _memory()
+        available = machine_memory()
         if needed > available:
             raise InputError(
                 InputProblem(
@@ -144,11 +144,3 @@ def fold_rows(add: Any, start: Tree, rows: Tree, valid: Any) -> Tree:
 
 
 _compiled_fold = partial(jax.jit, static_argnums=0)(fold_rows)
-
-
-def _memory() -> float:
-    """Return the bytes of memory of the machine, infinity where it does not report them."""
-    try:
-        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, OSError, ValueError):
-        return float("inf")

@@ -220,17 +220,21 @@ def first_step(span: Any, t0: Any, t1: Any, dtype: Any) -> Any:
     return min(max(step, 4.0 * ulp), span)
 
 
+def machine_memory() -> float:
+    """Return the bytes of memory of the machine, infinity where it does not report them."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, OSError, ValueError):
+        return math.inf
+
+
 def check_memory(state: int, itemsize: int, steps: int, degree: int) -> None:
     """Raise if the records of `dense=True` exceed the memory of the machine.
 
     `state` is the number of entries of x, `steps` the largest number of steps, and `degree` that of the
     polynomial of a step.
     """
-    needed = steps * itemsize * (state * (degree + 3) + 2)
-    try:
-        available = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):
-        return  # not every operating system reports its memory
+    needed, available = steps * itemsize * (state * (degree + 3) + 2), machine_memory()
     if needed > available:
         raise InputError(
             InputProblem(

@@ -24,6 +24,7 @@ from dvax.app.runs.applications.config import read_config
 from dvax.app.runs.checkpoints import Checkpoints
 from dvax.app.runs.driver import resume, run
 from dvax.app.runs.lock import lock
+from dvax.app.runs.rundir import FrameStore
 
 OUTPUT = "[output]\npng = false\nreport = false\ncheckpoint_seconds = 0\n"
 
@@ -180,6 +181,20 @@ def test_figures_that_fail_leave_the_states(tmp_path):
         "own.py, line" in outcome.stop_reason
         and "Its states alone were kept" in outcome.stop_reason
     )
+
+
+def test_hashes_end_with_the_last_complete_block(tmp_path):
+    point = ("point",)
+    store = FrameStore(
+        tmp_path / "a.zarr", 12, 4, {"s": (point, np.arange(3.0), {})},
+        {"p": (("time", "point"), np.float64, {})}, {}, {},
+    )  # fmt: skip
+    for begin, count in ((0, 4), (4, 4), (8, 2)):
+        times = np.arange(begin, begin + count, dtype=float)
+        store.write(times, {"p": np.ones((count, 3)) * times[:, None]})
+    assert set(store.files(8)) == {"s/c/0", *(f"{n}" for n in ("time/c/0", "time/c/1"))} | {
+        "p/c/0/0", "p/c/1/0",
+    }  # fmt: skip
 
 
 def test_left_over_folders_do_not_stop_a_run(made, tmp_path):

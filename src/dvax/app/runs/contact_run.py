@@ -88,12 +88,12 @@ class ContactRun(AbstractRun):
             ),
             {"long_name": "time", "units": config.units.time},
         )  # fmt: skip
-        self.store.adopt(path, self.at.frames, self.at.files)
+        self.store.copy_frames(path, self.at.frames, self.at.files)
         self.store.move(path)
         if self.at.frames == 0:
             return
         self.steps, self.rejected, self.method = self.at.steps, self.at.rejected, self.at.method
-        self.going_on(float(inputs.frame_times[self.at.frames - 1]), config.units.time)
+        self.tell_resumed(float(inputs.frame_times[self.at.frames - 1]), config.units.time)
         for first in range(0, self.at.frames, self.block):
             frames = slice(first, first + self.block)
             self.figures.add(inputs.frame_times[frames], self.store.read(frames), self.at.status)
@@ -103,7 +103,7 @@ class ContactRun(AbstractRun):
         if self.at.frames == self.kept.frames:
             return
         arrays, about = self.at.to_checkpoint()
-        about["files"] = self.store.files()
+        about["files"] = self.store.files(self.at.frames)
         self.checkpoints.save(self.at.frames, arrays, about)
         self.checkpoints.keep(2)
         self.kept = self.at

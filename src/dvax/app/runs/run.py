@@ -181,7 +181,7 @@ class AbstractRun(abc.ABC):
             with suppress(OSError):  # the log may lie on the same full disk
                 self.event("warning", message=f"No checkpoint could be written: {error}")
 
-    def going_on(self, t: float, unit: str) -> None:
+    def tell_resumed(self, t: float, unit: str) -> None:
         """Tell that the run goes on from this time."""
         self.event("stage", stage=f"going on from t = {t:.10g} {unit}".rstrip())
 

@@ -221,7 +221,7 @@ class FrameStore:
         self._hashes: dict[str, str] = {}
         self._publish()
 
-    def adopt(self, other: Path, written: int, hashes: Mapping[str, str]) -> None:
+    def copy_frames(self, other: Path, written: int, hashes: Mapping[str, str]) -> None:
         """Take over the first `written` frames of another store, in these files. Its metadata are not
         used: they have no hashes."""
         for name in hashes:
@@ -245,12 +245,18 @@ class FrameStore:
         stop = min(frames.stop, self.written)
         return {name: np.asarray(a[frames.start : stop]) for name, a in self._arrays.items()}
 
-    def files(self) -> dict[str, str]:
-        """Return the SHA-256 of every file of values. Files of complete blocks are read once."""
+    def files(self, frames: int) -> dict[str, str]:
+        """Return the SHA-256 of every file of values, of the arrays over time up to the complete chunks
+        of the first `frames`. Each is read once."""
+        over_time = {"time": self._time, **self._arrays}
         for file in sorted(self.path.rglob("c/**/*")):
-            name = str(file.relative_to(self.path))
-            if file.is_file() and name not in self._hashes:
-                self._hashes[name] = _sha256(file)
+            name = file.relative_to(self.path)
+            if not file.is_file() or str(name) in self._hashes:
+                continue
+            array = over_time.get(name.parts[0])
+            # c/<chunk of time>/…: the chunk behind a failed block is not complete.
+            if array is None or (int(name.parts[2]) + 1) * array.chunks[0] <= frames:
+                self._hashes[str(name)] = _sha256(file)
         return dict(self._hashes)
 
     def write(self, times: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
@@ -338,7 +344,7 @@ def consolidate(path: Path, frames: int | None = None) -> None:
     write_whole(path / "zarr.json", json.dumps(group).encode())
 
 
-def _is_begun(out: Path) -> bool:
+def _has_only_files_of_a_run(out: Path) -> bool:
     """Return whether a folder holds only what a run writes before its manifest."""
     return {file.name for file in out.iterdir()} <= {*FILES, *FOLDERS, LOCK}
 
@@ -358,7 +364,7 @@ def target_problems(out: Path, *, force: bool) -> Problems:
                 "results are never written over others unasked",
                 "Give another folder, or --force to replace what dvax wrote here.",
             )
-        elif not (out / "manifest.json").is_file() and not _is_begun(out):
+        elif not (out / "manifest.json").is_file() and not _has_only_files_of_a_run(out):
             problems.add(
                 str(out),
                 "a folder that is not empty and holds no manifest.json",

@@ -57,7 +57,9 @@ class ApplicationRun(AbstractRun):
         saved = self.saved[: count - 1]
         x, step = end_of(saved[-1], plan) if saved else (None, None)
         if saved:
-            self.going_on(float(plan.times[len(saved) * segment_length(plan) - 1]), plan.time_unit)
+            self.tell_resumed(
+                float(plan.times[len(saved) * segment_length(plan) - 1]), plan.time_unit
+            )
         for piece in segments(plan, len(saved), x, step):
             if not self.pieces:
                 self.pieces = [from_checkpoint(c, piece, plan) for c in saved]
