@@ -55,11 +55,11 @@ NEIGHBOURS = {
 
 CORE = {"jax", "equinox", "diffrax", "numpy", "optimistix", "scipy"}
 APPLICATION = {
-    *("matplotlib", "numcodecs", "pint", "plotly", "pydantic", "pydantic_core", "rich"),
-    *("tomli_w", "typer", "xarray", "zarr"),
+    *("dask", "distributed", "h5netcdf", "h5py", "matplotlib", "numcodecs", "pint", "plotly"),
+    *("pydantic", "pydantic_core", "rich", "tomli_w", "typer", "xarray", "zarr"),
 }
 # Extras that a function asks for when it is called, and says so where they are missing.
-EXTRAS = {"clarabel", "flatbuffers", "meshio", "skfem"}
+EXTRAS = {"clarabel", "flatbuffers", "meshio", "pyarrow", "skfem"}
 # What the command line may load before it knows what is asked of it.
 LIGHT = {"typer", "rich"}
 COMMAND_LINE = "dvax.app.cli"
