@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from dvax.app.cli.cache import cache_folder
+from dvax.app.runs.compilation_cache import cache_folder
 
 _SCRIPT = """
 import jax, jax.numpy as jnp
 from pathlib import Path
-from dvax.app.cli.cache import cache_folder, enable_compilation_cache
+from dvax.app.runs.compilation_cache import cache_folder, enable_compilation_cache
 
 def value():
     return float(jax.jit(lambda v: jnp.sin(v) + 2.0)(0.0))

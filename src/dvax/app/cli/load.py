@@ -3,19 +3,11 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dvax.app.cli.cache import enable_compilation_cache
+from dvax.app.runs.compilation_cache import enable_compilation_cache, enable_double
 
 if TYPE_CHECKING:
     from dvax.app.runs.applications.config import ModelConfig
     from dvax.app.runs.config import Config
-
-
-def enable_double() -> None:
-    """Switch JAX of this process to 64-bit numbers, which the library never does by itself. The
-    manifest of a run records it."""
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
 
 
 def load(

@@ -11,6 +11,7 @@ from dvax.app.cli.new import new
 from dvax.app.cli.report import report
 from dvax.app.cli.resume import resume
 from dvax.app.cli.run import run
+from dvax.app.cli.sweep import sweep
 
 app = typer.Typer(
     name="dvax",
@@ -46,5 +47,5 @@ def _program(
     """Options of the program itself; each command has its own."""
 
 
-for command in (new, check, run, resume, report, demo, doctor):
+for command in (new, check, run, resume, sweep, report, demo, doctor):
     app.command()(command)

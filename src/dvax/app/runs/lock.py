@@ -1,6 +1,8 @@
-"""A lock on a run directory, so that one process at a time writes into it."""
+"""Locks on files, so that one process at a time writes."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -15,13 +17,7 @@ def lock(directory: Path) -> IO[str]:
     **Raises:** `dvax.InputError` while another process holds it.
     """
     file = (directory / NAME).open("a+", encoding="utf-8")
-    try:
-        import fcntl
-    except ModuleNotFoundError:  # not on Windows
-        return file
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    if not _flock(file, wait=False):
         file.seek(0)
         process = file.read().strip()
         file.close()
@@ -35,3 +31,24 @@ def lock(directory: Path) -> IO[str]:
     file.write(str(os.getpid()))
     file.flush()
     return file
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """In the block this process alone holds the lock of a file; it waits for another one's end."""
+    with path.open("a+", encoding="utf-8") as file:
+        _flock(file, wait=True)
+        yield
+
+
+def _flock(file: IO[str], *, wait: bool) -> bool:
+    """Lock an open file. Returns whether it is locked now."""
+    try:
+        import fcntl
+    except ModuleNotFoundError:  # not on Windows
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        return False
+    return True

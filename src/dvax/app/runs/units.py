@@ -122,6 +122,12 @@ def converted(text: str, unit: str) -> float | None:
     return float(match["number"]) * float(_registry().Quantity(1.0, given).to(wanted).magnitude)
 
 
+def split_quantity(text: str) -> tuple[float, str] | None:
+    """Return number and unit of a text "number unit"; None where it is none."""
+    match = _match(text)
+    return None if match is None else (float(match["number"]), match["unit"].strip())
+
+
 def is_quantity(text: str) -> bool:
     """Whether a text has the form "number unit". No formula has it."""
     return _match(text) is not None

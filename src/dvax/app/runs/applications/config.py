@@ -99,7 +99,20 @@ def read_config(
     **Raises:** `dvax.InputError` with all problems found, those of the data files included.
     """
     source = Path(path)
-    raw = parse(source)
+    return check_config(
+        parse(source), source, allow_outside=allow_outside, quiet=quiet, allow_code=allow_code
+    )
+
+
+def check_config(
+    raw: dict[str, Any],
+    source: Path,
+    *,
+    allow_outside: bool = False,
+    quiet: bool = False,
+    allow_code: bool = False,
+) -> Config | ModelConfig:
+    """Check and complete a configuration that was parsed from the file `source`: `read_config`."""
     table = raw.get("model")
     name = "contact"
     if table is None and not set(raw) & (set(SECTIONS) - {"output"}):

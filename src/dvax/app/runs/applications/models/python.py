@@ -231,7 +231,15 @@ def _function(file: Path, name: str) -> Callable[..., Any]:
     return found
 
 
+_imported: dict[Path, tuple[bytes, ModuleType]] = {}
+
+
 def _import(file: Path) -> ModuleType:
+    """Return the module of a file, made once for its content: then runs with other parameters have the
+    same functions, and with them the same compiled programs."""
+    content = file.read_bytes()
+    if file in _imported and _imported[file][0] == content:
+        return _imported[file][1]
     # Beside it may lie modules that it imports.
     folder = str(file.parent)
     if folder not in sys.path:
@@ -245,6 +253,7 @@ def _import(file: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     spec.loader.exec_module(module)
+    _imported[file] = content, module
     return module
 
 

@@ -39,6 +39,14 @@ def enable_compilation_cache() -> None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
 
 
+def enable_double() -> None:
+    """Switch JAX of this process to 64-bit numbers, which the library never does by itself. The
+    manifest of a run records it."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+
+
 def cache_folder() -> Path:
     """Return the folder for these versions of dvax and JAX on this processor."""
     from dvax import __version__

@@ -1,0 +1,114 @@
+"""The processes that run the members of a sweep: Dask workers, here or on a cluster."""
+
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from dvax.app.runs.sweeps.records import read_record
+from dvax.errors import input_error
+
+RETRIES = 2
+"""How often a member is run again after its worker died."""
+
+_sweeps: dict[tuple[Any, ...], Any] = {}
+
+
+def run_task(
+    source: str, directory: str, member: int, allow_outside: bool, allow_code: bool
+) -> dict[str, Any]:
+    """Run a member, in a worker: the arguments are plain values, so that no code is sent."""
+    from dvax.app.runs.compilation_cache import enable_compilation_cache, enable_double
+    from dvax.app.runs.sweeps.member import run_member
+    from dvax.app.runs.sweeps.sweep import read_sweep
+
+    key = (source, Path(source).stat().st_mtime_ns, allow_outside, allow_code)
+    if key not in _sweeps:
+        enable_double()
+        enable_compilation_cache()
+        _sweeps.clear()
+        _sweeps[key] = read_sweep(source, allow_outside=allow_outside, allow_code=allow_code)
+    return run_member(_sweeps[key], Path(directory), member)
+
+
+@contextmanager
+def cluster(address: str | None, workers: int, threads: int) -> Iterator[Any]:
+    """A Dask client: of the scheduler at this address, else of as many new worker processes with so many
+    threads.
+
+    **Raises:** `dvax.InputError` if no scheduler answers.
+    """
+    import dask
+    from distributed import Client, LocalCluster
+
+    if address is not None:
+        try:
+            client = Client(address, timeout="20s")
+        except (OSError, ValueError, TimeoutError) as error:
+            raise input_error(
+                "--scheduler", address, f"no Dask scheduler answers there ({error})",
+                "Start one with dask scheduler, and dask worker with its address",
+            ) from None  # fmt: skip
+        with client:
+            yield client
+        return
+    environment = {
+        # The number of threads of XLA, which would take all cores for every worker.
+        "NPROC": str(threads),
+        "OMP_NUM_THREADS": str(threads),
+    }
+    with (
+        tempfile.TemporaryDirectory(prefix="dvax-sweep-") as folder,
+        dask.config.set({  # pyright: ignore[reportPrivateImportUsage]
+            "distributed.nanny.pre-spawn-environ": environment,
+            "distributed.worker.memory.target": False,
+            "distributed.worker.memory.spill": False,
+            "distributed.worker.memory.pause": False,
+            "distributed.worker.memory.terminate": False,
+            # A member holds its worker for as long as it runs.
+            "distributed.comm.timeouts.tcp": "1 day",
+        }),
+        LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None,
+            memory_limit=None, local_directory=folder, silence_logs=50,
+        ) as local,
+        Client(local) as client,
+    ):  # fmt: skip
+        yield client
+
+
+def results(
+    client: Any, sweep: Any, directory: Path, members: Sequence[int]
+) -> Iterator[Mapping[str, Any]]:
+    """The records of these members, as they end.
+
+    Tasks return their records, and the results are on disk: nothing is kept in the client.
+    """
+    from distributed import as_completed
+
+    where = str(sweep.source.resolve()), str(directory.resolve())
+    options = sweep.allow_outside, sweep.allow_code
+    tasks = {
+        client.submit(run_task, *where, k, *options, pure=False, retries=RETRIES): k
+        for k in members
+    }
+    for future, value in as_completed(tasks, with_results=True, raise_errors=False):
+        member = tasks.pop(future)
+        if future.status == "finished":
+            yield value
+            continue
+        error = value[1] if isinstance(value, tuple) else value
+        reason = f"{type(error).__name__}: {error}"
+        yield {
+            **(read_record(directory, member) or {"member": member}),
+            "status": "failed", "exit_code": 1, "reason": reason,
+        }  # fmt: skip
+
+
+def default_workers(threads: int) -> int:
+    """Return how many worker processes fit on the cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return max(1, len(os.sched_getaffinity(0)) // threads)
+    return max(1, (os.cpu_count() or 1) // threads)
