@@ -11,14 +11,14 @@ from dvax.app.cli.failure import reported
 from dvax.app.cli.options import Debug
 from dvax.errors import input_error
 
-FILES = ("spring.toml", "spring.py", "test_spring.py")
+FILES = ("spring.toml", "spring.py", "test_spring.py", "sweep.toml")
 
 
 def new(
     out: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to make.")],
     debug: Debug = False,
 ) -> None:
-    """Write a small problem of your own: a Python file, its configuration, and a test."""
+    """Write a small problem of your own: a Python file, its configuration, a test, a sweep."""
     with reported(debug, out):
         taken = [name for name in FILES if (out / name).exists()]
         if taken or (out.exists() and not out.is_dir()):

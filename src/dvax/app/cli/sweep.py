@@ -31,7 +31,9 @@ def sweep(
     ] = None,
     create: Annotated[
         bool,
-        typer.Option("--create", help="Run until one member has finished, then --member can follow."),
+        typer.Option(
+            "--create", help="Run until one member has finished, then --member can follow."
+        ),
     ] = False,
     show: Annotated[
         bool, typer.Option("--list", help="Print the members, and run nothing.")
@@ -185,8 +187,16 @@ class _Lines:
 
 
 def _conclude(sweep: Any, outcome: Any, quiet: bool) -> None:
-    """Print how a sweep ended, make its report, and exit with its code."""
+    """Make the report of a sweep, print how it ended, and exit with its code."""
+    from dvax.app.runs.interrupt import interruptible
+
     said = ", ".join(f"{count} {status}" for status, count in outcome.counts.items())
+    if sweep.table.output.report:
+        from dvax.app.plots.report import build_report
+
+        page = interruptible(lambda: build_report(outcome.directory))
+        if not quiet:
+            print_remark(f"report: {page}")
     if outcome.exit_code or not quiet:
         print_remark(f"{said}; the results are in {outcome.directory}")
     if outcome.exit_code:

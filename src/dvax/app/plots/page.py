@@ -25,30 +25,10 @@ _HINT = '<br><span class="hint">Drag in a figure to zoom, double-click to return
 
 def page(run: RunRecord, pictures: Sequence[Picture], missing: Sequence[str]) -> str:
     """The whole HTML text. `missing` says, a sentence each, which pictures the run cannot give."""
-    room = files("dvax.app.plots")
-    style = (room / "page.css").read_text(encoding="utf-8")
-    script = (room / "page.js").read_text(encoding="utf-8")
-    shown = "\n".join(map(_section, pictures))
     absent = "".join(f"<li>{escaped(text)}</li>" for text in missing)
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escaped(run.title)} · dvax report</title>
-<link rel="icon" href="data:,">
-<style>{style}</style>
-<script>{get_plotlyjs()}</script>
-</head>
-<body>
-<header>
-<h1>{escaped(run.title)}</h1>
-<p>{escaped(_subtitle(run))}{_HINT if pictures else ""}</p>
-</header>
-<main>
-{_banner(run)}
+    body = f"""{_banner(run)}
 <section><h2>Headline figures</h2>{headline_cards(run)}</section>
-{shown}
+{sections(pictures)}
 {f"<section><h2>Not drawn</h2><ul>{absent}</ul></section>" if absent else ""}
 {_stability(run)}
 <section><h2>Constants</h2>{constants_table(run)}
@@ -56,7 +36,37 @@ def page(run: RunRecord, pictures: Sequence[Picture], missing: Sequence[str]) ->
 magnitudes and not signs: they are conservative, and sharper ones stand beside them where there
 are any.</p>
 </section>
-<section><h2>The run</h2>{facts_table(run)}</section>
+<section><h2>The run</h2>{facts_table(run.manifest)}</section>"""
+    return document(run.title, _subtitle(run), body, has_pictures=bool(pictures))
+
+
+def sections(pictures: Sequence[Picture]) -> str:
+    """The sections of the pictures, one each."""
+    return "\n".join(map(_section, pictures))
+
+
+def document(title: str, subtitle: str, body: str, *, has_pictures: bool) -> str:
+    """The whole HTML text of a page with this body."""
+    room = files("dvax.app.plots")
+    style = (room / "page.css").read_text(encoding="utf-8")
+    script = (room / "page.js").read_text(encoding="utf-8")
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{escaped(title)} · dvax report</title>
+<link rel="icon" href="data:,">
+<style>{style}</style>
+<script>{get_plotlyjs()}</script>
+</head>
+<body>
+<header>
+<h1>{escaped(title)}</h1>
+<p>{escaped(subtitle)}{_HINT if has_pictures else ""}</p>
+</header>
+<main>
+{body}
 </main>
 <script>{script}</script>
 </body>

@@ -16,11 +16,13 @@ from dvax.app.plots.page import page
 from dvax.app.plots.picture import Picture
 from dvax.app.plots.run_reader import CONTACT, RunRecord, read_run
 from dvax.app.plots.separation import separation_picture
+from dvax.app.plots.sweep import sweep_page
 from dvax.app.runs.rundir import write_whole
+from dvax.app.runs.sweeps.records import is_sweep
 
 
 def build_report(run_dir: Path | str, *, stills: bool = True) -> Path:
-    """Write `report.html`, and with `stills` a PNG a picture, into the run directory `run_dir`.
+    """Write `report.html`, and with `stills` a PNG a picture, into the folder of a run or a sweep.
 
     Works on a run that stopped early too, and says so at the top of the page. Returns the path of
     the page. Raises InputError where `run_dir` is not a run directory or a file in it is damaged.
@@ -50,10 +52,14 @@ class Report:
 @np.errstate(over="ignore", invalid="ignore")  # infinite values become gaps
 def draw_report(run_dir: Path, *, stills: bool) -> Report:
     """Make the report of `build_report`, and write nothing."""
-    run = read_run(run_dir)
-    pictures, missing = _pictures(run)
+    if is_sweep(run_dir):
+        text, pictures = sweep_page(run_dir)
+    else:
+        run = read_run(run_dir)
+        pictures, missing = _pictures(run)
+        text = page(run, pictures, missing)
     drawn = {f"{picture.key}.png": _png(picture) for picture in pictures} if stills else {}
-    return Report(run.directory, page(run, pictures, missing), drawn)
+    return Report(run_dir, text, drawn)
 
 
 def _pictures(run: RunRecord) -> tuple[list[Picture], list[str]]:

@@ -121,12 +121,12 @@ def _sense(rate: float) -> str:
     return "trajectories approach" if rate < 0 else "trajectories may separate"
 
 
-def facts_table(run: RunRecord) -> str:
+def facts_table(manifest: Mapping[str, Any]) -> str:
     """The manifest, in reading order; nested values one a line."""
-    known = [(FACTS[key], run.manifest[key]) for key in FACTS if key in run.manifest]
+    known = [(FACTS[key], manifest[key]) for key in FACTS if key in manifest]
     others = [
         (_words(key), value)
-        for key, value in run.manifest.items()
+        for key, value in manifest.items()
         if key not in FACTS and key not in SHOWN_ELSEWHERE
     ]
     rows = [(escaped(name), _fact(value)) for name, value in [*known, *others]]

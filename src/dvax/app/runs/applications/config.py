@@ -115,6 +115,11 @@ def check_config(
     """Check and complete a configuration that was parsed from the file `source`: `read_config`."""
     table = raw.get("model")
     name = "contact"
+    if isinstance(raw.get("config"), str) and table is None:
+        raise input_error(
+            f"{source.name}: config", shown(raw["config"]), "a file with this key describes a sweep",
+            f"Run it with dvax sweep {source.name} -o DIR",
+        )  # fmt: skip
     if table is None and not set(raw) & (set(SECTIONS) - {"output"}):
         given = "an empty file" if not raw else f"no [model], but {', '.join(raw)}"
         raise input_error(

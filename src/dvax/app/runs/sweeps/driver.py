@@ -1,8 +1,7 @@
 """`sweep`: run the members that lack results, and leave one table of all."""
 
-import json
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -16,12 +15,18 @@ from dvax.app.runs.provenance import provenance
 from dvax.app.runs.rundir import consolidate, process, write_json
 from dvax.app.runs.sweeps import store
 from dvax.app.runs.sweeps.member import create_store, store_member
-from dvax.app.runs.sweeps.records import is_complete, read_record, records, write_lines
+from dvax.app.runs.sweeps.records import (
+    KIND,
+    MANIFEST,
+    is_complete,
+    is_sweep,
+    read_record,
+    records,
+    write_lines,
+)
 from dvax.app.runs.sweeps.sweep import Sweep
 from dvax.app.runs.sweeps.workers import cluster, results
 from dvax.errors import Problems
-
-MANIFEST, KIND = "manifest.json", "sweep"
 
 Listener = Callable[[Mapping[str, Any]], None]
 
@@ -76,7 +81,7 @@ def run_sweep(
                     batches = [[k] for k in todo] if create_only else [todo]
                     for batch in batches:
                         ended = results(client, sweep, out, batch)
-                        while (record := interruptible(lambda: next(ended, None))) is not None:
+                        while (record := interruptible(_next(ended))) is not None:
                             tell({"event": "member", **collector.add(record)})
                         if create_only and collector.has_store:
                             break
@@ -93,6 +98,10 @@ def run_sweep(
     return SweepOutcome(out, counts, code or (0 if finished else 3))
 
 
+def _next(records: Iterator[dict[str, Any]]) -> Callable[[], dict[str, Any] | None]:
+    return lambda: next(records, None)
+
+
 class _Collector:
     """Takes the records of members as they end. The store has the schema of the first member, in their
     order, that finishes: until then the results of others wait in their folders."""
@@ -104,22 +113,23 @@ class _Collector:
 
     def add(self, record: dict[str, Any]) -> dict[str, Any]:
         """Store what can be stored, and return the record."""
-        member = record["member"]
         if record["status"] == "solved":
-            self.waiting[member] = record
-        else:
-            self.failed.add(member)
+            self.waiting[record["member"]] = record
+        elif record["status"] != "finished":
+            self.failed.add(record["member"])
         if not self.has_store:
-            first = next(k for k in range(self.sweep.count) if k not in self.failed)
+            first = next((k for k in range(self.sweep.count) if k not in self.failed), None)
             if first not in self.waiting:
                 return record
             create_store(self.sweep, self.out, first)
             self.has_store = True
-            for failed in self.failed:
-                store.mark_member(self.out, failed, "failed")
         for each in self.waiting.values():
             store_member(self.sweep, self.out, each)
+        # The worker could not, if there was no store then.
+        for member in self.failed:
+            store.mark_member(self.out, member, "failed")
         self.waiting.clear()
+        self.failed.clear()
         return record
 
 
@@ -149,15 +159,6 @@ class _Manifest:
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
-
-
-def is_sweep(directory: Path) -> bool:
-    """Return whether a folder holds a sweep."""
-    try:
-        manifest = json.loads((directory / MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(manifest, dict) and manifest.get("kind") == KIND
 
 
 def target_problems(out: Path, *, resume: bool) -> Problems:

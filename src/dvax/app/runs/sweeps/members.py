@@ -1,6 +1,6 @@
 """The members of a sweep: the rows of its parameters.
 
-    members = grid × zip × sample × table      (those that the file has; the last one varies fastest)
+members = grid × zip × sample × table      (those that the file has; the last one varies fastest)
 """
 
 import csv
@@ -144,9 +144,7 @@ def _points(given: SampleSection, dimensions: int) -> np.ndarray:
     return np.clip(points, least, 1 - np.finfo(float).epsneg)
 
 
-def _table(
-    file: str, table: SweepFile, source: Path, allow_outside: bool
-) -> list[Parameter]:
+def _table(file: str, table: SweepFile, source: Path, allow_outside: bool) -> list[Parameter]:
     assert table.table is not None
     place = f"{file}: table.file"
     path = locate(table.table.file, source.parent, allow_outside, place)

@@ -31,8 +31,8 @@ class Parameter:
 
 
 def parameter(place: str, key: str, values: Sequence[Any]) -> Parameter:
-    """Return the parameter of these values: numbers, or texts such as "5 mm", become numbers in the unit
-    of the first one.
+    """Return the parameter of these values: numbers, and texts such as "5 mm", become numbers in the
+    unit of the first one.
 
     **Raises:** `dvax.InputError` if units do not convert.
     """
@@ -48,7 +48,7 @@ def parameter(place: str, key: str, values: Sequence[Any]) -> Parameter:
     return Parameter(key, tuple(values), tuple(numbers), unit)
 
 
-def from_numbers(key: str, numbers: Sequence[float], unit: str) -> Parameter:
+def from_numbers(key: str, numbers: np.ndarray, unit: str) -> Parameter:
     """Return the parameter of computed numbers: with a unit its values are texts."""
     values = tuple(f"{n!r} {unit}" if unit else n for n in map(float, numbers))
     return Parameter(key, values, tuple(map(float, numbers)), unit)
@@ -137,8 +137,9 @@ def _ends(
             place, f"{given[first]!r} and {given[second]!r}", "both have a unit, or none",
             "Write the unit with both",
         )  # fmt: skip
-    number = _in_unit(f"{place}.{second}", str(two.values[0]), one.unit) if one.unit else two.numbers[0]  # pyright: ignore  # noqa: E501
-    return one.numbers[0], number, one.unit  # pyright: ignore[reportOptionalSubscript]
+    number = _in_unit(f"{place}.{second}", given[second], one.unit) if one.unit else given[second]
+    assert one.numbers is not None
+    return one.numbers[0], float(number), one.unit
 
 
 def _scaled(place: str, given: Mapping[str, Any], low: float, high: float, points: Any) -> Any:
@@ -191,5 +192,3 @@ def flat_keys(table: Mapping[str, Any], is_value: Any, prefix: str = "") -> dict
 def is_range(table: Mapping[str, Any]) -> bool:
     """Return whether a table is a range or a distribution, and not a table of keys."""
     return bool({"from", "to", "low", "high", "mean", "deviation"} & set(table))
-
-

@@ -15,6 +15,7 @@ from typing import Any
 from dvax.app.runs.json_numbers import json_ready
 from dvax.app.runs.rundir import write_json, write_whole
 
+MANIFEST, KIND = "manifest.json", "sweep"
 FOLDER, LINES = "members", "members.jsonl"
 
 
@@ -56,3 +57,12 @@ def write_lines(directory: Path, count: int) -> None:
         json.dumps(json_ready(record), ensure_ascii=False) for record in records(directory, count)
     )
     write_whole(directory / LINES, "".join(f"{line}\n" for line in lines).encode())
+
+
+def is_sweep(directory: Path) -> bool:
+    """Return whether a folder holds a sweep."""
+    try:
+        manifest = json.loads((directory / MANIFEST).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(manifest, dict) and manifest.get("kind") == KIND

@@ -16,7 +16,7 @@ class SampleSection(Section):
     count: int = Field(ge=1, le=10**6, description="number of points", examples=[64])
     seed: int = Field(0, ge=0, description="seed of the generator: the same seed, the same points")
     between: dict[str, Any] = Field(
-        description="for each key { low, high }, with spacing = \"log\" where wanted, or "
+        description='for each key { low, high }, with spacing = "log" where wanted, or '
         "{ mean, deviation } of a normal distribution"
     )
 
@@ -55,4 +55,4 @@ class SweepFile(Section):
     )
     sample: SampleSection | None = Field(None, description="random points")
     table: TableSection | None = Field(None, description="members from a table")
-    output: SweepOutput = Field(default_factory=SweepOutput, description="what is kept")
+    output: SweepOutput = Field(SweepOutput.model_validate({}), description="what is kept")

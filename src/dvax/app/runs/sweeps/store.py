@@ -36,9 +36,11 @@ def create(
     count = len(parameters[0].values)
     coordinates: dict[str, Array] = {}
     for p in parameters:
-        about = {"long_name": p.key, **({} if p.numbers is None else {"units": p.unit or "1"})}
+        about = {"long_name": p.key, **({"units": p.unit} if p.unit else {})}
         coordinates[p.key] = Array((_MEMBER,), _coordinate(p), about)
-    coordinates[_MEMBER] = Array((_MEMBER,), np.arange(count), {"long_name": "number of the member"})
+    coordinates[_MEMBER] = Array(
+        (_MEMBER,), np.arange(count), {"long_name": "number of the member"}
+    )
     ofeach: dict[str, Array] = {
         "status": Array(
             (), np.int8(0),
@@ -107,7 +109,11 @@ def _coordinate(p: Parameter) -> np.ndarray:
 
 
 def _line(values: Any) -> str:
-    return "nothing" if values is None else f"{len(values)} values, {np.array2string(values, threshold=6)}"
+    return (
+        "nothing"
+        if values is None
+        else f"{len(values)} values, {np.array2string(values, threshold=6)}"
+    )
 
 
 class Array:

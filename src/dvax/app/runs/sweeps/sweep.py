@@ -110,9 +110,7 @@ class Sweep:
         return self._files[key]
 
 
-def read_sweep(
-    path: str | Path, *, allow_outside: bool = False, allow_code: bool = False
-) -> Sweep:
+def read_sweep(path: str | Path, *, allow_outside: bool = False, allow_code: bool = False) -> Sweep:
     """Read and check a sweep file, the configuration that it names, and its first and last member.
 
     **Raises:** `dvax.InputError` with all problems found.

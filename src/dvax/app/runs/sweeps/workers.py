@@ -2,16 +2,13 @@
 
 import os
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from dvax.app.runs.sweeps.records import read_record
+from dvax.app.runs.sweeps.records import read_record, write_record
 from dvax.errors import input_error
-
-RETRIES = 2
-"""How often a member is run again after its worker died."""
 
 _sweeps: dict[tuple[Any, ...], Any] = {}
 
@@ -35,8 +32,8 @@ def run_task(
 
 @contextmanager
 def cluster(address: str | None, workers: int, threads: int) -> Iterator[Any]:
-    """A Dask client: of the scheduler at this address, else of as many new worker processes with so many
-    threads.
+    """A Dask client: of the scheduler at this address, else of so many new processes with as many
+    threads each.
 
     **Raises:** `dvax.InputError` if no scheduler answers.
     """
@@ -61,7 +58,7 @@ def cluster(address: str | None, workers: int, threads: int) -> Iterator[Any]:
     }
     with (
         tempfile.TemporaryDirectory(prefix="dvax-sweep-") as folder,
-        dask.config.set({  # pyright: ignore[reportPrivateImportUsage]
+        dask.config.set({
             "distributed.nanny.pre-spawn-environ": environment,
             "distributed.worker.memory.target": False,
             "distributed.worker.memory.spill": False,
@@ -71,7 +68,7 @@ def cluster(address: str | None, workers: int, threads: int) -> Iterator[Any]:
             "distributed.comm.timeouts.tcp": "1 day",
         }),
         LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None,
+            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="",
             memory_limit=None, local_directory=folder, silence_logs=50,
         ) as local,
         Client(local) as client,
@@ -81,7 +78,7 @@ def cluster(address: str | None, workers: int, threads: int) -> Iterator[Any]:
 
 def results(
     client: Any, sweep: Any, directory: Path, members: Sequence[int]
-) -> Iterator[Mapping[str, Any]]:
+) -> Iterator[dict[str, Any]]:
     """The records of these members, as they end.
 
     Tasks return their records, and the results are on disk: nothing is kept in the client.
@@ -90,21 +87,25 @@ def results(
 
     where = str(sweep.source.resolve()), str(directory.resolve())
     options = sweep.allow_outside, sweep.allow_code
-    tasks = {
-        client.submit(run_task, *where, k, *options, pure=False, retries=RETRIES): k
-        for k in members
-    }
+    tasks = {client.submit(run_task, *where, k, *options, pure=False): k for k in members}
     for future, value in as_completed(tasks, with_results=True, raise_errors=False):
-        member = tasks.pop(future)
-        if future.status == "finished":
+        member, status = tasks.pop(future), future.status
+        if status == "finished":
             yield value
             continue
+        if status != "error":
+            raise input_error(
+                "--scheduler", str(client.scheduler.address), f"its tasks are {status}: it has ended",
+                "Start it again, and pass --resume to run what is missing",
+            )  # fmt: skip
+        # The worker died several times, or the disk refused: dvax itself leaves a record.
         error = value[1] if isinstance(value, tuple) else value
-        reason = f"{type(error).__name__}: {error}"
-        yield {
+        record = {
             **(read_record(directory, member) or {"member": member}),
-            "status": "failed", "exit_code": 1, "reason": reason,
+            "status": "failed", "exit_code": 1, "reason": f"{type(error).__name__}: {error}",
         }  # fmt: skip
+        write_record(directory, record)
+        yield record
 
 
 def default_workers(threads: int) -> int:
