@@ -22,3 +22,4 @@ from .results import RESULTS as RESULTS
 from .runge_kutta import DormandPrince as DormandPrince
 from .solution import Solution as Solution
 from .solve import solve as solve
+from .zarr_store import ZarrStore as ZarrStore

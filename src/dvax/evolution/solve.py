@@ -41,6 +41,7 @@ from .results import RESULTS
 from .setup import Options, Setup, as_arrays
 from .signature import flat
 from .solution import Solution
+from .streaming import check_save, stream
 
 _FIRST_ROOM = 2**12
 """Steps that a run with `dense=True` has room for at first, with few entries of the state."""
@@ -78,6 +79,7 @@ def solve(
     throw: bool = True,
     events: Sequence[Event] = (),
     max_events: int = 256,
+    save: Any = None,
 ) -> Solution:
     """Solve x' = Ax + f(t, x, u), u ∈ h(t, x, u) − N_{K(t)}(P u) from x(t0) = x0 up to t1.
 
@@ -117,6 +119,8 @@ def solve(
       `jax.jacfwd`: one loop cannot serve both;
     - `events`: a list of `dvax.Event`: functions of (t, x, u) whose zeros are recorded, end the run, or
       reset the state; `max_events`: the largest number of zeros, of all events together;
+    - `save`: a `dvax.ZarrStore` for the rows of `ts`: they are written while the run goes on, so that
+      its memory does not grow with their number. The solution that is returned has the last row alone;
     - `throw`: raise where the solve fails, inside `jax.grad` too; otherwise look at `result`. Under
       `jax.jit` and `jax.vmap` nothing can raise: times that were not reached are infinite there, their
       states NaN, and all derivatives NaN.
@@ -145,6 +149,9 @@ def solve(
 
     ```
     """
+    if save is not None:
+        others = dense, bool(events), certified_tol is not None, progress
+        check_save(save, ts, x0, args, others)
     check_events(events, max_events, method, dt, certified_tol is not None)
     if certified_tol is not None:
         x0 = _state(problem, x0)
@@ -170,6 +177,18 @@ def solve(
         vi_solver, max_steps, constants, progress,
     )  # fmt: skip
     _user_code.check_args(args, "dvax.solve")
+    if save is not None:
+        options: dict[str, Any] = dict(
+            dt=dt, rtol=rtol, atol=atol, method=method, vi_solver=vi_solver, constants=constants,
+            measure=measure, dt_max=dt_max, max_steps=max_steps, adjoint=adjoint, throw=False,
+            horizon=t1 - t0 if horizon is None else horizon,
+        )  # fmt: skip
+
+        def piece(x: Tree, start: float, end: float, times: np.ndarray, step: Any) -> Solution:
+            return solve(problem, x, start, end, args, times, dt0=step, **options)
+
+        every = np.asarray(ts, float)
+        return stream(piece, x0, float(t0), float(t1), every, dt0, save, dt is not None, throw)
     fixed = dt is not None
     if not fixed:
         warn_precision(x0, rtol)

@@ -26,9 +26,9 @@ from dvax.app.runs.config import load_config
 from dvax.app.runs.figure import Figure
 from dvax.app.runs.json_numbers import json_ready
 from dvax.app.runs.schema import SolverKeys
-from dvax.app.runs.solutions import all_finite
 from dvax.app.runs.solver_options import check_dt_max
 from dvax.errors import InputError, InputProblem, SolveError
+from dvax.evolution.rows import all_finite
 
 INFINITE = {"Hadamard": [("d_x = 0.2", "d_x = 900.0"), ("end = 1.0", "end = 1.2")]}
 TINY = {"norms": [('beta = "0.5 MPa/um"', "beta = 1e-300")]}

@@ -8,7 +8,7 @@ import numpy as np
 
 END = 1.0
 
-MODEL = '''
+MODEL = """
 from typing import Annotated
 import dvax
 
@@ -32,7 +32,7 @@ def build(
     return dvax.models.Model(
         problem, 1.0, 1.0, args=args, states={"depth": "mm"}, responses={"force": "mm/s"}, title="decay"
     )
-'''
+"""
 CONFIG = '[model]\npython = "decay.py:build"\nframes = 4\nmethod = "ETD2RK"\ndt = 0.001\n'
 
 

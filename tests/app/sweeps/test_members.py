@@ -28,7 +28,9 @@ def refused(folder, text):
 
 
 def test_grid_runs_all_combinations_and_its_last_key_varies_fastest(tmp_path):
-    found = members(tmp_path, '[grid]\n"a.x" = [1, 2]\n"a.y" = [true, false]\nb.z = ["p", "q", "r"]\n')
+    found = members(
+        tmp_path, '[grid]\n"a.x" = [1, 2]\n"a.y" = [true, false]\nb.z = ["p", "q", "r"]\n'
+    )
     rows = list(zip(*(p.values for p in found.values()), strict=True))
     assert list(found) == ["a.x", "a.y", "b.z"]
     assert rows == list(itertools.product([1, 2], [True, False], ["p", "q", "r"]))
@@ -57,7 +59,9 @@ def test_blocks_multiply_and_the_keys_of_zip_advance_together(tmp_path):
 def test_range_has_its_ends_exactly_and_even_spacing(tmp_path_factory, first, factor, count, log):
     last, spacing = first * factor, "log" if log else "linear"
     where = f'{{ from = {first!r}, to = {last!r}, count = {count}, spacing = "{spacing}" }}'
-    values = np.array(members(tmp_path_factory.getbasetemp(), f'[grid]\n"m.a" = {where}\n')["m.a"].values)
+    values = np.array(
+        members(tmp_path_factory.getbasetemp(), f'[grid]\n"m.a" = {where}\n')["m.a"].values
+    )
     assert (values[0], values[-1], len(values)) == (first, last, count)
     apart = np.diff(np.log(values) if log else values)
     np.testing.assert_allclose(apart, apart[0], rtol=1e-9)
@@ -91,7 +95,8 @@ def test_samples_lie_in_their_box_and_follow_from_the_seed(tmp_path, method):
         return members(
             tmp_path,
             f'[sample]\nmethod = "{method}"\ncount = {count}\nseed = {seed}\n[sample.between]\n'
-            '"m.a" = { low = 2.0, high = 3.0 }\n"m.b" = { low = "1 mm", high = "1 m", spacing = "log" }\n'
+            '"m.a" = { low = 2.0, high = 3.0 }\n'
+            '"m.b" = { low = "1 mm", high = "1 m", spacing = "log" }\n'
             '"m.c" = { mean = 5.0, deviation = 0.5 }\n',
         )
 
@@ -104,7 +109,9 @@ def test_samples_lie_in_their_box_and_follow_from_the_seed(tmp_path, method):
     assert abs(np.mean(np.log10(b) < 1.5) - 0.5) < (0.2 if method == "random" else 0.03)
     assert abs(c.mean() - 5) < 0.2 and abs(c.std() - 0.5) < 0.15
     if method == "sobol":
-        assert drawn(3, 16)["m.a"].values == one["m.a"].values[:16]  # more points keep the first ones
+        assert (
+            drawn(3, 16)["m.a"].values == one["m.a"].values[:16]
+        )  # more points keep the first ones
 
 
 def test_sobol_points_have_one_in_each_interval_of_a_power_of_two(tmp_path):
@@ -117,7 +124,7 @@ def test_sobol_points_have_one_in_each_interval_of_a_power_of_two(tmp_path):
 
 def test_cells_of_a_table_are_numbers_flags_and_texts(tmp_path):
     (tmp_path / "rows.csv").write_text(
-        "\ufeffm.a,m.b,m.c,m.d\r\n1,true,2 mm,\"a, b\"\r\n-1.5e3,false,3 cm,c\r\n", encoding="utf-8"
+        '\ufeffm.a,m.b,m.c,m.d\r\n1,true,2 mm,"a, b"\r\n-1.5e3,false,3 cm,c\r\n', encoding="utf-8"
     )
     found = members(tmp_path, '[table]\nfile = "rows.csv"\n')
     assert found["m.a"].values == (1, -1500.0) and found["m.b"].values == (True, False)
@@ -142,13 +149,15 @@ def test_cells_of_a_table_are_numbers_flags_and_texts(tmp_path):
         ('[grid]\n"m.a" = ["1 mm", "2 s"]\n', "must convert to the unit of the first value, mm"),
         ('[grid]\n"output.png" = [true]\n', "does not change the results"),
         ('[sample]\ncount = 0\n[sample.between]\n"m.a" = [0.0, 1.0]\n', "sample.count"),
-        ('[sample]\ncount = 4\n[sample.between]\n"m.a" = { mean = 1.0, deviation = 0.0 }\n', "positive"),
+        ('[sample]\ncount = 4\n[sample.between]\n"m.a" = { mean = 1.0, deviation = 0.0 }\n',
+         "positive"),
         ('[sample]\ncount = 4\n[sample.between]\n"m.a" = { low = 1.0 }\n', "m.a.high: got nothing"),
         ('[sample]\nmethod = "soboll"\ncount = 4\n[sample.between]\n"m.a" = [0.0, 1.0]\n', "'sobol'"),
         ('[table]\nfile = "none.csv"\n', "there is no such file"),
         ('[table]\nfile = "../rows.csv"\n', "in the configuration's folder"),
         ("[grind]\nx = [1]\n", "Did you mean 'grid'?"),
-        ('[grid]\n"m.a" = { from = 1, to = 2, count = 2000 }\n"m.b" = { from = 1, to = 2, count = 2000 }\n',
+        ('[grid]\n"m.a" = { from = 1, to = 2, count = 2000 }\n'
+         '"m.b" = { from = 1, to = 2, count = 2000 }\n',
          "at most 1000000"),
     ],
 )  # fmt: skip

@@ -139,9 +139,7 @@ def test_changed_configuration_is_run_again_and_an_unchanged_one_is_not(sweep, c
 
 
 def test_other_parameters_need_another_folder(copy, tmp_path):
-    other = read_sweep(
-        written(tmp_path / "other", SWEEP.replace("0.5]", "0.6]")), allow_code=True
-    )
+    other = read_sweep(written(tmp_path / "other", SWEEP.replace("0.5]", "0.6]")), allow_code=True)
     with pytest.raises(dvax.InputError, match="Go on with the sweep file of the beginning"):
         run_sweep(other, copy, resume=True)
 

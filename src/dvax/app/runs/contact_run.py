@@ -29,11 +29,11 @@ from dvax.app.runs.interrupt import Work, interruptible
 from dvax.app.runs.run import AbstractRun, Facts, Listener
 from dvax.app.runs.rundir import FrameStore, damaged_files, new_store, recover_store
 from dvax.app.runs.schema import SolverSection
-from dvax.app.runs.solutions import all_finite
 from dvax.app.runs.solver_options import settings
 from dvax.app.runs.wording import Wording
 from dvax.errors import SolveError
 from dvax.evolution import Solution, solve
+from dvax.evolution.rows import all_finite
 from dvax.spaces import AbstractSpace
 from dvax.theory import Bound, Status, bound_error
 

@@ -26,6 +26,8 @@ from typing import Any
 import numpy as np
 import zarr
 
+from dvax._files import consolidate as consolidate
+from dvax._files import write_whole as write_whole
 from dvax.app.runs import checkpoints
 from dvax.app.runs.json_numbers import json_ready
 from dvax.app.runs.lock import NAME as LOCK
@@ -108,24 +110,6 @@ def write_json(file: Path, content: Mapping[str, Any]) -> None:
     """Write an object; numbers that are not finite become strings. Raises `OSError`."""
     text = json.dumps(json_ready(content), indent=2, ensure_ascii=False, allow_nan=False)
     write_whole(file, f"{text}\n".encode())
-
-
-def write_whole(file: Path, content: bytes) -> None:
-    """Write beside `file`, then rename: readers get the old or the new content, and a full disk
-    leaves no partial file.
-
-    **Raises:** `OSError` with the name of the file.
-    """
-    beside = file.with_name(f".{file.name}.new")
-    try:
-        with beside.open("wb") as opened:
-            opened.write(content)
-            opened.flush()
-            os.fsync(opened.fileno())
-        beside.replace(file)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise type(error)(error.errno, error.strerror, str(file)) from error
 
 
 def process() -> dict[str, Any]:
@@ -324,24 +308,6 @@ def recover_store(path: Path) -> None:
     new = path.with_name(f".{path.name}.new")
     if not path.exists() and new.exists():
         new.rename(path)
-
-
-def consolidate(path: Path, frames: int | None = None) -> None:
-    """Replace the consolidated metadata of a store, which readers such as xarray use. With `frames`
-    every array in it ends with the last complete frame, so that the store of a killed run opens."""
-    about = {
-        folder.name: json.loads((folder / "zarr.json").read_text(encoding="utf-8"))
-        for folder in sorted(path.iterdir())
-        if (folder / "zarr.json").is_file()
-    }
-    for each in about.values():
-        if frames is not None and each.get("dimension_names", [None])[:1] == ["time"]:
-            each["shape"][0] = frames
-    group = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
-    group["consolidated_metadata"] = {
-        "kind": "inline", "must_understand": False, "metadata": about,
-    }  # fmt: skip
-    write_whole(path / "zarr.json", json.dumps(group).encode())
 
 
 def _has_only_files_of_a_run(out: Path) -> bool:

@@ -17,11 +17,11 @@ from dvax._tree import Label
 from dvax.app.runs.applications.base import Plan, Results, Variable
 from dvax.app.runs.checkpoints import Checkpoint
 from dvax.app.runs.interrupt import interruptible
-from dvax.app.runs.solutions import all_finite, cut, with_fields
 from dvax.app.runs.solver_options import SEGMENTS
 from dvax.errors import SolveError
 from dvax.evolution import Implicit, Solution, solve
 from dvax.evolution.responses import Responses
+from dvax.evolution.rows import all_finite, cut, with_fields
 
 
 def segments(plan: Plan, first: int = 0, x: Any = None, step: Any = None) -> Iterator[Solution]:
@@ -65,7 +65,7 @@ def segments(plan: Plan, first: int = 0, x: Any = None, step: Any = None) -> Ite
             if isinstance(error.solution, Solution) and len(error.solution.ts):
                 yield error.solution
             raise
-        yield cut(solution, len(wanted))
+        yield cut(solution, slice(len(wanted)))
         x, step = solution.stats["x"], None if fixed else float(solution.stats["next_dt"])
 
 

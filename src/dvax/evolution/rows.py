@@ -1,21 +1,21 @@
-"""Solutions of one piece of a run: their first rows, and a check that states are finite."""
+"""The saved rows of a solution: the first ones, joined ones, and a check that they are finite."""
 
 from typing import Any
 
 import jax.tree_util as jtu
 import numpy as np
 
-from dvax.errors import Fix, SolveError
-from dvax.evolution import Solution
+from ..errors import Fix, SolveError
+from .solution import Solution
 
 _ROWS = (
     "ts", "xs", "law", "defect", "law_defect", "completed_defect",
 )  # fmt: skip
 
 
-def cut(solution: Solution, count: int) -> Solution:
-    """The solution at the first `count` saved times."""
-    rows = {n: jtu.tree_map(lambda leaf: leaf[:count], getattr(solution, n)) for n in _ROWS}
+def cut(solution: Solution, which: slice) -> Solution:
+    """Return the solution at these saved times."""
+    rows = {n: jtu.tree_map(lambda leaf: leaf[which], getattr(solution, n)) for n in _ROWS}
     return with_fields(solution, rows)
 
 
@@ -44,7 +44,7 @@ def all_finite(solution: Solution, start: float) -> Solution:
     until = float(times[min(whole, count - 1)])
     raise SolveError(
         f"The state ceased to be finite between t = {after:.10g} and t = {until:.10g}.",
-        cut(solution, whole),
+        cut(solution, slice(whole)),
         (
             Fix("rtol", "1e-6", "in the place of dt, for steps that adapt"),
             Fix("", "", "Check the sizes of the coefficients, and the units that they are in"),
