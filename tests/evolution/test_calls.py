@@ -1,5 +1,7 @@
 """The arguments and results of `dvax.solve` around its compiled loop."""
 
+import re
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -142,10 +144,18 @@ def test_progress_output_appears_on_request_and_does_not_change_the_solution(ste
     case = c1()
     silent = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, **steps)
     assert "%" not in "".join(capfd.readouterr())
+    steps = steps | {"method": dvax.ETD2RK()}
     shown = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, progress=True, **steps)
     jax.block_until_ready(shown.xs)
     jax.effects_barrier()
-    assert "100.00%" in "".join(capfd.readouterr())
+    lines = capfd.readouterr().err.splitlines()
+    said = [
+        re.fullmatch(r"dvax.solve: (\d+)%, (\d+) steps of ETD2RK, [\d.e-]+ s( left)?", s)
+        for s in lines
+    ]
+    shares, counts = ([int(m[k]) for m in said if m] for k in (1, 2))
+    assert len(shares) == len(lines) > 3 and shares[-1] == 100
+    assert sorted(shares) == shares and sorted(counts) == counts
     # Another program, which is compiled otherwise: equal to rounding.
     assert float(shown.xs[0]) == pytest.approx(float(silent.xs[0]), rel=1e-13)
 

@@ -62,6 +62,15 @@ def test_rows_are_those_of_a_run_without_a_store(whole, tmp_path):
     assert int(end.stats["steps"]) >= int(whole.stats["steps"])
 
 
+def test_progress_counts_the_steps_of_all_pieces(tmp_path, capfd):
+    end = dvax.solve(
+        PROBLEM, -1.0, 0.0, END, ts=TIMES, rtol=1e-8, save=dvax.ZarrStore(tmp_path / "run.zarr"),
+        progress=True,
+    )  # fmt: skip
+    lines = capfd.readouterr().err.splitlines()
+    assert len(lines) == 13 and f"100%, {int(end.stats['steps'])} steps" in lines[-1]
+
+
 def test_bound_of_the_end_holds_for_the_whole_run(tmp_path):
     found = dvax.verify(PROBLEM, -1.0, 0.0, END).constants
     options = dict(constants=found, method=dvax.ETD2RK(), rtol=1e-4, atol=1e-4)

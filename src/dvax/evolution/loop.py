@@ -83,7 +83,7 @@ class Loop(eqx.Module):
         state = self._start(x0, ts is not None, checkpoints)
         t1 = self.controller.stops[-1]
         if ts is None:
-            return None, meter.keep(self._until(state, t1))
+            return None, self._until(state, t1)
         times, count = lax.stop_gradient(ts), ts.shape[0]
         blank = jax.eval_shape(lambda: self._read(state, times[0]))
         rows = jtu.tree_map(lambda s: jnp.zeros((count, *s.shape), s.dtype), blank)
@@ -96,7 +96,7 @@ class Loop(eqx.Module):
 
         start = state, rows, jnp.asarray(0)
         state, rows, _ = lax.while_loop(lambda carry: carry[2] <= count, turn, start)
-        return rows, meter.keep(state)
+        return rows, state
 
     def _start(self, x0: Tree, saves: bool, checkpoints: Checkpoints | None) -> State:
         controller, stepper = self.controller, self.stepper
@@ -247,7 +247,9 @@ class Loop(eqx.Module):
         shown = state.meter
         if self.progress:
             stops = self.controller.stops
-            shown = meter.advance(shown, (ahead[0] - stops[0]) / (stops[-1] - stops[0]))
+            share = (ahead[0] - stops[0]) / (stops[-1] - stops[0])
+            name = type(self.stepper.method).__name__
+            shown = meter.advance(shown, share, state.steps, name)
         t, x, integrated_defect, solver_state, jumped, bounds = ahead
         put = lambda table, row: _tree.put_if(own, table, state.steps, row)  # noqa: E731
         after = State(

@@ -150,7 +150,7 @@ def solve(
     ```
     """
     if save is not None:
-        others = dense, bool(events), certified_tol is not None, progress
+        others = dense, bool(events), certified_tol is not None
         check_save(save, ts, x0, args, others)
     check_events(events, max_events, method, dt, certified_tol is not None)
     if certified_tol is not None:
@@ -187,8 +187,10 @@ def solve(
         def piece(x: Tree, start: float, end: float, times: np.ndarray, step: Any) -> Solution:
             return solve(problem, x, start, end, args, times, dt0=step, **options)
 
-        every = np.asarray(ts, float)
-        return stream(piece, x0, float(t0), float(t1), every, dt0, save, dt is not None, throw)
+        return stream(
+            piece, x0, float(t0), float(t1), np.asarray(ts, float), dt0, save, dt is not None, throw,
+            progress,
+        )  # fmt: skip
     fixed = dt is not None
     if not fixed:
         warn_precision(x0, rtol)

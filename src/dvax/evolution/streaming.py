@@ -5,6 +5,7 @@ before, and all pieces share one compiled program, so that the memory of a run d
 number of saved times.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol, runtime_checkable
 
@@ -14,6 +15,7 @@ import numpy as np
 from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
+from . import meter
 from .results import is_success
 from .rows import cut, with_fields
 from .solution import Solution
@@ -38,7 +40,7 @@ class Store(Protocol):
         ...
 
 
-_OTHERS = ("dense", "events", "certified_tol", "progress")
+_OTHERS = ("dense", "events", "certified_tol")
 
 
 def check_save(save: Any, ts: Any, x0: Any, args: Any, others: tuple[bool, ...]) -> None:
@@ -69,7 +71,7 @@ def check_save(save: Any, ts: Any, x0: Any, args: Any, others: tuple[bool, ...])
 
 def stream(
     run: Callable[..., Solution], x0: Tree, t0: float, t1: float, times: np.ndarray, dt0: Any,
-    save: Store, fixed: bool, throw: bool,
+    save: Store, fixed: bool, throw: bool, progress: bool,
 ) -> Solution:  # fmt: skip
     """Write the rows of a run into `save`, and return its end.
 
@@ -79,7 +81,7 @@ def stream(
     **Raises:** `dvax.SolveError` where a piece fails, after the rows that were reached are saved.
     """
     save.begin(len(times))
-    totals = _Totals()
+    totals, began = _Totals(), meter.now()
     try:
         for piece, count in _pieces(run, x0, t0, t1, times, dt0, fixed):
             totals.add(piece)
@@ -87,6 +89,10 @@ def stream(
                 save.write(totals.rows(slice(count)))
             if not is_success(piece.result):
                 break
+            if progress:
+                done = math.floor(1000 * (float(piece.stats["t"]) - t0) / (t1 - t0))
+                method = str(piece.stats["method"]).partition(":")[0]
+                meter.show(method, done, totals.piece.stats["steps"], began)
     finally:
         save.finish()
     end = totals.rows(slice(max(count - 1, 0), count))
@@ -123,7 +129,7 @@ class _Totals:
     """The last piece, with the integrals of the defect and the counts of the whole run so far."""
 
     def __init__(self) -> None:
-        self.piece: Solution | None = None
+        self.piece: Any = None
 
     def add(self, piece: Solution) -> None:
         before, self.piece = self.piece, piece
@@ -145,7 +151,6 @@ class _Totals:
 
     def rows(self, which: slice) -> Solution:
         """Return these rows of the last piece."""
-        assert self.piece is not None
         return cut(self.piece, which)
 
 

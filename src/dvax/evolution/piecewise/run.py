@@ -8,7 +8,6 @@ therefore depends on the number of excited scales, and not on their ratios. Time
 relative to its start and stored as a sum of two numbers: a transient of 10⁻¹⁸ s is resolved at any t.
 """
 
-import jax.numpy as jnp
 import numpy as np
 
 from .. import meter
@@ -56,7 +55,7 @@ class Run:
         self.defect = self.law_defect = 0.0
         self.piece = pieces[0]
         self.t, self.result = pieces[0].start, "successful"
-        self.meter, self.printed_share = meter.begin() if progress else None, 0.0
+        self.began, self.printed_share = meter.now() if progress else None, 0.0
         self.span = pieces[-1].start + pieces[-1].length - self.t
         m = len(original.low)
         none = np.stack([np.full(m, np.inf), np.full(m, -np.inf)])
@@ -86,8 +85,8 @@ class Run:
     def _print_progress(self, share: float) -> None:
         """Print the completed share of the run, if `progress` is set."""
         self.printed_share = share
-        if self.meter is not None:
-            self.meter = meter.advance(self.meter, jnp.asarray(share))
+        if self.began is not None:
+            meter.show("PiecewiseLinear", math.floor(1000 * share), self.accepted, self.began)
 
     def _converted(self, piece: Piece) -> Piece:
         """Return the piece in the variables of the pivoted system."""
