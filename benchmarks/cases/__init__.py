@@ -30,6 +30,7 @@ CASES = (
     "stiffness",
     "picard",
     "ensemble",
+    "sweeps",
 )
 """The names that --only takes, in the order of a run."""
 

@@ -64,7 +64,8 @@ def cluster(address: str | None, workers: int, threads: int) -> Iterator[Any]:
             "distributed.worker.memory.spill": False,
             "distributed.worker.memory.pause": False,
             "distributed.worker.memory.terminate": False,
-            # A member holds its worker for as long as it runs.
+            # A worker that compiles or computes for long is not dead.
+            "distributed.scheduler.worker-ttl": None,
             "distributed.comm.timeouts.tcp": "1 day",
         }),
         LocalCluster(
