@@ -25,6 +25,7 @@ FLOORS = {
     "programs": -0.5,
     "_user_code": 0,
     "_figure_text": -2,
+    "_dataset": -0.5,
     "spaces": 0,
     "generators": 0,
     "operators": 0,

@@ -10,10 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
+from .._dataset import Names
 from .._jax.traces import current_trace
 from .._tree import Tree
 from ..errors import Fix, InputError, InputProblem, SolveError
 from .bounds import Bounds
+from .dataset import solution_dataset
 from .diagnose import failure
 from .event import Events
 from .flow import Flow
@@ -300,26 +302,39 @@ class Solution(eqx.Module):
             raise failure(self)
         return self
 
-    def to_xarray(self) -> "xarray.Dataset":
+    def to_xarray(
+        self,
+        states: Names = None,
+        responses: Names = None,
+        *,
+        time_unit: str = "",
+        bound: Any = None,
+    ) -> "xarray.Dataset":
         """Return the saved trajectory as an `xarray.Dataset` with dimension `time`.
 
-        Parts of a tuple state become `x0`, `x1`, …; axes of an array become `x_dim0`, ….
+        Variables are `x`, `u` and `y` = P u; parts of a tuple are `x0`, `x1`, …, and further axes
+        `x_dim0`, …. `law_error` and `defect` follow where they are known. Attributes say how the run
+        ended, by which method and in how many steps.
 
-        **Raises:** `ModuleNotFoundError` if xarray (the extra `dvax[app]`) is not installed.
+        **Arguments:** `states`, `responses`: a name for each entry of x (of u) or for each part of a
+        tuple, with its unit: {"position": "m", "velocity": "m/s"}, or a list of names; `time_unit`;
+        `bound`: a `dvax.Bound` of this solution, whose `error_bound_x` and `error_bound_u` are joined.
+
+        **Raises:** `ModuleNotFoundError` if xarray (the extra `dvax[app]`) is not installed;
+        `dvax.InputError` if names or bound do not fit, or if the solution is traced or a batch.
+
+        ```python
+        >>> import dvax
+        >>> model = dvax.models.Contact(alpha=1.0, beta=1.0, b_x=2.0, b_u=1.0, d_x=0.5, d_u=1.0,
+        ...                             kappa0=0.5, g=1.0, ell=3.0)
+        >>> sol = dvax.solve(model.problem, -1.0, 0.0, 2.0, ts=[0.0, 1.0, 2.0])
+        >>> data = sol.to_xarray({"depth": "mm"}, {"force": "N"}, time_unit="s")
+        >>> list(data), data.depth.attrs["units"], data.attrs["result"]
+        (['depth', 'force', 'y', 'defect'], 'mm', 'The end time was reached.')
+
+        ```
         """
-        import xarray
-
-        variables: dict[str, Any] = {}
-        for name, tree in (("x", self.xs), ("u", self.us), ("y", self.ys)):
-            leaves = jax.tree_util.tree_leaves(tree)
-            for k, leaf in enumerate(leaves):
-                label = name if len(leaves) == 1 else f"{name}{k}"
-                dims = ("time", *(f"{label}_dim{i}" for i in range(leaf.ndim - 1)))
-                variables[label] = (dims, np.asarray(leaf))
-        for name, series in (("law_error", self.law_error), ("defect", self.defect)):
-            if series is not None:
-                variables[name] = (("time",), np.asarray(series))
-        return xarray.Dataset(variables, coords={"time": np.asarray(self.ts)})
+        return solution_dataset(self, states, responses, time_unit, bound)
 
 
 def _responses(solution: Solution) -> Responses:
