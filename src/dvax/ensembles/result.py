@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
-from .._dataset import Variable, dataset, described, over
+from .._dataset import Variable, dataset, described, over, required
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..evolution import RESULTS, Solution
@@ -151,6 +151,37 @@ class Ensemble:
         time = (("time",), ts, described("time", time_unit or None))
         coords: dict[str, Variable] = {"time": time} if has_time else {}
         return dataset("Ensemble.to_xarray", variables, coords, {"method": self.method})
+
+    def plot(
+        self,
+        ts: Any,
+        quantiles: tuple[float, float] = (0.05, 0.95),
+        *,
+        name: str = "value",
+        unit: str = "",
+        time_unit: str = "",
+        title: str | None = None,
+        backend: str = "matplotlib",
+        axes: Any = None,
+    ) -> Any:
+        """Return a figure of the kept values over time: their mean, and the area between two quantiles
+        of the members that succeeded.
+
+        **Arguments:** `ts`: the saved times, one for each row of the values; `name`, `unit`: of the
+        values; `title`, `backend`, `axes`: as in `dvax.Solution.plot`.
+
+        **Raises:** `ModuleNotFoundError` if Matplotlib or Plotly (the extra `dvax[app]`) is missing;
+        `dvax.InputError` if values were not kept, or are not over these times.
+        """
+        for module in ("matplotlib", "plotly"):
+            required(module, "Ensemble.plot")
+        # Upward, since pictures belong to the application.
+        from ..app.plots.ensemble import plot_ensemble
+
+        return plot_ensemble(
+            self, ts, quantiles, name=name, unit=unit, time_unit=time_unit, title=title,
+            backend=backend, axes=axes,
+        )  # fmt: skip
 
     def failures(self) -> dict[int, str]:
         """Return the result of each failed member, in a sentence, by its number."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
-from .._dataset import Names
+from .._dataset import Names, required
 from .._jax.traces import current_trace
 from .._tree import Tree
 from ..errors import Fix, InputError, InputProblem, SolveError
@@ -335,6 +335,57 @@ class Solution(eqx.Module):
         ```
         """
         return solution_dataset(self, states, responses, time_unit, bound)
+
+    def plot(
+        self,
+        states: Names = None,
+        responses: Names = None,
+        *,
+        time_unit: str = "",
+        bound: Any = None,
+        title: str | None = None,
+        backend: str = "matplotlib",
+        axes: Any = None,
+    ) -> Any:
+        """Return a figure of the states, the responses, the active constraints and the error bound.
+
+        A panel for each part of x and u has up to six entries as curves, more entries of a vector as a
+        map over time, and those of an array with several axes as bands. Where K is a box its bounds are
+        dashed; y = P u has a panel of its own if it differs from u. The constraints are active in the
+        spans of `regimes` if `dense=True` recorded the steps, else at the saved times. Events are
+        vertical lines. Where fewer than two times were saved, the recorded steps are drawn.
+
+        **Arguments:** `states`, `responses`, `time_unit`: names and units as in `to_xarray`; entries
+        of one unit share a panel; `bound`: a `dvax.Bound` of this solution; `title`: by default the
+        method and the steps, or where a run stopped and why; `backend`: "matplotlib" or "plotly";
+        `axes`: Matplotlib axes to draw into, one for each panel.
+
+        **Returns:** a `matplotlib.figure.Figure` (`figure.savefig("a.png")`), or a Plotly figure
+        (`figure.write_html("a.html")`).
+
+        **Raises:** `ModuleNotFoundError` if Matplotlib or Plotly (the extra `dvax[app]`) is missing;
+        `dvax.InputError` if there is nothing to draw, or names, bound or axes do not fit.
+
+        ```python
+        >>> import dvax
+        >>> model = dvax.models.Contact(alpha=1.0, beta=1.0, b_x=2.0, b_u=1.0, d_x=0.5, d_u=1.0,
+        ...                             kappa0=0.5, g=1.0, ell=3.0)
+        >>> sol = dvax.solve(model.problem, -1.0, 0.0, 2.0, dense=True)
+        >>> figure = sol.plot({"depth": "mm"}, {"force": "N"}, time_unit="s")
+        >>> [axes.get_ylabel().split()[0] for axes in figure.axes]
+        ['depth', 'force', 'constraints']
+
+        ```
+        """
+        for module in ("matplotlib", "plotly"):
+            required(module, "Solution.plot")
+        # Upward, since pictures belong to the application.
+        from ..app.plots.solution import plot_solution
+
+        return plot_solution(
+            self, states, responses, time_unit=time_unit, bound=bound, title=title, backend=backend,
+            axes=axes,
+        )  # fmt: skip
 
 
 def _responses(solution: Solution) -> Responses:
