@@ -231,7 +231,7 @@ def test_blocks_of_rows_do_not_change_a_file(strip, tmp_path, monkeypatch, forma
 def test_incomplete_frames_are_left_out_and_named(tmp_path):
     """A killed run: the time of a frame is NaN until the frame is complete."""
     run = write_run(tmp_path / "run", Recipe((7,), frames=6, status="running"))
-    zarr.open_group(run / "trajectory.zarr", mode="r+")["time"][4:] = np.nan  # pyright: ignore
+    zarr.open_group(run / "trajectory.zarr", mode="r+")["time"][4:] = np.nan
     before = {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
     told: list[str] = []
     for format in FORMATS:

@@ -139,7 +139,7 @@ class Panel(AbstractPanel):
                 label=band.name,
             )
         for c in self.curves:
-            style = dict(linestyle=_DASHES[c.dash], linewidth=1.3)
+            style: dict[str, Any] = dict(linestyle=_DASHES[c.dash], linewidth=1.3)
             if c.as_marks:
                 style = dict(linestyle="", marker="o", markersize=4)
             axes.plot(c.x, c.y, color=c.ink, label=c.name, **style)
@@ -199,7 +199,7 @@ def panels_picture(
     figure = blank(round(150 + 240 * heights), shares)
     for row, panel in enumerate(panels, start=1):
         figure.update_yaxes(**panel.axis(), row=row, col=1)
-        low, high = figure.layout[_axis("yaxis", row)].domain  # pyright: ignore
+        low, high = figure.layout[_axis("yaxis", row)].domain
         lines = [_marks_trace(m) for m in marks] if row == 1 else []
         for trace in [*panel.traces(words, unit), *lines]:
             if trace.type == "heatmap":
@@ -209,7 +209,7 @@ def panels_picture(
             shows = trace.showlegend is not False and trace.name is not None
             shows &= (panel.has_legend or trace in lines) and trace.name not in named
             trace.update(showlegend=shows, legendgroup=trace.name)
-            named |= {trace.name} if shows else set()
+            named |= {str(trace.name)} if shows else set()
             figure.add_trace(trace, row, 1)
     # All at once: Plotly checks all shapes of a figure at each addition.
     figure.update_layout(

@@ -265,10 +265,10 @@ def _title(sol: Solution, time_unit: str) -> str:
 def _with_title(picture: Picture) -> go.Figure:
     """Return the interactive figure, which stands alone, with its title above the legend."""
     figure = picture.interactive
-    names = [str(t.name) for t in figure.data if t.showlegend]  # pyright: ignore
+    names = [str(t.name) for t in figure.data if t.showlegend]
     characters = sum(len(name) + 8 for name in names)
     lines = picture.title.count("\n") + 1
-    height = int(figure.layout.height)  # pyright: ignore
+    height = int(figure.layout.height)
     above = _TITLE_PIXELS + 16 * (lines - 1)
     legend = _LEGEND_PIXELS * -(-characters * _PIXELS_PER_CHARACTER // 600) if names else 0
     figure.update_layout(

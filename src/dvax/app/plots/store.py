@@ -27,8 +27,9 @@ class Variable:
         """How much is known of a bound: proved, declared or estimated."""
         self.dims: tuple[str, ...] = tuple(array.metadata.dimension_names or ())
         self.dtype: np.dtype = array.dtype
-        is_cut = self.dims[:1] == ("time",) and count is not None
-        self.shape: tuple[int, ...] = (count, *array.shape[1:]) if is_cut else tuple(array.shape)
+        self.shape: tuple[int, ...] = tuple(array.shape)
+        if self.dims[:1] == ("time",) and count is not None:
+            self.shape = (count, *self.shape[1:])
 
     @cached_property
     def values(self) -> np.ndarray:

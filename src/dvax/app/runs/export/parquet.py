@@ -1,7 +1,7 @@
 """Parquet: a table for each first dimension, written by blocks of rows.
 
 A variable with further dimensions is a column of lists of fixed length. The metadata of a field hold
-`units`, `long_name`, and `shape`, that of the lists; those of the schema the attributes of the run.
+`units`, `long_name`, `dims`, and `shape`, that of the lists; those of the schema the attributes of the run.
 """
 
 import json
@@ -61,7 +61,8 @@ def _schema(selection: Selection, table: Table) -> Any:
         kind = pa.from_numpy_dtype(variable.dtype)
         if len(variable.shape) > 1:
             kind = pa.list_(kind, int(np.prod(variable.shape[1:])))
-        about = {**selection.attributes(name), "shape": list(variable.shape[1:])}
+        own = {"dims": list(variable.dims), "shape": list(variable.shape[1:])}
+        about = {**selection.attributes(name), **own}
         fields.append(pa.field(name, kind, metadata=_texts(about)))
     return pa.schema(fields, metadata=_texts(selection.attrs))
 
