@@ -280,6 +280,12 @@ def test_files_are_replaced_only_by_force_and_nothing_else_is_touched(strip, tmp
             export_run(strip, target, force=True)
 
 
+def test_folder_may_be_the_working_folder(own, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    export_run(own, Path("."), format="csv")
+    assert {p.name for p in tmp_path.iterdir()} == {"time.csv", "cell.csv", "numbers.csv"}
+
+
 def test_failure_leaves_no_file(strip, tmp_path, monkeypatch):
     """A full disk while the second table is written, say."""
 

@@ -15,6 +15,8 @@ from dvax.evolution import Solution
 
 _MOST_ROWS = 12
 """Up to this many constraints that are ever active have a row each."""
+_MOST_LOCATED = 1000
+"""Up to this many entries of y the changes of every step are listed: each has a row of signs."""
 _LOWER, _UPPER, _ACTIVE = "at the lower bound", "at the upper bound", "active"
 _KINDS = (_LOWER, _UPPER, _ACTIVE)
 
@@ -67,7 +69,8 @@ def _signs(
     """Return the ends of intervals, and whether each constraint is active in each of them."""
     flow, x0 = sol.flow, sol.setup.x0
     like = flow.problem.zero_control(x0)
-    if sol.records is not None:
+    saved = len(sol.ts) >= 2
+    if sol.records is not None and not (saved and len(entries) > _MOST_LOCATED):
         zero = flow.switches(sol.setup.number("t0"), x0, like)
         if zero is not None:
             found = sol.regimes()

@@ -106,7 +106,7 @@ def entry_panels(
 ) -> list[AbstractPanel]:
     """Return the panel of one array over time: curves up to six entries, a map of a vector of more,
     and quantiles over the entries of an array with several axes."""
-    flat = values.reshape(len(times), -1).astype(float)
+    flat = np.asarray(values.reshape(len(times), -1), float)
     entries = flat.shape[1]
     if entries > MOST_CURVES and values.ndim == 2 and len(times) > 1:
         return [MapPanel(times, flat, name, f"entry of {name}", unit)]

@@ -61,8 +61,16 @@ def export_run(
 
 
 def staging_folder(target: Path) -> Path:
-    """Return the folder in which files are written before they are renamed, beside the target."""
-    return target.with_name(f".{target.name}.new")
+    """Return the folder in which files are written before they are renamed: beside a file, or inside a
+    folder."""
+    if _is_file(target):
+        return target.with_name(f".{target.name}.new")
+    return target / ".dvax-export.new"
+
+
+def _is_file(target: Path) -> bool:
+    """Return whether `target` names a file and no folder."""
+    return target.suffix.lower() in ENDINGS and not target.is_dir()
 
 
 def _format(target: Path, format: str | None) -> str:
@@ -89,7 +97,7 @@ def _format(target: Path, format: str | None) -> str:
 def _names(target: Path, suffix: str, labels: list[str]) -> tuple[Path, list[str]]:
     """Return the folder of the files, and their names: NAME.suffix and NAME-LABEL.suffix for a file,
     LABEL.suffix for a folder."""
-    if target.suffix.lower() == suffix and not target.is_dir():
+    if _is_file(target):
         others = [f"{target.stem}-{label}{target.suffix}" for label in labels[1:]]
         return target.parent, [target.name, *others]
     return target, [f"{label}{suffix}" for label in labels]

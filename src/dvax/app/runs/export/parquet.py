@@ -1,7 +1,8 @@
 """Parquet: a table for each first dimension, written by blocks of rows.
 
 A variable with further dimensions is a column of lists of fixed length. The metadata of a field hold
-`units`, `long_name`, `dims`, and `shape`, that of the lists; those of the schema the attributes of the run.
+`units`, `long_name`, `dims` and `shape`, that of the lists; those of the schema the attributes of the
+run.
 """
 
 import json
