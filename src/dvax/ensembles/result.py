@@ -9,9 +9,11 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from .._dataset import Variable, dataset, described, over, required
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..evolution import RESULTS, Solution
+from ..evolution.dataset import leaves_of
 from .moments import Moments
 
 
@@ -100,6 +102,86 @@ class Ensemble:
             return xp.nanquantile(xp.where(away, xp.nan, leaf), xp.asarray(q), axis=0)
 
         return jtu.tree_map(quantile, self.values)
+
+    def to_xarray(self, ts: Any = None, *, name: str = "value", time_unit: str = "") -> Any:
+        """Return the ensemble as an `xarray.Dataset` with dimension `member`.
+
+        Its variables are the values (`name`, or the keys of a dictionary), `failed`, `reached_time`,
+        `steps`, `rejected` and `switched`. With `keep=False` they are `name_mean` and `name_std`.
+
+        **Arguments:** `ts`: the saved times, which become the coordinate of the axis that follows the
+        members, where it has their number.
+
+        **Raises:** `ModuleNotFoundError` if xarray (the extra `dvax[app]`) is not installed.
+
+        ```python
+        >>> import dvax, numpy as np
+        >>> problem = dvax.Problem(
+        ...     A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),
+        ...     K=dvax.sets.Box(0.0, 0.5), f=lambda t, x, u, load: load - x - u,
+        ...     h=lambda t, x, u, load: 1.0 - x,
+        ... )
+        >>> ts = [0.0, 1.0, 2.0]
+        >>> data = dvax.ensemble(problem, 0.0, 0.0, 2.0, np.linspace(1.0, 3.0, 4), ts).to_xarray(ts)
+        >>> data["value"].dims, data.sizes["member"]
+        (('member', 'time'), 4)
+
+        ```
+        """
+        count = None if ts is None else np.size(ts)
+        kept = (("", self.values),) if self.values is not None else ()
+        reduced = (("_mean", self.mean), ("_std", self.std)) if self.values is None else ()
+        variables: dict[str, Variable] = {}
+        for suffix, tree in (*kept, *reduced):
+            lead = () if suffix else ("member",)
+            for label, leaf in leaves_of(tree, name).items():
+                axes = np.shape(leaf)[len(lead) :]
+                dims = (*lead, "time") if axes and axes[0] == count else lead
+                words = f"observed {label}" + suffix.replace("_", ", ")
+                variables[label + suffix] = over(dims, label, leaf, described(words))
+        for label, values, words in (
+            ("failed", self.failed, "whether the member failed"),
+            ("reached_time", self.ts, "time that the member reached"),
+            ("steps", self.steps, "accepted steps"),
+            ("rejected", self.rejected, "rejected steps"),
+            ("switched", self.switched, "whether another method went on"),
+        ):
+            variables[label] = ("member",), values, described(words)
+        has_time = any("time" in dims for dims, _, _ in variables.values())
+        time = (("time",), ts, described("time", time_unit or None))
+        coords: dict[str, Variable] = {"time": time} if has_time else {}
+        return dataset("Ensemble.to_xarray", variables, coords, {"method": self.method})
+
+    def plot(
+        self,
+        ts: Any,
+        quantiles: tuple[float, float] = (0.05, 0.95),
+        *,
+        name: str = "value",
+        unit: str = "",
+        time_unit: str = "",
+        title: str | None = None,
+        backend: str = "matplotlib",
+        axes: Any = None,
+    ) -> Any:
+        """Return a figure of the kept values over time: their mean, and the area between two quantiles
+        of the members that succeeded.
+
+        **Arguments:** `ts`: the saved times, one for each row of the values; `name`, `unit`: of the
+        values; `title`, `backend`, `axes`: as in `dvax.Solution.plot`.
+
+        **Raises:** `ModuleNotFoundError` if Matplotlib or Plotly (the extra `dvax[app]`) is missing;
+        `dvax.InputError` if values were not kept, or are not over these times.
+        """
+        for module in ("matplotlib", "plotly"):
+            required(module, "Ensemble.plot")
+        # Upward, since pictures belong to the application.
+        from ..app.plots.ensemble import plot_ensemble
+
+        return plot_ensemble(
+            self, ts, quantiles, name=name, unit=unit, time_unit=time_unit, title=title,
+            backend=backend, axes=axes,
+        )  # fmt: skip
 
     def failures(self) -> dict[int, str]:
         """Return the result of each failed member, in a sentence, by its number."""

@@ -8,6 +8,7 @@ import jax
 
 from .._tree import Tree
 from ..errors import InputError, InputProblem
+from .dataset import events_dataset
 
 
 class Event(eqx.Module):
@@ -116,6 +117,13 @@ class Events(eqx.Module):
             raise InputError(InputProblem("Events.of", repr(name), rule, fix))
         wanted = [k for k, own in enumerate(self.names) if own == name]
         return self.rows(jax.numpy.isin(self.index, jax.numpy.asarray(wanted)))
+
+    def to_xarray(self) -> Any:
+        """Return the events as an `xarray.Dataset` with dimension `event`: time, index, name, states.
+
+        **Raises:** `ModuleNotFoundError` if xarray (the extra `dvax[app]`) is not installed.
+        """
+        return events_dataset(self.ts, self.index, self.names, self.xs, self.xs_after)
 
     def rows(self, selection: Any) -> "Events":
         """Return some of the rows."""

@@ -20,8 +20,10 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from .._dataset import Names
 from .._tree import Tree
 from ..errors import InputError, InputProblem, SolveError
+from .dataset import solution_dataset
 from .event import Events
 from .results import RESULTS, is_success
 
@@ -111,6 +113,17 @@ class ExportedSolution(NamedTuple):
         if not is_success(self.result):
             raise SolveError(RESULTS[self.result], self, ())
         return self
+
+    def to_xarray(
+        self,
+        states: Names = None,
+        responses: Names = None,
+        *,
+        time_unit: str = "",
+        bound: Any = None,
+    ) -> Any:
+        """Return the saved trajectory as an `xarray.Dataset`, as `Solution.to_xarray` does."""
+        return solution_dataset(self, states, responses, time_unit, bound)
 
 
 class Exported:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from .._dataset import dataset, described
 from .flow import Flow
 from .locate_event import locate_event
 from .loop import Record
@@ -27,6 +28,21 @@ class Regimes(NamedTuple):
 
     times: np.ndarray
     positive: np.ndarray
+
+    def to_xarray(self, *, time_unit: str = "") -> Any:
+        """Return an `xarray.Dataset` with the dimensions `interval` and `switch`: `start`, `end`,
+        `positive`.
+
+        **Raises:** `ModuleNotFoundError` if xarray (the extra `dvax[app]`) is not installed.
+        """
+        unit = time_unit or None
+        ends = {
+            name: (("interval",), values, described(f"{name} of the interval", unit))
+            for name, values in (("start", self.times[:-1]), ("end", self.times[1:]))
+        }
+        words = "whether a switch function of K is positive"
+        positive = ("interval", "switch"), self.positive, described(words)
+        return dataset("Regimes.to_xarray", {**ends, "positive": positive})
 
 
 def regimes(flow: Flow, method: Any, records: Record, count: int) -> Regimes:

@@ -10,10 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
+from .._dataset import Names, required
 from .._jax.traces import current_trace
 from .._tree import Tree
 from ..errors import Fix, InputError, InputProblem, SolveError
 from .bounds import Bounds
+from .dataset import solution_dataset
 from .diagnose import failure
 from .event import Events
 from .flow import Flow
@@ -300,26 +302,90 @@ class Solution(eqx.Module):
             raise failure(self)
         return self
 
-    def to_xarray(self) -> "xarray.Dataset":
+    def to_xarray(
+        self,
+        states: Names = None,
+        responses: Names = None,
+        *,
+        time_unit: str = "",
+        bound: Any = None,
+    ) -> "xarray.Dataset":
         """Return the saved trajectory as an `xarray.Dataset` with dimension `time`.
 
-        Parts of a tuple state become `x0`, `x1`, …; axes of an array become `x_dim0`, ….
+        Variables are `x`, `u` and `y` = P u; parts of a tuple are `x0`, `x1`, …, and further axes
+        `x_dim0`, …. `law_error` and `defect` follow where they are known. Attributes say how the run
+        ended, by which method and in how many steps.
 
-        **Raises:** `ModuleNotFoundError` if xarray (the extra `dvax[app]`) is not installed.
+        **Arguments:** `states`, `responses`: a name for each entry of x (of u) or for each part of a
+        tuple, with its unit: {"position": "m", "velocity": "m/s"}, or a list of names; `time_unit`;
+        `bound`: a `dvax.Bound` of this solution, whose `error_bound_x` and `error_bound_u` are joined.
+
+        **Raises:** `ModuleNotFoundError` if xarray (the extra `dvax[app]`) is not installed;
+        `dvax.InputError` if names or bound do not fit, or if the solution is traced or a batch.
+
+        ```python
+        >>> import dvax
+        >>> model = dvax.models.Contact(alpha=1.0, beta=1.0, b_x=2.0, b_u=1.0, d_x=0.5, d_u=1.0,
+        ...                             kappa0=0.5, g=1.0, ell=3.0)
+        >>> sol = dvax.solve(model.problem, -1.0, 0.0, 2.0, ts=[0.0, 1.0, 2.0])
+        >>> data = sol.to_xarray({"depth": "mm"}, {"force": "N"}, time_unit="s")
+        >>> list(data), data.depth.attrs["units"], data.attrs["result"]
+        (['depth', 'force', 'y', 'defect'], 'mm', 'The end time was reached.')
+
+        ```
         """
-        import xarray
+        return solution_dataset(self, states, responses, time_unit, bound)
 
-        variables: dict[str, Any] = {}
-        for name, tree in (("x", self.xs), ("u", self.us), ("y", self.ys)):
-            leaves = jax.tree_util.tree_leaves(tree)
-            for k, leaf in enumerate(leaves):
-                label = name if len(leaves) == 1 else f"{name}{k}"
-                dims = ("time", *(f"{label}_dim{i}" for i in range(leaf.ndim - 1)))
-                variables[label] = (dims, np.asarray(leaf))
-        for name, series in (("law_error", self.law_error), ("defect", self.defect)):
-            if series is not None:
-                variables[name] = (("time",), np.asarray(series))
-        return xarray.Dataset(variables, coords={"time": np.asarray(self.ts)})
+    def plot(
+        self,
+        states: Names = None,
+        responses: Names = None,
+        *,
+        time_unit: str = "",
+        bound: Any = None,
+        title: str | None = None,
+        backend: str = "matplotlib",
+        axes: Any = None,
+    ) -> Any:
+        """Return a figure of the states, the responses, the active constraints and the error bound.
+
+        A panel for each part of x and u has up to six entries as curves, more entries of a vector as a
+        map over time, and those of an array with several axes as bands. Where K is a box its bounds are
+        dashed; y = P u has a panel of its own if it differs from u. The constraints are active in the
+        spans of `regimes` if `dense=True` recorded the steps, else at the saved times. Events are
+        vertical lines. Where fewer than two times were saved, the recorded steps are drawn.
+
+        **Arguments:** `states`, `responses`, `time_unit`: names and units as in `to_xarray`; entries
+        of one unit share a panel; `bound`: a `dvax.Bound` of this solution; `title`: by default the
+        method and the steps, or where a run stopped and why; `backend`: "matplotlib" or "plotly";
+        `axes`: Matplotlib axes to draw into, one for each panel.
+
+        **Returns:** a `matplotlib.figure.Figure` (`figure.savefig("a.png")`), or a Plotly figure
+        (`figure.write_html("a.html")`).
+
+        **Raises:** `ModuleNotFoundError` if Matplotlib or Plotly (the extra `dvax[app]`) is missing;
+        `dvax.InputError` if there is nothing to draw, or names, bound or axes do not fit.
+
+        ```python
+        >>> import dvax
+        >>> model = dvax.models.Contact(alpha=1.0, beta=1.0, b_x=2.0, b_u=1.0, d_x=0.5, d_u=1.0,
+        ...                             kappa0=0.5, g=1.0, ell=3.0)
+        >>> sol = dvax.solve(model.problem, -1.0, 0.0, 2.0, dense=True)
+        >>> figure = sol.plot({"depth": "mm"}, {"force": "N"}, time_unit="s")
+        >>> [axes.get_ylabel().split()[0] for axes in figure.axes]
+        ['depth', 'force', 'constraints']
+
+        ```
+        """
+        for module in ("matplotlib", "plotly"):
+            required(module, "Solution.plot")
+        # Upward, since pictures belong to the application.
+        from ..app.plots.solution import plot_solution
+
+        return plot_solution(
+            self, states, responses, time_unit=time_unit, bound=bound, title=title, backend=backend,
+            axes=axes,
+        )  # fmt: skip
 
 
 def _responses(solution: Solution) -> Responses:

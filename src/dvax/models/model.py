@@ -8,6 +8,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from .._dataset import named
 from .._tree import Tree
 from ..errors import Problems
 from ..evolution import Solution
@@ -121,17 +122,14 @@ class Model:
         """Return values and unit of each named entry or part of `rows`, those of the "states" or the
         "responses" at the saved times, a time axis in front."""
         names: Mapping[str, str] = getattr(self, which)
-        leaves = [np.asarray(leaf) for leaf in jtu.tree_leaves(rows)]
-        element = self.x0 if which == "states" else self.problem.zero_control(self.x0)
-        parts, entries = _counts(element)
         symbol = "x" if which == "states" else "u"
         if not names:
+            element = self.x0 if which == "states" else self.problem.zero_control(self.x0)
+            parts, entries = _counts(element)
             count = entries if entries <= _NAMED else parts
             names = {symbol if count == 1 else f"{symbol}{k}": "" for k in range(count)}
-        if len(names) == entries:
-            flat = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
-            return {n: (flat[:, k], unit) for k, (n, unit) in enumerate(names.items())}
-        return {n: (leaf, u) for leaf, (n, u) in zip(leaves, names.items(), strict=True)}
+        found = named(rows, names, symbol, f"dvax.models.Model({which})")
+        return {name: (np.asarray(values), unit or "") for name, (values, unit) in found.items()}
 
 
 _SETTINGS = ("method", "rtol", "atol", "dt", "dt_max", "max_steps", "vi_solver")

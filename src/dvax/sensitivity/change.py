@@ -9,6 +9,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from .._dataset import Variable, dataset, described
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..evolution import ETD4RK, AbstractMethod, solve
@@ -42,6 +43,21 @@ class Change(NamedTuple):
     u: Views
     derivative: Directional
     status: Status
+
+    def to_xarray(self) -> Any:
+        """Return the norms over time as an `xarray.Dataset`: `x_actual`, `x_predicted`, `x_certified`,
+        `x_certified_sharp`, and the same for u.
+
+        **Raises:** `ModuleNotFoundError` if xarray (the extra `dvax[app]`) is not installed.
+        """
+        variables: dict[str, Variable] = {}
+        for letter, views in (("x", self.x), ("u", self.u)):
+            for name, values in views._asdict().items():
+                if values is not None:
+                    about = described(f"‖Δ{letter}‖, {name.replace('_', ' ')}")
+                    variables[f"{letter}_{name}"] = ("time",), values, about
+        time = ("time",), self.ts, described("time")
+        return dataset("Change.to_xarray", variables, {"time": time}, {"status": self.status})
 
     def table(self) -> str:
         """Return the largest values over time, as lines of text."""

@@ -20,6 +20,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from .._dataset import dataset, described, named, over
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..evolution import ETD4RK, AbstractMethod, Solution, solve
@@ -41,6 +42,19 @@ class Directional(NamedTuple):
     dus: Tree
     sol: Solution
     kinks: list[Kink]
+
+    def to_xarray(self) -> Any:
+        """Return δx and δu over time as an `xarray.Dataset`: `dx`, `du`, and `dx0`, … for parts.
+
+        **Raises:** `ModuleNotFoundError` if xarray (the extra `dvax[app]`) is not installed.
+        """
+        place = "Directional.to_xarray"
+        variables = {
+            name: over(("time",), name, values, described(f"directional derivative {name}"))
+            for symbol, rows in (("dx", self.dxs), ("du", self.dus))
+            for name, (values, _) in named(rows, None, symbol, place).items()
+        }
+        return dataset(place, variables, {"time": (("time",), self.ts, described("time"))})
 
 
 class _Base(eqx.Module):

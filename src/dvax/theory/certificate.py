@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
+from .._dataset import Variable, dataset, described
 from ..errors import InputError, InputProblem
 from ..evolution import Implicit, Solution, between, disturbance, gronwall, solve
 from ..evolution.control import MAX_GROWTH
@@ -55,6 +56,22 @@ class Bound(eqx.Module):
     x_sharp: jax.Array | None
     u_sharp: jax.Array | None
     status: Status = eqx.field(static=True)
+
+    def to_xarray(self, *, time_unit: str = "", x_unit: str = "", u_unit: str = "") -> Any:
+        """Return the bounds as an `xarray.Dataset` over `time`: `error_bound_x`, `error_bound_u`, and
+        those with the paper's and with the sharper rate, `error_bound_x_paper`, ….
+
+        **Raises:** `ModuleNotFoundError` if xarray (the extra `dvax[app]`) is not installed.
+        """
+        variables: dict[str, Variable] = {}
+        for name in ("x", "u", "x_paper", "u_paper", "x_sharp", "u_sharp"):
+            values, letter = getattr(self, name), name[0]
+            if values is not None:
+                unit = (x_unit if letter == "x" else u_unit) or None
+                about = described(f"bound on ‖{letter}_h − {letter}‖", unit, status=self.status)
+                variables[f"error_bound_{name}"] = ("time",), values, about
+        time = ("time",), self.ts, described("time", time_unit or None)
+        return dataset("Bound.to_xarray", variables, {"time": time}, {"status": self.status})
 
 
 def bound_error(

@@ -1,5 +1,6 @@
 """The program: fast help, messages without tracebacks, and correct exit codes."""
 
+import json
 import os
 import subprocess
 import sys
@@ -46,10 +47,9 @@ def test_help_imports_no_large_packages(arguments: list[str]) -> None:
 
 def test_program_lists_its_commands() -> None:
     shown = CliRunner().invoke(app, ["--help"]).output
-    for command in ("new", "check", "run", "resume", "report", "demo", "doctor"):
+    for command in ("new", "check", "run", "resume", "report", "export", "demo", "doctor"):
         assert f"\n  {command} " in shown
-    for later in ("sweep", "export"):
-        assert f"\n  {later} " not in shown
+    assert "\n  sweep " not in shown
 
 
 def test_version_option_prints_the_package_version() -> None:
@@ -94,8 +94,25 @@ def test_doctor_self_test_uses_the_published_number() -> None:
 def test_doctor_reports_success() -> None:
     result = CliRunner().invoke(app, ["doctor"])
     assert result.exit_code == 0, result.output
-    for what in ("dvax", "jax", "plotly", "devices", "double", "passed"):
+    for what in ("dvax", "jax", "plotly", "devices", "double", "passed", "processor", "GiB free"):
         assert what in result.stdout
+    for what in ("extra energy", "extra parquet", "compiled programs", "JAX_COMPILATION_CACHE_DIR"):
+        assert what in result.stdout
+
+
+def test_doctor_prints_json_and_the_command_for_a_missing_extra(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        "dvax.app.cli.doctor.self_test", lambda: selftest.SelfTest(selftest.EXACT, 0.0, 0.1)
+    )
+    monkeypatch.setattr(machine, "extras", lambda: {"fem": {"meshio": None, "scikit-fem": "12.0"}})
+    result = CliRunner().invoke(app, ["doctor", "--json"])
+    facts = json.loads(result.stdout)["facts"]
+    assert facts["dvax"]["found"] == __version__
+    assert facts["extra fem"] == {
+        "found": "scikit-fem 12.0", "remark": "incomplete: pip install 'dvax[fem]'",
+    }  # fmt: skip
 
 
 def test_doctor_detects_a_wrong_result(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,5 @@
-"""The command line: `dvax new`, `check`, `run`, `resume`, `report`, `demo`, `doctor`.
+"""The command line: `dvax new`, `check`, `run`, `resume`, `report`, `export`, `demo`,
+`doctor`.
 
 It reads the arguments, calls `runs` and `plots`, and prints the outcome. Nothing heavy is imported
 before a command needs it, so that `dvax --help` answers at once.

@@ -1,11 +1,14 @@
 """`dvax doctor`: describe this installation, and test that it computes correctly."""
 
+import json
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from dvax.app.cli import machine
-from dvax.app.cli.console import print_error, print_table
+from dvax.app.cli.cache import cache_folder
+from dvax.app.cli.console import print_error, print_line, print_table
 from dvax.app.cli.failure import SOLVER_FAILED, reported
 from dvax.app.cli.options import Debug
 from dvax.app.cli.selftest import ALLOWED, END, self_test
@@ -14,14 +17,23 @@ from dvax.app.runs.compilation_cache import enable_double
 Row = tuple[str, str, str]
 
 
-def doctor(debug: Debug = False) -> None:
-    """Show versions, devices and precision, and solve a problem whose solution is known."""
+def doctor(
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Show what a report of a defect needs, and solve a problem whose solution is known."""
     with reported(debug):
         wrong: list[str] = []
         from dvax.app.runs.interrupt import interruptible
 
-        rows = interruptible(lambda: [*_installation(wrong), *_machine(), *_numbers(wrong)])
-        print_table(("what", "found", "remark"), rows)
+        rows = interruptible(
+            lambda: [*_installation(wrong), *_extras(), *_machine(), *_numbers(wrong)]
+        )
+        if as_json:
+            found = {what: {"found": value, "remark": remark} for what, value, remark in rows}
+            print_line(json.dumps({"facts": found, "errors": wrong}, indent=2, ensure_ascii=False))
+        else:
+            print_table(("what", "found", "remark"), rows)
         for text in wrong:
             print_error(f"error: {text}")
         if wrong:
@@ -31,7 +43,11 @@ def doctor(debug: Debug = False) -> None:
 def _installation(wrong: list[str]) -> list[Row]:
     from dvax import __version__
 
-    rows: list[Row] = [("dvax", __version__, ""), ("Python", machine.python(), "")]
+    commit = _commit()
+    rows: list[Row] = [
+        ("dvax", __version__, f"commit {commit}" if commit else str(Path(__file__).parents[2])),
+        ("Python", machine.python(), ""),
+    ]
     for names, extra in ((machine.LIBRARY, "dvax"), (machine.APPLICATION, "dvax[app]")):
         for name, version in machine.versions(names).items():
             rows.append((name, version or "missing", "" if version else f"part of {extra}"))
@@ -40,14 +56,38 @@ def _installation(wrong: list[str]) -> list[Row]:
     return rows
 
 
+def _commit() -> str | None:
+    from dvax.app.runs.provenance import commit
+
+    return commit()
+
+
+def _extras() -> list[Row]:
+    rows: list[Row] = []
+    for extra, packages in machine.extras().items():
+        known = ", ".join(f"{n} {v}" for n, v in packages.items() if v)
+        missing = [n for n, v in packages.items() if v is None]
+        command = f"pip install 'dvax[{extra}]'"
+        fix = "" if not missing else f"incomplete: {command}" if known else command
+        rows.append((f"extra {extra}", known or "not installed", fix))
+    return rows
+
+
 def _machine() -> list[Row]:
     memory = machine.memory_gib()
-    reason = machine.unwritable(Path.cwd())
-    return [
+    here = Path.cwd()
+    reason = machine.unwritable(here)
+    rows = [
+        ("processor", machine.processor(), ""),
         ("cores", str(machine.cores()), "that this process may use"),
         ("memory", "unknown" if memory is None else f"{memory:.1f} GiB", ""),
-        ("working folder", str(Path.cwd()), reason or "can be written"),
+        ("working folder", str(here), f"{reason or 'can be written'}, {_free(here)}"),
     ]
+    return [*rows, *((name, value, "environment") for name, value in machine.variables().items())]
+
+
+def _free(folder: Path) -> str:
+    return f"{machine.free_gib(folder):.1f} GiB free"
 
 
 def _numbers(wrong: list[str]) -> list[Row]:
@@ -67,8 +107,9 @@ def _numbers(wrong: list[str]) -> list[Row]:
             "This installation does not compute correctly; please report it with this output."
         )
     return [
-        ("devices", devices, ""),
+        ("devices", devices, f"{jax.local_device_count()} in this process"),
         ("precision", "double" if double else "single", "as the command line asks for"),
+        _cache(),
         (
             "self-test",
             "passed" if test.passed else "failed",
@@ -76,3 +117,14 @@ def _numbers(wrong: list[str]) -> list[Row]:
             f"error {test.error:.1e}, {test.seconds:.1f} s with compiling",
         ),
     ]
+
+
+def _cache() -> Row:
+    """Where compiled programs are kept, with their number and the space left."""
+    import jax
+
+    if not jax.config.jax_enable_compilation_cache:
+        return ("compiled programs", "not kept", "JAX_ENABLE_COMPILATION_CACHE is off")
+    path = Path(jax.config.jax_compilation_cache_dir or cache_folder())
+    count = sum(file.is_file() for file in path.iterdir()) if path.is_dir() else 0
+    return ("compiled programs", str(path), f"{count} files, {_free(path)}")

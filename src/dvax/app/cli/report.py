@@ -30,5 +30,5 @@ def report(
 
 
 def _import() -> None:
-    import dvax.app.plots
+    import dvax.app.plots.report
     import dvax.app.runs.rundir  # noqa: F401

@@ -1,15 +1,17 @@
 """Curves in panels one above the other that share the horizontal axis."""
 
+import abc
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import plotly.graph_objects as go
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from dvax.app.plots.lines import positive, thin
 from dvax.app.plots.picture import Picture
@@ -27,6 +29,8 @@ from dvax.app.plots.theme import (
 # Powers of ten, where Plotly would write 1µ and 1f.
 _LOGARITHMIC = dict(type="log", exponentformat="power", showexponent="all")
 _DASHES = {"solid": "-", "dash": "--", "dot": ":", "dashdot": "-.", "longdash": (0, (8, 3))}
+_PALE = 0.2
+"""The opacity of bands."""
 _LEGEND_CHARACTERS = 100
 """About as many fit beside each other above a still picture."""
 
@@ -53,23 +57,96 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Panel:
+class Band:
+    """The area between `low` and `high` over x, in the pale colour of a curve."""
+
+    x: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    name: str
+    colour: int | None = 0
+
+    @property
+    def ink(self) -> str:
+        return MUTED if self.colour is None else SERIES[self.colour % len(SERIES)]
+
+
+class AbstractPanel(abc.ABC):
+    """One panel of a picture.
+
+    - `words`, `unit`: of its vertical axis; `share`: its height relative to the other panels;
+    - `has_legend`: whether what it shows is named above it.
+    """
+
+    words: str
+    unit: str
+    share: float
+    has_row_names: ClassVar[bool] = False
+    """Whether its vertical axis has names in the place of numbers."""
+
+    @property
+    @abc.abstractmethod
+    def has_legend(self) -> bool: ...
+
+    @abc.abstractmethod
+    def traces(self, words: str, unit: str) -> list[Any]:
+        """Return the traces for Plotly; `words [unit]` is the horizontal axis."""
+
+    @abc.abstractmethod
+    def axis(self) -> dict[str, Any]:
+        """Return the vertical axis for Plotly."""
+
+    @abc.abstractmethod
+    def draw(self, axes: Axes) -> None:
+        """Draw with Matplotlib."""
+
+
+@dataclass(frozen=True)
+class Panel(AbstractPanel):
     """Curves under one vertical axis; `log` for a logarithmic one, on which values that it cannot
-    show are gaps. `share` is the height of the panel relative to the others."""
+    show are gaps. `share` is the height of the panel relative to the others; `bands` lie behind the
+    curves."""
 
     curves: list[Curve]
     words: str
     unit: str = ""
     log: bool = False
     share: float = field(default=1.0)
+    bands: tuple[Band, ...] = ()
 
     def __post_init__(self) -> None:
         if self.log:
             shown = [replace(curve, y=positive(curve.y)) for curve in self.curves]
             object.__setattr__(self, "curves", shown)
 
+    @property
+    def has_legend(self) -> bool:
+        return len(self.curves) + len(self.bands) > 1
+
+    def traces(self, words: str, unit: str) -> list[Any]:
+        bands = [_band_trace(band) for band in self.bands]
+        return bands + [_trace(curve, self, words, unit) for curve in self.curves]
+
+    def draw(self, axes: Axes) -> None:
+        for band in self.bands:
+            axes.fill_between(
+                band.x,
+                band.low,
+                band.high,
+                color=band.ink,
+                alpha=_PALE,
+                linewidth=0,
+                label=band.name,
+            )
+        for c in self.curves:
+            style: dict[str, Any] = dict(linestyle=_DASHES[c.dash], linewidth=1.3)
+            if c.as_marks:
+                style = dict(linestyle="", marker="o", markersize=4)
+            axes.plot(c.x, c.y, color=c.ink, label=c.name, **style)
+        axes.set_ylabel(axis_title(self.words.replace("<br>", "\n") + "\n", self.unit))
+        axes.set_yscale("log" if self.log else "linear")
+
     def axis(self) -> dict[str, Any]:
-        """The vertical axis for Plotly."""
         unit = unit_text(self.unit)
         title = self.words + (f"<br>[{unit}]" if unit else "")
         return dict(title_text=title, **(self._logarithmic() if self.log else {}))
@@ -81,6 +158,15 @@ class Panel:
         decades = float(np.ptp(np.log10(values))) if values.size else 0.0
         # Within one decade Plotly chooses the ticks.
         return dict(**_LOGARITHMIC, dtick=math.ceil(decades / 8) if decades > 1.0 else None)
+
+
+@dataclass(frozen=True)
+class TimeMarks:
+    """Times that a vertical line marks in every panel, such as those of an event."""
+
+    x: np.ndarray
+    name: str
+    dash: str = "dot"
 
 
 def bound_panel(x: np.ndarray, bound: Variable, unit: str, colour: int = 1, **more: Any) -> Panel:
@@ -99,22 +185,42 @@ def panels_picture(
     key: str,
     title: str,
     caption: str,
-    panels: Sequence[Panel],
+    panels: Sequence[AbstractPanel],
     words: str,
     unit: str = "",
     *,
     log: bool = False,
+    marks: Sequence[TimeMarks] = (),
 ) -> Picture:
     """The picture of these panels over the common axis `words [unit]`."""
     shares = tuple(panel.share / sum(p.share for p in panels) for panel in panels)
+    heights = sum(panel.share for panel in panels)
     named: set[str] = set()
-    figure = blank(150 + 240 * len(panels), shares)
+    figure = blank(round(150 + 240 * heights), shares)
     for row, panel in enumerate(panels, start=1):
-        for curve in panel.curves:
-            shows = len(panel.curves) > 1 and curve.name not in named
-            figure.add_trace(_trace(curve, panel, words, unit, shows), row, 1)
-            named |= {curve.name} if shows else set()
         figure.update_yaxes(**panel.axis(), row=row, col=1)
+        low, high = figure.layout[_axis("yaxis", row)].domain
+        lines = [_marks_trace(m) for m in marks] if row == 1 else []
+        for trace in [*panel.traces(words, unit), *lines]:
+            if trace.type == "heatmap":
+                trace.colorbar.update(
+                    y=(low + high) / 2, yanchor="middle", len=high - low, lenmode="fraction"
+                )
+            shows = trace.showlegend is not False and trace.name is not None
+            shows &= (panel.has_legend or trace in lines) and trace.name not in named
+            trace.update(showlegend=shows, legendgroup=trace.name)
+            named |= {str(trace.name)} if shows else set()
+            figure.add_trace(trace, row, 1)
+    # All at once: Plotly checks all shapes of a figure at each addition.
+    figure.update_layout(
+        shapes=[
+            dict(
+                type="line", x0=float(x), x1=float(x), y0=0, y1=1, xref=_axis("x", row),
+                yref=_axis("y", row) + " domain", line=dict(color=MUTED, width=1, dash=m.dash),
+            )
+            for row in range(1, len(panels) + 1) for m in marks for x in m.x
+        ]
+    )  # fmt: skip
     if log:
         figure.update_xaxes(**_LOGARITHMIC)
     figure.update_xaxes(title_text=axis_title(words, unit), row=len(panels), col=1)
@@ -122,53 +228,90 @@ def panels_picture(
     def still() -> Figure:
         with rc_context(STILL_STYLE):
             drawn, axes = still_axes(
-                len(panels), 1, figsize=(8, 1.2 + 2.4 * len(panels)), sharex=True, squeeze=False,
+                len(panels), 1, figsize=(8, 1.2 + 2.4 * heights), sharex=True, squeeze=False,
                 height_ratios=shares,
             )  # fmt: skip
-            named: set[str] = set()
-            for place, panel in zip(axes[:, 0], panels, strict=True):
-                for c in panel.curves:
-                    style = dict(linestyle=_DASHES[c.dash], linewidth=1.3)
-                    if c.as_marks:
-                        style = dict(linestyle="", marker="o", markersize=4)
-                    place.plot(c.x, c.y, color=c.ink, label=c.name, **style)
-                place.set_ylabel(axis_title(panel.words.replace("<br>", "\n") + "\n", panel.unit))
-                place.set_yscale("log" if panel.log else "linear")
-                _add_legend(place, panel, named)
+            draw_panels(panels, list(axes[:, 0]), words, unit, marks)
             axes[0, 0].set_xscale("log" if log else "linear")
             drawn.suptitle(title, x=0.01, ha="left", fontsize=11)
-            axes[-1, 0].set_xlabel(axis_title(words, unit))
-            drawn.align_ylabels()
+            # Long names of rows would push all labels away from their axes.
+            drawn.align_ylabels([a for a, p in zip(axes[:, 0], panels) if not p.has_row_names])
         return drawn
 
     return Picture(key=key, title=title, caption=caption, interactive=figure, still=still)
 
 
-def _add_legend(axes: Axes, panel: Panel, named: set[str]) -> None:
-    """Name the curves above the panel, but for those that a panel above has named."""
-    handles = [line for line in axes.lines if line.get_label() not in named]
-    if len(panel.curves) == 1 or not handles:
+def _axis(name: str, row: int) -> str:
+    """Return Plotly's name of an axis: the first has no number."""
+    return name if row == 1 else f"{name}{row}"
+
+
+def draw_panels(
+    panels: Sequence[AbstractPanel],
+    axes: Sequence[Axes],
+    words: str,
+    unit: str = "",
+    marks: Sequence[TimeMarks] = (),
+) -> None:
+    """Draw each panel into its axes with Matplotlib."""
+    named: set[str] = set()
+    for place, panel in zip(axes, panels, strict=True):
+        panel.draw(place)
+        lines = []
+        for m in marks:
+            style: dict[str, Any] = dict(color=MUTED, linestyle=_DASHES[m.dash], linewidth=1.0)
+            lines.append((Line2D([], [], **style), m.name))
+            for x in m.x:
+                place.axvline(float(x), **style)
+        _add_legend(place, panel, named, lines)
+    axes[-1].set_xlabel(axis_title(words, unit))
+
+
+def _add_legend(axes: Axes, panel: AbstractPanel, named: set[str], lines: Sequence[Any]) -> None:
+    """Name what the panel shows above it, but for what a panel above has named."""
+    shown = list(zip(*axes.get_legend_handles_labels(), strict=True)) if panel.has_legend else []
+    entries = {name: handle for handle, name in (*shown, *lines) if name not in named}
+    if not entries:
         return
-    names = [str(line.get_label()) for line in handles]
-    named.update(names)
-    columns = max(1, min(4, _LEGEND_CHARACTERS // (max(map(len, names)) + 8)))
+    named.update(entries)
+    columns = max(1, min(4, _LEGEND_CHARACTERS // (max(map(len, entries)) + 8)))
     axes.legend(
-        handles=handles, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1.0), fontsize=9,
-        borderpad=0.2,
+        handles=list(entries.values()), labels=list(entries), ncols=columns, loc="lower left",
+        bbox_to_anchor=(0, 1.0), fontsize=9, borderpad=0.2,
     )  # fmt: skip
 
 
-def _trace(curve: Curve, panel: Panel, words: str, unit: str, shows: bool) -> go.Scatter:
+def _trace(curve: Curve, panel: Panel, words: str, unit: str) -> go.Scatter:
     marks = curve.as_marks
     shown = slice(None) if marks else thin(curve.x, curve.y)
     return go.Scatter(
         x=curve.x[shown],
         y=curve.y[shown],
         name=curve.name,
-        legendgroup=curve.name,
-        showlegend=shows,
         mode="markers" if marks else "lines",
         line=None if marks else dict(color=curve.ink, width=1.6, dash=curve.dash),
         marker=dict(color=curve.ink, size=6) if marks else None,
         hovertemplate=f"%{{y:.5g}} {unit_text(panel.unit)} at {words} %{{x:.5g}} {unit_text(unit)}",
     )
+
+
+def _band_trace(band: Band) -> go.Scatter:
+    # Round the area: forth along the lower end, back along the upper one.
+    low, high = thin(band.x, band.low), thin(band.x, band.high)[::-1]
+    red, green, blue = (int(band.ink[k : k + 2], 16) for k in (1, 3, 5))
+    return go.Scatter(
+        x=np.concatenate([band.x[low], band.x[high]]),
+        y=np.concatenate([band.low[low], band.high[high]]),
+        name=band.name,
+        mode="lines",
+        line=dict(width=0),
+        fill="toself",
+        fillcolor=f"rgba({red},{green},{blue},{_PALE})",
+        hoverinfo="skip",
+    )
+
+
+def _marks_trace(marks: TimeMarks) -> go.Scatter:
+    """Return the entry of the legend: lines across a panel have none."""
+    style = dict(color=MUTED, width=1, dash=marks.dash)
+    return go.Scatter(x=[None], y=[None], mode="lines", name=marks.name, line=style)

@@ -14,19 +14,27 @@ import zarr
 
 
 class Variable:
-    """An array of the store: its first `count` frames where it depends on time, else all of it."""
+    """An array of the store: its first `count` frames where it depends on time, else all of it.
+
+    `dims`, `shape` and `dtype` are those of these values, `attrs` the attributes.
+    """
 
     def __init__(self, array: Any, count: int | None):
         self._array, self._count = array, count
-        self._attrs = array.attrs.asdict()
-        self.unit = str(self._attrs.get("units", ""))
-        self.status = str(self._attrs.get("status", ""))
+        self.attrs: Mapping[str, Any] = array.attrs.asdict()
+        self.unit = str(self.attrs.get("units", ""))
+        self.status = str(self.attrs.get("status", ""))
         """How much is known of a bound: proved, declared or estimated."""
+        self.dims: tuple[str, ...] = tuple(array.metadata.dimension_names or ())
+        self.dtype: np.dtype = array.dtype
+        self.shape: tuple[int, ...] = tuple(array.shape)
+        if self.dims[:1] == ("time",) and count is not None:
+            self.shape = (count, *self.shape[1:])
 
     @cached_property
     def values(self) -> np.ndarray:
         """All values. Read once: they may lie in many chunks."""
-        over_time = (self._array.metadata.dimension_names or ())[:1] == ("time",)
+        over_time = self.dims[:1] == ("time",)
         return np.asarray(self._array[: self._count] if over_time else self._array[...])
 
     def frames(self, which: slice | int) -> np.ndarray:

@@ -25,7 +25,7 @@ def provenance() -> dict[str, Any]:
     device = jax.devices()[0]
     return {
         "dvax": _version("dvax"),
-        "git_commit": _commit(),
+        "git_commit": commit(),
         "packages": {name: _version(name) for name in PACKAGES},
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -42,7 +42,7 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _commit() -> str | None:
+def commit() -> str | None:
     """Return the commit of the source tree that dvax runs from, with a + where files are modified; None
     outside of one."""
     folder = Path(__file__).resolve().parent
@@ -59,5 +59,5 @@ def _commit() -> str | None:
     # Only where this file is under version control: dvax may be installed in another checkout.
     if git("ls-files", "--error-unmatch", Path(__file__).name) is None:
         return None
-    commit = git("rev-parse", "HEAD")
-    return f"{commit}+" if commit and git("status", "--porcelain", "--", ".") else commit
+    head = git("rev-parse", "HEAD")
+    return f"{head}+" if head and git("status", "--porcelain", "--", ".") else head

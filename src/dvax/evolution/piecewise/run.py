@@ -8,6 +8,8 @@ therefore depends on the number of excited scales, and not on their ratios. Time
 relative to its start and stored as a sum of two numbers: a transient of 10⁻¹⁸ s is resolved at any t.
 """
 
+import math
+
 import numpy as np
 
 from .. import meter

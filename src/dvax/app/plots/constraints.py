@@ -1,0 +1,142 @@
+"""When the constraints of K are active, from a solution: spans of time, or shares of the entries."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from dvax._tree import Tree
+from dvax.app.plots.downsample import edges
+from dvax.app.plots.panels import AbstractPanel, Curve, Panel
+from dvax.app.plots.span_panel import SpanPanel, Spans
+from dvax.evolution import Solution
+
+_MOST_ROWS = 12
+"""Up to this many constraints that are ever active have a row each."""
+_MOST_LOCATED = 1000
+"""Up to this many entries of y the changes of every step are listed: each has a row of signs."""
+_LOWER, _UPPER, _ACTIVE = "at the lower bound", "at the upper bound", "active"
+_KINDS = (_LOWER, _UPPER, _ACTIVE)
+
+
+def box_rows(sol: Solution, times: np.ndarray) -> tuple[Tree, Tree] | None:
+    """Return the bounds of K at these times, trees of rows shaped like y, or None if K is no box."""
+    flow = sol.flow
+    problem, args = flow.problem, flow.args
+    like = problem.zero_control(sol.setup.x0)
+    if problem.set_at(sol.setup.number("t0"), args).intervals(like) is None:
+        return None
+
+    def at(t: Any) -> Any:
+        return problem.set_at(t, args).intervals(like)
+
+    rows = jax.jit(jax.vmap(at))(jnp.asarray(times, sol.ts.dtype))
+    lower, upper = jtu.tree_map(np.asarray, rows)
+    return lower, upper
+
+
+def constraint_panel(
+    sol: Solution, times: np.ndarray, rows: tuple[Tree, Tree], box: Any, entries: list[str]
+) -> AbstractPanel | None:
+    """Return a panel with the spans in which constraints are active. They are those of
+    `Solution.regimes` if the steps were recorded, else those of the saved times. None if no constraint
+    is active, or K has no switch functions. `entries` are the names of the entries of y."""
+    found = _signs(sol, times, rows, box, entries)
+    if found is None:
+        return None
+    ends, active, labels = found
+    used = np.flatnonzero(active.any(axis=0))
+    if not used.size:
+        return None
+    if used.size > _MOST_ROWS:
+        return _shares(ends, active, labels)
+    spans = tuple(
+        _spans(ends, active[:, k], _name(labels[k], labels), _KINDS.index(labels[k][1]))
+        for k in used
+    )
+    return SpanPanel(spans, "constraints", share=0.25 + 0.11 * len(spans))
+
+
+Label = tuple[str, str]
+"""The entry of y, and the kind of its constraint."""
+
+
+def _signs(
+    sol: Solution, times: np.ndarray, rows: tuple[Tree, Tree], box: Any, entries: list[str]
+) -> tuple[np.ndarray, np.ndarray, list[Label]] | None:
+    """Return the ends of intervals, and whether each constraint is active in each of them."""
+    flow, x0 = sol.flow, sol.setup.x0
+    like = flow.problem.zero_control(x0)
+    saved = len(sol.ts) >= 2
+    if sol.records is not None and not (saved and len(entries) > _MOST_LOCATED):
+        zero = flow.switches(sol.setup.number("t0"), x0, like)
+        if zero is not None:
+            found = sol.regimes()
+            labels = _labels(like, entries, found.positive.shape[1], box is not None)
+            return found.times, ~found.positive, labels
+    ends = edges(times)
+    ends[[0, -1]] = times[[0, -1]]
+    if box is not None:
+        active = [_on_box(y, *pair) for y, *pair in zip(*map(jtu.tree_leaves, (rows[1], *box)))]
+        columns = np.concatenate(active, axis=1)
+        return ends, columns, _labels(like, entries, columns.shape[1], True)
+    if flow.switches(sol.setup.number("t0"), x0, like) is None:
+        return None
+
+    def positive(row: Any) -> Any:
+        t, x = row
+        values = flow.switches(t, x, flow.rate(t, x, flow.guess(x)).z)
+        assert values is not None
+        return values > 0
+
+    signs = jax.jit(lambda rows: jax.lax.map(positive, rows))
+    columns = ~np.asarray(signs((jnp.asarray(times, sol.ts.dtype), rows[0])))
+    return ends, columns, _labels(like, entries, columns.shape[1], False)
+
+
+def _on_box(y: Any, lower: Any, upper: Any) -> np.ndarray:
+    """Return whether each entry is at its lower bound, then whether it is at its upper one."""
+    flat, low, high = (np.reshape(np.asarray(v), (len(y), -1)) for v in (y, lower, upper))
+    # y = P u is the projection up to the rounding of P.
+    rounding = 64 * np.finfo(flat.dtype).eps * np.maximum(np.abs(flat), 1e-300)
+    return np.concatenate([flat <= low + rounding, flat >= high - rounding], axis=1)
+
+
+def _labels(like: Tree, entries: list[str], count: int, is_box: bool) -> list[Label]:
+    """Return the labels of the constraints in the order of `AbstractSet.switches`: for each part of a
+    box the lower bounds of its entries, then the upper ones."""
+    if not is_box or count != 2 * len(entries):
+        return [(f"constraint {k}" if count > 1 else "constraint", _ACTIVE) for k in range(count)]
+    labels: list[Label] = []
+    rest = iter(entries)
+    for leaf in jtu.tree_leaves(like):
+        own = [next(rest) for _ in range(leaf.size)]
+        labels += [(entry, kind) for kind in (_LOWER, _UPPER) for entry in own]
+    return labels
+
+
+def _name(label: Label, labels: list[Label]) -> str:
+    entry, kind = label
+    if kind == _ACTIVE:
+        return entry
+    # The only entry needs no name.
+    return kind if len(labels) == 2 else f"{entry} {kind}"
+
+
+def _spans(ends: np.ndarray, active: np.ndarray, name: str, colour: int) -> Spans:
+    """Return the runs of intervals in which a constraint is active."""
+    change = np.diff(np.concatenate([[0], active.astype(np.int8), [0]]))
+    return Spans(name, ends[np.flatnonzero(change > 0)], ends[np.flatnonzero(change < 0)], colour)
+
+
+def _shares(ends: np.ndarray, active: np.ndarray, labels: list[Label]) -> Panel:
+    """Return the shares of the entries that are at a bound, as steps over time."""
+    x = np.repeat(ends, 2)[1:-1]
+    curves = []
+    for k, kind in enumerate(_KINDS):
+        columns = active[:, [own == kind for _, own in labels]]
+        if columns.any():
+            curves.append(Curve(x, np.repeat(100.0 * columns.mean(axis=1), 2), kind, k))
+    return Panel(curves, "constraints that<br>are active", "%", share=0.6)
