@@ -146,7 +146,8 @@ def panels_picture(
 
 def _add_legend(axes: Axes, panel: Panel, named: set[str]) -> None:
     """Name the curves above the panel, but for those that a panel above has named."""
-    handles = [line for line in axes.lines if line.get_label() not in named]
+    by_name = {line.get_label(): line for line in axes.lines if line.get_label() not in named}
+    handles = list(by_name.values())
     if len(panel.curves) == 1 or not handles:
         return
     names = [str(line.get_label()) for line in handles]

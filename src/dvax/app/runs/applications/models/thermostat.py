@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import jax
 import numpy as np
@@ -104,7 +104,7 @@ class ThermostatApplication(ModelApplication):
         model = Model(
             self.floor.problem, np.full(table.cells, table.initial), table.t_end, time_unit="h",
             states={"temperature": "degC"}, responses={"heating": "K/h"},
-            constants=self.floor.constants, settings={"rtol": 1e-6, "atol": 1e-6},
+            constants=self.floor.constants, settings={"rtol": 1e-5, "atol": 1e-5},
         )  # fmt: skip
         self.set_model(model, None)
 
