@@ -136,6 +136,11 @@ class MpcApplication(ModelApplication):
                     found[name] = _matrix(getattr(table, name), name, paths.get(name))
         problems.raise_any()
         n, m = found["A"].shape[0], found["B"].shape[1]
+        if found["A"].shape[1] != n:
+            raise input_error(
+                "model.A", f"{n} rows of {found['A'].shape[1]} numbers", "it is square",
+                "Write a row and a column for each state",
+            )  # fmt: skip
         self.weights = (found.setdefault("Q", np.eye(n)), found.setdefault("R", np.eye(m)))
         with problems.collect():
             self.state_units = self._units("states", "x", n)
@@ -273,8 +278,8 @@ class MpcApplication(ModelApplication):
                 "integral of the weighted squares, from the saved times",
             ),
             "time_at_limit": Figure(
-                float(at_limit.any(axis=1).mean()), "1",
-                "part of the saved times with an input at limits"
+                float(np.trapezoid(at_limit.any(axis=1), times) / (times[-1] - times[0] or 1.0)), "1",
+                "part of the time with an input at a limit",
             ),
         }  # fmt: skip
         c = self.constants

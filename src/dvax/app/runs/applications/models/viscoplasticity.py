@@ -158,7 +158,8 @@ class ViscoplasticityApplication(ModelApplication):
         for what, (values, unit) in of.items():
             for k, c in enumerate(COMPONENTS):
                 entry = values[:, int(c[0]) - 1, int(c[1]) - 1]
-                if k in self.moved or (what == "stress" and np.any(np.abs(entry) > 1e-9)):
+                roundoff = 1e-9 * np.abs(values).max()
+                if k in self.moved or np.abs(entry).max() > roundoff:
                     words = what.replace("_", " ")
                     series[f"{what}_{c}"] = Variable(
                         ("time",), entry, unit, f"{words}, component {c}"
