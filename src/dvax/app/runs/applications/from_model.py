@@ -37,7 +37,7 @@ class FramesKeys(SolverKeys):
     frames: int = Field(200, ge=1, le=10**6, description="number of intervals between saved states")
 
 
-class ModelApplication(AbstractApplication):
+class AbstractModelApplication(AbstractApplication):
     """An application that is complete when its constructor has called `set_model`.
 
     A subclass adds its own sizes, notes, figures and series in `sizes`, `notes` and `further`.

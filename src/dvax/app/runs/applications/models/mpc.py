@@ -12,7 +12,7 @@ from pydantic import Field, PlainValidator
 
 from dvax.app.runs.applications.base import Figure, Variable
 from dvax.app.runs.applications.certificate import Certificate
-from dvax.app.runs.applications.from_model import FramesKeys, ModelApplication
+from dvax.app.runs.applications.from_model import FramesKeys, AbstractModelApplication
 from dvax.app.runs.applications.history import read_history
 from dvax.app.runs.schema import in_unit, rule_error
 from dvax.errors import Problems, input_error
@@ -116,7 +116,7 @@ def _holding(A: np.ndarray, B: np.ndarray, reference: _Rows) -> tuple[_Rows, flo
     return reference._replace(rows=inputs), miss
 
 
-class MpcApplication(ModelApplication):
+class MpcApplication(AbstractModelApplication):
     """States against their reference, and inputs within their limits."""
 
     section = MpcSection

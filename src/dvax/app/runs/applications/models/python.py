@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field, ValidationError, create_model, model_vali
 
 from dvax.app.runs.applications.base import Figure, Variable
 from dvax.app.runs.applications.certificate import Certificate
-from dvax.app.runs.applications.from_model import FramesKeys, ModelApplication
+from dvax.app.runs.applications.from_model import FramesKeys, AbstractModelApplication
 from dvax.app.runs.schema import Section, in_unit
 from dvax.app.runs.schema_errors import translate, unknown_key
 from dvax.errors import DvaxError, InputError, input_error
@@ -49,7 +49,7 @@ class PythonSection(FramesKeys):
         return given
 
 
-class PythonApplication(ModelApplication):
+class PythonApplication(AbstractModelApplication):
     """States and responses over time, by the names that the model gives them."""
 
     section = PythonSection

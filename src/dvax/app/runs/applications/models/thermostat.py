@@ -10,7 +10,7 @@ from pydantic import Field
 
 from dvax.app.runs.applications.base import Figure, Variable
 from dvax.app.runs.applications.certificate import Certificate
-from dvax.app.runs.applications.from_model import FramesKeys, ModelApplication
+from dvax.app.runs.applications.from_model import FramesKeys, AbstractModelApplication
 from dvax.app.runs.applications.history import read_series
 from dvax.app.runs.schema import Section, in_unit, number_or_file
 from dvax.errors import Problems
@@ -70,7 +70,7 @@ class ThermostatSection(FramesKeys):
     t_end: Annotated[float, in_unit("h")] = Field(48.0, gt=0, description="end of the run [h]")
 
 
-class ThermostatApplication(ModelApplication):
+class ThermostatApplication(AbstractModelApplication):
     """Temperature and heating over place and time, and their means."""
 
     section = ThermostatSection

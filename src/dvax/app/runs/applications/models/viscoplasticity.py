@@ -11,7 +11,7 @@ from pydantic import Field
 
 from dvax.app.runs.applications.base import Figure, Variable
 from dvax.app.runs.applications.certificate import Certificate
-from dvax.app.runs.applications.from_model import FramesKeys, ModelApplication
+from dvax.app.runs.applications.from_model import FramesKeys, AbstractModelApplication
 from dvax.app.runs.applications.history import read_history
 from dvax.app.runs.schema import in_unit
 from dvax.errors import Problems, input_error
@@ -53,7 +53,7 @@ class ViscoplasticitySection(FramesKeys):
 _DEFAULTS = {"von-mises": {"strength": 250.0}, "drucker-prager": {"friction": 0.9, "tension": 0.0}}
 
 
-class ViscoplasticityApplication(ModelApplication):
+class ViscoplasticityApplication(AbstractModelApplication):
     """Stress and plastic strain over time."""
 
     section = ViscoplasticitySection
