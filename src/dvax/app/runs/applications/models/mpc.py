@@ -12,7 +12,7 @@ from pydantic import Field, PlainValidator
 
 from dvax.app.runs.applications.base import Figure, Variable
 from dvax.app.runs.applications.certificate import Certificate
-from dvax.app.runs.applications.from_model import FramesKeys, AbstractModelApplication
+from dvax.app.runs.applications.from_model import AbstractModelApplication, FramesKeys
 from dvax.app.runs.applications.history import read_history
 from dvax.app.runs.schema import in_unit, rule_error
 from dvax.errors import Problems, input_error

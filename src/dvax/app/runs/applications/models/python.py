@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field, ValidationError, create_model, model_vali
 
 from dvax.app.runs.applications.base import Figure, Variable
 from dvax.app.runs.applications.certificate import Certificate
-from dvax.app.runs.applications.from_model import FramesKeys, AbstractModelApplication
+from dvax.app.runs.applications.from_model import AbstractModelApplication, FramesKeys
 from dvax.app.runs.schema import Section, in_unit
 from dvax.app.runs.schema_errors import translate, unknown_key
 from dvax.errors import DvaxError, InputError, input_error

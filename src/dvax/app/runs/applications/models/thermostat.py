@@ -10,7 +10,7 @@ from pydantic import Field
 
 from dvax.app.runs.applications.base import Figure, Variable
 from dvax.app.runs.applications.certificate import Certificate
-from dvax.app.runs.applications.from_model import FramesKeys, AbstractModelApplication
+from dvax.app.runs.applications.from_model import AbstractModelApplication, FramesKeys
 from dvax.app.runs.applications.history import read_series
 from dvax.app.runs.schema import Section, in_unit, number_or_file
 from dvax.errors import Problems
