@@ -75,6 +75,13 @@ def read_columns(path: Path, wanted: list[str | None], key_column: str) -> list[
     return [Column(name, units[name] or "1", columns[name], columns["lines"]) for name in chosen]
 
 
+def column_names(path: Path) -> list[str]:
+    """Return the names in the first row of a CSV file, without their units."""
+    rows = csv_rows(path, FileProblems(path))
+    found = [_HEADER.fullmatch(cell) for cell in (rows[0][1] if rows else []) if len(cell) <= 200]
+    return [match["name"] for match in found if match is not None]
+
+
 def _only_other(table: Table, key_column: str) -> str | None:
     """Return the one column besides `key_column`; None, and a problem, where there are several."""
     others = [name for name in table.names if name != key_column]

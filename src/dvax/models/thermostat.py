@@ -26,25 +26,26 @@ COOLED, REGULATED, HEATED = -1, 0, 1
 class Thermostat(eqx.Module):
     """The heat equation on a rectangle Ω with a thermostat at every point.
 
-        x' = κΔx + u + ℓ(t)
+        x' = κΔx − λx + u + ℓ(t)
         u ∈ k(T_ref − x) − N_K(u),   K = {g₁ ≤ u ≤ g₂},   so that u = clip(k(T_ref − x), g₁, g₂)
 
     in X = U = L²(Ω), with insulated walls (Neumann), walls of temperature 0 (Dirichlet), or periodic
     boundary conditions. u is the heating power, negative for cooling. Free boundaries, on which
     k(T_ref − x) equals a limit, separate the three regimes. (With −u as the flow through a
-    semipermeable membrane this is the interior law of Duvaut and Lions.)
+    semipermeable membrane this is the interior law of Duvaut and Lions.) The loss λ is that to
+    surroundings of temperature 0; to those of temperature T(t) it is λx with the load λT(t).
 
-    The problem has A = κΔ, P = I, h = k(T_ref − x) and f = u + ℓ; F(y) = y − h(x) has γ = L_F = 1. On a
-    grid the weight of L² is the area of a cell, the projection is the clip, and Δ is exact for every
-    function that the grid resolves.
+    The problem has A = κΔ − λ, P = I, h = k(T_ref − x) and f = u + ℓ; F(y) = y − h(x) has
+    γ = L_F = 1. On a grid the weight of L² is the area of a cell, the projection is the clip, and Δ
+    is exact for every function that the grid resolves.
 
-    **Units:** with temperature in [T], length in [s], time in [t]: κ in [s]²/[t]; k in 1/[t]; u, g₁, g₂
-    and ℓ in [T]/[t] (power over heat capacity); T_ref in [T].
+    **Units:** with temperature in [T], length in [s], time in [t]: κ in [s]²/[t]; k and λ in 1/[t];
+    u, g₁, g₂ and ℓ in [T]/[t] (power over heat capacity); T_ref in [T].
 
     **Arguments:** `shape`: cells along each axis; `lengths`; `boundary` and `scheme` as for
-    `dvax.generators.Elliptic`; `diffusion` κ > 0; `gain` k > 0; `reference` T_ref and `load` ℓ:
-    numbers, arrays over the cells, `dvax.signals` or callables of t; `lower` g₁ ≤ `upper` g₂: numbers
-    or arrays over the cells (equal where there is no heater).
+    `dvax.generators.Elliptic`; `diffusion` κ > 0; `gain` k > 0; `loss` λ ≥ 0; `reference` T_ref
+    and `load` ℓ: numbers, arrays over the cells, `dvax.signals` or callables of t; `lower` g₁ ≤
+    `upper` g₂: numbers or arrays over the cells (equal where there is no heater).
 
     **Raises:** `dvax.InputError` with all invalid arguments.
 
@@ -85,6 +86,7 @@ class Thermostat(eqx.Module):
         lower: Any,
         upper: Any,
         load: Any = 0.0,
+        loss: Any = 0.0,
         lengths: Any = 1.0,
         boundary: Any = "neumann",
         scheme: str = "spectral",
@@ -94,8 +96,11 @@ class Thermostat(eqx.Module):
         why = "a negative diffusivity is ill-posed"
         self.diffusion = positive(f"{name}(diffusion)", diffusion, wrong, why=why)
         self.gain = positive(f"{name}(gain)", gain, wrong, why="heating must decrease with x")
+        loss_rate = positive(f"{name}(loss)", loss, wrong, zero=True)
         try:
-            self.generator = Elliptic(shape, lengths, boundary, self.diffusion, scheme=scheme)
+            self.generator = Elliptic(
+                shape, lengths, boundary, self.diffusion, reaction=0.0 - loss_rate, scheme=scheme
+            )
         except InputError as error:
             # Without a grid the fields cannot be checked.
             raise InputError(*wrong, *error.problems) from error
@@ -137,10 +142,10 @@ class Thermostat(eqx.Module):
     def constants(self) -> Constants:
         """The proved constants.
 
-        γ = L_F = 1, α_h = k, β_h = α_f = 0, β_f = 1, M = 1, and ω = −κλ₁ with the smallest
-        eigenvalue λ₁ of −Δ, which is 0 for insulated walls. The one-sided rate is μ = ω, since
-        heating decreases with temperature, ⟨u(x₁) − u(x₂), x₁ − x₂⟩ ≤ 0; the rate of the paper, ω +
-        k, ignores this sign."""
+        γ = L_F = 1, α_h = k, β_h = α_f = 0, β_f = 1, M = 1, and ω = −κλ₁ − λ with the
+        smallest eigenvalue λ₁ of −Δ, which is 0 for insulated walls. The one-sided rate is μ = ω,
+        since heating decreases with temperature, ⟨u(x₁) − u(x₂), x₁ − x₂⟩ ≤ 0; the rate of the
+        paper, ω + k, ignores this sign."""
         growth = self.generator.growth(self.space)
         return Constants(
             gamma=1.0,

@@ -40,6 +40,11 @@ class Assumption(NamedTuple):
     is_required: bool = True
     evidence: Any = None
 
+    @property
+    def holds_between_jumps(self) -> bool:
+        """Whether it fails at jumps alone, on both sides of which the theory holds."""
+        return self.why.endswith(_ON_EACH_SIDE)
+
 
 def assumptions(
     system: System, region: Region, K: SetMotion, knots: np.ndarray, moduli: ModulusStatuses

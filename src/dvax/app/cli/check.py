@@ -44,7 +44,11 @@ def check(
                 print_table(head, rows)
         for note in found.notes:
             print_remark(f"note: {note}")
-        refuted = [row for row in found.assumptions if row.is_required and row.status == "refuted"]
+        refuted = [
+            row
+            for row in found.assumptions
+            if row.is_required and row.status == "refuted" and not row.holds_between_jumps
+        ]
         for row in refuted:
             print_error(f"error: {row.label} does not hold ({row.statement}): {row.why}")
         outside = outside_the_class(found.constants)

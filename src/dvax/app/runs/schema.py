@@ -21,7 +21,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from dvax.app.runs.units import UnitError, Units, check_working_unit, is_quantity
+from dvax.app.runs.units import UnitError, Units, check_working_unit, converted, is_quantity
 
 ViSolver = Literal[
     "Auto", "Projection", "Extragradient", "ForwardBackwardForward", "GoldenRatio",
@@ -75,6 +75,41 @@ def in_quantity(kind: str) -> BeforeValidator:
         return _in_units(value, kind, info)
 
     return BeforeValidator(convert)
+
+
+def in_unit(unit: str) -> BeforeValidator:
+    """A number in this unit, or a text "number unit" that converts to it."""
+
+    def convert(value: Any) -> Any:
+        return _converted(value, unit) if isinstance(value, str) else value
+
+    return BeforeValidator(convert)
+
+
+def number_or_file(unit: str) -> PlainValidator:
+    """A number in this unit, a text "number unit", or else the name of a file."""
+
+    def convert(value: Any) -> float | str:
+        if isinstance(value, str):
+            return _converted(value, unit) if is_quantity(value) else value
+        if type(value) not in (int, float) or not math.isfinite(value):
+            raise rule_error(
+                f"it is a finite number in {unit}, or the name of a CSV file",
+                f'Write "2.5 {unit}", or a file such as "history.csv"',
+            )
+        return float(value)
+
+    return PlainValidator(convert)
+
+
+def _converted(text: str, unit: str) -> float:
+    number = converted(text, unit)
+    if number is None:
+        raise rule_error(
+            f"it is a number in {unit}, or a text with a number and a unit of that dimension",
+            f'Write "2.5 {unit}"',
+        )
+    return number
 
 
 def _finite(value: Any, kind: str, info: ValidationInfo, what: str) -> float:

@@ -113,6 +113,8 @@ def converted(text: str, unit: str) -> float | None:
     match = _match(text)
     if match is None:
         return None
+    if match["unit"].strip() == unit:
+        return float(match["number"])
     try:
         given, wanted = parse_unit(match["unit"]), parse_unit(unit)
     except UnitError:

@@ -192,7 +192,7 @@ def _check(
     paths: dict[str, Path] = {}
     for key in (*application.files, *application.folders):
         given = getattr(table, key)
-        if given is not None:
+        if isinstance(given, str):  # in the place of a file a key may have numbers
             place, is_folder = f"{file}: model.{key}", key in application.folders
             with problems.collect():
                 paths[key] = locate(given, source.parent, allow_outside, place, is_folder=is_folder)

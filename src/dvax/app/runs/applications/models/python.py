@@ -6,47 +6,24 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-import jax.tree_util as jtu
 import numpy as np
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    Field,
-    ValidationError,
-    create_model,
-    model_validator,
-)
+from pydantic import BaseModel, Field, ValidationError, create_model, model_validator
 
-from dvax.app.runs.applications.base import (
-    AbstractApplication,
-    Description,
-    Figure,
-    Plan,
-    Results,
-    Say,
-    Variable,
-)
-from dvax.app.runs.applications.certificate import Certificate, certificate
-from dvax.app.runs.schema import Section, SolverKeys, rule_error
+from dvax.app.runs.applications.base import Figure, Variable
+from dvax.app.runs.applications.certificate import Certificate
+from dvax.app.runs.applications.from_model import AbstractModelApplication, FramesKeys
+from dvax.app.runs.schema import Section, in_unit
 from dvax.app.runs.schema_errors import translate, unknown_key
-from dvax.app.runs.solver_options import check_model_steps, settings
-from dvax.app.runs.units import converted
 from dvax.errors import DvaxError, InputError, input_error
 from dvax.evolution import Solution
-from dvax.evolution.auto import choose
 from dvax.models import Model
-from dvax.theory import Constants, verify
-
-_FIGURES = 12
-"""Up to this many final values are figures of the summary."""
 
 
-class PythonSection(SolverKeys):
+class PythonSection(FramesKeys):
     """The function that builds the model, its parameters, and how long to run it."""
 
     name: Literal["python"] = Field("python", description="the model")
@@ -58,7 +35,6 @@ class PythonSection(SolverKeys):
         default_factory=dict, description="the arguments of that function"
     )
     t_end: float | None = Field(None, description="end of the run, by default that of the model")
-    frames: int = Field(200, ge=1, le=10**6, description="number of intervals between saved states")
     certify: bool = Field(
         False, description="choose steps whose defect can be bounded, and not the fastest ones"
     )
@@ -73,7 +49,7 @@ class PythonSection(SolverKeys):
         return given
 
 
-class PythonApplication(AbstractApplication):
+class PythonApplication(AbstractModelApplication):
     """States and responses over time, by the names that the model gives them."""
 
     section = PythonSection
@@ -92,115 +68,27 @@ class PythonApplication(AbstractApplication):
                 "it must return a dvax.models.Model",
                 "Write return dvax.models.Model(problem, x0, t_end)",
             )  # fmt: skip
-        self.own, self.title = model, model.title
         _run(self.file, lambda: model.problem.check(model.t0, model.x0, model.args))
-        self.t_end = float(model.t_end if table.t_end is None else table.t_end)
-        if not self.t_end > model.t0:
-            raise input_error(
-                "model.t_end",
-                f"{self.t_end:g}",
-                f"the run begins at {model.t0:g}",
-                "Write a later time",
-            )
-        check_model_steps(
-            table, self.t_end - model.t0, f"{self.t_end - model.t0:g} {model.time_unit}"
-        )
+        self.certified, self.place_of_figures = table.certify, f"{self.file.name}: figures"
+        self.set_model(model, table.t_end)
 
     @property
     def fit(self) -> str:
         return f"a problem of your own: {self.file.name}"
 
-    @property
-    def settings(self) -> dict[str, Any]:
-        return settings(self.table, **self.own.settings)
+    def call(self, work: Callable[[], Any]) -> Any:
+        return _run(self.file, work)
 
-    @cached_property
-    def verification(self) -> Any:
-        """What `dvax.verify` says of the problem."""
-        m = self.own
-        check = lambda: verify(m.problem, m.x0, m.t0, self.t_end, m.args)  # noqa: E731
-        return _run(self.file, check)
+    def notes(self) -> tuple[str, ...]:
+        return (f"The code of {self.file.name}:{self.table.function} is executed.",)
 
-    @property
-    def constants(self) -> Constants | None:
-        return self.own.constants or self.verification.constants
-
-    def describe(self) -> Description:
-        m = self.own
-        count = sum(np.size(leaf) for leaf in jtu.tree_leaves(m.x0))
-        law = sum(np.size(leaf) for leaf in jtu.tree_leaves(m.problem.zero_control(m.x0)))
-        sizes = [
-            ("states", str(count), ", ".join(m.states)),
-            ("responses", str(law), ", ".join(m.responses)),
-            (
-                "time",
-                f"{m.t0:g} to {self.t_end:g} {m.time_unit}",
-                f"{self.table.frames + 1} saved states",
-            ),
-        ]
-        notes = [f"The code of {self.file.name}:{self.table.function} is executed."]
-        if self.settings.get("method") is None and self.settings.get("dt") is None:
-            sizes.append(("method", *self._choice()))
-        return Description(self.constants, self.verification.assumptions, sizes, tuple(notes))
-
-    def _choice(self) -> tuple[str, str]:
-        """Return the method that `dvax.solve` will choose, and the reason."""
-        m, given = self.own, {"rtol": 1e-6, "atol": 1e-9} | self.settings
-        found = choose(
-            m.problem, m.x0, m.args, self.t_end - m.t0, float(max(given["rtol"], given["atol"])), False,
-            self.table.certify,
-        )  # fmt: skip
-        name, _, reason = str(found.text()).partition(": ")
-        return name, reason
-
-    def plan(self, say: Say) -> Plan:
-        m = self.own
-        say(f"solving from {m.t0:g} to {self.t_end:g} {m.time_unit}".rstrip())
-        times = np.linspace(m.t0, self.t_end, self.table.frames + 1)
-        constants = self.constants if self.table.certify else None
-        return Plan(
-            m.problem, m.x0, times, constants, self.settings, None, m.time_unit, m.args
-        )  # fmt: skip
-
-    def results(self, plan: Plan, solution: Solution, count: int) -> Results:
-        m, times = self.own, np.asarray(solution.ts)[:count]
-        variables = {"time": Variable(("time",), times, m.time_unit, "time")}
-        figures: dict[str, Figure] = {}
-        last = f"at t = {times[-1]:g} {m.time_unit}".rstrip()
-        for which, rows in (("states", solution.xs), ("responses", solution.us)):
-            for name, (values, unit) in m.series(which, rows).items():
-                key, values = name.replace("/", "∕"), values[:count]
-                dims = ("time", *(f"{key}_{k}" for k in range(values.ndim - 1)))
-                variables[key] = Variable(dims, values, unit, f"{which.removesuffix('s')} {name}")
-                if values.ndim == 1 and len(figures) < _FIGURES:
-                    figures[f"final_{key}"] = Figure(float(values[-1]), unit, f"{name} {last}")
-        bound = self._bound(solution, count)
-        if bound is not None:
-            words = "bound on the error of the state in the norm of the state space"
-            variables["error_bound"] = bound.variable("time", "", words)
-            figures["error_bound"] = bound.figure("", words)
-        if m.figures is not None:
-            of = m.figures
-            found = _run(self.file, lambda: dict(of(solution)))
-            taken = sorted(set(found) & set(figures))
-            if taken:
-                raise input_error(
-                    f"{self.file.name}: figures", ", ".join(taken), "these names are taken",
-                    "Choose others",
-                )  # fmt: skip
-            figures |= {
-                name: Figure(*_figure(self.file, name, entry)) for name, entry in found.items()
-            }
-        return Results(
-            figures, variables, self.constants, int(solution.stats["steps"]),
-            self.verification.assumptions,
-        )  # fmt: skip
-
-    def _bound(self, solution: Solution, count: int) -> Certificate | None:
-        constants = self.constants
-        if constants is None or solution.defect is None:
-            return None
-        return certificate(self.own.problem, solution, constants, count)
+    def further(
+        self, solution: Solution, bound: Certificate | None
+    ) -> tuple[Mapping[str, Variable], Mapping[str, Figure]]:
+        of = self.own.figures
+        found = {} if of is None else _run(self.file, lambda: dict(of(solution)))
+        figures = {n: Figure(*_figure(self.file, n, entry)) for n, entry in found.items()}
+        return {}, figures
 
 
 def _figure(file: Path, name: str, entry: Any) -> tuple[Any, str, str]:
@@ -340,19 +228,7 @@ def _with_unit(hint: Any) -> Any:
     unit = next((a for a in about if isinstance(a, str)), None)
     if unit is None:
         return hint
-
-    def convert(value: Any) -> Any:
-        if not isinstance(value, str):
-            return value
-        number = converted(value, unit)
-        if number is None:
-            raise rule_error(
-                f"it is a number in {unit}, or a text with a number and a unit of that dimension",
-                f'Write "2.5 {unit}"',
-            )
-        return number
-
-    return Annotated[of, BeforeValidator(convert), Field(description=f"[{unit}]")]
+    return Annotated[of, in_unit(unit), Field(description=f"[{unit}]")]
 
 
 APPLICATION = PythonApplication

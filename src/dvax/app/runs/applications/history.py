@@ -1,0 +1,82 @@
+"""Measured histories of an application: columns of a CSV file over its column of times."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from dvax.app.runs.schema_errors import unknown_key
+from dvax.app.runs.units import converted
+from dvax.errors import InputError, input_error
+from dvax.formats.csv_columns import Column, check_increasing, column_names, read_columns
+
+TIME = "time"
+
+
+class History(NamedTuple):
+    """Increasing times (m,), and the values (m,) of each column at them."""
+
+    times: np.ndarray
+    columns: Mapping[str, np.ndarray]
+
+    def check_covers(self, path: Path, t_end: float, unit: str) -> "History":
+        """Return the history, or raise an `InputError` unless it covers the run from 0 to `t_end`."""
+        first, last = float(self.times[0]), float(self.times[-1])
+        if first > 0.0 or last < t_end:
+            raise input_error(
+                path.name, f"times from {first:g} to {last:g} {unit}",
+                f"it covers the run, from 0 to {t_end:g} {unit}: nothing is extrapolated",
+                "Add rows, or shorten the run",
+            )  # fmt: skip
+        return self
+
+
+def read_history(path: Path, units: Mapping[str, str], time_unit: str) -> History:
+    """Return the columns of a file, each of which is one of `units`, in that unit.
+
+    **Raises:** `dvax.InputError` for other columns, and everything that is wrong in the file.
+    """
+    names = [name for name in column_names(path) if name != TIME]
+    unknown = [name for name in names if name not in units]
+    if unknown:
+        problems = (unknown_key(path.name, n, f"column {n}", [TIME, *units]) for n in unknown)
+        raise InputError(*problems)
+    return _history(path, read_columns(path, [TIME, *names], TIME), units, time_unit)
+
+
+def read_series(path: Path, name: str, unit: str, time_unit: str) -> History:
+    """Return the column `name` of a file in this unit, or the only one besides the times.
+
+    **Raises:** `dvax.InputError` with everything that is wrong in the file.
+    """
+    wanted = name if name in column_names(path) else None
+    time, column = read_columns(path, [TIME, wanted], TIME)
+    found = _history(path, [time, column], {column.name: unit}, time_unit)
+    return History(found.times, {name: found.columns[column.name]})
+
+
+def _history(
+    path: Path, columns: list[Column], units: Mapping[str, str], time_unit: str
+) -> History:
+    time, *others = columns
+    check_increasing(path.name, time)
+    if len(time.values) < 2:
+        raise input_error(
+            path.name, "one row", "a history has two rows at least", "Add the last time of the run"
+        )
+    times = _in_unit(path, time, time_unit)
+    return History(times, {c.name: _in_unit(path, c, units[c.name]) for c in others})
+
+
+def _in_unit(path: Path, column: Column, unit: str) -> np.ndarray:
+    wanted = unit or "1"
+    if column.unit == wanted:
+        return column.values
+    factor = converted(f"1 {column.unit}", wanted)
+    if factor is None:
+        raise input_error(
+            f"{path.name}, column {column.name!r}", f"[{column.unit}]",
+            f"its unit converts to {wanted}", f'Write "{column.name} [{wanted}]"',
+        )  # fmt: skip
+    return factor * column.values
