@@ -38,7 +38,7 @@ def evaluated(text: str) -> np.ndarray:
 
 
 def test_random_formulas_agree_with_the_reference_or_are_refused() -> None:
-    found = verdicts(0, 1500)
+    found = verdicts(0, 1000)
     assert 0.2 < found.count("read") / len(found) < 0.8
     attacks = found[: len(expressions.ATTACKS)]
     assert attacks.count("refused") > 0.8 * len(attacks)

@@ -45,7 +45,7 @@ def test_unchanged_configuration_is_read(seed, folder: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["configuration", "data"])
 def test_mutations_are_read_or_refused(kind: str, folder: Path) -> None:
-    found = verdicts(kind, folder, range(500))
+    found = verdicts(kind, folder, range(400))
     assert 0.03 < found["read"] / found.total() < 0.5, "the mutations reach both verdicts"
 
 

@@ -57,14 +57,14 @@ def process(*arguments: str, seconds: float = 300.0) -> subprocess.CompletedProc
 
 
 def test_check_of_mutated_configurations_ends_with_its_exit_codes(folder: Path) -> None:
-    assert Counter(check(number, folder) for number in range(60))[2] > 40
+    assert Counter(check(number, folder) for number in range(26))[2] > 15
 
 
 def test_name_of_a_configuration_that_is_not_utf8_is_printed(folder: Path) -> None:
     path = os.path.join(os.fsencode(folder), b"a\xff\x1b[31m\n.toml")
     Path(os.fsdecode(path)).write_text("[model]\nalpha = 1.0\n")
-    result = process("check", os.fsdecode(path))
-    assert result is not None and result.returncode == 2 and "Traceback" not in result.stderr
+    result = CliRunner().invoke(app, ["check", os.fsdecode(path)])
+    assert result.exit_code == 2 and "Traceback" not in result.output
     assert "1. a\\udcff\\x1b[31m\\n.toml: model.beta" in result.stderr
 
 
