@@ -6,6 +6,7 @@ import meshio
 import numpy as np
 import pytest
 import skfem
+from tests.fuzz.seeds import GMSH_2, GMSH_4, MEDIT
 
 import dvax
 from dvax.models.fem_contact import ElasticBody
@@ -255,7 +256,9 @@ def test_mesh_with_an_unclamped_part_is_rejected(block):
     [
         ("cut.msh", "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\n1 9 1 9\n2 1 0 9\n1\n2\n"),
         ("words.msh", "a mesh of a block"), ("data.inp", "*NODE\n1, a, b\n"),
-        ("half.vtu", "<VTKFile><Unstruct"), ("block.xyz1", "1 2 3"), ("empty.msh", ""),
+        ("half.vtu", "<VTKFile><Unstruct"), ("empty.msh", ""), ("packed.vtu", "<VTKFile"),
+        ("word.inp", "*ELEMENT, ELSET=a\n1, 1, 2\n"), ("nan.mesh", "MeshVersionFormatted 1\n"
+         "Dimension 2\nVertices\n1\n0 0 nan\n"),
     ],
 )  # fmt: skip
 def test_unreadable_mesh_file_is_rejected(tmp_path, capsys, name, text):
@@ -264,6 +267,64 @@ def test_unreadable_mesh_file_is_rejected(tmp_path, capsys, name, text):
     said = refusal(path)
     assert "meshio cannot read" in said and name in said
     assert capsys.readouterr() == ("", "")
+
+
+def test_mesh_that_may_name_another_file_is_rejected(block, tmp_path):
+    for name in (
+        "block.xdmf",
+        "block.med",
+        "block.e",
+        "block.node",
+        "block.xml",
+        "block.xyz1",
+        "block",
+    ):
+        (tmp_path / name).write_text("1 2 3")
+        assert "a mesh is one file" in refusal(tmp_path / name)
+    path = tmp_path / "block.inp"
+    for line in (
+        "*INCLUDE, INPUT=/etc/passwd",
+        " *include,input=block.inp",
+        "**\n*Include,INPUT=a",
+    ):
+        path.write_text(f"*NODE\n1, 0., 0., 0.\n{line}\n")
+        assert "includes no other one" in refusal(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("\n5 0 0 0", "\n99999999 0 0 0", "99999999; numbers of nodes"),
+        ("\n5 0 0 0", "\n1e9 0 0 0", "1e9; numbers of nodes"),
+        ("4.1 0 8", "4.1 1 8", "a binary file of Gmsh 4"),
+        ("-1 -1 0\n0", "-1e200 -1 0\n0", "at most 1e+100"),
+        ("1 2 5 4 1\n", "1 2 5 55 1\n", "node 55 of an element; there are the nodes 1 to 6"),
+        ("4 5 7\n", "4 -5 7\n", "node -5 of an element"),
+    ],
+)
+def test_mesh_with_impossible_numbers_is_rejected(old, new, said, tmp_path):
+    """meshio allocates arrays as long as the largest number of a node."""
+    text = next(text for text in (GMSH_2, GMSH_4, MEDIT) if old in text)
+    path = tmp_path / ("block.mesh" if text == MEDIT else "block.msh")
+    names = {"contact": "7", "clamped": "4"} if text == MEDIT else {}
+    path.write_text(text)
+    assert ElasticBody(path, **names)
+    path.write_text(text.replace(old, new))
+    assert said in refusal(path, **names)
+
+
+def test_compressed_vtu_mesh_is_small(tmp_path):
+    """zlib expands a thousandfold."""
+    path = tmp_path / "large.vtu"
+    rng = np.random.default_rng(0)
+    points = np.c_[rng.normal(size=(9000, 2)), np.zeros(9000)]
+    mesh = meshio.Mesh(points, [("triangle", np.arange(9000).reshape(-1, 3))])
+    mesh.write(path)
+    assert "Save it without compression" in refusal(path)
+    mesh.write(path, compression=None)
+    assert "groups of lines are: none" in refusal(path)
+    mesh.write(path, compression="lzma")
+    assert "Save it without compression" in refusal(path)
 
 
 def test_missing_mesh_file_is_rejected(tmp_path):

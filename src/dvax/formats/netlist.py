@@ -114,7 +114,7 @@ def _words(line: str) -> list[str]:
     line = line.split(";")[0].strip()
     if line.startswith(("*", "#")) or line.lower() == ".end":
         return []
-    line = re.sub(r"\s*=\s*", "=", line)
+    line = "=".join(part.strip() for part in line.split("="))
     return re.findall(r"[A-Za-z]+\s*\([^)]*\)?|\S+", line)
 
 

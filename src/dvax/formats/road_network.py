@@ -8,6 +8,9 @@ import numpy as np
 
 from ..errors import Problems, input_error
 
+_FREE_NODES = 1000
+"""The most nodes without a link: arrays have an entry for each node."""
+
 
 @dataclass(frozen=True, eq=False)
 class Network:
@@ -147,6 +150,11 @@ def link_problems(links: Any) -> Problems:
             links.name, f"{links.zones} zones and {links.nodes} nodes",
             "zones are the first ones of the nodes, so there are at most as many, and one at least",
             "Fix the counts",
+        )  # fmt: skip
+    if links.nodes > _FREE_NODES + 2 * len(links.init_node):
+        problems.add(
+            links.name, f"{links.nodes} nodes and {len(links.init_node)} links",
+            "a node has a link, and a link has two nodes", "Fix the number of nodes, or add the links",
         )  # fmt: skip
     if not 1 <= links.first_thru_node <= links.nodes + 1:
         problems.add(

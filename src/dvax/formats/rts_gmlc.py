@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import InputProblem, Problems
-from .table import FileProblems, Table, csv_rows
+from .table import FileProblems, Table, csv_rows, to_count
 
 LEAST_SLOPE = 1e-3
 """$/MWh per MW: the slope of a cost curve that is flat, as those of wind, sun and nuclear power are. It
 is the modulus γ of the law, whose solution would not be unique without it."""
 
-_FILES = {
+RTS_FILES = {
     "units": ("gen.csv", "RTS_Data/SourceData/gen.csv"),
     "load": (
         "DAY_AHEAD_regional_Load.csv",
@@ -23,6 +23,7 @@ _FILES = {
     "wind": ("DAY_AHEAD_wind.csv", "RTS_Data/timeseries_data_files/WIND/DAY_AHEAD_wind.csv"),
     "sun": ("DAY_AHEAD_pv.csv", "RTS_Data/timeseries_data_files/PV/DAY_AHEAD_pv.csv"),
 }
+"""The four files: beside each other, or where the repository has them."""
 _COLUMNS = (
     "GEN UID", "Bus ID", "Unit Type", "PMax MW", "Fuel Price $/MMBTU", "HR_incr_1", "HR_incr_3",
 )  # fmt: skip
@@ -74,7 +75,7 @@ def read_rts(folder: str | Path) -> RTS:
     Source: Barrows et al. 2020, IEEE Trans. Power Syst. 35, 119–127; github.com/GridMod/RTS-GMLC.
     """
     folder = Path(folder)
-    paths = {name: _place(folder, places) for name, places in _FILES.items()}
+    paths = {name: _place(folder, places) for name, places in RTS_FILES.items()}
     problems = Problems()
     for path in paths.values():
         if not path.is_file():
@@ -158,7 +159,7 @@ def _read_units(path: Path) -> list[_Unit]:
             kinds = ", ".join((*_THERMAL, "WIND", "PV", *_OTHERS))
             problems(line, repr(kind), f"it must be one of {kinds}", "Fix it", "Unit Type")
             continue
-        if not (len(bus) == 3 and bus.isdigit()):
+        if not (len(bus) == 3 and bus.isascii() and bus.isdigit()):
             rule = "it must be a bus of three digits, the first of which is its area"
             problems(line, repr(bus), rule, "Fix the number", "Bus ID")
         curve = _curve(table, line, numbers if kind in _THERMAL else numbers[:1])
@@ -200,7 +201,9 @@ def _read_hourly(path: Path) -> Hourly:
     for line, cells in table.rows:
         words = [cells[k] for k in clock]
         try:
-            year, month, day, period = map(int, words)
+            year, month, day, period = map(to_count, words)
+            if year is None or month is None or day is None or period is None:
+                raise ValueError("all four are integers")
             if not 1 <= period <= 24:
                 raise ValueError("a day has the periods 1 to 24")
             hours.append(datetime.datetime(year, month, day, period - 1))

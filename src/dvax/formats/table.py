@@ -5,9 +5,11 @@ numbers, and `FileProblems` collects what is wrong with one file, so that all of
 """
 
 import csv
+import io
 import math
 import os
 import re
+from collections import Counter
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -16,6 +18,8 @@ import numpy as np
 
 from ..errors import InputError, InputProblem, Problems, input_error
 
+MAX_CELLS = 10_000
+"""The most cells of a row of a CSV file."""
 MAX_PROBLEMS = 20
 """Problems of one file that are shown: a shifted column alone makes thousands."""
 NUMBER = re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,3})?")
@@ -77,10 +81,17 @@ def read_text(path: str | os.PathLike[str], kind: str, encoding: str = "latin-1"
 def csv_rows(path: Path, problems: FileProblems) -> list[tuple[int, list[str]]]:
     """Return (line, cells) of every row of a CSV file that is neither blank nor a comment (#)."""
     text = read_text(path, "a CSV file", "utf-8-sig")
-    reader = csv.reader(text.splitlines(), strict=True, skipinitialspace=True)
+    # With the ends of its lines, so that a number in quotes over two lines stays two numbers.
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True, skipinitialspace=True)
     rows: list[tuple[int, list[str]]] = []
     try:
         for cells in reader:
+            if len(cells) > MAX_CELLS:
+                rule = f"a row has at most {MAX_CELLS} cells"
+                problems(
+                    reader.line_num, f"{len(cells)} cells", rule, "Write values below each other"
+                )
+                raise problems.error()
             cells = [cell.strip() for cell in cells]
             if any(cells) and not cells[0].startswith("#"):
                 rows.append((reader.line_num, cells))
@@ -103,8 +114,10 @@ class Table:
         problems: FileProblems,
     ):
         self.header, self.names, self.problems = header, names, problems
-        for name in sorted({name for name in names if names.count(name) > 1}):
-            given = f"{name!r} {names.count(name)} times"
+        for name, count in sorted(Counter(names).items()):
+            if count == 1:
+                continue
+            given = f"{name!r} {count} times"
             problems(header, given, "a column has a name of its own", "Rename or remove the others")
         rule = f"line {header} names {len(names)} columns, and a gap is not a value"
         for line, cells in rows:

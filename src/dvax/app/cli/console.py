@@ -3,6 +3,7 @@
 On a terminal with colour and tables; in a pipe as plain lines, one fact a line, never wrapped.
 """
 
+import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -19,14 +20,25 @@ def console(*, stderr: bool = False) -> "Console":
     return Console(highlight=False, stderr=stderr)
 
 
+_CONTROL = re.compile(
+    "[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u202a-\\u202e\\u2066-\\u2069\\ud800-\\udfff]"
+)
+
+
+def visible(text: str) -> str:
+    """Return a text with escapes in the place of characters that control a terminal, reverse the
+    direction of writing, or cannot be encoded: names of files and keys may have them."""
+    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
 def print_line(text: str, style: str = "") -> None:
-    """Print a line of results exactly as given: no markup, no wrapping in a pipe."""
-    console().print(text, style=style or None, markup=False, soft_wrap=True)
+    """Print a line of results as given: no markup, no wrapping in a pipe."""
+    console().print(visible(text), style=style or None, markup=False, soft_wrap=True)
 
 
 def print_remark(text: str, style: str = "") -> None:
     """Print a line beside the results: progress, what was written where."""
-    console(stderr=True).print(text, style=style or None, markup=False, soft_wrap=True)
+    console(stderr=True).print(visible(text), style=style or None, markup=False, soft_wrap=True)
 
 
 def print_error(text: str) -> None:
@@ -40,7 +52,8 @@ def print_problems(error: InputError, kept: str = "nothing was written") -> None
     count = len(error.problems)
     print_error(f"error: {count} problem{'s' * (count != 1)} in the input; {kept}")
     for number, problem in enumerate(error.problems, start=1):
-        print_remark(f"{number}. {problem.place}", "bold")
+        place = problem.place.replace("\n", "\\n")  # of a key or a file
+        print_remark(f"{number}. {place}", "bold")
         print_remark(f"   given: {problem.given}")
         print_remark(f"   rule:  {problem.rule}")
         print_remark(f"   fix:   {problem.fix}")
@@ -57,7 +70,7 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         for name in head:
             drawn.add_column(name, overflow="fold")
         for row in rows:
-            drawn.add_row(*map(Text, row))
+            drawn.add_row(*(Text(visible(cell)) for cell in row))
         console().print(drawn)
         return
     from rich.cells import cell_len, set_cell_size

@@ -5,8 +5,6 @@ schema, the rules between values, the formulas, and every data file. All problem
 together.
 """
 
-import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,13 +16,13 @@ from dvax.app.runs.consistency import check_consistency
 from dvax.app.runs.contact_inputs import ContactInputs, read_inputs
 from dvax.app.runs.fields import Sources
 from dvax.app.runs.schema import OPTIONAL, SECTIONS
-from dvax.app.runs.schema_errors import shown, translate, unknown_key
+from dvax.app.runs.schema_errors import translate, unknown_key
 from dvax.app.runs.settings import Config as Config
 from dvax.app.runs.solver_options import check_dt_max, check_steps
+from dvax.app.runs.toml_file import read_toml
 from dvax.app.runs.units import Units
-from dvax.errors import InputError, InputProblem, Problems, input_error
+from dvax.errors import InputProblem, Problems
 
-MAX_BYTES = 2**20
 _DEFAULT_RTOL = 1e-6
 _ATOL_OF_SCALE = 1e-9  # relative to the indentation scale of the model
 
@@ -39,7 +37,7 @@ def load_config(path: str | Path, *, allow_outside: bool = False) -> Config:
     keys, types, units, ranges, contradictions, formulas (column) and data (file, line and column).
     """
     source = Path(path)
-    return check_contact(parse(source), source, allow_outside)
+    return check_contact(read_toml(source), source, allow_outside)
 
 
 def build_contact(config: Config) -> ContactInputs:
@@ -54,87 +52,6 @@ def with_points(config: Config, points: int) -> Config:
     """The same configuration on a one-dimensional boundary of other resolution."""
     boundary = config.boundary.model_copy(update={"points": (points,)})
     return config.model_copy(update={"boundary": boundary})
-
-
-def parse(source: Path) -> dict[str, Any]:
-    """A TOML file as a table. **Raises:** `InputError` with line and column."""
-
-    name = source.name
-    try:
-        if not source.is_file():
-            given = "a folder" if source.is_dir() else "no such file"
-            raise input_error(
-                str(source), given, "a configuration is a TOML file", "Check its name."
-            )
-        size = source.stat().st_size
-        if size > MAX_BYTES:
-            raise input_error(
-                name,
-                f"{size} bytes",
-                f"a configuration has at most {MAX_BYTES} bytes",
-                "Put data into CSV or NPY files.",
-            )
-        text = source.read_bytes().decode(
-            "utf-8-sig"
-        )  # Notepad begins a file with a byte-order mark
-        return tomllib.loads(text)
-    except InputError:
-        raise  # it is a ValueError too
-    except OSError as error:
-        raise input_error(
-            str(source), error.strerror or str(error), "it must be readable", "Check it."
-        ) from None
-    except UnicodeDecodeError as error:
-        raise input_error(
-            f"{name}, byte {error.start + 1}",
-            "bytes that are not UTF-8",
-            "TOML is UTF-8",
-            "Save it so.",
-        ) from None
-    except tomllib.TOMLDecodeError as error:
-        message = str(error)
-        found = re.search(r"\(at line (\d+), column (\d+)\)", message)
-        place = f"{name}, line {found[1]}, column {found[2]}" if found else f"{name}, at its end"
-        lines = text.splitlines() or [""]
-        line = lines[min(int(found[1]), len(lines)) - 1] if found else lines[-1]
-        raise input_error(place, repr(line.strip()[:120]), *_broken_toml(message, line)) from None
-    except (RecursionError, ValueError) as error:
-        # tomllib lets the errors of int() and of deep nesting through.
-        raise input_error(
-            name, shown(str(error)), "the file is not readable as TOML", "Write it simpler."
-        ) from None
-
-
-_TOML = (
-    ("Invalid value", "what stands after = is no value of TOML",
-     'Write a number with a point (0.5), true or false, a text in "quotes", or a list [1, 2].'),
-    ("Expected '=' after a key", "a line is key = value, or a heading [table]",
-     "Write = between the key and its value, and put keys with blanks in quotes."),
-    ("Invalid statement", "a line is key = value, or a heading [table]",
-     "Start comments with #, and keys with a letter."),
-    ("Cannot overwrite a value", "every key occurs once in its table",
-     "Remove one of the two lines with this key."),
-    ("Cannot declare", "every heading [table] occurs once, and [[table]] makes entries of a list",
-     "Join the two tables, or write [[table]] for each entry."),
-    ("Expected newline or end of document", "a value ends with its line",
-     'Write one key = value a line, numbers as 0.5 or 1e-3, and quantities in quotes: "5 ms".'),
-    ("Unterminated string", "a text ends with the quote it began with", "Close the quotes."),
-    ("Illegal character", "a text in quotes stands on one line", "Close the quotes on this line."),
-    ("Expected ']' at the end of a table", "a heading ends with ]", "Close the bracket."),
-    ('Expected "\'"', "a text ends with the quote it began with", "Close the quotes."),
-    ("Unclosed array", "a list ends with ]", "Close the bracket."),
-    ("Unescaped", "a backslash in a text in quotes begins an escape",
-     "Write paths with / or in 'single quotes'."),
-)  # fmt: skip
-
-
-def _broken_toml(message: str, line: str) -> tuple[str, str]:
-    """The rule that a line breaks, and the fix, from what the parser says."""
-    for start, rule, fix in _TOML:
-        if message.startswith(start):
-            return f"the file is not TOML: {rule}", fix
-    reason = re.sub(r"\s*\(at .*\)$", "", message)
-    return f"the file is not TOML ({reason})", 'Write key = value; texts in "quotes".'
 
 
 def check_contact(raw: dict[str, Any], source: Path, allow_outside: bool) -> Config:

@@ -4,10 +4,13 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from dvax.app.runs.schema_errors import shown
 from dvax.errors import InputError, input_error
 from dvax.formats.table import read_bytes
 
 MAX_BYTES = 256 * 2**20
+MAX_NAME = 4096
+"""The longest path of Linux, in bytes; longer ones take long to resolve."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +33,9 @@ def locate(
     """
 
     def refuse(rule: str, fix: str) -> InputError:
-        return input_error(place, repr(name), rule, fix)
+        return input_error(place, shown(name), rule, fix)
 
-    if not name or "\x00" in name:
+    if not name or "\x00" in name or len(name) > MAX_NAME:
         raise refuse("this is no file name", "Name a file beside the configuration.")
     path = Path(name) if allow_outside and Path(name).is_absolute() else folder / name
     try:
@@ -42,7 +45,8 @@ def locate(
         size = resolved.stat().st_size if file else 0
     except (OSError, RuntimeError) as error:
         fix = "Check the name and the permissions."
-        raise refuse(f"it cannot be opened: {error}", fix) from None
+        reason = getattr(error, "strerror", None) or "its links form a loop"
+        raise refuse(f"it cannot be opened: {reason}", fix) from None
     if not inside and not allow_outside:
         rule = "data lies in the configuration's folder or below it"
         raise refuse(rule, "Copy it there, or pass --allow-outside.")

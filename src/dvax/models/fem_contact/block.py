@@ -12,6 +12,10 @@ _MIN_ASPECT_RATIO = 1e-9
 """Smallest ratio of the sides of an element; below, its area is dominated by roundoff."""
 
 
+_MAX_ELEMENTS = 250_000
+"""A block of so many has two million unknowns; its factorisation needs gigabytes."""
+
+
 def block(
     width: Any = 8.0,
     height: Any = 4.0,
@@ -56,15 +60,22 @@ def block(
                 "Make the block wider or the fine zone narrower",
             )
         )  # fmt: skip
+    if not wrong and 2 * (fine + coarse) * layers > _MAX_ELEMENTS:
+        keys = ", ".join(f"mesh[{name!r}]" for name in counts)
+        wrong.add(
+            f"dvax.models.ElasticBody({keys})", f"{2 * (fine + coarse) * layers} elements",
+            f"a block has at most {_MAX_ELEMENTS}", "Use fewer columns or layers",
+        )  # fmt: skip
     wrong.raise_any()
     skfem = needed("skfem")
     inner = np.linspace(0.0, fine_half_width, fine + 1)
     outer = np.geomspace(fine_half_width, width / 2, coarse + 1)[1:]
     right = np.concatenate([inner, outer])
-    heights = float(growth) ** np.arange(layers)
-    depth = np.concatenate([[0.0], np.cumsum(heights)])
-    y = -float(height) * (depth / depth[-1])[::-1]
-    _check_sides(np.diff(right), np.diff(y))
+    with np.errstate(all="ignore"):  # heights that overflow are no sides of elements
+        heights = float(growth) ** np.arange(layers)
+        depth = np.concatenate([[0.0], np.cumsum(heights)])
+        y = -float(height) * (depth / depth[-1])[::-1]
+        _check_sides(np.diff(right), np.diff(y))
     mesh = skfem.MeshQuad.init_tensor(np.concatenate([-right[::-1], right[1:]]), y)
     middle = mesh.p[1, mesh.facets].mean(axis=0)
     # The first and the last value of y are exact, so they can be compared by equality.

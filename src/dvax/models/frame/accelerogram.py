@@ -41,6 +41,8 @@ class Accelerogram(AbstractSignal):
     def __init__(self, step: Any, acceleration: Any):
         name = "dvax.models.Accelerogram"
         samples = _tree.host(_tree.as_float(acceleration, f"{name}(acceleration)"))
+        with np.errstate(over="ignore"):  # what overflows is refused below
+            scaled = GRAVITY * samples
         wrong = Problems()
         if not (isinstance(step, float | int) and np.isfinite(step) and step > 0):
             wrong.add(
@@ -52,15 +54,15 @@ class Accelerogram(AbstractSignal):
                 f"{name}(acceleration)", f"shape {samples.shape}",
                 "it must be a vector of at least two samples", "Give one number for each sample",
             )  # fmt: skip
-        elif not np.all(np.isfinite(samples)):
-            k = int(np.flatnonzero(~np.isfinite(samples))[0])
+        elif not np.all(np.isfinite(scaled)):
+            k = int(np.flatnonzero(~np.isfinite(scaled))[0])
             wrong.add(
                 f"{name}(acceleration)", f"{samples[k]} at sample {k}",
-                "all samples must be finite", "Fill the gaps explicitly",
+                "all samples must be finite, in in/s² too", "Fill the gaps explicitly",
             )  # fmt: skip
         wrong.raise_any()
         self.step = float(step)
-        self.samples = jnp.asarray(GRAVITY * samples)
+        self.samples = jnp.asarray(scaled)
 
     @classmethod
     def from_at2(cls, path: str | os.PathLike[str]) -> "Accelerogram":

@@ -10,6 +10,9 @@ from ... import _tree
 from ...errors import InputProblem, Problems
 from ...formats.road_network import Network
 
+_OVERFLOWS = np.errstate(over="ignore", invalid="ignore", divide="ignore")
+"""Costs of extreme links are infinite without a warning; the caller checks them."""
+
 
 class LinkCosts(eqx.Module):
     """c(v) = t(v) + toll_weight·toll + distance_weight·length for each link, with the travel time
@@ -27,6 +30,7 @@ class LinkCosts(eqx.Module):
     power: Any
     most: Any = np.inf
 
+    @_OVERFLOWS
     def times(self, v: Any, capacity: Any) -> Any:
         """Return t(v)."""
         lib = _tree.array_module(v, capacity)
@@ -45,10 +49,12 @@ class LinkCosts(eqx.Module):
         """Return c(v)."""
         return self.times(v, capacity) + self.charge
 
+    @_OVERFLOWS
     def slopes(self, v: Any, capacity: Any) -> Any:
         """Return t′(v), for 0 ≤ v ≤ `most`."""
         return self.scale * self.power / capacity * (v / capacity) ** (self.power - 1.0)
 
+    @_OVERFLOWS
     def integrals(self, v: Any, capacity: Any) -> Any:
         """Return ∫₀ᵛ c, for 0 ≤ v ≤ `most`, the terms of Beckmann's objective."""
         congestion = self.scale * v * (v / capacity) ** self.power / (self.power + 1.0)
@@ -62,10 +68,17 @@ def link_costs(network: Network, toll_weight: Any, distance_weight: Any) -> Link
     lies between 0 and 1: then t′(0) = ∞ and there is no L_F.
     """
     problems = Problems()
-    charge = distance_weight * network.length
-    if network.toll is not None:
-        charge = charge + toll_weight * network.toll
-    elif toll_weight != 0:
+    with np.errstate(over="ignore"):  # a charge that overflows is refused below
+        charge = distance_weight * network.length
+        if network.toll is not None:
+            charge = charge + toll_weight * network.toll
+    if not np.all(np.isfinite(charge)):
+        problems.add(
+            "dvax.models.Traffic(toll_weight, distance_weight)",
+            f"{toll_weight:g} and {distance_weight:g}",
+            f"the cost of a link of {network.name} overflows", "Use smaller weights",
+        )  # fmt: skip
+    if network.toll is None and toll_weight != 0:
         problems.add(
             "dvax.models.Traffic(toll_weight)", f"{toll_weight:g}",
             f"{network.name} has no column toll, so the weight must be 0",

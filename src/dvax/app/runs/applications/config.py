@@ -13,10 +13,11 @@ from pydantic import BaseModel, ValidationError
 
 from dvax.app.runs.applications import models
 from dvax.app.runs.applications.base import AbstractApplication
-from dvax.app.runs.config import Config, check_contact, parse
+from dvax.app.runs.config import Config, check_contact
 from dvax.app.runs.data_file import DataFile, fingerprint, locate
 from dvax.app.runs.schema import SECTIONS, ModelSection, ReportSection, Section
 from dvax.app.runs.schema_errors import shown, translate, unknown_key
+from dvax.app.runs.toml_file import read_toml
 from dvax.app.runs.units import Units
 from dvax.app.runs.wording import Wording
 from dvax.errors import Problems, input_error
@@ -65,7 +66,9 @@ class ModelConfig:
         for key, path in self.paths.items():
             inside = self.application.folders.get(key, ("",))
             files = [path / name for name in inside if (path / name).is_file()]
-            found += [(f"model.{key}", file) for file in files]
+            # Of files with one name, the first is read.
+            first = {file.name: file for file in reversed(files)}
+            found += [(f"model.{key}", file) for file in files if first[file.name] == file]
         return found
 
     def fingerprints(self) -> list[DataFile]:
@@ -100,7 +103,7 @@ def read_config(
     """
     source = Path(path)
     return check_config(
-        parse(source), source, allow_outside=allow_outside, quiet=quiet, allow_code=allow_code
+        read_toml(source), source, allow_outside=allow_outside, quiet=quiet, allow_code=allow_code
     )
 
 
@@ -196,6 +199,11 @@ def _check(
             place, is_folder = f"{file}: model.{key}", key in application.folders
             with problems.collect():
                 paths[key] = locate(given, source.parent, allow_outside, place, is_folder=is_folder)
+            for name in application.folders.get(key, ()):
+                # A link in the folder may lead out of it.
+                if key in paths and (paths[key] / name).is_file():
+                    with problems.collect():
+                        locate(f"{given}/{name}", source.parent, allow_outside, place)
     problems.raise_any()
     with wording_of(application, file).in_keys():
         model = application(table, paths, quiet)

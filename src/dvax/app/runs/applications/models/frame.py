@@ -40,7 +40,7 @@ class FrameSection(SolverKeys):
     period: Annotated[float, in_quantity("time")] = Field(
         gt=0, le=1e6, description="natural period [s]"
     )
-    damping: float = Field(ge=0, description="of the critical damping")
+    damping: float = Field(ge=0, le=1e6, description="of the critical damping")
     yield_ratio: float | None = Field(
         None, gt=0, description="yield force over the largest elastic force; without it: elastic"
     )

@@ -25,6 +25,7 @@ from dvax.app.runs.solver_options import check_model_steps, settings
 from dvax.errors import input_error
 from dvax.evolution import ExpRosenbrock, Solution
 from dvax.formats import read_rts
+from dvax.formats.rts_gmlc import RTS_FILES
 from dvax.models.market import Market, largest_gain
 
 
@@ -50,15 +51,13 @@ class MarketApplication(AbstractApplication):
     section = MarketSection
     folders: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "data": (
-            "gen.csv", "DAY_AHEAD_regional_Load.csv", "DAY_AHEAD_wind.csv", "DAY_AHEAD_pv.csv",
+            *(name for places in RTS_FILES.values() for name in places),
         ),
     }  # fmt: skip
 
     def __init__(self, table: MarketSection, paths: Mapping[str, Path], quiet: bool):
         self.table, self.per_row = table, PerRow()
         rts = read_rts(paths["data"])
-        check_model_steps(table, float(max(table.hours - 1, 1)), f"{table.hours} hours")
-        self.times = np.arange(table.start_hour, table.start_hour + table.hours, dtype=float)
         options: dict[str, Any] = dict(
             speed=table.speed, reference_price=table.reference_price, elasticity=table.elasticity
         )
@@ -70,6 +69,8 @@ class MarketApplication(AbstractApplication):
                 f"{table.start_hour} and {table.hours}",
                 f"the data have the hours 0 to {last}", "Name hours inside",
             )  # fmt: skip
+        check_model_steps(table, float(max(table.hours - 1, 1)), f"{table.hours} hours")
+        self.times = np.arange(table.start_hour, table.start_hour + table.hours, dtype=float)
         first = min(table.start_hour, last - 1) if table.hours == 1 else table.start_hour
         self.market = Market.from_rts(rts, first, max(2, table.hours), **options)
 

@@ -20,7 +20,7 @@ from dvax.app.runs.applications.base import (
 from dvax.app.runs.applications.certificate import certificate
 from dvax.app.runs.schema import Section, SolverKeys, rule_error
 from dvax.app.runs.solver_options import check_model_steps, settings
-from dvax.errors import SolveError, input_error
+from dvax.errors import InputError, SolveError, input_error
 from dvax.evolution import Solution
 from dvax.formats import read_nodes
 from dvax.models.traffic import Incident, Traffic
@@ -99,12 +99,9 @@ class TrafficApplication(AbstractApplication):
                 ],
             )  # fmt: skip
         except SolveError as error:
-            raise input_error(
-                f"{paths['network'].name} and {paths['trips'].name}",
-                "numbers of which no equilibrium could be found",
-                "capacities, times and trips are of sizes that rounding can compare",
-                "Look in both files for very large and very small ones",
-            ) from error  # fmt: skip
+            raise self._extreme(paths) from error
+        if not np.isfinite(self.traffic.constants.L_F):
+            raise self._extreme(paths)
         left = float(np.min(self.traffic.least_capacity / self.traffic.network.capacity))
         if left < _LEAST_CAPACITY:
             raise input_error(
@@ -115,6 +112,14 @@ class TrafficApplication(AbstractApplication):
             )  # fmt: skip
         nodes = paths.get("nodes")
         self.places = None if nodes is None else read_nodes(nodes, self.traffic.network)
+
+    def _extreme(self, paths: Mapping[str, Path]) -> InputError:
+        return input_error(
+            f"{paths['network'].name} and {paths['trips'].name}",
+            "numbers of which no equilibrium could be found",
+            "capacities, times and trips are of sizes that rounding can compare",
+            "Look in both files for very large and very small ones",
+        )  # fmt: skip
 
     @property
     def fit(self) -> str:
