@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from .evolution import Picard as Picard
     from .evolution import PiecewiseLinear as PiecewiseLinear
     from .evolution import Solution as Solution
+    from .evolution import communication as communication
     from .evolution import export as export
     from .evolution import load_exported as load_exported
     from .evolution import solve as solve
@@ -80,6 +81,7 @@ _HOMES = {
         "PiecewiseLinear",
         "RESULTS",
         "Solution",
+        "communication",
         "export",
         "load_exported",
         "solve",
