@@ -30,6 +30,7 @@ CASES = (
     "stiffness",
     "picard",
     "ensemble",
+    "sharding",
 )
 """The names that --only takes, in the order of a run."""
 

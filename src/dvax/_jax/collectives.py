@@ -26,14 +26,16 @@ _BITS = {"pred": 8, "c64": 64, "c128": 128}
 _OPENING = re.compile(r"^(ENTRY )?%?([\w.\-]+) .*\{$")
 _LINE = re.compile(r"^\s*(?:ROOT )?%?[\w.\-]+ = (.*?) ([a-z][a-z0-9\-]*)\(")
 _ARRAY = re.compile(r"\b([a-z]+\d*\w*)\[([\d,]*)\]")
-_CALLED = re.compile(r"(?:body|condition|to_apply|calls|true_computation|false_computation)=%?([\w.\-]+)")
+_CALLED = re.compile(
+    r"(?:body|condition|to_apply|calls|true_computation|false_computation)=%?([\w.\-]+)"
+)
 _BRANCHES = re.compile(r"branch_computations=\{([^}]*)\}")
 _SCOPE = re.compile(r'op_name="([^"]*)"')
 
 
 class Found(NamedTuple):
-    """A collective operation: its kind, the bytes of its result on one device, whether it belongs to the
-    loop over steps (`in_step`), and whether a branch or a loop within a step contains it, so that a
+    """A collective operation: its kind, the bytes of its result on one device, whether it belongs to
+    the loop over steps (`in_step`), and whether a branch or a loop within a step contains it, so that a
     step may run it never or more than once (`optional`)."""
 
     kind: str
@@ -90,9 +92,7 @@ def _walk(
             yield from _walk(computations, other, scope, steps, optional or inner)
 
 
-def _is_step(
-    computations: dict[str, tuple[bool, list[str]]], name: str, scope: str
-) -> bool:
+def _is_step(computations: dict[str, tuple[bool, list[str]]], name: str, scope: str) -> bool:
     """Return whether a computation is the body of the loop over steps: the innermost one with
     operations in the scope. (XLA moves those that do not vary to the loop around it.)"""
     lines = computations[name][1]

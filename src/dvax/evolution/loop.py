@@ -26,7 +26,6 @@ from .results import RESULTS
 from .stepper import Propagators, SolverState, Step, Stepper, interpolate, local
 from .time_derivatives import is_differentiated
 
-
 STEP = "dvax_step"
 """The name of the operations of a step in the compiled program."""
 

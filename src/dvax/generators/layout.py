@@ -22,8 +22,8 @@ WHOLE: Spec = ((),)
 
 
 class Move(NamedTuple):
-    """The layout for the transform of one axis: `spec` and the padded `shape`; and the spec and the shape
-    before the shards of this axis moved to another one."""
+    """The layout for the transform of one axis: `spec` and the padded `shape`; and the spec and the
+    shape before the shards of this axis moved to another one."""
 
     axis: int
     spec: Spec
