@@ -167,7 +167,7 @@ def bounds():
     found = []
     for place in places():
         given, options = solved(name, place)
-        constants = dvax.verify(given[0], given[1], given[4]).constants
+        constants = dvax.verify(given[0], given[1], 0.0, 1.0, given[4]).constants
         sol = dvax.solve(*given, **options, constants=constants, dense=True)
         found.append(dvax.bound_error(given[0], sol, constants).x)
     return {"apart": apart(found[1], found[0])}

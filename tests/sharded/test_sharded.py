@@ -13,9 +13,24 @@ from tests.selection import mostly_thorough
 HERE = Path(__file__).parent
 PAGE = HERE.parents[1] / "docs" / "sharding.md"
 
+STATE = 16 * 24
 EXPECTED = {
     "diagonal, a box per point, fixed steps": [],
+    "diagonal, a box per point, ETD2RK": [["all-reduce", 2, 96, False]],
+    "diagonal, a box per point, the default": [["all-reduce", 6, 344, False]],
+    "a number, the orthant, ETD4RK": [["all-reduce", 6, 328, False]],
+    "zero, a box, ExpRosenbrock": [["all-reduce", 4, 256, False]],
+    "a number, a moving box, DormandPrince": [["all-reduce", 7, 352, False]],
+    "a number, a ball, fixed steps": [["all-reduce", 2, 16, False]],
+    "two parts, ETD2RK": [["all-reduce", 2, 192, False]],
+    # The whole state, once for each forward transform.
+    "a periodic line, fixed steps": [["all-gather", 2, 2 * 8 * 512, False]],
+    "a line between zeros, fixed steps": [["all-gather", 2, 2 * 8 * 512, False]],
+    # Two transforms forward and two back, each of the entries of one device.
+    "an insulated plane, fixed steps": [["all-to-all", 4, 4 * 8 * STATE // 8, False]],
 }
+"""For each case the collective operations of a step: kind, count, bytes on a device, optional."""
+
 QUICK = ["diagonal, a box per point, fixed steps", "an insulated plane, fixed steps"]
 
 
