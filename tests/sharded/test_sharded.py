@@ -28,6 +28,11 @@ EXPECTED = {
     "a line between zeros, fixed steps": [["all-gather", 2, 2 * 8 * 512, False]],
     # Two transforms forward and two back, each of the entries of one device.
     "an insulated plane, fixed steps": [["all-to-all", 4, 4 * 8 * STATE // 8, False]],
+    # Along the periodic axis 24 real numbers become 13 complex ones, padded to 16.
+    "a plane of two kinds, ETD2RK": [
+        ["all-reduce", 3, 104, False],
+        ["all-to-all", 4, 4 * 16 * 16 * 16 // 8, False],
+    ],
 }
 """For each case the collective operations of a step: kind, count, bytes on a device, optional."""
 
