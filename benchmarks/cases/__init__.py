@@ -31,6 +31,7 @@ CASES = (
     "picard",
     "ensemble",
     "sweeps",
+    "sharding",
 )
 """The names that --only takes, in the order of a run."""
 

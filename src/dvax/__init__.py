@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from .evolution import PiecewiseLinear as PiecewiseLinear
     from .evolution import Solution as Solution
     from .evolution import ZarrStore as ZarrStore
+    from .evolution import communication as communication
     from .evolution import export as export
     from .evolution import load_exported as load_exported
     from .evolution import solve as solve
@@ -82,6 +83,7 @@ _HOMES = {
         "RESULTS",
         "Solution",
         "ZarrStore",
+        "communication",
         "export",
         "load_exported",
         "solve",

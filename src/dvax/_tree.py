@@ -145,6 +145,21 @@ def is_concrete(*trees: Tree) -> bool:
     return True
 
 
+def is_sharded(leaf: Any) -> bool:
+    """Return whether a concrete value is an array on several devices, which NumPy would gather."""
+    return isinstance(leaf, jax.Array) and len(leaf.sharding.device_set) > 1
+
+
+def first_nonfinite(leaf: Any) -> tuple[int, ...] | None:
+    """Return the index of the first entry of a concrete array that is not finite, None for none."""
+    # NumPy compiles no program.
+    module: Any = jnp if is_sharded(leaf) else np
+    wrong = ~module.isfinite(leaf)
+    if not wrong.any():
+        return None
+    return tuple(int(k) for k in np.unravel_index(int(module.argmax(wrong)), wrong.shape))
+
+
 def primal(a: Tree) -> Tree:
     """Return the tree without its tangents, which is concrete where only derivatives are traced
     (`jax.grad` outside `jax.jit`)."""
@@ -315,7 +330,8 @@ def require(condition: Callable[[], Any], name: str, given: Any, rule: str, fix:
     # Concrete values may occur inside the trace of another function.
     with jax.ensure_compile_time_eval():
         result = condition()
-        holds = bool(np.all(result)) if np.ndim(result) else bool(result)
+        module = jnp if is_sharded(result) else np
+        holds = bool(module.all(result)) if np.ndim(result) else bool(result)
     if not holds:
         raise InputError(InputProblem(name, short(given), rule, fix))
 
@@ -323,7 +339,7 @@ def require(condition: Callable[[], Any], name: str, given: Any, rule: str, fix:
 def check_not_nan(name: str, a: Tree) -> None:
     """Raise an `InputError` if an entry of a concrete array is NaN."""
     for leaf in jtu.tree_leaves(a):
-        if is_concrete(leaf) and np.isnan(np.asarray(leaf)).any():
+        if is_concrete(leaf) and (jnp if is_sharded(leaf) else np).isnan(leaf).any():
             raise InputError(
                 InputProblem(name, short(leaf), "it must not be NaN", "Correct the NaN entries")
             )

@@ -1,6 +1,9 @@
 """The mild solution: exponential integrators, step control, `solve`, `Solution`."""
 
 from .bounds import Bounds as Bounds
+from .communication import Collective as Collective
+from .communication import Communication as Communication
+from .communication import communication as communication
 from .event import Event as Event
 from .event import Events as Events
 from .exported import Exported as Exported

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import AxisType, NamedSharding
 
 from .. import _tree
 from ..errors import InputError, InputProblem
@@ -162,7 +163,9 @@ def _not_finite(x0: Any) -> list[InputProblem]:
     """Return the problems of the initial state: empty, complex or non-finite parts."""
     wrong = []
     for leaf in jax.tree_util.tree_leaves(x0):
-        name, array = "dvax.solve(x0)", None if not _tree.is_concrete(leaf) else np.asarray(leaf)
+        name, wrong_at = "dvax.solve(x0)", None
+        if _tree.is_concrete(leaf):
+            wrong_at = _tree.first_nonfinite(leaf)
         if np.size(leaf) == 0:
             wrong.append(
                 InputProblem(name, f"shape {np.shape(leaf)}", "a state has at least one entry",
@@ -173,13 +176,29 @@ def _not_finite(x0: Any) -> list[InputProblem]:
                 InputProblem(name, f"an array of {jnp.result_type(leaf)}", "states are real",
                              "Use real and imaginary part as two components")
             )  # fmt: skip
-        elif array is not None and not np.isfinite(array).all():
-            place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        elif wrong_at is not None:
             wrong.append(
-                InputProblem(name, f"{array[place]} at index {place}",
+                InputProblem(name, f"{leaf[wrong_at]} at index {wrong_at}",
                              "every entry must be finite", "Correct the initial state there")
             )  # fmt: skip
+        elif _has_explicit_axes(leaf):
+            wrong.append(
+                InputProblem(
+                    name, f"an array on a mesh with explicit axes {leaf.sharding.mesh.axis_names}",
+                    "the axes must be of the type Auto, so that XLA shards the arrays of a step",
+                    "Build the mesh by jax.sharding.Mesh(devices, names), or by jax.make_mesh(…, "
+                    "axis_types=(jax.sharding.AxisType.Auto,))",
+                )
+            )  # fmt: skip
     return wrong
+
+
+def _has_explicit_axes(leaf: Any) -> bool:
+    """Return whether a concrete array is sharded over axes whose sharding is a part of its type."""
+    sharding = leaf.sharding if _tree.is_concrete(leaf) else None
+    if not isinstance(sharding, NamedSharding):
+        return False
+    return AxisType.Explicit in sharding.mesh.axis_types
 
 
 def _wrong_moduli(constants: Any) -> list[InputProblem]:

@@ -26,11 +26,7 @@ from .solution import Solution
 
 def compiled(setup: Setup, ts: Any, options: Options) -> tuple[Solution, bool | jax.Array]:
     """Return the solution, and whether the run succeeded and reached all saved times."""
-    numbers, signature = flatten(
-        (setup.problem, setup.method, setup.vi_solver, setup.events),
-        (setup.x0, setup.args, setup.moduli, ts),
-        (options, tuple(setup.setting)),
-    )
+    numbers, signature = _flat(setup, ts, options)
     start, _clock.compiling = time.perf_counter(), 0.0
     try:
         arrays, reached, static = _run(numbers, pack(setup.setting), signature)
@@ -53,6 +49,20 @@ def compiled(setup: Setup, ts: Any, options: Options) -> tuple[Solution, bool | 
         spent = time.perf_counter() - start
         solution.stats.update(compile_time=compiling, run_time=spent - compiling)
     return solution, reached
+
+
+def compiled_text(setup: Setup, ts: Any, options: Options) -> str:
+    """Return the program that `compiled` runs, as the text of its HLO."""
+    numbers, signature = _flat(setup, ts, options)
+    return _run.lower(numbers, pack(setup.setting), signature).compile().as_text()
+
+
+def _flat(setup: Setup, ts: Any, options: Options) -> tuple[list[Any], Signature]:
+    return flatten(
+        (setup.problem, setup.method, setup.vi_solver, setup.events),
+        (setup.x0, setup.args, setup.moduli, ts),
+        (options, tuple(setup.setting)),
+    )
 
 
 class _Clock(threading.local):

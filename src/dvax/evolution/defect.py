@@ -187,11 +187,8 @@ def _kinked(flow: Flow, evaluations: list[Evaluation]) -> Any:
     if known[0] is None:
         return jnp.asarray(True)
 
-    def signs(one: Evaluation, switches: Any) -> list[jax.Array]:
-        u = flow.operator.inverse(one.rate.y)
-        found = [switches]
-        if flow.pointwise:
-            found = list(switches.reshape((-1, *one.x.shape)))
+    def signs(one: Evaluation, switches: list[jax.Array]) -> list[jax.Array]:
+        u, found = flow.operator.inverse(one.rate.y), list(switches)
         for fn in (problem.f, problem.h):
             found += branches(lambda t, x, u, fn=fn: fn(t, x, u, args), one.t, one.x, u)
         return [s > 0 for s in found]

@@ -168,24 +168,31 @@ class ExcursionGuard(eqx.Module):
         """Return the largest ratio of a deviation to the deviation that may change a sign."""
         if self.enclosed:
             with below_parabola():
-                dev = jax.vmap(lambda p, q: self._deviation(flow, p, q))(first, second)
+                devs = jax.vmap(lambda p, q: self._deviation(flow, p, q))(first, second)
         else:
-            dev = _SAMPLING_SAFETY * _sampled_deviation([place[0] for place in samples], rows)
-        s0, s1 = jnp.stack(rows[:-1]), jnp.stack(rows[1:])
-        changes = (s0 > 0) != (s1 > 0)
-        room = (jnp.sqrt(jnp.abs(s0)) + jnp.sqrt(jnp.abs(s1))) ** 2
-        room = jnp.where(changes, jnp.abs(s1 - s0), room)
-        ratio = jnp.where(dev <= 0.0, 0.0, 4.0 * dev / (room + ignored))
-        # With infinite distance from the switch no deviation changes the sign.
-        ratio = jnp.where(jnp.isinf(room), 0.0, ratio)
-        return jnp.max(ratio, initial=0.0)
+            times = [place[0] for place in samples]
+            devs = [
+                _SAMPLING_SAFETY * _sampled_deviation(times, list(values))
+                for values in zip(*rows, strict=True)
+            ]
+        ratios = []
+        for dev, values in zip(devs, zip(*rows, strict=True), strict=True):
+            s0, s1 = jnp.stack(values[:-1]), jnp.stack(values[1:])
+            changes = (s0 > 0) != (s1 > 0)
+            room = (jnp.sqrt(jnp.abs(s0)) + jnp.sqrt(jnp.abs(s1))) ** 2
+            room = jnp.where(changes, jnp.abs(s1 - s0), room)
+            ratio = jnp.where(dev <= 0.0, 0.0, 4.0 * dev / (room + ignored))
+            # With infinite distance from the switch no deviation changes the sign.
+            ratios.append(jnp.where(jnp.isinf(room), 0.0, ratio))
+        return _largest(ratios)
 
-    def _deviation(self, flow: Flow, p: tuple, q: tuple) -> Any:
+    def _deviation(self, flow: Flow, p: tuple, q: tuple) -> list[Any]:
         """Return bounds on the deviations of the switch functions from lines between two samples."""
         t = LinearEnclosure(p[0], q[0], jnp.zeros_like(p[0]))
         bend = _deviation_of_z(flow, t, p[1])
         z = jtu.tree_map(LinearEnclosure, p[3], q[3], bend)
-        return enclose(lambda t, z: _switches(flow, t, p[1], z), t, z).dev
+        found = enclose(lambda t, z: flow.switch_parts(t, p[1], z), t, z)
+        return [one.dev for one in found]
 
 
 def guard(flow: Flow, t0: Any, x0: Tree) -> ExcursionGuard | None:
@@ -217,12 +224,6 @@ def guard(flow: Flow, t0: Any, x0: Tree) -> ExcursionGuard | None:
     ):
         trial = dataclasses.replace(trial, enclosed=False)
     return trial if trial.switches or trial.rates or trial.laws else None
-
-
-def _switches(flow: Flow, t: Any, x: Tree, z: Tree) -> jax.Array:
-    switches = flow.switches(t, x, z)
-    assert switches is not None
-    return switches
 
 
 def _deviation_of_z(flow: Flow, t: LinearEnclosure, x: Tree) -> Tree:

@@ -47,7 +47,7 @@ class Rate(NamedTuple):
     residual: jax.Array
     solved: jax.Array
     evaluations: jax.Array
-    switches: jax.Array | None = None
+    switches: list[jax.Array] | None = None
 
 
 class Flow(eqx.Module):
@@ -176,19 +176,18 @@ class Flow(eqx.Module):
         u = enclose(P.inverse, y)
         return enclose(lambda t, x, u: problem.f(t, x, u, args), t, x, u), u
 
-    def switches_of(self, t: Any, x: Tree, rate: Rate) -> jax.Array | None:
-        """`switches` at (t, x), whose rate this is."""
-        return self.switches(t, x, rate.z) if rate.switches is None else rate.switches
+    def switches_of(self, t: Any, x: Tree, rate: Rate) -> list[jax.Array] | None:
+        """`switch_parts` at (t, x), whose rate this is."""
+        return self.switch_parts(t, x, rate.z) if rate.switches is None else rate.switches
+
+    def switch_parts(self, t: Any, x: Tree, z: Tree | None) -> list[jax.Array] | None:
+        """What changes its sign where the response has a kink; None where K does not say."""
+        return self.problem.set_at(t, self.args).switches(z, self.problem.spaces(x)[1])
 
     def switches(self, t: Any, x: Tree, z: Tree | None) -> jax.Array | None:
-        """What changes its sign where the response has a kink; None where K does not say."""
-        K, space = self.problem.set_at(t, self.args), self.problem.spaces(x)[1]
-        found = K.switches(z, space)
-        if found is None:
-            return None
-        return jnp.concatenate(
-            [jnp.zeros(0, jnp.result_type(*jtu.tree_leaves(z))), *map(jnp.ravel, found)]
-        )
+        """`switch_parts` as one vector. This gathers what is sharded over several devices."""
+        found = self.switch_parts(t, x, z)
+        return None if found is None else joined(found, jnp.result_type(*jtu.tree_leaves(z)))
 
     def masked_error(self, t: Any, x: Tree, rate: Rate, error: Tree) -> Tree:
         """How far f̃ may be off, entry by entry, because z may be off by ± `error`.
@@ -229,6 +228,11 @@ class Flow(eqx.Module):
         return self.problem.spaces(x)[0]
 
 
+def joined(parts: list[jax.Array], dtype: Any) -> jax.Array:
+    """Return arrays of any shapes as one vector."""
+    return jnp.concatenate([jnp.zeros(0, dtype), *map(jnp.ravel, parts)])
+
+
 @eqx.filter_jit
 def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
     """The law solved by iteration. A function of its own, so that it is traced once a program, however
@@ -245,7 +249,7 @@ def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
     answer = flow.solver.solve(vi, start, flow.tol)
     value = problem.f(t, x, flow.operator.inverse(answer.y), args)
     solved = answer.result == RESULTS.successful
-    switches = flow.switches(t, x, answer.z) if flow.keeps_switches else None
+    switches = flow.switch_parts(t, x, answer.z) if flow.keeps_switches else None
     return Rate(
         value, answer.y, answer.z, answer.residual, solved, answer.evaluations,
         jax.lax.stop_gradient(switches),

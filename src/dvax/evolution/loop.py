@@ -26,6 +26,9 @@ from .results import RESULTS
 from .stepper import Propagators, SolverState, Step, Stepper, interpolate, local
 from .time_derivatives import is_differentiated
 
+STEP = "dvax_step"
+"""The name of the operations of a step in the compiled program."""
+
 
 class State(NamedTuple):
     """Where the loop stands: after `steps` accepted ones of `attempts`.
@@ -213,6 +216,10 @@ class Loop(eqx.Module):
 
     def _attempt(self, state: State, own: Any) -> State:
         """The state after one more attempt, where that is its `own`."""
+        with jax.named_scope(STEP):
+            return self._attempt_in_scope(state, own)
+
+    def _attempt_in_scope(self, state: State, own: Any) -> State:
         t0, t1, x0 = state.t, self.controller.end(state.control), state.x
         propagators = state.propagators if self._refits(state) else self._propagators(state, t0, t1)
         step = self.stepper.step(t0, t1, x0, state.solver_state, propagators, state.jumped)

@@ -13,6 +13,8 @@ from .. import _tree, _user_code
 from .._jax.messages import is_reverse_only
 from .._tree import Tree
 from ..errors import DifferentiationError, InputError, InputProblem
+from ..generators import AbstractGenerator
+from ..generators.sharded import place
 from ..problem import Problem
 from ..vi import AbstractSolver, Auto
 from .arguments import (
@@ -191,6 +193,7 @@ def solve(
             piece, x0, float(t0), float(t1), np.asarray(ts, float), dt0, save, dt is not None, throw,
             progress,
         )  # fmt: skip
+    problem = _placed(problem, x0)
     fixed = dt is not None
     if not fixed:
         warn_precision(x0, rtol)
@@ -312,6 +315,35 @@ def _examined(setup: Setup, times: Any, options: Options, solution: Solution) ->
         solution, _ = compiled(setup, times, options._replace(check_finite=True))
         solution = _tree.primal(solution)
     return _trim(solution)
+
+
+def prepared(
+    problem: Problem, x0: Any, t0: Any, t1: Any, args: Any, ts: Any, *, dt: Any, rtol: Any, atol: Any,
+    method: AbstractMethod | None, dense: bool,
+) -> tuple[Setup, Any, Options]:  # fmt: skip
+    """Return what `solve` compiles for these arguments: the setup, the saved times and the options."""
+    x0, fixed = _state(problem, x0), dt is not None
+    check(problem, x0, t0, t1, ts, dt, rtol, atol, None, None, None, method, "reverse", None, dense)
+    problem, t0, t1 = _placed(problem, x0), _number(t0), _number(t1)
+    choice = Choice(method)
+    if method is None:
+        choice = choose(problem, x0, args, t1 - t0, float(max(rtol, atol)), fixed, False)
+    setup, options = arranged(
+        problem, x0, t0, t1, args, dt, rtol, atol, choice.method, None, False, None,
+        None, dense, None, None, None, bound_steps(None, fixed, t0, t1, dt), "reverse", (), 0,
+    )  # fmt: skip
+    if dense:
+        options = options._replace(max_steps=min(options.max_steps, _FIRST_ROOM))
+    watched = bool(choice.reason) and choice.fallback is not None
+    options = options._replace(watch_stiffness=watched)
+    return setup, None if ts is None else _times(ts), options
+
+
+def _placed(problem: Problem, x0: Tree) -> Problem:
+    """Return the problem whose generator transforms states that are sharded as x0 is."""
+    A = problem.A
+    placed = place(A, _tree.primal(x0)) if isinstance(A, AbstractGenerator) else A
+    return problem if placed is A else eqx.tree_at(lambda p: p.A, problem, placed)
 
 
 def _state(problem: Any, x0: Any) -> Tree:

@@ -21,7 +21,7 @@ from .bounds import Bounds
 from .defect import Sample, enclosed, sampled
 from .evaluations import Evaluation, Stages, evaluated
 from .excursions import ExcursionGuard
-from .flow import Flow, Rate
+from .flow import Flow, Rate, joined
 from .locate_event import locate_event
 from .method import AbstractMethod, shortened
 
@@ -396,7 +396,7 @@ class Stepper(eqx.Module):
         def switches(t: Any, rate: Rate) -> jax.Array:
             found = flow.switches_of(t, x0, rate)
             assert found is not None
-            return lax.stop_gradient(found)
+            return lax.stop_gradient(joined(found, _tree.dtype(rate.z)))
 
         def at(theta: Any) -> jax.Array:
             t = t0 + theta * (t1 - t0)

@@ -1,5 +1,6 @@
 """Diffusion, advection and reaction with constant coefficients on a box."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, SupportsIndex
 
@@ -7,12 +8,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import NamedSharding
 
 from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..spaces import AbstractSpace
 from .abstract import AbstractPropagator, FlowStep, Growth
+from .layout import Layout
 from .phi import flow_factors, phi_scalar
 from .scalar import elementwise_chord_deviation
 from .spectral_state import (
@@ -107,15 +110,28 @@ class Elliptic(AbstractModal):
     def apply(self, v: Tree) -> Tree:
         if self.stencil is not None:
             return self.stencil.apply(v)
-        return self.transform.backward(times(self.symbol, self.transform.forward(v)))
+        symbol = self.transform.place(self.symbol)
+        return self.transform.backward(times(symbol, self.transform.forward(v)))
 
     def expand(self, v: Tree, coefficients: Tree = None) -> SpectralState:
         return with_coefficients(v, coefficients, self.transform.forward)
 
     def propagator(self, h: Any, terms: int) -> "SpectralPropagator":
         h = jnp.asarray(h).astype(self.symbol.dtype)
-        factors = flow_factors(h, phi_scalar(h * self.symbol, terms))
+        symbol = self.transform.place(self.symbol)
+        factors = flow_factors(h, phi_scalar(h * symbol, terms))
         return SpectralPropagator(self.transform, factors)
+
+    def sharded(self, sharding: NamedSharding) -> "Elliptic":
+        """Return A for states with this sharding: before an axis is transformed, its shards move to
+        another axis by an all-to-all. On one axis each device transforms the whole state.
+
+        `dvax.solve` does this by itself, unless A is a function of `args`."""
+        layout = Layout.of(sharding, len(self.transform.shape))
+        transform = dataclasses.replace(self.transform, layout=layout)
+        return eqx.tree_at(
+            lambda A: A.transform, self, transform, is_leaf=lambda v: isinstance(v, Transform)
+        )
 
     def check(self, space: AbstractSpace) -> None:
         _tree.fits(
@@ -145,20 +161,21 @@ class Elliptic(AbstractModal):
     def chord_deviation(self, step: FlowStep, space: AbstractSpace, growth: Growth) -> Tree:
         # Bound each coefficient; eigenfunctions are at most 1 in absolute value.
         h, x0, x1, c = step
+        symbol = self.transform.place(self.symbol)
         parts = [coefficients_of(v, self.transform.forward) for v in (x0, x1, *c)]
         if jnp.iscomplexobj(self.symbol):
             start, _, constant, *linear = parts
             slope = times(1.0 / h, linear[0]) if linear else jnp.zeros_like(constant)
-            curvature = jnp.abs(self.symbol * (self.symbol * start + constant) + slope)
-            amplification = jnp.exp(jnp.maximum(jnp.real(self.symbol), 0.0) * h)
+            curvature = jnp.abs(symbol * (symbol * start + constant) + slope)
+            amplification = jnp.exp(jnp.maximum(jnp.real(symbol), 0.0) * h)
             bounds = h**2 / 8 * amplification * curvature
         else:
 
             def bound(*parts: jax.Array) -> jax.Array:
-                return elementwise_chord_deviation(self.symbol, h, *parts)
+                return elementwise_chord_deviation(symbol, h, *parts)
 
             bounds = _bound_complex(bound, parts)
-        amplitudes = self.transform.amplitudes().astype(bounds.dtype)
+        amplitudes = self.transform.place(self.transform.amplitudes()).astype(bounds.dtype)
         return jnp.broadcast_to(jnp.sum(amplitudes * bounds), self.transform.shape)
 
 

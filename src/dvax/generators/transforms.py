@@ -19,6 +19,7 @@ single short axis is transformed by a product with a dense matrix.
 """
 
 import functools
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -26,6 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .layout import WHOLE, Layout, Move, padded
 from .line import dct, idct, irfft, rfft
 
 _MAX_DENSE_POINTS = 128
@@ -43,6 +45,7 @@ class Transform(eqx.Module):
 
     shape: tuple[int, ...] = eqx.field(static=True)
     boundary: tuple[str, ...] = eqx.field(static=True)
+    layout: Layout | None = eqx.field(static=True, default=None)
 
     @property
     def half(self) -> int:
@@ -81,6 +84,79 @@ class Transform(eqx.Module):
 
     def forward(self, x: jax.Array) -> jax.Array:
         """Return the coefficients of x."""
+        if self.layout is None:
+            return self._forward(x)
+        if len(self.shape) == 1:
+            return self.layout.locally(self._forward, x, WHOLE)
+        for move in self._moves():
+            x = padded(x, move.shape)
+            x = self.layout.locally(partial(self._forward_along, axis=move.axis), x, move.spec)
+        return x
+
+    def backward(self, c: jax.Array) -> jax.Array:
+        """Return the array with these coefficients."""
+        if self.layout is None:
+            return self._backward(c)
+        if len(self.shape) == 1:
+            return self.layout.constrain(self.layout.locally(self._backward, c, WHOLE))
+        for move in reversed(self._moves()):
+            c = self.layout.locally(partial(self._backward_along, axis=move.axis), c, move.spec)
+            c = self.layout.constrain(c, move.old_spec)
+            c = jax.lax.slice(c, (0,) * c.ndim, move.old_shape)
+        return c
+
+    def place(self, c: jax.Array) -> jax.Array:
+        """Return factors of the coefficients in the layout in which `forward` returns these: padded by
+        zeros to a multiple of the shards."""
+        if self.layout is None:
+            return c
+        if len(self.shape) == 1:
+            return self.layout.constrain(c, WHOLE)
+        last = self._moves()[-1]
+        shape = list(last.shape)
+        shape[last.axis] = c.shape[last.axis]
+        return self.layout.constrain(padded(c, tuple(shape)), last.spec)
+
+    def _moves(self) -> list[Move]:
+        """Return the moves of the shards, one for each axis in the order in which they are transformed:
+        of several axes those on one device first."""
+        layout = self.layout
+        assert layout is not None
+        axes = sorted(range(len(self.shape)), key=lambda k: bool(layout.spec[k]))
+        if not self.real:
+            # The real Fourier transform comes before the complex ones.
+            first = min(axes.index(k) for k, v in enumerate(self.boundary) if v == "periodic")
+            axes.remove(self.half)
+            axes.insert(first, self.half)
+        half = {} if self.real else {self.half: self.shape[self.half] // 2 + 1}
+        return layout.moves(self.shape, [(k, half.get(k, self.shape[k])) for k in axes])
+
+    def _forward_along(self, x: jax.Array, axis: int) -> jax.Array:
+        """Return the coefficients along one axis, real for real x unless the axis is periodic."""
+        kind = self.boundary[axis]
+        if kind == "periodic":
+            return (jnp.fft.rfft if axis == self.half else jnp.fft.fft)(x, axis=axis)
+        x = _fold(x, axis, kind)
+        if jnp.iscomplexobj(x):
+            F = jnp.fft.fft(x, axis=axis)
+            a = self._phase_factors(axis, F.dtype)
+            return a * F + jnp.conj(a) * _reflect(F, axis, F)
+        return self._cosines(jnp.fft.rfft(x, axis=axis), axis)
+
+    def _backward_along(self, c: jax.Array, axis: int) -> jax.Array:
+        """Return the array with these coefficients along one axis."""
+        kind, n = self.boundary[axis], self.shape[axis]
+        if kind == "periodic":
+            is_half = axis == self.half
+            return jnp.fft.irfft(c, n, axis) if is_half else jnp.fft.ifft(c, axis=axis)
+        if jnp.iscomplexobj(c):
+            a = jnp.conj(self._phase_factors(axis, c.dtype))
+            x = jnp.fft.ifft(0.5 * a * (c - 1j * _reflect(c, axis, None)), axis=axis)
+        else:
+            x = jnp.fft.irfft(self._of_cosines(c, axis), n, axis)
+        return _unfold(x, axis, kind)
+
+    def _forward(self, x: jax.Array) -> jax.Array:
         if self._uses_matrix():
             return _product(_matrices(self.shape[0], self.boundary[0])[0], x)
         if self._is_line():
@@ -94,27 +170,31 @@ class Transform(eqx.Module):
                 F = a * F + jnp.conj(a) * _reflect(F, axis, F)
         if not self.real:
             return F
-        n, axis = self.shape[self.half], self.half
+        return self._cosines(F, self.half)
+
+    def _cosines(self, F: jax.Array, axis: int) -> jax.Array:
+        """Return the real coefficients along an axis from the real Fourier transform of the folded
+        array."""
+        n = self.shape[axis]
         W = self._phase_factors(axis, F.dtype, n // 2 + 1) * F
         imaginary = jax.lax.slice_in_dim(jnp.imag(W), 1, (n + 1) // 2, axis=axis)
         return 2.0 * jnp.concatenate([jnp.real(W), -jnp.flip(imaginary, axis)], axis)
 
-    def backward(self, c: jax.Array) -> jax.Array:
-        """Return the array with these coefficients."""
+    def _of_cosines(self, c: jax.Array, axis: int) -> jax.Array:
+        """Return F with `_cosines(F, axis)` = c."""
+        n = self.shape[axis]
+        low = jax.lax.slice_in_dim(c, 0, n // 2 + 1, axis=axis)
+        high = jnp.flip(jax.lax.slice_in_dim(c, n - n // 2, n, axis=axis), axis)
+        zero = jnp.zeros_like(jax.lax.slice_in_dim(low, 0, 1, axis=axis))
+        F = jax.lax.complex(low, -jnp.concatenate([zero, high], axis))
+        return 0.5 * jnp.conj(self._phase_factors(axis, F.dtype, n // 2 + 1)) * F
+
+    def _backward(self, c: jax.Array) -> jax.Array:
         if self._uses_matrix():
             return _product(_matrices(self.shape[0], self.boundary[0])[1], c)
         if self._is_line():
             return irfft(c) if not self.real else idct(c, self._sign())
-        if self.real:
-            n, axis = self.shape[self.half], self.half
-            low = jax.lax.slice_in_dim(c, 0, n // 2 + 1, axis=axis)
-            high = jnp.flip(jax.lax.slice_in_dim(c, n - n // 2, n, axis=axis), axis)
-            zero = jnp.zeros_like(jax.lax.slice_in_dim(low, 0, 1, axis=axis))
-            high = jnp.concatenate([zero, high], axis)
-            F = jax.lax.complex(low, -high)
-            F = 0.5 * jnp.conj(self._phase_factors(axis, F.dtype, n // 2 + 1)) * F
-        else:
-            F = c
+        F = self._of_cosines(c, self.half) if self.real else c
         for axis in self._folded():
             if axis != self.half:
                 a = jnp.conj(self._phase_factors(axis, F.dtype))

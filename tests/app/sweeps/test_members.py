@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dvax.app.runs.config import parse
 from dvax.app.runs.sweeps.members import parameters
 from dvax.app.runs.sweeps.sweep import _checked
+from dvax.app.runs.toml_file import read_toml
 from dvax.errors import InputError
 
 
 def members(folder, text):
     file = folder / "sweep.toml"
     file.write_text('config = "model.toml"\n' + text)
-    found = parameters(_checked(parse(file), file.name), file, False)
+    found = parameters(_checked(read_toml(file), file.name), file, False)
     return {p.key: p for p in found}
 
 

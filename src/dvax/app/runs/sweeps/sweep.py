@@ -12,13 +12,14 @@ from typing import Any
 from pydantic import ValidationError
 
 from dvax.app.runs.applications.config import ModelConfig, check_config
-from dvax.app.runs.config import Config, parse
+from dvax.app.runs.config import Config
 from dvax.app.runs.data_file import locate
 from dvax.app.runs.provenance import provenance
 from dvax.app.runs.schema_errors import translate, unknown_key
 from dvax.app.runs.sweeps.members import parameters
 from dvax.app.runs.sweeps.parameters import Parameter
 from dvax.app.runs.sweeps.schema import SweepFile
+from dvax.app.runs.toml_file import read_toml
 from dvax.errors import InputError, Problems, input_error
 
 
@@ -116,11 +117,11 @@ def read_sweep(path: str | Path, *, allow_outside: bool = False, allow_code: boo
     **Raises:** `dvax.InputError` with all problems found.
     """
     source = Path(path)
-    raw = parse(source)
+    raw = read_toml(source)
     table = _checked(raw, source.name)
     base = locate(table.config, source.parent, allow_outside, f"{source.name}: config")
     found = tuple(parameters(table, source, allow_outside))
-    sweep = Sweep(table, source, base, parse(base), found, allow_outside, allow_code)
+    sweep = Sweep(table, source, base, read_toml(base), found, allow_outside, allow_code)
     problems = Problems()
     for member in dict.fromkeys((0, sweep.count - 1)):
         try:
