@@ -64,7 +64,7 @@ def _map(data: Mapping[str, Variable]) -> Picture:
             hovertemplate="%{z:.4g} degC at (%{x:.3g}, %{y:.3g}) m<extra></extra>",
         )
     )  # fmt: skip
-    figure.update_xaxes(title_text="x [m]")
+    figure.update_xaxes(title_text="x [m]", constrain="domain")
     figure.update_yaxes(title_text="y [m]", scaleanchor="x")
 
     def still() -> Figure:

@@ -67,11 +67,12 @@ def _cylinder(data: Mapping[str, Variable]) -> Picture:
     radius = np.sqrt(2 / 3) * data["yield_limit"].values[0]
     angle = np.linspace(0.0, 2 * np.pi, 200)
     circle = Curve(radius * np.cos(angle), radius * np.sin(angle), "yield surface", None, "dash")
+    path = Curve(along[:, 0], along[:, 1], "stress path", 3)
     picture = panels_picture(
         "yield_surface", "The stress path and the yield surface",
         "The plane of the two largest directions of the deviatoric stress. The yield surface is a "
         "circle in it; the distance to the circle is the overstress.",
-        [Panel([Curve(*along.T, "stress path", 3), circle], "second direction", "MPa", share=2.0)],
+        [Panel([path, circle], "second direction", "MPa", share=2.0)],
         "deviatoric stress, first direction", "MPa",
     )  # fmt: skip
     picture.interactive.update_yaxes(scaleanchor="x")

@@ -73,7 +73,8 @@ class ModelConfig:
 
     def fingerprints(self) -> list[DataFile]:
         """Size and SHA-256 of every data file."""
-        return [fingerprint(path.name, path) for _, path in self.data_files()]
+        files = dict.fromkeys(path for _, path in self.data_files())
+        return [fingerprint(path.name, path) for path in files]
 
     def tree(self) -> dict[str, Any]:
         """All settings as a TOML file has them."""
