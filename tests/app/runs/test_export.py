@@ -228,6 +228,16 @@ def test_blocks_of_rows_do_not_change_a_file(strip, tmp_path, monkeypatch, forma
         assert a.equals(b)
 
 
+def test_block_of_a_table_is_as_long_as_a_chunk_of_its_widest_variable(tmp_path, monkeypatch):
+    """A series in one chunk does not make a block of all frames."""
+    group = zarr.open_group(tmp_path / "a.zarr", mode="w", zarr_format=3)
+    wide = group.create_array("x", shape=(100, 50), chunks=(4, 50), dtype="f8")
+    long = group.create_array("t", shape=(100,), chunks=(100,), dtype="f8")
+    monkeypatch.setattr(selection, "_BLOCK_BYTES", 10 * 51 * 8)
+    found = list(selection.blocks([Variable(long, None), Variable(wide, None)], 100))
+    assert found[0] == slice(0, 12) and found[-1] == slice(96, 100)
+
+
 def test_incomplete_frames_are_left_out_and_named(tmp_path):
     """A killed run: the time of a frame is NaN until the frame is complete."""
     run = write_run(tmp_path / "run", Recipe((7,), frames=6, status="running"))

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -123,8 +123,10 @@ def _cache() -> Row:
     """Where compiled programs are kept, with their number and the space left."""
     import jax
 
-    if not jax.config.jax_enable_compilation_cache:
+    # The type of jax.config does not list its options.
+    config: Any = jax.config
+    if not config.jax_enable_compilation_cache:
         return ("compiled programs", "not kept", "JAX_ENABLE_COMPILATION_CACHE is off")
-    path = Path(jax.config.jax_compilation_cache_dir or cache_folder())
+    path = Path(config.jax_compilation_cache_dir or cache_folder())
     count = sum(file.is_file() for file in path.iterdir()) if path.is_dir() else 0
     return ("compiled programs", str(path), f"{count} files, {_free(path)}")

@@ -14,4 +14,4 @@ from dvax._lazy import lazy_names
 if TYPE_CHECKING:
     from dvax.app.plots.report import build_report as build_report
 
-__all__, __getattr__, __dir__ = lazy_names(__name__, {"report": ("build_report",)})  # pyright: ignore[reportUnsupportedDunderAll]
+__all__, __getattr__, __dir__ = lazy_names(__name__, {"report": ("build_report",)})

@@ -56,11 +56,11 @@ def _writer(selection: Selection, table: Table) -> Any:
             index = [table.dim] if table.has_index else []
             writer.writerow([*index, *(h for n in table.names for h in _heads(selection, n))])
             for block, values in table.blocks(selection):
-                columns = [_cells(v) for v in values.values()]
-                if table.has_index:
-                    columns.insert(0, [[k] for k in range(block.start, block.stop)])
-                for row in zip(*columns, strict=True):
-                    writer.writerow([cell for cells in row for cell in cells])
+                for k in range(block.stop - block.start):
+                    row = [block.start + k] if table.has_index else []
+                    writer.writerow(
+                        [*row, *(cell for v in values.values() for cell in _cells(v[k]))]
+                    )
 
     return write
 
@@ -75,11 +75,11 @@ def _heads(selection: Selection, name: str) -> list[str]:
     return [f"{name}[{','.join(map(str, index))}]{bracket}" for index in np.ndindex(*shape)]
 
 
-def _cells(values: np.ndarray) -> list[list[Any]]:
-    """Return rows of cells: numbers with all their digits, NaN as an empty cell."""
+def _cells(values: np.ndarray) -> list[Any]:
+    """Return the cells of a row: numbers with all their digits, NaN as an empty cell."""
     if values.dtype.kind != "f" or not np.isnan(values).any():
         return values.tolist()
-    return [["" if v != v else v for v in row] for row in values.tolist()]
+    return ["" if v != v else v for v in values.tolist()]
 
 
 def _entries(shape: Sequence[int]) -> int:

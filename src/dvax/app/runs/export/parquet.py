@@ -43,7 +43,7 @@ def _writer(selection: Selection, table: Table) -> Any:
 
     def write(path: Path) -> None:
         schema = _schema(selection, table)
-        with parquet.ParquetWriter(path, schema) as writer:
+        with parquet.ParquetWriter(path, schema, use_dictionary=False) as writer:
             for block, values in table.blocks(selection):
                 columns = {n: _column(v, selection.variables[n].shape) for n, v in values.items()}
                 if table.has_index:

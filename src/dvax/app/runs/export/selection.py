@@ -84,10 +84,12 @@ def select(directory: Path, names: Sequence[str] | None = None) -> Selection:
 
 def blocks(variables: Sequence[Variable], rows: int) -> Iterator[slice]:
     """Return slices of the first axis whose values fit into `_BLOCK_BYTES`, in whole chunks of the
-    store: a part of a chunk costs as much to read as the whole."""
-    of_row = sum(v.dtype.itemsize * int(np.prod(v.shape[1:])) for v in variables)
-    chunk = max((v.frames_per_chunk for v in variables), default=1)
-    step = -(-max(1, _BLOCK_BYTES // max(of_row, 1)) // chunk) * chunk
+    widest variable: a part of a chunk costs as much to read as the whole."""
+    of_row = [v.dtype.itemsize * int(np.prod(v.shape[1:])) for v in variables]
+    # A series may lie in one chunk, which says nothing about the fields.
+    widest = variables[int(np.argmax(of_row))]
+    chunk = widest.frames_per_chunk
+    step = -(-max(1, _BLOCK_BYTES // max(sum(of_row), 1)) // chunk) * chunk
     for start in range(0, rows, step):
         yield slice(start, min(start + step, rows))
 
