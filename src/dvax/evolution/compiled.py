@@ -54,7 +54,9 @@ def compiled(setup: Setup, ts: Any, options: Options) -> tuple[Solution, bool | 
 def compiled_text(setup: Setup, ts: Any, options: Options) -> str:
     """Return the program that `compiled` runs, as the text of its HLO."""
     numbers, signature = _flat(setup, ts, options)
-    return _run.lower(numbers, pack(setup.setting), signature).compile().as_text()
+    text = _run.lower(numbers, pack(setup.setting), signature).compile().as_text()
+    assert text is not None
+    return text
 
 
 def _flat(setup: Setup, ts: Any, options: Options) -> tuple[list[Any], Signature]:

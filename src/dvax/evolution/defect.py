@@ -194,7 +194,7 @@ def _kinked(flow: Flow, evaluations: list[Evaluation]) -> Any:
         return [s > 0 for s in found]
 
     kinked = jnp.asarray(False)
-    rows = list(map(signs, evaluations, known))
+    rows = [signs(one, s) for one, s in zip(evaluations, known, strict=True) if s is not None]
     for series in zip(*rows, strict=True):
         stacked = jnp.stack(series)
         changed = jnp.any(stacked[1:] != stacked[:-1], axis=0)

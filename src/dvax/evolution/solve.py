@@ -180,14 +180,14 @@ def solve(
     )  # fmt: skip
     _user_code.check_args(args, "dvax.solve")
     if save is not None:
-        options: dict[str, Any] = dict(
+        same: dict[str, Any] = dict(
             dt=dt, rtol=rtol, atol=atol, method=method, vi_solver=vi_solver, constants=constants,
             measure=measure, dt_max=dt_max, max_steps=max_steps, adjoint=adjoint, throw=False,
             horizon=t1 - t0 if horizon is None else horizon,
         )  # fmt: skip
 
         def piece(x: Tree, start: float, end: float, times: np.ndarray, step: Any) -> Solution:
-            return solve(problem, x, start, end, args, times, dt0=step, **options)
+            return solve(problem, x, start, end, args, times, dt0=step, **same)
 
         return stream(
             piece, x0, float(t0), float(t1), np.asarray(ts, float), dt0, save, dt is not None, throw,

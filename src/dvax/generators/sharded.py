@@ -18,5 +18,7 @@ def place(A: AbstractGenerator, x: Tree) -> AbstractGenerator:
         return A if same else Product(*parts)
     if not isinstance(A, Elliptic) or not isinstance(x, jax.Array) or not _tree.is_concrete(x):
         return A
-    is_sharded = isinstance(x.sharding, NamedSharding) and len(x.sharding.device_set) > 1
-    return A.sharded(x.sharding) if is_sharded and x.shape == A.transform.shape else A
+    sharding = x.sharding
+    if not isinstance(sharding, NamedSharding) or len(sharding.device_set) == 1:
+        return A
+    return A.sharded(sharding) if x.shape == A.transform.shape else A

@@ -7,12 +7,11 @@ from typing import Annotated, Any
 import typer
 
 from dvax.app.cli import machine
-from dvax.app.cli.cache import cache_folder
 from dvax.app.cli.console import print_error, print_line, print_table
 from dvax.app.cli.failure import SOLVER_FAILED, reported
 from dvax.app.cli.options import Debug
 from dvax.app.cli.selftest import ALLOWED, END, self_test
-from dvax.app.runs.compilation_cache import enable_double
+from dvax.app.runs.compilation_cache import cache_folder, enable_double
 
 Row = tuple[str, str, str]
 
