@@ -71,6 +71,7 @@ def test_progress_counts_the_steps_of_all_pieces(tmp_path, capfd):
     assert len(lines) == 13 and f"100%, {int(end.stats['steps'])} steps" in lines[-1]
 
 
+@pytest.mark.thorough
 def test_bound_of_the_end_holds_for_the_whole_run(tmp_path):
     found = dvax.verify(PROBLEM, -1.0, 0.0, END).constants
     options = dict(constants=found, method=dvax.ETD2RK(), rtol=1e-4, atol=1e-4)
@@ -91,6 +92,7 @@ def test_last_piece_that_is_not_full_and_an_end_behind_the_last_row(tmp_path):
     assert float(end.stats["t"]) == END and float(end.ts[0]) == 4.0
 
 
+@pytest.mark.thorough
 def test_tuple_state_and_single_row(tmp_path):
     pair = dvax.Problem(
         A=dvax.generators.Product(dvax.generators.Scalar(-1.0), dvax.generators.Scalar(-2.0)),
@@ -180,6 +182,7 @@ dvax.solve(PROBLEM, -1.0, 0.0, END, ts=TIMES, save=Killing({path!r}))
 """
 
 
+@pytest.mark.thorough
 def test_store_of_a_killed_run_opens_with_its_complete_rows(whole, tmp_path):
     path = tmp_path / "run.zarr"
     code = KILLED.format(folder=str(Path(__file__).parent), path=str(path))

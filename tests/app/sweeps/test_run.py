@@ -1,4 +1,4 @@
-"""A sweep on two workers: results, failures, records, the report, and what a second call runs."""
+"""A sweep on a worker: results, failures, records, the report, and what a second call runs."""
 
 import json
 import shutil
@@ -14,7 +14,7 @@ from dvax.app.cli.program import app
 from dvax.app.plots.report import build_report
 from dvax.app.runs.sweeps import driver
 from dvax.app.runs.sweeps.driver import run_sweep
-from dvax.app.runs.sweeps.member import run_member
+from dvax.app.runs.sweeps.member import create_store, run_member
 from dvax.app.runs.sweeps.records import read_record
 from dvax.app.runs.sweeps.store import NAME
 from dvax.app.runs.sweeps.sweep import read_sweep
@@ -53,7 +53,8 @@ def events():
 @pytest.fixture(scope="module")
 def outcome(sweep, events, tmp_path_factory):
     out = tmp_path_factory.mktemp("sweep") / "out"
-    return run_sweep(sweep, out, workers=2, tell=events.append)
+    # One worker, since each compiles the program; two run in the tests of kills.
+    return run_sweep(sweep, out, workers=1, tell=events.append)
 
 
 @pytest.fixture
@@ -188,3 +189,16 @@ def test_command_line_of_members(sweep, outcome, copy, tmp_path):
     assert refused.exit_code == 2 and "--allow-code" in refused.stderr
     wrong = CliRunner().invoke(app, ["run", file, "-o", str(tmp_path / "none")])
     assert wrong.exit_code == 2 and "dvax sweep" in wrong.stderr
+
+
+def test_unknown_variable_is_named_with_the_known_ones(sweep, copy, tmp_path):
+    shutil.rmtree(copy / NAME)
+    (copy / "members" / "000001.json").unlink()
+    assert run_member(sweep, copy, 1)["status"] == "solved"  # it waits for a store
+    text = SWEEP + '[output]\nvariables = ["dept"]\n'
+    other = read_sweep(written(tmp_path / "other", text), allow_code=True)
+    with pytest.raises(dvax.InputError, match="'dept'.*depth, error_bound, force, time"):
+        create_store(other, copy, 1)
+    create_store(sweep, copy, 1)
+    assert run_member(sweep, copy, 1)["status"] == "finished"
+    assert np.isfinite(values(copy)["depth"][1]).all()

@@ -32,8 +32,17 @@ def create(
     attributes: Mapping[str, Any],
 ) -> None:
     """Write an empty store for results like these, of all members; of the trajectory `variables`, by
-    default all."""
+    default all.
+
+    **Raises:** `dvax.InputError` if there is no such variable.
+    """
     count = len(parameters[0].values)
+    for name in variables or ():
+        if name not in results.arrays:
+            raise input_error(
+                "output.variables", repr(name), f"a run has {', '.join(sorted(results.arrays))}",
+                "Correct the name, and pass --resume to go on",
+            )  # fmt: skip
     coordinates: dict[str, Array] = {}
     for p in parameters:
         about = {"long_name": p.key, **({"units": p.unit} if p.unit else {})}

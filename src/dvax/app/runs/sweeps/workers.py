@@ -2,7 +2,7 @@
 
 import os
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,10 @@ from typing import Any
 from dvax.app.runs.sweeps.records import read_record, write_record
 from dvax.errors import input_error
 
+_PROGRAMS = 50
+"""Members that compiled, after which their programs are dropped."""
+
+_compiled = 0
 _sweeps: dict[tuple[Any, ...], Any] = {}
 
 
@@ -27,7 +31,21 @@ def run_task(
         enable_compilation_cache()
         _sweeps.clear()
         _sweeps[key] = read_sweep(source, allow_outside=allow_outside, allow_code=allow_code)
-    return run_member(_sweeps[key], Path(directory), member)
+    record = run_member(_sweeps[key], Path(directory), member)
+    _drop_programs(record)
+    return record
+
+
+def _drop_programs(record: Mapping[str, Any]) -> None:
+    """Drop the compiled programs of this process from time to time, if each member has others: they
+    would take all memory."""
+    global _compiled
+    import jax
+
+    _compiled += record.get("compile_seconds", 0.0) > 0.5
+    if _compiled >= _PROGRAMS:
+        _compiled = 0
+        jax.clear_caches()
 
 
 @contextmanager
