@@ -51,7 +51,7 @@ def test_rows_are_those_of_a_run_without_a_store(whole, tmp_path):
     store = dvax.ZarrStore(tmp_path / "run.zarr")
     end = dvax.solve(PROBLEM, -1.0, 0.0, END, ts=TIMES, rtol=1e-8, save=store)
     data = rows(store.path)
-    assert store.written == ROWS and np.array_equal(data["time"], TIMES)
+    assert store.complete_rows == ROWS and np.array_equal(data["time"], TIMES)
     assert set(data) == {"time", *whole.to_xarray().data_vars}
     for name, reference in (("x", whole.xs), ("u", whole.us), ("y", whole.ys)):
         np.testing.assert_allclose(data[name], reference, atol=1e-6, err_msg=name)
@@ -88,7 +88,7 @@ def test_last_piece_that_is_not_full_and_an_end_behind_the_last_row(tmp_path):
     times = np.linspace(0.5, 4.0, 19)
     store = dvax.ZarrStore(tmp_path / "run.zarr")
     end = dvax.solve(PROBLEM, -1.0, 0.0, END, ts=times, save=store)
-    assert store.written == 19 and np.array_equal(rows(store.path)["time"], times)
+    assert store.complete_rows == 19 and np.array_equal(rows(store.path)["time"], times)
     assert float(end.stats["t"]) == END and float(end.ts[0]) == 4.0
 
 
@@ -112,7 +112,7 @@ def test_failed_run_keeps_the_rows_that_it_reached(tmp_path):
     with pytest.raises(dvax.SolveError) as caught:
         dvax.solve(GROWING, 2.0, 0.0, END, ts=TIMES, save=store)
     data = rows(store.path)
-    assert 0 < store.written < ROWS and len(data["time"]) == store.written
+    assert 0 < store.complete_rows < ROWS and len(data["time"]) == store.complete_rows
     assert np.isfinite(data["x"]).all() and "infinite" not in str(data["time"][-1])
     assert isinstance(caught.value.solution, dvax.Solution)
     quiet = dvax.solve(
@@ -176,7 +176,7 @@ from test_streaming import PROBLEM, TIMES, END
 class Killing(dvax.ZarrStore):
     def write(self, rows):
         super().write(rows)
-        if self.written >= 40:
+        if self.complete_rows >= 40:
             os.kill(os.getpid(), 9)
 dvax.solve(PROBLEM, -1.0, 0.0, END, ts=TIMES, save=Killing({path!r}))
 """

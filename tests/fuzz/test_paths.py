@@ -1,6 +1,7 @@
 """A configuration reads files in its own folder alone, and runs no code, unless it is allowed to."""
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -29,9 +30,45 @@ KEYS = {
 }
 
 
+EXAMPLES = Path(__file__).parents[2] / "examples" / "configurations"
+MATRICES = {
+    "A": "0, 0, 1, 0\n0, 0, 0, 1\n-2, 1, -0.5, 0\n1, -2, 0, -0.5\n", "B": "0\n0\n1\n0\n",
+    "Q": "1, 10, 0.1, 0.1\n", "R": "1\n",
+}  # fmt: skip
+
+
+def _examples() -> dict[str, tuple[str, str, str]]:
+    """The same for the example configurations, whose keys may hold numbers in the place of a name."""
+    found: dict[str, tuple[str, str, str]] = {}
+    for name in ("heated_floor", "steel_cycles", "two_masses"):
+        text = (EXAMPLES / f"{name}.toml").read_text(encoding="utf-8")
+        for line in text.splitlines():
+            key, _, value = line.partition(" = ")
+            if value.endswith('.csv"'):
+                found[f"model.{key}"] = (text, line, value.strip('"'))
+            elif key in MATRICES:
+                named = f'{key} = "{key}.csv"'
+                found[f"model.{key}"] = (text.replace(line, named), named, f"{key}.csv")
+    text, line, name = found["model.reference"]
+    found["model.disturbance"] = (
+        f'{text}disturbance = "push.csv"\n',
+        'disturbance = "push.csv"',
+        "push.csv",
+    )
+    return found
+
+
+KEYS |= _examples()
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    return seeds.write_folder(tmp_path)
+    inside = seeds.write_folder(tmp_path)
+    for file in EXAMPLES.glob("*.csv"):
+        shutil.copy(file, inside)
+    for name, text in MATRICES.items():
+        (inside / f"{name}.csv").write_text(text)
+    return inside
 
 
 def test_every_key_that_names_a_file_is_tested() -> None:
@@ -43,7 +80,9 @@ def test_every_key_that_names_a_file_is_tested() -> None:
             assert f"model.{key}" in KEYS
 
 
-@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize(
+    "key", [pytest.param(k, marks=pytest.mark.thorough if k in _examples() else ()) for k in KEYS]
+)
 def test_files_outside_the_folder_are_refused_unless_allowed(key: str, folder: Path) -> None:
     if key == "model.mesh":
         pytest.importorskip("skfem")

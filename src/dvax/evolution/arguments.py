@@ -195,7 +195,7 @@ def _not_finite(x0: Any) -> list[InputProblem]:
 
 def _has_explicit_axes(leaf: Any) -> bool:
     """Return whether a concrete array is sharded over axes whose sharding is a part of its type."""
-    sharding = leaf.sharding if _tree.is_concrete(leaf) else None
+    sharding = getattr(leaf, "sharding", None) if _tree.is_concrete(leaf) else None
     if not isinstance(sharding, NamedSharding):
         return False
     return AxisType.Explicit in sharding.mesh.axis_types

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.experimental import io_callback
 
 from .._batch import any_lane, largest_of_lanes
+from .._jax.callbacks import io_callback
 
 _LINE = 20
 """Thousandths of a run between two lines."""

@@ -49,7 +49,7 @@ class ZarrStore:
         import zarr  # noqa: F401
 
         self.path = Path(path)
-        self.written = 0
+        self.complete_rows = 0
         """The number of complete rows."""
         self._overwrite = overwrite
         self._arrays: dict[str, Any] = {}
@@ -64,26 +64,26 @@ class ZarrStore:
                 )
             )  # fmt: skip
         shutil.rmtree(self.path, ignore_errors=True)
-        self.written, self._count, self._arrays = 0, count, {}
+        self.complete_rows, self._count, self._arrays = 0, count, {}
 
     def write(self, rows: Solution) -> None:
         """Append the rows of a solution; their times are written last. **Raises:** `OSError`."""
         data = rows.to_xarray()
         if not self._arrays:
             self._create(data)
-        region = slice(self.written, self.written + data.sizes["time"])
+        region = slice(self.complete_rows, self.complete_rows + data.sizes["time"])
         for name in (*data.data_vars, "time"):
             self._arrays[str(name)][region] = data[name].values
-        self.written = region.stop
-        consolidate(self.path, self.written)
+        self.complete_rows = region.stop
+        consolidate(self.path, self.complete_rows)
 
     def finish(self) -> None:
         """Cut off the rows that were not reached."""
         for array in self._arrays.values():
-            if array.shape[0] != self.written:
-                array.resize((self.written, *array.shape[1:]))
+            if array.shape[0] != self.complete_rows:
+                array.resize((self.complete_rows, *array.shape[1:]))
         if self._arrays:
-            consolidate(self.path, self.written)
+            consolidate(self.path, self.complete_rows)
 
     def _create(self, data: Any) -> None:
         import zarr

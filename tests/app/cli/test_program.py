@@ -49,7 +49,6 @@ def test_program_lists_its_commands() -> None:
     shown = CliRunner().invoke(app, ["--help"]).output
     for command in ("new", "check", "run", "resume", "report", "export", "demo", "doctor"):
         assert f"\n  {command} " in shown
-    assert "\n  sweep " not in shown
 
 
 def test_version_option_prints_the_package_version() -> None:

@@ -100,7 +100,7 @@ def _import() -> None:
 
 def _import_plots() -> None:
     with suppress(Exception):  # an import that fails is reported where the report is made
-        import dvax.app.plots  # noqa: F401
+        import dvax.app.plots.report  # noqa: F401
 
 
 def _report(outcome: "RunOutcome", png: bool, quiet: bool) -> None:
