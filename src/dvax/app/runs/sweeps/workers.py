@@ -87,8 +87,10 @@ def cluster(address: str | None, workers: int, threads: int) -> Iterator[Any]:
             "distributed.comm.timeouts.tcp": "1 day",
         }),
         LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="",
-            memory_limit=None, local_directory=folder, silence_logs=50,
+            n_workers=workers, threads_per_worker=1, processes=True, memory_limit=None,
+            local_directory=folder, silence_logs=50,
+            # Any free port, since the usual one may be that of another cluster here.
+            dashboard_address="127.0.0.1:0",
         ) as local,
         Client(local) as client,
     ):  # fmt: skip
