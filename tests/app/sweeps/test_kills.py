@@ -39,16 +39,8 @@ def file(tmp_path_factory):
 
 
 def started(file, out, *more):
-    command = [
-        sys.executable,
-        "-m",
-        "dvax.app.cli",
-        "sweep",
-        str(file),
-        "-o",
-        str(out),
-        "--allow-code",
-    ]
+    program = str(Path(sys.executable).with_name("dvax"))
+    command = [program, "sweep", str(file), "-o", str(out), "--allow-code"]
     return subprocess.Popen(
         [*command, *more], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )

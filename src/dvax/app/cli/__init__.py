@@ -1,4 +1,4 @@
-"""The command line: `dvax new`, `check`, `run`, `resume`, `report`, `export`, `demo`,
+"""The command line: `dvax new`, `check`, `run`, `resume`, `sweep`, `report`, `export`, `demo`,
 `doctor`.
 
 It reads the arguments, calls `runs` and `plots`, and prints the outcome. Nothing heavy is imported
