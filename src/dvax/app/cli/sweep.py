@@ -161,7 +161,7 @@ def _progress(quiet: bool) -> Iterator[Any]:
 
 
 class _Lines:
-    """A line for each tenth of the members, at most one in a second, and one for each failure."""
+    """A line for each tenth of the members, and one for each failure."""
 
     def __init__(self) -> None:
         self.count = self.done = self.tenth = 0

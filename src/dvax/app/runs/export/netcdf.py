@@ -12,7 +12,7 @@ from dvax.app.runs.export.selection import Selection
 
 SUFFIX = ".nc"
 _BATCH_BYTES = 2**26
-"""The most bytes of a batch of several variables. Each batch opens the file anew."""
+"""The most bytes of a batch of several variables. Each batch opens the file again."""
 
 
 def parts(selection: Selection) -> dict[str, Any]:

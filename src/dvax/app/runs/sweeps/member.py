@@ -139,7 +139,7 @@ def _resumed(sweep: Sweep, member: int, folder: Path) -> RunOutcome | None:
     try:
         return driver.resume(sweep.config(member), folder)
     except InputError:
-        return None  # it is run anew, and reports what is wrong with its input
+        return None  # then the member starts again, and reports what is wrong with its input
 
 
 def _manifest(folder: Path) -> Mapping[str, Any]:
