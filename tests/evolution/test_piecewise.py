@@ -167,8 +167,8 @@ def test_piecewise_switching_below_rounding_is_detected(level, M):
         state_space=dvax.spaces.Euclidean(2), control_space=dvax.spaces.Euclidean(1),
     )  # fmt: skip
     sol = dvax.solve(problem, np.array([level, 0.0]), 0.0, 4.0, method=dvax.PiecewiseLinear())
-    # Up with s to its maximum and no further. Each step rounds x, and processors differ: one gave 9 units
-    # in the last place.
+    # Up with s to its maximum and no further. Each step rounds x, and processors differ: one gave 9
+    # units in the last place.
     rounding = 16 * np.spacing(level) + 1e-12
     np.testing.assert_allclose(sol.xs[-1], [level + 1e-5, 1e-5], rtol=0.0, atol=rounding)
     assert int(sol.stats["switchings"]) == 2
