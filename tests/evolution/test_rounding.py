@@ -128,3 +128,26 @@ def test_start_far_from_zero_with_rounding_of_ten_tolerances_succeeds(method, st
             assert steep * np.spacing(abs(t0)) > 1e-6 and "Count time from the start" in str(error)
             continue
         assert np.abs(found - truth).max() <= 10 * (1e-9 + 1e-6 * np.abs(truth).max()), t0
+
+
+@once
+def oscillator():
+    return dvax.Problem(
+        A=dvax.generators.Dense(jnp.array([[0.0, 1.0], [-1.0, 0.0]])),
+        f=lambda t, x, u, args: 0.0 * x,
+        h=lambda t, x, u, args: 0.0 * u,
+        K=dvax.sets.Box(-1.0, 1.0),
+        P=dvax.operators.Scaling(1.0),
+    )
+
+
+@pytest.mark.parametrize("dt_max", [0.1, 0.13, 0.7])
+def test_lengths_of_many_steps_add_up_to_the_time(dt_max):
+    """Steps of one length share their φ-functions; rounded ends of steps at 0.1 would move the phase by
+    2e-8 within this time."""
+    t1 = 1e4
+    x = dvax.solve(
+        oscillator(), jnp.array([1.0, 0.0]), 0.0, t1, dt_max=dt_max, method=dvax.ETD2RK(),
+        max_steps=200_000,
+    ).xs[-1]  # fmt: skip
+    assert np.linalg.norm(x - np.array([np.cos(t1), -np.sin(t1)])) < 1e-11

@@ -20,6 +20,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..problem import Problem
+from .defect import ROUNDINGS
 from .growth import between, disturbance, gronwall
 from .results import RESULTS
 from .solution import Solution
@@ -81,11 +82,13 @@ def certified(
         if solution.result != RESULTS.successful:
             return solution  # throw=False: the result says what failed, and nothing is certified
         bounds = _bounds(solution, growth, t0)
-        rounding = _rounding(solution, growth, max(size, largest), t0, t1)
-        if rounding > 0.5 * tol:
+        of_steps, of_time = _roundoff(solution, growth, max(size, largest), t0, t1)
+        if of_steps + of_time > 0.5 * tol:
             reason = f"roundoff of x in {int(solution.stats['steps'])} steps, and of t"
-            raise _out_of_reach(tol, max(2.0 * rounding, reachable), growth, span, reason)
-        last, bound = bound, float(np.max(np.asarray(bounds))) + rounding
+            least = max(2.0 * (of_steps + of_time), reachable)
+            raise _out_of_reach(tol, least, growth, span, reason)
+        # That of the steps is part of their defect.
+        last, bound = bound, float(np.max(np.asarray(bounds))) + of_time
         if bound <= tol:
             if of_region(constants):
                 # The same steps with more saved times, which make the bounds between them sharper.
@@ -184,16 +187,19 @@ def _bounds(solution: Solution, growth: _Growth, t0: float) -> Any:
     return _smallest_bounds(t0, solution.ts, integrated, growth)[0]
 
 
-def _rounding(solution: Solution, growth: _Growth, rate: float, t0: float, t1: float) -> float:
-    """Return an estimate of the error due to roundoff: of x, twice a step, and of t, with |x'| of the
-    size `rate`."""
+def _roundoff(
+    solution: Solution, growth: _Growth, rate: float, t0: float, t1: float
+) -> tuple[float, float]:
+    """Return bounds on the error due to roundoff: of x in all steps, and of t, with |x'| of the size
+    `rate`."""
     space = solution.setup.problem.spaces(solution.setup.x0)[0]
     sizes = jax.vmap(space.norm)(solution.xs)
     size = float(np.maximum(np.max(np.asarray(sizes)), space.norm(solution.setup.x0)))
     eps = float(jnp.finfo(solution.setup.dtype).eps)
     steps = int(solution.stats["steps"])
     factor = min(M * np.exp(min(max(c, 0.0) * (t1 - t0), 700.0)) for M, c in growth.rates)
-    return float(factor) * eps * (2.0 * steps * size + 4.0 * max(abs(t0), abs(t1)) * rate)
+    of_steps = ROUNDINGS * steps * size
+    return float(factor) * eps * of_steps, eps * 4.0 * max(abs(t0), abs(t1)) * rate
 
 
 def _interval_bounds(solution: Solution, growth: _Growth, t0: float) -> Any:

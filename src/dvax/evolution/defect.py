@@ -16,6 +16,7 @@ from ..generators import FlowStep, Growth
 from ..generators.spectral_state import values
 from ..programs.branches import branches
 from ..programs.enclosure import LinearEnclosure, is_enclosure
+from ..spaces import AbstractSpace
 from .bounds import Bounds
 from .evaluations import Evaluation
 from .excursions import TRUSTED_STEP_SHARE
@@ -34,6 +35,9 @@ _MOMENT = 0.3
 
 _UNRESOLVED = 0.1
 """Part of the mean modulus of a defect that a polynomial through its samples may not show."""
+
+ROUNDINGS = 8.0
+"""Roundings that a step makes of x and of h f̃."""
 
 _SETTLES = 1e-3
 """Part of x by which a change of f̃ within a short step may change x over the run."""
@@ -164,6 +168,17 @@ def sampled(
     places = [(one.x, flow.operator.inverse(one.rate.y)) for one in lax.stop_gradient(along)]
     bounds = reduce(Bounds.hull, [Bounds((x, x), (u, u)) for x, u in places])
     return Sample(thetas, [*inner, last], error, defect, law_defect, bounds, signed, mean, kinked)
+
+
+def roundoff(space: AbstractSpace, arc: FlowStep) -> jax.Array:
+    """Return a disturbance that is at least the roundoff of a step, so that bounds cover it as well.
+
+    Propagation and summation are taken to have relative errors of `ROUNDINGS` ε; the length of the
+    step has one of ε.
+    """
+    h, x0, x1, c = lax.stop_gradient(values(tuple(arc)))
+    size = jnp.maximum(space.norm(x0), space.norm(x1))
+    return ROUNDINGS * jnp.finfo(h.dtype).eps * (size + h * space.norm(c[0]))
 
 
 def _interpolant(nodes: tuple[float, ...], values: tuple[Tree, ...]) -> tuple[Tree, ...]:

@@ -18,7 +18,7 @@ from ..generators import AbstractPropagator, FlowStep, Growth
 from ..generators.spectral_state import coefficients, values
 from . import error_estimate
 from .bounds import Bounds
-from .defect import Sample, enclosed, sampled
+from .defect import Sample, enclosed, roundoff, sampled
 from .evaluations import Evaluation, Stages, evaluated
 from .excursions import ExcursionGuard
 from .flow import Flow, Rate, joined
@@ -195,9 +195,9 @@ class Stepper(eqx.Module):
         return lax.cond(same, lambda: propagators, lambda: self.propagators(t1 - t0))
 
     def match(self, propagators: Propagators, t0: Any, t1: Any) -> Any:
-        """Whether these are the propagators for this step: t₀ + h is rounded, so that equal lengths
-        may differ by an ulp of t."""
-        return jnp.abs(t1 - t0 - propagators.length) <= 2 * _ulp(t0, t1)
+        """Whether these are the propagators for this step, up to a rounding of its length."""
+        length = t1 - t0
+        return jnp.abs(length - propagators.length) <= jnp.finfo(length.dtype).eps * length
 
     def advance(
         self, t0: Any, t1: Any, x0: Tree, propagators: Propagators | None, guess: Tree | None
@@ -448,20 +448,23 @@ class Stepper(eqx.Module):
     ) -> Sample:
         if not self.flow.enclosed:
             x0, c = values((arc.x0, arc.c))
-            return sampled(self.flow, self.method, arc.h, x0, c, evaluations, slope, propagate)
-        assert self.growth is not None
-        # A rate that the step before made was made where that one ended: a few roundings of t earlier,
-        # which a steep f tells apart.
-        begin = self._one_sided_time(t0, t1, 0.0)
-        begin = jnp.where(jumped, begin, 2.0 * t0 - begin)
-        ends = begin, self._one_sided_time(t0, t1, 1.0)
-        span = self.ends[1] - self.ends[0]
-        return enclosed(self.flow, self.growth, ends, arc, evaluations[-1].rate, span)
-
-
-def _ulp(t0: Any, t1: Any) -> Any:
-    return jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+            sample = sampled(self.flow, self.method, arc.h, x0, c, evaluations, slope, propagate)
+        else:
+            assert self.growth is not None
+            # A rate that the step before made was made where that one ended: a few roundings of t
+            # earlier, which a steep f tells apart.
+            begin = self._one_sided_time(t0, t1, 0.0)
+            begin = jnp.where(jumped, begin, 2.0 * t0 - begin)
+            ends = begin, self._one_sided_time(t0, t1, 1.0)
+            span = self.ends[1] - self.ends[0]
+            sample = enclosed(self.flow, self.growth, ends, arc, evaluations[-1].rate, span)
+        space = self.flow.state_space(values(arc.x1))
+        return sample._replace(defect=sample.defect + roundoff(space, arc))
 
 
 def _size(x: Tree) -> int:
     return sum(leaf.size for leaf in jtu.tree_leaves(x))
+
+
+def _ulp(t0: Any, t1: Any) -> Any:
+    return jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))

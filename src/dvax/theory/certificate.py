@@ -28,6 +28,7 @@ from .._dataset import Variable, dataset, described
 from ..errors import InputError, InputProblem
 from ..evolution import Implicit, Solution, between, disturbance, gronwall, solve
 from ..evolution.control import MAX_GROWTH
+from ..evolution.defect import ROUNDINGS
 from ..generators import AbstractGenerator, AbstractMatrixFree, Product
 from ..problem import Problem
 from .constants import Constants
@@ -45,7 +46,8 @@ class Bound(eqx.Module):
       are proved, that M, ω and ‖P⁻¹‖ are at least those implied by the structure of A and P, and that
       the defect is enclosed over every step. "estimated" means that the defect was sampled.
 
-    Bounds hold up to floating-point rounding in the solve itself.
+    The roundoff of every step and of t is included, for propagators and functions f, h and K that are
+    computed with relative errors of a few ε.
     """
 
     ts: jax.Array
@@ -125,11 +127,13 @@ def bound_error(
     if sol.defect is None or (regional and sol.bounds is None):
         measured = _solve_again(problem, sol, constants)
         distance = jax.vmap(lambda a, b: space.norm(_tree.sub(a, b)))(measured.xs, sol.xs)
+    of_x, of_u = _roundoff(problem, sol)
+    distance = distance + of_x
     assert measured.defect is not None and measured.law_defect is not None
     assert measured.completed_defect is not None
 
     defects = (measured.defect, measured.law_defect), measured.completed_defect
-    law = sol.law_residual, sol.law_step
+    law = sol.law_residual, sol.law_step, of_u
     initial = _initial_errors(initial_error, sol.ts.dtype)
     t0 = jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
     x, u, x_sharp, u_sharp = _bounds(constants, t0, sol.ts, defects, distance, law, initial)
@@ -144,8 +148,7 @@ def bound_error(
         if regional:
             assert measured.bounds is not None
             largest_x = _bound_since_previous_time(constants, t0, sol.ts, defects, initial)
-            law_error = constants.norm_P_inv * (law[0] / constants.gamma + law[1])
-            largest_u = constants.L * largest_x + law_error
+            largest_u = constants.L * largest_x + _law_error(constants, *law)
             spaces = problem.spaces(sol.setup.x0)
             inside = domain.contains(*measured.bounds, largest_x, largest_u, spaces)
     status = weakest(
@@ -164,13 +167,32 @@ def bound_error(
     )  # fmt: skip
 
 
+@eqx.filter_jit
+def _roundoff(problem: Problem, sol: Solution) -> tuple[jax.Array, jax.Array]:
+    """Return, for each saved time, how far x moves within a few roundings of t, and the roundoff of u.
+
+    The roundoff of the steps is part of their defect.
+    """
+    args, t0 = sol.setup.args, jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
+    generator, (state, control) = problem.generator(args), problem.spaces(sol.setup.x0)
+
+    def sizes(t: Any, x: Any, u: Any) -> tuple[Any, Any]:
+        rate = _tree.add(generator.apply(x), problem.f(t, x, u, args))
+        return state.norm(rate), control.norm(u)
+
+    speed, size = jax.vmap(sizes)(sol.ts, sol.xs, sol.us)
+    largest = jnp.maximum(jnp.abs(t0), jnp.abs(sol.ts))
+    unit = ROUNDINGS * jnp.finfo(sol.ts.dtype).eps
+    return unit * largest * speed, unit * size
+
+
 @jax.jit
 def _bounds(
     c: Constants, t0: Any, ts: Any, defects: tuple, distance: Any, law: tuple, initial: tuple
 ) -> tuple:
     """Return x, u, x_sharp and u_sharp of `Bound`."""
     total, completed = (disturbance(c, *parts) for parts in defects)
-    law_error = c.norm_P_inv * (law[0] / c.gamma + law[1])
+    law_error = _law_error(c, *law)
     x, *others = (
         gronwall(t0, ts, total, completed, rate, M, error) + distance
         for M, rate, error in _rates(c, initial)
@@ -180,6 +202,11 @@ def _bounds(
         return x, u, None, None
     sharp = jnp.min(jnp.stack(others), axis=0)
     return x, u, sharp, c.L * sharp + law_error
+
+
+def _law_error(c: Constants, residual: Any, step: Any, roundoff: Any) -> Any:
+    """Return a bound on the distance of the computed u from the solution of the law at x_h."""
+    return c.norm_P_inv * (residual / c.gamma + step) + roundoff
 
 
 def _rates(c: Constants, initial: tuple) -> list[tuple[Any, Any, Any]]:
