@@ -1,5 +1,6 @@
 """The members of a sweep: products, ranges, units, samples, tables; and what is refused."""
 
+import collections
 import itertools
 import math
 
@@ -122,6 +123,17 @@ def test_sobol_points_have_one_in_each_interval_of_a_power_of_two(tmp_path):
         assert sorted(math.floor(64 * v) for v in p.values) == list(range(64))
 
 
+def test_whole_samples_take_every_number_equally_often(tmp_path):
+    found = members(
+        tmp_path,
+        '[sample]\ncount = 64\n[sample.between]\n"m.a" = { low = 3, high = 6, whole = true }\n'
+        '"m.b" = { mean = 5, deviation = 2.0, whole = true }\n',
+    )
+    assert collections.Counter(found["m.a"].values) == dict.fromkeys([3, 4, 5, 6], 16)
+    assert all(type(v) is int for p in found.values() for v in p.values)
+    assert abs(np.mean(found["m.b"].numbers) - 5.0) < 0.2
+
+
 def test_cells_of_a_table_are_numbers_flags_and_texts(tmp_path):
     (tmp_path / "rows.csv").write_text(
         '\ufeffm.a,m.b,m.c,m.d\r\n1,true,2 mm,"a, b"\r\n-1.5e3,false,3 cm,c\r\n', encoding="utf-8"
@@ -152,6 +164,8 @@ def test_cells_of_a_table_are_numbers_flags_and_texts(tmp_path):
         ('[sample]\ncount = 4\n[sample.between]\n"m.a" = { mean = 1.0, deviation = 0.0 }\n',
          "positive"),
         ('[sample]\ncount = 4\n[sample.between]\n"m.a" = { low = 1.0 }\n', "m.a.high: got nothing"),
+        ('[sample]\ncount = 4\n[sample.between]\n"m.a" = { low = 1.5, high = 3, whole = true }\n',
+         "whole numbers have whole ends"),
         ('[sample]\nmethod = "soboll"\ncount = 4\n[sample.between]\n"m.a" = [0.0, 1.0]\n', "'sobol'"),
         ('[table]\nfile = "none.csv"\n', "there is no such file"),
         ('[table]\nfile = "../rows.csv"\n', "in the configuration's folder"),

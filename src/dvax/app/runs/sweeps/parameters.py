@@ -85,14 +85,15 @@ def listed(place: str, key: str, given: Any) -> Parameter:
 
 def drawn(place: str, key: str, given: Any, points: np.ndarray) -> Parameter:
     """Return the parameter of `points` in (0, 1): uniform between { low, high }, in the logarithm with
-    spacing = "log", or normal with { mean, deviation }.
+    spacing = "log", or normal with { mean, deviation }; whole numbers with whole = true.
 
     **Raises:** `dvax.InputError`.
     """
     if isinstance(given, list) and len(given) == 2:
         given = {"low": given[0], "high": given[1]}
     if isinstance(given, Mapping) and "mean" in given:
-        mean, deviation, unit = _ends(place, given, "mean", "deviation", ("mean", "deviation"))
+        allowed = ("mean", "deviation", "whole")
+        mean, deviation, unit = _ends(place, given, "mean", "deviation", allowed)
         if not deviation > 0:
             raise input_error(
                 f"{place}.deviation", repr(given["deviation"]), "it must be positive",
@@ -100,10 +101,17 @@ def drawn(place: str, key: str, given: Any, points: np.ndarray) -> Parameter:
             )  # fmt: skip
         from scipy.special import ndtri
 
-        return from_numbers(key, mean + deviation * ndtri(points), unit)
+        numbers = mean + deviation * ndtri(points)
+        if _is_whole(place, given, unit):
+            return parameter(place, key, [int(n) for n in np.rint(numbers)])
+        return from_numbers(key, numbers, unit)
     if isinstance(given, Mapping):
-        low, high, unit = _ends(place, given, "low", "high", ("low", "high", "spacing"))
-        return from_numbers(key, _scaled(place, given, low, high, points), unit)
+        low, high, unit = _ends(place, given, "low", "high", ("low", "high", "spacing", "whole"))
+        if not _is_whole(place, given, unit):
+            return from_numbers(key, _scaled(place, given, low, high, points), unit)
+        # Both ends as likely as the numbers between them.
+        numbers = np.floor(_scaled(place, given, low, high + 1, points))
+        return parameter(place, key, [int(n) for n in numbers])
     raise input_error(
         place, repr(given)[:70], "a sampled key has { low, high }, or { mean, deviation }",
         "Write { low = 1.0, high = 2.0 }",
@@ -140,6 +148,20 @@ def _ends(
     number = _in_unit(f"{place}.{second}", given[second], one.unit) if one.unit else given[second]
     assert one.numbers is not None
     return one.numbers[0], float(number), one.unit
+
+
+def _is_whole(place: str, given: Mapping[str, Any], unit: str) -> bool:
+    """Return whether whole numbers are asked for."""
+    whole = given.get("whole", False)
+    if not isinstance(whole, bool):
+        raise input_error(f"{place}.whole", repr(whole)[:70], "it is true or false", "Write true")
+    ends = [given[name] for name in ("low", "high") if name in given]
+    if whole and (unit or not all(isinstance(end, int) for end in ends)):
+        raise input_error(
+            f"{place}.whole", "true", "whole numbers have whole ends and no unit",
+            "Write { low = 10, high = 20, whole = true }",
+        )  # fmt: skip
+    return whole
 
 
 def _scaled(place: str, given: Mapping[str, Any], low: float, high: float, points: Any) -> Any:
