@@ -17,11 +17,26 @@ def named(page: Path) -> str:
     return page.relative_to(DOCS).as_posix()
 
 
+SHORT = ["index.md", "certificates.md", "results.md", "models/own-problem.md"]
+"""Pages whose examples `make test` runs; the others run in `make thorough` and on the newest Python."""
+
+
 def blocks(page: Path) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=named)
+def is_short(page: Path) -> bool:
+    """Whether the page has no examples, or is one of the short ones."""
+    return not blocks(page) or named(page) in SHORT
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=named(page), marks=[] if is_short(page) else [pytest.mark.thorough])
+        for page in PAGES
+    ],
+)
 def test_page_examples_print_the_documented_output(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

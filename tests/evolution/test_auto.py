@@ -63,6 +63,7 @@ def test_affine_problem_is_solved_exactly_between_kinks():
     assert int(sol.stats["steps"]) < 40
 
 
+@pytest.mark.thorough
 def test_oscillation_is_not_taken_for_stiffness():
     turning = dvax.Problem(
         A=dvax.generators.Dense(jnp.array([[-0.1, 20.0], [-20.0, -0.1]])),
@@ -85,12 +86,14 @@ def test_known_constants_and_fixed_steps_keep_the_method_whose_defect_is_enclose
     assert fixed.stats["method"] == "ETD2RK: the steps are given"
 
 
+@pytest.mark.thorough
 def test_named_method_is_kept_however_stiff():
     problem = spring(1e4, lambda t: 1.0 + jnp.sin(t))
     sol = dvax.solve(problem, 4.0, 0.0, 1.5, method=dvax.DormandPrince(), rtol=1e-4)
     assert sol.stats["method"] == "DormandPrince" and bool(sol.result == dvax.RESULTS.successful)
 
 
+@pytest.mark.thorough
 def test_choice_does_not_depend_on_transformations():
     problem = spring(3e3, lambda t: 1.0 + jnp.sin(t), power=2)
 
@@ -108,6 +111,7 @@ def test_choice_does_not_depend_on_transformations():
     assert abs(float(slope)) < 1e-6
 
 
+@pytest.mark.thorough
 def test_constant_slopes_are_read_under_transformations():
     problem = spring(3e3, lambda t: 1.0 + jnp.sin(t))
 
@@ -135,6 +139,7 @@ def test_largest_slope_is_that_of_the_free_or_of_the_held_response(slopes):
     assert f"the span is {largest:.2g}" in choice.reason
 
 
+@pytest.mark.thorough
 def test_function_that_closes_over_a_traced_number_is_followed_to_the_end():
     def last(pull):
         problem = spring(3e3, lambda t: pull + jnp.sin(t))
@@ -158,6 +163,7 @@ def field(n, generator=None):
 FIELDS = list(itertools.product((65, 100, 256, 257, 2000), TOLERANCES))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("n", "tol"), mostly_thorough(FIELDS, [(100, 1e-8), (257, 1e-4)]))
 def test_field_meets_its_tolerance_in_few_steps(n, tol):
     problem = field(n)
@@ -176,6 +182,7 @@ def test_field_meets_its_tolerance_in_few_steps(n, tol):
     assert int(sol.stats["steps"]) <= 0.3 * tol**-0.5 + 4 * min(n, 300) + 100
 
 
+@pytest.mark.thorough
 def test_field_is_left_to_its_exponential_by_a_method_that_suits_the_tolerance():
     n = 80
     heat = field(n, dvax.generators.Elliptic(n, 1.0, boundary="dirichlet"))

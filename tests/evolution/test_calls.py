@@ -38,6 +38,7 @@ def test_integer_times_and_steps_give_the_same_run_as_floats():
     assert int(whole.stats["steps"]) == 2
 
 
+@pytest.mark.thorough
 def test_args_keep_python_integers_and_flags_and_convert_floats_to_arrays():
     seen = []
 
@@ -88,6 +89,7 @@ def test_h_may_contain_a_debug_callback(steps):
     assert told and abs(float(found - want)) < 1e-5
 
 
+@pytest.mark.thorough
 def test_saved_responses_of_a_field_are_certified_like_those_of_points():
     case = c1()
     x0 = np.linspace(-1.0, 3.0, 5000)
@@ -120,6 +122,7 @@ def test_unhashable_args_raise_an_error_that_names_them():
         dvax.solve(system, -1.0, 0.0, 2.0, {1, 2}, dt=0.5)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("steps", [dict(rtol=1e-3, atol=1e-3), dict(dt=0.1, measure=True)])
 def test_solve_keeps_single_precision(steps):
     one = jnp.float32
@@ -187,6 +190,7 @@ def test_stats_count_the_evaluations_of_an_iterated_law():
     assert int(iterated.stats["evaluations"]) > 2 * 40
 
 
+@pytest.mark.thorough
 def test_stats_separate_compile_time_and_run_time():
     f = lambda t, x, u, args: 2.5 - 0.5 * x - u  # noqa: E731
     fresh = problem(f)

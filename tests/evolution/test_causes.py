@@ -63,6 +63,7 @@ def test_cause_finite_time_escape_names_the_time(p, c, method):
     assert dvax.solve(problem, 0.0, 0.0, end, method=dvax.DormandPrince(), **loose).xs.shape == (1,)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("steps", mostly_thorough([60, 90, 120], [90]))
 def test_cause_growth_faster_than_exponential_is_not_reported_as_escape(steps):
     # A drive that grows faster than any exponential, and a state that only follows it.
@@ -73,6 +74,7 @@ def test_cause_growth_faster_than_exponential_is_not_reported_as_escape(steps):
     assert "escape" not in str(error)
 
 
+@pytest.mark.thorough
 def test_cause_exponential_growth_is_not_reported_as_escape():
     error = failure(make(lambda t, x, u, args: x), x0=1.0, t1=1e4, rtol=1e-3)
     assert "escape" not in str(error) and "exponential growth" in error.cause
@@ -98,7 +100,7 @@ def test_cause_too_few_steps_of_a_circuit_is_the_only_one_reported(most):
     ("name", "at", "k"),
     mostly_thorough(
         [(name, at, k) for name in "fhK" for at in (0.37, 1.0, 1.9) for k in (0, 2)],
-        [("f", 0.37, 2), ("K", 1.0, 0)],
+        [("K", 1.0, 0)],
     ),
 )
 def test_cause_nonfinite_value_names_function_time_and_component(name, at, k):
@@ -117,6 +119,7 @@ def test_cause_nonfinite_value_names_function_time_and_component(name, at, k):
     assert name == "K" or f"({k},)" in error.cause  # the box is refused as a whole
 
 
+@pytest.mark.thorough
 def test_nonfinite_response_fails_even_if_f_does_not_depend_on_it():
     upper = jnp.array([1.0, jnp.nan])
     problem = make(
@@ -126,6 +129,7 @@ def test_nonfinite_response_fails_even_if_f_does_not_depend_on_it():
     assert "K is " in error.cause
 
 
+@pytest.mark.thorough
 def test_cause_state_outside_the_domain_of_f_names_the_place():
     # x' = −1 from ½ under √x, with a part that is NaN below 0.
     problem = make(lambda t, x, u, args: -1.0 + 0.0 * jnp.log(x))
@@ -136,6 +140,7 @@ def test_cause_state_outside_the_domain_of_f_names_the_place():
     )
 
 
+@pytest.mark.thorough
 def test_cause_nonmonotone_law_names_the_eigenvalue():
     gain = jnp.array([1.0, 3.0, 0.5])
     problem = make(lambda t, x, u, args: -u, h=lambda t, x, u, args: 1.0 - x + gain * u)
@@ -143,6 +148,7 @@ def test_cause_nonmonotone_law_names_the_eigenvalue():
     assert "not strongly monotone" in error.cause and "eigenvalue -2 " in error.cause
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rate", mostly_thorough([1e4, 1e5, 1e7, 1e9], [1e7]))
 def test_cause_stiffness_suggests_a_method_that_succeeds(rate):
     problem = make(lambda t, x, u, args: -rate * (x - jnp.cos(t)))
@@ -162,6 +168,7 @@ def test_suggested_max_steps_suffices():
     dvax.solve(problem, 0.0, 0.0, 20.0, max_steps=enough, rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_cause_tolerance_below_rounding_suggests_an_attainable_tolerance():
     problem = make(lambda t, x, u, args: jnp.sin(t) - x)
     with pytest.warns(UserWarning, match="cannot be reached"):
@@ -192,6 +199,7 @@ def test_solve_over_a_span_of_a_few_roundings_succeeds(t0, ulps):
     assert float(dvax.solve(RESTING, 1.0, t0, t1).xs[-1]) == pytest.approx(1.0, abs=1e-14)
 
 
+@pytest.mark.thorough
 def test_shape_of_u_follows_from_P_or_K():
     # x ∈ ℝ², u ∈ ℝ³, given by K alone, by P alone, by both, and by the parts of a product.
     options = [
@@ -276,6 +284,7 @@ METHODS = {
 }  # fmt: skip
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "method"),
     mostly_thorough([(n, m) for n in RELAYS for m in METHODS], [("one", "ETD2RK")]),

@@ -23,6 +23,7 @@ PROBLEM = dvax.Problem(
 )  # fmt: skip
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", mostly_thorough(METHODS, ["ETD2RK"]))
 def test_sampled_defect_of_smooth_systems_has_the_size_of_its_integral(name):
     """For random smooth systems in 20 to 200 steps, the samples do not miss the defect."""

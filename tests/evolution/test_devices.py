@@ -60,6 +60,7 @@ PROGRAM = """
 CASES = [["a batch", "a batch on each"], ["a field", "its gradient"]]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("names", mostly_thorough(CASES, CASES[:1]))
 def test_sharded_solve_equals_the_solve_on_one_device(names):
     program = textwrap.dedent(PROGRAM).replace("NAMES", repr(names))

@@ -102,6 +102,7 @@ def tent(lib, t, c, w=0.05):
     return lib.maximum(0.0, 1.0 - lib.abs(t**2 - c**2) / (2 * c * w))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "method"),
     mostly_thorough(
@@ -121,6 +122,7 @@ def test_pulse_beside_larger_data_is_not_missed(name, method):
     assert abs(float(sol.xs[-1]) - truth) <= 1e-4
 
 
+@pytest.mark.thorough
 def test_pulse_with_a_factor_that_is_zero_at_a_sample_is_not_missed():
     c, w, d = 59.3, 0.15, 13.8
     problem = dvax.Problem(

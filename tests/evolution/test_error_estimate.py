@@ -71,7 +71,7 @@ def error(before, after, turn, end, tol, method):
     return np.abs(np.asarray(sol.xs[-1]) - exact) / scale, int(sol.stats["steps"])
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", mostly_thorough(METHODS, ["default"]))
 @pytest.mark.parametrize("rate", mostly_thorough([1.0, 10.0, 1e2, 1e3, 1e4], [1e2]))
 @pytest.mark.parametrize("tol", mostly_thorough([1e-4, 1e-6, 1e-8], [1e-6]))
 def test_error_stays_below_the_tolerance_where_errors_decay(method, rate, tol):
@@ -88,6 +88,7 @@ def test_error_is_the_tolerance_times_the_growth_after_a_decay(method, growth, r
     assert np.all(found < np.exp(2.0 * growth))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", ["ETD4RK", "DormandPrince"])
 def test_decay_saves_steps(method):
     # A certificate integrates the norm of the defect, so that with constants nothing is owed.

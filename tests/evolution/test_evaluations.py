@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import dvax
 from dvax.evolution.evaluations import _along_line
@@ -33,6 +34,7 @@ def test_law_guess_takes_the_latest_of_several_values_at_one_time():
     assert float(_along_line(times, rows, 3)) == 2.0
 
 
+@pytest.mark.thorough
 def test_responses_at_saved_times_do_not_depend_on_the_guess():
     rng = np.random.default_rng(0)
     M = rng.normal(size=(8, 8))

@@ -45,7 +45,7 @@ METHODS = {
 }
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", mostly_thorough(METHODS, ["DormandPrince"]))
 def test_event_times_and_states_of_an_oscillator_are_exact_to_the_tolerance(method):
     omega = 3.0
     exact = (np.arange(10) + 0.5) * np.pi / omega
@@ -157,7 +157,11 @@ def test_bouncing_ball_has_the_events_of_the_closed_form():
 
 
 @pytest.mark.parametrize(
-    ("adjoint", "jacobian"), [("reverse", jax.jacrev), ("forward", jax.jacfwd)]
+    ("adjoint", "jacobian"),
+    [
+        pytest.param("reverse", jax.jacrev, marks=pytest.mark.thorough),
+        ("forward", jax.jacfwd),
+    ],
 )
 def test_bouncing_ball_has_the_derivatives_of_the_closed_form(adjoint, jacobian):
     found = jacobian(summary(adjoint), (0, 1, 2))(*BALL)
@@ -187,6 +191,7 @@ def test_second_derivatives_of_event_times_and_of_states_behind_resets_are_exact
     np.testing.assert_allclose(second(run), second(exact), rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_bouncing_ball_under_jit_and_vmap_agrees_with_single_solves():
     heights = jnp.array([1.0, 1.3, 1.6])
     batch = jax.jit(jax.vmap(lambda h: bounce(h, *BALL[1:]).events))(heights)
@@ -199,6 +204,7 @@ def test_bouncing_ball_under_jit_and_vmap_agrees_with_single_solves():
         assert np.all(np.isnan(batch.xs[k, count:]))
 
 
+@pytest.mark.thorough
 def test_dense_output_of_a_bouncing_ball_is_that_of_each_flight():
     sol = bounce(*BALL, dense=True, max_steps=200, ts=[0.5, 1.5, 2.25])
     flight = lambda t: (t - 1.0) - (t - 1.0) ** 2  # noqa: E731
@@ -207,6 +213,7 @@ def test_dense_output_of_a_bouncing_ball_is_that_of_each_flight():
         assert sol.evaluate(t)[0][X] == pytest.approx(flight(t), abs=1e-8)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("restitution", [0.5, 0.0])
 def test_events_that_accumulate_end_the_run_with_a_message(restitution):
     given = *BALL[:2], jnp.asarray(restitution)
@@ -218,6 +225,7 @@ def test_events_that_accumulate_end_the_run_with_a_message(restitution):
     assert any(fix.option == "max_events" for fix in caught.value.fixes)
 
 
+@pytest.mark.thorough
 def test_more_events_than_there_is_room_for_end_the_run():
     sol = bounce(*BALL, max_events=2, throw=False)
     assert sol.result == dvax.RESULTS.max_events and len(sol.events.ts) == 2
@@ -241,6 +249,7 @@ def tick(events, args=None, t1=10.0, **options):
 DIP = dvax.Event(lambda t, x, u, args: args[1] * ((x - args[0]) ** 2 - args[2]))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("place", [0.9, 5.0, 9.3])
 def test_two_zeros_in_one_step_are_two_events(sign, place):
@@ -258,11 +267,13 @@ def test_function_that_touches_zero_to_the_tolerance_is_one_event(sign, depth, c
     np.testing.assert_allclose(sol.events.ts, [5.0] * count, atol=1e-3)
 
 
+@pytest.mark.thorough
 def test_time_of_a_function_that_touches_zero_has_no_derivative():
     first = lambda place: tick([DIP], (place, 1.0, 0.0)).events.ts[0]  # noqa: E731
     assert np.isnan(jax.grad(first)(5.0))
 
 
+@pytest.mark.thorough
 def test_function_that_is_zero_on_an_interval_is_one_event():
     held = dvax.Event(lambda t, x, u, args: jnp.maximum(x - 5, 0.0) - jnp.maximum(3 - x, 0.0))
     ever = dvax.Event(lambda t, x, u, args: 0.0 * x)
@@ -273,11 +284,13 @@ def test_function_that_is_zero_on_an_interval_is_one_event():
     np.testing.assert_allclose(tick([ended]).ts, [3.0], atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_function_that_jumps_over_zero_is_an_event():
     jump = dvax.Event(lambda t, x, u, args: jnp.where(x < 4.0, -1.0, 2.0))
     np.testing.assert_allclose(tick([jump]).events.ts, [4.0], atol=1e-6)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("direction", "count"), [(0, 1), (1, 1), (-1, 0)])
 def test_event_at_the_start_happens_if_its_function_leaves_in_its_direction(direction, count):
     start = dvax.Event(lambda t, x, u, args: x, direction=direction)
@@ -289,12 +302,14 @@ def test_event_at_the_start_happens_if_its_function_leaves_in_its_direction(dire
     assert tick([reset]).xs[-1] == pytest.approx(10.0 + count, abs=1e-9)
 
 
+@pytest.mark.thorough
 def test_terminal_event_at_the_start_ends_the_run_there():
     sol = tick([dvax.Event(lambda t, x, u, args: x, terminal=True)])
     assert sol.ts.tolist() == [0.0] and sol.stats["steps"] == 0
     assert sol.result == dvax.RESULTS.terminal_event
 
 
+@pytest.mark.thorough
 def test_events_at_one_time_happen_in_their_order():
     # At x = 1, at the same time: x ↦ 2x and x ↦ x + 3.
     double = dvax.Event(
@@ -317,6 +332,7 @@ def test_events_at_one_time_happen_in_their_order():
 AT_THREE = dvax.Event(lambda t, x, u, args: x - args, terminal=True)
 
 
+@pytest.mark.thorough
 def test_terminal_event_ends_the_run_at_its_time():
     sol = tick([AT_THREE], 3.0)
     assert sol.result == dvax.RESULTS.terminal_event
@@ -329,6 +345,7 @@ def test_terminal_event_ends_the_run_at_its_time():
     assert ts[2] == np.inf
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("adjoint", "derivative"), [("reverse", jax.grad), ("forward", jax.jacfwd)]
 )
@@ -355,6 +372,7 @@ def test_end_of_a_run_at_a_terminal_event_has_the_derivative_of_its_time(adjoint
     )
 
 
+@pytest.mark.thorough
 def test_reset_switches_a_parameter_that_is_a_component_of_the_state():
     # A thermostat: x' = q − x, with q = 0 from x = 3/2 on and q = 2 from x = 1/2 on.
     problem = dvax.Problem(
@@ -379,6 +397,7 @@ def test_reset_switches_a_parameter_that_is_a_component_of_the_state():
         np.testing.assert_allclose(np.asarray(sol.events.ts, float), exact, atol=tol)
 
 
+@pytest.mark.thorough
 def test_event_of_a_saturated_response_is_the_change_of_regime():
     case = c1()
     reached = dvax.Event(lambda t, x, u, args: 0.5 - u, name="leaves its upper bound")
@@ -394,6 +413,7 @@ def test_event_of_a_saturated_response_is_the_change_of_regime():
     assert sol.events.ts[1] == pytest.approx(sol.regimes().times[2], abs=1e-4)
 
 
+@pytest.mark.thorough
 def test_events_that_are_only_recorded_change_neither_steps_nor_bounds():
     case = c1()
     options: dict[str, Any] = dict(
@@ -412,6 +432,7 @@ def test_events_that_are_only_recorded_change_neither_steps_nor_bounds():
     assert bounds[0].status == bounds[1].status
 
 
+@pytest.mark.thorough
 def test_bound_of_a_run_that_an_event_ended_holds_at_its_time_and_resets_have_none():
     case = c1()
     x0 = jnp.asarray(case.x0)
@@ -449,6 +470,7 @@ def test_invalid_events_are_refused_with_their_names(make, message):
         make()
 
 
+@pytest.mark.thorough
 def test_event_function_that_is_not_a_number_ends_the_run():
     with pytest.raises(dvax.SolveError) as caught:
         tick([dvax.Event(lambda t, x, u, args: jnp.sqrt(1.0 - x))])

@@ -32,6 +32,7 @@ def end_of(problem, t1, method):
 ALL = [(dip, method) for dip in DIPS for method in METHODS]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("dip", "method"), mostly_thorough(ALL, [("vee", "DormandPrince")]))
 def test_dip_of_a_bound_within_a_step_is_resolved(dip, method):
     """x' = u − 0.1x, u = min(0.05, k(t)): by quadrature of e^{−0.1(2 − s)} min(0.05, k(s))."""
@@ -48,6 +49,7 @@ def test_dip_of_a_bound_within_a_step_is_resolved(dip, method):
         assert abs(float(run(a)) - exact) <= 10 * (RTOL * abs(exact) + 1e-9) + 1e-10
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["where", "floor"])
 @pytest.mark.parametrize("method", mostly_thorough(METHODS, ["DormandPrince"]))
 def test_hidden_jump_does_not_end_a_run(kind, method):
@@ -66,6 +68,7 @@ def test_hidden_jump_does_not_end_a_run(kind, method):
         assert abs(float(run(a)) - exact) <= 10 * RTOL
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", mostly_thorough(METHODS, ["DormandPrince"]))
 @pytest.mark.parametrize("start", [0.0, pytest.param(-3e5, marks=pytest.mark.thorough)])
 def test_hundreds_of_hidden_jumps_do_not_end_a_run_at_a_tight_tolerance(method, start):
@@ -88,6 +91,7 @@ def test_hundreds_of_hidden_jumps_do_not_end_a_run_at_a_tight_tolerance(method, 
     assert abs(float(x) - exact) <= 10 * rtol
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("span", "method"),
     mostly_thorough(

@@ -93,6 +93,7 @@ def test_circuit_error_bound_holds_and_is_small(tank, exact):
     assert np.all(np.asarray(solution.law_residual) < 1e-12 * 10.0)  # of ten volts
 
 
+@pytest.mark.thorough
 def test_circuit_trajectories_do_not_separate(tank):
     circuit, solution = tank
     other = dvax.solve(

@@ -173,6 +173,7 @@ def test_duvaut_lions_overstress_on_a_straight_path_is_exponential(way):
     assert figures["plastic_strain"] == pytest.approx(np.sqrt(2 / 3) * plastic, abs=1e-9)
 
 
+@pytest.mark.thorough
 def test_duvaut_lions_overstress_with_decreasing_strength_is_the_closed_form():
     # ‖s‖ = R(t) + z, with R' = −r and z' = r − z/τ from where R meets the stress.
     def strength(t):
@@ -235,6 +236,7 @@ def test_duvaut_lions_converges_to_the_return_mapping(path, yields, back):
     assert errors[0] < 0.1 and np.all((ratios > 1.7) & (ratios < 2.2)), (errors, ratios)
 
 
+@pytest.mark.thorough
 def test_duvaut_lions_constants_are_proved_by_verify():
     model = point(WINDING)
     mine = model.constants
@@ -256,6 +258,7 @@ def test_duvaut_lions_constants_of_the_cone_are_proved_by_verify():
         assert float(getattr(model.constants, name)) == pytest.approx(value, abs=1e-9), name
 
 
+@pytest.mark.thorough
 def test_duvaut_lions_trajectories_of_one_strain_do_not_separate():
     model = point(WINDING)
     starts = 1e-3 * np.random.default_rng(4).normal(size=(2, 5))
@@ -265,6 +268,7 @@ def test_duvaut_lions_trajectories_of_one_strain_do_not_separate():
     assert np.all(np.diff(apart) <= 1e-9) and apart[-1] < 0.8 * apart[0]
 
 
+@pytest.mark.thorough
 def test_duvaut_lions_many_points_are_one_batch():
     ways = np.stack([SHEAR, TENSION, OEDOMETRIC]) * np.array([1.0, 2.0, -1.0])[:, None, None] * 2e-3
     rows = np.asarray(mandel(ways))[:, None, :] * TIMES[:, None]

@@ -36,6 +36,7 @@ def force(model, pressure):
     return model.figures(pressure)["force"]
 
 
+@pytest.mark.thorough
 def test_fem_contact_forces_converge_on_three_meshes(bodies):
     found = []
     for body, dofs, points, free, capped in zip(bodies, DOFS, POINTS, UNCAPPED, CAPPED):
@@ -98,6 +99,7 @@ def test_fem_contact_transient_reaches_the_steady_variational_inequality(run):
     assert np.all(np.diff(np.log(distance[late])) <= -0.5 + 1e-6)
 
 
+@pytest.mark.thorough
 def test_fem_contact_trajectory_bound_is_proved_and_holds(bodies):
     model = build(bodies[0])
     settings = dict(ts=np.linspace(1.0, 6.0, 6), rtol=0.0, method=model.method)
@@ -113,6 +115,7 @@ def test_fem_contact_trajectory_bound_is_proved_and_holds(bodies):
     assert np.max(found.x) < 2e-5 and np.max(true) > 10 * np.max(sharp.x)
 
 
+@pytest.mark.thorough
 def test_fem_contact_constants_are_proved_by_verify(bodies):
     model = build(bodies[0], relaxation_time=2.0, b_u=0.25)
     check = dvax.verify(model.problem, model.untouched, 0.0, 4.0)
@@ -130,6 +133,7 @@ def test_fem_contact_constants_are_proved_by_verify(bodies):
     assert float(c.sharp_decay_rate) == 0.5
 
 
+@pytest.mark.thorough
 def test_fem_contact_trajectories_approach_in_the_energy_norm(bodies):
     model = build(bodies[0], stiffness=30.0)
     starts = np.random.default_rng(3).normal(size=(2, model.untouched.size)) * 0.01
@@ -304,6 +308,7 @@ def test_fem_contact_stress_balances_the_punch(run, tmp_path: Path):
         model.write(tmp_path / "at.stl", t, x)
 
 
+@pytest.mark.thorough
 def test_fem_contact_indentation_may_be_a_table(bodies):
     record = dvax.signals.Table([0.0, 2.0, 3.0, 5.0], [0.0, 0.01, 0.01, 0.002])
     model = build(bodies[0], indentation=record)

@@ -155,6 +155,7 @@ def test_frame_viscoplastic_response_is_solved_to_rounding():
     assert "regularised by η/k = 0.01 s" in frame.fit
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "taus",
     [(1e-3, 1e-4), pytest.param((1e-3, 1e-4, 1e-5), marks=pytest.mark.thorough)],
@@ -177,6 +178,7 @@ def test_frame_viscoplastic_response_converges_to_the_elastoplastic_one(taus):
     np.testing.assert_allclose(np.log10(np.array(errors[:-1]) / errors[1:]), 1.0, atol=0.1)
 
 
+@pytest.mark.thorough
 def test_frame_with_yield_ratio_one_does_not_yield():
     arguments = dict(record=RECORD, period=0.8, damping=0.02, viscosity_ratio=0.01)
     just = Frame(yield_ratio=1.0 + 1e-9, **arguments).solve()
@@ -185,6 +187,7 @@ def test_frame_with_yield_ratio_one_does_not_yield():
     assert np.abs(np.asarray(less.xs)[:, 2]).max() > 1e-4
 
 
+@pytest.mark.thorough
 def test_frame_displacement_scales_with_record_and_strength():
     arguments = dict(period=0.6, damping=0.02, yield_ratio=0.3, viscosity_ratio=0.02)
     once = Frame(record=RECORD, **arguments).figures()
@@ -208,6 +211,7 @@ def test_response_spectrum_equals_single_frames():
         assert found.elastic[k] == pytest.approx(frame.figures()["largest_displacement"], rel=1e-6)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "taus", [[1.2e-4, 1e-8], pytest.param([1e-5, 1e-6, 1e-7], marks=pytest.mark.thorough)]
 )

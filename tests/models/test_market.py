@@ -86,6 +86,7 @@ def test_market_hourly_equilibria_of_rts_gmlc(rts):
         np.testing.assert_allclose(np.asarray(made)[k], u, atol=1e-6)
 
 
+@pytest.mark.thorough
 @needs_data
 def test_market_constants_of_rts_gmlc(week):
     market, _ = week
@@ -95,6 +96,7 @@ def test_market_constants_of_rts_gmlc(week):
     assert c.status_of("gamma", "L_F", "one_sided") == "proved"
 
 
+@pytest.mark.thorough
 @needs_data
 def test_market_week_in_july(week):
     market, sol = week
@@ -120,6 +122,7 @@ def test_market_week_in_july(week):
     assert abs(1.0 - 0.25 * float(market.speed) * (1.0 + 2.47)) > 4.0
 
 
+@pytest.mark.thorough
 @needs_data
 def test_market_first_hours_agree_with_an_independent_integrator_and_law(week):
     market, sol = week
@@ -226,6 +229,7 @@ def test_merit_order_solves_random_laws_to_rounding_ties_and_all():
         np.testing.assert_allclose(np.asarray(mine.y), u, atol=1e-7)
 
 
+@pytest.mark.thorough
 def test_merit_order_has_the_derivative_of_the_law():
     market = small()
     q = market.cost - 48.0
@@ -286,6 +290,7 @@ def test_market_constants_are_proved_by_verify():
     assert float(found.one_sided) <= -2.0 + 1e-9 and float(mine.one_sided) == -2.0
 
 
+@pytest.mark.thorough
 def test_market_prices_approach_with_the_one_sided_rate():
     market = small()
     ends = [

@@ -82,6 +82,7 @@ def test_mpc_without_active_limits_is_the_regulator(mpc):
     np.testing.assert_allclose(moves, -x @ np.asarray(mpc.regulator).T, atol=1e-14)
 
 
+@pytest.mark.thorough
 def test_mpc_slew_limits_agree_with_a_conic_solver():
     mpc = chain(slew=0.15, horizon=8)
     rng = np.random.default_rng(6)
@@ -154,6 +155,7 @@ def loop(mpc):
     return check, [run(jnp.asarray(x)) for x in x0]
 
 
+@pytest.mark.thorough
 def test_mpc_closed_loop_decay_is_proved_and_observed(mpc, loop):
     check, runs = loop
     assert check.status == "proved" and check.constants.status_of("energy") == "proved"
@@ -188,6 +190,7 @@ def test_mpc_loop_agrees_with_an_independent_integrator_and_solver(mpc, loop):
     np.testing.assert_allclose(np.asarray(run.xs)[[5, 10]], other.y.T, atol=2e-6)
 
 
+@pytest.mark.thorough
 def test_mpc_loop_converges_to_a_reachable_target(mpc):
     # Held by u_s = 0.3 at the first mass: S x_s = (0.3, 0, 0).
     rest = np.array([0.225, 0.15, 0.075, 0.0, 0.0, 0.0])

@@ -49,6 +49,7 @@ def test_rectifiers_of_any_scale_succeed_at_the_defaults(seed):
     assert np.abs(np.asarray(sol.law_step)).max() <= size
 
 
+@pytest.mark.thorough
 def test_rectifiers_do_not_depend_on_the_order_of_lines():
     # Ringing rates of a symmetric bridge are near each other; their vectors depended on the order, and
     # the bridge with its filter first took a step for every few periods.

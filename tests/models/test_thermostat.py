@@ -26,6 +26,7 @@ def mode(model):
     return jnp.asarray(phi), (2 * np.pi / 1.5) ** 2 + np.pi**2
 
 
+@pytest.mark.thorough
 def test_thermostat_without_saturation_decays_with_both_rates():
     model = plate()
     phi, eigenvalue = mode(model)

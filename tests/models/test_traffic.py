@@ -97,6 +97,7 @@ def test_traffic_tolls_and_lengths_enter_with_their_weights():
         assert time == pytest.approx(np.dot(times, v), rel=1e-13)  # tolls are not time
 
 
+@pytest.mark.thorough
 def test_traffic_follows_changing_demand_and_an_incident():
     rush = dvax.signals.Table([0.0, 10.0, 12.0, 60.0], [1.0, 1.0, 1.5, 1.5])
     hole = traffic.Incident((1, 3), 0.4, 30.0, 45.0)
@@ -201,6 +202,7 @@ def test_traffic_equilibrium_has_the_least_cost_over_all_flows(city):
     assert least < 0.8 * float(city.objective(0.0, city.equilibrium))
 
 
+@pytest.mark.thorough
 def test_traffic_converges_to_the_equilibrium_and_conserves_trips(city, days):
     least = float(city.objective(0.0, city.equilibrium))
     for sol in days:

@@ -153,6 +153,7 @@ def test_equilibrium_does_not_depend_on_the_blocks(monkeypatch):
     np.testing.assert_allclose(flows[0], flows[1], rtol=1e-5, atol=1e-3)
 
 
+@pytest.mark.thorough
 def test_equilibrium_sweep_conserves_sums_and_reduces_the_objective():
     network, trips = networks.grid(6, 7, 12, 60, 6e4, seed=1)
     costs = link_costs(network, 0.3, 0.4).up_to(np.full(len(network), trips.flow.sum()))

@@ -24,6 +24,7 @@ SHAPES = {
 EVERY = [(s, d, r) for s in SHAPES for d in (0.5, 1.0, 2.0) for r in (1e-3, 1e-1, 1.0, 10.0)]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("shape", "factor", "share"),
     mostly_thorough(EVERY, [("one way", 2.0, 0.1)]),
@@ -83,6 +84,7 @@ def test_link_newton_rejects_another_law():
         dvax.solve_vi(lambda y, args: y, dvax.sets.Simplex(1.0), jnp.ones(2), solver=solver)
 
 
+@pytest.mark.thorough
 def test_link_newton_solves_pairs_without_a_choice():
     network = traffic.Network(
         zones=2, nodes=2, first_thru_node=1, init_node=[1, 2], term_node=[2, 1],

@@ -46,6 +46,7 @@ def test_convolution_equals_the_circulant_matrix_of_its_kernel(n):
     assert ends.exact
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("shape", [(4, 6), (5, 3)])
 def test_convolution_in_two_dimensions(shape):
     k = np.hypot(*np.meshgrid(

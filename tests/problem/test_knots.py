@@ -57,6 +57,7 @@ def test_knots_of_a_table_at_a_shifted_time_give_a_warning():
         assert made.knots(0.0, 2.0, ZERO).tolist() == []
 
 
+@pytest.mark.thorough
 def test_data_that_do_not_cover_the_run_are_rejected():
     made = problem(f=lambda t, x, u, args: DATA(t) - u)
     for t0, t1 in ((0.0, 9.5), (-1.5, 2.0)):

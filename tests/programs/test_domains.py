@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import jax.extend.core.primitives as primitives
+import pytest
 from tests.programs.primitive_table import parts, table
 
 from dvax.programs import DOMAINS
@@ -43,6 +44,7 @@ assert jaxprs.read({variable: 3.0}, [variable, literal]) == [3.0, 2.0]
 """
 
 
+@pytest.mark.thorough
 def test_interpreter_works_without_exported_jaxpr_types():
     from dvax._jax import jaxprs
 

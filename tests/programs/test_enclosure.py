@@ -194,6 +194,7 @@ def test_enclosure_names_operations_without_a_rule():
         enclosed(lambda t: jnp.fft.irfft(jnp.fft.rfft(PROFILE * t), 3), 0.0, 1.0)
 
 
+@pytest.mark.thorough
 def test_trajectory_curvature_is_below_its_bound():
     space = dvax.spaces.Euclidean(2)
     generators = {

@@ -140,6 +140,7 @@ def test_derivative_in_the_time_of_an_undetected_jump_raises_an_error():
     assert np.isfinite(jax.grad(end, 1)(0.5, 1.0))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", mostly_thorough(["interp", "steps"], ["steps"]))
 @pytest.mark.parametrize(
     "method",

@@ -13,6 +13,7 @@ from tests.closed_forms import c1, c1_solution
 import dvax
 
 
+@pytest.mark.thorough
 def test_gradients_of_an_adaptive_batch_equal_those_of_single_runs():
     """Each lane has its own steps and kinks, and waits when it has ended."""
     case = c1()
@@ -94,6 +95,7 @@ def test_derivatives_of_a_batch_equal_those_of_its_runs(ts, steps):
         np.testing.assert_allclose(found[1], exact[1], rtol=1e-8)
 
 
+@pytest.mark.thorough
 def test_derivatives_of_a_batch_may_all_be_zero():
     """XLA then eliminates the whole loop, and aborts on unused arguments of an outlined call."""
     case = c1()

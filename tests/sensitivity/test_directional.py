@@ -95,6 +95,7 @@ def test_directional_derivative_on_a_kink_is_the_limit_of_one_sided_differences(
     assert np.max(np.abs(np.asarray(found.dxs[-1] + back.dxs[-1]))) > 1e-3
 
 
+@pytest.mark.thorough
 def test_directional_derivative_at_rest_on_a_kink_depends_on_the_side():
     rest = dvax.Problem(
         A=ZERO, P=ONE, K=dvax.sets.Box(0.0, 9.0), f=lambda t, x, u, args: u - 2.0 * x,
@@ -149,6 +150,7 @@ def test_directional_derivative_in_every_parameter_equals_jvp():
     np.testing.assert_allclose(np.asarray(found.dus), np.asarray(dus), rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.thorough
 def test_kinks_are_classified_as_crossing_touching_or_staying():
     """z crosses at 1, touches at 2 and stays from 3 on."""
     z = lambda t: jnp.where(t < 1.5, 1.0 - t, jnp.where(t < 3.0, -2.0 * (t - 2.0) ** 2, 0.0))  # noqa: E731
@@ -165,6 +167,7 @@ def test_kinks_are_classified_as_crossing_touching_or_staying():
     assert found[2].start == pytest.approx(3.0, abs=2e-3) and found[2].end == 4.0
 
 
+@pytest.mark.thorough
 def test_directional_derivative_rejects_wrong_directions():
     case = c1()
     with pytest.raises(dvax.InputError, match=r"dx0.*shape"):

@@ -52,6 +52,7 @@ CASES = list(itertools.product(METHODS, SETS))
 OFTEN = {("ETD2RK", "Ball"), ("Picard", "Ball")}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("method", "kind"), mostly_thorough(CASES, OFTEN))
 def test_derivatives_in_all_data_agree_with_central_differences(method, kind, uncached):
     names = list(GENERATORS)

@@ -46,6 +46,7 @@ def fitted(data):
     return found, jnp.sqrt(variance * jnp.diag(jnp.linalg.inv(J.T @ J)))
 
 
+@pytest.mark.thorough
 def test_fit_of_four_contact_parameters_to_a_noisy_record():
     noise = NOISE * np.random.default_rng(0).normal(size=(1, 200))
     found, error = fitted(observed(TRUTH) + noise[0])

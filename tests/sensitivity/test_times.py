@@ -63,6 +63,7 @@ METHODS = {
 OFTEN = {"ETD4RK, adaptive", "ETD2RK, fixed"}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", mostly_thorough(METHODS, ["ETD4RK, adaptive"]))
 def test_derivatives_in_all_times_agree_with_the_closed_form(name):
     method, settings, tol = METHODS[name]
@@ -135,6 +136,7 @@ def test_derivative_of_the_last_state_in_all_times(name, adjoint):
     np.testing.assert_allclose(found, want, rtol=tol, atol=tol)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("name", "adjoint"), mostly_thorough(ENDS[:4], {ENDS[1]}))
 def test_derivative_of_dense_output_in_its_time_and_the_end(name, adjoint):
     method, settings, _ = METHODS[name]
@@ -238,6 +240,7 @@ def test_second_derivatives_distinguish_equal_adaptive_steps():
     assert_close(found[2][2], 2.0 * (v**2 + x * bent), 1e-5)
 
 
+@pytest.mark.thorough
 def test_second_derivatives_distinguish_fixed_steps_at_a_jump():
     def square(given):
         t0, eta, t1 = given
@@ -250,6 +253,7 @@ def test_second_derivatives_distinguish_fixed_steps_at_a_jump():
     assert_close(jax.jit(jax.jacfwd(jax.jacrev(square)))(given), want, 1e-6)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", mostly_thorough(OFTEN, ["ETD2RK, fixed"]))
 def test_linearize_returns_values_and_derivatives_in_times(name):
     # As least squares do: the values must be known before the tangents are.

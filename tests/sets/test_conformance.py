@@ -165,6 +165,7 @@ def test_projection_derivatives_in_point_and_data_in_both_modes(name, kind):
     np.testing.assert_allclose(forward, central, rtol=1e-6, atol=1e-6 * size)
 
 
+@pytest.mark.thorough
 @every_other_set
 def test_projection_keeps_single_precision(name):
     data = jnp.asarray(CASES[name].data, jnp.float32)
@@ -176,6 +177,7 @@ def test_projection_keeps_single_precision(name):
     np.testing.assert_allclose(np.asarray(p), exact, atol=3e-5)
 
 
+@pytest.mark.thorough
 @every_other_set
 def test_projection_propagates_nan_for_every_set(name):
     z = np.full((1, N), 0.2)

@@ -113,6 +113,7 @@ DEGENERATE = {
 }  # fmt: skip
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", mostly_thorough(DEGENERATE, list(DEGENERATE)[1::3]))
 def test_projection_onto_degenerate_sets(name):
     K, z, exact = DEGENERATE[name]
@@ -121,6 +122,7 @@ def test_projection_onto_degenerate_sets(name):
     assert np.all(np.isfinite(slope(K, z)))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("unit", mostly_thorough([1e-8, 1e8], [1e-8]))
 def test_projection_is_scale_invariant(unit):
     z = np.array([3.0, 1.0])
@@ -258,6 +260,7 @@ def test_simplices_of_unequal_size_equal_single_ones():
         np.testing.assert_allclose(p, np.maximum(v - levels[count] / own, 0.0), atol=1e-13)
 
 
+@pytest.mark.thorough
 def test_cone_projection_to_the_apex_is_exact_at_any_distance():
     """For points of the polar cone, the apex is the projection and every row counts as held."""
     rng = np.random.default_rng(8)

@@ -67,6 +67,7 @@ def test_long_tables_find_their_piece_as_short_ones_do(count):
     np.testing.assert_allclose(found, np.interp(asked, t, np.sin(9 * t)), rtol=1e-12)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_table_is_linear_in_its_values_and_its_gradient_says_how(kind):
     t = 0.37

@@ -40,10 +40,12 @@ def run(**variables: str) -> str:
     return ended.stdout.strip()
 
 
+@pytest.mark.thorough
 def test_programs_are_stored_and_an_unreadable_entry_is_compiled_again(tmp_path: Path) -> None:
     assert run(XDG_CACHE_HOME=str(tmp_path)) == "True True"
 
 
+@pytest.mark.thorough
 def test_a_folder_that_cannot_be_made_means_no_cache(tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("in the way")

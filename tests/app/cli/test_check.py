@@ -58,6 +58,7 @@ def test_check_accepts_a_system_without_decay(tmp_path: Path) -> None:
     assert "projection route             does not hold" in result.stdout
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("refuted", [row("gamma", status="refuted"), row("gamma", value=-1.0)])
 def test_check_strict_rejects_a_system_outside_the_class(
     tree: Path, monkeypatch: pytest.MonkeyPatch, refuted: dict[str, Any]

@@ -53,12 +53,14 @@ def test_run_manifest_records_double_precision(finished: tuple[Path, Any]) -> No
     assert "64" in str(manifest["precision"])
 
 
+@pytest.mark.thorough
 def test_run_quiet_prints_nothing(tmp_path: Path) -> None:
     config = write_config(tmp_path / "in")
     result = CliRunner().invoke(app, ["run", str(config), "-o", str(tmp_path / "out"), "--quiet"])
     assert (result.exit_code, result.output) == (0, "")
 
 
+@pytest.mark.thorough
 def test_run_replaces_results_only_with_force(tmp_path: Path, finished: tuple[Path, Any]) -> None:
     config = write_config(tmp_path / "in")
     out = write_run(tmp_path / "out", Recipe((30,)))

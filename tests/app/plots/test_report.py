@@ -34,6 +34,7 @@ def stills(run_dir: Path) -> set[str]:
     return {file.stem for file in (run_dir / "figures").glob("*.png")}
 
 
+@pytest.mark.thorough
 def test_report_of_a_large_run_has_a_limited_size(large: Path) -> None:
     page = large / "report.html"
     assert page.stat().st_size < 12e6
@@ -92,6 +93,7 @@ def test_report_without_frames_has_no_pictures(tmp_path: Path) -> None:
     assert stills(run_dir) == set()
 
 
+@pytest.mark.thorough
 def test_report_of_a_surface_has_maps_with_a_slider(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40, 25), frames=30))
     text = build_report(run_dir).read_text(encoding="utf-8")

@@ -108,6 +108,7 @@ def test_run_summary_and_manifest_agree_with_the_frames(tmp_path: Path):
     assert rows["q_rho"]["value"] == pytest.approx(0.6)  # b_u, at rho = beta
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not EL_CENTRO.is_file(), reason="the El Centro record is not on this machine")
 def test_run_of_the_strip_under_a_recorded_earthquake(tmp_path: Path):
     (tmp_path / "run").mkdir()
@@ -121,6 +122,7 @@ def test_run_of_the_strip_under_a_recorded_earthquake(tmp_path: Path):
     assert 0 < summary["error_bound_x"]["value"] < 1e-2
 
 
+@pytest.mark.thorough
 def test_run_reports_compilation_before_progress(tmp_path: Path):
     config = tmp_path / "strip.toml"
     # A size of its own: what another test has compiled is not compiled again.

@@ -197,6 +197,7 @@ def test_expression_random_tokens_raise_input_errors_only(cases):
     assert cases / 200 < passed < cases, "the soup reaches both verdicts"
 
 
+@pytest.mark.thorough
 @settings(max_examples=500, deadline=None, database=None, derandomize=True)
 @given(st.text(max_size=80) | st.lists(st.sampled_from(TOKENS), max_size=40).map("".join))
 def test_expression_arbitrary_text_raises_input_errors_only(text):

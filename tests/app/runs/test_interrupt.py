@@ -119,6 +119,7 @@ main()
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("number", [signal.SIGTERM])
 def test_blocked_main_thread_is_terminated(number: signal.Signals) -> None:
     run = subprocess.Popen(

@@ -98,6 +98,7 @@ def test_run_that_overflows_writes_all_files(tmp_path: Path, changes: Any) -> No
 REFUSED = InputError(InputProblem("dvax.solve(dt_max)", "1e-12", "it is too short", "Write more"))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("error", "code"),
     [(REFUSED, 2), (SolveError("f is nan at t = 3."), 3), (TypeError("odd"), None)],

@@ -81,6 +81,7 @@ def test_the_report_says_that_code_ran_and_draws_the_variables_in_order(outcome)
     assert "own.py" in manifest["data"] and manifest["fit"] == "a problem of your own: own.py"
 
 
+@pytest.mark.thorough
 def test_a_run_directory_runs_again(outcome, tmp_path):
     again = run(
         read_config(outcome.directory / "config.resolved.toml", allow_code=True), tmp_path / "again"
@@ -88,6 +89,7 @@ def test_a_run_directory_runs_again(outcome, tmp_path):
     assert again.summary == outcome.summary
 
 
+@pytest.mark.thorough
 def test_arrays_and_a_certified_run(tmp_path):
     table = TABLE + "certify = true\nrtol = 1e-4\n[model.parameters]\npoints = 5\n"
     found = run(read_config(written(tmp_path, table=table), allow_code=True), tmp_path / "run")

@@ -81,7 +81,7 @@ def made(tmp_path_factory):
     return found
 
 
-@pytest.fixture(params=MODELS)
+@pytest.fixture(params=mostly_thorough(MODELS, ["own"]))
 def folder(request, made):
     return made[request.param]
 
@@ -112,6 +112,7 @@ def test_a_resumed_run_equals_one_that_was_not_interrupted(folder, part):
         assert manifest.get(key) == whole.get(key)
 
 
+@pytest.mark.thorough
 def test_a_run_that_failed_within_a_piece_resumes_at_its_beginning(tmp_path):
     """f is NaN for 1.03 < t < 1.09, and 21 frames make pieces of 0.2."""
     hole = POINT.replace(

@@ -101,6 +101,7 @@ def test_failures_are_named_and_leave_the_others_alone(outcome, events):
     assert kept == {"000000"}  # the other one failed before there was a run
 
 
+@pytest.mark.thorough
 def test_second_call_runs_nothing_but_the_failed_members(sweep, copy):
     before, events = values(copy), []
     again = run_sweep(sweep, copy, resume=True, workers=1, tell=events.append)
@@ -122,6 +123,7 @@ def test_member_alone_has_the_bits_of_the_sweep(sweep, copy):
         np.testing.assert_array_equal(before[name], after[name], err_msg=name)
 
 
+@pytest.mark.thorough
 def test_changed_configuration_is_run_again_and_an_unchanged_one_is_not(sweep, copy, tmp_path):
     moved = shutil.copytree(sweep.source.parent, tmp_path / "moved")
     same = read_sweep(moved / "sweep.toml", allow_code=True)
@@ -156,6 +158,7 @@ def test_targets_are_checked_before_anything_runs(sweep, outcome, tmp_path):
     assert driver.target_problems(tmp_path / "none", resume=False) == []
 
 
+@pytest.mark.thorough
 def test_report_shows_figures_failures_and_ranges(copy):
     page = build_report(copy).read_text()
     assert "2 members failed" in page and "this rate has no model" in page
