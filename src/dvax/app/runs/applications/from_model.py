@@ -4,14 +4,13 @@ import abc
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import jax.tree_util as jtu
 import numpy as np
 from pydantic import Field
 
 from dvax.app.runs.applications.base import (
-    AbstractApplication,
     Description,
     Figure,
     PerRow,
@@ -21,7 +20,7 @@ from dvax.app.runs.applications.base import (
     Variable,
 )
 from dvax.app.runs.applications.certificate import Certificate, certificate
-from dvax.app.runs.schema import SolverKeys
+from dvax.app.runs.schema import Section, SolverKeys
 from dvax.app.runs.solver_options import check_model_steps, settings
 from dvax.errors import input_error
 from dvax.evolution import Solution
@@ -39,12 +38,18 @@ class FramesKeys(SolverKeys):
     frames: int = Field(200, ge=1, le=10**6, description="number of intervals between saved states")
 
 
-class AbstractModelApplication(AbstractApplication):
-    """An application that is complete when its constructor has called `set_model`.
+class AbstractModelApplication(abc.ABC):
+    """A model that the table `[model]` of a configuration describes alone.
 
-    A subclass says which variables and figures its results have, in `series` and `figures`; it may
-    add to `sizes`, `notes`, `fixed` and `write_files`, and `prepare` a run. Its attributes:
+    Its constructor gets that table and the places of its data; with `quiet` it prints no progress. It
+    checks everything, solves nothing, and calls `set_model`. It raises `dvax.InputError` with all
+    problems. A subclass says which variables and figures its results have, in `series` and `figures`;
+    it may add to `sizes`, `notes`, `fixed` and `write_files`, and `prepare` a run. Its attributes:
 
+    - `section`: the table, for pydantic; `table`: the checked one, complete;
+    - `files`, `folders`: the keys that name data files, and folders with the files that are read there;
+    - `keys`: the keys that make an argument of the model, where their names differ from its name;
+    - `end`: the key for the last time of a run, where there is one;
     - `axis`: the name and the description of the saved times in the results;
     - `certified`: whether steps are chosen for a proved bound;
     - `verified`: whether `dvax.verify` checks the assumptions, besides the constants of the model;
@@ -52,6 +57,11 @@ class AbstractModelApplication(AbstractApplication):
       that of the state in the norm of the state space.
     """
 
+    section: ClassVar[type[Section]]
+    files: ClassVar[tuple[str, ...]] = ()
+    folders: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    keys: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    end: ClassVar[str | None] = None
     table: Any
     own: Model
     t_end: float
@@ -64,6 +74,14 @@ class AbstractModelApplication(AbstractApplication):
     bound_scale = 1.0
     place_of_figures = "figures"
 
+    @abc.abstractmethod
+    def __init__(self, table: Any, paths: Mapping[str, Path], quiet: bool): ...
+
+    @property
+    @abc.abstractmethod
+    def fit(self) -> str:
+        """Whether the model is in the class: "exact", by what it is regularised, or why it is not."""
+
     def set_model(
         self, model: Model, t_end: float | None = None, times: np.ndarray | None = None
     ) -> None:
@@ -72,7 +90,7 @@ class AbstractModelApplication(AbstractApplication):
 
         **Raises:** `dvax.InputError` if the run ends before it starts, or has no such steps.
         """
-        self.own, self.title, self.per_row = model, model.title, PerRow()
+        self.own, self.per_row = model, PerRow()
         self.t_end = float(model.t_end if t_end is None else t_end)
         if not self.t_end > model.t0:
             raise input_error(
@@ -98,11 +116,15 @@ class AbstractModelApplication(AbstractApplication):
         """The variables without a time axis, such as places, and fields at the last row of `end`."""
         return {}
 
-    def write_files(self, directory: Path, end: Solution) -> None:
-        """Write further files into the run directory, from the last row of `end`."""
+    def write_files(self, directory: Path, end: Solution) -> tuple[str, ...]:
+        """Write further files into the run directory, from the last row of `end`, and return their
+        names."""
+        return ()
 
-    def prepare(self, say: Say) -> None:
-        """Compute what a run needs before it is solved. **Raises:** `dvax.SolveError`."""
+    def prepare(self, say: Say) -> Model:
+        """Compute what a run needs before it is solved, and return the model, its initial state being
+        known. **Raises:** `dvax.SolveError`."""
+        return self.own
 
     def call(self, work: Callable[[], Any]) -> Any:
         """Return work(), which evaluates functions of the problem."""
@@ -118,6 +140,7 @@ class AbstractModelApplication(AbstractApplication):
 
     @property
     def settings(self) -> dict[str, Any]:
+        """The method, steps and tolerances: keywords for `dvax.solve`."""
         return settings(self.table, **self.own.settings)
 
     @cached_property
@@ -136,6 +159,7 @@ class AbstractModelApplication(AbstractApplication):
         return self.verification.assumptions if self.verified else ()
 
     def describe(self) -> Description:
+        """Constants, assumptions, sizes and notes: what is known before anything is solved."""
         m = self.own
         count = sum(np.size(leaf) for leaf in jtu.tree_leaves(m.x0))
         law = sum(np.size(leaf) for leaf in jtu.tree_leaves(m.problem.zero_control(m.x0)))
@@ -164,19 +188,26 @@ class AbstractModelApplication(AbstractApplication):
         return name, reason
 
     def plan(self, say: Say) -> Plan:
-        self.prepare(say)
-        m, times = self.own, self.times
+        """What to integrate, all else being computed. **Raises:** `dvax.SolveError`."""
+        m = self.own = self.prepare(say)
+        times = self.times
         if len(times) > 1:
             say(f"solving from {times[0]:g} to {times[-1]:g} {m.time_unit}".rstrip())
         constants = self.constants if self.certified else None
         return Plan(
-            m.problem, m.x0, times, constants, self.settings, None, m.time_unit, m.args
+            m.problem, m.x0, times, constants, self.settings, m.time_unit, m.args
         )  # fmt: skip
 
-    def results(self, plan: Plan, solution: Solution, count: int) -> Results:
+    def results(self, plan: Plan, solution: Any, count: int) -> Results:
+        """The results up to the time number `count` of the plan.
+
+        The solution has all rows of the plan; rows that were not reached repeat the last of those
+        `count`, so that one compiled program serves all results. It is None where the plan has one
+        time alone.
+        """
         name, words = self.axis
         time = Variable((name,), np.asarray(plan.times), self.own.time_unit, words)
-        bound = self._bound(solution)
+        bound, end = self._bound(solution), cast(Solution, solution)
         over_time = {
             key: Variable(v.dims, v.values[:count], v.unit, v.words, v.status)
             for key, v in {name: time, **self.series(solution, bound)}.items()
@@ -187,10 +218,10 @@ class AbstractModelApplication(AbstractApplication):
         return Results(
             self.figures(values, solution, bound), {**over_time, **self.fixed(solution)},
             self.constants, 0 if solution is None else int(solution.stats["steps"]),
-            self.assumptions, files=lambda directory: self.write_files(directory, solution),
+            self.assumptions, files=lambda directory: self.write_files(directory, end),
         )  # fmt: skip
 
-    def _bound(self, solution: Solution | None) -> Certificate | None:
+    def _bound(self, solution: Any) -> Certificate | None:
         if self.constants is None or solution is None:
             return None
         found = certificate(self.own.problem, solution, self.constants)

@@ -124,9 +124,10 @@ class FemContactApplication(AbstractModelApplication):
     def notes(self) -> tuple[str, ...]:
         return _notes(self)
 
-    def prepare(self, say: Say) -> None:
+    def prepare(self, say: Say) -> Model:
         say("solving at rest")
         self.rest = self.contact.equilibrium()
+        return self.own
 
     def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
         m = self.contact
@@ -186,8 +187,9 @@ class FemContactApplication(AbstractModelApplication):
             **self.bound_figure(_known(bound)),
         }  # fmt: skip
 
-    def write_files(self, directory: Path, end: Solution) -> None:
+    def write_files(self, directory: Path, end: Solution) -> tuple[str, ...]:
         self.contact.write(directory / "body.vtu", end.ts[-1], end.xs[-1])
+        return "body.vtu", "body-contact.vtu"
 
 
 def _known(bound: Certificate | None) -> Certificate | None:

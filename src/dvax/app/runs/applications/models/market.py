@@ -90,11 +90,11 @@ class MarketApplication(AbstractModelApplication):
             ("hours", str(len(self.times)), f"from hour {self.table.start_hour} on"),
         ]
 
-    def prepare(self, say: Say) -> None:
+    def prepare(self, say: Say) -> Model:
         say("solving for the prices at rest")
         prices, made = jax.vmap(self.market.equilibrium)(jnp.asarray(self.times))
-        self.own = replace(self.own, x0=prices[0])
         self.prices, self.made = np.asarray(prices), np.asarray(made)
+        return replace(self.own, x0=prices[0])
 
     def series(
         self, solution: Solution | None, bound: Certificate | None
