@@ -13,6 +13,7 @@ from tests.once import once
 from tests.selection import mostly_thorough
 
 import dvax
+from dvax.theory.certificate import continue_bound
 
 RUNS = {
     "adaptive ETD2RK": dict(rtol=1e-5, atol=1e-5, method=dvax.ETD2RK()),
@@ -129,6 +130,27 @@ def test_bound_error_of_a_run_in_pieces_equals_that_of_the_whole():
     whole, pieces = _pieces(ALL["C1"]().constants)
     for name in whole:
         np.testing.assert_allclose(pieces[name], whole[name], rtol=1e-10, err_msg=name)
+
+
+def test_bound_of_pieces_with_one_semigroup_equals_that_of_the_whole():
+    """M > 1 multiplies the integral over all pieces once."""
+    case = ALL["C1"]()
+    c = replaced(case.constants, M=2.0)
+    run = lambda x, t0, ts: dvax.solve(  # noqa: E731
+        case.problem, x, t0, ts[-1], args=case.args, ts=np.asarray(ts), dt=0.125, measure=True
+    )
+    whole = dvax.bound_error(case.problem, run(-1.0, 0.0, [0.5, 1.0, 1.5, 2.0]), c)
+    x, joined = -1.0, []
+    for begin in (0.0, 1.0):
+        part = run(x, begin, [begin + 0.5, begin + 1.0])
+        if joined:
+            joined.append(continue_bound(case.problem, part, c, joined[-1]))
+        else:
+            joined.append(dvax.bound_error(case.problem, part, c))
+        x = part.xs[-1]
+    for name in ("x", "u", "x_paper", "x_sharp"):
+        found = np.concatenate([getattr(bound, name) for bound in joined])
+        np.testing.assert_allclose(found, getattr(whole, name), rtol=1e-10, err_msg=name)
 
 
 @pytest.mark.thorough

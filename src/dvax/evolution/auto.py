@@ -132,7 +132,7 @@ def choose(
     if fixed:
         return Choice(_ETD2RK, "the steps are given")
     if certified:
-        return Choice(_ETD2RK, "its defect can be enclosed, so that a bound is proved")
+        return Choice(_ETD2RK, "a proved bound needs a defect that can be enclosed")
     facts = _facts(problem, x0, args)
     if facts.is_field and not facts.pointwise:
         return _with_fallback(

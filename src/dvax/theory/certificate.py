@@ -42,6 +42,8 @@ class Bound(eqx.Module):
     - `x_paper`, `u_paper`: with the paper's rate ω + ML̃;
     - `x_sharp`, `u_sharp`: with the one-sided constant μ or the rate of an energy norm, whichever is
       smaller; None if neither is known;
+    - `integrals`, (m, k): the Gronwall estimates of the k rates over their factors M, with which a run
+      that goes on starts; None if the problem was solved again;
     - `status`: the weakest status among the quantities in the bound. "proved" means that the constants
       are proved, that M, ω and ‖P⁻¹‖ are at least those implied by the structure of A and P, and that
       the defect is enclosed over every step. "estimated" means that the defect was sampled.
@@ -58,6 +60,7 @@ class Bound(eqx.Module):
     x_sharp: jax.Array | None
     u_sharp: jax.Array | None
     status: Status = eqx.field(static=True)
+    integrals: jax.Array | None = None
 
     def to_xarray(self, *, time_unit: str = "", x_unit: str = "", u_unit: str = "") -> Any:
         """Return the bounds as an `xarray.Dataset` over `time`: `error_bound_x`, `error_bound_u`, and
@@ -120,6 +123,27 @@ def bound_error(
     ```
     """
     _check(problem, sol, constants, initial_error)
+    return _bound_error(
+        problem, sol, constants, _initial_errors(initial_error, constants, sol.ts.dtype)
+    )
+
+
+def continue_bound(problem: Problem, sol: Solution, constants: Constants, before: Bound) -> Bound:
+    """Bound the error of a solution that goes on from the last state of another one of the same
+    problem, whose bound is `before`.
+
+    Both are one trajectory with one semigroup, so that the integral of each rate goes on,
+    ∫₀ᵗ = e^{c(t−τ)} ∫₀^τ + ∫_τ^t, and M multiplies their sum once. `bound_error` does not assume that
+    the pieces have one semigroup.
+    """
+    _check(problem, sol, constants, before)
+    if before.integrals is None:
+        return bound_error(problem, sol, constants, initial_error=before)
+    return _bound_error(problem, sol, constants, tuple(before.integrals[-1]))
+
+
+def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial: tuple) -> Bound:
+    """Return the bound for these initial errors, one for each rate."""
     space = problem.spaces(sol.setup.x0)[0]
     measured, distance = sol, jnp.zeros_like(sol.ts)
     domain = constants.domain
@@ -134,9 +158,9 @@ def bound_error(
 
     defects = (measured.defect, measured.law_defect), measured.completed_defect
     law = sol.law_residual, sol.law_step, of_u
-    initial = _initial_errors(initial_error, sol.ts.dtype)
     t0 = jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
-    x, u, x_sharp, u_sharp = _bounds(constants, t0, sol.ts, defects, distance, law, initial)
+    estimates, integrals = _estimates(constants, t0, sol.ts, defects, initial)
+    x, u, x_sharp, u_sharp = _bounds(constants, estimates, distance, law)
     best_x = x if x_sharp is None else jnp.minimum(x, x_sharp)
     best_u = u if u_sharp is None else jnp.minimum(u, u_sharp)
     domain_status: Status = "proved"
@@ -159,11 +183,11 @@ def bound_error(
     )
 
     def valid(v: jax.Array | None) -> Any:
-        return None if v is None else jnp.where(inside, v, jnp.inf)
+        return None if v is None else jnp.where(inside, v.T, jnp.inf).T
 
     return Bound(
         sol.ts, valid(best_x), valid(best_u), valid(x), valid(u), valid(x_sharp), valid(u_sharp),
-        status,
+        status, valid(integrals) if measured is sol else None,
     )  # fmt: skip
 
 
@@ -187,16 +211,19 @@ def _roundoff(problem: Problem, sol: Solution) -> tuple[jax.Array, jax.Array]:
 
 
 @jax.jit
-def _bounds(
-    c: Constants, t0: Any, ts: Any, defects: tuple, distance: Any, law: tuple, initial: tuple
-) -> tuple:
-    """Return x, u, x_sharp and u_sharp of `Bound`."""
+def _estimates(c: Constants, t0: Any, ts: Any, defects: tuple, initial: tuple) -> tuple:
+    """Return the Gronwall estimate of each rate, and all of them over their factors M."""
     total, completed = (disturbance(c, *parts) for parts in defects)
+    rates = _rates(c, initial)
+    found = [gronwall(t0, ts, total, completed, rate, M, error) for M, rate, error in rates]
+    return found, jnp.stack([x / M for x, (M, *_) in zip(found, rates, strict=True)], axis=1)
+
+
+@jax.jit
+def _bounds(c: Constants, estimates: list, distance: Any, law: tuple) -> tuple:
+    """Return x, u, x_sharp and u_sharp of `Bound`."""
     law_error = _law_error(c, *law)
-    x, *others = (
-        gronwall(t0, ts, total, completed, rate, M, error) + distance
-        for M, rate, error in _rates(c, initial)
-    )
+    x, *others = (estimate + distance for estimate in estimates)
     u = c.L * x + law_error
     if not others:
         return x, u, None, None
@@ -211,9 +238,10 @@ def _law_error(c: Constants, residual: Any, step: Any, roundoff: Any) -> Any:
 
 def _rates(c: Constants, initial: tuple) -> list[tuple[Any, Any, Any]]:
     """Return (M, rate, initial error) of every Gronwall estimate: the paper's, then the sharp ones."""
-    rates = [(c.M, c.growth_rate, initial[0])]
-    rates += [] if c.one_sided is None else [(1.0, c.one_sided, initial[1])]
-    return rates + ([] if c.energy is None else [(*c.energy, initial[1])])
+    rates = [(c.M, c.growth_rate)]
+    rates += [] if c.one_sided is None else [(1.0, c.one_sided)]
+    rates += [] if c.energy is None else [c.energy]
+    return [(*rate, error) for rate, error in zip(rates, initial, strict=True)]
 
 
 @jax.jit
@@ -309,13 +337,13 @@ def _continuation_problems(previous: Bound, t0: Any) -> list[InputProblem]:
     ]
 
 
-def _initial_errors(initial_error: Any, dtype: Any) -> tuple[Any, Any]:
-    """Return the initial errors of the paper's and of the sharp bound."""
-    if isinstance(initial_error, Bound):
-        paper, sharp = initial_error.x_paper, initial_error.x_sharp
-        return paper[-1], (paper if sharp is None else sharp)[-1]
-    error = jnp.asarray(initial_error, dtype)
-    return error, error
+def _initial_errors(initial_error: Any, c: Constants, dtype: Any) -> tuple[Any, ...]:
+    """Return the initial error of every rate."""
+    count = 1 + (c.one_sided is not None) + (c.energy is not None)
+    if not isinstance(initial_error, Bound):
+        return (jnp.asarray(initial_error, dtype),) * count
+    paper, sharp = initial_error.x_paper, initial_error.x_sharp
+    return paper[-1], *((paper if sharp is None else sharp)[-1],) * (count - 1)
 
 
 def _status_of_structure(problem: Problem, sol: Solution, c: Constants) -> Status:

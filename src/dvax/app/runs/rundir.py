@@ -34,10 +34,7 @@ from dvax.app.runs.lock import NAME as LOCK
 from dvax.app.runs.lock import lock
 from dvax.errors import Problems
 
-FILES = (
-    "config.resolved.toml", "manifest.json", "summary.json", "log.jsonl", "report.html",
-    "body.vtu", "body-contact.vtu",
-)  # fmt: skip
+FILES = ("config.resolved.toml", "manifest.json", "summary.json", "log.jsonl", "report.html")
 FOLDERS = (
     "trajectory.zarr", ".trajectory.zarr.new", ".trajectory.zarr.old", "figures", "inputs",
     checkpoints.FOLDER,
@@ -53,7 +50,7 @@ class RunDirectory:
         path.mkdir(parents=True, exist_ok=True)
         self._lock = lock(path)
         if clear:
-            for name in FILES:
+            for name in (*_further_files(path / "manifest.json"), *FILES):
                 (path / name).unlink(missing_ok=True)
             for name in FOLDERS:
                 if (path / name).exists():
@@ -88,6 +85,15 @@ class RunDirectory:
     def close(self) -> None:
         self._log.close()
         self._lock.close()
+
+
+def _further_files(manifest: Path) -> list[str]:
+    """Return the files that the model of a run wrote, by its manifest."""
+    try:
+        names = json.loads(manifest.read_text(encoding="utf-8"))["files"]
+        return [name for name in names if name == Path(name).name]
+    except (OSError, ValueError, LookupError, TypeError):
+        return []
 
 
 def _repair(log: Path) -> int:

@@ -209,11 +209,15 @@ class Frame(eqx.Module):
         bounded by means of the acceleration. The bound is proportional to τ, and not sharp. Source:
         Brokate and Sprekels, *Hysteresis and Phase Transitions* (1996), Proposition 2.3.4.
         """
+        return self.distance_bound(solution.ts, solution.xs[:, 1])
+
+    def distance_bound(self, ts: Any, velocity: Any) -> jax.Array:
+        """Return the bound of `elastoplastic_distance` from the velocities at the times ts."""
         w, tau, limit = self.omega, self.viscosity_ratio, self.yield_displacement
-        ts = solution.ts
+        ts = jnp.asarray(ts)
         half = 0.5 * jnp.max(jnp.diff(ts, prepend=0.0))
         ground = jnp.max(jnp.abs(self.record.samples))
-        speed = jax.lax.cummax(jnp.abs(solution.xs[:, 1]))
+        speed = jax.lax.cummax(jnp.abs(jnp.asarray(velocity)))
         denominator = 1.0 - half * (2.0 * self.damping * w + w**2 * tau)
         max_speed = (speed + half * (w**2 * limit + ground)) / denominator
         max_speed = jnp.where(denominator > 0.0, max_speed, jnp.inf)

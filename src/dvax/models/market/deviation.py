@@ -37,7 +37,20 @@ def largest_gain(
 
     ```
     """
-    best = 0.0
+    return float(largest_gains(price, output, capacity, cost, slope, firms, b).max())
+
+
+def largest_gains(
+    price: np.ndarray,
+    output: np.ndarray,
+    capacity: np.ndarray,
+    cost: np.ndarray,
+    slope: np.ndarray,
+    firms: np.ndarray,
+    b: float,
+) -> np.ndarray:
+    """Return the largest gain of any firm by a unilateral deviation, or 0, at each time."""
+    best = np.zeros(len(price))
     for f in range(firms.shape[1]):
         units = firms[:, f] > 0.5
         c, a, cap, u = cost[units], slope[units], capacity[:, units], output[:, units]
@@ -55,5 +68,5 @@ def largest_gain(
         d = offer(0.5 * (low + high)) - u
         first = ((price - b * u.sum(axis=1))[:, None] - c - a * u) * d
         second = 0.5 * (a * d * d).sum(axis=1) + b * d.sum(axis=1) ** 2
-        best = max(best, float(np.max(first.sum(axis=1) - second)))
+        best = np.maximum(best, first.sum(axis=1) - second)
     return best

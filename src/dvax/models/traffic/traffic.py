@@ -240,22 +240,27 @@ class Traffic(eqx.Module):
         largest |Σ flows/d(t) − 1| over pairs and saved times, of u, and for constant d of x as
         well."""
         t, x = float(solution.ts[-1]), solution.xs[-1]
+        return {
+            "objective": float(self.objective(t, x)),
+            "total_travel_time": float(self.total_travel_time(t, x)),
+            "max_conservation_error": float(self.conservation_errors(solution).max()),
+        }
+
+    def conservation_errors(self, solution: Solution) -> np.ndarray:
+        """Return the largest |Σ flows/d(t) − 1| over pairs at each saved time, of u, and for constant
+        d of x as well."""
         all_flows = [np.asarray(solution.us)]
         if self.factor is None:
             all_flows.append(np.asarray(solution.xs))
-        worst = 0.0
+        worst = np.zeros(len(solution.ts))
         for k, time in enumerate(np.asarray(solution.ts)):
             d = np.asarray(self.demands(time))
             for flows in all_flows:
                 sums = np.add.reduceat(flows[k], self.paths.starts)
                 # If the demand of a pair is 0 at this time, the error is relative to its trips.
                 scale = np.where(d > 0, d, self.trips.flow)
-                worst = max(worst, float(np.max(np.abs(sums - d) / scale)))
-        return {
-            "objective": float(self.objective(t, x)),
-            "total_travel_time": float(self.total_travel_time(t, x)),
-            "max_conservation_error": worst,
-        }
+                worst[k] = max(worst[k], float(np.max(np.abs(sums - d) / scale)))
+        return worst
 
 
 def _report(message: str) -> None:

@@ -1,16 +1,14 @@
-"""The interface between an application and a run."""
+"""What an application gives to a run."""
 
-import abc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from dvax.app.runs.figure import Figure as Figure
-from dvax.app.runs.schema import Section
 from dvax.problem import Problem
 from dvax.theory import Assumption, Constants
 
@@ -30,7 +28,8 @@ class Variable:
 @dataclass(frozen=True)
 class Results:
     """The results of a run: figures for summary.json, variables for trajectory.zarr, constants and
-    assumptions for the report; `files` writes further files into the run directory."""
+    assumptions for the report; `files` writes further files into the run directory, and returns their
+    names."""
 
     figures: Mapping[str, Figure]
     variables: Mapping[str, Variable]
@@ -38,7 +37,7 @@ class Results:
     steps: int
     assumptions: tuple[Assumption, ...] = ()
     notices: tuple[str, ...] = ()
-    files: Callable[[Path], None] | None = None
+    files: Callable[[Path], tuple[str, ...]] | None = None
 
 
 class Description(NamedTuple):
@@ -54,15 +53,13 @@ class Description(NamedTuple):
 @dataclass(frozen=True)
 class Plan:
     """What a run integrates: the problem from x0 at the first of `times` up to the last, saved at all
-    of them, with these `settings` (`AbstractApplication.settings`). `data` is the application's
-    own."""
+    of them, with these `settings`."""
 
     problem: Problem
     x0: Any
     times: np.ndarray
     constants: Constants | None
     settings: Mapping[str, Any]
-    data: Any = None
     time_unit: str = ""
     args: Any = None
 
@@ -85,55 +82,3 @@ class PerRow:
 
 Say = Callable[[str], None]
 """A function that reports the next stage of a run: "solving at rest"."""
-
-
-class AbstractApplication(abc.ABC):
-    """A model that the table `[model]` of a configuration describes alone.
-
-    It is made from that table and the places of its data, everything checked and nothing solved; with
-    `quiet` it prints no progress. The constructor raises `dvax.InputError` with all problems.
-
-    - `section`: the table, for pydantic; `table`: the checked one, complete;
-    - `files`, `folders`: the keys that name data files, and folders with the files that are read there;
-    - `keys`: the keys that make an argument of the model, where their names differ from its name;
-    - `end`: the key for the last time of a run, where there is one;
-    - `title`: of the run, by default that of the configuration.
-    """
-
-    section: ClassVar[type[Section]]
-    table: Any
-    files: ClassVar[tuple[str, ...]] = ()
-    folders: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-    keys: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-    end: ClassVar[str | None] = None
-    title: str = ""
-
-    @abc.abstractmethod
-    def __init__(self, table: Any, paths: Mapping[str, Path], quiet: bool): ...
-
-    @property
-    @abc.abstractmethod
-    def fit(self) -> str:
-        """Whether the model is in the class: "exact", by what it is regularised, or why it is not."""
-
-    @property
-    @abc.abstractmethod
-    def settings(self) -> Mapping[str, Any]:
-        """The method, steps and tolerances: keywords for `dvax.solve`."""
-
-    @abc.abstractmethod
-    def describe(self) -> Description:
-        """Constants, assumptions, sizes and notes: what is known before anything is solved."""
-
-    @abc.abstractmethod
-    def plan(self, say: Say) -> Plan:
-        """What to integrate, all else being computed. **Raises:** `dvax.SolveError`."""
-
-    @abc.abstractmethod
-    def results(self, plan: Plan, solution: Any, count: int) -> Results:
-        """The results up to the time number `count` of the plan.
-
-        The `dvax.Solution` has all rows of the plan; rows that were not reached repeat the last of
-        those `count`, so that one compiled program serves all results. It is None where the plan has
-        one time alone.
-        """

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ValidationError
 
 from dvax.app.runs.applications import models
-from dvax.app.runs.applications.base import AbstractApplication
 from dvax.app.runs.config import Config, check_contact
 from dvax.app.runs.data_file import DataFile, fingerprint, locate
 from dvax.app.runs.schema import SECTIONS, ModelSection, ReportSection, Section
@@ -21,6 +20,9 @@ from dvax.app.runs.toml_file import read_toml
 from dvax.app.runs.units import Units
 from dvax.app.runs.wording import Wording
 from dvax.errors import Problems, input_error
+
+if TYPE_CHECKING:
+    from dvax.app.runs.applications.from_model import AbstractModelApplication
 
 OWN = "python"
 """The name of `[model]` for a problem of the user's own."""
@@ -47,8 +49,8 @@ class ModelConfig:
     table: Section
     output: ReportSection
     source: Path
-    application: type[AbstractApplication]
-    model: AbstractApplication
+    application: "type[AbstractModelApplication]"
+    model: "AbstractModelApplication"
     paths: Mapping[str, Path]
 
     @property
@@ -84,7 +86,7 @@ class ModelConfig:
         }
 
 
-def wording_of(application: type[AbstractApplication], file: str) -> Wording:
+def wording_of(application: "type[AbstractModelApplication]", file: str) -> Wording:
     """The keys of a `file` that the arguments of an application come from."""
     elsewhere = {} if application.end is None else {"t1": application.end}
     return Wording(file, "model", application.section, application.keys, elsewhere)

@@ -1,31 +1,32 @@
-"""Applications whose problem is a `dvax.models.Model`: states and responses over time, by name."""
+"""Applications whose problem is a `dvax.models.Model`."""
 
 import abc
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar, cast
 
 import jax.tree_util as jtu
 import numpy as np
 from pydantic import Field
 
 from dvax.app.runs.applications.base import (
-    AbstractApplication,
     Description,
     Figure,
+    PerRow,
     Plan,
     Results,
     Say,
     Variable,
 )
 from dvax.app.runs.applications.certificate import Certificate, certificate
-from dvax.app.runs.schema import SolverKeys
+from dvax.app.runs.schema import Section, SolverKeys
 from dvax.app.runs.solver_options import check_model_steps, settings
 from dvax.errors import input_error
 from dvax.evolution import Solution
 from dvax.evolution.auto import choose
 from dvax.models import Model
-from dvax.theory import Constants, verify
+from dvax.theory import Assumption, Constants, verify
 
 _FIGURES = 12
 """Up to this many final values are figures of the summary."""
@@ -37,43 +38,93 @@ class FramesKeys(SolverKeys):
     frames: int = Field(200, ge=1, le=10**6, description="number of intervals between saved states")
 
 
-class AbstractModelApplication(AbstractApplication):
-    """An application that is complete when its constructor has called `set_model`.
+class AbstractModelApplication(abc.ABC):
+    """A model that the table `[model]` of a configuration describes alone.
 
-    A subclass adds its own sizes, notes, figures and series in `sizes`, `notes` and `further`.
+    Its constructor gets that table and the places of its data; with `quiet` it prints no progress. It
+    checks everything, solves nothing, and calls `set_model`. It raises `dvax.InputError` with all
+    problems. A subclass says which variables and figures its results have, in `series` and `figures`;
+    it may add to `sizes`, `notes`, `fixed` and `write_files`, and `prepare` a run. Its attributes:
+
+    - `section`: the table, for pydantic; `table`: the checked one, complete;
+    - `files`, `folders`: the keys that name data files, and folders with the files that are read there;
+    - `keys`: the keys that make an argument of the model, where their names differ from its name;
+    - `end`: the key for the last time of a run, where there is one;
+    - `axis`: the name and the description of the saved times in the results;
+    - `certified`: whether steps are chosen for a proved bound;
+    - `verified`: whether `dvax.verify` checks the assumptions, besides the constants of the model;
+    - `bound_words`, `bound_unit`, `bound_scale`: of the bound on the error, which is the scale times
+      that of the state in the norm of the state space.
     """
 
+    section: ClassVar[type[Section]]
+    files: ClassVar[tuple[str, ...]] = ()
+    folders: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    keys: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    end: ClassVar[str | None] = None
     table: Any
     own: Model
     t_end: float
+    times: np.ndarray
+    axis: ClassVar[tuple[str, str]] = ("time", "time")
     certified = True
-    """Whether steps are chosen for a proved bound."""
+    verified = True
     bound_words = "bound on the error of the state in the norm of the state space"
     bound_unit = ""
+    bound_scale = 1.0
     place_of_figures = "figures"
 
-    def set_model(self, model: Model, t_end: float | None) -> None:
-        """Take the `model`, and run it until `t_end`, or as long as the model says.
+    @abc.abstractmethod
+    def __init__(self, table: Any, paths: Mapping[str, Path], quiet: bool): ...
+
+    @property
+    @abc.abstractmethod
+    def fit(self) -> str:
+        """Whether the model is in the class: "exact", by what it is regularised, or why it is not."""
+
+    def set_model(
+        self, model: Model, t_end: float | None = None, times: np.ndarray | None = None
+    ) -> None:
+        """Take the `model`, and run it until `t_end`, or as long as the model says; save `times`, or
+        equally many frames as the table says.
 
         **Raises:** `dvax.InputError` if the run ends before it starts, or has no such steps.
         """
-        self.own, self.title = model, model.title
+        self.own, self.per_row = model, PerRow()
         self.t_end = float(model.t_end if t_end is None else t_end)
         if not self.t_end > model.t0:
             raise input_error(
                 "model.t_end", f"{self.t_end:g}", f"the run begins at {model.t0:g}",
                 "Write a later time",
             )  # fmt: skip
+        equal = times is None
+        self.times = np.linspace(model.t0, self.t_end, self.table.frames + 1) if equal else times
         span = self.t_end - model.t0
-        check_model_steps(self.table, span, f"{span:g} {model.time_unit}")
+        check_model_steps(self.table, span, f"{span:g} {model.time_unit}".rstrip())
 
     @abc.abstractmethod
-    def further(
-        self, solution: Solution, bound: Certificate | None
-    ) -> tuple[Mapping[str, Variable], Mapping[str, Figure]]:
-        """Series and figures besides those of the names of the model.
+    def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
+        """The variables over time, at the rows of a solution."""
 
-        The solution has all rows of the plan, and the results keep those that were reached."""
+    @abc.abstractmethod
+    def figures(
+        self, series: Mapping[str, np.ndarray], end: Solution, bound: Certificate | None
+    ) -> Mapping[str, Figure]:
+        """The figures of the summary, from the series and from the last row of the solution `end`."""
+
+    def fixed(self, end: Solution) -> Mapping[str, Variable]:
+        """The variables without a time axis, such as places, and fields at the last row of `end`."""
+        return {}
+
+    def write_files(self, directory: Path, end: Solution) -> tuple[str, ...]:
+        """Write further files into the run directory, from the last row of `end`, and return their
+        names."""
+        return ()
+
+    def prepare(self, say: Say) -> Model:
+        """Compute what a run needs before it is solved, and return the model, its initial state being
+        known. **Raises:** `dvax.SolveError`."""
+        return self.own
 
     def call(self, work: Callable[[], Any]) -> Any:
         """Return work(), which evaluates functions of the problem."""
@@ -89,6 +140,7 @@ class AbstractModelApplication(AbstractApplication):
 
     @property
     def settings(self) -> dict[str, Any]:
+        """The method, steps and tolerances: keywords for `dvax.solve`."""
         return settings(self.table, **self.own.settings)
 
     @cached_property
@@ -102,7 +154,12 @@ class AbstractModelApplication(AbstractApplication):
         """Those of the model, or else those of `dvax.verify`."""
         return self.own.constants or self.verification.constants
 
+    @property
+    def assumptions(self) -> tuple[Assumption, ...]:
+        return self.verification.assumptions if self.verified else ()
+
     def describe(self) -> Description:
+        """Constants, assumptions, sizes and notes: what is known before anything is solved."""
         m = self.own
         count = sum(np.size(leaf) for leaf in jtu.tree_leaves(m.x0))
         law = sum(np.size(leaf) for leaf in jtu.tree_leaves(m.problem.zero_control(m.x0)))
@@ -112,13 +169,13 @@ class AbstractModelApplication(AbstractApplication):
             *self.sizes(),
             (
                 "time",
-                f"{m.t0:g} to {self.t_end:g} {m.time_unit}",
-                f"{self.table.frames + 1} saved states",
+                f"{self.times[0]:g} to {self.times[-1]:g} {m.time_unit}".rstrip(),
+                f"{len(self.times)} saved states",
             ),
         ]
         if self.settings.get("method") is None and self.settings.get("dt") is None:
             sizes.append(("method", *self._choice()))
-        return Description(self.constants, self.verification.assumptions, sizes, self.notes())
+        return Description(self.constants, self.assumptions, sizes, self.notes())
 
     def _choice(self) -> tuple[str, str]:
         """Return the method that `dvax.solve` will choose, and the reason."""
@@ -131,45 +188,84 @@ class AbstractModelApplication(AbstractApplication):
         return name, reason
 
     def plan(self, say: Say) -> Plan:
-        m = self.own
-        say(f"solving from {m.t0:g} to {self.t_end:g} {m.time_unit}".rstrip())
-        times = np.linspace(m.t0, self.t_end, self.table.frames + 1)
+        """What to integrate, all else being computed. **Raises:** `dvax.SolveError`."""
+        m = self.own = self.prepare(say)
+        times = self.times
+        if len(times) > 1:
+            say(f"solving from {times[0]:g} to {times[-1]:g} {m.time_unit}".rstrip())
         constants = self.constants if self.certified else None
         return Plan(
-            m.problem, m.x0, times, constants, self.settings, None, m.time_unit, m.args
+            m.problem, m.x0, times, constants, self.settings, m.time_unit, m.args
         )  # fmt: skip
 
-    def results(self, plan: Plan, solution: Solution, count: int) -> Results:
-        m, times = self.own, np.asarray(solution.ts)[:count]
-        variables = {"time": Variable(("time",), times, m.time_unit, "time")}
-        figures: dict[str, Figure] = {}
-        last = f"at t = {times[-1]:g} {m.time_unit}".rstrip()
-        for which, rows in (("states", solution.xs), ("responses", solution.us)):
-            for name, (values, unit) in m.series(which, rows).items():
-                key, values = name.replace("/", "∕"), values[:count]
-                dims = ("time", *(f"{key}_{k}" for k in range(values.ndim - 1)))
-                variables[key] = Variable(dims, values, unit, f"{which.removesuffix('s')} {name}")
-                if values.ndim == 1 and len(figures) < _FIGURES:
-                    figures[f"final_{key}"] = Figure(float(values[-1]), unit, f"{name} {last}")
-        bound = self._bound(solution, count)
+    def results(self, plan: Plan, solution: Any, count: int) -> Results:
+        """The results up to the time number `count` of the plan.
+
+        The solution has all rows of the plan; rows that were not reached repeat the last of those
+        `count`, so that one compiled program serves all results. It is None where the plan has one
+        time alone.
+        """
+        name, words = self.axis
+        time = Variable((name,), np.asarray(plan.times), self.own.time_unit, words)
+        bound, end = self._bound(solution), cast(Solution, solution)
+        over_time = {
+            key: Variable(v.dims, v.values[:count], v.unit, v.words, v.status)
+            for key, v in {name: time, **self.series(solution, bound)}.items()
+        }
         if bound is not None:
-            words, unit = self.bound_words, self.bound_unit
-            variables["error_bound"] = bound.variable("time", unit, words)
-            figures["error_bound"] = bound.figure(unit, words)
-        series, more = self.further(solution, bound)
-        for name, v in series.items():
-            over_time = v.dims[:1] == ("time",)
-            variables[name] = Variable(
-                v.dims, v.values[:count] if over_time else v.values, v.unit, v.words
-            )
+            bound = bound._replace(values=bound.values[:count])
+        values = {key: v.values for key, v in over_time.items()}
         return Results(
-            variables=variables, figures=self._merged(figures, more), constants=self.constants,
-            steps=int(solution.stats["steps"]), assumptions=self.verification.assumptions,
+            self.figures(values, solution, bound), {**over_time, **self.fixed(solution)},
+            self.constants, 0 if solution is None else int(solution.stats["steps"]),
+            self.assumptions, files=lambda directory: self.write_files(directory, end),
         )  # fmt: skip
 
-    def _merged(
+    def _bound(self, solution: Any) -> Certificate | None:
+        if self.constants is None or solution is None:
+            return None
+        found = certificate(self.own.problem, solution, self.constants)
+        return found._replace(values=self.bound_scale * found.values)
+
+    def bound_series(self, bound: Certificate | None) -> dict[str, Variable]:
+        """The bound on the error over time, where there is one."""
+        if bound is None:
+            return {}
+        return {"error_bound": bound.variable(self.axis[0], self.bound_unit, self.bound_words)}
+
+    def bound_figure(self, bound: Certificate | None) -> dict[str, Figure]:
+        """The largest bound on the error, where there is one."""
+        return (
+            {}
+            if bound is None
+            else {"error_bound": bound.figure(self.bound_unit, self.bound_words)}
+        )
+
+    def named(self, solution: Solution) -> dict[str, Variable]:
+        """The states and responses by the names of the model."""
+        found = {}
+        for which, rows in (("states", solution.xs), ("responses", solution.us)):
+            for name, (values, unit) in self.own.series(which, rows).items():
+                key = store_name(name)
+                dims = (self.axis[0], *(f"{key}_{k}" for k in range(values.ndim - 1)))
+                found[key] = Variable(dims, values, unit, f"{which.removesuffix('s')} {name}")
+        return found
+
+    def final_values(self, end: Solution) -> dict[str, Figure]:
+        """The last values of the states and responses that are numbers."""
+        last = f"at t = {float(end.ts[-1]):g} {self.own.time_unit}".rstrip()
+        numbers = [(key, v) for key, v in self.named(end).items() if v.values.ndim == 1]
+        return {
+            f"final_{key}": Figure(
+                float(v.values[-1]), v.unit, f"{v.words.partition(' ')[2]} {last}"
+            )
+            for key, v in numbers[:_FIGURES]
+        }
+
+    def joined(
         self, figures: Mapping[str, Figure], more: Mapping[str, Figure]
-    ) -> Mapping[str, Figure]:
+    ) -> dict[str, Figure]:
+        """Return both. **Raises:** `dvax.InputError` if they share names."""
         taken = sorted(set(figures) & set(more))
         if taken:
             raise input_error(
@@ -177,8 +273,7 @@ class AbstractModelApplication(AbstractApplication):
             )
         return {**figures, **more}
 
-    def _bound(self, solution: Solution, count: int) -> Certificate | None:
-        constants = self.constants
-        if constants is None or solution.defect is None:
-            return None
-        return certificate(self.own.problem, solution, constants, count)
+
+def store_name(name: str) -> str:
+    """Return a name for a store, where a slash would begin a folder."""
+    return name.replace("/", "∕")

@@ -35,7 +35,7 @@ class ApplicationRun(AbstractRun):
         super().__init__(config, tell)
         self.model, self.wording = config.model, config.wording
         known = self.model.describe()
-        title = self.model.title or f"{config.name}, {config.source.stem}"
+        title = self.model.own.title or f"{config.name}, {config.source.stem}"
         about = {"model": config.name, "title": title, "fit": self.model.fit}
         rows = constant_rows(known.constants)
         self.facts = Facts(rows, known.assumptions, config.fingerprints(), known.notes, about)
@@ -134,7 +134,8 @@ class ApplicationRun(AbstractRun):
         attrs = {"title": self.facts.model["title"], "model": self.config.name}
         write_dataset(self.directory.path / "trajectory.zarr", results.variables, attrs)
         if results.files is not None:
-            results.files(self.directory.path)
+            names = list(results.files(self.directory.path))
+            self.facts = replace(self.facts, model={**self.facts.model, "files": names})
         return results.figures, True
 
     def _compute(self, plan: Plan) -> Callable[[], Results]:

@@ -2,25 +2,18 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
-from dvax.app.runs.applications.base import (
-    AbstractApplication,
-    Description,
-    Figure,
-    PerRow,
-    Plan,
-    Results,
-    Say,
-    Variable,
-)
-from dvax.app.runs.applications.certificate import certificate
+from dvax.app.runs.applications.base import Figure, Variable
+from dvax.app.runs.applications.certificate import Certificate
+from dvax.app.runs.applications.from_model import AbstractModelApplication, store_name
 from dvax.app.runs.schema import SolverKeys, in_quantity
-from dvax.app.runs.solver_options import check_model_steps, event_driven, settings
+from dvax.app.runs.solver_options import event_driven
 from dvax.evolution import ExpRosenbrock, PiecewiseLinear, Solution
+from dvax.models import Model
 from dvax.models.circuit import Circuit
 
 
@@ -39,85 +32,75 @@ class CircuitSection(SolverKeys):
     )
 
 
-class CircuitApplication(AbstractApplication):
+class CircuitApplication(AbstractModelApplication):
     """States, node voltages and diode currents over time."""
 
     section = CircuitSection
     files = ("netlist",)
     end = "model.t_end"
+    verified = False
+    bound_words = "bound on the error of the state in the norm of the energy, ‖x‖² = ΣCv² + ΣLi²"
+    bound_unit = "J^(1/2)"
 
     def __init__(self, table: CircuitSection, paths: Mapping[str, Path], quiet: bool):
-        self.table, self.per_row = table, PerRow()
-        self.circuit = Circuit.from_file(paths["netlist"], r_on=table.r_on, g_leak=table.g_leak)
-        self.circuit.check_sources(table.t_end)
-        check_model_steps(table, table.t_end, f"{table.t_end:g} s")
+        self.table = table
+        c = Circuit.from_file(paths["netlist"], r_on=table.r_on, g_leak=table.g_leak)
+        self.circuit = c
+        c.check_sources(table.t_end)
+        # As `dvax.models.Circuit.solve` has them.
+        method = PiecewiseLinear() if event_driven(table) else ExpRosenbrock()
+        model = Model(
+            c.problem, c.x0, table.t_end, states={name: _unit(name) for name in c.states},
+            constants=c.constants, settings={"method": method, "rtol": 1e-8, "atol": 1e-9},
+        )  # fmt: skip
+        self.set_model(model)
 
     @property
     def fit(self) -> str:
         return self.circuit.fit
 
-    @property
-    def settings(self) -> dict[str, Any]:
-        # As `dvax.models.Circuit.solve` has them.
-        method = PiecewiseLinear() if event_driven(self.table) else ExpRosenbrock()
-        return settings(self.table, method=method, rtol=1e-8, atol=1e-9)
+    def sizes(self) -> list[tuple[str, str, str]]:
+        return [("diodes", str(len(self.circuit.diodes)), ", ".join(self.circuit.diodes))]
 
-    def describe(self) -> Description:
+    def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
         c = self.circuit
-        sizes = [
-            ("states", str(len(c.states)), ", ".join(c.states)),
-            ("diodes", str(len(c.diodes)), ", ".join(c.diodes)),
-            ("time", f"0 to {self.table.t_end:g} s", f"{self.table.frames + 1} saved states"),
-        ]
-        return Description(c.constants, (), sizes)
-
-    def plan(self, say: Say) -> Plan:
-        c, table = self.circuit, self.table
-        say(f"solving from 0 to {table.t_end:g} s")
-        times = np.linspace(0.0, table.t_end, table.frames + 1)
-        return Plan(c.problem, c.x0, times, c.constants, self.settings, None, "s")
-
-    def results(self, plan: Plan, solution: Solution, count: int) -> Results:
-        c, times = self.circuit, np.asarray(solution.ts)[:count]
-        bound = certificate(c.problem, solution, c.constants, count)
         volts, amperes = (
-            self.per_row(of.__name__, of, solution.ts, solution.xs, solution.us)[:count]
+            self.per_row(of.__name__, of, solution.ts, solution.xs, solution.us)
             for of in (c.voltages, c.currents)
         )
-        time = ("time",)
-        variables = {"time": Variable(time, times, "s", "time")}
-        for k, name in enumerate(c.states):
-            unit = "V" if name.upper().startswith("C") else "A"
-            what = "voltage of" if unit == "V" else "current of"
-            values = np.asarray(solution.xs)[:count, k]
-            variables[_key("state", name)] = Variable(time, values, unit, f"{what} {name}")
-        for k, name in enumerate(c.nodes):
-            variables[_key("node", name)] = Variable(
-                time, volts[:, k], "V", f"voltage of node {name}"
-            )
-        for k, name in enumerate(c.diodes):
-            words = f"current of diode {name}"
-            variables[_key("diode", name)] = Variable(time, amperes[:, k], "A", words)
-        words = "bound on the error of the state, ‖x‖² = ΣCv² + ΣLi²"
-        variables["error_bound"] = bound.variable("time", "J^(1/2)", words)
-        figures = {
+        states = np.asarray(solution.xs)
+        found = {}
+        for kind, names, columns in (
+            ("state", c.states, states), ("node", c.nodes, volts), ("diode", c.diodes, amperes),
+        ):  # fmt: skip
+            for k, name in enumerate(names):
+                unit = {"node": "V", "diode": "A"}.get(kind) or _unit(name)
+                what = "voltage of" if unit == "V" else "current of"
+                words = f"{what} {name}" if kind == "state" else f"{what} {kind} {name}"
+                key = store_name(f"{kind}_{name}")
+                found[key] = Variable(("time",), columns[:, k], unit, words)
+        return {**found, **self.bound_series(bound)}
+
+    def figures(
+        self, series: Mapping[str, np.ndarray], end: Solution, bound: Certificate | None
+    ) -> Mapping[str, Figure]:
+        c = self.circuit
+        names = ", ".join(c.states)
+        return {
             "final_state": Figure(
-                np.asarray(solution.xs)[-1], "V, A", f"{', '.join(c.states)} at t = {times[-1]:g} s"
+                np.asarray(end.xs)[-1], "V, A", f"{names} at t = {float(end.ts[-1]):g} s"
             ),
-            "error_bound": bound.figure(
-                "J^(1/2)", "bound on the error of the state in the norm of the energy"
-            ),
+            **self.bound_figure(bound),
             "decay_rate": Figure(
                 float(c.constants.sharp_decay_rate) + 0.0, "1/s",
                 "two runs certainly approach at this rate in the norm of the energy",
             ),
         }  # fmt: skip
-        return Results(figures, variables, c.constants, int(solution.stats["steps"]))
 
 
-def _key(kind: str, name: str) -> str:
-    """A name in a store, where a slash would begin a folder."""
-    return f"{kind}_{name}".replace("/", "∕")
+def _unit(state: str) -> str:
+    """The unit of a state, the voltage of a capacitor or the current of an inductor."""
+    return "V" if state.upper().startswith("C") else "A"
 
 
 APPLICATION = CircuitApplication

@@ -7,21 +7,14 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from dvax.app.runs.applications.base import (
-    AbstractApplication,
-    Description,
-    Figure,
-    PerRow,
-    Plan,
-    Results,
-    Say,
-    Variable,
-)
-from dvax.app.runs.applications.certificate import certificate
+from dvax.app.runs.applications.base import Figure, Say, Variable
+from dvax.app.runs.applications.certificate import Certificate
+from dvax.app.runs.applications.from_model import AbstractModelApplication
 from dvax.app.runs.schema import SolverKeys
-from dvax.app.runs.solver_options import check_model_steps, settings
+from dvax.app.runs.solver_options import check_model_steps
 from dvax.errors import InputError, input_error
-from dvax.evolution import Implicit, Solution
+from dvax.evolution import Solution
+from dvax.models import Model
 from dvax.models.fem_contact import ElasticBody, FemContact
 
 _NOTABLE_INDENTATION = 0.1
@@ -62,16 +55,20 @@ class FemContactSection(SolverKeys):
     frames: int = Field(120, ge=1, le=10**6, description="number of intervals between saved states")
 
 
-class FemContactApplication(AbstractApplication):
+class FemContactApplication(AbstractModelApplication):
     """The pressure over time, its limit at rest, and the fields at the end for ParaView."""
 
     section = FemContactSection
     files = ("mesh",)
     end = "model.end"
+    verified = False
+    bound_words = "bound on the error of the state in the norm of the viscosity"
+    bound_unit = "([p][x]²)^(1/2)"
 
     def __init__(self, table: FemContactSection, paths: Mapping[str, Path], quiet: bool):
         file = paths.get("mesh")
-        self.table, self.per_row = table, PerRow()
+        self.table = table
+        # Before a mesh is assembled, which takes seconds.
         check_model_steps(table, table.end, f"the length {table.end:g}")
         sizes = _given(table, _SIZES)
         names = _given(table, ("contact", "clamped"))
@@ -105,57 +102,67 @@ class FemContactApplication(AbstractApplication):
             pressure_cap=np.inf if table.pressure_cap is None else table.pressure_cap,
             radius=table.radius, relaxation_time=table.relaxation_time, ramp=table.ramp,
         )  # fmt: skip
+        m = self.contact
+        model = Model(
+            m.problem, m.untouched, table.end, time_unit="[t]", constants=m.constants,
+            settings={"method": m.method, "rtol": 1e-7, "atol": 1e-11},
+        )  # fmt: skip
+        self.set_model(model)
+        self.along = np.argsort(m.body.points[:, 0])
 
     @property
     def fit(self) -> str:
         return self.contact.fit
 
-    def describe(self) -> Description:
+    def sizes(self) -> list[tuple[str, str, str]]:
         body = self.body
-        sizes = [
+        return [
             ("displacements", str(body.unknowns), "free ones, of quadratic elements"),
             ("contact points", str(len(body.points)), "Gauss points of the contact boundary"),
-            ("states", str(body.trace.shape[1]), "displacements that the contact can see"),
         ]
-        return Description(self.contact.constants, (), sizes, _notes(self))
 
-    @property
-    def settings(self) -> dict[str, Any]:
-        return settings(self.table, method=self.contact.method, rtol=1e-7, atol=1e-11)
+    def notes(self) -> tuple[str, ...]:
+        return _notes(self)
 
-    def plan(self, say: Say) -> Plan:
-        m, table = self.contact, self.table
+    def prepare(self, say: Say) -> Model:
         say("solving at rest")
-        rest = m.equilibrium()
-        times = np.linspace(0.0, table.end, table.frames + 1)
-        say(f"solving from 0 to {table.end:g}")
-        return Plan(m.problem, m.untouched, times, m.constants, self.settings, rest)
+        self.rest = self.contact.equilibrium()
+        return self.own
 
-    def results(self, plan: Plan, solution: Solution, count: int) -> Results:
-        m, rest, times = self.contact, plan.data, np.asarray(solution.ts)[:count]
-        pressure = self.per_row("pressure", m.pressure, solution.ts, solution.xs)[:count]
-        still, last = m.figures(rest.pressure), m.figures(pressure[-1])
+    def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
+        m = self.contact
+        pressure = self.per_row("pressure", m.pressure, solution.ts, solution.xs)
         force = np.array([m.figures(p)["force"] for p in pressure])
-        s = m.body.points[:, 0]
-        order = np.argsort(s)
-        deformed = m.body.nodes + m.displacement(solution.xs[-1])
-        stress = m.stress(solution.ts[-1], solution.xs[-1])
-        variables = {
-            "time": Variable(("time",), times, "[t]", "time"),
-            "place": Variable(("place",), s[order], "[x]", "contact points"),
-            "force": Variable(("time",), force, "[p][x]", "force on the punch"),
-            "pressure": Variable(("time", "place"), pressure[:, order], "[p]", "contact pressure"),
-            "pressure_at_rest": Variable(
-                ("place",), np.asarray(rest.pressure)[order], "[p]", "contact pressure at rest"
-            ),
-            "nodes": Variable(("node", "axis"), m.body.nodes, "[x]", "nodes"),
-            "deformed": Variable(("node", "axis"), deformed, "[x]", "nodes at the end"),
-            "cells": Variable(("cell", "corner"), m.body.cells(), "1", "nodes of each element"),
-            "stress": Variable(("cell", "component"), stress, "[p]", "xx, yy, zz, xy at the end"),
+        time, both = ("time",), ("time", "place")
+        return {
+            "force": Variable(time, force, "[p][x]", "force on the punch"),
+            "pressure": Variable(both, pressure[:, self.along], "[p]", "contact pressure"),
+            **self.bound_series(_known(bound)),
         }
+
+    def fixed(self, end: Solution) -> Mapping[str, Variable]:
+        m, t, x = self.contact, end.ts[-1], end.xs[-1]
+        nodes, rest = m.body.nodes, np.asarray(self.rest.pressure)[self.along]
+        place, two = ("place",), ("node", "axis")
+        stress, words = m.stress(t, x), "xx, yy, zz, xy at the end"
+        return {
+            "place": Variable(place, m.body.points[self.along, 0], "[x]", "contact points"),
+            "pressure_at_rest": Variable(place, rest, "[p]", "contact pressure at rest"),
+            "nodes": Variable(two, nodes, "[x]", "nodes"),
+            "deformed": Variable(two, nodes + m.displacement(x), "[x]", "nodes at the end"),
+            "cells": Variable(("cell", "corner"), m.body.cells(), "1", "nodes of each element"),
+            "stress": Variable(("cell", "component"), stress, "[p]", words),
+        }
+
+    def figures(
+        self, series: Mapping[str, np.ndarray], end: Solution, bound: Certificate | None
+    ) -> Mapping[str, Figure]:
+        m, rest = self.contact, self.rest
+        pressure = self.per_row("pressure", m.pressure, end.ts, end.xs)[-1]
+        still, last = m.figures(rest.pressure), m.figures(pressure)
         known = m.constants.status_of("gamma")
         certified = None if rest.vi.error_bound is None else float(rest.vi.error_bound)
-        figures = {
+        return {
             "force": Figure(still["force"], "[p][x]", "force on the punch at rest"),
             "contact_half_width": Figure(
                 still["contact_half_width"], "[x]", "half of the width under pressure, at rest"
@@ -166,7 +173,7 @@ class FemContactApplication(AbstractApplication):
             "peak_pressure": Figure(still["peak_pressure"], "[p]", "largest pressure at rest"),
             "final_force": Figure(last["force"], "[p][x]", "force at the end of the run"),
             "distance_from_rest": Figure(
-                float(np.abs(pressure[-1] - np.asarray(rest.pressure)).max()), "[p]",
+                float(np.abs(pressure - np.asarray(rest.pressure)).max()), "[p]",
                 "largest difference of the last pressure from that at rest",
             ),
             "rest_error_bound": Figure(
@@ -177,17 +184,17 @@ class FemContactApplication(AbstractApplication):
                 float(m.constants.sharp_decay_rate), "1/[t]",
                 "two states certainly approach at this rate in the norm of the viscosity",
             ),
+            **self.bound_figure(_known(bound)),
         }  # fmt: skip
-        if not isinstance(solution.setup.method, Implicit):
-            bound = certificate(m.problem, solution, m.constants, count)
-            words, unit = "bound on the error of the state", "([p][x]²)^(1/2)"
-            figures["error_bound"] = bound.figure(unit, f"{words} in the norm of the viscosity")
-            variables["error_bound"] = bound.variable("time", unit, words)
 
-        def files(directory: Path) -> None:
-            m.write(directory / "body.vtu", solution.ts[-1], solution.xs[-1])
+    def write_files(self, directory: Path, end: Solution) -> tuple[str, ...]:
+        self.contact.write(directory / "body.vtu", end.ts[-1], end.xs[-1])
+        return "body.vtu", "body-contact.vtu"
 
-        return Results(figures, variables, m.constants, int(solution.stats["steps"]), files=files)
+
+def _known(bound: Certificate | None) -> Certificate | None:
+    """Return the bound, or None: the default method is implicit, and has none."""
+    return None if bound is None or np.isnan(bound.values).any() else bound
 
 
 def _given(table: FemContactSection, names: tuple[str, ...]) -> dict[str, Any]:

@@ -2,26 +2,20 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from pydantic import Field
 
-from dvax.app.runs.applications.base import (
-    AbstractApplication,
-    Description,
-    Figure,
-    Plan,
-    Results,
-    Say,
-    Variable,
-)
-from dvax.app.runs.applications.certificate import certificate
+from dvax.app.runs.applications.base import Figure, Variable
+from dvax.app.runs.applications.certificate import Certificate
+from dvax.app.runs.applications.from_model import AbstractModelApplication
 from dvax.app.runs.schema import SolverKeys, in_quantity
-from dvax.app.runs.solver_options import check_model_steps, event_driven, settings
+from dvax.app.runs.solver_options import event_driven
 from dvax.evolution import ExpRosenbrock, PiecewiseLinear, Solution
+from dvax.models import Model
 from dvax.models.frame import Accelerogram, Frame
 from dvax.models.frame.peaks import peak_displacement
 
@@ -52,7 +46,7 @@ class FrameSection(SolverKeys):
     )
 
 
-class FrameApplication(AbstractApplication):
+class FrameApplication(AbstractModelApplication):
     """Displacements, the force of the spring, and the ground."""
 
     section = FrameSection
@@ -60,114 +54,122 @@ class FrameApplication(AbstractApplication):
     keys: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "step": ("record",), "acceleration": ("record",),
     }  # fmt: skip
+    verified = False
+    bound_words = "bound on the error of the displacement"
+    bound_unit = "in"
 
     def __init__(self, table: FrameSection, paths: Mapping[str, Path], quiet: bool):
         self.table = table
-        self.frame = Frame(
+        frame = self.frame = Frame(
             record=Accelerogram.from_at2(paths["record"]), period=table.period, damping=table.damping,
             yield_ratio=table.yield_ratio, viscosity_ratio=table.viscosity_ratio,
         )  # fmt: skip
-        long = float(self.frame.record.duration)
-        check_model_steps(table, long, f"{long:g} s")
+        self.omega = float(frame.omega)
+        self.bound_scale = 1.0 / self.omega
+        method = PiecewiseLinear() if event_driven(table) else ExpRosenbrock()
+        model = Model(
+            frame.problem, jnp.zeros(3), float(frame.times[-1]), constants=frame.constants,
+            states={"displacement": "in", "velocity": "in/s", "plastic": "in"},
+            settings={"method": method, "rtol": 1e-8},
+        )  # fmt: skip
+        self.set_model(model, times=frame.times)
+        # Saved intervals in one of the record.
+        self.between = (len(self.times) - 1) // (frame.record.samples.shape[0] - 1)
 
     @property
     def fit(self) -> str:
         return self.frame.fit
 
-    def describe(self) -> Description:
+    def sizes(self) -> list[tuple[str, str, str]]:
         record = self.frame.record
-        count, long = record.samples.shape[0], record.duration
-        sizes = [("record", f"{count} samples", f"{record.step:g} s apart, {long:g} s in all")]
-        period, notes = self.table.period, ()
+        words = f"{record.step:g} s apart, {record.duration:g} s in all"
+        return [("record", f"{record.samples.shape[0]} samples", words)]
+
+    def notes(self) -> tuple[str, ...]:
+        period, step = self.table.period, self.frame.record.step
         # An oscillation needs at least two samples a period (Nyquist).
-        if period < 2.0 * record.step:
-            notes = (
-                f"model.period is {period:g} s and samples of the record are {record.step:g} s apart: "
-                "what would shake a frame at this period is not in the record.",
-            )
-        return Description(self.frame.constants, (), sizes, notes)
+        if period >= 2.0 * step:
+            return ()
+        return (
+            f"model.period is {period:g} s and samples of the record are {step:g} s apart: "
+            "what would shake a frame at this period is not in the record.",
+        )
 
-    @property
-    def settings(self) -> dict[str, Any]:
-        method = PiecewiseLinear() if event_driven(self.table) else ExpRosenbrock()
-        return settings(self.table, method=method, rtol=1e-8)
+    def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
+        record = self.frame.record
+        d, v, plastic = np.asarray(solution.xs).T
+        ts = np.asarray(solution.ts)
+        ground = np.asarray(np.interp(ts, record.knots(), record.samples))
+        spring = self.omega**2 * (d - plastic)
+        time = ("time",)
+        found = {
+            "ground": Variable(time, ground, "in/s^2", "ground acceleration"),
+            "displacement": Variable(time, d, "in", "displacement against the ground"),
+            "velocity": Variable(time, v, "in/s", "velocity against the ground"),
+            "plastic": Variable(time, plastic, "in", "plastic displacement"),
+            "spring": Variable(time, spring, "in/s^2", "force of the spring a mass"),
+            **self.bound_series(bound),
+        }
+        both = {}
+        for name, one in found.items():
+            si = f"{one.words}, in SI units"
+            metres = one.unit.replace("in", "m")
+            both[name] = one
+            both[f"{name}_si"] = Variable(time, _INCH * one.values, metres, si, one.status)
+        return both
 
-    def plan(self, say: Say) -> Plan:
-        frame = self.frame
-        say("solving over the record")
-        return Plan(
-            frame.problem, jnp.zeros(3), frame.times, frame.constants, self.settings, None, "s"
-        )  # fmt: skip
-
-    def results(self, plan: Plan, solution: Solution, count: int) -> Results:
-        frame, constants = self.frame, self.frame.constants
-        bound = certificate(frame.problem, solution, constants, count)
-        between = (len(plan.times) - 1) // (frame.record.samples.shape[0] - 1)
-        d, v, plastic = np.asarray(solution.xs)[:count].T
-        ts = np.asarray(solution.ts)[:count]
-        omega = float(frame.omega)
-        ground = np.interp(ts, np.asarray(frame.record.knots()), np.asarray(frame.record.samples))
-        time, error = ("time",), bound.values / omega
-        spring = omega**2 * (d - plastic)
-        variables = {"time": Variable(time, ts, "s", "time")}
-        for name, values, unit, words in (
-            ("ground", ground, "in/s^2", "ground acceleration"),
-            ("displacement", d, "in", "displacement against the ground"),
-            ("velocity", v, "in/s", "velocity against the ground"),
-            ("plastic", plastic, "in", "plastic displacement"),
-            ("spring", spring, "in/s^2", "force of the spring a mass"),
-            ("error_bound", error, "in", "bound on the error of the displacement"),
-        ):
-            status = bound.status if name == "error_bound" else ""
-            variables[name] = Variable(time, values, unit, words, status)
-            metres = unit.replace("in", "m")
-            si = Variable(time, _INCH * values, metres, f"{words}, in SI units", status)
-            variables[f"{name}_si"] = si
-        peak = float(np.max(np.abs(d[::between])))
-        a = -2.0 * float(frame.damping) * omega * v - spring - ground
-        apart = frame.record.step / between
-        # Rows that were not reached repeat the last displacement with zero velocity.
-        behind = len(plan.times) - count
-        moves = np.pad(d, (0, behind), "edge"), np.pad(v, (0, behind)), np.pad(a, (0, behind))
-        top = float(_peak_displacement(*map(jnp.asarray, moves), apart))
-        largest = bound.largest
+    def figures(
+        self, series: Mapping[str, np.ndarray], end: Solution, bound: Certificate | None
+    ) -> Mapping[str, Figure]:
+        frame, omega = self.frame, self.omega
+        ts, d, v = (series[name] for name in ("time", "displacement", "velocity"))
+        peak = float(np.max(np.abs(d[:: self.between])))
+        a = -2.0 * float(frame.damping) * omega * v - series["spring"] - series["ground"]
+        # Rows that were not reached repeat the last displacement with zero velocity, so that one
+        # compiled program serves all partial results.
+        behind = (0, len(self.times) - len(ts))
+        ts, d, v, a = (
+            jnp.asarray(np.pad(rows, behind, "edge" if repeats else "constant"))
+            for rows, repeats in ((ts, True), (d, True), (v, False), (a, False))
+        )
+        top = float(_peak_displacement(d, v, a, frame.record.step / self.between))
         # The bound holds for every displacement, hence for their peaks.
-        proved = bound.proved(1.0 / omega)
+        proved = None if bound is None else bound.proved()
         within, last = (None, None) if proved is None else (float(proved.max()), float(proved[-1]))
+        plastic = float(series["plastic"][-1])
         lengths = {
-            "peak_displacement": (peak, within, "largest displacement at the times of the record"),
-            "largest_displacement": (
-                top, None, "largest displacement at all times"
+            "peak_displacement": Figure(
+                peak, "in", "largest displacement at the times of the record", within
             ),
-            "residual_displacement": (float(plastic[-1]), last, "plastic part of it at the end"),
-            "error_bound": (
-                None if largest is None else largest / omega, None,
-                f"bound on the error of the displacement ({bound.status})",
-            ),
-        }  # fmt: skip
+            "largest_displacement": Figure(top, "in", "largest displacement at all times"),
+            "residual_displacement": Figure(plastic, "in", "plastic part of it at the end", last),
+            **self.bound_figure(bound),
+        }
+        ratios = {}
         limit = float(frame.yield_displacement)
         if np.isfinite(limit):
-            lengths["yield_displacement"] = (limit, None, "displacement at which it yields")
-            lengths["elastoplastic_distance"] = (
-                float(np.max(np.asarray(frame.elastoplastic_distance(solution)))), None,
-                "bound on how far the displacement is from that of the elastoplastic frame, eta/k = 0 "
-                "(estimated, from the velocities that were computed)",
-            )  # fmt: skip
-        bounds = {"error_bound": bound.status, "elastoplastic_distance": "estimated"}
-        figures = {
-            n: Figure(value, "in", words, e, bounds.get(n))
-            for n, (value, e, words) in lengths.items()
-        }
-        if np.isfinite(limit):
-            figures["ductility"] = Figure(peak / limit, "1", "peak over yield displacement")
-        figures |= {
+            apart = float(np.max(np.asarray(frame.distance_bound(ts, v))))
+            lengths |= {
+                "yield_displacement": Figure(limit, "in", "displacement at which it yields"),
+                "elastoplastic_distance": Figure(
+                    apart, "in",
+                    "bound on how far the displacement is from that of the elastoplastic frame, "
+                    "eta/k = 0 (estimated, from the velocities that were computed)",
+                    bound="estimated",
+                ),
+            }  # fmt: skip
+            ratios["ductility"] = Figure(peak / limit, "1", "peak over yield displacement")
+        metres = {
             f"{name}_si": Figure(
-                None if value is None else _INCH * value, "m", f"{words}, in SI units",
-                None if error is None else _INCH * error, bounds.get(name),
+                _in_metres(f.value), "m", f"{f.meaning}, in SI units", _in_metres(f.error), f.bound
             )
-            for name, (value, error, words) in lengths.items()
-        }  # fmt: skip
-        return Results(figures, variables, constants, int(solution.stats["steps"]))
+            for name, f in lengths.items()
+        }
+        return {**lengths, **ratios, **metres}
+
+
+def _in_metres(inches: float | None) -> float | None:
+    return None if inches is None else _INCH * inches
 
 
 APPLICATION = FrameApplication

@@ -1,6 +1,7 @@
 """`[model] name = "market"`: a week of RTS-GMLC under a sticky price."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -9,24 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from pydantic import Field
 
-from dvax.app.runs.applications.base import (
-    AbstractApplication,
-    Description,
-    Figure,
-    PerRow,
-    Plan,
-    Results,
-    Say,
-    Variable,
-)
-from dvax.app.runs.applications.certificate import certificate
+from dvax.app.runs.applications.base import Figure, Say, Variable
+from dvax.app.runs.applications.certificate import Certificate
+from dvax.app.runs.applications.from_model import AbstractModelApplication
 from dvax.app.runs.schema import SolverKeys
-from dvax.app.runs.solver_options import check_model_steps, settings
 from dvax.errors import input_error
 from dvax.evolution import ExpRosenbrock, Solution
 from dvax.formats import read_rts
 from dvax.formats.rts_gmlc import RTS_FILES
-from dvax.models.market import Market, largest_gain
+from dvax.models import Model
+from dvax.models.market import Market
+from dvax.models.market.deviation import largest_gains
 
 
 class MarketSection(SolverKeys):
@@ -45,7 +39,7 @@ class MarketSection(SolverKeys):
     elasticity: float = Field(0.3, gt=0, description="of the mean load at the reference price")
 
 
-class MarketApplication(AbstractApplication):
+class MarketApplication(AbstractModelApplication):
     """Prices at rest for every hour, and the sticky price between them."""
 
     section = MarketSection
@@ -55,105 +49,109 @@ class MarketApplication(AbstractApplication):
         ),
     }  # fmt: skip
 
+    axis = ("hour", "hour of the data")
+    verified = False
+    bound_words = "bound on the error of the sticky price"
+    bound_unit = "$/MWh"
+
     def __init__(self, table: MarketSection, paths: Mapping[str, Path], quiet: bool):
-        self.table, self.per_row = table, PerRow()
+        self.table = table
         rts = read_rts(paths["data"])
         options: dict[str, Any] = dict(
             speed=table.speed, reference_price=table.reference_price, elasticity=table.elasticity
         )
+        start, hours = table.start_hour, table.hours
         # One hour alone is solved as a point of an interval of two hours.
         last = len(rts.load) - 1
-        if not table.start_hour + table.hours <= last + 1:
+        if not start + hours <= last + 1:
             raise input_error(
-                "dvax.models.Market.from_rts(start_hour, hours)",
-                f"{table.start_hour} and {table.hours}",
+                "dvax.models.Market.from_rts(start_hour, hours)", f"{start} and {hours}",
                 f"the data have the hours 0 to {last}", "Name hours inside",
             )  # fmt: skip
-        check_model_steps(table, float(max(table.hours - 1, 1)), f"{table.hours} hours")
-        self.times = np.arange(table.start_hour, table.start_hour + table.hours, dtype=float)
-        first = min(table.start_hour, last - 1) if table.hours == 1 else table.start_hour
-        self.market = Market.from_rts(rts, first, max(2, table.hours), **options)
+        first = min(start, last - 1) if hours == 1 else start
+        market = self.market = Market.from_rts(rts, first, max(2, hours), **options)
+        model = Model(
+            market.problem, table.reference_price, float(first + max(hours - 1, 1)), float(first),
+            states={"sticky_price": "$/MWh"}, time_unit="h", constants=market.constants,
+            settings={
+                "method": ExpRosenbrock(), "rtol": 1e-8, "atol": 1e-8, "vi_solver": market.law_solver,
+            },
+        )  # fmt: skip
+        self.set_model(model, times=np.arange(start, start + hours, dtype=float))
 
     @property
     def fit(self) -> str:
         return self.market.fit
 
-    def describe(self) -> Description:
-        firms = self.market.firms
-        sizes = [
-            ("units", str(firms.shape[0]), f"of {firms.shape[1]} firms"),
+    def sizes(self) -> list[tuple[str, str, str]]:
+        units, firms = self.market.firms.shape
+        return [
+            ("units", str(units), f"of {firms} firms"),
             ("hours", str(len(self.times)), f"from hour {self.table.start_hour} on"),
         ]
-        return Description(self.market.constants, (), sizes)
 
-    @property
-    def settings(self) -> dict[str, Any]:
-        solver = self.market.law_solver
-        return settings(
-            self.table, method=ExpRosenbrock(), rtol=1e-8, atol=1e-8, vi_solver=solver
-        )  # fmt: skip
-
-    def plan(self, say: Say) -> Plan:
-        market, times = self.market, self.times
+    def prepare(self, say: Say) -> Model:
         say("solving for the prices at rest")
-        prices, made = jax.vmap(market.equilibrium)(jnp.asarray(times))
-        rest = np.asarray(prices), np.asarray(made)
-        if len(times) > 1:
-            say("solving for the sticky price")
-        return Plan(market.problem, prices[0], times, market.constants, self.settings, rest, "h")
+        prices, made = jax.vmap(self.market.equilibrium)(jnp.asarray(self.times))
+        self.prices, self.made = np.asarray(prices), np.asarray(made)
+        return replace(self.own, x0=prices[0])
 
-    def results(self, plan: Plan, solution: Solution | None, count: int) -> Results:
-        market, times = self.market, np.asarray(plan.times)[:count]
-        prices, made = (values[:count] for values in plan.data)
-        every = self.per_row("capacity", market.capacity.value, jnp.asarray(plan.times))
-        capacity = every[:count]
+    def series(
+        self, solution: Solution | None, bound: Certificate | None
+    ) -> Mapping[str, Variable]:
+        market, times = self.market, self.times if solution is None else np.asarray(solution.ts)
+        which = np.searchsorted(self.times, times)
+        prices, made = self.prices[which], self.made[which]
+        capacity = self.per_row("capacity", market.capacity.value, jnp.asarray(times))
         firms = np.asarray(market.firms)
         numbers = np.asarray(market.cost), np.asarray(market.slope), firms, float(market.b)
-        gain = largest_gain(prices, made, capacity, *numbers)
-        variables = {
-            "hour": Variable(("hour",), times, "h", "hour of the data"),
+        gain = largest_gains(prices, made, capacity, *numbers)
+        found = {
             "price": Variable(("hour",), prices, "$/MWh", "Cournot-Nash price"),
             "made": Variable(("hour", "firm"), made @ firms, "MW", "what each firm makes"),
             "capacity": Variable(("hour", "firm"), capacity @ firms, "MW", "what it could make"),
         }
+        if solution is not None:
+            sticky = np.asarray(solution.xs)
+            gain = np.maximum(
+                gain, largest_gains(sticky, np.asarray(solution.us), capacity, *numbers)
+            )
+            words = "price that follows demand"
+            found["sticky_price"] = Variable(("hour",), sticky, "$/MWh", words)
+        words = "most that a firm could gain by making something else"
+        found["deviation_profit"] = Variable(("hour",), gain, "$/h", words)
+        return {**found, **self.bound_series(bound)}
+
+    def figures(
+        self, series: Mapping[str, np.ndarray], end: Solution, bound: Certificate | None
+    ) -> Mapping[str, Figure]:
+        prices, sticky = series["price"], series.get("sticky_price")
+        when = "at any hour" if sticky is None else "at rest or under way"
         figures = {
             "price": Figure(prices, "$/MWh", "Cournot-Nash price of every hour"),
             "max_deviation_profit": Figure(
-                gain, "$/h", "most that a firm could gain by making something else, at any hour"
+                float(series["deviation_profit"].max()), "$/h",
+                f"most that a firm could gain by making something else, {when}",
             ),
             "mean_price": Figure(float(np.mean(prices)), "$/MWh", "their mean"),
-        }
-        steps = 0
-        if solution is not None:
-            steps = int(solution.stats["steps"])
-            bound = certificate(market.problem, solution, market.constants, count)
-            sticky = np.asarray(solution.xs)[:count]
-            variables |= {
-                "sticky_price": Variable(("hour",), sticky, "$/MWh", "price that follows demand"),
-                "error_bound": bound.variable(
-                    "hour", "$/MWh", "bound on the error of the sticky price"
-                ),
-            }
-            under_way = largest_gain(sticky, np.asarray(solution.us)[:count], capacity, *numbers)
-            figures["max_deviation_profit"] = Figure(
-                max(gain, under_way), "$/h",
-                "most that a firm could gain by making something else, at rest or under way",
-            )  # fmt: skip
+        }  # fmt: skip
+        if sticky is not None:
             figures |= {
                 "sticky_price": Figure(
-                    sticky, "$/MWh", "price of the dynamics at every hour", bound.proved()
+                    sticky, "$/MWh", "price of the dynamics at every hour",
+                    None if bound is None else bound.proved(),
                 ),
                 "largest_lag": Figure(
                     float(np.abs(sticky - prices).max()), "$/MWh",
                     "most that the sticky price is away from the price at rest",
                 ),
-                "error_bound": bound.figure("$/MWh", "bound on the error of the sticky price"),
+                **self.bound_figure(bound),
                 "decay_rate": Figure(
-                    float(market.constants.sharp_decay_rate), "1/h",
+                    float(self.market.constants.sharp_decay_rate), "1/h",
                     "two prices certainly approach at this rate",
                 ),
             }  # fmt: skip
-        return Results(figures, variables, market.constants, steps)
+        return figures
 
 
 APPLICATION = MarketApplication

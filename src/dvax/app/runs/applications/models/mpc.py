@@ -12,7 +12,11 @@ from pydantic import Field, PlainValidator
 
 from dvax.app.runs.applications.base import Figure, Variable
 from dvax.app.runs.applications.certificate import Certificate
-from dvax.app.runs.applications.from_model import AbstractModelApplication, FramesKeys
+from dvax.app.runs.applications.from_model import (
+    AbstractModelApplication,
+    FramesKeys,
+    store_name,
+)
 from dvax.app.runs.applications.history import read_history
 from dvax.app.runs.schema import in_unit, rule_error
 from dvax.errors import Problems, input_error
@@ -245,28 +249,38 @@ class MpcApplication(AbstractModelApplication):
             )
         return tuple(found)
 
-    def further(
-        self, solution: Solution, bound: Certificate | None
-    ) -> tuple[Mapping[str, Variable], Mapping[str, Figure]]:
-        times, x, u = (np.asarray(v) for v in (solution.ts, solution.xs, solution.us))
-        wanted, m = self.reference.at(times), len(self.input_units)
-        held = self.feed.at(times)
-        series, figures = {}, {}
+    def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
+        times, u = np.asarray(solution.ts), np.asarray(solution.us)
+        wanted, series = self.reference.at(times), {}
         for k, (name, unit) in enumerate(self.state_units.items()):
-            key = f"reference_{name}"
+            key = f"reference_{store_name(name)}"
             series[key] = Variable(("time",), wanted[:, k], unit, f"reference of {name}")
         low, high = np.asarray(self.mpc.lower), np.asarray(self.mpc.upper)
-        at_limit = (u[:, :m] <= low) | (u[:, :m] >= high)
         for k, (name, unit) in enumerate(self.input_units.items()):
             for prefix, values, words in (
                 ("input", u[:, k], "input"), ("input_min", np.full(times.shape, low[k]), "least"),
                 ("input_max", np.full(times.shape, high[k]), "greatest"),
             ):  # fmt: skip
-                series[f"{prefix}_{name}"] = Variable(("time",), values, unit, f"{words} {name}")
-            figures[f"largest_{name}"] = Figure(
+                key = f"{prefix}_{store_name(name)}"
+                series[key] = Variable(("time",), values, unit, f"{words} {name}")
+        return {**self.named(solution), **self.bound_series(bound), **series}
+
+    def figures(
+        self, series: Mapping[str, np.ndarray], end: Solution, bound: Certificate | None
+    ) -> Mapping[str, Figure]:
+        def columns(prefix: str, names: Mapping[str, str]) -> np.ndarray:
+            return np.stack([series[f"{prefix}{store_name(name)}"] for name in names], axis=1)
+
+        times, x = series["time"], columns("", self.state_units)
+        u = columns("input_", self.input_units)
+        figures = {
+            f"largest_{name}": Figure(
                 float(np.abs(u[:, k]).max()), unit, f"largest |{name}| at the saved times"
             )
-        apart, moved = x - wanted, u[:, :m] - held
+            for k, (name, unit) in enumerate(self.input_units.items())
+        }
+        at_limit = (u <= np.asarray(self.mpc.lower)) | (u >= np.asarray(self.mpc.upper))
+        apart, moved = x - self.reference.at(times), u - self.feed.at(times)
         rate = np.einsum("ti,ij,tj->t", apart, self.weights[0], apart)
         rate += np.einsum("ti,ij,tj->t", moved, self.weights[1], moved)
         figures |= {
@@ -288,7 +302,7 @@ class MpcApplication(AbstractModelApplication):
             figures["decay_rate"] = Figure(
                 -float(c.energy[1]), "1/s", words.format(float(c.energy[0]))
             )
-        return series, figures
+        return self.joined(self.final_values(end) | self.bound_figure(bound), figures)
 
 
 APPLICATION = MpcApplication

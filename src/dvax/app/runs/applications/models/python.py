@@ -82,13 +82,16 @@ class PythonApplication(AbstractModelApplication):
     def notes(self) -> tuple[str, ...]:
         return (f"The code of {self.file.name}:{self.table.function} is executed.",)
 
-    def further(
-        self, solution: Solution, bound: Certificate | None
-    ) -> tuple[Mapping[str, Variable], Mapping[str, Figure]]:
+    def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
+        return {**self.named(solution), **self.bound_series(bound)}
+
+    def figures(
+        self, series: Mapping[str, np.ndarray], end: Solution, bound: Certificate | None
+    ) -> Mapping[str, Figure]:
         of = self.own.figures
-        found = {} if of is None else _run(self.file, lambda: dict(of(solution)))
-        figures = {n: Figure(*_figure(self.file, n, entry)) for n, entry in found.items()}
-        return {}, figures
+        found = {} if of is None else _run(self.file, lambda: dict(of(end)))
+        own = {n: Figure(*_figure(self.file, n, entry)) for n, entry in found.items()}
+        return self.joined(self.final_values(end) | self.bound_figure(bound), own)
 
 
 def _figure(file: Path, name: str, entry: Any) -> tuple[Any, str, str]:

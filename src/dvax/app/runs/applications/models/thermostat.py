@@ -150,9 +150,7 @@ class ThermostatApplication(AbstractModelApplication):
             ("time constant", f"{hours:.4g} h", "capacity over loss, of a floor without heaters"),
         ]
 
-    def further(
-        self, solution: Solution, bound: Certificate | None
-    ) -> tuple[Mapping[str, Variable], Mapping[str, Figure]]:
+    def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
         t, area = self.table, float(np.prod(self.table.lengths))
         times, x, u = (np.asarray(v) for v in (solution.ts, solution.xs, solution.us))
         outdoor, wanted = (
@@ -178,11 +176,28 @@ class ThermostatApplication(AbstractModelApplication):
                 ("heating_power", heating, "kW", "power of all heaters"),
                 ("heating_max", most, "kW", "greatest power of all heaters"),
                 ("heating_min", least, "kW", "least power of all heaters"),
+                (
+                    "below_set_point",
+                    below,
+                    "K",
+                    "temperature below the set point, mean of the floor",
+                ),
             )
         }
+        return {**self.named(solution), **self.bound_series(bound), **series}
+
+    def fixed(self, end: Solution) -> Mapping[str, Variable]:
+        t, found = self.table, {}
         for k, (name, n, side) in enumerate(zip("xy", t.cells, t.lengths, strict=True)):
             places = (np.arange(n) + 0.5) * side / n
-            series[name] = Variable((f"temperature_{k}",), places, "m", f"midpoints along {name}")
+            found[name] = Variable((f"temperature_{k}",), places, "m", f"midpoints along {name}")
+        return found
+
+    def figures(
+        self, series: Mapping[str, np.ndarray], end: Solution, bound: Certificate | None
+    ) -> Mapping[str, Figure]:
+        area, times = float(np.prod(self.table.lengths)), series["time"]
+        mean, heating = series["mean_temperature"], series["heating_power"]
         last = f"at t = {times[-1]:g} h"
         # |mean error| ≤ ‖error‖/√area
         within = None if bound is None else bound.proved(1.0 / np.sqrt(area))
@@ -196,7 +211,7 @@ class ThermostatApplication(AbstractModelApplication):
             ),
             "largest_heating": Figure(float(heating.max()), "kW", "at the saved times"),
             "below_set_point": Figure(
-                float(np.trapezoid(below, times)), "K h",
+                float(np.trapezoid(series["below_set_point"], times)), "K h",
                 "temperature below the set point, mean of the floor, over time",
             ),
             "decay_rate": Figure(
@@ -204,7 +219,7 @@ class ThermostatApplication(AbstractModelApplication):
                 "two temperatures certainly approach at this rate",
             ),
         }  # fmt: skip
-        return series, figures
+        return self.joined(self.final_values(end) | self.bound_figure(bound), figures)
 
 
 APPLICATION = ThermostatApplication

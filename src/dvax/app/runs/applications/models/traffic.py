@@ -2,27 +2,20 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from dvax.app.runs.applications.base import (
-    AbstractApplication,
-    Description,
-    Figure,
-    PerRow,
-    Plan,
-    Results,
-    Say,
-    Variable,
-)
-from dvax.app.runs.applications.certificate import certificate
+from dvax.app.runs.applications.base import Figure, Variable
+from dvax.app.runs.applications.certificate import Certificate
+from dvax.app.runs.applications.from_model import AbstractModelApplication
 from dvax.app.runs.schema import Section, SolverKeys, rule_error
-from dvax.app.runs.solver_options import check_model_steps, settings
+from dvax.app.runs.solver_options import check_model_steps
 from dvax.errors import InputError, SolveError, input_error
 from dvax.evolution import Solution
 from dvax.formats import read_nodes
+from dvax.models import Model
 from dvax.models.traffic import Incident, Traffic
 
 _DEFAULT_STEP = 0.25
@@ -74,16 +67,21 @@ class TrafficSection(SolverKeys):
     )
 
 
-class TrafficApplication(AbstractApplication):
+class TrafficApplication(AbstractModelApplication):
     """From the first day, on which all take the road that is fastest when empty, to the equilibrium."""
 
     section = TrafficSection
     files = ("network", "trips", "nodes")
     end = "model.days"
     keys: ClassVar[Mapping[str, tuple[str, ...]]] = {"link": ("init_node", "term_node")}
+    axis = ("day", "time")
+    verified = False
+    bound_words = "bound on the error of the path flows, in ℓ²"
+    bound_unit = "trip"
 
     def __init__(self, table: TrafficSection, paths: Mapping[str, Path], quiet: bool):
-        self.table, self.per_row = table, PerRow()
+        self.table = table
+        # Before paths are generated, which takes seconds.
         check_model_steps(table, table.days, f"{table.days:g} days")
         try:
             # By file names, so that the problems of both files are reported at once.
@@ -112,6 +110,12 @@ class TrafficApplication(AbstractApplication):
             )  # fmt: skip
         nodes = paths.get("nodes")
         self.places = None if nodes is None else read_nodes(nodes, self.traffic.network)
+        t, whole = self.traffic, np.arange(0.0, np.floor(table.days) + 0.5)
+        model = Model(
+            t.problem, t.all_or_nothing(), table.days, time_unit="day", constants=t.constants,
+            settings={"dt": min(_DEFAULT_STEP, table.days), "vi_solver": t.vi_solver},
+        )  # fmt: skip
+        self.set_model(model, times=np.unique(np.append(whole, table.days)))
 
     def _extreme(self, paths: Mapping[str, Path]) -> InputError:
         return input_error(
@@ -125,77 +129,82 @@ class TrafficApplication(AbstractApplication):
     def fit(self) -> str:
         return self.traffic.fit
 
-    def describe(self) -> Description:
-        t, table = self.traffic, self.table
-        sizes = [
+    def sizes(self) -> list[tuple[str, str, str]]:
+        t = self.traffic
+        return [
             ("links", str(len(t.network)), f"between {t.network.nodes} nodes"),
             ("pairs", str(len(t.trips)), f"with {float(np.sum(t.trips.flow)):g} trips"),
             ("paths", str(len(t.paths.lengths)), "generated until none of the network costs less"),
-            ("days", f"{table.days:g}", _steps(table)),
         ]
-        return Description(t.constants, (), sizes, _notes(table))
 
-    @property
-    def settings(self) -> dict[str, Any]:
-        step = min(_DEFAULT_STEP, self.table.days)
-        return settings(self.table, dt=step, vi_solver=self.traffic.vi_solver)
+    def notes(self) -> tuple[str, ...]:
+        return _notes(self.table)
 
-    def plan(self, say: Say) -> Plan:
-        t, table = self.traffic, self.table
-        whole = np.arange(0.0, np.floor(table.days) + 0.5)
-        days = whole if whole[-1] == table.days else np.append(whole, table.days)
-        say(f"solving {table.days:g} days")
-        return Plan(t.problem, t.all_or_nothing(), days, t.constants, self.settings, None, "days")
+    def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
+        t, each, ts, xs = self.traffic, self.per_row, solution.ts, solution.xs
+        day, link = ("day",), ("day", "link")
+        return {
+            name: Variable(dims, np.asarray(values), unit, words)
+            for name, dims, values, unit, words in (
+                ("objective", day, each("objective", t.objective, ts, xs),
+                 "trip cost", "Beckmann's objective"),
+                ("travel_time", day, each("travel_time", t.total_travel_time, ts, xs),
+                 "trip time", "time that all trips spend together"),
+                ("flow", link, each("flow", t.link_flows, xs), "trip", "flow of each link"),
+                ("capacity", link, each("capacity", t.capacity.value, ts),
+                 "trip", "capacity of each link"),
+                ("conservation_error", day, t.conservation_errors(solution),
+                 "1", "largest relative error of the trips of any pair"),
+            )
+        } | self.bound_series(bound)  # fmt: skip
 
-    def results(self, plan: Plan, solution: Solution, count: int) -> Results:
-        t, days = self.traffic, np.asarray(solution.ts)[:count]
-        bound = certificate(t.problem, solution, t.constants, count)
-        each = self.per_row
-        objectives = each("objective", t.objective, solution.ts, solution.xs)[:count]
-        spent = each("travel_time", t.total_travel_time, solution.ts, solution.xs)[:count]
-        flows = each("flow", t.link_flows, solution.xs)[:count]
-        gap = t.relative_gap(days[-1], solution.xs[-1])
-        # Paths are generated for all capacities; the equilibrium is that of the undisturbed network.
-        cut = np.asarray(t.capacity(days[-1])) != np.asarray(t.network.capacity)
-        least = np.nan if cut.any() else float(t.objective(days[-1], t.equilibrium))
-        found = t.figures(solution)
-        day = ("day",)
-        capacity = each("capacity", t.capacity.value, solution.ts)[:count]
-        variables = {
-            "day": Variable(day, days, "day", "time"),
-            "objective": Variable(day, objectives, "trip cost", "Beckmann's objective"),
-            "equilibrium": Variable((), np.asarray(least), "trip cost", "objective at equilibrium"),
-            "travel_time": Variable(day, spent, "trip time", "time that all trips spend together"),
-            "flow": Variable(("day", "link"), flows, "trip", "flow of each link"),
-            "capacity": Variable(("day", "link"), capacity, "trip", "capacity of each link"),
-            "init_node": Variable(("link",), np.asarray(t.network.init_node), "1", "from"),
-            "term_node": Variable(("link",), np.asarray(t.network.term_node), "1", "to"),
-            "error_bound": bound.variable("day", "trip", "bound on the error of path flows"),
+    def fixed(self, end: Solution) -> Mapping[str, Variable]:
+        network = self.traffic.network
+        least, words = np.asarray(self._least(end)), "objective at equilibrium"
+        found = {
+            "equilibrium": Variable((), least, "trip cost", words),
+            "init_node": Variable(("link",), np.asarray(network.init_node), "1", "from"),
+            "term_node": Variable(("link",), np.asarray(network.term_node), "1", "to"),
         }
         if self.places is not None:
-            variables["place"] = Variable(("node", "axis"), self.places, "1", "places of nodes")
+            found["place"] = Variable(("node", "axis"), self.places, "1", "places of nodes")
+        return found
+
+    def _least(self, end: Solution) -> float:
+        """Return the objective at equilibrium. Paths are generated for all capacities, and the
+        equilibrium is that of the undisturbed network: NaN if capacities differ on the last day."""
+        t, day = self.traffic, end.ts[-1]
+        cut = np.asarray(t.capacity(day)) != np.asarray(t.network.capacity)
+        return np.nan if cut.any() else float(t.objective(day, t.equilibrium))
+
+    def figures(
+        self, series: Mapping[str, np.ndarray], end: Solution, bound: Certificate | None
+    ) -> Mapping[str, Figure]:
         figures = {
             "objective": Figure(
-                found["objective"], "trip cost", "Beckmann's objective, Σ ∫ cost dv, on the last day"
+                float(series["objective"][-1]), "trip cost",
+                "Beckmann's objective, Σ ∫ cost dv, on the last day",
             ),
             "total_travel_time": Figure(
-                found["total_travel_time"], "trip time", "what all trips together spend that day"
+                float(series["travel_time"][-1]), "trip time",
+                "what all trips together spend that day",
             ),
             "max_conservation_error": Figure(
-                found["max_conservation_error"], "1",
+                float(series["conservation_error"].max()), "1",
                 "largest relative error of the trips of any pair, on any day",
             ),
             "relative_gap": Figure(
-                gap, "1",
+                self.traffic.relative_gap(end.ts[-1], end.xs[-1]), "1",
                 "share of all cost that would be saved if all took the least cost path of the network",
             ),
-            "error_bound": bound.figure("trip", "bound on the error of the path flows, in ℓ²"),
+            **self.bound_figure(bound),
         }  # fmt: skip
+        least = self._least(end)
         if np.isfinite(least):
             figures["equilibrium_objective"] = Figure(
                 least, "trip cost", "the same at the equilibrium that paths were generated for"
             )
-        return Results(figures, variables, t.constants, int(solution.stats["steps"]))
+        return figures
 
 
 def _notes(table: TrafficSection) -> tuple[str, ...]:
@@ -206,11 +215,6 @@ def _notes(table: TrafficSection) -> tuple[str, ...]:
         for number, i in enumerate(table.incidents, start=1)
         if i.end <= 0 or i.start >= table.days
     )
-
-
-def _steps(table: TrafficSection) -> str:
-    adaptive = table.rtol is not None or table.atol is not None
-    return "in adaptive steps" if adaptive else f"in steps of {table.dt or _DEFAULT_STEP:g}"
 
 
 APPLICATION = TrafficApplication

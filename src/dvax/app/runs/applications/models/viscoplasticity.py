@@ -79,6 +79,11 @@ class ViscoplasticityApplication(AbstractModelApplication):
         self.moved = [k for k, c in enumerate(COMPONENTS) if np.any(path.columns.get(f"e{c}", 0.0))]
         self.numbers = self._yield_numbers()
         von_mises = table.yield_condition == "von-mises"
+        # In an isotropic material a shear that is not moved has no stress; nor have the normal
+        # components, if none is moved and yielding does not depend on the pressure.
+        normal = not von_mises or min(self.moved, default=3) < 3
+        shear = [k for k in self.moved if k >= 3]
+        self.responding = [*(range(3) if normal else ()), *shear]
         self.point = DuvautLions(
             bulk=table.bulk_modulus, shear=table.shear_modulus, relaxation=table.relaxation_time,
             strain=Table(path.times, np.asarray(mandel(rows))),
@@ -128,9 +133,7 @@ class ViscoplasticityApplication(AbstractModelApplication):
             "check whether its unit is [1] or [%].",
         )
 
-    def further(
-        self, solution: Solution, bound: Certificate | None
-    ) -> tuple[Mapping[str, Variable], Mapping[str, Figure]]:
+    def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
         point, ts, xs = self.point, solution.ts, solution.xs
         stress, plastic, strain = (
             np.asarray(tensor(v))
@@ -146,6 +149,7 @@ class ViscoplasticityApplication(AbstractModelApplication):
             numbers["friction"] * np.maximum(pressure + numbers["tension"], 0.0)
         )  # fmt: skip
         size = np.sqrt(2 / 3) * np.linalg.norm(plastic, axis=(1, 2))
+        over = np.linalg.norm(np.asarray(_trial(point, ts, xs)) - np.asarray(solution.us), axis=1)
         series = {
             "equivalent_stress": Variable(("time",), q, "MPa", "√(3/2)‖dev σ‖"),
             "yield_limit": Variable(
@@ -153,24 +157,30 @@ class ViscoplasticityApplication(AbstractModelApplication):
             ),
             "pressure": Variable(("time",), pressure, "MPa", "−tr σ/3"),
             "equivalent_plastic_strain": Variable(("time",), size, "1", "√(2/3)‖ε_p‖"),
+            "overstress": Variable(("time",), over, "MPa", "distance from the yield set"),
         }
         of = {"strain": (strain, "1"), "stress": (stress, "MPa"), "plastic_strain": (plastic, "1")}
         for what, (values, unit) in of.items():
-            for k, c in enumerate(COMPONENTS):
+            words = what.replace("_", " ")
+            for k in self.moved if what == "strain" else self.responding:
+                c = COMPONENTS[k]
                 entry = values[:, int(c[0]) - 1, int(c[1]) - 1]
-                roundoff = 1e-9 * np.abs(values).max()
-                if k in self.moved or np.abs(entry).max() > roundoff:
-                    words = what.replace("_", " ")
-                    series[f"{what}_{c}"] = Variable(
-                        ("time",), entry, unit, f"{words}, component {c}"
-                    )
+                series[f"{what}_{c}"] = Variable(("time",), entry, unit, f"{words}, component {c}")
+        return {**self.named(solution), **self.bound_series(bound), **series}
+
+    def figures(
+        self, series: Mapping[str, np.ndarray], end: Solution, bound: Certificate | None
+    ) -> Mapping[str, Figure]:
+        q, size = series["equivalent_stress"], series["equivalent_plastic_strain"]
         proved = None if bound is None else bound.proved()
         most = None if proved is None else float(proved.max())
         G = self.table.shear_modulus
         soft = min(2 * G, 3 * self.table.bulk_modulus)
-        # Work of the stress on the plastic strain, by the trapezoidal rule.
-        work = np.sum(0.5 * (stress[1:] + stress[:-1]) * np.diff(plastic, axis=0))
-        over = np.linalg.norm(np.asarray(_trial(point, ts, xs)) - np.asarray(solution.us), axis=1)
+        # Work of the stress on the plastic strain, by the trapezoidal rule. Shear counts twice.
+        work = sum(
+            (1 if k < 3 else 2) * np.trapezoid(series[f"stress_{c}"], series[f"plastic_strain_{c}"])
+            for k, c in ((k, COMPONENTS[k]) for k in self.responding)
+        )
         figures = {
             # |Δq| ≤ √(3/2)‖Δσ‖ ≤ √(3G)‖Δε_p‖ in the norm of the energy.
             "peak_stress": Figure(
@@ -178,17 +188,18 @@ class ViscoplasticityApplication(AbstractModelApplication):
                 None if most is None else float(np.sqrt(3 * G)) * most,
             ),
             "overstress": Figure(
-                float(over.max()), "MPa", "largest distance of the stress from the yield set"
+                float(series["overstress"].max()), "MPa",
+                "largest distance of the stress from the yield set",
             ),
             "plastic_strain": Figure(
-                float(size[-1]), "1", f"√(2/3)‖ε_p‖ at t = {float(ts[-1]):g} s",
+                float(size[-1]), "1", f"√(2/3)‖ε_p‖ at t = {series['time'][-1]:g} s",
                 None if proved is None else float(np.sqrt(2 / (3 * soft)) * proved[-1]),
             ),
             "dissipated_energy": Figure(
                 float(work), "MJ/m^3", "work on the plastic strain, from the saved times"
             ),
         }  # fmt: skip
-        return series, figures
+        return self.joined(self.final_values(end) | self.bound_figure(bound), figures)
 
 
 def _trial(point: DuvautLions, ts: Any, xs: Any) -> jax.Array:
