@@ -19,6 +19,7 @@ from pathlib import Path
 import equinox as eqx
 import pytest
 from tests.figures import UNSTABLE, unstable_lines
+from tests.selection import mostly_thorough
 
 import dvax
 
@@ -260,7 +261,11 @@ def test_class_faults_are_detected():
     ]
 
 
-@pytest.mark.parametrize("name", CONTRACT)
+LONG = ["directional_derivative", "sensitivity.change"]
+"""Names with examples that `make thorough` runs, and continuous integration on the newest Python."""
+
+
+@pytest.mark.parametrize("name", mostly_thorough(CONTRACT, [n for n in CONTRACT if n not in LONG]))
 def test_public_names_have_an_example_that_runs(name: str):
     thing = resolve(name)
     finder = doctest.DocTestFinder(recurse=False)
