@@ -18,6 +18,7 @@ from pathlib import Path
 
 import equinox as eqx
 import pytest
+from docs.extensions.public_names import public_names
 from tests.figures import UNSTABLE, unstable_lines
 
 import dvax
@@ -260,9 +261,43 @@ def test_class_faults_are_detected():
     ]
 
 
-@pytest.mark.parametrize("name", CONTRACT)
+# Needs several devices; tests/sharded runs it in a process of its own.
+NOT_RUN_HERE = {"communication"}
+
+
+def test_contract_names_are_public():
+    assert not set(CONTRACT) - {name.removeprefix("dvax.") for name in public_names()}
+
+
+# Examples whose programs take long to compile; those of CONTRACT run always.
+LONG = {
+    *(
+        "Bound",
+        "Directional",
+        "Ensemble",
+        "Fold",
+        "ZarrStore",
+        "ensemble",
+        "export",
+        "load_exported",
+    ),
+    *("ensembles.Moments", "evolution.Bounds", "evolution.Exported", "evolution.ExportedSolution"),
+    *("models.DruckerPrager", "models.VonMises", "models.response_spectrum", "sensitivity.Change"),
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.thorough] if name in LONG else [])
+        for name in (name.removeprefix("dvax.") for name in public_names())
+    ],
+)
 def test_public_names_have_an_example_that_runs(name: str):
     thing = resolve(name)
+    if name in NOT_RUN_HERE:
+        assert ">>>" in (inspect.getdoc(thing) or "")
+        return
     finder = doctest.DocTestFinder(recurse=False)
     found = finder.find(thing, name, module=False, globs={})
     examples = [example for test in found for example in test.examples]
