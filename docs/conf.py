@@ -20,7 +20,8 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 from importlib.metadata import version as version_of  # noqa: E402
 
 if tuple(map(int, version_of("jaxlib").split(".")[:2])) < (0, 12):
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+    flags = ("--xla_backend_optimization_level=0", "--xla_cpu_use_fusion_emitters=false")
+    os.environ.setdefault("XLA_FLAGS", " ".join(flags))
 
 import jax  # noqa: E402
 
@@ -39,7 +40,9 @@ extensions = [
     "sphinx.ext.viewcode",
     "sphinx.ext.intersphinx",
     "sphinx_copybutton",
+    "sphinx_gallery.gen_gallery",
     "docs.extensions.mathml",
+    "docs.extensions.gallery",
     "docs.extensions.docstrings",
     "docs.extensions.figures",
     "docs.extensions.reference",
@@ -74,6 +77,29 @@ if os.environ.get("DVAX_DOCS_INTERSPHINX") == "1":
         "jax": ("https://docs.jax.dev/en/latest", None),
         "xarray": ("https://docs.xarray.dev/en/stable", None),
     }
+
+sphinx_gallery_conf = {
+    "examples_dirs": ["../examples/gallery"],
+    "gallery_dirs": ["gallery"],
+    "backreferences_dir": "generated/backreferences",
+    "doc_module": ("dvax",),
+    "reference_url": {"dvax": None},
+    "inspect_global_variables": False,
+    "abort_on_example_error": True,
+    "reset_modules": ("docs.extensions.gallery.reset",),
+    "image_scrapers": ("docs.extensions.gallery.figures",),
+    "within_subsection_order": "FileNameSortKey",
+    "capture_repr": (),
+    "remove_config_comments": True,
+    "min_reported_time": 0,
+    "show_signature": False,
+    "download_all_examples": False,
+    "thumbnail_size": (480, 330),
+    "first_notebook_cell": "%matplotlib inline\n# pip install 'dvax[app]'",
+    "write_computation_times": False,
+    # Two at a time: a program is compiled by one thread for the most part.
+    "parallel": 2,
+}
 
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True

@@ -5,6 +5,7 @@ import inspect
 import re
 from pathlib import Path
 
+import jax
 import pytest
 
 import dvax
@@ -21,7 +22,25 @@ def blocks(page: Path) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=named)
+# Pages whose examples compile many programs; `make thorough` runs them.
+LONG = {
+    "howto/troubleshooting.md",
+    "tutorials/fit.md",
+    "tutorials/heaters.md",
+    "tutorials/own-mesh.md",
+    "tutorials/price-game.md",
+    "tutorials/saturated-controller.md",
+}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=[pytest.mark.thorough] if named(page) in LONG else [])
+        for page in PAGES
+    ],
+    ids=named,
+)
 def test_page_examples_print_the_documented_output(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -32,8 +51,10 @@ def test_page_examples_print_the_documented_output(
     # One page is one session: later examples use what earlier ones made.
     test = doctest.DocTestParser().get_doctest("\n".join(found), {}, page.name, str(page), 0)
     report: list[str] = []
-    runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE)
-    runner.run(test, out=report.append)
+    runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS)
+    # As a user runs them: the strict promotion of the tests is for the library.
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        runner.run(test, out=report.append)
     assert runner.summarize(verbose=False).failed == 0, "".join(report)
 
 
