@@ -77,9 +77,11 @@ format: $(READY) ## rewrite the sources in the common format
 	$(PY) -m ruff check --fix .
 	$(PY) -m ruff format .
 
-docs: $(READY) ## the documentation as a site in ./site
+docs: $(READY) ## the documentation as a site in ./site, with all examples of the gallery
 	$(PY) -m pip install --quiet --no-build-isolation --editable '.[docs]'
-	$(PY) -m mkdocs build --strict
+	$(PY) -m sphinx --builder html --nitpicky --fail-on-warning --keep-going --quiet \
+	    --jobs 2 --doctree-dir build/doctrees docs site
+	$(PY) -m docs.extensions.check_site site
 
 lock: ## pin the newest releases that fit pyproject.toml (needs uv)
 	uv pip compile pyproject.toml --extra app --extra dev --universal --python-version 3.11 \
@@ -87,5 +89,6 @@ lock: ## pin the newest releases that fit pyproject.toml (needs uv)
 	    --custom-compile-command 'make lock' --output-file $(LOCK)
 
 clean: ## everything the other targets have written
-	rm -rf $(VENV) .cache .hypothesis .pytest_cache .ruff_cache build dist site demo-run
+	rm -rf $(VENV) .cache .hypothesis .pytest_cache .ruff_cache build dist site demo-run \
+	    docs/gallery docs/generated docs/reference/api
 	find src tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true

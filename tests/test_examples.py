@@ -1,8 +1,14 @@
-"""The programs of examples/ run, and print correct numbers."""
+"""The programs of examples/ run, print correct numbers, and those of the gallery a certificate."""
 
+import ast
+import contextlib
+import io
+import re
 import runpy
 from pathlib import Path
 
+import jax
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import scipy.integrate
@@ -110,3 +116,47 @@ def test_examples_print_correct_numbers_and_draw(name, tmp_path):
     TRUE[name](found)
     assert 0.0 < found["error_bound"] < 1e-3
     assert (tmp_path / f"{name}.png").stat().st_size > 20_000
+
+
+GALLERY = sorted((EXAMPLES / "gallery").glob("plot_*.py"))
+# These run in `make test`; all run in `make thorough` and in `make docs`.
+QUICK = {"plot_certificate_true_error", "plot_circuit_bridge", "plot_game_vi"}
+
+
+def test_gallery_has_a_description_a_figure_and_a_certificate_in_each_example():
+    assert len(GALLERY) >= 20
+    for file in GALLERY:
+        text = file.read_text(encoding="utf-8")
+        title, rule = (ast.get_docstring(ast.parse(text)) or "").split("\n")[:2]
+        assert len(rule) >= len(title) and set(rule) == {"="}, file.name
+        before, _, certificate = text.partition("# The certificate\n# ---------------\n")
+        assert "plt.subplots(" in before and "title=" in before, f"{file.name}: no picture"
+        # A status is printed as dvax says it, never as a constant of the example.
+        assert ".status" in certificate or "error_bound" in certificate, file.name
+        printed = re.findall(r"print\(.*", certificate)
+        assert printed and not any("proved" in line for line in printed if "decay" not in line), (
+            file
+        )
+
+
+@pytest.mark.parametrize(
+    "file",
+    [pytest.param(f, marks=[] if f.stem in QUICK else [pytest.mark.thorough]) for f in GALLERY],
+    ids=lambda file: file.stem,
+)
+def test_gallery_example_runs_and_labels_its_axes(file: Path):
+    printed = io.StringIO()
+    # As a user runs it: the strict promotion of the tests is for the library.
+    with (
+        jax.numpy_dtype_promotion("standard"),
+        jax.numpy_rank_promotion("allow"),
+        contextlib.redirect_stdout(printed),
+    ):
+        runpy.run_path(str(file))
+    figures = [plt.figure(number) for number in plt.get_fignums()]
+    assert figures
+    for figure in figures:
+        for axes in figure.axes:
+            assert axes.get_xlabel() or axes.get_ylabel(), "an axis without a name"
+    plt.close("all")
+    assert re.search(r"\b(proved|declared|estimated)\b|error bound", printed.getvalue())

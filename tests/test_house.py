@@ -18,8 +18,8 @@ from pathlib import Path
 
 import equinox as eqx
 import pytest
+from docs.extensions.public_names import public_names
 from tests.figures import UNSTABLE, unstable_lines
-from tests.selection import mostly_thorough
 
 import dvax
 
@@ -261,13 +261,44 @@ def test_class_faults_are_detected():
     ]
 
 
-LONG = ["directional_derivative", "sensitivity.change"]
-"""Names with examples that `make thorough` runs, and continuous integration on the newest Python."""
+# Needs several devices; tests/sharded runs it in a process of its own.
+NOT_RUN_HERE = {"communication"}
 
 
-@pytest.mark.parametrize("name", mostly_thorough(CONTRACT, [n for n in CONTRACT if n not in LONG]))
+def test_contract_names_are_public():
+    assert not set(CONTRACT) - {name.removeprefix("dvax.") for name in public_names()}
+
+
+# Examples whose programs take long to compile.
+LONG = {
+    *(
+        "Bound",
+        "Directional",
+        "Ensemble",
+        "Fold",
+        "ZarrStore",
+        "ensemble",
+        "export",
+        "load_exported",
+    ),
+    *("ensembles.Moments", "evolution.Bounds", "evolution.Exported", "evolution.ExportedSolution"),
+    *("models.DruckerPrager", "models.VonMises", "models.response_spectrum"),
+    *("directional_derivative", "sensitivity.Change", "sensitivity.change"),
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.thorough] if name in LONG else [])
+        for name in (name.removeprefix("dvax.") for name in public_names())
+    ],
+)
 def test_public_names_have_an_example_that_runs(name: str):
     thing = resolve(name)
+    if name in NOT_RUN_HERE:
+        assert ">>>" in (inspect.getdoc(thing) or "")
+        return
     finder = doctest.DocTestFinder(recurse=False)
     found = finder.find(thing, name, module=False, globs={})
     examples = [example for test in found for example in test.examples]

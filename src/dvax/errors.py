@@ -6,7 +6,18 @@ from dataclasses import dataclass
 
 
 class DvaxError(Exception):
-    """The base class of all exceptions of dvax."""
+    """The base class of all exceptions of dvax.
+
+    ```python
+    >>> import dvax
+    >>> try:
+    ...     dvax.sets.Box(1.0, 0.0)
+    ... except dvax.DvaxError as error:
+    ...     print(type(error).__name__)
+    InputError
+
+    ```
+    """
 
 
 @dataclass(frozen=True)
@@ -27,7 +38,20 @@ class InputProblem:
 
 
 class InputError(DvaxError, ValueError):
-    """The input of the user violates a rule. The error lists all problems, not only the first."""
+    """The input of the user violates a rule. The error lists all problems, not only the first.
+
+    ```python
+    >>> import dvax
+    >>> try:
+    ...     dvax.sets.Box(1.0, 0.0)
+    ... except dvax.InputError as error:
+    ...     print(error.problems[0].given)
+    ...     print(error.problems[0].fix)
+    lower = 1, upper = 0
+    Swap the bounds, or widen the interval
+
+    ```
+    """
 
     problems: tuple[InputProblem, ...]
 
@@ -87,6 +111,20 @@ class SolveError(DvaxError, RuntimeError):
 
     `cause` describes the failure and its evidence. `fixes` names options that may help, so that a
     caller with other names for them (the keys of a configuration file) can phrase them differently.
+
+    ```python
+    >>> import dvax
+    >>> problem = dvax.Problem(                    # x' = 1 + x² is infinite at t = π/2
+    ...     A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1.0),
+    ...     f=lambda t, x, u, args: 1.0 + x**2, h=lambda t, x, u, args: 0.5 - u,
+    ... )
+    >>> try:
+    ...     dvax.solve(problem, 0.0, 0.0, 3.0, method=dvax.DormandPrince())
+    ... except dvax.SolveError as error:
+    ...     print(error.fixes[0].option, f"{float(error.solution.stats['t']):.3f}")
+    t1 1.571
+
+    ```
     """
 
     def __init__(self, cause: str, solution: object = None, fixes: tuple[Fix, ...] = ()):
@@ -100,4 +138,20 @@ class SolveError(DvaxError, RuntimeError):
 
 
 class DifferentiationError(DvaxError, TypeError):
-    """The chosen adjoint does not support the requested differentiation mode."""
+    """The chosen adjoint does not support the requested differentiation mode.
+
+    ```python
+    >>> import dvax, jax
+    >>> problem = dvax.Problem(
+    ...     A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+    ...     f=lambda t, x, u, args: 3.0 - 0.5 * x - u,
+    ...     h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+    ... )
+    >>> try:
+    ...     jax.jvp(lambda x: dvax.solve(problem, x, 0.0, 2.0).xs[0], (-1.0,), (1.0,))
+    ... except dvax.DifferentiationError as error:
+    ...     print("forward" in str(error))
+    True
+
+    ```
+    """

@@ -11,7 +11,21 @@ from .._tree import Tree
 
 class Moments(NamedTuple):
     """The number of rows, their mean, and the sum of the squares of their deviations from it, entry by
-    entry."""
+    entry.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> problem = dvax.Problem(
+    ...     A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+    ...     f=lambda t, x, u, load: load - 0.5 * x - u,
+    ...     h=lambda t, x, u, load: 1.0 - 2.0 * x - u,
+    ... )
+    >>> found = dvax.ensemble(problem, -1.0, 0.0, 2.0, jnp.linspace(2.0, 4.0, 11))
+    >>> int(found.moments.count), bool(found.moments.mean == found.mean)
+    (11, True)
+
+    ```
+    """
 
     count: Any
     mean: Tree

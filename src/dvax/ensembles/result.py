@@ -22,9 +22,18 @@ class Fold(NamedTuple):
     `start`; `value` is what a member's `observe=` returns. `add` is a JAX function.
 
     ```python
-    >>> import jax.numpy as jnp
-    >>> import dvax
+    >>> import dvax, jax.numpy as jnp
+    >>> problem = dvax.Problem(
+    ...     A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+    ...     f=lambda t, x, u, load: load - 0.5 * x - u,
+    ...     h=lambda t, x, u, load: 1.0 - 2.0 * x - u,
+    ... )
     >>> largest = dvax.Fold(-jnp.inf, lambda carry, x: jnp.maximum(carry, jnp.max(x)))
+    >>> found = dvax.ensemble(
+    ...     problem, -1.0, 0.0, 2.0, jnp.linspace(2.0, 4.0, 11), folds={"largest": largest}
+    ... )
+    >>> bool(found.folded["largest"] == jnp.max(found.values))
+    True
 
     ```
     """
@@ -46,6 +55,21 @@ class Ensemble:
       with the reason where dvax chose;
     - `moments`: count, mean and squares of the members that succeeded (`dvax.ensembles.Moments`);
     - `folded`: the results of `folds=`, by name.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> problem = dvax.Problem(
+    ...     A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+    ...     f=lambda t, x, u, load: load - 0.5 * x - u,
+    ...     h=lambda t, x, u, load: 1.0 - 2.0 * x - u,
+    ... )
+    >>> found = dvax.ensemble(problem, -1.0, 0.0, 2.0, jnp.linspace(2.0, 4.0, 11))
+    >>> found.values.shape, bool(found.failed.any())
+    ((11,), False)
+    >>> print(f"{float(found.mean):.3f} ± {float(found.std):.3f}, median {found.quantile(0.5):.3f}")
+    1.835 ± 0.426, median 1.836
+
+    ```
     """
 
     values: Tree | None

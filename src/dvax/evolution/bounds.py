@@ -14,7 +14,22 @@ from ..programs.enclosure import is_enclosure
 
 
 class Bounds(NamedTuple):
-    """Entrywise bounds (low, high) on x_h and on u_h."""
+    """Entrywise bounds (low, high) on x_h and on u_h.
+
+    ```python
+    >>> import dvax
+    >>> problem = dvax.Problem(                    # Lipschitz in a region only
+    ...     A=dvax.generators.Scalar(-2.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1.0),
+    ...     f=lambda t, x, u, args: u - 0.1 * x**3, h=lambda t, x, u, args: 1.0 - x - u,
+    ... )
+    >>> check = dvax.verify(problem, 0.0, 0.0, 2.0, x=(-1.0, 1.0))
+    >>> sol = dvax.solve(problem, 0.0, 0.0, 2.0, constants=check.constants)
+    >>> low, high = sol.bounds.x                   # boxes that x does not leave, up to each saved time
+    >>> bool((-1.0 < low).all() and (high < 1.0).all())
+    True
+
+    ```
+    """
 
     x: tuple[Tree, Tree]
     u: tuple[Tree, Tree]

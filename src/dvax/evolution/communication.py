@@ -24,6 +24,14 @@ class Collective(NamedTuple):
     - `count`: how many; `bytes`: of the results of all of them on one device;
     - `optional`: a branch or a loop within a step contains them, so that a step may run them never or
       more than once.
+
+    ```python
+    >>> from dvax.evolution import Collective
+    >>> sums = Collective("all-reduce", count=2, bytes=16, optional=False)
+    >>> sums.kind, sums.count, sums.bytes
+    ('all-reduce', 2, 16)
+
+    ```
     """
 
     kind: str
@@ -49,7 +57,17 @@ class Collective(NamedTuple):
 
 class Communication(NamedTuple):
     """The collective operations of one attempted `step`, those outside the loop over steps (`once`),
-    and the number of `devices`. As text it is a table."""
+    and the number of `devices`. As text it is a table.
+
+    ```python
+    >>> from dvax.evolution import Collective, Communication
+    >>> sums = Collective("all-reduce", count=2, bytes=16, optional=False)
+    >>> print(Communication(devices=8, step=(sums,), once=()))
+             operation            count  bytes on a device
+    step     all-reduce               2                 16
+
+    ```
+    """
 
     devices: int
     step: tuple[Collective, ...]

@@ -92,10 +92,10 @@ class Events(eqx.Module):
     ...     f=lambda t, x, u, args: 1.0 + 0.0 * x, h=lambda t, x, u, args: x,
     ... )
     >>> half = dvax.Event(lambda t, x, u, args: x - 0.5, name="half")
-    >>> held = dvax.Event(lambda t, x, u, args: u - x, name="held")
-    >>> sol = dvax.solve(problem, 0.0, 0.0, 2.0, events=[half, held])
+    >>> full = dvax.Event(lambda t, x, u, args: x - 1.0, name="full")
+    >>> sol = dvax.solve(problem, 0.0, 0.0, 2.0, events=[full, half])
     >>> sol.events.index.tolist(), [f"{t:.6f}" for t in sol.events.of("half").ts]
-    ([0], ['0.500000'])
+    ([1, 0], ['0.500000'])
 
     ```
     """

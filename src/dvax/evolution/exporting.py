@@ -81,7 +81,7 @@ def export(
     >>> run.save("run.dvax")                                       # doctest: +SKIP
     >>> run = dvax.load_exported("run.dvax")                       # doctest: +SKIP
     >>> print(f"{float(run(-1.0).xs[0]):.4f} {float(run(-1.0, args={'load': 2.0}).xs[0]):.4f}")
-    1.8361 1.1935
+    1.8361 1.1899
 
     ```
     """

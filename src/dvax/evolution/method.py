@@ -33,6 +33,14 @@ class AbstractMethod(eqx.Module):
     away. Where `is_rosenbrock`, the method has A + J in the place of A and f̃ − Jx in that of f̃, with
     J = Df̃(t₀, x₀); where `explicit_in_A`, it has 0 and f̃ + Ax there. `pair` numbers two evaluations of
     a measured step at one time, whose differences show the slope of f̃.
+
+    ```python
+    >>> import dvax
+    >>> method = dvax.ETD4RK()
+    >>> isinstance(method, dvax.evolution.AbstractMethod), method.order, dvax.ETD2RK().order
+    (True, 4, 2)
+
+    ```
     """
 
     order: eqx.AbstractClassVar[int]

@@ -8,7 +8,23 @@ import jax.numpy as jnp
 
 
 class RESULTS(eqx.Enumeration):
-    """The result of a solve, described in a sentence."""
+    """The result of a solve, described in a sentence.
+
+    ```python
+    >>> import dvax
+    >>> problem = dvax.Problem(
+    ...     A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+    ...     f=lambda t, x, u, args: 3.0 - 0.5 * x - u,
+    ...     h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+    ... )
+    >>> sol = dvax.solve(problem, -1.0, 0.0, 2.0)
+    >>> sol.result == dvax.RESULTS.successful
+    Array(True, dtype=bool)
+    >>> print(dvax.RESULTS[sol.result])
+    The end time was reached.
+
+    ```
+    """
 
     successful = "The end time was reached."
     terminal_event = "A terminal event ended the run."

@@ -21,7 +21,24 @@ _UNIT, _GRAVITY = (re.compile(text, re.IGNORECASE) for text in (r"units?\b", r"\
 
 def read_at2(path: str | os.PathLike[str]) -> tuple[float, np.ndarray]:
     """Return the step (s) and the accelerations (in units of standard gravity) of an .at2 file. Raises
-    `InputError` with the line of every problem."""
+    `InputError` with the line of every problem.
+
+    ```python
+    >>> import pathlib, tempfile
+    >>> from dvax.formats import read_at2
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "record.at2"
+    >>> _ = file.write_text('''PEER STRONG MOTION DATABASE RECORD
+    ... A synthetic record
+    ... ACCELERATION TIME HISTORY IN UNITS OF G
+    ... NPTS=  4, DT= .02000 SEC
+    ...   0.0   0.1  -0.2   0.05
+    ... ''')
+    >>> step, acceleration = read_at2(file)
+    >>> step, acceleration.tolist()
+    (0.02, [0.0, 0.1, -0.2, 0.05])
+
+    ```
+    """
     lines, problems = read_text(path, "an .at2 file").splitlines(), FileProblems(path)
     found = next(((i, m) for i, t in enumerate(lines, 1) if (m := _SIZES.search(t))), None)
     if found is None:

@@ -63,6 +63,36 @@ def read_mesh(path: str | os.PathLike[str], contact: str, clamped: str) -> Any:
     kind, or a boundary is missing, empty, inside the body, or not along edges of elements.
 
     **Returns:** a scikit-fem `MeshTri` or `MeshQuad`.
+
+    ```python
+    >>> import pathlib, tempfile
+    >>> from dvax.formats import read_mesh
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "square.mesh"
+    >>> _ = file.write_text('''MeshVersionFormatted 2
+    ... Dimension 2
+    ... Vertices
+    ... 4
+    ... 0 0 0
+    ... 1 0 0
+    ... 1 1 0
+    ... 0 1 0
+    ... Edges
+    ... 4
+    ... 1 2 1
+    ... 2 3 2
+    ... 3 4 3
+    ... 4 1 2
+    ... Triangles
+    ... 2
+    ... 1 2 3 0
+    ... 1 3 4 0
+    ... End
+    ... ''')
+    >>> mesh = read_mesh(file, contact="3", clamped="1")
+    >>> mesh.nelements, sorted(mesh.boundaries)
+    (2, ['clamped', 'contact'])
+
+    ```
     """
     place = str(path)
     raw = _plane(_load(Path(path), place), place)

@@ -58,7 +58,16 @@ class Element:
 
 @dataclass(frozen=True)
 class Netlist:
-    """The elements in the order of the file, and its `name` in messages."""
+    """The elements in the order of the file, and its `name` in messages.
+
+    ```python
+    >>> from dvax.formats import read_netlist
+    >>> net = read_netlist("C1 out 0 1u", name="half.cir")
+    >>> net.name, [element.name for element in net.elements]
+    ('half.cir', ['C1'])
+
+    ```
+    """
 
     name: str
     elements: tuple[Element, ...]

@@ -42,6 +42,28 @@ class RTS(NamedTuple):
     - `names` of the n units; `area`, the number of each one's area, the first digit of its bus;
     - `cost` c and `slope` a of the marginal costs cᵢ + aᵢuᵢ, in $/MWh and $/MWh per MW;
     - `capacity`: what each can make, a row an hour; `load`, MW by hour; `start`, the first hour.
+
+    ```python
+    >>> import pathlib, tempfile
+    >>> from dvax.formats import read_rts
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> _ = (folder / "gen.csv").write_text('''
+    ... GEN UID,Bus ID,Unit Type,Fuel,PMax MW,Fuel Price $/MMBTU,HR_incr_1,HR_incr_2,HR_incr_3
+    ... 101_CC_1,101,CC,NG,300,4.0,7000,7200,7500
+    ... 102_WIND_1,102,WIND,Wind,150,0,0,0,0
+    ... 102_PV_1,102,PV,Solar,80,0,0,0,0
+    ... '''.lstrip())
+    >>> series = {"regional_Load": "1", "wind": "102_WIND_1", "pv": "102_PV_1"}
+    >>> for name, column in series.items():
+    ...     rows = [f"2021,3,14,{k},{3 * k}" for k in range(1, 25)]
+    ...     _ = (folder / f"DAY_AHEAD_{name}.csv").write_text(
+    ...         chr(10).join([f"Year,Month,Day,Period,{column}", *rows])
+    ...     )
+    >>> rts = read_rts(folder)
+    >>> rts.names, rts.cost.tolist(), rts.load[:2].tolist()
+    (('101_CC_1', '102_WIND_1', '102_PV_1'), [28.0, 0.0, 0.0], [3.0, 6.0])
+
+    ```
     """
 
     names: tuple[str, ...]
@@ -73,6 +95,28 @@ def read_rts(folder: str | Path) -> RTS:
     explains.
 
     Source: Barrows et al. 2020, IEEE Trans. Power Syst. 35, 119–127; github.com/GridMod/RTS-GMLC.
+
+    ```python
+    >>> import pathlib, tempfile
+    >>> from dvax.formats import read_rts
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> _ = (folder / "gen.csv").write_text('''
+    ... GEN UID,Bus ID,Unit Type,Fuel,PMax MW,Fuel Price $/MMBTU,HR_incr_1,HR_incr_2,HR_incr_3
+    ... 101_CC_1,101,CC,NG,300,4.0,7000,7200,7500
+    ... 102_WIND_1,102,WIND,Wind,150,0,0,0,0
+    ... 102_PV_1,102,PV,Solar,80,0,0,0,0
+    ... '''.lstrip())
+    >>> series = {"regional_Load": "1", "wind": "102_WIND_1", "pv": "102_PV_1"}
+    >>> for name, column in series.items():
+    ...     rows = [f"2021,3,14,{k},{3 * k}" for k in range(1, 25)]
+    ...     _ = (folder / f"DAY_AHEAD_{name}.csv").write_text(
+    ...         chr(10).join([f"Year,Month,Day,Period,{column}", *rows])
+    ...     )
+    >>> rts = read_rts(folder)
+    >>> rts.start.date().isoformat(), rts.capacity[0].tolist()
+    ('2021-03-14', [300.0, 3.0, 3.0])
+
+    ```
     """
     folder = Path(folder)
     paths = {name: _place(folder, places) for name, places in RTS_FILES.items()}

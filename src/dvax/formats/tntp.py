@@ -35,7 +35,27 @@ class Line(NamedTuple):
 
 
 class Flows(NamedTuple):
-    """Known flows: `volume` and `cost`, one of each a link, in the order of the network."""
+    """Known flows: `volume` and `cost`, one of each a link, in the order of the network.
+
+    ```python
+    >>> import pathlib, tempfile
+    >>> from dvax.formats import Network, read_flows
+    >>> roads = Network(
+    ...     zones=2, nodes=2, first_thru_node=1, init_node=[1, 2], term_node=[2, 1],
+    ...     capacity=[9.0, 9.0], length=[1.0, 1.0], free_flow_time=[5.0, 5.0], b=[0.15, 0.15],
+    ...     power=[4.0, 4.0],
+    ... )
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "roads.tntp"
+    >>> _ = file.write_text('''From To Volume Capacity Cost
+    ... 1 2 6.0 9.0 5.2
+    ... 2 1 3.0 9.0 5.0
+    ... ''')
+    >>> flows = read_flows(file, roads)
+    >>> float(flows.volume @ flows.cost)                            # the total travel time
+    46.2
+
+    ```
+    """
 
     volume: np.ndarray
     cost: np.ndarray
@@ -190,6 +210,25 @@ def read_flows(path: str | os.PathLike[str], network: Network) -> Flows:
 
     **Raises:** `dvax.InputError` for missing columns, cells that are no numbers, links that the
     network does not have, has twice in the file, or that are missing from it.
+
+    ```python
+    >>> import pathlib, tempfile
+    >>> from dvax.formats import Network, read_flows
+    >>> roads = Network(
+    ...     zones=2, nodes=2, first_thru_node=1, init_node=[1, 2], term_node=[2, 1],
+    ...     capacity=[9.0, 9.0], length=[1.0, 1.0], free_flow_time=[5.0, 5.0], b=[0.15, 0.15],
+    ...     power=[4.0, 4.0],
+    ... )
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "roads.tntp"
+    >>> _ = file.write_text('''From To Volume Capacity Cost
+    ... 1 2 6.0 9.0 5.2
+    ... 2 1 3.0 9.0 5.0
+    ... ''')
+    >>> flows = read_flows(file, roads)
+    >>> flows.volume.tolist(), flows.cost.tolist()
+    ([6.0, 3.0], [5.2, 5.0])
+
+    ```
     """
     lines, problems = read_text(path, "a TNTP file").splitlines(), FileProblems(path)
     header, rows = _first_row(lines, problems, "From To Volume Cost")
@@ -210,6 +249,24 @@ def read_nodes(path: str | os.PathLike[str], network: Network) -> np.ndarray:
 
     **Raises:** `dvax.InputError` for missing columns, cells that are no numbers, nodes that the
     network does not have, that stand twice, or that are missing.
+
+    ```python
+    >>> import pathlib, tempfile
+    >>> from dvax.formats import Network, read_nodes
+    >>> roads = Network(
+    ...     zones=2, nodes=2, first_thru_node=1, init_node=[1, 2], term_node=[2, 1],
+    ...     capacity=[9.0, 9.0], length=[1.0, 1.0], free_flow_time=[5.0, 5.0], b=[0.15, 0.15],
+    ...     power=[4.0, 4.0],
+    ... )
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "roads.tntp"
+    >>> _ = file.write_text('''Node X Y ;
+    ... 1 0.0 0.0 ;
+    ... 2 3.0 4.0 ;
+    ... ''')
+    >>> read_nodes(file, roads).tolist()
+    [[0.0, 0.0], [3.0, 4.0]]
+
+    ```
     """
     lines, problems = read_text(path, "a TNTP file").splitlines(), FileProblems(path)
     header, rows = _first_row(lines, problems, "Node X Y ;")

@@ -59,6 +59,14 @@ class Range(NamedTuple):
     is a second enclosure, if there is one. The inner product is Σ `weights`ᵢ aᵢ bᵢ, or one with
     l Σ wᵢaᵢ² ≤ ‖a‖² ≤ l `spread` Σ wᵢaᵢ² for some l. If `proved` is false the enclosure is declared,
     and so are the bounds that depend on it.
+
+    ```python
+    >>> import dvax
+    >>> region = dvax.generators.Range(-4.0, 0.0, height=1.0)      # −4 ≤ Re ≤ 0, |Im| ≤ 1
+    >>> region.low, region.high, region.height, region.proved
+    (-4.0, 0.0, 1.0, False)
+
+    ```
     """
 
     low: Any

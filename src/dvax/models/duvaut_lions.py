@@ -26,6 +26,19 @@ class VonMises(NamedTuple):
     """The yield condition √(3/2)‖dev σ‖ ≤ σ_y.
 
     `strength` is σ_y > 0: a number, a `dvax.signals` or a callable of t.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> from dvax.models.duvaut_lions import mandel
+    >>> law = dvax.models.VonMises(250.0)          # MPa
+    >>> shear = mandel(jnp.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    >>> point = dvax.models.DuvautLions(bulk=160e3, shear=80e3, relaxation=0.1, yields=law,
+    ...                                 strain=lambda t: 1e-3 * t * shear)
+    >>> sol = dvax.solve(point.problem, point.virgin, 0.0, 4.0)
+    >>> print(f"{float(point.stress(4.0, sol.xs[-1])[5] / 2**0.5):.2f}")
+    160.34
+
+    ```
     """
 
     strength: Any
@@ -36,6 +49,19 @@ class DruckerPrager(NamedTuple):
 
     `friction` is M > 0, a number. `tension` is the hydrostatic tensile strength p_t ≥ 0: a number, a
     `dvax.signals` or a callable of t.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> from dvax.models.duvaut_lions import mandel
+    >>> law = dvax.models.DruckerPrager(friction=0.9, tension=50.0)          # MPa
+    >>> shear = mandel(jnp.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    >>> point = dvax.models.DuvautLions(bulk=160e3, shear=80e3, relaxation=0.1, yields=law,
+    ...                                 strain=lambda t: 1e-3 * t * shear)
+    >>> sol = dvax.solve(point.problem, point.virgin, 0.0, 4.0)
+    >>> print(f"{float(point.stress(4.0, sol.xs[-1])[5] / 2**0.5):.2f}")
+    251.68
+
+    ```
     """
 
     friction: float

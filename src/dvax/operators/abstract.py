@@ -14,6 +14,17 @@ class Spectrum(NamedTuple):
 
     `exact`: m and norm are the smallest and largest values of the spectrum; else they enclose it.
     `declared`: the caller declared them, without proof.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> P = dvax.operators.Diagonal(jnp.array([1.0, 4.0]))
+    >>> spectrum = P.spectrum(dvax.spaces.Euclidean(2))
+    >>> float(spectrum.m), float(spectrum.norm), spectrum.exact
+    (1.0, 4.0, True)
+    >>> float(spectrum.norm_P_inv), float(spectrum.m_P)   # those of P⁻¹
+    (1.0, 0.25)
+
+    ```
     """
 
     m: Any
@@ -33,7 +44,20 @@ class Spectrum(NamedTuple):
 
 
 class AbstractOperator(eqx.Module):
-    """A linear, bounded, self-adjoint and coercive operator P with its inverse."""
+    """A linear, bounded, self-adjoint and coercive operator P with its inverse.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> P = dvax.operators.Diagonal(jnp.array([1.0, 4.0]))
+    >>> isinstance(P, dvax.operators.AbstractOperator)
+    True
+    >>> P.inverse(P.apply(jnp.array([3.0, 3.0]))).tolist()
+    [3.0, 3.0]
+    >>> float(P.spectrum(dvax.spaces.Euclidean(2)).norm)
+    4.0
+
+    ```
+    """
 
     @abc.abstractmethod
     def apply(self, v: Tree) -> Tree:

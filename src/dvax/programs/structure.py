@@ -26,6 +26,14 @@ class Structure(NamedTuple):
     - `pointwise`: Fᵢ depends on yᵢ only;
     - `isotropic`: affine and pointwise with one factor for all entries, F(y) = ay + c, so that
       y* = proj_K(−c/a) for every K. Each part of a tuple may have another a.
+
+    ```python
+    >>> import jax.numpy as jnp
+    >>> from dvax.vi import analyse
+    >>> analyse(lambda y: jnp.exp(y) + y, jnp.zeros(3))
+    Structure(affine=False, pointwise=True, isotropic=False)
+
+    ```
     """
 
     affine: bool
@@ -49,7 +57,16 @@ class _Dependence(NamedTuple):
 
 
 def analyse(F: Callable[[Tree], Tree], like: Tree) -> Structure:
-    """Return the structure of F for arguments of the shape of `like`, proved from its operations."""
+    """Return the structure of F for arguments of the shape of `like`, proved from its operations.
+
+    ```python
+    >>> import jax.numpy as jnp
+    >>> from dvax.vi import analyse
+    >>> analyse(lambda y: 2.0 * y - jnp.array([1.0, 2.0]), jnp.zeros(2))
+    Structure(affine=True, pointwise=True, isotropic=True)
+
+    ```
+    """
     shapes = [tuple(jnp.shape(leaf)) for leaf in jtu.tree_leaves(like)]
     inputs = [_Dependence(1, leaf, True) for leaf in enumerate(shapes)]
     outputs = _read(jax.make_jaxpr(F)(like), inputs)
@@ -62,7 +79,18 @@ def analyse(F: Callable[[Tree], Tree], like: Tree) -> Structure:
 
 
 def independent(fn: Callable[..., Tree], *args: Tree) -> bool:
-    """Return whether the code of `fn` proves that no output of fn(*args) depends on the args."""
+    """Return whether the code of `fn` proves that no output of fn(*args) depends on the args.
+
+    ```python
+    >>> import jax.numpy as jnp
+    >>> from dvax.vi import independent
+    >>> independent(lambda y: jnp.zeros(2), jnp.ones(2))
+    True
+    >>> independent(lambda y: y[::-1], jnp.ones(2))
+    False
+
+    ```
+    """
     program = jax.make_jaxpr(fn)(*args)
     inputs = [_Dependence(1, None, False) for _ in program.jaxpr.invars]
     return all(out.degree == 0 for out in _read(program, inputs))

@@ -36,6 +36,20 @@ class Change(NamedTuple):
 
     `x`, `u`: a `Views` each; `derivative`: the `dvax.Directional` of the prediction; `status`: that of
     the certified bounds. `table()` returns the largest values as text.
+
+    ```python
+    >>> import dvax
+    >>> problem = dvax.Problem(
+    ...     A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+    ...     f=lambda t, x, u, load: load - 0.5 * x - u,
+    ...     h=lambda t, x, u, load: 1.0 - 2.0 * x - u,
+    ... )
+    >>> bounds = dvax.parameter_bounds(problem, 2.9, 3.1, t1=2.0)
+    >>> change = dvax.sensitivity.change(problem, -1.0, 0.0, 2.0, 3.0, bounds, dargs=0.1)
+    >>> change.status, bool((change.x.actual <= change.x.certified).all())
+    ('proved', True)
+
+    ```
     """
 
     ts: np.ndarray

@@ -29,6 +29,21 @@ class Kink(NamedTuple):
 
     `switch` is the index of the switch of the set. For a `dvax.sets.Box` of m entries, switch i < m is
     the lower bound of entry i, and switch m + i the upper bound.
+
+    ```python
+    >>> import dvax
+    >>> problem = dvax.Problem(
+    ...     A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+    ...     f=lambda t, x, u, args: 3.0 - 0.5 * x - u,
+    ...     h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+    ... )
+    >>> sol = dvax.solve(problem, -1.0, 0.0, 2.0, rtol=1e-8, dense=True)
+    >>> for kink in dvax.sensitivity.kinks(sol):                     # u leaves 1/2, then arrives at 0
+    ...     print(kink.kind, kink.switch, f"{kink.start:.4f}")
+    crosses 1 0.3133
+    crosses 0 0.5241
+
+    ```
     """
 
     start: float

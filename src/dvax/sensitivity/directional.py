@@ -35,7 +35,21 @@ class Directional(NamedTuple):
     """(δx, δu) at the times `ts`, the base trajectory `sol` (with dense output), and its kinks.
 
     `dxs`, `dus` have a leading time axis. If no kink `stays`, the derivative is linear in the
-    direction."""
+    direction.
+
+    ```python
+    >>> import dvax
+    >>> problem = dvax.Problem(
+    ...     A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+    ...     f=lambda t, x, u, args: 3.0 - 0.5 * x - u,
+    ...     h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+    ... )
+    >>> change = dvax.directional_derivative(problem, -1.0, 0.0, 2.0, dx0=1.0)
+    >>> print(f"{float(change.dxs[0]):.6f}", [kink.kind for kink in change.kinks])
+    0.061466 ['crosses', 'crosses']
+
+    ```
+    """
 
     ts: jax.Array
     dxs: Tree

@@ -25,6 +25,19 @@ class AbstractSet(eqx.Module):
 
     **Traced data** cannot be checked when the set is constructed. If they describe an empty set, the
     projection is NaN or infinite, and so is never mistaken for a point of K.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> K, space = dvax.sets.Ball(jnp.zeros(2), 1.0), dvax.spaces.Euclidean(2)
+    >>> isinstance(K, dvax.sets.AbstractSet)
+    True
+    >>> y = K.project(jnp.array([3.0, 4.0]), space)
+    >>> print(y.round(6), float(K.distance(jnp.array([3.0, 4.0]), space)))
+    [0.6 0.8] 4.0
+    >>> bool(K.normal_cone_residual(y, 3.0 * y, space) < 1e-12)      # 3y is normal to the ball at y
+    True
+
+    ```
     """
 
     @abc.abstractmethod

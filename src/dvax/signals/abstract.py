@@ -25,6 +25,16 @@ class SignalReports:
     `knots` are their knots, and `spans` the intervals on which they are defined, with their types.
     `unresolved` names the signals whose knots in t are unknown, since they were evaluated at another
     time than t.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> load, t = dvax.signals.Table([0.0, 1.0, 2.0], [0.0, 4.0, 2.0]), jnp.array(0.5)
+    >>> with dvax.signals.listen(t) as reports:
+    ...     value = load(t)
+    >>> len(reports.knots), reports.unresolved
+    (1, [])
+
+    ```
     """
 
     def __init__(self, time: Any):
@@ -36,7 +46,18 @@ class SignalReports:
 
 @contextlib.contextmanager
 def listen(time: Any) -> Iterator[SignalReports]:
-    """Record every signal that is evaluated at `time` (the same tracer object) in the `with` block."""
+    """Record every signal that is evaluated at `time` (the same tracer object) in the `with` block.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> load, t = dvax.signals.Table([0.0, 1.0, 2.0], [0.0, 4.0, 2.0]), jnp.array(0.5)
+    >>> with dvax.signals.listen(t) as reports:
+    ...     value = 2.0 * load(t)
+    >>> [knots.tolist() for knots in reports.knots]
+    [[0.0, 1.0, 2.0]]
+
+    ```
+    """
     reports = SignalReports(time)
     previous = getattr(_active, "reports", None)
     _active.reports = reports
@@ -47,7 +68,18 @@ def listen(time: Any) -> Iterator[SignalReports]:
 
 
 class AbstractSignal(eqx.Module):
-    """A function of time whose values are arrays of one shape."""
+    """A function of time whose values are arrays of one shape.
+
+    ```python
+    >>> import dvax
+    >>> load = dvax.signals.Table([0.0, 1.0, 2.0], [0.0, 4.0, 2.0])
+    >>> isinstance(load, dvax.signals.AbstractSignal)
+    True
+    >>> load.knots().tolist(), [float(t) for t in load.span()]
+    ([0.0, 1.0, 2.0], [0.0, 2.0])
+
+    ```
+    """
 
     @abc.abstractmethod
     def value(self, t: Any) -> jax.Array:

@@ -12,7 +12,18 @@ from ..errors import InputError, InputProblem
 
 
 class AbstractSpace(eqx.Module):
-    """A real Hilbert space of arrays (or tuples of arrays) with its inner product."""
+    """A real Hilbert space of arrays (or tuples of arrays) with its inner product.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> space = dvax.spaces.L2(jnp.array([0.5, 0.5]))               # two cells of length 1/2
+    >>> isinstance(space, dvax.spaces.AbstractSpace)
+    True
+    >>> float(space.norm(jnp.ones(2))), float(space.inner(jnp.ones(2), jnp.array([1.0, 3.0])))
+    (1.0, 2.0)
+
+    ```
+    """
 
     @abc.abstractmethod
     def inner(self, a: Tree, b: Tree) -> jax.Array:

@@ -31,6 +31,22 @@ class Assumption(NamedTuple):
     - `is_required`: whether the theory needs it; one of two alternative sufficient conditions is not
       required;
     - `evidence`: the counterexample, if there is one.
+
+    ```python
+    >>> import dvax
+    >>> problem = dvax.Problem(
+    ...     A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+    ...     f=lambda t, x, u, args: 3.0 - 0.5 * x - u,
+    ...     h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+    ... )
+    >>> check = dvax.verify(problem, -1.0, 0.0, 2.0)
+    >>> assumption = check["ass:strong_pseudomono"]
+    >>> assumption.status, assumption.is_required
+    ('proved', True)
+    >>> assumption.why.split(" (")[0]
+    'γ = 2'
+
+    ```
     """
 
     label: str

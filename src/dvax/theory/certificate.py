@@ -50,6 +50,21 @@ class Bound(eqx.Module):
 
     The roundoff of every step and of t is included, for propagators and functions f, h and K that are
     computed with relative errors of a few ε.
+
+    ```python
+    >>> import dvax
+    >>> problem = dvax.Problem(
+    ...     A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+    ...     f=lambda t, x, u, args: 3.0 - 0.5 * x - u,
+    ...     h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+    ... )
+    >>> check = dvax.verify(problem, -1.0, 0.0, 2.0)
+    >>> sol = dvax.solve(problem, -1.0, 0.0, 2.0, ts=[1.0, 2.0], method=dvax.ETD2RK())
+    >>> bound = dvax.bound_error(problem, sol, check.constants)
+    >>> bound.status, bound.x.shape, bool((bound.x_sharp <= bound.x_paper).all())
+    ('proved', (2,), True)
+
+    ```
     """
 
     ts: jax.Array

@@ -17,7 +17,21 @@ _PRIMARY = (
 
 
 class Row(NamedTuple):
-    """One line of `Constants.table`: a constant with its value, label, status and meaning."""
+    """One line of `Constants.table`: a constant with its value, label, status and meaning.
+
+    ```python
+    >>> import dvax
+    >>> problem = dvax.Problem(
+    ...     A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+    ...     f=lambda t, x, u, args: 3.0 - 0.5 * x - u,
+    ...     h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+    ... )
+    >>> rows = dvax.verify(problem, -1.0, 0.0, 2.0).constants.table()
+    >>> print(rows[0].symbol, rows[0].value, rows[0].status)
+    γ 2.0 proved
+
+    ```
+    """
 
     name: str
     symbol: str
@@ -41,12 +55,12 @@ class Constants(eqx.Module):
     - `m_P`, `norm_P_inv`: min σ(P⁻¹) and ‖P⁻¹‖ (ass:operators);
     - `one_sided` (μ), optional: ⟨A(x−x') + f̃(x) − f̃(x'), x−x'⟩ ≤ μ‖x−x'‖². The paper's constants
       use absolute values where μ keeps signs, so μ ≤ ω + M L̃ if M = 1;
-      - `energy` (M, μ), optional: ‖x₁−x₂‖ ≤ M e^{μt}‖Δx₀‖ by contraction in another norm, of condition
-        number M² (`dvax.verify(energy=True)` computes one);
-      - `status`: "proved" or "declared" for all of them, or a mapping from name to status;
-      - `domain`: the `args`, times and states for which they hold, from `dvax.verify`; None for all.
+    - `energy` (M, μ), optional: ‖x₁−x₂‖ ≤ M e^{μt}‖Δx₀‖ by contraction in another norm, of condition
+      number M² (`dvax.verify(energy=True)` computes one);
+    - `status`: "proved" or "declared" for all of them, or a mapping from name to status;
+    - `domain`: the `args`, times and states for which they hold, from `dvax.verify`; None for all.
 
-      **Raises:** `dvax.InputError` if γ, L_F, m_P or ‖P⁻¹‖ is not positive, a Lipschitz modulus is
+    **Raises:** `dvax.InputError` if γ, L_F, m_P or ‖P⁻¹‖ is not positive, a Lipschitz modulus is
     negative, M < 1, or γ > L_F.
 
     ```python

@@ -10,5 +10,13 @@ from samples, a bound from the wrong side. refuted: a counterexample was found."
 
 
 def weakest(*statuses: Status) -> Status:
-    """Return the status of a number computed from others: the weakest of theirs."""
+    """Return the status of a number computed from others: the weakest of theirs.
+
+    ```python
+    >>> from dvax.theory import weakest
+    >>> weakest("proved", "estimated", "declared")
+    'estimated'
+
+    ```
+    """
     return ORDER[max(map(ORDER.index, statuses), default=0)]

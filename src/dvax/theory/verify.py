@@ -36,6 +36,21 @@ class Verification(NamedTuple):
     - `constants`: `dvax.Constants` with the status of each, or None if a modulus is missing or γ is not
       positive;
     - `route`: "variational inequality" or "projection", the route of the paper that gives the larger γ.
+
+    ```python
+    >>> import dvax
+    >>> problem = dvax.Problem(
+    ...     A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+    ...     f=lambda t, x, u, args: 3.0 - 0.5 * x - u,
+    ...     h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+    ... )
+    >>> check = dvax.verify(problem, -1.0, 0.0, 2.0)
+    >>> check.status, check.route, float(check.constants.gamma)
+    ('proved', 'variational inequality', 2.0)
+    >>> check["ass:f_lipschitz"].status
+    'proved'
+
+    ```
     """
 
     assumptions: tuple[Assumption, ...]

@@ -15,7 +15,17 @@ Operator = Callable[[Tree], Tree]
 
 
 class RESULTS(eqx.Enumeration):
-    """The result of a solve, with a message for the user."""
+    """The result of a solve, with a message for the user.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> F, K = lambda y, q: 2.0 * y - q, dvax.sets.Box(0.0, 1.0)
+    >>> vi = dvax.solve_vi(F, K, jnp.zeros(2), jnp.ones(2))
+    >>> print(dvax.vi.RESULTS[vi.result])
+    The tolerance was met.
+
+    ```
+    """
 
     successful = "The tolerance was met."
     max_steps = (
@@ -71,6 +81,17 @@ class FrozenVI(NamedTuple):
     """VI(K, F) in a space: find y ∈ K with ⟨F(y), v − y⟩ ≥ 0 for all v ∈ K.
 
     `gamma` and `L_F` are the moduli of F, or None if they are unknown.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> space = dvax.spaces.Euclidean(2)
+    >>> F, K = lambda y: 2.0 * y - 1.0, dvax.sets.Box(0.0, 0.25)
+    >>> vi = dvax.vi.FrozenVI(F, K, space, gamma=2.0, L_F=2.0)
+    >>> answer = dvax.vi.ClosedForm().solve(vi, jnp.zeros(2), 1e-10)
+    >>> answer.y.tolist()
+    [0.25, 0.25]
+
+    ```
     """
 
     F: Operator
@@ -91,6 +112,16 @@ class Answer(NamedTuple):
     - `evaluations`, the number of calls of F, without those for its derivatives;
     - `residual_step`, the λ in w = F(y) − F(b) + (b − y)/λ, by which the rounding of y is divided; ∞ if
       w has no such term.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> F = lambda y: 2.0 * y - 1.0
+    >>> vi = dvax.vi.FrozenVI(F, dvax.sets.Box(0.0, 0.25), dvax.spaces.Euclidean(2))
+    >>> answer = dvax.vi.ClosedForm().solve(vi, jnp.zeros(2), 1e-10)
+    >>> answer.y.tolist(), answer.z.tolist()                         # y is the projection of z
+    ([0.25, 0.25], [0.5, 0.5])
+
+    ```
     """
 
     y: Tree
@@ -107,6 +138,16 @@ class AbstractSolver(eqx.Module):
 
     If `certifies` is true, the method computes a w ∈ F(y) + N_K(y) and returns its norm as the
     residual. Otherwise y is a closed form or a bracketed root, and the caller must compute w.
+
+    ```python
+    >>> import dvax
+    >>> solver = dvax.vi.Extragradient()
+    >>> isinstance(solver, dvax.vi.AbstractSolver)
+    True
+    >>> print(f"{float(solver.contraction(1.0, 4.0)):.3f}")   # of an iteration, for γ = 1 and L_F = 4
+    0.890
+
+    ```
     """
 
     certifies: ClassVar[bool] = True

@@ -27,6 +27,16 @@ class Counterexample(NamedTuple):
 
     `gamma` is the largest modulus consistent with the pair, below the declared one (0 or less: F is not
     strongly pseudomonotone at all). `why` names the inequality that they violate.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> pair = dvax.vi.refute_gamma(
+    ...     lambda y, args: -y, dvax.sets.Box(0.0, 1.0), 0.5, jnp.array([0.0, 0.5, 1.0])
+    ... )
+    >>> isinstance(pair, dvax.vi.Counterexample), pair.gamma < 0.5
+    (True, True)
+
+    ```
     """
 
     y: Tree

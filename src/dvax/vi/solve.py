@@ -45,6 +45,16 @@ class VISolution(eqx.Module):
 
     The derivatives of a failed solve are NaN, unless it reached the roundoff floor. For a
     `dvax.vi.Weighted` operator aG all fields refer to G, which has the same solution.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> K = dvax.sets.Box(0.0, 1.0)
+    >>> F, q = lambda y, q: y + y**3 - q, jnp.array([0.625, 5.0])
+    >>> vi = dvax.solve_vi(F, K, jnp.zeros(2), q, gamma=1.0)
+    >>> vi.y.round(9).tolist(), vi.solver, bool(vi.error_bound < 1e-10)
+    ([0.5, 1.0], 'Bracketing', True)
+
+    ```
     """
 
     y: Tree
@@ -235,7 +245,16 @@ def rounding_of(vi: FrozenVI, y: Tree, step: Any, residual: Any) -> tuple[jax.Ar
 
 
 def default_space(like: Tree) -> AbstractSpace:
-    """Return the Euclidean space of elements shaped like `like`."""
+    """Return the Euclidean space of elements shaped like `like`.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> space = dvax.vi.default_space(jnp.zeros(3))
+    >>> float(space.norm(jnp.array([2.0, 3.0, 6.0])))
+    7.0
+
+    ```
+    """
     if isinstance(like, tuple):
         return Product(*(default_space(part) for part in like))
     return Euclidean(jnp.shape(like))

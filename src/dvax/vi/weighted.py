@@ -26,6 +26,15 @@ class Modulus(NamedTuple):
 
     If a proved modulus is not positive, G is not strongly monotone on the whole space. It may still be
     strongly monotone on a K that lies in a subspace.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> F = dvax.vi.Weighted(lambda y, b: 1.0 + y @ y, lambda y, b: 2.0 * y + b, M=1.0)
+    >>> modulus = F.modulus(jnp.zeros(2), jnp.ones(2), dvax.spaces.Euclidean(2))
+    >>> print(f"{float(modulus.value):.6f}", modulus.status)
+    2.000000 proved
+
+    ```
     """
 
     value: Any
