@@ -88,7 +88,7 @@ sphinx_gallery_conf = {
     "abort_on_example_error": True,
     "reset_modules": ("docs.extensions.gallery.reset",),
     "image_scrapers": ("docs.extensions.gallery.figures",),
-    "within_subsection_order": "FileNameSortKey",
+    "within_subsection_order": "docs.extensions.gallery.Order",
     "capture_repr": (),
     "remove_config_comments": True,
     "min_reported_time": 0,

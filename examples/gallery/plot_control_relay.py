@@ -3,7 +3,7 @@ A relay thermostat, and its ramp
 ================================
 
 A relay heats with 2 kW below 20 °C, and with nothing above. Its law jumps, so that it is outside
-the class. A controller with a proportional band ε is inside, and tends to the relay as ε → 0:
+the class. A controller with a proportional band ε is inside, and tends to the relay as ε → 0::
 
     C T' = −g (T − T_out(t)) + u,      u = clip(P (20 − T)/ε + P/2, 0, P)
 
