@@ -48,6 +48,8 @@ extensions = [
     "docs.extensions.reference",
 ]
 root_doc = "index"
+# Names in single backticks in the text of the gallery are code, and link to the reference.
+default_role = "code"
 exclude_patterns = ["extensions", "generated/backreferences", "**.ipynb"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 nitpicky = True

@@ -25,6 +25,7 @@ def blocks(page: Path) -> list[str]:
 
 # Pages whose examples compile many programs; `make thorough` runs them.
 LONG = {
+    "howto/from-projection.md",
     "howto/troubleshooting.md",
     "tutorials/fit.md",
     "tutorials/heaters.md",
