@@ -135,5 +135,5 @@ html_theme_options = {
     "footer_end": [],
     "secondary_sidebar_items": ["page-toc"],
 }
-html_sidebars = {"index": []}
+html_sidebars = {"index": [], "start": []}
 copyright = "the dvax maintainers, Apache-2.0"
