@@ -80,7 +80,7 @@ format: $(READY) ## rewrite the sources in the common format
 docs: $(READY) ## the documentation as a site in ./site, with all examples of the gallery
 	$(PY) -m pip install --quiet --no-build-isolation --editable '.[docs]'
 	$(PY) -m sphinx --builder html --nitpicky --fail-on-warning --keep-going --quiet \
-	    --jobs 2 --doctree-dir build/doctrees docs site
+	    --doctree-dir build/doctrees docs site
 	$(PY) -m docs.extensions.check_site site
 
 lock: ## pin the newest releases that fit pyproject.toml (needs uv)

@@ -48,6 +48,8 @@ extensions = [
     "docs.extensions.reference",
 ]
 root_doc = "index"
+# Names in single backticks in the text of the gallery are code, and link to the reference.
+default_role = "code"
 exclude_patterns = ["extensions", "generated/backreferences", "**.ipynb"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 nitpicky = True
@@ -88,7 +90,7 @@ sphinx_gallery_conf = {
     "abort_on_example_error": True,
     "reset_modules": ("docs.extensions.gallery.reset",),
     "image_scrapers": ("docs.extensions.gallery.figures",),
-    "within_subsection_order": "FileNameSortKey",
+    "within_subsection_order": "docs.extensions.gallery.Order",
     "capture_repr": (),
     "remove_config_comments": True,
     "min_reported_time": 0,
@@ -133,5 +135,5 @@ html_theme_options = {
     "footer_end": [],
     "secondary_sidebar_items": ["page-toc"],
 }
-html_sidebars = {"index": []}
+html_sidebars = {"index": [], "start": []}
 copyright = "the dvax maintainers, Apache-2.0"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 import pytest
+from docs.extensions.check_site import faults
 
 import dvax
 
@@ -18,7 +19,7 @@ def named(page: Path) -> str:
     return page.relative_to(DOCS).as_posix()
 
 
-SHORT = ["index.md", "certificates.md", "results.md", "models/own-problem.md"]
+SHORT = ["index.md", "start.md", "certificates.md", "results.md", "models/own-problem.md"]
 """Pages whose examples `make test` runs; the others run in `make thorough` and on the newest Python."""
 
 
@@ -98,3 +99,19 @@ def test_page_on_the_frozen_law_lists_every_set_solver_and_result():
     assert len(names) > 30
     missing = [name for name in names if f"`{name}`" not in text]
     assert not missing, f"not on the page: {missing}"
+
+
+def test_site_check_finds_broken_links_missing_texts_and_networks(tmp_path: Path):
+    (tmp_path / "a.html").write_text(
+        '<h1 id="top">A</h1><a href="b.html#here">b</a><a href="b.html#there">b</a>'
+        '<a href="c.html">c</a><img src="a.html"><img src="a.html" alt="a page">'
+        '<script src="https://example.org/x.js"></script><a href="https://example.org">x</a>',
+        encoding="utf-8",
+    )
+    (tmp_path / "b.html").write_text('<p id="here"><a href="#here">b</a></p>', encoding="utf-8")
+    assert sorted(set(faults(tmp_path))) == [
+        "a.html: a.html has no alternative text",
+        "a.html: loads https://example.org/x.js from a network",
+        "a.html: the link b.html#there has no such place",
+        "a.html: the link c.html leads nowhere",
+    ]

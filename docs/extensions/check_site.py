@@ -74,7 +74,7 @@ def main() -> None:
     size = sum(file.stat().st_size for file in files)
     pages = sum(file.suffix == ".html" for file in files)
     if found:
-        sys.exit("\n".join([*found, f"{len(found)} faults in {pages} pages"]))
+        sys.exit("\n".join([*found[:30], f"{len(found)} faults in {pages} pages"]))
     print(f"{site}: {pages} pages, {size / 1e6:.1f} MB, no broken links")  # noqa: T201
 
 

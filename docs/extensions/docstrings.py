@@ -63,7 +63,8 @@ class LinkNames(SphinxPostTransform):
         for block in self.document.findall(nodes.literal_block):
             # A session ends with an empty line for doctest.
             block.rawsource = block.rawsource.rstrip()
-            block[:] = [nodes.Text(block.astext().rstrip())] if len(block) < 2 else block[:]
+            text = block.astext().rstrip().replace("  # fmt: skip", "")
+            block[:] = [nodes.Text(text)] if len(block) < 2 else block[:]
         objects = self.env.domains.python_domain.objects
         for node in list(self.document.findall(nodes.literal)):
             if isinstance(node.parent, nodes.reference | addnodes.pending_xref):

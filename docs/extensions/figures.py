@@ -11,6 +11,9 @@ def draw(app: Sphinx) -> None:
     target = here / "generated"
     target.mkdir(exist_ok=True)
     for script in sorted((here / "figures").glob("*.py")):
+        # The picture of the README is committed, so that it shows without a build.
+        if script.stem == "readme":
+            continue
         picture = target / f"{script.stem}.svg"
         if not picture.is_file() or picture.stat().st_mtime < script.stat().st_mtime:
             runpy.run_path(str(script))["draw"](picture)

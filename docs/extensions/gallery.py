@@ -1,11 +1,14 @@
 """The pictures of the gallery: one style, and alternative texts that say what is drawn."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 from cycler import cycler
+from docutils import nodes
 from sphinx.application import Sphinx
+from sphinx.transforms.post_transforms import SphinxPostTransform
 
 # Okabe and Ito, which colour-blind readers can tell apart; C7 is grey, for limits.
 COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222222", "#777777"]
@@ -61,5 +64,34 @@ def figures(block: Any, block_vars: dict[str, Any], gallery_conf: dict[str, Any]
     return "\n".join(lines)
 
 
+ORDER = (
+    "mechanics control circuit field game ecology derivative ensemble certificate workflow".split()
+)
+
+
+class Order:
+    """Sort the examples by subject, and by name within a subject."""
+
+    def __init__(self, folder: str) -> None:
+        self.folder = folder
+
+    def __call__(self, name: str) -> tuple[int, str]:
+        return ORDER.index(name.split("_")[1]), name
+
+
+class Thumbnails(SphinxPostTransform):
+    """Describe each thumbnail by the title of its example."""
+
+    default_priority = 6
+
+    def run(self, **settings: Any) -> None:
+        for image in self.document.findall(nodes.image):
+            match = re.search(r"sphx_glr_(plot_\w+)_thumb", image.get("uri", ""))
+            if match and not image.get("alt"):
+                title = self.env.titles[f"gallery/{match[1]}"].astext()
+                image["alt"] = f"Picture of the example: {title}"
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
+    app.add_post_transform(Thumbnails)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -11,7 +11,7 @@ def inline(self, node: nodes.math) -> None:
 
 
 def block(self, node: nodes.math_block) -> None:
-    self.body.append(self.starttag(node, "div", CLASS="math formula", tabindex="0"))
+    self.body.append(self.starttag(node, "div", CLASS="formula", tabindex="0"))
     self.body.append(convert(node.astext(), display="block"))
     self.body.append("</div>\n")
     raise nodes.SkipNode

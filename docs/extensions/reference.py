@@ -14,6 +14,18 @@ FOLDER = "reference/api"
 BACKREFERENCES = "generated/backreferences"
 
 
+FIRST = ("Problem", "solve", "Solution", "verify", "bound_error", "Bound", "Constants", "Event")
+"""The names that stand first on the page of `dvax`; the others follow by name."""
+
+
+def rank(name: str) -> tuple[int, str]:
+    """The order of names on the page of a package: by name, abstract classes last."""
+    short = name.rpartition(".")[2]
+    if name.removeprefix("dvax.") in FIRST:
+        return FIRST.index(short), ""
+    return len(FIRST) + short.startswith("Abstract"), short.lower()
+
+
 def summary(thing: object) -> str:
     """The first sentence of the docstring."""
     text = inspect.getdoc(thing) or ""
@@ -69,6 +81,7 @@ def write(app: Sphinx) -> None:
     pages: dict[str, str] = {}
     for package in PACKAGES:
         names = {n: t for n, t in public_names().items() if n.rpartition(".")[0] == package}
+        names = dict(sorted(names.items(), key=lambda item: rank(item[0])))
         pages[f"package-{package}"] = index(package, names)
         pages |= {name: page(app, name, thing) for name, thing in names.items()}
     for old in folder.glob("*.rst"):

@@ -4,7 +4,7 @@ A half-wave rectifier, written by hand
 
 A diode charges a capacitor of 47 µF through 10 Ω from a source of 10 V and 50 Hz; a lamp of 1 kΩ
 discharges it. The current of an ideal diode is never negative, and the diode blocks exactly while
-it is zero:
+it is zero::
 
     0 ≤ i ⟂ (R i + v − e(t)) ≥ 0,       v' = (i − v/R_L)/C
 

@@ -4,7 +4,7 @@ A saturated PI controller, with and without anti-windup
 
 A heater of at most 5 kW keeps a tank at its set point. A PI controller asks for v = k_p e + z,
 and gets u = clip(v, 0, 5). While u is at its limit, the integrator z goes on to grow (it winds
-up), and the temperature overshoots. Back-calculation feeds u − v into the integrator:
+up), and the temperature overshoots. Back-calculation feeds u − v into the integrator::
 
     x' = (−x + u)/T,       z' = k_i e + b (u − v),       e = r(t) − x
 

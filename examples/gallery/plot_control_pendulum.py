@@ -6,6 +6,8 @@ A motor of at most 2 N m brings a pendulum of 1 m and 1 kg with friction to rest
 gravity needs 8.5 N m: it fails, and the pendulum hangs where the motor is at its limit. With 10 N
 m it succeeds. The law is the saturation of a controller with feed-forward,
 
+::
+
     θ'' = −9.81 sin θ − 2 θ' + u,      u = clip(9.81 sin θ_r + 8 (θ_r − θ) − 2 θ', −ū, ū)
 """
 

@@ -5,6 +5,8 @@ Van der Pol's oscillator with a saturated brake
 An oscillator that excites itself is braked by an actuator of limited force. With a force of 1.2
 it keeps its limit cycle; with 3 it comes to rest.
 
+::
+
     x' = v,      v' = (1 − x²) v − x + u,      u = clip(−2 v, −ū, ū)
 
 f has no global Lipschitz constant. `dvax.verify` takes a region of the states instead, and

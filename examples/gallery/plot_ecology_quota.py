@@ -4,7 +4,7 @@ Predator, prey, and a fishing quota
 
 Fish (prey x, in 1000 t) and seals (predator y, in 1000) live in a bay. The fleet catches what is
 above a protected stock of 0.8, with an effort of 2 per year, but not more than the quota of 0.25
-per year:
+per year::
 
     x' = x (1 − x/3) − x y/2 − u,     y' = y (x/2 − 0.4),     u = clip(2 (x − 0.8), 0, 0.25)
 """

@@ -5,6 +5,8 @@ A string and a moving obstacle
 A string in honey, fixed at both ends, is pushed up by a round obstacle that moves from left to
 right. The obstacle is soft: it pushes with 400 per unit of overlap, and at most with 12.
 
+::
+
     x_t = 0.1 x_ss + u,      u(t, s) = clip(400 (obstacle(t, s) − x), 0, 12)
 
 The place where the string leaves the obstacle is a free boundary, which moves.

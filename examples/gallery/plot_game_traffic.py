@@ -33,7 +33,7 @@ trips = Trips(zones=2, origin=[1], destination=[2], flow=[6.0])
 model = Traffic(network, trips, rho=1.0)
 ts = np.linspace(0.0, 20.0, 41)
 sol = dvax.solve(
-    model.problem, model.all_or_nothing(), 0.0, 20.0, ts=ts, dt=0.25, vi_solver=model.vi_solver,
+    model.problem, model.all_or_nothing(), 0.0, 20.0, ts=ts, dt=0.5, vi_solver=model.vi_solver,
     constants=model.constants,
 )  # fmt: skip
 

@@ -3,7 +3,7 @@ A mass on a spring meets a soft stop
 ====================================
 
 A mass of 1 kg hangs on a spring of 400 N/m and is driven by a periodic force. At 10 mm there is a
-rubber stop. It pushes back with 800 N/m, and yields at 8 N:
+rubber stop. It pushes back with 800 N/m, and yields at 8 N::
 
     m x'' = −k x − c x' + 6 sin(15 t) − u,        u = clip(800 (x − 0.01), 0, 8)      [N]
 

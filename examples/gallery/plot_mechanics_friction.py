@@ -7,6 +7,8 @@ box along, with at most 4 N. Coulomb's law has a jump at zero slip and is outsid
 dvax. A contact with the shear stiffness of real surfaces is inside: the friction force grows with
 the slip speed over ε = 1 mm/s before it saturates.
 
+::
+
     m v' = u,        u = clip((w(t) − v) F/ε, −F, F)      [N]
 """
 

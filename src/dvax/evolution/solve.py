@@ -107,8 +107,8 @@ def solve(
       in `stats["certified_bound"]`, or in `stats["estimated_bound"]` where the defect was sampled and
       not enclosed (`sol.enclosed`): methods of order above 2, and laws without closed form. A tolerance
       out of reach is refused after one cheap run, with the least bound in reach and what limits it.
-      Constants of a region hold while x and u stay in it: that is looked at 256 more times, and
-      between them it is for you to know;
+      Constants of a region hold while x and u stay in it. This is checked at 256 more times;
+      between them you must check it yourself;
     - `measure`: whether to sample the defect inside steps. Adaptive steps always do; fixed steps only
       when asked, since it doubles their cost;
     - `dense`: keep every step, for `Solution.evaluate`. Under `jax.jit` there is room for `max_steps`
