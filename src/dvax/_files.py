@@ -2,7 +2,9 @@
 
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 
 def write_whole(file: Path, content: bytes) -> None:
@@ -23,18 +25,28 @@ def write_whole(file: Path, content: bytes) -> None:
         raise type(error)(error.errno, error.strerror, str(file)) from error
 
 
+AXIS = "time_axis"
+"""The attribute of a store whose saved times are not called `time`, with their name."""
+
+
+def time_axis(attributes: Mapping[str, Any]) -> str:
+    """Return the name of the saved times of a store, by its attributes."""
+    return str(attributes.get(AXIS, "time"))
+
+
 def consolidate(path: Path, frames: int | None = None) -> None:
     """Replace the consolidated metadata of a store, which readers such as xarray use. With `frames`
     every array in it ends with the last complete frame, so that the store of a killed run opens."""
+    group = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+    axis = time_axis(group.get("attributes", {}))
     about = {
         folder.name: json.loads((folder / "zarr.json").read_text(encoding="utf-8"))
         for folder in sorted(path.iterdir())
         if (folder / "zarr.json").is_file()
     }
     for each in about.values():
-        if frames is not None and each.get("dimension_names", [None])[:1] == ["time"]:
+        if frames is not None and each.get("dimension_names", [None])[:1] == [axis]:
             each["shape"][0] = frames
-    group = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
     group["consolidated_metadata"] = {
         "kind": "inline", "must_understand": False, "metadata": about,
     }  # fmt: skip

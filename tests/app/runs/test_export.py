@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from dvax.app.cli.program import app
 from dvax.app.plots.store import Variable
 from dvax.app.runs.applications import base
-from dvax.app.runs.applications.run import write_dataset
+from dvax.app.runs.applications.run import open_store
 from dvax.app.runs.export import FORMATS, csv_files, export_run, netcdf, selection
 from dvax.errors import InputError
 
@@ -41,14 +41,19 @@ def own(tmp_path_factory) -> Path:
     folder.mkdir()
     times = np.linspace(0.0, 1.0, 5)
     vector = np.array([[1.5, np.nan, 3e-7]]) * np.arange(1.0, 6.0)[:, None]
-    variables = {
+    rows = {
         "time": base.Variable(("time",), times, "", "time"),
         "depth": base.Variable(("time",), times**2, "mm", "the depth"),
         "x": base.Variable(("time", "x_0"), vector, "[p]", "a vector"),
+    }
+    fixed = {
         "cells": base.Variable(("cell", "corner"), np.arange(6).reshape(2, 3), "1", "corners"),
         "least": base.Variable((), np.asarray(2.5), "trip cost", "a number"),
     }
-    write_dataset(folder / "trajectory.zarr", variables, {"title": "own", "model": "python"})
+    attrs = {"title": "own", "model": "python"}
+    store = open_store(folder / "trajectory.zarr", len(times), rows, fixed, attrs)
+    store.write(times, {name: v.values for name, v in rows.items() if name != "time"})
+    store.finish()
     about = {"status": "finished", "model": "python", "dvax": "0.1.0"}
     (folder / "manifest.json").write_text(json.dumps(about))
     return folder

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray
 from tests.app.runs.example import write
 from tests.app.runs.test_own_problem import POINT, TABLE
 from tests.app.runs.test_partial import SOLVE_ERROR, TANK, Stops
@@ -152,7 +153,7 @@ def test_checkpoints_stay_until_the_results_are_written(made, tmp_path, monkeypa
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr("dvax.app.runs.applications.run.write_dataset", full)
+        patched.setattr(FrameStore, "finish", full)
         with pytest.raises(OSError, match="No space"):
             go_on(part)
     assert (part / "checkpoints").is_dir()
@@ -173,15 +174,15 @@ def test_a_checkpoint_that_cannot_be_written_is_a_warning(tmp_path, monkeypatch)
     )
 
 
-def test_figures_that_fail_leave_the_states(tmp_path):
+def test_figures_that_fail_leave_the_variables_over_time(tmp_path):
     file = own(tmp_path)
     (tmp_path / "own.py").write_text(POINT.replace("jnp.max(sol.us)", "[][1]"))
     outcome = run(read_config(file, allow_code=True), tmp_path / "out")
     assert outcome.exit_code == 2 and outcome.has_results
-    assert (
-        "own.py, line" in outcome.stop_reason
-        and "Its states alone were kept" in outcome.stop_reason
-    )
+    assert "own.py, line" in outcome.stop_reason
+    assert "Its figures are missing" in outcome.stop_reason
+    with xarray.open_zarr(tmp_path / "out" / "trajectory.zarr", consolidated=False) as data:
+        assert {"depth", "force"} <= set(data) and data.sizes["time"] >= 2
 
 
 def test_hashes_end_with_the_last_complete_block(tmp_path):

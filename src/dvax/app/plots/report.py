@@ -66,8 +66,6 @@ def _pictures(run: RunRecord) -> tuple[list[Picture], list[str]]:
     """The pictures that the run can give, and a sentence for each that it cannot."""
     if run.trajectory is None:
         return [], ["There is no picture, because the run wrote no results."]
-    if run.has("state_part0"):
-        return [], ["The run was stopped before more than its states could be written."]
     if run.model != CONTACT:
         return application_pictures(run.model, run.trajectory.variables), []
     reduced = downsample(run)

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import zarr
 
+from dvax._files import time_axis
+
 
 class Variable:
     """An array of the store: its first `count` frames where it depends on time, else all of it.
@@ -19,8 +21,8 @@ class Variable:
     `dims`, `shape` and `dtype` are those of these values, `attrs` the attributes.
     """
 
-    def __init__(self, array: Any, count: int | None):
-        self._array, self._count = array, count
+    def __init__(self, array: Any, count: int | None, axis: str = "time"):
+        self._array, self._count, self._axis = array, count, axis
         self.attrs: Mapping[str, Any] = array.attrs.asdict()
         self.unit = str(self.attrs.get("units", ""))
         self.status = str(self.attrs.get("status", ""))
@@ -28,13 +30,13 @@ class Variable:
         self.dims: tuple[str, ...] = tuple(array.metadata.dimension_names or ())
         self.dtype: np.dtype = array.dtype
         self.shape: tuple[int, ...] = tuple(array.shape)
-        if self.dims[:1] == ("time",) and count is not None:
+        if self.dims[:1] == (axis,) and count is not None:
             self.shape = (count, *self.shape[1:])
 
     @cached_property
     def values(self) -> np.ndarray:
         """All values. Read once: they may lie in many chunks."""
-        over_time = self.dims[:1] == ("time",)
+        over_time = self.dims[:1] == (self._axis,)
         return np.asarray(self._array[: self._count] if over_time else self._array[...])
 
     def frames(self, which: slice | int) -> np.ndarray:
@@ -55,7 +57,7 @@ class Variable:
 @dataclass(frozen=True)
 class Store:
     """The variables of a run by name, and the attributes of the dataset. `count` is the number of
-    frames that are whole; None where there is no variable `time`."""
+    frames that are whole; None where no variable has the saved times."""
 
     attrs: Mapping[str, Any]
     variables: Mapping[str, Variable]
@@ -70,14 +72,14 @@ def open_store(path: Path) -> tuple[Store, int]:
     """
     group = zarr.open_group(path, mode="r")
     arrays = dict(group.arrays())
-    count, room = None, 0
-    if "time" in arrays:
-        time = np.asarray(arrays["time"][:], dtype=float)
+    count, room, axis = None, 0, time_axis(group.attrs.asdict())
+    if axis in arrays:
+        time = np.asarray(arrays[axis][:], dtype=float)
         increasing = np.isfinite(time) & (np.diff(time, prepend=-np.inf) > 0)
         room = len(time)
         count = room if increasing.all() else int(np.argmin(increasing))
     order = str(group.attrs.asdict().get("variable_order", "")).split()
     names = [name for name in order if name in arrays]
     names += [name for name in arrays if name not in names]
-    variables = {name: Variable(arrays[name], count) for name in names}
+    variables = {name: Variable(arrays[name], count, axis) for name in names}
     return Store(group.attrs.asdict(), variables, count), room

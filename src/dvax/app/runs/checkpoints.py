@@ -32,11 +32,17 @@ _STATE, _MANIFEST, _BESIDE = "state.npz", "MANIFEST.json", ".new"
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The number of a checkpoint, its arrays, and facts about them."""
+    """The number of a checkpoint, the file of its arrays, and facts about them."""
 
     number: int
-    arrays: list[np.ndarray]
+    file: Path
     about: Mapping[str, Any]
+
+    @property
+    def arrays(self) -> list[np.ndarray]:
+        """The arrays, read at each call: those of all checkpoints may not fit into the memory."""
+        with np.load(self.file, allow_pickle=False) as arrays:
+            return [arrays[f"arr_{k}"] for k in range(len(arrays.files))]
 
 
 class Checkpoints:
@@ -111,9 +117,7 @@ class Checkpoints:
             if hashlib.sha256(data).hexdigest() != content["files"][_STATE]:
                 damaged.append(str(state))
                 continue
-            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-                rows = [arrays[f"arr_{k}"] for k in range(len(arrays.files))]
-            found.append(Checkpoint(int(place.name[5:]), rows, content["about"]))
+            found.append(Checkpoint(int(place.name[5:]), state, content["about"]))
         return found, damaged
 
     def _places(self) -> list[Path]:

@@ -15,10 +15,11 @@ frame with a time is complete, whatever killed the run.
 
 import hashlib
 import json
+import math
 import os
 import platform
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from typing import Any
 import numpy as np
 import zarr
 
+from dvax._files import AXIS, time_axis
 from dvax._files import consolidate as consolidate
 from dvax._files import write_whole as write_whole
 from dvax.app.runs import checkpoints
@@ -156,17 +158,21 @@ def _alive(number: Any) -> bool:
 def cut_incomplete(path: Path) -> None:
     """Cut off the frames without a time, which a killed run had not completed."""
     group = zarr.open_group(path, mode="r+", use_consolidated=False)
-    if "time" not in group:
+    axis = time_axis(group.attrs.asdict())
+    if axis not in group:
         return
-    known = np.isfinite(np.asarray(group["time"][...]))  # pyright: ignore
+    known = np.isfinite(np.asarray(group[axis][...]))  # pyright: ignore
     whole = len(known) if known.all() else int(np.argmin(known))
     for _, array in group.arrays():
-        if getattr(array.metadata, "dimension_names", (None,))[:1] == ("time",):
+        if getattr(array.metadata, "dimension_names", (None,))[:1] == (axis,):
             array.resize((whole, *array.shape[1:]))
 
 
 class FrameStore:
-    """trajectory.zarr: variables over time, of which the first `written` frames are complete."""
+    """trajectory.zarr: variables over time, of which the first `written` frames are complete.
+
+    `coords` are complete from the start, and `sizes` are the lengths of dimensions that none of them
+    has. `axis` is the name of the saved times."""
 
     def __init__(
         self,
@@ -177,36 +183,53 @@ class FrameStore:
         variables: Mapping[str, tuple[tuple[str, ...], Any, dict[str, Any]]],
         attrs: Mapping[str, Any],
         time_attrs: Mapping[str, Any],
+        *,
+        axis: str = "time",
+        sizes: Mapping[str, int] | None = None,
     ):
-        self.path = path
+        self.path, self.axis = path, axis
         self.written = 0
-        points = next(len(values) for dims, values, _ in coords.values() if dims == ("point",))
-        sizes = {"time": frames, "point": points}
-        chunk = {"time": block, "point": min(points, max(1, _CHUNK_BYTES // (8 * block)))}
+        lengths = {
+            d: n for dims, v, _ in coords.values() for d, n in zip(dims, v.shape, strict=True)
+        }
+        lengths |= {**(sizes or {}), axis: frames}
         # Written by zarr alone: importing xarray takes longer than solving a block. To read a Dataset
         # xarray needs the names of the dimensions, and this attribute for its coordinates.
         group = zarr.open_group(
             path,
             mode="w-",
             zarr_format=3,
-            attributes={**attrs, "coordinates": " ".join(coords)},
+            attributes={
+                "coordinates": " ".join(coords),
+                **({} if axis == "time" else {AXIS: axis}),
+                **attrs,
+            },
         )
+
+        def chunks(dims: tuple[str, ...]) -> tuple[int, ...]:
+            shape = [block if d == axis else max(1, lengths[d]) for d in dims]
+            if dims and dims != (axis,):
+                before = block * math.prod(n for d, n in zip(dims, shape, strict=True) if d != axis)
+                most = _CHUNK_BYTES * shape[-1] // (8 * before)
+                shape[-1] = max(1, min(shape[-1], most))
+            return tuple(shape)
 
         def create(name: str, dims: tuple[str, ...], dtype: Any, meta: Mapping[str, Any]) -> Any:
             integer = np.issubdtype(dtype, np.integer)
+            fill = False if np.dtype(dtype).kind == "b" else -1 if integer else np.nan
             return group.create_array(
                 name,
-                shape=tuple(sizes[d] for d in dims),
-                chunks=tuple(chunk[d] for d in dims),
+                shape=tuple(lengths[d] for d in dims),
+                chunks=chunks(dims),
                 dtype=dtype,
-                fill_value=-1 if integer else np.nan,
+                fill_value=fill,
                 dimension_names=dims,
                 attributes=dict(meta),
             )
 
-        for name, (dims, values, meta) in coords.items():
-            create(name, dims, values.dtype, meta)[...] = values
-        self._time = create("time", ("time",), np.float64, time_attrs)
+        self._fixed = {n: create(n, dims, v.dtype, meta) for n, (dims, v, meta) in coords.items()}
+        self.put({name: values for name, (_, values, _) in coords.items()})
+        self._time = create(axis, (axis,), np.float64, time_attrs)
         self._arrays = {name: create(name, *variable) for name, variable in variables.items()}
         self._hashes: dict[str, str] = {}
         self._publish()
@@ -227,8 +250,18 @@ class FrameStore:
         replace_store(self.path, path)
         self.path = path
         group: Any = zarr.open_group(path, mode="r+", use_consolidated=False)
-        self._time = group["time"]
+        self._time = group[self.axis]
         self._arrays = {name: group[name] for name in self._arrays}
+        self._fixed = {name: group[name] for name in self._fixed}
+
+    def put(self, fixed: Mapping[str, np.ndarray]) -> None:
+        """Replace values of variables without a time axis."""
+        for name, values in fixed.items():
+            self._fixed[name][...] = values
+
+    def series(self) -> "Series":
+        """Return the variables over time of the complete frames, each read when it is asked for."""
+        return Series({self.axis: self._time, **self._arrays}, self.written)
 
     def read(self, frames: slice) -> dict[str, np.ndarray]:
         """Return the variables of some frames."""
@@ -238,7 +271,7 @@ class FrameStore:
     def files(self, frames: int) -> dict[str, str]:
         """Return the SHA-256 of every file of values, of the arrays over time up to the complete chunks
         of the first `frames`. Each is read once."""
-        over_time = {"time": self._time, **self._arrays}
+        over_time = {self.axis: self._time, **self._arrays}
         for file in sorted(self.path.rglob("c/**/*")):
             name = file.relative_to(self.path)
             if not file.is_file() or str(name) in self._hashes:
@@ -274,6 +307,22 @@ class FrameStore:
 
     def _publish(self) -> None:
         consolidate(self.path, self.written)
+
+
+class Series(Mapping[str, np.ndarray]):
+    """Variables over time that lie in a store, in the memory only while they are used."""
+
+    def __init__(self, arrays: Mapping[str, Any], count: int):
+        self._arrays, self._count = arrays, count
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return np.asarray(self._arrays[name][: self._count])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._arrays)
+
+    def __len__(self) -> int:
+        return len(self._arrays)
 
 
 def damaged_files(path: Path, hashes: Mapping[str, str]) -> str | None:

@@ -27,17 +27,13 @@ class Variable:
 
 @dataclass(frozen=True)
 class Results:
-    """The results of a run: figures for summary.json, variables for trajectory.zarr, constants and
-    assumptions for the report; `files` writes further files into the run directory, and returns their
+    """What a run has besides its variables over time: figures for summary.json, the other variables
+    of trajectory.zarr, and `files`, which writes further files into the run directory and returns their
     names."""
 
     figures: Mapping[str, Figure]
-    variables: Mapping[str, Variable]
-    constants: Constants | None
-    steps: int
-    assumptions: tuple[Assumption, ...] = ()
-    notices: tuple[str, ...] = ()
-    files: Callable[[Path], tuple[str, ...]] | None = None
+    fixed: Mapping[str, Variable]
+    files: Callable[[Path], tuple[str, ...]]
 
 
 class Description(NamedTuple):

@@ -11,17 +11,24 @@ from dvax.app.runs.applications.base import Figure, Variable
 from dvax.evolution import Implicit, Solution
 from dvax.problem import Problem
 from dvax.spaces import AbstractSpace
-from dvax.theory import Constants, bound_error
+from dvax.theory import Bound, Constants, bound_error, weakest
+from dvax.theory.certificate import continue_bound
 
 _ROUNDOFF_PER_STEP = 16.0
 """Unit roundoffs of the state that a step may add."""
 
 
 class Certificate(NamedTuple):
-    """A bound on ‖x_h − x‖ at every saved time, and what it rests on."""
+    """A bound on ‖x_h − x‖ at every saved time, and what it rests on.
+
+    A piece of a run that goes on needs `bound`, the numbers of `steps` and the largest `size` of a
+    state so far."""
 
     values: np.ndarray
-    status: str
+    status: Any
+    bound: Bound | None = None
+    steps: int = 0
+    size: float = 0.0
 
     @property
     def largest(self) -> float | None:
@@ -43,19 +50,27 @@ class Certificate(NamedTuple):
 
 
 def certificate(
-    problem: Problem, solution: Solution, constants: Constants, count: int | None = None
+    problem: Problem, solution: Solution, constants: Constants, before: Certificate | None = None
 ) -> Certificate:
-    """Return `dvax.bound_error` at the first `count` rows, plus the roundoff of all steps, which
-    that bound excludes and which dominates where a solve is exact."""
+    """Return `dvax.bound_error`, plus the roundoff of all steps, which that bound excludes and which
+    dominates where a solve is exact; `before`: of the piece whose last state the solution starts from.
+    """
     if isinstance(solution.setup.method, Implicit):
         # Implicit methods keep no polynomials of their steps, of which a defect could be measured.
-        return Certificate(np.full(len(solution.ts[:count]), np.nan), "not known")
-    bound = bound_error(problem, solution, constants)
+        return Certificate(np.full(len(solution.ts), np.nan), "not known")
+    steps, largest, status = int(solution.stats["steps"]), 0.0, "proved"
+    if before is None or before.bound is None:
+        bound = bound_error(problem, solution, constants)
+    else:
+        bound = continue_bound(problem, solution, constants, before.bound)
+        steps, largest, status = steps + before.steps, before.size, before.status
     space = problem.spaces(solution.setup.x0)[0]
     size: Any = _sizes(space, solution.xs)
     eps = np.finfo(jtu.tree_leaves(solution.xs)[0].dtype).eps
-    lost = _ROUNDOFF_PER_STEP * eps * (1.0 + float(solution.stats["steps"])) * float(size.max())
-    return Certificate(np.asarray(bound.x)[:count] + lost, bound.status)
+    largest = max(largest, float(size.max()))
+    lost = _ROUNDOFF_PER_STEP * eps * (1.0 + steps) * largest
+    status = weakest(status, bound.status)
+    return Certificate(np.asarray(bound.x) + lost, status, bound, steps, largest)
 
 
 @eqx.filter_jit

@@ -2,9 +2,10 @@
 
 import abc
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import jax.tree_util as jtu
 import numpy as np
@@ -53,6 +54,7 @@ class AbstractModelApplication(abc.ABC):
     - `axis`: the name and the description of the saved times in the results;
     - `certified`: whether steps are chosen for a proved bound;
     - `verified`: whether `dvax.verify` checks the assumptions, besides the constants of the model;
+    - `whole`: whether the figures need the solution at all saved times, which must fit into the memory;
     - `bound_words`, `bound_unit`, `bound_scale`: of the bound on the error, which is the scale times
       that of the state in the norm of the state space.
     """
@@ -69,6 +71,7 @@ class AbstractModelApplication(abc.ABC):
     axis: ClassVar[tuple[str, str]] = ("time", "time")
     certified = True
     verified = True
+    whole = False
     bound_words = "bound on the error of the state in the norm of the state space"
     bound_unit = ""
     bound_scale = 1.0
@@ -103,8 +106,8 @@ class AbstractModelApplication(abc.ABC):
         check_model_steps(self.table, span, f"{span:g} {model.time_unit}".rstrip())
 
     @abc.abstractmethod
-    def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
-        """The variables over time, at the rows of a solution."""
+    def series(self, solution: Any, bound: Certificate | None) -> Mapping[str, Variable]:
+        """The variables over time, each row from that row of a solution alone, and the bounds."""
 
     @abc.abstractmethod
     def figures(
@@ -198,34 +201,29 @@ class AbstractModelApplication(abc.ABC):
             m.problem, m.x0, times, constants, self.settings, m.time_unit, m.args
         )  # fmt: skip
 
-    def results(self, plan: Plan, solution: Any, count: int) -> Results:
-        """The results up to the time number `count` of the plan.
+    def bound(self, piece: Any, before: Certificate | None) -> Certificate | None:
+        """The bound on the error of a piece of the run, which goes on from the one `before`."""
+        if self.constants is None or piece is None:
+            return None
+        return certificate(self.own.problem, piece, self.constants, before)
 
-        The solution has all rows of the plan; rows that were not reached repeat the last of those
-        `count`, so that one compiled program serves all results. It is None where the plan has one
-        time alone.
+    def rows(self, piece: Any, bound: Certificate | None, count: int) -> dict[str, Variable]:
+        """The variables over time at the first `count` rows of a piece: those that follow repeat the
+        last, so that all pieces share one compiled program. It is None where there is one time alone.
         """
         name, words = self.axis
-        time = Variable((name,), np.asarray(plan.times), self.own.time_unit, words)
-        bound, end = self._bound(solution), cast(Solution, solution)
-        over_time = {
-            key: Variable(v.dims, v.values[:count], v.unit, v.words, v.status)
-            for key, v in {name: time, **self.series(solution, bound)}.items()
-        }
         if bound is not None:
-            bound = bound._replace(values=bound.values[:count])
-        values = {key: v.values for key, v in over_time.items()}
-        return Results(
-            self.figures(values, solution, bound), {**over_time, **self.fixed(solution)},
-            self.constants, 0 if solution is None else int(solution.stats["steps"]),
-            self.assumptions, files=lambda directory: self.write_files(directory, end),
-        )  # fmt: skip
+            bound = bound._replace(values=self.bound_scale * bound.values)
+        times = self.times if piece is None else np.asarray(piece.ts)
+        found = {name: Variable((name,), times, self.own.time_unit, words)}
+        found |= self.series(piece, bound)
+        return {key: replace(v, values=np.asarray(v.values)[:count]) for key, v in found.items()}
 
-    def _bound(self, solution: Any) -> Certificate | None:
-        if self.constants is None or solution is None:
-            return None
-        found = certificate(self.own.problem, solution, self.constants)
-        return found._replace(values=self.bound_scale * found.values)
+    def results(self, series: Mapping[str, np.ndarray], end: Any, status: str) -> Results:
+        """The results after the last row of the piece `end`; `status`: of the bound in the series."""
+        bound = Certificate(series["error_bound"], status) if "error_bound" in series else None
+        figures, fixed = self.figures(series, end, bound), self.fixed(end)
+        return Results(figures, fixed, lambda directory: self.write_files(directory, end))
 
     def bound_series(self, bound: Certificate | None) -> dict[str, Variable]:
         """The bound on the error over time, where there is one."""

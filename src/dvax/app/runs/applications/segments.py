@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from dvax._tree import Label
-from dvax.app.runs.applications.base import Plan, Results, Variable
+from dvax.app.runs.applications.base import Plan
 from dvax.app.runs.checkpoints import Checkpoint
 from dvax.app.runs.interrupt import interruptible
 from dvax.app.runs.solver_options import SEGMENTS
@@ -22,6 +22,9 @@ from dvax.errors import SolveError
 from dvax.evolution import Implicit, Solution, solve
 from dvax.evolution.responses import Responses
 from dvax.evolution.rows import all_finite, cut, with_fields
+
+_PIECE_BYTES = 2**20
+"""The size of the states of a piece. With responses, variables and copies it was sixty times that."""
 
 
 def segments(plan: Plan, first: int = 0, x: Any = None, step: Any = None) -> Iterator[Solution]:
@@ -70,8 +73,9 @@ def segments(plan: Plan, first: int = 0, x: Any = None, step: Any = None) -> Ite
 
 
 def segment_length(plan: Plan) -> int:
-    """The number of saved times of a piece."""
-    return max(2, math.ceil(len(plan.times) / SEGMENTS))
+    """The number of saved times of a piece: a hundredth of all, fewer where their states are large."""
+    row = sum(np.asarray(leaf).nbytes for leaf in jtu.tree_leaves(plan.x0))
+    return max(2, min(math.ceil(len(plan.times) / SEGMENTS), _PIECE_BYTES // max(1, row)))
 
 
 _SAVED = ("ts", "xs", "law", "defect", "law_defect", "completed_defect", "stats")
@@ -102,11 +106,12 @@ def from_checkpoint(saved: Checkpoint, like: Solution, plan: Plan) -> Solution:
     fields = tree.unflatten(rows)
     fields["stats"]["method"] = Label(saved.about["method"])
     setup = like.setup
+    begin = max(0, saved.number * segment_length(plan) - 1)
+    ends = {"t0": float(plan.times[begin]), "t1": float(np.asarray(fields["ts"])[-1])}
+    setup = setup._replace(setting={**setup.setting, **ends})
     if saved.number == 0:
         # That of the whole run (`join_pieces`).
-        ends = {"t0": float(plan.times[0]), "t1": float(np.asarray(fields["ts"])[-1])}
-        x0 = jtu.tree_map(jnp.asarray, plan.x0)
-        setup = setup._replace(x0=x0, setting={**setup.setting, **ends})
+        setup = setup._replace(x0=jtu.tree_map(jnp.asarray, plan.x0))
     return with_fields(like, fields | {"setup": setup, "enclosed": bool(saved.about["enclosed"])})
 
 
@@ -156,24 +161,6 @@ def join_pieces(pieces: list[Solution], count: int | None = None) -> Solution:
 def _padded(rows: Any, count: int) -> jax.Array:
     rows = np.asarray(rows)
     return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], count - len(rows), axis=0)]))
-
-
-def states_only(pieces: list[Solution]) -> Results:
-    """Return times and states without figures, which needs no compilation."""
-    parts = [jtu.tree_leaves(piece.xs) for piece in pieces]
-    leaves = [np.concatenate([np.asarray(v) for v in part]) for part in zip(*parts, strict=True)]
-    times = np.concatenate([np.asarray(piece.ts) for piece in pieces])
-    variables = {"time": Variable(("time",), times, "", "time")}
-    for k, leaf in enumerate(leaves):
-        rows = leaf.reshape(len(leaf), -1)
-        variables[f"{STATE}{k}"] = Variable(
-            ("time", f"entry{k}"), rows, "", f"part {k} of the state"
-        )
-    return Results({}, variables, None, sum(int(piece.stats["steps"]) for piece in pieces))
-
-
-STATE = "state_part"
-"""The variable names of results that consist of states only."""
 
 
 def _concatenate(parts: list[Any]) -> Any:

@@ -18,7 +18,7 @@ from dvax.errors import InputProblem, Problems, input_error
 
 _BLOCK_BYTES = 2**25
 """The most that the rows of a block take, unless a chunk of the store is larger."""
-_OF_THE_STORE = ("coordinates", "variable_order", "_FillValue")
+_OF_THE_STORE = ("coordinates", "variable_order", "time_axis", "_FillValue")
 """Attributes that describe a store and no other file."""
 
 

@@ -184,7 +184,7 @@ class FemContactApplication(AbstractModelApplication):
                 float(m.constants.sharp_decay_rate), "1/[t]",
                 "two states certainly approach at this rate in the norm of the viscosity",
             ),
-            **self.bound_figure(_known(bound)),
+            **self.bound_figure(bound),
         }  # fmt: skip
 
     def write_files(self, directory: Path, end: Solution) -> tuple[str, ...]:

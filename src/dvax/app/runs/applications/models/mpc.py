@@ -250,11 +250,16 @@ class MpcApplication(AbstractModelApplication):
         return tuple(found)
 
     def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
-        times, u = np.asarray(solution.ts), np.asarray(solution.us)
-        wanted, series = self.reference.at(times), {}
+        times, x, u = (np.asarray(v) for v in (solution.ts, solution.xs, solution.us))
+        wanted, u, time, found = (
+            self.reference.at(times),
+            u[:, : len(self.input_units)],
+            ("time",),
+            {},
+        )
         for k, (name, unit) in enumerate(self.state_units.items()):
             key = f"reference_{store_name(name)}"
-            series[key] = Variable(("time",), wanted[:, k], unit, f"reference of {name}")
+            found[key] = Variable(time, wanted[:, k], unit, f"reference of {name}")
         low, high = np.asarray(self.mpc.lower), np.asarray(self.mpc.upper)
         for k, (name, unit) in enumerate(self.input_units.items()):
             for prefix, values, words in (
@@ -262,39 +267,37 @@ class MpcApplication(AbstractModelApplication):
                 ("input_max", np.full(times.shape, high[k]), "greatest"),
             ):  # fmt: skip
                 key = f"{prefix}_{store_name(name)}"
-                series[key] = Variable(("time",), values, unit, f"{words} {name}")
-        return {**self.named(solution), **self.bound_series(bound), **series}
+                found[key] = Variable(time, values, unit, f"{words} {name}")
+        apart, moved = x - wanted, u - self.feed.at(times)
+        rate = np.einsum("ti,ij,tj->t", apart, self.weights[0], apart)
+        rate += np.einsum("ti,ij,tj->t", moved, self.weights[1], moved)
+        at_limit = ((u <= low) | (u >= high)).any(axis=1).astype(float)
+        found["weighted_squares"] = Variable(time, rate, "", "cost of a unit of time")
+        found["at_limit"] = Variable(time, at_limit, "1", "1 where an input is at a limit")
+        return {**self.named(solution), **self.bound_series(bound), **found}
 
     def figures(
         self, series: Mapping[str, np.ndarray], end: Solution, bound: Certificate | None
     ) -> Mapping[str, Figure]:
-        def columns(prefix: str, names: Mapping[str, str]) -> np.ndarray:
-            return np.stack([series[f"{prefix}{store_name(name)}"] for name in names], axis=1)
-
-        times, x = series["time"], columns("", self.state_units)
-        u = columns("input_", self.input_units)
+        times = series["time"]
         figures = {
             f"largest_{name}": Figure(
-                float(np.abs(u[:, k]).max()), unit, f"largest |{name}| at the saved times"
+                float(np.abs(series[f"input_{store_name(name)}"]).max()), unit,
+                f"largest |{name}| at the saved times",
             )
-            for k, (name, unit) in enumerate(self.input_units.items())
-        }
-        at_limit = (u <= np.asarray(self.mpc.lower)) | (u >= np.asarray(self.mpc.upper))
-        apart, moved = x - self.reference.at(times), u - self.feed.at(times)
-        rate = np.einsum("ti,ij,tj->t", apart, self.weights[0], apart)
-        rate += np.einsum("ti,ij,tj->t", moved, self.weights[1], moved)
+            for name, unit in self.input_units.items()
+        }  # fmt: skip
+        last = np.asarray(end.xs)[-1] - self.reference.at(times[-1:])[0]
+        limited = np.trapezoid(series["at_limit"], times) / (times[-1] - times[0] or 1.0)
         figures |= {
             "final_distance": Figure(
-                float(np.linalg.norm(apart[-1])), "", f"|x − reference| at t = {times[-1]:g} s"
+                float(np.linalg.norm(last)), "", f"|x − reference| at t = {times[-1]:g} s"
             ),
             "closed_loop_cost": Figure(
-                float(np.trapezoid(rate, times)), "s",
+                float(np.trapezoid(series["weighted_squares"], times)), "s",
                 "integral of the weighted squares, from the saved times",
             ),
-            "time_at_limit": Figure(
-                float(np.trapezoid(at_limit.any(axis=1), times) / (times[-1] - times[0] or 1.0)), "1",
-                "part of the time with an input at a limit",
-            ),
+            "time_at_limit": Figure(float(limited), "1", "part of the time with an input at a limit"),
         }  # fmt: skip
         c = self.constants
         if c is not None and c.energy is not None and c.energy[1] < 0:

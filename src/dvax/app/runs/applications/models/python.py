@@ -70,6 +70,7 @@ class PythonApplication(AbstractModelApplication):
             )  # fmt: skip
         _run(self.file, lambda: model.problem.check(model.t0, model.x0, model.args))
         self.certified, self.place_of_figures = table.certify, f"{self.file.name}: figures"
+        self.whole = model.figures is not None
         self.set_model(model, table.t_end)
 
     @property
