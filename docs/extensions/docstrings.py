@@ -62,9 +62,9 @@ class LinkNames(SphinxPostTransform):
     def run(self, **settings: Any) -> None:
         for block in self.document.findall(nodes.literal_block):
             # A session ends with an empty line for doctest.
-            block.rawsource = block.rawsource.rstrip()
-            text = block.astext().rstrip().replace("  # fmt: skip", "")
-            block[:] = [nodes.Text(text)] if len(block) < 2 else block[:]
+            if block.rawsource == block.astext():
+                block.rawsource = block.rawsource.rstrip()
+                block[:] = [nodes.Text(block.rawsource)]
         objects = self.env.domains.python_domain.objects
         for node in list(self.document.findall(nodes.literal)):
             if isinstance(node.parent, nodes.reference | addnodes.pending_xref):

@@ -60,6 +60,8 @@ bottom.set(xlabel="time t [min]", ylabel="power u [kW]")
 check = dvax.verify(problem, x0, 0.0, 120.0, 0.5)
 bound = dvax.bound_error(problem, runs["back-calculation"], check.constants)
 print(f"assumptions: {check.status}")
-print(f"rate of the theory: {float(check.constants.growth_rate):.2f} per minute, "
-      f"with signs: {float(check.constants.one_sided):.2f}")  # fmt: skip
+print(
+    f"rate of the theory: {float(check.constants.growth_rate):.2f} per minute, "
+    f"with signs: {float(check.constants.one_sided):.2f}"
+)
 print(f"error after 20 minutes: at most {float(bound.x[80]):.0e} ({bound.status})")

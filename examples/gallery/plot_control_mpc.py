@@ -17,9 +17,15 @@ from dvax.models import LinearMPC
 
 jax.config.update("jax_enable_x64", True)
 mpc = LinearMPC(
-    A=[[0.0, 1.0], [-1.0, -0.5]], B=[[0.0], [1.0]], Q=np.diag([2.0, 1.0]), R=[[1.0]],
-    horizon=8, step=0.25, lower=-1.0, upper=1.0,
-)  # fmt: skip
+    A=[[0.0, 1.0], [-1.0, -0.5]],
+    B=[[0.0], [1.0]],
+    Q=np.diag([2.0, 1.0]),
+    R=[[1.0]],
+    horizon=8,
+    step=0.25,
+    lower=-1.0,
+    upper=1.0,
+)
 x0, ts = jnp.array([3.0, 0.0]), np.linspace(0.0, 10.0, 201)
 sol = dvax.solve(mpc.problem, x0, 0.0, 10.0, ts=ts, rtol=1e-6, method=dvax.ETD4RK())
 

@@ -25,9 +25,16 @@ def flame(t):
 
 
 plate = Thermostat(
-    shape=(48, 32), lengths=(1.5, 1.0), boundary="dirichlet", diffusion=0.05, gain=6.0,
-    reference=1.0, lower=0.0, upper=2.0, load=flame,
-)  # fmt: skip
+    shape=(48, 32),
+    lengths=(1.5, 1.0),
+    boundary="dirichlet",
+    diffusion=0.05,
+    gain=6.0,
+    reference=1.0,
+    lower=0.0,
+    upper=2.0,
+    load=flame,
+)
 s1, s2 = plate.points
 ts = np.linspace(0.0, 6.0, 7)
 sol = dvax.solve(plate.problem, jnp.zeros((48, 32)), 0.0, 6.0, ts=ts, rtol=1e-4, atol=1e-6)
@@ -43,8 +50,13 @@ regimes = np.asarray(plate.regimes(ts[-1], sol.xs[-1])) + 1
 right.imshow(
     regimes.T, origin="lower", extent=extent, cmap=ListedColormap(colours), vmin=-0.5, vmax=2.5
 )
-right.legend(handles=[Patch(color=c, label=w) for c, w in zip(colours, words, strict=True)], ncols=3,
-             loc="upper center", bbox_to_anchor=(0.5, -0.2), frameon=False)  # fmt: skip
+right.legend(
+    handles=[Patch(color=c, label=w) for c, w in zip(colours, words, strict=True)],
+    ncols=3,
+    loc="upper center",
+    bbox_to_anchor=(0.5, -0.2),
+    frameon=False,
+)
 for axes, title in ((left, "Temperature at t = 6"), (right, "Heaters at t = 6")):
     axes.set(title=title, xlabel="s₁", ylabel="s₂")
     axes.grid(False)

@@ -64,6 +64,8 @@ figure.colorbar(image, label="u")
 
 check = dvax.verify(problem, x0, 0.0, 4.0)
 bound = dvax.bound_error(problem, sol, check.constants)
-print(f"assumptions: {check.status}; two strings approach with the rate "
-      f"{-float(check.constants.one_sided):.3f}")  # fmt: skip
+print(
+    f"assumptions: {check.status}; two strings approach with the rate "
+    f"{-float(check.constants.one_sided):.3f}"
+)
 print(f"error of the string in L²: at most {float(bound.x.max()):.0e} ({bound.status})")

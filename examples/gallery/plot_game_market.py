@@ -19,10 +19,14 @@ from dvax.models import Market
 jax.config.update("jax_enable_x64", True)
 names = ["coal", "gas", "wind"]
 market = Market(
-    cost=[20.0, 35.0, 0.0], slope=[0.05, 0.08, 0.01], firm=[0, 1, 2], b=0.05, speed=2.0,
+    cost=[20.0, 35.0, 0.0],
+    slope=[0.05, 0.08, 0.01],
+    firm=[0, 1, 2],
+    b=0.05,
+    speed=2.0,
     intercept=lambda t: 90.0 + 25.0 * jnp.sin(2 * jnp.pi * (t - 8.0) / 24.0),
     capacity=lambda t: jnp.stack([300.0, 400.0, 250.0 + 200.0 * jnp.cos(2 * jnp.pi * t / 24.0)]),
-)  # fmt: skip
+)
 sol = market.run(0.0, 48.0)
 
 # %%

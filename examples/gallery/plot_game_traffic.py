@@ -26,16 +26,30 @@ links = [
 ]
 tail, head, time, slope = (list(column) for column in zip(*links, strict=True))
 network = Network(
-    zones=2, nodes=4, first_thru_node=1, init_node=tail, term_node=head, capacity=[1.0] * 5,
-    length=[0.0] * 5, free_flow_time=time, b=slope, power=[1.0] * 5,
-)  # fmt: skip
+    zones=2,
+    nodes=4,
+    first_thru_node=1,
+    init_node=tail,
+    term_node=head,
+    capacity=[1.0] * 5,
+    length=[0.0] * 5,
+    free_flow_time=time,
+    b=slope,
+    power=[1.0] * 5,
+)
 trips = Trips(zones=2, origin=[1], destination=[2], flow=[6.0])
 model = Traffic(network, trips, rho=1.0)
 ts = np.linspace(0.0, 20.0, 41)
 sol = dvax.solve(
-    model.problem, model.all_or_nothing(), 0.0, 20.0, ts=ts, dt=0.5, vi_solver=model.vi_solver,
+    model.problem,
+    model.all_or_nothing(),
+    0.0,
+    20.0,
+    ts=ts,
+    dt=0.5,
+    vi_solver=model.vi_solver,
     constants=model.constants,
-)  # fmt: skip
+)
 
 # %%
 # A link of flow v takes t₀ (1 + b v) minutes.

@@ -25,9 +25,11 @@ problem = dvax.Problem(
     control_space=dvax.spaces.Euclidean(()),
 )
 impact = dvax.Event(
-    lambda t, x, u, args: x[0], direction=-1, name="impact",
+    lambda t, x, u, args: x[0],
+    direction=-1,
+    name="impact",
     reset=lambda t, x, u, args: jnp.stack([0.0 * x[0], -0.8 * x[1]]),
-)  # fmt: skip
+)
 top = dvax.Event(lambda t, x, u, args: x[1], direction=-1, name="top")
 x0, ts = jnp.array([4.0, 0.0]), np.linspace(0.0, 4.0, 801)
 sol = dvax.solve(problem, x0, 0.0, 4.0, ts=ts, events=[impact, top], rtol=1e-8, atol=1e-10)

@@ -47,8 +47,9 @@ bottom.axhline(8.0, color="C7", linestyle=":", label="yield force")
 bottom.set(xlabel="time t [s]", ylabel="reaction u [N]")
 bottom.legend(loc="upper right")
 for axes in (top, bottom):
-    axes.fill_between(ts, 0, 1, where=np.asarray(sol.us) > 0, color="0.9",
-                      transform=axes.get_xaxis_transform())  # fmt: skip
+    axes.fill_between(
+        ts, 0, 1, where=np.asarray(sol.us) > 0, color="0.9", transform=axes.get_xaxis_transform()
+    )
 
 # %%
 # The certificate
@@ -61,7 +62,9 @@ check = dvax.verify(problem, x0, 0.0, 2.0)
 bound = dvax.bound_error(problem, sol, check.constants)
 print(f"assumptions: {check.status}")
 print(f"method: {sol.stats['method'].split(':')[0]}, {int(sol.stats['steps'])} steps")
-print(f"growth rate of the theory: {float(check.constants.growth_rate):.0f} per second, "
-      f"with signs: {float(check.constants.one_sided):.0f} per second")  # fmt: skip
+print(
+    f"growth rate of the theory: {float(check.constants.growth_rate):.0f} per second, "
+    f"with signs: {float(check.constants.one_sided):.0f} per second"
+)
 for k in (50, 100):
     print(f"error of the state at {ts[k]:g} s: at most {float(bound.x[k]):.0e} √J ({bound.status})")

@@ -19,8 +19,10 @@ t = 0.02 * np.arange(400)
 record = Accelerogram(0.02, 0.4 * np.sin(2 * np.pi * t) * np.exp(-0.7 * t))  # in g
 frames = {
     "elastic": Frame(record=record, period=0.5, damping=0.05),
-    "yielding": Frame(record=record, period=0.5, damping=0.05, yield_ratio=0.5, viscosity_ratio=0.005),
-}  # fmt: skip
+    "yielding": Frame(
+        record=record, period=0.5, damping=0.05, yield_ratio=0.5, viscosity_ratio=0.005
+    ),
+}
 ts = np.linspace(0.0, t[-1], 800)
 runs = {name: frame.solve(ts=ts) for name, frame in frames.items()}
 

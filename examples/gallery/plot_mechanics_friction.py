@@ -59,6 +59,8 @@ check = dvax.verify(problem, 0.0, 0.0, 3.0)
 bound = dvax.bound_error(problem, sol, check.constants)
 print(f"assumptions: {check.status}")
 print(f"method: {sol.stats['method'].split(':')[0]}, {int(sol.stats['steps'])} steps")
-print(f"rate of the theory: {float(check.constants.growth_rate):.0f} per second, "
-      f"with signs: {float(check.constants.one_sided) + 0.0:.0f}")  # fmt: skip
+print(
+    f"rate of the theory: {float(check.constants.growth_rate):.0f} per second, "
+    f"with signs: {float(check.constants.one_sided) + 0.0:.0f}"
+)
 print(f"error of the speed at the end: at most {float(bound.x[-1]):.0e} m/s ({bound.status})")

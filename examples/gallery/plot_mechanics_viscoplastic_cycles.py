@@ -24,9 +24,12 @@ def angle(t):  # the shear strain, without a unit
 
 
 steel = DuvautLions(
-    bulk=160e3, shear=80e3, relaxation=0.05, yields=VonMises(250.0),
+    bulk=160e3,
+    shear=80e3,
+    relaxation=0.05,
+    yields=VonMises(250.0),
     strain=lambda t: angle(t) * shear,
-)  # fmt: skip
+)
 ts = np.linspace(0.0, 5.0, 501)
 sol = dvax.solve(steel.problem, steel.virgin, 0.0, 5.0, ts=ts, rtol=1e-5, atol=1e-8)
 
