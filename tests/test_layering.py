@@ -45,6 +45,7 @@ FLOORS = {
     # The public names: `import dvax` is for those who live above the library.
     "": 5.5,
     "app": 6,
+    "__main__": 7,
 }
 
 # Two rooms on one floor where one may look into the other, and why. Each pair must be in use.

@@ -56,6 +56,12 @@ def test_version_option_prints_the_package_version() -> None:
     assert (result.exit_code, result.stdout) == (0, f"dvax {__version__}\n")
 
 
+def test_python_m_dvax_is_the_command_line() -> None:
+    command = [sys.executable, "-m", "dvax", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == f"dvax {__version__}\n"
+
+
 @pytest.mark.parametrize("arguments", [["nonsense"], ["run"], ["run", "a.toml"], ["report", "--x"]])
 def test_wrong_usage_has_the_exit_code_of_bad_input(arguments: list[str]) -> None:
     result = CliRunner().invoke(app, arguments)
