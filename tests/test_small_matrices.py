@@ -33,6 +33,7 @@ def test_a_singular_matrix_has_no_finite_solution() -> None:
     assert not bool(jnp.any(jnp.isfinite(solve(jnp.ones((2, 2)), jnp.array([1.0, 2.0])))))
 
 
+@pytest.mark.thorough
 def test_the_derivatives_of_a_solution_are_those_of_the_system() -> None:
     rng = np.random.default_rng(0)
     M, dM, b, db = (jnp.asarray(v) for v in (*rng.normal(size=(2, 5, 5)), *rng.normal(size=(2, 5))))

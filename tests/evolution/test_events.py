@@ -258,6 +258,7 @@ def test_two_zeros_in_one_step_are_two_events(sign, place):
     assert sol.stats["steps"] < 15
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("depth", "count"), [(0.0, 1), (1e-7, 1), (-1e-7, 1), (-1e-2, 0)])
 def test_function_that_touches_zero_to_the_tolerance_is_one_event(sign, depth, count):

@@ -61,6 +61,7 @@ def test_exported_program_equals_the_solve_for_the_example_and_other_inputs(prog
         assert int(found.stats["steps"]) == int(sol.stats["steps"])
 
 
+@pytest.mark.thorough
 def test_exported_program_runs_in_a_process_without_the_problem(program):
     """And traces none of its functions, since it has none."""
     code = f"""
@@ -80,6 +81,7 @@ print(json.dumps([found.xs[0].tolist(), found.xs[1].tolist(), found.us.tolist()]
     np.testing.assert_allclose(us, sol.us, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_gradient_of_an_exported_program_equals_that_of_the_solve(program):
     run = dvax.load_exported(program)
 
@@ -96,6 +98,7 @@ def test_gradient_of_an_exported_program_equals_that_of_the_solve(program):
     )
 
 
+@pytest.mark.thorough
 def test_failed_run_of_an_exported_program_is_nan_with_its_result(program):
     run = dvax.load_exported(program)
     found = run(t0=1.0, t1=0.0)
@@ -127,6 +130,7 @@ def test_wrong_input_of_an_exported_program_is_refused(program, name):
         dvax.load_exported(program)(**given)
 
 
+@pytest.mark.thorough
 def test_transformations_that_jax_does_not_export_are_refused(program):
     run = dvax.load_exported(program)
     with pytest.raises(dvax.InputError, match="jax.lax.map"):
@@ -166,6 +170,7 @@ def test_files_that_are_no_readable_programs_are_refused(program):
         elsewhere()
 
 
+@pytest.mark.thorough
 def test_options_and_code_that_a_program_cannot_have_are_refused():
     def told(t, x, u, args):
         if args:
@@ -207,6 +212,7 @@ def test_program_of_another_method_equals_its_solve(options):
     assert float(run(0.5, t1=1.5).xs[0]) == pytest.approx(float(want), rel=1e-6)
 
 
+@pytest.mark.thorough
 def test_events_of_an_exported_program_are_those_of_the_solve():
     problem = dvax.Problem(
         A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 9.0),

@@ -70,6 +70,7 @@ def test_etd4rk_is_more_accurate_than_etd2rk_over_moving_boundaries():
     assert all(f < 0.5 * s for f, s in zip(fourth, second, strict=True))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("method", "rtol"),
     [

@@ -104,6 +104,7 @@ def test_implicit_rejects_unsupported_options(asked, words):
         dvax.Implicit(diffrax.Tsit5())
 
 
+@pytest.mark.thorough
 def test_implicit_failures_have_messages():
     case = c1()
     run = lambda **how: dvax.solve(  # noqa: E731
@@ -123,6 +124,7 @@ def test_implicit_failures_have_messages():
     np.testing.assert_allclose(np.asarray(partial.xs), [0.25], atol=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("solver", [diffrax.Kvaerno5(), diffrax.KenCarp4()])
 def test_knots_outside_of_the_run_change_nothing(solver):
     # x' = −x + u + 0.1 (t > b), u = x + 0.3 throughout; no b lies inside of the run.

@@ -110,6 +110,7 @@ OFTEN = [
 ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("name", "method"), mostly_thorough(RUNS, OFTEN))
 def test_grazing_and_chattering_kinks_are_solved_to_the_tolerance(name, method):
     z, method = CURVES[name], METHODS[method]
@@ -123,6 +124,7 @@ def test_grazing_and_chattering_kinks_are_solved_to_the_tolerance(name, method):
     assert int(sol.stats["rejected"]) <= share * int(sol.stats["steps"])
 
 
+@pytest.mark.thorough
 def test_law_that_is_not_lipschitz_in_time_raises_solve_error():
     # Steeper and steeper towards t = 1: not Lipschitz in time, which the paper asks for.
     def z(t):
@@ -186,6 +188,7 @@ SETS = {
 }  # fmt: skip
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", mostly_thorough(SETS, ["ball"]))
 def test_kinks_are_located_for_every_kind_of_set(name):
     K, z = SETS[name]
@@ -247,6 +250,7 @@ def test_regimes_of_a_set_without_kinks_are_one():
     assert times.tolist() == [0.0, 2.0] and positive.shape == (1, 0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("options", [
     {"rtol": 1e-6}, {"dt": 0.05}, {"rtol": 1e-9, "method": dvax.ETD4RK(), "dt0": 0.01, "dt_max": 0.3},
     {"rtol": 1e-4, "method": dvax.PiecewiseLinear()},
@@ -262,6 +266,7 @@ def test_regimes_without_dense_are_those_with_it(options):
     assert positive.tolist() == signs.tolist() == [[True, False], [True, True], [False, True]]
 
 
+@pytest.mark.thorough
 def test_regimes_of_a_failed_run_end_where_it_ended():
     case = c1()
     run = lambda **more: dvax.solve(  # noqa: E731
@@ -273,6 +278,7 @@ def test_regimes_of_a_failed_run_end_where_it_ended():
     assert times[-1] == pytest.approx(float(stopped.stats["t"])) and times[-1] < 1.0
 
 
+@pytest.mark.thorough
 def test_regimes_follow_a_run_that_resets_its_state():
     case = c1()
     back = dvax.Event(lambda t, x, u, args: x - 1.0, reset=lambda t, x, u, args: -x, direction=1)
@@ -284,6 +290,7 @@ def test_regimes_follow_a_run_that_resets_its_state():
     assert len(times) > 4 and positive.tolist() == signs.tolist()
 
 
+@pytest.mark.thorough
 def test_regimes_require_steps_outside_of_jit_and_a_set_with_switches():
     with pytest.raises(dvax.InputError, match="implicit methods record no polynomials"):
         dvax.solve(driven(jnp.sin), 0.0, 0.0, 2.0, method=dvax.Implicit()).regimes()

@@ -17,6 +17,7 @@ def slope(counts, errors):
     return -np.polyfit(np.log(counts), np.log(errors), 1)[0]
 
 
+@pytest.mark.thorough
 @each_method
 def test_order_on_the_shrinking_ball(method, order, fewest):
     """The order is nominal while the state is outside the ball."""

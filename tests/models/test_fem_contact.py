@@ -59,6 +59,7 @@ def test_fem_contact_forces_converge_on_three_meshes(bodies):
     assert np.all(steps[1] < 0.2 * steps[0])
 
 
+@pytest.mark.thorough
 def test_fem_contact_of_a_stiff_surface_agrees_with_hertz(bodies):
     body = bodies[2]
     model = build(body, stiffness=1e4, pressure_cap=np.inf)

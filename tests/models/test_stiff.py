@@ -290,6 +290,7 @@ def test_circuits_of_any_kind_and_scale_agree_with_hundred_digit_arithmetic(seed
     np.testing.assert_allclose(us, ys, rtol=0, atol=1e-8 * size)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "seed", [1, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(2, 60) if s != 45)]
 )

@@ -23,6 +23,7 @@ def records():
     yield "walk", Accelerogram(0.02, 0.3 * white / np.abs(white).max())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", mostly_thorough(["waves", "pulse", "walk"], ["walk"]))
 def test_frame_cost_does_not_grow_for_small_viscosity(name):
     record = dict(records())[name]

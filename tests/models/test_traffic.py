@@ -215,6 +215,7 @@ def test_traffic_converges_to_the_equilibrium_and_conserves_trips(city, days):
         assert float(jnp.min(sol.xs)) >= 0.0
 
 
+@pytest.mark.thorough
 def test_traffic_trajectories_do_not_separate(city, days):
     apart = np.linalg.norm(np.asarray(days[0].xs) - np.asarray(days[1].xs), axis=1)
     tolerance = 40 * city.vi_solver.least
@@ -223,6 +224,7 @@ def test_traffic_trajectories_do_not_separate(city, days):
     assert float(c.growth_rate) == 0.0 == float(c.sharp_decay_rate) and float(c.L) == 1.0
 
 
+@pytest.mark.thorough
 def test_traffic_responses_are_within_their_certificate(city, days):
     # By a Newton method with dense matrices, which shares no code with the solver but link costs.
     costs = jax.tree_util.tree_map(np.asarray, city.link_costs)

@@ -132,6 +132,7 @@ def test_bound_error_of_a_run_in_pieces_equals_that_of_the_whole():
         np.testing.assert_allclose(pieces[name], whole[name], rtol=1e-10, err_msg=name)
 
 
+@pytest.mark.thorough
 def test_bound_of_pieces_with_one_semigroup_equals_that_of_the_whole():
     """M > 1 multiplies the integral over all pieces once."""
     case = ALL["C1"]()
@@ -191,6 +192,7 @@ def test_bound_error_with_constants_below_the_proved_ones_is_declared():
         assert status(replaced(case.constants, **smaller)) == "declared"
 
 
+@pytest.mark.thorough
 def test_bound_error_of_the_response_ignores_the_constants_given_to_solve():
     # A nonmonotone weight: the law is solved by iteration, so that its error is more than rounding.
     case = ALL["C4"]()
@@ -377,6 +379,7 @@ REGIONS = [
 BETWEEN = [(name, *case) for name in ("steps of ETD2RK", "windows of Picard") for case in REGIONS]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "region", "good"), mostly_thorough(BETWEEN, [BETWEEN[0], BETWEEN[3]])
 )
@@ -404,6 +407,7 @@ def test_bound_error_detects_leaving_the_region_between_saved_times(name, region
     assert 1.3 < float(high[1]) < 1.7 and float(low[1]) > -0.1 and float(high[0]) < 0.1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("bound", [1.2, 2.0])
 def test_certified_tol_fails_if_the_trajectory_leaves_the_region(bound):
     problem = excursion()

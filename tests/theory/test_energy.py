@@ -34,6 +34,7 @@ def sheared(n, m, seed, pointwise):
 SIZES = [(2, 2, True), (3, 2, False), (5, 3, True)]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("n", "m", "pointwise"), mostly_thorough(SIZES, {(2, 2, True)}))
 def test_energy_norm_bounds_the_distance_of_trajectories(n, m, pointwise):
     rng = np.random.default_rng(9)
@@ -70,6 +71,7 @@ def test_energy_norm_proves_decay_where_moduli_give_growth():
     assert names["energy_rate"].value > 0
 
 
+@pytest.mark.thorough
 def test_energy_norm_growth_is_at_most_that_of_the_space_norm():
     for name in ("C1", "C2", "C3"):
         case = ALL[name]()

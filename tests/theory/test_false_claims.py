@@ -46,6 +46,7 @@ def test_verify_bounds_the_response_of_a_coupled_law_as_a_whole():
     assert mu >= max(rates) - 1e-6
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("K", "h"),
     [
@@ -100,6 +101,7 @@ def test_verify_with_a_declared_spectrum_is_not_proved():
     assert float(found.gamma) == pytest.approx(0.45, rel=1e-6)
 
 
+@pytest.mark.thorough
 def test_verify_of_a_weighted_law_with_a_declared_spectrum_is_declared():
     h = lambda t, x, u, a: u - (2.0 + jnp.sin(x[0])) * (u - 0.1 * jnp.tanh(u))  # noqa: E731
     for declared, P in enumerate(
@@ -158,6 +160,7 @@ def test_verify_does_not_mistake_a_slope_at_a_late_time_for_a_jump(begin, slope)
     assert check["ass:time_regularity (ii)"].status == "proved"
 
 
+@pytest.mark.thorough
 def test_certified_tol_rejects_constants_of_a_region_that_the_run_leaves():
     grows = problem(
         A=dvax.generators.Scalar(0.0), K=dvax.sets.Box(-10.0, 10.0),
@@ -184,6 +187,7 @@ def test_parameter_bounds_in_a_region_are_declared():
     assert bounds.status == "declared"
 
 
+@pytest.mark.thorough
 def test_bound_error_of_a_single_precision_run_accepts_double_constants():
     short = problem(K=dvax.sets.Box(jnp.float32(0.0), jnp.float32(1.0)))
     c = dvax.verify(short, jnp.zeros(2, jnp.float32)).constants
@@ -227,6 +231,7 @@ def test_parameter_bounds_measure_radii_from_the_origin():
             dvax.parameter_bounds(system, 0.0, 0.01, 1.0, start_radius=radius)
 
 
+@pytest.mark.thorough
 def test_parameter_bounds_do_not_hold_outside_their_box():
     system = problem(
         K=dvax.sets.Box(0.0, 0.5), f=lambda t, x, u, a: a**3 - 0.5 * x - u,

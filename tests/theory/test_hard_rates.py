@@ -45,6 +45,7 @@ def integral(rate, breaks, t):
     return sum(quad(one, a, b, limit=200)[0] for a, b in itertools.pairwise(edges))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "method"),
     mostly_thorough(
@@ -143,6 +144,7 @@ def test_enclosure_of_a_root_that_stays_zero_is_finite():
     assert float(adaptive.xs[-1]) == pytest.approx(1.0 - np.exp(-1.0), abs=1e-6)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("upper", "response"),
     [

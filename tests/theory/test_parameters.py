@@ -132,6 +132,7 @@ def contact(eta):
     )
 
 
+@pytest.mark.thorough
 def test_parameter_bounds_hold_for_pairs_of_trajectories():
     low, high = jnp.array([2.5, 0.4, 0.8, 1.5]), jnp.array([3.5, 0.6, 1.2, 2.5])
     problem = contact(None)

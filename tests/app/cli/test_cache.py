@@ -52,6 +52,7 @@ def test_a_folder_that_cannot_be_made_means_no_cache(tmp_path: Path) -> None:
     assert run(XDG_CACHE_HOME=str(blocked)) == "False False"
 
 
+@pytest.mark.thorough
 def test_the_cache_can_be_switched_off(tmp_path: Path) -> None:
     off = run(XDG_CACHE_HOME=str(tmp_path), JAX_ENABLE_COMPILATION_CACHE="false")
     assert off == "True False"

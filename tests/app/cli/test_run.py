@@ -102,6 +102,7 @@ def stand_in(status: str, code: int, directory: Path) -> Callable[..., driver.Ru
     return run
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("status", "code"), [("failed", 3), ("interrupted", 130)])
 def test_failed_run_prints_the_reason_and_keeps_its_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, status: str, code: int

@@ -41,6 +41,7 @@ def test_report_of_a_large_run_has_a_limited_size(large: Path) -> None:
     assert "a cell gathers up to 56 points and 2 frames" in page.read_text(encoding="utf-8")
 
 
+@pytest.mark.thorough
 def test_report_pictures_have_nonblank_png_files(large: Path) -> None:
     assert stills(large) == PICTURES
     for file in (large / "figures").glob("*.png"):
