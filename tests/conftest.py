@@ -28,7 +28,7 @@ gc.set_threshold(100_000, 50, 50)
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("MPLBACKEND", "Agg")
-# `make thorough` tests what users run, and more of it in its time, so that both of these are left out.
+# `make thorough` tests what users run, and more of it in its time.
 if os.environ.get("HYPOTHESIS_PROFILE") != "thorough":
     # XLA's older emitters compile in two thirds of the time, and LLVM without optimisation in a fifth
     # less. XLA_FLAGS= make test does without.
@@ -38,9 +38,11 @@ if os.environ.get("HYPOTHESIS_PROFILE") != "thorough":
         flags.append("--xla_cpu_use_fusion_emitters=false")
     os.environ.setdefault("XLA_FLAGS", " ".join(flags))
 
-    # Every annotation of the library is checked at each call. The hook must stand
-    # before the first import of dvax, hence here and not in a fixture. The application is left out: it
-    # promises an answer to input of any type, and a checker would answer first.
+if os.environ.get("DVAX_CHECK_ANNOTATIONS"):
+    # Every annotation of the library is checked at each call, which takes a fifth of a test's time.
+    # Continuous integration does so on the newest Python. The hook must stand before the first import
+    # of dvax, hence here and not in a fixture. The application is left out: it promises an answer to
+    # input of any type, and a checker would answer first.
     application = {"__init__", "app"}
     jaxtyping.install_import_hook(
         [

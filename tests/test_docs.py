@@ -19,7 +19,7 @@ def named(page: Path) -> str:
     return page.relative_to(DOCS).as_posix()
 
 
-SHORT = ["index.md", "start.md", "certificates.md", "results.md", "models/own-problem.md"]
+SHORT = ["index.md", "results.md", "models/own-problem.md"]
 """Pages whose examples `make test` runs; the others run in `make thorough` and on the newest Python."""
 
 

@@ -79,6 +79,7 @@ def test_error_stays_below_the_tolerance_where_errors_decay(method, rate, tol):
     assert np.all(found < 1.0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("growth", mostly_thorough([0.5, 1.0, 2.0, 4.0], [2.0]))
 @pytest.mark.parametrize("rate", mostly_thorough([10.0, 1e2, 1e3], [1e2]))

@@ -156,6 +156,7 @@ def test_bouncing_ball_has_the_events_of_the_closed_form():
     assert sol.events.of("impact").ts.shape == (3,)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("adjoint", "jacobian"),
     [

@@ -73,7 +73,6 @@ def lanes(method, dt):
     return {name: jnp.array([lane[name] for lane in every]) for name in WELL}
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("method", "dt", "adjoint"),
     mostly_thorough(
@@ -150,6 +149,7 @@ FAILURES = [(kind, None) for kind in KINDS]
 FAILURES += [(kind, 0.05) for kind in ("law without solution", "not a number")]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("kind", "dt"), mostly_thorough(FAILURES, [("not a number", None)]))
 @pytest.mark.parametrize("method", mostly_thorough([None, "ETD2RK", "ExpRosenbrock"], [None]))
 @pytest.mark.parametrize("name", mostly_thorough([*DERIVATIVES], ["grad"]))
@@ -188,6 +188,7 @@ def test_a_failed_run_raises_inside_a_derivative_and_is_nan_inside_jit(kind, dt,
         ).all()
 
 
+@pytest.mark.thorough
 def test_stability_changes_the_method_inside_a_derivative():
     # Van der Pol's oscillator on its slow branch, where x' = −x/(μ(1 − x²)).
     problem = dvax.Problem(

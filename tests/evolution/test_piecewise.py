@@ -42,6 +42,7 @@ def test_piecewise_contact_with_a_spring_of_any_stiffness_is_exact(stiffness):
     assert float(x) == pytest.approx(level + (2.0 - level) * left, rel=1e-13)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", mostly_thorough(range(6), [0]))
 def test_piecewise_random_systems_agree_with_matrix_exponentials(seed):
     rng = np.random.default_rng(seed)
@@ -218,6 +219,7 @@ def test_piecewise_locates_jumps_and_reports_nan_data():
     assert float(sol.us[0]) == pytest.approx(1.0)
 
 
+@pytest.mark.thorough
 def test_piecewise_forcing_with_a_thousand_periods_is_resolved():
     problem = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-9.0, 9.0),

@@ -51,6 +51,7 @@ def usual():
     return {name: way(3.0) for name, (way, _) in WAYS.items()}
 
 
+@pytest.mark.thorough
 def test_plain_programs_give_the_same_solutions_and_derivatives(usual, monkeypatch):
     by(monkeypatch, _jax._plain)
     for name, (way, apart) in WAYS.items():

@@ -42,6 +42,7 @@ def test_responses_solve_the_law_at_the_saved_states_and_are_computed_once():
     assert sol.us is sol.us and sol.responses() is sol.responses()
 
 
+@pytest.mark.thorough
 def test_responses_of_a_copy_or_of_a_solution_that_left_a_transformation_are_the_same():
     """A batch that left `equinox.filter_vmap` has its axis in front."""
     x0s, numbers = jnp.array([-1.0, 0.2]), jnp.array([1.0, 2.0])
@@ -57,6 +58,7 @@ def test_responses_of_a_copy_or_of_a_solution_that_left_a_transformation_are_the
             np.testing.assert_allclose(a, b, atol=1e-8)
 
 
+@pytest.mark.thorough
 def test_responses_of_a_problem_made_in_a_transformation_are_available_outside():
     """h closes over a number that is traced, which the solution takes along."""
 
@@ -78,6 +80,7 @@ def test_responses_first_read_inside_a_compiled_function_are_constants_and_kept(
     np.testing.assert_allclose(sol.us, law(sol.xs), atol=1e-8)
 
 
+@pytest.mark.thorough
 def test_responses_read_in_two_traces_do_not_mix():
     """Of a solution that is traced: a value from inside of a branch is not used outside of it."""
 
@@ -90,6 +93,7 @@ def test_responses_read_in_two_traces_do_not_mix():
     assert float(jax.jit(total)(-1.0)) == pytest.approx(2 * us.sum(), rel=1e-8)
 
 
+@pytest.mark.thorough
 def test_derivatives_of_responses_agree_in_both_modes_and_with_differences():
     def total(v, adjoint):
         sol = dvax.solve(cubic(), v[0], 0.0, 2.0, v[1], TS, rtol=1e-10, adjoint=adjoint)
@@ -103,6 +107,7 @@ def test_derivatives_of_responses_agree_in_both_modes_and_with_differences():
     np.testing.assert_allclose(reverse, forward, rtol=1e-8)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("iterated", "ts"), [(False, None), (True, [0.5, 1.0])])
 def test_response_without_a_value_at_one_saved_time_is_a_failure_of_the_run(iterated, ts):
     """h is 0/0 at t = 1 alone, where no step looks."""
@@ -129,6 +134,7 @@ class _Lost(dvax.vi.AbstractSolver):
         return answer._replace(y=jnp.where(lost, jnp.nan, answer.y))
 
 
+@pytest.mark.thorough
 def test_response_that_the_solver_does_not_find_raises_when_it_is_read():
     """And is NaN with NaN derivatives where it is traced."""
     options = dict(ts=TS, vi_solver=_Lost(), dt=0.3)

@@ -114,6 +114,7 @@ PEAKS = [
 ]  # fmt: skip
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("T", "z", "published", "opensees"), mostly_thorough(PEAKS, PEAKS[:1]))
 def test_frame_elastic_peaks_agree_with_the_published_table(el_centro, T, z, published, opensees):
     record = Accelerogram(STEP, el_centro)

@@ -68,6 +68,7 @@ def made_at(market, t, p):
     return np.clip((firms @ high - c) / a, 0.0, cap)
 
 
+@pytest.mark.thorough
 @needs_data
 def test_market_hourly_equilibria_of_rts_gmlc(rts):
     assert len(rts.names) == 102 and rts.capacity.shape == (8784, 102)

@@ -201,6 +201,7 @@ def test_verify_proves_a_pseudomonotone_law_with_zero_slope():
     assert check.constants is not None and float(check.constants.gamma) == pytest.approx(1.0)
 
 
+@pytest.mark.thorough
 def test_certified_tol_checks_the_region_between_saved_times():
     """For x = sin t, which exceeds 0.6 for a while, constants up to 0.6 do not hold then."""
     k = lambda x: 12 * jnp.tanh(5 * jnp.maximum(jnp.abs(x) - 0.6, 0.0))  # noqa: E731

@@ -78,6 +78,7 @@ def ratios(name, method, certify=True):
     return found
 
 
+@pytest.mark.thorough
 def test_certificates_are_above_the_true_error():
     # Steps chosen for the bound leave errors below rounding at the two smallest tolerances.
     assert len(ratios("C3", "ETD4RK")) >= len(TOLERANCES["ETD4RK"]) - 2

@@ -62,6 +62,7 @@ def dvax(folder: Path, *words: str) -> subprocess.CompletedProcess:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True)
 
 
+@pytest.mark.thorough
 def test_new_ready_model_is_one_file(tmp_path: Path) -> None:
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / "decay.py").write_text(MODEL, encoding="utf-8")

@@ -191,6 +191,7 @@ main()
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("stage", "command", "number"),
     mostly_thorough(

@@ -233,6 +233,7 @@ def solved(folder: Path, text: str, **files: str):
         return outcome, data.load()
 
 
+@pytest.mark.thorough
 def test_a_room_follows_the_heat_balance_of_scipy(tmp_path):
     outcome, data = solved(tmp_path, ROOM)
     outdoor = lambda t: np.interp(t, [0, 12, 24], [-5, 8, 2])  # noqa: E731

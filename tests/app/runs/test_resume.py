@@ -219,6 +219,7 @@ REFUSED = ("config.resolved.toml", "inputs")
 """Without these there is no run to go on with."""
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("harm", mostly_thorough(["flip", "truncate"], ["flip"]))
 def test_a_damaged_file_is_named_and_not_used(folder, part, tmp_path, harm):
     rng, whole = random.Random(3), results(folder / "whole")
