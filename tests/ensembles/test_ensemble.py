@@ -134,7 +134,7 @@ def test_members_that_fail_leave_the_others_alone():
     np.testing.assert_allclose(found.values[good], 1.0 / (1.0 - a[good]), rtol=1e-5)
     assert np.isnan(found.values[found.failed]).all()
     np.testing.assert_allclose(found.ts[1], 0.5, atol=1e-3)
-    np.testing.assert_allclose(found.mean, found.values[good].mean(), rtol=1e-14)
+    np.testing.assert_allclose(found.mean, found.values[good].mean(), rtol=1e-14, atol=1e-16)
     np.testing.assert_allclose(found.std, found.values[good].std(ddof=1), rtol=1e-12)
     np.testing.assert_allclose(found.quantile(0.5), np.median(found.values[good]))
     told = found.failures()
@@ -176,7 +176,7 @@ def test_moments_of_pieces_are_those_of_all(cut):
         part = Moments.of({k: v[piece] for k, v in rows.items()}, valid[piece])
         found, begin = part if found is None else found.merge(part), begin + count
     for name, row in rows.items():
-        np.testing.assert_allclose(found.mean[name], row[valid].mean(0), rtol=1e-14)
+        np.testing.assert_allclose(found.mean[name], row[valid].mean(0), rtol=1e-14, atol=1e-16)
         deviation = found.standard_deviation()[name]
         np.testing.assert_allclose(deviation, row[valid].std(0, ddof=1), rtol=1e-10)
 

@@ -231,7 +231,8 @@ def _estimates(c: Constants, t0: Any, ts: Any, defects: tuple, initial: tuple) -
     total, completed = (disturbance(c, *parts) for parts in defects)
     rates = _rates(c, initial)
     found = [gronwall(t0, ts, total, completed, rate, M, error) for M, rate, error in rates]
-    return found, jnp.stack([x / M for x, (M, *_) in zip(found, rates, strict=True)], axis=1)
+    parts = [x / jnp.asarray(M, x.dtype) for x, (M, *_) in zip(found, rates, strict=True)]
+    return found, jnp.stack(parts, axis=1)
 
 
 @jax.jit
