@@ -83,17 +83,25 @@ def _few_programs():
     more is ended by a segmentation fault within the compiler. A whole run comes close; the long checks
     also to the memory of a machine."""
     yield
-    if next(_TESTS) % _SO_MANY == 0 and _MAPPED.exists():
-        with _MAPPED.open() as lines:
-            mappings = sum(1 for _ in lines)
-        resident = int(_PAGES.read_text().split()[1])
-        if mappings > _AT_MOST or resident > _MOST_PAGES:
+    if next(_TESTS) % _SO_MANY == 0:
+        if _is_near_a_limit():
+            gc.unfreeze()
             jax.clear_caches()
             gc.collect()
             # glibc keeps what was freed. The memory would stay near the limit, so that every 25th
             # test dropped all programs, for five seconds and the time to compile them again.
             with contextlib.suppress(AttributeError):
                 ctypes.CDLL(None).malloc_trim(0)
+        # Programs stay: a search for garbage among them took up to ten seconds.
+        gc.freeze()
+
+
+def _is_near_a_limit() -> bool:
+    if not _MAPPED.exists():
+        return False
+    with _MAPPED.open() as lines:
+        mappings = sum(1 for _ in lines)
+    return mappings > _AT_MOST or int(_PAGES.read_text().split()[1]) > _MOST_PAGES
 
 
 @pytest.fixture
