@@ -12,7 +12,7 @@ from dvax.programs import DOMAINS
 ELSEWHERE = {
     # Operations that JAX does not list there, and those of releases other than this one.
     "bcoo_dot_general", "copy_p", "custom_vjp_call_jaxpr", "expand_dims", "optimization_barrier",
-    "scatter_add", "searchsorted", "split", "stack",
+    "scatter_add", "searchsorted", "split", "stack", "unstack",
 }  # fmt: skip
 
 

@@ -55,6 +55,7 @@ FUNCTIONS = {
     "cumulative": lambda t: jnp.cumsum(PROFILE * jnp.sin(t)),
     "written into": lambda t: jax.lax.dynamic_update_slice(PROFILE * t, jnp.sin(t)[None], (1,)),
     "taken apart": lambda t: jnp.split(jnp.sin(PROFILE * t), [1])[1],
+    "unpacked": lambda t: (lambda a, b, *rest: a * b - rest[0])(*jnp.sin(PROFILE * t)),
 }
 
 

@@ -51,6 +51,7 @@ FUNCTIONS = {
         lambda v: jnp.concatenate([p * v[0] for p in jnp.split(jnp.sin(v), [1])]),
         (-2.0, 2.0),
     ),
+    "unpacked": (lambda v: (lambda a, b, c: jnp.stack([a * b, jnp.sin(c), a]))(*v), (-2.0, 2.0)),
     "called": (lambda v: jax.jit(lambda w: w * jnp.tanh(w))(v), (-2.0, 2.0)),
 }
 

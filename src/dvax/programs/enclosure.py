@@ -565,7 +565,7 @@ _OF_FLOATS: dict[str, Rule] = {
     **same_for(STEPWISE, _stairs),
     **same_for(SMOOTH_NAMES, _smooth),
     **same_for({"add", "add_any", "sub"}, _sum),
-    "split": _split,
+    **same_for({"split", "unstack"}, _split),
     "mul": _product,
     "div": _quotient,
     "neg": _negative,

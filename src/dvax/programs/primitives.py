@@ -6,7 +6,7 @@ REARRANGING = frozenset({
 })  # fmt: skip
 """Each entry of the result is an entry of the argument, at a position independent of values."""
 
-JOINING = frozenset({"concatenate", "stack", "split"})
+JOINING = frozenset({"concatenate", "stack", "split", "unstack"})
 """The same for several arguments or results."""
 
 SUMMING = frozenset({"reduce_sum", "cumsum"})

@@ -117,6 +117,15 @@ def _split(eqn: Any, operands: list[Any]) -> list[Slope]:
     return pieces
 
 
+def _unstack(eqn: Any, operands: list[Any]) -> list[Slope]:
+    """Return the rows along an axis. From JAX 0.12 on, `x, v = state` is this operation."""
+    axis, rows = eqn.params["axis"], []
+    for k in range(len(eqn.outvars)):
+        take = lambda eqn, extra, v, k=k: np.take(v[0], k, axis=extra + axis)  # noqa: E731
+        rows.append(_linear(take)(eqn, operands))
+    return rows
+
+
 def _indexed(eqn: Any, operands: list[Any]) -> Slope | None:
     """Return the slope of an operation that is linear in its first argument, with constant indices in
     the others: apply it to each column of the derivatives."""
@@ -230,6 +239,7 @@ STRUCTURAL: dict[str, Rule] = {
     "concatenate": _linear(_concatenate),
     "stack": _linear(_stack),
     "split": _split,
+    "unstack": _unstack,
     **same_for({"gather", "dynamic_slice", "cumsum"}, _indexed),
     "reduce_max": _reduce_max,
     "reduce_min": _reduce_min,
