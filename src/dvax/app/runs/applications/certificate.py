@@ -52,8 +52,9 @@ class Certificate(NamedTuple):
 def certificate(
     problem: Problem, solution: Solution, constants: Constants, before: Certificate | None = None
 ) -> Certificate:
-    """Return `dvax.bound_error`, plus the roundoff of all steps, which that bound excludes and which
-    dominates where a solve is exact; `before`: of the piece whose last state the solution starts from.
+    """Return `dvax.bound_error`, plus the roundoff of all steps, which `PiecewiseLinear` does not count
+    in its defect and which dominates where a solve is exact; `before`: of the piece whose last state
+    the solution starts from.
     """
     if isinstance(solution.setup.method, Implicit):
         # Implicit methods keep no polynomials of their steps, of which a defect could be measured.
