@@ -44,24 +44,16 @@ class RTS(NamedTuple):
     - `capacity`: what each can make, a row an hour; `load`, MW by hour; `start`, the first hour.
 
     ```python
-    >>> import pathlib, tempfile
-    >>> from dvax.formats import read_rts
-    >>> folder = pathlib.Path(tempfile.mkdtemp())
-    >>> _ = (folder / "gen.csv").write_text('''
-    ... GEN UID,Bus ID,Unit Type,Fuel,PMax MW,Fuel Price $/MMBTU,HR_incr_1,HR_incr_2,HR_incr_3
-    ... 101_CC_1,101,CC,NG,300,4.0,7000,7200,7500
-    ... 102_WIND_1,102,WIND,Wind,150,0,0,0,0
-    ... 102_PV_1,102,PV,Solar,80,0,0,0,0
-    ... '''.lstrip())
-    >>> series = {"regional_Load": "1", "wind": "102_WIND_1", "pv": "102_PV_1"}
-    >>> for name, column in series.items():
-    ...     rows = [f"2021,3,14,{k},{3 * k}" for k in range(1, 25)]
-    ...     _ = (folder / f"DAY_AHEAD_{name}.csv").write_text(
-    ...         chr(10).join([f"Year,Month,Day,Period,{column}", *rows])
-    ...     )
-    >>> rts = read_rts(folder)
-    >>> rts.names, rts.cost.tolist(), rts.load[:2].tolist()
-    (('101_CC_1', '102_WIND_1', '102_PV_1'), [28.0, 0.0, 0.0], [3.0, 6.0])
+    >>> import datetime
+    >>> import numpy as np
+    >>> from dvax.formats import RTS
+    >>> rts = RTS(
+    ...     names=("101_CC_1",), area=np.array([1]), cost=np.array([28.0]), slope=np.array([0.01]),
+    ...     capacity=np.full((2, 1), 300.0), load=np.array([120.0, 150.0]),
+    ...     start=datetime.datetime(2021, 3, 14),
+    ... )
+    >>> float(rts.cost[0] + rts.slope[0] * rts.load[1])        # the marginal cost at 150 MW
+    29.5
 
     ```
     """
