@@ -38,19 +38,9 @@ class Flows(NamedTuple):
     """Known flows: `volume` and `cost`, one of each a link, in the order of the network.
 
     ```python
-    >>> import pathlib, tempfile
-    >>> from dvax.formats import Network, read_flows
-    >>> roads = Network(
-    ...     zones=2, nodes=2, first_thru_node=1, init_node=[1, 2], term_node=[2, 1],
-    ...     capacity=[9.0, 9.0], length=[1.0, 1.0], free_flow_time=[5.0, 5.0], b=[0.15, 0.15],
-    ...     power=[4.0, 4.0],
-    ... )
-    >>> file = pathlib.Path(tempfile.mkdtemp()) / "roads.tntp"
-    >>> _ = file.write_text('''From To Volume Capacity Cost
-    ... 1 2 6.0 9.0 5.2
-    ... 2 1 3.0 9.0 5.0
-    ... ''')
-    >>> flows = read_flows(file, roads)
+    >>> import numpy as np
+    >>> from dvax.formats import Flows
+    >>> flows = Flows(volume=np.array([6.0, 3.0]), cost=np.array([5.2, 5.0]))
     >>> float(flows.volume @ flows.cost)                            # the total travel time
     46.2
 
