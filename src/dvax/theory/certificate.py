@@ -48,8 +48,8 @@ class Bound(eqx.Module):
       are proved, that M, ω and ‖P⁻¹‖ are at least those implied by the structure of A and P, and that
       the defect is enclosed over every step. "estimated" means that the defect was sampled.
 
-    The roundoff of t, of u and of every step is included, for propagators and functions f, h and K
-    that are computed with relative errors of a few ε; for `PiecewiseLinear`, that of t and u alone.
+    The roundoff of every step, of t and of u is included, for propagators and functions f, h and K
+    that are computed with relative errors of a few ε.
 
     ```python
     >>> import dvax

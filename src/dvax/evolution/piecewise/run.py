@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from .. import meter
+from ..defect import ROUNDINGS
 from . import radau
 from .inputs import Piece, basis, is_continuous, values
 from .lengths import length_past, lengthen, shorten, two_sum
@@ -347,6 +348,7 @@ class Run:
         self.accepted += 1
         if step.used > 0.0:
             size, of_y, of_w = attempt.sizes(step.used)
+            self.defect += ROUNDINGS * np.finfo(float).eps * self._norm(size)
             self.largest = np.maximum(self.largest, [of_y, of_w])
             # The error is zero at the start of the step; Markov's inequality bounds its growth.
             self.truncation = min(1.0, _MARKOV * step.used) * attempt.truncation
