@@ -16,7 +16,7 @@ export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-times lint types thorough bench format docs lock clean
+.PHONY: help setup demo test test-times lint types thorough bench format docs installed lock clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1@/p' Makefile | awk -F@ '{ printf "%-17s %s\n", $$1, $$2 }'
@@ -82,6 +82,9 @@ docs: $(READY) ## the documentation as a site in ./site, with all examples of th
 	$(PY) -m sphinx --builder html --nitpicky --fail-on-warning --keep-going --quiet \
 	    --doctree-dir build/doctrees docs site
 	$(PY) -m docs.extensions.check_site site
+
+installed: $(READY) ## wheel and sdist by name from a local index, on each Python 3.11 to 3.14 of the PATH
+	$(PY) -m pytest -m thorough -rs tests/test_installation.py
 
 lock: ## pin the newest releases that fit pyproject.toml (needs uv)
 	uv pip compile pyproject.toml --extra app --extra dev --universal --python-version 3.11 \

@@ -1,6 +1,7 @@
-"""The installed package: a complete wheel, a core without extras, a fast command line."""
+"""The package: a complete wheel, its requirements, a fast command line."""
 
 import email
+import importlib.metadata
 import itertools
 import os
 import re
@@ -8,11 +9,12 @@ import subprocess
 import sys
 import time
 import tomllib
-import venv
 import zipfile
 from pathlib import Path
 
 import pytest
+
+import dvax
 
 ROOT = Path(__file__).parents[1]
 
@@ -117,8 +119,46 @@ def test_library_imports_its_declared_dependencies():
         assert re.search(rf"^\s*(import|from) {name}\b", code, re.MULTILINE), name
 
 
-def test_citation_has_the_current_version(wheel: Path):
-    assert f"\nversion: {version(wheel)}\n" in (ROOT / "CITATION.cff").read_text()
+def test_version_is_that_of_the_installed_package():
+    assert dvax.__version__ == importlib.metadata.version("dvax")
+    # Release, development version or none: what PEP 440 can order.
+    assert re.match(r"\d+\.\d+", dvax.__version__)
+
+
+def test_citation_has_the_version_of_the_newest_release():
+    """A release has a heading `## [1.2.3] - 2027-01-31` in the changelog."""
+    releases = re.findall(r"^## \[(\d[^\]]*)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    cited = re.findall(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    assert cited == releases[:1]
+
+
+def test_conda_recipe_has_the_requirements_of_the_package():
+    """Conda packages have no extras: the recipe has those of the command line too."""
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    project = declared["project"]
+    recipe = (ROOT / "packaging" / "conda" / "recipe.yaml").read_text()
+    parts = re.findall(r"^  (host|run|run_constraints):\n((?:    - .+\n)+)", recipe, re.MULTILINE)
+    found = {part: {line.strip()[2:] for line in lines.splitlines()} for part, lines in parts}
+    apart = {"python ${{ python_min }}.*", "python >=${{ python_min }}", "pip"}
+
+    def spelled(needs):
+        return {re.sub("([<>])", r" \1", need, count=1).replace("flatbuffers", "python-flatbuffers")
+                for need in needs}  # fmt: skip
+
+    extras = project["optional-dependencies"]
+    assert found["host"] - apart == spelled(declared["build-system"]["requires"])
+    assert found["run"] - apart == spelled([*project["dependencies"], *extras["app"]])
+    optional = [need for name in ("energy", "export", "fem", "parquet") for need in extras[name]]
+    assert found["run_constraints"] == spelled(optional)
+    assert f'python_min: "{project["requires-python"].removeprefix(">=")}"' in recipe
+
+
+def test_page_on_data_lists_every_file_of_data():
+    done = run("git", "ls-files", cwd=ROOT)
+    code = {"", *".py .md .toml .yaml .cff .txt .css .js .html .typed .rst .lock".split()}
+    data = {name for name in done.stdout.split() if Path(name).suffix not in code}
+    page = (ROOT / "docs" / "contributors" / "data.md").read_text()
+    assert data == set(re.findall(r"^\| `([^`]+)`", page, re.MULTILINE))
 
 
 def test_lock_file_contains_only_versions():
@@ -166,32 +206,3 @@ def test_help_takes_less_than_a_second():
         took.append(time.perf_counter() - start)
     print(f"dvax --help: best of five {min(took):.2f} s")
     assert min(took) < 1.0
-
-
-@pytest.mark.thorough
-def test_wheel_works_without_extras(wheel: Path, tmp_path: Path):
-    place = tmp_path / "clean"
-    venv.create(place, with_pip=True)
-    python = place / "bin" / "python"
-    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    run(python, "-m", "pip", "install", "--quiet", wheel, cwd=tmp_path, env=environment)
-    code = """
-import jax
-jax.config.update("jax_enable_x64", True)
-import dvax
-problem = dvax.Problem(
-    A=dvax.generators.Scalar(-1.0),
-    P=dvax.operators.Scaling(1.0),
-    K=dvax.sets.Box(0.0, 0.5),
-    f=lambda t, x, u, args: 3.0 - 0.5 * x - u,
-    h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
-)
-solution = dvax.solve(problem, -1.0, 0.0, 2.0, rtol=1e-10, atol=1e-10)
-print(dvax.__file__, float(solution.xs[-1]))
-"""
-    where, value = run(python, "-c", code, cwd=tmp_path, env=environment).stdout.split()
-    assert Path(where).is_relative_to(place)
-    # The closed form: saturated until t1 = ln(8/5)/(3/2), active for 2 ln(10/9), then unloaded.
-    assert abs(float(value) - 1.8360919559905713) < 1e-8
-    missing = "import dvax\ntry:\n    import rich\nexcept ModuleNotFoundError:\n    print('absent')"
-    assert run(python, "-c", missing, cwd=tmp_path, env=environment).stdout.strip() == "absent"

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from . import signals as signals
     from . import spaces as spaces
     from . import vi as vi
+    from ._version import __version__ as __version__
     from .ensembles import Ensemble as Ensemble
     from .ensembles import Fold as Fold
     from .ensembles import ensemble as ensemble
@@ -54,8 +55,6 @@ if TYPE_CHECKING:
     from .theory import verify as verify
     from .vi import solve_vi as solve_vi
 
-__version__ = "0.1.0"
-
 _MODULES = (
     "formats",
     "generators",
@@ -68,6 +67,7 @@ _MODULES = (
     "vi",
 )
 _HOMES = {
+    "_version": ("__version__",),
     "ensembles": ("Ensemble", "Fold", "ensemble"),
     "errors": ("DifferentiationError", "DvaxError", "InputError", "SolveError"),
     "evolution": (
@@ -101,5 +101,4 @@ _HOMES = {
     ),
     "vi": ("solve_vi",),
 }
-_ALL, __getattr__, __dir__ = lazy_names(__name__, _HOMES, _MODULES)
-__all__ = [*_ALL, "__version__"]  # pyright: ignore[reportUnsupportedDunderAll]
+__all__, __getattr__, __dir__ = lazy_names(__name__, _HOMES, _MODULES)

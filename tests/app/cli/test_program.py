@@ -62,6 +62,19 @@ def test_python_m_dvax_is_the_command_line() -> None:
     assert done.stdout == f"dvax {__version__}\n"
 
 
+def test_shell_completes_commands() -> None:
+    asked = {"_DVAX_COMPLETE": "complete_bash", "COMP_WORDS": "dvax re", "COMP_CWORD": "1"}
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; sys.argv = ['dvax']; import dvax.app.cli as c; c.main()",
+    ]
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=os.environ | asked, check=True
+    )
+    assert done.stdout.split() == ["resume", "report"]
+
+
 @pytest.mark.parametrize("arguments", [["nonsense"], ["run"], ["run", "a.toml"], ["report", "--x"]])
 def test_wrong_usage_has_the_exit_code_of_bad_input(arguments: list[str]) -> None:
     result = CliRunner().invoke(app, arguments)

@@ -17,7 +17,6 @@ from dvax.app.cli.sweep import sweep
 app = typer.Typer(
     name="dvax",
     no_args_is_help=True,
-    add_completion=False,
     # Tracebacks are Python's own, for defects and with --debug; user errors have none.
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
