@@ -16,6 +16,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "dvax"
 FLOORS = {
     "errors": -2,
     "_lazy": -2,
+    "_version": -2,
     "_files": -2,
     "_tree": -1,
     "_batch": -1,
