@@ -1,4 +1,4 @@
-"""`python -m benchmarks [--full] [--only NAME ...] [--save]`, from the root of the repository."""
+"""`python -m benchmarks [--full] [--only NAME ...] [--save [FILE]]`, from the repository's root."""
 
 import argparse
 import dataclasses
@@ -18,10 +18,6 @@ from .layout import as_text, verdicts
 from .section import Section, Target
 
 _RESULTS = Path(__file__).with_name("results")
-_READING = (
-    "Times are medians of samples taken in turn, after compilation; ratios are formed round by\n"
-    "round. benchmarks/README.md says how to read the tables."
-)
 
 
 def main() -> None:
@@ -51,7 +47,18 @@ def main() -> None:
     print(f"\nTargets\n-------\n{verdicts(sections)}")
     print(f"\n{facts['seconds']} s; load afterwards: {facts['load after']}")
     if options.save:
-        print(f"Saved as {_save(facts, sections, loads)}")
+        names = [name for name in CASES if not options.only or name in options.only]
+        content = {
+            "date": datetime.datetime.now().isoformat(timespec="seconds"),
+            "machine": facts,
+            "sections": [
+                {"name": name, "load": before, **_plain(section)}
+                for name, before, section in zip(names, loads, sections)
+            ],
+        }
+        options.save.parent.mkdir(exist_ok=True)
+        options.save.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", "utf-8")
+        print(f"Saved as {options.save}")
 
 
 def _options() -> argparse.Namespace:
@@ -60,25 +67,13 @@ def _options() -> argparse.Namespace:
     )
     parser.add_argument("--full", action="store_true", help="more rounds, longer runs, memory")
     parser.add_argument("--only", action="append", choices=CASES, help="this case (repeatable)")
-    parser.add_argument("--save", action="store_true", help=f"write {_RESULTS.name}/*.json too")
-    return parser.parse_args()
-
-
-def _save(facts: dict[str, str], sections: list[Section], loads: list[str]) -> Path:
-    """All figures as JSON, beside the facts about the machine."""
-    now = datetime.datetime.now()
     where = re.sub(r"\W+", "-", platform.node() or "machine").strip("-")
-    _RESULTS.mkdir(exist_ok=True)
-    file = _RESULTS / f"{now:%Y-%m-%dT%H%M}-{where}.json"
-    content = {
-        "date": now.isoformat(timespec="seconds"),
-        "machine": facts,
-        "sections": [
-            {"load": before, **_plain(section)} for before, section in zip(loads, sections)
-        ],
-    }
-    file.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-    return file.relative_to(machine.ROOT)
+    default = _RESULTS / f"{datetime.datetime.now():%Y-%m-%dT%H%M}-{where}.json"
+    parser.add_argument(
+        "--save", nargs="?", type=Path, const=default, metavar="FILE",
+        help=f"write all figures as JSON too ({_RESULTS.name}/DATE-MACHINE.json)",
+    )  # fmt: skip
+    return parser.parse_args()
 
 
 def _plain(thing: Any) -> Any:

@@ -1,7 +1,8 @@
 """The settings of the site (`make docs`). The build needs no network but the package index.
 
-The pages are Markdown (MyST). Four small extensions in docs/extensions/ do what no package does:
-docstrings in Markdown, formulas as MathML, a page for each public name, and the pictures of the pages.
+The pages are Markdown (MyST). Five small extensions in docs/extensions/ do what no package does:
+docstrings in Markdown, formulas as MathML, a page for each public name, the pictures of the pages, and
+tables of measured figures.
 """
 
 import os
@@ -45,6 +46,7 @@ extensions = [
     "docs.extensions.gallery",
     "docs.extensions.docstrings",
     "docs.extensions.figures",
+    "docs.extensions.measured",
     "docs.extensions.reference",
 ]
 root_doc = "index"

@@ -28,6 +28,7 @@ FLOORS = {
     "_user_code": 0,
     "_figure_text": -2,
     "_dataset": -0.5,
+    "_repr": -1,
     "spaces": 0,
     "generators": 0,
     "operators": 0,

@@ -10,6 +10,7 @@ import numpy as np
 
 from .. import _tree
 from .._dataset import Variable, dataset, described, over, required
+from .._repr import table, value_text
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..evolution import RESULTS, Solution
@@ -83,6 +84,14 @@ class Ensemble:
     moments: Moments
     folded: Mapping[str, Tree]
     again: Callable[[int], Solution] | None = dataclasses.field(repr=False, default=None)
+
+    def __repr__(self) -> str:
+        failed = int(self.failed.sum()) if _tree.is_concrete(self.failed) else "?"
+        shown = ("values", "mean", "std", "steps", "rejected")
+        return table(
+            f"Ensemble: {len(self)} members, {failed} failed",
+            [("method", self.method), *((name, value_text(getattr(self, name))) for name in shown)],
+        )
 
     def __len__(self) -> int:
         return len(self.failed)

@@ -12,6 +12,7 @@ import numpy as np
 from .. import _tree
 from .._dataset import Names, required
 from .._jax.traces import current_trace
+from .._repr import last_text, table, value_text
 from .._tree import Tree
 from ..errors import Fix, InputError, InputProblem, SolveError
 from .bounds import Bounds
@@ -106,6 +107,25 @@ class Solution(eqx.Module):
     enclosed: bool = eqx.field(static=True)
     plan: Plan | None = eqx.field(static=True)
     setup: Setup
+
+    def __repr__(self) -> str:
+        stats, spent = self.stats, {"compile_time": "compiling", "run_time": "running"}
+        seconds = [
+            f"{value_text(stats[k], 3)} s {doing}" for k, doing in spent.items() if k in stats
+        ]
+        return table(
+            f"Solution: {_message(self.result)}",
+            [
+                ("method", str(stats.get("method", type(self.setup.method).__name__))),
+                ("ts", value_text(self.ts)),
+                ("xs", value_text(self.xs)),
+                *((k, value_text(stats[k])) for k in ("steps", "rejected", "t") if k in stats),
+                ("time", ", ".join(seconds)),
+                ("defect", _defect_text(self)),
+                ("records", "" if self.records is None else "dense output: evaluate(t)"),
+                ("events", "" if self.events is None else "located: events"),
+            ],
+        )
 
     @property
     def us(self) -> Tree:
@@ -386,6 +406,23 @@ class Solution(eqx.Module):
             self, states, responses, time_unit=time_unit, bound=bound, title=title, backend=backend,
             axes=axes,
         )  # fmt: skip
+
+
+def _message(result: RESULTS) -> str:
+    """Return what a result says; of a batch or a traced one, that it is one."""
+    if not _tree.is_concrete(result):
+        return "a traced run"
+    failed = np.asarray(~is_success(result))
+    if failed.ndim == 0:
+        return str(RESULTS[result])
+    return f"{failed.size} runs, {int(failed.sum())} failed"
+
+
+def _defect_text(solution: Solution) -> str:
+    if solution.defect is None:
+        return ""
+    how = "enclosed over every step" if solution.enclosed else "sampled"
+    return f"{last_text(solution.defect)}, {how}"
 
 
 def _responses(solution: Solution) -> Responses:

@@ -25,6 +25,7 @@ import numpy as np
 
 from .. import _tree
 from .._dataset import Variable, dataset, described
+from .._repr import last_text, table, value_text
 from ..errors import InputError, InputProblem
 from ..evolution import Implicit, Solution, between, disturbance, gronwall, solve
 from ..evolution.control import MAX_GROWTH
@@ -76,6 +77,14 @@ class Bound(eqx.Module):
     u_sharp: jax.Array | None
     status: Status = eqx.field(static=True)
     integrals: jax.Array | None = None
+
+    def __repr__(self) -> str:
+        about = {"x": "‖x_h − x‖", "u": "‖u_h − u‖"}
+        rows = [
+            (f"{name}", f"≤ {last_text(getattr(self, name))} at the last time ({text})")
+            for name, text in about.items()
+        ]
+        return table(f"Bound: {self.status}", [("ts", value_text(self.ts)), *rows])
 
     def to_xarray(self, *, time_unit: str = "", x_unit: str = "", u_unit: str = "") -> Any:
         """Return the bounds as an `xarray.Dataset` over `time`: `error_bound_x`, `error_bound_u`, and

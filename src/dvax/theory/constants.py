@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
-from .. import _tree
+from .. import _repr, _tree
 from ..errors import InputError, InputProblem
 from .domain import Domain
 from .status import ORDER, Status, weakest
@@ -127,6 +127,17 @@ class Constants(eqx.Module):
         pairs: list[tuple[str, Status]] = [(n, given_statuses.get(n, "declared")) for n in present]
         self.statuses = tuple(pairs)
         self._check()
+
+    def __repr__(self) -> str:
+        optional = ("one_sided", "energy")
+        names = (*_PRIMARY, *(name for name in optional if getattr(self, name) is not None))
+        title = (
+            "Constants" if self.domain is None else "Constants for the times and states of `domain`"
+        )
+        return _repr.table(
+            title,
+            [(n, f"{_repr.value_text(getattr(self, n)):<14} {self.status_of(n)}") for n in names],
+        )
 
     @property
     def L(self) -> Any:

@@ -57,6 +57,10 @@ class Verification(NamedTuple):
     constants: Constants | None
     route: str
 
+    def __repr__(self) -> str:
+        parts = [f"Verification: {self.status}, route: {self.route}", self.table()]
+        return "\n".join([*parts, repr(self.constants)] if self.constants is not None else parts)
+
     def __getitem__(self, label: Any) -> Any:
         if not isinstance(label, str):
             return tuple(self)[label]
