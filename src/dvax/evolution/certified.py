@@ -199,7 +199,7 @@ def _roundoff(
     steps = int(solution.stats["steps"])
     factor = min(M * np.exp(min(max(c, 0.0) * (t1 - t0), 700.0)) for M, c in growth.rates)
     of_steps = ROUNDINGS * steps * size
-    return float(factor) * eps * of_steps, eps * 4.0 * max(abs(t0), abs(t1)) * rate
+    return float(factor) * eps * of_steps, ROUNDINGS * eps * max(abs(t0), abs(t1)) * rate
 
 
 def _interval_bounds(solution: Solution, growth: _Growth, t0: float) -> Any:
