@@ -113,8 +113,8 @@ def test_verify_of_a_weighted_law_with_a_declared_spectrum_is_declared():
         assert "F = aG" in row.why
 
 
-def test_verify_constants_hold_for_their_args_only():
-    f = lambda t, x, u, a: a["k"] * x - u  # noqa: E731
+def test_verify_constants_hold_for_their_args_and_times_only():
+    f = lambda t, x, u, a: a["k"] * x - u + jnp.sin(t)  # noqa: E731
     system = problem(f=f, K=dvax.sets.Box(-1.0, 1.0))
     one, other = {"k": jnp.asarray(1.0)}, {"k": jnp.asarray(3.0)}
     c = dvax.verify(system, 0.0, args=one).constants

@@ -257,3 +257,38 @@ def test_verify_does_not_refute_a_sharp_declared_modulus():
     )
     row = dvax.verify(large, declared={"alpha_f": 1.0})["ass:f_lipschitz"]
     assert row.status == "declared", row.why
+
+
+def autonomous(**data):
+    parts = dict(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+        f=lambda t, x, u, args: 3.0 - 0.5 * x - u, h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+    )  # fmt: skip
+    return dvax.Problem(**(parts | data))
+
+
+def test_constants_of_an_autonomous_problem_hold_at_all_times():
+    for data in ({}, {"K": lambda t, args: dvax.sets.Box(0.0, 0.5)}):
+        problem = autonomous(**data)
+        check = dvax.verify(problem, -1.0)  # on [0, 1]
+        sol = dvax.solve(problem, -1.0, 5.0, 25.0, method=dvax.ETD2RK())
+        assert dvax.bound_error(problem, sol, check.constants).status == "proved"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        {"f": lambda t, x, u, args: jnp.sin(t) - 0.5 * x - u},
+        # Zero at the state and the time that are tried.
+        {"f": lambda t, x, u, args: 3.0 - 0.5 * x - u + t * (x + 1.0)},
+        {"h": lambda t, x, u, args: 1.0 - 2.0 * x - u + jnp.maximum(t - 2.0, 0.0)},
+        {"h": lambda t, x, u, args: jnp.where(t < 2.0, 1.0, 3.0) - 2.0 * x - u},
+        {"K": lambda t, args: dvax.sets.Box(0.0, 0.5 + 0.1 * t)},
+    ],
+)
+def test_constants_of_data_that_depend_on_time_hold_in_their_interval(data):
+    problem = autonomous(**data)
+    check = dvax.verify(problem, -1.0)
+    assert check.constants.domain.t1 == 1.0
+    later = dvax.solve(problem, -1.0, 0.0, 3.0, method=dvax.ETD2RK())
+    assert dvax.bound_error(problem, later, check.constants).status != "proved"

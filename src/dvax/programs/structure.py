@@ -96,6 +96,25 @@ def independent(fn: Callable[..., Tree], *args: Tree) -> bool:
     return all(out.degree == 0 for out in _read(program, inputs))
 
 
+def independent_of_first(fn: Callable[..., Tree], first: Tree, *others: Tree) -> bool:
+    """Return whether the code of `fn` proves that fn(first, *others) does not depend on `first`,
+    whatever the others are.
+
+    ```python
+    >>> from dvax.programs.structure import independent_of_first
+    >>> independent_of_first(lambda t, x: 2.0 * x, 0.0, 1.0)
+    True
+    >>> independent_of_first(lambda t, x: t * x, 0.0, 0.0)
+    False
+
+    ```
+    """
+    program = jax.make_jaxpr(fn)(first, *others)
+    count = len(jtu.tree_leaves(first))
+    inputs = [_Dependence(int(i < count), None, False) for i in range(len(program.jaxpr.invars))]
+    return all(out.degree == 0 for out in _read(program, inputs))
+
+
 def _read(program: Any, inputs: list[_Dependence]) -> list[_Dependence]:
     return list(map(_lift, interpret(program, inputs, _DOMAIN)))
 

@@ -16,8 +16,8 @@ from ..spaces import AbstractSpace
 class Domain(eqx.Module):
     """The set of times, parameters, states and responses for which constants hold.
 
-    They hold for t0 ≤ t ≤ t1 and one value of `args`. `x` and `u` are entrywise bounds (low, high);
-    None means any x, and any u in P⁻¹K(t).
+    They hold for t0 ≤ t ≤ t1 (−∞ and ∞ if f, h and K do not depend on t) and one value of `args`.
+    `x` and `u` are entrywise bounds (low, high); None means any x, and any u in P⁻¹K(t).
     """
 
     t0: float

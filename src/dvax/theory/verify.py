@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -13,6 +14,8 @@ from ..errors import InputError, InputProblem
 from ..evolution.nonfinite import refuse_nonfinite_data
 from ..problem import Problem
 from ..programs.slope import Slope, SlopeEnclosure, TooLarge, interval, is_slope
+from ..programs.structure import independent_of_first
+from ..sets import AbstractSet
 from .assumptions import Assumption, assumptions
 from .certificate import is_declared
 from .constants import Constants
@@ -115,6 +118,8 @@ def verify(
     solutions there.) `declared`: moduli by name, or `dvax.Constants`. `energy`: search for a norm
     in which trajectories contract, for affine data of up to 40 unknowns (needs `dvax[energy]`).
 
+    If f, h and K do not depend on t, the constants hold at all times, whatever t0 and t1 are.
+
     The problem is not solved, and an assumption that fails is not an error: the result reports it.
 
     **Returns:** a `Verification`. **Raises:** `dvax.InputError` if the data do not fit together, or a
@@ -152,9 +157,28 @@ def verify(
     moduli = modulus_statuses(system, region, box, _declared(declared))
     statuses = tuple(assumptions(system, region, K, knots, moduli))
     # P⁻¹K(t) contains every response, so the domain only needs the bounds given by the caller.
+    if knots.size == 0 and _is_autonomous(system, t0):
+        time = interval(-np.inf, np.inf)
     domain = domain_of(time, None if x is None else states, None if u is None else given_u, args)
     constants = constants_of(system, region, moduli, domain, energy)
     return Verification(statuses, constants, _route(system, moduli))
+
+
+def _is_autonomous(system: System, t: float) -> bool:
+    """Return whether the code of f, h and K proves that none of them depends on t."""
+    problem, args = system.problem, system.args
+
+    def set_data(t: Any) -> list[Any]:
+        constant = isinstance(problem.K, AbstractSet)
+        return [] if constant else jtu.tree_leaves(problem.set_at(t, args))
+
+    def data(t: Any, x: Any, u: Any) -> Any:
+        return problem.f(t, x, u, args), problem.h(t, x, u, args), set_data(t)
+
+    # A function in a set may use t, which its code does not show.
+    if not all(map(eqx.is_array_like, set_data(jnp.asarray(t)))):
+        return False
+    return independent_of_first(data, jnp.asarray(t), system.x0, system.u0)
 
 
 def _route(system: System, moduli: ModulusStatuses) -> str:
