@@ -78,6 +78,21 @@ def test_ensemble_is_shown_with_mean_and_failures():
     assert f"{float(found.mean):.7g}" in repr(found)
 
 
+def test_events_are_shown_with_times_and_names():
+    half = dvax.Event(lambda t, x, u, load: x - 0.5, name="half")
+    other = dvax.Event(lambda t, x, u, load: x)
+    shown = repr(solve(3.0, events=[half, other]).events).splitlines()
+    assert shown[0] == "Events: 2"
+    assert shown[1].endswith("events[1]") and shown[2].endswith("half")
+    shape = eqx.filter_eval_shape(lambda load: solve(load, events=[half]).events, 3.0)
+    assert repr(shape).startswith("Events: a trace or a batch")
+
+
+def test_parameter_bounds_are_shown_with_their_numbers():
+    shown = repr(dvax.parameter_bounds(problem(), 2.9, 3.1, -1.0, t1=2.0))
+    assert shown.startswith("ParameterBounds: proved") and "C_f0       3.1" in shown
+
+
 @pytest.mark.parametrize(
     ("value", "text"),
     [

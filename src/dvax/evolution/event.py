@@ -6,9 +6,12 @@ from typing import Any
 import equinox as eqx
 import jax
 
+from .._repr import is_known, table, value_text
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from .dataset import events_dataset
+
+_MAX_SHOWN = 10
 
 
 class Event(eqx.Module):
@@ -105,6 +108,17 @@ class Events(eqx.Module):
     xs: Tree
     xs_after: Tree
     names: tuple[str | None, ...] = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        if not is_known(self.index) or self.index.ndim != 1:
+            rows = [("ts", value_text(self.ts)), ("index", value_text(self.index))]
+            return table("Events: a trace or a batch", rows)
+        happened = [(float(t), int(k)) for t, k in zip(self.ts, self.index, strict=True) if k >= 0]
+        rows = [(f"t = {t:.10g}", self.names[k] or f"events[{k}]") for t, k in happened]
+        more = (
+            [(f"… {len(rows) - _MAX_SHOWN} more", "to_xarray()")] if len(rows) > _MAX_SHOWN else []
+        )
+        return table(f"Events: {len(rows)}", rows[:_MAX_SHOWN] + more)
 
     def of(self, name: str) -> "Events":
         """Return the events of this name, of a solve that is not traced.

@@ -7,6 +7,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from .._repr import table, value_text
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from .constants import Constants
@@ -104,6 +105,11 @@ class ParameterBounds(eqx.Module):
                 )  # fmt: skip
         if problems:
             raise InputError(*problems)
+
+    def __repr__(self) -> str:
+        names = ("T", "kappa_K", "C_h0", "C_f0", "modulus_f", "modulus_h")
+        rows = [(name, value_text(getattr(self, name))) for name in names]
+        return f"{table(f'ParameterBounds: {self.status}', rows)}\n{self.constants!r}"
 
     @property
     def status(self) -> Status:
