@@ -9,6 +9,7 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from equinox import is_array_like
 from jax import lax
 
 from .errors import InputError, InputProblem
@@ -96,6 +97,17 @@ def same_shape(a: Tree, b: Tree) -> bool:
         return False
     pairs = zip(jtu.tree_leaves(a), jtu.tree_leaves(b), strict=True)
     return all(jnp.shape(p) == jnp.shape(q) for p, q in pairs)
+
+
+def same_values(a: Tree, b: Tree) -> bool:
+    """Return whether two trees have the same structure and equal leaves; False for traced leaves."""
+    (leaves, structure), (others, other) = jtu.tree_flatten(a), jtu.tree_flatten(b)
+    if structure != other or not is_concrete(leaves, others):
+        return False
+    return all(
+        one is two or (is_array_like(one) and is_array_like(two) and np.array_equal(one, two))
+        for one, two in zip(leaves, others, strict=True)
+    )
 
 
 def fits(name: str, given: Any, like: Tree, what: str) -> None:

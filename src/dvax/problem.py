@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -38,6 +38,21 @@ class FrozenOperator:
     def __call__(self, y: Tree) -> Tree:
         u = self.P.inverse(y)
         return _tree.sub(u, self.h(self.t, self.x, u, self.args))
+
+
+class Knots(NamedTuple):
+    """The knots of data, as vectors of times, and the intervals that the data cover."""
+
+    listed: list[Any]
+    spans: list[tuple[Any, Any, str, str]]
+
+    def within(self, t0: Any, t1: Any) -> Any:
+        """Return the sorted knots in (t0, t1).
+
+        **Raises:** `dvax.InputError` if some data do not cover [t0, t1].
+        """
+        _check_spans(self.spans, t0, t1)
+        return _knots.merge(self.listed, t0, t1) if self.listed else np.zeros(0)
 
 
 class Problem(eqx.Module):
@@ -303,6 +318,10 @@ class Problem(eqx.Module):
 
         **Raises:** `dvax.InputError` if some data do not cover [t0, t1].
         """
+        return self.data_knots(t0, x, args).within(t0, t1)
+
+    def data_knots(self, t0: Any, x: Tree, args: Any = None) -> "Knots":
+        """Return the knots of all data, and the intervals that they cover, for states shaped like x."""
         u, evaluations, reports = self.zero_control(x), self._evaluations(args), {}
 
         def traced_knots(t: Any, x: Tree, u: Tree) -> list[Any]:
@@ -320,14 +339,11 @@ class Problem(eqx.Module):
                 f"{name} is evaluated at a time other than t itself (shifted, scaled, or inside "
                 "another jit), so its knots in t are unknown and a step may pass one. Shift "
                 "its times instead, or wrap it as dvax.signals.Function(fn, knots=...).",
-                stacklevel=4,
+                stacklevel=5,
             )
-        _check_spans([(*span, name) for name in reports for span in reports[name].spans], t0, t1)
+        spans = [(*span, name) for name in reports for span in reports[name].spans]
         signal_knots = (knots for report in reports.values() for knots in report.knots)
-        listed = [*filter(_tree.is_concrete, signal_knots), *switches]
-        if not listed:
-            return np.zeros(0)
-        return _knots.merge(listed, t0, t1)
+        return Knots([*filter(_tree.is_concrete, signal_knots), *switches], spans)
 
     def check_data(self, t0: Any, t1: Any, x: Tree, args: Any = None) -> None:
         """Evaluate K, f and h at (t0, x) with concrete values, to check the data that they create.

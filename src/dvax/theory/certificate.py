@@ -30,6 +30,7 @@ from ..errors import InputError, InputProblem
 from ..evolution import Implicit, Solution, between, disturbance, gronwall, solve
 from ..evolution.control import MAX_GROWTH
 from ..evolution.defect import ROUNDINGS
+from ..evolution.setup import as_arrays
 from ..generators import AbstractGenerator, AbstractMatrixFree, Product
 from ..problem import Problem
 from .constants import Constants
@@ -175,14 +176,14 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
     if sol.defect is None or (regional and sol.bounds is None):
         measured = _solve_again(problem, sol, constants)
         distance = jax.vmap(lambda a, b: space.norm(_tree.sub(a, b)))(measured.xs, sol.xs)
-    of_x, of_u = _roundoff(problem, sol)
+    args, t0 = as_arrays(sol.setup.args), jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
+    of_x, of_u = _roundoff(problem, args, t0, sol.setup.x0, sol.ts, sol.xs, sol.us)
     distance = distance + of_x
     assert measured.defect is not None and measured.law_defect is not None
     assert measured.completed_defect is not None
 
     defects = (measured.defect, measured.law_defect), measured.completed_defect
     law = sol.law_residual, sol.law_step, of_u
-    t0 = jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
     estimates, integrals = _estimates(constants, t0, sol.ts, defects, initial)
     x, u, x_sharp, u_sharp = _bounds(constants, estimates, distance, law)
     best_x = x if x_sharp is None else jnp.minimum(x, x_sharp)
@@ -216,21 +217,22 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
 
 
 @eqx.filter_jit
-def _roundoff(problem: Problem, sol: Solution) -> tuple[jax.Array, jax.Array]:
+def _roundoff(
+    problem: Problem, args: Any, t0: Any, x0: Any, ts: Any, xs: Any, us: Any
+) -> tuple[jax.Array, jax.Array]:
     """Return, for each saved time, how far x moves within a few roundings of t, and the roundoff of u.
 
     The roundoff of the steps is part of their defect.
     """
-    args, t0 = sol.setup.args, jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
-    generator, (state, control) = problem.generator(args), problem.spaces(sol.setup.x0)
+    generator, (state, control) = problem.generator(args), problem.spaces(x0)
 
     def sizes(t: Any, x: Any, u: Any) -> tuple[Any, Any]:
         rate = _tree.add(generator.apply(x), problem.f(t, x, u, args))
         return state.norm(rate), control.norm(u)
 
-    speed, size = jax.vmap(sizes)(sol.ts, sol.xs, sol.us)
-    largest = jnp.maximum(jnp.abs(t0), jnp.abs(sol.ts))
-    unit = ROUNDINGS * jnp.finfo(sol.ts.dtype).eps
+    speed, size = jax.vmap(sizes)(ts, xs, us)
+    largest = jnp.maximum(jnp.abs(t0), jnp.abs(ts))
+    unit = ROUNDINGS * jnp.finfo(ts.dtype).eps
     return unit * largest * speed, unit * size
 
 

@@ -1,14 +1,19 @@
 """Solve a problem by `PiecewiseLinear`, from `Setup` to `Solution`."""
 
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ... import _tree
+from ..._once import once_per_object
 from ...errors import DifferentiationError
+from ...operators import AbstractOperator
+from ...problem import Knots, Problem
 from ...spaces import AbstractSpace
 from ..bounds import Bounds
 from ..responses import Responses
@@ -56,19 +61,16 @@ def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
     setup_start = time.perf_counter()
     problem, x0, args = setup.problem, jnp.asarray(setup.x0), as_arrays(setup.args)
     t0, t1, rtol, atol = (float(setup.setting[name]) for name in ("t0", "t1", "rtol", "atol"))
-    problem.check(t0, x0, args)
-    knots = np.asarray(problem.knots(t0, t1, x0, args), float)
-    stops = np.concatenate([[t0], knots, [t1]])
-    system = affine(problem, t0, x0, args)
-    state, control = problem.spaces(x0)
-    weights = np.asarray(jax.vmap(lambda v: state.norm(v.reshape(x0.shape)))(jnp.eye(x0.size)))
+    data = _data(problem, t0, x0, args)
+    system, spaces = data.system, problem.spaces(x0)
+    stops = np.concatenate([[t0], np.asarray(data.knots.within(t0, t1), float), [t1]])
     times = np.array([t1]) if ts is None else np.asarray(ts, float)
     try:
         pieces = build_pieces(problem, stops, x0, args, limits.max_steps)
     except UnresolvedInput as error:
         placeholder = [Piece(t0, t1 - t0, np.zeros((1, 1)), np.zeros(1), np.zeros(1))]
         run = Run(
-            system, system, placeholder, np.asarray(x0, float).ravel(), weights, (rtol, atol),
+            system, system, placeholder, np.asarray(x0, float).ravel(), data.weights, (rtol, atol),
             *_run_options(limits, times),
         )  # fmt: skip
         run.t, run.result = error.t, error.result
@@ -77,7 +79,7 @@ def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
         setup_end = time.perf_counter()
     else:
         run = Run(
-            system, pivoted(system), pieces, np.asarray(x0, float).ravel(), weights, (rtol, atol),
+            system, data.pivoted, pieces, np.asarray(x0, float).ravel(), data.weights, (rtol, atol),
             *_run_options(limits, times),
         )  # fmt: skip
         setup_end = time.perf_counter()
@@ -86,7 +88,49 @@ def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
         "compile_time": setup_end - setup_start,
         "run_time": time.perf_counter() - setup_end,
     }
-    return _solution(setup, x0, run, system, (state, control), limits, timing)
+    return _solution(setup, x0, run, system, spaces, limits, timing)
+
+
+class _Data(NamedTuple):
+    """What a run needs of a problem, and the arguments that it belongs to; `weights`: the norms of the
+    unit vectors of the state space."""
+
+    like: tuple[Any, ...]
+    args: Any
+    knots: Knots
+    system: Affine
+    pivoted: Affine
+    weights: Array
+
+    def serves(self, x0: jax.Array, args: Any) -> bool:
+        return self.like == (x0.shape, x0.dtype) and _tree.same_values(self.args, args)
+
+
+_kept: Callable[[Problem], list[_Data]] = once_per_object(lambda problem: [])
+"""The data of the last run of each problem: a run in pieces traces its functions once."""
+
+
+def _data(problem: Problem, t0: float, x0: jax.Array, args: Any) -> _Data:
+    """Return the data of a run. **Raises:** `dvax.InputError`, as `propagate` does."""
+    kept = _kept(problem)
+    if not (kept and kept[0].serves(x0, args)):
+        problem.check(t0, x0, args)
+        knots, system = problem.data_knots(t0, x0, args), affine(problem, t0, x0, args)
+        units = jnp.eye(x0.size).reshape(-1, *x0.shape)
+        weights = np.asarray(_norms(problem.spaces(x0)[0], units))
+        like = x0.shape, x0.dtype
+        kept[:] = [_Data(like, args, knots, system, pivoted(system), weights)]
+    return kept[0]
+
+
+@eqx.filter_jit
+def _norms(space: AbstractSpace, rows: jax.Array) -> jax.Array:
+    return jax.vmap(space.norm)(rows)
+
+
+@eqx.filter_jit
+def _inverses(operator: AbstractOperator, rows: jax.Array) -> jax.Array:
+    return jax.vmap(operator.inverse)(rows)
 
 
 def _run_options(limits: Limits, times: Array) -> tuple[int, Array, bool, bool, bool]:
@@ -109,7 +153,7 @@ def _solution(
     tau = 1.0 / max(float(np.linalg.norm(system.M, 2)), np.finfo(float).tiny)
     # One projection step as in `dvax.vi.certificate`, simplified for affine F.
     projection_step = ys - np.clip(ys - tau * w, system.low, system.up)
-    size = lambda v: jax.vmap(spaces[1].norm)(array(v, u0.shape))  # noqa: E731
+    size = lambda v: _norms(spaces[1], array(v, u0.shape))  # noqa: E731
     residual, step = (
         size(projection_step / tau - projection_step @ system.M.T),
         size(projection_step),
@@ -124,7 +168,7 @@ def _solution(
     return Solution(
         ts=array([r.t for r in rows], ()),
         xs=array([r.x for r in rows], x0.shape),
-        law=Responses(jax.vmap(P.inverse)(y) if rows else y, y, residual, step, error),
+        law=Responses(_inverses(P, y) if rows else y, y, residual, step, error),
         defect=array(defects[:, 0], ()),
         law_defect=array(defects[:, 1], ()),
         completed_defect=(array(completed_defect[:, 0], ()), array(completed_defect[:, 1], ())),

@@ -1,0 +1,71 @@
+"""What is called again with other numbers compiles nothing."""
+
+import contextlib
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.once import once
+
+import dvax
+from dvax._jax.compile_clock import listen
+
+STAGES: list[str] = []
+listen(lambda stage, seconds: STAGES.append(stage))
+
+
+@contextlib.contextmanager
+def nothing_is(*stages):
+    STAGES.clear()
+    yield
+    assert not set(stages) & set(STAGES), STAGES
+
+
+@once
+def problem():
+    return dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+        f=lambda t, x, u, load: load - 0.5 * x - u,
+        h=lambda t, x, u, load: 1.0 - 2.0 * x - u,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("method", [None, dvax.ETD2RK()], ids=["default", "ETD2RK"])
+def test_second_solve_and_its_bound_compile_nothing(method):
+    check = dvax.verify(problem(), -1.0, 0.0, 2.0, 3.0)
+
+    def run(load):
+        sol = dvax.solve(problem(), -1.0, 0.0, 2.0, load, [1.0, 2.0], method=method)
+        return sol.us, dvax.bound_error(problem(), sol, check.constants).x
+
+    run(3.0)
+    with nothing_is("compile", "trace"):
+        run(2.5)
+
+
+def test_second_piecewise_linear_run_traces_nothing_and_starts_where_it_should():
+    switched = dvax.Problem(
+        A=dvax.generators.Dense(jnp.array([[0.0, 1.0], [-1.0, -0.2]])),
+        P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(jnp.zeros(1), jnp.full(1, 0.5)),
+        f=lambda t, x, u, load: jnp.concatenate([0.0 * u, jnp.sin(t) - load * u]),
+        h=lambda t, x, u, load: x[:1] - 0.5 * u, control_space=dvax.spaces.Euclidean((1,)),
+    )  # fmt: skip
+
+    def run(x0, t0, t1, load=2.0):
+        ts = np.linspace(t0, t1, 5)[1:]
+        return dvax.solve(
+            switched, x0, t0, t1, load, ts, method=dvax.PiecewiseLinear(), rtol=1e-10, atol=1e-12
+        )
+
+    x0 = jnp.array([0.1, 0.0])
+    first = run(x0, 0.0, 4.0)
+    middle = first.xs[-1]
+    with nothing_is("compile", "trace"):
+        second = run(middle, 4.0, 8.0)
+    whole = run(x0, 0.0, 8.0)
+    np.testing.assert_allclose(second.xs[-1], whole.xs[-1], atol=1e-9)
+    # Other arguments are not those that were kept.
+    other = run(x0, 0.0, 4.0, 1.0)
+    expected = dvax.solve(switched, x0, 0.0, 4.0, 1.0, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(other.xs[-1], expected.xs[-1], atol=1e-8)
+    assert not np.allclose(other.xs[-1], first.xs[-1], atol=1e-3)
