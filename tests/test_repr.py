@@ -64,6 +64,9 @@ def test_constants_verification_and_bound_are_shown_with_statuses():
     assert repr(check).startswith("Verification: proved, route: variational inequality")
     assert check.table() in repr(check)
     assert repr(bound).startswith("Bound: proved") and f"{float(bound.x[-1]):.3g}" in repr(bound)
+    region = dvax.verify(problem(), -1.0, 0.0, 2.0, 3.0, x=(-2.0, 1.0)).constants
+    left = repr(dvax.bound_error(problem(), sol, region))
+    assert "≤ ∞" in left and "region" in left
     # A verification without constants, and constants of a batch.
     assert "None" not in repr(check._replace(constants=None))
     batch = eqx.filter_vmap(lambda g: dvax.Constants(

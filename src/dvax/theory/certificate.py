@@ -25,7 +25,7 @@ import numpy as np
 
 from .. import _tree
 from .._dataset import Variable, dataset, described
-from .._repr import last_text, table, value_text
+from .._repr import is_known, last_text, table, value_text
 from ..errors import InputError, InputProblem
 from ..evolution import Implicit, Solution, between, disturbance, gronwall, solve
 from ..evolution.control import MAX_GROWTH
@@ -85,6 +85,9 @@ class Bound(eqx.Module):
             (f"{name}", f"≤ {last_text(getattr(self, name))} at the last time ({text})")
             for name, text in about.items()
         ]
+        if is_known(self.x) and np.isinf(np.asarray(self.x)).any():
+            why = "where ∞: the region of the constants may be left, or the growth overflows"
+            rows.append(("", why))
         return table(f"Bound: {self.status}", [("ts", value_text(self.ts)), *rows])
 
     def to_xarray(self, *, time_unit: str = "", x_unit: str = "", u_unit: str = "") -> Any:
