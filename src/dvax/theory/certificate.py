@@ -166,14 +166,14 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
     if sol.defect is None or (regional and sol.bounds is None):
         measured = _solve_again(problem, sol, constants)
         distance = jax.vmap(lambda a, b: space.norm(_tree.sub(a, b)))(measured.xs, sol.xs)
-    of_x, of_u = _roundoff(problem, sol)
+    t0 = jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
+    of_x, of_u = _roundoff(problem, sol.setup.x0, sol.setup.args, t0, (sol.ts, sol.xs, sol.us))
     distance = distance + of_x
     assert measured.defect is not None and measured.law_defect is not None
     assert measured.completed_defect is not None
 
     defects = (measured.defect, measured.law_defect), measured.completed_defect
     law = sol.law_residual, sol.law_step, of_u
-    t0 = jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
     estimates, integrals = _estimates(constants, t0, sol.ts, defects, initial)
     x, u, x_sharp, u_sharp = _bounds(constants, estimates, distance, law)
     best_x = x if x_sharp is None else jnp.minimum(x, x_sharp)
@@ -207,21 +207,25 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
 
 
 @eqx.filter_jit
-def _roundoff(problem: Problem, sol: Solution) -> tuple[jax.Array, jax.Array]:
-    """Return, for each saved time, how far x moves within a few roundings of t, and the roundoff of u.
+def _roundoff(
+    problem: Problem, x0: Any, args: Any, t0: jax.Array, rows: tuple[Any, Any, Any]
+) -> tuple[jax.Array, jax.Array]:
+    """Return, for each of the `rows` (t, x, u), how far x moves within a few roundings of t, and the
+    roundoff of u.
 
-    The roundoff of the steps is part of their defect.
+    The roundoff of the steps is part of their defect. A `Solution` as an argument would be compiled
+    anew at each call, since its statistics hold the seconds that the solve took.
     """
-    args, t0 = sol.setup.args, jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
-    generator, (state, control) = problem.generator(args), problem.spaces(sol.setup.x0)
+    generator, (state, control) = problem.generator(args), problem.spaces(x0)
 
     def sizes(t: Any, x: Any, u: Any) -> tuple[Any, Any]:
         rate = _tree.add(generator.apply(x), problem.f(t, x, u, args))
         return state.norm(rate), control.norm(u)
 
-    speed, size = jax.vmap(sizes)(sol.ts, sol.xs, sol.us)
-    largest = jnp.maximum(jnp.abs(t0), jnp.abs(sol.ts))
-    unit = ROUNDINGS * jnp.finfo(sol.ts.dtype).eps
+    speed, size = jax.vmap(sizes)(*rows)
+    ts = rows[0]
+    largest = jnp.maximum(jnp.abs(t0), jnp.abs(ts))
+    unit = ROUNDINGS * jnp.finfo(ts.dtype).eps
     return unit * largest * speed, unit * size
 
 
