@@ -4,6 +4,7 @@ By zarr and not by xarray, whose import (with pandas) takes longer than drawing 
 """
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -42,6 +43,13 @@ class Variable:
     def frames(self, which: slice | int) -> np.ndarray:
         """The values at some frames, which lie below `count`."""
         return np.asarray(self._array[which])
+
+    def with_values(self, values: np.ndarray) -> "Variable":
+        """Return the variable with other values of the same shape, in memory."""
+        found = copy(self)
+        found._array, found._count = values, None
+        found.__dict__["values"] = values  # in the place of those that were read
+        return found
 
     @property
     def points(self) -> int:
