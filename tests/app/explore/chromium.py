@@ -32,11 +32,13 @@ class Page:
         self.requests: list[str] = []
 
     def open(self, url: str, width: int, height: int = 900, dark: bool = False) -> None:
-        target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        attached = self.call("Target.attachToTarget", targetId=target, flatten=True)
-        self._session = attached["sessionId"]
-        for domain in ("Page", "Runtime", "Log", "Network"):
-            self.call(f"{domain}.enable")
+        if self._session is None:
+            target = self.call("Target.createTarget", url="about:blank")["targetId"]
+            attached = self.call("Target.attachToTarget", targetId=target, flatten=True)
+            self._session = attached["sessionId"]
+            for domain in ("Page", "Runtime", "Log", "Network"):
+                self.call(f"{domain}.enable")
+        self.wrong, self.requests = [], []
         self.call(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1,
             mobile=False,
@@ -53,7 +55,7 @@ class Page:
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
 
-    def wait_for(self, script: str, seconds: float = 90.0) -> Any:
+    def wait_for(self, script: str, seconds: float = 60.0) -> Any:
         """Wait until an expression is true, and return it."""
         end = time.monotonic() + seconds
         while not (found := self.value(script)):

@@ -1,15 +1,13 @@
 """A ready model, or a problem of one's own, with sliders for the numbers of its configuration.
 
-At each move the configuration is checked and run as by `dvax run`, into a folder that is removed
-afterwards. Programs that are compiled for one value serve the next, since `dvax.solve` takes the
-numbers of a problem as arguments. The derivative in a parameter is a difference quotient of two runs.
+At each move the configuration is checked and solved as by `dvax run`, but in fewer pieces, in memory.
+Programs that are compiled for one value serve the next where the numbers of a problem are arguments of
+them. The derivative in a parameter is a difference quotient of two runs.
 """
 
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -30,21 +28,24 @@ from dvax.app.explore.subject import (
     Values,
     value_text,
 )
-from dvax.app.plots.run_reader import read_run
 from dvax.app.plots.store import Variable
 from dvax.app.plots.theme import unit_text
-from dvax.app.runs import driver
+from dvax.app.runs.applications.base import Figure
 from dvax.app.runs.applications.config import OWN, ModelConfig, check_config
+from dvax.app.runs.applications.segments import join_pieces, segment_length, segments
 from dvax.app.runs.toml_file import read_toml
-from dvax.errors import SolveError, input_error
+from dvax.errors import input_error
+from dvax.evolution import Solution
 
 _DIFFERENCE = 1e-3
 """The step of a difference quotient, relative to the value: large against tolerances of 1e-6."""
+_PARTS = 8
+"""The number of solves of a run. Between two of them it ends if there is a newer question."""
 
 
 @dataclass(frozen=True)
 class _Ran:
-    """A run. Its variables are in memory, since its folder is gone."""
+    """A run in memory."""
 
     variables: Mapping[str, Variable]
     drawings: list[Drawing]
@@ -119,19 +120,17 @@ class ModelSubject(AbstractSubject):
             self._tree(values), self.config.source, allow_outside=self._allow_outside, quiet=True,
             allow_code=True,
         )  # fmt: skip
-        with TemporaryDirectory(prefix="dvax-explore-") as folder:
-            outcome = driver.run(config, Path(folder) / "run", on_event=lambda event: check())
-            if outcome.status != "finished":
-                raise SolveError(outcome.stop_reason)
-            run = read_run(outcome.directory)
-            assert run.trajectory is not None
-            # All of it is read before the folder is removed.
-            variables = {n: v.with_values(v.values) for n, v in run.trajectory.variables.items()}
-            frames = run_drawings.frames(run, variables)
-            return _Ran(
-                variables, run_drawings.drawings(run), run_drawings.numbers(run),
-                run_drawings.certificate(run), frames, run.warnings,
-            )  # fmt: skip
+        with config.wording.in_keys():
+            variables, figures = _solved(config, check)
+        summary = {name: figure.to_json() for name, figure in figures.items()}
+        return _Ran(
+            variables,
+            run_drawings.of_variables(config.name, variables),
+            run_drawings.numbers(summary),
+            run_drawings.certificate(summary),
+            run_drawings.frames(variables),
+            config.model.notes(),
+        )
 
     def _slope(
         self, base: Values, key: str, check: Callable[[], None], wanted: bool
@@ -159,7 +158,9 @@ class ModelSubject(AbstractSubject):
         aim = question.values[key] if change else start + parameter.step(start)
         base = self._run(question.base, lambda: None).variables
         moved = {
-            name: v.with_values(v.values + (aim - start) * slope[name]) if name in slope else v
+            name: Variable.of(v.values + (aim - start) * slope[name], v.dims, v.attrs)
+            if name in slope
+            else v
             for name, v in base.items()
         }
         predicted = {d.key: d for d in run_drawings.of_variables(self.config.name, moved)}
@@ -169,11 +170,48 @@ class ModelSubject(AbstractSubject):
         return drawings, f"Dashed: {words} {unit}".rstrip() + ", by the difference quotient."
 
 
+def _solved(
+    config: ModelConfig, check: Callable[[], None]
+) -> tuple[dict[str, Variable], Mapping[str, Figure]]:
+    """Solve, and return the variables and the figures of a run.
+
+    **Raises:** `dvax.SolveError`, and what `check` raises between two pieces.
+    """
+    model = config.model
+    plan = model.plan(lambda words: check())
+    length = segment_length(plan, _PARTS)
+    pieces: list[Solution] = []
+    rows: list[Mapping[str, Any]] = []
+    end, bound = None, None
+    # A single time has no piece.
+    for piece in segments(plan, parts=_PARTS) if len(plan.times) > 1 else ():
+        check()
+        end = join_pieces([piece], length)
+        bound = model.bound(end, bound)
+        rows.append(model.rows(end, bound, len(piece.ts)))
+        pieces.append(piece)
+    if not rows:
+        rows.append(model.rows(None, None, 1))
+    series = {name: np.concatenate([row[name].values for row in rows]) for name in rows[0]}
+    whole = join_pieces(pieces, len(plan.times)) if model.whole and pieces else end
+    results = model.results(series, whole, "" if bound is None else bound.status)
+    variables = {
+        name: Variable.of(
+            np.asarray(series.get(name, v.values)), v.dims,
+            {"units": v.unit, "long_name": v.words, "status": v.status},
+        )
+        for name, v in {**rows[-1], **results.fixed}.items()
+    }  # fmt: skip
+    return variables, results.figures
+
+
 def _overlaid(drawing: Drawing, predicted: Drawing | None) -> Drawing:
     """Return a drawing with the curves of its prediction, where they differ from its own."""
     if predicted is None or len(predicted.data) != len(drawing.data):
         return drawing
     more: list[Any] = []
+    if drawing.key == "certificate":  # a bound on the error of one run
+        return drawing
     for own, other in zip(drawing.data, predicted.data, strict=True):
         if own.get("type") != "scatter" or own.get("mode") != "lines" or other.get("y") is None:
             continue

@@ -20,6 +20,8 @@ from dvax.app.plots.separation import separation_picture
 from dvax.app.plots.store import Variable
 from dvax.app.plots.theme import MUTED, PRESSURE_MAP, SERIES, quantity, unit_text
 
+Summary = Mapping[str, Mapping[str, Any]]
+"""The content of summary.json."""
 _SIDE = 256
 """The most cells of a map along each side."""
 _MOST = 4
@@ -49,18 +51,18 @@ def of_variables(model: str, variables: Mapping[str, Variable]) -> list[Drawing]
     return [of_picture(picture) for picture in application_pictures(model, variables)]
 
 
-def numbers(run: RunRecord) -> list[Number]:
+def numbers(summary: Summary) -> list[Number]:
     """Return the headline figures of a run."""
     return [
         Number(name.replace("_", " "), entry_text(entry), _unit(entry), str(entry.get("meaning", "")))
-        for name, entry in run.summary.items()
+        for name, entry in summary.items()
         if name != "status"
     ]  # fmt: skip
 
 
-def certificate(run: RunRecord) -> Certificate:
+def certificate(summary: Summary) -> Certificate:
     """Return what the summary of a run says about its error bounds."""
-    bounds = {name: e for name, e in run.summary.items() if name != "law_error" and e.get("bound")}
+    bounds = {name: e for name, e in summary.items() if name != "law_error" and e.get("bound")}
     sentences = tuple(
         f"{str(e['meaning'])[:1].upper()}{str(e['meaning'])[1:]}: {entry_text(e)} {_unit(e)}".rstrip()
         + "."
@@ -73,8 +75,11 @@ def certificate(run: RunRecord) -> Certificate:
     return Certificate(next((s for s in order if s in found), "estimated"), sentences)
 
 
-def frames(run: RunRecord, variables: Mapping[str, Variable]) -> AbstractFrames | None:
-    """Return the fields of a run at a saved time; None where its variables have none over time."""
+def frames(
+    variables: Mapping[str, Variable], shape: tuple[int, ...] | None = None
+) -> AbstractFrames | None:
+    """Return the fields of a run at a saved time; None where its variables have none over time.
+    `shape`: of the boundary of a contact law."""
     axis = next((name for name in _OF_TIME if name in variables), None)
     if axis is None:
         return None
@@ -85,7 +90,6 @@ def frames(run: RunRecord, variables: Mapping[str, Variable]) -> AbstractFrames 
     ]
     if not fields:
         return None
-    shape = run.boundary_shape if run.model == CONTACT else None
     return RunFrames(variables, axis, fields[:_MOST], shape)
 
 

@@ -4,9 +4,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 from dvax.app.explore import run_drawings
-from dvax.app.explore.subject import AbstractSubject, Answer, Drawing, Question, Values
+from dvax.app.explore.subject import (
+    AbstractFrames,
+    AbstractSubject,
+    Answer,
+    Drawing,
+    Question,
+    Values,
+)
 from dvax.app.plots.page import UNFINISHED
-from dvax.app.plots.run_reader import read_run
+from dvax.app.plots.run_reader import CONTACT, read_run
 from dvax.app.runs.resolved import NAME
 from dvax.errors import input_error
 
@@ -27,11 +34,18 @@ class SavedRun(AbstractSubject):
         run = self.run
         return Answer(
             run_drawings.drawings(run),
-            run_drawings.numbers(run),
-            run_drawings.certificate(run),
-            None if run.trajectory is None else run_drawings.frames(run, run.trajectory.variables),
+            run_drawings.numbers(run.summary),
+            run_drawings.certificate(run.summary),
+            self._frames(),
             notes=self._notes,
         )
+
+    def _frames(self) -> AbstractFrames | None:
+        run = self.run
+        if run.trajectory is None:
+            return None
+        shape = run.boundary_shape if run.model == CONTACT else None
+        return run_drawings.frames(run.trajectory.variables, shape)
 
     def stability_map(self, values: Values, across: str, upward: str) -> Drawing:
         raise input_error(
