@@ -16,6 +16,7 @@ import numpy as np
 
 from dvax._figure_text import entry_text
 from dvax.app.explore.contact_code import script
+from dvax.app.explore.contact_data import LETTERS, Data
 from dvax.app.explore.contact_drawings import ContactFrames, Fields, Prediction, drawings
 from dvax.app.explore.files import code_of_configuration, configuration_text
 from dvax.app.explore.recent import Recent
@@ -42,45 +43,15 @@ from dvax.app.runs.solver_options import settings
 from dvax.evolution import solve
 from dvax.evolution.rows import all_finite
 from dvax.models import Contact
-from dvax.signals import AbstractSignal, Constant, Product
 from dvax.theory import bound_error
 
 DEFAULT = Path(__file__).with_name("contact.toml")
 
-# Key: the letter of the paper, the meaning, and the kind of its unit.
-_LETTERS = {
-    "model.alpha": ("α", "relaxation rate", "rate"),
-    "model.beta": ("β", "pressure per reaction", "stiffness"),
-    "model.b_x": ("bₓ", "feedback of the indentation on the law", "number"),
-    "model.b_u": ("bᵤ", "feedback of the reaction on the law", "number"),
-    "model.d_x": ("dₓ", "feedback of the indentation on its rate", "rate"),
-    "model.d_u": ("dᵤ", "effect of the pressure on the rate", "rate"),
-    "model.kappa0": ("κ₀", "pressure capacity", "pressure"),
-}
 _FACTORS = {"demand.value": "factor of the demand g", "load.value": "factor of the load ℓ"}
 _HEADLINES = (
     "peak_pressure", "peak_pressure_time", "peak_force", "final_force", "peak_indentation",
     "peak_saturated_fraction", "peak_unloaded_fraction", "decay_rate", "sharp_decay_rate", "steps",
 )  # fmt: skip
-
-
-class Data(eqx.Module):
-    """What no slider moves: demand and load for the factor 1, the weights, and the initial state."""
-
-    demand: AbstractSignal
-    load: AbstractSignal
-    weights: jax.Array
-    x0: jax.Array
-
-    def model(self, values: Mapping[str, Any]) -> Contact:
-        """Return the contact law with these parameters."""
-        letters = {key.removeprefix("model."): values[key] for key in _LETTERS}
-        return Contact(
-            **letters,
-            g=Product(Constant(values["demand.value"]), self.demand),
-            ell=Product(Constant(values["load.value"]), self.load),
-            weights=self.weights,
-        )
 
 
 @dataclass(frozen=True)
@@ -257,7 +228,7 @@ def load_default() -> Config:
 
 @eqx.filter_jit
 def _slope(
-    values: Values,
+    values: Mapping[str, Any],
     direction: Mapping[str, Any],
     data: Data,
     times: Any,
@@ -266,7 +237,7 @@ def _slope(
 ) -> jax.Array:
     """Return the derivative of the pressure at all times in this direction of the parameters."""
 
-    def pressure(values: Values) -> Any:
+    def pressure(values: Mapping[str, Any]) -> Any:
         solution = solve(
             data.model(values).problem, data.x0, 0.0, end, None, times, adjoint="forward",
             horizon=end, **options,
@@ -291,7 +262,7 @@ def _key(values: Values) -> tuple[tuple[str, float], ...]:
 
 def _parameters(config: Config) -> tuple[Parameter, ...]:
     found = []
-    for key, (letter, words, kind) in _LETTERS.items():
+    for key, (letter, words, kind) in LETTERS.items():
         value = float(getattr(config.model, key.removeprefix("model.")))
         unit = config.units.of(kind)
         if value > 0:

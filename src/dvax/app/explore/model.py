@@ -120,6 +120,7 @@ class ModelSubject(AbstractSubject):
             self._tree(values), self.config.source, allow_outside=self._allow_outside, quiet=True,
             allow_code=True,
         )  # fmt: skip
+        assert isinstance(config, ModelConfig)  # the name of the model is that of before
         with config.wording.in_keys():
             variables, figures = _solved(config, check)
         summary = {name: figure.to_json() for name, figure in figures.items()}

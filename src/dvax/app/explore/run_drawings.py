@@ -24,7 +24,7 @@ Summary = Mapping[str, Mapping[str, Any]]
 """The content of summary.json."""
 _SIDE = 256
 """The most cells of a map along each side."""
-_MOST = 4
+_MAX_FIELDS = 4
 """The most fields that are drawn."""
 _OF_TIME = ("time", "hour", "day")
 """The names of the axis of saved times."""
@@ -90,7 +90,7 @@ def frames(
     ]
     if not fields:
         return None
-    return RunFrames(variables, axis, fields[:_MOST], shape)
+    return RunFrames(variables, axis, fields[:_MAX_FIELDS], shape)
 
 
 class RunFrames(AbstractFrames):

@@ -306,7 +306,7 @@ def _array(value: Any) -> Any:
     """Return an array as Plotly reads it: its numbers in base64."""
     if isinstance(value, np.ndarray):
         shape = {"shape": ",".join(map(str, value.shape))} if value.ndim > 1 else {}
-        data = base64.b64encode(np.ascontiguousarray(value)).decode()
+        data = base64.b64encode(value.tobytes()).decode()
         return {"dtype": value.dtype.str.lstrip("<|="), "bdata": data, **shape}
     if isinstance(value, np.generic):
         return value.item()

@@ -5,7 +5,7 @@ with the constants of the paper, α − d_x − d_u b_x/(1 + b_u). The observed 
 trajectories, −log(‖Δx(t)‖/‖Δx(0)‖)/t, at some points of the boundary.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,14 +13,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from dvax.app.explore.contact_data import Data
 from dvax.app.explore.drawing import POWERS, layout, single
 from dvax.app.explore.subject import Drawing, Parameter, Values
 from dvax.app.plots.theme import BLUE, INK, VERMILLION, axis_title
 from dvax.app.runs.settings import Config
 from dvax.evolution import ETD2RK, solve
-
-if TYPE_CHECKING:
-    from dvax.app.explore.contact import Data
 
 CELLS, POINTS, STEPS = 25, 12, 400
 _RATES = [[0.0, VERMILLION], [0.5, "#f4f4f2"], [1.0, BLUE.lower()]]
@@ -30,7 +28,7 @@ _FLOOR = 1e-9
 
 
 def plane(
-    data: "Data", companion_x0: np.ndarray, times: np.ndarray, config: Config, values: Values,
+    data: Data, companion_x0: np.ndarray, times: np.ndarray, config: Config, values: Values,
     axes: tuple[Parameter, Parameter],
 ) -> Drawing:  # fmt: skip
     """Return the map over the ranges of two parameters; the others have these values."""
@@ -92,12 +90,12 @@ def _boundary(x: Any, y: Any, rate: Any, name: str, dash: str) -> dict[str, Any]
     }  # fmt: skip
 
 
-def _some(data: "Data") -> np.ndarray:
+def _some(data: Data) -> np.ndarray:
     count = data.x0.shape[0]
     return np.unique(np.linspace(0, count - 1, min(count, POINTS)).astype(int))
 
 
-def _some_points(data: "Data", config: Config) -> "Data":
+def _some_points(data: Data, config: Config) -> Data:
     """Return the data at a few points: the law holds at each point by itself."""
     count, some = data.x0.shape[0], _some(data)
 
@@ -112,7 +110,7 @@ def _some_points(data: "Data", config: Config) -> "Data":
 @eqx.filter_jit
 def _rates(
     values: dict[str, jax.Array],
-    data: "Data",
+    data: Data,
     starts: jax.Array,
     times: Any,
     end: float,
