@@ -154,7 +154,8 @@ def test_contact_formula_in_factors_is_the_same_function(tmp_path: Path) -> None
 def test_contact_with_measured_data_exports_a_configuration_and_code_that_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config = load_config(write_config(tmp_path))
+    # Steps end at the saved times, as those of a run do.
+    config = load_config(write_config(tmp_path, ("frames = 8", "frames = 10")))
     subject = ContactSubject(config)
     values = values_of(subject, **{"model.b_u": 0.7})
     answer = subject.solve(Question(values, values), nothing)
@@ -177,7 +178,8 @@ def test_contact_on_a_surface_is_drawn_frame_by_frame(tmp_path: Path) -> None:
     file = write(tmp_path)
     text = file.read_text(encoding="utf-8")
     text = text.replace("length = 4.0\npoints = 12", "lengths = [4.0, 3.0]\npoints = [5, 4]")
-    file.write_text(text.replace("*s", "*s1"), encoding="utf-8")
+    text = text.replace("pi*s/4", "pi*s1/4").replace("0.1*s)", "0.1*s1)")
+    file.write_text(text, encoding="utf-8")
     subject = ContactSubject(load_config(file))
     values = values_of(subject)
     answer = subject.solve(Question(values, values, "model.b_x", True), nothing)

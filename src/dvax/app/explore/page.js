@@ -77,8 +77,18 @@
       element("div", { className: "views" }), plot, element("p", { className: "caption" })
     ]);
     place.append(box);
+    watcher.observe(box);
     return box;
   }
+
+  // A figure outside of the screen is drawn when it comes into sight.
+  const watcher = new IntersectionObserver(function (entries) {
+    entries.forEach(function (entry) {
+      const box = entry.target;
+      box.isAway = !entry.isIntersecting;
+      if (!box.isAway && box.undrawn) draw(box.undrawn, box.parentNode);
+    });
+  }, { rootMargin: "150px" });
 
   function draw(drawing, place) {
     const box = card(drawing, place), plot = box.querySelector(".plot");
@@ -86,6 +96,8 @@
     box.querySelector(".caption").textContent = drawing.caption;
     plot.setAttribute("aria-label", drawing.title + ". " + drawing.caption);
     choose(drawing, box, plot);
+    box.undrawn = box.isAway && plot.data ? drawing : null;
+    if (box.undrawn) return plot;
     const style = getComputedStyle(document.documentElement), ground = style.getPropertyValue("--card");
     const layout = Object.assign({}, drawing.layout, {
       paper_bgcolor: ground, plot_bgcolor: ground, uirevision: "kept", autosize: true

@@ -9,6 +9,7 @@ one, must be the page itself.
 import base64
 import json
 import secrets
+import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -105,6 +106,11 @@ class Server(ThreadingHTTPServer):
         }
         self._turn, self._newest, self._counter = threading.Lock(), 0, threading.Lock()
         self._answers: Recent[Answer] = Recent(4)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print the traceback of a defect; a browser that closes its connection is none."""
+        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
+            super().handle_error(request, client_address)
 
     def describe(self) -> dict[str, Any]:
         """Return the title, the sliders and the buttons of the page."""
