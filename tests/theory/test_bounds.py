@@ -13,6 +13,7 @@ from tests.once import once
 from tests.selection import mostly_thorough
 
 import dvax
+from dvax.app.runs.compile_time import compile_seconds
 from dvax.theory.certificate import continue_bound
 
 RUNS = {
@@ -427,3 +428,22 @@ def test_bound_error_rejects_a_method_without_a_defect():
     )
     with pytest.raises(dvax.InputError, match=r"dvax\.Implicit.*exponential method"):
         dvax.bound_error(case.problem, sol, case.constants)
+
+
+def test_bound_of_another_solution_compiles_nothing():
+    model = dvax.models.Contact(
+        alpha=1.0, beta=1.0, b_x=2.0, b_u=1.0, d_x=0.5, d_u=1.0, kappa0=0.5, g=1.0, ell=3.0
+    )
+    problem, constants = model.problem, model.constants
+
+    def bound(x0):
+        sol = dvax.solve(
+            problem, x0, 0.0, 1.0, dt=0.1, method=dvax.ETD2RK(), constants=constants, measure=True
+        )
+        return dvax.bound_error(problem, sol, constants)
+
+    first = bound(-1.0)
+    compiled = compile_seconds()
+    second = bound(-0.5)
+    assert first.status == second.status == "proved"
+    assert compile_seconds() == compiled

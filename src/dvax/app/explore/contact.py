@@ -73,7 +73,9 @@ class ContactSubject(AbstractSubject):
             jnp.asarray(inputs.boundary.weights),
             jnp.asarray(inputs.x0),
         )
-        self.title = f"Contact law, {config.source.stem}"
+        self.title = "Contact law"
+        if config.source != DEFAULT:
+            self.title += f", {config.source.stem}"
         points = " × ".join(map(str, inputs.boundary.shape))
         self.subtitle = f"{points} points, {len(inputs.frame_times)} saved times"
         self.parameters = _parameters(config)

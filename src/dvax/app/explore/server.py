@@ -267,6 +267,8 @@ class _Handler(BaseHTTPRequestHandler):
             return _encoded({"outdated": True})
         except DvaxError as error:
             return _encoded({"error": _text(error)})
+        except OSError as error:  # a data file was removed, say
+            return _encoded({"error": f"{error.filename}: {error.strerror}. Make it accessible."})
 
     def _request(self, kind: type[Section]) -> Section:
         if self.headers.get_content_type() != "application/json":
