@@ -43,7 +43,7 @@ def explore(
         server = interruptible(lambda: _server(target, port, allow_outside, allow_code))
         print_line(server.url)
         print_remark("Only this computer can open the page. Ctrl-C ends it.")
-        if browser:
+        if browser and _has_screen():
             webbrowser.open(server.url)
         try:
             interruptible(server.serve_forever)
@@ -70,6 +70,11 @@ def _server(target: Path | None, port: int, allow_outside: bool, allow_code: boo
             "--port", f"{ADDRESS}:{port}, {error.strerror}", "the port is free and may be used",
             "Give another one, or 0 for any that is free",
         ) from error  # fmt: skip
+
+
+def _has_screen() -> bool:
+    """Return whether a browser can open a window: one for terminals would take over this terminal."""
+    return sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ))
 
 
 def _end() -> NoReturn:
