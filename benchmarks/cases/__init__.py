@@ -32,6 +32,7 @@ CASES = (
     "ensemble",
     "sweeps",
     "sharding",
+    "explore",
 )
 """The names that --only takes, in the order of a run."""
 

@@ -47,7 +47,17 @@ def test_help_imports_no_large_packages(arguments: list[str]) -> None:
 
 def test_program_lists_its_commands() -> None:
     shown = CliRunner().invoke(app, ["--help"]).output
-    for command in ("new", "check", "run", "resume", "report", "export", "demo", "doctor"):
+    for command in (
+        "new",
+        "check",
+        "run",
+        "resume",
+        "report",
+        "explore",
+        "export",
+        "demo",
+        "doctor",
+    ):
         assert f"\n  {command} " in shown
 
 

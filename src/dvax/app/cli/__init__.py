@@ -1,5 +1,5 @@
-"""The command line: `dvax new`, `check`, `run`, `resume`, `sweep`, `report`, `export`, `demo`,
-`doctor`.
+"""The command line: `dvax new`, `check`, `run`, `resume`, `sweep`, `report`, `explore`, `export`,
+`demo`, `doctor`.
 
 It reads the arguments, calls `runs` and `plots`, and prints the outcome. Nothing heavy is imported
 before a command needs it, so that `dvax --help` answers at once.

@@ -7,6 +7,7 @@ import typer
 from dvax.app.cli.check import check
 from dvax.app.cli.demo import demo
 from dvax.app.cli.doctor import doctor
+from dvax.app.cli.explore import explore
 from dvax.app.cli.export import export
 from dvax.app.cli.new import new
 from dvax.app.cli.report import report
@@ -47,5 +48,5 @@ def _program(
     """Options of the program itself; each command has its own."""
 
 
-for command in (new, check, run, resume, sweep, report, export, demo, doctor):
+for command in (new, check, run, resume, sweep, report, explore, export, demo, doctor):
     app.command()(command)

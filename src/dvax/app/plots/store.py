@@ -7,12 +7,26 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import zarr
 
 from dvax._files import time_axis
+
+
+class _InMemory:
+    """Values with the attributes of an array of zarr."""
+
+    def __init__(self, values: np.ndarray, attrs: Mapping[str, Any], dims: tuple[str, ...]):
+        self.shape, self.dtype, self.chunks = values.shape, values.dtype, values.shape
+        self.attrs = SimpleNamespace(asdict=lambda: attrs)
+        self.metadata = SimpleNamespace(dimension_names=dims)
+        self._values = values
+
+    def __getitem__(self, which: Any) -> np.ndarray:
+        return self._values[which]
 
 
 class Variable:
@@ -42,6 +56,11 @@ class Variable:
     def frames(self, which: slice | int) -> np.ndarray:
         """The values at some frames, which lie below `count`."""
         return np.asarray(self._array[which])
+
+    @classmethod
+    def of(cls, values: np.ndarray, dims: tuple[str, ...], attrs: Mapping[str, Any]) -> "Variable":
+        """Return a variable whose values are in memory."""
+        return cls(_InMemory(values, attrs, dims), None)
 
     @property
     def points(self) -> int:

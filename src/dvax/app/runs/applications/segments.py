@@ -27,9 +27,11 @@ _PIECE_BYTES = 2**20
 """The size of the states of a piece. With responses, variables and copies it was sixty times that."""
 
 
-def segments(plan: Plan, first: int = 0, x: Any = None, step: Any = None) -> Iterator[Solution]:
+def segments(
+    plan: Plan, first: int = 0, x: Any = None, step: Any = None, parts: int = SEGMENTS
+) -> Iterator[Solution]:
     """The pieces of the solution from number `first` on, in order, each cut to its own times: from the
-    state x and with the step size that the piece before ended with.
+    state x and with the step size that the piece before ended with. There are about so many `parts`.
 
     **Raises:** `dvax.SolveError` after the last piece that was reached, the piece that failed (where
     it reached a saved time) included.
@@ -40,7 +42,7 @@ def segments(plan: Plan, first: int = 0, x: Any = None, step: Any = None) -> Ite
         return
     fixed = plan.settings.get("dt") is not None
     measure = {} if isinstance(plan.settings.get("method"), Implicit) else {"measure": True}
-    length = segment_length(plan)
+    length = segment_length(plan, parts)
     x = plan.x0 if first == 0 else x
     for begin in range(first * length, len(times), length):
         wanted = times[begin : begin + length]
@@ -72,10 +74,10 @@ def segments(plan: Plan, first: int = 0, x: Any = None, step: Any = None) -> Ite
         x, step = solution.stats["x"], None if fixed else float(solution.stats["next_dt"])
 
 
-def segment_length(plan: Plan) -> int:
+def segment_length(plan: Plan, parts: int = SEGMENTS) -> int:
     """The number of saved times of a piece: a hundredth of all, fewer where their states are large."""
     row = sum(np.asarray(leaf).nbytes for leaf in jtu.tree_leaves(plan.x0))
-    return max(2, min(math.ceil(len(plan.times) / SEGMENTS), _PIECE_BYTES // max(1, row)))
+    return max(2, min(math.ceil(len(plan.times) / parts), _PIECE_BYTES // max(1, row)))
 
 
 _SAVED = ("ts", "xs", "law", "defect", "law_defect", "completed_defect", "stats")

@@ -59,6 +59,7 @@ class PythonApplication(AbstractModelApplication):
     def __init__(self, table: PythonSection, paths: Mapping[str, Path], quiet: bool):
         self.file = paths["python"]
         build = _function(self.file, table.function)
+        self.units = _units(build)
         arguments, given = _run(self.file, lambda: _arguments(build, table.parameters))
         self.table = table.model_copy(update={"parameters": given})
         model = _run(self.file, lambda: build(**arguments))
@@ -219,20 +220,28 @@ def _arguments(
     return {p.name: getattr(made, p.name) for p in names}, complete
 
 
+def _units(build: Callable[..., Any]) -> dict[str, str]:
+    """Return the units of the parameters that have one."""
+    hints = get_type_hints(build, include_extras=True)
+    return {name: unit for name, hint in hints.items() if (unit := _unit(hint)) is not None}
+
+
+def _unit(hint: Any) -> str | None:
+    """Return the unit of a type, a text among its annotations."""
+    return next((a for a in getattr(hint, "__metadata__", ()) if isinstance(a, str)), None)
+
+
 def _plain(hint: Any) -> Any:
     """Return a type without its annotations."""
     return get_args(hint)[0] if get_origin(hint) is Annotated else hint
 
 
 def _with_unit(hint: Any) -> Any:
-    """Return a type whose unit, a text among its annotations, converts quantities."""
-    if get_origin(hint) is not Annotated:
-        return hint
-    of, *about = get_args(hint)
-    unit = next((a for a in about if isinstance(a, str)), None)
+    """Return a type whose unit converts quantities."""
+    unit = _unit(hint)
     if unit is None:
         return hint
-    return Annotated[of, in_unit(unit), Field(description=f"[{unit}]")]
+    return Annotated[_plain(hint), in_unit(unit), Field(description=f"[{unit}]")]
 
 
 APPLICATION = PythonApplication
