@@ -168,6 +168,20 @@ class _Gather:
         )
 
 
+def middles(edges: np.ndarray) -> np.ndarray:
+    """The centres between edges."""
+    return 0.5 * (edges[1:] + edges[:-1])
+
+
+def rounded(values: np.ndarray) -> np.ndarray:
+    """Return values in single precision, rounded to 13 bits, the four digits that a map shows: such
+    data compress to half their size."""
+    single = np.asarray(values, np.float32)
+    near = ((single.view(np.int32) + (1 << 9)) & ~((1 << 10) - 1)).view(np.float32)
+    # NaN and infinity stay what they are, and so do values that would round to infinity.
+    return np.where(np.isfinite(near), near, single)
+
+
 def starts(count: int, cells: int) -> np.ndarray:
     """Where each of at most `cells` nearly equal groups of `count` items begins."""
     groups = min(count, cells)

@@ -1,37 +1,62 @@
-"use strict";
-// Draws every figure of the page, and lets the buttons and sliders choose which trace is visible.
-(function () {
-  // No mode bar: it would lie over the legends. Drag to zoom, double-click to return (said in the page).
-  const config = { responsive: true, displayModeBar: false };
+// Draws every figure of the page and connects its controls.
+
+async function start() {
+  startScheme();
+  startTables();
+  startPrinting();
+  if (document.querySelector(".plot") === null) return;
+  if (typeof DecompressionStream === "undefined") {
+    document.getElementById("old-browser").hidden = false;
+    return;
+  }
+  // In the place of a script of its own, which a page from a disk could not load.
+  const plotly = document.createElement("script");
+  plotly.textContent = await unpack("plotly");
+  document.head.append(plotly);
+  const content = JSON.parse(await unpack("data"));
+  scheme.dark = content.dark;
   // On a touch screen a drag scrolls the page and does not zoom the figure.
-  const touch = window.matchMedia("(pointer: coarse)").matches;
-  document.querySelectorAll(".plot").forEach(function (plot) {
-    const figure = JSON.parse(document.getElementById(plot.id + "-data").textContent);
-    if (touch) figure.layout.dragmode = false;
-    Plotly.newPlot(plot, figure.data, figure.layout, config);
-  });
-  document.querySelectorAll(".views").forEach(function (views) {
-    const count = Number(views.dataset.count);
-    const traces = Array.from({ length: count }, function (_, i) { return i; });
-    const show = function (chosen) {
-      const visible = traces.map(function (i) { return i === chosen; });
-      Plotly.restyle(views.dataset.plot, { visible: visible }, traces);
-    };
-    views.querySelectorAll("button").forEach(function (button) {
-      button.addEventListener("click", function () {
-        views.querySelectorAll("button").forEach(function (other) {
-          other.setAttribute("aria-pressed", String(other === button));
-        });
-        show(Number(button.dataset.view));
-      });
+  const isTouch = window.matchMedia("(pointer: coarse)").matches;
+  for (const [key, { figure, about }] of Object.entries(content.figures)) {
+    const { data, layout } = decoded(figure);
+    if (isTouch) layout.dragmode = false;
+    const state = { plot: document.getElementById(key), data, layout, about: decoded(about) };
+    figures.set(key, state);
+    await draw(state);
+    rememberVisibility(state);
+    startZoom(state);
+    startDownloads(state);
+    if (about.views > 0) startViews(state);
+    if (about.frames) await startFrames(state);
+  }
+}
+
+// Buttons that choose which of the first traces is visible.
+function startViews(figure) {
+  const buttons = Array.from(document.querySelectorAll(`.views[data-plot="${CSS.escape(figure.plot.id)}"] button`));
+  buttons.forEach((button, chosen) => {
+    button.addEventListener("click", () => {
+      buttons.forEach((other) => other.setAttribute("aria-pressed", String(other === button)));
+      buttons.forEach((_, k) => { figure.data[k].visible = k === chosen; });
+      draw(figure);
     });
-    const slider = views.querySelector("input");
-    if (slider) {
-      const labels = slider.dataset.labels.split("\n");
-      slider.addEventListener("input", function () {
-        views.querySelector("output").textContent = labels[Number(slider.value)];
-        show(Number(slider.value));
-      });
-    }
   });
-})();
+}
+
+// On paper: everything unfolded, light colours.
+function startPrinting() {
+  let folded = [];
+  window.addEventListener("beforeprint", () => {
+    folded = Array.from(document.querySelectorAll("details:not([open])"));
+    folded.forEach((details) => { details.open = true; });
+    scheme.isPrinting = true;
+    setScheme(scheme.chosen);
+  });
+  window.addEventListener("afterprint", () => {
+    folded.forEach((details) => { details.open = false; });
+    scheme.isPrinting = false;
+    setScheme(scheme.chosen);
+  });
+}
+
+window.report = { ready: start(), figures };
