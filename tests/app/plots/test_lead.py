@@ -14,7 +14,6 @@ from dvax.app.plots.lead import lead
 from dvax.app.plots.page import lead_section
 from dvax.app.plots.run_reader import AssumptionRow, ConstantRow, RunRecord, read_run
 from dvax.app.plots.store import Store
-from dvax.theory.status import ORDER
 
 
 class Times:
@@ -29,7 +28,7 @@ def run(model: str = "circuit", **about: Any) -> RunRecord:
         "model": model, "status": "finished", "steps": 107, "method": "ExpRosenbrock: it is exact",
         "states": 3, "responses": 1, "fit": "exact",
     }  # fmt: skip
-    store = Store({}, {"time": Times()}, 5)  # pyright: ignore
+    store = Store({}, {"time": Times()}, 5)
     record = RunRecord(Path("."), manifest, {}, {}, (), (), store)
     return replace(record, **about)
 
@@ -101,13 +100,25 @@ def test_lead_uses_the_smallest_bound_of_the_state() -> None:
     assert "The error bound is proved: ≤ 1e-04 mm" in lead(run(summary=summary))[1]
 
 
-@pytest.mark.parametrize("status", ORDER)
+@pytest.mark.parametrize("status", ["proved", "declared", "estimated"])
 def test_lead_calls_well_posedness_by_its_weakest_assumption(status: str) -> None:
     rows = (AssumptionRow("a", "", "proved", ""), AssumptionRow("b", "", status, ""))
     told = lead(run(assumptions=rows))[-1]
     assert told.startswith(f"Well-posedness is {status}: ")
     shown = "all 2 assumptions" if status == "proved" else f"1 is proved, 1 is {status} (b)"
     assert shown in told and told.endswith("The model is in the class exactly.")
+
+
+def test_lead_gives_the_reason_of_a_refuted_assumption() -> None:
+    rows = (
+        AssumptionRow("a", "", "proved", ""),
+        AssumptionRow("b", "h is continuous in t", "refuted", "h jumps at t = 6"),
+    )
+    told = lead(run(assumptions=rows))[-1]
+    assert told.startswith(
+        "An assumption of well-posedness is refuted: h is continuous in t (h jumps at t = 6). For the "
+        "others, all 1 assumption of the theory are proved."
+    )
 
 
 def test_lead_ignores_sufficient_conditions_that_are_not_needed() -> None:

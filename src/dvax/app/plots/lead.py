@@ -4,13 +4,13 @@ They are made of summary.json and manifest.json, as the tables are.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from dvax._figure_text import entry_text
 from dvax.app.plots.run_reader import CONTACT, RunRecord
 from dvax.app.plots.theme import counted, number, unit_text
-from dvax.theory.status import ORDER, weakest
+from dvax.theory.status import ORDER
 
 # What a run of a model solves; another model is named.
 SUBJECTS = {
@@ -134,17 +134,24 @@ def _well_posed(run: RunRecord) -> str:
     if isinstance(gamma, int | float) and not gamma > 0:
         return f"Well-posedness is not shown: γ = {number(gamma)} is not positive."
     rows = [row for row in run.assumptions if row.is_required]
-    if rows:
-        statuses = {row.label: row.status for row in rows}
-        return f"{_verdict(statuses.values())} {_tally(statuses, 'assumption')}{_fit(run)}"
-    if run.constants:
-        statuses = {row.name: row.status for row in run.constants}
-        return f"{_verdict(statuses.values())} {_tally(statuses, 'constant')}{_fit(run)}"
-    return ""
+    if any(row.status == "refuted" for row in rows):
+        # A sufficient condition that fails does not refute what follows from it; the reason tells more.
+        failing = "; ".join(f"{r.statement} ({r.why})" for r in rows if r.status == "refuted")
+        others = {row.label: row.status for row in rows if row.status != "refuted"}
+        rest = f" For the others, {_tally(others, 'assumption')}" if others else ""
+        return f"An assumption of well-posedness is refuted: {failing}.{rest}{_fit(run)}"
+    statuses, noun = {row.label: row.status for row in rows}, "assumption"
+    if not rows:
+        statuses, noun = {row.name: row.status for row in run.constants}, "constant"
+    if not statuses:
+        return ""
+    return f"{_verdict(statuses.values())} {_tally(statuses, noun)}{_fit(run)}"
 
 
-def _verdict(statuses: Any) -> str:
-    return f"Well-posedness is {weakest(*(s for s in statuses if s in ORDER))}:"
+def _verdict(statuses: Collection[str]) -> str:
+    """The weakest status; a word that is none of the four says nothing."""
+    weakest = max(statuses, key=ORDER.index) if set(statuses) <= set(ORDER) else "not known"
+    return f"Well-posedness is {weakest}:"
 
 
 def _tally(statuses: Mapping[str, str], noun: str) -> str:
@@ -153,7 +160,7 @@ def _tally(statuses: Mapping[str, str], noun: str) -> str:
     for label, status in statuses.items():
         groups.setdefault(status, []).append(label)
     if set(groups) == {"proved"}:
-        return f"all {len(statuses)} {noun}s of the theory are proved."
+        return f"all {counted(len(statuses), noun)} of the theory are proved."
     parts = [
         f"{len(groups[status])} {'is' if len(groups[status]) == 1 else 'are'} {status}"
         + _named(status, groups[status])

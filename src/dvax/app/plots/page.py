@@ -127,7 +127,9 @@ def lead_section(said: Sequence[str]) -> str:
 
 def _marked(text: str) -> str:
     words = r"(?<=\bis )(?:proved|declared|estimated|refuted)\b"
-    return re.sub(words, lambda m: status_mark(m[0]), escaped(text))
+    # A line does not end between a sign and its number.
+    joined = escaped(text).replace("≤ ", "≤\u00a0")
+    return re.sub(words, lambda m: status_mark(m[0]), joined)
 
 
 def _contents(parts: Sequence[Part]) -> str:

@@ -132,10 +132,12 @@ def _bounds(members: _Members | None, lines: list[dict[str, Any]]) -> list[str]:
     """A sentence on the error bounds; none where the members have none."""
     figures = [] if members is None else members.figures
     for figure in figures:
+        # In the store, a figure with the name of a variable has this prefix.
+        name = figure.name.removeprefix("summary_")
         known = Counter(
-            line["bounds"][figure.name]
+            line["bounds"][name]
             for line in lines
-            if line["status"] == "finished" and figure.name in line.get("bounds", {})
+            if line["status"] == "finished" and name in line.get("bounds", {})
         )
         if "error_bound" not in figure.name or not known or members is None:
             continue
@@ -246,7 +248,7 @@ def _surface(members: _Members, axes: list[_Axis], grid: np.ndarray) -> Picture:
         "surface", "Response surfaces",
         "Each figure over both parameters; members without results are gaps. Cells have one size "
         "whatever the distance of the values.",
-        plot, still, Views("figure", labels) if len(labels) > 1 else None,
+        plot, still, Views("Figure", labels) if len(labels) > 1 else None,
         alternative=f"Maps over {axes[0].short} and {axes[1].short} of {', '.join(labels)}.",
     )  # fmt: skip
 

@@ -84,7 +84,7 @@ def unit_text(unit: str) -> str:
 
 def counted(count: int, noun: str) -> str:
     """A count with its noun: 1 frame, 2 frames."""
-    return f"{count} {noun}" + "s" * (count != 1)
+    return f"{number(count)} {noun}" + "s" * (count != 1)
 
 
 def quantity(value: Any, unit: str) -> str:

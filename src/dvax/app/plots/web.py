@@ -81,6 +81,6 @@ def _packed(values: np.ndarray) -> Mapping[str, Any]:
     """Return an array as Plotly writes arrays into JSON."""
     return {
         "dtype": f"{values.dtype.kind}{values.dtype.itemsize}",
-        "bdata": base64.b64encode(np.ascontiguousarray(values)).decode(),
+        "bdata": base64.b64encode(values.tobytes()).decode(),
         "shape": ", ".join(map(str, values.shape)),
     }

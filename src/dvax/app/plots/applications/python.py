@@ -10,7 +10,7 @@ from dvax.app.plots.picture import Picture
 from dvax.app.plots.section import Axis
 from dvax.app.plots.store import Variable
 
-_BOUND, _CURVES, _MOST = "error_bound", 6, 12
+_BOUND, _CURVES, _MOST_CURVES = "error_bound", 6, 12
 """So many series of one unit at most are drawn as curves."""
 
 
@@ -33,7 +33,7 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
         else:
             arrays.append(_extremes(t, name, values.reshape(len(t), -1), variable.unit))
     for unit_of, series in list(by_unit.items()):
-        if len(series) > _MOST and len(t) > 1:
+        if len(series) > _MOST_CURVES and len(t) > 1:
             names = [name for name, _ in by_unit.pop(unit_of)]
             values = np.stack([values for _, values in series], axis=1)
             fields.append((f"{names[0]} to {names[-1]}", values, Axis("value", unit_of)))
