@@ -193,12 +193,10 @@ class Panel(AbstractPanel):
                 return None
             begin = math.floor(math.log10(low))
             return 10.0**begin, 10.0 ** max(begin + 1, math.ceil(math.log10(high)))
-        least = _LEAST_SPREAD * max(abs(low), abs(high))
-        if high - low >= least:
+        if high - low >= _LEAST_SPREAD * max(abs(low), abs(high)):
             return None
-        middle, half = (low + high) / 2, 0.5 * (least or 1.0)
-        # A constant fills its axis from zero, as a reader expects of a number.
-        return (min(0.0, 1.2 * middle), max(0.0, 1.2 * middle)) if middle else (-half, half)
+        # The axis of a constant begins at zero.
+        return min(0.0, 1.2 * low), max(0.0, 1.2 * high)
 
     def _logarithmic(self) -> dict[str, Any]:
         """Whole decades between ticks, at most about eight of them: 2 × 10⁻⁷ is no landmark."""
