@@ -86,13 +86,15 @@ class Tab:
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1,
             mobile=width < 500,
         )  # fmt: skip
-        self(
-            "Emulation.setEmulatedMedia",
-            features=[{"name": "prefers-color-scheme", "value": scheme}],
-        )
+        self.set_scheme(scheme)
         self("Page.navigate", url=f"file://{page}")
         self._until(lambda answer: answer.get("method") == "Page.loadEventFired")
         self.run("window.report ? window.report.ready : null")
+
+    def set_scheme(self, scheme: str) -> None:
+        """Make the system light or dark."""
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        self("Emulation.setEmulatedMedia", features=features)
 
     def run(self, script: str) -> Any:
         """Return the value of a JavaScript expression; a promise is awaited."""

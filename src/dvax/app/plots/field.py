@@ -9,6 +9,7 @@ from dvax.app.plots.map_panel import MapPanel
 from dvax.app.plots.panels import Curve, panels_picture
 from dvax.app.plots.picture import Picture
 from dvax.app.plots.section import Axis, section_picture
+from dvax.app.plots.theme import pressure_bar
 
 
 def field_pictures(
@@ -33,6 +34,9 @@ def field_pictures(
         "Time to the right; a line marks the time of the profile below, and a click chooses it.",
         [panel], "time", time_unit,
     )  # fmt: skip
+    # A bar at the side would take half of the width of a phone.
+    plot, height = whole.interactive, whole.interactive["layout"]["height"]
+    plot.data[0].colorbar = pressure_bar(plot, upward.title, height)
     profile = section_picture(
         key, f"{title} at one time", "The slider and the button choose the time.",
         middles(edges_of_place), middles(edges_of_time), {upward.words: means}, across, upward,

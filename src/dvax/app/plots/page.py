@@ -30,6 +30,11 @@ return.</p>
 PNG.</p></noscript>
 <p class="banner" id="old-browser" hidden>This browser cannot unpack the figures. Update it, or open the
 PNG files in the folder figures.</p>"""
+# The browser refuses every request of the page. Plotly compiles its parallel axes ('unsafe-eval').
+_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval'; style-src 'unsafe-inline'; "
+    "img-src data: blob:"
+)
 _TOOLS = {"reset": "Reset zoom", "csv": "CSV", "png": "PNG", "svg": "SVG"}
 _ANCHOR = "about-"
 """Before the key of a picture, the id of its section."""
@@ -77,6 +82,7 @@ def document(
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">
+<meta http-equiv="Content-Security-Policy" content="{_POLICY}">
 <title>{escaped(title)} · dvax report</title>
 <link rel="icon" href="data:,">
 <style>{web.style()}</style>
@@ -127,8 +133,8 @@ def lead_section(said: Sequence[str]) -> str:
 
 def _marked(text: str) -> str:
     words = r"(?<=\bis )(?:proved|declared|estimated|refuted)\b"
-    # A line does not end between a sign and its number.
-    joined = escaped(text).replace("≤ ", "≤\u00a0")
+    # A line does not end within a number, or after its sign.
+    joined = re.sub(r"(?:≤ )?\d[\d.]*e[-+]\d+", r'<span class="whole">\g<0></span>', escaped(text))
     return re.sub(words, lambda m: status_mark(m[0]), joined)
 
 

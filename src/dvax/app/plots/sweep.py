@@ -14,7 +14,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure as Still
 
 from dvax._figure_text import entry_text
-from dvax.app.plots.page import Part, alert, document, fold, lead_section, sections
+from dvax.app.plots.page import Part, alert, document, fold, lead_section, section, sections
 from dvax.app.plots.panels import DASHES, Curve, Panel, panels_picture
 from dvax.app.plots.picture import Picture, Views
 from dvax.app.plots.tables import escaped, facts_table, table
@@ -372,7 +372,7 @@ def _ranges(members: _Members | None) -> list[Part]:
     """The table of parameters and figures with their ranges."""
     if members is None:
         text = '<p class="caption">No member has finished, so that there are no results.</p>'
-        return [Part("", "", text)]
+        return section("ranges", "Parameters and figures", text)
     rows = []
     for kind, axes, chosen in (
         ("parameter", members.parameters, slice(None)),

@@ -15,7 +15,7 @@ from dvax.app.plots.panels import DASHES, Curve, Panel, bound_panel, panels_pict
 from dvax.app.plots.picture import Picture
 from dvax.app.plots.section import Axis
 from dvax.app.plots.store import Variable
-from dvax.app.plots.theme import STILL_STYLE, blank, still_axes
+from dvax.app.plots.theme import STILL_STYLE, blank, pressure_bar, still_axes
 
 _MOMENTS = 5
 _CELLS = 400
@@ -89,12 +89,12 @@ def _stress(data: Mapping[str, Variable]) -> Picture:
     figure.add_trace(
         go.Heatmap(
             x=across, y=upward, z=rounded(shown), colorscale=_MAP.capitalize(),
-            colorbar=dict(title=dict(text="von Mises stress [p]", side="right")),
+            colorbar=pressure_bar(figure, "von Mises stress [p]", 460),
             hovertemplate="%{z:.4g} p at (%{x:.3g}, %{y:.3g})<extra></extra>", hoverongaps=False,
         )
     )  # fmt: skip
     figure.update_xaxes(title_text="x [x]", constrain="domain", showgrid=False)
-    figure.update_yaxes(title_text="y [x]", scaleanchor="x", showgrid=False)
+    figure.update_yaxes(title_text="y [x]", scaleanchor="x", constrain="domain", showgrid=False)
 
     def still() -> Figure:
         with rc_context({**STILL_STYLE, "axes.grid": False}):

@@ -18,7 +18,7 @@ from dvax.app.plots.panels import (
 )
 from dvax.app.plots.picture import Change, Frames, Picture
 from dvax.app.plots.store import Variable
-from dvax.app.plots.theme import STILL_STYLE, blank, quantity, still_axes
+from dvax.app.plots.theme import STILL_STYLE, blank, pressure_bar, quantity, still_axes
 
 _MAP, _MOMENTS = "viridis", 97
 
@@ -75,12 +75,12 @@ def _map(data: Mapping[str, Variable]) -> Picture:
         go.Heatmap(
             x=x, y=y, z=rounded(last), colorscale=_MAP.capitalize(),
             zmin=float(fields.min()), zmax=float(fields.max()),
-            colorbar=dict(title=dict(text="temperature [degC]", side="right")),
+            colorbar=pressure_bar(figure, "temperature [degC]", 440),
             hovertemplate="%{z:.4g} degC at (%{x:.3g}, %{y:.3g}) m<extra></extra>",
         )
     )  # fmt: skip
     figure.update_xaxes(title_text="x [m]", constrain="domain", showgrid=False)
-    figure.update_yaxes(title_text="y [m]", scaleanchor="x", showgrid=False)
+    figure.update_yaxes(title_text="y [m]", scaleanchor="x", constrain="domain", showgrid=False)
     labels = tuple(f"t = {quantity(float(t), data['time'].unit)}" for t in times[frames])
     # First the time of the largest differences.
     first = int(np.argmax(np.ptp(fields, axis=(1, 2))))

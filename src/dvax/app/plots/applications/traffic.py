@@ -12,7 +12,16 @@ from dvax.app.plots.downsample import rounded
 from dvax.app.plots.panels import Curve, Panel, bound_panel, panels_picture, value_range
 from dvax.app.plots.picture import Change, Frames, Picture
 from dvax.app.plots.store import Variable
-from dvax.app.plots.theme import INK, MUTED, STILL_STYLE, SURFACE, blank, number, still_axes
+from dvax.app.plots.theme import (
+    INK,
+    MUTED,
+    STILL_STYLE,
+    SURFACE,
+    blank,
+    number,
+    pressure_bar,
+    still_axes,
+)
 
 _BUSIEST = 5
 _MAP, _MOMENTS = "viridis", 97
@@ -101,12 +110,12 @@ def _map(data: Mapping[str, Variable]) -> Picture:
                 symbol="arrow", size=18, angle=np.degrees(np.arctan2(along[:, 0], along[:, 1])),
                 color=rounded(load), cmin=0.0, cmax=top, colorscale=_MAP.capitalize(),
                 line=dict(color=MUTED, width=1),
-                colorbar=dict(title=dict(text="flow / capacity", side="right")),
+                colorbar=pressure_bar(figure, "flow / capacity", 620),
             ),
         )
     )  # fmt: skip
-    figure.update_xaxes(visible=False)
-    figure.update_yaxes(visible=False, scaleanchor="x")
+    figure.update_xaxes(visible=False, constrain="domain")
+    figure.update_yaxes(visible=False, scaleanchor="x", constrain="domain")
     labels = tuple(f"day {number(float(t))}" for t in days[frames])
     moments = Frames(
         days[frames], labels, (Change(2, "marker.color", rounded(loads)),), len(frames) - 1

@@ -11,6 +11,9 @@ function axisTitle(figure, letter, name) {
   return plainText(own ?? any) || letter;
 }
 
+// A flat bar has its title in the margin of the figure.
+const barTitle = (figure, bar) => plainText(bar?.title?.text ?? figure.layout.title?.text);
+
 function cell(value, values) {
   if (typeof value !== "number") return `"${String(value ?? "").replace(/"/g, '""')}"`;
   if (!Number.isFinite(value)) return "";
@@ -28,7 +31,7 @@ function curveColumns(figure, traces) {
     if (!before || !isEqual(Array.from(before), Array.from(trace.x))) columns.push([across, trace.x]);
     before = trace.x;
     columns.push([trace.name ? `${trace.name}: ${upward}` : upward, trace.y]);
-    if (trace.marker?.colorbar) columns.push([plainText(trace.marker.colorbar.title?.text), trace.marker.color]);
+    if (trace.marker?.colorbar) columns.push([barTitle(figure, trace.marker.colorbar), trace.marker.color]);
   }
   return columns;
 }
@@ -44,7 +47,7 @@ function mapColumns(figure, traces) {
     columns.push(
       [axisTitle(figure, "x", xaxis), Array.from(upward, () => Array.from(across)).flat()],
       [axisTitle(figure, "y", yaxis), Array.from(upward, (v) => Array.from(across, () => v)).flat()],
-      [plainText(colorbar?.title?.text ?? figure.layout.title?.text) || name || "value", cells],
+      [barTitle(figure, colorbar) || name || "value", cells],
     );
   }
   return columns;

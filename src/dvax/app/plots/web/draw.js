@@ -60,6 +60,11 @@ function startScheme() {
   const name = () => { button.textContent = isDark() ? "Light colours" : "Dark colours"; };
   name();
   button.hidden = false;
-  button.addEventListener("click", () => { setScheme(isDark() ? "light" : "dark"); name(); });
+  button.addEventListener("click", () => {
+    const wanted = isDark() ? "light" : "dark";
+    // The choice that the system has, too, follows the system again.
+    setScheme(systemScheme.matches === (wanted === "dark") ? null : wanted);
+    name();
+  });
   systemScheme.addEventListener("change", () => { if (scheme.chosen === null) drawAll(); name(); });
 }

@@ -1,5 +1,7 @@
 // Draws every figure of the page and connects its controls.
 
+const NARROW = 640;
+
 async function start() {
   startScheme();
   startTables();
@@ -20,6 +22,7 @@ async function start() {
   for (const [key, { figure, about }] of Object.entries(content.figures)) {
     const { data, layout } = decoded(figure);
     if (isTouch) layout.dragmode = false;
+    if (window.innerWidth < NARROW) data.forEach(shrinkMarkers);
     const state = { plot: document.getElementById(key), data, layout, about: decoded(about) };
     figures.set(key, state);
     await draw(state);
@@ -29,6 +32,12 @@ async function start() {
     if (about.views > 0) startViews(state);
     if (about.frames) await startFrames(state);
   }
+}
+
+// On a phone large markers, such as the nodes of a network, would cover each other.
+function shrinkMarkers({ marker, textfont }) {
+  if (marker?.size > 10) marker.size *= 0.6;
+  if (textfont?.size) textfont.size *= 0.8;
 }
 
 // Buttons that choose which of the first traces is visible.
