@@ -59,13 +59,13 @@ class Reduced:
     cells: CellMaps | None
 
 
-def edges(centres: np.ndarray) -> np.ndarray:
-    """Cell edges half-way between increasing centres, the outer ones mirrored; shape (n + 1,)."""
-    if len(centres) == 1:
-        half = 0.5 * (abs(float(centres[0])) or 1.0)
-        return np.array([centres[0] - half, centres[0] + half])
-    middle = 0.5 * (centres[1:] + centres[:-1])
-    first, last = 1.5 * centres[0] - 0.5 * centres[1], 1.5 * centres[-1] - 0.5 * centres[-2]
+def edges(points: np.ndarray) -> np.ndarray:
+    """Cell edges half-way between increasing points, the outer ones mirrored; shape (n + 1,)."""
+    if len(points) == 1:
+        half = 0.5 * (abs(float(points[0])) or 1.0)
+        return np.array([points[0] - half, points[0] + half])
+    middle = 0.5 * (points[1:] + points[:-1])
+    first, last = 1.5 * points[0] - 0.5 * points[1], 1.5 * points[-1] - 0.5 * points[-2]
     return np.concatenate([[first], middle, [last]])
 
 
@@ -168,9 +168,9 @@ class _Gather:
         )
 
 
-def middles(edges: np.ndarray) -> np.ndarray:
-    """The centres between edges."""
-    return 0.5 * (edges[1:] + edges[:-1])
+def centres(edges: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The points of cells with these edges where each has one, else the middles of the cells."""
+    return points if len(points) == len(edges) - 1 else 0.5 * (edges[1:] + edges[:-1])
 
 
 def rounded(values: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dvax.app.plots.downsample import middles
+from dvax.app.plots.downsample import centres
 from dvax.app.plots.map_panel import MapPanel
 from dvax.app.plots.panels import Curve, panels_picture
 from dvax.app.plots.picture import Picture
@@ -27,6 +27,7 @@ def field_pictures(
     """Return the map of `values` (times, places), and the profile over the places, whose time a slider
     chooses. Without `places` the entries are numbered; `references` are curves beside the profile, and
     `label_unit` is the unit beside the slider if it is not `time_unit`."""
+    entries = np.arange(values.shape[1]) if places is None else places
     panel = MapPanel(times, values, upward.words, across.title, upward.unit, 1.2, places)
     edges_of_time, edges_of_place, means = panel.cells()
     whole = panels_picture(
@@ -39,7 +40,8 @@ def field_pictures(
     plot.data[0].colorbar = pressure_bar(plot, upward.title, height)
     profile = section_picture(
         key, f"{title} at one time", "The slider and the button choose the time.",
-        middles(edges_of_place), middles(edges_of_time), {upward.words: means}, across, upward,
+        centres(edges_of_place, entries), centres(edges_of_time, times), {upward.words: means}, across,
+        upward,
         time_unit if label_unit is None else label_unit, references,
     )  # fmt: skip
     return [whole, profile]

@@ -14,7 +14,7 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from dvax.app.plots.downsample import REGIMES, CellMaps, Reduced, edges, middles, rounded, starts
+from dvax.app.plots.downsample import REGIMES, CellMaps, Reduced, centres, edges, rounded, starts
 from dvax.app.plots.lines import thin
 from dvax.app.plots.panels import value_range
 from dvax.app.plots.picture import Change, Frames, Picture, Views
@@ -113,7 +113,7 @@ def _curve(run: RunRecord, reduced: Reduced, cells: CellMaps) -> list[Picture]:
         pressure.key, "Pressure along the boundary",
         "The profile at one time. The slider, the button and a click on the map above choose the time, "
         f"which a line marks in the map. {layout.note}",
-        middles(cells.space_edges), middles(cells.time_edges),
+        centres(cells.space_edges, np.sort(run.series("s"))), centres(cells.time_edges, run.time),
         dict(zip(PRESSURE_VIEWS, fields[0])),
         Axis("place on the boundary", place), Axis("pressure", run.unit("pressure")), time,
     )  # fmt: skip

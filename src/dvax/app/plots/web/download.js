@@ -31,6 +31,7 @@ function curveColumns(figure, traces) {
     if (!before || !isEqual(Array.from(before), Array.from(trace.x))) columns.push([across, trace.x]);
     before = trace.x;
     columns.push([trace.name ? `${trace.name}: ${upward}` : upward, trace.y]);
+    if (trace.marker?.colorbar && trace.text) columns.push(["name", trace.text]);
     if (trace.marker?.colorbar) columns.push([barTitle(figure, trace.marker.colorbar), trace.marker.color]);
   }
   return columns;
@@ -56,7 +57,9 @@ function mapColumns(figure, traces) {
 function csv(figure) {
   const shown = figure.data.filter((trace) => trace.visible !== false && trace.visible !== "legendonly");
   const maps = shown.filter((trace) => trace.type === "heatmap");
-  const curves = shown.filter((trace) => trace.type === "scatter" && trace.y?.length > 0 && trace.y[0] !== null);
+  // Without what has no read-out, such as the lines between nodes, and entries of the legend alone.
+  const curves = shown.filter((trace) =>
+    trace.type === "scatter" && trace.hoverinfo !== "skip" && trace.y?.length > 0 && trace.y[0] !== null);
   const lines = shown.filter((trace) => trace.type === "parcoords");
   const columns = [
     ...mapColumns(figure, maps), ...curveColumns(figure, curves),
@@ -76,14 +79,22 @@ function save(name, content) {
   URL.revokeObjectURL(link.href);
 }
 
+// Plotly makes one picture at a time.
+let lastPicture = Promise.resolve();
+
+function savePicture(figure, options) {
+  // A picture that failed is reported in the console, and does not keep the next one from being made.
+  lastPicture = lastPicture.catch(() => null)
+    .then(() => Plotly.downloadImage(figure.plot, { filename: figure.plot.id, ...options }));
+}
+
 function startDownloads(figure) {
   const box = document.querySelector(`.tools[data-plot="${CSS.escape(figure.plot.id)}"]`);
-  const name = figure.plot.id;
   const actions = {
     reset: () => resetZoom(figure),
-    csv: () => save(`${name}.csv`, csv(figure)),
-    png: () => Plotly.downloadImage(figure.plot, { format: "png", filename: name, scale: 2 }),
-    svg: () => Plotly.downloadImage(figure.plot, { format: "svg", filename: name }),
+    csv: () => save(`${figure.plot.id}.csv`, csv(figure)),
+    png: () => savePicture(figure, { format: "png", scale: 2 }),
+    svg: () => savePicture(figure, { format: "svg" }),
   };
   for (const button of box.querySelectorAll("button")) {
     button.addEventListener("click", actions[button.dataset.action]);
