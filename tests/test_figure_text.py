@@ -81,11 +81,11 @@ def test_figure_text_agrees_on_terminal_page_and_file(
     _print_figures(summary)
     said = capsys.readouterr().out
     page = build_report(run_dir, stills=False).read_text(encoding="utf-8")
-    cards = re.findall(r'<div class="value" title="([^"]*)">(.*?)</div>', page)
-    assert len(cards) == 4
+    cells = re.findall(r'<span class="number" title="([^"]*)">(.*?)</span></td>', page)
+    assert len(cells) == 4
     # A unit never breaks.
     assert re.search(r"3\.2e-07 <span class=\"unit\">MPa mm</span>", page)
     assert re.search(r"\.unit \{[^}]*white-space: nowrap", page)
-    for (whole, shown), entry in zip(cards, summary.values(), strict=True):
+    for (whole, shown), entry in zip(cells, summary.values(), strict=True):
         text = entry_text(entry)
         assert text in said and shown.startswith(text) and float(whole) == entry["value"]

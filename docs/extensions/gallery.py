@@ -10,8 +10,10 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.transforms.post_transforms import SphinxPostTransform
 
-# Okabe and Ito, which colour-blind readers can tell apart; C7 is grey, for limits.
-COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222222", "#777777"]
+from dvax.app.plots.theme import INK, MUTED, SERIES
+
+# Curves that colour-blind readers can tell apart; C7 is grey, for limits.
+COLOURS = [*SERIES, INK, MUTED]
 STYLE = {
     "axes.axisbelow": True,
     "axes.grid": True,

@@ -5,8 +5,10 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
+import pytest
 from typer.testing import CliRunner
 
+from dvax._figure_text import entry_text
 from dvax.app.cli.demo import CONFIG
 from dvax.app.cli.program import app
 from dvax.app.cli.resample import resample
@@ -25,6 +27,20 @@ def test_demo_runs_at_few_points_and_is_self_contained(tmp_path: Path) -> None:
     again = load_config(out / "config.resolved.toml")
     assert again.boundary.points == (50,)
     assert build_contact(again).boundary.size == 50
+
+
+@pytest.mark.thorough
+def test_demo_report_has_at_most_three_megabytes_and_begins_with_its_proof(tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    result = CliRunner().invoke(app, ["demo", "-o", str(out), "-q"])
+    assert result.exit_code == 0, result.output
+    page = out / "report.html"
+    assert page.stat().st_size <= 3e6
+    entry = json.loads((out / "summary.json").read_text())["error_bound_sharp_x"]
+    share = entry_text({"value": entry["relative"], "bound": "proved"}).removeprefix("≤ ")
+    text = page.read_text(encoding="utf-8")
+    assert f"at most {share} of the norm of the solution" in text
+    assert 'The error bound is <span class="status proved">proved</span>' in text
 
 
 def test_demo_does_not_overwrite_other_files(tmp_path: Path) -> None:

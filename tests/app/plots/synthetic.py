@@ -13,6 +13,10 @@ CONSTANTS = [
     ("response_lipschitz", "L", 1.0 / 1.5, "1", "eq:concrete_LU_vi", "of u in x"),
     ("decay_rate", "η − ML̃", 0.31, "1/s", "cor:incremental_stability", "certified decay"),
     ("hadamard", "C_T", 1.6667, "1", "eq:concrete_CT", "Hadamard constant on [0, T]"),
+    ("slope", "α_h", 3.2e-7, "1", "eq:slope", "a small one"),
+    ("growth", "ω", -1.5, "1/s", "eq:growth", "a negative one"),
+    ("stiffness", "k", 17000.0, "MPa", "eq:stiffness", "a large one"),
+    ("radius", "R", "inf", "um", "eq:radius", "an infinite one"),
 ]
 
 
@@ -127,6 +131,13 @@ def write_run(folder: Path, recipe: Recipe = Recipe()) -> Path:
             "value": float(pressure[:written].max(initial=0.0)),
             "unit": "MPa",
             "meaning": "Highest pressure over the boundary and the run.",
+        },
+        "error_bound_x": {
+            "value": 2e-6,
+            "unit": "um mm^(1/2)",
+            "meaning": "bound on ‖x_h − x‖ in L2 at the end (proved)",
+            "bound": "proved",
+            "relative": 1.6e-7,
         },
         "regimes_seen": {"value": ["unloaded", "active"], "unit": "", "meaning": "Regimes met."},
     }

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from tests.formats.test_rts_gmlc import write as write_rts
 
 import dvax
 from dvax.app.plots import build_report
@@ -202,3 +203,11 @@ def test_applications_page_lists_every_key_of_a_model(name):
             known = isinstance(field.default, int | float | str)
             told = "required" if field.is_required() else str(field.default) if known else "–"
             assert f"| `{key}` | {told} |" in table, key
+
+
+def test_model_that_reads_a_folder_keeps_its_name(tmp_path):
+    write_rts(tmp_path)
+    file = written(
+        tmp_path, '[model]\nname = "market"\ndata = "."\nstart_hour = 0\nhours = 4\n', "market.toml"
+    )
+    assert read_config(file).name == "market"

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from tests.app.plots.page_data import figures_of
 from typer.testing import CliRunner
 
 import dvax
@@ -76,7 +77,8 @@ def test_a_run_has_the_variables_of_the_model_by_name_and_unit(outcome):
 def test_the_report_says_that_code_ran_and_draws_the_variables_in_order(outcome):
     page = build_report(outcome.directory).read_text()
     assert "The code of own.py:build is executed." in page
-    assert page.index('"depth') < page.index('"force')
+    panels = str(figures_of(page)["histories"]["figure"]["data"])
+    assert panels.index("'depth") < panels.index("'force")
     manifest = json.loads((outcome.directory / "manifest.json").read_text())
     assert "own.py" in manifest["data"] and manifest["fit"] == "a problem of your own: own.py"
 

@@ -256,7 +256,7 @@ def test_a_room_follows_the_heat_balance_of_scipy(tmp_path):
     power = np.clip(80 * (data.set_point.values - T), 0, 80) * 48 / 1e3
     np.testing.assert_allclose(data.heating_power, power, atol=5e-3)
     page = build_report(outcome.directory).read_text()
-    assert "Temperature and heating" in page and "Temperature at the end" not in page
+    assert "Temperature and heating" in page and "Temperature of the floor" not in page
 
 
 @pytest.mark.thorough
@@ -269,7 +269,8 @@ def test_a_heated_floor_draws_a_map_and_heats_only_where_there_are_heaters(tmp_p
     assert np.all(data.coldest <= data.mean_temperature) and np.all(
         data.mean_temperature <= data.warmest
     )
-    assert "Temperature at the end" in build_report(outcome.directory).read_text()
+    page = build_report(outcome.directory).read_text()
+    assert "Temperature of the floor" in page and 'type="range"' in page
 
 
 @pytest.mark.thorough

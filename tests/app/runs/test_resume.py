@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 import dvax
 from dvax.app.cli.program import app
+from dvax.app.plots.run_reader import read_run
 from dvax.app.runs import run as run_module
 from dvax.app.runs.applications.config import read_config
 from dvax.app.runs.checkpoints import Checkpoints
@@ -105,6 +106,8 @@ def test_a_resumed_run_equals_one_that_was_not_interrupted(folder, part):
     assert outcome.exit_code == 0 and results(part) == results(folder / "whole")
     told = [event["stage"] for event in events(part, "stage")]
     assert len([words for words in told if words.startswith("going on from t = ")]) == 2
+    resumed = read_run(part).resumed
+    assert 1 <= len(resumed) <= 2 and all(words.startswith("t = ") for words in resumed)
     assert not (part / "checkpoints").exists()
     manifest, whole = (
         json.loads((d / "manifest.json").read_text()) for d in (part, folder / "whole")

@@ -163,6 +163,9 @@ def test_report_shows_figures_failures_and_ranges(copy):
     page = build_report(copy).read_text()
     assert "2 members failed" in page and "this rate has no model" in page
     assert "Figures over rate" in page and "Parameters and figures" in page
+    lead = page.split('<section class="lead"')[1].split("</section>")[0]
+    assert "This sweep ran decay.toml for" in lead and "of them finished." in lead
+    assert 'The error bound is <span class="status proved">proved</span> for 3 members' in lead
     drawn = {file.name for file in (copy / "figures").iterdir()}
     assert {"parallel.png", "response-model-parameters-rate.png"} <= drawn
 

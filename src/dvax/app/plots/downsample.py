@@ -59,13 +59,13 @@ class Reduced:
     cells: CellMaps | None
 
 
-def edges(centres: np.ndarray) -> np.ndarray:
-    """Cell edges half-way between increasing centres, the outer ones mirrored; shape (n + 1,)."""
-    if len(centres) == 1:
-        half = 0.5 * (abs(float(centres[0])) or 1.0)
-        return np.array([centres[0] - half, centres[0] + half])
-    middle = 0.5 * (centres[1:] + centres[:-1])
-    first, last = 1.5 * centres[0] - 0.5 * centres[1], 1.5 * centres[-1] - 0.5 * centres[-2]
+def edges(points: np.ndarray) -> np.ndarray:
+    """Cell edges half-way between increasing points, the outer ones mirrored; shape (n + 1,)."""
+    if len(points) == 1:
+        half = 0.5 * (abs(float(points[0])) or 1.0)
+        return np.array([points[0] - half, points[0] + half])
+    middle = 0.5 * (points[1:] + points[:-1])
+    first, last = 1.5 * points[0] - 0.5 * points[1], 1.5 * points[-1] - 0.5 * points[-2]
     return np.concatenate([[first], middle, [last]])
 
 
@@ -166,6 +166,20 @@ class _Gather:
             points_per_cell=self.points_per_cell,
             frames_per_cell=self.frames_per_cell,
         )
+
+
+def centres(edges: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The points of cells with these edges where each has one, else the middles of the cells."""
+    return points if len(points) == len(edges) - 1 else 0.5 * (edges[1:] + edges[:-1])
+
+
+def rounded(values: np.ndarray) -> np.ndarray:
+    """Return values in single precision, rounded to 13 bits, the four digits that a map shows: such
+    data compress to half their size."""
+    single = np.asarray(values, np.float32)
+    near = ((single.view(np.int32) + (1 << 9)) & ~((1 << 10) - 1)).view(np.float32)
+    # NaN and infinity stay what they are, and so do values that would round to infinity.
+    return np.where(np.isfinite(near), near, single)
 
 
 def starts(count: int, cells: int) -> np.ndarray:

@@ -7,8 +7,8 @@ import numpy as np
 import plotly.graph_objects as go
 from matplotlib.axes import Axes
 
-from dvax.app.plots.downsample import SPACE_CELLS, TIME_CELLS, edges, starts
-from dvax.app.plots.panels import AbstractPanel
+from dvax.app.plots.downsample import SPACE_CELLS, TIME_CELLS, edges, rounded, starts
+from dvax.app.plots.panels import AbstractPanel, value_range
 from dvax.app.plots.theme import PRESSURE_MAP, axis_title, unit_text
 
 
@@ -25,26 +25,39 @@ class MapPanel(AbstractPanel):
     share: float = field(default=1.0)
 
     @property
+    def entry(self) -> str:
+        """The words of a read-out for one entry."""
+        return "entry %{y:.0f}" if self.places is None else "place %{y:.4g}"
+
+    @property
     def has_legend(self) -> bool:
         return False
 
-    def _cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    @property
+    def description(self) -> str:
+        title = axis_title(self.name, self.unit)
+        return f"a map of {title}{value_range(self.values)}, {self.words} upward"
+
+    places: np.ndarray | None = None
+    """Of the entries; their numbers if not given."""
+
+    def cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the edges of the cells along time and along the entries, and their means."""
         frames, entries = self.values.shape
         begin, low = starts(frames, TIME_CELLS), starts(entries, SPACE_CELLS)
         sums = np.add.reduceat(np.add.reduceat(self.values, begin, axis=0), low, axis=1)
         counts = np.outer(np.diff([*begin, frames]), np.diff([*low, entries]))
-        places = np.arange(entries + 1) - 0.5
+        places = np.arange(entries + 1) - 0.5 if self.places is None else edges(self.places)
         return edges(self.x)[[*begin, frames]], places[[*low, entries]], sums / counts
 
     def traces(self, words: str, unit: str) -> list[Any]:
-        across, upward, means = self._cells()
+        across, upward, means = self.cells()
         bar = axis_title(self.name, self.unit)
         return [
             go.Heatmap(
-                x=across, y=upward, z=means.T.astype("f4"), colorscale=PRESSURE_MAP,
+                x=across, y=upward, z=rounded(means.T), colorscale=PRESSURE_MAP,
                 colorbar=dict(title=dict(text=bar, side="right"), thickness=14),
-                hovertemplate=f"%{{z:.4g}} {unit_text(self.unit)} in entry %{{y:.0f}} at {words} "
+                hovertemplate=f"%{{z:.4g}} {unit_text(self.unit)} in {self.entry} at {words} "
                 f"%{{x:.5g}} {unit_text(unit)}<extra></extra>",
             )
         ]  # fmt: skip
@@ -53,7 +66,7 @@ class MapPanel(AbstractPanel):
         return dict(title_text=self.words, showgrid=False)
 
     def draw(self, axes: Axes) -> None:
-        across, upward, means = self._cells()
+        across, upward, means = self.cells()
         image = axes.pcolormesh(across, upward, means.T, cmap=PRESSURE_MAP, rasterized=True)
         axes.grid(False)
         axes.set_ylabel(self.words)

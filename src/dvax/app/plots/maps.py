@@ -14,10 +14,12 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from dvax.app.plots.downsample import REGIMES, CellMaps, Reduced, edges, starts
+from dvax.app.plots.downsample import REGIMES, CellMaps, Reduced, centres, edges, rounded, starts
 from dvax.app.plots.lines import thin
-from dvax.app.plots.picture import Picture, Views
+from dvax.app.plots.panels import value_range
+from dvax.app.plots.picture import Change, Frames, Picture, Views
 from dvax.app.plots.run_reader import RunRecord
+from dvax.app.plots.section import Axis, section_picture
 from dvax.app.plots.theme import (
     MUTED,
     PRESSURE_MAP,
@@ -61,6 +63,7 @@ class Layout:
     place: str
     note: str
     height: int = 460
+    zoom: str = ""
     square: bool = False
     stills: dict[int, str] = field(default_factory=lambda: {0: ""})
 
@@ -98,13 +101,23 @@ def _curve(run: RunRecord, reduced: Reduced, cells: CellMaps) -> list[Picture]:
         (axis_title("time", time), axis_title("place on the boundary", place)),
         f"time %{{x:.4g}} {time}<br>place %{{y:.4g}} {place}<br>",
         cell_note(cells),
+        zoom=axis_title("time", time),
     )
     fields = [cells.mean, cells.high, cells.low], [cells.common, cells.highest, cells.lowest]
     views = Views("Show the", PRESSURE_VIEWS), Views("Show the", REGIME_VIEWS)
     if not cells.reduced:
         fields, views = (fields[0][:1], fields[1][:1]), (None, None)
     titles = "Pressure over space and time", "Regimes over space and time"
-    return _pictures(run, reduced, layout, titles, fields, views)
+    pressure, regimes = _pictures(run, reduced, layout, titles, fields, views, (None, None))
+    section = section_picture(
+        pressure.key, "Pressure along the boundary",
+        "The profile at one time. The slider, the button and a click on the map above choose the time, "
+        f"which a line marks in the map. {layout.note}",
+        centres(cells.space_edges, np.sort(run.series("s"))), centres(cells.time_edges, run.time),
+        dict(zip(PRESSURE_VIEWS, fields[0])),
+        Axis("place on the boundary", place), Axis("pressure", run.unit("pressure")), time,
+    )  # fmt: skip
+    return [pressure, section, regimes]
 
 
 def _surface(run: RunRecord, reduced: Reduced) -> list[Picture]:
@@ -123,8 +136,8 @@ def _surface(run: RunRecord, reduced: Reduced) -> list[Picture]:
         ]
         regimes.append(np.argmax(measure, axis=0).astype(np.int8))
     times = tuple(quantity(float(run.time[frame]), run.unit("time")) for frame in frames)
-    highest = [float(p.max()) for p in pressure]
     unit = run.unit("pressure")
+    highest = [float(p.max()) for p in pressure]
     labels = tuple(
         f"{time}, highest {quantity(top, unit)}" for time, top in zip(times, highest, strict=True)
     )
@@ -143,8 +156,12 @@ def _surface(run: RunRecord, reduced: Reduced) -> list[Picture]:
         stills={index: times[index] for index in _spread(len(frames), STILL_TIMES)},
     )
     titles = "Pressure over the boundary", "Regimes over the boundary"
-    views = Views("Time", labels, True, first), Views("Time", times, True, first)
-    return _pictures(run, reduced, layout, titles, (means, regimes), views)
+    shown = run.time[frames]
+    moments = tuple(
+        Frames(shown, words, (Change(0, "z", _upward(np.stack(field))),), first)
+        for field, words in ((means, labels), (regimes, times))
+    )
+    return _pictures(run, reduced, layout, titles, (means, regimes), (None, None), moments)
 
 
 def _pictures(
@@ -154,6 +171,7 @@ def _pictures(
     titles: tuple[str, str],
     fields: tuple[list[np.ndarray], list[np.ndarray]],
     views: tuple[Views | None, Views | None],
+    frames: tuple[Frames, ...] | tuple[None, None],
 ) -> list[Picture]:
     unit, kappa = run.unit("pressure"), run.attrs.get("kappa0")
     low, high = min(0.0, reduced.pressure_low), reduced.pressure_high
@@ -163,14 +181,17 @@ def _pictures(
         f"pressure %{{z:.4g}} {unit_text(unit)}",
     )
     words = axis_title("pressure", unit)
-    pressure_map = _interactive(layout, fields[0], views[0], pressures)
+    pressure_map = _interactive(
+        layout, fields[0] if frames[0] is None else fields[0][:1], pressures
+    )
     pressure_map.update_traces(colorbar=pressure_bar(pressure_map, words, layout.height))
-    regime_map = _interactive(layout, fields[1], views[1], _REGIMES)
+    regime_map = _interactive(layout, fields[1] if frames[1] is None else fields[1][:1], _REGIMES)
     for name, colour in zip(REGIMES, REGIME_COLOURS, strict=True):
         marker = dict(symbol="square", size=12, color=colour, line=dict(width=0.5))
         regime_map.add_trace(
             go.Scatter(x=[None], y=[None], name=name, mode="markers", marker=marker)
         )
+    axes_words = f"A map of {layout.titles[0]} to the right and {layout.titles[1]} upward"
     capacity = f" The capacity κ₀ is {quantity(kappa, unit)}." if kappa is not None else ""
     return [
         Picture(
@@ -181,6 +202,10 @@ def _pictures(
             interactive=pressure_map,
             still=lambda: _still(layout, titles[0], fields[0], pressures, words),
             views=views[0],
+            frames=frames[0],
+            zoom=layout.zoom,
+            alternative=f"{axes_words}: the pressure{value_range(np.array([low, high]))} "
+            f"{unit_text(unit)} in colours.",
         ),
         Picture(
             key="regimes",
@@ -190,22 +215,22 @@ def _pictures(
             interactive=regime_map,
             still=lambda: _still(layout, titles[1], fields[1], _REGIMES),
             views=views[1],
+            frames=frames[1],
+            zoom=layout.zoom,
+            alternative=f"{axes_words}: the regimes unloaded, active and saturated in colours.",
         ),
     ]
 
 
-def _interactive(
-    layout: Layout, fields: list[np.ndarray], views: Views | None, colours: Colours
-) -> go.Figure:
+def _interactive(layout: Layout, fields: list[np.ndarray], colours: Colours) -> go.Figure:
     figure = blank(layout.height)
-    first = 0 if views is None else views.first
     for index, values in enumerate(fields):
         figure.add_trace(
             go.Heatmap(
                 x=layout.edges[0],
                 y=layout.edges[1],
-                z=values.T.astype("i1" if values.dtype == np.int8 else "f4"),
-                visible=index == first,
+                z=_upward(values),
+                visible=index == 0,
                 hovertemplate=f"{layout.place}{colours.value}<extra></extra>",
                 **colours.interactive,
             )
@@ -215,6 +240,12 @@ def _interactive(
     anchor = dict(scaleanchor="x") if layout.square else {}
     figure.update_yaxes(title_text=layout.titles[1], showgrid=False, **square, **anchor)
     return figure
+
+
+def _upward(values: np.ndarray) -> np.ndarray:
+    """Return fields whose last axis goes upward, in the order and precision of a map of Plotly."""
+    rows = np.swapaxes(values, -1, -2)
+    return rows.astype("i1") if values.dtype == np.int8 else rounded(rows)
 
 
 def _still(
@@ -310,10 +341,12 @@ def shares_picture(run: RunRecord, reduced: Reduced) -> Picture:
                 mode="lines",
                 line=dict(width=0.5, color=MUTED),
                 fillcolor=colour,
-                hovertemplate=f"%{{y:.3g}} % at %{{x:.4g}} {run.unit('time')}",
+                hovertemplate="%{y:.3g} %",
             )
         )
-    figure.update_xaxes(title_text=words)
+    figure.update_layout(hovermode="x unified")
+    unified = f"time %{{x}} {run.unit('time')}"
+    figure.update_xaxes(title_text=words, hoverformat=".6~g", unifiedhovertitle_text=unified)
     figure.update_yaxes(title_text="share [%]", range=[0, 100])
     most = [f"{name} {number(share.max(), 3)} %" for name, share in zip(REGIMES, shares)]
 
@@ -335,4 +368,6 @@ def shares_picture(run: RunRecord, reduced: Reduced) -> Picture:
         f"{', '.join(most)}.",
         interactive=figure,
         still=still,
+        zoom=words,
+        alternative=f"Stacked areas over {words}; at most {', '.join(most)}.",
     )

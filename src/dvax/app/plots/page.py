@@ -1,89 +1,172 @@
-"""The page: one HTML file that holds its pictures, its script and its style.
+"""The page: one HTML file that holds its pictures, its scripts and its style.
 
-Nothing is fetched: Plotly's script is written into the file, and figures are JSON beside it.
+Nothing is fetched: Plotly and the data of the figures lie in the file, compressed. First come the
+sentences that matter, then the pictures, then the tables, folded away.
 """
 
+import re
 from collections.abc import Sequence
-from importlib.resources import files
+from typing import NamedTuple
 
-from plotly.offline import get_plotlyjs
-
-from dvax.app.plots.picture import Picture, Views
+from dvax.app.plots import web
+from dvax.app.plots.lead import lead
+from dvax.app.plots.picture import Frames, Picture, Views
 from dvax.app.plots.run_reader import CONTACT, UNFINISHED, RunRecord
 from dvax.app.plots.tables import (
     assumptions_table,
     constants_table,
     escaped,
     facts_table,
-    headline_cards,
+    figures_table,
+    files_table,
     rates_table,
+    status_mark,
 )
 from dvax.app.plots.theme import counted
 
-_HINT = '<br><span class="hint">Drag in a figure to zoom, double-click to return.</span>'
+_HINTS = """<p class="hint">Drag in a figure to zoom; figures over the same axis follow. Double-click to
+return.</p>
+<noscript><p class="banner">The figures need JavaScript. The folder figures holds them as
+PNG.</p></noscript>
+<p class="banner" id="old-browser" hidden>This browser cannot unpack the figures. Update it, or open the
+PNG files in the folder figures.</p>"""
+# The browser refuses every request of the page. Plotly compiles its parallel axes ('unsafe-eval').
+_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval'; style-src 'unsafe-inline'; "
+    "img-src data: blob:"
+)
+_TOOLS = {"reset": "Reset zoom", "csv": "CSV", "png": "PNG", "svg": "SVG"}
+_ANCHOR = "about-"
+"""Before the key of a picture, the id of its section."""
+
+
+class Part(NamedTuple):
+    """A part of the page, for its contents and for its body."""
+
+    key: str
+    title: str
+    text: str
 
 
 def page(run: RunRecord, pictures: Sequence[Picture], missing: Sequence[str]) -> str:
     """The whole HTML text. `missing` says, a sentence each, which pictures the run cannot give."""
     absent = "".join(f"<li>{escaped(text)}</li>" for text in missing)
-    body = f"""{_banner(run)}
-<section><h2>Headline figures</h2>{headline_cards(run)}</section>
-{sections(pictures)}
-{f"<section><h2>Not drawn</h2><ul>{absent}</ul></section>" if absent else ""}
-{_stability(run)}
-<section><h2>Constants</h2>{constants_table(run)}
-<p class="caption">Labels are those of the formulas in the paper. The paper's constants use
-magnitudes and not signs: they are conservative, and sharper ones stand beside them where there
-are any.</p>
-</section>
-<section><h2>The run</h2>{facts_table(run.manifest)}</section>"""
-    return document(run.title, _subtitle(run), body, has_pictures=bool(pictures))
+    figures = len(run.summary) - ("status" in run.summary)
+    parts = [
+        *sections(pictures),
+        *section("missing", "Not drawn", f"<ul>{absent}</ul>" if absent else ""),
+        *fold("figures", "Figures", figures_table(run), figures),
+        *fold("certificate", "Assumptions and rates", _stability(run), len(run.assumptions)),
+        *fold("constants", "Constants", _constants(run), len(run.constants)),
+        *fold("configuration", "Configuration", _configuration(run)),
+        *fold("provenance", "Provenance", facts_table(run.manifest)),
+        *fold("files", "Files and hashes", files_table(run)),
+    ]
+    top = f"{_alert(run)}{lead_section(lead(run))}{_notes(run)}"
+    return document(run.title, _subtitle(run), top, parts, pictures)
 
 
-def sections(pictures: Sequence[Picture]) -> str:
-    """The sections of the pictures, one each."""
-    return "\n".join(map(_section, pictures))
-
-
-def document(title: str, subtitle: str, body: str, *, has_pictures: bool) -> str:
-    """The whole HTML text of a page with this body."""
-    room = files("dvax.app.plots")
-    style = (room / "page.css").read_text(encoding="utf-8")
-    script = (room / "page.js").read_text(encoding="utf-8")
+def document(
+    title: str, subtitle: str, top: str, parts: Sequence[Part], pictures: Sequence[Picture]
+) -> str:
+    """The whole HTML text of a page: `top` comes before the contents, and the `parts` after them."""
+    data = ""
+    if pictures:
+        data = (
+            f'<script type="text/plain" id="plotly">{web.plotly_bundle()}</script>\n'
+            f'<script type="text/plain" id="data">{web.figures(pictures)}</script>\n'
+        )
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<meta http-equiv="Content-Security-Policy" content="{_POLICY}">
 <title>{escaped(title)} · dvax report</title>
 <link rel="icon" href="data:,">
-<style>{style}</style>
-<script>{get_plotlyjs()}</script>
+<style>{web.style()}</style>
 </head>
 <body>
 <header>
-<h1>{escaped(title)}</h1>
-<p>{escaped(subtitle)}{_HINT if has_pictures else ""}</p>
+<div class="top"><h1>{escaped(title)}</h1><button type="button" id="scheme" hidden></button></div>
+<p>{escaped(subtitle)}</p>
 </header>
 <main>
-{body}
+{top}
+{_contents(parts)}
+{_HINTS if pictures else ""}
+{"".join(part.text for part in parts)}
 </main>
-<script>{script}</script>
+{data}<script type="module">{web.script()}</script>
 </body>
 </html>
 """
 
 
-def _stability(run: RunRecord) -> str:
-    """The section on stability; empty where the run has neither constants nor assumptions."""
-    rates, assumptions = rates_table(run), assumptions_table(run)
-    if not (rates or assumptions):
-        return ""
+def sections(pictures: Sequence[Picture]) -> list[Part]:
+    """The sections of the pictures, one each."""
+    return [part for picture in pictures for part in section(*_drawn(picture))]
+
+
+def section(key: str, title: str, content: str) -> list[Part]:
+    """A part that is always shown; none without content."""
+    place = f"{_ANCHOR}{key}"
+    text = f'<section id="{place}"><h2>{escaped(title)}</h2>{content}</section>\n'
+    return [Part(place, title, text)] if content else []
+
+
+def fold(key: str, title: str, content: str, rows: int = 0) -> list[Part]:
+    """A part that is folded away; none without content."""
+    place = f"{_ANCHOR}{key}-table"
+    count = f' <span class="count">({rows})</span>' if rows else ""
+    head = f"<summary>{escaped(title)}{count}</summary>"
+    text = f'<details id="{place}">{head}{content}</details>\n'
+    return [Part(place, title, text)] if content else []
+
+
+def lead_section(said: Sequence[str]) -> str:
+    """The sentences that matter first; the status words of the theory in their colours."""
+    paragraphs = "".join(f"<p>{_marked(text)}</p>" for text in said)
+    return f'<section class="lead" aria-label="Summary">{paragraphs}</section>\n'
+
+
+def _marked(text: str) -> str:
+    words = r"(?<=\bis )(?:proved|declared|estimated|refuted)\b"
+    # A line does not end within a number, or after its sign.
+    joined = re.sub(r"(?:≤ )?\d[\d.]*e[-+]\d+", r'<span class="whole">\g<0></span>', escaped(text))
+    return re.sub(words, lambda m: status_mark(m[0]), joined)
+
+
+def _contents(parts: Sequence[Part]) -> str:
+    """Links to the parts of the page, in their order."""
+    links = "".join(f'<li><a href="#{part.key}">{escaped(part.title)}</a></li>' for part in parts)
+    return f'<nav class="contents" aria-label="Contents"><ul>{links}</ul></nav>'
+
+
+def _constants(run: RunRecord) -> str:
     caption = (
-        '<p class="caption">The distance of two trajectories grows at most at this rate. The paper\'s '
-        "adds magnitudes; the one with signs accounts for feedback that stabilises.</p>"
+        '<p class="caption">Labels are those of the formulas in the paper. The constants of the paper '
+        "use absolute values and not signs: they are conservative. Sharper ones are listed beside them "
+        "where there are any.</p>"
     )
-    return f"<section><h2>Stability</h2>{rates}{caption if rates else ''}{assumptions}</section>"
+    return constants_table(run) + caption if run.constants else ""
+
+
+def _configuration(run: RunRecord) -> str:
+    return f"<pre>{escaped(run.config_text)}</pre>" if run.config_text else ""
+
+
+def _stability(run: RunRecord) -> str:
+    """Assumptions and rates; empty where the run has neither."""
+    rates, assumptions = rates_table(run), assumptions_table(run)
+    if rates:
+        rates = (
+            f"<h3>Rate of separation</h3>{rates}"
+            '<p class="caption">The distance of two trajectories grows at most at this rate. The rate '
+            "of the paper ignores signs; the one with signs accounts for feedback that stabilises.</p>"
+        )
+    return assumptions + rates
 
 
 def _subtitle(run: RunRecord) -> str:
@@ -98,23 +181,26 @@ def _subtitle(run: RunRecord) -> str:
     return " · ".join(parts)
 
 
-def _banner(run: RunRecord) -> str:
-    """Notices at the top of the page: the run is partial, frames are left out, warnings."""
-    lines: list[str] = []
-    if run.status in UNFINISHED:
-        reach = _reach(run)
-        # The manifest of a killed run still says that the run is going on.
-        gone = run.status == "running"
-        reason = "" if gone else str(run.manifest.get("stop_reason") or "")
-        text = " ".join(part for part in (UNFINISHED[run.status], reach, reason) if part)
-        head = "No results." if run.trajectory is None else "Partial results."
-        lines.append(
-            f'<div class="banner partial" role="alert"><b>{head}</b> {escaped(text)}</div>'
-        )
+def _alert(run: RunRecord) -> str:
+    """The notice that the run is partial, with its reason; empty for one that reached its end."""
+    if run.status not in UNFINISHED:
+        return ""
+    # The manifest of a killed run still says that the run is going on.
+    reason = "" if run.status == "running" else str(run.manifest.get("stop_reason") or "")
+    text = " ".join(part for part in (UNFINISHED[run.status], _reach(run), reason) if part)
+    head = "No results." if run.trajectory is None else "Partial results."
+    return alert(f"<b>{head}</b> {escaped(text)}")
+
+
+def alert(content: str) -> str:
+    """A notice at the top of the page."""
+    return f'<div class="banner partial" role="alert">{content}</div>\n'
+
+
+def _notes(run: RunRecord) -> str:
+    """Frames that are left out, and warnings; empty without any."""
     said = "".join(f"<li>{escaped(text)}</li>" for text in (*run.notes, *run.warnings))
-    if said:
-        lines.append(f'<div class="banner"><b>Notes of the run.</b><ul>{said}</ul></div>')
-    return "\n".join(lines)
+    return f'<div class="banner"><b>Notes of the run.</b><ul>{said}</ul></div>' if said else ""
 
 
 def _reach(run: RunRecord) -> str:
@@ -129,40 +215,35 @@ def _reach(run: RunRecord) -> str:
     return f"It holds {held}, up to t = {run.time[-1]:.6g} {unit}{aim}."
 
 
-def _section(picture: Picture) -> str:
-    # "<" is escaped, so that no text of the run can close the script element.
-    figure = str(picture.interactive.to_json()).replace("<", "\\u003c")
-    height = picture.interactive["layout"]["height"]
-    return f"""<section><h2>{escaped(picture.title)}</h2>{_control(picture)}
-<div class="plot" id="{picture.key}" style="min-height:{height}px" role="img"
- aria-label="{escaped(picture.title)}"></div>
-<script type="application/json" id="{picture.key}-data">{figure}</script>
-<p class="caption">{escaped(picture.caption)}</p></section>"""
+def _drawn(picture: Picture) -> tuple[str, str, str]:
+    """Key, title and content of the section of a picture."""
+    key, height = escaped(picture.key), picture.interactive["layout"]["height"]
+    tools = "".join(
+        f'<button type="button" data-action="{action}">{label}</button>'
+        for action, label in _TOOLS.items()
+    )
+    views = "" if picture.views is None else _buttons(key, picture.views)
+    slider = "" if picture.frames is None else _slider(key, picture.frames)
+    content = f"""{views}{slider}
+<div class="plot" id="{key}" style="min-height:{height}px" role="img"
+ aria-label="{escaped(picture.description)}"></div>
+<p class="caption">{escaped(picture.caption)}</p>
+<div class="tools" data-plot="{key}" hidden>{tools}</div>"""
+    return key, picture.title, content
 
 
-def _control(picture: Picture) -> str:
-    views = picture.views
-    if views is None:
-        return ""
-    if views.slider:
-        return _slider(picture.key, views)
+def _buttons(key: str, views: Views) -> str:
     buttons = "".join(
-        f'<button type="button" aria-pressed="{str(index == views.first).lower()}" '
-        f'data-view="{index}">{escaped(label)}</button>'
+        f'<button type="button" aria-pressed="{str(index == 0).lower()}">{escaped(label)}</button>'
         for index, label in enumerate(views.labels)
     )
-    return (
-        f'<div class="views" data-plot="{picture.key}" data-count="{len(views.labels)}">'
-        f"<span>{escaped(views.name)}</span>{buttons}</div>"
-    )
+    return f'<div class="views" data-plot="{key}"><span>{escaped(views.name)}</span>{buttons}</div>'
 
 
-def _slider(key: str, views: Views) -> str:
-    labels = "\n".join(views.labels)
+def _slider(key: str, frames: Frames) -> str:
     return (
-        f'<div class="views" data-plot="{key}" data-count="{len(views.labels)}">'
-        f'<label for="{key}-view">{escaped(views.name)}</label>'
-        f'<input type="range" id="{key}-view" min="0" max="{len(views.labels) - 1}" step="1" '
-        f'value="{views.first}" data-labels="{escaped(labels)}">'
-        f"<output>{escaped(views.labels[views.first])}</output></div>"
+        f'<div class="frames" data-plot="{key}"><button type="button">Play</button>'
+        f'<label for="{key}-time">Time</label>'
+        f'<input type="range" id="{key}-time" min="0" max="{len(frames.labels) - 1}" step="1" '
+        f'value="{frames.first}"><output>{escaped(frames.labels[frames.first])}</output></div>'
     )

@@ -22,15 +22,20 @@ from dvax.app.plots.theme import (
     STILL_STYLE,
     axis_title,
     blank,
+    number,
     still_axes,
     unit_text,
 )
 
 # Powers of ten, where Plotly would write 1µ and 1f.
 _LOGARITHMIC = dict(type="log", exponentformat="power", showexponent="all")
+DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
+"""Of curves beside each other, so that they differ without their colours."""
 _DASHES = {"solid": "-", "dash": "--", "dot": ":", "dashdot": "-.", "longdash": (0, (8, 3))}
 _PALE = 0.2
 """The opacity of bands."""
+_LEAST_DECADES, _LEAST_SPREAD = 0.5, 1e-6
+"""Values within less than this are drawn on an axis of fixed ends."""
 _LEGEND_CHARACTERS = 100
 """About as many fit beside each other above a still picture."""
 
@@ -88,6 +93,11 @@ class AbstractPanel(abc.ABC):
     @abc.abstractmethod
     def has_legend(self) -> bool: ...
 
+    @property
+    @abc.abstractmethod
+    def description(self) -> str:
+        """What it shows, in words."""
+
     @abc.abstractmethod
     def traces(self, words: str, unit: str) -> list[Any]:
         """Return the traces for Plotly; `words [unit]` is the horizontal axis."""
@@ -123,6 +133,19 @@ class Panel(AbstractPanel):
     def has_legend(self) -> bool:
         return len(self.curves) + len(self.bands) > 1
 
+    @property
+    def description(self) -> str:
+        names = [item.name for item in (*self.bands, *self.curves) if item.name]
+        drawn = f": {', '.join(dict.fromkeys(names))}" if self.has_legend else ""
+        title = axis_title(self.words.replace("<br>", " "), self.unit)
+        ends = value_range(*(c.y for c in self.curves))
+        return f"{title}{ends}{drawn}"
+
+    @property
+    def is_over_time(self) -> bool:
+        """Whether the abscissae of all curves increase, so that a place has one value of each."""
+        return all(not (np.diff(curve.x) < 0).any() for curve in self.curves)
+
     def traces(self, words: str, unit: str) -> list[Any]:
         bands = [_band_trace(band) for band in self.bands]
         return bands + [_trace(curve, self, words, unit) for curve in self.curves]
@@ -145,19 +168,42 @@ class Panel(AbstractPanel):
             axes.plot(c.x, c.y, color=c.ink, label=c.name, **style)
         axes.set_ylabel(axis_title(self.words.replace("<br>", "\n") + "\n", self.unit))
         axes.set_yscale("log" if self.log else "linear")
+        ends = self._ends()
+        if ends is not None:
+            axes.set_ylim(ends)
 
     def axis(self) -> dict[str, Any]:
         unit = unit_text(self.unit)
         title = self.words + (f"<br>[{unit}]" if unit else "")
-        return dict(title_text=title, **(self._logarithmic() if self.log else {}))
+        ends = self._ends()
+        about: dict[str, Any] = dict(title_text=title)
+        if ends is not None:
+            about["range"] = list(np.log10(ends)) if self.log else list(ends)
+        return about | (self._logarithmic() if self.log else {})
+
+    def _ends(self) -> tuple[float, float] | None:
+        """The ends of the vertical axis where the values lie so close that it would show roundoff:
+        a whole decade on a logarithmic axis, 10⁻⁶ of the values on a linear one. None elsewhere."""
+        values = _finite(*(curve.y for curve in self.curves), *(band.low for band in self.bands))
+        if not values.size:
+            return None
+        low, high = float(values.min()), float(values.max())
+        if self.log:
+            if high > low * 10**_LEAST_DECADES:
+                return None
+            begin = math.floor(math.log10(low))
+            return 10.0**begin, 10.0 ** max(begin + 1, math.ceil(math.log10(high)))
+        if high - low >= _LEAST_SPREAD * max(abs(low), abs(high)):
+            return None
+        # The axis of a constant begins at zero.
+        return min(0.0, 1.2 * low), max(0.0, 1.2 * high)
 
     def _logarithmic(self) -> dict[str, Any]:
         """Whole decades between ticks, at most about eight of them: 2 × 10⁻⁷ is no landmark."""
-        values = np.concatenate([curve.y for curve in self.curves])
-        values = values[np.isfinite(values)]
+        values = _finite(*(curve.y for curve in self.curves))
         decades = float(np.ptp(np.log10(values))) if values.size else 0.0
-        # Within one decade Plotly chooses the ticks.
-        return dict(**_LOGARITHMIC, dtick=math.ceil(decades / 8) if decades > 1.0 else None)
+        # Over few decades 2 and 5 have ticks, too.
+        return dict(**_LOGARITHMIC, dtick="D2" if decades < 2 else math.ceil(decades / 8))
 
 
 @dataclass(frozen=True)
@@ -223,7 +269,21 @@ def panels_picture(
     )  # fmt: skip
     if log:
         figure.update_xaxes(**_LOGARITHMIC)
-    figure.update_xaxes(title_text=axis_title(words, unit), row=len(panels), col=1)
+    title_of_x = axis_title(words, unit)
+    figure.update_xaxes(title_text=title_of_x, row=len(panels), col=1)
+    if not log and all(isinstance(panel, Panel) and panel.is_over_time for panel in panels):
+        # One read-out of all curves of a panel; %{x} is its head.
+        figure.update_layout(hovermode="x unified")
+        figure.update_xaxes(
+            hoverformat=".6~g", unifiedhovertitle_text=f"{words} %{{x}} {unit_text(unit)}"
+        )
+    elif not log and all(isinstance(panel, Panel) for panel in panels):
+        # Lines touch the ends of an axis that Plotly chooses, where a path in a plane looks cut off.
+        across = _finite(
+            *(c.x for panel in panels if isinstance(panel, Panel) for c in panel.curves)
+        )
+        if across.size and (margin := 0.03 * float(np.ptp(across))) > 0:
+            figure.update_xaxes(range=[float(across.min()) - margin, float(across.max()) + margin])
 
     def still() -> Figure:
         with rc_context(STILL_STYLE):
@@ -238,7 +298,26 @@ def panels_picture(
             drawn.align_ylabels([a for a, p in zip(axes[:, 0], panels) if not p.has_row_names])
         return drawn
 
-    return Picture(key=key, title=title, caption=caption, interactive=figure, still=still)
+    shown = "; ".join(panel.description for panel in panels)
+    return Picture(
+        key=key, title=title, caption=caption, interactive=figure, still=still, zoom=title_of_x,
+        alternative=f"Over {title_of_x}: {shown}.",
+    )  # fmt: skip
+
+
+def value_range(*arrays: np.ndarray) -> str:
+    """Return " from … to …" of the finite values of these arrays; nothing where there are none."""
+    values = _finite(*arrays)
+    return (
+        f" from {number(float(values.min()))} to {number(float(values.max()))}"
+        if values.size
+        else ""
+    )
+
+
+def _finite(*arrays: np.ndarray) -> np.ndarray:
+    values = np.concatenate([np.ravel(array) for array in arrays] or [np.empty(0)]).astype(float)
+    return values[np.isfinite(values)]
 
 
 def _axis(name: str, row: int) -> str:
@@ -284,6 +363,7 @@ def _add_legend(axes: Axes, panel: AbstractPanel, named: set[str], lines: Sequen
 def _trace(curve: Curve, panel: Panel, words: str, unit: str) -> go.Scatter:
     marks = curve.as_marks
     shown = slice(None) if marks else thin(curve.x, curve.y)
+    place = f" at {words} %{{x:.5g}} {unit_text(unit)}"
     return go.Scatter(
         x=curve.x[shown],
         y=curve.y[shown],
@@ -291,14 +371,13 @@ def _trace(curve: Curve, panel: Panel, words: str, unit: str) -> go.Scatter:
         mode="markers" if marks else "lines",
         line=None if marks else dict(color=curve.ink, width=1.6, dash=curve.dash),
         marker=dict(color=curve.ink, size=6) if marks else None,
-        hovertemplate=f"%{{y:.5g}} {unit_text(panel.unit)} at {words} %{{x:.5g}} {unit_text(unit)}",
+        hovertemplate=f"%{{y:.5g}} {unit_text(panel.unit)}{'' if panel.is_over_time else place}",
     )
 
 
 def _band_trace(band: Band) -> go.Scatter:
     # Round the area: forth along the lower end, back along the upper one.
     low, high = thin(band.x, band.low), thin(band.x, band.high)[::-1]
-    red, green, blue = (int(band.ink[k : k + 2], 16) for k in (1, 3, 5))
     return go.Scatter(
         x=np.concatenate([band.x[low], band.x[high]]),
         y=np.concatenate([band.low[low], band.high[high]]),
@@ -306,7 +385,8 @@ def _band_trace(band: Band) -> go.Scatter:
         mode="lines",
         line=dict(width=0),
         fill="toself",
-        fillcolor=f"rgba({red},{green},{blue},{_PALE})",
+        fillcolor=band.ink,
+        opacity=_PALE,
         hoverinfo="skip",
     )
 

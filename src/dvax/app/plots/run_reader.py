@@ -12,11 +12,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from dvax._files import time_axis
 from dvax.app.plots.store import Store, Variable, open_store
 from dvax.errors import InputError, input_error
 
 CONTACT = "contact"
 """The model of a manifest that names none."""
+
+_RESUMED = "going on from "
+"""Before the time from which a run is resumed, in its log."""
 
 # The status of a run in manifest.json that did not reach its end, and what it means.
 UNFINISHED = {
@@ -51,6 +55,7 @@ class AssumptionRow:
     statement: str
     status: str
     why: str
+    is_required: bool = True
 
 
 Row = TypeVar("Row", ConstantRow, AssumptionRow)
@@ -69,6 +74,8 @@ class RunRecord:
     trajectory: Store | None
     assumptions: tuple[AssumptionRow, ...] = field(default=())
     notes: tuple[str, ...] = field(default=())
+    resumed: tuple[str, ...] = field(default=())
+    """The times from which the run went on, such as "t = 2 s"."""
 
     @property
     def model(self) -> str:
@@ -97,6 +104,13 @@ class RunRecord:
         return self.series("time")
 
     @property
+    def saved_times(self) -> Variable | None:
+        """The saved times of any model, with their unit; None where there are none."""
+        if self.trajectory is None:
+            return None
+        return self.trajectory.variables.get(time_axis(self.trajectory.attrs))
+
+    @property
     def boundary_shape(self) -> tuple[int, ...]:
         """(n,) on a curve, (n1, n2) on a surface whose points are flattened in C order."""
         given = self.attrs.get("boundary_shape")
@@ -109,6 +123,12 @@ class RunRecord:
         if self.trajectory is None:
             raise KeyError(f"{self.directory} holds no trajectory")
         return self.trajectory.variables[name]
+
+    @property
+    def config_text(self) -> str:
+        """The text of config.resolved.toml; empty where there is none."""
+        file = self.directory / "config.resolved.toml"
+        return file.read_text(encoding="utf-8") if file.is_file() else ""
 
     def has(self, name: str) -> bool:
         """Whether the trajectory holds the variable `name`."""
@@ -142,16 +162,22 @@ def read_run(directory: Path) -> RunRecord:
     trajectory, notes = _trajectory(
         directory / "trajectory.zarr", needs_time=manifest.get("model", CONTACT) == CONTACT
     )
+    events = _events(directory / "log.jsonl")
     return RunRecord(
         directory=directory,
         manifest=manifest,
         summary=_json(summary_file) if summary_file.is_file() else {},
         config=_toml(config_file) if config_file.is_file() else {},
         constants=_rows(ConstantRow, manifest.get("constants")),
-        warnings=_warnings(directory / "log.jsonl"),
+        warnings=_messages(events, "warning", "message"),
         trajectory=trajectory,
         assumptions=_rows(AssumptionRow, manifest.get("assumptions")),
         notes=notes,
+        resumed=tuple(
+            stage.removeprefix(_RESUMED)
+            for stage in _messages(events, "stage", "stage")
+            if stage.startswith(_RESUMED)
+        ),
     )
 
 
@@ -210,14 +236,20 @@ def _rows(kind: type[Row], rows: Any) -> tuple[Row, ...]:
     """A list of the manifest as rows of one kind."""
     names = tuple(kind.__dataclass_fields__)
     given = rows if isinstance(rows, list) else []
-    return tuple(kind(**{name: row.get(name, "") for name in names}) for row in given)
+    missing = dict.fromkeys(names, "") | {"is_required": True}
+    return tuple(kind(**{name: row.get(name, missing[name]) for name in names}) for row in given)
 
 
-def _warnings(log: Path) -> tuple[str, ...]:
-    """The warnings of the log, in order, each once. A last line cut off by a kill is not read."""
+def _messages(events: list[Mapping[str, Any]], kind: str, key: str) -> tuple[str, ...]:
+    """What the events of a kind say under `key`, in order, each once."""
+    return tuple(dict.fromkeys(str(e.get(key, "")) for e in events if e.get("event") == kind))
+
+
+def _events(log: Path) -> list[Mapping[str, Any]]:
+    """The events of the log, in order. A last line cut off by a kill is not read."""
     if not log.is_file():
-        return ()
-    found: dict[str, None] = {}
+        return []
+    found: list[Mapping[str, Any]] = []
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
     for number, line in enumerate(lines):
         try:
@@ -226,6 +258,6 @@ def _warnings(log: Path) -> tuple[str, ...]:
             if number == len(lines) - 1:
                 break
             raise _damaged(log, error) from error
-        if isinstance(event, dict) and event.get("event") == "warning":
-            found.setdefault(str(event.get("message", "")))
-    return tuple(found)
+        if isinstance(event, dict):
+            found.append(event)
+    return found

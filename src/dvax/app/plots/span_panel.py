@@ -37,6 +37,11 @@ class SpanPanel(AbstractPanel):
     def has_legend(self) -> bool:
         return False
 
+    @property
+    def description(self) -> str:
+        names = ", ".join(row.name for row in self.rows)
+        return f"{self.words}: spans of {names}"
+
     def traces(self, words: str, unit: str) -> list[Any]:
         return [
             go.Bar(

@@ -1,6 +1,7 @@
 """The report of a sweep: its figures over its parameters, and the members that failed."""
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +13,9 @@ import zarr
 from matplotlib import rc_context
 from matplotlib.figure import Figure as Still
 
-from dvax.app.plots.page import document, sections
-from dvax.app.plots.panels import Curve, Panel, panels_picture
+from dvax._figure_text import entry_text
+from dvax.app.plots.page import Part, alert, document, fold, lead_section, section, sections
+from dvax.app.plots.panels import DASHES, Curve, Panel, panels_picture
 from dvax.app.plots.picture import Picture, Views
 from dvax.app.plots.tables import escaped, facts_table, table
 from dvax.app.plots.theme import (
@@ -21,6 +23,7 @@ from dvax.app.plots.theme import (
     INK,
     PRESSURE_MAP,
     STILL_STYLE,
+    SURFACE,
     axis_title,
     blank,
     counted,
@@ -28,9 +31,11 @@ from dvax.app.plots.theme import (
     pressure_bar,
     quantity,
     still_axes,
+    unit_text,
 )
 from dvax.app.runs.sweeps.records import MANIFEST, records
 from dvax.app.runs.sweeps.store import NAME
+from dvax.theory.status import ORDER
 
 _PANELS, _CURVES, _FAILURES = 8, 6, 200
 
@@ -88,18 +93,66 @@ def sweep_page(directory: Path) -> tuple[str, list[Picture]]:
             else "",
         ]
         text = escaped(" ".join(filter(None, said)))
-        banner = f'<div class="banner partial" role="alert">{text}</div>'
-    body = f"""{banner}
-{sections(pictures)}
-{_ranges(members)}
-{_failures(failed)}
-<section><h2>The sweep</h2>{facts_table(manifest)}</section>"""
+        banner = alert(text)
+    parts = [
+        *sections(pictures),
+        *_failures(failed),
+        *_ranges(members),
+        *fold("provenance", "The sweep", facts_table(manifest)),
+    ]
     done = sum(line["status"] == "finished" for line in lines)
     subtitle = " · ".join(
         (f"dvax {manifest.get('dvax') or ''}".strip(), f"sweep of {Path(manifest['config']).name}",
          f"{done} of {counted(len(lines), 'member')}")
     )  # fmt: skip
-    return document(manifest["title"], subtitle, body, has_pictures=bool(pictures)), pictures
+    top = banner + lead_section(_lead(manifest, members, done, lines))
+    return document(manifest["title"], subtitle, top, parts, pictures), pictures
+
+
+def _lead(
+    manifest: Mapping[str, Any], members: _Members | None, done: int, lines: list[dict[str, Any]]
+) -> list[str]:
+    """The sentences at the top: what varies, how many members finished, and their error bounds."""
+    config = Path(manifest["config"]).name
+    said = []
+    for axis in [] if members is None else members.parameters:
+        values = np.unique(axis.values)
+        if len(values) > 1 and axis.is_number:
+            ends = f"{number(float(values[0]))} to {quantity(float(values[-1]), axis.unit)}"
+            said.append(f"{axis.short} ({counted(len(values), 'value')}, {ends})")
+        elif len(values) > 1:
+            said.append(f"{axis.short} ({counted(len(values), 'value')})")
+    over = f" over {' and '.join(said)}" if said else ""
+    count = counted(len(lines), "member")
+    text = f"This sweep ran {config} for {count}{over}: {done} of them finished."
+    return [text, *_bounds(members, lines)]
+
+
+def _bounds(members: _Members | None, lines: list[dict[str, Any]]) -> list[str]:
+    """A sentence on the error bounds; none where the members have none."""
+    figures = [] if members is None else members.figures
+    for figure in figures:
+        # In the store, a figure with the name of a variable has this prefix.
+        name = figure.name.removeprefix("summary_")
+        known = Counter(
+            line["bounds"][name]
+            for line in lines
+            if line["status"] == "finished" and name in line.get("bounds", {})
+        )
+        if "error_bound" not in figure.name or not known or members is None:
+            continue
+        words = " and ".join(f"{status} for {counted(n, 'member')}" for status, n in known.items())
+        values = figure.values[members.finished]
+        if not np.isfinite(values).all():
+            return [
+                f"The error bound is {words}; it is not finite for some, and states nothing there."
+            ]
+        largest = entry_text({"value": float(values.max()), "bound": max(known, key=ORDER.index)})
+        return [
+            f"The error bound is {words}; the largest is {largest} {unit_text(figure.unit)}".rstrip()
+            + "."
+        ]
+    return []
 
 
 def _members(path: Path, keys: list[str]) -> _Members | None:
@@ -154,6 +207,7 @@ def _surface(members: _Members, axes: list[_Axis], grid: np.ndarray) -> Picture:
     across, along = (np.unique(axis.values) for axis in axes)
     plot = blank(480)
     bar = pressure_bar(plot, "", 480)
+    plot.update_layout(margin=dict(t=100))
     maps = [np.where(members.finished[grid], f.values[grid], np.nan) for f in figures]
     # Even cells, since values of a logarithmic range would make some of them too narrow to see.
     names = [[number(v) for v in values] for values in (across, along)]
@@ -194,7 +248,8 @@ def _surface(members: _Members, axes: list[_Axis], grid: np.ndarray) -> Picture:
         "surface", "Response surfaces",
         "Each figure over both parameters; members without results are gaps. Cells have one size "
         "whatever the distance of the values.",
-        plot, still, Views("figure", labels) if len(labels) > 1 else None,
+        plot, still, Views("Figure", labels) if len(labels) > 1 else None,
+        alternative=f"Maps over {axes[0].short} and {axes[1].short} of {', '.join(labels)}.",
     )  # fmt: skip
 
 
@@ -216,7 +271,7 @@ def _response(members: _Members, over: _Axis, varying: list[_Axis]) -> Picture:
             curves.append(
                 Curve(
                     over.values[order], figure.values[order], ", ".join(label), colour,
-                    marks=not repeats or len(order) <= 2,
+                    DASHES[colour % len(DASHES)], marks=not repeats or len(order) <= 2,
                 )
             )  # fmt: skip
         panels.append(Panel(curves, figure.short, figure.unit, log=figure.is_wide))
@@ -252,7 +307,7 @@ def _parallel(members: _Members, varying: list[_Axis]) -> Picture:
             ],
         ),
         layout=dict(
-            height=460, font=dict(family=FONT, size=12, color=INK), paper_bgcolor="white",
+            height=460, font=dict(family=FONT, size=12, color=INK), paper_bgcolor=SURFACE,
             margin=dict(l=70, r=40, t=60, b=40),
         ),
     )  # fmt: skip
@@ -283,11 +338,19 @@ def _parallel(members: _Members, varying: list[_Axis]) -> Picture:
         "parallel", "Parameters and figures",
         f"A line a member; its colour is {first.short}. Drag along an axis to select members.",
         plot, still,
+        alternative=f"Parallel axes: {', '.join(axis.short for axis in axes)}; a line for each of "
+        f"{counted(int(rows.sum()), 'member')}.",
     )  # fmt: skip
 
 
 def _scale(axis: _Axis, rows: np.ndarray) -> tuple[np.ndarray, Mapping[str, Any]]:
-    """Return the values of an axis as numbers, and its ticks where they are texts."""
+    """Return the values of an axis as numbers, logarithms where they are wide, and its ticks where
+    they are texts."""
+    if axis.is_number and axis.is_wide:
+        powers = np.log10(axis.values[rows].astype(float))
+        ticks = np.unique(np.linspace(powers.min(), powers.max(), 5).round().astype(int))
+        texts = [number(10.0**power, 1) for power in map(float, ticks)]
+        return powers, dict(tickvals=ticks.tolist(), ticktext=texts)
     if axis.is_number:
         return axis.values[rows].astype(float), {}
     texts, places = np.unique(axis.values[rows].astype(str), return_inverse=True)
@@ -305,10 +368,11 @@ def _colours(shade: np.ndarray) -> np.ndarray:
     return colormaps[PRESSURE_MAP](shade)
 
 
-def _ranges(members: _Members | None) -> str:
+def _ranges(members: _Members | None) -> list[Part]:
     """The table of parameters and figures with their ranges."""
     if members is None:
-        return '<p class="caption">No member has finished, so that there are no results.</p>'
+        text = '<p class="caption">No member has finished, so that there are no results.</p>'
+        return section("ranges", "Parameters and figures", text)
     rows = []
     for kind, axes, chosen in (
         ("parameter", members.parameters, slice(None)),
@@ -327,13 +391,13 @@ def _ranges(members: _Members | None) -> str:
                 (kind, f"<code>{escaped(axis.name)}</code>", *map(escaped, (*shown, words)))
             )
     head = ("kind", "name", "smallest", "largest", "meaning")
-    return f"<section><h2>Parameters and figures</h2>{table(head, rows)}</section>"
+    return fold("ranges", "Ranges of parameters and figures", table(head, rows), len(rows))
 
 
-def _failures(failed: list[dict[str, Any]]) -> str:
-    """The table of the members that failed; empty without any."""
+def _failures(failed: list[dict[str, Any]]) -> list[Part]:
+    """The table of the members that failed; none without any."""
     if not failed:
-        return ""
+        return []
     rows = [
         tuple(
             map(escaped, (
@@ -347,4 +411,4 @@ def _failures(failed: list[dict[str, Any]]) -> str:
     more = len(failed) - len(rows)
     rest = f'<p class="caption">{counted(more, "more")} in members.jsonl.</p>' if more else ""
     head = ("member", "values", "reason")
-    return f"<section><h2>Members that failed</h2>{table(head, rows)}{rest}</section>"
+    return fold("failures", "Members that failed", f"{table(head, rows)}{rest}", len(failed))

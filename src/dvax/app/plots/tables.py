@@ -1,4 +1,4 @@
-"""The tables of the page: headline figures, constants, assumptions, rates, facts of the manifest."""
+"""The tables of the page: figures, constants, assumptions, rates, facts of the manifest."""
 
 import html
 import json
@@ -26,31 +26,44 @@ FACTS = {
     "python": "Python",
     "git_commit": "git commit",
 }
-SHOWN_ELSEWHERE = ("constants", "assumptions", "title")
+SHOWN_ELSEWHERE = ("constants", "assumptions", "title", "data", "files")
+_ROWS_TO_SORT = 8
+"""Tables with so many rows are sorted by a click on the head of a column."""
 
 
-def headline_cards(run: RunRecord) -> str:
-    """summary.json: one card a figure, its meaning beneath."""
-    cards = []
+def figures_table(run: RunRecord) -> str:
+    """summary.json: a row for each figure; the whole number is the tooltip of the shown one."""
+    rows = []
     for name, entry in run.summary.items():
         if name == "status":
             continue  # it stands at the top of the page, and among the facts of the run
         value = entry.get("value")
         unit = escaped(quantity("", str(entry.get("unit", ""))))
-        # Keep the unit on one line, with the last digits where there is room.
         shown = f'{escaped(entry_text(entry))} <span class="unit">{unit}</span>'.removesuffix(
             ' <span class="unit"></span>'
         )
-        # All digits, as a tooltip.
         whole = "" if isinstance(value, list) else f' title="{escaped(str(value))}"'
-        cards.append(
-            f'<div class="card"><div class="name">{escaped(_words(name))}</div>'
-            f'<div class="value"{whole}>{shown}</div>'
-            f'<div class="meaning">{escaped(str(entry.get("meaning", "")))}</div></div>'
+        rows.append(
+            (
+                f"<code>{escaped(name)}</code>",
+                f'<span class="number"{whole}>{shown}</span>',
+                escaped(str(entry.get("meaning", ""))),
+            )
         )
-    if not cards:
+    if not rows:
         return '<p class="caption">The run wrote no figures: they are made when it ends.</p>'
-    return f'<div class="cards">{"".join(cards)}</div>'
+    return table(("figure", "value", "meaning"), rows)
+
+
+def files_table(run: RunRecord) -> str:
+    """The files that the run read, with their hashes, and those that it wrote; empty without any."""
+    rows = [
+        (escaped(str(name)), "read", f"<code>{escaped(str(about.get('sha256', '')))}</code>",
+         escaped(number(about.get("bytes", ""))))
+        for name, about in (run.manifest.get("data") or {}).items()
+    ]  # fmt: skip
+    rows += [(escaped(str(name)), "written", "", "") for name in run.manifest.get("files") or ()]
+    return table(("file", "use", "SHA-256", "bytes"), rows) if rows else ""
 
 
 def constants_table(run: RunRecord) -> str:
@@ -106,7 +119,7 @@ def rates_table(run: RunRecord) -> str:
     if sharp is not None:
         mu = -float(sharp.value)
         rows.append(("with signs", "μ", mu, _sense(mu)))
-        rows.append(("lost to absolute values", "ω + M L̃ − μ", growth - mu, ""))
+        rows.append(("gap between the two rates", "ω + M L̃ − μ", growth - mu, ""))
     unit = constants["growth_rate"].unit
     cells = [
         tuple(map(escaped, (words, symbol, quantity(rate, unit), remark)))
@@ -157,7 +170,9 @@ def table(head: tuple[str, ...], rows: list[tuple[str, ...]], kind: str = "rows"
         + "</tr>"
         for row in rows
     )
-    return f'<table class="{kind}"><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>'
+    sorts = " sortable" if kind == "rows" and len(rows) >= _ROWS_TO_SORT else ""
+    rows_of = f"<thead><tr>{top}</tr></thead><tbody>{body}</tbody>"
+    return f'<div class="scroll"><table class="{kind}{sorts}">{rows_of}</table></div>'
 
 
 def _words(name: str) -> str:

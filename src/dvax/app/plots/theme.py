@@ -11,19 +11,47 @@ from plotly.subplots import make_subplots
 
 from dvax._figure_text import NOT_FINITE
 
-# Okabe and Ito (2008), in the order used here.
-BLUE, VERMILLION, GREEN, ORANGE, SKY, PURPLE = (
+# Six colours for curves. On white they have a contrast of at least 3, and each two of them differ for
+# every kind of colour vision (tests/app/plots/test_colours.py). The first two are of Okabe and Ito.
+BLUE, VERMILLION, GREEN, PURPLE, BROWN, NAVY = SERIES = (
     "#0072B2",
     "#D55E00",
-    "#009E73",
-    "#E69F00",
-    "#56B4E9",
-    "#CC79A7",
+    "#2CA57A",
+    "#D953F6",
+    "#8A461B",
+    "#10496B",
 )
-SERIES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
-INK, MUTED, RULE = "#1f2933", "#5f6b76", "#dde3e8"
+INK, MUTED, RULE, SURFACE = "#1F2933", "#5F6B76", "#DDE3E8", "#FFFFFF"
 # Pale to strong: the order of the regimes survives a grey print and every kind of colour blindness.
-REGIME_COLOURS = ("#E9E6DC", SKY, VERMILLION)
+REGIME_COLOURS = ("#F3F0E6", "#3F8ABF", "#682300")
+# What each colour of a figure is on a dark page.
+DARK = {
+    INK: "#E6EAEE",
+    MUTED: "#A3AFBA",
+    RULE: "#303A43",
+    SURFACE: "#171C21",
+    **dict(
+        zip(SERIES, ("#52AEFC", "#EE7289", "#96FFED", "#5B6EE0", "#F3CD27", "#A26211"), strict=True)
+    ),
+    **dict(zip(REGIME_COLOURS, ("#2B333B", "#338FCD", "#FDECD2"), strict=True)),
+}
+# Colours of the page, on a light and on a dark one; page.css has them as variables.
+PAGE_COLOURS = {
+    "ink": (INK, DARK[INK]),
+    "muted": (MUTED, DARK[MUTED]),
+    "rule": (RULE, DARK[RULE]),
+    "surface": (SURFACE, DARK[SURFACE]),
+    "page": ("#F5F7F9", "#0F1317"),
+    "accent": (BLUE, DARK[BLUE]),
+    "on-accent": ("#FFFFFF", "#0F1317"),
+    "border": ("#7D8994", "#6D7883"),
+    "notice": ("#B26A00", "#F3CD27"),
+    "alarm": ("#C24A00", "#FF8A5C"),
+    "proved": ("#D3ECE3", "#10402F"),
+    "declared": ("#D9E9F5", "#12395A"),
+    "estimated": ("#FBE9C6", "#4A3705"),
+    "refuted": ("#F7D9C8", "#5A2410"),
+}
 PRESSURE_MAP = "viridis"
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
 
@@ -56,7 +84,7 @@ def unit_text(unit: str) -> str:
 
 def counted(count: int, noun: str) -> str:
     """A count with its noun: 1 frame, 2 frames."""
-    return f"{count} {noun}" + "s" * (count != 1)
+    return f"{number(count)} {noun}" + "s" * (count != 1)
 
 
 def quantity(value: Any, unit: str) -> str:
@@ -95,10 +123,12 @@ def blank(height: int, row_heights: tuple[float, ...] = (1.0,)) -> go.Figure:
         template=_TEMPLATE,
         height=height,
         font=dict(family=FONT, size=13, color=INK),
-        paper_bgcolor="white",
-        plot_bgcolor="white",
+        paper_bgcolor=SURFACE,
+        plot_bgcolor=SURFACE,
         margin=dict(l=56, r=16, t=16, b=44),
-        hoverlabel=dict(font=dict(family=FONT)),
+        hoverlabel=dict(
+            font=dict(family=FONT, color=INK), bgcolor=SURFACE, bordercolor=MUTED, namelength=-1
+        ),
         legend=dict(
             traceorder="normal", orientation="h", x=0, y=1.01, xanchor="left", yanchor="bottom"
         ),

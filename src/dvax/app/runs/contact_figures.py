@@ -57,6 +57,7 @@ class Figures:
                 )
             },
             "law_error": float(values["law_error"].max()),
+            "norm_x": float(np.sqrt(values["indentation"][-1] ** 2 @ weights)),
         }
 
     @np.errstate(over="ignore", invalid="ignore")  # a rate that overflows is infinite
@@ -86,7 +87,7 @@ class Figures:
             ("error_bound_x", last["error_bound_x"], norm,
              f"bound on ‖x_h − x‖ in L2 at the end, paper's constants ({self.status})"),
             ("error_bound_sharp_x", last["error_bound_sharp_x"], norm,
-             f"the same with the one-sided rate ({self.status})"),
+             f"bound on ‖x_h − x‖ in L2 at the end, one-sided rate ({self.status})"),
             ("error_bound_u", last["error_bound_u"], norm,
              f"bound on ‖u_h − u‖ in L2 at the end ({self.status})"),
             ("law_error", last["law_error"], norm,
@@ -103,8 +104,12 @@ class Figures:
         bounds |= dict.fromkeys(
             ("error_bound_x", "error_bound_sharp_x", "error_bound_u"), self.status
         )
+        size = last["norm_x"]
+        relative = {
+            name: last[name] / size for name in ("error_bound_x", "error_bound_sharp_x") if size > 0
+        }
         return {
-            name: Figure(value, unit, meaning, bound=bounds.get(name))
+            name: Figure(value, unit, meaning, bound=bounds.get(name), relative=relative.get(name))
             for name, value, unit, meaning in rows
         }
 

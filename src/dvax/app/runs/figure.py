@@ -13,13 +13,15 @@ SAYS_NOTHING = "; it is not finite, so it gives no bound"
 class Figure:
     """A headline figure: a number, or a list of them; `error`: a proved bound on its error, or on those
     of its entries, where there is one. A figure that is a bound itself says in `bound` how much is
-    known of it: "proved", "declared" or "estimated"."""
+    known of it: "proved", "declared" or "estimated", and in `relative` its ratio to the norm of the
+    computed solution, where this is positive."""
 
     value: Any
     unit: str
     meaning: str
     error: Any = None
     bound: str | None = None
+    relative: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """The entry of summary.json. The meaning of a bound says where it is infinite or NaN."""
@@ -32,6 +34,8 @@ class Figure:
             finite = all(math.isfinite(v) for v in values if isinstance(v, float))
             entry["meaning"] += "" if finite else SAYS_NOTHING
             entry["bound"] = self.bound
+        if self.relative is not None and math.isfinite(self.relative):
+            entry["relative"] = float(self.relative)
         return entry
 
 

@@ -225,7 +225,7 @@ def _settings(tree: Mapping[str, Any], path: str = "") -> dict[str, str]:
     return found
 
 
-def assumption_rows(assumptions: Sequence[Assumption]) -> list[dict[str, str]]:
+def assumption_rows(assumptions: Sequence[Assumption]) -> list[dict[str, Any]]:
     """The assumptions as manifest and report show them."""
-    names = ("label", "statement", "status", "why")
+    names = ("label", "statement", "status", "why", "is_required")
     return [{name: getattr(row, name) for name in names} for row in assumptions]

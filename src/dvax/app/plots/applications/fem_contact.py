@@ -7,19 +7,42 @@ import plotly.graph_objects as go
 from matplotlib import rc_context
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
+from matplotlib.tri import Triangulation
 
-from dvax.app.plots.panels import Curve, Panel, bound_panel, panels_picture
+from dvax.app.plots.downsample import rounded
+from dvax.app.plots.field import field_pictures
+from dvax.app.plots.panels import DASHES, Curve, Panel, bound_panel, panels_picture, value_range
 from dvax.app.plots.picture import Picture
+from dvax.app.plots.section import Axis
 from dvax.app.plots.store import Variable
-from dvax.app.plots.theme import STILL_STYLE, blank, still_axes
+from dvax.app.plots.theme import STILL_STYLE, blank, pressure_bar, still_axes
 
 _MOMENTS = 5
+_CELLS = 400
+"""Of the map of the stress, along its longer side."""
 _MAP = "viridis"
 
 
 def pictures(data: Mapping[str, Variable]) -> list[Picture]:
-    """Pressure profiles, force over time, von Mises stress at the end."""
-    return [_pressure(data), _force(data), _stress(data)]
+    """Pressure over time and at one time, profiles until rest, force, von Mises stress at the end."""
+    return [*_field(data), _pressure(data), _force(data), _stress(data)]
+
+
+def _field(data: Mapping[str, Variable]) -> list[Picture]:
+    """The pressure over space and time, and along the contact boundary at one time."""
+    times, places, p = (data[name].values for name in ("time", "place", "pressure"))
+    near = _touched(p)
+    rest = Curve(places[near], data["pressure_at_rest"].values[near], "at rest", None, "dash")
+    return field_pictures(
+        "contact", "Contact pressure", times, places[near], p[:, near], Axis("place", "x"),
+        Axis("pressure", "p"), "t", [rest], label_unit="",
+    )  # fmt: skip
+
+
+def _touched(p: np.ndarray) -> slice:
+    """The points that were ever touched, with a margin; all where none was."""
+    touched = np.flatnonzero(p.max(axis=0) > 0)
+    return slice(max(touched[0] - 5, 0), touched[-1] + 6) if touched.size else slice(None)
 
 
 def _pressure(data: Mapping[str, Variable]) -> Picture:
@@ -29,15 +52,14 @@ def _pressure(data: Mapping[str, Variable]) -> Picture:
     rows = np.unique(
         1 + np.searchsorted(done, done[-1] * np.arange(1, _MOMENTS + 1) / (_MOMENTS + 0.01))
     )
-    curves = [Curve(s, p[row], f"t = {times[row]:.3g}", k) for k, row in enumerate(rows)]
-    curves.append(Curve(s, data["pressure_at_rest"].values, "at rest", None, "dash"))
-    touched = np.flatnonzero(p.max(axis=0) > 0)
-    if touched.size:
-        # The points that were ever touched, with a margin.
-        first, last = max(touched[0] - 5, 0), touched[-1] + 6
-        curves = [Curve(c.x[first:last], c.y[first:last], c.name, c.colour, c.dash) for c in curves]
+    near = _touched(p)
+    curves = [
+        Curve(s[near], p[row][near], f"t = {times[row]:.3g}", k, DASHES[k])
+        for k, row in enumerate(rows)
+    ]
+    curves.append(Curve(s[near], data["pressure_at_rest"].values[near], "at rest", None, "dash"))
     return panels_picture(
-        "pressure", "Contact pressure",
+        "pressure", "Contact pressure until rest",
         "Where the profile is flat the pressure is at its cap. The dashed one is the limit at rest, "
         "from its own variational inequality.",
         [Panel(curves, "pressure", "p")], "place", "x",
@@ -63,19 +85,16 @@ def _stress(data: Mapping[str, Variable]) -> Picture:
     corners = cells[:, : 4 if cells.shape[1] == 9 else 3]
     outlines = nodes[corners]
     figure = blank(460)
-    middle = outlines.mean(axis=1)
+    across, upward, shown = _map_of_cells(nodes, corners, mises)
     figure.add_trace(
-        go.Scatter(
-            x=middle[:, 0], y=middle[:, 1], mode="markers", showlegend=False,
-            marker=dict(
-                color=mises, colorscale=_MAP.capitalize(), size=6,
-                colorbar=dict(title=dict(text="von Mises stress [p]", side="right")),
-            ),
-            customdata=mises, hovertemplate="%{customdata:.4g} at (%{x:.3g}, %{y:.3g})",
+        go.Heatmap(
+            x=across, y=upward, z=rounded(shown), colorscale=_MAP.capitalize(),
+            colorbar=pressure_bar(figure, "von Mises stress [p]", 460),
+            hovertemplate="%{z:.4g} p at (%{x:.3g}, %{y:.3g})<extra></extra>", hoverongaps=False,
         )
     )  # fmt: skip
-    figure.update_xaxes(title_text="x [x]")
-    figure.update_yaxes(title_text="y [x]", scaleanchor="x")
+    figure.update_xaxes(title_text="x [x]", constrain="domain", showgrid=False)
+    figure.update_yaxes(title_text="y [x]", scaleanchor="x", constrain="domain", showgrid=False)
 
     def still() -> Figure:
         with rc_context({**STILL_STYLE, "axes.grid": False}):
@@ -96,4 +115,21 @@ def _stress(data: Mapping[str, Variable]) -> Picture:
         key="stress", title="Von Mises stress at the end",
         caption="Means over the elements. body.vtu holds the fields for ParaView.",
         interactive=figure, still=still,
+        alternative=f"A map of the body: the von Mises stress{value_range(mises)} p in colours.",
     )  # fmt: skip
+
+
+def _map_of_cells(
+    nodes: np.ndarray, corners: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the values of the elements on a grid of points, NaN outside the body, after its axes."""
+    halves = [(0, k, k + 1) for k in range(1, corners.shape[1] - 1)]
+    triangles = np.concatenate([corners[:, half] for half in halves])
+    low, high = nodes.min(axis=0), nodes.max(axis=0)
+    step = float((high - low).max()) / _CELLS
+    across, upward = (
+        a + step * (np.arange(max(1, round((b - a) / step))) + 0.5) for a, b in zip(low, high)
+    )
+    find = Triangulation(nodes[:, 0], nodes[:, 1], triangles).get_trifinder()
+    which = np.asarray(find(*np.meshgrid(across, upward)))
+    return across, upward, np.where(which < 0, np.nan, values[which % len(values)])

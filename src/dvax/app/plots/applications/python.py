@@ -4,37 +4,44 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from dvax.app.plots.panels import Curve, Panel, bound_panel, bound_title, panels_picture
+from dvax.app.plots.field import field_pictures
+from dvax.app.plots.panels import DASHES, Curve, Panel, bound_panel, bound_title, panels_picture
 from dvax.app.plots.picture import Picture
+from dvax.app.plots.section import Axis
 from dvax.app.plots.store import Variable
 
-_BOUND, _CURVES = "error_bound", 6
-_DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
+_BOUND, _CURVES, _MOST_CURVES = "error_bound", 6, 12
+"""So many series of one unit at most are drawn as curves."""
 
 
 def pictures(data: Mapping[str, Variable]) -> list[Picture]:
-    """Series over time by their units, arrays by their smallest, mean and largest entries, and the
-    error bound."""
+    """Vectors as maps, series over time by their units, other arrays by their smallest, mean and
+    largest entries, and the error bound."""
     time = data["time"]
     t, unit = time.values, time.unit
     by_unit: dict[str, list[tuple[str, np.ndarray]]] = {}
-    fields: list[Panel] = []
+    arrays: list[Panel] = []
+    fields: list[tuple[str, np.ndarray, Axis]] = []
     for name, variable in data.items():
         values = variable.values
         if name in ("time", _BOUND) or len(values) != len(t):
             continue
         if values.ndim == 1:
             by_unit.setdefault(variable.unit, []).append((name, values))
+        elif values.ndim == 2 and len(t) > 1 and values.shape[1] > _CURVES:
+            fields.append((name, values, Axis(name, variable.unit)))
         else:
-            flat = values.reshape(len(t), -1)
-            kinds = (("smallest", np.min), ("mean", np.mean), ("largest", np.max))
-            curves = [
-                Curve(t, of(flat, axis=1), f"{name}, {kind}", k)
-                for k, (kind, of) in enumerate(kinds)
-            ]
-            fields.append(Panel(curves, name, variable.unit))
-    panels = [*_panels(t, by_unit), *fields]
-    found = []
+            arrays.append(_extremes(t, name, values.reshape(len(t), -1), variable.unit))
+    for unit_of, series in list(by_unit.items()):
+        if len(series) > _MOST_CURVES and len(t) > 1:
+            names = [name for name, _ in by_unit.pop(unit_of)]
+            values = np.stack([values for _, values in series], axis=1)
+            fields.append((f"{names[0]} to {names[-1]}", values, Axis("value", unit_of)))
+    found: list[Picture] = []
+    for k, (title, values, upward) in enumerate(fields):
+        entry = Axis("entry", "")
+        found += field_pictures(f"field-{k}", title, t, None, values, entry, upward, unit)
+    panels = [*_panels(t, by_unit), *arrays]
     if panels:
         found.append(
             panels_picture(
@@ -55,13 +62,22 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
     return found
 
 
+def _extremes(t: np.ndarray, name: str, values: np.ndarray, unit: str) -> Panel:
+    kinds = (("smallest", np.min), ("mean", np.mean), ("largest", np.max))
+    curves = [
+        Curve(t, of(values, axis=1), f"{name}, {kind}", k, DASHES[k])
+        for k, (kind, of) in enumerate(kinds)
+    ]
+    return Panel(curves, name, unit)
+
+
 def _panels(t: np.ndarray, by_unit: Mapping[str, list[tuple[str, np.ndarray]]]) -> list[Panel]:
     panels, drawn = [], 0
     for unit, series in by_unit.items():
         for begin in range(0, len(series), _CURVES):
             some = series[begin : begin + _CURVES]
             curves = [
-                Curve(t, values, name, drawn + k, _DASHES[(drawn + k) // _CURVES % len(_DASHES)])
+                Curve(t, values, name, drawn + k, DASHES[(drawn + k) // _CURVES % len(DASHES)])
                 for k, (name, values) in enumerate(some)
             ]
             drawn += len(some)

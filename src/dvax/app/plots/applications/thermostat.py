@@ -2,16 +2,25 @@
 
 from collections.abc import Mapping
 
+import numpy as np
 import plotly.graph_objects as go
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from dvax.app.plots.panels import Curve, Panel, bound_panel, bound_title, panels_picture
-from dvax.app.plots.picture import Picture
+from dvax.app.plots.downsample import rounded
+from dvax.app.plots.panels import (
+    Curve,
+    Panel,
+    bound_panel,
+    bound_title,
+    panels_picture,
+    value_range,
+)
+from dvax.app.plots.picture import Change, Frames, Picture
 from dvax.app.plots.store import Variable
-from dvax.app.plots.theme import STILL_STYLE, blank, still_axes
+from dvax.app.plots.theme import STILL_STYLE, blank, pressure_bar, quantity, still_axes
 
-_MAP = "viridis"
+_MAP, _MOMENTS = "viridis", 97
 
 
 def pictures(data: Mapping[str, Variable]) -> list[Picture]:
@@ -24,7 +33,10 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
     means = [curve("mean_temperature", "mean", 0), curve("set_point", "set point", None, "dash")]
     is_field = data["temperature"].values[0].size > 1
     if is_field:
-        means[1:1] = [curve("coldest", "coldest", 5, "dot"), curve("warmest", "warmest", 4, "dot")]
+        means[1:1] = [
+            curve("coldest", "coldest", 5, "dot"),
+            curve("warmest", "warmest", 4, "dashdot"),
+        ]
     limits = [curve(f"heating_{end}", "limits", None, "dash") for end in ("min", "max")]
     bound = data["error_bound"]
     found = [
@@ -54,29 +66,40 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
 
 
 def _map(data: Mapping[str, Variable]) -> Picture:
-    x, y = data["x"].values, data["y"].values
-    last, title = data["temperature"].values[-1].T, "Temperature at the end"
-    figure = blank(420)
+    x, y, times = (data[name].values for name in ("x", "y", "time"))
+    frames = np.unique(np.linspace(0, len(times) - 1, _MOMENTS).round().astype(int))
+    fields = np.swapaxes(data["temperature"].values[frames], 1, 2)
+    last, title = fields[-1], "Temperature of the floor"
+    figure = blank(440)
     figure.add_trace(
         go.Heatmap(
-            x=x, y=y, z=last, colorscale=_MAP.capitalize(),
-            colorbar=dict(title=dict(text="temperature [degC]", side="right")),
+            x=x, y=y, z=rounded(last), colorscale=_MAP.capitalize(),
+            zmin=float(fields.min()), zmax=float(fields.max()),
+            colorbar=pressure_bar(figure, "temperature [degC]", 440),
             hovertemplate="%{z:.4g} degC at (%{x:.3g}, %{y:.3g}) m<extra></extra>",
         )
     )  # fmt: skip
-    figure.update_xaxes(title_text="x [m]", constrain="domain")
-    figure.update_yaxes(title_text="y [m]", scaleanchor="x")
+    figure.update_xaxes(title_text="x [m]", constrain="domain", showgrid=False)
+    figure.update_yaxes(title_text="y [m]", scaleanchor="x", constrain="domain", showgrid=False)
+    labels = tuple(f"t = {quantity(float(t), data['time'].unit)}" for t in times[frames])
+    # First the time of the largest differences.
+    first = int(np.argmax(np.ptp(fields, axis=(1, 2))))
+    moments = Frames(times[frames], labels, (Change(0, "z", rounded(fields)),), first)
 
     def still() -> Figure:
         with rc_context({**STILL_STYLE, "axes.grid": False}):
             drawn, axes = still_axes(figsize=(8, 4.4))
             image = axes.pcolormesh(x, y, last, cmap=_MAP, shading="nearest")
             axes.set_aspect("equal")
-            axes.set_title(title)
+            axes.set_title("Temperature at the end")
             axes.set_xlabel("x [m]")
             axes.set_ylabel("y [m]")
             drawn.colorbar(image, label="temperature [degC]", shrink=0.8)
         return drawn
 
     words = "Heat spreads from the heaters; where there is none the floor is colder."
-    return Picture(key="map", title=title, caption=words, interactive=figure, still=still)
+    return Picture(
+        "map", title, f"{words} The slider chooses the time.", figure, still, frames=moments,
+        alternative=f"A map of the floor: the temperature{value_range(fields)} degC in colours, at "
+        f"{len(frames)} times that a slider chooses.",
+    )  # fmt: skip

@@ -4,18 +4,27 @@ from collections.abc import Mapping
 
 import numpy as np
 import plotly.graph_objects as go
-from matplotlib import colormaps, rc_context
+from matplotlib import rc_context
 from matplotlib.collections import LineCollection
-from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from dvax.app.plots.panels import Curve, Panel, bound_panel, panels_picture
-from dvax.app.plots.picture import Picture
+from dvax.app.plots.downsample import rounded
+from dvax.app.plots.panels import Curve, Panel, bound_panel, panels_picture, value_range
+from dvax.app.plots.picture import Change, Frames, Picture
 from dvax.app.plots.store import Variable
-from dvax.app.plots.theme import INK, STILL_STYLE, blank, still_axes
+from dvax.app.plots.theme import (
+    INK,
+    MUTED,
+    STILL_STYLE,
+    SURFACE,
+    blank,
+    number,
+    pressure_bar,
+    still_axes,
+)
 
 _BUSIEST = 5
-_MAP = "viridis"
+_MAP, _MOMENTS = "viridis", 97
 _LINK_OFFSET = 0.012
 """How far, of the size of the map, a link is drawn to the right of the line between its nodes."""
 
@@ -62,64 +71,76 @@ def _days(data: Mapping[str, Variable]) -> Picture:
 def _map(data: Mapping[str, Variable]) -> Picture:
     place = data["place"].values.astype(float)
     first, last = (data[name].values.astype(int) - 1 for name in ("init_node", "term_node"))
-    load = data["flow"].values[-1] / data["capacity"].values[-1]
+    days = data["day"].values
+    frames = np.unique(np.linspace(0, len(days) - 1, _MOMENTS).round().astype(int))
+    loads = data["flow"].values[frames] / data["capacity"].values[frames]
+    load = loads[-1]
     along = place[last] - place[first]
     length = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
     right = np.column_stack([along[:, 1], -along[:, 0]]) / length
     aside = _LINK_OFFSET * np.ptp(place, axis=0).max() * right
     ends = np.stack([place[first] + aside, place[last] + aside], axis=1)
-    top = float(np.quantile(load, 0.98))
-    shades = colormaps[_MAP](np.clip(load / top, 0.0, 1.0))
+    top = float(np.quantile(loads, 0.98))
     figure = blank(620)
-    for k, (a, b) in enumerate(ends):
-        figure.add_trace(
-            go.Scatter(
-                x=[a[0], b[0]], y=[a[1], b[1]], mode="lines", showlegend=False,
-                line=dict(color=to_hex(shades[k]), width=4),
-                text=f"{first[k] + 1} → {last[k] + 1}: {load[k]:.2f} of its capacity",
-                hovertemplate="%{text}<extra></extra>",
-            )
-        )  # fmt: skip
+    # A gap between any two links makes one trace of all of them.
+    gaps = np.full((len(ends), 1, 2), np.nan)
+    lines = np.concatenate([ends, gaps], axis=1).reshape(-1, 2)
+    figure.add_trace(
+        go.Scatter(
+            x=lines[:, 0], y=lines[:, 1], mode="lines", showlegend=False, hoverinfo="skip",
+            line=dict(color=MUTED, width=1),
+        )
+    )  # fmt: skip
     figure.add_trace(
         go.Scatter(
             x=place[:, 0], y=place[:, 1], mode="markers+text", showlegend=False,
             text=[str(k + 1) for k in range(len(place))], textposition="middle center",
             textfont=dict(size=9, color=INK), hoverinfo="skip",
-            marker=dict(
-                size=17, color=np.zeros(len(place)), colorscale=[[0, "white"], [1, "white"]],
-                line=dict(color=INK, width=1),
-            ),
+            marker=dict(size=17, color=SURFACE, line=dict(color=INK, width=1)),
         )
     )  # fmt: skip
+    # Arrows in the middle of the links: Plotly reads values off markers, and not off lines.
+    middle = ends.mean(axis=1)
     figure.add_trace(
         go.Scatter(
-            x=[None], y=[None], mode="markers", showlegend=False,
+            x=middle[:, 0], y=middle[:, 1], mode="markers", showlegend=False,
+            text=[f"{a + 1} → {b + 1}" for a, b in zip(first, last)],
+            hovertemplate="%{text}: %{marker.color:.3g} of its capacity<extra></extra>",
             marker=dict(
-                colorscale=_MAP.capitalize(), cmin=0.0, cmax=top, color=[0.0],
-                colorbar=dict(title=dict(text="flow / capacity", side="right")),
+                symbol="arrow", size=18, angle=np.degrees(np.arctan2(along[:, 0], along[:, 1])),
+                color=rounded(load), cmin=0.0, cmax=top, colorscale=_MAP.capitalize(),
+                line=dict(color=MUTED, width=1),
+                colorbar=pressure_bar(figure, "flow / capacity", 620),
             ),
         )
     )  # fmt: skip
-    figure.update_xaxes(visible=False)
-    figure.update_yaxes(visible=False, scaleanchor="x")
+    figure.update_xaxes(visible=False, constrain="domain")
+    figure.update_yaxes(visible=False, scaleanchor="x", constrain="domain")
+    labels = tuple(f"day {number(float(t))}" for t in days[frames])
+    moments = Frames(
+        days[frames], labels, (Change(2, "marker.color", rounded(loads)),), len(frames) - 1
+    )
 
     def still() -> Figure:
         with rc_context({**STILL_STYLE, "axes.grid": False}):
             drawn, axes = still_axes(figsize=(8, 8))
-            lines = LineCollection(list(ends), array=load, cmap=_MAP, linewidths=3.0)
-            lines.set_clim(0.0, top)
-            axes.add_collection(lines)
+            drawn_links = LineCollection(list(ends), array=load, cmap=_MAP, linewidths=3.0)
+            drawn_links.set_clim(0.0, top)
+            axes.add_collection(drawn_links)
             axes.scatter(place[:, 0], place[:, 1], s=130, c="white", edgecolors=INK, zorder=3)
             for k, (x, y) in enumerate(place):
                 axes.text(x, y, str(k + 1), ha="center", va="center", fontsize=7, zorder=4)
             axes.set_aspect("equal")
             axes.set_axis_off()
             axes.set_title("How full the links are in the end")
-            drawn.colorbar(lines, label="flow / capacity", shrink=0.7)
+            drawn.colorbar(drawn_links, label="flow / capacity", shrink=0.7)
         return drawn
 
     return Picture(
-        key="map", title="How full the links are in the end",
-        caption="Of the two lines between nodes, each is on the right of its direction.",
-        interactive=figure, still=still,
+        "map", "How full the links are",
+        "An arrow stands in the middle of each link and points along it. Of the two links between "
+        "nodes, each is on the right of its direction. The slider chooses the day.",
+        figure, still, frames=moments,
+        alternative=f"A map of the network with {len(ends)} links; the flow over the capacity"
+        f"{value_range(loads)} in colours, on {len(frames)} days that a slider chooses.",
     )  # fmt: skip

@@ -75,7 +75,8 @@ def _cylinder(data: Mapping[str, Variable]) -> Picture:
         [Panel([path, circle], "second direction", "MPa", share=2.0)],
         "deviatoric stress, first direction", "MPa",
     )  # fmt: skip
-    picture.interactive.update_yaxes(scaleanchor="x")
+    picture.interactive.update_xaxes(constrain="domain")
+    picture.interactive.update_yaxes(scaleanchor="x", constrain="domain")
     drawing = picture.still
 
     def still() -> Figure:

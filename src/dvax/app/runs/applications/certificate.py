@@ -14,11 +14,13 @@ from dvax.theory.certificate import continue_bound
 class Certificate(NamedTuple):
     """A bound on ‖x_h − x‖ at every saved time, and what it rests on.
 
-    A piece of a run that goes on needs its `bound`."""
+    A piece of a run that goes on needs its `bound`. `size` is the largest norm of the computed state at
+    the saved times so far."""
 
     values: np.ndarray
     status: Any
     bound: Bound | None = None
+    size: float = 0.0
 
     @property
     def largest(self) -> float | None:
@@ -28,7 +30,10 @@ class Certificate(NamedTuple):
 
     def figure(self, unit: str, words: str) -> Figure:
         """The largest bound as a headline figure, with the word for how much is known of it."""
-        return Figure(self.largest, unit, f"{words} ({self.status})", bound=self.status)
+        top = self.largest
+        relative = None if top is None or not self.size > 0 else top / self.size
+        said = f"{words} ({self.status})"
+        return Figure(top, unit, said, bound=self.status, relative=relative)
 
     def variable(self, dimension: str, unit: str, words: str) -> Variable:
         """The bounds at the saved times."""

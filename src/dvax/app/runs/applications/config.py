@@ -202,11 +202,11 @@ def _check(
             place, is_folder = f"{file}: model.{key}", key in application.folders
             with problems.collect():
                 paths[key] = locate(given, source.parent, allow_outside, place, is_folder=is_folder)
-            for name in application.folders.get(key, ()):
+            for inside in application.folders.get(key, ()):
                 # A link in the folder may lead out of it.
-                if key in paths and (paths[key] / name).is_file():
+                if key in paths and (paths[key] / inside).is_file():
                     with problems.collect():
-                        locate(f"{given}/{name}", source.parent, allow_outside, place)
+                        locate(f"{given}/{inside}", source.parent, allow_outside, place)
     problems.raise_any()
     with wording_of(application, file).in_keys():
         model = application(table, paths, quiet)

@@ -205,7 +205,10 @@ class AbstractModelApplication(abc.ABC):
         """The bound on the error of a piece of the run, which goes on from the one `before`."""
         if self.constants is None or piece is None:
             return None
-        return certificate(self.own.problem, piece, self.constants, before)
+        found = certificate(self.own.problem, piece, self.constants, before)
+        space = self.own.problem.spaces(self.own.x0)[0]
+        size = float(np.max(self.per_row("norm", space.norm, piece.xs)))
+        return found._replace(size=size if before is None else max(size, before.size))
 
     def rows(self, piece: Any, bound: Certificate | None, count: int) -> dict[str, Variable]:
         """The variables over time at the first `count` rows of a piece: those that follow repeat the
@@ -219,9 +222,17 @@ class AbstractModelApplication(abc.ABC):
         found |= self.series(piece, bound)
         return {key: replace(v, values=np.asarray(v.values)[:count]) for key, v in found.items()}
 
-    def results(self, series: Mapping[str, np.ndarray], end: Any, status: str) -> Results:
-        """The results after the last row of the piece `end`; `status`: of the bound in the series."""
-        bound = Certificate(series["error_bound"], status) if "error_bound" in series else None
+    def results(
+        self, series: Mapping[str, np.ndarray], end: Any, status: str, size: float = 0.0
+    ) -> Results:
+        """The results after the last row of the piece `end`; `status`: of the bound in the series, and
+        `size`: the largest norm of the state."""
+        scaled = self.bound_scale * size
+        bound = (
+            Certificate(series["error_bound"], status, size=scaled)
+            if "error_bound" in series
+            else None
+        )
         figures, fixed = self.figures(series, end, bound), self.fixed(end)
         return Results(figures, fixed, lambda directory: self.write_files(directory, end))
 

@@ -27,6 +27,8 @@ from dvax.theory import Constants
 
 _BUFFER_BYTES = 2**23
 """So much of pieces and rows is held until it is written."""
+_COUNTS = ("states", "responses")
+"""The sizes that the manifest has."""
 _CHUNK_BYTES, _CHUNK_ROWS = 2**23, 10_000
 
 
@@ -44,7 +46,8 @@ class ApplicationRun(AbstractRun):
         self.model, self.wording = config.model, config.wording
         known = self.model.describe()
         title = self.model.own.title or f"{config.name}, {config.source.stem}"
-        about = {"model": config.name, "title": title, "fit": self.model.fit}
+        about: dict[str, Any] = {"model": config.name, "title": title, "fit": self.model.fit}
+        about |= {what: int(count) for what, count, _ in known.sizes if what in _COUNTS}
         rows = constant_rows(known.constants)
         self.facts = Facts(rows, known.assumptions, config.fingerprints(), known.notes, about)
         self.plan: Plan | None = None
@@ -197,9 +200,9 @@ class ApplicationRun(AbstractRun):
         """Return a function that computes the results of the rows in the store."""
         assert self.store is not None
         series, end = self.store.series(), self.end
-        status = "" if self.bound is None else self.bound.status
+        status, size = ("", 0.0) if self.bound is None else (self.bound.status, self.bound.size)
         whole = self._whole(series[self.store.axis]) if self.model.whole else lambda: end
-        return lambda: self.model.results(series, whole(), status)
+        return lambda: self.model.results(series, whole(), status, size)
 
     def _whole(self, times: np.ndarray) -> Callable[[], Solution]:
         """Return a function that reads and joins the pieces with these times. Their last row is

@@ -87,6 +87,7 @@ def _solve(sweep: Sweep, directory: Path, member: int, digest: str) -> dict[str,
         **about,
         "seconds": round(time.monotonic() - clock, 3),
         **_from_manifest(folder),
+        "bounds": _bounds(folder),
         "host": platform.node(),
         "process": os.getpid(),
     }
@@ -148,6 +149,13 @@ def _manifest(folder: Path) -> Mapping[str, Any]:
     except (OSError, ValueError):
         return {}
     return manifest if isinstance(manifest, dict) else {}
+
+
+def _bounds(folder: Path) -> dict[str, str]:
+    """Return how much is known of each bound in the summary of a run."""
+    file = folder / "summary.json"
+    summary = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    return {name: entry["bound"] for name, entry in summary.items() if "bound" in entry}
 
 
 def _from_manifest(folder: Path) -> dict[str, Any]:
