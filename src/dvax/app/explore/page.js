@@ -156,7 +156,9 @@
     });
   }
 
-  function drawAll(content) {
+  // `asked`: the frame of the question. Another one may have been chosen since.
+  function drawAll(content, asked) {
+    const chosen = frame;
     last = parsed(content);
     last.text = content;
     at("error").hidden = true;
@@ -174,6 +176,7 @@
     at("prediction").textContent = last.prediction;
     at("notes").hidden = !last.notes.length;
     at("notes").textContent = last.notes.join("\n");
+    if (last.frames && chosen !== asked) show(Math.min(chosen, last.frames.times.length - 1));
   }
 
   function numbers() {
@@ -216,13 +219,13 @@
       waiting = { derivative: derivative || (waiting !== null && waiting.derivative) };
       return;
     }
-    const number = ++sequence, began = performance.now();
+    const number = ++sequence, began = performance.now(), asked = frame;
     waiting = null;
     started = began;
     let more = false;
     try {
       const content = await text("solve", {
-        values: values, base: base, slider: slider, derivative: derivative, frame: frame
+        values: values, base: base, slider: slider, derivative: derivative, frame: asked
       });
       if (number !== sequence) return;
       const found = JSON.parse(content);
@@ -231,7 +234,7 @@
         say("not solved");
       } else if (!found.outdated) {
         answer = found.answer;
-        drawAll(content);
+        drawAll(content, asked);
         say("answered in " + Math.round(performance.now() - began) + " ms");
         more = found.hasMore && !dragging;
       }
