@@ -156,27 +156,30 @@
     });
   }
 
-  // `asked`: the frame of the question. Another one may have been chosen since.
-  function drawAll(content, asked) {
-    const chosen = frame;
+  function drawAll(content) {
     last = parsed(content);
     last.text = content;
     at("error").hidden = true;
     if (last.frames) {
       const scrub = at("frame");
       scrub.max = last.frames.times.length - 1;
-      frame = last.frames.frame;
+      // The time may have been moved since the question was sent.
+      if (frame === null) frame = last.frames.frame;
+      frame = Math.min(frame, last.frames.times.length - 1);
       scrub.value = frame;
       at("time").hidden = false;
       moment();
     }
     last.drawings.forEach(function (drawing, k) { draw(drawing, at(k ? "after" : "before")); });
-    if (last.frames) last.frames.drawings.forEach(function (d) { draw(d, at("frames")); });
+    if (last.frames && last.frames.frame === frame) {
+      last.frames.drawings.forEach(function (d) { draw(d, at("frames")); });
+    } else if (last.frames) {
+      show(frame);
+    }
     numbers();
     at("prediction").textContent = last.prediction;
     at("notes").hidden = !last.notes.length;
     at("notes").textContent = last.notes.join("\n");
-    if (last.frames && chosen !== asked) show(Math.min(chosen, last.frames.times.length - 1));
   }
 
   function numbers() {
@@ -219,13 +222,13 @@
       waiting = { derivative: derivative || (waiting !== null && waiting.derivative) };
       return;
     }
-    const number = ++sequence, began = performance.now(), asked = frame;
+    const number = ++sequence, began = performance.now();
     waiting = null;
     started = began;
     let more = false;
     try {
       const content = await text("solve", {
-        values: values, base: base, slider: slider, derivative: derivative, frame: asked
+        values: values, base: base, slider: slider, derivative: derivative, frame: frame
       });
       if (number !== sequence) return;
       const found = JSON.parse(content);
@@ -234,7 +237,7 @@
         say("not solved");
       } else if (!found.outdated) {
         answer = found.answer;
-        drawAll(content, asked);
+        drawAll(content);
         say("answered in " + Math.round(performance.now() - began) + " ms");
         more = found.hasMore && !dragging;
       }
@@ -341,14 +344,16 @@
     document.querySelectorAll(".plot").forEach(function (plot) {
       if (plot.dataset.time) Plotly.relayout(plot, { shapes: mark() });
     });
-    if (moved.frame) return; // the request in flight is followed by one for the newest frame
+    if (moved.frame) return; // the request in flight is followed by one for the newest time
     moved.frame = true;
     try {
-      let drawn = -1;
-      while (drawn !== frame && answer !== null) {
+      let drawn = -1, of = null;
+      while (drawn !== frame || of !== answer) {
         drawn = frame;
-        const found = parsed(await text("frame", { answer: answer, frame: drawn }));
-        if (!found.outdated) found.drawings.forEach(function (d) { draw(d, at("frames")); });
+        of = answer;
+        const found = parsed(await text("frame", { answer: of, frame: drawn }));
+        if (found.outdated || of !== answer) continue;
+        found.drawings.forEach(function (d) { draw(d, at("frames")); });
       }
     } catch (error) {
       failed("The server does not answer: " + error.message);
