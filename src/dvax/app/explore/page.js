@@ -163,13 +163,19 @@
     if (last.frames) {
       const scrub = at("frame");
       scrub.max = last.frames.times.length - 1;
-      frame = last.frames.frame;
+      // The time may have been moved since the question was sent.
+      if (frame === null) frame = last.frames.frame;
+      frame = Math.min(frame, last.frames.times.length - 1);
       scrub.value = frame;
       at("time").hidden = false;
       moment();
     }
     last.drawings.forEach(function (drawing, k) { draw(drawing, at(k ? "after" : "before")); });
-    if (last.frames) last.frames.drawings.forEach(function (d) { draw(d, at("frames")); });
+    if (last.frames && last.frames.frame === frame) {
+      last.frames.drawings.forEach(function (d) { draw(d, at("frames")); });
+    } else if (last.frames) {
+      show(frame);
+    }
     numbers();
     at("prediction").textContent = last.prediction;
     at("notes").hidden = !last.notes.length;
@@ -338,14 +344,16 @@
     document.querySelectorAll(".plot").forEach(function (plot) {
       if (plot.dataset.time) Plotly.relayout(plot, { shapes: mark() });
     });
-    if (moved.frame) return; // the request in flight is followed by one for the newest frame
+    if (moved.frame) return; // the request in flight is followed by one for the newest time
     moved.frame = true;
     try {
-      let drawn = -1;
-      while (drawn !== frame && answer !== null) {
+      let drawn = -1, of = null;
+      while (drawn !== frame || of !== answer) {
         drawn = frame;
-        const found = parsed(await text("frame", { answer: answer, frame: drawn }));
-        if (!found.outdated) found.drawings.forEach(function (d) { draw(d, at("frames")); });
+        of = answer;
+        const found = parsed(await text("frame", { answer: of, frame: drawn }));
+        if (found.outdated || of !== answer) continue;
+        found.drawings.forEach(function (d) { draw(d, at("frames")); });
       }
     } catch (error) {
       failed("The server does not answer: " + error.message);
