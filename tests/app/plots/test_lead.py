@@ -151,6 +151,7 @@ def test_lead_says_how_an_unfinished_run_ended(tmp_path: Path, status: str, word
     assert words in told and told.endswith("the results are partial.")
     empty = lead(read_run(write_run(tmp_path / "none", replace(recipe, written=0))))
     assert "there are no results for the contact law" in empty[0]
+    assert not any("error bound" in text for text in empty)
 
 
 def test_lead_says_that_a_run_was_resumed(tmp_path: Path) -> None:

@@ -98,6 +98,8 @@ def _span(run: RunRecord) -> str:
 def _bounded(run: RunRecord) -> str:
     """The error bound, how much is known of it, and its ratio to the size of the solution."""
     entry = best_bound(run.summary)
+    if run.trajectory is None:
+        return ""
     if entry is None:
         return "No error bound was computed." if run.summary else ""
     status, value = str(entry["bound"]), entry.get("value")
