@@ -27,10 +27,10 @@ SUBJECTS = {
 _STATE_BOUNDS = ("error_bound", "error_bound_sharp_x", "error_bound_x")
 """The figures that bound the error of the state."""
 _ENDINGS = {
-    "interrupted": "The run was interrupted",
-    "failed": "The run failed",
-    "killed": "The run was killed",
-    "running": "The run has not ended",
+    "interrupted": "The run was interrupted before its end",
+    "failed": "The run failed before its end",
+    "killed": "The run was killed before its end",
+    "running": "The run has not ended, or was killed",
 }
 _RESTS_ON = {
     "proved": "it follows from the structure of the problem, up to roundoff",
@@ -50,7 +50,7 @@ def _solved(run: RunRecord) -> str:
     """What was solved, over which time, how it ended."""
     if run.trajectory is None:
         ending = _ENDINGS.get(run.status, "The run ended")
-        return f"{ending} before it wrote results for {_subject(run)}."
+        return f"{ending}: there are no results for {_subject(run)}."
     steps, method = run.manifest.get("steps"), run.manifest.get("method")
     # The method may be followed by the reason for its choice.
     name = f" of {str(method).partition(':')[0]}" if method else ""
@@ -61,14 +61,15 @@ def _solved(run: RunRecord) -> str:
     if run.resumed:
         text += f" It was resumed at {' and '.join(run.resumed)}."
     if run.status in _ENDINGS:
-        text += f" {_ENDINGS[run.status]} before its end: the results are partial."
+        text += f" {_ENDINGS[run.status]}: the results are partial."
     return text
 
 
 def _subject(run: RunRecord) -> str:
     if run.model == "python":
         # The fit names the file that the configuration names, and not its copy.
-        return str(run.manifest.get("fit") or "a problem of your own").replace(":", ",")
+        words, _, file = str(run.manifest.get("fit") or "a problem of your own").partition(": ")
+        return f"{words} ({file})" if file else words
     return SUBJECTS.get(run.model, f"the model {run.model}")
 
 
@@ -97,6 +98,8 @@ def _span(run: RunRecord) -> str:
 def _bounded(run: RunRecord) -> str:
     """The error bound, how much is known of it, and its ratio to the size of the solution."""
     entry = best_bound(run.summary)
+    if run.trajectory is None:
+        return ""
     if entry is None:
         return "No error bound was computed." if run.summary else ""
     status, value = str(entry["bound"]), entry.get("value")

@@ -134,20 +134,24 @@ def _bounds(members: _Members | None, lines: list[dict[str, Any]]) -> list[str]:
     for figure in figures:
         # In the store, a figure with the name of a variable has this prefix.
         name = figure.name.removeprefix("summary_")
-        known = Counter(
+        statuses = Counter(
             line["bounds"][name]
             for line in lines
             if line["status"] == "finished" and name in line.get("bounds", {})
         )
-        if "error_bound" not in figure.name or not known or members is None:
+        if "error_bound" not in figure.name or not statuses or members is None:
             continue
-        words = " and ".join(f"{status} for {counted(n, 'member')}" for status, n in known.items())
+        words = " and ".join(
+            f"{status} for {counted(n, 'member')}" for status, n in statuses.items()
+        )
         values = figure.values[members.finished]
         if not np.isfinite(values).all():
             return [
                 f"The error bound is {words}; it is not finite for some, and states nothing there."
             ]
-        largest = entry_text({"value": float(values.max()), "bound": max(known, key=ORDER.index)})
+        largest = entry_text(
+            {"value": float(values.max()), "bound": max(statuses, key=ORDER.index)}
+        )
         return [
             f"The error bound is {words}; the largest is {largest} {unit_text(figure.unit)}".rstrip()
             + "."

@@ -106,7 +106,9 @@ class Figures:
         )
         size = last["norm_x"]
         relative = {
-            name: last[name] / size for name in ("error_bound_x", "error_bound_sharp_x") if size > 0
+            name: last[name] / size
+            for name in ("error_bound_x", "error_bound_sharp_x")
+            if 0 < size < np.inf
         }
         return {
             name: Figure(value, unit, meaning, bound=bounds.get(name), relative=relative.get(name))

@@ -31,7 +31,7 @@ class Certificate(NamedTuple):
     def figure(self, unit: str, words: str) -> Figure:
         """The largest bound as a headline figure, with the word for how much is known of it."""
         top = self.largest
-        relative = None if top is None or not self.size > 0 else top / self.size
+        relative = None if top is None or not 0 < self.size < np.inf else top / self.size
         said = f"{words} ({self.status})"
         return Figure(top, unit, said, bound=self.status, relative=relative)
 
