@@ -136,7 +136,7 @@ def test_conda_recipe_has_the_requirements_of_the_package():
     """Conda packages have no extras: the recipe has those of the command line too."""
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())
     project = declared["project"]
-    recipe = (ROOT / "packaging" / "conda" / "recipe.yaml").read_text()
+    recipe = (ROOT / "conda" / "recipe.yaml").read_text()
     parts = re.findall(r"^  (host|run|run_constraints):\n((?:    - .+\n)+)", recipe, re.MULTILINE)
     found = {part: {line.strip()[2:] for line in lines.splitlines()} for part, lines in parts}
     apart = {"python ${{ python_min }}.*", "python >=${{ python_min }}", "pip"}

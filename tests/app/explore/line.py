@@ -17,10 +17,12 @@ from dvax.app.explore.subject import (
     Question,
     Values,
 )
+from dvax.app.plots.picture import Views
 from dvax.app.plots.theme import BLUE, VERMILLION
 from dvax.errors import input_error
 
 TIMES = np.linspace(0.0, 1.0, 11)
+VIEWS = Views("Show the", ("place", "rate"))
 
 
 class LineFrames(AbstractFrames):
@@ -50,10 +52,10 @@ class Line(AbstractSubject):
         a = question.values["a"]
         if a > 9.0:
             raise input_error("a", f"{a:g}", "it is at most 9", "Move it back")
-        curves = [line(TIMES, a * TIMES, "x", BLUE)]
+        curves = [line(TIMES, a * TIMES, "x", BLUE), line(TIMES, a + 0 * TIMES, "rate", BLUE)]
         axes = layout(240, ("time", "s"), ("x", "mm"))
         return Answer(
-            [Drawing("curve", "The line", "x over time", curves, axes, has_time=True)],
+            [Drawing("curve", "The line", "x over time", curves, axes, VIEWS, has_time=True)],
             [Number("slope", f"{a:g}", "mm/s", "of the line")],
             Certificate("proved", ("The line is exact.",)),
             LineFrames(a),

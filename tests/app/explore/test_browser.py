@@ -68,6 +68,11 @@ def test_page_changes_a_number_when_a_slider_moves(
     ) == ("3.162 mm/s")
     labels = "Array.from(document.querySelectorAll('.plot')).map(p => p.getAttribute('aria-label'))"
     assert page.value(labels) == ["The line. x over time", "Level at t = 0.5 s. "]
+    shown = "document.querySelector('.plot').data.map(trace => trace.visible)"
+    chosen = "document.querySelector('.views [aria-pressed=true]').textContent"
+    assert (page.value(shown), page.value(chosen)) == ([True, False], "place")
+    page.value("Array.from(document.querySelectorAll('.views button'))[1].click()")
+    assert (page.value(shown), page.value(chosen)) == ([False, True], "rate")
     # In one script, as a hand moves it: an answer between the two would set the slider again.
     page.value(
         "const f = document.getElementById('frame'); f.value = 8; f.dispatchEvent(new Event('input'))"

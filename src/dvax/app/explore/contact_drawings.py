@@ -101,7 +101,7 @@ class ContactFrames(AbstractFrames):
             "profile",
             f"Pressure along the boundary at t = {at}",
             "The strip below the curve shows the regimes: unloaded (pale), active (blue: contact below "
-            "the capacity) and saturated (orange: the pressure is at κ₀).",
+            "the capacity) and saturated (brown: the pressure is at κ₀).",
             data,
             layout(
                 380, ("place on the boundary", f.units.length), ("pressure", f.units.pressure),

@@ -117,7 +117,7 @@
     const row = box.querySelector(".views");
     if (!drawing.views) return;
     const names = drawing.views.labels;
-    if (views[drawing.key] === undefined) views[drawing.key] = drawing.views.first;
+    if (views[drawing.key] === undefined) views[drawing.key] = 0;
     const show = function (index) {
       names.forEach(function (_, k) { drawing.data[k].visible = k === index; });
     };
@@ -131,17 +131,6 @@
       Plotly.restyle(plot, { visible: names.map(function (_, k) { return k === index; }) },
         names.map(function (_, k) { return k; }));
     };
-    if (drawing.views.slider) {
-      const output = element("output", { textContent: names[views[drawing.key]] });
-      const input = element("input", { type: "range", min: 0, max: names.length - 1, value: views[drawing.key] });
-      input.setAttribute("aria-label", drawing.views.name);
-      input.addEventListener("input", function () {
-        output.textContent = names[Number(input.value)];
-        redraw(Number(input.value));
-      });
-      row.append(drawing.views.name, input, output);
-      return;
-    }
     row.append(drawing.views.name);
     names.forEach(function (name, index) {
       const button = element("button", { type: "button", textContent: name });
