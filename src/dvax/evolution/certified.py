@@ -20,6 +20,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..problem import Problem
+from ..spaces import AbstractSpace
 from .defect import ROUNDINGS
 from .growth import between, disturbance, gronwall
 from .results import RESULTS
@@ -194,13 +195,17 @@ def _roundoff(
     """Return bounds on the error due to roundoff: of x in all steps, and of t, with |x'| of the size
     `rate`."""
     space = solution.setup.problem.spaces(solution.setup.x0)[0]
-    sizes = jax.vmap(space.norm)(solution.xs)
-    size = float(np.maximum(np.max(np.asarray(sizes)), space.norm(solution.setup.x0)))
+    size = float(_largest_norm(space, solution.setup.x0, solution.xs))
     eps = float(jnp.finfo(solution.setup.dtype).eps)
     steps = int(solution.stats["steps"])
     factor = min(M * np.exp(min(max(c, 0.0) * (t1 - t0), 700.0)) for M, c in growth.rates)
     of_steps = ROUNDINGS * steps * size
     return float(factor) * eps * of_steps, ROUNDINGS * eps * max(abs(t0), abs(t1)) * rate
+
+
+@eqx.filter_jit
+def _largest_norm(space: AbstractSpace, x0: Tree, xs: Tree) -> jax.Array:
+    return jnp.maximum(jnp.max(jax.vmap(space.norm)(xs)), space.norm(x0))
 
 
 def _interval_bounds(solution: Solution, growth: _Growth, t0: float) -> Any:
