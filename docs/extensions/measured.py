@@ -59,7 +59,15 @@ def cells(row: dict[str, Any]) -> tuple[str, ...]:
             values = [1.0 / values[0], 1.0 / values[2], 1.0 / values[1]]
         ratio = "{:.3g} ({:.3g} to {:.3g})".format(*values)
     errors = ("–" if e is None else f"{e:.1e}" for e in (row["error"], row["error_other"]))
-    return row["case"], row["versus"], duration(row["dvax"]), duration(row["other"]), ratio, *errors
+    numbers = (duration(row["dvax"]), duration(row["other"]), ratio, *errors)
+    return row["case"], row["versus"], *map(unbroken, numbers)
+
+
+def unbroken(number: str) -> str:
+    """Return a number that no line breaks, neither before its unit nor at its sign."""
+    return (
+        number.replace(" (", "\n(").replace(" ", "\u00a0").replace("-", "\u2011").replace("\n", " ")
+    )
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
