@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
-from tests.app.plots.browser import CHROMIUM, Tab, browser
+from tests.app.browser import CHROMIUM, Tab, browser
 from tests.app.plots.synthetic import CONSTANTS, Recipe, write_run
 
 from dvax.app.plots import build_report

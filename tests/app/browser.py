@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,11 +30,11 @@ os.execv(sys.argv[3], sys.argv[3:])
 
 class Tab:
     """One page. `shown` is what `open` has loaded, `errors` are the complaints of the console and of
-    the page, and `requests` the addresses that the page asked for besides its own."""
+    the page, and `requests` the addresses that it asked for, files and data apart."""
 
     def __init__(self, read: Any, write: Any):
         self._read, self._write, self._count, self._session = read, write, 0, ""
-        self.shown: tuple[Path, int, str] | None = None
+        self.shown: tuple[Path | str, int, str] | None = None
         self.errors: list[str] = []
         self.requests: list[str] = []
         target = self("Target.createTarget", url="about:blank")["targetId"]
@@ -77,8 +78,10 @@ class Tab:
             if not address.startswith(("file:", "data:", "blob:")):
                 self.requests.append(address)
 
-    def open(self, page: Path, width: int = 1280, height: int = 900, scheme: str = "light") -> None:
-        """Load a page in a window of this size, and wait until its figures are drawn."""
+    def open(
+        self, page: Path | str, width: int = 1280, height: int = 900, scheme: str = "light"
+    ) -> None:
+        """Load a file or an address in a window of this size, and wait until a report is drawn."""
         self.shown = (page, width, scheme)
         self.errors.clear()
         self.requests.clear()
@@ -87,7 +90,7 @@ class Tab:
             mobile=width < 500,
         )  # fmt: skip
         self.set_scheme(scheme)
-        self("Page.navigate", url=f"file://{page}")
+        self("Page.navigate", url=page if isinstance(page, str) else f"file://{page}")
         self._until(lambda answer: answer.get("method") == "Page.loadEventFired")
         self.run("window.report ? window.report.ready : null")
 
@@ -101,6 +104,14 @@ class Tab:
         found = self("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
+
+    def wait_for(self, script: str, seconds: float = 60.0) -> Any:
+        """Wait until an expression is true, and return it."""
+        end = time.monotonic() + seconds
+        while not (found := self.run(script)):
+            assert time.monotonic() < end, f"{script} stayed {found!r}; {self.errors}"
+            time.sleep(0.05)
+        return found
 
     def place(self, selector: str) -> dict[str, float]:
         """Return x, y, width and height of an element on the page."""
