@@ -292,3 +292,20 @@ def test_constants_of_data_that_depend_on_time_hold_in_their_interval(data):
     assert check.constants.domain.t1 == 1.0
     later = dvax.solve(problem, -1.0, 0.0, 3.0, method=dvax.ETD2RK())
     assert dvax.bound_error(problem, later, check.constants).status != "proved"
+
+
+def test_set_that_depends_on_args_alone_is_proved_as_a_fixed_one_is():
+    triangle = jnp.array([[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    polyhedron = lambda total: dvax.sets.Polyhedron(  # noqa: E731
+        triangle, jnp.array([1.0, 0.0, 0.0]) * total
+    )
+    parts = dict(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),
+        f=lambda t, x, u, total: u - 0.1 * x, h=lambda t, x, u, total: 1.0 - x,
+    )  # fmt: skip
+    x0 = jnp.zeros(2)
+    fixed = dvax.verify(dvax.Problem(K=polyhedron(0.7), **parts), x0, args=0.7)
+    called = dvax.verify(dvax.Problem(K=lambda t, total: polyhedron(total), **parts), x0, args=0.7)
+    assert [a.status for a in called.assumptions] == [a.status for a in fixed.assumptions]
+    moving = dvax.Problem(K=lambda t, total: polyhedron(total + 0.1 * t), **parts)
+    assert dvax.verify(moving, x0, args=0.7).status != "proved"

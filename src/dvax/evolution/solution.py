@@ -302,7 +302,7 @@ class Solution(eqx.Module):
             raise InputError(
                 InputProblem(
                     "Solution.regimes",
-                    f"a {type(flow.problem.set_at(t0, flow.args)).__name__}",
+                    f"K of type {type(flow.problem.set_at(t0, flow.args)).__name__}",
                     "the set must have switch functions (dvax.sets.AbstractSet.switches)",
                     "Write K as a set that has them, such as dvax.sets.Polyhedron",
                 )

@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -11,7 +12,9 @@ import numpy as np
 
 from .._tree import Tree
 from ..errors import InputError
+from ..problem import Problem
 from ..programs.slope import Slope, SlopeEnclosure, TooLarge, Values, interval, is_slope
+from ..programs.structure import independent
 from ..sets import AbstractSet, Ball, Intersection, Simplex
 from ..spaces import AbstractSpace
 from .system import System
@@ -55,7 +58,7 @@ def set_motion(system: System, t0: float, t1: float, knots: Values) -> SetMotion
     problem, like, args = system.problem, system.u0, system.args
     no_bounds = _infinite_bounds(like)
     first = problem.set_at(jnp.asarray(t0), args)
-    is_constant = isinstance(problem.K, AbstractSet)
+    is_constant = does_not_move(problem, t0, args)
     empty = _empty_at(system, np.array([t0]) if is_constant else _samples(t0, t1, knots))
     if _describe(first, like, system.control) is None:
         # The shape of the set is unknown. A constant set was checked when it was constructed.
@@ -79,6 +82,19 @@ def set_motion(system: System, t0: float, t1: float, knots: Values) -> SetMotion
     except TooLarge:
         return SetMotion(np.inf, *no_bounds, False, empty)
     return SetMotion(speed, low, high, is_nonempty and empty is None, empty)
+
+
+def does_not_move(problem: Problem, t: float, args: Any) -> bool:
+    """Return whether K is a set, or a function whose code proves that it does not depend on t."""
+    if isinstance(problem.K, AbstractSet):
+        return True
+
+    def numbers(t: Any) -> list[Any]:
+        return jtu.tree_leaves(problem.set_at(t, args))
+
+    # A function in a set may use t, which its code does not show.
+    known = all(map(eqx.is_array_like, numbers(jnp.asarray(t))))
+    return known and independent(numbers, jnp.asarray(t))
 
 
 def _rejects_empty(K: AbstractSet) -> bool:

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -15,7 +14,6 @@ from ..evolution.nonfinite import refuse_nonfinite_data
 from ..problem import Problem
 from ..programs.slope import Slope, SlopeEnclosure, TooLarge, interval, is_slope
 from ..programs.structure import independent_of_first
-from ..sets import AbstractSet
 from .assumptions import Assumption, assumptions
 from .certificate import is_declared
 from .constants import Constants
@@ -24,7 +22,7 @@ from .energy import energy_norm
 from .moduli import sharp_rate
 from .modulus_status import ModulusStatuses, modulus_statuses
 from .region import Region, as_intervals
-from .set_motion import SetMotion, set_motion
+from .set_motion import SetMotion, does_not_move, set_motion
 from .status import Status, weakest
 from .system import System
 
@@ -168,17 +166,12 @@ def _is_autonomous(system: System, t: float) -> bool:
     """Return whether the code of f, h and K proves that none of them depends on t."""
     problem, args = system.problem, system.args
 
-    def set_data(t: Any) -> list[Any]:
-        constant = isinstance(problem.K, AbstractSet)
-        return [] if constant else jtu.tree_leaves(problem.set_at(t, args))
-
     def data(t: Any, x: Any, u: Any) -> Any:
-        return problem.f(t, x, u, args), problem.h(t, x, u, args), set_data(t)
+        return problem.f(t, x, u, args), problem.h(t, x, u, args)
 
-    # A function in a set may use t, which its code does not show.
-    if not all(map(eqx.is_array_like, set_data(jnp.asarray(t)))):
-        return False
-    return independent_of_first(data, jnp.asarray(t), system.x0, system.u0)
+    return does_not_move(problem, t, args) and independent_of_first(
+        data, jnp.asarray(t), system.x0, system.u0
+    )
 
 
 def _route(system: System, moduli: ModulusStatuses) -> str:

@@ -10,7 +10,7 @@ from pydantic import Field
 from dvax.app.runs.applications.base import Figure, Variable
 from dvax.app.runs.applications.certificate import Certificate
 from dvax.app.runs.applications.from_model import AbstractModelApplication, store_name
-from dvax.app.runs.schema import SolverKeys, in_quantity
+from dvax.app.runs.schema import SolverKeys, in_quantity, in_unit
 from dvax.app.runs.solver_options import event_driven
 from dvax.evolution import ExpRosenbrock, PiecewiseLinear, Solution
 from dvax.models import Model
@@ -24,10 +24,10 @@ class CircuitSection(SolverKeys):
     netlist: str = Field(description="file with the elements of the circuit, a line each")
     t_end: Annotated[float, in_quantity("time")] = Field(gt=0, description="end of the run [s]")
     frames: int = Field(500, ge=1, le=10**6, description="number of intervals between saved states")
-    r_on: float | None = Field(
+    r_on: Annotated[float, in_unit("ohm")] | None = Field(
         None, gt=0, description="resistance in series with diodes that have none [ohm]"
     )
-    g_leak: float | None = Field(
+    g_leak: Annotated[float, in_unit("siemens")] | None = Field(
         None, gt=0, description="conductance across diodes that have none [siemens]"
     )
 
