@@ -1,5 +1,5 @@
 """Tables of measured figures: before the build, each case in docs/measured/*.json, which
-`python -m benchmarks --save FILE` writes, becomes docs/generated/measured-CASE.md for pages to include.
+`python -m benchmarks --save FILE` writes, becomes docs/generated/measured-CASE.inc for pages to include.
 """
 
 import json
@@ -19,7 +19,7 @@ def write(app: Sphinx) -> None:
         content = json.loads(file.read_text("utf-8"))
         for section in content["sections"]:
             text = "\n".join(lines(section, content)) + "\n"
-            (target / f"measured-{section['name']}.md").write_text(text, "utf-8")
+            (target / f"measured-{section['name']}.inc").write_text(text, "utf-8")
 
 
 def lines(section: dict[str, Any], run: dict[str, Any]) -> Iterator[str]:
