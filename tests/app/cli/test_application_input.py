@@ -50,10 +50,10 @@ REFUSED: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
         CIRCUIT, TANK.replace(" R=1k", ""), {"a.cir, line 3": ("r_on = 0.1 and g_leak = 1e-9",)},
     ),
     "units": (
-        CIRCUIT + 'r_on = "100 mohm"\ng_leak = "3 V"\n', TANK,
+        CIRCUIT + 'r_on = "100 mV"\ng_leak = "3 V"\n', TANK,
         {
-            "a.toml: model.r_on": ("without quotes, in ohm: r_on = 0.1  # ohm",),
-            "a.toml: model.g_leak": ("without quotes, in siemens.",),
+            "a.toml: model.r_on": ("it is a number in ohm", 'Write "2.5 ohm".'),
+            "a.toml: model.g_leak": ("it is a number in siemens", 'Write "2.5 siemens".'),
         },
     ),
     "no flow": (
@@ -231,3 +231,11 @@ def test_failed_run_without_results_reports_none(
     assert "what was computed" not in result.stderr and "nothing was written" not in result.stderr
     assert json.loads((out / "manifest.json").read_text())["status"] != "finished"
     assert not (out / "trajectory.zarr").exists()
+
+
+def test_resistance_of_a_circuit_takes_its_unit() -> None:
+    from dvax.app.runs.applications.models.circuit import CircuitSection
+
+    given = {"name": "circuit", "netlist": "a.cir", "t_end": "5 ms", "r_on": "100 mohm"}
+    table = CircuitSection.model_validate(given)
+    assert (table.r_on, table.g_leak, table.t_end) == (0.1, None, 0.005)
