@@ -1,5 +1,5 @@
 """Tables of measured figures: before the build, each case in docs/measured/*.json, which
-`python -m benchmarks --save FILE` writes, becomes docs/generated/measured-CASE.inc for pages to include.
+`python -m benchmarks --save FILE` writes, becomes docs/generated/measured-CASE.inc, which pages include.
 """
 
 import json
@@ -60,10 +60,10 @@ def cells(row: dict[str, Any]) -> tuple[str, ...]:
         ratio = "{:.3g} ({:.3g} to {:.3g})".format(*values)
     errors = ("–" if e is None else f"{e:.1e}" for e in (row["error"], row["error_other"]))
     numbers = (duration(row["dvax"]), duration(row["other"]), ratio, *errors)
-    return row["case"], row["versus"], *map(unbroken, numbers)
+    return row["case"], row["versus"], *map(on_one_line, numbers)
 
 
-def unbroken(number: str) -> str:
+def on_one_line(number: str) -> str:
     """Return a number that no line breaks, neither before its unit nor at its sign."""
     return (
         number.replace(" (", "\n(").replace(" ", "\u00a0").replace("-", "\u2011").replace("\n", " ")

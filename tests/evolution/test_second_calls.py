@@ -64,8 +64,14 @@ def test_second_piecewise_linear_run_traces_nothing_and_starts_where_it_should()
         second = run(middle, 4.0, 8.0)
     whole = run(x0, 0.0, 8.0)
     np.testing.assert_allclose(second.xs[-1], whole.xs[-1], atol=1e-9)
+    # Nor are arguments kept that NumPy changes in place.
+    load = np.array(2.0)
+    run(x0, 0.0, 4.0, load)
+    load[...] = 1.0
+    changed = run(x0, 0.0, 4.0, load)
     # Other arguments are not those that were kept.
     other = run(x0, 0.0, 4.0, 1.0)
     expected = dvax.solve(switched, x0, 0.0, 4.0, 1.0, rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(other.xs[-1], expected.xs[-1], atol=1e-8)
+    np.testing.assert_array_equal(changed.xs[-1], other.xs[-1])
     assert not np.allclose(other.xs[-1], first.xs[-1], atol=1e-3)

@@ -34,17 +34,19 @@ def wave(tmp_path_factory: pytest.TempPathFactory) -> ContactSubject:
 
 
 @pytest.fixture(scope="module")
-def moved(wave: ContactSubject) -> dict[str, float]:
+def values_elsewhere(wave: ContactSubject) -> dict[str, float]:
     return values_of(wave, **MOVED)
 
 
 @pytest.fixture(scope="module")
 def run_of_export(
-    wave: ContactSubject, moved: dict[str, float], tmp_path_factory: pytest.TempPathFactory
+    wave: ContactSubject,
+    values_elsewhere: dict[str, float],
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Any:
     """The run directory of the exported configuration."""
     folder = tmp_path_factory.mktemp("exported")
-    name, text = wave.export("configuration", moved)
+    name, text = wave.export("configuration", values_elsewhere)
     (folder / name).write_text(text, encoding="utf-8")
     outcome = driver.run(load_config(folder / name), folder / "run")
     assert outcome.status == "finished"
@@ -52,18 +54,18 @@ def run_of_export(
 
 
 def test_contact_pressure_is_that_of_a_run_of_the_exported_configuration(
-    wave: ContactSubject, moved: dict[str, float], run_of_export: Any
+    wave: ContactSubject, values_elsewhere: dict[str, float], run_of_export: Any
 ) -> None:
-    pressure = wave._solve(moved).fields.pressure
+    pressure = wave._solve(values_elsewhere).fields.pressure
     stored = run_of_export["pressure"].values
     assert stored.max() == pytest.approx(1.2), "the capacity is reached"
     np.testing.assert_allclose(pressure, stored, rtol=0, atol=1e-12)
 
 
 def test_contact_figures_are_those_of_a_run(
-    wave: ContactSubject, moved: dict[str, float], run_of_export: Any
+    wave: ContactSubject, values_elsewhere: dict[str, float], run_of_export: Any
 ) -> None:
-    answer = wave.solve(Question(moved, moved), nothing)
+    answer = wave.solve(Question(values_elsewhere, values_elsewhere), nothing)
     shown = {n.name.replace(" ", "_"): n for n in answer.numbers}
     assert {"peak_pressure", "final_force", "sharp_decay_rate"} <= set(shown)
     for name, number in shown.items():
@@ -74,13 +76,15 @@ def test_contact_figures_are_those_of_a_run(
 
 
 def test_contact_derivative_is_the_limit_of_difference_quotients(
-    wave: ContactSubject, moved: dict[str, float]
+    wave: ContactSubject, values_elsewhere: dict[str, float]
 ) -> None:
     for key in ("model.b_x", "load.value"):
-        exact = wave.derivative(moved, key)
+        exact = wave.derivative(values_elsewhere, key)
         step = 1e-5
         ends = [
-            wave._solve({**moved, key: moved[key] + sign * step}).fields.pressure
+            wave._solve(
+                {**values_elsewhere, key: values_elsewhere[key] + sign * step}
+            ).fields.pressure
             for sign in (1, -1)
         ]
         quotient = (ends[0] - ends[1]) / (2 * step)
@@ -110,12 +114,12 @@ def test_contact_prediction_is_close_to_the_solution_after_a_small_move(
 @pytest.mark.thorough
 def test_contact_code_gives_the_same_numbers(
     wave: ContactSubject,
-    moved: dict[str, float],
+    values_elsewhere: dict[str, float],
     run_of_export: Any,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    name, text = wave.export("code", moved)
+    name, text = wave.export("code", values_elsewhere)
     (tmp_path / name).write_text(text, encoding="utf-8")
     runpy.run_path(str(tmp_path / name))
     printed = dict(line.split()[:2] for line in capsys.readouterr().out.splitlines())

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 
 from ... import _tree
@@ -103,24 +104,27 @@ class _Data(NamedTuple):
     weights: Array
 
     def serves(self, x0: jax.Array, args: Any) -> bool:
+        """Return whether a run from x0 with these args has the same data."""
         return self.like == (x0.shape, x0.dtype) and _tree.same_values(self.args, args)
 
 
-_kept: Callable[[Problem], list[_Data]] = once_per_object(lambda problem: [])
+_cache: Callable[[Problem], list[_Data]] = once_per_object(lambda problem: [])
 """The data of the last run of each problem: a run in pieces traces its functions once."""
 
 
 def _data(problem: Problem, t0: float, x0: jax.Array, args: Any) -> _Data:
     """Return the data of a run. **Raises:** `dvax.InputError`, as `propagate` does."""
-    kept = _kept(problem)
-    if not (kept and kept[0].serves(x0, args)):
+    cache = _cache(problem)
+    if not (cache and cache[0].serves(x0, args)):
         problem.check(t0, x0, args)
         knots, system = problem.data_knots(t0, x0, args), affine(problem, t0, x0, args)
         units = jnp.eye(x0.size).reshape(-1, *x0.shape)
         weights = np.asarray(_norms(problem.spaces(x0)[0], units))
         like = x0.shape, x0.dtype
-        kept[:] = [_Data(like, args, knots, system, pivoted(system), weights)]
-    return kept[0]
+        # A copy: an array of NumPy may be changed before the next run.
+        args = jtu.tree_map(lambda v: np.array(v) if isinstance(v, np.ndarray) else v, args)
+        cache[:] = [_Data(like, args, knots, system, pivoted(system), weights)]
+    return cache[0]
 
 
 @eqx.filter_jit

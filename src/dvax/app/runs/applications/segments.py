@@ -75,7 +75,7 @@ def segments(
 
 
 def segment_length(plan: Plan, parts: int = SEGMENTS) -> int:
-    """The number of saved times of a piece: a hundredth of all, fewer where their states are large."""
+    """The number of saved times of a piece: a share of 1/`parts`, fewer where states are large."""
     row = sum(np.asarray(leaf).nbytes for leaf in jtu.tree_leaves(plan.x0))
     return max(2, min(math.ceil(len(plan.times) / parts), _PIECE_BYTES // max(1, row)))
 
