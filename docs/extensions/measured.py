@@ -1,5 +1,5 @@
 """Tables of measured figures: before the build, each case in docs/measured/*.json, which
-`python -m benchmarks --save FILE` writes, becomes docs/generated/measured-CASE.inc, which pages include.
+`python -m benchmarks --save FILE` writes, becomes docs/generated/measured-CASE.inc for pages.
 """
 
 import json

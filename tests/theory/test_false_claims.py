@@ -127,6 +127,15 @@ def test_verify_constants_hold_for_their_args_and_times_only():
         dvax.solve(system, 0.1, 0.0, 2.0, one, constants=c, certified_tol=1e-3)
 
 
+def test_verify_constants_do_not_follow_an_array_that_numpy_changes():
+    system = problem(f=lambda t, x, u, a: a * x - u, K=dvax.sets.Box(-1.0, 1.0))
+    args = np.array(1.0)
+    c = dvax.verify(system, 0.0, args=args).constants
+    args[...] = 3.0
+    sol = dvax.solve(system, 0.1, 0.0, 1.0, args, method=dvax.ETD2RK())
+    assert dvax.bound_error(system, sol, c).status == "declared"
+
+
 def test_verify_does_not_prove_an_empty_intersection():
     balls = dvax.sets.Intersection(
         dvax.sets.Ball(0.0, 1.0), dvax.sets.Ball(jnp.array([5.0, 0.0]), 1.0)

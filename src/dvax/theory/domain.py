@@ -36,7 +36,9 @@ class Domain(eqx.Module):
         args: Any,
     ):
         self.t0, self.t1, self.x, self.u = t0, t1, x, u
-        self.values, self.frame = _numbers_and_rest(args)
+        # Copies: an array of NumPy may be changed afterwards, and would still equal itself.
+        values, self.frame = _numbers_and_rest(args)
+        self.values = tuple(np.array(v) if isinstance(v, np.ndarray) else v for v in values)
 
     @property
     def is_unbounded(self) -> bool:
