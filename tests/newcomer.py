@@ -218,7 +218,7 @@ ARGUMENTS = {
     "a span that overflows": (lambda: solve(t0=-1e308, t1=1e308), "t1 − t0 must be finite"),
     "a span that underflows": (lambda: solve(t0=0.0, t1=5e-324), "t1 − t0 must be at least"),
     "ts text": (lambda: solve(ts="a"), "(ts); 'a'"),
-    "ts unsorted": (lambda: solve(ts=[1.0, 0.0]), "(ts); increasing times in [0, 1]"),
+    "ts unsorted": (lambda: solve(ts=[1.0, 0.0]), "(ts); increasing times in [0.0, 1.0]"),
     "ts NaN": (lambda: solve(ts=[0.0, nan]), "(ts); nan"),
     "ts empty": (lambda: solve(ts=[]), "(ts); nothing"),
     "ts outside": (lambda: solve(ts=[0.0, 2.0]), "(ts); in [0, 1]"),

@@ -315,7 +315,7 @@ SHAPE = {"load": LOADS[:3]}
     ((STARTS[:4], 0.0, 1.0, SHAPE), {}, r"x0s has 4, args\['load'\] has 3"),
     ((1.0, 0.0, 1.0, {"load": 2.0}), {}, "nothing with a member axis"),
     ((STARTS[:3], 0.0, np.array([1.0, 1.0, 0.0]), SHAPE), {}, "member 2: got 0, 0"),
-    ((STARTS[:3], 0.0, 1.0, SHAPE, [0.5, 2.0]), {}, r"vector of increasing times in \[0, 1\]"),
+    ((STARTS[:3], 0.0, 1.0, SHAPE, [0.5, 2.0]), {}, r"vector of increasing times in \[0.0, 1.0\]"),
     ((STARTS[:3], 0.0, 1.0, SHAPE, [[0.5], [1.0], [2.0]]), {}, r"ts\) of member 2"),
     ((STARTS[:3], 0.0, 1.0, SHAPE), {"axes": (0, 1)}, r"ensemble\(axes\)"),
     ((STARTS[:3], 0.0, 1.0, SHAPE), {"axes": (0, {"lode": 0})}, r"ensemble\(axes\)"),

@@ -134,9 +134,32 @@ def test_largest_slope_is_that_of_the_free_or_of_the_held_response(slopes):
         f=lambda t, x, u, args: fx * x + fu * u + jnp.cos(t),
         h=lambda t, x, u, args: hx * x + hu * u + t,
     )  # fmt: skip
-    choice = choose(problem, jnp.asarray(0.1), None, 3.0, 1e-6, False, False)
+    choice = choose(problem, jnp.asarray(0.1), None, 0.0, 3.0, 1e-6, False, False)
     largest = 3.0 * max(abs(0.5 + fx), abs(0.5 + fx + fu * hx / (1.0 - hu)))
     assert f"the span is {largest:.2g}" in choice.reason
+
+
+@pytest.mark.parametrize("where", ["K", "f", "h"])
+@pytest.mark.parametrize("read", ["closure", "args"])
+def test_data_that_begins_at_t0_is_not_read_before(where, read):
+    """A table is NaN outside of its hours, and log(t) at 0."""
+    hours = np.arange(5.0, 8.0)
+    own = {"hours": jnp.asarray(hours), "values": jnp.asarray(1.0 + 0.3 * np.cos(hours))}
+
+    def data(t, args):
+        table = own if args is None else args
+        return dvax.signals.Table(table["hours"], table["values"])(t) + jnp.log(t - 4.0)
+
+    at = lambda name, t, args: data(t, args) if name == where else 1.0  # noqa: E731
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-0.5), P=dvax.operators.Scaling(1.0),
+        K=lambda t, args: dvax.sets.Box(-1.0, at("K", t, args)),
+        f=lambda t, x, u, args: u + at("f", t, args),
+        h=lambda t, x, u, args: 2.0 * at("h", t, args) - 0.5 * u - x,
+    )  # fmt: skip
+    args = own if read == "args" else None
+    choice = choose(problem, jnp.asarray(0.3), args, 5.0, 2.0, 1e-6, False, False)
+    assert choice.text().startswith("DormandPrince")
 
 
 @pytest.mark.thorough

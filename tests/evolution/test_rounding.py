@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 from tests.once import once
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax.evolution.results import RESULTS
@@ -129,6 +130,25 @@ def test_start_far_from_zero_with_rounding_of_ten_tolerances_succeeds(method, st
             assert steep * np.spacing(abs(t0)) > 1e-6 and "Count time from the start" in str(error)
             continue
         assert np.abs(found - truth).max() <= 10 * (1e-9 + 1e-6 * np.abs(truth).max()), t0
+
+
+@pytest.mark.parametrize("steep", mostly_thorough([1e3, 1e4, 1e5, 1e6], [1e5]))
+def test_rounding_of_t_that_a_stiff_law_forgets_stops_no_run(steep):
+    """Wherever a run ends: its last step, and with it all steps, are others."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        q, t0, span = steep * rng.uniform(0.3, 1.0), rng.uniform(1e4, 3e5), rng.uniform(0.5, 2.0)
+        args = {"q": jnp.asarray(q), "g": jnp.asarray(30.0 * steep), "t0": jnp.asarray(t0)}
+        ts = t0 + span * np.array([0.5, 1.0])
+        method = dvax.ExpRosenbrock()
+        found = dvax.solve(FAR, 1e-3, t0, ts[1], args, ts, method=method, throw=False)
+        assert found.result == RESULTS.successful, (q, t0, span)
+        local = {**args, "t0": jnp.asarray(0.0)}
+        truth = dvax.solve(
+            FAR, 1e-3, 0.0, ts[1] - t0, local, ts - t0, method=method, rtol=1e-8, atol=1e-11
+        )
+        error = np.abs(np.asarray(found.xs - truth.xs)).max()
+        assert error <= 10 * (1e-9 + 1e-6 * np.abs(truth.xs).max()), (q, t0, span)
 
 
 @once

@@ -128,7 +128,7 @@ def ensemble(
     if method is None:
         tol = float(max(rtol, atol)) if _tree.is_concrete(rtol, atol) else math.nan
         certified = constants is not None
-        choice = choose(problem, x0, own_args, end - begin, tol, dt is not None, certified)
+        choice = choose(problem, x0, own_args, begin, end - begin, tol, dt is not None, certified)
     each = device_list(devices)
     if lanes is None:
         lanes = 1 if each[0].platform == "cpu" else _LANES

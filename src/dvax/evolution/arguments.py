@@ -148,15 +148,23 @@ def _eps(dtype: Any) -> float:
 
 def _check_times(rule: Any, ts: Any, t0: float, t1: float) -> None:
     fix = "Sort them, and remove times outside this interval"
-    text = f"it must be a vector of increasing times in [{t0:g}, {t1:g}]"
+    text = f"it must be a vector of increasing times in [{float(t0)!r}, {float(t1)!r}]"
     try:
         times = np.asarray(ts, float)
     except (TypeError, ValueError):
         rule(False, "ts", ts, text, "Write a list of numbers")
         return
-    is_sorted = times.ndim == 1 and times.size > 0 and bool(np.all(np.diff(times) >= 0))
-    is_inside = bool(is_sorted and t0 <= times[0] and times[-1] <= t1)
-    rule(is_inside, "ts", times if times.size else _tree.Text("nothing"), text, fix)
+    got = times if times.size else _tree.Text("nothing")
+    if times.ndim != 1 or times.size == 0:
+        rule(False, "ts", got, text, fix)
+        return
+    before = np.append(-np.inf, times[:-1])
+    wrong = ~((times >= before) & (times >= t0) & (times <= t1))
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        after = f", after {float(before[k])!r}" if times[k] < before[k] else ""
+        got = _tree.Text(f"{float(times[k])!r} at index {k}{after}")
+    rule(not wrong.any(), "ts", got, text, fix)
 
 
 def _not_finite(x0: Any) -> list[InputProblem]:

@@ -122,18 +122,21 @@ def choose(
     problem: Problem,
     x0: Tree,
     args: Any,
+    t0: Any,
     span: Any,
     tol: float,
     fixed: bool,
     certified: bool,
 ) -> Choice:
-    """Choose a method for a run over `span` at the tolerance `tol` (NaN if it is traced), from the
-    structure and the size of the problem."""
+    """Choose a method for a run over `span` from t0 at the tolerance `tol` (NaN if it is traced), from
+    the structure and the size of the problem."""
     if fixed:
         return Choice(_ETD2RK, "the steps are given")
     if certified:
         return Choice(_ETD2RK, "a proved bound needs a defect that can be enclosed")
-    facts = _facts(problem, x0, args)
+    # Data may be undefined at other times than those of the run.
+    t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(x0)))
+    facts = _facts(problem, t0, x0, args)
     if facts.is_field and not facts.pointwise:
         return _with_fallback(
             _ETD2RK,
@@ -143,7 +146,7 @@ def choose(
         )
     if facts.affine and not facts.is_field and (facts.state <= _EXACT or facts.diagonal):
         return Choice(_EXPROSENBROCK, "x' is affine in t and x between kinks, where it is exact")
-    rates = _rates(problem, x0, args, facts) if _tree.is_concrete(span) else _UNKNOWN
+    rates = _rates(problem, t0, x0, args, facts) if _tree.is_concrete(span) else _UNKNOWN
     # The exponential of a matrix costs as much as many steps.
     matrices = _SLOPES_OF_MATRICES * (1.0 + (facts.state / 4) ** 3)
     # Explicit steps follow each turn, the more of them the tighter the tolerance.
@@ -198,17 +201,17 @@ _MAX_FACTS = 256
 """Problems whose facts are kept: a key keeps the functions of a problem alive."""
 
 
-def _facts(problem: Problem, x0: Tree, args: Any) -> Facts:
+def _facts(problem: Problem, t0: jax.Array, x0: Tree, args: Any) -> Facts:
     leaves, tree = jtu.tree_flatten((x0, args))
     try:
         key = flat(problem).key, tree, tuple(map(_kind, leaves))
         if key in _FACTS:
             return _FACTS[key]
     except (InputError, TypeError):
-        return _read(problem, x0, as_arrays(args))  # what cannot be hashed is refused later
+        return _read(problem, t0, x0, as_arrays(args))  # what cannot be hashed is refused later
     if len(_FACTS) >= _MAX_FACTS:
         _FACTS.clear()
-    return _FACTS.setdefault(key, _read(problem, x0, as_arrays(args)))
+    return _FACTS.setdefault(key, _read(problem, t0, x0, as_arrays(args)))
 
 
 def _kind(leaf: Any) -> Any:
@@ -218,8 +221,7 @@ def _kind(leaf: Any) -> Any:
     return float if isinstance(leaf, float) else leaf
 
 
-def _read(problem: Problem, x0: Tree, args: Any) -> Facts:
-    t = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(x0)))
+def _read(problem: Problem, t: jax.Array, x0: Tree, args: Any) -> Facts:
     problem.check(t, x0, args)
     like = problem.zero_control(x0)
     state, law = (sum(leaf.size for leaf in jtu.tree_leaves(v)) for v in (x0, like))
@@ -263,7 +265,7 @@ _RATES: dict[Any, tuple[Any, Rates]] = {}
 of which an entry keeps alive."""
 
 
-def _rates(problem: Problem, x0: Tree, args: Any, facts: Facts) -> Rates:
+def _rates(problem: Problem, t0: jax.Array, x0: Tree, args: Any, facts: Facts) -> Rates:
     leaves = jtu.tree_leaves(args)
     key = id(problem), *(leaf if isinstance(leaf, float) else id(leaf) for leaf in leaves)
     if key in _RATES:
@@ -272,7 +274,7 @@ def _rates(problem: Problem, x0: Tree, args: Any, facts: Facts) -> Rates:
     is_known = flat(problem).is_concrete and _tree.is_concrete(args)
     values: list[complex] | None = []
     if is_known and facts.linear:
-        values = _eigenvalues(problem, x0, args, facts)
+        values = _eigenvalues(problem, t0, x0, args, facts)
         is_known = values is not None
     slope = max(map(abs, values or [0.0]))
     turn = max(abs(v.imag) for v in values or [0.0])
@@ -284,18 +286,21 @@ def _rates(problem: Problem, x0: Tree, args: Any, facts: Facts) -> Rates:
     return rates
 
 
-def _eigenvalues(problem: Problem, x0: Tree, args: Any, facts: Facts) -> list[complex] | None:
+def _eigenvalues(
+    problem: Problem, t0: jax.Array, x0: Tree, args: Any, facts: Facts
+) -> list[complex] | None:
     """Return the eigenvalues of A + Df̃ for u ∈ h − 0 inside K, and for u held at the boundary, where
     the derivatives of f and h are constant; None where their code closes over traced values."""
     with jax.ensure_compile_time_eval():
-        found = _spectra(problem, x0, args, facts.diagonal)
+        found = _spectra(problem, t0, x0, args, facts.diagonal)
     return None if found is None else np.concatenate(found).astype(complex).tolist()
 
 
-def _spectra(problem: Problem, x0: Tree, args: Any, diagonal: bool) -> list[Any] | None:
+def _spectra(
+    problem: Problem, t: jax.Array, x0: Tree, args: Any, diagonal: bool
+) -> list[Any] | None:
     # Any state will do, and x0 may be traced.
     x0 = jtu.tree_map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), x0)
-    t = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(x0)))
     like = problem.zero_control(x0)
 
     numbers, signature = flatten((problem,), (t, x0, like, args), diagonal)

@@ -201,7 +201,7 @@ def solve(
     choice = Choice(method)
     if method is None:
         tol = max(rtol, atol) if _tree.is_concrete(rtol, atol) else math.nan
-        choice = choose(problem, x0, args, t1 - t0, float(tol), fixed, constants is not None)
+        choice = choose(problem, x0, args, t0, t1 - t0, float(tol), fixed, constants is not None)
     setup, options = arranged(
         problem, x0, t0, t1, args, dt, rtol, atol, choice.method, vi_solver, progress, constants,
         measure, dense, dt0, dt_max, horizon, bound_steps(max_steps, fixed, t0, t1, dt), adjoint,
@@ -327,7 +327,7 @@ def prepared(
     problem, t0, t1 = _placed(problem, x0), _number(t0), _number(t1)
     choice = Choice(method)
     if method is None:
-        choice = choose(problem, x0, args, t1 - t0, float(max(rtol, atol)), fixed, False)
+        choice = choose(problem, x0, args, t0, t1 - t0, float(max(rtol, atol)), fixed, False)
     setup, options = arranged(
         problem, x0, t0, t1, args, dt, rtol, atol, choice.method, None, False, None,
         None, dense, None, None, None, bound_steps(None, fixed, t0, t1, dt), "reverse", (), 0,

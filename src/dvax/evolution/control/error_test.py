@@ -29,7 +29,8 @@ class Attempt(NamedTuple):
     - `begin`, `end`, `size`: its times, and end − begin;
     - `smallest`: the smallest step size, eight roundings of t;
     - `error`: the largest defect divided by the tolerance (1 is the limit), signed where it cancels;
-    - `modulus`: the same of the modulus of the defect;
+    - `modulus`: the same of the modulus of the defect, of which no earlier error decays;
+    - `unit`: of `error`, where earlier errors decay, in units of the defect;
     - `integrated`: the defect integrated over the step, in units of the tolerance of the whole run;
     - `roundoff`: the largest `error` that rounding of f̃ and of t can explain;
     - `usable`: the law was solved at `begin`, and no value is non-finite that a smaller step would
@@ -42,14 +43,17 @@ class Attempt(NamedTuple):
     smallest: Any
     error: Any
     modulus: Any
+    unit: Any
     integrated: Any
     roundoff: Any
     usable: Any
 
     def by_modulus(self, noisy: Any, horizon: Any) -> "Attempt":
         """Return the attempt as measured by the modulus where errors are `noisy`: roundoff cancels by
-        chance in a signed mean, so that no step size would bring it below a tolerance for long."""
-        error = jnp.where(noisy, self.modulus, self.error)
+        chance in a signed mean, so that no step size would bring it below a tolerance for long. It
+        decays as other errors do."""
+        by_modulus = jnp.maximum(self.error, self.unit * self.modulus)
+        error = jnp.where(noisy, by_modulus, self.error)
         integrated = jnp.where(noisy, self.modulus * self.size / horizon, self.integrated)
         return self._replace(error=error, integrated=integrated)
 
@@ -87,11 +91,12 @@ class ErrorTest(eqx.Module):
         relative = eps * (1.0 + largest / span)
         rate = self.horizon * self._ratio(step.c[0], x0, step.x1)
         roundoff = jnp.minimum(_ROUNDINGS * relative, _LARGEST_ROUNDOFF) * rate
+        unit = jnp.ones_like(error)
         if step.carried is not None:
             estimated = self._of_estimate(h, integrated, x0, step)
-            # In the unit of the error.
             unit = jnp.where(error > 0.0, estimated / jnp.where(error > 0.0, error, 1.0), 1.0)
-            error, roundoff = estimated, roundoff * jnp.where(jnp.isfinite(unit), unit, 1.0)
+            unit = jnp.where(jnp.isfinite(unit), unit, 1.0)
+            error, roundoff = estimated, roundoff * unit
         # Inside the step the defect has not cancelled or decayed yet.
         error = jnp.maximum(error, _INSIDE * modulus * h / self.horizon)
         # A law that is not solved inside the step may be that of a stage far away: the step was too
@@ -104,6 +109,7 @@ class ErrorTest(eqx.Module):
             smallest=8 * eps * largest,
             error=error,
             modulus=modulus,
+            unit=unit,
             integrated=jnp.where(step.solved, integrated, jnp.inf),
             roundoff=lax.stop_gradient(roundoff),
             usable=step.start_solved & step.finite,

@@ -184,8 +184,8 @@ class AbstractModelApplication(abc.ABC):
         """Return the method that `dvax.solve` will choose, and the reason."""
         m, given = self.own, {"rtol": 1e-6, "atol": 1e-9} | self.settings
         found = choose(
-            m.problem, m.x0, m.args, self.t_end - m.t0, float(max(given["rtol"], given["atol"])), False,
-            self.certified,
+            m.problem, m.x0, m.args, m.t0, self.t_end - m.t0, float(max(given["rtol"], given["atol"])),
+            False, self.certified,
         )  # fmt: skip
         name, _, reason = str(found.text()).partition(": ")
         return name, reason
