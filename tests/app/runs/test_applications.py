@@ -101,9 +101,15 @@ def test_data_errors_name_their_line(folder):
 def test_application_run_writes_figures_data_and_a_report(folder, outcome):
     assert outcome.exit_code == 0 and outcome.status == "finished"
     summary = json.loads((outcome.directory / "summary.json").read_text())
-    assert set(summary["final_state"]) == {"value", "unit", "meaning"}
-    assert len(summary["final_state"]["value"]) == 2
-    assert 0 < summary["error_bound"]["value"] < 1e-8
+    assert set(summary["final_C1"]) == {"value", "unit", "meaning"}
+    assert [summary[f"final_{name}"]["unit"] for name in ("C1", "L1")] == ["V", "A"]
+    bound = summary["error_bound"]["value"]
+    assert 0 < bound < 1e-8
+    # ‖x‖² = Cv² + Li², with the values of the netlist.
+    for name, storage, unit in (("C1", 1e-6, "V"), ("L1", 10e-3, "A")):
+        of_state = summary[f"error_bound_{name}"]
+        assert of_state["value"] == pytest.approx(bound / storage**0.5)
+        assert of_state["unit"] == unit and of_state["bound"] == summary["error_bound"]["bound"]
     manifest = json.loads((outcome.directory / "manifest.json").read_text())
     assert manifest["model"] == "circuit" and manifest["fit"] == "exact"
     assert list(manifest["data"]) == ["tank.cir"]
@@ -112,9 +118,9 @@ def test_application_run_writes_figures_data_and_a_report(folder, outcome):
     )
     with xarray.open_zarr(outcome.directory / "trajectory.zarr", consolidated=False) as data:
         assert data.sizes["time"] == 21 and "state_C1" in data
-        np.testing.assert_allclose(
-            [data.state_C1[-1], data.state_L1[-1]], summary["final_state"]["value"], rtol=1e-12
-        )
+        for name in ("C1", "L1"):
+            last = summary[f"final_{name}"]["value"]
+            np.testing.assert_allclose(data[f"state_{name}"][-1], last, rtol=1e-12)
         assert data.state_C1.attrs["units"] == "V"
     page = build_report(outcome.directory).read_text()
     assert "model circuit, exact" in page and "The circuit over time" in page

@@ -83,7 +83,8 @@ def test_stopped_run_keeps_its_frames_and_has_a_report(whole, tmp_path, error, s
         np.testing.assert_array_equal(part[name], kept, err_msg=str(name))
     summary = json.loads((outcome.directory / "summary.json").read_text())
     assert summary["status"]["value"] == status
-    assert summary["final_state"]["value"] == [part.state_C1[-1], part.state_L1[-1]]
+    for name in ("C1", "L1"):
+        assert summary[f"final_{name}"]["value"] == part[f"state_{name}"][-1]
     manifest = json.loads((outcome.directory / "manifest.json").read_text())
     assert manifest["status"] == status and manifest["steps"] > 0
     page = build_report(outcome.directory, stills=False).read_text(encoding="utf-8")

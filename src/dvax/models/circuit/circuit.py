@@ -60,8 +60,8 @@ class Circuit(eqx.Module):
     >>> tank = Circuit("C1 1 0 1u IC=10\\nL1 1 0 10m\\nD1 1 0 R=1k")
     >>> tank.fit, tank.states, float(tank.constants.gamma)
     ('exact', ('C1', 'L1'), 1000.0)
-    >>> [f"{v:.6f}" for v in tank.figures(5e-3)["final_state"]]
-    ['2.800403', '-0.008440']
+    >>> {name: f"{value:.6f}" for name, value in tank.figures(5e-3).items()}
+    {'final_C1': '2.800403', 'final_L1': '-0.008440'}
 
     ```
     """
@@ -222,8 +222,9 @@ class Circuit(eqx.Module):
         return jnp.where(jnp.asarray(self.blocking), other, u)
 
     def figures(self, t_end: Any, **settings: Any) -> dict[str, Any]:
-        """Return `final_state`, the state at `t_end` in the order of `states`."""
-        return {"final_state": [float(v) for v in self.solve(t_end, **settings).xs[-1]]}
+        """Return `final_C1` and so on: each of the `states` at `t_end`."""
+        last = self.solve(t_end, **settings).xs[-1]
+        return {f"final_{name}": float(v) for name, v in zip(self.states, last, strict=True)}
 
 
 class _Rate(eqx.Module):

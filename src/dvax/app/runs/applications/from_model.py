@@ -29,7 +29,7 @@ from dvax.evolution.auto import choose
 from dvax.models import Model
 from dvax.theory import Assumption, Constants, verify
 
-_FIGURES = 12
+FINAL_VALUES = 12
 """Up to this many final values are figures of the summary."""
 
 
@@ -268,7 +268,7 @@ class AbstractModelApplication(abc.ABC):
             f"final_{key}": Figure(
                 float(v.values[-1]), v.unit, f"{v.words.partition(' ')[2]} {last}"
             )
-            for key, v in numbers[:_FIGURES]
+            for key, v in numbers[:FINAL_VALUES]
         }
 
     def joined(

@@ -1,5 +1,6 @@
 """`[model] name = "circuit"`: a netlist from 0 to t_end."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,7 +10,11 @@ from pydantic import Field
 
 from dvax.app.runs.applications.base import Figure, Variable
 from dvax.app.runs.applications.certificate import Certificate
-from dvax.app.runs.applications.from_model import AbstractModelApplication, store_name
+from dvax.app.runs.applications.from_model import (
+    FINAL_VALUES,
+    AbstractModelApplication,
+    store_name,
+)
 from dvax.app.runs.schema import SolverKeys, in_quantity, in_unit
 from dvax.app.runs.solver_options import event_driven
 from dvax.evolution import ExpRosenbrock, PiecewiseLinear, Solution
@@ -84,18 +89,40 @@ class CircuitApplication(AbstractModelApplication):
     def figures(
         self, series: Mapping[str, np.ndarray], end: Solution, bound: Certificate | None
     ) -> Mapping[str, Figure]:
-        c = self.circuit
-        names = ", ".join(c.states)
+        c, last = self.circuit, float(end.ts[-1])
+        found = {}
+        for name, value in zip(c.states[:FINAL_VALUES], np.asarray(end.xs)[-1], strict=False):
+            found[f"final_{name}"] = Figure(
+                float(value), _unit(name), f"{_quantity(name)} {name} at t = {last:g} s"
+            )
         return {
-            "final_state": Figure(
-                np.asarray(end.xs)[-1], "V, A", f"{names} at t = {float(end.ts[-1]):g} s"
-            ),
+            **found,
             **self.bound_figure(bound),
+            **self.bounds_of_states(bound),
             "decay_rate": Figure(
                 float(c.constants.sharp_decay_rate) + 0.0, "1/s",
                 "two runs certainly approach at this rate in the norm of the energy",
             ),
         }  # fmt: skip
+
+    def bounds_of_states(self, bound: Certificate | None) -> dict[str, Figure]:
+        """Bounds in V and A: each term of ΣCv² + ΣLi² is at most the sum."""
+        if bound is None or bound.largest is None:
+            return {}
+        c, top = self.circuit, bound.largest
+        return {
+            f"error_bound_{name}": Figure(
+                top / math.sqrt(float(storage)), _unit(name),
+                f"bound on the error of the {_quantity(name)} {name} at all saved times "
+                f"({bound.status})",
+                bound=bound.status,
+            )
+            for name, storage in zip(c.states[:FINAL_VALUES], np.asarray(c.storage), strict=False)
+        }  # fmt: skip
+
+
+def _quantity(state: str) -> str:
+    return "voltage of" if _unit(state) == "V" else "current of"
 
 
 def _unit(state: str) -> str:
