@@ -43,7 +43,8 @@ _LEGEND_CHARACTERS = 100
 @dataclass(frozen=True)
 class Curve:
     """y over x. `colour` counts through the theme's series; None is the grey of what is for
-    comparison. `marks` draws points in the place of a line, as for a single point."""
+    comparison. `marks` draws points in the place of a line, as for a single point; `dots` draws them on
+    the line, where each was computed by itself."""
 
     x: np.ndarray
     y: np.ndarray
@@ -51,6 +52,7 @@ class Curve:
     colour: int | None = 0
     dash: str = "solid"
     marks: bool = False
+    dots: bool = False
 
     @property
     def ink(self) -> str:
@@ -165,6 +167,8 @@ class Panel(AbstractPanel):
             style: dict[str, Any] = dict(linestyle=_DASHES[c.dash], linewidth=1.3)
             if c.as_marks:
                 style = dict(linestyle="", marker="o", markersize=4)
+            elif c.dots:
+                style |= dict(marker="o", markersize=3.5)
             axes.plot(c.x, c.y, color=c.ink, label=c.name, **style)
         axes.set_ylabel(axis_title(self.words.replace("<br>", "\n") + "\n", self.unit))
         axes.set_yscale("log" if self.log else "linear")
@@ -368,9 +372,9 @@ def _trace(curve: Curve, panel: Panel, words: str, unit: str) -> go.Scatter:
         x=curve.x[shown],
         y=curve.y[shown],
         name=curve.name,
-        mode="markers" if marks else "lines",
+        mode="markers" if marks else "lines+markers" if curve.dots else "lines",
         line=None if marks else dict(color=curve.ink, width=1.6, dash=curve.dash),
-        marker=dict(color=curve.ink, size=6) if marks else None,
+        marker=dict(color=curve.ink, size=6 if marks else 5) if marks or curve.dots else None,
         hovertemplate=f"%{{y:.5g}} {unit_text(panel.unit)}{'' if panel.is_over_time else place}",
     )
 

@@ -3,7 +3,7 @@
 import json
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,10 @@ from dvax.app.runs.sweeps.store import NAME
 from dvax.theory.status import ORDER
 
 _PANELS, _CURVES, _FAILURES = 8, 6, 200
+_ENTRIES = 8
+"""Vectors of up to this many entries are figures, an entry each."""
+_DOTS = 60
+"""Curves of up to this many members have dots."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +64,14 @@ class _Axis:
 
     @property
     def is_wide(self) -> bool:
-        """Whether the values need a logarithmic axis."""
-        values = self.values[np.isfinite(self.values)]
-        return len(values) > 0 and bool(0 < 100 * values.min() < values.max())
+        """Whether the values need a logarithmic axis: over a decade or more, and spread more evenly by
+        their logarithms than by themselves."""
+        values = np.unique(self.values[np.isfinite(self.values)]).astype(float)
+        if len(values) < 3 or not 0 < 10 * values[0] <= values[-1]:
+            return False
+        middle = np.log(np.median(values))
+        even = np.log(0.5 * (values[0] + values[-1]))
+        return bool(abs(middle - np.mean(np.log(values[[0, -1]]))) < abs(middle - even))
 
 
 @dataclass(frozen=True)
@@ -170,14 +179,19 @@ def _members(path: Path, keys: list[str]) -> _Members | None:
         words = str(about.get("long_name", name))
         return _Axis(name, np.asarray(array[...]), str(about.get("units", "")), words)
 
-    only = [
-        name
-        for name, array in group.arrays()
-        if (getattr(array.metadata, "dimension_names", None) or ()) == ("member",)
-    ]
-    apart = {*keys, "member", "status"}
+    apart, figures = {*keys, "member", "status"}, []
+    for name, array in sorted(group.arrays()):
+        dims = tuple(getattr(array.metadata, "dimension_names", None) or ())
+        if dims == ("member",) and name not in apart:
+            figures.append(axis(name))
+        # A vector among the figures has a dimension of its own; variables over time have not.
+        elif dims == ("member", f"{name}_0") and array.shape[1] <= _ENTRIES:
+            whole = axis(name)
+            figures += [
+                replace(whole, name=f"{name}[{k}]", values=whole.values[:, k])
+                for k in range(array.shape[1])
+            ]
     finished = axis("status").values == 1
-    figures = [axis(name) for name in sorted(only) if name not in apart]
     figures.sort(key=lambda figure: figure.name == "steps")
     varying = [figure for figure in figures if np.isfinite(figure.values[finished]).any()]
     return _Members([axis(key) for key in keys], varying, finished)
@@ -276,6 +290,7 @@ def _response(members: _Members, over: _Axis, varying: list[_Axis]) -> Picture:
                 Curve(
                     over.values[order], figure.values[order], ", ".join(label), colour,
                     DASHES[colour % len(DASHES)], marks=not repeats or len(order) <= 2,
+                    dots=len(order) <= _DOTS,
                 )
             )  # fmt: skip
         panels.append(Panel(curves, figure.short, figure.unit, log=figure.is_wide))

@@ -1,0 +1,47 @@
+"""The report of a sweep: which axes are logarithmic, and which arrays of its store are figures."""
+
+import numpy as np
+import pytest
+import zarr
+
+from dvax.app.plots.sweep import _Axis, _members
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(
+    ("values", "is_wide"),
+    [
+        ([0.1, 0.3, 1.0, 3.0, 10.0], True),
+        (np.geomspace(1.0, 10.0, 7), True),
+        (10.0 ** RNG.uniform(-3.0, 1.0, 50), True),
+        (np.linspace(0.1, 10.0, 5), False),
+        (RNG.uniform(1.0, 100.0, 50), False),
+        ([1.0, 2.0, 4.0], False),
+        ([0.0, 1.0, 10.0, 100.0], False),
+        ([-1.0, 10.0, 100.0], False),
+        ([0.1, 10.0], False),
+        ([np.nan, 1.0, np.inf, 10.0, 100.0], True),
+        ([np.nan], False),
+    ],
+)
+def test_axis_is_logarithmic_where_values_spread_by_their_ratios(values, is_wide):
+    assert _Axis("a", np.asarray(values), "", "").is_wide == is_wide
+
+
+def test_entries_of_short_vectors_are_figures_and_variables_over_time_are_not(tmp_path):
+    group = zarr.open_group(tmp_path / "sweep.zarr", mode="w", zarr_format=3)
+    for name, values, dims in (
+        ("status", np.array([1, 2, 1]), ["member"]),
+        ("rate", np.array([1.0, 2.0, 3.0]), ["member"]),
+        ("peak", np.array([0.1, np.nan, 0.3]), ["member"]),
+        ("end", np.arange(6.0).reshape(3, 2), ["member", "end_0"]),
+        ("long", np.zeros((3, 40)), ["member", "long_0"]),
+        ("x", np.zeros((3, 5)), ["member", "time"]),
+    ):
+        group.create_array(name, data=values, dimension_names=dims, attributes={"units": "m"})
+    found = _members(tmp_path / "sweep.zarr", ["rate"])
+    assert found is not None
+    assert [figure.name for figure in found.figures] == ["end[0]", "end[1]", "peak"]
+    np.testing.assert_array_equal(found.figures[1].values, [1.0, 3.0, 5.0])
+    np.testing.assert_array_equal(found.finished, [True, False, True])
