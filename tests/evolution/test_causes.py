@@ -160,6 +160,16 @@ def test_cause_stiffness_suggests_a_method_that_succeeds(rate):
     assert float(found.xs[-1]) == pytest.approx(math.cos(1.0), abs=1e-3)
 
 
+@pytest.mark.parametrize("tolerances", [{"rtol": 1e-10}, {"rtol": 0.0, "atol": 1e-9}])
+def test_many_times_the_steps_so_far_are_the_last_advice(tolerances):
+    problem = make(lambda t, x, u, args: jnp.sin(20.0 * t) - x)
+    error = failure(problem, t1=500.0, max_steps=200, **tolerances)
+    (loosened,) = set(fixes(error)) & {"rtol", "atol"}
+    assert float(fixes(error)[loosened]) == pytest.approx(100 * tolerances[loosened])
+    assert [fix.option for fix in error.fixes][-1] == "max_steps"
+    assert int(fixes(error)["max_steps"]) % 100 == 0
+
+
 def test_suggested_max_steps_suffices():
     problem = make(lambda t, x, u, args: jnp.cos(5.0 * t) - x)
     error = failure(problem, t1=20.0, max_steps=300, rtol=1e-6)

@@ -48,6 +48,8 @@ _MAX_ROSENBROCK = 400
 """Largest number of unknowns for which a fix proposes `ExpRosenbrock` for a stiff problem."""
 _MIN_ATTEMPTS = 100
 """Smallest number of attempts from which the number of remaining steps is extrapolated."""
+_MANY_TIMES = 16
+"""More steps than this many times those so far are not the first advice."""
 _REFUSED = "refused: "
 _CHECKED = {name: f"Check {name} there" for name in ("K", "h", "f")} | {
     "A x": "Check A, and how large x becomes",
@@ -325,13 +327,14 @@ def _max_steps(stop: Stop) -> Diagnosis:
         if is_piece
         else f", with t1 = {t1:.12g} still {t1 - stop.t:.3g} away and a last "
     )
-    method, rtol = stop.setup.method, float(stop.setup.setting["rtol"])
+    method = stop.setup.method
+    rtol, atol = (float(stop.setup.setting[name]) for name in ("rtol", "atol"))
     text += f"step of {stop.step:.3g}."
     adaptive = isinstance(method, AbstractMethod) and not math.isfinite(stop.setup.setting["dt"])
     if adaptive:
         text += (
             f" {type(method).__name__}, of order {method.order}, is limited by the tolerance "
-            f"(rtol = {rtol:.3g}, atol = {float(stop.setup.setting['atol']):.3g}): one 100 times as "
+            f"(rtol = {rtol:.3g}, atol = {atol:.3g}): one 100 times as "
             f"large needs about {100 ** (1 / method.order):.2g} times fewer steps."
         )
     # After a few steps the extrapolation is unreliable, so use a larger factor.
@@ -339,14 +342,26 @@ def _max_steps(stop: Stop) -> Diagnosis:
     if isinstance(stop.setup.method, PiecewiseLinear):
         # Its events may all lie at the start, for example when a circuit is switched on.
         enough = min(enough, 100.0 * stop.attempts)
-    if enough < 2**31:
-        fixes = [Fix("max_steps", f"{math.ceil(enough)}", "at this pace")]
-        size = sum(leaf.size for leaf in jtu.tree_leaves(stop.x))
-        if adaptive and method.order < 4 and size <= FIELD:
-            fixes += [Fix("method", "DormandPrince", "of order 5, which may take fewer steps")]
-        return Diagnosis(text, tuple(fixes))
-    more = (Fix("method", "ExpRosenbrock", "whose steps may be longer"),)
-    return Diagnosis(text, (*more, Fix("rtol", f"{min(1e-2, 100 * rtol):.1g}", "for longer steps")))
+    option, looser = ("rtol", min(_MAX_RTOL, 100 * rtol)) if rtol > 0 else ("atol", 100 * atol)
+    looser = Fix(option, f"{looser:.1g}", "for longer steps")
+    if enough >= 2**31:
+        return Diagnosis(
+            text, (Fix("method", "ExpRosenbrock", "whose steps may be longer"), looser)
+        )
+    fixes = [Fix("max_steps", f"{_rounded_up(enough)}", "at this pace")]
+    size = sum(leaf.size for leaf in jtu.tree_leaves(stop.x))
+    if adaptive and method.order < 4 and size <= FIELD:
+        fixes += [Fix("method", "DormandPrince", "of order 5, which may take fewer steps")]
+    if adaptive and enough > _MANY_TIMES * stop.attempts:
+        # Many times the work so far is the last thing to try.
+        fixes = [*fixes[1:], looser, fixes[0]]
+    return Diagnosis(text, tuple(fixes))
+
+
+def _rounded_up(count: float) -> int:
+    """Return the count to two digits."""
+    unit = 10 ** max(math.floor(math.log10(count)) - 1, 0)
+    return math.ceil(count / unit) * unit
 
 
 def _law(stop: Stop) -> Diagnosis:
