@@ -29,8 +29,8 @@ class Attempt(NamedTuple):
     - `begin`, `end`, `size`: its times, and end − begin;
     - `smallest`: the smallest step size, eight roundings of t;
     - `error`: the largest defect divided by the tolerance (1 is the limit), signed where it cancels;
-    - `modulus`: the same of the modulus of the defect, of which no earlier error decays;
-    - `unit`: of `error`, where earlier errors decay, in units of the defect;
+    - `modulus`: the same of the modulus of the defect, without the decay of earlier errors;
+    - `unit`: the factor from the signed defect to `error`, which is 1 unless earlier errors decay;
     - `integrated`: the defect integrated over the step, in units of the tolerance of the whole run;
     - `roundoff`: the largest `error` that rounding of f̃ and of t can explain;
     - `usable`: the law was solved at `begin`, and no value is non-finite that a smaller step would
@@ -50,8 +50,8 @@ class Attempt(NamedTuple):
 
     def by_modulus(self, noisy: Any, horizon: Any) -> "Attempt":
         """Return the attempt as measured by the modulus where errors are `noisy`: roundoff cancels by
-        chance in a signed mean, so that no step size would bring it below a tolerance for long. It
-        decays as other errors do."""
+        chance in a signed mean, so that no step size would bring it below a tolerance for long. The
+        decay of earlier errors is that of the step (`unit`)."""
         by_modulus = jnp.maximum(self.error, self.unit * self.modulus)
         error = jnp.where(noisy, by_modulus, self.error)
         integrated = jnp.where(noisy, self.modulus * self.size / horizon, self.integrated)

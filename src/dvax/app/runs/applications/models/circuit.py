@@ -92,7 +92,7 @@ class CircuitApplication(AbstractModelApplication):
         c, last = self.circuit, float(end.ts[-1])
         found = {}
         for name, value in zip(c.states[:FINAL_VALUES], np.asarray(end.xs)[-1], strict=False):
-            found[f"final_{name}"] = Figure(
+            found[store_name(f"final_{name}")] = Figure(
                 float(value), _unit(name), f"{_quantity(name)} {name} at t = {last:g} s"
             )
         return {
@@ -111,7 +111,7 @@ class CircuitApplication(AbstractModelApplication):
             return {}
         c, top = self.circuit, bound.largest
         return {
-            f"error_bound_{name}": Figure(
+            store_name(f"error_bound_{name}"): Figure(
                 top / math.sqrt(float(storage)), _unit(name),
                 f"bound on the error of the {_quantity(name)} {name} at all saved times "
                 f"({bound.status})",
