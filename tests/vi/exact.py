@@ -4,6 +4,7 @@ import itertools
 import math
 from decimal import Decimal, localcontext
 from fractions import Fraction
+from random import Random
 
 
 class Undecided(Exception):
@@ -45,48 +46,43 @@ def times(M, y):
 
 
 def box(M, q, lower, upper, guess):
-    """From the active set of the guess; where that leads nowhere, from those of (M + s)y + q for
-    s = 2⁸, 2⁶, …, 2⁻³², 0: for large s they are found at once, and each is a guess for the next."""
-    y = _exchanged(M, q, lower, upper, guess)
-    if y is not None:
-        return y
-    for s in (*(Fraction(2) ** k for k in range(8, -33, -2)), 0):
-        more = [[v + s * (i == j) for j, v in enumerate(row)] for i, row in enumerate(M)]
-        y = _exchanged(more, q, lower, upper, guess)
-        guess = guess if y is None else y
-    if y is None:
-        raise Undecided("no active set")
-    return y
+    """The guess solves the problem of q + r for some r. From there q + λr is followed from λ = 1 to 0:
+    the solution is piecewise linear in λ, and for a P-matrix one index at a time changes its place
+    (parametric principal pivoting). r is random where it may be, so that no two change together."""
+    n, random = len(q), Random(0)
+    bounds = list(zip(lower, upper, strict=True))
+    place = [-1 if v <= a else 1 if v >= b else 0 for v, (a, b) in zip(guess, bounds, strict=True)]
 
+    def at_places(values):
+        return [(a, v, b)[p + 1] for v, (a, b), p in zip(values, bounds, place, strict=True)]
 
-def _exchanged(M, q, lower, upper, guess):
-    """Every violated condition is exchanged at once, and after 20 such turns, the first alone (Murty's
-    least-index rule, which ends for every P-matrix, but may take long: None after 200)."""
-    n = len(q)
-    place = [
-        -1 if y <= a else 1 if y >= b else 0 for y, a, b in zip(guess, lower, upper, strict=True)
-    ]
-    for turn in range(200):
-        y = [(lower[i], None, upper[i])[place[i] + 1] for i in range(n)]
+    F = [a + b for a, b in zip(times(M, at_places(guess)), q, strict=True)]
+    r = [-v - p * Fraction(random.randint(1, 10**6), 10**6) for p, v in zip(place, F, strict=True)]
+
+    def solution(y, q):
+        """y and My + q, where y is as given at the bounds and My + q = 0 elsewhere."""
         free = [i for i in range(n) if place[i] == 0]
         held = [i for i in range(n) if place[i] != 0]
         right = [-q[i] - sum(M[i][j] * y[j] for j in held) for i in free]
         for i, v in zip(free, solve([[M[i][j] for j in free] for i in free], right), strict=True):
             y[i] = v
-        F = [a + b for a, b in zip(times(M, y), q, strict=True)]
-        wrong = False
-        for i in range(n):
-            if lower[i] == upper[i]:
-                continue  # a number that is given, whatever its sign of F
-            if place[i] == 0 and not lower[i] <= y[i] <= upper[i]:
-                place[i], wrong = -1 if y[i] < lower[i] else 1, True
-            elif place[i] * F[i] > 0:
-                place[i], wrong = 0, True
-            if wrong and turn >= 20:
-                break
-        if not wrong:
+        return y, [a + b for a, b in zip(times(M, y), q, strict=True)]
+
+    parameter = Fraction(1)
+    while True:
+        y, F = solution(at_places([0] * n), q)
+        dy, dF = solution([0] * n, r)
+        changes = [(Fraction(0), n, 0)]  # the next λ, the index that changes there, its new place
+        for i, (a, b) in enumerate(bounds):
+            if place[i] == 0 and dy[i] != 0:
+                end, new = (a, -1) if dy[i] > 0 else (b, 1)
+                changes.append(((end - y[i]) / dy[i], i, new))
+            elif a < b and place[i] * dF[i] < 0:
+                changes.append((-F[i] / dF[i], i, 0))
+        parameter, i, new = max(change for change in changes if change[0] < parameter)
+        if i == n:
             return y
-    return None
+        place[i] = new
 
 
 def polyhedron(M, q, G, d, E, e, guess):
