@@ -75,12 +75,25 @@ def test_equilibrium_has_no_path_with_less_cost(case, one_way):
     if one_way:
         shape[:2] = [n + n % 2 for n in shape[:2]]
     network, trips = networks.grid(*shape, load, seed, one_way=one_way)
-    # Costs grow with the fourth power of the load. At some fifty times the capacity of every link the
-    # gap stays between 1e-8 and 1e-5.
+    # Costs grow with the fourth power of the load: at some fifty times the capacity of every link many
+    # paths carry flow, and the last digits take long.
     gap = 1e-12 if load < 3e5 else 1e-4
     found = solved(network, trips, gap)
     check(network, trips, found, gap, 1e-9 if load < 3e5 else 0.1)
     networks.walks(network, trips, found.paths)
+
+
+@pytest.mark.parametrize("one_way", [False, True])
+@pytest.mark.parametrize(
+    "load", [1e4, 6e4, *(pytest.param(v, marks=pytest.mark.thorough) for v in (3e5, 1e6))]
+)
+def test_equilibrium_far_above_the_capacities_is_reached(load, one_way):
+    """Costs grow with up to the sixth power of flows that are up to a hundred times the capacities, so
+    that slopes differ by ten orders of magnitude."""
+    for seed in range(8):
+        network, trips = networks.grid(4, 6, 6, 12, load, seed, one_way=one_way)
+        found = solved(network, trips)
+        check(network, trips, found, 1e-12)
 
 
 def free(network):

@@ -195,7 +195,9 @@ def _mean_norm(space: AbstractSpace, nodes: tuple[float, ...], values: list[Tree
     """Return ∫₀¹‖q‖ of the polynomial q with these values at the nodes, by Simpson's rule."""
     c = _interpolant(nodes, tuple(values))
     count = 2 * (len(nodes) - 1)
-    weights = np.array([1.0, *[4.0 if j % 2 else 2.0 for j in range(1, count)], 1.0]) / (3.0 * count)
+    weights = np.array([1.0, *[4.0 if j % 2 else 2.0 for j in range(1, count)], 1.0]) / (
+        3.0 * count
+    )
     thetas = jnp.linspace(0.0, 1.0, count + 1, dtype=jtu.tree_leaves(c)[0].dtype)
     norms = jax.vmap(lambda theta: space.norm(polynomial(c, theta)))(thetas)
     return jnp.dot(jnp.asarray(weights, norms.dtype), norms)

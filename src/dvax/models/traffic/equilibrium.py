@@ -17,7 +17,7 @@ import numpy as np
 from ...errors import SolveError
 from .costs import LinkCosts
 from .paths import Paths
-from .restricted import RestrictedProblem
+from .restricted import EXACT, ROUGH, RestrictedProblem
 from .shortest import ShortestPaths
 
 _COST_ROUNDOFF = 1e-13
@@ -28,6 +28,9 @@ _KEEP_TOLERANCE = 1e-6
 
 _MAX_ITERATIONS, _MAX_STAGNATION = 500, 60
 """The largest number of iterations, and of consecutive iterations without progress in gap or Φ."""
+
+_PATIENCE = 15
+"""The number of iterations without progress after which steps are exact, of all pairs together."""
 
 _MAX_SWEEPS = 4
 """Largest number of sweeps between two shortest-path searches."""
@@ -107,7 +110,10 @@ def equilibrate(
             # A path that costs less than all paths of its pair is not among them.
             paths, positions = paths.insert(*search.trace(tree, improvable), improvable)
             x, given = (_scatter(v, positions, len(paths.lengths)) for v in (x, given))
-        restricted = RestrictedProblem(costs, capacity, paths, demand, x, blocks)
+        effort = EXACT if stagnation >= _PATIENCE else ROUGH
+        if effort is EXACT:
+            blocks = 1
+        restricted = RestrictedProblem(costs, capacity, paths, demand, x, blocks, effort)
         for _ in range(_MAX_SWEEPS):
             restricted.sweep()
             if restricted.excess() <= _RESTRICTED_GAP_RATIO * saving:

@@ -14,7 +14,7 @@ affect its choice; the other flows are constants.
 """
 
 import itertools
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,16 +34,30 @@ pairs that share links: with one half, Chicago's sketch network needs two thirds
 _SHORT_STEP = 0.25
 """A step with a smaller step length is computed again, with a shorter prediction and larger slopes."""
 
-_MAX_FACES = 5
-"""Largest number of nested faces in a step."""
 
-_CG_TOLERANCE = 0.1
-_MAX_PRODUCTS = 200
-"""Relative residual of the conjugate gradient method, and largest number of products."""
+class Effort(NamedTuple):
+    """Largest number of nested `faces` in a step; whether the model of Φ falls from face to face
+    (`monotone`); relative residual of the conjugate gradient method (`tolerance`), and its largest
+    number of `products` with the Hessian."""
+
+    faces: int
+    monotone: bool
+    tolerance: float
+    products: int
+
+
+ROUGH = Effort(5, False, 0.1, 200)
+EXACT = Effort(50, True, 1e-8, 5000)
+"""Where slopes differ by many orders of magnitude, only the exact Newton step moves the pairs that are
+coupled by small ones."""
 
 _SLOPE_ROUNDOFF = 1e-15
 """A slope of Φ below this fraction of the total cost is treated as zero. Moving flow between paths with
 the same links changes Φ only by roundoff, which must not shorten a step that empties paths."""
+
+
+_TINY = 1e-9
+"""Part of a pair's demand below which the flow of a path is emptied at once."""
 
 
 class RestrictedProblem:
@@ -55,7 +69,7 @@ class RestrictedProblem:
 
     def __init__(
         self, costs: LinkCosts, capacity: np.ndarray, paths: Paths, demand: np.ndarray,
-        x: np.ndarray, blocks: int | None = None,
+        x: np.ndarray, blocks: int | None = None, effort: Effort = ROUGH,
     ) -> None:  # fmt: skip
         self.costs, self.capacity, self.start = costs, capacity, x
         rows = paths.differences(demand)
@@ -70,7 +84,7 @@ class RestrictedProblem:
         self.blocks = [
             _Block(
                 rows.matrix(int(starts[a]), int(starts[b])), rows.sizes[a:b], chosen[a:b],
-                x[rows.rows[starts[a] : starts[b]]],
+                x[rows.rows[starts[a] : starts[b]]], effort,
             )
             for a, b in itertools.pairwise(cuts.tolist())
             if b > a
@@ -100,8 +114,10 @@ class RestrictedProblem:
 class _Block:
     """A block of pairs: `matrix` has one row a path, `sizes` are the numbers of paths of the pairs."""
 
-    def __init__(self, matrix: Any, sizes: np.ndarray, demand: np.ndarray, x: np.ndarray) -> None:
-        self.matrix, self.transposed = matrix, matrix.T
+    def __init__(
+        self, matrix: Any, sizes: np.ndarray, demand: np.ndarray, x: np.ndarray, effort: Effort
+    ) -> None:
+        self.matrix, self.transposed, self.effort = matrix, matrix.T, effort
         self.sizes, self.demand, self.x = sizes, demand, x
         self.starts = np.cumsum(sizes) - sizes
 
@@ -137,15 +153,43 @@ class _Block:
         inverse, regularisation = self._metric(g, D)
         predicted = self._project(self.x - scale * g * inverse, inverse)
         free = predicted > 0
-        for _ in range(_MAX_FACES):
-            y = self.x + self._newton(g, D, free, inverse, regularisation)
-            # Remove paths with negative flow from the face, and repeat.
-            if not np.any(y < 0):
-                break
-            free &= y > 0
+        if self.effort.monotone:
+            free |= self.x > _TINY * self._to_paths(self.demand)
+            y = self._model_minimum(g, D, free, inverse, regularisation)
+        else:
+            for _ in range(self.effort.faces):
+                y = self.x + self._newton(g, D, free, inverse, regularisation)
+                # Remove paths with negative flow from the face, and repeat.
+                free = free & (y > 0)
+                if not np.any(y < 0) or np.any(self._sum(free) == 0):
+                    break
         target = self._project(y, inverse)
         newton_descends = g @ (target - self.x) <= 1e-3 * (g @ (predicted - self.x))
         return target if newton_descends else predicted
+
+    def _model_minimum(
+        self,
+        g: np.ndarray,
+        D: np.ndarray,
+        free: np.ndarray,
+        inverse: np.ndarray,
+        regularisation: np.ndarray,
+    ) -> np.ndarray:
+        """Return the minimum of the quadratic model on the face of the `free` paths or a smaller one.
+
+        The way to the minimum of a face ends where the first path is empty, and continues without it:
+        so the model falls all along."""
+        y = self.x
+        for _ in range(self.effort.faces):
+            goal = self.x + self._newton(g, D, free, inverse, regularisation)
+            falls = free & (goal < 0)
+            if not np.any(falls):
+                return goal
+            ratios = np.where(falls, y / np.where(falls, y - goal, 1.0), 1.0)
+            length = float(np.min(ratios))
+            free = free & (ratios > length)
+            y = np.where(free, np.maximum(y + length * (goal - y), 0.0), 0.0)
+        return y
 
     def gradient(self, c: np.ndarray) -> np.ndarray:
         """Return the path costs minus the least cost of each pair.
@@ -197,8 +241,8 @@ class _Block:
         z = precondition(r)
         p, size = -z, float(r @ z)
         # Emptied paths may have moved flow onto steep links, so their residual sets no tolerance.
-        goal = _CG_TOLERANCE**2 * min(size, float(g @ precondition(g)))
-        for _ in range(_MAX_PRODUCTS):
+        goal = self.effort.tolerance**2 * min(size, float(g @ precondition(g)))
+        for _ in range(self.effort.products):
             if not size > goal:
                 break
             Hp = hessian_product(p)
