@@ -7,7 +7,8 @@ would move all of its flow. So the pairs are divided into blocks, and the step o
 the link flows after the previous block (Gauss–Seidel). Within a block the Hessian couples the pairs.
 The conjugate gradient method minimises the quadratic model of Φ on the face of the paths that carry
 flow after a scaled projected gradient step (Bertsekas 1982), and on smaller faces while flows would be
-negative. Every step ends with an exact line search.
+negative. Every step ends with an exact line search. `ROUGH` steps suffice until slopes differ by many
+orders of magnitude; then `EXACT` ones minimise the model from face to face.
 
 Only pairs with at least two paths are unknowns, and only links that are not on all paths of a pair
 affect its choice; the other flows are constants.
@@ -54,7 +55,6 @@ coupled by small ones."""
 _SLOPE_ROUNDOFF = 1e-15
 """A slope of Φ below this fraction of the total cost is treated as zero. Moving flow between paths with
 the same links changes Φ only by roundoff, which must not shorten a step that empties paths."""
-
 
 _TINY = 1e-9
 """Part of a pair's demand below which the flow of a path is emptied at once."""
@@ -111,6 +111,15 @@ class RestrictedProblem:
         return x
 
 
+class _Model(NamedTuple):
+    """gᵀδ + ½δᵀ(ΔᵀDΔ + ε)δ, with the `inverse` of a diagonal metric and the `regularisation` ε."""
+
+    g: np.ndarray
+    D: np.ndarray
+    inverse: np.ndarray
+    regularisation: np.ndarray
+
+
 class _Block:
     """A block of pairs: `matrix` has one row a path, `sizes` are the numbers of paths of the pairs."""
 
@@ -151,15 +160,17 @@ class _Block:
     def _target(self, g: np.ndarray, D: np.ndarray, scale: float) -> np.ndarray:
         """Return the Newton point, or the scaled gradient point if its predicted descent is larger."""
         inverse, regularisation = self._metric(g, D)
+        model = _Model(g, D, inverse, regularisation)
         predicted = self._project(self.x - scale * g * inverse, inverse)
         free = predicted > 0
         if self.effort.monotone:
             free |= self.x > _TINY * self._to_paths(self.demand)
-            y = self._model_minimum(g, D, free, inverse, regularisation)
+            y = self._model_minimum(model, free)
         else:
             for _ in range(self.effort.faces):
-                y = self.x + self._newton(g, D, free, inverse, regularisation)
-                # Remove paths with negative flow from the face, and repeat.
+                y = self.x + self._newton(model, free)
+                # Remove paths with negative flow from the face, and repeat; roundoff of a long step
+                # may leave none of a pair.
                 free = free & (y > 0)
                 if not np.any(y < 0) or np.any(self._sum(free) == 0):
                     break
@@ -167,21 +178,14 @@ class _Block:
         newton_descends = g @ (target - self.x) <= 1e-3 * (g @ (predicted - self.x))
         return target if newton_descends else predicted
 
-    def _model_minimum(
-        self,
-        g: np.ndarray,
-        D: np.ndarray,
-        free: np.ndarray,
-        inverse: np.ndarray,
-        regularisation: np.ndarray,
-    ) -> np.ndarray:
-        """Return the minimum of the quadratic model on the face of the `free` paths or a smaller one.
+    def _model_minimum(self, model: _Model, free: np.ndarray) -> np.ndarray:
+        """Return the minimum of the model on the face of the `free` paths, or on a smaller face.
 
-        The way to the minimum of a face ends where the first path is empty, and continues without it:
-        so the model falls all along."""
+        The way to the minimum of a face ends where the first path is empty. From there it goes to the
+        minimum without that path. So the model falls all along."""
         y = self.x
         for _ in range(self.effort.faces):
-            goal = self.x + self._newton(g, D, free, inverse, regularisation)
+            goal = self.x + self._newton(model, free)
             falls = free & (goal < 0)
             if not np.any(falls):
                 return goal
@@ -214,18 +218,12 @@ class _Block:
         m = np.maximum(m, self._to_paths(least)) + regularisation
         return 1.0 / np.where(m > 0, m, 1.0), regularisation
 
-    def _newton(
-        self,
-        g: np.ndarray,
-        D: np.ndarray,
-        free: np.ndarray,
-        inverse: np.ndarray,
-        regularisation: np.ndarray,
-    ) -> np.ndarray:
+    def _newton(self, model: _Model, free: np.ndarray) -> np.ndarray:
         """Return the Newton step δ on the face of the `free` paths.
 
         δ = −x on the other paths and Σ δ = 0 for every pair. It minimises gᵀδ + ½δᵀ(ΔᵀDΔ + ε)δ
         approximately, by conjugate gradients with the preconditioner m on this face."""
+        g, D, inverse, regularisation = model
         weight = np.where(free, inverse, 0.0)
         fraction = weight / self._to_paths(self._sum(weight))
 
