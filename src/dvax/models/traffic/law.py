@@ -16,9 +16,10 @@ convergence.
 
 Only pairs with at least two paths, and only links that are not on all paths of a pair, enter the system
 (`Paths.differences`). ρ Dᵢ Sᵢᵢ is large for few links. The matrix is formed and factorised on these
-links, and this block is a preconditioner of conjugate gradients for the whole system. The set of paths
-that carry flow changes from one iteration to the next. The block is formed once for each law, and
-again if conjugate gradients need many products with it.
+links. This block, with the diagonal 1 + ρ Dᵢ Sᵢᵢ for all other links, is a preconditioner of conjugate
+gradients for the whole system. The set of paths that carry flow changes from one iteration to the next.
+The block is formed once for each law, and again if conjugate gradients need many products with it; the
+diagonal of S is that of the equilibrium.
 
 The linear system is solved inexactly: along g/s the slope is ρ⟨g, −sr⟩, which is positive for every
 iterate g of conjugate gradients. So dv = g/s for links with stiff costs, and −r − ρSsg for the others,
@@ -42,7 +43,7 @@ from ...vi.iteration import Trial, iterate
 from .costs import LinkCosts
 from .paths import Incidence, Paths
 
-_MAX_BLOCK_LINKS = 768
+_MAX_BLOCK_LINKS = 1024
 """Largest number of links in the factorised block."""
 _STIFF_LINK = 0.1
 """Links with a smaller ρ Dᵢ Sᵢᵢ are not in the factorised block."""
@@ -50,8 +51,9 @@ _STIFF_LINK = 0.1
 _CG_TOLERANCE = 1e-2
 _MAX_PRODUCTS = 500
 """Relative residual of the linear systems, and largest number of products."""
-_REFACTORISE_PRODUCTS = 16
-"""Number of products after which the block is formed again, which costs the same time."""
+_REFACTORISE_PRODUCTS = 32
+"""The block is formed again if a system needs so many more products than the first one with it: they
+cost the same time."""
 
 _ASCENT_FRACTION = 1e-4
 _MIN_STEP_LENGTH = 1e-9
@@ -75,16 +77,17 @@ class Choices(eqx.Module):
     """The paths of pairs with several paths, restricted to links that differ (`Paths.differences`).
 
     `rows` are their numbers among all paths, `pair` the numbers of their pairs, `incidence` the
-    links of each, and `paths_per_link` the number of these paths on each link. `block` are the
-    links of the factorised block. The entries of S on the block are sums into `cells` of one number
-    a path (`of_row`: whether it carries flow) and of one number a combination of links (`first`,
-    `second`: indices into `key_pair`, which lists (pair, link of the block); `key_row` → `key`
-    counts the paths that carry flow)."""
+    links of each, `paths_per_link` the number of these paths on each link, and `diagonal` the entries
+    Sᵢᵢ at given flows. `block` are the links of the factorised block. The entries of S on the block are
+    sums into `cells` of one number a path (`of_row`: whether it carries flow) and of one number a
+    combination of links (`first`, `second`: indices into `key_pair`, which lists (pair, link of the
+    block); `key_row` → `key` counts the paths that carry flow)."""
 
     rows: jax.Array
     pair: jax.Array
     incidence: Incidence
     paths_per_link: jax.Array
+    diagonal: jax.Array
     block: jax.Array
     cells: jax.Array
     of_row: jax.Array
@@ -103,7 +106,8 @@ class Choices(eqx.Module):
         pair = np.repeat(np.arange(len(differences.sizes)), differences.sizes)
         paths_per_link = np.bincount(differences.links, minlength=paths.count)
         used = (flows[differences.rows] > 0).astype(float)
-        weight = stiffness * _diagonal(pair, row, differences.links, used, paths.count)
+        diagonal = _diagonal(pair, row, differences.links, used, paths.count)
+        weight = stiffness * diagonal
         block = np.sort(np.argsort(-weight, kind="stable")[:_MAX_BLOCK_LINKS])
         block = block[weight[block] > _STIFF_LINK]
         position = np.full(paths.count, -1)
@@ -127,6 +131,7 @@ class Choices(eqx.Module):
         self.rows, self.pair, self.block = int32(differences.rows), int32(pair), int32(block)
         self.incidence = Incidence(lengths, differences.links, paths.count)
         self.paths_per_link = jnp.asarray(paths_per_link, float)
+        self.diagonal = jnp.asarray(diagonal, float)
         self.cells = int32(np.concatenate([path_cells, pair_cells]))
         self.of_row = int32(of_row)
         self.first, self.second = int32(first), int32(second)
@@ -190,13 +195,13 @@ class _State(NamedTuple):
 class _Method(NamedTuple):
     """The state of Newton's method.
 
-    `inverse` is the inverse of a Cholesky factor of the block, `products` the number of products that
-    the last linear system needed with it.
+    `inverse` is the inverse of a Cholesky factor of the block, `products` the numbers of products that
+    the first and the last linear system needed with it.
     """
 
     at: _State
     inverse: jax.Array
-    products: jax.Array
+    products: tuple[jax.Array, jax.Array]
 
 
 class LinkNewton(AbstractSolver):
@@ -229,7 +234,8 @@ class LinkNewton(AbstractSolver):
 
         def begin(*_: Any) -> _Method:
             size = len(self.choices.block)
-            return _Method(at, jnp.zeros((size, size), start.dtype), jnp.asarray(_MAX_PRODUCTS))
+            none, many = jnp.asarray(0), jnp.asarray(_MAX_PRODUCTS)
+            return _Method(at, jnp.zeros((size, size), start.dtype), (none, many))
 
         def advance(_: FrozenVI, method: _Method) -> tuple[_Method, Trial]:
             new, calls = law.ascend(method)
@@ -326,8 +332,8 @@ class _Law:
 
     def _newton(
         self, r: jax.Array, D: jax.Array, y: jax.Array, method: _Method
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return (dv for the residual r, the inverse of the block factor, the number of products)."""
+    ) -> tuple[jax.Array, jax.Array, tuple[jax.Array, jax.Array]]:
+        """Return (dv for the residual r, the inverse of the block factor, the numbers of products)."""
         choices, rho, s = self.choices, self.rho, jnp.sqrt(D)
         used = jnp.where(y > 0, 1.0, 0.0)
         count = jnp.maximum(choices.sums(used), 1.0)
@@ -344,19 +350,21 @@ class _Law:
             factor = jnp.linalg.cholesky(matrix + unit, symmetrize_input=False)
             return jax.scipy.linalg.solve_triangular(factor, unit, lower=True)
 
-        inverse = lax.cond(
-            method.products > _REFACTORISE_PRODUCTS, factorise, lambda: method.inverse
-        )
+        first, last = method.products
+        is_old = last > first + _REFACTORISE_PRODUCTS
+        inverse = lax.cond(is_old, factorise, lambda: method.inverse)
+
+        outside = 1.0 / (1.0 + rho * D * choices.diagonal)
 
         def precondition(g: jax.Array) -> jax.Array:
-            return g.at[block].set((inverse @ g[block]) @ inverse)
+            return (outside * g).at[block].set((inverse @ g[block]) @ inverse)
 
         g, Ssg, products = _conjugate_gradients(apply, precondition, s, rho, -s * r)
         # For an inexact g, the first formula has the smaller error in s dv on stiff links. The error
         # of the second remains bounded as s → 0.
         stiff = rho * D * choices.paths_per_link > _STIFF_LINK
         dv = jnp.where(stiff, g / jnp.where(stiff, s, 1.0), -r - rho * Ssg)
-        return dv, inverse, products
+        return dv, inverse, (jnp.where(is_old, products, first), products)
 
     def _rows(self, y: jax.Array) -> jax.Array:
         return y.at[self.choices.rows].get(mode="promise_in_bounds")
