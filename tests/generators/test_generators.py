@@ -106,6 +106,29 @@ def test_dense_growth_bound_of_a_nonnormal_matrix_decays(weighted):
     assert float(generators.Dense(A).growth(space).omega) > 50
 
 
+_growth = jax.jit(lambda A, omega: generators.Dense(A, omega).growth(spaces.Euclidean(len(A))).M)
+
+
+@pytest.mark.parametrize("n", [1, 3, 20])
+def test_dense_growth_constant_is_that_of_lyapunovs_equation_by_a_schur_decomposition(n):
+    """Rates from just above the spectrum to far above it; graded and nonnormal matrices."""
+    rng = np.random.default_rng(20261126 + n)
+    for k in range(30):
+        graded = np.diag(-(10.0 ** rng.uniform(-4, 4, n)))
+        above = np.triu(rng.normal(size=(n, n)), 1) * 10.0 ** rng.uniform(-3, 1)
+        A = (graded + above, rng.normal(size=(n, n)) * 10.0 ** rng.uniform(-3, 3))[k % 2]
+        size = np.linalg.norm(A, 2)
+        omega = np.max(np.linalg.eigvals(A).real) + 10.0 ** rng.uniform(-4, 0) * size
+        S = A - omega * np.eye(n)
+        Q = scipy.linalg.solve_continuous_lyapunov(S.T, -np.eye(n))
+        low, high = np.linalg.eigvalsh(0.5 * (Q + Q.T))[[0, -1]]
+        if low < 1e-10 * high:
+            continue
+        # Rounding enters the smallest eigenvalue of Q relative to the largest.
+        close = 1e-8 + 1e-13 * high / low
+        assert float(_growth(A, omega)) == pytest.approx(np.sqrt(high / low), rel=close)
+
+
 def test_growth_bounds_of_scalar_diagonal_zero_and_product():
     plane = spaces.Euclidean(2)
     assert float(generators.Scalar(-0.7).growth(plane).omega) == -0.7
