@@ -29,6 +29,7 @@ CASES = (
     "applications",
     "stiffness",
     "picard",
+    "accelerator",
     "ensemble",
     "sweeps",
     "sharding",

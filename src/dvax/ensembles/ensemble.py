@@ -28,8 +28,9 @@ from .moments import Moments
 from .result import Ensemble, Fold
 from .workers import device_list
 
-_LANES = 1024
-"""Members that an accelerator advances together."""
+_LANES, _ENTRIES = 8192, 2**23
+"""Members that an accelerator advances together, and the entries of all their states, at most: on
+an H100, 10⁵ members of a scalar law were 3.4 times as fast with 8192 lanes as with 1024."""
 
 
 def ensemble(
@@ -78,7 +79,7 @@ def ensemble(
     - `keep`: whether to keep these values of all members. Without it there are `mean`, `std` and what
       `folds` reduce: a dictionary of `dvax.Fold`;
     - `devices`: by default `jax.local_devices()`; `lanes`: how many members a device advances together,
-      by default 1 on a processor and 1024 elsewhere: these wait for the slowest among them;
+      by default 1 on a processor, elsewhere 8192 or fewer, for large states. They wait for the slowest;
     - `progress`: print how many members are done.
 
     Under `jax.grad` and `jax.jit` all members run in one loop, and a derivative solves each once more.
@@ -131,7 +132,8 @@ def ensemble(
         choice = choose(problem, x0, own_args, begin, end - begin, tol, dt is not None, certified)
     each = device_list(devices)
     if lanes is None:
-        lanes = 1 if each[0].platform == "cpu" else _LANES
+        size = sum(np.size(leaf) for leaf in jtu.tree_leaves(x0))
+        lanes = 1 if each[0].platform == "cpu" else max(1, min(_LANES, _ENTRIES // max(size, 1)))
     static = Static(
         measure, bound_steps(max_steps, dt is not None, *_longest(inputs), dt), adjoint, max_events,
         False, observe or (_end if ts is None else _states), lanes,
