@@ -45,6 +45,23 @@ def read(environment: dict[Any, Any], atoms: Any) -> list[Any]:
     return [atom.val if isinstance(atom, Literal) else environment[atom] for atom in atoms]
 
 
+def count_operations(program: Any) -> int:
+    """Return the number of operations of a program, with those of its inner programs."""
+    return sum(
+        1 + sum(map(count_operations, nested_programs(e.params))) for e in program.jaxpr.eqns
+    )
+
+
+def nested_programs(params: dict[str, Any]) -> list[Any]:
+    """Return the programs among the parameters of an operation, such as the branches of a `cond`."""
+    programs = []
+    for value in params.values():
+        for one in value if isinstance(value, tuple | list) else (value,):
+            if isinstance(one, ClosedJaxpr | Jaxpr):
+                programs.append(one if isinstance(one, ClosedJaxpr) else ClosedJaxpr(one, ()))
+    return programs
+
+
 def inner_program(eqn: Any) -> Any:
     """Return the program that a call applies to its arguments, or None for another operation."""
     if eqn.primitive.name not in CALLS:

@@ -20,9 +20,11 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jax.lax import GatherScatterMode
+
+from .jaxprs import count_operations, nested_programs
 
 _MAX_ENTRIES = 8192
 """Largest number of entries of a computed array: larger arrays gain more from several cores."""
@@ -104,7 +106,7 @@ def _bind(program: ClosedJaxpr, leaves: list[Any], packs: list[bool]) -> list[An
         numbers
         and 0 < sum(leaf.size for leaf in packed) <= _MAX_PACKED
         and _is_small(program)
-        and _count(program) <= _MAX_EQUATIONS
+        and count_operations(program) <= _MAX_EQUATIONS
     ):
         return jaxpr_as_fun(program)(*leaves)
     return _outlined_p.bind(*leaves, program=program, packs=tuple(packs))
@@ -112,11 +114,6 @@ def _bind(program: ClosedJaxpr, leaves: list[Any], packs: list[bool]) -> list[An
 
 # The following functions decide which programs are small and contain only operations that XLA can
 # compile in one function. A request for another program aborts the process.
-
-
-def _count(program: ClosedJaxpr) -> int:
-    """Return the number of operations of a program, with those of its inner programs."""
-    return sum(1 + sum(map(_count, _nested_programs(e.params))) for e in program.jaxpr.eqns)
 
 
 def _is_small(program: ClosedJaxpr) -> bool:
@@ -130,7 +127,7 @@ def _are_few(arrays: Any, most: int = _MAX_ENTRIES) -> bool:
 def _is_small_equation(eqn: Any) -> bool:
     name, results = eqn.primitive.name, [v.aval for v in eqn.outvars]
     if name in _NESTED:
-        return all(map(_is_small, _nested_programs(eqn.params)))
+        return all(map(_is_small, nested_programs(eqn.params)))
     if name in _PARTS:
         number = _PARTS[name]
         part = results[0] if number is None else eqn.invars[number].aval
@@ -147,15 +144,6 @@ def _is_small_equation(eqn: Any) -> bool:
     if name in _REDUCTIONS:
         return _are_few([eqn.invars[0].aval], _MAX_REDUCED)
     return name in _FREE or (name in _ELEMENTWISE and _are_few(results))
-
-
-def _nested_programs(params: dict[str, Any]) -> list[ClosedJaxpr]:
-    programs = []
-    for value in params.values():
-        for one in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(one, ClosedJaxpr | Jaxpr):
-                programs.append(one if isinstance(one, ClosedJaxpr) else ClosedJaxpr(one, ()))
-    return programs
 
 
 def _is_plain_product(eqn: Any, first: Any, second: Any) -> bool:

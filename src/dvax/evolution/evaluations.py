@@ -11,6 +11,7 @@ from jax import lax
 
 from .. import _tree
 from .._batch import any_lane
+from .._jax.jaxprs import count_operations
 from .._tree import Tree
 from .flow import Flow, Rate
 
@@ -22,6 +23,9 @@ class Evaluation(NamedTuple):
     x: Tree
     rate: Rate
 
+
+_MAX_ENTRIES, _MAX_OPERATIONS = 64, 100
+"""f̃ is in the program once if the state has no more entries, and f̃ more operations."""
 
 Stages = Callable[[Callable[[Any, Tree], Rate]], tuple[tuple[Tree, ...], Tree]]
 """From evaluate(t, x) to (the stage polynomial, x₁)."""
@@ -45,9 +49,17 @@ def evaluated(
 ) -> Evaluated:
     """A plan carried out from x₀, its first rate being `kept` (None: unknown), unless data `jumped`.
     `begin` is any time of the run."""
-    if flow.direct:
+    if flow.direct and not _is_long(flow, begin, x0):
         return _straight(flow, plan, kept, jumped)
     return _in_turn(flow, plan, begin, x0, guess, kept, jumped)
+
+
+def _is_long(flow: Flow, t: Any, x: Tree) -> bool:
+    """Return whether f̃ is many operations on few numbers, as the formula for a box in two dimensions
+    is: a compiler then takes most of its time for the copies of f̃."""
+    if sum(jnp.size(leaf) for leaf in jtu.tree_leaves(x)) > _MAX_ENTRIES:
+        return False
+    return count_operations(jax.make_jaxpr(lambda: flow.rate(t, x, None))()) > _MAX_OPERATIONS
 
 
 def _straight(flow: Flow, plan: Stages, kept: Rate | None, jumped: Any) -> Evaluated:
@@ -107,9 +119,9 @@ def _in_turn(
 ) -> Evaluated:
     """The same by a loop that evaluates f̃ at one place of the program.
 
-    A law that is solved by iteration takes a compiler a second or ten, once for every place. So the
-    plan is run again for every evaluation, with the rates known so far, to see where it goes next; of
-    all that it computes the compiler keeps what leads there.
+    A law that is solved by iteration takes a compiler a second or ten, once for every place, and a long
+    formula nearly as much. So the plan is run again for every evaluation, with the rates known so far,
+    to see where it goes next; of all that it computes the compiler keeps what leads there.
 
     The law is solved from what is known of y at that time, and not from where the plan went last: it
     may go to the end of the step for a stage, then inside, and to the end again.
@@ -155,7 +167,7 @@ def _in_turn(
 
     def one(k: Any, table: Rate) -> Rate:
         t, x = lax.switch(k, [partial(visit, i) for i in range(count)], table)
-        near = _tree.where(k > 0, _along_line(times, table.y, k), guess)
+        near = None if guess is None else _tree.where(k > 0, _along_line(times, table.y, k), guess)
         return _tree.put(table, k, flow.rate(t, x, near))
 
     table = lax.fori_loop(start, count, one, table)
