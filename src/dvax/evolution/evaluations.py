@@ -25,7 +25,7 @@ class Evaluation(NamedTuple):
 
 
 _MAX_ENTRIES, _MAX_OPERATIONS = 64, 100
-"""f̃ is in the program once if the state has no more entries, and f̃ more operations."""
+"""f̃ is in the program once if the state has no more entries than this, and f̃ more operations."""
 
 Stages = Callable[[Callable[[Any, Tree], Rate]], tuple[tuple[Tree, ...], Tree]]
 """From evaluate(t, x) to (the stage polynomial, x₁)."""
@@ -57,9 +57,13 @@ def evaluated(
 def _is_long(flow: Flow, t: Any, x: Tree) -> bool:
     """Return whether f̃ is many operations on few numbers, as the formula for a box in two dimensions
     is: a compiler then takes most of its time for the copies of f̃."""
-    if sum(jnp.size(leaf) for leaf in jtu.tree_leaves(x)) > _MAX_ENTRIES:
+    if not _has_few_entries(x):
         return False
     return count_operations(jax.make_jaxpr(lambda: flow.rate(t, x, None))()) > _MAX_OPERATIONS
+
+
+def _has_few_entries(x: Tree) -> bool:
+    return sum(jnp.size(leaf) for leaf in jtu.tree_leaves(x)) <= _MAX_ENTRIES
 
 
 def _straight(flow: Flow, plan: Stages, kept: Rate | None, jumped: Any) -> Evaluated:
@@ -166,7 +170,12 @@ def _in_turn(
         table, start = _tree.put(table, 0, kept), jnp.where(any_lane(jumped), 0, 1)
 
     def one(k: Any, table: Rate) -> Rate:
-        t, x = lax.switch(k, [partial(visit, i) for i in range(count)], table)
+        if _has_few_entries(x0):
+            # All places at once are less to compile than a branch for each.
+            places = [(place.t, place.x) for place in run(lambda i: row(table, i))[1]]
+            t, x = jtu.tree_map(lambda *each: jnp.stack(each)[k], *places)
+        else:
+            t, x = lax.switch(k, [partial(visit, i) for i in range(count)], table)
         near = None if guess is None else _tree.where(k > 0, _along_line(times, table.y, k), guess)
         return _tree.put(table, k, flow.rate(t, x, near))
 
