@@ -1,5 +1,6 @@
 """Every week of the RTS-GMLC year is solved at the default tolerances, for any origin of time."""
 
+import os
 from pathlib import Path
 
 import equinox as eqx
@@ -15,6 +16,7 @@ FOLDER = Path(__file__).parents[3] / "shared" / "data" / "RTS-GMLC"
 pytestmark = pytest.mark.skipif(
     not FOLDER.is_dir(), reason=f"RTS-GMLC is not in {FOLDER}, and its licence forbids copying it"
 )
+WIND = Path(os.environ.get("DVAX_RTS", "")) / "REAL_TIME_wind.csv"
 WEEKS = [4000, 8616, *range(0, 8736, 168)]
 
 
@@ -50,3 +52,22 @@ def test_market_with_wind_data_every_five_minutes(data, start):
     finer[:, moves] = np.maximum(0.0, finer[:, moves] * noise)
     windy = eqx.tree_at(lambda m: m.capacity, market, dvax.signals.Table(times, finer))
     assert float(windy.run().ts[-1]) == start + 167.0
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(not WIND.is_file(), reason="DVAX_RTS names no folder with REAL_TIME_wind.csv")
+@pytest.mark.parametrize("start", WEEKS)
+def test_market_with_measured_wind_every_five_minutes(data, start):
+    hours = min(168, len(data.load) - start)
+    market = Market.from_rts(data, start, hours)
+    names = WIND.read_text().partition("\n")[0].split(",")[4:]
+    wind = np.loadtxt(WIND, delimiter=",", skiprows=1)[:, 4:]
+    times = start + np.arange((hours - 1) * 12 + 1) / 12.0
+    hourly = np.asarray(market.capacity.values)
+    finer = np.stack([np.interp(times, market.capacity.times, row) for row in hourly.T], axis=1)
+    for name, power in zip(names, wind.T, strict=True):
+        finer[:, data.names.index(name)] = power[start * 12 : start * 12 + len(times)]
+    windy = eqx.tree_at(lambda m: m.capacity, market, dvax.signals.Table(times, finer))
+    sol = windy.run()
+    assert float(sol.ts[-1]) == start + hours - 1.0
+    assert float(dvax.bound_error(windy.problem, sol, windy.constants).x.max()) < 1e-6
