@@ -139,6 +139,30 @@ def test_small_box_solve_equals_the_iterated_law():
     assert float(slope) == pytest.approx(central, rel=1e-4)
 
 
+@pytest.mark.parametrize("kind", ["coupled law", "long f"])
+def test_small_box_runs_of_all_methods_agree(kind):
+    """A law or an f of many operations is in the program once, and is evaluated in a loop."""
+    rng = np.random.default_rng(2)
+    coupling = jnp.asarray(np.eye(3) + 0.3 * rng.normal(size=(3, 3)))
+    waves = lambda t: sum(jnp.sin(k * t) / k**2 for k in range(1, 31))  # noqa: E731
+    drive = waves if kind == "long f" else jnp.sin
+    apply = (lambda u: 0.5 * u) if kind == "long f" else (lambda u: coupling @ u)
+    problem = dvax.Problem(
+        A=dvax.generators.Dense(0.2 * rng.normal(size=(3, 3)) - np.eye(3)),
+        P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-0.4, 0.3),
+        f=lambda t, x, u, args: drive(3.0 * t) - u, h=lambda t, x, u, args: x - apply(u),
+    )  # fmt: skip
+
+    def solve(**options):
+        return np.asarray(
+            dvax.solve(problem, jnp.linspace(-1.0, 1.0, 3), 0.0, 2.0, **options).xs[-1]
+        )
+
+    exact = solve(rtol=1e-10, atol=1e-12, method=dvax.DormandPrince())
+    for method in (dvax.ETD2RK(), dvax.ExpRosenbrock()):
+        assert np.abs(solve(method=method, rtol=1e-4) - exact).max() < 1e-3, method
+
+
 def test_small_box_law_without_a_solution_fails():
     problem = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),

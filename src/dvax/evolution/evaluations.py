@@ -49,7 +49,8 @@ def evaluated(
 ) -> Evaluated:
     """A plan carried out from x₀, its first rate being `kept` (None: unknown), unless data `jumped`.
     `begin` is any time of the run."""
-    if flow.direct and not _is_long(flow, begin, x0):
+    # Enclosed steps are short, and keep no solution of the law.
+    if flow.direct and (flow.enclosed or not _is_long(flow, begin, x0)):
         return _straight(flow, plan, kept, jumped)
     return _in_turn(flow, plan, begin, x0, guess, kept, jumped)
 
