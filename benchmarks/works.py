@@ -25,7 +25,7 @@ class Work(NamedTuple):
 def _field(points: int, steps: int, **settings: Any) -> Call:
     law = strip(points)
     start = jnp.asarray(law.start)
-    span = {"t1": 1e-3 * steps, "dt": 1e-3} | settings
+    span: dict[str, Any] = {"t1": 1e-3 * steps, "dt": 1e-3} | settings
 
     return lambda: jax.block_until_ready(dvax.solve(law.model.problem, start, 0.0, **span).xs)[-1]
 
