@@ -1,4 +1,4 @@
-"""The same work on an accelerator and on the processor of the same machine."""
+"""The same workloads on an accelerator and on the processor of the same machine."""
 
 import jax
 import numpy as np
@@ -7,7 +7,7 @@ from ..clock import in_turn
 from ..layout import duration
 from ..peers.on_platform import Platform
 from ..section import Section, Table, compare
-from ..works import WORKS
+from ..workloads import WORKLOADS
 
 
 def run(full: bool) -> Section:
@@ -26,10 +26,10 @@ def run(full: bool) -> Section:
         return section
     first = Table("first call, with compilation", ("case", device.platform, "cpu"), [])
     with Platform(None) as ours, Platform("cpu") as theirs:
-        for name, work in WORKS.items():
+        for name, workload in WORKLOADS.items():
             sides = {"accelerator": ours, "cpu": theirs}
             for side in sides.values():
-                side.send("prepare", name)
+                side.send(do="prepare", workload=name)
             made = {key: side.prepared() for key, side in sides.items()}
             taken = in_turn(
                 {
@@ -41,10 +41,10 @@ def run(full: bool) -> Section:
             (seconds, answer), (seconds_cpu, answer_cpu) = made["accelerator"], made["cpu"]
             section.comparisons.append(
                 compare(
-                    work.what, "cpu", taken["accelerator"], taken["cpu"], direction="other/dvax",
+                    workload.what, "cpu", taken["accelerator"], taken["cpu"], direction="other/dvax",
                     error=float(np.max(np.abs(answer - answer_cpu))),
                 )
             )  # fmt: skip
-            first.rows.append((work.what, duration(seconds), duration(seconds_cpu)))
+            first.rows.append((workload.what, duration(seconds), duration(seconds_cpu)))
     section.tables.append(first)
     return section

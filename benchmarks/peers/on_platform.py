@@ -1,45 +1,40 @@
-"""A process that does the work of `benchmarks/works.py` on the platform that JAX_PLATFORMS names.
+"""A process that runs `benchmarks/workloads.py` on the platform that JAX_PLATFORMS names.
 
     python -m benchmarks.peers.on_platform
 
-It reads orders as lines of JSON, {"do": "prepare" or "sample", "work": NAME}, and answers each with a
-line: the seconds of the first call and where its result is stored, or the seconds of one sample.
+It reads orders as lines of JSON, {"do": "prepare" or "sample", "workload": NAME}, and answers each with
+a line: the seconds of the first call and where its result is stored, or the seconds of one sample.
 """
 
 import json
 import os
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
+
+from .process import Process
 
 _ROOT = Path(__file__).parents[2]
 
 
-class Platform:
-    """A client of such a process, to be used in a `with` statement.
+class Platform(Process):
+    """A client of such a process.
 
     `name` is a value of JAX_PLATFORMS, or None for the device that JAX takes by itself.
     """
 
     def __init__(self, name: str | None):
         self._folder = tempfile.TemporaryDirectory()
-        environment: Mapping[str, str] = os.environ
-        if name is not None:
-            environment = os.environ | {"JAX_PLATFORMS": name}
-        self._process = subprocess.Popen(
+        chosen = {} if name is None else {"JAX_PLATFORMS": name}
+        super().__init__(
             [sys.executable, "-m", "benchmarks.peers.on_platform", self._folder.name],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=_ROOT, env=environment,
+            cwd=_ROOT, env=os.environ | chosen,
         )  # fmt: skip
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self,
@@ -47,31 +42,16 @@ class Platform:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait(timeout=60)
+        super().__exit__(kind, error, trace)
         self._folder.cleanup()
-
-    def send(self, do: str, work: str) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps({"do": do, "work": work}) + "\n")
-        self._process.stdin.flush()
-
-    def receive(self) -> Any:
-        """**Raises:** `RuntimeError` if the process ended; it has printed why."""
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            raise RuntimeError(f"the process ended with status {self._process.wait()}")
-        return json.loads(line)
 
     def prepared(self) -> tuple[float, np.ndarray]:
         """Seconds of the first call, and its result."""
         seconds, stored = self.receive()
         return seconds, np.load(stored)
 
-    def sample(self, work: str) -> float:
-        self.send("sample", work)
+    def sample(self, workload: str) -> float:
+        self.send(do="sample", workload=workload)
         return self.receive()
 
 
@@ -81,14 +61,14 @@ def _serve(folder: Path) -> None:
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     from benchmarks.clock import timed
-    from benchmarks.works import WORKS
+    from benchmarks.workloads import WORKLOADS
 
     samples: dict[str, Any] = {}
     for line in sys.stdin:
         order = json.loads(line)
-        name = order["work"]
+        name = order["workload"]
         if order["do"] == "prepare":
-            call = WORKS[name].make()
+            call = WORKLOADS[name].make()
             start = time.perf_counter()
             result = np.asarray(call())
             seconds = time.perf_counter() - start

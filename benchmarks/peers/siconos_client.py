@@ -1,18 +1,18 @@
 """A client for Siconos: it starts the Python that has Siconos, and exchanges lines with it."""
 
-import json
 import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from ..contact_law import ContactLaw
 from .affine_boxes import Affine
+from .process import Process
 
 _HERE = Path(__file__).parent
 _PYTHONS = (sys.executable, "/usr/bin/python3", "python3")
@@ -36,7 +36,7 @@ def python() -> str | None:
     return None
 
 
-class _Running:
+class _Running(Process):
     """A running Siconos process, to be used in a `with` statement.
 
     Some of its solvers report success with NaN, and print a warning where they did not converge:
@@ -45,14 +45,8 @@ class _Running:
 
     def __init__(self, interpreter: str, program: str):
         self._print = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")
-        self._process = subprocess.Popen(
-            [interpreter, str(_HERE / program)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._print, text=True,
-            env=_ENVIRONMENT,
-        )  # fmt: skip
-
-    def __enter__(self) -> Self:
-        return self
+        command = [interpreter, str(_HERE / program)]
+        super().__init__(command, stderr=self._print, env=_ENVIRONMENT)
 
     def __exit__(
         self,
@@ -60,9 +54,7 @@ class _Running:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait(timeout=60)
+        super().__exit__(kind, error, trace)
         self._print.close()
 
     def said(self) -> str:
@@ -71,13 +63,8 @@ class _Running:
         return self._print.read().strip()
 
     def _ask(self, **order: Any) -> dict[str, Any]:
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.write(json.dumps(order) + "\n")
-        self._process.stdin.flush()
-        line = self._process.stdout.readline()
-        if not line:
-            raise RuntimeError(f"Siconos ended while asked to {order['do']}: {self.said()[-2000:]}")
-        return json.loads(line)
+        self.send(**order)
+        return self.receive()
 
 
 class Siconos(_Running):

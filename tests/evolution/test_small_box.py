@@ -140,7 +140,7 @@ def test_small_box_solve_equals_the_iterated_law():
 
 
 @pytest.mark.parametrize("kind", ["coupled law", "long f"])
-def test_small_box_runs_of_all_methods_agree(kind):
+def test_small_box_runs_of_three_methods_agree(kind):
     """A law or an f of many operations is in the program once, and is evaluated in a loop."""
     rng = np.random.default_rng(2)
     coupling = jnp.asarray(np.eye(3) + 0.3 * rng.normal(size=(3, 3)))

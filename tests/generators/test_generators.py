@@ -112,7 +112,7 @@ _growth = jax.jit(lambda A, omega: generators.Dense(A, omega).growth(spaces.Eucl
 @pytest.mark.parametrize("n", [1, 3, 20])
 def test_dense_growth_constant_is_that_of_lyapunovs_equation_by_a_schur_decomposition(n):
     """Rates from just above the spectrum to far above it; graded and nonnormal matrices."""
-    rng = np.random.default_rng(20261126 + n)
+    rng, compared = np.random.default_rng(20261126 + n), 0
     for k in range(30):
         graded = np.diag(-(10.0 ** rng.uniform(-4, 4, n)))
         above = np.triu(rng.normal(size=(n, n)), 1) * 10.0 ** rng.uniform(-3, 1)
@@ -127,6 +127,8 @@ def test_dense_growth_constant_is_that_of_lyapunovs_equation_by_a_schur_decompos
         # Rounding enters the smallest eigenvalue of Q relative to the largest.
         close = 1e-8 + 1e-13 * high / low
         assert float(_growth(A, omega)) == pytest.approx(np.sqrt(high / low), rel=close)
+        compared += 1
+    assert compared >= 20
 
 
 def test_growth_bounds_of_scalar_diagonal_zero_and_product():

@@ -15,6 +15,9 @@ from .._jax.jaxprs import count_operations
 from .._tree import Tree
 from .flow import Flow, Rate
 
+_MAX_ENTRIES, _MAX_OPERATIONS = 64, 100
+"""f̃ is in the program once if the state has no more entries than this, and f̃ more operations."""
+
 
 class Evaluation(NamedTuple):
     """Where f̃ was evaluated, and what it was."""
@@ -23,9 +26,6 @@ class Evaluation(NamedTuple):
     x: Tree
     rate: Rate
 
-
-_MAX_ENTRIES, _MAX_OPERATIONS = 64, 100
-"""f̃ is in the program once if the state has no more entries than this, and f̃ more operations."""
 
 Stages = Callable[[Callable[[Any, Tree], Rate]], tuple[tuple[Tree, ...], Tree]]
 """From evaluate(t, x) to (the stage polynomial, x₁)."""
@@ -49,7 +49,8 @@ def evaluated(
 ) -> Evaluated:
     """A plan carried out from x₀, its first rate being `kept` (None: unknown), unless data `jumped`.
     `begin` is any time of the run."""
-    # Enclosed steps are short, and keep no solution of the law.
+    # A step whose defect is enclosed has few evaluations, and its first rate lacks the solution of the
+    # law, which the loop would store.
     if flow.direct and (flow.enclosed or not _is_long(flow, begin, x0)):
         return _straight(flow, plan, kept, jumped)
     return _in_turn(flow, plan, begin, x0, guess, kept, jumped)

@@ -52,8 +52,8 @@ _CG_TOLERANCE = 1e-2
 _MAX_PRODUCTS = 500
 """Relative residual of the linear systems, and largest number of products."""
 _REFACTORISE_PRODUCTS = 32
-"""The block is formed again if a system needs so many more products than the first one with it: they
-cost the same time."""
+"""The block is formed again if a system needs this many products more than the first system with this
+block. Forming it takes about as long."""
 
 _ASCENT_FRACTION = 1e-4
 _MIN_STEP_LENGTH = 1e-9

@@ -1,4 +1,4 @@
-"""Work that dvax does on an accelerator as on a processor."""
+"""What dvax computes on an accelerator as on a processor."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,10 +12,10 @@ import dvax
 from .contact_law import strip
 
 Call = Callable[[], Any]
-"""Does the work, and returns numbers by which two platforms are compared."""
+"""Computes, and returns numbers by which two platforms are compared."""
 
 
-class Work(NamedTuple):
+class Workload(NamedTuple):
     """`make()` prepares a call: arrays on the device, functions compiled when it is first called."""
 
     what: str
@@ -99,24 +99,28 @@ def _simplices(count: int, n: int) -> Call:
     return lambda: jax.block_until_ready(run(values))
 
 
-WORKS = {
-    "field 1e5": Work("10⁵ contact points, 200 fixed steps, as called", lambda: _field(10**5, 200)),
-    "field 1e6": Work("10⁶ contact points, 200 fixed steps, as called", lambda: _field(10**6, 200)),
-    "field 1e7": Work("10⁷ contact points, 20 fixed steps, as called", lambda: _field(10**7, 20)),
-    "bound 1e6": Work(
+WORKLOADS = {
+    "field 1e5": Workload("10⁵ contact points, 200 fixed steps, as called", lambda: _field(10**5, 200)),
+    "field 1e6": Workload("10⁶ contact points, 200 fixed steps, as called", lambda: _field(10**6, 200)),
+    "field 1e7": Workload("10⁷ contact points, 20 fixed steps, as called", lambda: _field(10**7, 20)),
+    "bound 1e6": Workload(
         "10⁶ contact points, 200 fixed steps, the defect measured",
         lambda: _field(10**6, 200, measure=True),
     ),
-    "adaptive 1e5": Work(
+    "adaptive 1e5": Workload(
         "10⁵ contact points to rtol 1e-6, the default method",
         lambda: _field(10**5, 1000, dt=None, rtol=1e-6),
     ),
-    "gradient 1e5": Work("gradient by x₀ of 10⁵ points and 200 steps", lambda: _gradient(10**5, 200)),
-    "heat": Work("heat on 1024 × 1024 points with a saturated law, 20 steps", lambda: _heat(1024, 20)),
-    "ensemble": Work("10⁵ members of C1 to rtol 1e-6", lambda: _ensemble(10**5)),
-    "box": Work("one dense inequality on a box, n = 1000", lambda: _boxes(1, 1000)),
-    "boxes": Work("512 dense inequalities on boxes, n = 100", lambda: _boxes(512, 100)),
-    "pointwise": Work("10⁶ nonlinear laws on intervals", lambda: _pointwise(10**6)),
-    "simplices": Work("10⁵ simplices of 20 entries", lambda: _simplices(10**5, 20)),
-    "point": Work("one contact point, 200 fixed steps, as called", lambda: _field(1, 200)),
+    "gradient 1e5": Workload(
+        "gradient by x₀ of 10⁵ points and 200 steps", lambda: _gradient(10**5, 200)
+    ),
+    "heat": Workload(
+        "heat on 1024 × 1024 points with a saturated law, 20 steps", lambda: _heat(1024, 20)
+    ),
+    "ensemble": Workload("10⁵ members of C1 to rtol 1e-6", lambda: _ensemble(10**5)),
+    "box": Workload("one dense inequality on a box, n = 1000", lambda: _boxes(1, 1000)),
+    "boxes": Workload("512 dense inequalities on boxes, n = 100", lambda: _boxes(512, 100)),
+    "pointwise": Workload("10⁶ nonlinear laws on intervals", lambda: _pointwise(10**6)),
+    "simplices": Workload("10⁵ simplices of 20 entries", lambda: _simplices(10**5, 20)),
+    "point": Workload("one contact point, 200 fixed steps, as called", lambda: _field(1, 200)),
 }  # fmt: skip

@@ -1,0 +1,46 @@
+"""A child process that answers lines of JSON with lines of JSON."""
+
+import json
+import subprocess
+from types import TracebackType
+from typing import Any, Self
+
+
+class Process:
+    """A running child, to be used in a `with` statement, which ends it."""
+
+    def __init__(self, command: list[str], **options: Any):
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, **options
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait(timeout=60)
+
+    def send(self, **order: Any) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(order) + "\n")
+        self._process.stdin.flush()
+
+    def receive(self) -> Any:
+        """**Raises:** `RuntimeError` if the child ended instead of answering."""
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            status = self._process.wait()
+            raise RuntimeError(f"the process ended with status {status}. {self.said()[-2000:]}")
+        return json.loads(line)
+
+    def said(self) -> str:
+        """What the child printed for people, where that is kept."""
+        return ""
