@@ -137,6 +137,8 @@ def test_code_is_not_executed_without_the_flag(tmp_path):
     (POINT.replace('{"rtol": 1e-8}', '{"events": []}'), TABLE, "a run has the options method, rtol"),
     (POINT.replace("points: int = 1", "points: int = 'a'"), TABLE, "model.parameters.points"),
     (POINT.replace("load: float", "load: lode"), TABLE, "NameError: name 'lode' is not defined"),
+    ("from __future__ import annotations\n" + POINT.replace("load: float", "load: lode"), TABLE,
+     "NameError: name 'lode' is not defined"),
 ])  # fmt: skip
 def test_wrong_input_is_named_with_its_place(tmp_path, code, table, words):
     told = " ".join(problems(tmp_path, code, table))

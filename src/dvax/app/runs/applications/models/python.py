@@ -59,8 +59,10 @@ class PythonApplication(AbstractModelApplication):
     def __init__(self, table: PythonSection, paths: Mapping[str, Path], quiet: bool):
         self.file = paths["python"]
         build = _function(self.file, table.function)
-        self.units = _units(build)
-        arguments, given = _run(self.file, lambda: _arguments(build, table.parameters))
+        # Python 3.14 evaluates the types here, and not when it imports the file.
+        hints = _run(self.file, lambda: get_type_hints(build, include_extras=True))
+        self.units = {name: unit for name in hints if (unit := _unit(hints[name])) is not None}
+        arguments, given = _run(self.file, lambda: _arguments(build, hints, table.parameters))
         self.table = table.model_copy(update={"parameters": given})
         model = _run(self.file, lambda: build(**arguments))
         if not isinstance(model, Model):
@@ -173,14 +175,14 @@ def _run(file: Path, work: Callable[[], Any]) -> Any:
 
 
 def _arguments(
-    build: Callable[..., Any], given: dict[str, Any]
+    build: Callable[..., Any], hints: dict[str, Any], given: dict[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the arguments for `build` from the table of parameters, and that table, completed.
+    """Return the arguments for `build`, whose types are `hints`, from the table of parameters, and that
+    table, completed.
 
     Parameters are those of the function, each with its type, or one pydantic model. Annotated[float,
     "mm"] has a unit: a text such as "2 cm" is converted.
     """
-    hints = get_type_hints(build, include_extras=True)
     names = list(inspect.signature(build).parameters.values())
     only = hints.get(names[0].name) if len(names) == 1 else None
     kind: type[BaseModel]
@@ -218,12 +220,6 @@ def _arguments(
     if is_model:
         return {names[0].name: made}, complete
     return {p.name: getattr(made, p.name) for p in names}, complete
-
-
-def _units(build: Callable[..., Any]) -> dict[str, str]:
-    """Return the units of the parameters that have one."""
-    hints = get_type_hints(build, include_extras=True)
-    return {name: unit for name, hint in hints.items() if (unit := _unit(hint)) is not None}
 
 
 def _unit(hint: Any) -> str | None:
