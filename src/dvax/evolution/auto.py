@@ -158,7 +158,8 @@ def choose(
         )
     fast = rates.norm * span
     if fast > _FAST:
-        reason = f"‖A‖ times the span is {fast:.2g}, left to e^(hA)"
+        size = f"‖A‖ times the span is {fast:.2g}" if fast < np.inf else "A discretises an operator"
+        reason = f"{size}, left to e^(hA)"
         if tol >= _LOOSE:
             return _with_fallback(_ETD2RK, f"{reason}, and the tolerance is loose", facts, tol)
         return _with_fallback(_ETD4RK, reason, facts, tol)
