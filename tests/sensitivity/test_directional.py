@@ -183,6 +183,14 @@ def test_directional_derivative_rejects_wrong_directions():
         dvax.sensitivity.kinks(sol)
 
 
+def test_kinks_of_a_dense_piecewise_linear_solution_are_refused():
+    sol = dvax.solve(
+        c1().problem, -1.0, 0.0, 2.0, c1().args, method=dvax.PiecewiseLinear(), dense=True
+    )
+    with pytest.raises(dvax.InputError, match="exponential method"):
+        dvax.sensitivity.kinks(sol)
+
+
 @pytest.mark.thorough
 def test_directional_derivative_in_the_values_of_a_table():
     """x' = −x + load(t) − u with u = max(0, x − 1) is linear between jumps and kinks."""

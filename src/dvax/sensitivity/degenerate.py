@@ -14,7 +14,8 @@ import jax.tree_util as jtu
 import numpy as np
 
 from ..errors import InputError, InputProblem
-from ..evolution import Implicit, Solution
+from ..evolution import Solution
+from ..evolution.outcome import Record
 from ..evolution.stepper import interpolate, local
 
 _SAMPLES_PER_STEP = 8
@@ -58,7 +59,8 @@ def kinks(sol: Solution, *, tol: float = 1e-6) -> list[Kink]:
     A switch counts as zero if its absolute value is below `tol`, which must exceed the error of the
     solution. A zero over less than a thousandth of the run counts as an instant.
 
-    **Raises:** `dvax.InputError` if the solution has no dense output, or is of an implicit method.
+    **Raises:** `dvax.InputError` if the solution has no dense output, or is of `dvax.Implicit` or
+    `dvax.PiecewiseLinear`.
 
     ```python
     >>> import dvax
@@ -72,12 +74,13 @@ def kinks(sol: Solution, *, tol: float = 1e-6) -> list[Kink]:
 
     ```
     """
-    if sol.records is None or isinstance(sol.setup.method, Implicit):
+    if not isinstance(sol.records, Record):
+        dense = "without dense output" if sol.records is None else "with dense output"
         raise InputError(
             InputProblem(
                 "dvax.sensitivity.kinks",
-                "a solution without dense output",
-                "the kinks between saved times are located on the steps of the solution",
+                f"a solution of {type(sol.setup.method).__name__} {dense}",
+                "the kinks between saved times are located on the steps of an exponential method",
                 "Solve with dense=True and an exponential method",
             )
         )
@@ -99,7 +102,6 @@ def _has_switches(sol: Solution) -> bool:
 
 def _sample_switches(sol: Solution, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return (times, values of the switches at these times)."""
-    assert sol.records is not None
     flow, method = sol.flow, sol.setup.method
     steps = jtu.tree_map(lambda leaf: leaf[:count], sol.records)
     run = steps.start[0], steps.start[-1] + steps.length[-1]
