@@ -109,6 +109,50 @@ def test_slope_of_functions_with_jumps_or_without_rules_is_unbounded(fn):
     assert np.isinf(out.parts[0].radius).any()
 
 
+@pytest.mark.parametrize(
+    "fn",
+    [
+        lambda v: v[jnp.array([2, 1, 0])],
+        lambda v: jax.lax.dynamic_slice(v, (jnp.asarray(0),), (3,))[::-1],
+        lambda v: jnp.flip(jax.lax.cumsum(jnp.where(jnp.arange(3) == 0, v, 0.0))) + 0.0 * v[::-1],
+    ],
+    ids=["gather", "dynamic slice", "cumsum"],
+)
+def test_slope_is_not_rounded_to_the_default_type_of_jax(fn):
+    """Single precision rounds 1/3 up, so that a rounded lower bound does not enclose it."""
+    third = np.full(3, 1 / 3)
+    with jax.enable_x64(False):
+        out, unknown = SlopeEnclosure(fn, (jnp.zeros(3),), (0,))(interval(third, third + 0.2))
+    assert unknown == ()
+    assert out.low.tolist() == third.tolist() and out.high.tolist() == (third + 0.2).tolist()
+
+
+@pytest.mark.parametrize(
+    ("mode", "fill", "low"),
+    [
+        ("fill", 7.0, [0.5, 7.0, 0.0]),
+        ("fill", None, [0.5, -np.inf, 0.0]),
+        ("clip", None, [0.5, 0.5, 0.0]),
+    ],
+)
+def test_slope_of_an_index_outside_of_an_array_is_that_of_its_mode(mode, fill, low):
+    """Entries of f are v₁, the fill value or v₁, and v₀."""
+    fn = lambda v: jnp.take(v, jnp.array([1, 5, 0]), mode=mode, fill_value=fill)  # noqa: E731
+    box = interval(np.array([0.0, 0.5]), np.array([0.0, 0.5]))
+    out, _ = SlopeEnclosure(fn, (jnp.zeros(2),), (0,))(box)
+    assert out.low.tolist() == low
+    expected = [[0.0, 0.0, 1.0], [1.0, float(mode == "clip"), 0.0]]
+    assert out.parts[0].center.tolist() == expected and not out.parts[0].radius.any()
+
+
+def test_slope_of_rearranged_entries_is_diagonal_only_in_the_same_order():
+    everywhere = interval(np.full(4, -1.0), np.full(4, 1.0))
+    enclosed = lambda fn: SlopeEnclosure(fn, (jnp.zeros(4),), (0,))(everywhere).out.parts[0]  # noqa: E731
+    assert not enclosed(lambda v: v.reshape(2, 2)[None]).full
+    swapped = enclosed(lambda v: v.reshape(2, 2).T)
+    assert swapped.full and np.array_equal(swapped.center[:, 0, 1], [0.0, 0.0, 1.0, 0.0])
+
+
 def test_slope_names_operations_without_a_rule():
     enclosed = SlopeEnclosure(jnp.sort, (jnp.zeros(3),), (0,))(interval(-np.ones(3), np.ones(3)))
     assert enclosed.unknown == ("sort",)

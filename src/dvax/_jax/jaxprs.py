@@ -33,10 +33,11 @@ CALLS = CUSTOM | {
 """Primitives that apply one inner program to their arguments."""
 
 
-def bind(eqn: Any, operands: list[Any]) -> list[Any]:
-    """Return the results of one operation on these arrays."""
+def bind(eqn: Any, operands: list[Any], **others: Any) -> list[Any]:
+    """Return the results of one operation on these arrays, with some `others` of its parameters."""
     with eqn.ctx.manager:
-        results = eqn.primitive.bind(*operands, **eqn.primitive.get_bind_params(eqn.params))
+        params = eqn.primitive.get_bind_params(eqn.params) | others
+        results = eqn.primitive.bind(*operands, **params)
     return list(results) if eqn.primitive.multiple_results else [results]
 
 

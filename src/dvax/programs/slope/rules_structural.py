@@ -1,13 +1,15 @@
 """The rules of slope arithmetic for operations that rearrange or add entries, and for products."""
 
+import functools
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..._jax.jaxprs import bind
 from ..interpreter import Rule, same_for
+from ..primitives import JOINING, REARRANGING, SUMMING
 from .values import (
     Part,
     Slope,
@@ -22,131 +24,84 @@ from .values import (
     together,
 )
 
-Move = Callable[[Any, int, list[Values]], Values]
-"""A function of an equation, a number of extra axes in front, and the arguments with these axes, which
-returns the result of the operation."""
 
-
-def _linear(move: Move) -> Rule:
-    """Return the rule of a linear operation: it acts on the columns of derivatives as on values."""
-
-    def rule(eqn: Any, operands: list[Any]) -> Slope:
-        x = [lift(v, tuple(atom.aval.shape)) for v, atom in zip(operands, eqn.invars, strict=True)]
-        out = eqn.outvars[0].aval
-        # A reshape may permute the axes first.
-        permutes = eqn.primitive.name == "reshape" and eqn.params["dimensions"] is not None
-        in_order = eqn.primitive.name in _IN_ORDER and out.size == x[0].low.size and not permutes
-        size = max([out.size, *(v.low.size for v in x)])
-        parts = {}
-        for k, own in together(x, full=len(x) > 1, size=size).items():
-            is_diagonal = in_order and not own[0].full
-            if is_diagonal:
-                center, radius = (v.reshape(out.shape) for v in own[0][:2])
-            else:
-                full = [columns(part, size) for part in own]
-                center, radius = (move(eqn, 1, [part[i] for part in full]) for i in (0, 1))
-            parts[k] = Part(center, radius, not is_diagonal)
-        low, high = move(eqn, 0, [v.low for v in x]), move(eqn, 0, [v.high for v in x])
-        return Slope(low, high, parts)
-
-    return rule
-
-
-_IN_ORDER = {"reshape", "squeeze", "expand_dims", "broadcast_in_dim", "copy", "copy_p"}
-
-
-def _identity(eqn: Any, extra: int, operands: list[Values]) -> Values:
-    return operands[0]
-
-
-def _reshape(eqn: Any, extra: int, operands: list[Values]) -> Values:
-    (v,) = operands
-    order = eqn.params.get("dimensions") if eqn.primitive.name == "reshape" else None
-    if order is not None:
-        v = v.transpose(*range(extra), *(extra + axis for axis in order))
-    return v.reshape((*v.shape[:extra], *eqn.outvars[0].aval.shape))
-
-
-def _broadcast_in_dim(eqn: Any, extra: int, operands: list[Values]) -> Values:
-    (v,) = operands
-    shape = eqn.outvars[0].aval.shape
-    wide = [1] * len(shape)
-    for axis, place in enumerate(eqn.params["broadcast_dimensions"]):
-        wide[place] = v.shape[extra + axis]
-    return np.broadcast_to(v.reshape((*v.shape[:extra], *wide)), (*v.shape[:extra], *shape))
-
-
-def _transpose(eqn: Any, extra: int, operands: list[Values]) -> Values:
-    order = [extra + axis for axis in eqn.params["permutation"]]
-    return operands[0].transpose(*range(extra), *order)
-
-
-def _slice(eqn: Any, extra: int, operands: list[Values]) -> Values:
-    p = eqn.params
-    strides = p["strides"] or (1,) * len(p["start_indices"])
-    cuts = [slice(*cut) for cut in zip(p["start_indices"], p["limit_indices"], strides)]
-    return operands[0][(*(slice(None),) * extra, *cuts)]
-
-
-def _rev(eqn: Any, extra: int, operands: list[Values]) -> Values:
-    return np.flip(operands[0], tuple(extra + axis for axis in eqn.params["dimensions"]))
-
-
-def _reduce_sum(eqn: Any, extra: int, operands: list[Values]) -> Values:
-    return operands[0].sum(axis=tuple(extra + axis for axis in eqn.params["axes"]))
-
-
-def _concatenate(eqn: Any, extra: int, operands: list[Values]) -> Values:
-    return np.concatenate(operands, eqn.params["dimension"] + extra)
-
-
-def _stack(eqn: Any, extra: int, operands: list[Values]) -> Values:
-    return np.stack(operands, eqn.params["axis"] + extra)
-
-
-def _split(eqn: Any, operands: list[Any]) -> list[Slope]:
-    """Return the pieces along an axis, for example those of `ravel_pytree`."""
-    axis, sizes = eqn.params["axis"], list(map(int, eqn.params["sizes"]))
-    if len(sizes) == 1:
-        return operands
-    pieces = []
-    for end, size in zip(np.cumsum(sizes), sizes, strict=True):
-        cut = slice(end - size, end)
-        take = lambda eqn, extra, v, cut=cut: v[0][(*(slice(None),) * (extra + axis), cut)]  # noqa: E731
-        pieces.append(_linear(take)(eqn, operands))
-    return pieces
-
-
-def _unstack(eqn: Any, operands: list[Any]) -> list[Slope]:
-    """Return the rows along an axis. From JAX 0.12 on, `x, v = state` is this operation."""
-    axis, rows = eqn.params["axis"], []
-    for k in range(len(eqn.outvars)):
-        take = lambda eqn, extra, v, k=k: np.take(v[0], k, axis=extra + axis)  # noqa: E731
-        rows.append(_linear(take)(eqn, operands))
-    return rows
-
-
-def _indexed(eqn: Any, operands: list[Any]) -> Slope | None:
-    """Return the slope of an operation that is linear in its first argument, with constant indices in
-    the others: apply it to each column of the derivatives."""
-    x, *indices = operands
+def _rearranged(eqn: Any, operands: list[Any]) -> list[Slope] | None:
+    """Return the slopes of an operation whose results consist of entries of its arguments."""
+    count = 1 if eqn.primitive.name in _INDEXED else len(operands)
+    indices = operands[count:]
     if any(map(is_slope, indices)):
         return None
+    atoms = zip(operands[:count], eqn.invars[:count], strict=True)
+    x = [lift(v, tuple(atom.aval.shape)) for v, atom in atoms]
+    sources = _evaluate_sources(eqn, indices) if indices else _sources(eqn)
+    fill = eqn.params.get("fill_value")
+    return [_picked(x, source, math.nan if fill is None else fill) for source in sources]
 
-    def derivative(stack: Values) -> Values:
-        # Fill values are constants, with derivative 0.
-        params = dict(eqn.primitive.get_bind_params(eqn.params))
-        if "fill_value" in params:
-            params["fill_value"] = 0.0
-        each = [eqn.primitive.bind(jnp.asarray(v), *indices, **params) for v in stack]
-        return np.stack([np.asarray(v) for v in each])
 
-    def derivative_part(part: Part) -> Part:
-        full = columns(part, max(x.low.size, eqn.outvars[0].aval.size))
-        return Part(derivative(full.center), derivative(full.radius), True)
+_INDEXED = {"gather", "dynamic_slice"}
+"""The first argument is rearranged, and the others are indices."""
 
-    low, high = (np.asarray(bind(eqn, [jnp.asarray(v), *indices])[0]) for v in (x.low, x.high))
-    return Slope(low, high, mapped(x.parts, derivative_part))
+
+def _evaluate_sources(eqn: Any, indices: list[Any]) -> list[Values]:
+    """Return for each entry of the results its position in all arguments, joined as flat arrays, or −1
+    if it is a fill value.
+
+    The operation itself is evaluated on these positions. Integers are not rounded, whereas JAX rounds
+    float64 to its default type.
+    """
+    shapes = [atom.aval.shape for atom in eqn.invars[: len(eqn.invars) - len(indices)]]
+    starts = np.cumsum([0, *map(math.prod, shapes)])
+    positions = [
+        np.arange(start, end, dtype=np.int32).reshape(shape)
+        for start, end, shape in zip(starts, starts[1:], shapes, strict=False)
+    ]
+    params = {"fill_value": -1} if "fill_value" in eqn.params else {}
+    return list(map(np.asarray, bind(eqn, [*positions, *indices], **params)))
+
+
+@functools.lru_cache(256)
+def _sources(eqn: Any) -> list[Values]:
+    """Return the sources of an operation without indices, which depend on shapes only."""
+    return _evaluate_sources(eqn, [])
+
+
+def _picked(x: list[Slope], source: Values, fill: Any) -> Slope:
+    """Return the entries of x at these positions."""
+
+    def pick(leaves: list[Values], extra: int, fill: Any) -> Values:
+        flat = [v.reshape(*v.shape[:extra], math.prod(v.shape[extra:])) for v in leaves]
+        picked = np.concatenate(flat, axis=-1)[..., source]
+        return np.where(source < 0, fill, picked) if (source < 0).any() else picked
+
+    size = max([source.size, *(v.low.size for v in x)])
+    in_order = len(x) == 1 and np.array_equal(source.ravel(), np.arange(x[0].low.size))
+    parts = {}
+    for k, own in together(x, full=len(x) > 1, size=size).items():
+        if in_order and not own[0].full:
+            center, radius = (v.reshape(source.shape) for v in own[0][:2])
+        else:
+            full = [columns(part, size) for part in own]
+            center, radius = (pick([part[i] for part in full], 1, 0.0) for i in (0, 1))
+        parts[k] = Part(center, radius, not in_order or own[0].full)
+    low, high = pick([v.low for v in x], 0, fill), pick([v.high for v in x], 0, fill)
+    return Slope(low, high, parts)
+
+
+def _summed(eqn: Any, operands: list[Any]) -> Slope:
+    """Return the slope of a sum over axes, or of the partial sums along one."""
+    (x,), p = operands, eqn.params
+
+    def total(v: Values, extra: int) -> Values:
+        if eqn.primitive.name == "reduce_sum":
+            return v.sum(axis=tuple(extra + axis for axis in p["axes"]))
+        axis = extra + p["axis"]
+        return np.flip(np.cumsum(np.flip(v, axis), axis), axis) if p["reverse"] else v.cumsum(axis)
+
+    def derivative(part: Part) -> Part:
+        full = columns(part, x.low.size)
+        return Part(total(full.center, 1), total(full.radius, 1), True)
+
+    return Slope(total(x.low, 0), total(x.high, 0), mapped(x.parts, derivative))
 
 
 def _reduce_max(eqn: Any, operands: list[Any]) -> Slope:
@@ -229,18 +184,8 @@ def _dot_general(eqn: Any, operands: list[Any]) -> Slope:
 
 
 STRUCTURAL: dict[str, Rule] = {
-    **same_for({"stop_gradient", "copy", "copy_p"}, _linear(_identity)),
-    **same_for({"reshape", "squeeze", "expand_dims"}, _linear(_reshape)),
-    "broadcast_in_dim": _linear(_broadcast_in_dim),
-    "transpose": _linear(_transpose),
-    "slice": _linear(_slice),
-    "rev": _linear(_rev),
-    "reduce_sum": _linear(_reduce_sum),
-    "concatenate": _linear(_concatenate),
-    "stack": _linear(_stack),
-    "split": _split,
-    "unstack": _unstack,
-    **same_for({"gather", "dynamic_slice", "cumsum"}, _indexed),
+    **same_for(REARRANGING | JOINING | _INDEXED, _rearranged),
+    **same_for(SUMMING, _summed),
     "reduce_max": _reduce_max,
     "reduce_min": _reduce_min,
     "dot_general": _dot_general,
