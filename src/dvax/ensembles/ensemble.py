@@ -13,7 +13,7 @@ from .. import _tree, _user_code
 from .._tree import Tree
 from ..errors import Problems
 from ..evolution import RESULTS, Event, Implicit, PiecewiseLinear, Solution, solve
-from ..evolution.arguments import bound_steps, check, warn_precision
+from ..evolution.arguments import Arguments, bound_steps, check, warn_precision
 from ..evolution.auto import Choice, choose
 from ..evolution.event_arguments import check_events
 from ..evolution.method import AbstractMethod
@@ -106,7 +106,7 @@ def ensemble(
 
     ```
     """
-    options = dict(
+    options: dict[str, Any] = dict(
         dt=dt, rtol=rtol, atol=atol, method=method, vi_solver=vi_solver, constants=constants,
         measure=measure, dt0=dt0, dt_max=dt_max, horizon=horizon, max_steps=max_steps,
         adjoint=adjoint, events=events, max_events=max_events,
@@ -118,10 +118,7 @@ def ensemble(
     _check_times(inputs)
     # A member whose x0 is not finite fails alone.
     x0, own_args, begin, end, own_ts = inputs.member(inputs.example())
-    check(
-        problem, x0, begin, end, own_ts, dt, rtol, atol, dt0, dt_max, horizon, method, adjoint,
-        measure, False, vi_solver, max_steps, constants, progress,
-    )  # fmt: skip
+    check(Arguments(problem, x0, begin, end, own_args, own_ts, progress=progress, **options))
     _user_code.check_args(own_args, "dvax.ensemble")
     if dt is None:
         warn_precision(x0, rtol)

@@ -17,6 +17,7 @@ from jax import lax
 
 from .._tree import Tree
 from ..evolution import RESULTS
+from ..evolution.arguments import Arguments
 from ..evolution.closures import closure_convert
 from ..evolution.integrate import integrate
 from ..evolution.results import has_failed
@@ -134,13 +135,14 @@ def _member(numbers: list[Any], signature: Signature) -> Row:
     problem, method, vi_solver, events, constants = code
     (x0, args, t0, t1, ts), given = data
     static: Static = signature.options
-    option = lambda name: given.get(name)  # noqa: E731
-    setup, options = arranged(
-        problem, x0, t0, t1, args, option("dt"), given["rtol"], given["atol"], method, vi_solver, False,
-        constants, static.measure, False, option("dt0"), option("dt_max"), option("horizon"),
-        static.max_steps, static.adjoint, events, static.max_events,
+    stiff_steps = given.pop("stiff_steps")
+    call = Arguments(
+        problem, x0, t0, t1, args, method=method, vi_solver=vi_solver, constants=constants,
+        measure=static.measure, max_steps=static.max_steps, adjoint=static.adjoint, events=events,
+        max_events=static.max_events, **given,
     )  # fmt: skip
-    setup.setting["stiff_steps"] = given["stiff_steps"]
+    setup, options = arranged(call, method)
+    setup.setting["stiff_steps"] = stiff_steps
     options = options._replace(watch_stiffness=static.watch_stiffness)
     times = None if ts is None else jnp.asarray(ts, setup.dtype)
     solution, closes_over_traced = integrate(setup, times, options)

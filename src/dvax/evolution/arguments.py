@@ -3,8 +3,9 @@
 import math
 import os
 import warnings
+from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from .. import _tree
 from ..errors import InputError, InputProblem
 from ..problem import Problem
 from ..vi import AbstractSolver
+from .event import Event
 from .implicit import Implicit
 from .method import AbstractMethod
 from .picard import Picard
@@ -30,11 +32,41 @@ MAX_STEP_COUNT = 2**31 - 1
 """Largest value of max_steps: steps are counted in 32 bits."""
 
 
-def check(
-    problem, x0, t0, t1, ts, dt, rtol, atol, dt0, dt_max, horizon, method, adjoint, measure, dense,
-    vi_solver=None, max_steps=None, constants=None, progress=False,
-) -> None:  # fmt: skip
+class Arguments(NamedTuple):
+    """The arguments of `dvax.solve`, with its defaults."""
+
+    problem: Any
+    x0: Any
+    t0: Any
+    t1: Any
+    args: Any = None
+    ts: Any = None
+    dt: Any = None
+    rtol: Any = 1e-6
+    atol: Any = 1e-9
+    method: Any = None
+    vi_solver: Any = None
+    progress: bool = False
+    constants: Any = None
+    certified_tol: Any = None
+    measure: bool | None = None
+    dense: bool = False
+    dt0: Any = None
+    dt_max: Any = None
+    horizon: Any = None
+    max_steps: int | None = None
+    adjoint: str = "reverse"
+    throw: bool = True
+    events: Sequence[Event] = ()
+    max_events: int = 256
+    save: Any = None
+
+
+def check(call: Arguments) -> None:
     """Raise one `InputError` with everything that is wrong with the arguments of `dvax.solve`."""
+    problem, x0, method, vi_solver = call.problem, call.x0, call.method, call.vi_solver
+    t0, t1, ts, dt, dt_max = call.t0, call.t1, call.ts, call.dt, call.dt_max
+    max_steps = call.max_steps
     wrong: list[InputProblem] = []
 
     def rule(holds: bool, name: str, given: Any, text: str, fix: str) -> None:
@@ -49,20 +81,21 @@ def check(
          "it must be a method such as dvax.ETD2RK()", "Omit it for the default")  # fmt: skip
     rule(vi_solver is None or isinstance(vi_solver, AbstractSolver), "vi_solver", vi_solver,
          "it must be a solver such as dvax.vi.Auto()", "Omit it for the default")  # fmt: skip
-    rule(adjoint in ("reverse", "forward"), "adjoint", adjoint,
+    rule(call.adjoint in ("reverse", "forward"), "adjoint", call.adjoint,
          "it must be 'reverse' or 'forward'",
          "Use 'reverse' with jax.grad, 'forward' with jax.jvp")  # fmt: skip
-    for name, flag in (("measure", measure), ("dense", dense), ("progress", progress)):
+    flags = {"measure": call.measure, "dense": call.dense, "progress": call.progress}
+    for name, flag in flags.items():
         rule(isinstance(flag, _FLAGS), name, flag, "it must be True or False",
              "Omit it for the default")  # fmt: skip
     if isinstance(method, Implicit):
-        for name, flag in (("measure", measure), ("dense", dense)):
-            rule(not flag, name, True, "implicit methods record no polynomials of their steps",
+        for name in ("measure", "dense"):
+            rule(not flags[name], name, True, "implicit methods record no polynomials of their steps",
                  "Omit it and list the times in ts=, or use an exponential method")  # fmt: skip
         rule(dt is None, "dt", dt, "implicit methods choose their steps by rtol and atol, which also "
              "control the solution of their equations", "Omit it")  # fmt: skip
     if dt is not None:
-        for name, length in (("dt0", dt0), ("dt_max", dt_max)):
+        for name, length in (("dt0", call.dt0), ("dt_max", dt_max)):
             rule(length is None, name, length, "with dt all steps have that length",
                  f"Omit {name}, or omit dt for adaptive steps")  # fmt: skip
     if isinstance(method, PiecewiseLinear):
@@ -77,20 +110,12 @@ def check(
         rule(bool(is_integer and 1 <= max_steps <= MAX_STEP_COUNT), "max_steps", max_steps,
              f"it must be a whole number from 1 to {MAX_STEP_COUNT}",
              f"Omit it for {ADAPTIVE_STEPS}")  # fmt: skip
-    wrong += _not_finite(x0) + _wrong_moduli(constants)
-    numbers = {
-        "t0": t0,
-        "t1": t1,
-        "dt": dt,
-        "dt0": dt0,
-        "dt_max": dt_max,
-        "horizon": horizon,
-        "rtol": rtol,
-        "atol": atol,
-    }
+    wrong += _not_finite(x0) + _wrong_moduli(call.constants)
+    optional = ("dt", "dt0", "dt_max", "horizon")
+    numbers = {n: getattr(call, n) for n in ("t0", "t1", *optional, "rtol", "atol")}
     unusable = set()
     for name, value in numbers.items():
-        if type(value) is float or (value is None and name in ("dt", "dt0", "dt_max", "horizon")):
+        if type(value) is float or (value is None and name in optional):
             continue
         if not _tree.is_concrete(value) or _tree.is_number(value):
             continue
@@ -111,7 +136,7 @@ def check(
                  "Choose another unit of time")  # fmt: skip
         if ts is not None and _tree.is_concrete(ts):
             _check_times(rule, ts, float(t0), float(t1))
-    for name in ("dt", "dt0", "dt_max", "horizon", "rtol", "atol"):
+    for name in (*optional, "rtol", "atol"):
         value = numbers[name]
         if value is not None and name not in unusable and _tree.is_concrete(value):
             may_be_zero = name in ("rtol", "atol")
@@ -128,8 +153,8 @@ def check(
         rule(span <= limit * float(dt_max), "dt_max", dt_max,
              f"a run of length {span:g} takes more than max_steps = {limit} steps of that length",
              f"Write {span / limit:.1e} or more, or raise max_steps")  # fmt: skip
-    if not unusable & {"rtol", "atol"} and _tree.is_concrete(rtol, atol):
-        rule(bool(rtol != 0 or atol != 0), "rtol, atol", _tree.Text("0, 0"),
+    if not unusable & {"rtol", "atol"} and _tree.is_concrete(call.rtol, call.atol):
+        rule(bool(call.rtol != 0 or call.atol != 0), "rtol, atol", _tree.Text("0, 0"),
              "one of them must be positive", "No finite step has defect zero")  # fmt: skip
     if wrong:
         raise InputError(*wrong)

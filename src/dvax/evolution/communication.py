@@ -11,6 +11,7 @@ from .._jax.collectives import collectives
 from .._tree import Tree
 from ..errors import InputError, InputProblem
 from ..problem import Problem
+from .arguments import Arguments
 from .compiled import compiled_text
 from .loop import STEP
 from .method import AbstractMethod
@@ -132,9 +133,8 @@ def communication(
                 "Choose a method such as dvax.ETD2RK(), or omit it for the default",
             )
         )  # fmt: skip
-    setup, times, options = prepared(
-        problem, x0, t0, t1, args, ts, dt=dt, rtol=rtol, atol=atol, method=method, dense=dense
-    )
+    call = Arguments(problem, x0, t0, t1, args, ts, dt, rtol, atol, method, dense=dense)
+    setup, times, options = prepared(call)
     leaves = jax.tree_util.tree_leaves(setup.x0)
     devices = max(len(leaf.sharding.device_set) for leaf in leaves if _tree.is_concrete(leaf))
     if devices == 1:

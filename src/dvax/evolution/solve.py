@@ -19,6 +19,7 @@ from ..problem import Problem
 from ..vi import AbstractSolver, Auto
 from .arguments import (
     FIRST_GROWTH,
+    Arguments,
     bound_steps,
     check,
     check_memory,
@@ -155,58 +156,43 @@ def solve(
         others = dense, bool(events), certified_tol is not None
         check_save(save, ts, x0, args, others)
     check_events(events, max_events, method, dt, certified_tol is not None)
-    if certified_tol is not None:
-        x0 = _state(problem, x0)
-        _only_adaptive(dt, method)
-        check(
-            problem, x0, t0, t1, ts, dt, 0.0, 1.0, dt0, dt_max, horizon,
-            method, adjoint, measure, dense, vi_solver, max_steps, constants, progress,
-        )  # fmt: skip
-        again: dict[str, Any] = dict(
-            method=method, vi_solver=vi_solver, progress=progress, constants=constants, dense=dense,
-            dt0=dt0, dt_max=dt_max, max_steps=max_steps, adjoint=adjoint, throw=throw,
-            events=events, max_events=max_events,
-        )  # fmt: skip
-        begin, end = float(t0), float(t1)
-        run = lambda times, atol: solve(  # noqa: E731
-            problem, x0, t0, t1, args, times, rtol=0.0, atol=atol, **again
-        )
-        most = bound_steps(max_steps, False, t0, t1, None)
-        return certified(run, ts, problem, x0, args, begin, end, constants, certified_tol, most)
     x0 = _state(problem, x0)
-    check(
-        problem, x0, t0, t1, ts, dt, rtol, atol, dt0, dt_max, horizon, method, adjoint, measure, dense,
-        vi_solver, max_steps, constants, progress,
+    call = Arguments(
+        problem, x0, t0, t1, args, ts, dt, rtol, atol, method, vi_solver, progress, constants,
+        certified_tol, measure, dense, dt0, dt_max, horizon, max_steps, adjoint, throw, events,
+        max_events, save,
     )  # fmt: skip
+    if certified_tol is not None:
+        _only_adaptive(dt, method)
+        check(call._replace(rtol=0.0, atol=1.0))
+        most = bound_steps(max_steps, False, t0, t1, None)
+
+        def run(times: Any, atol: float) -> Solution:
+            own = call._replace(ts=times, rtol=0.0, atol=atol, horizon=None, certified_tol=None)
+            return solve(**own._asdict())
+
+        begin, end = float(t0), float(t1)
+        return certified(run, ts, problem, x0, args, begin, end, constants, certified_tol, most)
+    check(call)
     _user_code.check_args(args, "dvax.solve")
     if save is not None:
-        same: dict[str, Any] = dict(
-            dt=dt, rtol=rtol, atol=atol, method=method, vi_solver=vi_solver, constants=constants,
-            measure=measure, dt_max=dt_max, max_steps=max_steps, adjoint=adjoint, throw=False,
-            horizon=t1 - t0 if horizon is None else horizon,
-        )  # fmt: skip
+        whole = call._replace(
+            horizon=t1 - t0 if horizon is None else horizon, throw=False, progress=False, save=None
+        )
 
         def piece(x: Tree, start: float, end: float, times: np.ndarray, step: Any) -> Solution:
-            return solve(problem, x, start, end, args, times, dt0=step, **same)
+            own = whole._replace(x0=x, t0=start, t1=end, ts=times, dt0=step)
+            return solve(**own._asdict())
 
         return stream(
             piece, x0, float(t0), float(t1), np.asarray(ts, float), dt0, save, dt is not None, throw,
             progress,
         )  # fmt: skip
-    problem = _placed(problem, x0)
-    fixed = dt is not None
-    if not fixed:
+    if dt is None:
         warn_precision(x0, rtol)
-    t0, t1 = _number(t0), _number(t1)
-    choice = Choice(method)
-    if method is None:
-        tol = max(rtol, atol) if _tree.is_concrete(rtol, atol) else math.nan
-        choice = choose(problem, x0, args, t0, t1 - t0, float(tol), fixed, constants is not None)
-    setup, options = arranged(
-        problem, x0, t0, t1, args, dt, rtol, atol, choice.method, vi_solver, progress, constants,
-        measure, dense, dt0, dt_max, horizon, bound_steps(max_steps, fixed, t0, t1, dt), adjoint,
-        events, max_events,
-    )  # fmt: skip
+    call, choice = _chosen(call)
+    setup, options = arranged(call, choice.method)
+    problem = call.problem
     method = choice.method
     times = None if ts is None else _times(ts)
     if isinstance(method, PiecewiseLinear):
@@ -245,58 +231,37 @@ def solve(
     return solution
 
 
-def arranged(
-    problem: Problem,
-    x0: Tree,
-    t0: Any,
-    t1: Any,
-    args: Any,
-    dt: Any,
-    rtol: Any,
-    atol: Any,
-    method: Any,
-    vi_solver: AbstractSolver | None,
-    progress: bool,
-    constants: Any,
-    measure: bool | None,
-    dense: bool,
-    dt0: Any,
-    dt_max: Any,
-    horizon: Any,
-    max_steps: int,
-    adjoint: str,
-    events: Sequence[Event],
-    max_events: int,
-) -> tuple[Setup, Options]:
-    """Return the setup and the options of a run from the arguments of `solve`, which are checked."""
+def arranged(call: Arguments, method: Any) -> tuple[Setup, Options]:
+    """Return the setup and the options of a run by this method from arguments that are checked."""
+    x0, t0, t1, dt, dt0, dt_max = call.x0, call.t0, call.t1, call.dt, call.dt0, call.dt_max
     fixed, span = dt is not None, t1 - t0
     setting = {
         "t0": t0,
         "t1": t1,
         "dt": math.nan if dt is None else _number(dt),
-        "rtol": _number(rtol),
-        "atol": _number(atol),
+        "rtol": _number(call.rtol),
+        "atol": _number(call.atol),
         "dt0": first_step(span, t0, t1, _tree.dtype(x0)) if dt0 is None else _number(dt0),
         "dt0_growth": FIRST_GROWTH if dt0 is None else MAX_GROWTH,
         "dt_max": math.inf if dt_max is None else _number(dt_max),
-        "horizon": span if horizon is None else _number(horizon),
+        "horizon": span if call.horizon is None else _number(call.horizon),
         "stiff_steps": math.inf,
     }
-    measured = not isinstance(method, Implicit) and (bool(measure) or not fixed)
+    measured = not isinstance(method, Implicit) and (bool(call.measure) or not fixed)
     options = Options(
         fixed=fixed,
         measure=measured,
-        track_bounds=measured and of_region(constants),
+        track_bounds=measured and of_region(call.constants),
         check_finite=not fixed,
-        dense=dense,
-        max_steps=max_steps,
-        adjoint=adjoint,
-        progress=progress,
-        max_events=max_events if events else 0,
+        dense=call.dense,
+        max_steps=bound_steps(call.max_steps, fixed, t0, t1, dt),
+        adjoint=call.adjoint,
+        progress=call.progress,
+        max_events=call.max_events if call.events else 0,
     )
-    solver = _VI_SOLVER if vi_solver is None else vi_solver
-    setup = Setup(problem, x0, args, setting, method, solver, _moduli(constants), tuple(events))
-    return setup, options
+    solver = _VI_SOLVER if call.vi_solver is None else call.vi_solver
+    moduli, events = _moduli(call.constants), tuple(call.events)
+    return Setup(call.problem, x0, call.args, setting, method, solver, moduli, events), options
 
 
 def _examined(setup: Setup, times: Any, options: Options, solution: Solution) -> Solution:
@@ -317,26 +282,28 @@ def _examined(setup: Setup, times: Any, options: Options, solution: Solution) ->
     return _trim(solution)
 
 
-def prepared(
-    problem: Problem, x0: Any, t0: Any, t1: Any, args: Any, ts: Any, *, dt: Any, rtol: Any, atol: Any,
-    method: AbstractMethod | None, dense: bool,
-) -> tuple[Setup, Any, Options]:  # fmt: skip
+def prepared(call: Arguments) -> tuple[Setup, Any, Options]:
     """Return what `solve` compiles for these arguments: the setup, the saved times and the options."""
-    x0, fixed = _state(problem, x0), dt is not None
-    check(problem, x0, t0, t1, ts, dt, rtol, atol, None, None, None, method, "reverse", None, dense)
-    problem, t0, t1 = _placed(problem, x0), _number(t0), _number(t1)
-    choice = Choice(method)
-    if method is None:
-        choice = choose(problem, x0, args, t0, t1 - t0, float(max(rtol, atol)), fixed, False)
-    setup, options = arranged(
-        problem, x0, t0, t1, args, dt, rtol, atol, choice.method, None, False, None,
-        None, dense, None, None, None, bound_steps(None, fixed, t0, t1, dt), "reverse", (), 0,
-    )  # fmt: skip
-    if dense:
+    call = call._replace(x0=_state(call.problem, call.x0))
+    check(call)
+    call, choice = _chosen(call)
+    setup, options = arranged(call, choice.method)
+    if call.dense:
         options = options._replace(max_steps=min(options.max_steps, _FIRST_ROOM))
     watched = bool(choice.reason) and choice.fallback is not None
     options = options._replace(watch_stiffness=watched)
-    return setup, None if ts is None else _times(ts), options
+    return setup, None if call.ts is None else _times(call.ts), options
+
+
+def _chosen(call: Arguments) -> tuple[Arguments, Choice]:
+    """Return the arguments as numbers, with a generator for the sharding of x0, and the method."""
+    problem, t0, t1 = _placed(call.problem, call.x0), _number(call.t0), _number(call.t1)
+    call = call._replace(problem=problem, t0=t0, t1=t1)
+    if call.method is not None:
+        return call, Choice(call.method)
+    tol = max(call.rtol, call.atol) if _tree.is_concrete(call.rtol, call.atol) else math.nan
+    fixed, certified = call.dt is not None, call.constants is not None
+    return call, choose(problem, call.x0, call.args, t0, t1 - t0, float(tol), fixed, certified)
 
 
 def _placed(problem: Problem, x0: Tree) -> Problem:
