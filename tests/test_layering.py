@@ -127,7 +127,7 @@ def imports(package: Path) -> list[Import]:
 
 UPWARD = {
     # `Solution.regimes` runs the solve again where it did not record its steps.
-    ("dvax.evolution.solution", "dvax.evolution.recorded"),
+    ("dvax.evolution.solution", "dvax.evolution.solve"),
     # `Solution.plot`: pictures belong to the application.
     ("dvax.evolution.solution", "dvax.app.plots.solution"),
     ("dvax.ensembles.result", "dvax.app.plots.ensemble"),

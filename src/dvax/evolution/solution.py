@@ -309,9 +309,9 @@ class Solution(eqx.Module):
             )
         if self.records is None:
             # Here, since this module is below `solve`.
-            from .recorded import recorded
+            from .solve import run_again
 
-            return recorded(self).regimes()
+            return run_again(self, None, dense=True).regimes()
         assert not isinstance(self.setup.method, Implicit | PiecewiseLinear)
         return regimes(flow, self.setup.method, self.records, int(self.stats["steps"]))
 

@@ -18,6 +18,7 @@ from ..generators.sharded import place
 from ..problem import Problem
 from ..vi import AbstractSolver, Auto
 from .arguments import (
+    ADAPTIVE_STEPS,
     FIRST_GROWTH,
     Arguments,
     bound_steps,
@@ -40,7 +41,7 @@ from .nonfinite import refuse_nonfinite_data
 from .picard import Picard
 from .piecewise.method import PiecewiseLinear
 from .piecewise.propagate import Limits, propagate
-from .results import RESULTS
+from .results import RESULTS, is_success
 from .setup import Options, Setup, as_arrays
 from .signature import flat
 from .solution import Solution
@@ -51,6 +52,9 @@ _FIRST_ROOM = 2**12
 
 _LEAST_ROOM, _FIRST_ENTRIES = 64, 10**8
 """The same with many entries: as many as make `_FIRST_ENTRIES` entries in all, and at least 64."""
+
+_EVENTS = 256
+"""The default of `max_events`."""
 
 _VI_SOLVER = Auto()
 """Constructing the default at every call would cost a part of a short run."""
@@ -192,23 +196,28 @@ def solve(
         warn_precision(x0, rtol)
     call, choice = _chosen(call)
     setup, options = arranged(call, choice.method)
-    problem = call.problem
-    method = choice.method
-    times = None if ts is None else _times(ts)
+    return _run(choice, setup, None if ts is None else _times(ts), options, throw)
+
+
+def _run(choice: Choice, setup: Setup, times: Any, options: Options, throw: bool) -> Solution:
+    """Run, and raise the explanation of a failure, or return the run up to there.
+
+    **Raises:** `dvax.SolveError` if `throw`; `dvax.InputError` where the input explains the failure.
+    """
+    method, problem = choice.method, setup.problem
     if isinstance(method, PiecewiseLinear):
-        solution = propagate(
-            setup, times, Limits(options.max_steps, dense, options.track_bounds, progress)
-        )
+        limits = Limits(options.max_steps, options.dense, options.track_bounds, options.progress)
+        solution = propagate(setup, times, limits)
         solution.stats["method"] = choice.text()
         if throw and solution.result != RESULTS.successful:
             raise failure(solution)
         return solution
-    if dense and isinstance(method, AbstractMethod):
+    if options.dense and isinstance(method, AbstractMethod):
         solution, reached = _run_recorded(choice, setup, times, options)
     else:
         solution, reached = _run_chosen(choice, setup, times, options)
     setup = solution.setup
-    if reached is True and not dense and not events:
+    if reached is True and not options.dense and not setup.events:
         return solution
     if _tree.is_concrete(solution.ts, solution.xs):
         solution = _trim(solution)
@@ -229,6 +238,39 @@ def solve(
                 raise failure(ended)
             return solution if traced else ended
     return solution
+
+
+def run_again(
+    solution: Solution, ts: Any, *, dense: bool = False, constants: Any = None
+) -> Solution:
+    """Return the run of a solution made once more, with the same steps and other records.
+
+    With `constants` it has a defect, and bounds where they hold in a region, and no events. A run that
+    failed stops where it did.
+
+    **Raises:** `dvax.InputError` with `dense`, if the method records no steps.
+    """
+    setting = {name: _number(value) for name, value in solution.setup.setting.items()}
+    setup = solution.setup._replace(setting=setting)
+    if constants is not None:
+        setup = setup._replace(moduli=_moduli(constants), events=())
+    t0, t1, dt = setting["t0"], setting["t1"], setting["dt"]
+    adaptive = isinstance(dt, float) and math.isnan(dt)
+    attempts, most = solution.stats["steps"] + solution.stats["rejected"], None
+    if adaptive and _tree.is_concrete(attempts, solution.result):
+        succeeded = bool(is_success(solution.result))
+        most = max(ADAPTIVE_STEPS, int(attempts)) if succeeded else int(attempts)
+    happened = 0 if solution.events is None else len(solution.events.index)
+    call = Arguments(
+        setup.problem, setup.x0, t0, t1, setup.args, dt=None if adaptive else dt, method=setup.method,
+        constants=constants, measure=constants is not None or solution.defect is not None,
+        dense=dense, max_steps=most, events=setup.events, max_events=max(_EVENTS, happened),
+    )  # fmt: skip
+    if dense:
+        check(call)
+    _, options = arranged(call, setup.method)
+    times = None if ts is None else _times(ts)
+    return _run(Choice(setup.method), setup, times, options, False)
 
 
 def arranged(call: Arguments, method: Any) -> tuple[Setup, Options]:

@@ -15,7 +15,6 @@ holds with M = 1 and c = μ: d/dt‖x_h − x‖ ≤ μ‖x_h − x‖ + δ. The
 ‖u_h − u‖ ≤ L‖x_h − x‖ + ‖u_h − u_{x_h}‖.
 """
 
-import math
 from typing import Any
 
 import equinox as eqx
@@ -27,10 +26,10 @@ from .. import _tree
 from .._dataset import Variable, dataset, described
 from .._repr import is_known, last_text, table, value_text
 from ..errors import InputError, InputProblem
-from ..evolution import Implicit, Solution, between, disturbance, gronwall, solve
-from ..evolution.control import MAX_GROWTH
+from ..evolution import Implicit, Solution, between, disturbance, gronwall
 from ..evolution.defect import ROUNDINGS
 from ..evolution.setup import as_arrays
+from ..evolution.solve import run_again
 from ..generators import AbstractGenerator, AbstractMatrixFree, Product
 from ..problem import Problem
 from .constants import Constants
@@ -177,7 +176,7 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
     domain = constants.domain
     regional = domain is not None and not domain.is_unbounded
     if sol.defect is None or (regional and sol.bounds is None):
-        measured = _solve_again(problem, sol, constants)
+        measured = _solve_again(sol, constants)
         distance = jax.vmap(lambda a, b: space.norm(_tree.sub(a, b)))(measured.xs, sol.xs)
     args, t0 = as_arrays(sol.setup.args), jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
     of_x, of_u = _roundoff(problem, args, t0, sol.setup.x0, sol.ts, sol.xs, sol.us)
@@ -403,21 +402,9 @@ def is_declared(A: AbstractGenerator) -> bool:
     return isinstance(A, AbstractMatrixFree) and not A.numerical_range().proved
 
 
-def _solve_again(problem: Problem, sol: Solution, constants: Constants) -> Solution:
+def _solve_again(sol: Solution, constants: Constants) -> Solution:
     """Solve again with the same steps, and record all that a certificate needs."""
-    setup = sol.setup
-    setting = setup.setting
-    adaptive = isinstance(setting["dt"], float) and math.isnan(setting["dt"])
-    # A default dt0 is chosen again, together with the larger growth limit of the first step.
-    dt0_was_given = setting["dt0_growth"] <= MAX_GROWTH
-    dt_max = None if setting["dt_max"] == math.inf else setting["dt_max"]
-    again = solve(
-        problem, setup.x0, setting["t0"], setting["t1"], setup.args, sol.ts,
-        None if adaptive else setting["dt"],
-        rtol=setting["rtol"], atol=setting["atol"], dt0=setting["dt0"] if dt0_was_given else None,
-        dt_max=dt_max, horizon=setting["horizon"],
-        method=setup.method, vi_solver=setup.vi_solver, constants=constants, measure=True, throw=False,
-    )  # fmt: skip
+    again = run_again(sol, sol.ts, constants=constants)
     if again.ts.shape == sol.ts.shape:
         return again
     raise InputError(
