@@ -243,9 +243,10 @@ class Solution(eqx.Module):
         starts, times = np.asarray(records.start), np.asarray(t)
         last = int(np.isfinite(starts).sum()) - 1
         first = starts[0]
-        end = (
-            records.end if isinstance(records, Trajectory) else starts[last] + records.length[last]
-        )
+        if isinstance(records, Trajectory):
+            end = records.end
+        else:
+            end = starts[last] + records.length[last]
         outside = times[~((first <= times) & (times <= end))]
         if outside.size:
             raise InputError(
@@ -295,7 +296,7 @@ class Solution(eqx.Module):
                 )
             )  # fmt: skip
         if isinstance(self.records, Trajectory):
-            return Regimes(*signs(self.records))
+            return signs(self.records)
         flow = self.flow
         x0, t0 = self.setup.x0, self.setup.number("t0")
         if flow.switches(t0, x0, flow.problem.zero_control(x0)) is None:

@@ -40,7 +40,7 @@ from .method import AbstractMethod
 from .nonfinite import refuse_nonfinite_data
 from .picard import Picard
 from .piecewise.method import PiecewiseLinear
-from .piecewise.propagate import Limits, propagate
+from .piecewise.propagate import propagate
 from .results import RESULTS, is_success
 from .setup import Options, Setup, as_arrays
 from .signature import flat
@@ -206,8 +206,7 @@ def _run(choice: Choice, setup: Setup, times: Any, options: Options, throw: bool
     """
     method, problem = choice.method, setup.problem
     if isinstance(method, PiecewiseLinear):
-        limits = Limits(options.max_steps, options.dense, options.track_bounds, options.progress)
-        solution = propagate(setup, times, limits)
+        solution = propagate(setup, times, options)
         solution.stats["method"] = choice.text()
         if throw and solution.result != RESULTS.successful:
             raise failure(solution)

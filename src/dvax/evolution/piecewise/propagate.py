@@ -19,10 +19,9 @@ from ...spaces import AbstractSpace
 from ..bounds import Bounds
 from ..responses import Responses
 from ..results import RESULTS
-from ..setup import Setup, as_arrays
+from ..setup import Options, Setup, as_arrays
 from ..solution import Solution
 from .inputs import Piece, UnresolvedInput, build_pieces
-from .radau import STAGES
 from .records import Row
 from .run import Run
 from .system import Affine, affine, pivoted
@@ -31,23 +30,9 @@ from .trajectory import Trajectory
 Array = np.ndarray
 
 
-class Limits(NamedTuple):
-    """Options of a run.
-
-    - `max_steps`: the largest number of accepted and rejected steps;
-    - `dense`: keep the polynomials of all steps;
-    - `track_bounds`: bound x and u;
-    - `progress`: print the completed percentage.
-    """
-
-    max_steps: int
-    dense: bool
-    track_bounds: bool
-    progress: bool
-
-
-def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
-    """Return the solution, up to the last saved time that was reached if the run fails.
+def propagate(setup: Setup, ts: Any, options: Options) -> Solution:
+    """Return the solution, up to the last saved time that was reached if the run fails. Of the options
+    it uses `max_steps` (accepted and rejected ones), `dense`, `track_bounds` and `progress`.
 
     **Raises:** `dvax.InputError` if the problem is not piecewise affine; `dvax.DifferentiationError`
     under `jax.jit`, `jax.grad` and `jax.vmap`.
@@ -66,30 +51,28 @@ def propagate(setup: Setup, ts: Any, limits: Limits) -> Solution:
     system, spaces = data.system, problem.spaces(x0)
     stops = np.concatenate([[t0], np.asarray(data.knots.within(t0, t1), float), [t1]])
     times = np.array([t1]) if ts is None else np.asarray(ts, float)
+    unresolved = None
     try:
-        pieces = build_pieces(problem, stops, x0, args, limits.max_steps)
+        pieces = build_pieces(problem, stops, x0, args, options.max_steps)
     except UnresolvedInput as error:
-        placeholder = [Piece(t0, t1 - t0, np.zeros((1, 1)), np.zeros(1), np.zeros(1))]
-        run = Run(
-            system, system, placeholder, np.asarray(x0, float).ravel(), data.weights, (rtol, atol),
-            *_run_options(limits, times),
-        )  # fmt: skip
-        run.t, run.result = error.t, error.result
-        if run.result == "max_steps":
-            run.rejected = limits.max_steps  # each piece needs at least one step
-        setup_end = time.perf_counter()
-    else:
-        run = Run(
-            system, data.pivoted, pieces, np.asarray(x0, float).ravel(), data.weights, (rtol, atol),
-            *_run_options(limits, times),
-        )  # fmt: skip
-        setup_end = time.perf_counter()
+        pieces = [Piece(t0, t1 - t0, np.zeros((1, 1)), np.zeros(1), np.zeros(1))]
+        unresolved = error
+    run = Run(
+        system, data.pivoted, pieces, np.asarray(x0, float).ravel(), data.weights, (rtol, atol), times,
+        options,
+    )  # fmt: skip
+    setup_end = time.perf_counter()
+    if unresolved is None:
         run.advance()
+    else:
+        run.t, run.result = unresolved.t, unresolved.result
+        if run.result == "max_steps":
+            run.rejected = options.max_steps  # each piece needs at least one step
     timing = {
         "compile_time": setup_end - setup_start,
         "run_time": time.perf_counter() - setup_end,
     }
-    return _solution(setup, x0, run, system, spaces, limits, timing)
+    return _solution(setup, x0, run, system, spaces, options, timing)
 
 
 class _Data(NamedTuple):
@@ -137,14 +120,9 @@ def _inverses(operator: AbstractOperator, rows: jax.Array) -> jax.Array:
     return jax.vmap(operator.inverse)(rows)
 
 
-def _run_options(limits: Limits, times: Array) -> tuple[int, Array, bool, bool, bool]:
-    """Return the last arguments of `Run`."""
-    return limits.max_steps, times, limits.dense, limits.track_bounds, limits.progress
-
-
 def _solution(
     setup: Setup, x0: Any, run: Run, system: Affine, spaces: tuple[AbstractSpace, AbstractSpace],
-    limits: Limits, timing: dict[str, float],
+    options: Options, timing: dict[str, float],
 ) -> Solution:  # fmt: skip
     rows, dtype, problem = run.rows, x0.dtype, setup.problem
     u0 = problem.zero_control(x0)
@@ -176,7 +154,7 @@ def _solution(
         defect=array(defects[:, 0], ()),
         law_defect=array(defects[:, 1], ()),
         completed_defect=(array(completed_defect[:, 0], ()), array(completed_defect[:, 1], ())),
-        bounds=_bounds(rows, n, x0, u0, P) if limits.track_bounds and rows else None,
+        bounds=_bounds(rows, n, x0, u0, P) if options.track_bounds and rows else None,
         stats={
             "steps": run.accepted, "rejected": run.rejected,
             "evaluations": run.accepted + run.rejected, "switchings": run.switchings,
@@ -184,7 +162,7 @@ def _solution(
             "next_dt": setup.setting["dt0"], **timing,
         },
         result=getattr(RESULTS, run.result),
-        records=_trajectory(run) if limits.dense else None,
+        records=_trajectory(run) if options.dense else None,
         events=None,
         enclosed=False,
         plan=None,
@@ -209,22 +187,9 @@ def _bounds(rows: list[Row], n: int, x0: Any, u0: Any, P: Any) -> Bounds:
 
 
 def _trajectory(run: Run) -> Trajectory:
-    """Return the steps of a run as arrays, with oscillations padded to the same number."""
-    steps, (n, m) = run.steps, run.system.B.shape
-    count, width = len(steps), max((len(step.oscillations) for step in steps), default=0)
-    stack = lambda name, *shape: np.reshape(  # noqa: E731
-        [getattr(step, name) for step in steps], (count, *shape)
+    start, changes = (
+        np.array([step.start for step in run.steps]),
+        np.array([t for t, _ in run.events]),
     )
-    rates = np.zeros((count, width), complex)
-    oscillation_x, oscillation_y = (
-        np.zeros((count, width, n), complex),
-        np.zeros((count, width, m), complex),
-    )
-    for k, step in enumerate(steps):
-        for i, (rate, x, y) in enumerate(step.oscillations):
-            rates[k, i], oscillation_x[k, i], oscillation_y[k, i] = rate, x, y
-    return Trajectory(
-        stack("start"), stack("length"), stack("used"), stack("x", STAGES + 1, n),
-        stack("y", STAGES, m), rates, oscillation_x, oscillation_y,
-        np.array([t for t, _ in run.events]), np.reshape([mode for _, mode in run.events], (-1, m)),
-    )  # fmt: skip
+    modes = np.reshape([mode for _, mode in run.events], (-1, run.system.B.shape[1]))
+    return Trajectory(start, tuple(run.steps), changes, modes)

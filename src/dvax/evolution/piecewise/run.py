@@ -14,6 +14,7 @@ import numpy as np
 
 from .. import meter
 from ..defect import ROUNDINGS
+from ..setup import Options
 from . import radau
 from .inputs import Piece, basis, is_continuous, values
 from .lengths import length_past, lengthen, shorten, two_sum
@@ -36,18 +37,17 @@ class Run:
 
     def __init__(
         self, original: Affine, pivoted: Affine, pieces: list[Piece], x0: Array, weights: Array,
-        tol: tuple[float, float], max_steps: int, times: Array, dense: bool, track_bounds: bool,
-        progress: bool,
+        tol: tuple[float, float], times: Array, options: Options,
     ):  # fmt: skip
         self.original, self.system, self.pieces, self.x = original, pivoted, pieces, x0
-        self.weights, self.max_steps = weights, max_steps
+        self.weights, self.max_steps = weights, options.max_steps
         rtol, atol = tol
         self.tol, self.min_allowed = float(np.clip(1e-4 * rtol, 1e-12, 1e-6)), 1e-4 * atol
         self.rtol, self.atol, self.masked_error = rtol, atol, 0.0 * x0
         self.largest = np.zeros((2, len(original.low)))
         # Where p is w, its absolute tolerance scales with the law.
         self.min_allowed_p = self.min_allowed * np.where(pivoted.swapped, np.diag(original.M), 1.0)
-        self.times, self.dense = times, dense
+        self.times, self.dense = times, options.dense
         self._equations: dict[Mode, Equations] = {}
         self.mode = initial_mode(original)
         self.scale, self.x_error, self.truncation = np.abs(x0), 0.0 * x0, 0.0 * x0
@@ -58,11 +58,11 @@ class Run:
         self.defect = self.law_defect = 0.0
         self.piece = pieces[0]
         self.t, self.result = pieces[0].start, "successful"
-        self.began, self.printed_share = meter.now() if progress else None, 0.0
+        self.began, self.printed_share = meter.now() if options.progress else None, 0.0
         self.span = pieces[-1].start + pieces[-1].length - self.t
         m = len(original.low)
         none = np.stack([np.full(m, np.inf), np.full(m, -np.inf)])
-        self.bounds = np.hstack([np.stack([x0, x0]), none]) if track_bounds else None
+        self.bounds = np.hstack([np.stack([x0, x0]), none]) if options.track_bounds else None
 
     def advance(self) -> None:
         """Advance to the end of the run, or to a failure, which `result` then names."""
