@@ -18,10 +18,6 @@ class ETD3RK(dvax.evolution.AbstractMethod):
     samples: ClassVar[tuple[float, ...]] = TWO_SAMPLES
     safety: ClassVar[float] = 1.0
     has_half_stage: ClassVar[bool] = True
-    is_rosenbrock: ClassVar[bool] = False
-    explicit_in_A: ClassVar[bool] = False
-    pair: ClassVar[tuple[int, int] | None] = None
-    quadrature: ClassVar[tuple[float, ...] | None] = None
 
     def coefficients(self, evaluate, propagate, first, drift):
         middle = evaluate(0.5, propagate(0.5, (first,)))

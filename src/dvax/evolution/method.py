@@ -32,7 +32,9 @@ class AbstractMethod(eqx.Module):
     is at most `safety` times what they show. `has_half_stage` says that some stage lies half a step
     away. Where `is_rosenbrock`, the method has A + J in the place of A and f̃ − Jx in that of f̃, with
     J = Df̃(t₀, x₀); where `explicit_in_A`, it has 0 and f̃ + Ax there. `pair` numbers two evaluations of
-    a measured step at one time, whose differences show the slope of f̃.
+    a measured step at one time, whose differences show the slope of f̃. `quadrature` has the weights
+    of the integral of the defect, or None for those that interpolate. A method states the last five
+    where they differ from the defaults.
 
     ```python
     >>> import dvax
@@ -47,11 +49,11 @@ class AbstractMethod(eqx.Module):
     degree: eqx.AbstractClassVar[int]
     samples: eqx.AbstractClassVar[tuple[float, ...]]
     safety: eqx.AbstractClassVar[float]
-    has_half_stage: eqx.AbstractClassVar[bool]
-    is_rosenbrock: eqx.AbstractClassVar[bool]
-    explicit_in_A: eqx.AbstractClassVar[bool]
-    pair: eqx.AbstractClassVar[tuple[int, int] | None]
-    quadrature: eqx.AbstractClassVar[tuple[float, ...] | None]
+    has_half_stage: ClassVar[bool] = False
+    is_rosenbrock: ClassVar[bool] = False
+    explicit_in_A: ClassVar[bool] = False
+    pair: ClassVar[tuple[int, int] | None] = None
+    quadrature: ClassVar[tuple[float, ...] | None] = None
 
     @abc.abstractmethod
     def coefficients(
@@ -100,11 +102,6 @@ class ETD1(AbstractMethod):
     degree: ClassVar[int] = 0
     samples: ClassVar[tuple[float, ...]] = ONE_SAMPLE
     safety: ClassVar[float] = 1.0
-    has_half_stage: ClassVar[bool] = False
-    is_rosenbrock: ClassVar[bool] = False
-    explicit_in_A: ClassVar[bool] = False
-    pair: ClassVar[tuple[int, int] | None] = None
-    quadrature: ClassVar[tuple[float, ...] | None] = None
 
     def coefficients(self, evaluate, propagate, first, drift):
         return (first,)
@@ -132,11 +129,7 @@ class ETD2RK(AbstractMethod):
     degree: ClassVar[int] = 1
     samples: ClassVar[tuple[float, ...]] = ONE_SAMPLE
     safety: ClassVar[float] = 1.12
-    has_half_stage: ClassVar[bool] = False
-    is_rosenbrock: ClassVar[bool] = False
-    explicit_in_A: ClassVar[bool] = False
     pair: ClassVar[tuple[int, int] | None] = (1, -1)
-    quadrature: ClassVar[tuple[float, ...] | None] = None
 
     def coefficients(self, evaluate, propagate, first, drift):
         second = evaluate(1.0, propagate(1.0, (first,)))
@@ -170,8 +163,6 @@ class ETD4RK(AbstractMethod):
     samples: ClassVar[tuple[float, ...]] = TWO_SAMPLES
     safety: ClassVar[float] = 1.0
     has_half_stage: ClassVar[bool] = True
-    is_rosenbrock: ClassVar[bool] = False
-    explicit_in_A: ClassVar[bool] = False
     pair: ClassVar[tuple[int, int] | None] = (1, 2)
     quadrature: ClassVar[tuple[float, ...] | None] = (1 / 12, 5 / 12, 5 / 12, 1 / 12)
 
@@ -222,9 +213,6 @@ class ExpRosenbrock(AbstractMethod):
     safety: ClassVar[float] = 1.13
     has_half_stage: ClassVar[bool] = True
     is_rosenbrock: ClassVar[bool] = True
-    explicit_in_A: ClassVar[bool] = False
-    pair: ClassVar[tuple[int, int] | None] = None
-    quadrature: ClassVar[tuple[float, ...] | None] = None
 
     def coefficients(self, evaluate, propagate, first, drift):
         a = evaluate(0.5, propagate(0.5, (first, drift)))

@@ -62,8 +62,6 @@ class DormandPrince(AbstractMethod):
     degree: ClassVar[int] = 3
     samples: ClassVar[tuple[float, ...]] = _SAMPLES
     safety: ClassVar[float] = 1.85
-    has_half_stage: ClassVar[bool] = False
-    is_rosenbrock: ClassVar[bool] = False
     explicit_in_A: ClassVar[bool] = True
     pair: ClassVar[tuple[int, int] | None] = (5, 6)
     quadrature: ClassVar[tuple[float, ...] | None] = (1 / 12, 5 / 12, 0.0, 5 / 12, 1 / 12)
