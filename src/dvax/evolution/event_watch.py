@@ -11,7 +11,6 @@ where R is the reset. The derivative of this map is the saltation matrix (Aizerm
 the time of the event depends on x, and t is a constant. Every derivative of a run with events follows.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -30,7 +29,7 @@ from .event_search import RESTART, Walk, arrives, next_event, touches
 from .flow import Flow
 from .outcome import Record
 from .results import RESULTS
-from .stepper import Stepper, interpolate, local, one_sided_time
+from .stepper import Stepper, dense_output, one_sided_time
 from .time_derivatives import midpoint, velocity
 
 _WINDOW = 1e-6
@@ -275,7 +274,7 @@ class EventWatch(eqx.Module):
         which events happen where it stops, their widths, a table with the times, indices and widths of
         the others, and the number of its rows."""
         t0, h, *_ = step
-        at_x = self._states(stepper, step, end, guess)
+        at_x = dense_output(stepper.method, stepper.flow, step, guess, stepper.ends, end)
         inset = end - one_sided_time(t0, end, 1.0, stepper.ends)
 
         def values(theta: Any) -> jax.Array:
@@ -312,14 +311,6 @@ class EventWatch(eqx.Module):
         walk, table, count = lax.while_loop(lambda c: ~(c[0].found | c[0].ended), one, carry)
         return walk, *happens(walk), table, count
 
-    def _states(
-        self, stepper: Stepper, step: Record, end: Any, guess: Tree | None
-    ) -> Callable[[Any], Tree]:
-        """Return the dense output of a step as a function of θ."""
-        t0, h, x0, c = step
-        flow, _ = local(stepper.method, stepper.flow, t0, end, x0, guess, stepper.ends)
-        return lambda theta: interpolate(flow, h, theta, x0, c)
-
     def _fill(
         self,
         stepper: Stepper,
@@ -332,7 +323,7 @@ class EventWatch(eqx.Module):
         guess: Tree | None,
     ) -> Tree:
         """Return the table with the states of the events inside a step."""
-        at_x = self._states(stepper, step, end, guess)
+        at_x = dense_output(stepper.method, stepper.flow, step, guess, stepper.ends, end)
         last = jnp.minimum(count, self.max_events)
 
         def one(carry: tuple[Any, Tree]) -> tuple[Any, Tree]:

@@ -23,7 +23,7 @@ from .control import AbstractController, Adaptive, StepDecision, slack
 from .event_watch import EventWatch, Watched
 from .outcome import Record, Saved
 from .results import RESULTS
-from .stepper import Propagators, SolverState, Step, Stepper, interpolate, local
+from .stepper import Propagators, SolverState, Step, Stepper, dense_output
 from .time_derivatives import is_differentiated
 
 STEP = "dvax_step"
@@ -384,10 +384,8 @@ class Loop(eqx.Module):
 
     def _interpolate(self, record: Record, theta: Any, guess: Tree | None) -> Tree:
         """x_h inside a step."""
-        t0, stepper = record.start, self.stepper
-        end = t0 + record.length
-        flow, _ = local(stepper.method, stepper.flow, t0, end, record.x0, guess, stepper.ends)
-        return interpolate(flow, record.length, theta, record.x0, record.coefficients)
+        stepper = self.stepper
+        return dense_output(stepper.method, stepper.flow, record, guess, stepper.ends)(theta)
 
 
 def _at(times: jax.Array, row: Any) -> Any:

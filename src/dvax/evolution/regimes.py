@@ -1,5 +1,6 @@
 """The intervals of a trajectory on which the active constraints of K do not change."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +12,7 @@ from .._dataset import dataset, described
 from .flow import Flow
 from .locate_event import locate_event
 from .loop import Record
-from .stepper import interpolate, local, one_sided_time
+from .stepper import dense_output, one_sided_time
 
 _SAMPLES = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Positions in a step at which the signs of the switch functions are sampled."""
@@ -62,20 +63,26 @@ def regimes(flow: Flow, method: Any, records: Record, count: int) -> Regimes:
     return Regimes(np.array([*times, starts[-1] + lengths[-1]]), np.array(rows))
 
 
-def _changes(
-    flow: Flow, method: Any, step: Record, run: tuple[Any, Any]
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return the time of the first sign change in a step, and the one-sided signs at its two ends."""
-    end, guess = step.start + step.length, flow.guess(step.x0)
-    own, _ = local(method, flow, step.start, end, step.x0, guess, run)
+def switches_along(flow: Flow, method: Any, step: Record, run: Any) -> Callable[..., jax.Array]:
+    """Return the switch functions of K over a step as a function of θ, and of the time there if it is
+    one-sided."""
+    states = dense_output(method, flow, step, flow.guess(step.x0), run)
 
     def at(theta: Any, t: Any = None) -> jax.Array:
         t = step.start + theta * step.length if t is None else t
-        x = interpolate(own, step.length, theta, step.x0, step.coefficients)
+        x = states(theta)
         switches = flow.switches(t, x, flow.rate(t, x, flow.guess(x)).z)
         assert switches is not None
         return switches
 
+    return at
+
+
+def _changes(
+    flow: Flow, method: Any, step: Record, run: tuple[Any, Any]
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return the time of the first sign change in a step, and the one-sided signs at its two ends."""
+    end, at = step.start + step.length, switches_along(flow, method, step, run)
     values = [
         at(jnp.asarray(theta, end.dtype), one_sided_time(step.start, end, theta, run))
         for theta in _SAMPLES

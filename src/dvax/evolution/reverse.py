@@ -26,7 +26,7 @@ from .._jax import outlined
 from .._tree import Tree
 from .checkpoints import Checkpoints, Stack, checkpoint_count
 from .loop import Loop, Record, Saved, State
-from .stepper import SolverState, interpolate, local
+from .stepper import SolverState, dense_output
 from .time_derivatives import instantiate_zeros, is_zero
 
 
@@ -327,8 +327,9 @@ class _Backward:
             loop = self._parts(p)
             t0, t1 = self._times(loop, i)
             stepper = loop.stepper
-            flow, _ = local(stepper.method, stepper.flow, t0, t1, x, self.guess, stepper.ends)
-            return interpolate(flow, t1 - t0, (time - t0) / (t1 - t0), x, c)
+            step, method, ends = Record(t0, t1 - t0, x, c), stepper.method, stepper.ends
+            states = dense_output(method, stepper.flow, step, self.guess, ends, t1)
+            return states((time - t0) / (t1 - t0))
 
         _, pull = jax.vjp(at, moving, x, c)
         return pull(psi)

@@ -30,7 +30,7 @@ from .responses import Responses
 from .results import RESULTS, is_success
 from .saved_responses import Saved, saved_responses
 from .setup import Setup
-from .stepper import interpolate, local
+from .stepper import dense_output
 
 if TYPE_CHECKING:
     import xarray
@@ -227,11 +227,7 @@ class Solution(eqx.Module):
         run = self.setup.number("t0"), self.setup.number("t1")
         method = self.setup.method
         assert not isinstance(method, Implicit | PiecewiseLinear)
-        own, _ = local(
-            method, flow, step.start, step.start + step.length, step.x0,
-            flow.guess(step.x0), run,
-        )  # fmt: skip
-        x = interpolate(own, step.length, theta, step.x0, step.coefficients)
+        x = dense_output(method, flow, step, flow.guess(step.x0), run)(theta)
         rate = flow.rate(t, x, None)
         return x, flow.operator.inverse(rate.y)
 

@@ -24,6 +24,7 @@ from .excursions import ExcursionGuard
 from .flow import Flow, Rate, joined
 from .locate_event import locate_event
 from .method import AbstractMethod, shortened
+from .outcome import Record
 
 _SMALL = 64
 """Up to this many entries a look at every one of them is free."""
@@ -111,6 +112,16 @@ def local(
         return flow, None
     flow, drift = flow.linearised(one_sided_time(t0, t1, 0.0, ends), x0, guess)
     return flow, _tree.scale(t1 - t0, drift)
+
+
+def dense_output(
+    method: Any, flow: Flow, step: Record, guess: Tree | None, ends: tuple[Any, Any], end: Any = None,
+) -> Callable[[Any], Tree]:  # fmt: skip
+    """Return x_h over a step as a function of θ. `guess` is for the law at its start, `ends` are those
+    of the run; `end` is that of the step, by default start + length."""
+    end = step.start + step.length if end is None else end
+    own, _ = local(method, flow, step.start, end, step.x0, guess, ends)
+    return lambda theta: interpolate(own, step.length, theta, step.x0, step.coefficients)
 
 
 def one_sided_time(t0: Any, t1: Any, theta: float, ends: tuple[Any, Any]) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import InputError, InputProblem
 from ..evolution import Solution
 from ..evolution.outcome import Record
-from ..evolution.stepper import interpolate, local
+from ..evolution.regimes import switches_along
 
 _SAMPLES_PER_STEP = 8
 """Number of evaluations of the switches in a step."""
@@ -108,11 +108,8 @@ def _sample_switches(sol: Solution, count: int) -> tuple[np.ndarray, np.ndarray]
     thetas = jnp.arange(_SAMPLES_PER_STEP, dtype=steps.start.dtype) / _SAMPLES_PER_STEP
 
     def sample(step, theta):
-        end, guess = step.start + step.length, flow.guess(step.x0)
-        step_flow, _ = local(method, flow, step.start, end, step.x0, guess, run)
         t = step.start + theta * step.length
-        x = interpolate(step_flow, step.length, theta, step.x0, step.coefficients)
-        return t, flow.switches(t, x, flow.rate(t, x, flow.guess(x)).z)
+        return t, switches_along(flow, method, step, run)(theta)
 
     sample_steps = jax.jit(jax.vmap(lambda step: jax.vmap(lambda th: sample(step, th))(thetas)))
     last = jtu.tree_map(lambda leaf: leaf[-1], steps)
