@@ -8,9 +8,7 @@ import numpy as np
 from ..errors import Fix, SolveError
 from .solution import Solution
 
-_ROWS = (
-    "ts", "xs", "law", "defect", "law_defect", "completed_defect",
-)  # fmt: skip
+_ROWS = ("ts", "xs", "law", "defect", "law_defect", "completed_defect", "bounds")
 
 
 def cut(solution: Solution, which: slice) -> Solution:

@@ -42,6 +42,7 @@ from .picard import Picard
 from .piecewise.method import PiecewiseLinear
 from .piecewise.propagate import propagate
 from .results import RESULTS, is_success
+from .rows import cut
 from .setup import Options, Setup, as_arrays
 from .signature import flat
 from .solution import Solution
@@ -476,17 +477,4 @@ def _trim(solution: Solution) -> Solution:
     reached = np.isfinite(np.asarray(solution.ts))
     if reached.all() and solution.records is None:
         return solution
-    cut = lambda leaf: leaf[: int(reached.sum())]  # noqa: E731
-    fields = (
-        "ts",
-        "xs",
-        "law",
-        "defect",
-        "law_defect",
-        "completed_defect",
-        "bounds",
-    )
-    new = [jax.tree_util.tree_map(cut, getattr(solution, name)) for name in fields]
-    return eqx.tree_at(
-        lambda s: [getattr(s, name) for name in fields], solution, new, is_leaf=lambda x: x is None
-    )
+    return cut(solution, slice(int(reached.sum())))
