@@ -50,22 +50,18 @@ class Bounds(NamedTuple):
 
     def hull_of_rows(self) -> "Bounds":
         """Return the tightest bounds on all rows, which are stacked along the first axis."""
-        lowest, highest = partial(jnp.min, axis=0), partial(jnp.max, axis=0)
-        (low_x, high_x), (low_u, high_u) = self
-        return Bounds(
-            (jtu.tree_map(lowest, low_x), jtu.tree_map(highest, high_x)),
-            (jtu.tree_map(lowest, low_u), jtu.tree_map(highest, high_u)),
-        )
+        lows, highs = zip(*self, strict=True)
+        low = jtu.tree_map(partial(jnp.min, axis=0), lows)
+        high = jtu.tree_map(partial(jnp.max, axis=0), highs)
+        return Bounds(*zip(low, high, strict=True))
 
     def hull(self, other: "Bounds") -> "Bounds":
         """Return the tightest bounds that contain both. NaN propagates, and lies in no region."""
-        lowest = partial(jtu.tree_map, jnp.minimum)
-        highest = partial(jtu.tree_map, jnp.maximum)
-        (low_x, high_x), (low_u, high_u) = other
-        return Bounds(
-            (lowest(self.x[0], low_x), highest(self.x[1], high_x)),
-            (lowest(self.u[0], low_u), highest(self.u[1], high_u)),
-        )
+        lows, highs = zip(*self, strict=True)
+        other_lows, other_highs = zip(*other, strict=True)
+        low = jtu.tree_map(jnp.minimum, lows, other_lows)
+        high = jtu.tree_map(jnp.maximum, highs, other_highs)
+        return Bounds(*zip(low, high, strict=True))
 
 
 def _ends(enclosures: Tree) -> tuple[Tree, Tree]:
