@@ -32,7 +32,13 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._tree import Tree
-from ..programs.enclosure import LinearEnclosure, NoEnclosure, below_parabola, enclose, is_enclosure
+from ..programs.enclosure import (
+    LinearEnclosure,
+    below_parabola,
+    enclose,
+    has_enclosure,
+    is_enclosure,
+)
 from ..vi import independent
 from .evaluations import Evaluation
 from .flow import Flow, slope
@@ -205,23 +211,14 @@ def guard(flow: Flow, t0: Any, x0: Tree) -> ExcursionGuard | None:
     laws = not independent(lambda t: trial._data(flow, t, x0, z)[1], t0)
     trial = dataclasses.replace(trial, switches=trial.switches and laws, rates=rates, laws=laws)
 
-    def has_enclosure(fn: Any) -> bool:
-        try:
-            jax.eval_shape(fn, t0, x0, z)
-        except NoEnclosure:
-            return False
-        return True
-
     place = lambda t, x, z: (t, x, z, z)  # noqa: E731
     for name in ("rates", "laws"):
         alone = ExcursionGuard(False, name == "rates", name == "laws", True)
-        if getattr(trial, name) and not has_enclosure(
-            lambda *p, alone=alone: alone._pulses(flow, place(*p), place(*p))
-        ):
+        pulses = lambda *p, alone=alone: alone._pulses(flow, place(*p), place(*p))  # noqa: E731
+        if getattr(trial, name) and not has_enclosure(pulses, t0, x0, z):
             trial = dataclasses.replace(trial, **{name: False})
-    if trial.switches and not has_enclosure(
-        lambda *p: trial._deviation(flow, place(*p), place(*p))
-    ):
+    deviation = lambda *p: trial._deviation(flow, place(*p), place(*p))  # noqa: E731
+    if trial.switches and not has_enclosure(deviation, t0, x0, z):
         trial = dataclasses.replace(trial, enclosed=False)
     return trial if trial.switches or trial.rates or trial.laws else None
 

@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._tree import Tree
-from ..programs.enclosure import NoEnclosure, constant
+from ..programs.enclosure import constant, has_enclosure
 from ..vi import AbstractSolver, Auto, analyse, independent
 from .flow import Flow, slope
 from .implicit import Implicit
@@ -56,9 +55,11 @@ class Plan(NamedTuple):
         constant_slope = independent(lambda t, x: slope(problem, operator, t, x, args), t0, x0)
         plan = Plan(True, structure.isotropic, constant_slope, False, solver, False)
         line = not isinstance(setup.method, Implicit) and setup.method.degree <= 1
-        if intervals and line and _has_enclosure(plan.flow(setup), t0, x0):
-            return plan._replace(enclosed=True)
-        return plan
+        if not (intervals and line):
+            return plan
+        flow = plan.flow(setup)
+        enclosed = has_enclosure(lambda t, x: flow.enclosure(constant(t), constant(x)), t0, x0)
+        return plan._replace(enclosed=enclosed)
 
     def flow(self, setup: Setup) -> Flow:
         """Return the reduced map f̃ for the numbers of this call."""
@@ -104,11 +105,3 @@ def _tolerance(setup: Setup) -> jax.Array:
     adaptive = 1e-3 * defect / jnp.maximum(1.0, setup.number("horizon"))
     has_fixed_steps = ~jnp.isnan(setup.number("dt"))
     return jnp.maximum(jnp.where(has_fixed_steps, 1e-12, adaptive), floor)
-
-
-def _has_enclosure(flow: Flow, t0: jax.Array, x0: Tree) -> bool:
-    try:
-        jax.eval_shape(lambda t, x: flow.enclosure(constant(t), constant(x)), t0, x0)
-    except NoEnclosure:
-        return False
-    return True

@@ -109,6 +109,15 @@ def enclose(fn: Callable[..., Tree], *args: Tree) -> Tree:
     return jtu.tree_structure(shape).unflatten(list(map(_lift, results)))
 
 
+def has_enclosure(fn: Callable[..., Tree], *args: Tree) -> bool:
+    """Return whether every operation of fn(*args), which calls `enclose`, has a rule."""
+    try:
+        jax.eval_shape(fn, *args)
+    except NoEnclosure:
+        return False
+    return True
+
+
 def _no_deviation(value: Any) -> jax.Array:
     return jnp.zeros(jnp.shape(value), _real(value))
 
