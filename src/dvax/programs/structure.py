@@ -91,9 +91,7 @@ def independent(fn: Callable[..., Tree], *args: Tree) -> bool:
 
     ```
     """
-    program = jax.make_jaxpr(fn)(*args)
-    inputs = [_Dependence(1, None, False) for _ in program.jaxpr.invars]
-    return all(out.degree == 0 for out in _read(program, inputs))
+    return independent_of_first(lambda args: fn(*args), args)
 
 
 def independent_of_first(fn: Callable[..., Tree], first: Tree, *others: Tree) -> bool:
