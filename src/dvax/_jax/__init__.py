@@ -14,9 +14,8 @@ _FIRST_WITHOUT = (0, 12)
 """The first release of JAX on which outlining is not necessary."""
 
 
-def _plain(run: Callable[..., Any], *args: Any, large: Any = (), transposable: bool = False) -> Any:
+def _plain(run: Callable[..., Any], *args: Any, large: Any = ()) -> Any:
     """Return run(*args, *large)."""
-    del transposable
     return run(*args, *large)
 
 

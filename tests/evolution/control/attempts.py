@@ -9,8 +9,8 @@ NO, YES = jnp.asarray(False), jnp.asarray(True)
 
 def attempt(error, size, horizon=1.0, smallest=1e-14):
     return Attempt(
-        begin=jnp.asarray(0.0), end=jnp.asarray(size), size=jnp.asarray(size),
-        smallest=jnp.asarray(smallest), error=jnp.asarray(error), modulus=jnp.asarray(error),
+        size=jnp.asarray(size), smallest=jnp.asarray(smallest),
+        error=jnp.asarray(error), modulus=jnp.asarray(error),
         unit=jnp.asarray(1.0),
         integrated=jnp.asarray(error * size / horizon), roundoff=jnp.asarray(0.0),
         usable=jnp.asarray(True),

@@ -26,19 +26,17 @@ _INSIDE = 0.5
 class Attempt(NamedTuple):
     """An attempted step, as the parts of the controller use it.
 
-    - `begin`, `end`, `size`: its times, and end − begin;
+    - `size`: its length;
     - `smallest`: the smallest step size, eight roundings of t;
     - `error`: the largest defect divided by the tolerance (1 is the limit), signed where it cancels;
     - `modulus`: the same of the modulus of the defect, without the decay of earlier errors;
     - `unit`: the factor from the signed defect to `error`, which is 1 unless earlier errors decay;
     - `integrated`: the defect integrated over the step, in units of the tolerance of the whole run;
     - `roundoff`: the largest `error` that rounding of f̃ and of t can explain;
-    - `usable`: the law was solved at `begin`, and no value is non-finite that a smaller step would
+    - `usable`: the law was solved at its start, and no value is non-finite that a smaller step would
       leave so.
     """
 
-    begin: Any
-    end: Any
     size: Any
     smallest: Any
     error: Any
@@ -103,8 +101,6 @@ class ErrorTest(eqx.Module):
         # large.
         error, modulus = (jnp.where(step.solved, v, jnp.inf) for v in (error, modulus))
         return Attempt(
-            begin=t0,
-            end=t1,
             size=h,
             smallest=8 * eps * largest,
             error=error,

@@ -50,4 +50,3 @@ class PiecewiseLinear(eqx.Module):
 
     order: ClassVar[int] = 39
     degree: ClassVar[int] = 20
-    is_rosenbrock: ClassVar[bool] = False
