@@ -83,7 +83,7 @@ def certified(
         solution = run(ts, atol)
         if solution.result != RESULTS.successful:
             return solution  # throw=False: the result says what failed, and nothing is certified
-        bounds = _bounds(solution, growth, t0)
+        bounds, _ = _bounds(solution, growth, t0)
         of_steps, of_time = _roundoff(solution, growth, max(size, largest), t0, t1)
         if of_steps + of_time > 0.5 * tol:
             reason = f"roundoff of x in {int(solution.stats['steps'])} steps, and of t"
@@ -95,7 +95,7 @@ def certified(
             if of_region(constants):
                 # The same steps with more saved times, which make the bounds between them sharper.
                 denser = run(np.linspace(t0, t1, _REGION_CHECKS + 1)[1:], atol)
-                exit_time = _exit_time(denser, constants, _interval_bounds(denser, growth, t0))
+                exit_time = _exit_time(denser, constants, _bounds(denser, growth, t0)[1])
                 if exit_time is not None:
                     raise _outside(exit_time)
             return _with_bound(solution, bound)
@@ -182,11 +182,11 @@ def _sizes(problem: Problem, t0: jax.Array, x0: Tree, args: Any) -> tuple[jax.Ar
     return jnp.sqrt(space.size()), jnp.maximum(space.norm(rate), space.norm(x0))
 
 
-def _bounds(solution: Solution, growth: _Growth, t0: float) -> Any:
-    """Return the bound at every saved time."""
+def _bounds(solution: Solution, growth: _Growth, t0: float) -> tuple[jax.Array, jax.Array]:
+    """Return the bounds at every saved time, and on the interval from the last one to it."""
     assert solution.defect is not None and solution.completed_defect is not None
     integrated = (solution.defect, solution.law_defect), solution.completed_defect
-    return _smallest_bounds(t0, solution.ts, integrated, growth)[0]
+    return _smallest_bounds(t0, solution.ts, integrated, growth)
 
 
 def _roundoff(
@@ -206,13 +206,6 @@ def _roundoff(
 @eqx.filter_jit
 def _largest_norm(space: AbstractSpace, x0: Tree, xs: Tree) -> jax.Array:
     return jnp.maximum(jnp.max(jax.vmap(space.norm)(xs)), space.norm(x0))
-
-
-def _interval_bounds(solution: Solution, growth: _Growth, t0: float) -> Any:
-    """Return bounds that hold on the interval from the last saved time to each saved time."""
-    assert solution.defect is not None and solution.completed_defect is not None
-    integrated = (solution.defect, solution.law_defect), solution.completed_defect
-    return _smallest_bounds(t0, solution.ts, integrated, growth)[1]
 
 
 @jax.jit
