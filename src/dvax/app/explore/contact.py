@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from dvax._figure_text import entry_text
-from dvax.app.explore.contact_code import script
 from dvax.app.explore.contact_data import LETTERS, Data
 from dvax.app.explore.contact_drawings import ContactFrames, Fields, Prediction, drawings
 from dvax.app.explore.files import code_of_configuration, configuration_text
@@ -126,10 +125,7 @@ class ContactSubject(AbstractSubject):
         if kind == "configuration":
             files = [file for _, file in self.config.data_files()]
             return f"{name}.toml", configuration_text(tree, files)
-        text = script(self.config, self.inputs, values)
-        if text is None:  # measured data
-            text = code_of_configuration(tree, self.config.source)
-        return f"{name}.py", text
+        return f"{name}.py", code_of_configuration(tree, self.config.source)
 
     @property
     def _times(self) -> np.ndarray:
