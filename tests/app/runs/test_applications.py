@@ -124,7 +124,8 @@ def test_application_run_writes_figures_data_and_a_report(folder, outcome):
         assert data.state_C1.attrs["units"] == "V"
     page = build_report(outcome.directory).read_text()
     assert "model circuit, exact" in page and "The circuit over time" in page
-    assert (outcome.directory / "figures" / "circuit.png").stat().st_size > 10_000
+    for picture in ("circuit", "certificate"):
+        assert (outcome.directory / "figures" / f"{picture}.png").stat().st_size > 10_000
 
 
 def test_resolved_configuration_gives_the_same_run(outcome, tmp_path):

@@ -15,7 +15,6 @@ from matplotlib.lines import Line2D
 
 from dvax.app.plots.lines import positive, thin
 from dvax.app.plots.picture import Picture
-from dvax.app.plots.store import Variable
 from dvax.app.plots.theme import (
     MUTED,
     SERIES,
@@ -217,18 +216,6 @@ class TimeMarks:
     x: np.ndarray
     name: str
     dash: str = "dot"
-
-
-def bound_panel(x: np.ndarray, bound: Variable, unit: str, colour: int = 1, **more: Any) -> Panel:
-    """An error bound on a logarithmic axis, with the word for how much is known of it."""
-    known = f" ({bound.status})" if bound.status else ""
-    curve = Curve(x, bound.values, f"error bound{known}", colour)
-    return Panel([curve], f"error bound{known.replace(' ', '<br>')}", unit, log=True, **more)
-
-
-def bound_title(bound: Variable) -> str:
-    """Return the title of a picture of a bound: only a proved bound is called certified."""
-    return "Certified error" if bound.status == "proved" else f"Error bound, {bound.status}"
 
 
 def panels_picture(

@@ -4,6 +4,7 @@ import importlib
 import pkgutil
 from collections.abc import Mapping
 
+from dvax.app.plots.panels import Curve, Panel, panels_picture
 from dvax.app.plots.picture import Picture
 from dvax.app.plots.store import Variable
 from dvax.app.runs.applications import models
@@ -17,7 +18,8 @@ _DEFAULT = "python"
 
 
 def application_pictures(name: str, data: Mapping[str, Variable]) -> list[Picture]:
-    """Return the pictures of an application by its name: its own, or the default ones.
+    """Return the pictures of an application by its name, its own or the default ones, and that of
+    its error bound.
 
     **Raises:** `dvax.InputError` for the name of no model: it comes from a file that may be damaged.
     """
@@ -29,4 +31,17 @@ def application_pictures(name: str, data: Mapping[str, Variable]) -> list[Pictur
         )  # fmt: skip
     own = name if name in NAMES else _DEFAULT
     module = importlib.import_module(f"dvax.app.plots.applications.{own.replace('-', '_')}")
-    return module.pictures(data)
+    found = module.pictures(data)
+    return [*found, _certificate(data)] if "error_bound" in data else found
+
+
+def _certificate(data: Mapping[str, Variable]) -> Picture:
+    """The bound on the error at the saved times."""
+    bound = data["error_bound"]
+    axis, status = bound.dims[0], bound.status
+    # Only a proved bound is called certified.
+    title = "Certified error" if status == "proved" else f"Error bound, {status}"
+    curve = Curve(data[axis].values, bound.values, f"error bound ({status})", 1)
+    panel = Panel([curve], f"error bound<br>({status})", bound.unit, log=True)
+    words = bound.attrs.get("long_name", "bound on the error of the state")
+    return panels_picture("certificate", title, f"A {words}.", [panel], axis, data[axis].unit)

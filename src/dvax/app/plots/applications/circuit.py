@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from dvax.app.plots.panels import Curve, Panel, bound_panel, bound_title, panels_picture
+from dvax.app.plots.panels import Curve, Panel, panels_picture
 from dvax.app.plots.picture import Picture
 from dvax.app.plots.store import Variable
 
@@ -28,18 +28,10 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
         ]
         if curves:
             panels.append(Panel(curves, what, of))
-    bound = data["error_bound"]
-    certificate = bound_panel(t, bound, bound.unit)
     return [
         panels_picture(
             "circuit", "The circuit over time",
             "Voltages of the capacitors, currents of the inductors and of the diodes.",
             panels, "time", unit,
-        ),
-        panels_picture(
-            "certificate", bound_title(bound),
-            "A bound on the distance of the computed state from the true one, in the norm of the "
-            "stored energy, ‖x‖² = ΣCv² + ΣLi².",
-            [certificate], "time", unit,
         ),
     ]  # fmt: skip

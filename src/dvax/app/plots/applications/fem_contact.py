@@ -11,7 +11,7 @@ from matplotlib.tri import Triangulation
 
 from dvax.app.plots.downsample import rounded
 from dvax.app.plots.field import field_pictures
-from dvax.app.plots.panels import DASHES, Curve, Panel, bound_panel, panels_picture, value_range
+from dvax.app.plots.panels import DASHES, Curve, Panel, panels_picture, value_range
 from dvax.app.plots.picture import Picture
 from dvax.app.plots.section import Axis
 from dvax.app.plots.store import Variable
@@ -68,13 +68,11 @@ def _pressure(data: Mapping[str, Variable]) -> Picture:
 
 def _force(data: Mapping[str, Variable]) -> Picture:
     times = data["time"].values
-    panels = [Panel([Curve(times, data["force"].values, "force", 0)], "force", "p·x")]
-    if "error_bound" in data:
-        panels.append(bound_panel(times, data["error_bound"], "(p·x²)^0.5", share=0.7))
+    panel = Panel([Curve(times, data["force"].values, "force", 0)], "force", "p·x")
     return panels_picture(
         "force", "Force on the punch",
         "Units are those of the configuration: [x] of length, [p] of pressure, [t] of time.",
-        panels, "time", "t",
+        [panel], "time", "t",
     )  # fmt: skip
 
 

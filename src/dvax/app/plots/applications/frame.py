@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 
-from dvax.app.plots.panels import Curve, Panel, bound_panel, bound_title, panels_picture
+from dvax.app.plots.panels import Curve, Panel, panels_picture
 from dvax.app.plots.picture import Picture
 from dvax.app.plots.store import Variable
 
 
 def pictures(data: Mapping[str, Variable]) -> list[Picture]:
-    """Histories, hysteresis, and the certificate."""
+    """Histories and hysteresis."""
     t, d = data["time"].values, data["displacement"].values
     histories = [
         Panel([Curve(t, data["ground"].values, "ground", None)], "ground", "in/s^2", share=0.6),
@@ -18,8 +18,6 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
             "in",
         ),
     ]
-    bound = data["error_bound"]
-    certificate = [bound_panel(t, bound, "in")]
     return [
         panels_picture(
             "histories", "Displacement under the earthquake",
@@ -32,10 +30,5 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
             "beyond the yield force the viscosity bears the rest.",
             [Panel([Curve(d, data["spring"].values, "spring", 0)], "spring force a mass", "in/s^2")],
             "displacement", "in",
-        ),
-        panels_picture(
-            "certificate", bound_title(bound),
-            "A bound on the distance of the computed displacement from the true one.",
-            certificate, "time", "s",
         ),
     ]  # fmt: skip

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from dvax.app.plots.panels import Curve, Panel, bound_panel, bound_title, panels_picture
+from dvax.app.plots.panels import Curve, Panel, panels_picture
 from dvax.app.plots.picture import Picture
 from dvax.app.plots.store import Variable
 
@@ -10,7 +10,7 @@ _REFERENCE, _INPUT = "reference_", "input_"
 
 
 def pictures(data: Mapping[str, Variable]) -> list[Picture]:
-    """States in a panel a unit, inputs each in its own, and the error bound."""
+    """States in a panel a unit, and inputs each in its own."""
     t = data["time"].values
     states = [n.removeprefix(_REFERENCE) for n in data if n.startswith(_REFERENCE)]
     inputs = [n.removeprefix("input_max_") for n in data if n.startswith("input_max_")]
@@ -33,17 +33,11 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
         ]
         own = Curve(t, data[_INPUT + name].values, name, len(states) + k)
         panels.append(Panel([*limits, own], name, data[_INPUT + name].unit))
-    bound = data["error_bound"]
     return [
         panels_picture(
             "mpc", "The plant under predictive control",
             "The controller plans over its horizon at every time and applies the first input of the "
             "plan. Where an input is at a limit the plant cannot follow faster.",
             panels, "time", data["time"].unit,
-        ),
-        panels_picture(
-            "certificate", bound_title(bound),
-            "A bound on the distance of the computed state from the true one.",
-            [bound_panel(t, bound, bound.unit)], "time", data["time"].unit,
         ),
     ]  # fmt: skip

@@ -5,18 +5,18 @@ from collections.abc import Mapping
 import numpy as np
 
 from dvax.app.plots.field import field_pictures
-from dvax.app.plots.panels import DASHES, Curve, Panel, bound_panel, bound_title, panels_picture
+from dvax.app.plots.panels import DASHES, Curve, Panel, panels_picture
 from dvax.app.plots.picture import Picture
 from dvax.app.plots.section import Axis
 from dvax.app.plots.store import Variable
 
-_BOUND, _CURVES, _MOST_CURVES = "error_bound", 6, 12
+_CURVES, _MOST_CURVES = 6, 12
 """So many series of one unit at most are drawn as curves."""
 
 
 def pictures(data: Mapping[str, Variable]) -> list[Picture]:
     """Vectors as maps, series over time by their units, other arrays by their smallest, mean and
-    largest entries, and the error bound."""
+    largest entries."""
     time = data["time"]
     t, unit = time.values, time.unit
     by_unit: dict[str, list[tuple[str, np.ndarray]]] = {}
@@ -24,7 +24,7 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
     fields: list[tuple[str, np.ndarray, Axis]] = []
     for name, variable in data.items():
         values = variable.values
-        if name in ("time", _BOUND) or len(values) != len(t):
+        if name in ("time", "error_bound") or len(values) != len(t):
             continue
         if values.ndim == 1:
             by_unit.setdefault(variable.unit, []).append((name, values))
@@ -47,16 +47,6 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
             panels_picture(
                 "histories", "States and responses over time",
                 "Each variable of the model; those of one unit share a panel.", panels, "time", unit,
-            )
-        )  # fmt: skip
-    if _BOUND in data:
-        bound = data[_BOUND]
-        found.append(
-            panels_picture(
-                "certificate", bound_title(bound),
-                "A bound on the distance of the computed state from the true one, in the norm of the "
-                "state space.",
-                [bound_panel(t, bound, bound.unit)], "time", unit,
             )
         )  # fmt: skip
     return found

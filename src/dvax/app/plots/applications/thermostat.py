@@ -8,14 +8,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from dvax.app.plots.downsample import rounded
-from dvax.app.plots.panels import (
-    Curve,
-    Panel,
-    bound_panel,
-    bound_title,
-    panels_picture,
-    value_range,
-)
+from dvax.app.plots.panels import Curve, Panel, panels_picture, value_range
 from dvax.app.plots.picture import Change, Frames, Picture
 from dvax.app.plots.store import Variable
 from dvax.app.plots.theme import STILL_STYLE, blank, pressure_bar, quantity, still_axes
@@ -24,7 +17,7 @@ _MAP, _MOMENTS = "viridis", 97
 
 
 def pictures(data: Mapping[str, Variable]) -> list[Picture]:
-    """Histories, the map where there is more than one cell, and the error bound."""
+    """Histories, and the map where there is more than one cell."""
     t, unit = data["time"].values, data["time"].unit
 
     def curve(name: str, words: str, colour: int | None, dash: str = "solid") -> Curve:
@@ -38,7 +31,6 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
             curve("warmest", "warmest", 4, "dashdot"),
         ]
     limits = [curve(f"heating_{end}", "limits", None, "dash") for end in ("min", "max")]
-    bound = data["error_bound"]
     found = [
         panels_picture(
             "histories", "Temperature and heating",
@@ -54,14 +46,6 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
     ]  # fmt: skip
     if is_field:
         found.append(_map(data))
-    found.append(
-        panels_picture(
-            "certificate", bound_title(bound),
-            "A bound on the error of the temperature, ‖T‖² = ∫T² over the floor; divided by the root "
-            "of the area, of its mean.",
-            [bound_panel(t, bound, bound.unit)], "time", unit,
-        )
-    )  # fmt: skip
     return found
 
 

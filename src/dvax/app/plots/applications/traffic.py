@@ -9,7 +9,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from dvax.app.plots.downsample import rounded
-from dvax.app.plots.panels import Curve, Panel, bound_panel, panels_picture, value_range
+from dvax.app.plots.panels import Curve, Panel, panels_picture, value_range
 from dvax.app.plots.picture import Change, Frames, Picture
 from dvax.app.plots.store import Variable
 from dvax.app.plots.theme import (
@@ -57,14 +57,8 @@ def _days(data: Mapping[str, Variable]) -> Picture:
     ]
     return panels_picture(
         "days", "The way to equilibrium",
-        f"Above, {words}. In the middle, the links that are the fullest in the end. Below, the bound "
-        "on the error of the path flows.",
-        [
-            above,
-            Panel(links, "flow / capacity"),
-            bound_panel(days, data["error_bound"], "trip", _BUSIEST + 1, share=0.7),
-        ],
-        "time", "day",
+        f"Above, {words}. Below, the links that are the fullest in the end.",
+        [above, Panel(links, "flow / capacity")], "time", "day",
     )  # fmt: skip
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.figure import Figure
 
-from dvax.app.plots.panels import Curve, Panel, bound_panel, bound_title, panels_picture
+from dvax.app.plots.panels import Curve, Panel, panels_picture
 from dvax.app.plots.picture import Picture
 from dvax.app.plots.store import Variable
 
@@ -15,7 +15,7 @@ _DASHES = ("solid", "dash", "dot")
 
 
 def pictures(data: Mapping[str, Variable]) -> list[Picture]:
-    """Stress–strain curves, the path against the yield surface, histories, and the error bound."""
+    """Stress–strain curves, the path against the yield surface, and histories."""
     t, unit = data["time"].values, data["time"].unit
     moved = [n.removeprefix("strain_") for n in data if n.startswith("strain_")]
     loops, strains = [], []
@@ -27,7 +27,6 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
     words = "equivalent stress"
     plastic = Curve(t, 100 * data["equivalent_plastic_strain"].values, "plastic strain", 4)
     limits = Curve(t, limit, "yield limit", None, "dash")
-    bound = data["error_bound"]
     return [
         panels_picture(
             "stress_strain", "Stress over strain",
@@ -46,11 +45,6 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
             "time", unit,
         ),
         _cylinder(data) if np.ptp(limit) == 0.0 else _cone(data),
-        panels_picture(
-            "certificate", bound_title(bound),
-            "A bound on the error of the plastic strain, in the norm of the elastic energy.",
-            [bound_panel(t, bound, bound.unit)], "time", unit,
-        ),
     ]  # fmt: skip
 
 
