@@ -9,6 +9,7 @@ from rich.console import Console
 
 from dvax.app.cli import progress as progress_module
 from dvax.app.cli.progress import progress
+from dvax.app.cli.sweep import member_listener
 
 
 def events(count: int) -> Iterator[dict[str, Any]]:
@@ -32,7 +33,7 @@ def test_progress_in_a_pipe_prints_a_line_per_tenth(capsys: pytest.CaptureFixtur
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "compiled in 1.2 s"
     assert len([line for line in lines if line.startswith("t = ")]) == 10
-    assert lines[10].startswith("t = 2 of 2 s (100%), 10000 steps, 0 s left")
+    assert lines[10] == "t = 2 of 2 s, 10000 steps (100%), 0 s left"
     assert lines[11] == "warning: the [bold] step shrank"
 
 
@@ -77,12 +78,37 @@ def test_progress_on_a_terminal_is_a_bar(monkeypatch: pytest.MonkeyPatch) -> Non
             listener(event)
     shown = screen.getvalue()
     assert "compiled in 1.2 s" in shown
-    assert "100 %" in shown and "t = 2 s, 100 steps" in shown
+    assert "100 %" in shown and "t = 2 of 2 s, 100 steps" in shown
     assert "warning: the [bold] step shrank" in shown
 
 
 def test_progress_uses_the_unit_of_the_model(capsys: pytest.CaptureFixture[str]) -> None:
-    for unit, shown in (("days", "t = 1 of 2 days (50%)"), ("", "t = 1 of 2 (50%)")):
+    for unit, shown in (
+        ("days", "t = 1 of 2 days, 3 steps (50%)"),
+        ("", "t = 1 of 2, 3 steps (50%)"),
+    ):
         with progress(quiet=False) as listener:
             listener({"event": "progress", "t": 1.0, "t_end": 2.0, "steps": 3, "unit": unit})
         assert capsys.readouterr().err.startswith(shown)
+
+
+def test_progress_of_a_sweep_counts_members_and_warns_of_failures(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    told = [
+        {"event": "started", "members": 5, "complete": 1},
+        {"event": "member", "member": 1, "status": "finished"},
+        {"event": "member", "member": 2, "status": "failed", "reason": "no model"},
+        {"event": "member", "member": 3, "status": "finished"},
+        {"event": "member", "member": 4, "status": "finished"},
+        {"event": "stopped", "counts": {}},
+    ]
+    with progress(quiet=False) as listener:
+        tell = member_listener(listener)
+        for event in told:
+            tell(event)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "5 members, 1 complete"
+    assert lines[2] == "warning: member 2 failed: no model"
+    shown = [line.rpartition(",")[0] for line in lines[1:2] + lines[3:]]
+    assert shown == [f"{n} of 5 members ({25 * n - 25}%)" for n in (2, 3, 4, 5)]

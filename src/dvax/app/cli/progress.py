@@ -1,7 +1,8 @@
 """The progress of a run: a bar with the time left on a terminal, lines in a pipe.
 
 The driver sends events, dicts with `event` one of compiled, progress, stage, warning, stopped. A model
-that is solved in one piece has stages in the place of progress. Compile time is shown apart: it occurs
+that is solved in one piece has stages in the place of progress. An event of progress may have its text
+as `where`: members of a sweep do not have steps. Compile time is shown apart: it occurs
 once, and does not predict the time of the rest.
 """
 
@@ -60,21 +61,16 @@ class _Lines:
             return
         self.tenth, self.spoke = int(done * LINES), now
         left = (now - self.began) * (1 - done) / done if done > 0 else float("nan")
-        print_remark(
-            f"t = {event['t']:.6g} of {event['t_end']:.6g}{_unit(event)} ({done:.0%}), "
-            f"{_steps(event)}, {left:.0f} s left"
-        )
+        print_remark(f"{_where(event)} ({done:.0%}), {left:.0f} s left")
 
 
-def _steps(event: Event) -> str:
-    """The steps so far, with the name of the method."""
+def _where(event: Event) -> str:
+    """Return the text of an event of progress, else its time and its steps with their method."""
+    if "where" in event:
+        return event["where"]
+    time_text = f"t = {event['t']:.6g} of {event['t_end']:.6g} {event.get('unit', '')}".rstrip()
     method = str(event.get("method", "")).partition(":")[0]
-    return f"{event['steps']} steps" + (f" of {method}" if method else "")
-
-
-def _unit(event: Event) -> str:
-    """The unit of time with a space before it, where the event names one."""
-    return f" {event.get('unit', '')}".rstrip()
+    return f"{time_text}, {event['steps']} steps" + (f" of {method}" if method else "")
 
 
 @contextmanager
@@ -110,7 +106,7 @@ def _bar() -> Iterator[Listener]:
             elif kind == "stage":
                 bar.update(task, description=event["stage"])
             elif kind == "progress":
-                where = f"t = {event['t']:.4g}{_unit(event)}, {_steps(event)}"
-                bar.update(task, completed=event["t"], total=event["t_end"], where=where)
+                done, total = event["t"], event["t_end"]
+                bar.update(task, completed=done, total=total, where=_where(event))
 
         yield listen

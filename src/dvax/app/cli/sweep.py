@@ -1,18 +1,17 @@
 """`dvax sweep SWEEP.toml -o DIR`: many runs of one configuration."""
 
 import os
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, Any
 
 import typer
 
-from dvax.app.cli.console import console, print_remark, print_table
+from dvax.app.cli.console import print_remark, print_table
 from dvax.app.cli.failure import reported
 from dvax.app.cli.options import AllowCode, AllowOutside, Debug, Quiet
+from dvax.app.cli.progress import Listener, progress
 from dvax.errors import input_error
 
 
@@ -71,10 +70,10 @@ def sweep(
         from dvax.app.runs.sweeps.driver import run_sweep
         from dvax.app.runs.sweeps.workers import default_workers
 
-        with _progress(quiet) as tell:
+        with progress(quiet=quiet) as listener:
             outcome = run_sweep(
                 checked, out, resume=resume, create_only=create, threads=threads, scheduler=scheduler,
-                workers=workers or default_workers(threads), tell=tell,
+                workers=workers or default_workers(threads), tell=member_listener(listener),
             )  # fmt: skip
         _conclude(checked, outcome, quiet)
 
@@ -120,70 +119,26 @@ def _run_one(sweep: Any, out: Path, member: int) -> None:
         raise typer.Exit(record["exit_code"])
 
 
-@contextmanager
-def _progress(quiet: bool) -> Iterator[Any]:
-    """A listener for the events of a sweep: a bar on a terminal, lines in a pipe."""
-    if quiet:
-        yield lambda event: None
-    elif not console(stderr=True).is_terminal:
-        yield _Lines()
-    else:
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
+def member_listener(listener: Listener) -> Callable[[Mapping[str, Any]], None]:
+    """Return a listener for the events of a sweep that passes its members on as the progress of a run,
+    and failures as warnings."""
+    count = complete = done = 0
 
-        columns = (
-            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-            TextColumn("{task.fields[failed]}"), TimeElapsedColumn(), TextColumn("left"),
-            TimeRemainingColumn(),
-        )  # fmt: skip
-        with Progress(*columns, console=console(stderr=True)) as bar:
-            task, failed = bar.add_task("members", total=None, failed=""), 0
-
-            def listen(event: Any) -> None:
-                nonlocal failed
-                if event["event"] == "started":
-                    bar.update(task, total=event["members"], completed=event["complete"])
-                elif event["event"] == "member":
-                    bar.advance(task)
-                    if event["status"] == "failed":
-                        failed += 1
-                        bar.update(task, failed=f"{failed} failed")
-                        text = f"member {event['member']} failed: {event['reason']}"
-                        bar.console.print(text, markup=False, style="yellow")
-
-            yield listen
-
-
-class _Lines:
-    """A line for each tenth of the members, and one for each failure."""
-
-    def __init__(self) -> None:
-        self.count = self.done = self.tenth = 0
-        self.began = time.monotonic()
-
-    def __call__(self, event: Any) -> None:
+    def listen(event: Mapping[str, Any]) -> None:
+        nonlocal count, complete, done
         if event["event"] == "started":
-            self.count, self.done = event["members"], event["complete"]
-            self.tenth = 10 * self.done // self.count
-            found = f", {self.done} complete" if self.done else ""
-            print_remark(f"{self.count} members{found}")
-            self.first = self.done
+            count, complete = event["members"], event["complete"]
+            listener({"event": "stage", "stage": f"{count} members, {complete} complete"})
         elif event["event"] == "member":
-            self.done += 1
+            done += 1
             if event["status"] == "failed":
-                print_remark(f"member {event['member']} failed: {event['reason']}")
-            tenth = 10 * self.done // self.count
-            if tenth > self.tenth:
-                self.tenth = tenth
-                each = (time.monotonic() - self.began) / (self.done - self.first)
-                left = each * (self.count - self.done)
-                print_remark(f"{self.done} of {self.count} members, {left:.0f} s left")
+                message = f"member {event['member']} failed: {event['reason']}"
+                listener({"event": "warning", "message": message})
+            # The time left is that of the members of this call.
+            where = f"{complete + done} of {count} members"
+            listener({"event": "progress", "t": done, "t_end": count - complete, "where": where})
+
+    return listen
 
 
 def _conclude(sweep: Any, outcome: Any, quiet: bool) -> None:
