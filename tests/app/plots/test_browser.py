@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +17,7 @@ from tests.app.plots.synthetic import CONSTANTS, Recipe, write_run
 from dvax.app.plots import build_report
 from dvax.app.plots.applications import application_pictures
 from dvax.app.plots.page import document, sections
+from dvax.app.plots.picture import Views
 from dvax.app.plots.theme import DARK, REGIME_COLOURS
 
 pytestmark = pytest.mark.skipif(
@@ -142,11 +144,18 @@ def test_zoom_in_one_figure_over_time_zooms_the_others(desktop: Tab) -> None:
     assert_quiet(desktop)
 
 
-def test_buttons_choose_the_view_of_a_map(desktop: Tab) -> None:
-    visible = "document.getElementById('pressure').data.slice(0, 3).map((t) => t.visible)"
-    assert desktop.run(visible) == [True, False, False]
-    click(desktop, '.views[data-plot="pressure"] button:nth-of-type(2)')
-    assert desktop.run(visible) == [False, True, False]
+def test_buttons_choose_the_view_of_a_figure(tab: Tab, tmp_path: Path) -> None:
+    t = np.linspace(0.0, 1.0, 9)
+    variable: Any = SimpleNamespace(values=t, unit="s", status="")
+    (drawn,) = application_pictures("python", {"time": variable, "a": variable, "b": variable})
+    drawn = replace(drawn, views=Views("Show", ("a", "b")))
+    page = tmp_path / "report.html"
+    page.write_text(document("", "", "", sections([drawn]), [drawn]), encoding="utf-8")
+    tab.open(page, DESKTOP)
+    visible = "document.getElementById('histories').data.map((t) => t.visible)"
+    for chosen in (2, 1):
+        click(tab, f'.views[data-plot="histories"] button:nth-of-type({chosen})')
+        assert tab.run(visible) == [chosen == 1, chosen == 2]
 
 
 def test_data_of_a_figure_are_saved_as_csv(desktop: Tab) -> None:

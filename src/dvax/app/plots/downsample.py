@@ -1,9 +1,9 @@
 """One pass over the fields of a trajectory: what the pictures need, in memory a laptop has.
 
 A map on a screen has a few hundred cells each way; a run may have 10^6 points and 10^3 frames. The
-pass reads the trajectory block of frames by block of frames and keeps, for every cell of the map,
-the weighted mean and both extremes (so that no narrow peak is lost between the pixels), and for
-every frame the exact shares of the boundary in each regime, over all points.
+pass reads the trajectory block of frames by block of frames. It keeps, for every cell of the map, the
+weighted mean and the most common regime, and for every frame the exact shares of the boundary in each
+regime, over all points.
 """
 
 from collections.abc import Iterator
@@ -24,18 +24,14 @@ BLOCK_BYTES = 32 * 2**20
 class CellMaps:
     """Fields on a curve, reduced to cells. Arrays have shape (time cells, space cells).
 
-    `common`, `lowest`, `highest` hold regimes (0, 1, 2): the one that covers most of the cell, and
-    the extremes met in it. Edges have one entry more than there are cells.
+    `common` is the regime (0, 1, 2) that covers most of the cell. Edges have one entry more than there
+    are cells.
     """
 
     time_edges: np.ndarray
     space_edges: np.ndarray
     mean: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
     common: np.ndarray
-    lowest: np.ndarray
-    highest: np.ndarray
     points_per_cell: int
     frames_per_cell: int
 
@@ -115,38 +111,28 @@ def _check_regime(run: RunRecord, regime: np.ndarray, block: slice) -> None:
 
 
 class _Gather:
-    """Fold frames into cells: sums for the means, running extremes, regime measure per cell."""
+    """Fold frames into cells: sums for the means, and the measure of each regime in a cell."""
 
     def __init__(self, run: RunRecord):
         place = run.series("s")
-        # Nodes from a file need not be sorted along the curve; the map's axis must be.
-        order = np.argsort(place, kind="stable")
-        self.order = slice(None) if (np.diff(place) > 0).all() else order
         frames, points = len(run.time), len(place)
         self.starts = starts(points, SPACE_CELLS)
         time_starts = starts(frames, TIME_CELLS)
         self.cell_of_frame = np.repeat(
             np.arange(len(time_starts)), np.diff(np.append(time_starts, frames))
         )
-        self.weight = run.series("weight")[self.order]
-        self.space_edges = edges(place[order])[np.append(self.starts, points)]
+        self.weight = run.series("weight")
+        self.space_edges = edges(place)[np.append(self.starts, points)]
         self.time_edges = edges(run.time)[np.append(time_starts, frames)]
         self.points_per_cell = -(-points // len(self.starts))
         self.frames_per_cell = -(-frames // len(time_starts))
         shape = (len(time_starts), len(self.starts))
         self.sum = np.zeros(shape)
-        self.low, self.high = np.full(shape, np.inf), np.full(shape, -np.inf)
         self.measure = np.zeros((len(REGIMES), *shape))
-        self.lowest, self.highest = np.full(shape, 2, np.int8), np.zeros(shape, np.int8)
 
     def take(self, block: slice, pressure: np.ndarray, regime: np.ndarray) -> None:
-        pressure, regime = pressure[:, self.order], regime[:, self.order]
         into, starts = self.cell_of_frame[block], self.starts
         np.add.at(self.sum, into, np.add.reduceat(pressure * self.weight, starts, axis=1))
-        np.minimum.at(self.low, into, np.minimum.reduceat(pressure, starts, axis=1))
-        np.maximum.at(self.high, into, np.maximum.reduceat(pressure, starts, axis=1))
-        np.minimum.at(self.lowest, into, np.minimum.reduceat(regime, starts, axis=1))
-        np.maximum.at(self.highest, into, np.maximum.reduceat(regime, starts, axis=1))
         for kind in range(len(REGIMES)):
             covered = np.where(regime == kind, self.weight, 0.0)
             np.add.at(self.measure[kind], into, np.add.reduceat(covered, starts, axis=1))
@@ -158,11 +144,7 @@ class _Gather:
             time_edges=self.time_edges,
             space_edges=self.space_edges,
             mean=self.sum / whole,
-            low=self.low,
-            high=self.high,
             common=self.measure.argmax(axis=0).astype(np.int8),
-            lowest=self.lowest,
-            highest=self.highest,
             points_per_cell=self.points_per_cell,
             frames_per_cell=self.frames_per_cell,
         )

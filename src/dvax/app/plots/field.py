@@ -40,8 +40,7 @@ def field_pictures(
     plot.data[0].colorbar = pressure_bar(plot, upward.title, height)
     profile = section_picture(
         key, f"{title} at one time", "The slider and the button choose the time.",
-        centres(edges_of_place, entries), centres(edges_of_time, times), {upward.words: means}, across,
-        upward,
+        centres(edges_of_place, entries), centres(edges_of_time, times), means, across, upward,
         time_unit if label_unit is None else label_unit, references,
     )  # fmt: skip
     return [whole, profile]

@@ -17,7 +17,7 @@ from matplotlib.patches import Patch
 from dvax.app.plots.downsample import REGIMES, CellMaps, Reduced, centres, edges, rounded, starts
 from dvax.app.plots.lines import thin
 from dvax.app.plots.panels import value_range
-from dvax.app.plots.picture import Change, Frames, Picture, Views
+from dvax.app.plots.picture import Change, Frames, Picture
 from dvax.app.plots.run_reader import RunRecord
 from dvax.app.plots.section import Axis, section_picture
 from dvax.app.plots.theme import (
@@ -37,12 +37,6 @@ from dvax.app.plots.theme import (
 
 MOST_TIMES, STILL_TIMES = 24, 6
 CELLS_PER_SIDE = 128
-PRESSURE_VIEWS = ("mean of a cell", "highest in a cell", "lowest in a cell")
-REGIME_VIEWS = (
-    "most common regime of a cell",
-    "highest regime in a cell",
-    "lowest regime in a cell",
-)
 _REGIME_SCALE = [
     [edge, colour]
     for index, colour in enumerate(REGIME_COLOURS)
@@ -55,7 +49,7 @@ class Layout:
     """What the maps of one boundary have in common.
 
     `edges` of the cells and `titles` of the axes, horizontal before vertical; `square`: a length is the
-    same in both directions; `stills`: which of the views the still picture shows, and their titles.
+    same in both directions; `stills`: which of the times the still picture shows, and their titles.
     """
 
     edges: tuple[np.ndarray, np.ndarray]
@@ -103,18 +97,14 @@ def _curve(run: RunRecord, reduced: Reduced, cells: CellMaps) -> list[Picture]:
         cell_note(cells),
         zoom=axis_title("time", time),
     )
-    fields = [cells.mean, cells.high, cells.low], [cells.common, cells.highest, cells.lowest]
-    views = Views("Show the", PRESSURE_VIEWS), Views("Show the", REGIME_VIEWS)
-    if not cells.reduced:
-        fields, views = (fields[0][:1], fields[1][:1]), (None, None)
+    fields = [cells.mean], [cells.common]
     titles = "Pressure over space and time", "Regimes over space and time"
-    pressure, regimes = _pictures(run, reduced, layout, titles, fields, views, (None, None))
+    pressure, regimes = _pictures(run, reduced, layout, titles, fields, (None, None))
     section = section_picture(
         pressure.key, "Pressure along the boundary",
         "The profile at one time. The slider, the button and a click on the map above choose the time, "
         f"which a line marks in the map. {layout.note}",
-        centres(cells.space_edges, np.sort(run.series("s"))), centres(cells.time_edges, run.time),
-        dict(zip(PRESSURE_VIEWS, fields[0])),
+        centres(cells.space_edges, run.series("s")), centres(cells.time_edges, run.time), cells.mean,
         Axis("place on the boundary", place), Axis("pressure", run.unit("pressure")), time,
     )  # fmt: skip
     return [pressure, section, regimes]
@@ -161,7 +151,7 @@ def _surface(run: RunRecord, reduced: Reduced) -> list[Picture]:
         Frames(shown, words, (Change(0, "z", _upward(np.stack(field))),), first)
         for field, words in ((means, labels), (regimes, times))
     )
-    return _pictures(run, reduced, layout, titles, (means, regimes), (None, None), moments)
+    return _pictures(run, reduced, layout, titles, (means, regimes), moments)
 
 
 def _pictures(
@@ -170,7 +160,6 @@ def _pictures(
     layout: Layout,
     titles: tuple[str, str],
     fields: tuple[list[np.ndarray], list[np.ndarray]],
-    views: tuple[Views | None, Views | None],
     frames: tuple[Frames, ...] | tuple[None, None],
 ) -> list[Picture]:
     unit, kappa = run.unit("pressure"), run.attrs.get("kappa0")
@@ -181,11 +170,9 @@ def _pictures(
         f"pressure %{{z:.4g}} {unit_text(unit)}",
     )
     words = axis_title("pressure", unit)
-    pressure_map = _interactive(
-        layout, fields[0] if frames[0] is None else fields[0][:1], pressures
-    )
+    pressure_map = _interactive(layout, fields[0][0], pressures)
     pressure_map.update_traces(colorbar=pressure_bar(pressure_map, words, layout.height))
-    regime_map = _interactive(layout, fields[1] if frames[1] is None else fields[1][:1], _REGIMES)
+    regime_map = _interactive(layout, fields[1][0], _REGIMES)
     for name, colour in zip(REGIMES, REGIME_COLOURS, strict=True):
         marker = dict(symbol="square", size=12, color=colour, line=dict(width=0.5))
         regime_map.add_trace(
@@ -201,7 +188,6 @@ def _pictures(
             f"{quantity(high, unit)}.{capacity} {layout.note}",
             interactive=pressure_map,
             still=lambda: _still(layout, titles[0], fields[0], pressures, words),
-            views=views[0],
             frames=frames[0],
             zoom=layout.zoom,
             alternative=f"{axes_words}: the pressure{value_range(np.array([low, high]))} "
@@ -214,7 +200,6 @@ def _pictures(
             f"pressure is at κ₀. {layout.note}",
             interactive=regime_map,
             still=lambda: _still(layout, titles[1], fields[1], _REGIMES),
-            views=views[1],
             frames=frames[1],
             zoom=layout.zoom,
             alternative=f"{axes_words}: the regimes unloaded, active and saturated in colours.",
@@ -222,19 +207,17 @@ def _pictures(
     ]
 
 
-def _interactive(layout: Layout, fields: list[np.ndarray], colours: Colours) -> go.Figure:
+def _interactive(layout: Layout, values: np.ndarray, colours: Colours) -> go.Figure:
     figure = blank(layout.height)
-    for index, values in enumerate(fields):
-        figure.add_trace(
-            go.Heatmap(
-                x=layout.edges[0],
-                y=layout.edges[1],
-                z=_upward(values),
-                visible=index == 0,
-                hovertemplate=f"{layout.place}{colours.value}<extra></extra>",
-                **colours.interactive,
-            )
+    figure.add_trace(
+        go.Heatmap(
+            x=layout.edges[0],
+            y=layout.edges[1],
+            z=_upward(values),
+            hovertemplate=f"{layout.place}{colours.value}<extra></extra>",
+            **colours.interactive,
         )
+    )
     square = dict(constrain="domain") if layout.square else {}
     figure.update_xaxes(title_text=layout.titles[0], showgrid=False, **square)
     anchor = dict(scaleanchor="x") if layout.square else {}
@@ -251,7 +234,7 @@ def _upward(values: np.ndarray) -> np.ndarray:
 def _still(
     layout: Layout, title: str, fields: list[np.ndarray], colours: Colours, bar: str = ""
 ) -> Figure:
-    """The views of `layout.stills`, with a colour bar that is called `bar`, or the regimes' legend."""
+    """The fields of `layout.stills`, with a colour bar that is called `bar`, or the regimes' legend."""
     columns = min(3, len(layout.stills))
     rows = -(-len(layout.stills) // columns)
     width, height = 8.0, 4.6
@@ -295,8 +278,7 @@ def cell_note(cells: CellMaps) -> str:
     return (
         f"Drawn in {len(cells.time_edges) - 1} × {len(cells.space_edges) - 1} cells for the "
         f"screen: a cell gathers up to {counted(cells.points_per_cell, 'point')} and "
-        f"{counted(cells.frames_per_cell, 'frame')}. The buttons show the extremes of each "
-        "cell, so that no narrow peak is lost."
+        f"{counted(cells.frames_per_cell, 'frame')}. It has their mean pressure and most common regime."
     )
 
 

@@ -1,6 +1,6 @@
 """A section of a map at one time, which a slider chooses: a profile over the places."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,9 +12,7 @@ from dvax.app.plots.panels import DASHES, Curve, Panel, draw_panels, value_range
 from dvax.app.plots.picture import Change, Frames, Picture
 from dvax.app.plots.theme import (
     BLUE,
-    BROWN,
     MUTED,
-    PURPLE,
     STILL_STYLE,
     axis_title,
     blank,
@@ -24,7 +22,6 @@ from dvax.app.plots.theme import (
 )
 
 _STILLS = 5
-_STYLES = ((BLUE, "solid", 1.8), (BROWN, "dot", 1.2), (PURPLE, "dash", 1.2))
 
 
 class Axis(NamedTuple):
@@ -44,7 +41,7 @@ def section_picture(
     caption: str,
     places: np.ndarray,
     times: np.ndarray,
-    maps: Mapping[str, np.ndarray],
+    values: np.ndarray,
     across: Axis,
     upward: Axis,
     time_unit: str,
@@ -52,20 +49,18 @@ def section_picture(
 ) -> Picture:
     """Return the picture of profiles over `places` at one of `times`.
 
-    `maps`: up to three maps by name, each of shape (times, places), which are the first traces of the
-    picture `of`; the profiles are columns of these. `references` are curves that do not change.
+    `values`, of shape (times, places), is the map that is the first trace of the picture `of`; the
+    profiles are its columns. `references` are curves that do not change.
     """
-    finite = {name: np.where(np.isfinite(values), values, np.nan) for name, values in maps.items()}
+    values = np.where(np.isfinite(values), values, np.nan)
     # The time of the largest values: a profile at rest shows nothing.
-    size = np.nan_to_num(np.abs(next(iter(finite.values())))).mean(axis=1)
-    first = int(np.argmax(size))
+    first = int(np.argmax(np.nan_to_num(np.abs(values)).mean(axis=1)))
     figure = blank(360)
-    for (name, values), (colour, dash, width) in zip(finite.items(), _STYLES, strict=False):
-        style: dict[str, Any] = dict(color=colour, dash=dash, width=width)
-        _add(figure, places, values[first], name, style, upward.unit)
+    line = dict(color=BLUE, dash="solid", width=1.8)
+    _add(figure, places, values[first], upward.words, line, upward.unit)
     for curve in references:
         _add(figure, curve.x, curve.y, curve.name, dict(color=MUTED, dash=curve.dash), upward.unit)
-    shown = [*finite.values(), *(curve.y for curve in references)]
+    shown = [values, *(curve.y for curve in references)]
     figure.update_layout(hovermode="x unified", showlegend=len(shown) > 1)
     figure.update_xaxes(
         title_text=across.title, hoverformat=".6~g",
@@ -73,10 +68,9 @@ def section_picture(
     )  # fmt: skip
     figure.update_yaxes(title_text=upward.title, range=_ends(shown))
     labels = tuple(f"t = {number(float(t))} {unit_text(time_unit)}".rstrip() for t in times)
-    changes = tuple(Change(k, "y", section=(of, k)) for k in range(len(finite)))
+    change = Change(0, "y", section=(of, 0))
 
     def still() -> Figure:
-        values = next(iter(finite.values()))
         rows = np.unique(np.linspace(0, len(times) - 1, _STILLS).round().astype(int))
         curves = [Curve(places, values[k], labels[k], i, DASHES[i]) for i, k in enumerate(rows)]
         panel = Panel([*curves, *references], upward.words, upward.unit)
@@ -87,7 +81,7 @@ def section_picture(
         return drawn
 
     return Picture(
-        f"{of}-section", title, caption, figure, still, frames=Frames(times, labels, changes, first),
+        f"{of}-section", title, caption, figure, still, frames=Frames(times, labels, (change,), first),
         alternative=f"{upward.title}{value_range(*shown)} over {across.title}, at {len(times)} times "
         "that a slider chooses.",
     )  # fmt: skip
