@@ -195,7 +195,7 @@ def test_contact_on_a_surface_is_drawn_frame_by_frame(tmp_path: Path) -> None:
 
 def test_contact_defaults_have_2000_points() -> None:
     config = load_default()
-    assert config.boundary.points == (2000,)
+    assert config.boundary.points == [2000]
     # Steps end at the saved times, so that a run in blocks takes the same ones.
     assert config.solver.dt is not None
     steps = config.time.end / config.time.frames / config.solver.dt

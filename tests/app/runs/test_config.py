@@ -194,6 +194,16 @@ WRONG = {
         "boundary.points",
         "each direction",
     ),
+    "points of one direction": (
+        {"boundary": {"lengths": [1, 2], "points": [3]}, "load": {"value": 1.0}},
+        "boundary.points",
+        "each direction",
+    ),
+    "one length": (
+        {"boundary": {"lengths": [1], "points": [3, 3]}, "load": {"value": 1.0}},
+        "boundary.lengths",
+        "a list of at least 2",
+    ),
     "lengths": (
         {"boundary": {"lengths": [1, -2], "points": [3, 3]}, "load": {"value": 1.0}},
         "boundary.lengths",
@@ -213,6 +223,7 @@ WRONG = {
     "companion": ({"initial.companion": "sin(t)"}, "initial.companion, column 5", "are s"),
     "companion zero": ({"initial.companion": 0.0}, "initial.companion", "both trajectories"),
     "interest": ({"output.points_of_interest": [50]}, "points_of_interest[1]", "off the boundary"),
+    "interest no list": ({"output.points_of_interest": 5.0}, "points_of_interest", "a list"),
     "interest 2-D": (
         {"output.points_of_interest": [[1, 2]]},
         "points_of_interest[1]",

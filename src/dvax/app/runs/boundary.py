@@ -1,6 +1,7 @@
 """The contact boundary Gamma_C as points with quadrature weights."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,7 +35,7 @@ class Boundary:
         """The names of the coordinates in formulas."""
         return ("s",) if len(self.coordinates) == 1 else ("s1", "s2")
 
-    def nearest(self, place: tuple[float, ...]) -> int:
+    def nearest(self, place: Sequence[float]) -> int:
         """The index of the point nearest to a place."""
         pairs = zip(self.coordinates, place, strict=True)
         return int(np.argmin(sum((c - p) ** 2 for c, p in pairs)))
@@ -48,14 +49,14 @@ def build_boundary(section: BoundarySection, nodes: Path | None, units: Units) -
     if nodes is not None:
         return _from_file(nodes, units)
     assert section.points is not None  # the consistency of the section has been checked
-    lengths = section.lengths or (section.length or 0.0,)
+    lengths = section.lengths or [section.length or 0.0]
     cells = [length / n for length, n in zip(lengths, section.points, strict=True)]
     grid = np.meshgrid(
         *(cell * (np.arange(n) + 0.5) for cell, n in zip(cells, section.points, strict=True)),
         indexing="ij",
     )
     weights = np.full(math.prod(section.points), math.prod(cells))
-    return Boundary(tuple(c.ravel() for c in grid), weights, section.points)
+    return Boundary(tuple(c.ravel() for c in grid), weights, tuple(section.points))
 
 
 def _from_file(path: Path, units: Units) -> Boundary:

@@ -50,7 +50,7 @@ def build_contact(config: Config) -> ContactInputs:
 
 def with_points(config: Config, points: int) -> Config:
     """The same configuration on a one-dimensional boundary of other resolution."""
-    boundary = config.boundary.model_copy(update={"points": (points,)})
+    boundary = config.boundary.model_copy(update={"points": [points]})
     return config.model_copy(update={"boundary": boundary})
 
 
@@ -105,9 +105,7 @@ def check_contact(raw: dict[str, Any], source: Path, allow_outside: bool) -> Con
         draft.solver, longest_block(inputs.frame_times, inputs.boundary.size), f"{file}: solver"
     )
     if draft.output.points_of_interest is None:
-        places = tuple(
-            tuple(float(c[i]) for c in inputs.boundary.coordinates) for i in inputs.point_indices
-        )
+        places = [[float(c[i]) for c in inputs.boundary.coordinates] for i in inputs.point_indices]
         output = draft.output.model_copy(update={"points_of_interest": places})
         draft = draft.model_copy(update={"output": output})
     draft._source, draft._allow_outside = source, allow_outside

@@ -21,6 +21,7 @@ def check_consistency(raw: Mapping[str, Any], file: str) -> Problems:
 
 def _boundary(section: Mapping[str, Any], place: str, problems: Problems) -> None:
     given, points = set(section) & {"length", "lengths", "points", "file"}, section.get("points")
+    directions = len(points) if isinstance(points, list) else 1
     if given not in _BOUNDARIES:
         problems.add(
             place,
@@ -28,10 +29,10 @@ def _boundary(section: Mapping[str, Any], place: str, problems: Problems) -> Non
             "a boundary is length and points, or lengths and points, or a file of nodes",
             "Give exactly one of the three.",
         )
-    elif "lengths" in given and type(points) is int:
+    elif "lengths" in given and directions < 2:
         rule = "lengths = [a, b] needs a number of points for each direction"
         problems.add(f"{place}.points", shown(points), rule, "Write points = [n1, n2].")
-    elif "length" in given and isinstance(points, list):
+    elif "length" in given and directions > 1:
         rule = "length = ... is one-dimensional and has one number of points"
         fix = "Write points = n, or lengths = [a, b]."
         problems.add(f"{place}.points", shown(points), rule, fix)

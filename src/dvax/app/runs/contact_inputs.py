@@ -131,7 +131,7 @@ def _check_profiles(sections: dict[str, Any], sources: Sources) -> None:
             continue
         place = f"{sources.name}: {key}.profile"
         path = locate(profile.file, sources.folder, sources.allow_outside, f"{place}.file")
-        read_npy(profile, path, shape, place)
+        read_npy(profile, path, tuple(shape), place)
 
 
 def _initial_states(
@@ -193,7 +193,7 @@ def _points(
         if len(place) != len(boundary.coordinates):
             problems.add(
                 key,
-                str(list(place)),
+                str(place),
                 f"a point has {len(boundary.coordinates)} coordinate(s), {boundary.names}",
                 "Write [2.5] on a line and [[2.5, 1.0]] on a rectangle.",
             )
@@ -206,7 +206,7 @@ def _points(
         if outside:
             problems.add(
                 key,
-                str(list(place)),
+                str(place),
                 f"{' and '.join(outside)} lies off the boundary",
                 f"Choose a place on the boundary, in {units.length}.",
             )
@@ -217,7 +217,7 @@ def _points(
         # Half a cell is expected; a visible distance is reported.
         if max(abs(a - p) for a, p in zip(at, place, strict=True)) > 0.01 * extent:
             notices.append(
-                f"Point of interest {list(place)} {units.length}: the nearest point is "
+                f"Point of interest {place} {units.length}: the nearest point is "
                 f"{[float(f'{a:.9g}') for a in at]} {units.length}."
             )
         indices.append(index)

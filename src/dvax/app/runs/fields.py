@@ -104,7 +104,7 @@ def read_field(
             f"the factors multiply to {units.of(kind)}, so only one of them carries a unit",
             "Keep the unit of one factor; the others are pure numbers (columns [1]).",
         )
-    knots = () if isinstance(section, InitialSection) else section.knots or ()
+    knots = () if isinstance(section, InitialSection) else tuple(section.knots or ())
     constant = 1.0 if section.value is None else section.value
     field = Field(constant, expression, knots, series, profile, tuple(files))
     if isinstance(boundary, Boundary):

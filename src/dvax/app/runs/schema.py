@@ -121,42 +121,18 @@ def _finite(value: Any, kind: str, info: ValidationInfo, what: str) -> float:
     return float(number)
 
 
-def _pair_of_lengths(value: Any, info: ValidationInfo) -> tuple[float, ...]:
-    if not isinstance(value, list | tuple) or len(value) != 2:
-        raise rule_error("a two-dimensional boundary has two lengths", "Write lengths = [a, b]")
-    pair = tuple(_finite(v, "length", info, "a length") for v in value)
-    if not all(v > 0 for v in pair):
-        raise rule_error("a length is greater than 0", "Give both sides of the boundary")
-    return pair
+def _as_list(value: Any) -> Any:
+    """Return a list as it is, and anything else as a list with one entry."""
+    return value if isinstance(value, list) else [value]
 
 
-def _counts(value: Any) -> tuple[int, ...]:
-    counts = tuple(value) if isinstance(value, list | tuple) else (value,)
-    if len(counts) not in (1, 2) or not all(type(n) is int for n in counts):
-        raise rule_error(
-            "points is a whole number, or two of them", "Write points = 1000 or points = [100, 50]"
-        )
-    if not all(n >= 1 for n in counts) or math.prod(counts) > MAX_POINTS:
+def _check_count(points: list[int]) -> list[int]:
+    """Refuse more points than a run has memory for."""
+    if min(points) < 1 or math.prod(points) > MAX_POINTS:
         raise rule_error(
             f"a boundary has 1 to {MAX_POINTS} points in all", "Choose the resolution you need"
         )
-    return counts
-
-
-def _places(value: Any, info: ValidationInfo) -> tuple[tuple[float, ...], ...]:
-    if not isinstance(value, list | tuple):
-        raise rule_error("points_of_interest is a list", "Write points_of_interest = [2.5, 5.0]")
-    places = []
-    for place in value:
-        parts = place if isinstance(place, list | tuple) else (place,)
-        places.append(tuple(_finite(part, "length", info, "a coordinate") for part in parts))
-    return tuple(places)
-
-
-def _times(value: Any, info: ValidationInfo) -> tuple[float, ...]:
-    if not isinstance(value, list | tuple):
-        raise rule_error("knots is a list of times", "Write knots = [1.0, 2.0]")
-    return tuple(_finite(part, "time", info, "a time") for part in value)
+    return points
 
 
 def _perturbation(value: Any, info: ValidationInfo) -> float | str:
@@ -223,18 +199,25 @@ class ModelSection(Section):
     )
 
 
+Length = Annotated[float, in_quantity("length")]
+
+
 class BoundarySection(Section):
     """Gamma_C: ``length`` and ``points``, or ``lengths`` and ``points``, or ``file``."""
 
-    length: Annotated[float, in_quantity("length")] | None = Field(
-        None, gt=0, description="length of a one-dimensional boundary"
-    )
-    lengths: Annotated[tuple[float, ...] | None, PlainValidator(_pair_of_lengths)] = Field(
-        None, description="sides of a rectangular boundary"
-    )
-    points: Annotated[tuple[int, ...] | None, PlainValidator(_counts)] = Field(
-        None, description="midpoints of equal cells, one number a direction"
-    )
+    length: Length | None = Field(None, gt=0, description="length of a one-dimensional boundary")
+    lengths: (
+        Annotated[list[Annotated[Length, Field(gt=0)]], Field(min_length=2, max_length=2)] | None
+    ) = Field(None, description="sides of a rectangular boundary")
+    points: (
+        Annotated[
+            list[int],
+            Field(min_length=1, max_length=2),
+            BeforeValidator(_as_list),
+            AfterValidator(_check_count),
+        ]
+        | None
+    ) = Field(None, description="midpoints of equal cells, one number a direction")
     file: str | None = Field(None, description="CSV file with the columns s and weight")
 
 
@@ -290,7 +273,7 @@ class FieldSection(Section):
 class DrivingSection(FieldSection):
     """A field that may change in time."""
 
-    knots: Annotated[tuple[float, ...] | None, PlainValidator(_times)] = Field(
+    knots: list[Annotated[float, in_quantity("time")]] | None = Field(
         None, description="times where the formula has a kink"
     )
     series: SeriesSection | None = Field(None, description="a measured history")
@@ -410,8 +393,8 @@ class ReportSection(Section):
 class OutputSection(ReportSection):
     """What is written beside the trajectory of a contact law."""
 
-    points_of_interest: Annotated[tuple[tuple[float, ...], ...] | None, PlainValidator(_places)] = (
-        Field(None, description="places whose histories are shown; each snaps to the nearest point")
+    points_of_interest: list[Annotated[list[Length], BeforeValidator(_as_list)]] | None = Field(
+        None, description="places whose histories are shown; each snaps to the nearest point"
     )
 
 

@@ -17,7 +17,7 @@ _TYPES = {
     "int_from_float": "a whole number",
     "string_type": "a text in quotes",
     "bool_type": "true or false",
-    "tuple_type": "a list",
+    "list_type": "a list",
     "model_type": "a table",
     "model_attributes_type": "a table",
     "dict_type": "a table",
@@ -27,6 +27,8 @@ _LIMITS = {
     "greater_than_equal": ("at least", "ge"),
     "less_than": ("less than", "lt"),
     "less_than_equal": ("at most", "le"),
+    "too_short": ("a list of at least", "min_length"),
+    "too_long": ("a list of at most", "max_length"),
 }
 
 
@@ -70,7 +72,7 @@ def _problem(
     if kind in _LIMITS:
         sign, name = _LIMITS[kind]
         rule = f"it must be {sign} {context[name]:g} ({about})"
-        return InputProblem(place, given, rule, "Give such a value; check its sign and unit.")
+        return InputProblem(place, given, rule, "Give such a value; check its size and unit.")
     if kind == "finite_number":
         return InputProblem(place, given, "it must be finite", "Write an ordinary number.")
     if kind == "literal_error":

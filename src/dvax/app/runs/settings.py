@@ -58,7 +58,7 @@ class Config(Section):
     def tree(self) -> dict[str, Any]:
         """All settings as a TOML file has them; reading it beside the same data gives the same
         configuration."""
-        return _plain(self.model_dump(exclude_none=True))
+        return self.model_dump(exclude_none=True)
 
 
 def _files(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
@@ -69,17 +69,3 @@ def _files(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
         elif key == "file" and value is not None:
             found.append((f"{prefix}{key}", value))
     return found
-
-
-def _plain(value: Any) -> Any:
-    """Convert tuples for TOML: one entry becomes a number, several become an array."""
-    if isinstance(value, Mapping):
-        return {
-            key: [_plain(p) for p in inner]
-            if key in {"points_of_interest", "knots"}
-            else _plain(inner)
-            for key, inner in value.items()
-        }
-    if isinstance(value, tuple):
-        return value[0] if len(value) == 1 else list(value)
-    return value
