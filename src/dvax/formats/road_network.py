@@ -63,7 +63,7 @@ class Network:
             ("capacity", "length", "free_flow_time", "b", "power", "toll"),
         )  # fmt: skip
         if not problems:
-            problems = link_problems(self)
+            problems = self._problems()
         problems.raise_any()
 
     def __len__(self) -> int:
@@ -88,6 +88,61 @@ class Network:
         if self.lines is None:
             return f"{self.name}, link {index + 1}"
         return f"{self.name}, line {self.lines[index]}"
+
+    def _problems(self) -> Problems:
+        """Return the problems of each link."""
+        problems = Problems()
+        if not 1 <= self.zones <= self.nodes:
+            problems.add(
+                self.name, f"{self.zones} zones and {self.nodes} nodes",
+                "zones are the first ones of the nodes, so there are at most as many, and one at least",
+                "Fix the counts",
+            )  # fmt: skip
+        if self.nodes > _FREE_NODES + 2 * len(self.init_node):
+            problems.add(
+                self.name, f"{self.nodes} nodes and {len(self.init_node)} links",
+                "a node has a link, and a link has two nodes",
+                "Fix the number of nodes, or add the links",
+            )  # fmt: skip
+        if not 1 <= self.first_thru_node <= self.nodes + 1:
+            problems.add(
+                self.name, f"first_thru_node = {self.first_thru_node}",
+                f"it is a node, 1 to {self.nodes}: those below it are never passed through",
+                "Write 1 where every node may be passed through",
+            )  # fmt: skip
+        for column in ("init_node", "term_node"):
+            problems += _unknown(getattr(self, column), self.nodes, column, "node", self.place)
+        rules = (
+            ("capacity", True, "nothing goes through a link without one; remove a closed link"),
+            ("length", False, "distances are not negative"),
+            ("free_flow_time", False, "nothing arrives before it left"),
+            ("b", False, "more flow would be faster, and the equilibrium not unique"),
+            ("power", False, "more flow would be faster, and the equilibrium not unique"),
+            ("toll", False, "a path could gain by going round in circles"),
+        )
+        for column, strictly, why in rules:
+            values = getattr(self, column)
+            if values is None:
+                continue
+            sound = (values > 0 if strictly else values >= 0) & np.isfinite(values)
+            for i in np.flatnonzero(~sound):
+                rule = "a positive number" if strictly else "a number ≥ 0"
+                fix = f"Fix the {column}"
+                if column == "capacity":
+                    fix += "; a link whose time does not depend on its flow has b = 0"
+                problems.add(self.place(i), f"{column} {values[i]:g}", f"it is {rule}: {why}", fix)
+        for i in np.flatnonzero(self.init_node == self.term_node):
+            problems.add(
+                self.place(i), f"a link from node {self.init_node[i]} to itself",
+                "it leads nowhere", "Remove it",
+            )  # fmt: skip
+        for i, first in _repeated(self.init_node, self.term_node):
+            problems.add(
+                self.place(i), f"a link from {self.init_node[i]} to {self.term_node[i]}",
+                f"two nodes have one link a direction, and {self.place(first)} has this one",
+                "Remove one, or put a node into the second road",
+            )  # fmt: skip
+        return problems
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +177,7 @@ class Trips:
     def __post_init__(self) -> None:
         problems = _shaped(self, "Trips", ("origin", "destination"), ("flow",))
         if not problems:
-            problems = trip_problems(self)
+            problems = self._problems()
         problems.raise_any()
         inside = self.origin == self.destination
         object.__setattr__(self, "within", float(self.flow[inside].sum()))
@@ -138,89 +193,27 @@ class Trips:
 
     def place(self, index: Any) -> str:
         """Return the place of a pair: its line, or its number."""
-        return _pair_place(self, index)
+        if self.lines is None:
+            return f"{self.name}, pair {index + 1}"
+        return f"{self.name}, line {self.lines[index]}"
 
-
-def link_problems(links: Any) -> Problems:
-    """Return the problems of each link of a network, or of the part that could be read."""
-    problems = Problems()
-    place = lambda i: Network.place(links, i)  # noqa: E731
-    if not 1 <= links.zones <= links.nodes:
-        problems.add(
-            links.name, f"{links.zones} zones and {links.nodes} nodes",
-            "zones are the first ones of the nodes, so there are at most as many, and one at least",
-            "Fix the counts",
-        )  # fmt: skip
-    if links.nodes > _FREE_NODES + 2 * len(links.init_node):
-        problems.add(
-            links.name, f"{links.nodes} nodes and {len(links.init_node)} links",
-            "a node has a link, and a link has two nodes", "Fix the number of nodes, or add the links",
-        )  # fmt: skip
-    if not 1 <= links.first_thru_node <= links.nodes + 1:
-        problems.add(
-            links.name, f"first_thru_node = {links.first_thru_node}",
-            f"it is a node, 1 to {links.nodes}: those below it are never passed through",
-            "Write 1 where every node may be passed through",
-        )  # fmt: skip
-    for column in ("init_node", "term_node"):
-        problems += _unknown(getattr(links, column), links.nodes, column, "node", place)
-    rules = (
-        ("capacity", True, "nothing goes through a link without one; remove a closed link"),
-        ("length", False, "distances are not negative"),
-        ("free_flow_time", False, "nothing arrives before it left"),
-        ("b", False, "more flow would be faster, and the equilibrium not unique"),
-        ("power", False, "more flow would be faster, and the equilibrium not unique"),
-        ("toll", False, "a path could gain by going round in circles"),
-    )
-    for column, strictly, why in rules:
-        values = getattr(links, column)
-        if values is None:
-            continue
-        sound = (values > 0 if strictly else values >= 0) & np.isfinite(values)
-        for i in np.flatnonzero(~sound):
-            rule = "a positive number" if strictly else "a number ≥ 0"
-            fix = f"Fix the {column}"
-            if column == "capacity":
-                fix += "; a link whose time does not depend on its flow has b = 0"
-            problems.add(place(i), f"{column} {values[i]:g}", f"it is {rule}: {why}", fix)
-    for i in np.flatnonzero(links.init_node == links.term_node):
-        problems.add(
-            place(i), f"a link from node {links.init_node[i]} to itself",
-            "it leads nowhere", "Remove it",
-        )  # fmt: skip
-    for i, first in _repeated(links.init_node, links.term_node):
-        problems.add(
-            place(i), f"a link from {links.init_node[i]} to {links.term_node[i]}",
-            f"two nodes have one link a direction, and {place(first)} has this one",
-            "Remove one, or put a node into the second road",
-        )  # fmt: skip
-    return problems
-
-
-def trip_problems(trips: Any) -> Problems:
-    """Return the problems of each pair of a trip table, or of the part that could be read."""
-    problems = Problems()
-    place = lambda i: _pair_place(trips, i)  # noqa: E731
-    for column in ("origin", "destination"):
-        problems += _unknown(getattr(trips, column), trips.zones, column, "zone", place)
-    for i in np.flatnonzero(~((trips.flow >= 0) & np.isfinite(trips.flow))):
-        pair = f"{trips.origin[i]} to {trips.destination[i]}"
-        problems.add(
-            place(i), f"{trips.flow[i]:g} trips from {pair}", "trips are a number ≥ 0",
-            "Fix the number",
-        )  # fmt: skip
-    for i, first in _repeated(trips.origin, trips.destination):
-        problems.add(
-            place(i), f"trips from {trips.origin[i]} to {trips.destination[i]} once more",
-            f"a pair stands once, and {place(first)} has it", "Add the two up, or remove one",
-        )  # fmt: skip
-    return problems
-
-
-def _pair_place(trips: Any, index: Any) -> str:
-    if trips.lines is None:
-        return f"{trips.name}, pair {index + 1}"
-    return f"{trips.name}, line {trips.lines[index]}"
+    def _problems(self) -> Problems:
+        """Return the problems of each pair."""
+        problems = Problems()
+        for column in ("origin", "destination"):
+            problems += _unknown(getattr(self, column), self.zones, column, "zone", self.place)
+        for i in np.flatnonzero(~((self.flow >= 0) & np.isfinite(self.flow))):
+            pair = f"{self.origin[i]} to {self.destination[i]}"
+            problems.add(
+                self.place(i), f"{self.flow[i]:g} trips from {pair}", "trips are a number ≥ 0",
+                "Fix the number",
+            )  # fmt: skip
+        for i, first in _repeated(self.origin, self.destination):
+            problems.add(
+                self.place(i), f"trips from {self.origin[i]} to {self.destination[i]} once more",
+                f"a pair stands once, and {self.place(first)} has it", "Add the two up, or remove one",
+            )  # fmt: skip
+        return problems
 
 
 def _unknown(

@@ -11,20 +11,21 @@ angle brackets, then rows.
 
 import os
 import re
+from collections.abc import Callable
 from decimal import Decimal
 from difflib import get_close_matches
-from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from .road_network import Network, Trips, link_problems, trip_problems
+from .road_network import Network, Trips
 from .table import FileProblems, Table, read_text, to_count, to_number
 
 _LINK_NODES = ("init_node", "term_node")
 _LINK_NUMBERS = ("capacity", "length", "free_flow_time", "b", "power")
 _METADATA = re.compile(r"\s*<([^<>]*)>(.*)")
 _END = "END OF METADATA"
+T = TypeVar("T")
 
 
 class Line(NamedTuple):
@@ -101,12 +102,12 @@ def read_network(path: str | os.PathLike[str]) -> Network:
         )  # fmt: skip
     if zones is None or nodes is None or first is None or columns is None:
         raise problems.error()
-    links = SimpleNamespace(
-        zones=zones, nodes=nodes, first_thru_node=first, name=problems.file, **columns
-    )
-    problems += link_problems(links)
+    network = None
+    with problems.collect():
+        network = Network(zones, nodes, first, name=problems.file, **columns)
     problems.check()
-    return Network(**vars(links))
+    assert network is not None
+    return network
 
 
 def read_trips(path: str | os.PathLike[str]) -> Trips:
@@ -133,7 +134,8 @@ def read_trips(path: str | os.PathLike[str]) -> Trips:
     """
     lines, problems = read_text(path, "a TNTP file").splitlines(), FileProblems(path)
     metadata = _Metadata(lines, problems)
-    zones, total = metadata.count("NUMBER OF ZONES"), metadata.number("TOTAL OD FLOW")
+    zones = metadata.count("NUMBER OF ZONES")
+    total = metadata.read("TOTAL OD FLOW", to_number, "it is a decimal number")
     entries: list[tuple[int, int, float, int]] = []
     origin: int | None = None
     begun: dict[int, int] = {}
@@ -167,19 +169,13 @@ def read_trips(path: str | os.PathLike[str]) -> Trips:
                     "Write Origin and a zone above it",
                 )  # fmt: skip
                 headless = True
-    table = SimpleNamespace(
-        name=problems.file,
-        origin=np.array([e[0] for e in entries], np.int64),
-        destination=np.array([e[1] for e in entries], np.int64),
-        flow=np.array([e[2] for e in entries], np.float64),
-        lines=np.array([e[3] for e in entries], np.int64),
-    )
+    flow = np.array([e[2] for e in entries], np.float64)
     if total is not None:
         written = metadata.values["TOTAL OD FLOW"].text
         exponent = Decimal(written).as_tuple().exponent
         assert isinstance(exponent, int)
         with np.errstate(over="ignore"):
-            summed = float(table.flow.sum())
+            summed = float(flow.sum())
         # A zero may have any exponent: 0e999.
         if not abs(summed - total) <= 0.5 * 10.0 ** min(exponent, 300) + 1e-9 * abs(total):
             problems(
@@ -189,10 +185,15 @@ def read_trips(path: str | os.PathLike[str]) -> Trips:
             )  # fmt: skip
     if zones is None:
         raise problems.error()
-    table.zones = zones
-    problems += trip_problems(table)
+    origins, destinations, lines_of = (
+        np.array([e[k] for e in entries], np.int64) for k in (0, 1, 3)
+    )
+    trips = None
+    with problems.collect():
+        trips = Trips(zones, origins, destinations, flow, problems.file, lines_of)
     problems.check()
-    return Trips(**vars(table))
+    assert trips is not None
+    return trips
 
 
 def read_flows(path: str | os.PathLike[str], network: Network) -> Flows:
@@ -367,32 +368,16 @@ class _Metadata:
 
     def count(self, key: str) -> int | None:
         """A whole number ≥ 0, or None where it is missing or wrong, which is reported."""
-        found = self._find(key)
-        if found is None:
-            return None
-        if to_count(found.text) is None:
-            self.problems(
-                found.number,
-                f"<{key}> {found.text!r}",
-                "it is a whole number",
-                "Fix the number",
-            )
-            return None
-        return int(found.text)
+        return self.read(key, to_count, "it is a whole number")
 
-    def number(self, key: str) -> float | None:
-        """A finite number, or None where it is missing or wrong, which is reported."""
+    def read(self, key: str, convert: Callable[[str], T | None], rule: str) -> T | None:
+        """A value as `convert` reads it, or None where it is missing or wrong, which is reported."""
         found = self._find(key)
         if found is None:
             return None
-        value = to_number(found.text)
+        value = convert(found.text)
         if value is None:
-            self.problems(
-                found.number,
-                f"<{key}> {found.text!r}",
-                "it is a decimal number",
-                "Fix the number",
-            )
+            self.problems(found.number, f"<{key}> {found.text!r}", rule, "Fix the number")
         return value
 
     def line(self, key: str) -> int | None:
