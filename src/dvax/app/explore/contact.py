@@ -37,6 +37,7 @@ from dvax.app.runs.config import build_contact, load_config
 from dvax.app.runs.contact_figures import Figures
 from dvax.app.runs.contact_frames import norm_unit
 from dvax.app.runs.fields import Field
+from dvax.app.runs.keys import set_key
 from dvax.app.runs.settings import Config
 from dvax.app.runs.solver_options import settings
 from dvax.evolution import solve
@@ -120,7 +121,9 @@ class ContactSubject(AbstractSubject):
         return plane(self.data, self.inputs.companion_x0, self._times, self.config, values, axes)
 
     def export(self, kind: str, values: Values) -> tuple[str, str]:
-        tree = _nested(self.config.tree(), values)
+        tree = self.config.tree()
+        for key, value in values.items():
+            set_key(tree, key, value)
         name = f"{self.config.source.stem}_explored"
         if kind == "configuration":
             files = [file for _, file in self.config.data_files()]
@@ -274,11 +277,3 @@ def _parameters(config: Config) -> tuple[Parameter, ...]:
         low, high = sorted((-value, 3 * value)) if value else (-1.0, 1.0)
         found.append(Parameter(key, words, "", low, high, value))
     return tuple(found)
-
-
-def _nested(tree: dict[str, Any], values: Values) -> dict[str, Any]:
-    """Return the settings with the values of the sliders."""
-    for key, value in values.items():
-        section, _, name = key.partition(".")
-        tree.setdefault(section, {})[name] = value
-    return tree

@@ -33,6 +33,7 @@ from dvax.app.plots.theme import unit_text
 from dvax.app.runs.applications.base import Figure
 from dvax.app.runs.applications.config import OWN, ModelConfig, check_config
 from dvax.app.runs.applications.segments import join_pieces, segment_length, segments
+from dvax.app.runs.keys import set_key
 from dvax.app.runs.toml_file import read_toml
 from dvax.errors import input_error
 from dvax.evolution import Solution
@@ -101,13 +102,8 @@ class ModelSubject(AbstractSubject):
         tree = copy.deepcopy(self._raw)
         for key, value in values.items():
             parameter = self._labels[key]
-            if value == parameter.value:
-                continue
-            *tables, last = key.split(".")
-            table = tree
-            for name in tables:
-                table = table.setdefault(name, {})
-            table[last] = round(value) if parameter.whole else value
+            if value != parameter.value:
+                set_key(tree, key, round(value) if parameter.whole else value)
         return tree
 
     def _run(self, values: Values, check: Callable[[], None]) -> _Ran:

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import tomli_w
 
+from dvax.app.runs.keys import set_key
+
 if TYPE_CHECKING:
     from dvax.app.runs.applications.config import ModelConfig
     from dvax.app.runs.settings import Config
@@ -31,10 +33,7 @@ def write_resolved(config: "Config | ModelConfig", directory: Path) -> Path:
             target = directory / value / source.name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, target)
-        table = tree
-        for name in tables:
-            table = table[name]
-        table[last] = value
+        set_key(tree, key, value)
     path = directory / NAME
     path.write_text(tomli_w.dumps(tree), encoding="utf-8")
     return path

@@ -14,6 +14,7 @@ from dvax.app.runs.compile_time import compile_stopwatch
 from dvax.app.runs.data_file import DataFile, fingerprint
 from dvax.app.runs.figure import Figure
 from dvax.app.runs.interrupt import exit_code, writing
+from dvax.app.runs.keys import flat_keys
 from dvax.app.runs.provenance import provenance
 from dvax.app.runs.resolved import write_resolved
 from dvax.app.runs.rundir import RunDirectory, process
@@ -156,7 +157,8 @@ class AbstractRun(abc.ABC):
         return RunOutcome(status, code, reason, directory.path, summary, has_results)
 
     def _identity(self) -> dict[str, str]:
-        """Return the settings, the data and the versions, which must be the same for a run to go on."""
+        """Return what must be the same for a run to go on: the settings but those of the output, the
+        data and the versions."""
         files = self.config.data_files()
         keys = {key for key, _ in files}
         # Copies have other names than the files that they were made from.
@@ -164,10 +166,15 @@ class AbstractRun(abc.ABC):
             f"data of {key}, {k}": fingerprint(key, path).sha256
             for k, (key, path) in enumerate(files)
         }
+        settings = {
+            key: repr(value)
+            for key, value in flat_keys(self.config.tree()).items()
+            if key not in keys and not key.startswith("output.")
+        }
         made_by = provenance()
         packages = {name: str(made_by["packages"][name]) for name in ("jax", "jaxlib", "numpy")}
         return {
-            **{k: v for k, v in _settings(self.config.tree()).items() if k not in keys},
+            **settings,
             **data,
             **{name: str(made_by[name]) for name in ("dvax", "device", "precision")},
             **packages,
@@ -212,17 +219,6 @@ class AbstractRun(abc.ABC):
             "assumptions": assumption_rows(self.facts.assumptions),
         }
         self.directory.write_json("manifest.json", content)
-
-
-def _settings(tree: Mapping[str, Any], path: str = "") -> dict[str, str]:
-    """Return all settings but those of the output by their dotted keys."""
-    found: dict[str, str] = {}
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            found |= _settings(value, f"{path}{key}.")
-        elif not path.startswith("output."):
-            found[f"{path}{key}"] = repr(value)
-    return found
 
 
 def assumption_rows(assumptions: Sequence[Assumption]) -> list[dict[str, Any]]:

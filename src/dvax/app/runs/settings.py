@@ -1,12 +1,12 @@
 """The settings of a run: the sections of a configuration together, checked and complete."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pydantic import PrivateAttr
 
 from dvax.app.runs.fields import Sources
+from dvax.app.runs.keys import flat_keys
 from dvax.app.runs.schema import (
     BoundarySection,
     DemandSection,
@@ -53,19 +53,13 @@ class Config(Section):
 
     def data_files(self) -> list[tuple[str, Path]]:
         """(dotted key, file) of every data file that the configuration names."""
-        return [(key, self._source.parent / name) for key, name in _files(self.model_dump())]
+        return [
+            (key, self._source.parent / name)
+            for key, name in flat_keys(self.tree()).items()
+            if key.endswith(".file")
+        ]
 
     def tree(self) -> dict[str, Any]:
         """All settings as a TOML file has them; reading it beside the same data gives the same
         configuration."""
         return self.model_dump(exclude_none=True)
-
-
-def _files(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    found = []
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            found += _files(value, f"{prefix}{key}.")
-        elif key == "file" and value is not None:
-            found.append((f"{prefix}{key}", value))
-    return found

@@ -12,14 +12,8 @@ from typing import Any
 import numpy as np
 
 from dvax.app.runs.data_file import locate
-from dvax.app.runs.sweeps.parameters import (
-    Parameter,
-    drawn,
-    flat_keys,
-    is_range,
-    listed,
-    parameter,
-)
+from dvax.app.runs.keys import flat_keys
+from dvax.app.runs.sweeps.parameters import Parameter, drawn, is_range, listed, parameter
 from dvax.app.runs.sweeps.schema import SampleSection, SweepFile
 from dvax.errors import Problems, input_error
 

@@ -199,18 +199,6 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def flat_keys(table: Mapping[str, Any], is_value: Any, prefix: str = "") -> dict[str, Any]:
-    """Return the entries of nested tables by their dotted keys; `is_value` recognises a table that is
-    a value."""
-    entries: dict[str, Any] = {}
-    for key, value in table.items():
-        if isinstance(value, Mapping) and not is_value(value):
-            entries |= flat_keys(value, is_value, f"{prefix}{key}.")
-        else:
-            entries[f"{prefix}{key}"] = value
-    return entries
-
-
 def is_range(table: Mapping[str, Any]) -> bool:
     """Return whether a table is a range or a distribution, and not a table of keys."""
     return bool({"from", "to", "low", "high", "mean", "deviation"} & set(table))

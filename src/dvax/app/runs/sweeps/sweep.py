@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from dvax.app.runs.applications.config import ModelConfig, check_config
 from dvax.app.runs.config import Config
 from dvax.app.runs.data_file import locate
+from dvax.app.runs.keys import set_key
 from dvax.app.runs.provenance import provenance
 from dvax.app.runs.schema_errors import translate, unknown_key
 from dvax.app.runs.sweeps.members import parameters
@@ -52,16 +53,14 @@ class Sweep:
         """
         raw = copy.deepcopy(dict(self.raw))
         for key, value in self.values(member).items():
-            *tables, last = key.split(".")
-            inside = raw
-            for name in tables:
-                inside = inside.setdefault(name, {})
-                if not isinstance(inside, dict):
-                    raise input_error(
-                        f"{self.source.name}: {key}", repr(inside)[:70],
-                        f"{name} is no table in {self.base.name}", "Correct the key",
-                    )  # fmt: skip
-            inside[last] = value
+            try:
+                set_key(raw, key, value)
+            except LookupError as error:
+                name, given = error.args
+                raise input_error(
+                    f"{self.source.name}: {key}", repr(given)[:70],
+                    f"{name} is no table in {self.base.name}", "Correct the key",
+                ) from None  # fmt: skip
         return raw
 
     def config(self, member: int) -> Config | ModelConfig:
