@@ -96,7 +96,7 @@ def test_config_resolved_file_gives_the_same_run_elsewhere(tmp_path):
     np.testing.assert_array_equal(copied.load_signal(0.9), inputs.load_signal(0.9))
     np.testing.assert_array_equal(copied.demand_signal(0.9), inputs.demand_signal(0.9))
     assert {f.sha256 for f in copied.data_files} == {f.sha256 for f in inputs.data_files}
-    for text in ("frames = 4", "atol = ", "companion = ", "points_of_interest", 'kind = "cubic"'):
+    for text in ("frames = 4", "atol = ", "companion = ", 'kind = "cubic"'):
         assert text in tomli_w.dumps(again.tree())
 
 
@@ -105,14 +105,13 @@ def test_config_rectangle_has_points_in_c_order(tmp_path):
         "boundary": {"lengths": [4.0, "3 mm"], "points": [2, 3]},
         "demand": {"expression": "s1 + 10*s2"},
         "load": {"value": "1 mm/s"},
-        "output.points_of_interest": [[1.0, 2.5]],
     }
     inputs = build_contact(load_config(write(tmp_path, changes)))
     assert inputs.boundary.shape == (2, 3)
     np.testing.assert_allclose(inputs.demand_signal(0.0), [6, 16, 26, 8, 18, 28])
     assert float(np.sum(inputs.boundary.weights)) == pytest.approx(12.0)
     assert float(inputs.load_signal(0.0)) == pytest.approx(1000.0)
-    assert inputs.point_indices == (2,)
+    assert inputs.boundary.nearest((1.0, 2.5)) == 2
 
 
 def test_config_midpoint_weights_are_of_second_order(tmp_path):
@@ -136,7 +135,7 @@ def test_config_nodes_from_a_file(tmp_path):
 def test_config_points_of_interest_snap_with_a_note(tmp_path):
     changes = {"output.points_of_interest": ["0.5 cm", 6.25]}
     inputs = build_contact(load_config(write(tmp_path, changes)))
-    assert inputs.point_indices == (1, 2)
+    assert [inputs.boundary.nearest((s,)) for s in (5.0, 6.25)] == [1, 2]
     assert len(inputs.notices) == 1 and "nearest point is [3.75] mm" in inputs.notices[0]
 
 

@@ -104,10 +104,6 @@ def check_contact(raw: dict[str, Any], source: Path, allow_outside: bool) -> Con
     check_dt_max(
         draft.solver, longest_block(inputs.frame_times, inputs.boundary.size), f"{file}: solver"
     )
-    if draft.output.points_of_interest is None:
-        places = [[float(c[i]) for c in inputs.boundary.coordinates] for i in inputs.point_indices]
-        output = draft.output.model_copy(update={"points_of_interest": places})
-        draft = draft.model_copy(update={"output": output})
     draft._source, draft._allow_outside = source, allow_outside
     return draft
 

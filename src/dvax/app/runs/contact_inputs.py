@@ -27,7 +27,6 @@ class ContactInputs:
     - `demand`, `load`: g(t) and ell(t) as factors, see `demand_signal` and `load_signal`;
     - `x0`, `companion_x0`: the two initial states, (n,);
     - `frame_times`: the times to save, from 0 to the end;
-    - `point_indices`: the points whose histories are shown;
     - `data_files`: what was read, with fingerprints;
     - `notices`: sentences for the log, about what is allowed but worth knowing.
     """
@@ -38,7 +37,6 @@ class ContactInputs:
     x0: np.ndarray
     companion_x0: np.ndarray
     frame_times: np.ndarray
-    point_indices: tuple[int, ...]
     data_files: tuple[DataFile, ...]
     notices: tuple[str, ...]
 
@@ -93,11 +91,11 @@ def read_inputs(
                 shift = perturbation(initial.companion, boundary, key)
             elif isinstance(initial.companion, str):
                 compile_expression(initial.companion, coordinate_names, place=key)
-    indices, notices = (), []
+    notices: list[str] = []
     if boundary is not None and "output" in sections:
-        places = sections["output"].points_of_interest
+        places = sections["output"].points_of_interest or []
         with problems.collect():
-            indices, notices = _points(places, boundary, sources.name, units)
+            notices = _check_points(places, boundary, sources.name, units)
     problems.raise_any()
     if boundary is None or shift is None or time is None or len(fields) < len(_KINDS):
         return None
@@ -116,7 +114,6 @@ def read_inputs(
         x0=x0,
         companion_x0=companion_x0,
         frame_times=np.linspace(0.0, time.end, time.frames + 1),
-        point_indices=indices,
         data_files=tuple(dict.fromkeys(files)),
         notices=tuple(notices),
     )
@@ -141,21 +138,14 @@ def _initial_states(
     with np.errstate(over="ignore", invalid="ignore"):
         x0 = space_values(field, boundary)
         companion = x0 + shift
-    for key, state, what in (
-        ("initial", x0, "x(0, s)"),
-        (
-            "initial.companion",
-            companion,
-            "the start of the companion, which is x(0, s) plus companion, by default "
-            "(1 + b_u) kappa0 / (beta b_x),",
-        ),
-    ):
+    for key, state in (("initial", x0), ("initial.companion", companion)):
         bad = np.flatnonzero(~np.isfinite(state))
         if bad.size:
             raise input_error(
                 f"{file}: {key}",
                 f"{state[bad[0]]} at point {bad[0] + 1}",
-                f"{what} is finite at every point",
+                "x(0, s), and x(0, s) plus companion, by default (1 + b_u) kappa0 / (beta b_x), are "
+                "finite at every point",
                 "Check the sizes of the factors, and the units that they are in.",
             )
     return x0, companion
@@ -178,15 +168,14 @@ def _boundary(
     return boundary, files
 
 
-def _points(
-    places: Any, boundary: Boundary, file: str, units: Units
-) -> tuple[tuple[int, ...], list[str]]:
-    """Indices of the points of interest, each snapped to the nearest point, and notices where that is
-    far away. Raises `InputError`."""
-    if places is None:
-        return _quarters(boundary), []
+def _check_points(
+    places: list[list[float]], boundary: Boundary, file: str, units: Units
+) -> list[str]:
+    """Return notices for points of interest whose nearest point of the boundary is far away.
+
+    **Raises:** `InputError` for places off the boundary.
+    """
     problems = Problems()
-    indices: list[int] = []
     notices: list[str] = []
     for number, place in enumerate(places, start=1):
         key = f"{file}: output.points_of_interest[{number}]"
@@ -220,22 +209,11 @@ def _points(
                 f"Point of interest {place} {units.length}: the nearest point is "
                 f"{[float(f'{a:.9g}') for a in at]} {units.length}."
             )
-        indices.append(index)
     problems.raise_any()
-    return tuple(dict.fromkeys(indices)), notices
+    return notices
 
 
 def _margin(coordinate: np.ndarray) -> float:
     """How far a boundary reaches beyond its outermost points: the widest gap between neighbours."""
     distinct = np.unique(coordinate)
     return float(np.max(np.diff(distinct))) if distinct.size > 1 else float("inf")
-
-
-def _quarters(boundary: Boundary) -> tuple[int, ...]:
-    """The points at a quarter, half and three quarters of the boundary, in every direction."""
-    parts = [sorted({min(n * k // 4, n - 1) for k in (1, 2, 3)}) for n in boundary.shape]
-    if len(parts) == 1:
-        return tuple(parts[0])
-    middle = [axis[len(axis) // 2] for axis in parts]
-    along = [(i, middle[1]) for i in parts[0]] + [(middle[0], j) for j in parts[1]]
-    return tuple(dict.fromkeys(i * boundary.shape[1] + j for i, j in along))
