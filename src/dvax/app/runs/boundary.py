@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dvax.app.runs.schema import BoundarySection
-from dvax.app.runs.units import UnitError, Units
+from dvax.app.runs.units import Units
 from dvax.errors import InputProblem, Problems, input_error
 from dvax.formats.csv_columns import check_increasing, read_columns
 
@@ -63,13 +63,11 @@ def _from_file(path: Path, units: Units) -> Boundary:
     s, weight = read_columns(path, ["s", "weight"], "s")
     check_increasing(path.name, s)
     problems = Problems()
-    factors = []
+    columns = []
     for column in (s, weight):
-        try:
-            factors.append(units.factor(column.unit, "length"))
-        except UnitError as error:
-            place = f"{path.name}, column {column.name!r}"
-            problems.add(place, f"[{column.unit}]", error.rule, f"{error.fix}.")
+        # An infinite coordinate is refused by check_size.
+        with problems.collect(), np.errstate(over="ignore"):
+            columns.append(units.values(path.name, column, "length"))
     problems += [
         InputProblem(
             f"{path.name}, line {weight.lines[i]}, column 'weight'",
@@ -80,8 +78,7 @@ def _from_file(path: Path, units: Units) -> Boundary:
         for i in np.flatnonzero(~(weight.values > 0))[:20]
     ]
     problems.raise_any()
-    with np.errstate(over="ignore"):  # an infinite coordinate is refused by check_size
-        places, weights = s.values * factors[0], weight.values * factors[1]
+    places, weights = columns
     return Boundary((places,), weights, (places.size,))
 
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from dvax.app.runs.boundary import Boundary
 from dvax.app.runs.schema import ProfileSection, SeriesSection
-from dvax.app.runs.units import UnitError, Units
+from dvax.app.runs.units import Units
 from dvax.errors import Problems, input_error
 from dvax.formats.at2 import read_at2
-from dvax.formats.csv_columns import check_increasing, read_columns
+from dvax.formats.csv_columns import Column, check_increasing, read_columns
 from dvax.formats.table import read_bytes
 
 # What numpy raises for broken headers and data, errors of its tokenizer included.
@@ -79,16 +79,15 @@ def read_series(
                 f'Say what 1 g stands for: per_unit = "30 {units.of(kind)}".',
             )
         problems.raise_any()
-        times, unit = step * np.arange(raw.size) * units.factor("s", "time"), "g"
+        times = step * np.arange(raw.size) * units.factor("s", "time")
+        values, carries_unit = raw * factor, True
     else:
         time, column = read_columns(
             path, [section.time_column, section.column], section.time_column
         )
         check_increasing(path.name, time)
-        times = time.values * _factor(units, time.unit, "time", path.name, time.name)
-        raw, unit = column.values, column.unit
-        if factor is None and unit != "1":
-            factor = _factor(units, unit, kind, path.name, column.name)
+        times = units.values(path.name, time, "time")
+        values, carries_unit = _scaled(path.name, column, factor, units, kind)
     least = _CUBIC_LEAST if section.kind == "cubic" else 2
     if times.size < least:
         raise input_error(
@@ -108,9 +107,7 @@ def read_series(
         )
     if end is not None and times[-1] < end:
         times = np.append(times[:-1], end)
-    return Series(
-        times, raw * (1.0 if factor is None else factor), section.kind, factor is not None
-    )
+    return Series(times, values, section.kind, carries_unit)
 
 
 def read_profile(
@@ -137,7 +134,7 @@ def read_profile(
         path, [section.position_column, section.column], section.position_column
     )
     check_increasing(path.name, position)
-    s = position.values * _factor(units, position.unit, "length", path.name, position.name)
+    s = units.values(path.name, position, "length")
     slack = 1e-12 * np.max(np.abs(s))
     if s[0] > points.min() + slack or s[-1] < points.max() - slack:
         raise input_error(
@@ -147,10 +144,8 @@ def read_profile(
             "nothing is extrapolated",
             "Shorten the boundary, or measure further.",
         )
-    if factor is None and column.unit != "1":
-        factor = _factor(units, column.unit, kind, path.name, column.name)
-    values = np.interp(points, s, column.values) * (1.0 if factor is None else factor)
-    return Profile(values, factor is not None)
+    values, carries_unit = _scaled(path.name, column, factor, units, kind)
+    return Profile(np.interp(points, s, values), carries_unit)
 
 
 def read_npy(section: ProfileSection, path: Path, shape: tuple[int, ...], place: str) -> np.ndarray:
@@ -213,10 +208,12 @@ def _array(content: bytes) -> np.ndarray:
     return numbers.reshape(shape, order="F" if is_fortran else "C")
 
 
-def _factor(units: Units, unit: str, kind: str, file: str, column: str) -> float:
-    try:
-        return units.factor(unit, kind)
-    except UnitError as error:
-        raise input_error(
-            f"{file}, column {column!r}", f"[{unit}]", error.rule, f"{error.fix}."
-        ) from None
+def _scaled(
+    file: str, column: Column, per_unit: float | None, units: Units, kind: str
+) -> tuple[np.ndarray, bool]:
+    """Return the values of a column in working units, and whether they are more than pure numbers."""
+    if per_unit is not None:
+        return column.values * per_unit, True
+    if column.unit == "1":
+        return column.values, False
+    return units.values(file, column, kind), True

@@ -11,8 +11,11 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from dvax.errors import input_error
+from dvax.formats.csv_columns import Column
 from dvax.formats.table import NUMBER
 
 if TYPE_CHECKING:
@@ -82,18 +85,11 @@ class Units(BaseModel):
 
     def factor(self, unit: str, kind: str) -> float:
         """How many working units of `kind` one `unit` is. Raises `UnitError`."""
-        target = self.of(kind)
-        if unit.strip() == target:
-            return 1.0
-        registry = _registry()
-        given, wanted = parse_unit(unit), parse_unit(target)
-        if given.dimensionality != wanted.dimensionality:
-            raise UnitError(
-                f"{unit!r} does not measure this: the quantity is {_article(kind)}, in {target}",
-                f"Give it in {target} or a unit that converts to {target}",
-            )
-        # parse_unit refuses units with an offset, so that one number is the ratio.
-        return float(registry.Quantity(1.0, given).to(wanted).magnitude)
+        return ratio(unit, self.of(kind), f"the quantity is {_article(kind)}, in")
+
+    def values(self, file: str, column: Column, kind: str) -> np.ndarray:
+        """Return the values of a column of a file in working units. Raises `InputError`."""
+        return in_unit(file, column, self.of(kind), f"the quantity is {_article(kind)}, in")
 
     def convert(self, text: str, kind: str) -> float:
         """A text "number unit" in working units. Raises `UnitError`."""
@@ -108,20 +104,38 @@ class Units(BaseModel):
         return float(match["number"]) * self.factor(match["unit"].strip(), kind)
 
 
+def ratio(unit: str, wanted: str, what: str = "it is in") -> float:
+    """Return how many `wanted` one `unit` is. Raises `UnitError`, with `what` before `wanted`."""
+    if unit.strip() == wanted:
+        return 1.0
+    given, target = parse_unit(unit), parse_unit(wanted)
+    if given.dimensionality != target.dimensionality:
+        raise UnitError(
+            f"{unit!r} does not measure this: {what} {wanted}",
+            f"Give it in {wanted} or a unit that converts to {wanted}",
+        )
+    # parse_unit refuses units with an offset, so that one number is the ratio.
+    return float(_registry().Quantity(1.0, given).to(target).magnitude)
+
+
 def converted(text: str, unit: str) -> float | None:
     """A text "number unit" in another unit; None where the text or the unit does not allow it."""
     match = _match(text)
     if match is None:
         return None
-    if match["unit"].strip() == unit:
-        return float(match["number"])
     try:
-        given, wanted = parse_unit(match["unit"]), parse_unit(unit)
+        return float(match["number"]) * ratio(match["unit"], unit)
     except UnitError:
         return None
-    if given.dimensionality != wanted.dimensionality:
-        return None
-    return float(match["number"]) * float(_registry().Quantity(1.0, given).to(wanted).magnitude)
+
+
+def in_unit(file: str, column: Column, unit: str, what: str = "it is in") -> np.ndarray:
+    """Return the values of a column of a file in this unit. Raises `InputError`."""
+    try:
+        return column.values * ratio(column.unit, unit, what)
+    except UnitError as error:
+        place = f"{file}, column {column.name!r}"
+        raise input_error(place, f"[{column.unit}]", error.rule, f"{error.fix}.") from None
 
 
 def split_quantity(text: str) -> tuple[float, str] | None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dvax.app.runs.schema_errors import unknown_key
-from dvax.app.runs.units import converted
+from dvax.app.runs.units import in_unit
 from dvax.errors import InputError, input_error
 from dvax.formats.csv_columns import Column, check_increasing, column_names, read_columns
 
@@ -65,18 +65,5 @@ def _history(
         raise input_error(
             path.name, "one row", "a history has two rows at least", "Add the last time of the run"
         )
-    times = _in_unit(path, time, time_unit)
-    return History(times, {c.name: _in_unit(path, c, units[c.name]) for c in others})
-
-
-def _in_unit(path: Path, column: Column, unit: str) -> np.ndarray:
-    wanted = unit or "1"
-    if column.unit == wanted:
-        return column.values
-    factor = converted(f"1 {column.unit}", wanted)
-    if factor is None:
-        raise input_error(
-            f"{path.name}, column {column.name!r}", f"[{column.unit}]",
-            f"its unit converts to {wanted}", f'Write "{column.name} [{wanted}]"',
-        )  # fmt: skip
-    return factor * column.values
+    times = in_unit(path.name, time, time_unit)
+    return History(times, {c.name: in_unit(path.name, c, units[c.name] or "1") for c in others})
