@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from dvax.app.runs.rundir import consolidate
+
 KAPPA, BETA = 4.0, 0.8
 CONSTANTS = [
     ("strong_monotonicity", "γ", 1.875, "µm/MPa", "eq:concrete_strong_mono", "modulus of F"),
@@ -107,6 +109,7 @@ def write_run(folder: Path, recipe: Recipe = Recipe()) -> Path:
     written = recipe.frames if recipe.written is None else recipe.written
     if written:
         dataset.isel(time=slice(0, written)).to_zarr(folder / "trajectory.zarr", consolidated=False)
+        consolidate(folder / "trajectory.zarr")
     manifest = {
         "dvax": "0.1.0",
         "packages": {"jax": "0.10.2", "diffrax": "0.7.2"},

@@ -15,7 +15,7 @@ from tests.app.plots.synthetic import Recipe, write_run
 from typer.testing import CliRunner
 
 from dvax.app.cli.program import app
-from dvax.app.runs.rundir import FrameStore, close_killed, cut_incomplete, process, write_whole
+from dvax.app.runs.rundir import FrameStore, close_killed, process, write_whole
 
 
 @contextmanager
@@ -102,22 +102,13 @@ def test_close_killed_closes_dead_runs_only(tmp_path: Path) -> None:
     manifest = json.loads(file.read_text())
     assert manifest["status"] == "killed" and manifest["steps"] == 3
     assert "killed" in manifest["stop_reason"]
-    with xarray.open_zarr(store.path, consolidated=False, decode_times=False) as seen:
+    with xarray.open_zarr(store.path, decode_times=False) as seen:
         assert seen.sizes["time"] == 2
     assert not close_killed(tmp_path)
     file.write_text(
         json.dumps({"status": "running", **process(), "process": gone(), "host": "other"})
     )
     assert not close_killed(tmp_path)  # the state of a process on another host is unknown
-
-
-def test_frames_without_a_time_are_removed(tmp_path: Path) -> None:
-    store = store_of(tmp_path, 9)
-    store.write(*block(0, 2))
-    store._arrays["pressure"][2:4] = 7.0  # the run is killed here
-    cut_incomplete(store.path)
-    with xarray.open_zarr(store.path, consolidated=False, decode_times=False) as seen:
-        assert seen.sizes["time"] == 2 and not seen["pressure"].isnull().any()
 
 
 def test_report_of_a_killed_run_states_it(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from dvax.app.runs import contact_run, driver
 from dvax.app.runs.blocks import block_length, longest_block
 from dvax.app.runs.config import load_config
 from dvax.app.runs.figure import Figure
-from dvax.app.runs.json_numbers import json_ready
+from dvax.app.runs.json_files import json_ready
 from dvax.app.runs.schema import SolverKeys
 from dvax.app.runs.solver_options import check_dt_max
 from dvax.errors import InputError, InputProblem, SolveError

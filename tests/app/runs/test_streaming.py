@@ -17,7 +17,7 @@ from dvax.app.runs.applications.certificate import certificate
 from dvax.app.runs.applications.config import read_config
 from dvax.app.runs.applications.segments import join_pieces, segments
 from dvax.app.runs.driver import run
-from dvax.app.runs.rundir import FrameStore, cut_incomplete
+from dvax.app.runs.rundir import FrameStore
 
 
 def test_trajectory_of_a_run_can_be_read_while_it_goes_on(tmp_path: Path) -> None:
@@ -49,8 +49,7 @@ def test_rows_without_a_time_are_not_shown(tmp_path: Path, axis: str) -> None:
     found, room = open_store(store.path)
     assert found.count == room == 3  # the metadata end with the last complete row
     assert found.variables["price"].values.tolist() == [[1.0, 1.0]] * 3
-    cut_incomplete(store.path)
-    with xarray.open_zarr(store.path, consolidated=False) as data:
+    with xarray.open_zarr(store.path) as data:
         assert data.sizes == {axis: 3, "firm": 2}
 
 

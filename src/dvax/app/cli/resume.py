@@ -1,6 +1,5 @@
 """`dvax resume DIR`: go on with a run that ended early."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -35,18 +34,13 @@ def resume(
 
 
 def _status(directory: Path) -> str:
+    from dvax.app.runs.json_files import read_object
     from dvax.app.runs.resolved import NAME
 
-    file = directory / "manifest.json"
-    try:
-        manifest = json.loads(file.read_text(encoding="utf-8"))
-        status = str(manifest["status"])
-    except (OSError, ValueError, KeyError, TypeError):
-        # It is replaced as a whole, so that no interrupt damages it.
-        status = "" if (directory / NAME).is_file() else None
-    if status is None:
+    status = read_object(directory / "manifest.json").get("status", "")
+    if not status and not (directory / NAME).is_file():
         raise input_error(
             str(directory), "no run of dvax" if directory.is_dir() else "no such folder",
             f"a run that can go on has {NAME} and checkpoints", "Give the folder of dvax run -o DIR",
         )  # fmt: skip
-    return status
+    return str(status)

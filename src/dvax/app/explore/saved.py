@@ -69,7 +69,7 @@ from pathlib import Path
 import xarray
 
 run = Path({str(path)!r})
-print(xarray.open_zarr(run / "trajectory.zarr", consolidated=False))
+print(xarray.open_zarr(run / "trajectory.zarr"))
 for name, figure in json.loads((run / "summary.json").read_text(encoding="utf-8")).items():
     print(name, figure["value"], figure["unit"])
 '''

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from dvax.app.runs.json_numbers import json_ready
+from dvax.app.runs.json_files import json_ready
 from dvax.errors import Problems
 
 FOLDER = "checkpoints"

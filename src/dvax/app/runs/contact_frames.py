@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dvax.app.runs.contact_inputs import ContactInputs
-from dvax.app.runs.json_numbers import json_ready
+from dvax.app.runs.json_files import json_ready
 from dvax.app.runs.run import assumption_rows
 from dvax.app.runs.settings import Config
 from dvax.evolution import Solution

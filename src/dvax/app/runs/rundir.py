@@ -27,11 +27,11 @@ from typing import Any
 import numpy as np
 import zarr
 
-from dvax._files import AXIS, time_axis
+from dvax._files import AXIS
 from dvax._files import consolidate as consolidate
 from dvax._files import write_whole as write_whole
 from dvax.app.runs import checkpoints
-from dvax.app.runs.json_numbers import json_ready
+from dvax.app.runs.json_files import json_ready, read_object
 from dvax.app.runs.lock import NAME as LOCK
 from dvax.app.runs.lock import lock
 from dvax.errors import Problems
@@ -74,15 +74,7 @@ class RunDirectory:
 
     def title(self) -> str:
         """Return the title in the manifest, "" if there is none."""
-        try:
-            manifest = json.loads((self.path / "manifest.json").read_text(encoding="utf-8"))
-            return str(manifest.get("title", ""))
-        except (OSError, ValueError, AttributeError):
-            return ""
-
-    def remove(self, name: str) -> None:
-        """Remove a folder of results, to write it again."""
-        shutil.rmtree(self.path / name, ignore_errors=True)
+        return str(read_object(self.path / "manifest.json").get("title", ""))
 
     def close(self) -> None:
         self._log.close()
@@ -91,11 +83,9 @@ class RunDirectory:
 
 def _further_files(manifest: Path) -> list[str]:
     """Return the files that the model of a run wrote, by its manifest."""
-    try:
-        names = json.loads(manifest.read_text(encoding="utf-8"))["files"]
-        return [name for name in names if name == Path(name).name]
-    except (OSError, ValueError, LookupError, TypeError):
-        return []
+    names = read_object(manifest).get("files")
+    names = names if isinstance(names, list) else []
+    return [name for name in names if isinstance(name, str) and name == Path(name).name]
 
 
 def _repair(log: Path) -> int:
@@ -127,21 +117,14 @@ def process() -> dict[str, Any]:
 
 
 def close_killed(directory: Path) -> bool:
-    """Close a run whose process was killed: cut off its incomplete frames and record it in the
-    manifest. Returns whether that was so."""
+    """Record it in the manifest if the process of a run was killed. Returns whether that was so."""
     file = directory / "manifest.json"
-    try:
-        manifest = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False  # the next reader of the directory reports what is wrong
-    ours = isinstance(manifest, dict) and manifest.get("status") == "running"
-    if not ours or manifest.get("host") != platform.node() or _alive(manifest.get("process")):
+    manifest = read_object(file)
+    ours = manifest.get("status") == "running" and manifest.get("host") == platform.node()
+    if not ours or _alive(manifest.get("process")):
         return False
     reason = "The process was killed, or the machine stopped; it left no word."
     write_json(file, {**manifest, "status": "killed", "stop_reason": reason})
-    store = directory / "trajectory.zarr"
-    if store.is_dir():
-        cut_incomplete(store)
     return True
 
 
@@ -153,19 +136,6 @@ def _alive(number: Any) -> bool:
     except OSError:
         return True  # the process of another user
     return True
-
-
-def cut_incomplete(path: Path) -> None:
-    """Cut off the frames without a time, which a killed run had not completed."""
-    group = zarr.open_group(path, mode="r+", use_consolidated=False)
-    axis = time_axis(group.attrs.asdict())
-    if axis not in group:
-        return
-    known = np.isfinite(np.asarray(group[axis][...]))  # pyright: ignore
-    whole = len(known) if known.all() else int(np.argmin(known))
-    for _, array in group.arrays():
-        if getattr(array.metadata, "dimension_names", (None,))[:1] == (axis,):
-            array.resize((whole, *array.shape[1:]))
 
 
 class FrameStore:

@@ -5,7 +5,7 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 
 from dvax.app.runs import driver
 from dvax.app.runs.interrupt import exit_code
+from dvax.app.runs.json_files import read_object
 from dvax.app.runs.lock import locked
 from dvax.app.runs.run import RunOutcome
 from dvax.app.runs.sweeps.records import (
@@ -129,7 +130,7 @@ def _results(directory: Path, member: int) -> Results:
 
 def _finished(folder: Path) -> RunOutcome | None:
     """Return the outcome of a run that had ended before its record was written."""
-    manifest = _manifest(folder)
+    manifest = read_object(folder / "manifest.json")
     if manifest.get("status") != "finished" or not (folder / "summary.json").is_file():
         return None
     return RunOutcome("finished", 0, str(manifest["stop_reason"]), folder, {}, True)
@@ -143,22 +144,13 @@ def _resumed(sweep: Sweep, member: int, folder: Path) -> RunOutcome | None:
         return None  # then the member starts again, and reports what is wrong with its input
 
 
-def _manifest(folder: Path) -> Mapping[str, Any]:
-    try:
-        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return manifest if isinstance(manifest, dict) else {}
-
-
 def _bounds(folder: Path) -> dict[str, str]:
     """Return how much is known of each bound in the summary of a run."""
-    file = folder / "summary.json"
-    summary = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    summary = read_object(folder / "summary.json")
     return {name: entry["bound"] for name, entry in summary.items() if "bound" in entry}
 
 
 def _from_manifest(folder: Path) -> dict[str, Any]:
-    manifest = _manifest(folder)
+    manifest = read_object(folder / "manifest.json")
     names = ("steps", "method", "compile_seconds", "dvax", "packages", "precision", "device")
     return {name: manifest[name] for name in names if name in manifest}

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from dvax.app.runs.json_numbers import json_ready
+from dvax.app.runs.json_files import json_ready, read_object
 from dvax.app.runs.rundir import write_json, write_whole
 
 MANIFEST, KIND = "manifest.json", "sweep"
@@ -32,12 +32,8 @@ def write_record(directory: Path, record: Mapping[str, Any]) -> None:
 
 def read_record(directory: Path, member: int) -> dict[str, Any] | None:
     """Return the record of a member; None where there is none, or a damaged one."""
-    file = directory / FOLDER / f"{member:06d}.json"
-    try:
-        record = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return record if isinstance(record, dict) and record.get("member") == member else None
+    record = read_object(directory / FOLDER / f"{member:06d}.json")
+    return record if record.get("member") == member else None
 
 
 def is_complete(record: Mapping[str, Any] | None, hash: str) -> bool:
@@ -61,8 +57,4 @@ def write_lines(directory: Path, count: int) -> None:
 
 def is_sweep(directory: Path) -> bool:
     """Return whether a folder holds a sweep."""
-    try:
-        manifest = json.loads((directory / MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(manifest, dict) and manifest.get("kind") == KIND
+    return read_object(directory / MANIFEST).get("kind") == KIND
