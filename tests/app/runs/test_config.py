@@ -263,28 +263,40 @@ def test_config_long_strings_are_rejected_fast(tmp_path):
     assert time.perf_counter() - start < 3.0
 
 
-def test_config_errors_are_reported_at_once(tmp_path):
+def places_of(path) -> list[str]:
+    with pytest.raises(InputError) as caught:
+        load_config(path)
+    return [problem.place for problem in caught.value.problems]
+
+
+def test_config_errors_of_all_tables_are_reported_at_once(tmp_path):
     changes = {
         "colour": "red",
         "units.pressure": "mm",
         "model.alpha": -1.0,
         "model.kapa0": 2.0,
-        "demand.expression": "sine(t)",
         "demand.sereis": 1,
-        "load.series.file": "none.csv",
-        "load.expression": "foo",
-        "initial": {"profile": {"file": "../x.npy"}, "companion": "s+"},
+        "load.series.colum": "x",
+        "initial.companion": True,
         "time.frames": 0,
         "solver.dt": -1.0,
         "output.png": "yes",
     }
-    with pytest.raises(InputError) as caught:
-        load_config(write(tmp_path, changes))
-    places = "\n".join(problem.place for problem in caught.value.problems)
-    for key in changes:
-        if key != "initial":
-            assert key in places, key
-    for key in ("initial.profile.file", "initial.companion"):
+    found = places_of(write(tmp_path, changes))
+    assert sorted(found) == sorted(f"run.toml: {key}" for key in changes)
+
+
+def test_config_errors_of_all_data_are_reported_at_once(tmp_path):
+    changes = {
+        "demand.expression": "sine(t)",
+        "load.series.file": "none.csv",
+        "load.expression": "foo",
+        "initial": {"profile": {"file": "../x.csv"}, "companion": "s+"},
+        "solver.dt": 2.5,
+        "output.points_of_interest": [50.0],
+    }
+    places = "\n".join(places_of(write(tmp_path, changes)))
+    for key in (*changes, "initial.profile.file", "initial.companion"):
         assert key in places, key
 
 

@@ -7,10 +7,8 @@ import numpy as np
 
 from dvax.app.runs.boundary import Boundary, build_boundary, check_size
 from dvax.app.runs.data_file import DataFile, fingerprint, locate
-from dvax.app.runs.expressions import compile_expression
-from dvax.app.runs.fields import Field, Sources, perturbation, read_field, space_values, to_signal
+from dvax.app.runs.fields import Field, perturbation, read_field, space_values, to_signal
 from dvax.app.runs.measured import read_npy
-from dvax.app.runs.units import Units
 from dvax.errors import Problems, input_error
 
 if TYPE_CHECKING:
@@ -53,52 +51,30 @@ class ContactInputs:
         return to_signal(self.load, self.boundary)
 
 
-def read_inputs(
-    config: "Config",
-    sources: Sources,
-    units: Units,
-    value_has_unit: frozenset[str] = frozenset(),
-    coordinate_names: tuple[str, ...] = ("s",),
-) -> ContactInputs | None:
+def read_inputs(config: "Config", value_has_unit: frozenset[str] = frozenset()) -> ContactInputs:
     """Read and check all data that a configuration names. Raises `InputError` with all problems.
 
-    The configuration may lack sections that were refused before; the rest is checked all the same,
-    and None is returned. `value_has_unit` names the fields whose value was written with a unit,
-    `coordinate_names` are those of a boundary that was refused.
+    `value_has_unit` names the fields whose value was written with a unit.
     """
+    sources, units, end = config.sources, config.units, config.time.end
+    _check_profiles(config)  # a boundary of very many points takes time and memory
+    boundary, boundary_files = _boundary(config)
     problems = Problems()
-    sections = dict(config.__dict__)
-    time, initial = sections.get("time"), sections.get("initial")
-    end = time.end if time is not None else None
-    boundary, boundary_files = None, ()
-    with problems.collect():
-        _check_profiles(sections, sources)  # a boundary of very many points takes time and memory
-        boundary, boundary_files = _boundary(sections.get("boundary"), sources, units)
-    place = boundary or coordinate_names
     fields: dict[str, Field] = {}
     for key, kind in _KINDS.items():
-        if key in sections:
-            with problems.collect():
-                fields[key] = read_field(
-                    sections[key], key, kind, sources, units, place, end,
-                    value_has_unit=key in value_has_unit,
-                )  # fmt: skip
-    shift = None
-    if initial is not None and initial.companion is not None:
-        key = f"{sources.name}: initial.companion"
         with problems.collect():
-            if boundary is not None:
-                shift = perturbation(initial.companion, boundary, key)
-            elif isinstance(initial.companion, str):
-                compile_expression(initial.companion, coordinate_names, place=key)
-    notices: list[str] = []
-    if boundary is not None and "output" in sections:
-        places = sections["output"].points_of_interest or []
-        with problems.collect():
-            notices = _check_points(places, boundary, sources.name, units)
+            fields[key] = read_field(
+                getattr(config, key), key, kind, sources, units, boundary, end,
+                value_has_unit=key in value_has_unit,
+            )  # fmt: skip
+    shift, notices = np.zeros(()), []
+    with problems.collect():
+        companion = config.initial.companion
+        assert companion is not None  # the configuration is complete
+        shift = perturbation(companion, boundary, f"{sources.name}: initial.companion")
+    with problems.collect():
+        notices = _check_points(config, boundary)
     problems.raise_any()
-    if boundary is None or shift is None or time is None or len(fields) < len(_KINDS):
-        return None
     series = fields["demand"].series
     if series is not None and series.kind == "constant":
         notices.append(
@@ -113,22 +89,25 @@ def read_inputs(
         load=fields["load"],
         x0=x0,
         companion_x0=companion_x0,
-        frame_times=np.linspace(0.0, time.end, time.frames + 1),
+        frame_times=np.linspace(0.0, end, config.time.frames + 1),
         data_files=tuple(dict.fromkeys(files)),
         notices=tuple(notices),
     )
 
 
-def _check_profiles(sections: dict[str, Any], sources: Sources) -> None:
+def _check_profiles(config: "Config") -> None:
     """Raise an `InputError` where an NPY profile does not fit the number of points."""
-    shape = getattr(sections.get("boundary"), "points", None)
+    sources, problems = config.sources, Problems()
     for key in _KINDS:
-        profile = getattr(sections.get(key), "profile", None)
-        if shape is None or profile is None or not profile.file.lower().endswith(".npy"):
+        profile = getattr(config, key).profile
+        if config.boundary.points is None or profile is None:
             continue
-        place = f"{sources.name}: {key}.profile"
-        path = locate(profile.file, sources.folder, sources.allow_outside, f"{place}.file")
-        read_npy(profile, path, tuple(shape), place)
+        if profile.file.lower().endswith(".npy"):
+            place = f"{sources.name}: {key}.profile"
+            with problems.collect():
+                path = locate(profile.file, sources.folder, sources.allow_outside, f"{place}.file")
+                read_npy(profile, path, tuple(config.boundary.points), place)
+    problems.raise_any()
 
 
 def _initial_states(
@@ -151,34 +130,30 @@ def _initial_states(
     return x0, companion
 
 
-def _boundary(
-    section: Any, sources: Sources, units: Units
-) -> tuple[Boundary | None, tuple[DataFile, ...]]:
-    """The boundary and its file; None where the section was refused."""
-    if section is None:
-        return None, ()
+def _boundary(config: "Config") -> tuple[Boundary, tuple[DataFile, ...]]:
+    """The boundary and its file."""
+    sources, section = config.sources, config.boundary
     nodes, files = None, ()
     place = f"{sources.name}: boundary"
     if section.file is not None:
         place += ".file"
         nodes = locate(section.file, sources.folder, sources.allow_outside, place)
         files = (fingerprint(section.file, nodes),)
-    boundary = build_boundary(section, nodes, units)
+    boundary = build_boundary(section, nodes, config.units)
     check_size(boundary, place)
     return boundary, files
 
 
-def _check_points(
-    places: list[list[float]], boundary: Boundary, file: str, units: Units
-) -> list[str]:
+def _check_points(config: "Config", boundary: Boundary) -> list[str]:
     """Return notices for points of interest whose nearest point of the boundary is far away.
 
     **Raises:** `InputError` for places off the boundary.
     """
+    places, unit = config.output.points_of_interest or [], config.units.length
     problems = Problems()
     notices: list[str] = []
     for number, place in enumerate(places, start=1):
-        key = f"{file}: output.points_of_interest[{number}]"
+        key = f"{config.source.name}: output.points_of_interest[{number}]"
         if len(place) != len(boundary.coordinates):
             problems.add(
                 key,
@@ -197,7 +172,7 @@ def _check_points(
                 key,
                 str(place),
                 f"{' and '.join(outside)} lies off the boundary",
-                f"Choose a place on the boundary, in {units.length}.",
+                f"Choose a place on the boundary, in {unit}.",
             )
             continue
         index = boundary.nearest(place)
@@ -206,8 +181,8 @@ def _check_points(
         # Half a cell is expected; a visible distance is reported.
         if max(abs(a - p) for a, p in zip(at, place, strict=True)) > 0.01 * extent:
             notices.append(
-                f"Point of interest {place} {units.length}: the nearest point is "
-                f"{[float(f'{a:.9g}') for a in at]} {units.length}."
+                f"Point of interest {place} {unit}: the nearest point is "
+                f"{[float(f'{a:.9g}') for a in at]} {unit}."
             )
     problems.raise_any()
     return notices

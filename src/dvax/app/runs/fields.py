@@ -57,21 +57,19 @@ def read_field(
     kind: str,
     sources: Sources,
     units: Units,
-    boundary: Boundary | tuple[str, ...],
-    end: float | None,
+    boundary: Boundary,
+    end: float,
     *,
     value_has_unit: bool = False,
 ) -> Field:
     """Read, compile and check all factors of ``[key]``, a quantity of the given `kind`.
 
-    `end` is the end of the run, None where it is unknown. Where the boundary is unknown, pass the names
-    of its coordinates instead; profiles then stay unread. Raises `InputError` with the problems
-    of every factor.
+    `end` is the end of the run. Raises `InputError` with the problems of every factor.
     """
     problems = Problems()
     files: list[DataFile] = []
     prefix = f"{sources.name}: {key}"
-    names = boundary.names if isinstance(boundary, Boundary) else boundary
+    names = boundary.names
     names = names if isinstance(section, InitialSection) else ("t", *names)
     expression, series, profile = None, None, None
 
@@ -90,9 +88,7 @@ def read_field(
     with problems.collect():
         part, place = section.profile, f"{prefix}.profile"
         if part is not None:
-            path = open_file(part, place)
-            if isinstance(boundary, Boundary):
-                profile = read_profile(part, path, units, kind, boundary, place)
+            profile = read_profile(part, open_file(part, place), units, kind, boundary, place)
     problems.raise_any()
     carriers = ["value"] if value_has_unit else []
     carriers += ["series"] if series is not None and series.carries_unit else []
@@ -107,8 +103,7 @@ def read_field(
     knots = () if isinstance(section, InitialSection) else tuple(section.knots or ())
     constant = 1.0 if section.value is None else section.value
     field = Field(constant, expression, knots, series, profile, tuple(files))
-    if isinstance(boundary, Boundary):
-        _check_finite(field, boundary, end, prefix)
+    _check_finite(field, boundary, end, prefix)
     return field
 
 

@@ -57,7 +57,7 @@ class Profile:
 
 
 def read_series(
-    section: SeriesSection, path: Path, units: Units, kind: str, end: float | None, place: str
+    section: SeriesSection, path: Path, units: Units, kind: str, end: float, place: str
 ) -> Series:
     """Read a history that covers [0, end]; `kind` is the quantity of the field.
 
@@ -98,14 +98,14 @@ def read_series(
         )
     # The last time of a table in other units may miss `end` by a rounding error of the conversion.
     slack = 1e-12 * abs(times[-1])
-    if end is not None and (times[0] > 0 or times[-1] < end - slack):
+    if times[0] > 0 or times[-1] < end - slack:
         raise input_error(
             place,
             f"{path.name} from {times[0]:.12g} to {times[-1]:.12g} {units.time}",
             f"the data covers the run from 0 to {end:.12g} {units.time}: nothing is extrapolated",
             "Shorten time.end, or measure for longer.",
         )
-    if end is not None and times[-1] < end:
+    if times[-1] < end:
         times = np.append(times[:-1], end)
     return Series(times, values, section.kind, carries_unit)
 

@@ -2,12 +2,11 @@
 
 Every physical quantity is a number in the working units of ``[units]`` or a text "number unit",
 which is converted as it is read, so a validated configuration holds numbers alone. Rules that
-concern one value stand here, as do the reasons for them, which error messages repeat; rules between
-values stand in `dvax.app.runs.consistency`.
+concern the values of one section stand here, as do the reasons for them, which error messages repeat.
 """
 
 import math
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -18,6 +17,7 @@ from pydantic import (
     PlainValidator,
     ValidationInfo,
     field_validator,
+    model_validator,
 )
 from pydantic_core import PydanticCustomError
 
@@ -220,6 +220,31 @@ class BoundarySection(Section):
     ) = Field(None, description="midpoints of equal cells, one number a direction")
     file: str | None = Field(None, description="CSV file with the columns s and weight")
 
+    @field_validator("points")
+    @classmethod
+    def _directions(cls, points: list[int], info: ValidationInfo) -> list[int]:
+        sides = [name for name in ("length", "lengths") if info.data.get(name) is not None]
+        if sides == ["lengths"] and len(points) == 1:
+            raise rule_error(
+                "lengths = [a, b] needs a number of points for each direction",
+                "Write points = [n1, n2]",
+            )
+        if sides == ["length"] and len(points) > 1:
+            raise rule_error(
+                "length = ... is one-dimensional and has one number of points",
+                "Write points = n, or lengths = [a, b]",
+            )
+        return points
+
+    @model_validator(mode="after")
+    def _one_boundary(self) -> Self:
+        if self.model_fields_set not in ({"length", "points"}, {"lengths", "points"}, {"file"}):
+            raise rule_error(
+                "a boundary is length and points, or lengths and points, or a file of nodes",
+                "Give exactly one of the three",
+            )
+        return self
+
 
 class SeriesSection(Section):
     """A measured function of time."""
@@ -277,6 +302,25 @@ class DrivingSection(FieldSection):
         None, description="times where the formula has a kink"
     )
     series: SeriesSection | None = Field(None, description="a measured history")
+
+    @field_validator("knots")
+    @classmethod
+    def _of_formula(cls, knots: list[float], info: ValidationInfo) -> list[float]:
+        if info.data.get("expression", "") is None:
+            raise rule_error(
+                "knots are the times where the expression has a kink; measured data has its own",
+                "Remove knots or give the expression",
+            )
+        return knots
+
+    @model_validator(mode="after")
+    def _has_factor(self) -> Self:
+        if not {"value", "expression", "series", "profile"} & self.model_fields_set:
+            raise rule_error(
+                "it is the product of value, expression, series and profile, at least one of them",
+                "Write value = 0.0 for none",
+            )
+        return self
 
 
 class DemandSection(DrivingSection):

@@ -9,15 +9,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from dvax.app.runs.applications import models
 from dvax.app.runs.config import Config, check_contact
 from dvax.app.runs.data_file import DataFile, fingerprint, locate
 from dvax.app.runs.schema import SECTIONS, ModelSection, ReportSection, Section
-from dvax.app.runs.schema_errors import shown, translate, unknown_key
+from dvax.app.runs.schema_errors import shown
+from dvax.app.runs.sections import read_sections
 from dvax.app.runs.toml_file import read_toml
-from dvax.app.runs.units import Units
 from dvax.app.runs.wording import Wording
 from dvax.errors import Problems, input_error
 
@@ -33,7 +33,6 @@ APPLICATIONS = tuple(
 """The names of `[model]` that are applications: every module in `models`."""
 
 NAMES = ("contact", *APPLICATIONS)
-_SECTIONS = ("model", "output")
 
 
 def module_of(name: str) -> ModuleType:
@@ -183,18 +182,8 @@ def _check(
 ) -> ModelConfig:
     file = source.name
     application = module_of(name).APPLICATION
-    problems = Problems()
-    for key, value in raw.items():
-        if key not in _SECTIONS:
-            problems.append(unknown_key(f"{file}: {key}", key, value, list(_SECTIONS)))
-    sections: dict[str, Any] = {}
-    for key, kind in (("model", application.section), ("output", ReportSection)):
-        try:
-            sections[key] = kind.model_validate(raw.get(key, {}), context={"units": Units()})
-        except ValidationError as error:
-            problems += translate(error, file, key, kind)
-    problems.raise_any()
-    table = sections["model"]
+    sections = read_sections(raw, {"model": application.section, "output": ReportSection}, file)
+    problems, table = Problems(), sections["model"]
     paths: dict[str, Path] = {}
     for key in (*application.files, *application.folders):
         given = getattr(table, key)
