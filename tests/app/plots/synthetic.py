@@ -60,7 +60,7 @@ def write_run(folder: Path, recipe: Recipe = Recipe()) -> Path:
     regime = np.where(drive <= 0, 0, np.where(drive >= KAPPA, 2, 1)).astype(np.int8)
     weight = np.full(drive.shape[1], 100.0 / drive.shape[1])
     decay = np.exp(-0.31 * time)
-    norm = "um mm^(d/2)"
+    norm = "um mm^(1/2)"
     series = {
         "demand_mean": (1.0 + 0 * time, "um", {}),
         "load_mean": (load, "um/s", {}),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from dvax.app.runs.config import build_contact, load_config, with_points
+from dvax.app.runs.config import build_contact, load_config
 from dvax.app.runs.resolved import write_resolved
 from dvax.errors import InputError
 
@@ -149,11 +149,6 @@ def test_config_knots_of_a_formula_reach_the_signal(tmp_path):
     demand = {"expression": "where(t < 1, t, 1)", "knots": ["1000 ms"]}
     signal = build_contact(load_config(write(tmp_path, {"demand": demand}))).demand_signal
     np.testing.assert_allclose(signal.knots(), [1.0])
-
-
-def test_config_with_another_resolution(tmp_path):
-    config = load_config(write(tmp_path, {"demand": {"value": 1.0}}))
-    assert build_contact(with_points(config, 50)).boundary.size == 50
 
 
 WRONG = {

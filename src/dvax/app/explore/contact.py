@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dvax._figure_text import entry_text
+from dvax.app.explore import run_drawings
 from dvax.app.explore.contact_data import LETTERS, Data
 from dvax.app.explore.contact_drawings import ContactFrames, Fields, Prediction, drawings
 from dvax.app.explore.files import code_of_configuration, configuration_text
@@ -177,33 +177,8 @@ class ContactSubject(AbstractSubject):
             rows["regime"].astype(np.int8), np.asarray(bound.x), np.asarray(bound.u), bound.status,
             norm_unit(config, len(inputs.boundary.names)),
         )  # fmt: skip
-        numbers = [
-            Number(name.replace("_", " "), entry_text(e), unit_text(e["unit"]), e["meaning"])
-            for name, e in ((name, summary[name]) for name in _HEADLINES)
-        ]
-        return _Solved(fields, numbers, self._certificate(fields, summary))
-
-    def _certificate(self, fields: Fields, summary: Mapping[str, Any]) -> Certificate:
-        unit, time = unit_text(fields.norm), unit_text(self.config.units.time)
-        x, u = (
-            entry_text({"value": float(v[-1]), "bound": fields.status})
-            for v in (fields.bound_x, fields.bound_u)
-        )
-        rate = float(summary["sharp_decay_rate"]["value"])
-        decay = (
-            f"Two trajectories approach each other at a rate of {rate:.4g} 1/{time} at least."
-            if rate > 0
-            else f"No decay is certified: two trajectories may part at {-rate:.4g} 1/{time}."
-        )
-        end = f"t = {fields.times[-1]:g} {time}"
-        return Certificate(
-            fields.status,
-            (
-                f"At {end} the error of the indentation is {x} {unit}, and that of the reaction "
-                f"{u} {unit}, in the L2 norm of the boundary.",
-                decay,
-            ),
-        )
+        numbers = run_drawings.numbers({name: summary[name] for name in _HEADLINES})
+        return _Solved(fields, numbers, run_drawings.certificate(summary))
 
     def _predict(self, question: Question, key: str) -> Prediction:
         parameter = self._labels[key]

@@ -9,11 +9,11 @@ from dvax.app.explore.drawing import POWERS, PREDICTED, layout, line, single
 from dvax.app.explore.subject import AbstractFrames, Drawing
 from dvax.app.plots.downsample import REGIMES, SPACE_CELLS, TIME_CELLS, edges, starts
 from dvax.app.plots.lines import positive
+from dvax.app.plots.maps import REGIME_SCALE
 from dvax.app.plots.picture import Views
 from dvax.app.plots.theme import (
     MUTED,
     PRESSURE_MAP,
-    REGIME_COLOURS,
     SERIES,
     axis_title,
     quantity,
@@ -22,11 +22,6 @@ from dvax.app.plots.theme import (
 from dvax.app.runs.boundary import Boundary
 from dvax.app.runs.units import Units
 
-REGIME_SCALE = [
-    [edge, colour]
-    for index, colour in enumerate(REGIME_COLOURS)
-    for edge in (index / len(REGIMES), (index + 1) / len(REGIMES))
-]
 REGIME_WORDS = "0 unloaded, 1 active, 2 saturated"
 
 

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 
 from dvax._figure_text import entry_text
-from dvax.app.explore.contact_drawings import REGIME_SCALE, REGIME_WORDS
+from dvax.app.explore.contact_drawings import REGIME_WORDS
 from dvax.app.explore.drawing import layout, line, of_picture, single
 from dvax.app.explore.subject import AbstractFrames, Certificate, Drawing, Number
 from dvax.app.plots.applications import application_pictures
 from dvax.app.plots.certificate import certificate_picture
 from dvax.app.plots.downsample import downsample, starts
 from dvax.app.plots.histories import histories_picture
-from dvax.app.plots.maps import map_pictures, shares_picture
+from dvax.app.plots.maps import REGIME_SCALE, map_pictures, shares_picture
 from dvax.app.plots.picture import Picture
 from dvax.app.plots.run_reader import CONTACT, RunRecord
 from dvax.app.plots.separation import separation_picture

@@ -37,7 +37,7 @@ from dvax.app.plots.theme import (
 
 MOST_TIMES, STILL_TIMES = 24, 6
 CELLS_PER_SIDE = 128
-_REGIME_SCALE = [
+REGIME_SCALE = [
     [edge, colour]
     for index, colour in enumerate(REGIME_COLOURS)
     for edge in (index / len(REGIMES), (index + 1) / len(REGIMES))
@@ -72,7 +72,7 @@ class Colours:
 
 
 _REGIMES = Colours(
-    dict(zmin=-0.5, zmax=2.5, colorscale=_REGIME_SCALE, showscale=False),
+    dict(zmin=-0.5, zmax=2.5, colorscale=REGIME_SCALE, showscale=False),
     dict(
         cmap=ListedColormap(list(REGIME_COLOURS)),
         norm=BoundaryNorm([-0.5, 0.5, 1.5, 2.5], len(REGIMES)),

@@ -139,12 +139,8 @@ class RunRecord:
         return self[name].values.astype(float)
 
     def unit(self, name: str) -> str:
-        """The unit of a variable or coordinate, as the trajectory declares it.
-
-        Norms in L2 over a boundary of dimension d have the unit length^(d/2) in them.
-        """
-        half = "^0.5" if len(self.boundary_shape) == 1 else ""
-        return self[name].unit.replace("^(d/2)", half)
+        """The unit of a variable or coordinate, as the trajectory declares it."""
+        return self[name].unit
 
 
 def read_run(directory: Path) -> RunRecord:

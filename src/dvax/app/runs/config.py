@@ -40,12 +40,6 @@ def build_contact(config: Config) -> ContactInputs:
     return read_inputs(config)
 
 
-def with_points(config: Config, points: int) -> Config:
-    """The same configuration on a one-dimensional boundary of other resolution."""
-    boundary = config.boundary.model_copy(update={"points": [points]})
-    return config.model_copy(update={"boundary": boundary})
-
-
 def check_contact(raw: dict[str, Any], source: Path, allow_outside: bool) -> Config:
     """The configuration of a contact law, checked and completed."""
     file = source.name
