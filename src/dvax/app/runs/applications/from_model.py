@@ -250,6 +250,13 @@ class AbstractModelApplication(abc.ABC):
             else {"error_bound": bound.figure(self.bound_unit, self.bound_words)}
         )
 
+    def decay_figure(self, words: str) -> dict[str, Figure]:
+        """The certified rate at which two `words`, such as states, approach."""
+        constants, unit = self.constants, self.own.time_unit
+        assert constants is not None  # a model that has this figure declares them
+        said = f"two {words} certainly approach at this rate"
+        return {"decay_rate": Figure(float(constants.sharp_decay_rate) + 0.0, f"1/{unit}", said)}
+
     def named(self, solution: Solution) -> dict[str, Variable]:
         """The states and responses by the names of the model."""
         found = {}

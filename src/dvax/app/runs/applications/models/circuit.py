@@ -99,10 +99,7 @@ class CircuitApplication(AbstractModelApplication):
             **found,
             **self.bound_figure(bound),
             **self.bounds_of_states(bound),
-            "decay_rate": Figure(
-                float(c.constants.sharp_decay_rate) + 0.0, "1/s",
-                "two runs certainly approach at this rate in the norm of the energy",
-            ),
+            **self.decay_figure("runs, in the norm of the energy,"),
         }  # fmt: skip
 
     def bounds_of_states(self, bound: Certificate | None) -> dict[str, Figure]:

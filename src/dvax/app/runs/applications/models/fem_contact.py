@@ -180,10 +180,7 @@ class FemContactApplication(AbstractModelApplication):
                 certified, "[p][x]^(1/2)",
                 f"bound on the error of the pressure at rest, in L2 ({known})", bound=known,
             ),
-            "decay_rate": Figure(
-                float(m.constants.sharp_decay_rate), "1/[t]",
-                "two states certainly approach at this rate in the norm of the viscosity",
-            ),
+            **self.decay_figure("states, in the norm of the viscosity,"),
             **self.bound_figure(bound),
         }  # fmt: skip
 

@@ -146,10 +146,7 @@ class MarketApplication(AbstractModelApplication):
                     "most that the sticky price is away from the price at rest",
                 ),
                 **self.bound_figure(bound),
-                "decay_rate": Figure(
-                    float(self.market.constants.sharp_decay_rate), "1/h",
-                    "two prices certainly approach at this rate",
-                ),
+                **self.decay_figure("prices"),
             }  # fmt: skip
         return figures
 

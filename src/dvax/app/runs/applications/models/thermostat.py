@@ -214,10 +214,7 @@ class ThermostatApplication(AbstractModelApplication):
                 float(np.trapezoid(series["below_set_point"], times)), "K h",
                 "temperature below the set point, mean of the floor, over time",
             ),
-            "decay_rate": Figure(
-                float(self.floor.constants.sharp_decay_rate), "1/h",
-                "two temperatures certainly approach at this rate",
-            ),
+            **self.decay_figure("temperatures"),
         }  # fmt: skip
         return self.joined(self.final_values(end) | self.bound_figure(bound), figures)
 
