@@ -141,16 +141,16 @@ def test_lead_falls_back_to_the_constants() -> None:
         ("interrupted", "The run was interrupted before its end"),
         ("failed", "The run failed before its end"),
         ("killed", "The run was killed before its end"),
-        ("running", "The run has not ended"),
+        ("running", "The run had not ended"),
     ],
 )
 def test_lead_says_how_an_unfinished_run_ended(tmp_path: Path, status: str, words: str) -> None:
     recipe = Recipe((40,), frames=21, written=11, status=status)
     told = lead(read_run(write_run(tmp_path / "some", recipe)))[0]
     assert "the contact law at 40 points of the boundary from 0 to 20 (of 40) s" in told
-    assert words in told and told.endswith("the results are partial.")
+    assert words in told and told.endswith("The results are partial.")
     empty = lead(read_run(write_run(tmp_path / "none", replace(recipe, written=0))))
-    assert "there are no results for the contact law" in empty[0]
+    assert "There are no results for the contact law" in empty[0]
     assert not any("error bound" in text for text in empty)
 
 

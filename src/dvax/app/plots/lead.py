@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from dvax._figure_text import entry_text
-from dvax.app.plots.run_reader import CONTACT, RunRecord
+from dvax.app.plots.run_reader import CONTACT, UNFINISHED, RunRecord
 from dvax.app.plots.theme import counted, number, unit_text
 from dvax.theory.status import ORDER
 
@@ -26,12 +26,6 @@ SUBJECTS = {
 }
 _STATE_BOUNDS = ("error_bound", "error_bound_sharp_x", "error_bound_x")
 """The figures that bound the error of the state."""
-_ENDINGS = {
-    "interrupted": "The run was interrupted before its end",
-    "failed": "The run failed before its end",
-    "killed": "The run was killed before its end",
-    "running": "The run has not ended, or was killed",
-}
 _RESTS_ON = {
     "proved": "it follows from the structure of the problem, up to roundoff",
     "declared": "it rests on constants that the problem declares",
@@ -49,8 +43,8 @@ def lead(run: RunRecord) -> list[str]:
 def _solved(run: RunRecord) -> str:
     """What was solved, over which time, how it ended."""
     if run.trajectory is None:
-        ending = _ENDINGS.get(run.status, "The run ended")
-        return f"{ending}: there are no results for {_subject(run)}."
+        ending = UNFINISHED.get(run.status, "The run ended.")
+        return f"{ending} There are no results for {_subject(run)}."
     steps, method = run.manifest.get("steps"), run.manifest.get("method")
     # The method may be followed by the reason for its choice.
     name = f" of {str(method).partition(':')[0]}" if method else ""
@@ -60,8 +54,8 @@ def _solved(run: RunRecord) -> str:
     text = f"This run solved {_subject(run)}{_size(run)}{_span(run)}{how}{saved}."
     if run.resumed:
         text += f" It was resumed at {' and '.join(run.resumed)}."
-    if run.status in _ENDINGS:
-        text += f" {_ENDINGS[run.status]}: the results are partial."
+    if run.status in UNFINISHED:
+        text += f" {UNFINISHED[run.status]} The results are partial."
     return text
 
 
