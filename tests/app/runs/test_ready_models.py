@@ -207,8 +207,8 @@ def test_quantities_and_files_are_converted_to_the_units_of_a_model(tmp_path):
     assert room.table.t_end == 24.0 and room.table.capacity == pytest.approx(50.0)
     assert [float(room.set_point(t)) for t in (6.4, 6.6, 22.1)] == [17.0, 21.0, 16.0]
     plant = model_of(tmp_path, PLANT + 'reference = "reference.csv"\n')
-    np.testing.assert_allclose(plant.reference.rows[:, 0], [0.2, -0.1, -0.1], rtol=1e-14)
-    np.testing.assert_allclose(plant.feed.rows[:, 0], [0.2, -0.1, -0.1], rtol=1e-12)
+    np.testing.assert_allclose(plant.reference.values[:, 0], [0.2, -0.1, -0.1], rtol=1e-14)
+    np.testing.assert_allclose(plant.feed.values[:, 0], [0.2, -0.1, -0.1], rtol=1e-12)
 
 
 @pytest.mark.thorough

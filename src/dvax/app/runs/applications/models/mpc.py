@@ -5,8 +5,9 @@ import math
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal
 
+import jax
 import numpy as np
 from pydantic import Field, PlainValidator
 
@@ -79,21 +80,9 @@ class MpcSection(FramesKeys):
     t_end: Annotated[float, in_unit("s")] = Field(20.0, gt=0, description="end of the run [s]")
 
 
-class _Rows(NamedTuple):
-    """States or inputs (m, n) at times (m,), and how they are joined."""
-
-    times: np.ndarray
-    rows: np.ndarray
-    kind: Literal["constant", "linear"]
-
-    def table(self) -> Table:
-        return Table(self.times, self.rows, self.kind)
-
-    def at(self, ts: np.ndarray) -> np.ndarray:
-        """Return the rows at these times."""
-        if self.kind == "constant":
-            return self.rows[np.searchsorted(self.times, ts, side="right") - 1]
-        return np.stack([np.interp(ts, self.times, column) for column in self.rows.T], axis=1)
+def _at(table: Table, ts: np.ndarray) -> np.ndarray:
+    """Return the rows of a table at these times."""
+    return np.asarray(jax.vmap(table.value)(ts))
 
 
 def _matrix(given: Any, name: str, path: Path | None) -> np.ndarray:
@@ -110,14 +99,14 @@ def _matrix(given: Any, name: str, path: Path | None) -> np.ndarray:
     return np.array(given, float)
 
 
-def _holding(A: np.ndarray, B: np.ndarray, reference: _Rows) -> tuple[_Rows, float]:
+def _holding(A: np.ndarray, B: np.ndarray, reference: Table) -> tuple[Table, float]:
     """Return the inputs that hold the reference best, and the largest |x'| that remains."""
     if not len(A) == A.shape[1] == len(B):
         return reference, 0.0  # the controller rejects these matrices
-    push = reference.rows @ A.T
+    push = np.asarray(reference.values) @ A.T
     inputs = np.linalg.lstsq(B, -push.T, rcond=None)[0].T
     miss = float(np.linalg.norm(push + inputs @ B.T, axis=1).max())
-    return reference._replace(rows=inputs), miss
+    return Table(reference.times, inputs, reference.kind), miss
 
 
 class MpcApplication(AbstractModelApplication):
@@ -161,8 +150,7 @@ class MpcApplication(AbstractModelApplication):
         self.feed, self.miss = _holding(found["A"], found["B"], self.reference)
         self.mpc = LinearMPC(
             **found, horizon=table.horizon, step=table.step, slew=table.slew, lower=table.lower,
-            upper=table.upper, target=self.reference.table(), feed=self.feed.table(),
-            disturbance=push.table(),
+            upper=table.upper, target=self.reference, feed=self.feed, disturbance=push,
         )  # fmt: skip
         model = Model(
             self.mpc.problem, x0, table.t_end, states=self.state_units, responses={"plan": ""},
@@ -196,12 +184,12 @@ class MpcApplication(AbstractModelApplication):
 
     def _rows(
         self, key: str, kind: Literal["constant", "linear"], paths: Mapping[str, Path]
-    ) -> "_Rows":
+    ) -> Table:
         """Return states over time: from a file, or the same one all the time."""
         given, end = getattr(self.table, key), self.table.t_end
         if not isinstance(given, str):
             row = np.zeros(len(self.state_units)) if given is None else self._state(key, given)
-            return _Rows(np.array([0.0, end]), np.stack([row, row]), kind)
+            return Table(np.array([0.0, end]), np.stack([row, row]), kind)
         path, is_reference = paths[key], key == "reference"
         units = {n: u if is_reference else f"({u or '1'})/s" for n, u in self.state_units.items()}
         data = read_history(path, units, "s").check_covers(path, end, "s")
@@ -212,7 +200,7 @@ class MpcApplication(AbstractModelApplication):
                 "a reference has a column for each state", "Add it: 0 for a velocity at rest",
             )  # fmt: skip
         zero = np.zeros(len(data.times))
-        return _Rows(data.times, np.stack([data.columns.get(n, zero) for n in units], axis=1), kind)
+        return Table(data.times, np.stack([data.columns.get(n, zero) for n in units], axis=1), kind)
 
     @cached_property
     def verification(self) -> Any:
@@ -238,7 +226,7 @@ class MpcApplication(AbstractModelApplication):
                 f"{self.miss:.3g} there, so that the state stays away from it."
             )
         low, high = np.asarray(self.mpc.lower), np.asarray(self.mpc.upper)
-        if np.any((self.feed.rows < low) | (self.feed.rows > high)):
+        if np.any((self.feed.values < low) | (self.feed.values > high)):
             found.append(
                 "The input that holds model.reference is beyond model.lower or model.upper."
             )
@@ -252,7 +240,7 @@ class MpcApplication(AbstractModelApplication):
     def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
         times, x, u = (np.asarray(v) for v in (solution.ts, solution.xs, solution.us))
         wanted, u, time, found = (
-            self.reference.at(times),
+            _at(self.reference, times),
             u[:, : len(self.input_units)],
             ("time",),
             {},
@@ -268,7 +256,7 @@ class MpcApplication(AbstractModelApplication):
             ):  # fmt: skip
                 key = f"{prefix}_{store_name(name)}"
                 found[key] = Variable(time, values, unit, f"{words} {name}")
-        apart, moved = x - wanted, u - self.feed.at(times)
+        apart, moved = x - wanted, u - _at(self.feed, times)
         rate = np.einsum("ti,ij,tj->t", apart, self.weights[0], apart)
         rate += np.einsum("ti,ij,tj->t", moved, self.weights[1], moved)
         at_limit = ((u <= low) | (u >= high)).any(axis=1).astype(float)
@@ -287,7 +275,7 @@ class MpcApplication(AbstractModelApplication):
             )
             for name, unit in self.input_units.items()
         }  # fmt: skip
-        last = np.asarray(end.xs)[-1] - self.reference.at(times[-1:])[0]
+        last = np.asarray(end.xs)[-1] - _at(self.reference, times[-1:])[0]
         limited = np.trapezoid(series["at_limit"], times) / (times[-1] - times[0] or 1.0)
         figures |= {
             "final_distance": Figure(
