@@ -25,7 +25,7 @@ def test_demo_runs_at_few_points_and_is_self_contained(tmp_path: Path) -> None:
     assert (out / "report.html").is_file()
     # Its sampled input was in a folder that is gone; the run keeps copies of what it read.
     again = load_config(out / "config.resolved.toml")
-    assert again.boundary.points == (50,)
+    assert again.boundary.points == [50]
     assert build_contact(again).boundary.size == 50
 
 
