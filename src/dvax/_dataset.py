@@ -15,7 +15,7 @@ import numpy as np
 
 from . import _tree
 from ._tree import Tree
-from .errors import InputError, InputProblem
+from .errors import input_error
 
 Variable = tuple[tuple[str, ...], Any, dict[str, Any]]
 Names = Mapping[str, str] | Sequence[str] | None
@@ -50,11 +50,9 @@ def dataset(
     xarray = required("xarray", place)
     every = {**variables, **(coords or {})}
     if not _tree.is_concrete([values for _, values, _ in every.values()]):
-        raise InputError(
-            InputProblem(
-                place, "a result inside a compiled program", "a dataset holds numbers",
-                "Call it outside of jax.jit, jax.vmap and jax.grad",
-            )
+        raise input_error(
+            place, "a result inside a compiled program", "a dataset holds numbers",
+            "Call it outside of jax.jit, jax.vmap and jax.grad",
         )  # fmt: skip
     about = {"Conventions": "CF-1.11", "source": f"dvax {version('dvax')}", **(attrs or {})}
     return xarray.Dataset(*(_as_numpy(v) for v in (variables, coords or {})), attrs=about)
@@ -87,22 +85,18 @@ def named(rows: Tree, names: Names, symbol: str, place: str) -> dict[str, tuple[
         of = [symbol] if len(leaves) == 1 else [f"{symbol}{k}" for k in range(len(leaves))]
         return {name: (leaf, None) for name, leaf in zip(of, leaves, strict=True)}
     if isinstance(names, str) or not isinstance(names, Mapping | Sequence):
-        raise InputError(
-            InputProblem(
-                place, _tree.line(names), "it is a dictionary of names and units, or a list of names",
-                'Write {"position": "m"}, say',
-            )
+        raise input_error(
+            place, _tree.line(names), "it is a dictionary of names and units, or a list of names",
+            'Write {"position": "m"}, say',
         )  # fmt: skip
     units = dict(names) if isinstance(names, Mapping) else dict.fromkeys(map(str, names))
     entries = sum(math.prod(leaf.shape[1:]) for leaf in leaves)
     if len(units) not in (len(leaves), entries) or len(units) < len(names):
         parts = f", or for each of the {len(leaves)} parts" if len(leaves) != entries else ""
-        raise InputError(
-            InputProblem(
-                place, ", ".join(map(str, names)),
-                f"it needs a name of its own for each of the {entries} entries{parts}",
-                "Add or remove names",
-            )
+        raise input_error(
+            place, ", ".join(map(str, names)),
+            f"it needs a name of its own for each of the {entries} entries{parts}",
+            "Add or remove names",
         )  # fmt: skip
     if len(units) == entries:
         flat = np.concatenate([np.asarray(v).reshape(len(v), -1) for v in leaves], axis=1)

@@ -12,7 +12,7 @@ import numpy as np
 from equinox import is_array_like
 from jax import lax
 
-from .errors import InputError, InputProblem
+from .errors import InputError, input_error
 
 Tree = Any
 """A pytree of arrays of one floating type."""
@@ -113,39 +113,33 @@ def same_values(a: Tree, b: Tree) -> bool:
 def fits(name: str, given: Any, like: Tree, what: str) -> None:
     """Raise an `InputError` unless the array `given` has exactly the shape of `like`."""
     if isinstance(like, tuple) or jnp.shape(given) != jnp.shape(like):
-        raise InputError(
-            InputProblem(
-                name,
-                f"shape {jnp.shape(given)}",
-                f"it acts entry by entry on the {what}, whose elements have shape {shapes(like)}",
-                "Give it that shape, or pass state_space= or control_space= to dvax.Problem",
-            )
+        raise input_error(
+            name,
+            f"shape {jnp.shape(given)}",
+            f"it acts entry by entry on the {what}, whose elements have shape {shapes(like)}",
+            "Give it that shape, or pass state_space= or control_space= to dvax.Problem",
         )
 
 
 def fits_matrix(name: str, matrix: Any, like: Tree, what: str) -> None:
     """Raise an `InputError` unless `like` is a vector that the square `matrix` can act on."""
     if isinstance(like, tuple) or jnp.shape(like) != jnp.shape(matrix)[:1]:
-        raise InputError(
-            InputProblem(
-                name,
-                f"shape {jnp.shape(matrix)}",
-                f"it acts on the {what}, whose elements have shape {shapes(like)}",
-                "Give it as many rows as the vector has entries; state and control must be vectors",
-            )
+        raise input_error(
+            name,
+            f"shape {jnp.shape(matrix)}",
+            f"it acts on the {what}, whose elements have shape {shapes(like)}",
+            "Give it as many rows as the vector has entries; state and control must be vectors",
         )
 
 
 def fits_parts(name: str, count: int, like: Tree, what: str) -> None:
     """Raise an `InputError` unless `like` is a tuple of `count` parts."""
     if not isinstance(like, tuple) or len(like) != count:
-        raise InputError(
-            InputProblem(
-                name,
-                f"{count} parts",
-                f"it acts on the {what}, whose elements have shape {shapes(like)}",
-                "Give one part for each, and pass the spaces as dvax.spaces.Product(...)",
-            )
+        raise input_error(
+            name,
+            f"{count} parts",
+            f"it acts on the {what}, whose elements have shape {shapes(like)}",
+            "Give one part for each, and pass the spaces as dvax.spaces.Product(...)",
         )
 
 
@@ -235,21 +229,21 @@ def as_array(a: Any, name: str, min_size: int = 1) -> jax.Array:
     if isinstance(a, tuple):
         fix = f"Write jnp.array({[*a]!r})" if _are_numbers(a) else "Join them into one array"
         rule = "it must be one array: a tuple is an element of a direct sum, one array a part"
-        raise InputError(InputProblem(name, line(a), rule, fix))
+        raise input_error(name, line(a), rule, fix)
     array = _float_array(a, name, "it must be a real number or a floating-point array")
     if array.size < min_size:
         given, rule = f"an array of shape {array.shape}", "it must have at least one entry"
-        raise InputError(InputProblem(name, given, rule, "Give a number or a vector with entries"))
+        raise input_error(name, given, rule, "Give a number or a vector with entries")
     return array
 
 
 def as_number(a: Any, name: str, fix: str) -> jax.Array:
     """Return one floating-point number; `fix` is the advice for an array of several numbers."""
     if isinstance(a, tuple):
-        raise InputError(InputProblem(name, line(a), "it must be one number", fix))
+        raise input_error(name, line(a), "it must be one number", fix)
     number = _float_array(a, name, "it must be one real number")
     if number.shape != ():
-        raise InputError(InputProblem(name, _short_array(number), "it must be one number", fix))
+        raise input_error(name, _short_array(number), "it must be one number", fix)
     return number
 
 
@@ -262,14 +256,14 @@ def as_shape(shape: Any, name: str, fix: str) -> tuple[int, ...]:
         sizes, integers = (), (0,)
     if any(isinstance(n, bool) for n in sizes) or min(integers, default=1) < 1:
         rule = "it must be a whole number > 0, or a tuple of these"
-        raise InputError(InputProblem(name, line(shape), rule, fix))
+        raise input_error(name, line(shape), rule, fix)
     return integers
 
 
 def check_kind(given: Any, kind: Any, name: str, rule: str, fix: str) -> None:
     """Raise an `InputError` unless `given` is an instance of `kind`."""
     if not isinstance(given, kind):
-        raise InputError(InputProblem(name, _described(given), rule, fix))
+        raise input_error(name, _described(given), rule, fix)
 
 
 def check_parts(parts: tuple[Any, ...], kind: type, name: str, example: str) -> None:
@@ -280,7 +274,7 @@ def check_parts(parts: tuple[Any, ...], kind: type, name: str, example: str) -> 
     for number, part in enumerate(parts, start=1):
         check_kind(part, kind, f"{name}, part {number}", rule, fix)
     if not parts:
-        raise InputError(InputProblem(name, "no parts", f"it needs one {noun} or more", fix))
+        raise input_error(name, "no parts", f"it needs one {noun} or more", fix)
 
 
 def check_tolerance(tol: Any, name: str) -> None:
@@ -288,7 +282,7 @@ def check_tolerance(tol: Any, name: str) -> None:
     number = isinstance(tol, int | float | np.floating) and not isinstance(tol, bool)
     if not (number and 0 <= tol < np.inf):
         rule = "it must be a finite number ≥ 0 that is not traced"
-        raise InputError(InputProblem(name, _described(tol), rule, "Leave it out for the default"))
+        raise input_error(name, _described(tol), rule, "Leave it out for the default")
 
 
 def _are_numbers(a: tuple[Any, ...]) -> bool:
@@ -345,16 +339,14 @@ def require(condition: Callable[[], Any], name: str, given: Any, rule: str, fix:
         module = jnp if is_sharded(result) else np
         holds = bool(module.all(result)) if np.ndim(result) else bool(result)
     if not holds:
-        raise InputError(InputProblem(name, short(given), rule, fix))
+        raise input_error(name, short(given), rule, fix)
 
 
 def check_not_nan(name: str, a: Tree) -> None:
     """Raise an `InputError` if an entry of a concrete array is NaN."""
     for leaf in jtu.tree_leaves(a):
         if is_concrete(leaf) and (jnp if is_sharded(leaf) else np).isnan(leaf).any():
-            raise InputError(
-                InputProblem(name, short(leaf), "it must not be NaN", "Correct the NaN entries")
-            )
+            raise input_error(name, short(leaf), "it must not be NaN", "Correct the NaN entries")
 
 
 class Text(str):
@@ -416,7 +408,7 @@ def _not_real(name: str, given: Any, rule: str = _TREE) -> InputError:
         rule = "data and states are real, so the numbers must be real"
     argument = name.rpartition("(")[2].rstrip(")")
     argument = argument if argument.isidentifier() else "value"
-    return InputError(InputProblem(name, _described(given), rule, _conversion(given, argument)))
+    return input_error(name, _described(given), rule, _conversion(given, argument))
 
 
 def _conversion(given: Any, argument: str) -> str:

@@ -18,7 +18,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from . import _tree
-from .errors import DvaxError, InputError, InputProblem
+from .errors import DvaxError, InputError, InputProblem, input_error
 
 _LIBRARIES = {"dvax", "equinox", "jax", "jaxlib", "jaxtyping", "numpy", "scipy", "optimistix"}
 """Packages whose frames are not the user's code."""
@@ -54,14 +54,12 @@ def leaked_tracer_error(error: jax.errors.UnexpectedTracerError) -> InputError:
     """Return the `InputError` for a traced array that f, h or K stores beyond a call."""
     match = re.search(r"created on line (\S+?):(\d+)", str(error))
     place = f"{match[1]}, line {match[2]}" if match else "f, h, A, P or K of dvax.Problem"
-    return InputError(
-        InputProblem(
-            place,
-            "a traced array that is used after the call that created it",
-            "a dvax.signals.Table, or an array stored in a global, must not be created inside of f, h "
-            "or K, where it is traced and its times are unknown",
-            "Create it once, outside of the function, or pass it in args",
-        )
+    return input_error(
+        place,
+        "a traced array that is used after the call that created it",
+        "a dvax.signals.Table, or an array stored in a global, must not be created inside of f, h "
+        "or K, where it is traced and its times are unknown",
+        "Create it once, outside of the function, or pass it in args",
     )
 
 
@@ -80,7 +78,7 @@ def check_values(
     expected = jnp.result_type(*jtu.tree_leaves(x))
 
     def fail(given: str, rule: str, fix: str) -> None:
-        raise InputError(InputProblem(f"{caller}({name}), {_place(fn)}", given, rule, fix))
+        raise input_error(f"{caller}({name}), {_place(fn)}", given, rule, fix)
 
     for leaf in jtu.tree_leaves(out):
         if not _is_numeric(leaf):
@@ -116,7 +114,7 @@ def check_precision(name: str, data: Any, x: Any) -> None:
             if dtype != expected:
                 given = f"data of {jnp.dtype(dtype)}"
                 rule, fix = _precision_rule(dtype, expected, "the state x0")
-                raise InputError(InputProblem(f"dvax.Problem({name})", given, rule, fix))
+                raise input_error(f"dvax.Problem({name})", given, rule, fix)
 
 
 def check_args(args: Any, caller: str) -> None:
@@ -128,15 +126,13 @@ def check_args(args: Any, caller: str) -> None:
         leaves = jtu.tree_leaves(args)
     except ValueError:
         rule = "JAX sorts the keys of a dict, and these have no order"
-        raise InputError(
-            InputProblem(place, "keys of several types", rule, "Use strings")
-        ) from None
+        raise input_error(place, "keys of several types", rule, "Use strings") from None
     for leaf in leaves:
         if isinstance(leaf, np.ndarray) and leaf.dtype.kind not in "biufc":
             given = f"an array of {leaf.dtype}, {_tree.short(leaf)}"
             fix = "Convert it, np.asarray(..., float), and pass texts as str"
             rule = "the arrays in args must contain numbers"
-            raise InputError(InputProblem(place, given, rule, fix))
+            raise input_error(place, given, rule, fix)
 
 
 def _precision_rule(dtype: Any, expected: Any, element: str) -> tuple[str, str]:
@@ -184,12 +180,10 @@ def _check_parameters(
         signature.bind(*inputs.values())
     except TypeError:
         names = ", ".join(inputs)
-        raise InputError(
-            InputProblem(
-                f"{at}, {_place(fn)}", f"a function of {signature}",
-                f"it is called as {name}({names})",
-                f"Write {name}=lambda {names}: ..., even if some parameters are unused",
-            )
+        raise input_error(
+            f"{at}, {_place(fn)}", f"a function of {signature}",
+            f"it is called as {name}({names})",
+            f"Write {name}=lambda {names}: ..., even if some parameters are unused",
         ) from None  # fmt: skip
 
 

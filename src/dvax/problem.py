@@ -13,7 +13,7 @@ import numpy as np
 from . import _control_shape, _knots, _tree, _user_code
 from ._jax import outlined
 from ._tree import Tree
-from .errors import InputError, InputProblem
+from .errors import InputError, InputProblem, Problems, input_error
 from .generators import AbstractGenerator
 from .operators import AbstractOperator
 from .programs.switching_times import switching_times
@@ -101,7 +101,7 @@ class Problem(eqx.Module):
     control_space: AbstractSpace | None = None
 
     def __check_init__(self) -> None:
-        wrong = [
+        wrong = Problems(
             InputProblem(
                 f"dvax.Problem({name})",
                 " ".join(f"{type(value).__name__} {value!r}".split())[:200],
@@ -115,7 +115,7 @@ class Problem(eqx.Module):
             )
             if not isinstance(value, kind)
             and (not callable(value) or (isinstance(value, type) and issubclass(value, kind)))
-        ]
+        )
         wrong += [
             InputProblem(
                 f"dvax.Problem({name})",
@@ -139,8 +139,7 @@ class Problem(eqx.Module):
             )
             if not isinstance(space, AbstractSpace | None)
         ]
-        if wrong:
-            raise InputError(*wrong)
+        wrong.raise_any()
 
     def generator(self, args: Any = None) -> AbstractGenerator:
         """Return A for these args."""
@@ -237,7 +236,7 @@ class Problem(eqx.Module):
         state, control = self.spaces(x)
         state.check(x, "x0")
         u = self.zero_control(x)
-        problems: list[InputProblem] = []
+        problems = Problems()
         for attempt in (
             lambda: self._evaluate("A", self.A, {"args": args}, AbstractGenerator, x).check(state),
             lambda: self._evaluate("P", self.P, {"args": args}, AbstractOperator, x).check(control),
@@ -245,26 +244,21 @@ class Problem(eqx.Module):
             lambda: self._check_values("f", self.f, (t, x, u, args), x, "state"),
             lambda: self._check_values("h", self.h, (t, x, u, args), u, "control"),
         ):
-            try:
+            with problems.collect():
                 attempt()
-            except InputError as error:
-                problems += error.problems
-        if problems:
-            raise InputError(*problems)
+        problems.raise_any()
 
     def _evaluate(self, name: str, value: Any, inputs: dict[str, Any], kind: type, x: Tree) -> Any:
         """Return A, P or K, called with its arguments if it is a callable, after checking its type."""
         if not isinstance(value, kind):
             value = _user_code.call(name, value, inputs)
             if not isinstance(value, kind):
-                raise InputError(
-                    InputProblem(
-                        f"dvax.Problem({name})",
-                        f"a callable that returns {type(value).__name__} {value!r}"[:200],
-                        f"{name}({', '.join(inputs)}) must return an instance of dvax."
-                        f"{kind.__module__.split('.')[1]}.{kind.__name__}",
-                        f"See dvax.{kind.__module__.split('.')[1]}",
-                    )
+                raise input_error(
+                    f"dvax.Problem({name})",
+                    f"a callable that returns {type(value).__name__} {value!r}"[:200],
+                    f"{name}({', '.join(inputs)}) must return an instance of dvax."
+                    f"{kind.__module__.split('.')[1]}.{kind.__name__}",
+                    f"See dvax.{kind.__module__.split('.')[1]}",
                 )
         _user_code.check_precision(name, value, x)
         return value
@@ -290,15 +284,13 @@ class Problem(eqx.Module):
 
         out = jax.eval_shape(traced, *inputs[:3])
         if not _tree.same_shape(out, element):
-            raise InputError(
-                InputProblem(
-                    f"dvax.Problem({name})",
-                    f"a value of shape {_tree.shapes(out)}",
-                    f"{name}(t, x, u, args) must be in the {space} space, whose elements have "
-                    f"shape {_tree.shapes(element)}; it was called with x of shape "
-                    f"{_tree.shapes(inputs[1])} and u of shape {_tree.shapes(inputs[2])}{source}",
-                    _shape_fix(name, out, element, space),
-                )
+            raise input_error(
+                f"dvax.Problem({name})",
+                f"a value of shape {_tree.shapes(out)}",
+                f"{name}(t, x, u, args) must be in the {space} space, whose elements have "
+                f"shape {_tree.shapes(element)}; it was called with x of shape "
+                f"{_tree.shapes(inputs[1])} and u of shape {_tree.shapes(inputs[2])}{source}",
+                _shape_fix(name, out, element, space),
             )
 
     def _shape_origin(self, x: Tree) -> str:
@@ -406,7 +398,7 @@ def _shape_fix(name: str, out: Tree, element: Tree, space: str) -> str:
 def _check_spans(spans: list[tuple[Any, Any, str, str]], t0: Any, t1: Any) -> None:
     if not _tree.is_concrete(spans, t0, t1):
         return
-    short = [
+    short = Problems(
         InputProblem(
             f"a {name} in {where}",
             f"data from t = {float(first):g} to {float(last):g}",
@@ -415,6 +407,5 @@ def _check_spans(spans: list[tuple[Any, Any, str, str]], t0: Any, t1: Any) -> No
         )
         for first, last, name, where in spans
         if float(first) > float(t0) or float(last) < float(t1)
-    ]
-    if short:
-        raise InputError(*short)
+    )
+    short.raise_any()

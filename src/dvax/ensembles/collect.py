@@ -14,7 +14,7 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..evolution.arguments import machine_memory
 from .inputs import Inputs
 from .members import Program, Row
@@ -73,13 +73,11 @@ class Collected:
         needed = sum(leaf.nbytes // len(leaf) for leaf in leaves) * self.count
         available = machine_memory()
         if needed > available:
-            raise InputError(
-                InputProblem(
-                    "dvax.ensemble(keep)", "True",
-                    f"the observed values of {self.count} members need {needed / 2**30:.3g} GiB, and "
-                    f"the machine has {available / 2**30:.3g} GiB",
-                    "Observe less of each member, or pass keep=False and folds=",
-                )
+            raise input_error(
+                "dvax.ensemble(keep)", "True",
+                f"the observed values of {self.count} members need {needed / 2**30:.3g} GiB, and "
+                f"the machine has {available / 2**30:.3g} GiB",
+                "Observe less of each member, or pass keep=False and folds=",
             )  # fmt: skip
         table = lambda leaf: np.empty((self.count, *leaf.shape[1:]), leaf.dtype)  # noqa: E731
         return jtu.tree_map(table, found)

@@ -12,7 +12,7 @@ from .. import _tree
 from .._dataset import Variable, dataset, described, over, required
 from .._repr import table, value_text
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..evolution import RESULTS, Solution
 from ..evolution.dataset import leaves_of
 from .moments import Moments
@@ -113,12 +113,10 @@ class Ensemble:
         **Raises:** `dvax.InputError` if the values were not kept.
         """
         if self.values is None:
-            raise InputError(
-                InputProblem(
-                    "Ensemble.quantile", "an ensemble with keep=False",
-                    "quantiles are computed from the values of all members",
-                    "Observe little, such as observe=lambda sol: sol.xs[-1], and keep it",
-                )
+            raise input_error(
+                "Ensemble.quantile", "an ensemble with keep=False",
+                "quantiles are computed from the values of all members",
+                "Observe little, such as observe=lambda sol: sol.xs[-1], and keep it",
             )  # fmt: skip
         xp = _tree.array_module(self.values, self.failed)
         if xp is np:
@@ -233,18 +231,14 @@ class Ensemble:
         part of a compiled program.
         """
         if self.again is None:
-            raise InputError(
-                InputProblem(
-                    "Ensemble.member", "an ensemble inside a compiled program",
-                    "its inputs have no values", "Call it outside of jax.jit and jax.grad",
-                )
+            raise input_error(
+                "Ensemble.member", "an ensemble inside a compiled program",
+                "its inputs have no values", "Call it outside of jax.jit and jax.grad",
             )  # fmt: skip
         if not -len(self) <= k < len(self):
-            raise InputError(
-                InputProblem(
-                    "Ensemble.member(k)", str(k), f"members are numbered from 0 to {len(self) - 1}",
-                    "Give such a number",
-                )
+            raise input_error(
+                "Ensemble.member(k)", str(k), f"members are numbered from 0 to {len(self) - 1}",
+                "Give such a number",
             )  # fmt: skip
         return self.again(k)
 

@@ -13,7 +13,7 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding
 
 from .. import _tree
-from ..errors import InputError, InputProblem
+from ..errors import InputProblem, Problems, input_error
 from ..problem import Problem
 from ..vi import AbstractSolver
 from .event import Event
@@ -67,13 +67,13 @@ def check(call: Arguments) -> None:
     problem, x0, method, vi_solver = call.problem, call.x0, call.method, call.vi_solver
     t0, t1, ts, dt, dt_max = call.t0, call.t1, call.ts, call.dt, call.dt_max
     max_steps = call.max_steps
-    wrong: list[InputProblem] = []
+    wrong = Problems()
 
     def rule(holds: bool, name: str, given: Any, text: str, fix: str) -> None:
         if not holds:  # format the value here, so that valid calls do not pay for it
             plain = isinstance(given, _tree.Text) or hasattr(given, "dtype")
             line = _tree.short(given) if plain else repr(given)
-            wrong.append(InputProblem(f"dvax.solve({name})", line[:200], text, fix))
+            wrong.add(f"dvax.solve({name})", line[:200], text, fix)
 
     rule(isinstance(problem, Problem), "problem", _tree.Text(type(problem).__name__),
          "it must be a dvax.Problem", "Build one, or pass that of a model: model.problem")  # fmt: skip
@@ -156,8 +156,7 @@ def check(call: Arguments) -> None:
     if not unusable & {"rtol", "atol"} and _tree.is_concrete(call.rtol, call.atol):
         rule(bool(call.rtol != 0 or call.atol != 0), "rtol, atol", _tree.Text("0, 0"),
              "one of them must be positive", "No finite step has defect zero")  # fmt: skip
-    if wrong:
-        raise InputError(*wrong)
+    wrong.raise_any()
 
 
 @cache
@@ -192,36 +191,28 @@ def _check_times(rule: Any, ts: Any, t0: float, t1: float) -> None:
     rule(not wrong.any(), "ts", got, text, fix)
 
 
-def _not_finite(x0: Any) -> list[InputProblem]:
+def _not_finite(x0: Any) -> Problems:
     """Return the problems of the initial state: empty, complex or non-finite parts."""
-    wrong = []
+    wrong = Problems()
     for leaf in jax.tree_util.tree_leaves(x0):
         name, wrong_at = "dvax.solve(x0)", None
         if _tree.is_concrete(leaf):
             wrong_at = _tree.first_nonfinite(leaf)
         if np.size(leaf) == 0:
-            wrong.append(
-                InputProblem(name, f"shape {np.shape(leaf)}", "a state has at least one entry",
-                             "Omit parts without entries")
-            )  # fmt: skip
+            wrong.add(name, f"shape {np.shape(leaf)}", "a state has at least one entry",
+                      "Omit parts without entries")  # fmt: skip
         elif leaf.dtype.kind == "c":
-            wrong.append(
-                InputProblem(name, f"an array of {jnp.result_type(leaf)}", "states are real",
-                             "Use real and imaginary part as two components")
-            )  # fmt: skip
+            wrong.add(name, f"an array of {jnp.result_type(leaf)}", "states are real",
+                      "Use real and imaginary part as two components")  # fmt: skip
         elif wrong_at is not None:
-            wrong.append(
-                InputProblem(name, f"{leaf[wrong_at]} at index {wrong_at}",
-                             "every entry must be finite", "Correct the initial state there")
-            )  # fmt: skip
+            wrong.add(name, f"{leaf[wrong_at]} at index {wrong_at}",
+                      "every entry must be finite", "Correct the initial state there")  # fmt: skip
         elif _has_explicit_axes(leaf):
-            wrong.append(
-                InputProblem(
-                    name, f"an array on a mesh with explicit axes {leaf.sharding.mesh.axis_names}",
-                    "the axes must be of the type Auto, so that XLA shards the arrays of a step",
-                    "Build the mesh by jax.sharding.Mesh(devices, names), or by jax.make_mesh(…, "
-                    "axis_types=(jax.sharding.AxisType.Auto,))",
-                )
+            wrong.add(
+                name, f"an array on a mesh with explicit axes {leaf.sharding.mesh.axis_names}",
+                "the axes must be of the type Auto, so that XLA shards the arrays of a step",
+                "Build the mesh by jax.sharding.Mesh(devices, names), or by jax.make_mesh(…, "
+                "axis_types=(jax.sharding.AxisType.Auto,))",
             )  # fmt: skip
     return wrong
 
@@ -288,14 +279,12 @@ def check_memory(state: int, itemsize: int, steps: int, degree: int) -> None:
     """
     needed, available = steps * itemsize * (state * (degree + 3) + 2), machine_memory()
     if needed > available:
-        raise InputError(
-            InputProblem(
-                "dvax.solve(dense, max_steps)",
-                f"True and {steps}",
-                f"recording that many steps needs {needed / 2**30:.3g} GiB, and the machine has "
-                f"{available / 2**30:.3g} GiB",
-                "Give a smaller max_steps, or list the times in ts= instead of dense=True",
-            )
+        raise input_error(
+            "dvax.solve(dense, max_steps)",
+            f"True and {steps}",
+            f"recording that many steps needs {needed / 2**30:.3g} GiB, and the machine has "
+            f"{available / 2**30:.3g} GiB",
+            "Give a smaller max_steps, or list the times in ts= instead of dense=True",
         )
 
 
@@ -328,23 +317,19 @@ def bound_steps(max_steps: int | None, fixed: bool, t0, t1, dt) -> int:
     if not fixed:
         return ADAPTIVE_STEPS
     if not _tree.is_concrete(t0, t1, dt):
-        raise InputError(
-            InputProblem(
-                "dvax.solve(max_steps)",
-                "None, with t0, t1 or dt traced",
-                "the number of fixed steps is then unknown when the loop is compiled",
-                "Give max_steps, a bound on it",
-            )
+        raise input_error(
+            "dvax.solve(max_steps)",
+            "None, with t0, t1 or dt traced",
+            "the number of fixed steps is then unknown when the loop is compiled",
+            "Give max_steps, a bound on it",
         )
     span = float(t1) - float(t0)
     if not span / float(dt) < _MAX_FIXED_STEPS:
-        raise InputError(
-            InputProblem(
-                "dvax.solve(dt)",
-                f"{float(dt):g} for a span of {span:g}",
-                f"a run has at most {_MAX_FIXED_STEPS} fixed steps",
-                "Give a longer step, or solve in pieces",
-            )
+        raise input_error(
+            "dvax.solve(dt)",
+            f"{float(dt):g} for a span of {span:g}",
+            f"a run has at most {_MAX_FIXED_STEPS} fixed steps",
+            "Give a longer step, or solve in pieces",
         )
     count = math.ceil(span / float(dt)) + 1
     # Round up to a power of two ≥ 2¹², so that runs of different length share a compilation.

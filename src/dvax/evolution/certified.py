@@ -18,7 +18,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import InputError, Problems, input_error
 from ..problem import Problem
 from ..spaces import AbstractSpace
 from .defect import ROUNDINGS
@@ -242,40 +242,33 @@ def _exit_time(solution: Solution, constants: Any, error_bounds: Any) -> float |
 
 
 def _outside(t: float) -> InputError:
-    return InputError(
-        InputProblem(
-            "dvax.solve(constants)",
-            f"constants of a region that the trajectory leaves by t = {t:.6g}",
-            "outside it nothing bounds the error",
-            "Verify the problem in a larger region: dvax.verify(problem, x0, x=(low, high))",
-        )
+    return input_error(
+        "dvax.solve(constants)",
+        f"constants of a region that the trajectory leaves by t = {t:.6g}",
+        "outside it nothing bounds the error",
+        "Verify the problem in a larger region: dvax.verify(problem, x0, x=(low, high))",
     )
 
 
 def _check_domain(constants: Any, args: Any, t0: float, t1: float) -> None:
     """Raise if the constants were verified for other times or other `args`."""
     domain = getattr(constants, "domain", None)
-    wrong: list[InputProblem] = []
+    wrong = Problems()
     if domain is not None and not domain.covers(t0, t1):
-        wrong.append(
-            InputProblem(
-                "dvax.solve(constants)",
-                f"constants verified on [{domain.t0:.17g}, {domain.t1:.17g}]",
-                f"they must cover the run, which goes from {t0:.17g} to {t1:.17g}",
-                f"Verify for these: dvax.verify(problem, x0, {t0:g}, {t1:g}, args)",
-            )
+        wrong.add(
+            "dvax.solve(constants)",
+            f"constants verified on [{domain.t0:.17g}, {domain.t1:.17g}]",
+            f"they must cover the run, which goes from {t0:.17g} to {t1:.17g}",
+            f"Verify for these: dvax.verify(problem, x0, {t0:g}, {t1:g}, args)",
         )
     if domain is not None and not domain.has_args(args):
-        wrong.append(
-            InputProblem(
-                "dvax.solve(constants)",
-                "constants of another args",
-                "f and h may be steeper at these parameters than at those",
-                "Verify for these: dvax.verify(problem, x0, t0, t1, args)",
-            )
+        wrong.add(
+            "dvax.solve(constants)",
+            "constants of another args",
+            "f and h may be steeper at these parameters than at those",
+            "Verify for these: dvax.verify(problem, x0, t0, t1, args)",
         )
-    if wrong:
-        raise InputError(*wrong)
+    wrong.raise_any()
 
 
 def _with_bound(solution: Solution, bound: float) -> Solution:
@@ -292,43 +285,35 @@ def _out_of_reach(
     tol: float, reachable: float, growth: _Growth, span: float, why: str
 ) -> InputError:
     M, rate = min(growth.rates, key=lambda pair: pair[0] * _convolved(pair[1], span))
-    return InputError(
-        InputProblem(
-            "dvax.solve(certified_tol)",
-            f"{tol:g}",
-            f"errors may grow like M e^{{ct}} with M = {M:g} and c = {rate:g}, a defect by "
-            f"M Φ_c(T) = {M * _convolved(rate, span):.3g} over T = {span:g}, and the least "
-            f"bound in reach here is about {reachable:.3g} ({why})",
-            "Choose a larger certified_tol, solve for a shorter time, or find sharper constants: "
-            "dvax.verify gives a one-sided rate where possible",
-        )
+    return input_error(
+        "dvax.solve(certified_tol)",
+        f"{tol:g}",
+        f"errors may grow like M e^{{ct}} with M = {M:g} and c = {rate:g}, a defect by "
+        f"M Φ_c(T) = {M * _convolved(rate, span):.3g} over T = {span:g}, and the least "
+        f"bound in reach here is about {reachable:.3g} ({why})",
+        "Choose a larger certified_tol, solve for a shorter time, or find sharper constants: "
+        "dvax.verify gives a one-sided rate where possible",
     )
 
 
 def _check(constants: Any, tol: Any, x0: Tree) -> None:
     missing = [name for name in _REQUIRED_CONSTANTS if getattr(constants, name, None) is None]
     if constants is None or missing:
-        raise InputError(
-            InputProblem(
-                "dvax.solve(constants)",
-                "None" if constants is None else f"no {', '.join(missing)}",
-                "a bound on the error rests on the constants of the problem",
-                "Give dvax.Constants, or constants=dvax.verify(problem, x0).constants",
-            )
+        raise input_error(
+            "dvax.solve(constants)",
+            "None" if constants is None else f"no {', '.join(missing)}",
+            "a bound on the error rests on the constants of the problem",
+            "Give dvax.Constants, or constants=dvax.verify(problem, x0).constants",
         )
     if not _tree.is_concrete(tol, x0, constants):
-        raise InputError(
-            InputProblem(
-                "dvax.solve(certified_tol)",
-                "a traced value",
-                "the tolerance of a run depends on the results of earlier runs",
-                "Call dvax.solve outside jax.jit first, and pass the atol of that solution inside",
-            )
+        raise input_error(
+            "dvax.solve(certified_tol)",
+            "a traced value",
+            "the tolerance of a run depends on the results of earlier runs",
+            "Call dvax.solve outside jax.jit first, and pass the atol of that solution inside",
         )
     if not (_tree.is_number(tol) and np.isfinite(tol) and tol > 0):
-        raise InputError(
-            InputProblem(
-                "dvax.solve(certified_tol)", str(tol), "it must be a positive number",
-                "Give the largest error of x, in the norm of the state space, that is allowed",
-            )
+        raise input_error(
+            "dvax.solve(certified_tol)", str(tol), "it must be a positive number",
+            "Give the largest error of x, in the norm of the state space, that is allowed",
         )  # fmt: skip

@@ -9,7 +9,7 @@ import jax
 from .. import _tree
 from .._jax.collectives import collectives
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..problem import Problem
 from .arguments import Arguments
 from .compiled import compiled_text
@@ -126,23 +126,19 @@ def communication(
     ```
     """
     if method is not None and not isinstance(method, AbstractMethod):
-        raise InputError(
-            InputProblem(
-                "dvax.communication(method)", type(method).__name__,
-                "its program is not one loop over steps",
-                "Choose a method such as dvax.ETD2RK(), or omit it for the default",
-            )
+        raise input_error(
+            "dvax.communication(method)", type(method).__name__,
+            "its program is not one loop over steps",
+            "Choose a method such as dvax.ETD2RK(), or omit it for the default",
         )  # fmt: skip
     call = Arguments(problem, x0, t0, t1, args, ts, dt, rtol, atol, method, dense=dense)
     setup, times, options = prepared(call)
     leaves = jax.tree_util.tree_leaves(setup.x0)
     devices = max(len(leaf.sharding.device_set) for leaf in leaves if _tree.is_concrete(leaf))
     if devices == 1:
-        raise InputError(
-            InputProblem(
-                "dvax.communication(x0)", "a state on one device", "only several devices communicate",
-                'Shard it: jax.device_put(x0, NamedSharding(mesh, PartitionSpec("points")))',
-            )
+        raise input_error(
+            "dvax.communication(x0)", "a state on one device", "only several devices communicate",
+            'Shard it: jax.device_put(x0, NamedSharding(mesh, PartitionSpec("points")))',
         )  # fmt: skip
     found = collectives(compiled_text(setup, times, options), STEP)
     inside = _counted([(one.kind, one.optional, one.bytes) for one in found if one.in_step])

@@ -8,7 +8,7 @@ import numpy as np
 from .. import _tree
 from .._dataset import Names, Variable, dataset, described, named, over
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from .results import RESULTS
 
 _PLACE = "Solution.to_xarray"
@@ -29,11 +29,9 @@ def solution_dataset(
         found = named(rows, names, symbol, f"{_PLACE}({argument})")
         taken = sorted({"time", *variables} & set(found))
         if taken:
-            raise InputError(
-                InputProblem(
-                    f"{_PLACE}({argument})", ", ".join(taken), "this name stands for another variable",
-                    "Choose others",
-                )
+            raise input_error(
+                f"{_PLACE}({argument})", ", ".join(taken), "this name stands for another variable",
+                "Choose others",
             )  # fmt: skip
         for name, (values, unit) in found.items():
             variables[name] = over(("time",), name, values, described(f"{words} {name}", unit))
@@ -89,7 +87,7 @@ def check_single(sol: Any, place: str) -> None:
         given, fix = "a batch of solutions", "Select one: jax.tree.map(lambda leaf: leaf[0], sol)"
     else:
         return
-    raise InputError(InputProblem(place, given, "it needs the numbers of one solution", fix))
+    raise input_error(place, given, "it needs the numbers of one solution", fix)
 
 
 def check_bound(sol: Any, bound: Any, place: str) -> None:
@@ -97,11 +95,9 @@ def check_bound(sol: Any, bound: Any, place: str) -> None:
     ts = getattr(bound, "ts", None)
     if ts is None or not np.array_equal(np.asarray(ts), np.asarray(sol.ts)):
         given = type(bound).__name__ if ts is None else f"a bound at {np.size(ts)} other times"
-        raise InputError(
-            InputProblem(
-                place, given, f"it must be a bound at the {np.size(sol.ts)} saved times",
-                "Pass dvax.bound_error(problem, sol, constants) of this solution",
-            )
+        raise input_error(
+            place, given, f"it must be a bound at the {np.size(sol.ts)} saved times",
+            "Pass dvax.bound_error(problem, sol, constants) of this solution",
         )  # fmt: skip
 
 

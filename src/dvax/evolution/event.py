@@ -8,7 +8,7 @@ import jax
 
 from .._repr import is_known, table, value_text
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import InputProblem, Problems, input_error
 from .dataset import events_dataset
 
 _MAX_SHOWN = 10
@@ -52,7 +52,7 @@ class Event(eqx.Module):
     name: str | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __check_init__(self) -> None:
-        wrong = [
+        wrong = Problems(
             InputProblem(f"dvax.Event({name})", repr(given)[:120], f"it must be {kind}", fix)
             for name, given, holds, kind, fix in (
                 ("function", self.function, callable(self.function),
@@ -67,9 +67,8 @@ class Event(eqx.Module):
                 ("name", self.name, isinstance(self.name, str | None), "text", "Omit it"),
             )
             if not holds
-        ]  # fmt: skip
-        if wrong:
-            raise InputError(*wrong)
+        )  # fmt: skip
+        wrong.raise_any()
 
     @property
     def stops(self) -> bool:
@@ -128,7 +127,7 @@ class Events(eqx.Module):
         if name not in self.names:
             rule = f"it must be one of {[n for n in self.names if n is not None]}"
             fix = "Give the event this name: dvax.Event(…, name=…)"
-            raise InputError(InputProblem("Events.of", repr(name), rule, fix))
+            raise input_error("Events.of", repr(name), rule, fix)
         wanted = [k for k, own in enumerate(self.names) if own == name]
         return self.rows(jax.numpy.isin(self.index, jax.numpy.asarray(wanted)))
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree, _user_code
-from ..errors import InputError, InputProblem
+from ..errors import Problems, input_error
 from .closures import convert
 from .event import Event
 from .method import AbstractMethod
@@ -19,11 +19,11 @@ _CALLER = "dvax.Event"
 
 def check_events(events: Any, max_events: Any, method: Any, dt: Any, certified: bool) -> None:
     """Raise one `InputError` with everything that is wrong with the events of a solve."""
-    wrong: list[InputProblem] = []
+    wrong = Problems()
 
     def rule(holds: bool, name: str, given: Any, text: str, fix: str) -> None:
         if not holds:
-            wrong.append(InputProblem(f"dvax.solve({name})", repr(given)[:120], text, fix))
+            wrong.add(f"dvax.solve({name})", repr(given)[:120], text, fix)
 
     is_list = isinstance(events, list | tuple) and all(isinstance(e, Event) for e in events)
     rule(is_list, "events", events, "it must be a list of dvax.Event",
@@ -40,8 +40,7 @@ def check_events(events: Any, max_events: Any, method: Any, dt: Any, certified: 
         rule(not (certified and stops), "events, certified_tol", _tree.Text(f"event {stops}"),
              "a bound at all saved times holds for events that are only recorded",
              "Omit certified_tol, or terminal= and reset=")  # fmt: skip
-    if wrong:
-        raise InputError(*wrong)
+    wrong.raise_any()
 
 
 def checked_events(setup: Setup, args: Any) -> tuple[Event, ...]:
@@ -63,7 +62,7 @@ def _checked(event: Event, inputs: dict[str, Any]) -> Event:
     if jnp.shape(value) != ():
         given = f"shape {jnp.shape(value)}"
         fix = "Return one number, and write one dvax.Event for each"
-        raise InputError(InputProblem(f"{_CALLER}(function)", given, "it must be one number", fix))
+        raise input_error(f"{_CALLER}(function)", given, "it must be one number", fix)
     reset = event.reset
     if reset is not None:
         after = _shapes("reset", reset, inputs)
@@ -73,7 +72,7 @@ def _checked(event: Event, inputs: dict[str, Any]) -> Event:
                 f"it must be those of x, {_tree.shapes(x)}",
             )
             fix = "Return the whole state behind the event"
-            raise InputError(InputProblem(f"{_CALLER}(reset)", given, rule, fix))
+            raise input_error(f"{_CALLER}(reset)", given, rule, fix)
         reset = convert(reset, *inputs.values())
     function = convert(event.function, *inputs.values())
     parts = lambda e: (e.function, e.reset)  # noqa: E731

@@ -22,7 +22,7 @@ import numpy as np
 from .. import _tree
 from .._dataset import Names
 from .._tree import Tree
-from ..errors import InputError, InputProblem, SolveError
+from ..errors import InputError, SolveError, input_error
 from .dataset import solution_dataset
 from .event import Events
 from .results import RESULTS, is_success
@@ -54,12 +54,10 @@ class Input(NamedTuple):
         shape, dtype = getattr(given, "shape", None), getattr(given, "dtype", None)
         if shape != self.shape or dtype != self.dtype:
             what = type(given).__name__ if dtype is None else f"{dtype} of shape {shape}"
-            raise InputError(
-                InputProblem(
-                    f"the exported program ({self.name})", what,
-                    f"the program was compiled for {self.dtype} of shape {self.shape}",
-                    "Convert it, or export the problem again with such an example",
-                )
+            raise input_error(
+                f"the exported program ({self.name})", what,
+                f"the program was compiled for {self.dtype} of shape {self.shape}",
+                "Convert it, or export the problem again with such an example",
             )  # fmt: skip
         return given
 
@@ -180,30 +178,24 @@ class Exported:
         """
         platform = jax.export.default_export_platform()
         if platform not in self.header.platforms:
-            raise InputError(
-                InputProblem(
-                    "the exported program", f"the platform {platform}",
-                    f"it was compiled for {', '.join(self.header.platforms)}",
-                    f'Export it with platforms=["{platform}"]',
-                )
+            raise input_error(
+                "the exported program", f"the platform {platform}",
+                f"it was compiled for {', '.join(self.header.platforms)}",
+                f'Export it with platforms=["{platform}"]',
             )  # fmt: skip
         if not jax.config.read("jax_enable_x64") and self.header.inputs[0].dtype == "float64":
-            raise InputError(
-                InputProblem(
-                    "the exported program", "a process with 32-bit numbers",
-                    "it was compiled for float64",
-                    "Call jax.config.update('jax_enable_x64', True) first",
-                )
+            raise input_error(
+                "the exported program", "a process with 32-bit numbers",
+                "it was compiled for float64",
+                "Call jax.config.update('jax_enable_x64', True) first",
             )  # fmt: skip
         try:
             return self._run(self._inputs(x0, t0, t1, args, ts))
         except NotImplementedError as error:
-            raise InputError(
-                InputProblem(
-                    "the exported program", "a call inside jax.vmap or jax.jvp",
-                    f"JAX does not transform exported programs so: {_tree.line(error)}",
-                    "Use jax.lax.map for a batch, and jax.grad for derivatives",
-                )
+            raise input_error(
+                "the exported program", "a call inside jax.vmap or jax.jvp",
+                f"JAX does not transform exported programs so: {_tree.line(error)}",
+                "Use jax.lax.map for a batch, and jax.grad for derivatives",
             ) from error  # fmt: skip
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -229,20 +221,16 @@ class Exported:
     def _inputs(self, x0: Tree, t0: Any, t1: Any, args: Any, ts: Any) -> list[Any]:
         header, count = self.header, len(_leaves(self.header.state))
         if x0 is not None and not _has_structure(x0, header.state):
-            raise InputError(
-                InputProblem(
-                    "the exported program (x0)", _tree.line(_tree.shapes(x0)),
-                    f"the state of the example is {_described(header.state)}",
-                    "Give that structure, or export the problem again",
-                )
+            raise input_error(
+                "the exported program (x0)", _tree.line(_tree.shapes(x0)),
+                f"the state of the example is {_described(header.state)}",
+                "Give that structure, or export the problem again",
             )  # fmt: skip
         if ts is not None and not header.saves:
-            raise InputError(
-                InputProblem(
-                    "the exported program (ts)", "saved times",
-                    "the program saves t1 alone, since the example had no ts=",
-                    "Export the problem with as many times as you want",
-                )
+            raise input_error(
+                "the exported program (ts)", "saved times",
+                "the program saves t1 alone, since the example had no ts=",
+                "Export the problem with as many times as you want",
             )  # fmt: skip
         given = [None] * count if x0 is None else jtu.tree_leaves(x0)
         given += [t0, t1] + ([ts] if header.saves else [])
@@ -257,14 +245,12 @@ class Exported:
         arrays, static = split_args(args)
         expected = names, [tuple(one) for one in self.header.static]
         if ([name for name, _ in arrays], static) != expected:
-            raise InputError(
-                InputProblem(
-                    "the exported program (args)",
-                    ", ".join([name for name, _ in arrays] + [" = ".join(one) for one in static]),
-                    "the example has " + ", ".join(names + [" = ".join(o) for o in expected[1]])
-                    + ", and what is no array is compiled in",
-                    "Give args of that structure, or export the problem again",
-                )
+            raise input_error(
+                "the exported program (args)",
+                ", ".join([name for name, _ in arrays] + [" = ".join(one) for one in static]),
+                "the example has " + ", ".join(names + [" = ".join(o) for o in expected[1]])
+                + ", and what is no array is compiled in",
+                "Give args of that structure, or export the problem again",
             )  # fmt: skip
         return [leaf for _, leaf in arrays]
 
@@ -321,36 +307,28 @@ def load_exported(source: str | os.PathLike[str] | bytes) -> Exported:
         return Exported(Header(**header), program, example)
     except OSError as error:
         text = error.strerror or str(error)
-        raise InputError(
-            InputProblem(place, text, "the file must be readable", "Correct the path")
-        ) from error
+        raise input_error(place, text, "the file must be readable", "Correct the path") from error
     except (zipfile.BadZipFile, KeyError, TypeError, ValueError, EOFError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(
-            InputProblem(place, "a file that is damaged, or none of dvax", rule, fix)
-        ) from error
+        raise input_error(place, "a file that is damaged, or none of dvax", rule, fix) from error
 
 
 def _check_format(place: str, header: Any) -> None:
     if header["format"] > FORMAT:
-        raise InputError(
-            InputProblem(
-                place, f"a file of dvax {header['dvax']}, in format {header['format']}",
-                f"this version reads formats up to {FORMAT}",
-                f"Install dvax {header['dvax']} or newer",
-            )
+        raise input_error(
+            place, f"a file of dvax {header['dvax']}, in format {header['format']}",
+            f"this version reads formats up to {FORMAT}",
+            f"Install dvax {header['dvax']} or newer",
         )  # fmt: skip
     unknown = [name for name in header["results"] if not hasattr(RESULTS, name)]
     low = jax.export.minimum_supported_calling_convention_version
     high = jax.export.maximum_supported_calling_convention_version
     if unknown or not low <= header["calling_convention"] <= high:
-        raise InputError(
-            InputProblem(
-                place, f"a program of dvax {header['dvax']} and JAX {header['jax']}",
-                f"JAX {jax.__version__} and this version of dvax do not run it",
-                "Install the versions that exported it, or export the problem again",
-            )
+        raise input_error(
+            place, f"a program of dvax {header['dvax']} and JAX {header['jax']}",
+            f"JAX {jax.__version__} and this version of dvax do not run it",
+            "Install the versions that exported it, or export the problem again",
         )  # fmt: skip
 
 
@@ -360,12 +338,10 @@ def _deserialise(header: Header, program: bytes) -> jax.export.Exported:
         return jax.export.deserialize(bytearray(program))
     except Exception as error:
         # JAX documents no exceptions of its parser.
-        raise InputError(
-            InputProblem(
-                _PLACE, f"a program of JAX {header.jax}",
-                f"JAX {jax.__version__} cannot read it: {_tree.line(error)}",
-                "Install the version that exported it, or export the problem again",
-            )
+        raise input_error(
+            _PLACE, f"a program of JAX {header.jax}",
+            f"JAX {jax.__version__} cannot read it: {_tree.line(error)}",
+            "Install the version that exported it, or export the problem again",
         ) from error  # fmt: skip
 
 
@@ -374,11 +350,9 @@ def require_serialisation() -> None:
     try:
         import flatbuffers  # noqa: F401
     except ImportError as error:
-        raise InputError(
-            InputProblem(
-                "dvax.export", "no module 'flatbuffers'", "jax.export writes its programs with it",
-                'pip install "dvax[export]"',
-            )
+        raise input_error(
+            "dvax.export", "no module 'flatbuffers'", "jax.export writes its programs with it",
+            'pip install "dvax[export]"',
         ) from error  # fmt: skip
 
 

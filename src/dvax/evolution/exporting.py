@@ -13,7 +13,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import InputError, InputProblem, Problems, input_error
 from ..problem import Problem
 from .arguments import bound_steps
 from .exported import (
@@ -90,12 +90,10 @@ def export(
     example = solve(problem, x0, t0, t1, args, ts, **options)
     setup = example.setup
     if isinstance(setup.method, Implicit | PiecewiseLinear):
-        raise InputError(
-            InputProblem(
-                "dvax.export(method)", type(setup.method).__name__,
-                "it calls Python during a run, which no serialised program can",
-                "Pass method=dvax.ExpRosenbrock() for a stiff problem, or leave it out",
-            )
+        raise input_error(
+            "dvax.export(method)", type(setup.method).__name__,
+            "it calls Python during a run, which no serialised program can",
+            "Pass method=dvax.ExpRosenbrock() for a stiff problem, or leave it out",
         )  # fmt: skip
     if options.get("dt") is not None and options.get("max_steps") is None:
         options["max_steps"] = bound_steps(None, True, t0, t1, options["dt"])
@@ -143,25 +141,22 @@ def export(
 
 
 def _check(options: dict[str, Any], derivatives: Any) -> None:
-    wrong = [
+    wrong = Problems(
         InputProblem(
             f"dvax.export({name})", _tree.line(value),
             f"a program has the options {', '.join(_OPTIONS)}", "Leave it out",
         )
         for name, value in options.items()
         if name not in _OPTIONS
-    ]  # fmt: skip
+    )  # fmt: skip
     if not (
         isinstance(derivatives, int) and not isinstance(derivatives, bool) and derivatives >= 0
     ):
-        wrong.append(
-            InputProblem(
-                "dvax.export(derivatives)", _tree.line(derivatives), "it must be a whole number ≥ 0",
-                "Write derivatives=1 for jax.grad",
-            )
+        wrong.add(
+            "dvax.export(derivatives)", _tree.line(derivatives), "it must be a whole number ≥ 0",
+            "Write derivatives=1 for jax.grad",
         )  # fmt: skip
-    if wrong:
-        raise InputError(*wrong)
+    wrong.raise_any()
 
 
 def _outputs(sol: Solution) -> dict[str, Any]:
@@ -191,11 +186,9 @@ def _serialise(
     except (ValueError, NotImplementedError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(
-            InputProblem(
-                "dvax.export(problem)", "code that JAX does not serialise",
-                f"jax.export reports: {_tree.line(error, 300)}",
-                "Remove callbacks to Python (jax.debug.print, equinox.error_if) from the functions, "
-                "and check platforms=",
-            )
+        raise input_error(
+            "dvax.export(problem)", "code that JAX does not serialise",
+            f"jax.export reports: {_tree.line(error, 300)}",
+            "Remove callbacks to Python (jax.debug.print, equinox.error_if) from the functions, "
+            "and check platforms=",
         ) from error  # fmt: skip

@@ -12,7 +12,7 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from .flow import Flow
 from .outcome import Outcome, Saved
 from .results import RESULTS
@@ -64,13 +64,11 @@ class Implicit(eqx.Module):
 
     def __check_init__(self) -> None:
         if not isinstance(self.solver, diffrax.AbstractImplicitSolver):
-            raise InputError(
-                InputProblem(
-                    "dvax.Implicit(solver)",
-                    f"{type(self.solver).__name__}",
-                    "it must be an implicit solver of Diffrax",
-                    "Use diffrax.Kvaerno5() (the default), Kvaerno3() or KenCarp4(), for example",
-                )
+            raise input_error(
+                "dvax.Implicit(solver)",
+                f"{type(self.solver).__name__}",
+                "it must be an implicit solver of Diffrax",
+                "Use diffrax.Kvaerno5() (the default), Kvaerno3() or KenCarp4(), for example",
             )
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..generators import AbstractGenerator, AbstractPropagator, Diagonal, Scalar, Zero
 from ..generators.dense import MatrixPropagator
 from ..generators.phi import flow_factors, phi_matrix, phi_scalar
@@ -95,13 +95,11 @@ def linearise(generator: AbstractGenerator, jvp: Any, x: Tree) -> AbstractLinear
             return ElementwiseLinear(A, entries)
     size = sum(leaf.size for leaf in jtu.tree_leaves(x))
     if size > _MAX_DENSE:
-        raise InputError(
-            InputProblem(
-                "dvax.solve(method=dvax.ExpRosenbrock())",
-                f"{size} unknowns that A or f couples",
-                f"it forms the matrix A + Df, which may have at most {_MAX_DENSE} unknowns unless A is "
-                "a number or diagonal and f acts point by point",
-                "Use dvax.Implicit(), or the default method with more steps",
-            )
+        raise input_error(
+            "dvax.solve(method=dvax.ExpRosenbrock())",
+            f"{size} unknowns that A or f couples",
+            f"it forms the matrix A + Df, which may have at most {_MAX_DENSE} unknowns unless A is "
+            "a number or diagonal and f acts point by point",
+            "Use dvax.Implicit(), or the default method with more steps",
         )
     return MatrixLinear(matrix_of(generator.apply, x), matrix_of(jvp, x))

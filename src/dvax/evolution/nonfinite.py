@@ -9,25 +9,20 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import Problems
 from ..problem import Problem
 from .setup import Setup
 
 
 def refuse_nonfinite_data(problem: Problem, args: Any, caller: str) -> None:
     """Raise an `InputError` if A, P, K or args contain NaN, or if A or P contain infinity."""
-    wrong = []
+    wrong = Problems()
     for name, data in (("A", problem.A), ("P", problem.P), ("K", problem.K), ("args", args)):
         description = first_bad(data, allow_infinite=name in ("K", "args"))
         if description:
             place = f"{caller}(args)" if name == "args" else f"dvax.Problem({name})"
-            wrong.append(
-                InputProblem(
-                    place, description, "its numbers must be finite", "Correct the data there"
-                )
-            )
-    if wrong:
-        raise InputError(*wrong)
+            wrong.add(place, description, "its numbers must be finite", "Correct the data there")
+    wrong.raise_any()
 
 
 def first_bad(tree: Tree, allow_infinite: bool = False) -> str:

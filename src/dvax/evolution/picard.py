@@ -20,7 +20,7 @@ from jax import lax
 from .. import _tree
 from .._jax import forward_only
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..generators import AbstractGenerator, AbstractPropagator
 from .bounds import Bounds
 from .control import clip_to_stop, root_mean_squares
@@ -84,11 +84,9 @@ class Picard(eqx.Module):
         for name in ("nodes", "max_sweeps"):
             given = getattr(self, name)
             if not isinstance(given, int) or given < 1:
-                raise InputError(
-                    InputProblem(
-                        f"dvax.Picard({name})", repr(given), "it must be a positive integer",
-                        "64 nodes and 50 sweeps are the defaults",
-                    )
+                raise input_error(
+                    f"dvax.Picard({name})", repr(given), "it must be a positive integer",
+                    "64 nodes and 50 sweeps are the defaults",
                 )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 
 from .. import _tree
 from .._once import once_per_object
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 
 
 class Signature(NamedTuple):
@@ -93,12 +93,10 @@ def _exact_key(leaf: Any) -> tuple[Any, ...]:
     try:
         hash(leaf)
     except TypeError as error:
-        raise InputError(
-            InputProblem(
-                "dvax.solve(problem, args)",
-                f"{type(leaf).__name__} {_tree.line(leaf)}",
-                "values that are not arrays are static arguments, which must be hashable",
-                "Register its class as a pytree (such as an equinox.Module), or make it hashable",
-            )
+        raise input_error(
+            "dvax.solve(problem, args)",
+            f"{type(leaf).__name__} {_tree.line(leaf)}",
+            "values that are not arrays are static arguments, which must be hashable",
+            "Register its class as a pytree (such as an equinox.Module), or make it hashable",
         ) from error
     return type(leaf), leaf, math.copysign(1.0, leaf) if isinstance(leaf, float) else None

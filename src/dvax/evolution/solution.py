@@ -14,7 +14,7 @@ from .._dataset import Names, required
 from .._jax.traces import current_trace
 from .._repr import last_text, table, value_text
 from .._tree import Tree
-from ..errors import Fix, InputError, InputProblem, SolveError
+from ..errors import Fix, SolveError, input_error
 from .bounds import Bounds
 from .dataset import solution_dataset
 from .diagnose import failure
@@ -178,13 +178,11 @@ class Solution(eqx.Module):
         **Raises:** `dvax.InputError` if the steps were not recorded, or if t lies outside them.
         """
         if self.records is None:
-            raise InputError(
-                InputProblem(
-                    "Solution.evaluate",
-                    f"t = {t}",
-                    "the steps were not recorded, so only the saved times are available",
-                    "Solve with dense=True, or list the times in ts=",
-                )
+            raise input_error(
+                "Solution.evaluate",
+                f"t = {t}",
+                "the steps were not recorded, so only the saved times are available",
+                "Solve with dense=True, or list the times in ts=",
             )
         self._check_inside(t)
         if not jnp.ndim(t):
@@ -245,13 +243,11 @@ class Solution(eqx.Module):
             end = starts[last] + records.length[last]
         outside = times[~((first <= times) & (times <= end))]
         if outside.size:
-            raise InputError(
-                InputProblem(
-                    "Solution.evaluate",
-                    f"t = {float(outside.flat[0]):g}",
-                    f"t must lie in [{float(first):g}, {float(end):g}], which the solve covers",
-                    "Solve on a longer interval, or choose a time inside",
-                )
+            raise input_error(
+                "Solution.evaluate",
+                f"t = {float(outside.flat[0]):g}",
+                f"t must lie in [{float(first):g}, {float(end):g}], which the solve covers",
+                "Solve on a longer interval, or choose a time inside",
             )
 
     def regimes(self) -> Regimes:
@@ -277,32 +273,26 @@ class Solution(eqx.Module):
         ```
         """
         if not _tree.is_concrete(self.ts, self.xs, self.setup.setting):
-            raise InputError(
-                InputProblem(
-                    "Solution.regimes", "a solution inside a compiled program",
-                    "their number, and with it the shape of the result, depends on values",
-                    "Call it outside of jax.jit, jax.vmap and jax.grad",
-                )
+            raise input_error(
+                "Solution.regimes", "a solution inside a compiled program",
+                "their number, and with it the shape of the result, depends on values",
+                "Call it outside of jax.jit, jax.vmap and jax.grad",
             )  # fmt: skip
         if int(self.stats["steps"]) == 0:
-            raise InputError(
-                InputProblem(
-                    "Solution.regimes", "a run without steps", "the changes are located on its steps",
-                    "Look at why the run failed: its result and stats",
-                )
+            raise input_error(
+                "Solution.regimes", "a run without steps", "the changes are located on its steps",
+                "Look at why the run failed: its result and stats",
             )  # fmt: skip
         if isinstance(self.records, Trajectory):
             return signs(self.records)
         flow = self.flow
         x0, t0 = self.setup.x0, self.setup.number("t0")
         if flow.switches(t0, x0, flow.problem.zero_control(x0)) is None:
-            raise InputError(
-                InputProblem(
-                    "Solution.regimes",
-                    f"K of type {type(flow.problem.set_at(t0, flow.args)).__name__}",
-                    "the set must have switch functions (dvax.sets.AbstractSet.switches)",
-                    "Write K as a set that has them, such as dvax.sets.Polyhedron",
-                )
+            raise input_error(
+                "Solution.regimes",
+                f"K of type {type(flow.problem.set_at(t0, flow.args)).__name__}",
+                "the set must have switch functions (dvax.sets.AbstractSet.switches)",
+                "Write K as a set that has them, such as dvax.sets.Polyhedron",
             )
         if self.records is None:
             # Here, since this module is below `solve`.

@@ -12,7 +12,7 @@ import numpy as np
 from .. import _tree, _user_code
 from .._jax.messages import is_reverse_only
 from .._tree import Tree
-from ..errors import DifferentiationError, InputError, InputProblem
+from ..errors import DifferentiationError, InputError, input_error
 from ..generators import AbstractGenerator
 from ..generators.sharded import place
 from ..problem import Problem
@@ -374,11 +374,9 @@ def _only_adaptive(dt: Any, method: Any) -> None:
         ("method", method if isinstance(method, Implicit) else None, "its steps have no defect"),
     ):
         if given is not None:
-            raise InputError(
-                InputProblem(
-                    f"dvax.solve({name})", str(given), f"with certified_tol {why}",
-                    "Leave it out, or use dvax.bound_error on the solution",
-                )
+            raise input_error(
+                f"dvax.solve({name})", str(given), f"with certified_tol {why}",
+                "Leave it out, or use dvax.bound_error on the solution",
             )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from . import meter
 from .results import is_success
 from .rows import cut, with_fields
@@ -66,7 +66,7 @@ def check_save(save: Any, ts: Any, x0: Any, args: Any, others: tuple[bool, ...])
             f"Leave out {wrong[0]}=",
         )
     if place:
-        raise InputError(InputProblem(f"dvax.solve({place})", given, rule, fix))
+        raise input_error(f"dvax.solve({place})", given, rule, fix)
 
 
 def stream(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .._files import consolidate
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from .solution import Solution
 
 _CHUNK_BYTES = 2**23
@@ -57,11 +57,9 @@ class ZarrStore:
     def begin(self, count: int) -> None:
         """Make room for `count` rows. `dvax.solve` calls it before the run."""
         if self.path.exists() and not (self._overwrite and _is_store(self.path)):
-            raise InputError(
-                InputProblem(
-                    "dvax.ZarrStore(path)", str(self.path), "there is something at this path",
-                    "Give another path, or overwrite=True for a Zarr store",
-                )
+            raise input_error(
+                "dvax.ZarrStore(path)", str(self.path), "there is something at this path",
+                "Give another path, or overwrite=True for a Zarr store",
             )  # fmt: skip
         shutil.rmtree(self.path, ignore_errors=True)
         self.complete_rows, self._count, self._arrays = 0, count, {}

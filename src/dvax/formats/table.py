@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError, InputProblem, Problems, input_error
+from ..errors import InputError, Problems, input_error
 
 MAX_CELLS = 10_000
 """The most cells of a row of a CSV file."""
@@ -43,10 +43,10 @@ class FileProblems(Problems):
 
     def error(self) -> InputError:
         """Return an `InputError` with the first `MAX_PROBLEMS` problems and a count of the rest."""
-        shown, more = self[:MAX_PROBLEMS], len(self) - MAX_PROBLEMS
+        shown, more = Problems(self[:MAX_PROBLEMS]), len(self) - MAX_PROBLEMS
         if more > 0:
             rule = f"the first {MAX_PROBLEMS} are shown: often they have one cause"
-            shown.append(InputProblem(self.file, f"{more} more problems", rule, "Fix those first"))
+            shown.add(self.file, f"{more} more problems", rule, "Fix those first")
         return InputError(*shown)
 
     def check(self) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from .abstract import AbstractGenerator, AbstractPropagator, FlowStep, Growth
 from .chord_deviation import normwise_chord_deviation
@@ -48,13 +48,11 @@ class Dense(AbstractGenerator):
         self.matrix = _tree.as_array(matrix, "dvax.generators.Dense(matrix)")
         shape = self.matrix.shape
         if len(shape) != 2 or shape[0] != shape[1]:
-            raise InputError(
-                InputProblem(
-                    "dvax.generators.Dense(matrix)",
-                    f"shape {shape}",
-                    "a generator maps the state space to itself, so its matrix must be square",
-                    "Use dvax.generators.Diagonal for a vector of diagonal entries",
-                )
+            raise input_error(
+                "dvax.generators.Dense(matrix)",
+                f"shape {shape}",
+                "a generator maps the state space to itself, so its matrix must be square",
+                "Use dvax.generators.Diagonal for a vector of diagonal entries",
             )
         self.omega = None
         if omega is not None:

@@ -12,7 +12,7 @@ from jax.sharding import NamedSharding
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import Problems, input_error
 from ..spaces import AbstractSpace
 from .abstract import AbstractPropagator, FlowStep, Growth
 from .layout import Layout
@@ -228,13 +228,11 @@ def _broadcast_to_axes(name: str, value: Any, count: int) -> list[jax.Array]:
     full = f"dvax.generators.Elliptic({name})"
     array = _tree.as_array([*value] if isinstance(value, tuple) else value, full)
     if array.shape not in ((), (count,)):
-        raise InputError(
-            InputProblem(
-                full,
-                f"shape {array.shape}",
-                f"it must be one number, or one for each of the {count} axes",
-                f"Give {count} numbers",
-            )
+        raise input_error(
+            full,
+            f"shape {array.shape}",
+            f"it must be one number, or one for each of the {count} axes",
+            f"Give {count} numbers",
         )
     return list(jnp.broadcast_to(array, (count,)))
 
@@ -252,26 +250,19 @@ def _kinds(boundary: Any, axes: int) -> tuple[Any, ...]:
 
 def _check(shape: tuple[int, ...], kinds: tuple[str, ...], scheme: str) -> None:
     name = "dvax.generators.Elliptic"
-    wrong: list[InputProblem] = []
+    wrong = Problems()
     if not 1 <= len(shape) <= 3:
-        wrong.append(
-            InputProblem(f"{name}(shape)", str(shape),
-                         "there must be one to three axes of at least one cell",
-                         "Give the number of cells along each axis")
-        )  # fmt: skip
+        wrong.add(f"{name}(shape)", str(shape),
+                  "there must be one to three axes of at least one cell",
+                  "Give the number of cells along each axis")  # fmt: skip
     if len(kinds) != len(shape) or any(str(kind) not in BOUNDARIES for kind in kinds):
-        wrong.append(
-            InputProblem(f"{name}(boundary)", _tree.line(kinds),
-                         f"it must be one of {', '.join(BOUNDARIES)}, for all axes or for each",
-                         "Choose one of these")
-        )  # fmt: skip
+        wrong.add(f"{name}(boundary)", _tree.line(kinds),
+                  f"it must be one of {', '.join(BOUNDARIES)}, for all axes or for each",
+                  "Choose one of these")  # fmt: skip
     if not isinstance(scheme, str) or scheme not in ("spectral", "differences"):
-        wrong.append(
-            InputProblem(f"{name}(scheme)", _tree.line(scheme),
-                         "it must be 'spectral' or 'differences'", "Omit it for 'spectral'")
-        )  # fmt: skip
-    if wrong:
-        raise InputError(*wrong)
+        wrong.add(f"{name}(scheme)", _tree.line(scheme),
+                  "it must be 'spectral' or 'differences'", "Omit it for 'spectral'")  # fmt: skip
+    wrong.raise_any()
 
 
 def _check_numbers(L: list, d: list, c: list, kinds: tuple[str, ...]) -> None:
@@ -287,12 +278,10 @@ def _check_numbers(L: list, d: list, c: list, kinds: tuple[str, ...]) -> None:
     )  # fmt: skip
     for axis, (v, kind) in enumerate(zip(c, kinds, strict=True)):
         if kind != "periodic" and not _is_zero(v):
-            raise InputError(
-                InputProblem(
-                    f"{name}(velocity)",
-                    f"{_tree.short(v) if _tree.is_concrete(v) else 'a traced number'} along axis "
-                    f"{axis}, which is {kind}",
-                    "advection is diagonal only in the Fourier basis, so its axis must be periodic",
-                    "Add the advection to f, or use dvax.generators.Sparse",
-                )
+            raise input_error(
+                f"{name}(velocity)",
+                f"{_tree.short(v) if _tree.is_concrete(v) else 'a traced number'} along axis "
+                f"{axis}, which is {kind}",
+                "advection is diagonal only in the Fourier basis, so its axis must be periodic",
+                "Add the advection to f, or use dvax.generators.Sparse",
             )

@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from .faber import Range
 from .matrix_free import AbstractMatrixFree
 from .sparse import Sparse, Triplets, triplets
@@ -147,26 +147,22 @@ def _interval(scaled: Sparse, declared: tuple[float, float] | None) -> tuple[flo
         given = f"({low:g}, {high:g})"
     else:
         if not _tree.is_concrete(scaled.range.low):
-            raise InputError(
-                InputProblem(
-                    name, "None, with a traced mass matrix",
-                    "the number of products with M must not depend on traced values",
-                    "Declare the interval, such as (1/2, 2) for linear triangles",
-                )
+            raise input_error(
+                name, "None, with a traced mass matrix",
+                "the number of products with M must not depend on traced values",
+                "Declare the interval, such as (1/2, 2) for linear triangles",
             )  # fmt: skip
         slack = 64 * float(jnp.finfo(scaled.range.low.dtype).eps)
         low = float(scaled.range.low) * (1 - slack)
         high = float(scaled.range.high) * (1 + slack)
         given = f"None, and Gershgorin's circles give ({low:.3g}, {high:.3g})"
     if not 0.0 < low <= high < math.inf:
-        raise InputError(
-            InputProblem(
-                name, given,
-                "the eigenvalues of D⁻¹M must lie in a finite interval [l, h] with 0 < l ≤ h, on "
-                "which a polynomial approximates M⁻¹",
-                "Declare that of the element: (1/2, 2) for linear triangles, (1/2, 5/2) for linear "
-                "tetrahedra, (1/4, 9/4) for bilinear parallelograms, (1/8, 27/8) for trilinear boxes",
-            )
+        raise input_error(
+            name, given,
+            "the eigenvalues of D⁻¹M must lie in a finite interval [l, h] with 0 < l ≤ h, on "
+            "which a polynomial approximates M⁻¹",
+            "Declare that of the element: (1/2, 2) for linear triangles, (1/2, 5/2) for linear "
+            "tetrahedra, (1/4, 9/4) for bilinear parallelograms, (1/8, 27/8) for trilinear boxes",
         )  # fmt: skip
     return low, high
 
@@ -203,12 +199,10 @@ def _quotient_range(enclosure: Range, low: float, high: float) -> Range:
 def _check(M: Triplets, S: Triplets) -> None:
     name = "dvax.generators.FiniteElements"
     if M.size != S.size:
-        raise InputError(
-            InputProblem(
-                f"{name}(stiffness)", f"{S.size} rows, with a mass matrix of {M.size} rows",
-                "both must act on the same unknowns",
-                "Assemble both with the same mesh and boundary conditions",
-            )
+        raise input_error(
+            f"{name}(stiffness)", f"{S.size} rows, with a mass matrix of {M.size} rows",
+            "both must act on the same unknowns",
+            "Assemble both with the same mesh and boundary conditions",
         )  # fmt: skip
 
     eps = float(jnp.finfo(M.values.dtype).eps)

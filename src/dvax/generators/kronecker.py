@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace, Euclidean
 from .abstract import AbstractPropagator, FlowStep, Growth
 from .chord_deviation import normwise_chord_deviation
@@ -90,13 +90,11 @@ class KroneckerSum(AbstractModal):
     def check(self, space: AbstractSpace) -> None:
         zeros, m = space.zeros(), self.matrix.shape[0]
         if isinstance(zeros, tuple) or jnp.ndim(zeros) < 1 or zeros.shape[0] != m:
-            raise InputError(
-                InputProblem(
-                    "dvax.generators.KroneckerSum(matrix)",
-                    f"shape {self.matrix.shape}",
-                    f"it acts on the first axis of the state, whose shape is {_tree.shapes(zeros)}",
-                    f"Stack {m} components on one grid: x0 of shape ({m}, *grid)",
-                )
+            raise input_error(
+                "dvax.generators.KroneckerSum(matrix)",
+                f"shape {self.matrix.shape}",
+                f"it acts on the first axis of the state, whose shape is {_tree.shapes(zeros)}",
+                f"Stack {m} components on one grid: x0 of shape ({m}, *grid)",
             )
         self.field.check(Euclidean(zeros.shape[1:]))
 

@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import InputError, input_error
 from ..spaces import AbstractSpace
 from .abstract import AbstractGenerator, FlowStep, Growth
 from .chord_deviation import normwise_chord_deviation
@@ -81,13 +81,11 @@ class AbstractMatrixFree(AbstractGenerator):
         return normwise_chord_deviation(self, step, space, growth)
 
     def _shape_error(self, v: Tree, what: str) -> InputError:
-        return InputError(
-            InputProblem(
-                f"{type(self).__name__}.apply",
-                f"v of shape {_tree.shapes(v)}, {what}",
-                "a generator must map the state space to itself",
-                "Correct apply, or pass state_space= to dvax.Problem",
-            )
+        return input_error(
+            f"{type(self).__name__}.apply",
+            f"v of shape {_tree.shapes(v)}, {what}",
+            "a generator must map the state space to itself",
+            "Correct apply, or pass state_space= to dvax.Problem",
         )
 
 

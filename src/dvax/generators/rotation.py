@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from ..spaces import Product as ProductSpace
 from .abstract import AbstractPropagator, FlowStep, Growth
@@ -52,13 +52,11 @@ class Rotation(AbstractModal):
         if self.a.ndim == 0 and self.b.ndim > 0:
             self.a = jnp.broadcast_to(self.a, self.b.shape)
         if self.a.shape != self.b.shape:
-            raise InputError(
-                InputProblem(
-                    "dvax.generators.Rotation(growth, turn)",
-                    f"shapes {self.a.shape} and {self.b.shape}",
-                    "both must have the same shape",
-                    "Give both the same shape, or growth as a number",
-                )
+            raise input_error(
+                "dvax.generators.Rotation(growth, turn)",
+                f"shapes {self.a.shape} and {self.b.shape}",
+                "both must have the same shape",
+                "Give both the same shape, or growth as a number",
             )
 
     def apply(self, v: Tree) -> Tree:

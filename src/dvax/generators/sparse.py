@@ -10,7 +10,7 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from .faber import Ellipse, Range, smaller_ellipse
 from .matrix_free import AbstractMatrixFree
 
@@ -103,33 +103,27 @@ def triplets(matrix: Any, name: str) -> Triplets:
         rows, cols, values = coo.row, coo.col, coo.data
     elif hasattr(matrix, "indices") and hasattr(matrix, "data") and np.ndim(matrix.indices) == 2:
         if not _tree.is_concrete(matrix.indices):
-            raise InputError(
-                InputProblem(
-                    name,
-                    "traced indices",
-                    "the sparsity pattern must be concrete; only the values may depend on args",
-                    "Compute the indices outside of A",
-                )
+            raise input_error(
+                name,
+                "traced indices",
+                "the sparsity pattern must be concrete; only the values may depend on args",
+                "Compute the indices outside of A",
             )
         rows, cols = np.asarray(matrix.indices).T
         values = matrix.data
     else:
-        raise InputError(
-            InputProblem(
-                name,
-                f"{type(matrix).__name__} of shape {shape}",
-                "it must be a sparse matrix of SciPy, or a jax.experimental.sparse.BCOO",
-                "Use dvax.generators.Dense for an array, or convert it: scipy.sparse.csr_array(...)",
-            )
+        raise input_error(
+            name,
+            f"{type(matrix).__name__} of shape {shape}",
+            "it must be a sparse matrix of SciPy, or a jax.experimental.sparse.BCOO",
+            "Use dvax.generators.Dense for an array, or convert it: scipy.sparse.csr_array(...)",
         )
     if len(shape) != 2 or shape[0] != shape[1]:
-        raise InputError(
-            InputProblem(
-                name,
-                f"shape {shape}",
-                "a generator maps the state space to itself, so its matrix must be square",
-                "Pass a square matrix",
-            )
+        raise input_error(
+            name,
+            f"shape {shape}",
+            "a generator maps the state space to itself, so its matrix must be square",
+            "Pass a square matrix",
         )
     values = _tree.as_float(values, name)
     _tree.require(
@@ -142,13 +136,11 @@ def triplets(matrix: Any, name: str) -> Triplets:
 def _check_weights(weights: jax.Array, size: int) -> None:
     name = "dvax.generators.Sparse(weights)"
     if weights.shape not in ((), (size,)):
-        raise InputError(
-            InputProblem(
-                name,
-                f"shape {weights.shape}",
-                f"it must be one number, or one for each of the {size} unknowns",
-                "Give the diagonal of the lumped mass matrix",
-            )
+        raise input_error(
+            name,
+            f"shape {weights.shape}",
+            f"it must be one number, or one for each of the {size} unknowns",
+            "Give the diagonal of the lumped mass matrix",
         )
     _tree.require(
         lambda: bool(np.all(np.asarray(weights) > 0)), name, weights,

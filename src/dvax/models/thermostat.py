@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
-from ..errors import InputError, InputProblem, Problems
+from ..errors import InputError, Problems
 from ..generators import Elliptic
 from ..operators import Scaling
 from ..problem import Problem
@@ -231,14 +231,10 @@ def _signal(name: str, value: Any, cells: tuple) -> AbstractSignal:
     def constant(value: Any) -> jax.Array:
         wrong = Problems()
         field = _field(name, value, cells, wrong)
-        if wrong or (_tree.is_concrete(field) and not np.all(np.isfinite(np.asarray(field)))):
+        if _tree.is_concrete(field) and not np.all(np.isfinite(np.asarray(field))):
             place = f"dvax.models.Thermostat({name})"
-            raise InputError(
-                *(
-                    wrong
-                    or [InputProblem(place, _tree.short(field), "it must be finite", "Correct it")]
-                )
-            )
+            wrong.add(place, _tree.short(field), "it must be finite", "Correct it")
+        wrong.raise_any()
         return field
 
     return as_signal(value, constant)

@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from .abstract import AbstractOperator, Spectrum
 
@@ -49,14 +49,12 @@ class Convolution(AbstractOperator):
         )
         stored = (*self.shape[:-1], self.shape[-1] // 2 + 1) if self.shape else ()
         if len(self.shape) not in (1, 2) or jnp.shape(self.symbol) != stored:
-            raise InputError(
-                InputProblem(
-                    "dvax.operators.Convolution(symbol, shape)",
-                    f"shapes {jnp.shape(self.symbol)} and {self.shape}",
-                    f"the grid must have one or two dimensions, and the symbol the shape {stored} "
-                    "of its rfftn",
-                    "Evaluate the symbol at jnp.fft.fftfreq and, along the last axis, rfftfreq",
-                )
+            raise input_error(
+                "dvax.operators.Convolution(symbol, shape)",
+                f"shapes {jnp.shape(self.symbol)} and {self.shape}",
+                f"the grid must have one or two dimensions, and the symbol the shape {stored} "
+                "of its rfftn",
+                "Evaluate the symbol at jnp.fft.fftfreq and, along the last axis, rfftfreq",
             )
         _tree.require(
             lambda: jnp.all((self.symbol > 0) & jnp.isfinite(self.symbol)),
@@ -83,13 +81,11 @@ class Convolution(AbstractOperator):
         name = "dvax.operators.Convolution(symbol)"
         zeros = space.zeros()
         if isinstance(zeros, tuple) or jnp.shape(zeros) != self.shape:
-            raise InputError(
-                InputProblem(
-                    name,
-                    f"a grid of shape {self.shape}",
-                    f"it acts on the control space, whose elements have shape {_tree.shapes(zeros)}",
-                    "Pass control_space= to dvax.Problem",
-                )
+            raise input_error(
+                name,
+                f"a grid of shape {self.shape}",
+                f"it acts on the control space, whose elements have shape {_tree.shapes(zeros)}",
+                "Pass control_space= to dvax.Problem",
             )
         weights = jnp.asarray(space.weights())
         _tree.require(

@@ -8,7 +8,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from .abstract import AbstractOperator, Spectrum
 
@@ -38,13 +38,11 @@ class Dense(AbstractOperator):
         self.matrix = _tree.as_array(matrix, name)
         shape = self.matrix.shape
         if len(shape) != 2 or shape[0] != shape[1]:
-            raise InputError(
-                InputProblem(
-                    name,
-                    f"shape {shape}",
-                    "P maps the control space to itself, so its matrix must be square",
-                    "Use dvax.operators.Diagonal for a vector of diagonal entries",
-                )
+            raise input_error(
+                name,
+                f"shape {shape}",
+                "P maps the control space to itself, so its matrix must be square",
+                "Use dvax.operators.Diagonal for a vector of diagonal entries",
             )
         if _tree.is_concrete(self.matrix):
             _check_positive(name, np.asarray(self.matrix))
@@ -103,7 +101,7 @@ def _check_positive(name: str, matrix: np.ndarray) -> None:
     if given:
         rule = "P must be bounded and coercive, so its matrix must be finite and positive definite"
         fix = "Correct the matrix, or add a multiple of the identity"
-        raise InputError(InputProblem(name, given, rule, fix))
+        raise input_error(name, given, rule, fix)
 
 
 def _describe_indefinite(matrix: np.ndarray) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from .abstract import AbstractOperator, Spectrum
 
@@ -61,14 +61,12 @@ class LowRank(AbstractOperator):
             or shapes[0] not in ((), shapes[1][:1])
             or shapes[2] != shapes[1][1:]
         ):
-            raise InputError(
-                InputProblem(
-                    f"{name}(diagonal, U, s)",
-                    f"shapes {shapes[0]}, {shapes[1]} and {shapes[2]}",
-                    "U must have one row for each entry of the diagonal (unless that is one number) "
-                    "and one column for each entry of s",
-                    "Give the shapes (n,), (n, k) and (k,)",
-                )
+            raise input_error(
+                f"{name}(diagonal, U, s)",
+                f"shapes {shapes[0]}, {shapes[1]} and {shapes[2]}",
+                "U must have one row for each entry of the diagonal (unless that is one number) "
+                "and one column for each entry of s",
+                "Give the shapes (n,), (n, k) and (k,)",
             )
         _tree.require(
             lambda: jnp.all((self.diagonal > 0) & jnp.isfinite(self.diagonal)),
@@ -100,13 +98,11 @@ class LowRank(AbstractOperator):
         name = "dvax.operators.LowRank(U, s)"
         zeros = space.zeros()
         if isinstance(zeros, tuple) or jnp.shape(zeros) != self.U.shape[:1]:
-            raise InputError(
-                InputProblem(
-                    name,
-                    f"U of shape {self.U.shape}",
-                    f"it acts on the control space, whose elements have shape {_tree.shapes(zeros)}",
-                    "Give U as many rows as the control has entries, and the control as a vector",
-                )
+            raise input_error(
+                name,
+                f"U of shape {self.U.shape}",
+                f"it acts on the control space, whose elements have shape {_tree.shapes(zeros)}",
+                "Give U as many rows as the control has entries, and the control as a vector",
             )
         weights = jnp.broadcast_to(jnp.asarray(space.weights(), self.U.dtype), self.U.shape[:1])
         _tree.require(

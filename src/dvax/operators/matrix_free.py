@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from .abstract import AbstractOperator, Spectrum
 
@@ -100,13 +100,11 @@ class MatrixFree(AbstractOperator):
         zeros = space.zeros()
         out = jax.eval_shape(self.fn, zeros)
         if not _tree.same_shape(out, zeros):
-            raise InputError(
-                InputProblem(
-                    name,
-                    f"a value of shape {_tree.shapes(out)}",
-                    f"P must map the control space, of shape {_tree.shapes(zeros)}, to itself",
-                    "Return that shape from fn",
-                )
+            raise input_error(
+                name,
+                f"a value of shape {_tree.shapes(out)}",
+                f"P must map the control space, of shape {_tree.shapes(zeros)}, to itself",
+                "Return that shape from fn",
             )
         self._check_weights(space)
         if _tree.is_concrete((self.m, self.norm, space.weights())):
@@ -128,13 +126,11 @@ class MatrixFree(AbstractOperator):
                 for a, b in zip(*map(jax.tree_util.tree_leaves, (given, expected)), strict=True)
             )
         if not fits:
-            raise InputError(
-                InputProblem(
-                    "dvax.operators.MatrixFree(weights)",
-                    _tree.short(given),
-                    f"the weights must be those of {space!r}, in which P is self-adjoint",
-                    "Pass weights=space.weights()",
-                )
+            raise input_error(
+                "dvax.operators.MatrixFree(weights)",
+                _tree.short(given),
+                f"the weights must be those of {space!r}, in which P is self-adjoint",
+                "Pass weights=space.weights()",
             )
 
     def _check_properties(self, space: AbstractSpace, name: str) -> None:
@@ -165,7 +161,7 @@ class MatrixFree(AbstractOperator):
              "the declared m and norm must enclose it, or bounds that depend on them are wrong"),
         ):  # fmt: skip
             if wrong:
-                raise InputError(InputProblem(name, given, rule, "Correct fn, or m and norm"))
+                raise input_error(name, given, rule, "Correct fn, or m and norm")
 
 
 def _is_number(weights: Tree) -> bool:

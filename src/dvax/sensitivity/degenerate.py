@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..evolution import Solution
 from ..evolution.outcome import Record
 from ..evolution.regimes import switches_along
@@ -76,13 +76,11 @@ def kinks(sol: Solution, *, tol: float = 1e-6) -> list[Kink]:
     """
     if not isinstance(sol.records, Record):
         dense = "without dense output" if sol.records is None else "with dense output"
-        raise InputError(
-            InputProblem(
-                "dvax.sensitivity.kinks",
-                f"a solution of {type(sol.setup.method).__name__} {dense}",
-                "the kinks between saved times are located on the steps of an exponential method",
-                "Solve with dense=True and an exponential method",
-            )
+        raise input_error(
+            "dvax.sensitivity.kinks",
+            f"a solution of {type(sol.setup.method).__name__} {dense}",
+            "the kinks between saved times are located on the steps of an exponential method",
+            "Solve with dense=True and an exponential method",
         )
     count = int(sol.stats["steps"])
     if count == 0 or not _has_switches(sol):

@@ -22,7 +22,7 @@ import numpy as np
 from .. import _tree
 from .._dataset import dataset, described, named, over
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import InputError, input_error
 from ..evolution import ETD4RK, AbstractMethod, Solution, solve
 from ..problem import Problem
 from ..signals import Table, listen
@@ -144,12 +144,10 @@ def directional_derivative(
     ```
     """
     if not _tree.is_concrete(x0, t0, t1, args, dx0, dargs):
-        raise InputError(
-            InputProblem(
-                "dvax.directional_derivative", "a traced value",
-                "the kinks are located between the two solves, which requires concrete values",
-                "Call it outside jax.jit; away from kinks jax.jvp of dvax.solve is equal and compiles",
-            )
+        raise input_error(
+            "dvax.directional_derivative", "a traced value",
+            "the kinks are located between the two solves, which requires concrete values",
+            "Call it outside jax.jit; away from kinks jax.jvp of dvax.solve is equal and compiles",
         )  # fmt: skip
     x0 = _tree.as_float(x0, "x0")
     dx0, varied, fixed, direction = check_direction(x0, args, dx0, dargs)
@@ -327,11 +325,9 @@ def _check_shapes(x0: Tree, dx0: Tree, varied: Any, direction: Any) -> None:
 
 
 def _error(name: str, given: str, rule: str) -> InputError:
-    return InputError(
-        InputProblem(
-            f"dvax.directional_derivative({name})", given, rule,
-            "Give a direction of the same structure and shapes, with None for fixed leaves",
-        )
+    return input_error(
+        f"dvax.directional_derivative({name})", given, rule,
+        "Give a direction of the same structure and shapes, with None for fixed leaves",
     )  # fmt: skip
 
 

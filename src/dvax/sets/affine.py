@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from ._weights import has_uniform_weight, inverse_weights
 from .abstract import AbstractSet
@@ -86,13 +86,11 @@ def checked_rows(name: str, E: Any, e: Any, left: str, right: str) -> tuple[jax.
     E = _tree.as_array(E, f"{name}({left})")
     e = _tree.as_array(e, f"{name}({right})")
     if jnp.ndim(E) < 1 or jnp.shape(e) != jnp.shape(E)[:1] or jnp.shape(E)[0] == 0:
-        raise InputError(
-            InputProblem(
-                f"{name}({left}, {right})",
-                f"shapes {jnp.shape(E)} and {jnp.shape(e)}",
-                f"{left} must have one row, and {right} one number, for each condition",
-                f"Give {left} the shape (conditions, *shape of y) and {right} (conditions,)",
-            )
+        raise input_error(
+            f"{name}({left}, {right})",
+            f"shapes {jnp.shape(E)} and {jnp.shape(e)}",
+            f"{left} must have one row, and {right} one number, for each condition",
+            f"Give {left} the shape (conditions, *shape of y) and {right} (conditions,)",
         )
     _tree.require(
         lambda: jnp.all(jnp.isfinite(E)) & ~jnp.any(jnp.isnan(e)),
@@ -107,13 +105,11 @@ def checked_rows(name: str, E: Any, e: Any, left: str, right: str) -> tuple[jax.
 def check_row_shapes(name: str, E: jax.Array, like: Tree) -> None:
     """Raise an `InputError` unless the rows of E are shaped like the element `like`."""
     if isinstance(like, tuple) or jnp.shape(E)[1:] != jnp.shape(like):
-        raise InputError(
-            InputProblem(
-                name,
-                f"shape {jnp.shape(E)}",
-                f"every row must have the shape {_tree.shapes(like)} of y = P u",
-                "Give it the shape (conditions, *shape of y)",
-            )
+        raise input_error(
+            name,
+            f"shape {jnp.shape(E)}",
+            f"every row must have the shape {_tree.shapes(like)} of y = P u",
+            "Give it the shape (conditions, *shape of y)",
         )
 
 

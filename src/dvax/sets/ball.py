@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from .abstract import AbstractSet
 
@@ -59,14 +59,12 @@ class Ball(AbstractSet):
             _tree.same_shape(self.center, like)
             or (_tree.shapes(self.center) == () and not isinstance(self.center, tuple))
         ):
-            raise InputError(
-                InputProblem(
-                    "dvax.sets.Ball(center, radius)",
-                    f"shapes {_tree.shapes(self.center)} and {jnp.shape(self.radius)}",
-                    f"the center must be an element of shape {_tree.shapes(like)} or a number, "
-                    "the radius a number",
-                    "Use dvax.sets.Product for one ball a part",
-                )
+            raise input_error(
+                "dvax.sets.Ball(center, radius)",
+                f"shapes {_tree.shapes(self.center)} and {jnp.shape(self.radius)}",
+                f"the center must be an element of shape {_tree.shapes(like)} or a number, "
+                "the radius a number",
+                "Use dvax.sets.Product for one ball a part",
             )
 
     def _minus_center(self, z: Tree) -> Tree:

@@ -8,7 +8,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from .abstract import AbstractSet
 
@@ -86,13 +86,11 @@ class Box(AbstractSet):
 
     def check(self, like: Tree) -> None:
         if isinstance(like, tuple):
-            raise InputError(
-                InputProblem(
-                    "dvax.sets.Box",
-                    "one box",
-                    f"y = P u is a tuple of {len(like)} parts",
-                    "Give one set a part: dvax.sets.Product(...)",
-                )
+            raise input_error(
+                "dvax.sets.Box",
+                "one box",
+                f"y = P u is a tuple of {len(like)} parts",
+                "Give one set a part: dvax.sets.Product(...)",
             )
         shape = jnp.shape(like)
         for name, bound in (("lower", self.lower), ("upper", self.upper)):
@@ -101,13 +99,11 @@ class Box(AbstractSet):
             except ValueError:
                 fits = False
             if not fits:
-                raise InputError(
-                    InputProblem(
-                        f"dvax.sets.Box({name})",
-                        f"shape {bound.shape}",
-                        f"the bound must broadcast against y = P u, of shape {shape}",
-                        "Give the bound that shape, or set control_space= of dvax.Problem",
-                    )
+                raise input_error(
+                    f"dvax.sets.Box({name})",
+                    f"shape {bound.shape}",
+                    f"the bound must broadcast against y = P u, of shape {shape}",
+                    "Give the bound that shape, or set control_space= of dvax.Problem",
                 )
 
 
@@ -115,12 +111,10 @@ def _check_shapes(lower: tuple[int, ...], upper: tuple[int, ...]) -> None:
     try:
         np.broadcast_shapes(lower, upper)
     except ValueError:
-        raise InputError(
-            InputProblem(
-                "dvax.sets.Box(lower, upper)", f"shapes {lower} and {upper}",
-                "the shapes of both bounds must broadcast",
-                "Give both the same shape, or a number for all entries",
-            )
+        raise input_error(
+            "dvax.sets.Box(lower, upper)", f"shapes {lower} and {upper}",
+            "the shapes of both bounds must broadcast",
+            "Give both the same shape, or a number for all entries",
         ) from None  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from ._root import differentiable_root
 from ._weights import has_uniform_weight, inverse_weights
@@ -57,13 +57,11 @@ class Ellipsoid(AbstractSet):
             "Correct the entries that are not",
         )
         if (radii is None) == (shape is None):
-            raise InputError(
-                InputProblem(
-                    f"{name}(radii, shape)",
-                    "neither" if radii is None else "both",
-                    "an ellipsoid is defined by its half-axes along the coordinates or by its matrix S",
-                    "Give one of radii= and shape=",
-                )
+            raise input_error(
+                f"{name}(radii, shape)",
+                "neither" if radii is None else "both",
+                "an ellipsoid is defined by its half-axes along the coordinates or by its matrix S",
+                "Give one of radii= and shape=",
             )
         self.radii = self.shape = self.principal = None
         if radii is not None:
@@ -103,14 +101,12 @@ class Ellipsoid(AbstractSet):
         else:
             fits = fits and len(shape) == 1 and given == (shape[0], shape[0])
         if not fits:
-            raise InputError(
-                InputProblem(
-                    "dvax.sets.Ellipsoid(center, radii, shape)",
-                    f"shapes {jnp.shape(self.center)} and {given}",
-                    f"center and radii must have the shape {shape} of y = P u or be numbers; "
-                    "a matrix acts on vectors",
-                    "Use dvax.sets.Product for one ellipsoid a part",
-                )
+            raise input_error(
+                "dvax.sets.Ellipsoid(center, radii, shape)",
+                f"shapes {jnp.shape(self.center)} and {given}",
+                f"center and radii must have the shape {shape} of y = P u or be numbers; "
+                "a matrix acts on vectors",
+                "Use dvax.sets.Product for one ellipsoid a part",
             )
 
 
@@ -200,13 +196,11 @@ def _checked_radii(name: str, given: Any) -> jax.Array:
 def _checked_matrix(name: str, given: Any) -> jax.Array:
     matrix = _tree.as_array(given, name)
     if jnp.ndim(matrix) != 2 or matrix.shape[0] != matrix.shape[1]:
-        raise InputError(
-            InputProblem(
-                name,
-                f"shape {jnp.shape(matrix)}",
-                "the matrix of an ellipsoid must be square",
-                "Use radii= for half-axes along the coordinates",
-            )
+        raise input_error(
+            name,
+            f"shape {jnp.shape(matrix)}",
+            "the matrix of an ellipsoid must be square",
+            "Use radii= for half-axes along the coordinates",
         )
     _tree.require(
         lambda: (

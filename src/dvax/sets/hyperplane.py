@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from ._weights import inverse_weights
 from .abstract import AbstractSet
@@ -79,13 +79,11 @@ def checked_row(name: str, normal: Any, offset: Any) -> tuple[Tree, jax.Array]:
 def check_row_shape(name: str, normal: Tree, offset: jax.Array, like: Tree) -> None:
     """Raise an `InputError` unless the normal is shaped like `like` and the offset is a number."""
     if jnp.ndim(offset) != 0 or not _tree.same_shape(normal, like):
-        raise InputError(
-            InputProblem(
-                f"{name}(normal, offset)",
-                f"shapes {_tree.shapes(normal)} and {jnp.shape(offset)}",
-                f"the normal must have the shape {_tree.shapes(like)}, and the offset be a number",
-                "Use dvax.sets.AffineSubspace or dvax.sets.Polyhedron for several conditions",
-            )
+        raise input_error(
+            f"{name}(normal, offset)",
+            f"shapes {_tree.shapes(normal)} and {jnp.shape(offset)}",
+            f"the normal must have the shape {_tree.shapes(like)}, and the offset be a number",
+            "Use dvax.sets.AffineSubspace or dvax.sets.Polyhedron for several conditions",
         )
 
 

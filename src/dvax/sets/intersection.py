@@ -12,7 +12,7 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from .abstract import AbstractSet
 
@@ -56,16 +56,14 @@ class Intersection(AbstractSet):
         if not isinstance(max_cycles, int | np.integer) or max_cycles < 1:
             rule, fix = "it must be a whole number > 0", "Omit it for the default"
             given = _tree.line(max_cycles)
-            raise InputError(InputProblem(f"{name}(max_cycles)", given, rule, fix))
+            raise input_error(f"{name}(max_cycles)", given, rule, fix)
         self.sets, self.tol, self.max_cycles = sets, tol, max_cycles
         if not sets:
-            raise InputError(
-                InputProblem(
-                    "dvax.sets.Intersection",
-                    "no sets",
-                    "an intersection needs at least one set",
-                    "Use dvax.sets.WholeSpace() where there is no constraint",
-                )
+            raise input_error(
+                "dvax.sets.Intersection",
+                "no sets",
+                "an intersection needs at least one set",
+                "Use dvax.sets.WholeSpace() where there is no constraint",
             )
         example = "Intersection(dvax.sets.Box(0.0, 1.0), dvax.sets.Ball(0.0, 1.0))"
         _tree.check_parts(sets, AbstractSet, name, example)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from ._threshold import entry_thresholds, subtract, subtract_and_clip
 from ._weights import has_uniform_weight, inverse_weights
@@ -66,12 +66,10 @@ class L1Ball(AbstractSet):
     def check(self, like: Tree) -> None:
         shapes = _tree.shapes(self.center), jnp.shape(self.radius)
         if isinstance(like, tuple) or shapes not in ((jnp.shape(like), ()), ((), ())):
-            raise InputError(
-                InputProblem(
-                    "dvax.sets.L1Ball(center, radius)",
-                    f"shapes {shapes[0]} and {shapes[1]}",
-                    f"the center must be an array of the shape {_tree.shapes(like)} of y = P u, or "
-                    "a number, and the radius a number",
-                    "Use dvax.sets.Product for one ball a part",
-                )
+            raise input_error(
+                "dvax.sets.L1Ball(center, radius)",
+                f"shapes {shapes[0]} and {shapes[1]}",
+                f"the center must be an array of the shape {_tree.shapes(like)} of y = P u, or "
+                "a number, and the radius a number",
+                "Use dvax.sets.Product for one ball a part",
             )

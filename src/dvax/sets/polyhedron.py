@@ -11,7 +11,7 @@ from jax.custom_derivatives import SymbolicZero
 from .. import _tree
 from .._small_matrices import as_pseudoinverse, pseudoinverse
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from . import _dual_active_set as dual
 from ._weights import inverse_weights
@@ -58,13 +58,11 @@ class Polyhedron(AbstractSet):
         name = "dvax.sets.Polyhedron"
         self.G, self.d = checked_rows(name, G, d, "G", "d")
         if (E is None) != (e is None):
-            raise InputError(
-                InputProblem(
-                    f"{name}(E, e)",
-                    "one without the other",
-                    "the equations E y = e need both",
-                    "Give both or neither",
-                )
+            raise input_error(
+                f"{name}(E, e)",
+                "one without the other",
+                "the equations E y = e need both",
+                "Give both or neither",
             )
         if E is None:
             self.E, self.e = jnp.zeros((0, *self.G.shape[1:]), self.G.dtype), self.d[:0]
@@ -211,12 +209,10 @@ def _check_nonempty(name: str, G: np.ndarray, d: np.ndarray, E: np.ndarray, e: n
         violation = answer.x[-1] * size if answer.status == 0 else 0.0
         violation = 0.0 if violation <= 1e-6 * size else violation
     if violation > 0.0:
-        raise InputError(
-            InputProblem(
-                f"{name}(G, d, E, e)",
-                f"{len(d)} inequalities and {len(e)} equations that no y satisfies: the smallest "
-                f"possible violation, for rows scaled to length one, is {violation:.3g}",
-                "the set must not be empty, or the law has no solution",
-                "Increase entries of d, or remove conditions that contradict others",
-            )
+        raise input_error(
+            f"{name}(G, d, E, e)",
+            f"{len(d)} inequalities and {len(e)} equations that no y satisfies: the smallest "
+            f"possible violation, for rows scaled to length one, is {violation:.3g}",
+            "the set must not be empty, or the law has no solution",
+            "Increase entries of d, or remove conditions that contradict others",
         )

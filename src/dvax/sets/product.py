@@ -4,7 +4,7 @@ import jax
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from ..spaces import Product as ProductSpace
 from .abstract import AbstractSet
@@ -49,13 +49,11 @@ class Product(AbstractSet):
 
     def check(self, like: Tree) -> None:
         if not isinstance(like, tuple) or len(like) != len(self.parts):
-            raise InputError(
-                InputProblem(
-                    "dvax.sets.Product",
-                    f"{len(self.parts)} parts",
-                    "y = P u must be a tuple with as many parts",
-                    "Pass the control space: control_space=dvax.spaces.Product(...)",
-                )
+            raise input_error(
+                "dvax.sets.Product",
+                f"{len(self.parts)} parts",
+                "y = P u must be a tuple with as many parts",
+                "Pass the control space: control_space=dvax.spaces.Product(...)",
             )
         for part, leaf in zip(self.parts, like, strict=True):
             part.check(leaf)

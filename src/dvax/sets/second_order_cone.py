@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from ._root import root_in_unit_interval
 from ._weights import has_uniform_weight, inverse_weights
@@ -92,14 +92,12 @@ class SecondOrderCone(AbstractSet):
                 batch = None
             fits = batch == shape[:-1]
         if not fits:
-            raise InputError(
-                InputProblem(
-                    "dvax.sets.SecondOrderCone(slope)",
-                    f"y = P u of shape {shape} and a slope of shape {jnp.shape(self.slope)}",
-                    "y must have at least two entries along its last axis, the height first, and "
-                    "the slope must broadcast against the other axes",
-                    "Arrange the entries of each cone along the last axis",
-                )
+            raise input_error(
+                "dvax.sets.SecondOrderCone(slope)",
+                f"y = P u of shape {shape} and a slope of shape {jnp.shape(self.slope)}",
+                "y must have at least two entries along its last axis, the height first, and "
+                "the slope must broadcast against the other axes",
+                "Arrange the entries of each cone along the last axis",
             )
 
 

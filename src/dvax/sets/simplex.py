@@ -11,7 +11,7 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from ._threshold import entry_thresholds, shift_and_level, subtract, subtract_and_clip
 from ._weights import has_uniform_weight, inverse_weights
@@ -109,13 +109,11 @@ class Simplex(AbstractSet):
             fits = not isinstance(like, tuple) and len(shape) > 0 and shape[-1] > 0
             fits = fits and _broadcasts(jnp.shape(self.total), shape[:-1])
         if not fits:
-            raise InputError(
-                InputProblem(
-                    "dvax.sets.Simplex(total, sizes)",
-                    f"y = P u of shape {shape}, and totals of shape {jnp.shape(self.total)}",
-                    f"y must be {rule}",
-                    "Pass sizes= for simplices of unequal size; use dvax.sets.Product for tuples",
-                )
+            raise input_error(
+                "dvax.sets.Simplex(total, sizes)",
+                f"y = P u of shape {shape}, and totals of shape {jnp.shape(self.total)}",
+                f"y must be {rule}",
+                "Pass sizes= for simplices of unequal size; use dvax.sets.Product for tuples",
             )
 
 
@@ -170,22 +168,18 @@ def _blocks(
     """
     given = np.asarray(sizes)
     if given.ndim != 1 or given.size == 0 or given.dtype.kind not in "iu" or np.any(given < 1):
-        raise InputError(
-            InputProblem(
-                "dvax.sets.Simplex(sizes)",
-                _tree.short(given),
-                "sizes must be integers ≥ 1, one a simplex",
-                "Omit the simplices that have no entries",
-            )
+        raise input_error(
+            "dvax.sets.Simplex(sizes)",
+            _tree.short(given),
+            "sizes must be integers ≥ 1, one a simplex",
+            "Omit the simplices that have no entries",
         )
     if totals not in ((), given.shape):
-        raise InputError(
-            InputProblem(
-                "dvax.sets.Simplex(total, sizes)",
-                f"{totals} totals and {given.size} sizes",
-                "totals must be one number for all simplices, or one number a simplex",
-                "Give as many totals as sizes",
-            )
+        raise input_error(
+            "dvax.sets.Simplex(total, sizes)",
+            f"{totals} totals and {given.size} sizes",
+            "totals must be one number for all simplices, or one number a simplex",
+            "Give as many totals as sizes",
         )
     start = np.cumsum(given) - given
     entries, offset, smallest = int(given.sum()), 0, 1

@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..spaces import AbstractSpace
 from .abstract import AbstractSet
 
@@ -63,13 +63,11 @@ class Translated(AbstractSet):
 
     def check(self, like: Tree) -> None:
         if not (_is_number(self.offset) or _tree.same_shape(self.offset, like)):
-            raise InputError(
-                InputProblem(
-                    "dvax.sets.Translated(offset)",
-                    f"shape {_tree.shapes(self.offset)}",
-                    f"the offset must be an element of shape {_tree.shapes(like)}, or a number",
-                    "Give it that shape",
-                )
+            raise input_error(
+                "dvax.sets.Translated(offset)",
+                f"shape {_tree.shapes(self.offset)}",
+                f"the offset must be an element of shape {_tree.shapes(like)}, or a number",
+                "Give it that shape",
             )
         self.set.check(like)
 

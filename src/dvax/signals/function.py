@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from .abstract import AbstractSignal
 
 
@@ -56,11 +56,9 @@ def _times(knots: Any) -> np.ndarray:
         times = np.empty((0, 0))
     numbers = times.dtype.kind in "iuf" or times.size == 0
     if times.ndim != 1 or not numbers or np.any(np.isnan(times.astype(float))):
-        raise InputError(
-            InputProblem(
-                "dvax.signals.Function(knots)", _tree.line(knots),
-                "it must be a time, or a list of times, where fn is not smooth",
-                "Write knots=[0.5, 1.0]",
-            )
+        raise input_error(
+            "dvax.signals.Function(knots)", _tree.line(knots),
+            "it must be a time, or a list of times, where fn is not smooth",
+            "Write knots=[0.5, 1.0]",
         )  # fmt: skip
     return times.astype(float)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from .abstract import AbstractSignal
 
 Kind = Literal["constant", "linear", "cubic"]
@@ -45,13 +45,11 @@ class Table(AbstractSignal):
     def __init__(self, times: Any, values: Any, kind: Kind = "linear"):
         name = "dvax.signals.Table"
         if kind not in ("constant", "linear", "cubic"):
-            raise InputError(
-                InputProblem(
-                    f"{name}(kind)",
-                    repr(kind),
-                    "it must be 'constant', 'linear' or 'cubic'",
-                    "Choose one of them",
-                )
+            raise input_error(
+                f"{name}(kind)",
+                repr(kind),
+                "it must be 'constant', 'linear' or 'cubic'",
+                "Choose one of them",
             )
         # Concrete times are NumPy arrays, so that knots are known without running a program.
         self.times = _numbers(times, f"{name}(times)") if _tree.is_concrete(times) else times
@@ -82,11 +80,9 @@ def _numbers(values: Any, name: str) -> np.ndarray:
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):
-        raise InputError(
-            InputProblem(
-                name, " ".join(repr(values).split())[:120], "it must be a list or array of numbers",
-                "Give numbers, in rows of one length",
-            )
+        raise input_error(
+            name, " ".join(repr(values).split())[:120], "it must be a list or array of numbers",
+            "Give numbers, in rows of one length",
         ) from None  # fmt: skip
 
 
@@ -143,35 +139,29 @@ def _nan_outside(times: jax.Array, t: Any, out: jax.Array) -> jax.Array:
 
 def _check(name: str, times: Any, values: jax.Array, min_count: int) -> None:
     if np.ndim(times) != 1 or times.shape[0] < min_count or values.shape[:1] != times.shape:
-        raise InputError(
-            InputProblem(
-                f"{name}(times, values)",
-                f"shapes {np.shape(times)} and {values.shape}",
-                f"times must be a vector of at least {min_count} entries, with one value for each",
-                "Give one value (or row of values) for each time",
-            )
+        raise input_error(
+            f"{name}(times, values)",
+            f"shapes {np.shape(times)} and {values.shape}",
+            f"times must be a vector of at least {min_count} entries, with one value for each",
+            "Give one value (or row of values) for each time",
         )
     if isinstance(times, np.ndarray):
         gaps = np.flatnonzero(~np.isfinite(times))
         if gaps.size:
-            raise InputError(
-                InputProblem(
-                    f"{name}(times)",
-                    f"times[{gaps[0]}] = {times[gaps[0]]}",
-                    "times must be finite",
-                    "Remove the rows without a time",
-                )
+            raise input_error(
+                f"{name}(times)",
+                f"times[{gaps[0]}] = {times[gaps[0]]}",
+                "times must be finite",
+                "Remove the rows without a time",
             )
         wrong = np.flatnonzero(~(np.diff(times) > 0))
         if wrong.size:
             i = int(wrong[0])
-            raise InputError(
-                InputProblem(
-                    f"{name}(times)",
-                    f"times[{i}] = {times[i]:.17g}, times[{i + 1}] = {times[i + 1]:.17g}",
-                    "times must increase strictly, or the signal has two values at one time",
-                    "Sort the data and remove repeated times",
-                )
+            raise input_error(
+                f"{name}(times)",
+                f"times[{i}] = {times[i]:.17g}, times[{i + 1}] = {times[i + 1]:.17g}",
+                "times must increase strictly, or the signal has two values at one time",
+                "Sort the data and remove repeated times",
             )
     _tree.require(
         lambda: np.all(np.isfinite(values)),

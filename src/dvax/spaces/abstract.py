@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 
 
 class AbstractSpace(eqx.Module):
@@ -51,12 +51,10 @@ class AbstractSpace(eqx.Module):
     def check(self, a: Tree, name: str) -> None:
         """Raise an `InputError` unless `a` has the structure of this space's elements."""
         if not _tree.same_shape(a, self.zeros()):
-            raise InputError(
-                InputProblem(
-                    name,
-                    f"shape {_tree.shapes(a)}",
-                    f"it must be an element of {self!r}, of shape {_tree.shapes(self.zeros())}",
-                    f"Give {name} that shape, or pass another state_space= or control_space= to "
-                    "dvax.Problem",
-                )
+            raise input_error(
+                name,
+                f"shape {_tree.shapes(a)}",
+                f"it must be an element of {self!r}, of shape {_tree.shapes(self.zeros())}",
+                f"Give {name} that shape, or pass another state_space= or control_space= to "
+                "dvax.Problem",
             )

@@ -25,7 +25,7 @@ import numpy as np
 from .. import _tree
 from .._dataset import Variable, dataset, described
 from .._repr import is_known, last_text, table, value_text
-from ..errors import InputError, InputProblem
+from ..errors import InputProblem, Problems, input_error
 from ..evolution import Implicit, Solution, between, disturbance, gronwall
 from ..evolution.defect import ROUNDINGS
 from ..evolution.setup import as_arrays
@@ -287,7 +287,7 @@ def _bound_since_previous_time(
 
 
 def _check(problem: Problem, sol: Any, constants: Any, initial_error: Any) -> None:
-    problems: list[InputProblem] = [
+    problems = Problems(
         InputProblem(
             f"dvax.bound_error({name})", type(value).__name__, f"it must be a {kind}",
             f"Pass {source}",
@@ -298,53 +298,43 @@ def _check(problem: Problem, sol: Any, constants: Any, initial_error: Any) -> No
              "dvax.verify(problem, x0).constants"),
         )
         if not is_valid
-    ]  # fmt: skip
-    if problems:
-        raise InputError(*problems)
+    )  # fmt: skip
+    problems.raise_any()
     if sol.setup.problem is not problem and sol.setup.problem != problem:
-        problems.append(
-            InputProblem(
-                "dvax.bound_error(problem, sol)",
-                "a solution of another problem",
-                "the certificate evaluates the defect of this problem",
-                "Pass the problem that was solved",
-            )
+        problems.add(
+            "dvax.bound_error(problem, sol)",
+            "a solution of another problem",
+            "the certificate evaluates the defect of this problem",
+            "Pass the problem that was solved",
         )
     if isinstance(sol.setup.method, Implicit):
-        problems.append(
-            InputProblem(
-                "dvax.bound_error(sol)",
-                "a solution of dvax.Implicit",
-                "an implicit method keeps no polynomials of its steps, so its defect is unknown",
-                "Solve with an exponential method",
-            )
+        problems.add(
+            "dvax.bound_error(sol)",
+            "a solution of dvax.Implicit",
+            "an implicit method keeps no polynomials of its steps, so its defect is unknown",
+            "Solve with an exponential method",
         )
     if any(event.reset is not None for event in sol.setup.events):
-        problems.append(
-            InputProblem(
-                "dvax.bound_error(sol)",
-                "a solution of events with a reset",
-                "the computed and the exact trajectory are reset at different times, and in between "
-                "their distance is that of the reset, which no constant of the problem bounds",
-                "Bound the pieces between the events, solved one by one with initial_error=",
-            )
+        problems.add(
+            "dvax.bound_error(sol)",
+            "a solution of events with a reset",
+            "the computed and the exact trajectory are reset at different times, and in between "
+            "their distance is that of the reset, which no constant of the problem bounds",
+            "Bound the pieces between the events, solved one by one with initial_error=",
         )
     if not isinstance(initial_error, Bound) and _tree.is_concrete(initial_error):
         number = np.asarray(initial_error)
         real = number.ndim == 0 and np.issubdtype(number.dtype, np.number)
         if not (real and np.isfinite(number) and number >= 0):
-            problems.append(
-                InputProblem(
-                    "dvax.bound_error(initial_error)",
-                    _tree.short(initial_error),
-                    "it must be one number ≥ 0: a bound on ‖x_h(t0) − x(t0)‖",
-                    "Pass 0 if the initial state is exact, or the Bound of the previous run",
-                )
+            problems.add(
+                "dvax.bound_error(initial_error)",
+                _tree.short(initial_error),
+                "it must be one number ≥ 0: a bound on ‖x_h(t0) − x(t0)‖",
+                "Pass 0 if the initial state is exact, or the Bound of the previous run",
             )
     if isinstance(initial_error, Bound):
         problems += _continuation_problems(initial_error, sol.setup.setting["t0"])
-    if problems:
-        raise InputError(*problems)
+    problems.raise_any()
 
 
 def _continuation_problems(previous: Bound, t0: Any) -> list[InputProblem]:
@@ -407,11 +397,9 @@ def _solve_again(sol: Solution, constants: Constants) -> Solution:
     again = run_again(sol, sol.ts, constants=constants)
     if again.ts.shape == sol.ts.shape:
         return again
-    raise InputError(
-        InputProblem(
-            "dvax.bound_error(sol)",
-            f"{sol.ts.shape[0]} saved times, of which another run reaches {again.ts.shape[0]}",
-            "the defect was not recorded, so the certificate solves the problem again",
-            "Solve with constants= and measure=True, which records the defect",
-        )
+    raise input_error(
+        "dvax.bound_error(sol)",
+        f"{sol.ts.shape[0]} saved times, of which another run reaches {again.ts.shape[0]}",
+        "the defect was not recorded, so the certificate solves the problem again",
+        "Solve with constants= and measure=True, which records the defect",
     )

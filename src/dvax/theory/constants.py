@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from .. import _repr, _tree
-from ..errors import InputError, InputProblem
+from ..errors import InputProblem, Problems
 from .domain import Domain
 from .status import ORDER, Status, weakest
 
@@ -309,7 +309,7 @@ class Constants(eqx.Module):
             ("gamma", c.gamma <= c.L_F * (1 + 1e-12), "at most L_F"),
             ("m_P", c.m_P <= c.norm_P_inv * (1 + 1e-12), "at most norm_P_inv"),
         ]  # fmt: skip
-        wrong = [
+        wrong = Problems(
             InputProblem(
                 f"dvax.Constants({name})",
                 _tree.short(getattr(self, name)),
@@ -318,9 +318,8 @@ class Constants(eqx.Module):
             )
             for name, holds, rule in rules
             if _tree.is_concrete(holds) and not bool(np.all(holds))
-        ]
-        if wrong:
-            raise InputError(*wrong)
+        )
+        wrong.raise_any()
 
 
 def _exp(lib: Any, exponent: Any) -> Any:
@@ -338,7 +337,7 @@ def _number(value: Any) -> str:
 
 
 def _check_status(names: Collection[str], values: Mapping[str, Any]) -> None:
-    wrong = [
+    wrong = Problems(
         InputProblem(
             "dvax.Constants(status)",
             f"{name!r}: {value!r}",
@@ -348,6 +347,5 @@ def _check_status(names: Collection[str], values: Mapping[str, Any]) -> None:
         )
         for name, value in values.items()
         if name not in names or value not in ORDER
-    ]
-    if wrong:
-        raise InputError(*wrong)
+    )
+    wrong.raise_any()

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..programs.slope import TooLarge
 from .blocks import as_one_matrix
 from .formulas import growth_integral
@@ -220,12 +220,10 @@ def _solver() -> Any:
     try:
         import clarabel
     except ModuleNotFoundError as error:
-        raise InputError(
-            InputProblem(
-                "dvax.verify(energy=True)",
-                "no module named clarabel",
-                "the norm is found by a semidefinite program, which Clarabel solves",
-                "pip install 'dvax[energy]', or omit energy",
-            )
+        raise input_error(
+            "dvax.verify(energy=True)",
+            "no module named clarabel",
+            "the norm is found by a semidefinite program, which Clarabel solves",
+            "pip install 'dvax[energy]', or omit energy",
         ) from error
     return clarabel

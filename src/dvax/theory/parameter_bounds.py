@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import InputError, input_error
 from ..problem import Problem
 from ..programs.slope import Slope, SlopeEnclosure, TooLarge, interval, is_slope
 from ..sets import AbstractSet, Ball
@@ -141,12 +141,10 @@ def _including_origin(name: str, bounds: Any, tree: Tree) -> Tree:
 
     def one(v: Slope) -> Slope:
         if bounds is not None and not ((v.low <= 0) & (v.high >= 0)).all():
-            raise InputError(
-                InputProblem(
-                    f"dvax.parameter_bounds({name})", "a region without 0",
-                    "the bounds start from f(t, 0, 0) and h(t, 0, 0), so the moduli must hold at 0",
-                    "Widen it so that it contains 0",
-                )
+            raise input_error(
+                f"dvax.parameter_bounds({name})", "a region without 0",
+                "the bounds start from f(t, 0, 0) and h(t, 0, 0), so the moduli must hold at 0",
+                "Widen it so that it contains 0",
             )  # fmt: skip
         return interval(np.minimum(v.low, 0.0), np.maximum(v.high, 0.0))
 
@@ -250,11 +248,9 @@ def _within_ball(tree: Tree, space: AbstractSpace, R: Any) -> Tree:
 
 def _check(problem: Problem, low: Tree, high: Tree, start_radius: Any) -> None:
     if start_radius is not None and not (np.ndim(start_radius) == 0 and 0 <= start_radius < np.inf):
-        raise InputError(
-            InputProblem(
-                "dvax.parameter_bounds(start_radius)", _tree.short(start_radius),
-                "it must be one number ≥ 0: a bound on ‖ζ‖", "Pass the largest norm of a state",
-            )
+        raise input_error(
+            "dvax.parameter_bounds(start_radius)", _tree.short(start_radius),
+            "it must be one number ≥ 0: a bound on ‖ζ‖", "Pass the largest norm of a state",
         )  # fmt: skip
     same = _tree.same_shape(low, high)
     ordered = same and all(
@@ -262,13 +258,11 @@ def _check(problem: Problem, low: Tree, high: Tree, start_radius: Any) -> None:
         for a, b in zip(jtu.tree_leaves(low), jtu.tree_leaves(high), strict=True)
     )
     if not ordered:
-        raise InputError(
-            InputProblem(
-                "dvax.parameter_bounds(low, high)",
-                f"{_tree.short(low)} and {_tree.short(high)}",
-                "they must be the ends of a box of parameters: trees of one shape with low ≤ high",
-                "Pass the smallest and the largest value of every parameter",
-            )
+        raise input_error(
+            "dvax.parameter_bounds(low, high)",
+            f"{_tree.short(low)} and {_tree.short(high)}",
+            "they must be the ends of a box of parameters: trees of one shape with low ≤ high",
+            "Pass the smallest and the largest value of every parameter",
         )
 
 
@@ -284,22 +278,18 @@ def _require_fixed_operators(problem: Problem, t0: float, eta: Tree) -> None:
         ("K", partial(problem.set_at, jnp.asarray(t0))),
     ):
         if not independent(partial(arrays, build), eta):
-            raise InputError(
-                InputProblem(
-                    f"dvax.Problem({name})",
-                    "a callable that uses args",
-                    "Section 6 of the paper keeps A, P and K fixed and lets f and h alone vary",
-                    "Keep it out of args here; derivatives of solutions have no such restriction",
-                )
+            raise input_error(
+                f"dvax.Problem({name})",
+                "a callable that uses args",
+                "Section 6 of the paper keeps A, P and K fixed and lets f and h alone vary",
+                "Keep it out of args here; derivatives of solutions have no such restriction",
             )
 
 
 def _unknown(what: str, why: str) -> InputError:
-    return InputError(
-        InputProblem(
-            "dvax.parameter_bounds",
-            what,
-            f"no bound is known for all of these parameters: {why}",
-            "Pass a region in x or u, or a start_radius, or construct dvax.ParameterBounds",
-        )
+    return input_error(
+        "dvax.parameter_bounds",
+        what,
+        f"no bound is known for all of these parameters: {why}",
+        "Pass a region in x or u, or a start_radius, or construct dvax.ParameterBounds",
     )

@@ -9,7 +9,7 @@ import numpy as np
 from .. import _tree
 from .._repr import table, value_text
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import Problems
 from .constants import Constants
 from .formulas import growth_integral
 from .status import Status, weakest
@@ -89,7 +89,7 @@ class ParameterBounds(eqx.Module):
         domain: ParameterSet | None = None,
     ):
         self.constants, self.data_status, self.domain = constants, status, domain
-        problems = []
+        problems = Problems()
         values = dict(
             T=T, kappa_K=kappa_K, C_h0=C_h0, C_f0=C_f0, modulus_f=modulus_f, modulus_h=modulus_h
         )
@@ -97,14 +97,11 @@ class ParameterBounds(eqx.Module):
             number = _tree.as_float(value, f"dvax.ParameterBounds({name})")
             setattr(self, name, number)
             if _tree.is_concrete(number) and not (np.ndim(number) == 0 and float(number) >= 0):
-                problems.append(
-                    InputProblem(
-                        f"dvax.ParameterBounds({name})", _tree.short(number),
-                        "it must be one number ≥ 0", "Give a bound on it, or ∞ if none is known",
-                    )
+                problems.add(
+                    f"dvax.ParameterBounds({name})", _tree.short(number),
+                    "it must be one number ≥ 0", "Give a bound on it, or ∞ if none is known",
                 )  # fmt: skip
-        if problems:
-            raise InputError(*problems)
+        problems.raise_any()
 
     def __repr__(self) -> str:
         names = ("T", "kappa_K", "C_h0", "C_f0", "modulus_f", "modulus_h")

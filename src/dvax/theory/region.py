@@ -9,7 +9,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import InputError, input_error
 from ..programs.slope import Slope, interval, is_slope
 
 
@@ -106,6 +106,4 @@ def as_intervals(bounds: Any, like: Tree, name: str) -> Tree:
 
 
 def _error(name: str, value: Any, rule: str) -> InputError:
-    return InputError(
-        InputProblem(name, _tree.short(value), rule, "Give the bounds as (low, high)")
-    )
+    return input_error(name, _tree.short(value), rule, "Give the bounds as (low, high)")

@@ -9,7 +9,7 @@ import numpy as np
 
 from .. import _tree, _user_code
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import InputError, InputProblem, input_error
 from ..evolution.nonfinite import refuse_nonfinite_data
 from ..problem import Problem
 from ..programs.slope import Slope, SlopeEnclosure, TooLarge, interval, is_slope
@@ -272,14 +272,12 @@ def intersect(region: Tree, possible: Tree) -> Tree:
         low, high = np.maximum(a.low, b.low), np.minimum(a.high, b.high)
         if not (low <= high).all():
             k = np.unravel_index(np.argmax(low - high), low.shape)
-            raise InputError(
-                InputProblem(
-                    "dvax.verify(u)",
-                    f"[{a.low[k]:.6g}, {a.high[k]:.6g}] in entry {tuple(map(int, k))}",
-                    f"responses lie in P⁻¹K(t), within [{b.low[k]:.6g}, {b.high[k]:.6g}] there, so "
-                    "the region contains none of them",
-                    "Omit u, or widen it",
-                )
+            raise input_error(
+                "dvax.verify(u)",
+                f"[{a.low[k]:.6g}, {a.high[k]:.6g}] in entry {tuple(map(int, k))}",
+                f"responses lie in P⁻¹K(t), within [{b.low[k]:.6g}, {b.high[k]:.6g}] there, so "
+                "the region contains none of them",
+                "Omit u, or widen it",
             )
         return interval(low, high)
 
@@ -304,18 +302,14 @@ def time_span(t0: Any, t1: Any, name: str) -> tuple[float, float]:
     try:
         begin, end = float(t0), float(t1)
     except (TypeError, ValueError):
-        raise InputError(
-            InputProblem(
-                name, f"{t0!r}, {t1!r}"[:120], "they must be two real numbers with values",
-                "Give the times of the run",
-            )
+        raise input_error(
+            name, f"{t0!r}, {t1!r}"[:120], "they must be two real numbers with values",
+            "Give the times of the run",
         ) from None  # fmt: skip
     if not (np.isfinite([begin, end]).all() and begin < end):
-        raise InputError(
-            InputProblem(
-                name, f"[{begin:.17g}, {end:.17g}]",
-                "it must be an interval of time with t0 < t1", "Give the times of the run",
-            )
+        raise input_error(
+            name, f"[{begin:.17g}, {end:.17g}]",
+            "it must be an interval of time with t0 < t1", "Give the times of the run",
         )  # fmt: skip
     return begin, end
 
@@ -323,11 +317,9 @@ def time_span(t0: Any, t1: Any, name: str) -> tuple[float, float]:
 def state_for(problem: Problem, x0: Tree, t0: float, args: Any, name: str) -> Tree:
     """Return a state of this problem: the one given, or zero if its shape is known."""
     if not isinstance(problem, Problem):
-        raise InputError(
-            InputProblem(
-                name.split("(")[0] + "(problem)", type(problem).__name__, "it must be a dvax.Problem",
-                "Build one from A, P, K, f and h, or pass model.problem",
-            )
+        raise input_error(
+            name.split("(")[0] + "(problem)", type(problem).__name__, "it must be a dvax.Problem",
+            "Build one from A, P, K, f and h, or pass model.problem",
         )  # fmt: skip
     if x0 is not None:
         state = _tree.as_float(x0, "x0")
@@ -366,13 +358,11 @@ def _declared(declared: Mapping[str, float] | Constants | None) -> dict[str, flo
     if not isinstance(declared, Mapping):
         invalid = [type(declared).__name__]
     if invalid:
-        raise InputError(
-            InputProblem(
-                "dvax.verify(declared)",
-                f"{invalid[0]!r}",
-                f"it must map names among {', '.join(names)} to numbers",
-                "Correct the name; the others follow from A and P",
-            )
+        raise input_error(
+            "dvax.verify(declared)",
+            f"{invalid[0]!r}",
+            f"it must map names among {', '.join(names)} to numbers",
+            "Correct the name; the others follow from A and P",
         )
     values: dict[str, float] = {}
     for name, value in declared.items():
@@ -381,10 +371,8 @@ def _declared(declared: Mapping[str, float] | Constants | None) -> dict[str, flo
         except (TypeError, ValueError):
             values[name] = np.nan
         if not np.isfinite(values[name]):
-            raise InputError(
-                InputProblem(
-                    f"dvax.verify(declared[{name!r}])", repr(value)[:120],
-                    "a modulus must be a finite number", "Correct it, or omit it",
-                )
+            raise input_error(
+                f"dvax.verify(declared[{name!r}])", repr(value)[:120],
+                "a modulus must be a finite number", "Correct it, or omit it",
             )  # fmt: skip
     return values

@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..programs.matrix import matrix_of
 from ..programs.structure import analyse
 from .abstract import AbstractSolver, Answer, FrozenVI
@@ -75,17 +75,15 @@ class ActiveSet(AbstractSolver):
             if not is_valid:
                 value_text = describe(getattr(self, name))
                 place = f"dvax.vi.ActiveSet({name})"
-                raise InputError(InputProblem(place, value_text, rule, "Omit it"))
+                raise input_error(place, value_text, rule, "Omit it")
 
     def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
         if vi.K.intervals(y0) is None:
-            raise InputError(
-                InputProblem(
-                    "dvax.vi.ActiveSet",
-                    f"a {type(vi.K).__name__}, which is not a pointwise interval",
-                    "only a box fixes or frees each unknown separately",
-                    "Use dvax.vi.SemismoothNewton()",
-                )
+            raise input_error(
+                "dvax.vi.ActiveSet",
+                f"a {type(vi.K).__name__}, which is not a pointwise interval",
+                "only a box fixes or frees each unknown separately",
+                "Use dvax.vi.SemismoothNewton()",
             )
         size = sum(leaf.size for leaf in jtu.tree_leaves(y0))
         solve_linear = self._lu_solver(vi, y0) if size <= self.dense else self._krylov_solve

@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import _tree, _user_code
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import InputProblem, Problems, input_error
 from ..sets import AbstractSet
 from ..spaces import AbstractSpace
 from .abstract import AbstractSolver
@@ -26,41 +26,20 @@ def as_guess(y0: Any) -> Tree:
 
     **Raises:** `dvax.InputError` for anything else.
     """
-    y0 = _tree.as_float(y0, "y0")
-    if isinstance(y0, jax.Array) and y0.dtype.kind == "f":
-        return y0
-    return _as_plain_tuples(y0)
+    return _as_plain_tuples(_tree.as_float(y0, "y0"))
 
 
-def _as_plain_tuples(y: Any) -> Tree:
-    if isinstance(y, tuple):
-        return tuple(map(_as_plain_tuples, y))
-    if not hasattr(y, "dtype"):
-        raise InputError(
-            InputProblem(
-                f"{_CALLER}(y0)", f"a {type(y).__name__} in a tuple",
-                "y is an array, or a tuple of arrays", "Pass its arrays as a tuple",
-            )
-        )  # fmt: skip
-    if jnp.issubdtype(y.dtype, jnp.complexfloating):
-        raise InputError(
-            InputProblem(
-                f"{_CALLER}(y0)", f"an array of {y.dtype}", "y is real",
-                "Pass real and imaginary parts as two components",
-            )
-        )  # fmt: skip
-    return y
+def _as_plain_tuples(y: Tree) -> Tree:
+    return tuple(map(_as_plain_tuples, y)) if isinstance(y, tuple) else y
 
 
 def check(F: Any, K: Any, args: Any, solver: Any, space: Any) -> None:
     """Raise one `InputError` that lists every argument of a wrong type."""
-    problems = []
+    problems = Problems()
     if not callable(F):
-        problems.append(
-            InputProblem(
-                f"{_CALLER}(F)", describe(F), "it must be callable as (y, args)",
-                "Write F=lambda y, args: ...",
-            )
+        problems.add(
+            f"{_CALLER}(F)", describe(F), "it must be callable as (y, args)",
+            "Write F=lambda y, args: ...",
         )  # fmt: skip
     if not isinstance(K, AbstractSet):
         is_time_dependent = callable(K) and not isinstance(K, type)
@@ -69,19 +48,14 @@ def check(F: Any, K: Any, args: Any, solver: Any, space: Any) -> None:
             if is_time_dependent
             else "Write dvax.sets.Box(0.0, 1.0)"
         )
-        problems.append(
-            InputProblem(f"{_CALLER}(K)", describe(K), "it must be a set of dvax.sets", fix)
-        )
+        problems.add(f"{_CALLER}(K)", describe(K), "it must be a set of dvax.sets", fix)
     problems += solver_problems(f"{_CALLER}(solver)", solver)
     if not isinstance(space, AbstractSpace | None):
-        problems.append(
-            InputProblem(
-                f"{_CALLER}(space)", describe(space), "it must be a space of dvax.spaces, or None",
-                "Omit it for the Euclidean inner product",
-            )
+        problems.add(
+            f"{_CALLER}(space)", describe(space), "it must be a space of dvax.spaces, or None",
+            "Omit it for the Euclidean inner product",
         )  # fmt: skip
-    if problems:
-        raise InputError(*problems)
+    problems.raise_any()
     _user_code.check_args(args, _CALLER)
     for name, value in (("F", F), ("args", args)):
         for leaf in jtu.tree_leaves(value):
@@ -102,12 +76,10 @@ def _check_hashable(name: str, leaf: Any) -> None:
     try:
         hash(leaf)
     except TypeError:
-        raise InputError(
-            InputProblem(
-                f"{_CALLER}({name})", describe(leaf),
-                "a leaf that is not an array becomes a static argument, which must be hashable",
-                "Register its class as a pytree (an equinox.Module is one), or make it hashable",
-            )
+        raise input_error(
+            f"{_CALLER}({name})", describe(leaf),
+            "a leaf that is not an array becomes a static argument, which must be hashable",
+            "Register its class as a pytree (an equinox.Module is one), or make it hashable",
         ) from None  # fmt: skip
 
 
@@ -130,7 +102,7 @@ def as_number(name: str, value: Any, rule: Rule, dtype: Any) -> Any:
     if number is not value and obeys(rule, float(min(value, 1e308))):
         value_text += f", which is {number} in {jnp.dtype(dtype).name}"
     fix = "Omit it if it is unknown" if rule is MODULUS else "Omit it for 1e-10"
-    raise InputError(InputProblem(f"{_CALLER}({name})", value_text, rule.words, fix))
+    raise input_error(f"{_CALLER}({name})", value_text, rule.words, fix)
 
 
 def check_functions(F: Any, y0: Tree, args: Any, space: AbstractSpace) -> None:
@@ -140,12 +112,10 @@ def check_functions(F: Any, y0: Tree, args: Any, space: AbstractSpace) -> None:
     """
     zero = jax.eval_shape(space.zeros)  # abstract, so that its dtype does not enter the program
     if not _tree.same_shape(y0, zero):
-        raise InputError(
-            InputProblem(
-                f"{_CALLER}(y0)", f"shape {_tree.shapes(y0)}",
-                f"it must be an element of space={space!r}, of shape {_tree.shapes(zero)}",
-                "Give y0 that shape, or name the space of y in space=",
-            )
+        raise input_error(
+            f"{_CALLER}(y0)", f"shape {_tree.shapes(y0)}",
+            f"it must be an element of space={space!r}, of shape {_tree.shapes(zero)}",
+            "Give y0 that shape, or name the space of y in space=",
         )  # fmt: skip
     if not isinstance(F, Weighted):
         _check_function("F", F, y0, args, _CALLER)
@@ -155,11 +125,9 @@ def check_functions(F: Any, y0: Tree, args: Any, space: AbstractSpace) -> None:
     def weight(y: Tree) -> None:
         out = _user_code.call("a", F.a, {"y": y, "args": args}, caller="dvax.vi.Weighted")
         if not _tree.is_number(out) and jnp.shape(out) == ():
-            raise InputError(
-                InputProblem(
-                    "dvax.vi.Weighted(a)", describe(out), "a(y, args) must be one real number",
-                    "Return a scalar",
-                )
+            raise input_error(
+                "dvax.vi.Weighted(a)", describe(out), "a(y, args) must be one real number",
+                "Return a scalar",
             )  # fmt: skip
 
     jax.eval_shape(weight, y0)
@@ -179,7 +147,7 @@ def _check_function(name: str, fn: Callable[..., Any], y0: Tree, args: Any, call
         problem = _shape_problem(name, out, y) or _dtype_problem(name, out, y)
         if problem is not None:
             place = _user_code.place(f"{caller}({name})", fn)
-            raise InputError(InputProblem(place, *problem))
+            raise input_error(place, *problem)
 
     jax.eval_shape(traced, y0)
 

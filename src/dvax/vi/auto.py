@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import jax.tree_util as jtu
 
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..programs.structure import analyse
 from .abstract import AbstractSolver, Answer, FrozenVI
 from .active_set import ActiveSet
@@ -75,12 +75,10 @@ class ClosedForm(AbstractSolver):
 
     def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
         if isinstance(y0, tuple) or not analyse(vi.F, y0).isotropic:
-            raise InputError(
-                InputProblem(
-                    "dvax.vi.ClosedForm",
-                    "an F that its code does not show to be ay + c with one number a",
-                    "only for such an F is proj_K(−c/a) the solution for every K",
-                    "Use dvax.vi.Auto()",
-                )
+            raise input_error(
+                "dvax.vi.ClosedForm",
+                "an F that its code does not show to be ay + c with one number a",
+                "only for such an F is proj_K(−c/a) the solution for every K",
+                "Use dvax.vi.Auto()",
             )
         return affine_answer(vi, y0)

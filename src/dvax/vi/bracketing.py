@@ -10,7 +10,7 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import InputError, input_error
 from ..programs.structure import analyse
 from .abstract import RESULTS, AbstractSolver, Answer, FrozenVI
 from .brackets import Brackets, begin, has_no_sign_change, is_open, narrow, root, trial
@@ -161,14 +161,12 @@ def _not_pointwise(*, set_is_interval: bool) -> InputError:
     value_text = "an F that couples points"
     if not set_is_interval:
         value_text = "a set that is not a pointwise interval"
-    return InputError(
-        InputProblem(
-            "dvax.vi.Bracketing",
-            value_text,
-            "it solves one scalar inequality per point, so K must be a Box and the code of F must "
-            "show that Fᵢ depends on yᵢ alone",
-            "Use dvax.vi.Auto() or dvax.vi.Extragradient()",
-        )
+    return input_error(
+        "dvax.vi.Bracketing",
+        value_text,
+        "it solves one scalar inequality per point, so K must be a Box and the code of F must "
+        "show that Fᵢ depends on yᵢ alone",
+        "Use dvax.vi.Auto() or dvax.vi.Extragradient()",
     )
 
 

@@ -9,7 +9,7 @@ from jax import lax
 from .. import _tree
 from .._small_matrices import MAX_ROWS, eliminate, times
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..programs.matrix import matrix_of
 from ..programs.structure import analyse
 from ..sets import AbstractSet, Polyhedron, Simplex
@@ -62,14 +62,12 @@ class Lemke(AbstractSolver):
 
     def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
         if not is_affine_on_polyhedron(vi, y0):
-            raise InputError(
-                InputProblem(
-                    "dvax.vi.Lemke",
-                    f"an F on a {type(vi.K).__name__} of {_tree.shapes(y0)}",
-                    "the code of F must show that F is affine, and K must be a simplex or a polyhedron "
-                    f"without equations, of at most {MAX_ROWS} unknowns and {_MAX_CONDITIONS} rows",
-                    "Use dvax.vi.SemismoothNewton()",
-                )
+            raise input_error(
+                "dvax.vi.Lemke",
+                f"an F on a {type(vi.K).__name__} of {_tree.shapes(y0)}",
+                "the code of F must show that F is affine, and K must be a simplex or a polyhedron "
+                f"without equations, of at most {MAX_ROWS} unknowns and {_MAX_CONDITIONS} rows",
+                "Use dvax.vi.SemismoothNewton()",
             )
         fixed = vi._replace(K=jax.tree_util.tree_map(lax.stop_gradient, vi.K))
         M, y = lax.stop_gradient(_pivoted(fixed, y0))

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import _tree
-from ..errors import InputError, InputProblem
+from ..errors import InputProblem, Problems
 
 
 class Rule(NamedTuple):
@@ -41,16 +41,15 @@ def obeys(rule: Rule, value: Any) -> bool:
 def check_parameters(solver: Any, **rules: Rule) -> None:
     """Raise an `InputError` with every parameter of a solver that breaks its rule."""
     cls = type(solver)
-    problems = [
+    problems = Problems(
         InputProblem(
             f"dvax.vi.{cls.__name__}({name})", describe(value), rule.words,
             f"Omit it for {cls.__dataclass_fields__[name].default}",
         )
         for name, rule in rules.items()
         if not obeys(rule, value := getattr(solver, name))
-    ]  # fmt: skip
-    if problems:
-        raise InputError(*problems)
+    )  # fmt: skip
+    problems.raise_any()
 
 
 def describe(value: Any) -> str:

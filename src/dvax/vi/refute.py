@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import input_error
 from ..sets import AbstractSet
 from ..spaces import AbstractSpace
 from .abstract import FrozenVI
@@ -153,13 +153,11 @@ def _checked_first_point(points: Tree, gamma: Any) -> Tree:
     name = "dvax.vi.refute_gamma"
     counts = {jnp.shape(leaf)[:1] for leaf in jtu.tree_leaves(points)}
     if len(counts) != 1 or (count := counts.pop()) == () or count[0] < 2:
-        raise InputError(
-            InputProblem(
-                f"{name}(points)",
-                f"leaves of shape {_tree.shapes(points)}",
-                "at least two points are needed, stacked along the first axis of each leaf",
-                "Stack them: jnp.stack([y, z, ...])",
-            )
+        raise input_error(
+            f"{name}(points)",
+            f"leaves of shape {_tree.shapes(points)}",
+            "at least two points are needed, stacked along the first axis of each leaf",
+            "Stack them: jnp.stack([y, z, ...])",
         )
     _tree.require(
         lambda: bool(gamma > 0),

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import InputError, InputProblem
+from ..errors import InputProblem, Problems, input_error
 from ..programs.structure import analyse
 from ..spaces import AbstractSpace
 from .abstract import RESULTS
@@ -97,11 +97,9 @@ class Weighted(eqx.Module):
         self.a, self.G = a, G
         for name, fn in (("a", a), ("G", G)):
             if not callable(fn):
-                raise InputError(
-                    InputProblem(
-                        f"dvax.vi.Weighted({name})", describe(fn), "it must be callable as (y, args)",
-                        f"Write {name}=lambda y, args: ...",
-                    )
+                raise input_error(
+                    f"dvax.vi.Weighted({name})", describe(fn), "it must be callable as (y, args)",
+                    f"Write {name}=lambda y, args: ...",
                 )  # fmt: skip
         self.M = _positive("M", M, "a must be bounded away from 0, otherwise Mμ is not a modulus")
         self.mu = _positive("mu", mu, "G must be strongly monotone, otherwise y* may not be unique")
@@ -120,13 +118,11 @@ class Weighted(eqx.Module):
         """Return a(y) after checking that it is one number."""
         weight = jnp.asarray(self.a(y, args))
         if weight.shape != ():
-            raise InputError(
-                InputProblem(
-                    "dvax.vi.Weighted(a)",
-                    f"a value of shape {weight.shape}",
-                    "a(y) must be one number, so that it cancels from ⟨F(y), v − y⟩ ≥ 0 for every v",
-                    "Return a scalar",
-                )
+            raise input_error(
+                "dvax.vi.Weighted(a)",
+                f"a value of shape {weight.shape}",
+                "a(y) must be one number, so that it cancels from ⟨F(y), v − y⟩ ≥ 0 for every v",
+                "Return a scalar",
             )
         return weight
 
@@ -167,7 +163,7 @@ class Weighted(eqx.Module):
 def reject_moduli_of_product(gamma: Any, L_F: Any) -> None:
     """Raise an `InputError` if moduli of aG are given to a solve of VI(K, G)."""
     moduli = {"gamma": gamma, "L_F": L_F}
-    problems = [
+    problems = Problems(
         InputProblem(
             f"dvax.solve_vi({name})",
             _tree.short(value),
@@ -177,9 +173,8 @@ def reject_moduli_of_product(gamma: Any, L_F: Any) -> None:
         )
         for name, value in moduli.items()
         if value is not None
-    ]
-    if problems:
-        raise InputError(*problems)
+    )
+    problems.raise_any()
 
 
 def _least_eigenvalue(G: Callable[[Tree], Tree], like: Tree, space: AbstractSpace) -> jax.Array:
@@ -205,11 +200,9 @@ def _positive(name: str, value: Any, why: str) -> Any:
         return None
     value = _tree.as_float(value, f"dvax.vi.Weighted({name})")
     if _tree.shapes(value) != ():
-        raise InputError(
-            InputProblem(
-                f"dvax.vi.Weighted({name})", f"shape {_tree.shapes(value)}", "it must be one number",
-                "Give the smallest of them",
-            )
+        raise input_error(
+            f"dvax.vi.Weighted({name})", f"shape {_tree.shapes(value)}", "it must be one number",
+            "Give the smallest of them",
         )  # fmt: skip
     _tree.require(
         lambda: bool(value > 0) and bool(jnp.isfinite(value)),

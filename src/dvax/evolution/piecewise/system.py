@@ -19,7 +19,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from ..._tree import Tree
-from ...errors import InputError, InputProblem
+from ...errors import Problems, input_error
 from ...problem import Problem
 from ...vi import analyse, independent
 
@@ -86,36 +86,29 @@ def _check(problem: Problem, t0: Any, x0: Tree, u0: Tree, args: Any) -> None:
     sizes = [leaf.size for leaf in jtu.tree_leaves((x0, u0))]
     if several or max(sizes) > LARGEST:
         given = "several parts" if several else f"{sizes[0]} and {sizes[1]} entries"
-        raise InputError(
-            InputProblem(
-                place, f"a state or response of {given}",
-                f"state and response must each be one array of at most {LARGEST} entries",
-                "Omit method, or choose another one",
-            )
+        raise input_error(
+            place, f"a state or response of {given}",
+            f"state and response must each be one array of at most {LARGEST} entries",
+            "Omit method, or choose another one",
         )  # fmt: skip
     t, both = jnp.asarray(t0, jnp.result_type(x0)), (x0, u0)
-    wrong = []
+    wrong = Problems()
     for name, fn in (("f", problem.f), ("h", problem.h)):
         joint = lambda t, both, fn=fn: fn(t, *both, args)  # noqa: E731
         constant = independent(lambda t, joint=joint: jax.jacfwd(joint, argnums=1)(t, both), t)
         if not (constant and analyse(lambda both, joint=joint: joint(t, both), both).affine):
-            wrong.append(
-                InputProblem(
-                    f"{place}: {name}", "code that is not proved to be affine",
-                    f"{name} must be affine in (x, u) with coefficients that do not depend on t",
-                    "Omit method, or choose another one",
-                )
+            wrong.add(
+                f"{place}: {name}", "code that is not proved to be affine",
+                f"{name} must be affine in (x, u) with coefficients that do not depend on t",
+                "Omit method, or choose another one",
             )  # fmt: skip
     bounds = lambda t: problem.set_at(t, args).intervals(u0)  # noqa: E731
     if bounds(t) is None or not independent(bounds, t):
-        wrong.append(
-            InputProblem(
-                f"{place}: K", type(problem.set_at(t, args)).__name__,
-                "K must be a box that does not move", "Omit method, or choose another one",
-            )
+        wrong.add(
+            f"{place}: K", type(problem.set_at(t, args)).__name__,
+            "K must be a box that does not move", "Omit method, or choose another one",
         )  # fmt: skip
-    if wrong:
-        raise InputError(*wrong)
+    wrong.raise_any()
 
 
 @eqx.filter_jit

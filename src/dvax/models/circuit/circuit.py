@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ... import _tree
-from ...errors import InputError, InputProblem, Problems, input_error
+from ...errors import InputProblem, Problems, input_error
 from ...evolution import ExpRosenbrock, PiecewiseLinear, Solution, solve
 from ...formats.netlist import Netlist, read_netlist
 from ...generators import Dense
@@ -200,7 +200,7 @@ class Circuit(eqx.Module):
         if not _tree.is_concrete(t_end, self.sources):
             return
         end = float(t_end)
-        short = [
+        short = Problems(
             InputProblem(
                 place, f"{name}, which is defined from 0 to {last:.12g} s",
                 f"the run is from 0 to t_end = {end:.12g} s, and sources are not extrapolated",
@@ -208,9 +208,8 @@ class Circuit(eqx.Module):
             )
             for (name, place), source in zip(self.feeds, self.sources, strict=True)
             if (last := float(source.span()[1])) < end
-        ]  # fmt: skip
-        if short:
-            raise InputError(*short)
+        )  # fmt: skip
+        short.raise_any()
 
     def voltages(self, t: Any, x: Any, u: Any) -> jax.Array:
         """Return the voltages of the `nodes` against ground (V)."""

@@ -31,7 +31,7 @@ def load(network: Any, trips: Any) -> tuple[Network, Trips]:
     return loaded[0], loaded[1]
 
 
-def number_problems(**given: Any) -> list[InputProblem]:
+def number_problems(**given: Any) -> Problems:
     """Return the problems of the numerical arguments."""
     rules = {"rate": "> 0", "rho": "> 0", "gap": "> 0"}
     problems = Problems()

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ...errors import InputError
 from ...evolution import Solution
 from ...formats.road_network import Network, Trips
 from ...generators import Scalar
@@ -114,10 +113,8 @@ class Traffic(eqx.Module):
         values: dict[str, Any] = {}
 
         def attempt(name: str, make: Any) -> None:
-            try:
+            with wrong.collect():
                 values[name] = make()
-            except InputError as error:
-                wrong.extend(error.problems)
 
         attempt("files", lambda: load(network, trips))
         if "files" in values:
@@ -127,8 +124,7 @@ class Traffic(eqx.Module):
             attempt("capacity", lambda: capacities(roads, incidents))
             if not wrong:
                 attempt("costs", lambda: link_costs(roads, toll_weight, distance_weight))
-        if wrong:
-            raise InputError(*wrong)
+        wrong.raise_any()
         self.network, self.trips = values["files"]
         self.factor, self.peak = values["demand"]
         self.capacity, all_capacities = values["capacity"]

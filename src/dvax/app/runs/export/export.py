@@ -7,7 +7,7 @@ from pathlib import Path
 from types import ModuleType
 
 from dvax.app.runs.export.selection import select
-from dvax.errors import InputProblem, Problems, input_error
+from dvax.errors import Problems, input_error
 
 _MODULES = {
     "netcdf": "netcdf", "csv": "csv_files", "npz": "npz", "parquet": "parquet", "vtk": "vtk",
@@ -117,20 +117,16 @@ def _check(target: Path, folder: Path, paths: list[Path], force: bool) -> None:
     problems = Problems()
     for path in paths:
         if path.exists() and not force:
-            problems.append(
-                InputProblem(
-                    str(path), "a file that exists" if path.is_file() else "a folder that exists",
-                    "results are never written over others unasked",
-                    "Give another name, or --force to replace it",
-                )
+            problems.add(
+                str(path), "a file that exists" if path.is_file() else "a folder that exists",
+                "results are never written over others unasked",
+                "Give another name, or --force to replace it",
             )  # fmt: skip
         elif path.is_dir() and not _is_own(path):
-            problems.append(
-                InputProblem(
-                    str(path), "a folder with other files than frames",
-                    "--force replaces what dvax export wrote, and deletes nothing else",
-                    "Give another name",
-                )
+            problems.add(
+                str(path), "a folder with other files than frames",
+                "--force replaces what dvax export wrote, and deletes nothing else",
+                "Give another name",
             )  # fmt: skip
     problems.raise_any()
 

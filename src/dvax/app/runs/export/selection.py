@@ -14,7 +14,7 @@ import numpy as np
 from dvax.app.plots.run_reader import UNFINISHED, RunRecord, read_run
 from dvax.app.plots.store import Variable
 from dvax.app.runs.resolved import NAME as CONFIG
-from dvax.errors import InputProblem, Problems, input_error
+from dvax.errors import Problems, input_error
 
 _BLOCK_BYTES = 2**25
 """The most that the rows of a block take, unless a chunk of the store is larger."""
@@ -132,5 +132,5 @@ def _check(directory: Path, names: Sequence[str], every: Mapping[str, Variable])
             close = get_close_matches(name, every, n=1)
             fix = f"Did you mean {close[0]!r}?" if close else "Name some of these"
             rule = f"the run {directory} has {', '.join(every)}"
-            problems.append(InputProblem("--variables", repr(name), rule, fix))
+            problems.add("--variables", repr(name), rule, fix)
     problems.raise_any()

@@ -18,7 +18,7 @@ from dvax.app.runs.applications.certificate import Certificate
 from dvax.app.runs.applications.from_model import AbstractModelApplication, FramesKeys
 from dvax.app.runs.schema import Section, in_unit
 from dvax.app.runs.schema_errors import translate, unknown_key
-from dvax.errors import DvaxError, InputError, input_error
+from dvax.errors import DvaxError, InputError, Problems, input_error
 from dvax.evolution import Solution
 from dvax.models import Model
 
@@ -203,13 +203,12 @@ def _arguments(
             field: Any = Field(default, strict=strict, validate_default=True)
             fields[p.name] = (_with_unit(hints[p.name]), field)
         kind = create_model("Parameters", __base__=Section, **fields)
-    unknown = [
+    unknown = Problems(
         unknown_key(f"model.parameters.{key}", key, value, list(kind.model_fields))
         for key, value in given.items()
         if key not in kind.model_fields and kind.model_config.get("extra") != "allow"
-    ]
-    if unknown:
-        raise InputError(*unknown)
+    )
+    unknown.raise_any()
     try:
         made = kind.model_validate(given)
     except ValidationError as error:
