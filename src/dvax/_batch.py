@@ -38,8 +38,8 @@ def _(size: int, batched: list[bool], count: jax.Array) -> tuple[jax.Array, bool
 def is_active(condition: jax.Array) -> jax.Array:
     """Return True; under `jax.vmap`, return the condition.
 
-    A loop on `any_lane(condition)` continues while *any* lane needs it, and this function tells whether
-    an iteration belongs to this lane. A loop on the batched condition would select between the old and
+    A loop on `any_lane(condition)` continues while *any* lane needs it, and this function returns
+    whether an iteration belongs to this lane. A loop on the batched condition would select between the old and
     the new values of its whole carry after every iteration; here, tables that are written row by row
     need no selection.
     """

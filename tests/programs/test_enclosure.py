@@ -61,10 +61,17 @@ FUNCTIONS = {
 
 def farthest(fn, t0, t1):
     """The largest distance of fn from the line between its ends on a fine grid, entry by entry."""
-    theta = jnp.linspace(0.0, 1.0, 801)
+    return distance(fn, t0, t1, fn(t0), fn(t1))
+
+
+def distance(fn, t0, t1, a, b):
+    """The same from the line between a and b, inside of [t0, t1]: at an end that is a jump, rounding
+    decides which of its values fn has there."""
+    theta = jnp.linspace(0.0, 1.0, 801)[1:-1]
     values = jax.vmap(lambda s: jnp.asarray(fn(t0 + s * (t1 - t0))))(theta)
     weight = theta.reshape((-1,) + (1,) * (values.ndim - 1))
-    return jnp.abs(values - ((1 - weight) * values[:1] + weight * values[-1:])).max(axis=0)
+    a, b = jnp.asarray(a)[None], jnp.asarray(b)[None]
+    return jnp.abs(values - ((1 - weight) * a + weight * b)).max(axis=0)
 
 
 def enclosed(fn, t0, t1):
@@ -73,8 +80,13 @@ def enclosed(fn, t0, t1):
 
 @functools.cache
 def compiled(fn):
-    """The enclosure of fn over [t0, t1], fn at both ends, and `farthest`, in one program."""
-    return jax.jit(lambda t0, t1: (enclosed(fn, t0, t1), fn(t0), fn(t1), farthest(fn, t0, t1)))
+    """The enclosure of fn over [t0, t1], fn at both ends, and its `distance`, in one program."""
+
+    def both(t0, t1):
+        line = enclosed(fn, t0, t1)
+        return line, fn(t0), fn(t1), distance(fn, t0, t1, line.a, line.b)
+
+    return jax.jit(both)
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)

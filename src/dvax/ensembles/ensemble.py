@@ -185,7 +185,7 @@ def _ensemble(
         collect(kept, program(other), inputs, members, devices)
         solved = np.ones(len(members), bool)
         if result == RESULTS.step_too_small:
-            # Where the other method fails too, the first failure tells more.
+            # Where the other method fails too, the first failure is reported.
             solved = ~kept.rows.failed[members]
             kept.put(members[~solved], jtu.tree_map(lambda rows, s=solved: rows[~s], before))
         if solved.any():

@@ -302,7 +302,7 @@ def _stiff(stop: Stop) -> Diagnosis:
 
 
 def _max_events(solution: Any) -> Diagnosis:
-    """Report the last interval between two events, which tells whether they accumulate."""
+    """Report the last interval between two events, which shows whether they accumulate."""
     times = np.asarray(solution.events.ts)
     apart = f", the last two {times[-1] - times[-2]:.3g} apart" if len(times) > 1 else ""
     text = f"Number of events: {len(times)}{apart}."

@@ -1,4 +1,4 @@
-"""The evaluations of f̃ that a step asks for, one after the other."""
+"""The evaluations of f̃ that a step needs, one after the other."""
 
 from collections.abc import Callable
 from functools import partial

@@ -1,4 +1,4 @@
-"""The reduced map f̃ along a trajectory, with all that a step wants to know about the law."""
+"""The reduced map f̃ along a trajectory, with the quantities of the law that a step needs."""
 
 import dataclasses
 from typing import Any, NamedTuple

@@ -272,7 +272,7 @@ class Stepper(eqx.Module):
                 seen = self.guard.estimate(self.flow, along, variation, share)
                 excursion, variation = seen.ratio, seen.variation
             if slopes is not None:
-                # Where x itself changes at a comparable rate, accuracy asks for such steps too.
+                # Where x itself changes at a comparable rate, accuracy requires such steps too.
                 space = self.flow.state_space(x0)
                 change = space.norm(_tree.sub(x1, x0)) / space.norm(x1)
                 slope = slopes[self.method.explicit_in_A]
@@ -463,7 +463,7 @@ class Stepper(eqx.Module):
         else:
             assert self.growth is not None
             # A rate that the step before made was made where that one ended: a few roundings of t
-            # earlier, which a steep f tells apart.
+            # earlier, which a steep f distinguishes.
             begin = self._one_sided_time(t0, t1, 0.0)
             begin = jnp.where(jumped, begin, 2.0 * t0 - begin)
             ends = begin, self._one_sided_time(t0, t1, 1.0)

@@ -65,7 +65,7 @@ def read_columns(path: Path, wanted: list[str | None], key_column: str) -> list[
         if units[name] is None:
             problems(
                 line, repr(header[names.index(name)]),
-                "a column of numbers says its unit, or nobody knows what the numbers mean",
+                "a column of numbers names its unit, without which the numbers have no meaning",
                 f'Write "{name} [unit]", or [1] for pure numbers', name,
             )  # fmt: skip
     if len(rows) == 1:

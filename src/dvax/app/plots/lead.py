@@ -132,7 +132,7 @@ def _well_posed(run: RunRecord) -> str:
         return f"Well-posedness is not shown: γ = {number(gamma)} is not positive."
     rows = [row for row in run.assumptions if row.is_required]
     if any(row.status == "refuted" for row in rows):
-        # A sufficient condition that fails does not refute what follows from it; the reason tells more.
+        # A sufficient condition that fails does not refute what follows from it; the reason is stated.
         failing = "; ".join(f"{r.statement} ({r.why})" for r in rows if r.status == "refuted")
         others = {row.label: row.status for row in rows if row.status != "refuted"}
         rest = f" For the others, {_tally(others, 'assumption')}" if others else ""

@@ -71,7 +71,7 @@ def _user_cache() -> Path:
 
 
 def _processor() -> str:
-    """Return the model of the processor with its instruction sets, as far as the system tells."""
+    """Return the model of the processor with its instruction sets, if the system reports them."""
     text = f"{platform.machine()} {platform.processor()}"
     listing = Path("/proc/cpuinfo")
     if listing.is_file():

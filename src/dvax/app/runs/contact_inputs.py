@@ -78,7 +78,7 @@ def read_inputs(config: "Config", value_has_unit: frozenset[str] = frozenset()) 
     series = fields["demand"].series
     if series is not None and series.kind == "constant":
         notices.append(
-            "The demand jumps (series of kind 'constant'): the theory asks for g continuous in "
+            "The demand jumps (series of kind 'constant'): the theory requires g continuous in "
             "time, and u jumps with it."
         )
     x0, companion_x0 = _initial_states(fields["initial"], boundary, shift, sources.name)

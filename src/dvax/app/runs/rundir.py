@@ -111,7 +111,7 @@ def write_json(file: Path, content: Mapping[str, Any]) -> None:
 
 
 def process() -> dict[str, Any]:
-    """Return process id and host for the manifest, from which `close_killed` tells whether it still
+    """Return process id and host for the manifest, by which `close_killed` decides whether it still
     runs."""
     return {"process": os.getpid(), "host": platform.node()}
 
