@@ -39,9 +39,9 @@ def is_active(condition: jax.Array) -> jax.Array:
     """Return True; under `jax.vmap`, return the condition.
 
     A loop on `any_lane(condition)` continues while *any* lane needs it, and this function returns
-    whether an iteration belongs to this lane. A loop on the batched condition would select between the old and
-    the new values of its whole carry after every iteration; here, tables that are written row by row
-    need no selection.
+    whether an iteration belongs to this lane. A loop on the batched condition would select between the
+    old and the new values of its whole carry after every iteration; here, tables that are written row
+    by row need no selection.
     """
     return jnp.ones_like(condition)
 
