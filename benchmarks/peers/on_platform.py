@@ -11,8 +11,8 @@ import os
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -29,21 +29,13 @@ class Platform(Process):
     """
 
     def __init__(self, name: str | None):
-        self._folder = tempfile.TemporaryDirectory()
+        files = ExitStack()
+        folder = files.enter_context(tempfile.TemporaryDirectory())
         chosen = {} if name is None else {"JAX_PLATFORMS": name}
         super().__init__(
-            [sys.executable, "-m", "benchmarks.peers.on_platform", self._folder.name],
-            cwd=_ROOT, env=os.environ | chosen,
+            [sys.executable, "-m", "benchmarks.peers.on_platform", folder], files, cwd=_ROOT,
+            env=os.environ | chosen,
         )  # fmt: skip
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        super().__exit__(kind, error, trace)
-        self._folder.cleanup()
 
     def prepared(self) -> tuple[float, np.ndarray]:
         """Seconds of the first call, and its result."""

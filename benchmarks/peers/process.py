@@ -2,14 +2,16 @@
 
 import json
 import subprocess
-from types import TracebackType
+from contextlib import ExitStack
 from typing import Any, Self
 
 
 class Process:
-    """A running child, to be used in a `with` statement, which ends it."""
+    """A running child, to be used in a `with` statement, which ends it and closes the `files` that it
+    writes to."""
 
-    def __init__(self, command: list[str], **options: Any):
+    def __init__(self, command: list[str], files: ExitStack, **options: Any):
+        self._files = files
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, **options
         )
@@ -17,15 +19,11 @@ class Process:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait(timeout=60)
+        with self._files:
+            self._process.stdin.close()
+            self._process.wait(timeout=60)
 
     def send(self, **order: Any) -> None:
         assert self._process.stdin is not None

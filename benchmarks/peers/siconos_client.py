@@ -4,8 +4,8 @@ import os
 import subprocess
 import sys
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -44,18 +44,11 @@ class _Running(Process):
     """
 
     def __init__(self, interpreter: str, program: str):
-        self._print = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")
+        files = ExitStack()
+        file = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")
+        self._print = files.enter_context(file)
         command = [interpreter, str(_HERE / program)]
-        super().__init__(command, stderr=self._print, env=_ENVIRONMENT)
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        super().__exit__(kind, error, trace)
-        self._print.close()
+        super().__init__(command, files, stderr=self._print, env=_ENVIRONMENT)
 
     def said(self) -> str:
         """What Siconos has printed so far."""
