@@ -1,5 +1,6 @@
 """The arguments and results of `dvax.solve` around its compiled loop."""
 
+import inspect
 import re
 
 import equinox as eqx
@@ -11,6 +12,7 @@ from tests.closed_forms import c1
 from tests.selection import mostly_thorough
 
 import dvax
+from dvax.evolution.arguments import Arguments
 
 
 def problem(f):
@@ -21,6 +23,13 @@ def problem(f):
         f=f,
         h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
     )
+
+
+def test_arguments_have_the_names_the_order_and_the_defaults_of_solve():
+    signature = inspect.signature(dvax.solve).parameters.values()
+    assert tuple(p.name for p in signature) == Arguments._fields
+    defaults = {p.name: p.default for p in signature if p.default is not p.empty}
+    assert defaults == Arguments._field_defaults
 
 
 def test_solution_holds_the_given_problem_and_args_without_copies():

@@ -13,7 +13,7 @@ from .. import _tree, _user_code
 from .._tree import Tree
 from ..errors import Problems
 from ..evolution import RESULTS, Event, Implicit, PiecewiseLinear, Solution, solve
-from ..evolution.arguments import Arguments, bound_steps, check, warn_precision
+from ..evolution.arguments import MAX_EVENTS, Arguments, bound_steps, check, warn_precision
 from ..evolution.auto import Choice, choose
 from ..evolution.event_arguments import check_events
 from ..evolution.method import AbstractMethod
@@ -58,7 +58,7 @@ def ensemble(
     max_steps: int | None = None,
     adjoint: str = "reverse",
     events: Sequence[Event] = (),
-    max_events: int = 256,
+    max_events: int = MAX_EVENTS,
     devices: Sequence[Any] | None = None,
     lanes: int | None = None,
     progress: bool = False,

@@ -32,6 +32,10 @@ MAX_STEP_COUNT = 2**31 - 1
 """Largest value of max_steps: steps are counted in 32 bits."""
 
 
+MAX_EVENTS = 256
+"""The default of `max_events`."""
+
+
 class Arguments(NamedTuple):
     """The arguments of `dvax.solve`, with its defaults."""
 
@@ -58,7 +62,7 @@ class Arguments(NamedTuple):
     adjoint: str = "reverse"
     throw: bool = True
     events: Sequence[Event] = ()
-    max_events: int = 256
+    max_events: int = MAX_EVENTS
     save: Any = None
 
 

@@ -20,6 +20,7 @@ from ..vi import AbstractSolver, Auto
 from .arguments import (
     ADAPTIVE_STEPS,
     FIRST_GROWTH,
+    MAX_EVENTS,
     Arguments,
     bound_steps,
     check,
@@ -54,9 +55,6 @@ _FIRST_ROOM = 2**12
 _LEAST_ROOM, _FIRST_ENTRIES = 64, 10**8
 """The same with many entries: as many as make `_FIRST_ENTRIES` entries in all, and at least 64."""
 
-_EVENTS = 256
-"""The default of `max_events`."""
-
 _VI_SOLVER = Auto()
 """Constructing the default at every call would cost a part of a short run."""
 
@@ -86,7 +84,7 @@ def solve(
     adjoint: str = "reverse",
     throw: bool = True,
     events: Sequence[Event] = (),
-    max_events: int = 256,
+    max_events: int = MAX_EVENTS,
     save: Any = None,
 ) -> Solution:
     """Solve x' = Ax + f(t, x, u), u ∈ h(t, x, u) − N_{K(t)}(P u) from x(t0) = x0 up to t1.
@@ -264,7 +262,7 @@ def run_again(
     call = Arguments(
         setup.problem, setup.x0, t0, t1, setup.args, dt=None if adaptive else dt, method=setup.method,
         constants=constants, measure=constants is not None or solution.defect is not None,
-        dense=dense, max_steps=most, events=setup.events, max_events=max(_EVENTS, happened),
+        dense=dense, max_steps=most, events=setup.events, max_events=max(MAX_EVENTS, happened),
     )  # fmt: skip
     if dense:
         check(call)
