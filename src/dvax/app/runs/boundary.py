@@ -48,7 +48,7 @@ def build_boundary(section: BoundarySection, nodes: Path | None, units: Units) -
     """
     if nodes is not None:
         return _from_file(nodes, units)
-    assert section.points is not None  # the consistency of the section has been checked
+    assert section.points is not None  # the section has been checked
     lengths = section.lengths or [section.length or 0.0]
     cells = [length / n for length, n in zip(lengths, section.points, strict=True)]
     grid = np.meshgrid(
