@@ -59,8 +59,8 @@ FLAWS = {
     ),
     "ragged": ("time [s],load [um/s]\n0,1\n1\n3,2\n", "line 3", "1 cells"),
     "decimal comma": ("time [s],load [um/s]\n0,1\n1,2,5\n3,2\n", "line 3", "3 cells"),
-    "no unit": ("time [s],load\n0,1\n3,2\n", "line 1, column 'load'", "says its unit"),
-    "no time unit": ("time,load [um/s]\n0,1\n3,2\n", "line 1, column 'time'", "says its unit"),
+    "no unit": ("time [s],load\n0,1\n3,2\n", "line 1, column 'load'", "names its unit"),
+    "no time unit": ("time,load [um/s]\n0,1\n3,2\n", "line 1, column 'time'", "names its unit"),
     "wrong unit": (
         "time [s],load [um]\n0,1\n3,2\n",
         "column 'load'",
