@@ -20,7 +20,7 @@ from .programs.switching_times import switching_times
 from .sets import AbstractSet
 from .signals import listen
 from .spaces import AbstractSpace
-from .vi import AbstractSolver, Answer, Auto, FrozenVI, default_space
+from .vi import AbstractSolver, Answer, Auto, FrozenVI, analyse, default_space
 from .vi.arguments import solver_problems
 from .vi.outcome import raise_failure, unless_failed
 
@@ -38,6 +38,14 @@ class FrozenOperator:
     def __call__(self, y: Tree) -> Tree:
         u = self.P.inverse(y)
         return _tree.sub(u, self.h(self.t, self.x, u, self.args))
+
+    def inverse_up_to_a_factor(self, like: Tree) -> Callable[[Tree], Tree] | None:
+        """Return P if the code of h shows that ∂h/∂u is one number b, so that F′ = (1 − b)P⁻¹, which is
+        self-adjoint; None otherwise."""
+        if isinstance(like, tuple):
+            return None
+        law = analyse(lambda u: u - self.h(self.t, self.x, u, self.args), like)
+        return self.P.apply if law.isotropic else None
 
 
 class Knots(NamedTuple):

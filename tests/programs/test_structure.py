@@ -54,6 +54,11 @@ TRUTH = {
     "a matrix": (lambda y: MATRIX @ y, YES, NO, NO),
     "reversed": (lambda y: y[::-1], YES, NO, NO),
     "rolled": (lambda y: jnp.roll(y, 1), YES, NO, NO),
+    "a filter": (lambda y: jnp.fft.irfft(C[:2] * jnp.fft.rfft(y), 3), YES, NO, NO),
+    "a complex filter": (
+        lambda y: jnp.real(lax.complex(y, 2.0 * y[::-1]) * lax.complex(C, C)), YES, NO, NO,
+    ),
+    "a modulus": (lambda y: jnp.abs(jnp.fft.fft(y)), NO, NO, NO),
     "cumulative": (lambda y: jnp.cumsum(y), YES, NO, NO),
     "the mean": (lambda y: y - jnp.mean(y), YES, NO, NO),
     "gathered": (lambda y: y[jnp.array([2, 0, 1])], YES, NO, NO),

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .market import Market as Market
     from .model import Model as Model
     from .mpc import LinearMPC as LinearMPC
+    from .rough_contact import RoughContact as RoughContact
     from .thermostat import Thermostat as Thermostat
     from .traffic import Incident as Incident
     from .traffic import Network as Network
@@ -36,6 +37,7 @@ _HOMES = {
     "market": ("Market",),
     "model": ("Model",),
     "mpc": ("LinearMPC",),
+    "rough_contact": ("RoughContact",),
     "thermostat": ("Thermostat",),
     "traffic": ("Incident", "Network", "Traffic", "Trips"),
 }

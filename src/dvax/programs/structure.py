@@ -230,7 +230,10 @@ RULES: dict[str, Rule] = {
         "is_finite", "lgamma", "digamma", "reduce_precision",
     }, _pointwise),
     **same_for(
-        {"neg", "copy", "copy_p", "real", "imag", "optimization_barrier", "add", "sub", "add_any"},
+        {
+            "neg", "copy", "copy_p", "real", "imag", "complex", "conj", "optimization_barrier", "add",
+            "sub", "add_any",
+        },
         _together,
     ),
     **same_for((REARRANGING | SUMMING | {"dynamic_slice", "gather"}) - {"copy", "copy_p"}, _picking),

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -99,6 +99,16 @@ class FrozenVI(NamedTuple):
     space: AbstractSpace
     gamma: Any = None
     L_F: Any = None
+
+
+@runtime_checkable
+class HasInverse(Protocol):
+    """An F that knows the inverse of its derivative, as the law of a problem does: F′ = aP⁻¹."""
+
+    def inverse_up_to_a_factor(self, like: Tree) -> Callable[[Tree], Tree] | None:
+        """Return P, self-adjoint in the space of the VI, with F′(y) = aP⁻¹ for all y and one number a
+        that need not be known; None where the code does not show that there is one."""
+        ...
 
 
 class Answer(NamedTuple):

@@ -13,7 +13,7 @@ from .._tree import Tree
 from ..errors import input_error
 from ..programs.matrix import matrix_of
 from ..programs.structure import analyse
-from .abstract import AbstractSolver, Answer, FrozenVI
+from .abstract import AbstractSolver, Answer, FrozenVI, HasInverse
 from .block import solve_block
 from .newton import Linearisation, safeguarded_newton
 from .parameters import SAFETY, STEPS, UNKNOWNS, check_parameters, describe
@@ -33,7 +33,9 @@ class ActiveSet(AbstractSolver):
     Up to `dense` unknowns the matrix is formed. Beyond, the block is applied matrix-free, with one
     derivative of F per product, in conjugate gradients (`symmetric=True`: F′ is symmetric) or
     GMRES. Their relative tolerance is min(0.1, ‖w‖/‖w₀‖). They need a `preconditioner` if F′ is
-    ill-conditioned, as a discretised differential operator is.
+    ill-conditioned, as a discretised differential operator is. The law of a `dvax.Problem` has one if
+    the code of h shows that ∂h/∂u is one number: then F′ = aP⁻¹, and the block P_II is close to the
+    inverse of F′_II up to a factor, which conjugate gradients do not notice.
 
     Source: Hintermüller, Ito and Kunisch 2002, SIAM J. Optim. 13, 865–888 (the method and its
     equivalence to a semismooth Newton method). The safeguard is not from that paper.
@@ -86,10 +88,13 @@ class ActiveSet(AbstractSolver):
                 "Use dvax.vi.SemismoothNewton()",
             )
         size = sum(leaf.size for leaf in jtu.tree_leaves(y0))
-        solve_linear = self._lu_solver(vi, y0) if size <= self.dense else self._krylov_solve
-        return safeguarded_newton(
-            vi, y0, tol, solve_linear, step=self.step, max_steps=self.max_steps
+        solve_linear = (
+            self._lu_solver(vi, y0) if size <= self.dense else self._krylov_solver(vi, y0)
         )
+        return safeguarded_newton(
+            vi, y0, tol, solve_linear, step=self.step, max_steps=self.max_steps,
+            is_affine=analyse(vi.F, y0).affine,
+        )  # fmt: skip
 
     def _lu_solver(self, vi: FrozenVI, y0: Tree) -> Callable[[Linearisation, Tree], Tree]:
         constant = None
@@ -112,28 +117,45 @@ class ActiveSet(AbstractSolver):
 
         return solve
 
-    def _krylov_solve(self, at: Linearisation, right: Tree) -> Tree:
-        free = _free(at, right)
+    def _krylov_solver(self, vi: FrozenVI, y0: Tree) -> Callable[[Linearisation, Tree], Tree]:
+        symmetric, preconditioner = self.symmetric, self.preconditioner
+        weights: Any = None
+        inverse = None if symmetric or preconditioner is not None else inverse_of(vi, y0)
+        if inverse is not None:
+            # F′ is self-adjoint in the space: with the weights in front, it is a symmetric matrix.
+            weights, symmetric = vi.space.weights(), True
+            preconditioner = lambda free, r: jnp.where(free, inverse(r / weights), 0.0)  # noqa: E731
 
-        def restrict(d: Tree) -> Tree:
-            return jtu.tree_map(lambda f, v: jnp.where(f, v, 0.0), free, d)
+        def solve(at: Linearisation, right: Tree) -> Tree:
+            free = _free(at, right)
 
-        def apply(d: Tree) -> Tree:
-            """Return F′_II d_I; d and the result are 0 at the fixed unknowns."""
-            return restrict(at.slope(d))
+            def restrict(d: Tree) -> Tree:
+                return jtu.tree_map(lambda f, v: jnp.where(f, v, 0.0), free, d)
 
-        preconditioner = self.preconditioner
-        M = None if preconditioner is None else lambda r: preconditioner(free, r)
-        free_right = restrict(_tree.scale(1.0 / at.tau, right))
-        rtol: Any = jnp.clip(at.reduction, 1e-10, 0.1)
-        if self.symmetric:
-            d, _ = jax.scipy.sparse.linalg.cg(apply, free_right, tol=rtol, maxiter=1000, M=M)
-        else:
-            d, _ = jax.scipy.sparse.linalg.gmres(
-                apply, free_right, tol=rtol, atol=0.0, restart=40, maxiter=10, M=M
-            )
-        fixed = _tree.sub(right, _tree.scale(at.tau, at.slope(d)))
-        return jtu.tree_map(jnp.where, free, d, fixed)
+            def apply(d: Tree) -> Tree:
+                """Return F′_II d_I; d and the result are 0 at the fixed unknowns."""
+                product = restrict(at.slope(d))
+                return product if weights is None else weights * product
+
+            M = None if preconditioner is None else lambda r: preconditioner(free, r)
+            free_right = restrict(_tree.scale(1.0 / at.tau, right))
+            free_right = free_right if weights is None else weights * free_right
+            rtol: Any = jnp.clip(at.reduction, 1e-10, 0.1)
+            if symmetric:
+                d, _ = jax.scipy.sparse.linalg.cg(apply, free_right, tol=rtol, maxiter=1000, M=M)
+            else:
+                d, _ = jax.scipy.sparse.linalg.gmres(
+                    apply, free_right, tol=rtol, atol=0.0, restart=40, maxiter=10, M=M
+                )
+            fixed = _tree.sub(right, _tree.scale(at.tau, at.slope(d)))
+            return jtu.tree_map(jnp.where, free, d, fixed)
+
+        return solve
+
+
+def inverse_of(vi: FrozenVI, like: Tree) -> Callable[[Tree], Tree] | None:
+    """Return the inverse of F′ up to a factor, if F has one (`HasInverse`)."""
+    return vi.F.inverse_up_to_a_factor(like) if isinstance(vi.F, HasInverse) else None
 
 
 def _free(at: Linearisation, like: Tree) -> Tree:

@@ -8,7 +8,7 @@ from .._tree import Tree
 from ..errors import input_error
 from ..programs.structure import analyse
 from .abstract import AbstractSolver, Answer, FrozenVI
-from .active_set import ActiveSet
+from .active_set import ActiveSet, inverse_of
 from .bracketing import Bracketing, affine_answer, is_pointwise
 from .golden_ratio import GoldenRatio
 from .lemke import Lemke, is_affine_on_polyhedron
@@ -25,7 +25,8 @@ class Auto(AbstractSolver):
     - K a pointwise interval and F pointwise: `Bracketing` (closed form where F is affine);
     - F affine, K a simplex or a polyhedron of at most 16 unknowns: `Lemke`;
     - up to 1024 unknowns: `ActiveSet` on a box, `SemismoothNewton` on other sets;
-    - beyond: `GoldenRatio`, which needs no moduli and forms no matrix.
+    - beyond: `ActiveSet` on a box if F is the law of a problem with F′ = aP⁻¹, and otherwise
+      `GoldenRatio`. Both form no matrix.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -47,9 +48,10 @@ class Auto(AbstractSolver):
         if is_pointwise(vi, like):
             return Bracketing()
         size = sum(leaf.size for leaf in jtu.tree_leaves(like))
+        is_box = vi.K.intervals(like) is not None
         if size > _MAX_NEWTON_UNKNOWNS:
-            return GoldenRatio()
-        if vi.K.intervals(like) is not None:
+            return ActiveSet() if is_box and inverse_of(vi, like) is not None else GoldenRatio()
+        if is_box:
             return ActiveSet()
         return Lemke() if is_affine_on_polyhedron(vi, like) else SemismoothNewton()
 

@@ -40,7 +40,8 @@ _FIRST_RUN_LENGTH = 5
 steps identify most active sets."""
 
 _DIVERGENCE_RATIO = 10.0
-"""A Newton point is rejected if its ‖w‖ exceeds this multiple of the best."""
+"""A Newton point is rejected if its ‖w‖ exceeds this multiple of the best, unless F is affine. Then a
+large ‖w‖ comes from a wrong active set, which the next step corrects, and not from the linearisation."""
 
 _TRUST_RATIO = 2e3
 """The first Newton point is rejected if ‖F‖ exceeds this multiple of its value at the start: the point
@@ -79,8 +80,9 @@ class _State(NamedTuple):
 
 
 def safeguarded_newton(
-    vi: FrozenVI, y0: Tree, tol: Any, solve: LinearSolver, *, step: float, max_steps: int
-) -> Answer:
+    vi: FrozenVI, y0: Tree, tol: Any, solve: LinearSolver, *, step: float, max_steps: int,
+    is_affine: bool = False,
+) -> Answer:  # fmt: skip
     """Solve Φ(z) = F(y) + (z − y)/τ = 0 with y = proj_K(z); the value Φ(z) is the certificate w.
 
     Every iteration tries one z: it projects z, evaluates F at y = proj_K(z), and has the certificate
@@ -104,6 +106,7 @@ def safeguarded_newton(
     """
     # `iterate` passes an F without derivatives (`without_derivatives`), but Newton's method needs F′.
     differentiable_F = vi.F
+    divergence_ratio = jnp.inf if is_affine else _DIVERGENCE_RATIO
     target = residual_target(vi, tol)
 
     def advance(vi: FrozenVI, s: _State) -> tuple[_State, Trial]:
@@ -124,7 +127,7 @@ def safeguarded_newton(
         # The first Newton point has no earlier ‖w‖ to halve, so its ‖F‖ is limited instead.
         trusted = is_newton & ((norm_F <= s.trust_limit) | jnp.isfinite(s.best))
         halved = trusted & (residual <= 0.5 * s.best)
-        continues = trusted & (s.steps_left > 0) & (residual <= _DIVERGENCE_RATIO * s.best)
+        continues = trusted & (s.steps_left > 0) & (residual <= divergence_ratio * s.best)
         continues &= ~halved & jnp.isfinite(residual)
         failed = is_newton & ~halved & ~continues
         shortens = jnp.zeros_like(failed)

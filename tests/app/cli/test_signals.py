@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import xarray
 from tests.app.plots.synthetic import Recipe, write_run
-from tests.selection import mostly_thorough
 
 import dvax
 
@@ -40,10 +39,9 @@ TRIALS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("command", "seconds", "number", "twice"),
-    mostly_thorough(TRIALS, [(COMMANDS[0], 4.7, signal.SIGTERM, False)]),
-)
+# `test_interrupt` has one signal in one command for `make test`.
+@pytest.mark.thorough
+@pytest.mark.parametrize(("command", "seconds", "number", "twice"), TRIALS)
 def test_signal_at_any_time_ends_a_command_with_readable_results(
     tmp_path: Path, command: tuple[str, ...], seconds: float, number: signal.Signals, twice: bool
 ) -> None:
