@@ -26,6 +26,7 @@ CASES = (
     "box_vi",
     "pointwise",
     "obstacle",
+    "rough_contact",
     "applications",
     "stiffness",
     "picard",

@@ -23,7 +23,7 @@ from .._tree import Tree
 from ..errors import input_error
 from ..generators import AbstractGenerator, AbstractPropagator
 from .bounds import Bounds
-from .control import clip_to_stop, root_mean_squares
+from .control import RootMeanSquares, clip_to_stop
 from .flow import Flow
 from .method import ETD2RK
 from .outcome import Outcome, Record, Saved, end_alone, ended, with_tangents
@@ -361,9 +361,7 @@ def solve_by_windows(
         ETD2RK(), flow, True, False, None, options.track_bounds, True, False, ends, None, growth
     )
     rtol, atol, horizon = map(setup.number, ("rtol", "atol", "horizon"))
-    sizes = jax.vmap(
-        lambda *parts: jnp.stack(root_mean_squares(setup.problem.spaces(x0)[0])(*parts))
-    )
+    sizes = jax.vmap(lambda *parts: jnp.stack(RootMeanSquares(setup.problem.spaces(x0)[0])(*parts)))
 
     def size(error: Any, completed_defect: Any, after: Any) -> Any:
         """Return the defect in units of the tolerance, averaged over the steps of the window.

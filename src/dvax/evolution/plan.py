@@ -99,9 +99,13 @@ def _small_box(setup: Setup) -> AbstractSmallBox:
 
 
 def _tolerance(setup: Setup) -> jax.Array:
-    """Return the tolerance of the law: a thousandth of that of the defect, but at least 100 eps."""
+    """Return the tolerance of the law: a thousandth of that of the defect, but at least 100 eps. Where
+    it is known that an error of the law is multiplied by more than 1 in f̃, by β_f‖P⁻¹‖, the tolerance
+    is divided by that."""
     floor = 100 * jnp.finfo(setup.dtype).eps
     defect = setup.number("atol") + setup.number("rtol")
     adaptive = 1e-3 * defect / jnp.maximum(1.0, setup.number("horizon"))
+    if "law_gain" in setup.moduli:
+        adaptive = adaptive / jnp.maximum(1.0, setup.moduli["law_gain"])
     has_fixed_steps = ~jnp.isnan(setup.number("dt"))
     return jnp.maximum(jnp.where(has_fixed_steps, 1e-12, adaptive), floor)

@@ -19,7 +19,7 @@ class Setup(NamedTuple):
 
     - `setting`: the numbers t0, t1, dt (NaN for adaptive steps), rtol, atol, dt0, dt_max and horizon,
       and the `stiff_steps` of the stiffness guard;
-    - `moduli`: γ, L_F and ‖P⁻¹‖, as far as they are given;
+    - `moduli`: γ, L_F, ‖P⁻¹‖ and β_f‖P⁻¹‖, as far as they are given;
     - `method`: an `AbstractMethod`, `Implicit`, `Picard` or `PiecewiseLinear`;
     - `events`: of the user.
 

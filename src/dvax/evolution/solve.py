@@ -448,12 +448,18 @@ def _differentiably(
 
 
 def _moduli(constants: Any) -> dict[str, Any]:
-    """γ, L_F and ‖P⁻¹‖ of whatever object declares them."""
+    """γ, L_F, ‖P⁻¹‖ and the gain β_f‖P⁻¹‖ of the law in f̃, of whatever object declares them."""
     if constants is None:
         return {}
-    names = ("gamma", "L_F", "norm_P_inv")
+    names = ("gamma", "L_F", "norm_P_inv", "beta_f")
     known = {name: getattr(constants, name, None) for name in names}
-    return {name: _number(v) for name, v in known.items() if v is not None}
+    moduli = {name: _number(v) for name, v in known.items() if v is not None}
+    beta_f = moduli.pop("beta_f", None)
+    if beta_f is not None and "norm_P_inv" in moduli:
+        gain = beta_f * moduli["norm_P_inv"]
+        if not _tree.is_concrete(gain) or np.isfinite(gain):
+            moduli["law_gain"] = gain
+    return moduli
 
 
 def _times(ts: Any) -> Any:

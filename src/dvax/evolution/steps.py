@@ -19,7 +19,7 @@ from .control import (
     Adaptive,
     ErrorTest,
     Fixed,
-    root_mean_squares,
+    RootMeanSquares,
     step_count,
 )
 from .event import Events
@@ -117,7 +117,7 @@ def _controller(
 ) -> AbstractController:
     if options.fixed:
         return Fixed(stops, setup.number("dt"))
-    sizes = root_mean_squares(setup.problem.spaces(setup.x0)[0])
+    sizes = RootMeanSquares(setup.problem.spaces(setup.x0)[0])
     rtol, atol, horizon = map(setup.number, ("rtol", "atol", "horizon"))
     return Adaptive(
         stops,

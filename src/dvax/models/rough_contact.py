@@ -50,8 +50,8 @@ class RoughContact(eqx.Module):
 
     **Raises:** `dvax.InputError` with all invalid arguments.
 
-    Source of σ: Johnson 1985, Contact Mechanics, chapters 2 and 5; Carbone and Mangialardi 2008, J. Mech.
-    Phys. Solids 56, 684–706, for a layer on a base without friction.
+    Source of σ: Johnson 1985, Contact Mechanics, for the half-space; Carbone and Mangialardi 2008, J.
+    Mech. Phys. Solids 56, 684–706, for a layer on a base without friction.
 
     ```python
     >>> import jax, jax.numpy as jnp, dvax
@@ -240,7 +240,8 @@ def _profile(place: str, value: Any, wrong: Problems) -> jax.Array:
         if heights.ndim in (1, 2) and not (concrete and _tree.first_nonfinite(heights)):
             return heights
         wrong.add(
-            place, _tree.short(heights), "it must be an array of one or two dimensions of finite heights",
+            place, _tree.short(heights),
+            "it must be an array of one or two dimensions of finite heights",
             "Give the heights over the grid of the cell",
         )  # fmt: skip
     return jnp.zeros(2)

@@ -35,13 +35,13 @@ class Linearisation(NamedTuple):
 LinearSolver = Callable[[Linearisation, Tree], Tree]
 """Return d with τF′(y) D d + (I − D) d = right."""
 
-_FIRST_RUN_LENGTH = 5
+_FIRST_RUN_LENGTH, _FIRST_RUN_LENGTH_AFFINE = 5, 20
 """Number of consecutive Newton steps that may fail to halve the best ‖w‖, in the first run: a few
-steps identify most active sets."""
+steps identify most active sets. Of an affine F nothing else can be wrong, and more are allowed."""
 
 _DIVERGENCE_RATIO = 10.0
 """A Newton point is rejected if its ‖w‖ exceeds this multiple of the best, unless F is affine. Then a
-large ‖w‖ comes from a wrong active set, which the next step corrects, and not from the linearisation."""
+large ‖w‖ comes from a wrong active set, which the next step corrects, not from the linearisation."""
 
 _TRUST_RATIO = 2e3
 """The first Newton point is rejected if ‖F‖ exceeds this multiple of its value at the start: the point
@@ -107,6 +107,7 @@ def safeguarded_newton(
     # `iterate` passes an F without derivatives (`without_derivatives`), but Newton's method needs F′.
     differentiable_F = vi.F
     divergence_ratio = jnp.inf if is_affine else _DIVERGENCE_RATIO
+    first_run_length = _FIRST_RUN_LENGTH_AFFINE if is_affine else _FIRST_RUN_LENGTH
     target = residual_target(vi, tol)
 
     def advance(vi: FrozenVI, s: _State) -> tuple[_State, Trial]:
@@ -196,7 +197,7 @@ def safeguarded_newton(
 
     def begin(vi: FrozenVI, y0: Tree) -> _State:
         one = jnp.ones((), jnp.result_type(*jax.tree_util.tree_leaves(y0)))
-        infinity, run_length = jnp.inf * one, jnp.asarray(_FIRST_RUN_LENGTH)
+        infinity, run_length = jnp.inf * one, jnp.asarray(first_run_length)
         return _State(
             y0, jnp.asarray(_START), one, y0, y0, one, infinity, infinity, run_length, run_length,
             jnp.asarray(0), jnp.asarray(1), jnp.asarray(False), infinity,

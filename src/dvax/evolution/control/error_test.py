@@ -1,6 +1,5 @@
 """The error test: the defect of a step in units of the tolerance."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -56,6 +55,20 @@ class Attempt(NamedTuple):
         return self._replace(error=error, integrated=integrated)
 
 
+class RootMeanSquares(eqx.Module):
+    """The root mean square of each part of a state: its norm over that of the constant 1.
+
+    The weights of the space are arrays of the loop like all others: a function that closes over them
+    would hide them from the transformations of the loop."""
+
+    space: AbstractSpace
+
+    def __call__(self, x: Tree) -> list[Any]:
+        if isinstance(self.space, Product):
+            return [_mean(s, part) for s, part in zip(self.space.spaces, x, strict=True)]
+        return [_mean(self.space, x)]
+
+
 class ErrorTest(eqx.Module):
     """Compare the defect of a step with (atol + rtol‖x‖)/horizon.
 
@@ -71,7 +84,7 @@ class ErrorTest(eqx.Module):
     rtol: Any
     atol: Any
     horizon: Any
-    sizes: Callable[[Tree], list[Any]]
+    sizes: RootMeanSquares
     certify: bool = eqx.field(static=True)
     knows_decay: bool = eqx.field(static=True)
 
@@ -156,14 +169,6 @@ class ErrorTest(eqx.Module):
         ratio = jnp.max(jnp.stack(ratios)) if len(ratios) > 1 else ratios[0]
         # NaN must neither accept a step nor lengthen the next one.
         return jnp.where(jnp.isnan(ratio), jnp.inf, ratio)
-
-
-def root_mean_squares(space: AbstractSpace) -> Callable[[Tree], list[Any]]:
-    """Return the root mean square of each part of a state: its norm over that of the constant 1."""
-    if isinstance(space, Product):
-        spaces = space.spaces
-        return lambda tree: [_mean(s, p) for s, p in zip(spaces, tree, strict=True)]
-    return lambda tree: [_mean(space, tree)]
 
 
 def _mean(space: AbstractSpace, part: Tree) -> Any:
