@@ -26,6 +26,7 @@ CASES = (
     "box_vi",
     "pointwise",
     "obstacle",
+    "american_options",
     "applications",
     "stiffness",
     "picard",
