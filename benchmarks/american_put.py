@@ -80,8 +80,6 @@ def perpetual_boundary(put: Put) -> float:
 def problem(grid: Grid) -> dvax.Problem:
     """Return the penalised problem of a grid; `arguments` returns its `args`."""
     n, width = grid.cells, grid.width
-    with jax.ensure_compile_time_eval():  # the cached problem must not keep tracers
-        space = dvax.spaces.L2(jnp.full(n, width))
 
     def generator(args: dict[str, Any]) -> dvax.generators.Elliptic:
         return dvax.generators.Elliptic(
@@ -89,15 +87,17 @@ def problem(grid: Grid) -> dvax.Problem:
             scheme="differences",
         )  # fmt: skip
 
-    return dvax.Problem(
-        A=generator,
-        P=dvax.operators.Scaling(1.0),
-        K=dvax.sets.Box(0.0, jnp.inf),
-        f=lambda t, x, u, args: u,
-        h=lambda t, x, u, args: args["force"] + args["stiffness"] * (args["obstacle"] - x),
-        state_space=space,
-        control_space=space,
-    )
+    with jax.ensure_compile_time_eval():  # the cached problem must not keep tracers
+        space = dvax.spaces.L2(jnp.full(n, width))
+        return dvax.Problem(
+            A=generator,
+            P=dvax.operators.Scaling(1.0),
+            K=dvax.sets.Box(0.0, jnp.inf),
+            f=lambda t, x, u, args: u,
+            h=lambda t, x, u, args: args["force"] + args["stiffness"] * (args["obstacle"] - x),
+            state_space=space,
+            control_space=space,
+        )
 
 
 def arguments(grid: Grid, put: Put, width: Any, above: bool) -> dict[str, Any]:
@@ -136,13 +136,12 @@ def values(grid: Grid, put: Put, x: Any) -> jax.Array:
 def weights(grid: Grid, price: Any) -> tuple[Any, jax.Array]:
     """Return the nodes next to a price, and the weights of the polynomial through them."""
     place = jnp.log(price) / grid.width + grid.below - 0.5
-    nodes = (
-        jnp.arange(_NODES) + jax.lax.stop_gradient(jnp.floor(place)).astype(int) - _NODES // 2 + 1
-    )
-    distances = place - nodes.astype(place.dtype)
-    between = nodes[:, None] - nodes[None, :]
-    factors = jnp.where(between == 0, 1.0, distances[None, :] / jnp.where(between == 0, 1, between))
-    return nodes, jnp.prod(factors, axis=1)
+    first = jax.lax.stop_gradient(jnp.floor(place)) - _NODES // 2 + 1
+    nodes = first + jnp.arange(_NODES, dtype=place.dtype)
+    gaps = nodes[:, None] - nodes[None, :]
+    is_own = gaps == 0.0
+    factors = jnp.where(is_own, 1.0, (place - nodes)[None, :] / jnp.where(is_own, 1.0, gaps))
+    return nodes.astype(int), jnp.prod(factors, axis=1)
 
 
 def at_price(grid: Grid, on_grid: Any, price: Any) -> jax.Array:
@@ -193,10 +192,11 @@ def enclose(grid: Grid, put: Put, width: float, tol: float, prices: Any) -> Encl
         check = dvax.verify(
             problem(grid), initial(grid, put), 0.0, put.expiry, arguments(grid, put, width, above)
         )
+        assert check.constants is not None
         bound = dvax.bound_error(problem(grid), sol, check.constants)
         statuses += [check.status, bound.status]
         runs.append(sol)
-        errors.append([_time_error(grid, put, sol, p) for p in prices])
+        errors.append(_time_errors(grid, put, sol, prices))
     low, high = (values(grid, put, sol.xs[-1]) for sol in runs)
     places = [weights(grid, p) for p in prices]
     half = [float(jnp.abs(w) @ (0.5 * jnp.abs(high - low)[nodes])) for nodes, w in places]
@@ -208,21 +208,29 @@ def enclose(grid: Grid, put: Put, width: float, tol: float, prices: Any) -> Encl
     )  # fmt: skip
 
 
-def _time_error(grid: Grid, put: Put, sol: Any, price: float) -> float:
-    """Bound the error of V at a price that the time integration causes, from the enclosed defect δ.
+def _time_errors(grid: Grid, put: Put, sol: Any, prices: np.ndarray) -> np.ndarray:
+    """Bound the errors of V at prices that the time integration causes, from the enclosed defect δ.
 
     u decreases in x at every node, and A has no negative entries off its diagonal, so that
-    |e|' ≤ A|e| + |δ| entrywise, and |e(T)| ≤ ∫ e^{(T − t)A}|δ(t)| dt. With v the interpolation weights
-    times e^{as}, ⟨v, |e(T)|⟩ ≤ ∫ ‖e^{(T − t)A}v‖ ‖δ(t)‖ dt, and that norm decreases in T − t.
+    |e|' ≤ A|e| + |δ| entrywise, and |e(T)| ≤ ∫ e^{(T − t)A}|δ(t)| dt. With v the moduli of the
+    interpolation weights times e^{as}, ⟨v, |e(T)|⟩ ≤ ∫ ‖e^{(T − t)A}v‖ ‖δ(t)‖ dt. The norm decreases in
+    T − t.
     """
-    nodes, factors = weights(grid, price)
-    scale = jnp.exp(_transformation(put)[0] * jnp.asarray(grid.s))
-    v = jnp.zeros(grid.cells).at[nodes].add(jnp.abs(factors)) * scale / grid.width
+    scale = np.exp(_transformation(put)[0] * grid.s)
+    v = np.zeros((len(prices), grid.cells))
+    for row, price in zip(v, prices):
+        nodes, factors = weights(grid, price)
+        row[np.asarray(nodes)] = np.abs(factors)
+    v = jnp.asarray(v * scale / grid.width)
     generator = problem(grid).generator(sol.setup.args)
-    spread = jax.vmap(lambda t: generator.semigroup(t, v))(sol.ts[-1] - sol.ts[1:])
-    norms = jnp.sqrt(grid.width * jnp.sum(spread**2, axis=1))
+
+    def norms(t: jax.Array) -> jax.Array:
+        at_t = jax.vmap(lambda row: generator.semigroup(t, row))(v)
+        return jnp.sqrt(grid.width * jnp.sum(at_t**2, axis=1))
+
     # The defect from the start of the step that contains a saved time, up to the next saved time.
-    return float(norms @ (sol.defect[1:] - sol.completed_defect[0][:-1]))
+    defects = sol.defect[1:] - sol.completed_defect[0][:-1]
+    return np.asarray(defects @ jax.vmap(norms)(sol.ts[-1] - sol.ts[1:]))
 
 
 def boundary(grid: Grid, put: Put, on_grid: Any) -> float:

@@ -279,9 +279,9 @@ def _race(section: Section, table: Published, rounds: int) -> None:
     peers: dict[str, Callable[[], Any]] = {}
     for name, runs in (
         ("binomial tree (BBSR), {} steps",
-         {n: lambda n=n: [tree(p, *data, n) for p in prices] for n in 500 * 2 ** np.arange(8)}),
+         {n: lambda n=n: [tree(p, *data, n) for p in prices] for n in [500 * 2**k for k in range(8)]}),
         ("Crank–Nicolson, {} cells in σ√T",
-         {n: lambda n=n: _extrapolated(data, n, prices) for n in 25 * 2 ** np.arange(7)}),
+         {n: lambda n=n: _extrapolated(data, n, prices) for n in [25 * 2**k for k in range(7)]}),
     ):  # fmt: skip
         steps = next((n for n, fn in runs.items() if error(fn()) <= reached), list(runs)[-1])
         peers[name.format(steps)] = runs[steps]
@@ -303,7 +303,9 @@ def _race(section: Section, table: Published, rounds: int) -> None:
 
 def _extrapolated(data: tuple[Any, ...], cells: int, prices: np.ndarray) -> np.ndarray:
     """Return the values of finite differences, extrapolated as those of dvax."""
-    coarse, fine = (finite_differences(*data, n, 2 * n)(prices) for n in (cells // 2, cells))
+    coarse, fine = (
+        finite_differences(*data, cells=n, steps=2 * n)(prices) for n in (cells // 2, cells)
+    )
     return _pair(coarse, fine)
 
 
