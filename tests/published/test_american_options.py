@@ -10,7 +10,7 @@ from benchmarks.peers.american import IntegralEquation, finite_differences, tree
 
 BINOMIAL = Put(0.05, 0.0, 0.2)
 BINOMIAL_VALUES = {0.9: 11.4928, 1.0: 6.0903, 1.1: 2.9866, 1.2: 1.3672}
-"""Kim, Ma and Choe (2013), column "Binomial": S/K, and the value for the strike 100."""
+"""Mathematics 8(9), 1563 (2020), column "Binomial": S/K, and the value for the strike 100."""
 HODIE = Put(0.04, 0.02, 0.3)
 HODIE_VALUES = {
     0.759572: 25.32986, 0.839457: 19.49691, 0.927743: 14.26265, 1.025315: 9.84354,
