@@ -27,6 +27,7 @@ CASES = (
     "pointwise",
     "obstacle",
     "rough_contact",
+    "american_options",
     "applications",
     "stiffness",
     "picard",

@@ -67,8 +67,8 @@ def figures(block: Any, block_vars: dict[str, Any], gallery_conf: dict[str, Any]
 
 
 ORDER = (
-    "mechanics control circuit field game ecology derivative ensemble certificate workflow".split()
-)
+    "mechanics control circuit field game finance ecology derivative ensemble certificate workflow"
+).split()
 
 
 class Order:
