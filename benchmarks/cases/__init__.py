@@ -27,6 +27,7 @@ CASES = (
     "pointwise",
     "obstacle",
     "applications",
+    "published_circuits",
     "stiffness",
     "picard",
     "accelerator",
