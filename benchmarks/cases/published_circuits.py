@@ -103,19 +103,20 @@ def run(full: bool) -> Section:
         fair=(
             "Errors of the first three circuits: the largest in the voltage of C1 from 10 µs on, at "
             "the times of the file or at a thousand accepted times of ngspice, against the circuit "
-            "with ideal diodes, solved from switching to switching by matrix exponentials without code "
-            "of dvax. Siconos has the matrices, the step and θ of its tutorials, and a tenth of the "
-            "step. ngspice has the diodes of dvax (sidiode, two straight lines), its default step and "
-            "tolerance, and largest steps of 1 µs, 100 ns and 10 ns. Times: of ngspice what it "
-            "reports for the transient analysis, to a millisecond; of Siconos the stepping; of dvax "
-            "the call, after compilation (the converter with it), in a process with one BLAS thread, "
-            "as that of Siconos. dvax solves to roundoff at any tolerance, so that no row has equal "
-            "errors unless the resistance of the diodes is the error; the ratio belongs with both "
-            "errors. Bounds are those of dvax.bound_error in √J over the root of the capacity of C1, "
-            "for the circuit with r_on and g_leak. The distance from there to ideal diodes is that of two exact solutions. "
-            "BuckConverter: errors of the inductor's current, of dvax against the exact solution with "
-            "its leak, of Siconos (equations, step and solver of the tutorial) against that with half "
-            "of the leak, since the tutorial has none."
+            "with ideal diodes, solved from switching to switching by matrix exponentials without "
+            "code of dvax. Siconos has the matrices, the step and θ of its tutorials, and a tenth "
+            "of the step. ngspice has the diodes of dvax (sidiode, two straight lines), its default "
+            "step and tolerance, a relative tolerance of 1e-6, and largest steps of 1 µs, 100 ns "
+            "and 10 ns. Times: of ngspice what it reports for the transient analysis, to a "
+            "millisecond; of Siconos the stepping; of dvax the call, after compilation (the "
+            "converter with it), in a process with one BLAS thread, as that of Siconos. dvax solves "
+            "to roundoff at any tolerance, so that no row has equal errors unless the resistance of "
+            "the diodes is the error; the ratio belongs with both errors. Bounds are those of "
+            "dvax.bound_error in √J over the root of the capacity of C1, for the circuit with r_on "
+            "and g_leak. The distance from there to ideal diodes is that of two exact solutions. "
+            "BuckConverter: errors of the inductor's current, of dvax against the exact solution "
+            "with its leak, of Siconos (equations, step and solver of the tutorial) against that "
+            "with half of the leak, since the tutorial has none."
         ),
     )
     rounds = 5 if full else 3
@@ -182,13 +183,16 @@ def _ngspice(given: Published) -> Iterator[tuple[str, Sample, float]]:
         given.netlist, given.options.get("r_on", 1e3), given.options.get("g_leak", 1e-12)
     )
     output, end = f"v({given.node})", float(given.times[-1])
-    for label, longest in (("default", None), ("1 µs", 1e-6), ("100 ns", 1e-7), ("10 ns", 1e-8)):
-        once = ngspice.simulate(netlist, end, output, longest=longest)
+    for label, longest, reltol in (
+        ("default", None, 1e-3), ("tolerance 1e-6", None, 1e-6), ("1 µs", 1e-6, 1e-3),
+        ("100 ns", 1e-7, 1e-3), ("10 ns", 1e-8, 1e-3),
+    ):  # fmt: skip
+        once = ngspice.simulate(netlist, end, output, longest=longest, reltol=reltol)
         k = _few(once.ts)
         off = float(np.abs(once.values[k, 0] - given.exact(once.ts[k])[:, 0]).max())
 
-        def sample(longest: float | None = longest) -> float:
-            return ngspice.simulate(netlist, end, output, longest=longest).seconds
+        def sample(longest: float | None = longest, reltol: float = reltol) -> float:
+            return ngspice.simulate(netlist, end, output, longest=longest, reltol=reltol).seconds
 
         yield f"ngspice, {label}", sample, off
 
