@@ -83,8 +83,8 @@ PUBLISHED = {
     ),
     "DiodeBridgeCapFilter": Published(
         "DiodeBridgeCapFilter.ref", (4.999e-3, -0.1546391462618688, -4.624407808215309e-3), 1e-6, 1.0,
-        switching.FILTERED, "a", {"r_on": 1e-4, "g_leak": 1e-10}, _filtered,
-        switching.filtered(1e-4, 1e-10),
+        switching.FILTERED, "a", {"r_on": 1e-3, "g_leak": 1e-9}, _filtered,
+        switching.filtered(1e-3, 1e-9),
         {
             "A": [[0.0, -1e6, 0.0], [1e2, 0.0, 0.0], [0.0, 0.0, -1.0 / 3e-4]],
             "B": [[0.0, 0.0, -1e6, 1e6], [0.0] * 4, [1 / 3e-7, 0.0, 1 / 3e-7, 0.0]],

@@ -92,13 +92,13 @@ def test_dvax_is_within_its_bound_of_the_exact_circuit(name):
     sol = circuit.solve(ts[-1], ts=ts)
     off = np.asarray(sol.xs) - given.own(ts)
     bound = dvax.bound_error(circuit.problem, sol, circuit.constants)
-    # The exact solution is in double precision, which is no more exact than a rounding or two of x.
-    rounding = 64 * np.finfo(float).eps * np.sqrt(CAPACITY) * 10.0
     energy = np.sqrt(np.sum(np.asarray(circuit.storage) * off**2, axis=1))
+    # A rounding of x beside the bound: the exact solution is returned in double precision.
+    rounding = np.finfo(float).eps * np.sqrt(CAPACITY) * 10.0
     assert np.all(energy <= np.asarray(bound.x) + rounding)
     assert np.abs(off[:, 0]).max() <= 5e-9
     distance = np.abs(given.exact(ts) - np.asarray(sol.xs))[ts >= 1e-5, 0].max()
-    assert distance <= 3e-6  # of ideal diodes
+    assert distance <= 3e-5  # of ideal diodes
 
 
 def test_resistance_of_diodes_moves_the_filtered_bridge_in_proportion():
