@@ -191,8 +191,9 @@ def _valid(solvers: Mapping[Any, _Linear], z: Array, near: Any) -> Any:
 
 def _rates(on: Iterable[bool], r: float, g: float) -> list[Any]:
     """Return the conductances of regularised diodes: r alone, or r and 1/g in series."""
-    r, g = np.longdouble(r), np.longdouble(g)
-    return [1.0 / r if conducts else g / (1.0 + r * g) for conducts in on]
+    on_state, leak = np.longdouble(r), np.longdouble(g)
+    off_state = leak / (1.0 + on_state * leak)
+    return [1.0 / on_state if conducts else off_state for conducts in on]
 
 
 def _signs(on: Iterable[bool]) -> Array:
