@@ -29,6 +29,7 @@ CASES = (
     "rough_contact",
     "american_options",
     "applications",
+    "published_circuits",
     "stiffness",
     "picard",
     "accelerator",

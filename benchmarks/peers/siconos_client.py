@@ -129,14 +129,38 @@ class SiconosRaces(_Running):
         return answer["seconds"], np.array(answer["x"])
 
 
+class DvaxCircuits(Process):
+    """Circuits in dvax, in a process with one thread (`dvax_circuits.py`)."""
+
+    def __init__(self) -> None:
+        command = [sys.executable, "-m", "benchmarks.peers.dvax_circuits"]
+        super().__init__(command, ExitStack(), env=_ENVIRONMENT, cwd=_HERE.parents[1])
+
+    def load(self, ts: np.ndarray, **system: Any) -> None:
+        self.send(do="load", ts=ts.tolist(), **system)
+        self.receive()
+
+    def seconds(self) -> float:
+        """For one run to the end, as called."""
+        self.send(do="run")
+        return self.receive()["seconds"]
+
+    def result(self) -> dict[str, Any]:
+        """The answer to "result", with x at `ts` as an array."""
+        self.send(do="result")
+        answer = self.receive()
+        return answer | {"xs": np.array(answer["xs"])}
+
+
 class SiconosCircuit(_Running):
     """Linear circuits with ideal diodes (`siconos_circuit.py`)."""
 
     def __init__(self, interpreter: str):
         super().__init__(interpreter, "siconos_circuit.py")
 
-    def build(self, matrices: dict[str, Any], h: float, steps: int) -> None:
-        self._ask(do="build", **matrices, h=h, steps=steps)
+    def build(self, matrices: dict[str, Any], h: float, steps: int, **options: Any) -> None:
+        """`options` are those that `siconos_circuit.py` lists."""
+        self._ask(do="build", **matrices, h=h, steps=steps, **options)
 
     def run(self) -> tuple[float, np.ndarray]:
         """Seconds for the steps, and x at the end.
@@ -148,3 +172,7 @@ class SiconosCircuit(_Running):
         if not np.all(np.isfinite(x)):
             raise RuntimeError("Siconos returned a state that is not finite")
         return answer["seconds"], x
+
+    def trajectory(self) -> np.ndarray:
+        """x after every step of a system built with keep=True."""
+        return np.array(self._ask(do="run")["xs"])
