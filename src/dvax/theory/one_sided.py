@@ -89,6 +89,16 @@ def _minimise_mu(
             values = values + a + b * L + tau * norm_P * L * (c + e * L)
         return values
 
+    # No τ gives less than ½ λ_max(G). If feedback and coupling are opposite, B = 0 for one τ, which
+    # reaches that value: two eigenvalue problems in the place of a search.
+    squares, products = (np.sum(v * cross, axis=(1, 2)) for v in (cross, f_u.center))
+    if not pointwise:
+        squares, products = (np.sum(v, keepdims=True) for v in (squares, products))
+    if np.all(squares > 0) and np.all(products < 0):
+        opposite = mu(np.log(-products / squares))
+        least = 0.5 * eigenvalues(G)[:, -1]
+        if np.max(opposite) <= np.max(least) + 10 * _ROUNDING * np.abs(G).max():
+            return float(np.max(opposite)) + shift
     if pointwise:
         return float(np.max(_minimum(mu, len(G)))) + shift
     return float(_minimum(lambda log_tau: np.max(mu(log_tau), keepdims=True), 1)[0]) + shift
