@@ -23,6 +23,7 @@ CASES = (
     "simplices",
     "traffic",
     "traffic_days",
+    "published_traffic",
     "box_vi",
     "pointwise",
     "obstacle",

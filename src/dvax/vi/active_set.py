@@ -1,6 +1,7 @@
 """The primal-dual active-set method for boxes."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -124,7 +125,7 @@ class ActiveSet(AbstractSolver):
         if inverse is not None:
             # F′ is self-adjoint in the space: with the weights in front, it is a symmetric matrix.
             weights, symmetric = vi.space.weights(), True
-            preconditioner = lambda free, r: jnp.where(free, inverse(r / weights), 0.0)  # noqa: E731
+            preconditioner = partial(_block_of, inverse, weights)
 
         def solve(at: Linearisation, right: Tree) -> Tree:
             free = _free(at, right)
@@ -137,7 +138,7 @@ class ActiveSet(AbstractSolver):
                 product = restrict(at.slope(d))
                 return product if weights is None else weights * product
 
-            M = None if preconditioner is None else lambda r: preconditioner(free, r)
+            M = None if preconditioner is None else partial(preconditioner, free)
             free_right = restrict(_tree.scale(1.0 / at.tau, right))
             free_right = free_right if weights is None else weights * free_right
             rtol: Any = jnp.clip(at.reduction, 1e-10, 0.1)
@@ -156,6 +157,11 @@ class ActiveSet(AbstractSolver):
 def inverse_of(vi: FrozenVI, like: Tree) -> Callable[[Tree], Tree] | None:
     """Return the inverse of F′ up to a factor, if F has one (`HasInverse`)."""
     return vi.F.inverse_up_to_a_factor(like) if isinstance(vi.F, HasInverse) else None
+
+
+def _block_of(P: Callable[[Tree], Tree], weights: Any, free: Any, r: Any) -> Tree:
+    """Return P_II W⁻¹ r, for r that is 0 at the fixed unknowns."""
+    return jnp.where(free, P(r / weights), 0.0)
 
 
 def _free(at: Linearisation, like: Tree) -> Tree:
