@@ -1,6 +1,7 @@
 """A viscoelastic layer under a rough body: closed forms of Westergaard and Hertz, full contact, and the
 proved rate."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -122,6 +123,18 @@ def test_trajectories_approach_with_the_proved_rate():
     ]
     distance = [float(model.space.norm(d)) for d in ends[0] - ends[1]]
     assert np.all(distance <= distance[0] * np.exp(-ts / 0.8) * (1 + 1e-4))
+
+
+@pytest.mark.thorough
+def test_derivative_of_the_load_is_that_of_differences():
+    """1,600 unknowns: by the implicit function theorem, without a matrix."""
+    rough = np.random.default_rng(2).normal(size=(40, 40))
+    model = RoughContact(
+        profile=rough, lengths=1.0, modulus=1.0, thickness=3.0, approach=0.0, creep=1.0
+    )
+    load = lambda approach: jnp.mean(model.equilibrium(approach, tol=1e-12).y)  # noqa: E731
+    difference = (load(4.0 + 1e-6) - load(4.0 - 1e-6)) / 2e-6
+    assert float(jax.grad(load)(4.0)) == pytest.approx(float(difference), rel=1e-6)
 
 
 BAD = {
