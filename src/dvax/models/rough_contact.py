@@ -37,8 +37,8 @@ class RoughContact(eqx.Module):
     for the thickness H. For kH ≫ 1 that is ½E*k, the elastic half-space. A constant pressure p causes
     the displacement p(1 + c(1 − e^{−t/τ}))/E* H (a standard linear solid).
 
-    **The state.** The model has the state P^{½}x, whose norm in L² is the square root of the energy of
-    x. In this norm any two trajectories approach with the rate 1/τ (docs/models/rough-contact.md);
+    **The state.** The model has the state √P x, whose squared norm in L² is twice the energy of x. In
+    this norm any two trajectories approach with the rate 1/τ (docs/models/rough-contact.md);
     `creep(state)` is x.
 
     **Units:** profile, lengths, H and δ in [s]; E* and κ₀ in [p]; τ in [t].
@@ -113,7 +113,7 @@ class RoughContact(eqx.Module):
 
     @property
     def problem(self) -> Problem:
-        """The problem with A = −I/τ, P, K = [0, κ₀], f = cP^{½}u/τ and h = δ + r − P^{−½}x, in L²."""
+        """The problem with A = −I/τ, P, K = [0, κ₀], f = c√P u/τ and h = δ + r − √P⁻¹ x, in L²."""
         return Problem(
             A=Scalar(-1.0 / _tree.host(self.retardation_time)),
             P=self.operator,
@@ -128,10 +128,10 @@ class RoughContact(eqx.Module):
     def constants(self) -> Constants:
         """The proved constants.
 
-        With the least and the largest σ: γ = 1/σ_max, L_F = 1/σ_min, α_h = σ_min^{−½}, β_h = α_f = 0,
-        β_f = (c/τ)σ_max^{½}, M = 1, ω = −1/τ. The one-sided rate is μ = −1/τ: of two solutions with
-        differences d and v of states and responses, ⟨−P^{−½}d − v, Pv⟩ ≥ 0 since N_K is monotone, so
-        that ⟨(c/τ)P^{½}v, d⟩ ≤ −(c/τ)⟨v, Pv⟩ ≤ 0."""
+        With the least and the largest σ: γ = 1/σ_max, L_F = 1/σ_min, α_h = √(1/σ_min), β_h = α_f = 0,
+        β_f = (c/τ)√σ_max, M = 1, ω = −1/τ. The one-sided rate is μ = −1/τ: of two solutions with
+        differences d and v of states and responses, ⟨−√P⁻¹ d − v, Pv⟩ ≥ 0 since N_K is monotone, so
+        that ⟨(c/τ)√P v, d⟩ ≤ −(c/τ)⟨v, Pv⟩ ≤ 0."""
         spectrum = self.operator.spectrum(self.space)
         tau, creep = _tree.host((self.retardation_time, self.creep_ratio))
         return Constants(
@@ -155,7 +155,7 @@ class RoughContact(eqx.Module):
         return jnp.zeros_like(self.profile)
 
     def creep(self, state: Any) -> jax.Array:
-        """Return the displacement x by creep for a state P^{½}x."""
+        """Return the displacement x by creep for a state √P x."""
         return self.root.inverse(state)
 
     def equilibrium(
