@@ -54,7 +54,9 @@ TRUTH = {
     "a matrix": (lambda y: MATRIX @ y, YES, NO, NO),
     "reversed": (lambda y: y[::-1], YES, NO, NO),
     "rolled": (lambda y: jnp.roll(y, 1), YES, NO, NO),
-    "a filter": (lambda y: jnp.fft.irfft(C[:2] * jnp.fft.rfft(y), 3), YES, NO, NO),
+    "a filter": (
+        lambda y: jnp.fft.irfft(lax.complex(C[:2], 0.0 * C[:2]) * jnp.fft.rfft(y), 3), YES, NO, NO,
+    ),
     "a complex filter": (
         lambda y: jnp.real(lax.complex(y, 2.0 * y[::-1]) * lax.complex(C, C)), YES, NO, NO,
     ),
