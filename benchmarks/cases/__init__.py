@@ -17,6 +17,7 @@ CASES = (
     "transforms",
     "certificate",
     "derivatives",
+    "identification",
     "memory",
     "processes",
     "signals",
