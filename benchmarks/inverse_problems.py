@@ -189,8 +189,8 @@ def rectifier_by_ngspice() -> np.ndarray:
 
 LIPSCHITZ = 0.9
 """The largest product of the norms of the matrices of a limited network."""
-HIDDEN_MODULUS = 0.2
-"""γ of the hidden law: 1 − 0.8 max tanh′, since the part that turns the forces is skew-symmetric."""
+UNKNOWN_MODULUS = 0.2
+"""γ of the unknown law: 1 − 0.8 max tanh′, since the part that turns the forces is skew-symmetric."""
 WIDTH, NOISE, END = 12, 0.05, 6.0
 _TIMES = np.linspace(0.0, END, 21)[1:]
 _KNOTS = np.linspace(0.0, END, 13)
@@ -208,7 +208,7 @@ def wall(phi: Callable[[Any, Any], Any]) -> dvax.Problem:
     )
 
 
-def hidden(theta: Any, u: Any) -> Any:
+def unknown(theta: Any, u: Any) -> Any:
     return -0.8 * jnp.tanh(u - 0.5) + 0.3 * jnp.stack([u[1], -u[0]])
 
 
@@ -235,10 +235,10 @@ def wall_trajectory(problem: dvax.Problem, load: Any, theta: Any = None) -> Any:
 
 
 class Training:
-    """Records of the hidden law, and the training of a network on them; compiled once for all seeds."""
+    """Records of the unknown law, and a network's training on them; compiled once for all seeds."""
 
     def __init__(self) -> None:
-        self.model, truth = wall(network), wall(hidden)
+        self.model, truth = wall(network), wall(unknown)
         shapes = np.zeros((WIDTH, 2)), np.zeros(WIDTH), np.zeros((2, WIDTH))
         self.unravel = ravel_pytree(shapes)[1]
         self._truth = jax.jit(jax.vmap(lambda load: wall_trajectory(truth, load)))
@@ -252,7 +252,7 @@ class Training:
         self.gradient = jax.jit(jax.value_and_grad(loss))
 
     def setting(self, seed: int) -> tuple[Any, Any, np.ndarray]:
-        """Return two loads, noisy records of the hidden law under them, and initial weights."""
+        """Return two loads, noisy records of the unknown law under them, and initial weights."""
         rng = np.random.default_rng(seed)
         loads = jnp.asarray(rng.uniform(-0.5, 2.0, (2, 13, 2)))
         data = self._truth(loads) + NOISE * rng.normal(size=(2, len(_TIMES), 2))

@@ -158,7 +158,7 @@ def _network(section: Section, found: Table, costs: Table, seeds: int) -> None:
                 ))  # fmt: skip
                 if seed == 0 and limit == 1.0 and epoch == _EPOCHS:
                     found.rows.append((
-                        name, "γ [1]", f"{inverse.HIDDEN_MODULUS:g}",
+                        name, "γ [1]", f"{inverse.UNKNOWN_MODULUS:g}",
                         f"{gamma or 0.0:.4f} ({row.status})", f"lower bound by the norms "
                         f"{1.0 - inverse.LIPSCHITZ:.1f}", "–",
                     ))  # fmt: skip

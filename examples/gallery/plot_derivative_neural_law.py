@@ -52,9 +52,9 @@ def trajectory(problem, values, theta=None):
 # The training data: two loads, from a law that softens, and in which the forces turn each other. The
 # third load is for later.
 
-hidden = wall(lambda theta, u: -0.8 * jnp.tanh(u - 0.5) + 0.3 * jnp.stack([u[1], -u[0]]))
+unknown = wall(lambda theta, u: -0.8 * jnp.tanh(u - 0.5) + 0.3 * jnp.stack([u[1], -u[0]]))
 loads = jnp.asarray(rng.uniform(-0.5, 2.0, (3, 13, 2)))
-true = [trajectory(hidden, values) for values in loads]
+true = [trajectory(unknown, values) for values in loads]
 data = jnp.stack(true[:2]) + noise * rng.normal(size=(2, 20, 2))
 
 # %%
@@ -137,7 +137,7 @@ for history, color, marker, name in (
     missing = epochs[np.isnan(gammas)]
     if missing.size:
         left.plot(missing, 0 * missing, "x", color=color, markersize=9, label=f"{name}: no proof")
-left.axhline(0.2, color="0.4", linestyle="--", label="hidden law")
+left.axhline(0.2, color="0.4", linestyle="--", label="unknown law")
 left.axhline(1.0 - lipschitz, color="0.4", linestyle=":", label="1 − product of norms")
 left.set(xlabel="epoch", ylabel="proved γ [1]", title="Well posed?", xticks=epochs)
 left.set_ylim(-0.03, 0.42)
@@ -151,7 +151,7 @@ def prediction(values):
 
 sol = prediction(loads[2])
 for k, color in enumerate(("C0", "C1")):
-    right.plot(ts, true[2][:, k], color=color, label=f"pad {k + 1}, hidden law")
+    right.plot(ts, true[2][:, k], color=color, label=f"pad {k + 1}, unknown law")
     right.plot(ts, sol.xs[:, k], "o", color="0.2", markersize=4,
                label="predicted" if k else None)  # fmt: skip
 right.set(xlabel="time t [s]", ylabel="depth x [mm]", title="Unseen load")
@@ -177,13 +177,13 @@ right.legend(fontsize="x-small")
 # ---------------
 #
 # The bound is for the learned law: the distance of the computed trajectory from the exact one of the
-# same network. The distance to the hidden law is a difference of two computations.
+# same network. The distance to the unknown law is a difference of two computations.
 
 check = dvax.verify(model, jnp.zeros(2), 0.0, end, (load(loads[2]), bounded))
 bound = dvax.bound_error(model, sol, check.constants)
 distance = float(jnp.max(jnp.linalg.norm(sol.xs - true[2], axis=1)))
 print(f"assumptions: {check.status}; γ = {float(check.constants.gamma):.3f}")
 print(f"error of the prediction: at most {float(bound.x.max()):.1e} mm ({bound.status})")
-print(f"distance to the trajectory of the hidden law: {distance:.3f} mm")
+print(f"distance to the trajectory of the unknown law: {distance:.3f} mm")
 last = without[-1][1]["ass:strong_pseudomono"]
 print(f"without limits: {last.status}: {last.why}")

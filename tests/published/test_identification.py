@@ -116,8 +116,8 @@ def test_network_with_limited_norms_is_proved_and_its_modulus_is_a_lower_bound(s
 
 
 def test_modulus_of_the_hidden_law_is_the_known_one():
-    grid = inverse.sampled_modulus(inverse.hidden, None)
-    assert grid == pytest.approx(inverse.HIDDEN_MODULUS, abs=1e-12)
+    grid = inverse.sampled_modulus(inverse.unknown, None)
+    assert grid == pytest.approx(inverse.UNKNOWN_MODULUS, abs=1e-12)
 
 
 def test_proved_modulus_of_random_networks_is_a_lower_bound():
