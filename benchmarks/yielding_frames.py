@@ -5,10 +5,10 @@ drift. With the stiffness k, the hardening ratio a, the mass m, the damping c m 
 
     e_i' = v_i − v_(i−1),    m_i v_i' = Q_(i+1) − Q_i − c m_i v_i − m_i a_g,    Q = a k e + (1 − a) k s,
 
-and s_i' = e_i' until |s_i| reaches y_i. From there on s_i = ±y_i in an elastoplastic column, until e_i'
-changes its sign; in a viscoplastic one s_i' = e_i' − (s_i ∓ y_i)/τ, until |s_i| is below y_i again. In
-each mode (a sign or 0 for each storey) z = (e, v, s, a_g, its slope, 1) obeys z' = Zz. This is Steel01 of
-OpenSees. `switching.follow` solves it in long double; nothing is shared with dvax.
+and s_i' = e_i' until |s_i| reaches y_i. From there on s_i = ±y_i in an elastoplastic column, until
+e_i' changes its sign. In a viscoplastic one s_i' = e_i' − (s_i ∓ y_i)/τ, until |s_i| is below y_i
+again. In each mode (a sign or 0 for each storey) z = (e, v, s, a_g, its slope, 1) obeys z' = Zz. This
+is Steel01 of OpenSees. `switching.follow` solves it in long double; nothing is shared with dvax.
 """
 
 import itertools
@@ -37,20 +37,27 @@ class Frame(NamedTuple):
         return np.eye(len(self.mass)) - np.eye(len(self.mass), k=-1)
 
 
-def oscillator(period: float, damping_ratio: float, yield_drift: float, hardening: float = 0.0) -> Frame:
+def oscillator(
+    period: float, damping_ratio: float, yield_drift: float, hardening: float = 0.0
+) -> Frame:
     """Return a frame of one storey and unit mass."""
     w = 2.0 * np.pi / period
-    return Frame(np.ones(1), np.array([w * w]), np.array([yield_drift]), 2.0 * damping_ratio * w, hardening)
+    return Frame(
+        np.ones(1), np.array([w * w]), np.array([yield_drift]), 2.0 * damping_ratio * w, hardening
+    )
 
 
-def exact(frame: Frame, ground: Array, step: float, ts: Array, tau: float | None = None) -> tuple[Array, int]:
+def exact(
+    frame: Frame, ground: Array, step: float, ts: Array, tau: float | None = None
+) -> tuple[Array, int]:
     """Return (e, v, s) at the times ts, and the number of changes of the mode.
 
     `ground` has the acceleration every `step` s, linear in between. Without τ the columns are
     elastoplastic.
     """
     modes = {
-        signs: _mode(frame, signs, tau) for signs in itertools.product((0, 1, -1), repeat=len(frame.mass))
+        signs: _mode(frame, signs, tau)
+        for signs in itertools.product((0, 1, -1), repeat=len(frame.mass))
     }
     slopes = np.append(np.diff(ground) / step, 0.0)
     pieces = [
@@ -62,7 +69,9 @@ def exact(frame: Frame, ground: Array, step: float, ts: Array, tau: float | None
 
 def _mode(frame: Frame, signs: tuple[int, ...], tau: float | None) -> Mode:
     n, a, D = len(frame.mass), frame.hardening, np.asarray(frame.couplings, np.longdouble)
-    m, k, y = (np.asarray(v, np.longdouble) for v in (frame.mass, frame.stiffness, frame.yield_drift))
+    m, k, y = (
+        np.asarray(v, np.longdouble) for v in (frame.mass, frame.stiffness, frame.yield_drift)
+    )
     e, v, s = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
     load, slope, one = 3 * n, 3 * n + 1, 3 * n + 2
     Z = np.zeros((3 * n + 3, 3 * n + 3), np.longdouble)

@@ -30,6 +30,7 @@ CASES = (
     "american_options",
     "applications",
     "published_circuits",
+    "published_earthquake",
     "stiffness",
     "picard",
     "accelerator",

@@ -17,7 +17,7 @@ _PROGRAM = Path(__file__).with_name("opensees_frame.py")
 
 
 def python() -> str | None:
-    """Return a Python that imports openseespy: that of `DVAX_OPENSEES`, this one or python3; or None."""
+    """Return a Python that imports openseespy, or None. `DVAX_OPENSEES` may name one."""
     for candidate in (os.environ.get("DVAX_OPENSEES"), sys.executable, "python3"):
         try:
             command = [candidate or "", "-c", "import openseespy.opensees"]
