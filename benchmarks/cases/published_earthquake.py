@@ -1,4 +1,4 @@
-"""Chopra's elastoplastic oscillators under the El Centro record, against exact solutions and OpenSees."""
+"""Chopra's oscillators under the El Centro record, beside exact solutions and OpenSees."""
 
 import os
 import resource
@@ -192,8 +192,8 @@ def _published(
     errors = Table(
         "Errors of the displacement in in",
         ("strength", "η/k", "error of the viscoplastic frame", "bound", "status", "bound / error",
-         "largest error / bound at one time", "distance to the elastoplastic frame", "its bound", "time",
-         "MB"),
+         "largest error / bound at one time", "distance to the elastoplastic frame", "its bound",
+         "time", "MB"),
         [],
     )  # fmt: skip
     section.tables += [numbers, errors]

@@ -112,7 +112,7 @@ def test_energy_of_a_difference_never_increases():
 
 
 def test_published_peaks_are_those_of_exact_solutions(el_centro):
-    ground = GRAVITY / INCH * el_centro
+    ground = GRAVITY / INCH * el_centro[:501]  # the peaks are in the first ten seconds
     elastic = top(oscillator(PERIOD, DAMPING, 1e3), ground)
     assert elastic * (2.0 * np.pi / PERIOD) ** 2 * INCH / GRAVITY == pytest.approx(
         SPECTRAL, abs=5e-4
