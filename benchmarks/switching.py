@@ -57,23 +57,24 @@ def follow(
     ts: Array,
     choice: Choice | None = None,
     fewest: int = 500,
+    first: float = np.inf,
 ) -> tuple[Array, int]:
     """Return x at `ts`, the last of which is the end, and the number of switchings.
 
     `pieces` are the times at which sources have a new form, with the values that z has there after x.
     `choice` returns the key of the mode at z; without it the modes are tried. No sample is longer than
-    1/`fewest` of the time until the sources change.
+    1/`fewest` of the time until the sources change, and none after a switching longer than `first`.
     """
     starts = [*pieces]
     n, end = len(x0), float(ts[-1])
-    solvers = {name: _Linear(mode) for name, mode in modes.items()}
+    solvers = {name: _Linear(mode, first) for name, mode in modes.items()}
 
     def at(z: Array, near: Any) -> Any:
         if choice is None:
             return _valid(solvers, z, near)
         name = choice(z)
         if name not in solvers:
-            solvers[name] = _Linear(modes[name])
+            solvers[name] = _Linear(modes[name], first)
         return name
 
     x, key, switchings = np.asarray(x0, np.longdouble), None, 0
@@ -101,13 +102,13 @@ def follow(
 class _Linear:
     """The solution of one mode."""
 
-    def __init__(self, mode: Mode):
+    def __init__(self, mode: Mode, first: float):
         self.Z = np.asarray(mode.Z, np.longdouble)
         self.conditions, self.ties = mode.conditions, mode.ties
         rates = np.linalg.eigvals(self.Z.astype(float))
         fastest = max(float(np.abs(rates).max()), 1.0)
         turning = float(np.abs(rates.imag).max())
-        self.shortest = 1e-2 / fastest
+        self.shortest = min(1e-2 / fastest, first)
         self.longest = 0.1 / turning if turning else np.inf
         self._powers: dict[float, Array] = {}
 

@@ -32,6 +32,7 @@ CASES = (
     "american_options",
     "applications",
     "published_circuits",
+    "published_earthquake",
     "stiffness",
     "picard",
     "accelerator",

@@ -20,8 +20,8 @@ class Process:
         return self
 
     def __exit__(self, *error: object) -> None:
-        assert self._process.stdin is not None
-        with self._files:
+        assert self._process.stdin is not None and self._process.stdout is not None
+        with self._files, self._process.stdout:
             self._process.stdin.close()
             self._process.wait(timeout=60)
 
