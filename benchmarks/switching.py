@@ -107,7 +107,7 @@ class _Linear:
         self.conditions, self.ties = mode.conditions, mode.ties
         rates = np.linalg.eigvals(self.Z.astype(float))
         fastest = max(float(np.abs(rates).max()), 1.0)
-        turning = float(np.abs(rates.imag).max())
+        turning = float(np.abs(np.imag(rates)).max())
         self.shortest = min(1e-2 / fastest, first)
         self.longest = 0.1 / turning if turning else np.inf
         self._powers: dict[float, Array] = {}
