@@ -96,7 +96,9 @@ def _mode(frame: Frame, signs: tuple[int, ...], tau: float | None) -> Mode:
         else:
             Z[2 * n + i] -= sign * limit / np.longdouble(tau)
             conditions.append(limit)
-    return Mode(Z, np.array(conditions), np.array(ties) if ties else None)
+    separable = tau is not None and tau < 0.02 / float(np.sqrt((k / m).max()))
+    fast = tuple(2 * n + i for i, sign in enumerate(signs) if sign) if separable else ()
+    return Mode(Z, np.array(conditions), np.array(ties) if ties else None, fast)
 
 
 def peaks(frame: Frame, states: Array, ground: Callable[[Array], Array], ts: Array) -> Array:

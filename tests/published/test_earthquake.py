@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.linalg
 from benchmarks import yielding_frames
 from benchmarks.cases.published_earthquake import (
     DAMPING,
@@ -24,6 +25,7 @@ from benchmarks.cases.published_earthquake import (
     three_storeys,
 )  # fmt: skip
 from benchmarks.peers.opensees import OpenSees, python
+from benchmarks.switching import _Separated
 from benchmarks.yielding_frames import exact, oscillator
 
 import dvax
@@ -97,8 +99,29 @@ def check_bound(frame, samples, tau):
     return made
 
 
-def test_bound_of_a_hardening_frame_holds():
-    check_bound(three_storeys(), PULSE, 1e-5)
+@pytest.mark.parametrize("tau", [1e-5, 1e-9])
+def test_bound_of_a_hardening_frame_holds(tau):
+    check_bound(three_storeys(), PULSE, tau)
+
+
+@pytest.mark.parametrize("tau", [1e-6, 1e-8, 1e-10])
+def test_exact_solution_is_a_smooth_function_of_the_viscosity(tau):
+    # x(τ) = x₀ + τx₁ + O(τ²); the difference of quotients shows the roundoff of x, divided by τ.
+    frame = oscillator(PERIOD, DAMPING, 0.01)
+    limit, *rest = (
+        exact(frame, GRAVITY * PULSE, STEP, TIMES, each)[0][:, 0] for each in (None, 1e-5, tau)
+    )
+    slopes = (rest[0] - limit) / 1e-5, (rest[1] - limit) / tau
+    allowed = 1e-3 * np.abs(slopes[0]).max() + 1e-16 / tau
+    assert np.abs(slopes[1] - slopes[0]).max() <= allowed
+
+
+def test_fast_states_are_separated_only_if_their_rates_are_far_away():
+    with pytest.raises(ValueError, match="by far"):
+        _Separated(np.array([[-1.0, 30.0], [30.0, -2.0]], np.longdouble), (1,))
+    Z = np.array([[0.0, 1.0, 0.3], [-4.0, -0.1, 2.0], [3.0, 1.0, -500.0]], np.longdouble)
+    for h in (1e-4, 0.3):
+        assert np.abs(_Separated(Z, (2,))(h) - scipy.linalg.expm(Z.astype(float) * h)).max() < 1e-13
 
 
 def test_energy_of_a_difference_never_increases():
@@ -135,22 +158,22 @@ def test_newmark_steps_of_a_hundredth_second_return_the_published_peaks(el_centr
 @pytest.mark.thorough
 def test_dvax_returns_the_peaks_of_exact_solutions(el_centro):
     ground = Accelerogram(STEP, el_centro)
-    for limit in (0.56156, 0.28078):
+    for limit, tau in ((0.56156, 1e-8), (0.28078, 1e-8), (0.28078, 1e-10)):
         frame = Frame(record=ground, period=PERIOD, damping=DAMPING, yield_displacement=limit,
-                      viscosity_ratio=1e-8)  # fmt: skip
+                      viscosity_ratio=tau)  # fmt: skip
         sol = frame.solve()
         peak = float(frame.largest_displacement(sol))
         exact_peak = top(oscillator(PERIOD, DAMPING, limit), GRAVITY / INCH * el_centro)
         assert peak == pytest.approx(exact_peak, abs=1e-5)
         viscous, _ = exact(oscillator(PERIOD, DAMPING, limit), GRAVITY / INCH * el_centro, STEP,
-                           ground.knots(), 1e-8)  # fmt: skip
+                           ground.knots(), tau)  # fmt: skip
         bound = np.asarray(dvax.bound_error(frame.problem, sol, frame.constants).x)[::8]
         error = np.abs(np.asarray(sol.xs)[::8, 0] - viscous[:, 0]) * 2.0 * np.pi / PERIOD
         assert np.all(error <= bound)
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("tau", [1e-3, 1e-5, 1e-6])
+@pytest.mark.parametrize("tau", [1e-3, 1e-6, 1e-8, 1e-10])
 def test_bound_of_three_storeys_holds_under_the_record(el_centro, tau):
     check_bound(three_storeys(), el_centro, tau)
 
