@@ -136,12 +136,13 @@ def run(full: bool) -> Section:
         title="published_earthquake: Chopra's elastoplastic oscillators under the El Centro record",
         fair=(
             "Exact solutions are matrix exponentials from yielding to unloading, in long double, "
-            "without code of dvax (benchmarks/yielding_frames.py), after the separation of the states that "
-            "decay at the rate k/η. Errors: the largest of the displacement at the times of the record. dvax solves the viscoplastic frame; its error "
-            "against the elastoplastic one includes the regularisation η/k. OpenSees has Steel01 and "
-            "Newmark's method with constant average acceleration, in equal parts of the step of the "
-            "record, in a process of its own; its time is that of the steps, that of dvax is the call, "
-            "after compilation. All with one BLAS thread (OPENBLAS_NUM_THREADS=1)."
+            "without code of dvax (benchmarks/yielding_frames.py), after the separation of the states "
+            "that decay at the rate k/η. Errors: the largest of the displacement at the times of the "
+            "record. dvax solves the viscoplastic frame; its error against the elastoplastic one "
+            "includes the regularisation η/k. OpenSees has Steel01 and Newmark's method with constant "
+            "average acceleration, in equal parts of the step of the record, in a process of its own; "
+            "its time is that of the steps, that of dvax is the call, after compilation. All with one "
+            "BLAS thread (OPENBLAS_NUM_THREADS=1)."
         ),
     )
     folder = os.environ.get(FOLDER)
