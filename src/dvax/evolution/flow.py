@@ -26,6 +26,7 @@ from ..programs.enclosure import (
 from ..programs.structure import analyse
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, FrozenVI
+from .law_tolerance import LawTolerance
 from .linearised import AbstractLinear, linearise
 from .small_box import AbstractSmallBox
 
@@ -72,7 +73,7 @@ class Flow(eqx.Module):
     direct: bool = eqx.field(static=True)
     reciprocal: Tree | None
     enclosed: bool = eqx.field(static=True)
-    tol: Any
+    tol: LawTolerance
     gamma: Any
     L_F: Any
     small_box: AbstractSmallBox | None = None
@@ -150,7 +151,7 @@ class Flow(eqx.Module):
         value = problem.f(t, x, self.operator.inverse(found.y), args)
         residual = problem.spaces(x)[1].norm(found.w)
         # Where nothing is found the law has no solution, or is not monotone.
-        most = jnp.maximum(self.tol, 1e3 * small_box.rounding(found.y, q))
+        most = jnp.maximum(self.tol(x), 1e3 * small_box.rounding(found.y, q))
         apart = jnp.abs(found.y - jnp.clip(found.z, *bounds)).ravel()
         solved = jnp.all((jnp.abs(found.w).ravel() <= most) & (apart <= most))
         return Rate(value, found.y, found.z, residual, solved, jnp.asarray(1))
@@ -245,8 +246,9 @@ def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
         problem.spaces(x)[1],
         flow.gamma,
         flow.L_F,
+        stops_at_roundoff=True,
     )
-    answer = flow.solver.solve(vi, start, flow.tol)
+    answer = flow.solver.solve(vi, start, jax.lax.stop_gradient(flow.tol(x)))
     value = problem.f(t, x, flow.operator.inverse(answer.y), args)
     solved = answer.result == RESULTS.successful
     switches = flow.switch_parts(t, x, answer.z) if flow.keeps_switches else None

@@ -23,8 +23,9 @@ from .._tree import Tree
 from ..errors import input_error
 from ..generators import AbstractGenerator, AbstractPropagator
 from .bounds import Bounds
-from .control import RootMeanSquares, clip_to_stop
+from .control import clip_to_stop
 from .flow import Flow
+from .law_tolerance import RootMeanSquares
 from .method import ETD2RK
 from .outcome import Outcome, Record, Saved, end_alone, ended, with_tangents
 from .results import RESULTS

@@ -10,6 +10,7 @@ from ..programs.enclosure import constant, has_enclosure
 from ..vi import AbstractSolver, Auto, analyse, independent
 from .flow import Flow, slope
 from .implicit import Implicit
+from .law_tolerance import law_tolerance
 from .linearised import NoJacobian
 from .method import AbstractMethod
 from .setup import Setup, as_arrays
@@ -80,7 +81,7 @@ class Plan(NamedTuple):
             direct=self.closed_form or self.small_box,
             reciprocal=reciprocal,
             enclosed=self.enclosed,
-            tol=_tolerance(setup),
+            tol=law_tolerance(setup),
             gamma=setup.moduli.get("gamma"),
             L_F=setup.moduli.get("L_F"),
             small_box=_small_box(setup) if self.small_box else None,
@@ -96,16 +97,3 @@ def _small_box(setup: Setup) -> AbstractSmallBox:
     frozen = problem.frozen(t0, x0, args)
     M = jax.jacfwd(lambda v: frozen(v.reshape(like.shape)).ravel())(jnp.zeros_like(like).ravel())
     return small_box(M)
-
-
-def _tolerance(setup: Setup) -> jax.Array:
-    """Return the tolerance of the law: a thousandth of that of the defect, but at least 100 eps. Where
-    it is known that an error of the law is multiplied by more than 1 in f̃, by β_f‖P⁻¹‖, the tolerance
-    is divided by that."""
-    floor = 100 * jnp.finfo(setup.dtype).eps
-    defect = setup.number("atol") + setup.number("rtol")
-    adaptive = 1e-3 * defect / jnp.maximum(1.0, setup.number("horizon"))
-    if "law_gain" in setup.moduli:
-        adaptive = adaptive / jnp.maximum(1.0, setup.moduli["law_gain"])
-    has_fixed_steps = ~jnp.isnan(setup.number("dt"))
-    return jnp.maximum(jnp.where(has_fixed_steps, 1e-12, adaptive), floor)

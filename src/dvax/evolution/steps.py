@@ -19,12 +19,12 @@ from .control import (
     Adaptive,
     ErrorTest,
     Fixed,
-    RootMeanSquares,
     step_count,
 )
 from .event import Events
 from .event_watch import EventWatch
 from .flow import Flow, is_pointwise
+from .law_tolerance import RootMeanSquares
 from .loop import Loop, State
 from .method import AbstractMethod
 from .outcome import Outcome, end_alone, ended, with_tangents

@@ -26,7 +26,12 @@ from jax import lax
 from .._small_matrices import combine, times
 
 SLACK = 0.75
-"""A row is satisfied if its violation is at most eps^0.75 of its terms: 2e-12 in double precision."""
+"""A row holds with equality if its slack is at most eps^0.75 of its terms: 2e-12 in double precision.
+A violation of this size counts only if the row is far enough from a combination of active rows."""
+
+_INDEPENDENT = 1e-3
+"""Length of the component of a normal orthogonal to the active normals, from which on violations above
+roundoff count."""
 
 
 class Projection(NamedTuple):
@@ -78,10 +83,14 @@ def nearest_point(rows: jax.Array, bounds: jax.Array, z: jax.Array, size: jax.Ar
     def tolerance(x: jax.Array) -> jax.Array:
         return absolute + eps**SLACK * _norm(x)
 
+    def roundoff(x: jax.Array) -> jax.Array:
+        terms = jnp.abs(bounds) + size + _norm(x) + eps**SLACK * length_z
+        return 4 * (8 + n) * eps * terms
+
     def next_row(x: jax.Array, active: jax.Array, multiplier: jax.Array) -> tuple:
-        excess, least = slack(x), tolerance(x)
-        tied = jnp.where(excess >= -least, 0.0, -jnp.inf)
-        priority = jnp.where(excess > least, excess, tied)
+        excess = slack(x)
+        tied = jnp.where(excess >= -tolerance(x), 0.0, -jnp.inf)
+        priority = jnp.where(excess > roundoff(x), excess, tied)
         priority = jnp.where(multiplier > 0, jnp.inf, priority)
         priority = jnp.where(active, -jnp.inf, priority)
         row = lax.argmax(priority, 0, jnp.uint32)
@@ -102,8 +111,9 @@ def nearest_point(rows: jax.Array, bounds: jax.Array, z: jax.Array, size: jax.Ar
         square = jnp.sum(direction * direction)
         is_independent = square > (1e3 * eps) ** 2
 
-        violated = s.priority > 0
         excess = jnp.maximum(jnp.sum(normal * s.x) - bound, 0.0)
+        counts = (square > _INDEPENDENT**2) | (excess > _entry(tolerance(s.x), s.row))
+        violated = (s.priority > 0) & counts
         full_step = jnp.where(is_independent, excess / square, jnp.inf)
         full_step = jnp.where(violated, full_step, 0.0)
         ratios = jnp.where(coefficients > 10 * eps, s.multiplier / coefficients, jnp.inf)

@@ -18,9 +18,14 @@ from .._tree import Tree
 from ..spaces import AbstractSpace
 from .abstract import RESULTS, Answer, FrozenVI
 from .implicit import with_implicit_derivative
+from .projection_error import rounding_of_w
 
 _DIVERGENCE_FACTOR = 1e8
 """The method diverges if ‖y‖ exceeds 1 + ‖y₀‖ by this factor without reducing ‖w‖."""
+
+
+_ROUNDINGS = 4.0
+"""Ratio of ‖w‖ to its estimated rounding error at which `stops_at_roundoff` ends the iteration."""
 
 
 class Trial(NamedTuple):
@@ -97,6 +102,14 @@ def iterate(
     eps, norm = jnp.finfo(dtype).eps, partial(norm_of_constant, frozen.space)
     divergence_radius = _DIVERGENCE_FACTOR * (1.0 + norm(start))
 
+    def rounding_of_terms(trial: Trial, norm_F: Any, lam: Any, initial_step: Any) -> Any:
+        # λ at the start is about 1/L. A λ that became much smaller would make any ‖w‖ roundoff, and
+        # the terms of F have the size of L‖y‖ even if λ became much larger.
+        step = jnp.maximum(lam, 0.1 * initial_step)
+        size = norm(trial.y)
+        of_F = eps * (size / initial_step + norm_F)
+        return rounding_of_w(frozen.K, trial.y, size, norm_F, step) + of_F
+
     def total_norm(elements: list[Tree]) -> Any:
         return sum(map(norm, elements))
 
@@ -123,6 +136,8 @@ def iterate(
         # The first point replaces the start in any case, since the start may lie outside of K.
         better = (residual < s.residual) | (s.count == 0)
         done = residual <= target
+        if vi.stops_at_roundoff:
+            done |= residual <= _ROUNDINGS * rounding_of_terms(trial, norm_F, lam, initial_step)
         # The iterates changed by rounding alone, since the last iteration (stalled) or since the
         # checkpoint (cycling). Brent's algorithm renews the checkpoint at every power of two, so it
         # finds cycles of any length.
@@ -185,7 +200,8 @@ def iterate(
 def without_derivatives(vi: FrozenVI) -> FrozenVI:
     """Return the same problem without derivatives: the iteration is not differentiated."""
     K, space, gamma, L_F = jtu.tree_map(lax.stop_gradient, (vi.K, vi.space, vi.gamma, vi.L_F))
-    return FrozenVI(lambda y: lax.stop_gradient(vi.F(y)), K, space, gamma, L_F)
+    F = lambda y: lax.stop_gradient(vi.F(y))  # noqa: E731
+    return FrozenVI(F, K, space, gamma, L_F, vi.stops_at_roundoff)
 
 
 def residual_target(vi: FrozenVI, tol: Any) -> Any:

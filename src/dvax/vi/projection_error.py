@@ -1,4 +1,4 @@
-"""Estimate of the rounding error of a computed projection onto a set."""
+"""Estimates of the rounding errors of a computed projection onto a set, and of a computed w."""
 
 from typing import Any, NamedTuple
 
@@ -10,15 +10,33 @@ from .. import sets
 
 
 class ProjectionError(NamedTuple):
-    """The error is at most operations · ε · `condition` · (‖y‖ + `data`) + `absolute` (1 + ‖y‖).
+    """The error of y = proj_K(z) is at most operations · ε · `condition` · (‖y‖ + `data`)
+    + `relative` (‖y‖ + ‖z − y‖).
 
     `data` is the magnitude of the numbers that define the set, `condition` the condition of its
-    equations, and `absolute` the error of an iterative projection at its stopping tolerance.
+    equations, and `relative` the error of an iterative projection at its stopping tolerance.
     """
 
     data: Any
     condition: Any = 1.0
-    absolute: Any = 0.0
+    relative: Any = 0.0
+
+
+def rounding_of_w(K: sets.AbstractSet, like: Any, size: Any, norm_F: Any, step: Any) -> jax.Array:
+    """Return the rounding error of w = F(y) − F(b) + (b − y)/λ, without that of F, for y = proj_K(z).
+
+    `size` = ‖y‖, `norm_F` is the magnitude of the values of F, and `step` is λ. The projection onto an
+    interval is exact; that onto another set is assumed accurate to (8 + n)ε relative to the magnitudes
+    in `projection_error`.
+    """
+    eps = jnp.finfo(jnp.result_type(*jtu.tree_leaves(like))).eps
+    if K.intervals(like) is not None:
+        return eps * (2 * size / step + 8 * norm_F)
+    K_error, entries = projection_error(K), sum(leaf.size for leaf in jtu.tree_leaves(like))
+    operations = 2 * (8 + entries)
+    error_y = operations * K_error.condition * eps * (size + K_error.data)
+    error_y += K_error.relative * (size + step * norm_F)
+    return error_y / step + (8 + operations) * eps * norm_F
 
 
 _STOPPING_FACTOR = 16.0
@@ -55,10 +73,10 @@ def projection_error(K: sets.AbstractSet) -> ProjectionError:
     total = ProjectionError(
         sum(error.data for error in inner),
         jnp.max(jnp.stack([jnp.asarray(error.condition) for error in inner])),
-        sum(error.absolute for error in inner),
+        sum(error.relative for error in inner),
     )
     if isinstance(K, sets.Intersection):
-        total = total._replace(absolute=total.absolute + _STOPPING_FACTOR * K.tol)
+        total = total._replace(relative=total.relative + _STOPPING_FACTOR * K.tol)
     return total
 
 

@@ -22,7 +22,7 @@ from .auto import Auto
 from .certificate import certify
 from .iteration import first_step, without_derivatives
 from .parameters import MODULUS, TOLERANCE
-from .projection_error import projection_error
+from .projection_error import rounding_of_w
 from .weighted import Weighted, reject_moduli_of_product
 
 _MISSED_TOLERANCE = RESULTS.max_steps, RESULTS.stalled, RESULTS.cycling, RESULTS.singular
@@ -221,25 +221,16 @@ def rounding_of(vi: FrozenVI, y: Tree, step: Any, residual: Any) -> tuple[jax.Ar
 
     With z = fl(b − λF(b)) and y = proj_K(z), n = (z − y)/λ is in N_K(y), whatever the error of
     F(b). The computed w is F(y) + [(b − y)/λ − F(b)] with λ = `step`. It differs from F(y) + n by
-    the error of F(y), the error of z divided by λ, and the rounding of the terms. The projection
-    onto an interval is exact; that onto another set is assumed accurate to (8 + n)ε relative to the
-    magnitudes in `projection_error`. A norm that underflows is less than that of n numbers of
-    √tiny.
+    the error of F(y), the error of z divided by λ, and the rounding of the terms (`rounding_of_w`). A
+    norm that underflows is less than that of n numbers of √tiny.
     """
     norm, value = vi.space.norm, vi.F(y)
     error, proved = rounding_error(vi.F, y)
     kind = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y)))
-    eps, entries = kind.eps, sum(leaf.size for leaf in jtu.tree_leaves(y))
-    size, norm_F = norm(y), norm(value) + residual
-    if vi.K.intervals(y) is not None:
-        error_w = eps * (2 * size / step + 8 * norm_F)
-    else:
-        K_error, operations = projection_error(vi.K), 2 * (8 + entries)
-        error_y = operations * K_error.condition * eps * (size + K_error.data)
-        error_y += K_error.absolute * (1.0 + size)
-        error_w = error_y / step + (8 + operations) * eps * norm_F
+    entries = sum(leaf.size for leaf in jtu.tree_leaves(y))
+    error_w = rounding_of_w(vi.K, y, norm(y), norm(value) + residual, step)
     # The factor 1.01 covers the rounding of the norms and of this sum.
-    underflow = jnp.sqrt(entries * jnp.asarray(kind.tiny, size.dtype))
+    underflow = jnp.sqrt(entries * jnp.asarray(kind.tiny, error_w.dtype))
     bound = 1.01 * (norm(error) + error_w) + underflow
     return jnp.where(jnp.isfinite(residual), bound, jnp.inf), proved
 

@@ -6,7 +6,6 @@ from .controller import StepDecision as StepDecision
 from .controller import clip_to_stop as clip_to_stop
 from .controller import slack as slack
 from .error_test import ErrorTest as ErrorTest
-from .error_test import RootMeanSquares as RootMeanSquares
 from .fixed import Fixed as Fixed
 from .fixed import step_count as step_count
 from .growth_limiter import MAX_GROWTH as MAX_GROWTH

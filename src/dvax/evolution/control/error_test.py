@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 from jax import lax
 
 from ..._tree import Tree
-from ...spaces import AbstractSpace, Product
+from ..law_tolerance import RootMeanSquares
 from ..stepper import Step
 
 _ROUNDINGS = 1e6
@@ -53,20 +53,6 @@ class Attempt(NamedTuple):
         error = jnp.where(noisy, by_modulus, self.error)
         integrated = jnp.where(noisy, self.modulus * self.size / horizon, self.integrated)
         return self._replace(error=error, integrated=integrated)
-
-
-class RootMeanSquares(eqx.Module):
-    """The root mean square of each part of a state: its norm over that of the constant 1.
-
-    The weights of the space are arrays of the loop like all others: a function that closes over them
-    would hide them from the transformations of the loop."""
-
-    space: AbstractSpace
-
-    def __call__(self, x: Tree) -> list[Any]:
-        if isinstance(self.space, Product):
-            return [_mean(s, part) for s, part in zip(self.space.spaces, x, strict=True)]
-        return [_mean(self.space, x)]
 
 
 class ErrorTest(eqx.Module):
@@ -169,8 +155,3 @@ class ErrorTest(eqx.Module):
         ratio = jnp.max(jnp.stack(ratios)) if len(ratios) > 1 else ratios[0]
         # NaN must neither accept a step nor lengthen the next one.
         return jnp.where(jnp.isnan(ratio), jnp.inf, ratio)
-
-
-def _mean(space: AbstractSpace, part: Tree) -> Any:
-    norm = space.norm(part)
-    return norm / jnp.sqrt(space.size()).astype(norm.dtype)
