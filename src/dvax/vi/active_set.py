@@ -88,24 +88,24 @@ class ActiveSet(AbstractSolver):
                 "only a box fixes or frees each unknown separately",
                 "Use dvax.vi.SemismoothNewton()",
             )
-        size = sum(leaf.size for leaf in jtu.tree_leaves(y0))
-        solve_linear = (
-            self._lu_solver(vi, y0) if size <= self.dense else self._krylov_solver(vi, y0)
-        )
+        size, affine = sum(leaf.size for leaf in jtu.tree_leaves(y0)), analyse(vi.F, y0).affine
+        inverse, matrix, symmetric = None, None, self.symmetric
+        if size <= self.dense:
+            if affine:
+                matrix = _constant_slope(vi, y0)
+                symmetric = _is_symmetric(matrix, vi.space.weights(), y0)
+            solve_linear = self._lu_solver(matrix)
+        else:
+            if not symmetric and self.preconditioner is None:
+                inverse = inverse_of(vi, y0)
+            symmetric = symmetric or inverse is not None
+            solve_linear = self._krylov_solver(vi, inverse)
         return safeguarded_newton(
             vi, y0, tol, solve_linear, step=self.step, max_steps=self.max_steps,
-            is_affine=analyse(vi.F, y0).affine,
+            is_quadratic=jnp.asarray(symmetric) & affine,
         )  # fmt: skip
 
-    def _lu_solver(self, vi: FrozenVI, y0: Tree) -> Callable[[Linearisation, Tree], Tree]:
-        constant = None
-        if analyse(vi.F, y0).affine:
-
-            def derivative(d: Tree) -> Tree:
-                return jax.jvp(vi.F, (_tree.zeros_like(y0),), (d,))[1]
-
-            constant = jax.lax.stop_gradient(matrix_of(derivative, y0))
-
+    def _lu_solver(self, constant: Any) -> Callable[[Linearisation, Tree], Tree]:
         def solve(at: Linearisation, right: Tree) -> Tree:
             flat, unravel = ravel_pytree(right)
             matrix = matrix_of(at.slope, right) if constant is None else constant
@@ -118,10 +118,11 @@ class ActiveSet(AbstractSolver):
 
         return solve
 
-    def _krylov_solver(self, vi: FrozenVI, y0: Tree) -> Callable[[Linearisation, Tree], Tree]:
+    def _krylov_solver(
+        self, vi: FrozenVI, inverse: Callable[[Tree], Tree] | None
+    ) -> Callable[[Linearisation, Tree], Tree]:
         symmetric, preconditioner = self.symmetric, self.preconditioner
         weights: Any = None
-        inverse = None if symmetric or preconditioner is not None else inverse_of(vi, y0)
         if inverse is not None:
             # F′ is self-adjoint in the space: with the weights in front, it is a symmetric matrix.
             weights, symmetric = vi.space.weights(), True
@@ -152,6 +153,23 @@ class ActiveSet(AbstractSolver):
             return jtu.tree_map(jnp.where, free, d, fixed)
 
         return solve
+
+
+def _constant_slope(vi: FrozenVI, like: Tree) -> jax.Array:
+    """Return the matrix of an affine F."""
+
+    def derivative(d: Tree) -> Tree:
+        return jax.jvp(vi.F, (_tree.zeros_like(like),), (d,))[1]
+
+    return jax.lax.stop_gradient(matrix_of(derivative, like))
+
+
+def _is_symmetric(matrix: jax.Array, weights: Any, like: Tree) -> jax.Array:
+    """Return whether a matrix is self-adjoint in the space with these weights, up to roundoff."""
+    parts = jtu.tree_map(lambda w, v: jnp.broadcast_to(w, v.shape).astype(v.dtype), weights, like)
+    weighted = ravel_pytree(parts)[0][:, None] * matrix
+    eps = jnp.finfo(matrix.dtype).eps
+    return jnp.all(jnp.abs(weighted - weighted.T) <= 64 * eps * jnp.max(jnp.abs(weighted)))
 
 
 def inverse_of(vi: FrozenVI, like: Tree) -> Callable[[Tree], Tree] | None:

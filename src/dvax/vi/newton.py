@@ -35,13 +35,14 @@ class Linearisation(NamedTuple):
 LinearSolver = Callable[[Linearisation, Tree], Tree]
 """Return d with τF′(y) D d + (I − D) d = right."""
 
-_FIRST_RUN_LENGTH, _FIRST_RUN_LENGTH_AFFINE = 5, 20
+_FIRST_RUN_LENGTH, _FIRST_RUN_LENGTH_QUADRATIC = 5, 20
 """Number of consecutive Newton steps that may fail to halve the best ‖w‖, in the first run: a few
-steps identify most active sets. Of an affine F nothing else can be wrong, and more are allowed."""
+steps identify most active sets. If F is the gradient of a quadratic function, nothing else can be
+wrong, and more are allowed. (If F is affine but not symmetric, long runs often cycle.)"""
 
 _DIVERGENCE_RATIO = 10.0
-"""A Newton point is rejected if its ‖w‖ exceeds this multiple of the best, unless F is affine. Then a
-large ‖w‖ comes from a wrong active set, which the next step corrects, not from the linearisation."""
+"""A Newton point is rejected if its ‖w‖ exceeds this multiple of the best, unless F is the gradient of
+a quadratic function. Then a large ‖w‖ comes from a wrong active set, which the next step corrects."""
 
 _TRUST_RATIO = 2e3
 """The first Newton point is rejected if ‖F‖ exceeds this multiple of its value at the start: the point
@@ -81,7 +82,7 @@ class _State(NamedTuple):
 
 def safeguarded_newton(
     vi: FrozenVI, y0: Tree, tol: Any, solve: LinearSolver, *, step: float, max_steps: int,
-    is_affine: bool = False,
+    is_quadratic: Any = False,
 ) -> Answer:  # fmt: skip
     """Solve Φ(z) = F(y) + (z − y)/τ = 0 with y = proj_K(z); the value Φ(z) is the certificate w.
 
@@ -106,8 +107,8 @@ def safeguarded_newton(
     """
     # `iterate` passes an F without derivatives (`without_derivatives`), but Newton's method needs F′.
     differentiable_F = vi.F
-    divergence_ratio = jnp.inf if is_affine else _DIVERGENCE_RATIO
-    first_run_length = _FIRST_RUN_LENGTH_AFFINE if is_affine else _FIRST_RUN_LENGTH
+    divergence_ratio = jnp.where(is_quadratic, jnp.inf, _DIVERGENCE_RATIO)
+    first_run_length = jnp.where(is_quadratic, _FIRST_RUN_LENGTH_QUADRATIC, _FIRST_RUN_LENGTH)
     target = residual_target(vi, tol)
 
     def advance(vi: FrozenVI, s: _State) -> tuple[_State, Trial]:
