@@ -107,7 +107,6 @@ def safeguarded_newton(
     """
     # `iterate` passes an F without derivatives (`without_derivatives`), but Newton's method needs F′.
     differentiable_F = vi.F
-    divergence_ratio = jnp.where(is_quadratic, jnp.inf, _DIVERGENCE_RATIO)
     first_run_length = jnp.where(is_quadratic, _FIRST_RUN_LENGTH_QUADRATIC, _FIRST_RUN_LENGTH)
     target = residual_target(vi, tol)
 
@@ -129,7 +128,8 @@ def safeguarded_newton(
         # The first Newton point has no earlier ‖w‖ to halve, so its ‖F‖ is limited instead.
         trusted = is_newton & ((norm_F <= s.trust_limit) | jnp.isfinite(s.best))
         halved = trusted & (residual <= 0.5 * s.best)
-        continues = trusted & (s.steps_left > 0) & (residual <= divergence_ratio * s.best)
+        near = is_quadratic | (residual <= _DIVERGENCE_RATIO * s.best)
+        continues = trusted & (s.steps_left > 0) & near
         continues &= ~halved & jnp.isfinite(residual)
         failed = is_newton & ~halved & ~continues
         shortens = jnp.zeros_like(failed)
