@@ -159,6 +159,10 @@ SOLVE = {
     "args unpacked": (lambda: solve(problem(f=f_unpacks)), "f reads args; Pass args="),
     "args handed on": (lambda: solve(problem(f=f_helper)), "f reads args; Pass args="),
     "None from elsewhere": (lambda: solve(problem(f=f_other)), "NoneType; Fix that line"),
+    "another key": (
+        lambda: solve(problem(f=lambda t, x, u, args: args["rate"] * x), args={"rates": 1.0}),
+        "KeyError: 'rate'; 'rates'; Correct the key",
+    ),
 }
 CASES = {
     "numbers": NUMBERS, "arrays": ARRAYS, "shapes": SHAPES, "parts": PARTS, "solve": SOLVE

@@ -195,6 +195,10 @@ def _explain(
         f"{key} of shape {_tree.shapes(value)}" for key, value in inputs.items() if key in "xuy"
     )
     given = f"{type(error).__name__}: {_line(str(error))}"
+    if isinstance(error, KeyError) and isinstance(inputs.get("args"), Mapping):
+        known = ", ".join(map(repr, inputs["args"]))
+        rule, fix = f"args has the keys {known}", "Correct the key, or add it to args"
+        return InputProblem(f"{at}, {_place(fn, error.__traceback__)}", given, rule, fix)
     rule, fix = _reason(name, fn, inputs, error)
     if shapes:
         rule += f". It was traced with {shapes}{about}"

@@ -274,6 +274,23 @@ def test_cause_empty_set_names_the_time(K, method):
     assert "empty" in error.cause and "Check K there." in str(error)
 
 
+def test_cause_conditions_that_contradict_each_other_are_reported_as_an_empty_set():
+    for K, at in (
+        (sets.Intersection(sets.Box(0.0, 2.0), sets.HalfSpace(-jnp.ones(3), -7.0)), "t = 0"),
+        (
+            lambda t, a: sets.Polyhedron(
+                jnp.concatenate([jnp.eye(3), -jnp.ones((1, 3))]),
+                jnp.array([2.0, 2.0, 2.0, -12 * t]),
+            ),
+            "t = 0.5",
+        ),
+    ):
+        problem = make(lambda t, x, u, args: u - x, lambda t, x, u, args: x - 0.5 * u, K)
+        error = failure(problem, x0=jnp.ones(3), t1=1.0)
+        assert str(error).startswith(f"K is empty at {at}")
+        assert "contradict" in str(error)
+
+
 def test_cause_nonfinite_value_at_the_start_is_reported():
     error = failure(make(lambda t, x, u, args: 1.0 / t), x0=0.1, t1=1.0)
     assert "next to t = 0 " in error.cause or "f is inf" in error.cause

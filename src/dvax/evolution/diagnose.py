@@ -51,8 +51,10 @@ _MIN_ATTEMPTS = 100
 _MANY_TIMES = 16
 """More steps than this many times those so far are not the first advice."""
 _REFUSED = "refused: "
+_NEAREST = "the point of K nearest to 0"
 _CHECKED = {name: f"Check {name} there" for name in ("K", "h", "f")} | {
     "A x": "Check A, and how large x becomes",
+    _NEAREST: "Check the numbers that K is made of: some of its conditions contradict others",
     "u": "Check how h depends on u: the law has no solution where nothing bounds it",
 }
 
@@ -122,16 +124,20 @@ def _nonfinite(stop: Stop) -> Diagnosis:
     if velocity is None or first_bad(velocity):
         velocity = _tree.zeros_like(stop.x)
 
+    # Compiled once: each projection and each law may contain loops.
+    nearest = jax.jit(lambda s: problem.set_at(s, args).project(like, problem.spaces(stop.x)[1]))
+    response = jax.jit(lambda s, x: flow.operator.inverse(flow.rate(s, x, None).y))
+
     def pieces(ahead: float) -> dict[str, Callable[[], Tree]]:
         s = stop.time(stop.t + ahead)
         x = jtu.tree_map(lambda a, b: a + stop.time(ahead) * b, stop.x, velocity)
-        u = lambda: flow.operator.inverse(flow.rate(s, x, None).y)  # noqa: E731
         return {
             "A x": lambda: flow.generator.apply(x),
             "K": lambda: problem.set_at(s, args),
+            _NEAREST: lambda: nearest(s),
             "h": lambda: problem.h(s, x, like, args),
-            "u": u,
-            "f": lambda: problem.f(s, x, u(), args),
+            "u": lambda: response(s, x),
+            "f": lambda: problem.f(s, x, response(s, x), args),
         }
 
     def bad(name: str, ahead: float) -> str:
@@ -157,6 +163,8 @@ def _nonfinite(stop: Stop) -> Diagnosis:
             fixes = (Fix("", "", _CHECKED[name]),)
             if what.startswith(_REFUSED):
                 return Diagnosis(f"{name} is refused {at}: {what[len(_REFUSED) :]}.", fixes, True)
+            if name == _NEAREST:
+                return Diagnosis(f"K is empty {at}: {name} is {what}.", fixes, True)
             return Diagnosis(f"{name} is {what} {at}.", fixes)
         last_good = float(ahead)
     return Diagnosis()
