@@ -151,10 +151,19 @@ class Flow(eqx.Module):
         value = problem.f(t, x, self.operator.inverse(found.y), args)
         residual = problem.spaces(x)[1].norm(found.w)
         # Where nothing is found the law has no solution, or is not monotone.
-        most = jnp.maximum(self.tol(x), 1e3 * small_box.rounding(found.y, q))
+        most = jnp.maximum(self.law_tol(t, x, zero), 1e3 * small_box.rounding(found.y, q))
         apart = jnp.abs(found.y - jnp.clip(found.z, *bounds)).ravel()
         solved = jnp.all((jnp.abs(found.w).ravel() <= most) & (apart <= most))
         return Rate(value, found.y, found.z, residual, solved, jnp.asarray(1))
+
+    def law_tol(self, t: Any, x: Tree, y: Tree) -> jax.Array:
+        """Return the tolerance of the law at (t, x), from the effect that a change of y has on f."""
+
+        def effect(d: Tree) -> Tree:
+            fn = lambda y: self.problem.f(t, x, self.operator.inverse(y), self.args)  # noqa: E731
+            return jax.jvp(fn, (y,), (d,))[1]
+
+        return self.tol(x, effect, y)
 
     def enclosure(self, t: LinearEnclosure, x: Tree) -> tuple[Tree, Tree]:
         """Return linear enclosures of f̃ and u, given those of t and x.
@@ -246,9 +255,9 @@ def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
         problem.spaces(x)[1],
         flow.gamma,
         flow.L_F,
-        stops_at_roundoff=True,
+        rtol=flow.tol.relative,
     )
-    answer = flow.solver.solve(vi, start, jax.lax.stop_gradient(flow.tol(x)))
+    answer = flow.solver.solve(vi, start, flow.law_tol(t, x, start))
     value = problem.f(t, x, flow.operator.inverse(answer.y), args)
     solved = answer.result == RESULTS.successful
     switches = flow.switch_parts(t, x, answer.z) if flow.keeps_switches else None

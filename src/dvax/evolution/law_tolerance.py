@@ -1,10 +1,13 @@
-"""The tolerance of the law, relative to the state, and the sizes that tolerances are relative to."""
+"""The tolerance of the law from its effect on the state, and the sizes that tolerances refer to."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
 
 from .._tree import Tree
 from ..spaces import AbstractSpace, Product
@@ -13,8 +16,11 @@ from .setup import Setup
 _SHARE = 1e-3
 """Tolerance of the law in units of that of the defect."""
 
+_RELATIVE = 1e-2
+"""Tolerance of the law relative to its own terms, in units of rtol."""
+
 _FIXED_STEPS = 1e-12
-"""Tolerance of the law with fixed steps, relative to the state."""
+"""The same with fixed steps."""
 
 
 class RootMeanSquares(eqx.Module):
@@ -32,30 +38,51 @@ class RootMeanSquares(eqx.Module):
 
 
 class LawTolerance(eqx.Module):
-    """The largest ‖w‖/γ, or ‖w‖, of a law that counts as solved: atol + rtol‖x‖.
+    """The largest ‖w‖/γ, or ‖w‖, of a law that counts as solved: (atol + rtol‖x‖)/gain.
 
-    ‖x‖ is the root mean square of the state, of its smallest part where it has several. A law whose
-    roundoff is larger is solved to roundoff (`FrozenVI.stops_at_roundoff`).
+    `atol` and `rtol` are those of the defect, times a small share. ‖x‖ is the root mean square of the
+    state, of its smallest part where it has several. The gain is β_f‖P⁻¹‖ if it is known. Otherwise it
+    is estimated, as the root mean square of the change of f along a direction of u with entries ±1 at
+    the guess. Since such an estimate may be zero, ‖w‖ is also limited by `relative` times the size of
+    its terms.
     """
 
     atol: Any
     rtol: Any
+    relative: Any
+    gain: Any
     sizes: RootMeanSquares
 
-    def __call__(self, x: Tree) -> jax.Array:
-        return self.atol + self.rtol * jnp.min(jnp.stack(self.sizes(x)))
+    def __call__(self, x: Tree, effect: Callable[[Tree], Tree], like: Tree) -> jax.Array:
+        """Return the tolerance at x, where `effect` is the derivative of f with respect to y = Pu."""
+        gain = self.gain
+        if gain is None:
+            gain = jnp.max(jnp.stack(self.sizes(effect(_signs(like)))))
+        allowed = self.atol + self.rtol * jnp.min(jnp.stack(self.sizes(x)))
+        tol = jnp.where(gain > 0.0, allowed / jnp.where(gain > 0.0, gain, 1.0), jnp.inf)
+        return lax.stop_gradient(tol)
 
 
 def law_tolerance(setup: Setup) -> LawTolerance:
-    """Return the tolerance of the law: a thousandth of that of the defect. Where it is known that an
-    error of the law is multiplied by more than 1 in f̃, by β_f‖P⁻¹‖, it is divided by that."""
-    share = _SHARE / jnp.maximum(1.0, setup.number("horizon"))
-    if "law_gain" in setup.moduli:
-        share = share / jnp.maximum(1.0, setup.moduli["law_gain"])
+    """Return the tolerance of the law: a thousandth of that of the defect, in its effect on f̃."""
+    share = _SHARE / setup.number("horizon")
     has_fixed_steps = ~jnp.isnan(setup.number("dt"))
-    atol = jnp.where(has_fixed_steps, 0.0, share * setup.number("atol"))
-    rtol = jnp.where(has_fixed_steps, _FIXED_STEPS, share * setup.number("rtol"))
-    return LawTolerance(atol, rtol, RootMeanSquares(setup.problem.spaces(setup.x0)[0]))
+    atol, rtol = (
+        jnp.where(has_fixed_steps, jnp.inf, share * setup.number(name)) for name in ("atol", "rtol")
+    )
+    relative = jnp.where(has_fixed_steps, _FIXED_STEPS, _RELATIVE * setup.number("rtol"))
+    sizes = RootMeanSquares(setup.problem.spaces(setup.x0)[0])
+    return LawTolerance(atol, rtol, relative, setup.moduli.get("law_gain"), sizes)
+
+
+def _signs(like: Tree) -> Tree:
+    """Return a fixed element with entries ±1 that is not orthogonal to usual directions."""
+
+    def of_leaf(leaf: jax.Array) -> jax.Array:
+        k = jnp.arange(leaf.size, dtype=leaf.dtype).reshape(leaf.shape)
+        return jnp.sign(jnp.cos(1.0 + 2.3 * k))
+
+    return jtu.tree_map(of_leaf, like)
 
 
 def _mean(space: AbstractSpace, part: Tree) -> Any:

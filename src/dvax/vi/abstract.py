@@ -80,9 +80,9 @@ class RESULTS(eqx.Enumeration):
 class FrozenVI(NamedTuple):
     """VI(K, F) in a space: find y ∈ K with ⟨F(y), v − y⟩ ≥ 0 for all v ∈ K.
 
-    `gamma` and `L_F` are the moduli of F, or None if they are unknown. If `stops_at_roundoff` is true,
-    solvers also stop, with the result "successful", where ‖w‖ is not larger than its roundoff, which is
-    relative to the sizes of y and F(y): the tolerance is then one for a law that must be solved anyway.
+    `gamma` and `L_F` are the moduli of F, or None if they are unknown. If `rtol` is given, ‖w‖ must
+    also be at most `rtol` times the size of the terms of w, but a ‖w‖ that is roundoff of these terms
+    always suffices: a law in a time integration must be solved whatever its units are.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -101,7 +101,7 @@ class FrozenVI(NamedTuple):
     space: AbstractSpace
     gamma: Any = None
     L_F: Any = None
-    stops_at_roundoff: bool = False
+    rtol: Any = None
 
 
 @runtime_checkable

@@ -25,7 +25,7 @@ _DIVERGENCE_FACTOR = 1e8
 
 
 _ROUNDINGS = 4.0
-"""Ratio of ‖w‖ to its estimated rounding error at which `stops_at_roundoff` ends the iteration."""
+"""Ratio of ‖w‖ to its estimated rounding error that counts as roundoff."""
 
 
 class Trial(NamedTuple):
@@ -102,13 +102,14 @@ def iterate(
     eps, norm = jnp.finfo(dtype).eps, partial(norm_of_constant, frozen.space)
     divergence_radius = _DIVERGENCE_FACTOR * (1.0 + norm(start))
 
-    def rounding_of_terms(trial: Trial, norm_F: Any, lam: Any, initial_step: Any) -> Any:
+    def terms_of_w(trial: Trial, norm_F: Any, lam: Any, initial_step: Any) -> tuple[Any, Any]:
+        """Return the size of the terms of w, and their roundoff."""
         # λ at the start is about 1/L. A λ that became much smaller would make any ‖w‖ roundoff, and
         # the terms of F have the size of L‖y‖ even if λ became much larger.
-        step = jnp.maximum(lam, 0.1 * initial_step)
-        size = norm(trial.y)
-        of_F = eps * (size / initial_step + norm_F)
-        return rounding_of_w(frozen.K, trial.y, size, norm_F, step) + of_F
+        size, step = norm(trial.y), jnp.maximum(lam, 0.1 * initial_step)
+        terms = size / initial_step + norm_F
+        roundoff = rounding_of_w(frozen.K, trial.y, size, norm_F, step) + eps * terms
+        return terms, _ROUNDINGS * roundoff
 
     def total_norm(elements: list[Tree]) -> Any:
         return sum(map(norm, elements))
@@ -135,9 +136,11 @@ def iterate(
         residual = jnp.where(meaningless, jnp.inf, residual)
         # The first point replaces the start in any case, since the start may lie outside of K.
         better = (residual < s.residual) | (s.count == 0)
-        done = residual <= target
-        if vi.stops_at_roundoff:
-            done |= residual <= _ROUNDINGS * rounding_of_terms(trial, norm_F, lam, initial_step)
+        limit = target
+        if frozen.rtol is not None:
+            terms, roundoff = terms_of_w(trial, norm_F, lam, initial_step)
+            limit = jnp.maximum(jnp.minimum(target, frozen.rtol * terms), roundoff)
+        done = residual <= limit
         # The iterates changed by rounding alone, since the last iteration (stalled) or since the
         # checkpoint (cycling). Brent's algorithm renews the checkpoint at every power of two, so it
         # finds cycles of any length.
@@ -199,9 +202,8 @@ def iterate(
 
 def without_derivatives(vi: FrozenVI) -> FrozenVI:
     """Return the same problem without derivatives: the iteration is not differentiated."""
-    K, space, gamma, L_F = jtu.tree_map(lax.stop_gradient, (vi.K, vi.space, vi.gamma, vi.L_F))
-    F = lambda y: lax.stop_gradient(vi.F(y))  # noqa: E731
-    return FrozenVI(F, K, space, gamma, L_F, vi.stops_at_roundoff)
+    data = jtu.tree_map(lax.stop_gradient, vi._replace(F=None))
+    return data._replace(F=lambda y: lax.stop_gradient(vi.F(y)))
 
 
 def residual_target(vi: FrozenVI, tol: Any) -> Any:

@@ -108,7 +108,7 @@ def safeguarded_newton(
     # `iterate` passes an F without derivatives (`without_derivatives`), but Newton's method needs F′.
     differentiable_F = vi.F
     first_run_length = jnp.where(is_quadratic, _FIRST_RUN_LENGTH_QUADRATIC, _FIRST_RUN_LENGTH)
-    target = residual_target(vi, tol)
+    target = residual_target(vi, tol) if vi.rtol is None else 0.0
 
     def advance(vi: FrozenVI, s: _State) -> tuple[_State, Trial]:
         norm = partial(norm_of_constant, vi.space)
