@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 
 from .. import _tree
 from .._small_matrices import MAX_ROWS, solve, solve_constant
@@ -305,7 +306,16 @@ def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
         right = jnp.where(active, rows @ base - bound, 0.0)
         return base - solve(matrix, right) @ scaled
 
-    _, dy = jax.jvp(project_on_face, primals, tangents)
+    # Data without a tangent are constants.
+    moving = [k for k, v in enumerate(tangents) if not isinstance(v, SymbolicZero)]
+
+    def of_moving(*values: jax.Array) -> jax.Array:
+        inputs = list(primals)
+        for k, value in zip(moving, values, strict=True):
+            inputs[k] = value
+        return project_on_face(*inputs)
+
+    _, dy = jax.jvp(of_moving, [primals[k] for k in moving], [tangents[k] for k in moving])
     return (y, multiplier, is_free), (
         factor * dy,
         jnp.zeros_like(multiplier),
@@ -313,4 +323,4 @@ def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
     )
 
 
-_nearest.defjvp(_nearest_jvp)
+_nearest.defjvp(_nearest_jvp, symbolic_zeros=True)
