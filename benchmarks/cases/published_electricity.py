@@ -157,7 +157,7 @@ def _run(section: Section, case: Market) -> Hours:
                 "with a bound" if measure else "without", f"{case.last - case.first:,.0f}",
                 f"{int(solution.stats['steps']):,}", f"{laws:,}", duration(compiling),
                 duration(seconds), duration(seconds / laws), bound, worst,
-                f"{float(jnp.max(solution.law_error)):.1e}",
+                f"{float(np.max(np.asarray(solution.law_error))):.1e}",
             )
         )  # fmt: skip
     section.tables.append(

@@ -69,7 +69,7 @@ class LinearProgramme:
         return float(answer.fun), np.asarray(answer.eqlin.marginals)
 
     def _warm(self, cost: Any, lower: Any, upper: Any, low: Any, high: Any) -> Any:
-        import highspy  # pyright: ignore[reportMissingImports]
+        import highspy
 
         columns, rows = len(cost), len(low)
         if self.warm is None:
@@ -97,7 +97,7 @@ class QuadraticProgramme:
     """The law itself: min cost minus the benefit of the demand, for a given state."""
 
     def __init__(self, network: Network, weights: np.ndarray):
-        import clarabel  # pyright: ignore[reportMissingImports]
+        import clarabel
 
         self.network, self.beta = network, weights[network.units : -1]
         flows, balance = _balances(network)
