@@ -57,7 +57,10 @@ def _laws(case: Market) -> Callable[[jax.Array, jax.Array], Any]:
         K, space = problem.set_at(t), problem.spaces(x)[1]
         assert isinstance(K, dvax.sets.ConstrainedBox)
         z = problem.h(t, x, problem.zero_control(x), None)
-        return K.project(z, space), K.multipliers(z, space), K.upper
+        multipliers = K.multipliers(z, space)
+        # The projection, without solving for the multipliers again.
+        u = jnp.clip(z - multipliers @ K.R / space.weights(), K.lower, K.upper)
+        return u, multipliers, K.upper
 
     return jax.jit(lambda ts, xs: jax.lax.map(one, (ts, xs)))
 
