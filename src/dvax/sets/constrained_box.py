@@ -44,8 +44,8 @@ class ConstrainedBox(AbstractSet):
     **Arguments:** `lower`, `upper`: numbers or vectors; `R`: a matrix, one row a condition; `low`,
     `high`: vectors. All bounds may be infinite.
 
-    **Raises:** `dvax.InputError` if bounds cross, entries of R are not finite, or shapes differ. The
-    projection is NaN if no y satisfies all conditions, or the method does not converge.
+    **Raises:** `dvax.InputError` if the set is empty, entries of R are not finite, or shapes differ.
+    The projection is NaN if traced data describe an empty set, or if the method does not converge.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -85,11 +85,15 @@ class ConstrainedBox(AbstractSet):
             ("lower", "upper", self.lower, self.upper), ("low", "high", self.low, self.high),
         ):  # fmt: skip
             _tree.require(
-                lambda a=low_end, b=high_end: np.all(np.asarray(a) <= np.asarray(b)),
+                lambda a=low_end, b=high_end: _are_intervals(np.asarray(a), np.asarray(b)),
                 f"{name}({first}, {second})", (low_end, high_end),
-                f"{first} ≤ {second} must hold everywhere, or the set is empty",
+                f"{first} ≤ {second}, {first} < +∞ and {second} > −∞ must hold, or the set is empty",
                 "Swap the bounds, or widen the interval",
             )  # fmt: skip
+
+        data = self.lower, self.upper, self.R, self.low, self.high
+        if _tree.is_concrete(data):
+            _check_nonempty(name, *map(np.asarray, data))
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         return _nearest(*self._data(z, space))[0]
@@ -324,3 +328,49 @@ def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
 
 
 _nearest.defjvp(_nearest_jvp, symbolic_zeros=True)
+
+
+def _are_intervals(low: np.ndarray, high: np.ndarray) -> Any:
+    return np.all((low <= high) & (low < np.inf) & (high > -np.inf))
+
+
+def _check_nonempty(
+    name: str,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    R: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> None:
+    """Raise an `InputError` if no y within the bounds satisfies all rows.
+
+    Solve the linear programme: minimise v ≥ 0 subject to low − v ≤ R y ≤ high + v, with rows whose
+    largest entry is 1."""
+    import scipy.optimize  # a slow import that only this function needs
+
+    n = R.shape[1]
+    if any(end.shape not in ((), (1,), (n,)) for end in (lower, upper)):
+        return  # `check` explains the shapes
+    scale = np.max(np.abs(R), axis=1, initial=0.0)
+    scale = np.where(scale > 0, scale, 1.0)
+    rows = np.vstack([R, -R]) / np.concatenate([scale, scale])[:, None]
+    ends = np.concatenate([high, -low]) / np.concatenate([scale, scale])
+    is_bounded = ends < np.inf
+    box = np.stack([np.broadcast_to(lower, n), np.broadcast_to(upper, n)], axis=1)
+    answer = scipy.optimize.linprog(
+        np.append(np.zeros(n), 1.0),
+        A_ub=np.hstack([rows, -np.ones((len(ends), 1))])[is_bounded],
+        b_ub=ends[is_bounded],
+        bounds=[*box.tolist(), (0.0, None)],
+    )
+    size = np.max(np.abs(ends[is_bounded]), initial=0.0) or 1.0
+    # If the linear programme fails, accept the set: the projection checks its own result.
+    violation = answer.x[-1] if answer.status == 0 else 0.0
+    if violation > 1e-6 * size:
+        raise input_error(
+            f"{name}(lower, upper, R, low, high)",
+            f"{len(low)} rows that no y within the bounds satisfies: the smallest possible violation, "
+            f"for rows with the largest entry 1, is {violation:.3g}",
+            "the set must not be empty, or the law has no solution",
+            "Widen low and high, or the bounds of the unknowns",
+        )
