@@ -122,7 +122,10 @@ def run(full: bool) -> Section:
     hours = _run(section, case)
     _hour_by_hour(section, case, hours)
     _limits(section, network)
-    _race(section, case, hours)
+    # The days with the fewest and with the most hours in which a line binds.
+    binding = np.any(hours.multipliers[:-1, 1:] != 0, axis=1).reshape(-1, 24).sum(axis=1)
+    for day in (int(np.argmin(binding)), int(np.argmax(binding))):
+        _race(section, case, hours, day, int(binding[day]))
     return section
 
 
@@ -264,10 +267,11 @@ def _limits(section: Section, network: Network) -> None:
     )  # fmt: skip
 
 
-def _race(section: Section, case: Market, hours: Hours) -> None:
+def _race(section: Section, case: Market, hours: Hours, day: int, binding: int) -> None:
     network, loads = case.network, len(case.network.load_bus)
-    ts = case.first + 24.0 + MINUTES / 60 * np.arange(_RACE)
-    xs = np.tile(hours.xs[24], (_RACE, 1))
+    ts = case.first + 24.0 * day + MINUTES / 60 * np.arange(_RACE)
+    xs = np.tile(hours.xs[24 * day], (_RACE, 1))
+    name = f"{_RACE} laws of a day, lines bind in {binding} hours"
     run, points = _laws(case), (jnp.asarray(ts), jnp.asarray(xs))
     ours = law(case, ts, xs)
     programme = LinearProgramme(network)
@@ -296,7 +300,7 @@ def _race(section: Section, case: Market, hours: Hours) -> None:
     taken = in_turn(samples, 5, enough=60.0)
     section.comparisons.append(
         compare(
-            f"{_RACE} laws, every five minutes", f"{programme.name} (cost and prices only)",
+            name, f"{programme.name} (cost and prices only)",
             taken["dvax"], taken["lp"], direction="other/dvax",
         )
     )  # fmt: skip
@@ -304,10 +308,10 @@ def _race(section: Section, case: Market, hours: Hours) -> None:
         away = float(np.abs(np.array(others) - ours.us).max())
         section.comparisons.append(
             compare(
-                f"{_RACE} laws, every five minutes", "Clarabel", taken["dvax"], taken["clarabel"],
+                name, "Clarabel", taken["dvax"], taken["clarabel"],
                 direction="other/dvax", target=("≥", 1.0),
             )
         )  # fmt: skip
         section.notes.append(
-            f"Outputs of Clarabel differ from those of dvax by at most {away:.1e} MW."
+            f"Clarabel, {name}: outputs differ from those of dvax by at most {away:.1e} MW."
         )
