@@ -122,8 +122,9 @@ def run(full: bool) -> Section:
     hours = _run(section, case)
     _hour_by_hour(section, case, hours)
     _limits(section, network)
-    # The days with the fewest and with the most hours in which a line binds.
-    binding = np.any(hours.multipliers[:-1, 1:] != 0, axis=1).reshape(-1, 24).sum(axis=1)
+    # The whole days with the fewest and with the most hours in which a line binds.
+    binds = np.any(hours.multipliers[:, 1:] != 0, axis=1)[: 24 * ((last - first) // 24)]
+    binding = binds.reshape(-1, 24).sum(axis=1)
     for day in (int(np.argmin(binding)), int(np.argmax(binding))):
         _race(section, case, hours, day, int(binding[day]))
     return section
