@@ -33,6 +33,7 @@ CASES = (
     "applications",
     "published_circuits",
     "published_earthquake",
+    "published_electricity",
     "stiffness",
     "picard",
     "accelerator",

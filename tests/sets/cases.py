@@ -93,6 +93,19 @@ def _above(*values: Any) -> float:
     return float(max(0.0, *(np.max(v) for v in values)))
 
 
+LEFT, RIGHT = np.array([-1.0, -0.2, -0.5, -2.0]), np.array([0.3, 1.0, 0.5, 0.7])
+SUMS = np.array([[1.0, 2.0, -1.0, 0.5], [1.0, 1.0, 1.0, -1.0]])
+
+
+def _balanced(rng: np.random.Generator) -> np.ndarray:
+    """The farthest member along a random direction in which the second sum is 0."""
+    v = rng.normal(size=N)
+    v -= SUMS[1] * (SUMS[1] @ v) / (SUMS[1] @ SUMS[1])
+    limits = np.concatenate([RIGHT, -LEFT, [0.4, 0.6]])
+    along = np.concatenate([v, -v, [SUMS[0] @ v, -SUMS[0] @ v]])
+    return v * np.min(np.where(along > 0, limits / np.maximum(along, 1e-300), np.inf))
+
+
 SIGNS = np.array(list(product((-1.0, 1.0), repeat=N)))
 SIMPLEX_ROWS = (-np.eye(N), np.zeros(N), np.ones((1, N)), np.array([2.0]))
 PAIR_ROWS = np.array([[1.0, 0, 0, 0], [0, 1.0, 1.0, 1.0]])
@@ -182,6 +195,22 @@ CASES: dict[str, Case] = {
         lambda y: _above(G @ y - D, abs(y.sum())),
         _segment,
         (G, D, np.ones((1, N)), np.zeros(1)),
+    ),
+    "constrained box": Case(
+        lambda v: sets.ConstrainedBox(
+            v[:4], v[4:8], v[8:16].reshape(2, 4), jnp.stack([v[16], v[18]]), v[17:19]
+        ),
+        np.concatenate([LEFT, RIGHT, SUMS.ravel(), [-0.6, 0.4, 0.0]]),
+        lambda y: _above(
+            LEFT - y, y - RIGHT, SUMS[0] @ y - 0.4, -0.6 - SUMS[0] @ y, abs(SUMS[1] @ y)
+        ),
+        _balanced,
+        (
+            np.vstack([np.eye(N), -np.eye(N), SUMS[:1], -SUMS[:1]]),
+            np.concatenate([RIGHT, -LEFT, [0.4, 0.6]]),
+            SUMS[1:],
+            np.zeros(1),
+        ),
     ),
     "translated": Case(
         lambda v: sets.Translated(sets.Simplex(jnp.asarray(2.0, v.dtype)), v),

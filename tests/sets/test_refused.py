@@ -37,6 +37,27 @@ SQUARE = np.vstack([np.eye(2), -np.eye(2)])
         (lambda: sets.Ellipsoid(0.0, shape=np.diag([1.0, -1.0])), "positive definite"),
         (lambda: sets.Ellipsoid(0.0, shape=np.array([[1.0, 0.2], [0.0, 1.0]])), "symmetric"),
         (lambda: sets.Ellipsoid(0.0, shape=np.eye(3)).check(jnp.zeros(2)), r"\(3, 3\)"),
+        (
+            lambda: sets.ConstrainedBox(
+                0.0, 1.0, np.ones((1, 2)), np.array([3.0]), np.array([4.0])
+            ),
+            "is 1",
+        ),
+        (lambda: sets.ConstrainedBox(1.0, 0.0, np.ones((1, 2)), np.zeros(1), np.ones(1)), "upper"),
+        (lambda: sets.ConstrainedBox(0.0, 1.0, np.ones((1, 2)), np.ones(1), np.zeros(1)), "high"),
+        (lambda: sets.ConstrainedBox(0.0, 1.0, np.ones((1, 2)), np.zeros(2), np.ones(2)), "rows"),
+        (
+            lambda: sets.ConstrainedBox(
+                np.zeros(3), 1.0, np.ones((1, 2)), np.zeros(1), np.ones(1)
+            ).check(jnp.zeros(2)),
+            "columns",
+        ),
+        (
+            lambda: sets.ConstrainedBox(0.0, 1.0, np.ones((1, 3)), np.zeros(1), np.ones(1)).check(
+                jnp.zeros(2)
+            ),
+            "columns",
+        ),
         (lambda: sets.Polyhedron(SQUARE, -np.ones(4)), "is 1"),
         (lambda: sets.Polyhedron(np.zeros((1, 2)), -np.ones(1)), "no y satisfies"),
         (lambda: sets.Polyhedron(SQUARE, np.array([1.0, 1, 1, -np.inf])), "no y satisfies"),

@@ -4,6 +4,7 @@ from .abstract import AbstractSet as AbstractSet
 from .affine import AffineSubspace as AffineSubspace
 from .ball import Ball as Ball
 from .box import Box as Box
+from .constrained_box import ConstrainedBox as ConstrainedBox
 from .ellipsoid import Ellipsoid as Ellipsoid
 from .half_space import HalfSpace as HalfSpace
 from .hyperplane import Hyperplane as Hyperplane

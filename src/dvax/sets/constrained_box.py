@@ -1,0 +1,376 @@
+"""Boxes with linear conditions: bounds on the unknowns and on a few sums of them."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.custom_derivatives import SymbolicZero
+
+from .. import _tree
+from .._small_matrices import MAX_ROWS, solve, solve_constant
+from .._tree import Tree
+from ..errors import input_error
+from ..spaces import AbstractSpace
+from ._weights import inverse_weights
+from .abstract import AbstractSet
+
+_SLACK = 0.75
+"""A row is satisfied if its violation is at most eps^0.75 of its terms: 2e-12 in double precision."""
+_DAMPING = 64.0
+"""Multiple of eps that is added to the diagonal of the Newton matrix, relative to its largest value."""
+_LINE_SEARCH = 100
+"""Maximum number of points of a line search; bisection alone needs about 60."""
+
+
+class ConstrainedBox(AbstractSet):
+    """K = {y : lower ≤ y ≤ upper, low ≤ R y ≤ high}, with plain sums (R y)ₖ = Σᵢ Rₖᵢ yᵢ whatever the
+    space's weights. A row with low = high is an equation.
+
+    With multipliers μ of the rows, proj_K(z) = clip(z − W⁻¹Rᵀμ, lower, upper), where W has the weights
+    of the space. μ maximises the dual function of the projection, which is concave and piecewise
+    quadratic, and has as many variables as there are rows. Newton's method with an exact line search
+    maximises it. A step adds the row that is violated most, and removes a row whose multiplier
+    reaches 0. The method ends with the exact piece, so the rows hold to roundoff (relative 2e-12 in
+    double precision). An iteration costs a few products with R, where `Polyhedron` treats every
+    bound as a row of its own. R may have many rows, but few may be active: an iteration changes at
+    most 16 multipliers, so that with more active rows convergence is slow.
+
+    The derivative, in z and all data, is that of the projection onto the active bounds and rows. A row
+    that holds with equality counts as active, even with the multiplier 0. With more than 16 active
+    rows the derivative is NaN.
+
+    **Arguments:** `lower`, `upper`: numbers or vectors; `R`: a matrix, one row a condition; `low`,
+    `high`: vectors. All bounds may be infinite.
+
+    **Raises:** `dvax.InputError` if the set is empty, entries of R are not finite, or shapes differ.
+    The projection is NaN if traced data describe an empty set, or if the method does not converge.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> K = dvax.sets.ConstrainedBox(0.0, 1.0, jnp.ones((1, 3)), jnp.array([2.0]), jnp.array([2.0]))
+    >>> [round(float(v), 12) for v in K.project(jnp.array([3.0, 0.5, 0.1]), dvax.spaces.Euclidean(3))]
+    [1.0, 0.7, 0.3]
+
+    ```
+    """
+
+    lower: jax.Array
+    upper: jax.Array
+    R: jax.Array
+    low: jax.Array
+    high: jax.Array
+
+    def __init__(self, lower: Any, upper: Any, R: Any, low: Any, high: Any):
+        name = "dvax.sets.ConstrainedBox"
+        self.lower = _tree.as_array(lower, f"{name}(lower)")
+        self.upper = _tree.as_array(upper, f"{name}(upper)")
+        self.R = _tree.as_array(R, f"{name}(R)")
+        self.low = _tree.as_array(low, f"{name}(low)")
+        self.high = _tree.as_array(high, f"{name}(high)")
+        rows = jnp.shape(self.R)[:1]
+        if jnp.ndim(self.R) != 2 or not (jnp.shape(self.low) == jnp.shape(self.high) == rows):
+            raise input_error(
+                f"{name}(R, low, high)",
+                f"shapes {jnp.shape(self.R)}, {jnp.shape(self.low)} and {jnp.shape(self.high)}",
+                "R must be a matrix, and low and high must have one number for each of its rows",
+                "Give R the shape (conditions, unknowns), and low and high (conditions,)",
+            )
+        _tree.require(
+            lambda: np.all(np.isfinite(np.asarray(self.R))), f"{name}(R)", self.R,
+            "the entries of R must be finite", "Correct the entries that are not",
+        )  # fmt: skip
+        for first, second, low_end, high_end in (
+            ("lower", "upper", self.lower, self.upper), ("low", "high", self.low, self.high),
+        ):  # fmt: skip
+            _tree.require(
+                lambda a=low_end, b=high_end: _are_intervals(np.asarray(a), np.asarray(b)),
+                f"{name}({first}, {second})", (low_end, high_end),
+                f"{first} ≤ {second}, {first} < +∞ and {second} > −∞ must hold, or the set is empty",
+                "Swap the bounds, or widen the interval",
+            )  # fmt: skip
+
+        data = self.lower, self.upper, self.R, self.low, self.high
+        if _tree.is_concrete(data):
+            _check_nonempty(name, *map(np.asarray, data))
+
+    def project(self, z: Tree, space: AbstractSpace) -> Tree:
+        return _nearest(*self._data(z, space))[0]
+
+    def multipliers(self, z: Tree, space: AbstractSpace) -> jax.Array:
+        """Return the multipliers μ of the rows: W(z − proj_K(z)) − Rᵀμ is normal to the box there.
+
+        μₖ > 0 where the row is at `high`, and μₖ < 0 where it is at `low`. If F(y) = Wy − Wz is the
+        derivative of a cost, μₖ is the change of the least cost with −low or −high."""
+        return _nearest(*self._data(z, space))[1]
+
+    def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
+        """Return the distances of z − W⁻¹Rᵀμ to both bounds, and for each row its slack, or −|μ| if
+        the row is active. An equation never switches: its entry is −1."""
+        z, inverse_w, lower, upper, R, low, high = self._data(z, space)
+        y, multiplier, _ = _nearest(z, inverse_w, lower, upper, R, low, high)
+        shifted, sums = z - inverse_w * (multiplier @ R), R @ y
+        slack = jnp.minimum(high - sums, sums - low)
+        of_rows = jnp.where(multiplier == 0, slack, -jnp.abs(multiplier))
+        return [shifted - lower, upper - shifted, jnp.where(low == high, -1.0, of_rows)]
+
+    def _data(self, z: Tree, space: AbstractSpace) -> tuple[jax.Array, ...]:
+        # Bounds given as Python numbers take the type of z.
+        lower, upper = (
+            jnp.broadcast_to(b.astype(jnp.result_type(b, z)), z.shape)
+            for b in (self.lower, self.upper)
+        )
+        return z, inverse_weights(space, z), lower, upper, self.R, self.low, self.high
+
+    def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
+        return None
+
+    def check(self, like: Tree) -> None:
+        n = jnp.shape(self.R)[1]
+        shapes = jnp.shape(self.lower), jnp.shape(self.upper)
+        fits = not isinstance(like, tuple) and jnp.shape(like) == (n,)
+        if not fits or any(shape not in ((), (1,), (n,)) for shape in shapes):
+            raise input_error(
+                "dvax.sets.ConstrainedBox",
+                f"{n} columns of R, and bounds of the shapes {shapes[0]} and {shapes[1]}",
+                f"R must have one column, and lower and upper one number (or one for all), for each "
+                f"entry of the vector y = P u, of shape {_tree.shapes(like)}",
+                "Give R the shape (conditions, unknowns)",
+            )
+
+
+class _State(NamedTuple):
+    """Multipliers, y and R y there, the added row (−1: none), and whether the iteration is over."""
+
+    multiplier: jax.Array
+    y: jax.Array
+    sums: jax.Array
+    added: jax.Array
+    count: jax.Array
+    over: jax.Array
+
+
+@jax.custom_jvp
+def _nearest(
+    z: jax.Array, inverse_w: jax.Array, lower: jax.Array, upper: jax.Array,
+    R: jax.Array, low: jax.Array, high: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:  # fmt: skip
+    """Return (projection, multipliers, 1 for entries at no bound and else 0); NaN if it failed."""
+    m, n = R.shape
+    width = min(m, n, MAX_ROWS)
+    eps = jnp.finfo(z.dtype).eps
+    index = jnp.arange(m)
+    is_equation = low == high
+    damping = _DAMPING * eps * ((R * R) @ inverse_w)
+    damping = jnp.where(damping > 0, damping, 1.0)
+
+    def clip(multiplier: jax.Array) -> jax.Array:
+        return jnp.clip(z - inverse_w * (multiplier @ R), lower, upper)
+
+    def excess_of(sums: jax.Array) -> jax.Array:
+        """Return how far each row lies above `high` (positive) or below `low` (negative)."""
+        return jnp.maximum(sums - high, 0.0) + jnp.minimum(sums - low, 0.0)
+
+    def advance(s: _State) -> _State:
+        on_high = s.multiplier > 0
+        excess = excess_of(s.sums)
+        # The derivative of the dual function in the multipliers that are not 0.
+        gap = jnp.where(on_high, s.sums - high, s.sums - low)
+        is_active = is_equation | (s.multiplier != 0) | (index == s.added)
+        gap = jnp.where(s.multiplier == 0, excess, gap)
+        # The rows of a Newton step: the active ones with the largest gaps.
+        priority = jnp.where(is_active, 1.0 + jnp.abs(gap) / _tolerance(s.y, R, low, high), 0.0)
+        _, chosen = lax.top_k(priority, width)
+        used = is_active[chosen]
+        rows = jnp.where(used[:, None], R[chosen], 0.0)
+        is_free = (s.y > lower) & (s.y < upper)
+        scaled = rows * jnp.where(is_free, inverse_w, 0.0)[None, :]
+        diagonal = jnp.where(used, damping[chosen], 1.0)
+        matrix = scaled @ rows.T + jnp.diag(diagonal)
+        step = solve_constant(matrix, jnp.where(used, gap[chosen], 0.0))
+        step = jnp.where(used, step, 0.0)
+        # A multiplier of an inequality keeps its sign; it leaves the active rows at 0.
+        old = s.multiplier[chosen]
+        towards_zero = ~is_equation[chosen] & (old * step < 0)
+        ratios = jnp.where(towards_zero, -old / jnp.where(towards_zero, step, 1.0), jnp.inf)
+        most = jnp.minimum(1.0, jnp.min(ratios))
+        direction = step @ rows
+        slope_bound = jnp.sum(step * (s.sums[chosen] - gap[chosen]))
+        length = _line_search(
+            z - inverse_w * (s.multiplier @ R), -inverse_w * direction, lower, upper, direction,
+            slope_bound, most, eps,
+        )  # fmt: skip
+        leaves = towards_zero & (ratios <= length)
+        new = jnp.where(leaves, 0.0, old + length * step)
+        multiplier = s.multiplier.at[chosen].set(new)
+        return check(multiplier, s.count + 1)
+
+    def check(multiplier: jax.Array, count: Any) -> _State:
+        """Return the state at these multipliers, with the row to add."""
+        y = clip(multiplier)
+        sums = R @ y
+        excess, least = excess_of(sums), _tolerance(y, R, low, high)
+        gap = jnp.where(multiplier > 0, sums - high, sums - low)
+        is_active = is_equation | (multiplier != 0)
+        unsolved = jnp.where(is_equation, excess, jnp.where(multiplier != 0, gap, 0.0))
+        is_solved = jnp.all(jnp.abs(unsolved) <= least)
+        violation = jnp.where(is_active, 0.0, jnp.abs(excess) / least)
+        row = jnp.argmax(violation)
+        is_violated = violation[row] > 1.0
+        added = jnp.where(is_solved & is_violated, row, -1)
+        over = (is_solved & ~is_violated) | ~jnp.all(jnp.isfinite(multiplier))
+        return _State(multiplier, y, sums, added, jnp.asarray(count), over)
+
+    def unfinished(s: _State) -> jax.Array:
+        return ~s.over & (s.count < 100 + 10 * m)
+
+    end = lax.while_loop(unfinished, advance, check(jnp.zeros(m, z.dtype), 0))
+    is_valid = end.over & jnp.all(jnp.isfinite(end.multiplier))
+    is_valid &= jnp.all(lower <= upper) & jnp.all(low <= high)
+    is_free = (end.y > lower) & (end.y < upper)
+    y = jnp.where(is_valid, end.y, jnp.nan)
+    return y, end.multiplier, is_free.astype(z.dtype)
+
+
+def _tolerance(y: jax.Array, R: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+    """Return the violation of each row that counts as roundoff."""
+    bound = jnp.maximum(
+        jnp.where(jnp.isfinite(low), jnp.abs(low), 0.0),
+        jnp.where(jnp.isfinite(high), jnp.abs(high), 0.0),
+    )
+    lengths = jnp.sqrt(jnp.sum(R * R, axis=1))
+    return jnp.finfo(y.dtype).eps ** _SLACK * (bound + lengths * jnp.sqrt(jnp.sum(y * y)))
+
+
+def _line_search(
+    start: jax.Array, change: jax.Array, lower: jax.Array, upper: jax.Array,
+    direction: jax.Array, bound: jax.Array, most: jax.Array, eps: Any,
+) -> jax.Array:  # fmt: skip
+    """Return the maximiser in (0, most] of the dual function along a direction of ascent.
+
+    Its derivative d·clip(start + αc) − bound, with d the direction and c = −W⁻¹d, decreases and is
+    piecewise linear: Newton's method with bisection as a safeguard finds its zero."""
+
+    def slope(alpha: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        moved = start + alpha * change
+        y = jnp.clip(moved, lower, upper)
+        second = jnp.sum(jnp.where((moved > lower) & (moved < upper), direction * change, 0.0))
+        size = jnp.sum(jnp.abs(direction * y)) + jnp.abs(bound)
+        return jnp.sum(direction * y) - bound, second, size
+
+    def unfinished(state: tuple) -> jax.Array:
+        return ~state[-1] & (state[-2] < _LINE_SEARCH)
+
+    def advance(state: tuple) -> tuple:
+        low, high, alpha, count, _ = state
+        first, second, size = slope(alpha)
+        low, high = jnp.where(first > 0, alpha, low), jnp.where(first > 0, high, alpha)
+        newton = alpha - first / jnp.where(second < 0, second, -1.0)
+        inside = (second < 0) & (newton > low) & (newton < high)
+        new = jnp.where(inside, newton, 0.5 * (low + high))
+        done = (jnp.abs(first) <= 8 * eps * size) | (high - low <= 2 * eps * high)
+        return low, high, jnp.where(done, alpha, new), count + 1, done
+
+    at_end = slope(most)
+    # A full step within one piece ends where the derivative is zero up to roundoff.
+    enough = at_end[0] >= -64 * eps * at_end[2]
+    zero = jnp.zeros_like(most)
+    first_guess = jnp.where(enough, most, 0.5 * most)
+    state = (zero, most, first_guess, jnp.asarray(0), enough)
+    return lax.while_loop(unfinished, advance, state)[2]
+
+
+def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
+    """The derivative of the projection onto the active bounds and rows, which are fixed."""
+    y, multiplier, is_free = _nearest(*primals)
+    sums = primals[4] @ y
+    least = _tolerance(y, *primals[4:])
+    # A row that holds with equality is active, as in every set.
+    at_high = jnp.where(multiplier == 0, sums >= primals[6] - least, multiplier > 0)
+    at_low = jnp.where(multiplier == 0, sums <= primals[5] + least, multiplier < 0)
+    is_active = at_high | at_low
+    width = min(*primals[4].shape, MAX_ROWS)
+    _, chosen = lax.top_k(is_active.astype(jnp.int32), width)
+    active, on_high = is_active[chosen], at_high[chosen]
+    at_lower = primals[0] - primals[1] * (multiplier @ primals[4]) <= primals[2]
+    # Beyond 16 active rows the derivative is not available.
+    factor = jnp.where(jnp.sum(is_active) <= width, jnp.ones((), y.dtype), jnp.nan)
+
+    def project_on_face(z, inverse_w, lower, upper, R, low, high) -> jax.Array:
+        rows = jnp.where(active[:, None], R[chosen], 0.0)
+        bound = jnp.where(active, jnp.where(on_high, high[chosen], low[chosen]), 0.0)
+        fixed = jnp.where(at_lower, lower, upper)
+        base = jnp.where(is_free > 0, z, jnp.where(jnp.isfinite(fixed), fixed, 0.0))
+        scaled = rows * jnp.where(is_free > 0, inverse_w, 0.0)[None, :]
+        # Rows that depend on others (or have no free entry) make the matrix singular.
+        damping = _DAMPING * jnp.finfo(z.dtype).eps * ((rows * rows) @ inverse_w)
+        diagonal = jnp.where(damping > 0, damping, 1.0)
+        matrix = scaled @ rows.T + jnp.diag(lax.stop_gradient(diagonal))
+        right = jnp.where(active, rows @ base - bound, 0.0)
+        return base - solve(matrix, right) @ scaled
+
+    # Data without a tangent are constants.
+    moving = [k for k, v in enumerate(tangents) if not isinstance(v, SymbolicZero)]
+
+    def of_moving(*values: jax.Array) -> jax.Array:
+        inputs = list(primals)
+        for k, value in zip(moving, values, strict=True):
+            inputs[k] = value
+        return project_on_face(*inputs)
+
+    _, dy = jax.jvp(of_moving, [primals[k] for k in moving], [tangents[k] for k in moving])
+    return (y, multiplier, is_free), (
+        factor * dy,
+        jnp.zeros_like(multiplier),
+        jnp.zeros_like(is_free),
+    )
+
+
+_nearest.defjvp(_nearest_jvp, symbolic_zeros=True)
+
+
+def _are_intervals(low: np.ndarray, high: np.ndarray) -> Any:
+    return np.all((low <= high) & (low < np.inf) & (high > -np.inf))
+
+
+def _check_nonempty(
+    name: str,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    R: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> None:
+    """Raise an `InputError` if no y within the bounds satisfies all rows.
+
+    Solve the linear programme: minimise v ≥ 0 subject to low − v ≤ R y ≤ high + v, with rows whose
+    largest entry is 1."""
+    import scipy.optimize  # a slow import that only this function needs
+
+    n = R.shape[1]
+    if any(end.shape not in ((), (1,), (n,)) for end in (lower, upper)):
+        return  # `check` explains the shapes
+    scale = np.max(np.abs(R), axis=1, initial=0.0)
+    scale = np.where(scale > 0, scale, 1.0)
+    rows = np.vstack([R, -R]) / np.concatenate([scale, scale])[:, None]
+    ends = np.concatenate([high, -low]) / np.concatenate([scale, scale])
+    is_bounded = ends < np.inf
+    box = np.stack([np.broadcast_to(lower, n), np.broadcast_to(upper, n)], axis=1)
+    answer = scipy.optimize.linprog(
+        np.append(np.zeros(n), 1.0),
+        A_ub=np.hstack([rows, -np.ones((len(ends), 1))])[is_bounded],
+        b_ub=ends[is_bounded],
+        bounds=[*box.tolist(), (0.0, None)],
+    )
+    size = np.max(np.abs(ends[is_bounded]), initial=0.0) or 1.0
+    # If the linear programme fails, accept the set: the projection checks its own result.
+    violation = answer.x[-1] if answer.status == 0 else 0.0
+    if violation > 1e-6 * size:
+        raise input_error(
+            f"{name}(lower, upper, R, low, high)",
+            f"{len(low)} rows that no y within the bounds satisfies: the smallest possible violation, "
+            f"for rows with the largest entry 1, is {violation:.3g}",
+            "the set must not be empty, or the law has no solution",
+            "Widen low and high, or the bounds of the unknowns",
+        )
