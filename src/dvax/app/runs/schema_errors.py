@@ -21,6 +21,7 @@ _TYPES = {
     "model_type": "a table",
     "model_attributes_type": "a table",
     "dict_type": "a table",
+    "path_type": "the name of a file in quotes",
 }
 _LIMITS = {
     "greater_than": ("greater than", "gt"),

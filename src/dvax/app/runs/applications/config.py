@@ -73,9 +73,18 @@ class ModelConfig:
         return found
 
     def fingerprints(self) -> list[DataFile]:
-        """Size and SHA-256 of every data file."""
+        """Size and SHA-256 of every data file; files of one name have their folders before it."""
         files = dict.fromkeys(path for _, path in self.data_files())
-        return [fingerprint(path.name, path) for path in files]
+        names = [path.name for path in files]
+        return [
+            fingerprint(path.name if names.count(path.name) == 1 else self._name_of(path), path)
+            for path in files
+        ]
+
+    def _name_of(self, path: Path) -> str:
+        """Return the path of a file relative to the folder of the configuration, if it lies there."""
+        folder = self.source.parent.resolve()
+        return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
 
     def tree(self) -> dict[str, Any]:
         """All settings as a TOML file has them."""
@@ -198,5 +207,10 @@ def _check(
                         locate(f"{given}/{inside}", source.parent, allow_outside, place)
     problems.raise_any()
     with wording_of(application, file).in_keys():
+        further = application.further_files(table, paths)
+        for key, given in further.items():
+            with problems.collect():
+                paths[key] = locate(given, source.parent, allow_outside, f"{file}: model.{key}")
+        problems.raise_any()
         model = application(table, paths, quiet)
     return ModelConfig(name, model.table, sections["output"], source, application, model, paths)

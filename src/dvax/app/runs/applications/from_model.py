@@ -80,6 +80,12 @@ class AbstractModelApplication(abc.ABC):
     @abc.abstractmethod
     def __init__(self, table: Any, paths: Mapping[str, Path], quiet: bool): ...
 
+    @classmethod
+    def further_files(cls, table: Any, paths: Mapping[str, Path]) -> Mapping[str, str]:
+        """Return the names of data files besides those of `files`, by their dotted keys below
+        `[model]`. **Raises:** `dvax.InputError`."""
+        return {}
+
     @property
     @abc.abstractmethod
     def fit(self) -> str:

@@ -16,11 +16,14 @@ from pydantic import BaseModel, Field, ValidationError, create_model, model_vali
 from dvax.app.runs.applications.base import Figure, Variable
 from dvax.app.runs.applications.certificate import Certificate
 from dvax.app.runs.applications.from_model import AbstractModelApplication, FramesKeys
+from dvax.app.runs.keys import flat_keys, set_key
 from dvax.app.runs.schema import Section, in_unit
 from dvax.app.runs.schema_errors import translate, unknown_key
 from dvax.errors import DvaxError, InputError, Problems, input_error
 from dvax.evolution import Solution
 from dvax.models import Model
+
+_PARAMETERS = "parameters."
 
 
 class PythonSection(FramesKeys):
@@ -58,11 +61,10 @@ class PythonApplication(AbstractModelApplication):
 
     def __init__(self, table: PythonSection, paths: Mapping[str, Path], quiet: bool):
         self.file = paths["python"]
-        build = _function(self.file, table.function)
-        # Python 3.14 evaluates the types here, and not when it imports the file.
-        hints = _run(self.file, lambda: get_type_hints(build, include_extras=True))
+        build, hints = _function(self.file, table.function)
         self.units = {name: unit for name in hints if (unit := _unit(hints[name])) is not None}
-        arguments, given = _run(self.file, lambda: _arguments(build, hints, table.parameters))
+        located = {key: path for key, path in paths.items() if key.startswith(_PARAMETERS)}
+        arguments, given = _run(self.file, lambda: _arguments(build, hints, table, located))
         self.table = table.model_copy(update={"parameters": given})
         model = _run(self.file, lambda: build(**arguments))
         if not isinstance(model, Model):
@@ -75,6 +77,15 @@ class PythonApplication(AbstractModelApplication):
         self.certified, self.place_of_figures = table.certify, f"{self.file.name}: figures"
         self.whole = model.figures is not None
         self.set_model(model, table.t_end)
+
+    @classmethod
+    def further_files(cls, table: PythonSection, paths: Mapping[str, Path]) -> Mapping[str, str]:
+        """Return the values of the parameters whose type is `pathlib.Path`."""
+        file = paths["python"]
+        build, hints = _function(file, table.function)
+        kind, _ = _parameters(build, hints)
+        made = _run(file, lambda: _validated(kind, table.parameters))
+        return _file_names(made, table.parameters)
 
     @property
     def fit(self) -> str:
@@ -109,8 +120,8 @@ def _figure(file: Path, name: str, entry: Any) -> tuple[Any, str, str]:
     return number.tolist(), str(unit), str(meaning)
 
 
-def _function(file: Path, name: str) -> Callable[..., Any]:
-    """Import a file, and return its function of that name."""
+def _function(file: Path, name: str) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """Import a file, and return its function of that name with the types of its parameters."""
     module = _run(file, lambda: _import(file))
     found = getattr(module, name, None)
     if not callable(found):
@@ -123,7 +134,8 @@ def _function(file: Path, name: str) -> Callable[..., Any]:
             "model.python", f"{file.name}:{name}", f"{file.name} has no function {name!r}",
             f"It has {', '.join(known)}" if known else f"Write def {name}(...) in it",
         )  # fmt: skip
-    return found
+    # Python 3.14 evaluates the types here, and not when it imports the file.
+    return found, _run(file, lambda: get_type_hints(found, include_extras=True))
 
 
 _imported: dict[Path, tuple[bytes, ModuleType]] = {}
@@ -175,34 +187,56 @@ def _run(file: Path, work: Callable[[], Any]) -> Any:
 
 
 def _arguments(
-    build: Callable[..., Any], hints: dict[str, Any], given: dict[str, Any]
+    build: Callable[..., Any],
+    hints: dict[str, Any],
+    table: PythonSection,
+    located: Mapping[str, Path],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the arguments for `build`, whose types are `hints`, from the table of parameters, and that
-    table, completed.
+    table, completed. Data files have the paths `located`, by their dotted keys below `[model]`."""
+    kind, whole = _parameters(build, hints)
+    made = _validated(kind, table.parameters)
+    complete = made.model_dump(mode="json", exclude_none=True)
+    if located:
+        moved = made.model_dump(mode="json", exclude_none=True)
+        for key, path in located.items():
+            set_key(moved, key.removeprefix(_PARAMETERS), str(path))
+        made = _validated(kind, moved)
+    if whole is not None:
+        return {whole: made}, complete
+    return {name: getattr(made, name) for name in kind.model_fields}, complete
+
+
+def _parameters(
+    build: Callable[..., Any], hints: dict[str, Any]
+) -> tuple[type[BaseModel], str | None]:
+    """Return the schema of `[model.parameters]`, and the name of the parameter of `build` that takes
+    all of it, None where there is none.
 
     Parameters are those of the function, each with its type, or one pydantic model. Annotated[float,
     "mm"] has a unit: a text such as "2 cm" is converted.
     """
     names = list(inspect.signature(build).parameters.values())
     only = hints.get(names[0].name) if len(names) == 1 else None
-    kind: type[BaseModel]
-    is_model = False
     if isinstance(only, type) and issubclass(only, BaseModel):
-        kind, is_model = only, True
-    else:
-        fields: dict[str, Any] = {}
-        for p in names:
-            if p.name not in hints or p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD):
-                raise input_error(
-                    f"model.python: {build.__name__}({p.name})", str(p), "each parameter has a type",
-                    f"Write {p.name}: float = 1.0, or {p.name}: Annotated[float, \"mm\"]",
-                )  # fmt: skip
-            default = ... if p.default is p.empty else p.default
-            # Numbers, flags and texts as they are; a list of TOML may be a tuple, a text a choice.
-            strict = _plain(hints[p.name]) in (bool, int, float, str)
-            field: Any = Field(default, strict=strict, validate_default=True)
-            fields[p.name] = (_with_unit(hints[p.name]), field)
-        kind = create_model("Parameters", __base__=Section, **fields)
+        return only, names[0].name
+    fields: dict[str, Any] = {}
+    for p in names:
+        if p.name not in hints or p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD):
+            raise input_error(
+                f"model.python: {build.__name__}({p.name})", str(p), "each parameter has a type",
+                f"Write {p.name}: float = 1.0, or {p.name}: Annotated[float, \"mm\"]",
+            )  # fmt: skip
+        default = ... if p.default is p.empty else p.default
+        # Numbers, flags and texts as they are; a list of TOML may be a tuple, a text a choice.
+        strict = _plain(hints[p.name]) in (bool, int, float, str)
+        field: Any = Field(default, strict=strict, validate_default=True)
+        fields[p.name] = (_with_unit(hints[p.name]), field)
+    return create_model("Parameters", __base__=Section, **fields), None
+
+
+def _validated(kind: type[BaseModel], given: dict[str, Any]) -> BaseModel:
+    """Return the table of parameters, checked. **Raises:** `dvax.InputError`."""
     unknown = Problems(
         unknown_key(f"model.parameters.{key}", key, value, list(kind.model_fields))
         for key, value in given.items()
@@ -210,15 +244,37 @@ def _arguments(
     )
     unknown.raise_any()
     try:
-        made = kind.model_validate(given)
+        return kind.model_validate(given)
     except ValidationError as error:
         # The name of the file is added where it is known (`Wording`).
         found = translate(error, "", "model.parameters", kind)
         raise InputError(*(replace(p, place=p.place.removeprefix(": ")) for p in found)) from error
-    complete = made.model_dump(mode="json", exclude_none=True)
-    if is_model:
-        return {names[0].name: made}, complete
-    return {p.name: getattr(made, p.name) for p in names}, complete
+
+
+def _file_names(made: BaseModel, given: Mapping[str, Any]) -> dict[str, str]:
+    """Return the names of the data files among the parameters `made` from the table `given`, by their
+    dotted keys below `[model]`.
+
+    **Raises:** `dvax.InputError` for a file that the table does not name, and for a list of files.
+    """
+    named, problems, found = flat_keys(given), Problems(), {}
+    for key, value in flat_keys(made.model_dump()).items():
+        place = f"model.{_PARAMETERS}{key}"
+        if isinstance(value, list | tuple | set) and any(isinstance(v, Path) for v in value):
+            problems.add(
+                place, f"{len(value)} files in a list", "each data file has a key of its own",
+                "Write a parameter of type pathlib.Path for each file",
+            )  # fmt: skip
+        elif isinstance(value, Path) and key not in named:
+            problems.add(
+                place, f"the default {str(value)!r}",
+                "the configuration names every data file, so that the run has its copy and its hash",
+                f'Write {key.rpartition(".")[2]} = "{value.name}" in the configuration',
+            )  # fmt: skip
+        elif isinstance(value, Path):
+            found[f"{_PARAMETERS}{key}"] = str(named[key])
+    problems.raise_any()
+    return found
 
 
 def _unit(hint: Any) -> str | None:
