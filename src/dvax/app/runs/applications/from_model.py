@@ -20,15 +20,17 @@ from dvax.app.runs.applications.base import (
     Say,
     Variable,
 )
-from dvax.app.runs.applications.certificate import Certificate, certificate
+from dvax.app.runs.applications.certificate import Certificate, certificate, log_growth
 from dvax.app.runs.schema import Section, SolverKeys
 from dvax.app.runs.solver_options import check_model_steps, settings
+from dvax.app.runs.state_bound import REMEDY
 from dvax.errors import input_error
 from dvax.evolution import Solution
 from dvax.evolution.auto import choose
 from dvax.models import Model
 from dvax.theory import Assumption, Constants, verify
 
+EPSILON = float(np.finfo(float).eps)
 FINAL_VALUES = 12
 """Up to this many final values are figures of the summary."""
 
@@ -54,6 +56,8 @@ class AbstractModelApplication(abc.ABC):
     - `axis`: the name and the description of the saved times in the results;
     - `certified`: whether steps are chosen for a proved bound;
     - `verified`: whether `dvax.verify` checks the assumptions, besides the constants of the model;
+    - `energy`: whether `dvax.verify` searches for a norm in which trajectories approach each other;
+    - `remedy`: a sentence on what may make a bound smaller that certifies no digit;
     - `whole`: whether the figures need the solution at all saved times, which must fit into the memory;
     - `bound_words`, `bound_unit`, `bound_scale`: of the bound on the error, which is the scale times
       that of the state in the norm of the state space.
@@ -71,6 +75,8 @@ class AbstractModelApplication(abc.ABC):
     axis: ClassVar[tuple[str, str]] = ("time", "time")
     certified = True
     verified = True
+    energy = False
+    remedy = REMEDY
     whole = False
     bound_words = "bound on the error of the state in the norm of the state space"
     bound_unit = ""
@@ -156,7 +162,9 @@ class AbstractModelApplication(abc.ABC):
     def verification(self) -> Any:
         """The result of `dvax.verify` for the problem."""
         m = self.own
-        return self.call(lambda: verify(m.problem, m.x0, m.t0, self.t_end, m.args))
+        return self.call(
+            lambda: verify(m.problem, m.x0, m.t0, self.t_end, m.args, energy=self.energy)
+        )
 
     @property
     def constants(self) -> Constants | None:
@@ -184,7 +192,23 @@ class AbstractModelApplication(abc.ABC):
         ]
         if self.settings.get("method") is None and self.settings.get("dt") is None:
             sizes.append(("method", *self._choice()))
-        return Description(self.constants, self.assumptions, sizes, self.notes())
+        notes = (*self.notes(), *self._note_on_bound())
+        return Description(self.constants, self.assumptions, sizes, notes)
+
+    def _note_on_bound(self) -> tuple[str, ...]:
+        """Return a sentence if errors of the size of the tolerance may grow to that of the solution."""
+        if self.constants is None:
+            return ()
+        given = self.settings
+        # Errors of fixed steps are not known before a run, but those of rounding are.
+        error = EPSILON if given.get("dt") is not None else float(given.get("rtol", 1e-6))
+        growth = log_growth(self.constants, self.t_end - self.own.t0)
+        if growth + np.log(error) < 0 or not np.isfinite(growth):
+            return ()
+        return (
+            f"By these constants an error may grow by a factor of up to 1e{growth / np.log(10):.0f} "
+            f"over the run, so that the error bound may certify no digit. {self.remedy}",
+        )
 
     def _choice(self) -> tuple[str, str]:
         """Return the method that `dvax.solve` will choose, and the reason."""

@@ -22,6 +22,7 @@ from dvax.app.runs.schema_errors import translate, unknown_key
 from dvax.errors import DvaxError, InputError, Problems, input_error
 from dvax.evolution import Solution
 from dvax.models import Model
+from dvax.theory.energy import MAX_UNKNOWNS
 
 _PARAMETERS = "parameters."
 
@@ -40,6 +41,9 @@ class PythonSection(FramesKeys):
     t_end: float | None = Field(None, description="end of the run, by default that of the model")
     certify: bool = Field(
         False, description="choose steps whose defect can be bounded, and not the fastest ones"
+    )
+    energy: bool = Field(
+        False, description="search for a norm in which the error bound grows more slowly"
     )
 
     @model_validator(mode="before")
@@ -75,6 +79,9 @@ class PythonApplication(AbstractModelApplication):
             )  # fmt: skip
         _run(self.file, lambda: model.problem.check(model.t0, model.x0, model.args))
         self.certified, self.place_of_figures = table.certify, f"{self.file.name}: figures"
+        self.energy, self.remedy = table.energy, _remedy(table.energy)
+        if table.energy:
+            _check_energy(model)
         self.whole = model.figures is not None
         self.set_model(model, table.t_end)
 
@@ -95,7 +102,14 @@ class PythonApplication(AbstractModelApplication):
         return _run(self.file, work)
 
     def notes(self) -> tuple[str, ...]:
-        return (f"The code of {self.file.name}:{self.table.function} is executed.",)
+        said = [f"The code of {self.file.name}:{self.table.function} is executed."]
+        if self.energy and self.constants is not None and self.constants.energy is None:
+            said.append(
+                "energy = true has found no norm, and the error bound uses that of the state space. "
+                "The search needs f and h whose derivatives do not change, and at most "
+                f"{MAX_UNKNOWNS} unknowns of x and u together."
+            )
+        return tuple(said)
 
     def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
         return {**self.named(solution), **self.bound_series(bound)}
@@ -107,6 +121,31 @@ class PythonApplication(AbstractModelApplication):
         found = {} if of is None else _run(self.file, lambda: dict(of(end)))
         own = {n: Figure(*_figure(self.file, n, entry)) for n, entry in found.items()}
         return self.joined(self.final_values(end) | self.bound_figure(bound), own)
+
+
+def _remedy(has_energy: bool) -> str:
+    """Return what to try for a smaller bound."""
+    other = "weights of the state space (state_space=dvax.spaces.L2(weights)) or a shorter run"
+    first = "Try" if has_energy else "Try energy = true in [model],"
+    return (
+        f"{first} {other}; the page Troubleshooting by message of the documentation "
+        "(docs/howto/troubleshooting.md) says more."
+    )
+
+
+def _check_energy(model: Model) -> None:
+    """Raise an `InputError` if no norm can be searched for."""
+    if model.constants is not None:
+        raise input_error(
+            "model.energy", "true", "the model declares its constants, and nothing is searched for",
+            "Leave energy out, or constants= of dvax.models.Model",
+        )  # fmt: skip
+    if importlib.util.find_spec("clarabel") is None:
+        raise input_error(
+            "model.energy", "true",
+            "the norm is found by a semidefinite program, which Clarabel solves",
+            "Install it with pip install 'dvax[energy]', or leave energy out",
+        )  # fmt: skip
 
 
 def _figure(file: Path, name: str, entry: Any) -> tuple[Any, str, str]:
