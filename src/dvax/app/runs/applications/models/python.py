@@ -210,19 +210,30 @@ def _run(file: Path, work: Callable[[], Any]) -> Any:
     """
     try:
         return work()
+    except InputError as error:
+        place = _line(file, error)
+        if place == file.name:
+            raise
+        raise InputError(
+            *(replace(p, place=f"{place}: {p.place}") for p in error.problems)
+        ) from error
     except DvaxError:
         raise
     except Exception as error:
-        lines = [
-            f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(file)
-        ]
-        if isinstance(error, SyntaxError) and error.lineno:
-            lines.append(error.lineno)
-        place = f"{file.name}, line {lines[-1]}" if lines else file.name
         raise input_error(
-            place, f"{type(error).__name__}: {error}"[:300], "the file must run without an exception",
+            _line(file, error), f"{type(error).__name__}: {error}"[:300],
+            "the file must run without an exception",
             "Fix that line; --debug shows the traceback",
         ) from error  # fmt: skip
+
+
+def _line(file: Path, error: Exception) -> str:
+    """Return the file, with the last line in it that an exception passed through, if there is one."""
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if frame.filename == str(file)]
+    if isinstance(error, SyntaxError) and error.lineno:
+        lines.append(error.lineno)
+    return f"{file.name}, line {lines[-1]}" if lines else file.name
 
 
 def _arguments(
