@@ -14,12 +14,13 @@ from pydantic import BaseModel
 from dvax.app.runs.applications import models
 from dvax.app.runs.config import Config, check_contact
 from dvax.app.runs.data_file import DataFile, fingerprint, locate
+from dvax.app.runs.partial import validated_in_part
 from dvax.app.runs.schema import SECTIONS, ModelSection, ReportSection, Section
 from dvax.app.runs.schema_errors import shown
 from dvax.app.runs.sections import read_sections
 from dvax.app.runs.toml_file import read_toml
 from dvax.app.runs.wording import Wording
-from dvax.errors import Problems, input_error
+from dvax.errors import InputError, Problems, input_error
 
 if TYPE_CHECKING:
     from dvax.app.runs.applications.from_model import AbstractModelApplication
@@ -189,15 +190,44 @@ def _likely_application(table: Mapping[str, Any]) -> str | None:
 def _check(
     raw: dict[str, Any], name: str, source: Path, allow_outside: bool, quiet: bool
 ) -> ModelConfig:
-    file = source.name
+    file, problems = source.name, Problems()
     application = module_of(name).APPLICATION
-    sections = read_sections(raw, {"model": application.section, "output": ReportSection}, file)
-    problems, table = Problems(), sections["model"]
+    sections: dict[str, Any] = {}
+    with problems.collect():
+        kinds = {"model": application.section, "output": ReportSection}
+        sections = read_sections(raw, kinds, file)
+    table = sections.get("model") or validated_in_part(application.section, raw["model"])
+    if table is None:
+        raise InputError(*problems)
     paths: dict[str, Path] = {}
+    with problems.collect():
+        paths |= _located(application, table, source, allow_outside)
+    model = None
+    with problems.collect(), wording_of(application, file).in_keys():
+        if not problems or (application.is_checked_in_part and paths):
+            for key, given in application.further_files(table, paths).items():
+                with problems.collect():
+                    place = f"{file}: model.{key}"
+                    paths[key] = locate(given, source.parent, allow_outside, place)
+        if not problems or (application.is_checked_in_part and paths):
+            model = application(table, paths, quiet)
+    if problems or model is None:
+        raise InputError(*dict.fromkeys(problems))
+    return ModelConfig(name, model.table, sections["output"], source, application, model, paths)
+
+
+def _located(
+    application: "type[AbstractModelApplication]", table: Section, source: Path, allow_outside: bool
+) -> dict[str, Path]:
+    """Return the data files and folders that a table names, by their keys.
+
+    **Raises:** `dvax.InputError` with all that are missing.
+    """
+    problems, paths = Problems(), {}
     for key in (*application.files, *application.folders):
         given = getattr(table, key)
         if isinstance(given, str):  # in the place of a file a key may have numbers
-            place, is_folder = f"{file}: model.{key}", key in application.folders
+            place, is_folder = f"{source.name}: model.{key}", key in application.folders
             with problems.collect():
                 paths[key] = locate(given, source.parent, allow_outside, place, is_folder=is_folder)
             for inside in application.folders.get(key, ()):
@@ -206,11 +236,4 @@ def _check(
                     with problems.collect():
                         locate(f"{given}/{inside}", source.parent, allow_outside, place)
     problems.raise_any()
-    with wording_of(application, file).in_keys():
-        further = application.further_files(table, paths)
-        for key, given in further.items():
-            with problems.collect():
-                paths[key] = locate(given, source.parent, allow_outside, f"{file}: model.{key}")
-        problems.raise_any()
-        model = application(table, paths, quiet)
-    return ModelConfig(name, model.table, sections["output"], source, application, model, paths)
+    return paths

@@ -25,7 +25,7 @@ from dvax.app.runs.schema import Section, SolverKeys
 from dvax.app.runs.solver_options import check_model_steps, settings
 from dvax.app.runs.state_bound import REMEDY
 from dvax.errors import input_error
-from dvax.evolution import Solution
+from dvax.evolution import PiecewiseLinear, Solution
 from dvax.evolution.auto import choose
 from dvax.models import Model
 from dvax.theory import Assumption, Constants, verify
@@ -51,6 +51,8 @@ class AbstractModelApplication(abc.ABC):
 
     - `section`: the table, for pydantic; `table`: the checked one, complete;
     - `files`, `folders`: the keys that name data files, and folders with the files that are read there;
+    - `is_checked_in_part`: whether the constructor is also called if keys are wrong, which the table
+      does not have then, or if further files are missing, to find the other problems;
     - `keys`: the keys that make an argument of the model, where their names differ from its name;
     - `end`: the key for the last time of a run, where there is one;
     - `axis`: the name and the description of the saved times in the results;
@@ -66,6 +68,7 @@ class AbstractModelApplication(abc.ABC):
     section: ClassVar[type[Section]]
     files: ClassVar[tuple[str, ...]] = ()
     folders: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    is_checked_in_part: ClassVar[bool] = False
     keys: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     end: ClassVar[str | None] = None
     table: Any
@@ -200,8 +203,11 @@ class AbstractModelApplication(abc.ABC):
         if self.constants is None:
             return ()
         given = self.settings
-        # Errors of fixed steps are not known before a run, but those of rounding are.
-        error = EPSILON if given.get("dt") is not None else float(given.get("rtol", 1e-6))
+        # The errors of fixed steps are not known before a run, and exact steps have those of rounding.
+        is_rounding = given.get("dt") is not None or isinstance(
+            given.get("method"), PiecewiseLinear
+        )
+        error = EPSILON if is_rounding else float(given.get("rtol", 1e-6))
         growth = log_growth(self.constants, self.t_end - self.own.t0)
         if growth + np.log(error) < 0 or not np.isfinite(growth):
             return ()

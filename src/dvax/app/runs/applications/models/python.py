@@ -8,23 +8,19 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError, create_model, model_validator
+from pydantic import Field, model_validator
 
 from dvax.app.runs.applications.base import Figure, Variable
 from dvax.app.runs.applications.certificate import Certificate
 from dvax.app.runs.applications.from_model import AbstractModelApplication, FramesKeys
-from dvax.app.runs.keys import flat_keys, set_key
-from dvax.app.runs.schema import Section, in_unit
-from dvax.app.runs.schema_errors import translate, unknown_key
+from dvax.app.runs.applications.own_parameters import PREFIX, Parameters, complete, unit_of
 from dvax.errors import DvaxError, InputError, Problems, input_error
 from dvax.evolution import Solution
 from dvax.models import Model
 from dvax.theory.energy import MAX_UNKNOWNS
-
-_PARAMETERS = "parameters."
 
 
 class PythonSection(FramesKeys):
@@ -61,38 +57,47 @@ class PythonApplication(AbstractModelApplication):
 
     section = PythonSection
     files = ("python",)
+    is_checked_in_part = True
     end = "model.t_end"
 
     def __init__(self, table: PythonSection, paths: Mapping[str, Path], quiet: bool):
         self.file = paths["python"]
         build, hints = _function(self.file, table.function)
-        self.units = {name: unit for name in hints if (unit := _unit(hints[name])) is not None}
-        located = {key: path for key, path in paths.items() if key.startswith(_PARAMETERS)}
-        arguments, given = _run(self.file, lambda: _arguments(build, hints, table, located))
-        self.table = table.model_copy(update={"parameters": given})
-        model = _run(self.file, lambda: build(**arguments))
-        if not isinstance(model, Model):
-            raise input_error(
-                f"{self.file.name}: {table.function}", type(model).__name__,
-                "it must return a dvax.models.Model",
-                "Write return dvax.models.Model(problem, x0, t_end)",
-            )  # fmt: skip
-        _run(self.file, lambda: model.problem.check(model.t0, model.x0, model.args))
+        self.units = {name: unit for name in hints if (unit := unit_of(hints[name])) is not None}
+        parameters, problems = _run(self.file, lambda: Parameters(build, hints)), Problems()
+        made = _run(self.file, lambda: parameters.in_part(table.parameters))
+        with problems.collect():
+            made = _run(self.file, lambda: parameters.validated(table.parameters))
+        if made is None or set(parameters.files(made, table.parameters)) - set(paths):
+            # The caller reports files that are missing.
+            raise InputError(*problems)
+        located = {key: path for key, path in paths.items() if key.startswith(PREFIX)}
+        self.table = table.model_copy(update={"parameters": complete(made)})
+        try:
+            arguments = parameters.arguments(made, located)
+            model = _built(self.file, table.function, lambda: build(**arguments))
+        except InputError:
+            # With wrong parameters only the problems are of interest that do not depend on them.
+            problems.raise_any()
+            raise
         self.certified, self.place_of_figures = table.certify, f"{self.file.name}: figures"
         self.energy, self.remedy = table.energy, _remedy(table.energy)
-        if table.energy:
-            _check_energy(model)
         self.whole = model.figures is not None
-        self.set_model(model, table.t_end)
+        if table.energy:
+            with problems.collect():
+                _check_energy(model)
+        with problems.collect():
+            self.set_model(model, table.t_end)
+        problems.raise_any()
 
     @classmethod
     def further_files(cls, table: PythonSection, paths: Mapping[str, Path]) -> Mapping[str, str]:
         """Return the values of the parameters whose type is `pathlib.Path`."""
         file = paths["python"]
         build, hints = _function(file, table.function)
-        kind, _ = _parameters(build, hints)
-        made = _run(file, lambda: _validated(kind, table.parameters))
-        return _file_names(made, table.parameters)
+        parameters = _run(file, lambda: Parameters(build, hints))
+        made = _run(file, lambda: parameters.in_part(table.parameters))
+        return {} if made is None else parameters.files(made, table.parameters)
 
     @property
     def fit(self) -> str:
@@ -121,6 +126,19 @@ class PythonApplication(AbstractModelApplication):
         found = {} if of is None else _run(self.file, lambda: dict(of(end)))
         own = {n: Figure(*_figure(self.file, n, entry)) for n, entry in found.items()}
         return self.joined(self.final_values(end) | self.bound_figure(bound), own)
+
+
+def _built(file: Path, function: str, build: Callable[[], Any]) -> Model:
+    """Return the model that a function in a file builds, its problem checked."""
+    model = _run(file, build)
+    if not isinstance(model, Model):
+        raise input_error(
+            f"{file.name}: {function}", type(model).__name__,
+            "it must return a dvax.models.Model",
+            "Write return dvax.models.Model(problem, x0, t_end)",
+        )  # fmt: skip
+    _run(file, lambda: model.problem.check(model.t0, model.x0, model.args))
+    return model
 
 
 def _remedy(has_energy: bool) -> str:
@@ -234,115 +252,6 @@ def _line(file: Path, error: Exception) -> str:
     if isinstance(error, SyntaxError) and error.lineno:
         lines.append(error.lineno)
     return f"{file.name}, line {lines[-1]}" if lines else file.name
-
-
-def _arguments(
-    build: Callable[..., Any],
-    hints: dict[str, Any],
-    table: PythonSection,
-    located: Mapping[str, Path],
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the arguments for `build`, whose types are `hints`, from the table of parameters, and that
-    table, completed. Data files have the paths `located`, by their dotted keys below `[model]`."""
-    kind, whole = _parameters(build, hints)
-    made = _validated(kind, table.parameters)
-    complete = made.model_dump(mode="json", exclude_none=True)
-    if located:
-        moved = made.model_dump(mode="json", exclude_none=True)
-        for key, path in located.items():
-            set_key(moved, key.removeprefix(_PARAMETERS), str(path))
-        made = _validated(kind, moved)
-    if whole is not None:
-        return {whole: made}, complete
-    return {name: getattr(made, name) for name in kind.model_fields}, complete
-
-
-def _parameters(
-    build: Callable[..., Any], hints: dict[str, Any]
-) -> tuple[type[BaseModel], str | None]:
-    """Return the schema of `[model.parameters]`, and the name of the parameter of `build` that takes
-    all of it, None where there is none.
-
-    Parameters are those of the function, each with its type, or one pydantic model. Annotated[float,
-    "mm"] has a unit: a text such as "2 cm" is converted.
-    """
-    names = list(inspect.signature(build).parameters.values())
-    only = hints.get(names[0].name) if len(names) == 1 else None
-    if isinstance(only, type) and issubclass(only, BaseModel):
-        return only, names[0].name
-    fields: dict[str, Any] = {}
-    for p in names:
-        if p.name not in hints or p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD):
-            raise input_error(
-                f"model.python: {build.__name__}({p.name})", str(p), "each parameter has a type",
-                f"Write {p.name}: float = 1.0, or {p.name}: Annotated[float, \"mm\"]",
-            )  # fmt: skip
-        default = ... if p.default is p.empty else p.default
-        # Numbers, flags and texts as they are; a list of TOML may be a tuple, a text a choice.
-        strict = _plain(hints[p.name]) in (bool, int, float, str)
-        field: Any = Field(default, strict=strict, validate_default=True)
-        fields[p.name] = (_with_unit(hints[p.name]), field)
-    return create_model("Parameters", __base__=Section, **fields), None
-
-
-def _validated(kind: type[BaseModel], given: dict[str, Any]) -> BaseModel:
-    """Return the table of parameters, checked. **Raises:** `dvax.InputError`."""
-    unknown = Problems(
-        unknown_key(f"model.parameters.{key}", key, value, list(kind.model_fields))
-        for key, value in given.items()
-        if key not in kind.model_fields and kind.model_config.get("extra") != "allow"
-    )
-    unknown.raise_any()
-    try:
-        return kind.model_validate(given)
-    except ValidationError as error:
-        # The name of the file is added where it is known (`Wording`).
-        found = translate(error, "", "model.parameters", kind)
-        raise InputError(*(replace(p, place=p.place.removeprefix(": ")) for p in found)) from error
-
-
-def _file_names(made: BaseModel, given: Mapping[str, Any]) -> dict[str, str]:
-    """Return the names of the data files among the parameters `made` from the table `given`, by their
-    dotted keys below `[model]`.
-
-    **Raises:** `dvax.InputError` for a file that the table does not name, and for a list of files.
-    """
-    named, problems, found = flat_keys(given), Problems(), {}
-    for key, value in flat_keys(made.model_dump()).items():
-        place = f"model.{_PARAMETERS}{key}"
-        if isinstance(value, list | tuple | set) and any(isinstance(v, Path) for v in value):
-            problems.add(
-                place, f"{len(value)} files in a list", "each data file has a key of its own",
-                "Write a parameter of type pathlib.Path for each file",
-            )  # fmt: skip
-        elif isinstance(value, Path) and key not in named:
-            problems.add(
-                place, f"the default {str(value)!r}",
-                "the configuration names every data file, so that the run has its copy and its hash",
-                f'Write {key.rpartition(".")[2]} = "{value.name}" in the configuration',
-            )  # fmt: skip
-        elif isinstance(value, Path):
-            found[f"{_PARAMETERS}{key}"] = str(named[key])
-    problems.raise_any()
-    return found
-
-
-def _unit(hint: Any) -> str | None:
-    """Return the unit of a type, a text among its annotations."""
-    return next((a for a in getattr(hint, "__metadata__", ()) if isinstance(a, str)), None)
-
-
-def _plain(hint: Any) -> Any:
-    """Return a type without its annotations."""
-    return get_args(hint)[0] if get_origin(hint) is Annotated else hint
-
-
-def _with_unit(hint: Any) -> Any:
-    """Return a type whose unit converts quantities."""
-    unit = _unit(hint)
-    if unit is None:
-        return hint
-    return Annotated[_plain(hint), in_unit(unit), Field(description=f"[{unit}]")]
 
 
 APPLICATION = PythonApplication
