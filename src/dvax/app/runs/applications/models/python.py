@@ -36,7 +36,9 @@ class PythonSection(FramesKeys):
     )
     t_end: float | None = Field(None, description="end of the run, by default that of the model")
     certify: bool = Field(
-        False, description="choose steps whose defect can be bounded, and not the fastest ones"
+        False,
+        description="choose steps whose defect can be enclosed, and not the fastest ones; "
+        "they can be orders of magnitude more",
     )
     energy: bool = Field(
         False, description="search for a norm in which the error bound grows more slowly"
