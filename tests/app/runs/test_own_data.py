@@ -130,6 +130,16 @@ def test_a_wrong_data_file_is_named_with_its_key(tmp_path, parameters, function,
     assert all(word in told for word in words), told
 
 
+def test_a_missing_file_has_its_path_from_the_working_directory(tmp_path, monkeypatch):
+    file = written(tmp_path / "made", '[model.parameters]\nrate = "rate.csv"\n')
+    monkeypatch.chdir(file.parent)
+    assert "Put it at rate.csv or" in problem(file)
+    monkeypatch.chdir(tmp_path)
+    assert f"Put it at {Path('made/rate.csv')} or" in problem(file)
+    monkeypatch.chdir(file.parent / "data")
+    assert f"Put it at {file.parent / 'rate.csv'} or" in problem(file)
+
+
 def test_files_of_one_name_have_their_folders_in_the_manifest(tmp_path):
     file = written(tmp_path / "made", NAMED + 'other = "rate.csv"\n')
     (file.parent / "rate.csv").write_text("other\n")

@@ -2,12 +2,14 @@
 
 import json
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import dvax
 from dvax.app.cli.program import app
 from dvax.app.runs.applications.config import read_config
+from dvax.app.runs.applications.models.python import _bound_unit
 from dvax.app.runs.state_bound import useless_bound
 
 CODE = """
@@ -60,6 +62,19 @@ def test_check_and_run_say_that_a_bound_certifies_no_digit_and_energy_makes_it_s
     assert "certif" not in call("check", file)
     assert "certif" not in call("run", file, "-o", tmp_path / "small")
     assert bound(tmp_path / "small")["relative"] < 1e-3
+
+
+@pytest.mark.parametrize(("states", "space", "unit"), [
+    ({"a": "m", "b": "m"}, {}, "m"),
+    ({"a": "m", "b": "m/s"}, {}, ""),
+    ({"a": "m", "b": "m"}, {"state_space": dvax.spaces.L2(np.array([2.0, 1.0]))}, ""),
+])  # fmt: skip
+def test_a_bound_has_the_unit_that_all_states_have_in_a_norm_without_weights(states, space, unit):
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1.0),
+        f=lambda t, x, u, args: u, h=lambda t, x, u, args: -x, **space,
+    )  # fmt: skip
+    assert _bound_unit(dvax.models.Model(problem, np.zeros(2), 1.0, states=states)) == unit
 
 
 def test_check_says_that_no_norm_is_found(tmp_path):

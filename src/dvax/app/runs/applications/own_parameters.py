@@ -45,7 +45,8 @@ class Parameters:
             default = ... if p.default is p.empty else p.default
             # Numbers, flags and texts as they are; a list of TOML may be a tuple, a text a choice.
             strict = _plain(hints[p.name]) in (bool, int, float, str)
-            field: Any = Field(default, strict=strict, validate_default=True)
+            about = None if unit_of(hints[p.name]) else f"a parameter of {build.__name__}"
+            field: Any = Field(default, strict=strict, validate_default=True, description=about)
             fields[p.name] = (_with_unit(hints[p.name]), field)
         self.kind = create_model("Parameters", __base__=Section, **fields)
 

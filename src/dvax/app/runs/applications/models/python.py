@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal, get_type_hints
 
+import jax.tree_util as jtu
 import numpy as np
 from pydantic import Field, model_validator
 
@@ -84,7 +85,7 @@ class PythonApplication(AbstractModelApplication):
             raise
         self.certified, self.place_of_figures = table.certify, f"{self.file.name}: figures"
         self.energy, self.remedy = table.energy, _remedy(table.energy)
-        self.whole = model.figures is not None
+        self.whole, self.bound_unit = model.figures is not None, _bound_unit(model)
         if table.energy:
             with problems.collect():
                 _check_energy(model)
@@ -151,6 +152,14 @@ def _remedy(has_energy: bool) -> str:
         f"{first} {other}; the page Troubleshooting by message of the documentation "
         "(docs/howto/troubleshooting.md) says more."
     )
+
+
+def _bound_unit(model: Model) -> str:
+    """Return the unit of a norm of the state: that of all states if their weights are 1, else "", since
+    weights may have units."""
+    units = set(model.states.values())
+    weights = jtu.tree_leaves(model.problem.spaces(model.x0)[0].weights())
+    return units.pop() if len(units) == 1 and all(np.all(w == 1) for w in weights) else ""
 
 
 def _check_energy(model: Model) -> None:
