@@ -77,8 +77,19 @@ def test_so_many_members_are_checked_until_a_sweep_is_refused(tmp_path, monkeypa
 
 
 def test_error_of_dvax_in_a_function_of_the_user_has_its_line(tmp_path):
-    model = MODEL.replace('raise ValueError("this rate has no model")', "dvax.sets.Box(1.0, 0.0)")
-    file = written(tmp_path, RATES.format("[1.0, 13.0]"), model=model)
-    told = call(file, "--check").stderr
-    assert "(model.parameters.rate = 13.0): decay.py, line" in told
-    assert f"line {LINE}: dvax.sets.Box(lower, upper)" in told
+    in_build = MODEL.replace(
+        'raise ValueError("this rate has no model")', "dvax.sets.Box(1.0, 0.0)"
+    )
+    function = "lambda t, args: dvax.sets.Box(0.0, 13.5 - args['rate'])"
+    # K is called when the problem is checked, after the function has returned.
+    in_problem = MODEL.replace("dvax.sets.Box(0.0, 10.0)", function).replace("13.0", "-1.0")
+    for model, wrong, line in (
+        (in_build, "13.0", LINE),
+        (in_problem, "14.0", 1 + MODEL[: MODEL.index("dvax.sets.Box")].count("\n")),
+    ):
+        file = written(tmp_path / wrong, RATES.format(f"[1.0, {wrong}]"), model=model)
+        told = call(file, "--check").stderr
+        place = f"(model.parameters.rate = {wrong}): decay.py, line {line}: dvax.sets.Box"
+        assert place in told, told
+    debug = call(file, "--check", "--debug").stderr
+    assert "Traceback" in debug and "decay.py" in debug

@@ -202,17 +202,18 @@ def _check(
     paths: dict[str, Path] = {}
     with problems.collect():
         paths |= _located(application, table, source, allow_outside)
-    model = None
-    with problems.collect(), wording_of(application, file).in_keys():
-        if not problems or (application.is_checked_in_part and paths):
+    if problems and not (application.is_checked_in_part and paths):
+        raise InputError(*problems)
+    try:
+        with wording_of(application, file).in_keys():
             for key, given in application.further_files(table, paths).items():
                 with problems.collect():
                     place = f"{file}: model.{key}"
                     paths[key] = locate(given, source.parent, allow_outside, place)
-        if not problems or (application.is_checked_in_part and paths):
             model = application(table, paths, quiet)
-    if problems or model is None:
-        raise InputError(*dict.fromkeys(problems))
+    except InputError as error:
+        raise InputError(*problems, *error.problems) from error
+    problems.raise_any()
     return ModelConfig(name, model.table, sections["output"], source, application, model, paths)
 
 

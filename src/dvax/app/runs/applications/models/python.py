@@ -241,7 +241,8 @@ def _run(file: Path, work: Callable[[], Any]) -> Any:
         return work()
     except InputError as error:
         place = _line(file, error)
-        if place == file.name:
+        # Of several problems that were collected each has a line of its own.
+        if place == file.name or (error.__cause__ is not None and len(error.problems) > 1):
             raise
         raise InputError(
             *(replace(p, place=f"{place}: {p.place}") for p in error.problems)
@@ -257,11 +258,16 @@ def _run(file: Path, work: Callable[[], Any]) -> Any:
 
 
 def _line(file: Path, error: Exception) -> str:
-    """Return the file, with the last line in it that an exception passed through, if there is one."""
-    frames = traceback.extract_tb(error.__traceback__)
-    lines = [frame.lineno for frame in frames if frame.filename == str(file)]
-    if isinstance(error, SyntaxError) and error.lineno:
-        lines.append(error.lineno)
+    """Return the file, with the last line in it that an exception or its cause passed through, if there
+    is one."""
+    lines: list[int | None] = []
+    found: BaseException | None = error
+    while found is not None and not lines:
+        frames = traceback.extract_tb(found.__traceback__)
+        lines += [frame.lineno for frame in frames if frame.filename == str(file)]
+        if isinstance(found, SyntaxError) and found.lineno:
+            lines.append(found.lineno)
+        found = found.__cause__
     return f"{file.name}, line {lines[-1]}" if lines else file.name
 
 
