@@ -66,7 +66,12 @@ def input_error(place: str, given: str, rule: str, fix: str) -> InputError:
 
 
 class Problems(list[InputProblem]):
-    """A list of problems that are raised together."""
+    """A list of problems that are raised together.
+
+    `cause` is the first error that was collected: its traceback leads to the place in the user's code.
+    """
+
+    cause: InputError | None = None
 
     def add(self, place: str, given: str, rule: str, fix: str) -> None:
         """Append a problem; the arguments are those of `InputProblem`."""
@@ -79,11 +84,12 @@ class Problems(list[InputProblem]):
             yield
         except InputError as error:
             self += error.problems
+            self.cause = self.cause or error
 
     def raise_any(self) -> None:
         """Raise an `InputError` if there are problems."""
         if self:
-            raise InputError(*self)
+            raise InputError(*self) from self.cause
 
 
 @dataclass(frozen=True)

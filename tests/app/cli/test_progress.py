@@ -98,7 +98,13 @@ def test_progress_of_a_sweep_counts_members_and_warns_of_failures(
     told = [
         {"event": "started", "members": 5, "complete": 1},
         {"event": "member", "member": 1, "status": "finished"},
-        {"event": "member", "member": 2, "status": "failed", "reason": "no model"},
+        {
+            "event": "member",
+            "member": 2,
+            "status": "failed",
+            "reason": "no model",
+            "values": {"model.rate": 13.0},
+        },
         {"event": "member", "member": 3, "status": "finished"},
         {"event": "member", "member": 4, "status": "finished"},
         {"event": "stopped", "counts": {}},
@@ -109,6 +115,6 @@ def test_progress_of_a_sweep_counts_members_and_warns_of_failures(
             tell(event)
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "5 members, 1 complete"
-    assert lines[2] == "warning: member 2 failed: no model"
+    assert lines[2] == "warning: member 2 (model.rate = 13.0) failed: no model"
     shown = [line.rpartition(",")[0] for line in lines[1:2] + lines[3:]]
     assert shown == [f"{n} of 5 members ({25 * n - 25}%)" for n in (2, 3, 4, 5)]

@@ -72,6 +72,8 @@ def test_a_run_has_the_variables_of_the_model_by_name_and_unit(outcome):
         "value": 0.4, "unit": "N", "meaning": "the largest force",
     }  # fmt: skip
     assert outcome.summary["final_depth"]["value"] == data["depth"].values[-1]
+    # All states have this unit, and so has their norm.
+    assert outcome.summary["error_bound"]["unit"] == data["error_bound"].attrs["units"] == "mm"
 
 
 def test_the_report_says_that_code_ran_and_draws_the_variables_in_order(outcome):
@@ -120,6 +122,7 @@ def test_code_is_not_executed_without_the_flag(tmp_path):
 @pytest.mark.parametrize(("code", "table", "words"), [
     (POINT, TABLE + "[model.parameters]\nlaod = 1.0\n", "Did you mean 'load'?"),
     (POINT, TABLE + '[model.parameters]\nload = "a"\n', "own.toml: model.parameters.load"),
+    (POINT, TABLE + "[model.parameters]\nload = true\n", "it must be a number (a parameter of build)"),
     (POINT, TABLE + '[model.parameters]\nlimit = "3 s"\n', 'Write "2.5 N"'),
     (POINT, TABLE + "t_end = -1.0\n", "model.t_end"),
     (POINT, TABLE.replace(":build", ":biuld"), "It has build"),

@@ -75,6 +75,7 @@ def carry_out(
             outcome = driver.run(config, out, overwrite=force, on_event=listener)
     if not quiet:
         _print_figures(outcome.summary)
+        _print_useless_bound(config, outcome.summary)
     if outcome.exit_code:
         print_remark(f"{outcome.status}: {outcome.stop_reason}", "bold red")
         kept = (
@@ -127,6 +128,16 @@ def _report(outcome: "RunOutcome", png: bool, quiet: bool) -> None:
         if not interrupted:
             raise
         print_remark(f"for its report: dvax report {outcome.directory}")
+
+
+def _print_useless_bound(config: "Config | ModelConfig", summary: dict[str, Any]) -> None:
+    """Say if the error bound certifies no digit, and what to try."""
+    from dvax.app.runs.state_bound import REMEDY, useless_bound
+
+    model = getattr(config, "model", None)
+    said = useless_bound(summary, getattr(model, "remedy", REMEDY))
+    if said is not None:
+        print_remark(f"note: {said}")
 
 
 def _print_figures(summary: dict[str, Any]) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dvax.app.cli.console import print_remark, print_table
+from dvax.app.cli.console import print_line, print_remark, print_table
 from dvax.app.cli.failure import reported
 from dvax.app.cli.options import AllowCode, AllowOutside, Debug, Quiet
 from dvax.app.cli.progress import Listener, progress
@@ -37,6 +37,9 @@ def sweep(
     show: Annotated[
         bool, typer.Option("--list", help="Print the members, and run nothing.")
     ] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Check the input of all members, and run nothing.")
+    ] = False,
     workers: Annotated[
         int | None, typer.Option("--workers", min=1, help="Processes, by default one a core.")
     ] = None,
@@ -57,6 +60,14 @@ def sweep(
         from dvax.app.runs.interrupt import interruptible
 
         checked = interruptible(lambda: _read(file, allow_outside, allow_code))
+        if check:
+            from dvax.app.runs.sweeps.validity import member_problems
+
+            found = interruptible(lambda: member_problems(checked, range(checked.count)))
+            found.raise_any()
+            print_line(f"{file}: no problem in the input of {checked.count} members")
+            return
+        interruptible(lambda: _require_valid_member(checked))
         if show:
             _list(checked)
             return
@@ -88,6 +99,12 @@ def _read(file: Path, allow_outside: bool, allow_code: bool) -> Any:
     return read_sweep(file, allow_outside=allow_outside, allow_code=allow_code)
 
 
+def _require_valid_member(sweep: Any) -> None:
+    from dvax.app.runs.sweeps.validity import require_valid_member
+
+    require_valid_member(sweep)
+
+
 def _list(sweep: Any) -> None:
     """Print a row a member: its number, and its values."""
     keys = [p.key for p in sweep.parameters]
@@ -114,9 +131,17 @@ def _run_one(sweep: Any, out: Path, member: int) -> None:
         )  # fmt: skip
     store.check_fit(out, sweep.parameters)
     record = run_member(sweep, out, member)
-    print_remark(f"member {member}: {record['status']}: {record['reason']}")
+    print_remark(f"{_who(record)}: {record['status']}: {record['reason']}")
     if record["exit_code"]:
         raise typer.Exit(record["exit_code"])
+
+
+def _who(record: Mapping[str, Any]) -> str:
+    """Return the number of a member and its values, by its record."""
+    from dvax.app.runs.sweeps.sweep import values_text
+
+    values = values_text(record.get("values", {}))
+    return f"member {record['member']}" + (f" ({values})" if values else "")
 
 
 def member_listener(listener: Listener) -> Callable[[Mapping[str, Any]], None]:
@@ -132,7 +157,7 @@ def member_listener(listener: Listener) -> Callable[[Mapping[str, Any]], None]:
         elif event["event"] == "member":
             done += 1
             if event["status"] == "failed":
-                message = f"member {event['member']} failed: {event['reason']}"
+                message = f"{_who(event)} failed: {event['reason']}"
                 listener({"event": "warning", "message": message})
             # The time left is that of the members of this call.
             where = f"{complete + done} of {count} members"

@@ -3,13 +3,12 @@
 They are made of summary.json and manifest.json, as the tables are.
 """
 
-import math
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
 
 from dvax._figure_text import entry_text
 from dvax.app.plots.run_reader import CONTACT, UNFINISHED, RunRecord
 from dvax.app.plots.theme import counted, number, unit_text
+from dvax.app.runs.state_bound import best_bound, certifies_no_digit, is_finite
 from dvax.theory.status import ORDER
 
 # What a run of a model solves; another model is named.
@@ -24,8 +23,6 @@ SUBJECTS = {
     "traffic": "day-to-day traffic on a road network",
     "viscoplasticity": "a viscoplastic material point",
 }
-_STATE_BOUNDS = ("error_bound", "error_bound_sharp_x", "error_bound_x")
-"""The figures that bound the error of the state."""
 _RESTS_ON = {
     "proved": "it follows from the structure of the problem, up to roundoff",
     "declared": "it rests on constants that the problem declares",
@@ -96,33 +93,21 @@ def _bounded(run: RunRecord) -> str:
         return ""
     if entry is None:
         return "No error bound was computed." if run.summary else ""
-    status, value = str(entry["bound"]), entry.get("value")
+    status = str(entry["bound"])
     if status not in _RESTS_ON:
         return f"The error bound is {status}: this method keeps no data to compute it from."
     meaning = str(entry.get("meaning", "")).removesuffix(f" ({status})")
-    if not isinstance(value, int | float) or not math.isfinite(value):
+    if not is_finite(entry):
         return f"The error bound is not finite, so it states nothing about the error ({meaning})."
     amount = f"{entry_text(entry)} {unit_text(str(entry.get('unit', '')))}".strip()
     text = f"The error bound is {status}: {amount}"
     relative = entry.get("relative")
-    if isinstance(relative, int | float) and relative >= 1:
+    if certifies_no_digit(entry):
         text += ", more than the norm of the solution, so that it certifies no digit"
     elif isinstance(relative, int | float):
         share = entry_text({"value": float(relative), "bound": status}).removeprefix("≤ ")
         text += f", at most {share} of the norm of the solution"
     return f"{text} ({meaning}; {_RESTS_ON[status]})."
-
-
-def best_bound(summary: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Any] | None:
-    """Return the bound on the error of the state, the smallest where there are several; None without
-    one."""
-    entries = [summary[name] for name in _STATE_BOUNDS if "bound" in summary.get(name, {})]
-    return min(entries, key=_size_of, default=None)
-
-
-def _size_of(entry: Mapping[str, Any]) -> float:
-    value = entry.get("value")
-    return float(value) if isinstance(value, int | float) and math.isfinite(value) else math.inf
 
 
 def _well_posed(run: RunRecord) -> str:

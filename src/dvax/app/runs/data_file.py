@@ -56,8 +56,9 @@ def locate(
     if not is_folder and directory:
         raise refuse("it is a folder, and this is for a file", "Name a file in it.")
     if not is_folder and not file:
-        where = Path(folder.resolve().name) / name
-        raise refuse("there is no such file", f"Put it at {where} or fix the name.")
+        where, here = folder.resolve() / name, Path.cwd()
+        shown_path = where.relative_to(here) if where.is_relative_to(here) else where
+        raise refuse("there is no such file", f"Put it at {shown_path} or fix the name.")
     if size > MAX_BYTES:
         rule = f"it has {size} bytes and a data file at most {MAX_BYTES}"
         raise refuse(rule, "Thin the data out.")

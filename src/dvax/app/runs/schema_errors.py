@@ -21,6 +21,7 @@ _TYPES = {
     "model_type": "a table",
     "model_attributes_type": "a table",
     "dict_type": "a table",
+    "path_type": "the name of a file in quotes",
 }
 _LIMITS = {
     "greater_than": ("greater than", "gt"),
@@ -59,19 +60,20 @@ def _problem(
     dotted = _dotted(section, path)
     place = f"{file}: {dotted}"
     owner, info = _owner(model, path)
-    about = info.description if info is not None and info.description else "see the documentation"
+    description = (info.description if info is not None else None) or ""
+    about = f" ({description})" if description else ""
     kind, context, given = error["type"], error.get("ctx", {}), shown(error["input"])
     key = str(path[-1]) if path else section
     if kind == "extra_forbidden":
         return unknown_key(place, key, error["input"], list(owner.model_fields))
     if kind == "missing":
         sample = _sample(info)
-        return InputProblem(place, "nothing", f"it is required ({about})", f"Add {key} = {sample}")
+        return InputProblem(place, "nothing", f"it is required{about}", f"Add {key} = {sample}")
     if kind == "rule":
         return InputProblem(place, given, context["rule"], f"{context['fix']}.")
     if kind in _LIMITS:
         sign, name = _LIMITS[kind]
-        rule = f"it must be {sign} {context[name]:g} ({about})"
+        rule = f"it must be {sign} {context[name]:g}{about}"
         return InputProblem(place, given, rule, "Give such a value; check its size and unit.")
     if kind == "finite_number":
         return InputProblem(place, given, "it must be finite", "Write an ordinary number.")
@@ -83,13 +85,13 @@ def _problem(
     inner = None if info is None else _model_within(info.annotation)
     if kind == "list_type" and inner is not None:
         example = ", ".join(f"{name} = {_sample(f)}" for name, f in inner.model_fields.items())
-        rule = f"it is a list of tables ({about}), each with a heading of its own"
+        rule = f"it is a list of tables{about}, each with a heading of its own"
         fix = f"Write [[{dotted}]] in double brackets, and below it {example}."
         return InputProblem(place, given, rule, fix)
     if kind in _TYPES:
         number, text = kind.startswith(("float", "int")), isinstance(error["input"], str)
         fix = _bare(key, error["input"], about) if number and text else f"Write {_TYPES[kind]}."
-        return InputProblem(place, given, f"it must be {_TYPES[kind]} ({about})", fix)
+        return InputProblem(place, given, f"it must be {_TYPES[kind]}{about}", fix)
     return InputProblem(place, given, str(error["msg"]), "Fix the value.")
 
 

@@ -44,6 +44,15 @@ class Certificate(NamedTuple):
         return scale * self.values if self.status == "proved" else None
 
 
+def log_growth(constants: Constants, span: float) -> float:
+    """Return the logarithm of the factor by which a bound grows over a time of this length: that of the
+    smallest M e^{ct}, where c is a rate of the constants."""
+    rates = [(float(constants.M), float(constants.growth_rate))]
+    rates += [] if constants.one_sided is None else [(1.0, float(constants.one_sided))]
+    rates += [] if constants.energy is None else [tuple(map(float, constants.energy))]
+    return min(float(np.log(M)) + max(rate, 0.0) * span for M, rate in rates)
+
+
 def certificate(
     problem: Problem, solution: Solution, constants: Constants, before: Certificate | None = None
 ) -> Certificate:

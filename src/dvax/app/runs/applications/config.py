@@ -14,12 +14,13 @@ from pydantic import BaseModel
 from dvax.app.runs.applications import models
 from dvax.app.runs.config import Config, check_contact
 from dvax.app.runs.data_file import DataFile, fingerprint, locate
+from dvax.app.runs.partial import validated_in_part
 from dvax.app.runs.schema import SECTIONS, ModelSection, ReportSection, Section
 from dvax.app.runs.schema_errors import shown
 from dvax.app.runs.sections import read_sections
 from dvax.app.runs.toml_file import read_toml
 from dvax.app.runs.wording import Wording
-from dvax.errors import Problems, input_error
+from dvax.errors import InputError, Problems, input_error
 
 if TYPE_CHECKING:
     from dvax.app.runs.applications.from_model import AbstractModelApplication
@@ -73,9 +74,18 @@ class ModelConfig:
         return found
 
     def fingerprints(self) -> list[DataFile]:
-        """Size and SHA-256 of every data file."""
+        """Size and SHA-256 of every data file; files of one name have their folders before it."""
         files = dict.fromkeys(path for _, path in self.data_files())
-        return [fingerprint(path.name, path) for path in files]
+        names = [path.name for path in files]
+        return [
+            fingerprint(path.name if names.count(path.name) == 1 else self._name_of(path), path)
+            for path in files
+        ]
+
+    def _name_of(self, path: Path) -> str:
+        """Return the path of a file relative to the folder of the configuration, if it lies there."""
+        folder = self.source.parent.resolve()
+        return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
 
     def tree(self) -> dict[str, Any]:
         """All settings as a TOML file has them."""
@@ -180,15 +190,45 @@ def _likely_application(table: Mapping[str, Any]) -> str | None:
 def _check(
     raw: dict[str, Any], name: str, source: Path, allow_outside: bool, quiet: bool
 ) -> ModelConfig:
-    file = source.name
+    file, problems = source.name, Problems()
     application = module_of(name).APPLICATION
-    sections = read_sections(raw, {"model": application.section, "output": ReportSection}, file)
-    problems, table = Problems(), sections["model"]
+    sections: dict[str, Any] = {}
+    with problems.collect():
+        kinds = {"model": application.section, "output": ReportSection}
+        sections = read_sections(raw, kinds, file)
+    table = sections.get("model") or validated_in_part(application.section, raw["model"])
+    if table is None:
+        raise InputError(*problems)
     paths: dict[str, Path] = {}
+    with problems.collect():
+        paths |= _located(application, table, source, allow_outside)
+    if problems and not (application.is_checked_in_part and paths):
+        raise InputError(*problems)
+    try:
+        with wording_of(application, file).in_keys():
+            for key, given in application.further_files(table, paths).items():
+                with problems.collect():
+                    place = f"{file}: model.{key}"
+                    paths[key] = locate(given, source.parent, allow_outside, place)
+            model = application(table, paths, quiet)
+    except InputError as error:
+        raise InputError(*problems, *error.problems) from error
+    problems.raise_any()
+    return ModelConfig(name, model.table, sections["output"], source, application, model, paths)
+
+
+def _located(
+    application: "type[AbstractModelApplication]", table: Section, source: Path, allow_outside: bool
+) -> dict[str, Path]:
+    """Return the data files and folders that a table names, by their keys.
+
+    **Raises:** `dvax.InputError` with all that are missing.
+    """
+    problems, paths = Problems(), {}
     for key in (*application.files, *application.folders):
         given = getattr(table, key)
         if isinstance(given, str):  # in the place of a file a key may have numbers
-            place, is_folder = f"{file}: model.{key}", key in application.folders
+            place, is_folder = f"{source.name}: model.{key}", key in application.folders
             with problems.collect():
                 paths[key] = locate(given, source.parent, allow_outside, place, is_folder=is_folder)
             for inside in application.folders.get(key, ()):
@@ -197,6 +237,4 @@ def _check(
                     with problems.collect():
                         locate(f"{given}/{inside}", source.parent, allow_outside, place)
     problems.raise_any()
-    with wording_of(application, file).in_keys():
-        model = application(table, paths, quiet)
-    return ModelConfig(name, model.table, sections["output"], source, application, model, paths)
+    return paths

@@ -20,15 +20,17 @@ from dvax.app.runs.applications.base import (
     Say,
     Variable,
 )
-from dvax.app.runs.applications.certificate import Certificate, certificate
+from dvax.app.runs.applications.certificate import Certificate, certificate, log_growth
 from dvax.app.runs.schema import Section, SolverKeys
 from dvax.app.runs.solver_options import check_model_steps, settings
+from dvax.app.runs.state_bound import REMEDY
 from dvax.errors import input_error
-from dvax.evolution import Solution
+from dvax.evolution import PiecewiseLinear, Solution
 from dvax.evolution.auto import choose
 from dvax.models import Model
 from dvax.theory import Assumption, Constants, verify
 
+EPSILON = float(np.finfo(float).eps)
 FINAL_VALUES = 12
 """Up to this many final values are figures of the summary."""
 
@@ -49,11 +51,15 @@ class AbstractModelApplication(abc.ABC):
 
     - `section`: the table, for pydantic; `table`: the checked one, complete;
     - `files`, `folders`: the keys that name data files, and folders with the files that are read there;
+    - `is_checked_in_part`: whether the constructor is also called if keys are wrong, which the table
+      does not have then, or if further files are missing, to find the other problems;
     - `keys`: the keys that make an argument of the model, where their names differ from its name;
     - `end`: the key for the last time of a run, where there is one;
     - `axis`: the name and the description of the saved times in the results;
     - `certified`: whether steps are chosen for a proved bound;
     - `verified`: whether `dvax.verify` checks the assumptions, besides the constants of the model;
+    - `energy`: whether `dvax.verify` searches for a norm in which trajectories approach each other;
+    - `remedy`: a sentence on what may make a bound smaller that certifies no digit;
     - `whole`: whether the figures need the solution at all saved times, which must fit into the memory;
     - `bound_words`, `bound_unit`, `bound_scale`: of the bound on the error, which is the scale times
       that of the state in the norm of the state space.
@@ -62,6 +68,7 @@ class AbstractModelApplication(abc.ABC):
     section: ClassVar[type[Section]]
     files: ClassVar[tuple[str, ...]] = ()
     folders: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    is_checked_in_part: ClassVar[bool] = False
     keys: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     end: ClassVar[str | None] = None
     table: Any
@@ -71,6 +78,8 @@ class AbstractModelApplication(abc.ABC):
     axis: ClassVar[tuple[str, str]] = ("time", "time")
     certified = True
     verified = True
+    energy = False
+    remedy = REMEDY
     whole = False
     bound_words = "bound on the error of the state in the norm of the state space"
     bound_unit = ""
@@ -79,6 +88,12 @@ class AbstractModelApplication(abc.ABC):
 
     @abc.abstractmethod
     def __init__(self, table: Any, paths: Mapping[str, Path], quiet: bool): ...
+
+    @classmethod
+    def further_files(cls, table: Any, paths: Mapping[str, Path]) -> Mapping[str, str]:
+        """Return the names of data files besides those of `files`, by their dotted keys below
+        `[model]`. **Raises:** `dvax.InputError`."""
+        return {}
 
     @property
     @abc.abstractmethod
@@ -150,7 +165,9 @@ class AbstractModelApplication(abc.ABC):
     def verification(self) -> Any:
         """The result of `dvax.verify` for the problem."""
         m = self.own
-        return self.call(lambda: verify(m.problem, m.x0, m.t0, self.t_end, m.args))
+        return self.call(
+            lambda: verify(m.problem, m.x0, m.t0, self.t_end, m.args, energy=self.energy)
+        )
 
     @property
     def constants(self) -> Constants | None:
@@ -178,7 +195,26 @@ class AbstractModelApplication(abc.ABC):
         ]
         if self.settings.get("method") is None and self.settings.get("dt") is None:
             sizes.append(("method", *self._choice()))
-        return Description(self.constants, self.assumptions, sizes, self.notes())
+        notes = (*self.notes(), *self._note_on_bound())
+        return Description(self.constants, self.assumptions, sizes, notes)
+
+    def _note_on_bound(self) -> tuple[str, ...]:
+        """Return a sentence if errors of the size of the tolerance may grow to that of the solution."""
+        if self.constants is None:
+            return ()
+        given = self.settings
+        # The errors of fixed steps are not known before a run, and exact steps have those of rounding.
+        is_rounding = given.get("dt") is not None or isinstance(
+            given.get("method"), PiecewiseLinear
+        )
+        error = EPSILON if is_rounding else float(given.get("rtol", 1e-6))
+        growth = log_growth(self.constants, self.t_end - self.own.t0)
+        if growth + np.log(error) < 0 or not np.isfinite(growth):
+            return ()
+        return (
+            f"By these constants an error may grow by a factor of up to 1e{growth / np.log(10):.0f} "
+            f"over the run, so that the error bound may certify no digit. {self.remedy}",
+        )
 
     def _choice(self) -> tuple[str, str]:
         """Return the method that `dvax.solve` will choose, and the reason."""

@@ -3,7 +3,8 @@
 import copy
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,12 +17,12 @@ from dvax.app.runs.config import Config
 from dvax.app.runs.data_file import locate
 from dvax.app.runs.keys import set_key
 from dvax.app.runs.provenance import provenance
-from dvax.app.runs.schema_errors import translate, unknown_key
+from dvax.app.runs.schema_errors import shown, translate, unknown_key
 from dvax.app.runs.sweeps.members import parameters
 from dvax.app.runs.sweeps.parameters import Parameter
 from dvax.app.runs.sweeps.schema import SweepFile
 from dvax.app.runs.toml_file import read_toml
-from dvax.errors import InputError, Problems, input_error
+from dvax.errors import InputError, input_error
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,17 @@ class Sweep:
     def values(self, member: int) -> dict[str, Any]:
         """Return what the configuration of a member has at the swept keys."""
         return {p.key: p.values[member] for p in self.parameters}
+
+    @contextmanager
+    def naming(self, member: int) -> Iterator[None]:
+        """Problems that the block raises name the member, and its values."""
+        try:
+            yield
+        except InputError as error:
+            who = f"{self.source.name}, member {member} ({values_text(self.values(member))})"
+            raise InputError(
+                *(replace(p, place=f"{who}: {p.place}") for p in error.problems)
+            ) from error
 
     def tree(self, member: int) -> dict[str, Any]:
         """Return the configuration of a member as a TOML file has it.
@@ -110,8 +122,13 @@ class Sweep:
         return self._files[key]
 
 
+def values_text(values: Mapping[str, Any]) -> str:
+    """Return the values of a member for a message."""
+    return ", ".join(f"{key} = {shown(value)}" for key, value in values.items())
+
+
 def read_sweep(path: str | Path, *, allow_outside: bool = False, allow_code: bool = False) -> Sweep:
-    """Read and check a sweep file, the configuration that it names, and its first and last member.
+    """Read and check a sweep file, and read the configuration that it names.
 
     **Raises:** `dvax.InputError` with all problems found.
     """
@@ -120,19 +137,7 @@ def read_sweep(path: str | Path, *, allow_outside: bool = False, allow_code: boo
     table = _checked(raw, source.name)
     base = locate(table.config, source.parent, allow_outside, f"{source.name}: config")
     found = tuple(parameters(table, source, allow_outside))
-    sweep = Sweep(table, source, base, read_toml(base), found, allow_outside, allow_code)
-    problems = Problems()
-    for member in dict.fromkeys((0, sweep.count - 1)):
-        try:
-            sweep.config(member)
-        except InputError as error:
-            what = ", ".join(f"{key} = {value!r}" for key, value in sweep.values(member).items())
-            for p in error.problems:
-                place = f"{source.name}, member {member} ({what}): {p.place}"
-                problems.add(place, p.given, p.rule, p.fix)
-            break
-    problems.raise_any()
-    return sweep
+    return Sweep(table, source, base, read_toml(base), found, allow_outside, allow_code)
 
 
 def _checked(raw: dict[str, Any], file: str) -> SweepFile:

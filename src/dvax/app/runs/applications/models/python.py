@@ -8,19 +8,20 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_type_hints
 
+import jax.tree_util as jtu
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError, create_model, model_validator
+from pydantic import Field, model_validator
 
 from dvax.app.runs.applications.base import Figure, Variable
 from dvax.app.runs.applications.certificate import Certificate
 from dvax.app.runs.applications.from_model import AbstractModelApplication, FramesKeys
-from dvax.app.runs.schema import Section, in_unit
-from dvax.app.runs.schema_errors import translate, unknown_key
+from dvax.app.runs.applications.own_parameters import PREFIX, Parameters, complete, unit_of
 from dvax.errors import DvaxError, InputError, Problems, input_error
 from dvax.evolution import Solution
 from dvax.models import Model
+from dvax.theory.energy import MAX_UNKNOWNS
 
 
 class PythonSection(FramesKeys):
@@ -36,7 +37,12 @@ class PythonSection(FramesKeys):
     )
     t_end: float | None = Field(None, description="end of the run, by default that of the model")
     certify: bool = Field(
-        False, description="choose steps whose defect can be bounded, and not the fastest ones"
+        False,
+        description="choose steps whose defect can be enclosed, and not the fastest ones; "
+        "they can be orders of magnitude more",
+    )
+    energy: bool = Field(
+        False, description="search for a norm in which the error bound grows more slowly"
     )
 
     @model_validator(mode="before")
@@ -54,27 +60,47 @@ class PythonApplication(AbstractModelApplication):
 
     section = PythonSection
     files = ("python",)
+    is_checked_in_part = True
     end = "model.t_end"
 
     def __init__(self, table: PythonSection, paths: Mapping[str, Path], quiet: bool):
         self.file = paths["python"]
-        build = _function(self.file, table.function)
-        # Python 3.14 evaluates the types here, and not when it imports the file.
-        hints = _run(self.file, lambda: get_type_hints(build, include_extras=True))
-        self.units = {name: unit for name in hints if (unit := _unit(hints[name])) is not None}
-        arguments, given = _run(self.file, lambda: _arguments(build, hints, table.parameters))
-        self.table = table.model_copy(update={"parameters": given})
-        model = _run(self.file, lambda: build(**arguments))
-        if not isinstance(model, Model):
-            raise input_error(
-                f"{self.file.name}: {table.function}", type(model).__name__,
-                "it must return a dvax.models.Model",
-                "Write return dvax.models.Model(problem, x0, t_end)",
-            )  # fmt: skip
-        _run(self.file, lambda: model.problem.check(model.t0, model.x0, model.args))
+        build, hints = _function(self.file, table.function)
+        self.units = {name: unit for name in hints if (unit := unit_of(hints[name])) is not None}
+        parameters, problems = _run(self.file, lambda: Parameters(build, hints)), Problems()
+        made = _run(self.file, lambda: parameters.in_part(table.parameters))
+        with problems.collect():
+            made = _run(self.file, lambda: parameters.validated(table.parameters))
+        if made is None or set(parameters.files(made, table.parameters)) - set(paths):
+            # The caller reports files that are missing.
+            raise InputError(*problems)
+        located = {key: path for key, path in paths.items() if key.startswith(PREFIX)}
+        self.table = table.model_copy(update={"parameters": complete(made)})
+        try:
+            arguments = parameters.arguments(made, located)
+            model = _built(self.file, table.function, lambda: build(**arguments))
+        except InputError:
+            # With wrong parameters only the problems are of interest that do not depend on them.
+            problems.raise_any()
+            raise
         self.certified, self.place_of_figures = table.certify, f"{self.file.name}: figures"
-        self.whole = model.figures is not None
-        self.set_model(model, table.t_end)
+        self.energy, self.remedy = table.energy, _remedy(table.energy)
+        self.whole, self.bound_unit = model.figures is not None, _bound_unit(model)
+        if table.energy:
+            with problems.collect():
+                _check_energy(model)
+        with problems.collect():
+            self.set_model(model, table.t_end)
+        problems.raise_any()
+
+    @classmethod
+    def further_files(cls, table: PythonSection, paths: Mapping[str, Path]) -> Mapping[str, str]:
+        """Return the values of the parameters whose type is `pathlib.Path`."""
+        file = paths["python"]
+        build, hints = _function(file, table.function)
+        parameters = _run(file, lambda: Parameters(build, hints))
+        made = _run(file, lambda: parameters.in_part(table.parameters))
+        return {} if made is None else parameters.files(made, table.parameters)
 
     @property
     def fit(self) -> str:
@@ -84,7 +110,14 @@ class PythonApplication(AbstractModelApplication):
         return _run(self.file, work)
 
     def notes(self) -> tuple[str, ...]:
-        return (f"The code of {self.file.name}:{self.table.function} is executed.",)
+        said = [f"The code of {self.file.name}:{self.table.function} is executed."]
+        if self.energy and self.constants is not None and self.constants.energy is None:
+            said.append(
+                "energy = true has found no norm, and the error bound uses that of the state space. "
+                "The search needs f and h whose derivatives do not change, and at most "
+                f"{MAX_UNKNOWNS} unknowns of x and u together."
+            )
+        return tuple(said)
 
     def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
         return {**self.named(solution), **self.bound_series(bound)}
@@ -98,6 +131,52 @@ class PythonApplication(AbstractModelApplication):
         return self.joined(self.final_values(end) | self.bound_figure(bound), own)
 
 
+def _built(file: Path, function: str, build: Callable[[], Any]) -> Model:
+    """Return the model that a function in a file builds, its problem checked."""
+    model = _run(file, build)
+    if not isinstance(model, Model):
+        raise input_error(
+            f"{file.name}: {function}", type(model).__name__,
+            "it must return a dvax.models.Model",
+            "Write return dvax.models.Model(problem, x0, t_end)",
+        )  # fmt: skip
+    _run(file, lambda: model.problem.check(model.t0, model.x0, model.args))
+    return model
+
+
+def _remedy(has_energy: bool) -> str:
+    """Return what to try for a smaller bound."""
+    other = "weights of the state space (state_space=dvax.spaces.L2(weights)) or a shorter run"
+    first = "Try" if has_energy else "Try energy = true in [model],"
+    return (
+        f"{first} {other}; the page Troubleshooting by message of the documentation "
+        "(docs/howto/troubleshooting.md) says more."
+    )
+
+
+def _bound_unit(model: Model) -> str:
+    """Return the unit of a norm of the state: that of all states if their weights are 1, else "", since
+    weights may have units."""
+    units = set(model.states.values())
+    weights = jtu.tree_leaves(model.problem.spaces(model.x0)[0].weights())
+    return units.pop() if len(units) == 1 and all(np.all(w == 1) for w in weights) else ""
+
+
+def _check_energy(model: Model) -> None:
+    """Raise an `InputError` if no norm can be searched for."""
+    if model.constants is not None:
+        raise input_error(
+            "model.energy", "true", "the model declares its constants, and nothing is searched for",
+            "Leave energy out, or constants= of dvax.models.Model",
+        )  # fmt: skip
+    if importlib.util.find_spec("clarabel") is None:
+        raise input_error(
+            "model.energy", "true",
+            "the norm is found by a semidefinite program, which Clarabel solves",
+            "Install it with pip install 'dvax[energy]', or leave energy out",
+        )  # fmt: skip
+
+
 def _figure(file: Path, name: str, entry: Any) -> tuple[Any, str, str]:
     if not (isinstance(entry, tuple) and len(entry) == 3):
         raise input_error(
@@ -109,8 +188,8 @@ def _figure(file: Path, name: str, entry: Any) -> tuple[Any, str, str]:
     return number.tolist(), str(unit), str(meaning)
 
 
-def _function(file: Path, name: str) -> Callable[..., Any]:
-    """Import a file, and return its function of that name."""
+def _function(file: Path, name: str) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """Import a file, and return its function of that name with the types of its parameters."""
     module = _run(file, lambda: _import(file))
     found = getattr(module, name, None)
     if not callable(found):
@@ -123,7 +202,8 @@ def _function(file: Path, name: str) -> Callable[..., Any]:
             "model.python", f"{file.name}:{name}", f"{file.name} has no function {name!r}",
             f"It has {', '.join(known)}" if known else f"Write def {name}(...) in it",
         )  # fmt: skip
-    return found
+    # Python 3.14 evaluates the types here, and not when it imports the file.
+    return found, _run(file, lambda: get_type_hints(found, include_extras=True))
 
 
 _imported: dict[Path, tuple[bytes, ModuleType]] = {}
@@ -159,84 +239,36 @@ def _run(file: Path, work: Callable[[], Any]) -> Any:
     """
     try:
         return work()
+    except InputError as error:
+        place = _line(file, error)
+        # Of several problems that were collected each has a line of its own.
+        if place == file.name or (error.__cause__ is not None and len(error.problems) > 1):
+            raise
+        raise InputError(
+            *(replace(p, place=f"{place}: {p.place}") for p in error.problems)
+        ) from error
     except DvaxError:
         raise
     except Exception as error:
-        lines = [
-            f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(file)
-        ]
-        if isinstance(error, SyntaxError) and error.lineno:
-            lines.append(error.lineno)
-        place = f"{file.name}, line {lines[-1]}" if lines else file.name
         raise input_error(
-            place, f"{type(error).__name__}: {error}"[:300], "the file must run without an exception",
+            _line(file, error), f"{type(error).__name__}: {error}"[:300],
+            "the file must run without an exception",
             "Fix that line; --debug shows the traceback",
         ) from error  # fmt: skip
 
 
-def _arguments(
-    build: Callable[..., Any], hints: dict[str, Any], given: dict[str, Any]
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the arguments for `build`, whose types are `hints`, from the table of parameters, and that
-    table, completed.
-
-    Parameters are those of the function, each with its type, or one pydantic model. Annotated[float,
-    "mm"] has a unit: a text such as "2 cm" is converted.
-    """
-    names = list(inspect.signature(build).parameters.values())
-    only = hints.get(names[0].name) if len(names) == 1 else None
-    kind: type[BaseModel]
-    is_model = False
-    if isinstance(only, type) and issubclass(only, BaseModel):
-        kind, is_model = only, True
-    else:
-        fields: dict[str, Any] = {}
-        for p in names:
-            if p.name not in hints or p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD):
-                raise input_error(
-                    f"model.python: {build.__name__}({p.name})", str(p), "each parameter has a type",
-                    f"Write {p.name}: float = 1.0, or {p.name}: Annotated[float, \"mm\"]",
-                )  # fmt: skip
-            default = ... if p.default is p.empty else p.default
-            # Numbers, flags and texts as they are; a list of TOML may be a tuple, a text a choice.
-            strict = _plain(hints[p.name]) in (bool, int, float, str)
-            field: Any = Field(default, strict=strict, validate_default=True)
-            fields[p.name] = (_with_unit(hints[p.name]), field)
-        kind = create_model("Parameters", __base__=Section, **fields)
-    unknown = Problems(
-        unknown_key(f"model.parameters.{key}", key, value, list(kind.model_fields))
-        for key, value in given.items()
-        if key not in kind.model_fields and kind.model_config.get("extra") != "allow"
-    )
-    unknown.raise_any()
-    try:
-        made = kind.model_validate(given)
-    except ValidationError as error:
-        # The name of the file is added where it is known (`Wording`).
-        found = translate(error, "", "model.parameters", kind)
-        raise InputError(*(replace(p, place=p.place.removeprefix(": ")) for p in found)) from error
-    complete = made.model_dump(mode="json", exclude_none=True)
-    if is_model:
-        return {names[0].name: made}, complete
-    return {p.name: getattr(made, p.name) for p in names}, complete
-
-
-def _unit(hint: Any) -> str | None:
-    """Return the unit of a type, a text among its annotations."""
-    return next((a for a in getattr(hint, "__metadata__", ()) if isinstance(a, str)), None)
-
-
-def _plain(hint: Any) -> Any:
-    """Return a type without its annotations."""
-    return get_args(hint)[0] if get_origin(hint) is Annotated else hint
-
-
-def _with_unit(hint: Any) -> Any:
-    """Return a type whose unit converts quantities."""
-    unit = _unit(hint)
-    if unit is None:
-        return hint
-    return Annotated[_plain(hint), in_unit(unit), Field(description=f"[{unit}]")]
+def _line(file: Path, error: Exception) -> str:
+    """Return the file, with the last line in it that an exception or its cause passed through, if there
+    is one."""
+    lines: list[int | None] = []
+    found: BaseException | None = error
+    while found is not None and not lines:
+        frames = traceback.extract_tb(found.__traceback__)
+        lines += [frame.lineno for frame in frames if frame.filename == str(file)]
+        if isinstance(found, SyntaxError) and found.lineno:
+            lines.append(found.lineno)
+        found = found.__cause__
+    return f"{file.name}, line {lines[-1]}" if lines else file.name
 
 
 APPLICATION = PythonApplication
