@@ -132,7 +132,7 @@ class _Linear:
         size = np.abs(self.conditions) @ np.abs(z)
         return self.conditions @ z / np.where(size > 0.0, size, 1.0)
 
-    def until_change(self, z: Array, length: float, fewest: int) -> tuple[float, Array, bool]:
+    def until_change(self, z: Array, length: Any, fewest: int) -> tuple[float, Array, bool]:
         """Return how long the mode lasts, at most `length`, z then, and whether it has changed."""
         t, h, count = 0.0, self.shortest, 0
         while True:
