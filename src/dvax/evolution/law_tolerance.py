@@ -60,6 +60,9 @@ class LawTolerance(eqx.Module):
             gain = jnp.max(jnp.stack(self.sizes(effect(_signs(like)))))
         allowed = self.atol + self.rtol * jnp.min(jnp.stack(self.sizes(x)))
         tol = jnp.where(gain > 0.0, allowed / jnp.where(gain > 0.0, gain, 1.0), jnp.inf)
+        # Solvers that do not know the size of their terms need a limit that they can reach.
+        least = 100 * jnp.finfo(allowed.dtype).eps
+        tol = jnp.maximum(jnp.where(jnp.isinf(allowed), _FIXED_STEPS, tol), least)
         return lax.stop_gradient(tol)
 
 

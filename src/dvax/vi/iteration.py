@@ -139,7 +139,7 @@ def iterate(
         limit = target
         if frozen.rtol is not None:
             terms, roundoff = terms_of_w(trial, norm_F, lam, initial_step)
-            limit = jnp.maximum(jnp.minimum(target, frozen.rtol * terms), 16.0 * roundoff)
+            limit = jnp.maximum(jnp.minimum(target, frozen.rtol * terms), roundoff)
         done = residual <= limit
         # The iterates changed by rounding alone, since the last iteration (stalled) or since the
         # checkpoint (cycling). Brent's algorithm renews the checkpoint at every power of two, so it

@@ -244,7 +244,9 @@ class LinkNewton(AbstractSolver):
             return new, Trial(new.at.y, w, value, one, [new.at.y], calls)
 
         tol = jnp.maximum(jnp.maximum(tol, self.least), law.roundoff(at))
-        return iterate(vi, at.y, tol, begin, advance, self.max_steps, initial_evaluations=2)
+        # `roundoff` knows the terms of this law, which are larger than y.
+        own = vi._replace(rtol=None)
+        return iterate(own, at.y, tol, begin, advance, self.max_steps, initial_evaluations=2)
 
 
 class _Law:
