@@ -6,18 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.custom_derivatives import SymbolicZero
 
 from .. import _tree
 from .._small_matrices import MAX_ROWS, solve, solve_constant
 from .._tree import Tree
 from ..errors import input_error
 from ..spaces import AbstractSpace
+from ._dual_active_set import SLACK
+from ._moving import jvp_of_moving
 from ._weights import inverse_weights
 from .abstract import AbstractSet
 
-_SLACK = 0.75
-"""A row is satisfied if its violation is at most eps^0.75 of its terms: 2e-12 in double precision."""
 _DAMPING = 64.0
 """Multiple of eps that is added to the diagonal of the Newton matrix, relative to its largest value."""
 _LINE_SEARCH = 100
@@ -240,7 +239,7 @@ def _tolerance(y: jax.Array, R: jax.Array, low: jax.Array, high: jax.Array) -> j
         jnp.where(jnp.isfinite(high), jnp.abs(high), 0.0),
     )
     lengths = jnp.sqrt(jnp.sum(R * R, axis=1))
-    return jnp.finfo(y.dtype).eps ** _SLACK * (bound + lengths * jnp.sqrt(jnp.sum(y * y)))
+    return jnp.finfo(y.dtype).eps ** SLACK * (bound + lengths * jnp.sqrt(jnp.sum(y * y)))
 
 
 def _line_search(
@@ -310,16 +309,7 @@ def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
         right = jnp.where(active, rows @ base - bound, 0.0)
         return base - solve(matrix, right) @ scaled
 
-    # Data without a tangent are constants.
-    moving = [k for k, v in enumerate(tangents) if not isinstance(v, SymbolicZero)]
-
-    def of_moving(*values: jax.Array) -> jax.Array:
-        inputs = list(primals)
-        for k, value in zip(moving, values, strict=True):
-            inputs[k] = value
-        return project_on_face(*inputs)
-
-    _, dy = jax.jvp(of_moving, [primals[k] for k in moving], [tangents[k] for k in moving])
+    dy = jvp_of_moving(project_on_face, primals, tangents)
     return (y, multiplier, is_free), (
         factor * dy,
         jnp.zeros_like(multiplier),

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.custom_derivatives import SymbolicZero
 
 from .. import _tree
 from .._small_matrices import as_pseudoinverse, pseudoinverse
@@ -14,6 +13,7 @@ from .._tree import Tree
 from ..errors import input_error
 from ..spaces import AbstractSpace
 from . import _dual_active_set as dual
+from ._moving import jvp_of_moving
 from ._weights import inverse_weights
 from .abstract import AbstractSet
 from .affine import (
@@ -165,16 +165,7 @@ def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
         excess = jnp.sum(rows * point[None, :], axis=1) - bounds
         return root * (point - jnp.sum(back * excess[None, :], axis=1) + base)
 
-    # Inputs without a tangent are constants: the derivative in z alone is a projection.
-    moving = [k for k, v in enumerate(tangents) if not isinstance(v, SymbolicZero)]
-
-    def of_moving(*values: jax.Array) -> jax.Array:
-        inputs = list(primals)
-        for k, value in zip(moving, values, strict=True):
-            inputs[k] = value
-        return project_on_face(*inputs)
-
-    _, dy = jax.jvp(of_moving, [primals[k] for k in moving], [tangents[k] for k in moving])
+    dy = jvp_of_moving(project_on_face, primals, tangents)
     results = y, active, multiplier, inverse
     return results, (dy, *map(jnp.zeros_like, results[1:]))
 
