@@ -23,6 +23,13 @@ SETS = {
     "cone": lambda a: sets.SecondOrderCone(),
     "half-space": lambda a: sets.HalfSpace(a["G"][0], a["unit"]),
     "polyhedron": lambda a: sets.Polyhedron(a["G"], a["unit"] * a["d"]),
+    "constrained box": lambda a: sets.ConstrainedBox(
+        -a["unit"] * a["d"][:N],
+        a["unit"],
+        a["G"][:3],
+        -a["unit"] * a["d"][:3],
+        a["unit"] * a["d"][3:6],
+    ),
     "intersection": lambda a: sets.Intersection(
         sets.Box(0.0, a["unit"] * a["d"][:N]), sets.HalfSpace(jnp.ones(N), a["unit"])
     ),
@@ -79,6 +86,23 @@ def test_tight_tolerances_are_reached_for_large_responses(name):
             x0, args = data(3, size)
             other = dvax.solve(problem(name), x0, 0.0, t1, args, rtol=rtol, max_steps=20_000)
             assert np.abs(np.asarray(other.xs[-1]) / size - x).max() <= 100 * rtol
+
+
+def test_law_is_solved_if_the_state_is_zero_or_does_not_depend_on_the_response():
+    _, args = data(0)
+    K = SETS["simplex"](args)
+    law = lambda t, x, u, a: x - a["M"] @ u  # noqa: E731
+    for f in (
+        lambda t, x, u, a: (jnp.sin(t) - jnp.sum(u)) * jnp.ones(N),
+        lambda t, x, u, a: jnp.cos(t) * jnp.ones(N),
+    ):
+        made = dvax.Problem(
+            A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=K, f=f, h=law
+        )
+        for options in ({"dt": 0.1}, {"dt": 0.1, "method": dvax.DormandPrince()}, {}):
+            sol = dvax.solve(made, jnp.zeros(N), 0.0, 1.0, args, ts=[0.0, 1.0], **options)
+            for x, u in zip(sol.xs, sol.us, strict=True):
+                np.testing.assert_allclose(u, made.response(1.0, x, args), atol=1e-6)
 
 
 @pytest.mark.thorough

@@ -42,13 +42,14 @@ class LawTolerance(eqx.Module):
 
     `atol` and `rtol` are those of the defect, times a small share. ‖x‖ is the root mean square of the
     state, of its smallest part where it has several. The gain is β_f‖P⁻¹‖ if it is known. Otherwise it
-    is estimated, as the root mean square of the change of f along a direction of u with entries ±1 at
-    the guess. Since such an estimate may be zero, ‖w‖ is also limited by `relative` times the size of
-    its terms.
+    is estimated, as the root mean square of the change of f along one direction of y at the guess, and
+    1 if f does not change. Since such an estimate may be too small, ‖w‖ is also limited by `relative`
+    times the size of its terms. No tolerance exceeds `most`.
     """
 
     atol: Any
     rtol: Any
+    most: Any
     relative: Any
     gain: Any
     sizes: RootMeanSquares
@@ -57,33 +58,34 @@ class LawTolerance(eqx.Module):
         """Return the tolerance at x, where `effect` is the derivative of f with respect to y = Pu."""
         gain = self.gain
         if gain is None:
-            gain = jnp.max(jnp.stack(self.sizes(effect(_signs(like)))))
+            gain = jnp.max(jnp.stack(self.sizes(effect(_direction(like)))))
         allowed = self.atol + self.rtol * jnp.min(jnp.stack(self.sizes(x)))
-        tol = jnp.where(gain > 0.0, allowed / jnp.where(gain > 0.0, gain, 1.0), jnp.inf)
+        tol = jnp.minimum(allowed / jnp.where(gain > 0.0, gain, 1.0), self.most)
         # Solvers that do not know the size of their terms need a limit that they can reach.
-        least = 100 * jnp.finfo(allowed.dtype).eps
-        tol = jnp.maximum(jnp.where(jnp.isinf(allowed), _FIXED_STEPS, tol), least)
-        return lax.stop_gradient(tol)
+        return lax.stop_gradient(jnp.maximum(tol, 100 * jnp.finfo(tol.dtype).eps))
 
 
 def law_tolerance(setup: Setup) -> LawTolerance:
     """Return the tolerance of the law: a thousandth of that of the defect, in its effect on f̃."""
     share = _SHARE / setup.number("horizon")
     has_fixed_steps = ~jnp.isnan(setup.number("dt"))
-    atol, rtol = (
-        jnp.where(has_fixed_steps, jnp.inf, share * setup.number(name)) for name in ("atol", "rtol")
-    )
-    relative = jnp.where(has_fixed_steps, _FIXED_STEPS, _RELATIVE * setup.number("rtol"))
     sizes = RootMeanSquares(setup.problem.spaces(setup.x0)[0])
-    return LawTolerance(atol, rtol, relative, setup.moduli.get("law_gain"), sizes)
+    return LawTolerance(
+        atol=jnp.where(has_fixed_steps, jnp.inf, share * setup.number("atol")),
+        rtol=jnp.where(has_fixed_steps, 0.0, share * setup.number("rtol")),
+        most=jnp.where(has_fixed_steps, _FIXED_STEPS, jnp.inf),
+        relative=jnp.where(has_fixed_steps, _FIXED_STEPS, _RELATIVE * setup.number("rtol")),
+        gain=setup.moduli.get("law_gain"),
+        sizes=sizes,
+    )
 
 
-def _signs(like: Tree) -> Tree:
-    """Return a fixed element with entries ±1 that is not orthogonal to usual directions."""
+def _direction(like: Tree) -> Tree:
+    """Return a fixed element of which neither sums nor differences of entries vanish."""
 
     def of_leaf(leaf: jax.Array) -> jax.Array:
         k = jnp.arange(leaf.size, dtype=leaf.dtype).reshape(leaf.shape)
-        return jnp.sign(jnp.cos(1.0 + 2.3 * k))
+        return 1.0 + jnp.cos(1.0 + 2.3 * k)
 
     return jtu.tree_map(of_leaf, like)
 

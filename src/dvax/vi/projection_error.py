@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .. import sets
+from ..sets._dual_active_set import SLACK
 
 
 class ProjectionError(NamedTuple):
@@ -56,6 +57,8 @@ def projection_error(K: sets.AbstractSet) -> ProjectionError:
         # The rows of E have norm 1.
         rows = jnp.sqrt(1.0 * K.e.size)
         return ProjectionError(0.0, jnp.maximum(1.0, rows * jnp.linalg.norm(K.pseudoinverse)))
+    if isinstance(K, sets.ConstrainedBox):
+        return ProjectionError(0.0, relative=jnp.finfo(K.R.dtype).eps ** SLACK)
     if isinstance(K, sets.Translated):
         inner = projection_error(K.set)
         return inner._replace(data=inner.data + _norm_bound(K.offset))
