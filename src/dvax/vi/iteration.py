@@ -102,15 +102,6 @@ def iterate(
     eps, norm = jnp.finfo(dtype).eps, partial(norm_of_constant, frozen.space)
     divergence_radius = _DIVERGENCE_FACTOR * (1.0 + norm(start))
 
-    def terms_of_w(trial: Trial, norm_F: Any, lam: Any, initial_step: Any) -> tuple[Any, Any]:
-        """Return the size of the terms of w, and their roundoff."""
-        # λ at the start is about 1/L. A λ that became much smaller would make any ‖w‖ roundoff, and
-        # the terms of F have the size of L‖y‖ even if λ became much larger.
-        size, step = norm(trial.y), jnp.maximum(lam, 0.1 * initial_step)
-        terms = size / initial_step + norm_F
-        roundoff = rounding_of_w(frozen.K, trial.y, size, norm_F, step) + eps * terms
-        return terms, _ROUNDINGS * roundoff
-
     def total_norm(elements: list[Tree]) -> Any:
         return sum(map(norm, elements))
 
@@ -136,11 +127,7 @@ def iterate(
         residual = jnp.where(meaningless, jnp.inf, residual)
         # The first point replaces the start in any case, since the start may lie outside of K.
         better = (residual < s.residual) | (s.count == 0)
-        limit = target
-        if frozen.rtol is not None:
-            terms, roundoff = terms_of_w(trial, norm_F, lam, initial_step)
-            limit = jnp.maximum(jnp.minimum(target, frozen.rtol * terms), roundoff)
-        done = residual <= limit
+        done = residual <= residual_limit(frozen, target, trial.y, norm_F, lam, initial_step)
         # The iterates changed by rounding alone, since the last iteration (stalled) or since the
         # checkpoint (cycling). Brent's algorithm renews the checkpoint at every power of two, so it
         # finds cycles of any length.
@@ -209,6 +196,22 @@ def without_derivatives(vi: FrozenVI) -> FrozenVI:
 def residual_target(vi: FrozenVI, tol: Any) -> Any:
     """Return the ‖w‖ that meets the tolerance."""
     return tol if vi.gamma is None else vi.gamma * tol
+
+
+def residual_limit(
+    vi: FrozenVI, target: Any, y: Tree, norm_F: Any, lam: Any, initial_step: Any
+) -> Any:
+    """Return the ‖w‖ at y that ends an iteration: `target`, or less by `vi.rtol`, or roundoff.
+
+    λ at the start is about 1/L. A λ that became much smaller would make any ‖w‖ roundoff, and the terms
+    of F have the size of L‖y‖ even if λ became much larger.
+    """
+    if vi.rtol is None:
+        return target
+    size, step = norm_of_constant(vi.space, y), jnp.maximum(lam, 0.1 * initial_step)
+    terms = size / initial_step + norm_F
+    roundoff = rounding_of_w(vi.K, y, size, norm_F, step) + jnp.finfo(terms.dtype).eps * terms
+    return jnp.maximum(jnp.minimum(target, vi.rtol * terms), _ROUNDINGS * roundoff)
 
 
 def norm_of_constant(space: AbstractSpace, a: Tree) -> jax.Array:

@@ -16,7 +16,14 @@ from .._batch import any_lane
 from .._tree import Tree
 from .abstract import RESULTS, Answer, FrozenVI
 from .extragradient import GROWTH, REDUCTION, SMALLEST_REDUCTION
-from .iteration import Trial, inverse_slope, iterate, norm_of_constant, residual_target
+from .iteration import (
+    Trial,
+    inverse_slope,
+    iterate,
+    norm_of_constant,
+    residual_limit,
+    residual_target,
+)
 
 
 class Linearisation(NamedTuple):
@@ -108,7 +115,7 @@ def safeguarded_newton(
     # `iterate` passes an F without derivatives (`without_derivatives`), but Newton's method needs F′.
     differentiable_F = vi.F
     first_run_length = jnp.where(is_quadratic, _FIRST_RUN_LENGTH_QUADRATIC, _FIRST_RUN_LENGTH)
-    target = residual_target(vi, tol) if vi.rtol is None else 0.0
+    target = residual_target(vi, tol)
 
     def advance(vi: FrozenVI, s: _State) -> tuple[_State, Trial]:
         norm = partial(norm_of_constant, vi.space)
@@ -157,7 +164,8 @@ def safeguarded_newton(
             right = _tree.scale(-tau, w)
             return _tree.add(z, solve(Linearisation(slope, tangent, tau, reduction), right))
 
-        solves = next_is_newton & (residual > target)
+        limit = residual_limit(vi, target, y, norm_F, residual_step, tau)
+        solves = next_is_newton & (residual > limit)
         newton_z = lax.cond(any_lane(solves), newton, lambda: z)
         if vi.L_F is None:
             # Start from a larger λ, so that it recovers in regions where F is flatter.
