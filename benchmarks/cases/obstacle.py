@@ -19,6 +19,8 @@ _SIDES = (128, 256, 512, 1024)
 _FIRST = 64
 """Solved from zero; then each grid starts from the last."""
 _PATHS = (200, 2000, 6000)
+_POINTS = 100
+_CONDITIONS = (1.0, 1e2, 1e4)
 
 
 def run(full: bool) -> Section:
@@ -51,6 +53,7 @@ def run(full: bool) -> Section:
             target=Target("≤", 2.0, spread, "×"),
         )
     )  # fmt: skip
+    _without_options(section, 7 if full else 3)
     path = Table(
         "Evaluations of F a solve along a path, each solve started from the one before",
         ("law", "solves a turn", "mean", "most"), [],
@@ -122,6 +125,51 @@ def _measure(table: Table, guess: jax.Array, side: int, rounds: int) -> int:
         )
     )  # fmt: skip
     return int(found.evaluations)
+
+
+def _without_options(section: Section, rounds: int) -> None:
+    """Add laws y + κ(L + 0.3 S)y − b, with the five-point Laplacian L and a skew difference S."""
+    table = Table(
+        f"{_POINTS}² unknowns, y ≥ 0, F(y) = y + κ(L + sS)y − b, to {_TOL:g} in ‖w‖, from 0",
+        ("κ", "s", "solver", "F", "solve", "result"), [],
+    )  # fmt: skip
+    section.tables.append(table)
+    a, b = jnp.meshgrid(*2 * [jnp.linspace(-1.0, 1.0, _POINTS)], indexing="ij")
+    load = jnp.exp(-8.0 * ((a - 0.3) ** 2 + b**2)) - 0.4
+    solvers = {
+        "plain call": None, "Accelerated": dvax.vi.Accelerated(), "GoldenRatio": dvax.vi.GoldenRatio(),
+        "Extragradient": dvax.vi.Extragradient(),
+    }  # fmt: skip
+
+    def law(y: jax.Array, args: tuple[jax.Array, jax.Array]) -> jax.Array:
+        kappa, skew = args
+        v = jnp.pad(y, 1)
+        east, west = v[1:-1, 2:], v[1:-1, :-2]
+        coupling = 4.0 * y - east - west - v[2:, 1:-1] - v[:-2, 1:-1] + skew * (east - west)
+        return y + kappa * coupling - (1.0 + jnp.sqrt(kappa)) * load
+
+    for kappa in _CONDITIONS:
+        for skew in (0.0, 0.3):
+            solves, found = {}, {}
+            for name, solver in solvers.items():
+                if name == "Accelerated" and skew:
+                    continue
+                solves[name] = functools.partial(
+                    dvax.solve_vi, law, dvax.sets.Box(0.0, jnp.inf), jnp.zeros_like(load),
+                    (jnp.asarray(kappa), jnp.asarray(skew)), solver, _TOL,
+                )  # fmt: skip
+                found[name] = solves[name]()
+            taken = in_turn(
+                {n: timed(lambda f=f: jax.block_until_ready(f().y)) for n, f in solves.items()},
+                rounds,
+            )
+            for name, vi in found.items():
+                seconds = compare("", "", taken[name], taken["plain call"]).dvax
+                assert seconds is not None
+                chosen = f"{name}: {vi.solver}" if solvers[name] is None else name
+                solved = "solved" if vi.result == dvax.vi.RESULTS.successful else "not solved"
+                cost = str(int(vi.evaluations)), duration(seconds)
+                table.rows.append((f"{kappa:g}", f"{skew:g}", chosen, *cost, solved))
 
 
 def _along_a_path(solves: int, cubic: float) -> tuple[float, int]:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import dvax
-from dvax.vi import ActiveSet, Auto, GoldenRatio
 
 N = 1200
 
@@ -45,22 +44,3 @@ def test_law_of_a_coupled_field_satisfies_its_optimality_conditions(kind, cap):
     assert np.abs(F[~held & ~capped]).max() < 1e-8
     assert F[held].min() > -1e-8 and F[capped].max(initial=-1.0) < 1e-8
     assert int(answer.evaluations) < 40
-
-
-def test_choice_for_a_coupled_field_needs_a_law_whose_derivative_is_known():
-    P = dvax.operators.Convolution(jnp.ones(N // 2 + 1), N)
-    x = jnp.zeros(N)
-
-    def chosen(h, K):
-        problem = dvax.Problem(
-            A=dvax.generators.Zero(), P=P, K=K, f=lambda t, x, u, args: u, h=h,
-            control_space=dvax.spaces.Euclidean(N),
-        )  # fmt: skip
-        return type(Auto().choose(problem.frozen(0.0, x), K, x))
-
-    box = dvax.sets.Box(0.0, 1.0)
-    assert chosen(lambda t, x, u, args: x, box) is ActiveSet
-    assert chosen(lambda t, x, u, args: x - 2.0 * u, box) is ActiveSet
-    assert chosen(lambda t, x, u, args: x - u**3, box) is GoldenRatio
-    assert chosen(lambda t, x, u, args: x - u[::-1], box) is GoldenRatio
-    assert chosen(lambda t, x, u, args: x, dvax.sets.Ball(0.0, 1.0)) is GoldenRatio

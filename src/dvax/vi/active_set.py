@@ -16,6 +16,7 @@ from ..programs.matrix import matrix_of
 from ..programs.structure import analyse
 from .abstract import AbstractSolver, Answer, FrozenVI, HasInverse
 from .block import solve_block
+from .matrix_free import is_self_adjoint, solve_matrix_free
 from .newton import Linearisation, safeguarded_newton
 from .parameters import SAFETY, STEPS, UNKNOWNS, check_parameters, describe
 
@@ -32,9 +33,10 @@ class ActiveSet(AbstractSolver):
     affine, its matrix is formed once.
 
     Up to `dense` unknowns the matrix is formed. Beyond, the block is applied matrix-free, with one
-    derivative of F per product, in conjugate gradients (`symmetric=True`: F′ is symmetric) or
-    GMRES. Their relative tolerance is min(0.1, ‖w‖/‖w₀‖). They need a `preconditioner` if F′ is
-    ill-conditioned, as a discretised differential operator is. The law of a `dvax.Problem` has one if
+    derivative of F per product: in conjugate gradients if F′ is symmetric (declared by
+    `symmetric=True`, and otherwise decided by two products), and in BiCGStab followed by GMRES if not.
+    Their relative tolerance is min(0.1, ‖w‖/‖w₀‖). If F′ is ill-conditioned, as a discretised
+    differential operator is, a `preconditioner` saves products. The law of a `dvax.Problem` has one if
     the code of h shows that ∂h/∂u is one number: then F′ = aP⁻¹, and the block P_II is close to the
     inverse of F′_II up to a factor, which conjugate gradients do not notice.
 
@@ -89,20 +91,18 @@ class ActiveSet(AbstractSolver):
                 "Use dvax.vi.SemismoothNewton()",
             )
         size, affine = sum(leaf.size for leaf in jtu.tree_leaves(y0)), analyse(vi.F, y0).affine
-        inverse, matrix, symmetric = None, None, self.symmetric
+        matrix, symmetric = None, self.symmetric
         if size <= self.dense:
             if affine:
                 matrix = _constant_slope(vi, y0)
                 symmetric = _is_symmetric(matrix, vi.space.weights(), y0)
             solve_linear = self._lu_solver(matrix)
         else:
-            if not symmetric and self.preconditioner is None:
-                inverse = inverse_of(vi, y0)
-            symmetric = symmetric or inverse is not None
-            solve_linear = self._krylov_solver(vi, inverse)
+            solve_linear, symmetric = self._matrix_free_solver(vi, y0)
         return safeguarded_newton(
             vi, y0, tol, solve_linear, step=self.step, max_steps=self.max_steps,
-            is_quadratic=jnp.asarray(symmetric) & affine,
+            is_quadratic=False if symmetric is None else jnp.asarray(symmetric) & affine,
+            matrix_free=size > self.dense,
         )  # fmt: skip
 
     def _lu_solver(self, constant: Any) -> Callable[[Linearisation, Tree], Tree]:
@@ -118,50 +118,37 @@ class ActiveSet(AbstractSolver):
 
         return solve
 
-    def _krylov_solver(
-        self, vi: FrozenVI, inverse: Callable[[Tree], Tree] | None
-    ) -> Callable[[Linearisation, Tree], Tree]:
-        symmetric, preconditioner = self.symmetric, self.preconditioner
-        weights: Any = None
-        if inverse is not None:
-            # F′ is self-adjoint in the space: with the weights in front, it is a symmetric matrix.
-            weights, symmetric = vi.space.weights(), True
-            preconditioner = partial(_block_of, inverse, weights)
+    def _matrix_free_solver(
+        self, vi: FrozenVI, like: Tree
+    ) -> tuple[Callable[[Linearisation, Tree], Tree], Any]:
+        """Return the solver, and whether F′ is symmetric (None: it may change with y)."""
+        weights, given = vi.space.weights(), self.preconditioner
+        inverse = None if self.symmetric or given is not None else inverse_of(vi, like)
+        symmetric: Any = self.symmetric or inverse is not None or None
+        if symmetric is None and analyse(vi.F, like).affine:
+            symmetric = is_self_adjoint(_derivative_at_zero(vi, like), like, weights)
+        if self.symmetric:
+            # Declared for the plain product of two vectors.
+            weights = jtu.tree_map(jnp.ones_like, weights)
 
         def solve(at: Linearisation, right: Tree) -> Tree:
-            free = _free(at, right)
+            preconditioner = None
+            if inverse is not None:
+                preconditioner = partial(_block_of, inverse, weights, _free(at, right))
+            elif given is not None:
+                preconditioner = partial(given, _free(at, right))
+            return solve_matrix_free(at, right, weights, symmetric, preconditioner)
 
-            def restrict(d: Tree) -> Tree:
-                return jtu.tree_map(lambda f, v: jnp.where(f, v, 0.0), free, d)
-
-            def apply(d: Tree) -> Tree:
-                """Return F′_II d_I; d and the result are 0 at the fixed unknowns."""
-                product = restrict(at.slope(d))
-                return product if weights is None else weights * product
-
-            M = None if preconditioner is None else partial(preconditioner, free)
-            free_right = restrict(_tree.scale(1.0 / at.tau, right))
-            free_right = free_right if weights is None else weights * free_right
-            rtol: Any = jnp.clip(at.reduction, 1e-10, 0.1)
-            if symmetric:
-                d, _ = jax.scipy.sparse.linalg.cg(apply, free_right, tol=rtol, maxiter=1000, M=M)
-            else:
-                d, _ = jax.scipy.sparse.linalg.gmres(
-                    apply, free_right, tol=rtol, atol=0.0, restart=40, maxiter=10, M=M
-                )
-            fixed = _tree.sub(right, _tree.scale(at.tau, at.slope(d)))
-            return jtu.tree_map(jnp.where, free, d, fixed)
-
-        return solve
+        return solve, symmetric
 
 
 def _constant_slope(vi: FrozenVI, like: Tree) -> jax.Array:
     """Return the matrix of an affine F."""
+    return jax.lax.stop_gradient(matrix_of(_derivative_at_zero(vi, like), like))
 
-    def derivative(d: Tree) -> Tree:
-        return jax.jvp(vi.F, (_tree.zeros_like(like),), (d,))[1]
 
-    return jax.lax.stop_gradient(matrix_of(derivative, like))
+def _derivative_at_zero(vi: FrozenVI, like: Tree) -> Callable[[Tree], Tree]:
+    return lambda d: jax.jvp(vi.F, (_tree.zeros_like(like),), (d,))[1]
 
 
 def _is_symmetric(matrix: jax.Array, weights: Any, like: Tree) -> jax.Array:

@@ -2,20 +2,14 @@
 
 from typing import Any, ClassVar
 
-import jax.tree_util as jtu
-
 from .._tree import Tree
 from ..errors import input_error
 from ..programs.structure import analyse
 from .abstract import AbstractSolver, Answer, FrozenVI
-from .active_set import ActiveSet, inverse_of
+from .active_set import ActiveSet
 from .bracketing import Bracketing, affine_answer, is_pointwise
-from .golden_ratio import GoldenRatio
 from .lemke import Lemke, is_affine_on_polyhedron
 from .semismooth_newton import SemismoothNewton
-
-_MAX_NEWTON_UNKNOWNS = 1024
-"""Up to this size, forming and factorising a Jacobian at each step is affordable."""
 
 
 class Auto(AbstractSolver):
@@ -24,9 +18,8 @@ class Auto(AbstractSolver):
     - F(y) = ay + c with one number a: the closed form y* = proj_K(−c/a), for any K (`ClosedForm`);
     - K a pointwise interval and F pointwise: `Bracketing` (closed form where F is affine);
     - F affine, K a simplex or a polyhedron of at most 16 unknowns: `Lemke`;
-    - up to 1024 unknowns: `ActiveSet` on a box, `SemismoothNewton` on other sets;
-    - beyond: `ActiveSet` on a box if F is the law of a problem with F′ = aP⁻¹, and otherwise
-      `GoldenRatio`. Both form no matrix.
+    - otherwise `ActiveSet` on a box, `SemismoothNewton` on other sets. Beyond 1024 unknowns both form
+      no matrix.
 
     ```python
     >>> import dvax, jax.numpy as jnp
@@ -47,11 +40,7 @@ class Auto(AbstractSolver):
             return ClosedForm()
         if is_pointwise(vi, like):
             return Bracketing()
-        size = sum(leaf.size for leaf in jtu.tree_leaves(like))
-        is_box = vi.K.intervals(like) is not None
-        if size > _MAX_NEWTON_UNKNOWNS:
-            return ActiveSet() if is_box and inverse_of(vi, like) is not None else GoldenRatio()
-        if is_box:
+        if vi.K.intervals(like) is not None:
             return ActiveSet()
         return Lemke() if is_affine_on_polyhedron(vi, like) else SemismoothNewton()
 

@@ -5,7 +5,7 @@ every derivative that exists, in forward and reverse mode and of every order, wi
 iteration. At a kink the projection's convention (`dvax.sets.AbstractSet`) selects the element of dR/dy.
 If dR/dy is singular to rounding, y has no derivative (the solutions of VI(K, F) may not even be
 isolated), and the result is NaN (infinite or NaN for pointwise laws). Beyond 1024 unknowns the result
-is NaN if GMRES did not converge.
+is NaN if the Krylov method did not converge.
 """
 
 from collections.abc import Callable
@@ -20,9 +20,11 @@ from .._small_matrices import pivots, solve
 from .._tree import Tree
 from ..programs.matrix import matrix_of
 from .certificate import natural_residual
+from .krylov import solve_general
 
+_BICGSTAB_STEPS = 1000
 _MAX_DENSE_UNKNOWNS = 1024
-"""Up to this size the Jacobian is formed; beyond, GMRES applies it."""
+"""Up to this size the Jacobian is formed; beyond, a Krylov method applies it."""
 
 
 def with_implicit_derivative(vi: Any, solution: Tree, tau: Any, pointwise: bool) -> Tree:
@@ -59,13 +61,12 @@ def _general_solve(g: Callable[[Tree], Tree], b: Tree) -> Tree:
 
 
 def _krylov_solve(g: Callable[[jax.Array], jax.Array], b: jax.Array) -> jax.Array:
-    gmres = jax.scipy.sparse.linalg.gmres
     eps = float(jnp.finfo(b.dtype).eps)
-    # Relative residuals: the tolerance of GMRES, and the largest that counts as converged.
+    # Relative residuals: the tolerance of the method, and the largest that counts as converged.
     rtol, converged = max(1e-12, 10 * eps), eps**0.5
 
     def solve(apply: Callable[[jax.Array], jax.Array], right: jax.Array) -> jax.Array:
-        d, _ = gmres(apply, right, tol=rtol, atol=0.0, restart=50, maxiter=20)
+        d = solve_general(apply, right, rtol, _BICGSTAB_STEPS)
         residual = jnp.linalg.norm(right - apply(d))
         return jnp.where(residual <= converged * jnp.linalg.norm(right), d, jnp.nan)
 

@@ -24,13 +24,15 @@ from .iteration import (
     residual_limit,
     residual_target,
 )
+from .scattered import scattered
 
 
 class Linearisation(NamedTuple):
     """The linearisation of F at y = proj_K(z), and of the projection at z.
 
     `slope` applies F′(y), and `tangent` an element D of the generalised derivative of the projection
-    at z. `reduction` is ‖w‖ relative to its first value, for the tolerance of iterative linear solvers.
+    at z. `reduction` is the tolerance of iterative linear solvers: the smallest ‖w‖ relative to its
+    first value, or a tenth of the reduction that ends the iteration.
     """
 
     slope: Callable[[Tree], Tree]
@@ -89,7 +91,7 @@ class _State(NamedTuple):
 
 def safeguarded_newton(
     vi: FrozenVI, y0: Tree, tol: Any, solve: LinearSolver, *, step: float, max_steps: int,
-    is_quadratic: Any = False,
+    is_quadratic: Any = False, matrix_free: bool = False,
 ) -> Answer:  # fmt: skip
     """Solve Φ(z) = F(y) + (z − y)/τ = 0 with y = proj_K(z); the value Φ(z) is the certificate w.
 
@@ -117,6 +119,14 @@ def safeguarded_newton(
     first_run_length = jnp.where(is_quadratic, _FIRST_RUN_LENGTH_QUADRATIC, _FIRST_RUN_LENGTH)
     target = residual_target(vi, tol)
 
+    def first_tau(value: Tree, slope: Callable[[Tree], Tree]) -> jax.Array:
+        tau = inverse_slope(vi, value, slope)
+        if vi.L_F is not None or not matrix_free:
+            return tau
+        # The formula of `solve_matrix_free` amplifies the error of Dd by ‖I − τF′‖, so τ must not be
+        # longer than 1/‖F′‖. The direction of a smooth F underestimates ‖F′‖.
+        return jnp.minimum(tau, inverse_slope(vi, slope(scattered(value, 1)), slope))
+
     def advance(vi: FrozenVI, s: _State) -> tuple[_State, Trial]:
         norm = partial(norm_of_constant, vi.space)
         y, tangent = _linearise(lambda z: vi.K.project(z, vi.space), s.z)
@@ -124,7 +134,7 @@ def safeguarded_newton(
         norm_F = norm(value)
         is_start, is_newton = s.kind == _START, s.kind == _NEWTON
         is_predictor, is_corrector = s.kind == _PREDICTOR, s.kind == _CORRECTOR
-        tau = lax.cond(any_lane(is_start), lambda: inverse_slope(vi, value, slope), lambda: s.tau)
+        tau = lax.cond(any_lane(is_start), lambda: first_tau(value, slope), lambda: s.tau)
         tau = jnp.where(is_start, tau, s.tau)
         lam = jnp.where(is_start, step * tau, s.lam)
         residual_step = jnp.where(is_predictor | is_corrector, lam, tau)
@@ -159,12 +169,14 @@ def safeguarded_newton(
         least = jnp.where(residual < s.best, residual, s.best)
         best = jnp.where(is_start | continues | failed, s.best, least)
 
+        limit = residual_limit(vi, target, y, norm_F, residual_step, tau)
+
         def newton() -> Tree:
             reduction = jnp.where(jnp.isfinite(best), best / first, 1.0)
+            reduction = jnp.maximum(reduction, 0.1 * limit / residual)
             right = _tree.scale(-tau, w)
             return _tree.add(z, solve(Linearisation(slope, tangent, tau, reduction), right))
 
-        limit = residual_limit(vi, target, y, norm_F, residual_step, tau)
         solves = next_is_newton & (residual > limit)
         newton_z = lax.cond(any_lane(solves), newton, lambda: z)
         if vi.L_F is None:
@@ -219,6 +231,9 @@ def safeguarded_newton(
 
 
 def _linearise(fn: Callable[[Tree], Tree], at: Tree) -> tuple[Tree, Callable[[Tree], Tree]]:
-    """Return fn(at) and the derivative of fn there, as constants of an outer differentiation."""
+    """Return fn(at) and the derivative of fn there, as constants of an outer differentiation.
+
+    The numbers in the derivative are made constants, not its result: it must have a transpose.
+    """
     value, push = jax.linearize(fn, at)
-    return lax.stop_gradient(value), lambda d: lax.stop_gradient(push(d))
+    return lax.stop_gradient(value), jax.tree_util.tree_map(lax.stop_gradient, push)

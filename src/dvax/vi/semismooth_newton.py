@@ -1,16 +1,17 @@
 """Semismooth Newton's method for any K."""
 
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from .. import _tree
 from .._small_matrices import product, solve_constant
 from .._tree import Tree
 from ..programs.matrix import matrix_of
 from .abstract import AbstractSolver, Answer, FrozenVI
+from .matrix_free import solve_matrix_free
 from .newton import Linearisation, safeguarded_newton
 from .parameters import SAFETY, STEPS, UNKNOWNS, check_parameters
 
@@ -33,9 +34,10 @@ class SemismoothNewton(AbstractSolver):
     last steps are Newton steps: for polyhedral K, strict complementarity and F in C¹, the matrix is
     regular with an inverse of norm at most about 1/γ, and convergence is quadratic.
 
-    Up to `dense` unknowns the matrix is formed and factorised. Beyond, GMRES applies it, with the
-    relative tolerance min(0.1, ‖w‖/‖w₀‖). For boxes, `ActiveSet` is the same method with much
-    smaller systems.
+    Up to `dense` unknowns the matrix is formed and factorised. Beyond, Krylov methods apply it, with
+    the relative tolerance min(0.1, ‖w‖/‖w₀‖): conjugate gradients if two products show that F′ is
+    symmetric, and otherwise BiCGStab followed by GMRES. For boxes, `ActiveSet` is the same method with
+    much smaller systems.
 
     **Arguments:** `step` of the safeguard, in (0, 1); `max_steps`, the maximum number of iterations;
     `dense`.
@@ -59,9 +61,17 @@ class SemismoothNewton(AbstractSolver):
 
     def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
         size = sum(leaf.size for leaf in jax.tree_util.tree_leaves(y0))
-        solve_linear = _solve_by_lu if size <= self.dense else _solve_by_gmres
+        solve_linear = _solve_by_lu
+        if size > self.dense:
+            solve_linear = partial(_solve_matrix_free, vi.space.weights())
         return safeguarded_newton(
-            vi, y0, tol, solve_linear, step=self.step, max_steps=self.max_steps
+            vi,
+            y0,
+            tol,
+            solve_linear,
+            step=self.step,
+            max_steps=self.max_steps,
+            matrix_free=size > self.dense,
         )
 
 
@@ -73,11 +83,5 @@ def _solve_by_lu(at: Linearisation, right: Tree) -> Tree:
     return unravel(solve_constant(matrix, flat))
 
 
-def _solve_by_gmres(at: Linearisation, right: Tree) -> Tree:
-    def apply(d: Tree) -> Tree:
-        dy = at.tangent(d)
-        return _tree.add(_tree.scale(at.tau, at.slope(dy)), _tree.sub(d, dy))
-
-    rtol: Any = jnp.clip(at.reduction, 1e-8, 0.1)
-    move, _ = jax.scipy.sparse.linalg.gmres(apply, right, tol=rtol, atol=0.0, restart=40, maxiter=5)
-    return move
+def _solve_matrix_free(weights: Tree, at: Linearisation, right: Tree) -> Tree:
+    return solve_matrix_free(at, right, weights)
