@@ -35,7 +35,7 @@ class ActiveSet(AbstractSolver):
     Up to `dense` unknowns the matrix is formed. Beyond, the block is applied matrix-free, with one
     derivative of F per product: in conjugate gradients if F′ is symmetric (declared by
     `symmetric=True`, and otherwise decided by two products), and in BiCGStab followed by GMRES if not.
-    Their relative tolerance is min(0.1, ‖w‖/‖w₀‖). If F′ is ill-conditioned, as a discretised
+    Their relative tolerance is min(0.01, ‖w‖/‖w₀‖). If F′ is ill-conditioned, as a discretised
     differential operator is, a `preconditioner` saves products. The law of a `dvax.Problem` has one if
     the code of h shows that ∂h/∂u is one number: then F′ = aP⁻¹, and the block P_II is close to the
     inverse of F′_II up to a factor, which conjugate gradients do not notice.

@@ -35,7 +35,7 @@ class SemismoothNewton(AbstractSolver):
     regular with an inverse of norm at most about 1/γ, and convergence is quadratic.
 
     Up to `dense` unknowns the matrix is formed and factorised. Beyond, Krylov methods apply it, with
-    the relative tolerance min(0.1, ‖w‖/‖w₀‖): conjugate gradients if two products show that F′ is
+    the relative tolerance min(0.01, ‖w‖/‖w₀‖): conjugate gradients if two products show that F′ is
     symmetric, and otherwise BiCGStab followed by GMRES. For boxes, `ActiveSet` is the same method with
     much smaller systems.
 
