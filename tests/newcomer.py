@@ -177,8 +177,20 @@ FUNCTIONS = {
     ),
     "A a number": (lambda: solve(problem(A=lambda args: -1.0)), "Problem(A); AbstractGenerator"),
     "P nothing": (lambda: solve(problem(P=lambda args: None)), "Problem(P); NoneType"),
-    "A a matrix": (lambda: problem(A=jnp.eye(2)), "Problem(A); a generator"),
-    "K a pair": (lambda: problem(K=(0.0, 1.0)), "Problem(K); a set"),
+    "A a matrix": (lambda: problem(A=jnp.eye(2)), "Problem(A); a generator; Dense(matrix)"),
+    "P a number": (lambda: problem(P=1.0), "Problem(P); an operator; Scaling(1.0)"),
+    "K a pair": (lambda: problem(K=(0.0, 1.0)), "Problem(K); a set; Box(lower, upper)"),
+    "bounds that cross by roundoff": (
+        lambda: sets.Box(0.1 + 0.2, 0.3),
+        "Box(lower, upper); 0.30000000000000004; 0.29999999999999999",
+    ),
+    "u of a callable K": (
+        lambda: solve(
+            problem(K=lambda t, args: sets.Box(-jnp.ones(3), 1.0), h=lambda t, x, u, args: -x[:3]),
+            x0=jnp.zeros(5),
+        ),
+        "a callable K fixes no shape",
+    ),
     "f a number": (lambda: problem(f=1.0), "Problem(f); f=lambda t, x, u, args"),
     "a space of text": (lambda: problem(state_space="R2"), "Problem(state_space); a space"),
     "a space of a number": (
@@ -229,7 +241,7 @@ ARGUMENTS = {
     "dt text": (lambda: solve(dt="0.1"), "(dt); '0.1'"),
     "dt array": (lambda: solve(dt=jnp.ones(2)), "(dt); [1. 1.]"),
     "dt tiny": (lambda: solve(dt=1e-20), "(dt); a run has at most"),
-    "rtol negative": (lambda: solve(rtol=-1.0), "(rtol); -1.0"),
+    "rtol negative": (lambda: solve(rtol=-1.0), "(rtol); -1.0; ≥ 0"),
     "rtol none": (lambda: solve(rtol=None), "(rtol); None"),
     "rtol text": (lambda: solve(rtol="a"), "(rtol); 'a'"),
     "no tolerance": (lambda: solve(rtol=0.0, atol=0.0), "rtol, atol; one of them must be positive"),
@@ -265,6 +277,10 @@ ARGUMENTS = {
     ),
     "args that cannot be hashed": (lambda: solve(args={"a": {1, 2}}), "args; set {1, 2}; hashable"),
     "args NaN": (lambda: of_f(lambda t, x, u, args: args * u, args=nan), "(args); nan"),
+    "args NaN in a dictionary": (
+        lambda: of_f(lambda t, x, u, args: args["k"] * u, args={"b": 1.0, "k": nan}),
+        "(args); nan of ['k']",
+    ),
     "A NaN": (lambda: solve(problem(A=generators.Scalar(nan))), "Problem(A); nan"),
     "A NaN in a matrix": (
         lambda: solve(

@@ -80,8 +80,9 @@ class Problem(eqx.Module):
     - `f(t, x, u, args)`, `h(t, x, u, args)`: traceable by JAX; x and u are arrays, or tuples of
       arrays;
     - `state_space`, `control_space`: needed if they are not Euclidean. u has the shape that P and K
-      determine (by a matrix, or vectors of bounds), else that of x. Pass the control space if u has
-      another shape, such as `control_space=dvax.spaces.Euclidean(())` for a number u and a vector x.
+      determine (by a matrix, or vectors of bounds; not by a callable), else that of x. Pass the
+      control space if u has another shape, such as `control_space=dvax.spaces.Euclidean(())` for a
+      number u and a vector x.
 
     `args` is the parameter η of the paper: any pytree, which is passed to all of these.
 
@@ -114,12 +115,20 @@ class Problem(eqx.Module):
                 f"dvax.Problem({name})",
                 " ".join(f"{type(value).__name__} {value!r}".split())[:200],
                 f"it must be {what}, or a callable of {arguments} that returns one",
-                f"See dvax.{module}",
+                f"See dvax.{module}, for example {module}.{example}",
             )
-            for name, value, kind, what, arguments, module in (
-                ("A", self.A, AbstractGenerator, "a generator", "args", "generators"),
-                ("P", self.P, AbstractOperator, "an operator", "args", "operators"),
-                ("K", self.K, AbstractSet, "a set", "(t, args)", "sets"),
+            for name, value, kind, what, arguments, module, example in (
+                (
+                    "A",
+                    self.A,
+                    AbstractGenerator,
+                    "a generator",
+                    "args",
+                    "generators",
+                    "Dense(matrix)",
+                ),
+                ("P", self.P, AbstractOperator, "an operator", "args", "operators", "Scaling(1.0)"),
+                ("K", self.K, AbstractSet, "a set", "(t, args)", "sets", "Box(lower, upper)"),
             )
             if not isinstance(value, kind)
             and (not callable(value) or (isinstance(value, type) and issubclass(value, kind)))
@@ -306,7 +315,9 @@ class Problem(eqx.Module):
         if self.control_space is not None:
             return f" (of control_space={self.control_space!r})"
         if _control_shape.control_zero(self.P, self.K, x) is None:
-            return " (that of x, since P and K fix no other and control_space= is not given)"
+            if isinstance(self.K, AbstractSet):
+                return " (that of x, since P and K fix no other and control_space= is not given)"
+            return " (that of x: control_space= is not given, and a callable K fixes no shape)"
         parts = (f"{n}, {type(p).__name__}" for n, p in (("P", self.P), ("K", self.K)))
         return f" (which {' and '.join(parts)}, fix)"
 

@@ -321,7 +321,7 @@ SHAPE = {"load": LOADS[:3]}
     ((STARTS[:3], 0.0, 1.0, SHAPE), {"axes": (0, {"lode": 0})}, r"ensemble\(axes\)"),
     ((STARTS[:3], 0.0, 1.0, SHAPE), {"axes": (0, 0, 0)}, "it must be a pair"),
     ((STARTS[:3], 0.0, 1.0, SHAPE), {"method": dvax.PiecewiseLinear()}, "runs in Python"),
-    ((STARTS[:3], 0.0, 1.0, SHAPE), {"rtol": -1.0}, "positive and finite"),
+    ((STARTS[:3], 0.0, 1.0, SHAPE), {"rtol": -1.0}, "≥ 0 and finite"),
     ((STARTS[:0], 0.0, 1.0, {"load": LOADS[:0]}), {}, "at least one"),
 ])  # fmt: skip
 def test_arguments_that_break_a_rule(arguments, options, words):

@@ -121,3 +121,22 @@ def test_dt_max_limits_adaptive_steps():
     assert int(free.stats["steps"]) < 50 and int(limited.stats["steps"]) >= 100
     with pytest.raises(dvax.InputError, match="dt_max"):
         dvax.solve(problem, 1.0, 0.0, 1.0, dt_max=-1.0)
+
+
+@pytest.mark.parametrize("method", [None, dvax.ETD2RK()])
+def test_single_precision_state_beside_a_moving_set_of_double_precision(method):
+    # The center 0.0 of the ball is a double, and the guard bounds the changes of h and K together.
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0),
+        K=lambda t, args: dvax.sets.Ball(0.0, 1.0 + 0.5 * jnp.sin(t)),
+        f=lambda t, x, u, args: -x + u, h=lambda t, x, u, args: jnp.cos(t) + 0.0 * x,
+    )  # fmt: skip
+
+    def solve(dtype):
+        options = dict(rtol=1e-4, atol=1e-6, method=method)
+        return dvax.solve(problem, jnp.ones(2, dtype), 0.0, 2.0, **options).xs
+
+    with jax.numpy_dtype_promotion("standard"):
+        single, double = solve(jnp.float32), solve(jnp.float64)
+    assert single.dtype == jnp.float32
+    assert np.allclose(single, double, atol=1e-3)

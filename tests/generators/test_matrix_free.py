@@ -8,6 +8,7 @@ import pytest
 import scipy.linalg
 import scipy.sparse
 from jax.experimental.sparse import BCOO
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax import generators, spaces
@@ -397,3 +398,62 @@ def test_sparse_bound_from_a_declared_range_is_declared():
     assert is_declared(theirs.adjoint(spaces.Euclidean(N)))
     assert is_declared(generators.Product(ours, theirs))
     assert not is_declared(generators.Product(ours, generators.Scalar(-1.0)))
+
+
+def expm_step(A, h, x0, c0):
+    """The flow over h for x' = A x + c₀, by the exponential of an augmented matrix."""
+    n = len(x0)
+    joined = jnp.zeros((n + 1, n + 1)).at[:n, :n].set(A).at[:n, n].set(c0)
+    return (jax.scipy.linalg.expm(h * joined) @ jnp.append(x0, 1.0))[:n]
+
+
+CASES = [(which, h) for which in [(0,), (1,), (0, 1), (2,), (0, 1, 2)] for h in (0.05, 3.0)]
+
+
+@pytest.mark.parametrize(("which", "h"), mostly_thorough(CASES, {((0, 1), 3.0), ((2,), 0.05)}))
+def test_sparse_derivatives_of_the_flow_in_any_of_its_inputs(which, h):
+    rng = np.random.default_rng(7)
+    matrix = np.triu(np.tril(rng.normal(size=(5, 5)), 1), -1) + 2.0 * np.eye(5)
+    A, w = generators.Sparse(scipy.sparse.csr_array(matrix)), jnp.asarray(rng.normal(size=5))
+    if h == 3.0:
+        assert int(A.propagator(jnp.asarray(h), 2).substeps) > 1
+    x0, c0 = jnp.asarray(rng.normal(size=(2, 5)))
+    ours = lambda x0, c0, h: w @ A.propagator(h, 2).step(x0, (c0,))  # noqa: E731
+    theirs = lambda x0, c0, h: w @ expm_step(jnp.asarray(matrix), h, x0, c0)  # noqa: E731
+    given = x0, c0, jnp.asarray(h)
+    for order in (jax.grad, lambda f, at: jax.jacfwd(jax.grad(f, at), at)):
+        for a, b in zip(
+            jax.tree_util.tree_leaves(jax.jit(order(ours, which))(*given)),
+            jax.tree_util.tree_leaves(order(theirs, which)(*given)), strict=True,
+        ):  # fmt: skip
+            scale = float(jnp.abs(b).max()) + 1e-300
+            np.testing.assert_allclose(np.asarray(a) / scale, np.asarray(b) / scale, atol=1e-9)
+
+
+def test_sparse_gradients_of_a_batch_equal_those_of_its_lanes():
+    A = generators.Sparse(MATRICES["heat"])
+    hs, x0 = jnp.asarray([1e-3, 0.05, 2.0]), jnp.asarray(X0)
+    one = jax.grad(lambda x0, h: jnp.sum(A.semigroup(h, x0) ** 2))
+    together = jax.jit(jax.vmap(one, (None, 0)))(x0, hs)
+    for h, gradient in zip(hs, together, strict=True):
+        np.testing.assert_allclose(np.asarray(gradient), np.asarray(one(x0, h)), atol=1e-13)
+
+
+def test_matrix_free_gradient_of_a_part_of_a_tuple():
+    A, h = Waves(3.0), 0.4
+    q, p = jnp.asarray(RNG.normal(size=(2, 6)))
+    of_q = lambda q: jnp.sum(A.semigroup(h, (q, p))[1] ** 3)  # noqa: E731
+    along = jnp.asarray(RNG.normal(size=6))
+    slope = (of_q(q + 1e-5 * along) - of_q(q - 1e-5 * along)) / 2e-5
+    assert float(jax.grad(of_q)(q) @ along) == pytest.approx(float(slope), rel=1e-8)
+    assert float(jax.jvp(of_q, (q,), (along,))[1]) == pytest.approx(float(slope), rel=1e-8)
+
+
+def test_sparse_gradient_in_the_state_stores_no_terms():
+    n = 4000
+    heat = scipy.sparse.diags_array([1.0, -2.0, 1.0], offsets=[-1, 0, 1], shape=(n, n)).tocsr()
+    A, x0 = generators.Sparse(heat), jnp.ones(n)
+    pull = jax.jit(jax.grad(lambda x0: jnp.sum(A.semigroup(0.5, x0) ** 2)))
+    memory = pull.lower(x0).compile().memory_analysis()
+    if memory is not None:
+        assert memory.temp_size_in_bytes < 100 * x0.nbytes

@@ -149,7 +149,7 @@ def check(call: Arguments) -> None:
                 bool(is_valid),
                 name,
                 value,
-                "it must be positive and finite",
+                f"it must be {'≥ 0' if may_be_zero else 'positive'} and finite",
                 "Give a positive number",
             )
     if dt is None and not wrong and dt_max is not None and _tree.is_concrete(t0, t1, dt_max):

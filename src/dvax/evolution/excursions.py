@@ -127,13 +127,17 @@ class ExcursionGuard(eqx.Module):
             )
             # A pulse in one entry of f changes x as its share of the mean does.
             means = [jnp.sqrt(jnp.mean(leaf**2)) for leaf in excess[0]]
-            rates, laws = (_largest(part) if part else zero for part in (means, excess[1]))
+            # Numbers in a set may have a longer type than x: dvax.sets.Ball(0.0, …) beside float32.
+            rates, laws = (
+                _largest(part).astype(zero.dtype) if part else zero for part in (means, excess[1])
+            )
 
         def excursion(ignored: Any) -> Any:
             if not self.switches:
                 return zero
             rows = [flow.switches_of(v.t, v.x, v.rate) for v in evaluations]
-            return self._excursion(flow, samples, rows, first, second, ignored)
+            ratio = self._excursion(flow, samples, rows, first, second, ignored)
+            return ratio.astype(zero.dtype)
 
         # Use y and not z: an entry of z far outside K corresponds to a y at the bound.
         size = _largest([jnp.abs(leaf) for p in samples for leaf in jtu.tree_leaves(p[2])])

@@ -28,16 +28,25 @@ def refuse_nonfinite_data(problem: Problem, args: Any, caller: str) -> None:
 def first_bad(tree: Tree, allow_infinite: bool = False) -> str:
     """Describe the first NaN (or infinity) in a tree and its position; return "" if there is none."""
     # Skip setups: a solution among the args contains one, and its settings may be NaN.
-    whole = jtu.tree_leaves(tree, is_leaf=lambda v: isinstance(v, Setup))
-    leaves = [leaf for leaf in whole if isinstance(leaf, float | np.ndarray | jax.Array)]
-    for k, leaf in enumerate(leaves):
+    whole, _ = jtu.tree_flatten_with_path(tree, is_leaf=lambda v: isinstance(v, Setup))
+    leaves = [v for v in whole if isinstance(v[1], float | np.ndarray | jax.Array)]
+    for k, (path, leaf) in enumerate(leaves):
         if not _tree.is_concrete(leaf) or jnp.result_type(leaf).kind != "f":
             continue
         array = np.asarray(leaf)
         bad = np.isnan(array) if allow_infinite else ~np.isfinite(array)
         if bad.any():
             index = tuple(int(i) for i in np.argwhere(bad)[0])
-            part = f" of part {k}" if len(leaves) > 1 else ""
+            is_named = bool(path) and all(
+                isinstance(p, jtu.DictKey | jtu.SequenceKey) for p in path
+            )
+            part = (
+                f" of {jtu.keystr(path)}"
+                if is_named
+                else f" of part {k}"
+                if len(leaves) > 1
+                else ""
+            )
             place = f" in component {index}{part}" if index else part
             return f"{array[index]}{place} ({int(bad.sum())} of {bad.size} entries)"
     return ""

@@ -18,13 +18,16 @@ transform, SIAM J. Numer. Anal. 47 (2009); the bound: Beckermann, C. R. Acad. Sc
 """
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 
 from .. import _tree
 from .._batch import largest_of_lanes
@@ -104,6 +107,24 @@ def enclosing_ellipse(enclosure: Range, dtype: Any) -> Ellipse:
     )
 
 
+def _is_zero(tangent: Any) -> bool:
+    return isinstance(tangent, SymbolicZero)
+
+
+def _linear_in_all(tangents: list[Any]) -> list[jax.Array]:
+    """Return the tangents as arrays, each a linear function of all that are not symbolic zeros.
+
+    JAX transposes a linear solve only if it is linear in every part of its right-hand side.
+    """
+    first = sum(t.reshape(-1)[0] for t in tangents if not _is_zero(t))
+
+    def one(t: Any) -> jax.Array:
+        zero = 0.0 * first
+        return jnp.broadcast_to(zero, t.shape) if _is_zero(t) else t + zero
+
+    return [one(t) for t in tangents]
+
+
 class FaberPropagator(AbstractPropagator):
     """The flow over `substeps` equal substeps, each a Faber series of degree `degree`.
 
@@ -117,14 +138,150 @@ class FaberPropagator(AbstractPropagator):
     substeps: jax.Array
 
     def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
-        def substep(s: Any, x: Tree) -> Tree:
-            dtype = jnp.result_type(*jtu.tree_leaves(x))
-            count = self.substeps.astype(dtype)
-            new = self._sum((x, *_rescaled(s.astype(dtype) / count, 1.0 / count, c)))
-            return _tree.where(s < self.substeps, new, x)
+        numbers, rest = eqx.partition(self, eqx.is_array)
+        leaves, structure = jtu.tree_flatten(numbers)
 
+        def whole(leaves: list[Any]) -> FaberPropagator:
+            return eqx.combine(jtu.tree_unflatten(structure, leaves), rest)
+
+        @jax.custom_jvp
+        def flow(leaves: list[Any], v: tuple[Tree, ...]) -> Tree:
+            return whole(leaves)._plain_step(v)
+
+        def tangent(primals: Any, tangents: Any) -> tuple[Tree, Tree]:
+            (leaves, v), (leaf_tangents, v_tangents) = primals, tangents
+            propagator = whole(leaves)
+            out = propagator._plain_step(v)
+            parts, dv = jtu.tree_flatten(v_tangents, is_leaf=_is_zero)
+            total = _tree.zeros_like(out)
+            if not all(map(_is_zero, parts)):
+                dv = jtu.tree_unflatten(dv, _linear_in_all(parts))
+                total = propagator._linear_step(dv)
+            moving = [k for k, leaf in enumerate(leaf_tangents) if not _is_zero(leaf)]
+            if moving:
+
+                def of_data(data: list[Any]) -> Tree:
+                    changed = dict(zip(moving, data, strict=True))
+                    every = [changed.get(k, leaf) for k, leaf in enumerate(leaves)]
+                    return whole(every)._differentiable_step(v)
+
+                given = [leaves[k] for k in moving], [leaf_tangents[k] for k in moving]
+                total = _tree.add(total, jax.jvp(of_data, (given[0],), (given[1],))[1])
+            return out, total
+
+        flow.defjvp(tangent, symbolic_zeros=True)
+        return flow(leaves, (x0, *c))
+
+    def _linear_step(self, v: tuple[Tree, ...]) -> Tree:
+        """Return Sv for v = (x₀, c), with products with S and Sᵀ as derivatives.
+
+        The flow S is linear in v: y = Sv is a part of the solution of the triangular system v = b,
+        y − Sv = 0. Loops over the terms that a reverse pass can differentiate store every term that
+        there could be, at hundreds of times the cost.
+        """
+
+        def residual(system: tuple[tuple[Tree, ...], Tree]) -> tuple[tuple[Tree, ...], Tree]:
+            v, y = system
+            return v, _tree.sub(y, self._differentiable_step(v))
+
+        def solve(_: Any, right: tuple[tuple[Tree, ...], Tree]) -> tuple[tuple[Tree, ...], Tree]:
+            v, y = right
+            return v, _tree.add(y, self._plain_step(v))
+
+        def solve_transposed(
+            _: Any, right: tuple[tuple[Tree, ...], Tree]
+        ) -> tuple[tuple[Tree, ...], Tree]:
+            v, y = right
+            return tuple(map(_tree.add, v, self._transposed_step(y, len(v) - 1))), y
+
+        right = v, _tree.scale(0.0, v[0])
+        return lax.custom_linear_solve(residual, right, solve, solve_transposed)[1]
+
+    def _substeps(self) -> Any:
         # The lanes of a batch may have propagators of different step sizes.
-        return bounded_while(largest_of_lanes(self.substeps), substep, x0, 1, (_MAX_SUBSTEPS,))
+        return largest_of_lanes(self.substeps)
+
+    def _substep(self, s: Any, x: Tree, c: tuple[Tree, ...], total: Callable) -> Tree:
+        dtype = jnp.result_type(*jtu.tree_leaves(x))
+        count = self.substeps.astype(dtype)
+        new = total((x, *_rescaled(s.astype(dtype) / count, 1.0 / count, c)))
+        return _tree.where(s < self.substeps, new, x)
+
+    def _differentiable_step(self, v: tuple[Tree, ...]) -> Tree:
+        x0, *c = v
+        one = lambda s, x: self._substep(s, x, tuple(c), self._sum)  # noqa: E731
+        return bounded_while(self._substeps(), one, x0, 1, (_MAX_SUBSTEPS,))
+
+    def _plain_step(self, v: tuple[Tree, ...]) -> Tree:
+        x0, *c = v
+        one = lambda s, x: self._substep(s, x, tuple(c), self._plain_sum)  # noqa: E731
+        return lax.fori_loop(0, self._substeps(), one, x0)
+
+    def _transposed_step(self, y: Tree, terms: int) -> tuple[Tree, ...]:
+        """Return Sᵀy, the parts of x₀ and c."""
+        dtype = jnp.result_type(*jtu.tree_leaves(y))
+        count, substeps = self.substeps.astype(dtype), self._substeps()
+
+        def substep(k: Any, carry: tuple[Tree, tuple[Tree, ...]]) -> tuple[Tree, tuple[Tree, ...]]:
+            y, c = carry
+            s = substeps - 1 - k
+            x, *parts = self._transposed_sum(y, terms + 1)
+            theta, length = s.astype(dtype) / count, 1.0 / count
+            more = tuple(map(_tree.add, c, _rescaled_transposed(theta, length, tuple(parts))))
+            return _tree.where(s < self.substeps, (x, more), carry)
+
+        zero = tuple(_tree.zeros_like(y) for _ in range(terms))
+        x, c = lax.fori_loop(0, substeps, substep, (y, zero))
+        return x, *c
+
+    def _recurrence(self, dtype: Any) -> tuple[Any, Any, Any, jax.Array]:
+        """Return z₀, the two numbers of the recurrence, and the coefficients."""
+        z0, a, b = (number.astype(dtype) for number in self.ellipse)
+        return z0, 2.0 / (a + b), (a - b) / (a + b), self.coefficients.astype(dtype)
+
+    def _plain_sum(self, v: tuple[Tree, ...]) -> Tree:
+        """Return `_sum(v)` by a loop over the terms alone, which has no reverse derivative."""
+        z0, forward, back, rows = self._recurrence(jnp.result_type(*jtu.tree_leaves(v)))
+
+        def combined(factor: Any, k: Any, product: Any, first: Tree, second: Tree) -> Tree:
+            weights = (1.0 if isinstance(k, int) else 2.0) * rows[:, k]
+            return jtu.tree_map(
+                lambda Au, u, s, *leaves: sum(map(jnp.multiply, weights, leaves))
+                + factor * (Au - z0 * u) - back * s,
+                product, first, second, *v,
+            )  # fmt: skip
+
+        degree, zero = largest_of_lanes(self.degree), _tree.zeros_like(v[0])
+
+        def term(j: Any, carry: tuple[Tree, Tree]) -> tuple[Tree, Tree]:
+            first, second = carry
+            product = self.generator.apply(first)
+            return combined(forward, degree - j, product, first, second), first
+
+        first, second = lax.fori_loop(0, degree, term, (zero, zero))
+        return combined(0.5 * forward, 0, self.generator.apply(first), first, second)
+
+    def _transposed_sum(self, y: Tree, count: int) -> tuple[Tree, ...]:
+        """Return Σₖ coefficients[i, k] Fₖ(Aᵀ) y for i < count, with the transposed products of A."""
+        z0, forward, back, rows = self._recurrence(jnp.result_type(*jtu.tree_leaves(y)))
+        transpose = jax.vjp(self.generator.apply, y)[1]
+
+        def shifted_product(u: Tree) -> Tree:
+            return jtu.tree_map(lambda Au, u: Au - z0 * u, transpose(u)[0], u)
+
+        def scaled(factor: Any, u: Tree) -> Tree:
+            return jtu.tree_map(lambda leaf: factor * leaf, u)
+
+        def term(k: Any, carry: tuple[Tree, Tree, tuple[Tree, ...]]) -> Any:
+            tau, before, sums = carry
+            weights = 2.0 * rows[:, k]
+            sums = tuple(_tree.add(s, scaled(weights[i], tau)) for i, s in enumerate(sums))
+            new = jtu.tree_map(lambda m, b: forward * m - back * b, shifted_product(tau), before)
+            return new, tau, sums
+
+        sums = tuple(scaled(rows[i, 0], y) for i in range(count))
+        start = scaled(0.5 * forward, shifted_product(y)), y, sums
+        return lax.fori_loop(1, largest_of_lanes(self.degree) + 1, term, start)[2]
 
     def _sum(self, v: tuple[Tree, ...]) -> Tree:
         """Return Σₖ Fₖ(A) Σᵢ coefficients[i, k] vᵢ by Clenshaw's recurrence."""
@@ -225,3 +382,14 @@ def _rescaled(theta: Any, length: Any, c: tuple[Tree, ...]) -> tuple[Tree, ...]:
         return jtu.tree_map(lambda *leaves: sum(map(jnp.multiply, factors, leaves)), *c[j:])
 
     return tuple(map(coefficient, range(len(c))))
+
+
+def _rescaled_transposed(theta: Any, length: Any, w: tuple[Tree, ...]) -> tuple[Tree, ...]:
+    """Return the product of the transpose of `_rescaled` with w: Σⱼ (i over j) lʲ θ^{i−j} wⱼ."""
+    powers = [theta**k for k in range(len(w))]
+
+    def coefficient(i: int) -> Tree:
+        factors = [length**j * math.comb(i, j) * powers[i - j] for j in range(i + 1)]
+        return jtu.tree_map(lambda *leaves: sum(map(jnp.multiply, factors, leaves)), *w[: i + 1])
+
+    return tuple(map(coefficient, range(len(w))))

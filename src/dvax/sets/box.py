@@ -128,7 +128,9 @@ def _crossing(lower: jax.Array, upper: jax.Array) -> Any:
         return lower, upper
     index = tuple(map(int, wrong[0]))
     where = f" in entry {index} ({len(wrong)} of {low.size} such entries)" if index else ""
-    return _tree.Text(f"lower = {low[index]:.9g}, upper = {up[index]:.9g}{where}")
+    # Seventeen digits distinguish any two numbers.
+    digits = 9 if f"{low[index]:.9g}" != f"{up[index]:.9g}" else 17
+    return _tree.Text(f"lower = {low[index]:.{digits}g}, upper = {up[index]:.{digits}g}{where}")
 
 
 @jax.jit

@@ -84,9 +84,11 @@ class Bound(eqx.Module):
             (f"{name}", f"≤ {last_text(getattr(self, name))} at the last time ({text})")
             for name, text in about.items()
         ]
-        if is_known(self.x) and np.isinf(np.asarray(self.x)).any():
-            why = "where ∞: the region of the constants may be left, or the growth overflows"
-            rows.append(("", why))
+        infinite = np.isinf(np.asarray(self.x)) if is_known(self.x) else np.zeros(0, bool)
+        if infinite.any():
+            first = float(np.asarray(self.ts)[np.argmax(infinite)])
+            why = "the region of the constants may be left, or the growth overflows"
+            rows.append(("", f"∞ from t = {first:.6g} on: {why}"))
         return table(f"Bound: {self.status}", [("ts", value_text(self.ts)), *rows])
 
     def to_xarray(self, *, time_unit: str = "", x_unit: str = "", u_unit: str = "") -> Any:

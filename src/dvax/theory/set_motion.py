@@ -17,6 +17,7 @@ from ..programs.slope import Slope, SlopeEnclosure, TooLarge, Values, interval, 
 from ..programs.structure import independent
 from ..sets import AbstractSet, Ball, Intersection, Simplex
 from ..spaces import AbstractSpace
+from .set_bounds import bounds_of_fixed_set
 from .system import System
 from .weights import roots
 
@@ -62,8 +63,11 @@ def set_motion(system: System, t0: float, t1: float, knots: Values) -> SetMotion
     empty = _empty_at(system, np.array([t0]) if is_constant else _samples(t0, t1, knots))
     if _describe(first, like, system.control) is None:
         # The shape of the set is unknown. A constant set was checked when it was constructed.
-        is_nonempty = is_constant and empty is None and _rejects_empty(first)
-        return SetMotion(0.0 if is_constant else np.inf, *no_bounds, is_nonempty, empty)
+        if not is_constant:
+            return SetMotion(np.inf, *no_bounds, False, empty)
+        bounds = None if isinstance(like, tuple) else bounds_of_fixed_set(first, like)
+        is_nonempty = empty is None and _rejects_empty(first)
+        return SetMotion(0.0, *(bounds or no_bounds), is_nonempty, empty)
 
     def described(t: Any) -> Any:
         description = _describe(problem.set_at(t, args), like, system.control)

@@ -112,9 +112,10 @@ def verify(
     **Arguments:** `x0`: a state (only its shape matters; omit it for a scalar problem); `x`, `u`:
     the region for the statements as (low, high), numbers or elements. By default x is unbounded,
     and Pu lies in a box around K(t), if one is known. Constants of a region hold for trajectories
-    that stay in it. (If the region of u excludes a part of P⁻¹K(t), the law may have other
-    solutions there.) `declared`: moduli by name, or `dvax.Constants`. `energy`: search for a norm
-    in which trajectories contract, for affine data of up to 40 unknowns (needs `dvax[energy]`).
+    that stay in it. A bound of u that follows from K restricts nothing, so that responses may be at
+    it. (If the region of u excludes a part of P⁻¹K(t), the law may have other solutions there.)
+    `declared`: moduli by name, or `dvax.Constants`. `energy`: search for a norm in which trajectories
+    contract, for affine data of up to 40 unknowns (needs `dvax[energy]`).
 
     If f, h and K do not depend on t, the constants hold at all times, whatever t0 and t1 are.
 
@@ -148,16 +149,19 @@ def verify(
     K = set_motion(system, t0, t1, knots)
     states = as_intervals(x, x0, "dvax.verify(x)")
     given_u = as_intervals(u, system.u0, "dvax.verify(u)")
-    responses = intersect(given_u, response_box(system, K))
+    possible = response_box(system, K)
+    responses = intersect(given_u, possible)
     time = interval(t0, t1)
     region = Region(time, states, responses)
     box = Region(time, search_box(states, x0), search_box(responses, system.u0))
     moduli = modulus_statuses(system, region, box, _declared(declared))
     statuses = tuple(assumptions(system, region, K, knots, moduli))
-    # P⁻¹K(t) contains every response, so the domain only needs the bounds given by the caller.
+    # P⁻¹K(t) contains every response, so the domain needs only the bounds that exclude a part of it:
+    # a response at a limit of K would be on the boundary of any other region.
+    limits_u = None if u is None else without_limits(given_u, possible)
     if knots.size == 0 and _is_autonomous(system, t0):
         time = interval(-np.inf, np.inf)
-    domain = domain_of(time, None if x is None else states, None if u is None else given_u, args)
+    domain = domain_of(time, None if x is None else states, limits_u, args)
     constants = constants_of(system, region, moduli, domain, energy)
     return Verification(statuses, constants, _route(system, moduli))
 
@@ -282,6 +286,25 @@ def intersect(region: Tree, possible: Tree) -> Tree:
         return interval(low, high)
 
     return jtu.tree_map(one, region, possible, is_leaf=is_slope)
+
+
+def without_limits(region: Tree, possible: Tree) -> Tree | None:
+    """Return a region of u without the bounds that the box around all responses implies.
+
+    None stands for a region without bounds.
+    """
+
+    def one(a: Slope, b: Slope) -> Slope:
+        low, high = (
+            np.where(a.low <= b.low, -np.inf, a.low),
+            np.where(a.high >= b.high, np.inf, a.high),
+        )
+        return interval(low, high)
+
+    left = jtu.tree_map(one, region, possible, is_leaf=is_slope)
+    entries = jtu.tree_leaves(left, is_leaf=is_slope)
+    unbounded = all(bool(np.isinf(v.low).all() and np.isinf(v.high).all()) for v in entries)
+    return None if unbounded else left
 
 
 def search_box(tree: Tree, middle: Tree) -> Tree:

@@ -1,10 +1,12 @@
 """The report of a sweep: which axes are logarithmic, and which arrays of its store are figures."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import zarr
 
-from dvax.app.plots.sweep import _Axis, _members
+from dvax.app.plots.sweep import _PANELS, _Axis, _members, _omission
 
 RNG = np.random.default_rng(0)
 
@@ -45,3 +47,15 @@ def test_entries_of_short_vectors_are_figures_and_variables_over_time_are_not(tm
     assert [figure.name for figure in found.figures] == ["end[0]", "end[1]", "peak"]
     np.testing.assert_array_equal(found.figures[1].values, [1.0, 3.0, 5.0])
     np.testing.assert_array_equal(found.finished, [True, False, True])
+
+
+def test_figures_of_the_author_come_before_final_states_and_omissions_are_stated(tmp_path):
+    group = zarr.open_group(tmp_path / "sweep.zarr", mode="w", zarr_format=3)
+    finals = [f"final_{k}" for k in range(_PANELS)]
+    for name in ("status", "rate", "steps", "yield_total", *finals):
+        group.create_array(name, data=np.array([1, 1]), dimension_names=["member"])
+    found = _members(tmp_path / "sweep.zarr", ["rate"])
+    assert found is not None
+    assert [f.name for f in found.figures] == ["yield_total", *finals, "steps"]
+    assert f"{_PANELS} of {_PANELS + 2} figures are drawn" in _omission(found)
+    assert _omission(replace(found, figures=found.figures[:_PANELS])) == ""

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 import dvax
 from dvax.app.cli.program import app
 from dvax.app.plots.report import build_report
+from dvax.app.runs.export import export_run
 from dvax.app.runs.sweeps import driver
 from dvax.app.runs.sweeps.driver import run_sweep
 from dvax.app.runs.sweeps.member import create_store, run_member
@@ -168,6 +169,13 @@ def test_report_shows_figures_failures_and_ranges(copy):
     assert 'The error bound is <span class="status proved">proved</span> for 3 members' in lead
     drawn = {file.name for file in (copy / "figures").iterdir()}
     assert {"parallel.png", "response-model-parameters-rate.png"} <= drawn
+
+
+def test_export_of_a_sweep_names_its_store(outcome, tmp_path):
+    with pytest.raises(
+        dvax.InputError, match=r"folder of a sweep.*one run.*open_zarr\(.*sweep\.zarr"
+    ):
+        export_run(outcome.directory, tmp_path / "a.csv")
 
 
 def test_damaged_record_is_run_again(sweep, copy):

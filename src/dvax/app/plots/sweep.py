@@ -192,7 +192,8 @@ def _members(path: Path, keys: list[str]) -> _Members | None:
                 for k in range(array.shape[1])
             ]
     finished = axis("status").values == 1
-    figures.sort(key=lambda figure: figure.name == "steps")
+    # The figures that the author of a model chose are drawn first, since only some are drawn.
+    figures.sort(key=lambda figure: (figure.name == "steps", figure.name.startswith("final_")))
     varying = [figure for figure in figures if np.isfinite(figure.values[finished]).any()]
     return _Members([axis(key) for key in keys], varying, finished)
 
@@ -209,6 +210,16 @@ def _pictures(members: _Members) -> list[Picture]:
     if len(varying) > 1:
         pictures.append(_parallel(members, varying))
     return pictures
+
+
+def _omission(members: _Members) -> str:
+    """Return a sentence about the figures for which there is no panel, or ""."""
+    if len(members.figures) <= _PANELS:
+        return ""
+    return (
+        f" {_PANELS} of {len(members.figures)} figures are drawn; the table of ranges and sweep.zarr "
+        "have all."
+    )
 
 
 def _grid(axes: list[_Axis]) -> np.ndarray | None:
@@ -265,7 +276,7 @@ def _surface(members: _Members, axes: list[_Axis], grid: np.ndarray) -> Picture:
     return Picture(
         "surface", "Response surfaces",
         "Each figure over both parameters; members without results are gaps. Cells have one size "
-        "whatever the distance of the values.",
+        f"whatever the distance of the values.{_omission(members)}",
         plot, still, Views("Figure", labels) if len(labels) > 1 else None,
         alternative=f"Maps over {axes[0].short} and {axes[1].short} of {', '.join(labels)}.",
     )  # fmt: skip
@@ -297,7 +308,7 @@ def _response(members: _Members, over: _Axis, varying: list[_Axis]) -> Picture:
     others_said = " for each value of the other parameters" if others and repeats else ""
     return panels_picture(
         f"response-{over.name.replace('.', '-')}", f"Figures over {over.short}",
-        f"The figures of the members over {over.name}{others_said}.",
+        f"The figures of the members over {over.name}{others_said}.{_omission(members)}",
         panels, over.short, over.unit,
         log=over.is_wide,
     )  # fmt: skip

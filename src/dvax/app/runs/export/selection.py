@@ -14,6 +14,8 @@ import numpy as np
 from dvax.app.plots.run_reader import UNFINISHED, RunRecord, read_run
 from dvax.app.plots.store import Variable
 from dvax.app.runs.resolved import NAME as CONFIG
+from dvax.app.runs.sweeps.records import is_sweep
+from dvax.app.runs.sweeps.store import NAME as SWEEP_STORE
 from dvax.errors import Problems, input_error
 
 _BLOCK_BYTES = 2**25
@@ -59,6 +61,12 @@ def select(directory: Path, names: Sequence[str] | None = None) -> Selection:
 
     **Raises:** `dvax.InputError` if the folder holds no run, the run no results, or none of a name.
     """
+    if is_sweep(directory):
+        raise input_error(
+            str(directory), "the folder of a sweep", "dvax export reads the folder of one run",
+            f'Open it in Python: xarray.open_zarr("{directory / SWEEP_STORE}"), and its to_dataframe() '
+            'for CSV; or export runs of members, which runs = "all" in [output] keeps',
+        )  # fmt: skip
     run = read_run(directory)
     store = run.trajectory
     if store is None:

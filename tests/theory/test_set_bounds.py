@@ -1,0 +1,94 @@
+"""Boxes around K contain K, and a region of u that K implies restricts nothing."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvax
+from dvax.theory.set_bounds import bounds_of_fixed_set, propagate
+
+ROWS = jnp.ones((1, 3))
+SETS = {
+    "constrained box": dvax.sets.ConstrainedBox(
+        0.0, jnp.inf, ROWS, jnp.array([0.5]), jnp.array([2.0])
+    ),
+    "polyhedron": dvax.sets.Polyhedron(
+        jnp.concatenate([-jnp.eye(3), ROWS]), jnp.array([0.0, 0.0, 0.0, 2.0])
+    ),
+    "equation": dvax.sets.Polyhedron(-jnp.eye(3), jnp.zeros(3), 2.0 * ROWS, jnp.array([4.0])),
+}
+
+
+def bounds(K, n):
+    ends = bounds_of_fixed_set(K, jnp.zeros(n))
+    assert ends is not None
+    return ends
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_bounds_of_a_budget_are_its_total(name):
+    low, high = bounds(SETS[name], 3)
+    assert low == pytest.approx(np.zeros(3), abs=1e-11)
+    assert high == pytest.approx(np.full(3, 2.0), abs=1e-11)
+
+
+def test_bounds_of_a_half_space_are_infinite():
+    low, high = bounds(dvax.sets.Polyhedron(ROWS, jnp.array([2.0])), 3)
+    assert np.isneginf(low).all() and np.isposinf(high).all()
+
+
+def test_bounds_of_a_ball_of_sums_are_its_radius():
+    low, high = bounds(dvax.sets.L1Ball(1.0, 0.5), 2)
+    assert low == pytest.approx(np.full(2, 0.5)) and high == pytest.approx(np.full(2, 1.5))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_propagated_bounds_contain_every_point_of_the_set(seed):
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(4, 3)) * (rng.random((4, 3)) < 0.7)
+    y = rng.normal(size=(500, 3))
+    lower, upper = np.array([-0.8, -np.inf, -1.0]), np.array([np.inf, 0.9, 1.0])
+    low, high = -rng.uniform(0.1, 1.5, 4), rng.uniform(0.1, 1.5, 4)
+    low[0], high[1] = -np.inf, np.inf
+    sums = y @ rows.T
+    inside = ((lower <= y) & (y <= upper)).all(1) & ((low <= sums) & (sums <= high)).all(1)
+    sharper = propagate(lower, upper, rows, low, high)
+    assert inside.any() and (sharper[0] <= y[inside]).all() and (y[inside] <= sharper[1]).all()
+    assert (sharper[0] >= lower).all() and (sharper[1] <= upper).all()
+
+
+def grazing(K):
+    """Two stocks and a consumer that distributes its effort, which is at a limit of K at first."""
+    return dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=K,
+        f=lambda t, x, u, args: x * (1.0 - 0.5 * x) - 0.3 * x * u,
+        h=lambda t, x, u, args: u - (2.0 * u - x),
+    )  # fmt: skip
+
+
+KINDS = {
+    "box": dvax.sets.Box(0.0, 1.0),
+    "constrained box": dvax.sets.ConstrainedBox(
+        0.0, 1.0, jnp.ones((1, 2)), jnp.array([0.0]), jnp.array([1.0])
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_region_of_u_that_equals_the_box_around_K_admits_responses_at_its_limits(kind):
+    problem, x0 = grazing(KINDS[kind]), jnp.array([2.5, 0.0])
+    sol = dvax.solve(problem, x0, 0.0, 1.0, ts=jnp.linspace(0.0, 1.0, 5), rtol=1e-8)
+    assert float(sol.us[0].max()) == pytest.approx(1.0) and float(sol.us[0].min()) == 0.0
+    region = dict(x=(-0.5, 3.0))
+    implied = dvax.verify(problem, x0, 0.0, 1.0, **region).constants
+    stated = dvax.verify(problem, x0, 0.0, 1.0, u=(0.0, 1.0), **region).constants
+    errors = [dvax.bound_error(problem, sol, c).x for c in (implied, stated)]
+    assert np.isfinite(errors[1]).all() and np.array_equal(*errors)
+
+
+def test_region_of_u_that_excludes_responses_bounds_only_up_to_them():
+    problem, x0 = grazing(dvax.sets.Box(0.0, 1.0)), jnp.array([2.5, 0.1])
+    sol = dvax.solve(problem, x0, 0.0, 1.0, ts=jnp.linspace(0.0, 1.0, 5), rtol=1e-8)
+    check = dvax.verify(problem, x0, 0.0, 1.0, x=(-0.5, 3.0), u=(0.0, 0.9))
+    bound = dvax.bound_error(problem, sol, check.constants)
+    assert np.isinf(bound.x[1:]).all() and "∞ from t = 0.25 on" in repr(bound)
