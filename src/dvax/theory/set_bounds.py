@@ -7,8 +7,8 @@ from ..programs.slope import Values
 from ..sets import AbstractSet, ConstrainedBox, L1Ball, Polyhedron
 
 _PASSES = 4
-_ROUNDOFF = 1e-13
-"""Relative enlargement of a bound, more than the roundoff of a sum of 200 terms."""
+_ROUNDOFF = 4 * np.finfo(float).eps
+"""Relative enlargement of a bound for each term of the sums in it, more than their roundoff."""
 
 
 def bounds_of_fixed_set(K: AbstractSet, like: Tree) -> tuple[Values, Values] | None:
@@ -43,6 +43,7 @@ def propagate(
 ) -> tuple[Values, Values]:
     """Return bounds of {lower ≤ y ≤ upper, low ≤ rows y ≤ high} that are at least as sharp as
     (lower, upper), by interval propagation: rₖᵢ yᵢ ≤ highₖ − min Σ_{j≠i} rₖⱼ yⱼ, and so for low."""
+    roundoff = _ROUNDOFF * (rows.shape[1] + 4)
     for _ in range(_PASSES):
         before = lower, upper
         for sign, bound in ((1.0, high), (-1.0, -low)):
@@ -55,7 +56,7 @@ def propagate(
                 others = unbounded.sum(axis=1, keepdims=True) - unbounded
                 rest = bound[:, None] - (finite.sum(axis=1, keepdims=True) - finite)
                 size = np.abs(bound)[:, None] + np.abs(finite).sum(axis=1, keepdims=True)
-                rest = np.where(others > 0, np.inf, rest + _ROUNDOFF * size)
+                rest = np.where(others > 0, np.inf, rest + roundoff * size)
                 limit = rest / A
             upper = np.minimum(upper, np.where(A > 0, limit, np.inf).min(axis=0, initial=np.inf))
             lower = np.maximum(lower, np.where(A < 0, limit, -np.inf).max(axis=0, initial=-np.inf))

@@ -2,6 +2,8 @@
 
 from typing import Any, ClassVar
 
+import jax.tree_util as jtu
+
 from .._tree import Tree
 from ..errors import input_error
 from ..programs.structure import analyse
@@ -10,6 +12,11 @@ from .active_set import ActiveSet
 from .bracketing import Bracketing, affine_answer, is_pointwise
 from .lemke import Lemke, is_affine_on_polyhedron
 from .semismooth_newton import SemismoothNewton
+
+
+_LARGE_MAX_STEPS = 20_000
+"""Maximum number of iterations without a matrix: each costs little, and if Newton's method cannot find
+the active set among thousands of unknowns, the extragradient steps of the safeguard take thousands."""
 
 
 class Auto(AbstractSolver):
@@ -40,9 +47,13 @@ class Auto(AbstractSolver):
             return ClosedForm()
         if is_pointwise(vi, like):
             return Bracketing()
+        is_large = sum(leaf.size for leaf in jtu.tree_leaves(like)) > ActiveSet.dense
+        max_steps = _LARGE_MAX_STEPS if is_large else ActiveSet.max_steps
         if vi.K.intervals(like) is not None:
-            return ActiveSet()
-        return Lemke() if is_affine_on_polyhedron(vi, like) else SemismoothNewton()
+            return ActiveSet(max_steps=max_steps)
+        if is_affine_on_polyhedron(vi, like):
+            return Lemke()
+        return SemismoothNewton(max_steps=max_steps)
 
     def solve(self, vi: FrozenVI, y0: Tree, tol: Any) -> Answer:
         return self.choose_for(vi, y0).solve(vi, y0, tol)
