@@ -277,6 +277,14 @@ ARGUMENTS = {
     ),
     "args that cannot be hashed": (lambda: solve(args={"a": {1, 2}}), "args; set {1, 2}; hashable"),
     "args NaN": (lambda: of_f(lambda t, x, u, args: args * u, args=nan), "(args); nan"),
+    "an index that is too large": (
+        lambda: of_f(lambda t, x, u, args: -x + x[3], x0=jnp.zeros(3)),
+        "Problem(f); newcomer.py, line; the index 3 into an axis of 3 entries; from 0 to 2",
+    ),
+    "an index that is too small": (
+        lambda: of_f(lambda t, x, u, args: -x + x[-4], x0=jnp.zeros(3)),
+        "Problem(f); the index -1 (after JAX added the number of entries)",
+    ),
     "args NaN in a dictionary": (
         lambda: of_f(lambda t, x, u, args: args["k"] * u, args={"b": 1.0, "k": nan}),
         "(args); nan of ['k']",

@@ -7,6 +7,7 @@ shapes. The exceptions of Python and JAX point into the libraries. This module c
 
 import dis
 import inspect
+import os
 import re
 from collections.abc import Callable, Mapping
 from types import TracebackType
@@ -19,6 +20,7 @@ import numpy as np
 
 from . import _tree
 from .errors import DvaxError, InputError, InputProblem, input_error
+from .programs.indices import IndexOutside
 
 _LIBRARIES = {"dvax", "equinox", "jax", "jaxlib", "jaxtyping", "numpy", "scipy", "optimistix"}
 """Packages whose frames are not the user's code."""
@@ -296,6 +298,20 @@ def _in_library(trace: TracebackType) -> bool:
 def place(at: str, fn: Callable[..., Any]) -> str:
     """Return the name `at` of an argument with the file and line of the function's definition."""
     return f"{at}, {_place(fn)}"
+
+
+def index_error(at: str, fn: Callable[..., Any], wrong: IndexOutside) -> InputError:
+    """Return the `InputError` for a constant index outside of an array, in the function fn."""
+    folders = [f"{os.sep}{name}{os.sep}" for name in _LIBRARIES]
+    own = (line for line in wrong.lines if not any(folder in line[0] for folder in folders))
+    file, line = next(own, ("", 0))
+    added = " (after JAX added the number of entries)" if wrong.index < 0 else ""
+    return input_error(
+        f"{at}, {file}, line {line}" if file else place(at, fn),
+        f"the index {wrong.index}{added} into an axis of {wrong.entries} entries",
+        f"it must be from 0 to {wrong.entries - 1}: JAX raises no error, and reads the nearest entry",
+        "Correct the index; for the nearest entry on purpose, write x.at[i].get(mode='clip')",
+    )
 
 
 def _place(fn: Callable[..., Any], trace: TracebackType | None = None) -> str:

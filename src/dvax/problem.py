@@ -16,6 +16,7 @@ from ._tree import Tree
 from .errors import InputError, InputProblem, Problems, input_error
 from .generators import AbstractGenerator
 from .operators import AbstractOperator
+from .programs.indices import index_outside
 from .programs.switching_times import switching_times
 from .sets import AbstractSet
 from .signals import listen
@@ -299,7 +300,9 @@ class Problem(eqx.Module):
             _user_code.check_values(name, fn, out, x)
             return out
 
-        out = jax.eval_shape(traced, *inputs[:3])
+        program, out = jax.make_jaxpr(traced, return_shape=True)(*inputs[:3])
+        if (wrong := index_outside(program)) is not None:
+            raise _user_code.index_error(f"dvax.Problem({name})", fn, wrong)
         if not _tree.same_shape(out, element):
             raise input_error(
                 f"dvax.Problem({name})",

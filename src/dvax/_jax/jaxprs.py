@@ -46,6 +46,12 @@ def read(environment: dict[Any, Any], atoms: Any) -> list[Any]:
     return [atom.val if isinstance(atom, Literal) else environment[atom] for atom in atoms]
 
 
+def source_lines(eqn: Any) -> list[tuple[str, int]]:
+    """Return (file, line) of the calls that created an equation, innermost first."""
+    traceback = eqn.source_info.traceback
+    return [] if traceback is None else [(f.file_name, f.line_num) for f in traceback.frames]
+
+
 def count_operations(program: Any) -> int:
     """Return the number of operations of a program, with those of its inner programs."""
     return sum(

@@ -146,8 +146,13 @@ def _built(file: Path, function: str, build: Callable[[], Any]) -> Model:
 
 def _remedy(has_energy: bool) -> str:
     """Return what to try for a smaller bound."""
-    other = "weights of the state space (state_space=dvax.spaces.L2(weights)) or a shorter run"
-    first = "Try" if has_energy else "Try energy = true in [model],"
+    other = (
+        "constants of a region (constants=dvax.verify(problem, x0, x=(low, high)).constants of "
+        "dvax.models.Model), weights of the state space (state_space=dvax.spaces.L2(weights)) or a "
+        "shorter run"
+    )
+    linear = "energy = true in [model], if the derivatives of f and h do not change,"
+    first = "Try" if has_energy else f"Try {linear}"
     return (
         f"{first} {other}; the page Troubleshooting by message of the documentation "
         "(docs/howto/troubleshooting.md) says more."
