@@ -189,6 +189,8 @@ def safeguarded_newton(
             next_is_newton, _NEWTON, jnp.where(next_is_corrector, _CORRECTOR, _PREDICTOR)
         )
         run_length = jnp.where(failed, 2 * s.run_length, s.run_length)
+        # The share of the safeguard must not vanish as the runs become longer: it is what converges.
+        longest_wait = jnp.maximum(8, run_length // 8)
         new = _State(
             z=_tree.where(next_is_newton, newton_z, safeguard_z),
             kind=next_kind,
@@ -204,7 +206,9 @@ def safeguarded_newton(
             run_length=run_length,
             wait=wait,
             next_wait=jnp.where(
-                halved, 1, jnp.where(failed, jnp.minimum(2 * s.next_wait, 8), s.next_wait)
+                halved,
+                1,
+                jnp.where(failed, jnp.minimum(2 * s.next_wait, longest_wait), s.next_wait),
             ),
             singular=jnp.where(solves, ~_tree.all_finite(newton_z), s.singular),
             trust_limit=jnp.where(is_start, _TRUST_RATIO * norm_F, s.trust_limit),

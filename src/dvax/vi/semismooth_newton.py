@@ -23,7 +23,7 @@ class SemismoothNewton(AbstractSolver):
     The first step starts at z = y₀, the guess. A run of Newton steps continues while it halves the best
     ‖w‖ at least every sixth step (after a failed run every eleventh, and so on, doubling). Otherwise
     extragradient steps are made, from their own last iterate or from the last Newton point that halved
-    ‖w‖. After a failed run, 1, 2, 4, then 8 of them precede the next.
+    ‖w‖. After failed runs, 1, 2, 4, then 8 or more of them precede the next.
 
     An iteration is one projection and one evaluation of F: a Newton step, or the predictor or the
     corrector of an extragradient step (or a predictor whose step is then shortened). The projection of
