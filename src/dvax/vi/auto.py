@@ -13,7 +13,6 @@ from .bracketing import Bracketing, affine_answer, is_pointwise
 from .lemke import Lemke, is_affine_on_polyhedron
 from .semismooth_newton import SemismoothNewton
 
-
 _LARGE_MAX_STEPS = 20_000
 """Maximum number of iterations without a matrix: each costs little, and if Newton's method cannot find
 the active set among thousands of unknowns, the extragradient steps of the safeguard take thousands."""
