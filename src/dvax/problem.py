@@ -119,15 +119,7 @@ class Problem(eqx.Module):
                 f"See dvax.{module}, for example {module}.{example}",
             )
             for name, value, kind, what, arguments, module, example in (
-                (
-                    "A",
-                    self.A,
-                    AbstractGenerator,
-                    "a generator",
-                    "args",
-                    "generators",
-                    "Dense(matrix)",
-                ),
+                ("A", self.A, AbstractGenerator, "a generator", "args", "generators", "Dense(M)"),
                 ("P", self.P, AbstractOperator, "an operator", "args", "operators", "Scaling(1.0)"),
                 ("K", self.K, AbstractSet, "a set", "(t, args)", "sets", "Box(lower, upper)"),
             )

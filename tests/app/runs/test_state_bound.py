@@ -7,7 +7,9 @@ import pytest
 from typer.testing import CliRunner
 
 import dvax
+from dvax._figure_text import entry_text
 from dvax.app.cli.program import app
+from dvax.app.runs.applications.certificate import Certificate
 from dvax.app.runs.applications.config import read_config
 from dvax.app.runs.applications.models.python import _bound_unit
 from dvax.app.runs.state_bound import useless_bound
@@ -101,3 +103,10 @@ def test_energy_is_refused_where_nothing_is_searched(tmp_path, monkeypatch):
 def test_a_bound_is_useless_if_it_is_not_smaller_than_the_solution(entry, words):
     said = useless_bound({"error_bound": entry}, "Try this.")
     assert said is None if words is None else words in said and said.endswith("Try this.")
+
+
+def test_bound_that_becomes_infinite_is_a_number_and_one_that_was_not_computed_is_not() -> None:
+    infinite = Certificate(np.array([0.1, np.inf]), "estimated").figure("kg", "bound of x")
+    assert entry_text({"value": infinite.value, "bound": infinite.bound}) == "∞"
+    unknown = Certificate(np.full(2, np.nan), "not known").figure("kg", "bound of x")
+    assert unknown.value is None

@@ -146,7 +146,7 @@ def _print_figures(summary: dict[str, Any]) -> None:
     for name, entry in summary.items():
         if name == "status":
             continue  # it is the last line, and in the exit code
-        unit = "" if entry["unit"] == "1" else entry["unit"]
+        unit = "" if entry["unit"] == "1" or entry["value"] is None else entry["unit"]
         rows.append((name, f"{entry_text(entry)} {unit}".strip(), entry["meaning"]))
     if rows:
         print_table(("figure", "value", "meaning"), rows)

@@ -24,9 +24,9 @@ class Certificate(NamedTuple):
 
     @property
     def largest(self) -> float | None:
-        """Over all saved times; None where nothing is known."""
+        """Over all saved times; None where nothing is known, which infinity is not."""
         top = float(self.values.max())
-        return top if np.isfinite(top) else None
+        return None if np.isnan(top) else top
 
     def figure(self, unit: str, words: str) -> Figure:
         """The largest bound as a headline figure, with the word for how much is known of it."""
