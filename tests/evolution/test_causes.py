@@ -148,6 +148,15 @@ def test_cause_nonmonotone_law_names_the_eigenvalue():
     assert "not strongly monotone" in error.cause and "eigenvalue -2 " in error.cause
 
 
+def test_cause_law_that_does_not_depend_on_u_names_the_eigenvalue():
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Ball(0.0, 1.0),
+        f=lambda t, x, u, args: u, h=lambda t, x, u, args: 1.0 + x + u,
+    )  # fmt: skip
+    error = failure(problem, x0=jnp.zeros(2), t1=1.0)
+    assert "not strongly monotone" in error.cause and "eigenvalue 0 " in error.cause
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("rate", mostly_thorough([1e4, 1e5, 1e7, 1e9], [1e7]))
 def test_cause_stiffness_suggests_a_method_that_succeeds(rate):

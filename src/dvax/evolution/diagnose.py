@@ -161,6 +161,8 @@ def _nonfinite(stop: Stop) -> Diagnosis:
                 low, high = (low, middle) if bad(name, middle) else (middle, high)
             at, what = f"at t = {stop.t + high:.12g}", bad(name, high) or diagnosis
             fixes = (Fix("", "", _CHECKED[name]),)
+            if name == "u" and (cause := _not_monotone(stop)) is not None:
+                return cause
             if what.startswith(_REFUSED):
                 return Diagnosis(f"{name} is refused {at}: {what[len(_REFUSED) :]}.", fixes, True)
             if name == _NEAREST:
@@ -372,8 +374,25 @@ def _rounded_up(count: float) -> int:
     return math.ceil(count / unit) * unit
 
 
+_SIGN = Fix("", "", "Check the sign of the way in which h depends on u")
+
+
 def _law(stop: Stop) -> Diagnosis:
-    """Detect a law F(y) = P⁻¹y − h(t, x, P⁻¹y) that is not monotone at the last state."""
+    """Return why the law was not solved."""
+    cause = _not_monotone(stop)
+    if cause is not None:
+        return cause
+    return Diagnosis(
+        f"The solver of the law did not reach its tolerance at t = {stop.t:.12g}.",
+        (
+            Fix("vi_solver", "Extragradient", "or another solver of dvax.vi with more iterations"),
+            _SIGN,
+        ),
+    )
+
+
+def _not_monotone(stop: Stop) -> Diagnosis | None:
+    """Detect a law F(y) = P⁻¹y − h(t, x, P⁻¹y) that is not strongly monotone at the last state."""
     problem, args, t = stop.flow.problem, stop.flow.args, stop.time(stop.t)
     at = f"at t = {stop.t:.12g}"
     y = stop.flow.rate(t, stop.x, None).y
@@ -381,7 +400,6 @@ def _law(stop: Stop) -> Diagnosis:
     if y is None or first_bad(y):
         y = like
     flat, unravel = jax.flatten_util.ravel_pytree(y)
-    fix = Fix("", "", "Check the sign of the way in which h depends on u")
     if flat.size <= _MAX_DENSE_LAW:
         F = problem.frozen(t, stop.x, args)
         M = np.asarray(jax.jacfwd(lambda v: jax.flatten_util.ravel_pytree(F(unravel(v)))[0])(flat))
@@ -392,12 +410,6 @@ def _law(stop: Stop) -> Diagnosis:
                     f"F(y) = P⁻¹y − h(t, x, P⁻¹y) is not strongly monotone {at}: the symmetric part of "
                     f"its derivative has the eigenvalue {least:.6g} ≤ 0, so that the law may have no "
                     "solution or several.",
-                    (fix,),
+                    (_SIGN,),
                 )
-    return Diagnosis(
-        f"The solver of the law did not reach its tolerance {at}.",
-        (
-            Fix("vi_solver", "Extragradient", "or another solver of dvax.vi with more iterations"),
-            fix,
-        ),
-    )
+    return None

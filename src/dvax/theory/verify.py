@@ -393,9 +393,11 @@ def _declared(declared: Mapping[str, float] | Constants | None) -> dict[str, flo
             values[name] = float(value)
         except (TypeError, ValueError):
             values[name] = np.nan
-        if not np.isfinite(values[name]):
+        is_possible = values[name] > 0 if name in ("gamma", "L_F") else values[name] >= 0
+        if not (np.isfinite(values[name]) and is_possible):
             raise input_error(
                 f"dvax.verify(declared[{name!r}])", repr(value)[:120],
-                "a modulus must be a finite number", "Correct it, or omit it",
+                "a modulus must be a finite number, gamma and L_F positive, the others ≥ 0",
+                "Correct it, or omit it",
             )  # fmt: skip
     return values
