@@ -370,6 +370,10 @@ VERIFY = {
     "an unknown modulus": (lambda: verify(declared={"gam": 1.0}), "verify(declared); 'gam'"),
     "a modulus of text": (lambda: verify(declared={"gamma": "one"}), "declared['gamma']; 'one'"),
     "a modulus of NaN": (lambda: verify(declared={"gamma": nan}), "declared['gamma']; nan"),
+    "a modulus below 0": (
+        lambda: verify(declared={"gamma": -1.0}),
+        "declared['gamma']; -1.0; positive",
+    ),
     "moduli in a list": (lambda: verify(declared=[1]), "verify(declared); 'list'"),
     "A NaN": (lambda: verify(problem(A=generators.Scalar(nan))), "Problem(A); nan"),
     "args NaN": (lambda: verify(problem(f=lambda t, x, u, a: a * u), args=nan), "(args); nan"),
