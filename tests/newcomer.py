@@ -177,7 +177,7 @@ FUNCTIONS = {
     ),
     "A a number": (lambda: solve(problem(A=lambda args: -1.0)), "Problem(A); AbstractGenerator"),
     "P nothing": (lambda: solve(problem(P=lambda args: None)), "Problem(P); NoneType"),
-    "A a matrix": (lambda: problem(A=jnp.eye(2)), "Problem(A); a generator; Dense(matrix)"),
+    "A a matrix": (lambda: problem(A=jnp.eye(2)), "Problem(A); a generator; Dense(M)"),
     "P a number": (lambda: problem(P=1.0), "Problem(P); an operator; Scaling(1.0)"),
     "K a pair": (lambda: problem(K=(0.0, 1.0)), "Problem(K); a set; Box(lower, upper)"),
     "bounds that cross by roundoff": (
