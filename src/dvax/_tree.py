@@ -49,6 +49,11 @@ def scale(c: Any, a: Tree) -> Tree:
     return jtu.tree_map(lambda leaf: c * leaf, a)
 
 
+def dot(a: Tree, b: Tree) -> Any:
+    """Return the sum of the products of all entries, in the type of the leaves."""
+    return sum(map(jnp.vdot, jtu.tree_leaves(a), jtu.tree_leaves(b)))
+
+
 def where(condition: Any, a: Tree, b: Tree) -> Tree:
     """Return a if the condition is true, else b, without an operation for identical leaves."""
     return jtu.tree_map(lambda p, q: p if p is q else jnp.where(condition, p, q), a, b)

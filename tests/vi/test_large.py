@@ -14,6 +14,7 @@ import pytest
 import scipy.sparse as sp
 
 import dvax
+from dvax.vi.matrix_free import is_self_adjoint
 
 POINTS = 40
 CONDITIONS = (1e-2, 1.0, 1e2, 1e4, 1e6)
@@ -148,3 +149,32 @@ def test_a_problem_with_an_obstacle_on_a_fine_grid_is_solved_without_options():
     value = as_matrix(10.0, 0.0) @ u - (1.0 + np.sqrt(10.0)) * load(0.3) - 0.1 * x
     assert 0.1 < np.mean(u > 0) < 0.9
     assert np.linalg.norm(np.minimum(u, value)) < 1e-6
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("points", [40, 150])
+def test_symmetric_laws_are_recognised_in_single_and_in_double_precision(dtype, points):
+    def slope(skew, kappa, y):
+        v = jnp.pad(y.reshape(points, points), 1)
+        east, west, north, south = v[1:-1, 2:], v[1:-1, :-2], v[2:, 1:-1], v[:-2, 1:-1]
+        laplacian = 4.0 * v[1:-1, 1:-1] - east - west - north - south
+        return y + kappa * (laplacian + skew * (east - west)).ravel()
+
+    like, weights = jnp.zeros(points**2, dtype), jnp.asarray(0.5, dtype)
+    for kappa in CONDITIONS:
+        assert is_self_adjoint(partial(slope, 0.0, kappa), like, weights)
+        if kappa >= 1.0:
+            assert not is_self_adjoint(partial(slope, 0.3, kappa), like, weights)
+
+
+@pytest.mark.parametrize("skew", [0.0, 0.3])
+def test_laws_in_single_precision_are_solved_in_a_process_of_double_precision(skew):
+    kappa, b = 100.0, load(0.3)
+    args = (np.float32(kappa), np.float32(skew), np.float32(0.0), jnp.asarray(b, jnp.float32))
+    K = dvax.sets.Box(np.float32(0.0), np.float32(jnp.inf))
+    vi = dvax.solve_vi(F, K, jnp.zeros(POINTS**2, jnp.float32), args, tol=np.float32(1e-3))
+    y = np.asarray(vi.y)
+    value = as_matrix(kappa, skew) @ y - (1.0 + np.sqrt(kappa)) * b
+    assert y.dtype == np.float32
+    # Roundoff of F is about 8κ ‖y‖ ε.
+    assert np.linalg.norm(np.minimum(y, value)) < 2e-3 + 8 * kappa * 1e-7 * np.linalg.norm(y)

@@ -25,13 +25,9 @@ def solve_general(
     """
     d, _ = jax.scipy.sparse.linalg.bicgstab(apply, b, tol=rtol, maxiter=steps, M=preconditioner)
     residual = _tree.sub(b, apply(d))
-    is_better = _square(residual) < _square(b)
+    is_better = _tree.dot(residual, residual) < _tree.dot(b, b)
     d = jtu.tree_map(lambda v: jnp.where(is_better, v, 0.0), d)
     d, _ = jax.scipy.sparse.linalg.gmres(
         apply, b, x0=d, tol=rtol, atol=0.0, restart=_RESTART, maxiter=_RESTARTS, M=preconditioner
     )
     return d
-
-
-def _square(a: Tree) -> jax.Array:
-    return sum((jnp.vdot(leaf, leaf) for leaf in jtu.tree_leaves(a)), jnp.zeros(()))

@@ -30,8 +30,7 @@ def solve_matrix_free(
     Dd is unique, and solves D(τF′D + I − D) d = D right; then d = right + Dd − τF′Dd. The derivative D
     of a projection is self-adjoint in the space, whose `weights` W define its inner product. If F′ is
     as well (`symmetric`; None: decide by `is_self_adjoint`), conjugate gradients solve the system, and
-    otherwise GMRES. The `preconditioner` approximates the inverse of F′ in the
-    range of D.
+    otherwise `solve_general`. The `preconditioner` approximates the inverse of F′ in the range of D.
     """
     parts = _broadcast(weights, right)
     rtol: Any = jnp.clip(at.reduction, 1e-10, _LARGEST_TOLERANCE)
@@ -74,14 +73,10 @@ def is_self_adjoint(slope: Callable[[Tree], Tree], like: Tree, weights: Tree) ->
     a, b = scattered(parts, 1), scattered(parts, 2)
     weighted_a, weighted_b = (jtu.tree_map(jnp.multiply, parts, v) for v in (a, b))
     slope_a, slope_b = slope(a), slope(b)
-    difference = _dot(weighted_a, slope_b) - _dot(weighted_b, slope_a)
-    size = _dot(weighted_a, weighted_a) * _dot(slope_b, slope_b)
+    difference = _tree.dot(weighted_a, slope_b) - _tree.dot(weighted_b, slope_a)
+    size = _tree.dot(weighted_a, weighted_a) * _tree.dot(slope_b, slope_b)
     return jnp.abs(difference) <= 8 * jnp.finfo(size.dtype).eps * jnp.sqrt(size)
 
 
 def _broadcast(weights: Tree, like: Tree) -> Tree:
     return jtu.tree_map(lambda w, v: jnp.broadcast_to(w, v.shape).astype(v.dtype), weights, like)
-
-
-def _dot(a: Tree, b: Tree) -> jax.Array:
-    return sum(map(jnp.vdot, jtu.tree_leaves(a), jtu.tree_leaves(b)), jnp.zeros(()))
