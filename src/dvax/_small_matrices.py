@@ -21,7 +21,7 @@ def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
     if len(right) > MAX_ROWS:
         return jnp.linalg.solve(matrix, right)
     return lax.custom_linear_solve(
-        lambda x: matrix @ x,
+        lambda x: times(matrix, x),
         right,
         lambda _, vector: solve_constant(matrix, vector),
         lambda _, vector: solve_constant(matrix.T, vector),
@@ -73,19 +73,19 @@ def eliminate(matrix: jax.Array, right: jax.Array) -> tuple[jax.Array, jax.Array
 
 def times(A: jax.Array, x: jax.Array) -> jax.Array:
     """Return A x."""
-    return A @ x if max(A.shape) > MAX_ROWS else jnp.sum(A * x[None, :], axis=1)
+    return A @ x if A.size > MAX_ROWS**2 else jnp.sum(A * x[None, :], axis=1)
 
 
 def combine(weights: jax.Array, rows: jax.Array) -> jax.Array:
     """Return Σₖ weightsₖ rowsₖ."""
-    if max(rows.shape) > MAX_ROWS:
+    if rows.size > MAX_ROWS**2:
         return weights @ rows
     return jnp.sum(weights[:, None] * rows, axis=0)
 
 
 def product(A: jax.Array, B: jax.Array) -> jax.Array:
     """Return A B, for small matrices as a sum of products."""
-    if max(*A.shape, *B.shape) > MAX_ROWS:
+    if A.size * B.shape[1] > MAX_ROWS**3:
         return A @ B
     return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
 

@@ -33,6 +33,9 @@ CALLS = CUSTOM | {
 """Primitives that apply one inner program to their arguments."""
 
 
+LOOPS = frozenset({"while", "scan"})
+
+
 def bind(eqn: Any, operands: list[Any], **others: Any) -> list[Any]:
     """Return the results of one operation on these arrays, with some `others` of its parameters."""
     with eqn.ctx.manager:
@@ -56,6 +59,14 @@ def count_operations(program: Any) -> int:
     """Return the number of operations of a program, with those of its inner programs."""
     return sum(
         1 + sum(map(count_operations, nested_programs(e.params))) for e in program.jaxpr.eqns
+    )
+
+
+def has_loop(program: Any) -> bool:
+    """Return whether a program contains a loop."""
+    return any(
+        e.primitive.name in LOOPS or any(map(has_loop, nested_programs(e.params)))
+        for e in program.jaxpr.eqns
     )
 
 

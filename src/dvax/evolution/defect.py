@@ -238,7 +238,7 @@ def _unseen(flow: Flow, evaluations: list[Evaluation], doubt: Tree) -> Tree:
     """The most that is hidden at any of them; where projections are iterated, from one place of
     the program, as in `evaluations`."""
     masked = lambda v: flow.masked_error(v.t, v.x, v.rate, doubt)  # noqa: E731
-    if flow.direct:
+    if not flow.iterates:
         return _largest([masked(one) for one in evaluations])
     stacked = lax.map(masked, jtu.tree_map(lambda *leaves: jnp.stack(leaves), *evaluations))
     return jtu.tree_map(lambda leaf: jnp.max(leaf, axis=0), stacked)

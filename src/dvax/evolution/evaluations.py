@@ -51,7 +51,7 @@ def evaluated(
     `begin` is any time of the run."""
     # A step whose defect is enclosed has few evaluations, and its first rate lacks the solution of the
     # law, which the loop would store.
-    if flow.direct and (flow.enclosed or not _is_long(flow, begin, x0)):
+    if not flow.iterates and (flow.enclosed or not _is_long(flow, begin, x0)):
         return _straight(flow, plan, kept, jumped)
     return _in_turn(flow, plan, begin, x0, guess, kept, jumped)
 

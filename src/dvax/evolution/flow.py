@@ -57,11 +57,13 @@ class Flow(eqx.Module):
     `direct` says that the law has a closed form, so that no guess is needed: it was proved to be
     F(y) = ay − h(t, x, 0), pointwise on a set of pointwise intervals, or with one number a on any set,
     and y = proj_K(h(t, x, 0)/a); or affine on a box of few unknowns, solved by the formula `small_box`.
+    `iterates` says that the law, or the projection of its closed form, is computed by a loop. Such a
+    program takes a compiler a second or ten for every place that contains it.
     `reciprocal` is 1/a where a was proved not to depend on t and x, so that it is computed once.
     `enclosed` says that f̃ has a linear enclosure over a whole step, so that nothing about the defect
     is guessed. `linear` is A + J where some J joins A in what is left to the propagator.
-    With `keeps_switches`, `rate` also returns the switch functions of a law that is solved by
-    iteration, so that they are compiled once with it and not wherever they are read. `pointwise` says
+    With `keeps_switches`, `rate` also returns the switch functions of a law that `iterates`, so that
+    they are compiled once with it and not wherever they are read. `pointwise` says
     that each entry of f̃ depends on t and on that entry of x alone.
     """
 
@@ -71,6 +73,7 @@ class Flow(eqx.Module):
     operator: AbstractOperator
     solver: AbstractSolver
     direct: bool = eqx.field(static=True)
+    iterates: bool = eqx.field(static=True)
     reciprocal: Tree | None
     enclosed: bool = eqx.field(static=True)
     tol: LawTolerance
@@ -115,9 +118,7 @@ class Flow(eqx.Module):
 
     def rate(self, t: Any, x: Tree, guess: Tree | None) -> Rate:
         """f̃(t, x), the law being solved from `guess`."""
-        if self.direct:
-            return self._closed_form(t, x)
-        return _solved(self, t, x, guess)
+        return _by_loop(self, t, x, guess) if self.iterates else self._closed_form(t, x)
 
     def guess(self, x: Tree) -> Tree | None:
         """Where the law's solver starts when nothing is known; None where it needs no start."""
@@ -215,7 +216,7 @@ class Flow(eqx.Module):
 
         zero = _tree.zeros_like(error)
         points = [rate.z, _tree.add(rate.z, error), _tree.sub(rate.z, error)]
-        if self.direct:
+        if not self.iterates:
             base, linear = jax.jvp(project, (rate.z,), (error,))
             above, below = map(project, points[1:])
         else:
@@ -244,9 +245,15 @@ def joined(parts: list[jax.Array], dtype: Any) -> jax.Array:
 
 
 @eqx.filter_jit
+def _by_loop(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
+    """The rate of a flow that iterates. A function of its own, so that it is traced once a program,
+    however many places of a step ask for it."""
+    rate = flow._closed_form(t, x) if flow.direct else _solved(flow, t, x, guess)
+    switches = flow.switch_parts(t, x, rate.z) if flow.keeps_switches else None
+    return rate._replace(switches=jax.lax.stop_gradient(switches))
+
+
 def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
-    """The law solved by iteration. A function of its own, so that it is traced once a program, however
-    many places of a step ask for it."""
     problem, args = flow.problem, flow.args
     start = problem.zero_control(x) if guess is None else guess
     vi = FrozenVI(
@@ -260,11 +267,7 @@ def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
     answer = flow.solver.solve(vi, start, flow.law_tol(t, x, start))
     value = problem.f(t, x, flow.operator.inverse(answer.y), args)
     solved = answer.result == RESULTS.successful
-    switches = flow.switch_parts(t, x, answer.z) if flow.keeps_switches else None
-    return Rate(
-        value, answer.y, answer.z, answer.residual, solved, answer.evaluations,
-        jax.lax.stop_gradient(switches),
-    )  # fmt: skip
+    return Rate(value, answer.y, answer.z, answer.residual, solved, answer.evaluations)
 
 
 def is_pointwise(problem: Problem, operator: AbstractOperator, t: Any, x: Tree, args: Any) -> bool:

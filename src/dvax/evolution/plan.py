@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
+from .._jax.jaxprs import has_loop
 from ..programs.enclosure import constant, has_enclosure
 from ..vi import AbstractSolver, Auto, analyse, independent
 from .flow import Flow, slope
@@ -25,6 +26,7 @@ class Plan(NamedTuple):
     - `constant_slope`: a does not depend on t and x;
     - `small_box`: the law is affine on a box of a few unknowns, its matrix does not depend on t and x,
       and a formula solves it;
+    - `iterates`: the law, or the projection of its closed form, is computed by a loop;
     - `solver`: the solver of the law that `dvax.vi.Auto` chose, None if the user gave one;
     - `enclosed`: f̃ has an enclosure over a whole step, so that the defect is not sampled.
     """
@@ -33,6 +35,7 @@ class Plan(NamedTuple):
     one_slope: bool
     constant_slope: bool
     small_box: bool
+    iterates: bool
     solver: AbstractSolver | None
     enclosed: bool
 
@@ -42,7 +45,7 @@ class Plan(NamedTuple):
         problem, x0, args, t0 = setup.problem, setup.x0, as_arrays(setup.args), setup.number("t0")
         like = problem.zero_control(x0)
         if not isinstance(setup.vi_solver, Auto):
-            return Plan(False, False, False, False, None, False)
+            return Plan(False, False, False, False, True, None, False)
         K, frozen = problem.set_at(t0, args), problem.frozen(t0, x0, args)
         structure, is_box = analyse(frozen, like), K.intervals(like) is not None
         solver = setup.vi_solver.choose(frozen, K, like)
@@ -51,10 +54,14 @@ class Plan(NamedTuple):
             jacobian = lambda t, x: jax.jacfwd(problem.frozen(t, x, args))(like)  # noqa: E731
             affine = structure.affine and is_box and is_small(like)
             solved_by_formula = affine and independent(jacobian, t0, x0)
-            return Plan(False, False, False, solved_by_formula, solver, False)
+            return Plan(
+                False, False, False, solved_by_formula, not solved_by_formula, solver, False
+            )
         operator = problem.operator(args)
         constant_slope = independent(lambda t, x: slope(problem, operator, t, x, args), t0, x0)
-        plan = Plan(True, structure.isotropic, constant_slope, False, solver, False)
+        project = lambda z: K.project(z, problem.spaces(x0)[1])  # noqa: E731
+        iterates = not is_box and has_loop(jax.make_jaxpr(project)(like))
+        plan = Plan(True, structure.isotropic, constant_slope, False, iterates, solver, False)
         line = not isinstance(setup.method, Implicit) and setup.method.degree <= 1
         if not (intervals and line):
             return plan
@@ -79,6 +86,7 @@ class Plan(NamedTuple):
             operator=operator,
             solver=setup.vi_solver if self.solver is None else self.solver,
             direct=self.closed_form or self.small_box,
+            iterates=self.iterates,
             reciprocal=reciprocal,
             enclosed=self.enclosed,
             tol=law_tolerance(setup),

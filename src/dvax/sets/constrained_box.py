@@ -8,7 +8,7 @@ import numpy as np
 from jax import lax
 
 from .. import _tree
-from .._small_matrices import MAX_ROWS, solve, solve_constant
+from .._small_matrices import MAX_ROWS, combine, product, solve, solve_constant, times
 from .._tree import Tree
 from ..errors import input_error
 from ..spaces import AbstractSpace
@@ -109,7 +109,7 @@ class ConstrainedBox(AbstractSet):
         the row is active. An equation never switches: its entry is −1."""
         z, inverse_w, lower, upper, R, low, high = self._data(z, space)
         y, multiplier, _ = _nearest(z, inverse_w, lower, upper, R, low, high)
-        shifted, sums = z - inverse_w * (multiplier @ R), R @ y
+        shifted, sums = z - inverse_w * combine(multiplier, R), times(R, y)
         slack = jnp.minimum(high - sums, sums - low)
         of_rows = jnp.where(multiplier == 0, slack, -jnp.abs(multiplier))
         return [shifted - lower, upper - shifted, jnp.where(low == high, -1.0, of_rows)]
@@ -161,11 +161,11 @@ def _nearest(
     eps = jnp.finfo(z.dtype).eps
     index = jnp.arange(m)
     is_equation = low == high
-    damping = _DAMPING * eps * ((R * R) @ inverse_w)
+    damping = _DAMPING * eps * times(R * R, inverse_w)
     damping = jnp.where(damping > 0, damping, 1.0)
 
     def clip(multiplier: jax.Array) -> jax.Array:
-        return jnp.clip(z - inverse_w * (multiplier @ R), lower, upper)
+        return jnp.clip(z - inverse_w * combine(multiplier, R), lower, upper)
 
     def excess_of(sums: jax.Array) -> jax.Array:
         """Return how far each row lies above `high` (positive) or below `low` (negative)."""
@@ -180,13 +180,13 @@ def _nearest(
         gap = jnp.where(s.multiplier == 0, excess, gap)
         # The rows of a Newton step: the active ones with the largest gaps.
         priority = jnp.where(is_active, 1.0 + jnp.abs(gap) / _tolerance(s.y, R, low, high), 0.0)
-        _, chosen = lax.top_k(priority, width)
+        chosen = _largest(priority, width)
         used = is_active[chosen]
         rows = jnp.where(used[:, None], R[chosen], 0.0)
         is_free = (s.y > lower) & (s.y < upper)
         scaled = rows * jnp.where(is_free, inverse_w, 0.0)[None, :]
         diagonal = jnp.where(used, damping[chosen], 1.0)
-        matrix = scaled @ rows.T + jnp.diag(diagonal)
+        matrix = product(scaled, rows.T) + jnp.diag(diagonal)
         step = solve_constant(matrix, jnp.where(used, gap[chosen], 0.0))
         step = jnp.where(used, step, 0.0)
         # A multiplier of an inequality keeps its sign; it leaves the active rows at 0.
@@ -194,21 +194,21 @@ def _nearest(
         towards_zero = ~is_equation[chosen] & (old * step < 0)
         ratios = jnp.where(towards_zero, -old / jnp.where(towards_zero, step, 1.0), jnp.inf)
         most = jnp.minimum(1.0, jnp.min(ratios))
-        direction = step @ rows
+        direction = combine(step, rows)
         slope_bound = jnp.sum(step * (s.sums[chosen] - gap[chosen]))
         length = _line_search(
-            z - inverse_w * (s.multiplier @ R), -inverse_w * direction, lower, upper, direction,
+            z - inverse_w * combine(s.multiplier, R), -inverse_w * direction, lower, upper, direction,
             slope_bound, most, eps,
         )  # fmt: skip
         leaves = towards_zero & (ratios <= length)
         new = jnp.where(leaves, 0.0, old + length * step)
-        multiplier = s.multiplier.at[chosen].set(new)
+        multiplier = new if width == m else s.multiplier.at[chosen].set(new)
         return check(multiplier, s.count + 1)
 
     def check(multiplier: jax.Array, count: Any) -> _State:
         """Return the state at these multipliers, with the row to add."""
         y = clip(multiplier)
-        sums = R @ y
+        sums = times(R, y)
         excess, least = excess_of(sums), _tolerance(y, R, low, high)
         gap = jnp.where(multiplier > 0, sums - high, sums - low)
         is_active = is_equation | (multiplier != 0)
@@ -230,6 +230,11 @@ def _nearest(
     is_free = (end.y > lower) & (end.y < upper)
     y = jnp.where(is_valid, end.y, jnp.nan)
     return y, end.multiplier, is_free.astype(z.dtype)
+
+
+def _largest(priority: jax.Array, width: int) -> Any:
+    """Return the indices of the `width` largest entries; if these are all entries, a slice of all."""
+    return slice(None) if width == len(priority) else lax.top_k(priority, width)[1]
 
 
 def _tolerance(y: jax.Array, R: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
@@ -283,16 +288,16 @@ def _line_search(
 def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
     """The derivative of the projection onto the active bounds and rows, which are fixed."""
     y, multiplier, is_free = _nearest(*primals)
-    sums = primals[4] @ y
+    sums = times(primals[4], y)
     least = _tolerance(y, *primals[4:])
     # A row that holds with equality is active, as in every set.
     at_high = jnp.where(multiplier == 0, sums >= primals[6] - least, multiplier > 0)
     at_low = jnp.where(multiplier == 0, sums <= primals[5] + least, multiplier < 0)
     is_active = at_high | at_low
     width = min(*primals[4].shape, MAX_ROWS)
-    _, chosen = lax.top_k(is_active.astype(jnp.int32), width)
+    chosen = _largest(is_active.astype(jnp.int32), width)
     active, on_high = is_active[chosen], at_high[chosen]
-    at_lower = primals[0] - primals[1] * (multiplier @ primals[4]) <= primals[2]
+    at_lower = primals[0] - primals[1] * combine(multiplier, primals[4]) <= primals[2]
     # Beyond 16 active rows the derivative is not available.
     factor = jnp.where(jnp.sum(is_active) <= width, jnp.ones((), y.dtype), jnp.nan)
 
@@ -303,11 +308,11 @@ def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
         base = jnp.where(is_free > 0, z, jnp.where(jnp.isfinite(fixed), fixed, 0.0))
         scaled = rows * jnp.where(is_free > 0, inverse_w, 0.0)[None, :]
         # Rows that depend on others (or have no free entry) make the matrix singular.
-        damping = _DAMPING * jnp.finfo(z.dtype).eps * ((rows * rows) @ inverse_w)
+        damping = _DAMPING * jnp.finfo(z.dtype).eps * times(rows * rows, inverse_w)
         diagonal = jnp.where(damping > 0, damping, 1.0)
-        matrix = scaled @ rows.T + jnp.diag(lax.stop_gradient(diagonal))
-        right = jnp.where(active, rows @ base - bound, 0.0)
-        return base - solve(matrix, right) @ scaled
+        matrix = product(scaled, rows.T) + jnp.diag(lax.stop_gradient(diagonal))
+        right = jnp.where(active, times(rows, base) - bound, 0.0)
+        return base - combine(solve(matrix, right), scaled)
 
     dy = jvp_of_moving(project_on_face, primals, tangents)
     return (y, multiplier, is_free), (
