@@ -228,3 +228,28 @@ def test_field_with_a_coupled_law_keeps_order_two():
     )  # fmt: skip
     sol = dvax.solve(problem, jnp.linspace(0.0, 1.0, n), 0.0, 0.5, rtol=1e-3, atol=1e-3)
     assert sol.stats["method"].startswith("ETD2RK: with 80 unknowns in the law")
+
+
+@pytest.mark.parametrize(
+    ("A", "name"),
+    [
+        (dvax.generators.Scalar(-1.0), "DormandPrince"),
+        (dvax.generators.Elliptic(4, 1.0, boundary="neumann", diffusion=0.1), "ETD4RK"),
+    ],
+    ids=["number", "operator"],
+)
+def test_method_is_chosen_for_a_traced_end_of_the_run(A, name):
+    problem = dvax.Problem(
+        A=A, P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+        f=lambda t, x, u, args: args + 0.1 * x * (1.0 - x) - u,
+        h=lambda t, x, u, args: 4.0 * (x - 0.25),
+    )  # fmt: skip
+    chosen = []
+
+    def end(t1):
+        sol = dvax.solve(problem, jnp.full(4, 0.1), 0.0, t1, 1.0)
+        chosen.append(str(sol.stats["method"]))
+        return sol.xs[-1]
+
+    np.testing.assert_allclose(jax.jit(end)(2.0), end(2.0), rtol=1e-6)
+    assert all(text.startswith(name) for text in chosen)

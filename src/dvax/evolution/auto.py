@@ -146,7 +146,10 @@ def choose(
         )
     if facts.affine and not facts.is_field and (facts.state <= _EXACT or facts.diagonal):
         return Choice(_EXPROSENBROCK, "x' is affine in t and x between kinks, where it is exact")
-    rates = _rates(problem, t0, x0, args, facts) if _tree.is_concrete(span) else _UNKNOWN
+    rates = _rates(problem, t0, x0, args, facts)
+    if not _tree.is_concrete(span):
+        # Of a finite rate it is unknown how large it is over the span.
+        span, rates = 1.0, rates if math.isinf(rates.norm) else _UNKNOWN
     # The exponential of a matrix costs as much as many steps.
     matrices = _SLOPES_OF_MATRICES * (1.0 + (facts.state / 4) ** 3)
     # Explicit steps follow each turn, the more of them the tighter the tolerance.
