@@ -11,7 +11,8 @@ transform therefore yields the coefficients. Since ‖Fₖ(A)‖ ≤ 2 if E is c
 range (Beckermann 2005), the truncation error of g(A) is at most twice the sum of the omitted
 coefficients, for normal and non-normal A alike. The series is truncated at roundoff. There is no
 orthogonalisation and no stored basis. For large h‖A‖ the cost is about √(h‖A‖) products if A is
-self-adjoint and h‖A‖ if it is skew-adjoint. Derivatives are those of a polynomial.
+self-adjoint and h‖A‖ if it is skew-adjoint. The derivative in h is that of the differential equation, and the derivative in
+the data of A is that of the polynomial.
 
 Source: Beckermann and Reichel, Error estimates and evaluation of matrix functions via the Faber
 transform, SIAM J. Numer. Anal. 47 (2009); the bound: Beckermann, C. R. Acad. Sci. Paris 340 (2005).
@@ -19,7 +20,7 @@ transform, SIAM J. Numer. Anal. 47 (2009); the bound: Beckermann, C. R. Acad. Sc
 
 import math
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -45,6 +46,10 @@ _MAX_SUBSTEPS = 256
 _TERMS_PER_CHECKPOINT, _LOOP_WIDTHS = 8, (32, 32)
 """Shape of the nested loops over the terms of a series. The reverse pass stores one checkpoint for
 every 8 terms."""
+
+_CHECKPOINTS = 64
+"""Vectors of the recurrence that a derivative in the data of A stores. Between two of them are at most
+128 others, which are computed again."""
 
 
 class Ellipse(NamedTuple):
@@ -125,10 +130,49 @@ def _linear_in_all(tangents: list[Any]) -> list[jax.Array]:
     return [one(t) for t in tangents]
 
 
+def _linear_step(
+    with_data: Callable[[list[Any]], "FaberPropagator"], data: list[Any],
+    v: tuple[Tree, ...], dv: tuple[Tree, ...], change: list[Any],
+) -> Tree:  # fmt: skip
+    """Return the change S dv + (dS)v of the flow Sv, v = (x₀, c), for a change of the data of A.
+
+    It is linear in both changes, and so a part of the solution of a triangular system, y − S dv − (dS)v
+    = 0, whose transposed solution is written by hand. Loops over the terms that a reverse pass can
+    differentiate store every term that there could be, at hundreds of times the cost.
+    """
+
+    def apply(step: str, dv: tuple[Tree, ...], change: list[Any]) -> Tree:
+        if not change:
+            return getattr(with_data(data), step)(dv)
+        run = lambda data, v: getattr(with_data(data), step)(v)  # noqa: E731
+        return jax.jvp(run, (data, v), (change, dv))[1]
+
+    def residual(system: Any) -> Any:
+        dv, change, y = system
+        return dv, change, _tree.sub(y, apply("_differentiable_step", dv, change))
+
+    def solve(_: Any, right: Any) -> Any:
+        dv, change, y = right
+        return dv, change, _tree.add(y, apply("_plain_step", dv, change))
+
+    def solve_transposed(_: Any, right: Any) -> Any:
+        dv, change, y = right
+        propagator = with_data(data)
+        if change:
+            of_v, of_data = propagator._transposed_in_data(with_data, data, v, y)
+        else:
+            of_v, of_data = propagator._transposed_step(y, len(dv) - 1), []
+        return tuple(map(_tree.add, dv, of_v)), _tree.add(change, of_data), y
+
+    right = dv, change, _tree.scale(0.0, dv[0])
+    return lax.custom_linear_solve(residual, right, solve, solve_transposed)[2]
+
+
 class FaberPropagator(AbstractPropagator):
     """The flow over `substeps` equal substeps, each a Faber series of degree `degree`.
 
-    `coefficients[i, k]` multiplies Fₖ(A) x₀ (i = 0) or Fₖ(A) cᵢ₋₁.
+    `coefficients[i, k]` multiplies Fₖ(A) x₀ (i = 0) or Fₖ(A) cᵢ₋₁. `length` is h. Derivatives are those
+    of the flow: in h by its differential equation, in the data of A by the recurrence.
     """
 
     generator: AbstractGenerator
@@ -136,10 +180,12 @@ class FaberPropagator(AbstractPropagator):
     coefficients: jax.Array
     degree: jax.Array
     substeps: jax.Array
+    length: jax.Array
 
     def step(self, x0: Tree, c: tuple[Tree, ...]) -> Tree:
         numbers, rest = eqx.partition(self, eqx.is_array)
         leaves, structure = jtu.tree_flatten(numbers)
+        of_generator = range(len(jtu.tree_leaves(numbers.generator)))
 
         def whole(leaves: list[Any]) -> FaberPropagator:
             return eqx.combine(jtu.tree_unflatten(structure, leaves), rest)
@@ -150,52 +196,36 @@ class FaberPropagator(AbstractPropagator):
 
         def tangent(primals: Any, tangents: Any) -> tuple[Tree, Tree]:
             (leaves, v), (leaf_tangents, v_tangents) = primals, tangents
-            propagator = whole(leaves)
-            out = propagator._plain_step(v)
-            parts, dv = jtu.tree_flatten(v_tangents, is_leaf=_is_zero)
+            # The ellipse is constant, and the coefficients depend on h alone, whose derivative is below.
+            moving = [k for k in of_generator if not _is_zero(leaf_tangents[k])]
+
+            def with_data(data: list[Any]) -> FaberPropagator:
+                changed = dict(zip(moving, data, strict=True))
+                return whole([changed.get(k, leaf) for k, leaf in enumerate(leaves)])
+
+            out = flow(leaves, v)
             total = _tree.zeros_like(out)
-            if not all(map(_is_zero, parts)):
-                dv = jtu.tree_unflatten(dv, _linear_in_all(parts))
-                total = propagator._linear_step(dv)
-            moving = [k for k, leaf in enumerate(leaf_tangents) if not _is_zero(leaf)]
-            if moving:
-
-                def of_data(data: list[Any]) -> Tree:
-                    changed = dict(zip(moving, data, strict=True))
-                    every = [changed.get(k, leaf) for k, leaf in enumerate(leaves)]
-                    return whole(every)._differentiable_step(v)
-
-                given = [leaves[k] for k in moving], [leaf_tangents[k] for k in moving]
-                total = _tree.add(total, jax.jvp(of_data, (given[0],), (given[1],))[1])
+            parts, dv = jtu.tree_flatten(v_tangents, is_leaf=_is_zero)
+            given = [*parts, *(leaf_tangents[k] for k in moving)]
+            if not all(map(_is_zero, given)):
+                given = _linear_in_all(given)
+                dv, change = jtu.tree_unflatten(dv, given[: len(parts)]), given[len(parts) :]
+                data = [leaves[k] for k in moving]
+                total = _linear_step(with_data, data, v, dv, change)
+            of_h = leaf_tangents[-1]
+            if not _is_zero(of_h):
+                # d/dh = Ax₁ + p(1) − S(0, (j cⱼ))/h, from zφₖ′ = (z − k)φₖ + 1/(k − 1)!.
+                propagator, (x, *c) = whole(leaves), v
+                rate = reduce(_tree.add, c, propagator.generator.apply(out))
+                if len(c) > 1:
+                    c = tuple(_tree.scale(float(j), one) for j, one in enumerate(c))
+                    moved = flow(leaves, (_tree.zeros_like(x), *c))
+                    rate = _tree.sub(rate, _tree.scale(1.0 / propagator.length, moved))
+                total = _tree.add(total, _tree.scale(of_h, rate))
             return out, total
 
         flow.defjvp(tangent, symbolic_zeros=True)
         return flow(leaves, (x0, *c))
-
-    def _linear_step(self, v: tuple[Tree, ...]) -> Tree:
-        """Return Sv for v = (x₀, c), with products with S and Sᵀ as derivatives.
-
-        The flow S is linear in v: y = Sv is a part of the solution of the triangular system v = b,
-        y − Sv = 0. Loops over the terms that a reverse pass can differentiate store every term that
-        there could be, at hundreds of times the cost.
-        """
-
-        def residual(system: tuple[tuple[Tree, ...], Tree]) -> tuple[tuple[Tree, ...], Tree]:
-            v, y = system
-            return v, _tree.sub(y, self._differentiable_step(v))
-
-        def solve(_: Any, right: tuple[tuple[Tree, ...], Tree]) -> tuple[tuple[Tree, ...], Tree]:
-            v, y = right
-            return v, _tree.add(y, self._plain_step(v))
-
-        def solve_transposed(
-            _: Any, right: tuple[tuple[Tree, ...], Tree]
-        ) -> tuple[tuple[Tree, ...], Tree]:
-            v, y = right
-            return tuple(map(_tree.add, v, self._transposed_step(y, len(v) - 1))), y
-
-        right = v, _tree.scale(0.0, v[0])
-        return lax.custom_linear_solve(residual, right, solve, solve_transposed)[1]
 
     def _substeps(self) -> Any:
         # The lanes of a batch may have propagators of different step sizes.
@@ -219,28 +249,50 @@ class FaberPropagator(AbstractPropagator):
 
     def _transposed_step(self, y: Tree, terms: int) -> tuple[Tree, ...]:
         """Return Sᵀy, the parts of x₀ and c."""
+        sums = lambda s, y: (self._transposed_sum(y, terms + 1), ())  # noqa: E731
+        return self._in_reverse(y, terms, (), sums)[0]
+
+    def _transposed_in_data(
+        self, with_data: Callable, data: list[Any], v: tuple[Tree, ...], y: Tree
+    ) -> tuple[tuple[Tree, ...], list[Any]]:
+        """Return Sᵀy, and the product of y with the derivative of Sv in the data of A."""
+        x0, *c = v
+        count = self.substeps.astype(jnp.result_type(*jtu.tree_leaves(y)))
+        one = lambda s, x: self._substep(s, x, tuple(c), self._plain_sum)  # noqa: E731
+
+        def sums(s: Any, y: Tree) -> Any:
+            # A second pass over the earlier substeps: few steps have more than one.
+            x = lax.fori_loop(0, s, one, x0)
+            parts = _rescaled(s.astype(count.dtype) / count, 1.0 / count, tuple(c))
+            return self._transposed_sum_in_data(with_data, data, (x, *parts), y)
+
+        zero = [jnp.zeros_like(leaf) for leaf in data]
+        return self._in_reverse(y, len(c), zero, sums)
+
+    def _in_reverse(self, y: Tree, terms: int, zero: Any, sums: Callable) -> tuple[Any, Any]:
+        """Return the parts of x₀ and c, and the sum of what `sums` returns for each substep besides."""
         dtype = jnp.result_type(*jtu.tree_leaves(y))
         count, substeps = self.substeps.astype(dtype), self._substeps()
 
-        def substep(k: Any, carry: tuple[Tree, tuple[Tree, ...]]) -> tuple[Tree, tuple[Tree, ...]]:
-            y, c = carry
+        def substep(k: Any, carry: Any) -> Any:
+            y, c, total = carry
             s = substeps - 1 - k
-            x, *parts = self._transposed_sum(y, terms + 1)
+            (x, *parts), found = sums(s, y)
             theta, length = s.astype(dtype) / count, 1.0 / count
             more = tuple(map(_tree.add, c, _rescaled_transposed(theta, length, tuple(parts))))
-            return _tree.where(s < self.substeps, (x, more), carry)
+            return _tree.where(s < self.substeps, (x, more, _tree.add(total, found)), carry)
 
-        zero = tuple(_tree.zeros_like(y) for _ in range(terms))
-        x, c = lax.fori_loop(0, substeps, substep, (y, zero))
-        return x, *c
+        start = y, tuple(_tree.zeros_like(y) for _ in range(terms)), zero
+        x, c, total = lax.fori_loop(0, substeps, substep, start)
+        return (x, *c), total
 
     def _recurrence(self, dtype: Any) -> tuple[Any, Any, Any, jax.Array]:
         """Return z₀, the two numbers of the recurrence, and the coefficients."""
         z0, a, b = (number.astype(dtype) for number in self.ellipse)
         return z0, 2.0 / (a + b), (a - b) / (a + b), self.coefficients.astype(dtype)
 
-    def _plain_sum(self, v: tuple[Tree, ...]) -> Tree:
-        """Return `_sum(v)` by a loop over the terms alone, which has no reverse derivative."""
+    def _clenshaw(self, v: tuple[Tree, ...]) -> tuple[Callable, Callable]:
+        """Return the step of Clenshaw's recurrence, and the sum from the last two vectors."""
         z0, forward, back, rows = self._recurrence(jnp.result_type(*jtu.tree_leaves(v)))
 
         def combined(factor: Any, k: Any, product: Any, first: Tree, second: Tree) -> Tree:
@@ -251,15 +303,23 @@ class FaberPropagator(AbstractPropagator):
                 product, first, second, *v,
             )  # fmt: skip
 
-        degree, zero = largest_of_lanes(self.degree), _tree.zeros_like(v[0])
+        degree = largest_of_lanes(self.degree)
 
         def term(j: Any, carry: tuple[Tree, Tree]) -> tuple[Tree, Tree]:
             first, second = carry
             product = self.generator.apply(first)
             return combined(forward, degree - j, product, first, second), first
 
-        first, second = lax.fori_loop(0, degree, term, (zero, zero))
-        return combined(0.5 * forward, 0, self.generator.apply(first), first, second)
+        def end(first: Tree, second: Tree) -> Tree:
+            return combined(0.5 * forward, 0, self.generator.apply(first), first, second)
+
+        return term, end
+
+    def _plain_sum(self, v: tuple[Tree, ...]) -> Tree:
+        """Return `_sum(v)` by a loop over the terms alone, which has no reverse derivative."""
+        term, end = self._clenshaw(v)
+        zero = _tree.zeros_like(v[0])
+        return end(*lax.fori_loop(0, largest_of_lanes(self.degree), term, (zero, zero)))
 
     def _transposed_sum(self, y: Tree, count: int) -> tuple[Tree, ...]:
         """Return Σₖ coefficients[i, k] Fₖ(Aᵀ) y for i < count, with the transposed products of A."""
@@ -282,6 +342,77 @@ class FaberPropagator(AbstractPropagator):
         sums = tuple(scaled(rows[i, 0], y) for i in range(count))
         start = scaled(0.5 * forward, shifted_product(y)), y, sums
         return lax.fori_loop(1, largest_of_lanes(self.degree) + 1, term, start)[2]
+
+    def _transposed_sum_in_data(
+        self, with_data: Callable, data: list[Any], v: tuple[Tree, ...], y: Tree
+    ) -> tuple[tuple[Tree, ...], list[Any]]:
+        """Return `_transposed_sum(y)`, and the product of y with the derivative of the sum in the data.
+
+        The reverse pass meets the vectors of Clenshaw's recurrence from the last to the first. Some
+        are stored, and those between two of them are computed again when it arrives there.
+        """
+        z0, forward, back, rows = self._recurrence(jnp.result_type(*jtu.tree_leaves(y)))
+        term, _ = self._clenshaw(v)
+        degree, zero = largest_of_lanes(self.degree), _tree.zeros_like(v[0])
+        length = jnp.maximum(-(-degree // _CHECKPOINTS), 1)
+        longest = -(-(_FFT_SIZES[-1] // 2) // _CHECKPOINTS)
+        chunks = -(-degree // length)
+
+        def room(count: int, tree: Tree) -> Tree:
+            return jtu.tree_map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), tree)
+
+        def row(table: Tree, k: Any) -> Tree:
+            take = lambda leaf: lax.dynamic_index_in_dim(leaf, k, 0, False)  # noqa: E731
+            return jtu.tree_map(take, table)
+
+        def ends(q: Any) -> tuple[Any, Any]:
+            return q * length, jnp.minimum((q + 1) * length, degree)
+
+        def advance(q: Any, state: Any) -> Any:
+            carry, stored = state
+            return lax.fori_loop(*ends(q), term, carry), _tree.put(stored, q, carry)
+
+        start = (zero, zero), room(_CHECKPOINTS, (zero, zero))
+        (first, _), stored = lax.fori_loop(0, chunks, advance, start)
+
+        def pull(at: Tree, factor: Any, u: Tree) -> tuple[list[Any], Tree]:
+            """Return the parts of the data and of `at` in factor ⟨u, (A − z₀) at⟩."""
+            u = jtu.tree_map(lambda leaf: factor * leaf, u)
+            product = lambda data, at: with_data(data).generator.apply(at)  # noqa: E731
+            of_data, of_vector = jax.vjp(product, data, at)[1](u)
+            return of_data, jtu.tree_map(lambda Au, u: Au - z0 * u, of_vector, u)
+
+        def back_one(k: Any, at: Tree, state: Any) -> Any:
+            tau, before, sums, total = state
+            weights = 2.0 * rows[:, k]
+            sums = tuple(
+                jtu.tree_map(lambda s, u, w=weights[i]: s + w * u, one, tau)
+                for i, one in enumerate(sums)
+            )
+            found, product = pull(at, forward, tau)
+            new = jtu.tree_map(lambda m, b: m - back * b, product, before)
+            return new, tau, sums, _tree.add(total, found)
+
+        def chunk(q: Any, state: Any) -> Any:
+            begin, end = ends(chunks - 1 - q)
+
+            def again(j: Any, carry: Any) -> Any:
+                carry, table = carry
+                return term(j, carry), _tree.put(table, j - begin, carry[0])
+
+            given = row(stored, chunks - 1 - q), room(longest, zero)
+            _, table = lax.fori_loop(begin, end, again, given)
+
+            def one(i: Any, state: Any) -> Any:
+                j = end - 1 - i
+                return back_one(degree - j, row(table, j - begin), state)
+
+            return lax.fori_loop(0, end - begin, one, state)
+
+        total, tau = pull(first, 0.5 * forward, y)
+        sums = tuple(jtu.tree_map(lambda leaf, w=w: w * leaf, y) for w in rows[: len(v), 0])
+        _, _, sums, total = lax.fori_loop(0, chunks, chunk, (tau, y, sums, total))
+        return sums, total
 
     def _sum(self, v: tuple[Tree, ...]) -> Tree:
         """Return Σₖ Fₖ(A) Σᵢ coefficients[i, k] vᵢ by Clenshaw's recurrence."""
@@ -361,7 +492,7 @@ def faber_propagator(
     above_roundoff = lax.stop_gradient(jnp.abs(rows) > jnp.finfo(dtype).eps * scale)
     order = jnp.arange(rows.shape[1])
     degree = largest_of_lanes(jnp.max(jnp.where(above_roundoff, order, 0)))
-    return FaberPropagator(A, ellipse, jnp.where(order <= degree, rows, 0.0), degree, substeps)
+    return FaberPropagator(A, ellipse, jnp.where(order <= degree, rows, 0.0), degree, substeps, h)
 
 
 def _degree_bound(h: Any, a: Any, b: Any) -> Any:
