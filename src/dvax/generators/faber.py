@@ -11,8 +11,8 @@ transform therefore yields the coefficients. Since ‖Fₖ(A)‖ ≤ 2 if E is c
 range (Beckermann 2005), the truncation error of g(A) is at most twice the sum of the omitted
 coefficients, for normal and non-normal A alike. The series is truncated at roundoff. There is no
 orthogonalisation and no stored basis. For large h‖A‖ the cost is about √(h‖A‖) products if A is
-self-adjoint and h‖A‖ if it is skew-adjoint. The derivative in h is that of the differential equation, and the derivative in
-the data of A is that of the polynomial.
+self-adjoint and h‖A‖ if it is skew-adjoint. The derivative in h is that of the differential equation,
+and the derivative in the data of A is that of the polynomial.
 
 Source: Beckermann and Reichel, Error estimates and evaluation of matrix functions via the Faber
 transform, SIAM J. Numer. Anal. 47 (2009); the bound: Beckermann, C. R. Acad. Sci. Paris 340 (2005).
@@ -196,7 +196,7 @@ class FaberPropagator(AbstractPropagator):
 
         def tangent(primals: Any, tangents: Any) -> tuple[Tree, Tree]:
             (leaves, v), (leaf_tangents, v_tangents) = primals, tangents
-            # The ellipse is constant, and the coefficients depend on h alone, whose derivative is below.
+            # The ellipse is constant, and the coefficients depend on h alone, treated below.
             moving = [k for k in of_generator if not _is_zero(leaf_tangents[k])]
 
             def with_data(data: list[Any]) -> FaberPropagator:
