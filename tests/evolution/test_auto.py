@@ -253,3 +253,32 @@ def test_method_is_chosen_for_a_traced_end_of_the_run(A, name):
 
     np.testing.assert_allclose(jax.jit(end)(2.0), end(2.0), rtol=1e-6)
     assert all(text.startswith(name) for text in chosen)
+
+
+@pytest.mark.parametrize(
+    ("gain", "rtol", "name"),
+    [(0.2, 1e-3, "ETD2RK"), (40.0, 1e-3, "ETD4RK"), (2.0, 1e-3, "ETD2RK"), (2.0, 1e-5, "ETD4RK")],
+)
+def test_steep_laws_take_steps_of_order_four_at_loose_tolerances(gain, rtol, name):
+    problem = dvax.Problem(
+        A=dvax.generators.Elliptic(8, 1.0, boundary="neumann", diffusion=0.01),
+        P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1.2),
+        f=lambda t, x, u, args: jnp.exp(-t) + 0.1 * x * (1.0 - x) - u,
+        h=lambda t, x, u, args: args * (x - 0.25),
+    )  # fmt: skip
+    sol = dvax.solve(problem, jnp.zeros(8), 0.0, 2.0, gain, rtol=rtol)
+    assert str(sol.stats["method"]).startswith(name)
+
+
+def test_matrix_of_a_vibrating_chain_is_judged_by_its_frequencies():
+    n = 6
+    stiffness = 400.0 * (2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [-stiffness, -0.3 * np.eye(n)]])
+    problem = dvax.Problem(
+        A=dvax.generators.Dense(A), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-1.0, 1.0),
+        f=lambda t, x, u, args: jnp.concatenate([jnp.zeros(n), jnp.sin(t) - u * jnp.cos(x[:n])]),
+        h=lambda t, x, u, args: 50.0 * x[n:], control_space=dvax.spaces.Euclidean(n),
+    )  # fmt: skip
+    # Frequencies up to 40, and a norm of 1,600.
+    sol = dvax.solve(problem, jnp.zeros(2 * n), 0.0, 2.0)
+    assert str(sol.stats["method"]).startswith("DormandPrince")

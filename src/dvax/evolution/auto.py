@@ -51,14 +51,15 @@ _ETD2RK, _ETD4RK, _DORMANDPRINCE, _EXPROSENBROCK = (
 
 _LOOSE = 1e-5
 """Tolerance from which steps of order 2 with three evaluations beat those of order 4 with ten, where A
-is left to its exponential."""
+is left to its exponential and the slope of f̃ times the span is below √(tol/1e-5): the steps of order 2
+grow in number with that slope, and as 1/√tol."""
 
 _EXACT = 12
 """Unknowns up to which the exponential of A + Df costs less than the steps that it saves."""
 
 _FAST = 300.0
-"""‖A‖ times the span beyond which A is left to its exponential: an explicit method needs a third of
-this number of steps for stability alone."""
+"""The size of A times the span beyond which A is left to its exponential: an explicit method needs a
+third of this number of steps for stability alone."""
 
 _SLOPES, _SLOPES_OF_MATRICES = 60.0, 150.0
 """The spectral radius of A + Df̃ times the span, for constant derivatives of f and h, beyond which
@@ -161,9 +162,13 @@ def choose(
         )
     fast = rates.norm * span
     if fast > _FAST:
-        size = f"‖A‖ times the span is {fast:.2g}" if fast < np.inf else "A discretises an operator"
+        size = (
+            f"the size of A times the span is {fast:.2g}"
+            if fast < np.inf
+            else "A discretises an operator"
+        )
         reason = f"{size}, left to e^(hA)"
-        if tol >= _LOOSE:
+        if tol >= _LOOSE and rates.law * span <= math.sqrt(tol / _LOOSE):
             return _with_fallback(_ETD2RK, f"{reason}, and the tolerance is loose", facts, tol)
         return _with_fallback(_ETD4RK, reason, facts, tol)
     size = "f̃ acts entry by entry" if facts.is_field else "few unknowns"
@@ -181,8 +186,9 @@ def _with_fallback(method: Any, reason: str, facts: Facts, tol: float) -> Choice
 
 
 def norm(A: AbstractGenerator) -> float:
-    """Return a bound on ‖A‖ where A is a number, diagonal, a small matrix or made of such; infinity for
-    discretised operators; zero for what is traced, of which nothing is known."""
+    """Return the size of A as far as it limits explicit steps, where A is a number, diagonal, a matrix
+    or made of such: the spectral radius, or a bound on the norm of a large matrix. Return infinity for
+    discretised operators, and zero for what is traced, of which nothing is known."""
     if isinstance(A, Product):
         return max(map(norm, A.parts))
     if isinstance(A, Zero):
@@ -192,10 +198,17 @@ def norm(A: AbstractGenerator) -> float:
     if not _tree.is_concrete(A):
         return 0.0
     if isinstance(A, Dense):
-        return float(np.linalg.norm(np.asarray(A.matrix)))
+        return _of_matrix(np.asarray(A.matrix))
     if isinstance(A, Rotation):
         return float(np.max(np.hypot(A.a, A.b)))
     return float(np.max(np.abs(A.a if isinstance(A, Scalar) else A.entries)))
+
+
+def _of_matrix(matrix: np.ndarray) -> float:
+    # The norm of a system in positions and velocities exceeds its frequencies by far.
+    if len(matrix) <= _LINEARISABLE and np.all(np.isfinite(matrix)):
+        return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
+    return float(np.linalg.norm(matrix))
 
 
 _FACTS: dict[Any, Facts] = {}
@@ -254,15 +267,17 @@ def _is_linear(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) 
 
 
 class Rates(NamedTuple):
-    """How fast trajectories change: a bound on ‖A‖, the spectral radius `slope` of Ax + f̃, and the
-    largest imaginary part `turn` of its eigenvalues, both zero where unknown."""
+    """How fast trajectories change: the size of A (`norm`), the spectral radius `slope` of Ax + f̃, the
+    largest imaginary part `turn` of its eigenvalues, and the largest slope `law` of a pointwise f̃ at
+    x = 0, all but the first zero where unknown."""
 
     norm: float
     slope: float
     turn: float
+    law: float
 
 
-_UNKNOWN = Rates(0.0, 0.0, 0.0)
+_UNKNOWN = Rates(0.0, 0.0, 0.0, 0.0)
 
 _RATES: dict[Any, tuple[Any, Rates]] = {}
 """The rates of the latest problems, by the identity of the problem and of the arrays in its args, both
@@ -278,11 +293,16 @@ def _rates(problem: Problem, t0: jax.Array, x0: Tree, args: Any, facts: Facts) -
     is_known = flat(problem).is_concrete and _tree.is_concrete(args)
     values: list[complex] | None = []
     if is_known and facts.linear:
-        values = _eigenvalues(problem, t0, x0, args, facts)
+        values = _eigenvalues(problem, t0, x0, args, "diagonal" if facts.diagonal else "matrix")
         is_known = values is not None
+    law: list[complex] | None = []
+    size = norm(problem.generator(args))
+    if is_known and facts.pointwise and not facts.diagonal and size > 0:
+        law = _eigenvalues(problem, t0, x0, args, "without A")
+        is_known = law is not None
     slope = max(map(abs, values or [0.0]))
     turn = max(abs(v.imag) for v in values or [0.0])
-    rates = Rates(norm(problem.generator(args)), slope, turn)
+    rates = Rates(size, slope, turn, max(map(abs, law or [0.0])))
     if is_known:
         if len(_RATES) >= _MAX_FACTS:
             _RATES.clear()
@@ -291,28 +311,27 @@ def _rates(problem: Problem, t0: jax.Array, x0: Tree, args: Any, facts: Facts) -
 
 
 def _eigenvalues(
-    problem: Problem, t0: jax.Array, x0: Tree, args: Any, facts: Facts
+    problem: Problem, t0: jax.Array, x0: Tree, args: Any, kind: str
 ) -> list[complex] | None:
-    """Return the eigenvalues of A + Df̃ for u ∈ h − 0 inside K, and for u held at the boundary, where
-    the derivatives of f and h are constant; None where their code closes over traced values."""
+    """Return the eigenvalues of A + Df̃ at x = 0, for u ∈ h − 0 inside K, and for u held at the
+    boundary; None where the code of f or h closes over traced values. The `kind` says whether A + Df̃
+    is a "matrix", or "diagonal", or Df̃ alone, which is diagonal ("without A")."""
     with jax.ensure_compile_time_eval():
-        found = _spectra(problem, t0, x0, args, facts.diagonal)
+        found = _spectra(problem, t0, x0, args, kind)
     return None if found is None else np.concatenate(found).astype(complex).tolist()
 
 
-def _spectra(
-    problem: Problem, t: jax.Array, x0: Tree, args: Any, diagonal: bool
-) -> list[Any] | None:
+def _spectra(problem: Problem, t: jax.Array, x0: Tree, args: Any, kind: str) -> list[Any] | None:
     # Any state will do, and x0 may be traced.
     x0 = jtu.tree_map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), x0)
     like = problem.zero_control(x0)
 
-    numbers, signature = flatten((problem,), (t, x0, like, args), diagonal)
+    numbers, signature = flatten((problem,), (t, x0, like, args), kind)
     found = _derivatives(numbers, signature)
     if not _tree.is_concrete(found):
         return None
     fx, fu, hx, hu = map(np.asarray, found)
-    if diagonal:
+    if kind != "matrix":
         with np.errstate(divide="ignore", invalid="ignore"):
             free = fx + fu * hx / (1.0 - hu)
         return [v[np.isfinite(v)] for v in (fx, free)]
@@ -325,14 +344,15 @@ def _spectra(
 
 @partial(jax.jit, static_argnums=1)
 def _derivatives(numbers: list[Any], signature: Signature) -> list[jax.Array]:
-    """Return ∂(Ax + f)/∂x, ∂f/∂u, ∂h/∂x and ∂h/∂u: their diagonals where they are diagonal."""
+    """Return ∂(Ax + f)/∂x, ∂f/∂u, ∂h/∂x and ∂h/∂u, or their diagonals; see `_eigenvalues`."""
     (problem,), (t, x, u, args) = signature.unflatten(numbers)
     A = problem.generator(args)
     f = lambda x, u: problem.f(t, x, u, args)  # noqa: E731
     h = lambda x, u: problem.h(t, x, u, args)  # noqa: E731
-    fx = lambda x: _tree.add(A.apply(x), f(x, u))  # noqa: E731
+    kind = signature.options
+    fx = lambda x: f(x, u) if kind == "without A" else _tree.add(A.apply(x), f(x, u))  # noqa: E731
     fns = (fx, x), (lambda u: f(x, u), u), (lambda x: h(x, u), x), (lambda u: h(x, u), u)
-    if signature.options:
+    if kind != "matrix":
         ones = lambda v: jtu.tree_map(jnp.ones_like, v)  # noqa: E731
         return [jax.jvp(fn, (at,), (ones(at),))[1].ravel() for fn, at in fns]
     return [_matrix(fn, at) for fn, at in fns]
