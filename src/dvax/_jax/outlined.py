@@ -50,7 +50,7 @@ _PACKABLE = tuple(map(np.dtype, "bool int32 int64 uint32 float32 float64".split(
 
 _ELEMENTWISE = frozenset(
     "abs add add_any and bitcast_convert_type ceil clamp concatenate convert_element_type "
-    "copy div eq expand_dims floor ge gt integer_pow iota is_finite le lt max "
+    "copy div eq expand_dims floor ge gt integer_pow iota is_finite le le_to lt lt_to max "
     "min mul ne neg nextafter not or pad reduce_precision rem reshape rev round rsqrt "
     "select_n shift_left shift_right_arithmetic shift_right_logical sign slice split sqrt square "
     "squeeze stack sub transpose xor".split()

@@ -4,8 +4,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from .. import _tree
+from .._small_matrices import pseudoinverse, times
 from .._tree import Tree
 from ..errors import input_error
 from ..spaces import AbstractSpace
@@ -122,18 +124,20 @@ def normalised_conditions(E: jax.Array, e: jax.Array) -> tuple[jax.Array, jax.Ar
 def has_solution(E: jax.Array, e: jax.Array) -> jax.Array:
     """Return whether E y = e has a solution, up to roundoff."""
     rows, values = normalised_conditions(E, e)
-    back = jnp.linalg.pinv(rows)
-    y = back @ values
+    back = pseudoinverse(rows)
+    y = times(back, values)
     # Iterative refinement as in `project`: nearly parallel rows amplify roundoff.
     for _ in range(2):
-        y = y - back @ (rows @ y - values)
+        y = y - times(back, times(rows, y) - values)
     return jnp.all(jnp.isfinite(e)) & _is_solution(rows, values, y)
 
 
 def normalise_rows(rows: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return (rows scaled to length one, the scale factors); zero rows are unchanged."""
     # Divide by the largest entry first: the squares of very small entries would underflow.
-    largest = jnp.max(jnp.abs(rows), axis=1, initial=0.0)
+    # The scale does not depend on it. Where XLA computes the rows twice, with other roundoff, none may
+    # equal the maximum, and its derivative would be NaN.
+    largest = lax.stop_gradient(jnp.max(jnp.abs(rows), axis=1, initial=0.0))
     largest = jnp.where(largest == 0, 1.0, largest)
     square = jnp.sum((rows / largest[:, None]) ** 2, axis=1)
     scale = largest * jnp.sqrt(jnp.where(square == 0, 1.0, square))
@@ -142,4 +146,6 @@ def normalise_rows(rows: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def _is_solution(rows: jax.Array, values: jax.Array, y: jax.Array) -> jax.Array:
     slack = jnp.finfo(jnp.result_type(y)).eps ** _ROUNDOFF_EXPONENT
-    return jnp.all(jnp.abs(rows @ y - values) <= slack * (jnp.abs(values) + jnp.linalg.norm(y)))
+    return jnp.all(
+        jnp.abs(times(rows, y) - values) <= slack * (jnp.abs(values) + jnp.linalg.norm(y))
+    )

@@ -8,7 +8,7 @@ import numpy as np
 from jax import lax
 
 from .. import _tree
-from .._small_matrices import as_pseudoinverse, pseudoinverse
+from .._small_matrices import as_pseudoinverse, pseudoinverse, times
 from .._tree import Tree
 from ..errors import input_error
 from ..spaces import AbstractSpace
@@ -89,7 +89,7 @@ class Polyhedron(AbstractSet):
         flat, root, G, d, E, e = self._flat(z, space)
         y, active, multiplier, _ = _nearest(flat, root, G, d, E, e)
         rows, bounds = normalised_conditions(G * root[None, :], d)
-        return [jnp.where(active > 0, -multiplier, bounds - rows @ (y / root))]
+        return [jnp.where(active > 0, -multiplier, bounds - times(rows, y / root))]
 
     def _flat(self, z: Tree, space: AbstractSpace) -> tuple:
         n = z.size
@@ -141,11 +141,11 @@ def _reduce(
         return point, rows, bounds, 0.0, 1.0
     equations, values = normalised_conditions(E * root[None, :], e)
     back = pseudoinverse(equations)
-    base = back @ values
-    point = point - base - back @ (equations @ point - values)
-    point = point - back @ (equations @ point)
-    bounds = bounds - rows @ base
-    rows = rows - (rows @ back) @ equations
+    base = times(back, values)
+    point = point - base - times(back, times(equations, point) - values)
+    point = point - times(back, times(equations, point))
+    bounds = bounds - times(rows, base)
+    rows = jax.vmap(lambda row: row - times(back, times(equations, row)))(rows)
     # A row whose projection is shorter than this depends linearly on the equations.
     roundoff = float(jnp.finfo(z.dtype).eps) ** dual.SLACK
     is_long = jnp.sum(rows * rows, axis=1) > roundoff**2
