@@ -31,8 +31,12 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # `make thorough` tests what users run, and more of it in its time.
 if os.environ.get("HYPOTHESIS_PROFILE") != "thorough":
     # XLA's older emitters compile in two thirds of the time, and LLVM without optimisation in a fifth
-    # less. XLA_FLAGS= make test does without.
-    flags = ["--xla_backend_optimization_level=0"]
+    # less. A program in one part takes half the mappings of one in 32 parts. XLA_FLAGS= make test does
+    # without.
+    flags = [
+        "--xla_backend_optimization_level=0",
+        "--xla_cpu_parallel_codegen_split_count=1",
+    ]
     if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 12):
         # Later releases have no other emitters, and XLA ends a process on a flag that it does not know.
         flags.append("--xla_cpu_use_fusion_emitters=false")
