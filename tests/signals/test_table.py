@@ -137,3 +137,16 @@ def test_a_listener_hears_every_table_at_its_own_time_and_no_other():
     # Outside the block no signal is recorded.
     a(0.5)
     assert len(reports.knots) == 3
+
+
+def test_lists_in_args_are_tables():
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0),
+        K=lambda t, args: dvax.sets.Box(0.0, dvax.signals.Table([0.0, 1.0], args["limit"])(t)),
+        f=lambda t, x, u, args: dvax.signals.Table(args["times"], [1.0, 2.0])(t) - u,
+        h=lambda t, x, u, args: x,
+    )  # fmt: skip
+    lists = {"limit": [1.0, 2], "times": [0.0, 1.0]}
+    arrays = {"limit": jnp.array([1.0, 2.0]), "times": np.array([0.0, 1.0])}
+    ends = [dvax.solve(problem, 0.5, 0.0, 1.0, args).xs[-1] for args in (lists, arrays)]
+    np.testing.assert_allclose(*ends, rtol=1e-9)

@@ -52,7 +52,7 @@ class Table(AbstractSignal):
                 "Choose one of them",
             )
         # Concrete times are NumPy arrays, so that knots are known without running a program.
-        self.times = _numbers(times, f"{name}(times)") if _tree.is_concrete(times) else times
+        self.times = _numbers(times, f"{name}(times)")
         self.values = _tree.as_float(
             values if hasattr(values, "dtype") else _numbers(values, f"{name}(values)"),
             f"{name}(values)",
@@ -76,9 +76,11 @@ class Table(AbstractSignal):
         return self.times[0], self.times[-1]
 
 
-def _numbers(values: Any, name: str) -> np.ndarray:
+def _numbers(values: Any, name: str) -> Any:
     try:
-        return np.asarray(values, dtype=float)
+        if _tree.is_concrete(values):
+            return np.asarray(values, dtype=float)
+        return values if hasattr(values, "dtype") else jnp.asarray(values, float)
     except (TypeError, ValueError):
         raise input_error(
             name, " ".join(repr(values).split())[:120], "it must be a list or array of numbers",
