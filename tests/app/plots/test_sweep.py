@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import zarr
 
-from dvax.app.plots.sweep import _PANELS, _Axis, _members, _omission
+from dvax.app.plots.sweep import _PANELS, _Axis, _members, _omission, _with_numbers
 
 RNG = np.random.default_rng(0)
 
@@ -25,6 +25,7 @@ RNG = np.random.default_rng(0)
         ([0.1, 10.0], False),
         ([np.nan, 1.0, np.inf, 10.0, 100.0], True),
         ([np.nan], False),
+        ([1e10, 1e188, 1e190, 1e192], True),
     ],
 )
 def test_axis_is_logarithmic_where_values_spread_by_their_ratios(values, is_wide):
@@ -59,3 +60,9 @@ def test_figures_of_the_author_come_before_final_states_and_omissions_are_stated
     assert [f.name for f in found.figures] == ["yield_total", *finals, "steps"]
     assert f"{_PANELS} of {_PANELS + 2} figures are drawn" in _omission(found)
     assert _omission(replace(found, figures=found.figures[:_PANELS])) == ""
+
+
+def test_names_are_in_the_order_of_their_numbers():
+    names = ["final_q10", "final_q2", "final_q1", "x²", "final_p[2]", "3d"]
+    expected = ["3d", "final_p[2]", "final_q1", "final_q2", "final_q10", "x²"]
+    assert sorted(names, key=_with_numbers) == expected

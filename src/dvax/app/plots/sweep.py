@@ -1,6 +1,7 @@
 """The report of a sweep: its figures over its parameters, and the members that failed."""
 
 import json
+import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -65,10 +66,12 @@ class _Axis:
     @property
     def is_wide(self) -> bool:
         """Whether the values need a logarithmic axis: over a decade or more, and spread more evenly by
-        their logarithms than by themselves."""
+        their logarithms than by themselves; or over twelve decades."""
         values = np.unique(self.values[np.isfinite(self.values)]).astype(float)
         if len(values) < 3 or not 0 < 10 * values[0] <= values[-1]:
             return False
+        if values[-1] >= 1e12 * values[0]:
+            return True
         middle = np.log(np.median(values))
         even = np.log(0.5 * (values[0] + values[-1]))
         return bool(abs(middle - np.mean(np.log(values[[0, -1]]))) < abs(middle - even))
@@ -168,6 +171,12 @@ def _bounds(members: _Members | None, lines: list[dict[str, Any]]) -> list[str]:
     return []
 
 
+def _with_numbers(name: str) -> list[Any]:
+    """Return a key that sorts names by their numbers: q2 before q10."""
+    parts = re.split(r"([0-9]+)", name)
+    return [int(part) if k % 2 else part for k, part in enumerate(parts)]
+
+
 def _members(path: Path, keys: list[str]) -> _Members | None:
     if not path.is_dir():
         return None
@@ -180,7 +189,7 @@ def _members(path: Path, keys: list[str]) -> _Members | None:
         return _Axis(name, np.asarray(array[...]), str(about.get("units", "")), words)
 
     apart, figures = {*keys, "member", "status"}, []
-    for name, array in sorted(group.arrays()):
+    for name, array in sorted(group.arrays(), key=lambda item: _with_numbers(item[0])):
         dims = tuple(getattr(array.metadata, "dimension_names", None) or ())
         if dims == ("member",) and name not in apart:
             figures.append(axis(name))
