@@ -155,6 +155,7 @@ def test_cause_law_that_does_not_depend_on_u_names_the_eigenvalue():
     )  # fmt: skip
     error = failure(problem, x0=jnp.zeros(2), t1=1.0)
     assert "not strongly monotone" in error.cause and "eigenvalue 0 " in error.cause
+    assert "Subtract ε u from h" in str(error)
 
 
 @pytest.mark.thorough

@@ -375,6 +375,10 @@ def _rounded_up(count: float) -> int:
 
 
 _SIGN = Fix("", "", "Check the sign of the way in which h depends on u")
+_REGULARISE = Fix("", "", "Subtract ε u from h, with a small ε > 0: then the law has one solution")
+
+_ZERO = 1e-12
+"""Eigenvalues of this size, relative to the largest, are zero up to roundoff."""
 
 
 def _law(stop: Stop) -> Diagnosis:
@@ -404,12 +408,21 @@ def _not_monotone(stop: Stop) -> Diagnosis | None:
         F = problem.frozen(t, stop.x, args)
         M = np.asarray(jax.jacfwd(lambda v: jax.flatten_util.ravel_pytree(F(unravel(v)))[0])(flat))
         if np.isfinite(M).all():
-            least = float(np.linalg.eigvalsh(0.5 * (M + M.T))[0])
-            if least <= 0:
+            values = np.linalg.eigvalsh(0.5 * (M + M.T))
+            least, largest = float(values[0]), float(np.max(np.abs(values)))
+            law = (
+                f"F(y) = P⁻¹y − h(t, x, P⁻¹y) is not strongly monotone {at}: the symmetric part of "
+            )
+            if abs(least) <= _ZERO * largest:
                 return Diagnosis(
-                    f"F(y) = P⁻¹y − h(t, x, P⁻¹y) is not strongly monotone {at}: the symmetric part of "
-                    f"its derivative has the eigenvalue {least:.6g} ≤ 0, so that the law may have no "
-                    "solution or several.",
+                    f"{law}its derivative has the eigenvalue 0 up to roundoff, so that the law may "
+                    "have several solutions.",
+                    (_REGULARISE, _SIGN),
+                )
+            if least < 0:
+                return Diagnosis(
+                    f"{law}its derivative has the eigenvalue {least:.6g} < 0, so that the law may have "
+                    "no solution or several.",
                     (_SIGN,),
                 )
     return None
