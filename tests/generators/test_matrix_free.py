@@ -468,6 +468,7 @@ def test_derivatives_of_the_flow_in_the_entries_of_the_matrix_and_in_the_step(na
         A = generators.Sparse(BCOO((data, sparse.indices), shape=sparse.shape))
         return w @ A.propagator(h, terms + 1).step(x0, tuple(c))
 
+    @jax.jit
     def theirs(data, h, x0):
         A = BCOO((data, sparse.indices), shape=sparse.shape).todense()
         return w @ expm_flow(A, h, x0, c)
