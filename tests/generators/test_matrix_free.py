@@ -191,6 +191,17 @@ def test_sparse_derivative_at_zero_is_the_operator():
     )
 
 
+def test_derivative_of_a_step_of_length_zero_is_the_mean_rate():
+    A = generators.Sparse(MATRICES["heat"])
+    x0, *c = jnp.asarray(np.random.default_rng(4).normal(size=(4, len(X0))))
+    end = lambda h: A.propagator(h, 4).step(x0, tuple(c))  # noqa: E731
+    expected = MATRICES["heat"] @ np.asarray(x0) + sum(v / (j + 1) for j, v in enumerate(c))
+    rate = jax.jvp(end, (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
+    np.testing.assert_allclose(rate, expected, rtol=1e-11)
+    pulled = jax.grad(lambda h: jnp.sum(x0 * end(h)))(0.0)
+    assert float(pulled) == pytest.approx(float(x0 @ expected), rel=1e-11)
+
+
 def test_sparse_batch_equals_its_lanes():
     A = generators.Sparse(MATRICES["heat"])
     hs = jnp.asarray([1e-3, 0.05, 2.0])

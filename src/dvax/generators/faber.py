@@ -218,9 +218,12 @@ class FaberPropagator(AbstractPropagator):
                 propagator, (x, *c) = whole(leaves), v
                 rate = reduce(_tree.add, c, propagator.generator.apply(out))
                 if len(c) > 1:
+                    h, zero = propagator.length, _tree.zeros_like(x)
                     c = tuple(_tree.scale(float(j), one) for j, one in enumerate(c))
-                    moved = flow(leaves, (_tree.zeros_like(x), *c))
-                    rate = _tree.sub(rate, _tree.scale(1.0 / propagator.length, moved))
+                    mean = _tree.scale(1.0 / jnp.where(h == 0, 1.0, h), flow(leaves, (zero, *c)))
+                    limit = [_tree.scale(1.0 / (j + 1.0), one) for j, one in enumerate(c)]
+                    mean = _tree.where(h == 0, reduce(_tree.add, limit), mean)
+                    rate = _tree.sub(rate, mean)
                 total = _tree.add(total, _tree.scale(of_h, rate))
             return out, total
 
