@@ -32,8 +32,8 @@ CALLS = CUSTOM | {
 }  # fmt: skip
 """Primitives that apply one inner program to their arguments."""
 
-
 LOOPS = frozenset({"while", "scan"})
+"""Primitives that repeat an inner program."""
 
 
 def bind(eqn: Any, operands: list[Any], **others: Any) -> list[Any]:
