@@ -6,10 +6,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
+from jax.experimental.sparse import BCOO
 
 import dvax
+from dvax.models.rough_contact import RoughContact
 
 from .contact_law import strip
+from .rough_surface import surface
 
 Call = Callable[[], Any]
 """Computes, and returns numbers by which two platforms are compared."""
@@ -53,6 +57,47 @@ def _heat(side: int, steps: int) -> Call:
     x0 = jnp.asarray(np.random.default_rng(0).normal(size=(side, side)))
     run = jax.jit(lambda x: dvax.solve(problem, x, 0.0, 1e-3, dt=1e-3 / steps).xs[-1])
     return lambda: jax.block_until_ready(run(x0))
+
+
+def _conduction(side: int) -> tuple[Any, Any, np.ndarray]:
+    """Heat on a grid as a sparse matrix with its rate in args, with a limited heater at each point."""
+    line = scipy.sparse.diags([1.0, -2.0, 1.0], [-1, 0, 1], shape=(side, side)) * side**2
+    heat = BCOO.from_scipy_sparse(scipy.sparse.kronsum(line, line))
+    n = side**2
+    problem = dvax.Problem(
+        A=lambda rate: dvax.generators.Sparse(BCOO((rate * heat.data, heat.indices), shape=(n, n))),
+        P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 2.0),
+        f=lambda t, x, u, rate: u - x, h=lambda t, x, u, rate: 5.0 * (1.0 - x),
+    )  # fmt: skip
+    return problem, jnp.asarray(0.05), np.random.default_rng(4).uniform(0.0, 1.0, n)
+
+
+def _sparse(side: int, steps: int) -> Call:
+    problem, rate, x0 = _conduction(side)
+    start, span = jnp.asarray(x0), 0.1
+    run = jax.jit(
+        lambda rate: dvax.solve(problem, start, 0.0, span, args=rate, dt=span / steps).xs[-1]
+    )
+    return lambda: jax.block_until_ready(run(rate))
+
+
+def _sparse_gradient(side: int, steps: int) -> Call:
+    problem, rate, x0 = _conduction(side)
+    start, span = jnp.asarray(x0), 0.1
+    mean = lambda rate: jnp.mean(  # noqa: E731
+        dvax.solve(problem, start, 0.0, span, args=rate, dt=span / steps).xs[-1]
+    )
+    run = jax.jit(jax.grad(mean))
+    return lambda: jax.block_until_ready(run(rate))
+
+
+def _rough(n: int) -> Call:
+    heights = surface(n)
+    model = RoughContact(
+        profile=heights, lengths=1.0, modulus=1.0, thickness=0.1, approach=0.0
+    )  # fmt: skip
+    approach = 0.5 * float(heights.max() - heights.mean())
+    return lambda: jax.block_until_ready(model.equilibrium(approach).y)
 
 
 def _ensemble(members: int) -> Call:
@@ -117,6 +162,13 @@ WORKLOADS = {
     "heat": Workload(
         "heat on 1024 × 1024 points with a saturated law, 20 steps", lambda: _heat(1024, 20)
     ),
+    "sparse": Workload(
+        "heat on 256 × 256 points by a sparse matrix, 20 steps", lambda: _sparse(256, 20)
+    ),
+    "sparse gradient": Workload(
+        "its gradient by the entries of the matrix", lambda: _sparse_gradient(256, 20)
+    ),
+    "rough": Workload("a rough surface of 1024 × 1024 points in contact", lambda: _rough(1024)),
     "ensemble": Workload("10⁵ members of C1 to rtol 1e-6", lambda: _ensemble(10**5)),
     "box": Workload("one dense inequality on a box, n = 1000", lambda: _boxes(1, 1000)),
     "boxes": Workload("512 dense inequalities on boxes, n = 100", lambda: _boxes(512, 100)),
