@@ -397,24 +397,26 @@ class FaberPropagator(AbstractPropagator):
             return new, tau, sums, _tree.add(total, found)
 
         def chunk(q: Any, state: Any) -> Any:
-            begin, end = ends(chunks - 1 - q)
+            (begin, end), (table, state) = ends(chunks - 1 - q), state
 
             def again(j: Any, carry: Any) -> Any:
                 carry, table = carry
                 return term(j, carry), _tree.put(table, j - begin, carry[0])
 
-            given = row(stored, chunks - 1 - q), room(longest, zero)
+            given = row(stored, chunks - 1 - q), table
             _, table = lax.fori_loop(begin, end, again, given)
 
             def one(i: Any, state: Any) -> Any:
                 j = end - 1 - i
                 return back_one(degree - j, row(table, j - begin), state)
 
-            return lax.fori_loop(0, end - begin, one, state)
+            return table, lax.fori_loop(0, end - begin, one, state)
 
         total, tau = pull(first, 0.5 * forward, y)
         sums = tuple(jtu.tree_map(lambda leaf, w=w: w * leaf, y) for w in rows[: len(v), 0])
-        _, _, sums, total = lax.fori_loop(0, chunks, chunk, (tau, y, sums, total))
+        # One table for all chunks: to clear one for each took half of the time.
+        start = room(longest, zero), (tau, y, sums, total)
+        _, (_, _, sums, total) = lax.fori_loop(0, chunks, chunk, start)
         return sums, total
 
     def _sum(self, v: tuple[Tree, ...]) -> Tree:
