@@ -154,7 +154,8 @@ def _derivative_at_zero(vi: FrozenVI, like: Tree) -> Callable[[Tree], Tree]:
 def _is_symmetric(matrix: jax.Array, weights: Any, like: Tree) -> jax.Array:
     """Return whether a matrix is self-adjoint in the space with these weights, up to roundoff."""
     parts = jtu.tree_map(lambda w, v: jnp.broadcast_to(w, v.shape).astype(v.dtype), weights, like)
-    weighted = ravel_pytree(parts)[0][:, None] * matrix
+    # XLA takes seconds to evaluate the maximum of a large constant while it compiles.
+    weighted = ravel_pytree(parts)[0][:, None] * jax.lax.optimization_barrier(matrix)
     eps = jnp.finfo(matrix.dtype).eps
     return jnp.all(jnp.abs(weighted - weighted.T) <= 64 * eps * jnp.max(jnp.abs(weighted)))
 
