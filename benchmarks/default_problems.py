@@ -51,7 +51,7 @@ def cases(full: bool) -> list[Case]:
     found += [_turning(w) for w in (3.0, 30.0, 100.0)]
     found += [_clipped_drive(), _pendulum(), _stiff_diagonal()]
     found += [_chain(n) for n in (5, 40)]
-    found += [_shares(n) for n in (4, 12)]
+    found += [_shares(n) for n in (4, 12, 100)] + [_budget(200)]
     found += [_creep(eta) for eta in (1.0, 1e-2, 1e-4)]
     found += [_manufactured(A, K) for A in _MATRICES for K in _SETS]
     return found + [_strip(n) for n in ((100, 1000, 100_000) if full else (100,))]
@@ -202,23 +202,39 @@ def _chain(n: int) -> Case:
     )  # fmt: skip
 
 
+def _shared(total: float, v: Any, lib: Any) -> Any:
+    """The projection on the simplex of this sum, by sorting (Held, Wolfe and Crowder 1974)."""
+    down = -lib.sort(-v)
+    level = (lib.cumsum(down) - total) / lib.arange(1, v.shape[0] + 1)
+    return lib.maximum(v - lib.max(level), 0.0)
+
+
 def _shares(n: int) -> Case:
     """Shares on the simplex that follow payoffs, which the state lowers and a season moves."""
     phase = 2.0 * np.pi * np.arange(n) / n
-
-    def projected(v: Any, lib: Any) -> Any:
-        """The projection on the simplex, by sorting (Held, Wolfe and Crowder 1974)."""
-        down = -lib.sort(-v)
-        level = (lib.cumsum(down) - 1.0) / lib.arange(1, n + 1)
-        return lib.maximum(v - lib.max(level), 0.0)
-
     problem = dvax.Problem(
         A=generators.Scalar(-0.5), P=PLAIN, K=sets.Simplex(1.0), f=lambda t, x, u, args: u,
         h=lambda t, x, u, args: jnp.sin(t + jnp.asarray(phase)) - x,
     )  # fmt: skip
     return Case(
         f"shares on a simplex of {n}", problem, np.full(n, 1.0 / n), 10.0,
-        lambda t, x, lib: -0.5 * x + projected(lib.sin(t + phase) - x, lib),
+        lambda t, x, lib: -0.5 * x + _shared(1.0, lib.sin(t + phase) - x, lib),
+    )  # fmt: skip
+
+
+def _budget(n: int) -> Case:
+    """n states that share a tenth of n by need, each pushed at its own frequency."""
+    frequencies = np.linspace(1.0, 6.0, n)
+    needs = 0.5 + 1.5 * np.modf(np.arange(n) * 0.6180339887)[0]
+
+    problem = dvax.Problem(
+        A=generators.Scalar(-1.0), P=PLAIN, K=sets.Simplex(n / 10),
+        f=lambda t, x, u, args: jnp.sin(jnp.asarray(frequencies) * t) + u,
+        h=lambda t, x, u, args: jnp.asarray(needs) - 2.0 * x,
+    )  # fmt: skip
+    return Case(
+        f"a budget shared by {n}", problem, np.zeros(n), 3.0,
+        lambda t, x, lib: -x + lib.sin(frequencies * t) + _shared(n / 10, needs - 2.0 * x, lib),
     )  # fmt: skip
 
 

@@ -138,19 +138,12 @@ def choose(
     # Data may be undefined at other times than those of the run.
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(x0)))
     facts = _facts(problem, t0, x0, args)
-    if facts.is_field and not facts.pointwise:
-        return _with_fallback(
-            _ETD2RK,
-            f"with {facts.law} unknowns in the law, steps meet kinks at any time",
-            facts,
-            tol,
-        )
     if facts.affine and not facts.is_field and (facts.state <= _EXACT or facts.diagonal):
         return Choice(_EXPROSENBROCK, "x' is affine in t and x between kinks, where it is exact")
     rates = _rates(problem, t0, x0, args, facts)
     if not _tree.is_concrete(span):
         # Of a finite rate it is unknown how large it is over the span.
-        span, rates = 1.0, rates if math.isinf(rates.norm) else _UNKNOWN
+        span, rates = 1.0, rates._replace(law=math.inf) if math.isinf(rates.norm) else _UNKNOWN
     # The exponential of a matrix costs as much as many steps.
     matrices = _SLOPES_OF_MATRICES * (1.0 + (facts.state / 4) ** 3)
     # Explicit steps follow each turn, the more of them the tighter the tolerance.
@@ -171,8 +164,13 @@ def choose(
         if tol >= _LOOSE and rates.law * span <= math.sqrt(tol / _LOOSE):
             return _with_fallback(_ETD2RK, f"{reason}, and the tolerance is loose", facts, tol)
         return _with_fallback(_ETD4RK, reason, facts, tol)
-    size = "f̃ acts entry by entry" if facts.is_field else "few unknowns"
-    return _with_fallback(_DORMANDPRINCE, f"{size}, and nothing is known to be stiff", facts, tol)
+    why = "f̃ acts entry by entry" if facts.is_field else "few unknowns"
+    if facts.is_field and not facts.pointwise:
+        why = f"the law couples {facts.law} unknowns"
+        if not _has_matrix(problem.generator(args)):
+            # Half as many evaluations of the law a step, and e^(hA) costs little beside them.
+            return _with_fallback(_ETD4RK, why, facts, tol)
+    return _with_fallback(_DORMANDPRINCE, f"{why}, and nothing is known to be stiff", facts, tol)
 
 
 def _with_fallback(method: Any, reason: str, facts: Facts, tol: float) -> Choice:
@@ -183,6 +181,10 @@ def _with_fallback(method: Any, reason: str, facts: Facts, tol: float) -> Choice
     # Its own steps, of order 4, become as many as the stable ones of the other method.
     times *= max(1.0, 1e-4 / tol) ** (1 / 4)
     return Choice(method, reason, _EXPROSENBROCK, 100.0 * times)
+
+
+def _has_matrix(A: AbstractGenerator) -> bool:
+    return any(map(_has_matrix, A.parts)) if isinstance(A, Product) else isinstance(A, Dense)
 
 
 def norm(A: AbstractGenerator) -> float:
@@ -268,8 +270,8 @@ def _is_linear(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) 
 
 class Rates(NamedTuple):
     """How fast trajectories change: the size of A (`norm`), the spectral radius `slope` of Ax + f̃, the
-    largest imaginary part `turn` of its eigenvalues, and the largest slope `law` of a pointwise f̃ at
-    x = 0, all but the first zero where unknown."""
+    largest imaginary part `turn` of its eigenvalues, all zero where unknown, and the largest slope `law`
+    of a pointwise f̃ at x = 0, infinite where unknown."""
 
     norm: float
     slope: float
@@ -277,7 +279,7 @@ class Rates(NamedTuple):
     law: float
 
 
-_UNKNOWN = Rates(0.0, 0.0, 0.0, 0.0)
+_UNKNOWN = Rates(0.0, 0.0, 0.0, math.inf)
 
 _RATES: dict[Any, tuple[Any, Rates]] = {}
 """The rates of the latest problems, by the identity of the problem and of the arrays in its args, both
@@ -295,14 +297,14 @@ def _rates(problem: Problem, t0: jax.Array, x0: Tree, args: Any, facts: Facts) -
     if is_known and facts.linear:
         values = _eigenvalues(problem, t0, x0, args, "diagonal" if facts.diagonal else "matrix")
         is_known = values is not None
-    law: list[complex] | None = []
+    law: list[complex] | None = [math.inf]
     size = norm(problem.generator(args))
     if is_known and facts.pointwise and not facts.diagonal and size > 0:
         law = _eigenvalues(problem, t0, x0, args, "without A")
         is_known = law is not None
     slope = max(map(abs, values or [0.0]))
     turn = max(abs(v.imag) for v in values or [0.0])
-    rates = Rates(size, slope, turn, max(map(abs, law or [0.0])))
+    rates = Rates(size, slope, turn, max(map(abs, law or [math.inf])))
     if is_known:
         if len(_RATES) >= _MAX_FACTS:
             _RATES.clear()
