@@ -270,8 +270,8 @@ def _is_linear(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) 
 
 class Rates(NamedTuple):
     """How fast trajectories change: the size of A (`norm`), the spectral radius `slope` of Ax + f̃, the
-    largest imaginary part `turn` of its eigenvalues, all zero where unknown, and the largest slope `law`
-    of a pointwise f̃ at x = 0, infinite where unknown."""
+    largest imaginary part `turn` of its eigenvalues, both zero where unknown, and the largest slope
+    `law` of a pointwise f̃ at x = 0, infinite where unknown."""
 
     norm: float
     slope: float
