@@ -51,12 +51,13 @@ demo: $(READY) ## solve the rough contact strip; results and report in ./demo-ru
 	@$(VENV)/bin/dvax demo -o demo-run --force
 	@echo "The report: $(CURDIR)/demo-run/report.html"
 
+# Tests start many processes: without bytecode each compiles what it imports.
 test: lint types ## lint, formatting, types and tests (under 10 minutes on two cores)
-	$(PY) -m pytest -n $(WORKERS) --dist worksteal --durations=15
+	env -u PYTHONDONTWRITEBYTECODE $(PY) -m pytest -n $(WORKERS) --dist worksteal --durations=15
 	@echo 'make test: lint, formatting, types and every test not marked thorough have passed'
 
 test-times: $(READY) ## the tests of make test, with the processor time of each test, file and folder
-	$(PY) -m pytest -n $(WORKERS) --dist worksteal -p tests.processor_time
+	env -u PYTHONDONTWRITEBYTECODE $(PY) -m pytest -n $(WORKERS) --dist worksteal -p tests.processor_time
 
 lint: $(READY) ## ruff: rules and formatting
 	$(PY) -m ruff check .

@@ -23,10 +23,10 @@ ROOT = Path(__file__).parents[1]
 # as often as Python does by default, would take a twentieth of the time.
 gc.set_threshold(100_000, 50, 50)
 
-# Compiled programs outlive a test run. Through the environment, so that commands which tests start
-# as processes of their own find them too.
+# Compiled programs outlive a test run, but for those that take longer to store than to compile. Through
+# the environment, so that commands which tests start as processes of their own find them too.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.03")
 os.environ.setdefault("MPLBACKEND", "Agg")
 # `make thorough` tests what users run, and more of it in its time.
 if os.environ.get("HYPOTHESIS_PROFILE") != "thorough":
