@@ -95,7 +95,7 @@ def test_outline_attributes_are_set_if_and_only_if_OUTLINES(way):
     run = WAYS[way][0]
     text = jax.jit(run).lower(3.0).compile().as_text()
     outlined = 'inlineable="false",xla_cpu_small_call="true"' in text
-    assert outlined == _jax.OUTLINES
+    assert outlined == (_jax.OUTLINES and jax.default_backend() == "cpu")
 
 
 def test_solve_works_without_unstable_jax_interfaces():

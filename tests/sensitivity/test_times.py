@@ -60,7 +60,7 @@ METHODS = {
 }  # fmt: skip
 
 
-OFTEN = {"ETD4RK, adaptive", "ETD2RK, fixed"}
+OFTEN = ["ETD4RK, adaptive", "ETD2RK, fixed"]
 
 
 @pytest.mark.thorough
