@@ -59,7 +59,7 @@ def _heat(side: int, steps: int) -> Call:
     return lambda: jax.block_until_ready(run(x0))
 
 
-def _conduction(side: int) -> tuple[Any, Any, np.ndarray]:
+def conduction(side: int) -> tuple[Any, Any, np.ndarray]:
     """Heat on a grid as a sparse matrix with its rate in args, with a limited heater at each point."""
     line = scipy.sparse.diags([1.0, -2.0, 1.0], [-1, 0, 1], shape=(side, side)) * side**2
     heat = BCOO.from_scipy_sparse(scipy.sparse.kronsum(line, line))
@@ -73,7 +73,7 @@ def _conduction(side: int) -> tuple[Any, Any, np.ndarray]:
 
 
 def _sparse(side: int, steps: int) -> Call:
-    problem, rate, x0 = _conduction(side)
+    problem, rate, x0 = conduction(side)
     start, span = jnp.asarray(x0), 0.1
     run = jax.jit(
         lambda rate: dvax.solve(problem, start, 0.0, span, args=rate, dt=span / steps).xs[-1]
@@ -82,7 +82,7 @@ def _sparse(side: int, steps: int) -> Call:
 
 
 def _sparse_gradient(side: int, steps: int) -> Call:
-    problem, rate, x0 = _conduction(side)
+    problem, rate, x0 = conduction(side)
     start, span = jnp.asarray(x0), 0.1
     mean = lambda rate: jnp.mean(  # noqa: E731
         dvax.solve(problem, start, 0.0, span, args=rate, dt=span / steps).xs[-1]

@@ -26,7 +26,8 @@ def run(full: bool) -> Section:
         fair=(
             "Seconds of the first call in a process whose caches are empty (jax.clear_caches), tracing "
             "and compilation included, and of the same call once more. Processor time is that of all "
-            "cores. The games have six unknowns and a polyhedron of nine rows; one of them is cubic."
+            "cores. The games have six unknowns and a polyhedron of nine rows; one of them is cubic. "
+            "Laws y = proj(h) have three unknowns, and no iteration but that of the projection."
         ),
     )
     law = single()
@@ -35,6 +36,18 @@ def run(full: bool) -> Section:
         "four unknowns on a simplex": (*_simplex(), _END, _LEAST_RESULT),
         "affine game": (*_game(0.0), _END, _LEAST_RESULT),
         "cubic game": (*_game(0.1), _END, _LEAST_RESULT),
+        "three batteries, tables": (*_dispatch(), _END, _LEAST_RESULT),
+    }
+    sets = {
+        "polyhedron": dvax.sets.Polyhedron(G=jnp.asarray(_ROWS), d=jnp.ones(3)),
+        "box with a condition": dvax.sets.ConstrainedBox(
+            jnp.zeros(3), jnp.ones(3), jnp.asarray(_ROWS[:1]), -jnp.ones(1), 1.5 * jnp.ones(1)
+        ),
+        "ellipsoid": dvax.sets.Ellipsoid(jnp.zeros(3), jnp.array([1.0, 2.0, 3.0])),
+        "simplex": dvax.sets.Simplex(1.0),
+    }
+    cases |= {
+        f"y = proj(h), {name}": (*_direct(K), _END, _LEAST_RESULT) for name, K in sets.items()
     }
     rows = []
     for name, (problem, x0, end, least) in cases.items():
@@ -88,6 +101,38 @@ def _evaluation(problem: dvax.Problem, x0: Any) -> float:
         return jax.lax.fori_loop(0, _EVALUATIONS, one, problem.zero_control(x))
 
     return timed(lambda: jax.block_until_ready(loop(x0)))() / _EVALUATIONS
+
+
+_ROWS = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 0.0], [0.0, 1.0, -2.0]])
+
+
+def _direct(K: Any) -> tuple[dvax.Problem, Any]:
+    """A law without iteration beyond that of the projection."""
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=K,
+        f=lambda t, x, u, args: jnp.sin(t + jnp.arange(3.0)) + u,
+        h=lambda t, x, u, args: 1.0 - 2.0 * x,
+    )  # fmt: skip
+    return problem, jnp.zeros(3)
+
+
+def _dispatch() -> tuple[dvax.Problem, Any]:
+    """Three batteries that meet a load from a table at prices from another: limits of power, and a
+    condition that their powers add up to the load."""
+    times = np.arange(0.0, 7.0)
+    load = dvax.signals.Table(times, 1.0 + 0.5 * np.sin(times))
+    price = dvax.signals.Table(times, 2.0 + np.cos(times))
+    K = dvax.sets.Polyhedron(
+        G=jnp.vstack([jnp.eye(3), -jnp.eye(3)]), d=2.0 * jnp.ones(6), E=jnp.ones((1, 3)),
+        e=jnp.ones(1),
+    )  # fmt: skip
+    couple = jnp.asarray(0.3 * (np.ones((3, 3)) - np.eye(3)))
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-0.1), P=dvax.operators.Scaling(1.0), K=K,
+        f=lambda t, x, u, args: -u * load(t),
+        h=lambda t, x, u, args: x + price(t) - 0.5 * u - couple @ u,
+    )  # fmt: skip
+    return problem, jnp.array([1.0, 0.5, 0.2])
 
 
 def _simplex() -> tuple[dvax.Problem, Any]:

@@ -14,6 +14,7 @@ from ..clock import in_turn, timed
 from ..contact_law import ContactLaw, strip
 from ..peers import hand_fused
 from ..section import Section, compare
+from ..workloads import conduction
 
 _END = 2.0
 _LETTERS = ("alpha", "b_x", "b_u", "d_x", "d_u", "ell")
@@ -33,7 +34,8 @@ def run(full: bool) -> Section:
             "fixed steps it is the error of the steps. The second is that "
             "of x(2), and beside what is written by hand that of its derivative. By hand are the "
             "fused ETD2RK step in a scan under jax.grad, with respect to b_x, d_x and ℓ or to x0, all "
-            "states kept, and in a loop under jax.jvp in ℓ."
+            "states kept, and in a loop under jax.jvp in ℓ. Of the sparse matrix the derivative is "
+            "that in all entries, and its error that beside central differences of plain solves."
         ),
     )
     rounds = 15 if full else 7
@@ -44,7 +46,32 @@ def run(full: bool) -> Section:
         (10**5, {"dt": _END / 100}),
     ):
         _measure(section, strip(points), settings, rounds)
+    for side in (64, 256) if full else (64,):
+        _matrix(section, side, rounds)
     return section
+
+
+def _matrix(section: Section, side: int, rounds: int) -> None:
+    """The derivative in the entries of a sparse matrix, all proportional to a rate."""
+    problem, rate, x0 = conduction(side)
+    start, end, steps = jnp.asarray(x0), 0.1, 20
+
+    def mean(rate: Any) -> Any:
+        return jnp.mean(dvax.solve(problem, start, 0.0, end, rate, dt=end / steps).xs[-1])
+
+    plain, reverse = jax.jit(mean), jax.jit(jax.grad(mean))
+    change = 1e-4 * rate
+    difference = (plain(rate + change) - plain(rate - change)) / (2.0 * change)
+    sides = {
+        name: timed(lambda run=run: jax.block_until_ready(run(rate)))
+        for name, run in (("plain", plain), ("reverse", reverse))
+    }
+    taken = in_turn(sides, rounds)
+    section.comparisons.append(
+        compare(f"sparse matrix, n = {side**2}, {steps} steps, reverse", "plain solve",
+                taken["reverse"], taken["plain"],
+                error=abs(float(reverse(rate) / difference) - 1.0))
+    )  # fmt: skip
 
 
 def _measure(section: Section, law: ContactLaw, settings: dict[str, Any], rounds: int) -> None:
