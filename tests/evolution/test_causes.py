@@ -5,6 +5,7 @@ import math
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.sparse
 from benchmarks.netlists import multiplier
 from tests.selection import mostly_thorough
 
@@ -78,6 +79,23 @@ def test_cause_growth_faster_than_exponential_is_not_reported_as_escape(steps):
 def test_cause_exponential_growth_is_not_reported_as_escape():
     error = failure(make(lambda t, x, u, args: x), x0=1.0, t1=1e4, rtol=1e-3)
     assert "escape" not in str(error) and "exponential growth" in error.cause
+
+
+@pytest.mark.parametrize(
+    "A",
+    [
+        dvax.generators.Dense(np.diag([2000.0, -1.0, 3.0, 0.5])),
+        dvax.generators.Sparse(
+            scipy.sparse.diags([-1.0, 2.0, -1.0], [-1, 0, 1], shape=(4, 4)) * 1e3
+        ),
+    ],
+    ids=["matrix", "diffusion of the wrong sign"],
+)
+def test_cause_fast_growth_ends_the_run_where_the_norm_overflows(A):
+    # Beyond it no defect can be compared with the state: the steps became ever shorter.
+    error = failure(make(lambda t, x, u, args: u, A=A), x0=jnp.ones(4), t1=10.0, rtol=1e-3)
+    assert "exponential growth" in error.cause and "Check the signs in A" in str(error)
+    assert float(error.solution.stats["t"]) < 0.5
     error = failure(
         make(lambda t, x, u, args: t - x), x0=1.0, t1=50.0, max_steps=9, method=dvax.ETD2RK()
     )

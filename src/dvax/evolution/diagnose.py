@@ -212,6 +212,7 @@ def _escape(stop: Stop) -> Diagnosis:
         return Diagnosis(
             f"{grown}: exponential growth, at the mean rate {rate:.3g} per unit of time.",
             (Fix("", "", "Check the signs in A and f if x should stay bounded"),),
+            True,
         )
     return Diagnosis()
 

@@ -13,5 +13,5 @@ def attempt(error, size, horizon=1.0, smallest=1e-14):
         error=jnp.asarray(error), modulus=jnp.asarray(error),
         unit=jnp.asarray(1.0),
         integrated=jnp.asarray(error * size / horizon), roundoff=jnp.asarray(0.0),
-        usable=jnp.asarray(True),
+        finite=YES, usable=YES,
     )  # fmt: skip

@@ -196,4 +196,4 @@ class Adaptive(AbstractController):
         reason = RESULTS.where(step.solved, reason, RESULTS.law_unsolved)
         result = RESULTS.where(stuck, reason, RESULTS.successful)
         result = RESULTS.where(step.start_solved, result, RESULTS.law_unsolved)
-        return RESULTS.where(step.finite, result, RESULTS.nonfinite)
+        return RESULTS.where(attempt.finite, result, RESULTS.nonfinite)

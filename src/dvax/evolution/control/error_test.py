@@ -32,8 +32,8 @@ class Attempt(NamedTuple):
     - `unit`: the factor from the signed defect to `error`, which is 1 unless earlier errors decay;
     - `integrated`: the defect integrated over the step, in units of the tolerance of the whole run;
     - `roundoff`: the largest `error` that rounding of f̃ and of t can explain;
-    - `usable`: the law was solved at its start, and no value is non-finite that a smaller step would
-      leave so.
+    - `finite`: no value is non-finite that a smaller step would leave so, and ‖x‖² does not overflow;
+    - `usable`: finite, and the law was solved at its start.
     """
 
     size: Any
@@ -43,6 +43,7 @@ class Attempt(NamedTuple):
     unit: Any
     integrated: Any
     roundoff: Any
+    finite: Any
     usable: Any
 
     def by_modulus(self, noisy: Any, horizon: Any) -> "Attempt":
@@ -99,6 +100,7 @@ class ErrorTest(eqx.Module):
         # A law that is not solved inside the step may be that of a stage far away: the step was too
         # large.
         error, modulus = (jnp.where(step.solved, v, jnp.inf) for v in (error, modulus))
+        finite = step.finite & jnp.all(jnp.isfinite(jnp.stack(self.sizes(x0))))
         return Attempt(
             size=h,
             smallest=8 * eps * largest,
@@ -107,7 +109,8 @@ class ErrorTest(eqx.Module):
             unit=unit,
             integrated=jnp.where(step.solved, integrated, jnp.inf),
             roundoff=lax.stop_gradient(roundoff),
-            usable=step.start_solved & step.finite,
+            finite=finite,
+            usable=step.start_solved & finite,
         )
 
     def _of_estimate(self, h: Any, integrated: Any, x0: Tree, step: Step) -> Any:
