@@ -356,5 +356,5 @@ def test_interrupted_export_leaves_no_file(tmp_path):
         while not target.parent.is_dir() or not any(target.parent.iterdir()):
             time.sleep(0.05)
         process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 130
+        assert process.wait(60) == 130
     assert list(target.parent.iterdir()) == []

@@ -226,7 +226,8 @@ class MpcApplication(AbstractModelApplication):
                 f"{self.miss:.3g} there, so that the state stays away from it."
             )
         low, high = np.asarray(self.mpc.lower), np.asarray(self.mpc.upper)
-        if np.any((self.feed.values < low) | (self.feed.values > high)):
+        values = np.asarray(self.feed.values)
+        if np.any((values < low) | (values > high)):
             found.append(
                 "The input that holds model.reference is beyond model.lower or model.upper."
             )
