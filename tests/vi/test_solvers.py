@@ -228,3 +228,18 @@ def test_solvers_keep_single_precision():
         )
         assert vi.y.dtype == jnp.float32
         np.testing.assert_allclose(np.asarray(vi.y), [0.3, 1.0], atol=1e-5)
+
+
+def test_active_set_starts_from_the_active_set_of_a_gradient_step():
+    # From that at y₀ itself, where no unknown is at a bound, 5.7 evaluations in the mean.
+    rng = np.random.default_rng(1)
+    half = rng.normal(size=(20, 20))
+    matrix = jnp.asarray(half @ half.T / 20 + 0.1 * np.eye(20))
+    box = Box(-1.0, 1.0)
+
+    def evaluations(q):
+        law = lambda y, q: matrix @ y - q  # noqa: E731
+        return dvax.solve_vi(law, box, jnp.zeros(20), args=q, solver=ActiveSet()).evaluations
+
+    counts = jax.jit(jax.vmap(evaluations))(jnp.asarray(3.0 * rng.normal(size=(60, 20))))
+    assert float(jnp.mean(counts)) < 4.2

@@ -102,7 +102,7 @@ class ActiveSet(AbstractSolver):
         return safeguarded_newton(
             vi, y0, tol, solve_linear, step=self.step, max_steps=self.max_steps,
             is_quadratic=False if symmetric is None else jnp.asarray(symmetric) & affine,
-            matrix_free=size > self.dense,
+            matrix_free=size > self.dense, is_box=True,
         )  # fmt: skip
 
     def _lu_solver(self, constant: Any) -> Callable[[Linearisation, Tree], Tree]:
