@@ -105,9 +105,8 @@ def safeguarded_newton(
       until λ‖F(y) − F(b)‖ ≤ step ‖y − b‖;
     - its corrector, z = b − λF(ȳ), with the predictor's ȳ; its y is the next b.
 
-    The first Newton step starts from z = y₀ − τF(y₀) on a box (`is_box`), whose projection costs little:
-    the active set there is nearer to that of the solution than that at y₀. On other sets a second
-    projection in the loop body would cost more than it saves.
+    On a box (`is_box`) the first Newton step starts from z = y₀ − τF(y₀), where the active set is
+    nearer to that of the solution. On other sets the second projection costs more than it saves.
 
     From a good guess the second iteration ends the solve. A run of Newton steps continues while it
     halves the best ‖w‖ at least every sixth step. A failed run doubles the number of steps allowed to
