@@ -63,6 +63,12 @@ FUNCTIONS = {
         lambda: of_f(lambda t, x, u: -u),
         "newcomer.py, line; a function of (t, x, u); f(t, x, u, args)",
     ),
+    "a list in args": (
+        lambda: dvax.solve(
+            problem(f=lambda t, x, u, a: a[0] * x), jnp.ones(2), 0.0, 1.0, ([1.0, 2.0],)
+        ),
+        "Problem(f); newcomer.py, line; a list; jnp.asarray",
+    ),
     "f of five": (lambda: of_f(lambda t, x, u, a, b: -u), "Problem(f); called as f(t, x, u, args)"),
     "h of three": (lambda: solve(problem(h=lambda t, x, u: x)), "Problem(h); lambda t, x, u, args"),
     "K of one": (

@@ -244,6 +244,11 @@ def _reason(
         return "JAX arrays are immutable", "Write x = x.at[i].set(v) for x[i] = v"
     if inputs.get("args", 0) is None and _reads_args(fn, error):
         return f"{name} reads args, and no args were given", "Pass args=... to the call"
+    if isinstance(error, TypeError) and "'list'" in str(error):
+        return (
+            f"{name} computes with a list, as args may hold one, and arithmetic needs an array",
+            "Pass jnp.asarray(...) in place of the list",
+        )
     fix = "Fix that line"
     if "u" in inputs:
         fix += (

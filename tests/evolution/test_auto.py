@@ -298,3 +298,28 @@ def test_matrix_of_a_vibrating_chain_is_judged_by_its_frequencies():
     # Frequencies up to 40, and a norm of 1,600.
     sol = dvax.solve(problem, jnp.zeros(2 * n), 0.0, 2.0)
     assert str(sol.stats["method"]).startswith("DormandPrince")
+
+
+@pytest.mark.parametrize(
+    ("n", "span", "name"),
+    [(20, 1.0, "DormandPrince"), (80, 0.05, "DormandPrince"), (80, 2.0, "ETD4RK")],
+)
+def test_matrix_is_left_to_its_exponential_only_where_that_costs_less_than_stable_steps(
+    n, span, name
+):
+    # Heat as a matrix: 600, 400 and 16,000 explicit steps. An exponential is formed for each step size.
+    h = 1.0 / (n + 1)
+    heat = (np.eye(n, k=1) + np.eye(n, k=-1) - 2.0 * np.eye(n)) / h**2
+    problem = dvax.Problem(
+        A=dvax.generators.Dense(heat), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 2.0),
+        f=lambda t, x, u, args: jnp.sin(5.0 * t) + u - x**3, h=lambda t, x, u, args: 5.0 * (0.5 - x),
+    )  # fmt: skip
+    x0 = jnp.asarray(np.sin(np.pi * h * np.arange(1, n + 1)))
+    sol = dvax.solve(problem, x0, 0.0, span, rtol=1e-5, atol=1e-5)
+    assert sol.stats["method"].startswith(name)
+
+    def by_hand(t, x):
+        return heat @ x + np.sin(5.0 * t) + np.clip(5.0 * (0.5 - x), 0.0, 2.0) - x**3
+
+    exact = solve_ivp(by_hand, (0.0, span), x0, "Radau", rtol=1e-9, atol=1e-10).y[:, -1]
+    assert np.sqrt(np.mean((np.asarray(sol.xs[-1]) - exact) ** 2)) < 3e-5

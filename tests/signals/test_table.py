@@ -106,6 +106,10 @@ def test_a_product_of_a_profile_and_a_record_is_a_separable_field():
         (lambda: Table([0.0], [1.0]), ["at least 2"]),
         (lambda: Table([0.0, 1.0, 2.0], [1.0, 2.0, 3.0], "cubic"), ["at least 4"]),
         (lambda: Table([[0.0, 1.0]], [[1.0, 2.0]]), ["vector"]),
+        (
+            lambda: Table(np.array(["2020-01-01", "2020-01-02"], "M8[D]"), [1.0, 2.0]),
+            ["since a date"],
+        ),
         (lambda: Constant(float("nan")), ["finite"]),
     ],
 )

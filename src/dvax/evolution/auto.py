@@ -59,7 +59,8 @@ _EXACT = 12
 
 _FAST = 300.0
 """The size of A times the span beyond which A is left to its exponential: an explicit method needs a
-third of this number of steps for stability alone."""
+third of this number of steps for stability alone. For a matrix of n unknowns it is n times as large:
+its exponential, formed again for each step size, costs as much as some n steps."""
 
 _SLOPES, _SLOPES_OF_MATRICES = 60.0, 150.0
 """The spectral radius of A + Df̃ times the span, for constant derivatives of f and h, beyond which
@@ -153,8 +154,8 @@ def choose(
             _EXPROSENBROCK,
             f"the constant slope of Ax + f̃ times the span is {rates.slope * span:.2g}",
         )
-    fast = rates.norm * span
-    if fast > _FAST:
+    fast, forms_matrices = rates.norm * span, _has_matrix(problem.generator(args))
+    if fast > _FAST * (facts.state if forms_matrices else 1):
         size = (
             f"the size of A times the span is {fast:.2g}"
             if fast < np.inf
@@ -167,7 +168,7 @@ def choose(
     why = "f̃ acts entry by entry" if facts.is_field else "few unknowns"
     if facts.is_field and not facts.pointwise:
         why = f"the law couples {facts.law} unknowns"
-        if not _has_matrix(problem.generator(args)):
+        if not forms_matrices:
             # Half as many evaluations of the law a step, and e^(hA) costs little beside them.
             return _with_fallback(_ETD4RK, why, facts, tol)
     return _with_fallback(_DORMANDPRINCE, f"{why}, and nothing is known to be stiff", facts, tol)

@@ -79,12 +79,16 @@ class Table(AbstractSignal):
 def _numbers(values: Any, name: str) -> Any:
     try:
         if _tree.is_concrete(values):
+            if np.asarray(values).dtype.kind in "mM":
+                raise TypeError("dates have no unit that t would have")
             return np.asarray(values, dtype=float)
         return values if hasattr(values, "dtype") else jnp.asarray(values, float)
     except (TypeError, ValueError):
+        dates = "datetime" in repr(values)
         raise input_error(
             name, " ".join(repr(values).split())[:120], "it must be a list or array of numbers",
-            "Give numbers, in rows of one length",
+            "Give the numbers since a date: (times - times[0]) / np.timedelta64(1, 'h')" if dates
+            else "Give numbers, in rows of one length",
         ) from None  # fmt: skip
 
 

@@ -297,7 +297,7 @@ def _check(problem: Problem, sol: Any, constants: Any, initial_error: Any) -> No
         for name, value, is_valid, kind, source in (
             ("sol", sol, isinstance(sol, Solution), "dvax.Solution", "the result of dvax.solve"),
             ("constants", constants, isinstance(constants, Constants), "dvax.Constants",
-             "dvax.verify(problem, x0).constants"),
+             "dvax.verify(problem, x0).constants; if that is None, its table() says what is missing"),
         )
         if not is_valid
     )  # fmt: skip
