@@ -39,6 +39,8 @@ from .stopped import LAST_STEPS, Diagnosis, Stop
 
 _MAX_RTOL = 0.01
 """Largest rtol that a fix proposes."""
+_OVERFLOWS = 1e100
+"""|x| beyond which a run ends because numbers overflow, and not because f, h or K are at fault."""
 _MAX_DENSE_LAW = 64
 """Largest number of unknowns for which the derivative of the law is formed as a matrix."""
 _STABILITY_LIMIT = 3.0
@@ -92,7 +94,7 @@ def diagnose(solution: Any) -> Diagnosis:
     at_floor = stop.step <= 64.0 * max(stop.ulp, 5e-324)
     if result != RESULTS.max_steps or at_floor:
         # Overflow is the end of growth.
-        overflows = _largest(stop.x) > 1e100
+        overflows = _largest(stop.x) > _OVERFLOWS
         causes += [_escape, _nonfinite] if overflows else [_nonfinite]
     if result == RESULTS.law_unsolved:
         causes += [_law]
@@ -212,7 +214,7 @@ def _escape(stop: Stop) -> Diagnosis:
         return Diagnosis(
             f"{grown}: exponential growth, at the mean rate {rate:.3g} per unit of time.",
             (Fix("", "", "Check the signs in A and f if x should stay bounded"),),
-            True,
+            size > _OVERFLOWS,
         )
     return Diagnosis()
 
