@@ -77,7 +77,7 @@ hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "test"))
 
 
 _MAPPED, _PAGES = Path("/proc/self/maps"), Path("/proc/self/statm")
-_SO_MANY, _AT_MOST = 25, 40_000
+_SO_MANY, _AT_MOST = 25, 55_000
 _TESTS = itertools.count(1)
 
 
