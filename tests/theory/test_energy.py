@@ -99,6 +99,25 @@ def test_energy_norm_rate_is_recomputed_from_the_proposed_norm():
     assert energy._certify(np.diag([1.0, 1.0, -1.0]), np.ones(2), data) is None
 
 
+@pytest.mark.parametrize(
+    ("f", "h", "size", "reason"),
+    [
+        (lambda t, x, u, args: x * u, lambda t, x, u, args: 1.0 - u, 2, "∂f/∂x, ∂f/∂u are not"),
+        (lambda t, x, u, args: -u, lambda t, x, u, args: jnp.sin(x) - u, 2, "∂h/∂x are not"),
+        (lambda t, x, u, args: -u, lambda t, x, u, args: x - u, 21, "more than 40 unknowns"),
+        (lambda t, x, u, args: -u, lambda t, x, u, args: x + 2.0 * u, 2, "no constants"),
+    ],
+)
+def test_verification_says_why_there_is_no_energy_norm(f, h, size, reason):
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), f=f, h=h,
+        P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-1.0, 1.0),
+    )  # fmt: skip
+    check = dvax.verify(problem, jnp.zeros(size), x=(-2.0, 2.0), energy=True)
+    assert reason in check.no_energy and check.no_energy in repr(check)
+    assert check.constants is None or check.constants.energy is None
+
+
 def test_energy_norm_without_the_solver_names_the_extra(monkeypatch):
     real = builtins.__import__
 

@@ -31,6 +31,7 @@ from .system import Jacobians, System
 MAX_UNKNOWNS = 40
 """Largest number of unknowns of x and u together for which the program is solved."""
 
+_DERIVATIVES = ("∂f/∂x", "∂f/∂u", "∂h/∂x", "∂h/∂u")
 _BISECTIONS = 12
 _SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
 _SMALLEST_MULTIPLIER = 1e-8
@@ -48,22 +49,21 @@ class EnergyNorm(NamedTuple):
     rate: float
 
 
-def energy_norm(system: System, J: Jacobians, pointwise: bool, T: float) -> EnergyNorm | None:
-    """Return the Q that minimises √κ Φ_μ(T), the factor by which a constant defect grows.
-
-    The result is None if the derivatives of f and h are not constant, or no Q improves on the norm of
-    the space.
+def energy_norm(system: System, J: Jacobians, pointwise: bool, T: float) -> EnergyNorm | str:
+    """Return the Q that minimises √κ Φ_μ(T), the factor by which a constant defect grows, or the reason
+    for which there is none: the derivatives of f and h are not constant, or no Q improves on the norm
+    of the space.
 
     **Raises:** `dvax.InputError` if the solver is not installed.
     """
     data = _data(system, J, pointwise)
-    if data is None:
-        return None
+    if isinstance(data, str):
+        return data
     # If u is constant, no norm contracts faster than the linear part.
     low = float(np.max(np.real(np.linalg.eigvals(data.G))))
     start = high = _rate_of_space_norm(data)
     if not np.isfinite(high):
-        return None
+        return "the law is not strongly monotone in the form that the search needs"
     norms = []
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
@@ -79,7 +79,7 @@ def energy_norm(system: System, J: Jacobians, pointwise: bool, T: float) -> Ener
             norms.append(_certify(*proposal, data))
     norms = [norm for norm in norms if norm is not None]
     if not norms:
-        return None
+        return "the solver of the semidefinite program found none"
     return min(norms, key=lambda norm: norm.M * float(growth_integral(norm.rate, T)))
 
 
@@ -94,16 +94,24 @@ class _Data(NamedTuple):
     componentwise: bool
 
 
-def _data(system: System, J: Jacobians, pointwise: bool) -> _Data | None:
-    blocks = [*J[:4], system.A, system.P]
-    if any(b is None or not b.exact for b in blocks):
-        return None
+def _data(system: System, J: Jacobians, pointwise: bool) -> _Data | str:
+    """Return the matrices, or why there are none."""
+    blocks = dict(zip(_DERIVATIVES, J)) | {"A": system.A, "P": system.P}
+    unknown = [name for name, b in blocks.items() if b is None]
+    if unknown:
+        return f"no matrix is known for {', '.join(unknown)}"
+    moving = [name for name in _DERIVATIVES if not blocks[name].exact]
+    if moving:
+        return f"the derivatives {', '.join(moving)} are not proved constant"
+    if not (blocks["A"].exact and blocks["P"].exact):
+        return "A and P are not known exactly as matrices"
+    too_large = f"x and u have more than {MAX_UNKNOWNS} unknowns together"
     try:
-        f_x, f_u, h_x, h_u, A, P = (as_one_matrix(b).center[0] for b in blocks if b is not None)
+        f_x, f_u, h_x, h_u, A, P = (as_one_matrix(b).center[0] for b in blocks.values())
     except TooLarge:
-        return None
+        return too_large
     if len(A) + len(P) > MAX_UNKNOWNS:
-        return None
+        return too_large
     return _Data(A + f_x, f_u, h_x, np.eye(len(P)) - h_u, P, pointwise)
 
 

@@ -18,7 +18,7 @@ from .assumptions import Assumption, assumptions
 from .certificate import is_declared
 from .constants import Constants
 from .domain import Domain
-from .energy import energy_norm
+from .energy import EnergyNorm, energy_norm
 from .moduli import sharp_rate
 from .modulus_status import ModulusStatuses, modulus_statuses
 from .region import Region, as_intervals
@@ -36,7 +36,8 @@ class Verification(NamedTuple):
     - `assumptions`: the `Assumption`s; `check["ass:…"]` returns the one with this label;
     - `constants`: `dvax.Constants` with the status of each, or None if a modulus is missing or γ is not
       positive;
-    - `route`: "variational inequality" or "projection", the route of the paper that gives the larger γ.
+    - `route`: "variational inequality" or "projection", the route of the paper that gives the larger γ;
+    - `no_energy`: why `energy=True` has found no norm in which trajectories contract, or empty.
 
     ```python
     >>> import dvax
@@ -57,9 +58,11 @@ class Verification(NamedTuple):
     assumptions: tuple[Assumption, ...]
     constants: Constants | None
     route: str
+    no_energy: str = ""
 
     def __repr__(self) -> str:
         parts = [f"Verification: {self.status}, route: {self.route}", self.table()]
+        parts += [f"energy=True has found no norm: {self.no_energy}"] if self.no_energy else []
         return "\n".join([*parts, repr(self.constants)] if self.constants is not None else parts)
 
     def __getitem__(self, label: Any) -> Any:
@@ -115,7 +118,8 @@ def verify(
     that stay in it. A bound of u that follows from K restricts nothing, so that responses may be at
     it. (If the region of u excludes a part of P⁻¹K(t), the law may have other solutions there.)
     `declared`: moduli by name, or `dvax.Constants`. `energy`: search for a norm in which trajectories
-    contract, for affine data of up to 40 unknowns (needs `dvax[energy]`).
+    contract, for affine data of up to 40 unknowns (needs `dvax[energy]`); `no_energy` of the result
+    says why there is none.
 
     If f, h and K do not depend on t, the constants hold at all times, whatever t0 and t1 are.
 
@@ -162,7 +166,11 @@ def verify(
     if knots.size == 0 and _is_autonomous(system, t0):
         time = interval(-np.inf, np.inf)
     domain = domain_of(time, None if x is None else states, limits_u, args)
-    constants = constants_of(system, region, moduli, domain, energy)
+    found = _energy(system, region, moduli) if energy else ""
+    if isinstance(found, str):
+        constants = constants_of(system, region, moduli, domain)
+        return Verification(statuses, constants, _route(system, moduli), found)
+    constants = constants_of(system, region, moduli, domain, (found.M, found.rate))
     return Verification(statuses, constants, _route(system, moduli))
 
 
@@ -191,14 +199,13 @@ def _route(system: System, moduli: ModulusStatuses) -> str:
 
 
 def constants_of(
-    system: System, region: Region, moduli: ModulusStatuses, domain: Domain, energy: bool = False
-) -> Constants | None:
+    system: System, region: Region, moduli: ModulusStatuses, domain: Domain,
+    energy: tuple[float, float] | None = None,
+) -> Constants | None:  # fmt: skip
     """Return the constants, or None unless every modulus is finite and γ > 0."""
+    if not _give_constants(moduli):
+        return None
     values: dict[str, Any] = {name: entry.value for name, entry in moduli.by_name.items()}
-    if moduli.counterexample is not None or not values["gamma"] > 0:
-        return None
-    if not all(np.isfinite(value) for value in values.values()):
-        return None
     statuses: dict[str, Status] = {name: entry.status for name, entry in moduli.by_name.items()}
     declared = is_declared(system.problem.generator(system.args))
     A_status: Status = "declared" if declared else "proved"
@@ -207,20 +214,27 @@ def constants_of(
     mu = _one_sided_rate(system, region, moduli)
     if mu is not None:
         statuses["one_sided"] = weakest(A_status, P_status)
-    contraction = _energy(system, region) if energy else None
-    if contraction is not None:
+    if energy is not None:
         statuses["energy"] = "proved"
     return Constants(
         **values, M=system.growth.M, omega=system.growth.omega, m_P=system.spectrum.m_P,
         norm_P_inv=system.spectrum.norm_P_inv, one_sided=mu, status=statuses,
-        domain=domain, energy=contraction,
+        domain=domain, energy=energy,
     )  # fmt: skip
 
 
-def _energy(system: System, region: Region) -> tuple[float, float] | None:
+def _give_constants(moduli: ModulusStatuses) -> bool:
+    values = {name: entry.value for name, entry in moduli.by_name.items()}
+    finite = all(np.isfinite(value) for value in values.values())
+    return moduli.counterexample is None and values["gamma"] > 0 and finite
+
+
+def _energy(system: System, region: Region, moduli: ModulusStatuses) -> EnergyNorm | str:
+    """Return the norm, or why there is none."""
+    if not _give_constants(moduli):
+        return "the problem has no constants, since a modulus is missing or γ is not positive"
     t0, t1 = float(region.t.low), float(region.t.high)
-    norm = energy_norm(system, system.at(region), _pointwise(system, t0), t1 - t0)
-    return None if norm is None else (norm.M, norm.rate)
+    return energy_norm(system, system.at(region), _pointwise(system, t0), t1 - t0)
 
 
 def domain_of(time: Slope, x: Tree | None, u: Tree | None, args: Any) -> Domain:

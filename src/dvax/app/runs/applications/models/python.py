@@ -21,7 +21,6 @@ from dvax.app.runs.applications.own_parameters import PREFIX, Parameters, comple
 from dvax.errors import DvaxError, InputError, Problems, input_error
 from dvax.evolution import Solution
 from dvax.models import Model
-from dvax.theory.energy import MAX_UNKNOWNS
 
 
 class PythonSection(FramesKeys):
@@ -113,9 +112,8 @@ class PythonApplication(AbstractModelApplication):
         said = [f"The code of {self.file.name}:{self.table.function} is executed."]
         if self.energy and self.constants is not None and self.constants.energy is None:
             said.append(
-                "energy = true has found no norm, and the error bound uses that of the state space. "
-                "The search needs f and h whose derivatives do not change, and at most "
-                f"{MAX_UNKNOWNS} unknowns of x and u together."
+                "energy = true has found no norm, and the error bound uses that of the state space: "
+                f"{self.verification.no_energy}."
             )
         return tuple(said)
 
