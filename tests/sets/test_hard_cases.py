@@ -158,6 +158,56 @@ def test_projection_of_distant_points_keeps_all_digits(space):
     np.testing.assert_allclose(np.asarray(far), np.sqrt(0.5), rtol=1e-8)
 
 
+SIDES = np.vstack([np.eye(6), -np.eye(6), np.ones((1, 6))])
+ROWS = np.random.default_rng(3).normal(size=(3, 6))
+# name: (set of size one, the largest distance, digits of the conditions there)
+FAR_AWAY = {
+    "one row": (
+        sets.ConstrainedBox(0.0, 0.2, np.ones((1, 6)), np.zeros(1), np.full(1, 0.5)), 1e60, 1e-11,
+    ),
+    "an equation": (
+        sets.ConstrainedBox(0.0, 0.2, np.ones((1, 6)), np.full(1, 0.5), np.full(1, 0.5)), 1e60, 1e-11,
+    ),
+    "three rows": (sets.ConstrainedBox(-1.0, 1.0, ROWS, np.full(3, -0.5), np.full(3, 0.3)), 1e12, 1e-10),
+    "half-open": (
+        sets.ConstrainedBox(0.0, np.inf, np.abs(ROWS[:2]), np.full(2, -np.inf), np.ones(2)), 1e12, 1e-10,
+    ),
+    "polyhedron": (sets.Polyhedron(SIDES, np.append(np.ones(12), 1.0)), 1e18, 1e-13),
+    "equations": (
+        sets.Polyhedron(SIDES[:12], np.ones(12), np.ones((1, 6)), np.array([0.5])), 1e12, 1e-13,
+    ),
+    "simplex": (sets.Simplex(1.0), 1e18, 1e-13),
+    "ℓ1 ball": (sets.L1Ball(0.0, 1.0), 1e18, 1e-13),
+    "ball": (sets.Ball(0.0, 1.0), 1e18, 1e-13),
+    "ellipsoid": (sets.Ellipsoid(0.0, radii=np.geomspace(0.01, 1.0, 6)), 1e18, 1e-13),
+    "intersection": (
+        sets.Intersection(sets.Box(-1.0, 1.0), sets.HalfSpace(np.ones(6), 1.0)), 1e6, 1e-3,
+    ),
+    "ball and half-space": (
+        sets.Intersection(sets.Ball(0.0, 1.0), sets.HalfSpace(np.ones(6), 0.5)), 1e6, 1e-3,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FAR_AWAY)
+def test_projection_from_any_distance_is_in_the_set_and_nearest(name):
+    """⟨z − y, v − y⟩ ≤ 0 for v in K, and y is its own projection, up to roundoff of z in the first and
+    up to roundoff of y in the second."""
+    K, farthest, digits = FAR_AWAY[name]
+    rng = np.random.default_rng(0)
+    distances = np.geomspace(1.0, farthest, 40)[:, None]
+    # Half of the points lie in all directions, the others have entries that almost agree.
+    agreeing = 1.0 + rng.uniform(size=(20, 6)) * 10.0 ** rng.uniform(-16, 0, size=(20, 1))
+    z = distances * np.stack([rng.normal(size=(20, 6)), agreeing], axis=1).reshape(40, 6)
+    project = jax.jit(jax.vmap(lambda v: K.project(v, spaces.Euclidean(6))))
+    y, others = np.asarray(project(z)), np.asarray(project(rng.normal(size=(40, 6))))
+    np.testing.assert_allclose(np.asarray(project(y)), y, atol=digits, rtol=0)
+    steps = others[None, :, :] - y[:, None, :]
+    lengths = np.linalg.norm(z - y, axis=1)[:, None] * (1.0 + np.linalg.norm(steps, axis=2))
+    ahead = np.einsum("ijk,ik->ij", steps, z - y)
+    assert np.all(ahead <= max(1e-2 * digits, 1e-11) * lengths)
+
+
 TURNS_OUT_EMPTY = {
     "half-space": lambda a: sets.HalfSpace(0.0 * a * jnp.ones(2), 1.0),
     "hyperplane": lambda a: sets.Hyperplane(0.0 * a * jnp.ones(2), 0.0),

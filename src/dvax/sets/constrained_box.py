@@ -19,8 +19,9 @@ from .abstract import AbstractSet
 
 _DAMPING = 64.0
 """Multiple of eps that is added to the diagonal of the Newton matrix, relative to its largest value."""
-_LINE_SEARCH = 100
-"""Maximum number of points of a line search; bisection alone needs about 60."""
+_LINE_SEARCH = 400
+"""Maximum number of points of a line search. Bisection alone needs about 60, and more for a maximiser
+much nearer than the end of the search."""
 
 
 class ConstrainedBox(AbstractSet):
@@ -108,8 +109,10 @@ class ConstrainedBox(AbstractSet):
         """Return the distances of z − W⁻¹Rᵀμ to both bounds, and for each row its slack, or −|μ| if
         the row is active. An equation never switches: its entry is −1."""
         z, inverse_w, lower, upper, R, low, high = self._data(z, space)
-        y, multiplier, _ = _nearest(z, inverse_w, lower, upper, R, low, high)
+        y, multiplier, _, exact = _nearest(z, inverse_w, lower, upper, R, low, high)
         shifted, sums = z - inverse_w * combine(multiplier, R), times(R, y)
+        # The derivative of the one, the digits of the other.
+        shifted = shifted + lax.stop_gradient(exact - shifted)
         slack = jnp.minimum(high - sums, sums - low)
         of_rows = jnp.where(multiplier == 0, slack, -jnp.abs(multiplier))
         return [shifted - lower, upper - shifted, jnp.where(low == high, -1.0, of_rows)]
@@ -140,9 +143,14 @@ class ConstrainedBox(AbstractSet):
 
 
 class _State(NamedTuple):
-    """Multipliers, y and R y there, the added row (−1: none), and whether the iteration is over."""
+    """Multipliers, z − W⁻¹Rᵀμ, y and R y there, the added row (−1: none), and whether the iteration is
+    over.
+
+    z − W⁻¹Rᵀμ is the sum of all steps. Far from the set it is much smaller than both of its terms, and
+    their difference would not have the digits in which the rows hold."""
 
     multiplier: jax.Array
+    shifted: jax.Array
     y: jax.Array
     sums: jax.Array
     added: jax.Array
@@ -154,8 +162,9 @@ class _State(NamedTuple):
 def _nearest(
     z: jax.Array, inverse_w: jax.Array, lower: jax.Array, upper: jax.Array,
     R: jax.Array, low: jax.Array, high: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:  # fmt: skip
-    """Return (projection, multipliers, 1 for entries at no bound and else 0); NaN if it failed."""
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:  # fmt: skip
+    """Return the projection y, the multipliers μ, 1 for entries at no bound and else 0, and the
+    z − W⁻¹Rᵀμ of which y is the nearest point in the box; y is NaN if the method failed."""
     m, n = R.shape
     width = min(m, n, MAX_ROWS)
     eps = jnp.finfo(z.dtype).eps
@@ -163,9 +172,6 @@ def _nearest(
     is_equation = low == high
     damping = _DAMPING * eps * times(R * R, inverse_w)
     damping = jnp.where(damping > 0, damping, 1.0)
-
-    def clip(multiplier: jax.Array) -> jax.Array:
-        return jnp.clip(z - inverse_w * combine(multiplier, R), lower, upper)
 
     def excess_of(sums: jax.Array) -> jax.Array:
         """Return how far each row lies above `high` (positive) or below `low` (negative)."""
@@ -185,7 +191,15 @@ def _nearest(
         rows = jnp.where(used[:, None], R[chosen], 0.0)
         is_free = (s.y > lower) & (s.y < upper)
         scaled = rows * jnp.where(is_free, inverse_w, 0.0)[None, :]
-        diagonal = jnp.where(used, damping[chosen], 1.0)
+        # Where all entries of a row are at their bounds, the dual function is linear up to the next
+        # piece, however far that is: the step passes the pieces of all entries.
+        rates = jnp.abs(rows * inverse_w[None, :])
+        ahead = jnp.abs(s.shifted - s.y)[None, :] / jnp.where(rates > 0, rates, jnp.inf)
+        is_linear = jnp.sum(jnp.abs(scaled), axis=1) == 0
+        farthest = jnp.where(is_linear, 2.0 * jnp.max(ahead, axis=1, initial=0.0), 0.0)
+        enough = jnp.abs(gap[chosen]) / jnp.where(farthest > 0, farthest, jnp.inf)
+        added = jnp.where(farthest > 0, jnp.minimum(damping[chosen], enough), damping[chosen])
+        diagonal = jnp.where(used, added, 1.0)
         matrix = product(scaled, rows.T) + jnp.diag(diagonal)
         step = solve_constant(matrix, jnp.where(used, gap[chosen], 0.0))
         step = jnp.where(used, step, 0.0)
@@ -195,19 +209,17 @@ def _nearest(
         ratios = jnp.where(towards_zero, -old / jnp.where(towards_zero, step, 1.0), jnp.inf)
         most = jnp.minimum(1.0, jnp.min(ratios))
         direction = combine(step, rows)
+        change = -inverse_w * direction
         slope_bound = jnp.sum(step * (s.sums[chosen] - gap[chosen]))
-        length = _line_search(
-            z - inverse_w * combine(s.multiplier, R), -inverse_w * direction, lower, upper, direction,
-            slope_bound, most, eps,
-        )  # fmt: skip
+        length = _line_search(s.shifted, change, lower, upper, direction, slope_bound, most, eps)
         leaves = towards_zero & (ratios <= length)
         new = jnp.where(leaves, 0.0, old + length * step)
         multiplier = new if width == m else s.multiplier.at[chosen].set(new)
-        return check(multiplier, s.count + 1)
+        return check(multiplier, s.shifted + length * change, s.count + 1)
 
-    def check(multiplier: jax.Array, count: Any) -> _State:
+    def check(multiplier: jax.Array, shifted: jax.Array, count: Any) -> _State:
         """Return the state at these multipliers, with the row to add."""
-        y = clip(multiplier)
+        y = jnp.clip(shifted, lower, upper)
         sums = times(R, y)
         excess, least = excess_of(sums), _tolerance(y, R, low, high)
         gap = jnp.where(multiplier > 0, sums - high, sums - low)
@@ -219,17 +231,17 @@ def _nearest(
         is_violated = violation[row] > 1.0
         added = jnp.where(is_solved & is_violated, row, -1)
         over = (is_solved & ~is_violated) | ~jnp.all(jnp.isfinite(multiplier))
-        return _State(multiplier, y, sums, added, jnp.asarray(count), over)
+        return _State(multiplier, shifted, y, sums, added, jnp.asarray(count), over)
 
     def unfinished(s: _State) -> jax.Array:
         return ~s.over & (s.count < 100 + 10 * m)
 
-    end = lax.while_loop(unfinished, advance, check(jnp.zeros(m, z.dtype), 0))
+    end = lax.while_loop(unfinished, advance, check(jnp.zeros(m, z.dtype), z, 0))
     is_valid = end.over & jnp.all(jnp.isfinite(end.multiplier))
     is_valid &= jnp.all(lower <= upper) & jnp.all(low <= high)
     is_free = (end.y > lower) & (end.y < upper)
     y = jnp.where(is_valid, end.y, jnp.nan)
-    return y, end.multiplier, is_free.astype(z.dtype)
+    return y, end.multiplier, is_free.astype(z.dtype), end.shifted
 
 
 def _largest(priority: jax.Array, width: int) -> Any:
@@ -287,7 +299,7 @@ def _line_search(
 
 def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
     """The derivative of the projection onto the active bounds and rows, which are fixed."""
-    y, multiplier, is_free = _nearest(*primals)
+    y, multiplier, is_free, shifted = _nearest(*primals)
     sums = times(primals[4], y)
     least = _tolerance(y, *primals[4:])
     # A row that holds with equality is active, as in every set.
@@ -297,7 +309,7 @@ def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
     width = min(*primals[4].shape, MAX_ROWS)
     chosen = _largest(is_active.astype(jnp.int32), width)
     active, on_high = is_active[chosen], at_high[chosen]
-    at_lower = primals[0] - primals[1] * combine(multiplier, primals[4]) <= primals[2]
+    at_lower = shifted <= primals[2]
     # Beyond 16 active rows the derivative is not available.
     factor = jnp.where(jnp.sum(is_active) <= width, jnp.ones((), y.dtype), jnp.nan)
 
@@ -315,11 +327,8 @@ def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
         return base - combine(solve(matrix, right), scaled)
 
     dy = jvp_of_moving(project_on_face, primals, tangents)
-    return (y, multiplier, is_free), (
-        factor * dy,
-        jnp.zeros_like(multiplier),
-        jnp.zeros_like(is_free),
-    )
+    constant = multiplier, is_free, shifted
+    return (y, *constant), (factor * dy, *(jnp.zeros_like(v) for v in constant))
 
 
 _nearest.defjvp(_nearest_jvp, symbolic_zeros=True)

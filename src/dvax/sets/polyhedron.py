@@ -1,5 +1,6 @@
 """Polyhedra: linear inequalities and equations."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -113,14 +114,15 @@ def _nearest(
     if the set is empty. `root` is w^{−1/2}: in the coordinates y/root the norm of the space is the
     Euclidean norm.
     """
-    point, rows, bounds, base, scale = _reduce(z, root, G, d, E, e)
+    point, rows, bounds, base, scale, onto_null_space = _reduce(z, root, G, d, E, e)
     if len(e):
         size = jnp.abs(bounds) + jnp.sqrt(jnp.sum(base * base)) / scale
         solvable = has_solution(E, e)
     else:
         size, solvable = jnp.zeros_like(bounds), True
     nearest = dual.nearest_point(rows, bounds, point, size)
-    y = jnp.where(nearest.valid & solvable, nearest.x + base, jnp.nan)
+    # Once more: rounding of a distant point has left the equations by eps|z|.
+    y = jnp.where(nearest.valid & solvable, onto_null_space(nearest.x) + base, jnp.nan)
     # Without active rows, return z itself: scaling there and back has roundoff.
     interior = nearest.valid & ~jnp.any(nearest.active) & (len(e) == 0)
     y = jnp.where(interior, z, y * root)
@@ -129,28 +131,33 @@ def _nearest(
 
 def _reduce(
     z: jax.Array, root: jax.Array, G: jax.Array, d: jax.Array, E: jax.Array, e: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, Any, Any]:
-    """Return (point, rows, bounds, base, scale) with proj_K(z) = root (base + x), where x is the
-    projection of the point onto {x : rows x ≤ bounds}.
+) -> tuple[jax.Array, jax.Array, jax.Array, Any, Any, Callable[[jax.Array], jax.Array]]:
+    """Return (point, rows, bounds, base, scale, onto_null_space) with proj_K(z) = root (base + x), where
+    x is the projection of the point onto {x : rows x ≤ bounds}.
 
-    The rows have length one or zero. Equations restrict x to their null space; `base` is their solution
-    of least norm, and `scale` the length of the rows in the null space.
+    The rows have length one or zero. Equations restrict x to their null space, onto which the last
+    result projects; `base` is their solution of least norm, and `scale` the length of the rows in the
+    null space.
     """
     point, (rows, bounds) = z / root, normalised_conditions(G * root[None, :], d)
     if not len(e):
-        return point, rows, bounds, 0.0, 1.0
+        return point, rows, bounds, 0.0, 1.0, lambda x: x
     equations, values = normalised_conditions(E * root[None, :], e)
     back = pseudoinverse(equations)
     base = times(back, values)
+
+    def onto_null_space(x: jax.Array) -> jax.Array:
+        return x - times(back, times(equations, x))
+
     point = point - base - times(back, times(equations, point) - values)
-    point = point - times(back, times(equations, point))
+    point = onto_null_space(point)
     bounds = bounds - times(rows, base)
-    rows = jax.vmap(lambda row: row - times(back, times(equations, row)))(rows)
+    rows = jax.vmap(onto_null_space)(rows)
     # A row whose projection is shorter than this depends linearly on the equations.
     roundoff = float(jnp.finfo(z.dtype).eps) ** dual.SLACK
     is_long = jnp.sum(rows * rows, axis=1) > roundoff**2
     rows, scale = normalise_rows(jnp.where(is_long[:, None], rows, 0.0))
-    return point, rows, bounds / scale, base, scale
+    return point, rows, bounds / scale, base, scale, onto_null_space
 
 
 def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
@@ -159,7 +166,7 @@ def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
     def project_on_face(z, root, G, d, E, e) -> jax.Array:
         # Inactive rows are set to zero; d may be infinite there.
         G, d = jnp.where(active[:, None] > 0, G, 0.0), jnp.where(active > 0, d, 0.0)
-        point, rows, bounds, base, _ = _reduce(z, root, G, d, E, e)
+        point, rows, bounds, base, _, _ = _reduce(z, root, G, d, E, e)
         back = as_pseudoinverse(lax.stop_gradient(inverse).T, rows)
         # Sums of products: for a batch of tangents, matrix products would be calls of a library.
         excess = jnp.sum(rows * point[None, :], axis=1) - bounds
