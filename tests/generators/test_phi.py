@@ -88,6 +88,20 @@ def test_phi_of_a_matrix_is_the_integral_of_the_matrix_exponential(name):
         np.testing.assert_allclose(found[k], exact, atol=1e-10 * max(scale, 1.0), err_msg=f"φ{k}")
 
 
+@pytest.mark.parametrize("size", [1e8, 1e20, 1e80, 1e300])
+def test_phi_of_a_matrix_of_any_norm_keeps_its_slow_modes(size):
+    """A fast mode of rate −size leaves φₖ(Z) = −Z⁻¹/(k − 1)! there, and drives nothing slow."""
+    slow = np.array([[-0.3, 1.0], [-1.0, 0.2]])
+    Z = np.zeros((3, 3))
+    Z[:2, :2], Z[2, 2] = slow, -size
+    found = [np.asarray(v) for v in jax.jit(lambda z: phi_matrix(z, 3))(jnp.asarray(Z))]
+    expected = [np.asarray(v) for v in phi_matrix(jnp.asarray(slow), 3)]
+    for k in range(4):
+        np.testing.assert_allclose(found[k][:2, :2], expected[k], rtol=1e-13, atol=1e-14)
+        fast = 0.0 if k == 0 else 1.0 / math.factorial(k - 1)
+        assert found[k][2, 2] * size == pytest.approx(fast, abs=1e-6 if size < 1e9 else 1e-12)
+
+
 def test_flow_factors_include_factorials_and_step_size():
     # ∫₀^h e^{(h−s)a} (s/h)^j ds by quadrature, for a = −2, h = 0.3.
     h, a = 0.3, -2.0

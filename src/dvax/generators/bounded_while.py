@@ -18,8 +18,8 @@ def bounded_while(
     """Apply carry ← body(j, carry) for j = 0, …, count − 1, rounded up to a multiple of `block`.
 
     The loop is a tree of loops of the fixed lengths `block` and `widths`, which bound the number of
-    iterations. Subtrees that start beyond `count` are skipped. The reverse pass stores the carry at
-    the start of every block and recomputes the others.
+    iterations. Subtrees that start beyond `count` are skipped. The reverse pass stores the carries of
+    one subtree a level and recomputes the others.
     """
 
     def innermost(start: Any, carry: Any) -> Any:
@@ -37,7 +37,9 @@ def bounded_while(
 
         return outer
 
-    loop, size = jax.checkpoint(innermost), block
+    loop, size = innermost, block
     for width in widths:
-        loop, size = enclose(loop, width, size), size * width
+        # At every level: otherwise the values that a level stores are copied by the one around it,
+        # those of skipped subtrees included.
+        loop, size = enclose(jax.checkpoint(loop), width, size), size * width
     return loop(jnp.asarray(0), carry)

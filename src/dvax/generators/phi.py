@@ -14,7 +14,7 @@ from .bounded_while import bounded_while
 _TERMS = 20  # terms of the Taylor series on |z| < 1: 1/20! is below the roundoff of doubles
 _MAX_ROWS_BY_SUM = 8  # up to this size a library call takes longer than the product itself
 _MAX_ROWS_UNROLLED = 3  # up to this size unrolled sums are faster than a reduction
-_LOOP_DEPTH = 3  # at most 4³ halvings: norms up to 10¹⁹
+_LOOPS = (8, 8, 16)  # lengths of nested loops: at most 255 halvings, for norms up to 10⁷⁶
 
 
 def phi_scalar(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
@@ -61,7 +61,7 @@ def phi_matrix(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
     norm = lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(z), axis=0)))
     halvings = jnp.ceil(jnp.log2(jnp.where(norm > 1.0, norm, 1.0)))
     # The number is clipped: a non-finite Z gives non-finite results anyway.
-    halvings = largest_of_lanes(jnp.clip(halvings, 0, 4**_LOOP_DEPTH - 1).astype(int))
+    halvings = largest_of_lanes(jnp.clip(halvings, 0, math.prod(_LOOPS) - 1).astype(int))
     small = z * jnp.exp2(-halvings.astype(norm.dtype)).astype(z.dtype)
 
     top = max(order, 1)
@@ -87,7 +87,7 @@ def phi_matrix(z: jax.Array, order: int) -> tuple[jax.Array, ...]:
         return _product(E, E) + 2.0 * E, tuple(new)
 
     start = (_product(small, phis[0]), phis)
-    E, phis = bounded_while(halvings, double, start, 1, (4,) * _LOOP_DEPTH)
+    E, phis = bounded_while(halvings, double, start, 1, _LOOPS)
     return (eye + E, *phis)[: order + 1]
 
 
