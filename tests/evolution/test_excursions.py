@@ -123,7 +123,7 @@ def test_dt_max_limits_adaptive_steps():
         dvax.solve(problem, 1.0, 0.0, 1.0, dt_max=-1.0)
 
 
-@pytest.mark.parametrize("method", [None, dvax.ETD2RK()])
+@pytest.mark.parametrize("method", mostly_thorough([None, dvax.ETD2RK()], [None]))
 def test_single_precision_state_beside_a_moving_set_of_double_precision(method):
     # The center 0.0 of the ball is a double, and the guard bounds the changes of h and K together.
     problem = dvax.Problem(

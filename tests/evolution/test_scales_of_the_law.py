@@ -69,9 +69,7 @@ def solve(name, seed, size=1.0, rtol=1e-6, t1=2.0, atol=1e-9, unit=None):
     return np.asarray(sol.xs[-1]) / size, sol
 
 
-@pytest.mark.parametrize(
-    "name", mostly_thorough(SETS, {"box", "simplex", "polyhedron", "constrained box"})
-)
+@pytest.mark.parametrize("name", mostly_thorough(SETS, {"polyhedron", "constrained box"}))
 def test_solution_does_not_depend_on_units(name):
     x, sol = solve(name, 0)
     for size, unit in ((1e-6, 1e-6), (1e6, 1e6), (1.0, 1e-6), (1e6, 1e-3), (1e-3, 1e5)):
@@ -102,7 +100,7 @@ OPTIONS = {"fixed": {"dt": 0.1}, "order 5": {"dt": 0.1, "method": dvax.DormandPr
     ("rate", "options"),
     mostly_thorough(
         [(rate, options) for rate in RATES for options in OPTIONS],
-        {("zero", "fixed"), ("independent", "none")},
+        {("independent", "none")},
     ),
 )
 def test_law_is_solved_if_the_state_is_zero_or_does_not_depend_on_the_response(rate, options):

@@ -135,7 +135,7 @@ def test_elliptic_growth_bound_holds_and_is_sharp(shape, boundary):
         assert np.linalg.norm(moved, 2) <= M * np.exp(omega * t) * (1 + 1e-12)
 
 
-@pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(GRIDS, GRIDS[:5:4]))
+@pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(GRIDS, GRIDS[4:5]))
 def test_elliptic_step_stays_within_its_curvature_bound(shape, boundary):
     A, _, _ = operator(shape, boundary)
     x0, c0, c1 = jnp.asarray(np.random.default_rng(4).normal(size=(3, *shape)))

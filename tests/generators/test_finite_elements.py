@@ -8,6 +8,7 @@ import scipy.linalg
 import scipy.sparse
 from jax.experimental.sparse import BCOO
 from scipy.spatial import Delaunay
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax import generators, spaces
@@ -62,7 +63,7 @@ MESHES = {
 semigroup = jax.jit(lambda A, h, v: A.semigroup(h, v))
 
 
-@pytest.mark.parametrize("name", MESHES)
+@pytest.mark.parametrize("name", mostly_thorough(MESHES, list(MESHES)[:1]))
 def test_finite_elements_semigroup_is_that_of_the_pencil(name):
     M, S, interval = MESHES[name]
     A = generators.FiniteElements(M, S, interval, dissipative=True)

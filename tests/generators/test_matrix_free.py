@@ -94,7 +94,7 @@ def supports(A, w):
         yield theta, np.linalg.eigvalsh((turned + turned.conj().T) / 2)[-1]
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", mostly_thorough(range(20), range(8)))
 def test_sparse_numerical_range_lies_in_rectangle_and_ellipse(seed):
     rng = np.random.default_rng(seed)
     n = 12
@@ -421,7 +421,7 @@ def expm_step(A, h, x0, c0):
 CASES = [(which, h) for which in [(0,), (1,), (0, 1), (2,), (0, 1, 2)] for h in (0.05, 3.0)]
 
 
-@pytest.mark.parametrize(("which", "h"), mostly_thorough(CASES, {((0, 1), 3.0), ((2,), 0.05)}))
+@pytest.mark.parametrize(("which", "h"), mostly_thorough(CASES, {((0, 1), 3.0)}))
 def test_sparse_derivatives_of_the_flow_in_any_of_its_inputs(which, h):
     rng = np.random.default_rng(7)
     matrix = np.triu(np.tril(rng.normal(size=(5, 5)), 1), -1) + 2.0 * np.eye(5)

@@ -27,6 +27,7 @@ from benchmarks.cases.published_earthquake import (
 from benchmarks.peers.opensees import OpenSees, python
 from benchmarks.switching import _Separated
 from benchmarks.yielding_frames import exact, oscillator
+from tests.selection import mostly_thorough
 
 import dvax
 from dvax.models import Accelerogram, Frame
@@ -99,7 +100,7 @@ def check_bound(frame, samples, tau):
     return made
 
 
-@pytest.mark.parametrize("tau", [1e-5, 1e-9])
+@pytest.mark.parametrize("tau", mostly_thorough([1e-5, 1e-9], [1e-9]))
 def test_bound_of_a_hardening_frame_holds(tau):
     check_bound(three_storeys(), PULSE, tau)
 

@@ -168,9 +168,12 @@ FAR_AWAY = {
     "an equation": (
         sets.ConstrainedBox(0.0, 0.2, np.ones((1, 6)), np.full(1, 0.5), np.full(1, 0.5)), 1e60, 1e-11,
     ),
-    "three rows": (sets.ConstrainedBox(-1.0, 1.0, ROWS, np.full(3, -0.5), np.full(3, 0.3)), 1e12, 1e-10),
+    "three rows": (
+        sets.ConstrainedBox(-1.0, 1.0, ROWS, np.full(3, -0.5), np.full(3, 0.3)), 1e12, 1e-10,
+    ),
     "half-open": (
-        sets.ConstrainedBox(0.0, np.inf, np.abs(ROWS[:2]), np.full(2, -np.inf), np.ones(2)), 1e12, 1e-10,
+        sets.ConstrainedBox(0.0, np.inf, np.abs(ROWS[:2]), np.full(2, -np.inf), np.ones(2)),
+        1e12, 1e-10,
     ),
     "polyhedron": (sets.Polyhedron(SIDES, np.append(np.ones(12), 1.0)), 1e18, 1e-13),
     "equations": (

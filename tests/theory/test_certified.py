@@ -18,7 +18,7 @@ CASES = [
     for tol in tols
 ]  # fmt: skip
 OFTEN = {
-    ("C1", "ETD2RK", 1e-5), ("C4", "ETD4RK", 1e-3),
+    ("C4", "ETD4RK", 1e-3),
 }  # fmt: skip
 
 

@@ -78,7 +78,7 @@ def _hold(made, c):
 OFTEN = [0, 2, 4, *range(1, 23, 2)]
 
 
-@pytest.mark.parametrize("seed", mostly_thorough(OFTEN, [0, 1, 3, 5]))
+@pytest.mark.parametrize("seed", mostly_thorough(OFTEN, [0, 3]))
 def test_verify_is_correct_on_a_generated_system(seed):
     _check(seed)
 

@@ -34,8 +34,8 @@ _NEARER = 1.0 + 1e-6
 
 
 class _Cycle(NamedTuple):
-    """x, the qₖ, the duality gap, the largest distance of a yₖ from x, the roundoff of the gap, whether x
-    is the projection, and the number of cycles."""
+    """x, the qₖ, the duality gap, the largest distance of a yₖ from x, the roundoff of the gap, whether
+    x is the projection, and the number of cycles."""
 
     x: Tree
     q: tuple
@@ -47,8 +47,8 @@ class _Cycle(NamedTuple):
 
 
 class _Round(NamedTuple):
-    """The last cycle, the change of the qₖ in the last round, D(q), and by how many such changes the next
-    round starts ahead."""
+    """The last cycle, the change of the qₖ in the last round, D(q), and by how many such changes the
+    next round starts ahead."""
 
     at: _Cycle
     change: tuple

@@ -132,8 +132,8 @@ def _nearest(
 def _reduce(
     z: jax.Array, root: jax.Array, G: jax.Array, d: jax.Array, E: jax.Array, e: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, Any, Any, Callable[[jax.Array], jax.Array]]:
-    """Return (point, rows, bounds, base, scale, onto_null_space) with proj_K(z) = root (base + x), where
-    x is the projection of the point onto {x : rows x ≤ bounds}.
+    """Return (point, rows, bounds, base, scale, onto_null_space) with proj_K(z) = root (base + x),
+    where x is the projection of the point onto {x : rows x ≤ bounds}.
 
     The rows have length one or zero. Equations restrict x to their null space, onto which the last
     result projects; `base` is their solution of least norm, and `scale` the length of the rows in the
