@@ -92,4 +92,10 @@ def test_region_of_u_that_excludes_responses_bounds_only_up_to_them():
     sol = dvax.solve(problem, x0, 0.0, 1.0, ts=jnp.linspace(0.0, 1.0, 5), rtol=1e-8)
     check = dvax.verify(problem, x0, 0.0, 1.0, x=(-0.5, 3.0), u=(0.0, 0.9))
     bound = dvax.bound_error(problem, sol, check.constants)
-    assert np.isinf(bound.x[1:]).all() and "∞ from t = 0.25 on" in repr(bound)
+    assert np.isinf(bound.x[1:]).all()
+    reason = (
+        "∞ from t = 0.25 on: the region of the constants may be left after t = 0; up to t = 0.25, u"
+    )
+    assert reason in repr(bound) and "limits are -inf and 0.9" in bound.why
+    free = dvax.bound_error(problem, sol, dvax.verify(problem, x0).constants, initial_error=1e308)
+    assert np.isinf(free.x[-1]) and "larger than any number" in repr(free)

@@ -33,6 +33,7 @@ from ..evolution.solve import run_again
 from ..generators import AbstractGenerator, AbstractMatrixFree, Product
 from ..problem import Problem
 from .constants import Constants
+from .domain import Domain
 from .status import Status, weakest
 
 
@@ -43,6 +44,7 @@ class Bound(eqx.Module):
     - `x_paper`, `u_paper`: with the paper's rate ω + ML̃;
     - `x_sharp`, `u_sharp`: with the one-sided constant μ or the rate of an energy norm, whichever is
       smaller; None if neither is known;
+    - `why`: the reason for which the bound is infinite from some time on, or empty;
     - `integrals`, (m, k): the Gronwall estimates of the k rates over their factors M, with which a run
       that goes on starts; None if the problem was solved again;
     - `status`: the weakest status among the quantities in the bound. "proved" means that the constants
@@ -77,6 +79,7 @@ class Bound(eqx.Module):
     u_sharp: jax.Array | None
     status: Status = eqx.field(static=True)
     integrals: jax.Array | None = None
+    why: str = eqx.field(static=True, default="")
 
     def __repr__(self) -> str:
         about = {"x": "‖x_h − x‖", "u": "‖u_h − u‖"}
@@ -87,8 +90,7 @@ class Bound(eqx.Module):
         infinite = np.isinf(np.asarray(self.x)) if is_known(self.x) else np.zeros(0, bool)
         if infinite.any():
             first = float(np.asarray(self.ts)[np.argmax(infinite)])
-            why = "the region of the constants may be left, or the growth overflows"
-            rows.append(("", f"∞ from t = {first:.6g} on: {why}"))
+            rows.append(("", f"∞ from t = {first:.6g} on{f': {self.why}' if self.why else ''}"))
         return table(f"Bound: {self.status}", [("ts", value_text(self.ts)), *rows])
 
     def to_xarray(self, *, time_unit: str = "", x_unit: str = "", u_unit: str = "") -> Any:
@@ -193,7 +195,7 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
     best_x = x if x_sharp is None else jnp.minimum(x, x_sharp)
     best_u = u if u_sharp is None else jnp.minimum(u, u_sharp)
     domain_status: Status = "proved"
-    inside = jnp.ones(sol.ts.shape, bool)
+    inside, why = jnp.ones(sol.ts.shape, bool), ""
     if domain is not None:
         setting = sol.setup.setting
         covered = domain.covers(setting["t0"], setting["t1"]) and domain.has_args(sol.setup.args)
@@ -203,7 +205,9 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
             largest_x = _bound_since_previous_time(constants, t0, sol.ts, defects, initial)
             largest_u = constants.L * largest_x + _law_error(constants, *law)
             spaces = problem.spaces(sol.setup.x0)
-            inside = domain.contains(*measured.bounds, largest_x, largest_u, spaces)
+            values = (*measured.bounds, largest_x, largest_u, spaces)
+            inside = domain.contains(*values)
+            why = _exit(domain, sol.ts, inside, values)
     status = weakest(
         constants.status_of(*(name for name, _ in constants.statuses)),
         "proved" if measured.enclosed else "estimated",
@@ -216,8 +220,24 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
 
     return Bound(
         sol.ts, valid(best_x), valid(best_u), valid(x), valid(u), valid(x_sharp), valid(u_sharp),
-        status, valid(integrals) if measured is sol else None,
+        status, valid(integrals) if measured is sol else None, why or _overflow(best_x),
     )  # fmt: skip
+
+
+def _exit(domain: Domain, ts: jax.Array, inside: jax.Array, values: tuple) -> str:
+    """Return where the region may be left, as text; empty if it is not, or under tracing."""
+    if not _tree.is_concrete(inside, values) or bool(jnp.all(inside)):
+        return ""
+    k = int(np.argmin(np.asarray(inside)))
+    before = f" after t = {float(ts[k - 1]):.6g}" if k else ""
+    where = domain.exit_at(k, *values)
+    return f"the region of the constants may be left{before}; up to t = {float(ts[k]):.6g}, {where}"
+
+
+def _overflow(x: jax.Array) -> str:
+    if not _tree.is_concrete(x) or bool(jnp.all(jnp.isfinite(x))):
+        return ""
+    return "the bound on the growth of errors is larger than any number"
 
 
 @eqx.filter_jit

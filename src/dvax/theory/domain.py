@@ -1,5 +1,6 @@
 """The validity of constants: an interval of time, one value of `args`, and bounds on x and u."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -75,8 +76,44 @@ class Domain(eqx.Module):
         inside = jnp.ones(x_error.shape, bool)
         for values, error, ends, space in zip((x, u), (x_error, u_error), (self.x, self.u), spaces):
             if ends is not None:
-                inside = inside & _inside(*values, error, ends, space)
+                entries = (entry for _, entry in _excesses(*values, error, ends, space))
+                inside = inside & jnp.all(jnp.concatenate(list(entries), axis=1) <= 0, axis=1)
         return jnp.cumsum(~inside) == 0
+
+    def exit_at(
+        self,
+        k: int,
+        x: tuple[Tree, Tree],
+        u: tuple[Tree, Tree],
+        x_error: jax.Array,
+        u_error: jax.Array,
+        spaces: tuple[AbstractSpace, ...],
+    ) -> str:
+        """Return which entry may leave the domain by the most before the k-th saved time, as text.
+
+        The arguments are those of `contains`, with known values."""
+        found = []
+        data = zip("xu", (x, u), (x_error, u_error), (self.x, self.u), spaces)
+        for name, values, error, ends, space in data:
+            if ends is None:
+                continue
+            for place, entry in _excesses(*values, error, ends, space):
+                largest = np.asarray(entry[k])
+                at = int(np.argmax(np.where(np.isnan(largest), np.inf, largest)))
+                least, most, low, high = (
+                    np.asarray(leaf).reshape(-1)[at]
+                    for leaf in (
+                        *(jtu.tree_leaves(v)[place][k] for v in values),
+                        *(jtu.tree_leaves(end)[place] for end in ends),
+                    )
+                )
+                text = (
+                    f"{name}{_entry(values[0], place, at)} is computed within [{least:.6g}, "
+                    f"{most:.6g}] with an error of norm ≤ {float(error[k]):.3g}, and its limits are "
+                    f"{low:.6g} and {high:.6g}"
+                )
+                found.append((largest[at], text))
+        return max(found)[1]
 
 
 def _numbers_and_rest(args: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
@@ -87,17 +124,23 @@ def _numbers_and_rest(args: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     return numbers, (structure, others)
 
 
-def _inside(
+def _entry(rows: Tree, place: int, at: int) -> str:
+    """Return the place of an entry of one leaf, such as [3], of a tree with one row a saved time."""
+    path, leaf = jtu.tree_flatten_with_path(rows)[0][place]
+    index = np.unravel_index(at, leaf.shape[1:])
+    return jtu.keystr(path) + (f"[{', '.join(map(str, index))}]" if index else "")
+
+
+def _excesses(
     lows: Tree, highs: Tree, bound: jax.Array, ends: tuple[Tree, Tree], space: AbstractSpace
-) -> jax.Array:
-    """Return whether all values in [lows, highs] with errors of norm ≤ `bound` lie between `ends`."""
-    all_inside = jnp.ones(bound.shape, bool)
+) -> Iterator[tuple[int, jax.Array]]:
+    """Yield, for every leaf, its number and by how much each entry may lie outside of `ends`, for
+    values in [lows, highs] with errors of norm ≤ `bound`: one row a saved time."""
     weights = jtu.tree_map(
         lambda leaf, w: np.broadcast_to(w, leaf.shape[1:]), lows, space.weights()
     )
     leaves = map(jtu.tree_leaves, (lows, highs, weights, *ends))
-    for least, most, w, low, high in zip(*leaves, strict=True):
+    for place, (least, most, w, low, high) in enumerate(zip(*leaves, strict=True)):
         reach = bound.reshape(-1, *(1,) * (least.ndim - 1)) / jnp.sqrt(w)[None]
-        inside = (least - reach >= low[None]) & (most + reach <= high[None])
-        all_inside = all_inside & jnp.all(inside.reshape(len(bound), -1), axis=1)
-    return all_inside
+        outside = jnp.maximum(low[None] - (least - reach), most + reach - high[None])
+        yield place, outside.reshape(len(bound), -1)
