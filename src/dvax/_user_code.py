@@ -252,7 +252,7 @@ def _reason(
     fix = "Fix that line"
     if "u" in inputs:
         fix += (
-            "; if u has another shape, pass it to dvax.Problem: "
+            ", or x0, from which x has its shape; if u has another shape, pass it to dvax.Problem: "
             "control_space=dvax.spaces.Euclidean(()) for a single number, Euclidean(3) for a vector "
             "of 3"
         )
