@@ -29,6 +29,8 @@ _AHEAD, _SHORTER, _SHORTEST = 2.0, 4.0, 0.01
 nothing, and 0 below the last."""
 _NOISE = 8.0
 """Multiple of the roundoff of D that counts as no growth."""
+_MOST_ROUNDOFF = 16.0
+"""Multiple of the tolerance up to which the roundoff of the yₖ leaves a solution credible."""
 _NEARER = 1.0 + 1e-6
 """Ratio of two distances that counts as no growth."""
 
@@ -178,11 +180,13 @@ class Intersection(AbstractSet):
             size = space.norm(_tree.sub(z, x)) + space.norm(x)
             tol = self._tolerance(size)
             apart = jnp.max(jnp.stack(distances))
-            # The roundoff of the gap is eps times the norms of the qₖ.
+            # The roundoff of the yₖ is that of the qₖ. If K is empty, the qₖ grow until it hides how far
+            # the yₖ are apart.
             norms = jnp.stack([space.norm(qk) for qk in new_q])
-            roundoff = jnp.finfo(size.dtype).eps * jnp.sum(norms) * size
-            converged = (apart <= tol) & (gap <= tol * tol + 4.0 * roundoff)
-            return _Cycle(x, tuple(new_q), gap, apart, roundoff, converged, last.count + 1)
+            roundoff = jnp.finfo(size.dtype).eps * jnp.sum(norms)
+            converged = (apart <= tol) & (gap <= tol * tol + 4.0 * roundoff * size)
+            converged &= roundoff <= _MOST_ROUNDOFF * tol
+            return _Cycle(x, tuple(new_q), gap, apart, roundoff * size, converged, last.count + 1)
 
         def advance(state: _Round) -> _Round:
             start_q = jtu.tree_map(lambda a, b: a + state.ahead * b, state.at.q, state.change)
