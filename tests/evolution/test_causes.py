@@ -96,6 +96,36 @@ def test_cause_fast_growth_ends_the_run_where_the_norm_overflows(A):
     error = failure(make(lambda t, x, u, args: u, A=A), x0=jnp.ones(4), t1=10.0, rtol=1e-3)
     assert "exponential growth" in error.cause and "Check the signs in A" in str(error)
     assert float(error.solution.stats["t"]) < 0.5
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("rate", [3.0, 10.0, 60.0])
+@pytest.mark.parametrize(
+    "K",
+    [
+        sets.Box(0.0, 0.2),
+        sets.Simplex(0.5),
+        sets.ConstrainedBox(0.0, 0.2, np.ones((1, 4)), np.zeros(1), np.full(1, 0.5)),
+        sets.Polyhedron(
+            np.vstack([np.eye(4), -np.eye(4)]), np.append(np.full(4, 0.2), np.zeros(4))
+        ),
+    ],
+    ids=["box", "simplex", "constrained box", "polyhedron"],
+)
+def test_cause_growth_that_makes_a_run_stiff_is_named(K, rate):
+    """An epidemic whose infected recover at a rate of the wrong sign: the susceptible decay at a rate
+    that grows with the infected, to 10¹⁰⁰ times the scale of K and of the susceptible."""
+
+    def f(t, x, u, args):
+        infections = 0.4 * x[:4] * jnp.mean(x[4:])
+        return jnp.concatenate([-infections - u * x[:4], infections + rate * x[4:]])
+
+    problem = make(
+        f, lambda t, x, u, args: 4.0 * x[4:] - 0.5 * u, K, control_space=dvax.spaces.Euclidean(4)
+    )
+    x0 = jnp.concatenate([jnp.ones(4), jnp.array([0.05, 0.01, 0.01, 0.01])])
+    error = failure(problem, x0=x0, t1=400.0 / rate)
+    assert "exponential growth" in error.cause and "Check the signs in A" in str(error)
     error = failure(
         make(lambda t, x, u, args: t - x), x0=1.0, t1=50.0, max_steps=9, method=dvax.ETD2RK()
     )

@@ -18,8 +18,6 @@ from .abstract import AbstractSet
 
 _MAX_DENSE_SIZE = 512
 """Number of unknowns up to which the derivative uses a dense pseudoinverse; beyond, CG."""
-
-
 _FIRST_ROUND, _ROUND = 64, 8
 """Number of cycles in the first round, which ends with the solution near K, and in every other."""
 _STRAIGHT = 0.9
@@ -180,8 +178,8 @@ class Intersection(AbstractSet):
             size = space.norm(_tree.sub(z, x)) + space.norm(x)
             tol = self._tolerance(size)
             apart = jnp.max(jnp.stack(distances))
-            # The roundoff of the yₖ is that of the qₖ. If K is empty, the qₖ grow until it hides how far
-            # the yₖ are apart.
+            # The roundoff of the yₖ is that of the qₖ. If K is empty, the qₖ grow until it hides how
+            # far the yₖ are apart.
             norms = jnp.stack([space.norm(qk) for qk in new_q])
             roundoff = jnp.finfo(size.dtype).eps * jnp.sum(norms)
             converged = (apart <= tol) & (gap <= tol * tol + 4.0 * roundoff * size)
