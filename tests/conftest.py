@@ -28,6 +28,8 @@ gc.set_threshold(100_000, 50, 50)
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.03")
 os.environ.setdefault("MPLBACKEND", "Agg")
+# Programs without the places in the source where their operations come from are lowered sooner.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 # `make thorough` tests what users run, and more of it in its time.
 if os.environ.get("HYPOTHESIS_PROFILE") != "thorough":
     # XLA's older emitters compile in two thirds of the time, and LLVM without optimisation in a fifth
