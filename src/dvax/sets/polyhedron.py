@@ -25,6 +25,9 @@ from .affine import (
     normalised_conditions,
 )
 
+_ROUNDINGS = 8.0
+"""Violation of the equations, in roundings of the point, that a projection leaves uncorrected."""
+
 
 class Polyhedron(AbstractSet):
     """K = {y : G y ≤ d, E y = e}, with plain sums (G y)ₖ = Σᵢ Gₖᵢ yᵢ whatever the space's weights.
@@ -116,17 +119,27 @@ def _nearest(
     """
     point, rows, bounds, base, scale, onto_null_space = _reduce(z, root, G, d, E, e)
     if len(e):
-        size = jnp.abs(bounds) + jnp.sqrt(jnp.sum(base * base)) / scale
+        size = jnp.abs(bounds) + _length(base) / scale
         solvable = has_solution(E, e)
     else:
         size, solvable = jnp.zeros_like(bounds), True
     nearest = dual.nearest_point(rows, bounds, point, size)
-    # Once more: rounding of a distant point has left the equations by eps|z|.
-    y = jnp.where(nearest.valid & solvable, onto_null_space(nearest.x) + base, jnp.nan)
+    x = nearest.x
+    if len(e):
+        # Rounding of a distant point leaves the equations by eps|z|. A correction that is not needed
+        # would leave the inequalities instead, by a rounding of x.
+        corrected = onto_null_space(x)
+        rounding = _ROUNDINGS * jnp.finfo(z.dtype).eps * (_length(x) + _length(base))
+        x = jnp.where(_length(corrected - x) > rounding, corrected, x)
+    y = jnp.where(nearest.valid & solvable, x + base, jnp.nan)
     # Without active rows, return z itself: scaling there and back has roundoff.
     interior = nearest.valid & ~jnp.any(nearest.active) & (len(e) == 0)
     y = jnp.where(interior, z, y * root)
     return y, nearest.active.astype(z.dtype), nearest.multiplier, nearest.dual
+
+
+def _length(x: jax.Array) -> jax.Array:
+    return jnp.sqrt(jnp.sum(jnp.square(x)))
 
 
 def _reduce(
