@@ -11,7 +11,9 @@ import pytest
 from tests.oracles import affine_box_vi
 
 import dvax
+from dvax.sets import Ball, Simplex
 from dvax.vi import (
+    RESULTS,
     Extragradient,
     ForwardBackwardForward,
     Projection,
@@ -183,3 +185,13 @@ def test_contraction_factor_bounds_the_iterations_of_the_solver(name):
     allowed = np.log(1e10) / -np.log(float(solver.contraction(gamma, L)))
     print(f"{name}: {counts[1] - counts[0]} iterations for ten digits, {allowed:.0f} allowed")
     assert 10 < counts[1] - counts[0] <= allowed + 1
+
+
+@pytest.mark.parametrize("drive", [0.1, 5.0])
+@pytest.mark.parametrize("K", [Ball(0.0, 1.0), Simplex(1.0)], ids=["ball", "simplex"])
+def test_formula_on_any_set_has_a_certificate(K, drive):
+    """F(y) = y − c is solved by a projection, which has no ‖w‖ of its own."""
+    vi = dvax.solve_vi(lambda y, args: y - args, K, jnp.zeros(3), jnp.full(3, drive), gamma=1.0)
+    exact = K.project(jnp.full(3, drive), dvax.spaces.Euclidean(3))
+    assert vi.solver == "ClosedForm" and vi.result == RESULTS.successful
+    assert float(jnp.linalg.norm(vi.y - exact)) <= float(vi.error_bound) <= 1e-12

@@ -179,6 +179,8 @@ def _solve_and_certify(
         projected = certify(vi.F, vi.K, space, y, step)
         projected_rounding, _ = rounding_of(vi, projected.y, step, projected.norm)
         residual = jnp.where(answer.residual > 0, answer.residual, jnp.inf)
+        # A formula has no step of its own, and so no rounding of a certificate.
+        rounding = jnp.where(jnp.isfinite(residual), rounding, jnp.inf)
         smaller = projected.norm + projected_rounding < residual + rounding
         residual = jnp.where(smaller, projected.norm, residual)
         rounding = jnp.where(smaller, projected_rounding, rounding)
