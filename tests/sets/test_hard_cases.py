@@ -186,6 +186,9 @@ FAR_AWAY = {
     "intersection": (
         sets.Intersection(sets.Box(-1.0, 1.0), sets.HalfSpace(np.ones(6), 1.0)), 1e6, 1e-3,
     ),
+    "two balls": (
+        sets.Intersection(sets.Ball(0.0, 1.0), sets.Ball(np.eye(6)[0] * 1.5, 1.0)), 1e5, 1e-4,
+    ),
     "ball and half-space": (
         sets.Intersection(sets.Ball(0.0, 1.0), sets.HalfSpace(np.ones(6), 0.5)), 1e6, 1e-3,
     ),

@@ -22,7 +22,7 @@ _FIRST_ROUND, _ROUND = 64, 8
 """Number of cycles in the first round, which ends with the solution near K, and in every other."""
 _STRAIGHT = 0.9
 """Cosine of the angle between the changes of two rounds from which the next one starts ahead."""
-_AHEAD, _SHORTER, _SHORTEST = 2.0, 4.0, 0.01
+_AHEAD, _SHORTER, _SHORTEST = 2.0, 16.0, 0.2
 """By how many changes a round starts ahead: the first number, less by a factor where a round counts for
 nothing, and 0 below the last."""
 _NOISE = 8.0
@@ -68,8 +68,8 @@ class Intersection(AbstractSet):
     converged after `max_cycles`, in particular if K is empty, the result is NaN. The method converges
     linearly for polyhedral sets and slowly for curved sets that touch; use `Polyhedron` for many
     linear conditions. Far from K, where z is many times the size of K away, the changes of q are
-    extrapolated. The result has the digits that `tol` leaves of ‖z − x‖: at a distance of 10⁷ sizes
-    of K, four of x; farther away it may be NaN.
+    extrapolated. The result has the digits that `tol` leaves of ‖z − x‖: at a distance of 10⁵ sizes
+    of K, six of x; farther away it may be NaN.
 
     The derivative follows from these conditions by the implicit function theorem.
 
