@@ -173,8 +173,7 @@ class Intersection(AbstractSet):
                 ys.append(x)
             differences = [_tree.sub(y, x) for y in ys]
             distances = [space.norm(difference) for difference in differences]
-            pairs = zip(new_q, differences, strict=True)
-            gap = sum(space.inner(qk, d) for qk, d in pairs)
+            gap = _inner(space, tuple(new_q), tuple(differences))
             size = space.norm(_tree.sub(z, x)) + space.norm(x)
             tol = self._tolerance(size)
             apart = jnp.max(jnp.stack(distances))

@@ -205,7 +205,8 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
             largest_x = _bound_since_previous_time(constants, t0, sol.ts, defects, initial)
             largest_u = constants.L * largest_x + _law_error(constants, *law)
             spaces = problem.spaces(sol.setup.x0)
-            values = (*measured.bounds, largest_x, largest_u, spaces)
+            ranges_x, ranges_u = measured.bounds
+            values = ranges_x, ranges_u, largest_x, largest_u, spaces
             inside = domain.contains(*values)
             why = _exit(domain, sol.ts, inside, values)
     status = weakest(

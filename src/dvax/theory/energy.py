@@ -96,10 +96,11 @@ class _Data(NamedTuple):
 
 def _data(system: System, J: Jacobians, pointwise: bool) -> _Data | str:
     """Return the matrices, or why there are none."""
-    blocks = dict(zip(_DERIVATIVES, J)) | {"A": system.A, "P": system.P}
-    unknown = [name for name, b in blocks.items() if b is None]
-    if unknown:
-        return f"no matrix is known for {', '.join(unknown)}"
+    names = (*_DERIVATIVES, "A", "P")
+    found = dict(zip(names, (J.f_x, J.f_u, J.h_x, J.h_u, system.A, system.P)))
+    blocks = {name: block for name, block in found.items() if block is not None}
+    if len(blocks) < len(found):
+        return f"no matrix is known for {', '.join(name for name in found if name not in blocks)}"
     moving = [name for name in _DERIVATIVES if not blocks[name].exact]
     if moving:
         return f"the derivatives {', '.join(moving)} are not proved constant"
@@ -107,7 +108,7 @@ def _data(system: System, J: Jacobians, pointwise: bool) -> _Data | str:
         return "A and P are not known exactly as matrices"
     too_large = f"x and u have more than {MAX_UNKNOWNS} unknowns together"
     try:
-        f_x, f_u, h_x, h_u, A, P = (as_one_matrix(b).center[0] for b in blocks.values())
+        f_x, f_u, h_x, h_u, A, P = (as_one_matrix(block).center[0] for block in blocks.values())
     except TooLarge:
         return too_large
     if len(A) + len(P) > MAX_UNKNOWNS:
