@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -232,12 +233,13 @@ class _Reached:
         """Return arrays and facts; of the bound its last row."""
         assert isinstance(self.error, Bound)
         bound = {f.name: getattr(self.error, f.name) for f in fields(self.error)}
-        rows = {name: v for name, v in bound.items() if name != "status" and v is not None}
+        rows = {name: v for name, v in bound.items() if isinstance(v, jax.Array | np.ndarray)}
         main, other = self.main, self.other
         arrays = [main.x, other.x, self.defect, *(np.asarray(v)[-1:] for v in rows.values())]
         about = {
             "dt": [None if p.dt is None else float(p.dt) for p in (main, other)],
             "apart": self.apart, "bound": list(rows), "bound_status": self.error.status,
+            "why": self.error.why,
             "frames": self.frames, "steps": self.steps, "rejected": self.rejected,
             "method": self.method, "status": self.status,
         }  # fmt: skip
@@ -251,6 +253,7 @@ class _Reached:
         bound |= zip(about["bound"], map(jnp.asarray, rows), strict=True)
         return _Reached(
             _Piece(main, about["dt"][0]), _Piece(other, about["dt"][1]), float(about["apart"]),
-            Bound(**bound | {"status": about["bound_status"]}), defect[()], about["frames"],
-            about["steps"], about["rejected"], about["method"], about["status"], about["files"],
+            Bound(**bound | {"status": about["bound_status"], "why": about.get("why", "")}), defect[()],
+            about["frames"], about["steps"], about["rejected"], about["method"], about["status"],
+            about["files"],
         )  # fmt: skip
