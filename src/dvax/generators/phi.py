@@ -14,7 +14,7 @@ from .bounded_while import bounded_while
 _TERMS = 20  # terms of the Taylor series on |z| < 1: 1/20! is below the roundoff of doubles
 _MAX_ROWS_BY_SUM = 8  # up to this size a library call takes longer than the product itself
 _MAX_ROWS_UNROLLED = 3  # up to this size unrolled sums are faster than a reduction
-_LOOPS = (8, 8, 16)  # lengths of nested loops: at most 255 halvings, for norms up to 10⁷⁶
+_LOOPS = (8, 8, 16)  # lengths of nested loops: at most 1023 halvings, for norms up to 10³⁰⁷
 
 
 def phi_scalar(z: jax.Array, order: int) -> tuple[jax.Array, ...]:

@@ -111,7 +111,7 @@ class ConstrainedBox(AbstractSet):
         z, inverse_w, lower, upper, R, low, high = self._data(z, space)
         y, multiplier, _, exact = _nearest(z, inverse_w, lower, upper, R, low, high)
         shifted, sums = z - inverse_w * combine(multiplier, R), times(R, y)
-        # The derivative of the one, the digits of the other.
+        # The derivative of the difference, with the value to which the steps have summed.
         shifted = shifted + lax.stop_gradient(exact - shifted)
         slack = jnp.minimum(high - sums, sums - low)
         of_rows = jnp.where(multiplier == 0, slack, -jnp.abs(multiplier))
@@ -198,8 +198,8 @@ def _nearest(
         is_linear = jnp.sum(jnp.abs(scaled), axis=1) == 0
         farthest = jnp.where(is_linear, 2.0 * jnp.max(ahead, axis=1, initial=0.0), 0.0)
         enough = jnp.abs(gap[chosen]) / jnp.where(farthest > 0, farthest, jnp.inf)
-        added = jnp.where(farthest > 0, jnp.minimum(damping[chosen], enough), damping[chosen])
-        diagonal = jnp.where(used, added, 1.0)
+        least_slope = jnp.where(farthest > 0, jnp.minimum(damping[chosen], enough), damping[chosen])
+        diagonal = jnp.where(used, least_slope, 1.0)
         matrix = product(scaled, rows.T) + jnp.diag(diagonal)
         step = solve_constant(matrix, jnp.where(used, gap[chosen], 0.0))
         step = jnp.where(used, step, 0.0)

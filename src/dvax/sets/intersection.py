@@ -23,8 +23,8 @@ _FIRST_ROUND, _ROUND = 64, 8
 _STRAIGHT = 0.9
 """Cosine of the angle between the changes of two rounds from which the next one starts ahead."""
 _AHEAD, _SHORTER, _SHORTEST = 2.0, 16.0, 0.2
-"""By how many changes a round starts ahead: the first number, less by a factor where a round counts for
-nothing, and 0 below the last."""
+"""By how many changes a round starts ahead: the first number, divided by the second where a round is
+discarded, and 0 from the last one down."""
 _NOISE = 8.0
 """Multiple of the roundoff of D that counts as no growth."""
 _MOST_ROUNDOFF = 16.0
@@ -160,8 +160,8 @@ class Intersection(AbstractSet):
         A cycle maximises the dual function D(q) = −½‖z − Σqₖ‖² − Σ⟨qₖ, yₖ⟩ in one qₖ after the other,
         and may start from any q. Far from K, many cycles in a row change q by the same. The cycles are
         therefore done by rounds, and a round starts ahead of q by twice the change of the last one for
-        as long as D grows. Where D does not, the round counts for nothing, and the next one starts
-        nearer to q.
+        as long as D grows. Where D does not, the round is discarded, and the next one starts nearer to
+        q.
         """
 
         def cycle(last: _Cycle) -> _Cycle:

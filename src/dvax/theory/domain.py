@@ -76,8 +76,9 @@ class Domain(eqx.Module):
         inside = jnp.ones(x_error.shape, bool)
         for values, error, ends, space in zip((x, u), (x_error, u_error), (self.x, self.u), spaces):
             if ends is not None:
-                entries = (entry for _, entry in _excesses(*values, error, ends, space))
-                inside = inside & jnp.all(jnp.concatenate(list(entries), axis=1) <= 0, axis=1)
+                for least, most, low, high in _ranges(*values, error, ends, space):
+                    within = (least >= low) & (most <= high)
+                    inside = inside & jnp.all(within.reshape(len(inside), -1), axis=1)
         return jnp.cumsum(~inside) == 0
 
     def exit_at(
@@ -97,22 +98,18 @@ class Domain(eqx.Module):
         for name, values, error, ends, space in data:
             if ends is None:
                 continue
-            for place, entry in _excesses(*values, error, ends, space):
-                largest = np.asarray(entry[k])
-                at = int(np.argmax(np.where(np.isnan(largest), np.inf, largest)))
-                least, most, low, high = (
-                    np.asarray(leaf).reshape(-1)[at]
-                    for leaf in (
-                        *(jtu.tree_leaves(v)[place][k] for v in values),
-                        *(jtu.tree_leaves(end)[place] for end in ends),
-                    )
-                )
+            for place, ranges in enumerate(_ranges(*values, error, ends, space)):
+                least, most, low, high = (np.asarray(v) for v in ranges)
+                outside = np.maximum(low - least[k], most[k] - high).ravel()
+                at = int(np.argmax(outside))
+                computed = (np.ravel(jtu.tree_leaves(v)[place][k])[at] for v in values)
                 text = (
-                    f"{name}{_entry(values[0], place, at)} is computed within [{least:.6g}, "
-                    f"{most:.6g}] with an error of norm ≤ {float(error[k]):.3g}, and its limits are "
-                    f"{low:.6g} and {high:.6g}"
+                    f"{name}{_entry(values[0], place, at)} is computed within "
+                    "[{:.6g}, {:.6g}] ".format(*computed)
+                    + f"with an error of norm ≤ {float(error[k]):.3g}, and its limits are "
+                    f"{low.ravel()[at]:.6g} and {high.ravel()[at]:.6g}"
                 )
-                found.append((largest[at], text))
+                found.append((outside[at], text))
         return max(found)[1]
 
 
@@ -131,16 +128,15 @@ def _entry(rows: Tree, place: int, at: int) -> str:
     return jtu.keystr(path) + (f"[{', '.join(map(str, index))}]" if index else "")
 
 
-def _excesses(
+def _ranges(
     lows: Tree, highs: Tree, bound: jax.Array, ends: tuple[Tree, Tree], space: AbstractSpace
-) -> Iterator[tuple[int, jax.Array]]:
-    """Yield, for every leaf, its number and by how much each entry may lie outside of `ends`, for
-    values in [lows, highs] with errors of norm ≤ `bound`: one row a saved time."""
+) -> Iterator[tuple[jax.Array, ...]]:
+    """Yield, for every leaf, the least and the largest possible values of its entries, one row a saved
+    time, for computed values in [lows, highs] with errors of norm ≤ `bound`; and one row of its ends."""
     weights = jtu.tree_map(
         lambda leaf, w: np.broadcast_to(w, leaf.shape[1:]), lows, space.weights()
     )
     leaves = map(jtu.tree_leaves, (lows, highs, weights, *ends))
-    for place, (least, most, w, low, high) in enumerate(zip(*leaves, strict=True)):
+    for least, most, w, low, high in zip(*leaves, strict=True):
         reach = bound.reshape(-1, *(1,) * (least.ndim - 1)) / jnp.sqrt(w)[None]
-        outside = jnp.maximum(low[None] - (least - reach), most + reach - high[None])
-        yield place, outside.reshape(len(bound), -1)
+        yield least - reach, most + reach, low[None], high[None]
