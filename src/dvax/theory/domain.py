@@ -131,8 +131,8 @@ def _entry(rows: Tree, place: int, at: int) -> str:
 def _ranges(
     lows: Tree, highs: Tree, bound: jax.Array, ends: tuple[Tree, Tree], space: AbstractSpace
 ) -> Iterator[tuple[jax.Array, ...]]:
-    """Yield, for every leaf, the least and the largest possible values of its entries, one row a saved
-    time, for computed values in [lows, highs] with errors of norm ≤ `bound`; and one row of its ends."""
+    """Yield, for every leaf, the least and the largest possible values of its entries, a row a saved
+    time, for computed values in [lows, highs] with errors of norm ≤ `bound`, and a row of its ends."""
     weights = jtu.tree_map(
         lambda leaf, w: np.broadcast_to(w, leaf.shape[1:]), lows, space.weights()
     )
