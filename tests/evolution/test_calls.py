@@ -153,10 +153,9 @@ def test_solve_keeps_single_precision(steps):
     ],
 )
 def test_progress_output_appears_on_request_and_does_not_change_the_solution(steps, capfd):
-    case = c1()
+    case, steps = c1(), steps | {"method": dvax.ETD2RK()}
     silent = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, **steps)
     assert "%" not in "".join(capfd.readouterr())
-    steps = steps | {"method": dvax.ETD2RK()}
     shown = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, progress=True, **steps)
     jax.block_until_ready(shown.xs)
     jax.effects_barrier()

@@ -101,6 +101,7 @@ class ActiveSet(AbstractSolver):
             solve_linear, symmetric = self._matrix_free_solver(vi, y0)
         return safeguarded_newton(
             vi, y0, tol, solve_linear, step=self.step, max_steps=self.max_steps,
+            is_affine=affine,
             is_quadratic=False if symmetric is None else jnp.asarray(symmetric) & affine,
             matrix_free=size > self.dense, is_box=True,
         )  # fmt: skip

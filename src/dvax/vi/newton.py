@@ -50,12 +50,12 @@ steps identify most active sets. If F is the gradient of a quadratic function, n
 wrong, and more are allowed. (If F is affine but not symmetric, long runs often cycle.)"""
 
 _DIVERGENCE_RATIO = 10.0
-"""A Newton point is rejected if its ‖w‖ exceeds this multiple of the best, unless F is the gradient of
-a quadratic function. Then a large ‖w‖ comes from a wrong active set, which the next step corrects."""
+"""A Newton point is rejected if its ‖w‖ exceeds this multiple of the best, unless F is affine. Then a
+large ‖w‖ comes from a wrong active set, which the next step corrects."""
 
 _TRUST_RATIO = 2e3
-"""The first Newton point is rejected if ‖F‖ exceeds this multiple of its value at the start: the point
-is then outside the region where the linearisation approximates F."""
+"""The first Newton point is rejected if ‖F‖ exceeds this multiple of its value at the start, unless F
+is affine: the point is then outside the region where the linearisation approximates F."""
 
 _START, _NEWTON, _PREDICTOR, _CORRECTOR = range(4)
 """The kinds of trials."""
@@ -69,6 +69,7 @@ class _State(NamedTuple):
       may still fail to, of the `run_length` that the current run allows;
     - `wait`, the number of safeguard steps until the next Newton run; `next_wait`, that number after
       the next failed run;
+    - `reference`, an earlier ‖w‖ of the current run, with which a cycle is detected;
     - `singular`, whether the last linear system was singular;
     - `trust_limit`, the largest ‖F‖ accepted at the first Newton point.
     """
@@ -85,13 +86,14 @@ class _State(NamedTuple):
     run_length: jax.Array
     wait: jax.Array
     next_wait: jax.Array
+    reference: jax.Array
     singular: jax.Array
     trust_limit: jax.Array
 
 
 def safeguarded_newton(
     vi: FrozenVI, y0: Tree, tol: Any, solve: LinearSolver, *, step: float, max_steps: int,
-    is_quadratic: Any = False, matrix_free: bool = False, is_box: bool = False,
+    is_affine: bool, is_quadratic: Any = False, matrix_free: bool = False, is_box: bool = False,
 ) -> Answer:  # fmt: skip
     """Solve Φ(z) = F(y) + (z − y)/τ = 0 with y = proj_K(z); the value Φ(z) is the certificate w.
 
@@ -109,10 +111,10 @@ def safeguarded_newton(
     nearer to that of the solution. On other sets the second projection costs more than it saves.
 
     From a good guess the second iteration ends the solve. A run of Newton steps continues while it
-    halves the best ‖w‖ at least every sixth step. A failed run doubles the number of steps allowed to
-    the next one, since the contact set of an obstacle problem may change node by node. Otherwise
-    extragradient steps are made, from the last point that halved ‖w‖ or from the last extragradient
-    iterate.
+    halves the best ‖w‖ at least every sixth step, unless it cycles. A failed run doubles the number of
+    steps allowed to the next one, since the contact set of an obstacle problem may change node by node.
+    Otherwise extragradient steps are made, from the last point that halved ‖w‖ or from the last
+    extragradient iterate.
 
     All kinds share one loop body, and so one projection, F and linear system: the compile time of a
     program is proportional to their number.
@@ -147,11 +149,18 @@ def safeguarded_newton(
         residual = norm(w)
 
         # The first Newton point has no earlier ‖w‖ to halve, so its ‖F‖ is limited instead.
-        trusted = is_newton & ((norm_F <= s.trust_limit) | jnp.isfinite(s.best))
+        trusted = is_newton & (is_affine | (norm_F <= s.trust_limit) | jnp.isfinite(s.best))
         halved = trusted & (residual <= 0.5 * s.best)
-        near = is_quadratic | (residual <= _DIVERGENCE_RATIO * s.best)
+        near = is_affine | (residual <= _DIVERGENCE_RATIO * s.best)
         continues = trusted & (s.steps_left > 0) & near
-        continues &= ~halved & jnp.isfinite(residual)
+        # For affine F and polyhedral K a Newton point depends on the active set alone, so a ‖w‖ that
+        # comes back means a cycle. It is compared with that of the last step whose number in the run
+        # is a power of two (Brent's algorithm).
+        steps = s.run_length - s.steps_left
+        change = jnp.abs(residual - s.reference)
+        cycles = is_affine & (change <= jnp.finfo(residual.dtype).eps ** 0.5 * residual)
+        reference = jnp.where(is_newton & ((steps & (steps - 1)) == 0), residual, s.reference)
+        continues &= ~halved & ~cycles & jnp.isfinite(residual)
         failed = is_newton & ~halved & ~continues
         shortens = jnp.zeros_like(failed)
         if vi.L_F is None:
@@ -225,6 +234,7 @@ def safeguarded_newton(
                 1,
                 jnp.where(failed, jnp.minimum(2 * s.next_wait, longest_wait), s.next_wait),
             ),
+            reference=jnp.where(halved | failed, jnp.inf, reference),
             singular=jnp.where(solves, ~_tree.all_finite(newton_z), s.singular),
             trust_limit=jnp.where(is_start, _TRUST_RATIO * norm_F, s.trust_limit),
         )
@@ -240,7 +250,7 @@ def safeguarded_newton(
         infinity, run_length = jnp.inf * one, jnp.asarray(first_run_length)
         return _State(
             y0, jnp.asarray(_START), one, y0, y0, one, infinity, infinity, run_length, run_length,
-            jnp.asarray(0), jnp.asarray(1), jnp.asarray(False), infinity,
+            jnp.asarray(0), jnp.asarray(1), infinity, jnp.asarray(False), infinity,
         )  # fmt: skip
 
     return iterate(

@@ -10,6 +10,7 @@ from jax.flatten_util import ravel_pytree
 from .._small_matrices import product, solve_constant
 from .._tree import Tree
 from ..programs.matrix import matrix_of
+from ..programs.structure import analyse
 from .abstract import AbstractSolver, Answer, FrozenVI
 from .matrix_free import solve_matrix_free
 from .newton import Linearisation, safeguarded_newton
@@ -21,9 +22,10 @@ class SemismoothNewton(AbstractSolver):
     the certificate w: [F′(y) D + (I − D)/τ] d = −Φ(z), z⁺ = z + d, D ∈ ∂proj_K(z).
 
     The first step starts at z = y₀, the guess. A run of Newton steps continues while it halves the best
-    ‖w‖ at least every sixth step (after a failed run every eleventh, and so on, doubling). Otherwise
-    extragradient steps are made, from their own last iterate or from the last Newton point that halved
-    ‖w‖. After failed runs, 1, 2, 4, then 8 or more of them precede the next.
+    ‖w‖ at least every sixth step (after a failed run every eleventh, and so on, doubling). If the code
+    of F shows that it is affine, the run ends at a cycle, and no point is rejected for a large ‖w‖.
+    Otherwise extragradient steps are made, from their own last iterate or from the last Newton point
+    that halved ‖w‖. After failed runs, 1, 2, 4, then 8 or more of them precede the next.
 
     An iteration is one projection and one evaluation of F: a Newton step, or the predictor or the
     corrector of an extragradient step (or a predictor whose step is then shortened). The projection of
@@ -71,6 +73,7 @@ class SemismoothNewton(AbstractSolver):
             solve_linear,
             step=self.step,
             max_steps=self.max_steps,
+            is_affine=analyse(vi.F, y0).affine,
             matrix_free=size > self.dense,
         )
 
