@@ -1,4 +1,5 @@
-"""The time to a first result: solves, gradients and responses of laws with and without iteration."""
+"""The time to a first result: solves, gradients, responses and constants of laws with and without
+iteration."""
 
 import time
 from collections.abc import Callable
@@ -78,6 +79,7 @@ def _calls(
         ("solve", lambda: last(x0), least),
         ("gradient", lambda: jax.grad(last)(x0), _LEAST_GRADIENT),
         ("response", lambda: problem.response(0.3, x0), least),
+        ("verify", lambda: dvax.verify(problem, x0, t0=0.0, t1=end).constants.mu, least),
     ]
 
 

@@ -80,7 +80,17 @@ def put_if(condition: Any, table: Tree, index: Any, row: Tree) -> Tree:
 
 
 def zeros_like(a: Tree) -> Tree:
-    return jtu.tree_map(jnp.zeros_like, a)
+    return jtu.tree_map(_zeros, a)
+
+
+def _zeros(leaf: Any) -> jax.Array:
+    # JAX would compile a program for each shape. A large array is better made on its device.
+    if is_concrete(leaf) and isinstance(leaf, jax.Array) and leaf.size <= _MOST_ON_HOST:
+        return prepare(np.zeros_like, leaf)
+    return jnp.zeros_like(leaf)
+
+
+_MOST_ON_HOST = 4096
 
 
 def all_finite(a: Tree) -> jax.Array:
@@ -161,6 +171,11 @@ def is_sharded(leaf: Any) -> bool:
     return isinstance(leaf, jax.Array) and len(leaf.sharding.device_set) > 1
 
 
+def has_only_finite(a: Tree) -> bool:
+    """Return whether every entry of a concrete tree is finite, without a compiled program."""
+    return all(first_nonfinite(leaf) is None for leaf in jtu.tree_leaves(a))
+
+
 def first_nonfinite(leaf: Any) -> tuple[int, ...] | None:
     """Return the index of the first entry of a concrete array that is not finite, None for none."""
     # NumPy compiles no program.
@@ -190,6 +205,21 @@ def is_number(value: Any) -> bool:
         return not isinstance(value, bool)
     kind = getattr(getattr(value, "dtype", None), "kind", "")
     return kind in ("f", "i", "u") and getattr(value, "shape", None) == ()
+
+
+def prepare(fn: Callable[..., Any], *arrays: Any) -> jax.Array:
+    """Return fn(*arrays), an array that is computed once from parameters.
+
+    Concrete arrays are given to fn as NumPy arrays: outside of a trace JAX would compile a program for
+    each operation, which takes as long as thousands of steps."""
+    if not is_concrete(arrays) or any(map(is_sharded, arrays)):
+        return fn(*arrays)
+    result = np.asarray(fn(*map(np.asarray, arrays)))
+    # A Python number takes the type of what it meets, and so does a result of Python numbers.
+    are_weak = all(isinstance(a, int | float) or getattr(a, "weak_type", False) for a in arrays)
+    if are_weak and result.ndim == 0:
+        return jnp.asarray(float(result))
+    return jnp.asarray(result, jax.dtypes.canonicalize_dtype(result.dtype))
 
 
 def host(a: Tree) -> Tree:
@@ -309,7 +339,8 @@ def _float_array(leaf: Any, name: str, rule: str = _TREE) -> jax.Array:
     if isinstance(leaf, np.ma.MaskedArray | type) or dtype not in _FLOATS:
         raise _not_real(name, leaf, rule)
     try:
-        return jnp.asarray(leaf)
+        # With its type given, JAX compiles no program for a shape.
+        return jnp.asarray(leaf, jax.dtypes.canonicalize_dtype(dtype))
     except (TypeError, ValueError):  # pandas tables, ShapeDtypeStruct and others
         raise _not_real(name, leaf, rule) from None
 

@@ -137,7 +137,8 @@ def choose(
     if certified:
         return Choice(_ETD2RK, "a proved bound needs a defect that can be enclosed")
     # Data may be undefined at other times than those of the run.
-    t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(x0)))
+    dtype = _tree.dtype(x0)
+    t0 = jnp.asarray(np.asarray(t0, dtype) if _tree.is_concrete(t0) else t0, dtype)
     facts = _facts(problem, t0, x0, args)
     if facts.affine and not facts.is_field and (facts.state <= _EXACT or facts.diagonal):
         return Choice(_EXPROSENBROCK, "x' is affine in t and x between kinks, where it is exact")
@@ -326,7 +327,7 @@ def _eigenvalues(
 
 def _spectra(problem: Problem, t: jax.Array, x0: Tree, args: Any, kind: str) -> list[Any] | None:
     # Any state will do, and x0 may be traced.
-    x0 = jtu.tree_map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), x0)
+    x0 = jtu.tree_map(lambda leaf: jnp.asarray(np.zeros(leaf.shape), leaf.dtype), x0)
     like = problem.zero_control(x0)
 
     numbers, signature = flatten((problem,), (t, x0, like, args), kind)

@@ -277,7 +277,8 @@ def is_pointwise(problem: Problem, operator: AbstractOperator, t: Any, x: Tree, 
         return False
     if not isinstance(operator, Scaling | DiagonalOperator):
         return False
-    if problem.set_at(t, args).intervals(like) is None:
+    K = problem.set_at(t, args)
+    if jax.eval_shape(K.intervals, like) is None:
         return False
     return all(
         analyse(lambda v, fn=function: fn(t, v, v, args), x).pointwise

@@ -82,7 +82,7 @@ class Dense(AbstractGenerator):
 
     def check(self, space: AbstractSpace) -> None:
         name = "dvax.generators.Dense(matrix)"
-        _tree.fits_matrix(name, self.matrix, space.zeros(), "state space")
+        _tree.fits_matrix(name, self.matrix, space.like(), "state space")
 
     def adjoint(self, space: AbstractSpace) -> "Dense":
         # ⟨Av, w⟩ = vᵀAᵀWw, so A* = W⁻¹AᵀW.
@@ -91,14 +91,30 @@ class Dense(AbstractGenerator):
 
     def growth(self, space: AbstractSpace) -> Growth:
         # ⟨Av, v⟩ = vᵀWAv = qᵀ(W^{1/2}AW^{-1/2})q with q = W^{1/2}v.
-        root = jnp.broadcast_to(jnp.sqrt(space.weights()), self.matrix.shape[:1])
-        similar = root[:, None] * self.matrix / root[None, :]
+        root = _tree.prepare(_root, space.weights())
         if self.omega is not None:
+            similar = _similar(root, self.matrix)
             return Growth(_lyapunov_constant(similar, self.omega), self.omega)
-        return Growth(jnp.ones(()), jnp.linalg.eigvalsh(0.5 * (similar + similar.T))[-1])
+        return Growth(jnp.ones(()), _tree.prepare(_largest_rate, root, self.matrix))
 
     def chord_deviation(self, step: FlowStep, space: AbstractSpace, growth: Growth) -> Tree:
         return normwise_chord_deviation(self, step, space, growth)
+
+
+def _root(weights: Any) -> Any:
+    return np.sqrt(weights) if isinstance(weights, np.ndarray) else jnp.sqrt(weights)
+
+
+def _similar(root: Any, matrix: Any) -> Any:
+    """Return W^{1/2}AW^{-1/2}, for root = W^{1/2} as a vector or one number."""
+    return root.reshape(-1, 1) * matrix / root.reshape(1, -1)
+
+
+def _largest_rate(root: Any, matrix: Any) -> Any:
+    """Return the largest eigenvalue of the symmetric part."""
+    similar = _similar(root, matrix)
+    module = np if isinstance(similar, np.ndarray) else jnp
+    return module.linalg.eigvalsh(0.5 * (similar + similar.T))[-1]
 
 
 _MOST_DOUBLINGS = 60

@@ -40,7 +40,7 @@ class Diagonal(AbstractGenerator):
 
     def check(self, space: AbstractSpace) -> None:
         name = "dvax.generators.Diagonal(entries)"
-        _tree.fits(name, self.entries, space.zeros(), "state space")
+        _tree.fits(name, self.entries, space.like(), "state space")
 
     def adjoint(self, space: AbstractSpace) -> "Diagonal":
         return self

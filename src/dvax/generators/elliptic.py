@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, SupportsIndex
 
 import equinox as eqx
@@ -90,20 +91,21 @@ class Elliptic(AbstractModal):
         r = _tree.as_number(reaction, name, "Add a rate that varies in space to f")
         _check_numbers(L, d, c, kinds)
         self.transform = Transform(shape, kinds)
-        real, imaginary = r, jnp.zeros_like(r)
-        for axis in range(len(shape)):
-            even, odd = _eigenvalues(self.transform, axis, L[axis], scheme)
-            real = real - along(d[axis] * even, axis, len(shape))
-            imaginary = imaginary - along(c[axis] * odd, axis, len(shape))
-        no_advection = all(map(_is_zero, c))
-        self.symbol = real if no_advection else jax.lax.complex(real, imaginary)
+        real, imaginary = (partial(part, self.transform, scheme) for part in (_real, _imaginary))
+        self.symbol = _tree.prepare(real, r, *L, *d)
+        if not all(map(_is_zero, c)):
+            self.symbol = jax.lax.complex(self.symbol, _tree.prepare(imaginary, *L, *c))
         self.stencil = None
         if scheme == "differences":
-            cells = [side / n for side, n in zip(L, shape, strict=True)]
-            second = tuple(rate / cell**2 for rate, cell in zip(d, cells, strict=True))
+            second = tuple(
+                _tree.prepare(lambda rate, side, n=n: rate / (side / n) ** 2, *axis)
+                for n, *axis in zip(shape, d, L, strict=True)
+            )
             first = tuple(
-                None if _is_zero(rate) else rate / (2.0 * cell)
-                for rate, cell in zip(c, cells, strict=True)
+                None
+                if _is_zero(rate)
+                else _tree.prepare(lambda rate, side, n=n: rate / (2.0 * side / n), rate, side)
+                for n, rate, side in zip(shape, c, L, strict=True)
             )
             self.stencil = Stencil(kinds, second, first, r)
 
@@ -137,7 +139,7 @@ class Elliptic(AbstractModal):
         _tree.fits(
             "dvax.generators.Elliptic(shape)",
             jax.ShapeDtypeStruct(self.transform.shape, jnp.real(self.symbol).dtype),
-            space.zeros(),
+            space.like(),
             "state space",
         )
 
@@ -155,8 +157,8 @@ class Elliptic(AbstractModal):
 
     def growth(self, space: AbstractSpace) -> Growth:
         # ‖v‖ lies between √(min w) and √(max w) times the Euclidean norm, in which A is normal.
-        w = space.weights()
-        return Growth(jnp.sqrt(jnp.max(w) / jnp.min(w)), jnp.max(jnp.real(self.symbol)))
+        ratio = _tree.prepare(lambda w: (w.max() / w.min()) ** 0.5, space.weights())
+        return Growth(ratio, _tree.prepare(lambda symbol: symbol.real.max(), self.symbol))
 
     def chord_deviation(self, step: FlowStep, space: AbstractSpace, growth: Growth) -> Tree:
         # Bound each coefficient; eigenfunctions are at most 1 in absolute value.
@@ -200,9 +202,7 @@ def _bound_complex(bound: Any, parts: list[jax.Array]) -> jax.Array:
     return jnp.sqrt(real**2 + imaginary**2)
 
 
-def _eigenvalues(
-    transform: Transform, axis: int, length: jax.Array, scheme: str
-) -> tuple[jax.Array, jax.Array]:
+def _eigenvalues(transform: Transform, axis: int, length: Any, scheme: str) -> tuple[Any, Any]:
     """Return κ² and κ along an axis, or their finite-difference counterparts."""
     n, modes = transform.shape[axis], transform.modes(axis)
     periodic = transform.boundary[axis] == "periodic"
@@ -212,8 +212,26 @@ def _eigenvalues(
     angle_odd = (2 * np.pi if periodic else np.pi) * np.asarray(odd, float)
     if scheme == "differences":
         angle, angle_odd = 2 * n * np.sin(angle / (2 * n)), n * np.sin(angle_odd / n)
-    kappa, kappa_odd = (jnp.asarray(a, length.dtype) / length for a in (angle, angle_odd))
+    kappa, kappa_odd = (a.astype(length.dtype) / length for a in (angle, angle_odd))
     return kappa**2, kappa_odd
+
+
+def _real(transform: Transform, scheme: str, reaction: Any, *numbers: Any) -> Any:
+    """Return the real parts of the eigenvalues, r − Σ dκ², for `numbers` = lengths and diffusion."""
+    count = len(transform.shape)
+    for axis, (length, d) in enumerate(zip(numbers[:count], numbers[count:], strict=True)):
+        even = _eigenvalues(transform, axis, length, scheme)[0]
+        reaction = reaction - along(d * even, axis, count)
+    return reaction
+
+
+def _imaginary(transform: Transform, scheme: str, *numbers: Any) -> Any:
+    """Return the imaginary parts of the eigenvalues, −Σ cκ, for `numbers` = lengths and velocity."""
+    count, total = len(transform.shape), 0.0
+    for axis, (length, c) in enumerate(zip(numbers[:count], numbers[count:], strict=True)):
+        odd = _eigenvalues(transform, axis, length, scheme)[1]
+        total = total - along(c * odd, axis, count)
+    return total
 
 
 def _by_axis(name: str, value: Any, count: int) -> list[jax.Array]:
@@ -234,7 +252,9 @@ def _broadcast_to_axes(name: str, value: Any, count: int) -> list[jax.Array]:
             f"it must be one number, or one for each of the {count} axes",
             f"Give {count} numbers",
         )
-    return list(jnp.broadcast_to(array, (count,)))
+    if array.ndim == 0:
+        return [array] * count
+    return [_tree.prepare(lambda numbers, k=k: numbers[k], array) for k in range(count)]
 
 
 def _is_zero(v: jax.Array) -> bool:

@@ -88,7 +88,7 @@ class KroneckerSum(AbstractModal):
         return ModalPropagator(_transform(self.field), shaped)
 
     def check(self, space: AbstractSpace) -> None:
-        zeros, m = space.zeros(), self.matrix.shape[0]
+        zeros, m = space.like(), self.matrix.shape[0]
         if isinstance(zeros, tuple) or jnp.ndim(zeros) < 1 or zeros.shape[0] != m:
             raise input_error(
                 "dvax.generators.KroneckerSum(matrix)",
@@ -106,7 +106,7 @@ class KroneckerSum(AbstractModal):
             "all points must have the same weight, or A* is no Kronecker sum",
             "Use a space with one weight for all points",
         )  # fmt: skip
-        return KroneckerSum(self.field.adjoint(Euclidean(space.zeros().shape[1:])), self.matrix.T)
+        return KroneckerSum(self.field.adjoint(Euclidean(space.like().shape[1:])), self.matrix.T)
 
     def growth(self, space: AbstractSpace) -> Growth:
         coupling = jnp.linalg.eigvalsh(0.5 * (self.matrix + self.matrix.T))[-1]

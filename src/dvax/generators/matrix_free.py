@@ -56,7 +56,7 @@ class AbstractMatrixFree(AbstractGenerator):
         return faber_propagator(self, self.numerical_range(), h, terms)
 
     def check(self, space: AbstractSpace) -> None:
-        v = space.zeros()
+        v = space.like()
         try:
             out = jax.eval_shape(self.apply, v)
         except (TypeError, ValueError) as error:

@@ -45,7 +45,7 @@ class Product(AbstractModal):
         return ProductPropagator(tuple(a.propagator(h, terms) for a in self.parts))
 
     def check(self, space: AbstractSpace) -> None:
-        _tree.fits_parts("dvax.generators.Product", len(self.parts), space.zeros(), "state space")
+        _tree.fits_parts("dvax.generators.Product", len(self.parts), space.like(), "state space")
         for part, part_space in zip(self.parts, _parts(space, len(self.parts)), strict=True):
             part.check(part_space)
 

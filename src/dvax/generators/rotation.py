@@ -73,7 +73,7 @@ class Rotation(AbstractModal):
         return RotationPropagator(self, factors)
 
     def check(self, space: AbstractSpace) -> None:
-        zeros = space.zeros()
+        zeros = space.like()
         _tree.fits_parts("dvax.generators.Rotation", 2, zeros, "state space")
         shape = self.b.shape if self.transform is None else self.transform.shape
         like = jax.ShapeDtypeStruct(shape, self.b.dtype)

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 
+from .. import _tree
 from .._tree import Tree
 from ..spaces import AbstractSpace
 
@@ -35,12 +36,12 @@ class Spectrum(NamedTuple):
     @property
     def m_P(self) -> Any:
         """The coercivity modulus of P⁻¹, min σ(P⁻¹) = 1/‖P‖."""
-        return 1.0 / self.norm
+        return _tree.prepare(lambda norm: 1.0 / norm, self.norm)
 
     @property
     def norm_P_inv(self) -> Any:
         """‖P⁻¹‖ = 1/min σ(P)."""
-        return 1.0 / self.m
+        return _tree.prepare(lambda m: 1.0 / m, self.m)
 
 
 class AbstractOperator(eqx.Module):

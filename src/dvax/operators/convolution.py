@@ -79,7 +79,7 @@ class Convolution(AbstractOperator):
 
     def check(self, space: AbstractSpace) -> None:
         name = "dvax.operators.Convolution(symbol)"
-        zeros = space.zeros()
+        zeros = space.like()
         if isinstance(zeros, tuple) or jnp.shape(zeros) != self.shape:
             raise input_error(
                 name,

@@ -58,7 +58,7 @@ class Dense(AbstractOperator):
 
     def check(self, space: AbstractSpace) -> None:
         name = "dvax.operators.Dense(matrix)"
-        _tree.fits_matrix(name, self.matrix, space.zeros(), "control space")
+        _tree.fits_matrix(name, self.matrix, space.like(), "control space")
 
         def is_symmetric() -> bool:
             # NumPy: in a function that JAX traces, its own product would be traced.

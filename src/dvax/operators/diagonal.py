@@ -37,7 +37,7 @@ class Diagonal(AbstractOperator):
             "P must be coercive and bounded, so every entry must be positive and finite",
             "Remove or regularise the entries that are not",
         )
-        self.inverse_entries = 1.0 / self.entries
+        self.inverse_entries = _tree.prepare(lambda entries: 1.0 / entries, self.entries)
 
     def apply(self, v: Tree) -> Tree:
         return self.entries * v
@@ -48,7 +48,7 @@ class Diagonal(AbstractOperator):
     def check(self, space: AbstractSpace) -> None:
         # A positive diagonal is self-adjoint and coercive for all diagonal weights.
         name = "dvax.operators.Diagonal(entries)"
-        _tree.fits(name, self.entries, space.zeros(), "control space")
+        _tree.fits(name, self.entries, space.like(), "control space")
 
     def spectrum(self, space: AbstractSpace) -> Spectrum:
         return Spectrum(jnp.min(self.entries), jnp.max(self.entries))

@@ -96,7 +96,7 @@ class LowRank(AbstractOperator):
 
     def check(self, space: AbstractSpace) -> None:
         name = "dvax.operators.LowRank(U, s)"
-        zeros = space.zeros()
+        zeros = space.like()
         if isinstance(zeros, tuple) or jnp.shape(zeros) != self.U.shape[:1]:
             raise input_error(
                 name,

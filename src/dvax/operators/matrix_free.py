@@ -97,7 +97,7 @@ class MatrixFree(AbstractOperator):
 
     def check(self, space: AbstractSpace) -> None:
         name = "dvax.operators.MatrixFree(fn)"
-        zeros = space.zeros()
+        zeros = space.like()
         out = jax.eval_shape(self.fn, zeros)
         if not _tree.same_shape(out, zeros):
             raise input_error(

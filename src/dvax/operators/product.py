@@ -35,7 +35,7 @@ class Product(AbstractOperator):
         return tuple(p.inverse(q) for p, q in zip(self.parts, v, strict=True))
 
     def check(self, space: AbstractSpace) -> None:
-        _tree.fits_parts("dvax.operators.Product", len(self.parts), space.zeros(), "control space")
+        _tree.fits_parts("dvax.operators.Product", len(self.parts), space.like(), "control space")
         for part, part_space in zip(self.parts, _parts(space, len(self.parts)), strict=True):
             part.check(part_space)
 

@@ -39,7 +39,7 @@ class Scaling(AbstractOperator):
             "Give a positive number",
         )
         # Stored: a division for every entry, at every evaluation, would cost more than the law.
-        self.inverse_b = 1.0 / self.b
+        self.inverse_b = _tree.prepare(lambda b: 1.0 / b, self.b)
 
     def apply(self, v: Tree) -> Tree:
         return _tree.scale(self.b, v)

@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from .. import _tree
@@ -52,7 +53,7 @@ class AffineSubspace(AbstractSet):
         rows, _ = normalised_conditions(self.E, self.e)
         self.pseudoinverse = jnp.linalg.pinv(rows)
         _tree.require(
-            lambda: has_solution(self.E, self.e),
+            lambda: jax.jit(has_solution)(self.E, self.e),
             f"{name}(E, e)",
             (self.E, self.e),
             "E y = e must have a solution, or the set is empty and the law has no solution",
@@ -95,7 +96,7 @@ def checked_rows(name: str, E: Any, e: Any, left: str, right: str) -> tuple[jax.
             f"Give {left} the shape (conditions, *shape of y) and {right} (conditions,)",
         )
     _tree.require(
-        lambda: jnp.all(jnp.isfinite(E)) & ~jnp.any(jnp.isnan(e)),
+        lambda: _tree.has_only_finite(E) and not np.any(np.isnan(e)),
         f"{name}({left}, {right})",
         (E, e),
         f"{left} must be finite and {right} must not be NaN",

@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .. import _tree
 from .._tree import Tree
@@ -78,14 +79,14 @@ def center_and_radius(name: str, center: Any, radius: Any) -> tuple[Tree, jax.Ar
     center = _tree.as_float(center, f"{name}(center)")
     radius = _tree.as_array(radius, f"{name}(radius)")
     _tree.require(
-        lambda: jnp.all((radius >= 0) & jnp.isfinite(radius)),
+        lambda: np.all((np.asarray(radius) >= 0) & np.isfinite(radius)),
         f"{name}(radius)",
         radius,
         "the radius must be finite and ≥ 0, or the ball is empty or the whole space",
         "Use dvax.sets.WholeSpace() where there is no constraint",
     )
     _tree.require(
-        lambda: _tree.all_finite(center),
+        lambda: _tree.has_only_finite(center),
         f"{name}(center)",
         center,
         "the entries of the center must be finite",

@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from .. import _tree
@@ -50,7 +51,7 @@ class Ellipsoid(AbstractSet):
         name = "dvax.sets.Ellipsoid"
         self.center = _tree.as_array(center, f"{name}(center)")
         _tree.require(
-            lambda: _tree.all_finite(self.center),
+            lambda: _tree.has_only_finite(self.center),
             f"{name}(center)",
             self.center,
             "the entries of the center must be finite",
@@ -184,13 +185,14 @@ def _multiplier(zeta: jax.Array, lengths: jax.Array) -> jax.Array:
 def _checked_radii(name: str, given: Any) -> jax.Array:
     radii = _tree.as_array(given, name)
     _tree.require(
-        lambda: jnp.all((radii > 0) & jnp.isfinite(radii)),
+        lambda: np.all((np.asarray(radii) > 0) & np.isfinite(radii)),
         name,
         radii,
         "half-axes must be positive and finite, or the set is flat, empty or unbounded",
         "Use dvax.sets.Product with a dvax.sets.Box for fixed or unbounded directions",
     )
-    return jnp.where(radii > 0, radii, jnp.nan)
+    # A traced half-axis that is wrong becomes NaN, so that a solve stops.
+    return radii if _tree.is_concrete(radii) else jnp.where(radii > 0, radii, jnp.nan)
 
 
 def _checked_matrix(name: str, given: Any) -> jax.Array:

@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 
 from .. import _tree
 from .._tree import Tree
@@ -59,7 +60,7 @@ def checked_row(name: str, normal: Any, offset: Any) -> tuple[Tree, jax.Array]:
     offset = _tree.as_number(offset, f"{name}(offset)", several)
     _tree.require(
         lambda: (
-            _tree.all_finite(normal) & any(bool(jnp.any(a != 0)) for a in jtu.tree_leaves(normal))
+            _tree.has_only_finite(normal) and any(map(np.any, jtu.tree_leaves(_tree.host(normal))))
         ),
         f"{name}(normal)",
         normal,
@@ -67,7 +68,7 @@ def checked_row(name: str, normal: Any, offset: Any) -> tuple[Tree, jax.Array]:
         "Use dvax.sets.WholeSpace() where there is no constraint",
     )
     _tree.require(
-        lambda: jnp.isfinite(offset),
+        lambda: np.isfinite(np.asarray(offset)),
         f"{name}(offset)",
         offset,
         "the offset must be a finite number",

@@ -69,12 +69,13 @@ class Polyhedron(AbstractSet):
                 "Give both or neither",
             )
         if E is None:
-            self.E, self.e = jnp.zeros((0, *self.G.shape[1:]), self.G.dtype), self.d[:0]
+            self.E, self.e = (_tree.prepare(lambda a: a[:0], a) for a in (self.G, self.d))
         else:
             self.E, self.e = checked_rows(name, E, e, "E", "e")
-            check_row_shapes(f"{name}(E)", self.E, self.G[0])
+            row = jax.ShapeDtypeStruct(self.G.shape[1:], self.G.dtype)
+            check_row_shapes(f"{name}(E)", self.E, row)
             _tree.require(
-                lambda: has_solution(self.E, self.e),
+                lambda: jax.jit(has_solution)(self.E, self.e),
                 f"{name}(E, e)",
                 (self.E, self.e),
                 "E y = e must have a solution, or the set is empty and the law has no solution",

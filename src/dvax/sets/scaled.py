@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 
 from .. import _tree
 from .._tree import Tree
@@ -40,7 +41,7 @@ class Scaled(AbstractSet):
         self.set = set
         self.factor = _tree.as_number(factor, name, "Scale the data of the set itself")
         _tree.require(
-            lambda: jnp.isfinite(self.factor) & (self.factor != 0),
+            lambda: np.isfinite(self.factor) & (np.asarray(self.factor) != 0),
             name,
             self.factor,
             "the factor must be finite and not 0",

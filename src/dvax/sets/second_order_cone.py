@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .. import _tree
 from .._tree import Tree
@@ -44,7 +45,7 @@ class SecondOrderCone(AbstractSet):
         name = "dvax.sets.SecondOrderCone(slope)"
         self.slope = _tree.as_array(slope, name)
         _tree.require(
-            lambda: jnp.all((self.slope > 0) & jnp.isfinite(self.slope)),
+            lambda: np.all((np.asarray(self.slope) > 0) & np.isfinite(self.slope)),
             name,
             self.slope,
             "the slope must be positive and finite, or the cone is a line or a half-space",

@@ -56,7 +56,7 @@ class Simplex(AbstractSet):
         name = "dvax.sets.Simplex(total)"
         self.total = _tree.as_array(total, name)
         _tree.require(
-            lambda: jnp.all((self.total >= 0) & jnp.isfinite(self.total)),
+            lambda: np.all((np.asarray(self.total) >= 0) & np.isfinite(self.total)),
             name,
             self.total,
             "every total must be finite and ≥ 0, or the set is empty",

@@ -40,7 +40,7 @@ class Translated(AbstractSet):
         self.set = set
         self.offset = _tree.as_float(offset, "dvax.sets.Translated(offset)")
         _tree.require(
-            lambda: _tree.all_finite(self.offset),
+            lambda: _tree.has_only_finite(self.offset),
             "dvax.sets.Translated(offset)",
             self.offset,
             "the entries of the offset must be finite",

@@ -48,13 +48,18 @@ class AbstractSpace(eqx.Module):
         ones = jax.tree_util.tree_map(jnp.ones_like, self.zeros())
         return self.inner(ones, ones)
 
+    def like(self) -> Tree:
+        """Return an element as shapes and types, without values."""
+        return jax.eval_shape(self.zeros)
+
     def check(self, a: Tree, name: str) -> None:
         """Raise an `InputError` unless `a` has the structure of this space's elements."""
-        if not _tree.same_shape(a, self.zeros()):
+        like = self.like()
+        if not _tree.same_shape(a, like):
             raise input_error(
                 name,
                 f"shape {_tree.shapes(a)}",
-                f"it must be an element of {self!r}, of shape {_tree.shapes(self.zeros())}",
+                f"it must be an element of {self!r}, of shape {_tree.shapes(like)}",
                 f"Give {name} that shape, or pass another state_space= or control_space= to "
                 "dvax.Problem",
             )

@@ -120,13 +120,15 @@ def _integrable(
     moduli: ModulusStatuses,
 ) -> Assumption:
     label, statement = "ass:operators (iv)", "f and h are Carathéodory, f(·, 0, 0) is integrable"
-    zero = jtu.tree_map(jnp.zeros_like, system.x0)
+    zero = _tree.zeros_like(system.x0)
 
     def f_at_zero(t: Any) -> Tree:
         return system.problem.f(t, zero, system.u0, system.args)
 
     samples = np.linspace(*span, _SAMPLES)
-    finite = jax.vmap(lambda t: _tree.all_finite(f_at_zero(t)))(jnp.asarray(samples))
+    # One program: JAX would compile one for each operation of f.
+    is_finite = jax.jit(jax.vmap(lambda t: _tree.all_finite(f_at_zero(t))))
+    finite = np.asarray(is_finite(jnp.asarray(samples)))
     if not finite.all():
         t = samples[np.argmin(finite)]
         why = f"f(t, 0, 0) = {_tree.short(f_at_zero(jnp.asarray(t)))} at t = {t:.17g}"

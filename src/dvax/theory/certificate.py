@@ -15,6 +15,7 @@ holds with M = 1 and c = μ: d/dt‖x_h − x‖ ≤ μ‖x_h − x‖ + δ. The
 ‖u_h − u‖ ≤ L‖x_h − x‖ + ‖u_h − u_{x_h}‖.
 """
 
+import operator
 from typing import Any
 
 import equinox as eqx
@@ -184,7 +185,7 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
         distance = jax.vmap(lambda a, b: space.norm(_tree.sub(a, b)))(measured.xs, sol.xs)
     args, t0 = as_arrays(sol.setup.args), jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
     of_x, of_u = _roundoff(problem, args, t0, sol.setup.x0, sol.ts, sol.xs, sol.us)
-    distance = distance + of_x
+    distance = _tree.prepare(operator.add, distance, of_x)
     assert measured.defect is not None and measured.law_defect is not None
     assert measured.completed_defect is not None
 
@@ -192,10 +193,10 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
     law = sol.law_residual, sol.law_step, of_u
     estimates, integrals = _estimates(constants, t0, sol.ts, defects, initial)
     x, u, x_sharp, u_sharp = _bounds(constants, estimates, distance, law)
-    best_x = x if x_sharp is None else jnp.minimum(x, x_sharp)
-    best_u = u if u_sharp is None else jnp.minimum(u, u_sharp)
+    best_x = x if x_sharp is None else _tree.prepare(_smaller, x, x_sharp)
+    best_u = u if u_sharp is None else _tree.prepare(_smaller, u, u_sharp)
     domain_status: Status = "proved"
-    inside, why = jnp.ones(sol.ts.shape, bool), ""
+    inside, why = None, ""
     if domain is not None:
         setting = sol.setup.setting
         covered = domain.covers(setting["t0"], setting["t1"]) and domain.has_args(sol.setup.args)
@@ -217,7 +218,9 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
     )
 
     def valid(v: jax.Array | None) -> Any:
-        return None if v is None else jnp.where(inside, v.T, jnp.inf).T
+        if v is None or inside is None:
+            return v
+        return _tree.prepare(_where_inside, inside, v)
 
     return Bound(
         sol.ts, valid(best_x), valid(best_u), valid(x), valid(u), valid(x_sharp), valid(u_sharp),
@@ -235,8 +238,17 @@ def _exit(domain: Domain, ts: jax.Array, inside: jax.Array, values: tuple) -> st
     return f"the region of the constants may be left{before}; up to t = {float(ts[k]):.6g}, {where}"
 
 
+def _smaller(a: Any, b: Any) -> Any:
+    return (np if isinstance(a, np.ndarray) else jnp).minimum(a, b)
+
+
+def _where_inside(inside: Any, bound: Any) -> Any:
+    """Return the rows of a bound, infinite where the region of the constants may be left."""
+    return (np if isinstance(inside, np.ndarray) else jnp).where(inside, bound.T, np.inf).T
+
+
 def _overflow(x: jax.Array) -> str:
-    if not _tree.is_concrete(x) or bool(jnp.all(jnp.isfinite(x))):
+    if not _tree.is_concrete(x) or _tree.has_only_finite(x):
         return ""
     return "the bound on the growth of errors is larger than any number"
 

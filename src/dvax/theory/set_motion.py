@@ -1,7 +1,9 @@
 """Bounds on the data over time: position and speed of K(t), values and jumps of f and h."""
 
 import itertools
+import operator
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,6 +12,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from .. import _tree
 from .._tree import Tree
 from ..errors import InputError
 from ..problem import Problem
@@ -119,7 +122,12 @@ def _describe(
     bounds = K.intervals(like)
     if bounds is not None:
         low, high = bounds
-        return low, high, _MaximumSpeed(low, high), jtu.tree_map(jnp.subtract, high, low)
+        return (
+            low,
+            high,
+            _MaximumSpeed(low, high),
+            jtu.tree_map(partial(_tree.prepare, operator.sub), high, low),
+        )
     if isinstance(K, Ball) and not isinstance(like, tuple):
         reach = K.radius / jnp.sqrt(jnp.broadcast_to(space.weights(), like.shape))
         center = jnp.broadcast_to(K.center, like.shape)

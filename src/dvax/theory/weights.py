@@ -25,5 +25,6 @@ def flat_roots(space: AbstractSpace, like: Tree) -> jax.Array:
 def roots(space: AbstractSpace, like: Tree) -> list[Any]:
     """Return √wᵢ of every leaf as a flat NumPy array."""
     return [
-        np.sqrt(np.asarray(w, float)).ravel() for w in jtu.tree_leaves(full_weights(space, like))
+        np.broadcast_to(np.sqrt(np.asarray(w, float)), leaf.shape).ravel()
+        for leaf, w in zip(jtu.tree_leaves(like), jtu.tree_leaves(space.weights()), strict=True)
     ]

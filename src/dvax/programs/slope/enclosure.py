@@ -21,6 +21,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from ... import _tree
+from ..._jax.jaxprs import bind, operation
 from ..._tree import Tree
 from ..interpreter import Domain, Rule, interpret
 from .rules_elementwise import ELEMENTWISE
@@ -66,7 +68,7 @@ class SlopeEnclosure:
             k += differentiated
         unknown: list[str] = []
         with np.errstate(all="ignore"):
-            domain = Domain(RULES, is_slope, partial(_unknown, unknown), _apply)
+            domain = Domain(RULES, is_slope, partial(_unknown, unknown), _apply, _evaluate)
             results = interpret(self._program, inputs, domain)
         slopes = [r if is_slope(r) else interval(np.asarray(r), np.asarray(r)) for r in results]
         return EnclosedSlopes(self._output.unflatten(slopes), tuple(dict.fromkeys(unknown)))
@@ -80,6 +82,30 @@ def _apply(rule: Rule, eqn: Any, operands: list[Any]) -> list[Any] | None:
         _constant_if_decided(_without_nan(x))
         for x in (result if isinstance(result, list) else [result])
     ]
+
+
+_ARITHMETIC = {
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative,
+    "sqrt": np.sqrt, "max": np.maximum, "min": np.minimum,
+}  # fmt: skip
+
+
+def _evaluate(eqn: Any, operands: list[Any]) -> list[Any]:
+    """Return the results of an operation on constants. NumPy rounds arithmetic as XLA does, and
+    compiles no program."""
+    name, aval = operation(eqn), eqn.outvars[0].aval
+    if aval.dtype.kind == "f" and _tree.is_concrete(operands):
+        arrays = [np.asarray(v) for v in operands]
+        if name in _ARITHMETIC and all(a.dtype == aval.dtype for a in arrays):
+            return [np.asarray(_ARITHMETIC[name](*arrays))]
+        if name == "convert_element_type" and arrays[0].dtype.kind in "iuf":
+            return [arrays[0].astype(aval.dtype)]
+        if name == "broadcast_in_dim":
+            axes = [1] * aval.ndim
+            for axis, size in zip(eqn.params["broadcast_dimensions"], arrays[0].shape, strict=True):
+                axes[axis] = size
+            return [np.broadcast_to(arrays[0].reshape(axes), aval.shape)]
+    return bind(eqn, operands)
 
 
 def _unknown(names: list[str], eqn: Any, operands: list[Any]) -> list[Slope]:
