@@ -79,7 +79,7 @@ def _calls(
         ("solve", lambda: last(x0), least),
         ("gradient", lambda: jax.grad(last)(x0), _LEAST_GRADIENT),
         ("response", lambda: problem.response(0.3, x0), least),
-        ("verify", lambda: dvax.verify(problem, x0, 0.0, end).constants.L, least),
+        ("verify", lambda: dvax.verify(problem, x0, 0.0, end).constants, least),
     ]
 
 
