@@ -209,7 +209,7 @@ def jumps(
         return None
     near = 64 * np.finfo(float).eps * np.maximum(np.abs(knots), span[1] - span[0])
     samples = knots[:, None] + near[:, None] * np.array([-16.0, -1.0, 1.0, 16.0])
-    leaves = jtu.tree_leaves(jax.vmap(fn)(jnp.asarray(samples.ravel())))
+    leaves = jtu.tree_leaves(jax.jit(jax.vmap(fn))(jnp.asarray(samples.ravel())))
     values = [np.asarray(leaf).reshape(knots.size, 4, -1) for leaf in leaves]
     far_left, left, right, far_right = np.moveaxis(np.concatenate(values, axis=2), 1, 0)
     gap, wide_gap = (_row_maxima(p - q) for p, q in ((right, left), (far_right, far_left)))
