@@ -10,6 +10,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import input_error
 from ..spaces import AbstractSpace
+from ..spaces.matrices import numerical_range_on_axis, similar_matrix
 from .abstract import AbstractGenerator, AbstractPropagator, FlowStep, Growth
 from .chord_deviation import normwise_chord_deviation
 from .phi import flow_factors, phi_matrix
@@ -91,30 +92,13 @@ class Dense(AbstractGenerator):
 
     def growth(self, space: AbstractSpace) -> Growth:
         # ⟨Av, v⟩ = vᵀWAv = qᵀ(W^{1/2}AW^{-1/2})q with q = W^{1/2}v.
-        root = _tree.prepare(_root, space.weights())
         if self.omega is not None:
-            similar = _similar(root, self.matrix)
+            similar = similar_matrix(self.matrix, space.weights())
             return Growth(_lyapunov_constant(similar, self.omega), self.omega)
-        return Growth(jnp.ones(()), _tree.prepare(_largest_rate, root, self.matrix))
+        return Growth(jnp.ones(()), numerical_range_on_axis(self.matrix, space)[1])
 
     def chord_deviation(self, step: FlowStep, space: AbstractSpace, growth: Growth) -> Tree:
         return normwise_chord_deviation(self, step, space, growth)
-
-
-def _root(weights: Any) -> Any:
-    return np.sqrt(weights) if isinstance(weights, np.ndarray) else jnp.sqrt(weights)
-
-
-def _similar(root: Any, matrix: Any) -> Any:
-    """Return W^{1/2}AW^{-1/2}, for root = W^{1/2} as a vector or one number."""
-    return root.reshape(-1, 1) * matrix / root.reshape(1, -1)
-
-
-def _largest_rate(root: Any, matrix: Any) -> Any:
-    """Return the largest eigenvalue of the symmetric part."""
-    similar = _similar(root, matrix)
-    module = np if isinstance(similar, np.ndarray) else jnp
-    return module.linalg.eigvalsh(0.5 * (similar + similar.T))[-1]
 
 
 _MOST_DOUBLINGS = 60

@@ -10,6 +10,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import input_error
 from ..spaces import AbstractSpace
+from ..spaces.matrices import numerical_range_on_axis
 from .abstract import AbstractOperator, Spectrum
 
 
@@ -48,7 +49,7 @@ class Dense(AbstractOperator):
             _check_positive(name, np.asarray(self.matrix))
         # Every evaluation of the law applies P⁻¹. XLA fuses the product with a stored inverse, but
         # not a triangular solve. The method requires a well-conditioned P in any case.
-        self.inverse_matrix = jnp.linalg.inv(self.matrix)
+        self.inverse_matrix = _tree.prepare(_inverse, self.matrix)
 
     def apply(self, v: Tree) -> Tree:
         return self.matrix @ v
@@ -73,7 +74,7 @@ class Dense(AbstractOperator):
             "If the asymmetry is roundoff, symmetrise the matrix",
         )
         _tree.require(
-            lambda: self.spectrum(space).m > 0,
+            lambda: float(self.spectrum(space).m) > 0,
             name,
             self.matrix,
             "P must be coercive, so every eigenvalue must be positive",
@@ -81,11 +82,12 @@ class Dense(AbstractOperator):
         )
 
     def spectrum(self, space: AbstractSpace) -> Spectrum:
-        # P is similar to W^{1/2} P W^{-1/2}, which is symmetric if P is self-adjoint for W.
-        root = jnp.broadcast_to(jnp.sqrt(space.weights()), self.matrix.shape[:1])
-        similar = root[:, None] * self.matrix / root[None, :]
-        eigenvalues = jnp.linalg.eigvalsh(0.5 * (similar + similar.T))
-        return Spectrum(eigenvalues[0], eigenvalues[-1])
+        # P is self-adjoint, so these are the ends of its spectrum.
+        return Spectrum(*numerical_range_on_axis(self.matrix, space))
+
+
+def _inverse(matrix: Any) -> Any:
+    return (np if isinstance(matrix, np.ndarray) else jnp).linalg.inv(matrix)
 
 
 def _check_positive(name: str, matrix: np.ndarray) -> None:
