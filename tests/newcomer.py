@@ -100,6 +100,11 @@ FUNCTIONS = {
         lambda: verify(problem(K=lambda t, a: sets.Box(0.0, 1.0 if t < 1 else 2.0))),
         "Problem(K); jnp.where",
     ),
+    "integers": (
+        lambda: solve(problem(h=lambda t, x, u, args: jnp.where(t < 0.5, 1, 0))),
+        "Problem(h); newcomer.py, line; a value of int; floating-point; 1.0 for 1",
+    ),
+    "an integer": (lambda: of_f(lambda t, x, u, args: 0), "Problem(f); a value of int; 1.0 for 1"),
     "np.sin": (
         lambda: of_f(lambda t, x, u, args: np.sin(x)),
         "newcomer.py, line; jnp.sin(x) for np.sin(x)",

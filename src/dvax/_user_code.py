@@ -160,6 +160,19 @@ def _is_bool(leaf: Any) -> bool:
     return isinstance(leaf, bool) or getattr(leaf, "dtype", None) == np.dtype(bool)
 
 
+def check_not_integer(name: str, fn: Callable[..., Any], out: Any) -> None:
+    """Raise an `InputError` if `out` = fn(t, x, u, args) has integers, of which JAX has no derivative."""
+    for leaf in jtu.tree_leaves(out):
+        kind = getattr(getattr(leaf, "dtype", None), "kind", "")
+        if isinstance(leaf, int) or kind in ("i", "u"):
+            raise input_error(
+                f"dvax.Problem({name}), {_place(fn)}",
+                f"a value of {getattr(leaf, 'dtype', 'int')}",
+                f"{name}(t, x, u, args) must return floating-point numbers",
+                "Write 1.0 for 1, or convert an array: a.astype(float)",
+            )
+
+
 def _dtype(leaf: Any, expected: Any) -> Any:
     """Return the type of a leaf; Python numbers and weak types take the `expected` type."""
     if isinstance(leaf, bool | int | float):

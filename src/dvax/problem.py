@@ -290,6 +290,7 @@ class Problem(eqx.Module):
             named = {"t": t, "x": x, "u": u, "args": inputs[3]}
             out = _user_code.call(name, fn, named, source)
             _user_code.check_values(name, fn, out, x)
+            _user_code.check_not_integer(name, fn, out)
             return out
 
         program, out = jax.make_jaxpr(traced, return_shape=True)(*inputs[:3])

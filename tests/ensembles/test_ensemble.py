@@ -120,6 +120,22 @@ def test_events_are_observed_in_each_member():
     np.testing.assert_allclose(found.values[9], alone.events.ts[0], atol=1e-9)
 
 
+def test_first_member_with_an_empty_set_fails_alone():
+    """u = min(1/2, a), and x' = −x + u from 0."""
+    problem = dvax.Problem(
+        A=generators.Scalar(-1.0), P=operators.Scaling(1.0), K=lambda t, a: sets.Box(0.0, a),
+        f=lambda t, x, u, args: u, h=lambda t, x, u, args: 0.5 - 0.0 * x,
+    )  # fmt: skip
+    a = np.array([-1.0, 1.0, 0.25])
+    with pytest.warns(UserWarning, match="1 of 3 members failed, the first of them number 0"):
+        found = dvax.ensemble(problem, 0.0, 0.0, 1.0, a, axes=(None, 0))
+    assert found.failed.tolist() == [True, False, False]
+    exact = np.array([0.5, 0.25]) * -np.expm1(-1.0)
+    np.testing.assert_allclose(found.values[1:], exact, rtol=1e-6)
+    with pytest.raises(dvax.InputError, match="lower = 0, upper = -1"):
+        found.member(0)
+
+
 def test_members_that_fail_leave_the_others_alone():
     """x' = a x² from x = 1 escapes at t = 1/a."""
     problem = dvax.Problem(

@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import _tree, _user_code
 from .._tree import Tree
-from ..errors import Problems
+from ..errors import InputError, Problems
 from ..evolution import RESULTS, Event, Implicit, PiecewiseLinear, Solution, solve
 from ..evolution.arguments import MAX_EVENTS, Arguments, bound_steps, check, warn_precision
 from ..evolution.auto import Choice, choose
@@ -117,7 +117,7 @@ def ensemble(
     inputs = Inputs.of(states, as_arrays(args), *times, _times(ts), axes)
     _check_times(inputs)
     # A member whose x0 is not finite fails alone.
-    x0, own_args, begin, end, own_ts = inputs.member(inputs.example())
+    x0, own_args, begin, end, own_ts = inputs.member(inputs.examples()[0])
     check(Arguments(problem, x0, begin, end, own_args, own_ts, progress=progress, **options))
     _user_code.check_args(own_args, "dvax.ensemble")
     if dt is None:
@@ -126,7 +126,7 @@ def ensemble(
     if method is None:
         tol = float(max(rtol, atol)) if _tree.is_concrete(rtol, atol) else math.nan
         certified = constants is not None
-        choice = choose(problem, x0, own_args, begin, end - begin, tol, dt is not None, certified)
+        choice = _chosen(problem, inputs, tol, dt is not None, certified)
     each = device_list(devices)
     if lanes is None:
         size = sum(np.size(leaf) for leaf in jtu.tree_leaves(x0))
@@ -161,6 +161,19 @@ def ensemble(
         Moments.of(found.observed, valid),
         {name: fold_rows(f.add, f.start, found.observed, valid) for name, f in folds.items()},
     )  # fmt: skip
+
+
+def _chosen(problem: Problem, inputs: Inputs, tol: float, fixed: bool, certified: bool) -> Choice:
+    """Return a method for all members, chosen for the first one whose data are valid: a K that is
+    empty, for example, is the failure of that member alone."""
+    wrong: list[InputError] = []
+    for number in inputs.examples():
+        x0, args, begin, end, _ = inputs.member(number)
+        try:
+            return choose(problem, x0, args, begin, end - begin, tol, fixed, certified)
+        except InputError as error:
+            wrong.append(error)
+    raise wrong[0]
 
 
 def _ensemble(

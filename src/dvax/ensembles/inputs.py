@@ -70,17 +70,20 @@ class Inputs(NamedTuple):
             [leaf[k] if own else leaf for leaf, own in zip(self.leaves, self.own, strict=True)]
         )
 
-    def example(self) -> int:
-        """Return the number of the first member with finite values, 0 if there is none."""
+    def examples(self) -> list[int]:
+        """Return the numbers of the first members with finite values, [0] if there is none."""
         finite = np.ones(self.count, bool)
         for leaf, own in zip(self.leaves, self.own, strict=True):
             if own and _tree.is_concrete(leaf) and leaf.dtype.kind in "fc":
                 finite &= np.isfinite(leaf).reshape(self.count, -1).all(axis=1)
-        return int(np.argmax(finite))
+        return np.flatnonzero(finite)[:_EXAMPLES].tolist() or [0]
 
     def rows(self, members: Any) -> list[Any]:
         """Return the leaves that differ, of these members."""
         return [leaf[members] for leaf, own in zip(self.leaves, self.own, strict=True) if own]
+
+
+_EXAMPLES = 8
 
 
 def _is_array(leaf: Any) -> bool:

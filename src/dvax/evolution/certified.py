@@ -281,6 +281,11 @@ def _convolved(a: float, T: float) -> float:
     return T if a == 0.0 else float(np.expm1(min(a * T, 700.0)) / a)
 
 
+def _amount(value: float, before: str) -> str:
+    # `_convolved` limits its exponent, and such numbers say no more.
+    return f"{before}{value:.3g}" if value < 1e100 else "more than 1e100"
+
+
 def _out_of_reach(
     tol: float, reachable: float, growth: _Growth, span: float, why: str
 ) -> InputError:
@@ -289,8 +294,8 @@ def _out_of_reach(
         "dvax.solve(certified_tol)",
         f"{tol:g}",
         f"errors may grow like M e^{{ct}} with M = {M:g} and c = {rate:g}, a defect by "
-        f"M Φ_c(T) = {M * _convolved(rate, span):.3g} over T = {span:g}, and the least "
-        f"bound in reach here is about {reachable:.3g} ({why})",
+        f"{_amount(M * _convolved(rate, span), 'M Φ_c(T) = ')} over T = {span:g}, and the least "
+        f"bound in reach here is {_amount(reachable, 'about ')} ({why})",
         "Choose a larger certified_tol, solve for a shorter time, or find sharper constants: "
         "dvax.verify gives a one-sided rate where possible",
     )

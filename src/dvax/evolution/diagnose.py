@@ -211,8 +211,9 @@ def _escape(stop: Stop) -> Diagnosis:
                 )
     if size > 1e15 * (1.0 + first):
         rate = math.log(size / max(first, 1e-300)) / max(stop.t - t0, 1e-300)
+        at_rate = f", at the mean rate {rate:.3g} per unit of time" if math.isfinite(rate) else ""
         return Diagnosis(
-            f"{grown}: exponential growth, at the mean rate {rate:.3g} per unit of time.",
+            f"{grown}: exponential growth{at_rate}.",
             (Fix("", "", "Check the signs in A and f if x should stay bounded"),),
             size > _OVERFLOWS,
         )
