@@ -161,7 +161,7 @@ def _is_bool(leaf: Any) -> bool:
 
 
 def check_not_integer(name: str, fn: Callable[..., Any], out: Any) -> None:
-    """Raise an `InputError` if `out` = fn(t, x, u, args) has integers, of which JAX has no derivative."""
+    """Raise an `InputError` if `out` = fn(t, x, u, args) has integers, which have no derivative."""
     for leaf in jtu.tree_leaves(out):
         kind = getattr(getattr(leaf, "dtype", None), "kind", "")
         if isinstance(leaf, int) or kind in ("i", "u"):
