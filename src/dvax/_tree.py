@@ -173,7 +173,8 @@ def is_sharded(leaf: Any) -> bool:
 
 def has_only_finite(a: Tree) -> bool:
     """Return whether every entry of a concrete tree is finite, without a compiled program."""
-    return all(first_nonfinite(leaf) is None for leaf in jtu.tree_leaves(a))
+    modules = ((jnp if is_sharded(leaf) else np, leaf) for leaf in jtu.tree_leaves(a))
+    return all(bool(module.isfinite(leaf).all()) for module, leaf in modules)
 
 
 def first_nonfinite(leaf: Any) -> tuple[int, ...] | None:
