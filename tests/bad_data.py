@@ -89,6 +89,10 @@ ARRAYS = {
     "integer": (lambda: s.Box(0.0, np.int64(1)), "Box(upper); int64 1; jnp.asarray(upper, float)"),
     "integers": (lambda: s.Box(0.0, np.arange(2)), "Box(upper); int64; jnp.asarray(upper, float)"),
     "list of text": (lambda: s.Box(0.0, ["1"]), "Box(upper); ['1']; real numbers"),
+    "table of text": (
+        lambda: signals.Table([0.0, 1.0], ["1", "2"]),
+        "Table(values); ['1', '2']; a list or array of numbers",
+    ),
     "list of nothing": (lambda: s.Box(0.0, [None]), "Box(upper); [None]; real numbers"),
     "ragged": (lambda: g.Dense([[1.0], [1.0, 2.0]]), "Dense(matrix); rows of one length"),
     "complex": (lambda: s.Box(1j, 2.0), "Box(lower); 1j; jnp.real(lower)"),

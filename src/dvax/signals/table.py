@@ -79,8 +79,8 @@ class Table(AbstractSignal):
 def _numbers(values: Any, name: str) -> Any:
     try:
         if _tree.is_concrete(values):
-            if np.asarray(values).dtype.kind in "mM":
-                raise TypeError("dates have no unit that t would have")
+            if np.asarray(values).dtype.kind in "mMUS":
+                raise TypeError("dates have no unit that t would have, and texts are no numbers")
             return np.asarray(values, dtype=float)
         return values if hasattr(values, "dtype") else jnp.asarray(values, float)
     except (TypeError, ValueError):
