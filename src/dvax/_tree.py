@@ -215,7 +215,13 @@ def prepare(fn: Callable[..., Any], *arrays: Any) -> jax.Array:
     each operation, which takes as long as thousands of steps."""
     if not is_concrete(arrays) or any(map(is_sharded, arrays)):
         return fn(*arrays)
-    result = np.asarray(fn(*map(np.asarray, arrays)))
+    # NumPy has no weak types: a number given as 1.0 would turn single precision into double.
+    hosts = [np.asarray(a) for a in arrays]
+    is_real = [host.dtype.kind == "f" for host in hosts]
+    if any(is_real):
+        real = jnp.result_type(*(a for a, of in zip(arrays, is_real, strict=True) if of))
+        hosts = [host.astype(real) if of else host for host, of in zip(hosts, is_real, strict=True)]
+    result = np.asarray(fn(*hosts))
     # A Python number takes the type of what it meets, and so does a result of Python numbers.
     are_weak = all(isinstance(a, int | float) or getattr(a, "weak_type", False) for a in arrays)
     if are_weak and result.ndim == 0:

@@ -175,6 +175,16 @@ def test_elliptic_pure_advection_conserves_the_norm():
 
 def test_elliptic_keeps_single_precision_and_differentiates_parameters():
     one = np.float32
+    # A Python number beside single precision, in any of the parameters, keeps it.
+    for given in (
+        {"lengths": one(2.0)},
+        {"diffusion": one(2.0)},
+        {"lengths": np.full(1, one(2.0))},
+    ):
+        for scheme in ("spectral", "differences"):
+            single = generators.Elliptic(8, **given, scheme=scheme)
+            assert single.symbol.dtype == np.float32
+            assert single.apply(jnp.ones(8, one)).dtype == np.float32
     A = generators.Elliptic(8, one(1.0), "periodic", one(0.1), one(0.2), one(0.0))
     assert A.semigroup(one(0.1), jnp.ones(8, one)).dtype == np.float32
 

@@ -196,6 +196,7 @@ def _moving_set(
     def project(t: Any) -> Tree:
         return system.problem.set_at(t, system.args).project(z, system.control)
 
+    # A speed of 0 excludes jumps: the pieces of time beside one have no finite speed.
     jump = jumps(project, knots, span) if K.speed > 0.0 else None
     if jump is not None:
         why = f"proj_{{K(t)}}(1) jumps by {jump[1]:.6g} at t = {jump[0]:.17g}; {_ON_EACH_SIDE}"
