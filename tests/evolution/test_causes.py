@@ -392,3 +392,9 @@ def test_cause_relay_in_x_is_reported_and_can_be_written_as_a_law(name, method):
         smooth, jnp.asarray(x0), 0.0, told + 1e-2, method=dvax.ExpRosenbrock(), rtol=1e-4, atol=1e-6
     )
     assert abs(float(g(sol.xs[-1]))) <= 1.01 * width
+
+
+def test_cause_growth_from_zero_has_no_mean_rate():
+    error = failure(make(lambda t, x, u, args: 3.0 * x + 1.0), x0=jnp.asarray(0.0), t1=1000.0)
+    assert "exponential growth" in error.cause
+    assert "rate" not in error.cause and "inf" not in error.cause

@@ -210,8 +210,10 @@ def _escape(stop: Stop) -> Diagnosis:
                     ),
                 )
     if size > 1e15 * (1.0 + first):
-        rate = math.log(size / max(first, 1e-300)) / max(stop.t - t0, 1e-300)
-        at_rate = f", at the mean rate {rate:.3g} per unit of time" if math.isfinite(rate) else ""
+        at_rate = ""
+        if first > 0 and math.isfinite(size):  # else no mean rate is defined
+            rate = (math.log(size) - math.log(first)) / max(stop.t - t0, 1e-300)
+            at_rate = f", at the mean rate {rate:.3g} per unit of time"
         return Diagnosis(
             f"{grown}: exponential growth{at_rate}.",
             (Fix("", "", "Check the signs in A and f if x should stay bounded"),),
