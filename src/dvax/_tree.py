@@ -171,6 +171,13 @@ def is_sharded(leaf: Any) -> bool:
     return isinstance(leaf, jax.Array) and len(leaf.sharding.device_set) > 1
 
 
+def is_on_host(leaf: Any) -> bool:
+    """Return whether NumPy reads a concrete value without a copy."""
+    if not isinstance(leaf, jax.Array):
+        return True
+    return not is_sharded(leaf) and next(iter(leaf.sharding.device_set)).platform == "cpu"
+
+
 def has_only_finite(a: Tree) -> bool:
     """Return whether every entry of a concrete tree is finite, without a compiled program."""
     modules = ((jnp if is_sharded(leaf) else np, leaf) for leaf in jtu.tree_leaves(a))

@@ -1,6 +1,7 @@
 """What is called again with other numbers compiles nothing."""
 
 import contextlib
+import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
@@ -75,3 +76,42 @@ def test_second_piecewise_linear_run_traces_nothing_and_starts_where_it_should()
     np.testing.assert_allclose(other.xs[-1], expected.xs[-1], atol=1e-8)
     np.testing.assert_array_equal(changed.xs[-1], other.xs[-1])
     assert not np.allclose(other.xs[-1], first.xs[-1], atol=1e-3)
+
+
+@once
+def coupled():
+    """A law that a solver iterates for, on a set with switch functions."""
+    return dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),
+        K=dvax.sets.Polyhedron(jnp.array([[1.0, 1.0], [-1.0, 0.0]]), jnp.array([0.6, 0.0])),
+        f=lambda t, x, u, load: load * jnp.cos(t) - 0.5 * x + u,
+        h=lambda t, x, u, load: x - jnp.array([[0.5, 0.3], [-0.3, 0.5]]) @ u,
+    )  # fmt: skip
+
+
+def read(load):
+    sol = dvax.solve(
+        coupled(), jnp.array([0.2, -0.1]), 0.0, 2.0, load, [1.0, 2.0], dense=True,
+        method=dvax.DormandPrince(),
+    )  # fmt: skip
+    x, u = sol.evaluate(2.0)
+    np.testing.assert_allclose(x, sol.xs[-1], rtol=1e-9)
+    np.testing.assert_allclose(u, sol.us[-1], rtol=1e-7)
+    np.testing.assert_allclose(sol.evaluate(np.array([[2.0, 1.0]]))[0][0], sol.xs[::-1], rtol=1e-9)
+    return sol.regimes(), dvax.sensitivity.kinks(sol)
+
+
+def test_what_is_read_from_a_second_run_compiles_nothing():
+    read(3.0)
+    # The switch functions of K are counted by tracing K.
+    with nothing_is("compile"):
+        regimes, kinks = read(2.5)
+    assert len(regimes.times) == len(regimes.positive) + 1 and len(kinks) > 0
+
+
+def test_first_responses_of_a_law_that_iterates_are_one_program():
+    problem = dataclasses.replace(coupled(), K=dvax.sets.Ball(jnp.zeros(2), 0.25))
+    sol = dvax.solve(problem, jnp.array([0.2, -0.1]), 0.0, 0.1, 3.0, method=dvax.DormandPrince())
+    STAGES.clear()
+    assert np.isfinite(sol.us).all()
+    assert STAGES.count("compile") == 1, STAGES

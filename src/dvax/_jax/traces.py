@@ -1,7 +1,9 @@
 """The identity of the trace in which the current code runs."""
 
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
+import jax
 from jax.extend.core import get_opaque_trace_state
 
 
@@ -9,3 +11,17 @@ def current_trace() -> Any:
     """Return an object that is equal to another one if both were made in the same trace: values that a
     function computed in one trace must not be used in another."""
     return get_opaque_trace_state()
+
+
+_OUTSIDE = current_trace()
+"""That of a program's start: dvax is imported outside of transformations."""
+
+
+def evaluates() -> AbstractContextManager[None]:
+    """Return a context in which a call with concrete arguments is evaluated, though a transformation of
+    other values runs.
+
+    Outside of transformations it is empty: `jax.ensure_compile_time_eval` would compile a program for
+    each operation on constants of a function that is traced in it.
+    """
+    return nullcontext() if current_trace() == _OUTSIDE else jax.ensure_compile_time_eval()

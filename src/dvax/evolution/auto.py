@@ -12,6 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from .._jax.traces import evaluates
 from .._tree import Label, Tree
 from ..errors import InputError
 from ..generators import (
@@ -320,7 +321,7 @@ def _eigenvalues(
     """Return the eigenvalues of A + Df̃ at x = 0, for u ∈ h − 0 inside K, and for u held at the
     boundary; None where the code of f or h closes over traced values. The `kind` says whether A + Df̃
     is a "matrix", or "diagonal", or Df̃ alone, which is diagonal ("without A")."""
-    with jax.ensure_compile_time_eval():
+    with evaluates():
         found = _spectra(problem, t0, x0, args, kind)
     return None if found is None else np.concatenate(found).astype(complex).tolist()
 

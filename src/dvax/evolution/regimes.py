@@ -1,17 +1,20 @@
 """The intervals of a trajectory on which the active constraints of K do not change."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 
 from .._dataset import dataset, described
+from .after_run import at_rows, steps_at
 from .flow import Flow
 from .locate_event import locate_event
-from .loop import Record
+from .outcome import Record
+from .plan import Plan
+from .setup import Setup, as_arrays
 from .stepper import dense_output, one_sided_time
 
 _SAMPLES = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -46,13 +49,24 @@ class Regimes(NamedTuple):
         return dataset("Regimes.to_xarray", {**ends, "positive": positive})
 
 
-def regimes(flow: Flow, method: Any, records: Record, count: int) -> Regimes:
-    """Return the regimes of the first `count` ≥ 1 steps of a flow whose set has switch functions."""
-    steps = jtu.tree_map(lambda leaf: leaf[:count], records)
+def switch_count(setup: Setup) -> int | None:
+    """Return the number of the switch functions of the set K of a run, None if it has none at all."""
+    problem, x0, args = setup.problem, setup.x0, as_arrays(setup.args)
+
+    def switches(t: Any, x: Any) -> Any:
+        return problem.set_at(t, args).switches(problem.zero_control(x), problem.spaces(x)[1])
+
+    found = jax.eval_shape(switches, setup.number("t0"), x0)
+    return None if found is None else sum(leaf.size for leaf in found)
+
+
+def regimes(setup: Setup, plan: Plan, records: Record, count: int) -> Regimes:
+    """Return the regimes of the first `count` ≥ 1 steps of a run whose set has switch functions."""
+    steps = steps_at(records, slice(count))
     starts, lengths = np.asarray(steps.start), np.asarray(steps.length)
-    run = steps.start[0], steps.start[-1] + steps.length[-1]
-    changes = jax.jit(jax.vmap(lambda step: _changes(flow, method, step, run)))
-    events, before, after = map(np.asarray, changes(steps))
+    end = starts[-1] + lengths[-1]
+    run = np.full(count, starts[0]), np.full(count, end)
+    events, before, after = at_rows(_changes_in_steps, setup, plan, (steps, run))
     times, rows = [starts[0]], [before[0]]
     for k in range(count):
         # Jumps of data lie between two steps, and events of the trajectory inside a step.
@@ -60,7 +74,7 @@ def regimes(flow: Flow, method: Any, records: Record, count: int) -> Regimes:
             if np.any(row != rows[-1]):
                 times.append(time)
                 rows.append(row)
-    return Regimes(np.array([*times, starts[-1] + lengths[-1]]), np.array(rows))
+    return Regimes(np.array([*times, end]), np.array(rows))
 
 
 def switches_along(flow: Flow, method: Any, step: Record, run: Any) -> Callable[..., jax.Array]:
@@ -78,15 +92,17 @@ def switches_along(flow: Flow, method: Any, step: Record, run: Any) -> Callable[
     return at
 
 
-def _changes(
-    flow: Flow, method: Any, step: Record, run: tuple[Any, Any]
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return the time of the first sign change in a step, and the one-sided signs at its two ends."""
+def _changes_in_steps(setup: Setup, plan: Plan, rows: tuple[Record, Any]) -> Any:
+    """Return the time of the first sign change in each step, and the one-sided signs at its ends."""
+    return jax.vmap(partial(_changes, plan.flow(setup), setup.method))(*rows)
+
+
+def _changes(flow: Flow, method: Any, step: Record, run: tuple[Any, Any]) -> Any:
     end, at = step.start + step.length, switches_along(flow, method, step, run)
-    values = [
-        at(jnp.asarray(theta, end.dtype), one_sided_time(step.start, end, theta, run))
-        for theta in _SAMPLES
-    ]
+    thetas = jnp.asarray(_SAMPLES, end.dtype)
+    times = jnp.stack([one_sided_time(step.start, end, theta, run) for theta in _SAMPLES])
+    # As a loop: each evaluation site of a law that iterates takes its time to compile.
+    values = list(jax.lax.map(lambda sample: at(*sample), (thetas, times)))
     if values[0].size == 0:
         return jnp.full_like(end, jnp.inf), values[0] > 0, values[0] > 0
     event = step.start + locate_event(_SAMPLES, values, at) * step.length

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -15,6 +16,7 @@ from .._jax.traces import current_trace
 from .._repr import last_text, table, value_text
 from .._tree import Tree
 from ..errors import Fix, SolveError, input_error
+from .after_run import at_rows, steps_at
 from .bounds import Bounds
 from .dataset import solution_dataset
 from .diagnose import failure
@@ -25,11 +27,11 @@ from .outcome import Record
 from .piecewise.method import PiecewiseLinear
 from .piecewise.trajectory import Trajectory, signs
 from .plan import Plan
-from .regimes import Regimes, regimes
+from .regimes import Regimes, regimes, switch_count
 from .responses import Responses
 from .results import RESULTS, is_success
 from .saved_responses import Saved, saved_responses
-from .setup import Setup
+from .setup import Setup, as_arrays
 from .stepper import dense_output
 
 if TYPE_CHECKING:
@@ -185,6 +187,9 @@ class Solution(eqx.Module):
                 "Solve with dense=True, or list the times in ts=",
             )
         self._check_inside(t)
+        records, are_concrete = self.records, _tree.is_concrete(t, self.records)
+        if isinstance(records, Record) and are_concrete and not _tree.is_sharded(records.start):
+            return self._from_records(records, np.asarray(t, records.start.dtype))
         if not jnp.ndim(t):
             return self._at(t)
         times = jnp.ravel(jnp.asarray(t, self.ts.dtype))
@@ -196,6 +201,19 @@ class Solution(eqx.Module):
         axes = jnp.shape(t)
         return jax.tree_util.tree_map(lambda leaf: leaf.reshape(axes + leaf.shape[1:]), rows)
 
+    def _from_records(self, records: Record, times: np.ndarray) -> tuple[Tree, Tree]:
+        """Return x and u at concrete times, by a compiled program that is kept."""
+        flat = times.ravel()
+        if not flat.size:
+            return jax.vmap(self._at)(times)
+        which = np.searchsorted(np.asarray(records.start), flat, side="right") - 1
+        steps = steps_at(records, np.maximum(which, 0))
+        assert self.plan is not None
+        rows = at_rows(_inside_steps, self.setup, self.plan, (flat, steps))
+        return jax.tree_util.tree_map(
+            lambda leaf: jnp.asarray(leaf.reshape(times.shape + leaf.shape[1:])), rows
+        )
+
     def _at(self, t: Any) -> tuple[Tree, Tree]:
         """Return x and u at one time."""
         if isinstance(self.records, Trajectory):
@@ -204,30 +222,19 @@ class Solution(eqx.Module):
             x0, u0 = self.setup.x0, self.us[0]
             u = self.flow.operator.inverse(y.reshape(u0.shape).astype(u0.dtype))
             return x.reshape(jnp.shape(x0)).astype(self.xs.dtype), u
-        if _tree.is_concrete(t):
-            return self._within_step(t)
+        assert isinstance(self.records, Record)
+        flow, records, setup = self.flow, self.records, self.setup
 
         # Outline the call under a name: if f uses the trajectory of another run as data, enclosures
         # recognise this name and skip the call.
         def dvax_evaluate(t: Any) -> tuple[Tree, Tree]:
-            return self._within_step(t)
+            t = jnp.asarray(t, records.start.dtype)
+            i = jnp.clip(jnp.searchsorted(records.start, t, side="right") - 1, 0)
+            return _inside_step(
+                flow, setup, t, jax.tree_util.tree_map(lambda leaf: leaf[i], records)
+            )
 
         return jax.jit(dvax_evaluate)(t)
-
-    def _within_step(self, t: Any) -> tuple[Tree, Tree]:
-        """Return x and u at t, from the record of the step that contains t."""
-        flow, records = self.flow, self.records
-        assert isinstance(records, Record)
-        t = jnp.asarray(t, records.start.dtype)
-        i = jnp.clip(jnp.searchsorted(records.start, t, side="right") - 1, 0)
-        step = jax.tree_util.tree_map(lambda leaf: leaf[i], records)
-        theta = (t - step.start) / step.length
-        run = self.setup.number("t0"), self.setup.number("t1")
-        method = self.setup.method
-        assert not isinstance(method, Implicit | PiecewiseLinear)
-        x = dense_output(method, flow, step, flow.guess(step.x0), run)(theta)
-        rate = flow.rate(t, x, None)
-        return x, flow.operator.inverse(rate.y)
 
     def _check_inside(self, t: Any) -> None:
         records = self.records
@@ -285,12 +292,11 @@ class Solution(eqx.Module):
             )  # fmt: skip
         if isinstance(self.records, Trajectory):
             return signs(self.records)
-        flow = self.flow
-        x0, t0 = self.setup.x0, self.setup.number("t0")
-        if flow.switches(t0, x0, flow.problem.zero_control(x0)) is None:
+        if switch_count(self.setup) is None:
+            K = self.setup.problem.set_at(self.setup.number("t0"), as_arrays(self.setup.args))
             raise input_error(
                 "Solution.regimes",
-                f"K of type {type(flow.problem.set_at(t0, flow.args)).__name__}",
+                f"K of type {type(K).__name__}",
                 "the set must have switch functions (dvax.sets.AbstractSet.switches)",
                 "Write K as a set that has them, such as dvax.sets.Polyhedron",
             )
@@ -299,8 +305,8 @@ class Solution(eqx.Module):
             from .solve import run_again
 
             return run_again(self, None, dense=True).regimes()
-        assert not isinstance(self.setup.method, Implicit | PiecewiseLinear)
-        return regimes(flow, self.setup.method, self.records, int(self.stats["steps"]))
+        assert self.plan is not None
+        return regimes(self.setup, self.plan, self.records, int(self.stats["steps"]))
 
     def raise_if_failed(self) -> "Solution":
         """Return this solution if the run succeeded, else raise a `dvax.SolveError` that contains
@@ -403,6 +409,20 @@ def _message(result: RESULTS) -> str:
     if failed.ndim == 0:
         return str(RESULTS[result])
     return f"{failed.size} runs, {int(failed.sum())} failed"
+
+
+def _inside_step(flow: Flow, setup: Setup, t: Any, step: Record) -> tuple[Tree, Tree]:
+    """Return x and u at a time in a step."""
+    assert not isinstance(setup.method, Implicit | PiecewiseLinear)
+    run = setup.number("t0"), setup.number("t1")
+    theta = (t - step.start) / step.length
+    x = dense_output(setup.method, flow, step, flow.guess(step.x0), run)(theta)
+    return x, flow.operator.inverse(flow.rate(t, x, None).y)
+
+
+def _inside_steps(setup: Setup, plan: Plan, rows: tuple[jax.Array, Record]) -> tuple[Tree, Tree]:
+    """Return x and u at each of several times, each of them with its step."""
+    return jax.vmap(partial(_inside_step, plan.flow(setup), setup))(*rows)
 
 
 def _defect_text(solution: Solution) -> str:

@@ -6,17 +6,19 @@ and u is not differentiable at that time only. If s *stays* at zero, there are o
 derivatives from then on: `jax.grad` returns that of the constrained side.
 """
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 
 from ..errors import input_error
 from ..evolution import Solution
+from ..evolution.after_run import at_rows, steps_at
 from ..evolution.outcome import Record
-from ..evolution.regimes import switches_along
+from ..evolution.plan import Plan
+from ..evolution.regimes import switch_count, switches_along
+from ..evolution.setup import Setup
 
 _SAMPLES_PER_STEP = 8
 """Number of evaluations of the switches in a step."""
@@ -83,7 +85,7 @@ def kinks(sol: Solution, *, tol: float = 1e-6) -> list[Kink]:
             "Solve with dense=True and an exponential method",
         )
     count = int(sol.stats["steps"])
-    if count == 0 or not _has_switches(sol):
+    if count == 0 or not switch_count(sol.setup):
         return []
     times, values = _sample_switches(sol, count)
     result: list[Kink] = []
@@ -92,31 +94,32 @@ def kinks(sol: Solution, *, tol: float = 1e-6) -> list[Kink]:
     return sorted(result)
 
 
-def _has_switches(sol: Solution) -> bool:
-    flow, x0, t0 = sol.flow, sol.setup.x0, sol.setup.number("t0")
-    switches = flow.switches(t0, x0, flow.problem.zero_control(x0))
-    return switches is not None and switches.size > 0
-
-
 def _sample_switches(sol: Solution, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return (times, values of the switches at these times)."""
-    flow, method = sol.flow, sol.setup.method
-    steps = jtu.tree_map(lambda leaf: leaf[:count], sol.records)
-    run = steps.start[0], steps.start[-1] + steps.length[-1]
-    thetas = jnp.arange(_SAMPLES_PER_STEP, dtype=steps.start.dtype) / _SAMPLES_PER_STEP
-
-    def sample(step, theta):
-        t = step.start + theta * step.length
-        return t, switches_along(flow, method, step, run)(theta)
-
-    sample_steps = jax.jit(jax.vmap(lambda step: jax.vmap(lambda th: sample(step, th))(thetas)))
-    last = jtu.tree_map(lambda leaf: leaf[-1], steps)
-    times, values = sample_steps(steps)
-    end, at_end = jax.jit(sample)(last, jnp.ones((), thetas.dtype))
+    assert isinstance(sol.records, Record) and sol.plan is not None
+    steps = steps_at(sol.records, slice(count))
+    end = steps.start[-1] + steps.length[-1]
+    run = np.full(count, steps.start[0]), np.full(count, end)
+    values, last = at_rows(_switches_in_steps, sol.setup, sol.plan, (steps, run))
+    thetas = np.arange(_SAMPLES_PER_STEP) / _SAMPLES_PER_STEP
+    times = np.asarray(steps.start)[:, None] + thetas * np.asarray(steps.length)[:, None]
     return (
-        np.append(np.asarray(times).ravel(), np.asarray(end)),
-        np.concatenate([np.asarray(values).reshape(times.size, -1), np.asarray(at_end)[None]]),
+        np.append(times.ravel(), end),
+        np.concatenate([values.reshape(times.size, -1), last[-1:]]),
     )
+
+
+def _switches_in_steps(setup: Setup, plan: Plan, rows: tuple[Record, Any]) -> Any:
+    """Return the switches at some positions in each of several steps, and at its end."""
+    flow = plan.flow(setup)
+
+    def sample(step: Record, run: Any) -> tuple[jax.Array, jax.Array]:
+        at = switches_along(flow, setup.method, step, run)
+        thetas = jnp.arange(_SAMPLES_PER_STEP + 1, dtype=step.start.dtype) / _SAMPLES_PER_STEP
+        values = jax.lax.map(at, thetas)
+        return values[:-1], values[-1]
+
+    return jax.vmap(sample)(*rows)
 
 
 def _kinks_of_switch(times: np.ndarray, s: np.ndarray, switch: int, tol: float) -> list[Kink]:

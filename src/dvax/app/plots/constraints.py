@@ -1,9 +1,9 @@
 """When the constraints of K are active, from a solution: spans of time, or shares of the entries."""
 
+from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
@@ -12,6 +12,10 @@ from dvax.app.plots.downsample import edges
 from dvax.app.plots.panels import AbstractPanel, Curve, Panel
 from dvax.app.plots.span_panel import SpanPanel, Spans
 from dvax.evolution import Solution
+from dvax.evolution.after_run import at_rows
+from dvax.evolution.plan import Plan
+from dvax.evolution.regimes import switch_count
+from dvax.evolution.setup import Setup, as_arrays
 
 _MOST_ROWS = 12
 """Up to this many constraints that are ever active have a row each."""
@@ -23,18 +27,24 @@ _KINDS = (_LOWER, _UPPER, _ACTIVE)
 
 def box_rows(sol: Solution, times: np.ndarray) -> tuple[Tree, Tree] | None:
     """Return the bounds of K at these times, trees of rows shaped like y, or None if K is no box."""
-    flow = sol.flow
-    problem, args = flow.problem, flow.args
-    like = problem.zero_control(sol.setup.x0)
-    if problem.set_at(sol.setup.number("t0"), args).intervals(like) is None:
+    setup = sol.setup
+    if jax.eval_shape(partial(_bounds, setup), setup.number("t0")) is None:
         return None
+    return at_rows(_bounds_at, setup, _plan(sol), times.astype(sol.ts.dtype))
 
-    def at(t: Any) -> Any:
-        return problem.set_at(t, args).intervals(like)
 
-    rows = jax.jit(jax.vmap(at))(jnp.asarray(times, sol.ts.dtype))
-    lower, upper = jtu.tree_map(np.asarray, rows)
-    return lower, upper
+def _bounds(setup: Setup, t: Any) -> tuple[Tree, Tree] | None:
+    """Return the bounds of K at one time, None if it is no box."""
+    problem = setup.problem
+    return problem.set_at(t, as_arrays(setup.args)).intervals(problem.zero_control(setup.x0))
+
+
+def _bounds_at(setup: Setup, _: Plan, times: jax.Array) -> Any:
+    return jax.vmap(partial(_bounds, setup))(times)
+
+
+def _plan(sol: Solution) -> Plan:
+    return Plan.of(sol.setup) if sol.plan is None else sol.plan
 
 
 def constraint_panel(
@@ -67,33 +77,37 @@ def _signs(
     sol: Solution, times: np.ndarray, rows: tuple[Tree, Tree], box: Any, entries: list[str]
 ) -> tuple[np.ndarray, np.ndarray, list[Label]] | None:
     """Return the ends of intervals, and whether each constraint is active in each of them."""
-    flow, x0 = sol.flow, sol.setup.x0
-    like = flow.problem.zero_control(x0)
+    like = sol.setup.problem.zero_control(sol.setup.x0)
+    has_switches = switch_count(sol.setup) is not None
     saved = len(sol.ts) >= 2
-    if sol.records is not None and not (saved and len(entries) > _MOST_LOCATED):
-        zero = flow.switches(sol.setup.number("t0"), x0, like)
-        if zero is not None:
-            found = sol.regimes()
-            labels = _labels(like, entries, found.positive.shape[1], box is not None)
-            return found.times, ~found.positive, labels
+    if has_switches and sol.records is not None and not (saved and len(entries) > _MOST_LOCATED):
+        found = sol.regimes()
+        labels = _labels(like, entries, found.positive.shape[1], box is not None)
+        return found.times, ~found.positive, labels
     ends = edges(times)
     ends[[0, -1]] = times[[0, -1]]
     if box is not None:
         active = [_on_box(y, *pair) for y, *pair in zip(*map(jtu.tree_leaves, (rows[1], *box)))]
         columns = np.concatenate(active, axis=1)
         return ends, columns, _labels(like, entries, columns.shape[1], True)
-    if flow.switches(sol.setup.number("t0"), x0, like) is None:
+    if not has_switches:
         return None
+    given = times.astype(sol.ts.dtype), rows[0]
+    columns = ~at_rows(_positive, sol.setup, _plan(sol), given)
+    return ends, columns, _labels(like, entries, columns.shape[1], False)
 
-    def positive(row: Any) -> Any:
+
+def _positive(setup: Setup, plan: Plan, rows: tuple[jax.Array, Tree]) -> jax.Array:
+    """Return whether each switch function of K is positive, at each of several times."""
+    flow = plan.flow(setup)
+
+    def at(row: Any) -> Any:
         t, x = row
         values = flow.switches(t, x, flow.rate(t, x, flow.guess(x)).z)
         assert values is not None
         return values > 0
 
-    signs = jax.jit(lambda rows: jax.lax.map(positive, rows))
-    columns = ~np.asarray(signs((jnp.asarray(times, sol.ts.dtype), rows[0])))
-    return ends, columns, _labels(like, entries, columns.shape[1], False)
+    return jax.lax.map(at, rows)
 
 
 def _on_box(y: Any, lower: Any, upper: Any) -> np.ndarray:
