@@ -19,6 +19,7 @@ from ..evolution.event_arguments import check_events
 from ..evolution.method import AbstractMethod
 from ..evolution.picard import Picard
 from ..evolution.setup import as_arrays
+from ..evolution.several_solutions import warn_of_several_solutions
 from ..problem import Problem
 from ..vi import AbstractSolver, Auto
 from .collect import Collected, collect, fold_rows
@@ -151,7 +152,9 @@ def ensemble(
     if _tree.is_concrete(inputs.leaves, first.shared):
         kept = Collected(inputs.count, keep, folds, progress)
         if collect(kept, first, inputs, np.arange(inputs.count), each):
-            return _ensemble(kept, choice, program, inputs, each, problem, options)
+            members = _ensemble(kept, choice, program, inputs, each, problem, options)
+            warn_of_several_solutions(problem, begin, x0, own_args, constants)
+            return members
     # Within `jax.grad` or `jax.jit`.
     found = program(choice).traced(inputs.rows(slice(None)))
     valid = ~found.failed

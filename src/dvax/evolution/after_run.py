@@ -63,6 +63,7 @@ def at_rows(function: Function, setup: Setup, plan: Plan, rows: Tree) -> Tree:
 
     The number of rows in a block is a power of two, so that few programs serve all numbers of rows.
     """
+    rows = jtu.tree_map(_on_host, rows)
     leaves = jtu.tree_leaves(rows)
     count = len(leaves[0])
     entries = sum(leaf.size for leaf in leaves) // count
@@ -77,13 +78,14 @@ def at_rows(function: Function, setup: Setup, plan: Plan, rows: Tree) -> Tree:
 
 
 def steps_at(records: Record, which: Any) -> Record:
-    """Return the records of these steps (indices or a slice), as NumPy arrays where they are on the
-    host: each operation of JAX on another number of steps is another program."""
+    """Return the records of these steps (indices or a slice)."""
+    return jtu.tree_map(lambda leaf: _on_host(leaf)[which], records)
 
-    def rows(leaf: jax.Array) -> Any:
-        return np.asarray(leaf)[which] if _tree.is_on_host(leaf) else leaf[which]
 
-    return jtu.tree_map(rows, records)
+def _on_host(leaf: Any) -> Any:
+    """Return an array as one of NumPy where it is on the host: each operation of JAX on another number
+    of rows is another program."""
+    return np.asarray(leaf) if _tree.is_on_host(leaf) else leaf
 
 
 def _batched(numbers: list[Any], setting: Any, signature: Signature) -> Any:

@@ -45,6 +45,7 @@ from .piecewise.propagate import propagate
 from .results import RESULTS, is_success
 from .rows import cut
 from .setup import Options, Setup, as_arrays
+from .several_solutions import warn_of_several_solutions
 from .signature import flat
 from .solution import Solution
 from .streaming import check_save, stream
@@ -195,7 +196,9 @@ def solve(
         warn_precision(x0, rtol)
     call, choice = _chosen(call)
     setup, options = arranged(call, choice.method)
-    return _run(choice, setup, None if ts is None else _times(ts), options, throw)
+    solution = _run(choice, setup, None if ts is None else _times(ts), options, throw)
+    warn_of_several_solutions(problem, t0, x0, args, constants)
+    return solution
 
 
 def _run(choice: Choice, setup: Setup, times: Any, options: Options, throw: bool) -> Solution:
