@@ -153,7 +153,10 @@ def ensemble(
         kept = Collected(inputs.count, keep, folds, progress)
         if collect(kept, first, inputs, np.arange(inputs.count), each):
             members = _ensemble(kept, choice, program, inputs, each, problem, options)
-            warn_of_several_solutions(problem, begin, x0, own_args, constants)
+            # Data of the others may be invalid.
+            if (solved := np.flatnonzero(~np.asarray(members.failed))).size:
+                x0, own_args, begin, *_ = inputs.member(solved[0])
+                warn_of_several_solutions(problem, begin, x0, own_args, constants)
             return members
     # Within `jax.grad` or `jax.jit`.
     found = program(choice).traced(inputs.rows(slice(None)))

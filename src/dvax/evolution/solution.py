@@ -247,7 +247,7 @@ class Solution(eqx.Module):
         if isinstance(records, Trajectory):
             end = records.end
         else:
-            end = starts[last] + records.length[last]
+            end = starts[last] + np.asarray(records.length)[last]
         outside = times[~((first <= times) & (times <= end))]
         if outside.size:
             raise input_error(

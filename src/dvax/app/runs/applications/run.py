@@ -1,6 +1,6 @@
 """A run of an application, in segments of its saved times, which are written while the run goes on."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,6 +54,7 @@ class ApplicationRun(AbstractRun):
         self.end: Solution | None = None
         self.bound: Certificate | None = None
         self.unsaved: dict[int, Solution] = {}
+        self.unsaved_bytes = 0
         self.partial: Solution | None = None
         self.rows: list[dict[str, Variable]] = []
         self.store: FrameStore | None = None
@@ -87,6 +88,7 @@ class ApplicationRun(AbstractRun):
             # The piece in which a solve failed has fewer rows, and no run can resume after it.
             if len(piece.ts) == len(plan.times[number * length : (number + 1) * length]):
                 self.unsaved[number] = piece
+                self.unsaved_bytes += _bytes(piece)
             else:
                 self.partial = piece
             if is_first:
@@ -101,7 +103,7 @@ class ApplicationRun(AbstractRun):
                 "progress", t=t - begin, t_end=float(plan.times[-1]) - begin, steps=self.steps,
                 method=self.method, unit=plan.time_unit,
             )  # fmt: skip
-            if self.checkpoints.is_due() or _bytes(self.unsaved.values()) > _BUFFER_BYTES:
+            if self.checkpoints.is_due() or self.unsaved_bytes > _BUFFER_BYTES:
                 self.try_checkpoint()
         self._stage("writing the results")
         self._flush()
@@ -163,6 +165,7 @@ class ApplicationRun(AbstractRun):
             next_dt = None if fixed else float(piece.stats["next_dt"])
             self.checkpoints.save(number, arrays, about | {"next_dt": next_dt})
             del self.unsaved[number]
+            self.unsaved_bytes -= _bytes(piece)
 
     def reached(self) -> str:
         if self.plan is None or self.end is None or not self.is_shown:
@@ -231,9 +234,9 @@ class ApplicationRun(AbstractRun):
         self.event("stage", stage=words)
 
 
-def _bytes(pieces: Iterable[Solution]) -> int:
-    """Return the size of the rows of these pieces."""
-    return sum(np.asarray(array).nbytes for piece in pieces for array in to_checkpoint(piece)[0])
+def _bytes(piece: Solution) -> int:
+    """Return the size of the rows of a piece."""
+    return sum(np.asarray(array).nbytes for array in to_checkpoint(piece)[0])
 
 
 _ORDER = "variable_order"

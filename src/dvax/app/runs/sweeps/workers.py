@@ -78,6 +78,10 @@ def cluster(address: str | None, workers: int, threads: int) -> Iterator[Any]:
         tempfile.TemporaryDirectory(prefix="dvax-sweep-") as folder,
         dask.config.set({
             "distributed.nanny.pre-spawn-environ": environment,
+            # Ctrl-C in a terminal reaches all processes. This one ends the workers.
+            "distributed.worker.preload": [
+                "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+            ],
             "distributed.worker.memory.target": False,
             "distributed.worker.memory.spill": False,
             "distributed.worker.memory.pause": False,
