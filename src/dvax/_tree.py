@@ -87,6 +87,8 @@ def _zeros(leaf: Any) -> jax.Array:
     # JAX would compile a program for each shape. A large array is better made on its device.
     if is_concrete(leaf) and isinstance(leaf, jax.Array) and leaf.size <= _MOST_ON_HOST:
         return prepare(np.zeros_like, leaf)
+    if isinstance(leaf, jax.ShapeDtypeStruct) and leaf.size <= _MOST_ON_HOST:
+        return jnp.asarray(np.zeros(leaf.shape, leaf.dtype))
     return jnp.zeros_like(leaf)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from . import _control_shape, _knots, _tree, _user_code
 from ._jax import outlined
+from ._once import once_per_object
 from ._tree import Tree
 from .errors import InputError, InputProblem, Problems, input_error
 from .generators import AbstractGenerator
@@ -168,7 +169,7 @@ class Problem(eqx.Module):
         state = default_space(x) if self.state_space is None else self.state_space
         if self.control_space is not None:
             return state, self.control_space
-        zero = _control_shape.control_zero(self.P, self.K, x)
+        zero = _control_zero(self, x)
         return state, state if zero is None else default_space(zero)
 
     def frozen(self, t: Any, x: Tree, args: Any = None) -> "FrozenOperator":
@@ -376,10 +377,30 @@ class Problem(eqx.Module):
     def zero_control(self, x: Tree) -> Tree:
         """Return the zero of the control space, in the floating type of x."""
         if self.control_space is None:
-            zero = _control_shape.control_zero(self.P, self.K, x)
+            zero = _control_zero(self, x)
             return _tree.zeros_like(x) if zero is None else zero
         dtype = jnp.result_type(*jax.tree_util.tree_leaves(x))
         return jax.tree_util.tree_map(lambda leaf: leaf.astype(dtype), self.control_space.zeros())
+
+
+def _control_zero(problem: Problem, x: Tree) -> Tree | None:
+    """Return the zero of the control space that P and K determine, or None, found once for a shape."""
+    leaves, tree = jax.tree_util.tree_flatten(x)
+    known = _control_shapes(problem)
+    key = tree, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+    if key not in known:
+        zero = _control_shape.control_zero(problem.P, problem.K, x)
+        # Without values: an array may belong to a trace.
+        known[key] = jax.tree_util.tree_map(
+            lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), zero
+        )
+    return _tree.zeros_like(known[key])
+
+
+@once_per_object
+def _control_shapes(problem: Problem) -> dict[Any, Any]:
+    """Return a table of the shapes of u, one for each shape of x."""
+    return {}
 
 
 @eqx.filter_jit

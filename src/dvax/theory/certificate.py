@@ -21,17 +21,20 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
 from .._dataset import Variable, dataset, described
+from .._once import once_per_object
 from .._repr import is_known, last_text, table, value_text
 from ..errors import InputProblem, Problems, input_error
 from ..evolution import Implicit, Solution, between, disturbance, gronwall
 from ..evolution.defect import ROUNDINGS
 from ..evolution.setup import as_arrays
 from ..evolution.solve import run_again
-from ..generators import AbstractGenerator, AbstractMatrixFree, Product
+from ..generators import AbstractGenerator, AbstractMatrixFree, Growth, Product
+from ..operators import AbstractOperator, Spectrum
 from ..problem import Problem
 from .constants import Constants
 from .domain import Domain
@@ -403,21 +406,40 @@ def _initial_errors(initial_error: Any, c: Constants, dtype: Any) -> tuple[Any, 
 def _status_of_structure(problem: Problem, sol: Solution, c: Constants) -> Status:
     """Return "proved" if M, ω, m_P and ‖P⁻¹‖ are at least as pessimistic as the values proved from A
     and P. Sharper values may hold as well, but then they are declared."""
-    x0, args = sol.setup.x0, sol.setup.args
-    state, control = problem.spaces(x0)
-    growth = problem.generator(args).growth(state)
-    spectrum = problem.operator(args).spectrum(control)
+    growth, spectrum, declared = _structure(problem, sol.setup.x0, sol.setup.args)
     pairs = (
         (c.M, growth.M),
         (c.omega, growth.omega),
         (c.norm_P_inv, spectrum.norm_P_inv),
         (spectrum.m_P, c.m_P),
     )
-    if is_declared(problem.generator(args)) or spectrum.declared or not _tree.is_concrete(pairs):
+    if declared or spectrum.declared or not _tree.is_concrete(pairs):
         return "declared"
     rtol = 1e-9  # rounding error of an eigenvalue
     covered = [float(a) >= float(b) - rtol * abs(float(b)) for a, b in pairs]
     return "proved" if all(covered) else "declared"
+
+
+def _structure(problem: Problem, x0: Any, args: Any) -> tuple[Growth, Spectrum, bool]:
+    """Return the growth of A, the spectrum of P, and whether the numerical range of A is declared.
+
+    They are kept where A and P do not depend on args: pieces of a run are bounded one by one."""
+    given = isinstance(problem.A, AbstractGenerator) and isinstance(problem.P, AbstractOperator)
+    key = str(jtu.tree_map(jnp.shape, x0)), str(_tree.dtype(x0))
+    if given and key in _structures(problem):
+        return _structures(problem)[key]
+    state, control = problem.spaces(x0)
+    A, P = problem.generator(args), problem.operator(args)
+    found = A.growth(state), P.spectrum(control), is_declared(A)
+    if given and _tree.is_concrete(found):
+        _structures(problem)[key] = found
+    return found
+
+
+@once_per_object
+def _structures(problem: Problem) -> dict[Any, tuple[Growth, Spectrum, bool]]:
+    """Return a table of the structures of a problem, one for each shape of the state."""
+    return {}
 
 
 def is_declared(A: AbstractGenerator) -> bool:

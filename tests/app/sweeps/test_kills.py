@@ -42,8 +42,9 @@ def started(file, out, *more):
     program = str(Path(sys.executable).with_name("dvax"))
     command = [program, "sweep", str(file), "-o", str(out), "--allow-code"]
     return subprocess.Popen(
-        [*command, *more], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+        [*command, *more], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        start_new_session=True,
+    )  # fmt: skip
 
 
 def ended(process):
@@ -112,8 +113,15 @@ def test_killed_workers_lose_no_member(file, quiet, tmp_path):
     assert_same(out, quiet)
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_sweep_that_ends_early_goes_on(file, quiet, tmp_path, number):
+@pytest.mark.parametrize(
+    ("number", "send"),
+    [
+        (signal.SIGKILL, os.kill), (signal.SIGTERM, os.kill), (signal.SIGINT, os.kill),
+        # Ctrl-C in a terminal.
+        (signal.SIGINT, os.killpg),
+    ],
+)  # fmt: skip
+def test_sweep_that_ends_early_goes_on(file, quiet, tmp_path, number, send):
     out, chance, ends = tmp_path / "out", random.Random(int(number)), []
     for attempt in range(40):
         process = started(file, out, *(["--resume"] if out.exists() else []), "--workers", "2")
@@ -121,7 +129,7 @@ def test_sweep_that_ends_early_goes_on(file, quiet, tmp_path, number):
             # Later ones live longer, so that the sweep ends.
             code = process.wait(timeout=chance.uniform(6.0, 14.0) + 2 * attempt)
         except subprocess.TimeoutExpired:
-            os.kill(process.pid, number)
+            send(process.pid, number)
             code = process.wait(timeout=30)
         said = process.stdout.read()
         process.stdout.close()
@@ -132,7 +140,9 @@ def test_sweep_that_ends_early_goes_on(file, quiet, tmp_path, number):
             assert not out.exists() or not any(out.iterdir()) or number == signal.SIGKILL
         expected = {signal.SIGKILL: -9, signal.SIGTERM: 143, signal.SIGINT: 130}[number]
         assert code == expected, said
-        assert "Traceback" not in said, said
+        assert "Traceback" not in said and "Warning" not in said, said
+        if number != signal.SIGKILL and (out / "members.jsonl").exists():
+            assert "to run what is missing: dvax sweep" in said, said
     assert ends[-1] == 0 and len(ends) > 1
     assert_same(out, quiet)
 

@@ -171,16 +171,17 @@ def _conclude(sweep: Any, outcome: Any, quiet: bool) -> None:
     from dvax.app.runs.interrupt import interruptible
 
     said = ", ".join(f"{count} {status}" for status, count in outcome.counts.items())
-    if sweep.table.output.report:
-        from dvax.app.plots.report import build_report
-
-        page = interruptible(lambda: build_report(outcome.directory))
-        if not quiet:
-            print_remark(f"report: {page}")
+    # Before the report, for which an interrupt may leave no time.
     if outcome.exit_code or not quiet:
         print_remark(f"{said}; the results are in {outcome.directory}")
     if outcome.exit_code:
         flag = " --allow-code" if sweep.allow_code else ""
         command = f"dvax sweep {quote(str(sweep.source))} -o {quote(str(outcome.directory))}"
         print_remark(f"to run what is missing: {command} --resume{flag}")
+    if sweep.table.output.report:
+        from dvax.app.plots.report import build_report
+
+        page = interruptible(lambda: build_report(outcome.directory))
+        if not quiet:
+            print_remark(f"report: {page}")
     raise typer.Exit(outcome.exit_code)

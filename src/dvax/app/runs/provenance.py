@@ -2,6 +2,7 @@
 
 import platform
 import subprocess
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ def provenance() -> dict[str, Any]:
     }
 
 
+@cache
 def _version(package: str) -> str | None:
     try:
         return version(package)
@@ -42,6 +44,7 @@ def _version(package: str) -> str | None:
         return None
 
 
+@cache
 def commit() -> str | None:
     """Return the commit of the source tree that dvax runs from, with a + where files are modified; None
     outside of one."""

@@ -92,6 +92,8 @@ def run_sweep(
             if collector.has_store:
                 consolidate(out / store.NAME)
             counts = Counter(record["status"] for record in records(out, sweep.count))
+            if code:
+                counts["interrupted"] += counts.pop("running", 0)
             finished = create_only or counts["finished"] == sweep.count
             manifest.write("interrupted" if code else "finished", counts)
         tell({"event": "stopped", "counts": counts})

@@ -1,12 +1,15 @@
 """The processes that run the members of a sweep: Dask workers, here or on a cluster."""
 
 import os
+import signal
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
+from dvax.app.runs.interrupt import interruptible
 from dvax.app.runs.sweeps.records import read_record, write_record
 from dvax.errors import input_error
 
@@ -74,14 +77,21 @@ def cluster(address: str | None, workers: int, threads: int) -> Iterator[Any]:
         "NPROC": str(threads),
         "OMP_NUM_THREADS": str(threads),
     }
+
+    def start(folder: str) -> tuple[Any, Any]:
+        with _without_interrupts():
+            local = LocalCluster(
+                n_workers=workers, threads_per_worker=1, processes=True, memory_limit=None,
+                local_directory=folder, silence_logs=50,
+                # Any free port, since the usual one may be that of another cluster here.
+                dashboard_address="127.0.0.1:0",
+            )  # fmt: skip
+            return local, Client(local)
+
     with (
-        tempfile.TemporaryDirectory(prefix="dvax-sweep-") as folder,
+        tempfile.TemporaryDirectory(prefix="dvax-sweep-", ignore_cleanup_errors=True) as folder,
         dask.config.set({
             "distributed.nanny.pre-spawn-environ": environment,
-            # Ctrl-C in a terminal reaches all processes. This one ends the workers.
-            "distributed.worker.preload": [
-                "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
-            ],
             "distributed.worker.memory.target": False,
             "distributed.worker.memory.spill": False,
             "distributed.worker.memory.pause": False,
@@ -90,15 +100,52 @@ def cluster(address: str | None, workers: int, threads: int) -> Iterator[Any]:
             "distributed.scheduler.worker-ttl": None,
             "distributed.comm.timeouts.tcp": "1 day",
         }),
-        LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True, memory_limit=None,
-            local_directory=folder, silence_logs=50,
-            # Any free port, since the usual one may be that of another cluster here.
-            dashboard_address="127.0.0.1:0",
-        ) as local,
-        Client(local) as client,
     ):  # fmt: skip
-        yield client
+        local, client = interruptible(lambda: start(folder))
+        try:
+            yield client
+        except KeyboardInterrupt:
+            # Closing it would wait for the members that run, longer than a user does. The workers end
+            # with this process.
+            _abandoned.append((local, client))
+            raise
+        except BaseException:
+            _close(local, client)
+            raise
+        _close(local, client)
+
+
+def _close(local: Any, client: Any) -> None:
+    client.close()
+    local.close()
+
+
+_abandoned: list[Any] = []
+"""Clusters that an interrupt left open."""
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """In the block this thread, and the threads and processes that it starts, do not receive SIGINT:
+    Ctrl-C in a terminal reaches all processes, and the first one ends the others."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    # It would unblock the signal when the first process starts. After an interrupt it would warn of the
+    # semaphores of a cluster that nobody closed, which it then removes.
+    kept = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = "ignore:resource_tracker:UserWarning"
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        os.environ.pop("PYTHONWARNINGS")
+        if kept is not None:
+            os.environ["PYTHONWARNINGS"] = kept
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def results(
