@@ -48,6 +48,22 @@ FUNCTIONS = {
     ),
     "two vectors": (lambda v: jnp.outer(v, jnp.sin(v)) @ v, (-2.0, 2.0)),
     "picked": (lambda v: v[jnp.array([2, 0, 0])] + jnp.eye(3)[1] * v, (-2.0, 2.0)),
+    "written": (
+        lambda v: jnp.zeros(3).at[0].set(v[1]).at[jnp.array([2, 1])].set(v[:2] * v[2]) * v,
+        (-2.0, 2.0),
+    ),
+    "written over itself": (
+        lambda v: jnp.sin(v).at[1].set(v[2])[::-1].at[1:].set(v[:2] ** 2),
+        (-2.0, 2.0),
+    ),
+    "added at places": (
+        lambda v: (v**2).at[jnp.array([2, 0, 2, 7])].add(jnp.append(v, 1.0)).at[0].add(-v[1]),
+        (-2.0, 2.0),
+    ),
+    "a block written": (
+        lambda v: jax.lax.dynamic_update_slice(M * v[None], jnp.outer(v[:2], v[:2]), (0, 1)) @ v,
+        (-2.0, 2.0),
+    ),
     "taken apart": (
         lambda v: jnp.concatenate([p * v[0] for p in jnp.split(jnp.sin(v), [1])]),
         (-2.0, 2.0),
@@ -115,9 +131,12 @@ def test_slope_of_functions_with_jumps_or_without_rules_is_unbounded(fn):
     [
         lambda v: v[jnp.array([2, 1, 0])],
         lambda v: jax.lax.dynamic_slice(v, (jnp.asarray(0),), (3,))[::-1],
+        lambda v: jnp.zeros(3).at[jnp.array([1, 0, 2])].set(v),
+        lambda v: jnp.zeros(3).at[jnp.array([1, 0, 2])].add(v),
+        lambda v: jax.lax.dynamic_update_slice(jnp.zeros(3), v, (jnp.asarray(0),)),
         lambda v: jnp.flip(jax.lax.cumsum(jnp.where(jnp.arange(3) == 0, v, 0.0))) + 0.0 * v[::-1],
     ],
-    ids=["gather", "dynamic slice", "cumsum"],
+    ids=["gather", "dynamic slice", "scatter", "scatter-add", "update", "cumsum"],
 )
 def test_slope_is_not_rounded_to_the_default_type_of_jax(fn):
     """Single precision rounds 1/3 up, so that a rounded lower bound does not enclose it."""

@@ -64,6 +64,9 @@ TRUTH = {
     "cumulative": (lambda y: jnp.cumsum(y), YES, NO, NO),
     "the mean": (lambda y: y - jnp.mean(y), YES, NO, NO),
     "gathered": (lambda y: y[jnp.array([2, 0, 1])], YES, NO, NO),
+    "written": (lambda y: C.at[jnp.array([2, 0])].set(y[:2]), YES, NO, NO),
+    "added at places": (lambda y: y.at[1].add(3.0 * y[2]), YES, NO, NO),
+    "a block written": (lambda y: lax.dynamic_update_slice(y, y[1:], (0,)), YES, NO, NO),
     "differences": (lambda y: y - jnp.concatenate([y[:1], y[:-1]]), YES, NO, NO),
     "one entry for all": (lambda y: jnp.broadcast_to(y[0], 3), YES, NO, NO),
     "a choice between orders": (lambda y: jnp.where(MASK, y, y[::-1]), YES, NO, NO),
@@ -96,6 +99,10 @@ TRUTH = {
     "a moving index": (lambda y: y * y[jnp.argmax(y)], NO, NO, NO),
     "sliced by itself": (
         lambda y: jnp.broadcast_to(lax.dynamic_slice(y, (jnp.argmax(y),), (1,)), (3,)), NO, NO, NO,
+    ),
+    "written at a moving place": (lambda y: y.at[jnp.argmax(y)].set(0.0), NO, NO, NO),
+    "a block at a moving place": (
+        lambda y: lax.dynamic_update_slice(y, C[:1], (jnp.argmax(y),)), NO, NO, NO,
     ),
     "a branch": (lambda y: lax.cond(y[0] > 0, lambda: y, lambda: 2.0 * y), NO, NO, NO),
     "a loop": (lambda y: lax.fori_loop(0, 3, lambda _, z: z * y[0] + y, y), NO, NO, NO),

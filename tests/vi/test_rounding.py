@@ -197,3 +197,24 @@ def test_derivative_of_a_failed_solve_vi_is_nan():
             assert all(np.isfinite(v).all() for v in good)
             bad = derive(lambda *p, K=K: y(*p, K, 2), (0, 1))(*at)
             assert all(np.isnan(v).all() for v in bad)
+
+
+INDEXED = {
+    "written": lambda y: (3.0 * y).at[jnp.array([2, 0])].set(y[:2] / 3.0),
+    "added": lambda y: (y / 3.0).at[jnp.array([1, 1, 4, 1])].add(y[:4] * 0.1),
+    "a block": lambda y: jax.lax.dynamic_update_slice(y / 7.0, y[:2] * 0.1, (1,)),
+}
+
+
+@pytest.mark.parametrize("F", INDEXED.values(), ids=INDEXED)
+def test_rounding_of_entries_written_or_added_at_places_is_proved_and_holds(F):
+    """Against the same operations in double precision."""
+    rng = np.random.default_rng(3)
+    bound_of = jax.jit(lambda y: rounding_error(F, y)[0])
+    assert rounding_error(F, jnp.zeros(5, jnp.float32))[1]
+    for _ in range(50):
+        y = (rng.normal(size=5) * 10.0 ** rng.integers(-3, 4, 5)).astype(np.float32)
+        error = np.abs(np.asarray(F(jnp.asarray(y)), float) - np.asarray(F(jnp.asarray(y, float))))
+        bound = np.asarray(bound_of(y))
+        assert np.all(error <= bound)
+        assert np.all(bound <= 32 * np.finfo(np.float32).eps * (np.abs(y).sum() + 1e-30))

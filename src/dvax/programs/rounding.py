@@ -99,6 +99,20 @@ def _indexed(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
     return bind(eqn, [x[0].error, *(one.value for one in x[1:])])[0]
 
 
+def _written(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
+    """Return the error of an array into which values are written at some indices."""
+    real = [is_real(one.value) for one in x]
+    return bind(eqn, [o.error if r else o.value for o, r in zip(x, real, strict=True)])[0]
+
+
+def _added(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
+    """Return the error of an array to which values are added at some indices."""
+    (a, p, _), (indices, *_), (b, q, _) = x
+    add = lambda r, s: bind(eqn, [r, indices, s])[0]  # noqa: E731
+    count = add(jnp.ones_like(a), jnp.ones_like(b))
+    return 2 * add(p, q) + count * _eps(v) * add(jnp.abs(a), jnp.abs(b))
+
+
 def _select(eqn: Any, x: list[_Value], v: jax.Array) -> jax.Array:
     which, *cases = x
     chosen = bind(eqn, [which.value, *(case.error for case in cases)])[0]
@@ -182,6 +196,8 @@ RULES: dict[str, Rule] = {
     **same_for(REARRANGING | JOINING, _rearranged),
     **same_for({"neg", "real", "imag", "optimization_barrier", "pad"}, _rearranged),
     **same_for({"dynamic_slice", "gather"}, _indexed),
+    **same_for({"dynamic_update_slice", "scatter"}, _written),
+    **same_for({"scatter-add", "scatter_add"}, _added),
     **same_for({"max", "min"}, _extremum),
     **same_for({"reduce_max", "reduce_min"}, _largest_error),
     **same_for({"add", "sub", "add_any"}, _sum),

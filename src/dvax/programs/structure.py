@@ -202,8 +202,15 @@ def _sparse_product(eqn: Any, operands: list[_Dependence]) -> _Dependence:
     return _general(eqn, operands) if operands[1].degree else _matrix_product(eqn, operands)
 
 
-def _scatter_add(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+def _scatter(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    """Return the dependence of values that are written, or added, into an array at some indices."""
     return _general(eqn, operands) if operands[1].degree else _mixing(eqn, operands)
+
+
+def _update(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    """Return the dependence of an array with a block in the place of some entries."""
+    is_fixed = not any(index.degree for index in operands[2:])
+    return _mixing(eqn, operands) if is_fixed else _general(eqn, operands)
 
 
 def _linear_solve(eqn: Any, operands: list[_Dependence]) -> _Dependence:
@@ -240,7 +247,8 @@ RULES: dict[str, Rule] = {
     **same_for({"reshape", "squeeze", "broadcast_in_dim"}, _reshaping),
     **same_for(JOINING | {"pad", "fft"}, _mixing),
     **same_for({"dot_general", "conv_general_dilated"}, _matrix_product),
-    **same_for({"scatter-add", "scatter_add"}, _scatter_add),
+    **same_for({"scatter", "scatter-add", "scatter_add"}, _scatter),
+    "dynamic_update_slice": _update,
     **same_for(CUSTOM, _custom),
     "mul": _product,
     "div": _quotient,

@@ -26,11 +26,12 @@ from ..._jax.jaxprs import bind, operation
 from ..._tree import Tree
 from ..interpreter import Domain, Rule, interpret
 from .rules_elementwise import ELEMENTWISE
+from .rules_scatter import SCATTER
 from .rules_structural import STRUCTURAL
 from .rules_tables import TABLES
 from .values import MAX_ENTRIES, Part, Slope, TooLarge, entries, interval, is_slope
 
-RULES: dict[str, Rule] = {**ELEMENTWISE, **STRUCTURAL, **TABLES}
+RULES: dict[str, Rule] = {**ELEMENTWISE, **STRUCTURAL, **SCATTER, **TABLES}
 
 
 class EnclosedSlopes(NamedTuple):

@@ -35,7 +35,7 @@ def _rearranged(eqn: Any, operands: list[Any]) -> list[Slope] | None:
     x = [lift(v, tuple(atom.aval.shape)) for v, atom in atoms]
     sources = _evaluate_sources(eqn, indices) if indices else _sources(eqn)
     fill = eqn.params.get("fill_value")
-    return [_picked(x, source, math.nan if fill is None else fill) for source in sources]
+    return [picked(x, source, math.nan if fill is None else fill) for source in sources]
 
 
 _INDEXED = {"gather", "dynamic_slice"}
@@ -65,7 +65,7 @@ def _sources(eqn: Any) -> list[Values]:
     return _evaluate_sources(eqn, [])
 
 
-def _picked(x: list[Slope], source: Values, fill: Any) -> Slope:
+def picked(x: list[Slope], source: Values, fill: Any) -> Slope:
     """Return the entries of x at these positions."""
 
     def pick(leaves: list[Values], extra: int, fill: Any) -> Values:

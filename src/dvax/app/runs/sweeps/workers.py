@@ -1,13 +1,14 @@
 """The processes that run the members of a sweep: Dask workers, here or on a cluster."""
 
+import logging
 import os
 import signal
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from dvax.app.runs.interrupt import interruptible
 from dvax.app.runs.sweeps.records import read_record, write_record
@@ -15,6 +16,11 @@ from dvax.errors import input_error
 
 _PROGRAMS = 50
 """Members that compiled, after which their programs are dropped."""
+
+_STARTS = 3
+"""How often workers are started at most: the system may end one of them at once, say for its memory."""
+
+Value = TypeVar("Value")
 
 _compiled = 0
 _sweeps: dict[tuple[Any, ...], Any] = {}
@@ -62,6 +68,8 @@ def cluster(address: str | None, workers: int, threads: int) -> Iterator[Any]:
     from distributed import Client, LocalCluster
 
     if address is not None:
+        # `results` reports a scheduler that has ended.
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         try:
             client = Client(address, timeout="20s")
         except (OSError, ValueError, TimeoutError) as error:
@@ -101,7 +109,7 @@ def cluster(address: str | None, workers: int, threads: int) -> Iterator[Any]:
             "distributed.comm.timeouts.tcp": "1 day",
         }),
     ):  # fmt: skip
-        local, client = interruptible(lambda: start(folder))
+        local, client = interruptible(lambda: _repeated(lambda: start(folder)))
         try:
             yield client
         except KeyboardInterrupt:
@@ -113,6 +121,16 @@ def cluster(address: str | None, workers: int, threads: int) -> Iterator[Any]:
             _close(local, client)
             raise
         _close(local, client)
+
+
+def _repeated(start: Callable[[], Value]) -> Value:
+    """Return start(), called again where a worker ended while it started."""
+    for _ in range(_STARTS - 1):
+        try:
+            return start()
+        except RuntimeError:
+            continue
+    return start()
 
 
 def _close(local: Any, client: Any) -> None:
