@@ -2,7 +2,10 @@
 
 import contextlib
 import dataclasses
+import subprocess
+import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -115,3 +118,32 @@ def test_first_responses_of_a_law_that_iterates_are_one_program():
     STAGES.clear()
     assert np.isfinite(sol.us).all()
     assert STAGES.count("compile") == 1, STAGES
+
+
+FIRST_USE = """
+import jax
+
+def first(load):
+    from dvax._jax.traces import _OUTSIDE, current_trace  # modules of dvax are imported when first used
+    assert current_trace() != _OUTSIDE
+    return load
+
+jax.jit(first)(2.0)
+from dvax._jax.traces import _OUTSIDE, current_trace
+assert current_trace() == _OUTSIDE
+"""
+
+
+def test_dvax_may_be_used_first_inside_of_a_transformation():
+    done = subprocess.run([sys.executable, "-c", FIRST_USE], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_concrete_responses_are_read_inside_of_a_transformation():
+    known = dvax.solve(problem(), -1.0, 0.0, 2.0, 3.0, dense=True, method=dvax.ETD2RK())
+
+    def read(load):
+        return load * float(np.asarray(known.us)[0]) * known.evaluate(0.5)[1]
+
+    inside = jax.jit(read)(2.0)
+    np.testing.assert_allclose(inside, read(2.0), rtol=1e-15)

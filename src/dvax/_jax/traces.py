@@ -1,5 +1,6 @@
 """The identity of the trace in which the current code runs."""
 
+import threading
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -13,8 +14,17 @@ def current_trace() -> Any:
     return get_opaque_trace_state()
 
 
-_OUTSIDE = current_trace()
-"""That of a program's start: dvax is imported outside of transformations."""
+def _outside() -> Any:
+    """Return the trace outside of all transformations, in which each thread starts: this module may be
+    imported inside of one."""
+    found: list[Any] = []
+    thread = threading.Thread(target=lambda: found.append(current_trace()))
+    thread.start()
+    thread.join()
+    return found[0]
+
+
+_OUTSIDE = _outside()
 
 
 def evaluates() -> AbstractContextManager[None]:
