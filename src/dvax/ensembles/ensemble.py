@@ -155,7 +155,7 @@ def ensemble(
             members = _ensemble(kept, choice, program, inputs, each, problem, options)
             # Data of the others may be invalid.
             if (solved := np.flatnonzero(~np.asarray(members.failed))).size:
-                x0, own_args, begin, *_ = inputs.member(solved[0])
+                x0, own_args, begin, *_ = inputs.member(int(solved[0]))
                 warn_of_several_solutions(problem, begin, x0, own_args, constants)
             return members
     # Within `jax.grad` or `jax.jit`.

@@ -101,10 +101,13 @@ def _pair(problem: Problem, t: jax.Array, x: Tree, args: Any) -> tuple[Tree, Tre
     project = jax.jit(lambda v: K.project(unravel(v), space))
     centre = ravel_pytree(project(np.zeros(size, M.dtype)))[0]
     for k, scale in itertools.product(np.flatnonzero(is_negative), _SCALES):
-        step = scale * (1.0 + np.linalg.norm(centre)) * vectors[:, k]
-        y, z = project(centre - step), project(centre + step)
+        length = scale * (1.0 + np.linalg.norm(centre))
+        y, z = (project(centre + sign * length * vectors[:, k]) for sign in (-1.0, 1.0))
         difference = _tree.sub(z, y)
         d = ravel_pytree(difference)[0]
+        # Where K excludes this direction, the difference is rounding.
+        if np.linalg.norm(d) <= 1e3 * np.finfo(M.dtype).eps * length:
+            continue
         product = float(space.inner(unravel(jnp.asarray(M @ d)), difference))
         if product < -_ROUNDING * np.max(np.abs(values)) * float(
             space.inner(difference, difference)
