@@ -43,8 +43,9 @@ _MAX_SEEN = 256
 def warn_of_several_solutions(problem: Problem, t0: Any, x0: Tree, args: Any, moduli: Any) -> None:
     """Warn, once for a problem, if its law is affine and two points of K prove that it is not monotone.
 
-    Where `moduli` declares γ, the law has one solution. On a box it has one too if all principal minors
-    of its matrix are positive (Cottle, Pang and Stone 1992, theorem 3.3.7).
+    Where `moduli` declares γ, the law has one solution. On a box it has at most one if all principal
+    minors of its matrix are positive: F is then a P function (Facchinei and Pang 2003, proposition
+    3.5.10).
     """
     if getattr(moduli, "gamma", None) is not None:
         return
@@ -109,9 +110,8 @@ def _pair(problem: Problem, t: jax.Array, x: Tree, args: Any) -> tuple[Tree, Tre
         if np.linalg.norm(d) <= 1e3 * np.finfo(M.dtype).eps * length:
             continue
         product = float(space.inner(unravel(jnp.asarray(M @ d)), difference))
-        if product < -_ROUNDING * np.max(np.abs(values)) * float(
-            space.inner(difference, difference)
-        ):
+        squared = float(space.inner(difference, difference))
+        if product < -_ROUNDING * np.max(np.abs(values)) * squared:
             return y, z, product
     return None
 
