@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dvax
-from dvax.evolution import several_solutions
+from dvax.evolution import first_run
 from dvax.evolution.several_solutions import warn_of_several_solutions
 
 SPREAD = np.array([[2.0, 1.0, 0.0], [1.0, 2.0, 1.0], [0.0, 1.0, 2.0]])
@@ -33,7 +33,7 @@ def problem(M, K):
 
 
 def warn(M, K, size=3, constants=None):
-    several_solutions._SEEN.clear()
+    first_run._SEEN.clear()
     warn_of_several_solutions(problem(M, K), 0.0, jnp.zeros(size), None, constants)
 
 
@@ -45,14 +45,14 @@ def test_law_with_the_wrong_sign_is_named_with_two_points_that_prove_it(K, scale
 
 
 def test_warning_comes_with_the_first_solution_and_not_with_the_second():
-    several_solutions._SEEN.clear()
+    first_run._SEEN.clear()
     wrong = problem(
         np.array([[1.0, 2.0], [2.0, 1.0]]), dvax.sets.Box(jnp.zeros(2), jnp.full(2, 3.0))
     )
     with pytest.warns(UserWarning, match=r"y = \[0.707, 0\] and z = \[0, 0.707\]"):
         dvax.solve(wrong, jnp.zeros(2), 0.0, 0.1)
     dvax.solve(wrong, jnp.ones(2), 0.0, 0.1)
-    several_solutions._SEEN.clear()
+    first_run._SEEN.clear()
     with pytest.warns(UserWarning, match="is not monotone on K"):
         dvax.ensemble(wrong, jnp.zeros((2, 2)), 0.0, 0.1)
 
@@ -88,8 +88,10 @@ def test_declared_modulus_is_believed():
 
 
 def test_values_that_are_traced_are_not_examined():
-    several_solutions._SEEN.clear()
+    first_run._SEEN.clear()
     own = problem(-SPREAD, SETS["Box"])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        jax.eval_shape(lambda x: warn_of_several_solutions(own, 0.0, x, None, None), jnp.zeros(3))
+        jax.eval_shape(
+            lambda x: first_run.warn_after_first_run(own, 0.0, x, None, None), jnp.zeros(3)
+        )

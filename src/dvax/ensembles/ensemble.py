@@ -16,10 +16,10 @@ from ..evolution import RESULTS, Event, Implicit, PiecewiseLinear, Solution, sol
 from ..evolution.arguments import MAX_EVENTS, Arguments, bound_steps, check, warn_precision
 from ..evolution.auto import Choice, choose
 from ..evolution.event_arguments import check_events
+from ..evolution.first_run import warn_after_first_run
 from ..evolution.method import AbstractMethod
 from ..evolution.picard import Picard
 from ..evolution.setup import as_arrays
-from ..evolution.several_solutions import warn_of_several_solutions
 from ..problem import Problem
 from ..vi import AbstractSolver, Auto
 from .collect import Collected, collect, fold_rows
@@ -156,7 +156,7 @@ def ensemble(
             # Data of the others may be invalid.
             if (solved := np.flatnonzero(~np.asarray(members.failed))).size:
                 x0, own_args, begin, *_ = inputs.member(int(solved[0]))
-                warn_of_several_solutions(problem, begin, x0, own_args, constants)
+                warn_after_first_run(problem, begin, x0, own_args, constants)
             return members
     # Within `jax.grad` or `jax.jit`.
     found = program(choice).traced(inputs.rows(slice(None)))

@@ -20,7 +20,7 @@ from .._tree import Tree
 from ..problem import Problem
 from ..programs.structure import analyse
 from .setup import as_arrays
-from .signature import Signature, flat, flatten
+from .signature import Signature, flatten
 
 _LARGEST = 64
 """Most unknowns of a law whose matrix is formed."""
@@ -34,14 +34,9 @@ _ROUNDING = 1e-8
 _SCALES = (1.0, 1e-3, 1e3)
 """Distances at which two points of K are sought."""
 
-_SEEN: set[Any] = set()
-"""The problems that were examined, by their code and the shapes of their arrays."""
-
-_MAX_SEEN = 256
-
 
 def warn_of_several_solutions(problem: Problem, t0: Any, x0: Tree, args: Any, moduli: Any) -> None:
-    """Warn, once for a problem, if its law is affine and two points of K prove that it is not monotone.
+    """Warn if the law of a problem is affine and two points of K prove that it is not monotone.
 
     Where `moduli` declares γ, the law has one solution. On a box it has at most one if all principal
     minors of its matrix are positive: F is then a P function (Facchinei and Pang 2003, proposition
@@ -49,14 +44,6 @@ def warn_of_several_solutions(problem: Problem, t0: Any, x0: Tree, args: Any, mo
     """
     if getattr(moduli, "gamma", None) is not None:
         return
-    leaves, tree = jtu.tree_flatten((x0, args))
-    numbers = [leaf if isinstance(leaf, float) else np.shape(leaf) for leaf in leaves]
-    key = flat(problem).key, tree, tuple(type(n) if isinstance(n, float) else n for n in numbers)
-    if key in _SEEN or not _tree.is_concrete(flat(problem).numbers, t0, leaves):
-        return
-    if len(_SEEN) >= _MAX_SEEN:
-        _SEEN.clear()
-    _SEEN.add(key)
     t = jnp.asarray(np.asarray(t0, _tree.dtype(x0)))
     pair = _pair(problem, t, x0, as_arrays(args))
     if pair is not None:
@@ -67,7 +54,7 @@ def warn_of_several_solutions(problem: Problem, t0: Any, x0: Tree, args: Any, mo
             f"{_text(z)} in K, ⟨F(z) − F(y), z − y⟩ = {product:.3g} < 0. Check the sign of the way in "
             "which h depends on u. (Where a modulus γ > 0 of strong pseudomonotonicity is known, "
             "declare it in constants=.)",
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

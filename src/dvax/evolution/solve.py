@@ -36,6 +36,7 @@ from .control import MAX_GROWTH
 from .diagnose import failure
 from .event import Event
 from .event_arguments import check_events
+from .first_run import warn_after_first_run
 from .implicit import Implicit
 from .method import AbstractMethod
 from .nonfinite import refuse_nonfinite_data
@@ -45,7 +46,6 @@ from .piecewise.propagate import propagate
 from .results import RESULTS, is_success
 from .rows import cut
 from .setup import Options, Setup, as_arrays
-from .several_solutions import warn_of_several_solutions
 from .signature import flat
 from .solution import Solution
 from .streaming import check_save, stream
@@ -197,7 +197,9 @@ def solve(
     call, choice = _chosen(call)
     setup, options = arranged(call, choice.method)
     solution = _run(choice, setup, None if ts is None else _times(ts), options, throw)
-    warn_of_several_solutions(problem, t0, x0, args, constants)
+    adaptive = dt is None and not isinstance(choice.method, PiecewiseLinear)
+    states = solution.xs if adaptive else None
+    warn_after_first_run(problem, t0, x0, args, constants, states, atol)
     return solution
 
 
