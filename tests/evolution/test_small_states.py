@@ -55,6 +55,11 @@ def test_a_state_that_stays_0_is_exact_and_one_that_decays_was_large():
     dvax.solve(problem(0.0), jnp.ones(2), 0.0, 40.0)
 
 
+def test_run_without_saved_states_is_not_examined():
+    first_run._SEEN.clear()
+    dvax.solve(problem(1e-12), jnp.zeros(2), 0.0, 3.0, ts=[])
+
+
 def test_fixed_steps_have_no_tolerance_and_traced_states_no_size():
     run(1e-12, dt=0.01)
     with warnings.catch_warnings():

@@ -64,8 +64,14 @@ def count_operations(program: Any) -> int:
 
 def has_loop(program: Any) -> bool:
     """Return whether a program contains a loop."""
+    return has_operation(program, LOOPS)
+
+
+def has_operation(program: Any, names: Any) -> bool:
+    """Return whether a program contains one of these primitives."""
     return any(
-        e.primitive.name in LOOPS or any(map(has_loop, nested_programs(e.params)))
+        e.primitive.name in names
+        or any(has_operation(inner, names) for inner in nested_programs(e.params))
         for e in program.jaxpr.eqns
     )
 

@@ -69,4 +69,5 @@ def _largest(weights: Tree, states: Tree) -> float:
         values = np.asarray(leaf)
         return np.sum(np.asarray(weight) * values**2, axis=tuple(range(1, values.ndim)))
 
-    return float(np.sqrt(np.max(sum(jtu.tree_leaves(jtu.tree_map(squares, weights, states))))))
+    total = sum(jtu.tree_leaves(jtu.tree_map(squares, weights, states)))
+    return float(np.sqrt(np.max(total, initial=0.0)))

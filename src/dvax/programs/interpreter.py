@@ -46,12 +46,13 @@ def interpret(program: Any, inputs: list[Any], domain: Domain) -> list[Any]:
     environment = dict(zip(jaxpr.constvars, program.consts, strict=True))
     environment |= dict(zip(jaxpr.invars, inputs, strict=True))
     for eqn in jaxpr.eqns:
-        results = _operate(eqn, read(environment, eqn.invars), domain)
+        results = operate(eqn, read(environment, eqn.invars), domain)
         environment.update(zip(eqn.outvars, results, strict=True))
     return read(environment, jaxpr.outvars)
 
 
-def _operate(eqn: Any, operands: list[Any], domain: Domain) -> list[Any]:
+def operate(eqn: Any, operands: list[Any], domain: Domain) -> list[Any]:
+    """Return the values of the results of one operation."""
     if not any(map(domain.is_abstract, operands)):
         return domain.evaluate(eqn, operands)
     rule = domain.rules.get(operation(eqn))

@@ -22,16 +22,18 @@ import jax.tree_util as jtu
 import numpy as np
 
 from ... import _tree
-from ..._jax.jaxprs import bind, operation
+from ..._jax.jaxprs import bind, has_operation, operation
 from ..._tree import Tree
-from ..interpreter import Domain, Rule, interpret
+from ..interpreter import Domain, Rule, interpret, operate
+from .rules_choice import CHOICE, choice_rules
 from .rules_elementwise import ELEMENTWISE
 from .rules_scatter import SCATTER
 from .rules_structural import STRUCTURAL
 from .rules_tables import TABLES
+from .sources import Recorder
 from .values import MAX_ENTRIES, Part, Slope, TooLarge, entries, interval, is_slope
 
-RULES: dict[str, Rule] = {**ELEMENTWISE, **STRUCTURAL, **SCATTER, **TABLES}
+RULES: dict[str, Rule] = {**ELEMENTWISE, **CHOICE, **STRUCTURAL, **SCATTER, **TABLES}
 
 
 class EnclosedSlopes(NamedTuple):
@@ -54,6 +56,8 @@ class SlopeEnclosure:
         )
         self._program, shape = jax.make_jaxpr(fn, return_shape=True)(*shaped)
         self._output = jtu.tree_structure(shape)
+        # Sources cost time and memory, and serve selections only.
+        self._has_choice = has_operation(self._program, {"select_n"})
         self._wrt = [i in wrt for i, like in enumerate(likes) for _ in jtu.tree_leaves(like)]
 
     def __call__(self, *args: Tree) -> EnclosedSlopes:
@@ -61,28 +65,35 @@ class SlopeEnclosure:
 
         **Raises:** `TooLarge` if a matrix of derivatives is too large.
         """
+        unknown: list[str] = []
+        recorder = Recorder(lambda eqn, x: operate(eqn, x, domain)) if self._has_choice else None
         inputs, k = [], 0
         leaves = jtu.tree_leaves(args, is_leaf=is_slope)
         for leaf, differentiated in zip(leaves, self._wrt, strict=True):
             part = Part(np.ones(leaf.low.shape), np.zeros(leaf.low.shape), False)
-            inputs.append(leaf._replace(parts={k: part} if differentiated else {}))
+            leaf = leaf._replace(parts={k: part} if differentiated else {})
+            inputs.append(leaf if recorder is None else recorder.input(leaf))
             k += differentiated
-        unknown: list[str] = []
+        rules = RULES | choice_rules(recorder)
+        apply = partial(_apply, recorder)
+        domain = Domain(rules, is_slope, partial(_unknown, unknown), apply, _evaluate)
         with np.errstate(all="ignore"):
-            domain = Domain(RULES, is_slope, partial(_unknown, unknown), _apply, _evaluate)
             results = interpret(self._program, inputs, domain)
         slopes = [r if is_slope(r) else interval(np.asarray(r), np.asarray(r)) for r in results]
         return EnclosedSlopes(self._output.unflatten(slopes), tuple(dict.fromkeys(unknown)))
 
 
-def _apply(rule: Rule, eqn: Any, operands: list[Any]) -> list[Any] | None:
+def _apply(
+    recorder: Recorder | None, rule: Rule, eqn: Any, operands: list[Any]
+) -> list[Any] | None:
     result = rule(eqn, operands)
     if result is None:
         return None
-    return [
-        _constant_if_decided(_without_nan(x))
-        for x in (result if isinstance(result, list) else [result])
-    ]
+    results = result if isinstance(result, list) else [result]
+    values = [_constant_if_decided(_without_nan(x)) for x in results]
+    if recorder is None:
+        return values
+    return [recorder.result(x, eqn, operands, k) for k, x in enumerate(values)]
 
 
 _ARITHMETIC = {

@@ -189,24 +189,6 @@ def _not(eqn: Any, operands: list[Any]) -> Slope | None:
     return _opposite(operands[0]) if operands[0].low.dtype == bool else None
 
 
-def _select(eqn: Any, operands: list[Any]) -> Slope | None:
-    which, *cases = _lifted(eqn, operands)
-    if len(cases) != 2 or which.low.dtype != bool:
-        return None
-    no, yes = cases
-    is_decided = which.low == which.high
-    pick = lambda a, b, other: np.where(is_decided, np.where(which.low, b, a), other)  # noqa: E731
-    parts = {}
-    for k, (a, b, by_choice) in together([no, yes, which]).items():
-        both = hull(a, b)
-        # If the choice depends on v, the value may jump.
-        radius = np.where(is_dependent(by_choice), np.inf, both.radius)
-        center = pick(a.center, b.center, both.center)
-        parts[k] = Part(center, pick(a.radius, b.radius, radius), a.full)
-    low = pick(no.low, yes.low, np.minimum(no.low, yes.low))
-    return Slope(low, pick(no.high, yes.high, np.maximum(no.high, yes.high)), parts)
-
-
 def _convert(eqn: Any, operands: list[Any]) -> Slope | None:
     (x,) = operands
     before, after = eqn.invars[0].aval, eqn.outvars[0].aval
@@ -242,6 +224,5 @@ ELEMENTWISE: dict[str, Rule] = {
     "and": _logic(np.logical_and),
     "or": _logic(np.logical_or),
     "not": _not,
-    "select_n": _select,
     "convert_element_type": _convert,
 }

@@ -34,11 +34,15 @@ class Part(NamedTuple):
 
 
 class Slope(NamedTuple):
-    """The bounds low ≤ q ≤ high, and ∂q/∂vₖ for every k in `parts`; q does not depend on other vₖ."""
+    """The bounds low ≤ q ≤ high, and ∂q/∂vₖ for every k in `parts`; q does not depend on other vₖ.
+
+    `source`: how q was computed (`sources.Source`), if that is kept.
+    """
 
     low: Values
     high: Values
     parts: dict[int, Part]
+    source: Any = None
 
 
 def interval(low: Any, high: Any) -> Slope:

@@ -1,0 +1,98 @@
+"""How the values of slope arithmetic were computed, so that a part of a program can be evaluated again.
+
+The value of one branch of a selection matters only where that branch is selected. So its program is
+evaluated again with what is known there: the comparison is decided, and the compared value is on one
+side of its limit.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .values import Slope, is_slope
+
+MAX_ENTRIES_KEPT = 4096
+"""Values with more entries keep no source, since a source keeps its arguments alive."""
+
+_MAX_DEPTH = 200
+"""Largest number of operations one after the other in a source."""
+
+_MAX_EVALUATIONS = 2000
+"""Largest number of operations that are evaluated again in one enclosure."""
+
+
+class Source(NamedTuple):
+    """The operation that computed a value.
+
+    - `key`: equal for values of the same operation on the same arguments; inputs have one each;
+    - `eqn`, `operands`, `output`: the operation, its arguments, and the number of the result. An input
+      has no operation;
+    - `depth`: the number of operations one after the other.
+    """
+
+    key: int
+    eqn: Any
+    operands: tuple[Any, ...]
+    output: int
+    depth: int
+
+
+class Recorder:
+    """Attaches sources to values, and evaluates values again.
+
+    `operate` returns the results of an operation by its rule.
+    """
+
+    def __init__(self, operate: Callable[[Any, list[Any]], list[Any]]):
+        self._operate = operate
+        self._keys: dict[Any, int] = {}
+        self._left = _MAX_EVALUATIONS
+
+    def input(self, value: Slope) -> Slope:
+        """Return an input with a source of its own."""
+        key = len(self._keys)
+        self._keys[("input", key)] = key
+        return value._replace(source=Source(key, None, (), 0, 0))
+
+    def result(self, value: Any, eqn: Any, operands: list[Any], output: int) -> Any:
+        """Return the result of an operation with its source."""
+        if not is_slope(value) or np.size(value.low) > MAX_ENTRIES_KEPT:
+            return value
+        slopes = [v for v in operands if is_slope(v)]
+        if any(v.source is None or v.source.depth >= _MAX_DEPTH for v in slopes):
+            return value._replace(source=None)
+        depth = 1 + max(v.source.depth for v in slopes)
+        of = tuple(self._key(v) for v in operands)
+        key = self._keys.setdefault(
+            (eqn.primitive.name, str(eqn.params), of, output), len(self._keys)
+        )
+        return value._replace(source=Source(key, eqn, tuple(operands), output, depth))
+
+    def _key(self, value: Any) -> Any:
+        if is_slope(value):
+            return value.source.key
+        array = np.asarray(value)
+        return (array.shape, array.dtype.str, array.tobytes())
+
+    def again(self, value: Any, known: dict[int, Any]) -> Any:
+        """Return a value with the values in `known`, by their keys, in place of those before.
+
+        Returns the value as it was where too many operations were evaluated again.
+        """
+        memo: dict[int, Any] = dict(known)
+
+        def visit(v: Any) -> Any:
+            if not is_slope(v) or v.source is None or v.source.eqn is None:
+                return memo.get(v.source.key, v) if is_slope(v) and v.source else v
+            source = v.source
+            if source.key not in memo:
+                operands = [visit(one) for one in source.operands]
+                same = all(a is b for a, b in zip(operands, source.operands, strict=True))
+                memo[source.key] = v
+                if not same and self._left > 0:
+                    self._left -= 1
+                    memo[source.key] = self._operate(source.eqn, operands)[source.output]
+            return memo[source.key]
+
+        return visit(value)
