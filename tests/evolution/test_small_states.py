@@ -57,7 +57,7 @@ def test_a_state_that_stays_0_is_exact_and_one_that_decays_was_large():
 
 def test_run_without_saved_states_is_not_examined():
     first_run._SEEN.clear()
-    dvax.solve(problem(1e-12), jnp.zeros(2), 0.0, 3.0, ts=[])
+    dvax.solve(problem(1e-12), jnp.zeros(2), 0.0, 3.0, ts=np.zeros(0))
 
 
 def test_fixed_steps_have_no_tolerance_and_traced_states_no_size():
