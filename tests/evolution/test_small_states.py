@@ -55,9 +55,11 @@ def test_a_state_that_stays_0_is_exact_and_one_that_decays_was_large():
     dvax.solve(problem(0.0), jnp.ones(2), 0.0, 40.0)
 
 
-def test_run_without_saved_states_is_not_examined():
+def test_run_that_ended_before_the_first_saved_time_is_not_examined():
     first_run._SEEN.clear()
-    dvax.solve(problem(1e-12), jnp.zeros(2), 0.0, 3.0, ts=np.zeros(0))
+    own = problem(1e-12)
+    sol = dvax.solve(own, jnp.zeros(2), 0.0, 3.0, ts=TIMES[1:], max_steps=2, throw=False)
+    assert sol.xs.shape == (0, 2)
 
 
 def test_fixed_steps_have_no_tolerance_and_traced_states_no_size():
