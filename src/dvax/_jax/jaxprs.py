@@ -4,11 +4,11 @@ A traced program is a `ClosedJaxpr`: a list of equations, each of which applies 
 and literals, and the arrays that the traced function closes over.
 """
 
-from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
+
+from .known_functions import known_name
 
 
 def _types() -> tuple[Any, ...]:
@@ -103,13 +103,13 @@ def inner_program(eqn: Any) -> Any:
 def operation(eqn: Any) -> str:
     """Return the name of an operation in tables of rules.
 
-    It is the name of the primitive, or of a called function: "searchsorted", or "dvax_..." for
-    functions of dvax that have a rule of their own.
+    It is the name of the primitive, or of a called function: one of `known_functions.VARIANTS`, or
+    "dvax_..." for functions of dvax that have a rule of their own.
     """
     name = eqn.params.get("name")
-    if isinstance(name, str) and (name.startswith("dvax_") or _is_search(eqn)):
+    if isinstance(name, str) and name.startswith("dvax_"):
         return name
-    return eqn.primitive.name
+    return known_name(eqn) or eqn.primitive.name
 
 
 def scan_counts(params: dict[str, Any]) -> tuple[int, int] | None:
@@ -123,27 +123,3 @@ def scan_counts(params: dict[str, Any]) -> tuple[int, int] | None:
     except (AttributeError, KeyError, TypeError, ValueError):
         return None
     return counts[0], counts[1]
-
-
-def _is_search(eqn: Any) -> bool:
-    """Return whether a call is `jnp.searchsorted` for one number, as in `jnp.interp` and in a piecewise
-    constant table.
-
-    Its name must match, and its program must equal that of JAX for these shapes.
-    """
-    inner = eqn.params.get("jaxpr")
-    if eqn.params.get("name") != "searchsorted" or inner is None or len(eqn.invars) != 2:
-        return False
-    row, value = (
-        jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype, weak_type=v.aval.weak_type)
-        for v in eqn.invars
-    )
-    if len(row.shape) != 1:
-        return False
-    for side in ("left", "right"):
-        for method in ("scan", "scan_unrolled", "compare_all"):
-            search = partial(jnp.searchsorted, side=side, method=method)
-            expected = jax.make_jaxpr(search)(row, value).jaxpr.eqns
-            if len(expected) == 1 and str(expected[0].params.get("jaxpr")) == str(inner):
-                return True
-    return False

@@ -332,7 +332,8 @@ def _loop(eqn: Any, operands: list[Any]) -> list[Any]:
     def stack(rows: list[Any]) -> LinearEnclosure:
         return _map(lambda *parts: jnp.stack(parts), *map(_lift, rows))
 
-    results = unroll(eqn, operands, _DOMAIN, row, stack)
+    run = lambda program, x: interpret(program, x, _DOMAIN)  # noqa: E731
+    results = unroll(eqn, operands, run, row, stack)
     if results is None:
         raise NoEnclosure("a loop of many turns")
     return results

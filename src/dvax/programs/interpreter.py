@@ -55,7 +55,7 @@ def operate(eqn: Any, operands: list[Any], domain: Domain) -> list[Any]:
     """Return the values of the results of one operation."""
     if not any(map(domain.is_abstract, operands)):
         return domain.evaluate(eqn, operands)
-    rule = domain.rules.get(operation(eqn))
+    rule = domain.rules.get(operation(eqn)) or domain.rules.get(eqn.primitive.name)
     results = None if rule is None else domain.apply(rule, eqn, operands)
     if results is not None:
         return results
@@ -76,14 +76,15 @@ MAX_UNROLLED = 32
 def unroll(
     eqn: Any,
     operands: list[Any],
-    domain: Domain,
+    run: Callable[[Any, list[Any]], list[Any]],
     row: Callable[..., Any],
     stack: Callable[..., Any],
 ) -> list[Any] | None:
     """Return the results of a `lax.scan`, unrolled, or None if it has more than `MAX_UNROLLED`
     iterations. (A `fori_loop` with static bounds is a scan.)
 
-    `row(value, k)` returns the k-th row of an array, and `stack(values)` an array of rows.
+    `run(program, inputs)` interprets its program, `row(value, k)` returns the k-th row of an array, and
+    `stack(values)` an array of rows.
     """
     length, counts = eqn.params["length"], scan_counts(eqn.params)
     if not 0 < length <= MAX_UNROLLED or counts is None:
@@ -93,7 +94,7 @@ def unroll(
     rows: list[list[Any]] = [[] for _ in range(length)]
     for k in reversed(range(length)) if eqn.params["reverse"] else range(length):
         turn = [*constants, *carry, *(row(v, k) for v in arrays)]
-        out = interpret(eqn.params["jaxpr"], turn, domain)
+        out = run(eqn.params["jaxpr"], turn)
         carry, rows[k] = out[: len(carry)], out[len(carry) :]
     return [*carry, *(stack(list(each)) for each in zip(*rows, strict=True))]
 

@@ -27,13 +27,23 @@ from ..._tree import Tree
 from ..interpreter import Domain, Rule, interpret, operate
 from .rules_choice import CHOICE, choice_rules
 from .rules_elementwise import ELEMENTWISE
+from .rules_functions import FUNCTIONS
+from .rules_programs import PROGRAMS, program_rules
 from .rules_scatter import SCATTER
 from .rules_structural import STRUCTURAL
 from .rules_tables import TABLES
 from .sources import Recorder
 from .values import MAX_ENTRIES, Part, Slope, TooLarge, entries, interval, is_slope
 
-RULES: dict[str, Rule] = {**ELEMENTWISE, **CHOICE, **STRUCTURAL, **SCATTER, **TABLES}
+RULES: dict[str, Rule] = {
+    **ELEMENTWISE,
+    **CHOICE,
+    **STRUCTURAL,
+    **SCATTER,
+    **TABLES,
+    **FUNCTIONS,
+    **PROGRAMS,
+}
 
 
 class EnclosedSlopes(NamedTuple):
@@ -57,7 +67,7 @@ class SlopeEnclosure:
         self._program, shape = jax.make_jaxpr(fn, return_shape=True)(*shaped)
         self._output = jtu.tree_structure(shape)
         # Sources cost time and memory, and serve selections only.
-        self._has_choice = has_operation(self._program, {"select_n"})
+        self._has_choice = has_operation(self._program, {"select_n", "cond"})
         self._wrt = [i in wrt for i, like in enumerate(likes) for _ in jtu.tree_leaves(like)]
 
     def __call__(self, *args: Tree) -> EnclosedSlopes:
@@ -74,7 +84,8 @@ class SlopeEnclosure:
             leaf = leaf._replace(parts={k: part} if differentiated else {})
             inputs.append(leaf if recorder is None else recorder.input(leaf))
             k += differentiated
-        rules = RULES | choice_rules(recorder)
+        run = lambda program, x: interpret(program, x, domain)  # noqa: E731
+        rules = RULES | choice_rules(recorder) | program_rules(run)
         apply = partial(_apply, recorder)
         domain = Domain(rules, is_slope, partial(_unknown, unknown), apply, _evaluate)
         with np.errstate(all="ignore"):
@@ -90,7 +101,7 @@ def _apply(
     if result is None:
         return None
     results = result if isinstance(result, list) else [result]
-    values = [_constant_if_decided(_without_nan(x)) for x in results]
+    values = [_constant_if_decided(_without_nan(x)) if is_slope(x) else x for x in results]
     if recorder is None:
         return values
     return [recorder.result(x, eqn, operands, k) for k, x in enumerate(values)]
@@ -140,13 +151,13 @@ def _anything(operands: list[Any], aval: Any) -> Slope:
 
 
 def _constant_if_decided(x: Slope) -> Any:
-    """Return a comparison that has the same result in the whole region as a constant."""
-    return x.low if x.low.dtype == bool and (x.low == x.high).all() else x
+    """Return a comparison, or an index, that is the same in the whole region as a constant."""
+    return x.low if x.low.dtype.kind in "biu" and (x.low == x.high).all() else x
 
 
 def _without_nan(x: Slope) -> Slope:
     """Return the slope with unbounded intervals in place of NaN, the result of ∞ − ∞ and the like."""
-    if x.low.dtype == bool:
+    if x.low.dtype.kind != "f":
         return x
     parts = {}
     for k, p in x.parts.items():

@@ -95,7 +95,9 @@ def _clamp(eqn: Any, operands: list[Any]) -> Slope:
 
 
 def _abs(eqn: Any, operands: list[Any]) -> Slope:
-    return _largest(operands[0], negative(operands[0]))
+    (x,) = operands
+    y = _largest(x, negative(x))
+    return y._replace(low=np.maximum(y.low, 0.0))
 
 
 def _composed(phi: Smooth, x: Slope) -> Slope:
@@ -127,12 +129,14 @@ def _stairs(phi: Callable[[Values], Values]) -> Rule:
         (x,) = operands
         low, high = phi(x.low), phi(x.high)
         jump = np.where(low == high, 0.0, np.inf)
-        level = lambda p: Part(  # noqa: E731
-            np.zeros_like(p.center), np.where(is_dependent(p), jump, 0.0), p.full
-        )
-        return Slope(low, high, mapped(x.parts, level))
+        return Slope(low, high, mapped(x.parts, lambda p: _jumping(p, jump)))
 
     return rule
+
+
+def _jumping(part: Part, jump: Values) -> Part:
+    """Return the derivative of a piecewise constant function: 0, or `jump` where it depends on v."""
+    return Part(np.zeros_like(part.center), np.where(is_dependent(part), jump, 0.0), part.full)
 
 
 def _round(eqn: Any, operands: list[Any]) -> Slope | None:
@@ -189,9 +193,19 @@ def _not(eqn: Any, operands: list[Any]) -> Slope | None:
     return _opposite(operands[0]) if operands[0].low.dtype == bool else None
 
 
+def _is_finite(eqn: Any, operands: list[Any]) -> Slope:
+    (x,) = operands
+    bounded = np.isfinite(x.low) & np.isfinite(x.high)
+    return _decided(bounded, np.ones_like(bounded), x)
+
+
 def _convert(eqn: Any, operands: list[Any]) -> Slope | None:
     (x,) = operands
     before, after = eqn.invars[0].aval, eqn.outvars[0].aval
+    if before.dtype == bool and np.issubdtype(after.dtype, np.integer):
+        jump = np.where(x.low == x.high, 0.0, np.inf)
+        low, high = (end.astype(after.dtype) for end in (x.low, x.high))
+        return Slope(low, high, mapped(x.parts, lambda p: _jumping(p, jump)))
     if not is_real(after):
         return None
     if is_real(before):
@@ -224,5 +238,6 @@ ELEMENTWISE: dict[str, Rule] = {
     "and": _logic(np.logical_and),
     "or": _logic(np.logical_or),
     "not": _not,
+    "is_finite": _is_finite,
     "convert_element_type": _convert,
 }

@@ -139,18 +139,18 @@ def _einsum(eqn: Any, extra: tuple[int, int]) -> str:
     return f"{sides[0]},{sides[1]}->{front}{''.join(out)}"
 
 
-class _Ball(NamedTuple):
+class Ball(NamedTuple):
     """An interval array as center and radius."""
 
     center: Values
     radius: Values
 
 
-def _ball(x: Slope) -> _Ball:
-    return _Ball(*between(np.asarray(x.low, float), np.asarray(x.high, float), True)[:2])
+def ball(x: Slope) -> Ball:
+    return Ball(*between(np.asarray(x.low, float), np.asarray(x.high, float), True)[:2])
 
 
-def _times(spec: str, x: Any, y: Any) -> _Ball:
+def times(spec: str, x: Any, y: Any) -> Ball:
     """Return the product of two interval arrays."""
 
     def dot(a: Values, b: Values) -> Values:
@@ -162,23 +162,23 @@ def _times(spec: str, x: Any, y: Any) -> _Ball:
         return np.where(infinite > 0, np.inf, finite)
 
     radius = bound(np.abs(x.center), y.radius) + bound(x.radius, np.abs(y.center) + y.radius)
-    return _Ball(dot(x.center, y.center), radius)
+    return Ball(dot(x.center, y.center), radius)
 
 
 def _dot_general(eqn: Any, operands: list[Any]) -> Slope:
     left, right = (lift(v, tuple(atom.aval.shape)) for v, atom in zip(operands, eqn.invars))
-    x, y = _ball(left), _ball(right)
-    value = _times(_einsum(eqn, (0, 0)), x, y)
+    x, y = ball(left), ball(right)
+    value = times(_einsum(eqn, (0, 0)), x, y)
     out = eqn.outvars[0].aval.size
 
-    def by(side: Slope, spec: str, times: Callable[[str, Part], _Ball]) -> Slope:
+    def by(side: Slope, spec: str, times: Callable[[str, Part], Ball]) -> Slope:
         """Return the derivatives of the product through one side."""
         full = lambda part: columns(part, max(side.low.size, out))  # noqa: E731
         parts = mapped(side.parts, lambda part: Part(*times(spec, full(part)), True))
         return Slope(value.center, value.center, parts)
 
-    by_left = by(left, _einsum(eqn, (1, 0)), lambda spec, part: _times(spec, part, y))
-    by_right = by(right, _einsum(eqn, (0, 1)), lambda spec, part: _times(spec, x, part))
+    by_left = by(left, _einsum(eqn, (1, 0)), lambda spec, part: times(spec, part, y))
+    by_right = by(right, _einsum(eqn, (0, 1)), lambda spec, part: times(spec, x, part))
     parts = added(by_left, by_right)
     return Slope(value.center - value.radius, value.center + value.radius, parts)
 
