@@ -1,6 +1,6 @@
 """A run whose saved rows go into a store, piece by piece.
 
-A piece has as many rows as fit into 32 MB. It starts from the last state and step size of the one
+A piece has as many rows as fit into 8 MB. It starts from the last state and step size of the one
 before, and all pieces share one compiled program, so that the memory of a run does not grow with the
 number of saved times.
 """
@@ -20,7 +20,7 @@ from .results import is_success
 from .rows import cut, with_fields
 from .solution import Solution
 
-_PIECE_BYTES = 2**25
+_PIECE_BYTES = 2**23
 
 
 @runtime_checkable
