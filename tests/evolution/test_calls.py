@@ -25,6 +25,14 @@ def problem(f):
     )
 
 
+@pytest.mark.parametrize("rtol", [1.0, 10.0, 1e6])
+def test_rtol_that_accepts_any_answer_is_refused(rtol):
+    with pytest.raises(
+        dvax.InputError, match=r"rtol\): got .*must be below 1, or an error as large"
+    ):
+        dvax.solve(c1().problem, -1.0, 0.0, 1.0, rtol=rtol)
+
+
 def test_arguments_have_the_names_the_order_and_the_defaults_of_solve():
     signature = inspect.signature(dvax.solve).parameters.values()
     assert tuple(p.name for p in signature) == Arguments._fields

@@ -99,3 +99,23 @@ def test_region_of_u_that_excludes_responses_bounds_only_up_to_them():
     assert reason in repr(bound) and "limits are -inf and 0.9" in bound.why
     free = dvax.bound_error(problem, sol, dvax.verify(problem, x0).constants, initial_error=1e308)
     assert np.isinf(free.x[-1]) and "larger than any number" in repr(free)
+
+
+MOVING = {
+    "constrained box": lambda t, args: dvax.sets.ConstrainedBox(
+        jnp.zeros(2), 0.02 + 0.01 * jnp.sin(t) * jnp.ones(2), jnp.ones((1, 2)), jnp.zeros(1),
+        (0.05 + t)[None],
+    ),
+    "ball in the 1-norm": lambda t, args: dvax.sets.L1Ball(jnp.zeros(2), 0.02 + 0.01 * jnp.cos(t)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", MOVING)
+def test_bounds_of_a_moving_set_limit_the_region_of_u(kind):
+    problem = grazing(MOVING[kind])
+    problem = dvax.Problem(
+        A=problem.A, P=problem.P, K=MOVING[kind], f=lambda t, x, u, args: -u * x, h=problem.h
+    )
+    found = dvax.verify(problem, jnp.ones(2), 0.0, 3.0, x=(0.0, 1.0))
+    assert found["ass:f_lipschitz"].status == "proved"
+    assert 0.03 <= float(found.constants.alpha_f) <= 0.031

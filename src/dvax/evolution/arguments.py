@@ -160,6 +160,9 @@ def check(call: Arguments) -> None:
     if not unusable & {"rtol", "atol"} and _tree.is_concrete(call.rtol, call.atol):
         rule(bool(call.rtol != 0 or call.atol != 0), "rtol, atol", _tree.Text("0, 0"),
              "one of them must be positive", "No finite step has defect zero")  # fmt: skip
+        rule(bool(call.rtol < 1), "rtol", call.rtol,
+             "it must be below 1, or an error as large as x itself is accepted",
+             "Write rtol=1e-6 for six digits")  # fmt: skip
     wrong.raise_any()
 
 

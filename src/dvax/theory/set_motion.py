@@ -2,7 +2,7 @@
 
 import itertools
 import operator
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from ..errors import InputError
 from ..problem import Problem
 from ..programs.slope import Slope, SlopeEnclosure, TooLarge, Values, interval, is_slope
 from ..programs.structure import independent
-from ..sets import AbstractSet, Ball, Intersection, Simplex
+from ..sets import AbstractSet, Ball, ConstrainedBox, Intersection, L1Ball, Simplex
 from ..spaces import AbstractSpace
 from .set_bounds import bounds_of_fixed_set
 from .system import System
@@ -67,7 +67,9 @@ def set_motion(system: System, t0: float, t1: float, knots: Values) -> SetMotion
     if _describe(first, like, system.control) is None:
         # The shape of the set is unknown. A constant set was checked when it was constructed.
         if not is_constant:
-            return SetMotion(np.inf, *no_bounds, False, empty)
+            pieces = times(t0, t1, knots)
+            bounds = _bounds_of_moving_set(lambda t: problem.set_at(t, args), like, pieces)
+            return SetMotion(np.inf, *(bounds or no_bounds), False, empty)
         bounds = None if isinstance(like, tuple) else bounds_of_fixed_set(first, like)
         is_nonempty = empty is None and _rejects_empty(first)
         return SetMotion(0.0, *(bounds or no_bounds), is_nonempty, empty)
@@ -102,6 +104,33 @@ def does_not_move(problem: Problem, t: float, args: Any) -> bool:
     # A function in a set may use t, which its code does not show.
     known = all(map(eqx.is_array_like, numbers(jnp.asarray(t))))
     return known and independent(numbers, jnp.asarray(t))
+
+
+def _bounds_of_moving_set(
+    K: Callable[[Any], AbstractSet], like: Tree, pieces: Iterable[Slope]
+) -> tuple[Values, Values] | None:
+    """Return bounds of all K(t), from those that K(t) has entry by entry; None for a set without."""
+
+    def bounds(t: Any) -> tuple[Any, Any]:
+        now = K(t)
+        if isinstance(now, L1Ball):
+            ends = now.center - now.radius, now.center + now.radius
+        elif isinstance(now, ConstrainedBox):
+            ends = now.lower, now.upper
+        else:
+            raise NotImplementedError
+        low, high = (jnp.broadcast_to(end, jnp.shape(like)) for end in ends)
+        return low, high
+
+    if isinstance(like, tuple):
+        return None
+    try:
+        enclosure = SlopeEnclosure(bounds, (jnp.zeros(()),), ())
+    except NotImplementedError:
+        return None
+    found = [enclosure(piece).out for piece in pieces]
+    low = np.minimum.reduce([ends[0].low for ends in found])
+    return low, np.maximum.reduce([ends[1].high for ends in found])
 
 
 def _rejects_empty(K: AbstractSet) -> bool:
