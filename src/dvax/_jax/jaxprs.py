@@ -4,9 +4,11 @@ A traced program is a `ClosedJaxpr`: a list of equations, each of which applies 
 and literals, and the arrays that the traced function closes over.
 """
 
+import functools
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from .known_functions import known_name
 
@@ -87,7 +89,12 @@ def nested_programs(params: dict[str, Any]) -> list[Any]:
 
 
 def inner_program(eqn: Any) -> Any:
-    """Return the program that a call applies to its arguments, or None for another operation."""
+    """Return the program that a call applies to its arguments, or None for another operation.
+
+    A polynomial, which is one operation from JAX 0.12 on, counts as a call of Horner's scheme.
+    """
+    if eqn.primitive.name == "polynomial":
+        return _horner(*((v.aval.shape, str(v.aval.dtype)) for v in eqn.invars))
     if eqn.primitive.name not in CALLS:
         return None
     for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
@@ -98,6 +105,20 @@ def inner_program(eqn: Any) -> Any:
         if isinstance(inner, ClosedJaxpr) and len(inner.jaxpr.invars) == len(eqn.invars):
             return inner
     return None
+
+
+@functools.lru_cache(64)
+def _horner(*types: tuple[tuple[int, ...], str]) -> Any:
+    """Return the program of c₀ + x (c₁ + x (c₂ + …)) for x and coefficients of these types."""
+
+    def value(x: Any, *coefficients: Any) -> Any:
+        *others, total = coefficients
+        total = jnp.broadcast_to(total, x.shape)
+        for c in reversed(others):
+            total = total * x + c
+        return total
+
+    return jax.make_jaxpr(value)(*(jax.ShapeDtypeStruct(*each) for each in types))
 
 
 def operation(eqn: Any) -> str:
