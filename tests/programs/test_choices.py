@@ -59,6 +59,9 @@ CONTINUOUS = {
 DISCONTINUOUS = {
     "step": lambda v: jnp.where(v > 0, 1.0, 0.0),
     "a small jump": lambda v: jnp.where(v > 0, v + 1e-9, v),
+    "a jump beside a sentinel": lambda v: jnp.where(v > 0, jnp.minimum(v + 1.0, 1e30), v),
+    "a jump beside a large term": lambda v: jnp.where(v > 0, v + 1.0 + 1e30 * v, v * 1e20),
+    "a jump beside a small quotient": lambda v: jnp.where(v > 0.5, v / 1e-30 * 1e-30 + 1.0, v),
     "wrong limit": lambda v: jnp.where(v > 0.5, v - 0.4, 0.0),
     "another entry": lambda v: jnp.where(v > 0, v[::-1], 0.0),
     "another entry by an index": lambda v: jnp.where(v > 0, v[jnp.array([1, 2, 0])], 0.0),

@@ -94,7 +94,8 @@ def test_dvax_is_within_its_bound_of_the_exact_circuit(name):
     bound = dvax.bound_error(circuit.problem, sol, circuit.constants)
     energy = np.sqrt(np.sum(np.asarray(circuit.storage) * off**2, axis=1))
     # Two roundings beside the bound: the exact solution is returned in double precision, and the
-    # entries of its matrices, rates up to 2·10⁹ per second, are rounded to long double.
+    # entries of its matrices, rates up to 2·10⁹ per second, and of their exponentials are rounded to
+    # long double.
     fastest = max(float(np.abs(mode.Z).max()) for mode in given.regularised.values())
     relative = np.finfo(float).eps + 4.0 * float(np.finfo(np.longdouble).eps) * fastest * ts
     rounding = relative * np.sqrt(CAPACITY) * 10.0

@@ -68,7 +68,9 @@ def set_motion(system: System, t0: float, t1: float, knots: Values) -> SetMotion
         # The shape of the set is unknown. A constant set was checked when it was constructed.
         if not is_constant:
             pieces = times(t0, t1, knots)
-            bounds = _bounds_of_moving_set(lambda t: problem.set_at(t, args), like, pieces)
+            bounds = None
+            if isinstance(first, ConstrainedBox | L1Ball) and not isinstance(like, tuple):
+                bounds = _bounds_of_moving_set(lambda t: problem.set_at(t, args), like, pieces)
             return SetMotion(np.inf, *(bounds or no_bounds), False, empty)
         bounds = None if isinstance(like, tuple) else bounds_of_fixed_set(first, like)
         is_nonempty = empty is None and _rejects_empty(first)
@@ -108,26 +110,18 @@ def does_not_move(problem: Problem, t: float, args: Any) -> bool:
 
 def _bounds_of_moving_set(
     K: Callable[[Any], AbstractSet], like: Tree, pieces: Iterable[Slope]
-) -> tuple[Values, Values] | None:
-    """Return bounds of all K(t), from those that K(t) has entry by entry; None for a set without."""
+) -> tuple[Values, Values]:
+    """Return bounds of all K(t), from those that K(t) has entry by entry."""
 
-    def bounds(t: Any) -> tuple[Any, Any]:
+    def bounds(t: Any) -> list[Any]:
         now = K(t)
-        if isinstance(now, L1Ball):
-            ends = now.center - now.radius, now.center + now.radius
-        elif isinstance(now, ConstrainedBox):
-            ends = now.lower, now.upper
-        else:
-            raise NotImplementedError
-        low, high = (jnp.broadcast_to(end, jnp.shape(like)) for end in ends)
-        return low, high
+        assert isinstance(now, ConstrainedBox | L1Ball)
+        ends = (now.lower, now.upper) if isinstance(now, ConstrainedBox) else (
+            now.center - now.radius, now.center + now.radius
+        )  # fmt: skip
+        return [jnp.broadcast_to(end, jnp.shape(like)) for end in ends]
 
-    if isinstance(like, tuple):
-        return None
-    try:
-        enclosure = SlopeEnclosure(bounds, (jnp.zeros(()),), ())
-    except NotImplementedError:
-        return None
+    enclosure = SlopeEnclosure(bounds, (jnp.zeros(()),), ())
     found = [enclosure(piece).out for piece in pieces]
     low = np.minimum.reduce([ends[0].low for ends in found])
     return low, np.maximum.reduce([ends[1].high for ends in found])

@@ -3,8 +3,8 @@
 The function a(v) where v > w and b(v) elsewhere is continuous if a = b wherever v = w. Both branches
 are expanded into polynomials with rational coefficients, in which v is replaced by w. Every function
 that is no polynomial counts as a new variable, but its values at the points where they are rational are
-known, such as e⁰ = 1. A difference of the size of rounding errors counts as 0, since it comes from
-constants such as 0.1, which are rounded themselves.
+known, such as e⁰ = 1. A difference of a few roundings of the values themselves counts as 0, since it
+comes from constants such as 0.1, which are rounded.
 """
 
 import math
@@ -98,11 +98,18 @@ def _agree_at(
             a, b = (e.of(branch) for e, branch in zip(expansions, (no, yes), strict=True))
         except _NoProof:
             return False
-        largest = max(e.largest for e in expansions)
-        gaps = _sum(a, b, -1).values()
-        return all(np.all(np.abs(gap) <= Fraction(_EPS_FACTOR * eps) * largest) for gap in gaps)
+        return _differ_by_rounding(a, b, eps)
 
     return any(all(map(is_proved, each)) for each in _solutions(v, w, shape))
+
+
+def _differ_by_rounding(a: Terms, b: Terms, eps: float) -> bool:
+    """Return whether each coefficient of a − b is rounding beside those of a and b."""
+    for product, gap in _sum(a, b, -1).items():
+        size = sum(np.abs(terms.get(product, Fraction(0))) for terms in (a, b))
+        if np.any(np.abs(gap) > Fraction(_EPS_FACTOR * eps) * size):
+            return False
+    return True
 
 
 def _solutions(v: Any, w: Any, shape: tuple[int, ...]) -> Iterator[list[dict[int, Terms]]]:
@@ -141,14 +148,10 @@ def modulus_argument(value: Any) -> Any:
 
 
 class _Expansion:
-    """The expansion of values into polynomials, with some values given.
-
-    `largest` is the largest coefficient so far, to which rounding errors are proportional.
-    """
+    """The expansion of values into polynomials, with some values given."""
 
     def __init__(self, shape: tuple[int, ...], known: dict[int, Terms], choices: dict[int, bool]):
         self.shape, self.known, self.choices = shape, known, choices
-        self.largest = Fraction(0)
         self._memo: dict[int, Terms] = dict(known)
         self._depends: dict[int, bool] = dict.fromkeys((*known, *choices), True)
 
@@ -158,18 +161,13 @@ class _Expansion:
         **Raises:** `_NoProof`.
         """
         if not is_slope(value):
-            return self._measured(_constant(self._fractions(np.asarray(value))))
+            return _constant(self._fractions(np.asarray(value)))
         if value.source is None:
             raise _NoProof
         key = value.source.key
         if key not in self._memo:
-            self._memo[key] = self._measured(self._expand(value))
+            self._memo[key] = self._expand(value)
         return self._memo[key]
-
-    def _measured(self, terms: Terms) -> Terms:
-        for factor in terms.values():
-            self.largest = max(self.largest, np.max(np.abs(factor)))
-        return terms
 
     def _fractions(self, array: np.ndarray) -> Any:
         if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
