@@ -70,6 +70,35 @@ def test_projection_derivative_in_the_data_of_held_points():
     np.testing.assert_allclose(shared(jnp.array([1.0, 2.0])), [0.5, 0.25])
 
 
+@pytest.mark.parametrize("kind", ["inequality", "equation"])
+def test_at_a_vertex_that_a_row_and_all_bounds_share_the_row_moves_the_point(kind):
+    # A shared limit that is a multiple of the single ones: y = 1 for the k largest z/w, else 0.
+    n = 8
+    rng = np.random.default_rng(5)
+    space, rows = spaces.L2(np.exp(rng.normal(size=n))), np.ones((1, n))
+
+    def project(z, upper, limit, row):
+        low = limit if kind == "equation" else jnp.array([-jnp.inf])
+        return sets.ConstrainedBox(0.0, upper, row, low, limit).project(z, space)
+
+    derivative = jax.jit(jax.jacfwd(project, (1, 2)))
+    onto = jax.jit(project)
+    for scale in ([1.0] * n, rng.uniform(0.5, 2.0, n)):
+        row = jnp.asarray(rows * scale)
+        for k in (1, 3, n):
+            z = jnp.asarray(30.0 * np.where(np.arange(n) < k, 1.0, -1.0) + rng.normal(size=n))
+            z, upper = jnp.asarray(rng.permutation(z)), jnp.ones(n)
+            limit = row @ jnp.where(z > 0, 1.0, 0.0)
+            of_upper, of_limit = derivative(z, upper, limit, row)
+            y = onto(z, upper, limit, row)
+            np.testing.assert_allclose(y, np.where(z > 0, 1.0, 0.0), atol=1e-12)
+            np.testing.assert_allclose(row @ of_limit, 1.0, rtol=1e-9)
+            np.testing.assert_allclose(row @ of_upper, 0.0, atol=1e-9)
+            step = -1e-4
+            tightened = (onto(z, upper, limit + step, row) - y) / step
+            np.testing.assert_allclose(of_limit[:, 0], tightened, atol=1e-7)
+
+
 @pytest.mark.thorough
 def test_projection_second_derivatives_are_those_of_the_face():
     K, z = sets.Ellipsoid(0.0, radii=jnp.array([2.0, 1.0])), jnp.array([3.0, 2.0])

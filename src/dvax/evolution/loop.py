@@ -5,6 +5,7 @@ nothing between saved times, and the lanes of a batch wait for each other no lon
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -78,6 +79,13 @@ class Loop(eqx.Module):
     progress: bool = eqx.field(static=True)
     forward_mode: bool = eqx.field(static=True)
     watch: EventWatch | None = None
+
+    def for_derivatives(self) -> "Loop":
+        """Return the loop whose steps a derivative can take as well."""
+        stepper = self.stepper
+        # A method that linearises has no limit of stability, and steps of a given size have no choice.
+        limited = self.controller.adapts and not stepper.method.is_rosenbrock
+        return replace(self, stepper=replace(stepper, for_derivatives=limited))
 
     def run(
         self, x0: Tree, ts: jax.Array | None, checkpoints: Checkpoints | None = None

@@ -33,8 +33,8 @@ class AbstractMethod(eqx.Module):
     away. Where `is_rosenbrock`, the method has A + J in the place of A and f̃ − Jx in that of f̃, with
     J = Df̃(t₀, x₀); where `explicit_in_A`, it has 0 and f̃ + Ax there. `pair` numbers two evaluations of
     a measured step at one time, whose differences show the slope of f̃. `quadrature` has the weights
-    of the integral of the defect, or None for those that interpolate. A method states the last five
-    where they differ from the defaults.
+    of the integral of the defect, or None for those that interpolate. Without A, steps are `stable` for
+    real hλ ≥ −stable. A method states the last six where they differ from the defaults.
 
     ```python
     >>> import dvax
@@ -54,6 +54,7 @@ class AbstractMethod(eqx.Module):
     explicit_in_A: ClassVar[bool] = False
     pair: ClassVar[tuple[int, int] | None] = None
     quadrature: ClassVar[tuple[float, ...] | None] = None
+    stable: ClassVar[float] = 2.0
 
     @abc.abstractmethod
     def coefficients(
@@ -165,6 +166,7 @@ class ETD4RK(AbstractMethod):
     has_half_stage: ClassVar[bool] = True
     pair: ClassVar[tuple[int, int] | None] = (1, 2)
     quadrature: ClassVar[tuple[float, ...] | None] = (1 / 12, 5 / 12, 5 / 12, 1 / 12)
+    stable: ClassVar[float] = 2.7
 
     def coefficients(self, evaluate, propagate, first, drift):
         a = evaluate(0.5, propagate(0.5, (first,)))

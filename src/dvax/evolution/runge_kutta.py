@@ -65,6 +65,7 @@ class DormandPrince(AbstractMethod):
     explicit_in_A: ClassVar[bool] = True
     pair: ClassVar[tuple[int, int] | None] = (5, 6)
     quadrature: ClassVar[tuple[float, ...] | None] = (1 / 12, 5 / 12, 0.0, 5 / 12, 1 / 12)
+    stable: ClassVar[float] = 3.3
 
     def coefficients(self, evaluate, propagate, first, drift):
         sum_of = lambda weights, terms: combined(*zip(weights, terms, strict=False))  # noqa: E731

@@ -16,7 +16,7 @@ from .._knots import END_ULPS, KNOT_ULPS
 from .._tree import Tree
 from ..generators import AbstractPropagator, FlowStep, Growth
 from ..generators.spectral_state import coefficients, values
-from . import error_estimate
+from . import error_estimate, power_iteration
 from .bounds import Bounds
 from .defect import Sample, enclosed, roundoff, sampled
 from .evaluations import Evaluation, Stages, evaluated
@@ -37,14 +37,15 @@ _SLOW = 0.1
 class SolverState(NamedTuple):
     """What the next step reuses of an accepted one: the rate at its end, a guess for the law, the
     coefficients of its end in the eigenfunctions of A, the largest `variation` of the data between
-    samples so far (`ExcursionGuard`), and an estimate of the `error` of x, each None where it is not
-    needed."""
+    samples so far (`ExcursionGuard`), an estimate of the `error` of x, and the `direction` of the power
+    iteration, each None where it is not needed."""
 
     rate: Rate | None
     guess: Tree | None
     coefficients: Tree
     variation: Tree
     error: Tree | None = None
+    direction: Tree | None = None
 
 
 class Propagators(NamedTuple):
@@ -55,6 +56,19 @@ class Propagators(NamedTuple):
     full: AbstractPropagator
     half: AbstractPropagator | None
     inner: tuple[AbstractPropagator, ...]
+
+
+class Fastest(NamedTuple):
+    """The fastest change that a derivative of the run may have within a step.
+
+    - `slope`: h times the largest slope of what the method treats explicitly (`power_iteration`);
+    - `is_damped`: such a change decays;
+    - `is_stiff`: x itself changes slowly beside it.
+    """
+
+    slope: Any
+    is_damped: Any
+    is_stiff: Any
 
 
 class Step(NamedTuple):
@@ -73,6 +87,7 @@ class Step(NamedTuple):
     - `evaluations`: of F;
     - `stiffness`: h times the slope of f̃ between two stages, None where the method has no such pair;
     - `carried`: the estimated error of x₀, and what the step leaves of it, None where not estimated;
+    - `fastest`: what limits the steps of a derivative, None where none is wanted.
     """
 
     x1: Tree
@@ -90,6 +105,7 @@ class Step(NamedTuple):
     stiffness: Any = None
     signed: Tree | None = None
     carried: tuple[Tree, Tree] | None = None
+    fastest: Fastest | None = None
 
 
 def interpolate(flow: Flow, length: Any, theta: Any, x0: Tree, c: tuple[Tree, ...]) -> Tree:
@@ -150,7 +166,8 @@ class Stepper(eqx.Module):
     - `estimate`: carry an estimate of the error of x along;
     - `ends`: first and last time of the run;
     - `uniform`: the propagators, where all steps have one length that is known beforehand;
-    - `growth`: of the semigroup, where the defect is enclosed.
+    - `growth`: of the semigroup, where the defect is enclosed;
+    - `for_derivatives`: find the largest slope of f̃, which limits steps whose derivative is wanted.
     """
 
     method: AbstractMethod
@@ -164,6 +181,7 @@ class Stepper(eqx.Module):
     ends: tuple[Any, Any]
     uniform: Propagators | None
     growth: Growth | None
+    for_derivatives: bool = eqx.field(static=True, default=False)
 
     def begin(self, x0: Tree) -> SolverState:
         """Before the first step nothing is known but where to look first."""
@@ -176,7 +194,10 @@ class Stepper(eqx.Module):
         rate = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), blank)
         none = None if self.guard is None else self.guard.start(self.flow, self.ends[0], x0)
         error = _tree.zeros_like(x0) if self.estimate else None
-        return SolverState(rate, guess, known, none, error)
+        direction = None
+        if self.for_derivatives:
+            direction = power_iteration.pattern(self.flow.state_space(x0), x0)
+        return SolverState(rate, guess, known, none, error, direction)
 
     def restart(self, solver_state: SolverState, x: Tree) -> SolverState:
         """Return the state of the stepper after the state of the run was set to x."""
@@ -247,7 +268,7 @@ class Stepper(eqx.Module):
         first, last = evaluations[0].rate, evaluations[-1].rate
         error, integrated_defect, event, excursion, bounds = None, (0.0, 0.0), None, None, None
         stiffness, signed, carried, estimate = None, None, None, None
-        variation = solver_state.variation
+        variation, fastest, direction = solver_state.variation, None, None
         if self.measure:
             slopes = self._slopes(t1 - t0, evaluations)
             whole = None if slopes is None else slopes[1]
@@ -271,12 +292,17 @@ class Stepper(eqx.Module):
                 share = (t1 - t0) / (self.ends[1] - self.ends[0])
                 seen = self.guard.estimate(self.flow, along, variation, share)
                 excursion, variation = seen.ratio, seen.variation
+            # Where x itself changes at a comparable rate, accuracy requires such steps too.
+            space = self.flow.state_space(x0)
+            change = space.norm(_tree.sub(x1, x0)) / space.norm(x1)
             if slopes is not None:
-                # Where x itself changes at a comparable rate, accuracy requires such steps too.
-                space = self.flow.state_space(x0)
-                change = space.norm(_tree.sub(x1, x0)) / space.norm(x1)
                 slope = slopes[self.method.explicit_in_A]
                 stiffness = jnp.where(change < _SLOW * slope, slope, 0.0)
+            if self.for_derivatives:
+                guess = solver_state.guess if first.y is None else first.y
+                fastest, direction = self._fastest(
+                    t0, t1, x0, guess, solver_state.direction, change
+                )
             # Further in, a bad value may come from a step that was too long: it is cut, not fatal.
             finite = _tree.all_finite(first.value)
         else:
@@ -290,6 +316,7 @@ class Stepper(eqx.Module):
             known,
             variation,
             estimate,
+            direction,
         )
         solved = jnp.all(jnp.stack([one.rate.solved for one in evaluations]))
         # The first one was made by the step before, unless nothing is kept, or data jumped.
@@ -297,7 +324,7 @@ class Stepper(eqx.Module):
         own = counts[0] if kept is None else jnp.where(jumped, counts[0], 0)
         return Step(
             x1, c, error, integrated_defect, event, excursion, bounds, after, first.solved, solved,
-            finite, sum(counts[1:], own), stiffness, signed, carried,
+            finite, sum(counts[1:], own), stiffness, signed, carried, fastest,
         )  # fmt: skip
 
     def _local(
@@ -397,6 +424,20 @@ class Stepper(eqx.Module):
         scale = h / space.norm(apart)
         return lax.stop_gradient((scale * space.norm(change), scale * space.norm(whole)))
 
+    def _fastest(
+        self, t0: Any, t1: Any, x0: Tree, guess: Tree | None, direction: Any, change: Any
+    ) -> tuple[Fastest, Tree]:
+        """Return what limits the steps of a derivative, and the next direction of the power iteration.
+        `change` is that of x over the step, relative to x."""
+        flow, t0, t1, x0, guess, direction = _constant((self.flow, t0, t1, x0, guess, direction))
+        t = self._one_sided_time(t0, t1, 0.0)
+        value = lambda x: flow.nonlinear_part(x, flow.rate(t, x, guess).value)  # noqa: E731
+        _, push = jax.linearize(value, x0)
+        space = flow.state_space(x0)
+        slope, is_damped, direction = power_iteration.refine(space, push, direction)
+        slope = (t1 - t0) * slope
+        return _constant((Fastest(slope, is_damped, change < _SLOW * slope), direction))
+
     def _event(
         self, t0: Any, t1: Any, x0: Tree, c: Any, first: Rate, sample: Sample, wanted: Any
     ) -> Any:
@@ -471,6 +512,12 @@ class Stepper(eqx.Module):
             sample = enclosed(self.flow, self.growth, ends, arc, evaluations[-1].rate, span)
         space = self.flow.state_space(values(arc.x1))
         return sample._replace(defect=sample.defect + roundoff(space, arc))
+
+
+def _constant(tree: Any) -> Any:
+    """Return the tree with no derivative in its numbers."""
+    numbers, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(lax.stop_gradient(numbers), rest)
 
 
 def _size(x: Tree) -> int:

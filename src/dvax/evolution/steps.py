@@ -19,6 +19,7 @@ from .control import (
     Adaptive,
     ErrorTest,
     Fixed,
+    TangentLimit,
     step_count,
 )
 from .event import Events
@@ -58,7 +59,7 @@ def by_steps(
         watch=watch,
     )
     if options.adjoint == "forward":
-        saved, end = forward_only(outlined(Loop.run, loop, x0, ts))
+        saved, end = forward_only(outlined(Loop.run, loop.for_derivatives(), x0, ts))
     else:
         saved, end = reverse.run(loop, x0, ts)
     complete = end.t >= t1
@@ -129,6 +130,7 @@ def _controller(
             certify=bool(setup.moduli),
             knows_decay=method.is_rosenbrock,
         ),
+        tangents=TangentLimit(rtol, method.order, method.stable),
         first=setup.number("dt0"),
         first_growth=setup.number("dt0_growth"),
         longest=setup.number("dt_max"),

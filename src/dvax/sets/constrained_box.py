@@ -38,8 +38,9 @@ class ConstrainedBox(AbstractSet):
     most 16 multipliers, so that with more active rows convergence is slow.
 
     The derivative, in z and all data, is that of the projection onto the active bounds and rows. A row
-    that holds with equality counts as active, even with the multiplier 0. With more than 16 active
-    rows the derivative is NaN.
+    that holds with equality counts as active, even with the multiplier 0. If all entries of an active
+    row are at their bounds, one of them moves with the row: the derivative is then the one-sided one
+    for a row that is tightened. With more than 16 active rows it is NaN.
 
     **Arguments:** `lower`, `upper`: numbers or vectors; `R`: a matrix, one row a condition; `low`,
     `high`: vectors. All bounds may be infinite.
@@ -299,7 +300,7 @@ def _line_search(
 
 def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
     """The derivative of the projection onto the active bounds and rows, which are fixed."""
-    y, multiplier, is_free, shifted = _nearest(*primals)
+    y, multiplier, free, shifted = _nearest(*primals)
     sums = times(primals[4], y)
     least = _tolerance(y, *primals[4:])
     # A row that holds with equality is active, as in every set.
@@ -310,6 +311,9 @@ def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
     chosen = _largest(is_active.astype(jnp.int32), width)
     active, on_high = is_active[chosen], at_high[chosen]
     at_lower = shifted <= primals[2]
+    outwards = jnp.where(active, jnp.where(on_high, 1.0, -1.0), 0.0)
+    rows, movable = outwards[:, None] * primals[4][chosen], primals[2] < primals[3]
+    is_free = (free > 0) | _released(rows, free, shifted - y, primals[1], movable)
     # Beyond 16 active rows the derivative is not available.
     factor = jnp.where(jnp.sum(is_active) <= width, jnp.ones((), y.dtype), jnp.nan)
 
@@ -317,9 +321,9 @@ def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
         rows = jnp.where(active[:, None], R[chosen], 0.0)
         bound = jnp.where(active, jnp.where(on_high, high[chosen], low[chosen]), 0.0)
         fixed = jnp.where(at_lower, lower, upper)
-        base = jnp.where(is_free > 0, z, jnp.where(jnp.isfinite(fixed), fixed, 0.0))
-        scaled = rows * jnp.where(is_free > 0, inverse_w, 0.0)[None, :]
-        # Rows that depend on others (or have no free entry) make the matrix singular.
+        base = jnp.where(is_free, z, jnp.where(jnp.isfinite(fixed), fixed, 0.0))
+        scaled = rows * jnp.where(is_free, inverse_w, 0.0)[None, :]
+        # Rows that depend on others make the matrix singular.
         damping = _DAMPING * jnp.finfo(z.dtype).eps * times(rows * rows, inverse_w)
         diagonal = jnp.where(damping > 0, damping, 1.0)
         matrix = product(scaled, rows.T) + jnp.diag(lax.stop_gradient(diagonal))
@@ -327,8 +331,28 @@ def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
         return base - combine(solve(matrix, right), scaled)
 
     dy = jvp_of_moving(project_on_face, primals, tangents)
-    constant = multiplier, is_free, shifted
+    constant = multiplier, free, shifted
     return (y, *constant), (factor * dy, *(jnp.zeros_like(v) for v in constant))
+
+
+def _released(
+    rows: jax.Array, free: jax.Array, beyond: jax.Array, inverse_w: jax.Array, movable: jax.Array
+) -> jax.Array:
+    """Return which entries leave their bounds where the limits of the active rows change: for each row
+    with no free entry, the one that has to move first where the row is tightened. With no such entry
+    the derivative at a vertex would violate the row.
+
+    `rows` point outwards, `beyond` is how far entries would be above (+) or below (−) their bounds."""
+    rates = jnp.abs(rows) * inverse_w[None, :]
+    is_held = ~jnp.any((rates > 0) & (free > 0)[None, :], axis=1)
+    candidate = (rates > 0) & movable[None, :]
+    inwards = candidate & (rows * beyond[None, :] >= 0)
+    # An equation at the end of its range can only be relaxed.
+    candidate = jnp.where(jnp.any(inwards, axis=1, keepdims=True), inwards, candidate)
+    distance = jnp.abs(beyond)[None, :] / jnp.where(candidate, rates, 1.0)
+    first = jnp.argmin(jnp.where(candidate, distance, jnp.inf), axis=1)
+    is_first = candidate & (first[:, None] == jnp.arange(rows.shape[1])[None, :])
+    return jnp.any(is_held[:, None] & is_first, axis=0)
 
 
 _nearest.defjvp(_nearest_jvp, symbolic_zeros=True)

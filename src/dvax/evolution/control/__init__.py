@@ -9,3 +9,4 @@ from .error_test import ErrorTest as ErrorTest
 from .fixed import Fixed as Fixed
 from .fixed import step_count as step_count
 from .growth_limiter import MAX_GROWTH as MAX_GROWTH
+from .tangent_limit import TangentLimit as TangentLimit

@@ -18,6 +18,7 @@ from .event_bracket import EventBracket
 from .growth_limiter import GrowthLimiter, limit_by_excursion, next_size, resume_planned
 from .roundoff_guard import RoundoffGuard
 from .stiffness_guard import StiffnessGuard
+from .tangent_limit import TangentLimit
 
 
 class Adaptive(AbstractController):
@@ -32,7 +33,8 @@ class Adaptive(AbstractController):
 
     1. `ErrorTest` measures the step, and `ErrorBudget` says which steps above the tolerance are
        accepted;
-    2. the `GrowthLimiter` chooses the next step size;
+    2. the `GrowthLimiter` chooses the next step size, below the `TangentLimit` where a derivative is
+       wanted;
     3. the `RoundoffGuard` lets steps grow where the error is roundoff;
     4. the `EventBracket` ends steps at events that the stepper located;
     5. the `StiffnessGuard` ends the run where stability limits the steps, if another method is worth
@@ -45,6 +47,7 @@ class Adaptive(AbstractController):
 
     stops: jax.Array
     test: ErrorTest
+    tangents: TangentLimit
     first: Any
     first_growth: Any
     longest: Any
@@ -57,7 +60,7 @@ class Adaptive(AbstractController):
 
     class State(NamedTuple):
         """The `end` of the next attempt, the step `size` that is planned, the number of the next
-        `stop`, and the states of the parts."""
+        `stop`, and the states of the parts: `decay` is that of the `TangentLimit`."""
 
         end: Any
         size: Any
@@ -66,6 +69,7 @@ class Adaptive(AbstractController):
         growth: GrowthLimiter
         guard: RoundoffGuard
         event: jax.Array
+        decay: Any
         stiffness: StiffnessGuard | None
 
     def init(self):
@@ -78,6 +82,7 @@ class Adaptive(AbstractController):
             growth=GrowthLimiter.at_start(first),
             guard=RoundoffGuard.at_start(first),
             event=EventBracket.no_event(first).pack(),
+            decay=jnp.zeros_like(first),
             stiffness=None if self.stiff_steps is None else StiffnessGuard.at_start(),
         )
 
@@ -100,6 +105,10 @@ class Adaptive(AbstractController):
         crossing = state.budget.may_cross(attempt, is_resolved)
         excursion = self._excursion(x0, step, attempt, span)
         passes = (attempt.error <= 1.0) | covered | crossing
+        tangent, decay = None, state.decay
+        if step.fastest is not None:
+            tangent = self.tangents.of(step.fastest, decay, attempt.size, attempt.smallest)
+            passes = passes & tangent.is_short_enough
         accepted = attempt.usable & passes & (excursion <= 1.0)
         budget = state.budget.after(attempt, accepted, covered, is_roundoff)
 
@@ -136,7 +145,11 @@ class Adaptive(AbstractController):
         jumped = accepted & (t1 == self.stops[state.stop])
         last = self.stops.shape[0] - 1
         stop = jnp.minimum(jnp.where(jumped, state.stop + 1, state.stop), last)
+        size = size if tangent is None else tangent.limit(size, attempt.size)
         size = jnp.minimum(jnp.maximum(size, attempt.smallest), self.longest)
+        if step.fastest is not None:
+            excited = accepted & (at_event | jumped)
+            decay = self.tangents.after(step.fastest, decay, attempt.error, accepted, excited)
         exhausted = is_noise & ~is_roundoff & state.budget.is_exhausted() & state.guard.had_noise()
         new = self.State(
             end=clip_to_stop(begin, size, event.limit(begin, self.stops[stop])),
@@ -146,6 +159,7 @@ class Adaptive(AbstractController):
             growth=state.growth.after(accepted, directed, guard.wait),
             guard=guard,
             event=event.pack(),
+            decay=decay,
             stiffness=None,
         )
         result = self._result(step, attempt, accepted, exhausted)
@@ -153,8 +167,10 @@ class Adaptive(AbstractController):
         # 5. End the run where stability limits the steps.
         if state.stiffness is not None and step.stiffness is not None:
             assert self.stiff_steps is not None
-            counts = accepted & ~at_event & jnp.isfinite(step.stiffness)
             stiffness = lax.stop_gradient(step.stiffness)
+            if tangent is not None:
+                stiffness = jnp.where(tangent.is_stiff, 1.0, stiffness)
+            counts = accepted & ~at_event & jnp.isfinite(stiffness)
             votes = state.stiffness.after(stiffness, counts)
             remaining = (self.stops[-1] - t1) / attempt.size
             stiff = votes.fires(stiffness, counts, remaining, self.stiff_steps)

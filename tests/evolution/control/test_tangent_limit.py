@@ -1,0 +1,100 @@
+"""The tangent limit: steps that a derivative can take, and the slope that limits them."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.evolution.control.attempts import NO, YES
+
+from dvax import spaces
+from dvax.evolution.control import TangentLimit
+from dvax.evolution.power_iteration import pattern, refine
+from dvax.evolution.stepper import Fastest
+
+# (order, stable, R(z)) of an explicit method; its tangents are multiplied by R(z) and not by e^z.
+METHODS = [
+    (2, 2.0, lambda z: 1 + z + z**2 / 2),
+    (4, 2.7, lambda z: 1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24),
+]
+
+
+def longest(limit, slope, decay, size=1.0):
+    fastest = Fastest(jnp.asarray(slope), YES, NO)
+    return limit.of(fastest, jnp.asarray(decay), jnp.asarray(size), jnp.asarray(1e-16))
+
+
+@pytest.mark.parametrize(("order", "stable", "R"), METHODS)
+@pytest.mark.parametrize("rtol", [1e-3, 1e-6, 1e-10])
+def test_tangent_limit_resolves_a_tangent_to_ten_tolerances_in_its_time(order, stable, R, rtol):
+    limit = TangentLimit(jnp.asarray(rtol), order, stable)
+    for slope in (0.1, 3.0, 1e5):
+        z = float(longest(limit, slope, 0.0).longest) * slope
+        if z < 0.8 * 0.8 * stable:
+            for turn in (1.0, -1.0, 1j):
+                error = abs(R(turn * z) / np.exp(turn * z) - 1.0) / z
+                assert error <= 10.0 * rtol * np.exp(z)
+        assert z <= 0.8 * stable
+
+
+@pytest.mark.parametrize(("order", "stable", "R"), METHODS)
+def test_tangent_limit_rises_to_stability_as_tangents_decay(order, stable, R):
+    limit = TangentLimit(jnp.asarray(1e-5), order, stable)
+    slope, decay, z = 7.0, jnp.asarray(0.0), 0.0
+    for _ in range(400):
+        z = float(longest(limit, slope, decay).longest) * slope
+        fastest = Fastest(jnp.asarray(z), YES, YES)
+        decay = limit.after(fastest, decay, jnp.asarray(1e-3), YES, NO)
+    assert z == pytest.approx(0.8 * 0.8 * stable) and abs(R(-z)) < 1.0
+    # It falls back where tangents are excited, where they do not decay, and where the state is at rest.
+    steady = Fastest(jnp.asarray(z), NO, YES)
+    for at, error, excited in ((fastest, 1e-3, YES), (steady, 1e-3, NO), (fastest, 1e-12, NO)):
+        assert float(limit.after(at, decay, jnp.asarray(error), YES, excited)) == 0.0
+
+
+def test_tangent_limit_keeps_a_step_size_within_a_fifth_and_ignores_a_slope_of_zero():
+    limit = TangentLimit(jnp.asarray(1e-6), 4, 2.7)
+    assert float(longest(limit, 0.0, 0.0).longest) == np.inf
+    bound = longest(limit, 1.0, 0.0)
+    aim = float(bound.longest)
+    for present, wanted, size in (
+        (aim, 5.0, aim),
+        (0.85 * aim, 5.0, 0.85 * aim),
+        (0.7 * aim, 5.0, aim),
+        (1.3 * aim, 5.0, aim),
+        (aim, 0.5 * aim, 0.5 * aim),
+    ):
+        assert float(bound.limit(wanted, present)) == pytest.approx(size)
+
+
+def spectrum(kind, n, rng):
+    rates = np.geomspace(0.1, 40.0, n)
+    Q = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    if kind == "diffusion":
+        return np.diag(-rates), True
+    if kind == "symmetric":
+        return Q @ np.diag(-rates) @ Q.T, True
+    if kind == "growth":
+        return Q @ np.diag(rates) @ Q.T, False
+    m = n // 2
+    zero, one = np.zeros((m, m)), np.eye(m)
+    return np.block([[zero, one], [-np.diag(rates[1::2] ** 2), -0.01 * one]]), False
+
+
+@pytest.mark.parametrize("kind", ["diffusion", "symmetric", "growth", "oscillation"])
+@pytest.mark.parametrize("n", [2, 20])
+def test_power_iteration_finds_the_spectral_radius(kind, n):
+    B, decays = spectrum(kind, n, np.random.default_rng(n))
+    space = spaces.L2(np.linspace(0.5, 2.0, n))
+    direction, slope = pattern(space, jnp.zeros(n)), 0.0
+    assert float(space.norm(direction)) == pytest.approx(1.0)
+    for _ in range(40):
+        slope, is_damped, direction = refine(space, lambda v: B @ v, direction)
+    assert 0.85 * 40.0 <= float(slope) <= 1.15 * 40.0
+    assert bool(is_damped) == decays
+
+
+def test_power_iteration_waits_where_nothing_moves():
+    space, zero = spaces.Euclidean(3), jnp.zeros(3)
+    start = pattern(space, zero)
+    for push in (jnp.zeros_like, lambda v: jnp.full(3, jnp.nan)):
+        slope, _, direction = refine(space, push, start)
+        assert float(slope) == 0.0 and jnp.array_equal(direction, start)

@@ -1,0 +1,160 @@
+"""Derivatives where the state stands still: no error of the state limits the steps there, so that the
+linearised equation v' = (A + Df̃)v has to. Oracle: the exponential of its matrix."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from tests.selection import mostly_thorough
+
+import dvax
+
+SHARE = 10.0
+"""Relative error of a derivative within the time 1/σ, in tolerances, as `TangentLimit` states it."""
+
+
+def real(k, n, rng):
+    return _rotated(-np.diag(np.geomspace(1.0, k, n)), rng)
+
+
+def unstable(k, n, rng):
+    return _rotated(np.diag([2.0, *-np.geomspace(1.0, k, n - 1)]), rng)
+
+
+def oscillating(k, n, rng):
+    turns = [np.array([[0.0, w], [-w, 0.0]]) for w in np.geomspace(1.0, k, n // 2)]
+    return _rotated(scipy.linalg.block_diag(*turns), rng)
+
+
+def positions_and_velocities(k, n, rng):
+    m = n // 2
+    return np.block(
+        [
+            [np.zeros((m, m)), np.eye(m)],
+            [-np.diag(np.geomspace(1.0, k**2, m)), -0.1 * np.eye(m)],
+        ]
+    )
+
+
+def _rotated(L, rng):
+    Q = np.linalg.qr(rng.normal(size=L.shape))[0]
+    return Q @ L @ Q.T
+
+
+PROBLEM = dvax.Problem(
+    A=dvax.generators.Zero(),
+    P=dvax.operators.Scaling(1.0),
+    K=dvax.sets.Box(-1e9, 1e9),
+    f=lambda t, x, u, args: args["B"] @ (x - args["p"]) + u,
+    h=lambda t, x, u, args: 0.1 * (x - args["p"]) ** 2 - 0.5 * u,
+)
+"""x' = B(x − p) + u, with a response that is flat where x = p."""
+
+METHODS = {
+    "DormandPrince": (dvax.DormandPrince(), 1e-6, 100.0),
+    "ETD4RK": (dvax.ETD4RK(), 1e-6, 100.0),
+    "ETD2RK": (dvax.ETD2RK(), 1e-4, 30.0),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    mostly_thorough(
+        [
+            (kind, name)
+            for kind in (real, unstable, oscillating, positions_and_velocities)
+            for name in METHODS
+        ],
+        always=[(real, "ETD4RK"), (positions_and_velocities, "DormandPrince")],
+    ),
+)
+def test_from_rest_a_derivative_is_the_exponential_of_the_matrix(kind, name):
+    method, rtol, fastest = METHODS[name]
+    rng, T, n = np.random.default_rng(3), 3.0, 6
+
+    def last(x0, p, B, w):
+        args = {"B": B, "p": p}
+        solution = dvax.solve(PROBLEM, x0, 0.0, T, args, method=method, rtol=rtol, atol=1e-3 * rtol)
+        return jnp.dot(w, solution.xs[-1])
+
+    for k in (fastest, fastest / 10, fastest / 100):
+        B = kind(k, n, rng)
+        p, w = rng.normal(size=(2, n))
+        of_x0, of_p = jax.grad(last, (0, 1))(*map(jnp.asarray, (p, p, B, w)))
+        E = scipy.linalg.expm(B * T)
+        sigma = np.max(np.abs(np.linalg.eigvals(B)))
+        size = np.linalg.norm(w) * max(1.0, np.linalg.norm(E, 2))
+        most = SHARE * rtol * (1.0 + sigma * T) * size
+        assert np.linalg.norm(of_x0 - E.T @ w) <= most
+        assert np.linalg.norm(of_p - (w - E.T @ w)) <= most
+
+
+@pytest.mark.parametrize("mode", ["reverse", "forward"])
+def test_parts_at_rest_limit_the_steps_beside_a_part_that_moves(mode):
+    # A slow oscillation chooses steps of 10⁻¹; beside it a part with the rate k stands at p.
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(),
+        P=dvax.operators.Scaling(1.0),
+        K=dvax.sets.Box(-1.0, 1.0),
+        f=lambda t, x, u, a: jnp.stack([x[1], -x[0], -a[0] * (x[2] - a[1])]) + 0.0 * u,
+        h=lambda t, x, u, a: -u,
+    )
+
+    def last(p, k):
+        x0, args = jnp.array([1.0, 0.0, 2.0]), jnp.stack([k, p])
+        method = dvax.DormandPrince()
+        return dvax.solve(problem, x0, 0.0, 5.0, args, method=method, adjoint=mode).xs[-1, 2]
+
+    derivative = jax.jacfwd(last) if mode == "forward" else jax.grad(last)
+    for k in (1.0, 30.0, 1000.0):
+        assert derivative(2.0, k) == pytest.approx(-np.expm1(-5.0 * k), abs=1e-4)
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.0])
+def test_a_state_on_a_line_limits_the_steps_and_so_does_one_on_a_kink(speed):
+    # x = p + vt solves x' = v − l(x − p − vt) − (k − l) max(x − p − vt, 0), on the kink of the law.
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(),
+        P=dvax.operators.Scaling(1.0),
+        K=dvax.sets.Box(0.0, jnp.inf),
+        f=lambda t, x, u, a: speed - a["l"] * (x - speed * t - 0.5) - (a["k"] - a["l"]) * u,
+        h=lambda t, x, u, a: x - speed * t - 0.5,
+    )
+
+    def last(x0, k, l):
+        args = {"k": k, "l": l}
+        return dvax.solve(problem, x0, 0.0, 2.0, args, method=dvax.DormandPrince()).xs[-1]
+
+    k = jnp.array([3.0, 50.0, 2000.0, 5.0])
+    # On the line rounding chooses the side of the kink: there both sides are one.
+    l = k if speed else jnp.array([50.0, 3.0, 5.0, 2000.0])
+    found = jax.vmap(jax.grad(last), (None, 0, 0))(0.5, k, l)
+    # On a kink a derivative is one of the two one-sided ones, or lies between them.
+    low, high = np.sort([np.exp(-2.0 * k), np.exp(-2.0 * l)], axis=0)
+    assert np.all(found >= low - 1e-5) and np.all(found <= high + 1e-5)
+
+
+def test_a_law_at_rest_on_a_stiff_kink_has_the_derivative_of_the_linearised_method():
+    # Growth on a substrate with two one-sided bounds on the flux v = (0.08 − λ₁ + λ₂)/ε: x comes to
+    # rest on a kink, where an explicit method would take steps of 50 times its stability limit.
+    eps = 0.004
+
+    def flux(l):
+        return (0.08 - l[0] + l[1]) / eps
+
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(),
+        P=dvax.operators.Scaling(1.0),
+        K=dvax.sets.Box(jnp.zeros(2), jnp.inf * jnp.ones(2)),
+        f=lambda t, x, l, vm: x[0] * jnp.stack([0.08 * flux(l), -flux(l)]),
+        h=lambda t, x, l, vm: (
+            l - (jnp.stack([vm * x[1] / (0.5 + x[1]) - flux(l), flux(l)]) + 1e-3 * l)
+        ),
+    )
+
+    def last(vm, method=None):
+        return dvax.solve(problem, jnp.array([0.05, 55.5]), 0.0, 12.0, vm, method=method).xs[-1, 0]
+
+    expected = float(jax.grad(last)(10.0, dvax.ExpRosenbrock()))
+    assert jax.grad(last)(10.0) == pytest.approx(expected, rel=1e-4)
