@@ -69,6 +69,10 @@ FUNCTIONS = {
         ),
         "Problem(f); newcomer.py, line; a list; jnp.asarray",
     ),
+    "f of x first": (
+        lambda: of_f(lambda x, t, u, args: -x),
+        "Problem(f); the parameters x, t, u, args; called as f(t, x, u, args)",
+    ),
     "f of five": (lambda: of_f(lambda t, x, u, a, b: -u), "Problem(f); called as f(t, x, u, args)"),
     "h of three": (lambda: solve(problem(h=lambda t, x, u: x)), "Problem(h); lambda t, x, u, args"),
     "K of one": (

@@ -200,6 +200,24 @@ def _check_parameters(
             f"it is called as {name}({names})",
             f"Write {name}=lambda {names}: ..., even if some parameters are unused",
         ) from None  # fmt: skip
+    _check_order(at, name, fn, [*signature.parameters][: len(inputs)], [*inputs])
+
+
+def _check_order(
+    at: str, name: str, fn: Callable[..., Any], given: list[str], expected: list[str]
+) -> None:
+    """Raise an `InputError` if parameters have the names of others in another order: f(x, t, u, args)
+    would compute with t as the state, without an error where shapes agree. A state that is named u is
+    allowed, f(t, u, q, args)."""
+    order = [expected.index(word) for word in given if word in expected]
+    if order == sorted(order):
+        return
+    names = ", ".join(expected)
+    raise input_error(
+        f"{at}, {_place(fn)}", f"the parameters {', '.join(given)}",
+        f"it is called as {name}({names}), by position",
+        f"Write {name}=lambda {names}: ..., or give other names to the parameters",
+    )  # fmt: skip
 
 
 def _explain(

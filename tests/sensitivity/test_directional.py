@@ -168,6 +168,21 @@ def test_kinks_are_classified_as_crossing_touching_or_staying():
 
 
 @pytest.mark.thorough
+def test_kinks_at_a_bound_that_becomes_infinite():
+    # The law u = min(max(s − x, 0), b(t)) with b = 0.3 while sin 9t > 0, else no bound.
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0),
+        P=dvax.operators.Scaling(1.0),
+        K=lambda t, args: dvax.sets.Box(0.0, jnp.where(jnp.sin(9 * t) < 0.0, jnp.inf, 0.3)),
+        f=lambda t, x, u, args: u,
+        h=lambda t, x, u, args: jnp.sin(3 * t) - x - u,
+    )
+    sol = dvax.solve(problem, 0.1, 0.0, 1.0, dense=True, max_steps=2**12)
+    found = [kink.start for kink in dvax.sensitivity.kinks(sol) if kink.switch == 1]
+    for jump in (np.pi / 9, 2 * np.pi / 9):
+        assert min(abs(np.array(found) - jump)) < 1e-6
+
+
 def test_directional_derivative_rejects_wrong_directions():
     case = c1()
     with pytest.raises(dvax.InputError, match=r"dx0.*shape"):

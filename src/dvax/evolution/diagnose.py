@@ -52,6 +52,9 @@ _MIN_ATTEMPTS = 100
 """Smallest number of attempts from which the number of remaining steps is extrapolated."""
 _MANY_TIMES = 16
 """More steps than this many times those so far are not the first advice."""
+_LATER = 1e-3
+"""Share of the run after which K is looked at again where it becomes empty."""
+
 _REFUSED = "refused: "
 _NEAREST = "the point of K nearest to 0"
 _CHECKED = {name: f"Check {name} there" for name in ("K", "h", "f")} | {
@@ -165,6 +168,11 @@ def _nonfinite(stop: Stop) -> Diagnosis:
             fixes = (Fix("", "", _CHECKED[name]),)
             if name == "u" and (cause := _not_monotone(stop)) is not None:
                 return cause
+            if name in ("K", _NEAREST):
+                # There its numbers differ by more than a rounding.
+                later = min(high + _LATER * (stop.span[1] - stop.span[0]), stop.span[1] - stop.t)
+                if later > high and (there := bad(name, later)):
+                    at, what = f"from {at[3:]} on", there
             if what.startswith(_REFUSED):
                 return Diagnosis(f"{name} is refused {at}: {what[len(_REFUSED) :]}.", fixes, True)
             if name == _NEAREST:

@@ -144,9 +144,12 @@ def _kinks_of_switch(times: np.ndarray, s: np.ndarray, switch: int, tol: float) 
             i = j + 1
             continue
         if i + 1 < len(s) and s[i] * s[i + 1] < 0 and not is_zero[i + 1]:
-            t = float(times[i] + (times[i + 1] - times[i]) * s[i] / (s[i] - s[i + 1]))
+            # A bound that becomes infinite does so between the two times.
+            finite = np.all(np.isfinite(s[i : i + 2]))
+            share = s[i] / (s[i] - s[i + 1]) if finite else 0.5
+            t = float(times[i] + (times[i + 1] - times[i]) * share)
             result.append(Kink(t, t, switch, "crosses"))
-        elif 0 < i < len(s) - 1 and abs(s[i]) <= min(abs(s[i - 1]), abs(s[i + 1])):
+        elif 0 < i < len(s) - 1 and abs(s[i]) <= min(abs(s[i - 1]), abs(s[i + 1])) < np.inf:
             # The minimum of the parabola through three values may be smaller than all of them.
             minimum = abs(s[i]) - _distance_to_vertex(s[i - 1 : i + 2])
             if minimum <= tol:
@@ -160,7 +163,8 @@ def _distance_to_vertex(s: np.ndarray) -> float:
     """Return the middle one of three values of |s|, minus the minimum of the parabola through them."""
     a, b, c = np.abs(s)
     curvature = a - 2 * b + c
-    return 0.0 if curvature <= 0 else (a - c) ** 2 / (8 * curvature)
+    # A bound that becomes infinite is no vertex.
+    return 0.0 if not 0 < curvature < np.inf else (a - c) ** 2 / (8 * curvature)
 
 
 def _vertex_time(times: np.ndarray, s: np.ndarray, i: int) -> float:
