@@ -167,7 +167,6 @@ def test_kinks_are_classified_as_crossing_touching_or_staying():
     assert found[2].start == pytest.approx(3.0, abs=2e-3) and found[2].end == 4.0
 
 
-@pytest.mark.thorough
 def test_kinks_at_a_bound_that_becomes_infinite():
     # The law u = min(max(s − x, 0), b(t)) with b = 0.3 while sin 9t > 0, else no bound.
     problem = dvax.Problem(
@@ -183,6 +182,7 @@ def test_kinks_at_a_bound_that_becomes_infinite():
         assert min(abs(np.array(found) - jump)) < 1e-6
 
 
+@pytest.mark.thorough
 def test_directional_derivative_rejects_wrong_directions():
     case = c1()
     with pytest.raises(dvax.InputError, match=r"dx0.*shape"):
