@@ -158,3 +158,68 @@ def test_a_law_at_rest_on_a_stiff_kink_has_the_derivative_of_the_linearised_meth
 
     expected = float(jax.grad(last)(10.0, dvax.ExpRosenbrock()))
     assert jax.grad(last)(10.0) == pytest.approx(expected, rel=1e-4)
+
+
+def test_equal_parts_of_a_tuple_that_exchange_limit_the_steps():
+    problem = dvax.Problem(
+        A=dvax.generators.Product(dvax.generators.Zero(), dvax.generators.Zero()),
+        P=dvax.operators.Scaling(1.0),
+        K=dvax.sets.Box(-1.0, 1.0),
+        control_space=dvax.spaces.Euclidean(()),
+        f=lambda t, x, u, k: (k * jnp.sin(x[1] - x[0]) + 0.0 * u, k * jnp.sin(x[0] - x[1])),
+        h=lambda t, x, u, k: -u,
+    )
+
+    def last(x0, k):
+        return dvax.solve(problem, x0, 0.0, 3.0, k, method=dvax.DormandPrince()).xs[0][-1, 0]
+
+    for k in (1.0, 20.0, 400.0):
+        of_one, of_other = jax.grad(last)((2.0 * jnp.ones(4),) * 2, k)
+        decayed = 0.5 * np.exp(-6.0 * k)
+        assert of_one[0] == pytest.approx(0.5 + decayed, abs=1e-4)
+        assert of_other[0] == pytest.approx(0.5 - decayed, abs=1e-4)
+
+
+def test_code_with_a_derivative_in_reverse_alone_has_a_gradient():
+    @jax.custom_vjp
+    def sine(x):
+        return jnp.sin(x)
+
+    sine.defvjp(lambda x: (jnp.sin(x), x), lambda x, v: (v * jnp.cos(x),))
+
+    def last(x0, sine):
+        problem = dvax.Problem(
+            A=dvax.generators.Scalar(-1.0),
+            P=dvax.operators.Scaling(1.0),
+            K=dvax.sets.Box(-1.0, 1.0),
+            f=lambda t, x, u, args: sine(x) + u,
+            h=lambda t, x, u, args: -u,
+        )
+        return dvax.solve(problem, x0, 0.0, 1.0, method=dvax.ETD4RK()).xs[-1]
+
+    expected = float(jax.grad(lambda x0: last(x0, jnp.sin))(1.0))
+    assert jax.grad(lambda x0: last(x0, sine))(1.0) == pytest.approx(expected, rel=1e-9)
+
+
+def test_units_of_the_state_do_not_change_the_steps():
+    # Concentrations in mol/L beside voltages: S B S⁻¹ has the spectral radius of B.
+    B = jnp.array([[-1.0, 1.0], [1.0, -2.0]])
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(),
+        P=dvax.operators.Scaling(1.0),
+        K=dvax.sets.Box(-1.0, 1.0),
+        control_space=dvax.spaces.Euclidean(()),
+        f=lambda t, x, u, s: s * (B @ (x / s - 1.0)) + 0.0 * u,
+        h=lambda t, x, u, s: -u,
+    )
+
+    def last(x0, s):
+        solution = dvax.solve(problem, x0, 0.0, 3.0, s, method=dvax.DormandPrince())
+        return solution.xs[-1, 0], solution.stats["steps"]
+
+    exact = scipy.linalg.expm(3.0 * np.asarray(B))[0, 0]
+    for start in (0.5, 1.0):
+        for s in ([1.0, 1.0], [1e-3, 1e3], [1e-9, 300.0]):
+            s = jnp.asarray(s)
+            slope, steps = jax.grad(last, has_aux=True)(start * s, s)
+            assert slope[0] == pytest.approx(exact, abs=1e-4) and int(steps) <= 60

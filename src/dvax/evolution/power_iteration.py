@@ -12,40 +12,65 @@ Each step applies B twice to a direction d:
     σ = √(‖B²d‖/‖d‖),   d ← B²d/‖B²d‖ + p/10,   ‖p‖ = 1.
 
 The square makes σ independent of the units of positions and velocities: for x'' = −ω²x it is ω for any
-d. The pattern p, which contains all frequencies, keeps a part of d in entries that a held response
-decouples now, and not later. σ is an estimate from below, within a factor of 1.1 after some steps.
+d. The pattern p contains all frequencies, and its entries are as large as those of x: entries in other
+units would be amplified by the ratio of the units. It keeps a part of d in entries that a held response
+decouples now, and not later. σ is an estimate, from below for a normal B within a factor of 1.1 after
+some steps.
 """
 
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .. import _tree
+from .._jax.jaxprs import has_operation
 from .._tree import Tree
 from ..spaces import AbstractSpace
 
 _SHARE = 0.1
 """Share of the pattern p in the next direction."""
 
+_OF_ZERO = 1e-6
+"""Entry of the pattern where x is zero, relative to the largest one."""
+
 _ALONG = 0.7
 """Cosine from which a vector points along another one: it is 1 for an eigenvector of a real eigenvalue,
 and below 0.71 for eigenvalues whose imaginary parts exceed the real ones."""
 
 
-def pattern(space: AbstractSpace, like: Tree) -> Tree:
-    """Return p, a state of norm 1 in which all frequencies are present."""
+def pattern(space: AbstractSpace, x: Tree) -> Tree:
+    """Return p, a state of norm 1 in which all frequencies are present, with entries as large as those
+    of x; all alike where x is zero."""
+    leaves, tree = jtu.tree_flatten(x)
+    largest = jnp.max(jnp.stack([jnp.max(jnp.abs(leaf), initial=0.0) for leaf in leaves]))
+    least = jnp.where(largest > 0.0, _OF_ZERO * largest, 1.0)
+    count, entries = 0, []
+    for leaf in leaves:
+        # A chirp that neighbouring entries, and equal parts of the state, do not repeat.
+        k = jnp.arange(count, count + leaf.size, dtype=leaf.dtype).reshape(leaf.shape)
+        size = jnp.where(leaf == 0.0, least, jnp.abs(leaf))
+        entries.append(size * jnp.cos(1.0 + k * (1.0 + 0.6180339887 * k)))
+        count += leaf.size
+    return _normalised(space, jtu.tree_unflatten(tree, entries))
 
-    def one(leaf: Any) -> Any:
-        k = jnp.arange(leaf.size, dtype=leaf.dtype).reshape(leaf.shape)
-        # A chirp that neighbouring entries do not repeat.
-        return jnp.cos(1.0 + k * (1.0 + 0.6180339887 * k))
 
-    return _normalised(space, jtu.tree_map(one, like))
+def linearised(fn: Callable[[Tree], Tree], x: Tree) -> Callable[[Tree], Tree]:
+    """Return v ↦ Dfn(x) v, or its transpose, whose spectrum is the same, where code has a derivative of
+    its own in reverse alone (`jax.custom_vjp`)."""
+    push = jax.linearize(fn, x)[1]
+    # JAX refuses such code when it compiles, and not here.
+    if has_operation(jax.make_jaxpr(push)(x), {"custom_lin"}):
+        pull = jax.vjp(fn, x)[1]
+        return lambda v: pull(v)[0]
+    return push
 
 
-def refine(space: AbstractSpace, push: Callable[[Tree], Tree], d: Tree) -> tuple[Any, Any, Tree]:
+def refine(
+    space: AbstractSpace, push: Callable[[Tree], Tree], d: Tree, p: Tree
+) -> tuple[Any, Any, Tree]:
     """Return σ, whether v decays where it changes fastest, and the next direction, where `push` applies
     B. A B that is zero or not finite leaves the direction as it is, and σ = 0: it limits nothing.
 
@@ -59,7 +84,7 @@ def refine(space: AbstractSpace, push: Callable[[Tree], Tree], d: Tree) -> tuple
     is_real = space.inner(d, two) > _ALONG * space.norm(d) * length
     is_damped = is_real & (space.inner(one, two) < -_ALONG * space.norm(one) * length)
     unit = _tree.scale(1.0 / jnp.where(known, length, 1.0), two)
-    mixed = _tree.add(unit, _tree.scale(_SHARE, pattern(space, d)))
+    mixed = _tree.add(unit, _tree.scale(_SHARE, p))
     return jnp.where(known, jnp.sqrt(size), 0.0), is_damped, _tree.where(known, mixed, d)
 
 

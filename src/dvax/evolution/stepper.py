@@ -432,9 +432,11 @@ class Stepper(eqx.Module):
         flow, t0, t1, x0, guess, direction = _constant((self.flow, t0, t1, x0, guess, direction))
         t = self._one_sided_time(t0, t1, 0.0)
         value = lambda x: flow.nonlinear_part(x, flow.rate(t, x, guess).value)  # noqa: E731
-        _, push = jax.linearize(value, x0)
         space = flow.state_space(x0)
-        slope, is_damped, direction = power_iteration.refine(space, push, direction)
+        pattern = power_iteration.pattern(space, x0)
+        slope, is_damped, direction = power_iteration.refine(
+            space, power_iteration.linearised(value, x0), direction, pattern
+        )
         slope = (t1 - t0) * slope
         return _constant((Fastest(slope, is_damped, change < _SLOW * slope), direction))
 

@@ -44,10 +44,16 @@ def test_tangent_limit_rises_to_stability_as_tangents_decay(order, stable, R):
         fastest = Fastest(jnp.asarray(z), YES, YES)
         decay = limit.after(fastest, decay, jnp.asarray(1e-3), YES, NO)
     assert z == pytest.approx(0.8 * 0.8 * stable) and abs(R(-z)) < 1.0
-    # It falls back where tangents are excited, where they do not decay, and where the state is at rest.
+    # It falls back where tangents are excited, and where they do not decay.
     steady = Fastest(jnp.asarray(z), NO, YES)
-    for at, error, excited in ((fastest, 1e-3, YES), (steady, 1e-3, NO), (fastest, 1e-12, NO)):
-        assert float(limit.after(at, decay, jnp.asarray(error), YES, excited)) == 0.0
+    for at, excited in ((fastest, YES), (steady, NO)):
+        assert float(limit.after(at, decay, jnp.asarray(1e-3), YES, excited)) == 0.0
+    # At rest it rises more slowly.
+    slow, fast = (
+        float(limit.after(fastest, jnp.asarray(0.0), jnp.asarray(error), YES, NO))
+        for error in (1e-12, 1e-3)
+    )
+    assert slow == pytest.approx(0.1 * fast)
 
 
 def test_tangent_limit_keeps_a_step_size_within_a_fifth_and_ignores_a_slope_of_zero():
@@ -84,17 +90,35 @@ def spectrum(kind, n, rng):
 def test_power_iteration_finds_the_spectral_radius(kind, n):
     B, decays = spectrum(kind, n, np.random.default_rng(n))
     space = spaces.L2(np.linspace(0.5, 2.0, n))
-    direction, slope = pattern(space, jnp.zeros(n)), 0.0
-    assert float(space.norm(direction)) == pytest.approx(1.0)
+    p, slope = pattern(space, jnp.zeros(n)), 0.0
+    direction = p
+    assert float(space.norm(p)) == pytest.approx(1.0)
     for _ in range(40):
-        slope, is_damped, direction = refine(space, lambda v: B @ v, direction)
+        slope, is_damped, direction = refine(space, lambda v: B @ v, direction, p)
     assert 0.85 * 40.0 <= float(slope) <= 1.15 * 40.0
     assert bool(is_damped) == decays
+
+
+def test_power_iteration_finds_the_radius_in_any_units():
+    # Entries in units a and b: a calcium concentration in mol/L beside a voltage in mV.
+    space = spaces.Euclidean(2)
+    for units in ([1.0, 1.0], [1e-6, 1.0], [1e-9, 300.0], [1e6, 1e-6]):
+        S = np.diag(units)
+        B = S @ np.array([[-1.0, 1.0], [1.0, -2.0]]) @ np.linalg.inv(S)
+        p = direction = pattern(space, jnp.asarray([0.7, 1.3]) * jnp.asarray(units))
+        for _ in range(10):
+            slope, _, direction = refine(space, lambda v, B=B: B @ v, direction, p)
+        assert float(slope) == pytest.approx(2.618, rel=0.2)
+
+
+def test_power_iteration_sees_the_exchange_of_equal_parts():
+    start = pattern(spaces.Product(spaces.Euclidean(4), spaces.Euclidean(4)), (jnp.ones(4),) * 2)
+    assert float(jnp.max(jnp.abs(start[0] - start[1]))) > 0.1
 
 
 def test_power_iteration_waits_where_nothing_moves():
     space, zero = spaces.Euclidean(3), jnp.zeros(3)
     start = pattern(space, zero)
     for push in (jnp.zeros_like, lambda v: jnp.full(3, jnp.nan)):
-        slope, _, direction = refine(space, push, start)
+        slope, _, direction = refine(space, push, start, start)
         assert float(slope) == 0.0 and jnp.array_equal(direction, start)

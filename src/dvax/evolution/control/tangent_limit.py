@@ -18,6 +18,9 @@ _STABLE = 0.8
 _AIM = 0.8
 """Share of the limit at which new steps aim, so that they may stay as they are nearby."""
 
+_LARGEST_TURN = 1.0
+"""Largest z of solutions that do not decay: beyond it the explicit methods let oscillations grow."""
+
 _SLACK = 2.0
 """Factor by which a step may be too long: at a kink the slope changes between two steps."""
 
@@ -65,10 +68,13 @@ class TangentLimit(eqx.Module):
 
     def of(self, fastest: Fastest, decay: Any, size: Any, smallest: Any) -> StepLimit:
         """Return the limit after a step of this size, where `decay` is D."""
-        slope, _, is_stiff = lax.stop_gradient(fastest)
+        slope, is_damped, is_stiff = lax.stop_gradient(fastest)
         error = _SHARE * jnp.maximum(self.rtol, jnp.finfo(size.dtype).eps)
         accurate = (math.factorial(self.order + 1) * error) ** (1.0 / self.order)
-        most = jnp.minimum(accurate * jnp.exp(decay / self.order), _STABLE * self.stable)
+        most = jnp.minimum(
+            accurate * jnp.exp(decay / self.order),
+            jnp.where(is_damped, _STABLE * self.stable, _LARGEST_TURN),
+        )
         longest = _AIM * size * (most / jnp.where(slope > 0.0, slope, 1.0))
         return StepLimit(
             longest=jnp.where(slope > 0.0, longest, jnp.inf),
@@ -80,9 +86,10 @@ class TangentLimit(eqx.Module):
         self, fastest: Fastest, decay: Any, error: Any, accepted: Any, is_excited: Any
     ) -> Any:
         """Return D after an attempt with this error in tolerances. Events and jumps of the data excite
-        what has decayed (`is_excited`). Nothing is counted where the fastest solutions do not decay,
-        and none where the state is at rest: slower solutions, which may grow, are then resolved by
-        nothing else."""
+        what has decayed (`is_excited`), and nothing is counted where the fastest solutions do not
+        decay. At rest a tenth is: slower solutions, which may grow, are then resolved by nothing
+        else."""
         slope, is_damped, _ = lax.stop_gradient(fastest)
-        counted = jnp.minimum(decay + jnp.where(accepted, slope, 0.0), _LARGEST_DECAY)
-        return jnp.where(is_excited | ~is_damped | (error < _AT_REST), 0.0, counted)
+        added = jnp.where(error < _AT_REST, 0.1 * slope, slope)
+        counted = jnp.minimum(decay + jnp.where(accepted, added, 0.0), _LARGEST_DECAY)
+        return jnp.where(is_excited | ~is_damped, 0.0, counted)
