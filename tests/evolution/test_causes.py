@@ -328,7 +328,7 @@ EMPTIED = [
 def test_cause_empty_set_names_the_time(K, method):
     error = failure(make(lambda t, x, u, args: u - x, K=K), x0=0.1, t1=1.0, method=method)
     # Of no value that is not finite: the set is refused, by its own words.
-    assert str(error).startswith("K is refused at t = 0.5")
+    assert str(error).startswith("K is refused from t = 0.5")
     assert "empty" in error.cause and "Check K there." in str(error)
 
 
@@ -345,7 +345,7 @@ def test_cause_conditions_that_contradict_each_other_are_reported_as_an_empty_se
     ):
         problem = make(lambda t, x, u, args: u - x, lambda t, x, u, args: x - 0.5 * u, K)
         error = failure(problem, x0=jnp.ones(3), t1=1.0)
-        assert str(error).startswith(f"K is empty at {at}")
+        assert str(error).startswith(f"K is empty from {at}")
         assert "contradict" in str(error)
 
 
