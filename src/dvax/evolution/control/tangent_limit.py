@@ -59,7 +59,8 @@ class TangentLimit(eqx.Module):
 
         z ≤ ((p+1)! 10 rtol e^D)^{1/p},   D = Σ z over the steps since then,
 
-    up to the limit of stability of the method. `order` is p, `stable` that limit.
+    up to the limit of stability of the method, or up to 1 where the fastest solutions do not decay.
+    `order` is p, `stable` the limit of stability on the negative axis.
     """
 
     rtol: Any
