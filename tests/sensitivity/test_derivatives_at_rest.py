@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from scipy.integrate import cumulative_trapezoid, solve_ivp
 from tests.selection import mostly_thorough
 
 import dvax
@@ -223,3 +224,101 @@ def test_units_of_the_state_do_not_change_the_steps():
             s = jnp.asarray(s)
             slope, steps = jax.grad(last, has_aux=True)(start * s, s)
             assert slope[0] == pytest.approx(exact, abs=1e-4) and int(steps) <= 60
+
+
+VARIED = dvax.Problem(
+    A=dvax.generators.Zero(),
+    P=dvax.operators.Scaling(1.0),
+    K=dvax.sets.Box(-1e9, 1e9),
+    control_space=dvax.spaces.Euclidean(()),
+    f=lambda t, x, u, a: a["L"] @ (x - 1.0) + gain(t, a) * (a["M"] @ (x - 1.0)) + 0.0 * u,
+    h=lambda t, x, u, a: -u,
+)
+"""x' = (L + g(t) M)(x − 1), at rest in x = 1 however fast g changes."""
+
+
+def gain(t, a):
+    """A table, a pulse and an oscillation."""
+    pulse = jnp.exp(-(((t - a["center"]) / a["width"]) ** 2))
+    return a["table"](t) + a["pulse"] * pulse + a["wave"] * jnp.cos(a["omega"] * t)
+
+
+def varied(kind, rng):
+    k = {"table": 0.0, "pulse": 0.0, "wave": 0.0, kind: 10.0 ** rng.uniform(0.5, 2.0)}
+    if kind == "wave":
+        k["wave"] = rng.uniform(1.0, 6.0)
+    rows = k["table"] * np.array([0.0, 0.0, *rng.uniform(0.0, 1.0, 2), 0.0])
+    n = 3
+    return {
+        "L": jnp.asarray(_rotated(np.diag(rng.uniform(-1.0, 0.2, n)), rng)),
+        "M": jnp.asarray(_rotated(-np.diag([1.0, *rng.uniform(-0.1, 1.0, n - 1)]), rng)),
+        "table": dvax.signals.Table(np.linspace(0.0, 6.0, 5), jnp.asarray(rows), kind="linear"),
+        "pulse": jnp.asarray(k["pulse"] / 10.0),
+        "center": jnp.asarray(rng.uniform(2.0, 5.0)),
+        "width": jnp.asarray(rng.uniform(0.3, 1.5)),
+        "wave": jnp.asarray(k["wave"]),
+        "omega": jnp.asarray(10.0 ** rng.uniform(0.0, 1.5)),
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "seed"),
+    mostly_thorough(
+        [
+            (name, kind, seed)
+            for name in ("DormandPrince", "ETD4RK", "ExpRosenbrock")
+            for kind in ("table", "pulse", "wave")
+            for seed in range(4)
+        ],
+        always=[
+            ("DormandPrince", "table", 0),
+            ("DormandPrince", "wave", 0),
+            ("ETD4RK", "pulse", 0),
+            ("ExpRosenbrock", "table", 1),
+        ],
+    ),
+)
+def test_at_rest_a_slope_that_changes_in_time_limits_the_steps(name, kind, seed):
+    args, T, rtol = varied(kind, np.random.default_rng([seed, len(kind)])), 6.0, 1e-6
+
+    def last(x0, args):
+        method = getattr(dvax, name)()
+        return dvax.solve(VARIED, x0, 0.0, T, args, method=method, rtol=rtol, atol=1e-9).xs[-1]
+
+    found = jax.jit(jax.jacrev(last))(jnp.ones(3), args)
+    matrix = jax.jit(lambda t: args["L"] + gain(t, args) * args["M"])
+    exact = solve_ivp(
+        lambda t, v: (np.asarray(matrix(t)) @ v.reshape(3, 3)).ravel(),
+        (0.0, T), np.eye(3).ravel(), rtol=1e-11, atol=1e-13, max_step=0.02,
+    ).y[:, -1].reshape(3, 3)  # fmt: skip
+    sigma = max(np.max(np.abs(np.linalg.eigvals(matrix(t)))) for t in np.linspace(0.0, T, 400))
+    size = max(1.0, np.linalg.norm(exact, 2))
+    assert np.linalg.norm(found - exact) <= SHARE * rtol * (1.0 + sigma * T) * size
+
+
+@pytest.mark.parametrize("name", ["DormandPrince", "ExpRosenbrock"])
+def test_a_part_that_moves_may_make_a_part_at_rest_stiff(name):
+    # k(x₀) rises from 0.1 to `top` while x₀ falls through 1/2; x₁ = 1 stays.
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(),
+        P=dvax.operators.Scaling(1.0),
+        K=dvax.sets.Box(-1.0, 1.0),
+        control_space=dvax.spaces.Euclidean(()),
+        f=lambda t, x, u, top: (
+            jnp.stack([-0.3 * x[0], -stiffness(x[0], top) * (x[1] - 1.0), x[1] - 1.0]) + 0.0 * u
+        ),
+        h=lambda t, x, u, top: -u,
+    )
+
+    def stiffness(x, top):
+        return 0.1 + top * jax.nn.sigmoid(40.0 * (0.5 - x))
+
+    def last(x0, top):
+        return dvax.solve(problem, x0, 0.0, 6.0, top, method=getattr(dvax, name)()).xs[-1, 2]
+
+    for top in (3.0, 30.0, 300.0):
+        found = jax.grad(last)(jnp.array([1.0, 1.0, 0.0]), top)[1]
+        t = np.linspace(0.0, 6.0, 200_001)
+        rates = stiffness(np.exp(-0.3 * t), top)
+        decayed = np.exp(-cumulative_trapezoid(rates, t, initial=0.0))
+        assert found == pytest.approx(np.trapezoid(decayed, t), rel=1e-3)

@@ -17,6 +17,7 @@ from jax import lax
 from .. import _tree
 from .._batch import any_lane, is_active
 from .._tree import Tree
+from ..vi import independent
 from . import meter
 from .bounds import Bounds
 from .checkpoints import Checkpoints
@@ -80,12 +81,14 @@ class Loop(eqx.Module):
     forward_mode: bool = eqx.field(static=True)
     watch: EventWatch | None = None
 
-    def for_derivatives(self) -> "Loop":
-        """Return the loop whose steps a derivative can take as well."""
-        stepper = self.stepper
-        # A method that linearises has no limit of stability, and steps of a given size have no choice.
-        limited = self.controller.adapts and not stepper.method.is_rosenbrock
-        return replace(self, stepper=replace(stepper, for_derivatives=limited))
+    def for_derivatives(self, x0: Tree) -> "Loop":
+        """Return the loop from x0 whose steps a derivative can take as well."""
+        # Steps of a given size have no choice.
+        if not self.controller.adapts:
+            return self
+        flow, t0 = self.stepper.flow, self.stepper.ends[0]
+        varies = not independent(lambda t: flow.rate(t, x0, flow.guess(x0)).value, t0)
+        return replace(self, stepper=replace(self.stepper, for_derivatives=True, varies=varies))
 
     def run(
         self, x0: Tree, ts: jax.Array | None, checkpoints: Checkpoints | None = None

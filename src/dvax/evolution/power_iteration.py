@@ -5,9 +5,11 @@ state has chosen. Where the state stands still, or moves along a line, its error
 size, however fast v changes: a spring that starts at rest, differentiated in its position, would take
 steps beyond the limit of stability, and v would grow without bound. So where a derivative is wanted
 the step size is limited by σ, the spectral radius of B = Df̃ (of A + Df̃ for a method that is explicit
-in A), whatever the state does (`Adaptive`).
+in A), whatever the state does (`Adaptive`). For a method that linearises, B is φ₁(h(A + J))(Df̃ − J)
+with the J of the start of the step: what a change of Df̃ adds in a step, divided by h.
 
-Each step applies B twice to a direction d:
+Each step applies B twice to a direction d, at its end, and where f̃ depends on t at its start and at
+the samples inside too:
 
     σ = √(‖B²d‖/‖d‖),   d ← B²d/‖B²d‖ + p/10,   ‖p‖ = 1.
 
@@ -18,8 +20,9 @@ decouples now, and not later. σ is an estimate, from below for a normal B withi
 some steps.
 """
 
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -68,11 +71,24 @@ def linearised(fn: Callable[[Tree], Tree], x: Tree) -> Callable[[Tree], Tree]:
     return push
 
 
-def refine(
-    space: AbstractSpace, push: Callable[[Tree], Tree], d: Tree, p: Tree
-) -> tuple[Any, Any, Tree]:
-    """Return σ, whether v decays where it changes fastest, and the next direction, where `push` applies
-    B. A B that is zero or not finite leaves the direction as it is, and σ = 0: it limits nothing.
+class Refined(NamedTuple):
+    """What one application of B² to the direction d shows.
+
+    - `slope`: σ;
+    - `is_damped`: v decays where it changes fastest;
+    - `first`: Bd;
+    - `direction`: the next d.
+    """
+
+    slope: Any
+    is_damped: Any
+    first: Tree
+    direction: Tree
+
+
+def refine(space: AbstractSpace, push: Callable[[Tree], Tree], d: Tree, p: Tree) -> Refined:
+    """Apply B² to d, where `push` applies B. A B that is zero or not finite leaves the direction as it
+    is, and σ = 0: it limits nothing.
 
     v decays where Bd points against d, and B²d along it: an oscillation has −ω²d there, though its
     velocities alone may point anywhere."""
@@ -85,7 +101,25 @@ def refine(
     is_damped = is_real & (space.inner(one, two) < -_ALONG * space.norm(one) * length)
     unit = _tree.scale(1.0 / jnp.where(known, length, 1.0), two)
     mixed = _tree.add(unit, _tree.scale(_SHARE, p))
-    return jnp.where(known, jnp.sqrt(size), 0.0), is_damped, _tree.where(known, mixed, d)
+    slope = jnp.where(known, jnp.sqrt(size), 0.0)
+    return Refined(slope, is_damped, one, _tree.where(known, mixed, d))
+
+
+def variation(space: AbstractSpace, nodes: tuple[float, ...], rows: Tree) -> Any:
+    """Return hω of a function of θ with these rows at the nodes in [0, 1], as if it were a multiple of
+    e^{ihωθ}: (m! |divided difference|/|function|)^{1/m} for the highest order m. It is 0 for a
+    polynomial of a lower degree, and for two nodes or fewer."""
+    m = len(nodes) - 1
+    if m < 2:
+        return jnp.zeros(())
+    weights = [1.0 / math.prod(a - b for b in nodes if b != a) for a in nodes]
+    difference = jtu.tree_map(
+        lambda leaf: jnp.tensordot(jnp.asarray(weights, leaf.dtype), leaf, 1), rows
+    )
+    largest = jnp.max(jax.vmap(space.norm)(rows))
+    known = jnp.isfinite(largest) & (largest > 0.0)
+    share = math.factorial(m) * space.norm(difference) / jnp.where(known, largest, 1.0)
+    return jnp.where(known, share ** (1.0 / m), 0.0)
 
 
 def _normalised(space: AbstractSpace, d: Tree) -> Tree:

@@ -50,7 +50,7 @@ def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State
     def forward(*given: Any) -> Any:
         leaves = [leaf.value for leaf in given]
         x0, loop, ts = whole(leaves)
-        loop = loop.for_derivatives()
+        loop = loop.for_derivatives(x0)
 
         def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State]:
             return loop.run(x0, ts, Checkpoints(x0, checkpoint_count(x0, loop.max_steps)))

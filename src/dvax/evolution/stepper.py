@@ -38,7 +38,7 @@ class SolverState(NamedTuple):
     """What the next step reuses of an accepted one: the rate at its end, a guess for the law, the
     coefficients of its end in the eigenfunctions of A, the largest `variation` of the data between
     samples so far (`ExcursionGuard`), an estimate of the `error` of x, and the `direction` of the power
-    iteration, each None where it is not needed."""
+    iteration with the largest `slope` at x, each None where it is not needed."""
 
     rate: Rate | None
     guess: Tree | None
@@ -46,6 +46,7 @@ class SolverState(NamedTuple):
     variation: Tree
     error: Tree | None = None
     direction: Tree | None = None
+    slope: Any = None
 
 
 class Propagators(NamedTuple):
@@ -62,11 +63,13 @@ class Fastest(NamedTuple):
     """The fastest change that a derivative of the run may have within a step.
 
     - `slope`: h times the largest slope of what the method treats explicitly (`power_iteration`);
+    - `variation`: hω, where the derivative of f̃ changes in time as e^{iωt} does;
     - `is_damped`: such a change decays;
     - `is_stiff`: x itself changes slowly beside it.
     """
 
     slope: Any
+    variation: Any
     is_damped: Any
     is_stiff: Any
 
@@ -167,7 +170,8 @@ class Stepper(eqx.Module):
     - `ends`: first and last time of the run;
     - `uniform`: the propagators, where all steps have one length that is known beforehand;
     - `growth`: of the semigroup, where the defect is enclosed;
-    - `for_derivatives`: find the largest slope of f̃, which limits steps whose derivative is wanted.
+    - `for_derivatives`: find the largest slope of f̃, which limits steps whose derivative is wanted;
+    - `varies`: f̃ depends on t other than through x, so that slopes are looked at inside a step too.
     """
 
     method: AbstractMethod
@@ -182,6 +186,7 @@ class Stepper(eqx.Module):
     uniform: Propagators | None
     growth: Growth | None
     for_derivatives: bool = eqx.field(static=True, default=False)
+    varies: bool = eqx.field(static=True, default=False)
 
     def begin(self, x0: Tree) -> SolverState:
         """Before the first step nothing is known but where to look first."""
@@ -194,10 +199,11 @@ class Stepper(eqx.Module):
         rate = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), blank)
         none = None if self.guard is None else self.guard.start(self.flow, self.ends[0], x0)
         error = _tree.zeros_like(x0) if self.estimate else None
-        direction = None
+        direction, slope = None, None
         if self.for_derivatives:
             direction = power_iteration.pattern(self.flow.state_space(x0), x0)
-        return SolverState(rate, guess, known, none, error, direction)
+            slope = jnp.zeros_like(self.ends[0])
+        return SolverState(rate, guess, known, none, error, direction, slope)
 
     def restart(self, solver_state: SolverState, x: Tree) -> SolverState:
         """Return the state of the stepper after the state of the run was set to x."""
@@ -268,7 +274,8 @@ class Stepper(eqx.Module):
         first, last = evaluations[0].rate, evaluations[-1].rate
         error, integrated_defect, event, excursion, bounds = None, (0.0, 0.0), None, None, None
         stiffness, signed, carried, estimate = None, None, None, None
-        variation, fastest, direction = solver_state.variation, None, None
+        variation, fastest = solver_state.variation, None
+        direction, steepest = solver_state.direction, solver_state.slope
         if self.measure:
             slopes = self._slopes(t1 - t0, evaluations)
             whole = None if slopes is None else slopes[1]
@@ -299,9 +306,15 @@ class Stepper(eqx.Module):
                 slope = slopes[self.method.explicit_in_A]
                 stiffness = jnp.where(change < _SLOW * slope, slope, 0.0)
             if self.for_derivatives:
-                guess = solver_state.guess if first.y is None else first.y
-                fastest, direction = self._fastest(
-                    t0, t1, x0, guess, solver_state.direction, change
+                others = evaluations[-1 - len(sample.thetas) :]
+                fastest, direction, steepest = self._fastest(
+                    t1 - t0,
+                    evaluations[0],
+                    others,
+                    sample.thetas,
+                    solver_state,
+                    propagators,
+                    change,
                 )
             # Further in, a bad value may come from a step that was too long: it is cut, not fatal.
             finite = _tree.all_finite(first.value)
@@ -317,6 +330,7 @@ class Stepper(eqx.Module):
             variation,
             estimate,
             direction,
+            steepest,
         )
         solved = jnp.all(jnp.stack([one.rate.solved for one in evaluations]))
         # The first one was made by the step before, unless nothing is kept, or data jumped.
@@ -425,20 +439,67 @@ class Stepper(eqx.Module):
         return lax.stop_gradient((scale * space.norm(change), scale * space.norm(whole)))
 
     def _fastest(
-        self, t0: Any, t1: Any, x0: Tree, guess: Tree | None, direction: Any, change: Any
-    ) -> tuple[Fastest, Tree]:
-        """Return what limits the steps of a derivative, and the next direction of the power iteration.
+        self,
+        h: Any,
+        first: Evaluation,
+        others: list[Evaluation],
+        nodes: tuple[float, ...],
+        solver_state: SolverState,
+        propagators: Propagators | None,
+        change: Any,
+    ) -> tuple[Fastest, Tree, Any]:
+        """Return what limits the steps of a derivative, the next direction of the power iteration, and
+        the slope at x₁. The `others` are evaluations at the `nodes` in the step and at its end;
         `change` is that of x over the step, relative to x."""
-        flow, t0, t1, x0, guess, direction = _constant((self.flow, t0, t1, x0, guess, direction))
-        t = self._one_sided_time(t0, t1, 0.0)
-        value = lambda x: flow.nonlinear_part(x, flow.rate(t, x, guess).value)  # noqa: E731
-        space = flow.state_space(x0)
-        pattern = power_iteration.pattern(space, x0)
-        slope, is_damped, direction = power_iteration.refine(
-            space, power_iteration.linearised(value, x0), direction, pattern
+        flow, h, first, others, solver_state, propagators, change = _constant(
+            (self.flow, h, first, others, solver_state, propagators, change)
         )
-        slope = (t1 - t0) * slope
-        return _constant((Fastest(slope, is_damped, change < _SLOW * slope), direction))
+        space = flow.state_space(first.x)
+        pattern = power_iteration.pattern(space, first.x)
+        places, nodes = [first, *others], (0.0, *nodes, 1.0)
+        if not self.varies:
+            # Where nothing but x moves, the step before has looked at the start.
+            places, nodes = places[-1:], nodes[-1:]
+        known = all(v.rate.y is not None for v in places)
+
+        def look(t: Any, x: Tree, guess: Tree | None) -> power_iteration.Refined:
+            value = lambda x: flow.nonlinear_part(x, flow.rate(t, x, guess).value)  # noqa: E731
+            push = power_iteration.linearised(value, x)
+            if self.method.is_rosenbrock:
+                assert propagators is not None
+                by, none, remainder = propagators.full, _tree.zeros_like(x), push
+                push = lambda v: by.step(none, (remainder(v),))  # noqa: E731
+            return power_iteration.refine(space, push, solver_state.direction, pattern)
+
+        looks = [(v.t, v.x, v.rate.y if known else solver_state.guess) for v in places]
+        found = lax.map(
+            lambda at: look(*at), jtu.tree_map(lambda *leaves: jnp.stack(leaves), *looks)
+        )
+        steepest = jnp.argmax(found.slope)
+        variation = power_iteration.variation(space, nodes, found.first)
+        if self.method.is_rosenbrock:
+            # Behind a kink another Df̃ is no matter of the step size.
+            slope = jnp.max(jnp.where(self._same_side(first, places), found.slope, 0.0))
+            fastest = Fastest(slope, variation, jnp.asarray(False), jnp.asarray(False))
+        else:
+            slope = h * jnp.maximum(found.slope[steepest], solver_state.slope)
+            is_damped = found.is_damped[steepest]
+            fastest = Fastest(slope, variation, is_damped, change < _SLOW * slope)
+        direction = jtu.tree_map(lambda leaf: leaf[steepest], found.direction)
+        return _constant((fastest, direction, found.slope[-1]))
+
+    def _same_side(self, first: Evaluation, others: list[Evaluation]) -> jax.Array:
+        """Return for the others whether no kink of the response lies between them and the first one;
+        true where events are not located."""
+        if not self.locate:
+            return jnp.ones(len(others), bool)
+
+        def sides(v: Evaluation) -> jax.Array:
+            found = self.flow.switches_of(v.t, v.x, v.rate)
+            assert found is not None
+            return joined(found, _tree.dtype(v.rate.z)) > 0.0
+
+        return jnp.stack([jnp.all(sides(v) == sides(first)) for v in others])
 
     def _event(
         self, t0: Any, t1: Any, x0: Tree, c: Any, first: Rate, sample: Sample, wanted: Any

@@ -59,7 +59,7 @@ def by_steps(
         watch=watch,
     )
     if options.adjoint == "forward":
-        saved, end = forward_only(outlined(Loop.run, loop.for_derivatives(), x0, ts))
+        saved, end = forward_only(outlined(Loop.run, loop.for_derivatives(x0), x0, ts))
     else:
         saved, end = reverse.run(loop, x0, ts)
     complete = end.t >= t1
@@ -130,7 +130,9 @@ def _controller(
             certify=bool(setup.moduli),
             knows_decay=method.is_rosenbrock,
         ),
-        tangents=TangentLimit(rtol, method.order, method.stable),
+        tangents=TangentLimit(
+            rtol, stops[-1] - stops[0], method.order, method.stable, method.is_rosenbrock
+        ),
         first=setup.number("dt0"),
         first_growth=setup.number("dt0_growth"),
         longest=setup.number("dt_max"),

@@ -1,14 +1,18 @@
 """The tangent limit: steps that a derivative can take, and the slope that limits them."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.evolution.control.attempts import NO, YES
+from tests.evolution.control.attempts import NO, YES, attempt
 
+import dvax
 from dvax import spaces
 from dvax.evolution.control import TangentLimit
-from dvax.evolution.power_iteration import pattern, refine
+from dvax.evolution.power_iteration import pattern, refine, variation
 from dvax.evolution.stepper import Fastest
+
+ZERO = jnp.asarray(0.0)
 
 # (order, stable, R(z)) of an explicit method; its tangents are multiplied by R(z) and not by e^z.
 METHODS = [
@@ -17,15 +21,15 @@ METHODS = [
 ]
 
 
-def longest(limit, slope, decay, size=1.0):
-    fastest = Fastest(jnp.asarray(slope), YES, NO)
-    return limit.of(fastest, jnp.asarray(decay), jnp.asarray(size), jnp.asarray(1e-16))
+def longest(limit, slope, decay, size=1.0, variation=0.0, error=1.0):
+    fastest = Fastest(jnp.asarray(slope), jnp.asarray(variation), YES, NO)
+    return limit.of(fastest, jnp.asarray(decay), attempt(error, size))
 
 
 @pytest.mark.parametrize(("order", "stable", "R"), METHODS)
 @pytest.mark.parametrize("rtol", [1e-3, 1e-6, 1e-10])
 def test_tangent_limit_resolves_a_tangent_to_ten_tolerances_in_its_time(order, stable, R, rtol):
-    limit = TangentLimit(jnp.asarray(rtol), order, stable)
+    limit = TangentLimit(jnp.asarray(rtol), 100.0, order, stable)
     for slope in (0.1, 3.0, 1e5):
         z = float(longest(limit, slope, 0.0).longest) * slope
         if z < 0.8 * 0.8 * stable:
@@ -37,15 +41,15 @@ def test_tangent_limit_resolves_a_tangent_to_ten_tolerances_in_its_time(order, s
 
 @pytest.mark.parametrize(("order", "stable", "R"), METHODS)
 def test_tangent_limit_rises_to_stability_as_tangents_decay(order, stable, R):
-    limit = TangentLimit(jnp.asarray(1e-5), order, stable)
+    limit = TangentLimit(jnp.asarray(1e-5), 100.0, order, stable)
     slope, decay, z = 7.0, jnp.asarray(0.0), 0.0
     for _ in range(400):
         z = float(longest(limit, slope, decay).longest) * slope
-        fastest = Fastest(jnp.asarray(z), YES, YES)
+        fastest = Fastest(jnp.asarray(z), ZERO, YES, YES)
         decay = limit.after(fastest, decay, jnp.asarray(1e-3), YES, NO)
     assert z == pytest.approx(0.8 * 0.8 * stable) and abs(R(-z)) < 1.0
     # It falls back where tangents are excited, and where they do not decay.
-    steady = Fastest(jnp.asarray(z), NO, YES)
+    steady = Fastest(jnp.asarray(z), ZERO, NO, YES)
     for at, excited in ((fastest, YES), (steady, NO)):
         assert float(limit.after(at, decay, jnp.asarray(1e-3), YES, excited)) == 0.0
     # At rest it rises more slowly.
@@ -57,7 +61,7 @@ def test_tangent_limit_rises_to_stability_as_tangents_decay(order, stable, R):
 
 
 def test_tangent_limit_keeps_a_step_size_within_a_fifth_and_ignores_a_slope_of_zero():
-    limit = TangentLimit(jnp.asarray(1e-6), 4, 2.7)
+    limit = TangentLimit(jnp.asarray(1e-6), 100.0, 4, 2.7)
     assert float(longest(limit, 0.0, 0.0).longest) == np.inf
     bound = longest(limit, 1.0, 0.0)
     aim = float(bound.longest)
@@ -90,13 +94,13 @@ def spectrum(kind, n, rng):
 def test_power_iteration_finds_the_spectral_radius(kind, n):
     B, decays = spectrum(kind, n, np.random.default_rng(n))
     space = spaces.L2(np.linspace(0.5, 2.0, n))
-    p, slope = pattern(space, jnp.zeros(n)), 0.0
-    direction = p
+    p = direction = pattern(space, jnp.zeros(n))
     assert float(space.norm(p)) == pytest.approx(1.0)
     for _ in range(40):
-        slope, is_damped, direction = refine(space, lambda v: B @ v, direction, p)
-    assert 0.85 * 40.0 <= float(slope) <= 1.15 * 40.0
-    assert bool(is_damped) == decays
+        found = refine(space, lambda v: B @ v, direction, p)
+        direction = found.direction
+    assert 0.85 * 40.0 <= float(found.slope) <= 1.15 * 40.0
+    assert bool(found.is_damped) == decays
 
 
 def test_power_iteration_finds_the_radius_in_any_units():
@@ -107,8 +111,9 @@ def test_power_iteration_finds_the_radius_in_any_units():
         B = S @ np.array([[-1.0, 1.0], [1.0, -2.0]]) @ np.linalg.inv(S)
         p = direction = pattern(space, jnp.asarray([0.7, 1.3]) * jnp.asarray(units))
         for _ in range(10):
-            slope, _, direction = refine(space, lambda v, B=B: B @ v, direction, p)
-        assert float(slope) == pytest.approx(2.618, rel=0.2)
+            found = refine(space, lambda v, B=B: B @ v, direction, p)
+            direction = found.direction
+        assert float(found.slope) == pytest.approx(2.618, rel=0.2)
 
 
 def test_power_iteration_sees_the_exchange_of_equal_parts():
@@ -120,5 +125,49 @@ def test_power_iteration_waits_where_nothing_moves():
     space, zero = spaces.Euclidean(3), jnp.zeros(3)
     start = pattern(space, zero)
     for push in (jnp.zeros_like, lambda v: jnp.full(3, jnp.nan)):
-        slope, _, direction = refine(space, push, start, start)
-        assert float(slope) == 0.0 and jnp.array_equal(direction, start)
+        found = refine(space, push, start, start)
+        assert float(found.slope) == 0.0 and jnp.array_equal(found.direction, start)
+
+
+@pytest.mark.parametrize("method", [dvax.ETD4RK(), dvax.DormandPrince()], ids=["three", "four"])
+def test_variation_is_the_frequency_of_a_wave_and_zero_for_a_polynomial(method):
+    nodes = (0.0, *method.samples, 1.0)
+    space, at = spaces.Euclidean(2), jnp.asarray(nodes)
+    for turn in (0.03, 0.3, 1.0):
+        rows = jnp.stack([jnp.cos(turn * at), jnp.sin(turn * at)], 1)
+        assert float(variation(space, nodes, rows)) == pytest.approx(turn, rel=0.05)
+    degree = len(nodes) - 2
+    rows = jnp.stack([at**degree, 1.0 - 3.0 * at], 1)
+    # The root of a rounding.
+    assert float(variation(space, nodes, rows)) <= (1e4 * np.finfo(float).eps) ** (1 / (degree + 1))
+    # Samples of a wave that is much faster show that it is not resolved, unless they meet the same
+    # phase by chance.
+    turns = np.outer(np.random.default_rng(len(nodes)).uniform(5.0, 1e3, 400), nodes)
+    rows = jnp.stack([jnp.cos(turns), jnp.sin(turns)], 2)
+    found = jax.vmap(lambda rows: variation(space, nodes, rows))(rows)
+    assert np.mean(found >= 1.0) >= 0.98
+    assert float(variation(space, (1.0,), rows[0, :1])) == 0.0
+
+
+@pytest.mark.parametrize("order", [2, 4, 5])
+def test_tangent_limit_resolves_a_variation_in_time_at_rest_alone(order):
+    limit = TangentLimit(jnp.asarray(1e-6), 1.0, order, 3.0)
+    accurate = float(longest(limit, 1.0, 0.0).longest)
+    # With a slope of 1 a wave of the frequency 4 needs steps a quarter as long.
+    at_rest = longest(limit, 1.0, 0.0, variation=4.0, error=0.0)
+    assert float(at_rest.longest) == pytest.approx(accurate / 4.0)
+    assert not bool(at_rest.is_short_enough)
+    moving = longest(limit, 1.0, 0.0, variation=4.0, error=1e-3)
+    assert float(moving.longest) == pytest.approx(accurate)
+    # A slope that changes nothing within the run needs no steps.
+    assert float(longest(limit, 1e-30, 0.0, variation=4.0, error=0.0).longest) > 100.0
+    # Rounding on a kink is a variation in every step: the finest ones pass.
+    finest = longest(limit, 1e-9, 0.0, size=2e-4, variation=4.0, error=0.0)
+    assert bool(finest.is_short_enough) and float(finest.longest) >= 1e-4
+
+
+def test_tangent_limit_of_a_method_that_linearises_grows_as_the_square_of_the_step():
+    # The change of f' over a step, and the step, are both proportional to it.
+    limit = TangentLimit(jnp.asarray(1e-6), 100.0, 4, 3.0, True)
+    bound = float(longest(limit, 1.0, 0.0).longest)
+    assert float(longest(limit, 4.0, 0.0, size=2.0).longest) == pytest.approx(bound)

@@ -107,7 +107,7 @@ class Adaptive(AbstractController):
         passes = (attempt.error <= 1.0) | covered | crossing
         tangent, decay = None, state.decay
         if step.fastest is not None:
-            tangent = self.tangents.of(step.fastest, decay, attempt.size, attempt.smallest)
+            tangent = self.tangents.of(step.fastest, decay, attempt)
             passes = passes & tangent.is_short_enough
         accepted = attempt.usable & passes & (excursion <= 1.0)
         budget = state.budget.after(attempt, accepted, covered, is_roundoff)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..stepper import Fastest
+from .error_test import Attempt
 
 _SHARE = 10.0
 """Error of a tangent within the time 1/σ, relative to it and in tolerances."""
@@ -32,6 +33,14 @@ _AT_REST = 1e-8
 
 _LARGEST_DECAY = 40.0
 """Decay D up to which is counted: e^−40 is below any tolerance."""
+
+_COUNTED_AT_REST = 0.1
+"""Share of z that counts in D at rest: slower solutions, which may grow, are resolved by nothing else
+there."""
+
+_FINEST = 1e-4
+"""Step size, as a share of the run, down to which a change of B within a step is resolved: one that no
+step resolves is the rounding of a state on a kink."""
 
 
 class StepLimit(NamedTuple):
@@ -60,26 +69,43 @@ class TangentLimit(eqx.Module):
         z ≤ ((p+1)! 10 rtol e^D)^{1/p},   D = Σ z over the steps since then,
 
     up to the limit of stability of the method, or up to 1 where the fastest solutions do not decay.
-    `order` is p, `stable` the limit of stability on the negative axis.
+    Where the state stands still, a B that varies in time as e^{iωt} is resolved as well: with z the
+    smaller of hω and hω (Tσ)^{1/p}, T being the `span` of the run.
+
+    `order` is p, `stable` the limit of stability on the negative axis; `is_exact` for a method that
+    linearises, whose B is the change of f̃' since the start of the step.
     """
 
     rtol: Any
+    span: Any
     order: int = eqx.field(static=True)
     stable: float = eqx.field(static=True)
+    is_exact: bool = eqx.field(static=True, default=False)
 
-    def of(self, fastest: Fastest, decay: Any, size: Any, smallest: Any) -> StepLimit:
-        """Return the limit after a step of this size, where `decay` is D."""
-        slope, is_damped, is_stiff = lax.stop_gradient(fastest)
+    def of(self, fastest: Fastest, decay: Any, attempt: Attempt) -> StepLimit:
+        """Return the limit after an attempt, where `decay` is D."""
+        slope, variation, is_damped, is_stiff = lax.stop_gradient(fastest)
+        size, smallest = attempt.size, attempt.smallest
         error = _SHARE * jnp.maximum(self.rtol, jnp.finfo(size.dtype).eps)
         accurate = (math.factorial(self.order + 1) * error) ** (1.0 / self.order)
-        most = jnp.minimum(
-            accurate * jnp.exp(decay / self.order),
-            jnp.where(is_damped, _STABLE * self.stable, _LARGEST_TURN),
-        )
-        longest = _AIM * size * (most / jnp.where(slope > 0.0, slope, 1.0))
+        accurate = accurate * jnp.exp(decay / self.order)
+        most = jnp.minimum(accurate, jnp.where(is_damped, _STABLE * self.stable, _LARGEST_TURN))
+        # The change of f̃' over a step, and the step, are proportional to h.
+        of_slope = _share(most, slope) ** (0.5 if self.is_exact else 1.0)
+        variation = variation * jnp.minimum(slope * self.span / size, 1.0) ** (1.0 / self.order)
+        at_rest = attempt.error < _AT_REST
+        of_change = jnp.where(at_rest, _share(accurate, variation), jnp.inf)
+        if self.is_exact:
+            of_change, of_slope = jnp.minimum(of_slope, of_change), jnp.full_like(slope, jnp.inf)
+        finest = _FINEST * self.span
+        # Twice the finest one, so that a step that is cut to it passes.
+        resolves = (_SLACK * of_change >= 1.0) | (size <= 2.0 * finest)
+        stable = (_SLACK * of_slope >= 1.0) | (size <= 2.0 * smallest)
         return StepLimit(
-            longest=jnp.where(slope > 0.0, longest, jnp.inf),
-            is_short_enough=(slope <= _SLACK * most) | (size <= 2.0 * smallest),
+            longest=jnp.minimum(
+                _AIM * size * of_slope, jnp.maximum(_AIM * size * of_change, finest)
+            ),
+            is_short_enough=resolves & stable,
             is_stiff=is_stiff & (slope > _BINDS * most),
         )
 
@@ -88,9 +114,13 @@ class TangentLimit(eqx.Module):
     ) -> Any:
         """Return D after an attempt with this error in tolerances. Events and jumps of the data excite
         what has decayed (`is_excited`), and nothing is counted where the fastest solutions do not
-        decay. At rest a tenth is: slower solutions, which may grow, are then resolved by nothing
-        else."""
-        slope, is_damped, _ = lax.stop_gradient(fastest)
-        added = jnp.where(error < _AT_REST, 0.1 * slope, slope)
+        decay."""
+        slope, _, is_damped, _ = lax.stop_gradient(fastest)
+        added = jnp.where(error < _AT_REST, _COUNTED_AT_REST * slope, slope)
         counted = jnp.minimum(decay + jnp.where(accepted, added, 0.0), _LARGEST_DECAY)
         return jnp.where(is_excited | ~is_damped, 0.0, counted)
+
+
+def _share(most: Any, z: Any) -> Any:
+    """Return most/z, ∞ for z = 0."""
+    return jnp.where(z > 0.0, most / jnp.where(z > 0.0, z, 1.0), jnp.inf)
