@@ -63,6 +63,10 @@ FUNCTIONS = {
         lambda: of_f(lambda t, x, u: -u),
         "newcomer.py, line; a function of (t, x, u); f(t, x, u, args)",
     ),
+    "a text in args": (
+        lambda: of_f(lambda t, x, u, args: x * args["k"], args={"k": "3"}),
+        "Problem(f); args['k'] = '3'; float(...)",
+    ),
     "a list in args": (
         lambda: dvax.solve(
             problem(f=lambda t, x, u, a: a[0] * x), jnp.ones(2), 0.0, 1.0, ([1.0, 2.0],)

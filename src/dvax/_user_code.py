@@ -238,6 +238,13 @@ def _explain(
     return InputProblem(f"{at}, {_place(fn, error.__traceback__)}", given, rule, fix)
 
 
+def _texts(args: Any) -> str:
+    """Return the first texts in args with their places, "" if there are none."""
+    leaves = jtu.tree_flatten_with_path(args)[0]
+    texts = [f"args{jtu.keystr(path)} = {leaf!r}" for path, leaf in leaves if isinstance(leaf, str)]
+    return _line(", ".join(texts[:2]))
+
+
 def _reason(
     name: str, fn: Callable[..., Any], inputs: Mapping[str, Any], error: Exception
 ) -> tuple[str, str]:
@@ -275,6 +282,11 @@ def _reason(
         return "JAX arrays are immutable", "Write x = x.at[i].set(v) for x[i] = v"
     if inputs.get("args", 0) is None and _reads_args(fn, error):
         return f"{name} reads args, and no args were given", "Pass args=... to the call"
+    if isinstance(error, TypeError) and (texts := _texts(inputs.get("args"))):
+        return (
+            f"args holds text, {texts}, and arithmetic needs numbers",
+            "Convert numbers that were read as text: float(...)",
+        )
     if isinstance(error, TypeError) and "'list'" in str(error):
         return (
             f"{name} computes with a list, as args may hold one, and arithmetic needs an array",

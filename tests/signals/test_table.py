@@ -100,7 +100,11 @@ def test_a_product_of_a_profile_and_a_record_is_a_separable_field():
         (lambda: Table([0.0, 1.0, 1.0], [1.0, 2.0, 3.0]), ["times[1]", "increase"]),
         (lambda: Table([0.0, np.nan], [1.0, 2.0]), ["times[1]", "finite"]),
         (lambda: Table([0.0, np.inf], [1.0, 2.0]), ["times[1]", "finite"]),
-        (lambda: Table([0.0, 1.0], [1.0, np.nan]), ["values", "finite"]),
+        (lambda: Table([0.0, 1.0], [1.0, np.nan]), ["values[1] = nan", "first of 1", "finite"]),
+        (
+            lambda: Table([0.0, 1.0], [[1.0, 2.0], [np.inf, np.nan]]),
+            ["values[1, 0] = inf", "first of 2"],
+        ),
         (lambda: Table([0.0, 1.0], [1.0, np.inf]), ["values", "finite"]),
         (lambda: Table([0.0, 1.0], [1.0, 2.0, 3.0]), ["(2,)", "(3,)"]),
         (lambda: Table([0.0], [1.0]), ["at least 2"]),

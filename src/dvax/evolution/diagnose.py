@@ -430,7 +430,7 @@ def _not_monotone(stop: Stop) -> Diagnosis | None:
             if abs(least) <= _ZERO * largest:
                 return Diagnosis(
                     f"{law}its derivative has the eigenvalue 0 up to roundoff, so that the law may "
-                    "have several solutions.",
+                    "have no solution or several.",
                     (_REGULARISE, _SIGN),
                 )
             if least < 0:

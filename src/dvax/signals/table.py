@@ -169,13 +169,16 @@ def _check(name: str, times: Any, values: jax.Array, min_count: int) -> None:
                 "times must increase strictly, or the signal has two values at one time",
                 "Sort the data and remove repeated times",
             )
-    _tree.require(
-        lambda: np.all(np.isfinite(values)),
-        f"{name}(values)",
-        values,
-        "measured values must be finite",
-        "Remove the times of missing values, or fill them explicitly",
-    )
+    if _tree.is_concrete(values):
+        gaps = np.argwhere(~np.isfinite(values))
+        if len(gaps):
+            index = ", ".join(map(str, gaps[0]))
+            raise input_error(
+                f"{name}(values)",
+                f"values[{index}] = {values[tuple(gaps[0])]}, the first of {len(gaps)}",
+                "measured values must be finite",
+                "Remove the times of missing values, or fill them explicitly",
+            )
 
 
 def _spline_slopes(times: Any, values: jax.Array) -> jax.Array:
