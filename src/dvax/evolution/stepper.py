@@ -301,8 +301,8 @@ class Stepper(eqx.Module):
                 excursion, variation = seen.ratio, seen.variation
             # Where x itself changes at a comparable rate, accuracy requires such steps too.
             space = self.flow.state_space(x0)
-            moved = space.norm(_tree.sub(x1, x0))
-            change = jnp.where(moved > 0.0, moved / space.norm(x1), 0.0)
+            distance = space.norm(_tree.sub(x1, x0))
+            change = jnp.where(distance > 0.0, distance / space.norm(x1), 0.0)
             if slopes is not None:
                 slope = slopes[self.method.explicit_in_A]
                 stiffness = jnp.where(change < _SLOW * slope, slope, 0.0)
