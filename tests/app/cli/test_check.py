@@ -68,8 +68,23 @@ def test_check_strict_rejects_a_system_outside_the_class(
     lenient = CliRunner().invoke(app, ["check", str(tree)])
     strict = CliRunner().invoke(app, ["check", str(tree), "--strict"])
     assert (lenient.exit_code, strict.exit_code) == (0, 4)
-    for result in (lenient, strict):
-        assert "error: outside the class of the theory: gamma" in result.stderr
+    for result, word in ((lenient, "warning"), (strict, "error")):
+        assert f"{word}: outside the class of the theory: gamma" in result.stderr
+
+
+@pytest.mark.thorough
+def test_check_ends_with_an_error_where_a_set_becomes_empty(tmp_path: Path) -> None:
+    folder = tmp_path / "new"
+    assert CliRunner().invoke(app, ["new", str(folder)]).exit_code == 0
+    code = folder / "spring.py"
+    bounds = '-args["limit"], args["limit"]'
+    assert bounds in code.read_text()
+    code.write_text(code.read_text().replace(bounds, '-args["limit"], 2.0 - 2.0 * t'))
+    command = ["check", str(folder / "spring.toml"), "--allow-code"]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 4
+    # Box(-5, 2 - 2 t) is empty from t = 3.5 on.
+    assert "error: ass:operators (iii)" in result.stderr
 
 
 def test_check_prints_the_sizes_of_the_run(tree: Path) -> None:

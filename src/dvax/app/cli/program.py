@@ -24,7 +24,7 @@ app = typer.Typer(
     help=(
         "Solve coupled nonsmooth dynamical systems, with a certificate of the error.\n\n"
         "Exit codes: 0 done, 2 wrong input, 3 the solver failed, 4 outside the class of problems "
-        "(check --strict), 5 no space left to write, 130 interrupted, 143 asked to terminate. Whatever "
+        "(check), 5 no space left to write, 130 interrupted, 143 asked to terminate. Whatever "
         "ends a run, the frames that were solved until then are kept."
     ),
 )
