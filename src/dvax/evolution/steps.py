@@ -176,7 +176,7 @@ def _stepper(
         growth,
     )
     if options.fixed and stops.shape[0] == 2 and not method.is_rosenbrock:
-        length = (t1 - t0) / step_count(t1 - t0, setup.number("dt"))
+        length = (t1 - t0) / step_count(t0, t1, setup.number("dt"))
         return dataclasses.replace(stepper, uniform=stepper.propagators(length))
     return stepper
 

@@ -10,6 +10,9 @@ from ... import _tree
 from ..results import RESULTS
 from .controller import AbstractController, StepDecision
 
+_ROUNDINGS = 4.0
+"""Roundings of the ends of an interval, by which it may be longer than a number of steps."""
+
 
 class Fixed(AbstractController):
     """Equal steps no longer than dt between one stop and the next."""
@@ -65,15 +68,20 @@ class Fixed(AbstractController):
         return self._time(segment, index - before)
 
     def _counts(self) -> Any:
-        return step_count(jnp.diff(self.stops), self.dt).astype(int)
+        return step_count(self.stops[:-1], self.stops[1:], self.dt).astype(int)
 
     def _time(self, segment: Any, step: Any) -> Any:
         left, right = self.stops[segment], self.stops[segment + 1]
-        count, step = step_count(right - left, self.dt), jnp.asarray(step, left.dtype)
+        count, step = step_count(left, right, self.dt), jnp.asarray(step, left.dtype)
         # The last end is the stop itself: a sum may round past it.
         return jnp.where(step >= count, right, left + step * ((right - left) / count))
 
 
-def step_count(span: Any, dt: Any) -> Any:
-    """Return the least number of equal steps no longer than dt (up to rounding) that fill the span."""
-    return jnp.maximum(jnp.ceil(span / dt * (1 - 1e-12)), 1.0)
+def step_count(left: Any, right: Any, dt: Any) -> Any:
+    """Return the least number of equal steps no longer than dt that fill the time from left to right,
+    up to the rounding of these times and of dt."""
+    span, eps = right - left, jnp.finfo(jnp.result_type(left)).eps
+    rounding = _ROUNDINGS * eps * (span + jnp.maximum(jnp.abs(left), jnp.abs(right)))
+    # Near the resolution of t the steps are what they are.
+    span = jnp.maximum(span - rounding, 0.5 * span)
+    return jnp.maximum(jnp.ceil(span / dt), 1.0)
