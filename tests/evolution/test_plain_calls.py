@@ -119,3 +119,18 @@ print(f"{float(sol.xs[-1]):.5f} {float(forward[0]):.5f}", sol.stats["compile_tim
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     # What is traced is timed all the same.
     assert done.stdout == "1.83609 1.83609 True\n", done.stderr
+
+
+def test_an_array_as_state_with_a_tuple_as_response_is_solved():
+    # u = (clip(x), clip(x)): x' = −x + 1 − 2 min(x, 1) from 0, so that x = (1 − e^{−3t})/3.
+    Euclidean, Box, same = dvax.spaces.Euclidean, dvax.sets.Box, dvax.operators.Scaling(1.0)
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0),
+        P=dvax.operators.Product(same, same),
+        K=dvax.sets.Product(Box(-1.0, 1.0), Box(0.0, 2.0)),
+        f=lambda t, x, u, args: 1.0 - u[0] - u[1],
+        h=lambda t, x, u, args: (x, x),
+        control_space=dvax.spaces.Product(Euclidean(()), Euclidean(())),
+    )
+    solution = dvax.solve(problem, 0.0, 0.0, 1.0)
+    assert solution.xs[-1] == pytest.approx(-np.expm1(-3.0) / 3.0, rel=1e-5)

@@ -273,7 +273,7 @@ def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
 def is_pointwise(problem: Problem, operator: AbstractOperator, t: Any, x: Tree, args: Any) -> bool:
     """Return whether each entry of f̃(t, x) depends on t and on that entry of x alone."""
     like = problem.zero_control(x)
-    if not isinstance(x, jax.Array) or jnp.shape(like) != x.shape:
+    if not (isinstance(x, jax.Array) and isinstance(like, jax.Array) and like.shape == x.shape):
         return False
     if not isinstance(operator, Scaling | DiagonalOperator):
         return False

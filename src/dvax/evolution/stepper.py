@@ -64,12 +64,14 @@ class Fastest(NamedTuple):
 
     - `slope`: h times the largest slope of what the method treats explicitly (`power_iteration`);
     - `variation`: hω, where the derivative of f̃ changes in time as e^{iωt} does;
+    - `kink`: the same as `slope`, with what lies behind a kink of the response;
     - `is_damped`: such a change decays;
     - `is_stiff`: x itself changes slowly beside it.
     """
 
     slope: Any
     variation: Any
+    kink: Any
     is_damped: Any
     is_stiff: Any
 
@@ -481,11 +483,12 @@ class Stepper(eqx.Module):
         if self.method.is_rosenbrock:
             # Behind a kink another Df̃ is no matter of the step size.
             slope = jnp.max(jnp.where(self._same_side(first, places), found.slope, 0.0))
-            fastest = Fastest(slope, variation, jnp.asarray(False), jnp.asarray(False))
+            kink, no = found.slope[steepest], jnp.asarray(False)
+            fastest = Fastest(slope, variation, kink, is_damped=no, is_stiff=no)
         else:
             slope = h * jnp.maximum(found.slope[steepest], solver_state.slope)
             is_damped = found.is_damped[steepest]
-            fastest = Fastest(slope, variation, is_damped, change < _SLOW * slope)
+            fastest = Fastest(slope, variation, slope, is_damped, change < _SLOW * slope)
         direction = jtu.tree_map(lambda leaf: leaf[steepest], found.direction)
         return _constant((fastest, direction, found.slope[-1]))
 

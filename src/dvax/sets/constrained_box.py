@@ -114,7 +114,8 @@ class ConstrainedBox(AbstractSet):
         shifted, sums = z - inverse_w * combine(multiplier, R), times(R, y)
         # The derivative of the difference, with the value to which the steps have summed.
         shifted = shifted + lax.stop_gradient(exact - shifted)
-        slack = jnp.minimum(high - sums, sums - low)
+        # A row is released where the derivative no longer counts it as active.
+        slack = jnp.minimum(high - sums, sums - low) - _tolerance(y, R, low, high)
         of_rows = jnp.where(multiplier == 0, slack, -jnp.abs(multiplier))
         return [shifted - lower, upper - shifted, jnp.where(low == high, -1.0, of_rows)]
 

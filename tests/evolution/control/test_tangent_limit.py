@@ -22,7 +22,7 @@ METHODS = [
 
 
 def longest(limit, slope, decay, size=1.0, variation=0.0, error=1.0):
-    fastest = Fastest(jnp.asarray(slope), jnp.asarray(variation), YES, NO)
+    fastest = Fastest(jnp.asarray(slope), jnp.asarray(variation), jnp.asarray(slope), YES, NO)
     return limit.of(fastest, jnp.asarray(decay), attempt(error, size))
 
 
@@ -45,11 +45,11 @@ def test_tangent_limit_rises_to_stability_as_tangents_decay(order, stable, R):
     slope, decay, z = 7.0, jnp.asarray(0.0), 0.0
     for _ in range(400):
         z = float(longest(limit, slope, decay).longest) * slope
-        fastest = Fastest(jnp.asarray(z), ZERO, YES, YES)
+        fastest = Fastest(jnp.asarray(z), ZERO, ZERO, YES, YES)
         decay = limit.after(fastest, decay, jnp.asarray(1e-3), YES, NO)
     assert z == pytest.approx(0.8 * 0.8 * stable) and abs(R(-z)) < 1.0
     # It falls back where tangents are excited, and where they do not decay.
-    steady = Fastest(jnp.asarray(z), ZERO, NO, YES)
+    steady = Fastest(jnp.asarray(z), ZERO, ZERO, NO, YES)
     for at, excited in ((fastest, YES), (steady, NO)):
         assert float(limit.after(at, decay, jnp.asarray(1e-3), YES, excited)) == 0.0
     # At rest it rises more slowly.

@@ -105,10 +105,15 @@ class Adaptive(AbstractController):
         crossing = state.budget.may_cross(attempt, is_resolved)
         excursion = self._excursion(x0, step, attempt, span)
         passes = (attempt.error <= 1.0) | covered | crossing
-        tangent, decay = None, state.decay
+        known = EventBracket.unpack(state.event)
+        tangent, decay, ends_at_kink = None, state.decay, False
         if step.fastest is not None:
             tangent = self.tangents.of(step.fastest, decay, attempt)
             passes = passes & tangent.is_short_enough
+            ends_at_kink = ~tangent.may_cross & known.may_try()
+        found = self._event(step, attempt, (excursion > 1.0) | ends_at_kink)
+        if tangent is not None:
+            passes = passes & ~(ends_at_kink & (found < jnp.inf))
         accepted = attempt.usable & passes & (excursion <= 1.0)
         budget = state.budget.after(attempt, accepted, covered, is_roundoff)
 
@@ -133,8 +138,6 @@ class Adaptive(AbstractController):
         size = resume_planned(size, attempt, accepted, state.size)
 
         # 4. End steps at events. An event explains a rejection: the planned step size stays.
-        known = EventBracket.unpack(state.event)
-        found = self._event(step, attempt, excursion)
         rejected = ~accepted & attempt.usable & jnp.isfinite(attempt.error)
         event, directed = known.after(attempt, found, state.size, rejected)
         at_event = directed | (accepted & known.is_known())
@@ -197,11 +200,12 @@ class Adaptive(AbstractController):
         watched = attempt.size > TRUSTED_STEP_SHARE * span
         return lax.stop_gradient(jnp.where(watched, self.test.excursion(x0, step), 0.0))
 
-    def _event(self, step: Step, attempt: Attempt, excursion: Any) -> Any:
-        """Return the time of the first event inside a step that is too long for it, ∞ for none."""
+    def _event(self, step: Step, attempt: Attempt, is_too_long: Any) -> Any:
+        """Return the time of the first event inside a step that `is_too_long` for it, or has too large
+        an error; ∞ for none."""
         if step.event is None:
             return jnp.full_like(attempt.size, jnp.inf)
-        wanted = (attempt.error > 1.0) | (excursion > 1.0)
+        wanted = (attempt.error > 1.0) | is_too_long
         return lax.stop_gradient(step.event(wanted & self.locates))
 
     def _result(self, step: Step, attempt: Attempt, accepted: Any, exhausted: Any) -> RESULTS:

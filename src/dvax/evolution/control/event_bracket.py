@@ -52,13 +52,17 @@ class EventBracket(NamedTuple):
     def is_known(self) -> Any:
         return self.time < jnp.inf
 
+    def may_try(self) -> Any:
+        """Return whether a step may be directed at an event."""
+        return self.tries < _MAX_TRIES
+
     def after(
         self, attempt: Attempt, event: Any, planned: Any, rejected: Any
     ) -> tuple["EventBracket", Any]:
         """Return the bracket after an attempt in which an `event` (∞: none) was located, and whether
         the next step is directed at it; `planned` is the size that steps have without events."""
         h = attempt.size
-        directed = rejected & (event < jnp.inf) & (self.tries < _MAX_TRIES)
+        directed = rejected & (event < jnp.inf) & self.may_try()
         # The error of an estimate is O(h²), hence (h/size)² of the previous one; one power less and a
         # factor of four are left as a margin. No estimate is closer than the bracket of its search.
         known = self.is_known()

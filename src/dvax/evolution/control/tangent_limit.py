@@ -28,8 +28,8 @@ _SLACK = 2.0
 _BINDS = 0.5
 """Share of the limit from which the slope is taken to choose the steps."""
 
-_AT_REST = 1e-8
-"""Error, in tolerances, below which the state is taken to be at rest."""
+_AT_REST, _ROUNDINGS = 1e-8, 100.0
+"""Error, in tolerances and in roundings of x, below which the state is taken to be at rest."""
 
 _LARGEST_DECAY = 40.0
 """Decay D up to which is counted: e^−40 is below any tolerance."""
@@ -38,17 +38,22 @@ _COUNTED_AT_REST = 0.1
 """Share of z that counts in D at rest: slower solutions, which may grow, are resolved by nothing else
 there."""
 
+_CROSSING = 10.0
+"""Largest z of a step over a kink, in errors of a tangent: the state is continuous there, and does not
+show that the slope is wrong in a part of the step."""
+
 _FINEST = 1e-4
 """Step size, as a share of the run, down to which a change of B within a step is resolved: one that no
 step resolves is the rounding of a state on a kink."""
 
 
 class StepLimit(NamedTuple):
-    """The `longest` next step; whether the present one `is_short_enough`; and whether the slope chooses
-    the steps while x stands still (`is_stiff`)."""
+    """The `longest` next step; whether the present one `is_short_enough`, and so short that it
+    `may_cross` a kink; and whether the slope chooses the steps while x stands still (`is_stiff`)."""
 
     longest: Any
     is_short_enough: Any
+    may_cross: Any
     is_stiff: Any
 
     def limit(self, size: Any, present: Any) -> Any:
@@ -84,7 +89,7 @@ class TangentLimit(eqx.Module):
 
     def of(self, fastest: Fastest, decay: Any, attempt: Attempt) -> StepLimit:
         """Return the limit after an attempt, where `decay` is D."""
-        slope, variation, is_damped, is_stiff = lax.stop_gradient(fastest)
+        slope, variation, kink, is_damped, is_stiff = lax.stop_gradient(fastest)
         size, smallest = attempt.size, attempt.smallest
         error = _SHARE * jnp.maximum(self.rtol, jnp.finfo(size.dtype).eps)
         accurate = (math.factorial(self.order + 1) * error) ** (1.0 / self.order)
@@ -93,8 +98,7 @@ class TangentLimit(eqx.Module):
         # The change of f̃' over a step, and the step, are proportional to h.
         of_slope = _share(most, slope) ** (0.5 if self.is_exact else 1.0)
         variation = variation * jnp.minimum(slope * self.span / size, 1.0) ** (1.0 / self.order)
-        at_rest = attempt.error < _AT_REST
-        of_change = jnp.where(at_rest, _share(accurate, variation), jnp.inf)
+        of_change = jnp.where(self._is_at_rest(attempt.error), _share(accurate, variation), jnp.inf)
         if self.is_exact:
             of_change, of_slope = jnp.minimum(of_slope, of_change), jnp.full_like(slope, jnp.inf)
         finest = _FINEST * self.span
@@ -106,6 +110,7 @@ class TangentLimit(eqx.Module):
                 _AIM * size * of_slope, jnp.maximum(_AIM * size * of_change, finest)
             ),
             is_short_enough=resolves & stable,
+            may_cross=kink <= _CROSSING * error,
             is_stiff=is_stiff & (slope > _BINDS * most),
         )
 
@@ -115,10 +120,15 @@ class TangentLimit(eqx.Module):
         """Return D after an attempt with this error in tolerances. Events and jumps of the data excite
         what has decayed (`is_excited`), and nothing is counted where the fastest solutions do not
         decay."""
-        slope, _, is_damped, _ = lax.stop_gradient(fastest)
-        added = jnp.where(error < _AT_REST, _COUNTED_AT_REST * slope, slope)
+        slope, is_damped = lax.stop_gradient((fastest.slope, fastest.is_damped))
+        added = jnp.where(self._is_at_rest(error), _COUNTED_AT_REST * slope, slope)
         counted = jnp.minimum(decay + jnp.where(accepted, added, 0.0), _LARGEST_DECAY)
         return jnp.where(is_excited | ~is_damped, 0.0, counted)
+
+    def _is_at_rest(self, error: Any) -> Any:
+        """Return whether the state stands still, by the error of a step in tolerances."""
+        rounding = jnp.finfo(jnp.result_type(error)).eps / self.rtol
+        return error < jnp.maximum(_AT_REST, _ROUNDINGS * rounding)
 
 
 def _share(most: Any, z: Any) -> Any:

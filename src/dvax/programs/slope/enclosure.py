@@ -25,6 +25,7 @@ from ... import _tree
 from ..._jax.jaxprs import bind, has_operation, operation
 from ..._tree import Tree
 from ..interpreter import Domain, Rule, interpret, operate
+from .chains import CURVED, Chains
 from .rules_choice import CHOICE, choice_rules
 from .rules_elementwise import ELEMENTWISE
 from .rules_functions import FUNCTIONS
@@ -66,8 +67,8 @@ class SlopeEnclosure:
         )
         self._program, shape = jax.make_jaxpr(fn, return_shape=True)(*shaped)
         self._output = jtu.tree_structure(shape)
-        # Sources cost time and memory, and serve selections only.
-        self._has_choice = has_operation(self._program, {"select_n", "cond"})
+        # Sources cost time and memory, and serve selections and chains only.
+        self._has_sources = has_operation(self._program, {"select_n", "cond"} | CURVED)
         self._wrt = [i in wrt for i, like in enumerate(likes) for _ in jtu.tree_leaves(like)]
 
     def __call__(self, *args: Tree) -> EnclosedSlopes:
@@ -76,7 +77,10 @@ class SlopeEnclosure:
         **Raises:** `TooLarge` if a matrix of derivatives is too large.
         """
         unknown: list[str] = []
-        recorder = Recorder(lambda eqn, x: operate(eqn, x, domain)) if self._has_choice else None
+        recorder, chains = None, None
+        if self._has_sources:
+            chains = Chains(_elementwise)
+            recorder = Recorder(lambda eqn, x: operate(eqn, x, domain), chains.tightened)
         inputs, k = [], 0
         leaves = jtu.tree_leaves(args, is_leaf=is_slope)
         for leaf, differentiated in zip(leaves, self._wrt, strict=True):
@@ -86,17 +90,27 @@ class SlopeEnclosure:
             k += differentiated
         run = lambda program, x: interpret(program, x, domain)  # noqa: E731
         rules = RULES | choice_rules(recorder) | program_rules(run)
-        apply = partial(_apply, recorder)
+        apply = partial(_apply, recorder, chains)
         domain = Domain(rules, is_slope, partial(_unknown, unknown), apply, _evaluate)
         with np.errstate(all="ignore"):
             results = interpret(self._program, inputs, domain)
+            if chains is not None:
+                results = [chains.tightened(r) for r in results]
         slopes = [r if is_slope(r) else interval(np.asarray(r), np.asarray(r)) for r in results]
         return EnclosedSlopes(self._output.unflatten(slopes), tuple(dict.fromkeys(unknown)))
 
 
+def _elementwise(eqn: Any, operands: list[Any]) -> Slope | None:
+    """Return the result of an elementwise operation, None where its rule does not cover it."""
+    result = ELEMENTWISE[eqn.primitive.name](eqn, operands)
+    return None if result is None else _without_nan(result)
+
+
 def _apply(
-    recorder: Recorder | None, rule: Rule, eqn: Any, operands: list[Any]
+    recorder: Recorder | None, chains: Chains | None, rule: Rule, eqn: Any, operands: list[Any]
 ) -> list[Any] | None:
+    if chains is not None:
+        operands = chains.operands(eqn, operands)
     result = rule(eqn, operands)
     if result is None:
         return None

@@ -58,7 +58,7 @@ def _refined(recorder: Recorder, which: Slope, case: Any, is_yes: bool) -> Any:
             above = (name in ("gt", "ge")) == value
             _cut(known, v, w, above)
             _cut(known, w, v, not above)
-    return recorder.again(case, known)
+    return recorder.tightened(recorder.again(case, known))
 
 
 def _cut(known: dict[int, Any], value: Any, limit: Any, above: bool) -> None:

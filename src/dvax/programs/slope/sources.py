@@ -2,12 +2,13 @@
 
 The value of one branch of a selection matters only where that branch is selected. So its program is
 evaluated again with what is known there: the comparison is decided, and the compared value is on one
-side of its limit.
+side of its limit. A function of one value is evaluated again on pieces of its interval (`chains`).
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax.tree_util as jtu
 import numpy as np
 
 from .values import Slope, is_slope
@@ -41,12 +42,19 @@ class Source(NamedTuple):
 class Recorder:
     """Attaches sources to values, and evaluates values again.
 
-    `operate` returns the results of an operation by its rule.
+    `operate` returns the results of an operation by its rule, `tightened` a value with the bounds that
+    follow from its chain.
     """
 
-    def __init__(self, operate: Callable[[Any, list[Any]], list[Any]]):
+    def __init__(
+        self,
+        operate: Callable[[Any, list[Any]], list[Any]],
+        tightened: Callable[[Any], Any],
+    ):
         self._operate = operate
+        self.tightened = tightened
         self._keys: dict[Any, int] = {}
+        self._kept: list[Any] = []
         self._left = _MAX_EVALUATIONS
 
     def input(self, value: Slope) -> Slope:
@@ -64,16 +72,27 @@ class Recorder:
             return value._replace(source=None)
         depth = 1 + max(v.source.depth for v in slopes)
         of = tuple(self._key(v) for v in operands)
-        key = self._keys.setdefault(
-            (eqn.primitive.name, str(eqn.params), of, output), len(self._keys)
+        params = eqn.params.values()
+        # The text of a program does not show its constants.
+        programs = any(
+            hasattr(p, "eqns") or hasattr(p, "jaxpr") for p in jtu.tree_leaves(list(params))
         )
+        name = id(self._keep(eqn)) if programs else (eqn.primitive.name, str(eqn.params))
+        key = self._keys.setdefault((name, of, output), len(self._keys))
         return value._replace(source=Source(key, eqn, tuple(operands), output, depth))
 
     def _key(self, value: Any) -> Any:
         if is_slope(value):
             return value.source.key
         array = np.asarray(value)
+        if array.size > MAX_ENTRIES_KEPT:
+            return id(self._keep(value))
         return (array.shape, array.dtype.str, array.tobytes())
+
+    def _keep(self, value: Any) -> Any:
+        """Return a value, which is kept so that no other one gets its id."""
+        self._kept.append(value)
+        return value
 
     def again(self, value: Any, known: dict[int, Any]) -> Any:
         """Return a value with the values in `known`, by their keys, in place of those before.
