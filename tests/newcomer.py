@@ -63,6 +63,11 @@ FUNCTIONS = {
         lambda: of_f(lambda t, x, u: -u),
         "newcomer.py, line; a function of (t, x, u); f(t, x, u, args)",
     ),
+    "times with a unit": (
+        lambda: solve(ts=np.array([0, 1], "m8[s]")),
+        "solve(ts); timedelta64",
+    ),
+    "NaN in a bound": (lambda: sets.Box(np.array([0.0, np.nan]), 1.0), "Box(lower); NaN"),
     "a text in args": (
         lambda: of_f(lambda t, x, u, args: x * args["k"], args={"k": "3"}),
         "Problem(f); args['k'] = '3'; float(...)",
@@ -316,7 +321,7 @@ ARGUMENTS = {
         "Problem(A); nan in component (0, 1)",
     ),
     "P NaN": (lambda: operators.Scaling(nan), "Scaling(b); nan"),
-    "K NaN": (lambda: sets.Box(0.0, nan), "Box(lower, upper); lower = 0, upper = nan"),
+    "K NaN": (lambda: sets.Box(0.0, nan), "Box(upper); nan; NaN"),
     "K empty": (
         lambda: sets.Box(jnp.zeros(300), -jnp.ones(300)),
         "lower = 0, upper = -1 in entry (0,) (300 of 300",

@@ -180,6 +180,16 @@ def _eps(dtype: Any) -> float:
 def _check_times(rule: Any, ts: Any, t0: float, t1: float) -> None:
     fix = "Sort them, and remove times outside this interval"
     text = f"it must be a vector of increasing times in [{float(t0)!r}, {float(t1)!r}]"
+    if np.asarray(ts).dtype.kind in "mM":
+        # NumPy would convert them to a number of nanoseconds, or of any other unit.
+        rule(
+            False,
+            "ts",
+            ts,
+            text,
+            "Write the times in the unit of t0: times / np.timedelta64(1, 's')",
+        )
+        return
     try:
         times = np.asarray(ts, float)
     except (TypeError, ValueError):

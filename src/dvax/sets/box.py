@@ -42,6 +42,8 @@ class Box(AbstractSet):
         shapes = jnp.shape(self.lower), jnp.shape(self.upper)
         if shapes[0] != shapes[1]:
             _check_shapes(*shapes)
+        for name, bound in (("lower", self.lower), ("upper", self.upper)):
+            _tree.check_not_nan(f"dvax.sets.Box({name})", bound)
         # In NumPy: JAX compiles a program for each check, which takes longer than 100 small steps.
         _tree.require(
             lambda: np.all(np.asarray(self.lower) <= np.asarray(self.upper)),

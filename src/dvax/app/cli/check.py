@@ -32,7 +32,15 @@ def check(
 
         loaded = interruptible(lambda: load(config, allow_outside, allow_code=allow_code))
         found = interruptible(lambda: overview(loaded))
-        print_line(f"{loaded.source}: no problem in the configuration and its data", "bold")
+        refuted = [
+            row
+            for row in found.assumptions
+            if row.is_required and row.status == "refuted" and not row.holds_between_jumps
+        ]
+        # No run gets past a time at which K(t) is empty; other laws may have a solution all the same.
+        impossible = any(row.label == "ass:operators (iii)" for row in refuted)
+        if not impossible:
+            print_line(f"{loaded.source}: no problem in the configuration and its data", "bold")
         if found.fit:
             print_line(f"class: {found.fit}")
         assumptions = [(row.label, row.status, row.statement, row.why) for row in found.assumptions]
@@ -47,14 +55,7 @@ def check(
                 print_table(head, rows)
         for note in found.notes:
             print_remark(f"note: {note}")
-        refuted = [
-            row
-            for row in found.assumptions
-            if row.is_required and row.status == "refuted" and not row.holds_between_jumps
-        ]
         outside = outside_the_class(found.constants)
-        # No run gets past a time at which K(t) is empty; other laws may have a solution all the same.
-        impossible = any(row.label == "ass:operators (iii)" for row in refuted)
         word = "error" if strict or impossible else "warning"
         for row in refuted:
             print_error(f"{word}: {row.label} does not hold ({row.statement}): {row.why}")
