@@ -38,6 +38,12 @@ def positions_and_velocities(k, n, rng):
     )
 
 
+def decaying_beside_oscillating(k, n, rng):
+    w = k * rng.uniform(0.2, 1.05)
+    parts = np.array([[0.0, w], [-w, 0.0]]), -np.diag(np.geomspace(k / 5.0, k, n - 2))
+    return scipy.linalg.block_diag(*parts)
+
+
 def _rotated(L, rng):
     Q = np.linalg.qr(rng.normal(size=L.shape))[0]
     return Q @ L @ Q.T
@@ -64,10 +70,20 @@ METHODS = {
     mostly_thorough(
         [
             (kind, name)
-            for kind in (real, unstable, oscillating, positions_and_velocities)
+            for kind in (
+                real,
+                unstable,
+                oscillating,
+                positions_and_velocities,
+                decaying_beside_oscillating,
+            )
             for name in METHODS
         ],
-        always=[(real, "ETD4RK"), (positions_and_velocities, "DormandPrince")],
+        always=[
+            (real, "ETD4RK"),
+            (positions_and_velocities, "DormandPrince"),
+            (decaying_beside_oscillating, "DormandPrince"),
+        ],
     ),
 )
 def test_from_rest_a_derivative_is_the_exponential_of_the_matrix(kind, name):
@@ -322,3 +338,23 @@ def test_a_part_that_moves_may_make_a_part_at_rest_stiff(name):
         rates = stiffness(np.exp(-0.3 * t), top)
         decayed = np.exp(-cumulative_trapezoid(rates, t, initial=0.0))
         assert found == pytest.approx(np.trapezoid(decayed, t), rel=1e-3)
+
+
+def test_a_decay_does_not_hide_an_oscillation_at_rest():
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(),
+        P=dvax.operators.Scaling(1.0),
+        K=dvax.sets.Box(-1.0, 1.0),
+        control_space=dvax.spaces.Euclidean(()),
+        f=lambda t, x, u, a: (
+            jnp.stack([-a[0] * (x[0] - 1.0), x[2], -(a[1] ** 2) * jnp.sin(x[1])]) + 0.0 * u
+        ),
+        h=lambda t, x, u, a: -u,
+    )
+
+    def last(x0, a):
+        return dvax.solve(problem, x0, 0.0, 3.0, a, method=dvax.DormandPrince()).xs[-1, 1]
+
+    for decay, w in ((20.0, 20.0), (100.0, 80.0), (100.0, 105.0), (100.0, 30.0)):
+        found = jax.grad(last)(jnp.array([1.0, 0.0, 0.0]), jnp.array([decay, w]))[1]
+        assert found == pytest.approx(np.cos(3.0 * w), abs=1e-5 * (1.0 + 3.0 * w))

@@ -18,6 +18,9 @@ d. The pattern p contains all frequencies, and its entries are as large as those
 units would be amplified by the ratio of the units. It keeps a part of d in entries that a held response
 decouples now, and not later. σ is an estimate, from below for a normal B within a factor of 1.1 after
 some steps.
+
+Where the fastest solutions decay, others remain: the slope of a second direction, in which they have
+decayed, limits the steps as well (`remaining`).
 """
 
 import math
@@ -35,6 +38,9 @@ from ..spaces import AbstractSpace
 
 _SHARE = 0.1
 """Share of the pattern p in the next direction."""
+
+_PRESENT = 1e-6
+"""Share of the pattern that is added to what has not decayed: what is excited later is seen."""
 
 _OF_ZERO = 1e-6
 """Entry of the pattern where x is zero, relative to the largest one."""
@@ -120,6 +126,24 @@ def variation(space: AbstractSpace, nodes: tuple[float, ...], rows: Tree) -> Any
     known = jnp.isfinite(largest) & (largest > 0.0)
     share = math.factorial(m) * space.norm(difference) / jnp.where(known, largest, 1.0)
     return jnp.where(known, share ** (1.0 / m), 0.0)
+
+
+def remaining(
+    space: AbstractSpace, push: Callable[[Tree], Tree], e: Tree, slope: Any, p: Tree
+) -> tuple[Any, Tree]:
+    """Return the slope √(‖B²e‖/‖e‖) of what has not decayed, and the next e,
+
+        e ← e + τBe + τ²B²e/2 + 10⁻⁶p,   τ = 1/σ,
+
+    in which the fastest decay is halved, and an oscillation stays. σ is the `slope`."""
+    one = push(e)
+    two = push(one)
+    size = space.norm(two) / space.norm(e)
+    known = jnp.isfinite(size) & (slope > 0.0)
+    tau = 1.0 / jnp.where(known, slope, 1.0)
+    after = _tree.add(e, _tree.add(_tree.scale(tau, one), _tree.scale(0.5 * tau**2, two)))
+    after = _tree.add(_normalised(space, after), _tree.scale(_PRESENT, p))
+    return jnp.where(known, jnp.sqrt(size), 0.0), _tree.where(known, after, e)
 
 
 def _normalised(space: AbstractSpace, d: Tree) -> Tree:

@@ -38,7 +38,8 @@ class SolverState(NamedTuple):
     """What the next step reuses of an accepted one: the rate at its end, a guess for the law, the
     coefficients of its end in the eigenfunctions of A, the largest `variation` of the data between
     samples so far (`ExcursionGuard`), an estimate of the `error` of x, and the `direction` of the power
-    iteration with the largest `slope` at x, each None where it is not needed."""
+    iteration, the direction of what has `not_decayed` and the largest `slope` at x, each None where it
+    is not needed."""
 
     rate: Rate | None
     guess: Tree | None
@@ -46,6 +47,7 @@ class SolverState(NamedTuple):
     variation: Tree
     error: Tree | None = None
     direction: Tree | None = None
+    not_decayed: Tree | None = None
     slope: Any = None
 
 
@@ -64,6 +66,7 @@ class Fastest(NamedTuple):
 
     - `slope`: h times the largest slope of what the method treats explicitly (`power_iteration`);
     - `variation`: hω, where the derivative of f̃ changes in time as e^{iωt} does;
+    - `remaining`: h times the slope of what has not decayed;
     - `kink`: the same as `slope`, with what lies behind a kink of the response;
     - `is_damped`: such a change decays;
     - `is_stiff`: x itself changes slowly beside it.
@@ -71,6 +74,7 @@ class Fastest(NamedTuple):
 
     slope: Any
     variation: Any
+    remaining: Any
     kink: Any
     is_damped: Any
     is_stiff: Any
@@ -201,11 +205,12 @@ class Stepper(eqx.Module):
         rate = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), blank)
         none = None if self.guard is None else self.guard.start(self.flow, self.ends[0], x0)
         error = _tree.zeros_like(x0) if self.estimate else None
-        direction, slope = None, None
+        direction, others, slope = None, None, None
         if self.for_derivatives:
-            direction = power_iteration.pattern(self.flow.state_space(x0), x0)
+            space = self.flow.state_space(x0)
+            direction = others = power_iteration.pattern(space, x0)
             slope = jnp.zeros_like(self.ends[0])
-        return SolverState(rate, guess, known, none, error, direction, slope)
+        return SolverState(rate, guess, known, none, error, direction, others, slope)
 
     def restart(self, solver_state: SolverState, x: Tree) -> SolverState:
         """Return the state of the stepper after the state of the run was set to x."""
@@ -277,7 +282,7 @@ class Stepper(eqx.Module):
         error, integrated_defect, event, excursion, bounds = None, (0.0, 0.0), None, None, None
         stiffness, signed, carried, estimate = None, None, None, None
         variation, fastest = solver_state.variation, None
-        direction, steepest = solver_state.direction, solver_state.slope
+        tangents = solver_state.direction, solver_state.not_decayed, solver_state.slope
         if self.measure:
             slopes = self._slopes(t1 - t0, evaluations)
             whole = None if slopes is None else slopes[1]
@@ -310,7 +315,7 @@ class Stepper(eqx.Module):
                 stiffness = jnp.where(change < _SLOW * slope, slope, 0.0)
             if self.for_derivatives:
                 others = evaluations[-1 - len(sample.thetas) :]
-                fastest, direction, steepest = self._fastest(
+                fastest, tangents = self._fastest(
                     t1 - t0,
                     evaluations[0],
                     others,
@@ -332,8 +337,7 @@ class Stepper(eqx.Module):
             known,
             variation,
             estimate,
-            direction,
-            steepest,
+            *tangents,
         )
         solved = jnp.all(jnp.stack([one.rate.solved for one in evaluations]))
         # The first one was made by the step before, unless nothing is kept, or data jumped.
@@ -450,9 +454,9 @@ class Stepper(eqx.Module):
         solver_state: SolverState,
         propagators: Propagators | None,
         change: Any,
-    ) -> tuple[Fastest, Tree, Any]:
-        """Return what limits the steps of a derivative, the next direction of the power iteration, and
-        the slope at x₁. The `others` are evaluations at the `nodes` in the step and at its end;
+    ) -> tuple[Fastest, tuple[Tree, Tree, Any]]:
+        """Return what limits the steps of a derivative, and the next directions of the power iteration
+        with the slope at x₁. The `others` are evaluations at the `nodes` in the step and at its end;
         `change` is that of x over the step, relative to x."""
         flow, h, first, others, solver_state, propagators, change = _constant(
             (self.flow, h, first, others, solver_state, propagators, change)
@@ -465,17 +469,22 @@ class Stepper(eqx.Module):
             places, nodes = places[-1:], nodes[-1:]
         known = all(v.rate.y is not None for v in places)
 
-        def look(t: Any, x: Tree, guess: Tree | None) -> power_iteration.Refined:
+        def look(
+            t: Any, x: Tree, guess: Tree | None
+        ) -> tuple[power_iteration.Refined, tuple[Any, Tree]]:
             value = lambda x: flow.nonlinear_part(x, flow.rate(t, x, guess).value)  # noqa: E731
             push = power_iteration.linearised(value, x)
             if self.method.is_rosenbrock:
                 assert propagators is not None
                 by, none, remainder = propagators.full, _tree.zeros_like(x), push
                 push = lambda v: by.step(none, (remainder(v),))  # noqa: E731
-            return power_iteration.refine(space, push, solver_state.direction, pattern)
+            found = power_iteration.refine(space, push, solver_state.direction, pattern)
+            return found, power_iteration.remaining(
+                space, push, solver_state.not_decayed, found.slope, pattern
+            )
 
         looks = [(v.t, v.x, v.rate.y if known else solver_state.guess) for v in places]
-        found = lax.map(
+        found, (slopes, others) = lax.map(
             lambda at: look(*at), jtu.tree_map(lambda *leaves: jnp.stack(leaves), *looks)
         )
         steepest = jnp.argmax(found.slope)
@@ -484,13 +493,16 @@ class Stepper(eqx.Module):
             # Behind a kink another Df̃ is no matter of the step size.
             slope = jnp.max(jnp.where(self._same_side(first, places), found.slope, 0.0))
             kink, no = found.slope[steepest], jnp.asarray(False)
-            fastest = Fastest(slope, variation, kink, is_damped=no, is_stiff=no)
+            zero = jnp.zeros_like(slope)
+            fastest = Fastest(slope, variation, zero, kink, is_damped=no, is_stiff=no)
         else:
             slope = h * jnp.maximum(found.slope[steepest], solver_state.slope)
             is_damped = found.is_damped[steepest]
-            fastest = Fastest(slope, variation, slope, is_damped, change < _SLOW * slope)
+            rest = h * jnp.max(slopes)
+            fastest = Fastest(slope, variation, rest, slope, is_damped, change < _SLOW * slope)
         direction = jtu.tree_map(lambda leaf: leaf[steepest], found.direction)
-        return _constant((fastest, direction, found.slope[-1]))
+        last = jtu.tree_map(lambda leaf: leaf[-1], others)
+        return _constant((fastest, (direction, last, found.slope[-1])))
 
     def _same_side(self, first: Evaluation, others: list[Evaluation]) -> jax.Array:
         """Return for the others whether no kink of the response lies between them and the first one;

@@ -9,7 +9,7 @@ from tests.evolution.control.attempts import NO, YES, attempt
 import dvax
 from dvax import spaces
 from dvax.evolution.control import TangentLimit
-from dvax.evolution.power_iteration import pattern, refine, variation
+from dvax.evolution.power_iteration import pattern, refine, remaining, variation
 from dvax.evolution.stepper import Fastest
 
 ZERO = jnp.asarray(0.0)
@@ -21,8 +21,8 @@ METHODS = [
 ]
 
 
-def longest(limit, slope, decay, size=1.0, variation=0.0, error=1.0):
-    fastest = Fastest(jnp.asarray(slope), jnp.asarray(variation), jnp.asarray(slope), YES, NO)
+def longest(limit, slope, decay, size=1.0, variation=0.0, error=1.0, remaining=0.0):
+    fastest = Fastest(*map(jnp.asarray, (slope, variation, remaining, slope)), YES, NO)
     return limit.of(fastest, jnp.asarray(decay), attempt(error, size))
 
 
@@ -45,11 +45,11 @@ def test_tangent_limit_rises_to_stability_as_tangents_decay(order, stable, R):
     slope, decay, z = 7.0, jnp.asarray(0.0), 0.0
     for _ in range(400):
         z = float(longest(limit, slope, decay).longest) * slope
-        fastest = Fastest(jnp.asarray(z), ZERO, ZERO, YES, YES)
+        fastest = Fastest(jnp.asarray(z), ZERO, ZERO, ZERO, YES, YES)
         decay = limit.after(fastest, decay, jnp.asarray(1e-3), YES, NO)
     assert z == pytest.approx(0.8 * 0.8 * stable) and abs(R(-z)) < 1.0
     # It falls back where tangents are excited, and where they do not decay.
-    steady = Fastest(jnp.asarray(z), ZERO, ZERO, NO, YES)
+    steady = Fastest(jnp.asarray(z), ZERO, ZERO, ZERO, NO, YES)
     for at, excited in ((fastest, YES), (steady, NO)):
         assert float(limit.after(at, decay, jnp.asarray(1e-3), YES, excited)) == 0.0
     # At rest it rises more slowly.
@@ -101,6 +101,19 @@ def test_power_iteration_finds_the_spectral_radius(kind, n):
         direction = found.direction
     assert 0.85 * 40.0 <= float(found.slope) <= 1.15 * 40.0
     assert bool(found.is_damped) == decays
+
+
+def test_what_has_not_decayed_is_an_oscillation_or_the_slowest_solution():
+    rng, space = np.random.default_rng(1), spaces.Euclidean(6)
+    for w in (0.0, 3.0, 20.0, 42.0):
+        B = np.diag([0.0, 0.0, -0.1, -2.0, -15.0, -40.0])
+        B[0, 1], B[1, 0] = w, -w
+        Q = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+        p = e = pattern(space, jnp.zeros(6))
+        sigma = max(40.0, w)
+        for _ in range(60):
+            slope, e = remaining(space, lambda v, B=Q @ B @ Q.T: B @ v, e, jnp.asarray(sigma), p)
+        assert 0.5 * w <= float(slope) <= 1.1 * max(w, 3.0)
 
 
 def test_power_iteration_finds_the_radius_in_any_units():
@@ -171,3 +184,16 @@ def test_tangent_limit_of_a_method_that_linearises_grows_as_the_square_of_the_st
     limit = TangentLimit(jnp.asarray(1e-6), 100.0, 4, 3.0, True)
     bound = float(longest(limit, 1.0, 0.0).longest)
     assert float(longest(limit, 4.0, 0.0, size=2.0).longest) == pytest.approx(bound)
+
+
+def test_tangent_limit_resolves_what_has_not_decayed_whatever_has():
+    limit = TangentLimit(jnp.asarray(1e-6), 100.0, 4, 2.7)
+    resolved = float(longest(limit, 1.0, 0.0).longest)
+    assert float(longest(limit, 1.0, 30.0).longest) > 5.0 * resolved
+    assert float(longest(limit, 1.0, 30.0, remaining=0.5).longest) == pytest.approx(2.0 * resolved)
+
+
+def test_tangent_limit_crosses_a_kink_by_a_step_of_ten_errors_alone():
+    limit = TangentLimit(jnp.asarray(1e-6), 100.0, 4, 2.7)
+    assert bool(longest(limit, 0.9e-4, 0.0).may_cross)
+    assert not bool(longest(limit, 1.1e-4, 0.0).may_cross)

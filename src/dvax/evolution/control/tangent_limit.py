@@ -74,6 +74,7 @@ class TangentLimit(eqx.Module):
         z ≤ ((p+1)! 10 rtol e^D)^{1/p},   D = Σ z over the steps since then,
 
     up to the limit of stability of the method, or up to 1 where the fastest solutions do not decay.
+    What has not decayed (`power_iteration.remaining`) has a limit of its own, with its slope and D = 0.
     Where the state stands still, a B that varies in time as e^{iωt} is resolved as well: with z the
     smaller of hω and hω (Tσ)^{1/p}, T being the `span` of the run.
 
@@ -89,14 +90,15 @@ class TangentLimit(eqx.Module):
 
     def of(self, fastest: Fastest, decay: Any, attempt: Attempt) -> StepLimit:
         """Return the limit after an attempt, where `decay` is D."""
-        slope, variation, kink, is_damped, is_stiff = lax.stop_gradient(fastest)
+        slope, variation, remaining, kink, is_damped, is_stiff = lax.stop_gradient(fastest)
         size, smallest = attempt.size, attempt.smallest
         error = _SHARE * jnp.maximum(self.rtol, jnp.finfo(size.dtype).eps)
-        accurate = (math.factorial(self.order + 1) * error) ** (1.0 / self.order)
-        accurate = accurate * jnp.exp(decay / self.order)
+        resolved = (math.factorial(self.order + 1) * error) ** (1.0 / self.order)
+        accurate = resolved * jnp.exp(decay / self.order)
         most = jnp.minimum(accurate, jnp.where(is_damped, _STABLE * self.stable, _LARGEST_TURN))
         # The change of f̃' over a step, and the step, are proportional to h.
         of_slope = _share(most, slope) ** (0.5 if self.is_exact else 1.0)
+        of_slope = jnp.minimum(of_slope, _share(jnp.minimum(resolved, _LARGEST_TURN), remaining))
         variation = variation * jnp.minimum(slope * self.span / size, 1.0) ** (1.0 / self.order)
         of_change = jnp.where(self._is_at_rest(attempt.error), _share(accurate, variation), jnp.inf)
         if self.is_exact:
