@@ -490,7 +490,7 @@ class Stepper(eqx.Module):
         steepest = jnp.argmax(found.slope)
         variation = power_iteration.variation(space, nodes, found.first)
         if self.method.is_rosenbrock:
-            # Behind a kink another Df̃ is no matter of the step size.
+            # The jump of Df̃ at a kink does not shrink with the step, and steps end at kinks.
             slope = jnp.max(jnp.where(self._same_side(first, places), found.slope, 0.0))
             kink, no = found.slope[steepest], jnp.asarray(False)
             zero = jnp.zeros_like(slope)
