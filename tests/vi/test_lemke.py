@@ -7,7 +7,8 @@ import pytest
 
 import dvax
 from dvax.sets import Ball, Polyhedron, Simplex
-from dvax.vi import RESULTS, Auto, Lemke
+from dvax.vi import RESULTS, Auto, FrozenVI, Lemke
+from dvax.vi.known import Known
 
 N, ROWS, COUNT = 5, 8, 40
 
@@ -98,6 +99,33 @@ def test_the_derivative_is_that_on_the_face() -> None:
     expected[:2, :2] = -np.linalg.inv(system)[:2, :2]
     np.testing.assert_allclose(jax.jacfwd(y)(q), expected, atol=1e-10)
     np.testing.assert_allclose(jax.jacrev(y)(q), expected, atol=1e-10)
+
+
+def test_a_known_solution_has_the_derivative_on_its_face() -> None:
+    """On the active rows G_A y = d_A the derivative in (−q, d_A) is a block of the inverse of the
+    matrix [M G_Aᵀ; G_A 0]."""
+    rng = np.random.default_rng(3)
+    M, y = matrices(rng), rng.normal(size=(COUNT, N))
+    G = rng.normal(size=(COUNT, ROWS, N))
+    multipliers = np.where(np.arange(ROWS) < 3, rng.exponential(size=(COUNT, ROWS)) + 0.1, 0.0)
+    slack = np.where(np.arange(ROWS) < 3, 0.0, rng.exponential(size=(COUNT, ROWS)) + 0.1)
+    d = np.einsum("kij,kj->ki", G, y) + slack
+    q = -np.einsum("kij,kj->ki", M, y) - np.einsum("kij,ki->kj", G, multipliers)
+
+    def known(data, M, G, y):
+        q, d = data
+        vi = FrozenVI(lambda v: M @ v + q, Polyhedron(G, d), dvax.spaces.Euclidean(N))
+        return Known().solve(vi, y, 1.0).y
+
+    arrays = map(jnp.asarray, (M, G, y))
+    of_q, of_d = jax.jit(jax.vmap(jax.jacfwd(known)))((jnp.asarray(q), jnp.asarray(d)), *arrays)
+    zero = np.zeros((3, 3))
+    for k in range(COUNT):
+        rows = G[k, :3]
+        inverse = np.linalg.inv(np.block([[M[k], rows.T], [rows, zero]]))
+        np.testing.assert_allclose(of_q[k], -inverse[:N, :N], atol=1e-8)
+        np.testing.assert_allclose(of_d[k][:, :3], inverse[:N, N:], atol=1e-8)
+        np.testing.assert_array_equal(of_d[k][:, 3:], 0.0)
 
 
 def test_iterations_take_over_where_pivoting_fails() -> None:

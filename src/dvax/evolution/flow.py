@@ -26,6 +26,7 @@ from ..programs.enclosure import (
 from ..programs.structure import analyse
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, FrozenVI
+from ..vi.known import Known
 from .law_tolerance import LawTolerance
 from .linearised import AbstractLinear, linearise
 from .small_box import AbstractSmallBox
@@ -119,6 +120,13 @@ class Flow(eqx.Module):
     def rate(self, t: Any, x: Tree, guess: Tree | None) -> Rate:
         """f̃(t, x), the law being solved from `guess`."""
         return _by_loop(self, t, x, guess) if self.iterates else self._closed_form(t, x)
+
+    def with_known_response(self) -> "Flow":
+        """The same, where `rate` is asked for derivatives alone and its guess solves the law: an
+        iteration takes long to compile."""
+        if self.direct or not self.iterates or not self.solver.certifies:
+            return self
+        return dataclasses.replace(self, solver=Known(), keeps_switches=False)
 
     def guess(self, x: Tree) -> Tree | None:
         """Where the law's solver starts when nothing is known; None where it needs no start."""

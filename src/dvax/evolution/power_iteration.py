@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax import lax
 
 from .. import _tree
 from .._jax.jaxprs import has_operation
@@ -92,14 +93,28 @@ class Refined(NamedTuple):
     direction: Tree
 
 
-def refine(space: AbstractSpace, push: Callable[[Tree], Tree], d: Tree, p: Tree) -> Refined:
-    """Apply B² to d, where `push` applies B. A B that is zero or not finite leaves the direction as it
-    is, and σ = 0: it limits nothing.
+def applied_twice(push: Callable[[Tree], Tree], *vectors: Tree) -> list[tuple[Tree, Tree]]:
+    """Return (Bv, B²v) for each v, where `push` applies B: by a loop, so that B is in the program
+    once."""
+
+    def apply(v: Tree, start: tuple[Tree, Any]) -> tuple[Tree, Tree]:
+        fresh, begins = start
+        image = push(_tree.where(begins, fresh, v))
+        return image, image
+
+    starts = jtu.tree_map(lambda *leaves: jnp.repeat(jnp.stack(leaves), 2, axis=0), *vectors)
+    begins = jnp.arange(2 * len(vectors)) % 2 == 0
+    _, images = lax.scan(apply, vectors[0], (starts, begins))
+    row = lambda k: jtu.tree_map(lambda leaf: leaf[k], images)  # noqa: E731
+    return [(row(2 * k), row(2 * k + 1)) for k in range(len(vectors))]
+
+
+def refine(space: AbstractSpace, d: Tree, one: Tree, two: Tree, p: Tree) -> Refined:
+    """Return what Bd (`one`) and B²d (`two`) show. A B that is zero or not finite leaves the direction
+    as it is, and σ = 0: it limits nothing.
 
     v decays where Bd points against d, and B²d along it: an oscillation has −ω²d there, though its
     velocities alone may point anywhere."""
-    one = push(d)
-    two = push(one)
     length = space.norm(two)
     size = length / space.norm(d)
     known = jnp.isfinite(size) & (size > 0.0)
@@ -129,15 +144,14 @@ def variation(space: AbstractSpace, nodes: tuple[float, ...], rows: Tree) -> Any
 
 
 def remaining(
-    space: AbstractSpace, push: Callable[[Tree], Tree], e: Tree, slope: Any, p: Tree
+    space: AbstractSpace, e: Tree, one: Tree, two: Tree, slope: Any, p: Tree
 ) -> tuple[Any, Tree]:
-    """Return the slope √(‖B²e‖/‖e‖) of what has not decayed, and the next e,
+    """Return the slope √(‖B²e‖/‖e‖) of what has not decayed, from Be (`one`) and B²e (`two`), and the
+    next e,
 
         e ← e + τBe + τ²B²e/2 + 10⁻⁶p,   τ = 1/σ,
 
     in which the fastest decay is halved, and an oscillation stays. σ is the `slope`."""
-    one = push(e)
-    two = push(one)
     size = space.norm(two) / space.norm(e)
     known = jnp.isfinite(size) & (slope > 0.0)
     tau = 1.0 / jnp.where(known, slope, 1.0)

@@ -468,20 +468,21 @@ class Stepper(eqx.Module):
             # Where nothing but x moves, the step before has looked at the start.
             places, nodes = places[-1:], nodes[-1:]
         known = all(v.rate.y is not None for v in places)
+        solved = flow.with_known_response() if known else flow
 
         def look(
-            t: Any, x: Tree, guess: Tree | None
+            t: Any, x: Tree, y: Tree | None
         ) -> tuple[power_iteration.Refined, tuple[Any, Tree]]:
-            value = lambda x: flow.nonlinear_part(x, flow.rate(t, x, guess).value)  # noqa: E731
+            value = lambda x: flow.nonlinear_part(x, solved.rate(t, x, y).value)  # noqa: E731
             push = power_iteration.linearised(value, x)
             if self.method.is_rosenbrock:
                 assert propagators is not None
                 by, none, remainder = propagators.full, _tree.zeros_like(x), push
                 push = lambda v: by.step(none, (remainder(v),))  # noqa: E731
-            found = power_iteration.refine(space, push, solver_state.direction, pattern)
-            return found, power_iteration.remaining(
-                space, push, solver_state.not_decayed, found.slope, pattern
-            )
+            d, e = solver_state.direction, solver_state.not_decayed
+            of_d, of_e = power_iteration.applied_twice(push, d, e)
+            found = power_iteration.refine(space, d, *of_d, pattern)
+            return found, power_iteration.remaining(space, e, *of_e, found.slope, pattern)
 
         looks = [(v.t, v.x, v.rate.y if known else solver_state.guess) for v in places]
         found, (slopes, others) = lax.map(

@@ -9,7 +9,13 @@ from tests.evolution.control.attempts import NO, YES, attempt
 import dvax
 from dvax import spaces
 from dvax.evolution.control import TangentLimit
-from dvax.evolution.power_iteration import pattern, refine, remaining, variation
+from dvax.evolution.power_iteration import (
+    applied_twice,
+    pattern,
+    refine,
+    remaining,
+    variation,
+)
 from dvax.evolution.stepper import Fastest
 
 ZERO = jnp.asarray(0.0)
@@ -75,6 +81,11 @@ def test_tangent_limit_keeps_a_step_size_within_a_fifth_and_ignores_a_slope_of_z
         assert float(bound.limit(wanted, present)) == pytest.approx(size)
 
 
+def refined(space, push, d, p):
+    ((one, two),) = applied_twice(push, d)
+    return refine(space, d, one, two, p)
+
+
 def spectrum(kind, n, rng):
     rates = np.geomspace(0.1, 40.0, n)
     Q = np.linalg.qr(rng.normal(size=(n, n)))[0]
@@ -97,7 +108,7 @@ def test_power_iteration_finds_the_spectral_radius(kind, n):
     p = direction = pattern(space, jnp.zeros(n))
     assert float(space.norm(p)) == pytest.approx(1.0)
     for _ in range(40):
-        found = refine(space, lambda v: B @ v, direction, p)
+        found = refined(space, lambda v: B @ v, direction, p)
         direction = found.direction
     assert 0.85 * 40.0 <= float(found.slope) <= 1.15 * 40.0
     assert bool(found.is_damped) == decays
@@ -112,8 +123,20 @@ def test_what_has_not_decayed_is_an_oscillation_or_the_slowest_solution():
         p = e = pattern(space, jnp.zeros(6))
         sigma = max(40.0, w)
         for _ in range(60):
-            slope, e = remaining(space, lambda v, B=Q @ B @ Q.T: B @ v, e, jnp.asarray(sigma), p)
+            ((one, two),) = applied_twice(lambda v, B=Q @ B @ Q.T: B @ v, e)
+            slope, e = remaining(space, e, one, two, jnp.asarray(sigma), p)
         assert 0.5 * w <= float(slope) <= 1.1 * max(w, 3.0)
+
+
+def test_two_applications_to_each_of_several_trees():
+    rng = np.random.default_rng(0)
+    B = rng.normal(size=(3, 3))
+    trees = [(jnp.asarray(rng.normal(size=3)), jnp.asarray(rng.normal())) for _ in range(3)]
+    images = applied_twice(lambda v: (B @ v[0], 2.0 * v[1]), *trees)
+    for (v, a), (one, two) in zip(trees, images, strict=True):
+        np.testing.assert_allclose(one[0], B @ v, rtol=1e-14)
+        np.testing.assert_allclose(two[0], B @ B @ v, rtol=1e-13)
+        assert float(one[1]) == 2.0 * a and float(two[1]) == 4.0 * a
 
 
 def test_power_iteration_finds_the_radius_in_any_units():
@@ -124,7 +147,7 @@ def test_power_iteration_finds_the_radius_in_any_units():
         B = S @ np.array([[-1.0, 1.0], [1.0, -2.0]]) @ np.linalg.inv(S)
         p = direction = pattern(space, jnp.asarray([0.7, 1.3]) * jnp.asarray(units))
         for _ in range(10):
-            found = refine(space, lambda v, B=B: B @ v, direction, p)
+            found = refined(space, lambda v, B=B: B @ v, direction, p)
             direction = found.direction
         assert float(found.slope) == pytest.approx(2.618, rel=0.2)
 
@@ -138,7 +161,7 @@ def test_power_iteration_waits_where_nothing_moves():
     space, zero = spaces.Euclidean(3), jnp.zeros(3)
     start = pattern(space, zero)
     for push in (jnp.zeros_like, lambda v: jnp.full(3, jnp.nan)):
-        found = refine(space, push, start, start)
+        found = refined(space, push, start, start)
         assert float(found.slope) == 0.0 and jnp.array_equal(found.direction, start)
 
 
