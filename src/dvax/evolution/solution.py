@@ -373,8 +373,8 @@ class Solution(eqx.Module):
         method and the steps, or where a run stopped and why; `backend`: "matplotlib" or "plotly";
         `axes`: Matplotlib axes to draw into, one for each panel.
 
-        **Returns:** a `matplotlib.figure.Figure` (`figure.savefig("a.png")`), or a Plotly figure
-        (`figure.write_html("a.html")`).
+        **Returns:** a `matplotlib.figure.Figure` (`figure.savefig("a.png")`; `plt.show()` shows it if
+        `matplotlib.pyplot` was imported before), or a Plotly figure (`figure.write_html("a.html")`).
 
         **Raises:** `ModuleNotFoundError` if Matplotlib or Plotly (the extra `dvax[app]`) is missing;
         `dvax.InputError` if there is nothing to draw, or names, bound or axes do not fit.

@@ -22,6 +22,12 @@ from dvax.evolution import Events
 TS = np.linspace(0.0, 2.0, 21)
 
 
+@pytest.fixture(autouse=True)
+def closed_figures():
+    yield
+    plt.close("all")
+
+
 @once
 def solved():
     """u in a moving box, whose second upper bound is infinite; u = 0.5 sin 4t before it is clipped."""
@@ -38,6 +44,12 @@ def solved():
 
 def lines_of(axes: Axes) -> dict[str, np.ndarray]:
     return {str(line.get_label()): np.asarray(line.get_ydata()) for line in axes.lines}
+
+
+def test_pyplot_shows_the_figure():
+    figure = solved().plot()
+    assert plt.gcf() is figure
+    assert solved().plot(axes=figure.axes) is figure and plt.get_fignums() == [1]
 
 
 def test_panels_show_states_responses_their_bounds_and_active_constraints():

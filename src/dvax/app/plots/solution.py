@@ -1,5 +1,6 @@
 """The default picture of a `dvax.Solution`: states, responses, active constraints, error bound."""
 
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -98,7 +99,16 @@ def finished(
         draw_panels(panels, given_axes, "time", time_unit, marks)
         return given_axes[0].figure
     picture = panels_picture("solution", title, "", panels, "time", time_unit, marks=marks)
-    return picture.still() if backend == "matplotlib" else _with_title(picture)
+    return _with_title(picture) if backend == "plotly" else _shown_by_pyplot(picture.still())
+
+
+def _shown_by_pyplot(figure: Figure) -> Figure:
+    """Return the figure, which `pyplot.show` shows where the program has imported pyplot. A notebook
+    shows what a cell returns, and would show it twice."""
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    if pyplot is not None and "inline" not in pyplot.get_backend():
+        pyplot.figure(figure)
+    return figure
 
 
 def entry_panels(
