@@ -22,7 +22,10 @@ from . import _tree
 from .errors import DvaxError, InputError, InputProblem, input_error
 from .programs.indices import IndexOutside
 
-_LIBRARIES = {"dvax", "equinox", "jax", "jaxlib", "jaxtyping", "numpy", "scipy", "optimistix"}
+_LIBRARIES = {
+    "dvax", "equinox", "jax", "jaxlib", "jaxtyping", "numpy", "scipy", "optimistix",
+    "pandas", "polars", "pyarrow", "xarray",
+}  # fmt: skip
 """Packages whose frames are not the user's code."""
 
 
@@ -122,7 +125,8 @@ def check_precision(name: str, data: Any, x: Any) -> None:
 def check_args(args: Any, caller: str) -> None:
     """Raise an `InputError` if `args` is no pytree of numbers.
 
-    Dict keys may not be sortable, and arrays may contain text or Python objects."""
+    Dict keys may not be sortable, arrays may contain text or Python objects, and tables of other
+    libraries are no arrays."""
     place = f"{caller}(args)"
     try:
         leaves = jtu.tree_leaves(args)
@@ -130,6 +134,10 @@ def check_args(args: Any, caller: str) -> None:
         rule = "JAX sorts the keys of a dict, and these have no order"
         raise input_error(place, "keys of several types", rule, "Use strings") from None
     for leaf in leaves:
+        if _is_table(leaf):
+            given, rule = _kind(leaf), "JAX computes with arrays, and with containers of arrays"
+            fix = "Pass jnp.asarray(v.to_numpy()); for named numbers, dict(v)"
+            raise input_error(place, given, rule, fix)
         if isinstance(leaf, np.ndarray) and leaf.dtype.kind not in "biufc":
             given = f"an array of {leaf.dtype}, {_tree.short(leaf)}"
             fix = "Convert it, np.asarray(..., float), and pass texts as str"
@@ -238,6 +246,27 @@ def _explain(
     return InputProblem(f"{at}, {_place(fn, error.__traceback__)}", given, rule, fix)
 
 
+def _is_table(value: Any) -> bool:
+    """Return whether a value is data of pandas or a similar library, and no array."""
+    has_method = callable(getattr(value, "to_numpy", None))
+    return has_method and not isinstance(value, np.ndarray | jax.Array)
+
+
+def _kind(value: Any) -> str:
+    return f"a {type(value).__name__} of {type(value).__module__.split('.')[0]}"
+
+
+def _table_read(fn: Callable[..., Any]) -> tuple[str, Any] | None:
+    """Return name and value of the first table that fn reads from around it; None without one."""
+    try:
+        found = inspect.getclosurevars(fn)
+    except TypeError:
+        return None
+    return next(
+        ((n, v) for n, v in {**found.globals, **found.nonlocals}.items() if _is_table(v)), None
+    )
+
+
 def _texts(args: Any) -> str:
     """Return the first texts in args with their places, "" if there are none."""
     leaves = jtu.tree_flatten_with_path(args)[0]
@@ -250,6 +279,11 @@ def _reason(
 ) -> tuple[str, str]:
     """Return the rule that was violated, and the fix."""
     traced = f"JAX traces {name}, so that its arguments have no values, which"
+    if isinstance(error, TypeError) and (table := _table_read(fn)) is not None:
+        return (
+            f"{name} reads `{table[0]}`, {_kind(table[1])}, and JAX computes with arrays",
+            "Convert what it reads once, outside of the function: jnp.asarray(v.to_numpy())",
+        )
     if isinstance(error, jax.errors.TracerBoolConversionError):
         return (
             f"{traced} `if`, `while`, `and`, `or`, `not`, `min` and `max` require",

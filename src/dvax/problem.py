@@ -366,6 +366,23 @@ class Problem(eqx.Module):
                 evaluate(t, x, u)
         _check_spans([(*span, name) for name in reports for span in reports[name].spans], t0, t1)
 
+    def check_spans(self, t0: Any, t1: Any, x: Tree, args: Any = None) -> None:
+        """Trace K, f and h, to check that the data in them cover the time span.
+
+        **Raises:** `dvax.InputError` if some data do not cover [t0, t1].
+        """
+        evaluations, reports = self._evaluations(args), {}
+
+        def traced(t: Any, x: Tree, u: Tree) -> None:
+            for name, evaluate in evaluations.items():
+                with listen(t) as reports[name]:
+                    evaluate(t, x, u)
+
+        time = jnp.asarray(t0, jnp.result_type(float))
+        jax.eval_shape(traced, time, x, self.zero_control(x))
+        spans = [(*span, name) for name in reports for span in reports[name].spans]
+        _check_spans([span for span in spans if _tree.is_concrete(span)], t0, t1)
+
     def _evaluations(self, args: Any) -> dict[str, Callable[[Any, Tree, Tree], Any]]:
         """Return K, f and h as functions of (t, x, u)."""
         return {

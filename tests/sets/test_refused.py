@@ -1,5 +1,7 @@
 """Empty, inconsistent or misshapen sets are rejected before a run."""
 
+import itertools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -58,14 +60,14 @@ SQUARE = np.vstack([np.eye(2), -np.eye(2)])
             ),
             "columns",
         ),
-        (lambda: sets.Polyhedron(SQUARE, -np.ones(4)), "is 1"),
-        (lambda: sets.Polyhedron(np.zeros((1, 2)), -np.ones(1)), "no y satisfies"),
-        (lambda: sets.Polyhedron(SQUARE, np.array([1.0, 1, 1, -np.inf])), "no y satisfies"),
+        (lambda: sets.Polyhedron(SQUARE, -np.ones(4)), "is at least 1"),
+        (lambda: sets.Polyhedron(np.zeros((1, 2)), -np.ones(1)), "no y satisfies row 0 of G"),
+        (lambda: sets.Polyhedron(SQUARE, np.array([1.0, 1, 1, -np.inf])), "of d is −∞"),
         (lambda: sets.Polyhedron(SQUARE, np.array([1.0, 1, 1, np.nan])), "must not be NaN"),
         (lambda: sets.Polyhedron(SQUARE, np.ones(4), np.ones((1, 2))), "both"),
         (
             lambda: sets.Polyhedron(SQUARE, np.ones(4), np.ones((1, 2)), np.array([3.0])),
-            "no y satisfies",
+            "and E y = e",
         ),
         (
             lambda: sets.Polyhedron(SQUARE, np.ones(4), np.ones((2, 2)), np.array([0.0, 1.0])),
@@ -86,3 +88,19 @@ SQUARE = np.vstack([np.eye(2), -np.eye(2)])
 def test_empty_or_inconsistent_sets_are_rejected_by_name(make, word):
     with pytest.raises(dvax.InputError, match=word):
         make()
+
+
+def test_the_rows_that_contradict_each_other_are_named():
+    """Rows g and −g with a gap between them, hidden among rows of a large cube."""
+    rng = np.random.default_rng(0)
+    for n, extra in itertools.product((2, 5, 9), (0, 3, 20)):
+        g = rng.normal(size=n)
+        others = rng.normal(size=(extra, n))
+        rows, bounds = (
+            np.concatenate([others, [g, -g]]),
+            np.append(np.full(extra, 1e3), [1.0, -1.1]),
+        )
+        order = rng.permutation(extra + 2)
+        guilty = ", ".join(map(str, sorted(np.flatnonzero(order >= extra))))
+        with pytest.raises(dvax.InputError, match=f"no y satisfies rows {guilty} of G:"):
+            sets.Polyhedron(rows[order], bounds[order])

@@ -16,7 +16,7 @@ from ..evolution import RESULTS, Event, Implicit, PiecewiseLinear, Solution, sol
 from ..evolution.arguments import MAX_EVENTS, Arguments, bound_steps, check, warn_precision
 from ..evolution.auto import Choice, choose
 from ..evolution.event_arguments import check_events
-from ..evolution.first_run import warn_after_first_run
+from ..evolution.first_run import key_of_first_run, warn_after_first_run
 from ..evolution.method import AbstractMethod
 from ..evolution.picard import Picard
 from ..evolution.setup import as_arrays
@@ -156,7 +156,9 @@ def ensemble(
             # Data of the others may be invalid.
             if (solved := np.flatnonzero(~np.asarray(members.failed))).size:
                 x0, own_args, begin, *_ = inputs.member(int(solved[0]))
-                warn_after_first_run(problem, begin, x0, own_args, constants)
+                key = key_of_first_run(problem, begin, x0, own_args)
+                if key is not None:
+                    warn_after_first_run(key, problem, begin, x0, own_args, constants)
             return members
     # Within `jax.grad` or `jax.jit`.
     found = program(choice).traced(inputs.rows(slice(None)))

@@ -165,14 +165,15 @@ def _nonfinite(stop: Stop) -> Diagnosis:
                 middle = 0.5 * (low + high)
                 low, high = (low, middle) if bad(name, middle) else (middle, high)
             at, what = f"at t = {stop.t + high:.12g}", bad(name, high) or diagnosis
-            fixes = (Fix("", "", _CHECKED[name]),)
             if name == "u" and (cause := _not_monotone(stop)) is not None:
                 return cause
-            if name in ("K", _NEAREST):
-                # There its numbers differ by more than a rounding.
+            if name in ("K", _NEAREST, "u"):
+                # There its numbers differ by more than a rounding, which may be all that is wrong at
+                # first: then K is not refused, and has a nearest point, but the law has no solution.
                 later = min(high + _LATER * (stop.span[1] - stop.span[0]), stop.span[1] - stop.t)
-                if later > high and (there := bad(name, later)):
-                    at, what = f"from {at[3:]} on", there
+                if later > high and (found := _first(bad, ("K", _NEAREST), later)):
+                    (name, what), at = found, f"from {at[3:]} on"
+            fixes = (Fix("", "", _CHECKED[name]),)
             if what.startswith(_REFUSED):
                 return Diagnosis(f"{name} is refused {at}: {what[len(_REFUSED) :]}.", fixes, True)
             if name == _NEAREST:
@@ -180,6 +181,13 @@ def _nonfinite(stop: Stop) -> Diagnosis:
             return Diagnosis(f"{name} is {what} {at}.", fixes)
         last_good = float(ahead)
     return Diagnosis()
+
+
+def _first(
+    bad: Callable[[str, float], str], names: tuple[str, ...], ahead: float
+) -> tuple[str, str] | None:
+    """Return the first name of what is bad then, and how; None where nothing is."""
+    return next(((name, what) for name in names if (what := bad(name, ahead))), None)
 
 
 def _escape(stop: Stop) -> Diagnosis:

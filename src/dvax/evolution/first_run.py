@@ -1,15 +1,18 @@
-"""Warnings after the first run of a problem, which no check before a run can give."""
+"""What is examined once for a problem: its data before the first run, and its states after it."""
 
 import math
 import warnings
 from typing import Any
 
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
 from .._tree import Tree
 from ..problem import Problem
+from .nonfinite import first_bad, nonfinite_data
+from .setup import as_arrays
 from .several_solutions import warn_of_several_solutions
 from .signature import flat
 
@@ -25,7 +28,35 @@ _SHARE = 0.1
 """Largest share of the state that atol may be without a warning."""
 
 
+def key_of_first_run(problem: Problem, t0: Any, x0: Tree, args: Any) -> Any:
+    """Return a key of the code of the problem and the shapes of its data, None where it is traced, or
+    was examined before."""
+    leaves, tree = jtu.tree_flatten((x0, args))
+    numbers = [leaf if isinstance(leaf, float) else np.shape(leaf) for leaf in leaves]
+    key = flat(problem).key, tree, tuple(type(n) if isinstance(n, float) else n for n in numbers)
+    is_new = key not in _SEEN and _tree.is_concrete(flat(problem).numbers, t0, leaves)
+    return key if is_new else None
+
+
+def check_before_first_run(problem: Problem, t0: Any, t1: Any, x0: Tree, args: Any) -> None:
+    """Refuse data that end too early, or that are NaN where they are used, before the compilation of
+    a run that would fail.
+
+    **Raises:** `dvax.InputError`.
+    """
+    args = as_arrays(args)
+    if _tree.is_concrete(t1):
+        problem.check_spans(t0, t1, x0, args)
+    wrong = nonfinite_data(problem, args, "dvax.solve")
+    if wrong:
+        t, u = jnp.asarray(t0, _tree.dtype(x0)), problem.zero_control(x0)
+        used = (problem.f(t, x0, u, args), problem.h(t, x0, u, args), problem.set_at(t, args))
+        if first_bad((problem.A, problem.P, used), allow_infinite=True):
+            wrong.raise_any()
+
+
 def warn_after_first_run(
+    key: Any,
     problem: Problem,
     t0: Any,
     x0: Tree,
@@ -34,15 +65,11 @@ def warn_after_first_run(
     states: Tree = None,
     atol: Any = None,
 ) -> None:
-    """Warn, once for a problem, of a law with several solutions and of states that atol hides.
+    """Warn of a law with several solutions and of states that atol hides, and store the `key`
+    (`key_of_first_run`).
 
     `states`: the saved ones of a run with the tolerance `atol`; without them, of the law alone.
     """
-    leaves, tree = jtu.tree_flatten((x0, args))
-    numbers = [leaf if isinstance(leaf, float) else np.shape(leaf) for leaf in leaves]
-    key = flat(problem).key, tree, tuple(type(n) if isinstance(n, float) else n for n in numbers)
-    if key in _SEEN or not _tree.is_concrete(flat(problem).numbers, t0, leaves):
-        return
     if len(_SEEN) >= _MAX_SEEN:
         _SEEN.clear()
     _SEEN.add(key)

@@ -14,15 +14,16 @@ from ..problem import Problem
 from .setup import Setup
 
 
-def refuse_nonfinite_data(problem: Problem, args: Any, caller: str) -> None:
-    """Raise an `InputError` if A, P, K or args contain NaN, or if A or P contain infinity."""
+def nonfinite_data(problem: Problem, args: Any, caller: str) -> Problems:
+    """Return the problems of A, P, K and args that contain NaN, and of A and P that contain
+    infinity."""
     wrong = Problems()
     for name, data in (("A", problem.A), ("P", problem.P), ("K", problem.K), ("args", args)):
         description = first_bad(data, allow_infinite=name in ("K", "args"))
         if description:
             place = f"{caller}(args)" if name == "args" else f"dvax.Problem({name})"
             wrong.add(place, description, "its numbers must be finite", "Correct the data there")
-    wrong.raise_any()
+    return wrong
 
 
 def first_bad(tree: Tree, allow_infinite: bool = False) -> str:

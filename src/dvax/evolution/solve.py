@@ -36,10 +36,10 @@ from .control import MAX_GROWTH
 from .diagnose import failure
 from .event import Event
 from .event_arguments import check_events
-from .first_run import warn_after_first_run
+from .first_run import check_before_first_run, key_of_first_run, warn_after_first_run
 from .implicit import Implicit
 from .method import AbstractMethod
-from .nonfinite import refuse_nonfinite_data
+from .nonfinite import nonfinite_data
 from .picard import Picard
 from .piecewise.method import PiecewiseLinear
 from .piecewise.propagate import propagate
@@ -196,10 +196,14 @@ def solve(
         warn_precision(x0, rtol)
     call, choice = _chosen(call)
     setup, options = arranged(call, choice.method)
+    first = key_of_first_run(problem, t0, x0, args)
+    if first is not None:
+        check_before_first_run(problem, t0, t1, x0, args)
     solution = _run(choice, setup, None if ts is None else _times(ts), options, throw)
-    adaptive = dt is None and not isinstance(choice.method, PiecewiseLinear)
-    states = solution.xs if adaptive else None
-    warn_after_first_run(problem, t0, x0, args, constants, states, atol)
+    if first is not None:
+        adaptive = dt is None and not isinstance(choice.method, PiecewiseLinear)
+        states = solution.xs if adaptive else None
+        warn_after_first_run(first, problem, t0, x0, args, constants, states, atol)
     return solution
 
 
@@ -317,7 +321,7 @@ def _examined(setup: Setup, times: Any, options: Options, solution: Solution) ->
     # Data that ends too early is NaN from there on: then that is what is wrong.
     problem, x0, args = setup.problem, setup.x0, setup.args
     t0, t1 = setup.setting["t0"], setup.setting["t1"]
-    refuse_nonfinite_data(problem, args, "dvax.solve")
+    nonfinite_data(problem, args, "dvax.solve").raise_any()
     problem.knots(t0, t1, x0, as_arrays(args))
     problem.check_data(t0, t1, x0, args)
     if options.fixed:

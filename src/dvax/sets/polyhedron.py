@@ -25,6 +25,9 @@ from .affine import (
     normalised_conditions,
 )
 
+_LISTED = 8
+"""Most rows that a message lists."""
+
 _ROUNDINGS = 8.0
 """Violation of the equations, in roundings of the point, that a projection leaves uncorrected."""
 
@@ -206,7 +209,7 @@ def _check_nonempty(name: str, G: np.ndarray, d: np.ndarray, E: np.ndarray, e: n
     length = np.where(length > 0, length, 1.0)
     bounded = d < np.inf
     rows, bounds = (flat / length[:, None])[bounded], (d / length)[bounded]
-    violation = np.inf
+    violation, text = np.inf, "an entry of d is −∞"
     if np.all(np.isfinite(bounds)):
         size = max(np.max(np.abs(bounds), initial=0.0), np.max(np.abs(e), initial=0.0)) or 1.0
         answer = scipy.optimize.linprog(
@@ -220,11 +223,17 @@ def _check_nonempty(name: str, G: np.ndarray, d: np.ndarray, E: np.ndarray, e: n
         # If the linear programme fails, accept the set: the projection checks its own result.
         violation = answer.x[-1] * size if answer.status == 0 else 0.0
         violation = 0.0 if violation <= 1e-6 * size else violation
+        if violation > 0.0:
+            # The rows with multipliers have a nonnegative sum that no y satisfies.
+            among = np.flatnonzero(bounded)[np.abs(answer.ineqlin.marginals) > 1e-9]
+            listed = ", ".join(map(str, among[:_LISTED])) + (", …" if len(among) > _LISTED else "")
+            text = f"no y satisfies row{'s' * (len(among) > 1)} {listed} of G"
+            text += " and E y = e" * bool(len(e))
+            text += f": for rows of length one the violation is at least {violation:.3g}"
     if violation > 0.0:
         raise input_error(
             f"{name}(G, d, E, e)",
-            f"{len(d)} inequalities and {len(e)} equations that no y satisfies: the smallest "
-            f"possible violation, for rows scaled to length one, is {violation:.3g}",
+            f"{len(d)} inequalities and {len(e)} equations, and {text}",
             "the set must not be empty, or the law has no solution",
             "Increase entries of d, or remove conditions that contradict others",
         )

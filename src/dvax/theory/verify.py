@@ -10,7 +10,7 @@ import numpy as np
 from .. import _tree, _user_code
 from .._tree import Tree
 from ..errors import InputError, InputProblem, input_error
-from ..evolution.nonfinite import refuse_nonfinite_data
+from ..evolution.nonfinite import nonfinite_data
 from ..problem import Problem
 from ..programs.slope import Slope, SlopeEnclosure, TooLarge, interval, is_slope
 from ..programs.structure import independent_of_first
@@ -146,7 +146,7 @@ def verify(
     t0, t1 = time_span(t0, t1, "dvax.verify(t0, t1)")
     _user_code.check_args(args, "dvax.verify")
     x0 = state_for(problem, x0, t0, args, "dvax.verify(x0)")
-    refuse_nonfinite_data(problem, args, "dvax.verify")
+    nonfinite_data(problem, args, "dvax.verify").raise_any()
     problem.check(jnp.asarray(t0), x0, args)
     system = System(problem, x0, args)
     knots = np.asarray(problem.knots(t0, t1, x0, args), float)
