@@ -10,8 +10,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from .known_functions import known_name
-
 
 def _types() -> tuple[Any, ...]:
     """Return the types `ClosedJaxpr`, `Jaxpr` and `Literal`, from a program that is traced here."""
@@ -119,18 +117,6 @@ def _horner(*types: tuple[tuple[int, ...], str]) -> Any:
         return total
 
     return jax.make_jaxpr(value)(*(jax.ShapeDtypeStruct(*each) for each in types))
-
-
-def operation(eqn: Any) -> str:
-    """Return the name of an operation in tables of rules.
-
-    It is the name of the primitive, or of a called function: one of `known_functions.VARIANTS`, or
-    "dvax_..." for functions of dvax that have a rule of their own.
-    """
-    name = eqn.params.get("name")
-    if isinstance(name, str) and name.startswith("dvax_"):
-        return name
-    return known_name(eqn) or eqn.primitive.name
 
 
 def scan_counts(params: dict[str, Any]) -> tuple[int, int] | None:

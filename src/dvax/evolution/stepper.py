@@ -96,7 +96,8 @@ class Step(NamedTuple):
     - `evaluations`: of F;
     - `stiffness`: h times the slope of f̃ between two stages, None where the method has no such pair;
     - `carried`: the estimated error of x₀, and what the step leaves of it, None where not estimated;
-    - `fastest`: what limits the steps of a derivative, None where none is wanted.
+    - `fastest`: what limits the steps of a derivative, None where none is wanted;
+    - `unenclosed`: all values are finite, and the defect has no enclosure, as at a jump in time.
     """
 
     x1: Tree
@@ -115,6 +116,7 @@ class Step(NamedTuple):
     signed: Tree | None = None
     carried: tuple[Tree, Tree] | None = None
     fastest: Fastest | None = None
+    unenclosed: Any = False
 
 
 def interpolate(flow: Flow, length: Any, theta: Any, x0: Tree, c: tuple[Tree, ...]) -> Tree:
@@ -340,12 +342,15 @@ class Stepper(eqx.Module):
             *tangents,
         )
         solved = jnp.all(jnp.stack([one.rate.solved for one in evaluations]))
+        unenclosed: Any = False
+        if self.measure and self.flow.enclosed:
+            unenclosed = solved & _tree.all_finite((x1, last.value)) & ~_tree.all_finite(error)
         # The first one was made by the step before, unless nothing is kept, or data jumped.
         counts = [one.rate.evaluations for one in evaluations]
         own = counts[0] if kept is None else jnp.where(jumped, counts[0], 0)
         return Step(
             x1, c, error, integrated_defect, event, excursion, bounds, after, first.solved, solved,
-            finite, sum(counts[1:], own), stiffness, signed, carried, fastest,
+            finite, sum(counts[1:], own), stiffness, signed, carried, fastest, unenclosed,
         )  # fmt: skip
 
     def _local(

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from .._jax.jaxprs import bind, inner_program, operation, read, scan_counts
+from .._jax.jaxprs import bind, inner_program, read, scan_counts
+from .._jax.known_functions import operation
 
 Rule = Callable[..., Any]
 """A function of an equation and the values of its arguments that returns the values of its results."""
@@ -25,7 +26,7 @@ def _apply(rule: Rule, eqn: Any, operands: list[Any]) -> list[Any] | None:
 class Domain(NamedTuple):
     """An abstract domain.
 
-    - `rules`: the rules by the names of operations (`dvax._jax.jaxprs.operation`);
+    - `rules`: the rules by the names of operations (`dvax._jax.known_functions.operation`);
     - `is_abstract`: returns whether a value belongs to the domain;
     - `unknown`: returns the results of an operation without a rule and without an inner program;
     - `apply`: applies a rule, and returns None if the rule does not cover these arguments;

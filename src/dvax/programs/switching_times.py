@@ -28,7 +28,8 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
-from .._jax.jaxprs import Literal, bind, inner_program, operation, scan_counts
+from .._jax.jaxprs import Literal, bind, inner_program, scan_counts
+from .._jax.known_functions import operation
 from ..errors import DifferentiationError
 from .interpreter import Domain, Rule, interpret, is_real, same_for
 from .primitives import LOGICAL, ORDERING, REARRANGING, TABLES

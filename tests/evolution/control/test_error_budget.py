@@ -34,10 +34,11 @@ def test_error_budget_allows_four_crossings_until_the_next_accurate_step():
     """Four successive crossings are allowed; an accurate step restores the budget."""
     budget, jump = ErrorBudget.at_start(jnp.asarray(1.0)), attempt(1e9, 1e-14)
     for _ in range(4):
-        assert bool(budget.may_cross(jump, YES)) and not bool(budget.may_cross(jump, NO))
+        assert bool(budget.may_cross(jump, YES, NO)) and not bool(budget.may_cross(jump, NO, NO))
         budget = budget.after(jump, YES, NO, NO)
-    assert not bool(budget.may_cross(jump, YES))
+    assert not bool(budget.may_cross(jump, YES, NO))
     budget = budget.after(attempt(0.5, 1e-3), YES, NO, NO)
-    assert bool(budget.may_cross(jump, YES))
-    assert not bool(budget.may_cross(attempt(np.inf, 1e-14), YES))
-    assert not bool(budget.may_cross(attempt(1e9, 1e-12), YES))
+    assert bool(budget.may_cross(jump, YES, NO))
+    assert not bool(budget.may_cross(attempt(np.inf, 1e-14), YES, NO))
+    assert bool(budget.may_cross(attempt(np.inf, 1e-14), YES, YES))
+    assert not bool(budget.may_cross(attempt(1e9, 1e-12), YES, NO))

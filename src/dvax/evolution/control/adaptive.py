@@ -102,7 +102,7 @@ class Adaptive(AbstractController):
         is_roundoff = lax.stop_gradient(is_noise & (attempt.error <= attempt.roundoff))
         covered = state.budget.covers(attempt, is_noise) | is_roundoff
         is_resolved = 4.0 * attempt.smallest <= TRUSTED_STEP_SHARE * span
-        crossing = state.budget.may_cross(attempt, is_resolved)
+        crossing = state.budget.may_cross(attempt, is_resolved, step.unenclosed)
         excursion = self._excursion(x0, step, attempt, span)
         passes = (attempt.error <= 1.0) | covered | crossing
         known = EventBracket.unpack(state.event)
@@ -211,7 +211,7 @@ class Adaptive(AbstractController):
     def _result(self, step: Step, attempt: Attempt, accepted: Any, exhausted: Any) -> RESULTS:
         # A step size is rounded with the two times that it lies between.
         stuck = ~accepted & ((attempt.size <= 1.25 * attempt.smallest) | exhausted)
-        finite = jnp.isfinite(attempt.error)
+        finite = jnp.isfinite(attempt.error) | step.unenclosed
         reason = RESULTS.where(finite, RESULTS.step_too_small, RESULTS.nonfinite)
         reason = RESULTS.where(step.solved, reason, RESULTS.law_unsolved)
         result = RESULTS.where(stuck, reason, RESULTS.successful)

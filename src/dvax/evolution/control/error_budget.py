@@ -43,11 +43,13 @@ class ErrorBudget(NamedTuple):
         share = jnp.where(large, _LARGE_SHARE, _SHARE)
         return attempt.integrated <= share * self.remaining
 
-    def may_cross(self, attempt: Attempt, is_resolved: Any) -> Any:
-        """Return whether the step may cross a jump whatever its error; `is_resolved` says whether
-        steps of this size are small against the run."""
+    def may_cross(self, attempt: Attempt, is_resolved: Any, unenclosed: Any) -> Any:
+        """Return whether the step may cross a jump whatever its error, which is infinite where the
+        defect is `unenclosed`; `is_resolved` says whether steps of this size are small against the
+        run."""
         smallest = is_resolved & (attempt.size <= 4.0 * attempt.smallest)
-        return smallest & (self.crossings < _MAX_CROSSINGS) & jnp.isfinite(attempt.error)
+        is_known = jnp.isfinite(attempt.error) | unenclosed
+        return smallest & (self.crossings < _MAX_CROSSINGS) & is_known
 
     def is_exhausted(self) -> Any:
         return self.remaining < _EXHAUSTED
@@ -55,10 +57,11 @@ class ErrorBudget(NamedTuple):
     def after(
         self, attempt: Attempt, accepted: Any, covered: Any, is_roundoff: Any
     ) -> "ErrorBudget":
-        """Return the budget after an attempt. Roundoff that no step size reduces is not charged."""
-        above = attempt.error > 1.0
+        """Return the budget after an attempt. Roundoff that no step size reduces is not charged, and
+        no infinite defect: the step is one of the `crossings`."""
+        above = (attempt.error > 1.0) & jnp.isfinite(attempt.integrated)
         left = jnp.maximum(self.remaining - attempt.integrated, 0.0)
         remaining = jnp.where(accepted & above & ~is_roundoff, left, self.remaining)
-        crossed = jnp.where(accepted & ~covered & above, self.crossings + 1, self.crossings)
+        crossed = jnp.where(accepted & ~covered & (attempt.error > 1.0), self.crossings + 1, self.crossings)
         onward = accepted & (attempt.error <= 1.0) & (attempt.size > 16.0 * attempt.smallest)
         return ErrorBudget(remaining, jnp.where(onward, 0, crossed))

@@ -22,7 +22,8 @@ import jax.tree_util as jtu
 import numpy as np
 
 from ... import _tree
-from ..._jax.jaxprs import bind, has_operation, operation
+from ..._jax.jaxprs import bind, has_operation
+from ..._jax.known_functions import operation
 from ..._tree import Tree
 from ..interpreter import Domain, Rule, interpret, operate
 from .chains import CURVED, Chains
