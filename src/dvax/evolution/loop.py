@@ -4,7 +4,7 @@ One loop over the saved times holds one loop over steps, so that a step is compi
 nothing between saved times, and the lanes of a batch wait for each other no longer than they must.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from .. import _tree
 from .._batch import any_lane, is_active
 from .._tree import Tree
 from ..vi import independent
-from . import meter
+from . import forcing, meter
 from .bounds import Bounds
 from .checkpoints import Checkpoints
 from .control import AbstractController, Adaptive, StepDecision, slack
@@ -81,14 +81,17 @@ class Loop(eqx.Module):
     forward_mode: bool = eqx.field(static=True)
     watch: EventWatch | None = None
 
-    def for_derivatives(self, x0: Tree) -> "Loop":
-        """Return the loop from x0 whose steps a derivative can take as well."""
+    def for_derivatives(self, x0: Tree, chosen: Sequence[bool] | None = None) -> "Loop":
+        """Return the loop from x0 whose steps a derivative can take as well: one in x0 and the `chosen`
+        arrays of the problem and of args (None: in all)."""
         # Steps of a given size have no choice.
         if not self.controller.adapts:
             return self
         flow, t0 = self.stepper.flow, self.stepper.ends[0]
         varies = not independent(lambda t: flow.rate(t, x0, flow.guess(x0)).value, t0)
-        return replace(self, stepper=replace(self.stepper, for_derivatives=True, varies=varies))
+        forced_by = forcing.groups(flow, t0, x0, chosen) if varies else ()
+        stepper = replace(self.stepper, for_derivatives=True, varies=varies, forced_by=forced_by)
+        return replace(self, stepper=stepper)
 
     def run(
         self, x0: Tree, ts: jax.Array | None, checkpoints: Checkpoints | None = None

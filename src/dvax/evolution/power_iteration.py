@@ -67,14 +67,14 @@ def pattern(space: AbstractSpace, x: Tree) -> Tree:
     return _normalised(space, jtu.tree_unflatten(tree, entries))
 
 
-def linearised(fn: Callable[[Tree], Tree], x: Tree) -> Callable[[Tree], Tree]:
-    """Return v ↦ Dfn(x) v, or its transpose, whose spectrum is the same, where code has a derivative of
-    its own in reverse alone (`jax.custom_vjp`)."""
-    push = jax.linearize(fn, x)[1]
+def linearised(fn: Callable[[Tree, Any], Tree], x: Tree, p: Any) -> Callable[[Tree, Any], Tree]:
+    """Return (v, q) ↦ Dfn(x, p)(v, q). Where code has a derivative of its own in reverse alone
+    (`jax.custom_vjp`), v ↦ Dₓfn v is transposed, which has the same spectrum, and q is ignored."""
+    push = jax.linearize(fn, x, p)[1]
     # JAX refuses such code when it compiles, and not here.
-    if has_operation(jax.make_jaxpr(push)(x), {"custom_lin"}):
-        pull = jax.vjp(fn, x)[1]
-        return lambda v: pull(v)[0]
+    if has_operation(jax.make_jaxpr(push)(x, p), {"custom_lin"}):
+        pull = jax.vjp(lambda x: fn(x, p), x)[1]
+        return lambda v, q: pull(v)[0]
     return push
 
 
@@ -93,20 +93,27 @@ class Refined(NamedTuple):
     direction: Tree
 
 
-def applied_twice(push: Callable[[Tree], Tree], *vectors: Tree) -> list[tuple[Tree, Tree]]:
-    """Return (Bv, B²v) for each v, where `push` applies B: by a loop, so that B is in the program
-    once."""
+def images(
+    push: Callable[[Tree, jax.Array], Tree], vectors: tuple[Tree, ...], count: int
+) -> tuple[list[tuple[Tree, Tree]], Tree]:
+    """Return (Bv, B²v) for each v, and the `count` rows of G, where push(v, w) is Bv + Gᵀw: by a loop,
+    so that the derivative is in the program once."""
 
-    def apply(v: Tree, start: tuple[Tree, Any]) -> tuple[Tree, Tree]:
-        fresh, begins = start
-        image = push(_tree.where(begins, fresh, v))
+    def apply(v: Tree, start: tuple[Tree, Any, jax.Array]) -> tuple[Tree, Tree]:
+        fresh, begins, weights = start
+        image = push(_tree.where(begins, fresh, v), weights)
         return image, image
 
-    starts = jtu.tree_map(lambda *leaves: jnp.repeat(jnp.stack(leaves), 2, axis=0), *vectors)
-    begins = jnp.arange(2 * len(vectors)) % 2 == 0
-    _, images = lax.scan(apply, vectors[0], (starts, begins))
-    row = lambda k: jtu.tree_map(lambda leaf: leaf[k], images)  # noqa: E731
-    return [(row(2 * k), row(2 * k + 1)) for k in range(len(vectors))]
+    many = 2 * len(vectors)
+    zeros = [_tree.zeros_like(vectors[0])] * count
+    starts = [v for v in vectors for _ in range(2)] + zeros
+    fresh = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *starts)
+    begins = (jnp.arange(many + count) % 2 == 0) | (jnp.arange(many + count) >= many)
+    weights = jnp.concatenate([jnp.zeros((many, count)), jnp.eye(count)])
+    _, found = lax.scan(apply, vectors[0], (fresh, begins, weights))
+    row = lambda k: jtu.tree_map(lambda leaf: leaf[k], found)  # noqa: E731
+    twice = [(row(2 * k), row(2 * k + 1)) for k in range(len(vectors))]
+    return twice, jtu.tree_map(lambda leaf: leaf[many:], found)
 
 
 def refine(space: AbstractSpace, d: Tree, one: Tree, two: Tree, p: Tree) -> Refined:
@@ -126,21 +133,25 @@ def refine(space: AbstractSpace, d: Tree, one: Tree, two: Tree, p: Tree) -> Refi
     return Refined(slope, is_damped, one, _tree.where(known, mixed, d))
 
 
-def variation(space: AbstractSpace, nodes: tuple[float, ...], rows: Tree) -> Any:
+def variation(
+    space: AbstractSpace, nodes: tuple[float, ...], rows: Tree, least: Any = 0.0
+) -> tuple[Any, Any]:
     """Return hω of a function of θ with these rows at the nodes in [0, 1], as if it were a multiple of
     e^{ihωθ}: (m! |divided difference|/|function|)^{1/m} for the highest order m. It is 0 for a
-    polynomial of a lower degree, and for two nodes or fewer."""
+    polynomial of a lower degree, and for two nodes or fewer. |function| counts as `least` at least.
+    Return |function| too."""
     m = len(nodes) - 1
+    largest = jnp.max(jax.vmap(space.norm)(rows))
     if m < 2:
-        return jnp.zeros(())
+        return jnp.zeros(()), largest
     weights = [1.0 / math.prod(a - b for b in nodes if b != a) for a in nodes]
     difference = jtu.tree_map(
         lambda leaf: jnp.tensordot(jnp.asarray(weights, leaf.dtype), leaf, 1), rows
     )
-    largest = jnp.max(jax.vmap(space.norm)(rows))
-    known = jnp.isfinite(largest) & (largest > 0.0)
-    share = math.factorial(m) * space.norm(difference) / jnp.where(known, largest, 1.0)
-    return jnp.where(known, share ** (1.0 / m), 0.0)
+    size = jnp.maximum(largest, least)
+    known = jnp.isfinite(size) & (size > 0.0)
+    share = math.factorial(m) * space.norm(difference) / jnp.where(known, size, 1.0)
+    return jnp.where(known, share ** (1.0 / m), 0.0), largest
 
 
 def remaining(

@@ -35,9 +35,10 @@ def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State
     output, and the last. Of all the other things the derivative is zero."""
     dynamic, static = eqx.partition((x0, loop, ts), eqx.is_array)
     leaves, tree = jtu.tree_flatten(dynamic)
-    # Which of them say where steps end.
+    # Which of them say where steps end, and which are data.
     _, numbered, _ = jtu.tree_unflatten(tree, range(len(leaves)))
-    timing = jtu.tree_leaves(numbered.controller)
+    timing, own = jtu.tree_leaves(numbered.controller), numbered.stepper.flow
+    data = jtu.tree_leaves((own.problem, own.args))
 
     def whole(leaves: Any) -> tuple[Tree, Loop, jax.Array | None]:
         return eqx.combine(jtu.tree_unflatten(tree, leaves), static)
@@ -50,7 +51,7 @@ def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State
     def forward(*given: Any) -> Any:
         leaves = [leaf.value for leaf in given]
         x0, loop, ts = whole(leaves)
-        loop = loop.for_derivatives(x0)
+        loop = loop.for_derivatives(x0, [given[k].perturbed for k in data])
 
         def run(loop: Loop, x0: Tree, ts: jax.Array | None) -> tuple[Saved | None, State]:
             return loop.run(x0, ts, Checkpoints(x0, checkpoint_count(x0, loop.max_steps)))

@@ -16,7 +16,7 @@ from .._knots import END_ULPS, KNOT_ULPS
 from .._tree import Tree
 from ..generators import AbstractPropagator, FlowStep, Growth
 from ..generators.spectral_state import coefficients, values
-from . import error_estimate, power_iteration
+from . import error_estimate, forcing, power_iteration
 from .bounds import Bounds
 from .defect import Sample, enclosed, roundoff, sampled
 from .evaluations import Evaluation, Stages, evaluated
@@ -34,12 +34,19 @@ _SLOW = 0.1
 """Rate of change of x, as a share of the slope of f̃, below which a slope is called stiff."""
 
 
+_INSIDE = 0.3, 0.7
+"""Where a step is looked at inside if its method samples no defect there."""
+
+_FADED = 1e-3
+"""Share of the largest forcing so far below which its changes count less."""
+
+
 class SolverState(NamedTuple):
     """What the next step reuses of an accepted one: the rate at its end, a guess for the law, the
     coefficients of its end in the eigenfunctions of A, the largest `variation` of the data between
     samples so far (`ExcursionGuard`), an estimate of the `error` of x, and the `direction` of the power
-    iteration, the direction of what has `not_decayed` and the largest `slope` at x, each None where it
-    is not needed."""
+    iteration, the direction of what has `not_decayed`, the largest `slope` at x and the largest
+    `forcing` by parameters so far, each None where it is not needed."""
 
     rate: Rate | None
     guess: Tree | None
@@ -49,6 +56,7 @@ class SolverState(NamedTuple):
     direction: Tree | None = None
     not_decayed: Tree | None = None
     slope: Any = None
+    forcing: Any = None
 
 
 class Propagators(NamedTuple):
@@ -66,6 +74,7 @@ class Fastest(NamedTuple):
 
     - `slope`: h times the largest slope of what the method treats explicitly (`power_iteration`);
     - `variation`: hω, where the derivative of f̃ changes in time as e^{iωt} does;
+    - `forcing`: the same of the derivative in parameters (`forcing.groups`);
     - `remaining`: h times the slope of what has not decayed;
     - `kink`: the same as `slope`, with what lies behind a kink of the response;
     - `is_damped`: such a change decays;
@@ -74,6 +83,7 @@ class Fastest(NamedTuple):
 
     slope: Any
     variation: Any
+    forcing: Any
     remaining: Any
     kink: Any
     is_damped: Any
@@ -179,7 +189,8 @@ class Stepper(eqx.Module):
     - `uniform`: the propagators, where all steps have one length that is known beforehand;
     - `growth`: of the semigroup, where the defect is enclosed;
     - `for_derivatives`: find the largest slope of f̃, which limits steps whose derivative is wanted;
-    - `varies`: f̃ depends on t other than through x, so that slopes are looked at inside a step too.
+    - `varies`: f̃ depends on t other than through x, so that slopes are looked at inside a step too;
+    - `forced_by`: the parameters in which a derivative is wanted, and whose effect on f̃ depends on t.
     """
 
     method: AbstractMethod
@@ -195,6 +206,7 @@ class Stepper(eqx.Module):
     growth: Growth | None
     for_derivatives: bool = eqx.field(static=True, default=False)
     varies: bool = eqx.field(static=True, default=False)
+    forced_by: forcing.Groups = eqx.field(static=True, default=())
 
     def begin(self, x0: Tree) -> SolverState:
         """Before the first step nothing is known but where to look first."""
@@ -207,12 +219,13 @@ class Stepper(eqx.Module):
         rate = jtu.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), blank)
         none = None if self.guard is None else self.guard.start(self.flow, self.ends[0], x0)
         error = _tree.zeros_like(x0) if self.estimate else None
-        direction, others, slope = None, None, None
+        direction, others, slope, forced = None, None, None, None
         if self.for_derivatives:
             space = self.flow.state_space(x0)
             direction = others = power_iteration.pattern(space, x0)
             slope = jnp.zeros_like(self.ends[0])
-        return SolverState(rate, guess, known, none, error, direction, others, slope)
+            forced = jnp.zeros(len(self.forced_by), _tree.dtype(x0))
+        return SolverState(rate, guess, known, none, error, direction, others, slope, forced)
 
     def restart(self, solver_state: SolverState, x: Tree) -> SolverState:
         """Return the state of the stepper after the state of the run was set to x."""
@@ -284,7 +297,7 @@ class Stepper(eqx.Module):
         error, integrated_defect, event, excursion, bounds = None, (0.0, 0.0), None, None, None
         stiffness, signed, carried, estimate = None, None, None, None
         variation, fastest = solver_state.variation, None
-        tangents = solver_state.direction, solver_state.not_decayed, solver_state.slope
+        tangents = solver_state[5:]
         if self.measure:
             slopes = self._slopes(t1 - t0, evaluations)
             whole = None if slopes is None else slopes[1]
@@ -459,56 +472,74 @@ class Stepper(eqx.Module):
         solver_state: SolverState,
         propagators: Propagators | None,
         change: Any,
-    ) -> tuple[Fastest, tuple[Tree, Tree, Any]]:
+    ) -> tuple[Fastest, tuple[Tree, Tree, Any, Any]]:
         """Return what limits the steps of a derivative, and the next directions of the power iteration
-        with the slope at x₁. The `others` are evaluations at the `nodes` in the step and at its end;
-        `change` is that of x over the step, relative to x."""
+        with the slope at x₁ and the largest forcing. The `others` are evaluations at the `nodes` in the
+        step and at its end; `change` is that of x over the step, relative to x."""
         flow, h, first, others, solver_state, propagators, change = _constant(
             (self.flow, h, first, others, solver_state, propagators, change)
         )
         space = flow.state_space(first.x)
         pattern = power_iteration.pattern(space, first.x)
         places, nodes = [first, *others], (0.0, *nodes, 1.0)
+        known = all(v.rate.y is not None for v in places)
+        looks = [(v.t, v.x, v.rate.y if known else solver_state.guess) for v in places]
         if not self.varies:
             # Where nothing but x moves, the step before has looked at the start.
-            places, nodes = places[-1:], nodes[-1:]
-        known = all(v.rate.y is not None for v in places)
+            looks, nodes = looks[-1:], nodes[-1:]
+        elif len(looks) == 2:
+            between = [_between(theta, *looks) for theta in _INSIDE]
+            looks, nodes = [looks[0], *between, looks[1]], (0.0, *_INSIDE, 1.0)
         solved = flow.with_known_response() if known else flow
+        p = forcing.parameters(flow, self.forced_by)
 
-        def look(
-            t: Any, x: Tree, y: Tree | None
-        ) -> tuple[power_iteration.Refined, tuple[Any, Tree]]:
-            value = lambda x: flow.nonlinear_part(x, solved.rate(t, x, y).value)  # noqa: E731
-            push = power_iteration.linearised(value, x)
-            if self.method.is_rosenbrock:
+        def look(t: Any, x: Tree, y: Tree | None) -> tuple[Any, Any, Tree]:
+            def value(x: Tree, p: list[jax.Array]) -> Tree:
+                own = forcing.with_parameters(solved, self.forced_by, p)
+                return flow.nonlinear_part(x, own.rate(t, x, y).value)
+
+            of_both = power_iteration.linearised(value, x, p)
+
+            def push(v: Tree, weights: jax.Array) -> Tree:
+                image = of_both(v, forcing.directions(flow, self.forced_by, weights))
+                if not self.method.is_rosenbrock:
+                    return image
                 assert propagators is not None
-                by, none, remainder = propagators.full, _tree.zeros_like(x), push
-                push = lambda v: by.step(none, (remainder(v),))  # noqa: E731
-            d, e = solver_state.direction, solver_state.not_decayed
-            of_d, of_e = power_iteration.applied_twice(push, d, e)
-            found = power_iteration.refine(space, d, *of_d, pattern)
-            return found, power_iteration.remaining(space, e, *of_e, found.slope, pattern)
+                return propagators.full.step(_tree.zeros_like(x), (image,))
 
-        looks = [(v.t, v.x, v.rate.y if known else solver_state.guess) for v in places]
-        found, (slopes, others) = lax.map(
+            d, e = solver_state.direction, solver_state.not_decayed
+            (of_d, of_e), forced = power_iteration.images(push, (d, e), len(self.forced_by))
+            found = power_iteration.refine(space, d, *of_d, pattern)
+            rest = power_iteration.remaining(space, e, *of_e, found.slope, pattern)
+            return found, rest, forced
+
+        found, (slopes, others), forced = lax.map(
             lambda at: look(*at), jtu.tree_map(lambda *leaves: jnp.stack(leaves), *looks)
         )
         steepest = jnp.argmax(found.slope)
-        variation = power_iteration.variation(space, nodes, found.first)
+        variation, _ = power_iteration.variation(space, nodes, found.first)
+        of_forcing, largest = jnp.zeros_like(h), solver_state.forcing
+        if self.forced_by:
+            rows = jtu.tree_map(lambda leaf: jnp.moveaxis(leaf, 1, 0), forced)
+            each, sizes = jax.vmap(
+                lambda rows, least: power_iteration.variation(space, nodes, rows, least)
+            )(rows, _FADED * largest)
+            of_forcing, largest = jnp.max(each), jnp.maximum(largest, sizes)
         if self.method.is_rosenbrock:
             # The jump of Df̃ at a kink does not shrink with the step, and steps end at kinks.
             slope = jnp.max(jnp.where(self._same_side(first, places), found.slope, 0.0))
             kink, no = found.slope[steepest], jnp.asarray(False)
             zero = jnp.zeros_like(slope)
-            fastest = Fastest(slope, variation, zero, kink, is_damped=no, is_stiff=no)
+            fastest = Fastest(slope, variation, of_forcing, zero, kink, is_damped=no, is_stiff=no)
         else:
             slope = h * jnp.maximum(found.slope[steepest], solver_state.slope)
             is_damped = found.is_damped[steepest]
             rest = h * jnp.max(slopes)
-            fastest = Fastest(slope, variation, rest, slope, is_damped, change < _SLOW * slope)
+            is_stiff = change < _SLOW * slope
+            fastest = Fastest(slope, variation, of_forcing, rest, slope, is_damped, is_stiff)
         direction = jtu.tree_map(lambda leaf: leaf[steepest], found.direction)
         last = jtu.tree_map(lambda leaf: leaf[-1], others)
-        return _constant((fastest, (direction, last, found.slope[-1])))
+        return _constant((fastest, (direction, last, found.slope[-1], largest)))
 
     def _same_side(self, first: Evaluation, others: list[Evaluation]) -> jax.Array:
         """Return for the others whether no kink of the response lies between them and the first one;
@@ -597,6 +628,11 @@ class Stepper(eqx.Module):
             sample = enclosed(self.flow, self.growth, ends, arc, evaluations[-1].rate, span)
         space = self.flow.state_space(values(arc.x1))
         return sample._replace(defect=sample.defect + roundoff(space, arc))
+
+
+def _between(theta: float, *ends: tuple[Any, Tree, Tree | None]) -> tuple[Any, Tree, Tree | None]:
+    """Return (t, x, y) on the line between two."""
+    return jtu.tree_map(lambda a, b: (1.0 - theta) * a + theta * b, *ends)
 
 
 def _constant(tree: Any) -> Any:

@@ -1,5 +1,7 @@
 """The tangent limit: steps that a derivative can take, and the slope that limits them."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +12,7 @@ import dvax
 from dvax import spaces
 from dvax.evolution.control import TangentLimit
 from dvax.evolution.power_iteration import (
-    applied_twice,
+    images,
     pattern,
     refine,
     remaining,
@@ -27,8 +29,9 @@ METHODS = [
 ]
 
 
-def longest(limit, slope, decay, size=1.0, variation=0.0, error=1.0, remaining=0.0):
-    fastest = Fastest(*map(jnp.asarray, (slope, variation, remaining, slope)), YES, NO)
+def longest(limit, slope, decay, size=1.0, variation=0.0, error=1.0, remaining=0.0, forcing=0.0):
+    numbers = slope, variation, forcing, remaining, slope
+    fastest = Fastest(*map(jnp.asarray, numbers), YES, NO)
     return limit.of(fastest, jnp.asarray(decay), attempt(error, size))
 
 
@@ -51,11 +54,11 @@ def test_tangent_limit_rises_to_stability_as_tangents_decay(order, stable, R):
     slope, decay, z = 7.0, jnp.asarray(0.0), 0.0
     for _ in range(400):
         z = float(longest(limit, slope, decay).longest) * slope
-        fastest = Fastest(jnp.asarray(z), ZERO, ZERO, ZERO, YES, YES)
+        fastest = Fastest(jnp.asarray(z), ZERO, ZERO, ZERO, ZERO, YES, YES)
         decay = limit.after(fastest, decay, jnp.asarray(1e-3), YES, NO)
     assert z == pytest.approx(0.8 * 0.8 * stable) and abs(R(-z)) < 1.0
     # It falls back where tangents are excited, and where they do not decay.
-    steady = Fastest(jnp.asarray(z), ZERO, ZERO, ZERO, NO, YES)
+    steady = Fastest(jnp.asarray(z), ZERO, ZERO, ZERO, ZERO, NO, YES)
     for at, excited in ((fastest, YES), (steady, NO)):
         assert float(limit.after(at, decay, jnp.asarray(1e-3), YES, excited)) == 0.0
     # At rest it rises more slowly.
@@ -82,7 +85,7 @@ def test_tangent_limit_keeps_a_step_size_within_a_fifth_and_ignores_a_slope_of_z
 
 
 def refined(space, push, d, p):
-    ((one, two),) = applied_twice(push, d)
+    ((one, two),), _ = images(lambda v, weights: push(v), (d,), 0)
     return refine(space, d, one, two, p)
 
 
@@ -123,20 +126,22 @@ def test_what_has_not_decayed_is_an_oscillation_or_the_slowest_solution():
         p = e = pattern(space, jnp.zeros(6))
         sigma = max(40.0, w)
         for _ in range(60):
-            ((one, two),) = applied_twice(lambda v, B=Q @ B @ Q.T: B @ v, e)
+            ((one, two),), _ = images(lambda v, _, B=Q @ B @ Q.T: B @ v, (e,), 0)
             slope, e = remaining(space, e, one, two, jnp.asarray(sigma), p)
         assert 0.5 * w <= float(slope) <= 1.1 * max(w, 3.0)
 
 
-def test_two_applications_to_each_of_several_trees():
+def test_images_are_those_of_two_applications_and_of_each_parameter():
     rng = np.random.default_rng(0)
-    B = rng.normal(size=(3, 3))
+    B, G = rng.normal(size=(3, 3)), rng.normal(size=(4, 3))
     trees = [(jnp.asarray(rng.normal(size=3)), jnp.asarray(rng.normal())) for _ in range(3)]
-    images = applied_twice(lambda v: (B @ v[0], 2.0 * v[1]), *trees)
-    for (v, a), (one, two) in zip(trees, images, strict=True):
-        np.testing.assert_allclose(one[0], B @ v, rtol=1e-14)
+    twice, forced = images(lambda v, w: (B @ v[0] + w @ G, 2.0 * v[1] + w[0]), tuple(trees), 4)
+    for (v, a), (one, two) in zip(trees, twice, strict=True):
+        np.testing.assert_allclose(one[0], B @ v, rtol=1e-13)
         np.testing.assert_allclose(two[0], B @ B @ v, rtol=1e-13)
         assert float(one[1]) == 2.0 * a and float(two[1]) == 4.0 * a
+    np.testing.assert_allclose(forced[0], G, rtol=1e-14)
+    np.testing.assert_array_equal(forced[1], [1.0, 0.0, 0.0, 0.0])
 
 
 def test_power_iteration_finds_the_radius_in_any_units():
@@ -171,18 +176,32 @@ def test_variation_is_the_frequency_of_a_wave_and_zero_for_a_polynomial(method):
     space, at = spaces.Euclidean(2), jnp.asarray(nodes)
     for turn in (0.03, 0.3, 1.0):
         rows = jnp.stack([jnp.cos(turn * at), jnp.sin(turn * at)], 1)
-        assert float(variation(space, nodes, rows)) == pytest.approx(turn, rel=0.05)
+        assert float(variation(space, nodes, rows)[0]) == pytest.approx(turn, rel=0.05)
     degree = len(nodes) - 2
     rows = jnp.stack([at**degree, 1.0 - 3.0 * at], 1)
     # The root of a rounding.
-    assert float(variation(space, nodes, rows)) <= (1e4 * np.finfo(float).eps) ** (1 / (degree + 1))
+    assert float(variation(space, nodes, rows)[0]) <= (1e4 * np.finfo(float).eps) ** (
+        1 / (degree + 1)
+    )
     # Samples of a wave that is much faster show that it is not resolved, unless they meet the same
     # phase by chance.
     turns = np.outer(np.random.default_rng(len(nodes)).uniform(5.0, 1e3, 400), nodes)
     rows = jnp.stack([jnp.cos(turns), jnp.sin(turns)], 2)
-    found = jax.vmap(lambda rows: variation(space, nodes, rows))(rows)
+    found = jax.vmap(lambda rows: variation(space, nodes, rows)[0])(rows)
     assert np.mean(found >= 1.0) >= 0.98
-    assert float(variation(space, (1.0,), rows[0, :1])) == 0.0
+    assert float(variation(space, (1.0,), rows[0, :1])[0]) == 0.0
+
+
+@pytest.mark.parametrize("order", [2, 4, 5])
+def test_tangent_limit_resolves_a_forcing_whether_the_state_moves_or_not(order):
+    limit = TangentLimit(jnp.asarray(1e-6), 1.0, order, 3.0)
+    for error in (0.0, 1e-3, 1.0):
+        found = [
+            float(longest(limit, 1e-9, 0.0, forcing=z, error=error).longest) for z in (1.0, 4.0)
+        ]
+        # (hω)^p/(p+1)! is 10 rtol, with the usual distance.
+        resolved = (math.factorial(order + 1) * 1e-5) ** (1.0 / order)
+        assert found == pytest.approx([0.8 * resolved, 0.2 * resolved])
 
 
 @pytest.mark.parametrize("order", [2, 4, 5])

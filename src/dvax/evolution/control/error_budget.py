@@ -62,6 +62,8 @@ class ErrorBudget(NamedTuple):
         above = (attempt.error > 1.0) & jnp.isfinite(attempt.integrated)
         left = jnp.maximum(self.remaining - attempt.integrated, 0.0)
         remaining = jnp.where(accepted & above & ~is_roundoff, left, self.remaining)
-        crossed = jnp.where(accepted & ~covered & (attempt.error > 1.0), self.crossings + 1, self.crossings)
+        crossed = jnp.where(
+            accepted & ~covered & (attempt.error > 1.0), self.crossings + 1, self.crossings
+        )
         onward = accepted & (attempt.error <= 1.0) & (attempt.size > 16.0 * attempt.smallest)
         return ErrorBudget(remaining, jnp.where(onward, 0, crossed))

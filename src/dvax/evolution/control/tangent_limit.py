@@ -76,7 +76,8 @@ class TangentLimit(eqx.Module):
     up to the limit of stability of the method, or up to 1 where the fastest solutions do not decay.
     What has not decayed (`power_iteration.remaining`) has a limit of its own, with its slope and D = 0.
     Where the state stands still, a B that varies in time as e^{iωt} is resolved as well: with z the
-    smaller of hω and hω (Tσ)^{1/p}, T being the `span` of the run.
+    smaller of hω and hω (Tσ)^{1/p}, T being the `span` of the run. So is a forcing by parameters with
+    hω, always: nothing of it is in x where its amplitude is zero.
 
     `order` is p, `stable` the limit of stability on the negative axis; `is_exact` for a method that
     linearises, whose B is the change of f̃' since the start of the step.
@@ -90,7 +91,7 @@ class TangentLimit(eqx.Module):
 
     def of(self, fastest: Fastest, decay: Any, attempt: Attempt) -> StepLimit:
         """Return the limit after an attempt, where `decay` is D."""
-        slope, variation, remaining, kink, is_damped, is_stiff = lax.stop_gradient(fastest)
+        slope, variation, forcing, remaining, kink, is_damped, is_stiff = lax.stop_gradient(fastest)
         size, smallest = attempt.size, attempt.smallest
         error = _SHARE * jnp.maximum(self.rtol, jnp.finfo(size.dtype).eps)
         resolved = (math.factorial(self.order + 1) * error) ** (1.0 / self.order)
@@ -101,6 +102,7 @@ class TangentLimit(eqx.Module):
         of_slope = jnp.minimum(of_slope, _share(jnp.minimum(resolved, _LARGEST_TURN), remaining))
         variation = variation * jnp.minimum(slope * self.span / size, 1.0) ** (1.0 / self.order)
         of_change = jnp.where(self._is_at_rest(attempt.error), _share(accurate, variation), jnp.inf)
+        of_change = jnp.minimum(of_change, _share(resolved, forcing))
         if self.is_exact:
             of_change, of_slope = jnp.minimum(of_slope, of_change), jnp.full_like(slope, jnp.inf)
         finest = _FINEST * self.span
