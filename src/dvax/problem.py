@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import _control_shape, _knots, _tree, _user_code
+from ._captured import current
 from ._jax import outlined
 from ._once import once_per_object
 from ._tree import Tree
@@ -209,7 +210,7 @@ class Problem(eqx.Module):
 
         The residual is at most 1e-10, or the roundoff. The first call compiles; later calls with the
         same functions and shapes reuse the program. Pass values that change in `args`: a number that
-        f, h, A, P or K reads from its closure is read at compilation only.
+        f, h, A, P or K reads from around it makes another program when it changes.
 
         **Raises:** `dvax.SolveError` if the solver fails. If the failure is traced (`jax.jit`,
         `jax.vmap`), values and derivatives are NaN instead.
@@ -227,6 +228,7 @@ class Problem(eqx.Module):
     def _solve_law(self, t: Any, x: Tree, args: Any, solver: Any, of_rate: bool) -> Tree:
         """Return u_x(t), or f̃(t, x) if `of_rate`, after checking the input and the solution of the
         law."""
+        self = current(self)
         x, t = _tree.as_float(x, "x"), _tree.as_float(t, "t")
         for name, value in (("t", t), ("x", x)):
             _tree.check_not_nan(name, value)

@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree, _user_code
+from .._captured import current
 from .._tree import Tree
 from ..errors import InputError, Problems
 from ..evolution import RESULTS, Event, Implicit, PiecewiseLinear, Solution, solve
@@ -114,6 +115,7 @@ def ensemble(
     )  # fmt: skip
     check_events(events, max_events, method, dt, False)
     check_own(method, observe, folds, keep, lanes, axes)
+    problem = current(problem)
     states, times = _tree.as_float(x0s, "x0s"), (_times(t0), _times(t1))
     inputs = Inputs.of(states, as_arrays(args), *times, _times(ts), axes)
     _check_times(inputs)

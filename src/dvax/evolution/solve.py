@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree, _user_code
+from .._captured import current
 from .._jax.messages import is_reverse_only
 from .._tree import Tree
 from ..errors import DifferentiationError, InputError, input_error
@@ -160,7 +161,7 @@ def solve(
         others = dense, bool(events), certified_tol is not None
         check_save(save, ts, x0, args, others)
     check_events(events, max_events, method, dt, certified_tol is not None)
-    x0 = _state(problem, x0)
+    problem, x0 = current(problem), _state(problem, x0)
     call = Arguments(
         problem, x0, t0, t1, args, ts, dt, rtol, atol, method, vi_solver, progress, constants,
         certified_tol, measure, dense, dt0, dt_max, horizon, max_steps, adjoint, throw, events,
@@ -333,7 +334,7 @@ def _examined(setup: Setup, times: Any, options: Options, solution: Solution) ->
 
 def prepared(call: Arguments) -> tuple[Setup, Any, Options]:
     """Return what `solve` compiles for these arguments: the setup, the saved times and the options."""
-    call = call._replace(x0=_state(call.problem, call.x0))
+    call = call._replace(problem=current(call.problem), x0=_state(call.problem, call.x0))
     check(call)
     call, choice = _chosen(call)
     setup, options = arranged(call, choice.method)

@@ -25,6 +25,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from .._captured import current
 from .._dataset import Variable, dataset, described
 from .._once import once_per_object
 from .._repr import is_known, last_text, table, value_text
@@ -157,6 +158,7 @@ def bound_error(
 
     ```
     """
+    problem = current(problem)
     _check(problem, sol, constants, initial_error)
     return _bound_error(
         problem, sol, constants, _initial_errors(initial_error, constants, sol.ts.dtype)
@@ -171,6 +173,7 @@ def continue_bound(problem: Problem, sol: Solution, constants: Constants, before
     ∫₀ᵗ = e^{c(t−τ)} ∫₀^τ + ∫_τ^t, and M multiplies their sum once. `bound_error` does not assume that
     the pieces have one semigroup.
     """
+    problem = current(problem)
     _check(problem, sol, constants, before)
     if before.integrals is None:
         return bound_error(problem, sol, constants, initial_error=before)
@@ -338,12 +341,14 @@ def _check(problem: Problem, sol: Any, constants: Any, initial_error: Any) -> No
         if not is_valid
     )  # fmt: skip
     problems.raise_any()
-    if sol.setup.problem is not problem and sol.setup.problem != problem:
+    solved = current(sol.setup.problem)
+    if solved is not problem and solved != problem:
         problems.add(
             "dvax.bound_error(problem, sol)",
-            "a solution of another problem",
+            "a solution of another problem, or of this one with other values of what f, h or K reads "
+            "from around it (a global, a closure, an attribute)",
             "the certificate evaluates the defect of this problem",
-            "Pass the problem that was solved",
+            "Pass the problem that was solved, and values that change in args",
         )
     if isinstance(sol.setup.method, Implicit):
         problems.add(

@@ -8,6 +8,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree, _user_code
+from .._captured import current
 from .._tree import Tree
 from ..errors import InputError, InputProblem, input_error
 from ..evolution.nonfinite import nonfinite_data
@@ -143,6 +144,7 @@ def verify(
 
     ```
     """
+    problem = current(problem)
     t0, t1 = time_span(t0, t1, "dvax.verify(t0, t1)")
     _user_code.check_args(args, "dvax.verify")
     x0 = state_for(problem, x0, t0, args, "dvax.verify(x0)")

@@ -1,0 +1,203 @@
+"""The values that the functions of a problem read from around them: closures, globals, defaults, and
+attributes of objects.
+
+A compiled program contains the values that f, h, K, A and P read when they were traced. So that a value
+that has changed since is not missed, a problem is used as `current(problem)`: its functions compare as
+equal only if what they read is equal. Values in args do not need this, and change without another
+compilation.
+"""
+
+import functools
+import hashlib
+import math
+import sys
+import types
+from collections.abc import Callable, Hashable
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.tree_util as jtu
+import numpy as np
+
+from ._once import once_per_object
+
+_LIBRARIES = frozenset(
+    {"dvax", "equinox", "jax", "jaxlib", "jaxtyping", "numpy", "scipy", "optimistix", "builtins"}
+) | set(sys.stdlib_module_names)
+"""Packages whose functions read nothing that a user changes."""
+
+_DEPTH = 4
+"""Levels of containers, objects and functions that are looked into."""
+
+_MAX_ENTRIES = 10_000
+"""Largest container whose entries are compared one by one."""
+
+_MAX_VERSIONS = 16
+
+Part = TypeVar("Part")
+
+
+class _Same:
+    """A key of an object that is compared by identity, and kept alive so that no other one has it."""
+
+    def __init__(self, one: Any):
+        self.one = one
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.one is self.one
+
+    def __hash__(self) -> int:
+        return id(self.one)
+
+
+class _Captured:
+    """A function with the key of what it reads."""
+
+    def __init__(self, fn: Callable[..., Any], key: Hashable):
+        functools.update_wrapper(self, fn, updated=())
+        self.fn, self.key = fn, key
+
+    def __call__(self, *args: Any) -> Any:
+        return self.fn(*args)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Captured) and other.fn == self.fn and other.key == self.key
+
+    def __hash__(self) -> int:
+        return hash((self.fn, self.key))
+
+    def __repr__(self) -> str:
+        return repr(self.fn)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _itself, (self.fn,)
+
+
+def _itself(fn: Any) -> Any:
+    return fn
+
+
+def current(part: Part) -> Part:
+    """Return a problem whose functions are distinguished by the values that they read now: the same
+    object as long as these are equal."""
+    places = _functions(part) if isinstance(part, eqx.Module) else ()
+    if not places:
+        return part
+    keys = tuple(_of_function(fn, _DEPTH, frozenset()) for _, fn in places)
+    if not any(keys):
+        return part
+    versions = _versions(part)
+    found = versions.get(keys)
+    if found is None:
+        if len(versions) >= _MAX_VERSIONS:
+            versions.clear()
+        leaves, tree = jtu.tree_flatten(part)
+        for (place, fn), key in zip(places, keys, strict=True):
+            if key:
+                leaves[place] = _Captured(fn, key)
+        found = versions[keys] = jtu.tree_unflatten(tree, leaves)
+    return found
+
+
+@once_per_object
+def _functions(part: Any) -> tuple[tuple[int, Any], ...]:
+    """Return the functions of the user among the leaves, with their places."""
+    found = enumerate(jtu.tree_leaves(part))
+    return tuple((k, leaf) for k, leaf in found if callable(leaf) and _is_own(leaf))
+
+
+@once_per_object
+def _versions(part: Any) -> dict[Any, Any]:
+    """Return a table of the versions of a problem, by the keys of its functions."""
+    return {}
+
+
+def _is_own(one: Any) -> bool:
+    """Return whether a function or an object is not one of a library, and none with a key already."""
+    if isinstance(one, _Captured):
+        return False
+    kind = one if isinstance(one, types.FunctionType | types.MethodType) else type(one)
+    if isinstance(one, functools.partial | types.SimpleNamespace):
+        return True
+    return str(getattr(kind, "__module__", "")).split(".")[0] not in _LIBRARIES
+
+
+def _of_function(fn: Any, depth: int, seen: frozenset[int]) -> tuple[Hashable, ...]:
+    """Return the keys of what a function reads, empty if it reads nothing that may change."""
+    if depth == 0 or id(fn) in seen:
+        return ()
+    seen = seen | {id(fn)}
+    if isinstance(fn, functools.partial):
+        return tuple(_key(v, depth, seen) for v in (fn.func, list(fn.args), fn.keywords))
+    if isinstance(fn, types.MethodType):
+        return _key(fn.__self__, depth, seen), *_of_function(fn.__func__, depth, seen)
+    if not isinstance(fn, types.FunctionType):
+        call = getattr(type(fn), "__call__", None)  # noqa: B004 (the code of its calls is wanted)
+        own = _of_function(call, depth, seen) if isinstance(call, types.FunctionType) else ()
+        return _key(fn, depth, seen - {id(fn)}), *own
+    values = []
+    for cell in fn.__closure__ or ():
+        try:
+            values.append(cell.cell_contents)
+        except ValueError:
+            continue  # not assigned yet
+    values += fn.__defaults__ or ()
+    values += (fn.__kwdefaults__ or {}).values()
+    names, around = _names(fn.__code__), fn.__globals__
+    for name in names:
+        value = around.get(name)
+        if isinstance(value, types.ModuleType):
+            if value.__name__.split(".")[0] not in _LIBRARIES:
+                values += [vars(value)[n] for n in names if n in vars(value)]
+        elif value is not None:
+            values.append(value)
+    keys = (_key(value, depth - 1, seen) for value in values)
+    return tuple(key for key in keys if key is not None)
+
+
+@functools.lru_cache(1024)
+def _names(code: types.CodeType) -> tuple[str, ...]:
+    """Return the names that code and the functions defined in it read from around them."""
+    inner = (c for c in code.co_consts if isinstance(c, types.CodeType))
+    return tuple(dict.fromkeys([*code.co_names, *(n for c in inner for n in _names(c))]))
+
+
+def _key(value: Any, depth: int, seen: frozenset[int]) -> Hashable:
+    """Return a key of a value, None if it cannot change."""
+    kind = type(value)
+    if value is None or kind in (bool, int, str, bytes, complex):
+        return kind, value
+    if kind is float:
+        return kind, value.hex(), math.copysign(1.0, value)
+    if isinstance(value, np.ndarray | np.generic):
+        array = np.asarray(value)
+        if array.dtype.hasobject:
+            return _Same(value)
+        digest = hashlib.blake2b(np.ascontiguousarray(array).data, digest_size=16).digest()
+        return kind, array.shape, str(array.dtype), digest
+    if isinstance(value, jax.core.Tracer | types.ModuleType):
+        return None
+    if id(value) in seen:
+        return None
+    if isinstance(value, jax.Array) or depth == 0:
+        return _Same(value)
+    seen = seen | {id(value)}
+    if isinstance(value, list | tuple | set | frozenset) and len(value) <= _MAX_ENTRIES:
+        return kind, tuple(_key(v, depth - 1, seen) for v in value)
+    if isinstance(value, dict) and len(value) <= _MAX_ENTRIES:
+        pairs = ((_key(k, 1, seen), _key(v, depth - 1, seen)) for k, v in value.items())
+        return kind, tuple(pairs)
+    if isinstance(value, eqx.Module):
+        functions = _functions(value)
+        return _Same(value), *(_of_function(fn, depth - 1, seen) for _, fn in functions)
+    is_function = isinstance(value, types.FunctionType | types.MethodType | functools.partial)
+    if not _is_own(value) or isinstance(value, type):
+        return None if is_function else _Same(value)
+    if is_function:
+        return _Same(value), _of_function(value, depth, seen - {id(value)})
+    try:
+        attributes = vars(value)
+    except TypeError:
+        return _Same(value)
+    return _Same(value), tuple((n, _key(v, depth - 1, seen)) for n, v in attributes.items())

@@ -1,0 +1,178 @@
+"""What f, h and K read from around them may change between two calls: no program with the old values is
+used."""
+
+import dataclasses
+import functools
+import pickle
+import types
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dvax
+from dvax._captured import current
+
+LOAD = 3.0
+
+
+class Plant:
+    def __init__(self):
+        self.load = 3.0
+
+    def rate(self, t, x, u, args):
+        return self.load - 0.5 * x - u
+
+    def __call__(self, t, x, u, args):
+        return self.load - 0.5 * x - u
+
+
+@dataclasses.dataclass
+class Data:
+    inner: dict = dataclasses.field(default_factory=lambda: {"load": [3.0]})
+
+
+def doubled(x):
+    return LOAD - 0.5 * x
+
+
+def scaled(table, t, x, u, args):
+    return table["load"] - 0.5 * x - u
+
+
+def by_global():
+    return lambda t, x, u, args: LOAD - 0.5 * x - u, lambda v: globals().update(LOAD=v)
+
+
+def by_helper():
+    return lambda t, x, u, args: doubled(x) - u, lambda v: globals().update(LOAD=v)
+
+
+def by_closure():
+    load = 3.0
+
+    def change(v):
+        nonlocal load
+        load = v
+
+    return lambda t, x, u, args: load - 0.5 * x - u, change
+
+
+def by_container(make, put):
+    table = make()
+    return lambda t, x, u, args: float(table[0]) - 0.5 * x - u, functools.partial(put, table)
+
+
+def by_namespace():
+    space = types.SimpleNamespace(load=3.0)
+    return lambda t, x, u, args: space.load - 0.5 * x - u, lambda v: setattr(space, "load", v)
+
+
+def by_dataclass():
+    data = Data()
+    change = lambda v: data.inner["load"].__setitem__(0, v)  # noqa: E731
+    return lambda t, x, u, args: data.inner["load"][0] - 0.5 * x - u, change
+
+
+def by_method():
+    plant = Plant()
+    return plant.rate, lambda v: setattr(plant, "load", v)
+
+
+def by_object():
+    plant = Plant()
+    return plant, lambda v: setattr(plant, "load", v)
+
+
+def by_partial():
+    table = {"load": 3.0}
+    return functools.partial(scaled, table), lambda v: table.update(load=v)
+
+
+def put(table, v):
+    table[0] = v
+
+
+WAYS = {
+    "global": by_global,
+    "global of a helper": by_helper,
+    "closure": by_closure,
+    "list": lambda: by_container(lambda: [3.0], put),
+    "dict": lambda: by_container(lambda: {0: 3.0}, put),
+    "array": lambda: by_container(lambda: np.array([3.0]), put),
+    "namespace": by_namespace,
+    "dataclass": by_dataclass,
+    "method": by_method,
+    "object": by_object,
+    "partial": by_partial,
+}
+
+
+def problem(f):
+    return dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+        f=f, h=lambda t, x, u, args: 1.0 - 2.0 * x - u,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_value_that_was_changed_is_read_again(way):
+    f, change = WAYS[way]()
+    change(3.0)
+    one = problem(f)
+    found = []
+    for load in (3.0, 5.0, 3.0):
+        change(load)
+        found.append(float(dvax.solve(one, -1.0, 0.0, 2.0).xs[-1]))
+    change(3.0)
+    assert found[0] == pytest.approx(1.836091956, abs=1e-5)
+    assert found[1] == pytest.approx(3.110066757, abs=1e-5)
+    assert found[2] == found[0]
+
+
+def test_an_iterated_law_a_set_and_the_response_are_read_again():
+    limit, slope = {"v": 1.0}, [1.0]
+    one = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0),
+        K=lambda t, args: dvax.sets.Simplex(limit["v"]),
+        f=lambda t, x, u, args: u - x,
+        h=lambda t, x, u, args: slope[0] * jnp.array([1.0, 0.8]) + 0.1 * jnp.tanh(u),
+    )  # fmt: skip
+    x0, sums = jnp.zeros(2), []
+    for v, s in ((1.0, 1.0), (2.0, 1.0), (2.0, 3.0)):
+        limit["v"], slope[0] = v, s
+        u = one.response(0.0, x0)
+        sums.append(float(jnp.sum(u)))
+        # x follows the constant u.
+        end = dvax.solve(one, x0, 0.0, 1.0).xs[-1]
+        np.testing.assert_allclose(end, (1.0 - np.exp(-1.0)) * u, atol=1e-5)
+    assert sums == pytest.approx([1.0, 2.0, 2.0])
+
+
+def test_a_bound_of_a_solution_with_other_values_is_refused():
+    f, change = by_namespace()
+    one = problem(f)
+    sol = dvax.solve(one, -1.0, 0.0, 2.0, method=dvax.ETD2RK())
+    constants = dvax.verify(one, -1.0, 0.0, 2.0).constants
+    assert dvax.bound_error(one, sol, constants).status == "proved"
+    change(5.0)
+    with pytest.raises(dvax.InputError, match="other values of what f, h or K reads"):
+        dvax.bound_error(one, sol, constants)
+
+
+def test_nothing_new_is_the_same_problem_and_solutions_can_be_pickled():
+    one = problem(Plant())
+    assert current(one) is current(one) and current(current(one)) is current(one)
+    plain = problem(lambda t, x, u, args: -u)
+    assert current(plain) is plain
+    own = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
+        f=functools.partial(scaled, {"load": 3.0}), h=unloaded,
+    )  # fmt: skip
+    sol = dvax.solve(own, -1.0, 0.0, 2.0)
+    again = pickle.loads(pickle.dumps(sol))  # noqa: S301
+    np.testing.assert_array_equal(again.xs, sol.xs)
+
+
+def unloaded(t, x, u, args):
+    return 1.0 - 2.0 * x - u
