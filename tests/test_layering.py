@@ -23,7 +23,7 @@ FLOORS = {
     "_small_matrices": -1,
     "_failure": -1,
     "_once": -2,
-    "_captured": -1,
+    "_captured": 0,
     "_jax": -1,
     "programs": -0.5,
     "_user_code": 0,

@@ -20,6 +20,7 @@ import jax
 import jax.tree_util as jtu
 import numpy as np
 
+from . import _tree
 from ._once import once_per_object
 
 _LIBRARIES = frozenset(
@@ -176,7 +177,7 @@ def _key(value: Any, depth: int, seen: frozenset[int]) -> Hashable:
             return _Same(value)
         digest = hashlib.blake2b(np.ascontiguousarray(array).data, digest_size=16).digest()
         return kind, array.shape, str(array.dtype), digest
-    if isinstance(value, jax.core.Tracer | types.ModuleType):
+    if isinstance(value, types.ModuleType) or not _tree.is_concrete(value):
         return None
     if id(value) in seen:
         return None

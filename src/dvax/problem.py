@@ -83,11 +83,14 @@ class Problem(eqx.Module):
     - `f(t, x, u, args)`, `h(t, x, u, args)`: traceable by JAX; x and u are arrays, or tuples of
       arrays;
     - `state_space`, `control_space`: needed if they are not Euclidean. u has the shape that P and K
-      determine (by a matrix, or vectors of bounds; not by a callable), else that of x. Pass the
-      control space if u has another shape, such as `control_space=dvax.spaces.Euclidean(())` for a
-      number u and a vector x.
+      determine (by a matrix, or vectors of bounds; not by a callable), else that of x, and is then in
+      the state space, with its weights: K is projected onto in their norm. Pass the control space if u
+      has another shape or other weights, such as `control_space=dvax.spaces.Euclidean(())` for a number
+      u and a vector x.
 
-    `args` is the parameter η of the paper: any pytree, which is passed to all of these.
+    `args` is the parameter η of the paper: any pytree, which is passed to all of these. Other values
+    that f, h, K, A and P read (globals, closures, attributes of objects) may change between two calls,
+    each of which then compiles a program again: pass numbers that change in `args`.
 
     ```python
     >>> import dvax

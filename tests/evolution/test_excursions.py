@@ -140,3 +140,22 @@ def test_single_precision_state_beside_a_moving_set_of_double_precision(method):
         single, double = solve(jnp.float32), solve(jnp.float64)
     assert single.dtype == jnp.float32
     assert np.allclose(single, double, atol=1e-3)
+
+
+@pytest.mark.parametrize("method", [dvax.DormandPrince(), dvax.ETD4RK(), dvax.ExpRosenbrock()])
+def test_a_set_that_was_made_in_single_precision_limits_a_run_in_double_precision(method):
+    """Its numbers have no effect on the type: 1.0 is 1.0 in both."""
+    with jax.enable_x64(False):
+        early = dvax.sets.Box(-1.0, 1.0)
+    table = dvax.signals.Table(np.arange(5.0), np.array([1.0, 2.0, 0.0, 3.0, 1.0]))
+
+    def end(K):
+        problem = dvax.Problem(
+            A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=K,
+            control_space=dvax.spaces.Euclidean(()),
+            f=lambda t, x, u, args: args(t) - u, h=lambda t, x, u, args: 3.0 * (args(t) - x),
+        )  # fmt: skip
+        return dvax.solve(problem, 0.0, 0.0, 4.0, table, method=method).xs[-1]
+
+    with jax.numpy_dtype_promotion("standard"):
+        assert end(early) == end(dvax.sets.Box(-1.0, 1.0))

@@ -49,3 +49,32 @@ def test_table_created_inside_f_is_integrated_exactly(kind, method, shift):
     exact = np.interp(ts, fine, np.append(0.0, grown))
     np.testing.assert_allclose(sol.xs, exact, atol=1e-9)
     assert int(sol.stats["rejected"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("q", "method"),
+    mostly_thorough(
+        [
+            (q, m)
+            for q in (1, 2, 5, 8)
+            for m in (dvax.ETD2RK(), dvax.ETD4RK(), dvax.DormandPrince(), dvax.ExpRosenbrock())
+        ],
+        [(5, dvax.ETD2RK()), (2, dvax.ExpRosenbrock())],
+    ),
+)
+def test_a_kink_that_no_code_declares_is_crossed(q, method):
+    """A hat around t = q, from a table that is read by floor(t): its kinks are not found, and no
+    enclosure holds across them. Until then x is exactly 0, and any step is accurate."""
+    values = jnp.zeros(12).at[q].set(1.0)
+
+    def hat(t):
+        i = jnp.floor(t).astype(int)
+        return values[i] + (t - jnp.floor(t)) * (values[i + 1] - values[i])
+
+    problem = dvax.Problem(
+        A=generators.Scalar(-1.0), P=operators.Scaling(1.0), K=sets.Box(-5.0, 5.0),
+        f=lambda t, x, u, args: u, h=lambda t, x, u, args: hat(t),
+    )  # fmt: skip
+    assert len(problem.knots(0.0, 10.0, jnp.zeros(()))) == 0
+    end = dvax.solve(problem, 0.0, 0.0, 10.0, method=method).xs[-1]
+    assert float(end) == pytest.approx(np.exp(q - 10.0) * (2.0 * np.cosh(1.0) - 2.0), abs=2e-6)

@@ -50,7 +50,7 @@ def _known_name(eqn: Any) -> str | None:
 
     The name of the call must match (functions with a derivative of their own have none in some versions
     of JAX), and its program must be that of JAX for these shapes. `searchsorted` counts for a single
-    number only.
+    number only, and `interp` without values of its own outside of the table.
     """
     name = eqn.params.get("name")
     inner = inner_program(eqn)
@@ -60,6 +60,8 @@ def _known_name(eqn: Any) -> str | None:
         return None
     avals = tuple((v.aval.shape, str(v.aval.dtype), v.aval.weak_type) for v in eqn.invars)
     if name == "searchsorted" and (len(avals) != 2 or len(avals[0][0]) != 1 or avals[1][0] != ()):
+        return None
+    if name == "_interp" and len(avals) != 3:
         return None
     return name if _text(inner) in _programs(name, avals) else None
 

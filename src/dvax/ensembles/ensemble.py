@@ -198,11 +198,11 @@ def _ensemble(
     """Return the ensemble, after solving members by another method where stability or rounding limited
     the steps of the first."""
     text, switched = str(choice.text()), np.zeros(inputs.count, bool)
-    for result in (RESULTS.stiff, RESULTS.step_too_small):
+    others = [(r, c) for r in (RESULTS.stiff, RESULTS.step_too_small) for c in choice.after(r)]
+    for result, other in others if choice.reason else []:
         assert kept.rows is not None
         members = np.flatnonzero(np.asarray(kept.rows.result == result))
-        other = choice.after(result) if choice.reason else None
-        if other is None or not len(members):
+        if not len(members):
             continue
         before = kept.take(members)
         collect(kept, program(other), inputs, members, devices)

@@ -91,15 +91,17 @@ class Choice(NamedTuple):
         name = type(self.method).__name__
         return Label(f"{name}: {self.reason}{where}" if self.reason else name)
 
-    def after(self, result: RESULTS) -> "Choice | None":
-        """Return the choice after a run of the method that ended with `result`."""
+    def after(self, result: RESULTS) -> "list[Choice]":
+        """Return what to try, in this order, after a run of the method that ended with `result`."""
         first = type(self.method).__name__
         if result == RESULTS.stiff:
-            return Choice(self.fallback, f"stability limited the steps of {first}")
-        if result == RESULTS.step_too_small and not isinstance(self.method, ETD2RK):
-            # Its defect is zero where f̃ is a line in t, however steep, and enclosed elsewhere.
-            return Choice(_ETD2RK, f"rounding limited the steps of {first}")
-        return None
+            return [Choice(self.fallback, f"stability limited the steps of {first}")]
+        if result != RESULTS.step_too_small or isinstance(self.method, ETD2RK):
+            return []
+        # The defect of ETD2RK is zero where f̃ is a line in t, however steep, and enclosed elsewhere.
+        # Over a long run DormandPrince has fewer and longer steps than both.
+        others = [_DORMANDPRINCE] * isinstance(self.method, ExpRosenbrock) + [_ETD2RK]
+        return [Choice(other, f"rounding limited the steps of {first}") for other in others]
 
 
 class Facts(NamedTuple):

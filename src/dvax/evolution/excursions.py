@@ -119,15 +119,15 @@ class ExcursionGuard(eqx.Module):
                 changes, dev = jax.vmap(lambda p, q: self._pulses(flow, p, q))(first, second)
             largest = lambda tree: jtu.tree_map(lambda leaf: jnp.max(leaf, axis=0), tree)  # noqa: E731
             decay = 0.5 ** (_HALVINGS * share)
+            # Numbers in a set may have a shorter type than x, or a longer one.
             variation = jtu.tree_map(
-                lambda v, m: jnp.maximum(decay * v, m), variation, largest(changes)
+                lambda v, m: jnp.maximum(decay * v, m).astype(v.dtype), variation, largest(changes)
             )
             excess = jtu.tree_map(
                 lambda d, v: jnp.maximum(d - _VARIATION_SHARE * v, 0.0), largest(dev), variation
             )
             # A pulse in one entry of f changes x as its share of the mean does.
             means = [jnp.sqrt(jnp.mean(leaf**2)) for leaf in excess[0]]
-            # Numbers in a set may have a longer type than x: dvax.sets.Ball(0.0, …) beside float32.
             rates, laws = (
                 _largest(part).astype(zero.dtype) if part else zero for part in (means, excess[1])
             )

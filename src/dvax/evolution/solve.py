@@ -417,13 +417,13 @@ def _run_chosen(
             guarded, times, options._replace(watch_stiffness=choice.fallback is not None)
         )
         if isinstance(reached, bool):
-            other = None if reached else choice.after(solution.result)
-            if other is not None:
-                t = float(_tree.primal(solution.stats["t"]))
+            t = float(_tree.primal(solution.stats["t"]))
+            for other in [] if reached else choice.after(solution.result):
                 again = setup._replace(method=other.method)
                 second, reached = _differentiably(again, times, options)
                 if reached or solution.result == RESULTS.stiff:
                     text, solution = other.text(f" at t = {t:.6g}"), second
+                    break
             solution.stats["method"] = text
             return solution, reached
         # f, h or K closes over what is traced, so that no other method can follow this one.

@@ -146,8 +146,8 @@ def _remedy(has_energy: bool) -> str:
     """Return what to try for a smaller bound."""
     other = (
         "constants of a region (constants=dvax.verify(problem, x0, x=(low, high)).constants of "
-        "dvax.models.Model), weights of the state space (state_space=dvax.spaces.L2(weights)) or a "
-        "shorter run"
+        "dvax.models.Model), weights of the state space (state_space=dvax.spaces.L2(weights), with "
+        "control_space= if u has the shape of x) or a shorter run"
     )
     linear = "energy = true in [model], if the derivatives of f and h do not change,"
     first = "Try" if has_energy else f"Try {linear}"
