@@ -22,6 +22,7 @@ import numpy as np
 
 from . import _tree
 from ._once import once_per_object
+from .errors import input_error
 
 _LIBRARIES = frozenset(
     {"dvax", "equinox", "jax", "jaxlib", "jaxtyping", "numpy", "scipy", "optimistix", "builtins"}
@@ -101,6 +102,46 @@ def current(part: Part) -> Part:
     return found
 
 
+class Reads:
+    """The values that the functions of a problem of `current` read, to be compared with others."""
+
+    def __init__(self, part: Any):
+        leaves = jtu.tree_leaves(part)
+        self.keys = tuple(leaf.key for leaf in leaves if isinstance(leaf, _Captured))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Reads) and other.keys == self.keys
+
+    def __hash__(self) -> int:
+        return hash(self.keys)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _stored, (bool(self.keys),)
+
+
+def _stored(is_known: bool) -> Reads:
+    """Return what was read before it was stored: values are not stored, and equal no others."""
+    found = Reads(None)
+    found.keys = (_Same(object()),) if is_known else ()
+    return found
+
+
+def require_unchanged(part: Any, place: str) -> None:
+    """Refuse to read functions of a problem of `current` again after what they read has changed.
+
+    **Raises:** `dvax.InputError`.
+    """
+    for leaf in jtu.tree_leaves(part):
+        if isinstance(leaf, _Captured) and _of_function(leaf.fn, _DEPTH, frozenset()) != leaf.key:
+            raise input_error(
+                place,
+                "a function of the problem that reads other values now than in the run",
+                "this result is computed from f, h and K when it is first asked for, and what they "
+                "read from around them (a global, a closure, an attribute) has changed",
+                "Pass values that change in args, or ask for the result before they change",
+            )
+
+
 @once_per_object
 def _functions(part: Any) -> tuple[tuple[int, Any], ...]:
     """Return the functions of the user among the leaves, with their places."""
@@ -122,6 +163,14 @@ def _is_own(one: Any) -> bool:
     if isinstance(one, functools.partial | types.SimpleNamespace):
         return True
     return str(getattr(kind, "__module__", "")).split(".")[0] not in _LIBRARIES
+
+
+@functools.lru_cache(1024)
+def _is_installed(module: str) -> bool:
+    """Return whether a module is one of an installed package, whose objects may hold large graphs of
+    others."""
+    file = getattr(sys.modules.get(module), "__file__", None) or ""
+    return "site-packages" in file or "dist-packages" in file
 
 
 def _of_function(fn: Any, depth: int, seen: frozenset[int]) -> tuple[Hashable, ...]:
@@ -197,6 +246,10 @@ def _key(value: Any, depth: int, seen: frozenset[int]) -> Hashable:
         return None if is_function else _Same(value)
     if is_function:
         return _Same(value), _of_function(value, depth, seen - {id(value)})
+    if callable(to_numpy := getattr(value, "to_numpy", None)):
+        return _Same(value), _key(to_numpy(), depth - 1, seen)
+    if _is_installed(type(value).__module__):
+        return _Same(value)
     try:
         attributes = vars(value)
     except TypeError:

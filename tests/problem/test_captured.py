@@ -8,6 +8,7 @@ import types
 
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 
 import dvax
@@ -158,6 +159,47 @@ def test_a_bound_of_a_solution_with_other_values_is_refused():
     change(5.0)
     with pytest.raises(dvax.InputError, match="other values of what f, h or K reads"):
         dvax.bound_error(one, sol, constants)
+
+
+def test_constants_of_other_values_are_declared():
+    f, change = by_list_of_slopes()
+    one = problem(f)
+    constants = dvax.verify(one, -1.0, 0.0, 2.0).constants
+    for slope, status in ((0.5, "proved"), (0.7, "declared")):
+        change(slope)
+        sol = dvax.solve(one, -1.0, 0.0, 2.0, method=dvax.ETD2RK())
+        assert dvax.bound_error(one, sol, constants).status == status
+    again = dvax.verify(one, -1.0, 0.0, 2.0).constants
+    assert dvax.bound_error(one, sol, again).status == "proved"
+    assert float(again.alpha_f) == 0.7
+
+
+def by_list_of_slopes():
+    slopes = [0.5]
+    return lambda t, x, u, args: 3.0 - slopes[0] * x - u, lambda v: slopes.__setitem__(0, v)
+
+
+def test_what_is_computed_later_is_refused_after_a_change():
+    f, change = by_closure()
+    one = problem(f)
+    sol = dvax.solve(one, -1.0, 0.0, 2.0)
+    assert sol.us.shape == (1,)
+    sol = dvax.solve(one, -0.9, 0.0, 2.0, dense=True)
+    change(5.0)
+    with pytest.raises(dvax.InputError, match="reads other values now than in the run"):
+        sol.evaluate(1.0)
+    change(3.0)
+    assert np.isfinite(sol.evaluate(1.0)[0])
+
+
+def test_a_table_of_pandas_is_read_again():
+    table = pd.DataFrame({"load": [3.0]})
+    one = problem(lambda t, x, u, args: float(table["load"].iloc[0]) - 0.5 * x - u)
+    found = []
+    for load in (3.0, 5.0):
+        table.loc[0, "load"] = load
+        found.append(float(dvax.solve(one, -1.0, 0.0, 2.0).xs[-1]))
+    assert found == pytest.approx([1.836091956, 3.110066757], abs=1e-5)
 
 
 def test_nothing_new_is_the_same_problem_and_solutions_can_be_pickled():

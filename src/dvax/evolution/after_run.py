@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from .._captured import require_unchanged
 from .._jax.messages import is_equinox_check
 from .._jax.traces import evaluates
 from .._tree import Tree
@@ -40,6 +41,7 @@ def after_run(function: Function, setup: Setup, plan: Plan, data: Any, depth: in
     number of axes of a batch in front of all arrays: those of a solution that left
     `equinox.filter_vmap` have them.
     """
+    require_unchanged(setup.problem, "dvax.Solution")
     code = setup.problem, setup.method, setup.vi_solver, plan
     setting = pack({name: setup.setting[name] for name in _SETTING})
     numbers, signature = flatten(

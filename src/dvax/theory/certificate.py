@@ -25,7 +25,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
-from .._captured import current
+from .._captured import Reads, current
 from .._dataset import Variable, dataset, described
 from .._once import once_per_object
 from .._repr import is_known, last_text, table, value_text
@@ -205,7 +205,9 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
     inside, why = None, ""
     if domain is not None:
         setting = sol.setup.setting
-        covered = domain.covers(setting["t0"], setting["t1"]) and domain.has_args(sol.setup.args)
+        covered = domain.covers(setting["t0"], setting["t1"]) and domain.has_args(
+            sol.setup.args, Reads(problem)
+        )
         domain_status = "proved" if covered else "declared"
         if regional:
             assert measured.bounds is not None

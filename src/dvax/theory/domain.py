@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from .._captured import Reads
 from .._tree import Tree
 from ..spaces import AbstractSpace
 
@@ -17,7 +18,8 @@ from ..spaces import AbstractSpace
 class Domain(eqx.Module):
     """The set of times, parameters, states and responses for which constants hold.
 
-    They hold for t0 ≤ t ≤ t1 (−∞ and ∞ if f, h and K do not depend on t) and one value of `args`.
+    They hold for t0 ≤ t ≤ t1 (−∞ and ∞ if f, h and K do not depend on t), one value of `args`, and what
+    the functions read from around them (`reads`; None: not known to matter).
     `x` and `u` are entrywise bounds (low, high); None means any x, and any u in P⁻¹K(t).
     """
 
@@ -27,6 +29,7 @@ class Domain(eqx.Module):
     u: tuple[Tree, Tree] | None
     values: tuple[Any, ...]
     frame: tuple[Any, ...] = eqx.field(static=True)
+    reads: Reads | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -35,7 +38,9 @@ class Domain(eqx.Module):
         x: tuple[Tree, Tree] | None,
         u: tuple[Tree, Tree] | None,
         args: Any,
+        reads: Reads | None = None,
     ):
+        self.reads = reads
         self.t0, self.t1, self.x, self.u = t0, t1, x, u
         # Copies: an array of NumPy may be changed afterwards, and would still equal itself.
         values, self.frame = _numbers_and_rest(args)
@@ -53,8 +58,11 @@ class Domain(eqx.Module):
         margin = 1e-12 * max(abs(self.t0), abs(self.t1))
         return self.t0 - margin <= float(t0) and float(t1) <= self.t1 + margin
 
-    def has_args(self, args: Any) -> bool:
-        """Return whether `args` equals that of the constants; False for traced values."""
+    def has_args(self, args: Any, reads: Reads | None = None) -> bool:
+        """Return whether `args`, and what the functions read, equal those of the constants; False for
+        traced values."""
+        if self.reads is not None and self.reads != reads:
+            return False
         values, frame = _numbers_and_rest(args)
         if frame != self.frame or not _tree.is_concrete(values, self.values):
             return False

@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from .._captured import current
 from .._tree import Tree
 from ..errors import InputError, input_error
 from ..problem import Problem
@@ -79,6 +80,7 @@ def parameter_bounds(
     ```
     """
     low, high = _tree.as_floats(low, "low"), _tree.as_floats(high, "high")
+    problem = current(problem)
     _check(problem, low, high, start_radius)
     middle = jtu.tree_map(lambda a, b: 0.5 * (a + b), low, high)
     t0, t1 = time_span(t0, t1, "dvax.parameter_bounds(t0, t1)")
@@ -98,7 +100,7 @@ def parameter_bounds(
     box = Region(region.t, search_box(states, x0), search_box(responses, system.u0), eta)
     moduli = modulus_statuses(system, region, box, {})
     domain = domain_of(
-        region.t, None if x is None else states, None if u is None else given_u, middle
+        region.t, None if x is None else states, None if u is None else given_u, middle, problem
     )
     constants = constants_of(system, region, moduli, domain)
     if constants is None:

@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree, _user_code
-from .._captured import current
+from .._captured import Reads, current
 from .._tree import Tree
 from ..errors import InputError, InputProblem, input_error
 from ..evolution.nonfinite import nonfinite_data
@@ -167,7 +167,7 @@ def verify(
     limits_u = None if u is None else without_limits(given_u, possible)
     if knots.size == 0 and _is_autonomous(system, t0):
         time = interval(-np.inf, np.inf)
-    domain = domain_of(time, None if x is None else states, limits_u, args)
+    domain = domain_of(time, None if x is None else states, limits_u, args, problem)
     found = _energy(system, region, moduli) if energy else ""
     if isinstance(found, str):
         constants = constants_of(system, region, moduli, domain)
@@ -239,8 +239,8 @@ def _energy(system: System, region: Region, moduli: ModulusStatuses) -> EnergyNo
     return energy_norm(system, system.at(region), _pointwise(system, t0), t1 - t0)
 
 
-def domain_of(time: Slope, x: Tree | None, u: Tree | None, args: Any) -> Domain:
-    """Return the domain of constants for these times, bounds of x and u, and args."""
+def domain_of(time: Slope, x: Tree | None, u: Tree | None, args: Any, problem: Problem) -> Domain:
+    """Return the domain of constants of a problem for these times, bounds of x and u, and args."""
 
     def bounds(tree: Tree | None) -> tuple[Tree, Tree] | None:
         if tree is None:
@@ -248,7 +248,7 @@ def domain_of(time: Slope, x: Tree | None, u: Tree | None, args: Any) -> Domain:
         low = jtu.tree_map(lambda v: v.low, tree, is_leaf=is_slope)
         return low, jtu.tree_map(lambda v: v.high, tree, is_leaf=is_slope)
 
-    return Domain(float(time.low), float(time.high), bounds(x), bounds(u), args)
+    return Domain(float(time.low), float(time.high), bounds(x), bounds(u), args, Reads(problem))
 
 
 def _one_sided_rate(system: System, region: Region, moduli: ModulusStatuses) -> float | None:
