@@ -248,16 +248,19 @@ def _resolution(stop: Stop) -> Diagnosis:
     t0, t1 = stop.span
     if not (stop.ulp > 0 and stop.step <= 64.0 * stop.ulp and stop.ulp > 1e-14 * (t1 - t0)):
         return Diagnosis()
+    shift = "Count time from the start of the run, so that |t| is not large against t1 − t0"
+    longer = (
+        "Use double precision: jax.config.update('jax_enable_x64', True) before anything else, and "
+        "x0 of float64"
+    )
+    is_short = jnp.finfo(stop.setup.dtype).bits < 64
+    # A shift of time gains nothing where the run is as long as t is large.
+    gains = abs(t0) > 0.1 * (t1 - t0)
+    fixes = [Fix("", "", text) for text, helps in ((longer, is_short), (shift, gains)) if helps]
     return Diagnosis(
         f"The steps ({stop.step:.3g}) are as small as the rounding of t ({stop.ulp:.3g} at "
         f"t = {stop.t:.12g}).",
-        (
-            Fix(
-                "",
-                "",
-                "Count time from the start of the run, so that |t| is not large against t1 − t0",
-            ),
-        ),
+        tuple(fixes) or (Fix("", "", "Solve in pieces whose time begins at 0"),),
     )
 
 

@@ -152,6 +152,22 @@ def test_report_has_no_readable_data_of_a_figure(tmp_path: Path) -> None:
     assert EVIL in figures_of(text)["histories"]["figure"]["layout"]["yaxis"]["title"]["text"]
 
 
+def test_a_bound_without_a_finite_value_has_no_picture():
+    inf = float("inf")
+    for values, words in (
+        ([1e-9, 1e-8, 1e-7], ""),
+        ([1e-9, 1e-8, inf], "From time = 2 s on it states nothing."),
+        ([0.0, inf, inf], None),
+    ):
+        data = {"time": variable([0.0, 1.0, 2.0], "s"), "x": variable([0.0, 1.0, 2.0], "m")}
+        bound = {"values": np.array(values), "unit": "m", "status": "proved"}
+        data["error_bound"] = SimpleNamespace(**bound, dims=("time",), attrs={})
+        found = application_pictures("python", data)
+        assert len(found) == (1 if words is None else 2)
+        if words is not None:
+            assert found[-1].key == "certificate" and found[-1].caption.endswith(words)
+
+
 def test_report_describes_every_figure_in_words(large: Path) -> None:
     text = (large / "report.html").read_text(encoding="utf-8")
     described = re.findall(r'class="plot"[^>]*role="img"\s+aria-label="([^"]+)"', text)

@@ -4,9 +4,13 @@ import importlib
 import pkgutil
 from collections.abc import Mapping
 
+import numpy as np
+
+from dvax.app.plots.lines import LARGEST
 from dvax.app.plots.panels import Curve, Panel, panels_picture
 from dvax.app.plots.picture import Picture
 from dvax.app.plots.store import Variable
+from dvax.app.plots.theme import quantity
 from dvax.app.runs.applications import models
 from dvax.errors import input_error
 
@@ -32,7 +36,10 @@ def application_pictures(name: str, data: Mapping[str, Variable]) -> list[Pictur
     own = name if name in NAMES else _DEFAULT
     module = importlib.import_module(f"dvax.app.plots.applications.{own.replace('-', '_')}")
     found = module.pictures(data)
-    return [*found, _certificate(data)] if "error_bound" in data else found
+    bound = data.get("error_bound")
+    # Where no value can be drawn, the sentences of the report say all that there is to say.
+    is_drawn = bound is not None and ((bound.values > 0.0) & (bound.values <= LARGEST)).any()
+    return [*found, _certificate(data)] if is_drawn else found
 
 
 def _certificate(data: Mapping[str, Variable]) -> Picture:
@@ -43,5 +50,9 @@ def _certificate(data: Mapping[str, Variable]) -> Picture:
     title = "Certified error" if status == "proved" else f"Error bound, {status}"
     curve = Curve(data[axis].values, bound.values, f"error bound ({status})", 1)
     panel = Panel([curve], f"error bound<br>({status})", bound.unit, log=True)
-    words = bound.attrs.get("long_name", "bound on the error of the state")
-    return panels_picture("certificate", title, f"A {words}.", [panel], axis, data[axis].unit)
+    words = f"A {bound.attrs.get('long_name', 'bound on the error of the state')}."
+    above = ~(bound.values <= LARGEST)
+    if above.any():
+        first = quantity(float(data[axis].values[np.argmax(above)]), data[axis].unit)
+        words += f" From {axis} = {first} on it states nothing."
+    return panels_picture("certificate", title, words, [panel], axis, data[axis].unit)
