@@ -7,13 +7,14 @@ equal only if what they read is equal. Values in args do not need this, and chan
 compilation.
 """
 
+import dis
 import functools
 import hashlib
 import math
 import sys
 import types
 from collections.abc import Callable, Hashable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -173,19 +174,59 @@ def _is_installed(module: str) -> bool:
     return "site-packages" in file or "dist-packages" in file
 
 
+class _Names(NamedTuple):
+    """The names of globals and of attributes that code reads, with the functions defined in it."""
+
+    around: frozenset[str]
+    attributes: frozenset[str]
+
+
+@functools.lru_cache(1024)
+def _names(code: types.CodeType) -> _Names:
+    around, attributes = set(), set()
+    for step in dis.get_instructions(code):
+        if step.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+            around.add(step.argval)
+        elif step.opname in ("LOAD_ATTR", "LOAD_METHOD"):
+            attributes.add(step.argval)
+    for inner in (_names(c) for c in code.co_consts if isinstance(c, types.CodeType)):
+        around |= inner.around
+        attributes |= inner.attributes
+    return _Names(frozenset(around), frozenset(attributes))
+
+
+@functools.lru_cache(1024)
+def _attributes_read(kind: type, names: frozenset[str]) -> frozenset[str]:
+    """Return the attributes that code with these names of attributes reads of objects of a class, by
+    itself and by the methods that it calls."""
+    found, ahead = set(names), list(names)
+    while ahead:
+        method = getattr(kind, ahead.pop(), None)
+        method = getattr(method, "fget", method)
+        if isinstance(method, types.FunctionType):
+            more = _names(method.__code__).attributes - found
+            found |= more
+            ahead += more
+    return frozenset(found)
+
+
 def _of_function(fn: Any, depth: int, seen: frozenset[int]) -> tuple[Hashable, ...]:
     """Return the keys of what a function reads, empty if it reads nothing that may change."""
     if depth == 0 or id(fn) in seen:
         return ()
     seen = seen | {id(fn)}
     if isinstance(fn, functools.partial):
-        return tuple(_key(v, depth, seen) for v in (fn.func, list(fn.args), fn.keywords))
+        inner = fn.func if isinstance(fn.func, types.FunctionType) else None
+        names = _names(inner.__code__).attributes if inner else frozenset[str]()
+        parts = list(fn.args), fn.keywords
+        return *(_key(v, depth, seen, names) for v in parts), *_of_function(fn.func, depth, seen)
     if isinstance(fn, types.MethodType):
-        return _key(fn.__self__, depth, seen), *_of_function(fn.__func__, depth, seen)
+        names = frozenset([fn.__func__.__name__])
+        return _key(fn.__self__, depth, seen, names), *_of_function(fn.__func__, depth, seen)
     if not isinstance(fn, types.FunctionType):
         call = getattr(type(fn), "__call__", None)  # noqa: B004 (the code of its calls is wanted)
         own = _of_function(call, depth, seen) if isinstance(call, types.FunctionType) else ()
-        return _key(fn, depth, seen - {id(fn)}), *own
+        return _key(fn, depth, seen - {id(fn)}, frozenset(["__call__"])), *own
     values = []
     for cell in fn.__closure__ or ():
         try:
@@ -195,26 +236,20 @@ def _of_function(fn: Any, depth: int, seen: frozenset[int]) -> tuple[Hashable, .
     values += fn.__defaults__ or ()
     values += (fn.__kwdefaults__ or {}).values()
     names, around = _names(fn.__code__), fn.__globals__
-    for name in names:
+    for name in sorted(names.around):
         value = around.get(name)
         if isinstance(value, types.ModuleType):
             if value.__name__.split(".")[0] not in _LIBRARIES:
-                values += [vars(value)[n] for n in names if n in vars(value)]
+                values += [vars(value)[n] for n in sorted(names.attributes) if n in vars(value)]
         elif value is not None:
             values.append(value)
-    keys = (_key(value, depth - 1, seen) for value in values)
+    keys = (_key(value, depth - 1, seen, names.attributes) for value in values)
     return tuple(key for key in keys if key is not None)
 
 
-@functools.lru_cache(1024)
-def _names(code: types.CodeType) -> tuple[str, ...]:
-    """Return the names that code and the functions defined in it read from around them."""
-    inner = (c for c in code.co_consts if isinstance(c, types.CodeType))
-    return tuple(dict.fromkeys([*code.co_names, *(n for c in inner for n in _names(c))]))
-
-
-def _key(value: Any, depth: int, seen: frozenset[int]) -> Hashable:
-    """Return a key of a value, None if it cannot change."""
+def _key(value: Any, depth: int, seen: frozenset[int], names: frozenset[str]) -> Hashable:
+    """Return a key of a value, None if it cannot change. `names` are those of attributes that are
+    read."""
     kind = type(value)
     if value is None or kind in (bool, int, str, bytes, complex):
         return kind, value
@@ -233,11 +268,11 @@ def _key(value: Any, depth: int, seen: frozenset[int]) -> Hashable:
     if isinstance(value, jax.Array) or depth == 0:
         return _Same(value)
     seen = seen | {id(value)}
+    inside = functools.partial(_key, depth=depth - 1, seen=seen, names=names)
     if isinstance(value, list | tuple | set | frozenset) and len(value) <= _MAX_ENTRIES:
-        return kind, tuple(_key(v, depth - 1, seen) for v in value)
+        return kind, tuple(map(inside, value))
     if isinstance(value, dict) and len(value) <= _MAX_ENTRIES:
-        pairs = ((_key(k, 1, seen), _key(v, depth - 1, seen)) for k, v in value.items())
-        return kind, tuple(pairs)
+        return kind, tuple((inside(k), inside(v)) for k, v in value.items())
     if isinstance(value, eqx.Module):
         functions = _functions(value)
         return _Same(value), *(_of_function(fn, depth - 1, seen) for _, fn in functions)
@@ -247,11 +282,13 @@ def _key(value: Any, depth: int, seen: frozenset[int]) -> Hashable:
     if is_function:
         return _Same(value), _of_function(value, depth, seen - {id(value)})
     if callable(to_numpy := getattr(value, "to_numpy", None)):
-        return _Same(value), _key(to_numpy(), depth - 1, seen)
-    if _is_installed(type(value).__module__):
+        return _Same(value), inside(to_numpy())
+    if _is_installed(kind.__module__):
         return _Same(value)
     try:
         attributes = vars(value)
     except TypeError:
         return _Same(value)
-    return _Same(value), tuple((n, _key(v, depth - 1, seen)) for n, v in attributes.items())
+    read = _attributes_read(kind, names)
+    found = ((n, inside(v)) for n, v in attributes.items() if n in read)
+    return _Same(value), tuple(found)

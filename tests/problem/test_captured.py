@@ -202,6 +202,38 @@ def test_a_table_of_pandas_is_read_again():
     assert found == pytest.approx([1.836091956, 3.110066757], abs=1e-5)
 
 
+def test_what_no_function_reads_makes_no_other_program():
+    plant = Plant()
+    plant.runs = 0
+    one = problem(plant.rate)
+    first = current(one)
+    plant.runs, plant.history = 1, [1.0]
+    globals().update(history=plant.history)
+    assert current(one) is first
+    plant.load = 4.0
+    assert current(one) is not first
+
+
+def test_attributes_that_methods_read_are_read_again():
+    class Outer(Plant):
+        scale = 1.0
+
+        @property
+        def gain(self):
+            return self.scale * self.load
+
+        def driven(self, x):
+            return self.gain - 0.5 * x
+
+    plant = Outer()
+    one = problem(lambda t, x, u, args: plant.driven(x) - u)
+    first = current(one)
+    plant.load = 5.0
+    second = current(one)
+    plant.scale = 2.0
+    assert len({id(first), id(second), id(current(one))}) == 3
+
+
 def test_nothing_new_is_the_same_problem_and_solutions_can_be_pickled():
     one = problem(Plant())
     assert current(one) is current(one) and current(current(one)) is current(one)
