@@ -13,6 +13,7 @@ import hashlib
 import math
 import sys
 import types
+import weakref
 from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple, TypeVar
 
@@ -54,21 +55,46 @@ class _Same:
         return id(self.one)
 
 
-class _Captured:
-    """A function with the key of what it reads."""
+_WRITTEN: Any = weakref.WeakKeyDictionary()
+"""The places of what functions change themselves when they are called, such as a list of their calls:
+it is no input, and every call would make another program."""
 
-    def __init__(self, fn: Callable[..., Any], key: Hashable):
+
+def _written(fn: Any) -> frozenset[int]:
+    try:
+        return _WRITTEN.get(fn, frozenset())
+    except TypeError:
+        return frozenset()  # an object without weak references
+
+
+def _without_written(fn: Any, key: tuple[Any, ...]) -> tuple[Any, ...]:
+    written = _written(fn)
+    return key if not written else tuple(pair for pair in key if pair[0] not in written)
+
+
+class _Captured:
+    """A function with the key of what it reads: pairs of a place and the value there."""
+
+    def __init__(self, fn: Callable[..., Any], key: tuple[Any, ...]):
         functools.update_wrapper(self, fn, updated=())
         self.fn, self.key = fn, key
 
     def __call__(self, *args: Any) -> Any:
-        return self.fn(*args)
+        before = dict(_of_function(self.fn, _DEPTH, frozenset()))
+        value = self.fn(*args)
+        after = dict(_of_function(self.fn, _DEPTH, frozenset()))
+        if after != before:
+            changed = {place for place in before if after.get(place) != before[place]}
+            _WRITTEN[self.fn] = _written(self.fn) | changed
+        return value
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Captured) and other.fn == self.fn and other.key == self.key
+        if not isinstance(other, _Captured) or other.fn != self.fn:
+            return False
+        return _without_written(self.fn, other.key) == _without_written(self.fn, self.key)
 
     def __hash__(self) -> int:
-        return hash((self.fn, self.key))
+        return hash(self.fn)
 
     def __repr__(self) -> str:
         return repr(self.fn)
@@ -88,7 +114,8 @@ def current(part: Part) -> Part:
     if not places:
         return part
     keys = tuple(_of_function(fn, _DEPTH, frozenset()) for _, fn in places)
-    if not any(keys):
+    reads = [bool(key) or bool(_written(fn)) for (_, fn), key in zip(places, keys, strict=True)]
+    if not any(reads):
         return part
     versions = _versions(part)
     found = versions.get(keys)
@@ -96,8 +123,8 @@ def current(part: Part) -> Part:
         if len(versions) >= _MAX_VERSIONS:
             versions.clear()
         leaves, tree = jtu.tree_flatten(part)
-        for (place, fn), key in zip(places, keys, strict=True):
-            if key:
+        for (place, fn), key, is_reader in zip(places, keys, reads, strict=True):
+            if is_reader:
                 leaves[place] = _Captured(fn, key)
         found = versions[keys] = jtu.tree_unflatten(tree, leaves)
     return found
@@ -108,22 +135,22 @@ class Reads:
 
     def __init__(self, part: Any):
         leaves = jtu.tree_leaves(part)
-        self.keys = tuple(leaf.key for leaf in leaves if isinstance(leaf, _Captured))
+        self.functions: tuple[Any, ...] = tuple(v for v in leaves if isinstance(v, _Captured))
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Reads) and other.keys == self.keys
+        return isinstance(other, Reads) and other.functions == self.functions
 
     def __hash__(self) -> int:
-        return hash(self.keys)
+        return hash(self.functions)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _stored, (bool(self.keys),)
+        return _stored, (bool(self.functions),)
 
 
 def _stored(is_known: bool) -> Reads:
     """Return what was read before it was stored: values are not stored, and equal no others."""
     found = Reads(None)
-    found.keys = (_Same(object()),) if is_known else ()
+    found.functions = (_Same(object()),) if is_known else ()
     return found
 
 
@@ -133,7 +160,9 @@ def require_unchanged(part: Any, place: str) -> None:
     **Raises:** `dvax.InputError`.
     """
     for leaf in jtu.tree_leaves(part):
-        if isinstance(leaf, _Captured) and _of_function(leaf.fn, _DEPTH, frozenset()) != leaf.key:
+        if not isinstance(leaf, _Captured):
+            continue
+        if _Captured(leaf.fn, _of_function(leaf.fn, _DEPTH, frozenset())) != leaf:
             raise input_error(
                 place,
                 "a function of the problem that reads other values now than in the run",
@@ -210,11 +239,17 @@ def _attributes_read(kind: type, names: frozenset[str]) -> frozenset[str]:
     return frozenset(found)
 
 
-def _of_function(fn: Any, depth: int, seen: frozenset[int]) -> tuple[Hashable, ...]:
-    """Return the keys of what a function reads, empty if it reads nothing that may change."""
+def _of_function(fn: Any, depth: int, seen: frozenset[int]) -> tuple[Any, ...]:
+    """Return pairs of a place and the key of what a function reads there, empty if it reads nothing
+    that may change."""
     if depth == 0 or id(fn) in seen:
         return ()
-    seen = seen | {id(fn)}
+    keys = enumerate(_keys_of_function(fn, depth, seen | {id(fn)}))
+    return _without_written(fn, tuple((k, key) for k, key in keys if key is not None))
+
+
+def _keys_of_function(fn: Any, depth: int, seen: frozenset[int]) -> tuple[Hashable, ...]:
+    """Return the keys of what a function reads, in an order that does not change."""
     if isinstance(fn, functools.partial):
         inner = fn.func if isinstance(fn.func, types.FunctionType) else None
         names = _names(inner.__code__).attributes if inner else frozenset[str]()
@@ -241,10 +276,9 @@ def _of_function(fn: Any, depth: int, seen: frozenset[int]) -> tuple[Hashable, .
         if isinstance(value, types.ModuleType):
             if value.__name__.split(".")[0] not in _LIBRARIES:
                 values += [vars(value)[n] for n in sorted(names.attributes) if n in vars(value)]
-        elif value is not None:
+        elif name in around:
             values.append(value)
-    keys = (_key(value, depth - 1, seen, names.attributes) for value in values)
-    return tuple(key for key in keys if key is not None)
+    return tuple(_key(value, depth - 1, seen, names.attributes) for value in values)
 
 
 def _key(value: Any, depth: int, seen: frozenset[int], names: frozenset[str]) -> Hashable:

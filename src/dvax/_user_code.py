@@ -259,7 +259,7 @@ def _kind(value: Any) -> str:
 def _table_read(fn: Callable[..., Any]) -> tuple[str, Any] | None:
     """Return name and value of the first table that fn reads from around it; None without one."""
     try:
-        found = inspect.getclosurevars(fn)
+        found = inspect.getclosurevars(inspect.unwrap(fn))
     except TypeError:
         return None
     return next(

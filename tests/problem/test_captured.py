@@ -202,6 +202,22 @@ def test_a_table_of_pandas_is_read_again():
     assert found == pytest.approx([1.836091956, 3.110066757], abs=1e-5)
 
 
+def test_a_record_of_its_calls_that_a_function_keeps_is_no_input():
+    calls, load = [], {"v": 3.0}
+
+    def f(t, x, u, args):
+        calls.append(1)
+        return load["v"] - 0.5 * x - u
+
+    one = problem(f)
+    first = dvax.solve(one, -1.0, 0.0, 2.0).xs[-1]
+    count = len(calls)
+    assert dvax.solve(one, -1.0, 0.0, 2.0).xs[-1] == first and len(calls) == count
+    load["v"] = 5.0
+    assert float(dvax.solve(one, -1.0, 0.0, 2.0).xs[-1]) == pytest.approx(3.110066757, abs=1e-5)
+    assert len(calls) > count
+
+
 def test_what_no_function_reads_makes_no_other_program():
     plant = Plant()
     plant.runs = 0

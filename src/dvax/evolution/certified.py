@@ -17,6 +17,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
+from .._captured import Reads
 from .._tree import Tree
 from ..errors import InputError, Problems, input_error
 from ..problem import Problem
@@ -65,7 +66,7 @@ def certified(
     **Raises:** `dvax.InputError` if `tol` is out of reach, because of roundoff or of `max_steps`.
     """
     _check(constants, tol, x0)
-    _check_domain(constants, args, t0, t1)
+    _check_domain(problem, constants, args, t0, t1)
     growth, span = _growth(constants), t1 - t0
     amplification = growth.amplification(span)
     size, largest = (float(v) for v in _sizes(problem, jnp.asarray(t0), x0, as_arrays(args)))
@@ -250,8 +251,9 @@ def _outside(t: float) -> InputError:
     )
 
 
-def _check_domain(constants: Any, args: Any, t0: float, t1: float) -> None:
-    """Raise if the constants were verified for other times or other `args`."""
+def _check_domain(problem: Problem, constants: Any, args: Any, t0: float, t1: float) -> None:
+    """Raise if the constants were verified for other times, other `args`, or other values that the
+    functions read."""
     domain = getattr(constants, "domain", None)
     wrong = Problems()
     if domain is not None and not domain.covers(t0, t1):
@@ -261,10 +263,10 @@ def _check_domain(constants: Any, args: Any, t0: float, t1: float) -> None:
             f"they must cover the run, which goes from {t0:.17g} to {t1:.17g}",
             f"Verify for these: dvax.verify(problem, x0, {t0:g}, {t1:g}, args)",
         )
-    if domain is not None and not domain.has_args(args):
+    if domain is not None and not domain.has_args(args, Reads(problem)):
         wrong.add(
             "dvax.solve(constants)",
-            "constants of another args",
+            "constants of another args, or of other values that f, h or K reads from around it",
             "f and h may be steeper at these parameters than at those",
             "Verify for these: dvax.verify(problem, x0, t0, t1, args)",
         )
