@@ -486,7 +486,7 @@ class Stepper(eqx.Module):
         looks = [(v.t, v.x, v.rate.y if known else solver_state.guess) for v in places]
         if not self.varies:
             # Where nothing but x moves, the step before has looked at the start.
-            looks, nodes = looks[-1:], nodes[-1:]
+            looks, places, nodes = looks[-1:], places[-1:], nodes[-1:]
         elif len(looks) == 2:
             between = [_between(theta, *looks) for theta in _INSIDE]
             looks, nodes = [looks[0], *between, looks[1]], (0.0, *_INSIDE, 1.0)
