@@ -10,7 +10,6 @@ compilation.
 import dis
 import functools
 import hashlib
-import math
 import sys
 import types
 import weakref
@@ -288,7 +287,7 @@ def _key(value: Any, depth: int, seen: frozenset[int], names: frozenset[str]) ->
     if value is None or kind in (bool, int, str, bytes, complex):
         return kind, value
     if kind is float:
-        return kind, value.hex(), math.copysign(1.0, value)
+        return kind, value.hex()  # NaN equals itself, and 0.0 is not -0.0
     if isinstance(value, np.ndarray | np.generic):
         array = np.asarray(value)
         if array.dtype.hasobject:

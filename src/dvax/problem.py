@@ -335,12 +335,10 @@ class Problem(eqx.Module):
 
     def data_knots(self, t0: Any, x: Tree, args: Any = None) -> "Knots":
         """Return the knots of all data, and the intervals that they cover, for states shaped like x."""
-        u, evaluations, reports = self.zero_control(x), self._evaluations(args), {}
+        u, (evaluate, reports) = self.zero_control(x), self._listening(args)
 
         def traced_knots(t: Any, x: Tree, u: Tree) -> list[Any]:
-            for name, evaluate in evaluations.items():
-                with listen(t) as reports[name]:
-                    evaluate(t, x, u)
+            evaluate(t, x, u)
             # Knots that are computed from args leave this trace as outputs.
             all_knots = (knots for report in reports.values() for knots in report.knots)
             return [knots for knots in all_knots if not _tree.is_concrete(knots)]
@@ -354,7 +352,7 @@ class Problem(eqx.Module):
                 "its times instead, or wrap it as dvax.signals.Function(fn, knots=...).",
                 stacklevel=5,
             )
-        spans = [(*span, name) for name in reports for span in reports[name].spans]
+        spans = _spans(reports)
         signal_knots = (knots for report in reports.values() for knots in report.knots)
         return Knots([*filter(_tree.is_concrete, signal_knots), *switches], spans)
 
@@ -365,28 +363,30 @@ class Problem(eqx.Module):
         """
         if not _tree.is_concrete(t0, t1, x, args):
             return
-        t, u, reports = jnp.asarray(t0, jnp.result_type(float)), self.zero_control(x), {}
-        for name, evaluate in self._evaluations(args).items():
-            with listen(t) as reports[name]:
-                evaluate(t, x, u)
-        _check_spans([(*span, name) for name in reports for span in reports[name].spans], t0, t1)
+        evaluate, reports = self._listening(args)
+        evaluate(jnp.asarray(t0, jnp.result_type(float)), x, self.zero_control(x))
+        _check_spans(_spans(reports), t0, t1)
 
     def check_spans(self, t0: Any, t1: Any, x: Tree, args: Any = None) -> None:
         """Trace K, f and h, to check that the data in them cover the time span.
 
         **Raises:** `dvax.InputError` if some data do not cover [t0, t1].
         """
+        evaluate, reports = self._listening(args)
+        time = jnp.asarray(t0, jnp.result_type(float))
+        jax.eval_shape(evaluate, time, x, self.zero_control(x))
+        _check_spans([span for span in _spans(reports) if _tree.is_concrete(span)], t0, t1)
+
+    def _listening(self, args: Any) -> tuple[Callable[[Any, Tree, Tree], None], dict[str, Any]]:
+        """Return a function that evaluates K, f and h, and a table of what their data report to it."""
         evaluations, reports = self._evaluations(args), {}
 
-        def traced(t: Any, x: Tree, u: Tree) -> None:
-            for name, evaluate in evaluations.items():
+        def evaluate(t: Any, x: Tree, u: Tree) -> None:
+            for name, function in evaluations.items():
                 with listen(t) as reports[name]:
-                    evaluate(t, x, u)
+                    function(t, x, u)
 
-        time = jnp.asarray(t0, jnp.result_type(float))
-        jax.eval_shape(traced, time, x, self.zero_control(x))
-        spans = [(*span, name) for name in reports for span in reports[name].spans]
-        _check_spans([span for span in spans if _tree.is_concrete(span)], t0, t1)
+        return evaluate, reports
 
     def _evaluations(self, args: Any) -> dict[str, Callable[[Any, Tree, Tree], Any]]:
         """Return K, f and h as functions of (t, x, u)."""
@@ -451,6 +451,11 @@ def _shape_fix(name: str, out: Tree, element: Tree, space: str) -> str:
     shape = getattr(out, "shape", None)
     given = shape is not None and space == "control"
     return fix + (f", such as control_space=dvax.spaces.Euclidean({shape})" if given else "")
+
+
+def _spans(reports: dict[str, Any]) -> list[tuple[Any, Any, str, str]]:
+    """Return (first time, last time, kind of data, function) of all data that reported."""
+    return [(*span, name) for name in reports for span in reports[name].spans]
 
 
 def _check_spans(spans: list[tuple[Any, Any, str, str]], t0: Any, t1: Any) -> None:
