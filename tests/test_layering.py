@@ -20,6 +20,7 @@ FLOORS = {
     "_files": -2,
     "_tree": -1,
     "_batch": -1,
+    "_lookup": -1,
     "_small_matrices": -1,
     "_failure": -1,
     "_once": -2,

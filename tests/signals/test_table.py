@@ -7,6 +7,8 @@ import pytest
 import scipy.interpolate
 
 import dvax
+from dvax._jax.jaxprs import count_operations
+from dvax._lookup import count_up_to
 from dvax.signals import Constant, Function, Product, Table, listen
 
 TIMES = np.array([-1.0, -0.2, 0.1, 0.9, 2.0, 2.5])
@@ -58,13 +60,34 @@ def test_a_cubic_table_of_four_points_is_the_cubic_through_them():
     np.testing.assert_allclose(found, s**3 - 2 * s**2 + 1, atol=1e-12)
 
 
-@pytest.mark.parametrize("count", [4096, 4097])
-def test_long_tables_find_their_piece_as_short_ones_do(count):
-    t = np.linspace(0, 1, count)
-    table = Table(t, np.sin(9 * t))
-    asked = np.random.default_rng(1).uniform(0, 1, 50)
-    found = np.asarray(jax.vmap(table.value)(jnp.asarray(asked)))
-    np.testing.assert_allclose(found, np.interp(asked, t, np.sin(9 * t)), rtol=1e-12)
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 10, 63, 65, 1000, 1024, 1025, 4097])
+def test_the_times_up_to_any_time_are_counted_as_numpy_does(count):
+    rng = np.random.default_rng(count)
+    times = np.sort(rng.uniform(0, 1, count))
+    near = np.concatenate([times, np.nextafter(times, -1), np.nextafter(times, 2)])
+    asked = np.concatenate([rng.uniform(-0.1, 1.1, 50), rng.choice(near, 100), near[:9], near[-9:]])
+    find = jax.jit(lambda t: count_up_to(jnp.asarray(times), t))
+    one_by_one = [int(find(t)) for t in asked[:60]]
+    expected = np.searchsorted(times, asked, side="right")
+    np.testing.assert_array_equal(one_by_one, expected[:60])
+    np.testing.assert_array_equal(jax.vmap(find)(asked), expected)
+    np.testing.assert_array_equal(find(asked), expected)
+
+
+@pytest.mark.parametrize("count", [169, 8784])
+def test_a_lookup_has_few_operations_because_a_program_contains_many(count):
+    table = Table(np.arange(count), np.sin(np.arange(count)))
+    program = jax.make_jaxpr(table.value)(0.5)
+    assert count_operations(program) < 60
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_table_takes_an_array_of_times(kind):
+    table = Table(TIMES, VALUES, kind)
+    asked = ASKED[:60].reshape(5, 12)
+    found = table(asked)
+    assert found.shape == (5, 12, 2)
+    np.testing.assert_allclose(found.reshape(60, 2), exact(kind, ASKED[:60]), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.thorough

@@ -25,6 +25,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._jax.jaxprs import bind
+from .._lookup import count_up_to
 from .._tree import Tree
 from .interpreter import Domain, Rule, interpret, is_real, same_for, unroll
 from .primitives import COMPARING, JOINING, LOGICAL, REARRANGING, STEPWISE, SUMMING, TABLES
@@ -362,10 +363,9 @@ def _table(eqn: Any, operands: list[Any]) -> LinearEnclosure:
         raise NoEnclosure("a table that moves")
     a, b = (bind(eqn, [*operands[:-1], end])[0] for end in (t.a, t.b))
     times, values = jnp.asarray(times), jnp.asarray(values)
-    method = "scan_unrolled" if times.shape[0] <= 4096 else "scan"
-    position = lambda t, side: jnp.searchsorted(times, t, side=side, method=method)  # noqa: E731
-    is_one_piece = position(t.highest, "left") <= position(t.lowest, "right")
-    i = jnp.clip(position(t.lowest, "right") - 1, 0, times.shape[0] - 2)
+    count, last = count_up_to(times, t.lowest), times.shape[0] - 1
+    is_one_piece = (count > last) | (t.highest <= times[jnp.minimum(count, last)])
+    i = jnp.clip(count - 1, 0, last - 1)
     width = times[i + 1] - times[i]
     rise, slope, bend = values[i + 1] - values[i], jnp.zeros(()), jnp.zeros(())
     if eqn.params["name"] == "dvax_linear_table":

@@ -6,8 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from .. import _tree
+from .._lookup import count_up_to
 from ..errors import input_error
 from .abstract import AbstractSignal
 
@@ -62,6 +64,8 @@ class Table(AbstractSignal):
         self.slopes = _spline_slopes(self.times, self.values) if kind == "cubic" else None
 
     def value(self, t: Any) -> jax.Array:
+        if jnp.ndim(t):
+            return jax.vmap(self.value)(t)
         times = jnp.asarray(self.times)
         if self.kind == "constant":
             return dvax_constant_table(times, self.values, t)
@@ -98,45 +102,43 @@ def _numbers(values: Any, name: str) -> Any:
 @jax.jit
 def dvax_constant_table(times: jax.Array, values: jax.Array, t: Any) -> jax.Array:
     """Return vᵢ for t in [tᵢ, tᵢ₊₁)."""
-    i, _ = _locate(times, t)
-    out = jnp.where(t >= times[i + 1], values[i + 1], values[i])
-    return _nan_outside(times, t, out)
+    i, (_, right) = _locate(times, t)
+    v0, v1 = _pair(values, i)
+    return _nan_outside(times, t, jnp.where(t >= right, v1, v0))
 
 
 @jax.jit
 def dvax_linear_table(times: jax.Array, values: jax.Array, t: Any) -> jax.Array:
     """Return the piecewise linear interpolant at t."""
-    i, s = _locate(times, t)
-    v0, v1 = values[i], values[i + 1]
-    return _nan_outside(times, t, v0 + s * (v1 - v0))
+    i, (left, right) = _locate(times, t)
+    v0, v1 = _pair(values, i)
+    return _nan_outside(times, t, v0 + (t - left) / (right - left) * (v1 - v0))
 
 
 @jax.jit
 def dvax_cubic_table(times: jax.Array, values: jax.Array, slopes: jax.Array, t: Any) -> jax.Array:
     """Return the cubic Hermite interpolant with these slopes at t."""
-    i, s = _locate(times, t)
-    width = times[i + 1] - times[i]
-    v0, v1 = values[i], values[i + 1]
-    d0, d1 = slopes[i] * width, slopes[i + 1] * width
+    i, (left, right) = _locate(times, t)
+    width = right - left
+    s = (t - left) / width
+    v0, v1 = _pair(values, i)
+    d0, d1 = (slope * width for slope in _pair(slopes, i))
     jump = v1 - v0
     out = v0 + s * (d0 + s * ((3 * jump - 2 * d0 - d1) + s * (d0 + d1 - 2 * jump)))
     return _nan_outside(times, t, out)
 
 
-_MAX_UNROLLED_TIMES = 4096
-"""Number of times up to which the bisection is unrolled."""
+def _locate(times: jax.Array, t: Any) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    """Return i and (tᵢ, tᵢ₊₁) with tᵢ ≤ t ≤ tᵢ₊₁."""
+    last = times.shape[0] - 2
+    i = lax.clamp(np.int32(0), count_up_to(times, t) - 1, np.int32(last))
+    return i, _pair(times, i)
 
 
-def _locate(times: jax.Array, t: Any) -> tuple[jax.Array, jax.Array]:
-    """Return i with tᵢ ≤ t ≤ tᵢ₊₁, and the relative position of t between these times."""
-    # Time of a lookup: counting 68 ns for 168 times and 3.9 µs for 8784; bisection 27 ns unrolled,
-    # 100 ns as a loop.
-    count = times.shape[0]
-    method = "scan_unrolled" if count <= _MAX_UNROLLED_TIMES else "scan"
-    position = jnp.searchsorted(times, t, side="right", method=method)
-    i = jnp.clip(position - 1, 0, count - 2)
-    left, right = times[i], times[i + 1]
-    return i, (t - left) / (right - left)
+def _pair(rows: jax.Array, i: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the rows i and i + 1, which exist."""
+    pair = lax.dynamic_slice_in_dim(rows, i, 2, allow_negative_indices=False)
+    return pair[0], pair[1]
 
 
 def _nan_outside(times: jax.Array, t: Any, out: jax.Array) -> jax.Array:
