@@ -112,6 +112,12 @@ def test_what_is_read_from_a_second_run_compiles_nothing():
     assert len(regimes.times) == len(regimes.positive) + 1 and len(kinks) > 0
 
 
+def test_a_number_of_numpy_compiles_nothing_after_one_of_python():
+    read(3.0)
+    with nothing_is("compile"):
+        read(np.float64(2.75))
+
+
 def test_first_responses_of_a_law_that_iterates_are_one_program():
     problem = dataclasses.replace(coupled(), K=dvax.sets.Ball(jnp.zeros(2), 0.25))
     sol = dvax.solve(problem, jnp.array([0.2, -0.1]), 0.0, 0.1, 3.0, method=dvax.DormandPrince())

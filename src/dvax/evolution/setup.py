@@ -86,5 +86,8 @@ def unpack(entries: Any, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def as_arrays(args: Any) -> Any:
-    """Return args with Python floats converted to arrays; integers and flags remain static."""
-    return jtu.tree_map(lambda v: jnp.asarray(v) if isinstance(v, float) else v, args)
+    """Return args with floats converted to arrays; integers and flags remain static.
+
+    `np.float64`, which is a float of Python too, has the same program as other floats.
+    """
+    return jtu.tree_map(lambda v: jnp.asarray(float(v)) if isinstance(v, float) else v, args)

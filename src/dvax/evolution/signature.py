@@ -56,7 +56,7 @@ def flatten(code: tuple[Any, ...], data: Any, options: Any) -> tuple[list[Any], 
     """
     parts = [flat(part) for part in code]
     leaves, tree = jtu.tree_flatten(data)
-    last = [leaf if isinstance(leaf, float) or eqx.is_array(leaf) else None for leaf in leaves]
+    last = [_number(leaf) for leaf in leaves]
     keys = tuple(
         _exact_key(leaf) if number is None else None
         for leaf, number in zip(leaves, last, strict=True)
@@ -64,6 +64,13 @@ def flatten(code: tuple[Any, ...], data: Any, options: Any) -> tuple[list[Any], 
     numbers = [*(n for part in parts for n in part.numbers), *last]
     static = (*(key for part in parts for key in part.static), *keys)
     return numbers, Signature(tuple(part.tree for part in parts), tree, static, options)
+
+
+def _number(leaf: Any) -> Any:
+    """Return a leaf of the data that is traced, else None; np.float64 as a float, whose type it has."""
+    if isinstance(leaf, float):
+        return float(leaf)
+    return leaf if eqx.is_array(leaf) else None
 
 
 def flat(part: Any) -> Flat:
