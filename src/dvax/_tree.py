@@ -266,6 +266,14 @@ def as_float(a: Tree, name: str) -> Tree:
     return _float_array(a, name)
 
 
+def as_arrays(args: Any) -> Any:
+    """Return args with floats converted to arrays; integers and flags remain static.
+
+    `np.float64`, which is a float of Python too, has the same program as other floats.
+    """
+    return jtu.tree_map(lambda v: jnp.asarray(float(v)) if isinstance(v, float) else v, args)
+
+
 def as_floats(a: Tree, name: str) -> Tree:
     """Return the parameters of a problem, an arbitrary tree, as floating-point arrays."""
     if not jtu.tree_leaves(a):

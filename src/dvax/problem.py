@@ -240,10 +240,8 @@ class Problem(eqx.Module):
         if wrong := solver_problems("solver", solver):
             raise InputError(*wrong)
         # Without this a number would be a static argument, and a new one compile a new program.
-        numbers = jax.tree_util.tree_map(
-            lambda v: jnp.asarray(v) if isinstance(v, float) else v, args
-        )
-        out, solved, answer = _solve_compiled(self, t, x, numbers, solver, of_rate)
+        args = _tree.as_arrays(args)
+        out, solved, answer = _solve_compiled(self, t, x, args, solver, of_rate)
         raise_failure(solved, answer, solver)
         return out
 
@@ -262,6 +260,12 @@ class Problem(eqx.Module):
         ):
             with problems.collect():
                 attempt()
+        if (
+            problems
+            and isinstance(x, tuple)
+            and not any(isinstance(v, tuple) or jnp.ndim(v) for v in x)
+        ):
+            problems.insert(0, _tuple_of_numbers(x))
         problems.raise_any()
 
     def _evaluate(self, name: str, value: Any, inputs: dict[str, Any], kind: type, x: Tree) -> Any:
@@ -442,6 +446,19 @@ def _solve_compiled(
         return *unless_failed(vi, answer, read), answer
 
     return outlined(run, problem, t, x, args)
+
+
+def _has_parts(leaf: Tree) -> bool:
+    return isinstance(leaf, tuple) or jnp.ndim(leaf) > 0
+
+
+def _tuple_of_numbers(x: Tree) -> InputProblem:
+    numbers = ", ".join(f"{float(v):g}" if _tree.is_concrete(v) else "..." for v in x)
+    return InputProblem(
+        "x0", f"a tuple of {len(x)} numbers",
+        "a tuple is a state in several parts, which f and h take and return as tuples",
+        f"If the state is a vector, write a list or an array: x0 = [{numbers}]",
+    )  # fmt: skip
 
 
 def _shape_fix(name: str, out: Tree, element: Tree, space: str) -> str:

@@ -86,3 +86,33 @@ def test_a_table_of_pandas_in_a_function_is_named(f, name):
         dvax.solve(problem(f), jnp.ones(2), 0.0, 1.0)
     message = str(caught.value)
     assert name in message and "to_numpy()" in message and "test_first_run.py" in message
+
+
+@pytest.mark.usefixtures("nothing_compiled")
+def test_saved_times_in_the_place_of_args_are_refused():
+    own = problem(lambda t, x, u, args: -u)
+    for times in (np.linspace(0.0, 1.0, 11), jnp.array([0.5, 1.0])):
+        with pytest.raises(dvax.InputError, match="no function of the problem uses it.*ts="):
+            dvax.solve(own, jnp.ones(2), 0.0, 1.0, times)
+
+
+@pytest.mark.parametrize("x0", [(0.0, 1.0), (1.0, 2.0, 3.0)])
+def test_a_vector_that_is_given_as_a_tuple_is_named(x0):
+    own = problem(lambda t, x, u, args: -x - u)
+    with pytest.raises(dvax.InputError) as caught:
+        dvax.solve(own, x0, 0.0, 1.0)
+    listed = ", ".join(f"{v:g}" for v in x0)
+    assert f"a tuple of {len(x0)} numbers" in str(caught.value).splitlines()[0]
+    assert f"x0 = [{listed}]" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "args",
+    [np.array([0.0, 0.5, 1.0]), np.array([3.0, 2.0]), np.array([0.5, 7.0]), np.array([0.5])],
+    ids=["used", "falling", "later", "one"],
+)
+def test_arrays_in_args_that_may_be_parameters_are_accepted(args):
+    own = problem(lambda t, x, u, args: -u)
+    if args.size == 3:
+        own = problem(lambda t, x, u, args: args[:2] - u)
+    assert np.isfinite(dvax.solve(own, jnp.ones(2), 0.0, 1.0, args).xs).all()

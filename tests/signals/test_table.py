@@ -87,7 +87,9 @@ def test_a_table_takes_an_array_of_times(kind):
     asked = ASKED[:60].reshape(5, 12)
     found = table(asked)
     assert found.shape == (5, 12, 2)
-    np.testing.assert_allclose(found.reshape(60, 2), exact(kind, ASKED[:60]), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        found.reshape(60, 2), exact(kind, ASKED[:60]), rtol=1e-12, atol=1e-12
+    )
 
 
 @pytest.mark.thorough

@@ -20,7 +20,6 @@ from ..evolution.event_arguments import check_events
 from ..evolution.first_run import key_of_first_run, warn_after_first_run
 from ..evolution.method import AbstractMethod
 from ..evolution.picard import Picard
-from ..evolution.setup import as_arrays
 from ..problem import Problem
 from ..vi import AbstractSolver, Auto
 from .collect import Collected, collect, fold_rows
@@ -117,7 +116,7 @@ def ensemble(
     check_own(method, observe, folds, keep, lanes, axes)
     problem = current(problem)
     states, times = _tree.as_float(x0s, "x0s"), (_times(t0), _times(t1))
-    inputs = Inputs.of(states, as_arrays(args), *times, _times(ts), axes)
+    inputs = Inputs.of(states, _tree.as_arrays(args), *times, _times(ts), axes)
     _check_times(inputs)
     # A member whose x0 is not finite fails alone.
     x0, own_args, begin, end, own_ts = inputs.member(inputs.examples()[0])

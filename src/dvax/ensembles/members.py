@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 
+from .. import _tree
 from .._tree import Tree
 from ..evolution import RESULTS
 from ..evolution.arguments import Arguments
 from ..evolution.closures import closure_convert
 from ..evolution.integrate import integrate
 from ..evolution.results import has_failed
-from ..evolution.setup import as_arrays
 from ..evolution.signature import Signature, flatten
 from ..evolution.solve import arranged
 from .inputs import Inputs
@@ -147,7 +147,7 @@ def _member(numbers: list[Any], signature: Signature) -> Row:
     times = None if ts is None else jnp.asarray(ts, setup.dtype)
     solution, closes_over_traced = integrate(setup, times, options)
     if closes_over_traced:
-        converted = closure_convert(problem, setup.number("t0"), x0, as_arrays(args))
+        converted = closure_convert(problem, setup.number("t0"), x0, _tree.as_arrays(args))
         solution = eqx.tree_at(lambda s: s.setup, solution, setup._replace(problem=converted))
     stats = solution.stats
     return Row(

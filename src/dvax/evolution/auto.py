@@ -30,7 +30,6 @@ from .flow import is_pointwise
 from .method import ETD2RK, ETD4RK, ExpRosenbrock
 from .results import RESULTS
 from .runge_kutta import DormandPrince
-from .setup import as_arrays
 from .signature import Signature, flat, flatten
 
 FIELD, LARGE_LAW = 64, 256
@@ -232,10 +231,12 @@ def _facts(problem: Problem, t0: jax.Array, x0: Tree, args: Any) -> Facts:
         if key in _FACTS:
             return _FACTS[key]
     except (InputError, TypeError):
-        return _read(problem, t0, x0, as_arrays(args))  # what cannot be hashed is refused later
+        return _read(
+            problem, t0, x0, _tree.as_arrays(args)
+        )  # what cannot be hashed is refused later
     if len(_FACTS) >= _MAX_FACTS:
         _FACTS.clear()
-    return _FACTS.setdefault(key, _read(problem, t0, x0, as_arrays(args)))
+    return _FACTS.setdefault(key, _read(problem, t0, x0, _tree.as_arrays(args)))
 
 
 def _kind(leaf: Any) -> Any:
@@ -296,7 +297,7 @@ def _rates(problem: Problem, t0: jax.Array, x0: Tree, args: Any, facts: Facts) -
     key = id(problem), *(leaf if isinstance(leaf, float) else id(leaf) for leaf in leaves)
     if key in _RATES:
         return _RATES[key][1]
-    kept, args = args, as_arrays(args)
+    kept, args = args, _tree.as_arrays(args)
     is_known = flat(problem).is_concrete and _tree.is_concrete(args)
     values: list[complex] | None = []
     if is_known and facts.linear:

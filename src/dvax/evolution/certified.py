@@ -25,7 +25,6 @@ from ..spaces import AbstractSpace
 from .defect import ROUNDINGS
 from .growth import between, disturbance, gronwall
 from .results import RESULTS
-from .setup import as_arrays
 from .solution import Solution
 
 _FIRST_RUN_FACTOR = 100.0
@@ -69,7 +68,7 @@ def certified(
     _check_domain(problem, constants, args, t0, t1)
     growth, span = _growth(constants), t1 - t0
     amplification = growth.amplification(span)
-    size, largest = (float(v) for v in _sizes(problem, jnp.asarray(t0), x0, as_arrays(args)))
+    size, largest = (float(v) for v in _sizes(problem, jnp.asarray(t0), x0, _tree.as_arrays(args)))
     eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(x0))).eps)
     reachable = _RATE_ROUNDOFF * eps * largest * amplification
     if not tol >= reachable:

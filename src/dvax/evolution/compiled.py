@@ -19,7 +19,7 @@ from .._jax.messages import is_equinox_check
 from .closures import closure_convert
 from .integrate import integrate
 from .results import has_failed
-from .setup import Options, Setup, as_arrays, pack, unpack
+from .setup import Options, Setup, pack, unpack
 from .signature import Signature, flatten
 from .solution import Solution
 
@@ -40,7 +40,7 @@ def compiled(setup: Setup, ts: Any, options: Options) -> tuple[Solution, bool | 
     tree, closes_over_traced = static.value
     if closes_over_traced:
         # So that the solution may leave the transformation in which these values are traced.
-        t0, args = setup.number("t0"), as_arrays(setup.args)
+        t0, args = setup.number("t0"), _tree.as_arrays(setup.args)
         problem = closure_convert(setup.problem, t0, setup.x0, args)
         setup = setup._replace(problem=problem)
     solution = jtu.tree_unflatten(tree, [*arrays, setup])

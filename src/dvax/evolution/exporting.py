@@ -28,7 +28,6 @@ from .exported import (
 from .implicit import Implicit
 from .piecewise.method import PiecewiseLinear
 from .results import RESULTS, result_names
-from .setup import as_arrays
 from .solution import Solution
 from .solve import solve
 
@@ -108,7 +107,7 @@ def export(
     # A Python number has the type of the state.
     numbers = [(n, np.asarray(v, dtype) if isinstance(v, float) else v) for n, v in numbers]
     given = [*states, *times, *numbers]
-    leaves, tree = jtu.tree_flatten(as_arrays(args))
+    leaves, tree = jtu.tree_flatten(_tree.as_arrays(args))
     is_number = [isinstance(leaf, jax.Array | np.ndarray) for leaf in leaves]
 
     def program(inputs: list[Any]) -> dict[str, Any]:

@@ -4,15 +4,17 @@ import math
 import warnings
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
 from .._tree import Tree
+from ..errors import input_error
 from ..problem import Problem
 from .nonfinite import first_bad, nonfinite_data
-from .setup import as_arrays
 from .several_solutions import warn_of_several_solutions
 from .signature import flat
 
@@ -44,15 +46,40 @@ def check_before_first_run(problem: Problem, t0: Any, t1: Any, x0: Tree, args: A
 
     **Raises:** `dvax.InputError`.
     """
-    args = as_arrays(args)
+    args = _tree.as_arrays(args)
     if _tree.is_concrete(t1):
         problem.check_spans(t0, t1, x0, args)
+        _check_not_saved_times(problem, t0, t1, x0, args)
     wrong = nonfinite_data(problem, args, "dvax.solve")
     if wrong:
         t, u = jnp.asarray(t0, _tree.dtype(x0)), problem.zero_control(x0)
         used = (problem.f(t, x0, u, args), problem.h(t, x0, u, args), problem.set_at(t, args))
         if first_bad((problem.A, problem.P, used), allow_infinite=True):
             wrong.raise_any()
+
+
+def _check_not_saved_times(problem: Problem, t0: Any, t1: Any, x0: Tree, args: Any) -> None:
+    """Refuse times of [t0, t1] as args that no function uses: they were meant to be saved times."""
+    if not isinstance(args, np.ndarray | jax.Array) or np.ndim(args) != 1 or np.size(args) < 2:
+        return
+    times = np.asarray(args)
+    if times[0] < float(t0) or times[-1] > float(t1) or not np.all(np.diff(times) > 0):
+        return
+    t, u = jnp.asarray(t0, _tree.dtype(x0)), problem.zero_control(x0)
+
+    def values(args: Any) -> list[Any]:
+        parts = problem.f(t, x0, u, args), problem.h(t, x0, u, args), problem.set_at(t, args)
+        found = jtu.tree_leaves((parts, problem.generator(args), problem.operator(args)))
+        return [leaf for leaf in found if eqx.is_array(leaf)]
+
+    program = jax.make_jaxpr(values)(args).jaxpr
+    used = [*program.outvars, *(v for e in program.eqns for v in e.invars)]
+    if program.invars[0] not in used:
+        raise input_error(
+            "dvax.solve(args)", f"{times.size} times from {times[0]:g} to {times[-1]:g}",
+            "the argument after t1 is args, and no function of the problem uses it",
+            "Pass saved times by name, dvax.solve(problem, x0, t0, t1, ts=...), or leave args out",
+        )  # fmt: skip
 
 
 def warn_after_first_run(

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
+from .. import _tree
 from .._jax.jaxprs import has_loop
 from ..programs.enclosure import constant, has_enclosure
 from ..vi import AbstractSolver, Auto, analyse, independent
@@ -14,7 +15,7 @@ from .implicit import Implicit
 from .law_tolerance import law_tolerance
 from .linearised import NoJacobian
 from .method import AbstractMethod
-from .setup import Setup, as_arrays
+from .setup import Setup
 from .small_box import AbstractSmallBox, is_small, small_box
 
 
@@ -42,7 +43,8 @@ class Plan(NamedTuple):
     @staticmethod
     def of(setup: Setup) -> "Plan":
         """Return the plan from the code of f, h and K, traced at the start of the run."""
-        problem, x0, args, t0 = setup.problem, setup.x0, as_arrays(setup.args), setup.number("t0")
+        problem, x0, t0 = setup.problem, setup.x0, setup.number("t0")
+        args = _tree.as_arrays(setup.args)
         like = problem.zero_control(x0)
         if not isinstance(setup.vi_solver, Auto):
             return Plan(False, False, False, False, True, None, False)
@@ -71,7 +73,8 @@ class Plan(NamedTuple):
 
     def flow(self, setup: Setup) -> Flow:
         """Return the reduced map f̃ for the numbers of this call."""
-        problem, x0, args, t0 = setup.problem, setup.x0, as_arrays(setup.args), setup.number("t0")
+        problem, x0, t0 = setup.problem, setup.x0, setup.number("t0")
+        args = _tree.as_arrays(setup.args)
         operator, generator, method = problem.operator(args), problem.generator(args), setup.method
         reciprocal = None
         if self.closed_form and self.constant_slope:
@@ -99,7 +102,7 @@ class Plan(NamedTuple):
 
 def _small_box(setup: Setup) -> AbstractSmallBox:
     """Return the formula of an affine law on a box of a few unknowns."""
-    problem, x0, args, t0 = setup.problem, setup.x0, as_arrays(setup.args), setup.number("t0")
+    problem, x0, args, t0 = setup.problem, setup.x0, _tree.as_arrays(setup.args), setup.number("t0")
     like = problem.zero_control(x0)
     assert isinstance(like, jax.Array)
     frozen = problem.frozen(t0, x0, args)

@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import _tree
 from .._dataset import dataset, described
 from .after_run import at_rows, steps_at
 from .flow import Flow
 from .locate_event import locate_event
 from .outcome import Record
 from .plan import Plan
-from .setup import Setup, as_arrays
+from .setup import Setup
 from .stepper import dense_output, one_sided_time
 
 _SAMPLES = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -51,7 +52,7 @@ class Regimes(NamedTuple):
 
 def switch_count(setup: Setup) -> int | None:
     """Return the number of the switch functions of the set K of a run, None if it has none at all."""
-    problem, x0, args = setup.problem, setup.x0, as_arrays(setup.args)
+    problem, x0, args = setup.problem, setup.x0, _tree.as_arrays(setup.args)
 
     def switches(t: Any, x: Any) -> Any:
         return problem.set_at(t, args).switches(problem.zero_control(x), problem.spaces(x)[1])

@@ -4,7 +4,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
@@ -83,11 +82,3 @@ def pack(setting: dict[str, Any]) -> Any:
 def unpack(entries: Any, names: tuple[str, ...]) -> dict[str, Any]:
     """Return the setting with these entries."""
     return dict(zip(names, entries, strict=True))
-
-
-def as_arrays(args: Any) -> Any:
-    """Return args with floats converted to arrays; integers and flags remain static.
-
-    `np.float64`, which is a float of Python too, has the same program as other floats.
-    """
-    return jtu.tree_map(lambda v: jnp.asarray(float(v)) if isinstance(v, float) else v, args)

@@ -19,7 +19,6 @@ from .. import _tree
 from .._tree import Tree
 from ..problem import Problem
 from ..programs.structure import analyse
-from .setup import as_arrays
 from .signature import Signature, flatten
 
 _LARGEST = 64
@@ -45,7 +44,7 @@ def warn_of_several_solutions(problem: Problem, t0: Any, x0: Tree, args: Any, mo
     if getattr(moduli, "gamma", None) is not None:
         return
     t = jnp.asarray(np.asarray(t0, _tree.dtype(x0)))
-    pair = _pair(problem, t, x0, as_arrays(args))
+    pair = _pair(problem, t, x0, _tree.as_arrays(args))
     if pair is not None:
         y, z, product = pair
         warnings.warn(

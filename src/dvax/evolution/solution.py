@@ -31,7 +31,7 @@ from .regimes import Regimes, regimes, switch_count
 from .responses import Responses
 from .results import RESULTS, is_success
 from .saved_responses import Saved, saved_responses
-from .setup import Setup, as_arrays
+from .setup import Setup
 from .stepper import dense_output
 
 if TYPE_CHECKING:
@@ -293,7 +293,7 @@ class Solution(eqx.Module):
         if isinstance(self.records, Trajectory):
             return signs(self.records)
         if switch_count(self.setup) is None:
-            K = self.setup.problem.set_at(self.setup.number("t0"), as_arrays(self.setup.args))
+            K = self.setup.problem.set_at(self.setup.number("t0"), _tree.as_arrays(self.setup.args))
             raise input_error(
                 "Solution.regimes",
                 f"K of type {type(K).__name__}",

@@ -46,7 +46,7 @@ from .piecewise.method import PiecewiseLinear
 from .piecewise.propagate import propagate
 from .results import RESULTS, is_success
 from .rows import cut
-from .setup import Options, Setup, as_arrays
+from .setup import Options, Setup
 from .signature import flat
 from .solution import Solution
 from .streaming import check_save, stream
@@ -233,7 +233,7 @@ def _run(choice: Choice, setup: Setup, times: Any, options: Options, throw: bool
         traced = not _tree.is_concrete(solution.ts, solution.xs)
         if traced:
             # Inside of `jax.grad`, though not of `jax.jit` or `jax.vmap`, the values are known.
-            args = as_arrays(setup.args)
+            args = _tree.as_arrays(setup.args)
             problem = closure_convert(problem, setup.number("t0"), setup.x0, args)
             setup = setup._replace(problem=problem, args=args)
             setup, times, ended = _tree.primal((setup, times, solution))
@@ -323,7 +323,7 @@ def _examined(setup: Setup, times: Any, options: Options, solution: Solution) ->
     problem, x0, args = setup.problem, setup.x0, setup.args
     t0, t1 = setup.setting["t0"], setup.setting["t1"]
     nonfinite_data(problem, args, "dvax.solve").raise_any()
-    problem.knots(t0, t1, x0, as_arrays(args))
+    problem.knots(t0, t1, x0, _tree.as_arrays(args))
     problem.check_data(t0, t1, x0, args)
     if options.fixed:
         # Once more, keeping the last good state, to say where it went wrong.

@@ -32,7 +32,6 @@ from .._repr import is_known, last_text, table, value_text
 from ..errors import InputProblem, Problems, input_error
 from ..evolution import Implicit, Solution, between, disturbance, gronwall
 from ..evolution.defect import ROUNDINGS
-from ..evolution.setup import as_arrays
 from ..evolution.solve import run_again
 from ..generators import AbstractGenerator, AbstractMatrixFree, Growth, Product
 from ..operators import AbstractOperator, Spectrum
@@ -189,7 +188,7 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
     if sol.defect is None or (regional and sol.bounds is None):
         measured = _solve_again(sol, constants)
         distance = jax.vmap(lambda a, b: space.norm(_tree.sub(a, b)))(measured.xs, sol.xs)
-    args, t0 = as_arrays(sol.setup.args), jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
+    args, t0 = _tree.as_arrays(sol.setup.args), jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
     of_x, of_u = _roundoff(problem, args, t0, sol.setup.x0, sol.ts, sol.xs, sol.us)
     distance = _tree.prepare(operator.add, distance, of_x)
     assert measured.defect is not None and measured.law_defect is not None

@@ -7,6 +7,7 @@ import jax
 import jax.tree_util as jtu
 import numpy as np
 
+from dvax import _tree
 from dvax._tree import Tree
 from dvax.app.plots.downsample import edges
 from dvax.app.plots.panels import AbstractPanel, Curve, Panel
@@ -15,7 +16,7 @@ from dvax.evolution import Solution
 from dvax.evolution.after_run import at_rows
 from dvax.evolution.plan import Plan
 from dvax.evolution.regimes import switch_count
-from dvax.evolution.setup import Setup, as_arrays
+from dvax.evolution.setup import Setup
 
 _MOST_ROWS = 12
 """Up to this many constraints that are ever active have a row each."""
@@ -36,7 +37,7 @@ def box_rows(sol: Solution, times: np.ndarray) -> tuple[Tree, Tree] | None:
 def _bounds(setup: Setup, t: Any) -> tuple[Tree, Tree] | None:
     """Return the bounds of K at one time, None if it is no box."""
     problem = setup.problem
-    return problem.set_at(t, as_arrays(setup.args)).intervals(problem.zero_control(setup.x0))
+    return problem.set_at(t, _tree.as_arrays(setup.args)).intervals(problem.zero_control(setup.x0))
 
 
 def _bounds_at(setup: Setup, _: Plan, times: jax.Array) -> Any:

@@ -19,7 +19,7 @@ from ...spaces import AbstractSpace
 from ..bounds import Bounds
 from ..responses import Responses
 from ..results import RESULTS
-from ..setup import Options, Setup, as_arrays
+from ..setup import Options, Setup
 from ..solution import Solution
 from .inputs import Piece, UnresolvedInput, build_pieces
 from .records import Row
@@ -45,7 +45,7 @@ def propagate(setup: Setup, ts: Any, options: Options) -> Solution:
             "if they are not too stiff."
         )
     setup_start = time.perf_counter()
-    problem, x0, args = setup.problem, jnp.asarray(setup.x0), as_arrays(setup.args)
+    problem, x0, args = setup.problem, jnp.asarray(setup.x0), _tree.as_arrays(setup.args)
     t0, t1, rtol, atol = (float(setup.setting[name]) for name in ("t0", "t1", "rtol", "atol"))
     data = _data(problem, t0, x0, args)
     system, spaces = data.system, problem.spaces(x0)
@@ -126,7 +126,7 @@ def _solution(
 ) -> Solution:  # fmt: skip
     rows, dtype, problem = run.rows, x0.dtype, setup.problem
     u0 = problem.zero_control(x0)
-    P = problem.operator(as_arrays(setup.args))
+    P = problem.operator(_tree.as_arrays(setup.args))
     n, m = x0.size, u0.size
     array = lambda values, shape: jnp.asarray(  # noqa: E731
         np.reshape(np.array(values, float), (len(rows), *shape)), dtype
