@@ -16,7 +16,7 @@ export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-times lint types thorough bench format docs installed lock clean
+.PHONY: help setup demo test slow test-times lint types thorough bench format docs installed lock clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1@/p' Makefile | awk -F@ '{ printf "%-17s %s\n", $$1, $$2 }'
@@ -54,7 +54,10 @@ demo: $(READY) ## solve the rough contact strip; results and report in ./demo-ru
 # Tests start many processes: without bytecode each compiles what it imports.
 test: lint types ## lint, formatting, types and tests (under 10 minutes on two cores)
 	env -u PYTHONDONTWRITEBYTECODE $(PY) -m pytest -n $(WORKERS) --dist worksteal --durations=15
-	@echo 'make test: lint, formatting, types and every test not marked thorough have passed'
+	@echo 'make test: lint, formatting, types and every test not marked slow or thorough have passed'
+
+slow: $(READY) ## the tests that take more than about two seconds each
+	env -u PYTHONDONTWRITEBYTECODE $(PY) -m pytest -n $(WORKERS) --dist worksteal -m slow --durations=15
 
 test-times: $(READY) ## the tests of make test, with the processor time of each test, file and folder
 	env -u PYTHONDONTWRITEBYTECODE $(PY) -m pytest -n $(WORKERS) --dist worksteal -p tests.processor_time

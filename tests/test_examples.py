@@ -139,6 +139,7 @@ def test_gallery_has_a_description_a_figure_and_a_certificate_in_each_example():
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "file",
     [pytest.param(f, marks=[] if f.stem in QUICK else [pytest.mark.thorough]) for f in GALLERY],

@@ -282,6 +282,7 @@ LONG = set(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -338,6 +339,7 @@ def test_architecture_page_names_existing_files():
     assert not absent
 
 
+@pytest.mark.slow
 def test_unstable_jax_interfaces_are_used_in_one_folder_only():
     assert list(unstable_lines()) == []
     # The reader finds what it looks for.

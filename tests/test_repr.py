@@ -40,6 +40,7 @@ def test_failed_solution_is_shown_with_its_failure_and_its_last_time():
     assert ["t", f"{float(sol.stats['t']):.7g}"] in [line.split() for line in shown]
 
 
+@pytest.mark.slow
 def test_solutions_of_a_batch_and_of_a_trace_are_shown():
     assert repr(eqx.filter_vmap(solve)(jnp.linspace(2.0, 4.0, 3))).startswith(
         "Solution: 3 runs, 0 failed"
@@ -57,6 +58,7 @@ def test_solutions_of_a_batch_and_of_a_trace_are_shown():
     assert repr(shape).startswith("Solution: ")
 
 
+@pytest.mark.slow
 def test_constants_verification_and_bound_are_shown_with_statuses():
     check, sol = dvax.verify(problem(), -1.0, 0.0, 2.0, 3.0), solve(3.0)
     bound = dvax.bound_error(problem(), sol, check.constants)
@@ -81,6 +83,7 @@ def test_ensemble_is_shown_with_mean_and_failures():
     assert f"{float(found.mean):.7g}" in repr(found)
 
 
+@pytest.mark.slow
 def test_events_are_shown_with_times_and_names():
     half = dvax.Event(lambda t, x, u, load: x - 0.5, name="half")
     other = dvax.Event(lambda t, x, u, load: x)

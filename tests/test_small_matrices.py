@@ -13,6 +13,7 @@ def unit_rows(seed: int, m: int, n: int) -> np.ndarray:
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 4, MAX_ROWS, MAX_ROWS + 1])
 def test_a_system_is_solved(n: int) -> None:
     rng = np.random.default_rng(n)

@@ -101,6 +101,7 @@ OPTIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mostly_thorough(OPTIONS, ["dt", "numbers"]))
 def test_options_are_those_of_solve(name):
     options = OPTIONS[name]
@@ -120,6 +121,7 @@ def test_events_are_observed_in_each_member():
     np.testing.assert_allclose(found.values[9], alone.events.ts[0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_first_member_with_an_empty_set_fails_alone():
     """u = min(1/2, a), and x' = −x + u from 0."""
     problem = dvax.Problem(
@@ -136,6 +138,7 @@ def test_first_member_with_an_empty_set_fails_alone():
         found.member(0)
 
 
+@pytest.mark.slow
 def test_members_that_fail_leave_the_others_alone():
     """x' = a x² from x = 1 escapes at t = 1/a."""
     problem = dvax.Problem(
@@ -268,6 +271,7 @@ def test_pieces_come_back_in_order_and_errors_are_raised():
         list(in_order(range(20), fails, "abc"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mode", mostly_thorough(["grad", "jit of grad", "closure", "jacfwd"], ["jacfwd"])
 )
@@ -319,6 +323,7 @@ def test_derivatives_of_a_failed_member_are_nan_and_others_are_right():
         jax.jit(lambda s: run(s).member(0).xs)(1.0)
 
 
+@pytest.mark.slow
 def test_progress_counts_the_members(capfd):
     dvax.ensemble(loaded(), STARTS[:70], 0.0, 1.0, {"load": LOADS[:70]}, progress=True)
     assert "dvax.ensemble: 70 of 70 members, 0 s left" in capfd.readouterr().err
@@ -375,6 +380,7 @@ def test_members_are_the_same_on_all_devices():
     subprocess.run([sys.executable, "-c", ON_DEVICES], env=os.environ | flags, check=True)
 
 
+@pytest.mark.slow
 def test_an_ensemble_without_success_has_no_mean():
     with pytest.warns(UserWarning, match="3 of 3 members failed"):
         found = dvax.ensemble(
@@ -398,6 +404,7 @@ def test_a_member_that_does_not_start_at_a_number_fails_alone(place):
     assert np.flatnonzero(found.failed).tolist() == [place]
 
 
+@pytest.mark.slow
 def test_an_ensemble_keeps_its_inputs():
     loads = np.array(LOADS[:3])
     found = dvax.ensemble(loaded(), -1.0, 0.0, 1.0, {"load": loads})
@@ -407,6 +414,7 @@ def test_an_ensemble_keeps_its_inputs():
         found.member(3)
 
 
+@pytest.mark.slow
 def test_moments_of_complex_values_and_quantiles_of_flags():
     rows = RNG.normal(size=50) + 1j * RNG.normal(size=50)
     found = Moments.of(rows[:20], np.ones(20, bool)).merge(Moments.of(rows[20:], np.ones(30, bool)))

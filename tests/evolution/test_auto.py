@@ -39,6 +39,7 @@ def spring(stiffness, push, power=1):
 STIFFNESSES = [3e3, 1e4, 1e5, 1e6]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("power", mostly_thorough([1, 2], [1]))
 @pytest.mark.parametrize("stiffness", mostly_thorough(STIFFNESSES, [1e4]))
 def test_stiff_law_is_solved_by_a_method_without_a_limit_of_stability(stiffness, power):
@@ -76,6 +77,7 @@ def test_oscillation_is_not_taken_for_stiffness():
     assert sol.stats["method"].startswith("DormandPrince: ")
 
 
+@pytest.mark.slow
 def test_known_constants_and_fixed_steps_keep_the_method_whose_defect_is_enclosed():
     case = closed_forms.c1()
     known = dvax.solve(
@@ -219,6 +221,7 @@ def test_field_is_left_to_its_exponential_by_a_method_that_suits_the_tolerance()
     np.testing.assert_allclose(traced(1e-7), tight.xs, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("A", "name"),
     [
@@ -251,6 +254,7 @@ def test_field_with_a_coupled_law_has_order_four(A, name):
     np.testing.assert_allclose(sol.xs, second.xs, atol=2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("A", "name"),
     [
@@ -276,6 +280,7 @@ def test_method_is_chosen_for_a_traced_end_of_the_run(A, name):
     assert all(text.startswith(name) for text in chosen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gain", "rtol", "name"),
     mostly_thorough(
@@ -299,6 +304,7 @@ def test_steep_laws_take_steps_of_order_four_at_loose_tolerances(gain, rtol, nam
     assert str(sol.stats["method"]).startswith(name)
 
 
+@pytest.mark.slow
 def test_matrix_of_a_vibrating_chain_is_judged_by_its_frequencies():
     n = 6
     stiffness = 400.0 * (2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
@@ -313,6 +319,7 @@ def test_matrix_of_a_vibrating_chain_is_judged_by_its_frequencies():
     assert str(sol.stats["method"]).startswith("DormandPrince")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "span", "name"),
     mostly_thorough(

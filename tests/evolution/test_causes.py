@@ -46,6 +46,7 @@ ESCAPES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("p", "c", "method"),
     mostly_thorough(ESCAPES, [(3.0, 20.0, dvax.ETD2RK())]),
@@ -81,6 +82,7 @@ def test_cause_exponential_growth_is_not_reported_as_escape():
     assert "escape" not in str(error) and "exponential growth" in error.cause
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "A",
     [
@@ -132,6 +134,7 @@ def test_cause_growth_that_makes_a_run_stiff_is_named(K, rate):
     assert "grow" not in error.cause.split("max_steps")[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("most", [1, 20, 60, 100])
 def test_cause_too_few_steps_of_a_circuit_is_the_only_one_reported(most):
     # A multiplier with 20 periods of its source: with 20 steps not even these have a piece each.
@@ -144,6 +147,7 @@ def test_cause_too_few_steps_of_a_circuit_is_the_only_one_reported(most):
     assert most < int(error.fixes[0].value) <= 100 * most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "at", "k"),
     mostly_thorough(
@@ -196,6 +200,7 @@ def test_cause_nonmonotone_law_names_the_eigenvalue():
     assert "not strongly monotone" in error.cause and "eigenvalue -2 " in error.cause
 
 
+@pytest.mark.slow
 def test_cause_law_that_does_not_depend_on_u_names_the_eigenvalue():
     problem = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Ball(0.0, 1.0),
@@ -218,6 +223,7 @@ def test_cause_stiffness_suggests_a_method_that_succeeds(rate):
     assert float(found.xs[-1]) == pytest.approx(math.cos(1.0), abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerances", [{"rtol": 1e-10}, {"rtol": 0.0, "atol": 1e-9}])
 def test_many_times_the_steps_so_far_are_the_last_advice(tolerances):
     problem = make(lambda t, x, u, args: jnp.sin(20.0 * t) - x)
@@ -228,6 +234,7 @@ def test_many_times_the_steps_so_far_are_the_last_advice(tolerances):
     assert int(fixes(error)["max_steps"]) % 100 == 0
 
 
+@pytest.mark.slow
 def test_suggested_max_steps_suffices():
     problem = make(lambda t, x, u, args: jnp.cos(5.0 * t) - x)
     error = failure(problem, t1=20.0, max_steps=300, rtol=1e-6)
@@ -332,6 +339,7 @@ def test_cause_empty_set_names_the_time(K, method):
     assert "empty" in error.cause and "Check K there." in str(error)
 
 
+@pytest.mark.slow
 def test_cause_conditions_that_contradict_each_other_are_reported_as_an_empty_set():
     cube = jnp.concatenate([jnp.eye(3), -jnp.ones((1, 3))])
     release = jnp.concatenate([jnp.ones((1, 3)), -jnp.eye(3)])

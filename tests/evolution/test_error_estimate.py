@@ -71,6 +71,7 @@ def error(before, after, turn, end, tol, method):
     return np.abs(np.asarray(sol.xs[-1]) - exact) / scale, int(sol.stats["steps"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", mostly_thorough(METHODS, ["default"]))
 @pytest.mark.parametrize("rate", mostly_thorough([1.0, 10.0, 1e2, 1e3, 1e4], [1e2]))
 @pytest.mark.parametrize("tol", mostly_thorough([1e-4, 1e-6, 1e-8], [1e-6]))

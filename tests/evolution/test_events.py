@@ -45,6 +45,7 @@ METHODS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", mostly_thorough(METHODS, ["DormandPrince"]))
 def test_event_times_and_states_of_an_oscillator_are_exact_to_the_tolerance(method):
     omega = 3.0
@@ -64,6 +65,7 @@ def test_event_times_and_states_of_an_oscillator_are_exact_to_the_tolerance(meth
 RISING = component(X, direction=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", mostly_thorough(["DormandPrince", "ExpRosenbrock"], ["ExpRosenbrock"])
 )

@@ -123,6 +123,7 @@ def test_dt_max_limits_adaptive_steps():
         dvax.solve(problem, 1.0, 0.0, 1.0, dt_max=-1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", mostly_thorough([None, dvax.ETD2RK()], [None]))
 def test_single_precision_state_beside_a_moving_set_of_double_precision(method):
     # The center 0.0 of the ball is a double, and the guard bounds the changes of h and K together.
@@ -142,6 +143,7 @@ def test_single_precision_state_beside_a_moving_set_of_double_precision(method):
     assert np.allclose(single, double, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [dvax.DormandPrince(), dvax.ETD4RK(), dvax.ExpRosenbrock()])
 def test_a_set_that_was_made_in_single_precision_limits_a_run_in_double_precision(method):
     """Its numbers have no effect on the type: 1.0 is 1.0 in both."""

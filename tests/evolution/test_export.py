@@ -44,6 +44,7 @@ def solve(x0, load):
     return dvax.solve(pair(), x0, 0.0, 2.0, {"load": load, "n": -1}, TS, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_exported_program_equals_the_solve_for_the_example_and_other_inputs(program):
     run = dvax.load_exported(program)
     other = (START[0] + 0.1, START[1])

@@ -54,6 +54,7 @@ def test_nan_ends_the_run_and_the_error_names_function_time_and_component(name, 
     np.testing.assert_allclose(np.asarray(sol.xs[:, 2]), -np.exp(-sol.ts), atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", mostly_thorough([0.02, 0.1], [0.1]))
 def test_saved_states_before_a_failure_are_kept(dt):
     ts = np.linspace(0.0, 2.0, 21)
@@ -63,6 +64,7 @@ def test_saved_states_before_a_failure_are_kept(dt):
     np.testing.assert_allclose(sol.xs[:, 2], 0.9 * np.exp(-2 * ts[:8]), atol=1e-2)
 
 
+@pytest.mark.slow
 def test_throw_false_returns_the_failure_as_result():
     sol = dvax.solve(system("f"), jnp.zeros(3), 0.0, 2.0, rtol=1e-3, throw=False)
     assert sol.result == RESULTS.nonfinite
@@ -76,6 +78,7 @@ def test_max_steps_failure_has_a_partial_result():
     assert 0 < len(caught.value.solution.ts) < 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", mostly_thorough([3.0, 1.0], [3.0]))
 def test_law_without_a_solution_fails(gain):
     # F(y) = (1 − gain) y + …: not strongly pseudomonotone, so the closed form proj(−c/a) means
@@ -92,6 +95,7 @@ def test_law_without_a_solution_fails(gain):
             dvax.solve(problem, jnp.zeros(2), 0.0, 1.0)
 
 
+@pytest.mark.slow
 def test_moving_set_that_becomes_empty_ends_the_run():
     problem = dvax.Problem(
         A=dvax.generators.Scalar(-1.0),
@@ -134,6 +138,7 @@ TRACED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "method"), mostly_thorough(TRACED, [("t1 before t0", "ETD2RK"), ("dt", "ETD2RK")])
 )

@@ -64,6 +64,7 @@ def test_data_that_make_a_run_fail_are_refused_before_it_is_compiled(own, args, 
     assert words in str(caught.value)
 
 
+@pytest.mark.slow
 def test_data_that_are_not_used_may_be_nan():
     own = problem(lambda t, x, u, args: args["a"] * x - u)
     args = {"a": -1.0, "missing": np.array([np.nan])}

@@ -54,6 +54,7 @@ def errors(method, counts):
     return [max(map(mean, np.asarray(sol.xs) - exact)) for sol in runs]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "order"),
     [pytest.param(dvax.ETD1(), 1.0, marks=pytest.mark.thorough), (dvax.ETD2RK(), 2.0)],
@@ -87,6 +88,7 @@ def test_error_over_moving_boundaries_is_below_twice_the_tolerance(method, rtol)
     assert max(map(mean, np.asarray(sol.xs) - exact)) < 2.0 * rtol
 
 
+@pytest.mark.slow
 def test_free_boundaries_agree_with_the_closed_form():
     case = c7(N)
     ts = np.array([0.0, 0.15, 0.3])

@@ -42,6 +42,7 @@ def test_derivative_with_fixed_steps_is_of_first_order_across_kinks(adjoint):
         assert error < 0.05 * dt
 
 
+@pytest.mark.slow
 def test_response_is_differentiable():
     # In contact u = ½ − x, so du/dx0 = −dx/dx0; dx/dx0 there is e^{−1.5 t₁} e^{−(t−t₁)/2}.
     t = 0.45
@@ -56,6 +57,7 @@ def test_response_is_differentiable():
     np.testing.assert_allclose(np.asarray(found), [exact, -exact], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_wrong_adjoint_raises_an_error_that_names_the_right_one():
     with pytest.raises(dvax.DifferentiationError, match='adjoint="forward"'):
         jax.jvp(lambda x: end(x, 3.0, "reverse"), (-1.0,), (1.0,))

@@ -18,6 +18,7 @@ SHAPES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
 def test_the_bump_of_the_samples_bounds_a_jump_or_kink_at_any_place(method, shape):

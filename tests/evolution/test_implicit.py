@@ -13,6 +13,7 @@ from dvax import generators, signals
 PLAIN = dvax.operators.Scaling(1.0)
 
 
+@pytest.mark.slow
 def test_implicit_solves_the_contact_law_across_kinks():
     case, ts = c1(), np.linspace(0.0, 2.0, 9)
     sol = dvax.solve(
@@ -44,6 +45,7 @@ def test_implicit_solves_a_stiff_system():
     assert int(sol.stats["steps"]) < 400
 
 
+@pytest.mark.slow
 def test_implicit_accepts_the_law_as_explicit_part():
     # The tests turn off the optimisation with which Diffrax's own root finder rejects every step here.
     case = c1()
@@ -81,6 +83,7 @@ def pushed(times, values):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_implicit_steps_end_at_jumps_of_data():
     problem = pushed([0.0, 0.37, 1.0], [1.0, -3.0, 0.0])
     sol = dvax.solve(problem, 0.0, 0.0, 1.0, method=dvax.Implicit(diffrax.Kvaerno3()))

@@ -32,6 +32,7 @@ def test_locate_event_returns_the_first_sign_change():
     assert float(locate_event(thetas, values, late, wanted=False)) == np.inf
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [1e-4, 0.123, 0.5, 0.9, 0.9999])
 @pytest.mark.parametrize("hair", [0.0, 1e-12, 1e-6])
 def test_locate_event_finds_where_a_function_reaches_or_leaves_zero(place, hair):
@@ -43,6 +44,7 @@ def test_locate_event_finds_where_a_function_reaches_or_leaves_zero(place, hair)
         assert float(locate_event(thetas, values, at)) == pytest.approx(place, abs=2e-5)
 
 
+@pytest.mark.slow
 def test_etd4rk_keeps_order_four_across_unannounced_kinks():
     case = c1()
     steps, errors = [], []
@@ -209,6 +211,7 @@ def test_kinks_are_located_for_every_kind_of_set(name):
         assert int(sol.stats["rejected"]) <= 0.4 * int(sol.stats["steps"])
 
 
+@pytest.mark.slow
 def test_regimes_are_those_of_the_closed_form():
     case = c1()
     options = dict(args=case.args, dense=True, max_steps=4096)

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import dvax
 from dvax.evolution.method import TWO_SAMPLES, combined
@@ -35,6 +36,7 @@ PROBLEM = dvax.Problem(
 X0 = jnp.array([1.0, -0.5])
 
 
+@pytest.mark.slow
 def test_new_exponential_method_has_its_order_with_fixed_steps():
     exact = dvax.solve(PROBLEM, X0, 0.0, 2.0, rtol=1e-12, atol=1e-12, method=dvax.ETD4RK()).xs[-1]
     errors = [

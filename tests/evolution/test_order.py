@@ -54,6 +54,7 @@ def test_order_on_the_contact_law_with_its_kinks_on_the_grid(method, order, fewe
     assert found == pytest.approx(order, abs=0.05)
 
 
+@pytest.mark.slow
 def test_polynomial_forcing_is_integrated_exactly():
     # f̃ constant: ETD1 is exact; a line in t: ETD2RK is; a parabola: ETD4RK is, in one step, however
     # stiff A is.
@@ -81,6 +82,7 @@ def test_polynomial_forcing_is_integrated_exactly():
         np.testing.assert_allclose(np.asarray(sol.xs[-1]), exact, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_order_on_a_field_with_free_boundaries():
     """The order is 2, and the method of order 4 is more accurate."""
     # Heat with a saturated contact law at each point; the free boundaries move through the grid.

@@ -71,6 +71,7 @@ LARGE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SMALL)
 def test_outlined_small_program_is_one_function_with_equal_values(name):
     run = looped(SMALL[name])
@@ -79,6 +80,7 @@ def test_outlined_small_program_is_one_function_with_equal_values(name):
     np.testing.assert_allclose(program(V), jax.jit(run)(V), rtol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LARGE)
 def test_outlined_leaves_large_programs_and_library_calls_unchanged(name):
     run = looped(LARGE[name])
@@ -198,6 +200,7 @@ def test_outlined_accepts_long_constants_beside_computed_arguments(n):
         np.testing.assert_allclose(found, exact)
 
 
+@pytest.mark.slow
 def test_outlined_batch_and_its_derivatives_equal_those_of_the_plain_program():
     run = looped(lambda k, v: jax.lax.dynamic_update_index_in_dim(jnp.sin(v), v[k % N], 1, 0))
     whole = lambda v: outlined(run, v)  # noqa: E731
@@ -230,6 +233,7 @@ def test_outlined_jvp_is_finite_with_undifferentiated_arguments():
     assert np.isfinite(jax.jit(push)(V)[1]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", mostly_thorough([c1, c2, c3], [c1]))
 def test_outlined_solve_of_a_small_system_is_one_function(case):
     # What makes a step of a small system cheap: should a new operation end it, this says so.

@@ -24,6 +24,7 @@ def solve(case, **how):
     return sol, np.array(off)
 
 
+@pytest.mark.slow
 def test_picard_has_order_two_on_the_shrinking_ball():
     case = c3()
     counts = np.array([64, 128, 256, 512])
@@ -37,6 +38,7 @@ def test_picard_has_order_two_on_the_shrinking_ball():
     assert found == pytest.approx(2.0, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", mostly_thorough([c1, c2, c3], [c1]))
 def test_picard_error_is_below_its_bound_and_near_the_tolerance(make):
     case = make()
@@ -66,6 +68,7 @@ def test_picard_sweeps_converge_superlinearly():
     assert int(sol.stats["windows"]) == 1 and 15 <= int(sol.stats["sweeps"]) <= 28
 
 
+@pytest.mark.slow
 def test_picard_sums_in_turn_and_by_doubling_agree():
     rng = np.random.default_rng(3)
     A = generators.Dense(rng.normal(size=(3, 3)))
@@ -100,6 +103,7 @@ def test_picard_solves_an_iterated_law_as_one_batch():
     np.testing.assert_allclose(np.asarray(u), np.asarray(theirs.us[0]), atol=5e-5)
 
 
+@pytest.mark.slow
 def test_picard_windows_end_at_jumps_of_data():
     table = signals.Table([0.0, 0.37, 1.0], [1.0, -3.0, 0.0], kind="constant")
     problem = dvax.Problem(
@@ -112,6 +116,7 @@ def test_picard_windows_end_at_jumps_of_data():
         assert int(sol.stats["rejected"]) == 0
 
 
+@pytest.mark.slow
 def test_picard_has_forward_derivatives_only():
     case = c1()
 
@@ -126,6 +131,7 @@ def test_picard_has_forward_derivatives_only():
         jax.grad(lambda v: end(*v))(given)
 
 
+@pytest.mark.slow
 def test_picard_window_without_convergence_is_shortened_or_fails():
     """Adaptive windows are shortened; a fixed one ends with picard_unconverged."""
     problem = dvax.Problem(
@@ -142,6 +148,7 @@ def test_picard_window_without_convergence_is_shortened_or_fails():
     assert run(rtol=1e-3, max_steps=64).result == dvax.RESULTS.max_steps
 
 
+@pytest.mark.slow
 def test_picard_batch_equals_its_lanes():
     case = c1()
     run = lambda ell: dvax.solve(  # noqa: E731

@@ -156,6 +156,7 @@ def test_piecewise_progress_output_does_not_change_the_solution(capfd):
     assert shares == sorted(set(shares))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [1e4, 1e2, 1.0, 1e-6])
 @pytest.mark.parametrize("M", [1e-8, 1e-10, 1e-13])
 def test_piecewise_switching_below_rounding_is_detected(level, M):

@@ -65,6 +65,7 @@ def test_plain_programs_give_the_same_solutions_and_derivatives(usual, monkeypat
     jax.clear_caches()
 
 
+@pytest.mark.slow
 def test_outlined_and_plain_solution_is_the_closed_form(usual):
     # x is saturated up to ln(1.6)/1.5, in contact for 2 ln(10/9), and free from then on.
     free = 2.0 - np.log(1.6) / 1.5 - 2.0 * np.log(10 / 9)
@@ -121,6 +122,7 @@ print(f"{float(sol.xs[-1]):.5f} {float(forward[0]):.5f}", sol.stats["compile_tim
     assert done.stdout == "1.83609 1.83609 True\n", done.stderr
 
 
+@pytest.mark.slow
 def test_an_array_as_state_with_a_tuple_as_response_is_solved():
     # u = (clip(x), clip(x)): x' = −x + 1 − 2 min(x, 1) from 0, so that x = (1 − e^{−3t})/3.
     Euclidean, Box, same = dvax.spaces.Euclidean, dvax.sets.Box, dvax.operators.Scaling(1.0)

@@ -34,6 +34,7 @@ def law(x, number=1.0):
     return np.cbrt(right / 2 + root) + np.cbrt(right / 2 - root)
 
 
+@pytest.mark.slow
 def test_responses_solve_the_law_at_the_saved_states_and_are_computed_once():
     sol = solve(-1.0)
     np.testing.assert_allclose(sol.us, law(sol.xs), atol=1e-8)

@@ -84,6 +84,7 @@ def test_checkpoints_return_the_stored_states():
             assert int(index) == i - i % stride == int(x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("places", "steps", "most"), [
     (8, 1, 0), (8, 8, 0), (8, 9, 1), (8, 64, 3), (2, 30, 16), (1, 12, 6), (32, 100, 1),
     pytest.param(32, 10_000, 5, marks=pytest.mark.thorough),
@@ -157,6 +158,7 @@ def test_reverse_derivatives_of_the_dense_output():
     assert float(jax.grad(dense)(-1.0)) == pytest.approx(np.exp(-0.15), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_reverse_second_derivatives_and_batches_of_derivatives():
     problem = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 5.0),
@@ -178,6 +180,7 @@ def test_reverse_second_derivatives_and_batches_of_derivatives():
     assert float(second) == pytest.approx(float(jax.hessian(exact)(1.0, 0.4)), rel=2e-3)
 
 
+@pytest.mark.slow
 def test_reverse_derivative_in_a_closed_over_parameter():
     case = c1()
 
@@ -193,6 +196,7 @@ def test_reverse_derivative_in_a_closed_over_parameter():
     assert float(jax.grad(end)(3.0)) == pytest.approx(c1_derivatives()[1], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_failed_run_under_jit_returns_nan():
     case = c1()
     run = lambda x0: dvax.solve(case.problem, x0, 0.0, 2.0, case.args, max_steps=8).xs  # noqa: E731

@@ -53,6 +53,7 @@ def tracked(gain, t1):
     return x0, solve_ivp(rate, (0.0, t1), x0, method="Radau", rtol=1e-12, atol=1e-12).y[:, -1]
 
 
+@pytest.mark.slow
 def test_exp_rosenbrock_keeps_its_order_with_stiff_feedback():
     # Steps of 80 to 320 times the time that the feedback takes: the defect is of order 4 (shorter steps
     # show the rounding of f̃, which the gain amplifies), and the error what the feedback makes of it.
@@ -69,6 +70,7 @@ def test_exp_rosenbrock_keeps_its_order_with_stiff_feedback():
     assert slope(counts, defects) == pytest.approx(4.0, abs=0.25)
 
 
+@pytest.mark.slow
 def test_exp_rosenbrock_number_of_steps_does_not_grow_with_the_gain():
     gain = 1e4
     x0, exact = tracked(gain, 1.6)

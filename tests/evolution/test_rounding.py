@@ -41,6 +41,7 @@ def exact(t):
     return np.sin(5 * t) / 5 + share[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("atol", [1e-6, 2.5e-7, 2e-7])
 def test_steps_are_not_reduced_for_errors_dominated_by_rounding(atol):
     found = run(atol)
@@ -52,6 +53,7 @@ def test_steps_are_not_reduced_for_errors_dominated_by_rounding(atol):
     assert int(found.stats["steps"]) < 10_000
 
 
+@pytest.mark.slow
 def test_tolerance_below_rounding_fails_early_and_the_suggested_one_succeeds():
     # Roundoff is random, and so is the step at which the controller has seen enough of it.
     runs = [run(atol) for atol in np.linspace(1.9e-8, 2.1e-8, 15)]
@@ -65,6 +67,7 @@ def test_tolerance_below_rounding_fails_early_and_the_suggested_one_succeeds():
     assert run(float(named)).result == RESULTS.successful
 
 
+@pytest.mark.slow
 def test_trials_of_longer_steps_become_rare_without_success():
     # A forcing of one length throughout: every step is as long as the tolerance lets it be.
     turning = dvax.Problem(
@@ -111,6 +114,7 @@ FAR = dvax.Problem(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steep", [1e2, 1e3, 1e4])
 @pytest.mark.parametrize("method", [dvax.ExpRosenbrock(), dvax.DormandPrince()])
 def test_start_far_from_zero_with_rounding_of_ten_tolerances_succeeds(method, steep):

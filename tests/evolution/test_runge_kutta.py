@@ -47,6 +47,7 @@ def test_dormand_prince_step_and_dense_output_equal_those_of_scipy_rk45():
         )
 
 
+@pytest.mark.slow
 def test_dormand_prince_orders_of_steps_dense_output_and_defect():
     case = c3()
     counts = np.array([20, 40, 80, 160])
@@ -88,6 +89,7 @@ def test_dormand_prince_order_on_a_smooth_system_agrees_with_scipy():
     assert found == pytest.approx(5.0, abs=0.15)
 
 
+@pytest.mark.slow
 def test_dormand_prince_keeps_order_five_across_unannounced_kinks():
     case = c1()
     steps, errors = [], []
@@ -106,6 +108,7 @@ def test_dormand_prince_keeps_order_five_across_unannounced_kinks():
     assert found > 4.5
 
 
+@pytest.mark.slow
 def test_dormand_prince_regimes_are_those_of_the_closed_form():
     case = c1()
     sol = dvax.solve(
@@ -132,6 +135,7 @@ def test_dormand_prince_derivatives_are_those_of_the_closed_form():
         assert float(found) == pytest.approx(exact[0], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_dormand_prince_is_accurate_on_a_stiff_system():
     """A stiff system needs more steps, and is as accurate."""
     problem = dvax.Problem(

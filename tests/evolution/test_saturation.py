@@ -91,6 +91,7 @@ RUNS = list(itertools.product(SYSTEMS, METHODS))
 OFTEN = [("bumper", "ETD2RK"), ("pulses", "DormandPrince")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "method"), mostly_thorough(RUNS, OFTEN))
 def test_error_follows_the_tolerance_through_saturation(name, method):
     problem, x0, T, exact = SYSTEMS[name]()

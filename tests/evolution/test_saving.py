@@ -11,6 +11,7 @@ import dvax
 from dvax.evolution import RESULTS
 
 
+@pytest.mark.slow
 def test_dense_output_saved_times_and_the_exact_solution_agree():
     case = c3()
     ts = np.array([0.0, 0.013, 0.5, 1.7, 2.999, 3.0, 3.4, 4.0])
@@ -28,6 +29,7 @@ def test_dense_output_saved_times_and_the_exact_solution_agree():
     assert float(dense.ts[-1]) == 4.0 and np.array_equal(dense.xs[-1], saved.xs[-1])
 
 
+@pytest.mark.slow
 def test_dense_runs_have_room_for_the_steps_that_they_take():
     # More steps than there is room for at first, and a state whose 2²⁰ steps would fill the memory.
     case = c1()
@@ -69,6 +71,7 @@ TIMES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", mostly_thorough(TIMES, ["some of each"]))
 def test_saved_rows_agree_with_the_dense_output(which):
     """Of the same steps, whichever are saved: against the dense output, and in a batch, where the
@@ -99,6 +102,7 @@ def test_saved_rows_agree_with_the_dense_output(which):
     np.testing.assert_allclose(together[1][0], found.xs, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", mostly_thorough(["every step", "some of each"], ["some of each"]))
 def test_derivatives_of_saved_rows_agree_in_both_modes(which):
     weights = jnp.asarray(np.random.default_rng(0).normal(size=len(TIMES[which])))
@@ -125,6 +129,7 @@ def test_derivatives_of_saved_rows_agree_in_both_modes(which):
     np.testing.assert_allclose(back, by_hand, rtol=3e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("t", mostly_thorough([-0.1, 2.5], [2.5]))
 def test_evaluate_outside_the_solved_interval_raises_an_error(t):
     sol = dvax.solve(
@@ -134,6 +139,7 @@ def test_evaluate_outside_the_solved_interval_raises_an_error(t):
         sol.evaluate(t)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [dvax.ETD4RK(), dvax.PiecewiseLinear()])
 def test_evaluate_at_an_array_of_times_gives_a_row_for_each(method):
     case = c1()

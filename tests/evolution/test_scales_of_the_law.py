@@ -69,6 +69,7 @@ def solve(name, seed, size=1.0, rtol=1e-6, t1=2.0, atol=1e-9, unit=None):
     return np.asarray(sol.xs[-1]) / size, sol
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mostly_thorough(SETS, {"polyhedron", "constrained box"}))
 def test_solution_does_not_depend_on_units(name):
     x, sol = solve(name, 0)
@@ -78,6 +79,7 @@ def test_solution_does_not_depend_on_units(name):
         assert int(run.stats["steps"]) <= 1.2 * int(sol.stats["steps"]) + 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mostly_thorough(["simplex", "cone", "polyhedron"], {"simplex"}))
 def test_tight_tolerances_are_reached_for_large_responses(name):
     # The default atol is far below the roundoff of the response here.

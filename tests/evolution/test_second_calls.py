@@ -34,6 +34,7 @@ def problem():
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [None, dvax.ETD2RK()], ids=["default", "ETD2RK"])
 def test_second_solve_and_its_bound_compile_nothing(method):
     check = dvax.verify(problem(), -1.0, 0.0, 2.0, 3.0)
@@ -47,6 +48,7 @@ def test_second_solve_and_its_bound_compile_nothing(method):
         run(2.5)
 
 
+@pytest.mark.slow
 def test_second_piecewise_linear_run_traces_nothing_and_starts_where_it_should():
     switched = dvax.Problem(
         A=dvax.generators.Dense(jnp.array([[0.0, 1.0], [-1.0, -0.2]])),
@@ -104,6 +106,7 @@ def read(load):
     return sol.regimes(), dvax.sensitivity.kinks(sol)
 
 
+@pytest.mark.slow
 def test_what_is_read_from_a_second_run_compiles_nothing():
     read(3.0)
     # The switch functions of K are counted by tracing K.
@@ -118,6 +121,7 @@ def test_a_number_of_numpy_compiles_nothing_after_one_of_python():
         read(np.float64(2.75))
 
 
+@pytest.mark.slow
 def test_first_responses_of_a_law_that_iterates_are_one_program():
     problem = dataclasses.replace(coupled(), K=dvax.sets.Ball(jnp.zeros(2), 0.25))
     sol = dvax.solve(problem, jnp.array([0.2, -0.1]), 0.0, 0.1, 3.0, method=dvax.DormandPrince())
@@ -140,6 +144,7 @@ assert current_trace() == _OUTSIDE
 """
 
 
+@pytest.mark.slow
 def test_dvax_may_be_used_first_inside_of_a_transformation():
     done = subprocess.run([sys.executable, "-c", FIRST_USE], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -36,6 +36,7 @@ def warn(M, K, size=3, constants=None):
     warn_of_several_solutions(problem(M, K), 0.0, jnp.zeros(size), None, constants)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("K", SETS.values(), ids=SETS)
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
 def test_law_with_the_wrong_sign_is_named_with_two_points_that_prove_it(K, scale):
@@ -43,6 +44,7 @@ def test_law_with_the_wrong_sign_is_named_with_two_points_that_prove_it(K, scale
         warn(-scale * SPREAD, K)
 
 
+@pytest.mark.slow
 def test_warning_comes_with_the_first_solution_and_not_with_the_second():
     first_run._SEEN.clear()
     wrong = problem(
@@ -63,6 +65,7 @@ def test_monotone_law_is_not_named(K):
         warn(M, K)
 
 
+@pytest.mark.slow
 def test_law_that_is_monotone_on_the_plane_of_the_set_is_not_named():
     for size in (3, 6, 20):
         warn(np.eye(size) - 3.0, dvax.sets.Simplex(2.0), size)

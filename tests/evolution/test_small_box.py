@@ -25,6 +25,7 @@ WAYS = [(Medians, 2), (faces, 2), (faces, 3), (faces, 4)]
 each_way = pytest.mark.parametrize(("way", "n"), WAYS, ids=["medians", "9", "27", "81 faces"])
 
 
+@pytest.mark.slow
 @each_way
 def test_small_box_solution_satisfies_the_law_for_any_bounds(way, n):
     rng = np.random.default_rng(n)
@@ -62,6 +63,7 @@ MONOTONE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", MONOTONE)
 def test_small_box_medians_solve_every_monotone_law(kind):
     """The medians solve every monotone law that has a solution."""
@@ -88,6 +90,7 @@ def test_small_box_medians_solve_every_monotone_law(kind):
     assert np.all(np.abs(w) <= 1e-12 * size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", [Medians, faces])
 def test_small_box_derivative_is_that_of_the_face(way):
     """An entry that touches its bound counts as held."""
@@ -140,6 +143,7 @@ def test_small_box_solve_equals_the_iterated_law():
     assert float(slope) == pytest.approx(central, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", mostly_thorough(["coupled law", "long f"], ["coupled law"]))
 def test_small_box_runs_of_three_methods_agree(kind):
     """A law or an f of many operations is in the program once, and is evaluated in a loop."""
@@ -164,6 +168,7 @@ def test_small_box_runs_of_three_methods_agree(kind):
         assert np.abs(solve(method=method, rtol=1e-4) - exact).max() < 1e-3, method
 
 
+@pytest.mark.slow
 def test_small_box_law_without_a_solution_fails():
     problem = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),
@@ -181,6 +186,7 @@ def test_small_box_applies_to_two_to_four_unknowns():
     assert sides(4).shape == (81, 4)
 
 
+@pytest.mark.slow
 def test_small_box_law_of_large_gain_is_solved_to_rounding():
     """A bridge of diodes with 1 µS and 1 mΩ: eigenvalues of M from 1e-3 to 1e6."""
     leak, on, s = 1e6, 1e-3, 0.5 * np.array([-1.0, 1.0, 1.0, -1.0])

@@ -26,6 +26,7 @@ def run(scale, space=None, size=2, **options):
     return dvax.solve(problem(scale, space), jnp.zeros(size), 0.0, 3.0, ts=TIMES, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-9, 1e-12, 1e-30])
 def test_state_below_atol_is_named_with_the_tolerance_that_resolves_it(scale):
     with pytest.warns(UserWarning, match="atol = 1e-09 hides the solution") as found:
@@ -37,11 +38,13 @@ def test_state_below_atol_is_named_with_the_tolerance_that_resolves_it(scale):
     assert np.max(np.abs(close - exact)) < 1e-2 * np.max(np.abs(exact))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-7, 1.0, 1e6])
 def test_larger_states_are_not_named(scale):
     run(scale)
 
 
+@pytest.mark.slow
 def test_weights_of_the_state_space_count():
     small = dvax.spaces.L2(jnp.full(2, 1e-18))
     with pytest.warns(UserWarning, match="hides the solution"):
@@ -49,12 +52,14 @@ def test_weights_of_the_state_space_count():
     run(1e-9, dvax.spaces.L2(jnp.full(2, 1e18)))
 
 
+@pytest.mark.slow
 def test_a_state_that_stays_0_is_exact_and_one_that_decays_was_large():
     run(0.0)
     first_run._SEEN.clear()
     dvax.solve(problem(0.0), jnp.ones(2), 0.0, 40.0)
 
 
+@pytest.mark.slow
 def test_run_that_ended_before_the_first_saved_time_is_not_examined():
     first_run._SEEN.clear()
     own = problem(1e-12)

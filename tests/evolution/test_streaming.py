@@ -47,6 +47,7 @@ def rows(path):
         return {str(name): np.asarray(array) for name, array in data.variables.items()}
 
 
+@pytest.mark.slow
 def test_rows_are_those_of_a_run_without_a_store(whole, tmp_path):
     store = dvax.ZarrStore(tmp_path / "run.zarr")
     end = dvax.solve(PROBLEM, -1.0, 0.0, END, ts=TIMES, rtol=1e-8, save=store)
@@ -107,6 +108,7 @@ def test_tuple_state_and_single_row(tmp_path):
     np.testing.assert_allclose(data["x1"], np.full((1, 3), np.exp(-2.0)), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_failed_run_keeps_the_rows_that_it_reached(tmp_path):
     store = dvax.ZarrStore(tmp_path / "run.zarr")
     with pytest.raises(dvax.SolveError) as caught:

@@ -51,6 +51,7 @@ def test_table_created_inside_f_is_integrated_exactly(kind, method, shift):
     assert int(sol.stats["rejected"]) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("q", "method"),
     mostly_thorough(

@@ -27,6 +27,7 @@ def counted():
     return problem, traces
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [float, jnp.asarray], ids=["Python numbers", "arrays"])
 def test_new_tolerances_times_states_and_parameters_do_not_recompile(number):
     problem, traces = counted()
@@ -53,6 +54,7 @@ def test_fixed_steps_of_another_length_do_not_recompile():
     assert int(sol.stats["steps"]) == 223
 
 
+@pytest.mark.slow
 def test_vmap_over_states_and_parameters_equals_a_loop():
     case = c1()
     x0s, ells = jnp.array([-1.0, 0.2, 3.0]), jnp.array([3.0, 1.0, 0.1])
@@ -83,6 +85,7 @@ def test_run_in_two_halves_equals_the_whole_run():
     np.testing.assert_allclose(np.asarray(rest.xs), np.asarray(whole.xs), rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_f_may_use_fourier_transforms():
     n = 32
     s = jnp.arange(float(n)) * (2.0 * jnp.pi / n)

@@ -36,6 +36,7 @@ def verdicts(kind: str, folder: Path, numbers: range) -> Counter[str]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS, ids=lambda seed: seed.name)
 def test_unchanged_configuration_is_read(seed, folder: Path) -> None:
     path = folder / "whole.toml"

@@ -22,6 +22,7 @@ USUAL = [(s, b) for s, b in KINDS if s in ((1,), (5,))] + [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(KINDS, USUAL))
 def test_elliptic_transform_agrees_with_its_definition_and_inverts(shape, boundary):
     x = np.random.default_rng(0).normal(size=shape)
@@ -95,6 +96,7 @@ def operator(shape, boundary):
     return A, matrix_of(shape, lengths, boundary, diffusion, velocity, -0.3), numbers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(GRIDS, GRIDS[2::4]))
 def test_elliptic_differences_equal_their_matrix(shape, boundary):
     A, matrix, _ = operator(shape, boundary)
@@ -135,6 +137,7 @@ def test_elliptic_growth_bound_holds_and_is_sharp(shape, boundary):
         assert np.linalg.norm(moved, 2) <= M * np.exp(omega * t) * (1 + 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "boundary"), mostly_thorough(GRIDS, GRIDS[4:5]))
 def test_elliptic_step_stays_within_its_curvature_bound(shape, boundary):
     A, _, _ = operator(shape, boundary)
@@ -173,6 +176,7 @@ def test_elliptic_pure_advection_conserves_the_norm():
     assert float(A.growth(spaces.Euclidean((8, 9))).omega) == 0.0
 
 
+@pytest.mark.slow
 def test_elliptic_keeps_single_precision_and_differentiates_parameters():
     one = np.float32
     # A Python number beside single precision, in any of the parameters, keeps it.

@@ -63,6 +63,7 @@ MESHES = {
 semigroup = jax.jit(lambda A, h, v: A.semigroup(h, v))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mostly_thorough(MESHES, list(MESHES)[:1]))
 def test_finite_elements_semigroup_is_that_of_the_pencil(name):
     M, S, interval = MESHES[name]
@@ -103,6 +104,7 @@ def test_finite_elements_named_intervals_are_those_of_the_elements(interval):
     np.testing.assert_allclose([values[0], values[-1]], interval)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MESHES)
 def test_finite_elements_numerical_range_lies_in_the_rectangle(name):
     M, S, interval = MESHES[name]
@@ -126,6 +128,7 @@ def test_finite_elements_growth_bound_holds_in_diagonal_norms():
     assert float(A.growth(spaces.L2(D)).M) == pytest.approx(2.0)
 
 
+@pytest.mark.slow
 def test_finite_elements_adjoint_is_correct():
     M, S, interval = MESHES["triangles"]
     A = generators.FiniteElements(M, S, interval)

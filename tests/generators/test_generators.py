@@ -196,6 +196,7 @@ ADJOINTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ADJOINTS)
 def test_adjoint_and_its_semigroup_satisfy_the_inner_product_identity(name):
     A, space = ADJOINTS[name]

@@ -31,6 +31,7 @@ def matrix_of(A, shape):
     return np.asarray(columns).T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mostly_thorough(FIELDS, list(FIELDS)[::2]))
 def test_kronecker_semigroup_is_the_matrix_exponential(name):
     A = generators.KroneckerSum(FIELDS[name], B)
@@ -48,6 +49,7 @@ def test_kronecker_semigroup_is_the_matrix_exponential(name):
         np.testing.assert_allclose(found, exact, atol=1e-12 * max(1.0, np.abs(exact).max()))
 
 
+@pytest.mark.slow
 def test_kronecker_parts_commute_and_the_growth_bound_holds():
     field = FIELDS["fixed and free ends"]
     A = generators.KroneckerSum(field, B)
@@ -67,6 +69,7 @@ def test_kronecker_parts_commute_and_the_growth_bound_holds():
     assert float(bound.omega) == pytest.approx(exact, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_kronecker_adjoint_is_correct():
     space = spaces.Euclidean((3, *GRID))
     A = generators.KroneckerSum(FIELDS["advection"], B)
@@ -75,6 +78,7 @@ def test_kronecker_adjoint_is_correct():
     assert float(left) == pytest.approx(float(space.inner(v, A.adjoint(space).semigroup(0.3, w))))
 
 
+@pytest.mark.slow
 def test_kronecker_solve_equals_that_of_the_dense_matrix():
     field = generators.Elliptic(6, 1.0, "neumann", diffusion=0.05)
     coupling = np.array([[-0.5, 0.5], [0.3, -0.3]])

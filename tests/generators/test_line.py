@@ -35,6 +35,7 @@ def test_line_inverse_transform_ignores_imaginary_parts_of_real_modes(n):
     np.testing.assert_allclose(irfft(jnp.asarray(F)), back, atol=1e-13)
 
 
+@pytest.mark.slow
 @SIZES
 def test_line_cosine_and_sine_transforms_are_of_type_two(n):
     x = numbers(n)
@@ -43,6 +44,7 @@ def test_line_cosine_and_sine_transforms_are_of_type_two(n):
         np.testing.assert_allclose(idct(jnp.asarray(whole), sign), x, atol=1e-13)
 
 
+@pytest.mark.slow
 @SIZES
 def test_line_transforms_have_derivatives_in_both_modes(n):
     rng = np.random.default_rng(n)

@@ -66,6 +66,7 @@ def flow(A, h, x0, c):
 X0, C = RNG.normal(size=N), RNG.normal(size=(3, N))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MATRICES)
 def test_sparse_semigroup_is_the_matrix_exponential(name):
     A = generators.Sparse(MATRICES[name], weights_of(name))
@@ -94,6 +95,7 @@ def supports(A, w):
         yield theta, np.linalg.eigvalsh((turned + turned.conj().T) / 2)[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", mostly_thorough(range(20), range(8)))
 def test_sparse_numerical_range_lies_in_rectangle_and_ellipse(seed):
     rng = np.random.default_rng(seed)
@@ -136,6 +138,7 @@ def test_sparse_growth_bound_holds_in_two_norms(name):
     assert float(A.growth(spaces.L2(w)).M) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("own", [False, True])
 def test_sparse_adjoint_and_its_semigroup_are_correct(own):
     name = "weighted heat" if own else "advection and diffusion"
@@ -191,6 +194,7 @@ def test_sparse_derivative_at_zero_is_the_operator():
     )
 
 
+@pytest.mark.slow
 def test_derivative_of_a_step_of_length_zero_is_the_mean_rate():
     A = generators.Sparse(MATRICES["heat"])
     x0, *c = jnp.asarray(np.random.default_rng(4).normal(size=(4, len(X0))))
@@ -325,6 +329,7 @@ def test_sparse_propagates_nan():
     assert np.isnan(lanes[1]).all()
 
 
+@pytest.mark.slow
 def test_sparse_keeps_single_precision_at_equal_cost():
     matrix = MATRICES["stiff heat"].astype(np.float32)
     propagator = generators.Sparse(matrix).propagator(jnp.asarray(0.5, jnp.float32), 2)
@@ -421,6 +426,7 @@ def expm_step(A, h, x0, c0):
 CASES = [(which, h) for which in [(0,), (1,), (0, 1), (2,), (0, 1, 2)] for h in (0.05, 3.0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("which", "h"), mostly_thorough(CASES, {((0, 1), 3.0)}))
 def test_sparse_derivatives_of_the_flow_in_any_of_its_inputs(which, h):
     rng = np.random.default_rng(7)
@@ -461,6 +467,7 @@ FLOWS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "terms"),
     mostly_thorough(
@@ -507,6 +514,7 @@ def test_derivatives_of_the_flow_in_the_entries_of_the_matrix_and_in_the_step(na
     np.testing.assert_allclose(lanes[1], pull[0], atol=1e-9 * float(jnp.abs(pull[0]).max()))
 
 
+@pytest.mark.slow
 def test_sparse_gradients_of_a_batch_equal_those_of_its_lanes():
     A = generators.Sparse(MATRICES["heat"])
     hs, x0 = jnp.asarray([1e-3, 0.05, 2.0]), jnp.asarray(X0)
@@ -516,6 +524,7 @@ def test_sparse_gradients_of_a_batch_equal_those_of_its_lanes():
         np.testing.assert_allclose(np.asarray(gradient), np.asarray(one(x0, h)), atol=1e-13)
 
 
+@pytest.mark.slow
 def test_matrix_free_gradient_of_a_part_of_a_tuple():
     A, h = Waves(3.0), 0.4
     q, p = jnp.asarray(RNG.normal(size=(2, 6)))
@@ -536,6 +545,7 @@ def test_sparse_gradient_in_the_state_stores_no_terms():
         assert memory.temp_size_in_bytes < 100 * x0.nbytes
 
 
+@pytest.mark.slow
 def test_sparse_gradient_in_the_entries_stores_a_few_hundred_vectors():
     n = 4000
     heat = scipy.sparse.diags_array([1.0, -2.0, 1.0], offsets=[-1, 0, 1], shape=(n, n)).tocsr()

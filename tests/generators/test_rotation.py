@@ -41,6 +41,7 @@ def test_rotation_growth_bound_holds(weights):
     assert omega == 0.2 and (M == 1.0) == (weights[0] == weights[1])
 
 
+@pytest.mark.slow
 def test_rotation_step_stays_within_its_curvature_bound():
     rotation, h = generators.Rotation(A, B), 0.1
     x0, c0, c1 = map(split, np.random.default_rng(1).normal(size=(3, 6)))

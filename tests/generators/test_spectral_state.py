@@ -51,6 +51,7 @@ def close(a, b):
     jtu.tree_map(lambda p, q: np.testing.assert_allclose(p, q, rtol=1e-11, atol=1e-11), a, b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_spectral_state_step_equals_the_plain_step(name):
     A, shape = GENERATORS[name]
@@ -73,6 +74,7 @@ def test_spectral_state_operations_are_linear(name):
     close(both, expand_state(A, values(both)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_spectral_state_curvature_bound_is_the_same(name):
     A, shape = GENERATORS[name]
@@ -87,6 +89,7 @@ def test_spectral_state_curvature_bound_is_the_same(name):
     close(A.chord_deviation(arc, space, growth), plain)
 
 
+@pytest.mark.slow
 def test_spectral_state_derivatives_equal_those_of_the_plain_step():
     A, shape = GENERATORS["dirichlet"]
     x0, c0 = state(shape, 0), state(shape, 1)
@@ -100,6 +103,7 @@ def test_spectral_state_derivatives_equal_those_of_the_plain_step():
         close(slope(lambda v: expand_state(A, v)), slope(lambda v: v))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "how",
     [

@@ -295,6 +295,7 @@ def test_circuit_mains_rectifier_agrees_with_scipy():
     assert list(figures.values()) == [float(found.xs[-1, 0])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("series", mostly_thorough([1.0, 100.0], [1.0]))
 def test_circuit_stiff_diode_with_a_sine_source_does_not_stall_at_small_voltages(series):
     circuit = Circuit(f"V1 a 0 SIN(0 10 1k)\nR1 a b 1k\nC1 b 0 1u\nD1 b 0 R={series}\n")

@@ -82,6 +82,7 @@ def test_contact_rate_is_that_of_eq_concrete_state():
     assert float(model.problem.reduced(t, x)) == pytest.approx(2 * t - 0.5 * x - 1.1 * u, abs=1e-14)
 
 
+@pytest.mark.slow
 def test_contact_solution_does_not_depend_on_the_units():
     # Indentation in mm instead of m, pressure in kPa instead of MPa, time in min instead of s.
     X, P, T = 1e3, 1e3, 1 / 60

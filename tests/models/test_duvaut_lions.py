@@ -142,6 +142,7 @@ def test_duvaut_lions_projection_is_the_return_mapping(yields, back):
     assert np.einsum("ki,kli->kl", gaps, y[None] - y[:, None]).max() <= 1e-13
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "way",
     [

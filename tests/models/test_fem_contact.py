@@ -87,6 +87,7 @@ def run(bodies):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_fem_contact_transient_reaches_the_steady_variational_inequality(run):
     model, sol = run
     rest = model.equilibrium()
@@ -147,6 +148,7 @@ def test_fem_contact_trajectories_approach_in_the_energy_norm(bodies):
     assert np.all(distance <= np.exp(-ts) * distance[0] + 4e-7)
 
 
+@pytest.mark.slow
 def test_fem_contact_fully_saturated_body_creeps_exponentially(bodies):
     body, tau, cap = bodies[0], 1.7, 1e-4
     model = build(body, indentation=lambda t: 2.0 + 0.0 * t, pressure_cap=cap, relaxation_time=tau)
@@ -208,6 +210,7 @@ def euler(M, B, w, model, dt, steps):
     return x, np.array(out)
 
 
+@pytest.mark.slow
 def test_fem_contact_condensed_body_equals_the_whole_body():
     mesh = bulged()
     whole, body = Whole(mesh), ElasticBody(mesh)
@@ -233,6 +236,7 @@ def test_fem_contact_condensed_body_equals_the_whole_body():
     assert root * np.linalg.norm(y) == pytest.approx(np.sqrt(0.7 * x @ (whole.K @ x)), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_fem_contact_steady_state_solves_a_quadratic_programme(bodies):
     model = build(bodies[0], b_u=0.5)
     body, rest = bodies[0], model.equilibrium()

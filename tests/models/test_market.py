@@ -172,6 +172,7 @@ def small(**changed):
     return Market(**(given | changed))
 
 
+@pytest.mark.slow
 def test_market_of_two_equal_firms_is_the_textbook_duopoly():
     # p = α − bQ, cost cu + au²/2: each firm makes (α − c)/(3b + a).
     market = small(

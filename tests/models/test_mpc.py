@@ -64,6 +64,7 @@ def test_mpc_programme_is_the_cost_of_the_horizon(mpc):
         assert condensed == pytest.approx(apart, rel=1e-11)
 
 
+@pytest.mark.slow
 def test_mpc_plan_agrees_with_an_independent_solver_at_many_states(mpc):
     rng = np.random.default_rng(4)
     x = rng.normal(size=(200, 6)) * rng.uniform(0.05, 4.0, (200, 1))
@@ -105,6 +106,7 @@ def test_mpc_slew_limits_agree_with_a_conic_solver():
     assert mpc.lipschitz.regions is None
 
 
+@pytest.mark.slow
 def test_mpc_lipschitz_constants_hold_and_become_sharper(mpc):
     theory, projection, regions = mpc.lipschitz
     assert regions <= projection <= theory
@@ -172,6 +174,7 @@ def test_mpc_closed_loop_decay_is_proved_and_observed(mpc, loop):
     assert 0.0 < figures["held"] < 0.5 and figures["lipschitz"] == mpc.lipschitz.regions
 
 
+@pytest.mark.slow
 def test_mpc_constants_are_proved_by_verify(mpc, loop):
     mine, found = mpc.constants, loop[0].constants
     for name in ("gamma", "L_F", "alpha_h", "beta_h", "alpha_f", "beta_f", "omega", "L"):

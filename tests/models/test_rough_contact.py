@@ -18,6 +18,7 @@ def wavy(n, approach, **changes):
     return RoughContact(profile=np.cos(2 * np.pi * s), approach=approach, **given | changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("relaxed", mostly_thorough([False, True], [True]))
 def test_wavy_surface_has_the_area_of_westergaard(relaxed):
     """p̄ = (πE*Δ/λ) sin²(πa/λ) on the width 2a, for heights Δ(1 − cos 2πs/λ)."""
@@ -32,6 +33,7 @@ def test_wavy_surface_has_the_area_of_westergaard(relaxed):
         assert low <= mean <= high
 
 
+@pytest.mark.slow
 def test_sphere_has_the_pressure_of_hertz():
     """p₀³ = 6FE*²/(π³R²), with contact on a twelfth of the cell's length."""
     n, radius, modulus = 96, 2.0, 5.0
@@ -45,6 +47,7 @@ def test_sphere_has_the_pressure_of_hertz():
     assert peak**3 == pytest.approx(6 * force * modulus**2 / (np.pi**3 * radius**2), rel=0.02)
 
 
+@pytest.mark.slow
 def test_optimality_conditions_hold_at_any_load_and_hardness():
     rng = np.random.default_rng(0)
     for seed in range(4):
@@ -63,6 +66,7 @@ def test_optimality_conditions_hold_at_any_load_and_hardness():
         assert gap[p == 0].min(initial=0.0) > -1e-8 and gap[p == 1.5].max(initial=0.0) < 1e-8
 
 
+@pytest.mark.slow
 def test_creep_in_full_contact_is_exponential():
     """x = c/(1 + c) (δ + r)(1 − e^{−(1+c)t/τ}) where every point stays in contact."""
     model = wavy(32, 40.0)
@@ -74,6 +78,7 @@ def test_creep_in_full_contact_is_exponential():
         np.testing.assert_allclose(model.creep(state), whole * -np.expm1(-1.5 * t / 0.8), rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "creep"),
     mostly_thorough([((64,), 0.5), ((64,), 3.0), ((16, 12), 0.5), ((16, 12), 3.0)], [((64,), 0.5)]),
@@ -103,6 +108,7 @@ def test_pressure_under_a_constant_approach_relaxes_with_its_contact_unchanged(s
         assert float(jnp.max(jnp.abs(p - part * first))) < 1e-2 * float(jnp.max(first))
 
 
+@pytest.mark.slow
 def test_constants_are_those_that_verify_proves():
     model = wavy(24, 6.0)
     check = dvax.verify(model.problem, model.untouched, 0.0, 1.0)
@@ -114,6 +120,7 @@ def test_constants_are_those_that_verify_proves():
     assert mine.growth_rate > 0 and float(mine.one_sided) == -1 / 0.8
 
 
+@pytest.mark.slow
 def test_trajectories_approach_with_the_proved_rate():
     model, rng = wavy(64, 5.0), np.random.default_rng(1)
     ts = np.linspace(0.0, 3.0, 7)

@@ -61,6 +61,7 @@ def agrees_at_any_resistance(case):
     return sol
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", FEW)
 def test_stiff_diodes_of_small_resistance_succeed_at_the_defaults(case):
     agrees_at_any_resistance(case)
@@ -126,6 +127,7 @@ def test_stiff_rectifier_agrees_with_radau(case):
     np.testing.assert_allclose(mine, found.y.T[:, columns], atol=2e-6)
 
 
+@pytest.mark.slow
 def test_stiff_bridge_and_clipper_of_almost_ideal_diodes():
     bridge = """
     V1 a 0 SIN(0 10 1k)
@@ -266,6 +268,7 @@ def test_circuits_of_any_kind_and_scale_succeed_at_the_defaults(seed):
 
 # Not number 153, and not number 45 below: their references, the exact solution and Radau, had not
 # ended after eight minutes.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seed",
     [

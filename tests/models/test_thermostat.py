@@ -61,6 +61,7 @@ def manufactured():
     return plate(load=load), phi, lambda t: 20.0 + np.asarray(a(t) * phi)
 
 
+@pytest.mark.slow
 def test_thermostat_manufactured_field_with_moving_free_boundaries(manufactured):
     model, phi, exact = manufactured
     errors = []
@@ -86,6 +87,7 @@ def test_thermostat_regimes_lie_between_level_lines(manufactured):
         np.testing.assert_allclose(response, power, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_thermostat_bound_is_proved_and_above_the_true_error(manufactured):
     model, phi, exact = manufactured
     ts = np.linspace(0.0, 1.0, 5)
@@ -118,6 +120,7 @@ def free_boundary(kappa, k, g, side):
     return sigma, profile
 
 
+@pytest.mark.slow
 def test_thermostat_steady_free_boundary_agrees_with_the_closed_form():
     kappa, k, g = 0.2, 12.0, 4.0
     sigma, profile = free_boundary(kappa, k, g, 1.0)

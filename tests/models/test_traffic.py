@@ -35,6 +35,7 @@ def braess(tmp_path_factory):
     return traffic.Traffic(*networks.braess(tmp_path_factory.mktemp("braess")))
 
 
+@pytest.mark.slow
 def test_traffic_braess_network_reaches_its_equilibrium(braess):
     sol = run(braess, braess.all_or_nothing(), 40.0, [0.0, 40.0])
     assert sorted(np.asarray(sol.xs[0])) == [0.0, 0.0, 6.0]  # the cost of this path is 60 + 16 + 60
@@ -49,6 +50,7 @@ def test_traffic_braess_network_reaches_its_equilibrium(braess):
     assert braess.fit.startswith("exact") and braess.relative_gap(0.0, sol.xs[-1]) <= 1e-8
 
 
+@pytest.mark.slow
 def test_traffic_law_agrees_with_the_enumeration_of_faces(braess):
     incidence = braess.paths.incidence().toarray()
     slope = incidence @ np.diag([10.0, 1.0, 1.0, 1.0, 10.0]) @ incidence.T
@@ -124,6 +126,7 @@ def test_traffic_follows_changing_demand_and_an_incident():
     assert float(model.constants.L_F) == pytest.approx(1 + 50.0 * 0.5, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
     mostly_thorough(
@@ -185,6 +188,7 @@ def days(city):
     return [run(city, x0, 24.0, ts) for x0 in starts]
 
 
+@pytest.mark.slow
 def test_traffic_equilibrium_has_the_least_cost_over_all_flows(city):
     # c(v)·w ≥ c(v)·v for all flows w makes v the least of Φ, which is convex; w by linear programming
     # on links, with neither paths nor split nodes.

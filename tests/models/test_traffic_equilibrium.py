@@ -83,6 +83,7 @@ def test_equilibrium_has_no_path_with_less_cost(case, one_way):
     networks.walks(network, trips, found.paths)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("one_way", [False, True])
 @pytest.mark.parametrize(
     "load", [1e4, 6e4, *(pytest.param(v, marks=pytest.mark.thorough) for v in (3e5, 1e6))]

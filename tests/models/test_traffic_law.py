@@ -58,6 +58,7 @@ def test_link_newton_agrees_with_accelerated_gradients(shape, factor, share):
         x = x + 0.5 * (one.y - x)
 
 
+@pytest.mark.slow
 def test_link_newton_block_is_that_of_the_dense_matrix():
     # S = Δ P Δᵀ, P = diag(used) − mean over the used paths of a pair, of dense matrices.
     model = traffic.Traffic(*networks.grid(**SHAPES["one way"]))

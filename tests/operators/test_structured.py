@@ -62,6 +62,7 @@ def test_convolution_in_two_dimensions(shape):
     check_all(P, spaces.Euclidean(shape), matrix, shape)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("s", [[2.0, 0.5], [2.0, -0.02]])
 def test_low_rank_operator_equals_its_matrix(s):
     n, s = 6, np.array(s)
@@ -78,6 +79,7 @@ def test_low_rank_operator_equals_its_matrix(s):
     check_all(operators.LowRank(d, blocks, s), spaces.L2(w), matrix, (n,))
 
 
+@pytest.mark.slow
 def test_low_rank_spectrum_of_a_large_operator_is_marked_as_bounds():
     n = 600
     U, d = RNG.normal(size=(n, 2)) / 20, RNG.uniform(0.5, 2.0, n)

@@ -116,6 +116,7 @@ def problem(f):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_a_value_that_was_changed_is_read_again(way):
     f, change = WAYS[way]()
@@ -131,6 +132,7 @@ def test_a_value_that_was_changed_is_read_again(way):
     assert found[2] == found[0]
 
 
+@pytest.mark.slow
 def test_an_iterated_law_a_set_and_the_response_are_read_again():
     limit, slope = {"v": 1.0}, [1.0]
     one = dvax.Problem(
@@ -150,6 +152,7 @@ def test_an_iterated_law_a_set_and_the_response_are_read_again():
     assert sums == pytest.approx([1.0, 2.0, 2.0])
 
 
+@pytest.mark.slow
 def test_a_bound_of_a_solution_with_other_values_is_refused():
     f, change = by_namespace()
     one = problem(f)
@@ -161,6 +164,7 @@ def test_a_bound_of_a_solution_with_other_values_is_refused():
         dvax.bound_error(one, sol, constants)
 
 
+@pytest.mark.slow
 def test_constants_of_other_values_are_declared():
     f, change = by_list_of_slopes()
     one = problem(f)
@@ -179,6 +183,7 @@ def by_list_of_slopes():
     return lambda t, x, u, args: 3.0 - slopes[0] * x - u, lambda v: slopes.__setitem__(0, v)
 
 
+@pytest.mark.slow
 def test_what_is_computed_later_is_refused_after_a_change():
     f, change = by_closure()
     one = problem(f)

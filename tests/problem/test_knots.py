@@ -65,6 +65,7 @@ def test_data_that_do_not_cover_the_run_are_rejected():
             dvax.solve(made, 0.0, t0, t1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "dt"),
     mostly_thorough(

@@ -152,6 +152,7 @@ def test_problem_rejects_args_that_jax_cannot_trace(args, given):
         assert given in caught.value.problems[0].given
 
 
+@pytest.mark.slow
 def test_problem_accepts_strings_in_args():
     sol = dvax.solve(make(), jnp.zeros(2), 0.0, 1.0, {"load": 2.0, "name": "of a run"})
     assert sol.result == dvax.RESULTS.successful

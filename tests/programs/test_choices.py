@@ -89,6 +89,7 @@ def jacobian(part):
     return np.diag(part.center), np.diag(part.radius)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONTINUOUS)
 def test_selection_whose_branches_agree_has_a_bounded_slope(name):
     fn, most = CONTINUOUS[name]
@@ -122,6 +123,7 @@ def test_selection_that_jumps_has_an_unbounded_slope(name):
     assert np.isinf(out.parts[0].radius).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(40))
 def test_random_pieces_are_continuous_only_if_they_meet(seed):
     """Two random functions meet at a random limit after one of them was moved there."""

@@ -93,6 +93,7 @@ def compiled(fn):
     return both
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FUNCTIONS)
 @settings(max_examples=25)
 @given(t0=st.floats(0.0, 3.5), length=st.floats(1e-4, 0.5))
@@ -103,6 +104,7 @@ def test_enclosure_bounds_every_function(name, t0, length):
     assert np.all(np.asarray(found) <= np.asarray(line.dev) + 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mostly_thorough(RATES, list(RATES)[::2]))
 def test_enclosure_of_adversarial_functions_holds_or_is_refused(name):
     rate, breaks = RATES[name]

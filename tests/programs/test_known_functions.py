@@ -28,6 +28,7 @@ print(int(sol.stats["steps"]), problem.knots(0.0, 10.0, x0, values).tolist())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["DormandPrince"])
 def test_the_knots_of_a_table_do_not_depend_on_what_was_traced_first(method):
     found = {

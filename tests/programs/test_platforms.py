@@ -70,6 +70,7 @@ def test_inequalities_are_solved_on_a_gpu(name):
     lower(lambda q: dvax.solve_vi(law, K, jnp.zeros(3), q, solver=SOLVERS[name]).y, jnp.ones(3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
 def test_problems_are_solved_on_a_gpu(name):
     # Fixed steps of Picard, which has no others; the rest chooses its steps and measures its defect.

@@ -130,6 +130,7 @@ FUNCTIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_slope_encloses_values_and_difference_quotients(name):
     fn, (low, high) = FUNCTIONS[name]
@@ -278,6 +279,7 @@ def test_slope_over_pieces_of_a_region_is_sharper():
     assert all(jtu.tree_leaves(h.parts[0].radius)[0] <= whole.parts[0].radius for h in halves)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", mostly_thorough(["constant", "linear", "cubic"], ["cubic"]))
 @pytest.mark.parametrize(
     "shape", [pytest.param((), marks=pytest.mark.thorough), (2,)], ids=["one", "two"]
@@ -329,6 +331,7 @@ CHAINS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHAINS)
 def test_functions_of_one_value_are_enclosed_nearly_sharply(name):
     # Largest |∂fn| on a fine grid; what interval arithmetic alone gives is up to 200 times larger.

@@ -127,6 +127,7 @@ def test_structure_claims_are_true(name):
         assert fact or not claim, f"{name} is not {word}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TRUTH)
 def test_structure_table_of_expected_properties_agrees_with_samples(name):
     # The table above is checked too: differences at random points show what is affine or pointwise.

@@ -70,6 +70,7 @@ CASES = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("where", "form", "method", "dt", "count"),
     mostly_thorough(CASES, [("K", "t - a > 0", "ETD2RK", 0.11, 2)]),
@@ -216,12 +217,14 @@ def _end_with(drive):
     return lambda a: dvax.solve(case, 0.3, 0.0, 1.9, a, dt=0.05, max_steps=64).xs[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HIDDEN)
 def test_derivative_in_a_time_hidden_by_code_raises_an_error(name):
     with pytest.raises(dvax.DifferentiationError, match="may jump at a time"):
         jax.grad(_end_with(HIDDEN[name]))(0.7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mostly_thorough(READ, ["a table", "a loop that compares x"]))
 def test_derivative_that_moves_no_jump_is_computed(name):
     end, a = _end_with(READ[name]), 0.7

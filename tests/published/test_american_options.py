@@ -65,6 +65,7 @@ def wide(grid):
     return enclose(grid, BINOMIAL, 4e-3, 1e-3, PRICES)
 
 
+@pytest.mark.slow
 def test_two_laws_enclose_the_value_and_the_certificate_is_proved(grid, wide):
     narrow = enclose(grid, BINOMIAL, 1e-3, 1e-4, PRICES)
     assert wide.status == narrow.status == "proved"
@@ -79,6 +80,7 @@ def test_two_laws_enclose_the_value_and_the_certificate_is_proved(grid, wide):
     )
 
 
+@pytest.mark.slow
 def test_bound_of_the_time_integration_exceeds_its_error(grid, wide):
     tight = enclose(grid, BINOMIAL, 4e-3, 1e-6, PRICES)
     for rough, fine in ((wide.low, tight.low), (wide.high, tight.high)):

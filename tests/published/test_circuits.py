@@ -85,6 +85,7 @@ def test_files_are_those_of_the_scheme_of_the_tutorials(name):
     assert np.abs(rows[1:, 1:3] - own[:, :2]).max() <= 5e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mostly_thorough(PUBLISHED, ["DiodeBridge"]))
 def test_dvax_is_within_its_bound_of_the_exact_circuit(name):
     given = PUBLISHED[name]

@@ -100,11 +100,13 @@ def check_bound(frame, samples, tau):
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tau", mostly_thorough([1e-5, 1e-9], [1e-9]))
 def test_bound_of_a_hardening_frame_holds(tau):
     check_bound(three_storeys(), PULSE, tau)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tau", [1e-6, 1e-8, 1e-10])
 def test_exact_solution_is_a_smooth_function_of_the_viscosity(tau):
     # x(τ) = x₀ + τx₁ + O(τ²); the difference of quotients shows the roundoff of x, divided by τ.
@@ -135,6 +137,7 @@ def test_energy_of_a_difference_never_increases():
         assert np.linalg.eigvalsh(form + form.T)[-1] <= 1e-9 * np.linalg.norm(form)
 
 
+@pytest.mark.slow
 def test_published_peaks_are_those_of_exact_solutions(el_centro):
     ground = GRAVITY / INCH * el_centro[:501]  # the peaks are in the first ten seconds
     elastic = top(oscillator(PERIOD, DAMPING, 1e3), ground)

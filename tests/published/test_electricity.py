@@ -75,6 +75,7 @@ def test_prices_and_outputs_on_two_buses_are_those_of_the_closed_form():
     np.testing.assert_allclose(found.prices[0], [14.0, 30.0 + 0.2 * (demand - 40.0)], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_demand_has_the_long_elasticity_in_the_end():
     case = market(two_buses(), 0, 40)
     solution = solve(case, np.array([40.0]), False)
@@ -141,6 +142,7 @@ def test_blocks_of_constant_cost_come_near_with_the_square_of_their_width():
         assert np.all(costs - own >= -1e-6) and np.all(costs - own <= chord + 1e-6)
 
 
+@pytest.mark.slow
 def test_verify_proves_the_constants():
     case = market(network(), 0, HOURS - 1)
     found = dvax.verify(case.problem, jnp.zeros(3), case.first, case.last).constants
@@ -150,6 +152,7 @@ def test_verify_proves_the_constants():
     assert float(found.one_sided) == pytest.approx(-SHORT / LONG)
 
 
+@pytest.mark.slow
 def test_error_of_a_run_lies_below_its_bound():
     case = market(network(), 0, HOURS - 1)
     ts = np.arange(case.first, case.last + 1.0)

@@ -36,6 +36,7 @@ def within_three_errors(result, truth):
 SIDES = [(16, seed) for seed in range(8)] + [(100, seed) for seed in range(4)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("side", "seed"), mostly_thorough(SIDES, [(16, seed) for seed in range(3)])
 )
@@ -67,6 +68,7 @@ def test_standard_errors_of_the_field_are_those_of_many_fits():
     assert np.abs(apart.mean(axis=0)).max() <= 3.0 / np.sqrt(200)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", mostly_thorough(range(8), [0, 1, 2]))
 def test_parameters_of_a_rectifier_are_found_from_scipys_trajectory(seed):
     solve, jacobian = rectifier()
@@ -114,6 +116,7 @@ def check_limited(theta, load):
 NO_LOAD = np.zeros((13, 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", mostly_thorough([0.2, 0.5, 1.0, 2.0], [1.0]))
 def test_network_with_limited_norms_is_proved_well_posed(scale):
     flat = scale * np.random.default_rng(5).normal(size=5 * inverse.WIDTH)
@@ -135,6 +138,7 @@ def test_modulus_of_the_hidden_law_is_the_known_one():
     assert grid == pytest.approx(inverse.UNKNOWN_MODULUS, abs=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", mostly_thorough([0.3, 1.0, 3.0], [0.3, 1.0]))
 def test_proved_modulus_of_a_random_network_is_a_lower_bound(scale):
     made = training()

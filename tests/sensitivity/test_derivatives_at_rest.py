@@ -65,6 +65,7 @@ METHODS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "name"),
     mostly_thorough(
@@ -128,6 +129,7 @@ def test_parts_at_rest_limit_the_steps_beside_a_part_that_moves(mode):
         assert derivative(2.0, k) == pytest.approx(-np.expm1(-5.0 * k), abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [1.0, 0.0])
 def test_a_state_on_a_line_limits_the_steps_and_so_does_one_on_a_kink(speed):
     # x = p + vt solves x' = v − l(x − p − vt) − (k − l) max(x − p − vt, 0), on the kink of the law.
@@ -152,6 +154,7 @@ def test_a_state_on_a_line_limits_the_steps_and_so_does_one_on_a_kink(speed):
     assert np.all(found >= low - 1e-5) and np.all(found <= high + 1e-5)
 
 
+@pytest.mark.slow
 def test_a_law_at_rest_on_a_stiff_kink_has_the_derivative_of_the_linearised_method():
     # Growth on a substrate with two one-sided bounds on the flux v = (0.08 − λ₁ + λ₂)/ε: x comes to
     # rest on a kink, where an explicit method would take steps of 50 times its stability limit.
@@ -177,6 +180,7 @@ def test_a_law_at_rest_on_a_stiff_kink_has_the_derivative_of_the_linearised_meth
     assert jax.grad(last)(10.0) == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_equal_parts_of_a_tuple_that_exchange_limit_the_steps():
     problem = dvax.Problem(
         A=dvax.generators.Product(dvax.generators.Zero(), dvax.generators.Zero()),
@@ -197,6 +201,7 @@ def test_equal_parts_of_a_tuple_that_exchange_limit_the_steps():
         assert of_other[0] == pytest.approx(0.5 - decayed, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_code_with_a_derivative_in_reverse_alone_has_a_gradient():
     @jax.custom_vjp
     def sine(x):
@@ -218,6 +223,7 @@ def test_code_with_a_derivative_in_reverse_alone_has_a_gradient():
     assert jax.grad(lambda x0: last(x0, sine))(1.0) == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_units_of_the_state_do_not_change_the_steps():
     # Concentrations in mol/L beside voltages: S B S⁻¹ has the spectral radius of B.
     B = jnp.array([[-1.0, 1.0], [1.0, -2.0]])
@@ -277,6 +283,7 @@ def varied(kind, rng):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "kind", "seed"),
     mostly_thorough(
@@ -312,6 +319,7 @@ def test_at_rest_a_slope_that_changes_in_time_limits_the_steps(name, kind, seed)
     assert np.linalg.norm(found - exact) <= SHARE * rtol * (1.0 + sigma * T) * size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["DormandPrince", "ExpRosenbrock"])
 def test_a_part_that_moves_may_make_a_part_at_rest_stiff(name):
     # k(x₀) rises from 0.1 to `top` while x₀ falls through 1/2; x₁ = 1 stays.
@@ -340,6 +348,7 @@ def test_a_part_that_moves_may_make_a_part_at_rest_stiff(name):
         assert found == pytest.approx(np.trapezoid(decayed, t), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_decay_does_not_hide_an_oscillation_at_rest():
     problem = dvax.Problem(
         A=dvax.generators.Zero(),

@@ -80,6 +80,7 @@ CASES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mostly_thorough(CASES, {"disc, in"}))
 def test_directional_derivative_on_a_kink_is_the_limit_of_one_sided_differences(name):
     make, x0, args, dx0, dargs = CASES[name]
@@ -167,6 +168,7 @@ def test_kinks_are_classified_as_crossing_touching_or_staying():
     assert found[2].start == pytest.approx(3.0, abs=2e-3) and found[2].end == 4.0
 
 
+@pytest.mark.slow
 def test_kinks_at_a_bound_that_becomes_infinite():
     # The law u = min(max(s − x, 0), b(t)) with b = 0.3 while sin 9t > 0, else no bound.
     problem = dvax.Problem(

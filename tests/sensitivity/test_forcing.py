@@ -54,6 +54,7 @@ def exact(rates, x0):
 CASES = [(m, r, x) for m in METHODS for r in RATES for x in ([0.0, 0.0], [1.0, 0.0])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "rate", "x0"),
     mostly_thorough(

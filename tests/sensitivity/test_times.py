@@ -158,6 +158,7 @@ def test_derivative_of_dense_output_in_its_time_and_the_end(name, adjoint):
     assert_close(found, jax.jacfwd(truth)(given), 1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "adjoint"), mostly_thorough(ENDS[:4], {ENDS[0]}))
 def test_derivative_of_a_state_saved_at_a_jump_uses_the_left_limit(name, adjoint):
     method, settings, tol = METHODS[name]

@@ -135,6 +135,7 @@ OWN_WAY = ("affine subspace", "simplex", "second-order cone", "ellipsoid, matrix
 EACH = [(name, "plain" if name == "intersection" else "weighted") for name in CASES]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "kind"), mostly_thorough([*EACH, *((name, "plain") for name in OWN_WAY)], EACH[::3])
 )
@@ -188,6 +189,7 @@ def test_projection_propagates_nan_for_every_set(name):
     assert np.isnan(project(name, "weighted", z)[0, 1])
 
 
+@pytest.mark.slow
 @every_space
 @every_other_set
 def test_projection_derivative_jumps_exactly_at_sign_changes_of_switches(name, kind):

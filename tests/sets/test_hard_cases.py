@@ -70,6 +70,7 @@ def test_projection_derivative_in_the_data_of_held_points():
     np.testing.assert_allclose(shared(jnp.array([1.0, 2.0])), [0.5, 0.25])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["inequality", "equation"])
 def test_at_a_vertex_that_a_row_and_all_bounds_share_the_row_moves_the_point(kind):
     # A shared limit that is a multiple of the single ones: y = 1 for the k largest z/w, else 0.
@@ -176,6 +177,7 @@ def test_projection_is_scale_invariant(unit):
         np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("space", [PLANE, UNEVEN], ids=["plain", "weighted"])
 def test_projection_of_distant_points_keeps_all_digits(space):
     z = jnp.array([1e8, 1e8 + 1.0])
@@ -224,6 +226,7 @@ FAR_AWAY = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAR_AWAY)
 def test_projection_from_any_distance_is_in_the_set_and_nearest(name):
     """⟨z − y, v − y⟩ ≤ 0 for v in K, and y is its own projection, up to roundoff of z in the first and

@@ -60,6 +60,7 @@ def test_a_cubic_table_of_four_points_is_the_cubic_through_them():
     np.testing.assert_allclose(found, s**3 - 2 * s**2 + 1, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 10, 63, 65, 1000, 1024, 1025, 4097])
 def test_the_times_up_to_any_time_are_counted_as_numpy_does(count):
     rng = np.random.default_rng(count)
@@ -172,6 +173,7 @@ def test_a_listener_hears_every_table_at_its_own_time_and_no_other():
     assert len(reports.knots) == 3
 
 
+@pytest.mark.slow
 def test_lists_in_args_are_tables():
     problem = dvax.Problem(
         A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0),

@@ -55,6 +55,7 @@ def test_bound_error_is_above_the_true_error_at_every_saved_time(name, run):
 METHODS = {m.__name__: m() for m in (dvax.DormandPrince, dvax.ExpRosenbrock, dvax.ETD4RK)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "method"),
     mostly_thorough(
@@ -163,6 +164,7 @@ def test_bound_error_of_pieces_includes_the_overshoot_of_each():
     assert pieces["x_paper"][-1] > 1.5 * whole["x_paper"][-1]
 
 
+@pytest.mark.slow
 def test_bound_error_continues_only_from_the_last_bounded_time():
     case = ALL["C1"]()
     run = lambda x, t0, t1, ts: dvax.solve(  # noqa: E731
@@ -235,6 +237,7 @@ def _reference(alpha, load, ts, breaks=()):
     return np.concatenate(out)
 
 
+@pytest.mark.slow
 def test_bound_error_does_not_grow_with_the_number_of_saved_times():
     """A step is counted once, for any number of saved times in it."""
     case = ALL["C1"]()
@@ -251,6 +254,7 @@ def test_bound_error_does_not_grow_with_the_number_of_saved_times():
     assert end[2000][1] < 0.9 * end[1][1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", mostly_thorough([0.1, 0.05], [0.1]))
 def test_bound_error_covers_saved_times_between_steps_of_a_stiff_contact(dt):
     # Trajectories approach fast here, so a bound must not let an impulse decay before it acted.
@@ -264,6 +268,7 @@ def test_bound_error_covers_saved_times_between_steps_of_a_stiff_contact(dt):
     assert np.all(np.asarray(bound.x_sharp) >= error - 1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mostly_thorough(["ETD1", "ETD2RK"], ["ETD1"]))
 def test_bound_error_covers_an_unannounced_jump_at_the_end_of_a_step(name):
     # What floor does is not read off the code as a time (t < 1 would be).
@@ -330,6 +335,7 @@ def test_pairs_of_contact_trajectories_satisfy_the_estimates():
     assert decaying > 3 and sharpest > 0.3
 
 
+@pytest.mark.slow
 def test_bound_error_with_constants_of_a_region_is_finite_inside_it():
     case = ALL["C1"]()
     ts = np.linspace(0.0, 2.0, 21)[1:]
@@ -421,6 +427,7 @@ def test_certified_tol_fails_if_the_trajectory_leaves_the_region(bound):
         assert float(run().stats["certified_bound"]) <= 1e-3
 
 
+@pytest.mark.slow
 def test_bound_error_rejects_a_method_without_a_defect():
     case = ALL["C1"]()
     sol = dvax.solve(

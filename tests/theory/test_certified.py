@@ -38,6 +38,7 @@ def errors(case, x0, sol):
     return np.array(of_x), np.array(of_u)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "method", "tol"), mostly_thorough(CASES, OFTEN))
 def test_certified_tol_is_above_the_true_error(name, method, tol):
     case, x0, constants = system(name)
@@ -100,6 +101,7 @@ def test_certified_tol_rejects_conflicting_arguments():
         )(x0)
 
 
+@pytest.mark.slow
 def test_certified_tol_reports_a_failed_run_as_failed():
     case, x0, constants = system("C1")
     sol = dvax.solve(

@@ -54,6 +54,7 @@ def test_energy_norm_bounds_the_distance_of_trajectories(n, m, pointwise):
     assert better >= 3
 
 
+@pytest.mark.slow
 def test_energy_norm_proves_decay_where_moduli_give_growth():
     problem = sheared(3, 2, 0, True)
     c = dvax.verify(problem, jnp.zeros(3), 0.0, 6.0, energy=True).constants
@@ -99,6 +100,7 @@ def test_energy_norm_rate_is_recomputed_from_the_proposed_norm():
     assert energy._certify(np.diag([1.0, 1.0, -1.0]), np.ones(2), data) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("f", "h", "size", "reason"),
     [

@@ -85,6 +85,7 @@ def test_verify_accepts_user_functions_with_names_of_dvax():
     assert float(c.alpha_f) >= 2.0
 
 
+@pytest.mark.slow
 def test_verify_with_a_declared_spectrum_is_not_proved():
     n = 3000
     e = jnp.zeros(n).at[0].set(1.0)
@@ -113,6 +114,7 @@ def test_verify_of_a_weighted_law_with_a_declared_spectrum_is_declared():
         assert "F = aG" in row.why
 
 
+@pytest.mark.slow
 def test_verify_constants_hold_for_their_args_and_times_only():
     f = lambda t, x, u, a: a["k"] * x - u + jnp.sin(t)  # noqa: E731
     system = problem(f=f, K=dvax.sets.Box(-1.0, 1.0))
@@ -127,6 +129,7 @@ def test_verify_constants_hold_for_their_args_and_times_only():
         dvax.solve(system, 0.1, 0.0, 2.0, one, constants=c, certified_tol=1e-3)
 
 
+@pytest.mark.slow
 def test_verify_constants_do_not_follow_an_array_that_numpy_changes():
     system = problem(f=lambda t, x, u, a: a * x - u, K=dvax.sets.Box(-1.0, 1.0))
     args = np.array(1.0)
@@ -144,6 +147,7 @@ def test_verify_does_not_prove_an_empty_intersection():
     assert check["ass:operators (iii)"].status != "proved"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("knot", [0.5, 0.0])
 def test_verify_detects_jumps_in_time_at_any_knot(knot):
     switch = dvax.signals.Function(

@@ -69,6 +69,7 @@ def test_proved_bound_is_above_the_error_for_hard_rates(name, method):
         assert np.all(np.asarray(bound.x) >= error - 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mostly_thorough(SAMPLED, SAMPLED[::2]))
 def test_bound_without_enclosure_is_estimated(name):
     rate, _ = RATES[name]
@@ -77,6 +78,7 @@ def test_bound_without_enclosure_is_estimated(name):
     assert dvax.bound_error(system, sol, CONSTANTS).status == "estimated"
 
 
+@pytest.mark.slow
 def test_adaptive_steps_locate_unannounced_jumps():
     rate, _ = RATES["a jump in the middle"]
     system = problem(lambda t, x, u, args: rate(t) + 0.0 * u)
@@ -89,6 +91,7 @@ def test_adaptive_steps_locate_unannounced_jumps():
     assert bound.x[-1] < 1e-3
 
 
+@pytest.mark.slow
 def test_bound_of_a_run_without_saved_times_is_empty():
     rate, _ = RATES["a short pulse"]
     system = problem(lambda t, x, u, args: rate(t) + 0.0 * u)
@@ -108,6 +111,7 @@ def test_bound_of_a_run_without_saved_times_is_empty():
     assert dvax.bound_error(system, sol, CONSTANTS).x.shape == (0,)
 
 
+@pytest.mark.slow
 def test_bound_integrates_the_norm_of_a_rotating_defect():
     """The norms of the defect add up, while the norm of its mean would be smaller."""
     # The defect swings from one axis to the other while e^{At} turns with it, so that its norms add
@@ -133,6 +137,7 @@ def test_bound_integrates_the_norm_of_a_rotating_defect():
     assert float(bound.x[-1]) >= error
 
 
+@pytest.mark.slow
 def test_enclosure_of_a_root_that_stays_zero_is_finite():
     # Its slope is infinite there, and nothing moves.
     system = problem(lambda t, x, u, args: 1.0 - x + jnp.sqrt(jnp.maximum(t - 5.0, 0.0)) + 0.0 * u)

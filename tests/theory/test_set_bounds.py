@@ -75,6 +75,7 @@ KINDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", mostly_thorough(KINDS, {"box"}))
 def test_region_of_u_that_equals_the_box_around_K_admits_responses_at_its_limits(kind):
     problem, x0 = grazing(KINDS[kind]), jnp.array([2.5, 0.0])
@@ -87,6 +88,7 @@ def test_region_of_u_that_equals_the_box_around_K_admits_responses_at_its_limits
     assert np.isfinite(errors[1]).all() and np.array_equal(*errors)
 
 
+@pytest.mark.slow
 def test_region_of_u_that_excludes_responses_bounds_only_up_to_them():
     problem, x0 = grazing(dvax.sets.Box(0.0, 1.0)), jnp.array([2.5, 0.1])
     sol = dvax.solve(problem, x0, 0.0, 1.0, ts=jnp.linspace(0.0, 1.0, 5), rtol=1e-8)
@@ -110,6 +112,7 @@ MOVING = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", MOVING)
 def test_bounds_of_a_moving_set_limit_the_region_of_u(kind):
     problem = grazing(MOVING[kind])

@@ -78,6 +78,7 @@ def _hold(made, c):
 OFTEN = [0, 2, 4, *range(1, 23, 2)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", mostly_thorough(OFTEN, [0, 3]))
 def test_verify_is_correct_on_a_generated_system(seed):
     _check(seed)
@@ -165,6 +166,7 @@ def test_verify_in_a_region_proves_finite_moduli():
     assert float(within.constants.alpha_f) == pytest.approx(12.0)
 
 
+@pytest.mark.slow
 def test_verify_keeps_or_refutes_declared_moduli():
     # The code of h has an operation without a rule, so that nothing is proved of it.
     without = dvax.verify(cubic())
@@ -178,6 +180,7 @@ def test_verify_keeps_or_refutes_declared_moduli():
     assert "declared as 0.25" in wrong["ass:lipschitz_smallness"].why
 
 
+@pytest.mark.slow
 def test_verify_rejects_wrong_arguments_by_name():
     problem = cubic()
     with pytest.raises(dvax.InputError, match=r"x0.*shape"):
@@ -267,6 +270,7 @@ def autonomous(**data):
     return dvax.Problem(**(parts | data))
 
 
+@pytest.mark.slow
 def test_constants_of_an_autonomous_problem_hold_at_all_times():
     for data in ({}, {"K": lambda t, args: dvax.sets.Box(0.0, 0.5)}):
         problem = autonomous(**data)
@@ -275,6 +279,7 @@ def test_constants_of_an_autonomous_problem_hold_at_all_times():
         assert dvax.bound_error(problem, sol, check.constants).status == "proved"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "data",
     [

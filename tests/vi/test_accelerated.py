@@ -10,6 +10,7 @@ from dvax.sets import Ball, Box
 from dvax.vi import RESULTS, Accelerated
 
 
+@pytest.mark.slow
 def test_accelerated_minimises_an_ill_conditioned_quadratic_on_simplices():
     # Made from its answer: y* with the multipliers of three simplices, κ = 10⁴.
     rng = np.random.default_rng(6)
@@ -33,6 +34,7 @@ def test_accelerated_minimises_an_ill_conditioned_quadratic_on_simplices():
     assert float(vi.error_bound) > 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("K", [Box(-0.1, 0.2), Ball(0.0, 0.5)], ids=["box", "ball"])
 def test_accelerated_minimises_a_convex_function(K):
     # ψ(y) = Σ log(1 + e^(Gy − b)) + ½|y|²: γ = 1, by L-BFGS-B or SLSQP.

@@ -18,6 +18,7 @@ def answers():
     return answers_of(bad_input)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "words"), NAMES, ids=[name for name, _ in NAMES])
 def test_solve_vi_rejects_wrong_arguments_in_one_line(answers, name, words):
     is_a_good_refusal(answers[name], words)
@@ -44,6 +45,7 @@ ROTATION = bad_input.cyclic()
 FEW = dvax.vi.Projection(5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["response", "reduced"])
 def test_response_of_an_unsolved_law_raises_solve_error(name):
     x = jnp.zeros(2)
@@ -53,6 +55,7 @@ def test_response_of_an_unsolved_law_raises_solve_error(name):
     np.testing.assert_allclose(getattr(ROTATION, name)(0.0, x), right, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_response_of_an_unsolved_law_is_nan_under_transformations():
     R = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
     law = bad_input.cyclic(h=lambda t, x, u, args: u - args * (R @ u - x))

@@ -57,6 +57,7 @@ def same(one, other, lane, atol=0.0):
 CHEAP = ("auto",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [pytest.param(n, marks=() if n in CHEAP else pytest.mark.thorough) for n in SOLVERS],

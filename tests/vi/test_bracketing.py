@@ -30,6 +30,7 @@ def solve(name, y0, count=POINTS):
     return vi
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 def test_bracketing_needs_at_most_fifteen_evaluations_and_three_from_the_solution(name):
     law, lower, upper, drive = LAWS[name]
@@ -51,6 +52,7 @@ def test_bracketing_solution_does_not_depend_on_the_guess():
         np.testing.assert_allclose(np.asarray(y), np.asarray(found[0]), rtol=1e-14, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_bracketing_evaluations_are_bounded_at_roots_with_zero_or_infinite_slope():
     c = jnp.linspace(-0.3, 1.3, 1001)
     for power, most in ((3.0, 240), (0.5, 60)):
@@ -61,6 +63,7 @@ def test_bracketing_evaluations_are_bounded_at_roots_with_zero_or_infinite_slope
         np.testing.assert_allclose(np.asarray(vi.y), np.clip(c, 0, 1), atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bound", [0.9332785790714507, -1e-3, 1e12])
 def test_bracketing_from_a_guess_beside_the_bound_returns_the_bound(bound):
     # The guess is a few spacings from the bound: nothing is left to narrow, and no sign has changed.

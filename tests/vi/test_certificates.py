@@ -187,6 +187,7 @@ def test_contraction_factor_bounds_the_iterations_of_the_solver(name):
     assert 10 < counts[1] - counts[0] <= allowed + 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drive", [0.1, 5.0])
 @pytest.mark.parametrize("K", [Ball(0.0, 1.0), Simplex(1.0)], ids=["ball", "simplex"])
 def test_formula_on_any_set_has_a_certificate(K, drive):

@@ -94,6 +94,7 @@ def projections(K):
     return _compiled.setdefault(id(K), jax.jit(project))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", sorted({*PROBLEMS} - {"fukushima2", "mathiesen as an intersection"})
 )

@@ -21,6 +21,7 @@ def box_solution(q):
     return vi.y
 
 
+@pytest.mark.slow
 def test_derivative_on_a_box_is_the_inverse_of_the_free_block():
     y = np.asarray(box_solution(jnp.asarray(Q)))
     free = np.abs(y) < 1 - 1e-6
@@ -50,6 +51,7 @@ def test_derivative_of_held_entries_is_that_of_their_bound():
         )
 
 
+@pytest.mark.slow
 def test_derivative_on_a_ball_satisfies_the_lagrange_conditions():
     # My + q + μy = 0, |y| = r: differentiate these two equations by hand.
     q, r = np.array([-5.0, -3.0, 1.0]), 0.8
@@ -73,6 +75,7 @@ def test_derivative_on_a_ball_satisfies_the_lagrange_conditions():
 SOLVERS = [Bracketing(), Extragradient(), Auto()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", mostly_thorough(SOLVERS, SOLVERS[2:]))
 def test_derivatives_of_a_nonlinear_law_of_first_and_second_order(solver):
     # y³ + y = c on [−10, 10]: y' = 1/(3y² + 1), y'' = −6y/(3y² + 1)³.
@@ -94,6 +97,7 @@ def test_derivatives_of_a_nonlinear_law_of_first_and_second_order(solver):
         assert float(second(c)) == pytest.approx(curvature, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_jvp_and_vjp_are_transposes_and_agree_with_differences():
     rng = np.random.default_rng(2)
 

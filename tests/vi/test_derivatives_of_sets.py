@@ -71,6 +71,7 @@ def test_derivative_on_a_polyhedron_in_rows_offsets_and_operator():
     np.testing.assert_allclose(back, exact, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivative_on_a_simplex_in_its_total():
     at = (M, Q, np.array(1.7))
     y, (dM, dq, dtotal), forward, back = jvp_and_vjp(

@@ -95,6 +95,7 @@ def check(name, kappa, skew, cubic, shift):
     return vi
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["half line", "ball"])
 def test_laws_of_any_condition_are_solved(name):
     for kappa in CONDITIONS:
@@ -133,6 +134,7 @@ def test_derivatives_of_large_laws_are_those_of_the_solution(name):
             np.testing.assert_allclose(value, float(quotient) / (2 * change), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_problem_with_an_obstacle_on_a_fine_grid_is_solved_without_options():
     args = (jnp.asarray(10.0), 0.0, 0.0, jnp.asarray(load(0.3)))
     problem = dvax.Problem(
@@ -151,6 +153,7 @@ def test_a_problem_with_an_obstacle_on_a_fine_grid_is_solved_without_options():
     assert np.linalg.norm(np.minimum(u, value)) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("points", [40, 150])
 def test_symmetric_laws_are_recognised_in_single_and_in_double_precision(dtype, points):

@@ -25,6 +25,7 @@ def matrices(rng) -> np.ndarray:
     return half @ transposed[0] / N + 0.1 * np.eye(N) + skew - transposed[1]
 
 
+@pytest.mark.slow
 def test_solutions_on_polyhedra_are_found_with_one_certificate() -> None:
     """y* with G y* = d on the active rows, and F(y*) = −Gᵀλ for multipliers λ of them alone."""
     rng = np.random.default_rng(0)
@@ -85,6 +86,7 @@ def test_the_weights_of_the_space_are_those_of_the_law() -> None:
     np.testing.assert_allclose(one.y, two.y, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_derivative_is_that_on_the_face() -> None:
     """On the face y₃ = 0 of the simplex, (y₁, y₂, μ) solves a linear system, whose derivative in q is a
     column of its inverse."""
@@ -101,6 +103,7 @@ def test_the_derivative_is_that_on_the_face() -> None:
     np.testing.assert_allclose(jax.jacrev(y)(q), expected, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_known_solution_has_the_derivative_on_its_face() -> None:
     """On the active rows G_A y = d_A the derivative in (−q, d_A) is a block of the inverse of the
     matrix [M G_Aᵀ; G_A 0]."""

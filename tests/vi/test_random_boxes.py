@@ -75,6 +75,7 @@ def check(name, seed):
 OFTEN = ("auto",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [pytest.param(n, marks=() if n in OFTEN else pytest.mark.thorough) for n in SOLVERS],

@@ -20,6 +20,7 @@ def trap(y, _):
     return (2 + jnp.sin(y)) * y - DRIVE
 
 
+@pytest.mark.slow
 def test_refute_gamma_by_three_solutions_of_the_additive_drive():
     """The three solutions have no error bound, and refute every modulus."""
     found = [
@@ -36,12 +37,14 @@ def test_refute_gamma_by_three_solutions_of_the_additive_drive():
         assert float(broken.y) != float(broken.z)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", [(0, 1), (0, 2), (1, 2)])
 def test_refute_gamma_by_any_two_solutions(pair):
     broken = refute_gamma(trap, Box(0.0, END), 1e-9, jnp.asarray(THREE[list(pair)]))
     assert broken is not None and broken.gamma < 1e-9
 
 
+@pytest.mark.slow
 def test_refute_gamma_by_points_that_violate_the_definition():
     broken = refute_gamma(trap, Box(0.0, END), 1e-6, jnp.linspace(0.0, END, 40))
     assert broken is not None
@@ -50,6 +53,7 @@ def test_refute_gamma_by_points_that_violate_the_definition():
     assert float(trap(z, None)) * (z - y) == pytest.approx(broken.gamma * (z - y) ** 2, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_refute_gamma_refutes_too_large_moduli_and_not_the_true_one():
     # ⟨F(y), y − z⟩ = 0.5‖y − z‖² + a rotation: 0.5 exactly.
     F = lambda y, _: 0.5 * y + 4.0 * jnp.stack([-y[1], y[0]]) - 1.0  # noqa: E731
@@ -59,6 +63,7 @@ def test_refute_gamma_refutes_too_large_moduli_and_not_the_true_one():
     assert broken is not None and 0.5 <= broken.gamma < 0.6
 
 
+@pytest.mark.slow
 def test_refute_gamma_accepts_tuples_and_weighted_operators():
     K = dvax.sets.Product(Box(0.0, 1.0), Box(0.0, 1.0))
     F = lambda y, _: (-y[0], y[1])  # noqa: E731

@@ -68,6 +68,7 @@ SETS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "n", "count", "seed"),
     mostly_thorough(
@@ -150,6 +151,7 @@ def test_rounding_analysis_needs_one_product_for_exact_factors(F):
     assert names.count("dot_general") == 2
 
 
+@pytest.mark.slow
 def test_rounding_of_nonlinear_laws_is_proved_and_estimated_without_a_rule():
     y = jnp.linspace(-2.0, 3.0, 40)
     smooth = lambda y: y**3 + jnp.tanh(5.0 * y) / (2.0 + jnp.cos(y)) - jnp.exp(y) + jnp.sum(y**2)  # noqa: E731
@@ -177,6 +179,7 @@ def test_stalled_is_returned_if_rounding_exceeds_the_tolerance():
     assert solve(1e-10).rounding_status == "proved"
 
 
+@pytest.mark.slow
 def test_derivative_of_a_failed_solve_vi_is_nan():
     M = jnp.array([[2.0, -1.0], [1.0, 3.0]])
 
@@ -206,6 +209,7 @@ INDEXED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("F", INDEXED.values(), ids=INDEXED)
 def test_rounding_of_entries_written_or_added_at_places_is_proved_and_holds(F):
     """Against the same operations in double precision."""

@@ -12,6 +12,7 @@ from tests.selection import mostly_thorough
 import dvax
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("far", mostly_thorough([1e3, 1e4, 1e6, 1e8], [1e8]))
 @pytest.mark.parametrize("kind", ["Ball", "Translated", "HalfSpace"])
 def test_error_bound_includes_rounding_of_sets_far_from_zero(kind, far):

@@ -66,6 +66,7 @@ def types(jaxpr):
             yield from types(inner)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gamma", [None, 0.5])
 @pytest.mark.parametrize("name", SOLVERS)
 def test_solve_vi_keeps_single_precision(name, gamma):

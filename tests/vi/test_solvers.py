@@ -48,6 +48,7 @@ EDGES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", range(len(EDGES)))
 @pytest.mark.parametrize("guess", mostly_thorough([0.0, -7.3, 1e3], [-7.3]))
 def test_bracketing_needs_no_slope_no_guess_and_no_finite_interval(case, guess):
@@ -68,6 +69,7 @@ def test_bracketing_solves_all_points_of_a_field_at_once():
     assert int(vi.iterations) < 60
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("F", "K", "solver", "result"),
     [
@@ -118,6 +120,7 @@ def test_newton_solves_a_law_steeper_than_rounding_to_two_spacings():
 STEPPING = [Extragradient(), ForwardBackwardForward(), GoldenRatio(), SemismoothNewton()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", STEPPING, ids=lambda solver: type(solver).__name__)
 def test_step_below_rounding_gives_no_certificate(solver):
     # A jump from −10 to 1 at the start itself: no step is short enough, until y − λF(y) is y, where
@@ -136,6 +139,7 @@ def test_projection_on_a_rotation_returns_cycling():
     assert vi.result == RESULTS.cycling
 
 
+@pytest.mark.slow
 def test_error_bound_holds_after_too_few_iterations():
     for solver in (
         Extragradient(max_steps=3), Bracketing(max_steps=3), Projection(max_steps=3),
@@ -206,6 +210,7 @@ ALL = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver", mostly_thorough(ALL, ALL[:1]), ids=lambda solver: type(solver).__name__
 )

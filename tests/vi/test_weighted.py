@@ -233,6 +233,7 @@ def test_weighted_lanes_have_their_own_results():
     np.testing.assert_allclose(np.asarray(vi.y), [0.5, 1.2, 3.0])
 
 
+@pytest.mark.slow
 def test_weighted_keeps_single_precision():
     y0 = jnp.zeros(3, jnp.float32)
     matrix, shift = jnp.asarray(WEIGHT, jnp.float32), jnp.asarray(SHIFT, jnp.float32)

@@ -152,6 +152,7 @@ def refused(config: Path, expected: dict[str, tuple[str, ...]]) -> None:
     assert not (config.parent / "out").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REFUSED)
 def test_application_errors_name_keys_of_the_file(name: str, tmp_path: Path) -> None:
     text, netlist, expected = REFUSED[name]

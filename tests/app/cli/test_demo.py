@@ -18,6 +18,7 @@ from dvax.app.runs.config import build_contact, load_config
 DEMO = Path(str(files("dvax.app.runs") / "demo"))
 
 
+@pytest.mark.slow
 def test_demo_runs_at_few_points_and_is_self_contained(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     result = CliRunner().invoke(app, ["demo", "-o", str(out), "--points", "50"])

@@ -100,6 +100,7 @@ def test_missing_app_packages_give_an_error_with_the_fix() -> None:
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_report_writes_and_prints_the_path_of_the_page(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((30,), frames=5))
     result = CliRunner().invoke(app, ["report", str(run_dir)])
@@ -119,6 +120,7 @@ def test_doctor_self_test_uses_the_published_number() -> None:
     assert abs(selftest.EXACT - 1.8360919559905713) < 1e-15
 
 
+@pytest.mark.slow
 def test_doctor_reports_success() -> None:
     result = CliRunner().invoke(app, ["doctor"])
     assert result.exit_code == 0, result.output

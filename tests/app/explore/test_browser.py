@@ -92,6 +92,7 @@ def test_page_shows_an_error_and_recovers(page: Tab, server: Server) -> None:
     assert page.errors == []
 
 
+@pytest.mark.slow
 def test_page_saves_pictures_and_the_configuration(
     page: Tab, server: Server, tmp_path: Path
 ) -> None:

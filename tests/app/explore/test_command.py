@@ -56,6 +56,7 @@ def test_explore_refuses_a_port_that_is_taken(tmp_path: Path) -> None:
     assert str(port) in result.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "number",
     [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.thorough)],

@@ -53,6 +53,7 @@ def run_of_export(
     return read_run(folder / "run")
 
 
+@pytest.mark.slow
 def test_contact_pressure_is_that_of_a_run_of_the_exported_configuration(
     wave: ContactSubject, values_elsewhere: dict[str, float], run_of_export: Any
 ) -> None:
@@ -75,6 +76,7 @@ def test_contact_figures_are_those_of_a_run(
     assert answer.certificate.status == "proved"
 
 
+@pytest.mark.slow
 def test_contact_derivative_is_the_limit_of_difference_quotients(
     wave: ContactSubject, values_elsewhere: dict[str, float]
 ) -> None:

@@ -44,6 +44,7 @@ def test_model_sliders_have_names_units_and_ranges(decay: ModelSubject) -> None:
     assert (push.unit, push.low, push.high, push.log) == ("mm/s", -1.0, 1.0, False)
 
 
+@pytest.mark.slow
 def test_model_solution_and_prediction_have_their_closed_forms(decay: ModelSubject) -> None:
     rate, push = "model.parameters.rate", "model.parameters.push"
     base = values_of(decay, **{push: 0.5})

@@ -208,6 +208,7 @@ def test_page_follows_the_system_to_dark_and_its_switch_back(desktop: Tab) -> No
     assert_quiet(desktop)
 
 
+@pytest.mark.slow
 def test_page_is_as_wide_as_a_phone_with_all_tables_unfolded(tab: Tab, page: Path) -> None:
     tab.open(page, PHONE)
     assert overflow(tab) <= 0

@@ -45,6 +45,7 @@ def stills(run_dir: Path) -> set[str]:
     return {file.stem for file in (run_dir / "figures").glob("*.png")}
 
 
+@pytest.mark.slow
 def test_report_of_a_large_run_has_at_most_three_megabytes(large: Path) -> None:
     page = large / "report.html"
     assert page.stat().st_size <= 3e6
@@ -90,6 +91,7 @@ def test_report_of_a_stopped_run_begins_with_its_status(tmp_path: Path, status: 
     assert "from 0 to 20 (of 40) s" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("written", mostly_thorough([1, 2], [1]))
 def test_report_of_few_frames_has_pictures(tmp_path: Path, written: int) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), written=written, status="failed"))
@@ -114,6 +116,7 @@ def test_report_of_a_surface_has_maps_with_a_slider(tmp_path: Path) -> None:
     assert "24 of 30 saved frames are drawn." in text
 
 
+@pytest.mark.slow
 def test_report_without_companion_explains_the_missing_picture(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), companion=False))
     text = build_report(run_dir).read_text(encoding="utf-8")

@@ -46,6 +46,7 @@ def lines_of(axes: Axes) -> dict[str, np.ndarray]:
     return {str(line.get_label()): np.asarray(line.get_ydata()) for line in axes.lines}
 
 
+@pytest.mark.slow
 def test_pyplot_shows_the_figure():
     figure = solved().plot()
     assert plt.gcf() is figure

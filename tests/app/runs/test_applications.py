@@ -98,6 +98,7 @@ def test_data_errors_name_their_line(folder):
     assert any("open.cir, line 2" in line for line in told)
 
 
+@pytest.mark.slow
 def test_application_run_writes_figures_data_and_a_report(folder, outcome):
     assert outcome.exit_code == 0 and outcome.status == "finished"
     summary = json.loads((outcome.directory / "summary.json").read_text())

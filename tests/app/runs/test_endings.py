@@ -40,6 +40,7 @@ def test_failed_write_keeps_the_old_file_and_leaves_no_part(
     assert file.read_text() == "old" and os.listdir(tmp_path) == ["summary.json"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stills", [True, False])
 def test_report_on_a_full_disk_names_path_and_fix(
     tmp_path: Path, stills: bool, monkeypatch: pytest.MonkeyPatch
@@ -111,6 +112,7 @@ def test_close_killed_closes_dead_runs_only(tmp_path: Path) -> None:
     assert not close_killed(tmp_path)  # the state of a process on another host is unknown
 
 
+@pytest.mark.slow
 def test_report_of_a_killed_run_states_it(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), frames=21, written=11, status="running"))
     file = run_dir / "manifest.json"

@@ -76,6 +76,7 @@ def problem(file: Path) -> str:
     return str(found)
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_the_copy_of_its_data_from_any_working_directory(tmp_path, monkeypatch):
     folder, elsewhere = tmp_path / "made", tmp_path / "elsewhere"
     elsewhere.mkdir()
@@ -96,6 +97,7 @@ def test_a_run_goes_on_with_the_copy_of_its_data_from_any_working_directory(tmp_
         np.testing.assert_allclose(data.level.values[-1], AREA, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_run_does_not_go_on_with_other_data(tmp_path):
     part = tmp_path / "part"
     config = read_config(written(tmp_path / "made"), allow_code=True)

@@ -54,6 +54,7 @@ def outcome(tmp_path_factory):
     return run(read_config(written(folder, table=table), allow_code=True), folder / "run")
 
 
+@pytest.mark.slow
 def test_a_run_has_the_variables_of_the_model_by_name_and_unit(outcome):
     assert outcome.exit_code == 0
     data = xarray.open_zarr(outcome.directory / "trajectory.zarr")
@@ -190,6 +191,7 @@ def test_check_names_the_line_of_an_error_in_a_function_of_the_problem(tmp_path)
         assert "own.py, line" in result.stderr and "name 'damping' is not defined" in result.stderr
 
 
+@pytest.mark.slow
 def test_new_writes_a_problem_that_runs_and_whose_test_passes(tmp_path):
     folder = tmp_path / "mine"
     assert CliRunner().invoke(app, ["new", str(folder)]).exit_code == 0

@@ -64,6 +64,7 @@ SOLVE_ERROR = dvax.SolveError(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("error", "status", "code"),
     [
@@ -115,6 +116,7 @@ def plan_of_the_closed_form(count: int, **settings) -> Plan:
     return Plan(model.problem, jnp.asarray(-1.0), times, model.constants, settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "settings"),
     mostly_thorough(

@@ -99,6 +99,7 @@ def events(directory: Path, kind: str) -> list[dict]:
     return [event for event in map(json.loads, lines) if event["event"] == kind]
 
 
+@pytest.mark.slow
 def test_a_resumed_run_equals_one_that_was_not_interrupted(folder, part):
     again = go_on(part, Stops(2, SOLVE_ERROR))
     assert again.exit_code == 3
@@ -286,6 +287,7 @@ def test_one_process_at_a_time_writes_a_run(made, tmp_path):
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
+@pytest.mark.slow
 def test_resume_says_what_there_is_nothing_to_do_about(made, tmp_path):
     result = CliRunner().invoke(app, ["resume", str(made["circuit"] / "whole")])
     assert result.exit_code == 0 and "nothing to go on with" in result.stderr

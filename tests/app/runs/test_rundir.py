@@ -109,6 +109,7 @@ def test_marked_and_truncated_frames_are_on_disk(store: FrameStore) -> None:
     np.testing.assert_array_equal(frames["pressure"], values(4)["pressure"])
 
 
+@pytest.mark.slow
 def test_run_and_report_do_not_import_xarray_or_pandas() -> None:
     program = (
         "import sys, dvax.app.runs.driver, dvax.app.plots\n"

@@ -52,6 +52,7 @@ def bound(directory):
     return json.loads((directory / "summary.json").read_text())["error_bound"]
 
 
+@pytest.mark.slow
 def test_check_and_run_say_that_a_bound_certifies_no_digit_and_energy_makes_it_small(tmp_path):
     file = written(tmp_path / "plain")
     told = call("check", file)

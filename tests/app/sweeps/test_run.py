@@ -112,6 +112,7 @@ def test_second_call_runs_nothing_but_the_failed_members(sweep, copy):
     assert all(np.array_equal(before[n], after[n], equal_nan=True) for n in before if n != "status")
 
 
+@pytest.mark.slow
 def test_member_alone_has_the_bits_of_the_sweep(sweep, copy):
     before = values(copy)
     for k in FINISHED:
@@ -184,6 +185,7 @@ def test_damaged_record_is_run_again(sweep, copy):
     assert run_member(sweep, copy, 3)["status"] == "finished"
 
 
+@pytest.mark.slow
 def test_command_line_of_members(sweep, outcome, copy, tmp_path):
     file = str(sweep.source)
 

@@ -40,6 +40,7 @@ def test_check_lists_all_invalid_members_with_values_file_and_line(tmp_path):
     assert valid.exit_code == 0 and "no problem in the input of 2 members" in valid.stdout
 
 
+@pytest.mark.slow
 def test_invalid_members_fail_with_their_values_and_the_others_run(tmp_path):
     file = written(tmp_path, RATES.format("[13.0, 1.0, 13.0]"))
     result = call(file, "-o", str(tmp_path / "out"), "--workers", "1")

@@ -48,6 +48,7 @@ def test_tangent_limit_resolves_a_tangent_to_ten_tolerances_in_its_time(order, s
         assert z <= 0.8 * stable
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "stable", "R"), METHODS)
 def test_tangent_limit_rises_to_stability_as_tangents_decay(order, stable, R):
     limit = TangentLimit(jnp.asarray(1e-5), 100.0, order, stable)
@@ -103,6 +104,7 @@ def spectrum(kind, n, rng):
     return np.block([[zero, one], [-np.diag(rates[1::2] ** 2), -0.01 * one]]), False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["diffusion", "symmetric", "growth", "oscillation"])
 @pytest.mark.parametrize("n", [2, 20])
 def test_power_iteration_finds_the_spectral_radius(kind, n):
@@ -117,6 +119,7 @@ def test_power_iteration_finds_the_spectral_radius(kind, n):
     assert bool(found.is_damped) == decays
 
 
+@pytest.mark.slow
 def test_what_has_not_decayed_is_an_oscillation_or_the_slowest_solution():
     rng, space = np.random.default_rng(1), spaces.Euclidean(6)
     for w in (0.0, 3.0, 20.0, 42.0):
@@ -144,6 +147,7 @@ def test_images_are_those_of_two_applications_and_of_each_parameter():
     np.testing.assert_array_equal(forced[1], [1.0, 0.0, 0.0, 0.0])
 
 
+@pytest.mark.slow
 def test_power_iteration_finds_the_radius_in_any_units():
     # Entries in units a and b: a calcium concentration in mol/L beside a voltage in mV.
     space = spaces.Euclidean(2)
@@ -170,6 +174,7 @@ def test_power_iteration_waits_where_nothing_moves():
         assert float(found.slope) == 0.0 and jnp.array_equal(found.direction, start)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [dvax.ETD4RK(), dvax.DormandPrince()], ids=["three", "four"])
 def test_variation_is_the_frequency_of_a_wave_and_zero_for_a_polynomial(method):
     nodes = (0.0, *method.samples, 1.0)
