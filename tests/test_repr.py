@@ -77,6 +77,7 @@ def test_constants_verification_and_bound_are_shown_with_statuses():
     assert "[1, 2]" in repr(batch)
 
 
+@pytest.mark.slow
 def test_ensemble_is_shown_with_mean_and_failures():
     found = dvax.ensemble(problem(), -1.0, 0.0, 2.0, jnp.linspace(2.0, 4.0, 5))
     assert repr(found).startswith("Ensemble: 5 members, 0 failed")

@@ -66,6 +66,7 @@ def test_members_are_single_solves(states):
     assert found.method == alone.stats["method"]
 
 
+@pytest.mark.slow
 def test_members_of_a_closed_form():
     case = c1()
     ends = np.linspace(0.2, 2.0, 40)

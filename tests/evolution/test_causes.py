@@ -363,6 +363,7 @@ def test_cause_conditions_that_contradict_each_other_are_reported_as_an_empty_se
             assert word in str(error)
 
 
+@pytest.mark.slow
 def test_cause_nonfinite_value_at_the_start_is_reported():
     error = failure(make(lambda t, x, u, args: 1.0 / t), x0=0.1, t1=1.0)
     assert "next to t = 0 " in error.cause or "f is inf" in error.cause

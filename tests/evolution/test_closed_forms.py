@@ -45,6 +45,7 @@ def test_error_of_closed_forms_is_below_ten_tolerances(name, method):
         assert error.max() <= 10 * rtol
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mostly_thorough(ALL, ["C3"]))
 def test_saved_states_of_closed_forms_are_accurate_and_responses_certified(name):
     case = ALL[name]()

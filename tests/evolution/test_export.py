@@ -124,6 +124,7 @@ WRONG = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WRONG)
 def test_wrong_input_of_an_exported_program_is_refused(program, name):
     given, text = WRONG[name]

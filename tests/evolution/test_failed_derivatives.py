@@ -73,6 +73,7 @@ def lanes(method, dt):
     return {name: jnp.array([lane[name] for lane in every]) for name in WELL}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "dt", "adjoint"),
     mostly_thorough(

@@ -107,6 +107,7 @@ def test_a_vector_that_is_given_as_a_tuple_is_named(x0):
     assert f"x0 = [{listed}]" in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "args",
     [np.array([0.0, 0.5, 1.0]), np.array([3.0, 2.0]), np.array([0.5, 7.0]), np.array([0.5])],

@@ -65,6 +65,7 @@ def test_order_of_convergence_over_moving_boundaries(method, order):
     assert abs(-slope - order) < 0.15
 
 
+@pytest.mark.slow
 def test_etd4rk_is_more_accurate_than_etd2rk_over_moving_boundaries():
     counts = (10, 40, 160)
     second, fourth = (errors(method, counts) for method in (dvax.ETD2RK(), dvax.ETD4RK()))

@@ -31,6 +31,7 @@ def test_forward_derivatives_of_c1_agree_with_the_closed_form():
         assert float(found) == pytest.approx(exact, abs=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ["reverse", "forward"])
 def test_derivative_with_fixed_steps_is_of_first_order_across_kinks(adjoint):
     def last(x0, dt):

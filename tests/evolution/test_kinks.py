@@ -246,6 +246,7 @@ def test_regimes_change_at_jumps_of_data():
     assert positive.tolist() == [[True, True], [True, False], [True, True]]
 
 
+@pytest.mark.slow
 def test_regimes_of_a_set_without_kinks_are_one():
     problem = driven(jnp.sin, sets.WholeSpace())
     sol = dvax.solve(problem, 0.0, 0.0, 2.0, rtol=1e-3, dense=True, max_steps=4096)

@@ -50,6 +50,7 @@ def test_new_exponential_method_has_its_order_with_fixed_steps():
     assert np.log2(errors[0] / errors[1]) > 2.7
 
 
+@pytest.mark.slow
 def test_new_exponential_method_meets_the_tolerance_with_adaptive_steps():
     exact = dvax.solve(PROBLEM, X0, 0.0, 2.0, rtol=1e-12, atol=1e-12, method=dvax.ETD4RK()).xs[-1]
     sol = dvax.solve(PROBLEM, X0, 0.0, 2.0, rtol=1e-7, atol=1e-7, method=ETD3RK())

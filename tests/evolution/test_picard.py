@@ -50,6 +50,7 @@ def test_picard_error_is_below_its_bound_and_near_the_tolerance(make):
     assert int(sol.stats["sweeps"]) < 20 * int(sol.stats["windows"])
 
 
+@pytest.mark.slow
 def test_picard_bound_of_the_contact_law_is_proved():
     case = c1()
     sol, _ = solve(case, rtol=1e-4, atol=1e-4)

@@ -73,6 +73,7 @@ def test_responses_of_a_problem_made_in_a_transformation_are_available_outside()
         np.testing.assert_allclose(sol.us, law(sol.xs, number), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_responses_first_read_inside_a_compiled_function_are_constants_and_kept():
     sol = solve(-1.0)
     inside = jax.jit(lambda factor: factor * (sol.us + sol.ys))(2.0)

@@ -136,6 +136,7 @@ def test_start_far_from_zero_with_rounding_of_ten_tolerances_succeeds(method, st
         assert np.abs(found - truth).max() <= 10 * (1e-9 + 1e-6 * np.abs(truth).max()), t0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steep", mostly_thorough([1e3, 1e4, 1e5, 1e6], [1e5]))
 def test_rounding_of_t_that_a_stiff_law_forgets_stops_no_run(steep):
     """Wherever a run ends: its last step, and with it all steps, are others."""
@@ -166,6 +167,7 @@ def oscillator():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt_max", [0.1, 0.13, 0.7])
 def test_lengths_of_many_steps_add_up_to_the_time(dt_max):
     """Steps of one length share their φ-functions; rounded ends of steps at 0.1 would move the phase by

@@ -98,6 +98,7 @@ RATES = {
 OPTIONS = {"fixed": {"dt": 0.1}, "order 5": {"dt": 0.1, "method": dvax.DormandPrince()}, "none": {}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate", "options"),
     mostly_thorough(

@@ -115,6 +115,7 @@ def test_what_is_read_from_a_second_run_compiles_nothing():
     assert len(regimes.times) == len(regimes.positive) + 1 and len(kinks) > 0
 
 
+@pytest.mark.slow
 def test_a_number_of_numpy_compiles_nothing_after_one_of_python():
     read(3.0)
     with nothing_is("compile"):

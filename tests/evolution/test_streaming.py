@@ -63,6 +63,7 @@ def test_rows_are_those_of_a_run_without_a_store(whole, tmp_path):
     assert int(end.stats["steps"]) >= int(whole.stats["steps"])
 
 
+@pytest.mark.slow
 def test_progress_counts_the_steps_of_all_pieces(tmp_path, capfd):
     end = dvax.solve(
         PROBLEM, -1.0, 0.0, END, ts=TIMES, rtol=1e-8, save=dvax.ZarrStore(tmp_path / "run.zarr"),

@@ -44,6 +44,7 @@ def test_unchanged_configuration_is_read(seed, folder: Path) -> None:
     assert cases.load(path, seed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["configuration", "data"])
 def test_mutations_are_read_or_refused(kind: str, folder: Path) -> None:
     found = verdicts(kind, folder, range(400))

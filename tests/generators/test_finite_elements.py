@@ -114,6 +114,7 @@ def test_finite_elements_numerical_range_lies_in_the_rectangle(name):
     assert float(found.height) <= 1e-9 * abs(float(found.low))
 
 
+@pytest.mark.slow
 def test_finite_elements_growth_bound_holds_in_diagonal_norms():
     M, S, interval = MESHES["triangles"]
     A = generators.FiniteElements(M, S, interval, dissipative=True)

@@ -79,6 +79,7 @@ def test_sparse_semigroup_is_the_matrix_exponential(name):
         assert np.abs(found - expected).max() <= size * np.abs(expected).max()
 
 
+@pytest.mark.slow
 def test_sparse_number_of_products_is_as_documented():
     heat = generators.Sparse(MATRICES["heat"]).propagator(jnp.asarray(2.0), 2)
     wave = generators.Sparse(MATRICES["advection"]).propagator(jnp.asarray(2.0), 2)

@@ -213,6 +213,7 @@ def test_duvaut_lions_flow_on_the_cone_dilates_with_exponential_overstress():
 SQUEEZE = 1.5e-3 * np.eye(3) * np.linspace(0.0, 1.0, 9)[:, None, None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "yields", "back"),
     [

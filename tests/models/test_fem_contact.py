@@ -256,6 +256,7 @@ def test_fem_contact_steady_state_solves_a_quadratic_programme(bodies):
     assert float(jnp.linalg.norm(rate)) < 1e-9
 
 
+@pytest.mark.slow
 def test_fem_contact_equilibrium_converges_where_newton_cycles(bodies):
     body = bodies[0]
     C = body.trace @ (body.trace * body.weights[:, None]).T
@@ -284,6 +285,7 @@ def test_fem_contact_equilibrium_converges_where_newton_cycles(bodies):
         assert int(rest.vi.iterations) < 10
 
 
+@pytest.mark.slow
 def test_fem_contact_stress_balances_the_punch(run, tmp_path: Path):
     model, sol = run
     t, x = float(sol.ts[3]), sol.xs[3]

@@ -190,6 +190,7 @@ def test_market_of_two_equal_firms_is_the_textbook_duopoly():
     assert float(sol.xs[0]) == pytest.approx(float(p) + 8.0 * np.exp(-rate), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_market_equilibrium_and_derivative_agree_with_bounded_least_squares():
     market = small()
     p, u = market.equilibrium(0.0)

@@ -181,6 +181,7 @@ def test_mpc_constants_are_proved_by_verify(mpc, loop):
         assert float(getattr(mine, name)) == pytest.approx(float(getattr(found, name))), name
 
 
+@pytest.mark.slow
 def test_mpc_loop_agrees_with_an_independent_integrator_and_solver(mpc, loop):
     H, G, A, B = map(np.asarray, (mpc.H, mpc.G, mpc.A, mpc.B))
     run = loop[1][0]

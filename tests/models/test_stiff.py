@@ -253,6 +253,7 @@ def drawn(rng, mild=False):
     return text, source, 3 * T, events
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seed", [0, 3, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(5, 300))]
 )

@@ -178,6 +178,7 @@ def test_thermostat_insulated_plate_at_full_power_has_rate_zero():
     assert float(model.space.norm(ends[1] - ends[0])) == pytest.approx(np.sqrt(1.5), rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("boundary", ["dirichlet", "neumann", "periodic"])
 def test_thermostat_constants_are_proved_by_verify(boundary):
     model = plate(boundary=boundary)

@@ -241,6 +241,7 @@ def test_traffic_responses_are_within_their_certificate(city, days):
             assert tries < 500 and error <= float(bound) + rounding and float(bound) <= 1e-2
 
 
+@pytest.mark.slow
 def test_traffic_objective_gradient_is_the_path_costs(city):
     for x in (city.all_or_nothing(), city.equilibrium):
         slope = jax.grad(lambda x: city.objective(0.0, x))(x)
@@ -362,6 +363,7 @@ def sioux_falls():
     return model, formats.read_flows(folder / "SiouxFalls_flow.tntp", model.network)
 
 
+@pytest.mark.slow
 def test_traffic_sioux_falls_agrees_with_published_flows(sioux_falls):
     model, known = sioux_falls
     spent = float(model.total_travel_time(0.0, model.equilibrium))

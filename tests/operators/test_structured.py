@@ -112,6 +112,7 @@ def test_matrix_free_inverse_uses_the_inner_product_of_the_space():
         assert both.declared and not both.exact
 
 
+@pytest.mark.slow
 def test_matrix_free_inverse_is_differentiated_implicitly():
     M, v = jnp.array([[2.0, 0.5], [0.5, 1.0]]), jnp.array([1.0, 2.0])
 

@@ -197,6 +197,7 @@ def test_what_is_computed_later_is_refused_after_a_change():
     assert np.isfinite(sol.evaluate(1.0)[0])
 
 
+@pytest.mark.slow
 def test_a_table_of_pandas_is_read_again():
     table = pd.DataFrame({"load": [3.0]})
     one = problem(lambda t, x, u, args: float(table["load"].iloc[0]) - 0.5 * x - u)
@@ -207,6 +208,7 @@ def test_a_table_of_pandas_is_read_again():
     assert found == pytest.approx([1.836091956, 3.110066757], abs=1e-5)
 
 
+@pytest.mark.slow
 def test_a_record_of_its_calls_that_a_function_keeps_is_no_input():
     calls, load = [], {"v": 3.0}
 

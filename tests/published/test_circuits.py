@@ -59,6 +59,7 @@ def tutorial_scheme(name, h, steps):
     return theta_scheme(A, theta, h, steps, [10.0] + [0.0] * (n - 1), cases[name])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_published_numbers_are_those_of_a_first_order_scheme(name):
     given = PUBLISHED[name]

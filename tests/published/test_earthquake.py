@@ -73,6 +73,7 @@ def test_exact_solution_is_the_limit_of_newmark_steps_with_second_order():
     assert 8.0 <= errors[0] / errors[1] <= 32.0
 
 
+@pytest.mark.slow
 def test_viscous_columns_approach_elastoplastic_ones_in_proportion():
     frame = three_storeys()
     limit, _ = exact(frame, GRAVITY * PULSE, STEP, TIMES)

@@ -48,6 +48,7 @@ def test_parameters_of_a_contact_field_are_found_within_three_standard_errors(si
     assert result.chi2 == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / data.size))
 
 
+@pytest.mark.slow
 def test_pressure_law_of_the_field_agrees_with_scipy():
     # The errors of ETD2RK at kinks, which fixed steps do not meet, are below the noise of the data.
     solve, _ = field(16)
@@ -86,6 +87,7 @@ def test_parameters_of_a_rectifier_are_found_from_the_trajectory_of_ngspice():
     within_three_errors(result, inverse.RECTIFIER_TRUTH)
 
 
+@pytest.mark.slow
 def test_voltage_alone_does_not_determine_the_rectifier():
     # v depends on the products of the capacity with both resistances only.
     _, jacobian = rectifier()

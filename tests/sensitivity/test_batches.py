@@ -63,6 +63,7 @@ def test_gradient_of_ten_thousand_steps_fits_in_four_gigabytes():
 ROWS = np.array([0.0, 0.25, 0.5, 1.0, 1.93, 2.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "steps",
     [

@@ -80,6 +80,7 @@ def test_the_derivative_in_an_amplitude_of_zero_resolves_the_wave(name, rate, x0
     assert np.max(np.abs(found - expected) / scale) <= 2e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 12])
 def test_a_wave_around_the_law_and_many_parameters_are_resolved_in_both_modes(count):
     """Amplitudes in a closure and in args: parameters beyond seven share a direction."""

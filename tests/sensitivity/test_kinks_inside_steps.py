@@ -22,6 +22,7 @@ SETS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "rtol"),
     mostly_thorough(

@@ -41,6 +41,7 @@ FIRST = ("ETD1", "adaptive, of the first order")
 OFTEN = {("heat", "ETD2RK", "fixed")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("made", "method", "steps"), mostly_thorough(CASES, OFTEN))
 def test_hessian_by_forward_over_reverse_equals_forward_over_forward(made, method, steps, uncached):
     pair = made == "Rotation"

@@ -49,6 +49,7 @@ def ball(center, radius, t1):
     return run.y[:, -1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("t1", mostly_thorough([2.0, 4.0], {4.0}))
 def test_derivative_in_radius_and_centre_of_c3_is_the_closed_form(t1):
     """|x| = (2 − rt)e^{−t/2} until it meets the ball at 2/r − 1, and from there r e^{…}: at t = 4,

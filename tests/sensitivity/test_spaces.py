@@ -18,6 +18,7 @@ CASES = [(s, m, a) for s in SPACES for m in METHODS for a in ("forward", "revers
 ALWAYS = [("L2 and Euclidean", "the default", "reverse")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("space", "method", "adjoint"), mostly_thorough(CASES, ALWAYS))
 def test_derivative_of_an_adaptive_run_is_that_of_the_closed_form(space, method, adjoint):
     """x' = −x + u with 2u = ax, so that x(1) = e^{a/2 − 1} x₀; a second part is 0."""

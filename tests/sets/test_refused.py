@@ -12,6 +12,7 @@ from dvax import sets
 SQUARE = np.vstack([np.eye(2), -np.eye(2)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "word"),
     [

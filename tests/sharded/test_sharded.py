@@ -48,6 +48,7 @@ def on_eight_devices(*names: str) -> dict:
     return json.loads(subprocess.run(program, check=True, capture_output=True, text=True).stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", mostly_thorough([QUICK, sorted({*EXPECTED} - {*QUICK})], [QUICK]))
 def test_eight_devices_have_the_solution_of_one(names):
     for name, found in on_eight_devices(*names).items():

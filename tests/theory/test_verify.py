@@ -91,6 +91,7 @@ def test_verify_is_correct_on_two_hundred_generated_systems(seed):
     _check(seed + 1)
 
 
+@pytest.mark.slow
 def test_verify_refutes_the_additive_drive_with_a_counterexample():
     made, check = inspect(3)
     row = check["ass:strong_pseudomono"]

@@ -113,6 +113,7 @@ def test_newton_projects_and_evaluates_at_one_place_of_its_program(monkeypatch):
     assert len(places) <= 3 and len(counts) <= 4
 
 
+@pytest.mark.slow
 def test_newton_from_a_solution_ends_after_two_evaluations():
     """The first finds F at the solution and its face, the second the certificate."""
     K = Polyhedron(jnp.array([[1.0, 1.0], [-1.0, 2.0]]), jnp.array([1.0, 0.5]))

@@ -170,6 +170,7 @@ def test_simplex_problem_has_seven_solutions_by_enumeration_of_faces():
     assert set(nearest) == set(range(7))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver", [Bracketing(), Extragradient()], ids=["bracketing", "extragradient"]
 )

@@ -154,6 +154,7 @@ def test_doctor_detects_a_wrong_result(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "off by 3.60e-02" in result.stderr
 
 
+@pytest.mark.slow
 def test_doctor_names_a_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "APPLICATION", ("typer", "a-package-that-is-not-there"))
     result = CliRunner().invoke(app, ["doctor"])

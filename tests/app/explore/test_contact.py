@@ -63,6 +63,7 @@ def test_contact_pressure_is_that_of_a_run_of_the_exported_configuration(
     np.testing.assert_allclose(pressure, stored, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_contact_figures_are_those_of_a_run(
     wave: ContactSubject, values_elsewhere: dict[str, float], run_of_export: Any
 ) -> None:
@@ -95,6 +96,7 @@ def test_contact_derivative_is_the_limit_of_difference_quotients(
         assert np.mean(np.abs(quotient - exact) < 1e-6) > 0.95
 
 
+@pytest.mark.slow
 def test_contact_prediction_is_close_to_the_solution_after_a_small_move(
     wave: ContactSubject,
 ) -> None:

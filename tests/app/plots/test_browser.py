@@ -194,6 +194,7 @@ def area(picture: np.ndarray, colour: str) -> int:
     return int((np.abs(picture - np.array(to_rgb(colour))).max(axis=-1) < 2 / 255).sum())
 
 
+@pytest.mark.slow
 def test_page_follows_the_system_to_dark_and_its_switch_back(desktop: Tab) -> None:
     light = pixels(desktop)
     desktop.set_scheme("dark")

@@ -61,6 +61,7 @@ def test_report_pictures_have_nonblank_png_files(large: Path) -> None:
         assert pixels[..., :3].std() > 0.05, f"{file.name} is blank"
 
 
+@pytest.mark.slow
 def test_report_lists_every_constant_with_its_label(large: Path) -> None:
     text = (large / "report.html").read_text(encoding="utf-8")
     for name, _, _, _, label, _ in CONSTANTS:
@@ -79,6 +80,7 @@ def test_report_of_a_finished_run_has_no_banner(large: Path) -> None:
     assert "Partial results." not in (large / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("status", ["interrupted", "failed", "running"])
 def test_report_of_a_stopped_run_begins_with_its_status(tmp_path: Path, status: str) -> None:
     run_dir = write_run(tmp_path / "run", Recipe((40,), frames=21, written=11, status=status))

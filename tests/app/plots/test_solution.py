@@ -53,6 +53,7 @@ def test_pyplot_shows_the_figure():
     assert solved().plot(axes=figure.axes) is figure and plt.get_fignums() == [1]
 
 
+@pytest.mark.slow
 def test_panels_show_states_responses_their_bounds_and_active_constraints():
     sol = solved()
     figure = sol.plot()

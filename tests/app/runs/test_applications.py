@@ -129,6 +129,7 @@ def test_application_run_writes_figures_data_and_a_report(folder, outcome):
         assert (outcome.directory / "figures" / f"{picture}.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_resolved_configuration_gives_the_same_run(outcome, tmp_path):
     moved = tmp_path / "moved"
     shutil.copytree(outcome.directory, moved)

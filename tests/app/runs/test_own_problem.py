@@ -77,6 +77,7 @@ def test_a_run_has_the_variables_of_the_model_by_name_and_unit(outcome):
     assert outcome.summary["error_bound"]["unit"] == data["error_bound"].attrs["units"] == "mm"
 
 
+@pytest.mark.slow
 def test_the_report_says_that_code_ran_and_draws_the_variables_in_order(outcome):
     page = build_report(outcome.directory).read_text()
     assert "The code of own.py:build is executed." in page

@@ -135,6 +135,7 @@ def test_a_run_that_failed_within_a_piece_resumes_at_its_beginning(tmp_path):
     assert results(tmp_path / "out") == before
 
 
+@pytest.mark.slow
 def test_results_stay_until_there_are_better_ones(made, tmp_path):
     part = Path(shutil.copytree(made["circuit"] / "part", tmp_path / "part"))
     before = {name: data for name, data in results(part).items() if name != "summary.json"}

@@ -50,6 +50,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("write", "method", "status"),
     mostly_thorough(CASES, [CASES[1], CASES[2]]),

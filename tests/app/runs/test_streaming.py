@@ -79,6 +79,7 @@ def test_run_that_is_stopped_while_it_reads_its_checkpoints_keeps_its_results(
     assert go_on(tmp_path / "out").exit_code == 0
 
 
+@pytest.mark.slow
 def test_bound_of_a_run_in_pieces_is_above_its_error_and_not_above_that_of_the_whole() -> None:
     from tests.app.runs.test_partial import plan_of_the_closed_form
 

@@ -63,6 +63,7 @@ def copy(outcome, tmp_path):
     return Path(shutil.copytree(outcome.directory, tmp_path / "copy"))
 
 
+@pytest.mark.slow
 def test_results_are_those_of_the_closed_form_at_each_member(outcome):
     with xarray.open_zarr(outcome.directory / NAME) as data:
         assert data.attrs["title"] == "decays" and data.sizes["member"] == len(RATES)
@@ -179,6 +180,7 @@ def test_export_of_a_sweep_names_its_store(outcome, tmp_path):
         export_run(outcome.directory, tmp_path / "a.csv")
 
 
+@pytest.mark.slow
 def test_damaged_record_is_run_again(sweep, copy):
     (copy / "members" / "000003.json").write_text("{")
     assert read_record(copy, 3) is None
