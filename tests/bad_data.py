@@ -26,7 +26,7 @@ class Lines:
     def __repr__(self):
         return "\n".join(f"row {k}   {float(k)}" for k in range(100))
 
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
+    __hash__ = None
 
 
 def f_unpacks(t, x, u, args):

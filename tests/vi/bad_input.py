@@ -39,7 +39,7 @@ def branches(y, args):
 
 
 class Unhashable:
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
+    __hash__ = None
 
     def __call__(self, y, args):
         return y

@@ -80,10 +80,11 @@ def test_solve_vi_under_jit_traces_once():
     counts = []
     F = counted(counts)
     solve = jax.jit(lambda y0, target, K: dvax.solve_vi(F, K, y0, target).y)
+    after = []
     for number in range(4):
         y = solve(jnp.full(2, 0.1 * number), jnp.array([0.5, 9.0 + number]), Box(0.0, 1.0 + number))
-        first = len(counts) if number == 0 else first
-        assert len(counts) == first
+        after.append(len(counts))
+    assert after == [after[0]] * 4
     assert float(y[1] + y[1] ** 3) == pytest.approx(12.0, rel=1e-12)
 
 
