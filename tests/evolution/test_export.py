@@ -153,6 +153,7 @@ def damaged(program, **changes):
     return copy.read_bytes()
 
 
+@pytest.mark.slow
 def test_files_that_are_no_readable_programs_are_refused(program):
     whole = program.read_bytes()
     for source, text in (

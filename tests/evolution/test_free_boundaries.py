@@ -103,6 +103,7 @@ def test_free_boundaries_agree_with_the_closed_form():
         np.testing.assert_array_equal((u == 0.0)[~near[1]], (from_end > none)[~near[1]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [pytest.param(dvax.ETD1(), marks=pytest.mark.thorough), dvax.ETD2RK()]
 )

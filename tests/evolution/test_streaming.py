@@ -86,6 +86,7 @@ def test_bound_of_the_end_holds_for_the_whole_run(tmp_path):
     assert 1e-9 < error <= float(bound.x[-1])
 
 
+@pytest.mark.slow
 def test_last_piece_that_is_not_full_and_an_end_behind_the_last_row(tmp_path):
     times = np.linspace(0.5, 4.0, 19)
     store = dvax.ZarrStore(tmp_path / "run.zarr")

@@ -349,6 +349,7 @@ def test_fem_contact_force_has_derivatives_in_all_parameters(bodies):
         assert float(slope[k]) == pytest.approx(float(quotient), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_fem_contact_solution_does_not_depend_on_the_units(bodies):
     sizes = dict(zip(("fine", "coarse", "layers"), MESHES[0]))
     mm = ElasticBody({**sizes, "width": 8e3, "height": 4e3, "fine_half_width": 500.0},

@@ -69,6 +69,7 @@ def test_report_lists_every_constant_with_its_label(large: Path) -> None:
         assert f"<code>{label}</code>" in text
 
 
+@pytest.mark.slow
 def test_report_makes_no_network_request(large: Path) -> None:
     text = (large / "report.html").read_text(encoding="utf-8")
     outside_scripts = "".join(part.split("</script>")[-1] for part in text.split("<script"))

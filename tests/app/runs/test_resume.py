@@ -151,6 +151,7 @@ def test_results_stay_until_there_are_better_ones(made, tmp_path):
     assert results(part) == results(made["circuit"] / "whole")
 
 
+@pytest.mark.slow
 def test_checkpoints_stay_until_the_results_are_written(made, tmp_path, monkeypatch):
     part = Path(shutil.copytree(made["circuit"] / "part", tmp_path / "part"))
 

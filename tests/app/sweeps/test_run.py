@@ -79,6 +79,7 @@ def test_results_are_those_of_the_closed_form_at_each_member(outcome):
         assert np.isnan(data.depth.values[[0, 2]]).all()
 
 
+@pytest.mark.slow
 def test_failures_are_named_and_leave_the_others_alone(outcome, events):
     assert outcome.exit_code == 3 and outcome.counts == {"finished": 3, "failed": 2}
     with xarray.open_zarr(outcome.directory / NAME) as data:
