@@ -57,7 +57,8 @@ test: lint types ## lint, formatting, types and tests (under 10 minutes on two c
 	@echo 'make test: lint, formatting, types and every test not marked slow or thorough have passed'
 
 slow: $(READY) ## the tests that take more than about two seconds each
-	env -u PYTHONDONTWRITEBYTECODE $(PY) -m pytest -n $(WORKERS) --dist worksteal -m slow --durations=15
+	env -u PYTHONDONTWRITEBYTECODE $(PY) -m pytest -n $(WORKERS) --dist worksteal \
+	    -m "slow and not thorough" --durations=15
 
 test-times: $(READY) ## the tests of make test, with the processor time of each test, file and folder
 	env -u PYTHONDONTWRITEBYTECODE $(PY) -m pytest -n $(WORKERS) --dist worksteal -p tests.processor_time
