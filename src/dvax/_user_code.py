@@ -5,6 +5,7 @@ first programs fail there: too few parameters, an `if` on a traced value, a NumP
 shapes. The exceptions of Python and JAX point into the libraries. This module converts them to an
 `InputError`."""
 
+import dataclasses
 import dis
 import inspect
 import os
@@ -41,11 +42,17 @@ def call(
     `about` describes the origin of the shape of u, for messages.
 
     **Raises:** `dvax.InputError` if fn has other parameters, or raises an exception that is typical
-    of a common mistake. Any other exception keeps its type and gets a note."""
+    of a common mistake; that of dvax gets the place in fn. Any other exception keeps its type and
+    gets a note."""
     at = f"{caller}({name})"
     _check_parameters(at, name, fn, inputs)
     try:
         return fn(*inputs.values())
+    except InputError as error:
+        place = f"{at}, {_place(fn, error.__traceback__)}: "
+        raise InputError(
+            *(dataclasses.replace(p, place=place + p.place) for p in error.problems)
+        ) from error
     except DvaxError:
         raise
     except (TypeError, ValueError, LookupError, AttributeError) as error:

@@ -284,11 +284,14 @@ class Problem(eqx.Module):
         return value
 
     def _check_set(self, t: Any, x: Tree, u: Tree, args: Any) -> None:
+        def at(t: Any) -> AbstractSet:
+            return self._evaluate("K", self.K, {"t": t, "args": args}, AbstractSet, x)
+
         def traced(t: Any) -> None:
-            self._evaluate("K", self.K, {"t": t, "args": args}, AbstractSet, x)
+            at(t)
 
         jax.eval_shape(traced, t)  # with a traced t, as in a run
-        self.set_at(t, args).check(u)
+        at(t).check(u)
 
     def _check_values(
         self, name: str, fn: Callable[..., Any], inputs: tuple, element: Tree, space: str

@@ -424,3 +424,15 @@ def test_moments_of_complex_values_and_quantiles_of_flags():
         loaded(), -1.0, 0.0, 1.0, {"load": LOADS[:5]}, observe=lambda sol: sol.xs[-1] > 0.0
     )
     assert 0.0 <= flags.quantile(0.5) <= 1.0
+
+
+def test_parameters_of_the_members_are_coordinates():
+    loads = np.linspace(2.0, 4.0, 5)
+    found = dvax.ensemble(loaded(), -1.0, 0.0, 1.0, {"load": loads}, rtol=1e-5)
+    table = found.to_xarray(parameters={"load": loads, "pair": np.stack([loads, loads], axis=1)})
+    assert table["load"].dims == ("member",) and table["pair"].dims == ("member", "pair_dim0")
+    nearest = table.swap_dims(member="load").sel(load=3.1, method="nearest")["value"]
+    assert float(nearest) == found.values[2]
+    for wrong in ({"load": loads[:-1]}, {"load": 1.0}, {"value": loads}):
+        with pytest.raises(dvax.InputError, match="a row for each of the 5 members"):
+            found.to_xarray(parameters=wrong)

@@ -156,3 +156,17 @@ def test_problem_rejects_args_that_jax_cannot_trace(args, given):
 def test_problem_accepts_strings_in_args():
     sol = dvax.solve(make(), jnp.zeros(2), 0.0, 1.0, {"load": 2.0, "name": "of a run"})
     assert sol.result == dvax.RESULTS.successful
+
+
+def test_the_place_of_a_set_that_is_refused_is_that_in_K():
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0),
+        K=lambda t, args: dvax.sets.Box(args, 1.0),
+        f=lambda t, x, u, args: u - x, h=lambda t, x, u, args: x - u,
+    )  # fmt: skip
+    assert problem.check(0.0, jnp.asarray(0.5), jnp.asarray(0.5)) is None
+    with pytest.raises(dvax.InputError) as caught:
+        problem.check(0.0, jnp.asarray(0.5), jnp.asarray(2.0))
+    found = caught.value.problems[0]
+    assert found.place.startswith("dvax.Problem(K)") and "test_problem.py, line" in found.place
+    assert "dvax.sets.Box(lower, upper)" in found.place and "lower = 2" in found.given

@@ -134,16 +134,25 @@ class Ensemble:
 
         return jtu.tree_map(quantile, self.values)
 
-    def to_xarray(self, ts: Any = None, *, name: str = "value", time_unit: str = "") -> Any:
+    def to_xarray(
+        self,
+        ts: Any = None,
+        *,
+        name: str = "value",
+        time_unit: str = "",
+        parameters: Mapping[str, Any] | None = None,
+    ) -> Any:
         """Return the ensemble as an `xarray.Dataset` with dimension `member`.
 
         Its variables are the values (`name`, or the keys of a dictionary), `failed`, `reached_time`,
         `steps`, `rejected` and `switched`. With `keep=False` they are `name_mean` and `name_std`.
 
         **Arguments:** `ts`: the saved times, which become the coordinate of the axis that follows the
-        members, where it has their number.
+        members, where it has their number; `parameters`: names and values that differ between the
+        members, one row each, which become coordinates.
 
-        **Raises:** `ModuleNotFoundError` if xarray (the extra `dvax[app]`) is not installed.
+        **Raises:** `dvax.InputError` if a parameter has another number of rows; `ModuleNotFoundError`
+        if xarray (the extra `dvax[app]`) is not installed.
 
         ```python
         >>> import dvax, numpy as np
@@ -152,10 +161,11 @@ class Ensemble:
         ...     K=dvax.sets.Box(0.0, 0.5), f=lambda t, x, u, load: load - x - u,
         ...     h=lambda t, x, u, load: 1.0 - x,
         ... )
-        >>> ts = [0.0, 1.0, 2.0]
-        >>> data = dvax.ensemble(problem, 0.0, 0.0, 2.0, np.linspace(1.0, 3.0, 4), ts).to_xarray(ts)
-        >>> data["value"].dims, data.sizes["member"]
-        (('member', 'time'), 4)
+        >>> ts, loads = [0.0, 1.0, 2.0], np.linspace(1.0, 2.5, 4)
+        >>> found = dvax.ensemble(problem, 0.0, 0.0, 2.0, loads, ts)
+        >>> data = found.to_xarray(ts, parameters={"load": loads})
+        >>> data["value"].dims, data["load"].values.tolist()
+        (('member', 'time'), [1.0, 1.5, 2.0, 2.5])
 
         ```
         """
@@ -181,6 +191,14 @@ class Ensemble:
         has_time = any("time" in dims for dims, _, _ in variables.values())
         time = (("time",), ts, described("time", time_unit or None))
         coords: dict[str, Variable] = {"time": time} if has_time else {}
+        for label, rows in (parameters or {}).items():
+            if np.shape(rows)[:1] != (len(self),) or label in {"time", *variables}:
+                raise input_error(
+                    "Ensemble.to_xarray(parameters)", f"{label} of shape {np.shape(rows)}",
+                    f"a parameter has a row for each of the {len(self)} members, and a name of its own",
+                    "Give the values that the members were solved with",
+                )  # fmt: skip
+            coords[label] = over(("member",), label, rows, described(f"parameter {label}"))
         return dataset("Ensemble.to_xarray", variables, coords, {"method": self.method})
 
     def plot(

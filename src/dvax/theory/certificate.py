@@ -216,7 +216,8 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
             ranges_x, ranges_u = measured.bounds
             values = ranges_x, ranges_u, largest_x, largest_u, spaces
             inside = domain.contains(*values)
-            why = _exit(domain, sol.ts, inside, values)
+            rates = [rate for _, rate, _ in _rates(constants, initial)]
+            why = _exit(domain, sol.ts, inside, values, rates)
     status = weakest(
         constants.status_of(*(name for name, _ in constants.statuses)),
         "proved" if measured.enclosed else "estimated",
@@ -235,14 +236,20 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
     )  # fmt: skip
 
 
-def _exit(domain: Domain, ts: jax.Array, inside: jax.Array, values: tuple) -> str:
-    """Return where the region may be left, as text; empty if it is not, or under tracing."""
-    if not _tree.is_concrete(inside, values) or bool(jnp.all(inside)):
+def _exit(domain: Domain, ts: jax.Array, inside: jax.Array, values: tuple, rates: list[Any]) -> str:
+    """Return where the region may be left, and how fast errors may grow, as text; empty if it is not
+    left, or under tracing."""
+    if not _tree.is_concrete(inside, values, rates) or bool(jnp.all(inside)):
         return ""
     k = int(np.argmin(np.asarray(inside)))
     before = f" after t = {float(ts[k - 1]):.6g}" if k else ""
     where = domain.exit_at(k, *values)
-    return f"the region of the constants may be left{before}; up to t = {float(ts[k]):.6g}, {where}"
+    rate = min(map(float, rates))
+    growth = f". Errors may grow by the factor e^({rate:.3g} t)" if rate > 0 else ""
+    return (
+        f"the region of the constants may be left{before}; up to t = {float(ts[k]):.6g}, {where}"
+        f"{growth}"
+    )
 
 
 def _smaller(a: Any, b: Any) -> Any:
