@@ -247,6 +247,12 @@ def _explain(
         known = ", ".join(map(repr, inputs["args"]))
         rule, fix = f"args has the keys {known}", "Correct the key, or add it to args"
         return InputProblem(f"{at}, {_place(fn, error.__traceback__)}", given, rule, fix)
+    args, others = inputs.get("args"), [inputs.get(key) for key in "xu"]
+    if str(error) == f"{type(args).__name__} index out of range" and not any(
+        isinstance(value, type(args)) for value in others
+    ):
+        rule, fix = f"args has {len(args)} entries", "Correct the index, or add the entry to args"
+        return InputProblem(f"{at}, {_place(fn, error.__traceback__)}", given, rule, fix)
     rule, fix = _reason(name, fn, inputs, error)
     if shapes:
         rule += f". It was traced with {shapes}{about}"

@@ -252,8 +252,8 @@ class Problem(eqx.Module):
         u = self.zero_control(x)
         problems = Problems()
         for attempt in (
-            lambda: self._evaluate("A", self.A, {"args": args}, AbstractGenerator, x).check(state),
-            lambda: self._evaluate("P", self.P, {"args": args}, AbstractOperator, x).check(control),
+            lambda: self._check_map("A", self.A, args, AbstractGenerator, x, state),
+            lambda: self._check_map("P", self.P, args, AbstractOperator, x, control),
             lambda: self._check_set(t, x, u, args),
             lambda: self._check_values("f", self.f, (t, x, u, args), x, "state"),
             lambda: self._check_values("h", self.h, (t, x, u, args), u, "control"),
@@ -283,15 +283,23 @@ class Problem(eqx.Module):
         _user_code.check_precision(name, value, x)
         return value
 
+    def _check_map(
+        self, name: str, value: Any, args: Any, kind: type, x: Tree, space: AbstractSpace
+    ) -> None:
+        def at(args: Any) -> Any:
+            return self._evaluate(name, value, {"args": args}, kind, x)
+
+        if not isinstance(value, kind):
+            _check_indices(name, value, at, args)
+        at(args).check(space)
+
     def _check_set(self, t: Any, x: Tree, u: Tree, args: Any) -> None:
-        def at(t: Any) -> AbstractSet:
+        def at(t: Any, args: Any) -> AbstractSet:
             return self._evaluate("K", self.K, {"t": t, "args": args}, AbstractSet, x)
 
-        def traced(t: Any) -> None:
-            at(t)
-
-        jax.eval_shape(traced, t)  # with a traced t, as in a run
-        at(t).check(u)
+        if not isinstance(self.K, AbstractSet):
+            _check_indices("K", self.K, at, t, args)
+        at(t, args).check(u)
 
     def _check_values(
         self, name: str, fn: Callable[..., Any], inputs: tuple, element: Tree, space: str
@@ -299,16 +307,14 @@ class Problem(eqx.Module):
         """Evaluate f or h abstractly, and check that its value has the shape of `element`."""
         source = self._shape_origin(inputs[1])
 
-        def traced(t: Any, x: Tree, u: Tree) -> Any:
-            named = {"t": t, "x": x, "u": u, "args": inputs[3]}
+        def traced(t: Any, x: Tree, u: Tree, args: Any) -> Any:
+            named = {"t": t, "x": x, "u": u, "args": args}
             out = _user_code.call(name, fn, named, source)
             _user_code.check_values(name, fn, out, x)
             _user_code.check_not_integer(name, fn, out)
             return out
 
-        program, out = jax.make_jaxpr(traced, return_shape=True)(*inputs[:3])
-        if (wrong := index_outside(program)) is not None:
-            raise _user_code.index_error(f"dvax.Problem({name})", fn, wrong)
+        out = _check_indices(name, fn, traced, *inputs)
         if not _tree.same_shape(out, element):
             raise input_error(
                 f"dvax.Problem({name})",
@@ -410,6 +416,19 @@ class Problem(eqx.Module):
             return _tree.zeros_like(x) if zero is None else zero
         dtype = jnp.result_type(*jax.tree_util.tree_leaves(x))
         return jax.tree_util.tree_map(lambda leaf: leaf.astype(dtype), self.control_space.zeros())
+
+
+def _check_indices(name: str, fn: Any, traced: Callable[..., Any], *inputs: Any) -> Any:
+    """Return the shapes of traced(*inputs), whose code contains fn, the argument `name`.
+
+    **Raises:** `dvax.InputError` if it reads an array at a constant index outside."""
+    # The arrays in args are traced, as in a run: at an array with values JAX reads at once.
+    arrays, others = eqx.partition(inputs, lambda v: isinstance(v, jax.Array | np.ndarray | float))
+    whole = lambda arrays: eqx.filter(traced(*eqx.combine(arrays, others)), eqx.is_array)  # noqa: E731
+    program, out = jax.make_jaxpr(whole, return_shape=True)(arrays)
+    if (wrong := index_outside(program)) is not None:
+        raise _user_code.index_error(f"dvax.Problem({name})", fn, wrong)
+    return out
 
 
 def _control_zero(problem: Problem, x: Tree) -> Tree | None:

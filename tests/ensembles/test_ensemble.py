@@ -433,6 +433,9 @@ def test_parameters_of_the_members_are_coordinates():
     assert table["load"].dims == ("member",) and table["pair"].dims == ("member", "pair_dim0")
     nearest = table.swap_dims(member="load").sel(load=3.1, method="nearest")["value"]
     assert float(nearest) == found.values[2]
+    for wrong in (95, [0.5, -0.1], np.nan):
+        with pytest.raises(dvax.InputError, match="quantiles are from 0 to 1"):
+            found.quantile(wrong)
     for wrong in ({"load": loads[:-1]}, {"load": 1.0}, {"value": loads}):
         with pytest.raises(dvax.InputError, match="a row for each of the 5 members"):
             found.to_xarray(parameters=wrong)

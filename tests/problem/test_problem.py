@@ -170,3 +170,41 @@ def test_the_place_of_a_set_that_is_refused_is_that_in_K():
     found = caught.value.problems[0]
     assert found.place.startswith("dvax.Problem(K)") and "test_problem.py, line" in found.place
     assert "dvax.sets.Box(lower, upper)" in found.place and "lower = 2" in found.given
+
+
+PAIR = jnp.array([0.1, 0.2])
+
+
+def of_parameters(**own):
+    standard = dict(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 3.0),
+        f=lambda t, x, u, args: u, h=lambda t, x, u, args: 16.0 - x,
+    )  # fmt: skip
+    return dvax.Problem(**{**standard, **own})
+
+
+@pytest.mark.parametrize(
+    ("own", "args"),
+    [
+        (dict(h=lambda t, x, u, args: args[2] * x), PAIR),
+        (dict(h=lambda t, x, u, args: args[2] * x), np.asarray(PAIR)),
+        (dict(f=lambda t, x, u, args: args["k"][5] * u), {"k": PAIR}),
+        (dict(h=lambda t, x, u, args: args["k"][args["row"]] * x), {"k": PAIR, "row": 2}),
+        (dict(K=lambda t, args: dvax.sets.Box(0.0, args[-3])), PAIR),
+        (dict(A=lambda args: dvax.generators.Scalar(-args[2])), PAIR),
+        (dict(P=lambda args: dvax.operators.Scaling(args[9])), PAIR),
+    ],
+    ids=["h", "array of NumPy", "f", "index in args", "K", "A", "P"],
+)
+def test_an_index_outside_of_an_array_in_args_is_refused(own, args):
+    with pytest.raises(dvax.InputError, match="into an axis of 2 entries") as caught:
+        of_parameters(**own).check(0.0, jnp.asarray(1.0), args)
+    name = next(iter(own))
+    assert caught.value.problems[0].place.startswith(f"dvax.Problem({name}), ")
+    assert "test_problem.py, line" in caught.value.problems[0].place
+
+
+@pytest.mark.parametrize("args", [[0.1, 0.2], (0.1, 0.2)])
+def test_an_index_outside_of_a_list_in_args_names_args(args):
+    with pytest.raises(dvax.InputError, match="index out of range; args has 2 entries"):
+        of_parameters(h=lambda t, x, u, p: p[2] * x).check(0.0, jnp.asarray(1.0), args)

@@ -110,8 +110,13 @@ class Ensemble:
         """Return the quantiles q in [0, 1] of the members that succeeded; for a list of them, with a
         leading axis.
 
-        **Raises:** `dvax.InputError` if the values were not kept.
+        **Raises:** `dvax.InputError` if the values were not kept, or q is not in [0, 1].
         """
+        if _tree.is_concrete(q) and not np.all((np.asarray(q) >= 0) & (np.asarray(q) <= 1)):
+            raise input_error(
+                "Ensemble.quantile(q)", _tree.line(q), "quantiles are from 0 to 1",
+                "Write 0.95 for 95 %",
+            )  # fmt: skip
         if self.values is None:
             raise input_error(
                 "Ensemble.quantile", "an ensemble with keep=False",

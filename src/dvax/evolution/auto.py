@@ -168,7 +168,8 @@ def choose(
         if tol >= _LOOSE and rates.law * span <= math.sqrt(tol / _LOOSE):
             return _with_fallback(_ETD2RK, f"{reason}, and the tolerance is loose", facts, tol)
         return _with_fallback(_ETD4RK, reason, facts, tol)
-    why = "f̃ acts entry by entry" if facts.is_field else "few unknowns"
+    states = "1 state" if facts.state == 1 else f"{facts.state} states"
+    why = "f̃ acts entry by entry" if facts.is_field else states
     if facts.is_field and not facts.pointwise:
         why = f"the law couples {facts.law} unknowns"
         if not forms_matrices:

@@ -30,7 +30,7 @@ from ..errors import Fix, InputError, SolveError
 from .auto import FIELD
 from .implicit import Implicit
 from .jumps import find_discontinuity, find_jump
-from .method import AbstractMethod
+from .method import AbstractMethod, ExpRosenbrock
 from .nonfinite import first_bad
 from .piecewise.method import PiecewiseLinear
 from .results import RESULTS
@@ -380,9 +380,12 @@ def _max_steps(stop: Stop) -> Diagnosis:
     option, looser = ("rtol", min(_MAX_RTOL, 100 * rtol)) if rtol > 0 else ("atol", 100 * atol)
     looser = Fix(option, f"{looser:.1g}", "for longer steps")
     if enough >= 2**31:
-        return Diagnosis(
-            text, (Fix("method", "ExpRosenbrock", "whose steps may be longer"), looser)
-        )
+        other = Fix("method", "ExpRosenbrock", "whose steps may be longer")
+        if isinstance(method, ExpRosenbrock):
+            other = Fix("", "", "Or see where the steps become short: a law that is steeper than "
+                        "needed, or a jump, needs a step for each of its kinks")  # fmt: skip
+            return Diagnosis(text, (looser, other))
+        return Diagnosis(text, (other, looser))
     fixes = [Fix("max_steps", f"{_rounded_up(enough)}", "at this pace")]
     size = sum(leaf.size for leaf in jtu.tree_leaves(stop.x))
     if adaptive and method.order < 4 and size <= FIELD:

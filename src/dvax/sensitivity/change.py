@@ -12,7 +12,7 @@ from .. import _tree
 from .._dataset import Variable, dataset, described
 from .._tree import Tree
 from ..errors import InputError, InputProblem
-from ..evolution import ETD4RK, AbstractMethod, solve
+from ..evolution import AbstractMethod, solve
 from ..problem import Problem
 from ..theory import ParameterBounds
 from ..theory.status import Status
@@ -132,7 +132,6 @@ def change(
     """
     t0, t1 = float(t0), float(t1)
     times = np.linspace(t0, t1, 41) if ts is None else np.asarray(ts, float)
-    method = ETD4RK() if method is None else method
     x0 = _tree.as_float(x0, "x0")
     settings: dict[str, Any] = dict(method=method, rtol=rtol, atol=atol, max_steps=max_steps)
     state, control = problem.spaces(x0)

@@ -23,7 +23,7 @@ from .. import _tree
 from .._dataset import dataset, described, named, over
 from .._tree import Tree
 from ..errors import InputError, input_error
-from ..evolution import ETD4RK, AbstractMethod, Solution, solve
+from ..evolution import AbstractMethod, Solution, solve
 from ..problem import Problem
 from ..signals import Table, listen
 from .critical import activity, critical_cone
@@ -114,7 +114,7 @@ def directional_derivative(
 ) -> Directional:
     """Return (δx, δu) with x(ζ + εδζ, η + εδη) = x + ε δx + o(ε) for ε ↓ 0, and u likewise.
 
-    **Arguments:** as in `dvax.solve` (the default method is ETD4RK); `dx0`, `dargs`: the direction,
+    **Arguments:** as in `dvax.solve`; `dx0`, `dargs`: the direction,
     shaped like x0 and args, with None for zero (also for leaves of `dargs`); `tol`: a constraint is
     active if y is within `tol` of its bound, and weakly active if F is below `tol`. It must be well
     above the error of the base trajectory. Kinks within `tol` of each other are not distinguished, and
@@ -152,7 +152,6 @@ def directional_derivative(
     x0 = _tree.as_float(x0, "x0")
     dx0, varied, fixed, direction = check_direction(x0, args, dx0, dargs)
     dx0 = jtu.tree_map(lambda d, a: d.astype(a.dtype), dx0, x0)
-    method = ETD4RK() if method is None else method
     settings: dict[str, Any] = dict(rtol=rtol, atol=atol, max_steps=max_steps, method=method)
     sol = solve(problem, x0, t0, t1, args, ts, dense=True, **settings)
     base_kinks = kinks(sol, tol=tol)

@@ -377,11 +377,10 @@ def state_for(problem: Problem, x0: Tree, t0: float, args: Any, name: str) -> Tr
             InputProblem(
                 name,
                 "None",
-                "the problem does not fit a scalar state and names no state space, so the shape of its "
-                "states is unknown",
-                "Pass any state: dvax.verify(problem, x0)",
+                "the problem names no state space, and does not take a single number as its state",
+                "Pass any state as x0",
             ),
-            *error.problems,
+            error.problems[0],
         ) from error
     return zero
 
