@@ -4,7 +4,8 @@ attributes of objects.
 A compiled program contains the values that f, h, K, A and P read when they were traced. So that a value
 that has changed since is not missed, a problem is used as `current(problem)`: its functions compare as
 equal only if what they read is equal. Values in args do not need this, and change without another
-compilation.
+compilation. Functions that are made again, by another call of the function that defines them, are
+equal if their code and what they read are: they share a compiled program.
 """
 
 import dis
@@ -54,6 +55,66 @@ class _Same:
         return id(self.one)
 
 
+class _Code:
+    """A key of a function without what it reads, which has keys of its own."""
+
+    def __init__(self, fn: types.FunctionType):
+        self.fn = fn
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Code) and _is_same_code(self.fn, other.fn)
+
+    def __hash__(self) -> int:
+        return hash(self.fn.__code__)
+
+
+_VALUES = (bool, int, float, complex, str, bytes, type(None), np.ndarray, np.generic)
+"""Types whose keys are their values."""
+
+
+def _is_same_code(fn: Any, other: Any, depth: int = _DEPTH) -> bool:
+    """Return whether two functions differ at most in values that have keys: their code is the same, and
+    so are the objects in their closures and defaults."""
+    if fn is other:
+        return True
+    if depth == 0 or not (type(fn) is type(other) is types.FunctionType):
+        return False
+    if fn.__globals__ is not other.__globals__ or fn.__code__ != other.__code__:
+        return False
+    if fn.__dict__ or other.__dict__:
+        return False
+    try:
+        mine, others = (
+            (
+                [cell.cell_contents for cell in f.__closure__ or ()],
+                list(f.__defaults__ or ()),
+                sorted((f.__kwdefaults__ or {}).items()),
+            )
+            for f in (fn, other)
+        )
+    except ValueError:  # a variable of the closure is not assigned yet
+        return False
+    return _have_same_objects(mine, others, depth - 1)
+
+
+def _have_same_objects(one: Any, other: Any, depth: int) -> bool:
+    if one is other:
+        return True
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, _VALUES):
+        return not getattr(one, "dtype", np.dtype(float)).hasobject
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and _have_same_objects(
+            list(one.values()), [other[key] for key in one], depth
+        )
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(
+            _have_same_objects(a, b, depth) for a, b in zip(one, other, strict=True)
+        )
+    return _is_same_code(one, other, depth)
+
+
 _WRITTEN: Any = weakref.WeakKeyDictionary()
 """The places of what functions change themselves when they are called, such as a list of their calls:
 it is no input, and every call would make another program."""
@@ -88,12 +149,14 @@ class _Captured:
         return value
 
     def __eq__(self, other: object) -> bool:
-        if not isinstance(other, _Captured) or other.fn != self.fn:
+        if not isinstance(other, _Captured):
+            return False
+        if other.fn != self.fn and not _is_same_code(other.fn, self.fn):
             return False
         return _without_written(self.fn, other.key) == _without_written(self.fn, self.key)
 
     def __hash__(self) -> int:
-        return hash(self.fn)
+        return hash(getattr(self.fn, "__code__", self.fn))
 
     def __repr__(self) -> str:
         return repr(self.fn)
@@ -113,18 +176,14 @@ def current(part: Part) -> Part:
     if not places:
         return part
     keys = tuple(_of_function(fn, _DEPTH, frozenset()) for _, fn in places)
-    reads = [bool(key) or bool(_written(fn)) for (_, fn), key in zip(places, keys, strict=True)]
-    if not any(reads):
-        return part
     versions = _versions(part)
     found = versions.get(keys)
     if found is None:
         if len(versions) >= _MAX_VERSIONS:
             versions.clear()
         leaves, tree = jtu.tree_flatten(part)
-        for (place, fn), key, is_reader in zip(places, keys, reads, strict=True):
-            if is_reader:
-                leaves[place] = _Captured(fn, key)
+        for (place, fn), key in zip(places, keys, strict=True):
+            leaves[place] = _Captured(fn, key)
         found = versions[keys] = jtu.tree_unflatten(tree, leaves)
     return found
 
@@ -134,7 +193,8 @@ class Reads:
 
     def __init__(self, part: Any):
         leaves = jtu.tree_leaves(part)
-        self.functions: tuple[Any, ...] = tuple(v for v in leaves if isinstance(v, _Captured))
+        captured = (v for v in leaves if isinstance(v, _Captured))
+        self.functions: tuple[Any, ...] = tuple(v for v in captured if v.key or _written(v.fn))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Reads) and other.functions == self.functions
@@ -313,7 +373,8 @@ def _key(value: Any, depth: int, seen: frozenset[int], names: frozenset[str]) ->
     if not _is_own(value) or isinstance(value, type):
         return None if is_function else _Same(value)
     if is_function:
-        return _Same(value), _of_function(value, depth, seen - {id(value)})
+        own = _Code(value) if isinstance(value, types.FunctionType) else _Same(value)
+        return own, _of_function(value, depth, seen - {id(value)})
     if callable(to_numpy := getattr(value, "to_numpy", None)):
         return _Same(value), inside(to_numpy())
     if _is_installed(kind.__module__):

@@ -13,6 +13,10 @@ import pytest
 
 import dvax
 from dvax._captured import current
+from dvax._jax.compile_clock import listen
+
+STAGES: list[str] = []
+listen(lambda stage, seconds: STAGES.append(stage))
 
 LOAD = 3.0
 
@@ -261,7 +265,7 @@ def test_nothing_new_is_the_same_problem_and_solutions_can_be_pickled():
     one = problem(Plant())
     assert current(one) is current(one) and current(current(one)) is current(one)
     plain = problem(lambda t, x, u, args: -u)
-    assert current(plain) is plain
+    assert current(plain) is current(plain)
     own = dvax.Problem(
         A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 0.5),
         f=functools.partial(scaled, {"load": 3.0}), h=unloaded,
@@ -273,3 +277,67 @@ def test_nothing_new_is_the_same_problem_and_solutions_can_be_pickled():
 
 def unloaded(t, x, u, args):
     return 1.0 - 2.0 * x - u
+
+
+GAIN = 1.0
+
+
+def made(scale=1.0, wave=jnp.sin, table=None, inner=2.0, loss=lambda x: x):
+    """A problem whose functions are other objects at each call."""
+
+    def leak(x):
+        return inner * GAIN * loss(x)
+
+    def rate(t, x, u, args, offset=0.5 * scale):
+        return args * wave(t) + offset - leak(x) - u * (1.0 if table is None else table["k"])
+
+    return dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 3.0),
+        f=rate, h=lambda t, x, u, args: 1.0 - x,
+    )  # fmt: skip
+
+
+def parts(problem):
+    problem = current(problem)
+    return problem.f, problem.h
+
+
+OTHERS = {
+    "number": dict(scale=2.0),
+    "function of a library": dict(wave=jnp.cos),
+    "number of an inner function": dict(inner=3.0),
+    "array": dict(table={"k": np.array(2.0)}),
+    "other code": dict(loss=lambda x: x**2),
+}
+
+
+@pytest.mark.parametrize("own", OTHERS.values(), ids=OTHERS)
+def test_functions_that_are_made_again_are_equal_if_what_they_read_is(own):
+    first, again, other = made(**own), made(**own), made()
+    assert parts(first) == parts(again) and hash(parts(first)) == hash(parts(again))
+    assert parts(first)[0] != parts(other)[0] and parts(first)[1] == parts(other)[1]
+
+
+def test_functions_made_again_differ_after_a_global_of_an_inner_function_has_changed(monkeypatch):
+    before = parts(made())
+    monkeypatch.setitem(globals(), "GAIN", 5.0)
+    assert parts(made()) != before
+    monkeypatch.undo()
+    assert parts(made()) == before
+
+
+def test_objects_in_the_closures_of_functions_made_again_are_compared_by_identity():
+    plant, table = Plant(), dvax.signals.Table([0.0, 1.0], [1.0, 2.0])
+    for one, other in ((plant, Plant()), (table, dvax.signals.Table([0.0, 1.0], [1.0, 2.0]))):
+        assert parts(made(table=one)) == parts(made(table=one))
+        assert parts(made(table=one)) != parts(made(table=other))
+
+
+def test_a_problem_made_again_compiles_nothing_and_one_with_another_value_is_solved_anew():
+    solve = lambda problem, load: float(dvax.solve(problem, 0.5, 0.0, 2.0, load).xs[-1])  # noqa: E731
+    first = solve(made(), 1.0)
+    STAGES.clear()
+    assert solve(made(), 1.0) == first and solve(made(), 2.0) != first
+    assert "compile" not in STAGES
+    assert solve(made(inner=1.0), 1.0) != first and "compile" in STAGES
+    assert solve(made(), 1.0) == first

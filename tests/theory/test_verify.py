@@ -184,7 +184,7 @@ def test_verify_keeps_or_refutes_declared_moduli():
 @pytest.mark.slow
 def test_verify_rejects_wrong_arguments_by_name():
     problem = cubic()
-    with pytest.raises(dvax.InputError, match=r"x0.*shape"):
+    with pytest.raises(dvax.InputError, match=r"x0.*names no state space"):
         dvax.verify(cubic(A=dvax.generators.Diagonal(jnp.ones(3)), f=lambda t, x, u, args: -x - u))
     with pytest.raises(dvax.InputError, match=r"t0 < t1"):
         dvax.verify(problem, t0=1.0, t1=1.0)
