@@ -247,10 +247,9 @@ def _explain(
         known = ", ".join(map(repr, inputs["args"]))
         rule, fix = f"args has the keys {known}", "Correct the key, or add it to args"
         return InputProblem(f"{at}, {_place(fn, error.__traceback__)}", given, rule, fix)
-    args, others = inputs.get("args"), [inputs.get(key) for key in "xu"]
-    if str(error) == f"{type(args).__name__} index out of range" and not any(
-        isinstance(value, type(args)) for value in others
-    ):
+    args = inputs.get("args")
+    is_own = isinstance(args, list) or not any(isinstance(inputs.get(k), tuple) for k in "xu")
+    if isinstance(args, list | tuple) and is_own and "index out of range" in str(error):
         rule, fix = f"args has {len(args)} entries", "Correct the index, or add the entry to args"
         return InputProblem(f"{at}, {_place(fn, error.__traceback__)}", given, rule, fix)
     rule, fix = _reason(name, fn, inputs, error)
