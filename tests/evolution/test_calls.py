@@ -12,6 +12,7 @@ from tests.closed_forms import c1
 from tests.selection import mostly_thorough
 
 import dvax
+from dvax._captured import current
 from dvax.evolution.arguments import Arguments
 
 
@@ -43,7 +44,7 @@ def test_arguments_have_the_names_the_order_and_the_defaults_of_solve():
 def test_solution_holds_the_given_problem_and_args_without_copies():
     case = c1()
     sol = dvax.solve(case.problem, -1.0, 0.0, 2.0, args=case.args, dt=0.1)
-    assert sol.setup.problem is case.problem
+    assert sol.setup.problem is current(case.problem)
     assert sol.setup.args is case.args
 
 

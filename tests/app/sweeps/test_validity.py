@@ -90,7 +90,8 @@ def test_error_of_dvax_in_a_function_of_the_user_has_its_line(tmp_path):
     ):
         file = written(tmp_path / wrong, RATES.format(f"[1.0, {wrong}]"), model=model)
         told = call(file, "--check").stderr
-        place = f"(model.parameters.rate = {wrong}): decay.py, line {line}: dvax.sets.Box"
+        owner = "dvax.Problem(K), " if wrong == "14.0" else ""
+        place = f"(model.parameters.rate = {wrong}): {owner}decay.py, line {line}: dvax.sets.Box"
         assert place in told, told
     debug = call(file, "--check", "--debug").stderr
     assert "Traceback" in debug and "decay.py" in debug

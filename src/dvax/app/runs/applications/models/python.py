@@ -248,7 +248,15 @@ def _run(file: Path, work: Callable[[], Any]) -> Any:
         if place == file.name or (error.__cause__ is not None and len(error.problems) > 1):
             raise
         raise InputError(
-            *(replace(p, place=f"{place}: {p.place}") for p in error.problems)
+            *(
+                replace(
+                    p,
+                    place=p.place.replace(str(file), file.name)
+                    if str(file) in p.place
+                    else f"{place}: {p.place}",
+                )
+                for p in error.problems
+            )
         ) from error
     except DvaxError:
         raise
