@@ -367,3 +367,25 @@ def test_a_decay_does_not_hide_an_oscillation_at_rest():
     for decay, w in ((20.0, 20.0), (100.0, 80.0), (100.0, 105.0), (100.0, 30.0)):
         found = jax.grad(last)(jnp.array([1.0, 0.0, 0.0]), jnp.array([decay, w]))[1]
         assert found == pytest.approx(np.cos(3.0 * w), abs=1e-5 * (1.0 + 3.0 * w))
+
+
+@pytest.mark.slow
+def test_steps_grow_where_all_derivatives_have_decayed():
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, jnp.inf),
+        f=lambda t, x, u, a: a**2 - x**2 - u, h=lambda t, x, u, a: x - a - 1.0,
+    )  # fmt: skip
+
+    def end(a, t1):
+        sol = dvax.solve(problem, 1.0, 0.0, t1, a, method=dvax.DormandPrince())
+        return sol.xs[-1], sol.stats["steps"]
+
+    steps = []
+    for t1 in (1.0, 10.0, 100.0):
+        # x = a tanh(a t + artanh(1/a)).
+        exact = jax.grad(lambda a, t=t1: a * jnp.tanh(a * t + jnp.arctanh(1.0 / a)))(2.0)
+        found, count = jax.grad(end, has_aux=True)(2.0, t1)
+        assert float(found) == pytest.approx(float(exact), abs=1e-5)
+        steps.append(int(count))
+    # Ten steps per unit time resolve e^(-4t) to 1e-5; stability needs one.
+    assert steps[2] - steps[1] < 4 * 90

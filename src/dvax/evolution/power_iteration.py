@@ -125,12 +125,17 @@ def refine(space: AbstractSpace, d: Tree, one: Tree, two: Tree, p: Tree) -> Refi
     length = space.norm(two)
     size = length / space.norm(d)
     known = jnp.isfinite(size) & (size > 0.0)
-    is_real = space.inner(d, two) > _ALONG * space.norm(d) * length
-    is_damped = is_real & (space.inner(one, two) < -_ALONG * space.norm(one) * length)
     unit = _tree.scale(1.0 / jnp.where(known, length, 1.0), two)
     mixed = _tree.add(unit, _tree.scale(_SHARE, p))
     slope = jnp.where(known, jnp.sqrt(size), 0.0)
-    return Refined(slope, is_damped, one, _tree.where(known, mixed, d))
+    return Refined(slope, _decays(space, d, one, two), one, _tree.where(known, mixed, d))
+
+
+def _decays(space: AbstractSpace, v: Tree, one: Tree, two: Tree) -> Any:
+    """Return whether Bv (`one`) points against v, and B²v (`two`) along it."""
+    length = space.norm(two)
+    is_real = space.inner(v, two) > _ALONG * space.norm(v) * length
+    return is_real & (space.inner(one, two) < -_ALONG * space.norm(one) * length)
 
 
 def variation(
@@ -156,9 +161,9 @@ def variation(
 
 def remaining(
     space: AbstractSpace, e: Tree, one: Tree, two: Tree, slope: Any, p: Tree
-) -> tuple[Any, Tree]:
-    """Return the slope √(‖B²e‖/‖e‖) of what has not decayed, from Be (`one`) and B²e (`two`), and the
-    next e,
+) -> tuple[Any, Any, Tree]:
+    """Return the slope √(‖B²e‖/‖e‖) of what has not decayed, from Be (`one`) and B²e (`two`), whether
+    it decays now, and the next e,
 
         e ← e + τBe + τ²B²e/2 + 10⁻⁶p,   τ = 1/σ,
 
@@ -168,7 +173,8 @@ def remaining(
     tau = 1.0 / jnp.where(known, slope, 1.0)
     after = _tree.add(e, _tree.add(_tree.scale(tau, one), _tree.scale(0.5 * tau**2, two)))
     after = _tree.add(_normalised(space, after), _tree.scale(_PRESENT, p))
-    return jnp.where(known, jnp.sqrt(size), 0.0), _tree.where(known, after, e)
+    slope = jnp.where(known, jnp.sqrt(size), 0.0)
+    return slope, _decays(space, e, one, two), _tree.where(known, after, e)
 
 
 def _normalised(space: AbstractSpace, d: Tree) -> Tree:

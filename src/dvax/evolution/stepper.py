@@ -77,7 +77,7 @@ class Fastest(NamedTuple):
     - `forcing`: the same of the derivative in parameters (`forcing.groups`);
     - `remaining`: h times the slope of what has not decayed;
     - `kink`: the same as `slope`, with what lies behind a kink of the response;
-    - `is_damped`: such a change decays;
+    - `is_damped`: such a change decays; `ends`: what has not decayed does now;
     - `is_stiff`: x itself changes slowly beside it.
     """
 
@@ -87,6 +87,7 @@ class Fastest(NamedTuple):
     remaining: Any
     kink: Any
     is_damped: Any
+    ends: Any
     is_stiff: Any
 
 
@@ -513,7 +514,7 @@ class Stepper(eqx.Module):
             rest = power_iteration.remaining(space, e, *of_e, found.slope, pattern)
             return found, rest, forced
 
-        found, (slopes, others), forced = lax.map(
+        found, (slopes, ends, others), forced = lax.map(
             lambda at: look(*at), jtu.tree_map(lambda *leaves: jnp.stack(leaves), *looks)
         )
         steepest = jnp.argmax(found.slope)
@@ -530,13 +531,16 @@ class Stepper(eqx.Module):
             slope = jnp.max(jnp.where(self._same_side(first, places), found.slope, 0.0))
             kink, no = found.slope[steepest], jnp.asarray(False)
             zero = jnp.zeros_like(slope)
-            fastest = Fastest(slope, variation, of_forcing, zero, kink, is_damped=no, is_stiff=no)
+            fastest = Fastest(slope, variation, of_forcing, zero, kink, no, no, no)
         else:
             slope = h * jnp.maximum(found.slope[steepest], solver_state.slope)
             is_damped = found.is_damped[steepest]
             rest = h * jnp.max(slopes)
             is_stiff = change < _SLOW * slope
-            fastest = Fastest(slope, variation, of_forcing, rest, slope, is_damped, is_stiff)
+            is_ending = jnp.all(ends)
+            fastest = Fastest(
+                slope, variation, of_forcing, rest, slope, is_damped, is_ending, is_stiff
+            )
         direction = jtu.tree_map(lambda leaf: leaf[steepest], found.direction)
         last = jtu.tree_map(lambda leaf: leaf[-1], others)
         return _constant((fastest, (direction, last, found.slope[-1], largest)))

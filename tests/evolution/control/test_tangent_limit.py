@@ -29,10 +29,13 @@ METHODS = [
 ]
 
 
-def longest(limit, slope, decay, size=1.0, variation=0.0, error=1.0, remaining=0.0, forcing=0.0):
+def longest(
+    limit, slope, decay, size=1.0, variation=0.0, error=1.0, remaining=0.0, forcing=0.0,
+    of_rest=0.0, ends=NO,
+):  # fmt: skip
     numbers = slope, variation, forcing, remaining, slope
-    fastest = Fastest(*map(jnp.asarray, numbers), YES, NO)
-    return limit.of(fastest, jnp.asarray(decay), attempt(error, size))
+    fastest = Fastest(*map(jnp.asarray, numbers), YES, ends, NO)
+    return limit.of(fastest, jnp.stack([jnp.asarray(decay), of_rest]), attempt(error, size))
 
 
 @pytest.mark.parametrize(("order", "stable", "R"), METHODS)
@@ -52,19 +55,19 @@ def test_tangent_limit_resolves_a_tangent_to_ten_tolerances_in_its_time(order, s
 @pytest.mark.parametrize(("order", "stable", "R"), METHODS)
 def test_tangent_limit_rises_to_stability_as_tangents_decay(order, stable, R):
     limit = TangentLimit(jnp.asarray(1e-5), 100.0, order, stable)
-    slope, decay, z = 7.0, jnp.asarray(0.0), 0.0
+    slope, decay, z = 7.0, jnp.zeros(2), 0.0
     for _ in range(400):
-        z = float(longest(limit, slope, decay).longest) * slope
-        fastest = Fastest(jnp.asarray(z), ZERO, ZERO, ZERO, ZERO, YES, YES)
+        z = float(longest(limit, slope, decay[0]).longest) * slope
+        fastest = Fastest(jnp.asarray(z), ZERO, ZERO, ZERO, ZERO, YES, NO, YES)
         decay = limit.after(fastest, decay, jnp.asarray(1e-3), YES, NO)
     assert z == pytest.approx(0.8 * 0.8 * stable) and abs(R(-z)) < 1.0
     # It falls back where tangents are excited, and where they do not decay.
-    steady = Fastest(jnp.asarray(z), ZERO, ZERO, ZERO, ZERO, NO, YES)
+    steady = Fastest(jnp.asarray(z), ZERO, ZERO, ZERO, ZERO, NO, NO, YES)
     for at, excited in ((fastest, YES), (steady, NO)):
-        assert float(limit.after(at, decay, jnp.asarray(1e-3), YES, excited)) == 0.0
+        assert float(limit.after(at, decay, jnp.asarray(1e-3), YES, excited)[0]) == 0.0
     # At rest it rises more slowly.
     slow, fast = (
-        float(limit.after(fastest, jnp.asarray(0.0), jnp.asarray(error), YES, NO))
+        float(limit.after(fastest, jnp.zeros(2), jnp.asarray(error), YES, NO)[0])
         for error in (1e-12, 1e-3)
     )
     assert slow == pytest.approx(0.1 * fast)
@@ -130,8 +133,37 @@ def test_what_has_not_decayed_is_an_oscillation_or_the_slowest_solution():
         sigma = max(40.0, w)
         for _ in range(60):
             ((one, two),), _ = images(lambda v, _, B=Q @ B @ Q.T: B @ v, (e,), 0)
-            slope, e = remaining(space, e, one, two, jnp.asarray(sigma), p)
+            slope, ends, e = remaining(space, e, one, two, jnp.asarray(sigma), p)
         assert 0.5 * w <= float(slope) <= 1.1 * max(w, 3.0)
+        assert not bool(ends)
+
+
+@pytest.mark.slow
+def test_the_counted_decay_of_what_remains_is_at_most_that_of_the_slowest_solution():
+    limit, rng = TangentLimit(jnp.asarray(1e-6), 100.0, 4, 2.7), np.random.default_rng(2)
+    counted = []
+    for case in range(12):
+        count = 1 if case == 0 else 5
+        rates = np.sort(10.0 ** rng.uniform(-2, 2, count)) if case else np.array([4.0])
+        Q = np.linalg.qr(rng.normal(size=(count, count)))[0] if case % 2 else np.eye(count)
+        B, space = -Q @ np.diag(rates) @ Q.T, spaces.Euclidean(count)
+        p = e = pattern(space, jnp.zeros(count))
+        sigma, decay, t = rates[-1], jnp.zeros(2), 0.0
+        step = jax.jit(
+            lambda e, B=B, p=p, space=space, sigma=sigma: remaining(
+                space, e, B @ e, B @ (B @ e), jnp.asarray(sigma), p
+            )
+        )
+        for _ in range(300):
+            z = rng.choice([0.3, 1.0, 2.2])
+            slope, ends, e = step(e)
+            fastest = Fastest(jnp.asarray(z), ZERO, ZERO, slope * z / sigma, ZERO, YES, ends, NO)
+            decay, t = limit.after(fastest, decay, jnp.asarray(1e-3), YES, NO), t + z / sigma
+            assert float(decay[1]) <= rates[0] * t + 1.0
+        counted.append(float(decay[1]))
+    assert counted[0] == 40.0 and sum(c > 1.0 for c in counted) >= 4
+    free = Fastest(jnp.asarray(z), ZERO, ZERO, slope, ZERO, YES, NO, NO)
+    assert float(limit.after(free, decay, jnp.asarray(1e-3), YES, NO)[1]) == 0.0
 
 
 def test_images_are_those_of_two_applications_and_of_each_parameter():
@@ -238,6 +270,9 @@ def test_tangent_limit_resolves_what_has_not_decayed_whatever_has():
     resolved = float(longest(limit, 1.0, 0.0).longest)
     assert float(longest(limit, 1.0, 30.0).longest) > 5.0 * resolved
     assert float(longest(limit, 1.0, 30.0, remaining=0.5).longest) == pytest.approx(2.0 * resolved)
+    after = dict(remaining=0.5, of_rest=30.0)
+    assert float(longest(limit, 1.0, 30.0, **after, ends=YES).longest) > 5.0 * resolved
+    assert float(longest(limit, 1.0, 30.0, **after).longest) == pytest.approx(0.8 * 1.0 / 0.5)
 
 
 def test_tangent_limit_crosses_a_kink_by_a_step_of_ten_errors_alone():

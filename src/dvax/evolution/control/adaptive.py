@@ -82,7 +82,7 @@ class Adaptive(AbstractController):
             growth=GrowthLimiter.at_start(first),
             guard=RoundoffGuard.at_start(first),
             event=EventBracket.no_event(first).pack(),
-            decay=jnp.zeros_like(first),
+            decay=jnp.zeros(2, jnp.result_type(first)),
             stiffness=None if self.stiff_steps is None else StiffnessGuard.at_start(),
         )
 

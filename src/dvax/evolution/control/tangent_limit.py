@@ -38,6 +38,10 @@ _COUNTED_AT_REST = 0.1
 """Share of z that counts in D at rest: slower solutions, which may grow, are resolved by nothing else
 there."""
 
+_COUNTED_OF_REST = 0.5
+"""Share of the decay of what remains that counts: the slope of a direction that contains faster
+solutions is larger than that of the slowest."""
+
 _CROSSING = 10.0
 """Largest z of a step over a kink, in errors of a tangent: the state is continuous there, and does not
 show that the slope is wrong in a part of the step."""
@@ -74,7 +78,8 @@ class TangentLimit(eqx.Module):
         z ≤ ((p+1)! 10 rtol e^D)^{1/p},   D = Σ z over the steps since then,
 
     up to the limit of stability of the method, or up to 1 where the fastest solutions do not decay.
-    What has not decayed (`power_iteration.remaining`) has a limit of its own, with its slope and D = 0.
+    What has not decayed (`power_iteration.remaining`) has a limit of its own, with its slope and a D of
+    its own: 0 for an oscillation, and half of its decay where it ends too.
     Where the state stands still, a B that varies in time as e^{iωt} is resolved as well: with z the
     smaller of hω and hω (Tσ)^{1/p}, T being the `span` of the run. So is a forcing by parameters with
     hω, always: nothing of it is in x where its amplitude is zero.
@@ -90,16 +95,20 @@ class TangentLimit(eqx.Module):
     is_exact: bool = eqx.field(static=True, default=False)
 
     def of(self, fastest: Fastest, decay: Any, attempt: Attempt) -> StepLimit:
-        """Return the limit after an attempt, where `decay` is D."""
-        slope, variation, forcing, remaining, kink, is_damped, is_stiff = lax.stop_gradient(fastest)
+        """Return the limit after an attempt, where `decay` are the two D."""
+        slope, variation, forcing, remaining, kink, is_damped, ends, is_stiff = lax.stop_gradient(
+            fastest
+        )
         size, smallest = attempt.size, attempt.smallest
         error = _SHARE * jnp.maximum(self.rtol, jnp.finfo(size.dtype).eps)
         resolved = (math.factorial(self.order + 1) * error) ** (1.0 / self.order)
-        accurate = resolved * jnp.exp(decay / self.order)
-        most = jnp.minimum(accurate, jnp.where(is_damped, _STABLE * self.stable, _LARGEST_TURN))
+        accurate, of_rest = resolved * jnp.exp(decay / self.order)
+        stable = _STABLE * self.stable
+        most = jnp.minimum(accurate, jnp.where(is_damped, stable, _LARGEST_TURN))
+        of_rest = jnp.minimum(of_rest, jnp.where(ends, stable, _LARGEST_TURN))
         # The change of f̃' over a step, and the step, are proportional to h.
         of_slope = _share(most, slope) ** (0.5 if self.is_exact else 1.0)
-        of_slope = jnp.minimum(of_slope, _share(jnp.minimum(resolved, _LARGEST_TURN), remaining))
+        of_slope = jnp.minimum(of_slope, _share(of_rest, remaining))
         variation = variation * jnp.minimum(slope * self.span / size, 1.0) ** (1.0 / self.order)
         of_change = jnp.where(self._is_at_rest(attempt.error), _share(accurate, variation), jnp.inf)
         of_change = jnp.minimum(of_change, _share(resolved, forcing))
@@ -108,12 +117,12 @@ class TangentLimit(eqx.Module):
         finest = _FINEST * self.span
         # Twice the finest one, so that a step that is cut to it passes.
         resolves = (_SLACK * of_change >= 1.0) | (size <= 2.0 * finest)
-        stable = (_SLACK * of_slope >= 1.0) | (size <= 2.0 * smallest)
+        is_stable = (_SLACK * of_slope >= 1.0) | (size <= 2.0 * smallest)
         return StepLimit(
             longest=jnp.minimum(
                 _AIM * size * of_slope, jnp.maximum(_AIM * size * of_change, finest)
             ),
-            is_short_enough=resolves & stable,
+            is_short_enough=resolves & is_stable,
             may_cross=kink <= _CROSSING * error,
             is_stiff=is_stiff & (slope > _BINDS * most),
         )
@@ -121,13 +130,17 @@ class TangentLimit(eqx.Module):
     def after(
         self, fastest: Fastest, decay: Any, error: Any, accepted: Any, is_excited: Any
     ) -> Any:
-        """Return D after an attempt with this error in tolerances. Events and jumps of the data excite
-        what has decayed (`is_excited`), and nothing is counted where the fastest solutions do not
-        decay."""
-        slope, is_damped = lax.stop_gradient((fastest.slope, fastest.is_damped))
-        added = jnp.where(self._is_at_rest(error), _COUNTED_AT_REST * slope, slope)
-        counted = jnp.minimum(decay + jnp.where(accepted, added, 0.0), _LARGEST_DECAY)
-        return jnp.where(is_excited | ~is_damped, 0.0, counted)
+        """Return D of the fastest solutions and of what remains after an attempt with this error in
+        tolerances. Events and jumps of the data excite what has decayed (`is_excited`), and nothing is
+        counted where the solutions do not decay."""
+        fastest = lax.stop_gradient(fastest)
+        slope, remaining = fastest.slope, fastest.remaining
+        of_fastest = jnp.where(self._is_at_rest(error), _COUNTED_AT_REST * slope, slope)
+        # The direction of what remains is that of solutions which decay for 1/σ in a step at most.
+        of_rest = _COUNTED_OF_REST * remaining / jnp.maximum(slope, 1.0)
+        added = jnp.where(accepted, jnp.stack([of_fastest, of_rest]), 0.0)
+        decays = jnp.stack([fastest.is_damped, fastest.ends]) & ~is_excited
+        return jnp.where(decays, jnp.minimum(decay + added, _LARGEST_DECAY), 0.0)
 
     def _is_at_rest(self, error: Any) -> Any:
         """Return whether the state stands still, by the error of a step in tolerances."""
