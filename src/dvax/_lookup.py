@@ -15,9 +15,9 @@ _LARGEST_COUNT = 32
 def count_up_to(times: jax.Array, t: jax.Array) -> jax.Array:
     """Return the number of sorted times ≤ t (of any, if t is NaN).
 
-    Up to 1024 times, counting in every √n-th time and then in the block found takes 14 operations; a
-    bisection takes 550 if it is unrolled, most of the compilation of a problem with three tables, and
-    is slower in either form.
+    Up to 1024 times it counts in every √n-th time and then in the block found, which takes a few
+    operations. An unrolled bisection takes hundreds, which were most of the compilation of a problem
+    with tables; as a loop it is slower to run.
     """
     t = jnp.asarray(t)
     size = math.isqrt(max(times.shape[0] - 1, 0)) + 1

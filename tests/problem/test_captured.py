@@ -341,3 +341,33 @@ def test_a_problem_made_again_compiles_nothing_and_one_with_another_value_is_sol
     assert "compile" not in STAGES
     assert solve(made(inner=1.0), 1.0) != first and "compile" in STAGES
     assert solve(made(), 1.0) == first
+
+
+def nested(depth, value, wrap):
+    """A function whose innermost helper reads a value, `depth` closures or containers away."""
+    inner = lambda x: value * x  # noqa: E731
+    for _ in range(depth):
+        inner = wrap(inner)
+    return dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 3.0),
+        f=lambda t, x, u, args: inner(x) - u, h=lambda t, x, u, args: 1.0 - x,
+    )  # fmt: skip
+
+
+def within_list(inner):
+    held = [inner]
+    return lambda x: held[0](x)
+
+
+def within_dict(inner):
+    held = {"f": (inner,)}
+    return lambda x: held["f"][0](x)
+
+
+@pytest.mark.parametrize("wrap", [lambda inner: lambda x: inner(x), within_list, within_dict])
+@pytest.mark.parametrize("depth", range(7))
+def test_a_value_is_told_apart_at_any_depth_of_functions_made_again(depth, wrap):
+    one, other = parts(nested(depth, 2.0, wrap)), parts(nested(depth, 3.0, wrap))
+    assert one[0] != other[0]
+    if depth == 0:
+        assert one == parts(nested(depth, 2.0, wrap))

@@ -232,9 +232,8 @@ def _facts(problem: Problem, t0: jax.Array, x0: Tree, args: Any) -> Facts:
         if key in _FACTS:
             return _FACTS[key]
     except (InputError, TypeError):
-        return _read(
-            problem, t0, x0, _tree.as_arrays(args)
-        )  # what cannot be hashed is refused later
+        # What cannot be hashed is refused later.
+        return _read(problem, t0, x0, _tree.as_arrays(args))
     if len(_FACTS) >= _MAX_FACTS:
         _FACTS.clear()
     return _FACTS.setdefault(key, _read(problem, t0, x0, _tree.as_arrays(args)))

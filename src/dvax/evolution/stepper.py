@@ -77,7 +77,7 @@ class Fastest(NamedTuple):
     - `forcing`: the same of the derivative in parameters (`forcing.groups`);
     - `remaining`: h times the slope of what has not decayed;
     - `kink`: the same as `slope`, with what lies behind a kink of the response;
-    - `is_damped`: such a change decays; `ends`: what has not decayed does now;
+    - `is_damped`: such a change decays; `ends`: what has not decayed so far decays too;
     - `is_stiff`: x itself changes slowly beside it.
     """
 
