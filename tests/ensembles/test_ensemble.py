@@ -15,6 +15,7 @@ import dvax
 from dvax import generators, operators, sets, spaces
 from dvax.ensembles import Moments
 from dvax.ensembles.ensemble import check_own
+from dvax.ensembles.members import _compiled
 from dvax.ensembles.workers import in_order
 
 COUNT = 150
@@ -41,6 +42,18 @@ def pair():
 RNG = np.random.default_rng(5)
 LOADS = RNG.uniform(2.0, 4.0, COUNT)
 STARTS = RNG.uniform(-1.0, 0.5, COUNT)
+
+
+def test_ensembles_of_about_as_many_members_run_one_program():
+    programs = []
+    for count in (150, 129, 200, 256):
+        loads = np.linspace(2.0, 4.0, count)
+        found = dvax.ensemble(loaded(), np.zeros(count), 0.0, 2.0, {"load": loads})
+        programs.append(_compiled._cache_size())
+        for k in (0, count - 1):
+            alone = dvax.solve(loaded(), 0.0, 0.0, 2.0, {"load": loads[k]})
+            assert abs(found.values[k] - alone.xs[-1]) <= 1e-12
+    assert len(set(programs)) == 1
 
 
 @pytest.fixture(scope="module")

@@ -73,3 +73,20 @@ def test_fixed_steps_have_no_tolerance_and_traced_states_no_size():
         warnings.simplefilter("error")
         first_run._SEEN.clear()
         jax.eval_shape(lambda x: dvax.solve(problem(1e-12), x, 0.0, 3.0).xs, jnp.zeros(2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("modulus", [1.0, 1e3, 1e9])
+@pytest.mark.parametrize("viscosity", [1e-2, 7e3])
+def test_rounding_errors_of_rates_that_cancel_are_not_named(modulus, viscosity):
+    """An elastic load h: x' = 1.1 (u − h)/η with u = h within K."""
+    direction = jnp.array([0.3, 0.7, -0.1])
+    elastic = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Ball(0.0, modulus),
+        f=lambda t, x, u, args: (1.1 * u - modulus * t * direction * 1.1) / viscosity,
+        h=lambda t, x, u, args: modulus * (t * direction - x),
+    )  # fmt: skip
+    first_run._SEEN.clear()
+    atol = 1e-9 * modulus / viscosity
+    sol = dvax.solve(elastic, jnp.zeros(3), 0.0, 0.9, ts=np.linspace(0.0, 0.9, 5), atol=atol)
+    assert np.max(np.abs(sol.xs)) < atol

@@ -126,8 +126,11 @@ def _piece(inputs: Inputs, count: int, lanes: int) -> int:
     saved = 1 if ts is None else len(ts)
     state = sum(np.asarray(leaf).nbytes for leaf in jtu.tree_leaves(x0))
     most = max(1, min(_LONGEST_PIECE, _PIECE_BYTES // max(1, saved * state)))
-    least = min(count, max(lanes, -(-count // _PIECES)))
-    pieces = -(-count // min(most, least))
+    wanted = -(-count // _PIECES)
+    if lanes == 1:
+        # A power of two: ensembles of about as many members run the same program.
+        return 2 ** min((wanted - 1).bit_length(), most.bit_length() - 1)
+    pieces = -(-count // min(most, count, max(lanes, wanted)))
     return -(-count // pieces)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
-from ..errors import input_error
+from ..errors import SolveError, input_error
 from ..problem import Problem
 from .nonfinite import first_bad, nonfinite_data
 from .several_solutions import warn_of_several_solutions
@@ -28,6 +28,9 @@ _MAX_ROWS = 64
 
 _SHARE = 0.1
 """Largest share of the state that atol may be without a warning."""
+
+_ROUNDINGS = 100.0
+"""Multiple of a rounding of u in f at each time, up to which a state counts as rounding."""
 
 
 def key_of_first_run(problem: Problem, t0: Any, x0: Tree, args: Any) -> Any:
@@ -89,36 +92,55 @@ def warn_after_first_run(
     x0: Tree,
     args: Any,
     moduli: Any,
-    states: Tree = None,
+    saved: tuple[Any, Tree] | None = None,
     atol: Any = None,
 ) -> None:
     """Warn of a law with several solutions and of states that atol hides, and store the `key`
     (`key_of_first_run`).
 
-    `states`: the saved ones of a run with the tolerance `atol`; without them, of the law alone.
+    `saved`: times and states of a run with the tolerance `atol`; without them, of the law alone.
     """
     if len(_SEEN) >= _MAX_SEEN:
         _SEEN.clear()
     _SEEN.add(key)
     warn_of_several_solutions(problem, t0, x0, args, moduli)
-    if states is not None and _tree.is_concrete(states, atol):
-        _warn_of_small_states(problem, x0, states, float(atol))
+    if saved is not None and _tree.is_concrete(saved, atol):
+        _warn_of_small_states(problem, t0, x0, args, *saved, float(atol))
 
 
-def _warn_of_small_states(problem: Problem, x0: Tree, states: Tree, atol: float) -> None:
-    """Warn if atol is more than a tenth of the largest state, unless all of them are 0."""
-    weights = problem.spaces(x0)[0].weights()
-    count = len(jtu.tree_leaves(states)[0])
-    rows = np.unique(np.linspace(0, count - 1, _MAX_ROWS).astype(int)) if count else []
-    saved = (jtu.tree_map(lambda leaf, k=k: leaf[k], states) for k in rows)
-    largest = max(_norm(weights, x) for x in (x0, *saved))
-    if 0.0 < largest and atol > _SHARE * largest:
-        warnings.warn(
-            f"atol = {atol:g} hides the solution: the norm of x is at most {largest:.3g} at t0 and at "
-            "the saved times, so an error as large as x itself may pass. Pass "
-            f"atol = {1e-3 * largest:.0e} or less, or choose units in which x is of size 1.",
-            stacklevel=4,
-        )
+def _warn_of_small_states(
+    problem: Problem, t0: Any, x0: Tree, args: Any, ts: Any, xs: Tree, atol: float
+) -> None:
+    """Warn if atol is more than a tenth of the largest state, unless all of them are 0 or rounding."""
+    weights, row = problem.spaces(x0)[0].weights(), lambda k: jtu.tree_map(lambda leaf: leaf[k], xs)
+    rows = np.unique(np.linspace(0, len(ts) - 1, _MAX_ROWS).astype(int)) if len(ts) else []
+    largest = max(_norm(weights, x) for x in (x0, *map(row, rows)))
+    if not 0.0 < largest < atol / _SHARE:
+        return
+    if len(ts) and largest <= _rounding(problem, args, t0, ts[-1], row(-1)):
+        return
+    warnings.warn(
+        f"atol = {atol:g} hides the solution: the norm of x is at most {largest:.3g} at t0 and at "
+        "the saved times, so an error as large as x itself may pass. Pass "
+        f"atol = {1e-3 * largest:.0e} or less, or choose units in which x is of size 1.",
+        stacklevel=4,
+    )
+
+
+def _rounding(problem: Problem, args: Any, t0: Any, t: Any, x: Tree) -> float:
+    """Return the size of states that rounding errors of u cause from t0 to t, where the terms of f
+    cancel."""
+
+    @jax.jit
+    def effect(u: Tree) -> Tree:
+        return jax.jvp(lambda u: problem.f(t, x, u, args), (u,), (u,))[1]
+
+    try:
+        change = effect(problem.response(t, x, args))
+    except SolveError:
+        return 0.0
+    size = _norm(problem.spaces(x)[0].weights(), change) * float(t - t0)
+    return _ROUNDINGS * float(jnp.finfo(_tree.dtype(x)).eps) * size
 
 
 def _norm(weights: Tree, x: Tree) -> float:

@@ -23,7 +23,9 @@ from ..programs.enclosure import (
     largest,
     smallest,
 )
+from ..programs.partial_evaluation import PartialEvaluation
 from ..programs.structure import analyse
+from ..sets import AbstractSet, Polyhedron
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, FrozenVI
 from ..vi.known import Known
@@ -65,7 +67,8 @@ class Flow(eqx.Module):
     is guessed. `linear` is A + J where some J joins A in what is left to the propagator.
     With `keeps_switches`, `rate` also returns the switch functions of a law that `iterates`, so that
     they are compiled once with it and not wherever they are read. `pointwise` says
-    that each entry of f̃ depends on t and on that entry of x alone.
+    that each entry of f̃ depends on t and on that entry of x alone. `prepared` is K, with what does not
+    depend on t computed once (`prepare`).
     """
 
     problem: Problem
@@ -84,6 +87,24 @@ class Flow(eqx.Module):
     linear: AbstractLinear | None = None
     keeps_switches: bool = eqx.field(static=True, default=False)
     pointwise: bool = eqx.field(static=True, default=False)
+    prepared: PartialEvaluation | None = None
+
+    def prepare(self, t: Any, x: Tree) -> "Flow":
+        """Return the flow that computes what does not depend on t of K(t) here, and not at each
+        evaluation, if its law is computed by a loop."""
+        if not self.iterates:
+            return self
+        like, space = self.problem.zero_control(x), self.problem.spaces(x)[1]
+
+        def K(t: Any) -> AbstractSet:
+            K = self.problem.set_at(t, self.args)
+            return K.prepared(like, space) if isinstance(K, Polyhedron) else K
+
+        return dataclasses.replace(self, prepared=PartialEvaluation.of(K, t))
+
+    def set_at(self, t: Any) -> AbstractSet:
+        """Return K(t)."""
+        return self.problem.set_at(t, self.args) if self.prepared is None else self.prepared(t)
 
     def propagator(self, h: Any, terms: int) -> AbstractPropagator:
         """The exact flow over h of x' = Ax + p, or of x' = (A + J)x + p."""
@@ -144,7 +165,7 @@ class Flow(eqx.Module):
             a = slope(problem, self.operator, t, x, args)
             z = jtu.tree_map(jnp.divide, drive, a)
             solved = _all_positive(a)
-        y = problem.set_at(t, args).project(z, problem.spaces(x)[1])
+        y = self.set_at(t).project(z, problem.spaces(x)[1])
         value = problem.f(t, x, self.operator.inverse(y), args)
         exact = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(x)))
         # With a slope that is not positive the law is not monotone, and this is not its solution.
@@ -153,7 +174,7 @@ class Flow(eqx.Module):
     def _by_formula(self, small_box: AbstractSmallBox, t: Any, x: Tree) -> Rate:
         problem, args = self.problem, self.args
         zero = problem.zero_control(x)
-        bounds = problem.set_at(t, args).intervals(zero)
+        bounds = self.set_at(t).intervals(zero)
         assert bounds is not None
         q = problem.frozen(t, x, args)(zero)
         found = small_box.solve(q, *bounds)
@@ -201,7 +222,7 @@ class Flow(eqx.Module):
 
     def switch_parts(self, t: Any, x: Tree, z: Tree | None) -> list[jax.Array] | None:
         """What changes its sign where the response has a kink; None where K does not say."""
-        return self.problem.set_at(t, self.args).switches(z, self.problem.spaces(x)[1])
+        return self.set_at(t).switches(z, self.problem.spaces(x)[1])
 
     def switches(self, t: Any, x: Tree, z: Tree | None) -> jax.Array | None:
         """`switch_parts` as one vector. This gathers what is sharded over several devices."""
@@ -216,7 +237,7 @@ class Flow(eqx.Module):
         proj(z ± e) − proj(z) that is not linear in e, which is zero deep inside K and deep outside it
         and large just where z might have crossed the boundary unseen.
         """
-        K = self.problem.set_at(t, self.args)
+        K = self.set_at(t)
         space = self.problem.spaces(x)[1]
         P = self.operator
         project = lambda z: K.project(z, space)  # noqa: E731
@@ -266,7 +287,7 @@ def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
     start = problem.zero_control(x) if guess is None else guess
     vi = FrozenVI(
         problem.frozen(t, x, args),
-        problem.set_at(t, args),
+        flow.set_at(t),
         problem.spaces(x)[1],
         flow.gamma,
         flow.L_F,

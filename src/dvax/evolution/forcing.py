@@ -64,7 +64,7 @@ def with_parameters(flow: Flow, chosen: Groups, values: list[jax.Array]) -> Flow
     for k, value in zip((k for group in chosen for k in group), values, strict=True):
         leaves[k] = value
     problem, args = rebuild(leaves)
-    return dataclasses.replace(flow, problem=problem, args=args)
+    return dataclasses.replace(flow, problem=problem, args=args, prepared=None)
 
 
 def directions(flow: Flow, chosen: Groups, weights: jax.Array) -> list[jax.Array]:

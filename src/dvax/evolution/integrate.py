@@ -35,7 +35,7 @@ def integrate(setup: Setup, ts: Any, options: Options) -> tuple[Solution, bool]:
     flow = plan.flow(setup)
     flow = dataclasses.replace(
         flow, problem=closure_convert(setup.problem, setup.number("t0"), setup.x0, flow.args)
-    )
+    ).prepare(setup.number("t0"), setup.x0)
     valid = setup.is_valid(ts)
     events = checked_events(setup, flow.args)
     outcome = _run(setup._replace(events=events), flow, ts, valid, options)

@@ -93,7 +93,7 @@ def _sequential(run: Any, times: Any, xs: Tree, guesses: Tree | None) -> Any:
 def _response(flow: Flow, control: Any, tau: Any, t: Any, x: Tree, guess: Tree | None) -> Any:
     """Return u, y, w and ȳ − y at one time."""
     rate = flow.rate(t, x, guess)
-    K = flow.problem.set_at(t, flow.args)
+    K = flow.set_at(t)
     frozen = flow.problem.frozen(t, x, flow.args)
     certificate = certify(frozen, K, control, rate.y, tau)
     return flow.operator.inverse(rate.y), rate.y, certificate.w, _tree.sub(certificate.y, rate.y)
@@ -103,5 +103,5 @@ def _is_finite(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> jax.Array:
     problem, args = flow.problem, flow.args
     if guess is None:
         return _tree.all_finite(flow.rate(t, x, guess).y)
-    y = problem.set_at(t, args).project(guess, problem.spaces(x)[1])
+    y = flow.set_at(t).project(guess, problem.spaces(x)[1])
     return _tree.all_finite((guess, problem.frozen(t, x, args)(y)))

@@ -203,8 +203,8 @@ def solve(
     solution = _run(choice, setup, None if ts is None else _times(ts), options, throw)
     if first is not None:
         adaptive = dt is None and not isinstance(choice.method, PiecewiseLinear)
-        states = solution.xs if adaptive else None
-        warn_after_first_run(first, problem, t0, x0, args, constants, states, atol)
+        saved = (solution.ts, solution.xs) if adaptive else None
+        warn_after_first_run(first, problem, t0, x0, args, constants, saved, atol)
     return solution
 
 

@@ -64,15 +64,12 @@ class _State(NamedTuple):
 def nearest_point(rows: jax.Array, bounds: jax.Array, z: jax.Array, size: jax.Array) -> Projection:
     """Return the projection of z onto {x : rows x ≤ bounds}.
 
-    The rows have length one (or zero), and bounds may be +∞. `size` has one number a row: the
-    magnitude of the terms that were subtracted to form its bound, for the roundoff tolerance.
+    The rows have length one (or zero). `size` has one number a row: the magnitude of the terms that
+    were subtracted to form its bound, for the roundoff tolerance.
     """
     m, n = rows.shape
     dtype = jnp.result_type(z)
     eps, index = jnp.finfo(dtype).eps, jnp.arange(m, dtype=jnp.uint32)
-    # A row without a bound is never active.
-    is_bounded = jnp.isfinite(bounds)
-    rows, bounds = jnp.where(is_bounded[:, None], rows, 0.0), jnp.where(is_bounded, bounds, 1.0)
     # At the apex of a cone x should be 0; its roundoff is relative to the norm of z.
     length_z = _norm(z)
     absolute = eps**SLACK * (jnp.abs(bounds) + size) + eps ** (1.0 + SLACK) * length_z

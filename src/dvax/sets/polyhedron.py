@@ -1,8 +1,8 @@
 """Polyhedra: linear inequalities and equations."""
 
-from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,9 +60,11 @@ class Polyhedron(AbstractSet):
     d: jax.Array
     E: jax.Array
     e: jax.Array
+    reduced: "_Reduced | None" = eqx.field(repr=False)
 
     def __init__(self, G: Any, d: Any, E: Any = None, e: Any = None):
         name = "dvax.sets.Polyhedron"
+        self.reduced = None
         self.G, self.d = checked_rows(name, G, d, "G", "d")
         if (E is None) != (e is None):
             raise input_error(
@@ -87,22 +89,32 @@ class Polyhedron(AbstractSet):
         if _tree.is_concrete((self.G, self.d, self.E, self.e)):
             _check_nonempty(name, *(np.asarray(a) for a in (self.G, self.d, self.E, self.e)))
 
+    def prepared(self, like: Tree, space: AbstractSpace) -> "Polyhedron":
+        """Return the same set with what its projections compute from its data alone.
+
+        A program that projects in a loop computes it once, before the loop."""
+        return eqx.tree_at(lambda K: K.reduced, self, self._reduce(like, space), is_leaf=_is_none)
+
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
-        return _nearest(*self._flat(z, space))[0].reshape(z.shape)
+        return _nearest(z.reshape(-1), *self._reduced(z, space))[0].reshape(z.shape)
 
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array]:
         """Return, for each row, its slack, or minus its multiplier if the row is active.
 
-        The multipliers of linearly dependent rows are not unique."""
-        flat, root, G, d, E, e = self._flat(z, space)
-        y, active, multiplier, _ = _nearest(flat, root, G, d, E, e)
-        rows, bounds = normalised_conditions(G * root[None, :], d)
-        return [jnp.where(active > 0, -multiplier, bounds - times(rows, y / root))]
+        The multipliers of linearly dependent rows are not unique. A row without a bound has the
+        slack 1."""
+        reduced = self._reduced(z, space)
+        y, active, multiplier, _ = _nearest(z.reshape(-1), *reduced)
+        slack = reduced.bounds - times(reduced.rows, y / reduced.root - reduced.base)
+        return [jnp.where(active > 0, -multiplier, slack)]
 
-    def _flat(self, z: Tree, space: AbstractSpace) -> tuple:
-        n = z.size
-        root = jnp.sqrt(inverse_weights(space, z)).reshape(-1)
-        return z.reshape(-1), root, self.G.reshape(-1, n), self.d, self.E.reshape(-1, n), self.e
+    def _reduced(self, z: Tree, space: AbstractSpace) -> "_Reduced":
+        return self._reduce(z, space) if self.reduced is None else self.reduced
+
+    def _reduce(self, like: Tree, space: AbstractSpace) -> "_Reduced":
+        n = like.size
+        root = jnp.sqrt(inverse_weights(space, like)).reshape(-1)
+        return _reduce(root, self.G.reshape(-1, n), self.d, self.E.reshape(-1, n), self.e)
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         return None
@@ -111,34 +123,90 @@ class Polyhedron(AbstractSet):
         check_row_shapes("dvax.sets.Polyhedron(G)", self.G, like)
 
 
-@jax.custom_jvp
-def _nearest(
-    z: jax.Array, root: jax.Array, G: jax.Array, d: jax.Array, E: jax.Array, e: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Return (projection, 1 for active rows of G and else 0, multipliers, B).
+class _Reduced(NamedTuple):
+    """The data of a polyhedron without its equations: proj_K(z) = root (base + x), where x is the
+    projection of `point(z)` onto {x : rows x ≤ bounds} in the null space of the equations.
 
-    B is the transposed pseudoinverse of the active rows that `_reduce` returns. The projection is NaN
-    if the set is empty. `root` is w^{−1/2}: in the coordinates y/root the norm of the space is the
-    Euclidean norm.
+    `root` is w^{−1/2}: in the coordinates y/root the norm of the space is the Euclidean norm. The rows
+    have length one or zero. `base` is the solution of least norm of `equations` x = `values`, and
+    `back` their pseudoinverse. `size` has the magnitudes that were subtracted to form the bounds.
+    `solvable` is whether the equations have a solution and no bound is −∞ or NaN.
     """
-    point, rows, bounds, base, scale, onto_null_space = _reduce(z, root, G, d, E, e)
-    if len(e):
-        size = jnp.abs(bounds) + _length(base) / scale
-        solvable = has_solution(E, e)
-    else:
-        size, solvable = jnp.zeros_like(bounds), True
-    nearest = dual.nearest_point(rows, bounds, point, size)
+
+    root: jax.Array
+    rows: jax.Array
+    bounds: jax.Array
+    equations: jax.Array
+    values: jax.Array
+    back: jax.Array
+    base: jax.Array
+    size: jax.Array
+    solvable: jax.Array
+
+    def onto_null_space(self, x: jax.Array) -> jax.Array:
+        if not len(self.values):
+            return x
+        return x - times(self.back, times(self.equations, x))
+
+    def point(self, z: jax.Array) -> jax.Array:
+        """Return the point whose projection in the null space is x."""
+        point = z / self.root
+        if not len(self.values):
+            return point
+        residual = times(self.equations, point) - self.values
+        return self.onto_null_space(point - self.base - times(self.back, residual))
+
+
+def _reduce(root: jax.Array, G: jax.Array, d: jax.Array, E: jax.Array, e: jax.Array) -> _Reduced:
+    solvable = jnp.all(d > -jnp.inf)
+    # A row without a bound is never active.
+    has_bound = d != jnp.inf
+    G, d = jnp.where(has_bound[:, None], G, 0.0), jnp.where(has_bound, d, 1.0)
+    rows, bounds = normalised_conditions(G * root[None, :], d)
+    if not len(e):
+        base, size = jnp.zeros_like(root), jnp.zeros_like(bounds)
+        return _Reduced(root, rows, bounds, E, e, E.T, base, size, solvable)
+    equations, values = normalised_conditions(E * root[None, :], e)
+    back = pseudoinverse(equations)
+    base = times(back, values)
+    reduced = _Reduced(root, rows, bounds, equations, values, back, base, bounds, solvable)
+    bounds = bounds - times(rows, base)
+    rows = jax.vmap(reduced.onto_null_space)(rows)
+    # A row whose projection is shorter than this depends linearly on the equations.
+    roundoff = float(jnp.finfo(root.dtype).eps) ** dual.SLACK
+    is_long = jnp.sum(rows * rows, axis=1) > roundoff**2
+    rows, scale = normalise_rows(jnp.where(is_long[:, None], rows, 0.0))
+    bounds = bounds / scale
+    return reduced._replace(
+        rows=rows,
+        bounds=bounds,
+        size=lax.stop_gradient(jnp.abs(bounds) + _length(base) / scale),
+        solvable=solvable & has_solution(E, e),
+    )
+
+
+@jax.custom_jvp
+def _nearest(z: jax.Array, *data: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Return (projection, 1 for active rows of G and else 0, multipliers, B), given the fields of a
+    `_Reduced`.
+
+    B is the transposed pseudoinverse of its active rows. The projection is NaN if the set is empty.
+    """
+    K = _Reduced(*data)
+    has_equations = len(K.values) > 0
+    nearest = dual.nearest_point(K.rows, K.bounds, K.point(z), K.size)
     x = nearest.x
-    if len(e):
+    if has_equations:
         # Rounding of a distant point leaves the equations by eps|z|. A correction that is not needed
         # would leave the inequalities instead, by a rounding of x.
-        corrected = onto_null_space(x)
-        rounding = _ROUNDINGS * jnp.finfo(z.dtype).eps * (_length(x) + _length(base))
+        corrected = K.onto_null_space(x)
+        rounding = _ROUNDINGS * jnp.finfo(z.dtype).eps * (_length(x) + _length(K.base))
         x = jnp.where(_length(corrected - x) > rounding, corrected, x)
-    y = jnp.where(nearest.valid & solvable, x + base, jnp.nan)
-    # Without active rows, return z itself: scaling there and back has roundoff.
-    interior = nearest.valid & ~jnp.any(nearest.active) & (len(e) == 0)
-    y = jnp.where(interior, z, y * root)
+    is_valid = nearest.valid & K.solvable
+    y = jnp.where(is_valid, x + K.base, jnp.nan) * K.root
+    if not has_equations:
+        # Without active rows, return z itself: scaling there and back has roundoff.
+        y = jnp.where(is_valid & ~jnp.any(nearest.active), z, y)
     return y, nearest.active.astype(z.dtype), nearest.multiplier, nearest.dual
 
 
@@ -146,48 +214,24 @@ def _length(x: jax.Array) -> jax.Array:
     return jnp.sqrt(jnp.sum(jnp.square(x)))
 
 
-def _reduce(
-    z: jax.Array, root: jax.Array, G: jax.Array, d: jax.Array, E: jax.Array, e: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, Any, Any, Callable[[jax.Array], jax.Array]]:
-    """Return (point, rows, bounds, base, scale, onto_null_space) with proj_K(z) = root (base + x),
-    where x is the projection of the point onto {x : rows x ≤ bounds}.
-
-    The rows have length one or zero. Equations restrict x to their null space, onto which the last
-    result projects; `base` is their solution of least norm, and `scale` the length of the rows in the
-    null space.
-    """
-    point, (rows, bounds) = z / root, normalised_conditions(G * root[None, :], d)
-    if not len(e):
-        return point, rows, bounds, 0.0, 1.0, lambda x: x
-    equations, values = normalised_conditions(E * root[None, :], e)
-    back = pseudoinverse(equations)
-    base = times(back, values)
-
-    def onto_null_space(x: jax.Array) -> jax.Array:
-        return x - times(back, times(equations, x))
-
-    point = point - base - times(back, times(equations, point) - values)
-    point = onto_null_space(point)
-    bounds = bounds - times(rows, base)
-    rows = jax.vmap(onto_null_space)(rows)
-    # A row whose projection is shorter than this depends linearly on the equations.
-    roundoff = float(jnp.finfo(z.dtype).eps) ** dual.SLACK
-    is_long = jnp.sum(rows * rows, axis=1) > roundoff**2
-    rows, scale = normalise_rows(jnp.where(is_long[:, None], rows, 0.0))
-    return point, rows, bounds / scale, base, scale, onto_null_space
+def _is_none(node: Any) -> bool:
+    return node is None
 
 
 def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
     y, active, multiplier, inverse = _nearest(*primals)
 
-    def project_on_face(z, root, G, d, E, e) -> jax.Array:
-        # Inactive rows are set to zero; d may be infinite there.
-        G, d = jnp.where(active[:, None] > 0, G, 0.0), jnp.where(active > 0, d, 0.0)
-        point, rows, bounds, base, _, _ = _reduce(z, root, G, d, E, e)
+    def project_on_face(z: jax.Array, *data: jax.Array) -> jax.Array:
+        K = _Reduced(*data)
+        rows, bounds = (
+            jnp.where(active[:, None] > 0, K.rows, 0.0),
+            jnp.where(active > 0, K.bounds, 0.0),
+        )
         back = as_pseudoinverse(lax.stop_gradient(inverse).T, rows)
         # Sums of products: for a batch of tangents, matrix products would be calls of a library.
+        point = K.point(z)
         excess = jnp.sum(rows * point[None, :], axis=1) - bounds
-        return root * (point - jnp.sum(back * excess[None, :], axis=1) + base)
+        return K.root * (point - jnp.sum(back * excess[None, :], axis=1) + K.base)
 
     dy = jvp_of_moving(project_on_face, primals, tangents)
     results = y, active, multiplier, inverse
