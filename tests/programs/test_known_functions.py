@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from dvax._jax.known_functions import VARIANTS, operation
+import dvax
+from dvax._jax.known_functions import VARIANTS, _programs, operation
 
 SCRIPT = """
 import jax, jax.numpy as jnp
@@ -56,3 +57,25 @@ def test_another_function_of_the_same_name_is_not_recognised():
     assert name_of(plain, weights) == "norm"
     weighted.__name__ = "norm"
     assert name_of(jax.jit(weighted), weights) not in VARIANTS
+
+
+CALLS = {
+    "hypot": lambda x: jnp.hypot(x, 1.0),
+    "_interp": lambda x: jnp.interp(x, jnp.array([-1.0, 0.0, 2.0]), jnp.array([1.0, 0.0, 2.0])),
+    "logaddexp": lambda x: jnp.logaddexp(x, 0.0),
+    "norm": lambda x: jnp.linalg.norm(x) * jnp.ones(2),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_constants_of_a_known_function_are_sharp_where_the_input_was_checked_first(name):
+    """The check of indices, which every call begins with, must not change what is recognised."""
+    _programs.cache_clear()
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-1.0, 1.0),
+        f=lambda t, x, u, args: CALLS[name](x) + u, h=lambda t, x, u, args: -x,
+    )  # fmt: skip
+    found = dvax.verify(problem, jnp.array([0.3, 0.2]), 0.0, 1.0, x=(-3.0, 3.0))
+    assert found["ass:f_lipschitz"].status == "proved"
+    # The norm depends on both entries.
+    assert found.constants.alpha_f <= (1.0 if name != "norm" else 2.0) + 1e-12

@@ -263,3 +263,47 @@ def test_parameter_bounds_do_not_hold_outside_their_box():
     bounds = dvax.parameter_bounds(grows, 0.0, 0.1, t1=2.0, start_radius=1.0)
     with pytest.raises(dvax.InputError, match=r"norm 3"):
         change(grows, 3.0, 0.0, 2.0, 0.05, bounds, dargs=0.01)
+
+
+def friction(v):
+    return -jnp.sign(v)
+
+
+JUMPS = {
+    "sign": (friction, 2.0),
+    "heaviside": (lambda v: jnp.heaviside(v - 0.7, 0.0), 1.0),
+    "with a slope": (lambda v: -100.0 * v - jnp.where(v > 1.2, 3.0, 0.0), 3.0),
+    "small beside others": (lambda v: 30.0 * jnp.cos(v) + 0.5 * jnp.floor(v / 2.5), 0.5),
+    "branches apart": (lambda v: jnp.where(v > 0.3, -1.0, -v), 0.7),
+    "condition": (lambda v: jax.vmap(lambda w: lax.cond(w < -1, lambda: 2.0, lambda: w))(v), 3.0),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["f", "h"])
+@pytest.mark.parametrize("name", JUMPS)
+def test_verify_refutes_a_lipschitz_constant_of_a_function_that_jumps(name, where):
+    """An estimate from slopes and differences would be a number without meaning."""
+    fn, height = JUMPS[name]
+    system = problem(**{where: lambda t, x, u, args: fn(x) - u})
+    found = dvax.verify(system, jnp.array([0.3, 0.2]), 0.0, 5.0, x=(-3.0, 3.0))
+    label = {"f": "ass:f_lipschitz", "h": "ass:h_lipschitz_x"}[where]
+    assert found[label].status == found.status == "refuted"
+    text = found[label].why.split("jumps by ")[1]
+    assert float(text.split()[0]) == pytest.approx(height, rel=1e-3)
+    assert "as a law" in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "fn",
+    [
+        lambda v: jnp.tanh(1e6 * v), lambda v: jax.scipy.special.digamma(v + 4.0),
+        lambda v: jnp.sign(v) * jnp.sqrt(jnp.abs(v)), jnp.sinc, lambda v: jnp.fmod(v, 50.0),
+        lambda v: (1e10 + jnp.fmod(v, 50.0)) - 1e10, lambda v: jnp.cumprod(1.0 + v),
+    ],
+)  # fmt: skip
+def test_verify_does_not_mistake_a_steep_function_or_rounding_for_a_jump(fn):
+    system = problem(f=lambda t, x, u, args: fn(x) - u)
+    found = dvax.verify(system, jnp.array([0.3, 0.2]), 0.0, 5.0, x=(-3.0, 3.0))
+    assert found["ass:f_lipschitz"].status in ("proved", "estimated")

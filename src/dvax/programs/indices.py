@@ -41,7 +41,9 @@ def index_outside(program: Any) -> IndexOutside | None:
     def evaluate(eqn: Any, operands: list[Any]) -> list[Any]:
         if eqn.effects or not all(map(_is_index, operands)) or not operands:
             return unknown(eqn, operands)
-        return bind(eqn, operands)
+        # Only here: a function of JAX that is traced in this context has another program.
+        with jax.ensure_compile_time_eval():
+            return bind(eqn, operands)
 
     def apply(rule: Rule, eqn: Any, operands: list[Any]) -> list[Any]:
         for index, entries in rule(eqn, operands):
@@ -50,8 +52,7 @@ def index_outside(program: Any) -> IndexOutside | None:
         return unknown(eqn, operands)
 
     domain = Domain(RULES, lambda v: isinstance(v, _Unknown), unknown, apply, evaluate)
-    with jax.ensure_compile_time_eval():
-        interpret(program, [_Unknown()] * len(program.jaxpr.invars), domain)
+    interpret(program, [_Unknown()] * len(program.jaxpr.invars), domain)
     return outside[0] if outside else None
 
 

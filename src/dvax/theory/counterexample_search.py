@@ -27,6 +27,13 @@ _MAX_ENTRIES = 2_000_000
 _ROUNDING_FACTOR = 1e4
 """Assumed rounding error of F, in units of ε times its norm."""
 
+_JUMP_HALVINGS = 70
+"""Number of halvings of a segment, after which its ends are equal or neighbouring numbers."""
+
+_JUMP_SHARE = 1e-3
+"""Share of the largest change of a function, above which a change between neighbours is a jump and not
+rounding."""
+
 _MAX_DENSE_SIZE = 64
 """Up to this size the norm of a derivative is computed from singular values."""
 
@@ -46,11 +53,25 @@ class CounterexamplePair(NamedTuple):
     backward: float
 
 
-def largest_slope(system: System, region: Region, name: str, by: str) -> float:
+class Jump(NamedTuple):
+    """A function changes by `height` between `place` and the next number."""
+
+    height: float
+    place: Tree
+
+
+class SlopeSearch(NamedTuple):
+    """A lower bound on a Lipschitz modulus, and a jump of the function, if one was found."""
+
+    value: float
+    jump: Jump | None
+
+
+def search_slope(system: System, region: Region, name: str, by: str) -> SlopeSearch:
     """Return a lower bound on the Lipschitz modulus of `name` ("f" or "h") in `by` ("x" or "u").
 
     A search in a bounded region takes the largest norm of the derivative and the largest difference
-    quotient between near and far points.
+    quotient between near and far points, and halves the segments between far points towards a jump.
     """
     fn = getattr(system.problem, name)
     out = system.state if name == "f" else system.control
@@ -69,14 +90,50 @@ def largest_slope(system: System, region: Region, name: str, by: str) -> float:
     best = jax.vmap(norm)(_climb(norm, starts, low, high))
     others = _points(low, high, _STARTS, 2)
     quotients = []
+    k = 1 if by == "x" else 2
     for fraction in (1.0, 1e-3, 1e-6):
-        k = 1 if by == "x" else 2
         ends = jtu.tree_map(lambda a, b, r=fraction: a + r * (b - a), starts[k], others[k])
         quotients.append(
             jax.vmap(lambda p, v: _quotient(with_argument, p, v, out, into, by))(starts, ends)
         )
     slopes = jnp.concatenate([best, *quotients])
-    return float(jnp.max(jnp.where(jnp.isfinite(slopes), slopes, 0.0)))
+    value = float(jnp.max(jnp.where(jnp.isfinite(slopes), slopes, 0.0)))
+    return SlopeSearch(value, _jump(with_argument, starts, starts[k], others[k], out))
+
+
+def _jump(fn: Callable, points: tuple, starts: Tree, ends: Tree, out: AbstractSpace) -> Jump | None:
+    """Return the largest jump of fn(t, x, u, v) in v that halving of segments finds, or None.
+
+    The change over two neighbouring numbers is a jump if it is more than a share of the largest change
+    over a whole segment. A function with such a slope is resolved by no step.
+    """
+
+    def change(point: tuple, v: Tree, w: Tree) -> jax.Array:
+        size = out.norm(_tree.sub(fn(*point, v), fn(*point, w)))
+        return jnp.where(jnp.isfinite(size), size, 0.0)
+
+    def halve(point: tuple, v: Tree, w: Tree) -> tuple[jax.Array, jax.Array, Tree]:
+        def half(k: Any, ends: tuple[Tree, Tree]) -> tuple[Tree, Tree]:
+            v, w = ends
+            middle = jtu.tree_map(lambda a, b: 0.5 * (a + b), v, w)
+            is_first = change(point, v, middle) >= change(point, middle, w)
+            return _tree.where(is_first, v, middle), _tree.where(is_first, middle, w)
+
+        first, second = jax.lax.fori_loop(0, _JUMP_HALVINGS, half, (v, w))
+        return change(point, v, w), change(point, first, second), first
+
+    whole, last, places = jax.jit(jax.vmap(halve))(points, starts, ends)
+    worst = int(jnp.argmax(last))
+    height = float(last[worst])
+    if not height > _JUMP_SHARE * float(jnp.max(whole)):
+        return None
+
+    def place(leaf: jax.Array, end: jax.Array) -> jax.Array:
+        # Halving towards 0 ends at a rounding of the segment.
+        at = leaf[worst]
+        return jnp.where(jnp.abs(at) <= 1e-12 * jnp.abs(end[worst]), 0.0, at)
+
+    return Jump(height, jtu.tree_map(place, places, ends))
 
 
 def find_counterexample(system: System, region: Region) -> CounterexamplePair | None:

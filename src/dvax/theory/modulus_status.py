@@ -13,7 +13,7 @@ from ..programs.slope import SlopeEnclosure, is_slope
 from .counterexample_search import (
     CounterexamplePair,
     find_counterexample,
-    largest_slope,
+    search_slope,
     smallest_monotonicity,
 )
 from .moduli import SMALLNESS, Moduli, moduli
@@ -67,9 +67,16 @@ def modulus_statuses(
         if np.isfinite(value):
             by_name[name] = ModulusStatus(value, "proved", method)
         else:
-            lower = largest_slope(system, box, of, by)
+            found = search_slope(system, box, of, by)
             why = _reason_without_proof(proved, of, method)
-            by_name[name] = _estimate(lower, declared.get(name), box, why)
+            by_name[name] = _estimate(found.value, declared.get(name), box, why)
+            if found.jump is not None:
+                place = f"{by} = {_tree.short(found.jump.place)}"
+                reason = (
+                    f"{of} jumps by {found.jump.height:.6g} at {place}, so no constant holds. Write "
+                    "a switch, such as the sign in a friction force, as a law u ∈ h − N_K(P u)"
+                )
+                by_name[name] = ModulusStatus(np.inf, "refuted", reason)
     by_name["L_F"] = _lipschitz_status(system, proved, by_name["beta_h"], declared)
     unweighted = _unweighted_law(system, region)
     gamma, reason = proved.gamma
