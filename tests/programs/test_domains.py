@@ -13,7 +13,7 @@ from dvax.programs import DOMAINS
 ELSEWHERE = {
     # Operations that JAX does not list there, and those of releases other than this one.
     "bcoo_dot_general", "copy_p", "custom_vjp_call_jaxpr", "expand_dims", "optimization_barrier",
-    "scatter_add", "split", "stack", "unstack", *VARIANTS,
+    "scatter_add", "scatter_mul", "split", "stack", "tile", "unstack", *VARIANTS,
 }  # fmt: skip
 
 

@@ -61,6 +61,24 @@ FUNCTIONS = {
         lambda v: (v**2).at[jnp.array([2, 0, 2, 7])].add(jnp.append(v, 1.0)).at[0].add(-v[1]),
         (-2.0, 2.0),
     ),
+    "multiplied at places": (
+        lambda v: v.at[0].multiply(v[1]).at[jnp.array([2, 1])].divide(3.0 + v[:2]) * v,
+        (-2.0, 2.0),
+    ),
+    "remainders": (
+        lambda v: jnp.mod(v + 9.0, 20.0) * v + jnp.fmod(v, 3.0) + jnp.fmod(v - 5.0, -8.0),
+        (-2.0, 2.0),
+    ),
+    "products of several": (
+        lambda v: jnp.prod(v) * jnp.cumprod(v[::-1]) + jnp.prod(M * v[None], axis=1),
+        (-2.0, 2.0),
+    ),
+    "partial products from the end": (lambda v: jax.lax.cumprod(v, reverse=True), (-2.0, 2.0)),
+    "repeated": (lambda v: jnp.tile(v, 2)[1:4] * jnp.sin(v), (-2.0, 2.0)),
+    "sums of squares": (
+        lambda v: jnp.sqrt(1.0 + v @ v) + jnp.log1p(jnp.vdot(v, v)) * v,
+        (-2.0, 2.0),
+    ),
     "a block written": (
         lambda v: jax.lax.dynamic_update_slice(M * v[None], jnp.outer(v[:2], v[:2]), (0, 1)) @ v,
         (-2.0, 2.0),
@@ -176,6 +194,8 @@ def test_slope_encloses_values_and_difference_quotients(name):
         lambda v: jnp.arctanh(2.0 * v),
         lambda v: jnp.arccosh(v),
         lambda v: jnp.round(3.0 * v),
+        lambda v: jnp.fmod(v, 0.5),
+        lambda v: v % 3.0,
         lambda v: jnp.real(jnp.fft.fft(v)),
         lambda v: jnp.arctan2(v, v[::-1]),
         lambda v: jnp.arctan2(v, -1.0),
@@ -237,12 +257,13 @@ def test_slope_of_rearranged_entries_is_diagonal_only_in_the_same_order():
 
 
 def test_slope_names_operations_without_a_rule():
-    enclosed = SlopeEnclosure(jnp.cumprod, (jnp.zeros(3),), (0,))(interval(-np.ones(3), np.ones(3)))
-    assert enclosed.unknown == ("cumprod",)
+    fn = jax.scipy.special.digamma
+    enclosed = SlopeEnclosure(fn, (jnp.zeros(3),), (0,))(interval(np.ones(3), 2.0 * np.ones(3)))
+    assert enclosed.unknown == ("digamma",)
 
 
 def test_slope_ignores_undifferentiated_arguments():
-    fn = lambda t, v: v * 2.0 + jnp.prod(jnp.stack([t, t]))  # noqa: E731
+    fn = lambda t, v: v * 2.0 + jax.scipy.special.digamma(t)  # noqa: E731
     out, unknown = SlopeEnclosure(fn, (jnp.zeros(()), jnp.zeros(3)), (1,))(
         interval(0.0, 1.0), interval(-np.inf * np.ones(3), np.inf * np.ones(3))
     )

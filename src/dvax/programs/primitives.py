@@ -2,7 +2,7 @@
 
 REARRANGING = frozenset({
     "reshape", "squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "slice", "copy",
-    "copy_p", "stop_gradient",
+    "copy_p", "stop_gradient", "tile",
 })  # fmt: skip
 """Each entry of the result is an entry of the argument, at a position independent of values."""
 

@@ -43,10 +43,11 @@ def _sub(eqn: Any, operands: list[Any]) -> Slope:
 
 
 def _mul(eqn: Any, operands: list[Any]) -> Slope:
-    return _times(*_lifted(eqn, operands))
+    return multiplied(*_lifted(eqn, operands))
 
 
-def _times(x: Slope, y: Slope) -> Slope:
+def multiplied(x: Slope, y: Slope) -> Slope:
+    """Return x y."""
     corners = [product(a, b) for a in (x.low, x.high) for b in (y.low, y.high)]
     low, high = np.minimum.reduce(corners), np.maximum.reduce(corners)
     by_x = mapped(x.parts, lambda part: scaled(part, y.low, y.high))
@@ -58,7 +59,7 @@ def _div(eqn: Any, operands: list[Any]) -> Slope | None:
     if not is_real(eqn.outvars[0].aval):
         return None  # integers are divided with a remainder
     x, y = _lifted(eqn, operands)
-    return _times(x, _composed(integer_power(-1), y))
+    return multiplied(x, _composed(integer_power(-1), y))
 
 
 def _neg(eqn: Any, operands: list[Any]) -> Slope:
@@ -137,6 +138,29 @@ def _stairs(phi: Callable[[Values], Values]) -> Rule:
 def _jumping(part: Part, jump: Values) -> Part:
     """Return the derivative of a piecewise constant function: 0, or `jump` where it depends on v."""
     return Part(np.zeros_like(part.center), np.where(is_dependent(part), jump, 0.0), part.full)
+
+
+def _remainder(eqn: Any, operands: list[Any]) -> Slope | None:
+    """Return the slope of x − c trunc(x/c) for constant c: that of x where the quotient is constant."""
+    x, c = _lifted(eqn, operands)
+    if c.parts or not np.array_equal(c.low, c.high) or not is_real(eqn.outvars[0].aval):
+        return None
+    length = np.abs(c.low)
+    low, high = np.fmod(x.low, length), np.fmod(x.high, length)
+    # The remainder is exact, so that the quotients are integers up to a rounding.
+    first, last = np.round((x.low - low) / length), np.round((x.high - high) / length)
+    is_one = (first == last) & np.isfinite(first)
+    jump = np.where(is_one, 0.0, np.inf)
+
+    def derivative(part: Part) -> Part:
+        center = np.where(is_one, part.center, 0.0)
+        return Part(center, part.radius + _jumping(part, jump).radius, part.full)
+
+    return Slope(
+        np.where(is_one, low, np.where(x.low < 0, -length, 0.0)),
+        np.where(is_one, high, np.where(x.high > 0, length, 0.0)),
+        mapped(x.parts, derivative),
+    )
 
 
 def _round(eqn: Any, operands: list[Any]) -> Slope | None:
@@ -229,6 +253,7 @@ ELEMENTWISE: dict[str, Rule] = {
     "floor": _stairs(np.floor),
     "ceil": _stairs(np.ceil),
     "round": _round,
+    "rem": _remainder,
     "eq": _equal,
     "ne": lambda eqn, operands: _opposite(_equal(eqn, operands)),
     "lt": _compare(lambda x, y: (x.high < y.low, x.low < y.high)),

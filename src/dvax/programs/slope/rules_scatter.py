@@ -8,6 +8,7 @@ import numpy as np
 
 from ..._jax.jaxprs import bind
 from ..interpreter import Rule, same_for
+from .rules_elementwise import multiplied
 from .rules_structural import picked
 from .values import Part, Slope, Values, is_slope, lift, together
 
@@ -28,7 +29,19 @@ def _updated(eqn: Any, operands: list[Any]) -> Slope | None:
 def _written(eqn: Any, operands: list[Any]) -> Slope | None:
     """Return the slope of an array with other values at constant places, each of which is written
     once."""
-    array, indices, new = operands
+    return _placed(eqn, operands, operands[0])
+
+
+def _multiplied(eqn: Any, operands: list[Any]) -> Slope | None:
+    """Return the slope of an array that is multiplied at constant places, at each of them once."""
+    shape = tuple(eqn.invars[0].aval.shape)
+    factor = _placed(eqn, operands, np.ones(shape))
+    return None if factor is None else multiplied(lift(operands[0], shape), factor)
+
+
+def _placed(eqn: Any, operands: list[Any], array: Any) -> Slope | None:
+    """Return an array with the new values of a scatter in the place of its own."""
+    _, indices, new = operands
     target = None if is_slope(indices) else _targets(eqn, indices)
     if target is None or (target < 0).any() or len(np.unique(target)) < target.size:
         return None
@@ -91,4 +104,5 @@ SCATTER: dict[str, Rule] = {
     "dynamic_update_slice": _updated,
     "scatter": _written,
     **same_for({"scatter-add", "scatter_add"}, _added),
+    **same_for({"scatter-mul", "scatter_mul"}, _multiplied),
 }

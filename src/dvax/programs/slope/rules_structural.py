@@ -1,6 +1,7 @@
 """The rules of slope arithmetic for operations that rearrange or add entries, and for products."""
 
 import functools
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -8,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..._jax.jaxprs import bind
-from ..interpreter import Rule, same_for
+from ..interpreter import MAX_UNROLLED, Rule, same_for
 from ..primitives import JOINING, REARRANGING, SUMMING
+from .rules_elementwise import multiplied
 from .values import (
     Part,
     Slope,
@@ -122,6 +124,38 @@ def _reduce_min(eqn: Any, operands: list[Any]) -> Slope:
     return negative(_reduce_max(eqn, [negative(operands[0])]))
 
 
+def _reduce_prod(eqn: Any, operands: list[Any]) -> Slope | None:
+    """Return the slope of the product of entries along axes."""
+    (x,), axes = operands, tuple(eqn.params["axes"])
+    rows = np.moveaxis(_positions(x), axes, range(len(axes)))
+    partial = _partial_products(x, rows.reshape(-1, *eqn.outvars[0].aval.shape))
+    return None if partial is None else partial[-1]
+
+
+def _cumprod(eqn: Any, operands: list[Any]) -> Slope | None:
+    """Return the slope of the partial products along an axis."""
+    (x,), axis = operands, eqn.params["axis"]
+    rows = np.moveaxis(_positions(x), axis, 0)
+    partial = _partial_products(x, rows[::-1] if eqn.params["reverse"] else rows)
+    if partial is None:
+        return None
+    joined = np.arange(x.low.size).reshape(rows.shape)
+    joined = joined[::-1] if eqn.params["reverse"] else joined
+    return picked(partial, np.moveaxis(joined, 0, axis), 0.0)
+
+
+def _positions(x: Slope) -> Values:
+    return np.arange(x.low.size).reshape(x.low.shape)
+
+
+def _partial_products(x: Slope, rows: Values) -> list[Slope] | None:
+    """Return the products of the entries at the first positions, at the first two, and so on."""
+    if not 0 < len(rows) <= MAX_UNROLLED:
+        return None
+    entries = [picked([x], row, 0.0) for row in rows]
+    return list(itertools.accumulate(entries, multiplied))
+
+
 def _einsum(eqn: Any, extra: tuple[int, int]) -> str:
     """Return the einsum formula of a dot_general with `extra` axes in front of each side."""
     (of_left, of_right), (batch_left, batch_right) = eqn.params["dimension_numbers"]
@@ -169,6 +203,15 @@ def _dot_general(eqn: Any, operands: list[Any]) -> Slope:
     left, right = (lift(v, tuple(atom.aval.shape)) for v, atom in zip(operands, eqn.invars))
     x, y = ball(left), ball(right)
     value = times(_einsum(eqn, (0, 0)), x, y)
+    low, high = value.center - value.radius, value.center + value.radius
+    if operands[0] is operands[1] and value.center.ndim == 0:
+        # A sum of squares; its range is that of the squares where all entries meet themselves.
+        (of_left, of_right), _ = eqn.params["dimension_numbers"]
+        if tuple(of_left) == tuple(of_right):
+            ends = np.square(left.low), np.square(left.high)
+            has_zero = (left.low <= 0) & (left.high >= 0)
+            low = np.sum(np.where(has_zero, 0.0, np.minimum(*ends)))
+            high = np.sum(np.maximum(*ends))
     out = eqn.outvars[0].aval.size
 
     def by(side: Slope, spec: str, times: Callable[[str, Part], Ball]) -> Slope:
@@ -180,7 +223,7 @@ def _dot_general(eqn: Any, operands: list[Any]) -> Slope:
     by_left = by(left, _einsum(eqn, (1, 0)), lambda spec, part: times(spec, part, y))
     by_right = by(right, _einsum(eqn, (0, 1)), lambda spec, part: times(spec, x, part))
     parts = added(by_left, by_right)
-    return Slope(value.center - value.radius, value.center + value.radius, parts)
+    return Slope(low, high, parts)
 
 
 STRUCTURAL: dict[str, Rule] = {
@@ -188,5 +231,7 @@ STRUCTURAL: dict[str, Rule] = {
     **same_for(SUMMING, _summed),
     "reduce_max": _reduce_max,
     "reduce_min": _reduce_min,
+    "reduce_prod": _reduce_prod,
+    "cumprod": _cumprod,
     "dot_general": _dot_general,
 }
