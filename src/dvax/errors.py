@@ -88,6 +88,8 @@ class Problems(list[InputProblem]):
 
     def raise_any(self) -> None:
         """Raise an `InputError` if there are problems."""
+        if self.cause is not None and self.cause.problems == tuple(self):
+            raise self.cause  # with one traceback
         if self:
             raise InputError(*self) from self.cause
 

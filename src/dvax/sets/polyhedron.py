@@ -41,6 +41,9 @@ class Polyhedron(AbstractSet):
     active rows. A row that holds with equality counts as active, even with a zero multiplier. A
     change of one of several identical rows is distributed over all of them.
 
+    Each bound on a single unknown is a row here. With many of them and few other rows,
+    `dvax.sets.ConstrainedBox` is the same set with a faster projection.
+
     **Arguments:** `G`: an array of shape (rows, *shape of y), a matrix if y is a vector; `d`: a
     vector, whose entries may be +∞; `E`, `e`: equations of the same form, or None.
 
