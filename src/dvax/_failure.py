@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax import lax
 
 
 def nan_derivatives_where(failed: Any, outputs: Any, inputs: Any) -> Any:
@@ -29,6 +30,14 @@ def nan_derivatives_where(failed: Any, outputs: Any, inputs: Any) -> Any:
     )
 
 
+def nan_derivatives_if_used(failed: Any, outputs: list[jax.Array], inputs: Any) -> list[jax.Array]:
+    """Return `outputs` with NaN first derivatives if `failed` is true, and unchanged ones otherwise.
+
+    In reverse mode, an output on which the result does not depend contributes 0, not 0 · NaN.
+    """
+    return _marked_if_used(outputs, [v for v in jtu.tree_leaves(inputs) if _is_real(v)], failed)
+
+
 @jax.custom_jvp
 def _marked(outputs: list[Any], inputs: list[Any], failed: Any) -> list[Any]:
     return outputs
@@ -37,21 +46,55 @@ def _marked(outputs: list[Any], inputs: list[Any], failed: Any) -> list[Any]:
 @partial(_marked.defjvp, symbolic_zeros=True)
 def _(primals: tuple, tangents: tuple) -> tuple[list[Any], list[Any]]:
     outputs, inputs, failed = primals
+    values = _marked(outputs, inputs, failed)
+    output_tangents, total = _tangents(outputs, tangents)
+    if total is None:
+        return values, output_tangents
+    # The factor depends on the inputs in the same way, so that higher derivatives are NaN as well.
+    (nan,) = _marked([jnp.full_like(total, jnp.nan)], inputs, failed)
+    # Select on both sides of the product, since 0 · NaN is NaN in forward and in reverse mode.
+    nan_term = jnp.where(failed, jnp.where(failed, total, 0.0) * nan, 0.0)
+    return values, [leaf + nan_term.astype(leaf.dtype) for leaf in output_tangents]
+
+
+@jax.custom_jvp
+def _marked_if_used(outputs: list[Any], inputs: list[Any], failed: Any) -> list[Any]:
+    return outputs
+
+
+@partial(_marked_if_used.defjvp, symbolic_zeros=True)
+def _(primals: tuple, tangents: tuple) -> tuple[list[Any], list[Any]]:
+    outputs, inputs, failed = primals
+    values = _marked_if_used(outputs, inputs, failed)
+    output_tangents, total = _tangents(outputs, tangents)
+    if total is None:
+        return values, output_tangents
+    nan_term = _nan_of(jnp.where(failed, total, 0.0))
+    nan_term = jnp.where(failed, nan_term, 0.0)
+    return values, [leaf + nan_term.astype(leaf.dtype) for leaf in output_tangents]
+
+
+def _tangents(outputs: list[Any], tangents: tuple) -> tuple[list[Any], Any]:
+    """Return the tangents of the outputs, and the sum of those of the inputs, None if all are zero."""
     output_tangents, input_tangents, _ = tangents
     nonzero = [tangent for tangent in input_tangents if not _is_zero(tangent)]
-    values = _marked(outputs, inputs, failed)
     output_tangents = [
         jnp.zeros(leaf.shape, leaf.dtype) if _is_zero(leaf) else leaf for leaf in output_tangents
     ]
     if not outputs or not nonzero:
-        return values, output_tangents
+        return output_tangents, None
     dtype = jnp.finfo(jnp.result_type(*outputs)).dtype
-    total = sum(jnp.sum(jnp.real(tangent)).astype(dtype) for tangent in nonzero)
-    # The factor depends on the inputs in the same way, so that higher derivatives are NaN as well.
-    (nan,) = _marked([jnp.asarray(jnp.nan, dtype)], inputs, failed)
-    # Select on both sides of the product, since 0 · NaN is NaN in forward and in reverse mode.
-    nan_term = jnp.where(failed, jnp.where(failed, total, 0.0) * nan, 0.0)
-    return values, [leaf + nan_term.astype(leaf.dtype) for leaf in output_tangents]
+    return output_tangents, sum(jnp.sum(jnp.real(tangent)).astype(dtype) for tangent in nonzero)
+
+
+def _nan_of(tangent: jax.Array) -> jax.Array:
+    """Return NaN, as a linear function whose transpose maps 0 to 0 and other numbers to NaN."""
+    return lax.custom_linear_solve(
+        lambda v: v,
+        tangent,
+        lambda _, v: v * jnp.nan,
+        lambda _, cotangent: jnp.where(cotangent == 0, 0.0, cotangent * jnp.nan),
+    )
 
 
 def _is_zero(leaf: Any) -> bool:

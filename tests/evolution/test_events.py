@@ -481,6 +481,83 @@ def test_event_function_that_is_not_a_number_ends_the_run():
     assert caught.value.solution.result == dvax.RESULTS.event_nonfinite
 
 
+@once
+def stuck() -> dvax.Problem:
+    """A motor that friction, smooth in a layer of width args, brings to rest."""
+    return dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-1.0, 1.0),
+        control_space=dvax.spaces.Euclidean(()),
+        f=lambda t, x, u, args: jnp.stack([x[V], -0.9 * x[X] - 20.0 * u]),
+        h=lambda t, x, u, args: x[V] / args,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [dvax.ExpRosenbrock(), dvax.ETD4RK()], ids=["rosenbrock", "etd"])
+def test_function_that_decays_to_its_rounding_errors_has_few_events(method):
+    """It is zero up to rounding, in places with thousands of changes of sign in a step."""
+    for layer in (1.0, 0.02):
+        for tol in (1e-5, 1e-7, 1e-9):
+            problem, x0 = stuck(), jnp.array([0.4, 0.0])
+            options = dict(rtol=tol, atol=1e-2 * tol, method=method)
+            sol = dvax.solve(problem, x0, 0.0, 80.0, layer, events=[component(V)], **options)
+            plain = dvax.solve(problem, x0, 0.0, 80.0, layer, **options)
+            # It starts at rest, and creeps to zero without a reversal.
+            assert len(sol.events.ts) <= 3
+            assert int(sol.stats["steps"]) == int(plain.stats["steps"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [1.0, 1e-12, 1e9])
+@pytest.mark.parametrize("decay", [0.3, 1.5])
+def test_every_zero_of_a_damped_oscillation_above_its_rounding_is_found(scale, decay):
+    """In any unit of the event function: x = e^{−dt} cos t, whose zeros are those of cos t. The method
+    is exact for it."""
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1.0),
+        control_space=dvax.spaces.Euclidean(()),
+        f=lambda t, x, u, args: jnp.stack([-args * x[0] - x[1] + 0.0 * u, x[0] - args * x[1]]),
+        h=lambda t, x, u, args: -u,
+    )  # fmt: skip
+    event = dvax.Event(lambda t, x, u, args: scale * x[0])
+    sol = dvax.solve(problem, jnp.array([1.0, 0.0]), 0.0, 40.0, decay, rtol=1e-8, events=[event])
+    exact = (np.arange(13) + 0.5) * np.pi
+    found, count = np.asarray(sol.events.ts), int(np.sum(exact < 27.0 / decay))
+    assert count <= len(found) <= 13
+    assert np.abs(found[:count] - exact[:count]).max() <= 1e-6
+
+
+# x‴ = a from rest: x′ is zero at the start with zero slope. The time of that zero has no derivative.
+
+
+@once
+def from_rest() -> dvax.Problem:
+    return dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-1.0, 1.0),
+        control_space=dvax.spaces.Euclidean(()),
+        f=lambda t, x, u, args: jnp.stack([x[1], x[2], args + 0.0 * u]),
+        h=lambda t, x, u, args: -x[0],
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adjoint", ["reverse", "forward"])
+def test_a_time_without_a_derivative_leaves_those_of_other_results(adjoint):
+    rest, passed = component(1, name="rest"), component(0, 1 / 6, name="passed")
+    jacobian = jax.jacrev if adjoint == "reverse" else jax.jacfwd
+
+    def results(a):
+        sol = dvax.solve(
+            from_rest(), jnp.zeros(3), 0.0, 2.0, a, events=[rest, passed], adjoint=adjoint
+        )
+        return sol.events.ts[0], sol.events.ts[1], sol.events.xs[1, 2], sol.xs[-1, 0]
+
+    first, second, speed, last = jacobian(results)(1.0)
+    assert np.isnan(first)
+    # t = a^{−1/3}, x″ = at there, and x(2) = 8a/6.
+    np.testing.assert_allclose([second, speed, last], [-1 / 3, 2 / 3, 4 / 3], rtol=1e-6)
+
+
 # The search by itself: polynomials with given roots in a step of length 1.
 
 
@@ -493,16 +570,17 @@ def count_zeros(roots):
         return jax.jvp(values, (theta,), (jnp.ones_like(theta),))
 
     directions, touch, shortest = jnp.zeros(1, int), jnp.full(1, 1e-13), jnp.asarray(1e-9)
+    noise = jnp.zeros(1)
 
     def one(carry):
         walk, count = carry
-        walk = next_event(walk, at, directions, touch, shortest)
+        walk = next_event(walk, at, directions, touch, noise, shortest)
         count = count + walk.found.astype(int)
-        return _tree.where(walk.found, walk.onward(), walk), count
+        return _tree.where(walk.found, walk.onward(shortest), walk), count
 
     zero = jnp.asarray(0.0)
     # As in a run, which begins with a short step.
-    start = Walk.at(zero, *at(zero), jnp.asarray(1e-3)), jnp.asarray(0)
+    start = Walk.at(zero, *at(zero), jnp.asarray(1e-3), shortest), jnp.asarray(0)
     return jax.lax.while_loop(lambda carry: ~carry[0].ended, one, start)[1]
 
 

@@ -10,7 +10,9 @@ is shortened. In a resolved interval g reaches zero in two ways:
 
 Intervals with one of the two are divided until they are short. An extremum within `touch` of zero is
 one event, at the extremum: an error of that size would make it two zeros or none. Leaving zero is no
-event, so that a function that is zero on an interval has one event there.
+event, so that a function that is zero on an interval has one event there. In an interval in which a
+function stays within its `noise` it keeps its sign and has no event: one that decays to zero has none
+at its rounding errors.
 """
 
 from collections.abc import Callable
@@ -38,9 +40,9 @@ _VALUE_ERROR, _SLOPE_ERROR = 0.1, 0.5
 
 class Walk(NamedTuple):
     """The interval [a, b] in units of the step, with the values v and slopes d at its ends, the length
-    `reach` of the next interval, whether the values at b are `known`, and the results: whether an event
-    was `found`, which is in [a, b], or the walk `ended`: at the end of the step, or at a value vb that
-    is not finite."""
+    `reach` of the next interval, whether the values at b are `known`, which functions are `above` their
+    noise in the interval, and the results: whether an event was `found`, which is in [a, b], or the
+    walk `ended`: at the end of the step, or at a value vb that is not finite."""
 
     a: Any
     va: jax.Array
@@ -50,18 +52,20 @@ class Walk(NamedTuple):
     db: jax.Array
     reach: Any
     known: Any
+    above: jax.Array
     found: Any
     ended: Any
 
     @staticmethod
-    def at(a: Any, v: jax.Array, d: jax.Array, reach: Any) -> "Walk":
+    def at(a: Any, v: jax.Array, d: jax.Array, reach: Any, shortest: Any) -> "Walk":
         """Return the walk that starts at a."""
-        no = jnp.asarray(False)
-        return Walk(a, v, d, jnp.minimum(a + reach, 1.0), v, d, reach, no, no, a >= 1.0)
+        no, reach = jnp.asarray(False), jnp.maximum(reach, shortest)
+        b, above = jnp.minimum(a + reach, 1.0), jnp.zeros(v.shape, bool)
+        return Walk(a, v, d, b, v, d, reach, no, above, no, a >= 1.0)
 
-    def onward(self) -> "Walk":
+    def onward(self, shortest: Any) -> "Walk":
         """Return the walk behind an event that was found."""
-        return Walk.at(self.b, self.vb, self.db, RESTART * self.reach)
+        return Walk.at(self.b, self.vb, self.db, RESTART * self.reach, shortest)
 
 
 def next_event(
@@ -69,17 +73,20 @@ def next_event(
     at: Callable[[Any], tuple[jax.Array, jax.Array]],
     directions: jax.Array,
     touch: jax.Array,
+    noise: jax.Array,
     shortest: Any,
 ) -> Walk:
     """Continue the walk to the next event, or to the end of the step.
 
     `at(θ)` returns values and slopes; `shortest` is the length of the interval in which an event is
-    located.
+    located, and of the first one behind it.
     """
 
     def advance(s: Walk) -> Walk:
         m = jnp.where(s.known, s.a + DIVISION * (s.b - s.a), s.b)
         v, d = at(m)
+        above = jnp.where(s.known, s.above, jnp.abs(s.va) > noise) | (jnp.abs(v) > noise)
+        v, s = jnp.where(above, v, jnp.sign(s.va) * jnp.abs(v)), s._replace(above=above)
         divided = _divide(s, m, v, d, directions, touch, shortest)
         extended = s._replace(vb=v, db=d, known=jnp.asarray(True))
         # A value that is not finite has no sign, and no interval around it would be resolved.
@@ -116,10 +123,10 @@ def _divide(
     walk: Walk, m: Any, v: jax.Array, d: jax.Array, directions: Any, touch: Any, shortest: Any
 ) -> Walk:
     """Return the walk after the values v and d at m inside its interval."""
-    a, va, da, b, vb, db, reach, *_ = walk
+    a, va, da, b, vb, db, reach, _, above, *_ = walk
     h = b - a
     happens = lambda p, v, d, q, w, e: (  # noqa: E731
-        arrives(v, w, directions) | touches(v, d, w, e, q - p, directions, touch)
+        above & (arrives(v, w, directions) | touches(v, d, w, e, q - p, directions, touch))
     )
     # The cubic of Hermite: va + s(da h + s(c₂ + c₃ s)), s = (m − a)/h.
     s, rise = (m - a) / h, vb - va
@@ -155,6 +162,7 @@ def _divide(
         db=jnp.where(to_left, d, db),
         reach=reach,
         known=~onward,
+        above=above,
         found=found,
         ended=onward & (b >= 1.0),
     )

@@ -22,7 +22,7 @@ from jax import lax
 
 from .. import _tree
 from .._batch import any_lane
-from .._failure import nan_derivatives_where
+from .._failure import nan_derivatives_if_used
 from .._tree import Tree
 from .event import Event, Events
 from .event_search import RESTART, Walk, arrives, next_event, touches
@@ -43,6 +43,9 @@ _MIN_ULPS, _BRACKET_ULPS = 16, 4
 
 _TOUCH = 2.0
 """An extremum of g counts as zero within this many tolerances."""
+
+_ROUNDINGS = 1024.0
+"""Roundings of the largest value of a function, below which its value is not told from zero."""
 
 _ACCUMULATION = 8
 """Stops that follow each other by less than this many smallest distances are taken to accumulate."""
@@ -122,6 +125,11 @@ class EventWatch(eqx.Module):
     @property
     def _resets(self) -> list[int]:
         return [k for k, event in enumerate(self.events) if event.reset is not None]
+
+    def _noise(self, sizes: jax.Array) -> jax.Array:
+        """Return the values of the functions, given their largest ones, that are not told from zero: 0
+        for an event that ends a step, since none of those may be missed."""
+        return jnp.where(self._stops, 0.0, _ROUNDINGS * jnp.finfo(sizes.dtype).eps * sizes)
 
     def values(self, flow: Flow, t: Any, x: Tree, guess: Tree | None) -> jax.Array:
         """Return the values of all functions."""
@@ -286,13 +294,15 @@ class EventWatch(eqx.Module):
 
         touch = _TOUCH * (self.atol + self.rtol * watched.sizes)
         ulp = jnp.maximum(_ulp(t0), _ulp(end)) / h + jnp.finfo(t0.dtype).eps
-        limits = self._directions, touch, jnp.maximum(_BRACKET, _BRACKET_ULPS * ulp)
+        shortest = jnp.maximum(_BRACKET, _BRACKET_ULPS * ulp)
+        limits = self._directions, touch, self._noise(watched.sizes), shortest
         width = _width(t0, end)
 
         def happens(walk: Walk) -> tuple[jax.Array, jax.Array]:
             arrived = arrives(walk.va, walk.vb, self._directions)
             near = touches(walk.va, walk.da, walk.vb, walk.db, walk.b - walk.a, *limits[:2])
-            return walk.found & (arrived | near), jnp.where(near & ~arrived, 0.0, width)
+            fired = walk.found & walk.above & (arrived | near)
+            return fired, jnp.where(near & ~arrived, 0.0, width)
 
         def one(carry: tuple[Walk, Rows, Any]) -> tuple[Walk, Rows, Any]:
             walk, table, count = carry
@@ -301,14 +311,18 @@ class EventWatch(eqx.Module):
             onward = walk.found & ~jnp.any(fired & self._stops)
             row = Rows(t0 + walk.b * h, -1, None, None, widths, None)
             table, count = self._put(table, fired & onward, count, row)
-            return _tree.where(onward, walk.onward(), walk), table, count
+            return _tree.where(onward, walk.onward(shortest), walk), table, count
+
+        def goes_on(carry: tuple[Walk, Rows, Any]) -> Any:
+            walk, _, count = carry
+            return ~(walk.found | walk.ended) & (count <= self.max_events)
 
         reach = jnp.minimum(watched.reach / h, 1.0)
-        first = Walk.at(jnp.zeros_like(t0), watched.values, watched.slopes * h, reach)
+        first = Walk.at(jnp.zeros_like(t0), watched.values, watched.slopes * h, reach, shortest)
         first = first._replace(ended=~active)
         table = watched.rows._replace(step=None, at_end=None, x=None)
         carry = first, table, watched.count
-        walk, table, count = lax.while_loop(lambda c: ~(c[0].found | c[0].ended), one, carry)
+        walk, table, count = lax.while_loop(goes_on, one, carry)
         return walk, *happens(walk), table, count
 
     def _fill(
@@ -395,7 +409,8 @@ class EventWatch(eqx.Module):
         s, exists = lax.fori_loop(0, 2, newton, (jnp.zeros_like(t), jnp.asarray(True)))
         exists &= jnp.abs(s) <= 2.0 * width
         s = jnp.where(fired & exists, s, 0.0)
-        return nan_derivatives_where(fired & ~exists, s, (flow, t, x))
+        (s,) = nan_derivatives_if_used(fired & ~exists, [s], (flow, t, x))
+        return s
 
     def fired(self, rows: Rows, count: Any, step: Any) -> tuple[jax.Array, jax.Array]:
         """Return which events happened at the end of a step, and their widths."""
