@@ -486,9 +486,12 @@ def _tuple_of_numbers(x: Tree) -> InputProblem:
 def _shape_fix(name: str, out: Tree, element: Tree, space: str) -> str:
     if isinstance(out, list | tuple) and not isinstance(element, tuple):
         return f"Join the components: return jnp.stack([...]) from {name}"
-    fix = f"Return that shape from {name}, or pass {space}_space= to dvax.Problem"
     shape = getattr(out, "shape", None)
-    given = shape is not None and space == "control"
+    if space == "state":
+        like_x = shape is not None and len(shape) == len(getattr(element, "shape", ()))
+        return f"Return that shape from {name}" + (f", or give x0 the shape {shape}" * like_x)
+    fix = f"Return that shape from {name}, or pass {space}_space= to dvax.Problem"
+    given = shape is not None
     return fix + (f", such as control_space=dvax.spaces.Euclidean({shape})" if given else "")
 
 
@@ -500,14 +503,17 @@ def _spans(reports: dict[str, Any]) -> list[tuple[Any, Any, str, str]]:
 def _check_spans(spans: list[tuple[Any, Any, str, str]], t0: Any, t1: Any) -> None:
     if not _tree.is_concrete(spans, t0, t1):
         return
+    places: dict[tuple[float, float, str], list[str]] = {}
+    for first, last, name, where in spans:
+        if float(first) > float(t0) or float(last) < float(t1):
+            places.setdefault((float(first), float(last), name), []).append(where)
     short = Problems(
         InputProblem(
-            f"a {name} in {where}",
-            f"data from t = {float(first):g} to {float(last):g}",
+            f"a {name} in {', '.join(dict.fromkeys(where))}",
+            f"data from t = {first:g} to {last:g}",
             f"it must cover [t0, t1] = [{float(t0):g}, {float(t1):g}]: data are never extrapolated",
             "Shorten the time span, or extend the data",
         )
-        for first, last, name, where in spans
-        if float(first) > float(t0) or float(last) < float(t1)
+        for (first, last, name), where in places.items()
     )
     short.raise_any()

@@ -225,10 +225,10 @@ def test_field_is_left_to_its_exponential_by_a_method_that_suits_the_tolerance()
 @pytest.mark.parametrize(
     ("A", "name"),
     [
-        (dvax.generators.Scalar(-1.0), "ETD4RK: the law couples 80 unknowns"),
+        (dvax.generators.Scalar(-1.0), "ETD4RK: f̃ couples 80 states"),
         pytest.param(
             dvax.generators.Dense(-np.eye(80)),
-            "DormandPrince: the law couples 80 unknowns",
+            "DormandPrince: f̃ couples 80 states",
             marks=pytest.mark.thorough,
         ),
         pytest.param(

@@ -171,7 +171,7 @@ def choose(
     states = "1 state" if facts.state == 1 else f"{facts.state} states"
     why = "f̃ acts entry by entry" if facts.is_field else states
     if facts.is_field and not facts.pointwise:
-        why = f"the law couples {facts.law} unknowns"
+        why = f"f̃ couples {facts.state} states"
         if not forms_matrices:
             # Half as many evaluations of the law a step, and e^(hA) costs little beside them.
             return _with_fallback(_ETD4RK, why, facts, tol)

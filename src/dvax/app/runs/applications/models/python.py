@@ -21,6 +21,7 @@ from dvax.app.runs.applications.own_parameters import PREFIX, Parameters, comple
 from dvax.errors import DvaxError, InputError, Problems, input_error
 from dvax.evolution import Solution
 from dvax.models import Model
+from dvax.theory.energy import MAX_UNKNOWNS
 
 
 class PythonSection(FramesKeys):
@@ -83,7 +84,8 @@ class PythonApplication(AbstractModelApplication):
             problems.raise_any()
             raise
         self.certified, self.place_of_figures = table.certify, f"{self.file.name}: figures"
-        self.energy, self.remedy = table.energy, _remedy(table.energy)
+        may_use_energy = not table.energy and _unknowns(model) <= MAX_UNKNOWNS
+        self.energy, self.remedy = table.energy, _remedy(may_use_energy)
         self.whole, self.bound_unit = model.figures is not None, _bound_unit(model)
         if table.energy:
             with problems.collect():
@@ -142,7 +144,13 @@ def _built(file: Path, function: str, build: Callable[[], Any]) -> Model:
     return model
 
 
-def _remedy(has_energy: bool) -> str:
+def _unknowns(model: Model) -> int:
+    """Return the number of entries of x and u."""
+    both = model.x0, model.problem.zero_control(model.x0)
+    return sum(np.size(leaf) for leaf in jtu.tree_leaves(both))
+
+
+def _remedy(may_use_energy: bool) -> str:
     """Return what to try for a smaller bound."""
     other = (
         "constants of a region (constants=dvax.verify(problem, x0, x=(low, high)).constants of "
@@ -150,7 +158,7 @@ def _remedy(has_energy: bool) -> str:
         "control_space= if u has the shape of x) or a shorter run"
     )
     linear = "energy = true in [model], if the derivatives of f and h do not change,"
-    first = "Try" if has_energy else f"Try {linear}"
+    first = f"Try {linear}" if may_use_energy else "Try"
     return (
         f"{first} {other}; the page Troubleshooting by message of the documentation "
         "(docs/howto/troubleshooting.md) says more."
