@@ -9,6 +9,7 @@ import pytest
 
 import dvax
 from dvax._jax.jaxprs import has_loop
+from dvax._jax.known_functions import operation
 from dvax.programs.partial_evaluation import PartialEvaluation
 
 
@@ -44,6 +45,13 @@ def test_values_and_derivatives_are_those_of_the_function(fn):
             found, expected = transform(partly)(*point), transform(fn)(*point)
             assert jax.tree.structure(found) == jax.tree.structure(expected)
             assert all(map(np.allclose, jax.tree.leaves(found), jax.tree.leaves(expected)))
+
+
+def test_a_table_stays_the_function_that_other_rules_know():
+    table = dvax.signals.Table(np.arange(4.0), np.array([0.0, 2.0, 1.0, 3.0]))
+    part = PartialEvaluation.of(lambda t: dvax.sets.Box(0.0, table(t)), jnp.zeros(()))
+    names = [operation(eqn) for eqn in jax.make_jaxpr(part)(1.0).eqns]
+    assert "dvax_linear_table" in names
 
 
 def test_what_does_not_depend_on_t_is_computed_before():

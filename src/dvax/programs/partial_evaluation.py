@@ -1,8 +1,8 @@
 """Partial evaluation: the part of a function of t that does not depend on t is computed once.
 
 Operations on constants alone are computed where the function is evaluated partially; those that depend
-on t are kept as a list, and run at each call. Calls are entered, except those with a derivative rule of
-their own, which stay one operation, as loops and conditions do.
+on t are kept as a list, and run at each call. A call of a function, a loop or a condition is one
+operation: some functions have rules or derivatives of their own.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.tree_util as jtu
 
-from .._jax.jaxprs import CUSTOM, bind
+from .._jax.jaxprs import CALLS, bind
 from .._tree import Tree
 from .interpreter import Domain, interpret
 
@@ -77,7 +77,7 @@ class PartialEvaluation(eqx.Module):
             return results
 
         domain = Domain(
-            rules=dict.fromkeys(CUSTOM, keep),
+            rules=dict.fromkeys(CALLS, keep),
             is_abstract=lambda value: isinstance(value, _Later),
             unknown=keep,
         )
