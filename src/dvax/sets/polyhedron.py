@@ -160,7 +160,7 @@ class _Reduced(NamedTuple):
         return self.onto_null_space(point - self.base - times(self.back, residual))
 
 
-def _reduce(root: jax.Array, G: jax.Array, d: jax.Array, E: jax.Array, e: jax.Array) -> _Reduced:
+def _reduce(root: jax.Array, G: Any, d: Any, E: Any, e: Any) -> _Reduced:
     solvable = jnp.all(d > -jnp.inf)
     # A row without a bound is never active.
     has_bound = d != jnp.inf
@@ -189,7 +189,7 @@ def _reduce(root: jax.Array, G: jax.Array, d: jax.Array, E: jax.Array, e: jax.Ar
 
 
 @jax.custom_jvp
-def _nearest(z: jax.Array, *data: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+def _nearest(z: jax.Array, *data: Any) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Return (projection, 1 for active rows of G and else 0, multipliers, B), given the fields of a
     `_Reduced`.
 
@@ -224,7 +224,7 @@ def _is_none(node: Any) -> bool:
 def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
     y, active, multiplier, inverse = _nearest(*primals)
 
-    def project_on_face(z: jax.Array, *data: jax.Array) -> jax.Array:
+    def project_on_face(z: jax.Array, *data: Any) -> jax.Array:
         K = _Reduced(*data)
         rows, bounds = (
             jnp.where(active[:, None] > 0, K.rows, 0.0),
