@@ -88,10 +88,12 @@ class Problems(list[InputProblem]):
 
     def raise_any(self) -> None:
         """Raise an `InputError` if there are problems."""
-        if self.cause is not None and self.cause.problems == tuple(self):
-            raise self.cause  # with one traceback
+        cause = self.cause
+        if cause is not None and cause.problems == tuple(self):
+            # One traceback, without the notes that JAX adds to an error.
+            raise InputError(*self).with_traceback(cause.__traceback__) from cause.__cause__
         if self:
-            raise InputError(*self) from self.cause
+            raise InputError(*self) from cause
 
 
 @dataclass(frozen=True)
