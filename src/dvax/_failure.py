@@ -5,6 +5,7 @@ the solution. NaN values do not ensure NaN derivatives: a loop without iteration
 masks an entry, replaces a NaN cotangent by 0.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -46,15 +47,12 @@ def _marked(outputs: list[Any], inputs: list[Any], failed: Any) -> list[Any]:
 @partial(_marked.defjvp, symbolic_zeros=True)
 def _(primals: tuple, tangents: tuple) -> tuple[list[Any], list[Any]]:
     outputs, inputs, failed = primals
-    values = _marked(outputs, inputs, failed)
-    output_tangents, total = _tangents(outputs, tangents)
-    if total is None:
-        return values, output_tangents
-    # The factor depends on the inputs in the same way, so that higher derivatives are NaN as well.
-    (nan,) = _marked([jnp.full_like(total, jnp.nan)], inputs, failed)
-    # Select on both sides of the product, since 0 · NaN is NaN in forward and in reverse mode.
-    nan_term = jnp.where(failed, jnp.where(failed, total, 0.0) * nan, 0.0)
-    return values, [leaf + nan_term.astype(leaf.dtype) for leaf in output_tangents]
+
+    def times_nan(total: jax.Array) -> jax.Array:
+        # The factor depends on the inputs in the same way, so that higher derivatives are NaN as well.
+        return total * _marked([jnp.full_like(total, jnp.nan)], inputs, failed)[0]
+
+    return _marked(*primals), _with_nan(outputs, failed, tangents, times_nan)
 
 
 @jax.custom_jvp
@@ -64,27 +62,25 @@ def _marked_if_used(outputs: list[Any], inputs: list[Any], failed: Any) -> list[
 
 @partial(_marked_if_used.defjvp, symbolic_zeros=True)
 def _(primals: tuple, tangents: tuple) -> tuple[list[Any], list[Any]]:
-    outputs, inputs, failed = primals
-    values = _marked_if_used(outputs, inputs, failed)
-    output_tangents, total = _tangents(outputs, tangents)
-    if total is None:
-        return values, output_tangents
-    nan_term = _nan_of(jnp.where(failed, total, 0.0))
-    nan_term = jnp.where(failed, nan_term, 0.0)
-    return values, [leaf + nan_term.astype(leaf.dtype) for leaf in output_tangents]
+    return _marked_if_used(*primals), _with_nan(primals[0], primals[2], tangents, _nan_of)
 
 
-def _tangents(outputs: list[Any], tangents: tuple) -> tuple[list[Any], Any]:
-    """Return the tangents of the outputs, and the sum of those of the inputs, None if all are zero."""
+def _with_nan(
+    outputs: list[Any], failed: Any, tangents: tuple, nan_of: Callable[[jax.Array], jax.Array]
+) -> list[Any]:
+    """Return the tangents of the outputs; if `failed`, plus nan_of(the sum of those of the inputs)."""
     output_tangents, input_tangents, _ = tangents
     nonzero = [tangent for tangent in input_tangents if not _is_zero(tangent)]
     output_tangents = [
         jnp.zeros(leaf.shape, leaf.dtype) if _is_zero(leaf) else leaf for leaf in output_tangents
     ]
     if not outputs or not nonzero:
-        return output_tangents, None
+        return output_tangents
     dtype = jnp.finfo(jnp.result_type(*outputs)).dtype
-    return output_tangents, sum(jnp.sum(jnp.real(tangent)).astype(dtype) for tangent in nonzero)
+    total = sum(jnp.sum(jnp.real(tangent)).astype(dtype) for tangent in nonzero)
+    # Select on both sides, since 0 · NaN is NaN in forward and in reverse mode.
+    nan_term = jnp.where(failed, nan_of(jnp.where(failed, total, 0.0)), 0.0)
+    return [leaf + nan_term.astype(leaf.dtype) for leaf in output_tangents]
 
 
 def _nan_of(tangent: jax.Array) -> jax.Array:

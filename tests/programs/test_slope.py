@@ -196,6 +196,7 @@ def test_slope_encloses_values_and_difference_quotients(name):
         lambda v: jnp.round(3.0 * v),
         lambda v: jnp.fmod(v, 0.5),
         lambda v: v % 3.0,
+        lambda v: jnp.fmod(v, 0.0),
         lambda v: jnp.real(jnp.fft.fft(v)),
         lambda v: jnp.arctan2(v, v[::-1]),
         lambda v: jnp.arctan2(v, -1.0),

@@ -146,6 +146,8 @@ def _remainder(eqn: Any, operands: list[Any]) -> Slope | None:
     if c.parts or not np.array_equal(c.low, c.high) or not is_real(eqn.outvars[0].aval):
         return None
     length = np.abs(c.low)
+    if not (length > 0).all():
+        return None
     low, high = np.fmod(x.low, length), np.fmod(x.high, length)
     # The remainder is exact, so that the quotients are integers up to a rounding.
     first, last = np.round((x.low - low) / length), np.round((x.high - high) / length)
