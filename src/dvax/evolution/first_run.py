@@ -117,7 +117,7 @@ def _warn_of_small_states(
     largest = max(_norm(weights, x) for x in (x0, *map(row, rows)))
     if not 0.0 < largest < atol / _SHARE:
         return
-    if len(ts) and largest <= _rounding(problem, args, t0, ts[-1], row(-1)):
+    if len(ts) and _is_zero(problem, args, x0, [ts[k] for k in rows]):
         return
     warnings.warn(
         f"atol = {atol:g} hides the solution: the norm of x is at most {largest:.3g} at t0 and at "
@@ -127,20 +127,28 @@ def _warn_of_small_states(
     )
 
 
-def _rounding(problem: Problem, args: Any, t0: Any, t: Any, x: Tree) -> float:
-    """Return the size of states that rounding errors of u cause from t0 to t, where the terms of f
-    cancel."""
+def _is_zero(problem: Problem, args: Any, x0: Tree, ts: Any) -> bool:
+    """Return whether x = 0 is the solution up to rounding: x0 = 0, and at each time of `ts` the terms
+    of f̃(t, 0) cancel. A method may amplify these rounding errors up to the tolerance."""
+    x = jtu.tree_map(jnp.zeros_like, x0)
+    weights = problem.spaces(x)[0].weights()
+    if _norm(weights, x0) > 0.0:
+        return False
 
     @jax.jit
-    def effect(u: Tree) -> Tree:
-        return jax.jvp(lambda u: problem.f(t, x, u, args), (u,), (u,))[1]
+    def rate(t: Any, u: Tree) -> Any:
+        """Return f(t, 0, u) and the part of it that u causes."""
+        return jax.jvp(lambda u: problem.f(t, x, u, args), (u,), (u,))
 
+    roundings = _ROUNDINGS * float(jnp.finfo(_tree.dtype(x)).eps)
     try:
-        change = effect(problem.response(t, x, args))
+        for t in ts:
+            value, caused = rate(t, problem.response(t, x, args))
+            if not _norm(weights, value) <= roundings * _norm(weights, caused):
+                return False
     except SolveError:
-        return 0.0
-    size = _norm(problem.spaces(x)[0].weights(), change) * float(t - t0)
-    return _ROUNDINGS * float(jnp.finfo(_tree.dtype(x)).eps) * size
+        return False
+    return True
 
 
 def _norm(weights: Tree, x: Tree) -> float:
