@@ -85,6 +85,7 @@ def test_the_report_says_that_code_ran_and_draws_the_variables_in_order(outcome)
     assert panels.index("'depth") < panels.index("'force")
     manifest = json.loads((outcome.directory / "manifest.json").read_text())
     assert "own.py" in manifest["data"] and manifest["fit"] == "a problem of your own: own.py"
+    assert manifest["title"] == "build, own"
 
 
 @pytest.mark.thorough

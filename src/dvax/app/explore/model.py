@@ -61,7 +61,7 @@ class ModelSubject(AbstractSubject):
 
     def __init__(self, config: ModelConfig, allow_outside: bool):
         self.config, self._allow_outside = config, allow_outside
-        self.title = config.model.own.title or f"{config.name}, {config.source.stem}"
+        self.title = config.title
         self.subtitle = f"model {config.name}, {config.model.fit}"
         self.parameters = sliders(config)
         self.planes, self.exports = (), ("configuration", "code")

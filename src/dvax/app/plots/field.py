@@ -1,4 +1,4 @@
-"""A field over a line: its map over space and time, and its profile at one time."""
+"""A field over a line, or the entries of a vector: a map over time, and a profile at one time."""
 
 from collections.abc import Sequence
 
@@ -25,13 +25,14 @@ def field_pictures(
     label_unit: str | None = None,
 ) -> list[Picture]:
     """Return the map of `values` (times, places), and the profile over the places, whose time a slider
-    chooses. Without `places` the entries are numbered; `references` are curves beside the profile, and
-    `label_unit` is the unit beside the slider if it is not `time_unit`."""
+    chooses. Without `places` they are the entries of a vector, by their numbers; `references` are
+    curves beside the profile, and `label_unit` is the unit beside the slider if it is not `time_unit`.
+    """
     entries = np.arange(values.shape[1]) if places is None else places
     panel = MapPanel(times, values, upward.words, across.title, upward.unit, 1.2, places)
     edges_of_time, edges_of_place, means = panel.cells()
     whole = panels_picture(
-        key, f"{title} over space and time",
+        key, f"{title} over {'entries' if places is None else 'space'} and time",
         "Time to the right; a line marks the time of the profile below, and a click chooses it.",
         [panel], "time", time_unit,
     )  # fmt: skip

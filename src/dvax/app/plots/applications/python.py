@@ -1,4 +1,5 @@
-"""Pictures of a model that has none of its own: its variables over time, a panel a unit."""
+"""Pictures of a model that has none of its own: its variables over time, a panel for each unit and
+each numbered name."""
 
 from collections.abc import Mapping
 
@@ -19,7 +20,7 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
     largest entries."""
     time = data["time"]
     t, unit = time.values, time.unit
-    by_unit: dict[str, list[tuple[str, np.ndarray]]] = {}
+    groups: dict[tuple[str, str], list[tuple[str, np.ndarray]]] = {}
     arrays: list[Panel] = []
     fields: list[tuple[str, np.ndarray, Axis]] = []
     for name, variable in data.items():
@@ -27,26 +28,27 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
         if name in ("time", "error_bound") or len(values) != len(t):
             continue
         if values.ndim == 1:
-            by_unit.setdefault(variable.unit, []).append((name, values))
+            groups.setdefault((variable.unit, _numbered(name)), []).append((name, values))
         elif values.ndim == 2 and len(t) > 1 and values.shape[1] > _CURVES:
             fields.append((name, values, Axis(name, variable.unit)))
         else:
             arrays.append(_extremes(t, name, values.reshape(len(t), -1), variable.unit))
-    for unit_of, series in list(by_unit.items()):
+    for (unit_of, word), series in list(groups.items()):
         if len(series) > _MOST_CURVES and len(t) > 1:
-            names = [name for name, _ in by_unit.pop(unit_of)]
+            names = [name for name, _ in groups.pop((unit_of, word))]
             values = np.stack([values for _, values in series], axis=1)
-            fields.append((f"{names[0]} to {names[-1]}", values, Axis("value", unit_of)))
+            fields.append((f"{names[0]} to {names[-1]}", values, Axis(word or "value", unit_of)))
     found: list[Picture] = []
     for k, (title, values, upward) in enumerate(fields):
         entry = Axis("entry", "")
         found += field_pictures(f"field-{k}", title, t, None, values, entry, upward, unit)
-    panels = [*_panels(t, by_unit), *arrays]
+    panels = [*_panels(t, groups), *arrays]
     if panels:
         found.append(
             panels_picture(
                 "histories", "States and responses over time",
-                "Each variable of the model; those of one unit share a panel.", panels, "time", unit,
+                "Each variable of the model; those of one unit share a panel, and so do those of one "
+                "name with numbers behind it.", panels, "time", unit,
             )
         )  # fmt: skip
     return found
@@ -61,9 +63,17 @@ def _extremes(t: np.ndarray, name: str, values: np.ndarray, unit: str) -> Panel:
     return Panel(curves, name, unit)
 
 
-def _panels(t: np.ndarray, by_unit: Mapping[str, list[tuple[str, np.ndarray]]]) -> list[Panel]:
+def _numbered(name: str) -> str:
+    """Return the name before the number of an entry: x of x0, x1, …; empty without a number."""
+    word = name.rstrip("0123456789")
+    return "" if word == name else word.rstrip("_")
+
+
+def _panels(
+    t: np.ndarray, groups: Mapping[tuple[str, str], list[tuple[str, np.ndarray]]]
+) -> list[Panel]:
     panels, drawn = [], 0
-    for unit, series in by_unit.items():
+    for (unit, word), series in groups.items():
         for begin in range(0, len(series), _CURVES):
             some = series[begin : begin + _CURVES]
             curves = [
@@ -71,6 +81,6 @@ def _panels(t: np.ndarray, by_unit: Mapping[str, list[tuple[str, np.ndarray]]]) 
                 for k, (name, values) in enumerate(some)
             ]
             drawn += len(some)
-            words = some[0][0] if len(some) == 1 else "value"
+            words = some[0][0] if len(some) == 1 else word or "value"
             panels.append(Panel(curves, words, unit))
     return panels

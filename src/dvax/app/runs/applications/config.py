@@ -54,6 +54,11 @@ class ModelConfig:
     paths: Mapping[str, Path]
 
     @property
+    def title(self) -> str:
+        """The title of the model, by default its name and the file of the configuration."""
+        return self.model.own.title or f"{self.model.label or self.name}, {self.source.stem}"
+
+    @property
     def wording(self) -> Wording:
         """The keys that the arguments of the model come from."""
         return wording_of(self.application, self.source.name)

@@ -96,6 +96,11 @@ class AbstractModelApplication(abc.ABC):
         return {}
 
     @property
+    def label(self) -> str:
+        """What a title calls the model, if not by its name in the configuration."""
+        return ""
+
+    @property
     @abc.abstractmethod
     def fit(self) -> str:
         """Whether the model is in the class: "exact", by what it is regularised, or why it is not."""

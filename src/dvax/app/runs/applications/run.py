@@ -45,8 +45,7 @@ class ApplicationRun(AbstractRun):
         super().__init__(config, tell)
         self.model, self.wording = config.model, config.wording
         known = self.model.describe()
-        title = self.model.own.title or f"{config.name}, {config.source.stem}"
-        about: dict[str, Any] = {"model": config.name, "title": title, "fit": self.model.fit}
+        about: dict[str, Any] = {"model": config.name, "title": config.title, "fit": self.model.fit}
         about |= {what: int(count) for what, count, _ in known.sizes if what in _COUNTS}
         rows = constant_rows(known.constants)
         self.facts = Facts(rows, known.assumptions, config.fingerprints(), known.notes, about)

@@ -104,6 +104,10 @@ class PythonApplication(AbstractModelApplication):
         return {} if made is None else parameters.files(made, table.parameters)
 
     @property
+    def label(self) -> str:
+        return self.table.function
+
+    @property
     def fit(self) -> str:
         return f"a problem of your own: {self.file.name}"
 

@@ -1,0 +1,33 @@
+"""Pictures of a user's problem: states and responses have a panel each, vectors a map."""
+
+import numpy as np
+
+from dvax.app.plots.applications.python import pictures
+from dvax.app.plots.store import Variable
+
+TIMES = np.linspace(0.0, 1.0, 5)
+
+
+def drawn(**series):
+    def variable(values, unit):
+        return Variable.of(values, ("time",), {"units": unit})
+
+    found = {name: variable(values, "m") for name, values in series.items()}
+    return pictures({"time": variable(TIMES, "s"), **found})
+
+
+def titles_of_axes(picture):
+    layout = picture.interactive["layout"]
+    axes = [name for name in layout if name.startswith("yaxis")]
+    return {layout[name]["title"]["text"].replace("<br>", " ") for name in axes}
+
+
+def test_numbered_names_have_a_panel_each_and_other_names_one_for_their_unit():
+    names = ("x0", "x1", "u0", "u1", "depth", "gap")
+    (picture,) = drawn(**{name: k + TIMES for k, name in enumerate(names)})
+    assert titles_of_axes(picture) == {"x [m]", "u [m]", "value [m]"}
+
+
+def test_entries_of_a_vector_are_not_called_places():
+    titles = [picture.title for picture in drawn(x=np.ones((5, 9)) * TIMES[:, None])]
+    assert titles == ["x over entries and time", "x at one time"]
