@@ -282,14 +282,14 @@ class Constants(eqx.Module):
             rows.append(
                 ("sharp_decay_rate", "−μ", self.sharp_decay_rate,
                  "one-sided, sharper than the paper", ("one_sided",),
-                 "rate of approach that takes the sign of the feedback into account")
+                 "rate of approach, if positive; it takes the sign of the feedback into account")
             )  # fmt: skip
         if self.energy is not None:
             overshoot, rate_of_energy = self.energy
             rows.append(
                 ("energy_rate", "−μ_Q", -_tree.host(rate_of_energy),
                  "energy norm, sharper than the paper", ("energy",),
-                 f"rate of approach with an overshoot of {_number(overshoot)}")
+                 f"rate of approach, if positive, with an overshoot of {_number(overshoot)}")
             )  # fmt: skip
         return [
             # Adding 0 turns −0 into 0.

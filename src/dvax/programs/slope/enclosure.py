@@ -29,13 +29,14 @@ from ..interpreter import Domain, Rule, interpret, operate
 from .chains import CURVED, Chains
 from .rules_choice import CHOICE, choice_rules
 from .rules_elementwise import ELEMENTWISE
+from .rules_exponentials import of_exponentials
 from .rules_functions import FUNCTIONS
 from .rules_programs import PROGRAMS, program_rules
 from .rules_scatter import SCATTER
 from .rules_structural import STRUCTURAL
 from .rules_tables import TABLES
 from .sources import Recorder
-from .values import MAX_ENTRIES, Part, Slope, TooLarge, entries, interval, is_slope
+from .values import MAX_ENTRIES, Part, Slope, TooLarge, entries, interval, is_slope, sharper
 
 RULES: dict[str, Rule] = {
     **ELEMENTWISE,
@@ -119,7 +120,12 @@ def _apply(
     values = [_constant_if_decided(_without_nan(x)) if is_slope(x) else x for x in results]
     if recorder is None:
         return values
-    return [recorder.result(x, eqn, operands, k) for k, x in enumerate(values)]
+    values = [recorder.result(x, eqn, operands, k) for k, x in enumerate(values)]
+    if is_slope(values[0]):
+        whole = of_exponentials(eqn, operands, values[0])
+        if whole is not None:
+            values[0] = sharper(values[0], _without_nan(whole))
+    return values
 
 
 _ARITHMETIC = {

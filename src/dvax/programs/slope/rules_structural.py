@@ -29,7 +29,7 @@ from .values import (
 
 def _rearranged(eqn: Any, operands: list[Any]) -> list[Slope] | None:
     """Return the slopes of an operation whose results consist of entries of its arguments."""
-    count = 1 if eqn.primitive.name in _INDEXED else len(operands)
+    count = 1 if eqn.primitive.name in INDEXED else len(operands)
     indices = operands[count:]
     if any(map(is_slope, indices)):
         return None
@@ -40,8 +40,17 @@ def _rearranged(eqn: Any, operands: list[Any]) -> list[Slope] | None:
     return [picked(x, source, math.nan if fill is None else fill) for source in sources]
 
 
-_INDEXED = {"gather", "dynamic_slice"}
+INDEXED = frozenset({"gather", "dynamic_slice"})
 """The first argument is rearranged, and the others are indices."""
+
+
+def positions(eqn: Any, operands: list[Any]) -> Values | None:
+    """Return for each entry of the result its position in the first argument, or −1 if it is a fill
+    value; None if that depends on the variables."""
+    indices = operands[1:]
+    if any(map(is_slope, indices)):
+        return None
+    return (_evaluate_sources(eqn, indices) if indices else _sources(eqn))[0]
 
 
 def _evaluate_sources(eqn: Any, indices: list[Any]) -> list[Values]:
@@ -227,7 +236,7 @@ def _dot_general(eqn: Any, operands: list[Any]) -> Slope:
 
 
 STRUCTURAL: dict[str, Rule] = {
-    **same_for(REARRANGING | JOINING | _INDEXED, _rearranged),
+    **same_for(REARRANGING | JOINING | INDEXED, _rearranged),
     **same_for(SUMMING, _summed),
     "reduce_max": _reduce_max,
     "reduce_min": _reduce_min,

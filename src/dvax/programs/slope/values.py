@@ -125,6 +125,19 @@ def added(x: Slope, y: Slope, sign: float = 1.0) -> dict[int, Part]:
     }
 
 
+def sharper(a: Slope, b: Slope) -> Slope:
+    """Return the sharper bounds of two enclosures of one value, entry by entry."""
+    parts = {}
+    for k in a.parts.keys() & b.parts.keys():
+        p, q = a.parts[k], b.parts[k]
+        if p.full != q.full:
+            p, q = (columns(part, a.low.size) for part in (p, q))
+        is_better = q.radius < p.radius
+        center, radius = (np.where(is_better, v, w) for v, w in zip(q[:2], p[:2], strict=True))
+        parts[k] = Part(center, radius, p.full)
+    return Slope(np.maximum(a.low, b.low), np.minimum(a.high, b.high), parts, a.source)
+
+
 def hull(a: Part, b: Part) -> Part:
     """Return the smallest part that contains two parts of the same form."""
     low = np.minimum(a.center - a.radius, b.center - b.radius)
