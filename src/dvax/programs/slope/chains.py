@@ -14,7 +14,7 @@ import numpy as np
 
 from ..interpreter import is_real
 from ..smooth import SMOOTH_NAMES
-from .values import Part, Slope, is_slope, mapped, scaled
+from .values import Part, Slope, is_slope, mapped, scaled, sharper
 
 CURVED = SMOOTH_NAMES | {"mul", "div", "max", "min", "clamp", "abs", "pow"}
 """The operations of a chain that are not affine."""
@@ -84,7 +84,7 @@ class Chains:
         bounded = np.isfinite(root.low) & np.isfinite(root.high)
         if count < 2 or not is_curved or not bounded.any():
             return value
-        ends = _cuts(root.low, root.high)
+        ends = cuts(root.low, root.high)
         if ends is None:
             return value
         ones = np.ones((len(ends) - 1, *root.low.shape))
@@ -95,21 +95,10 @@ class Chains:
         part = found.parts.get(0)
         center, radius = (np.zeros_like(ones),) * 2 if part is None else part[:2]
         down, up = np.min(center - radius, axis=0), np.max(center + radius, axis=0)
-        parts = {}
-        for k, new in mapped(root.parts, lambda part: scaled(part, down, up)).items():
-            old = value.parts[k]
-            if new.full != old.full:
-                return value
-            is_better = new.radius < old.radius
-            center, radius = (
-                np.where(is_better, a, b) for a, b in zip(new[:2], old[:2], strict=True)
-            )
-            parts[k] = Part(center, radius, old.full)
-        return value._replace(
-            low=np.maximum(value.low, np.min(found.low, axis=0)),
-            high=np.minimum(value.high, np.max(found.high, axis=0)),
-            parts=parts,
-        )
+        parts = mapped(root.parts, lambda part: scaled(part, down, up))
+        if any(part.full != value.parts[k].full for k, part in parts.items()):
+            return value
+        return sharper(value, Slope(np.min(found.low, axis=0), np.max(found.high, axis=0), parts))
 
     def _at(self, value: Slope, root: Slope, piece: Slope) -> Slope | None:
         """Return the value with `piece` in place of its root; None where a rule does not cover it."""
@@ -123,7 +112,7 @@ class Chains:
                 operands = [visit(one) for one in source.operands]
                 if any(one is None for one in operands):
                     return None
-                memo[source.key] = self._operate(_widened(source.eqn, len(piece.low)), operands)
+                memo[source.key] = self._operate(widened(source.eqn, piece.low.shape), operands)
             return memo[source.key]
 
         return visit(value)
@@ -138,10 +127,10 @@ def _is_same(a: Slope, b: Slope) -> bool:
     return same and np.array_equal(a.low, b.low) and np.array_equal(a.high, b.high)
 
 
-def _widened(eqn: Any, count: int) -> Any:
-    """Return an operation on arrays with one more axis in front."""
+def widened(eqn: Any, shape: tuple[int, ...]) -> Any:
+    """Return an elementwise operation on arrays of another shape, with one more axis in front."""
     aval = eqn.outvars[0].aval
-    wide = SimpleNamespace(shape=(count, *aval.shape), dtype=aval.dtype, ndim=aval.ndim + 1)
+    wide = SimpleNamespace(shape=shape, dtype=aval.dtype, ndim=len(shape))
     return SimpleNamespace(
         primitive=eqn.primitive,
         params=eqn.params,
@@ -150,7 +139,7 @@ def _widened(eqn: Any, count: int) -> Any:
     )
 
 
-def _cuts(low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
+def cuts(low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
     """Return the ends of the pieces between two bounds, along a new first axis; None for too many.
     Entries without bounds are one piece, and others of length zero."""
     shares = np.concatenate([_SHARES, 1.0 - _SHARES, np.arange(_UNIFORM + 1) / _UNIFORM])

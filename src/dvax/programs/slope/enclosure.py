@@ -27,6 +27,7 @@ from ..._jax.known_functions import operation
 from ..._tree import Tree
 from ..interpreter import Domain, Rule, interpret, operate
 from .chains import CURVED, Chains
+from .radial import RadialFunctions
 from .rules_choice import CHOICE, choice_rules
 from .rules_elementwise import ELEMENTWISE
 from .rules_exponentials import of_exponentials
@@ -79,9 +80,9 @@ class SlopeEnclosure:
         **Raises:** `TooLarge` if a matrix of derivatives is too large.
         """
         unknown: list[str] = []
-        recorder, chains = None, None
+        recorder, chains, radial = None, None, None
         if self._has_sources:
-            chains = Chains(_elementwise)
+            chains, radial = Chains(_elementwise), RadialFunctions(_elementwise)
             recorder = Recorder(lambda eqn, x: operate(eqn, x, domain), chains.tightened)
         inputs, k = [], 0
         leaves = jtu.tree_leaves(args, is_leaf=is_slope)
@@ -92,7 +93,7 @@ class SlopeEnclosure:
             k += differentiated
         run = lambda program, x: interpret(program, x, domain)  # noqa: E731
         rules = RULES | choice_rules(recorder) | program_rules(run)
-        apply = partial(_apply, recorder, chains)
+        apply = partial(_apply, recorder, chains, radial)
         domain = Domain(rules, is_slope, partial(_unknown, unknown), apply, _evaluate)
         with np.errstate(all="ignore"):
             results = interpret(self._program, inputs, domain)
@@ -109,7 +110,12 @@ def _elementwise(eqn: Any, operands: list[Any]) -> Slope | None:
 
 
 def _apply(
-    recorder: Recorder | None, chains: Chains | None, rule: Rule, eqn: Any, operands: list[Any]
+    recorder: Recorder | None,
+    chains: Chains | None,
+    radial: RadialFunctions | None,
+    rule: Rule,
+    eqn: Any,
+    operands: list[Any],
 ) -> list[Any] | None:
     if chains is not None:
         operands = chains.operands(eqn, operands)
@@ -118,13 +124,13 @@ def _apply(
         return None
     results = result if isinstance(result, list) else [result]
     values = [_constant_if_decided(_without_nan(x)) if is_slope(x) else x for x in results]
-    if recorder is None:
+    if recorder is None or radial is None:
         return values
     values = [recorder.result(x, eqn, operands, k) for k, x in enumerate(values)]
     if is_slope(values[0]):
-        whole = of_exponentials(eqn, operands, values[0])
-        if whole is not None:
-            values[0] = sharper(values[0], _without_nan(whole))
+        for whole in (of_exponentials(eqn, operands, values[0]), radial.of(values[0])):
+            if whole is not None:
+                values[0] = sharper(values[0], _without_nan(whole))
     return values
 
 
