@@ -28,7 +28,9 @@ def positive(
         number = _tree.as_float(value, place)
         holds = jnp.ndim(number) == 0
         if holds and _tree.is_concrete(number):
-            holds = bool(np.isfinite(number) and (number >= 0 if zero else number > 0))
+            # By NumPy: XLA takes numbers below 1e-308 for 0.
+            value = np.asarray(number)
+            holds = bool(np.isfinite(value) and (value >= 0 if zero else value > 0))
         if holds:
             return number
         rule = "it must be a number ≥ 0" if zero else "it must be a positive number"
