@@ -106,7 +106,7 @@ def test_result_does_not_depend_on_transformations_which_may_change_the_method()
     # Traced, a run cannot be followed by another: it goes on as it began.
     value, label = jax.jit(last)(4.0)
     assert label.startswith("DormandPrince: ")
-    # Steps cost more with their derivatives, and the program of another method pays off earlier.
+    # The derivative limits the steps too: more of them are left, and another method pays off.
     slope, label = jax.grad(last, has_aux=True)(4.0)
     assert label.startswith("ExpRosenbrock: stability limited the steps of DormandPrince")
     np.testing.assert_allclose(value, last(4.0)[0], atol=1e-5)
