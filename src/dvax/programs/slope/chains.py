@@ -14,7 +14,7 @@ import numpy as np
 
 from ..interpreter import is_real
 from ..smooth import SMOOTH_NAMES
-from .values import Part, Slope, is_slope, mapped, scaled, sharper
+from .values import Part, Slope, Values, is_slope, mapped, scaled, sharper
 
 CURVED = SMOOTH_NAMES | {"mul", "div", "max", "min", "clamp", "abs", "pow"}
 """The operations of a chain that are not affine."""
@@ -139,7 +139,7 @@ def widened(eqn: Any, shape: tuple[int, ...]) -> Any:
     )
 
 
-def cuts(low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
+def cuts(low: Values, high: Values) -> Values | None:
     """Return the ends of the pieces between two bounds, along a new first axis; None for too many.
     Entries without bounds are one piece, and others of length zero."""
     shares = np.concatenate([_SHARES, 1.0 - _SHARES, np.arange(_UNIFORM + 1) / _UNIFORM])

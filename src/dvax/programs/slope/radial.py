@@ -32,9 +32,9 @@ class _Length(NamedTuple):
 
     key: int
     vector: Slope
-    rows: np.ndarray
-    squared: np.ndarray
-    change: np.ndarray
+    rows: Values
+    squared: Values
+    change: Values
 
 
 class _Radial(NamedTuple):
@@ -45,7 +45,7 @@ class _Radial(NamedTuple):
 
     length: _Length
     g: Slope
-    places: np.ndarray
+    places: Values
     factor: Values | None
 
 

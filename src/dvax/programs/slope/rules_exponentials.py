@@ -32,14 +32,14 @@ class _Atom(NamedTuple):
     """The entries `places` of a value, times `factors`."""
 
     root: Slope
-    places: np.ndarray
-    factors: np.ndarray
+    places: Values
+    factors: Values
 
 
 class _Form(NamedTuple):
     """An array that is affine in other values: a constant plus the sum of the atoms."""
 
-    constant: np.ndarray
+    constant: Values
     atoms: tuple[_Atom, ...]
 
     def map(self, fn: Any) -> "_Form":
@@ -109,7 +109,7 @@ def _rearranged(eqn: Any, operands: tuple[Any, ...], form: _Form, behind: int = 
     if places is None or (places < 0).any():
         return None
 
-    def moved(v: np.ndarray) -> np.ndarray:
+    def moved(v: Values) -> Values:
         tail = v.shape[v.ndim - behind :] if behind else ()
         return v.reshape(-1, *tail)[places]
 
@@ -167,7 +167,7 @@ def _total(eqn: Any, operands: tuple[Any, ...], terms: _Form) -> _Form:
     """Return the terms of a sum over axes."""
     axes, of = tuple(eqn.params["axes"]), np.shape(operands[0].low)
 
-    def behind(v: np.ndarray) -> np.ndarray:
+    def behind(v: Values) -> Values:
         v = np.broadcast_to(v, (*of, v.shape[-1]))
         last = range(len(of) - len(axes), len(of))
         return np.moveaxis(v, axes, last).reshape(*eqn.outvars[0].aval.shape, -1)
