@@ -1,6 +1,7 @@
-"""Selection of the cases that run in `make test`; the others run in `make thorough`."""
+"""Selection of cases: those of `make test`, and those of `make thorough`, which ends within hours."""
 
-from collections.abc import Collection, Iterable, Set
+import os
+from collections.abc import Collection, Iterable, Sequence, Set
 from typing import Any
 
 import pytest
@@ -21,3 +22,12 @@ def mostly_thorough(cases: Iterable[Any], always: Collection[Any]) -> list[Any]:
         )
         for case in cases
     ]
+
+
+def spread(cases: Sequence[Any], number: int) -> list[Any]:
+    """`number` of the cases at equal distances, from the first one on; all of them with the environment
+    variable DVAX_ALL_CASES=1."""
+    assert 0 < number < len(cases), "take all cases"
+    if os.environ.get("DVAX_ALL_CASES") == "1":
+        return list(cases)
+    return [cases[k * len(cases) // number] for k in range(number)]

@@ -8,6 +8,7 @@ import scipy.integrate
 from tests.models.exact_circuit import TooManySamples, solve_exactly
 from tests.models.tableau import random_netlist, tableau
 from tests.oracles import affine_box_vi
+from tests.selection import mostly_thorough, spread
 
 import dvax
 from dvax.formats.netlist_sources import read_waveform
@@ -68,7 +69,7 @@ def test_stiff_diodes_of_small_resistance_succeed_at_the_defaults(case):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", spread(CASES, 41))
 def test_stiff_circuits_with_any_resistance_parasitics_and_source_succeed_at_the_defaults(case):
     agrees_at_any_resistance(case)
 
@@ -172,7 +173,7 @@ def stiffened(seed):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", spread(range(60), 15))
 def test_stiff_random_circuits_agree_with_an_independent_analysis(seed):
     text = stiffened(seed)
     sources = [line for line in text.splitlines() if line[0] in "VI"]
@@ -254,9 +255,7 @@ def drawn(rng, mild=False):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "seed", [0, 3, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(5, 300))]
-)
+@pytest.mark.parametrize("seed", mostly_thorough([0, 3, *spread(range(5, 300), 40)], [0, 3]))
 def test_circuits_of_any_kind_and_scale_succeed_at_the_defaults(seed):
     text, _, end, events = drawn(np.random.default_rng(seed))
     circuit, ts = Circuit(text), np.linspace(0.0, end, 21)
@@ -271,11 +270,7 @@ def test_circuits_of_any_kind_and_scale_succeed_at_the_defaults(seed):
 # ended after eight minutes.
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "seed",
-    [
-        25,
-        *(pytest.param(s, marks=pytest.mark.thorough) for s in (2, *range(26, 200)) if s != 153),
-    ],
+    "seed", mostly_thorough([25, *spread([s for s in (2, *range(26, 200)) if s != 153], 30)], [25])
 )
 def test_circuits_of_any_kind_and_scale_agree_with_hundred_digit_arithmetic(seed):
     text, source, end, _ = drawn(np.random.default_rng(seed))
@@ -295,9 +290,7 @@ def test_circuits_of_any_kind_and_scale_agree_with_hundred_digit_arithmetic(seed
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    "seed", [1, *(pytest.param(s, marks=pytest.mark.thorough) for s in range(2, 60) if s != 45)]
-)
+@pytest.mark.parametrize("seed", spread([s for s in range(1, 60) if s != 45], 15))
 def test_circuits_of_any_kind_agree_with_radau_on_an_independent_analysis(seed):
     text, source, end, _ = drawn(np.random.default_rng(1000 + seed), mild=True)
     circuit, ts = Circuit(text), np.linspace(0.0, end, 13)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import xarray
 from tests.app.plots.synthetic import Recipe, write_run
+from tests.selection import spread
 
 import dvax
 
@@ -41,7 +42,7 @@ TRIALS = [
 
 # `test_interrupt` has one signal in one command for `make test`.
 @pytest.mark.thorough
-@pytest.mark.parametrize(("command", "seconds", "number", "twice"), TRIALS)
+@pytest.mark.parametrize(("command", "seconds", "number", "twice"), spread(TRIALS, 61))
 def test_signal_at_any_time_ends_a_command_with_readable_results(
     tmp_path: Path, command: tuple[str, ...], seconds: float, number: signal.Signals, twice: bool
 ) -> None:
