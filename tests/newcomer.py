@@ -311,7 +311,7 @@ ARGUMENTS = {
     ),
     "args NaN in a dictionary": (
         lambda: of_f(lambda t, x, u, args: args["k"] * u, args={"b": 1.0, "k": nan}),
-        "(args); nan of ['k']",
+        "(args); nan in ['k']",
     ),
     "A NaN": (lambda: solve(problem(A=generators.Scalar(nan))), "Problem(A); nan"),
     "A NaN in a matrix": (

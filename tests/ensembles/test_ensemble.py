@@ -148,8 +148,30 @@ def test_first_member_with_an_empty_set_fails_alone():
     assert found.failed.tolist() == [True, False, False]
     exact = np.array([0.5, 0.25]) * -np.expm1(-1.0)
     np.testing.assert_allclose(found.values[1:], exact, rtol=1e-6)
+    assert "K is refused at t = 0" in found.failures()[0]
+    assert "lower = 0, upper = -1" in found.failures()[0]
     with pytest.raises(dvax.InputError, match="lower = 0, upper = -1"):
         found.member(0)
+
+
+@pytest.mark.slow
+def test_failures_name_data_that_are_not_finite_and_sets_that_are_empty():
+    problem = dvax.Problem(
+        A=generators.Scalar(-1.0), P=operators.Scaling(1.0),
+        K=lambda t, args: sets.ConstrainedBox(
+            jnp.zeros(2), jnp.ones(2), jnp.ones((1, 2)), args["need"] * jnp.ones(1), jnp.full(1, 9.0)
+        ),
+        f=lambda t, x, u, args: args["push"] - u, h=lambda t, x, u, args: x - u,
+    )  # fmt: skip
+    x0s, need, push = np.ones((5, 2)), np.array([0.5, 1.0, 3.0, 0.1, 0.5]), np.ones((5, 2))
+    x0s[0, 1], push[3, 0] = np.inf, np.nan
+    with pytest.warns(
+        UserWarning, match=r"3 of 5 members failed.*Its x0 is inf in component \(1,\)"
+    ):
+        told = dvax.ensemble(problem, x0s, 0.0, 1.0, {"need": need, "push": push}).failures()
+    assert set(told) == {0, 2, 3}
+    assert "K is refused at t = 0" in told[2] and "must not be empty" in told[2]
+    assert told[3].endswith("Its args contain nan in component (0,) of ['push'] (1 of 2 entries).")
 
 
 @pytest.mark.slow

@@ -43,7 +43,7 @@ def nothing_compiled(monkeypatch):
             None,
             "a Table in K",
         ),
-        (problem(lambda t, x, u, args: args["a"] * x), {"a": np.nan, "b": 1.0}, "nan of ['a']"),
+        (problem(lambda t, x, u, args: args["a"] * x), {"a": np.nan, "b": 1.0}, "nan in ['a']"),
         (
             problem(lambda t, x, u, args: args[1] * x),
             (1.0, jnp.array([1.0, np.nan])),

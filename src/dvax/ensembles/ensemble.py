@@ -13,7 +13,7 @@ from .. import _tree, _user_code
 from .._captured import current
 from .._tree import Tree
 from ..errors import InputError, Problems
-from ..evolution import RESULTS, Event, Implicit, PiecewiseLinear, Solution, solve
+from ..evolution import RESULTS, Event, Implicit, PiecewiseLinear, Solution
 from ..evolution.arguments import MAX_EVENTS, Arguments, bound_steps, check, warn_precision
 from ..evolution.auto import Choice, choose
 from ..evolution.event_arguments import check_events
@@ -22,6 +22,7 @@ from ..evolution.method import AbstractMethod
 from ..evolution.picard import Picard
 from ..problem import Problem
 from ..vi import AbstractSolver, Auto
+from .alone import Alone
 from .collect import Collected, collect, fold_rows
 from .inputs import Inputs
 from .members import Program, Static
@@ -216,14 +217,9 @@ def _ensemble(
             text += f"; {count} by {other.text()}"
     rows, moments = kept.rows, kept.moments
     assert rows is not None and moments is not None
-
-    def again(k: int) -> Solution:
-        x0, args, t0, t1, ts = inputs.member(k)
-        return solve(problem, x0, t0, t1, args, ts, **options)
-
     found = Ensemble(
         rows.observed, rows.failed, rows.result, rows.t, rows.steps, rows.rejected, switched, text,
-        moments, kept.folded, again,
+        moments, kept.folded, Alone(problem, inputs, options),
     )  # fmt: skip
     if failures := found.failures():
         first = next(iter(failures))

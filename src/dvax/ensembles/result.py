@@ -15,6 +15,7 @@ from .._tree import Tree
 from ..errors import input_error
 from ..evolution import RESULTS, Solution
 from ..evolution.dataset import leaves_of
+from .alone import Alone
 from .moments import Moments
 
 
@@ -83,7 +84,7 @@ class Ensemble:
     method: str
     moments: Moments
     folded: Mapping[str, Tree]
-    again: Callable[[int], Solution] | None = dataclasses.field(repr=False, default=None)
+    alone: Alone | None = dataclasses.field(repr=False, default=None)
 
     def __repr__(self) -> str:
         failed = int(self.failed.sum()) if _tree.is_concrete(self.failed) else "?"
@@ -238,13 +239,19 @@ class Ensemble:
         )  # fmt: skip
 
     def failures(self) -> dict[int, str]:
-        """Return the result of each failed member, in a sentence, by its number."""
+        """Return the result of each failed member, with the time that it reached and what is wrong with
+        its data, in sentences, by its number."""
         # Messages are looked up by arrays of JAX.
         each = lambda k: jtu.tree_map(lambda leaf: jnp.asarray(leaf[k]), self.results)  # noqa: E731
+        failed = np.flatnonzero(np.asarray(self.failed)).tolist()
+        nonfinite = np.asarray(self.results == RESULTS.nonfinite)
+        wrong: dict[int, str] = {}
+        if self.alone is not None:
+            wrong = self.alone.invalid_data({k: float(self.ts[k]) for k in failed if nonfinite[k]})
         return {
-            int(k): f"{RESULTS[each(k)]} Stopped at t = {float(self.ts[k]):.10g} after "
-            f"{int(self.steps[k])} steps."
-            for k in np.flatnonzero(np.asarray(self.failed))
+            k: f"{RESULTS[each(k)]} Stopped at t = {float(self.ts[k]):.10g} after "
+            f"{int(self.steps[k])} steps." + (f" {wrong[k]}" if k in wrong else "")
+            for k in failed
         }
 
     def member(self, k: int) -> Solution:
@@ -253,7 +260,7 @@ class Ensemble:
         **Raises:** `dvax.SolveError` with the cause, if it fails; `dvax.InputError` if the ensemble is
         part of a compiled program.
         """
-        if self.again is None:
+        if self.alone is None:
             raise input_error(
                 "Ensemble.member", "an ensemble inside a compiled program",
                 "its inputs have no values", "Call it outside of jax.jit and jax.grad",
@@ -263,11 +270,11 @@ class Ensemble:
                 "Ensemble.member(k)", str(k), f"members are numbered from 0 to {len(self) - 1}",
                 "Give such a number",
             )  # fmt: skip
-        return self.again(k)
+        return self.alone.solve(k)
 
 
 jtu.register_dataclass(
     Ensemble,
-    [f.name for f in dataclasses.fields(Ensemble) if f.name not in ("method", "again")],
-    ["method", "again"],
+    [f.name for f in dataclasses.fields(Ensemble) if f.name not in ("method", "alone")],
+    ["method", "alone"],
 )

@@ -41,13 +41,9 @@ def first_bad(tree: Tree, allow_infinite: bool = False) -> str:
             is_named = bool(path) and all(
                 isinstance(p, jtu.DictKey | jtu.SequenceKey) for p in path
             )
-            part = (
-                f" of {jtu.keystr(path)}"
-                if is_named
-                else f" of part {k}"
-                if len(leaves) > 1
-                else ""
-            )
-            place = f" in component {index}{part}" if index else part
-            return f"{array[index]}{place} ({int(bad.sum())} of {bad.size} entries)"
+            part = jtu.keystr(path) if is_named else f"part {k}" if len(leaves) > 1 else ""
+            places = (f"component {index}" if index else "", part)
+            place = " of ".join(text for text in places if text)
+            count = f" ({int(bad.sum())} of {bad.size} entries)" if bad.size > 1 else ""
+            return f"{array[index]}" + (f" in {place}" if place else "") + count
     return ""
