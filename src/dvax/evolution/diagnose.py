@@ -27,7 +27,6 @@ import numpy as np
 from .. import _tree
 from .._tree import Tree
 from ..errors import Fix, InputError, SolveError
-from .auto import FIELD
 from .implicit import Implicit
 from .jumps import find_discontinuity, find_jump
 from .method import AbstractMethod, ExpRosenbrock
@@ -91,7 +90,7 @@ def diagnose(solution: Any) -> Diagnosis:
         step = (t - t0) / max(steps, 1) or t1 - t0  # its steps are as long as its events are apart
     stop = Stop(
         setup, solution.flow, t, stats["x"], min(float(step), max(t1 - t, 0.0)), steps,
-        steps + rejected,
+        steps + rejected, ":" not in str(stats.get("method", ":")),
     )  # fmt: skip
     causes: list[Callable[[Stop], Diagnosis]] = []
     at_floor = stop.step <= 64.0 * max(stop.ulp, 5e-324)
@@ -387,9 +386,8 @@ def _max_steps(stop: Stop) -> Diagnosis:
             return Diagnosis(text, (looser, other))
         return Diagnosis(text, (other, looser))
     fixes = [Fix("max_steps", f"{_rounded_up(enough)}", "at this pace")]
-    size = sum(leaf.size for leaf in jtu.tree_leaves(stop.x))
-    if adaptive and method.order < 4 and size <= FIELD:
-        fixes += [Fix("method", "DormandPrince", "of order 5, which may take fewer steps")]
+    if adaptive and stop.is_method_named:
+        fixes += [Fix("", "", "Omit method=, so that dvax chooses one for this problem")]
     if adaptive and enough > _MANY_TIMES * stop.attempts:
         # Many times the work so far is the last thing to try.
         fixes = [*fixes[1:], looser, fixes[0]]

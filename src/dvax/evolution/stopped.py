@@ -31,7 +31,7 @@ class Stop(NamedTuple):
     """The last state of a failed run, as the tests for causes need it.
 
     `step` is the next step size, `steps` the number of accepted steps, and `attempts` the number of
-    accepted and rejected ones.
+    accepted and rejected ones; `is_method_named` says that the caller named the method.
     """
 
     setup: Setup
@@ -41,6 +41,7 @@ class Stop(NamedTuple):
     step: float
     steps: int
     attempts: int
+    is_method_named: bool
 
     @property
     def span(self) -> tuple[float, float]:
