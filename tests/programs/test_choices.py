@@ -51,6 +51,24 @@ CONTINUOUS = {
         lambda v: jnp.where(v > 0, v * jnp.where(v > -1, 1.0, 2.0), 0.0), 1.0,
     ),
     "called": (lambda v: jax.jit(lambda w: jnp.where(w > 0, w, 2.0 * w))(v) + v, 3.0),
+    "the first of several conditions": (
+        lambda v: jnp.select([v < 0.0, v < 1.0, v < 1.5], [0.0 * v, v, 2.0 * v - 1.0], 2.0), 2.0,
+    ),
+    "windows one beside the other": (
+        lambda v: jnp.select([v < 0, (v >= 0) & (v <= 1), v > 1], [0.0 * v, v, 2.0 * v - 1.0]), 2.0,
+    ),
+    "a condition and its opposite": (
+        lambda v: jnp.select([v[0] < v[1], v[0] >= v[1]], [v[1] * W, v[0] * W], 7.0),
+        float(np.abs(W).max()),
+    ),
+    "conditions of one number each": (
+        lambda v: jax.vmap(lambda s: jnp.select([s < -1.0, s < 1.0], [-1.0, s], 1.0))(v), 1.0,
+    ),
+    "a conditional for each entry": (
+        lambda v: jax.vmap(lambda s: jax.lax.cond(s > 0.5, lambda: 2.0 * s - 1.0, lambda: s - 0.5))(v),
+        2.0,
+    ),
+    "a number against an array": (lambda v: jnp.where(v[0] < W, v[0], W), 1.0),
     "function of the condition": (
         lambda v: jnp.where(jnp.sin(v) > 0, jnp.sin(v), 0.5 * jnp.sin(v)), 1.0,
     ),
@@ -79,6 +97,9 @@ DISCONTINUOUS = {
         v > 0, (v + 0.5).astype(int).astype(float) * v, 0.1 - v
     ),
     "the sum": lambda v: jnp.where(jnp.sum(v) > 0.1, v, 2.0 * v),
+    "a gap between windows": lambda v: jnp.select([v < 0, (v >= 0) & (v < 1), v > 1], [0 * v, v, v]),
+    "the first of two conditions": lambda v: jnp.select([v < 1.0, v < 0.0], [v, 2.0 * v], 0.0),
+    "opposites without the limit": lambda v: jnp.select([v < 0.3, v > 0.3], [v, v], 7.0),
     "equal to": lambda v: jnp.where(v == 0.5, 1.0, v),
 }  # fmt: skip
 
@@ -150,3 +171,45 @@ def test_nested_selections_take_bounded_work():
     enclosure = SlopeEnclosure(fn, (jnp.zeros(3),), (0,))
     part = enclosure(interval(np.full(3, -2.0), np.full(3, 2.0))).out.parts[0]
     assert np.max(np.abs(part.center) + part.radius) <= 1.0
+
+
+LIMITS = jnp.asarray([0.0, -1.5, 0.5])
+
+# Functions of (x, s) whose branches take other entries than their own. s selects: they may jump in it.
+MIXING = {
+    "a sum": lambda x, s: jnp.where(s < 1.0, jnp.sum(jnp.where(s < 1.0, 0.0, 9.0)), 0.0) * x,
+    "the entry before": lambda x, s: jnp.where(s < 1, jnp.roll(jnp.where(s < 1, 0.0, 9.0), 1), 0.0) * x,
+    "a sum of what is cut off": lambda x, s: jnp.where(s < 1, jnp.sum(jnp.maximum(s - 1, 0)), 0.0) * x,
+    "the largest": lambda x, s: jnp.where(s < 1.0, jnp.max(s), 0.0) * x,
+    "the condition of another row": lambda x, s: jnp.where(
+        (s < 1.0)[:, None], jnp.where((s < 1.0)[None, :], 0.0, 9.0), 0.0
+    ) @ x,
+    "a dead zone with a common factor": lambda x, s: jnp.where(
+        jnp.abs(x) <= 0.1, (0.1 - jnp.abs(x)) * x[0], 0.0
+    ),
+    "a dead zone with the sum": lambda x, s: jnp.where(
+        jnp.abs(x) <= 0.1, (0.1 - jnp.abs(x)) * jnp.sum(x), 0.0
+    ),
+    "a number against an array": lambda x, s: jnp.where(x[0] >= LIMITS, (x[0] - LIMITS) ** 2, 0.0 * x),
+    "the sign of a sum": lambda x, s: jnp.where(jnp.sum(s) > 0.0, jnp.sum(jnp.abs(s)) * x, x[::-1]),
+    "several conditions": lambda x, s: jnp.select(
+        [s < 0.0, s < 1.0], [jnp.sum(s) * x, jnp.max(s) * x], jnp.min(s) * x
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MIXING)
+def test_a_condition_says_nothing_about_other_entries(name):
+    fn = MIXING[name]
+    enclosure = SlopeEnclosure(fn, (jnp.zeros(3), jnp.zeros(3)), (0,))
+    rng = np.random.default_rng(11)
+    derivative = jax.jit(jax.vmap(jax.jacfwd(fn)))
+    for width in np.repeat([6.0, 1.5, 0.3], 8):
+        low = rng.uniform(-2.0, 2.0, (2, 3))
+        high = low + width * rng.uniform(0.0, 1.0, (2, 3))
+        out, unknown = enclosure(*map(interval, low, high))
+        center, radius = jacobian(out.parts[0])
+        points = rng.uniform(low[:, None], high[:, None], (2, 400, 3))
+        found = np.moveaxis(np.asarray(derivative(*points)), 1, 2)
+        assert unknown == () and np.all(np.abs(found - center) <= radius + 1e-12)

@@ -110,3 +110,43 @@ def test_a_quotient_without_exponentials_of_one_sum_has_the_bounds_of_its_operat
     out, part = slopes(fn, low, high)
     exact = np.asarray(jax.jacfwd(fn)(low).T)
     assert np.all(np.abs(exact - part.center) <= part.radius) and np.isfinite(out.high).all()
+
+
+# (function of one number, its derivative), where 1 − p is far below the rounding of 1
+TAILS = {
+    "softplus by hand": (lambda v: jnp.log1p(jnp.exp(v)), jax.nn.sigmoid),
+    "logaddexp of a constant": (lambda v: jnp.logaddexp(0.0, v), jax.nn.sigmoid),
+    "logaddexp with a constant": (lambda v: jnp.logaddexp(v, 0.0), jax.nn.sigmoid),
+    "share": (
+        lambda v: jnp.exp(-v) / (1.0 + jnp.exp(-v)),
+        lambda v: -jax.nn.sigmoid(v) * jax.nn.sigmoid(-v),
+    ),
+    "share beside two": (
+        lambda v: jax.nn.softmax(jnp.stack([jnp.zeros(3), v, v - 1.0]), axis=0)[0],
+        lambda v: -(p := jnp.exp(v) * (1 + jnp.exp(-1.0))) / (1 + p) ** 2,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TAILS)
+@pytest.mark.parametrize(("low", "high"), [(-60.0, -40.0), (-32.0, -31.0), (-700.0, -300.0)])
+def test_derivatives_in_the_tails_are_bounded_to_their_last_digits(name, low, high):
+    fn, derivative = TAILS[name]
+    box = interval(np.full(3, low), np.full(3, high))
+    part = columns(SlopeEnclosure(fn, (jnp.zeros(3),), (0,))(box).out.parts[0], 3)
+    for at in np.linspace(low, high, 7):
+        exact = float(derivative(at))
+        assert np.all(
+            np.abs(exact - np.diagonal(part.center)) <= np.diagonal(part.radius) * (1 + 1e-12)
+        )
+
+
+def test_averages_of_averages_stay_small_programs():
+    def fn(v):
+        total = jnp.exp(v)
+        for _ in range(12):
+            total = 0.5 * (total + total[::-1])
+        return jnp.log(total)
+
+    part = SlopeEnclosure(fn, (jnp.zeros(N),), (0,))(interval(-np.ones(N), np.ones(N))).out.parts[0]
+    assert np.isfinite(part.radius).all()

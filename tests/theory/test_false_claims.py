@@ -307,3 +307,39 @@ def test_verify_does_not_mistake_a_steep_function_or_rounding_for_a_jump(fn):
     system = problem(f=lambda t, x, u, args: fn(x) - u)
     found = dvax.verify(system, jnp.array([0.3, 0.2]), 0.0, 5.0, x=(-3.0, 3.0))
     assert found["ass:f_lipschitz"].status in ("proved", "estimated")
+
+
+@pytest.mark.slow
+def test_a_law_with_a_dead_zone_times_a_sum_is_not_proved_monotone():
+    """The condition on one entry was once applied to the sum too: γ = 0.55 was called proved,
+    while the symmetric part of ∂F has the eigenvalue −0.085."""
+    inside = lambda v: jnp.abs(v) <= 0.1  # noqa: E731
+    zone = lambda v: jnp.where(inside(v), (0.1 - jnp.abs(v)) * jnp.sum(v), 0.0)  # noqa: E731
+    system = problem(f=lambda t, x, u, a: 0.0 * x, h=lambda t, x, u, a: -zone(u - 0.5))
+    y = jnp.array([0.599466, 0.998102, 0.987523])
+    J = np.asarray(jax.jacfwd(lambda y: y + zone(y - 0.5))(y))
+    least = np.linalg.eigvalsh(0.5 * (J + J.T))[0]
+    assert least < -0.08
+    check = dvax.verify(system, jnp.zeros(3))
+    assert check["ass:strong_pseudomono"].status != "proved"
+    assert check.constants is None
+
+
+@pytest.mark.slow
+def test_switching_times_of_each_entry_do_not_hold_for_the_others():
+    rates = jnp.array([1.0, 2.0])
+    fast = lambda t, x, u, a: jnp.where(t * rates > 1.0, x, jnp.sum(t * rates) * x)  # noqa: E731
+    found = dvax.verify(problem(f=fast), jnp.zeros(2), 0.0, 1.0, x=(-1.0, 1.0))
+    assert float(found.constants.alpha_f) >= 3.0
+
+
+@pytest.mark.slow
+def test_a_sum_of_exponentials_beside_a_value_of_many_operations_is_bounded():
+    def deep(x):
+        for _ in range(70):
+            x = 0.5 * jnp.sin(x) + 0.1 * x
+        return x
+
+    system = problem(f=lambda t, x, u, a: deep(x) - jnp.log(1 + jnp.exp(x)))
+    found = dvax.verify(system, jnp.zeros(2), 0.0, 1.0, x=(-1.0, 1.0))
+    assert 0.731 <= float(found.constants.alpha_f) <= 0.74

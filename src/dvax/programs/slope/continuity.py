@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from ..interpreter import is_real
-from .sources import Source
+from .alignment import Axes, operand_axes, own_axes
+from .sources import COMPARISONS, Source, relation_of
 from .values import is_slope
 
 Terms = dict[frozenset[tuple[Any, int]], Any]
@@ -33,8 +34,6 @@ _EPS_FACTOR = 8
 
 _FLIPPED = {"lt", "le"}
 
-COMPARISONS = frozenset({"lt", "le", "gt", "ge"})
-
 
 class _NoProof(Exception):
     """The branches have no polynomials in this arithmetic."""
@@ -42,6 +41,12 @@ class _NoProof(Exception):
 
 def agree(which: Any, no: Any, yes: Any, shape: tuple[int, ...], eps: float) -> bool:
     """Return whether `no` = `yes` is proved wherever one of the comparisons in `which` switches."""
+    try:
+        a, b = (_Expansion(shape, {}, {}).of(v) for v in (no, yes))
+        if _differ_by_rounding(a, b, 0.0):
+            return True
+    except _NoProof:
+        pass
     if which.source is None:
         return False
     try:
@@ -53,17 +58,36 @@ def agree(which: Any, no: Any, yes: Any, shape: tuple[int, ...], eps: float) -> 
         return False
 
 
-def facts(source: Source | None, is_true: bool) -> list[tuple[Source, bool]]:
-    """Return the Boolean values, each with its value, that follow from the value of one of them."""
-    if source is None or source.eqn is None:
+def facts(source: Source | None, is_true: bool, axes: Axes) -> list[tuple[Source, bool, Axes]]:
+    """Return the Boolean values that follow from the value of one of them, with their own and axes."""
+    if source is None or source.eqn is None or axes is None:
         return []
     name = source.eqn.primitive.name
-    found = [(source, is_true)]
+    found: list[tuple[Source, bool, Axes]] = [(source, is_true, axes)]
     if name == "not":
         is_true = not is_true
-    if name in ("not", *_MOVING) or name == ("and" if is_true else "or"):
-        for operand in source.operands:
-            found += facts(operand.source, is_true) if is_slope(operand) else []
+    slopes = [v for v in source.operands if is_slope(v)]
+    follows = name in ("not", *_MOVING) or name == ("and" if is_true else "or")
+    if name in ("and", "or") and not follows and len(slopes) == 1:
+        # The other operand leaves the choice to this one where it is true in `and`, false in `or`.
+        (other,) = (v for v in source.operands if not is_slope(v))
+        follows = bool(np.all(np.asarray(other) == (name == "and")))
+    for operand in slopes if follows else []:
+        found += facts(operand.source, is_true, operand_axes(source.eqn, axes, operand))
+    return found
+
+
+def _choices(choice: Source, is_true: bool) -> dict[Any, bool]:
+    """Return what follows from a Boolean value: other ones by their keys, and relations."""
+    found: dict[Any, bool] = {}
+    whole = own_axes(choice.eqn.outvars[0].aval.shape) if choice.eqn is not None else None
+    for source, value, axes in facts(choice, is_true, whole):
+        if axes not in (whole, ()):
+            continue
+        found[source.key] = value
+        relation = relation_of(source)
+        if relation is not None:
+            found[relation[0]] = value == relation[1]
     return found
 
 
@@ -90,7 +114,7 @@ def _agree_at(
 ) -> bool:
     """Return whether the branches agree where the two sides of a comparison are equal."""
     v, w = comparison.operands
-    choices = [{s.key: value for s, value in facts(choice, c)} for c in (False, True)]
+    choices = [_choices(choice, is_true) for is_true in (False, True)]
 
     def is_proved(known: dict[int, Terms]) -> bool:
         expansions = [_Expansion(shape, known, own) for own in choices]
@@ -150,10 +174,10 @@ def modulus_argument(value: Any) -> Any:
 class _Expansion:
     """The expansion of values into polynomials, with some values given."""
 
-    def __init__(self, shape: tuple[int, ...], known: dict[int, Terms], choices: dict[int, bool]):
+    def __init__(self, shape: tuple[int, ...], known: dict[int, Terms], choices: dict[Any, bool]):
         self.shape, self.known, self.choices = shape, known, choices
         self._memo: dict[int, Terms] = dict(known)
-        self._depends: dict[int, bool] = dict.fromkeys((*known, *choices), True)
+        self._depends: dict[Any, bool] = dict.fromkeys((*known, *choices), True)
 
     def of(self, value: Any) -> Terms:
         """Return the polynomial of a value.
@@ -204,30 +228,55 @@ class _Expansion:
         if len(source.operands) != 3:
             raise _NoProof
         which, no, yes = source.operands
-        if is_slope(which):
-            if which.source is None:
+        choice = self._decided(which)
+        if choice is None:
+            # `jax.vmap` of `lax.cond` selects between a value and itself.
+            terms = self.of(no)
+            if not _differ_by_rounding(terms, self.of(yes), 0.0):
                 raise _NoProof
-            choice = self.choices.get(
-                _stripped(which.source).key, self.choices.get(which.source.key)
-            )
-            if choice is None:
-                choice = self._decide(_stripped(which.source))
-            return self.of(yes if choice else no)
-        if np.all(which) or not np.any(which):
-            return self.of(yes if np.all(which) else no)
-        raise _NoProof
+            return terms
+        return self.of(yes if choice else no)
 
-    def _decide(self, source: Source) -> bool:
-        """Return the result of a comparison that is the same in every entry."""
-        name = "" if source.eqn is None else source.eqn.primitive.name
-        if name not in COMPARISONS:
-            raise _NoProof
-        left, right = map(self.of, source.operands)
-        terms = _sum(left, right, -1)
+    def _chosen(self, which: Source) -> bool | None:
+        """Return a Boolean value that is given, None if it is not."""
+        inner = stripped(which)
+        for key in (inner.key, which.key):
+            if key in self.choices:
+                return self.choices[key]
+        relation = relation_of(inner)
+        if relation is None or relation[0] not in self.choices:
+            return None
+        return self.choices[relation[0]] == relation[1]
+
+    def _decided(self, value: Any) -> bool | None:
+        """Return a Boolean value that is the same in every entry, None if it is not known."""
+        if not is_slope(value):
+            return bool(np.all(value)) if np.all(value) or not np.any(value) else None
+        if value.source is None:
+            return None
+        given = self._chosen(value.source)
+        source = stripped(value.source)
+        if given is not None or source.eqn is None:
+            return given
+        name = source.eqn.primitive.name
+        if name in COMPARISONS:
+            return self._compared(name, *source.operands)
+        if name not in ("and", "or", "not"):
+            return None
+        operands = [self._decided(v) for v in source.operands]
+        if name == "not":
+            return None if operands[0] is None else not operands[0]
+        if (name == "or") in operands:
+            return name == "or"
+        return None if None in operands else name == "and"
+
+    def _compared(self, name: str, left: Any, right: Any) -> bool | None:
+        """Return the result of a comparison, the same in every entry, that does not switch here."""
+        terms = _sum(self.of(left), self.of(right), -1)
         gaps = np.atleast_1d(np.asarray(terms.get(_ONE, 0), dtype=object))
         is_above, is_below = bool(np.all(gaps > 0)), bool(np.all(gaps < 0))
         if any(product != _ONE for product in terms) or not (is_above or is_below):
-            raise _NoProof
+            return None
         return is_above == (name not in _FLIPPED)
 
     def _function(self, name: str, source: Source) -> Terms:
@@ -252,10 +301,14 @@ class _Expansion:
         return self._depends[source.key]
 
 
-def _stripped(source: Source) -> Source:
-    """Return the source of a value before it was only repeated or reshaped."""
+def stripped(source: Source) -> Source:
+    """Return the source of a value before it was only reshaped, or repeated from one entry."""
     while source.eqn is not None and source.eqn.primitive.name in _MOVING:
-        source = source.operands[0].source
+        whole = own_axes(source.eqn.outvars[0].aval.shape)
+        inner = source.operands[0]
+        if operand_axes(source.eqn, whole, inner) not in (whole, ()):
+            break
+        source = inner.source
     return source
 
 

@@ -92,7 +92,7 @@ class SlopeEnclosure:
             inputs.append(leaf if recorder is None else recorder.input(leaf))
             k += differentiated
         run = lambda program, x: interpret(program, x, domain)  # noqa: E731
-        rules = RULES | choice_rules(recorder) | program_rules(run)
+        rules = RULES | choice_rules(recorder, run) | program_rules(run)
         apply = partial(_apply, recorder, chains, radial)
         domain = Domain(rules, is_slope, partial(_unknown, unknown), apply, _evaluate)
         with np.errstate(all="ignore"):

@@ -228,6 +228,8 @@ def _is_finite(eqn: Any, operands: list[Any]) -> Slope:
 def _convert(eqn: Any, operands: list[Any]) -> Slope | None:
     (x,) = operands
     before, after = eqn.invars[0].aval, eqn.outvars[0].aval
+    if before.dtype == bool and after.dtype == bool:
+        return x
     if before.dtype == bool and np.issubdtype(after.dtype, np.integer):
         jump = np.where(x.low == x.high, 0.0, np.inf)
         low, high = (end.astype(after.dtype) for end in (x.low, x.high))

@@ -28,6 +28,13 @@ _DEPTH, _MAX_TERMS = 8, 64
 """Largest number of operations one after the other in an exponent, and in a sum."""
 
 
+_MAX_JOINED = 512
+"""Largest number of terms of sums that are added."""
+
+_UNDERFLOW = 1e-307
+"""The smallest upper bound of a weight: more than 1 over the largest floating-point number."""
+
+
 class _Atom(NamedTuple):
     """The entries `places` of a value, times `factors`."""
 
@@ -58,7 +65,7 @@ class _Form(NamedTuple):
             for root, places, factors in form.map(lambda v: np.broadcast_to(v, shape)).atoms:
                 left = times * factors
                 for k, (known, at, before) in enumerate(atoms):
-                    if known.source.key == root.source.key:
+                    if _is_same(known, root):
                         same = at == places
                         atoms[k] = _Atom(known, at, before + np.where(same, left, 0.0))
                         left = np.where(same, 0.0, left)
@@ -88,6 +95,10 @@ class _Form(NamedTuple):
     def is_zero(self) -> Values:
         """Return where the form is 0 whatever the values are."""
         return np.logical_and.reduce([self.constant == 0, *(a.factors == 0 for a in self.atoms)])
+
+
+def _is_same(a: Slope, b: Slope) -> bool:
+    return a is b or (None not in (a.source, b.source) and a.source.key == b.source.key)
 
 
 def _atom(value: Slope) -> _Form:
@@ -180,13 +191,24 @@ def _sum(eqn: Any, operands: tuple[Any, ...], a: _Form, b: _Form) -> _Form:
 
 
 def _joined(a: _Form, b: _Form, shape: tuple[int, ...]) -> _Form:
-    """Return the terms of two sums."""
+    """Return the terms of two sums.
+
+    **Raises:** `TooLarge`.
+    """
+    if a.constant.shape[-1] + b.constant.shape[-1] > _MAX_JOINED:
+        raise TooLarge
     a, b = (f.map(lambda v: np.broadcast_to(v, (*shape, v.shape[-1]))) for f in (a, b))
     join = lambda v, w: np.concatenate([v, w], axis=-1)  # noqa: E731
-    atoms = [_Atom(r, *(join(v, np.zeros_like(b.constant, v.dtype)) for v in (p, c)))
-             for r, p, c in a.atoms]  # fmt: skip
-    atoms += [_Atom(r, *(join(np.zeros_like(a.constant, v.dtype), v) for v in (p, c)))
-              for r, p, c in b.atoms]  # fmt: skip
+    atoms, left = [], list(b.atoms)
+    for root, *first in a.atoms:
+        # One atom for both sums, where they have the same value.
+        same = next((k for k, atom in enumerate(left) if _is_same(atom.root, root)), None)
+        second = [np.zeros_like(b.constant, v.dtype) for v in first]
+        if same is not None:
+            second = left.pop(same)[1:]
+        atoms.append(_Atom(root, *map(join, first, second)))
+    for root, *second in left:
+        atoms.append(_Atom(root, *(join(np.zeros_like(a.constant, v.dtype), v) for v in second)))
     return _Form(join(a.constant, b.constant), tuple(atoms))
 
 
@@ -212,7 +234,21 @@ def _weights(a: _Form) -> tuple[Values, Values]:
         raise TooLarge
     pairs = a.map(lambda v: v[..., None, :]).plus(a.map(lambda v: v[..., :, None]), -1.0)
     low, high = pairs.bounds()
-    return 1.0 / np.exp(high).sum(axis=-1), 1.0 / np.exp(low).sum(axis=-1)
+    least, largest = 1.0 / np.exp(high).sum(axis=-1), 1.0 / np.exp(low).sum(axis=-1)
+    return least, np.maximum(largest, _UNDERFLOW)
+
+
+def _sums(a: _Form) -> list[tuple[Values, Values]]:
+    """Return the lower bounds, and the upper ones, of Σₖ e^{aₖ} over all terms, and over those that are
+    not constantly 1."""
+    is_other = ~a.is_zero()
+    terms = [np.exp(v) for v in a.bounds()]
+    return [(v.sum(axis=-1), v.sum(axis=-1, where=is_other)) for v in terms]
+
+
+def _share(part: Values, total: Values) -> Values:
+    """Return part/total, 1 where both overflow. (The difference of 1 and the rest would cancel.)"""
+    return np.where(np.isinf(part) | (total == 0), 1.0, part / total)
 
 
 def _combined(
@@ -260,12 +296,12 @@ def _quotient(eqn: Any, operands: list[Any]) -> Slope | None:
     shape = eqn.outvars[0].aval.shape
     a = a.map(lambda w: np.broadcast_to(w, (*shape, w.shape[-1])))
     delta = a.plus(v, -1.0)
-    low, high = delta.bounds()
-    low, high = 1.0 / np.exp(high).sum(axis=-1), 1.0 / np.exp(low).sum(axis=-1)
+    (smallest, others), (largest_sum, most_others) = _sums(delta)
+    low, high = 1.0 / largest_sum, np.maximum(1.0 / smallest, _UNDERFLOW)
     least, largest = _weights(a)
     own = delta.is_zero().sum(axis=-1)
     most = np.where(own > 0, 0.25 / np.maximum(own, 1), np.inf)
-    at_ends = low * (1.0 - own * low), high * (1.0 - own * high)
+    at_ends = low * _share(most_others, largest_sum), high * _share(others, smallest)
     has_peak = (own > 0) & (2.0 * own * low <= 1.0) & (2.0 * own * high >= 1.0)
     total = np.minimum(*at_ends), np.where(has_peak, most, np.maximum(*at_ends))
     weights = low[..., None] * least, np.minimum(high[..., None] * largest, most[..., None])
@@ -283,11 +319,7 @@ def _logarithm(exponents: _Form, sign: float = 1.0) -> Slope:
     """Return the slope of ± log Σₖ e^{aₖ}."""
     ends = [np.logaddexp.reduce(v, axis=-1) for v in exponents.bounds()]
     least, largest = _weights(exponents)
-    own = exponents.is_zero()
-    rest = (
-        1.0 - np.minimum(largest.sum(axis=-1, where=own), 1.0),
-        1.0 - least.sum(axis=-1, where=own),
-    )
+    rest = tuple(_share(others, total) for total, others in _sums(exponents))
     parts = _combined(exponents, (least, largest), rest, sign)
     low, high = ends if sign > 0 else (-ends[1], -ends[0])
     return Slope(low, high, parts)

@@ -47,13 +47,16 @@ def _interp(eqn: Any, operands: list[Any]) -> Slope | None:
 
 
 def _logaddexp(eqn: Any, operands: list[Any]) -> Slope:
-    """Return the slope of log(eᵃ + eᵇ), which grows with a by σ(a − b), and with b by 1 − σ(a − b)."""
+    """Return the slope of log(eᵃ + eᵇ), which grows with a by σ(a − b), and with b by σ(b − a)."""
     a, b = (lift(v, eqn.outvars[0].aval.shape) for v in operands)
     weight = lambda v: 1.0 / (1.0 + np.exp(-v))  # noqa: E731
-    low, high = weight(a.low - b.high), weight(a.high - b.low)
-    by_a = a._replace(parts=mapped(a.parts, lambda part: scaled(part, low, high)))
-    by_b = b._replace(parts=mapped(b.parts, lambda part: scaled(part, 1.0 - high, 1.0 - low)))
-    parts = added(by_a, by_b)
+
+    def grown(v: Slope, other: Slope) -> Slope:
+        # The difference 1 − σ(a − b) would cancel.
+        low, high = weight(v.low - other.high), weight(v.high - other.low)
+        return v._replace(parts=mapped(v.parts, lambda part: scaled(part, low, high)))
+
+    parts = added(grown(a, b), grown(b, a))
     return Slope(np.logaddexp(a.low, b.low), np.logaddexp(a.high, b.high), parts)
 
 

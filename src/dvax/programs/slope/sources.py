@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax.tree_util as jtu
 import numpy as np
 
+from .alignment import Axes, operand_axes
 from .values import Slope, is_slope
 
 MAX_ENTRIES_KEPT = 4096
@@ -37,6 +38,37 @@ class Source(NamedTuple):
     operands: tuple[Any, ...]
     output: int
     depth: int
+
+
+class Known(NamedTuple):
+    """A value, or whether a relation (`relation_of`) holds, in the entries at these axes: (), if it has
+    one entry."""
+
+    value: Any
+    axes: Axes
+
+
+COMPARISONS = frozenset({"lt", "le", "gt", "ge"})
+
+
+def relation_of(source: Source) -> tuple[Any, bool] | None:
+    """Return the key of v < w, and whether a value is this or its opposite; None if it is neither."""
+    name = "" if source.eqn is None else source.eqn.primitive.name
+    if name not in COMPARISONS:
+        return None
+    v, w = map(_identity, source.operands)
+    if v is None or w is None:
+        return None
+    return ("less", *((v, w) if name in ("lt", "ge") else (w, v))), name in ("lt", "gt")
+
+
+def _identity(value: Any) -> Any:
+    """Return what is equal for equal values; None if a value has no source."""
+    if is_slope(value):
+        return None if value.source is None else value.source.key
+    array = np.asarray(value)
+    is_same = array.size > 0 and bool(np.all(array == array.flat[0]))
+    return ("number", float(array.flat[0])) if is_same else (array.shape, array.tobytes())
 
 
 class Recorder:
@@ -94,24 +126,36 @@ class Recorder:
         self._kept.append(value)
         return value
 
-    def again(self, value: Any, known: dict[int, Any]) -> Any:
-        """Return a value with the values in `known`, by their keys, in place of those before.
+    def again(self, value: Any, known: "dict[Any, Known]", axes: Axes) -> Any:
+        """Return a value of these axes with what is known in place of what was before.
 
         Returns the value as it was where too many operations were evaluated again.
         """
-        memo: dict[int, Any] = dict(known)
+        memo: dict[Any, Any] = {}
+        everywhere = any(fact.axes == () for fact in known.values())
 
-        def visit(v: Any) -> Any:
-            if not is_slope(v) or v.source is None or v.source.eqn is None:
-                return memo.get(v.source.key, v) if is_slope(v) and v.source else v
-            source = v.source
-            if source.key not in memo:
-                operands = [visit(one) for one in source.operands]
+        def visit(v: Any, axes: Axes) -> Any:
+            if not is_slope(v) or v.source is None or (axes is None and not everywhere):
+                return v
+            source, shape = v.source, np.shape(v.low)
+            key = source.key, axes
+            if key in memo:
+                return memo[key]
+            memo[key] = v
+            given, relation = known.get(source.key), relation_of(source)
+            if given is not None and given.axes in ((), axes):
+                memo[key] = given.value
+            elif relation is not None and (fact := known.get(relation[0])) is not None:
+                if fact.axes in ((), axes):
+                    memo[key] = np.full(shape, fact.value == relation[1])
+            if memo[key] is v and source.eqn is not None:
+                operands = [
+                    visit(one, operand_axes(source.eqn, axes, one)) for one in source.operands
+                ]
                 same = all(a is b for a, b in zip(operands, source.operands, strict=True))
-                memo[source.key] = v
                 if not same and self._left > 0:
                     self._left -= 1
-                    memo[source.key] = self._operate(source.eqn, operands)[source.output]
-            return memo[source.key]
+                    memo[key] = self._operate(source.eqn, operands)[source.output]
+            return memo[key]
 
-        return visit(value)
+        return visit(value, axes)
