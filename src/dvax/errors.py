@@ -56,7 +56,8 @@ class InputError(DvaxError, ValueError):
     problems: tuple[InputProblem, ...]
 
     def __init__(self, *problems: InputProblem):
-        self.problems = problems
+        # Several keys may name one file.
+        self.problems = problems = tuple(dict.fromkeys(problems))
         super().__init__("\n".join(map(str, problems)))
 
 

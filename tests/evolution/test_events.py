@@ -401,6 +401,30 @@ def test_reset_switches_a_parameter_that_is_a_component_of_the_state():
         np.testing.assert_allclose(np.asarray(sol.events.ts, float), exact, atol=tol)
 
 
+@pytest.mark.slow
+def test_time_at_which_a_law_saturates_has_its_derivative_whatever_the_steps():
+    """A heater with a PI law: the event is at a kink, and the step behind it may be of any length."""
+    want = lambda x: 6.0 * (20.0 - x[0]) + x[1]  # noqa: E731
+    problem = dvax.Problem(
+        A=generators.Zero(), P=operators.Scaling(1.0), K=sets.Box(0.0, 15.0),
+        control_space=dvax.spaces.Euclidean(()),
+        f=lambda t, x, u, k: jnp.stack(
+            [0.5 * (k * (2.0 - x[0]) + u), 1.5 * (20.0 - x[0]) + 2.0 * (u - want(x))]
+        ),
+        h=lambda t, x, u, k: want(x),
+    )  # fmt: skip
+    full = dvax.Event(lambda t, x, u, k: want(x) - 15.0, direction=1)
+
+    def time(k, t1):
+        x0 = jnp.array([18.0, 0.0])
+        return dvax.solve(problem, x0, 0.0, t1, k, rtol=1e-7, events=[full]).events.ts[0]
+
+    derivative = jax.jit(jax.grad(time))
+    ends = np.append(np.linspace(2.0, 10.0, 81), 3.7)
+    exact = float(time(1.0 + 1e-4, 2.0) - time(1.0 - 1e-4, 2.0)) / 2e-4
+    np.testing.assert_allclose([float(derivative(1.0, t1)) for t1 in ends], exact, rtol=1e-5)
+
+
 @pytest.mark.thorough
 def test_event_of_a_saturated_response_is_the_change_of_regime():
     case = c1()

@@ -129,7 +129,11 @@ class EventWatch(eqx.Module):
     def _noise(self, sizes: jax.Array) -> jax.Array:
         """Return the values of the functions, given their largest ones, that are not told from zero: 0
         for an event that ends a step, since none of those may be missed."""
-        return jnp.where(self._stops, 0.0, _ROUNDINGS * jnp.finfo(sizes.dtype).eps * sizes)
+        return jnp.where(self._stops, 0.0, self._rounding(sizes))
+
+    @staticmethod
+    def _rounding(sizes: jax.Array) -> jax.Array:
+        return _ROUNDINGS * jnp.finfo(sizes.dtype).eps * sizes
 
     def values(self, flow: Flow, t: Any, x: Tree, guess: Tree | None) -> jax.Array:
         """Return the values of all functions."""
@@ -296,13 +300,16 @@ class EventWatch(eqx.Module):
         ulp = jnp.maximum(_ulp(t0), _ulp(end)) / h + jnp.finfo(t0.dtype).eps
         shortest = jnp.maximum(_BRACKET, _BRACKET_ULPS * ulp)
         limits = self._directions, touch, self._noise(watched.sizes), shortest
-        width = _width(t0, end)
+        width, rounding = _width(t0, end), self._rounding(watched.sizes)
 
         def happens(walk: Walk) -> tuple[jax.Array, jax.Array]:
             arrived = arrives(walk.va, walk.vb, self._directions)
             near = touches(walk.va, walk.da, walk.vb, walk.db, walk.b - walk.a, *limits[:2])
             fired = walk.found & walk.above & (arrived | near)
-            return fired, jnp.where(near & ~arrived, 0.0, width)
+            # In a short step, as from a kink to the next, g is rounded by more than it changes in it.
+            slope = jnp.minimum(jnp.abs(walk.da), jnp.abs(walk.db)) / h
+            rounded = rounding / jnp.where(slope == 0, jnp.inf, slope)
+            return fired, jnp.where(near & ~arrived, 0.0, width + rounded)
 
         def one(carry: tuple[Walk, Rows, Any]) -> tuple[Walk, Rows, Any]:
             walk, table, count = carry

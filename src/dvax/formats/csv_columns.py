@@ -30,10 +30,16 @@ class Column:
     lines: np.ndarray
 
 
-def read_columns(path: Path, wanted: list[str | None], key_column: str) -> list[Column]:
+def read_columns(
+    path: Path,
+    wanted: list[str | None],
+    key_column: str,
+    choose: str = "Add column = with one of these names",
+) -> list[Column]:
     """Return the `wanted` columns of a CSV file, in that order.
 
-    None stands for "the one column besides `key_column`". Raises `InputError` with every problem:
+    None stands for "the one column besides `key_column`", and `choose` says what to do where there are
+    several. Raises `InputError` with every problem:
     a missing column or unit, a gap, text, NaN or infinity in a number column, rows of other
     lengths.
     """
@@ -57,7 +63,7 @@ def read_columns(path: Path, wanted: list[str | None], key_column: str) -> list[
         units[title] = match["unit"] or None if match else None
     table = Table(line, names, rows[1:], problems)
     there = table.has(*(name for name in wanted if name is not None))
-    named = [name or _only_other(table, key_column) for name in wanted]
+    named = [name or _only_other(table, key_column, choose) for name in wanted]
     chosen = [name for name in named if name is not None]
     if not there or len(chosen) < len(wanted):
         raise problems.error()
@@ -82,14 +88,14 @@ def column_names(path: Path) -> list[str]:
     return [match["name"] for match in found if match is not None]
 
 
-def _only_other(table: Table, key_column: str) -> str | None:
+def _only_other(table: Table, key_column: str, choose: str) -> str | None:
     """Return the one column besides `key_column`; None, and a problem, where there are several."""
     others = [name for name in table.names if name != key_column]
     if len(others) == 1:
         return others[0]
     given = f"columns {', '.join(map(repr, table.names))}"
     rule = f"without a column's name there is exactly one besides {key_column!r}"
-    table.problems(table.header, given, rule, "Add column = with one of these names")
+    table.problems(table.header, given, rule, choose)
     return None
 
 

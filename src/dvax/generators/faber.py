@@ -236,7 +236,7 @@ class FaberPropagator(AbstractPropagator):
 
     def _substep(self, s: Any, x: Tree, c: tuple[Tree, ...], total: Callable) -> Tree:
         dtype = jnp.result_type(*jtu.tree_leaves(x))
-        count = self.substeps.astype(dtype)
+        count = jnp.asarray(self.substeps, dtype)
         new = total((x, *_rescaled(s.astype(dtype) / count, 1.0 / count, c)))
         return _tree.where(s < self.substeps, new, x)
 
@@ -260,7 +260,7 @@ class FaberPropagator(AbstractPropagator):
     ) -> tuple[tuple[Tree, ...], list[Any]]:
         """Return Sᵀy, and the product of y with the derivative of Sv in the data of A."""
         x0, *c = v
-        count = self.substeps.astype(jnp.result_type(*jtu.tree_leaves(y)))
+        count = jnp.asarray(self.substeps, jnp.result_type(*jtu.tree_leaves(y)))
         one = lambda s, x: self._substep(s, x, tuple(c), self._plain_sum)  # noqa: E731
 
         def sums(s: Any, y: Tree) -> Any:
@@ -275,7 +275,7 @@ class FaberPropagator(AbstractPropagator):
     def _in_reverse(self, y: Tree, terms: int, zero: Any, sums: Callable) -> tuple[Any, Any]:
         """Return the parts of x₀ and c, and the sum of what `sums` returns for each substep besides."""
         dtype = jnp.result_type(*jtu.tree_leaves(y))
-        count, substeps = self.substeps.astype(dtype), self._substeps()
+        count, substeps = jnp.asarray(self.substeps, dtype), self._substeps()
 
         def substep(k: Any, carry: Any) -> Any:
             y, c, total = carry
@@ -291,7 +291,7 @@ class FaberPropagator(AbstractPropagator):
 
     def _recurrence(self, dtype: Any) -> tuple[Any, Any, Any, jax.Array]:
         """Return z₀, the two numbers of the recurrence, and the coefficients."""
-        z0, a, b = (number.astype(dtype) for number in self.ellipse)
+        z0, a, b = (jnp.asarray(number, dtype) for number in self.ellipse)
         return z0, 2.0 / (a + b), (a - b) / (a + b), self.coefficients.astype(dtype)
 
     def _clenshaw(self, v: tuple[Tree, ...]) -> tuple[Callable, Callable]:
@@ -422,7 +422,7 @@ class FaberPropagator(AbstractPropagator):
     def _sum(self, v: tuple[Tree, ...]) -> Tree:
         """Return Σₖ Fₖ(A) Σᵢ coefficients[i, k] vᵢ by Clenshaw's recurrence."""
         dtype = jnp.result_type(*jtu.tree_leaves(v))
-        z0, a, b = (number.astype(dtype) for number in self.ellipse)
+        z0, a, b = (jnp.asarray(number, dtype) for number in self.ellipse)
         rows = self.coefficients.astype(dtype)
         forward, back = 2.0 / (a + b), (a - b) / (a + b)
 

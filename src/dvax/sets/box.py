@@ -81,7 +81,7 @@ class Box(AbstractSet):
         def one(bound: jax.Array) -> jax.Array:
             # Bounds given as Python numbers take the type of `like`.
             common = jnp.result_type(bound, like)
-            bound = bound if bound.dtype == common else bound.astype(common)
+            bound = bound if bound.dtype == common else jnp.asarray(bound, common)
             return jnp.broadcast_to(bound, jnp.shape(like))
 
         return one(self.lower), one(self.upper)

@@ -122,7 +122,7 @@ class ConstrainedBox(AbstractSet):
     def _data(self, z: Tree, space: AbstractSpace) -> tuple[jax.Array, ...]:
         # Bounds given as Python numbers take the type of z.
         lower, upper = (
-            jnp.broadcast_to(b.astype(jnp.result_type(b, z)), z.shape)
+            jnp.broadcast_to(jnp.asarray(b, jnp.result_type(b, z)), z.shape)
             for b in (self.lower, self.upper)
         )
         return z, inverse_weights(space, z), lower, upper, self.R, self.low, self.high

@@ -55,6 +55,9 @@ _FACTOR = rf"(?:{_NAME}|{_GROUP})"
 _UNIT = re.compile(rf"(?:1\s*/\s*)?{_FACTOR}(?:{_BETWEEN}{_FACTOR})*")
 
 
+_OFFSET = "has a zero point of its own"
+
+
 class UnitError(ValueError):
     """A text that is no quantity or no unit; `fix` says what to write instead."""
 
@@ -108,7 +111,13 @@ def ratio(unit: str, wanted: str, what: str = "it is in") -> float:
     """Return how many `wanted` one `unit` is. Raises `UnitError`, with `what` before `wanted`."""
     if unit.strip() == wanted:
         return 1.0
-    given, target = parse_unit(unit), parse_unit(wanted)
+    try:
+        given, target = parse_unit(unit), parse_unit(wanted)
+    except UnitError as error:
+        rule = error.rule
+        if rule.endswith(_OFFSET):
+            rule = f"nothing is converted to or from a unit that {_OFFSET}, such as degC"
+        raise UnitError(f"{what} {wanted}, and {rule}", f"Give it in {wanted}") from None
     if given.dimensionality != target.dimensionality:
         raise UnitError(
             f"{unit!r} does not measure this: {what} {wanted}",
@@ -184,7 +193,7 @@ def parse_unit(unit: str) -> "pint.Unit":
             f"{unit!r} is not a known unit", "Write one such as s, mm, um/s or MPa/mm (1 for none)"
         ) from None
     if not math.isclose(two, 2 * one, rel_tol=1e-9):
-        raise UnitError(f"{unit!r} has a zero point of its own", "Use a unit that starts at zero")
+        raise UnitError(f"{unit!r} {_OFFSET}", "Use a unit that starts at zero")
     return parsed
 
 

@@ -15,19 +15,21 @@ TIME = "time"
 
 
 class History(NamedTuple):
-    """Increasing times (m,), and the values (m,) of each column at them."""
+    """Increasing times (m,), the values (m,) of each column at them, and the unit of time in the file."""
 
     times: np.ndarray
     columns: Mapping[str, np.ndarray]
+    unit: str
 
     def check_covers(self, path: Path, t_end: float, unit: str) -> "History":
         """Return the history, or raise an `InputError` unless it covers the run from 0 to `t_end`."""
         first, last = float(self.times[0]), float(self.times[-1])
         if first > 0.0 or last < t_end:
+            header = "" if self.unit == unit else f" ({TIME} [{self.unit}] in the first row)"
             raise input_error(
-                path.name, f"times from {first:g} to {last:g} {unit}",
+                path.name, f"times from {first:g} to {last:g} {unit}{header}",
                 f"it covers the run, from 0 to {t_end:g} {unit}: nothing is extrapolated",
-                "Add rows, or shorten the run",
+                "Add rows, shorten the run, or correct the unit of the times",
             )  # fmt: skip
         return self
 
@@ -51,9 +53,10 @@ def read_series(path: Path, name: str, unit: str, time_unit: str) -> History:
     **Raises:** `dvax.InputError` with everything that is wrong in the file.
     """
     wanted = name if name in column_names(path) else None
-    time, column = read_columns(path, [TIME, wanted], TIME)
+    choose = f"Call the column that is meant {name!r}, as in \"{name} [{unit}]\""
+    time, column = read_columns(path, [TIME, wanted], TIME, choose)
     found = _history(path, [time, column], {column.name: unit}, time_unit)
-    return History(found.times, {name: found.columns[column.name]})
+    return found._replace(columns={name: found.columns[column.name]})
 
 
 def _history(
@@ -66,4 +69,5 @@ def _history(
             path.name, "one row", "a history has two rows at least", "Add the last time of the run"
         )
     times = in_unit(path.name, time, time_unit)
-    return History(times, {c.name: in_unit(path.name, c, units[c.name] or "1") for c in others})
+    columns = {c.name: in_unit(path.name, c, units[c.name] or "1") for c in others}
+    return History(times, columns, time.unit)
