@@ -406,7 +406,7 @@ def test_time_at_which_a_law_saturates_has_its_derivative_whatever_the_steps():
     """A heater with a PI law: the event is at a kink, and the step behind it may be of any length."""
     want = lambda x: 6.0 * (20.0 - x[0]) + x[1]  # noqa: E731
     problem = dvax.Problem(
-        A=generators.Zero(), P=operators.Scaling(1.0), K=sets.Box(0.0, 15.0),
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 15.0),
         control_space=dvax.spaces.Euclidean(()),
         f=lambda t, x, u, k: jnp.stack(
             [0.5 * (k * (2.0 - x[0]) + u), 1.5 * (20.0 - x[0]) + 2.0 * (u - want(x))]

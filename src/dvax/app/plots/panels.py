@@ -62,6 +62,13 @@ class Curve:
         return self.marks or len(self.x) == 1
 
 
+    @property
+    def is_visible(self) -> bool:
+        """Whether it has a point, or a line between two."""
+        finite = np.isfinite(np.asarray(self.y, float))
+        return bool((finite if self.as_marks or self.dots else finite[1:] & finite[:-1]).any())
+
+
 @dataclass(frozen=True)
 class Band:
     """The area between `low` and `high` over x, in the pale colour of a curve."""
@@ -174,15 +181,24 @@ class Panel(AbstractPanel):
         ends = self._ends()
         if ends is not None:
             axes.set_ylim(ends)
+        if not self._has_values:
+            axes.set_yticks([], [])
+            axes.tick_params(axis="y", which="both", length=0, labelleft=False)
 
     def axis(self) -> dict[str, Any]:
         unit = unit_text(self.unit)
         title = self.words + (f"<br>[{unit}]" if unit else "")
         ends = self._ends()
-        about: dict[str, Any] = dict(title_text=title)
+        about: dict[str, Any] = dict(title_text=title, showticklabels=self._has_values)
         if ends is not None:
             about["range"] = list(np.log10(ends)) if self.log else list(ends)
         return about | (self._logarithmic() if self.log else {})
+
+    @property
+    def _has_values(self) -> bool:
+        """Whether anything is drawn: an axis without values would have invented numbers."""
+        bands = _finite(*(band.low for band in self.bands)).size > 0
+        return bands or any(curve.is_visible for curve in self.curves)
 
     def _ends(self) -> tuple[float, float] | None:
         """The ends of the vertical axis where the values lie so close that it would show roundoff:

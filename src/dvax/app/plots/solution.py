@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from dvax._dataset import Names, named
 from dvax._tree import Tree
 from dvax.app.plots.constraints import box_rows, constraint_panel
+from dvax.app.plots.lines import LARGEST
 from dvax.app.plots.map_panel import MapPanel
 from dvax.app.plots.panels import (
     AbstractPanel,
@@ -237,11 +238,12 @@ def _is_finite(box: Any) -> bool:
 
 
 def _bound_panel(bound: Any) -> Panel:
-    ts = np.asarray(bound.ts, float)
-    curves = [
-        Curve(ts, np.asarray(values, float), f"bound on the error of {name}", k, dash)
-        for k, (name, values, dash) in enumerate((("x", bound.x, "solid"), ("u", bound.u, "dash")))
-    ]
+    ts, curves = np.asarray(bound.ts, float), []
+    for k, (name, values, dash) in enumerate((("x", bound.x, "solid"), ("u", bound.u, "dash"))):
+        values = np.asarray(values, float)
+        above = ~(values <= LARGEST)
+        since = f" (infinite from t = {ts[np.argmax(above)]:.4g} on)" if above.any() else ""
+        curves.append(Curve(ts, values, f"bound on the error of {name}{since}", k, dash))
     return Panel(curves, f"error bound<br>({bound.status})", log=True)
 
 

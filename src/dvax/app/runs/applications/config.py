@@ -140,6 +140,13 @@ def check_config(
             f"{source.name}: config", shown(raw["config"]), "a file with this key describes a sweep",
             f"Run it with dvax sweep {source.name} -o DIR",
         )  # fmt: skip
+    unknown = [key for key in raw if key not in ("model", *SECTIONS)]
+    has_name = isinstance(table, Mapping) and bool({"name", OWN} & set(table))
+    if not has_name and (typo := get_close_matches("model", unknown, n=1)):
+        raise input_error(
+            f"{source.name}: {typo[0]}", f"[{typo[0]}]", "there is no table of this name here",
+            "Did you mean [model]?",
+        )  # fmt: skip
     if table is None and not set(raw) & (set(SECTIONS) - {"output"}):
         given = "an empty file" if not raw else f"no [model], but {', '.join(raw)}"
         raise input_error(

@@ -15,7 +15,7 @@ TIME = "time"
 
 
 class History(NamedTuple):
-    """Increasing times (m,), the values (m,) of each column at them, and the unit of time in the file."""
+    """Increasing times (m,), the values (m,) of each column, and the unit of time in the file."""
 
     times: np.ndarray
     columns: Mapping[str, np.ndarray]
@@ -53,7 +53,7 @@ def read_series(path: Path, name: str, unit: str, time_unit: str) -> History:
     **Raises:** `dvax.InputError` with everything that is wrong in the file.
     """
     wanted = name if name in column_names(path) else None
-    choose = f"Call the column that is meant {name!r}, as in \"{name} [{unit}]\""
+    choose = f'Call the column that is meant {name!r}, as in "{name} [{unit}]"'
     time, column = read_columns(path, [TIME, wanted], TIME, choose)
     found = _history(path, [time, column], {column.name: unit}, time_unit)
     return found._replace(columns={name: found.columns[column.name]})
