@@ -266,8 +266,7 @@ def test_circuits_of_any_kind_and_scale_succeed_at_the_defaults(seed):
     assert np.abs(np.asarray(sol.law_step)).max() <= size
 
 
-# Not number 153, and not number 45 below: their references, the exact solution and Radau, had not
-# ended after eight minutes.
+# Not number 153: its reference, the exact solution, had not ended after eight minutes.
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "seed", mostly_thorough([25, *spread([s for s in (2, *range(26, 200)) if s != 153], 30)], [25])
@@ -289,8 +288,12 @@ def test_circuits_of_any_kind_and_scale_agree_with_hundred_digit_arithmetic(seed
     np.testing.assert_allclose(us, ys, rtol=0, atol=1e-8 * size)
 
 
+_MOST_EVALUATIONS = 300_000
+"""Of the law, for the reference: some take hours."""
+
+
 @pytest.mark.thorough
-@pytest.mark.parametrize("seed", spread([s for s in range(1, 60) if s != 45], 15))
+@pytest.mark.parametrize("seed", spread(range(1, 60), 15))
 def test_circuits_of_any_kind_agree_with_radau_on_an_independent_analysis(seed):
     text, source, end, _ = drawn(np.random.default_rng(1000 + seed), mild=True)
     circuit, ts = Circuit(text), np.linspace(0.0, end, 13)
@@ -314,7 +317,11 @@ def test_circuits_of_any_kind_agree_with_radau_on_an_independent_analysis(seed):
         q = plain.C @ x + plain.e[:, 0] * drive(t)
         return affine_box_vi(D, q, np.zeros(m), np.full(m, np.inf))
 
+    evaluations = itertools.count()
+
     def rate(t, x):
+        if next(evaluations) > _MOST_EVALUATIONS:
+            pytest.skip(f"the reference needs more than {_MOST_EVALUATIONS} evaluations")
         return plain.A @ x + plain.B @ law(t, x) + plain.b[:, 0] * drive(t)
 
     def jacobian(t, x):

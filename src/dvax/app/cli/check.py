@@ -39,7 +39,12 @@ def check(
         ]
         # No run gets past a time at which K(t) is empty; other laws may have a solution all the same.
         impossible = any(row.label == "ass:operators (iii)" for row in refuted)
-        if not impossible:
+        if refuted and not impossible:
+            words = (
+                "the configuration and its data are valid, but an assumption does not hold (below)"
+            )
+            print_line(f"{loaded.source}: {words}", "bold")
+        elif not impossible:
             print_line(f"{loaded.source}: no problem in the configuration and its data", "bold")
         if found.fit:
             print_line(f"class: {found.fit}")

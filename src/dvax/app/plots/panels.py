@@ -61,7 +61,6 @@ class Curve:
     def as_marks(self) -> bool:
         return self.marks or len(self.x) == 1
 
-
     @property
     def is_visible(self) -> bool:
         """Whether it has a point, or a line between two."""

@@ -68,10 +68,10 @@ class _Axis:
         """Whether the values need a logarithmic axis: over a decade or more, and spread more evenly by
         their logarithms than by themselves; or over twelve decades."""
         values = np.unique(self.values[np.isfinite(self.values)]).astype(float)
-        if len(values) < 3 or not 0 < 10 * values[0] <= values[-1]:
+        if len(values) < 2 or not 0 < 10 * values[0] <= values[-1]:
             return False
-        if values[-1] >= 1e12 * values[0]:
-            return True
+        if len(values) == 2 or values[-1] >= 1e12 * values[0]:
+            return bool(values[-1] >= 1e3 * values[0])
         middle = np.log(np.median(values))
         even = np.log(0.5 * (values[0] + values[-1]))
         return bool(abs(middle - np.mean(np.log(values[[0, -1]]))) < abs(middle - even))
@@ -186,7 +186,9 @@ def _members(path: Path, keys: list[str]) -> _Members | None:
         array: Any = group[name]
         about = array.attrs.asdict()
         words = str(about.get("long_name", name))
-        return _Axis(name, np.asarray(array[...]), str(about.get("units", "")), words)
+        values = np.asarray(array[...])
+        values = values.astype(str) if values.dtype.kind == "T" else values
+        return _Axis(name, values, str(about.get("units", "")), words)
 
     apart, figures = {*keys, "member", "status"}, []
     for name, array in sorted(group.arrays(), key=lambda item: _with_numbers(item[0])):
@@ -202,7 +204,8 @@ def _members(path: Path, keys: list[str]) -> _Members | None:
             ]
     finished = axis("status").values == 1
     # The figures that the author of a model chose are drawn first, since only some are drawn.
-    figures.sort(key=lambda figure: (figure.name == "steps", figure.name.startswith("final_")))
+    last = lambda name: (name == "steps", "error_bound" in name, name.startswith("final_"))  # noqa: E731
+    figures.sort(key=lambda figure: last(figure.name))
     varying = [figure for figure in figures if np.isfinite(figure.values[finished]).any()]
     return _Members([axis(key) for key in keys], varying, finished)
 
@@ -247,15 +250,18 @@ def _surface(members: _Members, axes: list[_Axis], grid: np.ndarray) -> Picture:
     bar = pressure_bar(plot, "", 480)
     plot.update_layout(margin=dict(t=100))
     maps = [np.where(members.finished[grid], f.values[grid], np.nan) for f in figures]
+    maps = [np.where(np.isfinite(values), values, np.nan) for values in maps]
     # Even cells, since values of a logarithmic range would make some of them too narrow to see.
     names = [[number(v) for v in values] for values in (across, along)]
     for k, (figure, values) in enumerate(zip(figures, maps, strict=True)):
         title = axis_title(figure.short, figure.unit)
+        shown = np.log10(values) if figure.is_wide else values
+        ticks = dict(tickprefix="10^", exponentformat="none") if figure.is_wide else {}
         plot.add_trace(
             go.Heatmap(
-                x=names[0], y=names[1], z=values, colorscale=PRESSURE_MAP, visible=k == 0,
-                colorbar=dict(bar, title=dict(text=title, side="top")),
-                hovertemplate="%{x}, %{y}: %{z:.5g}<extra></extra>",
+                x=names[0], y=names[1], z=shown, customdata=values, colorscale=PRESSURE_MAP,
+                visible=k == 0, colorbar=dict(bar, title=dict(text=title, side="top"), **ticks),
+                hovertemplate="%{x}, %{y}: %{customdata:.5g}<extra></extra>",
             )
         )  # fmt: skip
     plot.update_xaxes(title_text=axis_title(axes[0].short, axes[0].unit), type="category")
@@ -271,7 +277,10 @@ def _surface(members: _Members, axes: list[_Axis], grid: np.ndarray) -> Picture:
             for place in places.flat[len(figures) :]:
                 place.set_visible(False)
             for place, figure, values in zip(places.flat, figures, maps, strict=False):
-                image = place.imshow(values, origin="lower", aspect="auto", cmap=PRESSURE_MAP)
+                image = place.imshow(
+                    values, origin="lower", aspect="auto", cmap=PRESSURE_MAP,
+                    norm="log" if figure.is_wide else None,
+                )  # fmt: skip
                 place.set_xticks(range(len(across)), names[0], rotation=45, ha="right")
                 place.set_yticks(range(len(along)), names[1])
                 place.grid(visible=False)

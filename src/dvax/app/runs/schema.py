@@ -21,7 +21,14 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from dvax.app.runs.units import UnitError, Units, check_working_unit, converted, is_quantity
+from dvax.app.runs.units import (
+    UnitError,
+    Units,
+    check_working_unit,
+    converted,
+    is_linear,
+    is_quantity,
+)
 
 ViSolver = Literal[
     "Auto", "Projection", "Extragradient", "ForwardBackwardForward", "GoldenRatio",
@@ -104,6 +111,11 @@ def number_or_file(unit: str) -> PlainValidator:
 
 def _converted(text: str, unit: str) -> float:
     number = converted(text, unit)
+    if number is None and is_quantity(text) and not is_linear(unit):
+        raise rule_error(
+            f"its unit is {unit!r}, which is no unit that a text can be converted to",
+            "Write a bare number, or correct the unit where the parameter is declared",
+        )
     if number is None:
         raise rule_error(
             f"it is a number in {unit}, or a text with a number and a unit of that dimension",

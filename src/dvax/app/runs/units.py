@@ -138,6 +138,15 @@ def converted(text: str, unit: str) -> float | None:
         return None
 
 
+def is_linear(unit: str) -> bool:
+    """Return whether quantities can be converted to a unit: it is known, and starts at zero."""
+    try:
+        parse_unit(unit)
+    except UnitError:
+        return False
+    return True
+
+
 def in_unit(file: str, column: Column, unit: str, what: str = "it is in") -> np.ndarray:
     """Return the values of a column of a file in this unit. Raises `InputError`."""
     try:

@@ -70,9 +70,14 @@ def create(
         attributes={"Conventions": "CF-1.11", **attributes, "coordinates": " ".join(coordinates)},
     )  # fmt: skip
     for name, array in coordinates.items():
-        group.create_array(
-            name, data=array.values, dimension_names=array.dims, attributes=dict(array.about)
-        )
+        values = np.asarray(array.values)
+        # Zarr's specification has texts of any length, and none of a fixed one.
+        kind = "string" if values.dtype.kind == "U" else values.dtype
+        new_array = group.create_array(
+            name, shape=values.shape, dtype=kind, dimension_names=array.dims,
+            attributes=dict(array.about),
+        )  # fmt: skip
+        new_array[...] = values
     for name, array in ofeach.items():
         values = np.asarray(array.values)
         integer = values.dtype.kind in "iub"
